@@ -17,8 +17,8 @@ from .controllers.nmpc import Nmpc
 from .controllers.sliding_mode import SlidingMode
 from .controllers.two_dof import Feedforward, TwoDof
 from .env_facts import AnyEnv
-from .learned.files import ZIP, is_policy, shipped
-from .learned.policy import Learned
+from .learned.files import ZIP, is_policy, list_shipped
+from .learned.policy import PolicyController
 
 AGENTS = Registry(
     "agent",
@@ -35,7 +35,7 @@ AGENTS = Registry(
         "mpc": Mpc,
         "nmpc": Nmpc,
         "lane-keeping": LaneKeeping,
-        "learned": Learned,
+        "learned": PolicyController,
     },
 )
 """Every agent that has a name, but for policies: the package's own and those registered."""
@@ -49,12 +49,12 @@ __all__ = [
     "Esc",
     "Feedforward",
     "LaneKeeping",
-    "Learned",
     "Lqr",
     "ModelFollowing",
     "Mpc",
     "Nmpc",
     "NoControl",
+    "PolicyController",
     "SlidingMode",
     "TwoDof",
     "make_agent",
@@ -114,10 +114,10 @@ def make_agent(
     if isinstance(name, str):
         if name.endswith(ZIP):
             zips = import_module(".training.zips", __name__)  # by name: a room above `learned`
-            return Learned(env, zips.policy_from_zip(name, env, trust=trust, **options))
+            return PolicyController(env, zips.policy_from_zip(name, env, trust=trust, **options))
         if name not in AGENTS and is_policy(name):
-            return Learned(env, policy=name, **options)
-        factory = AGENTS.load(name, shipped())
+            return PolicyController(env, policy=name, **options)
+        factory = AGENTS.load(name, list_shipped())
         check_options(name, factory, options)
         agent = factory(env, **options)
     elif isinstance(name, type) or not hasattr(name, "predict"):
@@ -126,8 +126,8 @@ def make_agent(
         raise TypeError(f"{type(name).__name__} is built already, got {', '.join(options)}")
     if not hasattr(agent, "predict"):
         raise TypeError(f"{name!r} is no agent: {type(agent).__name__} has no predict")
-    made: Controller | Agent = agent
-    return made
+    result: Controller | Agent = agent
+    return result
 
 
 def register_agent(name: str, factory: Callable[..., Agent] | str) -> None:

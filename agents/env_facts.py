@@ -9,9 +9,9 @@ import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ..envs.arguments import brief
+from ..envs.arguments import short_repr
 from ..envs.engine.config import EnvConfig
-from ..envs.task.observation import Entry, space_of
+from ..envs.task.observation import ObservationEntry, make_space
 from ..envs.vehicle.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -28,7 +28,9 @@ _TRANSPARENT = {
     "DictInfoToList HumanRendering ObstructView RecordEpisodeStatistics RecordVideo "
     "RenderCollection VectorizeTransformReward",
     "stable_baselines3": "Monitor VecCheckNan VecMonitor VecNormalize VecVideoRecorder",
-    __name__.partition(".")[0]: "EstimateObservation OwnObservation Prepared Rated Remembered "
+    __name__.partition(".")[
+        0
+    ]: "EstimateObservation OwnObservation CompactObservation RewardScaleWrapper MemoryObservation "
     "TruthObservation",
 }
 _CHANGES = {"reset", "step", "step_async", "step_wait", "observation", "observations", "action",
@@ -44,7 +46,7 @@ class EnvFacts:
     reference: of `envs.task.reference.REFERENCES`. width: of an action.
     """
 
-    layout: tuple[Entry, ...]
+    layout: tuple[ObservationEntry, ...]
     nominal: Vehicle
     full_scale: float
     authority: float
@@ -70,8 +72,8 @@ class PlantKind(NamedTuple):
 class EnvView:
     """The spaces and facts of a vector environment, from which an agent is built elsewhere.
 
-    `make_agent`, `facts_of` and our controllers take it for an env. It has no `reset`, no `step`
-    and no seed: an agent built from it learns of the true car by observations alone.
+    `make_agent`, `get_env_facts` and our controllers take it for an env. It has no `reset`, no
+    `step` and no seed: an agent built from it learns of the true car by observations alone.
 
     Attributes:
         num_envs: Number of rows, a car each.
@@ -91,7 +93,7 @@ class EnvView:
     def from_env(cls, env: VectorEnv[Any, Any, Any]) -> "EnvView":
         """Take the view of a vector env, with its wrappers."""
         spaces = env.single_observation_space, env.single_action_space
-        return cls(env.num_envs, facts_of(env), plants_of(env), *spaces)
+        return cls(env.num_envs, get_env_facts(env), list_plant_kinds(env), *spaces)
 
     @property
     def unwrapped(self) -> "EnvView":
@@ -109,7 +111,7 @@ class EnvView:
         return batch_space(self.single_action_space, self.num_envs)
 
     @property
-    def layout(self) -> tuple[Entry, ...]:
+    def layout(self) -> tuple[ObservationEntry, ...]:
         """The observation's entries: names, units and bounds."""
         return self.facts.layout
 
@@ -119,7 +121,7 @@ class EnvView:
         return self.facts.nominal
 
 
-def made(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
+def make_env(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
     """The env of an id; what its arguments lack is said as the env says it, and no longer."""
     try:
         return gym.make(env_id, **options)
@@ -127,7 +129,7 @@ def made(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
         raise TypeError(str(error).partition(" was raised from the environment")[0]) from None
 
 
-def facts_of(env: AnyEnv | EnvView) -> EnvFacts:
+def get_env_facts(env: AnyEnv | EnvView) -> EnvFacts:
     """The facts of an env, a vector env, a stable-baselines3 `VecEnv` or an `EnvView`.
 
     Every wrapper is of a class that is known to leave observations and actions as they are, or has
@@ -138,13 +140,13 @@ def facts_of(env: AnyEnv | EnvView) -> EnvFacts:
     the rows of a vector env have different nominal cars or limits.
     """
     try:
-        return _facts(env)
+        return _collect_facts(env)
     except AttributeError as error:
         made_by = "an agent is built for an env as of gym.make('sideslip/YawVision-v0')"
-        raise TypeError(f"{made_by}, got {brief(env)}") from error
+        raise TypeError(f"{made_by}, got {short_repr(env)}") from error
 
 
-def _facts(env: Any) -> EnvFacts:
+def _collect_facts(env: Any) -> EnvFacts:
     nominals: Sequence[Any]
     vehicles: Sequence[Any]
     if isinstance(env, EnvView):
@@ -157,15 +159,21 @@ def _facts(env: Any) -> EnvFacts:
         period, kind = base.control_period, base.reference
     elif isinstance(env, VectorEnv):
         base = env.unwrapped
-        layout, width = layout_of(env), base.single_action_space.shape[0]
-        nominals, vehicles = _rows(base, "nominal"), _rows(base, "vehicle")
-        period, kind = _common(base, "control_period"), _common(base, "reference")
+        layout, width = get_layout(env), base.single_action_space.shape[0]
+        nominals, vehicles = _get_row_values(base, "nominal"), _get_row_values(base, "vehicle")
+        period, kind = (
+            _get_common_value(base, "control_period"),
+            _get_common_value(base, "reference"),
+        )
     else:
         base = env.unwrapped
-        layout, width = _common(base, "layout"), base.action_space.shape[0]
+        layout, width = _get_common_value(base, "layout"), base.action_space.shape[0]
         _check_wrappers(env, layout)
         nominals, vehicles = base.get_attr("nominal"), base.get_attr("vehicle")
-        period, kind = _common(base, "control_period"), _common(base, "reference")
+        period, kind = (
+            _get_common_value(base, "control_period"),
+            _get_common_value(base, "reference"),
+        )
     limits = [(car.yaw_moment_limit, car.steering_authority) for car in vehicles]
     for i, car in enumerate(zip(nominals, limits, strict=True)):
         if car != (nominals[0], limits[0]):
@@ -176,55 +184,64 @@ def _facts(env: Any) -> EnvFacts:
     return EnvFacts(layout, nominals[0], *limits[0], period, kind, width)
 
 
-def plants_of(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
+def list_plant_kinds(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
     """The kinds of plant among the rows of an env."""
     if isinstance(env, EnvView):
         return env.plants
-    scenarios = ((config.scenario, config.yaw_first) for config in configs_of(env))
+    scenarios = ((config.scenario, config.yaw_first) for config in list_configs(env))
     return frozenset(
-        PlantKind(each.tyres, each.small_angle, each.roll, each.lags, first)
-        for each, first in scenarios
+        PlantKind(scenario.tyres, scenario.small_angle, scenario.roll, scenario.lags, yaw_first)
+        for scenario, yaw_first in scenarios
     )
 
 
-def configs_of(env: AnyEnv) -> Sequence[EnvConfig]:
+def list_configs(env: AnyEnv) -> Sequence[EnvConfig]:
     """The arguments of an env, or of each environment in a vector env that has no one for all."""
     base: Any = env.unwrapped
     return [base.config] if hasattr(base, "config") else base.get_attr("config")
 
 
-def _wrappers(env: Any) -> Iterator[Any]:
+def _iterate_wrappers(env: Any) -> Iterator[Any]:
     """The wrappers from the outermost in, and those of sub-environments in this process."""
     inner = vars(env)
     if isinstance(env, gym.Wrapper | VectorWrapper) or "venv" in inner:
         yield env
-        yield from _wrappers(inner["venv"] if "venv" in inner else env.env)  # noqa: SIM401
-    for each in (*inner.get("envs", ()), *filter(None, [inner.get("vector_env")])):
-        yield from _wrappers(each)
+        yield from _iterate_wrappers(inner["venv"] if "venv" in inner else env.env)  # noqa: SIM401
+    for child in (*inner.get("envs", ()), *filter(None, [inner.get("vector_env")])):
+        yield from _iterate_wrappers(child)
 
 
 def _is_transparent(wrapper: Any) -> bool:
     """Whether a wrapper is known, or says itself, to leave observations and actions alone."""
     if "transparent" in vars(wrapper):
         return wrapper.transparent is True
-    for each in type(wrapper).__mro__:
-        if "transparent" in vars(each):
-            return vars(each)["transparent"] is True
-        if each.__name__ in _TRANSPARENT.get(each.__module__.partition(".")[0], "").split():
+    for base_class in type(wrapper).__mro__:
+        if "transparent" in vars(base_class):
+            return vars(base_class)["transparent"] is True
+        if (
+            base_class.__name__
+            in _TRANSPARENT.get(base_class.__module__.partition(".")[0], "").split()
+        ):
             return not getattr(wrapper, "norm_obs", False)  # of VecNormalize
-        if not _CHANGES.isdisjoint(vars(each)):
+        if not _CHANGES.isdisjoint(vars(base_class)):
             return False
     return False
 
 
-def _check_wrappers(env: Any, layout: tuple[Entry, ...]) -> None:
+def _check_wrappers(env: Any, layout: tuple[ObservationEntry, ...]) -> None:
     """ValueError for a wrapper that is not known to be transparent, with its name."""
-    wrong = [type(each).__name__ for each in _wrappers(env) if not _is_transparent(each)]
+    wrong = [
+        type(wrapper).__name__ for wrapper in _iterate_wrappers(env) if not _is_transparent(wrapper)
+    ]
     base = env.unwrapped
     if {"layout", "envs", "vector_env"}.isdisjoint(dir(base)):  # elsewhere: spaces show wrappers
         single = "single_" if isinstance(env, VectorEnv) else ""
-        seen, acts = (getattr(base, f"{single}{of}_space") for of in ("observation", "action"))
-        if seen != space_of(layout) or acts != gym.spaces.Box(-1.0, 1.0, acts.shape, np.float32):
+        observed, acted_on = (
+            getattr(base, f"{single}{role}_space") for role in ("observation", "action")
+        )
+        if observed != make_space(layout) or acted_on != gym.spaces.Box(
+            -1.0, 1.0, acted_on.shape, np.float32
+        ):
             wrong.append(f"a wrapper within {type(base).__name__}")
     if wrong:
         raise ValueError(
@@ -234,23 +251,23 @@ def _check_wrappers(env: Any, layout: tuple[Entry, ...]) -> None:
         )
 
 
-def layout_of(env: VectorEnv[Any, Any, Any]) -> tuple[Entry, ...]:
+def get_layout(env: VectorEnv[Any, Any, Any]) -> tuple[ObservationEntry, ...]:
     """The outermost layout that a layer offers, else that of the sub-environments; ValueError for
-    a wrapper that `facts_of` refuses."""
+    a wrapper that `get_env_facts` refuses."""
     layer: Any = env
     while "layout" not in vars(layer) and isinstance(layer, VectorWrapper):
         layer = layer.env
-    layout = tuple(_common(layer, "layout"))
+    layout = tuple(_get_common_value(layer, "layout"))
     _check_wrappers(env, layout)
     return layout
 
 
-def _rows(base: Any, name: str) -> Sequence[Any]:
+def _get_row_values(base: Any, name: str) -> Sequence[Any]:
     """An attribute of each row: the vector env's own sequence, or its sub-environments'."""
     return list(getattr(base, name) if hasattr(base, name) else base.get_attr(name))
 
 
-def _common(base: Any, name: str) -> Any:
+def _get_common_value(base: Any, name: str) -> Any:
     """An attribute that all rows share; ValueError where they do not."""
     if hasattr(base, name):
         return getattr(base, name)

@@ -17,38 +17,44 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ..envs.backend.decorators import plain
+from ..envs.backend.decorators import as_python
 from ..envs.engine.config import EnvConfig
 from ..envs.record import PACKET_WIDTH, Array
-from ..envs.scenarios.steering import wandering
+from ..envs.scenarios.steering import compute_wander_gains
 from ..envs.task.reference import REFERENCES
 from ..envs.ticks import TICK
-from ..estimators.design.models import states_for
+from ..estimators.design.models import select_states
 from ..estimators.make import make_estimator
 from ..estimators.vector import estimate as vector
 from ..estimators.wrappers.estimate import EstimateObservation
 from .controllers.base import Controller
-from .design.sampled_model import DesignModel, Purpose, cost_weights, design_model, one_tick
-from .env_facts import AnyEnv, configs_of
-from .rungs import FILTER, OUTPUTS, levels_of
+from .design.sampled_model import (
+    DesignModel,
+    DesignSpec,
+    compute_cost_weights,
+    make_design_model,
+    make_tick_model,
+)
+from .env_facts import AnyEnv, list_configs
+from .rungs import FILTER, OUTPUTS, make_noise_options
 
-_MUST = {
+_REQUIRED = {
     "steering": "wander", "small_angle": True, "tyres": "linear", "roll": False,
     "hdop_law": "constant", "hdop_spread": 0.0,
 }  # fmt: skip
-_MAY = {
+_ALLOWED = {
     "name", "duration", "amplitude", "frequency", "hold", "speed", "friction", "noise",
     "vehicle", "nominal", "disturbance_force", "disturbance_moment", "disturbance_time",
     "half_width", "camera_delays", "camera_jitter", "camera_loss", "camera_outage", "gps_period",
     "gps_delays", "gps_outage",
 }  # fmt: skip
 _ZERO = ("motor_lag", "steering_lag", "motor_power", "antenna_ahead", "antenna_left")
-_SILENT = {"accel": 1e4, "wheel": 100.0, "gps_speed": 100.0, "gps_position": 1e4}
+_MIN_NOISE = {"accel": 1e4, "wheel": 100.0, "gps_speed": 100.0, "gps_position": 1e4}
 """Noise from which on a sensor that the filter does not read says nothing of the car."""
 
 
 @dataclass(frozen=True)
-class Plant:
+class LinearPlant:
     """A linear scenario at the control's instants: x+ = G x + H u + w, w of covariance W.
 
     model: as designs have it, the driver's angle decaying. rest: what noise within a period costs,
@@ -64,10 +70,10 @@ class Plant:
     @property
     def driver(self) -> int:
         """The place of the driver's angle in x."""
-        return self.model.purpose.states.index("driver")
+        return self.model.design_spec.states.index("driver")
 
     @property
-    def keep(self) -> float:
+    def decay(self) -> float:
         """The share of the driver's angle that is left a period later, on average."""
         return float(self.model.G[self.driver, self.driver])
 
@@ -80,13 +86,13 @@ class Optimum:
     costs: S_j du^2. errors: covariance of the best estimate, by schedule, (schedules, steps, n, n).
     """
 
-    plant: Plant
+    plant: LinearPlant
     cost: float
     gains: Array
     weights: Array
     errors: Array
 
-    def cost_of(self, gains: Array) -> float:
+    def compute_cost(self, gains: Array) -> float:
         """Expected cost of u = -L_j E[x_j | ...] for gains (steps, n), or (n,) of all steps."""
         model, W = self.plant.model, self.plant.W
         L = np.broadcast_to(gains, self.gains.shape)
@@ -106,54 +112,54 @@ class Optimum:
         Whoever acts: in expectation his cost less the optimum, and much less scattered. read: what
         `Lqg` reads in his cars, (N, steps, 5). Actions are those that the motors deliver.
         """
-        answers = _answers(self.plant, self.gains)
-        answers[0, -1] /= self.plant.keep  # the first angle is seen before it acts
-        wrong = actions + np.einsum("nji,ji->nj", read, answers)
+        read_gains = _select_gains(self.plant, self.gains)
+        read_gains[0, -1] /= self.plant.decay  # the first angle is seen before it acts
+        wrong = actions + np.einsum("nji,ji->nj", read, read_gains)
         return np.asarray(wrong**2 @ self.weights)
 
 
-def plant_of(env: AnyEnv) -> Plant:
+def make_linear_plant(env: AnyEnv) -> LinearPlant:
     """The linear plant of an env, single or vector; ValueError where its scenario is not linear."""
-    config = configs_of(env)[0]
+    config = list_configs(env)[0]
     scenario, n = config.scenario, int(config.control_period)
     _check(config)
     car, speed = config.base.nominal, config.base.held_speed
     assert speed is not None
     kind = REFERENCES.index(config.reference)
     full = config.base.vehicle.yaw_moment_limit
-    purpose = Purpose(n, full, False, kind, "forces", scenario.disturbance_time)
-    model = design_model(car, speed, purpose)
-    G1, _, C, _ = one_tick(car, speed, purpose)
-    names, weights = purpose.states, TICK * np.diag(cost_weights(purpose))
+    design_spec = DesignSpec(n, full, False, kind, "forces", scenario.disturbance_time)
+    model = make_design_model(car, speed, design_spec)
+    G1, _, C, _ = make_tick_model(car, speed, design_spec)
+    names, weights = design_spec.states, TICK * np.diag(compute_cost_weights(design_spec))
     sd = np.zeros(len(names))
     sd[[names.index("F_d"), names.index("N_d")]] = (
         scenario.disturbance_force,
         scenario.disturbance_moment,
     )
-    fresh = np.diag(sd**2 * (1.0 - np.diag(G1) ** 2))
+    process_noise = np.diag(sd**2 * (1.0 - np.diag(G1) ** 2))
     W, rest = np.zeros_like(G1), 0.0
     for _ in range(n):
         rest += float(np.trace(weights @ C @ W @ C.T))
-        W = G1 @ W @ G1.T + fresh
+        W = G1 @ W @ G1.T + process_noise
     driver = names.index("driver")
     amplitude, frequency, hold = (
         scenario.range(name)[0] for name in ("amplitude", "frequency", "hold")
     )
-    keep, fresh_angle = plain(wandering)(amplitude, frequency, hold)
-    model.G[driver, driver], W[driver, driver], sd[driver] = keep, fresh_angle**2, amplitude
-    return Plant(model, W, rest, np.diag(sd**2), round(scenario.duration / (n * TICK)))
+    decay, angle_noise = as_python(compute_wander_gains)(amplitude, frequency, hold)
+    model.G[driver, driver], W[driver, driver], sd[driver] = decay, angle_noise**2, amplitude
+    return LinearPlant(model, W, rest, np.diag(sd**2), round(scenario.duration / (n * TICK)))
 
 
 def _check(config: EnvConfig) -> None:
     """ValueError, naming what, where no optimum is known."""
     scenario, base, period = config.scenario, config.base, int(config.control_period) * TICK
-    own = {key: getattr(scenario, key) for key in _MUST}
-    wrong = [f"{key} {value!r}" for key, value in own.items() if value != _MUST[key]]
-    wrong += [key for key in scenario.to_dict() if key not in _MAY | set(_MUST)]
+    values = {key: getattr(scenario, key) for key in _REQUIRED}
+    wrong = [f"{key} {value!r}" for key, value in values.items() if value != _REQUIRED[key]]
+    wrong += [key for key in scenario.to_dict() if key not in _ALLOWED | set(_REQUIRED)]
     wrong += [
-        f"noise of {name} below {least:g}"
-        for name, least in _SILENT.items()
-        if not scenario.noise.get(name, 0.0) >= least
+        f"noise of {name} below {minimum:g}"
+        for name, minimum in _MIN_NOISE.items()
+        if not scenario.noise.get(name, 0.0) >= minimum
     ]
     wrong += [f"noise of {name}" for name in scenario.noise if name.endswith("_bias")]
     car = base.vehicle
@@ -170,31 +176,31 @@ def _check(config: EnvConfig) -> None:
         raise ValueError(f"scenario {scenario.name!r} has no known optimum: {', '.join(wrong)}")
 
 
-def truth_of(env: AnyEnv) -> dict[str, Any]:
+def make_true_options(env: AnyEnv) -> dict[str, Any]:
     """Options of `exact-kf` that know the noise, the disturbances and where an episode starts."""
-    config = configs_of(env)[0]
-    start = dict.fromkeys(states_for(tuple(config.slow)), 0.0)
-    options = levels_of(config.scenario) | {"slow": list(config.slow), "prior": start}
+    config = list_configs(env)[0]
+    start = dict.fromkeys(select_states(tuple(config.slow)), 0.0)
+    options = make_noise_options(config.scenario) | {"slow": list(config.slow), "prior": start}
     speed, noise = config.base.held_speed, config.scenario.noise
     if speed is not None and "course" in noise:
         options["course_noise"] = noise["course"] / speed
     return options
 
 
-def optimum(env: gym.Env[Any, Any], schedules: int = 1) -> Optimum:
+def compute_optimum(env: gym.Env[Any, Any], schedules: int = 1) -> Optimum:
     """The optimum of a linear scenario of a single env, which is driven to see what arrives when.
 
     schedules: seeds 0 .. schedules-1 whose arrivals are averaged over; one will do where nothing is
-    lost or late by chance. Raises ValueError as `plant_of`.
+    lost or late by chance. Raises ValueError as `make_linear_plant`.
     """
-    plant = plant_of(env)
-    gains, weights, cost = _regulator(plant)
-    errors = np.array([_errors(env, plant, seed) for seed in range(schedules)])
+    plant = make_linear_plant(env)
+    gains, weights, cost = _solve_regulator(plant)
+    errors = np.array([_compute_error_covariances(env, plant, seed) for seed in range(schedules)])
     blind = np.einsum("j,ji,kjil,jl->", weights, gains, errors, gains) / schedules
     return Optimum(plant, cost + float(blind), gains, weights, errors)
 
 
-def _regulator(plant: Plant) -> tuple[Array, Array, float]:
+def _solve_regulator(plant: LinearPlant) -> tuple[Array, Array, float]:
     """K_j (steps, n), S_j (steps,), and the expected cost of an episode whose state is known."""
     model, n = plant.model, len(plant.model.G)
     G, H, V = model.G, model.H, np.zeros((n, n))
@@ -209,55 +215,58 @@ def _regulator(plant: Plant) -> tuple[Array, Array, float]:
     return gains, weights, cost + float(np.trace(V @ plant.start))
 
 
-def _errors(env: gym.Env[Any, Any], plant: Plant, seed: int) -> Array:
+def _compute_error_covariances(env: gym.Env[Any, Any], plant: LinearPlant, seed: int) -> Array:
     """Covariance of the best estimate at every decision of a seed's episode, (steps, n, n)."""
     env.reset(seed=seed)
     base: Any = env.unwrapped
     facts = {"vehicle": base.nominal, "sensors": base.slow_sensors, "speed": base.held_speed}
-    filter_ = make_estimator(FILTER, **facts, **truth_of(env))
-    names = plant.model.purpose.states
-    here = [names.index(name) for name in OUTPUTS]
-    there = [filter_.names.index(name) for name in OUTPUTS]
-    found = np.zeros((plant.steps, len(names), len(names)))
-    still = np.zeros(env.action_space.shape or (), np.float32)
+    filter_ = make_estimator(FILTER, **facts, **make_true_options(env))
+    names = plant.model.design_spec.states
+    state_indices = [names.index(name) for name in OUTPUTS]
+    filter_indices = [filter_.names.index(name) for name in OUTPUTS]
+    covariances = np.zeros((plant.steps, len(names), len(names)))
+    idle = np.zeros(env.action_space.shape or (), np.float32)
     for j in range(plant.steps):
         record = base.record
         filter_.step(record.fast, record.packets.reshape(-1, PACKET_WIDTH))
-        found[j][np.ix_(here, here)] = filter_.P[np.ix_(there, there)]
+        covariances[j][np.ix_(state_indices, state_indices)] = filter_.P[
+            np.ix_(filter_indices, filter_indices)
+        ]
         if j > 0:
-            found[j, plant.driver, plant.driver] = plant.W[plant.driver, plant.driver]
-        env.step(still)
-    return found
+            covariances[j, plant.driver, plant.driver] = plant.W[plant.driver, plant.driver]
+        env.step(idle)
+    return covariances
 
 
-def _answers(plant: Plant, gains: Array) -> Array:
+def _select_gains(plant: LinearPlant, gains: Array) -> Array:
     """Gains (..., n) of the state as those (..., 5) of what `Lqg` reads."""
-    names = plant.model.purpose.states
-    found = gains[..., [names.index(name) for name in (*OUTPUTS, "driver")]]
-    found[..., -1] *= plant.keep
-    return found
+    names = plant.model.design_spec.states
+    selected = gains[..., [names.index(name) for name in (*OUTPUTS, "driver")]]
+    selected[..., -1] *= plant.decay
+    return selected
 
 
 class Lqg(Controller):
-    """The best policy of a linear scenario that goes on for ever, on `estimated` of its env.
+    """The best policy of a linear scenario that goes on for ever, on `wrap_optimal_estimate` of its
+    env.
 
     It lacks the last steps, when nothing is to come, and takes the first angle for a last one.
-    `gains` (n,) is what `Optimum.cost_of` prices, but for that.
+    `gains` (n,) is what `Optimum.compute_cost` prices, but for that.
     """
 
     needs = (*(f"{name}_hat" for name in OUTPUTS), "steer_command")
 
     def __init__(self, env: AnyEnv, gains: Array | None = None) -> None:
         super().__init__(env)
-        plant = plant_of(env)
-        self.gains = _regulator(plant)[0][0] if gains is None else gains
-        self._answer = _answers(plant, self.gains)
+        plant = make_linear_plant(env)
+        self.gains = _solve_regulator(plant)[0][0] if gains is None else gains
+        self._answer = _select_gains(plant, self.gains)
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         action[:, 0] = -inputs @ self._answer
 
 
-def estimated(env: Any) -> Any:
+def wrap_optimal_estimate(env: Any) -> Any:
     """The env, single or vector, with the optimal estimate in its observation."""
     wrapper: Any = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation
-    return wrapper(env, FILTER, outputs=OUTPUTS, std=False, options=truth_of(env))
+    return wrapper(env, FILTER, outputs=OUTPUTS, std=False, options=make_true_options(env))

@@ -12,19 +12,19 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
-from ..envs.arguments import brief
-from ..envs.backend.extras import extra
-from ..envs.backend.files import whole
+from ..envs.arguments import short_repr
+from ..envs.backend.extras import require_extra
+from ..envs.backend.files import atomic_file
 from ..envs.record import Log, Record, concatenate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-FLOOR = 0.001  # of an episode's cost, in logarithms and ratios: what differs by less is alike
+COST_FLOOR = 0.001  # of an episode's cost, in logarithms and ratios: what differs by less is alike
 
 
-class Step(NamedTuple):
+class EpisodeStep(NamedTuple):
     """The outcome of an env-step, as the env returns it; of a vector env a row a car.
 
     The first one is the reset: its action and reward are zero. running: (N,) the rows whose first
@@ -40,12 +40,12 @@ class Step(NamedTuple):
     running: npt.NDArray[np.bool_]
 
 
-def steps_of(
+def iterate_steps(
     env: gym.Env[Any, Any] | VectorEnv[Any, Any, Any],
     agent: Any = None,
     seeds: Any = None,
     options: dict[str, Any] | None = None,
-) -> Iterator[Step]:
+) -> Iterator[EpisodeStep]:
     """The steps of an episode, or of each row's first one, until the last row's is over.
 
     agent: anything with stable-baselines3's `predict`; None leaves the cars alone. seeds, options:
@@ -59,39 +59,39 @@ def steps_of(
     obs, info = env.reset(seed=seeds, options=options)
     running = np.ones(getattr(env, "num_envs", 1), np.bool_)
     action, state, start = np.zeros(env.action_space.shape or (1,), np.float32), None, running
-    yield Step(obs, info, action, 0.0, False, False, running)
+    yield EpisodeStep(obs, info, action, 0.0, False, False, running)
     while running.any():
         if agent is not None:
             action, state = agent.predict(obs, state, start, deterministic=True)
         obs, reward, terminated, truncated, info = env.step(action)
-        yield Step(obs, info, action, reward, terminated, truncated, running)
+        yield EpisodeStep(obs, info, action, reward, terminated, truncated, running)
         start = np.atleast_1d(np.logical_or(terminated, truncated))
         running = running & ~start
 
 
-def drives_of(
+def evaluate_episodes(
     env: VectorEnv[Any, Any, Any], agent: Any, seeds: Sequence[int]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """The cost J of each seed's first episode, (N,), and its steps; agent: of `steps_of`."""
+    """The cost J of each seed's first episode, (N,), and its steps; agent: of `iterate_steps`."""
     costs, lengths = np.zeros(env.num_envs), np.full(env.num_envs, -1.0)  # the reset is no step
-    for step in steps_of(env, agent, list(seeds)):
+    for step in iterate_steps(env, agent, list(seeds)):
         costs -= np.where(step.running, step.reward, 0.0)
         lengths += step.running
     return costs, lengths
 
 
-def costs_of(
+def evaluate_costs(
     env: VectorEnv[Any, Any, Any], agent: Any, seeds: Sequence[int]
 ) -> npt.NDArray[np.float64]:
-    """The costs of `drives_of`."""
-    return drives_of(env, agent, seeds)[0]
+    """The costs of `evaluate_episodes`."""
+    return evaluate_episodes(env, agent, seeds)[0]
 
 
-def cost_ratios(
+def compute_cost_ratios(
     costs: npt.NDArray[np.float64], others: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
     """Costs over others' on the same seeds, (N,), as every score compares them."""
-    return np.asarray((costs + FLOOR) / (others + FLOOR))
+    return np.asarray((costs + COST_FLOOR) / (others + COST_FLOOR))
 
 
 _UNITS = {
@@ -151,7 +151,7 @@ class Rollout:
 
     def to_pandas(self) -> "DataFrame":
         """The table, a row a step, units in its attribute `attrs["units"]` (needs `report`)."""
-        with extra("report", "to_pandas needs pandas"):
+        with require_extra("report", "to_pandas needs pandas"):
             from pandas import DataFrame
 
         table = DataFrame(self.columns)
@@ -160,7 +160,7 @@ class Rollout:
 
     def to_parquet(self, path: str | Path) -> None:
         """Write the table; units stand in the columns' metadata (needs the extra `report`)."""
-        with extra("report", "to_parquet needs pyarrow"):
+        with require_extra("report", "to_parquet needs pyarrow"):
             import pyarrow as pa
             import pyarrow.parquet as pq
 
@@ -169,12 +169,12 @@ class Rollout:
             for name in self.columns
         ]
         table = pa.table(list(self.columns.values()), schema=pa.schema(fields))
-        with whole(path) as file:
+        with atomic_file(path) as file:
             pq.write_table(table, file)
 
     def plot(self) -> "Figure":
         """Sideslip angle, yaw rate, yaw moment and steering over time (needs `report`)."""
-        with extra("report", "plot needs matplotlib"):
+        with require_extra("report", "plot needs matplotlib"):
             from matplotlib.figure import Figure
 
         figure = Figure(figsize=(8.0, 7.0), layout="constrained")
@@ -229,22 +229,22 @@ def rollout(
 ) -> Rollout:
     """Run one episode.
 
-    env: an environment or its id. agent, options: of `steps_of`; seed: of the reset. Raises
+    env: an environment or its id. agent, options: of `iterate_steps`; seed: of the reset. Raises
     TypeError for a vector env, or one that is not of this package.
     """
     if isinstance(env, str):
-        with contextlib.closing(gym.make(env)) as made:
-            return rollout(made, agent, seed, options)
+        with contextlib.closing(gym.make(env)) as new_env:
+            return rollout(new_env, agent, seed, options)
     if not (isinstance(env, gym.Env) and env.has_wrapper_attr("layout")):
         raise TypeError(
-            f"rollout runs one env of this package, got {brief(env)}; agents.rollout.drives_of "
-            "runs a vector env"
+            f"rollout runs one env of this package, got {short_repr(env)}; "
+            "agents.rollout.drives_of runs a vector env"
         )
     base: Any = env.unwrapped
     layout = env.get_wrapper_attr("layout")
     rows, records = [], []
-    for step in steps_of(env, agent, seed, options):
-        info = step.info | motion_of(base)
+    for step in iterate_steps(env, agent, seed, options):
+        info = step.info | get_motion(base)
         info.pop("is_success", None)
         numbers = (*info.values(), step.reward, *step.action, *step.obs)
         rows.append([float(number) for number in numbers])
@@ -253,14 +253,14 @@ def rollout(
     names += ["action"] if width == 1 else [f"action_{i}" for i in range(width)]
     names += [f"obs_{entry.name}" for entry in layout]
     table = np.array(rows).T
-    units = {name: _unit(name) for name in names}
+    units = {name: _find_unit(name) for name in names}
     units |= {f"obs_{entry.name}": entry.unit for entry in layout}
     columns = dict(zip(names, table, strict=True))
     record = concatenate(records)
-    return Rollout(columns, units, _log(base, record, columns))
+    return Rollout(columns, units, _make_log(base, record, columns))
 
 
-def motion_of(base: Any) -> dict[str, float]:
+def get_motion(base: Any) -> dict[str, float]:
     """The rest of the motion, not in `info`: v_x, v_y (m/s), phi (rad), y_l and place X, Y (m)."""
     motion = base.motion
     return {
@@ -273,7 +273,7 @@ def motion_of(base: Any) -> dict[str, float]:
     }
 
 
-def _unit(name: str) -> str:
+def _find_unit(name: str) -> str:
     """The unit of a number of `info`; those of wrappers end in a state's name."""
     for ending in ("beta_hat", "beta_std"):
         if name.endswith(ending):
@@ -281,7 +281,7 @@ def _unit(name: str) -> str:
     return INFO_UNITS.get(name, "-")
 
 
-def _log(base: Any, record: Record, columns: dict[str, npt.NDArray[np.float64]]) -> Log:
+def _make_log(base: Any, record: Record, columns: dict[str, npt.NDArray[np.float64]]) -> Log:
     """The record with the truth; ticks between rows are interpolated."""
     t = record.ticks * record.dt
     truth = {name: np.interp(t, columns["t"], columns[name]) for name in TRUTH}

@@ -23,15 +23,16 @@ from .controllers.lqr import Lqr
 from .controllers.nmpc import Nmpc
 
 NOMINAL = "nominal"
-PARAMETERS = ("oracle-parameters-lqr", "oracle-parameters-nmpc")
-STATE = ("oracle-state-lqr", "oracle-state-nmpc")
-RUNGS = (NOMINAL, *PARAMETERS, *STATE)
-"""From the bottom up: those of `PARAMETERS` know car, friction, noise and biases, those of `STATE`
-also the state and what pushes the car; neither controller is always the better one."""
+PARAMETER_ORACLES = ("oracle-parameters-lqr", "oracle-parameters-nmpc")
+STATE_ORACLES = ("oracle-state-lqr", "oracle-state-nmpc")
+ORACLES = (NOMINAL, *PARAMETER_ORACLES, *STATE_ORACLES)
+"""From the bottom up: those of `PARAMETER_ORACLES` know car, friction, noise and biases, those of
+`STATE_ORACLES` also the state and what pushes the car; neither controller is always the better
+one."""
 
 FILTER = "exact-kf"
-CURVED = "joint"
-KNOWN = dict.fromkeys(("front_tyres_sd", "rear_tyres_sd", "inverse_friction_sd"), 0.1)
+TYRE_FILTER = "joint"
+TYRE_FILTER_OPTIONS = dict.fromkeys(("front_tyres_sd", "rear_tyres_sd", "inverse_friction_sd"), 0.1)
 """The filter of tyres that have a limit, which it knows to a tenth: so much does its law lack of
 the plant's. To a thousandth it believes itself, and costs 1.1 to 4 times as much."""
 OUTPUTS = ("beta", "gamma", "F_d", "N_d")
@@ -46,7 +47,7 @@ _NOISE = {
 }
 
 
-def levels_of(scenario: Scenario) -> dict[str, Any]:
+def make_noise_options(scenario: Scenario) -> dict[str, Any]:
     """Options of `exact-kf`: the noise and the disturbances of a scenario.
 
     The course's noise follows the HDOP that comes with each packet, as far as the scenario's does.
@@ -62,24 +63,27 @@ def levels_of(scenario: Scenario) -> dict[str, Any]:
     }
     if scenario.roll:
         options["fast"] = ["gyro", "accel_y"]
-        options["accel_bias_sd"] = spread_of(scenario, "accel_y_bias")
-    options |= {"bias_sd": spread_of(scenario, "gyro_bias"), "bank_sd": spread_of(scenario, "bank")}
+        options["accel_bias_sd"] = compute_range_rms(scenario, "accel_y_bias")
+    options |= {
+        "bias_sd": compute_range_rms(scenario, "gyro_bias"),
+        "bank_sd": compute_range_rms(scenario, "bank"),
+    }
     return options | {option: noise[key] for key, option in _NOISE.items() if key in noise}
 
 
-def without_biases(scenario: Scenario) -> Scenario:
+def remove_biases(scenario: Scenario) -> Scenario:
     """The scenario as a filter meets it that knows the sensors' biases and takes them away."""
     noise = {key: value for key, value in scenario.noise.items() if not key.endswith("_bias")}
     return scenario.replace(noise=noise, gyro_bias=0.0, accel_y_bias=0.0)
 
 
-def spread_of(scenario: Scenario, name: str) -> float:
+def compute_range_rms(scenario: Scenario, name: str) -> float:
     """Root mean square of a quantity that is drawn evenly from its range."""
     low, high = scenario.range(name)
     return math.sqrt((low * low + low * high + high * high) / 3.0)
 
 
-def make_rung(
+def make_oracle(
     name: str,
     env_id: str,
     num_envs: int | None = None,
@@ -87,61 +91,64 @@ def make_rung(
     options: Mapping[str, Mapping[str, Any]] | None = None,
     **env_kwargs: Any,
 ) -> tuple[Any, Controller]:
-    """(env, agent): a rung of `RUNGS` and the env whose observation it needs.
+    """(env, agent): a rung of `ORACLES` and the env whose observation it needs.
 
     num_envs: a vector env of so many rows, whose own arguments are vector_kwargs; None: a single
     one. options: {"filter": of `exact-kf`, "controller": of the agent}, over the defaults: all of
-    the id's slow sensors, `levels_of` the scenario, a grip limit. env_kwargs:
+    the id's slow sensors, `make_noise_options` the scenario, a grip limit. env_kwargs:
     of the env (scenario, vehicle, ...). Of the true car, stiffness and friction may differ between
     episodes; the rest is the env's.
 
     Raises ValueError for another name, TypeError for other options, and what `gym.make`, the filter
     and the agent raise.
     """
-    check_choice("rung", name, RUNGS)
+    check_choice("rung", name, ORACLES)
     chosen: dict[str, Mapping[str, Any]] = {"filter": {}, "controller": {}} | dict(options or {})
     if len(chosen) != 2:
         raise TypeError(f"options of a rung are 'filter' and 'controller', got {sorted(chosen)}")
-    alone: Any = gym.make(env_id, **env_kwargs)
-    if name in PARAMETERS:
-        unbiased = without_biases(alone.unwrapped.scenario)
+    single_env: Any = gym.make(env_id, **env_kwargs)
+    if name in PARAMETER_ORACLES:
+        unbiased = remove_biases(single_env.unwrapped.scenario)
         env_kwargs |= {"scenario": unbiased.to_dict()}
-        alone = gym.make(env_id, **env_kwargs)
-    base: Any = alone.unwrapped
-    env = alone
+        single_env = gym.make(env_id, **env_kwargs)
+    base: Any = single_env.unwrapped
+    env = single_env
     if num_envs is not None:
         env = gym.make_vec(env_id, num_envs=num_envs, **dict(vector_kwargs or {}), **env_kwargs)
-    if name not in STATE:
-        env = _filtered(env, base, name in PARAMETERS, chosen["filter"])
+    if name not in STATE_ORACLES:
+        env = _add_filter(env, base, name in PARAMETER_ORACLES, chosen["filter"])
     if name != NOMINAL:
-        told = VectorTruthObservation if num_envs is not None else TruthObservation
-        states = () if name in PARAMETERS else STATES
+        truth_wrapper = VectorTruthObservation if num_envs is not None else TruthObservation
+        states = () if name in PARAMETER_ORACLES else STATES
         parameters = (*STIFFNESSES, FRICTION.removeprefix("true_"))
-        env = told(env, parameters, states)
+        env = truth_wrapper(env, parameters, states)
     settings: dict[str, Any] = {"disturbance_time": base.scenario.disturbance_time, "grip": GRIP}
-    plans = name in (PARAMETERS[1], STATE[1])
+    plans = name in (PARAMETER_ORACLES[1], STATE_ORACLES[1])
     if not plans:  # a plan foresees the steering's rate
         settings["steer_weight"] = STEER_WEIGHT
     if name != NOMINAL:
-        settings |= {"vehicle": base.vehicle, "stiffness": [f"true_{each}" for each in STIFFNESSES]}
-    kind = Nmpc if plans else Lqr
-    return env, kind(env, **settings | dict(chosen["controller"]))
+        settings |= {
+            "vehicle": base.vehicle,
+            "stiffness": [f"true_{stiffness}" for stiffness in STIFFNESSES],
+        }
+    controller_class = Nmpc if plans else Lqr
+    return env, controller_class(env, **settings | dict(chosen["controller"]))
 
 
-def _filtered(env: Any, base: Any, told: bool, options: Mapping[str, Any]) -> Any:
+def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, Any]) -> Any:
     """The env with a filter on all of its slow sensors, that of the true tyres where it is told."""
-    levels = levels_of(base.scenario) | {"slow": list(base.slow_sensors)}
+    levels = make_noise_options(base.scenario) | {"slow": list(base.slow_sensors)}
     if "gps" not in base.slow_sensors:
         del levels["hdop_table"]
-    curved = told and base.scenario.tyres == "fiala"
-    if curved:
-        levels |= KNOWN
+    has_tyre_filter = knows_tyres and base.scenario.tyres == "fiala"
+    if has_tyre_filter:
+        levels |= TYRE_FILTER_OPTIONS
     wrapper = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation
     return wrapper(
         env,
-        CURVED if curved else FILTER,
+        TYRE_FILTER if has_tyre_filter else FILTER,
         outputs=OUTPUTS,
         std=False,
-        vehicle=TRUTH if told else None,
+        vehicle=TRUTH if knows_tyres else None,
         options=levels | dict(options),
     )

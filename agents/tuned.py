@@ -28,13 +28,13 @@ def read_tuned(path: Path = FILE) -> dict[str, dict[str, Options]]:
         raise ValueError(f"{path} is no TOML: {error}") from None
     for kind, names in classes.items():
         for name, parts in names.items() if isinstance(names, dict) else [("", names)]:
-            whole = isinstance(parts, dict) and parts.keys() <= set(PARTS)
-            if not (whole and all(isinstance(each, dict) for each in parts.values())):
+            is_valid = isinstance(parts, dict) and parts.keys() <= set(PARTS)
+            if not (is_valid and all(isinstance(options, dict) for options in parts.values())):
                 raise ValueError(f"{path}: {kind}.{name} is no table of {' and '.join(PARTS)}")
     return dict(classes)
 
 
-def tuned(contest_class: str, name: str) -> Options:
+def get_tuned_options(contest_class: str, name: str) -> Options:
     """{"filter": options, "controller": options} of a contestant; empty where none was tuned."""
-    found = read_tuned().get(contest_class, {}).get(name, {})
-    return {part: dict(found.get(part, {})) for part in PARTS}
+    options = read_tuned().get(contest_class, {}).get(name, {})
+    return {part: dict(options.get(part, {})) for part in PARTS}

@@ -13,13 +13,13 @@ from rich.console import Console
 from .. import __version__
 from ..agents.rollout import Rollout, rollout
 from ..envs.record import Array
-from ..estimators.analysis.bound import bound
-from .harness.drives import SETTLED, filter_arguments
-from .harness.parallel import chunked, run_cases
-from .harness.results import Row, Suite, Table
+from ..estimators.analysis.bound import compute_error_bound
+from .harness.drives import SETTLED, make_filter_arguments
+from .harness.parallel import run_cases, split_seeds
+from .harness.results import ResultRow, ResultTable, Suite
 from .harness.stats import Estimate, interval, ratio_of_roots, root_mean
-from .harness.verdict import leader, verdict
-from .papers.ledger.filters import Filter, filters_for
+from .harness.verdict import describe_leader, format_verdict
+from .papers.ledger.filters import PaperFilter, make_filters
 
 SEEDS = 100
 QUICK_SEEDS = 10
@@ -41,12 +41,12 @@ class Experiment:
     env_id: str
     paper: str
     text: str
-    filters: tuple[Filter, ...]
+    filters: tuple[PaperFilter, ...]
 
 
-def _filters(*names: str) -> tuple[Filter, ...]:
-    true = Filter(TRUE_MODEL, "exact-kf", vehicle="true")
-    return (*(Filter(name, name) for name in (*names, "exact-kf", "joint")), true)
+def _make_filters(*names: str) -> tuple[PaperFilter, ...]:
+    true = PaperFilter(TRUE_MODEL, "exact-kf", vehicle="true")
+    return (*(PaperFilter(name, name) for name in (*names, "exact-kf", "joint")), true)
 
 
 EXPERIMENTS = (
@@ -57,7 +57,7 @@ EXPERIMENTS = (
         "tie-vision Fig. 7",
         "Sine steering at 25 km/h, tyres 1.2 times stiffer than the filters believe; camera every "
         "33 ms, 30 ms late.",
-        _filters("bicycle-kf", "single-rate-kf", "multirate-kf", "multirate-residual-kf"),
+        _make_filters("bicycle-kf", "single-rate-kf", "multirate-kf", "multirate-residual-kf"),
     ),
     Experiment(
         "GPS, side wind",
@@ -66,13 +66,13 @@ EXPERIMENTS = (
         "dakf-stability Fig. 6",
         "Lane change at 25 km/h with a side wind from 4 to 8 s and no GPS from 4 to 6 s; the "
         "filters believe in tyres 1.4 times stiffer than they are.",
-        _filters("bicycle-kf", "single-rate-kf", "course-kf", "dakf"),
+        _make_filters("bicycle-kf", "single-rate-kf", "course-kf", "dakf"),
     ),
 )
 
 
 @dataclass(frozen=True)
-class Seeds:
+class SeedChunk:
     """One case: a handful of seeds of an experiment."""
 
     experiment: int
@@ -80,7 +80,7 @@ class Seeds:
 
 
 @dataclass
-class Measured:
+class EstimationResult:
     """Mean squared errors (seeds, filters), of the bound (seeds,), CPU us per tick.
 
     example: the drive of seed 0 and each filter's estimate of beta.
@@ -92,40 +92,42 @@ class Measured:
     example: tuple[Rollout, dict[str, Array]] | None
 
 
-def _env(experiment: Experiment) -> gym.Env[Any, Any]:
+def _make_env(experiment: Experiment) -> gym.Env[Any, Any]:
     return gym.make(experiment.env_id, scenario=experiment.scenario, control_period=1)
 
 
-def measure(case: Seeds) -> Measured:
+def measure(case: SeedChunk) -> EstimationResult:
     """Drive the seeds of a case once and run every filter over the same records."""
     experiment = EXPERIMENTS[case.experiment]
-    env = _env(experiment)
+    env = _make_env(experiment)
     base: Any = env.unwrapped
     shape = (len(case.seeds), len(experiment.filters))
     squares, cost, best = np.empty(shape), np.empty(shape), np.empty(len(case.seeds))
     example = None
     for i, seed in enumerate(case.seeds):
         drive = rollout(env, seed=seed)
-        late = drive.log.time >= SETTLED - 1e-9
+        settled = drive.log.time >= SETTLED - 1e-9
         traces = {}
-        for j, (label, estimator) in enumerate(filters_for(experiment.filters, base).items()):
+        for j, (label, estimator) in enumerate(make_filters(experiment.filters, base).items()):
             estimator.run(drive.log)  # gains are designed when they are first asked for
             start = time.process_time()
             estimates = estimator.run(drive.log)
-            cost[i, j] = (time.process_time() - start) / len(late) * 1e6
+            cost[i, j] = (time.process_time() - start) / len(settled) * 1e6
             traces[label] = estimates["beta"]
-            squares[i, j] = np.mean((traces[label] - drive.log.truth["beta"])[late] ** 2)
-        std = bound(record=drive.log.record, **filter_arguments(base) | {"vehicle": base.vehicle})
-        best[i] = np.mean(std[late] ** 2)
+            squares[i, j] = np.mean((traces[label] - drive.log.truth["beta"])[settled] ** 2)
+        std = compute_error_bound(
+            record=drive.log.record, **make_filter_arguments(base) | {"vehicle": base.vehicle}
+        )
+        best[i] = np.mean(std[settled] ** 2)
         if seed == 0:
             example = (drive, traces)
-    return Measured(squares, best, cost, example)
+    return EstimationResult(squares, best, cost, example)
 
 
 def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = None) -> Suite:
     """Every estimator of both experiments on the seeds 0 .. seeds-1."""
-    chunks = chunked(seeds, _CHUNK)
-    cases = [Seeds(e, chunk) for e in range(len(EXPERIMENTS)) for chunk in chunks]
+    chunks = split_seeds(seeds, _CHUNK)
+    cases = [SeedChunk(e, chunk) for e in range(len(EXPERIMENTS)) for chunk in chunks]
     results = run_cases(measure, cases, "estimation", jobs, console)
     suite = Suite(
         "estimation",
@@ -140,34 +142,43 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
         "the first is not. dakf-stability's order (DAKF before KF) holds on its Fig. 6. Intervals "
         "are 95 % over seeds.",
     )
-    found, examples = list[tuple[Array, Array]](), list[tuple[Rollout, dict[str, Array]]]()
+    errors, examples = list[tuple[Array, Array]](), list[tuple[Rollout, dict[str, Array]]]()
     for e, experiment in enumerate(EXPERIMENTS):
-        mine = [r for case, r in zip(cases, results, strict=True) if case.experiment == e]
-        squares = np.concatenate([m.squares for m in mine])
-        best = np.concatenate([m.bound for m in mine])
-        cost = np.median(np.concatenate([m.cost for m in mine]), axis=0)
-        found.append((squares, best))
-        _add(suite, experiment, squares, best, cost)
-        examples += [m.example for m in mine if m.example is not None]
-    suite.verdict = answer(found)
-    _draw(suite, found, examples)
+        experiment_results = [
+            r for case, r in zip(cases, results, strict=True) if case.experiment == e
+        ]
+        squares = np.concatenate([m.squares for m in experiment_results])
+        best = np.concatenate([m.bound for m in experiment_results])
+        cost = np.median(np.concatenate([m.cost for m in experiment_results]), axis=0)
+        errors.append((squares, best))
+        _add_rows(suite, experiment, squares, best, cost)
+        examples += [m.example for m in experiment_results if m.example is not None]
+    suite.verdict = compose_verdict(errors)
+    _draw_figures(suite, errors, examples)
     return suite
 
 
-def answer(found: Sequence[tuple[Array, Array]]) -> str:
+def compose_verdict(errors: Sequence[tuple[Array, Array]]) -> str:
     """The verdict. found: mean squared errors (seeds, filters) and of the bound (seeds,), of each
     experiment."""
     firsts, unaided, known = [], [], []
-    for experiment, (squares, best) in zip(EXPERIMENTS, found, strict=True):
-        of = dict(zip((each.label for each in experiment.filters), squares.T, strict=True))
-        rivals = sorted((n for n in of if n != TRUE_MODEL), key=lambda name: of[name].mean())
-        over = {other: interval(of[rivals[0]], ratio_of_roots, of[other]) for other in rivals[1:]}
-        least = float(ratio_of_roots(of[rivals[0]], best))
-        first = leader(rivals[0], over, "err")
-        firsts.append(f"{experiment.brief}: {first}, {least:.2f} times the least possible.")
-        unaided.append(f"{ratio_of_roots(of[UNAIDED], of[rivals[0]]):.1f}")
-        known.append(f"{ratio_of_roots(of[TRUE_MODEL], of[rivals[0]]):.2f}")
-    return verdict(
+    for experiment, (squares, best) in zip(EXPERIMENTS, errors, strict=True):
+        by_label = dict(
+            zip((filter_.label for filter_ in experiment.filters), squares.T, strict=True)
+        )
+        rivals = sorted(
+            (n for n in by_label if n != TRUE_MODEL), key=lambda name: by_label[name].mean()
+        )
+        ratios = {
+            other: interval(by_label[rivals[0]], ratio_of_roots, by_label[other])
+            for other in rivals[1:]
+        }
+        over_bound = float(ratio_of_roots(by_label[rivals[0]], best))
+        first = describe_leader(rivals[0], ratios, "err")
+        firsts.append(f"{experiment.brief}: {first}, {over_bound:.2f} times the least possible.")
+        unaided.append(f"{ratio_of_roots(by_label[UNAIDED], by_label[rivals[0]]):.1f}")
+        known.append(f"{ratio_of_roots(by_label[TRUE_MODEL], by_label[rivals[0]]):.2f}")
+    return format_verdict(
         "An estimator infers the sideslip angle: between where the car points and where it goes.",
         *firsts,
         f"Without the slow sensor the error is {' and '.join(unaided)} times as large, "
@@ -176,9 +187,11 @@ def answer(found: Sequence[tuple[Array, Array]]) -> str:
     )
 
 
-def _add(suite: Suite, experiment: Experiment, squares: Array, best: Array, cost: Array) -> None:
+def _add_rows(
+    suite: Suite, experiment: Experiment, squares: Array, best: Array, cost: Array
+) -> None:
     """Rows and a table of one experiment, best estimator first."""
-    env = _env(experiment)
+    env = _make_env(experiment)
     spec = env.spec.to_json() if env.spec is not None else ""
     common: dict[str, Any] = {
         "suite": suite.name,
@@ -192,20 +205,20 @@ def _add(suite: Suite, experiment: Experiment, squares: Array, best: Array, cost
     lines = [(float(root_mean(best)), ["the bound", f"{1e3 * root_mean(best):.2f}", "", "1", ""])]
     for j, filter_ in enumerate(experiment.filters):
         error = interval(squares[:, j], root_mean)
-        over = interval(squares[:, j], ratio_of_roots, best)
+        ratio = interval(squares[:, j], ratio_of_roots, best)
         us = float(cost[j])
         suite.rows += [
-            Row.of(metric, number, estimator=filter_.label, **common)
+            ResultRow.from_estimate(metric, number, estimator=filter_.label, **common)
             for metric, number in (
                 ("rmse", error),
-                ("rmse_over_bound", over),
+                ("rmse_over_bound", ratio),
                 ("us_per_tick", Estimate(us)),
             )
         ]
         texts = error.text(1e3, ".2f")
-        lines.append((error.value, [filter_.label, *texts, f"{over.value:.2f}", f"{us:.3f}"]))
+        lines.append((error.value, [filter_.label, *texts, f"{ratio.value:.2f}", f"{us:.3f}"]))
     suite.tables.append(
-        Table(
+        ResultTable(
             f"{experiment.paper}: error of the sideslip angle ({len(squares)} seeds)",
             ("estimator", "RMSE / mrad", "95 % interval", "over the bound", "us per tick"),
             [cells for _, cells in sorted(lines, key=lambda line: line[0])],
@@ -214,33 +227,33 @@ def _add(suite: Suite, experiment: Experiment, squares: Array, best: Array, cost
     )
 
 
-def _draw(
+def _draw_figures(
     suite: Suite,
-    found: Sequence[tuple[Array, Array]],
+    errors: Sequence[tuple[Array, Array]],
     examples: Sequence[tuple[Rollout, dict[str, Array]]],
 ) -> None:
     """Figures of every experiment; nothing where plotly is not installed."""
     try:
-        from .report.figures import error_series, groups_with_interval, time_series
+        from .report.figures import draw_error_series, draw_groups, draw_time_series
     except ModuleNotFoundError:
         return
     groups, angle = {}, "sideslip angle / mrad"
-    for experiment, (squares, best) in zip(EXPERIMENTS, found, strict=True):
-        over = {
-            each.label: Estimate(*interval(column, ratio_of_roots, best))
-            for each, column in zip(experiment.filters, squares.T, strict=True)
+    for experiment, (squares, best) in zip(EXPERIMENTS, errors, strict=True):
+        ratios = {
+            item.label: Estimate(*interval(column, ratio_of_roots, best))
+            for item, column in zip(experiment.filters, squares.T, strict=True)
         }
         title = f"{experiment.brief} ({experiment.paper})"
-        groups[title] = dict(sorted(over.items(), key=lambda pair: pair[1].value))
+        groups[title] = dict(sorted(ratios.items(), key=lambda pair: pair[1].value))
     ratio = "error / the least possible: less is better"
-    bars = groups_with_interval(groups, ratio, {1.0: "the bound"})
+    bars = draw_groups(groups, ratio, {1.0: "the bound"})
     text = "Root mean square error over what the optimal filter has; whiskers: 95 % intervals."
     suite.answers.append(("Which estimator comes closest to the sideslip angle?", bars, text))
     for experiment, (drive, traces) in zip(EXPERIMENTS, examples, strict=True):
         t, beta = drive.log.time, drive.log.truth["beta"]
-        lines = {"truth": 1e3 * beta} | {label: 1e3 * each for label, each in traces.items()}
-        missed = {label: 1e3 * (each - beta) for label, each in traces.items()}
-        over_time = time_series(t, lines, angle)
+        lines = {"truth": 1e3 * beta} | {label: 1e3 * item for label, item in traces.items()}
+        missed = {label: 1e3 * (item - beta) for label, item in traces.items()}
+        over_time = draw_time_series(t, lines, angle)
         if experiment is EXPERIMENTS[0]:
             over_time.update_layout(meta="wide")
             text = f"{experiment.text} The truth lies on top of the estimates."
@@ -248,7 +261,7 @@ def _draw(
         else:
             title = f"{experiment.paper}: the sideslip angle and its estimates (seed 0)"
             suite.figures.append((title, over_time, experiment.text))
-        figure = error_series(t, missed, f"error of the {angle}")
+        figure = draw_error_series(t, missed, f"error of the {angle}")
         suite.figures.append(
             (f"{experiment.paper}: errors (seed 0)", figure, "Estimate minus truth.")
         )

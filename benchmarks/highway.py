@@ -14,22 +14,22 @@ from rich.console import Console
 
 from .. import __version__
 from ..agents import make_agent
-from ..agents.rollout import steps_of
-from ..agents.rungs import make_rung
+from ..agents.rollout import iterate_steps
+from ..agents.rungs import make_oracle
 from ..envs.record import Array
 from ..envs.task.failures import FAILURES
 from ..estimators.wrappers.estimate import EstimateObservation
-from .control.build import agent_options, estimate_options
-from .control.cells import REFERENCE_FILTER, Cell
-from .control.contests import ORACLES, STATE, Contest
-from .harness.drives import make_env, quietly
-from .harness.parallel import chunked, run_cases
-from .harness.results import Row, Suite, Table
+from .control.build import make_agent_options, make_estimate_options
+from .control.cells import REFERENCE_FILTER, ControlEntry
+from .control.contests import ORACLES, STATE, ControlTask
+from .harness.drives import call_quietly, make_env
+from .harness.parallel import run_cases, split_seeds
+from .harness.results import ResultRow, ResultTable, Suite
 from .harness.stats import Estimate, interval, ratio_of_means, root_mean, share
-from .harness.verdict import percent, verdict
+from .harness.verdict import format_percent, format_verdict
 
 NAME, ID = "highway", "sideslip/Highway-v0"
-CONTEST = Contest("", ID, "passenger-car", "lagged", "wet-evasion")
+CONTEST = ControlTask("", ID, "passenger-car", "lagged", "wet-evasion")
 ORACLE = ORACLES[STATE][0]
 READS = {"none": "", "ppo-yaw-vision": "", ORACLE: ""}
 CONTROLLERS = ("none", "ppo-yaw-vision", "two-dof", "lqr", "nmpc", ORACLE)
@@ -50,43 +50,43 @@ highway-env's own lane keeping: our record (gyro, camera 30 ms late) built from 
 filters and `lane-keeping` on it, beside the noisy state that highway-env observes itself."""
 
 
-def swerve(case: tuple[str, tuple[int, ...]]) -> Array:
+def simulate_swerve(case: tuple[str, tuple[int, ...]]) -> Array:
     """(seeds, 3): cost, failure and largest slip in rad of a controller on some seeds."""
-    who, seeds = case
-    cell = Cell(CONTEST, READS.get(who, REFERENCE_FILTER), who)
-    if cell.rung:
-        env, agent = make_rung(cell.rung, ID, options=cell.best, **cell.env_options)
+    controller, seeds = case
+    entry = ControlEntry(CONTEST, READS.get(controller, REFERENCE_FILTER), controller)
+    if entry.oracle:
+        env, agent = make_oracle(entry.oracle, ID, options=entry.best, **entry.env_options)
     else:
         name, options = "", dict[str, Any]()
-        if cell.estimator:
-            name, options = "exact-kf", estimate_options(cell)
-        env = make_env(ID, name, options, **cell.env_options)
-        agent = make_agent(who, env, **agent_options(cell))
-    found = []
+        if entry.estimator:
+            name, options = "exact-kf", make_estimate_options(entry)
+        env = make_env(ID, name, options, **entry.env_options)
+        agent = make_agent(controller, env, **make_agent_options(entry))
+    rows = []
     for seed in seeds:
-        steps = list(steps_of(env, agent, FIRST_SEED + seed))
+        steps = list(iterate_steps(env, agent, FIRST_SEED + seed))
         slip = max(abs(step.info["beta"]) for step in steps)
-        found.append([-sum(step.reward for step in steps), steps[-1].info["failure"], slip])
-    return np.array(found)
+        rows.append([-sum(step.reward for step in steps), steps[-1].info["failure"], slip])
+    return np.array(rows)
 
 
 def keep_lane(case: tuple[str, int]) -> Array:
     """(5,): RMS errors of slip, yaw rate, heading and offset at the preview point, and the RMS
     offset in m from the lane's centre, in the second half of a drive."""
-    from ..envs.highway.keeping import STATES, KeepingEnv, OwnObservation
+    from ..envs.highway.keeping import STATES, KeepingEnv, NativeObservation
 
     reader, seed = case
     base: Any = KeepingEnv()
     env: Any
     if reader in (RETURNED, NEWEST):
-        env = OwnObservation(base, reader == RETURNED)
+        env = NativeObservation(base, reader == RETURNED)
     else:
-        env = quietly(EstimateObservation, base, reader, outputs=STATES, std=False)
+        env = call_quietly(EstimateObservation, base, reader, outputs=STATES, std=False)
     agent = make_agent("lane-keeping", env, moment=False)
     names = [entry.name for entry in env.get_wrapper_attr("layout")]
     columns = [names.index(f"{name}_hat") for name in STATES]
     rows = []
-    for step in steps_of(env, agent, seed):
+    for step in iterate_steps(env, agent, seed):
         error = step.obs[columns] - base.truth
         rows.append([*error, base.motion.y])
     return root_mean(np.square(rows[len(rows) // 2 :]), axis=0)
@@ -103,105 +103,118 @@ def run(
     if find_spec("highway_env") is None:
         suite.verdict = 'Not driven: it needs highway-env, pip install "sideslip[highway]".'
         return suite
-    cases = list(product(CONTROLLERS, chunked(seeds, CHUNK)))
-    parts = run_cases(swerve, cases, NAME, jobs, console)
+    cases = list(product(CONTROLLERS, split_seeds(seeds, CHUNK)))
+    parts = run_cases(simulate_swerve, cases, NAME, jobs, console)
     swerves = {
-        who: np.concatenate(
-            [part for (each, _), part in zip(cases, parts, strict=True) if each == who]
+        controller: np.concatenate(
+            [part for (item, _), part in zip(cases, parts, strict=True) if item == controller]
         )
-        for who in CONTROLLERS
+        for controller in CONTROLLERS
     }
-    drives_of = list(product(READERS, range(drives)))
-    kept = run_cases(keep_lane, drives_of, KEEPING, jobs, console)
+    lane_cases = list(product(READERS, range(drives)))
+    results = run_cases(keep_lane, lane_cases, KEEPING, jobs, console)
     lanes = {
         reader: np.array(
-            [each for (name, _), each in zip(drives_of, kept, strict=True) if name == reader]
+            [item for (name, _), item in zip(lane_cases, results, strict=True) if name == reader]
         )
         for reader in READERS
     }
-    _swerves(suite, swerves)
-    _lanes(suite, lanes)
-    suite.verdict = answer(swerves, lanes)
+    _add_swerves(suite, swerves)
+    _add_lanes(suite, lanes)
+    suite.verdict = compose_verdict(swerves, lanes)
     return suite
 
 
-def ended(numbers: Array, by: str) -> Estimate:
+def compute_end_rate(numbers: Array, cause: str) -> Estimate:
     """The share of episodes that ended by a failure, "none" for success, with Wilson's interval."""
-    return share(numbers[:, 1] == FAILURES.index(by))
+    return share(numbers[:, 1] == FAILURES.index(cause))
 
 
-def answer(swerves: Mapping[str, Array], lanes: Mapping[str, Array]) -> str:
-    """The verdict; arguments as `swerve` and `keep_lane` have them, by controller and reader."""
-    success = {who: ended(numbers, "none") for who, numbers in swerves.items()}
+def compose_verdict(swerves: Mapping[str, Array], lanes: Mapping[str, Array]) -> str:
+    """The verdict; arguments as `simulate_swerve` and `keep_lane` have them, by controller and
+    reader."""
+    success = {
+        controller: compute_end_rate(numbers, "none") for controller, numbers in swerves.items()
+    }
     rivals = sorted(
-        (who for who in success if who not in ("none", ORACLE)), key=lambda who: -success[who].value
+        (controller for controller in success if controller not in ("none", ORACLE)),
+        key=lambda controller: -success[controller].value,
     )
     free = swerves["none"]
-    ends = ", ".join(f"{by} {100.0 * ended(free, by).value:.0f} %" for by in ENDS)
+    ends = ", ".join(
+        f"{cause} {100.0 * compute_end_rate(free, cause).value:.0f} %" for cause in ENDS
+    )
     offset = {reader: float(numbers[:, -1].mean()) for reader, numbers in lanes.items()}
-    ours, theirs = (
+    filter_best, observation_best = (
         min((offset[r], r) for r in READERS[:2]),
         min((offset[r], r) for r in READERS[2:]),
     )
-    return verdict(
+    return format_verdict(
         "A late driver swerves around a braking vehicle on a wet road; control has the yaw moment.",
-        f"Success: {rivals[0]} {percent(success[rivals[0]])}, then {rivals[1]} "
-        f"{percent(success[rivals[1]])}; none {percent(success['none'])}.",
-        f"Why: without control {ends}; knowing state and car saves {percent(success[ORACLE])}.",
-        f"highway-env's lane keeping: {ours[1]} holds {100.0 * ours[0]:.0f} cm rms, its own "
-        f"observation {100.0 * theirs[0]:.0f} cm.",
+        f"Success: {rivals[0]} {format_percent(success[rivals[0]])}, then {rivals[1]} "
+        f"{format_percent(success[rivals[1]])}; none {format_percent(success['none'])}.",
+        f"Why: without control {ends}; knowing state and car saves "
+        f"{format_percent(success[ORACLE])}.",
+        f"highway-env's lane keeping: {filter_best[1]} holds {100.0 * filter_best[0]:.0f} cm "
+        f"rms, its own observation {100.0 * observation_best[0]:.0f} cm.",
         "Not covered: drivers who brake as well, sharper bends, other vehicles that swerve.",
     )
 
 
-def _swerves(suite: Suite, swerves: Mapping[str, Array]) -> None:
+def _add_swerves(suite: Suite, swerves: Mapping[str, Array]) -> None:
     cells, free = [], swerves["none"]
-    for who, numbers in swerves.items():
-        success = ended(numbers, "none")
+    for controller, numbers in swerves.items():
+        success = compute_end_rate(numbers, "none")
         cost = interval(numbers[:, 0], ratio_of_means, free[:, 0])
         slip = interval(numbers[:, 2])
-        ends = {by: ended(numbers, by) for by in ENDS}
+        ends = {cause: compute_end_rate(numbers, cause) for cause in ENDS}
         cells.append(
             [
-                who,
+                controller,
                 *success.text(1e2, ".1f"),
-                *(f"{100.0 * each.value:.1f}" for each in ends.values()),
+                *(f"{100.0 * rate.value:.1f}" for rate in ends.values()),
                 *cost.text(1e2, ".0f"),
                 f"{np.degrees(slip.value):.2f}",
             ]
         )
         metrics = {"success_rate": success, "ratio": cost, "peak_slip": slip}
-        metrics |= {f"{by}_rate": each for by, each in ends.items()}
-        reads = READS.get(who, REFERENCE_FILTER)
-        _add(suite, CONTEST.scenario, metrics, len(numbers), controller=who, estimator=reads)
-    header = ("controller", "success / %", "95 % interval", *(f"{by} / %" for by in ENDS))
+        metrics |= {f"{cause}_rate": rate for cause, rate in ends.items()}
+        reads = READS.get(controller, REFERENCE_FILTER)
+        _add_rows(
+            suite, CONTEST.scenario, metrics, len(numbers), controller=controller, estimator=reads
+        )
+    header = ("controller", "success / %", "95 % interval", *(f"{cause} / %" for cause in ENDS))
     more = ("cost / none's / %", "95 % interval", "peak slip / deg")
     note = (
         f"The same {len(free)} seeds for all; Wilson's intervals; costs are means with failures "
         "charged to the end, paired."
     )
     suite.tables.append(
-        Table("An evasive lane change on a wet road", (*header, *more), cells, note)
+        ResultTable("An evasive lane change on a wet road", (*header, *more), cells, note)
     )
 
 
-def _lanes(suite: Suite, lanes: Mapping[str, Array]) -> None:
+def _add_lanes(suite: Suite, lanes: Mapping[str, Array]) -> None:
     cells = []
     for reader, numbers in lanes.items():
-        slip, rate, heading, ahead, offset = (interval(column) for column in numbers.T)
-        shown = [f"{1e3 * each.value:.1f}" for each in (slip, rate, heading)]
-        cells.append([reader, *shown, f"{100.0 * ahead.value:.1f}", *offset.text(1.0, ".2f")])
-        who = {"controller": "lane-keeping", "estimator": reader}
-        _add(suite, KEEPING, {"rmse": slip, "offset": offset}, len(numbers), **who)
+        slip, rate, heading, preview_offset, offset = (interval(column) for column in numbers.T)
+        shown = [f"{1e3 * error.value:.1f}" for error in (slip, rate, heading)]
+        cells.append(
+            [reader, *shown, f"{100.0 * preview_offset.value:.1f}", *offset.text(1.0, ".2f")]
+        )
+        labels = {"controller": "lane-keeping", "estimator": reader}
+        _add_rows(suite, KEEPING, {"rmse": slip, "offset": offset}, len(numbers), **labels)
     header = ("reads", "slip / mrad", "yaw rate / (mrad/s)", "heading / mrad", "y_l / cm")
     where = ("off the centre / m", "95 % interval")
     note = "RMS errors of what the controller reads, and where the car was, from half time on."
-    suite.tables.append(Table("highway-env's lane keeping", (*header, *where), cells, note))
+    suite.tables.append(ResultTable("highway-env's lane keeping", (*header, *where), cells, note))
 
 
-def _add(suite: Suite, scenario: str, metrics: Mapping[str, Estimate], n: int, **who: str) -> None:
+def _add_rows(
+    suite: Suite, scenario: str, metrics: Mapping[str, Estimate], n: int, **labels: str
+) -> None:
     common = {"suite": NAME, "salt": "fixed", "env_version": f"{ID} {__version__}"}
     suite.rows += [
-        Row.of(metric, number, scenario=scenario, n=n, **who, **common)
+        ResultRow.from_estimate(metric, number, scenario=scenario, n=n, **labels, **common)
         for metric, number in metrics.items()
     ]

@@ -16,23 +16,23 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from ..agents.rollout import steps_of
+from ..agents.rollout import iterate_steps
 from ..envs.outside.plants import OUTSIDE_PLANTS
-from ..envs.scenarios.manoeuvres import scenario_from
-from ..estimators.user_files import reason_of
+from ..envs.scenarios.manoeuvres import make_scenario
+from ..estimators.user_files import describe_error
 from .control.build import make_cars
-from .control.cells import ADAPTIVE, LEARNED, Cell
-from .control.contests import NOMINAL, STEERING, Contest, changed, contests
-from .control.episodes import NUMBERS, Chunk, Driven
+from .control.cells import ADAPTIVE, LEARNED, ControlEntry
+from .control.contests import NOMINAL, STEERING, ControlTask, list_scored_tasks, vary_scenario
+from .control.episodes import NUMBERS, Chunk, DriveResult
 from .control.run import measure
-from .control.scores import gains, survived
-from .control.seeds import salt_of, seeds_of_contests
-from .harness.results import Suite, Table
+from .control.scores import compute_log_ratios, survival_mask
+from .control.seeds import make_salt, make_task_seeds
+from .harness.results import ResultTable, Suite
 from .harness.stats import Estimate, geometric_mean, share
-from .harness.verdict import verdict
+from .harness.verdict import format_verdict
 from .learned import EPISODES as EPISODES
 from .learned import QUICK_EPISODES as QUICK_EPISODES
-from .learned import Found, contestants, everybody, illustrated, tabled
+from .learned import TransferResult, add_figures, add_tables, collect_results, list_entries
 
 NAME = "learned-outside"
 OUTSIDE_ID = "sideslip/Outside-v0"
@@ -51,7 +51,7 @@ _NONE = " Left out: pip install 'sideslip[outside]'."
 
 
 @dataclass(frozen=True)
-class OutsideContest(Contest):
+class OutsideTask(ControlTask):
     """A class's contest with an outside plant in place of its car and a straight road in place of
     its bends. model: of `OutsideEnv`; like: the id whose actuators it has."""
 
@@ -71,38 +71,40 @@ class OutsideContest(Contest):
     @property
     def env_options(self) -> dict[str, Any]:
         """Options of the env; of the contest's cars only the friction that a designer expects."""
-        friction = dict(scenario_from(self.scenario).nominal)["friction"]
+        friction = dict(make_scenario(self.scenario).nominal)["friction"]
         flat = {"road": "straight", "bank": 0.0, "vehicle": {}, "nominal": {"friction": friction}}
         return {
             "model": self.model,
-            "scenario": changed(self, flat),
+            "scenario": vary_scenario(self, flat),
             "reference": self.reference,
             "steering": self.like == STEERING,
         }
 
 
-def outside(kind: str, model: str) -> OutsideContest:
+def make_outside_task(kind: str, model: str) -> OutsideTask:
     """A class's `MANOEUVRE` with a model as the car."""
-    like = next(each for each in contests() if (each.kind, each.scenario) == (kind, MANOEUVRE))
-    return OutsideContest("", OUTSIDE_ID, "", like.reference, MANOEUVRE, model, like.env_id)
+    like = next(
+        task for task in list_scored_tasks() if (task.kind, task.scenario) == (kind, MANOEUVRE)
+    )
+    return OutsideTask("", OUTSIDE_ID, "", like.reference, MANOEUVRE, model, like.env_id)
 
 
-def drive(chunk: Chunk) -> Driven:
-    """`control.episodes.drive` of cars that are stepped one by one: cost and failure of each
+def run_chunk(chunk: Chunk) -> DriveResult:
+    """`control.episodes.run_chunk` of cars that are stepped one by one: cost and failure of each
     episode, the other numbers NaN."""
-    begun, numbers = time.process_time(), np.full((len(chunk.seeds), len(NUMBERS)), np.nan)
+    start_time, numbers = time.process_time(), np.full((len(chunk.seeds), len(NUMBERS)), np.nan)
     try:
-        env, agent = make_cars(chunk.cell, len(chunk.seeds))
+        env, agent = make_cars(chunk.entry, len(chunk.seeds))
         costs, failures = np.zeros((2, len(chunk.seeds)))
-        for step in steps_of(env, agent, list(chunk.seeds)):
+        for step in iterate_steps(env, agent, list(chunk.seeds)):
             costs -= np.where(step.running, step.reward, 0.0)
             failures = np.where(step.running, step.info["failure"], failures)
         env.close()
     except Exception as error:
-        return Driven(numbers, np.nan, error=reason_of(error))
+        return DriveResult(numbers, np.nan, error=describe_error(error))
     numbers[:, NUMBERS.index("cost")] = costs
     numbers[:, NUMBERS.index("failure")] = failures
-    return Driven(numbers, time.process_time() - begun)
+    return DriveResult(numbers, time.process_time() - start_time)
 
 
 def run(
@@ -115,7 +117,7 @@ def run(
 ) -> Suite:
     """Every class of `KINDS` on every model.
 
-    episodes: of each. quick: the drift model alone. salt: of the seeds, "" for `salt_of`'s. The
+    episodes: of each. quick: the drift model alone. salt: of the seeds, "" for `make_salt`'s. The
     rest is of `control.run.measure`. Raises ValueError with the reason where somebody cannot drive.
     """
     suite = Suite(NAME, "Learned policies in cars that are not ours", _TEXT)
@@ -123,62 +125,77 @@ def run(
         suite.text += _NONE
         return suite
     models = ["drift"] if quick else list(OUTSIDE_PLANTS)
-    cells = [
-        Cell(outside(kind, model), *who)
+    entries = [
+        ControlEntry(make_outside_task(kind, model), *pair)
         for model in models
         for kind in KINDS
-        for who in contestants(kind)
+        for pair in list_entries(kind)
     ]
-    salt = salt or salt_of()
-    seeds = seeds_of_contests(salt, episodes)
-    results = measure(cells, seeds, jobs=jobs, console=console, keep=keep, by=drive, title=NAME)
-    found = [
-        Found(
-            kind, {each: [everybody(results, outside(kind, each), each)] for each in models}, salt
+    salt = salt or make_salt()
+    seeds = make_task_seeds(salt, episodes)
+    results = measure(
+        entries, seeds, jobs=jobs, console=console, keep=keep, runner=run_chunk, title=NAME
+    )
+    transfers = [
+        TransferResult(
+            kind,
+            {
+                item: [collect_results(results, make_outside_task(kind, item), item)]
+                for item in models
+            },
+            salt,
         )
         for kind in KINDS
     ]
     note = "Other seeds on each model. No training met any."
-    for each in found:
-        title = f"{each.kind} in a BMW"
-        tabled(suite, each, title, OUTSIDE_ID, f"{MANOEUVRE} on a straight road", note)
-        suite.tables.insert(-1, _ratios(each, title))
-    suite.verdict = answer(found)
-    illustrated(suite, found)
+    for item in transfers:
+        title = f"{item.kind} in a BMW"
+        add_tables(suite, item, title, OUTSIDE_ID, f"{MANOEUVRE} on a straight road", note)
+        suite.tables.insert(-1, _make_ratio_table(item, title))
+    suite.verdict = compose_verdict(transfers)
+    add_figures(suite, transfers)
     return suite
 
 
-def answer(found: Sequence[Found]) -> str:
+def compose_verdict(transfers: Sequence[TransferResult]) -> str:
     """The verdict: the policies of each class, by their cost over their rivals' on all models."""
     lines = []
-    for each, policy in ((one, who) for one in found for _, who in LEARNED[one.kind]):
-        costs = {rival: _over(each, policy, rival, each.driven) for rival in _RIVALS}
-        said = ", ".join(f"{_percent(cost)} % of {rival}'s" for rival, cost in costs.items())
-        fails = 100.0 * share(each.failed(policy)).value
+    for transfer, policy in (
+        (one, controller) for one in transfers for _, controller in LEARNED[one.kind]
+    ):
+        costs = {
+            rival: _compute_cost_ratio(transfer, policy, rival, transfer.drives)
+            for rival in _RIVALS
+        }
+        said = ", ".join(f"{_format_percent(cost)} % of {rival}'s" for rival, cost in costs.items())
+        fails = 100.0 * share(transfer.mark_failures(policy)).value
         lines.append(f"{policy} costs {said}; {fails:.0f} % fail.")
-    return verdict("On CommonRoad's BMW, designed for by all but the policies:", *lines)
+    return format_verdict("On CommonRoad's BMW, designed for by all but the policies:", *lines)
 
 
-def _over(found: Found, who: str, rival: str, models: Iterable[str]) -> Estimate:
+def _compute_cost_ratio(
+    transfer: TransferResult, controller: str, rival: str, models: Iterable[str]
+) -> Estimate:
     """Geometric mean of the cost over a rival's, paired, where the rival survives."""
     logs = []
-    for (those,) in (found.driven[model] for model in models):
-        kept = survived(those[rival])
-        logs.append(-gains(those[rival].costs, those[who])[kept])
+    for (results,) in (transfer.drives[model] for model in models):
+        mask = survival_mask(results[rival])
+        logs.append(-compute_log_ratios(results[rival].costs, results[controller])[mask])
     return geometric_mean(*logs)
 
 
-def _ratios(found: Found, title: str) -> Table:
+def _make_ratio_table(transfer: TransferResult, title: str) -> ResultTable:
     """What everybody costs on each model over `_RIVALS`."""
     cells = [
-        [who, *("" if who == rival else _percent(_over(found, who, rival, [model]))
-                for model in found.driven for rival in _RIVALS)]
-        for _, who in contestants(found.kind)
+        [controller, *("" if controller == rival else _format_percent(_compute_cost_ratio(transfer,
+            controller, rival, [model]))
+                for model in transfer.drives for rival in _RIVALS)]
+        for _, controller in list_entries(transfer.kind)
     ]  # fmt: skip
-    header = [f"{model}, % of {rival}" for model in found.driven for rival in _RIVALS]
+    header = [f"{model}, % of {rival}" for model in transfer.drives for rival in _RIVALS]
     note = "Geometric means, paired, where the one compared with survives; a failure counts 20."
-    return Table(f"{title}: cost over others'", ("controller", *header), cells, note)
+    return ResultTable(f"{title}: cost over others'", ("controller", *header), cells, note)
 
 
-def _percent(ratio: Estimate) -> str:
+def _format_percent(ratio: Estimate) -> str:
     return ratio.inline(100.0, ".0f")

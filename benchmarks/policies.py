@@ -14,22 +14,22 @@ import numpy as np
 from .. import __version__
 from ..agents.learned.card import JsonMap
 from ..agents.learned.files import Policy, load_policy, save_policy
-from ..agents.rollout import cost_ratios
-from .control.cells import Cell
-from .control.contests import Contest
-from .control.episodes import Array, Chunk, Driven, drive
-from .control.seeds import salted_seeds
-from .control.tables import spec_of
+from ..agents.rollout import compute_cost_ratios
+from .control.cells import ControlEntry
+from .control.contests import ControlTask
+from .control.episodes import Array, Chunk, DriveResult, run_chunk
+from .control.seeds import make_salted_seeds
+from .control.tables import make_spec
 from .harness.parallel import run_cases
-from .harness.results import Row, Suite, Table
-from .harness.stats import geometric_mean, interval, won
-from .harness.verdict import percent, verdict
+from .harness.results import ResultRow, ResultTable, Suite
+from .harness.stats import compute_win_rate, geometric_mean, interval
+from .harness.verdict import format_percent, format_verdict
 
 CLASSICAL, FILTER = "lqr", "exact-kf"
 
 
 @dataclass
-class Enjoyed:
+class PolicyEvaluation:
     """The contestants' episodes on the same seeds: the policy's first.
 
     salt: of the seeds, "" where the caller chose them. reference: of the env. driven: by
@@ -40,23 +40,23 @@ class Enjoyed:
     salt: str
     seeds: list[int]
     reference: str
-    cells: dict[str, Cell]
-    driven: dict[str, Driven]
+    entries: dict[str, ControlEntry]
+    drives: dict[str, DriveResult]
     left_out: dict[str, str]
 
     def costs(self, name: str) -> Array:
         """(seeds,) of a contestant."""
-        return self.driven[name].costs
+        return self.drives[name].costs
 
 
-def enjoy(
+def evaluate_policy(
     policy: str,
     episodes: int = 256,
     *,
     env_id: str | None = None,
     scenario: str | None = None,
     seed: int | None = None,
-) -> Enjoyed:
+) -> PolicyEvaluation:
     """Drive a policy, the uncontrolled car, and the classical line.
 
     policy: a shipped name or a path. env_id: another env than the policy's own, with that id's
@@ -66,28 +66,30 @@ def enjoy(
     Raises ValueError where the policy cannot drive the env, and what `load_policy` raises.
     """
     loaded = load_policy(policy)
-    home, shown, reference, options = _task(loaded, env_id, scenario)
+    home, shown, reference, options = _describe_task(loaded, env_id, scenario)
     salt = loaded.salt if seed is None else ""
-    seeds = salted_seeds(salt, episodes) if seed is None else list(range(seed, seed + episodes))
+    seeds = (
+        make_salted_seeds(salt, episodes) if seed is None else list(range(seed, seed + episodes))
+    )
     rivals = {f"{CLASSICAL} on {FILTER}": (FILTER, CLASSICAL), "none": ("", "none")}
     if loaded.name in rivals:
         raise ValueError(f"the policy's file is called {loaded.name!r}, as what it is held against")
     contestants = {loaded.name: (loaded.card.estimator, policy)} | rivals
-    cells = {
-        name: Cell(Contest(env_id=home, scenario=shown), estimator, who, options)
-        for name, (estimator, who) in contestants.items()
+    entries = {
+        name: ControlEntry(ControlTask(env_id=home, scenario=shown), estimator, controller, options)
+        for name, (estimator, controller) in contestants.items()
     }
-    chunks = [Chunk(cell, tuple(seeds), keep=True) for cell in cells.values()]
-    driven = dict(zip(cells, run_cases(drive, chunks, loaded.name, jobs=1), strict=True))
-    errors = {name: each.error for name, each in driven.items() if each.error}
+    chunks = [Chunk(entry, tuple(seeds), keep=True) for entry in entries.values()]
+    results = dict(zip(entries, run_cases(run_chunk, chunks, loaded.name, jobs=1), strict=True))
+    errors = {name: outcome.error for name, outcome in results.items() if outcome.error}
     for needed in (loaded.name, "none"):
         if needed in errors:
             raise ValueError(f"{needed} cannot drive {home}: {errors[needed]}")
-    there = {name: each for name, each in driven.items() if name not in errors}
-    return Enjoyed(loaded, salt, seeds, reference, cells, there, errors)
+    drives = {name: outcome for name, outcome in results.items() if name not in errors}
+    return PolicyEvaluation(loaded, salt, seeds, reference, entries, drives, errors)
 
 
-def _task(
+def _describe_task(
     policy: Policy, env_id: str | None, scenario: str | None
 ) -> tuple[str, str, str, JsonMap]:
     """(env's id, what its scenario is called, its reference, its options)."""
@@ -100,72 +102,85 @@ def _task(
     return home, base.scenario.name, base.reference, options
 
 
-def evaluation(found: Enjoyed) -> dict[str, Any]:
+def summarise_evaluation(result: PolicyEvaluation) -> dict[str, Any]:
     """For a card: the seeds' salt, and each contestant's mean cost with its 95 % interval."""
     costs = {}
-    for name in found.driven:
-        mean, low, high = (round(each, 6) for each in interval(found.costs(name)))
+    for name in result.drives:
+        mean, low, high = (round(number, 6) for number in interval(result.costs(name)))
         costs[name] = {"mean": mean, "low": low, "high": high}
-    return {"salt": found.salt, "episodes": len(found.seeds), "cost": costs}
+    return {"salt": result.salt, "episodes": len(result.seeds), "cost": costs}
 
 
-def evaluate(path: str | Path, episodes: int = 256) -> Enjoyed:
+def record_evaluation(path: str | Path, episodes: int = 256) -> PolicyEvaluation:
     """Drive a policy's test seeds in its own env and write what it costs into its card."""
-    found = enjoy(str(path), episodes)
-    policy = found.policy
-    save_policy(path, policy.network, replace(policy.card, evaluation=evaluation(found)))
-    return found
+    result = evaluate_policy(str(path), episodes)
+    policy = result.policy
+    save_policy(path, policy.network, replace(policy.card, evaluation=summarise_evaluation(result)))
+    return result
 
 
-def suite_of(found: Enjoyed) -> Suite:
+def make_suite(result: PolicyEvaluation) -> Suite:
     """Table and rows; the first episode over time and in motion."""
-    name, card = found.policy.name, found.policy.card
-    cell = found.cells[name]
+    name, card = result.policy.name, result.policy.card
+    entry = result.entries[name]
     text = (
-        f"{len(found.seeds)} episodes of {cell.contest.scenario}, the same seeds for all. "
+        f"{len(result.seeds)} episodes of {entry.task.scenario}, the same seeds for all. "
         f"{name} was trained by {card.algorithm or 'an unnamed algorithm'} on {card.steps} "
         f"steps of {card.env_id} (reference: {card.reference}) in {card.cpu_seconds:.0f} CPU-s."
     )
-    judged = found.reference
-    if judged != card.reference:
-        text += f" Here it is judged by another reference, {judged}: by another cost."
-    suite = Suite("enjoy", f"{name} on {cell.contest.env_id}", text, _rows(found), [_table(found)])
-    from .control.figures import over_time
+    reference = result.reference
+    if reference != card.reference:
+        text += f" Here it is judged by another reference, {reference}: by another cost."
+    suite = Suite(
+        "enjoy", f"{name} on {entry.task.env_id}", text, _make_rows(result), [_make_table(result)]
+    )
+    from .control.figures import make_time_explorer
 
     series: dict[tuple[str, ...], Array] = {
-        (who,): each.series for who, each in found.driven.items() if each.series is not None
+        (label,): outcome.series
+        for label, outcome in result.drives.items()
+        if outcome.series is not None
     }
-    suite.explorers.append(over_time("The first seed, side by side", (), series, name))
-    suite.verdict = _verdict(found)
+    suite.explorers.append(make_time_explorer("The first seed, side by side", (), series, name))
+    suite.verdict = _compose_verdict(result)
     return suite
 
 
-def _verdict(found: Enjoyed) -> str:
+def _compose_verdict(result: PolicyEvaluation) -> str:
     """What the policy costs over each of the others, and how often it fails."""
-    name, others = found.policy.name, [each for each in found.driven if each != found.policy.name]
-    fails = 100.0 * np.mean(found.driven[name]["failure"] != 0.0)
+    name, others = (
+        result.policy.name,
+        [label for label in result.drives if label != result.policy.name],
+    )
+    fails = 100.0 * np.mean(result.drives[name]["failure"] != 0.0)
     lines = []
     for other in others:
-        logs = np.log(cost_ratios(found.costs(name), found.costs(other)))
-        lines.append(f"{name} costs {percent(geometric_mean(logs))} of {other}, seed by seed.")
-    limits = f"Not said: other cars, scenarios and seeds than these {len(found.seeds)}."
-    return verdict(*lines, f"It fails in {fails:.0f} % of the episodes. {limits}")
+        logs = np.log(compute_cost_ratios(result.costs(name), result.costs(other)))
+        lines.append(
+            f"{name} costs {format_percent(geometric_mean(logs))} of {other}, seed by seed."
+        )
+    limits = f"Not said: other cars, scenarios and seeds than these {len(result.seeds)}."
+    return format_verdict(*lines, f"It fails in {fails:.0f} % of the episodes. {limits}")
 
 
-def _table(found: Enjoyed) -> Table:
-    first = found.policy.name
-    own, cells = found.costs(first), []
-    for name, driven in found.driven.items():
+def _make_table(result: PolicyEvaluation) -> ResultTable:
+    first = result.policy.name
+    costs, cells = result.costs(first), []
+    for name, outcome in result.drives.items():
         rival = name != first
-        ratio = percent(geometric_mean(np.log(cost_ratios(own, driven.costs)))) if rival else ""
+        ratio = (
+            format_percent(geometric_mean(np.log(compute_cost_ratios(costs, outcome.costs))))
+            if rival
+            else ""
+        )
         cells.append(
             [
                 name,
                 ratio,
-                f"{100.0 * won(own, driven.costs).value:.0f} %" if rival else "",
-                f"{1e3 * driven['rms_slip'].mean():.2f}",
-                f"{driven['largest_step'].mean():.0f}",
-                f"{100.0 * np.mean(driven['failure'] != 0.0):.1f} %",
+                f"{100.0 * compute_win_rate(costs, outcome.costs).value:.0f} %" if rival else "",
+                f"{1e3 * outcome['rms_slip'].mean():.2f}",
+                f"{outcome['largest_step'].mean():.0f}",
+                f"{100.0 * np.mean(outcome['failure'] != 0.0):.1f} %",
             ]
         )
     header = (f"{first} costs, of it", "better", "RMS slip", "step", "fails")
@@ -174,18 +189,25 @@ def _table(found: Enjoyed) -> Table:
         f"better: share of the seeds on which {first} costs less. Slip in mrad. step: "
         "the largest between two decisions, in N m."
     )
-    left_out = [f"{name} was not driven: {error}." for name, error in found.left_out.items()]
-    return Table("What it costs", ("controller", *header), cells, " ".join([note, *left_out]))
+    left_out = [f"{name} was not driven: {error}." for name, error in result.left_out.items()]
+    return ResultTable("What it costs", ("controller", *header), cells, " ".join([note, *left_out]))
 
 
-def _rows(found: Enjoyed) -> list[Row]:
+def _make_rows(result: PolicyEvaluation) -> list[ResultRow]:
     rows = []
-    for name, driven in found.driven.items():
-        cell, own = found.cells[name], name == found.policy.name
-        who = {"estimator": cell.estimator, "controller": name if own else cell.controller}
-        seeds: dict[str, Any] = {"n": len(found.seeds), "salt": found.salt, "spec": spec_of(cell)}
-        what = {"suite": "enjoy", "env_version": f"{cell.contest.env_id} {__version__}"}
+    for name, outcome in result.drives.items():
+        entry, is_policy = result.entries[name], name == result.policy.name
+        labels = {
+            "estimator": entry.estimator,
+            "controller": name if is_policy else entry.controller,
+        }
+        seeds: dict[str, Any] = {
+            "n": len(result.seeds),
+            "salt": result.salt,
+            "spec": make_spec(entry),
+        }
+        common = {"suite": "enjoy", "env_version": f"{entry.task.env_id} {__version__}"}
         for metric in ("cost", "rms_slip", "peak_slip", "effort", "largest_step"):
-            columns = {"scenario": cell.contest.scenario, **what, **who, **seeds}
-            rows.append(Row.of(metric, interval(driven[metric]), **columns))
+            columns = {"scenario": entry.task.scenario, **common, **labels, **seeds}
+            rows.append(ResultRow.from_estimate(metric, interval(outcome[metric]), **columns))
     return rows

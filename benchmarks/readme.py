@@ -17,14 +17,14 @@ import typer
 from rich.console import Console
 
 from .. import __version__
-from .control.cells import LEARNED, REFERENCE_CONTROLLER, REFERENCE_FILTER, Cell
-from .control.contests import NOMINAL, PARAMETERS, STATE, STEERING, contests
-from .control.ladder import yardsticks
+from .control.cells import LEARNED, REFERENCE_CONTROLLER, REFERENCE_FILTER, ControlEntry
+from .control.contests import NOMINAL, PARAMETERS, STATE, STEERING, list_scored_tasks
+from .control.ladder import make_score_scales
 from .control.run import measure
-from .control.seeds import salt_of, seeds_of_contests
-from .control.tables import rows_of, standings
-from .harness.errors import one_line
-from .harness.results import Row, read_json, write_json, write_text
+from .control.seeds import make_salt, make_task_seeds
+from .control.tables import make_rows, rank_entries
+from .harness.errors import report_user_errors
+from .harness.results import ResultRow, read_json, write_json, write_text
 
 README, FIRST_ROWS = Path("README.md"), Path("docs/first.json")
 PAGE, ROWS = Path("docs/benchmark.md"), Path("docs/control.json")
@@ -77,9 +77,9 @@ FIRST: Mapping[str, Sequence[tuple[str, str]]] = {
 EPISODES = 32  # a contest, of README's table
 
 
-def drive_first(
+def measure_first(
     jobs: int | None = None, console: Console | None = None, salt: str = ""
-) -> list[Row]:
+) -> list[ResultRow]:
     """Drive README's entries in every scored contest with steering; return the tiers' rows.
 
     Args:
@@ -93,46 +93,46 @@ def drive_first(
     Raises:
         ValueError: An entry could not drive.
     """
-    played = [each for each in contests() if each.tier and each.env_id == STEERING]
-    policies = {who: kind for kind, pairs in LEARNED.items() for _, who in pairs}
-    asked = [
-        Cell(contest, estimator, controller)
-        for contest in played
+    tasks = [item for item in list_scored_tasks() if item.tier and item.env_id == STEERING]
+    policies = {policy: kind for kind, pairs in LEARNED.items() for _, policy in pairs}
+    requests = [
+        ControlEntry(task, estimator, controller)
+        for task in tasks
         for entries in FIRST.values()
         for controller, estimator in entries
-        if policies.get(controller, contest.kind) == contest.kind
+        if policies.get(controller, task.kind) == task.kind
     ]
-    salt = salt or salt_of()
-    seeds = seeds_of_contests(salt, EPISODES)
-    results = measure(asked, seeds, jobs=jobs, console=console, title="README")
-    rows: list[Row] = []
-    for cell, driven in results.found.items():
-        if driven.error:
-            raise ValueError(f"{cell.label} in {cell.contest.name}: {driven.error}")
+    salt = salt or make_salt()
+    seeds = make_task_seeds(salt, EPISODES)
+    results = measure(requests, seeds, jobs=jobs, console=console, title="README")
+    rows: list[ResultRow] = []
+    for entry, result in results.outcomes.items():
+        if result.error:
+            raise ValueError(f"{entry.label} in {entry.task.name}: {result.error}")
     for tier in HEADS:
-        mine = yardsticks(results, [contest for contest in played if contest.tier == tier])
-        for each in standings(results.found, tier, mine):
-            made = (row for row in rows_of(each, salt) if row.metric in METRICS)
-            rows += [row for row in made if row.scenario == f"tier {tier}"]
+        scales = make_score_scales(results, [task for task in tasks if task.tier == tier])
+        for item in rank_entries(results.outcomes, tier, scales):
+            metric_rows = (row for row in make_rows(item, salt) if row.metric in METRICS)
+            rows += [row for row in metric_rows if row.scenario == f"tier {tier}"]
     return rows
 
 
-def tier_rows(path: str | Path) -> list[Row]:
+def read_tier_rows(path: str | Path) -> list[ResultRow]:
     """The tiers' rows of a file that the table is made of; raises what `read_json` does."""
     tiers = {f"tier {tier}" for tier in HEADS}
     return [row for row in read_json(path) if row.metric in METRICS and row.scenario in tiers]
 
 
-def table(rows: Sequence[Row]) -> str:
+def make_table(rows: Sequence[ResultRow]) -> str:
     """Cost in % of nominal's with its interval, and in brackets failures in %, as Markdown."""
-    found = {(row.scenario, row.controller, row.estimator, row.metric): row for row in rows}
+    by_key = {(row.scenario, row.controller, row.estimator, row.metric): row for row in rows}
     lines = ["| | " + " | ".join(f"{tier}: {text}" for tier, text in HEADS.items()) + " |"]
     lines.append("|---" * (1 + len(HEADS)) + "|")
-    for name, who in SHOWN.items():
+    for name, key in SHOWN.items():
         cells = []
         for tier in HEADS:
-            cost, failing = (found.get((f"tier {tier}", *who, metric)) for metric in METRICS)
-            spread = "" if cost is None or who[0] == NOMINAL else _spread(cost)
+            cost, failing = (by_key.get((f"tier {tier}", *key, metric)) for metric in METRICS)
+            spread = "" if cost is None or key[0] == NOMINAL else _format_interval(cost)
             if cost is None or failing is None:
                 cells.append("")
             else:
@@ -141,9 +141,9 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def first_table(rows: Sequence[Row]) -> str:
+def make_first_table(rows: Sequence[ResultRow]) -> str:
     """Make README's table: cost in % of nominal's, the best of the first tier's columns first."""
-    found = {
+    by_key = {
         (row.scenario, row.controller, row.estimator): row.value
         for row in rows
         if row.metric == METRICS[0]
@@ -151,25 +151,28 @@ def first_table(rows: Sequence[Row]) -> str:
     lines = ["| | " + " | ".join(f"{tier}: {text}" for tier, text in HEADS.items()) + " |"]
     lines.append("|---" * (1 + len(HEADS)) + "|")
     for name, entries in FIRST.items():
-        costs = [[found.get((f"tier {tier}", *each)) for each in entries] for tier in HEADS]
-        cells = [next((f"{100.0 * x:.0f}" for x in of if x is not None), "") for of in costs]
+        costs = [[by_key.get((f"tier {tier}", *pair)) for pair in entries] for tier in HEADS]
+        cells = [
+            next((f"{100.0 * x:.0f}" for x in tier_costs if x is not None), "")
+            for tier_costs in costs
+        ]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
-def headlines(root: Path) -> list[str]:
+def make_headlines(root: Path) -> list[str]:
     """Make README's sentences with numbers from the files in docs.
 
     `sideslip bench estimation --json docs/estimation.json` and `sideslip bench speed --json
     docs/speed.json` write the files.
     """
     rows = read_json(root / "docs/estimation.json")
-    over = {
+    ratios = {
         row.estimator: row
         for row in rows
         if (row.scenario, row.metric) == ("tie-vision-fig7", "rmse_over_bound")
     }
-    ours, theirs = over["joint"], over["multirate-residual-kf"]
+    joint, multirate = ratios["joint"], ratios["multirate-residual-kf"]
     (step,) = (
         row.value
         for row in read_json(root / "docs/speed.json")
@@ -177,64 +180,70 @@ def headlines(root: Path) -> list[str]:
     )
     first = [row for row in read_json(root / FIRST_ROWS) if row.metric == METRICS[0]]
     wide = [
-        max(math.ceil(100.0 * (row.high / row.value - 1.0)) for row in first if of(row.scenario))
-        for of in ("tier 2c".__ne__, "tier 2c".__eq__)
+        max(
+            math.ceil(100.0 * (row.high / row.value - 1.0))
+            for row in first
+            if matches(row.scenario)
+        )
+        for matches in ("tier 2c".__ne__, "tier 2c".__eq__)
     ]
     return [
         f"Their 95 % intervals reach up to {wide[0]} % above them, {wide[1]} % at the limit",
-        f"`joint` errs {ours.value:.2f} times as much as the best possible filter, the paper's own "
-        f"filter {theirs.value:.1f} times ({ours.n} seeds).",
+        f"`joint` errs {joint.value:.2f} times as much as the best possible filter, the "
+        f"paper's own filter {multirate.value:.1f} times ({joint.n} seeds).",
         f"A 10 ms step takes {step:.1f} us of CPU time a car in a batch of 1,024.",
     ]
 
 
-def _spread(row: Row) -> str:
+def _format_interval(row: ResultRow) -> str:
     return f" [{100.0 * row.low:.0f}, {100.0 * row.high:.0f}]"
 
 
-def put(text: str, made: str) -> str:
+def replace_table(text: str, new_table: str) -> str:
     """A page with another table; ValueError where it has none."""
     pattern = re.compile(r"^\| \| 1: [^\n]*\n(\|[^\n]*\n)+", re.MULTILINE)
     if len(pattern.findall(text)) != 1:
         raise ValueError("the page has no table that begins with the tiers, or several")
-    return pattern.sub(lambda _: made + "\n", text)
+    return pattern.sub(lambda _: new_table + "\n", text)
 
 
-def added(
-    rows: Sequence[Row], name: str, jobs: int | None = None, console: Console | None = None
-) -> list[Row]:
+def add_policy(
+    rows: Sequence[ResultRow], name: str, jobs: int | None = None, console: Console | None = None
+) -> list[ResultRow]:
     """The rows with those of a learned policy in its class's contests, on the rows' own seeds.
 
     Its contests' reference points are driven anew. Raises ValueError for one that is not among
     `LEARNED`, for rows of another version or without tier 1, and where somebody cannot drive.
     """
-    of = {kind: read for kind, those in LEARNED.items() for read, who in those if who == name}
-    if not of:
-        known = ", ".join(who for those in LEARNED.values() for _, who in those)
+    estimators = {
+        kind: read for kind, pairs in LEARNED.items() for read, policy in pairs if policy == name
+    }
+    if not estimators:
+        known = ", ".join(policy for pairs in LEARNED.values() for _, policy in pairs)
         raise ValueError(f"the matrix's policies are {known}, got {name!r}")
     tier_1 = [row for row in rows if (row.controller, row.scenario) == (STATE, "tier 1")]
     versions = {row.env_version for row in tier_1}
     if versions != {__version__}:
         got = ", ".join(versions) or "none"
         raise ValueError(f"expected rows of {STATE} in tier 1, of version {__version__}, got {got}")
-    count = sum(contest.tier == "1" for contest in contests())
+    count = sum(task.tier == "1" for task in list_scored_tasks())
     episodes = -(-tier_1[0].n // count)  # n: of those that the rungs survived
-    played = [contest for contest in contests() if contest.tier and contest.kind in of]
-    asked = [Cell(contest, "", rung) for contest in played for rung in (NOMINAL, STATE)]
-    asked += [Cell(contest, of[contest.kind], name) for contest in played]
-    seeds = seeds_of_contests(tier_1[0].salt, episodes)
-    results = measure(asked, seeds, jobs=jobs, console=console, title=name)
-    for cell, driven in results.found.items():
-        if driven.error:
-            raise ValueError(f"{cell.label} in {cell.contest.name}: {driven.error}")
-    found = [row for row in rows if row.controller != name]
+    tasks = [task for task in list_scored_tasks() if task.tier and task.kind in estimators]
+    requests = [ControlEntry(task, "", oracle) for task in tasks for oracle in (NOMINAL, STATE)]
+    requests += [ControlEntry(task, estimators[task.kind], name) for task in tasks]
+    seeds = make_task_seeds(tier_1[0].salt, episodes)
+    results = measure(requests, seeds, jobs=jobs, console=console, title=name)
+    for entry, result in results.outcomes.items():
+        if result.error:
+            raise ValueError(f"{entry.label} in {entry.task.name}: {result.error}")
+    merged = [row for row in rows if row.controller != name]
     for tier in HEADS:
-        mine = yardsticks(results, [contest for contest in played if contest.tier == tier])
-        for each in standings(results.found, tier, mine):
-            if each.cell.controller == name:
-                new = (row for row in rows_of(each, tier_1[0].salt) if row.metric in METRICS)
-                found += [row for row in new if row.scenario == f"tier {tier}"]
-    return found
+        scales = make_score_scales(results, [task for task in tasks if task.tier == tier])
+        for standing in rank_entries(results.outcomes, tier, scales):
+            if standing.entry.controller == name:
+                new = (row for row in make_rows(standing, tier_1[0].salt) if row.metric in METRICS)
+                merged += [row for row in new if row.scenario == f"tier {tier}"]
+    return merged
 
 
 def main(
@@ -246,21 +255,21 @@ def main(
     """Write rows and the tables made of them, in the repository's root."""
     console = Console(stderr=True)
     if first:
-        found = drive_first(console=console, salt=salt)
-        _write(FIRST_ROWS, found, README, first_table(found))
+        result_rows = measure_first(console=console, salt=salt)
+        _write(FIRST_ROWS, result_rows, README, make_first_table(result_rows))
     if rows is not None:
-        found = tier_rows(rows)
+        result_rows = read_tier_rows(rows)
         for name in add or []:
-            found = added(found, name, console=console)
-        _write(ROWS, found, PAGE, table(found))
+            result_rows = add_policy(result_rows, name, console=console)
+        _write(ROWS, result_rows, PAGE, make_table(result_rows))
 
 
-def _write(path: Path, rows: Sequence[Row], page: Path, made: str) -> None:
-    text = put(page.read_text(encoding="utf-8"), made)
+def _write(path: Path, rows: Sequence[ResultRow], page: Path, new_table: str) -> None:
+    text = replace_table(page.read_text(encoding="utf-8"), new_table)
     write_json(path, rows)
     write_text(page, text)
 
 
 if __name__ == "__main__":
-    with one_line():
+    with report_user_errors():
         typer.run(main)

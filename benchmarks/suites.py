@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from .harness.parallel import one_bar
+from .harness.parallel import use_shared_bar
 from .harness.results import Suite
 
 if TYPE_CHECKING:
-    from .entrants.challenge import Challenge
+    from .entrants.challenge import ComparisonRequest
 
 
 @dataclass(frozen=True)
@@ -32,57 +32,57 @@ class Request:
     episodes: int | None = None
     keep: Path | None = None
     clairvoyant: Path | None = None
-    challenge: "Challenge | None" = None
+    comparison: "ComparisonRequest | None" = None
     salt: str = ""
 
 
 _Run = Callable[[Any, Request], Suite]
 
 
-def _seeds(suite: Any, r: Request) -> Any:
+def _run_seeds(suite: Any, r: Request) -> Any:
     usual = suite.QUICK_SEEDS if r.quick else suite.SEEDS
     return suite.run(r.episodes or usual, r.jobs, r.console)
 
 
-def _control(suite: Any, r: Request) -> Any:
+def _run_control(suite: Any, r: Request) -> Any:
     from .control.cells import EPISODES, QUICK_EPISODES
 
-    if r.challenge is not None:
-        from .entrants.suite import run as run_challenge
+    if r.comparison is not None:
+        from .entrants.suite import run as run_comparison
 
-        return run_challenge(r.challenge, r.jobs, r.console, r.keep)
+        return run_comparison(r.comparison, r.jobs, r.console, r.keep)
     usual = QUICK_EPISODES if r.quick else EPISODES
     return suite.run(r.episodes or usual, r.jobs, r.console, r.keep, r.quick, r.clairvoyant, r.salt)
 
 
-def _learned(suite: Any, r: Request) -> Any:
+def _run_learned(suite: Any, r: Request) -> Any:
     usual = suite.QUICK_EPISODES if r.quick else suite.EPISODES
     return suite.run(r.episodes or usual, r.jobs, r.console, r.keep, r.quick, r.salt)
 
 
-def _following(suite: Any, r: Request) -> Any:
+def _run_following(suite: Any, r: Request) -> Any:
     numbers = (suite.QUICK_SEEDS, suite.QUICK_CARS) if r.quick else (suite.SEEDS, suite.CARS)
     return suite.run(*numbers, r.jobs, r.console)
 
 
-def _highway(suite: Any, r: Request) -> Any:
+def _run_highway(suite: Any, r: Request) -> Any:
     numbers = (suite.QUICK_SEEDS, suite.QUICK_DRIVES) if r.quick else (suite.SEEDS, suite.DRIVES)
     return suite.run(*numbers, r.jobs, r.console)
 
 
 SUITES: dict[str, tuple[str, _Run]] = {
-    "estimation": (".estimation", _seeds),
-    "unknown": (".unknown.suite", _seeds),
-    "control": (".control.suite", _control),
-    "learned": (".learned", _learned),
-    "learned-outside": (".learned_outside", _learned),
+    "estimation": (".estimation", _run_seeds),
+    "unknown": (".unknown.suite", _run_seeds),
+    "control": (".control.suite", _run_control),
+    "learned": (".learned", _run_learned),
+    "learned-outside": (".learned_outside", _run_learned),
     "memory": (
         ".memory.suite",
         lambda suite, r: suite.run(r.quick, r.episodes, r.jobs, r.console, r.keep),
     ),
-    "papers": (".papers.suite", _seeds),
-    "following": (".following", _following),
-    "highway": (".highway", _highway),
+    "papers": (".papers.suite", _run_seeds),
+    "following": (".following", _run_following),
+    "highway": (".highway", _run_highway),
     "recovery": (".recovery", lambda suite, r: suite.run(r.quick, r.jobs, r.console)),
     "procedures": (".procedures.suite", lambda suite, r: suite.run(r.quick, r.jobs, r.console)),
     "speed": (".speed.suite", lambda suite, r: suite.run(r.quick, r.console)),
@@ -97,14 +97,14 @@ def check_salt(salt: str, names: Sequence[str]) -> None:
     if salt and not {*SALTED} & {*names}:
         raise ValueError(f"--salt goes with {', '.join(SALTED)}, got {', '.join(names)}")
     if salt:
-        from .control.seeds import salted_seeds
+        from .control.seeds import make_salted_seeds
 
-        salted_seeds(salt, 1)
+        make_salted_seeds(salt, 1)
 
 
 def run_suites(names: Sequence[str], request: Request) -> list[Suite]:
     """Run suites of `SUITES` one after the other, with one progress bar for all of them."""
-    with one_bar(request.console, f"bench {' '.join(names)}"):
+    with use_shared_bar(request.console, f"bench {' '.join(names)}"):
         return [run_suite(name, request) for name in names]
 
 

@@ -5,15 +5,15 @@ if __name__ != "sideslip.envs":
     raise ImportError(f"this folder is the package sideslip.envs; it was imported as {__name__}")
 
 from .record import Log, Record
-from .scenarios.manoeuvres import SCENARIOS, scenario_from
+from .scenarios.manoeuvres import SCENARIOS, make_scenario
 from .scenarios.scenario import Scenario
 from .sensors.link import SlowSensor
 from .stability import StabilityEnv
 from .task.failures import FAILURES
-from .task.observation import Entry
+from .task.observation import ObservationEntry
 from .vector import StabilityVectorEnv
 from .vehicle.vehicle import COMS, PASSENGER_CAR, Vehicle, critical_speed
-from .vehicle.vehicles import VEHICLES, vehicle_from
+from .vehicle.vehicles import VEHICLES, make_vehicle
 
 __all__ = [
     "COMS",
@@ -21,8 +21,8 @@ __all__ = [
     "PASSENGER_CAR",
     "SCENARIOS",
     "VEHICLES",
-    "Entry",
     "Log",
+    "ObservationEntry",
     "Record",
     "Scenario",
     "SlowSensor",
@@ -30,6 +30,6 @@ __all__ = [
     "StabilityVectorEnv",
     "Vehicle",
     "critical_speed",
-    "scenario_from",
-    "vehicle_from",
+    "make_scenario",
+    "make_vehicle",
 ]

@@ -15,17 +15,17 @@ from gymnasium.vector import AutoresetMode
 
 Mask = npt.NDArray[np.bool_]
 Actions = npt.NDArray[np.float32]
-NAMED = 8  # rows that a message lists
-LARGEST = 1e12
+MAX_LISTED_ROWS = 8  # rows that a message lists
+MAX_NUMBER = 1e12
 """The largest number of a scenario or a vehicle: its ticks and its square are numbers still."""
-_NO_NUMBERS = (TypeError, ValueError, OverflowError)  # what numpy raises where it finds none
+_CONVERSION_ERRORS = (TypeError, ValueError, OverflowError)  # what numpy raises where it finds none
 
 _FLOAT32 = np.dtype(np.float32)
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = 80
 
 
-def brief(value: object) -> str:
+def short_repr(value: object) -> str:
     """A value in a message, short however long it is."""
     try:
         return _REPR.repr(value)
@@ -33,7 +33,7 @@ def brief(value: object) -> str:
         return f"<{type(value).__name__}>"
 
 
-def listed(names: Iterable[str]) -> str:
+def join_names(names: Iterable[str]) -> str:
     """Names in a message, the first of them where they are many."""
     return textwrap.shorten(", ".join(names), 250, placeholder=" ...")
 
@@ -41,59 +41,61 @@ def listed(names: Iterable[str]) -> str:
 def is_finite(value: Any) -> bool:
     """Whether a value is a number, and no larger than LARGEST; True and False are none."""
     number = isinstance(value, int | float | np.integer | np.floating)
-    return number and not isinstance(value, bool) and bool(abs(value) <= LARGEST)
+    return number and not isinstance(value, bool) and bool(abs(value) <= MAX_NUMBER)
 
 
-def number_of(name: str, value: Any) -> float:
+def check_number(name: str, value: Any) -> float:
     """A finite number as a float; ValueError, with its name, for another value."""
     if not is_finite(value):
-        raise ValueError(f"{name} {brief(value)} is no finite number")
+        raise ValueError(f"{name} {short_repr(value)} is no finite number")
     return float(value)
 
 
-def mapping_of(name: str, value: Any) -> Mapping[str, Any]:
+def check_mapping(name: str, value: Any) -> Mapping[str, Any]:
     """A mapping; TypeError, with its name, for another value."""
     if not isinstance(value, Mapping):
-        raise TypeError(f"{name} is a mapping, got {brief(value)}")
+        raise TypeError(f"{name} is a mapping, got {short_repr(value)}")
     return value
 
 
-def unknown_names(what: str, values: Iterable[Any], known: Iterable[str]) -> str:
+def describe_unknown(what: str, values: Iterable[Any], known: Iterable[str]) -> str:
     """A message about names that are not known: what the first may have meant, or what there is."""
     got, names = list(values), list(known)
     close = difflib.get_close_matches(got[0][:80], names, 1) if isinstance(got[0], str) else []
-    hint = f"did you mean {close[0]!r}?" if close else f"known: {listed(names)}"
-    return f"unknown {what} {listed(map(brief, got))}; {hint}"
+    hint = f"did you mean {close[0]!r}?" if close else f"known: {join_names(names)}"
+    return f"unknown {what} {join_names(map(short_repr, got))}; {hint}"
 
 
 def check_choice(what: str, value: Any, known: Iterable[str]) -> None:
     """ValueError for a value that is none of the known names, with the nearest of them."""
     if not isinstance(value, str) or value not in known:
-        raise ValueError(unknown_names(what, [value], known))
+        raise ValueError(describe_unknown(what, [value], known))
 
 
 def check_options(what: str, function: Callable[..., Any], options: Iterable[str]) -> None:
     """TypeError for an option that a function does not take beside its first argument, with the
     nearest of those that it does."""
     parameters = list(inspect.signature(function).parameters.values())[1:]
-    if any(each.kind is each.VAR_KEYWORD for each in parameters):
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         return
-    known = [each.name for each in parameters]
+    known = [parameter.name for parameter in parameters]
     if unknown := [name for name in options if name not in known]:
-        raise TypeError(f"{what}: {unknown_names('option', unknown, known)}")
+        raise TypeError(f"{what}: {describe_unknown('option', unknown, known)}")
 
 
-def count_of(name: str, value: Any, what: str, least: int = 1, most: int | None = None) -> int:
+def check_int(
+    name: str, value: Any, what: str, minimum: int = 1, maximum: int | None = None
+) -> int:
     """How many of `what`; TypeError for no whole number, ValueError out of least .. most."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise TypeError(f"{name} is a number of {what}, got {brief(value)}")
-    if value < least or (most is not None and value > most):
-        span = f"at least {least}" if most is None else f"{least} to {most} {what}"
-        raise ValueError(f"{name} is {span}, got {brief(value)}")
+        raise TypeError(f"{name} is a number of {what}, got {short_repr(value)}")
+    if value < minimum or (maximum is not None and value > maximum):
+        limits = f"at least {minimum}" if maximum is None else f"{minimum} to {maximum} {what}"
+        raise ValueError(f"{name} is {limits}, got {short_repr(value)}")
     return int(value)
 
 
-def each_of(name: str, value: Any, count: int) -> Sequence[Any]:
+def expand_rows(name: str, value: Any, count: int) -> Sequence[Any]:
     """An argument of each row: a list or tuple as it is, another value for all; ValueError for a
     list of another length."""
     if not isinstance(value, list | tuple):
@@ -103,26 +105,26 @@ def each_of(name: str, value: Any, count: int) -> Sequence[Any]:
     return value
 
 
-def mode_of(autoreset_mode: Any) -> AutoresetMode:
+def parse_autoreset_mode(autoreset_mode: Any) -> AutoresetMode:
     """The mode of its name or itself; ValueError for another."""
     try:
         return AutoresetMode(autoreset_mode)
     except ValueError:
         known = ", ".join(repr(mode.value) for mode in AutoresetMode)
-        got = brief(autoreset_mode)
+        got = short_repr(autoreset_mode)
         raise ValueError(f"unknown autoreset_mode {got}; known: {known}") from None
 
 
-def named(rows: npt.ArrayLike) -> str:
+def format_rows(rows: npt.ArrayLike) -> str:
     """ "row 3" or "rows 1, 5, ..." in a message."""
     numbers = np.asarray(rows).tolist()
     if len(numbers) == 1:
         return f"row {numbers[0]}"
-    dots = ", ..." if len(numbers) > NAMED else ""
-    return f"rows {', '.join(map(str, numbers[:NAMED]))}{dots} ({len(numbers)} of them)"
+    dots = ", ..." if len(numbers) > MAX_LISTED_ROWS else ""
+    return f"rows {', '.join(map(str, numbers[:MAX_LISTED_ROWS]))}{dots} ({len(numbers)} of them)"
 
 
-def seeds_of(seed: Any, count: int) -> list[int | None]:
+def parse_seeds(seed: Any, count: int) -> list[int | None]:
     """A seed for each row: `seed + i` of a number, a list as it is.
 
     Raises ValueError for a list of another length or a negative seed, TypeError for a seed that is
@@ -134,17 +136,19 @@ def seeds_of(seed: Any, count: int) -> list[int | None]:
         seeds: list[int | None] = [int(seed) + i for i in range(count)]
     else:
         if not isinstance(seed, Sequence | np.ndarray):
-            raise TypeError(f"seed: an int or a list of {count}, got {brief(seed)}")
+            raise TypeError(f"seed: an int or a list of {count}, got {short_repr(seed)}")
         if len(seed) != count:
             raise ValueError(f"seed: an int or a list of {count}, got {len(seed)}")
-        seeds = [None if each is None else operator.index(each) for each in seed]
-    bad = [i for i, each in enumerate(seeds) if each is not None and each < 0]
+        seeds = [None if entry is None else operator.index(entry) for entry in seed]
+    bad = [i for i, entry in enumerate(seeds) if entry is not None and entry < 0]
     if bad:
-        raise ValueError(f"seed: {named(bad)} would get a negative seed, {brief(seeds[bad[0]])}")
+        raise ValueError(
+            f"seed: {format_rows(bad)} would get a negative seed, {short_repr(seeds[bad[0]])}"
+        )
     return seeds
 
 
-def mask_of(mask: Any, count: int) -> Mask:
+def parse_reset_mask(mask: Any, count: int) -> Mask:
     """The rows of options["reset_mask"], all without it; TypeError or ValueError for no mask."""
     if mask is None:
         return np.ones(count, np.bool_)
@@ -158,7 +162,7 @@ def mask_of(mask: Any, count: int) -> Mask:
     return mask.copy()
 
 
-def options_of(options: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
+def split_options(options: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
     """The options of each row's reset: a list, tuple or array has one for each row, None for a row
     without it."""
     columns = {}
@@ -176,13 +180,13 @@ def options_of(options: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
     ]
 
 
-def action_of(action: Any, width: int, fail: bool) -> Actions:
+def parse_action(action: Any, width: int, fail: bool) -> Actions:
     """One action (width,) as float32; what has another shape or is no numbers raises ValueError,
     with `fail` it is NaN."""
     if type(action) is np.ndarray and action.dtype is _FLOAT32 and action.shape == (width,):
         return action if action.flags.carray else action.copy()  # others are other types
     try:
-        return _action_of(action, width)
+        return _convert_action(action, width)
     except ValueError as error:
         if not fail:
             raise ValueError(
@@ -191,52 +195,52 @@ def action_of(action: Any, width: int, fail: bool) -> Actions:
     return np.full(width, np.nan, np.float32)
 
 
-def actions_of(actions: Any, count: int, width: int, fail: bool) -> Actions:
+def parse_actions(actions: Any, count: int, width: int, fail: bool) -> Actions:
     """Actions (count, width) as float32.
 
     What has another shape or is no numbers raises ValueError and names the rows; with `fail` these
     rows are NaN.
     """
     try:
-        force = np.array(actions, np.float32)  # a copy: contiguous whatever came
-        if force.shape == (count, width):
-            return force
-    except _NO_NUMBERS:  # rows of different lengths, or no numbers
+        array = np.array(actions, np.float32)  # a copy: contiguous whatever came
+        if array.shape == (count, width):
+            return array
+    except _CONVERSION_ERRORS:  # rows of different lengths, or no numbers
         pass
-    force, wrong = np.full((count, width), np.nan, np.float32), {}
+    array, wrong = np.full((count, width), np.nan, np.float32), {}
     try:
         rows = list(actions)
     except TypeError:  # no rows at all
         rows = []
     for i, row in enumerate(rows if len(rows) == count else ()):
         try:
-            force[i] = _action_of(row, width)
+            array[i] = _convert_action(row, width)
         except ValueError as error:
             wrong[i] = str(error)
     if not fail and (wrong or len(rows) != count):
         bad = list(wrong)
-        got = f"in {named(bad)} {wrong[bad[0]]}" if bad else f"{len(rows)} rows"
+        got = f"in {format_rows(bad)} {wrong[bad[0]]}" if bad else f"{len(rows)} rows"
         raise ValueError(f"actions have shape ({count}, {width}), got {got}; nothing was stepped")
-    return force
+    return array
 
 
 def warn_once(env: Any, actions: Actions) -> None:
     """Warn, once an env, of actions far outside of -1 to 1."""
     if not vars(env).get("_warned"):
-        most = np.abs(actions[np.isfinite(actions)]).max()
+        largest = np.abs(actions[np.isfinite(actions)]).max()
         logger.warn(
-            f"an action of {most:g} is clipped to 1: actions are shares of full scale, from -1 to "
-            "1, not N m or rad; the env says so once"
+            f"an action of {largest:g} is clipped to 1: actions are shares of full scale, "
+            "from -1 to 1, not N m or rad; the env says so once"
         )
     env._warned = True
 
 
-def _action_of(action: Any, width: int) -> Actions:
+def _convert_action(action: Any, width: int) -> Actions:
     """One action; ValueError says what came instead."""
     try:
-        force = np.array(action, np.float32)
-    except _NO_NUMBERS as error:
-        raise ValueError(f"{brief(action)}: {error}") from None
-    if force.shape != (width,):
-        raise ValueError(f"shape {force.shape}")
-    return force
+        array = np.array(action, np.float32)
+    except _CONVERSION_ERRORS as error:
+        raise ValueError(f"{short_repr(action)}: {error}") from None
+    if array.shape != (width,):
+        raise ValueError(f"shape {array.shape}")
+    return array

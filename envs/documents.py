@@ -10,19 +10,19 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_origin
 
-from .arguments import brief, is_finite, listed
-from .backend.files import write_whole
+from .arguments import is_finite, join_names, short_repr
+from .backend.files import write_atomic
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-Made = TypeVar("Made", bound="DataclassInstance")
-ENDINGS = (".toml", ".json")
+DataclassT = TypeVar("DataclassT", bound="DataclassInstance")
+SUFFIXES = (".toml", ".json")
 
 
-def ends_in(source: object, endings: tuple[str, ...]) -> bool:
+def has_suffix(source: object, suffixes: tuple[str, ...]) -> bool:
     """Whether a value is a text or a `Path` with one of these endings."""
-    return isinstance(source, str | os.PathLike) and str(source).lower().endswith(endings)
+    return isinstance(source, str | os.PathLike) and str(source).lower().endswith(suffixes)
 
 
 def is_document(source: object) -> bool:
@@ -37,18 +37,18 @@ def read_document(source: "str | os.PathLike[str]", what: str) -> dict[str, Any]
     another ending, and a file that is no TOML or JSON or holds no mapping.
     """
     path = Path(source)
-    values = _parsed(path, what)
-    base = _base_beside(path, values)
+    values = _parse_file(path, what)
+    base = _find_base(path, values)
     if base is not None:
-        _check_ends(path, base, what)
+        _check_base_cycle(path, base, what)
         values["base"] = str(base)
     return values
 
 
-def _parsed(path: Path, what: str) -> dict[str, Any]:
+def _parse_file(path: Path, what: str) -> dict[str, Any]:
     kind = path.suffix.lower()
-    if kind not in ENDINGS:
-        raise ValueError(f"{path}: the file of a {what} ends in {' or '.join(ENDINGS)}")
+    if kind not in SUFFIXES:
+        raise ValueError(f"{path}: the file of a {what} ends in {' or '.join(SUFFIXES)}")
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such {what} file")
     if not path.is_file():
@@ -68,7 +68,7 @@ def _parsed(path: Path, what: str) -> dict[str, Any]:
     return values
 
 
-def _base_beside(path: Path, values: Mapping[str, Any]) -> Path | None:
+def _find_base(path: Path, values: Mapping[str, Any]) -> Path | None:
     """The file beside a file that it names under `base`."""
     base = values.get("base")
     with contextlib.suppress(OSError, ValueError):  # a text that can be no file's name
@@ -77,14 +77,14 @@ def _base_beside(path: Path, values: Mapping[str, Any]) -> Path | None:
     return None
 
 
-def _check_ends(path: Path, base: Path | None, what: str) -> None:
+def _check_base_cycle(path: Path, base: Path | None, what: str) -> None:
     """ValueError where a file's base, or the base of that, leads back to one of them."""
-    seen = {path.resolve()}
+    visited = {path.resolve()}
     while base is not None:
-        if base.resolve() in seen:
+        if base.resolve() in visited:
             raise ValueError(f"{path}: its base is the file itself, or leads back to it")
-        seen.add(base.resolve())
-        base = _base_beside(base, _parsed(base, what)) if ends_in(base, ENDINGS) else None
+        visited.add(base.resolve())
+        base = _find_base(base, _parse_file(base, what)) if has_suffix(base, SUFFIXES) else None
 
 
 def write_document(path: "str | os.PathLike[str]", values: Mapping[str, Any]) -> None:
@@ -93,44 +93,46 @@ def write_document(path: "str | os.PathLike[str]", values: Mapping[str, Any]) ->
     Raises ValueError for another ending.
     """
     kind = Path(path).suffix.lower()
-    if kind not in ENDINGS:
-        raise ValueError(f"{path}: expected a file that ends in {' or '.join(ENDINGS)}")
+    if kind not in SUFFIXES:
+        raise ValueError(f"{path}: expected a file that ends in {' or '.join(SUFFIXES)}")
     if kind == ".json":
         text = json.dumps(values, indent=1)
     else:
-        text = "\n".join(f"{_key(name)} = {toml_of(value)}" for name, value in values.items())
-    write_whole(os.fspath(path), (text + "\n").encode())
+        text = "\n".join(
+            f"{_format_key(name)} = {to_toml(value)}" for name, value in values.items()
+        )
+    write_atomic(os.fspath(path), (text + "\n").encode())
 
 
-def toml_of(value: Any) -> str:
+def to_toml(value: Any) -> str:
     """A number, text, list or mapping as TOML writes it behind a key."""
     if isinstance(value, Mapping):
-        pairs = (f"{_key(name)} = {toml_of(each)}" for name, each in value.items())
+        pairs = (f"{_format_key(name)} = {to_toml(item)}" for name, item in value.items())
         return f"{{ {', '.join(pairs)} }}"
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(toml_of, value)) + "]"
+        return "[" + ", ".join(map(to_toml, value)) + "]"
     if isinstance(value, float) and not math.isfinite(value):
         return repr(value)  # inf, which JSON calls Infinity
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _key(name: str) -> str:
-    return name if name.isascii() and name.isidentifier() else toml_of(name)
+def _format_key(name: str) -> str:
+    return name if name.isascii() and name.isidentifier() else to_toml(name)
 
 
-def made_of(kind: type[Made], entry: Any, where: str) -> Made:
+def from_json(kind: type[DataclassT], entry: Any, where: str) -> DataclassT:
     """A dataclass's instance from a JSON object, whose lists may stand for tuples.
 
     Raises ValueError, with the place and the field, for an unknown or missing field and a value of
     another type.
     """
     if not isinstance(entry, dict):
-        raise ValueError(f"{where}: expected a JSON object, got {brief(entry)}")
-    known: dict[str, Any] = {each.name: each for each in fields(kind)}
-    needed = {name for name, each in known.items() if each.default is each.default_factory}
-    for what, names in (("unknown", entry.keys() - known), ("missing", needed - entry.keys())):
+        raise ValueError(f"{where}: expected a JSON object, got {short_repr(entry)}")
+    known: dict[str, Any] = {spec.name: spec for spec in fields(kind)}
+    required = {name for name, spec in known.items() if spec.default is spec.default_factory}
+    for what, names in (("unknown", entry.keys() - known), ("missing", required - entry.keys())):
         if names:
-            raise ValueError(f"{where}: {what} {listed(sorted(names))}")
+            raise ValueError(f"{where}: {what} {join_names(sorted(names))}")
     lists = {name: value for name, value in entry.items() if isinstance(value, list)}
     tuples = {n: tuple(v) for n, v in lists.items() if get_origin(known[n].type) is tuple}
     check_types(kind, entry | tuples, where)
@@ -142,9 +144,9 @@ def made_of(kind: type[Made], entry: Any, where: str) -> Made:
 
 def check_types(kind: "type[DataclassInstance]", values: Mapping[str, Any], where: str) -> None:
     """ValueError, with the place and the field, for a value of another type than a dataclass's."""
-    types: dict[str, Any] = {each.name: each.type for each in fields(kind)}
+    types: dict[str, Any] = {spec.name: spec.type for spec in fields(kind)}
     for name, value in values.items():
-        wanted = get_origin(types[name]) or types[name]
-        fits = isinstance(value, wanted) or (wanted is float and is_finite(value))
-        if not fits or (isinstance(value, bool) and wanted is not bool):
-            raise ValueError(f"{where}: {name} is {brief(value)}, not {wanted.__name__}")
+        expected = get_origin(types[name]) or types[name]
+        fits = isinstance(value, expected) or (expected is float and is_finite(value))
+        if not fits or (isinstance(value, bool) and expected is not bool):
+            raise ValueError(f"{where}: {name} is {short_repr(value)}, not {expected.__name__}")

@@ -4,9 +4,9 @@ import dataclasses
 import math
 from typing import Any
 
-from .arguments import brief
+from .arguments import short_repr
 
-_MISTAKEN = {  # units in which a number may be instead, as shares of the right one
+_CONFUSED_UNITS = {  # units in which a number may be instead, as shares of the right one
     "m": {"mm": 1e-3, "cm": 1e-2},
     "s": {"ms": 1e-3},
     "m/s": {"km/h": 1.0 / 3.6},
@@ -35,9 +35,9 @@ def quantity(
 def check_plausible(values: Any) -> None:
     """Raise ValueError for a number of a dataclass outside its range, with the unit that it may be
     in by mistake."""
-    entries = [each for each in dataclasses.fields(values) if "plausible" in each.metadata]
+    entries = [spec for spec in dataclasses.fields(values) if "plausible" in spec.metadata]
     for entry in sorted(
-        entries, key=lambda each: len(each.metadata["per"])
+        entries, key=lambda spec: len(spec.metadata["per"])
     ):  # those last go by others
         unit, _, (low, high), per = entry.metadata.values()
         value, scale = getattr(values, entry.name), math.prod(getattr(values, n) for n in per)
@@ -45,11 +45,13 @@ def check_plausible(values: Any) -> None:
         for number in value if isinstance(value, tuple) else (value,):
             if number is None or low <= number <= high:
                 continue
-            of = f" for its {', '.join(per)}" if per else ""
-            units = _MISTAKEN.get(unit, {}).items()
-            meant = " or ".join(name for name, size in units if low <= number * size <= high)
-            got = f"{type(values).__name__}.{entry.name}: {brief(number)} {unit}".removesuffix(" -")
+            per_text = f" for its {', '.join(per)}" if per else ""
+            units = _CONFUSED_UNITS.get(unit, {}).items()
+            candidates = " or ".join(name for name, size in units if low <= number * size <= high)
+            got = f"{type(values).__name__}.{entry.name}: {short_repr(number)} {unit}".removesuffix(
+                " -"
+            )
             raise ValueError(
-                f"{got} is outside the plausible {low:.4g} to {high:.4g}{of}"
-                f"{f' (is it in {meant}?)' if meant else ''}; strict=False takes it"
+                f"{got} is outside the plausible {low:.4g} to {high:.4g}{per_text}"
+                f"{f' (is it in {candidates}?)' if candidates else ''}; strict=False takes it"
             )

@@ -72,10 +72,10 @@ class Record:
         """The tick of each row."""
         return np.arange(self.first, self.first + len(self.fast))
 
-    def packets_of(self, sensor: str) -> Array:
+    def select_packets(self, sensor: str) -> Array:
         """The packets of one slow sensor, (count, PACKET_WIDTH)."""
-        wanted = self.packets[:, PACKET.sensor] == SLOW_NAMES.index(sensor)
-        return np.asarray(self.packets[wanted], np.float64)
+        is_wanted = self.packets[:, PACKET.sensor] == SLOW_NAMES.index(sensor)
+        return np.asarray(self.packets[is_wanted], np.float64)
 
 
 def concatenate(records: list[Record]) -> Record:

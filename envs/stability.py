@@ -9,33 +9,44 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
-from .arguments import action_of, warn_once
-from .backend.decorators import entry_of
-from .engine.arrays import Packed
+from .arguments import parse_action, warn_once
+from .backend.decorators import compile_call
+from .engine.arrays import WorkspaceMixin
 from .engine.config import EnvConfig
 from .engine.layout import PARAMS_WIDTH, Z
 from .engine.reset import reset_vehicle
-from .engine.step import step_packed
-from .engine.views import motion_in, record_in, slow_in, true_states_in, vehicle_in
+from .engine.step import step_workspace
+from .engine.views import (
+    compute_true_states,
+    get_motion,
+    get_slow_sensors,
+    get_vehicle,
+    make_record,
+)
 from .record import Array, Record
-from .rendering.drawn import DrawnOne, Numbers
-from .scenarios.manoeuvres import ScenarioSource, scenario_from
+from .rendering.drawn import PackedArrays, SingleRenderMixin
+from .scenarios.manoeuvres import ScenarioSource, make_scenario
 from .scenarios.scenario import Scenario
 from .sensors.link import SlowSensor
 from .task.failures import REFUSED, RUNNING, WILD
-from .task.info import info_of
-from .task.observation import Entry
+from .task.info import make_info
+from .task.observation import ObservationEntry
 from .ticks import TICK
 from .vehicle.dynamics import Motion
 from .vehicle.vehicle import Vehicle
-from .vehicle.vehicles import VehicleSource, vehicle_from
-from .vision import Seeing
+from .vehicle.vehicles import VehicleSource, make_vehicle
+from .vision import CameraMixin
 
-_STEP: list[Any] = []  # `step_packed` for the types of an env's arrays, once one has stepped
+_COMPILED_STEP: list[
+    Any
+] = []  # `step_workspace` for the types of an env's arrays, once one has stepped
 
 
 class StabilityEnv(
-    Packed, Seeing, DrawnOne, gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]
+    WorkspaceMixin,
+    CameraMixin,
+    SingleRenderMixin,
+    gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]],
 ):
     """Keep a car's sideslip angle where it should be, by two motors and, if asked, by steering.
 
@@ -89,14 +100,14 @@ class StabilityEnv(
 
     ## Arguments
     sensors: "vision", "vision-uneven", "gps" or "fusion" (camera and GPS). scenario: as of
-    `scenario_from`. vehicle: the true one, as of `vehicle_from`; nominal: that of estimators and
+    `make_scenario`. vehicle: the true one, as of `make_vehicle`; nominal: that of estimators and
     controllers (default: vehicle). control_period: ticks of 1 ms. reference: "zero-slip", "model"
     (its steady state), "limited" (by friction) or "lagged" (so limited, understeering, lag 0.1 s).
     fast: "summary" or "all". with_map: the road's curvature is seen, which estimators are always
     told. slow, by name ("camera", "gps"): fields of `SlowSensor` that replace the id's. yaw_first:
     yaw moment before acceleration where both pass the motors' limit. steering: the action may steer
-    too. vision, delay, appearance: as of `Seeing`. render_mode: of `Drawn`. strict: whether
-    implausible numbers of scenario and vehicles are refused.
+    too. vision, delay, appearance: as of `CameraMixin`. render_mode: of `RenderMixin`. strict:
+    whether implausible numbers of scenario and vehicles are refused.
     """
 
     config: EnvConfig
@@ -121,24 +132,24 @@ class StabilityEnv(
         strict: bool = True,
         **slow: Mapping[str, Any] | None,
     ) -> None:
-        car = vehicle_from(vehicle, strict)
-        believed = car if nominal is None else vehicle_from(nominal, strict)
+        car = make_vehicle(vehicle, strict)
+        nominal_vehicle = car if nominal is None else make_vehicle(nominal, strict)
         self.config = EnvConfig(
-            sensors, scenario_from(scenario), car, believed, control_period, reference, fast,
+            sensors, make_scenario(scenario), car, nominal_vehicle, control_period, reference, fast,
             with_map, yaw_first, steering, on_bad_action, vision, delay, strict, slow,
         )  # fmt: skip
         self.control_period, self.reference = int(control_period), reference
-        self._now = self.config.base
-        self._draw_in(render_mode)
-        self._see_in(vision, delay, appearance)
+        self._episode = self.config.base
+        self._init_rendering(render_mode)
+        self._init_camera(vision, delay, appearance)
 
-        self.layout: tuple[Entry, ...] = self.config.layout
+        self.layout: tuple[ObservationEntry, ...] = self.config.layout
         low, high = self.config.bounds.astype(np.float32)
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
-        self._width = self.config.action_width
-        self._fails = on_bad_action == "fail"
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (self._width,), np.float32)
-        self._make_room(PARAMS_WIDTH)
+        self._action_width = self.config.action_width
+        self._fail_on_bad_action = on_bad_action == "fail"
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (self._action_width,), np.float32)
+        self._allocate(PARAMS_WIDTH)
         self.ticks_done = 0  # rows of the newest record
         # the record as it stood before the newest reset: a vector env resets within a step
         self.final_rows, self.final_packets = self.rows.copy(), self.packets.copy()
@@ -148,23 +159,23 @@ class StabilityEnv(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Start an episode; see the class docstring for the options."""
-        config = self.config.with_options(options or {})
+        config = self.config.apply_options(options or {})
         super().reset(seed=seed)  # refused options leave everything as it was
-        self._now = config
+        self._episode = config
         key = int(self.np_random.integers(0, 2**64, dtype=np.uint64))
         self.final_rows[:], self.final_packets[:] = self.rows, self.packets
         self.final_ticks_done, self.final_delivered = self.ticks_done, self.delivered
-        self._make_room(len(config.start.params))
+        self._allocate(len(config.start.params))
         reset_vehicle(config.start, key & 0xFFFFFFFF, key >> 32, self._bounds, self._row)
         self._over = False
-        self._begin()
+        self._start_episode()
         self.ticks_done, self.annotations = 1, {}
-        info = info_of(self._told())
-        if self.eye is not None:
-            info |= self.eye.marks
+        info = make_info(self._read_report())
+        if self.camera is not None:
+            info |= self.camera.metadata_flags
         if self._traces:
-            self._seen()
-        return self._observation(), info
+            self._record_step()
+        return self._copy_observation(), info
 
     def step(
         self, action: npt.ArrayLike
@@ -172,41 +183,41 @@ class StabilityEnv(
         """Hold the action for one control period."""
         if self._over:
             raise ResetNeeded("the episode is over or was never started: call reset() first")
-        force = action_of(action, self._width, self._fails)
-        eye = self.eye
-        before = None if eye is None else self._state.copy()
-        done = self._advance(force)
+        command = parse_action(action, self._action_width, self._fail_on_bad_action)
+        camera = self.camera
+        before = None if camera is None else self._state.copy()
+        done = self._advance(command)
         if done <= 0:
             if done == REFUSED:
-                raise ValueError(f"action {force.tolist()} is not finite; nothing was stepped")
+                raise ValueError(f"action {command.tolist()} is not finite; nothing was stepped")
             self._obs[:] = 0.0
-        elif eye is not None:
-            eye.look(before, self._row, done, self._bounds, self._window)
+        elif camera is not None:
+            camera.process_step(before, self._row, done, self._bounds, self._window)
         self.ticks_done = done
-        info = info_of(self._told())
-        if eye is not None:
-            info |= eye.marks
+        info = make_info(self._read_report())
+        if camera is not None:
+            info |= camera.metadata_flags
         terminated, truncated = info["failure"] != RUNNING, info["is_success"]
         self._over = terminated or truncated
         if self._traces:
-            self._seen()
-        return self._observation(), -info["cost"], terminated, truncated, info
+            self._record_step()
+        return self._copy_observation(), -info["cost"], terminated, truncated, info
 
-    def _advance(self, force: npt.NDArray[np.float32]) -> int:
+    def _advance(self, command: npt.NDArray[np.float32]) -> int:
         """One control period; what `step_vehicle` returns."""
-        if not _STEP:
-            _STEP.append(entry_of(step_packed, self._work, force))
-        done: int = _STEP[0](self._work, force)
+        if not _COMPILED_STEP:
+            _COMPILED_STEP.append(compile_call(step_workspace, self._workspace, command))
+        done: int = _COMPILED_STEP[0](self._workspace, command)
         if done >= WILD:
             done -= WILD
-            warn_once(self, force)
+            warn_once(self, command)
         return done
 
     @property
     def record(self) -> Record:
         """What the wires carried in the newest step, or at tick 0 after a reset (a copy)."""
         rows, packets = self.rows[: self.ticks_done], self.packets[: self.delivered]
-        return record_in(self._state, rows, packets)
+        return make_record(self._state, rows, packets)
 
     @property
     def dt(self) -> float:
@@ -216,46 +227,46 @@ class StabilityEnv(
     @property
     def scenario(self) -> Scenario:
         """The scenario of this episode."""
-        return self._now.scenario
+        return self._episode.scenario
 
     @property
     def vehicle(self) -> Vehicle:
         """The true vehicle now, with what the seed drew; friction is the mean of both sides'."""
-        return vehicle_in(self._now, self._params, self._state)
+        return get_vehicle(self._episode, self._params, self._state)
 
     @property
     def motion(self) -> Motion:
         """The true velocities, heading, place and roll now, in SI units; no sensor tells these."""
-        return motion_in(self._state)
+        return get_motion(self._state)
 
     @property
     def true_state(self) -> Array:
         """The `TrueState` now, (len(TrueState),); no sensor tells these."""
         rows = self._params[None], self._state[None], self._switches[None]
-        return np.asarray(true_states_in(*rows)[0])
+        return np.asarray(compute_true_states(*rows)[0])
 
     @property
     def nominal(self) -> Vehicle:
         """The vehicle that estimators and controllers are designed for."""
-        return self._now.nominal
+        return self._episode.nominal
 
     @property
     def held_speed(self) -> float | None:
         """The speed in m/s that is held exactly (small-angle plant), else None."""
-        return self._now.held_speed
+        return self._episode.held_speed
 
     @property
     def slow_sensors(self) -> dict[str, SlowSensor]:
         """The slow sensors by name, with the clock phase that this episode drew."""
-        return slow_in(self._now, self._state)
+        return get_slow_sensors(self._episode, self._state)
 
     @property
     def redraws(self) -> int:
         """Unstable draws thrown away at this reset."""
         return int(self._state[Z.clock.redraws])
 
-    def _numbers(self, row: int) -> Numbers:
-        return self._params, self._state, self._switches, self._report, self._now
+    def _get_packed_arrays(self, row: int) -> PackedArrays:
+        return self._params, self._state, self._switches, self._report, self._episode
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot that `set_state` continues from, bit for bit."""
@@ -263,7 +274,7 @@ class StabilityEnv(
             "params": self._params.copy(),
             "state": self._state.copy(),
             "switches": self._switches.copy(),
-            "config": self._now,
+            "config": self._episode,
             "layout": self.layout,
             "rows": self.rows.copy(),
             "packets": self.packets.copy(),
@@ -280,11 +291,11 @@ class StabilityEnv(
             )
         if snapshot["layout"] != self.layout:
             raise ValueError("the snapshot is of an env with other sensors or another observation")
-        self._make_room(len(snapshot["params"]))
+        self._allocate(len(snapshot["params"]))
         self._params[:] = snapshot["params"]
         self._state[:] = snapshot["state"]
         self._switches[:] = snapshot["switches"]
-        self._now = snapshot["config"]
+        self._episode = snapshot["config"]
         self.rows[:] = snapshot["rows"]
         self.packets[:] = snapshot["packets"]
         self._report[:] = snapshot["report"]

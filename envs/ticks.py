@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from .backend.decorators import jit, plain
+from .backend.decorators import as_python, jit
 from .backend.primitives import floor
 
 TICK = 0.001
@@ -12,14 +12,14 @@ NEVER = -1.0
 
 
 @jit
-def whole_ticks(seconds: Any) -> Any:
+def round_to_ticks(seconds: Any) -> Any:
     """Whole ticks of a time in seconds."""
     return floor(seconds / TICK + 0.5)
 
 
-_whole_ticks = plain(whole_ticks)
+_round_to_ticks = as_python(round_to_ticks)
 
 
-def ticks(seconds: float) -> float:
-    """`whole_ticks` without the compiler."""
-    return float(_whole_ticks(seconds))
+def count_ticks(seconds: float) -> float:
+    """`round_to_ticks` without the compiler."""
+    return float(_round_to_ticks(seconds))

@@ -12,26 +12,37 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from .arguments import actions_of, count_of, each_of, mask_of, mode_of, named, seeds_of, warn_once
+from .arguments import (
+    check_int,
+    expand_rows,
+    format_rows,
+    parse_actions,
+    parse_autoreset_mode,
+    parse_reset_mask,
+    parse_seeds,
+    warn_once,
+)
 from .engine.batch import step_rows
 from .engine.config import EnvConfig
-from .engine.episodes import Episodes
+from .engine.episodes import EpisodeBatch
 from .engine.layout import Z
 from .record import Array
-from .rendering.drawn import DrawnRows, Numbers
+from .rendering.drawn import PackedArrays, VectorRenderMixin
 from .stability import StabilityEnv
 from .task.failures import REFUSED, WILD
-from .task.info import infos_of
+from .task.info import make_infos
 
 Observations = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
 Infos = dict[str, Any]
 
-_INFO = ("all", "ends")
-_BY_ROW = ("scenario", "vehicle")  # arguments that may be a list
+_INFO_MODES = ("all", "ends")
+_ROW_ARGUMENTS = ("scenario", "vehicle")  # arguments that may be a list
 
 
-class StabilityVectorEnv(DrawnRows, Episodes, VectorEnv[Observations, Any, npt.NDArray[Any]]):
+class StabilityVectorEnv(
+    VectorRenderMixin, EpisodeBatch, VectorEnv[Observations, Any, npt.NDArray[Any]]
+):
     """`num_envs` environments, each of which is a `StabilityEnv(**arguments)` bit for bit.
 
     Observations, rewards, ends, infos and records are those of `SyncVectorEnv`: row i of
@@ -43,7 +54,7 @@ class StabilityVectorEnv(DrawnRows, Episodes, VectorEnv[Observations, Any, npt.N
     all its episodes. max_episode_steps: as of `TimeLimit` around each row. autoreset_mode:
     "NextStep", "SameStep" or "Disabled" (rows that ended wait for `reset` with a `reset_mask`), or
     the enum. info: "all" has the infos of every row in every step, as `SyncVectorEnv` does; "ends"
-    only those of the last step of an episode, and none at resets. render_mode: of `Drawn`.
+    only those of the last step of an episode, and none at resets. render_mode: of `RenderMixin`.
 
     ## Reset
     `seed`: an int, or a list (N,) of int or None. `options`: those of `StabilityEnv`, each one for
@@ -76,26 +87,26 @@ class StabilityVectorEnv(DrawnRows, Episodes, VectorEnv[Observations, Any, npt.N
         max_episode_steps: int | None = None,
         **arguments: Any,
     ) -> None:
-        self.num_envs = N = count_of("num_envs", num_envs, "environments")
-        self._mode = mode_of(autoreset_mode)
-        if info not in _INFO:
+        self.num_envs = N = check_int("num_envs", num_envs, "environments")
+        self._mode = parse_autoreset_mode(autoreset_mode)
+        if info not in _INFO_MODES:
             raise ValueError(f"info is 'all' or 'ends', got {info!r}")
         self._all_infos = info == "all"
-        self._longest = max_episode_steps
+        self._max_steps = max_episode_steps
         if max_episode_steps is not None:
-            self._longest = count_of("max_episode_steps", max_episode_steps, "steps")
-        one, rows = _rows_of(arguments, N)
-        Episodes.__init__(self, rows)
-        self.reference = one.reference
-        self._draw_in(render_mode)
+            self._max_steps = check_int("max_episode_steps", max_episode_steps, "steps")
+        first_env, rows = _make_row_configs(arguments, N)
+        EpisodeBatch.__init__(self, rows)
+        self.reference = first_env.reference
+        self._init_rendering(render_mode)
         self.metadata["autoreset_mode"] = self._mode
-        self.single_observation_space = one.observation_space
-        self.single_action_space = one.action_space
-        self.observation_space = batch_space(one.observation_space, N)
-        self.action_space = batch_space(one.action_space, N)
+        self.single_observation_space = first_env.observation_space
+        self.single_action_space = first_env.action_space
+        self.observation_space = batch_space(first_env.observation_space, N)
+        self.action_space = batch_space(first_env.action_space, N)
 
         self._started = False
-        self._waiting = 0  # rows that are over
+        self._n_over = 0  # rows that are over
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -118,105 +129,109 @@ class StabilityVectorEnv(DrawnRows, Episodes, VectorEnv[Observations, Any, npt.N
         Raises TypeError or ValueError for what is out of place, ResetNeeded where a mask leaves
         out rows that were never started; then everything is as it was.
         """
-        N, rest = self.num_envs, dict(options or {})
-        seeds, mask = seeds_of(seed, N), mask_of(rest.pop("reset_mask", None), N)
+        N, remaining = self.num_envs, dict(options or {})
+        seeds, mask = parse_seeds(seed, N), parse_reset_mask(remaining.pop("reset_mask", None), N)
         if not (self._started or mask.all()):
             raise ResetNeeded("reset all rows first: a reset_mask leaves out some of them")
         chosen = np.flatnonzero(mask)
-        configs, of = self.with_options(rest, chosen.tolist())
-        new = {i: seeding.np_random(s) for i in chosen.tolist() if (s := seeds[i]) is not None}
-        for i, (generator, own) in new.items():
-            self.generators[i], self.seeds[i] = generator, own
-        self.reset_rows(chosen, configs, of)
+        configs, config_index = self.apply_options(remaining, chosen.tolist())
+        new_generators = {
+            i: seeding.np_random(s) for i in chosen.tolist() if (s := seeds[i]) is not None
+        }
+        for i, (generator, used_seed) in new_generators.items():
+            self.generators[i], self.seeds[i] = generator, used_seed
+        self.reset_rows(chosen, configs, config_index)
         self.over[mask] = False
-        self._waiting, self._started = int(self.over.sum()), True
+        self._n_over, self._started = int(self.over.sum()), True
         if self._traces:
-            self._seen()
-        return self.obs.copy(), infos_of(self.reports, mask) if self._all_infos else {}
+            self._record_step()
+        return self.obs.copy(), make_infos(self.reports, mask) if self._all_infos else {}
 
     def step(self, actions: npt.ArrayLike) -> tuple[Observations, Array, Flags, Flags, Infos]:
         """Hold each row's action for one control period."""
         N = self.num_envs
         if not self._started:
             raise ResetNeeded("no episode was started: call reset() first")
-        if self._waiting and self._mode == AutoresetMode.DISABLED:
+        if self._n_over and self._mode == AutoresetMode.DISABLED:
             raise ResetNeeded(
-                f"the episode is over in {named(np.flatnonzero(self.over))}: "
+                f"the episode is over in {format_rows(np.flatnonzero(self.over))}: "
                 "call reset() with a reset_mask"
             )
         config = self.config
-        asked = actions_of(actions, N, config.action_width, config.on_bad_action == "fail")
-        resting = np.flatnonzero(self.over) if self._waiting else None
+        commands = parse_actions(actions, N, config.action_width, config.on_bad_action == "fail")
+        over_rows = np.flatnonzero(self.over) if self._n_over else None
         rewards, terminated, truncated = np.empty(N), np.empty(N, np.bool_), np.empty(N, np.bool_)
-        ended = step_rows(
+        n_ended = step_rows(
             *self.arrays,
-            asked,
+            commands,
             self.control_period,
             config.bounds,
             rewards,
             terminated,
             truncated,
-            self.block,
+            self.lane_buffers,
         )
-        if ended == REFUSED:
-            bad = np.flatnonzero(~np.isfinite(asked).all(1) & ~self.over)
+        if n_ended == REFUSED:
+            bad = np.flatnonzero(~np.isfinite(commands).all(1) & ~self.over)
             raise ValueError(
-                f"the action of {named(bad)} is not finite, {asked[bad[0]].tolist()}; "
+                f"the action of {format_rows(bad)} is not finite, {commands[bad[0]].tolist()}; "
                 "nothing was stepped"
             )
-        if ended >= WILD:
-            ended -= WILD
-            warn_once(self, asked)
-        if resting is not None:
-            self.reset_rows(resting)
-        if self._longest is not None:
-            late = self.states[:, Z.clock.tick] > (self._longest - 1) * self.control_period
-            truncated |= late
-            ended += int((late & ~self.over).sum())
-            self.over |= late
+        if n_ended >= WILD:
+            n_ended -= WILD
+            warn_once(self, commands)
+        if over_rows is not None:
+            self.reset_rows(over_rows)
+        if self._max_steps is not None:
+            is_timed_out = (
+                self.states[:, Z.clock.tick] > (self._max_steps - 1) * self.control_period
+            )
+            truncated |= is_timed_out
+            n_ended += int((is_timed_out & ~self.over).sum())
+            self.over |= is_timed_out
         infos: Infos = {}
-        if ended and self._mode == AutoresetMode.SAME_STEP:
-            infos, ended = self._finished(), 0
-        self._waiting = ended
+        if n_ended and self._mode == AutoresetMode.SAME_STEP:
+            infos, n_ended = self._reset_finished(), 0
+        self._n_over = n_ended
         if self._all_infos:
-            infos |= infos_of(self.reports, np.ones(N, np.bool_))
-        elif ended:
-            infos |= infos_of(self.reports, self.over)
+            infos |= make_infos(self.reports, np.ones(N, np.bool_))
+        elif n_ended:
+            infos |= make_infos(self.reports, self.over)
         if self._traces:
-            self._seen()
+            self._record_step()
         return self.obs.copy(), rewards, terminated, truncated, infos
 
-    def _finished(self) -> Infos:
+    def _reset_finished(self) -> Infos:
         """Reset the rows that are over; returns what they reported last."""
         final_obs, rows = np.full(self.num_envs, None), np.flatnonzero(self.over)
         for i in rows:
             final_obs[i] = self.obs[i].copy()
-        infos: Infos = {"final_info": infos_of(self.reports, self.over), "final_obs": final_obs}
+        infos: Infos = {"final_info": make_infos(self.reports, self.over), "final_obs": final_obs}
         for key in tuple(infos):
             infos[f"_{key}"] = self.over.copy()
         self.reset_rows(rows)
         self.over[:] = False
         return infos
 
-    def _numbers(self, row: int) -> Numbers:
+    def _get_packed_arrays(self, row: int) -> PackedArrays:
         numbers = self.params[row], self.states[row], self.switches[row], self.reports[row]
         return *numbers, self.configs[row]
 
     @property  # type: ignore[misc]  # without a setter, as in sync
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
         """Each row's generator, which draws one 64-bit key a reset."""
-        return tuple(map(self.generator, range(self.num_envs)))
+        return tuple(map(self.get_generator, range(self.num_envs)))
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
         """What each row's generator was seeded with."""
         for i in range(self.num_envs):
-            self.generator(i)  # a row without one gets one now
+            self.get_generator(i)  # a row without one gets one now
         return tuple(self.seeds)
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot of all rows that `set_state` continues from, bit for bit."""
-        arrays = {name: each.copy() for name, each in self.arrays._asdict().items()}
+        arrays = {name: array.copy() for name, array in self.arrays._asdict().items()}
         return arrays | {
             "layout": self.layout,
             "configs": list(self.configs),
@@ -230,41 +245,43 @@ class StabilityVectorEnv(DrawnRows, Episodes, VectorEnv[Observations, Any, npt.N
 
         Raises ValueError for one of another number of rows, control period or observation.
         """
-        rows, ours = np.shape(snapshot["rows"]), self.rows.shape
-        if rows != ours:
+        shape, own_shape = np.shape(snapshot["rows"]), self.rows.shape
+        if shape != own_shape:
             raise ValueError(
-                f"the snapshot has {rows[0]} rows of {rows[1]} ticks a step, this env {ours[0]} "
-                f"of {ours[1]}"
+                f"the snapshot has {shape[0]} rows of {shape[1]} ticks a step, this env "
+                f"{own_shape[0]} of {own_shape[1]}"
             )
         if snapshot["layout"] != self.layout:
             raise ValueError("the snapshot is of an env with other sensors or another observation")
-        for name, each in self.arrays._asdict().items():
+        for name, array in self.arrays._asdict().items():
             if name != "params":
-                each[:] = snapshot[name]
-        self.hold(snapshot["params"].copy())
+                array[:] = snapshot[name]
+        self.set_params(snapshot["params"].copy())
         self.configs, self.seeds = list(snapshot["configs"]), list(snapshot["seeds"])
         self.generators = copy.deepcopy(snapshot["rng"])
-        self._started, self._waiting = snapshot["started"], int(self.over.sum())
-        self.sort()
+        self._started, self._n_over = snapshot["started"], int(self.over.sum())
+        self.group_by_variant()
 
 
-def _rows_of(arguments: Mapping[str, Any], count: int) -> tuple[StabilityEnv, list[EnvConfig]]:
+def _make_row_configs(
+    arguments: Mapping[str, Any], count: int
+) -> tuple[StabilityEnv, list[EnvConfig]]:
     """The first row's env, and the config of each row; rows with the same values share one."""
     if arguments.get("vision") == "image":
         raise ValueError(
             "vision='image' sees for one car at a time: make_vec(..., vectorization_mode='sync')"
         )
-    columns = {name: each_of(name, arguments.get(name), count) for name in _BY_ROW}
+    columns = {name: expand_rows(name, arguments.get(name), count) for name in _ROW_ARGUMENTS}
     envs: dict[tuple[int, ...], StabilityEnv] = {}
     rows = []
     for values in zip(*columns.values(), strict=True):
         key = tuple(map(id, values))
         if key not in envs:
-            own = {
+            row_arguments = {
                 name: value
                 for name, value in zip(columns, values, strict=True)
                 if value is not None
             }
-            envs[key] = StabilityEnv(**{**arguments, **own})
+            envs[key] = StabilityEnv(**{**arguments, **row_arguments})
         rows.append(envs[key].config)
     return next(iter(envs.values())), rows

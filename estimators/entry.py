@@ -9,10 +9,10 @@ from numba.extending import is_jitted
 
 from ..envs.record import PACKET_WIDTH
 from .core.memory import FILTER
-from .core.run import advance, receive_all, step_all, write_estimate
+from .core.run import advance, process_packet_all, step_all, write_estimate
 
 
-def entry(function: Any, *example: Any) -> Any:
+def compile_call(function: Any, *example_args: Any) -> Any:
     """The compiled call of a function for arguments of the example's types.
 
     numba finds out the types of the arguments at every call, which costs more than a filter's
@@ -20,34 +20,34 @@ def entry(function: Any, *example: Any) -> Any:
     """
     if not is_jitted(function):
         return function
-    return function.compile(tuple(map(numba.typeof, example)))
+    return function.compile(tuple(map(numba.typeof, example_args)))
 
 
-def _memory() -> tuple[Any, Any]:
+def _make_example() -> tuple[Any, Any]:
     return np.zeros(1, FILTER), np.zeros((1, 1, 1))
 
 
 @cache
-def advance_entry() -> Any:
+def compile_advance() -> Any:
     """`advance` as a plain call."""
     matrix, vector = np.zeros((1, 1)), np.zeros(1)
-    return entry(advance, *_memory(), matrix, 0, matrix, 0, 0, matrix, matrix, vector)
+    return compile_call(advance, *_make_example(), matrix, 0, matrix, 0, 0, matrix, matrix, vector)
 
 
 @cache
-def estimate_entry() -> Any:
+def compile_estimate() -> Any:
     """`write_estimate` as a plain call."""
-    return entry(write_estimate, *_memory(), np.zeros(1), np.zeros((1, 1)))
+    return compile_call(write_estimate, *_make_example(), np.zeros(1), np.zeros((1, 1)))
 
 
 @cache
-def receive_entry() -> Any:
-    """`receive_all` as a plain call."""
-    return entry(receive_all, *_memory(), np.zeros(PACKET_WIDTH))
+def compile_process_packet() -> Any:
+    """`process_packet_all` as a plain call."""
+    return compile_call(process_packet_all, *_make_example(), np.zeros(PACKET_WIDTH))
 
 
 @cache
-def step_entry() -> Any:
+def compile_step() -> Any:
     """`step_all` as a plain call."""
     matrix = np.zeros((1, 1))
-    return entry(step_all, *_memory(), matrix, matrix, 0)
+    return compile_call(step_all, *_make_example(), matrix, matrix, 0)

@@ -12,15 +12,15 @@ import numpy.typing as npt
 from ..envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Log, Record
 from ..envs.sensors.link import SlowSensor
 from ..envs.sensors.slow import SLOW_NAMES
-from .core.memory import Counters, Filters, Memory
-from .core.run import begin_all
+from .core.memory import FilterRecord, FilterRecords, SkipCounters
+from .core.run import reset_filters
 from .core.transition import KINEMATIC, LATERAL, VELOCITY_ROLL
 from .design.config import FilterConfig
-from .design.error_map import MARGINAL, designed, spectral_radius, unobservable
+from .design.error_map import MARGINAL, design_and_map, find_unobservable, spectral_radius
 from .design.models import STATES
-from .design.periodic import table_shape
-from .design.schedule import Schedule, whole_ticks
-from .entry import advance_entry, estimate_entry, receive_entry, step_entry
+from .design.periodic import compute_table_shape
+from .design.schedule import Schedule, count_ticks
+from .entry import compile_advance, compile_estimate, compile_process_packet, compile_step
 from .estimates import Estimates, UnobservableWarning
 
 Array = npt.NDArray[np.float64]
@@ -35,7 +35,7 @@ class Estimator:
     """A filter at work; built by `make_estimator`.
 
     `name`, `config`, schedules (of each layer): what it was built from. `names` and `units` of its
-    n states; `x` (n,) and `P` (n, n) at "now"; `tick`, of the last fast row. `unobservable`:
+    n states; `x` (n,) and `P` (n, n) at "now"; `tick`, of the last fast row. `find_unobservable`:
     directions that its sensors cannot see. `spectral_radius` of its error over a cycle. `dt`:
     seconds of a tick. `needs`: the fast columns it reads. `filters` (layers,), `gains` (cells,
     rows, columns): its memory and its tables, as compiled code takes them.
@@ -57,30 +57,30 @@ class Estimator:
         self.filters, self._schedules = filters, schedules
         f = self._f
         cells = round((f.high - f.low) / f.spacing) + 1 if f.spacing > 0.0 else 1
-        shape = (cells, *table_shape(f, schedules[-1])) if f.periodic else (1, 1, 1)
+        shape = (cells, *compute_table_shape(f, schedules[-1])) if f.periodic else (1, 1, 1)
         self.gains = np.zeros(shape)
         self.spectral_radius = 0.0
         self.unobservable: tuple[str, ...] = ()
         self.reset()
 
     @property
-    def _f(self) -> Memory:
+    def _f(self) -> FilterRecord:
         return self.filters[0]
 
     @property
     def needs(self) -> tuple[str, ...]:
         """The fast columns that a record must have."""
-        read = {int(c) for f in self.filters for c in f.u_column[: f.inputs, 0]}
-        read |= {int(c) for f in self.filters for c in f.y_column[: f.fasts, 0]}
+        columns = {int(c) for f in self.filters for c in f.u_column[: f.inputs, 0]}
+        columns |= {int(c) for f in self.filters for c in f.y_column[: f.fasts, 0]}
         # a log without them had no yaw moment and a straight road
-        read -= {FAST.torque_left, FAST.torque_right, FAST.curvature}
+        columns -= {FAST.torque_left, FAST.torque_right, FAST.curvature}
         if any(f.kind in (KINEMATIC, VELOCITY_ROLL) for f in self.filters):
-            read.add(FAST.gyro)
+            columns.add(FAST.gyro)
         if self._f.measured and (self._f.kind == LATERAL or self._f.speed_state >= 0):
-            read.add(FAST.wheel_left)
-        return tuple(FAST._fields[column] for column in sorted(read))
+            columns.add(FAST.wheel_left)
+        return tuple(FAST._fields[column] for column in sorted(columns))
 
-    def check(self, filters: Filters) -> None:
+    def check(self, filters: FilterRecords) -> None:
         """Refuse a filter that diverges with a ValueError; warn of what it cannot see.
 
         filters: its memory, or that of the same filter with its first slow sensor alone.
@@ -90,20 +90,22 @@ class Estimator:
             names = self.names[first : first + int(f.n)]
             speeds = CHECKED_SPEEDS if f.measured else (float(f.speed),)
             for speed, schedule in itertools.product(speeds, self._schedules):
-                M = self._designed(f, schedule, speed)[1]
+                M = self._design_table(f, schedule, speed)[1]
                 radius = spectral_radius(M)
                 self.spectral_radius = max(radius, self.spectral_radius)
                 if abs(radius - 1.0) <= MARGINAL and not self.unobservable:
-                    self.unobservable = unobservable(M, names)
+                    self.unobservable = find_unobservable(M, names)
             first += int(f.n)
         if self.unobservable:
             text = f"{self.name} cannot see: {'; '.join(self.unobservable)}"
             warnings.warn(text, UnobservableWarning, stacklevel=3)
 
-    def _designed(self, f: Memory, schedule: Schedule, speed: float) -> tuple[Array, Array]:
+    def _design_table(
+        self, f: FilterRecord, schedule: Schedule, speed: float
+    ) -> tuple[Array, Array]:
         """The table of gains at a speed and the map of the error; ValueError if that grows."""
         try:
-            table, M = designed(f, schedule, speed, self.config)
+            table, M = design_and_map(f, schedule, speed, self.config)
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from None
         radius = spectral_radius(M)
@@ -116,13 +118,13 @@ class Estimator:
 
     def design_missing(self) -> None:
         """Make the table of gains that compiled code has just asked for."""
-        self._design(int(self._f.wanted))
+        self._design_cell(int(self._f.wanted))
 
-    def _design(self, cell: int) -> None:
+    def _design_cell(self, cell: int) -> None:
         """Fill the table of gains of one cell."""
         f = self._f
         speed = float(f.low + cell * f.spacing) if f.measured else float(f.speed)
-        self.gains[cell] = self._designed(f, self._schedules[-1], speed)[0]
+        self.gains[cell] = self._design_table(f, self._schedules[-1], speed)[0]
 
     def reset(self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0) -> None:
         """Forget everything; the next fast row is the tick `first`.
@@ -137,11 +139,11 @@ class Estimator:
                     f"{self.name} was built for the {name} {sensor}, the reset has {new}"
                 )
             s = SLOW_NAMES.index(name)
-            what = f"{self.name}: the {name}'s phase"
-            phase = whole_ticks(new.phase or 0.0, self.dt, what)
+            label = f"{self.name}: the {name}'s phase"
+            phase = count_ticks(new.phase or 0.0, self.dt, label)
             for f in self.filters:
                 f.phase[s] = f.origin = phase
-        begin_all(self.filters, first)
+        reset_filters(self.filters, first)
 
     def step(self, fast: Array, packets: Array, count: int | None = None) -> None:
         """Take fast rows (k, FAST_WIDTH) and the first `count` packets (all if None).
@@ -151,21 +153,21 @@ class Estimator:
         fast = np.ascontiguousarray(fast, np.float64)
         packets = np.ascontiguousarray(packets, np.float64)
         try:
-            (_, wide), (arrived, long) = fast.shape, packets.shape
+            (_, fast_width), (n_packets, packet_width) = fast.shape, packets.shape
         except ValueError:
-            wide, arrived, long = 0, 0, 0
-        if wide != FAST_WIDTH or long != PACKET_WIDTH:
-            raise ValueError(_misshapen(fast, packets))
+            fast_width, n_packets, packet_width = 0, 0, 0
+        if fast_width != FAST_WIDTH or packet_width != PACKET_WIDTH:
+            raise ValueError(_format_shape_error(fast, packets))
         if count is not None:
-            if not 0 <= count <= arrived:
-                raise ValueError(f"count is 0 to {arrived}, as many as packets, got {count}")
-            arrived = count
-        self._step(fast, packets, arrived)
+            if not 0 <= count <= n_packets:
+                raise ValueError(f"count is 0 to {n_packets}, as many as packets, got {count}")
+            n_packets = count
+        self._step(fast, packets, n_packets)
 
     def _step(self, fast: Array, packets: Array, count: int) -> None:
-        done, rows = step_entry()(self.filters, self.gains, fast, packets, count), len(fast)
+        done, rows = compile_step()(self.filters, self.gains, fast, packets, count), len(fast)
         if done < rows:  # gains are missing
-            self._go_on(done, rows, (fast, rows, packets, count), (EMPTY, EMPTY, NO_NIS))
+            self._finish_rows(done, rows, (fast, rows, packets, count), (EMPTY, EMPTY, NO_NIS))
 
     def take(
         self,
@@ -183,18 +185,18 @@ class Estimator:
         to be filled with the normalised innovation squared of each packet, or empty.
         """
         record, outputs = (fast, rows, packets, count), (X, S, nis)
-        done = advance_entry()(self.filters, self.gains, *record, 0, *outputs)
+        done = compile_advance()(self.filters, self.gains, *record, 0, *outputs)
         if done < rows:
-            self._go_on(done, rows, record, outputs)
+            self._finish_rows(done, rows, record, outputs)
 
-    def _go_on(self, done: int, rows: int, record: Any, outputs: Any) -> None:
+    def _finish_rows(self, done: int, rows: int, record: Any, outputs: Any) -> None:
         """The rest of the rows, designing the gains that are asked for on the way.
 
         record, outputs: the arguments of `advance` before and behind the rows done.
         """
         while done < rows:
             self.design_missing()
-            done = advance_entry()(self.filters, self.gains, *record, done, *outputs)
+            done = compile_advance()(self.filters, self.gains, *record, done, *outputs)
 
     def predict(self, fast_row: npt.ArrayLike) -> None:
         """Take one fast row: from the last tick to this one, with the gyro."""
@@ -208,21 +210,21 @@ class Estimator:
         self._receive(values)
 
     def _receive(self, packet: Array) -> None:
-        receive_entry()(self.filters, self.gains, packet)
+        compile_process_packet()(self.filters, self.gains, packet)
 
     def run(self, source: Log | Record) -> Estimates:
         """Reset, then filter a whole record.
 
         Raises ValueError if the record is empty, has another tick than `dt`, or lacks a column.
         """
-        record = self.accept(source)
+        record = self.prepare_record(source)
         fast, packets = (np.ascontiguousarray(a, np.float64) for a in (record.fast, record.packets))
         X, S = np.empty((2, len(fast), len(self.names)))
         nis = np.full(len(packets), np.nan)
         self.take(fast, len(fast), packets, len(packets), X, S, nis)
         return Estimates(np.asarray(record.ticks * record.dt, np.float64), X, S, self.names, nis)
 
-    def accept(self, source: Log | Record) -> Record:
+    def prepare_record(self, source: Log | Record) -> Record:
         """Reset for a record, which is returned; raises as `run`."""
         record = source.record if isinstance(source, Log) else source
         if len(record.fast) == 0:
@@ -248,18 +250,18 @@ class Estimator:
     @property
     def x(self) -> Array:
         """The states now, (n,)."""
-        return self._estimate(0)[0]
+        return self._read_estimate(0)[0]
 
     @property
     def P(self) -> Array:
         """Their covariance now, (n, n); with periodic gains that of the settled cycle."""
-        return self._estimate(len(self.names))[1]
+        return self._read_estimate(len(self.names))[1]
 
-    def _estimate(self, width: int) -> tuple[Array, Array]:
+    def _read_estimate(self, width: int) -> tuple[Array, Array]:
         """The states (n,) and their covariance (width, width): width is n, or 0 for none."""
         x, P = np.empty(len(self.names)), np.zeros((width, width))
-        while not estimate_entry()(self.filters, self.gains, x, P):
-            self._design(int(self._f.cell))
+        while not compile_estimate()(self.filters, self.gains, x, P):
+            self._design_cell(int(self._f.cell))
         return x, P
 
     @property
@@ -270,7 +272,7 @@ class Estimator:
     @property
     def counts(self) -> dict[str, int]:
         """All counters by name."""
-        return dict(zip(Counters._fields, map(int, self._f.counts), strict=True))
+        return dict(zip(SkipCounters._fields, map(int, self._f.counts), strict=True))
 
     @property
     def nis(self) -> float:
@@ -279,7 +281,7 @@ class Estimator:
         return float(self._f.nis)
 
     def __getattr__(self, name: str) -> int:
-        if name in Counters._fields:
+        if name in SkipCounters._fields:
             return self.counts[name]
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
@@ -287,7 +289,7 @@ class Estimator:
         return f"<{self.name}: {', '.join(self.names)} at tick {self.tick}>"
 
 
-def _misshapen(fast: Array, packets: Array) -> str:
+def _format_shape_error(fast: Array, packets: Array) -> str:
     if fast.shape[1:] != (FAST_WIDTH,):
         return f"fast rows have shape (k, {FAST_WIDTH}), got {fast.shape}"
     return f"packets have shape (k, {PACKET_WIDTH}), got {packets.shape}"

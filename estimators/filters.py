@@ -20,7 +20,7 @@ from ..envs.sensors.slow import SLOW_NAMES
 
 
 @dataclass(frozen=True, kw_only=True)
-class Filter:
+class FilterDefinition:
     """One row: what a filter is, and the defaults of its options.
 
     slow: slow sensors it can use, the preferred first (none: fast ones alone). model: "bicycle" or
@@ -46,7 +46,7 @@ class Filter:
     source: str
 
 
-ANY = SLOW_NAMES
+ANY_SLOW = SLOW_NAMES
 GPS = ("gps",)
 CAMERA = ("camera",)
 
@@ -72,35 +72,37 @@ ROBUST = (
 """For a car that nobody has measured: levels of `benchmarks.tuning.robust`, found on simulated
 drives alone."""
 
-FILTERS: dict[str, Filter] = {
-    "bicycle-kf": Filter(source="tie-vision VI.A, the model (1)-(2)"),
-    "single-rate-kf": Filter(slow=ANY, intersample="single-rate", source="tie-vision (12)-(15)"),
-    "multirate-kf": Filter(slow=ANY, source="tie-vision (12)-(13), (16)"),
-    "multirate-residual-kf": Filter(
-        slow=ANY, intersample="pseudo-residual", source="tie-vision (12)-(13), (17)-(22)"
+FILTERS: dict[str, FilterDefinition] = {
+    "bicycle-kf": FilterDefinition(source="tie-vision VI.A, the model (1)-(2)"),
+    "single-rate-kf": FilterDefinition(
+        slow=ANY_SLOW, intersample="single-rate", source="tie-vision (12)-(15)"
     ),
-    "uneven-delay-kf": Filter(
+    "multirate-kf": FilterDefinition(slow=ANY_SLOW, source="tie-vision (12)-(13), (16)"),
+    "multirate-residual-kf": FilterDefinition(
+        slow=ANY_SLOW, intersample="pseudo-residual", source="tie-vision (12)-(13), (17)-(22)"
+    ),
+    "uneven-delay-kf": FilterDefinition(
         slow=CAMERA,
         intersample="pseudo-residual",
         delay="stored",
         source="uneven-delay (11)-(22)",
     ),
-    "constant-delay-kf": Filter(
+    "constant-delay-kf": FilterDefinition(
         slow=CAMERA,
         intersample="pseudo-residual",
         delay="constant",
         source="uneven-delay 5, the rival in Fig. 5",
     ),
-    "vision-only-kf": Filter(
+    "vision-only-kf": FilterDefinition(
         slow=CAMERA, fast=(), source="uneven-delay (3)-(7), the camera's rows of C alone"
     ),
-    "course-kf": Filter(
+    "course-kf": FilterDefinition(
         slow=GPS, gains="covariance", source="dakf-stability VI.A, [10]: (5)-(20) without d_1, d_2"
     ),
-    "dakf": Filter(
+    "dakf": FilterDefinition(
         slow=GPS, gains="covariance", disturbances="walk", source="dakf-stability (5)-(20)"
     ),
-    "double-layer": Filter(
+    "double-layer": FilterDefinition(
         slow=GPS,
         intersample="pseudo-residual",
         gains="covariance",
@@ -109,19 +111,19 @@ FILTERS: dict[str, Filter] = {
         hdop=((1.0, 1.0), (20.0, 20.0)),
         source="double-layer-gps (28)-(29), (34)-(42)",
     ),
-    "lob-2": Filter(
+    "lob-2": FilterDefinition(
         gains="placed", poles=(-60.0, -120.0), source="double-layer-gps 6.1, Aoki 2005"
     ),
-    "roll-kf": Filter(
+    "roll-kf": FilterDefinition(
         model="roll", fast=("roll_rate",), source="double-layer-gps 6.2 and (3), Tseng 2003"
     ),
-    "kinematic-velocity-kf": Filter(
+    "kinematic-velocity-kf": FilterDefinition(
         model="kinematic",
         fast=("wheel",),
         gains="covariance",
         source="double-layer-gps 6.3 and (4)-(5), Chen 2008",
     ),
-    "dual-rate": Filter(
+    "dual-rate": FilterDefinition(
         slow=GPS,
         fast=(),
         intersample="dual-rate",
@@ -129,34 +131,34 @@ FILTERS: dict[str, Filter] = {
         delay="ignore",
         source="dual-rate (4)-(35), (37)-(38)",
     ),
-    "lob": Filter(
+    "lob": FilterDefinition(
         fast=("gyro", "accel_y"),
         gains="placed",
         poles=(-2.0, -2.0),
         source="dakf-stability VI.A, [5]: gamma and a_y of (1)",
     ),
-    "yaw-moment-observer": Filter(
+    "yaw-moment-observer": FilterDefinition(
         model="yaw-moment", gains="placed", poles=(-20.0, -25.0), source="dakf-stability (2), [11]"
     ),
-    "lateral-force-observer": Filter(
+    "lateral-force-observer": FilterDefinition(
         model="tyre-forces",
         fast=("gyro", "accel_y"),
         gains="placed",
         poles=(-20.0, -25.0, -30.0),
         source="dakf-stability (1)-(2), [11]",
     ),
-    "exact-kf": Filter(
-        slow=ANY, gains="covariance", disturbances="forces", source="docs/PAPERS.md section 3"
+    "exact-kf": FilterDefinition(
+        slow=ANY_SLOW, gains="covariance", disturbances="forces", source="docs/PAPERS.md section 3"
     ),
-    "joint": Filter(
-        slow=ANY,
+    "joint": FilterDefinition(
+        slow=ANY_SLOW,
         gains="covariance",
         disturbances="forces",
         options=JOINT,
         source="docs/estimators.md, beyond the papers",
     ),
-    "joint-robust": Filter(
-        slow=ANY,
+    "joint-robust": FilterDefinition(
+        slow=ANY_SLOW,
         gains="covariance",
         disturbances="forces",
         options=(*JOINT, *ROBUST),

@@ -10,24 +10,24 @@ from ..envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH
 from ..envs.sensors.link import SlowSensor
 from .core.memory import FILTER
 from .design.config import FilterConfig
-from .design.options import FIND, columns_of
-from .design.schedule import Schedule, whole_ticks
-from .entry import advance_entry, receive_entry
+from .design.options import FIND, find_columns
+from .design.schedule import Schedule, count_ticks
+from .entry import compile_advance, compile_process_packet
 from .estimator import EMPTY, NO_NIS, Array, Estimator
-from .find_latency import Search, aligned
-from .protocol import deviations
+from .find_latency import LatencySearch, align_rows
+from .protocol import compute_std
 
-_HISTORY: int = FILTER.fields["predicted"][1]  # type: ignore[index]  # where a memory's window begins, in bytes
-_PLACE = PACKET_WIDTH  # column behind a packet's: its place in the call
+_HISTORY_OFFSET: int = FILTER.fields["predicted"][1]  # type: ignore[index]  # where a memory's window begins, in bytes
+_INDEX_COLUMN = PACKET_WIDTH  # column behind a packet's: its place in the call
 
 
 class LateEstimator(Estimator):
     """A filter with the option `latency`; built by `make_estimator`.
 
-    `behind`, a memory, is the filter at the time t - L of the latest channel, with every channel at
-    the time when it was true. The estimate at t is a copy of it that goes on to t with what is
-    known by then: the inputs, channels that are less late, the packets. So it is the conditional
-    mean of a linear system, as without latencies. A step costs L / dt ticks more.
+    `delayed_filters`, a memory, is the filter at the time t - L of the latest channel, with every
+    channel at the time when it was true. The estimate at t is a copy of it that goes on to t with
+    what is known by then: the inputs, channels that are less late, the packets. So it is the
+    conditional mean of a linear system, as without latencies. A step costs L / dt ticks more.
 
     `latency`: s by channel in force; `latency_sd`: s, of the one that is looked for, infinite
     while it is not known and the channel is taken as punctual.
@@ -38,34 +38,38 @@ class LateEstimator(Estimator):
     def __init__(
         self, config: FilterConfig, dt: float, filters: Any, schedules: tuple[Schedule, ...]
     ) -> None:
-        self._known, self._found = dict[int, int](), ""
+        self._fixed_lags, self._unknown_channel = dict[int, int](), ""
         for channel, late in config.latency.items():
             if late == FIND:
-                self._found, late = channel, 0.0
-            lag = whole_ticks(float(late), dt, f"{config.name}: a latency of {channel}")
-            self._known |= dict.fromkeys(columns_of(channel), lag)
+                self._unknown_channel, late = channel, 0.0
+            lag = count_ticks(float(late), dt, f"{config.name}: a latency of {channel}")
+            self._fixed_lags |= dict.fromkeys(find_columns(channel), lag)
         super().__init__(config, dt, filters, schedules)
 
     def reset(self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0) -> None:
         """As `Estimator.reset`; a latency is looked for anew."""
         super().reset(sensors, first)
-        self.behind = self.filters.copy()
-        self._rows, self._waiting = np.zeros((0, FAST_WIDTH)), np.zeros((0, _PLACE + 1))
-        self._search = Search(columns_of(self._found), self.dt) if self._found else None
+        self.delayed_filters = self.filters.copy()
+        self._rows, self._waiting = np.zeros((0, FAST_WIDTH)), np.zeros((0, _INDEX_COLUMN + 1))
+        self._search = (
+            LatencySearch(find_columns(self._unknown_channel), self.dt)
+            if self._unknown_channel
+            else None
+        )
         if self._search:
-            self._search.begin(self.behind, self._rows, self._waiting)
+            self._search.begin(self.delayed_filters, self._rows, self._waiting)
 
     @property
     def _lags(self) -> dict[int, int]:
         """Ticks by column."""
-        found = self._search
-        return self._known | (dict.fromkeys(found.columns, found.lag) if found else {})
+        search = self._search
+        return self._fixed_lags | (dict.fromkeys(search.columns, search.lag) if search else {})
 
     @property
-    def _longest(self) -> int:
-        """Ticks by which `behind` is behind."""
+    def _max_lag(self) -> int:
+        """Ticks by which `delayed_filters` is behind."""
         search = self._search
-        return max(*self._lags.values(), search.longest if search and not search.done else 0)
+        return max(*self._lags.values(), search.max_lag if search and not search.done else 0)
 
     def _receive(self, packet: Array) -> None:
         self.take(np.zeros((0, FAST_WIDTH)), 0, packet[None], 1)
@@ -83,70 +87,81 @@ class LateEstimator(Estimator):
         S: Array = EMPTY,
         nis: Array = NO_NIS,
     ) -> None:
-        """As `Estimator.take`; a packet that `behind` uses in a later call has no NIS."""
-        left: Array = np.column_stack((packets[:count], np.arange(float(count))))
-        self._waiting[:, _PLACE] = -1.0
+        """As `Estimator.take`; a packet that `delayed_filters` uses in a later call has no NIS."""
+        remaining: Array = np.column_stack((packets[:count], np.arange(float(count))))
+        self._waiting[:, _INDEX_COLUMN] = -1.0
         tick, start = self.tick, 0
-        while start < rows or len(left):
+        while start < rows or len(remaining):
             stop = min(start + 1, rows) if len(X) else rows
             if self._search and not self._search.done:
-                stop = min(stop, start + self._search.until_look())
-            here = ~(left[:, PACKET.arrived] > tick + stop) | (stop == rows)
-            self._move(fast[start:stop], left[here], tick + stop, nis)
-            left = left[~here]
+                stop = min(stop, start + self._search.count_until_look())
+            is_due = ~(remaining[:, PACKET.arrived] > tick + stop) | (stop == rows)
+            self._update_delayed(fast[start:stop], remaining[is_due], tick + stop, nis)
+            remaining = remaining[~is_due]
             if len(X) and stop > start:
-                self._go_ahead()
+                self._predict_current()
                 X[start] = self.x
-                S[start] = deviations(self.P)
+                S[start] = compute_std(self.P)
             start = stop
         if not len(X):
-            self._go_ahead()
-        self.filters["counts"] = self.behind["counts"]
+            self._predict_current()
+        self.filters["counts"] = self.delayed_filters["counts"]
 
-    def _move(self, fast: Array, packets: Array, now: int, nis: Array) -> None:
-        """Take rows up to the tick `now`, and packets: `behind` what is due there."""
+    def _update_delayed(self, fast: Array, packets: Array, now: int, nis: Array) -> None:
+        """Take rows up to the tick `now`, and packets: `delayed_filters` what is due there."""
         rows = np.concatenate((self._rows, fast))
-        due = max(len(rows) - self._longest, 0)
-        came = np.concatenate((self._waiting, packets))
-        arrived = came[:, PACKET.arrived]
-        later = (arrived > now - len(rows) + due) & (arrived <= now)  # others are to be counted
-        self._rows, self._waiting = rows[due:], came[later]
-        self._pass_on(aligned(rows, self._lags)[:due], came[~later], nis)
+        n_due = max(len(rows) - self._max_lag, 0)
+        pending = np.concatenate((self._waiting, packets))
+        arrived = pending[:, PACKET.arrived]
+        is_later = (arrived > now - len(rows) + n_due) & (
+            arrived <= now
+        )  # others are to be counted
+        self._rows, self._waiting = rows[n_due:], pending[is_later]
+        self._process_delayed(align_rows(rows, self._lags)[:n_due], pending[~is_later], nis)
         if self._search and not self._search.done:
             self._search.take(fast, packets)
-            self.behind[:] = self._search.look(self.behind, self._rows, self._waiting, self.gains)
+            self.delayed_filters[:] = self._search.look(
+                self.delayed_filters, self._rows, self._waiting, self.gains
+            )
 
-    def _pass_on(self, fast: Array, handed: Array, nis: Array) -> None:
-        """Rows and packets to `behind`."""
-        packets, own = np.ascontiguousarray(handed[:, :_PLACE]), np.full(len(handed), np.nan)
+    def _process_delayed(self, fast: Array, pending: Array, nis: Array) -> None:
+        """Rows and packets to `delayed_filters`."""
+        packets, pending_nis = (
+            np.ascontiguousarray(pending[:, :_INDEX_COLUMN]),
+            np.full(len(pending), np.nan),
+        )
         if len(fast):
-            record = fast, len(fast), packets, len(packets), 0, EMPTY, EMPTY, own
-            advance_entry()(self.behind, self.gains, *record)
+            record = fast, len(fast), packets, len(packets), 0, EMPTY, EMPTY, pending_nis
+            compile_advance()(self.delayed_filters, self.gains, *record)
         else:
             for packet in packets:
-                receive_entry()(self.behind, self.gains, packet)
+                compile_process_packet()(self.delayed_filters, self.gains, packet)
         if len(nis):
-            new = handed[:, _PLACE] >= 0.0
-            nis[handed[new, _PLACE].astype(int)] = own[new]
+            is_new = pending[:, _INDEX_COLUMN] >= 0.0
+            nis[pending[is_new, _INDEX_COLUMN].astype(int)] = pending_nis[is_new]
 
-    def _go_ahead(self) -> None:
-        """From `behind` to now, with what has come."""
-        now, then = (
-            each.view(np.uint8).reshape(len(each), -1) for each in (self.filters, self.behind)
+    def _predict_current(self) -> None:
+        """From `delayed_filters` to now, with what has come."""
+        current, delayed = (
+            records.view(np.uint8).reshape(len(records), -1)
+            for records in (self.filters, self.delayed_filters)
         )
-        short = self.config.delay == "clone" and not self._f.store_predictions
-        used = _HISTORY if short else None
-        now[:, :used] = then[:, :used]
+        skip_history = self.config.delay == "clone" and not self._f.store_predictions
+        end = _HISTORY_OFFSET if skip_history else None
+        current[:, :end] = delayed[:, :end]
         if len(self._rows):
-            rows = aligned(self._rows, self._lags)
-            packets = np.ascontiguousarray(self._waiting[:, :_PLACE])
+            rows = align_rows(self._rows, self._lags)
+            packets = np.ascontiguousarray(self._waiting[:, :_INDEX_COLUMN])
             record = rows, len(rows), packets, len(packets), 0, EMPTY, EMPTY, NO_NIS
-            advance_entry()(self.filters, self.gains, *record)
+            compile_advance()(self.filters, self.gains, *record)
 
     @property
     def latency(self) -> dict[str, float]:
         """Seconds by channel, as they are in force."""
-        return {each: self._lags[columns_of(each)[0]] * self.dt for each in self.config.latency}
+        return {
+            channel: self._lags[find_columns(channel)[0]] * self.dt
+            for channel in self.config.latency
+        }
 
     @property
     def latency_sd(self) -> float:
@@ -155,10 +170,10 @@ class LateEstimator(Estimator):
 
     def get_state(self) -> Any:
         """As `Estimator.get_state`."""
-        state = self.filters, self.behind, self._rows, self._waiting, self._search
+        state = self.filters, self.delayed_filters, self._rows, self._waiting, self._search
         return copy.deepcopy(state)
 
     def set_state(self, snapshot: Any) -> None:
         """As `Estimator.set_state`."""
-        filters, behind, self._rows, self._waiting, self._search = copy.deepcopy(snapshot)
-        self.filters[:], self.behind[:] = filters, behind
+        filters, delayed_filters, self._rows, self._waiting, self._search = copy.deepcopy(snapshot)
+        self.filters[:], self.delayed_filters[:] = filters, delayed_filters

@@ -8,13 +8,13 @@ from typing import Any, overload
 from ..envs.sensors.link import SlowSensor
 from ..envs.ticks import TICK
 from ..envs.vehicle.vehicle import COMS
-from ..envs.vehicle.vehicles import VehicleSource, vehicle_from
-from .design.assemble import alone, assemble, told_tyres
-from .design.config import configure
+from ..envs.vehicle.vehicles import VehicleSource, make_vehicle
+from .design.assemble import assemble, remove_tyre_states, select_first_sensor
+from .design.config import parse_config
 from .estimator import Estimator
 from .filters import FILTERS
 from .late import LateEstimator
-from .protocol import EstimatorFactory, ForeignEstimator, label_of
+from .protocol import EstimatorFactory, ForeignEstimator, get_label
 from .registry import Registry
 
 
@@ -39,7 +39,7 @@ def make_estimator(
 
     name: of `FILTERS`; or a registered name, an entry point "package.module:Name", a class in a
     file, "FILE.py:Name", or a factory, which is called with the arguments below: what it builds
-    comes as a `ForeignEstimator`. vehicle: the filter's, as `vehicle_from` takes it. sensors: the
+    comes as a `ForeignEstimator`. vehicle: the filter's, as `make_vehicle` takes it. sensors: the
     slow sensors that are there, by name ("camera", "gps"). dt: seconds of a tick. speed: m/s if it
     is held; None measures it with the front wheels. options: of a filter of `FILTERS`, those that
     `FilterConfig` lists.
@@ -51,22 +51,28 @@ def make_estimator(
         that exclude each other, a filter that diverges.
     TypeError: unknown option.
     """
-    there, own = dict(sensors or {}), label_of(name)
+    available, label = dict(sensors or {}), get_label(name)
     if not dt > 0.0:
-        raise ValueError(f"{own}: a tick of {dt!r} s")
+        raise ValueError(f"{label}: a tick of {dt!r} s")
     if not (isinstance(name, str) and name in FILTERS):
         factory = ESTIMATORS.load(name) if isinstance(name, str) else name
-        built = factory(vehicle=vehicle_from(vehicle), sensors=there, dt=dt, speed=speed, **options)
-        return built if isinstance(built, Estimator) else ForeignEstimator(built, own, dt, there)
+        built = factory(
+            vehicle=make_vehicle(vehicle), sensors=available, dt=dt, speed=speed, **options
+        )
+        return (
+            built if isinstance(built, Estimator) else ForeignEstimator(built, label, dt, available)
+        )
     if speed is not None and not 0.0 <= speed < math.inf:
         raise ValueError(f"{name}: speed is in m/s and not negative, got {speed!r}")
-    config = configure(name, FILTERS[name], there, options)
-    car = vehicle_from(vehicle)
+    config = parse_config(name, FILTERS[name], available, options)
+    car = make_vehicle(vehicle)
     layers, schedules = assemble(config, car, dt, speed)
     estimator = (LateEstimator if config.latency else Estimator)(config, dt, layers, schedules)
-    several = len(config.sensors) > 1  # no cycle of both to check
-    checked = told_tyres(alone(config) if several else config)
-    estimator.check(layers if checked is config else assemble(checked, car, dt, speed)[0])
+    is_multi_sensor = len(config.sensors) > 1  # no cycle of both to check
+    checked_config = remove_tyre_states(select_first_sensor(config) if is_multi_sensor else config)
+    estimator.check(
+        layers if checked_config is config else assemble(checked_config, car, dt, speed)[0]
+    )
     return estimator
 
 

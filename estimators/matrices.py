@@ -6,7 +6,7 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 
-def matrix(name: str, value: npt.ArrayLike) -> Array:
+def parse_matrix(name: str, value: npt.ArrayLike) -> Array:
     """A finite matrix; ValueError for anything else."""
     M = np.array(value, np.float64)
     if M.ndim != 2 or not M.size or not np.isfinite(M).all():
@@ -14,7 +14,7 @@ def matrix(name: str, value: npt.ArrayLike) -> Array:
     return M
 
 
-def vector(name: str, value: npt.ArrayLike, n: int) -> Array:
+def parse_vector(name: str, value: npt.ArrayLike, n: int) -> Array:
     """A finite vector (n,), or a number that stands for n equal ones; ValueError otherwise."""
     v = np.array(value, np.float64)
     v = np.full(n, v) if v.ndim == 0 else v
@@ -23,30 +23,32 @@ def vector(name: str, value: npt.ArrayLike, n: int) -> Array:
     return v
 
 
-def square(name: str, value: npt.ArrayLike, n: int) -> Array:
+def parse_square(name: str, value: npt.ArrayLike, n: int) -> Array:
     """A finite (n, n), from that, its diagonal (n,) or a number on it; ValueError otherwise."""
     M = np.array(value, np.float64)
-    M = np.diag(vector(name, M, n)) if M.ndim < 2 else M
+    M = np.diag(parse_vector(name, M, n)) if M.ndim < 2 else M
     if M.shape != (n, n) or not np.isfinite(M).all():
         raise ValueError(f"{name} is finite and has shape ({n}, {n}) or ({n},), got {value!r}")
     return M
 
 
-def check_covariance(what: str, M: Array, definite: bool = False) -> None:
+def check_covariance(name: str, M: Array, definite: bool = False) -> None:
     """ValueError unless M is finite, symmetric and positive semidefinite (or definite)."""
     if not np.isfinite(M).all():
-        raise ValueError(f"{what} is not finite")
+        raise ValueError(f"{name} is not finite")
     if not np.allclose(M, M.T, rtol=1e-9, atol=0.0):
-        raise ValueError(f"{what} is not symmetric")
-    least = np.linalg.eigvalsh(M).min(initial=np.inf)
-    if least < -1e-12 * np.abs(M).max(initial=1e-300):
-        raise ValueError(f"{what} is indefinite: its least eigenvalue is {least:.3g}")
-    if definite and not least > 0.0:
-        raise ValueError(f"{what} must be positive definite: its least eigenvalue is {least:.3g}")
+        raise ValueError(f"{name} is not symmetric")
+    min_eigenvalue = np.linalg.eigvalsh(M).min(initial=np.inf)
+    if min_eigenvalue < -1e-12 * np.abs(M).max(initial=1e-300):
+        raise ValueError(f"{name} is indefinite: its least eigenvalue is {min_eigenvalue:.3g}")
+    if definite and not min_eigenvalue > 0.0:
+        raise ValueError(
+            f"{name} must be positive definite: its least eigenvalue is {min_eigenvalue:.3g}"
+        )
 
 
-def covariance(name: str, value: npt.ArrayLike, n: int, definite: bool = False) -> Array:
+def parse_covariance(name: str, value: npt.ArrayLike, n: int, definite: bool = False) -> Array:
     """A covariance (n, n), from that, its diagonal (n,) or a number on it; ValueError otherwise."""
-    M = square(name, value, n)
+    M = parse_square(name, value, n)
     check_covariance(name, M, definite)
     return M

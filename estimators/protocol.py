@@ -73,16 +73,16 @@ class ForeignEstimator:
     def __init__(
         self, inner: EstimatorLike, name: str, dt: float, sensors: Mapping[str, SlowSensor]
     ) -> None:
-        missing = [each for each in ("names", "reset", "step") if not hasattr(inner, each)]
-        if missing:
+        missing_members = [word for word in ("names", "reset", "step") if not hasattr(inner, word)]
+        if missing_members:
             raise TypeError(
-                f"{name} is no estimator: {type(inner).__name__} has no {', '.join(missing)}; "
-                "see sideslip.estimators.EstimatorLike"
+                f"{name} is no estimator: {type(inner).__name__} has no "
+                f"{', '.join(missing_members)}; see sideslip.estimators.EstimatorLike"
             )
         self.inner, self.name, self.dt, self.sensors = inner, name, dt, dict(sensors)
         self.names = () if isinstance(inner.names, str) else tuple(inner.names)
-        words = all(isinstance(each, str) and each for each in self.names)
-        if not (self.names and words and len(set(self.names)) == len(self.names)):
+        are_words = all(isinstance(word, str) and word for word in self.names)
+        if not (self.names and are_words and len(set(self.names)) == len(self.names)):
             raise ValueError(f"{name}: names are distinct words, one a state, got {inner.names!r}")
         self.units = tuple(STATES.get(state, FOREIGN_STATE).unit for state in self.names)
 
@@ -98,14 +98,14 @@ class ForeignEstimator:
     @property
     def x(self) -> Array:
         """The states now, (n,); ValueError for another shape, TypeError where there are none."""
-        return self._checked("x", (len(self.names),))
+        return self._read_member("x", (len(self.names),))
 
     @property
     def P(self) -> Array:
         """Their covariance now, (n, n); errors as those of `x`."""
-        return self._checked("P", (len(self.names),) * 2)
+        return self._read_member("P", (len(self.names),) * 2)
 
-    def _checked(self, member: str, shape: tuple[int, ...]) -> Array:
+    def _read_member(self, member: str, shape: tuple[int, ...]) -> Array:
         try:
             value = np.array(getattr(self.inner, member), np.float64)
         except (AttributeError, TypeError, ValueError) as error:
@@ -133,7 +133,7 @@ class ForeignEstimator:
         x, std = np.empty((2, len(record.fast), len(self.names)))
         for k, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):
             self.step(record.fast[k : k + 1], record.packets[start:end])
-            x[k], std[k] = self.x, deviations(self.P)
+            x[k], std[k] = self.x, compute_std(self.P)
         nis = np.full(len(record.packets), np.nan)
         return Estimates(np.asarray(record.ticks * record.dt, np.float64), x, std, self.names, nis)
 
@@ -149,15 +149,15 @@ class ForeignEstimator:
         return f"<{self.name}: {', '.join(self.names)}>"
 
 
-def label_of(source: Any) -> str:
+def get_label(source: Any) -> str:
     """What messages call an estimator or its factory: a name, or that of its class."""
     if isinstance(source, str):
         return source
-    ours = getattr(source, "name", None)
-    own = ours if isinstance(ours, str) else getattr(source, "__qualname__", None)
-    return str(own or type(source).__name__)
+    name = getattr(source, "name", None)
+    label = name if isinstance(name, str) else getattr(source, "__qualname__", None)
+    return str(label or type(source).__name__)
 
 
-def deviations(P: Array) -> Array:
+def compute_std(P: Array) -> Array:
     """Standard deviations (n,) of a covariance (n, n); NaN stays."""
     return np.sqrt(np.maximum(np.diag(P), 0.0))

@@ -5,7 +5,7 @@ import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
-from ..envs.arguments import unknown_names
+from ..envs.arguments import describe_unknown
 from .user_files import is_user_file, load_user_class
 
 Factory = Callable[..., Any]
@@ -17,9 +17,9 @@ class Registry:
     kind: what they make, for messages. ours: the package's own. Iterates over all names.
     """
 
-    def __init__(self, kind: str, ours: Mapping[str, Factory | str]) -> None:
+    def __init__(self, kind: str, builtin: Mapping[str, Factory | str]) -> None:
         self._kind = kind
-        self._factories: dict[str, Factory | str] = dict(ours)
+        self._factories: dict[str, Factory | str] = dict(builtin)
 
     def register(self, name: str, factory: Factory | str) -> None:
         """Make a name known; the same factory once more changes nothing.
@@ -34,7 +34,7 @@ class Registry:
             raise ValueError(f"the name of an {self._kind} has letters and no colon, got {name!r}")
         if isinstance(factory, str):
             if not is_user_file(factory):
-                _parts(factory)
+                _split_entry_point(factory)
         elif not callable(factory):
             raise TypeError(
                 f"{name!r}: a factory is callable or 'package.module:Name', "
@@ -57,8 +57,8 @@ class Registry:
         if is_user_file(factory):
             return load_user_class(factory)
         if ":" in factory:
-            return imported(factory)
-        raise ValueError(unknown_names(self._kind, [name], [*self._factories, *others]))
+            return import_entry_point(factory)
+        raise ValueError(describe_unknown(self._kind, [name], [*self._factories, *others]))
 
     def __contains__(self, name: object) -> bool:
         return name in self._factories
@@ -70,24 +70,24 @@ class Registry:
         return iter(tuple(self._factories))
 
 
-def _parts(entry_point: str) -> tuple[str, str]:
+def _split_entry_point(entry_point: str) -> tuple[str, str]:
     module, _, name = entry_point.partition(":")
     if not all(word.isidentifier() for word in (*module.split("."), *name.split("."))):
         raise ValueError(f"an entry point is 'package.module:Name', got {entry_point!r}")
     return module, name
 
 
-def imported(entry_point: str) -> Factory:
+def import_entry_point(entry_point: str) -> Factory:
     """What stands at "package.module:Name"; errors as `Registry.load`."""
-    module, name = _parts(entry_point)
+    module, name = _split_entry_point(entry_point)
     try:
-        found = importlib.import_module(module)
+        imported_module = importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # a module that it needs is missing
         raise ValueError(f"{entry_point!r}: there is no module {error.name!r}") from None
     try:
-        factory = operator.attrgetter(name)(found)
+        factory = operator.attrgetter(name)(imported_module)
     except AttributeError:
         raise ValueError(f"{entry_point!r}: the module {module!r} has no {name!r}") from None
     if not callable(factory):
@@ -95,10 +95,14 @@ def imported(entry_point: str) -> Factory:
     return factory  # type: ignore[no-any-return]
 
 
-def entry_point_of(factory: Factory) -> str | None:
-    """ "package.module:Name" of a factory that `imported` finds there, else None."""
+def find_entry_point(factory: Factory) -> str | None:
+    """ "package.module:Name" of a factory that `import_entry_point` finds there, else None."""
     text = f"{getattr(factory, '__module__', '')}:{getattr(factory, '__qualname__', '')}"
     try:
-        return text if not text.startswith("__main__:") and imported(text) is factory else None
+        return (
+            text
+            if not text.startswith("__main__:") and import_entry_point(text) is factory
+            else None
+        )
     except (TypeError, ValueError):
         return None

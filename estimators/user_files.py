@@ -9,13 +9,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-ENDING = ".py"
+SUFFIX = ".py"
 _PREFIX = "sideslip_user_file_"  # of the modules' names
 
 
 def is_user_file(text: str) -> bool:
     """Whether it is "FILE.py" or "FILE.py:Name"."""
-    return text.endswith(ENDING) or text.rpartition(":")[0].endswith(ENDING)
+    return text.endswith(SUFFIX) or text.rpartition(":")[0].endswith(SUFFIX)
 
 
 def find_class(text: str) -> tuple[Path, str]:
@@ -24,7 +24,7 @@ def find_class(text: str) -> tuple[Path, str]:
     Raises FileNotFoundError where there is no such file; ValueError, with file and line, for what
     is no Python, has no such name, or defines no class or several and none is named.
     """
-    file, _, name = (text, "", "") if text.endswith(ENDING) else text.rpartition(":")
+    file, _, name = (text, "", "") if text.endswith(SUFFIX) else text.rpartition(":")
     path = Path(file)
     if not path.is_file():
         raise FileNotFoundError(f"{text!r}: there is no file {path}")
@@ -35,16 +35,16 @@ def find_class(text: str) -> tuple[Path, str]:
     except ValueError as error:  # a null byte
         raise ValueError(f"{path} is no Python: {error}") from None
     classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
-    classes = [each for each in classes if not each.startswith("_")]
-    there = f"it defines {', '.join(classes) or 'no class'}"
-    if name and name not in set(_bound(tree)):
-        raise ValueError(f"{path} has no {name!r}; {there}")
+    classes = [class_name for class_name in classes if not class_name.startswith("_")]
+    definitions = f"it defines {', '.join(classes) or 'no class'}"
+    if name and name not in set(_iterate_bindings(tree)):
+        raise ValueError(f"{path} has no {name!r}; {definitions}")
     if not name and len(classes) != 1:
-        raise ValueError(f"say what of {path} is meant, as {path}:NAME; {there}")
+        raise ValueError(f"say what of {path} is meant, as {path}:NAME; {definitions}")
     return path, name or classes[0]
 
 
-def _bound(tree: ast.Module) -> Iterator[str]:
+def _iterate_bindings(tree: ast.Module) -> Iterator[str]:
     """The names that a file binds somewhere."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ClassDef | ast.FunctionDef):
@@ -64,7 +64,7 @@ def load_user_class(text: str) -> Callable[..., Any]:
     """
     path, name = find_class(text)
     try:
-        factory = getattr(_module(path.resolve()), name)
+        factory = getattr(_load_module(path.resolve()), name)
     except AttributeError:
         raise ValueError(f"{path} has no {name!r} once it is run") from None
     if not callable(factory):
@@ -72,7 +72,7 @@ def load_user_class(text: str) -> Callable[..., Any]:
     return factory  # type: ignore[no-any-return]
 
 
-def _module(path: Path) -> ModuleType:
+def _load_module(path: Path) -> ModuleType:
     content = path.read_bytes()
     name = f"{_PREFIX}{path.stem}_{hashlib.sha256(str(path).encode() + content).hexdigest()[:12]}"
     if name in sys.modules:
@@ -86,15 +86,15 @@ def _module(path: Path) -> ModuleType:
         spec.loader.exec_module(module)
     except Exception as error:
         del sys.modules[name]
-        raise ValueError(f"{path} cannot be loaded: {reason_of(error)}") from error
+        raise ValueError(f"{path} cannot be loaded: {describe_error(error)}") from error
     return module
 
 
-def reason_of(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """An error's kind and text, and the line of the user's file in which it arose, if it did."""
-    text, place, trace = f"{type(error).__name__}: {error}", "", error.__traceback__
+    text, location, trace = f"{type(error).__name__}: {error}", "", error.__traceback__
     while trace is not None:
         if str(trace.tb_frame.f_globals.get("__name__", "")).startswith(_PREFIX):
-            place = f" ({Path(trace.tb_frame.f_code.co_filename).name}, line {trace.tb_lineno})"
+            location = f" ({Path(trace.tb_frame.f_code.co_filename).name}, line {trace.tb_lineno})"
         trace = trace.tb_next
-    return text + place
+    return text + location

@@ -23,22 +23,22 @@ import sideslip.benchmarks.control.calibration
 import sideslip.benchmarks.entrants.baselines
 import sideslip.estimators.learned.files
 from sideslip.agents import make_agent
-from sideslip.agents.learned.files import load_policy, shipped
+from sideslip.agents.learned.files import list_shipped, load_policy
 from sideslip.agents.live import datagrams, session
 from sideslip.agents.rollout import rollout
 from sideslip.agents.tuned import read_tuned
-from sideslip.benchmarks.control.contests import Measured, read_contests
+from sideslip.benchmarks.control.contests import TaskMeasurement, read_tasks
 from sideslip.benchmarks.entrants.baselines import read_baselines
-from sideslip.benchmarks.harness.results import Row, read_json
-from sideslip.benchmarks.recorded.wires import Wires, wires_of
+from sideslip.benchmarks.harness.results import ResultRow, read_json
+from sideslip.benchmarks.recorded.wires import SignalCalibration, read_wires
 from sideslip.envs.recordings.columns import COLUMNS
-from sideslip.envs.scenarios.manoeuvres import scenario_from
+from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.envs.scenarios.scenario import Scenario
 from sideslip.envs.sensors.camera.pinhole import Pinhole
 from sideslip.envs.vehicle.vehicle import Vehicle
-from sideslip.envs.vehicle.vehicles import WIRES, vehicle_from
+from sideslip.envs.vehicle.vehicles import WIRE_TABLES, make_vehicle
 from sideslip.estimators import EstimateObservation
-from sideslip.estimators.learned.network_file import architecture_of
+from sideslip.estimators.learned.network_file import describe_network
 from sideslip.estimators.wrappers.truth import TruthObservation
 
 OLD = Path(__file__).parent / "files/old"
@@ -65,17 +65,20 @@ def names_now() -> dict[str, list[str]]:
     calibration = sideslip.benchmarks.control.calibration
     return {
         "policy card": fields_of(sideslip.agents.learned.card.Card),
-        "network": list(architecture_of(load_policy(shipped()[0]).network)),
+        "network": list(describe_network(load_policy(list_shipped()[0]).network)),
         "correction card": fields_of(sideslip.estimators.learned.files.CorrectionCard),
         "scenario": fields_of(Scenario),
         "vehicle": fields_of(Vehicle),
-        "wires": [*WIRES, *fields_of(Wires)],
+        "wires": [*WIRE_TABLES, *fields_of(SignalCalibration)],
         "camera": fields_of(Pinhole),
         "log columns": list(COLUMNS),
-        "rows": fields_of(Row),
-        "contests": fields_of(Measured),
-        "calibration": [*fields_of(calibration.Entry), *fields_of(calibration.Episode)],
-        "baselines": fields_of(sideslip.benchmarks.entrants.baselines.Entry),
+        "rows": fields_of(ResultRow),
+        "contests": fields_of(TaskMeasurement),
+        "calibration": [
+            *fields_of(calibration.CalibrationRecord),
+            *fields_of(calibration.ClairvoyantEpisode),
+        ],
+        "baselines": fields_of(sideslip.benchmarks.entrants.baselines.BaselineRecord),
         "session": list(session._SETUP),
         "datagrams": [name for kind in datagrams.FIELDS.values() for name in kind],
         "info": sorted(info),
@@ -102,10 +105,10 @@ def test_names_that_stand_in_files_are_what_they_were() -> None:
 
 def test_a_scenario_a_vehicle_with_its_wires_and_a_camera_are_read() -> None:
     noisy = {"base": "gust", "duration": 0.5, "noise": {"gyro": 0.01}}
-    assert scenario_from(OLD / "scenario.toml") == scenario_from(noisy)
-    car, coms = vehicle_from(OLD / "vehicle.toml").to_dict(), vehicle_from("coms").to_dict()
+    assert make_scenario(OLD / "scenario.toml") == make_scenario(noisy)
+    car, coms = make_vehicle(OLD / "vehicle.toml").to_dict(), make_vehicle("coms").to_dict()
     assert car == pytest.approx(coms, nan_ok=True)
-    assert wires_of(OLD / "vehicle.toml") == Wires(
+    assert read_wires(OLD / "vehicle.toml") == SignalCalibration(
         15.2, -1, 0.01, {"gps": 0.2}, {"gyro_noise": 0.01}
     )
     camera = Pinhole.read(OLD / "camera.json")
@@ -113,13 +116,15 @@ def test_a_scenario_a_vehicle_with_its_wires_and_a_camera_are_read() -> None:
 
 
 def test_rows_and_a_session_are_read() -> None:
-    row = Row("control", "tier 1", "cost_vs_nominal", 0.5, "", "none", 0.4, 0.6, 12, salt="ab12")
+    row = ResultRow(
+        "control", "tier 1", "cost_vs_nominal", 0.5, "", "none", 0.4, 0.6, 12, salt="ab12"
+    )
     assert read_json(OLD / "rows.json") == [row]
     assert session.read_setup(OLD / "session.slip")["estimator"] == "exact-kf"
-    (block,) = session.blocks_of(OLD / "session.slip")
+    (block,) = session.read_blocks(OLD / "session.slip")
     found = [datagrams.decode(arrival.data) for batch in block.batches for arrival in batch]
     kinds = [getattr(each, "kind", each) for each in found]
-    assert kinds == [datagrams.Kind.INERTIAL, datagrams.Kind.END]
+    assert kinds == [datagrams.DatagramKind.INERTIAL, datagrams.DatagramKind.END]
 
 
 @pytest.mark.parametrize(
@@ -135,9 +140,9 @@ def test_a_spec_makes_its_environment(file: str, wrapper: type) -> None:
 
 
 def test_what_the_package_ships_is_read() -> None:
-    assert all(load_policy(name).card.env_id for name in shipped())
+    assert all(load_policy(name).card.env_id for name in list_shipped())
     calibrated = sideslip.benchmarks.control.calibration.read_calibration()
-    assert calibrated and read_contests() and read_baselines() and read_tuned()
+    assert calibrated and read_tasks() and read_baselines() and read_tuned()
 
 
 @pytest.mark.parametrize(("algo", "action"), [("ppo", 0.012264779), ("gradient", -0.5908138)])
@@ -159,7 +164,7 @@ def test_a_training_goes_on_from_its_checkpoint(
     folder = shutil.copytree(OLD / "training", tmp_path / "training")
     state = read_state(folder / train.CHECKPOINT)
     monkeypatch.setattr(train, "__version__", state["sideslip"])
-    task = train.task_in(folder)
+    task = train.read_task(folder)
     found = train.train(task, state["steps"], folder, resume=True)
     assert [each.steps for each in found.evaluations] == [0, 16]
     assert found.model.num_timesteps == 16

@@ -13,7 +13,7 @@ FLOORS = ("envs", "estimators", "agents", "benchmarks")
 SOURCES = [path for floor in FLOORS for path in sorted((ROOT / floor).rglob("*.py"))]
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 FACES = [path for path in SOURCES if path.name == "__init__.py"]
-MOST_LINES, MOST_MODULES = 300, 14
+MOST_LINES, MOST_MODULES = 450, 14
 DATA = {"golden"}  # folders beside tests that hold what these compare with
 
 
@@ -22,7 +22,7 @@ def name(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
-def test_no_file_is_longer_than_three_hundred_lines() -> None:
+def test_no_file_is_longer_than_450_lines() -> None:
     lines = {name(path): path.read_text().count("\n") for path in (*SOURCES, *TESTS)}
     assert len(lines) > 250
     assert {path: count for path, count in lines.items() if count > MOST_LINES} == {}

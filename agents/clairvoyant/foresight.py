@@ -7,25 +7,29 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.backend.arrays import read
-from ...envs.backend.decorators import plain
-from ...envs.engine.arrays import Row
-from ...envs.engine.layout import Drive, P, Task, Z
-from ...envs.engine.step import kind_of, step_vehicle
-from ...envs.engine.tick import Kind
-from ...envs.engine.window import programmed, window_of
-from ...envs.scenarios.roads import NOMINAL_PATH, Lead, laid_by
-from ...envs.scenarios.speed import Pace, acceleration_command, wanted_motion
-from ...envs.scenarios.wind import wind_at
+from ...envs.backend.decorators import as_python
+from ...envs.engine.arrays import EpisodeArrays
+from ...envs.engine.layout import ActuatorState, P, TaskParams, Z
+from ...envs.engine.step import make_step_variant, step_vehicle
+from ...envs.engine.tick import StepVariant
+from ...envs.engine.window import compute_profile_angle, make_window
+from ...envs.scenarios.roads import NOMINAL_PATH, NominalMotion, step_nominal_car
+from ...envs.scenarios.speed import (
+    SpeedProfile,
+    compute_acceleration_command,
+    compute_speed_reference,
+)
+from ...envs.scenarios.wind import compute_wind
 from ...envs.task.info import REPORT
-from ...envs.task.reference import Target
+from ...envs.task.reference import ReferenceParams
 from ...envs.ticks import FOREVER, TICK
-from ...envs.vehicle.actuators import Lag, lag_of, lagged
-from ...envs.vehicle.dynamics import Car, Road
+from ...envs.vehicle.actuators import Lag, apply_lag, make_lag
+from ...envs.vehicle.dynamics import CarParams, RoadParams
 
 Array = npt.NDArray[np.float64]
 
 
-class Known(NamedTuple):
+class PreviewStep(NamedTuple):
     """Inputs and parameters of one step of the plan that no action changes, or hardly
     (`beta_ref`, `gamma_ref`); `command` and `weight` are of the step's start."""
 
@@ -41,14 +45,14 @@ class Known(NamedTuple):
     mu: Any
     mu_r: Any
     speed: Any  # m/s, the driver's set point
-    ahead: Any  # m/s2, the driver's acceleration, fed forward
+    acceleration: Any  # m/s2, the driver's acceleration, fed forward
     turn: Any  # rad/s, of a road that is laid tick by tick
     weight: Any  # s for which the cost rate at the start counts
     beta_ref: Any  # rad, of a reference with a memory; of the step's start
     gamma_ref: Any  # rad/s
 
 
-class State(NamedTuple):
+class PlanState(NamedTuple):
     """States of a plan: motion, actuators, the driver's integral."""
 
     v_x: Any
@@ -69,24 +73,24 @@ class State(NamedTuple):
     added: Any
 
 
-class Fixed(NamedTuple):
+class PlanParams(NamedTuple):
     """Parameters that are constant within an episode; hashable, so that they are a solver's key.
 
-    car: with zeros for the fields of `Known`. motor, steering: of a step; motor_tick,
+    car: with zeros for the fields of `PreviewStep`. motor, steering: of a step; motor_tick,
     steering_tick: of a tick. ticks: of a step, a control period. periods: of the episode. width:
     of the action.
     """
 
-    car: Car
-    road: Road
-    pace: Pace
+    car: CarParams
+    road: RoadParams
+    speed_profile: SpeedProfile
     motor: Lag
     steering: Lag
     motor_tick: Lag
     steering_tick: Lag
-    target: Target
-    task: Task
-    kind: Kind
+    target: ReferenceParams
+    task: TaskParams
+    kind: StepVariant
     width: int
     ticks: int
     periods: int
@@ -100,13 +104,13 @@ class Forecast:
     tick 0. driver: (periods, n) rad, the driver's command at every tick.
     """
 
-    fixed: Fixed
+    fixed: PlanParams
     known: Array
-    start: State
+    start: PlanState
     driver: Array
 
 
-def forecast_of(base: Any, actions: Array | None = None) -> Forecast:
+def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
     """The rest of an episode that was just reset.
 
     base: the unwrapped env at tick 0. actions: (K, width), none: zero; a driver who reacts to the
@@ -118,55 +122,61 @@ def forecast_of(base: Any, actions: Array | None = None) -> Forecast:
     p, z = snapshot["params"], snapshot["state"]
     if z[Z.clock.tick] != 0.0:
         raise ValueError("a forecast starts at an episode's start: call reset() first")
-    start = state_of(z)
-    fixed = _fixed(base, p, snapshot["config"].start.switches, n)
+    start = read_plan_state(z)
+    fixed = _make_plan_params(base, p, snapshot["config"].start.switches, n)
     ticks = fixed.periods * n
     if actions is None:
         actions = np.zeros((fixed.periods, fixed.width))
-    drive, driver, refs = _driven(base, snapshot, actions, n)
+    drive, driver, refs = _simulate_actions(base, snapshot, actions, n)
     command = driver
-    if not fixed.kind.follows and base.scenario.steering != "wander":
-        command = np.array([programmed(p, float(k)) for k in range(ticks + 1)])
-    known = _known(p, fixed, drive, command, refs)
+    if not fixed.kind.has_driver and base.scenario.steering != "wander":
+        command = np.array([compute_profile_angle(p, float(k)) for k in range(ticks + 1)])
+    known = _compute_preview(p, fixed, drive, command, refs)
     return Forecast(fixed, known, start, command[:-1].reshape(-1, n))
 
 
-def state_of(z: Array) -> State:
+def read_plan_state(z: Array) -> PlanState:
     """The State in a packed state vector of the env."""
     motion, drive = read(z, Z.motion), read(z, Z.drive)
-    return State._make((*motion, drive.T_l, drive.T_r, drive.integral, drive.slewing, drive.added))
+    return PlanState._make(
+        (*motion, drive.T_l, drive.T_r, drive.integral, drive.slewing, drive.added)
+    )
 
 
-def _fixed(base: Any, p: Array, switches: Any, ticks: int) -> Fixed:
+def _make_plan_params(base: Any, p: Array, switches: Any, ticks: int) -> PlanParams:
     vehicle, lags = base.vehicle, base.scenario.lags
     motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
     task = read(p, P.task)
-    return Fixed(
+    return PlanParams(
         read(p, P.car)._replace(C_f=0.0, C_r=0.0, mu=0.0, mu_r=0.0),
         read(p, P.road),
-        read(p, P.pace)._replace(speed=0.0, acceleration=0.0, start=0.0, end=FOREVER, surge=0.0),
-        lag_of(motor, ticks * TICK),
-        lag_of(steering, ticks * TICK),
-        lag_of(motor, TICK),
-        lag_of(steering, TICK),
+        read(p, P.speed_profile)._replace(
+            speed=0.0, acceleration=0.0, start=0.0, end=FOREVER, surge=0.0
+        ),
+        make_lag(motor, ticks * TICK),
+        make_lag(steering, ticks * TICK),
+        make_lag(motor, TICK),
+        make_lag(steering, TICK),
         read(p, P.target),
         task,
-        plain(kind_of)(p, switches),
+        as_python(make_step_variant)(p, switches),
         base.action_space.shape[0],
         ticks,
         -int(-task.duration // ticks),
     )
 
 
-def _driven(base: Any, snapshot: Any, actions: Array, n: int) -> tuple[Array, Array, Array]:
+def _simulate_actions(
+    base: Any, snapshot: Any, actions: Array, n: int
+) -> tuple[Array, Array, Array]:
     """(K n + 1, len(Drive)), the driver's angle (K n + 1,) and the references (K n + 1, 2): the
     env's own ticks under actions.
 
     Disturbances, and a programme's front wheels without the added angle, do not depend on them.
     """
-    z, window = snapshot["state"], window_of(1)
+    z, window = snapshot["state"], make_window(1)
     bounds = np.array([[entry.low, entry.high] for entry in base.layout]).T.copy()
-    row = Row(
+    row = EpisodeArrays(
         p=snapshot["params"],
         z=z,
         switches=snapshot["switches"],
@@ -175,91 +185,102 @@ def _driven(base: Any, snapshot: Any, actions: Array, n: int) -> tuple[Array, Ar
         packets=snapshot["packets"],
         report=np.zeros(len(REPORT)),
     )
-    taken = np.repeat(np.vstack([actions, actions[-1:]]).astype(np.float32), n, axis=0)
+    held_actions = np.repeat(np.vstack([actions, actions[-1:]]).astype(np.float32), n, axis=0)
     ticks = n * len(actions)
-    drive, driver = np.empty((ticks + 1, len(Drive._fields))), np.empty(ticks + 1)
+    drive, driver = np.empty((ticks + 1, len(ActuatorState._fields))), np.empty(ticks + 1)
     refs = np.empty((ticks + 1, 2))
     for tick in range(ticks + 1):
         drive[tick] = read(z, Z.drive)
         driver[tick], refs[tick] = z[Z.driver], read(z, Z.refs)
-        step_vehicle(*row, taken[tick], 1, bounds, window)
+        step_vehicle(*row, held_actions[tick], 1, bounds, window)
     # a car thrown about may leave the numbers
     return np.nan_to_num(drive), np.nan_to_num(driver), np.nan_to_num(refs)
 
 
-def _known(p: Array, fixed: Fixed, drive: Array, command: Array, refs: Array) -> Array:
+def _compute_preview(
+    p: Array, fixed: PlanParams, drive: Array, command: Array, refs: Array
+) -> Array:
     """(len(Known), steps of the plan + 1)."""
     q, last = fixed.ticks, len(command) - 1
-    at = np.arange(0, last, q)
-    names = Drive._fields
+    nodes = np.arange(0, last, q)
+    names = ActuatorState._fields
     angle = drive[:, names.index("delta_f")] - drive[:, names.index("added")]
 
-    def wheels(ticks: Any, rest: float) -> Array:
+    def compute_wheel_angle(ticks: Any, rest: float) -> Array:
         """The front wheels without the added angle, once `rest` of a tick's deviation is left."""
-        return np.asarray(plain(lagged)(command[ticks], angle[ticks], rest))
+        return np.asarray(as_python(apply_lag)(command[ticks], angle[ticks], rest))
 
-    lag, middle = fixed.steering_tick, at + q // 2
+    lag, middle = fixed.steering_tick, nodes + q // 2
     wind = read(p, P.wind)
-    blown = np.array([wind_at(float(tick), wind) for tick in range(last)])
+    wind_forces = np.array([compute_wind(float(tick), wind) for tick in range(last)])
     forces = np.column_stack(
         [drive[:last, names.index("F_d")], drive[:last, names.index("N_d")], np.zeros(last)]
     )
-    push = (forces + blown).reshape(-1, q, 3).mean(axis=1)
-    pace = np.array([_set_point(float(tick), read(p, P.pace)) for tick in at])
-    car, change = read(p, P.car), read(p, P.change)
-    worn = at >= change.tick
+    mean_forces = (forces + wind_forces).reshape(-1, q, 3).mean(axis=1)
+    set_points = np.array(
+        [_compute_set_point(float(tick), read(p, P.speed_profile)) for tick in nodes]
+    )
+    car, change = read(p, P.car), read(p, P.tyre_change)
+    is_changed = nodes >= change.tick
     tyres = [
-        np.where(worn, factor * stiffness, stiffness)
+        np.where(is_changed, factor * stiffness, stiffness)
         for factor, stiffness in ((change.front, car.C_f), (change.rear, car.C_r))
     ]
     table = (
-        wheels(at, lag.start),
-        wheels(middle, lag.middle if q % 2 else lag.start),
-        wheels(at + q - 1, lag.end),
-        command[at],
-        *push.T,
+        compute_wheel_angle(nodes, lag.start),
+        compute_wheel_angle(middle, lag.middle if q % 2 else lag.start),
+        compute_wheel_angle(nodes + q - 1, lag.end),
+        command[nodes],
+        *mean_forces.T,
         *tyres,
-        *(np.full(len(at), value) for value in (car.mu, car.mu_r)),
-        *pace.T,
-        _turns(p, fixed.kind, command[:last]).reshape(-1, q).mean(axis=1),
-        _weights(at, fixed),
-        *refs[at].T,
+        *(np.full(len(nodes), value) for value in (car.mu, car.mu_r)),
+        *set_points.T,
+        _compute_road_turns(p, fixed.kind, command[:last]).reshape(-1, q).mean(axis=1),
+        _compute_weights(nodes, fixed),
+        *refs[nodes].T,
     )
-    known = np.array(Known._make(table))
+    known = np.array(PreviewStep._make(table))
     end = known[:, -1:].copy()  # of the episode's end only command, references and weight count
-    end[Known._fields.index("command")] = command[last]
-    end[Known._fields.index("beta_ref") :, 0] = refs[last]
-    end[Known._fields.index("weight")] = (
+    end[PreviewStep._fields.index("command")] = command[last]
+    end[PreviewStep._fields.index("beta_ref") :, 0] = refs[last]
+    end[PreviewStep._fields.index("weight")] = (
         0.5 * (q + 1) * TICK if last == fixed.task.duration else 0.0
     )
     return np.hstack([known, end])
 
 
-def _turns(p: Array, kind: Kind, command: Array) -> Array:
+def _compute_road_turns(p: Array, kind: StepVariant, command: Array) -> Array:
     """(ticks,) rad/s, by how much the road turns in each tick, where a nominal car lays it."""
-    turns, lead = np.zeros(len(command)), Lead(0.0, 0.0)
+    turns, path = np.zeros(len(command)), NominalMotion(0.0, 0.0)
     if kind.road == NOMINAL_PATH:
-        pace, leader = read(p, P.pace), read(p, P.leader)
-        wanted, laid = plain(wanted_motion), plain(laid_by)
+        speed_profile, nominal_car = read(p, P.speed_profile), read(p, P.nominal_car)
+        compute_motion, follow_path = (
+            as_python(compute_speed_reference),
+            as_python(step_nominal_car),
+        )
         for tick, steer in enumerate(command):
-            turns[tick], lead = laid(lead, steer, wanted(float(tick), pace)[0], leader)
+            turns[tick], path = follow_path(
+                path, steer, compute_motion(float(tick), speed_profile)[0], nominal_car
+            )
     return turns
 
 
-def _set_point(tick: float, pace: Pace) -> tuple[float, float]:
+def _compute_set_point(tick: float, speed_profile: SpeedProfile) -> tuple[float, float]:
     """The driver's (speed in m/s, acceleration in m/s2 fed forward) at a tick."""
-    bare = pace._replace(hold=1.0, k_p=0.0, k_i=0.0)
-    ahead = acceleration_command(tick, 0.0, 0.0, bare, np.inf)[0]
-    both = acceleration_command(tick, 0.0, 0.0, bare._replace(k_p=1.0), np.inf)[0]
-    return both - ahead, ahead
+    feedforward_profile = speed_profile._replace(hold=1.0, k_p=0.0, k_i=0.0)
+    feedforward = compute_acceleration_command(tick, 0.0, 0.0, feedforward_profile, np.inf)[0]
+    total = compute_acceleration_command(
+        tick, 0.0, 0.0, feedforward_profile._replace(k_p=1.0), np.inf
+    )[0]
+    return total - feedforward, feedforward
 
 
-def _weights(at: npt.NDArray[np.int_], fixed: Fixed) -> Array:
+def _compute_weights(nodes: npt.NDArray[np.int_], fixed: PlanParams) -> Array:
     """Seconds for which the cost rate at each step's start stands in the sum over ticks 1 .. T.
 
     The sum over every q-th tick by the trapezoid rule, its end apart; exact for q = 1.
     """
     q = fixed.ticks
-    weights = np.where(at < fixed.task.duration, q * TICK, 0.0)
+    weights = np.where(nodes < fixed.task.duration, q * TICK, 0.0)
     weights[0] = 0.5 * (q - 1) * TICK
     return np.asarray(weights)

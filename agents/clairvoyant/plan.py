@@ -17,20 +17,20 @@ import numpy.typing as npt
 
 from ...envs.engine.layout import P
 from ..controllers.base import Controller
-from ..rollout import steps_of
-from .foresight import Forecast, State, forecast_of, state_of
-from .slopes import INPUTS, Problem, Trajectory, limits_along, problem_of, slopes_along
-from .sweep import sweep
+from ..rollout import iterate_steps
+from .foresight import Forecast, PlanState, make_forecast, read_plan_state
+from .slopes import N_INPUTS, IlqrProblem, Trajectory, compute_limits, linearise_run, make_problem
+from .sweep import run_backward_pass
 
 Array = npt.NDArray[np.float64]
 Actions = npt.NDArray[np.float32]
 
-LENGTHS = (1.0, 0.4, 0.1)  # of a step, tried in turn
-DAMPING = 1e-2  # of the first sweep
-DAMPINGS = (1e-8, 1e4)  # the least, and the one at which no step is left to try
-FACTOR = 4.0  # between dampings
-MOST_SWEEPS = 60
-SLOW = (1e-3, 3)  # so little gained, relative, in so many steps in a row: settled
+STEP_LENGTHS = (1.0, 0.4, 0.1)  # of a step, tried in turn
+FIRST_DAMPING = 1e-2  # of the first sweep
+DAMPING_LIMITS = (1e-8, 1e4)  # the least, and the one at which no step is left to try
+DAMPING_FACTOR = 4.0  # between dampings
+MAX_ITERATIONS = 60
+STALL_RULE = (1e-3, 3)  # so little gained, relative, in so many steps in a row: settled
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Plan:
     """Actions (K, width) for an episode, the best run that a start led to.
 
     cost: of the run in the env. status: "settled", "stuck" (no step was cheaper) or "stopped"
-    (after `MOST_SWEEPS` steps). seconds: of CPU time.
+    (after `MAX_ITERATIONS` steps). seconds: of CPU time.
     """
 
     actions: Actions
@@ -48,7 +48,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Run:
+class PlanRun:
     """The env's run of actions; length: periods until it ended."""
 
     trajectory: Trajectory
@@ -56,111 +56,119 @@ class Run:
     length: int
 
 
-def drive(
-    env: gym.Env[Any, Any], seed: int, actions: Array, follow: tuple[Array, Array] | None = None
-) -> Run:
+def simulate_run(
+    env: gym.Env[Any, Any], seed: int, actions: Array, feedback: tuple[Array, Array] | None = None
+) -> PlanRun:
     """One episode in the env. follow: (states, gains) to which the actions are corrected."""
     env.reset(seed=seed)
     base: Any = env.unwrapped
-    taken = np.array(actions, np.float32)
-    states, cost, length = np.empty((len(actions) + 1, len(State._fields))), 0.0, 0
-    states[0] = state_of(base.get_state()["state"])
-    for k in range(len(taken)):
-        if follow is not None:
-            planned, gains = follow
+    applied = np.array(actions, np.float32)
+    states, cost, length = np.empty((len(actions) + 1, len(PlanState._fields))), 0.0, 0
+    states[0] = read_plan_state(base.get_state()["state"])
+    for k in range(len(applied)):
+        if feedback is not None:
+            planned, gains = feedback
             corrected = actions[k] - gains[k] @ (states[k] - planned[k])
-            taken[k] = np.clip(corrected, -1.0, 1.0)
-        _, reward, terminated, truncated, _ = env.step(taken[k])
+            applied[k] = np.clip(corrected, -1.0, 1.0)
+        _, reward, terminated, truncated, _ = env.step(applied[k])
         cost -= float(reward)
-        states[k + 1 :] = state_of(base.get_state()["state"])
+        states[k + 1 :] = read_plan_state(base.get_state()["state"])
         length = k + 1
         if terminated or truncated:
             break
-    return Run(Trajectory(states, taken.astype(np.float64)), cost, length)
+    return PlanRun(Trajectory(states, applied.astype(np.float64)), cost, length)
 
 
-def replay(env: gym.Env[Any, Any], seed: int, actions: npt.ArrayLike) -> float:
+def evaluate_actions(env: gym.Env[Any, Any], seed: int, actions: npt.ArrayLike) -> float:
     """The cost of actions (K, width) in an episode of the env."""
-    return drive(env, seed, np.asarray(actions, np.float64)).cost
+    return simulate_run(env, seed, np.asarray(actions, np.float64)).cost
 
 
-def plan(env: gym.Env[Any, Any], seed: int, start: npt.ArrayLike | None = None) -> Plan:
+def solve_ilqr(env: gym.Env[Any, Any], seed: int, start: npt.ArrayLike | None = None) -> Plan:
     """The best that can be found for an episode from a start.
 
     start: actions (K, width), None: zero. Raises ModuleNotFoundError without the extra `mpc`.
     """
-    began = time.process_time()
+    start_time = time.process_time()
     env.reset(seed=seed)
-    forecast = forecast_of(env.unwrapped)
+    forecast = make_forecast(env.unwrapped)
     shape = (forecast.fixed.periods, forecast.fixed.width)
     actions = np.zeros(shape) if start is None else np.asarray(start, np.float64)
     if actions.shape != shape:
         raise ValueError(f"a plan of this episode has shape {shape}, got {actions.shape}")
     best, status = _search(env, seed, forecast, actions)
-    taken = best.trajectory.actions.astype(np.float32)
-    return Plan(taken, best.cost, status, time.process_time() - began)
+    applied = best.trajectory.actions.astype(np.float32)
+    return Plan(applied, best.cost, status, time.process_time() - start_time)
 
 
 def _search(
     env: gym.Env[Any, Any], seed: int, forecast: Forecast, actions: Array
-) -> tuple[Run, str]:
+) -> tuple[PlanRun, str]:
     """The best run that the steps from a start lead to, and how they ended."""
-    problem, best, damping, slow = problem_of(forecast.fixed), drive(env, seed, actions), DAMPING, 0
-    for sweeps in range(MOST_SWEEPS):
-        if forecast.fixed.kind.follows:  # the driver answers to the newest run
+    problem, best, damping, n_stalled = (
+        make_problem(forecast.fixed),
+        simulate_run(env, seed, actions),
+        FIRST_DAMPING,
+        0,
+    )
+    for iteration in range(MAX_ITERATIONS):
+        if forecast.fixed.kind.has_driver:  # the driver answers to the newest run
             env.reset(seed=seed)
-            forecast = forecast_of(env.unwrapped, best.trajectory.actions)
-        before = best.cost
-        best, damping = _improve(env, seed, problem, forecast, best, damping)
-        if best.cost >= before:
-            return best, "settled" if sweeps else "stuck"
-        slow = slow + 1 if best.cost > before * (1.0 - SLOW[0]) else 0
-        if slow == SLOW[1]:
+            forecast = make_forecast(env.unwrapped, best.trajectory.actions)
+        previous_cost = best.cost
+        best, damping = _run_line_search(env, seed, problem, forecast, best, damping)
+        if best.cost >= previous_cost:
+            return best, "settled" if iteration else "stuck"
+        n_stalled = n_stalled + 1 if best.cost > previous_cost * (1.0 - STALL_RULE[0]) else 0
+        if n_stalled == STALL_RULE[1]:
             return best, "settled"
     return best, "stopped"
 
 
-def _improve(
+def _run_line_search(
     env: gym.Env[Any, Any],
     seed: int,
-    problem: Problem,
+    problem: IlqrProblem,
     forecast: Forecast,
-    run: Run,
+    run: PlanRun,
     damping: float,
-) -> tuple[Run, float]:
+) -> tuple[PlanRun, float]:
     """(the first cheaper run, the damping for the next step); the run itself where none is."""
     fixed, size = problem.fixed, len(problem.names)
-    at = _realised(problem, run.trajectory)
-    slopes = slopes_along(problem, forecast.known, at)
-    limits = limits_along(problem, forecast, at)
-    inputs = np.zeros((fixed.periods, INPUTS))
-    inputs[:, : fixed.width] = at.actions
+    nominal_run = _use_achieved_steering(problem, run.trajectory)
+    slopes = linearise_run(problem, forecast.known, nominal_run)
+    limits = compute_limits(problem, forecast, nominal_run)
+    inputs = np.zeros((fixed.periods, N_INPUTS))
+    inputs[:, : fixed.width] = nominal_run.actions
     d, G = np.empty_like(inputs), np.empty((*inputs.shape, size))
-    gains = np.zeros((fixed.periods, fixed.width, len(State._fields)))
-    while damping < DAMPINGS[1]:
-        sweep(slopes, limits, inputs, run.length, damping, d, G)
-        gains[:, :, problem.at] = -G[:, : fixed.width] / problem.scale
-        for length in LENGTHS:
-            wanted = at.actions + length * d[:, : fixed.width]
-            tried = drive(env, seed, wanted, (at.states, gains))
-            if tried.cost < run.cost:
-                factor = {LENGTHS[0]: 1.0 / FACTOR, LENGTHS[-1]: FACTOR}.get(length, 1.0)
-                return tried, max(damping * factor, DAMPINGS[0])
-        damping *= FACTOR
+    gains = np.zeros((fixed.periods, fixed.width, len(PlanState._fields)))
+    while damping < DAMPING_LIMITS[1]:
+        run_backward_pass(slopes, limits, inputs, run.length, damping, d, G)
+        gains[:, :, problem.state_indices] = -G[:, : fixed.width] / problem.scale
+        for length in STEP_LENGTHS:
+            candidate = nominal_run.actions + length * d[:, : fixed.width]
+            trial = simulate_run(env, seed, candidate, (nominal_run.states, gains))
+            if trial.cost < run.cost:
+                factor = {
+                    STEP_LENGTHS[0]: 1.0 / DAMPING_FACTOR,
+                    STEP_LENGTHS[-1]: DAMPING_FACTOR,
+                }.get(length, 1.0)
+                return trial, max(damping * factor, DAMPING_LIMITS[0])
+        damping *= DAMPING_FACTOR
     return run, damping
 
 
-def _realised(problem: Problem, run: Trajectory) -> Trajectory:
+def _use_achieved_steering(problem: IlqrProblem, run: Trajectory) -> Trajectory:
     """A run whose steering asks for no more than it got: the slopes know no limit of its rate."""
-    if run.actions.shape[1] < INPUTS:
+    if run.actions.shape[1] < N_INPUTS:
         return run
-    actions, column = run.actions.copy(), State._fields.index("slewing")
+    actions, column = run.actions.copy(), PlanState._fields.index("slewing")
     actions[:, 1] = run.states[1:, column] / problem.fixed.task.authority
     return Trajectory(run.states, actions)
 
 
 @dataclass(frozen=True)
-class Ceiling:
+class ClairvoyantResult:
     """The best run found of an episode.
 
     winner: a label of costs. costs: of every start's own run ("two-dof") and of the plan from it
@@ -175,49 +183,51 @@ class Ceiling:
     seconds: float
 
 
-def ceiling(
+def compute_clairvoyant(
     env: gym.Env[Any, Any], seed: int, starts: Mapping[str, npt.ArrayLike] | None = None
-) -> Ceiling:
+) -> ClairvoyantResult:
     """The best of the plans from other methods' runs, and of those runs themselves.
 
     starts: actions (K, width) by method; without any the plan starts from zero. A method that no
     plan beats is the ceiling.
     """
-    began, base = time.process_time(), env.unwrapped
+    start_time, base = time.process_time(), env.unwrapped
     env.reset(seed=seed)
-    shape = (_periods(base), *(base.action_space.shape or ()))
-    tried: dict[str, Actions] = {"none": np.zeros(shape, np.float32)}
-    tried |= {name: np.asarray(actions, np.float32) for name, actions in (starts or {}).items()}
-    costs = {name: replay(env, seed, actions) for name, actions in tried.items()}
-    plans = {name: plan(env, seed, tried[name]) for name in starts or tried}
-    for name, made in plans.items():
-        tried[f"from {name}"], costs[f"from {name}"] = made.actions, made.cost
+    shape = (_count_periods(base), *(base.action_space.shape or ()))
+    candidates: dict[str, Actions] = {"none": np.zeros(shape, np.float32)}
+    candidates |= {
+        name: np.asarray(actions, np.float32) for name, actions in (starts or {}).items()
+    }
+    costs = {name: evaluate_actions(env, seed, actions) for name, actions in candidates.items()}
+    plans = {name: solve_ilqr(env, seed, candidates[name]) for name in starts or candidates}
+    for name, solved in plans.items():
+        candidates[f"from {name}"], costs[f"from {name}"] = solved.actions, solved.cost
     winner = min(costs, key=lambda label: costs[label])
-    return Ceiling(
-        tried[winner],
+    return ClairvoyantResult(
+        candidates[winner],
         costs[winner],
         winner,
         costs,
-        {name: made.status for name, made in plans.items()},
-        time.process_time() - began,
+        {name: solved.status for name, solved in plans.items()},
+        time.process_time() - start_time,
     )
 
 
-def actions_of(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
+def record_actions(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
     """(K, width): the actions of an agent in an episode; zeros after a failure."""
     base: Any = env.unwrapped
-    _, *steps = steps_of(env, agent, seed)
-    taken = np.zeros((_periods(base), *base.action_space.shape), np.float32)
-    taken[: len(steps)] = [step.action for step in steps]
-    return taken
+    _, *steps = iterate_steps(env, agent, seed)
+    actions = np.zeros((_count_periods(base), *base.action_space.shape), np.float32)
+    actions[: len(steps)] = [step.action for step in steps]
+    return actions
 
 
-def _periods(base: Any) -> int:
+def _count_periods(base: Any) -> int:
     """Control periods of the episode that was last reset."""
     return -int(-base.get_state()["params"][P.task.duration] // base.control_period)
 
 
-class Replay(Controller):
+class PlanReplay(Controller):
     """A plan as an agent: the actions of one episode, whatever is observed; zeros after them.
 
     actions: (K, width) shares of full scale.

@@ -4,53 +4,61 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 
-from ...envs.backend.decorators import plain
-from ...envs.backend.on_casadi import SYMBOLS, symbolic
-from ...envs.engine.tick import load_at, torques
+from ...envs.backend.decorators import as_python
+from ...envs.backend.on_casadi import SYMBOLS, to_casadi
+from ...envs.engine.tick import compute_lagged_load, compute_motor_torques
 from ...envs.scenarios.roads import NOMINAL_PATH
-from ...envs.task.cost import cost_rate
-from ...envs.task.reference import LAGGED, reference
+from ...envs.task.cost import compute_cost_rate
+from ...envs.task.reference import LAGGED, compute_reference
 from ...envs.ticks import TICK
-from ...envs.vehicle.actuators import lagged, yaw_moment
-from ...envs.vehicle.dynamics import Motion, Push, sideslip_angle
+from ...envs.vehicle.actuators import apply_lag, compute_yaw_moment
+from ...envs.vehicle.dynamics import DisturbanceForces, Motion, compute_sideslip_angle
 from ...envs.vehicle.integration import rk4
-from .foresight import Fixed, Known, State
+from .foresight import PlanParams, PlanState, PreviewStep
 
-_rk4, _load_at, _torques = symbolic(rk4), symbolic(load_at), symbolic(torques)
-_slip, _lagged, _yaw_moment = symbolic(sideslip_angle), symbolic(lagged), symbolic(yaw_moment)
-_reference = symbolic(reference)
+_rk4, _load_at, _torques = (
+    to_casadi(rk4),
+    to_casadi(compute_lagged_load),
+    to_casadi(compute_motor_torques),
+)
+_slip, _apply_lag, _yaw_moment = (
+    to_casadi(compute_sideslip_angle),
+    to_casadi(apply_lag),
+    to_casadi(compute_yaw_moment),
+)
+_reference = to_casadi(compute_reference)
 # a sum of squares: without its cap and, for the sake of its slope at zero, its sign's guard
-_uncapped = plain(
-    cost_rate, SYMBOLS | {"minimum": lambda rate, cap: rate, "absolute": lambda rate: rate}
+_uncapped_cost_rate = as_python(
+    compute_cost_rate, SYMBOLS | {"minimum": lambda rate, cap: rate, "absolute": lambda rate: rate}
 )
 
 TORQUES = ("T_l", "T_r")
 
 
-class Step(NamedTuple):
+class PlanStep(NamedTuple):
     """The end of one step of the plan."""
 
-    state: State
+    state: PlanState
     effort: Any  # cost of the actuators' work within the step
     slewed: Any  # rad, by how much the added steering moved
 
 
-def carried(fixed: Fixed) -> tuple[str, ...]:
-    """The states that matter to the cost in an episode, in the order of `State`."""
+def list_active_states(fixed: PlanParams) -> tuple[str, ...]:
+    """The states that matter to the cost in an episode, in the order of `PlanState`."""
     road = fixed.road
-    needed = {"v_x", "v_y", "gamma", *TORQUES}
+    active = {"v_x", "v_y", "gamma", *TORQUES}
     if fixed.kind.roll:
-        needed |= {"phi", "phi_dot"}
-    if fixed.pace.hold and fixed.pace.k_i:
-        needed |= {"integral"}
+        active |= {"phi", "phi_dot"}
+    if fixed.speed_profile.hold and fixed.speed_profile.k_i:
+        active |= {"integral"}
     if fixed.width > 1:
-        needed |= {"slewing", "added"}
-    if road.curvature or road.across or road.along:
-        needed |= {"psi", "s", "y", "theta"}
-    return tuple(name for name in State._fields if name in needed)
+        active |= {"slewing", "added"}
+    if road.curvature or road.lateral or road.longitudinal:
+        active |= {"psi", "s", "y", "theta"}
+    return tuple(name for name in PlanState._fields if name in active)
 
 
-def node_errors(fixed: Fixed, x: State, known: Known) -> tuple[Any, Any]:
+def compute_node_errors(fixed: PlanParams, x: PlanState, known: PreviewStep) -> tuple[Any, Any]:
     """(e_beta, e_gamma) of the motion at a step's start."""
     kind = fixed.kind
     beta = _slip(x.v_x, x.v_y, kind.small_angle)
@@ -60,12 +68,12 @@ def node_errors(fixed: Fixed, x: State, known: Known) -> tuple[Any, Any]:
     return beta - beta_ref, x.gamma - gamma_ref
 
 
-def node_cost(fixed: Fixed, errors: tuple[Any, Any], known: Known) -> Any:
+def compute_node_cost(fixed: PlanParams, errors: tuple[Any, Any], known: PreviewStep) -> Any:
     """Cost of the errors at a step's start, without the cap, for the seconds it stands for."""
-    return known.weight * _uncapped(*errors, 0.0, 0.0, fixed.kind.reference)
+    return known.weight * _uncapped_cost_rate(*errors, 0.0, 0.0, fixed.kind.reference)
 
 
-def advance(fixed: Fixed, x: State, action: Any, known: Known) -> Step:
+def advance(fixed: PlanParams, x: PlanState, action: Any, known: PreviewStep) -> PlanStep:
     """One step of the plan: a Runge-Kutta step of the env's own plant over `fixed.ticks` ticks.
 
     action: shares of full scale, as the env takes them. The driver's acceleration is that of the
@@ -73,9 +81,11 @@ def advance(fixed: Fixed, x: State, action: Any, known: Known) -> Step:
     """
     car = fixed.car._replace(C_f=known.C_f, C_r=known.C_r, mu=known.mu, mu_r=known.mu_r)
     task, kind, q = fixed.task, fixed.kind, fixed.ticks
-    pace = fixed.pace._replace(speed=known.speed, acceleration=known.ahead)
+    speed_profile = fixed.speed_profile._replace(speed=known.speed, acceleration=known.acceleration)
     N_z = action[0] * task.yaw_scale
-    T_l, T_r, _, integral = _torques(N_z, 0.0, x.v_x, x.integral, pace, car, task.yaw_first)
+    T_l, T_r, _, integral = _torques(
+        N_z, 0.0, x.v_x, x.integral, speed_profile, car, task.yaw_first
+    )
     slewing = action[1] * task.authority if fixed.width > 1 else 0.0
     moved = slewing - x.slewing if fixed.width > 1 else 0.0
     # the angle moves at its full rate and then rests: its mean over the step
@@ -84,7 +94,7 @@ def advance(fixed: Fixed, x: State, action: Any, known: Known) -> Step:
     if kind.road == NOMINAL_PATH:
         road = road._replace(turn=known.turn)
     loads = tuple(
-        _load_at(angle + _lagged(extra, x.added, rest), T_l, T_r, x, motor_rest, car, kind)
+        _load_at(angle + _apply_lag(extra, x.added, rest), T_l, T_r, x, motor_rest, car, kind)
         for angle, rest, motor_rest in (
             (known.steer_start, steering.start, motor.start),
             (known.steer_middle, steering.middle, motor.middle),
@@ -94,7 +104,7 @@ def advance(fixed: Fixed, x: State, action: Any, known: Known) -> Step:
     motion = _rk4(
         Motion(*x[: len(Motion._fields)]),
         loads,
-        Push(known.F_d, known.N_d, known.N_x),
+        DisturbanceForces(known.F_d, known.N_d, known.N_x),
         car,
         road,
         q * TICK,
@@ -106,23 +116,25 @@ def advance(fixed: Fixed, x: State, action: Any, known: Known) -> Step:
     for tick in range(q):
         left, right = fixed.motor_tick, fixed.steering_tick
         rest = left.mean * left.end**tick
-        share = _yaw_moment(_lagged(T_l, x.T_l, rest), _lagged(T_r, x.T_r, rest), car)
-        added = _lagged(extra, x.added, right.mean * right.end**tick)
-        effort += TICK * _uncapped(0.0, 0.0, share / task.yaw_scale, added, kind.reference)
-    after = State._make(
+        share = _yaw_moment(_apply_lag(T_l, x.T_l, rest), _apply_lag(T_r, x.T_r, rest), car)
+        added = _apply_lag(extra, x.added, right.mean * right.end**tick)
+        effort += TICK * _uncapped_cost_rate(
+            0.0, 0.0, share / task.yaw_scale, added, kind.reference
+        )
+    next_state = PlanState._make(
         (
             *motion,
-            _lagged(T_l, x.T_l, motor.end),
-            _lagged(T_r, x.T_r, motor.end),
+            _apply_lag(T_l, x.T_l, motor.end),
+            _apply_lag(T_r, x.T_r, motor.end),
             x.integral + q * (integral - x.integral),
             slewing,
-            _lagged(extra, x.added, steering.end),
+            _apply_lag(extra, x.added, steering.end),
         )
     )
-    return Step(after, effort, moved)
+    return PlanStep(next_state, effort, moved)
 
 
-def scales(fixed: Fixed, names: tuple[str, ...]) -> list[float]:
+def get_state_scales(fixed: PlanParams, names: tuple[str, ...]) -> list[float]:
     """Physical units of one unit of each state in the solver: all are of order one."""
     small = {"phi": 0.1, "phi_dot": 0.5, "slewing": 0.1, "added": 0.1}
     return [fixed.car.T_max if name in TORQUES else small.get(name, 1.0) for name in names]

@@ -8,15 +8,21 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.decorators import plain
+from ...envs.backend.decorators import as_python
 from ...envs.backend.primitives import ARRAYS
-from ...envs.vehicle.actuators import within_stop
-from .foresight import Fixed, Forecast, Known, State
-from .plant import advance, carried, node_cost, node_errors, scales
+from ...envs.vehicle.actuators import limit_angle
+from .foresight import Forecast, PlanParams, PlanState, PreviewStep
+from .plant import (
+    advance,
+    compute_node_cost,
+    compute_node_errors,
+    get_state_scales,
+    list_active_states,
+)
 
 Array = npt.NDArray[np.float64]
 
-INPUTS = 2  # in a sweep: share of the moment and of the steering, which may be held at zero
+N_INPUTS = 2  # in a sweep: share of the moment and of the steering, which may be held at zero
 
 
 @dataclass(frozen=True)
@@ -28,7 +34,7 @@ class Trajectory:
     actions: Array
 
 
-class Slopes(NamedTuple):
+class Linearisation(NamedTuple):
     """Of n = len(names) + INPUTS variables, the states in their scales, then the inputs.
 
     F: (K, len(names), n), of the state after each period. g, H: (K + 1, n), (K + 1, n, n),
@@ -53,70 +59,76 @@ class Limits(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Problem:
+class IlqrProblem:
     """What is the same in every episode with the same Fixed."""
 
-    fixed: Fixed
+    fixed: PlanParams
     names: tuple[str, ...]
     scale: Array
     slopes: Any  # of CasADi, for all nodes at once
 
     @property
-    def at(self) -> list[int]:
+    def state_indices(self) -> list[int]:
         """Where the carried states stand in a State."""
-        return [State._fields.index(name) for name in self.names]
+        return [PlanState._fields.index(name) for name in self.names]
 
 
 @functools.lru_cache(maxsize=8)
-def problem_of(fixed: Fixed) -> Problem:
+def make_problem(fixed: PlanParams) -> IlqrProblem:
     """The functions, cached for each of the newest few kinds of episode."""
-    names = carried(fixed)
-    scale, size = np.array(scales(fixed, names)), len(names)
-    w, known = ca.SX.sym("w", size + fixed.width), ca.SX.sym("known", len(Known._fields))
-    zero = State(*(0.0,) * len(State._fields))
+    names = list_active_states(fixed)
+    scale, size = np.array(get_state_scales(fixed, names)), len(names)
+    w, known = ca.SX.sym("w", size + fixed.width), ca.SX.sym("known", len(PreviewStep._fields))
+    zero = PlanState(*(0.0,) * len(PlanState._fields))
     x = zero._replace(**{name: scale[i] * w[i] for i, name in enumerate(names)})
-    each = Known(*ca.vertsplit(known))
-    step = advance(fixed, x, ca.vertsplit(w[size:]), each)
-    after = ca.vertcat(*(getattr(step.state, name) for name in names)) / scale
-    e, errors = ca.SX.sym("e", 2), ca.vertcat(*node_errors(fixed, x, each))
-    curve, pull = ca.hessian(node_cost(fixed, (e[0], e[1]), each), e)
-    slope = ca.jacobian(errors, w)
-    work_curve, work_pull = ca.hessian(step.effort, w)  # a sum of squares of nearly linear terms
-    gradient = slope.T @ ca.substitute(pull, e, errors) + work_pull
-    hessian = slope.T @ curve @ slope + work_curve
-    node = ca.Function(
-        "node", [w, known], [ca.jacobian(after, w), gradient, hessian], {"cse": True}
+    step_inputs = PreviewStep(*ca.vertsplit(known))
+    step = advance(fixed, x, ca.vertsplit(w[size:]), step_inputs)
+    next_state = ca.vertcat(*(getattr(step.state, name) for name in names)) / scale
+    e, errors = ca.SX.sym("e", 2), ca.vertcat(*compute_node_errors(fixed, x, step_inputs))
+    error_hessian, error_gradient = ca.hessian(
+        compute_node_cost(fixed, (e[0], e[1]), step_inputs), e
     )
-    return Problem(fixed, names, scale, node.map(fixed.periods + 1))
+    error_jacobian = ca.jacobian(errors, w)
+    effort_hessian, effort_gradient = ca.hessian(
+        step.effort, w
+    )  # a sum of squares of nearly linear terms
+    gradient = error_jacobian.T @ ca.substitute(error_gradient, e, errors) + effort_gradient
+    hessian = error_jacobian.T @ error_hessian @ error_jacobian + effort_hessian
+    node = ca.Function(
+        "node", [w, known], [ca.jacobian(next_state, w), gradient, hessian], {"cse": True}
+    )
+    return IlqrProblem(fixed, names, scale, node.map(fixed.periods + 1))
 
 
-def slopes_along(problem: Problem, known: Array, run: Trajectory) -> Slopes:
+def linearise_run(problem: IlqrProblem, known: Array, run: Trajectory) -> Linearisation:
     """Of every period of a run; an input that the action lacks has none but its own square."""
     size, K, width = len(problem.names), problem.fixed.periods, problem.fixed.width
-    at = np.zeros((size + width, K + 1))
-    at[:size] = (run.states[:, problem.at] / problem.scale).T
-    at[size:, :K] = run.actions.T
-    some, n = size + width, size + INPUTS
-    F, g, H = (np.nan_to_num(value.full()) for value in problem.slopes(at, known))
-    made = Slopes(np.zeros((K, size, n)), np.zeros((K + 1, n)), np.tile(np.eye(n), (K + 1, 1, 1)))
-    made.F[:, :, :some] = F.reshape(size, K + 1, some).transpose(1, 0, 2)[:K]
-    made.g[:, :some] = g.T
-    made.H[:, :some, :some] = H.reshape(some, K + 1, some).transpose(1, 0, 2)
-    return made
+    points = np.zeros((size + width, K + 1))
+    points[:size] = (run.states[:, problem.state_indices] / problem.scale).T
+    points[size:, :K] = run.actions.T
+    n_used, n = size + width, size + N_INPUTS
+    F, g, H = (np.nan_to_num(value.full()) for value in problem.slopes(points, known))
+    result = Linearisation(
+        np.zeros((K, size, n)), np.zeros((K + 1, n)), np.tile(np.eye(n), (K + 1, 1, 1))
+    )
+    result.F[:, :, :n_used] = F.reshape(size, K + 1, n_used).transpose(1, 0, 2)[:K]
+    result.g[:, :n_used] = g.T
+    result.H[:, :n_used, :n_used] = H.reshape(n_used, K + 1, n_used).transpose(1, 0, 2)
+    return result
 
 
-def limits_along(problem: Problem, forecast: Forecast, run: Trajectory) -> Limits:
+def compute_limits(problem: IlqrProblem, forecast: Forecast, run: Trajectory) -> Limits:
     """Full scale, the stop of the wheels, and the steering's rate from where it stands in a run."""
     fixed, K = problem.fixed, problem.fixed.periods
-    low, high, zero = np.zeros((K, INPUTS)), np.zeros((K, INPUTS)), np.zeros(K)
+    low, high, zero = np.zeros((K, N_INPUTS)), np.zeros((K, N_INPUTS)), np.zeros(K)
     low[:, : fixed.width], high[:, : fixed.width] = -1.0, 1.0
-    if fixed.width < INPUTS:
+    if fixed.width < N_INPUTS:
         return Limits(low, high, zero, zero, 0, 0.0)
     task, column = fixed.task, problem.names.index("slewing")
-    inside = plain(within_stop, ARRAYS)
-    low[:, 1] = inside(-task.authority, forecast.driver, task.stop).max(axis=1) / task.authority
-    high[:, 1] = inside(task.authority, forecast.driver, task.stop).min(axis=1) / task.authority
-    stands = run.states[:K, State._fields.index("slewing")] / task.authority
-    most = task.slew * fixed.ticks / task.authority
+    clip_angle = as_python(limit_angle, ARRAYS)
+    low[:, 1] = clip_angle(-task.authority, forecast.driver, task.stop).max(axis=1) / task.authority
+    high[:, 1] = clip_angle(task.authority, forecast.driver, task.stop).min(axis=1) / task.authority
+    position = run.states[:K, PlanState._fields.index("slewing")] / task.authority
+    max_change = task.slew * fixed.ticks / task.authority
     slope = problem.scale[column] / task.authority
-    return Limits(low, high, stands - most, stands + most, column, slope)
+    return Limits(low, high, position - max_change, position + max_change, column, slope)

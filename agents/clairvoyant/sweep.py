@@ -12,7 +12,7 @@ from ...envs.backend.decorators import jit
 
 
 @jit
-def cheapest(Q: Any, q: Any, low: Any, high: Any) -> Any:
+def solve_input_qp(Q: Any, q: Any, low: Any, high: Any) -> Any:
     """(d_0, d_1, whether each is free): least q'd + d'Qd / 2 with low <= d <= high.
 
     Q: (2, 2), positive definite; the rest (2,).
@@ -22,31 +22,31 @@ def cheapest(Q: Any, q: Any, low: Any, high: Any) -> Any:
     y = (Q[0, 1] * q[0] - Q[0, 0] * q[1]) / det
     if low[0] < x < high[0] and low[1] < y < high[1]:
         return x, y, True, True
-    least, best, free = math.inf, np.zeros(2), np.zeros(2, np.bool_)
+    min_cost, best, free = math.inf, np.zeros(2), np.zeros(2, np.bool_)
     d = np.zeros(2)
     for i in range(2):
         for side in range(2):
             other = 1 - i
             d[i] = high[i] if side else low[i]
-            inside = -(q[other] + Q[0, 1] * d[i]) / Q[other, other]
-            d[other] = min(max(inside, low[other]), high[other])
+            interior = -(q[other] + Q[0, 1] * d[i]) / Q[other, other]
+            d[other] = min(max(interior, low[other]), high[other])
             cost = q @ d + 0.5 * (d @ (Q @ d))
-            if cost < least:
-                least = cost
+            if cost < min_cost:
+                min_cost = cost
                 best[:], free[:] = d, False
-                free[other] = d[other] == inside
+                free[other] = d[other] == interior
     return best[0], best[1], free[0], free[1]
 
 
 @jit
-def sweep(
+def run_backward_pass(
     slopes: Any, limits: Any, inputs: Any, length: int, damping: float, d: Any, G: Any
 ) -> None:
     """Fill d (K, 2) with the changes of the inputs and G (K, 2, size) with the gains on the state.
 
-    slopes: a `Slopes`. limits: a `Limits`. inputs: (K, 2), of the run. length: periods of the run;
-    behind it nothing changes. damping: added to the inputs' curvature. Where the steering is at the
-    end of its rate it follows the state it has come from.
+    slopes: a `Linearisation`. limits: a `Limits`. inputs: (K, 2), of the run. length: periods of
+    the run; behind it nothing changes. damping: added to the inputs' curvature. Where the steering
+    is at the end of its rate it follows the state it has come from.
     """
     size = slopes.F.shape[1]
     V, v = slopes.H[length][:size, :size].copy(), slopes.g[length][:size].copy()
@@ -62,7 +62,7 @@ def sweep(
             low[1] = min(max(limits.rate_low[k] - inputs[k, 1], low_1), high_1)
             high[1] = max(min(limits.rate_high[k] - inputs[k, 1], high_1), low_1)
         damped = Quu + damping * np.eye(2)
-        d[k, 0], d[k, 1], free_0, free_1 = cheapest(damped, q[size:], low, high)
+        d[k, 0], d[k, 1], free_0, free_1 = solve_input_qp(damped, q[size:], low, high)
         gain = G[k]
         if not free_1 and low_1 < d[k, 1] < high_1:
             gain[1, limits.column] = limits.slope

@@ -10,8 +10,8 @@ from .lqr import IN, Lqr
 from .nmpc import Nmpc
 
 TYRES = ("front_tyres_hat", "rear_tyres_hat")
-GRIP = "inverse_friction_hat"
-LEAST, MOST = 0.2, 1.2  # of the friction that is believed
+INVERSE_FRICTION = "inverse_friction_hat"
+MIN_FRICTION, MAX_FRICTION = 0.2, 1.2  # of the friction that is believed
 
 
 class AdaptiveLqr(Lqr):
@@ -26,14 +26,17 @@ class AdaptiveLqr(Lqr):
     def __init__(self, env: AnyEnv, grip: float | None = 0.7, **options: Any) -> None:
         super().__init__(env, stiffness=TYRES, grip=grip, **options)
 
-    def _more(self, names: set[str]) -> tuple[str, ...]:
-        return (*super()._more(names), *((GRIP,) if GRIP in names else ()))
+    def _list_extra_entries(self, names: set[str]) -> tuple[str, ...]:
+        return (
+            *super()._list_extra_entries(names),
+            *((INVERSE_FRICTION,) if INVERSE_FRICTION in names else ()),
+        )
 
-    def _friction(self, inputs: Array) -> Array:
-        if GRIP not in self.needs:
-            return super()._friction(inputs)
-        estimated = inputs[:, self.needs.index(GRIP)]
-        return np.asarray(1.0 / np.clip(estimated, 1.0 / MOST, 1.0 / LEAST))
+    def _get_friction(self, inputs: Array) -> Array:
+        if INVERSE_FRICTION not in self.needs:
+            return super()._get_friction(inputs)
+        estimated = inputs[:, self.needs.index(INVERSE_FRICTION)]
+        return np.asarray(1.0 / np.clip(estimated, 1.0 / MAX_FRICTION, 1.0 / MIN_FRICTION))
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         inputs[:, IN.front_stiffness] *= self.vehicle.front_stiffness

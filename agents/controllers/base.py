@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.decorators import jit, plain
+from ...envs.backend.decorators import as_python, jit
 from ...envs.backend.primitives import ARRAYS
-from ...envs.engine.packing import car_of
-from ...envs.vehicle.actuators import torque_limit
-from ...envs.vehicle.dynamics import Car
+from ...envs.engine.packing import make_car
+from ...envs.vehicle.actuators import compute_torque_limit
+from ...envs.vehicle.dynamics import CarParams
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
-from ..env_facts import AnyEnv, facts_of
+from ..env_facts import AnyEnv, get_env_facts
 
 Array = npt.NDArray[np.float64]
 
-_torque_limit = plain(torque_limit, ARRAYS)
+_torque_limit = as_python(compute_torque_limit, ARRAYS)
 FRICTION = "true_friction"  # the entry whose friction a grip limit goes by, where it is there
 
 
@@ -47,9 +47,9 @@ class Controller(ABC):
     _design: tuple[Any, ...] = ()  # the arguments of a compiled law behind inputs, state, action
 
     def __init__(self, env: AnyEnv, grip: float | None = None) -> None:
-        facts = facts_of(env)
+        facts = get_env_facts(env)
         names = [entry.name for entry in facts.layout]
-        self.grip = None if grip is None else positive("grip", grip)
+        self.grip = None if grip is None else check_positive("grip", grip)
         limits = grip is not None or self.knows_friction
         self._true_friction = limits and FRICTION in names
         if self._true_friction:
@@ -58,7 +58,7 @@ class Controller(ABC):
         if missing:
             raise ValueError(
                 f"{type(self).__name__} needs {', '.join(missing)} in the observation"
-                f"{_hint(missing)}"
+                f"{_describe_wrapper(missing)}"
             )
         self._columns = np.array([names.index(name) for name in self.needs], dtype=np.int64)
         self._width = len(names)
@@ -76,24 +76,24 @@ class Controller(ABC):
         return f"<{type(self).__name__} for {self.vehicle.name}{grip}; reads {reads}>"
 
     @cached_property
-    def _car(self) -> Car:
-        return car_of(self.vehicle)
+    def _car(self) -> CarParams:
+        return make_car(self.vehicle)
 
-    def _friction(self, inputs: Array) -> Array:
+    def _get_friction(self, inputs: Array) -> Array:
         """(N,) the friction that a grip limit goes by."""
         return inputs[:, -1] if self._true_friction else np.full(len(inputs), self.nominal.friction)
 
-    def _most(self, inputs: Array) -> Array:
+    def _compute_max_moment(self, inputs: Array) -> Array:
         """(N,) the largest yaw moment as a share of full scale: what the motors' power at the
         measured speed (columns 0 and 1, the front wheels) and `grip` leave of it."""
-        car, most = self.vehicle, np.ones(len(inputs))
+        car, max_moment = self.vehicle, np.ones(len(inputs))
         if car.motor_power > 0.0:
-            most = _torque_limit(inputs[:, :2].mean(axis=1), self._car) / car.motor_torque
+            max_moment = _torque_limit(inputs[:, :2].mean(axis=1), self._car) / car.motor_torque
         if self.grip is None:
-            return most
+            return max_moment
         load = car.mass * GRAVITY * car.front_arm / (2.0 * car.wheelbase)  # N, of a rear tyre
         per_friction = self.grip * load * car.rear_track / self.full_scale
-        return np.minimum(per_friction * self._friction(inputs), most)
+        return np.minimum(per_friction * self._get_friction(inputs), max_moment)
 
     @abstractmethod
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
@@ -104,10 +104,10 @@ class Controller(ABC):
         where the env has one, the added steering as a share of the vehicle's authority.
         """
 
-    def _not_finite(self, rows: Any, state: Array) -> None:  # noqa: B027
+    def _mark_not_finite(self, rows: Any, state: Array) -> None:  # noqa: B027
         """Note the rows (N,) whose inputs are not finite, in the state (N, memory) or elsewhere."""
 
-    def acted(self, state: Array, action: npt.NDArray[np.float32]) -> None:  # noqa: B027
+    def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:  # noqa: B027
         """Note in the state (N, memory) that the action taken (N, width) is not the own one."""
 
     def predict(
@@ -137,14 +137,14 @@ class Controller(ABC):
             inputs[bad] = 0.0
             self._law(inputs, memory, action)
             memory[bad], action[bad] = before, np.nan
-            self._not_finite(bad, memory)
+            self._mark_not_finite(bad, memory)
         else:
             self._law(inputs, memory, action)
         shares = np.clip(action, -1.0, 1.0).astype(np.float32)
         return (shares[0] if obs.ndim == 1 else shares), memory
 
 
-def _hint(missing: list[str]) -> str:
+def _describe_wrapper(missing: list[str]) -> str:
     """The wrapper whose observation has these entries."""
     if any(name.startswith("true_") for name in missing):
         return "; wrap the env in sideslip.estimators.wrappers.truth.TruthObservation"
@@ -153,19 +153,19 @@ def _hint(missing: list[str]) -> str:
     return ""
 
 
-def entries_of(env: AnyEnv) -> set[str]:
+def list_entry_names(env: AnyEnv) -> set[str]:
     """The names in the env's observation."""
-    return {entry.name for entry in facts_of(env).layout}
+    return {entry.name for entry in get_env_facts(env).layout}
 
 
-def positive(name: str, value: float) -> float:
+def check_positive(name: str, value: float) -> float:
     """The value; ValueError unless it is positive and finite."""
     if not 0.0 < value < math.inf:
         raise ValueError(f"{name} is a positive number, got {value!r}")
     return float(value)
 
 
-def not_negative(name: str, value: float) -> float:
+def check_not_negative(name: str, value: float) -> float:
     """The value; ValueError unless it is finite and zero or more."""
     if not 0.0 <= value < math.inf:
         raise ValueError(f"{name} is a number of zero or more, got {value!r}")
@@ -173,9 +173,9 @@ def not_negative(name: str, value: float) -> float:
 
 
 @jit
-def integrated(integral: Any, step: Any, wanted: Any, limited: Any) -> Any:
+def integrate_antiwindup(integral: Any, step: Any, unlimited: Any, limited: Any) -> Any:
     """An integral after a step, which is dropped where it would push further past the limit."""
-    if wanted == limited or (wanted > limited) != (step > 0.0):
+    if unlimited == limited or (unlimited > limited) != (step > 0.0):
         return integral + step
     return integral
 

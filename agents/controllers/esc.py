@@ -8,13 +8,20 @@ import numpy as np
 
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute, maximum
-from ...envs.task.reference import LIMITED, reference, target_of
+from ...envs.task.reference import LIMITED, compute_reference, make_reference_params
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import Vehicle
-from ..design.gain_schedule import SPEEDS, cell
-from ..design.nominal_car import nominal_car, plant_of
+from ..design.gain_schedule import SPEEDS, find_cell
+from ..design.nominal_car import compute_plant_python, make_nominal_car
 from ..env_facts import AnyEnv
-from .base import Array, Controller, entries_of, integrated, not_negative, positive
+from .base import (
+    Array,
+    Controller,
+    check_not_negative,
+    check_positive,
+    integrate_antiwindup,
+    list_entry_names,
+)
 
 BANDWIDTH = 16.0  # rad/s
 RELEASE = 0.5  # s, in which the integral is let go within the dead band
@@ -27,19 +34,21 @@ Inputs = namedtuple("Inputs", "wheel_left wheel_right steer_command gyro beta_ha
 IN = Inputs(*range(5))
 
 
-def yaw_gains(vehicle: Vehicle, speed: float, bandwidth: float = BANDWIDTH) -> tuple[float, float]:
+def compute_yaw_gains(
+    vehicle: Vehicle, speed: float, bandwidth: float = BANDWIDTH
+) -> tuple[float, float]:
     """(k_p, k_i) of the yaw moment on the yaw rate's error, N m s/rad and N m/rad.
 
     Both poles of the yaw equation with its own damping at the bandwidth: s^2 + (k_p / I - a22) s +
     k_i / I = (s + bandwidth)^2; where the damping alone is more, k_p is zero.
     """
     I = vehicle.yaw_inertia  # noqa: E741
-    a22 = plant_of(nominal_car(vehicle), speed).a22
+    a22 = compute_plant_python(make_nominal_car(vehicle), speed).a22
     return max(I * (2.0 * bandwidth + a22), 0.0), I * bandwidth * bandwidth
 
 
 @jit
-def beyond(value: Any, band: Any) -> Any:
+def apply_dead_zone(value: Any, band: Any) -> Any:
     """The part of a value outside of +-band, with its sign."""
     if value > band:
         return value - band
@@ -53,7 +62,7 @@ def _esc_law(
     x: Any,
     state: Any,
     action: Any,
-    most: Any,
+    max_moment: Any,
     target: Any,
     speeds: Any,
     gains: Any,
@@ -67,17 +76,17 @@ def _esc_law(
     """x: `Inputs`. state: the integral in N m."""
     for n in range(len(x)):
         v = maximum(0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right]), speeds[0])
-        i, share = cell(speeds, v)
+        i, share = find_cell(speeds, v)
         k_p = (1.0 - share) * gains[i, 0] + share * gains[i + 1, 0]
         k_i = (1.0 - share) * gains[i, 1] + share * gains[i + 1, 1]
-        _, gamma_ref = reference(x[n, IN.steer_command], v, target, LIMITED)
-        error = beyond(gamma_ref - x[n, IN.gyro], band)
-        wanted = k_p * error + state[n, 0]
+        _, gamma_ref = compute_reference(x[n, IN.steer_command], v, target, LIMITED)
+        error = apply_dead_zone(gamma_ref - x[n, IN.gyro], band)
+        unlimited = k_p * error + state[n, 0]
         if bounded:  # more yaw rate to the side the car slides to: beta' = ... - gamma
-            wanted += stiffness * beyond(x[n, IN.beta_hat], slip)
-        limit = most[n] * full_scale
-        N_z = min(max(wanted, -limit), limit)
-        state[n, 0] = integrated(state[n, 0], k_i * error * dt, wanted, N_z)
+            unlimited += stiffness * apply_dead_zone(x[n, IN.beta_hat], slip)
+        limit = max_moment[n] * full_scale
+        N_z = min(max(unlimited, -limit), limit)
+        state[n, 0] = integrate_antiwindup(state[n, 0], k_i * error * dt, unlimited, N_z)
         if absolute(error) == 0.0:
             state[n, 0] -= state[n, 0] * dt / RELEASE
         action[n, 0] = N_z / full_scale
@@ -92,7 +101,7 @@ class Esc(Controller):
     Beyond +-`slip` (rad) a moment of `stiffness` (N m/rad; default: the full moment at twice the
     bound) drives beta back, where the observation has beta_hat; without, it does without.
 
-    bandwidth: rad/s, of `yaw_gains`. grip: of `Controller`. Memory: the integral. Raises
+    bandwidth: rad/s, of `compute_yaw_gains`. grip: of `Controller`. Memory: the integral. Raises
     ValueError for an option out of range.
     """
 
@@ -107,23 +116,25 @@ class Esc(Controller):
         stiffness: float | None = None,
         grip: float | None = None,
     ) -> None:
-        bounded = "beta_hat" in entries_of(env)
+        bounded = "beta_hat" in list_entry_names(env)
         self.needs = Inputs._fields if bounded else Inputs._fields[:-1]
         super().__init__(env, grip)
-        bandwidth, slip = positive("bandwidth", bandwidth), positive("slip", slip)
+        bandwidth, slip = check_positive("bandwidth", bandwidth), check_positive("slip", slip)
         if not 0.0 <= band < math.inf:
             raise ValueError(f"band is zero or more, in rad/s, got {band!r}")
         self._design = (
-            target_of(self.nominal),
+            make_reference_params(self.nominal),
             np.array(SPEEDS),
-            np.array([yaw_gains(self.nominal, v, bandwidth) for v in SPEEDS]),
+            np.array([compute_yaw_gains(self.nominal, v, bandwidth) for v in SPEEDS]),
             float(band),
             slip,
-            self.full_scale / slip if stiffness is None else not_negative("stiffness", stiffness),
+            self.full_scale / slip
+            if stiffness is None
+            else check_not_negative("stiffness", stiffness),
             int(bounded),
             self.full_scale,
             self.control_period * TICK,
         )
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _esc_law(inputs, state, action, self._most(inputs), *self._design)
+        _esc_law(inputs, state, action, self._compute_max_moment(inputs), *self._design)

@@ -14,12 +14,12 @@ from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import maximum
 from ...envs.task.cost import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
 from ...envs.ticks import TICK
-from ...envs.vehicle.linear import LinearModel, vision
+from ...envs.vehicle.linear import LinearModel, make_vision_model
 from ...envs.vehicle.vehicle import Vehicle
-from ..design.gain_schedule import SPEEDS, interpolated
-from ..design.sampled_model import optimal
+from ..design.gain_schedule import SPEEDS, interpolate_gains
+from ..design.sampled_model import solve_lqr
 from ..env_facts import AnyEnv
-from .base import Array, Controller, positive
+from .base import Array, Controller, check_positive
 
 Inputs = namedtuple(
     "Inputs",
@@ -47,10 +47,10 @@ HASTE = 3.0
 OFFSET_SCALE, INTEGRAL_SCALE = 0.1, 0.2  # m, m s
 
 
-def lane_model(
+def make_lane_model(
     vehicle: Vehicle, speed: float, period: int, full_scale: float, haste: float
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """(G, H, Q, R, N) of `Lane` over `period` ticks, as `optimal` takes them.
+    """(G, H, Q, R, N) of `Lane` over `period` ticks, as `solve_lqr` takes them.
 
     Inputs: the share of the full yaw moment in N m, and rad added to the driver's steering. The
     cost rate is the env's of beta and of both inputs, with gamma against V kappa, the offset over
@@ -59,7 +59,7 @@ def lane_model(
     linear law asks for what the rate cannot give. It is taken at the end of each period.
     """
     n, T = len(AT), period * TICK
-    plane = vision(vehicle, speed)
+    plane = make_vision_model(vehicle, speed)
     lags = [max(tau, TICK) for tau in (vehicle.motor_lag, vehicle.steering_lag)]
     A, B = np.zeros((n, n)), np.zeros((n, 2))
     A[:3, :3] = plane.A[:3, :3]
@@ -71,21 +71,25 @@ def lane_model(
         A[state, state], B[state, i] = -1.0 / lag, 1.0 / lag
     A[AT.delta_f, AT.driver] = 1.0 / lags[1]
     A[AT.integral, AT.y] = 1.0
-    G, H = LinearModel(A, B, np.eye(n), Lane._fields, (), ()).discrete(T)
+    G, H = LinearModel(A, B, np.eye(n), Lane._fields, (), ()).discretise(T)
     C = np.zeros((6, n))
     for row, state in enumerate((AT.beta, AT.gamma, AT.N_z, AT.y, AT.integral, AT.delta_f)):
         C[row, state] = 1.0
     C[1, AT.kappa], C[5, AT.driver] = -speed, -1.0  # gamma - V kappa; the added steering alone
-    ahead = np.zeros((1, n + 2))  # of the applied steering, the one asked for
-    ahead[0, AT.delta_f], ahead[0, AT.driver], ahead[0, n + 1] = -1.0, 1.0, 1.0
-    judged = np.vstack([C @ np.hstack([G, H]), ahead])
+    command_error = np.zeros((1, n + 2))  # of the applied steering, the one asked for
+    command_error[0, AT.delta_f], command_error[0, AT.driver], command_error[0, n + 1] = (
+        -1.0,
+        1.0,
+        1.0,
+    )
+    cost_outputs = np.vstack([C @ np.hstack([G, H]), command_error])
     reach = vehicle.steering_rate * (T + vehicle.steering_lag)
     scales = (BETA_SCALE, GAMMA_SCALE, 1.0, OFFSET_SCALE, INTEGRAL_SCALE, STEER_SCALE, reach)
     shares = (1.0, 1.0, EFFORT_WEIGHT, 1.0, 1.0, EFFORT_WEIGHT, haste)
     W = T * np.diag([share / scale**2 for share, scale in zip(shares, scales, strict=True)])
-    whole = judged.T @ W @ judged
-    whole = 0.5 * (whole + whole.T)
-    return G, H, whole[:n, :n], whole[n:, n:], whole[:n, n:]
+    cost_matrix = cost_outputs.T @ W @ cost_outputs
+    cost_matrix = 0.5 * (cost_matrix + cost_matrix.T)
+    return G, H, cost_matrix[:n, :n], cost_matrix[n:, n:], cost_matrix[:n, n:]
 
 
 @jit
@@ -119,7 +123,7 @@ def _lane_keeping_law(
         z[AT.N_z] = share * (x[row, IN.torque_right] - x[row, IN.torque_left])
         z[AT.delta_f], z[AT.driver] = x[row, IN.steer], x[row, IN.steer_command]
         z[AT.integral], z[AT.kappa] = state[row, LAST.integral], kappa
-        interpolated(table, axes, v, 0.0, 0.0, K)
+        interpolate_gains(table, axes, v, 0.0, 0.0, K)
         free = True
         for i in range(m):
             u = 0.0
@@ -143,7 +147,7 @@ class LaneKeeping(Controller):
     `curvature_time` seconds; what that lacks, the integral makes up. y is the offset of the centre
     of gravity, not of the preview point, which on a curve is never zero for a car in its lane.
 
-    moment: also by the yaw moment, else by steering alone. haste: of `lane_model`.
+    moment: also by the yaw moment, else by steering alone. haste: of `make_lane_model`.
 
     Raises ValueError for an env whose action does not steer, a missing entry or an option out of
     range.
@@ -164,15 +168,15 @@ class LaneKeeping(Controller):
         inputs = slice(0 if moment else 1, 2)
         gains, car = [], self.nominal
         for speed in speeds:
-            G, H, Q, R, N = lane_model(car, speed, self.control_period, self.full_scale, haste)
-            optimum = optimal(G, H[:, inputs], Q, R[inputs, inputs], N[:, inputs], len(MOVED))
+            G, H, Q, R, N = make_lane_model(car, speed, self.control_period, self.full_scale, haste)
+            optimum = solve_lqr(G, H[:, inputs], Q, R[inputs, inputs], N[:, inputs], len(MOVED))
             gains.append(optimum[0])
         self._design = (
             np.ascontiguousarray(np.array(gains)[:, None, None]),
             (np.array(speeds), np.zeros(1), np.zeros(1)),
             0.5 * car.rear_track / car.wheel_radius / self.full_scale,
             car.preview,
-            positive("curvature_time", curvature_time),
+            check_positive("curvature_time", curvature_time),
             self.control_period * TICK,
             self.authority,
         )

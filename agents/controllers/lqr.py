@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import copied, jit
+from ...envs.backend.decorators import copy_into, jit
 from ...envs.backend.primitives import absolute
 from ...envs.task.reference import REFERENCES
 from ...envs.ticks import TICK
-from ...envs.vehicle.tyres import SLOW
+from ...envs.vehicle.tyres import MIN_SPEED
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
-from ..design.gain_schedule import SPEEDS, gain_table, interpolated
-from ..design.sampled_model import Purpose
+from ..design.gain_schedule import SPEEDS, interpolate_gains, make_gain_table
+from ..design.sampled_model import DesignSpec
 from ..env_facts import AnyEnv
-from .base import Array, Controller, entries_of, positive
+from .base import Array, Controller, check_positive, list_entry_names
 
 Inputs = namedtuple(
     "Inputs",
@@ -30,15 +30,15 @@ IN = Inputs(*range(14))
 
 
 @jit
-def predicted_state(x: Any, share: Any, z: Any) -> None:
+def make_design_state(x: Any, share: Any, z: Any) -> None:
     """Fill z, the states of the design model, from a row of `Inputs`.
 
     share: what 1 N m of difference between the motors is of the full yaw moment.
     """
     z[0], z[1] = x[IN.beta_hat], x[IN.gamma_hat]
     z[2] = share * (x[IN.torque_right] - x[IN.torque_left])
-    copied(x[IN.steer : IN.beta_hat], z[3:7])
-    copied(x[IN.disturbance_1 : IN.disturbance_1 + len(z) - 7], z[7:])
+    copy_into(x[IN.steer : IN.beta_hat], z[3:7])
+    copy_into(x[IN.disturbance_1 : IN.disturbance_1 + len(z) - 7], z[7:])
 
 
 @jit
@@ -46,8 +46,8 @@ def _lqr_law(
     x: Any,
     state: Any,
     action: Any,
-    most: Any,
-    slides: Any,
+    max_moment: Any,
+    sliding_slip: Any,
     table: Any,
     axes: Any,
     scheduled: int,
@@ -64,25 +64,28 @@ def _lqr_law(
         v = 0.5 * (x[row, IN.wheel_left] + x[row, IN.wheel_right])
         front = x[row, IN.front_stiffness] if scheduled else 0.0
         rear = x[row, IN.rear_stiffness] if scheduled else 0.0
-        interpolated(table, axes, v, front, rear, KS)
-        predicted_state(x[row], share, z)
+        interpolate_gains(table, axes, v, front, rear, KS)
+        make_design_state(x[row], share, z)
         u, w = 0.0, 0.0
         for j in range(n):
             u -= KS[0, j] * z[j]
             w -= KS[m - 1, j] * z[j]
         if m == 1:
-            action[row, 0] = _clipped(u, -most[row], most[row])
+            action[row, 0] = _clip(u, -max_moment[row], max_moment[row])
             continue
         low, high = max(state[row, 0] - slew, -authority), min(state[row, 0] + slew, authority)
-        straight = z[0] + front_arm * z[1] / max(v, SLOW) - z[4]  # added, that leaves no slip
-        most_w, least_w = max(straight + slides[row], 0.0), min(straight - slides[row], 0.0)
-        low, high = _clipped(least_w, low, high), _clipped(most_w, low, high)
-        u, w = best_within(KS[0, n], KS[0, n + 1], KS[1, n + 1], u, w, most[row], low, high)
+        straight = z[0] + front_arm * z[1] / max(v, MIN_SPEED) - z[4]  # added, that leaves no slip
+        max_w, min_w = (
+            max(straight + sliding_slip[row], 0.0),
+            min(straight - sliding_slip[row], 0.0),
+        )
+        low, high = _clip(min_w, low, high), _clip(max_w, low, high)
+        u, w = solve_box_qp(KS[0, n], KS[0, n + 1], KS[1, n + 1], u, w, max_moment[row], low, high)
         action[row, 0], action[row, 1], state[row, 0] = u, w / authority, w
 
 
 class Lqr(Controller):
-    """u = -K(v) x for the nominal vehicle as `design_model` predicts it.
+    """u = -K(v) x for the nominal vehicle as `make_design_model` predicts it.
 
     x: the estimates beta_hat and gamma_hat (without the latter the gyro), the applied torques and
     steering, the driver's command, the references, and the disturbances F_d_hat, N_d_hat or
@@ -100,7 +103,7 @@ class Lqr(Controller):
     Raises ValueError for a missing entry or an option out of range.
     """
 
-    shortest = 1  # ticks, of the period that the gains are designed for
+    min_period = 1  # ticks, of the period that the gains are designed for
 
     def __init__(
         self,
@@ -117,73 +120,73 @@ class Lqr(Controller):
             raise ValueError(f"stiffness names two entries or none, got {list(stiffness)}")
         if not (0.0 < span[0] < span[1] < math.inf and knots >= 2):
             raise ValueError(f"span rises from above zero, with 2 knots or more: {span}, {knots}")
-        names = entries_of(env)
+        names = list_entry_names(env)
         pairs = {"forces": ("F_d_hat", "N_d_hat"), "rates": ("d1_hat", "d2_hat")}
         kind = next((kind for kind, pair in pairs.items() if names.issuperset(pair)), "none")
-        instead = ("beta_ref", "beta_ref")
+        substitutes = ("beta_ref", "beta_ref")
         self.needs = (
             *Inputs._fields[: IN.gamma_hat],
             "gamma_hat" if "gamma_hat" in names else "gyro",
-            *pairs.get(kind, instead),
-            *(stiffness or instead),
-            *self._more(names),
+            *pairs.get(kind, substitutes),
+            *(stiffness or substitutes),
+            *self._list_extra_entries(names),
         )
         super().__init__(env, grip)
         car = self.nominal if vehicle is None else vehicle
         self.memory = 1 if self.width == 2 else 0
-        self.purpose = Purpose(
-            max(self.control_period, self.shortest),
+        self.design_spec = DesignSpec(
+            max(self.control_period, self.min_period),
             self.full_scale,
             self.width == 2,
             REFERENCES.index(self.reference),
             kind,
-            positive("disturbance_time", disturbance_time),
-            positive("steer_weight", steer_weight),
+            check_positive("disturbance_time", disturbance_time),
+            check_positive("steer_weight", steer_weight),
         )
         fronts, rears = (
-            tuple((own * np.geomspace(*span, knots)).tolist()) if stiffness else ()
-            for own in (car.front_stiffness, car.rear_stiffness)
+            tuple((nominal_stiffness * np.geomspace(*span, knots)).tolist()) if stiffness else ()
+            for nominal_stiffness in (car.front_stiffness, car.rear_stiffness)
         )
         self.share = 0.5 * car.rear_track / car.wheel_radius / self.full_scale
         self.vehicle = car
         speeds = SPEEDS[::2] if stiffness else SPEEDS
-        self.table, self._terminal = gain_table(car, self.purpose, speeds, fronts, rears)
+        self.table, self._terminal = make_gain_table(car, self.design_spec, speeds, fronts, rears)
         self.axes = tuple(np.array(axis) for axis in (speeds, fronts or (0.0,), rears or (0.0,)))
         slew = car.steering_rate * self.control_period * TICK
         self.scheduled = len(stiffness) == 2
         limits = self.authority, slew, car.front_arm
         self._design = self.table, self.axes, int(self.scheduled), self.share, *limits
 
-    def _more(self, names: set[str]) -> tuple[str, ...]:
+    def _list_extra_entries(self, names: set[str]) -> tuple[str, ...]:
         """Entries of an observation that a subclass reads behind `Inputs`."""
         return ()
 
     def gains(self, speed: float, front: float = 0.0, rear: float = 0.0) -> Array:
         """K (m, n) at a speed in m/s, and at stiffnesses in N/rad where it is scheduled on them."""
         KS = np.empty(self.table.shape[3:])
-        interpolated(self.table, self.axes, float(speed), float(front), float(rear), KS)
-        return KS[:, : len(self.purpose.states)]
+        interpolate_gains(self.table, self.axes, float(speed), float(front), float(rear), KS)
+        return KS[:, : len(self.design_spec.states)]
 
     def curvature(self, speed: float) -> Array:
         """S (width, width) at a speed in m/s: an action that differs by e from the best one adds
         e' S e to the cost of what follows, while the car is linear and nothing limits it."""
         KS = np.empty(self.table.shape[3:])
         car, per = self.vehicle, np.array([1.0, self.authority])[: self.width]
-        interpolated(
+        interpolate_gains(
             self.table, self.axes, float(speed), car.front_stiffness, car.rear_stiffness, KS
         )
-        return np.asarray(KS[:, len(self.purpose.states) :] * np.outer(per, per))
+        return np.asarray(KS[:, len(self.design_spec.states) :] * np.outer(per, per))
 
-    def acted(self, state: Array, action: Any) -> None:
+    def record_action(self, state: Array, action: Any) -> None:
         """The steering that the rate limit goes by is what was added."""
         if self.width == 2:
             state[:, 0] = action[:, 1] * self.authority
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        limits = self._most(inputs), self._slides(inputs)
+        limits = self._compute_max_moment(inputs), self._compute_sliding_slip(inputs)
         _lqr_law(inputs, state, action, *limits, *self._design)
 
-    def _slides(self, inputs: Array) -> Array:
+    def _compute_sliding_slip(self, inputs: Array) -> Array:
         """(N,) rad of slip beyond which the front tyres' force grows no more (Fiala's), infinite
         without a grip limit."""
         if self.grip is None:
@@ -191,36 +194,36 @@ class Lqr(Controller):
         car = self.vehicle
         stiffness = inputs[:, IN.front_stiffness] if self.scheduled else car.front_stiffness
         load = car.mass * GRAVITY * car.rear_arm / (2.0 * car.wheelbase)  # N, of a front tyre
-        slides: Array = 3.0 * self._friction(inputs) * load / np.maximum(stiffness, 1.0)
-        return slides
+        sliding_slip: Array = 3.0 * self._get_friction(inputs) * load / np.maximum(stiffness, 1.0)
+        return sliding_slip
 
 
 @jit
-def _clipped(value: Any, low: Any, high: Any) -> Any:
+def _clip(value: Any, low: Any, high: Any) -> Any:
     return min(max(value, low), high)
 
 
 @jit
-def best_within(
-    s_uu: Any, s_uw: Any, s_ww: Any, u: Any, w: Any, most: Any, low: Any, high: Any
+def solve_box_qp(
+    s_uu: Any, s_uw: Any, s_ww: Any, u: Any, w: Any, max_u: Any, low: Any, high: Any
 ) -> Any:
     """The point with |u| <= most and low <= w <= high that is nearest to (u, w).
 
     Nearest in du^2 s_uu + 2 du dw s_uw + dw^2 s_ww, positive definite: (u, w) itself where it is
     within, else the least of the four edges' own minima.
     """
-    if absolute(u) <= most and low <= w <= high:
+    if absolute(u) <= max_u and low <= w <= high:
         return u, w
-    best_u, best_w, least = 0.0, 0.0, -1.0
+    best_u, best_w, best_cost = 0.0, 0.0, -1.0
     for edge in range(4):
         if edge < 2:
-            a = most if edge == 0 else -most
-            b = _clipped(w - s_uw / s_ww * (a - u), low, high)
+            a = max_u if edge == 0 else -max_u
+            b = _clip(w - s_uw / s_ww * (a - u), low, high)
         else:
             b = low if edge == 2 else high
-            a = _clipped(u - s_uw / s_uu * (b - w), -most, most)
+            a = _clip(u - s_uw / s_uu * (b - w), -max_u, max_u)
         du, dw = a - u, b - w
         cost = du * du * s_uu + 2.0 * du * dw * s_uw + dw * dw * s_ww
-        if least < 0.0 or cost < least:
-            best_u, best_w, least = a, b, cost
+        if best_cost < 0.0 or cost < best_cost:
+            best_u, best_w, best_cost = a, b, cost
     return best_u, best_w

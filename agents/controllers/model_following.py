@@ -12,16 +12,29 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import jit, plain
+from ...envs.backend.decorators import as_python, jit
 from ...envs.backend.primitives import maximum
-from ...envs.task.reference import LAGGED, REFERENCES, ZERO_SLIP, reference, target_of
+from ...envs.task.reference import (
+    LAGGED,
+    REFERENCES,
+    ZERO_SLIP,
+    compute_reference,
+    make_reference_params,
+)
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import Vehicle
-from ..design.nominal_car import drift, inputs_for, keeping, nominal_car, plant_at, plant_of
+from ..design.nominal_car import (
+    compute_drift,
+    compute_plant,
+    compute_plant_python,
+    compute_steady_yaw_rate,
+    make_nominal_car,
+    solve_inputs,
+)
 from ..env_facts import AnyEnv
-from .base import Array, Controller, entries_of, integrated
+from .base import Array, Controller, integrate_antiwindup, list_entry_names
 
-SLOWEST = 2.0  # m/s: below it the vehicle is taken as at this speed
+MIN_SPEED = 2.0  # m/s: below it the vehicle is taken as at this speed
 BANDWIDTH = (5.0, 5.0)  # rad/s, K_beta and K_gamma of dakf-stability V.D
 
 
@@ -38,7 +51,7 @@ IN = Inputs(*range(9))
 LAST = Memory(*range(4))
 
 
-def feedback_gains(
+def compute_feedback_gains(
     vehicle: Vehicle, speed: float, bandwidth: Sequence[float] = BANDWIDTH
 ) -> tuple[Array, Array]:
     """(P, I), each (2, 2), of C_fb = P + I / s from errors of beta, gamma to delta_f, N_z.
@@ -48,14 +61,14 @@ def feedback_gains(
     internally stable where the nominal car is, below its critical speed. The printed (32) is this
     for equal K only.
     """
-    plant = plant_of(nominal_car(vehicle), float(speed))
+    plant = compute_plant_python(make_nominal_car(vehicle), float(speed))
     columns = np.diag(np.asarray(bandwidth, np.float64))
     P = [_inputs(plant, *column) for column in columns]
     I = [_inputs(plant, *(-x for x in _drift(plant, *column))) for column in columns]  # noqa: E741
     return np.array(P).T, np.array(I).T
 
 
-_drift, _inputs = plain(drift), plain(inputs_for)
+_drift, _inputs = as_python(compute_drift), as_python(solve_inputs)
 
 
 @jit
@@ -63,7 +76,7 @@ def _model_following_law(
     x: Any,
     state: Any,
     action: Any,
-    most: Any,
+    max_moment: Any,
     car: Any,
     target: Any,
     kind: int,
@@ -75,35 +88,48 @@ def _model_following_law(
 ) -> None:
     """x: `Inputs`. state: `Memory`. K: K_beta, K_gamma."""
     for n in range(len(x)):
-        v = maximum(0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right]), SLOWEST)
+        v = maximum(0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right]), MIN_SPEED)
         driver, beta_ref, gamma_ref = x[n, IN.steer_command], x[n, IN.beta_ref], x[n, IN.gamma_ref]
-        plant = plant_at(car, v)
-        before = state[n, LAST.driver] if state[n, LAST.known] > 0.0 else driver
-        old, new = reference(before, v, target, kind), reference(driver, v, target, kind)
-        moves = ((new[0] - old[0]) / dt, (new[1] - old[1]) / dt)  # of the references
+        plant = compute_plant(car, v)
+        last_driver = state[n, LAST.driver] if state[n, LAST.known] > 0.0 else driver
+        old, new = (
+            compute_reference(last_driver, v, target, kind),
+            compute_reference(driver, v, target, kind),
+        )
+        reference_rates = ((new[0] - old[0]) / dt, (new[1] - old[1]) / dt)  # of the references
         if kind == LAGGED:
-            away = (1.0 - target.rest) / TICK
-            moves = (away * (new[0] - beta_ref), away * (new[1] - gamma_ref))
+            approach_rate = (1.0 - target.rest) / TICK
+            reference_rates = (
+                approach_rate * (new[0] - beta_ref),
+                approach_rate * (new[1] - gamma_ref),
+            )
         if kind == ZERO_SLIP:  # the yaw rate is free: the one that keeps beta_ref
-            gamma_ref = keeping(plant, beta_ref, driver)
-            moves = (moves[0], (gamma_ref - keeping(plant, beta_ref, before)) / dt)
-        moved = drift(plant, beta_ref, gamma_ref)
+            gamma_ref = compute_steady_yaw_rate(plant, beta_ref, driver)
+            reference_rates = (
+                reference_rates[0],
+                (gamma_ref - compute_steady_yaw_rate(plant, beta_ref, last_driver)) / dt,
+            )
+        drift_rates = compute_drift(plant, beta_ref, gamma_ref)
         p_beta = K[0] * (beta_ref - x[n, IN.beta_hat])
         p_gamma = K[1] * (gamma_ref - x[n, IN.gamma_hat])
         # (28) by the references' derivatives, P of (31), and (26) at once: B^-1 is linear
-        delta_f, N_z = inputs_for(
+        delta_f, N_z = solve_inputs(
             plant,
-            moves[0] - moved[0] + p_beta - rejection * x[n, IN.d1_hat],
-            moves[1] - moved[1] + p_gamma - rejection * x[n, IN.d2_hat],
+            reference_rates[0] - drift_rates[0] + p_beta - rejection * x[n, IN.d1_hat],
+            reference_rates[1] - drift_rates[1] + p_gamma - rejection * x[n, IN.d2_hat],
         )
         delta_f, N_z = delta_f + state[n, LAST.delta_f], N_z + state[n, LAST.N_z]  # (33)
         steer = min(max(delta_f, driver - authority), driver + authority)
-        limit = most[n] * full_scale
+        limit = max_moment[n] * full_scale
         moment = min(max(N_z, -limit), limit)
-        moved = drift(plant, p_beta, p_gamma)
-        steps = inputs_for(plant, -moved[0] * dt, -moved[1] * dt)  # I of (31), forward Euler
-        state[n, LAST.delta_f] = integrated(state[n, LAST.delta_f], steps[0], delta_f, steer)
-        state[n, LAST.N_z] = integrated(state[n, LAST.N_z], steps[1], N_z, moment)
+        drift_rates = compute_drift(plant, p_beta, p_gamma)
+        steps = solve_inputs(
+            plant, -drift_rates[0] * dt, -drift_rates[1] * dt
+        )  # I of (31), forward Euler
+        state[n, LAST.delta_f] = integrate_antiwindup(
+            state[n, LAST.delta_f], steps[0], delta_f, steer
+        )
+        state[n, LAST.N_z] = integrate_antiwindup(state[n, LAST.N_z], steps[1], N_z, moment)
         state[n, LAST.driver], state[n, LAST.known] = driver, 1.0
         action[n, 0] = moment / full_scale
         action[n, 1] = (steer - driver) / authority
@@ -134,19 +160,19 @@ class ModelFollowing(Controller):
         rejection: bool = True,
         grip: float | None = None,
     ) -> None:
-        instead = {} if "gamma_hat" in entries_of(env) else {"gamma_hat": "gyro"}
+        substitutes = {} if "gamma_hat" in list_entry_names(env) else {"gamma_hat": "gyro"}
         if not rejection:  # whatever stands there is multiplied by zero
-            instead |= {"d1_hat": "beta_ref", "d2_hat": "gamma_ref"}
-        self.needs = tuple(instead.get(name, name) for name in Inputs._fields)
+            substitutes |= {"d1_hat": "beta_ref", "d2_hat": "gamma_ref"}
+        self.needs = tuple(substitutes.get(name, name) for name in Inputs._fields)
         super().__init__(env, grip)
         if self.width != 2:
             raise ValueError("ModelFollowing needs an env whose action steers (steering=True)")
-        K = [float(each) for each in bandwidth]
-        if len(K) != 2 or not all(0.0 < each < math.inf for each in K):
+        K = [float(value) for value in bandwidth]
+        if len(K) != 2 or not all(0.0 < value < math.inf for value in K):
             raise ValueError(f"bandwidth is two positive numbers in rad/s, got {bandwidth!r}")
         self._design = (
-            nominal_car(self.nominal),
-            target_of(self.nominal),
+            make_nominal_car(self.nominal),
+            make_reference_params(self.nominal),
             REFERENCES.index(self.reference),
             np.array(K),
             float(rejection),
@@ -156,4 +182,4 @@ class ModelFollowing(Controller):
         )
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _model_following_law(inputs, state, action, self._most(inputs), *self._design)
+        _model_following_law(inputs, state, action, self._compute_max_moment(inputs), *self._design)

@@ -9,14 +9,14 @@ from scipy.sparse import csc_matrix
 
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import Vehicle
-from ..design.condensed_qp import Quadratic, quadratic
+from ..design.condensed_qp import QuadraticProgram, condense_qp
 from ..design.gain_schedule import SPEEDS
-from ..design.sampled_model import Purpose, design_model
+from ..design.sampled_model import DesignSpec, make_design_model
 from ..env_facts import AnyEnv
 from .base import Array
-from .lqr import IN, Lqr, predicted_state
+from .lqr import IN, Lqr, make_design_state
 
-STEP = 10  # ticks, the shortest of the prediction
+MIN_STEP = 10  # ticks, the shortest of the prediction
 NOT_FINITE = "the observation is not finite"
 RHO = 0.1  # the solver's first; every call starts from it, whatever the last one ended with
 _SETTINGS = {
@@ -32,11 +32,11 @@ _SETTINGS = {
 
 
 @lru_cache(maxsize=4 * len(SPEEDS))
-def _program(
-    vehicle: Vehicle, speed: float, purpose: Purpose, horizon: int, authority: float
-) -> Quadratic:
-    limits = np.array([1.0, authority])[: len(purpose.inputs)]
-    return quadratic(design_model(vehicle, speed, purpose), horizon, limits)
+def _make_program(
+    vehicle: Vehicle, speed: float, design_spec: DesignSpec, horizon: int, authority: float
+) -> QuadraticProgram:
+    limits = np.array([1.0, authority])[: len(design_spec.inputs)]
+    return condense_qp(make_design_model(vehicle, speed, design_spec), horizon, limits)
 
 
 class Mpc(Lqr):
@@ -77,16 +77,16 @@ class Mpc(Lqr):
         super().__init__(env, disturbance_time=disturbance_time, grip=grip)
         self._osqp: Any = osqp
         known = osqp.SolverStatus
-        self._good = (int(known.OSQP_SOLVED), int(known.OSQP_SOLVED_INACCURATE))
+        self._accepted = (int(known.OSQP_SOLVED), int(known.OSQP_SOLVED_INACCURATE))
         self.horizon, self.iterations = horizon, iterations
-        period = max(self.control_period, STEP)
-        self.prediction = dataclasses.replace(self.purpose, period=period)
+        period = max(self.control_period, MIN_STEP)
+        self.prediction = dataclasses.replace(self.design_spec, period=period)
         self._shift = period == self.control_period
         self._change = self.nominal.steering_rate * period * TICK / self.authority
         inputs = horizon * self.width
         self._rows = inputs + (horizon if self.width > 1 else 0)
         self.memory = 1 + inputs + self._rows
-        self._ready_for: dict[float, tuple[Quadratic, Any]] = {}
+        self._ready_for: dict[float, tuple[QuadraticProgram, Any]] = {}
         self.status: list[str] = []
         self.solve_time: list[float] = []
 
@@ -100,67 +100,68 @@ class Mpc(Lqr):
 
         self.__dict__.update(state | {"_osqp": osqp})
 
-    def program(self, speed: float) -> Quadratic:
+    def get_program(self, speed: float) -> QuadraticProgram:
         """The quadratic program for a speed in m/s, that of the nearest of `SPEEDS`."""
-        nearest = _nearest(speed)
-        return _program(self.nominal, nearest, self.prediction, self.horizon, self.authority)
+        nearest = _find_nearest_speed(speed)
+        return _make_program(self.nominal, nearest, self.prediction, self.horizon, self.authority)
 
-    def _not_finite(self, rows: Any, state: Array) -> None:
+    def _mark_not_finite(self, rows: Any, state: Array) -> None:
         for i in np.flatnonzero(rows):
             self.status[i] = NOT_FINITE
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         self.status, self.solve_time = [], []
-        z = np.empty(len(self.purpose.states))
-        rows = zip(inputs, state, action, self._most(inputs), strict=True)
-        for x, memory, chosen, most in rows:
-            predicted_state(x, self.share, z)
+        z = np.empty(len(self.design_spec.states))
+        rows = zip(inputs, state, action, self._compute_max_moment(inputs), strict=True)
+        for x, memory, row_action, max_moment in rows:
+            make_design_state(x, self.share, z)
             speed = 0.5 * (x[IN.wheel_left] + x[IN.wheel_right])
-            status, seconds = self._solve(speed, z, memory, chosen, float(most))
+            status, seconds = self._solve(speed, z, memory, row_action, float(max_moment))
             self.status.append(status)
             self.solve_time.append(seconds)
 
-    def acted(self, state: Array, action: Any) -> None:
+    def record_action(self, state: Array, action: Any) -> None:
         """As of `Lqr`; here it is a share of the full steering."""
         if self.width == 2:
             state[:, 0] = action[:, 1]
 
     def _solve(
-        self, speed: float, z: Array, memory: Array, chosen: Array, most: float
+        self, speed: float, z: Array, memory: Array, row_action: Array, max_moment: float
     ) -> tuple[str, float]:
-        """Fill the action `chosen` (m,) and the memory of a row; the solver's status and time."""
+        """Fill the action `row_action` (m,) and the memory of a row; the solver's status and
+        time."""
         m, count = self.width, self.horizon * self.width
         low, high = -np.ones(self._rows), np.ones(self._rows)
-        low[:count:m], high[:count:m] = -most, most
+        low[:count:m], high[:count:m] = -max_moment, max_moment
         if m > 1:
             low[count:], high[count:] = -self._change, self._change
             low[count] += memory[0]
             high[count] += memory[0]
-        program, solver = self._ready(_nearest(speed))
+        program, solver = self._get_solver(_find_nearest_speed(speed))
         solver.update_settings(rho=RHO)
         solver.update(q=program.F @ z, l=low, u=high)
         solver.warm_start(x=memory[1 : 1 + count], y=memory[1 + count :])
-        found = solver.solve(raise_error=False)
-        if found.info.status_val not in self._good:
-            chosen[:] = np.nan
-            return str(found.info.status), float(found.info.run_time)
-        chosen[:] = found.x[:m]
-        memory[0] = found.x[1] if m > 1 else 0.0
-        memory[1 : 1 + count] = self._moved_on(found.x, m)
-        memory[1 + count : 1 + 2 * count] = self._moved_on(found.y[:count], m)
-        memory[1 + 2 * count :] = self._moved_on(found.y[count:], 1)
-        return str(found.info.status), float(found.info.run_time)
+        solution = solver.solve(raise_error=False)
+        if solution.info.status_val not in self._accepted:
+            row_action[:] = np.nan
+            return str(solution.info.status), float(solution.info.run_time)
+        row_action[:] = solution.x[:m]
+        memory[0] = solution.x[1] if m > 1 else 0.0
+        memory[1 : 1 + count] = self._shift_solution(solution.x, m)
+        memory[1 + count : 1 + 2 * count] = self._shift_solution(solution.y[:count], m)
+        memory[1 + 2 * count :] = self._shift_solution(solution.y[count:], 1)
+        return str(solution.info.status), float(solution.info.run_time)
 
-    def _moved_on(self, values: Array, width: int) -> Array:
+    def _shift_solution(self, values: Array, width: int) -> Array:
         """A solution a step later, the last step repeated."""
         if not self._shift or len(values) == 0:
             return values
         return np.concatenate([values[width:], values[-width:]])
 
-    def _ready(self, speed: float) -> tuple[Quadratic, Any]:
+    def _get_solver(self, speed: float) -> tuple[QuadraticProgram, Any]:
         """The program of a speed of `SPEEDS` and its solver, set up when first needed."""
         if speed not in self._ready_for:
-            program, solver = self.program(speed), self._osqp.OSQP()
+            program, solver = self.get_program(speed), self._osqp.OSQP()
             solver.setup(
                 csc_matrix(np.triu(program.P)),
                 np.zeros(len(program.P)),
@@ -174,5 +175,5 @@ class Mpc(Lqr):
         return self._ready_for[speed]
 
 
-def _nearest(speed: float) -> float:
-    return float(min(SPEEDS, key=lambda each: abs(each - speed)))
+def _find_nearest_speed(speed: float) -> float:
+    return float(min(SPEEDS, key=lambda knot: abs(knot - speed)))

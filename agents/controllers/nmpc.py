@@ -9,22 +9,28 @@ import numpy as np
 
 from ...envs.backend.decorators import jit
 from ...envs.backend.elementary import sincos
-from ...envs.engine.tick import Kind
-from ...envs.task.reference import LAGGED, Target, reference, target_of
+from ...envs.engine.tick import StepVariant
+from ...envs.task.reference import LAGGED, ReferenceParams, compute_reference, make_reference_params
 from ...envs.ticks import TICK
-from ...envs.vehicle.dynamics import Motion, Push
-from ...envs.vehicle.tyres import SLOW, TYRE_LAWS, shifts
+from ...envs.vehicle.dynamics import DisturbanceForces, Motion
+from ...envs.vehicle.tyres import MIN_SPEED, TYRE_LAWS, has_load_shift
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
-from ..design.gain_schedule import interpolated
-from ..design.gauss_newton import MOST_VARIABLES, improved
-from ..design.prediction_model import Model, Start, blocks_of, changed_tyres, model_of
-from ..env_facts import AnyEnv, plants_of
-from .base import Array, positive
+from ..design.gain_schedule import interpolate_gains
+from ..design.gauss_newton import MAX_VARIABLES, update_plan
+from ..design.prediction_model import (
+    PredictionModel,
+    PredictionStart,
+    make_blocks,
+    make_prediction_model,
+    replace_tyres,
+)
+from ..env_facts import AnyEnv, list_plant_kinds
+from .base import Array, check_positive
 from .lqr import IN, Lqr
 
-STEP = 10  # ticks, the shortest of the prediction
-FIRST = 6  # more iterations at an episode's first decision
-STEEPEST = 1.2  # rad of sideslip, beyond which a prediction starts from this
+MIN_STEP = 10  # ticks, the shortest of the prediction
+FIRST_ITERATIONS = 6  # more iterations at an episode's first decision
+MAX_SIDESLIP = 1.2  # rad of sideslip, beyond which a prediction starts from this
 STATUSES = ("unknown", "solved", "the observation is not finite", "diverged")
 UNKNOWN, SOLVED, NOT_FINITE, DIVERGED = range(len(STATUSES))
 
@@ -38,9 +44,9 @@ PLAN = len(Memory._fields)
 class Design(NamedTuple):
     """What all decisions of a controller share."""
 
-    model: Model
-    target: Target
-    gains: Any  # K of `gain_schedule.Tables`, (..., m, n)
+    model: PredictionModel
+    target: ReferenceParams
+    gains: Any  # K of `gain_schedule.GainTables`, (..., m, n)
     terminal: Any
     axes: Any
     blocks: Any
@@ -51,38 +57,44 @@ class Design(NamedTuple):
 
 
 @jit
-def _shifted(plan: Any, blocks: Any, m: int, steps: float) -> None:
+def _shift_plan(plan: Any, blocks: Any, m: int, steps: float) -> None:
     """Move a plan on by so many steps of the prediction, each block towards its next."""
     for i in range(len(plan) - m):
         plan[i] += (plan[i + m] - plan[i]) * min(1.0, steps / blocks[i // m])
 
 
 @jit
-def _regulator(table: Any, axes: Any, v: Any, front: Any, rear: Any, per: Any) -> Any:
+def _interpolate_regulator(table: Any, axes: Any, v: Any, front: Any, rear: Any, per: Any) -> Any:
     """(rows, 9) of a table: columns of the states with forces, which may be rates in the table."""
-    found, full = np.empty(table.shape[3:]), np.zeros((table.shape[3], 9))
-    interpolated(table, axes, v, front, rear, found)
-    for i in range(len(found)):
-        for j in range(min(found.shape[1], 9)):
-            full[i, j] = found[i, j]
-        full[i, 7] *= per[0]
-        full[i, 8] *= per[1]
-    return full
+    values, padded = np.empty(table.shape[3:]), np.zeros((table.shape[3], 9))
+    interpolate_gains(table, axes, v, front, rear, values)
+    for i in range(len(values)):
+        for j in range(min(values.shape[1], 9)):
+            padded[i, j] = values[i, j]
+        padded[i, 7] *= per[0]
+        padded[i, 8] *= per[1]
+    return padded
 
 
 @jit
-def problem_of(design: Design, x: Any, friction: Any, roll: Any, slewing: Any, most: Any) -> Any:
+def prepare_prediction(
+    design: Design, x: Any, friction: Any, roll: Any, slewing: Any, max_moment: Any
+) -> Any:
     """(where the prediction starts, K, T) for a row of `lqr.Inputs`.
 
     roll: rad, rad/s; NaN where they are not measured. slewing: rad of steering last added.
     """
     model, disturbed = design.model, design.disturbed
-    v = max(0.5 * (x[IN.wheel_left] + x[IN.wheel_right]), SLOW)
+    v = max(0.5 * (x[IN.wheel_left] + x[IN.wheel_right]), MIN_SPEED)
     front = x[IN.front_stiffness] if design.scheduled else model.car.C_f
     rear = x[IN.rear_stiffness] if design.scheduled else model.car.C_r
-    car = changed_tyres(model.car, front, rear, friction)
+    car = replace_tyres(model.car, front, rear, friction)
     gamma, driver, refs = x[IN.gamma_hat], x[IN.steer_command], (x[IN.beta_ref], x[IN.gamma_ref])
-    steady = reference(driver, v, design.target, LAGGED) if model.kind.reference == LAGGED else refs
+    steady = (
+        compute_reference(driver, v, design.target, LAGGED)
+        if model.kind.reference == LAGGED
+        else refs
+    )
     per = (car.m * v, car.I) if disturbed == 2 else (1.0, 1.0)
     F_d = x[IN.disturbance_1] * per[0] if disturbed else 0.0
     N_d = x[IN.disturbance_2] * per[1] if disturbed else 0.0
@@ -90,9 +102,9 @@ def problem_of(design: Design, x: Any, friction: Any, roll: Any, slewing: Any, m
     if phi != phi:  # as in a steady turn
         phi, rate = car.S * v * gamma / (car.K_x - car.S * GRAVITY), 0.0
     rolls = float(model.kind.roll)
-    sine, cosine = sincos(min(max(x[IN.beta_hat], -STEEPEST), STEEPEST))
+    sine, cosine = sincos(min(max(x[IN.beta_hat], -MAX_SIDESLIP), MAX_SIDESLIP))
     v_y = v * (x[IN.beta_hat] if model.kind.small_angle else sine / cosine)
-    start = Start(
+    start = PredictionStart(
         car,
         Motion(v, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, rolls * phi, rolls * rate),
         x[IN.torque_left],
@@ -103,29 +115,31 @@ def problem_of(design: Design, x: Any, friction: Any, roll: Any, slewing: Any, m
         (x[IN.torque_left] + x[IN.torque_right]) / (car.m * car.r),
         refs,
         steady,
-        Push(F_d, N_d, 0.0),
-        most,
+        DisturbanceForces(F_d, N_d, 0.0),
+        max_moment,
     )
     per_force = (1.0 / per[0], 1.0 / per[1])
-    K = _regulator(design.gains, design.axes, v, front, rear, per_force)
-    return start, K, _regulator(design.terminal, design.axes, v, front, rear, per_force)
+    K = _interpolate_regulator(design.gains, design.axes, v, front, rear, per_force)
+    return start, K, _interpolate_regulator(design.terminal, design.axes, v, front, rear, per_force)
 
 
 @jit
 def _nmpc_law(
-    x: Any, state: Any, action: Any, most: Any, friction: Any, rolls: Any, design: Design
+    x: Any, state: Any, action: Any, max_moment: Any, friction: Any, rolls: Any, design: Design
 ) -> None:
-    """x: `lqr.Inputs`. state: `Memory` and the plan. rolls: (N, 2), as in `problem_of`."""
+    """x: `lqr.Inputs`. state: `Memory` and the plan. rolls: (N, 2), as in `prepare_prediction`."""
     blocks, m = design.blocks, design.gains.shape[3]
     for row in range(len(x)):
         slewing = state[row, LAST.slewing]
-        start, K, T = problem_of(design, x[row], friction[row], rolls[row], slewing, most[row])
-        plan, more = state[row, PLAN:].copy(), FIRST
+        start, K, T = prepare_prediction(
+            design, x[row], friction[row], rolls[row], slewing, max_moment[row]
+        )
+        plan, extra_iterations = state[row, PLAN:].copy(), FIRST_ITERATIONS
         if state[row, LAST.status] == SOLVED:
-            _shifted(plan, blocks, m, design.steps)
-            more = 0
-        J, share, wheel = improved(
-            design.model, start, K, T, blocks, plan, design.iterations + more
+            _shift_plan(plan, blocks, m, design.steps)
+            extra_iterations = 0
+        J, share, wheel = update_plan(
+            design.model, start, K, T, blocks, plan, design.iterations + extra_iterations
         )
         if np.isfinite(J):
             state[row, PLAN:], state[row, LAST.slewing] = plan, wheel
@@ -157,7 +171,7 @@ class Nmpc(Lqr):
     env have different plants.
     """
 
-    shortest = STEP
+    min_period = MIN_STEP
     knows_friction = True
 
     def __init__(
@@ -177,17 +191,17 @@ class Nmpc(Lqr):
         super().__init__(env, *options)
         if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
             raise ValueError(f"iterations is a positive whole number, got {iterations!r}")
-        purpose, target = self.purpose, target_of(self.nominal)
-        period = purpose.period
-        steps = max(round(positive("horizon", horizon) / (period * TICK)), 1)
-        blocks = blocks_of(steps, MOST_VARIABLES // self.width)
+        design_spec, target = self.design_spec, make_reference_params(self.nominal)
+        period = design_spec.period
+        steps = max(round(check_positive("horizon", horizon) / (period * TICK)), 1)
+        blocks = make_blocks(steps, MAX_VARIABLES // self.width)
         self.memory = PLAN + self.width * len(blocks)
-        kind, lags, yaw_first = _plant(env, purpose.kind)
-        model = model_of(
+        kind, lags, yaw_first = _read_plant_kind(env, design_spec.kind)
+        model = make_prediction_model(
             self.vehicle, kind, period, lags,
-            disturbance_time if purpose.disturbances == "forces" else math.inf,
-            target.rest if purpose.kind == LAGGED else 1.0,
-            purpose.steer_weight, self.full_scale, self.authority, yaw_first,
+            disturbance_time if design_spec.disturbances == "forces" else math.inf,
+            target.rest if design_spec.kind == LAGGED else 1.0,
+            design_spec.steer_weight, self.full_scale, self.authority, yaw_first,
         )  # fmt: skip
         self.design = Design(
             model,
@@ -197,38 +211,42 @@ class Nmpc(Lqr):
             self.axes,
             blocks,
             int(self.scheduled),
-            ("none", "forces", "rates").index(purpose.disturbances),
+            ("none", "forces", "rates").index(design_spec.disturbances),
             self.control_period / period,
             iterations,
         )
 
-    def _more(self, names: set[str]) -> tuple[str, ...]:
+    def _list_extra_entries(self, names: set[str]) -> tuple[str, ...]:
         rolling = ("phi_hat", "phi_rate_hat")
         self._rolling = names.issuperset(rolling)
         return rolling if self._rolling else ()
 
-    def _not_finite(self, rows: Any, state: Array) -> None:
+    def _mark_not_finite(self, rows: Any, state: Array) -> None:
         state[rows, LAST.status] = NOT_FINITE
 
     def status(self, state: Array) -> list[str]:
         """Of each row of a state, what became of its last decision: of `STATUSES`."""
-        return [STATUSES[int(each)] for each in state[:, LAST.status]]
+        return [STATUSES[int(code)] for code in state[:, LAST.status]]
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         rolls = np.full((len(inputs), 2), np.nan)
         if self._rolling:
             rolls = np.ascontiguousarray(inputs[:, len(IN) : len(IN) + 2])
-        friction = np.ascontiguousarray(self._friction(inputs))
-        _nmpc_law(inputs, state, action, self._most(inputs), friction, rolls, self.design)
+        friction = np.ascontiguousarray(self._get_friction(inputs))
+        _nmpc_law(
+            inputs, state, action, self._compute_max_moment(inputs), friction, rolls, self.design
+        )
 
 
-def _plant(env: AnyEnv, reference: int) -> tuple[Kind, bool, bool]:
+def _read_plant_kind(env: AnyEnv, reference: int) -> tuple[StepVariant, bool, bool]:
     """(the plant's text, whether its actuators lag, whether the yaw moment comes first)."""
-    plants = plants_of(env)
+    plants = list_plant_kinds(env)
     if len(plants) != 1:
         raise ValueError("the rows of a vector env share one prediction, but their plants differ")
     (plant,) = plants
     law, small, roll = TYRE_LAWS.index(plant.tyres), int(plant.small_angle), int(plant.roll)
-    shifting = shifts(small, law, roll)
-    kind = Kind(small, law, reference, roll, follows=0, lag=2, shifting=shifting, road=0)
+    shifting = has_load_shift(small, law, roll)
+    kind = StepVariant(
+        small, law, reference, roll, has_driver=0, lag=2, has_load_shift=shifting, road=0
+    )
     return kind, plant.lags, plant.yaw_first

@@ -5,12 +5,23 @@ from typing import Any
 
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import maximum
-from ...envs.task.reference import LAGGED, REFERENCES, ZERO_SLIP, reference, target_of
+from ...envs.task.reference import (
+    LAGGED,
+    REFERENCES,
+    ZERO_SLIP,
+    compute_reference,
+    make_reference_params,
+)
 from ...envs.ticks import TICK
-from ..design.nominal_car import drift, keeping, nominal_car, plant_at
+from ..design.nominal_car import (
+    compute_drift,
+    compute_plant,
+    compute_steady_yaw_rate,
+    make_nominal_car,
+)
 from ..env_facts import AnyEnv
-from .base import Array, Controller, entries_of, positive
-from .model_following import SLOWEST
+from .base import Array, Controller, check_positive, list_entry_names
+from .model_following import MIN_SPEED
 
 Inputs = namedtuple(
     "Inputs", "wheel_left wheel_right steer_command steer beta_ref gamma_ref beta_hat gamma_hat"
@@ -25,7 +36,7 @@ LAST = Memory(*range(3))
 
 
 @jit
-def surface(plant: Any, pole: Any) -> Any:
+def compute_surface_slope(plant: Any, pole: Any) -> Any:
     """xi of s = gamma - gamma_ref + xi (beta - beta_ref): on s = 0 beta's error decays at `pole`.
 
     There beta' = a11 beta + a12 gamma makes its error's pole a11 - a12 xi. With a12 near -1, xi is
@@ -35,14 +46,14 @@ def surface(plant: Any, pole: Any) -> Any:
 
 
 @jit
-def _goal(x: Any, v: Any, plant: Any, target: Any, kind: int) -> Any:
+def _compute_reference(x: Any, v: Any, plant: Any, target: Any, kind: int) -> Any:
     """(beta_ref, gamma_ref) of a row: a lagged reference is the observation's, and where the yaw
     rate is free it is the one that keeps beta_ref."""
     if kind == LAGGED:
         return x[IN.beta_ref], x[IN.gamma_ref]
-    beta, gamma = reference(x[IN.steer_command], v, target, kind)
+    beta, gamma = compute_reference(x[IN.steer_command], v, target, kind)
     if kind == ZERO_SLIP:
-        gamma = keeping(plant, beta, x[IN.steer])
+        gamma = compute_steady_yaw_rate(plant, beta, x[IN.steer])
     return beta, gamma
 
 
@@ -51,7 +62,7 @@ def _sliding_mode_law(
     x: Any,
     state: Any,
     action: Any,
-    most: Any,
+    max_moment: Any,
     car: Any,
     target: Any,
     kind: int,
@@ -63,24 +74,26 @@ def _sliding_mode_law(
 ) -> None:
     """x: `Inputs`. state: `Memory`."""
     for n in range(len(x)):
-        v = maximum(0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right]), SLOWEST)
-        plant = plant_at(car, v)
+        v = maximum(0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right]), MIN_SPEED)
+        plant = compute_plant(car, v)
         beta, gamma, delta = x[n, IN.beta_hat], x[n, IN.gamma_hat], x[n, IN.steer]
-        xi = surface(plant, pole)
-        beta_ref, gamma_ref = _goal(x[n], v, plant, target, kind)
-        moves_beta, moves_gamma = 0.0, 0.0  # the references' derivatives
+        xi = compute_surface_slope(plant, pole)
+        beta_ref, gamma_ref = _compute_reference(x[n], v, plant, target, kind)
+        beta_ref_rate, gamma_ref_rate = 0.0, 0.0  # the references' derivatives
         if state[n, LAST.known] > 0.0:
-            moves_beta = (beta_ref - state[n, LAST.beta_ref]) / dt
-            moves_gamma = (gamma_ref - state[n, LAST.gamma_ref]) / dt
+            beta_ref_rate = (beta_ref - state[n, LAST.beta_ref]) / dt
+            gamma_ref_rate = (gamma_ref - state[n, LAST.gamma_ref]) / dt
         s = gamma - gamma_ref + xi * (beta - beta_ref)
-        own = drift(plant, beta, gamma)
-        free = own[1] + plant.b21 * delta - moves_gamma
-        free += xi * (own[0] + plant.b11 * delta - moves_beta)  # s' without the yaw moment
+        drift_rates = compute_drift(plant, beta, gamma)
+        s_rate = drift_rates[1] + plant.b21 * delta - gamma_ref_rate
+        s_rate += xi * (
+            drift_rates[0] + plant.b11 * delta - beta_ref_rate
+        )  # s' without the yaw moment
         reach = rate * layer * min(max(s / layer, -1.0), 1.0)
-        N_z = -(free + reach) / plant.b22  # Rajamani 8.3: equivalent control and boundary layer
+        N_z = -(s_rate + reach) / plant.b22  # Rajamani 8.3: equivalent control and boundary layer
         state[n, LAST.beta_ref], state[n, LAST.gamma_ref] = beta_ref, gamma_ref
         state[n, LAST.known] = 1.0
-        action[n, 0] = min(max(N_z / full_scale, -most[n]), most[n])
+        action[n, 0] = min(max(N_z / full_scale, -max_moment[n]), max_moment[n])
 
 
 class SlidingMode(Controller):
@@ -88,9 +101,9 @@ class SlidingMode(Controller):
 
     Rajamani, Vehicle Dynamics and Control, 8.3: the equivalent control of the nominal car at the
     measured speed keeps s constant, and within a boundary layer of `layer` rad/s s decays at `rate`
-    rad/s (outside at rate x layer rad/s2). xi is `surface` for the `pole` in rad/s. Where the yaw
-    rate is not judged, gamma_ref is the yaw rate that keeps beta_ref. Reads beta_hat, and
-    gamma_hat or else the gyro. grip: of `Controller`. Memory: `Memory`.
+    rad/s (outside at rate x layer rad/s2). xi is `compute_surface_slope` for the `pole` in rad/s.
+    Where the yaw rate is not judged, gamma_ref is the yaw rate that keeps beta_ref. Reads beta_hat,
+    and gamma_hat or else the gyro. grip: of `Controller`. Memory: `Memory`.
 
     Raises ValueError for an option that is not positive, or an observation without beta_hat.
     """
@@ -105,20 +118,20 @@ class SlidingMode(Controller):
         layer: float = 0.2,
         grip: float | None = None,
     ) -> None:
-        yaw_rate = "gamma_hat" if "gamma_hat" in entries_of(env) else "gyro"
+        yaw_rate = "gamma_hat" if "gamma_hat" in list_entry_names(env) else "gyro"
         self.needs = (*Inputs._fields[: IN.gamma_hat], yaw_rate)
         super().__init__(env, grip)
-        self.pole, self.rate = positive("pole", pole), positive("rate", rate)
+        self.pole, self.rate = check_positive("pole", pole), check_positive("rate", rate)
         self._design = (
-            nominal_car(self.nominal),
-            target_of(self.nominal),
+            make_nominal_car(self.nominal),
+            make_reference_params(self.nominal),
             REFERENCES.index(self.reference),
             self.pole,
             self.rate,
-            positive("layer", layer),
+            check_positive("layer", layer),
             self.full_scale,
             self.control_period * TICK,
         )
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _sliding_mode_law(inputs, state, action, self._most(inputs), *self._design)
+        _sliding_mode_law(inputs, state, action, self._compute_max_moment(inputs), *self._design)

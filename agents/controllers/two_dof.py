@@ -14,13 +14,13 @@ from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute, maximum, select
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import Vehicle
-from ..design.nominal_car import CAR, nominal_car, plant_at
+from ..design.nominal_car import CAR, compute_plant, make_nominal_car
 from ..design.pi import PLACEMENTS, POLE, design_pi, sample_pi
 from ..env_facts import AnyEnv
-from .base import Array, Controller, integrated, not_negative
+from .base import Array, Controller, check_not_negative, integrate_antiwindup
 
-SLOWEST = 2.0  # m/s: gains below it are those of this speed
-SPEEDS = np.arange(SLOWEST, 61.0, 0.5)  # m/s
+MIN_SPEED = 2.0  # m/s: gains below it are those of this speed
+SPEEDS = np.arange(MIN_SPEED, 61.0, 0.5)  # m/s
 CAMERA_PERIOD = 0.033  # s
 FEEDFORWARDS = ("reference", "zero-slip")
 
@@ -36,28 +36,28 @@ LAST = Memory(*range(3))
 
 
 @jit
-def _denominator(car: Any, V: Any) -> Any:
+def _compute_denominator(car: Any, V: Any) -> Any:
     """-a12 m V^2, kept from zero, where the yaw moment has no static effect on the slip."""
     mV2, excess = car[CAR.m] * V * V, car[CAR.l_f] * car[CAR.C_f] - car[CAR.l_r] * car[CAR.C_r]
-    denominator, least = mV2 + 2.0 * excess, 0.05 * (mV2 + 2.0 * absolute(excess))
-    if absolute(denominator) < least:
-        denominator = select(denominator < 0.0, -least, least)
+    denominator, min_size = mV2 + 2.0 * excess, 0.05 * (mV2 + 2.0 * absolute(excess))
+    if absolute(denominator) < min_size:
+        denominator = select(denominator < 0.0, -min_size, min_size)
     return denominator
 
 
 @jit
-def _static_gain(car: Any, V: Any) -> Any:
+def _compute_static_gain(car: Any, V: Any) -> Any:
     m, l_f, l_r, C_f, C_r = car[CAR.m], car[CAR.l_f], car[CAR.l_r], car[CAR.C_f], car[CAR.C_r]
     mV2 = m * V * V
     numerator = 4.0 * l_r * (l_f + l_r) * C_f * C_r - 2.0 * l_f * C_f * mV2
-    return numerator / _denominator(car, V)  # tie-vision (24)
+    return numerator / _compute_denominator(car, V)  # tie-vision (24)
 
 
 @jit
-def _slip_gain(car: Any, V: Any) -> Any:
+def _compute_slip_gain(car: Any, V: Any) -> Any:
     """N m/rad: the yaw moment that holds a sideslip angle, beside (24)'s that makes it zero."""
-    plant, m = plant_at(car, V), car[CAR.m]
-    yaw_rate = plant.a11 * m * V * V / _denominator(car, V)  # that keeps it, -a11 / a12
+    plant, m = compute_plant(car, V), car[CAR.m]
+    yaw_rate = plant.a11 * m * V * V / _compute_denominator(car, V)  # that keeps it, -a11 / a12
     return -(plant.a21 + plant.a22 * yaw_rate) / plant.b22
 
 
@@ -67,10 +67,10 @@ def feedforward_gain(vehicle: Vehicle, speed: float) -> float:
     Where the yaw moment has no static effect on beta (m V^2 = 2 (l_r C_r - l_f C_f), which exists
     for understeering cars only) the gain is limited to what 5 % of the terms would give.
     """
-    return float(_static_gain(nominal_car(vehicle), float(speed)))
+    return float(_compute_static_gain(make_nominal_car(vehicle), float(speed)))
 
 
-def _pi_table(
+def _make_pi_table(
     vehicle: Vehicle, gain: float, pole: float, placement: str, period: float | None
 ) -> Array:
     """(len(SPEEDS), 2) of k_p and k_i."""
@@ -78,22 +78,22 @@ def _pi_table(
         gains = [design_pi(vehicle, float(v), pole, placement) for v in SPEEDS]
     else:
         gains = [sample_pi(vehicle, float(v), period, pole, placement) for v in SPEEDS]
-    return gain * np.array([(each.k_p, each.k_i) for each in gains])
+    return gain * np.array([(pi.k_p, pi.k_i) for pi in gains])
 
 
 @jit
-def _scheduled(table: Any, v: Any) -> Any:
+def _interpolate_column(table: Any, v: Any) -> Any:
     """A column of a table over SPEEDS, interpolated at v and held beyond its ends."""
-    at = min(max((v - SLOWEST) / 0.5, 0.0), len(table) - 1.000001)
-    i = int(at)
-    return table[i] + (at - i) * (table[i + 1] - table[i])
+    position = min(max((v - MIN_SPEED) / 0.5, 0.0), len(table) - 1.000001)
+    i = int(position)
+    return table[i] + (position - i) * (table[i + 1] - table[i])
 
 
 @jit
 def _feedforward_law(x: Any, action: Any, car: Any, full_scale: float) -> None:
     for n in range(len(x)):
         v = 0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right])
-        gain = _static_gain(car, maximum(v, SLOWEST))
+        gain = _compute_static_gain(car, maximum(v, MIN_SPEED))
         action[n, 0] = gain * x[n, IN.steer_command] / full_scale
 
 
@@ -102,7 +102,7 @@ def _two_dof_law(
     x: Any,
     state: Any,
     action: Any,
-    most: Any,
+    max_moment: Any,
     follows: int,
     car: Any,
     k_p: Any,
@@ -119,15 +119,15 @@ def _two_dof_law(
             continue
         v = 0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right])
         error = x[n, IN.beta_ref] - x[n, IN.beta_hat]
-        forward = _static_gain(car, maximum(v, SLOWEST)) * x[n, IN.steer_command]
+        forward = _compute_static_gain(car, maximum(v, MIN_SPEED)) * x[n, IN.steer_command]
         if follows:
-            forward += _slip_gain(car, maximum(v, SLOWEST)) * x[n, IN.beta_ref]
+            forward += _compute_slip_gain(car, maximum(v, MIN_SPEED)) * x[n, IN.beta_ref]
         integral = state[n, LAST.integral]
-        wanted = forward + _scheduled(k_p, v) * error + integral
-        limit = most[n] * full_scale
-        N_z = min(max(wanted, -limit), limit)
-        step = _scheduled(k_i, v) * error * dt  # forward Euler
-        state[n, LAST.integral] = integrated(integral, step, wanted, N_z)
+        unlimited = forward + _interpolate_column(k_p, v) * error + integral
+        limit = max_moment[n] * full_scale
+        N_z = min(max(unlimited, -limit), limit)
+        step = _interpolate_column(k_i, v) * error * dt  # forward Euler
+        state[n, LAST.integral] = integrate_antiwindup(integral, step, unlimited, N_z)
         state[n, LAST.wait] = wait - 1.0
         state[n, LAST.share] = N_z / full_scale
         action[n, 0] = state[n, LAST.share]
@@ -140,7 +140,7 @@ class Feedforward(Controller):
 
     def __init__(self, env: AnyEnv) -> None:
         super().__init__(env)
-        self._design = nominal_car(self.nominal), self.full_scale
+        self._design = make_nominal_car(self.nominal), self.full_scale
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         _feedforward_law(inputs, action, *self._design)
@@ -183,13 +183,13 @@ class TwoDof(Controller):
         period = self.control_period * TICK
         wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
         dt = wait * period
-        table = _pi_table(
-            self.nominal, not_negative("gain", gain), pole, placement, dt if sampled else None
+        table = _make_pi_table(
+            self.nominal, check_not_negative("gain", gain), pole, placement, dt if sampled else None
         )
         self.k_p, self.k_i = np.ascontiguousarray(table.T)
-        car = nominal_car(self.nominal)
+        car = make_nominal_car(self.nominal)
         follows = int(feedforward == FEEDFORWARDS[0])
         self._design = follows, car, self.k_p, self.k_i, self.full_scale, wait, dt
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _two_dof_law(inputs, state, action, self._most(inputs), *self._design)
+        _two_dof_law(inputs, state, action, self._compute_max_moment(inputs), *self._design)

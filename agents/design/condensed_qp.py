@@ -6,11 +6,11 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from ...envs.record import Array
-from .sampled_model import DesignModel, cost_to_go
+from .sampled_model import DesignModel, compute_cost_to_go
 
 
 @dataclass(frozen=True)
-class Quadratic:
+class QuadraticProgram:
     """Minimise a'P a / 2 + (F x)'a over the inputs a (h m,) of h steps from the state x (n,).
 
     Inputs stand step by step, as shares of their limits. The cost is scaled, so that the mean of
@@ -23,7 +23,7 @@ class Quadratic:
     A: Array
 
 
-def quadratic(model: DesignModel, horizon: int, limits: Array) -> Quadratic:
+def condense_qp(model: DesignModel, horizon: int, limits: Array) -> QuadraticProgram:
     """The program over `horizon` steps of a model, with the regulator's cost of what follows.
 
     limits: (m,), the inputs at a share of 1.
@@ -32,10 +32,10 @@ def quadratic(model: DesignModel, horizon: int, limits: Array) -> Quadratic:
     Sx, Su = np.zeros(((horizon + 1) * n, n)), np.zeros(((horizon + 1) * n, horizon * m))
     Sx[:n] = np.eye(n)
     for i in range(horizon):  # x = Sx x_0 + Su u, row by row of steps
-        now, then = slice(i * n, (i + 1) * n), slice((i + 1) * n, (i + 2) * n)
-        Sx[then], Su[then] = model.G @ Sx[now], model.G @ Su[now]
-        Su[then, i * m : (i + 1) * m] += model.H
-    Q = block_diag(*[model.Q] * horizon, cost_to_go(model)[1])
+        rows, next_rows = slice(i * n, (i + 1) * n), slice((i + 1) * n, (i + 2) * n)
+        Sx[next_rows], Su[next_rows] = model.G @ Sx[rows], model.G @ Su[rows]
+        Su[next_rows, i * m : (i + 1) * m] += model.H
+    Q = block_diag(*[model.Q] * horizon, compute_cost_to_go(model)[1])
     R = block_diag(*[model.R] * horizon)
     N = np.vstack([block_diag(*[model.N] * horizon), np.zeros((n, horizon * m))])
     scale = np.tile(limits, horizon)
@@ -46,4 +46,4 @@ def quadratic(model: DesignModel, horizon: int, limits: Array) -> Quadratic:
     if m > 1:
         changes = np.eye(horizon) - np.eye(horizon, k=-1)
         A = np.vstack([A, np.kron(changes, [[0.0, 1.0]])])
-    return Quadratic(0.5 * (P + P.T) / size, F / size, A)
+    return QuadraticProgram(0.5 * (P + P.T) / size, F / size, A)

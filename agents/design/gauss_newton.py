@@ -5,89 +5,102 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...envs.backend.arrays import lane_count
+from ...envs.backend.arrays import count_lanes
 from ...envs.backend.decorators import jit
-from .prediction import RESIDUALS, TERMINAL, roll_out
-from .prediction_model import Model, Start
+from .prediction import N_RESIDUALS, N_TERMINAL, simulate_plans
+from .prediction_model import PredictionModel, PredictionStart
 
-PLANS = 16  # that are tried at once
-MOST_VARIABLES = PLANS - 1  # one is the plan itself
+N_CANDIDATES = 16  # that are tried at once
+MAX_VARIABLES = N_CANDIDATES - 1  # one is the plan itself
 LIMIT = 2.0  # of a variable: from one limit of an input to the other
 DIFFERENCE = 0.01  # of a variable, for slopes
-LEAST_DAMPING = 1e-4  # Levenberg and Marquardt's, of the first of the steps that are tried
-LENGTHS = (1.0, 0.3)  # each step is tried whole and in part
+MIN_DAMPING = 1e-4  # Levenberg and Marquardt's, of the first of the steps that are tried
+STEP_LENGTHS = (1.0, 0.3)  # each step is tried whole and in part
 
 
-class Lanes(NamedTuple):
+class PlanBatch(NamedTuple):
     """Plans side by side, and what came of them: a column for each."""
 
     plans: Any  # (variables, count)
-    pokes: Any
+    perturbations: Any
     limits: Any
     residuals: Any
     first: Any  # (2, count), share of the moment and rad of steering
 
 
 @jit
-def lanes_of(variables: int, blocks: Any, count: int) -> Lanes:
+def make_plan_batch(variables: int, blocks: Any, count: int) -> PlanBatch:
     """So many columns, of zeros."""
-    return Lanes(
+    return PlanBatch(
         np.zeros((variables, count)),
         np.zeros((variables, count)),
         np.zeros((variables, count)),
-        np.zeros((RESIDUALS * blocks.sum() + TERMINAL, count)),
+        np.zeros((N_RESIDUALS * blocks.sum() + N_TERMINAL, count)),
         np.zeros((2, count)),
     )
 
 
 @jit
-def roll_all(model: Model, start: Start, K: Any, terminal: Any, blocks: Any, all: Lanes) -> None:
-    """`roll_out` of any number of plans, as many at a time as there are lanes."""
-    width, (variables, count) = lane_count(), all.plans.shape
-    some = lanes_of(variables, blocks, width)
+def simulate_batch(
+    model: PredictionModel,
+    start: PredictionStart,
+    K: Any,
+    terminal: Any,
+    blocks: Any,
+    batch: PlanBatch,
+) -> None:
+    """`simulate_plans` of any number of plans, as many at a time as there are lanes."""
+    width, (variables, count) = count_lanes(), batch.plans.shape
+    chunk = make_plan_batch(variables, blocks, width)
     for c in range(0, count, width):
         n = min(width, count - c)
-        some.plans[:, :n], some.pokes[:, :n] = all.plans[:, c : c + n], all.pokes[:, c : c + n]
-        roll_out(
+        chunk.plans[:, :n], chunk.perturbations[:, :n] = (
+            batch.plans[:, c : c + n],
+            batch.perturbations[:, c : c + n],
+        )
+        simulate_plans(
             model, start, K, terminal, blocks,
-            some.plans, some.pokes, some.residuals, some.limits, some.first,
+            chunk.plans, chunk.perturbations, chunk.residuals, chunk.limits, chunk.first,
         )  # fmt: skip
-        all.residuals[:, c : c + n] = some.residuals[:, :n]
-        all.limits[:, c : c + n], all.first[:, c : c + n] = some.limits[:, :n], some.first[:, :n]
+        batch.residuals[:, c : c + n] = chunk.residuals[:, :n]
+        batch.limits[:, c : c + n], batch.first[:, c : c + n] = (
+            chunk.limits[:, :n],
+            chunk.first[:, :n],
+        )
 
 
 @jit
-def _costs(seen: Any, J: Any) -> None:
+def _sum_squares(residuals: Any, J: Any) -> None:
     """Fill J (count,) with the sums of the squared residuals."""
     J[:] = 0.0
-    for r in range(len(seen)):
+    for r in range(len(residuals)):
         for c in range(len(J)):
-            J[c] += seen[r, c] * seen[r, c]
+            J[c] += residuals[r, c] * residuals[r, c]
 
 
 @jit
-def _normal_equations(all: Lanes, A: Any, g: Any) -> None:
+def _compute_normal_equations(batch: PlanBatch, A: Any, g: Any) -> None:
     """Fill A = J'J and g = J'r; column i + 1 pokes variable i of the plan in the first.
 
     A variable that is at a limit, and would be cheaper beyond it, is left where it is.
     """
-    n, seen = len(g), all.residuals
+    n, residuals = len(g), batch.residuals
     slope = np.empty(n)
     A[:], g[:] = 0.0, 0.0
-    for r in range(len(seen)):
+    for r in range(len(residuals)):
         for i in range(n):
-            slope[i] = (seen[r, i + 1] - seen[r, 0]) / DIFFERENCE
+            slope[i] = (residuals[r, i + 1] - residuals[r, 0]) / DIFFERENCE
         for i in range(n):
-            g[i] += slope[i] * seen[r, 0]
+            g[i] += slope[i] * residuals[r, 0]
             for j in range(n):
                 A[i, j] += slope[i] * slope[j]
     for i in range(n):
-        if all.limits[i, 0] * g[i] < 0.0:
+        if batch.limits[i, 0] * g[i] < 0.0:
             A[i, :], A[:, i], g[i] = 0.0, 0.0, 0.0
 
 
 @jit
-def damped_step(A: Any, g: Any, damping: float, L: Any, d: Any) -> None:
+def solve_damped_step(A: Any, g: Any, damping: float, L: Any, d: Any) -> None:
     """Fill d with the solution of (A + damping diag A) d = -g; zeros where there is none.
 
     A: positive semidefinite; a variable without an effect stays. L: (n, n) to work in.
@@ -117,30 +130,36 @@ def damped_step(A: Any, g: Any, damping: float, L: Any, d: Any) -> None:
 
 
 @jit
-def _poke(plan: Any, all: Lanes) -> None:
+def _fill_perturbations(plan: Any, batch: PlanBatch) -> None:
     """Fill every column with the plan; a column pokes one variable, the first none."""
     for i in range(len(plan)):
-        all.plans[i, :] = plan[i]
-        all.pokes[i, i + 1] = DIFFERENCE
+        batch.plans[i, :] = plan[i]
+        batch.perturbations[i, i + 1] = DIFFERENCE
 
 
 @jit
-def _propose(plan: Any, A: Any, g: Any, plans: Any) -> None:
+def _fill_candidates(plan: Any, A: Any, g: Any, plans: Any) -> None:
     """Fill plans with the plan, the regulator's own (zeros), and steps of growing damping."""
-    n, damping = len(plan), LEAST_DAMPING
+    n, damping = len(plan), MIN_DAMPING
     L, d = np.empty((n, n)), np.empty(n)
     plans[:, 0], plans[:, 1] = plan, 0.0
-    for c in range(2, plans.shape[1], len(LENGTHS)):
-        damped_step(A, g, damping, L, d)
+    for c in range(2, plans.shape[1], len(STEP_LENGTHS)):
+        solve_damped_step(A, g, damping, L, d)
         damping *= 10.0
-        for k in range(len(LENGTHS)):
+        for k in range(len(STEP_LENGTHS)):
             for i in range(n):
-                plans[i, c + k] = min(max(plan[i] + LENGTHS[k] * d[i], -LIMIT), LIMIT)
+                plans[i, c + k] = min(max(plan[i] + STEP_LENGTHS[k] * d[i], -LIMIT), LIMIT)
 
 
 @jit
-def improved(
-    model: Model, start: Start, K: Any, terminal: Any, blocks: Any, plan: Any, iterations: int
+def update_plan(
+    model: PredictionModel,
+    start: PredictionStart,
+    K: Any,
+    terminal: Any,
+    blocks: Any,
+    plan: Any,
+    iterations: int,
 ) -> Any:
     """(J, share, rad of added steering): the cost of the improved plan and its first commands.
 
@@ -148,21 +167,26 @@ def improved(
     J is not finite where no plan was; then the plan is as it was.
     """
     n = len(plan)
-    all, A, g, J = lanes_of(n, blocks, PLANS), np.empty((n, n)), np.empty(n), np.empty(PLANS)
-    least, share, wheel = math.inf, 0.0, 0.0
+    batch, A, g, J = (
+        make_plan_batch(n, blocks, N_CANDIDATES),
+        np.empty((n, n)),
+        np.empty(n),
+        np.empty(N_CANDIDATES),
+    )
+    min_cost, share, wheel = math.inf, 0.0, 0.0
     for _ in range(iterations):
-        _poke(plan, all)
-        roll_all(model, start, K, terminal, blocks, all)
-        _normal_equations(all, A, g)
-        _propose(plan, A, g, all.plans)
-        all.pokes[:] = 0.0
-        roll_all(model, start, K, terminal, blocks, all)
-        _costs(all.residuals, J)
-        best, least = 0, math.inf
-        for c in range(PLANS):
-            if J[c] < least:
-                best, least = c, J[c]
-        if least < math.inf:
-            plan[:] = all.plans[:, best]
-            share, wheel = all.first[0, best], all.first[1, best]
-    return least, share, wheel
+        _fill_perturbations(plan, batch)
+        simulate_batch(model, start, K, terminal, blocks, batch)
+        _compute_normal_equations(batch, A, g)
+        _fill_candidates(plan, A, g, batch.plans)
+        batch.perturbations[:] = 0.0
+        simulate_batch(model, start, K, terminal, blocks, batch)
+        _sum_squares(batch.residuals, J)
+        best, min_cost = 0, math.inf
+        for c in range(N_CANDIDATES):
+            if J[c] < min_cost:
+                best, min_cost = c, J[c]
+        if min_cost < math.inf:
+            plan[:] = batch.plans[:, best]
+            share, wheel = batch.first[0, best], batch.first[1, best]
+    return min_cost, share, wheel

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...envs.vehicle.linear import bicycle
+from ...envs.vehicle.linear import make_bicycle_model
 from ...envs.vehicle.vehicle import Vehicle
 
 POLE = 2.0 * math.pi * 2.0  # rad/s: Table II of tie-vision places poles at 2 Hz
@@ -34,7 +34,7 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str
     Raises ValueError for another placement or pole.
     """
     _check(pole, placement)
-    model = bicycle(vehicle, speed)
+    model = make_bicycle_model(vehicle, speed)
     closed = model.A - model.B[:, 1:] @ [[1.0, 0.0]]  # its polynomial less the plant's is G's upper
     k = float((np.poly(closed) - np.poly(model.A))[-1])
     slow_first = sorted(-float(p.real) for p in np.linalg.eigvals(model.A))
@@ -43,7 +43,7 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str
         product = min(pole, p_2) ** 2
     else:
         product = pole * (p_2 - pole) if pole < p_2 else 0.25 * p_2 * p_2
-    k_p = _capped(vehicle, product / k) if k != 0.0 else 0.0
+    k_p = _limit_gain(vehicle, product / k) if k != 0.0 else 0.0
     return PI(k_p, k_p * p_1)
 
 
@@ -54,9 +54,9 @@ def _check(pole: float, placement: str) -> None:
         raise ValueError(f"pole is a positive number in rad/s, got {pole!r}")
 
 
-def _capped(vehicle: Vehicle, k_p: float) -> float:
-    most = vehicle.yaw_moment_limit / 0.01
-    return min(max(float(k_p), -most), most)
+def _limit_gain(vehicle: Vehicle, k_p: float) -> float:
+    max_gain = vehicle.yaw_moment_limit / 0.01
+    return min(max(float(k_p), -max_gain), max_gain)
 
 
 def sample_pi(
@@ -70,10 +70,10 @@ def sample_pi(
     raises as that does.
     """
     _check(pole, placement)
-    model = bicycle(vehicle, speed)
+    model = make_bicycle_model(vehicle, speed)
     p_1, p_2 = np.sort(-np.linalg.eigvals(model.A).real).tolist()
     a_1, a_2 = math.exp(-max(p_1, 0.0) * period), math.exp(-p_2 * period)
-    G, H = model.discrete(period)
+    G, H = model.discretise(period)
     b_1 = H[0, 1]
     b_0 = G[0, 1] * H[1, 1] - G[1, 1] * H[0, 1]
     if b_1 + b_0 == 0.0:
@@ -85,7 +85,7 @@ def sample_pi(
         radius = min(pole, p_2)
         continuous = radius**2 / float(model.A[0, 1] * model.B[1, 1])
 
-        def excess(factor: float) -> float:
+        def compute_excess(factor: float) -> float:
             k_p = factor * continuous
             poles = np.roots([1.0, k_p * b_1 - 1.0 - a_2, a_2 + k_p * b_0]).astype(complex)
             return float(np.prod(np.log(poles)).real - (radius * period) ** 2)
@@ -93,7 +93,11 @@ def sample_pi(
         from scipy.optimize import brentq  # slow to load
 
         factors = np.linspace(0.0, 4.0, 81)  # the first of them, before a pole leaves z > 0
-        beyond = next((f for f in factors[1:] if excess(f) > 0.0), None)
-        k_p = continuous * (4.0 if beyond is None else brentq(excess, beyond - 0.05, beyond))
-    k_p = _capped(vehicle, float(k_p))
+        upper_factor = next((f for f in factors[1:] if compute_excess(f) > 0.0), None)
+        k_p = continuous * (
+            4.0
+            if upper_factor is None
+            else brentq(compute_excess, upper_factor - 0.05, upper_factor)
+        )
+    k_p = _limit_gain(vehicle, float(k_p))
     return PI(k_p, k_p * (1.0 - a_1) / period)

@@ -8,21 +8,29 @@ limited or bent it is the best one. As many plans as a SIMD value has lanes are 
 import math
 from typing import Any, NamedTuple
 
-from ...envs.backend.arrays import at, put
-from ...envs.backend.decorators import apart, inlined
+from ...envs.backend.arrays import load_element, store_element
+from ...envs.backend.decorators import inline, noinline
 from ...envs.backend.primitives import maximum, minimum, select
-from ...envs.engine.tick import load_at
+from ...envs.engine.tick import compute_lagged_load
 from ...envs.ticks import TICK
-from ...envs.vehicle.actuators import distribute, lagged, slewed, torque_limit, within_stop
-from ...envs.vehicle.dynamics import Motion, Push, sideslip_angle
+from ...envs.vehicle.actuators import (
+    allocate_torques,
+    apply_lag,
+    compute_torque_limit,
+    limit_angle,
+    limit_rate,
+)
+from ...envs.vehicle.dynamics import DisturbanceForces, Motion, compute_sideslip_angle
 from ...envs.vehicle.integration import rk4
-from .prediction_model import Model, Start
+from .prediction_model import PredictionModel, PredictionStart
 
-RESIDUALS = 6  # of a step: slip, yaw rate, moment and steering with the spread of each in the step
-TERMINAL = 4  # residuals behind the last step
+N_RESIDUALS = (
+    6  # of a step: slip, yaw rate, moment and steering with the spread of each in the step
+)
+N_TERMINAL = 4  # residuals behind the last step
 
 
-class Now(NamedTuple):
+class PredictionState(NamedTuple):
     """A prediction's state between steps."""
 
     motion: Any
@@ -36,129 +44,160 @@ class Now(NamedTuple):
     N_d: Any
 
 
-@inlined
-def clipped(value: Any, most: Any) -> Any:
+@inline
+def clip_symmetric(value: Any, limit: Any) -> Any:
     """The value within +-most."""
-    return minimum(maximum(value, 0.0 - most), most)
+    return minimum(maximum(value, 0.0 - limit), limit)
 
 
-@inlined
-def at_limit(value: Any, low: Any, high: Any) -> Any:
+@inline
+def detect_limit(value: Any, low: Any, high: Any) -> Any:
     """1 or -1 where the value is at the upper or the lower limit, else 0."""
     close = 1e-9 * (high - low)
     return select(value >= high - close, 1.0, select(value <= low + close, -1.0, 0.0))
 
 
-@inlined
-def product(M: Any, row: int, model: Model, driver: Any, now: Now, beta: Any) -> Any:
+@inline
+def multiply_row(
+    M: Any, row: int, model: PredictionModel, driver: Any, state: PredictionState, beta: Any
+) -> Any:
     """A row of M (rows, 9) times the states of the design model with forces."""
-    share = 0.5 * model.car.d_r / model.car.r / model.full_scale * (now.T_r - now.T_l)
-    lateral = M[row, 0] * beta + M[row, 1] * now.motion.gamma + M[row, 2] * share
-    held = M[row, 3] * now.delta_f + M[row, 4] * driver + M[row, 5] * now.beta_ref
-    pushed = M[row, 6] * now.gamma_ref + M[row, 7] * now.F_d + M[row, 8] * now.N_d
+    share = 0.5 * model.car.d_r / model.car.r / model.full_scale * (state.T_r - state.T_l)
+    lateral = M[row, 0] * beta + M[row, 1] * state.motion.gamma + M[row, 2] * share
+    held = M[row, 3] * state.delta_f + M[row, 4] * driver + M[row, 5] * state.beta_ref
+    pushed = M[row, 6] * state.gamma_ref + M[row, 7] * state.F_d + M[row, 8] * state.N_d
     return lateral + held + pushed
 
 
-@inlined
-def commanded(
-    model: Model, start: Start, K: Any, now: Now, beta: Any, added: Any, turn: Any
+@inline
+def compute_commands(
+    model: PredictionModel,
+    start: PredictionStart,
+    K: Any,
+    state: PredictionState,
+    beta: Any,
+    added: Any,
+    turn: Any,
 ) -> Any:
     """(share of full scale, rad of added steering, which of both are at a limit): the regulator's
     answer and a plan's part.
 
     Where nothing steers K has one row, and there is no turn. At a limit: 1 or -1.
     """
-    most = start.most
-    share = clipped(0.0 - product(K, 0, model, start.driver, now, beta), most) + added
+    max_moment = start.max_moment
+    share = (
+        clip_symmetric(0.0 - multiply_row(K, 0, model, start.driver, state, beta), max_moment)
+        + added
+    )
     wheel, bound = 0.0 * share, 0.0 * share
     if len(K) > 1:
-        wheel = clipped(0.0 - product(K, 1, model, start.driver, now, beta), model.authority)
-        wheel = clipped(wheel + model.authority * turn, model.authority)
-        wheel = slewed(now.slewing, wheel, model.slew)
-        high = minimum(now.slewing + model.slew, model.authority)
-        low = maximum(now.slewing - model.slew, 0.0 - model.authority)
-        bound = at_limit(wheel, low, high)
-    share = clipped(share, most)
-    return share, wheel, at_limit(share, 0.0 - most, most), bound
+        wheel = clip_symmetric(
+            0.0 - multiply_row(K, 1, model, start.driver, state, beta), model.authority
+        )
+        wheel = clip_symmetric(wheel + model.authority * turn, model.authority)
+        wheel = limit_rate(state.slewing, wheel, model.slew)
+        high = minimum(state.slewing + model.slew, model.authority)
+        low = maximum(state.slewing - model.slew, 0.0 - model.authority)
+        bound = detect_limit(wheel, low, high)
+    share = clip_symmetric(share, max_moment)
+    return share, wheel, detect_limit(share, 0.0 - max_moment, max_moment), bound
 
 
-@inlined
-def advanced(
-    model: Model, start: Start, now: Now, share: Any, wheel: Any, more: Any, turn: Any
+@inline
+def predict_step(
+    model: PredictionModel,
+    start: PredictionStart,
+    state: PredictionState,
+    share: Any,
+    wheel: Any,
+    share_beyond: Any,
+    steer_beyond: Any,
 ) -> Any:
     """(the state after a step, the effort's four residuals) for commands held over it.
 
-    more, turn: of share and wheel, beyond every limit of theirs.
+    share_beyond, steer_beyond: of share and wheel, beyond every limit of theirs.
     """
     kind, motor, steering, h = model.kind, model.motor, model.steering, model.step
     car, driver = start.car, start.driver
-    most = torque_limit(now.motion.v_x, car)
+    max_torque = compute_torque_limit(state.motion.v_x, car)
     N_z = share * model.full_scale
-    T_l, T_r = distribute(N_z, start.a_x, car, model.yaw_first, most)
-    beyond = more * (model.full_scale * car.r / car.d_r)
-    T_l, T_r = T_l - beyond, T_r + beyond
-    extra = within_stop(wheel, driver, model.stop) + turn
+    T_l, T_r = allocate_torques(N_z, start.a_x, car, model.yaw_first, max_torque)
+    torque_beyond = share_beyond * (model.full_scale * car.r / car.d_r)
+    T_l, T_r = T_l - torque_beyond, T_r + torque_beyond
+    extra = limit_angle(wheel, driver, model.stop) + steer_beyond
     steer = driver + extra
     loads = (
-        load_at(lagged(steer, now.delta_f, steering.start), T_l, T_r, now, motor.start, car, kind),
-        load_at(
-            lagged(steer, now.delta_f, steering.middle), T_l, T_r, now, motor.middle, car, kind
+        compute_lagged_load(
+            apply_lag(steer, state.delta_f, steering.start), T_l, T_r, state, motor.start, car, kind
         ),
-        load_at(lagged(steer, now.delta_f, steering.end), T_l, T_r, now, motor.end, car, kind),
+        compute_lagged_load(
+            apply_lag(steer, state.delta_f, steering.middle),
+            T_l,
+            T_r,
+            state,
+            motor.middle,
+            car,
+            kind,
+        ),
+        compute_lagged_load(
+            apply_lag(steer, state.delta_f, steering.end), T_l, T_r, state, motor.end, car, kind
+        ),
     )
-    push, road = Push(now.F_d, now.N_d, 0.0), model.road
-    motion = rk4(now.motion, loads, push, car, road, h, kind.small_angle, kind.law, kind.roll)
+    push, road = DisturbanceForces(state.F_d, state.N_d, 0.0), model.road
+    motion = rk4(state.motion, loads, push, car, road, h, kind.small_angle, kind.law, kind.roll)
     per_torque = 0.5 * car.d_r / car.r / model.full_scale
-    asked, before = per_torque * (T_r - T_l), per_torque * (now.T_r - now.T_l)
-    added = now.delta_f - driver
+    target_share, share_before = per_torque * (T_r - T_l), per_torque * (state.T_r - state.T_l)
+    added = state.delta_f - driver
     efforts = (
-        model.per_share * lagged(asked, before, model.motor_work[0]),
-        model.per_share * model.motor_work[1] * (before - asked),
-        model.per_steer * lagged(extra, added, model.steering_work[0]),
+        model.per_share * apply_lag(target_share, share_before, model.motor_work[0]),
+        model.per_share * model.motor_work[1] * (share_before - target_share),
+        model.per_steer * apply_lag(extra, added, model.steering_work[0]),
         model.per_steer * model.steering_work[1] * (added - extra),
     )
-    after = Now(
+    next_state = PredictionState(
         motion,
-        lagged(T_l, now.T_l, motor.end),
-        lagged(T_r, now.T_r, motor.end),
-        lagged(steer, now.delta_f, steering.end),
+        apply_lag(T_l, state.T_l, motor.end),
+        apply_lag(T_r, state.T_r, motor.end),
+        apply_lag(steer, state.delta_f, steering.end),
         wheel,
-        lagged(start.steady[0], now.beta_ref, model.ref_rest),
-        lagged(start.steady[1], now.gamma_ref, model.ref_rest),
-        model.keep * now.F_d,
-        model.keep * now.N_d,
+        apply_lag(start.steady[0], state.beta_ref, model.ref_rest),
+        apply_lag(start.steady[1], state.gamma_ref, model.ref_rest),
+        model.decay * state.F_d,
+        model.decay * state.N_d,
     )
-    return after, efforts
+    return next_state, efforts
 
 
-@apart
-def roll_out(
-    model: Model,
-    start: Start,
+@noinline
+def simulate_plans(
+    model: PredictionModel,
+    start: PredictionStart,
     K: Any,
     terminal: Any,
     blocks: Any,
     plans: Any,
-    pokes: Any,
+    perturbations: Any,
     residuals: Any,
     limits: Any,
     first: Any,
 ) -> None:
     """Roll out plans (variables, lanes): fill their residuals and their first commands.
 
-    pokes: (variables, lanes), which change the commands beyond their limits, for slopes that a
-    limit does not hide. limits: (variables, lanes), filled with whether a block starts at one.
+    perturbations: (variables, lanes), which change the commands beyond their limits, for slopes
+    that a limit does not hide. limits: (variables, lanes), filled with whether a block starts at
+    one.
 
     blocks: steps of each. Variables: of every block the share of the yaw moment and, where the car
     steers, that of the authority. residuals: (RESIDUALS steps + TERMINAL, lanes), whose squares
     sum to J but for its cap. first: (2, lanes).
     """
-    zero, m, moved = 0.0 * at(plans, 0), len(K), start.motion
+    zero, m, start_motion = 0.0 * load_element(plans, 0), len(K), start.motion
     motion = Motion(
-        moved.v_x + zero, moved.v_y + zero, moved.gamma + zero, zero, zero, zero, zero, zero, zero,
-        moved.phi + zero, moved.phi_dot + zero,
+        start_motion.v_x + zero, start_motion.v_y + zero, start_motion.gamma + zero, zero, zero,
+        zero, zero, zero, zero,
+        start_motion.phi + zero, start_motion.phi_dot + zero,
     )  # fmt: skip
-    now = Now(
+    state = PredictionState(
         motion,
         start.T_l + zero,
         start.T_r + zero,
@@ -169,32 +208,48 @@ def roll_out(
         start.push.F_d + zero,
         start.push.N_d + zero,
     )
-    beta = sideslip_angle(now.motion.v_x, now.motion.v_y, model.kind.small_angle)
-    row, last = 0, RESIDUALS * (blocks.sum() - 1)
+    beta = compute_sideslip_angle(state.motion.v_x, state.motion.v_y, model.kind.small_angle)
+    row, last = 0, N_RESIDUALS * (blocks.sum() - 1)
     for b in range(len(blocks)):
-        added, more, turn, bend = at(plans, m * b), at(pokes, m * b), zero, zero
+        added, share_beyond, turn, steer_beyond = (
+            load_element(plans, m * b),
+            load_element(perturbations, m * b),
+            zero,
+            zero,
+        )
         if m > 1:
-            turn, bend = at(plans, m * b + 1), model.authority * at(pokes, m * b + 1)
+            turn, steer_beyond = (
+                load_element(plans, m * b + 1),
+                model.authority * load_element(perturbations, m * b + 1),
+            )
         for k in range(blocks[b]):
-            share, wheel, ends, bound = commanded(model, start, K, now, beta, added, turn)
+            share, wheel, ends, bound = compute_commands(model, start, K, state, beta, added, turn)
             if k == 0:
-                put(limits, ends, m * b)
+                store_element(limits, ends, m * b)
                 if m > 1:
-                    put(limits, bound, m * b + 1)
+                    store_element(limits, bound, m * b + 1)
             if row == 0:
-                put(first, share, 0)
-                put(first, wheel, 1)
-            now, efforts = advanced(model, start, now, share, wheel, more, bend)
-            beta = sideslip_angle(now.motion.v_x, now.motion.v_y, model.kind.small_angle)
+                store_element(first, share, 0)
+                store_element(first, wheel, 1)
+            state, efforts = predict_step(
+                model, start, state, share, wheel, share_beyond, steer_beyond
+            )
+            beta = compute_sideslip_angle(
+                state.motion.v_x, state.motion.v_y, model.kind.small_angle
+            )
             # ticks after the first step's start up to its end, by the trapezoid rule
             node = math.sqrt(model.step if row < last else 0.5 * (model.step + TICK))
             span = math.sqrt(model.step)
-            put(residuals, node * model.per_beta * (beta - now.beta_ref), row)
-            put(residuals, node * model.per_gamma * (now.motion.gamma - now.gamma_ref), row + 1)
-            put(residuals, span * efforts[0], row + 2)
-            put(residuals, span * efforts[1], row + 3)
-            put(residuals, span * efforts[2], row + 4)
-            put(residuals, span * efforts[3], row + 5)
-            row += RESIDUALS
-    for j in range(TERMINAL):
-        put(residuals, product(terminal, j, model, start.driver, now, beta), row + j)
+            store_element(residuals, node * model.per_beta * (beta - state.beta_ref), row)
+            store_element(
+                residuals, node * model.per_gamma * (state.motion.gamma - state.gamma_ref), row + 1
+            )
+            store_element(residuals, span * efforts[0], row + 2)
+            store_element(residuals, span * efforts[1], row + 3)
+            store_element(residuals, span * efforts[2], row + 4)
+            store_element(residuals, span * efforts[3], row + 5)
+            row += N_RESIDUALS
+    for j in range(N_TERMINAL):
+        store_element(
+            residuals, multiply_row(terminal, j, model, start.driver, state, beta), row + j
+        )

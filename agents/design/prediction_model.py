@@ -6,23 +6,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...envs.backend.decorators import jit
-from ...envs.engine.packing import car_of
-from ...envs.engine.tick import Kind
+from ...envs.engine.packing import make_car
+from ...envs.engine.tick import StepVariant
 from ...envs.record import Array
 from ...envs.task.cost import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
 from ...envs.task.reference import ZERO_SLIP
 from ...envs.ticks import TICK
-from ...envs.vehicle.actuators import Lag, lag_of
-from ...envs.vehicle.dynamics import Car, Road
+from ...envs.vehicle.actuators import Lag, make_lag
+from ...envs.vehicle.dynamics import CarParams, RoadParams
 from ...envs.vehicle.vehicle import Vehicle
 
 
-class Model(NamedTuple):
+class PredictionModel(NamedTuple):
     """What all predictions share: numbers alone."""
 
-    car: Car  # the nominal one
-    road: Road  # straight and flat
-    kind: Kind
+    car: CarParams  # the nominal one
+    road: RoadParams  # straight and flat
+    kind: StepVariant
     motor: Lag  # of a step
     steering: Lag
     motor_work: tuple[float, float]  # mean and spread over a step of what is left of a deviation
@@ -33,7 +33,7 @@ class Model(NamedTuple):
     slew: float  # rad a step
     stop: float  # rad
     yaw_first: float
-    keep: float  # what a step leaves of the disturbances
+    decay: float  # what a step leaves of the disturbances
     ref_rest: float  # and of a lagged reference's deviation
     per_beta: float  # square roots of the cost's weights
     per_gamma: float
@@ -41,7 +41,7 @@ class Model(NamedTuple):
     per_steer: float
 
 
-class Start(NamedTuple):
+class PredictionStart(NamedTuple):
     """Where a prediction starts."""
 
     car: Any
@@ -55,19 +55,19 @@ class Start(NamedTuple):
     refs: Any  # (beta, gamma) now
     steady: Any  # and where a lagged reference goes
     push: Any
-    most: Any  # share of full scale that the yaw moment may take
+    max_moment: Any  # share of full scale that the yaw moment may take
 
 
-def work_of(time_constant: float, ticks: int) -> tuple[float, float]:
+def compute_lag_moments(time_constant: float, ticks: int) -> tuple[float, float]:
     """Mean and standard deviation over a step's ticks of what is left of a deviation."""
-    tick = lag_of(time_constant, TICK)
+    tick = make_lag(time_constant, TICK)
     left = tick.mean * tick.end ** np.arange(ticks)
     return float(left.mean()), float(left.std())
 
 
-def model_of(
+def make_prediction_model(
     vehicle: Vehicle,
-    kind: Kind,
+    kind: StepVariant,
     ticks: int,
     lags: bool,
     disturbance_time: float,
@@ -76,18 +76,18 @@ def model_of(
     full_scale: float,
     authority: float,
     yaw_first: bool,
-) -> Model:
+) -> PredictionModel:
     """The model of a car in steps of some ticks; the cost is that of `sampled_model`."""
     step = ticks * TICK
     motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
-    return Model(
-        car_of(vehicle),
-        Road(0.0, 0.0, 1.0),
+    return PredictionModel(
+        make_car(vehicle),
+        RoadParams(0.0, 0.0, 1.0),
         kind,
-        lag_of(motor, step),
-        lag_of(steering, step),
-        work_of(motor, ticks),
-        work_of(steering, ticks),
+        make_lag(motor, step),
+        make_lag(steering, step),
+        compute_lag_moments(motor, ticks),
+        compute_lag_moments(steering, ticks),
         step,
         full_scale,
         authority,
@@ -103,14 +103,14 @@ def model_of(
     )
 
 
-def blocks_of(steps: int, count: int) -> Array:
+def make_blocks(steps: int, count: int) -> Array:
     """Lengths of at most `count` blocks of a horizon of so many steps, growing to its end."""
     ends = np.unique(np.rint(np.geomspace(1.0, steps, count)).astype(np.int64))
     return np.diff(ends, prepend=0)
 
 
 @jit
-def changed_tyres(car: Any, C_f: Any, C_r: Any, mu: Any) -> Any:
+def replace_tyres(car: Any, C_f: Any, C_r: Any, mu: Any) -> Any:
     """The car with other stiffnesses and another friction."""
     tyres, road, other = (C_f, C_r), (mu,), (mu,)
-    return Car(*(car[:4] + tyres + car[6:10] + road + car[11:19] + other + car[20:]))
+    return CarParams(*(car[:4] + tyres + car[6:10] + road + car[11:19] + other + car[20:]))

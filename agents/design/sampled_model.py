@@ -15,8 +15,8 @@ from ...envs.record import Array
 from ...envs.task.cost import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
 from ...envs.task.reference import ZERO_SLIP
 from ...envs.ticks import TICK
-from ...envs.vehicle.actuators import lag_of
-from ...envs.vehicle.linear import LinearModel, bicycle
+from ...envs.vehicle.actuators import make_lag
+from ...envs.vehicle.linear import LinearModel, make_bicycle_model
 from ...envs.vehicle.vehicle import Vehicle
 
 DYNAMIC = ("beta", "gamma", "N_z", "delta_f")
@@ -36,7 +36,7 @@ them, or d_1 and d_2 in rad/s and rad/s2, which stay: dakf-stability (8)-(9), (1
 
 
 @dataclass(frozen=True)
-class Purpose:
+class DesignSpec:
     """The parameters of a design, but for the car and its speed.
 
     period: ticks. full_scale: N m of the first input. steers: whether steering is the second.
@@ -76,38 +76,42 @@ class DesignModel:
     Q: Array
     R: Array
     N: Array
-    purpose: Purpose
+    design_spec: DesignSpec
 
 
-def design_model(vehicle: Vehicle, speed: float, purpose: Purpose) -> DesignModel:
+def make_design_model(vehicle: Vehicle, speed: float, design_spec: DesignSpec) -> DesignModel:
     """The model of a vehicle at a speed in m/s; ValueError unless that is positive."""
-    G1, H1, C, D = one_tick(vehicle, speed, purpose)
+    G1, H1, C, D = make_tick_model(vehicle, speed, design_spec)
     n, m = H1.shape
-    W = TICK * np.diag(cost_weights(purpose))
+    W = TICK * np.diag(compute_cost_weights(design_spec))
     step, G, H = np.hstack([G1, H1]), np.eye(n), np.zeros((n, m))
-    whole = np.zeros((n + m, n + m))
-    for _ in range(purpose.period):
-        now = np.vstack([np.hstack([G, H]), np.hstack([np.zeros((m, n)), np.eye(m)])])
-        judged = np.hstack([C, D]) @ now
-        whole += judged.T @ W @ judged
-        G, H = np.split(step @ now, [n], axis=1)
-    whole = 0.5 * (whole + whole.T)
-    return DesignModel(G, H, whole[:n, :n], whole[n:, n:], whole[:n, n:], purpose)
+    cost_matrix = np.zeros((n + m, n + m))
+    for _ in range(design_spec.period):
+        transition = np.vstack([np.hstack([G, H]), np.hstack([np.zeros((m, n)), np.eye(m)])])
+        cost_outputs = np.hstack([C, D]) @ transition
+        cost_matrix += cost_outputs.T @ W @ cost_outputs
+        G, H = np.split(step @ transition, [n], axis=1)
+    cost_matrix = 0.5 * (cost_matrix + cost_matrix.T)
+    return DesignModel(
+        G, H, cost_matrix[:n, :n], cost_matrix[n:, n:], cost_matrix[:n, n:], design_spec
+    )
 
 
-def one_tick(vehicle: Vehicle, speed: float, purpose: Purpose) -> tuple[Array, Array, Array, Array]:
+def make_tick_model(
+    vehicle: Vehicle, speed: float, design_spec: DesignSpec
+) -> tuple[Array, Array, Array, Array]:
     """(G, H) of a tick, and (C, D) from state and input at its start to what the cost judges.
 
     Judged at the tick's end: e_beta, e_gamma, and the means over the tick of the delivered share
     of the yaw moment and of the added steering, which is the applied less the driver's.
     """
-    lags = [lag_of(tau, TICK) for tau in (vehicle.motor_lag, vehicle.steering_lag)]
-    plane, push = _tick_of_the_plane(vehicle, speed, purpose)
-    n, m = len(purpose.states), len(purpose.inputs)
+    lags = [make_lag(tau, TICK) for tau in (vehicle.motor_lag, vehicle.steering_lag)]
+    plane, push = _discretise_plane(vehicle, speed, design_spec)
+    n, m = len(design_spec.states), len(design_spec.inputs)
     G, H = np.eye(n), np.zeros((n, m))
     G[:2] = 0.0
     G[:2, :4], H[:2, :1], G[:2, 4:5] = plane[:, :4], plane[:, 4:5], plane[:, 5:6]
-    if purpose.steers:
+    if design_spec.steers:
         H[:2, 1:] = plane[:, 5:6]
     C, D = np.zeros((4, n)), np.zeros((4, m))
     C[2, 2], C[3, 3], C[3, 4] = lags[0].mean, lags[1].mean, -lags[1].mean
@@ -116,20 +120,22 @@ def one_tick(vehicle: Vehicle, speed: float, purpose: Purpose) -> tuple[Array, A
     G[3, 4] = 1.0 - lags[1].end
     for i in range(m):
         H[2 + i, i], D[2 + i, i] = 1.0 - lags[i].end, 1.0 - lags[i].mean
-    if purpose.disturbances != "none":
+    if design_spec.disturbances != "none":
         G[:2, 7:] = push
-        if purpose.disturbances == "forces":
-            G[7:, 7:] *= math.exp(-TICK / purpose.disturbance_time)
+        if design_spec.disturbances == "forces":
+            G[7:, 7:] *= math.exp(-TICK / design_spec.disturbance_time)
     C[:2], D[:2] = G[:2], H[:2]
     C[0, 5], C[1, 6] = -1.0, -1.0
     return G, H, C, D
 
 
-def _tick_of_the_plane(vehicle: Vehicle, speed: float, purpose: Purpose) -> tuple[Array, Array]:
+def _discretise_plane(
+    vehicle: Vehicle, speed: float, design_spec: DesignSpec
+) -> tuple[Array, Array]:
     """beta and gamma after a tick: (2, 6) from themselves, both actuators and both commands, and
     (2, 2) from the disturbances. An actuator without lag is its command."""
-    model = bicycle(vehicle, speed)
-    scale = np.array([purpose.full_scale, 1.0])
+    model = make_bicycle_model(vehicle, speed)
+    scale = np.array([design_spec.full_scale, 1.0])
     B = model.B[:, ::-1] * scale  # columns N_z, delta_f, as the inputs stand
     A = np.zeros((4, 4))
     A[:2, :2] = model.A
@@ -141,42 +147,42 @@ def _tick_of_the_plane(vehicle: Vehicle, speed: float, purpose: Purpose) -> tupl
         else:
             inputs[:2, i] = B[:, i]
     per = (1.0 / (vehicle.mass * speed), 1.0 / vehicle.yaw_inertia)
-    inputs[:2, 2:] = np.diag(per if purpose.disturbances == "forces" else (1.0, 1.0))
-    G, H = LinearModel(A, inputs, np.eye(4), DYNAMIC, (), ()).discrete(TICK)
+    inputs[:2, 2:] = np.diag(per if design_spec.disturbances == "forces" else (1.0, 1.0))
+    G, H = LinearModel(A, inputs, np.eye(4), DYNAMIC, (), ()).discretise(TICK)
     return np.hstack([G[:2], H[:2, :2]]), H[:2, 2:]
 
 
-def cost_weights(purpose: Purpose) -> Sequence[float]:
+def compute_cost_weights(design_spec: DesignSpec) -> Sequence[float]:
     """The weights of the four that the cost judges: docs/ARCHITECTURE.md, "Cost and score"."""
     return (
         1.0 / BETA_SCALE**2,
-        0.0 if purpose.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2,
+        0.0 if design_spec.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2,
         EFFORT_WEIGHT,
-        purpose.steer_weight * EFFORT_WEIGHT / STEER_SCALE**2 if purpose.steers else 0.0,
+        design_spec.steer_weight * EFFORT_WEIGHT / STEER_SCALE**2 if design_spec.steers else 0.0,
     )
 
 
-def regulator(model: DesignModel) -> tuple[Array, Array]:
+def compute_regulator(model: DesignModel) -> tuple[Array, Array]:
     """K (m, n) of u = -K x, which minimises the sum of the model's cost, and S (m, m): another
-    input for one period costs (u + K x)'S(u + K x) more. See `cost_to_go`."""
-    K, V = cost_to_go(model)
-    return K, input_cost(model, V)
+    input for one period costs (u + K x)'S(u + K x) more. See `compute_cost_to_go`."""
+    K, V = compute_cost_to_go(model)
+    return K, compute_input_cost(model, V)
 
 
-def input_cost(model: DesignModel, V: Array) -> Array:
-    """S (m, m) of `regulator`, for the cost to go V."""
+def compute_input_cost(model: DesignModel, V: Array) -> Array:
+    """S (m, m) of `compute_regulator`, for the cost to go V."""
     return model.R + model.H.T @ V @ model.H
 
 
-def cost_to_go(model: DesignModel) -> tuple[Array, Array]:
+def compute_cost_to_go(model: DesignModel) -> tuple[Array, Array]:
     """K (m, n) of u = -K x, which minimises the sum of the model's cost, and V (n, n): what is
-    to come costs x'Vx, but for a part that no input changes. See `optimal`.
+    to come costs x'Vx, but for a part that no input changes. See `solve_lqr`.
     """
-    return optimal(model.G, model.H, model.Q, model.R, model.N, len(DYNAMIC))
+    return solve_lqr(model.G, model.H, model.Q, model.R, model.N, len(DYNAMIC))
 
 
-def optimal(G: Array, H: Array, Q: Array, R: Array, N: Array, moved: int) -> tuple[Array, Array]:
-    """`cost_to_go` of any model whose inputs move its first `moved` states alone.
+def solve_lqr(G: Array, H: Array, Q: Array, R: Array, N: Array, moved: int) -> tuple[Array, Array]:
+    """`compute_cost_to_go` of any model whose inputs move its first `moved` states alone.
 
     These have the gains of `control.dlqr`; to the others, which move by themselves and need not
     decay, the optimal answer follows from a linear equation for their part of the cost to go.
@@ -194,6 +200,6 @@ def optimal(G: Array, H: Array, Q: Array, R: Array, N: Array, moved: int) -> tup
     right = Q[:d, d:] - K.T @ N2.T + closed.T @ P @ A12
     lhs = np.eye(right.size) - np.kron(W.T, closed.T)
     P12 = np.linalg.solve(lhs, right.ravel(order="F")).reshape(right.shape, order="F")
-    answer = np.linalg.solve(R + B.T @ P @ B, B.T @ (P @ A12 + P12 @ W) + N2.T)
+    held_gain = np.linalg.solve(R + B.T @ P @ B, B.T @ (P @ A12 + P12 @ W) + N2.T)
     V = np.block([[P, P12], [P12.T, np.zeros_like(W)]])
-    return np.asarray(np.hstack([K, answer]), np.float64), V
+    return np.asarray(np.hstack([K, held_gain]), np.float64), V

@@ -9,7 +9,7 @@ from ... import __version__
 from ...envs.documents import check_types
 from ...estimators.user_files import is_user_file
 from ...estimators.wrappers.estimate import EstimateObservation
-from ..env_facts import AnyEnv, facts_of, made
+from ..env_facts import AnyEnv, get_env_facts, make_env
 
 JsonMap = dict[str, Any]
 
@@ -57,7 +57,7 @@ class Card:
         self.to_json()
 
     @classmethod
-    def of(
+    def from_env_id(
         cls,
         env_id: str,
         env_options: Mapping[str, Any] | None = None,
@@ -72,18 +72,18 @@ class Card:
             "estimator": estimator,
             "estimator_options": dict(estimator_options or {}),
         }
-        env = made(env_id, options["env_options"])
+        env = make_env(env_id, options["env_options"])
         if estimator:
             env = EstimateObservation(env, estimator, **options["estimator_options"])
-        card = cls.seen(env, **options, **rest)
+        card = cls.from_env(env, **options, **rest)
         env.close()
         return card
 
     @classmethod
-    def seen(cls, env: AnyEnv, **rest: Any) -> "Card":
+    def from_env(cls, env: AnyEnv, **rest: Any) -> "Card":
         """A card with the observation, control period and reference of an env, single or vector;
         rest: the other fields."""
-        facts = facts_of(env)
+        facts = get_env_facts(env)
         entries = tuple((entry.name, entry.unit) for entry in facts.layout)
         return cls(
             observation=entries,
@@ -92,10 +92,10 @@ class Card:
             **rest,
         )
 
-    def to_json(self, **more: Any) -> str:
+    def to_json(self, **extra: Any) -> str:
         """The card as a JSON object, with further fields."""
         try:
-            return json.dumps(asdict(self) | more, allow_nan=False)
+            return json.dumps(asdict(self) | extra, allow_nan=False)
         except (TypeError, ValueError) as error:
             raise ValueError(f"the card holds what JSON has not: {error}") from None
 

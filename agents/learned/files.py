@@ -12,19 +12,19 @@ import numpy as np
 import numpy.typing as npt
 from safetensors.numpy import save
 
-from ...envs.arguments import unknown_names
-from ...envs.backend.files import write_whole
-from ...envs.documents import made_of
+from ...envs.arguments import describe_unknown
+from ...envs.backend.files import write_atomic
+from ...envs.documents import from_json
 from ...estimators.learned.network import Network
-from ...estimators.learned.network_file import ENDING as ENDING
 from ...estimators.learned.network_file import (
-    MEMORY,
-    architecture_of,
-    json_object,
-    network_of,
+    NO_MEMORY,
+    build_network,
+    collect_tensors,
+    describe_network,
+    parse_json_object,
     read_tensors,
-    tensors_of,
 )
+from ...estimators.learned.network_file import SUFFIX as SUFFIX
 from .card import Card
 
 FORMAT = 2
@@ -51,26 +51,26 @@ class Policy:
     def salt(self) -> str:
         """A hash of the network, from which its test seeds are made (hexadecimal)."""
         digest = hashlib.sha256()
-        for name, values in tensors_of(self.network).items():
+        for name, values in collect_tensors(self.network).items():
             digest.update(name.encode() + values.tobytes())
         return digest.hexdigest()[:16]
 
 
-def shipped() -> list[str]:
+def list_shipped() -> list[str]:
     """The names of the policies that come with the package."""
-    return sorted(path.stem for path in FOLDER.glob(f"*{ENDING}"))
+    return sorted(path.stem for path in FOLDER.glob(f"*{SUFFIX}"))
 
 
 def is_policy(name: str) -> bool:
     """Whether `load_policy` would look for this: a shipped name, or a path by its ending."""
-    return name.endswith(ENDING) or name in shipped()
+    return name.endswith(SUFFIX) or name in list_shipped()
 
 
-def stamp(name: str) -> str:
+def hash_policy(name: str) -> str:
     """A hash of a policy's file, "" for a name that is no policy's."""
-    path = FOLDER / f"{name}{ENDING}" if name in shipped() else Path(name)
-    there = is_policy(name) and path.is_file()
-    return hashlib.sha256(path.read_bytes()).hexdigest() if there else ""
+    path = FOLDER / f"{name}{SUFFIX}" if name in list_shipped() else Path(name)
+    exists = is_policy(name) and path.is_file()
+    return hashlib.sha256(path.read_bytes()).hexdigest() if exists else ""
 
 
 def save_policy(path: str | Path, network: Network, card: Card) -> None:
@@ -80,62 +80,62 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
     is not as wide as the network's input.
     """
     target = Path(path)
-    if target.suffix != ENDING:
-        raise ValueError(f"a policy's file is NAME{ENDING}, got {target}")
+    if target.suffix != SUFFIX:
+        raise ValueError(f"a policy's file is NAME{SUFFIX}, got {target}")
     if len(card.observation) != network.inputs:
         raise ValueError(
             f"the card's observation has {len(card.observation)} entries, "
             f"the network takes {network.inputs}"
         )
-    metadata = {"format": str(FORMAT), "card": card.to_json(network=architecture_of(network))}
-    write_whole(target, save(tensors_of(network), metadata))
+    metadata = {"format": str(FORMAT), "card": card.to_json(network=describe_network(network))}
+    write_atomic(target, save(collect_tensors(network), metadata))
 
 
 def load_policy(path: str | Path) -> Policy:
     """A policy from its file, or a shipped one by its name.
 
     Raises FileNotFoundError where there is none, ValueError for a file that is no policy, is cut
-    short, is larger than `MOST_BYTES`, has another format, or whose card and tensors do not fit
+    short, is larger than `MAX_BYTES`, has another format, or whose card and tensors do not fit
     together.
     """
-    found = _found(path)
-    tensors, metadata = read_tensors(found, "policy")
+    file = _find_file(path)
+    tensors, metadata = read_tensors(file, "policy")
     try:
-        fields = _card_fields(metadata)
+        fields = _read_card_fields(metadata)
         observation = fields.get("observation")
         if not isinstance(observation, list):
             raise ValueError(f"the card's observation is a list, got {observation!r}")
-        network = network_of(fields.pop("network", None), len(observation), tensors)
-        return Policy(found.stem, network, made_of(Card, fields, "the card"))
+        network = build_network(fields.pop("network", None), len(observation), tensors)
+        return Policy(file.stem, network, from_json(Card, fields, "the card"))
     except ValueError as error:
-        raise ValueError(f"{found}: {error}") from None
+        raise ValueError(f"{file}: {error}") from None
 
 
-def _found(path: str | Path) -> Path:
+def _find_file(path: str | Path) -> Path:
     name = str(path)
-    if name in shipped():
-        return FOLDER / f"{name}{ENDING}"
+    if name in list_shipped():
+        return FOLDER / f"{name}{SUFFIX}"
     file = Path(path)
     if not file.is_file():
         if file.is_dir():
             raise FileNotFoundError(f"policy {name} is a folder")
         raise FileNotFoundError(
-            f"there is no such file and {unknown_names('policy', [name], shipped())}"
+            f"there is no such file and {describe_unknown('policy', [name], list_shipped())}"
         )
     return file
 
 
-def _card_fields(metadata: dict[str, str]) -> dict[str, Any]:
+def _read_card_fields(metadata: dict[str, str]) -> dict[str, Any]:
     """The card's JSON object with the architecture, checked as far as the format goes."""
     if not {"format", "card"} <= metadata.keys():
         raise ValueError("safetensors without a card: this is not a policy of sideslip")
-    known = [str(each) for each in range(1, FORMAT + 1)]
+    known = [str(version) for version in range(1, FORMAT + 1)]
     if metadata["format"] not in known:
         raise ValueError(
             f"the card has format {metadata['format'][:20]}, this sideslip reads "
             f"{' and '.join(known)}: another sideslip made it"
         )
-    fields = json_object(metadata["card"])
+    fields = parse_json_object(metadata["card"])
     if metadata["format"] == "1" and isinstance(fields.get("network"), dict):
-        fields["network"] |= MEMORY  # it has none
+        fields["network"] |= NO_MEMORY  # it has none
     return fields

@@ -3,13 +3,13 @@
 from pathlib import Path
 
 from ..controllers.base import Array, Controller
-from ..env_facts import AnyEnv, facts_of
+from ..env_facts import AnyEnv, get_env_facts
 from .files import Policy, load_policy
 
 DEFAULT = "ppo-yaw-vision"
 
 
-class Learned(Controller):
+class PolicyController(Controller):
     """The deterministic action of a policy's network, clipped to [-1, 1].
 
     What the network remembers of an episode (frames, cells) is in the state of `predict`.
@@ -26,14 +26,14 @@ class Learned(Controller):
 
     def __init__(self, env: AnyEnv, policy: str | Path | Policy = DEFAULT) -> None:
         self.policy = policy if isinstance(policy, Policy) else load_policy(policy)
-        name, card, facts = self.policy.name, self.policy.card, facts_of(env)
+        name, card, facts = self.policy.name, self.policy.card, get_env_facts(env)
         reads = self.policy.reads
         entries = [entry for entry, read in zip(card.observation, reads, strict=True) if read]
         units = {entry.name: entry.unit for entry in facts.layout}
         wrong = [
-            f"{each} in {unit} (here {units[each]})"
-            for each, unit in entries
-            if units.get(each, unit) != unit
+            f"{label} in {unit} (here {units[label]})"
+            for label, unit in entries
+            if units.get(label, unit) != unit
         ]
         if wrong:
             raise ValueError(f"policy {name} was trained on {', '.join(wrong)}")
@@ -47,13 +47,15 @@ class Learned(Controller):
                 f"policy {name} gives {self.policy.network.width} numbers, "
                 f"the env's action has {facts.width}"
             )
-        self.needs = tuple(each for each, _ in entries)
+        self.needs = tuple(label for label, _ in entries)
         try:
             super().__init__(env)
         except ValueError as error:
-            there, here = (", ".join(names) for names in (dict(card.observation), units))
-            raise ValueError(f"{error}. {name} was trained on {there}; here are {here}") from None
-        self.network = self.policy.network.reading(reads)
+            trained_on, available = (", ".join(names) for names in (dict(card.observation), units))
+            raise ValueError(
+                f"{error}. {name} was trained on {trained_on}; here are {available}"
+            ) from None
+        self.network = self.policy.network.select_inputs(reads)
         self.memory = self.network.memory
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:

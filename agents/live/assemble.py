@@ -16,20 +16,20 @@ import numpy.typing as npt
 
 from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH
 from ...envs.ticks import TICK
-from .datagrams import SENSORS, STAMP, Bad, Kind, Message, decode
+from .datagrams import SENSORS, TICK_US, DatagramKind, Message, RejectReason, decode
 
 Array = npt.NDArray[np.float64]
 
 PATIENCE = 10  # ticks of silence, from which on the last row is held
-MOST_HELD = 1000  # ticks that are bridged; a longer gap begins anew
-MOST_BEHIND = 100  # rows from the past in succession: then the sender's clock was set back
+MAX_HELD = 1000  # ticks that are bridged; a longer gap begins anew
+MAX_BEHIND = 100  # rows from the past in succession: then the sender's clock was set back
 WINDOW = 1024  # sequence numbers; an older one is of a sender that began anew
-MOST_WAITING = 64  # packets of slow sensors before a fast row
-_INPUTS = (Kind.INERTIAL, Kind.END, *SENSORS)
+MAX_WAITING = 64  # packets of slow sensors before a fast row
+_INPUTS = (DatagramKind.INERTIAL, DatagramKind.END, *SENSORS)
 NO_PACKETS = np.zeros((0, PACKET_WIDTH))
 BRIDGED = ("lost", "restarted", "held", "late", "begun anew", "dropped")
-"""What is counted beside `Bad`: sequence numbers that never came, senders that began anew, ticks
-without a row, rows behind their tick, gaps too long to be bridged, packets without a row."""
+"""What is counted beside `RejectReason`: sequence numbers that never came, senders that began anew,
+ticks without a row, rows behind their tick, gaps too long to be bridged, packets without a row."""
 
 
 class Arrival(NamedTuple):
@@ -50,18 +50,18 @@ class Tick(NamedTuple):
     begins: bool  # forget everything before
 
 
-class Assembler:
+class StreamSynchroniser:
     """Makes ticks of datagrams.
 
     patience: calls of `take` without a fast row, from which on the last one is held; None: for
-    ever. `counts`: of what was ignored, by `Bad` and `BRIDGED`. `sender`: of the newest row.
-    `accepted`: datagrams of the newest batch. `over`: whether the drive's end came. `silent`: calls
-    since the last fast row.
+    ever. `counts`: of what was ignored, by `RejectReason` and `BRIDGED`. `sender`: of the newest
+    row. `accepted`: datagrams of the newest batch. `over`: whether the drive's end came. `silent`:
+    calls since the last fast row.
     """
 
     def __init__(self, patience: int | None = PATIENCE) -> None:
         self.patience = patience
-        self.counts: Counter[str] = Counter({name: 0 for name in (*Bad, *BRIDGED)})
+        self.counts: Counter[str] = Counter({name: 0 for name in (*RejectReason, *BRIDGED)})
         self.sender: Any = None
         self.accepted: list[bytes] = []
         self.over, self.silent = False, 0
@@ -76,17 +76,19 @@ class Assembler:
         self.accepted.clear()
         for arrival in batch:
             message = decode(arrival.data)
-            if isinstance(message, Bad) or message.kind not in _INPUTS:
-                self.counts[message if isinstance(message, Bad) else Bad.KIND] += 1
-            elif self._in_order(message):
+            if isinstance(message, RejectReason) or message.kind not in _INPUTS:
+                self.counts[
+                    message if isinstance(message, RejectReason) else RejectReason.KIND
+                ] += 1
+            elif self._check_order(message):
                 self.accepted.append(arrival.data)
-                if message.kind == Kind.INERTIAL:
+                if message.kind == DatagramKind.INERTIAL:
                     self.sender, self.silent = arrival.sender, 0
-                    yield from self._row(message)
+                    yield from self._process_row(message)
                 elif message.kind in SENSORS:
-                    self._waiting.append((SENSORS[Kind(message.kind)], message))
-                    self._drop(MOST_WAITING)
-                elif message.kind == Kind.END:
+                    self._waiting.append((SENSORS[DatagramKind(message.kind)], message))
+                    self._remove_oldest(MAX_WAITING)
+                elif message.kind == DatagramKind.END:
                     self.over = True
         last, patience = self._last, self.patience
         if last is not None and self.silent and patience is not None and self.silent > patience:
@@ -94,37 +96,37 @@ class Assembler:
             for _ in range(missed):
                 self.counts["held"] += 1
                 last = last._replace(number=last.number + 1, begins=False)
-                yield self._ended(last)
+                yield self._finish_tick(last)
 
-    def _in_order(self, message: Message) -> bool:
+    def _check_order(self, message: Message) -> bool:
         """Whether this is the newest of its kind; else it is counted."""
-        before = self._newest.get(message.kind)
-        if before is not None:
-            ahead = (message.sequence - before) & 0xFFFFFFFF
-            behind = 2**32 - ahead
-            if ahead == 0 or behind < WINDOW:
-                self.counts[Bad.REORDERED if ahead else Bad.DUPLICATE] += 1
+        newest = self._newest.get(message.kind)
+        if newest is not None:
+            advance = (message.sequence - newest) & 0xFFFFFFFF
+            behind = 2**32 - advance
+            if advance == 0 or behind < WINDOW:
+                self.counts[RejectReason.REORDERED if advance else RejectReason.DUPLICATE] += 1
                 return False
-            if ahead < 2**31:
-                self.counts["lost"] += ahead - 1
+            if advance < 2**31:
+                self.counts["lost"] += advance - 1
             else:
                 self.counts["restarted"] += 1
-                self._last = None if message.kind == Kind.INERTIAL else self._last
+                self._last = None if message.kind == DatagramKind.INERTIAL else self._last
         self._newest[message.kind] = message.sequence
         return True
 
-    def _row(self, message: Message) -> Iterator[Tick]:
+    def _process_row(self, message: Message) -> Iterator[Tick]:
         """The tick of a fast row, after those that are missing before it."""
-        row, number, last = message.values, round(message.stamp / STAMP), self._last
+        row, number, last = message.values, round(message.stamp / TICK_US), self._last
         begins = last is None
         if last is not None:
             missing = number - last.number - 1
             if missing < 0:
                 self._behind += 1
-                if self._behind <= MOST_BEHIND:
+                if self._behind <= MAX_BEHIND:
                     self.counts["late"] += 1
                     return
-            begins = not 0 <= missing <= MOST_HELD
+            begins = not 0 <= missing <= MAX_HELD
             self.counts["begun anew"] += begins
             for skipped in range(0 if begins else missing):
                 self.counts["held"] += 1
@@ -133,16 +135,16 @@ class Assembler:
                 )
         self._behind = 0
         fast = np.array(row[:FAST_WIDTH])
-        yield self._ended(Tick(number, fast, row[-1], NO_PACKETS, begins))
+        yield self._finish_tick(Tick(number, fast, row[-1], NO_PACKETS, begins))
 
-    def _ended(self, tick: Tick) -> Tick:
+    def _finish_tick(self, tick: Tick) -> Tick:
         """The tick with the packets that wait for one."""
         packets = NO_PACKETS
         if self._waiting:
             packets = np.zeros((len(self._waiting), PACKET_WIDTH))
             for packet, (sensor, message) in zip(packets, self._waiting, strict=True):
                 *values, age, quality = message.values
-                sent = round(message.stamp / STAMP) if message.stamp else tick.number
+                sent = round(message.stamp / TICK_US) if message.stamp else tick.number
                 captured = sent - round(age / TICK)
                 head = sensor, captured, tick.number, quality, message.sequence
                 packet[: PACKET.value + len(values)] = *head, *values
@@ -152,8 +154,8 @@ class Assembler:
         self._last = tick._replace(packets=packets)
         return self._last
 
-    def _drop(self, most: int) -> None:
+    def _remove_oldest(self, limit: int) -> None:
         """The oldest packets go where no row takes them."""
-        while len(self._waiting) > most:
+        while len(self._waiting) > limit:
             self.counts["dropped"] += 1
             del self._waiting[0]

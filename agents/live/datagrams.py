@@ -6,7 +6,7 @@ Network byte order: a header of 20 bytes, `count` doubles and, behind the estima
 |---|---|
 | 0-3 | "SLIP" |
 | 4 | VERSION |
-| 5 | kind, of `Kind` |
+| 5 | kind, of `DatagramKind` |
 | 6-7 | count, the doubles that follow |
 | 8-11 | sequence number: of this sender's datagrams of this kind, modulo 2^32 |
 | 12-19 | stamp, us of the inertial sender's clock, int64, 0 to 2^53; 0: of another clock |
@@ -25,14 +25,14 @@ from ...envs.sensors.slow import CAMERA, GPS, SLOW
 
 MAGIC, VERSION = b"SLIP", 1
 HEADER = struct.Struct("!4sBBHIq")
-MOST = 1400  # bytes: fits a frame of Ethernet
+MAX_BYTES = 1400  # bytes: fits a frame of Ethernet
 LIMIT = 1e7  # the largest magnitude of any value, SI
-LATEST = 2**53  # us: 285 years, and a whole number as a double too
-LONGEST_AGE = 10.0  # s, of a slow sensor's sample
-STAMP = 1000  # us a tick
+MAX_STAMP = 2**53  # us: 285 years, and a whole number as a double too
+MAX_AGE = 10.0  # s, of a slow sensor's sample
+TICK_US = 1000  # us a tick
 
 
-class Kind(IntEnum):
+class DatagramKind(IntEnum):
     """What a datagram holds."""
 
     INERTIAL = 1  # a fast row: the tick is complete with it
@@ -44,7 +44,7 @@ class Kind(IntEnum):
     END = 7  # the drive is over
 
 
-class Bad(StrEnum):
+class RejectReason(StrEnum):
     """Why a datagram is ignored; every one is counted."""
 
     FOREIGN = "foreign"  # shorter than a header, or without the magic
@@ -58,7 +58,7 @@ class Bad(StrEnum):
     REORDERED = "reordered"  # an older one
 
 
-class Status(NamedTuple):
+class LoopStatus(NamedTuple):
     """What a loop has counted, as the doubles of a datagram; latencies and jitter in us."""
 
     ticks: float = 0.0
@@ -71,17 +71,19 @@ class Status(NamedTuple):
     time: float = 0.0  # us of the last tick's work
 
 
-def _slow(place: int) -> tuple[str, ...]:
+def _list_slow_fields(place: int) -> tuple[str, ...]:
     return *(value.name for value in SLOW[place].values), "age", "quality"
 
 
-SENSORS = {Kind.CAMERA: CAMERA, Kind.GPS: GPS}
+SENSORS = {DatagramKind.CAMERA: CAMERA, DatagramKind.GPS: GPS}
 FIELDS: dict[int, tuple[str, ...]] = {
-    Kind.INERTIAL: (*FAST._fields, "steer_next"),  # rad, the driver's command from now on
-    **{kind: _slow(place) for kind, place in SENSORS.items()},  # age: s from capture to sending
-    Kind.CONTROL: ("yaw_moment", "steering"),  # N m, rad, both added to the driver's
-    Kind.STATUS: Status._fields,
-    Kind.END: (),
+    DatagramKind.INERTIAL: (*FAST._fields, "steer_next"),  # rad, the driver's command from now on
+    **{
+        kind: _list_slow_fields(place) for kind, place in SENSORS.items()
+    },  # age: s from capture to sending
+    DatagramKind.CONTROL: ("yaw_moment", "steering"),  # N m, rad, both added to the driver's
+    DatagramKind.STATUS: LoopStatus._fields,
+    DatagramKind.END: (),
 }
 
 
@@ -104,31 +106,31 @@ def encode(
     return head + struct.pack(f"!{count}d", *values) + ",".join(names).encode()
 
 
-def decode(data: bytes) -> Message | Bad:
+def decode(data: bytes) -> Message | RejectReason:
     """The message of a datagram, or why there is none."""
-    if len(data) > MOST:
-        return Bad.OVERSIZED
+    if len(data) > MAX_BYTES:
+        return RejectReason.OVERSIZED
     if len(data) < HEADER.size or data[:4] != MAGIC:
-        return Bad.FOREIGN
+        return RejectReason.FOREIGN
     _, version, kind, count, sequence, stamp = HEADER.unpack_from(data)
     end = HEADER.size + 8 * count
     names: tuple[str, ...] = ()
     if version != VERSION:
-        return Bad.VERSION
-    if kind == Kind.ESTIMATE:
+        return RejectReason.VERSION
+    if kind == DatagramKind.ESTIMATE:
         names = tuple(data[end:].decode("ascii", "replace").split(","))
         if end > len(data) or count != 2 * len(names):
-            return Bad.LENGTH
+            return RejectReason.LENGTH
     elif kind not in FIELDS:
-        return Bad.KIND
+        return RejectReason.KIND
     elif end != len(data) or count != len(FIELDS[kind]):
-        return Bad.LENGTH
+        return RejectReason.LENGTH
     values = struct.unpack_from(f"!{count}d", data, HEADER.size)
     if not all(map(math.isfinite, values)):
-        return Bad.NOT_FINITE
-    far = kind != Kind.STATUS and any(abs(value) > LIMIT for value in values)
-    if far or not 0 <= stamp <= LATEST:
-        return Bad.RANGE
-    if kind in SENSORS and not 0.0 <= values[-2] <= LONGEST_AGE:
-        return Bad.RANGE
+        return RejectReason.NOT_FINITE
+    is_large = kind != DatagramKind.STATUS and any(abs(value) > LIMIT for value in values)
+    if is_large or not 0 <= stamp <= MAX_STAMP:
+        return RejectReason.RANGE
+    if kind in SENSORS and not 0.0 <= values[-2] <= MAX_AGE:
+        return RejectReason.RANGE
     return Message(kind, sequence, stamp, values, names)

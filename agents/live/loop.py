@@ -7,15 +7,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from .assemble import Arrival, Assembler, Tick
-from .datagrams import STAMP, Bad, Kind, Status
-from .onboard import Onboard
+from .assemble import Arrival, StreamSynchroniser, Tick
+from .datagrams import TICK_US, DatagramKind, LoopStatus, RejectReason
+from .onboard import OnboardController
 from .port import Port, clock
 from .session import Recorder
 
 PERIOD = 1_000_000  # ns
 LEAD = 100_000  # ns from a fast row's arrival to the deadline that follows it
-PULL, MOST_PULL = 0.02, 5_000  # of the distance from that, ns a tick: two clocks drift apart
+PHASE_GAIN, MAX_PHASE_STEP = (
+    0.02,
+    5_000,
+)  # of the distance from that, ns a tick: two clocks drift apart
 SUSPENDED = 1_000_000_000  # ns; who comes this late was not merely busy
 STATUS_EVERY = 100  # ticks
 IDLE = 0.1  # s
@@ -27,13 +30,13 @@ class Histogram:
 
     def __init__(self) -> None:
         self.counts, self.number = [0] * (_TOP + 1), 0
-        self.newest = self.most = 0.0
+        self.newest = self.largest = 0.0
 
     def add(self, us: float) -> None:
         """Count a time."""
         self.counts[min(max(int(us), 0), _TOP)] += 1
         self.number += 1
-        self.newest, self.most = us, max(self.most, us)
+        self.newest, self.largest = us, max(self.largest, us)
 
     def quantile(self, share: float) -> float:
         """The time that a share of all do not exceed, to 1 us; NaN of none."""
@@ -41,17 +44,17 @@ class Histogram:
         for us, count in enumerate(self.counts):
             left -= count
             if count and left <= 0:
-                return us + 1.0 if us < _TOP else self.most
+                return us + 1.0 if us < _TOP else self.largest
         return math.nan
 
-    def summary(self) -> dict[str, float]:
+    def summarise(self) -> dict[str, float]:
         """Median, 99.9 % and the largest."""
         if not self.number:
             return {}
-        return {"median": self.quantile(0.5), "p999": self.quantile(0.999), "max": self.most}
+        return {"median": self.quantile(0.5), "p999": self.quantile(0.999), "max": self.largest}
 
 
-COUNTED = ("ticks", "deadlines", "misses", "per_million", "suspensions", "actions", "seconds")
+COUNTERS = ("ticks", "deadlines", "misses", "per_million", "suspensions", "actions", "seconds")
 TIMES = ("jitter", "latency", "work")
 
 
@@ -81,8 +84,8 @@ class Statistics:
         return 1e6 * self.misses / max(self.deadlines, 1)
 
 
-def _listed(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+def _format_counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in counts.items() if count)
 
 
 @dataclass
@@ -95,8 +98,8 @@ class Loop:
     fast row, after which `run` ends, with TimeoutError if there was none at all. `ended`: why.
     """
 
-    onboard: Onboard
-    assembler: Assembler
+    onboard: OnboardController
+    assembler: StreamSynchroniser
     port: Port
     targets: Sequence[Any] = ()
     viewer: Any = None
@@ -112,38 +115,38 @@ class Loop:
 
         Raises TimeoutError where no inertial data comes at all.
         """
-        begun = heard = time.monotonic()
-        was = gc.isenabled()
+        start_time = last_heard = time.monotonic()
+        had_gc = gc.isenabled()
         gc.disable()  # a collection takes hundreds of ms
         deadline: int | None = None
         try:
-            while not self._over(stop, begun + duration):
+            while not self._check_end(stop, start_time + duration):
                 if deadline is None or self.step:
                     batch = self.port.wait(IDLE)
                     if self._take(batch) and not self.step:
                         deadline = clock() + PERIOD
                 else:
-                    deadline = self._tick(deadline)
+                    deadline = self._run_tick(deadline)
                 if not self.assembler.silent:
-                    heard = time.monotonic()
-                elif time.monotonic() - heard > self.patience:
-                    self._silence()
+                    last_heard = time.monotonic()
+                elif time.monotonic() - last_heard > self.patience:
+                    self._handle_silence()
                     break
         finally:
-            if was:
+            if had_gc:
                 gc.enable()
-            self.statistics.seconds = time.monotonic() - begun
+            self.statistics.seconds = time.monotonic() - start_time
 
-    def _over(self, stop: Callable[[], bool], end: float) -> bool:
+    def _check_end(self, stop: Callable[[], bool], end: float) -> bool:
         reasons = {
             "the drive is over": self.assembler.over,
             "stopped": stop(),
             "the time is over": time.monotonic() > end,
         }
-        self.ended = next((reason for reason, true in reasons.items() if true), "")
+        self.ended = next((reason for reason, holds in reasons.items() if holds), "")
         return bool(self.ended)
 
-    def _silence(self) -> None:
+    def _handle_silence(self) -> None:
         host, port = self.port.address
         if not self.statistics.ticks:
             raise TimeoutError(
@@ -151,36 +154,36 @@ class Loop:
             )
         self.ended = f"no inertial data for {self.patience:g} s"
 
-    def _tick(self, deadline: int) -> int:
+    def _run_tick(self, deadline: int) -> int:
         """Wait for a deadline and take what came; the next one."""
-        batch, measured = self.port.until(deadline), self.statistics
-        woke = clock()
+        batch, statistics = self.port.receive_until(deadline), self.statistics
+        wake_time = clock()
         rows = self._take(batch)
-        done = clock()
-        measured.deadlines += 1
-        measured.jitter.add((woke - deadline) * 1e-3)
-        measured.work.add((done - woke) * 1e-3)
+        end_time = clock()
+        statistics.deadlines += 1
+        statistics.jitter.add((wake_time - deadline) * 1e-3)
+        statistics.work.add((end_time - wake_time) * 1e-3)
         if rows and batch:
-            measured.latency.add((done - batch[0].at) * 1e-3)
+            statistics.latency.add((end_time - batch[0].at) * 1e-3)
         if rows == 1 and batch:
-            away = PULL * (batch[-1].at + LEAD - deadline)
-            deadline += round(min(max(away, -MOST_PULL), MOST_PULL))
+            phase_step = PHASE_GAIN * (batch[-1].at + LEAD - deadline)
+            deadline += round(min(max(phase_step, -MAX_PHASE_STEP), MAX_PHASE_STEP))
         deadline += PERIOD
-        if done > deadline:
-            missed = (done - deadline) // PERIOD + 1
-            measured.misses += missed
-            measured.deadlines += missed
-            measured.suspensions += missed * PERIOD > SUSPENDED
+        if end_time > deadline:
+            missed = (end_time - deadline) // PERIOD + 1
+            statistics.misses += missed
+            statistics.deadlines += missed
+            statistics.suspensions += missed * PERIOD > SUSPENDED
             deadline += missed * PERIOD
         return deadline
 
     def _take(self, batch: list[Arrival]) -> int:
         """The ticks of a batch: estimates and controls are sent; how many there were."""
-        onboard, measured, ticks = self.onboard, self.statistics, 0
+        onboard, statistics, ticks = self.onboard, self.statistics, 0
         for tick in self.assembler.take(batch):
             onboard.take(tick)
             ticks += 1
-            measured.ticks += 1
+            statistics.ticks += 1
             self._send(tick)
             if self.recorder is not None:
                 self.recorder.note(onboard)
@@ -191,46 +194,50 @@ class Loop:
         return ticks
 
     def _send(self, tick: Tick) -> None:
-        onboard, stamp = self.onboard, tick.number * STAMP
-        if onboard.fresh and onboard.action is not None and self.assembler.sender is not None:
+        onboard, stamp = self.onboard, tick.number * TICK_US
+        if (
+            onboard.has_new_action
+            and onboard.action is not None
+            and self.assembler.sender is not None
+        ):
             self.statistics.actions += 1
             moment = float(onboard.action[0]) * onboard.facts.full_scale
             turn = float(onboard.action[1]) if len(onboard.action) > 1 else 0.0
             control = moment, turn * onboard.facts.authority
-            self.port.send(self.assembler.sender, Kind.CONTROL, stamp, control)
-        everyone = [*self.targets, self.viewer] if tick.number % 10 == 0 else self.targets
-        for target in filter(None, everyone):
+            self.port.send(self.assembler.sender, DatagramKind.CONTROL, stamp, control)
+        receivers = [*self.targets, self.viewer] if tick.number % 10 == 0 else self.targets
+        for target in filter(None, receivers):
             values = (*onboard.x.tolist(), *onboard.std.tolist())
-            self.port.send(target, Kind.ESTIMATE, stamp, values, onboard.names)
+            self.port.send(target, DatagramKind.ESTIMATE, stamp, values, onboard.names)
         if self.viewer is not None and tick.number % STATUS_EVERY == 0:
-            self.port.send(self.viewer, Kind.STATUS, stamp, self.status())
+            self.port.send(self.viewer, DatagramKind.STATUS, stamp, self.status())
 
-    def status(self) -> Status:
+    def status(self) -> LoopStatus:
         """What the loop has counted so far."""
-        measured, counts = self.statistics, self.assembler.counts
-        bad = sum(counts[each] for each in Bad)
-        numbers = measured.ticks, measured.misses, counts["held"], bad, counts["lost"]
-        times = measured.jitter.newest, measured.latency.newest, measured.work.newest
-        return Status._make(map(float, (*numbers, *times)))
+        statistics, counts = self.statistics, self.assembler.counts
+        bad = sum(counts[reason] for reason in RejectReason)
+        numbers = statistics.ticks, statistics.misses, counts["held"], bad, counts["lost"]
+        times = statistics.jitter.newest, statistics.latency.newest, statistics.work.newest
+        return LoopStatus._make(map(float, (*numbers, *times)))
 
     def numbers(self) -> dict[str, Any]:
         """All that was measured, as JSON takes it."""
-        measured = self.statistics
-        times = {f"{name}_us": getattr(measured, name).summary() for name in TIMES}
+        statistics = self.statistics
+        times = {f"{name}_us": getattr(statistics, name).summarise() for name in TIMES}
         counts = {"counts": dict(self.assembler.counts), "refused": self.onboard.refused}
-        return {name: getattr(measured, name) for name in COUNTED} | times | counts
+        return {name: getattr(statistics, name) for name in COUNTERS} | times | counts
 
     def lines(self, name: str) -> list[str]:
         """The beginning of a verdict on the loop of an estimator of that name."""
         m, counts = self.statistics, self.assembler.counts
         ended = f"{name}: {m.ticks} ticks in {m.seconds:.1f} s, {self.ended}"
-        ignored, refused = map(_listed, (counts, self.onboard.refused))
+        ignored, refused = map(_format_counts, (counts, self.onboard.refused))
         by = f"; packets that the estimator refused: {refused}" if refused else ""
         lines = [f"{ended}.", f"Ignored or bridged: {ignored or 'nothing'}{by}."]
         if m.deadlines:
             jitter, latency = (
                 f"median {t['median']:.0f}, 99.9 % {t['p999']:.0f}, most {t['max']:.0f} us"
-                for t in (m.jitter.summary(), m.latency.summary())
+                for t in (m.jitter.summarise(), m.latency.summarise())
             )
             missed = f"{m.misses} of {m.deadlines} deadlines missed"
             lines[0] = f"{ended}; {missed}, {m.per_million:.0f} per million."

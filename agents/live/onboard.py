@@ -7,28 +7,28 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.backend.arrays import read
-from ...envs.backend.decorators import plain
-from ...envs.engine.arrays import Row
+from ...envs.backend.decorators import as_python
+from ...envs.engine.arrays import EpisodeArrays
 from ...envs.engine.layout import FLAGS, STATE_WIDTH, P, Z
 from ...envs.engine.observe import observe
-from ...envs.engine.packets import note
+from ...envs.engine.packets import update_newest
 from ...envs.record import FAST, FAST_WIDTH
 from ...envs.task.info import REPORT
-from ...envs.task.reference import followed, reference
+from ...envs.task.reference import compute_reference, filter_reference
 from ...envs.ticks import NEVER
 from ...estimators.estimator import Estimator
-from ...estimators.protocol import deviations
+from ...estimators.protocol import compute_std
 from ...estimators.wrappers.estimate import EstimateObservation
-from ...estimators.wrappers.kernel import observe_entry
-from ...estimators.wrappers.outputs import write
-from ..env_facts import facts_of
+from ...estimators.wrappers.kernel import compile_observe
+from ...estimators.wrappers.outputs import write_outputs
+from ..env_facts import get_env_facts
 from .assemble import NO_PACKETS, Tick
 
-_reference, _followed = plain(reference), plain(followed)
+_reference, _filter_reference = as_python(compute_reference), as_python(filter_reference)
 Array = npt.NDArray[np.float64]
 
 
-class Onboard:
+class OnboardController:
     """An estimator and an agent on what the wires carry.
 
     env: an `EstimateObservation`, which has the sensors' clocks, the nominal car, the references
@@ -45,10 +45,10 @@ class Onboard:
         base: Any = env.unwrapped
         env.reset(seed=seed)
         self.base = base
-        self.facts, self.agent, self.outputs = facts_of(env), agent, env.outputs
+        self.facts, self.agent, self.outputs = get_env_facts(env), agent, env.outputs
         self.estimator: Any = env.estimator
         self.sensors, self.names = self.base.slow_sensors, env.estimator.names
-        self._ours = isinstance(self.estimator, Estimator) and self.estimator.compiled
+        self._is_native = isinstance(self.estimator, Estimator) and self.estimator.compiled
         snapshot = self.base.get_state()
         self._p, self._switches = snapshot["params"], snapshot["switches"]
         self._kind, self._target = int(self._switches[FLAGS.reference]), read(self._p, P.target)
@@ -62,68 +62,68 @@ class Onboard:
     @property
     def x(self) -> Array:
         """The estimate now, (n,)."""
-        now: Array = self._X[0]
-        return now
+        estimate: Array = self._X[0]
+        return estimate
 
     @property
     def std(self) -> Array:
         """Its standard deviations, (n,)."""
-        now: Array = self._S[0]
-        return now
+        deviation: Array = self._S[0]
+        return deviation
 
     @property
     def refused(self) -> dict[str, int]:
         """What the estimator, one of ours, has counted of packets that it did not use."""
-        return self.estimator.counts if self._ours else {}
+        return self.estimator.counts if self._is_native else {}
 
     def begin(self, first: int) -> None:
         """Forget everything; the next tick is `first`."""
         self.estimator.reset(self.sensors, first)
         self._z, self._refs = np.zeros(STATE_WIDTH), None
-        for at in Z.slow:
-            self._z[at.captured] = NEVER
+        for sensor in Z.slow:
+            self._z[sensor.captured] = NEVER
         self._count, self._packets = 0, [NO_PACKETS]
         self._memory, self._start = None, np.ones(1, np.bool_)
         self.action: npt.NDArray[np.float32] | None = None
-        self.fresh = False
+        self.has_new_action = False
 
     def take(self, tick: Tick) -> None:
         """A tick: the estimate and, at the end of a control period, the agent's action."""
         if tick.begins:
             self.begin(tick.number)
         n, row = self.facts.control_period, tick.row
-        if self._ours:
-            one, packets = row.reshape(1, -1), tick.packets
-            self.estimator.take(one, 1, packets, len(packets), self._X, self._S)
+        if self._is_native:
+            rows, packets = row.reshape(1, -1), tick.packets
+            self.estimator.take(rows, 1, packets, len(packets), self._X, self._S)
         else:
             self.estimator.step(row.reshape(1, -1), tick.packets)
-            self._X[0], self._S[0] = self.estimator.x, deviations(self.estimator.P)
+            self._X[0], self._S[0] = self.estimator.x, compute_std(self.estimator.P)
         self._rows[self._count] = row
         self._count += 1
         if len(tick.packets):
             self._packets.append(tick.packets)
             for packet in tick.packets:
-                note(self._z, packet, float(tick.number))
+                update_newest(self._z, packet, float(tick.number))
         v = 0.5 * float(row[FAST.wheel_left] + row[FAST.wheel_right])
         steady = _reference(tick.steer_next, v, self._target, self._kind)
         before, target, kind = self._refs, self._target, self._kind
-        self._refs = steady if before is None else _followed(before, steady, target, kind)
-        self.fresh = tick.number % n == 0
-        if self.fresh:
-            self._act(tick.number)
+        self._refs = steady if before is None else _filter_reference(before, steady, target, kind)
+        self.has_new_action = tick.number % n == 0
+        if self.has_new_action:
+            self._compute_action(tick.number)
         elif self._count == n:  # begun within a period
             self._count = 0
 
-    def _act(self, number: int) -> None:
-        obs, start = self.observation(number), self._start
+    def _compute_action(self, number: int) -> None:
+        obs, start = self.make_observation(number), self._start
         self._count, self._packets, self._start = 0, [NO_PACKETS], np.zeros(1, np.bool_)
         if self.agent is None:
             self.action = np.zeros(self.facts.width, np.float32)
             return
-        found = self.agent.predict(obs, self._memory, start, deterministic=True)
-        self.action, self._memory = found
+        prediction = self.agent.predict(obs, self._memory, start, deterministic=True)
+        self.action, self._memory = prediction
 
-    def observation(self, number: int) -> npt.NDArray[np.float32]:
+    def make_observation(self, number: int) -> npt.NDArray[np.float32]:
         """What the env's agents would see now, at the tick `number`."""
         done, outputs = self._count, self.outputs
         packets = np.concatenate(self._packets)
@@ -131,15 +131,17 @@ class Onboard:
         shown = len(self._rows) if self._switches[FLAGS.all_samples] else done
         obs = np.empty(self._bounds.shape[1], np.float32)
         self._z[Z.clock.tick] = number
-        row = Row(self._p, self._z, self._switches, obs, self._rows, packets, np.zeros(len(REPORT)))
+        row = EpisodeArrays(
+            self._p, self._z, self._switches, obs, self._rows, packets, np.zeros(len(REPORT))
+        )
         observe(row, shown, len(packets), self._refs, self._bounds)
         out, estimator = np.empty(len(outputs.layout), np.float32), self.estimator
         last = outputs.inner, outputs.plan, outputs.limits, 0.0, 0.0, out, np.zeros(3)
-        if self._ours:  # which takes no further row here
+        if self._is_native:  # which takes no further row here
             record = self._rows, 0, NO_PACKETS, 0, 0
-            observe_entry()(estimator.filters, estimator.gains, *record, obs, *last)
+            compile_observe()(estimator.filters, estimator.gains, *record, obs, *last)
         else:
-            write(estimator, obs, *last)
+            write_outputs(estimator, obs, *last)
         return out
 
     def _warm_up(self) -> None:

@@ -8,33 +8,33 @@ from collections.abc import Sequence
 from typing import Any
 
 from .assemble import Arrival
-from .datagrams import MOST, Kind, encode
+from .datagrams import MAX_BYTES, DatagramKind, encode
 
 LOOPBACK, PORT = "127.0.0.1", 47001
 BUFFER = 1 << 22  # bytes of the kernel's, as far as it grants them
-MOST_AT_ONCE = 512  # datagrams of a batch: whoever floods the port does not stop the loop
+MAX_BATCH = 512  # datagrams of a batch: whoever floods the port does not stop the loop
 SPIN = 150_000  # ns before a point in time, which sleeping alone would miss
 
 clock = time.monotonic_ns
 """ns of the clock that nobody sets."""
 
 
-def address_of(text: str, host: str = LOOPBACK) -> tuple[str, int]:
+def parse_address(text: str, host: str = LOOPBACK) -> tuple[str, int]:
     """The IPv4 address of HOST:PORT or PORT; ValueError for another text or an unknown host."""
-    before, _, number = text.rpartition(":")
+    host_text, _, number = text.rpartition(":")
     if not (number.isascii() and number.isdigit() and 0 <= int(number) < 65536):
         raise ValueError(f"an address is HOST:PORT or PORT, got {text!r}")
     try:
-        return socket.gethostbyname(before or host), int(number)
+        return socket.gethostbyname(host_text or host), int(number)
     except OSError as error:
         raise ValueError(f"{text!r} is no address of IPv4: {error}") from None
 
 
-def spin_until(when: int) -> None:
+def wait_until(deadline: int) -> None:
     """Return at a point in time of `clock`."""
-    if (left := when - clock() - SPIN) > 0:
+    if (left := deadline - clock() - SPIN) > 0:
         time.sleep(left * 1e-9)
-    while clock() < when:
+    while clock() < deadline:
         pass
 
 
@@ -53,14 +53,16 @@ class Port:
             self._socket.bind((host, port))
         except OSError as error:
             self._socket.close()
-            why = "is in use" if error.errno == errno.EADDRINUSE else f"is none: {error.strerror}"
-            raise OSError(f"UDP port {port} of {host} {why}") from None
+            reason = (
+                "is in use" if error.errno == errno.EADDRINUSE else f"is none: {error.strerror}"
+            )
+            raise OSError(f"UDP port {port} of {host} {reason}") from None
         self.address: tuple[str, int] = self._socket.getsockname()
         self.unsent = 0
         self._sent: dict[int, int] = {}
 
     def send(
-        self, to: Any, kind: Kind, stamp: int, values: Sequence[float] = (), names: Any = ()
+        self, to: Any, kind: DatagramKind, stamp: int, values: Sequence[float] = (), names: Any = ()
     ) -> None:
         """Send a message; stamp: us."""
         number = self._sent[kind] = self._sent.get(kind, -1) + 1
@@ -69,11 +71,11 @@ class Port:
         except OSError:
             self.unsent += 1
 
-    def drain(self, batch: list[Arrival]) -> list[Arrival]:
+    def receive_available(self, batch: list[Arrival]) -> list[Arrival]:
         """The batch with what has arrived, up to MOST_AT_ONCE."""
-        while len(batch) < MOST_AT_ONCE:
+        while len(batch) < MAX_BATCH:
             try:
-                data, sender = self._socket.recvfrom(MOST + 1)
+                data, sender = self._socket.recvfrom(MAX_BYTES + 1)
             except BlockingIOError:
                 break
             except OSError:  # a message of the network about an earlier datagram
@@ -84,20 +86,20 @@ class Port:
     def wait(self, seconds: float) -> list[Arrival]:
         """What arrives first, or nothing after so long."""
         select.select([self._socket], [], [], max(seconds, 0.0))
-        return self.drain([])
+        return self.receive_available([])
 
-    def until(self, when: int) -> list[Arrival]:
+    def receive_until(self, deadline: int) -> list[Arrival]:
         """What arrives until a point in time of `clock`, each with the time it came."""
         batch: list[Arrival] = []
-        while (left := when - clock() - SPIN) > 0:
-            if len(batch) >= MOST_AT_ONCE:
+        while (left := deadline - clock() - SPIN) > 0:
+            if len(batch) >= MAX_BATCH:
                 time.sleep(left * 1e-9)
                 break
             if select.select([self._socket], [], [], left * 1e-9)[0]:
-                self.drain(batch)
-        while clock() < when:
-            self.drain(batch)
-        return self.drain(batch)
+                self.receive_available(batch)
+        while clock() < deadline:
+            self.receive_available(batch)
+        return self.receive_available(batch)
 
     def close(self) -> None:
         """Free the port."""

@@ -6,23 +6,23 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from ...envs.recordings.geodesy import metres
-from ...envs.recordings.sources import open_source
-from .datagrams import LONGEST_AGE, Kind
+from ...envs.recordings.geodesy import to_metres
+from ...envs.recordings.sources import make_source
+from .datagrams import MAX_AGE, DatagramKind
 from .port import Port
 
-WORST_HDOP = 99.0  # of a receiver without a fix
-LONGEST_PAUSE = 10.0  # s between two epochs of a file
+MAX_HDOP = 99.0  # of a receiver without a fix
+MAX_PAUSE = 10.0  # s between two epochs of a file
 
 
 @dataclass
 class Relay:
-    """Sends the epochs of a source, as `envs.recordings.sources.open_source` takes it.
+    """Sends the epochs of a source, as `envs.recordings.sources.make_source` takes it.
 
     port: from which it sends, to the address `to`. latency: s from an epoch to its sentences, which
     the receiver adds. speed: of a file, which is played in the time of its epochs. A lost line is
     opened again; `error` has why the relay ended, "" at a file's end. `sent`: datagrams. `counts`:
-    of the decoder. Raises what `open_source` does.
+    of the decoder. Raises what `make_source` does.
     """
 
     source: str
@@ -36,50 +36,50 @@ class Relay:
     _origin: tuple[float, float] | None = field(default=None)
 
     def __post_init__(self) -> None:
-        self._chunks = open_source(self.source)
+        self._chunks = make_source(self.source)
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Relay until the source ends, is lost for good, or `stop`."""
-        plays = not self.source.startswith(("serial:", "tcp:"))
-        before, due = math.nan, time.monotonic()
+        is_file = not self.source.startswith(("serial:", "tcp:"))
+        last_time, due = math.nan, time.monotonic()
         try:
-            for epoch in self._epochs():
-                if epoch is not None and plays and epoch.t > before:
-                    due += min(epoch.t - before, LONGEST_PAUSE) / self.speed
-                while not stop() and plays and (left := due - time.monotonic()) > 0.0:
+            for epoch in self._iterate_epochs():
+                if epoch is not None and is_file and epoch.t > last_time:
+                    due += min(epoch.t - last_time, MAX_PAUSE) / self.speed
+                while not stop() and is_file and (left := due - time.monotonic()) > 0.0:
                     time.sleep(min(left, 0.1))
                 if stop():
                     return
                 if epoch is not None:
-                    before = epoch.t
-                    self.port.send(self.to, Kind.GPS, 0, self._values(epoch))
+                    last_time = epoch.t
+                    self.port.send(self.to, DatagramKind.GPS, 0, self._make_values(epoch))
                     self.sent += 1
         except OSError as error:
             self.error = str(error)
 
-    def _epochs(self) -> Iterator[Any]:
+    def _iterate_epochs(self) -> Iterator[Any]:
         """The epochs, and None after each chunk of bytes."""
         from ...envs.recordings.nmea import Decoder
 
         decoder = Decoder()
         self.counts = decoder.counts
         for chunk in self._chunks:
-            yield from decoder.feed(chunk)
+            yield from decoder.decode_chunk(chunk)
             yield None
         yield from decoder.finish()
 
-    def _values(self, epoch: Any) -> list[float]:
+    def _make_values(self, epoch: Any) -> list[float]:
         """The doubles of a datagram; an unknown number is 0, an unknown HDOP the worst."""
-        X, Y = self._place(epoch) if epoch.fixed else (0.0, 0.0)
-        hdop = epoch.hdop if math.isfinite(epoch.hdop) else WORST_HDOP
-        course, speed = (each if math.isfinite(each) else 0.0 for each in epoch[3:5])
+        X, Y = self._compute_position(epoch) if epoch.fixed else (0.0, 0.0)
+        hdop = epoch.hdop if math.isfinite(epoch.hdop) else MAX_HDOP
+        course, speed = (value if math.isfinite(value) else 0.0 for value in epoch[3:5])
         age = epoch.age + self.latency
-        age = min(max(age, 0.0), LONGEST_AGE) if math.isfinite(age) else LONGEST_AGE
+        age = min(max(age, 0.0), MAX_AGE) if math.isfinite(age) else MAX_AGE
         return [course, speed, X, Y, hdop, float(epoch.satellites), age, float(epoch.quality)]
 
-    def _place(self, epoch: Any) -> tuple[float, float]:
+    def _compute_position(self, epoch: Any) -> tuple[float, float]:
         """m to the east and north of the first fix."""
         if self._origin is None:
             self._origin = epoch.latitude, epoch.longitude
-        east, north = metres(epoch.latitude, epoch.longitude, self._origin)
+        east, north = to_metres(epoch.latitude, epoch.longitude, self._origin)
         return float(east), float(north)

@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from .assemble import Arrival, Assembler
-from .onboard import Onboard
+from .assemble import Arrival, StreamSynchroniser
+from .onboard import OnboardController
 
 MAGIC = b"SLIPSES1"
-BATCHES, BYTES = 100, 1 << 13  # of a block at most: a tenth of a second
+MAX_BATCHES, MAX_BLOCK_BYTES = 100, 1 << 13  # of a block at most: a tenth of a second
 _LENGTH = struct.Struct("!I")
 _BLOCK = struct.Struct("!4sIIII")  # magic, batches, bytes, checksums of these and of estimates
 _ITEM = struct.Struct("!HH")  # which batch of the block, bytes of the datagram
@@ -46,16 +46,16 @@ class Recorder:
         self._file.write(MAGIC + _LENGTH.pack(len(text)) + text)
         self._items, self._batches, self._digest = bytearray(), 0, 0
 
-    def note(self, onboard: Onboard) -> None:
+    def note(self, onboard: OnboardController) -> None:
         """An estimate, for the checksum."""
-        self._digest = digest_of(onboard, self._digest)
+        self._digest = update_digest(onboard, self._digest)
 
     def take(self, accepted: list[bytes]) -> None:
         """The datagrams of a batch that were accepted."""
         for data in accepted:
             self._items += _ITEM.pack(self._batches, len(data)) + data
         self._batches += 1
-        if self._batches == BATCHES or len(self._items) > BYTES:
+        if self._batches == MAX_BATCHES or len(self._items) > MAX_BLOCK_BYTES:
             self._write()
 
     def _write(self) -> None:
@@ -70,12 +70,12 @@ class Recorder:
         self._file.close()
 
 
-def digest_of(onboard: Onboard, before: int) -> int:
+def update_digest(onboard: OnboardController, digest: int) -> int:
     """A checksum of an estimate and of all before it."""
-    return zlib.crc32(onboard.std.tobytes(), zlib.crc32(onboard.x.tobytes(), before))
+    return zlib.crc32(onboard.std.tobytes(), zlib.crc32(onboard.x.tobytes(), digest))
 
 
-class Block(NamedTuple):
+class SessionBlock(NamedTuple):
     """A block: its batches of datagrams, and the checksum of the estimates after it."""
 
     batches: list[list[Arrival]]
@@ -85,55 +85,55 @@ class Block(NamedTuple):
 def read_setup(path: Path | str) -> dict[str, Any]:
     """The setup of a session; ValueError for a file that is none, or lacks some of it."""
     with open(path, "rb") as file:
-        setup = _setup(path, file)
+        setup = _read_header(path, file)
     wrong = [name for name, kind in _SETUP.items() if not isinstance(setup.get(name, ...), kind)]
     if wrong:
         raise ValueError(f"{path}: its setup lacks {', '.join(wrong)}, or has it of another type")
     return setup
 
 
-def _setup(path: Path | str, file: Any) -> dict[str, Any]:
+def _read_header(path: Path | str, file: Any) -> dict[str, Any]:
     if file.read(len(MAGIC)) == MAGIC:
         length = file.read(_LENGTH.size)
         if len(length) == _LENGTH.size:
             try:
-                found = json.loads(file.read(*_LENGTH.unpack(length)))
+                setup = json.loads(file.read(*_LENGTH.unpack(length)))
             except (ValueError, RecursionError):
-                found = None
-            if isinstance(found, dict):
-                return found
+                setup = None
+            if isinstance(setup, dict):
+                return setup
     raise ValueError(f"{path} is no session of `sideslip live --record`, or only its beginning")
 
 
-def blocks_of(path: Path | str) -> Iterator[Block]:
+def read_blocks(path: Path | str) -> Iterator[SessionBlock]:
     """The blocks of a session up to its end, or to where it was cut or damaged."""
     with open(path, "rb") as file:
-        _setup(path, file)
+        _read_header(path, file)
         while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
             magic, count, size, check, digest = _BLOCK.unpack(head)
-            data = file.read(size) if magic == _MAGIC and count <= BATCHES else b""
+            data = file.read(size) if magic == _MAGIC and count <= MAX_BATCHES else b""
             if magic != _MAGIC or len(data) != size or zlib.crc32(data) != check:
                 return
-            batches = _batches(data, count)
+            batches = _parse_batches(data, count)
             if batches is None:
                 return
-            yield Block(batches, digest)
+            yield SessionBlock(batches, digest)
 
 
-def _batches(data: bytes, count: int) -> list[list[Arrival]] | None:
+def _parse_batches(data: bytes, count: int) -> list[list[Arrival]] | None:
     """The datagrams of each batch; None where somebody made up what the checksum is of."""
     batches: list[list[Arrival]] = [[] for _ in range(count)]
-    at = 0
-    while len(data) - at >= _ITEM.size:
-        which, size = _ITEM.unpack_from(data, at)
-        at += _ITEM.size + size
-        if which >= count or at > len(data):
+    offset = 0
+    while len(data) - offset >= _ITEM.size:
+        index, size = _ITEM.unpack_from(data, offset)
+        offset += _ITEM.size + size
+        if index >= count or offset > len(data):
             return None
-        batches[which].append(Arrival(0, data[at - size : at]))
-    return batches if at == len(data) else None
+        batches[index].append(Arrival(0, data[offset - size : offset]))
+    return batches if offset == len(data) else None
 
 
-class Replay(NamedTuple):
+class SessionReplay(NamedTuple):
     """What a replay gives: ticks (T,), x and std (T, n), and whether every block's checksum of the
     estimates is the session's."""
 
@@ -143,20 +143,20 @@ class Replay(NamedTuple):
     same: bool
 
 
-def replay(path: Path | str, onboard: Onboard, patience: int | None) -> Replay:
-    """Take a session again; patience: of its `Assembler`."""
-    assembler, digest, same = Assembler(patience), 0, True
+def replay(path: Path | str, onboard: OnboardController, patience: int | None) -> SessionReplay:
+    """Take a session again; patience: of its `StreamSynchroniser`."""
+    assembler, digest, same = StreamSynchroniser(patience), 0, True
     ticks: list[int] = []
     numbers: list[list[npt.NDArray[np.float64]]] = [[], []]
-    for block in blocks_of(path):
+    for block in read_blocks(path):
         for batch in block.batches:
             for tick in assembler.take(batch):
                 onboard.take(tick)
-                digest = digest_of(onboard, digest)
+                digest = update_digest(onboard, digest)
                 ticks.append(tick.number)
                 numbers[0].append(onboard.x.copy())
                 numbers[1].append(onboard.std.copy())
         same = same and digest == block.digest
     shape = len(ticks), len(onboard.names)
-    x, std = (np.array(each).reshape(shape) for each in numbers)
-    return Replay(np.array(ticks, np.int64), x, std, same)
+    x, std = (np.array(values).reshape(shape) for values in numbers)
+    return SessionReplay(np.array(ticks, np.int64), x, std, same)

@@ -15,19 +15,19 @@ from ...envs.engine.layout import Z
 from ...envs.record import FAST, PACKET
 from ...envs.sensors.slow import WIDTHS
 from ...envs.ticks import TICK
-from ..env_facts import facts_of
+from ..env_facts import get_env_facts
 from ..rollout import Rollout, rollout
-from .datagrams import SENSORS, STAMP, Bad, Kind, Message, decode
-from .port import Port, clock, spin_until
+from .datagrams import SENSORS, TICK_US, DatagramKind, Message, RejectReason, decode
+from .port import Port, clock, wait_until
 
-MOST_TICKS = 250  # of a control period in lock-step: so many rows the kernel holds
+MAX_TICKS = 250  # of a control period in lock-step: so many rows the kernel holds
 SLACK = 150_000  # ns before the next row is due, at which a control is too late
-ANSWER = 60.0  # s that lock-step waits for a control
+CONTROL_TIMEOUT = 60.0  # s that lock-step waits for a control
 _KINDS = {place: kind for kind, place in SENSORS.items()}
 
 
 @dataclass
-class Wires:
+class WireAgent:
     """What drives an env in the place of an agent: its record goes out, controls come in.
 
     env: a `StabilityEnv`, bare. port: from which it sends, to the address `to`. step: lock-step,
@@ -43,12 +43,12 @@ class Wires:
     speed: float = 1.0
     late: int = 0
     periods: int = 0
-    _begun: int = 0  # ns, when tick 0 is due
+    _start_time: int = 0  # ns, when tick 0 is due
     _newest: int = -1  # stamp of the newest control
     _action: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros(1, np.float32))
 
     def __post_init__(self) -> None:
-        self._facts = facts_of(self.env)
+        self._facts = get_env_facts(self.env)
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: Any = 1
@@ -56,16 +56,16 @@ class Wires:
         """The action that comes back for the newest record; as of stable-baselines3."""
         if not self.periods:
             self._action = np.zeros(self._facts.width, np.float32)
-            self._begun = clock() + round(1e9 * TICK)
+            self._start_time = clock() + round(1e9 * TICK)
         tick = self.send()
         self.periods += 1
         if self.step:
-            self._wait_for(tick * STAMP)
+            self._wait_for_control(tick * TICK_US)
         else:
-            end = self._due(tick + 1) - SLACK
-            while self._newest < tick * STAMP and clock() < end:
+            end = self._get_due_time(tick + 1) - SLACK
+            while self._newest < tick * TICK_US and clock() < end:
                 self._read(self.port.wait((end - clock()) * 1e-9))
-            self.late += self._newest < tick * STAMP
+            self.late += self._newest < tick * TICK_US
         return self._action.copy(), state
 
     def send(self) -> int:
@@ -76,27 +76,30 @@ class Wires:
         steers = [*record.fast[1:, FAST.steer_command], command]
         for tick, row, steer in zip(record.ticks.tolist(), record.fast, steers, strict=True):
             if not self.step:
-                spin_until(self._due(tick))
+                wait_until(self._get_due_time(tick))
             for packet in record.packets[record.packets[:, PACKET.arrived] == tick]:
                 kind = _KINDS[int(packet[PACKET.sensor])]
                 age = (packet[PACKET.arrived] - packet[PACKET.captured]) * TICK
-                self.port.send(self.to, kind, tick * STAMP, _values(kind, packet, age))
-            self.port.send(self.to, Kind.INERTIAL, tick * STAMP, [*row.tolist(), float(steer)])
+                self.port.send(self.to, kind, tick * TICK_US, _make_values(kind, packet, age))
+            self.port.send(
+                self.to, DatagramKind.INERTIAL, tick * TICK_US, [*row.tolist(), float(steer)]
+            )
         return int(record.ticks[-1])
 
     def end(self) -> None:
         """Send what the last step left, and that the drive is over."""
-        self.port.send(self.to, Kind.END, self.send() * STAMP)
+        self.port.send(self.to, DatagramKind.END, self.send() * TICK_US)
 
-    def _due(self, tick: int) -> int:
-        return self._begun + round(tick * TICK * 1e9 / self.speed)
+    def _get_due_time(self, tick: int) -> int:
+        return self._start_time + round(tick * TICK * 1e9 / self.speed)
 
-    def _wait_for(self, stamp: int) -> None:
-        end = time.monotonic() + ANSWER
+    def _wait_for_control(self, stamp: int) -> None:
+        end = time.monotonic() + CONTROL_TIMEOUT
         while self._newest < stamp:
             if time.monotonic() > end:
                 raise TimeoutError(
-                    f"no control came within {ANSWER:g} s for the tick {stamp // STAMP}: does "
+                    f"no control came within {CONTROL_TIMEOUT:g} s for the tick "
+                    f"{stamp // TICK_US}: does "
                     f"`sideslip live` run with --step at {self.to[0]}:{self.to[1]}?"
                 )
             self._read(self.port.wait(0.1))
@@ -104,18 +107,18 @@ class Wires:
     def _read(self, arrivals: Any) -> None:
         for arrival in arrivals:
             message = decode(arrival.data)
-            if isinstance(message, Bad) or message.kind != Kind.CONTROL:
+            if isinstance(message, RejectReason) or message.kind != DatagramKind.CONTROL:
                 continue
             if message.stamp >= self._newest:
-                self._newest, self._action = message.stamp, self._action_of(message)
+                self._newest, self._action = message.stamp, self._decode_action(message)
 
-    def _action_of(self, message: Message) -> npt.NDArray[np.float32]:
+    def _decode_action(self, message: Message) -> npt.NDArray[np.float32]:
         moment, turn = message.values
         shares = moment / self._facts.full_scale, turn / self._facts.authority
         return np.array(shares[: self._facts.width], np.float32)
 
 
-def _values(kind: Kind, packet: Any, age: float) -> list[float]:
+def _make_values(kind: DatagramKind, packet: Any, age: float) -> list[float]:
     width = WIDTHS[SENSORS[kind]]
     values = packet[PACKET.value : PACKET.value + width].tolist()
     return [*values, float(age), float(packet[PACKET.quality])]
@@ -128,7 +131,7 @@ def simulate(
     seed: int = 0,
     step: bool = False,
     speed: float = 1.0,
-) -> tuple[Rollout, Wires]:
+) -> tuple[Rollout, WireAgent]:
     """One episode of an env whose agent is at the other end of the wires, and the wires.
 
     In lock-step the drive is that of `rollout` with the same agent, bit for bit; in real time it
@@ -136,15 +139,15 @@ def simulate(
     Raises ValueError for a control period too long for lock-step, TimeoutError where no control
     comes.
     """
-    if step and facts_of(env).control_period > MOST_TICKS:
-        raise ValueError(f"in lock-step a control period has at most {MOST_TICKS} ticks")
-    wires = Wires(env, port, to, step, speed)
-    drive = rollout(env, wires, seed)
-    wires.end()
-    return drive, wires
+    if step and get_env_facts(env).control_period > MAX_TICKS:
+        raise ValueError(f"in lock-step a control period has at most {MAX_TICKS} ticks")
+    agent = WireAgent(env, port, to, step, speed)
+    drive = rollout(env, agent, seed)
+    agent.end()
+    return drive, agent
 
 
-class Other:
+class SimulatedCarProcess:
     """The other end in a process of its own, ready before it starts.
 
     Arguments: the env's id and options, those of `simulate`. Raises what the env raises.
@@ -152,30 +155,32 @@ class Other:
 
     def __init__(self, *arguments: Any) -> None:
         context = get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_other, args=(theirs, *arguments), daemon=True)
+        self._pipe, child_pipe = context.Pipe()
+        self._process = context.Process(
+            target=_run_simulated_car, args=(child_pipe, *arguments), daemon=True
+        )
         self._process.start()
-        theirs.close()
-        self._heard()
+        child_pipe.close()
+        self._receive()
 
-    def go(self) -> None:
+    def start_drive(self) -> None:
         """Begin."""
         self._pipe.send("go")
 
     def result(self) -> Any:
         """(columns of the drive, controls late, periods), when it is over."""
-        return self._heard()
+        return self._receive()
 
-    def _heard(self) -> Any:
+    def _receive(self) -> Any:
         try:
-            found = self._pipe.recv()
+            message = self._pipe.recv()
         except EOFError:
             raise ChildProcessError("the simulated car's process ended") from None
-        if isinstance(found, Exception):
-            raise found
-        return found
+        if isinstance(message, Exception):
+            raise message
+        return message
 
-    def __enter__(self) -> "Other":
+    def __enter__(self) -> "SimulatedCarProcess":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -184,20 +189,22 @@ class Other:
         self._pipe.close()
 
 
-def _other(
+def _run_simulated_car(
     pipe: Any, env_id: str, options: dict[str, Any], to: Any, seed: int, step: bool, speed: float
 ) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the loop at the car's end has the summary
     try:
         env = gym.make(env_id, **options)
         with Port() as port:
-            idle = Wires(env, port, port.address, speed=10.0)
-            rollout(env, idle, seed, {"duration": 0.1})  # what is to be compiled is compiled now
+            warm_up_agent = WireAgent(env, port, port.address, speed=10.0)
+            rollout(
+                env, warm_up_agent, seed, {"duration": 0.1}
+            )  # what is to be compiled is compiled now
             gc.collect()
             gc.freeze()
             pipe.send("ready")
             pipe.recv()
-            drive, wires = simulate(env, port, to, seed, step, speed)
-        pipe.send((drive.columns, wires.late, wires.periods))
+            drive, agent = simulate(env, port, to, seed, step, speed)
+        pipe.send((drive.columns, agent.late, agent.periods))
     except Exception as error:
         pipe.send(error)

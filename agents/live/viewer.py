@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ...estimators.design.models import FOREIGN_STATE, STATES
-from .datagrams import Bad, Kind, Message, Status, decode
+from .datagrams import DatagramKind, LoopStatus, Message, RejectReason, decode
 from .port import LOOPBACK, Port
 
 PAGE = Path(__file__).with_name("page.html")
@@ -30,53 +30,53 @@ _POLICY = (
 )
 
 
-class Seen(asyncio.DatagramProtocol):
+class ViewerProtocol(asyncio.DatagramProtocol):
     """The newest datagrams. samples: (s, estimates, standard deviations), in degrees where states
     are angles; count: of all so far."""
 
     def __init__(self) -> None:
         self.names: tuple[str, ...] = ()
         self.samples: deque[list[float]] = deque(maxlen=round(100 * SECONDS))
-        self.status, self.count, self.over = Status(), 0, asyncio.Event()
+        self.status, self.count, self.over = LoopStatus(), 0, asyncio.Event()
 
     def datagram_received(self, data: bytes, _: Any) -> None:
         """Take a datagram of the loop."""
         message = decode(data)
-        if isinstance(message, Bad):
+        if isinstance(message, RejectReason):
             return
-        if message.kind == Kind.ESTIMATE:
-            self._estimate(message)
-        elif message.kind == Kind.STATUS:
-            self.status = Status(*message.values)
-        elif message.kind == Kind.END:
+        if message.kind == DatagramKind.ESTIMATE:
+            self._add_estimate(message)
+        elif message.kind == DatagramKind.STATUS:
+            self.status = LoopStatus(*message.values)
+        elif message.kind == DatagramKind.END:
             self.over.set()
 
-    def _estimate(self, message: Message) -> None:
+    def _add_estimate(self, message: Message) -> None:
         if message.names != self.names:
             self.names = message.names
             self.samples.clear()
-        factors = [_DEGREES if unit_of(name)[0] == "d" else 1.0 for name in self.names] * 2
+        factors = [_DEGREES if get_unit(name)[0] == "d" else 1.0 for name in self.names] * 2
         values = [a * b for a, b in zip(message.values, factors, strict=True)]
         self.samples.append([message.stamp * 1e-6, *values])
         self.count += 1
 
 
-def unit_of(name: str) -> str:
+def get_unit(name: str) -> str:
     """The unit in which a state is shown."""
     return STATES.get(name, FOREIGN_STATE).unit.replace("rad", "deg")
 
 
-def table_of(seen: Seen, title: str) -> Any:
+def make_table(protocol: ViewerProtocol, title: str) -> Any:
     """The estimates, and what the loop has counted."""
     from rich.table import Table
     from rich.text import Text
 
     table = Table("state", "estimate", "std", "unit", title=Text(title), title_justify="left")
-    n = len(seen.names)
-    newest = seen.samples[-1] if seen.samples else []
-    for name, x, std in zip(seen.names, newest[1 : 1 + n], newest[1 + n :], strict=False):
-        table.add_row(Text(name), f"{x:+.3f}", f"{std:.3f}", unit_of(name))
-    counts = seen.status
+    n = len(protocol.names)
+    newest = protocol.samples[-1] if protocol.samples else []
+    for name, x, std in zip(protocol.names, newest[1 : 1 + n], newest[1 + n :], strict=False):
+        table.add_row(Text(name), f"{x:+.3f}", f"{std:.3f}", get_unit(name))
+    counts = protocol.status
     time = f"t {newest[0]:.1f} s; " if newest else "no inertial data yet; "
     table.caption = (
         f"{time}{counts.misses:.0f} of {counts.ticks:.0f} deadlines missed, "
@@ -86,20 +86,20 @@ def table_of(seen: Seen, title: str) -> Any:
     return table
 
 
-def news_of(seen: Seen, sent: int) -> tuple[str, int]:
+def make_event(protocol: ViewerProtocol, sent: int) -> tuple[str, int]:
     """What came after the first `sent` samples as JSON, all of them where none were sent; and how
     many there are now."""
-    new = min(seen.count - sent, len(seen.samples))
-    news = {
+    n_new = min(protocol.count - sent, len(protocol.samples))
+    event = {
         "all": sent == 0,
-        "names": [[name, unit_of(name)] for name in seen.names],
-        "samples": list(seen.samples)[len(seen.samples) - new :],
-        "status": seen.status._asdict(),
+        "names": [[name, get_unit(name)] for name in protocol.names],
+        "samples": list(protocol.samples)[len(protocol.samples) - n_new :],
+        "status": protocol.status._asdict(),
     }
-    return json.dumps(news), seen.count
+    return json.dumps(event), protocol.count
 
 
-async def _events(seen: Seen, request: Any) -> Any:
+async def _send_events(protocol: ViewerProtocol, request: Any) -> Any:
     """Server-sent events: what is new, twenty times a second."""
     from aiohttp import web
 
@@ -107,17 +107,17 @@ async def _events(seen: Seen, request: Any) -> Any:
     await response.prepare(request)
     sent = 0
     with suppress(ConnectionError):
-        while not seen.over.is_set():
-            text, sent = news_of(seen, sent)
+        while not protocol.over.is_set():
+            text, sent = make_event(protocol, sent)
             await response.write(f"data: {text}\n\n".encode())
             await asyncio.sleep(0.05)
     return response
 
 
-async def _page(title: str, seen: Seen, _: Any) -> Any:
+async def _render_page(title: str, protocol: ViewerProtocol, _: Any) -> Any:
     from aiohttp import web
 
-    text, _ = news_of(seen, 0)  # so that it is drawn as soon as it is loaded
+    text, _ = make_event(protocol, 0)  # so that it is drawn as soon as it is loaded
     nonce = secrets.token_urlsafe(16)
     page = PAGE.read_text(encoding="utf-8").replace("NONCE", nonce).replace("TITLE", escape(title))
     text = page.replace("FIRST", text.replace("<", "\\u003c"))
@@ -125,7 +125,7 @@ async def _page(title: str, seen: Seen, _: Any) -> Any:
     return web.Response(text=text, content_type="text/html", headers=headers)
 
 
-def is_ours(host: str, origin: str | None) -> bool:
+def is_same_origin(host: str, origin: str | None) -> bool:
     """Say whether a request is for this server and from its own page.
 
     A page elsewhere that lets its name resolve to this address has that name as the host.
@@ -143,21 +143,23 @@ def is_ours(host: str, origin: str | None) -> bool:
     return name == "localhost" and origin in (None, f"http://{host}")
 
 
-async def _view(title: str, page: tuple[str, int] | None, screen: bool, pipe: Any) -> None:
+async def _run_viewer(title: str, page: tuple[str, int] | None, screen: bool, pipe: Any) -> None:
     loop, runner, address = asyncio.get_running_loop(), None, ""
-    transport, seen = await loop.create_datagram_endpoint(Seen, local_addr=(LOOPBACK, 0))
+    transport, protocol = await loop.create_datagram_endpoint(
+        ViewerProtocol, local_addr=(LOOPBACK, 0)
+    )
     if page is not None:
         from aiohttp import web
 
         @web.middleware
-        async def guard(request: Any, handler: Any) -> Any:
-            if not is_ours(request.host, request.headers.get("Origin")):
+        async def check_origin(request: Any, handler: Any) -> Any:
+            if not is_same_origin(request.host, request.headers.get("Origin")):
                 raise web.HTTPForbidden(text="this page is served by its address, to itself alone")
             return await handler(request)
 
-        app = web.Application(middlewares=[guard])
-        app.router.add_get("/", partial(_page, title, seen))
-        app.router.add_get("/events", partial(_events, seen))
+        app = web.Application(middlewares=[check_origin])
+        app.router.add_get("/", partial(_render_page, title, protocol))
+        app.router.add_get("/events", partial(_send_events, protocol))
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.5)
         await runner.setup()
         await web.TCPSite(runner, *page).start()
@@ -168,22 +170,22 @@ async def _view(title: str, page: tuple[str, int] | None, screen: bool, pipe: An
         from rich.live import Live
 
         with Live(refresh_per_second=5, auto_refresh=False) as live:
-            while not seen.over.is_set():
-                live.update(table_of(seen, f"{title} {address}"), refresh=True)
+            while not protocol.over.is_set():
+                live.update(make_table(protocol, f"{title} {address}"), refresh=True)
                 with suppress(TimeoutError):
-                    await asyncio.wait_for(seen.over.wait(), 0.2)
-    await seen.over.wait()
+                    await asyncio.wait_for(protocol.over.wait(), 0.2)
+    await protocol.over.wait()
     transport.close()
     if runner is not None:
         await runner.cleanup()
 
 
-def _main(title: str, page: tuple[str, int] | None, screen: bool, pipe: Any) -> None:
+def _run_process(title: str, page: tuple[str, int] | None, screen: bool, pipe: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the loop ends it, with its summary
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # whatever the loop's is
     os.nice(5)
     try:
-        asyncio.run(_view(title, page, screen, pipe))
+        asyncio.run(_run_viewer(title, page, screen, pipe))
     except (OSError, ModuleNotFoundError) as error:
         missing = isinstance(error, ModuleNotFoundError)
         pipe.send("the page needs aiohttp: pip install 'sideslip[wires]'" if missing else error)
@@ -199,26 +201,26 @@ class Viewer:
 
     def __init__(self, title: str, page: tuple[str, int] | None, screen: bool) -> None:
         context = get_context("spawn")
-        pipe, theirs = context.Pipe()
-        arguments = title, page, screen, theirs
-        self._process = context.Process(target=_main, args=arguments, daemon=True)
+        pipe, child_pipe = context.Pipe()
+        arguments = title, page, screen, child_pipe
+        self._process = context.Process(target=_run_process, args=arguments, daemon=True)
         self._process.start()
-        theirs.close()
+        child_pipe.close()
         try:
-            found = pipe.recv()
+            reply = pipe.recv()
         except EOFError:
-            found = "the viewer ended before it began"
-        if isinstance(found, OSError):
-            raise OSError(f"the page of port {page[1] if page else 0}: {found.strerror}")
-        if isinstance(found, str):
-            raise ModuleNotFoundError(found)
-        self.address, self.url = found
+            reply = "the viewer ended before it began"
+        if isinstance(reply, OSError):
+            raise OSError(f"the page of port {page[1] if page else 0}: {reply.strerror}")
+        if isinstance(reply, str):
+            raise ModuleNotFoundError(reply)
+        self.address, self.url = reply
 
     def __enter__(self) -> "Viewer":
         return self
 
     def __exit__(self, *_: object) -> None:
         with Port() as port:
-            port.send(self.address, Kind.END, 0)
+            port.send(self.address, DatagramKind.END, 0)
         self._process.join(3.0)
         self._process.kill()

@@ -28,8 +28,8 @@ from pathlib import Path
 from typing import Any
 
 from ...envs.arguments import check_choice, is_finite
-from ...envs.backend.extras import extra
-from .export import activations
+from ...envs.backend.extras import require_extra
+from .export import list_activations
 from .normalise import Scaling, Standardised  # first: it says which extra is missing
 
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
@@ -41,13 +41,21 @@ Settings = dict[str, Any]
 
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
 PERIOD = 0.01  # s, of control: of the environments whose discount stands in the files
-BEGUN = "begun"  # the entry of a training that goes on from a policy
-BEGUN_TRACES = "begun-traces"  # from one with traces
-EVENLY = -0.55  # log of the deviation of actions drawn evenly
+WARM_START_ENTRY = "begun"  # the entry of a training that goes on from a policy
+WARM_START_TRACES_ENTRY = "begun-traces"  # from one with traces
+UNIFORM_LOG_STD = -0.55  # log of the deviation of actions drawn evenly
 
-_OF_TRAINING = ("n_timesteps", "n_envs", "policy", "normalize")
+_TRAINING_SETTINGS = ("n_timesteps", "n_envs", "policy", "normalize")
 _SCHEDULED = ("learning_rate", "clip_range")
-_OURS = {"env", "seed", "device", "verbose", "tensorboard_log", "stats_window_size", "source"}
+_MANAGED_ARGUMENTS = {
+    "env",
+    "seed",
+    "device",
+    "verbose",
+    "tensorboard_log",
+    "stats_window_size",
+    "source",
+}
 
 
 @dataclass(frozen=True)
@@ -62,9 +70,9 @@ class Algorithm:
     def load(self) -> Callable[..., BaseAlgorithm]:
         """The class; ModuleNotFoundError without its package."""
         module, name = self.kind.split(":")
-        with extra("train", "training needs {}"):
-            found: Callable[..., BaseAlgorithm] = getattr(import_module(module), name)
-        return found
+        with require_extra("train", "training needs {}"):
+            algorithm_class: Callable[..., BaseAlgorithm] = getattr(import_module(module), name)
+        return algorithm_class
 
 
 ALGORITHMS = {
@@ -72,25 +80,27 @@ ALGORITHMS = {
     "sac": Algorithm("stable_baselines3:SAC", "sac"),
     "tqc": Algorithm("sb3_contrib:TQC", "tqc"),
     "recurrent-ppo": Algorithm("sb3_contrib:RecurrentPPO", "ppo_lstm"),
-    "gradient": Algorithm(f"{__package__}.gradient:Gradient", "gradient", on_tensors=True),
+    "gradient": Algorithm(
+        f"{__package__}.gradient:AnalyticPolicyGradient", "gradient", on_tensors=True
+    ),
 }
 
 
-def algorithm_of(name: str) -> Algorithm:
+def get_algorithm(name: str) -> Algorithm:
     """An algorithm by its name; ValueError for another."""
     check_choice("algorithm", name, ALGORITHMS)
     return ALGORITHMS[name]
 
 
-def settings_of(algo: str, env_id: str, file: str | Path | None = None) -> Settings:
+def read_settings(algo: str, env_id: str, file: str | Path | None = None) -> Settings:
     """An environment's settings, or those of "default", from a file of rl-baselines3-zoo's format.
 
     file: default: the package's own. Raises what `check_settings` raises, FileNotFoundError, and
     ValueError for a file that is no such YAML or has neither entry.
     """
-    with extra("train", "settings need {}"):
+    with require_extra("train", "settings need {}"):
         import yaml
-    path = HYPERPARAMS / f"{algorithm_of(algo).zoo}.yml" if file is None else Path(file)
+    path = HYPERPARAMS / f"{get_algorithm(algo).zoo}.yml" if file is None else Path(file)
     try:
         entries = yaml.safe_load(path.read_text())
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -101,58 +111,58 @@ def settings_of(algo: str, env_id: str, file: str | Path | None = None) -> Setti
     key = env_id if env_id in entries else "default"
     if key not in entries:
         raise ValueError(f"{path} has no settings of {env_id}, and no 'default'")
-    found = entries[key]
+    settings = entries[key]
     try:
-        check_settings(algo, found)
+        check_settings(algo, settings)
     except ValueError as error:
         raise ValueError(f"{path}, {key}: {error}") from None
-    return dict(found)
+    return dict(settings)
 
 
 def check_settings(algo: str, settings: Any) -> None:
     """ValueError for settings that the algorithm has not, or that say code instead of a value."""
     if not isinstance(settings, Mapping):
         raise ValueError(f"settings are {{name: value}}, got {settings!r}")
-    arguments = inspect.signature(algorithm_of(algo).load()).parameters
-    known = sorted((arguments.keys() - _OURS) | set(_OF_TRAINING))
-    numbers = {"n_timesteps": 0, "n_envs": 0} | {k: each.default for k, each in arguments.items()}
+    arguments = inspect.signature(get_algorithm(algo).load()).parameters
+    known = sorted((arguments.keys() - _MANAGED_ARGUMENTS) | set(_TRAINING_SETTINGS))
+    numbers = {"n_timesteps": 0, "n_envs": 0} | {k: item.default for k, item in arguments.items()}
     for name, value in settings.items():
         if name not in known:
             raise ValueError(f"unknown option {name!r} of {algo}; known: {', '.join(known)}")
         if name.endswith("_kwargs") and not isinstance(value, Mapping):
             raise ValueError(f"{name} is {{name: value}}, which is no code to run, got {value!r}")
         if name in _SCHEDULED:
-            _schedule(name, value)
+            _make_schedule(name, value)
         elif isinstance(value, str) and is_finite(numbers.get(name)):
             hint = "; YAML reads 2e6 as text, 2.0e+6 as a number" if "e" in value else ""
             raise ValueError(f"{name} is a number, got {value!r}{hint}")
     kwargs = settings.get("policy_kwargs", {})
-    if "activation_fn" in kwargs and algorithm_of(algo).on_tensors:
+    if "activation_fn" in kwargs and get_algorithm(algo).on_tensors:
         raise ValueError(f"the layers of {algo} are of silu: it has no activation_fn")
-    check_choice("activation_fn", kwargs.get("activation_fn", "tanh"), tuple(activations()))
-    missing = [each for each in ("n_envs", "n_timesteps", "policy") if each not in settings]
+    check_choice("activation_fn", kwargs.get("activation_fn", "tanh"), tuple(list_activations()))
+    missing = [item for item in ("n_envs", "n_timesteps", "policy") if item not in settings]
     if missing:
         raise ValueError(f"no {', '.join(missing)}")
 
 
-def spread_of(settings: Settings) -> float:
+def compute_action_std(settings: Settings) -> float:
     """Standard deviation of the actions that a training begins with."""
-    return math.exp(settings.get("policy_kwargs", {}).get("log_std_init", EVENLY))
+    return math.exp(settings.get("policy_kwargs", {}).get("log_std_init", UNIFORM_LOG_STD))
 
 
-def options_of(algo: str, settings: Settings, seconds: float, num_envs: int) -> Settings:
+def make_model_options(algo: str, settings: Settings, seconds: float, num_envs: int) -> Settings:
     """Arguments of the class, in JSON types, for a control period and a number of environments:
     gamma forgets as much in a second as in the file, a batch divides a rollout."""
-    found = {name: value for name, value in settings.items() if name not in _OF_TRAINING}
-    if "gamma" in found:
-        found["gamma"] = found["gamma"] ** (seconds / PERIOD)
-    kind: Any = algorithm_of(algo).load()
+    options = {name: value for name, value in settings.items() if name not in _TRAINING_SETTINGS}
+    if "gamma" in options:
+        options["gamma"] = options["gamma"] ** (seconds / PERIOD)
+    kind: Any = get_algorithm(algo).load()
     rolls_out = issubclass(kind, OnPolicyAlgorithm)  # elsewhere n_steps is that of returns
-    if rolls_out and "n_steps" in found and "batch_size" in found:
-        rollout = num_envs * found["n_steps"]
-        most = min(found["batch_size"], rollout)
-        found["batch_size"] = max(n for n in range(1, most + 1) if rollout % n == 0)
-    return found
+    if rolls_out and "n_steps" in options and "batch_size" in options:
+        rollout = num_envs * options["n_steps"]
+        max_size = min(options["batch_size"], rollout)
+        options["batch_size"] = max(n for n in range(1, max_size + 1) if rollout % n == 0)
+    return options
 
 
 def make_model(
@@ -164,25 +174,25 @@ def make_model(
     seed: int,
     **rest: Any,
 ) -> BaseAlgorithm:
-    """An untrained model. settings: of `settings_of`. seconds: of a control period. scaling: of
+    """An untrained model. settings: of `read_settings`. seconds: of a control period. scaling: of
     `Standardised`. rest: further arguments of the class, as its device."""
-    options = options_of(algo, settings, seconds, env.num_envs)
-    options |= {name: _schedule(name, options[name]) for name in _SCHEDULED if name in options}
+    options = make_model_options(algo, settings, seconds, env.num_envs)
+    options |= {name: _make_schedule(name, options[name]) for name in _SCHEDULED if name in options}
     mean, scale, clip, mixing = scaling
-    form = dict(options.get("policy_kwargs", {}))
-    if "activation_fn" in form:
-        form["activation_fn"] = activations()[form["activation_fn"]]
+    policy_kwargs = dict(options.get("policy_kwargs", {}))
+    if "activation_fn" in policy_kwargs:
+        policy_kwargs["activation_fn"] = list_activations()[policy_kwargs["activation_fn"]]
     options["policy_kwargs"] = {
-        **form,
+        **policy_kwargs,
         "features_extractor_class": Standardised,
         "features_extractor_kwargs": {"mean": mean, "scale": scale, "clip": clip, "mixing": mixing},
     }
-    kind = algorithm_of(algo).load()
+    kind = get_algorithm(algo).load()
     window = env.num_envs
     return kind(settings["policy"], env, stats_window_size=window, seed=seed, **options, **rest)
 
 
-def _schedule(name: str, value: Any) -> Any:
+def _make_schedule(name: str, value: Any) -> Any:
     """A number as it is, "lin_NUMBER" as a schedule that falls to zero."""
     word, _, number = str(value).rpartition("_")
     try:
@@ -197,9 +207,9 @@ def _schedule(name: str, value: Any) -> Any:
 def check_device(name: str) -> None:
     """ValueError for a name that is no device of torch's, or one that is not at hand."""
     try:
-        found = get_device(name)  # the CPU where there is no CUDA
+        device = get_device(name)  # the CPU where there is no CUDA
     except RuntimeError:
         known = "a device is cpu, cuda or another of torch's, or auto"
         raise ValueError(f"{known}, got {name!r}") from None
-    if name.startswith("cuda") and found.type != "cuda":
+    if name.startswith("cuda") and device.type != "cuda":
         raise ValueError(f"torch finds no CUDA device, got {name!r}; auto takes one if there is")

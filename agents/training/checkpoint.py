@@ -9,10 +9,10 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
-from ...envs.backend.extras import extra
-from ...envs.backend.files import write_whole
+from ...envs.backend.extras import require_extra
+from ...envs.backend.files import write_atomic
 
-with extra("train", "training needs {}"):
+with require_extra("train", "training needs {}"):
     import torch
     from safetensors.torch import save
 
@@ -35,10 +35,10 @@ def save_checkpoint(path: Path, model: Any, rest: dict[str, Any]) -> None:
                 tensors |= {f"{part}/{i}/{key}": value for key, value in values.items()}
         else:
             tensors |= {f"{part}/{name}": value for name, value in state.items()}
-    tensors |= {f"{VARIABLES}/{name}": value for name, value in _variables(model).items()}
+    tensors |= {f"{VARIABLES}/{name}": value for name, value in _get_variables(model).items()}
     plain = {name: value.detach().cpu().clone() for name, value in tensors.items()}
     content = json.dumps({"format": FORMAT, "groups": groups, **rest}, allow_nan=False)
-    write_whole(path, save(plain, {"checkpoint": content}))
+    write_atomic(path, save(plain, {"checkpoint": content}))
 
 
 def read_state(path: Path) -> dict[str, Any]:
@@ -60,7 +60,7 @@ def read_state(path: Path) -> dict[str, Any]:
     return state
 
 
-def _variables(model: Any) -> dict[str, torch.Tensor]:
+def _get_variables(model: Any) -> dict[str, torch.Tensor]:
     """What `get_parameters` leaves out, though a model's zip has it."""
     return {name: getattr(model, name) for name in model._get_torch_save_params()[1]}
 
@@ -69,7 +69,7 @@ def load_parameters(path: Path, model: Any) -> None:
     """Give a model the parameters and the state of the optimisers of a checkpoint."""
     groups = read_state(path)["groups"]
     parts: dict[str, dict[str, Any]] = {part: {} for part in model.get_parameters()}
-    variables = _variables(model)
+    variables = _get_variables(model)
     for part, group in groups.items():
         parts[part] = {"param_groups": group, "state": {}}
     with safe_open(path, "pt") as file:

@@ -18,34 +18,34 @@ import numpy as np
 
 from ...estimators.learned.correction import Array, learned
 from ...estimators.learned.files import Correction, CorrectionCard
-from ...estimators.learned.kernel import DEVIATION, LEAST, stack_at
+from ...estimators.learned.kernel import DEVIATION, MIN_LOG_DEVIATION, locate_stack
 from ...estimators.learned.network import Network
 from ...estimators.vector.estimate import EstimateObservation
 from ..controllers.base import NoControl
 from ..controllers.lqr import Lqr
-from ..rollout import steps_of
-from .traces.mixing import scale_of
+from ..rollout import iterate_steps
+from .traces.mixing import compute_scale
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 
 OUTPUTS = ("beta", "gamma", "F_d", "N_d")  # what LQR reads
 READ = (*OUTPUTS, "bias", "front_tyres", "rear_tyres", "inverse_friction")
 """States that a network reads where the filter has them."""
-FIRST = (("lqr", "fusion"), ("none", "fusion"), ("shaken", "fusion"), ("lqr", "vision"),
+FIRST_ROUND = (("lqr", "fusion"), ("none", "fusion"), ("shaken", "fusion"), ("lqr", "vision"),
          ("shaken", "gps"))  # fmt: skip
-SECOND = (("lqr", "fusion"), ("lqr", "vision"), ("lqr", "gps"))
+SECOND_ROUND = (("lqr", "fusion"), ("lqr", "vision"), ("lqr", "gps"))
 """Who drives with which slow sensors, on the filter, then on the correction."""
 TRAINING, HELD_OUT = 2**67, 2**68  # seeds; `keeper` and `distill` have others
 _SEEDS = 2**40  # of a training
 EVERY = 10  # env-steps from one sample to the next
-LARGEST = 0.5  # rad: a car that slips more is lost, and nothing to learn from
-_SHAKEN, _MEMORY = 0.6, 0.95  # standard deviation of the added action, share left after a step
+MAX_SIDESLIP = 0.5  # rad: a car that slips more is lost, and nothing to learn from
+_NOISE_STD, _MEMORY = 0.6, 0.95  # standard deviation of the added action, share left after a step
 HIDDEN = (64, 64)
 CLIP = 8.0  # standard deviations of an input
 BATCH, RATE = 1024, 2e-3  # of Adam; its steps fall to a fiftieth
 NORMAL_95 = 1.959964
 
-Drive = tuple[str, dict[str, Any]]
+DriveSpec = tuple[str, dict[str, Any]]
 """A scenario in an env: an id, and options of `gym.make`."""
 
 
@@ -57,7 +57,7 @@ class Samples(NamedTuple):
     errors: Array
 
 
-class _Shaken(Lqr):
+class _NoisyLqr(Lqr):
     """LQR whose action is disturbed by coloured noise."""
 
     def __init__(self, env: Any) -> None:
@@ -67,49 +67,53 @@ class _Shaken(Lqr):
     def predict(self, *arguments: Any, **options: Any) -> Any:
         """LQR's action and the noise, clipped."""
         action, state = super().predict(*arguments, **options)
-        fresh = self._rng.standard_normal(action.shape) * (1.0 - _MEMORY**2) ** 0.5
-        self._noise = _MEMORY * self._noise + _SHAKEN * fresh
+        white_noise = self._rng.standard_normal(action.shape) * (1.0 - _MEMORY**2) ** 0.5
+        self._noise = _MEMORY * self._noise + _NOISE_STD * white_noise
         return np.clip(action + self._noise, -1.0, 1.0).astype(np.float32), state
 
 
-AGENTS: dict[str, Any] = {"none": NoControl, "lqr": Lqr, "shaken": _Shaken}
+AGENTS: dict[str, Any] = {"none": NoControl, "lqr": Lqr, "shaken": _NoisyLqr}
 
 
-def samples(
-    correction: Correction, drives: Sequence[Drive], ways: Sequence[Any], seed: int, episodes: int
+def collect_samples(
+    correction: Correction,
+    drives: Sequence[DriveSpec],
+    drivers: Sequence[Any],
+    seed: int,
+    episodes: int,
 ) -> Samples:
     """Samples of every drive in every way on a correction, each with so many seeds of its own."""
-    seeds, found = itertools.count(seed, episodes), list[Samples]()
-    for (env_id, options), (who, sensors) in itertools.product(drives, ways):
+    seeds, collected = itertools.count(seed, episodes), list[Samples]()
+    for (env_id, options), (driver, sensors) in itertools.product(drives, drivers):
         options = {"sensors": sensors, "on_bad_action": "fail", **options}
         env: Any = gym.make_vec(env_id, num_envs=episodes, **options)
         read = [name for name in OUTPUTS if name in correction.card.states]
         factory = functools.partial(learned, file=correction)
         env = EstimateObservation(env, factory, outputs=read, std=False)
-        found += _sampled(env, AGENTS[who](env), next(seeds))
+        collected += _iterate_samples(env, AGENTS[driver](env), next(seeds))
         env.close()
-    return _joined(found)
+    return _concatenate(collected)
 
 
-def _sampled(env: Any, agent: Any, seed: int) -> Iterator[Samples]:
+def _iterate_samples(env: Any, agent: Any, seed: int) -> Iterator[Samples]:
     """Samples of the first episodes' steps, one of `EVERY`."""
     batch, seeds = env.estimator, list(range(seed, seed + env.num_envs))
     net = batch.first.net
-    stack = slice(stack_at(net), stack_at(net) + int(net.sizes[0]))
-    for step in itertools.islice(steps_of(env, agent, seeds), 0, None, EVERY):
+    stack = slice(locate_stack(net), locate_stack(net) + int(net.sizes[0]))
+    for step in itertools.islice(iterate_steps(env, agent, seeds), 0, None, EVERY):
         truth, memory = step.info["beta"], batch.memory
-        chosen = step.running & (np.abs(truth) < LARGEST) & (memory[:, DEVIATION] > 0.0)
+        chosen = step.running & (np.abs(truth) < MAX_SIDESLIP) & (memory[:, DEVIATION] > 0.0)
         beta = batch.filters[chosen, 0].x[:, net.beta]
         yield Samples(memory[chosen, stack].astype(np.float32), truth[chosen] - beta)
 
 
-def _joined(parts: Sequence[Samples]) -> Samples:
-    return Samples(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+def _concatenate(parts: Sequence[Samples]) -> Samples:
+    return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def train_correction(
     card: CorrectionCard,
-    drives: Sequence[Drive],
+    drives: Sequence[DriveSpec],
     episodes: int = 32,
     epochs: int = 20,
     report: Callable[[str], None] = lambda _: None,
@@ -122,55 +126,64 @@ def train_correction(
     """
     if not drives or episodes < 1 or epochs < 1:
         raise ValueError(f"{len(drives)} drives, {episodes} episodes, {epochs} epochs: 1 at least")
-    begun, first, few = time.process_time(), card.seed * _SEEDS, max(episodes // 8, 1)
+    start_time, first, n_test = time.process_time(), card.seed * _SEEDS, max(episodes // 8, 1)
     report("drives on the filter")
     plain, none = (np.zeros(card.inputs), np.ones(card.inputs)), np.zeros((2, card.inputs))
     blank = Correction(card, Network(*plain, [none], [np.zeros(2)], "relu", clip=np.inf))
-    seen = samples(blank, drives, FIRST, TRAINING + first, episodes)
-    mean, spread = seen.inputs.mean(0, np.float64), seen.inputs.std(0, dtype=np.float64)
-    scale = scale_of(spread)
-    np.subtract(seen.inputs, mean.astype(np.float32), out=seen.inputs)
-    np.clip(seen.inputs * scale.astype(np.float32), -CLIP, CLIP, out=seen.inputs)
+    first_samples = collect_samples(blank, drives, FIRST_ROUND, TRAINING + first, episodes)
+    mean, spread = (
+        first_samples.inputs.mean(0, np.float64),
+        first_samples.inputs.std(0, dtype=np.float64),
+    )
+    scale = compute_scale(spread)
+    np.subtract(first_samples.inputs, mean.astype(np.float32), out=first_samples.inputs)
+    np.clip(first_samples.inputs * scale.astype(np.float32), -CLIP, CLIP, out=first_samples.inputs)
     report("the first network")
-    draft = Correction(card, _fitted(seen, mean, scale, (epochs + 1) // 2, card.seed))
+    draft = Correction(card, _fit_network(first_samples, mean, scale, (epochs + 1) // 2, card.seed))
     report("drives on the first network")
-    more = samples(draft, drives, SECOND, TRAINING + first + _SEEDS // 2, episodes)
+    second_samples = collect_samples(
+        draft, drives, SECOND_ROUND, TRAINING + first + _SEEDS // 2, episodes
+    )
     report("the second network")
-    network = _fitted(_joined([seen, more]), mean, scale, epochs, card.seed)
+    network = _fit_network(
+        _concatenate([first_samples, second_samples]), mean, scale, epochs, card.seed
+    )
     report("calibration")
     last = Correction(card, network)
-    errors, deviations = judged(last, samples(last, drives, SECOND, HELD_OUT + first, few))
+    errors, deviations = compute_errors(
+        last, collect_samples(last, drives, SECOND_ROUND, HELD_OUT + first, n_test)
+    )
     factor = float(np.quantile(np.abs(errors / deviations), 0.95)) / NORMAL_95
     biases = [*network.biases[:-1], network.biases[-1] + [0.0, np.log(factor)]]
     last = Correction(card, replace(network, biases=biases))
-    test = samples(last, drives, SECOND, HELD_OUT + first + _SEEDS // 2, few)
-    spent = round(time.process_time() - begun, 1)
-    quality = quality_of(last, test)
-    card = replace(card, temperature=factor, cpu_seconds=spent, evaluation=quality)
+    test = collect_samples(last, drives, SECOND_ROUND, HELD_OUT + first + _SEEDS // 2, n_test)
+    cpu_seconds = round(time.process_time() - start_time, 1)
+    quality = compute_quality(last, test)
+    card = replace(card, temperature=factor, cpu_seconds=cpu_seconds, evaluation=quality)
     return replace(last, card=card)
 
 
-def _fitted(seen: Samples, mean: Array, scale: Array, epochs: int, seed: int) -> Network:
+def _fit_network(data: Samples, mean: Array, scale: Array, epochs: int, seed: int) -> Network:
     """A network that learned from samples, whose inputs are normalised by mean and scale."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
-    sizes = [seen.inputs.shape[1], *HIDDEN, 2]
+    sizes = [data.inputs.shape[1], *HIDDEN, 2]
     layers = [torch.nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
-    between = itertools.chain(*((each, torch.nn.ReLU()) for each in layers[:-1]))
-    model, unit = torch.nn.Sequential(*between, layers[-1]), float(seen.errors.std()) or 1.0
-    x, y = torch.from_numpy(seen.inputs), torch.from_numpy((seen.errors / unit).astype(np.float32))
+    between = itertools.chain(*((linear, torch.nn.ReLU()) for linear in layers[:-1]))
+    model, unit = torch.nn.Sequential(*between, layers[-1]), float(data.errors.std()) or 1.0
+    x, y = torch.from_numpy(data.inputs), torch.from_numpy((data.errors / unit).astype(np.float32))
     optimiser = torch.optim.Adam(model.parameters(), RATE)
     steps = epochs * -(-len(x) // BATCH)
-    falling = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.02, steps)
+    schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.02, steps)
     for _ in range(epochs):
         for chosen in torch.split(torch.randperm(len(x)), BATCH):
             middle, log_sd = model(x[chosen]).T
-            log_sd = log_sd.clamp(LEAST - np.log(unit), 0.0 - np.log(unit))
+            log_sd = log_sd.clamp(MIN_LOG_DEVIATION - np.log(unit), 0.0 - np.log(unit))
             nll = 0.5 * ((y[chosen] - middle) * torch.exp(-log_sd)) ** 2 + log_sd
             optimiser.zero_grad()
             (nll * torch.exp(log_sd.detach())).mean().backward()
             optimiser.step()
-            falling.step()
+            schedule.step()
     weights = [layer.weight.detach().numpy().astype(np.float64) for layer in layers]
     biases = [layer.bias.detach().numpy().astype(np.float64) for layer in layers]
     weights[-1][0] *= unit
@@ -178,21 +191,21 @@ def _fitted(seen: Samples, mean: Array, scale: Array, epochs: int, seed: int) ->
     return Network(mean, scale, weights, biases, "relu", clip=CLIP)
 
 
-def judged(correction: Correction, seen: Samples) -> tuple[Array, Array]:
+def compute_errors(correction: Correction, data: Samples) -> tuple[Array, Array]:
     """(errors of the sum, its deviations) by NumPy, of samples driven on the correction; rad."""
     ones = np.ones(correction.card.inputs)
     plain = replace(correction.network, mean=0.0 * ones, scale=ones)
-    added, logarithm = plain(seen.inputs.astype(np.float64)).T
-    return seen.errors - added, np.exp(np.clip(logarithm, LEAST, 0.0))
+    added, logarithm = plain(data.inputs.astype(np.float64)).T
+    return data.errors - added, np.exp(np.clip(logarithm, MIN_LOG_DEVIATION, 0.0))
 
 
-def quality_of(correction: Correction, seen: Samples) -> dict[str, float]:
+def compute_quality(correction: Correction, data: Samples) -> dict[str, float]:
     """RMSE of the filter and of the sum (rad), coverage of 95 % intervals, mean squared error over
     variance, of samples driven on a correction."""
-    errors, deviations = judged(correction, seen)
+    errors, deviations = compute_errors(correction, data)
     squares = (errors / deviations) ** 2
     return {
-        "filter_rmse": float(np.mean(seen.errors**2) ** 0.5),
+        "filter_rmse": float(np.mean(data.errors**2) ** 0.5),
         "rmse": float(np.mean(errors**2) ** 0.5),
         "coverage": float(np.mean(squares < NORMAL_95**2)),
         "nees": float(np.mean(squares)),

@@ -18,20 +18,20 @@ import numpy as np
 from ..controllers.lqr import Lqr
 from ..learned.card import Card
 from ..learned.files import Policy, save_policy
-from ..learned.policy import Learned
-from ..rollout import FLOOR
-from .student import LONGER, Course, Student, fitted
-from .traces.drives import Drives, Scaling, Single, normalised, scaling_of
-from .traces.mixing import scale_of
+from ..learned.policy import PolicyController
+from ..rollout import COST_FLOOR
+from .student import LAST_ROUND_FACTOR, DistillConfig, Student, fit_model
+from .traces.drives import Demonstrations, Scaling, Single, compute_scaling, normalise_inputs
+from .traces.mixing import compute_scale
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 
-DISTILLING = 2**69  # no other seeds are as large: `keeper`, `corrections`
-SEEDS = 2**40  # of a training
+DISTILL_SEEDS = 2**69  # no other seeds are as large: `keeper`, `corrections`
+SEEDS_PER_TRAINING = 2**40  # of a training
 _MEMORY = 0.95  # share of the noise left after a step
 
 
-class Lesson(NamedTuple):
+class DistillTask(NamedTuple):
     """Cars that a student drives, the same cars as the teacher sees them, and the teacher.
 
     Vector envs of as many rows that reset themselves; a `Controller`.
@@ -42,7 +42,7 @@ class Lesson(NamedTuple):
     teacher: Any
 
 
-class Round(NamedTuple):
+class RoundResult(NamedTuple):
     """What a round came to: steps of the student's envs so far, mean cost of its episodes, and the
     loss, relative to their cost, of the last epoch."""
 
@@ -51,13 +51,13 @@ class Round(NamedTuple):
     loss: float
 
 
-def drive(
-    lesson: Lesson,
+def collect_demonstrations(
+    task: DistillTask,
     policy: Any,
     seeds: Sequence[int],
     noise: float,
-    usual: float = np.inf,
-) -> Drives:
+    max_cost: float = np.inf,
+) -> Demonstrations:
     """Each seed's first episode, driven by a policy, or by the teacher, shaken, without one.
 
     policy: a `Policy`, anything with stable-baselines3's `predict`, or None. usual: the cost by
@@ -66,45 +66,51 @@ def drive(
 
     Raises ValueError where the teacher's cars are not those of the student.
     """
-    cars, twins, teacher = lesson
-    student = Learned(cars, policy) if isinstance(policy, Policy) else policy
+    cars, twins, teacher = task
+    student = PolicyController(cars, policy) if isinstance(policy, Policy) else policy
     rng = np.random.default_rng(seeds[0])
     spread = noise * rng.random((len(seeds), 1))
     obs, _ = cars.reset(seed=list(seeds))
-    seen, _ = twins.reset(seed=list(seeds))
+    teacher_obs, _ = twins.reset(seed=list(seeds))
     running = start = np.ones(len(seeds), np.bool_)
-    shaken, own, memory = np.zeros((len(seeds), teacher.width)), None, None
+    coloured_noise, student_state, teacher_state = np.zeros((len(seeds), teacher.width)), None, None
     costs, steps = np.zeros(len(seeds)), []
-    unseen = _unseen(lesson)
+    privileged_columns = _list_privileged_columns(task)
     while running.any():
-        label, memory = teacher.predict(seen, memory, start)
+        label, teacher_state = teacher.predict(teacher_obs, teacher_state, start)
         if student is None:
-            shaken = _MEMORY * shaken + (1.0 - _MEMORY**2) ** 0.5 * rng.standard_normal(label.shape)
-            action = np.clip(np.nan_to_num(label) + spread * shaken, -1.0, 1.0).astype(np.float32)
+            coloured_noise = _MEMORY * coloured_noise + (
+                1.0 - _MEMORY**2
+            ) ** 0.5 * rng.standard_normal(label.shape)
+            action = np.clip(np.nan_to_num(label) + spread * coloured_noise, -1.0, 1.0).astype(
+                np.float32
+            )
         else:
-            action, own = student.predict(obs, own, start)
-        taught = running & np.isfinite(label).all(axis=1)
-        steps.append((obs, np.nan_to_num(label), seen[:, unseen], taught))
-        teacher.acted(memory, action)
+            action, student_state = student.predict(obs, student_state, start)
+        is_valid = running & np.isfinite(label).all(axis=1)
+        steps.append((obs, np.nan_to_num(label), teacher_obs[:, privileged_columns], is_valid))
+        teacher.acted(teacher_state, action)
         obs, rewards, terminated, truncated, _ = cars.step(action)
-        seen, theirs, *_ = twins.step(action)
-        if not np.array_equal(rewards[running], theirs[running]):
+        teacher_obs, teacher_rewards, *_ = twins.step(action)
+        if not np.array_equal(rewards[running], teacher_rewards[running]):
             raise ValueError("the teacher's cars are others than the student's: rewards differ")
         costs -= np.where(running, rewards, 0.0)
         start = np.logical_or(terminated, truncated)
         running = running & ~start
-    x, y, told, w = (np.stack(each, axis=1) for each in zip(*steps, strict=True))
-    weights = w / (np.minimum(costs, usual)[:, None] + FLOOR)
-    return Drives(x, y, told, weights.astype(np.float32), _curvature(cars, teacher, x), costs)
+    x, y, privileged, w = (np.stack(columns, axis=1) for columns in zip(*steps, strict=True))
+    weights = w / (np.minimum(costs, max_cost)[:, None] + COST_FLOOR)
+    return Demonstrations(
+        x, y, privileged, weights.astype(np.float32), _compute_curvature(cars, teacher, x), costs
+    )
 
 
-def _unseen(lesson: Lesson) -> list[int]:
+def _list_privileged_columns(task: DistillTask) -> list[int]:
     """Columns of what the teacher reads that is not in the student's observation."""
-    names, known = ([e.name for e in env.layout] for env in (lesson.teachers, lesson.cars))
-    return [names.index(name) for name in lesson.teacher.needs if name not in known]
+    names, known = ([e.name for e in env.layout] for env in (task.teachers, task.cars))
+    return [names.index(name) for name in task.teacher.needs if name not in known]
 
 
-def _curvature(cars: Any, teacher: Any, obs: Single) -> Single:
+def _compute_curvature(cars: Any, teacher: Any, obs: Single) -> Single:
     """The Riccati matrix of the teacher's design at the drives' mean speed; without one, unity."""
     if not isinstance(teacher, Lqr):
         return np.eye(teacher.width, dtype=np.float32)
@@ -113,20 +119,20 @@ def _curvature(cars: Any, teacher: Any, obs: Single) -> Single:
     return teacher.curvature(speed).astype(np.float32)
 
 
-class Distilled(NamedTuple):
+class DistillResult(NamedTuple):
     """The policy, and what each round came to."""
 
     policy: Policy
-    rounds: tuple[Round, ...]
+    rounds: tuple[RoundResult, ...]
 
 
 def distill(
     card: Card,
-    lessons: Sequence[Lesson],
-    course: Course,
+    tasks: Sequence[DistillTask],
+    config: DistillConfig,
     path: str | Path,
-    report: Callable[[Round], None] = lambda _: None,
-) -> Distilled:
+    report: Callable[[RoundResult], None] = lambda _: None,
+) -> DistillResult:
     """Train a policy on all lessons and write it to a file after every round.
 
     card: of what the lessons' cars are; the training's numbers are filled in. path: ends in
@@ -137,44 +143,51 @@ def distill(
     FloatingPointError, with the step, where the loss or the weights are not finite: the file then
     holds the round before.
     """
-    if not lessons:
+    if not tasks:
         raise ValueError("no lessons: there is nothing to learn from")
-    unseen = len(_unseen(lessons[0]))
-    if course.told and not unseen:
+    n_privileged = len(_list_privileged_columns(tasks[0]))
+    if config.told and not n_privileged:
         raise ValueError("nothing is left to be told: the student sees all that its teacher reads")
     torch.set_num_threads(1)
-    torch.manual_seed(course.seed)
-    begun, target, steps = time.process_time(), Path(path), 0
-    cars = lessons[0].cars
-    seeds = itertools.count(DISTILLING + course.seed * SEEDS, cars.num_envs)
+    torch.manual_seed(config.seed)
+    start_time, target, steps = time.process_time(), Path(path), 0
+    cars = tasks[0].cars
+    seeds = itertools.count(DISTILL_SEEDS + config.seed * SEEDS_PER_TRAINING, cars.num_envs)
     width = cars.single_action_space.shape[0]
-    model = Student(len(cars.layout), width, course, unseen)
+    model = Student(len(cars.layout), width, config, n_privileged)
     policy: Policy | None = None
     scaling: Scaling | None = None
-    drives: list[Drives] = []
-    rounds: list[Round] = []
-    usual = [np.inf] * len(lessons)
-    for i in range(course.rounds):
-        fresh = []
-        for lesson, most in zip(lessons, usual, strict=True):
+    drives: list[Demonstrations] = []
+    rounds: list[RoundResult] = []
+    max_costs = [np.inf] * len(tasks)
+    for i in range(config.rounds):
+        new_drives = []
+        for task, max_cost in zip(tasks, max_costs, strict=True):
             first = next(seeds)
-            numbers = range(first, first + lesson.cars.num_envs)
-            fresh.append(drive(lesson, policy, numbers, course.noise, most))
-        steps += sum(int((each.weights > 0.0).sum()) for each in fresh)
+            numbers = range(first, first + task.cars.num_envs)
+            new_drives.append(collect_demonstrations(task, policy, numbers, config.noise, max_cost))
+        steps += sum(int((demo.weights > 0.0).sum()) for demo in new_drives)
         if scaling is None:
-            scaling = scaling_of(fresh, cars.layout, lessons[0].teacher.needs)
-            model.whiten(fresh, scaling)
-            usual = [float(np.median(each.costs)) for each in fresh]
-            told = np.concatenate([each.told[each.weights > 0.0] for each in fresh])
-            middle, scale = told.mean(0), scale_of(told.std(0))
-        drives += [each._replace(told=normalised(each.told, middle, scale)) for each in fresh]
-        epochs = course.epochs * (LONGER if i == course.rounds - 1 else 1)
-        loss = fitted(model, drives, scaling, course, epochs)
-        rounds.append(Round(steps, float(np.mean([each.costs.mean() for each in fresh])), loss))
-        spent = round(time.process_time() - begun, 1)
-        card = replace(card, steps=steps, cpu_seconds=spent)
+            scaling = compute_scaling(new_drives, cars.layout, tasks[0].teacher.needs)
+            model.fit_whitening(new_drives, scaling)
+            max_costs = [float(np.median(demo.costs)) for demo in new_drives]
+            privileged = np.concatenate(
+                [demo.privileged[demo.weights > 0.0] for demo in new_drives]
+            )
+            middle, scale = privileged.mean(0), compute_scale(privileged.std(0))
+        drives += [
+            demo._replace(privileged=normalise_inputs(demo.privileged, middle, scale))
+            for demo in new_drives
+        ]
+        epochs = config.epochs * (LAST_ROUND_FACTOR if i == config.rounds - 1 else 1)
+        loss = fit_model(model, drives, scaling, config, epochs)
+        rounds.append(
+            RoundResult(steps, float(np.mean([demo.costs.mean() for demo in new_drives])), loss)
+        )
+        cpu_seconds = round(time.process_time() - start_time, 1)
+        card = replace(card, steps=steps, cpu_seconds=cpu_seconds)
         policy = Policy(target.stem, model.network(scaling), card)
         save_policy(target, policy.network, card)
         report(rounds[-1])
     assert policy is not None
-    return Distilled(policy, tuple(rounds))
+    return DistillResult(policy, tuple(rounds))

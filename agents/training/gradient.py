@@ -13,32 +13,39 @@ import numpy as np
 
 from ...envs.device.env import DeviceVectorEnv
 from .normalise import Standardised
-from .rewards import Rates
-from .task import Task
+from .rewards import RewardScale
+from .task import TrainingTask
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.policies import BasePolicy  # isort: skip
 from torch import nn  # isort: skip
 
-_LARGEST = 1.0  # norm of a step's gradient
+_MAX_GRADIENT_NORM = 1.0  # norm of a step's gradient
 
 
-class Source(NamedTuple):
+class TrainingSource(NamedTuple):
     """What a training drives: a `DeviceVectorEnv` with gradients that resets itself in the same
     step; the seeds of its cars; what a car's reward is multiplied by."""
 
     cars: Any
     seeds: list[int]
-    rates: Rates
+    reward_scale: RewardScale
 
 
-def source_of(task: Task, first: int, rates: Rates, device: Any, compile: bool) -> Source:
+def make_source(
+    task: TrainingTask, first: int, reward_scale: RewardScale, device: Any, compile: bool
+) -> TrainingSource:
     """A task's environments on tensors; first: seed of row 0."""
-    how: dict[str, Any] = {"device": device, "dtype": "float32", "grad": True, "compile": compile}
-    how |= {"autoreset_mode": "SameStep", **task.options(task.num_envs)}
-    cars = DeviceVectorEnv.make(task.env_id, task.num_envs, **how)
-    return Source(cars, [first + i for i in range(task.num_envs)], rates)
+    options: dict[str, Any] = {
+        "device": device,
+        "dtype": "float32",
+        "grad": True,
+        "compile": compile,
+    }
+    options |= {"autoreset_mode": "SameStep", **task.options(task.num_envs)}
+    cars = DeviceVectorEnv.make(task.env_id, task.num_envs, **options)
+    return TrainingSource(cars, [first + i for i in range(task.num_envs)], reward_scale)
 
 
 class GruPolicy(BasePolicy):
@@ -90,29 +97,29 @@ class GruPolicy(BasePolicy):
         deterministic: bool = True,
     ) -> tuple[Any, Any]:
         """(actions within [-1, 1], the next state), as stable-baselines3's; nothing is drawn."""
-        seen, one = self.obs_to_tensor(observation)[0], np.ndim(observation) == 1
-        before = self.begin(len(seen)) if state is None else torch.as_tensor(state[0])
+        obs_tensor, is_single = self.obs_to_tensor(observation)[0], np.ndim(observation) == 1
+        before = self.begin(len(obs_tensor)) if state is None else torch.as_tensor(state[0])
         if state is not None and episode_start is not None:
-            over = torch.as_tensor(np.asarray(episode_start, np.bool_), device=self.device)
-            before = torch.where(over[:, None], 0.0, before)
+            is_start = torch.as_tensor(np.asarray(episode_start, np.bool_), device=self.device)
+            before = torch.where(is_start[:, None], 0.0, before)
         with torch.no_grad():
-            actions, after = self(seen, before)
-        acted = actions.clamp(-1.0, 1.0).cpu().numpy()
-        return acted[0] if one else acted, (after,)
+            actions, after = self(obs_tensor, before)
+        clipped = actions.clamp(-1.0, 1.0).cpu().numpy()
+        return clipped[0] if is_single else clipped, (after,)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Any:
         return self(observation, self.begin(len(observation)))[0]
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        layers = [each.out_features for each in self.layers if isinstance(each, nn.Linear)]
-        own = {"cells": self.cell.hidden_size, "net_arch": layers[:-1]}
+        layers = [layer.out_features for layer in self.layers if isinstance(layer, nn.Linear)]
+        sizes = {"cells": self.cell.hidden_size, "net_arch": layers[:-1]}
         shared: dict[str, Any] = super()._get_constructor_parameters()
         kind: dict[str, Any] = {"features_extractor_class": self.features_extractor_class}
         kind |= {"features_extractor_kwargs": self.features_extractor_kwargs}
-        return shared | own | kind | {"lr_schedule": self._dummy_schedule}
+        return shared | sizes | kind | {"lr_schedule": self._dummy_schedule}
 
 
-class Gradient(BaseAlgorithm):
+class AnalyticPolicyGradient(BaseAlgorithm):
     """Stable-baselines3's form of an algorithm that follows the cost's slope.
 
     policy: "GruPolicy". env: its spaces count. learning_rate: of Adam. n_steps: control periods of
@@ -129,7 +136,7 @@ class Gradient(BaseAlgorithm):
         learning_rate: Any = 5e-3,
         n_steps: int = 16,
         compile: bool = True,
-        source: Callable[..., Source] | None = None,
+        source: Callable[..., TrainingSource] | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -172,7 +179,7 @@ class Gradient(BaseAlgorithm):
         tb_log_name: str = "gradient",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
-    ) -> "Gradient":
+    ) -> "AnalyticPolicyGradient":
         """Windows until so many steps are driven, as of every algorithm.
 
         Raises ValueError without a source, FloatingPointError, with the step, where the slope is
@@ -184,35 +191,37 @@ class Gradient(BaseAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         policy: Any = self.policy
-        cars, seeds, rates = self.source(device=self.device, compile=self.compile)
-        rates.begin()
+        cars, seeds, reward_scale = self.source(device=self.device, compile=self.compile)
+        reward_scale.begin()
         obs, _ = cars.reset(seed=seeds)
         state = policy.begin(cars.num_envs)
         callback.on_training_start(locals(), globals())
-        going, windows = True, 0
-        while going and self.num_timesteps < total:
+        is_running, windows = True, 0
+        while is_running and self.num_timesteps < total:
             callback.on_rollout_start()
-            paid, obs, state = driven(policy, cars, obs, state, rates, self.n_steps)
+            mean_cost, obs, state = unroll_window(
+                policy, cars, obs, state, reward_scale, self.n_steps
+            )
             self.num_timesteps += self.n_steps * cars.num_envs
             self._update_current_progress_remaining(self.num_timesteps, total)
-            self._descend(paid)
+            self._update_weights(mean_cost)
             cars.detach()
             obs, state, windows = obs.detach(), state.detach(), windows + 1
-            going = callback.on_step()
-            self.logger.record("train/cost_rate", paid.item())
+            is_running = callback.on_step()
+            self.logger.record("train/cost_rate", mean_cost.item())
             if log_interval and windows % log_interval == 0:
                 self.logger.dump(self.num_timesteps)
             callback.on_rollout_end()
         callback.on_training_end()
         return self
 
-    def _descend(self, paid: Any) -> None:
+    def _update_weights(self, mean_cost: Any) -> None:
         """One step of the weights down the slope of what a window cost."""
         optimizer = self.policy.optimizer
         self._update_learning_rate(optimizer)
         optimizer.zero_grad()
-        paid.backward()
-        norm = nn.utils.clip_grad_norm_(self.policy.parameters(), _LARGEST)
+        mean_cost.backward()
+        norm = nn.utils.clip_grad_norm_(self.policy.parameters(), _MAX_GRADIENT_NORM)
         if not norm.isfinite():
             raise FloatingPointError(
                 f"the cost's slope is not finite after step {self.num_timesteps}"
@@ -226,21 +235,21 @@ class Gradient(BaseAlgorithm):
         return ["policy", "policy.optimizer"], []
 
 
-def driven(
-    policy: Any, cars: Any, obs: Any, state: Any, rates: Rates, steps: int
+def unroll_window(
+    policy: Any, cars: Any, obs: Any, state: Any, reward_scale: RewardScale, steps: int
 ) -> tuple[Any, Any, Any]:
     """(mean of the weighted costs of so many steps, with its graph, last observations and state).
 
-    policy: a `GruPolicy`. cars, rates: of a `Source`. obs: (N, k). state: (N, cells), zero where an
-    episode begins.
+    policy: a `GruPolicy`. cars, rates: of a `TrainingSource`. obs: (N, k). state: (N, cells), zero
+    where an episode begins.
     """
-    paid = torch.zeros((), dtype=cars.dtype, device=cars.device)
+    mean_cost = torch.zeros((), dtype=cars.dtype, device=cars.device)
     for _ in range(steps):
         actions, state = policy(obs, state)
         obs, rewards, terminated, truncated, _ = cars.step(actions)
-        weights = torch.tensor(rates.now, dtype=cars.dtype, device=cars.device)
-        paid = paid - (rewards * weights).mean() / steps
+        weights = torch.tensor(reward_scale.now, dtype=cars.dtype, device=cars.device)
+        mean_cost = mean_cost - (rewards * weights).mean() / steps
         over = terminated | truncated
-        rates.ended(over.cpu().numpy())
+        reward_scale.start_next_drives(over.cpu().numpy())
         state = torch.where(over[:, None], 0.0, state)
-    return paid, obs, state
+    return mean_cost, obs, state

@@ -11,20 +11,32 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ... import __version__
-from ...envs.backend.files import whole, write_whole
+from ...envs.backend.files import atomic_file, write_atomic
 from ...envs.record import Array
 from ..learned.card import Card
 from ..learned.files import Policy, save_policy
-from ..rollout import cost_ratios, costs_of, drives_of
+from ..rollout import compute_cost_ratios, evaluate_costs, evaluate_episodes
 from ..vec_env import zoo
 from ..vec_env.env import make_vec_env
-from .algorithms import algorithm_of, check_device, make_model, options_of, spread_of
+from .algorithms import (
+    check_device,
+    compute_action_std,
+    get_algorithm,
+    make_model,
+    make_model_options,
+)
 from .checkpoint import load_parameters, save_checkpoint
-from .export import network_from_sb3
-from .normalise import measured
-from .rewards import Rated, Rates, alike, paid_by, weights_of
-from .starts import Begun, give, start_of
-from .task import Task
+from .export import convert_sb3_policy
+from .normalise import measure_scaling
+from .rewards import (
+    RewardScale,
+    RewardScaleWrapper,
+    compute_equal_weights,
+    compute_scenario_weights,
+    measure_reward_scale,
+)
+from .starts import PolicyWarmStart, load_warm_start, read_warm_start
+from .task import TrainingTask
 
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip  # after ours, which
 from stable_baselines3.common.callbacks import BaseCallback  # isort: skip  # name a missing extra
@@ -32,17 +44,19 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # 
 from stable_baselines3.common.vec_env import VecEnv  # isort: skip
 
 CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
-POLICY, BEST, BEGUN_WITH = "policy.safetensors", "best_model.zip", "begun_with.safetensors"
-_MEASURED = 64  # environments whose observations make the scaling
+POLICY, BEST, WARM_START_FILE = "policy.safetensors", "best_model.zip", "begun_with.safetensors"
+_SCALING_ENVS = 64  # environments whose observations make the scaling
 
 # Seeds of tests and of the calibration are below 2^63, those of `corrections` and `distill` beyond.
-_WEIGHING, _EVALUATION, _SCALING, _TRAINING = 2**63, 2**64, 2**65, 2**66
-_ROOM = 2**40  # seeds of a training: it takes those from its steps on when it starts or goes on
+_WEIGHT_SEEDS, _EVALUATION_SEEDS, _SCALING_SEEDS, _TRAINING_SEEDS = 2**63, 2**64, 2**65, 2**66
+_SEEDS_PER_TRAINING = (
+    2**40
+)  # seeds of a training: it takes those from its steps on when it starts or goes on
 
 
-def evaluation_seeds(episodes: int) -> list[int]:
+def make_evaluation_seeds(episodes: int) -> list[int]:
     """Of the episodes of an evaluation."""
-    return [_EVALUATION + i for i in range(episodes)]
+    return [_EVALUATION_SEEDS + i for i in range(episodes)]
 
 
 class Evaluation(NamedTuple):
@@ -60,7 +74,7 @@ class Evaluation(NamedTuple):
     of_start: float | None = None
 
     @property
-    def judged(self) -> float:
+    def criterion(self) -> float:
         """By which the best one is chosen."""
         return self.cost if self.of_start is None else self.of_start
 
@@ -75,7 +89,7 @@ class Progress(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Means:
+class RunOptions:
     """What may be another when a training goes on.
 
     eval_freq: steps from one evaluation to the next. device: torch's name. tensorboard_log: a
@@ -99,7 +113,7 @@ class Means:
 
 
 @dataclass(frozen=True)
-class Aim:
+class RunRecord:
     """What a training was told besides its task: steps, those between two evaluations, the command
     for the policy's card, the name of the policy that it began with."""
 
@@ -109,44 +123,49 @@ class Aim:
     begun_with: str = ""
 
 
-class Keeper(BaseCallback):
+class EvalCallback(BaseCallback):
     """Builds the model; evaluates it between rollouts and keeps what is needed to go on.
 
     checkpoint: the state of one, None for a new training. steps: as many as it is to have.
-    begun_with: the policy that the training began with: each drive weighs by what it pays there.
+    initial_policy: the policy that the training began with: each drive weighs by what it pays
+    there.
     """
 
     def __init__(
         self,
-        task: Task,
+        task: TrainingTask,
         folder: Path,
         checkpoint: Mapping[str, Any] | None,
-        means: Means,
+        run_options: RunOptions,
         steps: int = 0,
-        begun_with: Policy | None = None,
+        initial_policy: Policy | None = None,
     ) -> None:
         super().__init__()
-        self.task, self.folder, self.means = task, folder, means
-        name = "" if begun_with is None else begun_with.name
-        self.aim = Aim(steps, means.eval_freq, means.command, name)
-        self.seeds = evaluation_seeds(task.n_eval_envs)
-        self.tested = task.vector_env(task.n_eval_envs)
-        self.begun_with, self.begun = begun_with, None
-        if begun_with is not None:
-            self.begun = Begun(begun_with, task, self.tested, _SCALING + task.seed)
-            self.tested = self.begun.around(self.tested)
-        base: Any = self.tested.unwrapped
+        self.task, self.folder, self.run_options = task, folder, run_options
+        name = "" if initial_policy is None else initial_policy.name
+        self.run_record = RunRecord(steps, run_options.eval_freq, run_options.command, name)
+        self.seeds = make_evaluation_seeds(task.n_eval_envs)
+        self.eval_env = task.vector_env(task.n_eval_envs)
+        self.initial_policy, self.warm_start = initial_policy, None
+        if initial_policy is not None:
+            self.warm_start = PolicyWarmStart(
+                initial_policy, task, self.eval_env, _SCALING_SEEDS + task.seed
+            )
+            self.eval_env = self.warm_start.wrap_env(self.eval_env)
+        base: Any = self.eval_env.unwrapped
         self.period: float = base.control_period * base.dt  # s
         saved = {} if checkpoint is None else checkpoint
-        self.evaluations = [Evaluation(*each) for each in saved.get("evaluations", [])]
-        none = self._means(costs_of(self.tested, None, self.seeds))
-        if none.mean() == 0.0:
+        self.evaluations = [Evaluation(*row) for row in saved.get("evaluations", [])]
+        uncontrolled = self._average_scenarios(evaluate_costs(self.eval_env, None, self.seeds))
+        if uncontrolled.mean() == 0.0:
             raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
-        self.alike = alike(none)
-        self.none = float(np.mean(none * self.alike))
-        self.weights = np.ones(1) if begun_with else weights_of(task, _WEIGHING)
-        driver = self.begun.driver if self.begun else None
-        self.to_beat = costs_of(self.tested, driver, self.seeds) if driver else None
+        self.equal_weights = compute_equal_weights(uncontrolled)
+        self.uncontrolled_cost = float(np.mean(uncontrolled * self.equal_weights))
+        self.weights = (
+            np.ones(1) if initial_policy else compute_scenario_weights(task, _WEIGHT_SEEDS)
+        )
+        driver = self.warm_start.driver if self.warm_start else None
+        self.initial_costs = evaluate_costs(self.eval_env, driver, self.seeds) if driver else None
         self.scaling: Any = saved.get("scaling")
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
         self.since = time.process_time()
@@ -159,58 +178,63 @@ class Keeper(BaseCallback):
     ) -> BaseAlgorithm:
         """The model, new, of the checkpoint, a zip or a policy, with the environments it is
         trained on."""
-        task, means = self.task, self.means
+        task, run_options = self.task, self.run_options
         start = None
         if trained_agent is not None:
-            width = (self.tested.single_observation_space.shape or (0,))[0]
-            start = start_of(trained_agent, width, trust)
+            width = (self.eval_env.single_observation_space.shape or (0,))[0]
+            start = read_warm_start(trained_agent, width, trust)
         elif checkpoint is None:
-            start = self.begun.start if self.begun else None
+            start = self.warm_start.start if self.warm_start else None
         if start is not None:
             self.scaling = start.scaling
         if self.scaling is None:
-            spread, seed = spread_of(task.settings), _SCALING + task.seed
-            mixed = algorithm_of(task.algo).on_tensors
-            self.scaling = measured(task.vector_env(_MEASURED), spread, seed, task.reads, mixed)
+            spread, seed = compute_action_std(task.settings), _SCALING_SEEDS + task.seed
+            mixed = get_algorithm(task.algo).on_tensors
+            self.scaling = measure_scaling(
+                task.vector_env(_SCALING_ENVS), spread, seed, task.reads, mixed
+            )
         env = make_vec_env(
             task.env_id,
             task.num_envs,
-            estimator=task.around,
+            estimator=task.estimator_kwargs,
             env_kwargs=task.options(task.num_envs),
-            wrapper_class=self.begun.around if self.begun else None,
+            wrapper_class=self.warm_start.wrap_env if self.warm_start else None,
         )
         steps = 0 if checkpoint is None else int(checkpoint["steps"])
         seed = (task.seed + steps) % 2**32
-        first = _TRAINING + task.seed * _ROOM + steps
-        rated = Rated(env, self._rates(env, first, steps))
-        further: dict[str, Any] = {"device": means.device, "tensorboard_log": means.tensorboard_log}
-        if algorithm_of(task.algo).on_tensors:
-            from .gradient import source_of
+        first = _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING + steps
+        scaled_env = RewardScaleWrapper(env, self._make_reward_scale(env, first, steps))
+        further: dict[str, Any] = {
+            "device": run_options.device,
+            "tensorboard_log": run_options.tensorboard_log,
+        }
+        if get_algorithm(task.algo).on_tensors:
+            from .gradient import make_source
 
-            further["source"] = partial(source_of, task, first, rated.rates)
+            further["source"] = partial(make_source, task, first, scaled_env.reward_scale)
         model = make_model(
-            task.algo, task.settings, rated, self.period, self.scaling, seed, **further
+            task.algo, task.settings, scaled_env, self.period, self.scaling, seed, **further
         )
         if checkpoint is not None:
             load_parameters(self.folder / CHECKPOINT, model)
             if isinstance(model, OffPolicyAlgorithm):
                 model.learning_starts += steps  # its buffer begins empty
         if start is not None:
-            give(start, model)
+            load_warm_start(start, model)
         model.num_timesteps = steps
         env.seed(first)
         self.init_callback(model)
         return model
 
-    def _rates(self, env: VecEnv, first: int, steps: int) -> Rates:
+    def _make_reward_scale(self, env: VecEnv, first: int, steps: int) -> RewardScale:
         """What is paid for the cars' costs, from this seed and step on."""
-        if self.begun is not None:
-            each = -(-(self.aim.steps - steps) // env.num_envs)
-            return Rates(paid_by(self.begun.driver, env, first, each))
+        if self.warm_start is not None:
+            n_steps = -(-(self.run_record.steps - steps) // env.num_envs)
+            return RewardScale(measure_reward_scale(self.warm_start.driver, env, first, n_steps))
         rate = np.resize(self.weights, env.num_envs) / self.period
-        return Rates(rate[:, None].tolist())
+        return RewardScale(rate[:, None].tolist())
 
-    def _means(self, costs: Array) -> Array:
+    def _average_scenarios(self, costs: Array) -> Array:
         """Of the evaluation's drives of each scenario, (k,)."""
         k = max(len(self.task.scenarios), 1)
         return np.array([costs[i::k].mean() for i in range(k)])
@@ -220,20 +244,22 @@ class Keeper(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         self.check()
-        last = self.evaluations[-1].steps if self.evaluations else -self.means.eval_freq
-        if self.model.num_timesteps - last >= self.means.eval_freq:
+        last = self.evaluations[-1].steps if self.evaluations else -self.run_options.eval_freq
+        if self.model.num_timesteps - last >= self.run_options.eval_freq:
             self.evaluate()
 
     def _on_rollout_end(self) -> None:
-        if self.means.report is not None:
+        if self.run_options.report is not None:
             ended = self.model.ep_info_buffer
-            cost = -float(np.mean([each["r"] for each in ended])) if ended else None
+            cost = -float(np.mean([episode["r"] for episode in ended])) if ended else None
             progress = Progress(self.model.num_timesteps, cost, tuple(self.evaluations))
-            self.means.report(progress)
+            self.run_options.report(progress)
 
     def check(self) -> None:
         """FloatingPointError where the weights are not finite."""
-        if not all(bool(each.isfinite().all()) for each in self.model.policy.parameters()):
+        if not all(
+            bool(parameter.isfinite().all()) for parameter in self.model.policy.parameters()
+        ):
             raise FloatingPointError(
                 f"the weights are not finite after step {self.model.num_timesteps}; "
                 f"{self.folder / CHECKPOINT} holds them as they were at the last evaluation"
@@ -243,58 +269,65 @@ class Keeper(BaseCallback):
         """Cost of the policy as it is; the best one so far and the checkpoint are written."""
         self.check()
         self.spent += time.process_time() - self.since
-        costs, lengths = drives_of(self.tested, self.model, self.seeds)
-        cost, ratio = float(np.mean(self._means(costs) * self.alike)), None
-        if self.to_beat is not None:
-            ratio = float(np.exp(np.log(cost_ratios(costs, self.to_beat)).mean()))
+        costs, lengths = evaluate_episodes(self.eval_env, self.model, self.seeds)
+        cost, ratio = float(np.mean(self._average_scenarios(costs) * self.equal_weights)), None
+        if self.initial_costs is not None:
+            ratio = float(np.exp(np.log(compute_cost_ratios(costs, self.initial_costs)).mean()))
         spent = round(self.spent, 3)
-        now = Evaluation(self.model.num_timesteps, spent, cost, cost / self.none, ratio)
-        if all(now.judged < each.judged for each in self.evaluations):
-            self._keep_best(now)
-        self.evaluations.append(now)
+        current = Evaluation(
+            self.model.num_timesteps, spent, cost, cost / self.uncontrolled_cost, ratio
+        )
+        if all(current.criterion < evaluation.criterion for evaluation in self.evaluations):
+            self._keep_best(current)
+        self.evaluations.append(current)
         self.logger.record("eval/mean_reward", -cost)
         self.logger.dump(self.model.num_timesteps)
         checkpoint = {
             "sideslip": __version__,
             "task": asdict(self.task),
             "steps": self.model.num_timesteps,
-            "aim": asdict(self.aim),
+            "aim": asdict(self.run_record),
             "scaling": self.scaling,
             "evaluations": self.evaluations,
         }
         save_checkpoint(self.folder / CHECKPOINT, self.model, checkpoint)
-        lines = "".join(json.dumps(each._asdict()) + "\n" for each in self.evaluations)
-        write_whole(self.folder / CURVE, lines.encode())
-        zoo.leave(self.folder, self.task.env_id, self.model, costs, lengths)
+        lines = "".join(json.dumps(evaluation._asdict()) + "\n" for evaluation in self.evaluations)
+        write_atomic(self.folder / CURVE, lines.encode())
+        zoo.write_evaluation(self.folder, self.task.env_id, self.model, costs, lengths)
         self.since = time.process_time()
 
-    def _keep_best(self, now: Evaluation) -> None:
+    def _keep_best(self, current: Evaluation) -> None:
         task = self.task
-        described = options_of(task.algo, task.settings, self.period, task.num_envs)
-        described |= {"num_envs": task.num_envs, "policy": task.settings["policy"]}
-        described |= {"reads": task.reads} if task.reads else {}
-        if self.begun_with is not None:
-            before = self.begun_with.card.algorithm_options
-            described |= {"begun_with": self.begun_with.name}
-            described |= {"class": before["class"]} if "class" in before and task.scenarios else {}
+        algorithm_options = make_model_options(task.algo, task.settings, self.period, task.num_envs)
+        algorithm_options |= {"num_envs": task.num_envs, "policy": task.settings["policy"]}
+        algorithm_options |= {"reads": task.reads} if task.reads else {}
+        if self.initial_policy is not None:
+            before = self.initial_policy.card.algorithm_options
+            algorithm_options |= {"begun_with": self.initial_policy.name}
+            algorithm_options |= (
+                {"class": before["class"]} if "class" in before and task.scenarios else {}
+            )
         mixture: dict[str, Any] = {"scenarios": task.scenarios} if task.scenarios else {}
-        if task.scenarios and self.begun_with is None:
+        if task.scenarios and self.initial_policy is None:
             mixture["weights"] = self.weights.round(3).tolist()
         first = {"scenario": task.scenarios[0]} if task.scenarios else {}
-        card = Card.of(
+        card = Card.from_env_id(
             task.env_id,
             task.env_options | first,
             task.estimator,
             task.estimator_options,
             algorithm=task.algo,
-            algorithm_options=described | mixture,
-            command=self.means.command,
-            seeds={"training": task.seed, "from": _TRAINING + task.seed * _ROOM},
-            steps=now.steps,
-            cpu_seconds=now.cpu_seconds,
+            algorithm_options=algorithm_options | mixture,
+            command=self.run_options.command,
+            seeds={
+                "training": task.seed,
+                "from": _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING,
+            },
+            steps=current.steps,
+            cpu_seconds=current.cpu_seconds,
         )
-        network = network_from_sb3(self.model)
-        network = self.begun.whole(network) if self.begun else network
+        network = convert_sb3_policy(self.model)
+        network = self.warm_start.merge_network(network) if self.warm_start else network
         save_policy(self.folder / POLICY, network, card)
-        with whole(self.folder / BEST) as file:
+        with atomic_file(self.folder / BEST) as file:
             self.model.save(file)

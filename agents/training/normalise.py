@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
-from ...envs.backend.extras import extra
-from ..env_facts import layout_of
-from .traces.mixing import whitening
+from ...envs.backend.extras import require_extra
+from ..env_facts import get_layout
+from .traces.mixing import compute_whitening
 
-with extra("train", "training needs {}"):
+with require_extra("train", "training needs {}"):
     import torch
     from stable_baselines3.common.torch_layers import FlattenExtractor
 
@@ -29,9 +29,9 @@ Scaling = tuple[list[float], list[float], float | None, list[list[float]] | None
 """Mean, scale, clip and mixing of `Standardised`, in JSON types."""
 
 CLIP = 10.0  # standard deviations
-_WARM_UP, _LONG = 0.2, 4.0  # s: until every sensor has spoken, and of the whole drive
-_HELD = 0.2  # s, in which random actions fade to 1/e
-_LEAST = 1e-3  # variance, of what varies by 1, that a mixture of entries has at least
+_WARM_UP, _DURATION = 0.2, 4.0  # s: until every sensor has spoken, and of the whole drive
+_CORRELATION_TIME = 0.2  # s, in which random actions fade to 1/e
+_MIN_VARIANCE = 1e-3  # variance, of what varies by 1, that a mixture of entries has at least
 _CONSTANT = 1e-9  # what varies less is not read
 
 
@@ -64,7 +64,9 @@ class Standardised(FlattenExtractor):
     @property
     def numbers(self) -> tuple[Array, Array, float | None]:
         """(mean, scale, clip) as they are used."""
-        mean, scale = (each.cpu().numpy().astype(np.float64) for each in (self.mean, self.scale))
+        mean, scale = (
+            tensor.cpu().numpy().astype(np.float64) for tensor in (self.mean, self.scale)
+        )
         return mean, scale, float(self.clip) if self.clip.isfinite() else None
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
@@ -73,7 +75,7 @@ class Standardised(FlattenExtractor):
         return z @ self.mixing
 
 
-def measured(
+def measure_scaling(
     env: VectorEnv[Any, Any, Any],
     spread: float,
     seed: int,
@@ -86,7 +88,7 @@ def measured(
     under actions that are held for a while nothing is correlated. Raises ValueError for a name that
     the observation has not, and where nothing of what is read varies.
     """
-    names = [entry.name for entry in layout_of(env)]  # rows may believe in other nominal cars
+    names = [entry.name for entry in get_layout(env)]  # rows may believe in other nominal cars
     base: Any = env.unwrapped
     period = base.control_period * base.dt
     unknown = [name for name in reads if name not in names]
@@ -94,32 +96,34 @@ def measured(
         raise ValueError(
             f"the observation has no {', '.join(unknown)} to read; it has {', '.join(names)}"
         )
-    samples = _driven(env, spread, seed, period, 0.0)
+    samples = _collect_observations(env, spread, seed, period, 0.0)
     deviation = samples.std(axis=0)
     varies = deviation > _CONSTANT
     if reads:
         varies &= np.isin(names, reads)
     if not varies.any():
-        raise ValueError(f"nothing of what the network reads varies within {_LONG:g} s")
+        raise ValueError(f"nothing of what the network reads varies within {_DURATION:g} s")
     scale = np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
     mean, mixing = samples.mean(axis=0), None
     if mixed:
-        held = _driven(env, spread, seed, period, math.exp(-period / _HELD))
-        standard = np.clip((held - mean) * scale, -CLIP, CLIP)
-        mixing = whitening(standard, _LEAST).tolist()
+        held_samples = _collect_observations(
+            env, spread, seed, period, math.exp(-period / _CORRELATION_TIME)
+        )
+        standard = np.clip((held_samples - mean) * scale, -CLIP, CLIP)
+        mixing = compute_whitening(standard, _MIN_VARIANCE).tolist()
     return mean.tolist(), scale.tolist(), CLIP, mixing
 
 
-def _driven(
-    env: VectorEnv[Any, Any, Any], spread: float, seed: int, period: float, kept: float
+def _collect_observations(
+    env: VectorEnv[Any, Any, Any], spread: float, seed: int, period: float, decay: float
 ) -> Array:
     """Observations (n, k) under noise, of which so much is kept from a step to the next."""
-    rng, seen = np.random.default_rng(seed), []
+    rng, observations = np.random.default_rng(seed), []
     noise = np.zeros(env.action_space.shape or ())
     env.reset(seed=seed)
-    for step in range(round(_LONG / period)):
-        noise = kept * noise + (1.0 - kept**2) ** 0.5 * rng.standard_normal(noise.shape)
+    for step in range(round(_DURATION / period)):
+        noise = decay * noise + (1.0 - decay**2) ** 0.5 * rng.standard_normal(noise.shape)
         obs, *_ = env.step((spread * noise).astype(np.float32))
         if step >= round(_WARM_UP / period):
-            seen.append(obs)
-    return np.concatenate(seen).astype(np.float64)
+            observations.append(obs)
+    return np.concatenate(observations).astype(np.float64)

@@ -9,17 +9,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from ...envs.task.observation import Entry
-from ...estimators.learned.memory import PARTS, Traces
+from ...envs.task.observation import ObservationEntry
+from ...estimators.learned.memory import CELL_WEIGHTS, MovingAverages
 from ...estimators.learned.network import Network
-from ..env_facts import layout_of
+from ..env_facts import get_layout
 from ..learned.files import Policy
-from .algorithms import BEGUN, BEGUN_TRACES, Settings, algorithm_of, settings_of
-from .export import normalisation
+from .algorithms import (
+    WARM_START_ENTRY,
+    WARM_START_TRACES_ENTRY,
+    Settings,
+    get_algorithm,
+    read_settings,
+)
+from .export import read_normalisation
 from .normalise import Scaling
-from .task import Task
-from .traces.remembered import Remembered, mixing_of
-from .zips import check_zip, normaliser_of, unpickled
+from .task import TrainingTask
+from .traces.remembered import MemoryObservation, measure_mixing
+from .zips import check_zip, find_normaliser, load_normaliser
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.save_util import load_from_zip_file  # isort: skip
@@ -27,7 +33,7 @@ from stable_baselines3.common.save_util import load_from_zip_file  # isort: skip
 _GRU = [f"cell.{part}_l0" for part in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
 
 
-class Start(NamedTuple):
+class WarmStart(NamedTuple):
     """A zip or policy by its name: weights and optimisers, by their names in `get_parameters`, a
     zip's further tensors, the scaling of what they read, and whether the rest of the model stays
     as it is."""
@@ -39,7 +45,7 @@ class Start(NamedTuple):
     partial: bool = False
 
 
-def start_of(path: str | Path, width: int, trust: bool = False) -> Start:
+def read_warm_start(path: str | Path, width: int, trust: bool = False) -> WarmStart:
     """The tensors of a zip, which are read without running code of its maker's.
 
     width: of the observation. trust: whether a pickle of VecNormalize beside the zip may be read.
@@ -48,29 +54,37 @@ def start_of(path: str | Path, width: int, trust: bool = False) -> Start:
     file = Path(path)
     check_zip(file)
     try:
-        _, found, variables = load_from_zip_file(file, load_data=False, device="cpu")
-        parameters: dict[str, Any] = found
+        _, loaded, variables = load_from_zip_file(file, load_data=False, device="cpu")
+        parameters: dict[str, Any] = loaded
         policy = parameters["policy"]
     except Exception as error:  # torch raises many for one that is cut short
         raise ValueError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
-    own = {
+    buffers = {
         name.rpartition(".")[2]: x for name, x in policy.items() if "features_extractor." in name
     }
-    if own.keys() >= {"mean", "scale", "clip"}:  # every network of the policy has the same
-        bound = float(own["clip"])
-        mixing = own["mixing"].tolist() if "mixing" in own else None
-        numbers = own["mean"].tolist(), own["scale"].tolist(), bound if bound < math.inf else None
-        return Start(str(file), parameters, variables or {}, (*numbers, mixing))
-    beside = normaliser_of(file)
-    if beside is not None and not trust:
-        raise PermissionError(f"{beside} is a pickle, which may run code: say --trust to read it")
-    mean, scale, clip = normalisation(unpickled(beside) if beside else None, width, 1)
-    return Start(
+    if buffers.keys() >= {"mean", "scale", "clip"}:  # every network of the policy has the same
+        bound = float(buffers["clip"])
+        mixing = buffers["mixing"].tolist() if "mixing" in buffers else None
+        numbers = (
+            buffers["mean"].tolist(),
+            buffers["scale"].tolist(),
+            bound if bound < math.inf else None,
+        )
+        return WarmStart(str(file), parameters, variables or {}, (*numbers, mixing))
+    normaliser_file = find_normaliser(file)
+    if normaliser_file is not None and not trust:
+        raise PermissionError(
+            f"{normaliser_file} is a pickle, which may run code: say --trust to read it"
+        )
+    mean, scale, clip = read_normalisation(
+        load_normaliser(normaliser_file) if normaliser_file else None, width, 1
+    )
+    return WarmStart(
         str(file), parameters, variables or {}, (mean.tolist(), scale.tolist(), clip, None)
     )
 
 
-def task_from(policy: Policy, **fields: Any) -> Task:
+def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
     """The task of going on from a policy: its card's environment, filter and mixture, and settings
     with its network's form.
 
@@ -85,44 +99,56 @@ def task_from(policy: Policy, **fields: Any) -> Task:
     scenarios = fields.pop("scenarios", mixture)
     if scenarios:
         options.pop("scenario", None)
-    own: dict[str, Any] = {"env_id": card.env_id, "env_options": options, "scenarios": scenarios}
+    task_fields: dict[str, Any] = {
+        "env_id": card.env_id,
+        "env_options": options,
+        "scenarios": scenarios,
+    }
     if fields.get("estimator", card.estimator) == card.estimator:
-        own |= {"estimator": card.estimator, "estimator_options": dict(card.estimator_options)}
-    settings = fields.pop("settings", None) or settings_of(algo, _entry(policy))
-    own["settings"] = _formed(settings, policy, algo)
-    return Task(**own | fields)
+        task_fields |= {
+            "estimator": card.estimator,
+            "estimator_options": dict(card.estimator_options),
+        }
+    settings = fields.pop("settings", None) or read_settings(algo, _choose_entry(policy))
+    task_fields["settings"] = _add_policy_form(settings, policy, algo)
+    return TrainingTask(**task_fields | fields)
 
 
-def settings_in(file: str | Path | None, algo: str, env_id: str, start: Any) -> Settings:
+def resolve_settings(file: str | Path | None, algo: str, env_id: str, start: Any) -> Settings:
     """Settings from a file, None for the package's own: of an environment, or, where start is a
-    policy, of going on from it, with its form. Raises as `settings_of` and `task_from`."""
+    policy, of going on from it, with its form. Raises as `read_settings` and
+    `make_finetune_task`."""
     if not isinstance(start, Policy):
-        return settings_of(algo, env_id, file)
-    return _formed(settings_of(algo, _entry(start), file), start, algo)
+        return read_settings(algo, env_id, file)
+    return _add_policy_form(read_settings(algo, _choose_entry(start), file), start, algo)
 
 
-def _entry(policy: Policy) -> str:
+def _choose_entry(policy: Policy) -> str:
     """The settings of going on from it."""
-    return BEGUN_TRACES if Traces.kind in [cell.kind for cell in policy.network.cells] else BEGUN
+    return (
+        WARM_START_TRACES_ENTRY
+        if MovingAverages.kind in [cell.kind for cell in policy.network.cells]
+        else WARM_START_ENTRY
+    )
 
 
-def _formed(settings: Settings, policy: Policy, algo: str) -> Settings:
-    form = _form_of(policy, algo)
+def _add_policy_form(settings: Settings, policy: Policy, algo: str) -> Settings:
+    form = _get_policy_form(policy, algo)
     return settings | {"policy_kwargs": settings.get("policy_kwargs", {}) | form}
 
 
-def _form_of(policy: Policy, algo: str) -> dict[str, Any]:
+def _get_policy_form(policy: Policy, algo: str) -> dict[str, Any]:
     """The `policy_kwargs` of a model whose actor is a policy's network."""
-    network, on_tensors = policy.network, algorithm_of(algo).on_tensors
+    network, on_tensors = policy.network, get_algorithm(algo).on_tensors
     kinds = [cell.kind for cell in network.cells]
     if algo != "ppo" and not on_tensors:
         raise ValueError(f"{algo} begins with a zip, not with policy {policy.name}")
     form = network.output, network.history, kinds
-    known = [["gru"]] if on_tensors else [[], [Traces.kind]]
-    if form not in [("linear", 1, each) for each in known]:
-        wanted = "a GRU" if on_tensors else "nothing or traces"
+    known = [["gru"]] if on_tensors else [[], [MovingAverages.kind]]
+    if form not in [("linear", 1, option) for option in known]:
+        needed = "a GRU" if on_tensors else "nothing or traces"
         raise ValueError(
-            f"{algo} goes on from dense layers without tanh at their end, {wanted} before them and "
+            f"{algo} goes on from dense layers without tanh at their end, {needed} before them and "
             f"no older frames; (output, history, cells) of {policy.name} are {form}"
         )
     if on_tensors and network.activation != "silu":
@@ -133,23 +159,32 @@ def _form_of(policy: Policy, algo: str) -> dict[str, Any]:
     )
 
 
-def started_by(policy: Policy, task: Task, layout: Sequence[Entry]) -> Start:
+def make_warm_start(
+    policy: Policy, task: TrainingTask, layout: Sequence[ObservationEntry]
+) -> WarmStart:
     """What the actor of a task's model begins with; its critic, if it has one, stays as it is.
 
     layout: of the task's observation.
     Raises ValueError for a policy of another form than the settings', or another observation.
     """
-    network, seen = policy.network, [name for name, _ in policy.card.observation]
+    network, policy_entries = policy.network, [name for name, _ in policy.card.observation]
     names = [entry.name for entry in layout]
-    if seen != names:
-        raise ValueError(f"{policy.name} reads {', '.join(seen)}; here there is {', '.join(names)}")
-    form, told = _form_of(policy, task.algo), task.settings.get("policy_kwargs", {})
-    if told != told | form:
-        raise ValueError(f"{policy.name} is a network of {form}, and the settings say {told}")
-    on_tensors = algorithm_of(task.algo).on_tensors
+    if policy_entries != names:
+        raise ValueError(
+            f"{policy.name} reads {', '.join(policy_entries)}; here there is {', '.join(names)}"
+        )
+    form, policy_kwargs = (
+        _get_policy_form(policy, task.algo),
+        task.settings.get("policy_kwargs", {}),
+    )
+    if policy_kwargs != policy_kwargs | form:
+        raise ValueError(
+            f"{policy.name} is a network of {form}, and the settings say {policy_kwargs}"
+        )
+    on_tensors = get_algorithm(task.algo).on_tensors
     if on_tensors:
         cell = network.cells[0]
-        arrays = dict(zip(_GRU, (getattr(cell, part) for part in PARTS), strict=True))
+        arrays = dict(zip(_GRU, (getattr(cell, part) for part in CELL_WEIGHTS), strict=True))
         layers = [f"layers.{2 * i}" for i in range(len(network.weights))]
     else:
         arrays, hidden = {}, range(len(network.hidden))
@@ -159,17 +194,17 @@ def started_by(policy: Policy, task: Task, layout: Sequence[Entry]) -> Start:
     tensors = {name: torch.tensor(x, dtype=torch.float32) for name, x in arrays.items()}
     read = network if on_tensors else network.dense
     scaling = read.mean.tolist(), read.scale.tolist(), read.clip, None
-    return Start(policy.name, {"policy": tensors}, {}, scaling, partial=True)
+    return WarmStart(policy.name, {"policy": tensors}, {}, scaling, partial=True)
 
 
-def give(start: Start, model: Any) -> None:
+def load_warm_start(start: WarmStart, model: Any) -> None:
     """Give a model what it starts with; ValueError where that is of another network."""
-    kept = {
+    unchanged = {
         name: x
         for name, x in model.get_parameters()["policy"].items()
         if start.partial or "features_extractor." in name  # a zip from elsewhere has it outside
     }
-    policy = kept | start.parameters["policy"]
+    policy = unchanged | start.parameters["policy"]
     try:
         model.set_parameters(
             {**model.get_parameters(), **start.parameters, "policy": policy}, device=model.device
@@ -183,7 +218,7 @@ def give(start: Start, model: Any) -> None:
         ) from error
 
 
-class Driver:
+class NetworkAgent:
     """A network at the wheel, which reads its observation as it is: rows may be of any cars."""
 
     def __init__(self, network: Network) -> None:
@@ -200,32 +235,41 @@ class Driver:
         return np.clip(actions, -1.0, 1.0).astype(np.float32), memory
 
 
-class Begun:
+class PolicyWarmStart:
     """A policy that a training goes on from, and how.
 
     start: of the model; driver: at the wheel as the policy is. PPO has no memory: traces, which
     stay as they are, are part of its environments, mixed as the policy's own drives show them.
 
-    env: of the task, without them. seed: of those drives. Raises what `started_by` raises.
+    env: of the task, without them. seed: of those drives. Raises what `make_warm_start` raises.
     """
 
     def __init__(
-        self, policy: Policy, task: Task, env: VectorEnv[Any, Any, Any], seed: int
+        self, policy: Policy, task: TrainingTask, env: VectorEnv[Any, Any, Any], seed: int
     ) -> None:
-        layout, self._network = layout_of(env), policy.network
-        self.start, self.driver = started_by(policy, task, layout), Driver(policy.network)
+        layout, self._network = get_layout(env), policy.network
+        self.start, self.driver = (
+            make_warm_start(policy, task, layout),
+            NetworkAgent(policy.network),
+        )
         self._mixing = None
-        if policy.network.cells and not algorithm_of(task.algo).on_tensors:
-            alone = Driver(policy.network.dense)
-            self._mixing = mixing_of(env, policy.network, lambda obs: alone.predict(obs)[0], seed)
-            mixed = self._mixing.without(policy.network)
-            self.start = started_by(replace(policy, network=mixed), task, layout)
-            self.driver = Driver(mixed.dense)
+        if policy.network.cells and not get_algorithm(task.algo).on_tensors:
+            dense_agent = NetworkAgent(policy.network.dense)
+            self._mixing = measure_mixing(
+                env, policy.network, lambda obs: dense_agent.predict(obs)[0], seed
+            )
+            mixed = self._mixing.adapt_to_mixed(policy.network)
+            self.start = make_warm_start(replace(policy, network=mixed), task, layout)
+            self.driver = NetworkAgent(mixed.dense)
 
-    def around(self, env: VectorEnv[Any, Any, Any]) -> VectorEnv[Any, Any, Any]:
+    def wrap_env(self, env: VectorEnv[Any, Any, Any]) -> VectorEnv[Any, Any, Any]:
         """A vector env as the model sees it."""
-        return Remembered(env, self._network, self._mixing) if self._mixing else env
+        return MemoryObservation(env, self._network, self._mixing) if self._mixing else env
 
-    def whole(self, network: Network) -> Network:
+    def merge_network(self, network: Network) -> Network:
         """The network of plain observations, of the model's."""
-        return self._network.ending(self._mixing.within(network)) if self._mixing else network
+        return (
+            self._network.replace_dense(self._mixing.adapt_to_plain(network))
+            if self._mixing
+            else network
+        )

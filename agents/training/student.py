@@ -12,31 +12,32 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.extras import extra
-from ...estimators.learned.memory import Cell, Memory
+from ...envs.backend.extras import require_extra
+from ...estimators.learned.memory import MemoryLayer, RecurrentCell
 from ...estimators.learned.network import Network
-from .traces.drives import CLIP, Drives, Scaling, Single
+from .traces.drives import CLIP, Demonstrations, Scaling, Single
 from .traces.layer import TraceLayer
 
-with extra("train", "distillation needs torch"):
+with require_extra("train", "distillation needs torch"):
     import torch
     from torch import nn
 
 WINDOW = 50  # steps through which the gradient goes back in time
 SAMPLES = 512  # steps of a batch without memory
-LONGER = 3  # times as many epochs in the last round
+LAST_ROUND_FACTOR = 3  # times as many epochs in the last round
 Batch = tuple[Any, Any, Any, Any, Any, bool]
 """Mixed observations (B, T, k), labels (B, T, m), what is told (B, T, q), weights (B, T),
 curvatures (B, m, m), and whether it begins the episodes."""
 
 
 @dataclass(frozen=True)
-class Course:
+class DistillConfig:
     """How a student learns.
 
     rounds: of driving and learning, the first one with the teacher at the wheel. epochs: passes
-    over all drives in a round, `LONGER` times as many in the last one. cells: of a GRU; traces:
-    bent units of `Traces`; neither for a student without memory. hidden: sizes of the dense layers.
+    over all drives in a round, `LAST_ROUND_FACTOR` times as many in the last one. cells: of a GRU;
+    traces: bent units of `MovingAverages`; neither for a student without memory. hidden: sizes of
+    the dense layers.
     learning_rate: of Adam, falling to a fiftieth in each round. noise: largest standard deviation
     of what shakes the teacher's actions. seed: of weights and episodes. batch: episodes, for a
     student with memory. told: how much the squared errors count of what a student with memory has
@@ -70,11 +71,11 @@ class Course:
         if self.told and not (self.cells or self.traces):
             raise ValueError("a student without memory has nothing to say: told is for those with")
 
-    def described(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """All numbers but the seed, in JSON types."""
-        found = asdict(self) | {"hidden": list(self.hidden)}
-        del found["seed"]
-        return found
+        numbers = asdict(self) | {"hidden": list(self.hidden)}
+        del numbers["seed"]
+        return numbers
 
     @property
     def window(self) -> int:
@@ -85,50 +86,60 @@ class Course:
 class Student(nn.Module):
     """A GRU or traces, if there are any, and dense layers behind, on mixed observations.
 
-    told: so many more numbers, linear in what the cells, or behind traces the last layer but one,
-    hold, are of use in training alone.
+    n_privileged: so many more numbers, linear in what the cells, or behind traces the last layer
+    but one, hold, are of use in training alone.
     """
 
-    def __init__(self, inputs: int, width: int, course: Course, told: int = 0) -> None:
+    def __init__(
+        self, inputs: int, width: int, config: DistillConfig, n_privileged: int = 0
+    ) -> None:
         super().__init__()
-        self.cell = nn.GRU(inputs, course.cells, batch_first=True) if course.cells else None
-        self.traces = TraceLayer(inputs, course.traces) if course.traces else None
-        remembered = self.traces.size if self.traces else course.cells
-        sizes = [remembered or inputs, *course.hidden, width]
+        self.cell = nn.GRU(inputs, config.cells, batch_first=True) if config.cells else None
+        self.traces = TraceLayer(inputs, config.traces) if config.traces else None
+        memory_size = self.traces.size if self.traces else config.cells
+        sizes = [memory_size or inputs, *config.hidden, width]
         self.dense = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
-        self.tell = nn.Linear(course.cells or sizes[-2], told) if course.told else None
-        self.recurrent = bool(remembered)
+        self.auxiliary_head = (
+            nn.Linear(config.cells or sizes[-2], n_privileged) if config.told else None
+        )
+        self.recurrent = bool(memory_size)
 
     def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
         """(actions and what is told (B, T, m + q), the next state) of inputs (B, T, k)."""
         memory = self.cell or self.traces
         if memory is not None:
             z, state = memory(z, state)
-        held = z
+        memory_output = z
         for layer in self.dense[:-1]:
             z = nn.functional.silu(layer(z))
-        more = [] if self.tell is None else [self.tell(held if self.cell else z)]
-        return torch.cat([self.dense[-1](z), *more], dim=-1), state
+        auxiliary = (
+            []
+            if self.auxiliary_head is None
+            else [self.auxiliary_head(memory_output if self.cell else z)]
+        )
+        return torch.cat([self.dense[-1](z), *auxiliary], dim=-1), state
 
-    def whiten(self, drives: Sequence[Drives], scaling: Scaling) -> None:
+    def fit_whitening(self, drives: Sequence[Demonstrations], scaling: Scaling) -> None:
         """Mix what traces hold plain, so that nothing of it is correlated on these drives."""
         if self.traces is not None:
-            self.traces.whiten([(scaling.mixed(each.obs), each.weights > 0.0) for each in drives])
+            self.traces.fit_whitening(
+                [(scaling.mix_inputs(demo.obs), demo.weights > 0.0) for demo in drives]
+            )
 
     def network(self, scaling: Scaling) -> Network:
         """The same function of plain observations, by NumPy."""
         numbers = {name: value.detach().numpy().copy() for name, value in self.named_parameters()}
         names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
         first = "cell.weight_ih_l0" if self.cell else "dense.0.weight"
-        cells: list[Memory] = []
+        cells: list[MemoryLayer] = []
         if self.traces:
             cells.append(self.traces.cell(scaling.mixing))
             layer = [numbers[f"dense.0.{part}"] for part in ("weight", "bias")]
-            numbers["dense.0.weight"], numbers["dense.0.bias"] = self.traces.behind(*layer)
+            numbers["dense.0.weight"], numbers["dense.0.bias"] = self.traces.convert_weights(*layer)
         else:
             numbers[first] = numbers[first] @ scaling.mixing
         if self.cell:
-            cells.append(Cell("gru", *(numbers[f"cell.{name}"] for name in names)))
+            cells.append(RecurrentCell("gru", *(numbers[f"cell.{name}"] for name in names)))
         dense = range(len(self.dense))
         return Network(
             scaling.mean,
@@ -141,24 +152,26 @@ class Student(nn.Module):
         )
 
 
-def _joined(parts: Sequence[Single]) -> Any:
+def _concatenate(parts: Sequence[Single]) -> Any:
     return torch.from_numpy(np.concatenate(parts))
 
 
-class _Episodes:
+class _EpisodeBatches:
     """Some episodes of a few lessons at once, cut into windows that the state goes through."""
 
-    def __init__(self, drives: Sequence[Drives], scaling: Scaling, course: Course) -> None:
+    def __init__(
+        self, drives: Sequence[Demonstrations], scaling: Scaling, config: DistillConfig
+    ) -> None:
         self.drives, self.scaling = drives, scaling
-        self.batch, self.window = course.batch, course.window
-        self.everyone = [(i, j) for i, each in enumerate(drives) for j in range(len(each.costs))]
-        longest = max(each.weights.shape[1] for each in drives)
-        self.most = -(-len(self.everyone) // self.batch) * -(-longest // self.window)
+        self.batch, self.window = config.batch, config.window
+        self.episodes = [(i, j) for i, demo in enumerate(drives) for j in range(len(demo.costs))]
+        longest = max(demo.weights.shape[1] for demo in drives)
+        self.n_batches = -(-len(self.episodes) // self.batch) * -(-longest // self.window)
 
     def __iter__(self) -> Iterator[Batch]:
-        names = ("obs", "labels", "told", "weights")
-        for chosen in torch.split(torch.randperm(len(self.everyone)), self.batch):
-            rows = [self.everyone[int(i)] for i in chosen]
+        names = ("obs", "labels", "privileged", "weights")
+        for chosen in torch.split(torch.randperm(len(self.episodes)), self.batch):
+            rows = [self.episodes[int(i)] for i in chosen]
             longest = max(self.drives[i].weights.shape[1] for i, _ in rows)
             arrays = [
                 np.zeros((len(rows), longest, *getattr(self.drives[0], name).shape[2:]), np.float32)
@@ -169,66 +182,74 @@ class _Episodes:
                 for array, name in zip(arrays, names, strict=True):
                     array[row, :length] = getattr(self.drives[i], name)[j]
             S = torch.from_numpy(np.stack([self.drives[i].curvature for i, _ in rows]))
-            arrays[0] = self.scaling.mixed(arrays[0])
-            for at in range(0, longest, self.window):
-                z, y, q, w = (torch.from_numpy(a[:, at : at + self.window]) for a in arrays)
-                yield z, y, q, w, S, at == 0
+            arrays[0] = self.scaling.mix_inputs(arrays[0])
+            for start in range(0, longest, self.window):
+                z, y, q, w = (torch.from_numpy(a[:, start : start + self.window]) for a in arrays)
+                yield z, y, q, w, S, start == 0
 
 
-class _Steps:
+class _StepBatches:
     """`SAMPLES` single steps of all drives at once, as if each were an episode."""
 
-    def __init__(self, drives: Sequence[Drives], scaling: Scaling, _: Course) -> None:
-        there = [each.weights > 0.0 for each in drives]
-        self.lesson = torch.cat([torch.full((int(t.sum()),), i) for i, t in enumerate(there)])
-        self.curvatures = torch.from_numpy(np.stack([each.curvature for each in drives]))
-        pairs = list(zip(drives, there, strict=True))
-        self.x = _joined([scaling.mixed(each.obs[t]) for each, t in pairs])
-        self.y = _joined([each.labels[t] for each, t in pairs])
-        self.q = _joined([each.told[t] for each, t in pairs])
-        self.w = _joined([each.weights[t] for each, t in pairs])
-        self.most = -(-len(self.w) // SAMPLES)
+    def __init__(
+        self, drives: Sequence[Demonstrations], scaling: Scaling, _: DistillConfig
+    ) -> None:
+        valid = [demo.weights > 0.0 for demo in drives]
+        self.demo_index = torch.cat(
+            [torch.full((int(mask.sum()),), i) for i, mask in enumerate(valid)]
+        )
+        self.curvatures = torch.from_numpy(np.stack([demo.curvature for demo in drives]))
+        pairs = list(zip(drives, valid, strict=True))
+        self.x = _concatenate([scaling.mix_inputs(demo.obs[mask]) for demo, mask in pairs])
+        self.y = _concatenate([demo.labels[mask] for demo, mask in pairs])
+        self.q = _concatenate([demo.privileged[mask] for demo, mask in pairs])
+        self.w = _concatenate([demo.weights[mask] for demo, mask in pairs])
+        self.n_batches = -(-len(self.w) // SAMPLES)
 
     def __iter__(self) -> Iterator[Batch]:
         for i in torch.split(torch.randperm(len(self.w)), SAMPLES):
-            S = self.curvatures[self.lesson[i]]
-            yield *(each[i, None] for each in (self.x, self.y, self.q, self.w)), S, True
+            S = self.curvatures[self.demo_index[i]]
+            yield *(array[i, None] for array in (self.x, self.y, self.q, self.w)), S, True
 
 
-def fitted(
-    model: nn.Module, drives: Sequence[Drives], scaling: Scaling, course: Course, epochs: int
+def fit_model(
+    model: nn.Module,
+    drives: Sequence[Demonstrations],
+    scaling: Scaling,
+    config: DistillConfig,
+    epochs: int,
 ) -> float:
     """Train a model on drives; the loss of the last epoch. Raises FloatingPointError where it
     diverges.
 
     model: gives actions and state as a `Student`; `recurrent` says whether steps belong together.
     """
-    optimiser = torch.optim.Adam(model.parameters(), course.learning_rate)
-    batches = (_Episodes if model.recurrent else _Steps)(drives, scaling, course)
-    falling = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.02, epochs * batches.most)
-    count = sum(len(each.costs) for each in drives)
-    length = sum(int((each.weights > 0.0).sum()) for each in drives) / count
-    idle = sum(each.missed_by_zero for each in drives) / count
+    optimiser = torch.optim.Adam(model.parameters(), config.learning_rate)
+    batches = (_EpisodeBatches if model.recurrent else _StepBatches)(drives, scaling, config)
+    schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.02, epochs * batches.n_batches)
+    count = sum(len(demo.costs) for demo in drives)
+    length = sum(int((demo.weights > 0.0).sum()) for demo in drives) / count
+    zero_loss = sum(demo.zero_loss for demo in drives) / count
     step, total, state = 0, 0.0, None
     for _ in range(epochs):
         total = 0.0
         for z, y, q, w, S, begins in batches:
             out, state = model(z, None if begins else state)
             state = None if state is None else state.detach()
-            there = w > 0.0
+            valid = w > 0.0
             error = out[..., : y.shape[-1]] - y
-            added = torch.einsum("bti,bij,btj->bt", error, S, error) * w
-            loss = length * added.sum() / there.sum().clamp(min=1)  # of an episode
-            if course.told:
-                missed = (out[..., y.shape[-1] :] - q)[there].square().mean(-1).sum()
-                loss = loss / idle + course.told * missed / there.sum().clamp(min=1)
+            added_cost = torch.einsum("bti,bij,btj->bt", error, S, error) * w
+            loss = length * added_cost.sum() / valid.sum().clamp(min=1)  # of an episode
+            if config.told:
+                auxiliary_error = (out[..., y.shape[-1] :] - q)[valid].square().mean(-1).sum()
+                loss = loss / zero_loss + config.told * auxiliary_error / valid.sum().clamp(min=1)
             optimiser.zero_grad()
             loss.backward()
             norm = nn.utils.clip_grad_norm_(model.parameters(), 1.0)
             if not torch.isfinite(loss + norm):
                 raise FloatingPointError(f"the loss is {loss.item()} at step {step}")
             optimiser.step()
-            falling.step()
+            schedule.step()
             step += 1
-            total += float(added.detach().sum())
+            total += float(added_cost.detach().sum())
     return total / count

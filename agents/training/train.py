@@ -13,23 +13,23 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ... import __version__
-from ...envs.documents import made_of
+from ...envs.documents import from_json
 from ..learned.card import check_names_no_code
 from ..learned.files import Policy, is_policy, load_policy, save_policy
 from .checkpoint import read_state
 from .keeper import (
-    BEGUN_WITH,
     BEST,
     CHECKPOINT,
     CURVE,
     POLICY,
-    Aim,
+    WARM_START_FILE,
+    EvalCallback,
     Evaluation,
-    Keeper,
-    Means,
     Progress,
+    RunOptions,
+    RunRecord,
 )
-from .task import Task
+from .task import TrainingTask
 from .zips import check_zip
 
 import torch  # isort: skip  # after ours, which say which extra is missing
@@ -38,12 +38,22 @@ from stable_baselines3.common.callbacks import BaseCallback  # isort: skip
 from stable_baselines3.common.logger import KVWriter  # isort: skip
 
 __all__ = [
-    "BEST", "CHECKPOINT", "CURVE", "POLICY",
-    "Aim", "Keeper", "Means", "Progress", "Task", "Trained", "task_in", "train",
+    "BEST",
+    "CHECKPOINT",
+    "CURVE",
+    "POLICY",
+    "EvalCallback",
+    "Progress",
+    "RunOptions",
+    "RunRecord",
+    "TrainResult",
+    "TrainingTask",
+    "read_task",
+    "train",
 ]  # fmt: skip
 
 
-class Trained(NamedTuple):
+class TrainResult(NamedTuple):
     """The last model, and all evaluations."""
 
     model: BaseAlgorithm
@@ -52,33 +62,33 @@ class Trained(NamedTuple):
     @property
     def best(self) -> Evaluation:
         """The evaluation whose model is kept."""
-        return min(self.evaluations, key=lambda each: each.judged)
+        return min(self.evaluations, key=lambda evaluation: evaluation.criterion)
 
 
 def train(
-    task: Task,
+    task: TrainingTask,
     steps: int,
     folder: str | Path,
     resume: bool = False,
-    means: Means | None = None,
+    run_options: RunOptions | None = None,
     trained_agent: str | Path | Policy | None = None,
     trust: bool = False,
-) -> Trained:
+) -> TrainResult:
     """Train up to a number of steps (rounded up to whole rollouts), in a folder.
 
     resume: go on from the folder's checkpoint: weights, optimisers, step size, steps and
     evaluations are those of the checkpoint, episodes are new; a replay buffer begins empty and is
     filled as at the start, by `learning_starts` steps of random actions, before weights change.
     trained_agent: a zip of stable-baselines3 whose weights a new training begins with; or, for
-    `ppo` and `gradient`, a `Policy` or its name (`task_from` makes its task). Each drive then
-    weighs by what the policy pays in it, and the best evaluation is that of the least geometric
-    mean over the policy's costs. trust: of `starts.start_of`.
+    `ppo` and `gradient`, a `Policy` or its name (`make_finetune_task` makes its task). Each drive
+    then weighs by what the policy pays in it, and the best evaluation is that of the least
+    geometric mean over the policy's costs. trust: of `starts.start_of`.
 
     Raises ValueError where the folder holds another training, FileNotFoundError where there is
     none to go on with, FloatingPointError, with the step, where weights are not finite any more
     (the folder holds the last evaluation's), and what `make_vec_env` and `start_of` raise.
     """
-    how = means or Means()
+    chosen_options = run_options or RunOptions()
     if steps < 1:
         raise ValueError(f"steps is at least 1, got {steps}")
     if trained_agent is not None:
@@ -91,40 +101,44 @@ def train(
                 trained_agent = load_policy(trained_agent)
             else:
                 check_zip(Path(trained_agent))
-    if how.tensorboard_log is not None and find_spec("tensorboard") is None:
+    if chosen_options.tensorboard_log is not None and find_spec("tensorboard") is None:
         raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
-    tracked = _Tracked(how.track, Path(folder).name, asdict(task)) if how.track else None
+    tracker = (
+        _WandbCallback(chosen_options.track, Path(folder).name, asdict(task))
+        if chosen_options.track
+        else None
+    )
     torch.set_num_threads(1)  # on small matrices threads only wait for each other
-    place = Path(folder)
-    checkpoint = _start(task, place, resume)
-    begun_with = _begun_with(place, resume, trained_agent)
-    zipped = None if isinstance(trained_agent, Policy) else trained_agent
-    keeper = Keeper(task, place, checkpoint, how, steps, begun_with)
-    watchers: list[BaseCallback] = [keeper] if tracked is None else [tracked, keeper]
-    model = keeper.build(checkpoint, zipped, trust)
+    folder_path = Path(folder)
+    checkpoint = _prepare_folder(task, folder_path, resume)
+    initial_policy = _resolve_initial_policy(folder_path, resume, trained_agent)
+    zip_path = None if isinstance(trained_agent, Policy) else trained_agent
+    callback = EvalCallback(task, folder_path, checkpoint, chosen_options, steps, initial_policy)
+    callbacks: list[BaseCallback] = [callback] if tracker is None else [tracker, callback]
+    model = callback.build(checkpoint, zip_path, trust)
     done = model.num_timesteps
     if done < steps:
         try:
             first = done == 0
             model.learn(
-                steps - done, callback=watchers, reset_num_timesteps=first, tb_log_name=task.algo
+                steps - done, callback=callbacks, reset_num_timesteps=first, tb_log_name=task.algo
             )
-            keeper.evaluate()
+            callback.evaluate()
         except ValueError:  # torch's, of a distribution that is none, or the env's, of actions
-            keeper.check()
+            callback.check()
             raise
         finally:
-            if tracked is not None:
-                tracked.finish()
-    return Trained(model, tuple(keeper.evaluations))
+            if tracker is not None:
+                tracker.finish()
+    return TrainResult(model, tuple(callback.evaluations))
 
 
-def start_in(folder: str | Path) -> Policy | None:
+def load_initial_policy(folder: str | Path) -> Policy | None:
     """The policy that a folder's training began with, None for another training.
 
-    Raises as `task_in`, and FileNotFoundError where its copy is not in the folder any more.
+    Raises as `read_task`, and FileNotFoundError where its copy is not in the folder any more.
     """
-    name, file = aim_in(folder).begun_with, Path(folder) / BEGUN_WITH
+    name, file = read_run_record(folder).begun_with, Path(folder) / WARM_START_FILE
     if not name:
         return None
     if not file.is_file():
@@ -132,25 +146,25 @@ def start_in(folder: str | Path) -> Policy | None:
     return replace(load_policy(file), name=name)
 
 
-def _begun_with(folder: Path, resume: bool, agent: Any) -> Policy | None:
+def _resolve_initial_policy(folder: Path, resume: bool, agent: Any) -> Policy | None:
     """The policy that a training began with; a copy of it stays in the folder."""
     if resume:
-        return start_in(folder)
+        return load_initial_policy(folder)
     if not isinstance(agent, Policy):
-        (folder / BEGUN_WITH).unlink(missing_ok=True)  # of one that had no evaluation yet
+        (folder / WARM_START_FILE).unlink(missing_ok=True)  # of one that had no evaluation yet
         return None
-    save_policy(folder / BEGUN_WITH, agent.network, agent.card)
+    save_policy(folder / WARM_START_FILE, agent.network, agent.card)
     return agent
 
 
-def aim_in(folder: str | Path) -> Aim:
-    """Of a folder's checkpoint. Raises as `task_in`."""
-    task_in(folder)
+def read_run_record(folder: str | Path) -> RunRecord:
+    """Of a folder's checkpoint. Raises as `read_task`."""
+    read_task(folder)
     path = Path(folder) / CHECKPOINT
-    return made_of(Aim, read_state(path)["aim"], f"{path}: the aim")
+    return from_json(RunRecord, read_state(path)["aim"], f"{path}: the aim")
 
 
-class _Tracked(BaseCallback):
+class _WandbCallback(BaseCallback):
     """Hands what stable-baselines3 logs to a run of Weights & Biases.
 
     project, name: the run's. config: told to it. Raises ModuleNotFoundError without wandb.
@@ -162,12 +176,15 @@ class _Tracked(BaseCallback):
             wandb: Any = import_module("wandb")
         except ImportError:
             raise ModuleNotFoundError("tracking needs wandb: pip install wandb") from None
-        self._wandb, self._about = wandb, {"project": project, "name": name, "config": config}
+        self._wandb, self._run_arguments = (
+            wandb,
+            {"project": project, "name": name, "config": config},
+        )
         self._run: Any = None
 
     def _on_training_start(self) -> None:
-        self._run = self._wandb.init(**self._about)
-        self.logger.output_formats.append(_Writer(self._run))
+        self._run = self._wandb.init(**self._run_arguments)
+        self.logger.output_formats.append(_WandbWriter(self._run))
 
     def _on_step(self) -> bool:
         return True
@@ -178,7 +195,7 @@ class _Tracked(BaseCallback):
             self._run.finish()
 
 
-class _Writer(KVWriter):
+class _WandbWriter(KVWriter):
     def __init__(self, run: Any) -> None:
         self._run = run
 
@@ -189,7 +206,7 @@ class _Writer(KVWriter):
         """Nothing: the run ends with the training."""
 
 
-def task_in(folder: str | Path, **arguments: Any) -> Task:
+def read_task(folder: str | Path, **arguments: Any) -> TrainingTask:
     """The task of a folder's checkpoint; ValueError where an argument differs from it.
 
     Raises FileNotFoundError where there is no checkpoint, ValueError for one of another version.
@@ -204,11 +221,11 @@ def task_in(folder: str | Path, **arguments: Any) -> Task:
             f"{path} was made by sideslip {version}, this is {__version__}, whose cars and costs "
             "may be others: train anew, in another folder"
         )
-    names = [each.name for each in fields(Task)]  # a default for none of them
+    names = [task_field.name for task_field in fields(TrainingTask)]  # a default for none of them
     missing = [name for name in names if not isinstance(saved, dict) or name not in saved]
     if missing:
         raise ValueError(f"{path}: the checkpoint's task lacks {', '.join(missing)}")
-    task = made_of(Task, saved, f"{path}: the task")
+    task = from_json(TrainingTask, saved, f"{path}: the task")
     try:
         check_names_no_code(task.env_id, task.estimator, task.estimator_options)
     except ValueError as error:
@@ -222,10 +239,10 @@ def task_in(folder: str | Path, **arguments: Any) -> Task:
     return task
 
 
-def _start(task: Task, folder: Path, resume: bool) -> dict[str, Any] | None:
+def _prepare_folder(task: TrainingTask, folder: Path, resume: bool) -> dict[str, Any] | None:
     """The checkpoint's state, None for a new training in a folder that is ready for it."""
     if resume:
-        task_in(folder, **asdict(task))
+        read_task(folder, **asdict(task))
         return read_state(folder / CHECKPOINT)
     if (folder / CHECKPOINT).exists():
         raise ValueError(

@@ -15,12 +15,12 @@ from zipfile import BadZipFile, ZipFile
 
 import gymnasium as gym
 
-from ...envs.task.observation import Entry, space_of
+from ...envs.task.observation import ObservationEntry, make_space
 from ...estimators.wrappers.estimate import EstimateObservation
-from ..env_facts import AnyEnv, facts_of
+from ..env_facts import AnyEnv, get_env_facts
 from ..learned.card import Card
-from ..learned.files import ENDING, Policy, save_policy
-from .export import known_policy, network_from_sb3
+from ..learned.files import SUFFIX, Policy, save_policy
+from .export import convert_sb3_policy, find_actor_reader
 
 _NEEDED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
 _MEMBERS = {"data", "policy.pth"}
@@ -45,21 +45,21 @@ def policy_from_zip(
 
     Raises FileNotFoundError where there is no file, PermissionError without trust, ValueError for a
     file that is no such zip, a policy trained on another observation, or one that
-    `network_from_sb3` refuses, ModuleNotFoundError without stable-baselines3.
+    `convert_sb3_policy` refuses, ModuleNotFoundError without stable-baselines3.
     """
     file = Path(path)
     check_trusted(file, trust)
     content, weights = _read(file)
-    policy = _built(file, content, weights)
-    frames = _frames(file, policy.observation_space, facts_of(env).layout)
-    found = normaliser_of(file, normalise)
-    normaliser = None if found is None else unpickled(found)
-    network = network_from_sb3(policy, normaliser, frames)
+    policy = _build_policy(file, content, weights)
+    frames = _count_frames(file, policy.observation_space, get_env_facts(env).layout)
+    normaliser_file = find_normaliser(file, normalise)
+    normaliser = None if normaliser_file is None else load_normaliser(normaliser_file)
+    network = convert_sb3_policy(policy, normaliser, frames)
     described = {
         "algorithm": f"stable-baselines3's {type(policy).__name__}",
         "steps": int(content.get("num_timesteps", 0)),
     }
-    return Policy(file.stem, network, Card.seen(env, **{"env_id": "", **described, **about}))
+    return Policy(file.stem, network, Card.from_env(env, **{"env_id": "", **described, **about}))
 
 
 def export_zip(
@@ -79,8 +79,8 @@ def export_zip(
     `policy_from_zip` and `save_policy` raise.
     """
     check_trusted(Path(path), trust)
-    if Path(target).suffix != ENDING:
-        raise ValueError(f"a policy's file is NAME{ENDING}, got {target}")
+    if Path(target).suffix != SUFFIX:
+        raise ValueError(f"a policy's file is NAME{SUFFIX}, got {target}")
     options = dict(env_options or {})
     env: gym.Env[Any, Any] = gym.make(env_id, **options)
     if estimator:
@@ -92,16 +92,16 @@ def export_zip(
     return replace(policy, name=Path(target).stem)
 
 
-def normaliser_of(path: Path, normalise: str | Path | None = None) -> Path | None:
+def find_normaliser(path: Path, normalise: str | Path | None = None) -> Path | None:
     """The pickle of a zip's VecNormalize: the argument, else one beside the zip, else None."""
     if normalise is not None:
         return Path(normalise)
-    beside = (
+    candidates = (
         path.with_suffix(".pkl"),
         path.with_name(_NORMALISER),
         path.with_suffix("") / _NORMALISER,  # where rl-baselines3-zoo puts it
     )
-    return next((file for file in beside if file.is_file()), None)
+    return next((file for file in candidates if file.is_file()), None)
 
 
 def check_trusted(file: Path, trust: bool) -> None:
@@ -156,7 +156,7 @@ def _read(file: Path) -> tuple[dict[str, Any], Any]:
     return content or {}, (weights or {})["policy"]
 
 
-def _built(file: Path, content: dict[str, Any], weights: Any) -> Any:
+def _build_policy(file: Path, content: dict[str, Any], weights: Any) -> Any:
     """The policy with its weights, without the algorithm and its environments."""
     from stable_baselines3.common.policies import ActorCriticPolicy
 
@@ -165,7 +165,7 @@ def _built(file: Path, content: dict[str, Any], weights: Any) -> Any:
     options.pop("device", None)
     if not isinstance(kind, type):
         raise ValueError(f"{file}: its policy is of no class, but {kind!r}")
-    known_policy(kind)
+    find_actor_reader(kind)
     if issubclass(kind, ActorCriticPolicy):
         options.setdefault("use_sde", bool(content.get("use_sde", False)))
     spaces = content["observation_space"], content["action_space"]
@@ -179,43 +179,44 @@ def _built(file: Path, content: dict[str, Any], weights: Any) -> Any:
     return policy
 
 
-def unpickled(file: Path) -> Any:
+def load_normaliser(file: Path) -> Any:
     """A VecNormalize."""
     from stable_baselines3.common.vec_env import VecNormalize
 
     if not file.is_file():
         raise FileNotFoundError(f"{file}: no such file")
     try:
-        found = pickle.loads(file.read_bytes())
+        normaliser = pickle.loads(file.read_bytes())
     except Exception as error:  # a pickle raises what its maker wrote
         raise ValueError(f"{file} cannot be read as a VecNormalize: {error}") from error
-    if not isinstance(found, VecNormalize):
-        raise ValueError(f"{file} holds a {type(found).__name__}, not a VecNormalize")
-    return found
+    if not isinstance(normaliser, VecNormalize):
+        raise ValueError(f"{file} holds a {type(normaliser).__name__}, not a VecNormalize")
+    return normaliser
 
 
-def _frames(file: Path, space: Any, layout: Sequence[Entry]) -> int:
+def _count_frames(file: Path, space: Any, layout: Sequence[ObservationEntry]) -> int:
     """How many frames of the layout the policy takes; ValueError where it takes something else."""
     if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
         raise ValueError(f"{file} was trained on {space}, not on an observation of one dimension")
     frames, rest = divmod(space.shape[0], len(layout))
-    if frames > 0 and rest == 0 and space == space_of(layout, frames):
+    if frames > 0 and rest == 0 and space == make_space(layout, frames):
         return frames
-    here = ", ".join(entry.name for entry in layout)
+    names = ", ".join(entry.name for entry in layout)
     raise ValueError(
-        f"{file} was trained on {space.shape[0]} numbers{_known(space)}; the observation here has "
-        f"{len(layout)}: {here}. An export (`sideslip export`) reads its entries by name and "
+        f"{file} was trained on {space.shape[0]} numbers{_describe_matching_env(space)}; the "
+        "observation here has "
+        f"{len(layout)}: {names}. An export (`sideslip export`) reads its entries by name and "
         "drives a wider observation too"
     )
 
 
-def _known(space: Any) -> str:
+def _describe_matching_env(space: Any) -> str:
     """The id of ours that has this observation, with the names, as far as there is one."""
     for env_id in [name for name in gym.registry if name.startswith("sideslip/")]:
         try:
-            layout = facts_of(gym.make(env_id)).layout
+            layout = get_env_facts(gym.make(env_id)).layout
         except ModuleNotFoundError:  # of an extra
             continue
-        if space == space_of(layout):
+        if space == make_space(layout):
             return f", those of {env_id}: {', '.join(entry.name for entry in layout)}"
     return " that no environment here has by itself (with an estimator, say which)"

@@ -9,13 +9,13 @@ import numpy.typing as npt
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from ...envs.backend.extras import extra
-from ...envs.task.info import info_of
+from ...envs.backend.extras import require_extra
+from ...envs.task.info import make_info
 from ...envs.vector import StabilityVectorEnv
 from ...estimators.vector.estimate import EstimateObservation
-from .row import Row
+from .row import VecEnvRow
 
-with extra("train", "training needs torch and stable-baselines3"):
+with require_extra("train", "training needs torch and stable-baselines3"):
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
@@ -24,7 +24,7 @@ Indices = int | Iterable[int] | None
 Wrapping = Callable[[VectorEnv[Any, Any, Any]], VectorEnv[Any, Any, Any]]
 
 
-class _Nothing(dict[str, Any]):
+class _EmptyInfo(dict[str, Any]):
     """The info of a row where nothing ended: empty, one for all rows, and closed."""
 
     def _refuse(self, *_: Any, **__: Any) -> NoReturn:
@@ -39,7 +39,7 @@ class _Nothing(dict[str, Any]):
         return dict, ()
 
 
-NOTHING = _Nothing()
+EMPTY_INFO = _EmptyInfo()
 
 
 class NativeVecEnv(VecEnv):
@@ -47,8 +47,8 @@ class NativeVecEnv(VecEnv):
 
     What stable-baselines3 would get of its `DummyVecEnv` around single environments with the same
     seeds, bit for bit, but for one thing: where no episode ends, `infos` holds one empty dict that
-    all rows share (`NOTHING`; it refuses to be written into, `infos` itself is a fresh list). Where
-    one ends, its row has the whole info of the last step, `terminal_observation` and
+    all rows share (`EMPTY_INFO`; it refuses to be written into, `infos` itself is a fresh list).
+    Where one ends, its row has the whole info of the last step, `terminal_observation` and
     `TimeLimit.truncated`. `reset_infos` are those of each row's newest reset.
 
     vector_env: with autoreset in the same step; `make_vec_env` builds one. `get_attr` reads what
@@ -72,7 +72,7 @@ class NativeVecEnv(VecEnv):
                 f"vector env with autoreset_mode='SameStep', not {mode}"
             )
         self.vector_env, self._base = vector_env, base
-        self._rows = [Row(vector_env, i) for i in range(vector_env.num_envs)]
+        self._rows = [VecEnvRow(vector_env, i) for i in range(vector_env.num_envs)]
         self._actions: Any = None
         super().__init__(
             vector_env.num_envs,
@@ -89,10 +89,10 @@ class NativeVecEnv(VecEnv):
     def reset(self) -> Observations:
         """Start an episode in every row, with the seeds and options that were set for it."""
         seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
-        obs, infos = self.vector_env.reset(seed=seeds, options=_merged(self._options))
+        obs, infos = self.vector_env.reset(seed=seeds, options=_merge_options(self._options))
         self._reset_seeds()
         self._reset_options()
-        self._keep(range(self.num_envs), infos)
+        self._store_infos(range(self.num_envs), infos)
         return np.asarray(obs)
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
@@ -108,22 +108,22 @@ class NativeVecEnv(VecEnv):
         actions, self._actions = self._actions, None
         obs, rewards, terminated, truncated, infos = self.vector_env.step(actions)
         dones = terminated | truncated
-        each: list[dict[str, Any]] = [NOTHING] * self.num_envs
+        row_infos: list[dict[str, Any]] = [EMPTY_INFO] * self.num_envs
         if "final_obs" in infos:
             ended = np.flatnonzero(dones).tolist()
-            finals = _rows_of(infos["final_info"], ended)
+            finals = _split_infos(infos["final_info"], ended)
             for i, info in zip(ended, finals, strict=True):
                 info["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
                 info["terminal_observation"] = infos["final_obs"][i]
-                each[i] = info
-            self._keep(ended, infos)
-        return obs, rewards.astype(np.float32), dones, each
+                row_infos[i] = info
+            self._store_infos(ended, infos)
+        return obs, rewards.astype(np.float32), dones, row_infos
 
-    def _keep(self, rows: Sequence[int], infos: Mapping[str, Any]) -> None:
+    def _store_infos(self, rows: Sequence[int], infos: Mapping[str, Any]) -> None:
         """Remember the infos that the resets of these rows returned."""
-        more = {key: each for key, each in infos.items() if "final_" not in key}
-        for i, info in zip(rows, _rows_of(more, rows), strict=True):
-            self.reset_infos[i] = info_of(self._base.reports[i].tolist()) | info
+        reset_infos = {key: value for key, value in infos.items() if "final_" not in key}
+        for i, info in zip(rows, _split_infos(reset_infos, rows), strict=True):
+            self.reset_infos[i] = make_info(self._base.reports[i].tolist()) | info
 
     def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:
         """A frame of each row, of render_mode="rgb_array"."""
@@ -140,27 +140,27 @@ class NativeVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
         """What `Row` tells of each row; AttributeError for a name that is not among it."""
-        return [row.get_wrapper_attr(attr_name) for row in self._chosen(indices)]
+        return [row.get_wrapper_attr(attr_name) for row in self._get_rows(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
         """Keep a value beside the rows; AttributeError for a name that is the environment's."""
-        for row in self._chosen(indices):
+        for row in self._get_rows(indices):
             row.set_wrapper_attr(attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
         """Call a method of `Row` for each row; AttributeError for another."""
-        chosen = [row.get_wrapper_attr(method_name) for row in self._chosen(indices)]
+        chosen = [row.get_wrapper_attr(method_name) for row in self._get_rows(indices)]
         return [method(*method_args, **method_kwargs) for method in chosen]
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Indices = None
     ) -> list[bool]:
         """Whether the rows wear a wrapper: a single one's class stands for its vector twin."""
-        return [row.is_wrapped(wrapper_class) for row in self._chosen(indices)]
+        return [row.is_wrapped(wrapper_class) for row in self._get_rows(indices)]
 
-    def _chosen(self, indices: Indices) -> list[Row]:
+    def _get_rows(self, indices: Indices) -> list[VecEnvRow]:
         return [self._rows[i] for i in self._get_indices(indices)]
 
 
@@ -209,23 +209,25 @@ def make_native_env(
     env: VectorEnv[Any, Any, Any] = gym.make_vec(env_id, num_envs=num_envs, **arguments)
     if estimator is None:
         return env
-    how = dict(estimator) if isinstance(estimator, Mapping) else {"estimator": estimator}
-    return EstimateObservation(env, **how)
+    estimator_options = (
+        dict(estimator) if isinstance(estimator, Mapping) else {"estimator": estimator}
+    )
+    return EstimateObservation(env, **estimator_options)
 
 
-def _rows_of(infos: Mapping[str, Any], rows: Sequence[int]) -> list[dict[str, Any]]:
+def _split_infos(infos: Mapping[str, Any], rows: Sequence[int]) -> list[dict[str, Any]]:
     """A vector env's infos of some rows, as the single env's infos."""
     singles: list[dict[str, Any]] = [{} for _ in rows]
     for key, column in infos.items():
         if not key.startswith("_"):
-            values, there = column[rows].tolist(), infos[f"_{key}"][rows].tolist()
-            for info, value, known in zip(singles, values, there, strict=True):
-                if known:
+            values, is_present = column[rows].tolist(), infos[f"_{key}"][rows].tolist()
+            for info, value, is_set in zip(singles, values, is_present, strict=True):
+                if is_set:
                     info[key] = value
     return singles
 
 
-def _merged(options: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+def _merge_options(options: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """The rows' options as the vector env takes them, None where there are none."""
-    names = dict.fromkeys(name for each in options for name in each)
-    return {name: [each.get(name) for each in options] for name in names} or None
+    names = dict.fromkeys(name for row_options in options for name in row_options)
+    return {name: [row_options.get(name) for row_options in options] for name in names} or None

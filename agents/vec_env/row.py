@@ -6,18 +6,18 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
 
-from ...envs.task.info import info_of
+from ...envs.task.info import make_info
 from ...envs.vehicle.dynamics import Motion
 from ...estimators.vector import estimate as vector
 from ...estimators.vector import truth as truth_vector
 from ...estimators.wrappers import estimate as wrappers
 from ...estimators.wrappers import truth
 
-_OWN = (  # a sequence in the vector env, with an item for each row
+_ROW_ATTRIBUTES = (  # a sequence in the vector env, with an item for each row
     "vehicle", "nominal", "scenario", "record", "held_speed", "slow_sensors", "motion",
     "estimator", "np_random", "np_random_seed",
 )  # fmt: skip
-_SHARED = (
+_SHARED_ATTRIBUTES = (
     "layout", "control_period", "reference", "dt", "setting", "spec", "render_mode", "metadata",
 )  # fmt: skip
 _SPACES = ("observation_space", "action_space")
@@ -28,17 +28,18 @@ _TWINS: dict[type, type] = {
 }
 
 
-class Row:
+class VecEnvRow:
     """Row i of a vector env: its attributes are those of the single env of the same name.
 
-    Attributes: those of `_OWN`, `_SHARED` and `_SPACES`, the methods, and what was set here.
+    Attributes: those of `_ROW_ATTRIBUTES`, `_SHARED_ATTRIBUTES` and `_SPACES`, the methods, and
+    what was set here.
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any], i: int) -> None:
         self._env, self._i = env, i
         self._set: dict[str, Any] = {}
 
-    def _layers(self) -> Iterator[VectorEnv[Any, Any, Any]]:
+    def _iterate_layers(self) -> Iterator[VectorEnv[Any, Any, Any]]:
         """From the outermost to the bare vector env."""
         layer = self._env
         while isinstance(layer, VectorWrapper):
@@ -52,16 +53,16 @@ class Row:
             return self._set[name]
         if name in _METHODS:
             return getattr(self, name)
-        there = f"single_{name}" if name in _SPACES else name
-        if name in (*_OWN, *_SHARED, *_SPACES):
-            for layer in self._layers():
-                if there in vars(layer) or hasattr(type(layer), there):
-                    value = getattr(layer, there)
-                    return self._own(name, value) if name in _OWN else value
-        known = (*_OWN, *_SHARED, *_SPACES, *_METHODS, *self._set)
+        attribute = f"single_{name}" if name in _SPACES else name
+        if name in (*_ROW_ATTRIBUTES, *_SHARED_ATTRIBUTES, *_SPACES):
+            for layer in self._iterate_layers():
+                if attribute in vars(layer) or hasattr(type(layer), attribute):
+                    value = getattr(layer, attribute)
+                    return self._get_row_value(name, value) if name in _ROW_ATTRIBUTES else value
+        known = (*_ROW_ATTRIBUTES, *_SHARED_ATTRIBUTES, *_SPACES, *_METHODS, *self._set)
         raise AttributeError(f"a row of a vector env has {', '.join(known)}; not {name!r}")
 
-    def _own(self, name: str, value: Any) -> Any:
+    def _get_row_value(self, name: str, value: Any) -> Any:
         return Motion(*value[self._i].tolist()) if name == "motion" else value[self._i]
 
     def has_wrapper_attr(self, name: str) -> bool:
@@ -86,13 +87,13 @@ class Row:
     ) -> tuple[Any, dict[str, Any]]:
         """Start a new episode in this row alone; its observation (k,) and info."""
         mask = np.arange(self._env.num_envs) == self._i
-        seeds: Any = [seed if mine else None for mine in mask]
+        seeds: Any = [seed if is_row else None for is_row in mask]
         more = {name: [value] * len(mask) for name, value in (options or {}).items()}
         obs, _ = self._env.reset(seed=seeds, options={**more, "reset_mask": mask})
         base: Any = self._env.unwrapped
-        return obs[self._i], info_of(base.reports[self._i].tolist())
+        return obs[self._i], make_info(base.reports[self._i].tolist())
 
     def is_wrapped(self, wrapper_class: type) -> bool:
         """Whether one of the layers is of this class, or the twin of this single wrapper."""
         wanted = _TWINS.get(wrapper_class, wrapper_class)
-        return any(isinstance(layer, wanted) for layer in self._layers())
+        return any(isinstance(layer, wanted) for layer in self._iterate_layers())

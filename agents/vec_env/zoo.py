@@ -12,65 +12,67 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.extras import extra
-from ...envs.backend.files import whole, write_whole
+from ...envs.backend.extras import require_extra
+from ...envs.backend.files import atomic_file, write_atomic
 from ...envs.record import Array
 
 EVALUATIONS = "evaluations.npz"
 WRAPPER = "sideslip.estimators.EstimateObservation"
 
 
-def name_of(env_id: str) -> str:
+def make_file_name(env_id: str) -> str:
     """The id as a file's name."""
     return env_id.replace("/", "-")
 
 
-def next_folder(logs: Path, algo: str, env_id: str) -> Path:
+def find_next_folder(logs: Path, algo: str, env_id: str) -> Path:
     """Where the next training belongs; algo: as the zoo calls it."""
-    numbered = re.compile(re.escape(name_of(env_id)) + r"_(\d+)")
-    there = (logs / algo).iterdir() if (logs / algo).is_dir() else ()
-    taken = [int(found[1]) for each in there if (found := numbered.fullmatch(each.name))]
-    return logs / algo / f"{name_of(env_id)}_{max(taken, default=0) + 1}"
+    numbered = re.compile(re.escape(make_file_name(env_id)) + r"_(\d+)")
+    entries = (logs / algo).iterdir() if (logs / algo).is_dir() else ()
+    taken = [int(match[1]) for path in entries if (match := numbered.fullmatch(path.name))]
+    return logs / algo / f"{make_file_name(env_id)}_{max(taken, default=0) + 1}"
 
 
 def describe(
-    folder: Path, settings: Mapping[str, Any], around: Any, arguments: Mapping[str, Any]
+    folder: Path, settings: Mapping[str, Any], estimator_kwargs: Any, arguments: Mapping[str, Any]
 ) -> None:
     """Make the folder, with all that `enjoy` asks for before it loads a model.
 
     settings: in the zoo's format; `normalize` is none of the model's, whose scales are its own.
-    around: arguments of `EstimateObservation`, or None. arguments: of the command line, "env" and
-    "env_kwargs" among them. All in JSON types.
+    estimator_kwargs: arguments of `EstimateObservation`, or None. arguments: of the command line,
+    "env" and "env_kwargs" among them. All in JSON types.
     """
-    with extra("train", "a folder of the zoo's needs {}"):
+    with require_extra("train", "a folder of the zoo's needs {}"):
         import yaml
     config = dict(settings) | {"normalize": False}
-    if around is not None:
-        config["env_wrapper"] = [{WRAPPER: around}]
-    place = folder / name_of(arguments["env"])
+    if estimator_kwargs is not None:
+        config["env_wrapper"] = [{WRAPPER: estimator_kwargs}]
+    place = folder / make_file_name(arguments["env"])
     place.mkdir(parents=True)
     for name, content in (("config.yml", config), ("args.yml", dict(arguments))):
-        write_whole(place / name, yaml.safe_dump(content).encode())
+        write_atomic(place / name, yaml.safe_dump(content).encode())
 
 
-def leave(folder: Path, env_id: str, model: Any, costs: Array, lengths: Array) -> None:
+def write_evaluation(folder: Path, env_id: str, model: Any, costs: Array, lengths: Array) -> None:
     """Keep an evaluation's model and its episodes' costs and steps, where the folder is the zoo's.
 
     A later evaluation than this one, of a training that was stopped before its checkpoint, goes.
     """
-    if not (folder / name_of(env_id)).is_dir():
+    if not (folder / make_file_name(env_id)).is_dir():
         return
-    with whole(folder / f"{name_of(env_id)}.zip") as file:
+    with atomic_file(folder / f"{make_file_name(env_id)}.zip") as file:
         model.save(file)
-    now: dict[str, Any] = {
+    evaluation: dict[str, Any] = {
         "timesteps": np.array([model.num_timesteps]),
         "results": -costs[None],
         "ep_lengths": lengths[None].astype(np.int64),
     }
     path = folder / EVALUATIONS
     if path.exists():
-        with np.load(path, allow_pickle=False) as found:
-            before = found["timesteps"] < model.num_timesteps
-            now = {name: np.concatenate([found[name][before], now[name]]) for name in now}
-    with whole(path) as file:
-        np.savez(file, **now)
+        with np.load(path, allow_pickle=False) as saved:
+            before = saved["timesteps"] < model.num_timesteps
+            evaluation = {
+                name: np.concatenate([saved[name][before], evaluation[name]]) for name in evaluation
+            }
+    with atomic_file(path) as file:
+        np.savez(file, **evaluation)

@@ -9,9 +9,9 @@ from rich.console import Console
 from rich.table import Table
 
 from ...envs.arguments import check_choice
-from ..harness.engines import PROCESSES, engine
-from .options import Address, EngineName, command_line
-from .output import check_files, explain_interrupt, wrote
+from ..harness.engines import PROCESSES, use_engine
+from .options import Address, EngineName, get_command_line
+from .output import check_files, handle_interrupt, print_written
 
 
 def calibrate_command(
@@ -30,28 +30,32 @@ def calibrate_command(
     A stopped run goes on where it was when the same command runs again in the same folder. `bench
     control --clairvoyant FILE` reads the file.
     """
-    from ..control.calibration import FILE, calibrate, cases_of, forget, update
-    from ..control.contests import contests
+    from ..control.calibration import FILE, calibrate, make_cases, remove_cases, update
+    from ..control.contests import list_scored_tasks
 
     path = FILE if write else out
     check_files(json=path)
-    known = {each.name: each for each in contests()}
+    known = {item.name: item for item in list_scored_tasks()}
     for name in contest or []:
         check_choice("contest", name, known)
-    asked = [known[name] for name in contest or known]
+    tasks = [known[name] for name in contest or known]
     console, folder = Console(), Path(f".{path.name}.cases").absolute()
-    left = sum(not each.path.exists() for each in cases_of(asked, folder, seeds))
-    text = f"{left} of {len(asked) * seeds} episodes are left; the same command goes on if stopped."
+    remaining = sum(not item.path.exists() for item in make_cases(tasks, folder, seeds))
+    n_episodes = len(tasks) * seeds
+    text = f"{remaining} of {n_episodes} episodes are left; the same command goes on if stopped."
     console.print(text, highlight=False)
-    with engine(engine_name, address), explain_interrupt("run the same command in the same folder"):
-        made = calibrate(asked, folder, seeds, command_line(), jobs, console)
-    update(path, made)
-    forget(cases_of(asked, folder, seeds))
+    with (
+        use_engine(engine_name, address),
+        handle_interrupt("run the same command in the same folder"),
+    ):
+        records = calibrate(tasks, folder, seeds, get_command_line(), jobs, console)
+    update(path, records)
+    remove_cases(make_cases(tasks, folder, seeds))
     table = Table("contest", "none", "clairvoyant", "a plan wins")
-    for entry in made:
-        none = np.mean([episode.costs["none"] for episode in entry.episodes])
-        wins = sum(episode.winner.startswith("from") for episode in entry.episodes)
-        best = f"{entry.costs.mean():.4g}"
-        table.add_row(entry.contest.name, f"{none:.4g}", best, f"{wins} of {seeds}")
+    for record in records:
+        none = np.mean([episode.costs["none"] for episode in record.episodes])
+        wins = sum(episode.winner.startswith("from") for episode in record.episodes)
+        best = f"{record.costs.mean():.4g}"
+        table.add_row(record.task.name, f"{none:.4g}", best, f"{wins} of {seeds}")
     console.print(table)
-    wrote(console, path)
+    print_written(console, path)

@@ -8,7 +8,7 @@ import typer
 from .names import complete
 
 if TYPE_CHECKING:
-    from ..entrants.challenge import Challenge
+    from ..entrants.challenge import ComparisonRequest
 
 Agents = Annotated[
     list[str] | None,
@@ -32,7 +32,7 @@ Fresh = Annotated[
 Limit = Annotated[float, typer.Option(help="s of wall time for a contestant in a contest.")]
 
 
-def challenge_of(
+def make_request(
     suites: Sequence[str],
     agents: Sequence[str],
     estimators: Sequence[str],
@@ -45,7 +45,7 @@ def challenge_of(
     episodes: int | None,
     quick: bool,
     trust: bool,
-) -> "Challenge | None":
+) -> "ComparisonRequest | None":
     """The challenge of a command line, None without contestants; ValueError for options that go
     with them alone, or with the suite `control` alone."""
     if not (agents or estimators):
@@ -55,12 +55,14 @@ def challenge_of(
     if list(suites) not in ([], ["control"]):
         raise ValueError("--agent and --estimator go with the suite control alone")
     from ..control.cells import QUICK_EPISODES
-    from ..entrants.challenge import EPISODES, Challenge, pairs_of
+    from ..entrants.challenge import EPISODES, ComparisonRequest, make_user_entries
 
-    pairs = pairs_of(agents, ["" if each == "none" else each for each in estimators], trust)
+    pairs = make_user_entries(
+        agents, ["" if name == "none" else name for name in estimators], trust
+    )
     if not pairs:
         raise ValueError("--estimator none goes with --agent")
-    driven = episodes or (QUICK_EPISODES if quick else EPISODES)
-    return Challenge(
-        tuple(pairs), vehicle, tuple(scenarios), env_id, driven, None, fresh, salt, limit
+    n_episodes = episodes or (QUICK_EPISODES if quick else EPISODES)
+    return ComparisonRequest(
+        tuple(pairs), vehicle, tuple(scenarios), env_id, n_episodes, None, fresh, salt, limit
     )

@@ -6,18 +6,18 @@ from typing import Any
 import gymnasium as gym
 
 from ...agents import make_agent
-from ...agents.env_facts import made
-from ...estimators.wrappers.arguments import usual_estimator
+from ...agents.env_facts import make_env
+from ...estimators.wrappers.arguments import choose_estimator
 from ...estimators.wrappers.estimate import EstimateObservation
-from ..control.build import outputs_for
-from ..harness.drives import quietly
+from ..control.build import list_outputs
+from ..harness.drives import call_quietly
 from .names import check_env
 
 _USUAL = ("sideslip/YawVision-v0", "sideslip/AfsYawFusion-v0")
 
 
 @dataclass(frozen=True)
-class Contestant:
+class AgentSpec:
     """The names of an agent and its estimator (None: without one), and their options.
 
     trust: whether a policy's zip may be read, which runs code of its maker's.
@@ -29,31 +29,33 @@ class Contestant:
     estimator_options: dict[str, Any]
     trust: bool = False
 
-    def on(self, env_id: str | None, options: dict[str, Any]) -> tuple[gym.Env[Any, Any], Any]:
+    def build(self, env_id: str | None, options: dict[str, Any]) -> tuple[gym.Env[Any, Any], Any]:
         """(the env with the estimator, the agent), on the first of the usual ids that fits.
 
         options: of the env. Raises ValueError or TypeError for what is unknown or does not fit.
         """
         if env_id is not None:
             check_env(env_id)
-            return self._built(env_id, options)
+            return self._build(env_id, options)
         first, *others = _USUAL
         try:
-            return self._built(first, options)
+            return self._build(first, options)
         except ValueError:
             for other in others:
                 try:
-                    return self._built(other, options)
+                    return self._build(other, options)
                 except (TypeError, ValueError):
                     continue
             raise
 
-    def _built(self, env_id: str, options: dict[str, Any]) -> tuple[gym.Env[Any, Any], Any]:
-        env = made(env_id, options)
+    def _build(self, env_id: str, options: dict[str, Any]) -> tuple[gym.Env[Any, Any], Any]:
+        env = make_env(env_id, options)
         sensors = env.get_wrapper_attr("slow_sensors")
         if self.estimator is not None:
-            outputs, own = outputs_for(self.estimator), self.estimator_options
-            env = quietly(EstimateObservation, env, self.estimator, outputs, options=own or None)
+            outputs, filter_options = list_outputs(self.estimator), self.estimator_options
+            env = call_quietly(
+                EstimateObservation, env, self.estimator, outputs, options=filter_options or None
+            )
         elif self.estimator_options:
             raise ValueError("--estimator-option needs --estimator")
         try:
@@ -62,6 +64,6 @@ class Contestant:
             if self.estimator is None and "_hat" in str(error):
                 raise ValueError(
                     f"{self.agent} works on an estimate: add --estimator, for example "
-                    f"--estimator {usual_estimator(sensors)}"
+                    f"--estimator {choose_estimator(sensors)}"
                 ) from None
             raise

@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from ..harness.parallel import one_bar
-from .export import Trust, as_policy, sizes_of
-from .output import check_files, show_episode, write_output, wrote
+from ..harness.parallel import use_shared_bar
+from .export import Trust, describe_sizes, export_policy
+from .output import check_files, print_written, show_episode, write_output
 
 if TYPE_CHECKING:
     from ...agents.learned.files import Policy
@@ -45,31 +45,31 @@ def enjoy_command(
     A zip drives the id that it was trained on (--env); `sideslip export` takes further options.
     """
     from ...agents.learned.files import load_policy
-    from ..control.figures import contestant_of, run_of
-    from ..policies import enjoy, suite_of
-    from ..report.film import Driver, check_film, film
+    from ..control.figures import make_env_and_agent, run_entry
+    from ..policies import evaluate_policy, make_suite
+    from ..report.film import FilmDriver, check_film, write_film
 
     console = Console()
     check_files(html=html, json=json, parquet=parquet, plot=plot)
     check_film(video)
-    with as_policy(policy, env, trust) as path:
+    with export_policy(policy, env, trust) as path:
         if card:
             _show_card(console, load_policy(path))
             return
-        with one_bar(console, f"enjoy {policy}"):
-            found = enjoy(path, episodes, env_id=env, scenario=scenario, seed=seed)
-        write_output(console, [suite_of(found)], html, json, parquet)
-        first = found.cells[found.policy.name]
-        show_episode(console, run_of(first, found.seeds[0]), found.policy.name, plot)
+        with use_shared_bar(console, f"enjoy {policy}"):
+            evaluation = evaluate_policy(path, episodes, env_id=env, scenario=scenario, seed=seed)
+        write_output(console, [make_suite(evaluation)], html, json, parquet)
+        first = evaluation.entries[evaluation.policy.name]
+        show_episode(console, run_entry(first, evaluation.seeds[0]), evaluation.policy.name, plot)
         if video is not None:
-            cars = (found.policy.name, first), ("no control", found.cells["none"])
-            film(
+            cars = (evaluation.policy.name, first), ("no control", evaluation.entries["none"])
+            write_film(
                 video,
-                [Driver(name, *contestant_of(cell)) for name, cell in cars],
-                found.seeds[0],
+                [FilmDriver(name, *make_env_and_agent(entry)) for name, entry in cars],
+                evaluation.seeds[0],
                 console,
             )
-            wrote(console, video)
+            print_written(console, video)
 
 
 def _show_card(console: Console, policy: "Policy") -> None:
@@ -80,7 +80,7 @@ def _show_card(console: Console, policy: "Policy") -> None:
     fields = asdict(policy.card) | {
         "observation": ", ".join(f"{name} / {unit}" for name, unit in policy.card.observation),
         "not read": ", ".join(unread) or "none",
-        "network": f"{sizes_of(network)}, {network.activation}, {network.output} output",
+        "network": f"{describe_sizes(network)}, {network.activation}, {network.output} output",
         "observation clipped at": network.clip,
     }
     table = Table("field", "value", box=box.SIMPLE_HEAD, title=policy.name, title_justify="left")
@@ -89,16 +89,19 @@ def _show_card(console: Console, policy: "Policy") -> None:
     console.print(table)
 
 
-def judged(file: Path, kind: str, episodes: int) -> Table:
+def make_task_table(file: Path, kind: str, episodes: int) -> Table:
     """What a policy costs in each contest of its class; its card has it too."""
-    from ..distillation import judge
+    from ..distillation import evaluate_card
 
     table = Table("contest", "in % of nominal", "adaptive-nmpc", "better", "fails")
-    with one_bar(Console(), f"judge {file}"):
-        written = judge(file, kind, episodes)
-    for contest, found in written["cost in % of nominal"].items():
-        own, rival = found["policy"], found["adaptive-nmpc"]
-        better, fails = found["better than adaptive-nmpc"][0], found["fails"]
-        numbers = f"{own[0]:.0f} [{own[1]:.0f}, {own[2]:.0f}]", f"{rival[0]:.0f}"
-        table.add_row(contest, *numbers, f"{100.0 * better:.0f} %", f"{100.0 * fails:.0f} %")
+    with use_shared_bar(Console(), f"judge {file}"):
+        written = evaluate_card(file, kind, episodes)
+    for task, record in written["cost in % of nominal"].items():
+        policy_cost, rival_cost = record["policy"], record["adaptive-nmpc"]
+        better, fails = record["better than adaptive-nmpc"][0], record["fails"]
+        numbers = (
+            f"{policy_cost[0]:.0f} [{policy_cost[1]:.0f}, {policy_cost[2]:.0f}]",
+            f"{rival_cost[0]:.0f}",
+        )
+        table.add_row(task, *numbers, f"{100.0 * better:.0f} %", f"{100.0 * fails:.0f} %")
     return table

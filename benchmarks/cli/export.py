@@ -10,8 +10,8 @@ import typer
 from rich.console import Console
 
 from ..harness.results import check_writable
-from .options import command_line, options_of
-from .output import wrote
+from .options import get_command_line, parse_options
+from .output import print_written
 
 if TYPE_CHECKING:
     from ...estimators.learned.network import Network
@@ -39,25 +39,26 @@ def export_command(
     trust: Trust = False,
 ) -> None:
     """Make a policy's file of a zip: weights and a card, which no reader has to trust."""
-    from ...agents.training.zips import export_zip, normaliser_of
+    from ...agents.training.zips import export_zip, find_normaliser
 
     target = out or zipped.with_suffix(".safetensors")
     check_writable(target)
-    options = options_of(option)
+    options = parse_options(option)
     policy = export_zip(
         zipped, target, env, options, estimator,
-        trust=trust, normalise=normalise, command=command_line(),
+        trust=trust, normalise=normalise, command=get_command_line(),
     )  # fmt: skip
-    console, scaled = Console(soft_wrap=True), normaliser_of(zipped, normalise)
+    console, scaled = Console(soft_wrap=True), find_normaliser(zipped, normalise)
     console.print(
-        f"network: {sizes_of(policy.network)}; observations normalised by: {scaled or 'nothing'}",
+        f"network: {describe_sizes(policy.network)}; observations normalised by: "
+        f"{scaled or 'nothing'}",
         markup=False,
         highlight=False,
     )
-    wrote(console, target)
+    print_written(console, target)
 
 
-def sizes_of(network: "Network") -> str:
+def describe_sizes(network: "Network") -> str:
     """What an observation goes through, as "22 x 3 frames x 16 lstm x 64 x 1"."""
     frames = [f"{network.history} frames"] if network.history > 1 else []
     cells = [f"{cell.size} {cell.kind}" for cell in network.cells]
@@ -66,7 +67,7 @@ def sizes_of(network: "Network") -> str:
 
 
 @contextmanager
-def as_policy(name: str, env: str | None, trust: bool) -> Iterator[str]:
+def export_policy(name: str, env: str | None, trust: bool) -> Iterator[str]:
     """A policy's name or path as it is; a zip as the path of its export, for the time being."""
     if not name.endswith(".zip"):
         yield name

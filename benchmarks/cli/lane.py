@@ -10,11 +10,11 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from ...envs.backend.extras import extra
-from ...envs.backend.files import whole, write_whole
+from ...envs.backend.extras import require_extra
+from ...envs.backend.files import atomic_file, write_atomic
 from ...envs.documents import read_document, write_document
-from ..harness.parallel import one_bar
-from .output import check_files, wrote
+from ..harness.parallel import use_shared_bar
+from .output import check_files, print_written
 
 if TYPE_CHECKING:
     from ...envs.sensors.camera.finder import Lane, LaneFinder
@@ -50,7 +50,7 @@ def lane_command(
     lane of the width stated; without intrinsics a lens of usual width is assumed.
     """
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(LARGEST))  # read where it is loaded
-    with extra("vision", "the lane finder needs {}"):
+    with require_extra("vision", "the lane finder needs {}"):
         import cv2
     from ...envs.sensors.camera.films import PICTURES, Film, read_picture
 
@@ -72,15 +72,15 @@ def lane_command(
             picture = read_picture(source)
         except cv2.error:
             raise ValueError(f"{source}: expected a picture of at most {LARGEST} pixels") from None
-        finder = _finder([picture], intrinsics, lane_width, source)
-        lanes, seconds = _still(picture, finder, out)
+        finder = _make_finder([picture], intrinsics, lane_width, source)
+        lanes, seconds = _process_picture(picture, finder, out)
     else:
         film = Film(source)
-        finder = _finder(film.head(TRIES), intrinsics, lane_width, source)
-        lanes, seconds = _film(film, finder, out, console)
-        if len(lanes) < film.promised:
+        finder = _make_finder(film.read_head(TRIES), intrinsics, lane_width, source)
+        lanes, seconds = _process_film(film, finder, out, console)
+        if len(lanes) < film.frame_count:
             console.print(
-                f"the film ends after {len(lanes)} of the {film.promised} frames it promises"
+                f"the film ends after {len(lanes)} of the {film.frame_count} frames it promises"
             )
     _report(console, source, finder.camera, lanes, seconds)
     if json is not None:
@@ -88,40 +88,46 @@ def lane_command(
         write_document(json, {"source": str(source), "frames": frames})
     for path in (out, json):
         if path is not None:
-            wrote(console, path)
+            print_written(console, path)
 
 
 def _calibrate(folder: Path, path: Path, console: Console) -> None:
     """Write the intrinsics that a folder's chessboards give."""
-    from ...envs.sensors.camera.chessboard import calibrated
+    from ...envs.sensors.camera.chessboard import calibrate_camera
     from ...envs.sensors.camera.films import PICTURES
 
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: there is no such folder")
     check_files(json=path)
-    boards = sorted(each for each in folder.iterdir() if each.suffix.lower() in PICTURES)
-    camera, error = calibrated(boards)
+    boards = sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURES)
+    camera, error = calibrate_camera(boards)
     write_document(path, {"K": camera.K, "dist": camera.dist, "size": camera.size, "rms_px": error})
     console.print(f"corners within {error:.2f} px rms in {len(boards)} pictures", highlight=False)
-    wrote(console, path)
+    print_written(console, path)
 
 
-def _finder(
+def _make_finder(
     pictures: "list[Image]", intrinsics: Path | None, lane_width: float, source: Path
 ) -> "LaneFinder":
     """A finder for the camera of some pictures, the first of which that can shows its mounting.
 
     Raises ValueError for intrinsics of another size, and where no picture shows a lane.
     """
-    from ...envs.sensors.camera.analytic import View
+    from ...envs.sensors.camera.analytic import FieldOfView
     from ...envs.sensors.camera.finder import LaneFinder
-    from ...envs.sensors.camera.mounting import FAR, HEADING, NEAR, default_camera, mounted
+    from ...envs.sensors.camera.mounting import (
+        FAR,
+        HEADING,
+        NEAR,
+        estimate_mounting,
+        make_default_camera,
+    )
     from ...envs.sensors.camera.pinhole import Pinhole
 
     height, width = pictures[0].shape[:2]
     known: Any = {}
     if intrinsics is None:
-        camera = default_camera((width, height))
+        camera = make_default_camera((width, height))
     else:
         try:
             camera, known = Pinhole.read(intrinsics), read_document(intrinsics, "camera")
@@ -135,20 +141,22 @@ def _finder(
     failed = None
     for picture in pictures if not {"height", "tilt"} <= known.keys() else ():
         try:
-            camera, failed = mounted(camera, picture, lane_width), None
+            camera, failed = estimate_mounting(camera, picture, lane_width), None
             break
         except ValueError as error:
             failed = error
     if failed is not None:
         raise ValueError(f"{source}: {failed}")
-    return LaneFinder(camera, lane_width, NEAR, FAR, view=View(HEADING, 0.5 * lane_width))
+    return LaneFinder(camera, lane_width, NEAR, FAR, view=FieldOfView(HEADING, 0.5 * lane_width))
 
 
-def _still(picture: "Image", finder: "LaneFinder", out: Path | None) -> tuple[list["Lane"], float]:
+def _process_picture(
+    picture: "Image", finder: "LaneFinder", out: Path | None
+) -> tuple[list["Lane"], float]:
     """(lanes, seconds a picture) of a picture, which is drawn; the fastest of some runs."""
     import cv2
 
-    from ...envs.sensors.camera.films import drawn
+    from ...envs.sensors.camera.films import draw_lane
 
     lane, seconds = finder.find(picture), np.inf
     for _ in range(10):
@@ -156,35 +164,35 @@ def _still(picture: "Image", finder: "LaneFinder", out: Path | None) -> tuple[li
         finder.find(picture)
         seconds = min(seconds, time.thread_time() - began)
     if out is not None:
-        _, data = cv2.imencode(out.suffix.lower(), drawn(picture, finder, lane))
-        write_whole(out, data.tobytes())
+        _, data = cv2.imencode(out.suffix.lower(), draw_lane(picture, finder, lane))
+        write_atomic(out, data.tobytes())
     return [lane], seconds
 
 
-def _film(
+def _process_film(
     film: Any, finder: "LaneFinder", out: Path | None, console: Console
 ) -> tuple[list["Lane"], float]:
     """(lanes, seconds a picture, the median) of a film, which is drawn."""
     import cv2
 
-    from ...envs.sensors.camera.films import drawn
+    from ...envs.sensors.camera.films import draw_lane
 
     lanes, times = [], []
-    with TemporaryDirectory() as folder, one_bar(console, "lane", "pictures") as bar:
+    with TemporaryDirectory() as folder, use_shared_bar(console, "lane", "pictures") as bar:
         part = Path(folder, f"lane{out.suffix.lower() if out else '.avi'}")
         writer = None
         if out is not None:
             code = cv2.VideoWriter.fourcc(*("mp4v" if part.suffix == ".mp4" else "MJPG"))
             writer = cv2.VideoWriter(str(part), code, film.rate, finder.camera.size)
-        for picture in bar.track(film, film.promised or None, task_id=bar.task_ids[0]):
+        for picture in bar.track(film, film.frame_count or None, task_id=bar.task_ids[0]):
             began = time.thread_time()
             lanes.append(finder.find(picture))
             times.append(time.thread_time() - began)
             if writer is not None:
-                writer.write(drawn(picture, finder, lanes[-1]))
+                writer.write(draw_lane(picture, finder, lanes[-1]))
         if writer is not None and out is not None:
             writer.release()
-            with whole(out) as file:
+            with atomic_file(out) as file:
                 file.write(part.read_bytes())
     return lanes, float(np.median(times))
 
@@ -193,21 +201,21 @@ def _report(
     console: Console, source: Path, camera: "Pinhole", lanes: list["Lane"], seconds: float
 ) -> None:
     """Print what was found."""
-    from ...envs.sensors.camera.films import described
+    from ...envs.sensors.camera.films import describe_lane
 
-    found = [lane for lane in lanes if lane.quality > 0.0]
+    detected = [lane for lane in lanes if lane.quality > 0.0]
     if len(lanes) == 1:
-        lines = [f"{source.name}: {described(lanes[0])}"]
+        lines = [f"{source.name}: {describe_lane(lanes[0])}"]
     else:
-        lines = [f"{source.name}: a lane in {len(found)} of {len(lanes)} frames"]
-        if found:
+        lines = [f"{source.name}: a lane in {len(detected)} of {len(lanes)} frames"]
+        if detected:
             psi, offset = (
-                np.array([getattr(lane, name) for lane in found]) for name in ("psi", "y")
+                np.array([getattr(lane, name) for lane in detected]) for name in ("psi", "y")
             )
             lines.append(
                 f"psi {np.degrees(psi.mean()):+.2f} deg (sd {np.degrees(psi.std()):.2f}), offset "
                 f"{offset.mean():+.2f} m (sd {offset.std():.2f}), quality "
-                f"{np.mean([lane.quality for lane in found]):.2f}"
+                f"{np.mean([lane.quality for lane in detected]):.2f}"
             )
     lines.append(
         f"camera {camera.height:.2f} m high, tilted {np.degrees(camera.tilt):+.2f} deg; "

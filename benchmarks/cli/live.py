@@ -17,15 +17,15 @@ from rich.console import Console
 from rich.markup import escape
 
 from ...envs.arguments import check_choice
-from ...envs.backend.files import write_whole
-from ..harness.verdict import verdict
+from ...envs.backend.files import write_atomic
+from ..harness.verdict import format_verdict
 from .export import Trust
 from .names import check_env, complete
-from .options import options_of
-from .output import check_files, show_episode, wrote
+from .options import parse_options
+from .output import check_files, print_written, show_episode
 
 if TYPE_CHECKING:
-    from ...agents.live.onboard import Onboard
+    from ...agents.live.onboard import OnboardController
 
 _Options = list[str] | None
 _Text = str | None
@@ -77,39 +77,39 @@ def live_command(
 
     With --simulate a simulated car is at the other end; without an ESTIMATOR it is alone.
     """
-    from ...agents.live.port import LOOPBACK, address_of
+    from ...agents.live.port import LOOPBACK, parse_address
 
     check_files(json=json)
-    target = address_of(to) if to else (LOOPBACK, port)
+    target = parse_address(to) if to else (LOOPBACK, port)
     chosen = {"scenario": scenario, "vehicle": vehicle, "control_period": control_period}
     options = {name: value for name, value in chosen.items() if value is not None}
     setup: dict[str, Any] = {
         "estimator": estimator,
         "agent": agent,
         "env": env,
-        "options": options | options_of(option),
-        "agent_options": options_of(agent_option),
-        "estimator_options": options_of(estimator_option),
+        "options": options | parse_options(option),
+        "agent_options": parse_options(agent_option),
+        "estimator_options": parse_options(estimator_option),
         "seed": seed,
     }
     if relay is not None:
-        _relay(relay, target, latency, speed, duration, json)
+        _run_relay(relay, target, latency, speed, duration, json)
     elif replay is not None:
         _replay(replay, setup, trust, json)
     elif estimator is not None:
         web = None if page is None else (host, page)
-        everyone = [address_of(each) for each in publish or []]
+        subscribers = [parse_address(text) for text in publish or []]
         receiver = None if gps is None else (gps, latency)
-        ends = _Ends((host, port), everyone, web, receiver, simulate, speed, step, trust)
-        _live(setup, ends, duration, record, json)
+        ends = _Connections((host, port), subscribers, web, receiver, simulate, speed, step, trust)
+        _run_live(setup, ends, duration, record, json)
     elif simulate:
-        _drive(env or "sideslip/YawVision-v0", setup, target, step, speed)
+        _run_simulation(env or "sideslip/YawVision-v0", setup, target, step, speed)
     else:
         raise ValueError("name an ESTIMATOR, or --simulate, --relay or --replay")
 
 
 @dataclass
-class _Ends:
+class _Connections:
     """What the loop is connected to. bound, page: (host, port). receiver: (source, latency)."""
 
     bound: tuple[str, int]
@@ -122,45 +122,49 @@ class _Ends:
     trust: bool
 
 
-def _contestant(setup: dict[str, Any], trust: bool) -> tuple[Any, Any]:
+def _make_env_and_agent(setup: dict[str, Any], trust: bool) -> tuple[Any, Any]:
     names = setup["agent"], setup["agent_options"], setup["estimator"], setup["estimator_options"]
-    from .contestant import Contestant
+    from .contestant import AgentSpec
 
-    return Contestant(*names, trust).on(setup["env"], setup["options"])
-
-
-def _onboard(setup: dict[str, Any], trust: bool) -> "Onboard":
-    from ...agents.live.onboard import Onboard
-
-    return Onboard(*_contestant(setup, trust), setup["seed"])
+    return AgentSpec(*names, trust).build(setup["env"], setup["options"])
 
 
-def _stopping() -> list[int]:
+def _make_controller(setup: dict[str, Any], trust: bool) -> "OnboardController":
+    from ...agents.live.onboard import OnboardController
+
+    return OnboardController(*_make_env_and_agent(setup, trust), setup["seed"])
+
+
+def _watch_signals() -> list[int]:
     """A list that a signal to end fills."""
     signals: list[int] = []
-    for each in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(each, lambda number, _: signals.append(number))
+    for signal_number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signal_number, lambda number, _: signals.append(number))
     return signals
 
 
-def _live(
-    setup: dict[str, Any], ends: _Ends, duration: float, record: Path | None, json: Path | None
+def _run_live(
+    setup: dict[str, Any],
+    ends: _Connections,
+    duration: float,
+    record: Path | None,
+    json: Path | None,
 ) -> None:
     """The loop with all that is connected to it, and what it measured."""
-    from ...agents.live.assemble import PATIENCE, Assembler
+    from ...agents.live.assemble import PATIENCE, StreamSynchroniser
     from ...agents.live.loop import Loop
     from ...agents.live.port import Port
     from ...agents.live.relay import Relay
     from ...agents.live.session import Recorder
-    from ...agents.live.simulate import Other
+    from ...agents.live.simulate import SimulatedCarProcess
     from ...agents.live.viewer import Viewer
 
     patience = None if ends.step else round(PATIENCE / min(ends.speed, 1.0))
     with ExitStack() as stack:
         port = stack.enter_context(Port(*ends.bound))
-        onboard = _onboard(setup, ends.trust)
+        onboard = _make_controller(setup, ends.trust)
         setup["env"] = onboard.base.spec.id
-        loop = Loop(onboard, Assembler(patience), port, ends.publish, step=ends.step)
+        loop = Loop(onboard, StreamSynchroniser(patience), port, ends.publish, step=ends.step)
         if ends.page is not None or console.is_terminal:
             title = f"{setup['estimator']}, {setup['agent']}"
             viewer = stack.enter_context(Viewer(title, ends.page, console.is_terminal))
@@ -168,9 +172,9 @@ def _live(
             console.print(viewer.url and f"page: {viewer.url}")
         other = None
         if ends.simulate:
-            asked = setup["env"], setup["options"], port.address, setup["seed"]
-            other = stack.enter_context(Other(*asked, ends.step, ends.speed))
-        signals = _stopping()
+            arguments = setup["env"], setup["options"], port.address, setup["seed"]
+            other = stack.enter_context(SimulatedCarProcess(*arguments, ends.step, ends.speed))
+        signals = _watch_signals()
         relay = None
         if ends.receiver is not None:
             source, latency = ends.receiver
@@ -181,7 +185,7 @@ def _live(
             stack.callback(loop.recorder.close)
         console.print(f"listening on {port.address[0]}:{port.address[1]}")
         if other is not None:
-            other.go()
+            other.start_drive()
         loop.run(lambda: bool(signals), duration)
         drive = other.result() if other is not None and loop.assembler.over else None
     numbers = setup | loop.numbers() | {"load": os.getloadavg(), "cores": os.cpu_count()}
@@ -189,22 +193,22 @@ def _live(
     if relay is not None and relay.error:
         lines.append(f"The receiver was lost: {relay.error}")
     if drive is not None:
-        lines.append(_beside_offline(drive, setup, ends.trust, numbers))
-    console.print(f"[bold]{escape(verdict(*lines))}[/]")
+        lines.append(_compare_offline(drive, setup, ends.trust, numbers))
+    console.print(f"[bold]{escape(format_verdict(*lines))}[/]")
     if record is not None:
-        wrote(console, record)
+        print_written(console, record)
     _write(json, numbers)
 
 
-def _beside_offline(
-    found: tuple[Any, int, int], setup: dict[str, Any], trust: bool, numbers: dict[str, Any]
+def _compare_offline(
+    drive: tuple[Any, int, int], setup: dict[str, Any], trust: bool, numbers: dict[str, Any]
 ) -> str:
     """How far the drive over the wires is from the one without them."""
     from ...agents.rollout import rollout
 
-    columns, late, periods = found
-    offline = rollout(*_contestant(setup, trust), setup["seed"]).columns
-    same = all(np.array_equal(offline[name], each) for name, each in columns.items())
+    columns, late, periods = drive
+    offline = rollout(*_make_env_and_agent(setup, trust), setup["seed"]).columns
+    same = all(np.array_equal(offline[name], values) for name, values in columns.items())
     rows = min(len(columns["beta"]), len(offline["beta"]))
     away = float(np.max(np.abs(columns["beta"][:rows] - offline["beta"][:rows])))
     numbers |= {"same": same, "late": late, "periods": periods, "beta_away": away}
@@ -216,7 +220,9 @@ def _beside_offline(
     )
 
 
-def _drive(env_id: str, setup: dict[str, Any], target: Any, step: bool, speed: float) -> None:
+def _run_simulation(
+    env_id: str, setup: dict[str, Any], target: Any, step: bool, speed: float
+) -> None:
     """The simulated car alone."""
     from ...agents.live.port import Port
     from ...agents.live.simulate import simulate
@@ -229,13 +235,13 @@ def _drive(env_id: str, setup: dict[str, Any], target: Any, step: bool, speed: f
     console.print(f"{wires.late} of {wires.periods} controls came a period late")
 
 
-def _relay(
+def _run_relay(
     source: str, target: Any, latency: float, speed: float, duration: float, json: Path | None
 ) -> None:
     from ...agents.live.port import Port
     from ...agents.live.relay import Relay
 
-    signals, end = _stopping(), monotonic() + duration
+    signals, end = _watch_signals(), monotonic() + duration
     with Port() as port:
         relay = Relay(source, port, target, latency, speed)
         relay.run(lambda: bool(signals) or monotonic() > end)
@@ -247,7 +253,7 @@ def _relay(
         raise OSError(relay.error)
 
 
-def _replay(path: Path, asked: dict[str, Any], trust: bool, json: Path | None) -> None:
+def _replay(path: Path, requested: dict[str, Any], trust: bool, json: Path | None) -> None:
     from ...agents import AGENTS
     from ...agents.learned.card import check_names_no_code
     from ...agents.live.session import read_setup, replay
@@ -255,18 +261,18 @@ def _replay(path: Path, asked: dict[str, Any], trust: bool, json: Path | None) -
 
     setup = read_setup(path)
     for kind, known in (("estimator", FILTERS), ("agent", AGENTS)):
-        if setup.get(kind) != asked[kind]:  # a file's text may not choose what code is run
+        if setup.get(kind) != requested[kind]:  # a file's text may not choose what code is run
             check_choice(f"{kind} in {path}, name it in the command to run it:", setup[kind], known)
-    unasked = "" if setup["env"] == asked["env"] else setup["env"]
+    unasked = "" if setup["env"] == requested["env"] else setup["env"]
     check_names_no_code(unasked, "", setup["estimator_options"])
-    onboard = _onboard(asked | setup, trust)
-    found = replay(path, onboard, setup["patience"])
-    same = "those of the session bit for bit" if found.same else "NOT those of the session"
-    console.print(f"{len(found.ticks)} ticks; the estimates are {same}")
-    _write(json, setup | {"ticks": len(found.ticks), "same": found.same})
+    onboard = _make_controller(requested | setup, trust)
+    session = replay(path, onboard, setup["patience"])
+    same = "those of the session bit for bit" if session.same else "NOT those of the session"
+    console.print(f"{len(session.ticks)} ticks; the estimates are {same}")
+    _write(json, setup | {"ticks": len(session.ticks), "same": session.same})
 
 
 def _write(path: Path | None, numbers: dict[str, Any]) -> None:
     if path is not None:
-        write_whole(path, (writer.dumps(numbers, indent=1) + "\n").encode())
-        wrote(console, path)
+        write_atomic(path, (writer.dumps(numbers, indent=1) + "\n").encode())
+        print_written(console, path)

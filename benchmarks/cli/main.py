@@ -10,19 +10,19 @@ from rich.table import Table
 
 from ... import __version__
 from ...envs.arguments import check_choice
-from ..harness.engines import PROCESSES, engine
-from ..harness.errors import one_line
+from ..harness.engines import PROCESSES, use_engine
+from ..harness.errors import report_user_errors
 from ..report.page import check_page, write_page
 from ..suites import SUITES, Request, check_salt, run_suites
 from .calibrate import calibrate_command
-from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, challenge_of
+from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, make_request
 from .enjoy import enjoy_command
 from .export import Trust, export_command
 from .lane import lane_command
 from .live import live_command
 from .names import KINDS, complete
-from .options import Address, EngineName, Salt, options_of
-from .output import check_files, explain_interrupt, show_episode, write_output, wrote
+from .options import Address, EngineName, Salt, parse_options
+from .output import check_files, handle_interrupt, print_written, show_episode, write_output
 from .recorded import Mapping, identify_command, replay_command
 from .train import distill_command, train_command, train_estimator_command
 from .tune import tune_app
@@ -60,20 +60,20 @@ Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes
 
 def main() -> None:
     """Entry point of `sideslip`; a user's error is one line and exit status 2."""
-    with one_line():
+    with report_user_errors():
         app()
 
 
-def _version(shown: bool) -> None:
+def _print_version(shown: bool) -> None:
     if shown:
         console.print(f"sideslip {__version__}", highlight=False)
         raise typer.Exit
 
 
 @app.callback()
-def face(
+def describe_app(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print it.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print it.")
     ] = False,
 ) -> None:
     """Lateral stability of electric vehicles: environments, estimators, controllers."""
@@ -149,22 +149,22 @@ def run(
 ) -> None:
     """Drive one episode, print its score, draw it."""
     from ...agents.rollout import rollout
-    from ..report.film import Driver, check_film, film_drive
-    from .contestant import Contestant
+    from ..report.film import FilmDriver, check_film, write_drive_film
+    from .contestant import AgentSpec
 
     check_files(plot=plot, parquet=parquet, kml=kml)
     check_film(video)
     chosen = {"scenario": scenario, "vehicle": vehicle, "control_period": control_period}
-    asked = {name: value for name, value in chosen.items() if value is not None}
-    who = Contestant(
-        agent, options_of(agent_option), estimator, options_of(estimator_option), trust
+    env_options = {name: value for name, value in chosen.items() if value is not None}
+    spec = AgentSpec(
+        agent, parse_options(agent_option), estimator, parse_options(estimator_option), trust
     )
-    driver = Driver(agent, *who.on(env_id, asked | options_of(option)))
+    driver = FilmDriver(agent, *spec.build(env_id, env_options | parse_options(option)))
     if env_id is None and driver.env.spec is not None:
         console.print(f"on {driver.env.spec.id}", highlight=False)
     drive = rollout(driver.env, driver.agent, seed)
     show_episode(console, drive, agent, plot, parquet, kml)
-    film_drive(video, driver, beside, seed, console)
+    write_drive_film(video, driver, beside, seed, console)
 
 
 @app.command(short_help="Compare estimators and controllers.")
@@ -207,7 +207,7 @@ def bench(
 ) -> None:
     """Compare estimators and controllers, and a recorded drive with --log; with --agent and
     --estimator your own beside some of the package's."""
-    challenge = challenge_of(
+    challenge = make_request(
         suites or [],
         agent or [],
         estimator or [],
@@ -234,7 +234,7 @@ def bench(
         done.append(replay_file(log, vehicle, mapping=mapping))
     request = Request(quick, jobs, console, episodes, keep, clairvoyant, challenge, salt)
     how = "the same command" if keep else "add --keep FOLDER, which keeps finished cases"
-    with engine(engine_name, address), explain_interrupt(how):
+    with use_engine(engine_name, address), handle_interrupt(how):
         done += run_suites(names, request)
     order = [*names, "replay"]
     done.sort(key=lambda suite: order.index(suite.name))
@@ -243,7 +243,7 @@ def bench(
         from ..picture import write_picture
 
         write_picture(picture, done)
-        wrote(console, picture)
+        print_written(console, picture)
     if page is not None:
         write_page(page, done)
-        wrote(console, page)
+        print_written(console, page)

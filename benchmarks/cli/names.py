@@ -25,7 +25,7 @@ _ENVIRONMENTS = {
 }
 
 
-def environments() -> dict[str, str]:
+def list_environments() -> dict[str, str]:
     """The package's ids with their slow sensors."""
     import gymnasium as gym
 
@@ -38,115 +38,117 @@ def check_env(env_id: str) -> None:
     import gymnasium as gym
 
     if env_id not in gym.registry and ":" not in env_id:
-        check_choice("environment", env_id, environments())
+        check_choice("environment", env_id, list_environments())
 
 
-def scenarios() -> dict[str, str]:
+def list_scenarios() -> dict[str, str]:
     """What a driver does in each, how fast and on what; a range is drawn by the seed."""
     from ...envs.scenarios.manoeuvres import SCENARIOS
 
-    found = {}
-    for name, each in SCENARIOS.items():
-        path = f" on {each.path}" if each.path != "road" else ""
+    lines = {}
+    for name, scenario in SCENARIOS.items():
+        path = f" on {scenario.path}" if scenario.path != "road" else ""
         words = [
-            f"{each.steering}{path}",
-            f"{_range(each.range('speed'), 3.6)} km/h",
-            f"friction {_range(each.range('friction'))}",
-            f"{each.duration:g} s",
+            f"{scenario.steering}{path}",
+            f"{_format_range(scenario.range('speed'), 3.6)} km/h",
+            f"friction {_format_range(scenario.range('friction'))}",
+            f"{scenario.duration:g} s",
         ]
-        words += [f"tier {each.tier}"] if each.tier else []
-        found[name] = ", ".join([*words, *(text for text, there in _marks(each) if there)])
-    return found
+        words += [f"tier {scenario.tier}"] if scenario.tier else []
+        lines[name] = ", ".join(
+            [*words, *(text for text, is_set in _list_marks(scenario) if is_set)]
+        )
+    return lines
 
 
-def _marks(each: "Scenario") -> list[tuple[str, Any]]:
+def _list_marks(scenario: "Scenario") -> list[tuple[str, Any]]:
     """What sets a scenario apart, and whether it does."""
     return [
-        ("side wind", any(each.range("wind_force"))),
-        ("braking", each.speed_change < 0.0),
-        ("bend", any(each.range("curvature"))),
-        ("another friction on the right", each.friction_right),
-        ("tyres that change", each.tyre_change_time),
-        ("outages", each.camera_outage or each.gps_outage),
-        ("starts sliding", any(each.range("initial_beta"))),
+        ("side wind", any(scenario.range("wind_force"))),
+        ("braking", scenario.speed_change < 0.0),
+        ("bend", any(scenario.range("curvature"))),
+        ("another friction on the right", scenario.friction_right),
+        ("tyres that change", scenario.tyre_change_time),
+        ("outages", scenario.camera_outage or scenario.gps_outage),
+        ("starts sliding", any(scenario.range("initial_beta"))),
     ]
 
 
-def _range(ends: tuple[float, float], factor: float = 1.0) -> str:
+def _format_range(ends: tuple[float, float], factor: float = 1.0) -> str:
     low, high = (f"{factor * end:.3g}" for end in ends)
     return low if low == high else f"{low} to {high}"
 
 
-def vehicles() -> dict[str, str]:
+def list_vehicles() -> dict[str, str]:
     """Mass, wheelbase, and above which speed a car is unstable."""
     from ...envs.vehicle.vehicle import critical_speed
     from ...envs.vehicle.vehicles import VEHICLES
 
-    found = {}
+    lines = {}
     for name, car in VEHICLES.items():
         limit = 3.6 * critical_speed(car)
         stable = "understeers" if limit == math.inf else f"unstable above {limit:.3g} km/h"
-        found[name] = f"{car.mass:g} kg, wheelbase {car.wheelbase:.2f} m, {stable}"
-    return found
+        lines[name] = f"{car.mass:g} kg, wheelbase {car.wheelbase:.2f} m, {stable}"
+    return lines
 
 
-def estimators() -> dict[str, str]:
+def list_estimators() -> dict[str, str]:
     """The slow sensors that a filter takes, and where it comes from."""
     from ...estimators.filters import FILTERS
     from ...estimators.make import ESTIMATORS
 
-    found = {name: "registered" for name in ESTIMATORS}
+    lines = {name: "registered" for name in ESTIMATORS}
     behind = "a network behind the filter of its file, which corrects the sideslip angle"
-    found |= {name: behind for name in found if name.startswith("learned")}
-    for name, each in FILTERS.items():
-        slow = " or ".join(each.slow) if len(each.slow) < 2 else "camera, GPS or both"
-        found[name] = f"{slow.replace('gps', 'GPS') or 'fast sensors alone'}; {each.source}"
-    return found
+    lines |= {name: behind for name in lines if name.startswith("learned")}
+    for name, filter_ in FILTERS.items():
+        slow = " or ".join(filter_.slow) if len(filter_.slow) < 2 else "camera, GPS or both"
+        lines[name] = f"{slow.replace('gps', 'GPS') or 'fast sensors alone'}; {filter_.source}"
+    return lines
 
 
-def agents() -> dict[str, str]:
+def list_agents() -> dict[str, str]:
     """The first sentence of each controller's docstring."""
     from ...agents import AGENTS
 
-    return {name: _first_sentence(AGENTS.load(name).__doc__) for name in AGENTS}
+    return {name: _extract_sentence(AGENTS.load(name).__doc__) for name in AGENTS}
 
 
-def policies() -> dict[str, str]:
+def list_policies() -> dict[str, str]:
     """The algorithm and the environment of each policy that is shipped."""
-    from ...agents.learned.files import load_policy, shipped
+    from ...agents.learned.files import list_shipped, load_policy
 
-    cards = {name: load_policy(name).card for name in shipped()}
+    cards = {name: load_policy(name).card for name in list_shipped()}
     return {
         name: f"{card.algorithm} on {card.env_id}, estimator {card.estimator or 'none'}"
         for name, card in cards.items()
     }
 
 
-def suites() -> dict[str, str]:
+def list_suites() -> dict[str, str]:
     """The first sentence of each suite's module, which is not imported for it."""
-    found = {}
+    lines = {}
     for name, (module, _) in SUITES.items():
         spec = find_spec(module, __package__.rpartition(".")[0])
         assert spec is not None and spec.origin is not None
         with open(spec.origin, encoding="utf-8") as file:
-            found[name] = _first_sentence(ast.get_docstring(ast.parse(file.read())))
-    return found
+            lines[name] = _extract_sentence(ast.get_docstring(ast.parse(file.read())))
+    return lines
 
 
-def _first_sentence(text: str | None) -> str:
+def _extract_sentence(text: str | None) -> str:
     words = " ".join((text or "").split()).removeprefix("Question: ").replace("`", "")
     question, mark, _ = words.partition("? ")
     return question + "?" if mark else words.partition(". ")[0].removesuffix(".")
 
 
 KINDS: dict[str, Callable[[], dict[str, str]]] = {
-    "environments": environments,
-    "scenarios": scenarios,
-    "vehicles": vehicles,
-    "estimators": estimators,
-    "agents": agents,
-    "policies": policies,
-    "suites": suites,
+    "environments": list_environments,
+    "scenarios": list_scenarios,
+    "vehicles": list_vehicles,
+    "estimators": list_estimators,
+    "agents": list_agents,
+    "policies": list_policies,
+    "suites": list_suites,
 }
 """What has a name, and a line on each."""
 
@@ -154,8 +156,8 @@ KINDS: dict[str, Callable[[], dict[str, str]]] = {
 def complete(*kinds: str) -> Callable[[str], Iterable[Any]]:
     """A completion of names of these kinds, with the line on each."""
 
-    def completed(incomplete: str) -> list[tuple[str, str]]:
-        there = [pair for kind in kinds for pair in KINDS[kind]().items()]
-        return [(name, line) for name, line in there if name.startswith(incomplete)]
+    def list_matches(incomplete: str) -> list[tuple[str, str]]:
+        pairs = [pair for kind in kinds for pair in KINDS[kind]().items()]
+        return [(name, line) for name, line in pairs if name.startswith(incomplete)]
 
-    return completed
+    return list_matches

@@ -17,7 +17,7 @@ Salt = Annotated[
 ]
 
 
-def option_of(text: str) -> tuple[str, Any]:
+def parse_option(text: str) -> tuple[str, Any]:
     """NAME=VALUE; a value that is no JSON is a word."""
     name, equals, value = text.partition("=")
     if not (name and equals):
@@ -28,11 +28,11 @@ def option_of(text: str) -> tuple[str, Any]:
         return name, value
 
 
-def options_of(texts: Sequence[str] | None) -> dict[str, Any]:
+def parse_options(texts: Sequence[str] | None) -> dict[str, Any]:
     """The options in texts of NAME=VALUE; ValueError for a text of another form."""
-    return dict(map(option_of, texts or ()))
+    return dict(map(parse_option, texts or ()))
 
 
-def command_line() -> str:
+def get_command_line() -> str:
     """The command line of this process."""
     return shlex.join(["sideslip", *sys.argv[1:]])

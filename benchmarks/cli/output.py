@@ -13,10 +13,10 @@ import typer
 from rich.console import Console
 
 from ... import __version__
-from ...envs.backend.files import whole
+from ...envs.backend.files import atomic_file
 from ..harness.parallel import Bar
 from ..harness.results import (
-    Row,
+    ResultRow,
     Suite,
     check_writable,
     write_json,
@@ -24,12 +24,12 @@ from ..harness.results import (
     write_text,
 )
 from ..report.terminal import print_run, print_suite
-from .options import command_line
+from .options import get_command_line
 
 if TYPE_CHECKING:
     from ...agents.rollout import Rollout
-    from ...agents.training.task import Task
-    from ...agents.training.train import Progress as Now
+    from ...agents.training.task import TrainingTask
+    from ...agents.training.train import Progress as TrainingProgress
 
 _ENDINGS = {
     "correction": (".safetensors",),
@@ -61,7 +61,7 @@ def check_files(**paths: Path | None) -> None:
 
 
 @contextmanager
-def explain_interrupt(how: str) -> Iterator[None]:
+def handle_interrupt(how: str) -> Iterator[None]:
     """End with exit status 130 where the user interrupts, and say how to continue."""
     try:
         yield
@@ -70,7 +70,7 @@ def explain_interrupt(how: str) -> Iterator[None]:
         raise typer.Exit(130) from None
 
 
-def wrote(console: Console, path: Path) -> None:
+def print_written(console: Console, path: Path) -> None:
     """Print what was written."""
     console.print(f"wrote {path}", highlight=False, soft_wrap=True, markup=False)
 
@@ -78,13 +78,13 @@ def wrote(console: Console, path: Path) -> None:
 def show_episode(
     console: Console,
     drive: "Rollout",
-    who: str,
+    driver: str,
     plot: Path | None = None,
     parquet: Path | None = None,
     kml: Path | None = None,
 ) -> None:
     """Print an episode's score in a line and draw it; who: its driver."""
-    from ..report.kml import track_kml
+    from ..report.kml import make_track_kml
 
     slip = drive["beta"]
     console.print(
@@ -96,15 +96,15 @@ def show_episode(
         highlight=False,
     )
     if plot is not None:
-        with whole(plot) as file:
+        with atomic_file(plot) as file:
             drive.plot().savefig(file, format=plot.suffix[1:] or "png", dpi=120)
-        wrote(console, plot)
+        print_written(console, plot)
     if parquet is not None:
         drive.to_parquet(parquet)
-        wrote(console, parquet)
+        print_written(console, parquet)
     if kml is not None:
-        write_text(kml, track_kml(drive.log.name, {who: (drive["X"], drive["Y"])}))
-        wrote(console, kml)
+        write_text(kml, make_track_kml(drive.log.name, {driver: (drive["X"], drive["Y"])}))
+        print_written(console, kml)
 
 
 def write_output(
@@ -120,58 +120,61 @@ def write_output(
         print_run(console, suites, html is not None)
     for suite in () if brief else suites:
         print_suite(console, suite)
-    rows: list[Row] = [row for suite in suites for row in suite.rows]
+    rows: list[ResultRow] = [row for suite in suites for row in suite.rows]
     if json is not None:
         write_json(json, rows)
-        wrote(console, json)
+        print_written(console, json)
     if parquet is not None:
         write_parquet(parquet, rows)
-        wrote(console, parquet)
+        print_written(console, parquet)
     if html is not None:
         from ..report.html import write_report
 
-        write_report(html, list(suites), command_line(), environment())
-        wrote(console, html)
+        write_report(html, list(suites), get_command_line(), collect_versions())
+        print_written(console, html)
 
 
-def words_of(task: "Task", steps: int) -> list[str]:
+def make_command(task: "TrainingTask", steps: int) -> list[str]:
     """The command that trains this from the start."""
     words = ["sideslip", "train", "--algo", task.algo, "--env", task.env_id]
     words += ["--estimator", task.estimator] if task.estimator else []
-    given = {"--estimator-option": task.estimator_options, "--option": task.env_options}
-    for option, values in given.items():
+    option_groups = {"--estimator-option": task.estimator_options, "--option": task.env_options}
+    for option, values in option_groups.items():
         for name, value in values.items():
             words += [
                 option,
                 f"{name}={value if isinstance(value, str) else json.dumps(value)}",
             ]
-    words += [word for each in task.scenarios for word in ("--scenarios", str(each))]
-    words += [word for each in task.reads for word in ("--reads", each)]
+    words += [word for item in task.scenarios for word in ("--scenarios", str(item))]
+    words += [word for item in task.reads for word in ("--reads", item)]
     numbers = {"--steps": steps, "--seed": task.seed, "--num-envs": task.num_envs}
     numbers |= {"--n-eval-envs": task.n_eval_envs}
     return words + [word for name, value in numbers.items() for word in (name, str(value))]
 
 
-def folder_of(task: "Task", start: str, out: Path | None, logs: Path | None) -> Path:
+def choose_folder(task: "TrainingTask", start: str, out: Path | None, logs: Path | None) -> Path:
     """A training's folder: out, the next one of the zoo's in logs, or by its task and what it
     begins with. ValueError for both."""
     if logs is not None:
         if out is not None:
             raise ValueError(f"--log-folder {logs} numbers its folders itself: without --out {out}")
-        return task.zoo_folder(logs)
+        return task.find_zoo_folder(logs)
     if out is not None:
         return out
-    given = task.env_options.items()
-    options = [each if isinstance(each, str) else name for name, each in given]
+    env_options = task.env_options.items()
+    options = [value if isinstance(value, str) else name for name, value in env_options]
     options += ["mixture"] if task.scenarios else []
     words = [task.env_id.rpartition("/")[2], task.algo, task.estimator, *options, start]
     return Path("-".join(["train", *filter(None, words), str(task.seed)]))
 
 
-def show_training(bar: Bar, now: "Now") -> None:
+def show_training(bar: Bar, now: "TrainingProgress") -> None:
     """Show where a training stands: its newest episodes, the newest and the best evaluation."""
     text = "" if now.cost is None else f"cost {now.cost:.3g} exploring, "
-    last, best = now.evaluations[-1], min(now.evaluations, key=lambda each: each.judged)
+    last, best = (
+        now.evaluations[-1],
+        min(now.evaluations, key=lambda evaluation: evaluation.criterion),
+    )
     if last.of_start is None:
         text += f"of none's {last.of_none:.3f}, best {best.of_none:.3f}"
     else:
@@ -179,12 +182,12 @@ def show_training(bar: Bar, now: "Now") -> None:
     bar.update(bar.task_ids[0], completed=now.steps, description=text)
 
 
-def environment() -> dict[str, str]:
+def collect_versions() -> dict[str, str]:
     """Versions that the numbers depend on."""
-    found = {"sideslip": __version__, "Python": platform.python_version()}
+    versions = {"sideslip": __version__, "Python": platform.python_version()}
     for name in _SHOWN:
         try:
-            found[name] = version(name)
+            versions[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return versions

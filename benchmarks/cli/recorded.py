@@ -7,11 +7,11 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from ..harness.parallel import one_bar
+from ..harness.parallel import use_shared_bar
 from ..report.terminal import print_suite
 from .names import complete
-from .options import option_of, options_of
-from .output import check_files, write_output, wrote
+from .options import parse_option, parse_options
+from .output import check_files, print_written, write_output
 
 Texts = list[str] | None
 Drive = Annotated[
@@ -27,26 +27,28 @@ Sign = Annotated[int | None, typer.Option(help="1 or -1, of the logged steering.
 Offset = Annotated[float | None, typer.Option(help="deg at the wheels, added to the steering.")]
 
 
-def _wires(vehicle: str | None, latency: Texts, **steering: float | None) -> Any:
+def _read_wires(vehicle: str | None, latency: Texts, **steering: float | None) -> Any:
     """What the vehicle's file has of the wires, and over it what was asked for."""
-    from ..recorded.wires import wires_of
+    from ..recorded.wires import read_wires
 
-    known = wires_of(vehicle)
-    asked: dict[str, Any] = {name: value for name, value in steering.items() if value is not None}
-    late = {**known.latency, **options_of(latency)}
-    return known._replace(latency=late, **asked).check()
+    known = read_wires(vehicle)
+    overrides: dict[str, Any] = {
+        name: value for name, value in steering.items() if value is not None
+    }
+    late = {**known.latency, **parse_options(latency)}
+    return known._replace(latency=late, **overrides).check()
 
 
-def estimator_options(texts: Texts) -> dict[str, dict[str, Any]]:
+def parse_estimator_options(texts: Texts) -> dict[str, dict[str, Any]]:
     """{"joint": {"members": 4}} from texts such as "joint.members=4"; ValueError for others."""
-    found: dict[str, dict[str, Any]] = {}
+    options: dict[str, dict[str, Any]] = {}
     for text in texts or ():
-        key, value = option_of(text)
+        key, value = parse_option(text)
         name, dot, option = key.partition(".")
         if not (name and dot and option):
             raise ValueError(f"an estimator's option is ESTIMATOR.NAME=VALUE, got {text!r}")
-        found.setdefault(name, {})[option] = value
-    return found
+        options.setdefault(name, {})[option] = value
+    return options
 
 
 def replay_command(
@@ -105,21 +107,21 @@ def replay_command(
     console = Console()
     check_files(html=html, json=json, parquet=parquet, plot=plot, kml=kml)
     if is_nmea(log):
-        from ..recorded.receiver_suite import draw, receiver_suite, replay_nmea, write_kml
+        from ..recorded.receiver_suite import draw, make_receiver_suite, replay_nmea, write_kml
 
-        with one_bar(console, f"replay {log}"):
+        with use_shared_bar(console, f"replay {log}"):
             received = replay_nmea(log, vehicle, mapping)
-        write_output(console, [receiver_suite(received)], html, json, parquet)
+        write_output(console, [make_receiver_suite(received)], html, json, parquet)
         for path, write in ((plot, draw), (kml, write_kml)):
             if path is not None:
                 write(path, received)
-                wrote(console, path)
+                print_written(console, path)
         return
     if plot or kml:
         raise ValueError(f"{log}: --plot and --kml are for a receiver's log (NMEA); see --html")
     offset = None if steering_offset is None else math.radians(steering_offset)
-    wires = _wires(vehicle, latency, ratio=steering_ratio, sign=steering_sign, offset=offset)
-    with one_bar(console, f"replay {log}"):
+    wires = _read_wires(vehicle, latency, ratio=steering_ratio, sign=steering_sign, offset=offset)
+    with use_shared_bar(console, f"replay {log}"):
         suite = replay_file(
             log,
             vehicle,
@@ -128,7 +130,7 @@ def replay_command(
             nominal=nominal,
             until=until,
             estimators=estimator,
-            options=estimator_options(estimator_option),
+            options=parse_estimator_options(estimator_option),
             course_rate=course_rate,
             course_noise_deg=course_noise,
             delay=course_delay,
@@ -172,12 +174,12 @@ def identify_command(
     console = Console()
     check_files(toml=out)
     offset = None if steering_offset is None else math.radians(steering_offset)
-    wires = _wires(vehicle, None, ratio=steering_ratio, sign=steering_sign, offset=offset)
-    with one_bar(console, f"identify {log}"):
-        found, suite = identify_file(log, vehicle, mapping or (), wires, tyres, until)
+    wires = _read_wires(vehicle, None, ratio=steering_ratio, sign=steering_sign, offset=offset)
+    with use_shared_bar(console, f"identify {log}"):
+        result, suite = identify_file(log, vehicle, mapping or (), wires, tyres, until)
     print_suite(console, suite)
-    if found.reason:
+    if result.reason:
         raise typer.Exit(1)
     if out is not None:
-        write_vehicle(out, found.car, found.wires)
-        wrote(console, out)
+        write_vehicle(out, result.car, result.wires)
+        print_written(console, out)

@@ -14,15 +14,15 @@ from rich.console import Console
 from rich.table import Table
 
 from ... import __version__
-from ..harness.parallel import one_bar
-from .enjoy import judged
+from ..harness.parallel import use_shared_bar
+from .enjoy import make_task_table
 from .export import Trust
 from .names import check_env, complete
-from .options import command_line, options_of
-from .output import check_files, folder_of, show_training, words_of, wrote
+from .options import get_command_line, parse_options
+from .output import check_files, choose_folder, make_command, print_written, show_training
 
 if TYPE_CHECKING:
-    from ...agents.training.train import Trained
+    from ...agents.training.train import TrainResult
 
 EPISODES, CONTESTS = 256, 32  # of the policy's test, and of each contest of its class
 _Text = str | None
@@ -101,17 +101,26 @@ def train_command(
     With --resume the options left out are those of the training in the folder.
     """
     from ...agents.learned.files import Policy, load_policy
-    from ...agents.training.starts import settings_in
-    from ...agents.training.train import CURVE, POLICY, Aim, Means, aim_in, start_in, task_in, train
-    from ..distillation import start_and_task
-    from ..policies import evaluate, evaluation
+    from ...agents.training.starts import resolve_settings
+    from ...agents.training.train import (
+        CURVE,
+        POLICY,
+        RunOptions,
+        RunRecord,
+        load_initial_policy,
+        read_run_record,
+        read_task,
+        train,
+    )
+    from ..distillation import prepare_start
+    from ..policies import record_evaluation, summarise_evaluation
 
     options: dict[str, Any] = {
         "env_id": env,
         "algo": algo,
         "estimator": estimator,
-        "estimator_options": options_of(estimator_option) or None,
-        "env_options": options_of(option) or None,
+        "estimator_options": parse_options(estimator_option) or None,
+        "env_options": parse_options(option) or None,
         "scenarios": scenarios or None,
         "seed": seed,
         "num_envs": num_envs,
@@ -125,28 +134,32 @@ def train_command(
         raise ValueError(f"--log-folder {log_folder} is for a new training: name the old --out")
     if varied and resume:
         raise ValueError(f"--varied {varied} is for a new training: an old one keeps its contests")
-    agent, new = start_and_task(trained_agent, varied)
+    agent, new = prepare_start(trained_agent, varied)
     if log_folder is not None and isinstance(agent, Policy) and agent.network.memory:
         raise ValueError(f"the zoo's `enjoy` drives nothing that remembers as {agent.name}: --out")
-    task = task_in(out) if resume and out else new(**options)
-    folder = folder_of(task, trained_agent.stem if trained_agent else "", out, log_folder)
+    task = read_task(out) if resume and out else new(**options)
+    folder = choose_folder(task, trained_agent.stem if trained_agent else "", out, log_folder)
     if conf_file is not None:
-        start = start_in(folder) if resume else agent
-        options["settings"] = settings_in(conf_file, task.algo, task.env_id, start)
-    task = task_in(folder, **options) if resume else new(**options)
-    aim = aim_in(folder) if resume else Aim(int(task.settings["n_timesteps"]), Means.eval_freq, "")
+        start = load_initial_policy(folder) if resume else agent
+        options["settings"] = resolve_settings(conf_file, task.algo, task.env_id, start)
+    task = read_task(folder, **options) if resume else new(**options)
+    aim = (
+        read_run_record(folder)
+        if resume
+        else RunRecord(int(task.settings["n_timesteps"]), RunOptions.eval_freq, "")
+    )
     steps = aim.steps if steps is None else steps
     eval_freq = aim.eval_freq if eval_freq is None else eval_freq
     more = {"--eval-freq": eval_freq, "--conf-file": conf_file, "--trained-agent": trained_agent}
     more["--varied"] = varied
-    given = [str(word) for pair in more.items() if pair[1] for word in pair]
+    arguments = [str(word) for pair in more.items() if pair[1] for word in pair]
     named = replace(task, scenarios=[]) if varied else task
-    command = shlex.join([*words_of(named, steps), *given])
+    command = shlex.join([*make_command(named, steps), *arguments])
     command = f"{aim.command}; sideslip train --resume --steps {steps}" if resume else command
     console = Console()
-    with one_bar(console if progress else None, "train", "steps", steps) as bar:
+    with use_shared_bar(console if progress else None, "train", "steps", steps) as bar:
         project, show = wandb_project_name if track else "", partial(show_training, bar)
-        means = Means(eval_freq, device, tensorboard_log, show, command, project)
+        means = RunOptions(eval_freq, device, tensorboard_log, show, command, project)
         if log_folder is not None:
             task.describe_for_zoo(folder, steps, eval_freq)
         try:
@@ -155,26 +168,26 @@ def train_command(
             if log_folder is not None and not (folder / POLICY).exists():
                 shutil.rmtree(folder)  # it has nothing but the zoo's description
             raise
-    console.print(_table(trained))
+    console.print(_make_table(trained))
     kind = load_policy(folder / POLICY).card.algorithm_options.get("class")
     if kind is not None:
-        console.print(judged(folder / POLICY, kind, CONTESTS))
+        console.print(make_task_table(folder / POLICY, kind, CONTESTS))
     else:
-        costs = evaluation(evaluate(folder / POLICY, EPISODES))["cost"]
-        shown = ", ".join(f"{name} {each['mean']:.4g}" for name, each in costs.items())
+        costs = summarise_evaluation(record_evaluation(folder / POLICY, EPISODES))["cost"]
+        shown = ", ".join(f"{name} {cost['mean']:.4g}" for name, cost in costs.items())
         where = f" of {task.scenarios[0]}, the mixture's first" if task.scenarios else ""
         console.print(f"mean cost on test seeds{where}: {shown}", highlight=False, soft_wrap=True)
-    wrote(console, folder / POLICY)
-    wrote(console, folder / CURVE)
+    print_written(console, folder / POLICY)
+    print_written(console, folder / CURVE)
 
 
-def _table(trained: "Trained") -> Table:
+def _make_table(trained: "TrainResult") -> Table:
     table = Table("steps", "CPU-s", "cost", "of none's", "of its start's")
-    for each in trained.evaluations:
-        mark = " best" if each is trained.best else ""
-        numbers = f"{each.steps:,}", f"{each.cpu_seconds:.1f}", f"{each.cost:.4g}"
-        start = "" if each.of_start is None else f"{each.of_start:.3f}"
-        table.add_row(*numbers, f"{each.of_none:.3f}{mark}", start)
+    for evaluation in trained.evaluations:
+        mark = " best" if evaluation is trained.best else ""
+        numbers = f"{evaluation.steps:,}", f"{evaluation.cpu_seconds:.1f}", f"{evaluation.cost:.4g}"
+        start = "" if evaluation.of_start is None else f"{evaluation.of_start:.3f}"
+        table.add_row(*numbers, f"{evaluation.of_none:.3f}{mark}", start)
     return table
 
 
@@ -220,32 +233,34 @@ def distill_command(
     out: Annotated[Path | None, typer.Option(help="The file; default: NAME here.")] = None,
 ) -> None:
     """Distil a policy by DAgger; its card says what it costs in each contest, on unseen seeds."""
-    from ...agents.training.distill import Round, distill
-    from ...agents.training.student import Course
-    from ..distillation import card_of, lessons_of
+    from ...agents.training.distill import RoundResult, distill
+    from ...agents.training.student import DistillConfig
+    from ..distillation import make_card, make_lessons
 
     target, console = out or Path(f"{name}.safetensors"), Console()
     check_files(policy=target)
     sizes = tuple(hidden or (64, 64))
-    course = Course(
+    course = DistillConfig(
         rounds, epochs, cells, sizes, noise=noise, seed=seed, batch=batch, told=told, traces=traces
     )
     about = {"class": kind, "teacher": teacher, "cars": cars, "varied": varied}
-    about |= course.described()
+    about |= course.describe()
     options = {"algorithm": "distill", "algorithm_options": about, "seeds": {"training": seed}}
-    seen = options_of(option)
-    card = card_of(kind, estimator, teacher, seen, command=command_line(), **options)
+    observation_options = parse_options(option)
+    card = make_card(
+        kind, estimator, teacher, observation_options, command=get_command_line(), **options
+    )
 
-    def show(now: Round) -> None:
+    def show(now: RoundResult) -> None:
         text = f"{now.steps:,} steps, mean cost {now.cost:.4g}, loss {now.loss:.3g}"
         console.print(text, highlight=False)
         bar.advance(bar.task_ids[0])
 
-    with one_bar(console, f"distill {name}", "rounds", rounds) as bar:
-        lessons = lessons_of(kind, teacher, estimator, cars, varied, seed, seen)
+    with use_shared_bar(console, f"distill {name}", "rounds", rounds) as bar:
+        lessons = make_lessons(kind, teacher, estimator, cars, varied, seed, observation_options)
         distill(card, lessons, course, target, show)
-    console.print(judged(target, kind, episodes))
-    wrote(console, target)
+    console.print(make_task_table(target, kind, episodes))
+    print_written(console, target)
 
 
 def train_estimator_command(
@@ -268,33 +283,33 @@ def train_estimator_command(
     from ...agents.training.corrections import READ, train_correction
     from ...estimators.learned.files import CorrectionCard, save_correction
     from ...estimators.make import make_estimator
-    from ..control.contests import YAW, contests
+    from ..control.contests import YAW, list_scored_tasks
 
     target, console = out or Path(f"{name}.safetensors"), Console()
     check_files(correction=target)
-    known = [each.scenario for each in contests()]
+    known = [item.scenario for item in list_scored_tasks()]
     wanted = dict.fromkeys(scenarios or known)
-    drives = [(c.env_id, c.env_options) for c in contests() if c.scenario in wanted]
-    drives += [(YAW, {"scenario": each}) for each in wanted if each not in known]
+    drives = [(c.env_id, c.env_options) for c in list_scored_tasks() if c.scenario in wanted]
+    drives += [(YAW, {"scenario": item}) for item in wanted if item not in known]
     from ...envs.sensors.slow import SENSOR_SETS
 
-    both, options = SENSOR_SETS["fusion"], options_of(option)
-    there = make_estimator(base, sensors=both, slow=list(both), **options).names
+    both, options = SENSOR_SETS["fusion"], parse_options(option)
+    states = make_estimator(base, sensors=both, slow=list(both), **options).names
     card = CorrectionCard(
         base=base,
         base_options=options,
-        states=tuple(each for each in READ if each in there),
+        states=tuple(item for item in READ if item in states),
         scenarios=tuple(wanted),
         seed=seed,
-        command=command_line(),
+        command=get_command_line(),
         sideslip=__version__,
     )
-    with one_bar(console, f"train-estimator {name}") as bar:
+    with use_shared_bar(console, f"train-estimator {name}") as bar:
         task = bar.task_ids[0]
-        found = train_correction(
+        correction = train_correction(
             card, drives, episodes, epochs, lambda text: bar.update(task, description=text)
         )
-    save_correction(target, found)
-    for what, number in found.card.evaluation.items():
+    save_correction(target, correction)
+    for what, number in correction.card.evaluation.items():
         console.print(f"{what} on held-out seeds: {number:.4g}", highlight=False)
-    wrote(console, target)
+    print_written(console, target)

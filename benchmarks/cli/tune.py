@@ -8,11 +8,11 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from ..harness.engines import PROCESSES, engine
+from ..harness.engines import PROCESSES, use_engine
 from ..harness.results import check_writable
 from ..report.terminal import print_suite
-from .options import Address, EngineName, options_of
-from .output import check_files, wrote
+from .options import Address, EngineName, parse_options
+from .output import check_files, print_written
 
 tune_app = typer.Typer(no_args_is_help=True)
 Texts = list[str] | None
@@ -24,11 +24,11 @@ Seed = Annotated[int, typer.Option(help="Of the sampler; another on each machine
 
 
 @tune_app.callback()
-def face() -> None:
+def describe_tune() -> None:
     """Find the numbers of a method by search."""
 
 
-def _searched(text: str) -> tuple[str, tuple[float, float] | None]:
+def _parse_range(text: str) -> tuple[str, tuple[float, float] | None]:
     """NAME or NAME=LOW:HIGH."""
     name, equals, limits = text.partition("=")
     if not equals:
@@ -73,26 +73,26 @@ def tune_estimator(
     """
     from ...estimators.design import tunings
     from ..tuning.file import update
-    from ..tuning.suite import entry, run
-    from ..tuning.task import STORAGE, make_task
+    from ..tuning.suite import make_entry, run
+    from ..tuning.task import STORAGE, make_estimator_tuning
 
     files = [*([out] if out else []), *([tunings.FILE] if write else [])]
     check_files(toml=out)
     check_writable(*files)
-    task = make_task(
+    task = make_estimator_tuning(
         name,
         scenario,
         env or None,
         target,
-        options_of(option),
-        dict(map(_searched, search)) if search else None,
-        dict(map(_searched, noise or [])),
+        parse_options(option),
+        dict(map(_parse_range, search)) if search else None,
+        dict(map(_parse_range, noise or [])),
         seeds,
     )
     if write and not all(key.startswith("q_") for key in task.search):
         raise ValueError("shipped tunings hold process noise alone: --out writes the others")
     console = Console()
-    suite, found = run(task, trials, test_seeds, storage or STORAGE, sampler, seed, jobs, console)
+    suite, result = run(task, trials, test_seeds, storage or STORAGE, sampler, seed, jobs, console)
     print_suite(console, suite)
     flags: list[tuple[str, Sequence[Any]]] = [
         ("--scenario", scenario),
@@ -108,10 +108,10 @@ def tune_estimator(
     ]
     words = [str(word) for flag, values in flags for value in values for word in (flag, value)]
     command = shlex.join(["sideslip", "tune", "estimator", name, *words])
-    made = entry(task, found, command, note)
+    made = make_entry(task, result, command, note)
     for path in files:
         update(path, made)
-        wrote(console, path)
+        print_written(console, path)
 
 
 @tune_app.command("controller")
@@ -137,9 +137,9 @@ def tune_controller(
     the contestant cannot drive is named and left out.
     """
     from ...agents.tuned import FILE
-    from ..control.seeds import tuning_seeds
+    from ..control.seeds import make_tuning_seeds
     from ..tuning import controllers
-    from ..tuning.file import put_tuned
+    from ..tuning.file import write_tuned
     from ..tuning.spaces import KINDS
     from ..tuning.task import STORAGE
 
@@ -147,19 +147,21 @@ def tune_controller(
     console, tables, logs = Console(), [out, FILE] if write else [out], [log]
     if write:
         logs.append(controllers.LOGS)
-    for each in kind or KINDS:
-        task = controllers.contestant(name, each, tuning_seeds(seeds))
+    for class_name in kind or KINDS:
+        task = controllers.make_controller_tuning(name, class_name, make_tuning_seeds(seeds))
         try:
-            with engine(engine_name, address):
-                found = controllers.tune(task, trials, storage or STORAGE, seed, jobs, console)
+            with use_engine(engine_name, address):
+                result = controllers.tune(task, trials, storage or STORAGE, seed, jobs, console)
         except ValueError as error:
             if kind:
                 raise
-            console.print(f"{name} in {each} was left out: {error}", markup=False, highlight=False)
+            console.print(
+                f"{name} in {class_name} was left out: {error}", markup=False, highlight=False
+            )
             continue
-        print_suite(console, controllers.suite_of(task, found))
+        print_suite(console, controllers.make_suite(task, result))
         for path in filter(None, tables):
-            put_tuned(path, each, name, found["options"])
+            write_tuned(path, class_name, name, result["options"])
         for folder in filter(None, logs):
             folder.mkdir(parents=True, exist_ok=True)
-            controllers.write_log(folder / f"{each}.{name}.json", found)
+            controllers.write_log(folder / f"{class_name}.{name}.json", result)

@@ -21,12 +21,12 @@ from rich.console import Console
 from ... import __version__
 from ...envs.arguments import is_finite
 from ..harness.parallel import run_cases
-from ..harness.results import made_of, read_objects, write_text
-from .cells import Cell
-from .contests import NOMINAL, STATE, Contest, oracle_of
+from ..harness.results import from_json, read_objects, write_text
+from .cells import ControlEntry
+from .contests import NOMINAL, STATE, ControlTask, find_oracle
 from .episodes import Array
-from .run import Results, measure, sources
-from .scores import gains, survived
+from .run import Results, hash_sources, measure
+from .scores import compute_log_ratios, survival_mask
 
 FILE = Path(__file__).with_name("clairvoyant.json")
 SEEDS = 64
@@ -35,25 +35,26 @@ _SAME = 1e-9  # of a cost
 
 
 @dataclass(frozen=True)
-class Case:
+class CalibrationCase:
     """One episode of a contest."""
 
-    contest: Contest
+    task: ControlTask
     seed: int
     folder: str  # of finished cases
 
     @property
     def path(self) -> Path:
         """The file of the finished case; other sources or another question give another name."""
-        rung = oracle_of(self.contest)  # with which the search begins
-        asked = [asdict(self.contest), rung, self.seed, sources(), __version__]
-        digest = hashlib.sha256(json.dumps(asked).encode()).hexdigest()
+        oracle = find_oracle(self.task)  # with which the search begins
+        key = [asdict(self.task), oracle, self.seed, hash_sources(), __version__]
+        digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()
         return Path(self.folder) / f"{digest[:24]}.json"
 
 
 @dataclass(frozen=True)
-class Episode:
-    """What was found of one seed; the fields of `agents.clairvoyant.Ceiling` without actions."""
+class ClairvoyantEpisode:
+    """What was found of one seed; the fields of `agents.clairvoyant.ClairvoyantResult` without
+    actions."""
 
     seed: int
     cost: float
@@ -64,7 +65,7 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class Entry:
+class CalibrationRecord:
     """A contest's episodes, and the command that made them."""
 
     tier: str
@@ -74,12 +75,12 @@ class Entry:
     scenario: str
     env_version: str
     command: str
-    episodes: tuple[Episode, ...]
+    episodes: tuple[ClairvoyantEpisode, ...]
 
     @property
-    def contest(self) -> Contest:
+    def task(self) -> ControlTask:
         """Of which these are the costs."""
-        return Contest(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
+        return ControlTask(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
 
     @property
     def costs(self) -> Array:
@@ -87,39 +88,41 @@ class Entry:
         return np.array([episode.cost for episode in self.episodes])
 
 
-def seeds_of(contest: Contest, count: int = SEEDS) -> list[int]:
+def derive_seeds(task: ControlTask, count: int = SEEDS) -> list[int]:
     """The first `count` seeds of a contest's calibration; more seeds begin with the same ones."""
-    texts = [f"clairvoyant {__version__} {contest.seed_text} {i}" for i in range(count)]
+    texts = [f"clairvoyant {__version__} {task.seed_text} {i}" for i in range(count)]
     digests = [hashlib.sha256(text.encode()).digest() for text in texts]
     return [_FIRST + int.from_bytes(digest[:4]) % _FIRST for digest in digests]
 
 
-def solve(case: Case) -> Episode:
+def solve(case: CalibrationCase) -> ClairvoyantEpisode:
     """The best of the plans from nominal's and the oracle's runs; from the folder of finished cases
     where it is there."""
-    from ...agents.clairvoyant.plan import actions_of, ceiling
-    from ...agents.rungs import make_rung
+    from ...agents.clairvoyant.plan import compute_clairvoyant, record_actions
+    from ...agents.rungs import make_oracle
 
-    done = _finished(case)
+    done = _read_finished(case)
     if done is not None:
         return done
-    contest, starts = case.contest, {}
-    for name, rung in ((NOMINAL, NOMINAL), (STATE, oracle_of(contest))):
-        driver = make_rung(rung, contest.env_id, **contest.env_options)
-        starts[name] = actions_of(*driver, case.seed)
-    env: gym.Env[Any, Any] = gym.make(contest.env_id, **contest.env_options)
-    found = ceiling(env, case.seed, starts)
-    seconds = round(found.seconds, 1)
-    episode = Episode(case.seed, found.cost, found.winner, found.costs, found.statuses, seconds)
+    task, starts = case.task, {}
+    for name, oracle in ((NOMINAL, NOMINAL), (STATE, find_oracle(task))):
+        driver = make_oracle(oracle, task.env_id, **task.env_options)
+        starts[name] = record_actions(*driver, case.seed)
+    env: gym.Env[Any, Any] = gym.make(task.env_id, **task.env_options)
+    result = compute_clairvoyant(env, case.seed, starts)
+    seconds = round(result.seconds, 1)
+    episode = ClairvoyantEpisode(
+        case.seed, result.cost, result.winner, result.costs, result.statuses, seconds
+    )
     write_text(case.path, json.dumps(asdict(episode)))
     return episode
 
 
-def _finished(case: Case) -> Episode | None:
+def _read_finished(case: CalibrationCase) -> ClairvoyantEpisode | None:
     """The episode of the case's file; None where it is absent or damaged."""
     try:
         entry = json.loads(case.path.read_text(encoding="utf-8"))
-        episode = made_of(Episode, entry, str(case.path))
+        episode = from_json(ClairvoyantEpisode, entry, str(case.path))
     except (OSError, ValueError, RecursionError):
         return None
     costs = [episode.cost, episode.costs.get("none", math.nan), episode.seconds]
@@ -127,13 +130,13 @@ def _finished(case: Case) -> Episode | None:
 
 
 def calibrate(
-    contests: Sequence[Contest],
+    tasks: Sequence[ControlTask],
     folder: Path,
     seeds: int = SEEDS,
     command: str = "",
     jobs: int | None = None,
     console: Console | None = None,
-) -> list[Entry]:
+) -> list[CalibrationRecord]:
     """One entry a contest; folder: of finished cases, from which a stopped run goes on.
 
     Raises ValueError for fewer than two seeds (no interval), ModuleNotFoundError, with what to
@@ -149,25 +152,25 @@ def calibrate(
             "the clairvoyant needs CasADi and OSQP: pip install 'sideslip[mpc]'"
         ) from None
     folder.mkdir(parents=True, exist_ok=True)
-    cases = cases_of(contests, folder, seeds)
+    cases = make_cases(tasks, folder, seeds)
     episodes = run_cases(solve, cases, "calibration", jobs, console)
     return [
-        Entry(
-            **asdict(contest),
+        CalibrationRecord(
+            **asdict(task),
             env_version=__version__,
             command=command,
             episodes=tuple(episodes[i * seeds : (i + 1) * seeds]),
         )
-        for i, contest in enumerate(contests)
+        for i, task in enumerate(tasks)
     ]
 
 
-def cases_of(contests: Sequence[Contest], folder: Path, seeds: int) -> list[Case]:
+def make_cases(tasks: Sequence[ControlTask], folder: Path, seeds: int) -> list[CalibrationCase]:
     """Every episode, contest by contest."""
-    return [Case(c, seed, str(folder)) for c in contests for seed in seeds_of(c, seeds)]
+    return [CalibrationCase(c, seed, str(folder)) for c in tasks for seed in derive_seeds(c, seeds)]
 
 
-def forget(cases: Sequence[Case]) -> None:
+def remove_cases(cases: Sequence[CalibrationCase]) -> None:
     """Remove finished cases once their entries are written; those of other runs stay."""
     for case in cases:
         case.path.unlink(missing_ok=True)
@@ -176,68 +179,89 @@ def forget(cases: Sequence[Case]) -> None:
         folder.rmdir()
 
 
-def read_calibration(path: str | Path = FILE, stale: bool = False) -> dict[Contest, Entry]:
+def read_calibration(
+    path: str | Path = FILE, stale: bool = False
+) -> dict[ControlTask, CalibrationRecord]:
     """The entries of a file by contest. stale: those of another version or of other seeds are left
     out instead of refused.
 
     Raises FileNotFoundError where there is none, ValueError, with file, entry and field, for one
     that is cut short or lacks something, of another version or of other seeds.
     """
-    entries = {}
-    for i, each in enumerate(read_objects(path), 1):
+    records = {}
+    for i, item in enumerate(read_objects(path), 1):
         where = f"{path}: entry {i}"
-        episodes = each.get("episodes", ())
+        episodes = item.get("episodes", ())
         if not isinstance(episodes, list):
             raise ValueError(f"{where}: episodes is no list")
-        made = (made_of(Episode, one, f"{where}, episode {k}") for k, one in enumerate(episodes, 1))
-        entry = made_of(Entry, each | {"episodes": tuple(made)}, where)
-        seeds, why = [one.seed for one in entry.episodes], ""
-        if entry.env_version != __version__:
-            why = f"of version {entry.env_version}, not {__version__}"
-        elif seeds != seeds_of(entry.contest, len(seeds)):
+        parsed = (
+            from_json(ClairvoyantEpisode, one, f"{where}, episode {k}")
+            for k, one in enumerate(episodes, 1)
+        )
+        record = from_json(CalibrationRecord, item | {"episodes": tuple(parsed)}, where)
+        seeds, why = [one.seed for one in record.episodes], ""
+        if record.env_version != __version__:
+            why = f"of version {record.env_version}, not {__version__}"
+        elif seeds != derive_seeds(record.task, len(seeds)):
             why = "its seeds are not this contest's"
         if why and not stale:
-            raise ValueError(f"{where}, {entry.contest.name}, is stale: {why}")
+            raise ValueError(f"{where}, {record.task.name}, is stale: {why}")
         if not why:
-            entries[entry.contest] = entry
-    return entries
+            records[record.task] = record
+    return records
 
 
-def update(path: str | Path, made: Sequence[Entry]) -> None:
+def update(path: str | Path, new_records: Sequence[CalibrationRecord]) -> None:
     """Replace or add entries of a file, which is made if it is not there; its stale ones go."""
-    entries = read_calibration(path, stale=True) if Path(path).exists() else {}
-    entries |= {entry.contest: entry for entry in made}
-    ordered = sorted(entries.values(), key=lambda entry: entry.contest.name)
-    write_text(path, json.dumps([asdict(entry) for entry in ordered], indent=1) + "\n")
+    records = read_calibration(path, stale=True) if Path(path).exists() else {}
+    records |= {record.task: record for record in new_records}
+    ordered = sorted(records.values(), key=lambda record: record.task.name)
+    write_text(path, json.dumps([asdict(record) for record in ordered], indent=1) + "\n")
 
 
-def check_fresh(entries: Mapping[Contest, Entry], path: str | Path = FILE) -> None:
+def check_current(
+    records: Mapping[ControlTask, CalibrationRecord], path: str | Path = FILE
+) -> None:
     """ValueError, with the contest, where the uncontrolled car no longer costs what it did."""
-    for contest, entry in entries.items():
-        cell, seeds = Cell(contest, "", "none"), [episode.seed for episode in entry.episodes]
-        now = measure([cell], seeds, jobs=1).found[cell]
-        then = np.array([episode.costs["none"] for episode in entry.episodes])
+    for task, record in records.items():
+        control_entry, seeds = (
+            ControlEntry(task, "", "none"),
+            [episode.seed for episode in record.episodes],
+        )
+        now = measure([control_entry], seeds, jobs=1).outcomes[control_entry]
+        then = np.array([episode.costs["none"] for episode in record.episodes])
         if now.error or not np.allclose(now.costs, then, rtol=_SAME, atol=0.0):
             raise ValueError(
-                f"{path}: {contest.name} is stale: the uncontrolled car costs {now.costs[0]:.6g} "
+                f"{path}: {task.name} is stale: the uncontrolled car costs {now.costs[0]:.6g} "
                 f"on its first seed, {then[0]:.6g} when it was calibrated; run sideslip calibrate"
             )
 
 
-def driven_there(
-    entries: Mapping[Contest, Entry], cells: Sequence[Cell], **options: Any
+def measure_calibrated(
+    records: Mapping[ControlTask, CalibrationRecord],
+    control_entries: Sequence[ControlEntry],
+    **options: Any,
 ) -> Results:
     """The cells of calibrated contests on the clairvoyant's seeds; options: of `measure`."""
-    seeds = {contest: [each.seed for each in entry.episodes] for contest, entry in entries.items()}
-    mine = [cell for contest in entries for cell in cells if cell.contest == contest]
-    return measure(mine, seeds.__getitem__, title="control, the clairvoyant's seeds", **options)
+    seeds = {task: [each.seed for each in record.episodes] for task, record in records.items()}
+    task_entries = [
+        control_entry
+        for task in records
+        for control_entry in control_entries
+        if control_entry.task == task
+    ]
+    return measure(
+        task_entries, seeds.__getitem__, title="control, the clairvoyant's seeds", **options
+    )
 
 
-def leads(entries: Mapping[Contest, Entry], there: Results) -> dict[Cell, Array]:
+def compute_regrets(
+    records: Mapping[ControlTask, CalibrationRecord], results: Results
+) -> dict[ControlEntry, Array]:
     """(n,) log(J / J_clairvoyant) of each cell on the seeds that it survives."""
-    found = {}
-    for cell, driven in there.found.items():
-        if not driven.error and survived(driven).any():
-            best = entries[cell.contest].costs[: len(driven.costs)]
-            found[cell] = -gains(best, driven)[survived(driven)]
-    return found
+    regrets = {}
+    for entry, result in results.outcomes.items():
+        if not result.error and survival_mask(result).any():
+            best = records[entry.task].costs[: len(result.costs)]
+            regrets[entry] = -compute_log_ratios(best, result)[survival_mask(result)]
+    return regrets

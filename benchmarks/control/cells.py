@@ -6,9 +6,19 @@ from typing import Any
 
 from ...agents import AGENTS
 from ...agents.learned.files import is_policy, load_policy
-from ...agents.tuned import Options, tuned
-from ...envs.task.observation import SEEN
-from .contests import NOMINAL, ORACLES, PARAMETERS, STATE, STEERING, TIERS, YAW, Contest, oracle_of
+from ...agents.tuned import Options, get_tuned_options
+from ...envs.task.observation import OBSERVATION_OPTIONS
+from .contests import (
+    NOMINAL,
+    ORACLES,
+    PARAMETERS,
+    STATE,
+    STEERING,
+    TIERS,
+    YAW,
+    ControlTask,
+    find_oracle,
+)
 
 TRUTH, REFERENCE_CONTROLLER = "truth", "lqr"
 REFERENCE_FILTER = "exact-kf, all sensors"
@@ -45,8 +55,8 @@ CONTROLLERS: dict[str, tuple[str, ...]] = {
     STEERING: ("two-dof", "esc", "model-following", "nmpc"),
 }
 """Besides the reference controller, on the reference filter."""
-RUNGS = (NOMINAL, PARAMETERS, STATE)
-_CANDIDATES = tuple(name for those in ORACLES.values() for name in those)
+ORACLE_NAMES = (NOMINAL, PARAMETERS, STATE)
+_CANDIDATES = tuple(name for names in ORACLES.values() for name in names)
 LEARNED: dict[str, tuple[tuple[str, str], ...]] = {
     "car-steering": (("joint", "distill-car-steering"), ("", "raw-car-steering")),
     "car-yaw": (("joint", "distill-car-yaw"), ("", "raw-car-yaw")),
@@ -77,18 +87,18 @@ QUICK_CONTESTS = 2
 """Of each tier, in a quick run."""
 
 
-def some_of(contests: Sequence[Contest]) -> list[Contest]:
+def select_quick_tasks(tasks: Sequence[ControlTask]) -> list[ControlTask]:
     """`QUICK_CONTESTS` of each tier, from its first to its last."""
-    found = []
-    for tier in dict.fromkeys(contest.tier for contest in contests):
-        mine = [contest for contest in contests if contest.tier == tier]
-        step = max(len(mine) / QUICK_CONTESTS, 1.0)
-        found += [mine[int(i * step)] for i in range(min(QUICK_CONTESTS, len(mine)))]
-    return found
+    selected = []
+    for tier in dict.fromkeys(task.tier for task in tasks):
+        tier_tasks = [task for task in tasks if task.tier == tier]
+        step = max(len(tier_tasks) / QUICK_CONTESTS, 1.0)
+        selected += [tier_tasks[int(i * step)] for i in range(min(QUICK_CONTESTS, len(tier_tasks)))]
+    return selected
 
 
 @dataclass(frozen=True)
-class Cell:
+class ControlEntry:
     """One square of the matrix.
 
     estimator: a name of `SETUPS` or of `make_estimator`, "truth", or "" where the controller reads
@@ -99,7 +109,7 @@ class Cell:
     whatever these three are.
     """
 
-    contest: Contest
+    task: ControlTask
     estimator: str
     controller: str
     options: dict[str, Any] = field(default_factory=dict, compare=False)
@@ -110,24 +120,25 @@ class Cell:
     def is_users(self) -> bool:
         """Whether its controller is a user's own."""
         name = self.controller
-        known = name in AGENTS or name in (*RUNGS, *_CANDIDATES) or is_policy(name)
+        known = name in AGENTS or name in (*ORACLE_NAMES, *_CANDIDATES) or is_policy(name)
         return "controller" in self.objects or not known
 
     @property
     def best(self) -> Options:
-        """The options of its filter and its controller: `tuned`, or those of `agents.tuned`, where
-        the reference controller, `nominal`'s design on any filter, has the rung's, a user's own the
-        rung's filter, and one that was not tuned what it shares with the rung."""
+        """The options of its filter and its controller: `get_tuned_options`, or those of
+        `agents.get_tuned_options`, where the reference controller, `nominal`'s design on any
+        filter, has the rung's, a user's own the rung's filter, and one that was not tuned what it
+        shares with the rung."""
         if self.tuned is not None:
             return self.tuned
         if self.is_users:
-            return tuned(self.contest.kind, NOMINAL) | {"controller": {}}
-        kind, name = self.contest.kind, self.rung or self.controller
-        if name in SHARED and not any(tuned(kind, name).values()):
+            return get_tuned_options(self.task.kind, NOMINAL) | {"controller": {}}
+        kind, name = self.task.kind, self.oracle or self.controller
+        if name in SHARED and not any(get_tuned_options(kind, name).values()):
             source, numbers = SHARED[name]
-            best = tuned(kind, source)["controller"]
+            best = get_tuned_options(kind, source)["controller"]
             return {"filter": {}, "controller": {key: best[key] for key in numbers & best.keys()}}
-        return tuned(kind, NOMINAL if name == REFERENCE_CONTROLLER else name)
+        return get_tuned_options(kind, NOMINAL if name == REFERENCE_CONTROLLER else name)
 
     @property
     def label(self) -> str:
@@ -139,36 +150,39 @@ class Cell:
         """Options of the env: an action that is none ends the episode, and a policy sees what its
         training saw."""
         card = load_policy(self.controller).card.env_options if is_policy(self.controller) else {}
-        seen = {name: card[name] for name in SEEN if name in card}
-        return self.contest.env_options | {"on_bad_action": "fail"} | seen | self.options
+        observed = {name: card[name] for name in OBSERVATION_OPTIONS if name in card}
+        return self.task.env_options | {"on_bad_action": "fail"} | observed | self.options
 
     @property
-    def rung(self) -> str:
+    def oracle(self) -> str:
         """The rung of the ladder that drives, "" where a contestant does."""
         if self.is_users:
             return ""
         if self.controller in ORACLES:
-            return oracle_of(self.contest, self.controller)
+            return find_oracle(self.task, self.controller)
         return self.controller if self.controller in (NOMINAL, *_CANDIDATES) else ""
 
     @property
     def slow(self) -> bool:
         """Whether it takes so long to decide that it gets fewer episodes."""
-        return (self.rung or self.controller) in SLOW_CONTROLLERS
+        return (self.oracle or self.controller) in SLOW_CONTROLLERS
 
 
-def cells(contests: Sequence[Contest], quick: bool = False) -> Iterator[Cell]:
+def make_entries(tasks: Sequence[ControlTask], quick: bool = False) -> Iterator[ControlEntry]:
     """Every cell of the matrix, contest by contest; quick: without the slow contestants.
 
     All estimators in the contests with the first of their tier's ids.
     """
-    for contest in contests:
-        made = [Cell(contest, "", rung) for rung in (*RUNGS, "none")]
-        first = contest.tier not in TIERS or contest.env_id == TIERS[contest.tier][0][0]
+    for task in tasks:
+        entries = [ControlEntry(task, "", oracle) for oracle in (*ORACLE_NAMES, "none")]
+        first = task.tier not in TIERS or task.env_id == TIERS[task.tier][0][0]
         filters = ESTIMATORS if first else (REFERENCE_FILTER, TRUTH)
-        made += [Cell(contest, name, REFERENCE_CONTROLLER) for name in filters]
-        made += [Cell(contest, REFERENCE_FILTER, who) for who in CONTROLLERS[contest.env_id]]
-        made += [Cell(contest, *pair) for pair in (*ADAPTIVE.items(), CORRECTED)]
-        if contest.tier:
-            made += [Cell(contest, *pair) for pair in LEARNED.get(contest.kind, ())]
-        yield from (cell for cell in made if not (quick and cell.slow and not cell.rung))
+        entries += [ControlEntry(task, name, REFERENCE_CONTROLLER) for name in filters]
+        entries += [
+            ControlEntry(task, REFERENCE_FILTER, controller)
+            for controller in CONTROLLERS[task.env_id]
+        ]
+        entries += [ControlEntry(task, *pair) for pair in (*ADAPTIVE.items(), CORRECTED)]
+        if task.tier:
+            entries += [ControlEntry(task, *pair) for pair in LEARNED.get(task.kind, ())]
+        yield from (entry for entry in entries if not (quick and entry.slow and not entry.oracle))

@@ -15,47 +15,49 @@ from rich.table import Table
 
 from ... import __version__
 from ..harness.stats import Estimate, geometric_mean
-from .cells import Cell
+from .cells import ControlEntry
 from .contests import (
     LIMIT,
     NOMINAL,
     ORACLES,
     PARAMETERS,
     STATE,
-    Contest,
-    Measured,
-    candidates,
-    write_contests,
+    ControlTask,
+    TaskMeasurement,
+    list_candidates,
+    write_tasks,
 )
-from .episodes import Array, Driven
+from .episodes import Array, DriveResult
 from .run import Results, measure
-from .scores import Yardstick, survived
-from .seeds import tuning_seeds
+from .scores import ScoreScale, survival_mask
+from .seeds import make_tuning_seeds
 
 EPISODES = 64
-GAP, LEAST, FAILING = 0.3, 0.2, 0.1
+GAP, MIN_LOW, FAILING = 0.3, 0.2, 0.1
 """A contest is scored whose gap is above the first, its lower limit above the second, and in which
 nominal fails in less than this share (at the limit in any, but never always)."""
 
 
-def rungs_of(contest: Contest) -> list[Cell]:
+def make_oracle_entries(task: ControlTask) -> list[ControlEntry]:
     """Nominal and the candidates for the oracles."""
-    return [Cell(contest, "", name) for name in (NOMINAL, *ORACLES[PARAMETERS], *ORACLES[STATE])]
+    return [
+        ControlEntry(task, "", name) for name in (NOMINAL, *ORACLES[PARAMETERS], *ORACLES[STATE])
+    ]
 
 
-def judged(results: Results, contest: Contest) -> Measured:
+def measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
     """A candidate's numbers; the better oracle is that of fewer failures, then of the larger gap.
 
     A rung that could not be computed, and cars that all fail, leave a gap of 0 and the reason.
     """
-    nominal = results.of(contest, NOMINAL)
+    nominal = results.select(task, NOMINAL)
     errors = [f"{NOMINAL}: {nominal.error}"] if nominal.error else []
-    failing = 1.0 if nominal.error else float(np.mean(~survived(nominal)))
-    knowing, _, _, _ = _better(results, contest, PARAMETERS, nominal)
-    name, gap, kept, more = _better(results, contest, STATE, nominal)
-    errors += more
-    return Measured(
-        **asdict(contest),
+    failing = 1.0 if nominal.error else float(np.mean(~survival_mask(nominal)))
+    knowing, _, _, _ = _select_oracle(results, task, PARAMETERS, nominal)
+    name, gap, n_compared, oracle_errors = _select_oracle(results, task, STATE, nominal)
+    errors += oracle_errors
+    return TaskMeasurement(
+        **asdict(task),
         env_version=__version__,
         oracle=name,
         knowing=knowing,
@@ -63,61 +65,61 @@ def judged(results: Results, contest: Contest) -> Measured:
         low=round(gap.low, 4),
         high=round(gap.high, 4),
         failing=round(failing, 4),
-        judged=kept,
+        judged=n_compared,
         n=len(nominal.costs),
         verdict="; ".join(errors)
-        if nominal.error or len(more) == len(ORACLES[STATE])
-        else _verdict(contest, gap, failing, kept),
+        if nominal.error or len(oracle_errors) == len(ORACLES[STATE])
+        else _describe_verdict(task, gap, failing, n_compared),
     )
 
 
-def _better(
-    results: Results, contest: Contest, rung: str, nominal: Driven
+def _select_oracle(
+    results: Results, task: ControlTask, oracle_kind: str, nominal: DriveResult
 ) -> tuple[str, Estimate, int, list[str]]:
     """(name, gap to nominal, episodes judged) of the better candidate, and what went wrong."""
-    found: list[tuple[bool, float, str, Estimate, int]] = []
+    options: list[tuple[bool, float, str, Estimate, int]] = []
     errors = []
-    for name in ORACLES[rung]:
-        oracle = results.of(contest, name)
+    for name in ORACLES[oracle_kind]:
+        oracle = results.select(task, name)
         if oracle.error:
             errors.append(f"{name}: {oracle.error}")
         elif not nominal.error:
-            own = Yardstick(nominal, oracle).paired(oracle)[1]
-            gap, failing = _gap(own), float(np.mean(~survived(oracle)))
-            found.append((failing > FAILING, -gap.value, name, gap, len(own)))
-    nothing = (True, 0.0, ORACLES[rung][0], Estimate(0.0, 0.0, 0.0), 0)
-    _, _, name, gap, kept = min(found) if found else nothing
-    return name, gap, kept, errors
+            log_ratios = ScoreScale(nominal, oracle).compute_paired_ratios(oracle)[1]
+            gap, failing = _compute_gap(log_ratios), float(np.mean(~survival_mask(oracle)))
+            options.append((failing > FAILING, -gap.value, name, gap, len(log_ratios)))
+    nothing = (True, 0.0, ORACLES[oracle_kind][0], Estimate(0.0, 0.0, 0.0), 0)
+    _, _, name, gap, n_compared = min(options) if options else nothing
+    return name, gap, n_compared, errors
 
 
-def _gap(own: Array) -> Estimate:
+def _compute_gap(log_ratios: Array) -> Estimate:
     """The mean of r with its interval, 0 where no episode or only one is left."""
-    if len(own) < 2:
+    if len(log_ratios) < 2:
         return Estimate(0.0, 0.0, 0.0)
-    return Estimate(*(math.log(each) for each in geometric_mean(own)))
+    return Estimate(*(math.log(number) for number in geometric_mean(log_ratios)))
 
 
-def _verdict(contest: Contest, gap: Estimate, failing: float, kept: int) -> str:
-    if kept < 2:
+def _describe_verdict(task: ControlTask, gap: Estimate, failing: float, n_compared: int) -> str:
+    if n_compared < 2:
         return "no episode that nominal and oracle-state survive"
-    if failing >= FAILING and contest.tier not in LIMIT:
+    if failing >= FAILING and task.tier not in LIMIT:
         return f"nominal fails in {100.0 * failing:.0f} %"
-    if not (gap.value > GAP and gap.low > LEAST):
+    if not (gap.value > GAP and gap.low > MIN_LOW):
         return f"too little to win: {gap.value:.2f} [{gap.low:.2f}, {gap.high:.2f}]"
     return "scored"
 
 
-def choose(
-    among: Sequence[Contest] | None = None,
+def choose_tasks(
+    among: Sequence[ControlTask] | None = None,
     episodes: int = EPISODES,
     jobs: int | None = None,
     console: Console | None = None,
-) -> list[Measured]:
+) -> list[TaskMeasurement]:
     """Measure candidates (default: all); one that cannot be driven is not scored, with why."""
-    among = candidates() if among is None else among
-    cells = [cell for contest in among for cell in rungs_of(contest)]
-    results = measure(cells, tuning_seeds(episodes), jobs=jobs, console=console)
-    return [judged(results, contest) for contest in among]
+    among = list_candidates() if among is None else among
+    entries = [entry for task in among for entry in make_oracle_entries(task)]
+    results = measure(entries, make_tuning_seeds(episodes), jobs=jobs, console=console)
+    return [measure_task(results, task) for task in among]
 
 
 def main(
@@ -127,18 +129,24 @@ def main(
 ) -> None:
     """Which contests are scored: where the rungs of the ladder lie apart, on tuning seeds."""
     console = Console()
-    found = choose(None, episodes, jobs, console)
+    measurements = choose_tasks(None, episodes, jobs, console)
     columns = "tier", "contest", *ORACLES, "gap", "nominal fails / %", "verdict"
     table = Table(*columns)
-    for each in found:
-        gap = f"{each.gap:.2f} [{each.low:.2f}, {each.high:.2f}]"
-        failing = f"{100.0 * each.failing:.1f}"
+    for measurement in measurements:
+        gap = f"{measurement.gap:.2f} [{measurement.low:.2f}, {measurement.high:.2f}]"
+        failing = f"{100.0 * measurement.failing:.1f}"
         table.add_row(
-            each.tier, each.contest.name, each.knowing, each.oracle, gap, failing, each.verdict
+            measurement.tier,
+            measurement.task.name,
+            measurement.knowing,
+            measurement.oracle,
+            gap,
+            failing,
+            measurement.verdict,
         )
     console.print(table)
     if write:
-        write_contests(found)
+        write_tasks(measurements)
 
 
 if __name__ == "__main__":

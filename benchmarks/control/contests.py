@@ -14,9 +14,9 @@ from typing import Any
 from ... import __version__
 from ...agents import rungs
 from ...envs.arguments import check_choice
-from ...envs.scenarios.manoeuvres import SCENARIOS, scenario_from
+from ...envs.scenarios.manoeuvres import SCENARIOS, make_scenario
 from ...envs.vehicle.vehicles import VEHICLES
-from ..harness.results import made_of, read_objects, write_text
+from ..harness.results import from_json, read_objects, write_text
 
 YAW = "sideslip/YawFusion-v0"
 STEERING = "sideslip/AfsYawFusion-v0"
@@ -24,7 +24,7 @@ FILE = Path(__file__).with_name("contests.json")
 COMMAND = "python -m sideslip.benchmarks.control.choice --write"
 
 NOMINAL, PARAMETERS, STATE = "nominal", "oracle-parameters", "oracle-state"
-ORACLES = {PARAMETERS: rungs.PARAMETERS, STATE: rungs.STATE}
+ORACLES = {PARAMETERS: rungs.PARAMETER_ORACLES, STATE: rungs.STATE_ORACLES}
 """The rungs of which a contest's better one has the name."""
 
 TIERS: dict[str, tuple[tuple[str, str, str], ...]] = {
@@ -45,7 +45,7 @@ LIMIT = ("2c",)
 
 
 @dataclass(frozen=True)
-class Contest:
+class ControlTask:
     """A scenario in an environment; vehicle and reference: "" for the id's own. tier: "" where it
     is none of a score's."""
 
@@ -83,27 +83,27 @@ class Contest:
     def env_options(self) -> dict[str, Any]:
         """Options of the env."""
         car = {"vehicle": self.vehicle, "nominal": self.vehicle} if self.vehicle else {}
-        judged = {"reference": self.reference} if self.reference else {}
-        return {"scenario": self.scenario} | car | judged
+        reference_options = {"reference": self.reference} if self.reference else {}
+        return {"scenario": self.scenario} | car | reference_options
 
 
-def changed(contest: Contest, change: Mapping[str, Any]) -> dict[str, Any]:
+def vary_scenario(task: ControlTask, change: Mapping[str, Any]) -> dict[str, Any]:
     """A contest's scenario, over its name, with some fields changed.
 
     change: fields of `Scenario`; noise comes to the scenario's own, and "mass" is a factor on the
     true car's, of which controllers and filters know nothing.
     """
-    fields, base = dict(change), scenario_from(contest.scenario)
+    fields, base = dict(change), make_scenario(task.scenario)
     if "noise" in fields:
         fields["noise"] = dict(base.noise) | fields["noise"]
     if "mass" in fields:
-        mass = fields.pop("mass") * VEHICLES[contest.vehicle].mass
+        mass = fields.pop("mass") * VEHICLES[task.vehicle].mass
         fields["vehicle"] = dict(base.vehicle) | {"mass": mass}
-    return {"base": contest.scenario} | fields
+    return {"base": task.scenario} | fields
 
 
 @dataclass(frozen=True)
-class Measured:
+class TaskMeasurement:
     """A candidate with what was measured on tuning seeds: an entry of the file.
 
     oracle, knowing: the better of `ORACLES` for state and for parameters. gap: mean
@@ -129,63 +129,70 @@ class Measured:
     verdict: str
 
     @property
-    def contest(self) -> Contest:
+    def task(self) -> ControlTask:
         """Of which these are the numbers."""
-        return Contest(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
+        return ControlTask(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
 
 
-def candidates() -> list[Contest]:
+def list_candidates() -> list[ControlTask]:
     """Every scenario that has a tier, with each of the tier's ids and references."""
     return [
-        Contest(tier, *driven, name)
-        for tier, those in TIERS.items()
-        for driven in those
+        ControlTask(tier, *variant, name)
+        for tier, variants in TIERS.items()
+        for variant in variants
         for name, scenario in SCENARIOS.items()
         if scenario.tier == tier
     ]
 
 
-def read_contests(path: Path = FILE) -> tuple[Measured, ...]:
+def read_tasks(path: Path = FILE) -> tuple[TaskMeasurement, ...]:
     """All candidates of a file.
 
     Raises FileNotFoundError, and ValueError, with the file and what to do, where it was measured
     with another version, is cut short, or names what there is not.
     """
-    found = []
-    for i, each in enumerate(read_objects(path), 1):
-        entry, where = made_of(Measured, each, f"{path}: entry {i}"), f"{path}: entry {i}"
-        if entry.env_version != __version__:
+    measurements = []
+    for i, item in enumerate(read_objects(path), 1):
+        measurement, where = (
+            from_json(TaskMeasurement, item, f"{path}: entry {i}"),
+            f"{path}: entry {i}",
+        )
+        if measurement.env_version != __version__:
             raise ValueError(
-                f"{where} was measured with version {entry.env_version}, this is {__version__}; "
-                f"measure the contests anew: {COMMAND}"
+                f"{where} was measured with version {measurement.env_version}, this is "
+                f"{__version__}; measure the contests anew: {COMMAND}"
             )
-        check_choice(f"{where}: oracle", entry.oracle, ORACLES[STATE])
-        check_choice(f"{where}: knowing", entry.knowing, ORACLES[PARAMETERS])
-        if entry.contest not in candidates():
-            raise ValueError(f"{where}: {entry.contest} is no contest of this version; {COMMAND}")
-        found.append(entry)
-    return tuple(found)
+        check_choice(f"{where}: oracle", measurement.oracle, ORACLES[STATE])
+        check_choice(f"{where}: knowing", measurement.knowing, ORACLES[PARAMETERS])
+        if measurement.task not in list_candidates():
+            raise ValueError(
+                f"{where}: {measurement.task} is no contest of this version; {COMMAND}"
+            )
+        measurements.append(measurement)
+    return tuple(measurements)
 
 
-def write_contests(entries: Sequence[Measured], path: Path = FILE) -> None:
-    """Write a file that `read_contests` reads."""
-    write_text(path, json.dumps([asdict(each) for each in entries], indent=1) + "\n")
-
-
-@cache
-def contests() -> tuple[Contest, ...]:
-    """The scored contests, tier by tier; raises as `read_contests`."""
-    return tuple(each.contest for each in read_contests() if each.verdict == "scored")
+def write_tasks(entries: Sequence[TaskMeasurement], path: Path = FILE) -> None:
+    """Write a file that `read_tasks` reads."""
+    write_text(path, json.dumps([asdict(entry) for entry in entries], indent=1) + "\n")
 
 
 @cache
-def _measured() -> dict[Contest, Measured]:
-    return {each.contest: each for each in read_contests()} if FILE.is_file() else {}
+def list_scored_tasks() -> tuple[ControlTask, ...]:
+    """The scored contests, tier by tier; raises as `read_tasks`."""
+    return tuple(
+        measurement.task for measurement in read_tasks() if measurement.verdict == "scored"
+    )
 
 
-def oracle_of(contest: Contest, name: str = STATE) -> str:
+@cache
+def _index_measurements() -> dict[ControlTask, TaskMeasurement]:
+    return {measurement.task: measurement for measurement in read_tasks()} if FILE.is_file() else {}
+
+
+def find_oracle(task: ControlTask, name: str = STATE) -> str:
     """The better of `ORACLES` of a name in a contest; LQR where none was measured."""
-    found = _measured().get(contest)
-    if found is None:
+    measurement = _index_measurements().get(task)
+    if measurement is None:
         return ORACLES[name][0]
-    return found.oracle if name == STATE else found.knowing
+    return measurement.oracle if name == STATE else measurement.knowing

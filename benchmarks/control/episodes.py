@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...agents.rollout import Step, steps_of
-from ...envs.arguments import actions_of
+from ...agents.rollout import EpisodeStep, iterate_steps
+from ...envs.arguments import parse_actions
 from ...envs.record import FAST
 from ...envs.task.failures import FAILURES
 from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import Motion
-from ...estimators.user_files import reason_of
-from ..harness.dissipation import dissipated
-from ..harness.metrics import EPISODE, FOLDS, Moment
+from ...estimators.user_files import describe_error
+from ..harness.dissipation import compute_dissipation
+from ..harness.metrics import EPISODE, REDUCTIONS, StepSample
 from .build import make_cars
-from .cells import Cell
+from .cells import ControlEntry
 
 Array = npt.NDArray[np.float64]
 
@@ -31,13 +31,13 @@ SIGNALS = (*_INFO[1:], *_PLACE)
 class Chunk:
     """A case: some seeds of a cell. keep: whether it returns the first seed's time series."""
 
-    cell: Cell
+    entry: ControlEntry
     seeds: tuple[int, ...]
     keep: bool = False
 
 
 @dataclass
-class Driven:
+class DriveResult:
     """Episodes of a cell in the order of their seeds.
 
     numbers: (seeds, NUMBERS). seconds: of CPU time. series: (k, 1 + SIGNALS) with the time first,
@@ -58,82 +58,93 @@ class Driven:
         """(seeds,)."""
         return self["cost"]
 
-    def failed(self, by: str) -> Array:
+    def mark_failures(self, cause: str) -> Array:
         """(seeds,) 1 where an episode ended by this failure, NaN where none was driven."""
-        return np.where(np.isnan(self["failure"]), np.nan, self["failure"] == FAILURES.index(by))
+        return np.where(np.isnan(self["failure"]), np.nan, self["failure"] == FAILURES.index(cause))
 
 
-class _Tally:
+class _MetricAccumulator:
     """The metrics of all cars while their episodes run; reset: the first of their steps."""
 
-    def __init__(self, base: Any, reset: Step) -> None:
+    def __init__(self, base: Any, reset: EpisodeStep) -> None:
         car, self.width = base.vehicle[0], base.single_action_space.shape[0]
-        self.full = np.array([car.yaw_moment_limit, car.steering_authority])
-        self.full[self.width :] = 0.0
+        self.full_scale = np.array([car.yaw_moment_limit, car.steering_authority])
+        self.full_scale[self.width :] = 0.0
         self.dt = base.control_period * TICK
         self.base, self.radius = base, car.wheel_radius
-        self.last, self.before = reset.info, np.zeros((base.num_envs, 2))
-        self.turned, self.aside = np.zeros((2, base.num_envs))
+        self.last, self.last_command = reset.info, np.zeros((base.num_envs, 2))
+        self.turned, self.lateral_deviation = np.zeros((2, base.num_envs))
         self.steps, self.totals = np.zeros(base.num_envs), np.zeros((len(EPISODE), base.num_envs))
 
-    def add(self, step: Step) -> None:
-        asked = np.zeros_like(self.before)
-        shares = actions_of(step.action, len(asked), self.width, fail=True)
-        asked[:, : self.width] = np.clip(np.nan_to_num(shares), -1.0, 1.0)
+    def add(self, step: EpisodeStep) -> None:
+        command = np.zeros_like(self.last_command)
+        shares = parse_actions(step.action, len(command), self.width, fail=True)
+        command[:, : self.width] = np.clip(np.nan_to_num(shares), -1.0, 1.0)
         info, speed = step.info, self.base.motion[:, Motion._fields.index("v_x")]
         self.turned += (info["gamma"] - info["gamma_ref"]) * self.dt
-        self.aside += speed * (self.turned + info["beta"] - info["beta_ref"]) * self.dt
+        self.lateral_deviation += speed * (self.turned + info["beta"] - info["beta_ref"]) * self.dt
         torques = self.base.rows[:, -1, [FAST.torque_left, FAST.torque_right]]
         power = np.abs(torques).sum(axis=1) * speed / self.radius
-        heat = dissipated(self.base.params, self.base.states, self.base.switches)
-        moment = Moment(
-            *(asked, self.before, step.reward, info, self.last, self.full, self.dt, self.aside),
-            *(power, heat),
+        tyre_dissipation = compute_dissipation(
+            self.base.params, self.base.states, self.base.switches
+        )
+        moment = StepSample(
+            *(
+                command,
+                self.last_command,
+                step.reward,
+                info,
+                self.last,
+                self.full_scale,
+                self.dt,
+                self.lateral_deviation,
+            ),
+            *(power, tyre_dissipation),
         )
         for metric, total in zip(EPISODE, self.totals, strict=True):
-            added = FOLDS[metric.fold].add(total, metric.of(moment))
+            added = REDUCTIONS[metric.reduction].add(total, metric.compute(moment))
             np.copyto(total, added, where=step.running)
         self.steps += step.running
-        self.last, self.before = step.info, asked
+        self.last, self.last_command = step.info, command
 
     def numbers(self) -> Array:
         """(cars, NUMBERS)."""
-        folds = [FOLDS[metric.fold] for metric in EPISODE]
+        folds = [REDUCTIONS[metric.reduction] for metric in EPISODE]
         done = [f.finish(t, self.steps) for f, t in zip(folds, self.totals, strict=True)]
         return np.stack(done, axis=1)
 
 
-def drive(chunk: Chunk) -> Driven:
+def run_chunk(chunk: Chunk) -> DriveResult:
     """Drive one episode a seed; the reason why a cell cannot be built or driven is its `error`."""
     try:
-        return _drive(chunk)
+        return _run_chunk(chunk)
     except Exception as error:
         empty = np.full((len(chunk.seeds), len(NUMBERS)), np.nan)
-        return Driven(empty, np.nan, error=reason_of(error))
+        return DriveResult(empty, np.nan, error=describe_error(error))
 
 
-def _drive(chunk: Chunk) -> Driven:
-    begun = time.process_time()
-    env, agent = make_cars(chunk.cell, len(chunk.seeds))
-    steps = steps_of(env, agent, list(chunk.seeds))
+def _run_chunk(chunk: Chunk) -> DriveResult:
+    start_time = time.process_time()
+    env, agent = make_cars(chunk.entry, len(chunk.seeds))
+    steps = iterate_steps(env, agent, list(chunk.seeds))
     reset = next(steps)
-    tally, series = _Tally(env.unwrapped, reset), [_signals(env, reset)]
+    tally, series = _MetricAccumulator(env.unwrapped, reset), [_read_signals(env, reset)]
     for step in steps:
         if chunk.keep and step.running[0]:
-            series.append(_signals(env, step))
+            series.append(_read_signals(env, step))
         tally.add(step)
     env.close()
-    spent = time.process_time() - begun
-    return Driven(tally.numbers(), spent, np.array(series) if chunk.keep else None)
+    spent = time.process_time() - start_time
+    return DriveResult(tally.numbers(), spent, np.array(series) if chunk.keep else None)
 
 
-def _signals(env: Any, step: Step) -> list[float]:
+def _read_signals(env: Any, step: EpisodeStep) -> list[float]:
     """The time and SIGNALS of the first car."""
     motion = env.unwrapped.motion[0]
     place = [float(motion[Motion._fields.index(name)]) for name in _PLACE]
     return [float(step.info[name][0]) for name in _INFO] + place
 
 
-def control_period(cell: Cell) -> float:
+def get_control_period(entry: ControlEntry) -> float:
     """Seconds between two decisions of a cell."""
-    return int(cell.options.get("control_period", 10)) * TICK
+    return int(entry.options.get("control_period", 10)) * TICK

@@ -8,19 +8,19 @@ import numpy as np
 from ...agents import make_agent
 from ...agents.rollout import Rollout, rollout
 from ...envs.record import Array
-from ...envs.rendering.palette import colour
+from ...envs.rendering.palette import find_colour
 from ...envs.vehicle.vehicles import VEHICLES
 from ..harness.drives import make_env
 from ..harness.explorer import Explorer, Panel
 from ..harness.results import Suite
 from ..harness.stats import Estimate, geometric_mean
-from ..report.kml import track_kml
-from .answer import best_controller, costs, on_its_own
-from .build import agent_options, estimate_options, name_of
-from .cells import REFERENCE_CONTROLLER, RUNGS, TRUTH, Cell
-from .contests import NOMINAL, TITLES, Contest
+from ..report.kml import make_track_kml
+from .answer import costs, find_best_controller, is_default_filter
+from .build import get_filter_name, make_agent_options, make_estimate_options
+from .cells import ORACLE_NAMES, REFERENCE_CONTROLLER, TRUTH, ControlEntry
+from .contests import NOMINAL, TITLES, ControlTask
 from .episodes import SIGNALS
-from .ladder import DELAYS, PRICE_CONTEST, Price, lines
+from .ladder import DELAY_TASK, DELAYS, DelayCost, make_cost_lines
 from .run import Results
 from .tables import Standing
 
@@ -36,141 +36,153 @@ _COST = "cost / nominal's, %: less is better"
 _CAPTION = "nominal: an LQG that knows the data sheet. Whiskers: 95 % intervals. Hollow: a variant."
 
 
-def illustrate(
+def add_figures(
     suite: Suite,
-    found: Mapping[str, Sequence[Standing]],
+    by_tier: Mapping[str, Sequence[Standing]],
     results: Results,
-    prices: Sequence[Price],
-    ahead: Mapping[Contest, Array],
+    prices: Sequence[DelayCost],
+    foresight: Mapping[ControlTask, Array],
 ) -> None:
     """Add the figures to a suite that has its verdict; without plotly only the tracks.
 
-    ahead: (n,) log(J_oracle-state / J_clairvoyant) of calibrated contests.
+    foresight: (n,) log(J_oracle-state / J_clairvoyant) of calibrated contests.
     """
-    series = {cell: each.series for cell, each in results.found.items() if each.series is not None}
-    best = best_controller(found)
-    suite.files += _tracks(series, best)
+    series = {
+        entry: result.series
+        for entry, result in results.outcomes.items()
+        if result.series is not None
+    }
+    best = find_best_controller(by_tier)
+    suite.files += _make_tracks(series, best)
     try:
-        from ..report.figures import curves, groups_with_interval
+        from ..report.figures import draw_curves, draw_groups
     except ModuleNotFoundError:
         return
-    asked = (
-        ("Which controller holds the car?", {"All contests": costs(found)}),
-        ("Which controller holds it in each tier?", _groups(found, _controller)),
-        ("Which estimator does a controller drive best with?", _groups(found, _estimator)),
-        ("What would knowing more save?", _ladder(found, ahead)),
+    questions = (
+        ("Which controller holds the car?", {"All contests": costs(by_tier)}),
+        ("Which controller holds it in each tier?", _group_costs(by_tier, _controller)),
+        ("Which estimator does a controller drive best with?", _group_costs(by_tier, _estimator)),
+        ("What would knowing more save?", _group_oracles(by_tier, foresight)),
     )
     suite.answers += [
-        (title, groups_with_interval(groups, _COST, {100.0: "nominal"}), _CAPTION)
-        for title, groups in asked
+        (title, draw_groups(groups, _COST, {100.0: "nominal"}), _CAPTION)
+        for title, groups in questions
         if any(groups.values())
     ]
-    shown = lines(prices)
+    shown = make_cost_lines(prices)
     if shown:
         ms, label = 1e3 * np.array(DELAYS), "cost / nominal's with sensors in time"
-        figure = curves(ms, shown, "further delay of camera and GPS / ms", label)
+        figure = draw_curves(ms, shown, "further delay of camera and GPS / ms", label)
         text = (
-            f"{PRICE_CONTEST.name}: camera every 50 ms, GPS every 200 ms; each filter is designed "
+            f"{DELAY_TASK.name}: camera every 50 ms, GPS every 200 ms; each filter is designed "
             "for its delay."
         )
         suite.answers.append(("What does late sensing cost?", figure, text))
-    suite.explorers.append(_two_cells(series, best))
-    for tier, standings in found.items():
-        suite.figures += _maps(tier, standings)
+    suite.explorers.append(_make_explorer(series, best))
+    for tier, standings in by_tier.items():
+        suite.figures += _draw_maps(tier, standings)
 
 
-def _groups(found: Mapping[str, Sequence[Standing]], name: Any) -> dict[str, dict[str, Estimate]]:
+def _group_costs(
+    by_tier: Mapping[str, Sequence[Standing]], name: Any
+) -> dict[str, dict[str, Estimate]]:
     """By tier, the cost over nominal's in %, the best first; name: of a cell, "" leaves it out."""
     groups = {}
-    for tier, standings in found.items():
+    for tier, standings in by_tier.items():
         costs = {
-            name(each.cell): Estimate(*(100.0 * n for n in each.overall["cost_vs_nominal"]))
-            for each in standings
-            if name(each.cell) and "cost_vs_nominal" in each.overall
+            name(standing.entry): Estimate(
+                *(100.0 * n for n in standing.overall["cost_vs_nominal"])
+            )
+            for standing in standings
+            if name(standing.entry) and "cost_vs_nominal" in standing.overall
         }
         title = f"Tier {tier}: {TITLES[tier]}"
         groups[title] = dict(sorted(costs.items(), key=lambda pair: pair[1].value))
     return {title: costs for title, costs in groups.items() if costs}
 
 
-def _estimator(cell: Cell) -> str:
+def _estimator(cell: ControlEntry) -> str:
     return cell.estimator if cell.controller == REFERENCE_CONTROLLER else ""
 
 
-def _controller(cell: Cell) -> str:
-    own = on_its_own(cell.controller, cell.estimator) and cell.controller != NOMINAL
+def _controller(cell: ControlEntry) -> str:
+    own = is_default_filter(cell.controller, cell.estimator) and cell.controller != NOMINAL
     return cell.controller if own and cell.estimator != TRUTH else ""
 
 
-def _ladder(
-    found: Mapping[str, Sequence[Standing]], ahead: Mapping[Contest, Array]
+def _group_oracles(
+    by_tier: Mapping[str, Sequence[Standing]], foresight: Mapping[ControlTask, Array]
 ) -> dict[str, dict[str, Estimate]]:
-    groups = _groups(found, lambda cell: cell.controller if cell.controller in RUNGS else "")
-    for tier in found:
+    groups = _group_costs(
+        by_tier, lambda entry: entry.controller if entry.controller in ORACLE_NAMES else ""
+    )
+    for tier in by_tier:
         title = f"Tier {tier}: {TITLES[tier]}"
-        mine = [each for contest, each in ahead.items() if contest.tier == tier]
-        if mine and "oracle-state" in groups.get(title, {}):
+        logs = [value for task, value in foresight.items() if task.tier == tier]
+        if logs and "oracle-state" in groups.get(title, {}):
             state = groups[title]["oracle-state"].value
-            over = geometric_mean(*(-each for each in mine))
-            groups[title]["clairvoyant"] = Estimate(*(state * each for each in over))
+            ratio = geometric_mean(*(-value for value in logs))
+            groups[title]["clairvoyant"] = Estimate(*(state * value for value in ratio))
     return groups
 
 
-def _maps(tier: str, standings: Sequence[Standing]) -> list[tuple[str, Any, str]]:
-    from ..report.heat_maps import heat_map
+def _draw_maps(tier: str, standings: Sequence[Standing]) -> list[tuple[str, Any, str]]:
+    from ..report.heat_maps import draw_heat_map
 
-    names = [each.label for each in standings]
-    contests = list(dict.fromkeys(c for each in standings for c in each.results))
+    names = [standing.label for standing in standings]
+    tasks = list(dict.fromkeys(c for standing in standings for c in standing.results))
     figures = []
     for metric, good, text in (
         ("cost_vs_nominal", "low", "Over nominal's, the paired geometric mean; 1: nominal."),
         ("failure_rate", "low", "The share of episodes in which the car spun or left the road."),
     ):
-        values = np.full((len(standings), len(contests)), np.nan)
-        for i, each in enumerate(standings):
-            for j, contest in enumerate(contests):
-                if metric in each.by_contest.get(contest, {}):
-                    values[i, j] = each.by_contest[contest][metric].value
+        values = np.full((len(standings), len(tasks)), np.nan)
+        for i, standing in enumerate(standings):
+            for j, task in enumerate(tasks):
+                if metric in standing.by_task.get(task, {}):
+                    values[i, j] = standing.by_task[task][metric].value
         if np.isfinite(values).any():
             title = f"Tier {tier}: {metric.replace('_', ' ')} in every contest"
-            columns = [contest.name for contest in contests]
-            figures.append((title, heat_map(names, columns, values, metric, good), text))
+            columns = [task.name for task in tasks]
+            figures.append((title, draw_heat_map(names, columns, values, metric, good), text))
     return figures
 
 
-def _tracks(series: Mapping[Cell, Array], best: str) -> list[tuple[str, str, str]]:
+def _make_tracks(series: Mapping[ControlEntry, Array], best: str) -> list[tuple[str, str, str]]:
     """The tracks of the first and the last contest, for a map: no control and the best one."""
-    contests = list(dict.fromkeys(cell.contest for cell in series))
+    tasks = list(dict.fromkeys(entry.task for entry in series))
     files = []
-    for contest in dict.fromkeys(contests[:1] + contests[-1:]):
+    for task in dict.fromkeys(tasks[:1] + tasks[-1:]):
         places = {
-            cell.label: (each[:, 1 + SIGNALS.index("X")], each[:, 1 + SIGNALS.index("Y")])
-            for cell, each in series.items()
-            if cell.contest == contest and cell.controller in ("none", best)
-            if on_its_own(cell.controller, cell.estimator)
+            entry.label: (values[:, 1 + SIGNALS.index("X")], values[:, 1 + SIGNALS.index("Y")])
+            for entry, values in series.items()
+            if entry.task == task and entry.controller in ("none", best)
+            if is_default_filter(entry.controller, entry.estimator)
         }
-        text = track_kml(contest.name, places, {name: colour(name) for name in places})
-        name = f"{contest.name.replace(', ', '-')}.kml"
+        text = make_track_kml(task.name, places, {name: find_colour(name) for name in places})
+        name = f"{task.name.replace(', ', '-')}.kml"
         files.append((name, "application/vnd.google-earth.kml+xml", text))
     return files
 
 
-def _two_cells(series: Mapping[Cell, Array], best: str) -> Explorer:
+def _make_explorer(series: Mapping[ControlEntry, Array], best: str) -> Explorer:
     """Every cell's first test seed; at first no control and the best controller."""
-    own = (c.label for c in series if c.controller == best and on_its_own(best, c.estimator))
+    labels = (
+        c.label for c in series if c.controller == best and is_default_filter(best, c.estimator)
+    )
     keyed: dict[tuple[str, ...], Array] = {
-        (c.contest.tier, c.contest.name, c.label): each for c, each in series.items()
+        (c.task.tier, c.task.name, c.label): values for c, values in series.items()
     }
     bodies: dict[tuple[str, ...], tuple[float, float]] = {}
-    for cell in series:
-        car = VEHICLES[cell.contest.vehicle or "coms"]
+    for entry in series:
+        car = VEHICLES[entry.task.vehicle or "coms"]
         size = (_BODY[0] * car.wheelbase, _BODY[1] * car.front_track)
-        bodies[cell.contest.tier, cell.contest.name] = size
-    best = next(own, "")
-    return over_time("Any two side by side", ("tier", "contest"), keyed, best, bodies)
+        bodies[entry.task.tier, entry.task.name] = size
+    best = next(labels, "")
+    return make_time_explorer("Any two side by side", ("tier", "contest"), keyed, best, bodies)
 
 
-def over_time(
+def make_time_explorer(
     title: str,
     menus: Sequence[str],
     series: Mapping[tuple[str, ...], Array],
@@ -184,7 +196,7 @@ def over_time(
     cells = {}
     for key, values in series.items():
         signals = dict(zip(("t", *SIGNALS), values.T, strict=True))
-        cells[key] = {name: _SCALES.get(name, 1.0) * each for name, each in signals.items()}
+        cells[key] = {name: _SCALES.get(name, 1.0) * signal for name, signal in signals.items()}
     caption = (
         "The same seed in both: line the contestant's, dashed the reference. The arrow is where "
         "the car goes in a quarter of a second, its angle to the body the sideslip."
@@ -192,14 +204,14 @@ def over_time(
     return Explorer(title, menus, cells, _PANELS, caption, ("none", best), bodies or {})
 
 
-def run_of(cell: Cell, seed: int) -> Rollout:
+def run_entry(entry: ControlEntry, seed: int) -> Rollout:
     """One episode of a contestant in a single env."""
-    return rollout(*contestant_of(cell), seed)
+    return rollout(*make_env_and_agent(entry), seed)
 
 
-def contestant_of(cell: Cell) -> tuple[Any, Any]:
+def make_env_and_agent(entry: ControlEntry) -> tuple[Any, Any]:
     """A single env with its filter, and the contestant that drives it."""
-    estimate = estimate_options(cell) if cell.estimator else None
-    name = name_of(cell.estimator)
-    env = make_env(cell.contest.env_id, name, estimate, **cell.env_options)
-    return env, make_agent(cell.controller, env, **agent_options(cell))
+    estimate = make_estimate_options(entry) if entry.estimator else None
+    name = get_filter_name(entry.estimator)
+    env = make_env(entry.task.env_id, name, estimate, **entry.env_options)
+    return env, make_agent(entry.controller, env, **make_agent_options(entry))

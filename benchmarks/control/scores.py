@@ -12,66 +12,68 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...agents.rollout import cost_ratios
+from ...agents.rollout import compute_cost_ratios
 from ..harness.stats import Estimate, ratio_of_sums
-from .episodes import Array, Driven
+from .episodes import Array, DriveResult
 
-NOTHING = 0.05
+MIN_GAP = 0.05
 """A mean gap below which there is nothing to win."""
 _CLIP = 3.0
-FAILED = 20.0  # times nominal's cost, of an episode that ends by a failure
+FAILURE_RATIO = 20.0  # times nominal's cost, of an episode that ends by a failure
 
 
-def survived(driven: Driven) -> npt.NDArray[np.bool_]:
+def survival_mask(result: DriveResult) -> npt.NDArray[np.bool_]:
     """(seeds,) whether an episode ended by no failure."""
-    return np.asarray(driven["failure"] == 0.0)
+    return np.asarray(result["failure"] == 0.0)
 
 
-def gains(nominal: Array, driven: Driven) -> Array:
+def compute_log_ratios(nominal: Array, result: DriveResult) -> Array:
     """(n,) r of the first n episodes; nominal: (n,) costs of the same seeds."""
     n = len(nominal)
     with np.errstate(invalid="ignore"):
-        r = np.log(cost_ratios(nominal, driven.costs[:n]))
-    return np.where(survived(driven)[:n], np.clip(r, -_CLIP, _CLIP), -math.log(FAILED))
+        r = np.log(compute_cost_ratios(nominal, result.costs[:n]))
+    return np.where(survival_mask(result)[:n], np.clip(r, -_CLIP, _CLIP), -math.log(FAILURE_RATIO))
 
 
 @dataclass(frozen=True)
-class Yardstick:
+class ScoreScale:
     """What 0 and 1 are in a contest: the episodes of `nominal` and `oracle-state`.
 
     Raises ValueError with the reason where one of them was not driven.
     """
 
-    nominal: Driven
-    oracle: Driven
+    nominal: DriveResult
+    oracle: DriveResult
 
     def __post_init__(self) -> None:
-        for name, rung in (("nominal", self.nominal), ("oracle-state", self.oracle)):
-            if rung.error:
-                raise ValueError(f"{name}: {rung.error}")
+        for name, oracle in (("nominal", self.nominal), ("oracle-state", self.oracle)):
+            if oracle.error:
+                raise ValueError(f"{name}: {oracle.error}")
 
-    def kept(self, n: int) -> npt.NDArray[np.bool_]:
+    def mark_compared(self, n: int) -> npt.NDArray[np.bool_]:
         """(m,) of at most n episodes: which of them both survive."""
         n = min(n, len(self.nominal.costs), len(self.oracle.costs))
-        return survived(self.nominal)[:n] & survived(self.oracle)[:n]
+        return survival_mask(self.nominal)[:n] & survival_mask(self.oracle)[:n]
 
-    def paired(self, driven: Driven) -> tuple[Array, Array]:
+    def compute_paired_ratios(self, result: DriveResult) -> tuple[Array, Array]:
         """(r of a contestant, r of the oracle) on the same episodes, those that count."""
-        kept = self.kept(len(driven.costs))
-        nominal = self.nominal.costs[: len(kept)]
-        return gains(nominal, driven)[kept], gains(nominal, self.oracle)[kept]
+        compared = self.mark_compared(len(result.costs))
+        nominal = self.nominal.costs[: len(compared)]
+        return compute_log_ratios(nominal, result)[compared], compute_log_ratios(
+            nominal, self.oracle
+        )[compared]
 
     @property
     def gap(self) -> float:
         """The oracle's mean r; NaN where no episode counts."""
-        _, own = self.paired(self.oracle)
-        return float(own.mean()) if len(own) else math.nan
+        _, oracle_ratios = self.compute_paired_ratios(self.oracle)
+        return float(oracle_ratios.mean()) if len(oracle_ratios) else math.nan
 
 
 def score(pairs: Sequence[tuple[Array, Array]]) -> Estimate:
-    """The score over contests from each one's `Yardstick.paired`, those that have no episode left
+    """The score over contests from each one's `ScoreScale.paired`, those that have no episode left
     out; NaN where nothing is to be won."""
-    there = [pair for pair in pairs if len(pair[0])]
-    if not there or np.mean([own.mean() for _, own in there]) < NOTHING:
+    filled = [pair for pair in pairs if len(pair[0])]
+    if not filled or np.mean([oracle_ratios.mean() for _, oracle_ratios in filled]) < MIN_GAP:
         return Estimate(math.nan)
-    return ratio_of_sums([r for r, _ in there], [own for _, own in there])
+    return ratio_of_sums([r for r, _ in filled], [oracle_ratios for _, oracle_ratios in filled])

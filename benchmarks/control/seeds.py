@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from ... import __version__
-from ...agents.learned.files import ENDING
-from .contests import Contest
+from ...agents.learned.files import SUFFIX
+from .contests import ControlTask
 
-Seeds = Sequence[int] | Callable[[Contest], Sequence[int]]
+Seeds = Sequence[int] | Callable[[ControlTask], Sequence[int]]
 """The same in every contest, or of each."""
 
 _PACKAGE = Path(__file__).resolve().parents[2]
-_CONTESTANTS = dict.fromkeys(("estimators", "agents"), (".py", ".toml", ENDING))
+_CONTESTANTS = dict.fromkeys(("estimators", "agents"), (".py", ".toml", SUFFIX))
 _LENGTH = 16
 _TUNING = 2**29  # the clairvoyant's are beyond 2^30
 
 
-def salt_of(*more: str) -> str:
+def make_salt(*more: str) -> str:
     """The salt: a hash of the contestants' files, weights included, the env's version and further
     texts."""
     digest = hashlib.sha256(__version__.encode())
@@ -33,7 +33,7 @@ def salt_of(*more: str) -> str:
     return digest.hexdigest()[:_LENGTH]
 
 
-def salted_seeds(salt: str, n: int, more: str = "") -> list[int]:
+def make_salted_seeds(salt: str, n: int, more: str = "") -> list[int]:
     """The first n test seeds of a salt (hexadecimal), each below 2^32; more seeds keep the first.
 
     more: a text that makes them others. Raises ValueError for a salt that is not hexadecimal.
@@ -46,15 +46,15 @@ def salted_seeds(salt: str, n: int, more: str = "") -> list[int]:
     return [int(child.generate_state(1)[0]) for child in children]
 
 
-def seeds_of_contests(salt: str, n: int) -> Callable[[Contest], list[int]]:
+def make_task_seeds(salt: str, n: int) -> Callable[[ControlTask], list[int]]:
     """The first n test seeds of each contest.
 
     Other ones in each: a seed draws the car as well, and contests that share their cars would not
     be independent strata of an interval.
     """
-    return lambda contest: salted_seeds(salt, n, contest.seed_text)
+    return lambda task: make_salted_seeds(salt, n, task.seed_text)
 
 
-def tuning_seeds(n: int) -> list[int]:
+def make_tuning_seeds(n: int) -> list[int]:
     """The first n seeds on which contests are chosen and controllers tuned: no test's."""
     return list(range(_TUNING, _TUNING + n))

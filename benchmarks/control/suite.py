@@ -9,29 +9,43 @@ from rich.console import Console
 
 from ... import __version__
 from ...agents.learned.files import is_policy, load_policy
-from ..harness.results import Row, Suite, Table
-from .answer import answer
-from .build import decision_time
-from .calibration import FILE, Entry, check_fresh, driven_there, leads, read_calibration
-from .cells import EPISODES, LEARNED, Cell, cells, some_of
-from .contests import STATE, TITLES, Contest, contests
+from ..harness.results import ResultRow, ResultTable, Suite
+from .answer import compose_verdict
+from .build import measure_decision_time
+from .calibration import (
+    FILE,
+    CalibrationRecord,
+    check_current,
+    compute_regrets,
+    measure_calibrated,
+    read_calibration,
+)
+from .cells import EPISODES, LEARNED, ControlEntry, make_entries, select_quick_tasks
+from .contests import STATE, TITLES, ControlTask, list_scored_tasks
 from .episodes import Array
-from .figures import illustrate
+from .figures import add_figures
 from .ladder import (
+    DELAY_TASK,
     DELAYS,
-    PRICE_CONTEST,
-    Price,
-    below_the_clairvoyant,
-    findings,
-    knowledge_table,
-    ladder_table,
-    price_of_delay,
-    refusals_of,
-    yardsticks,
+    DelayCost,
+    describe_findings,
+    find_below_optimum,
+    list_failures,
+    make_knowledge_table,
+    make_oracle_table,
+    make_score_scales,
+    measure_delay_cost,
 )
 from .run import Results, measure
-from .seeds import salt_of, seeds_of_contests
-from .tables import Standing, contest_table, main_table, motion_table, rows_of, standings
+from .seeds import make_salt, make_task_seeds
+from .tables import (
+    Standing,
+    make_main_table,
+    make_motion_table,
+    make_rows,
+    make_task_table,
+    rank_entries,
+)
 
 _TEXT = """\
 In a contest everybody drives the same salted seeds, and everything is paired by episode. \
@@ -57,43 +71,55 @@ def run(
     episodes: a cell (slow controllers have at most 64). keep: a folder in which finished cases
     stay, so that a run that was stopped goes on. quick: a few contests, without the slow
     contestants and the price of delay. clairvoyant: a file of `sideslip calibrate`, None: the
-    package's, if there is one. salt: of the seeds, "" for `salt_of`'s.
+    package's, if there is one. salt: of the seeds, "" for `make_salt`'s.
     """
-    salt = salt or salt_of()
-    played = some_of(contests()) if quick else list(contests())
-    asked = list(cells(played, quick))
-    entries = _calibrated(clairvoyant, played)
-    seeds = seeds_of_contests(salt, episodes)
-    results = measure(asked, seeds, jobs=jobs, console=console, keep=keep)
-    there = driven_there(entries, asked, jobs=jobs, console=console, keep=keep)
+    salt = salt or make_salt()
+    tasks = select_quick_tasks(list_scored_tasks()) if quick else list(list_scored_tasks())
+    requested = list(make_entries(tasks, quick))
+    records = _read_calibrated(clairvoyant, tasks)
+    seeds = make_task_seeds(salt, episodes)
+    results = measure(requested, seeds, jobs=jobs, console=console, keep=keep)
+    calibrated = measure_calibrated(records, requested, jobs=jobs, console=console, keep=keep)
     suite = Suite("control", "Which controller and estimator hold the car", "")
-    tiers = {tier: [c for c in played if c.tier == tier] for tier in TITLES}
-    tiers = {tier: those for tier, those in tiers.items() if those}
-    found, foreseen, more = {}, _foreseen(entries, there), []
-    for tier, those in tiers.items():
-        found[tier] = standings(results.found, tier, yardsticks(results, those))
-        for each in found[tier]:
-            if each.driven:
-                each.us = decision_time(next(cell for cell in asked if _is_of(cell, each)))
-            suite.rows += rows_of(each, salt)
+    tiers = {tier: [c for c in tasks if c.tier == tier] for tier in TITLES}
+    tiers = {tier: tier_tasks for tier, tier_tasks in tiers.items() if tier_tasks}
+    by_tier, foresight, detail_tables = {}, _compute_foresight(records, calibrated), []
+    for tier, tier_tasks in tiers.items():
+        by_tier[tier] = rank_entries(results.outcomes, tier, make_score_scales(results, tier_tasks))
+        for item in by_tier[tier]:
+            if item.drives:
+                item.us = measure_decision_time(
+                    next(entry for entry in requested if _is_driven_entry(entry, item))
+                )
+            suite.rows += make_rows(item, salt)
         title = f"Tier {tier}: {TITLES[tier]}"
-        note = " ".join([_NOTE, *findings(found[tier]), *(_learned() if tier == "1" else ())])
-        suite.tables.append(main_table(title, found[tier], note))
-        more += [contest_table(f"{title}, contest by contest", found[tier], those)]
-        more += [motion_table(f"{title}: the motion", found[tier])]
-    suite.tables.append(knowledge_table(results, tiers, foreseen))
-    ladder = ladder_table(results, played, foreseen)
-    ladder.note += _beaten(entries, there)
-    suite.tables += [ladder, *more]
+        note = " ".join(
+            [
+                _NOTE,
+                *describe_findings(by_tier[tier]),
+                *(_describe_policies() if tier == "1" else ()),
+            ]
+        )
+        suite.tables.append(make_main_table(title, by_tier[tier], note))
+        detail_tables += [
+            make_task_table(f"{title}, contest by contest", by_tier[tier], tier_tasks)
+        ]
+        detail_tables += [make_motion_table(f"{title}: the motion", by_tier[tier])]
+    suite.tables.append(make_knowledge_table(results, tiers, foresight))
+    ladder = make_oracle_table(results, tasks, foresight)
+    ladder.note += _describe_beaten(records, calibrated)
+    suite.tables += [ladder, *detail_tables]
     late: list[Results] = []
-    prices: list[Price] = []
+    prices: list[DelayCost] = []
     if not quick:
-        prices, late = price_of_delay(seeds(PRICE_CONTEST), jobs=jobs, console=console, keep=keep)
-    suite.rows += _price_rows(prices, episodes, salt)
-    suite.tables += _refusals(results, late)
-    suite.verdict = answer(found, prices, foreseen)
-    illustrate(suite, found, results, prices, foreseen)
-    spent = np.nansum([c.seconds for each in (results, there, *late) for c in each.found.values()])
+        prices, late = measure_delay_cost(seeds(DELAY_TASK), jobs=jobs, console=console, keep=keep)
+    suite.rows += _make_delay_rows(prices, episodes, salt)
+    suite.tables += _make_failure_tables(results, late)
+    suite.verdict = compose_verdict(by_tier, prices, foresight)
+    add_figures(suite, by_tier, results, prices, foresight)
+    spent = np.nansum(
+        [c.seconds for item in (results, calibrated, *late) for c in item.outcomes.values()]
+    )
     suite.text = f"{_TEXT} Driven in {spent / 60.0:.1f} CPU-minutes."
     return suite
 
@@ -105,40 +131,51 @@ _NOTE = (
 )
 
 
-def _is_of(cell: Cell, standing: Standing) -> bool:
+def _is_driven_entry(entry: ControlEntry, standing: Standing) -> bool:
     """Whether it is a cell that the contestant drove without an error."""
-    same = (cell.controller, cell.estimator) == (standing.cell.controller, standing.cell.estimator)
-    return same and cell.contest in standing.driven
+    same = (entry.controller, entry.estimator) == (
+        standing.entry.controller,
+        standing.entry.estimator,
+    )
+    return same and entry.task in standing.drives
 
 
-def _calibrated(path: Path | None, played: Sequence[Contest]) -> dict[Contest, Entry]:
+def _read_calibrated(
+    path: Path | None, tasks: Sequence[ControlTask]
+) -> dict[ControlTask, CalibrationRecord]:
     """The clairvoyant's entries of contests; ValueError where one is stale."""
     path = FILE if path is None and FILE.is_file() else path
     if path is None:
         return {}
     read = read_calibration(path)
-    entries = {contest: each for contest, each in read.items() if contest in played}
-    check_fresh(entries, path)
-    return entries
+    records = {task: record for task, record in read.items() if task in tasks}
+    check_current(records, path)
+    return records
 
 
-def _foreseen(entries: Mapping[Contest, Entry], there: Results) -> dict[Contest, Array]:
+def _compute_foresight(
+    records: Mapping[ControlTask, CalibrationRecord], calibrated: Results
+) -> dict[ControlTask, Array]:
     """(n,) log(J_oracle-state / J_clairvoyant) of each calibrated contest."""
-    return {c.contest: each for c, each in leads(entries, there).items() if c.controller == STATE}
+    return {
+        c.task: regret
+        for c, regret in compute_regrets(records, calibrated).items()
+        if c.controller == STATE
+    }
 
 
-def _beaten(entries: Mapping[Contest, Entry], there: Results) -> str:
+def _describe_beaten(records: Mapping[ControlTask, CalibrationRecord], calibrated: Results) -> str:
     """Who costs less than the clairvoyant on its own seeds."""
-    if not entries:
+    if not records:
         return ""
-    found = leads(entries, there)
-    names = [f"{cell.label} ({cell.contest.name})" for cell in found]
-    below = below_the_clairvoyant(names, list(found.values()))
-    who = f"below it: {'; '.join(below)}" if below else "nobody is below it (Holm-corrected)"
-    return f" On the clairvoyant's seeds {who}."
+    regrets = compute_regrets(records, calibrated)
+    names = [f"{entry.label} ({entry.task.name})" for entry in regrets]
+    below = find_below_optimum(names, list(regrets.values()))
+    summary = f"below it: {'; '.join(below)}" if below else "nobody is below it (Holm-corrected)"
+    return f" On the clairvoyant's seeds {summary}."
 
 
-def _learned() -> list[str]:
+def _describe_policies() -> list[str]:
     """The training of the policies in the table."""
     names = [name for pairs in LEARNED.values() for _, name in pairs if is_policy(name)]
     cards = {name: load_policy(name).card for name in names}
@@ -149,34 +186,34 @@ def _learned() -> list[str]:
     ]
 
 
-def _refusals(results: Results, late: Sequence[Results]) -> list[Table]:
-    lines = refusals_of(results)
-    for delay, each in zip(DELAYS, late, strict=False):
-        lines += refusals_of(each, delay)
+def _make_failure_tables(results: Results, late: Sequence[Results]) -> list[ResultTable]:
+    lines = list_failures(results)
+    for delay, delayed in zip(DELAYS, late, strict=False):
+        lines += list_failures(delayed, delay)
     if not lines:
         return []
     header = ("tier", "contest", "controller and estimator", "what happened")
     note = (
         "The share of a cell's episodes; the rest of a failed one is charged at the highest cost."
     )
-    return [Table("Cells that went wrong", header, lines, note, keyed=False)]
+    return [ResultTable("Cells that went wrong", header, lines, note, keyed=False)]
 
 
-def _price_rows(prices: Sequence[Price], n: int, salt: str) -> list[Row]:
+def _make_delay_rows(prices: Sequence[DelayCost], n: int, salt: str) -> list[ResultRow]:
     """Rows of the price of delay; the scenario has the delay."""
     return [
-        Row.of(
+        ResultRow.from_estimate(
             "cost_vs_nominal",
-            each,
+            ratio,
             suite="control",
-            scenario=f"{PRICE_CONTEST.name}, sensors {1e3 * delay:.0f} ms late",
-            estimator=price.cell.estimator,
-            controller=price.cell.controller,
+            scenario=f"{DELAY_TASK.name}, sensors {1e3 * delay:.0f} ms late",
+            estimator=price.entry.estimator,
+            controller=price.entry.controller,
             n=n,
             salt=salt,
-            env_version=f"{PRICE_CONTEST.env_id} {__version__}",
+            env_version=f"{DELAY_TASK.env_id} {__version__}",
         )
         for price in prices
-        for delay, each in zip(DELAYS[: len(price.over)], price.over, strict=True)
-        if np.isfinite(each.value)
+        for delay, ratio in zip(DELAYS[: len(price.over)], price.over, strict=True)
+        if np.isfinite(ratio.value)
     ]

@@ -14,17 +14,23 @@ import numpy as np
 from rich.console import Console
 
 from ... import __version__
-from ..control.cells import REFERENCE_CONTROLLER, REFERENCE_FILTER, TRUTH, Cell, some_of
-from ..control.contests import NOMINAL, STATE, Contest, contests
-from ..control.episodes import NUMBERS, Driven
+from ..control.cells import (
+    REFERENCE_CONTROLLER,
+    REFERENCE_FILTER,
+    TRUTH,
+    ControlEntry,
+    select_quick_tasks,
+)
+from ..control.contests import NOMINAL, STATE, ControlTask, list_scored_tasks
+from ..control.episodes import NUMBERS, DriveResult
 from ..control.run import Results, measure
-from ..control.seeds import salt_of, seeds_of_contests
-from ..harness.results import made_of, read_objects, write_text
+from ..control.seeds import make_salt, make_task_seeds
+from ..harness.results import from_json, read_objects, write_text
 from .challenge import EPISODES
 
 FILE = Path(__file__).with_name("baselines.json")
 COMMAND = f"python -m {__name__}"
-RUNGS = (("", NOMINAL), ("", STATE), ("", "none"))
+BASELINE_PAIRS = (("", NOMINAL), ("", STATE), ("", "none"))
 CONTROLLERS = ((REFERENCE_FILTER, "esc"),)
 ESTIMATORS = (("multirate-kf, camera and gps", REFERENCE_CONTROLLER), (TRUTH, REFERENCE_CONTROLLER))
 """(estimator, controller) of everybody's baselines, an agent's rivals and an estimator's."""
@@ -33,7 +39,7 @@ _SAME = 1e-6  # of a cost, on whatever processor
 
 
 @dataclass(frozen=True)
-class Entry:
+class BaselineRecord:
     """A baseline's episodes in a contest: an entry of the file. salt: of the seeds. failures:
     codes."""
 
@@ -50,67 +56,83 @@ class Entry:
     failures: list[int]
 
     @property
-    def cell(self) -> Cell:
+    def entry(self) -> ControlEntry:
         """Of which these are the episodes."""
-        contest = Contest(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
-        return Cell(contest, self.estimator, self.controller)
+        task = ControlTask(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
+        return ControlEntry(task, self.estimator, self.controller)
 
-    def driven(self, n: int) -> Driven:
+    def drives(self, n: int) -> DriveResult:
         """The first n episodes; what is not on file is NaN."""
         numbers = np.full((n, len(NUMBERS)), np.nan)
         numbers[:, NUMBERS.index("cost")] = self.costs[:n]
         numbers[:, NUMBERS.index("failure")] = self.failures[:n]
-        return Driven(numbers, 0.0)
+        return DriveResult(numbers, 0.0)
 
 
-def cells_of(those: Sequence[Contest], agents: bool = True, estimators: bool = True) -> list[Cell]:
+def make_baseline_entries(
+    tasks: Sequence[ControlTask], agents: bool = True, estimators: bool = True
+) -> list[ControlEntry]:
     """The baselines in these contests. agents, estimators: whether such are among the rivals."""
-    who = RUNGS + (CONTROLLERS if agents else ()) + (ESTIMATORS if estimators else ())
-    return [Cell(contest, *each) for contest in those for each in who]
+    pairs = BASELINE_PAIRS + (CONTROLLERS if agents else ()) + (ESTIMATORS if estimators else ())
+    return [ControlEntry(task, *pair) for task in tasks for pair in pairs]
 
 
-def read_baselines(path: Path = FILE) -> dict[Cell, Entry]:
+def read_baselines(path: Path = FILE) -> dict[ControlEntry, BaselineRecord]:
     """The entries of a file; none of another version's. Raises ValueError for another file."""
-    entries = (made_of(Entry, x, f"{path}: entry {i}") for i, x in enumerate(read_objects(path), 1))
-    return {each.cell: each for each in entries if each.env_version == __version__}
+    records = (
+        from_json(BaselineRecord, x, f"{path}: entry {i}")
+        for i, x in enumerate(read_objects(path), 1)
+    )
+    return {record.entry: record for record in records if record.env_version == __version__}
 
 
-def on_file(cells: Sequence[Cell], n: int, **options: Any) -> tuple[str, Results] | None:
+def find_baselines(
+    wanted: Sequence[ControlEntry], n: int, **options: Any
+) -> tuple[str, Results] | None:
     """(salt, first n episodes) of baselines that are all on file with so many, and of whom a sample
     that is driven again costs the same; None where there are no such.
 
     The sample: `SAMPLE` episodes of each, of the slow ones in one contest. options: of `measure`.
     """
-    entries = read_baselines(FILE) if FILE.is_file() else {}
-    there = [entries[cell] for cell in cells if cell in entries and len(entries[cell].costs) >= n]
-    salts = {each.salt for each in there}
-    if len(there) < len(cells) or len(salts) != 1:
+    records = read_baselines(FILE) if FILE.is_file() else {}
+    matches = [
+        records[entry] for entry in wanted if entry in records and len(records[entry].costs) >= n
+    ]
+    salts = {record.salt for record in matches}
+    if len(matches) < len(wanted) or len(salts) != 1:
         return None
     (salt,) = salts
-    slow = [cell for cell in cells if cell.slow]
-    sample = [cell for cell in cells if cell not in slow[1:]]
-    again = measure(sample, seeds_of_contests(salt, SAMPLE), title="baselines, a sample", **options)
-    for cell, driven in again.found.items():
-        if driven.error or not np.allclose(
-            driven.costs, entries[cell].costs[:SAMPLE], rtol=_SAME, atol=0.0
+    slow = [entry for entry in wanted if entry.slow]
+    sample = [entry for entry in wanted if entry not in slow[1:]]
+    again = measure(sample, make_task_seeds(salt, SAMPLE), title="baselines, a sample", **options)
+    for entry, result in again.outcomes.items():
+        if result.error or not np.allclose(
+            result.costs, records[entry].costs[:SAMPLE], rtol=_SAME, atol=0.0
         ):
             return None
-    return salt, Results({cell: entries[cell].driven(n) for cell in cells})
+    return salt, Results({entry: records[entry].drives(n) for entry in wanted})
 
 
 def write_baselines(path: Path = FILE, jobs: int | None = None) -> None:
     """Drive all baselines of the usual contests, and write the file; ValueError where one fails."""
-    salt = salt_of()
-    cells = cells_of(some_of(contests()))
-    found = measure(cells, seeds_of_contests(salt, EPISODES), jobs=jobs, console=Console()).found
+    salt = make_salt()
+    control_entries = make_baseline_entries(select_quick_tasks(list_scored_tasks()))
+    results = measure(
+        control_entries, make_task_seeds(salt, EPISODES), jobs=jobs, console=Console()
+    ).outcomes
     lines = []
-    for cell, driven in found.items():
-        if driven.error:
-            raise ValueError(f"{cell.contest.name}, {cell.label}: {driven.error}")
-        costs, failures = driven.costs.tolist(), driven["failure"].astype(int).tolist()
-        names = asdict(cell.contest) | {"estimator": cell.estimator, "controller": cell.controller}
-        entry = Entry(**names, salt=salt, env_version=__version__, costs=costs, failures=failures)
-        lines.append(json.dumps(asdict(entry)))
+    for control_entry, result in results.items():
+        if result.error:
+            raise ValueError(f"{control_entry.task.name}, {control_entry.label}: {result.error}")
+        costs, failures = result.costs.tolist(), result["failure"].astype(int).tolist()
+        names = asdict(control_entry.task) | {
+            "estimator": control_entry.estimator,
+            "controller": control_entry.controller,
+        }
+        record = BaselineRecord(
+            **names, salt=salt, env_version=__version__, costs=costs, failures=failures
+        )
+        lines.append(json.dumps(asdict(record)))
     write_text(path, "[\n" + ",\n".join(lines) + "\n]\n")
 
 

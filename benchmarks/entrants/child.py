@@ -24,11 +24,11 @@ import numpy as np
 
 from ...agents import make_agent
 from ...agents.env_facts import EnvView
-from ...envs.arguments import actions_of
+from ...envs.arguments import parse_actions
 from ...envs.sensors.link import SlowSensor
 from ...estimators.make import make_estimator
-from ...estimators.user_files import reason_of
-from ..control.build import Checked
+from ...estimators.user_files import describe_error
+from ..control.build import CheckedAgent
 
 MEMORY = 4 * 2**30
 """Bytes of address space of a contestant."""
@@ -42,7 +42,7 @@ _SYSTEM = ("/proc", "/sys", "/dev", "/etc", "/usr", "/lib", "/lib64")
 _OPENS = {"open": 0, "ctypes.dlopen": 0, "import": 1}  # audit events, the argument with the path
 
 
-class Start(NamedTuple):
+class ChildSettings(NamedTuple):
     """What the process is told before any code of the contestant runs.
 
     Args:
@@ -54,7 +54,7 @@ class Start(NamedTuple):
     allowed: frozenset[str] | None
 
 
-class Contestant:
+class EntryServer:
     """The agent, or the estimators of all rows, of one process."""
 
     def __init__(self) -> None:
@@ -66,14 +66,14 @@ class Contestant:
         """Build the agent of a text that `make_agent` takes."""
         env: Any = view
         agent = make_agent(source, env, **options)
-        self._agent = Checked(agent, view.num_envs, view.facts.width)
+        self._agent = CheckedAgent(agent, view.num_envs, view.facts.width)
         return b""
 
     def predict(self, observation: Any, start: Any) -> bytes:
         """Return the actions of all rows, float32 (rows, width); the memory stays here."""
         action, self._state = self._agent.predict(observation, self._state, start)
         rows, width = self._agent.shape
-        return actions_of(action, rows, width, fail=True).tobytes()
+        return parse_actions(action, rows, width, fail=True).tobytes()
 
     def estimator(self, row: int, source: str, arguments: Mapping[str, Any]) -> bytes:
         """Build the estimator of a row; return the names of its states as JSON."""
@@ -106,10 +106,10 @@ def main() -> None:
         driver.send_bytes(FAILED + text.encode())
         os._exit(1)
 
-    confine(Path(start.scratch))
-    sys.addaudithook(_audit(opened, start, refuse))
+    limit_process(Path(start.scratch))
+    sys.addaudithook(_make_audit_hook(opened, start, refuse))
     driver.send_bytes(DONE + json.dumps(time.process_time()).encode())
-    contestant = Contestant()
+    server = EntryServer()
     with suppress(EOFError):
         while True:
             name, *arguments = driver.recv()
@@ -117,20 +117,24 @@ def main() -> None:
                 answer = (
                     json.dumps(sorted(opened)).encode()
                     if name == "opened"
-                    else getattr(contestant, name)(*arguments)
+                    else getattr(server, name)(*arguments)
                 )
             except MemoryError as error:
-                refuse(f"{reason_of(error)}; a contestant has {MEMORY / 2**30:g} GiB of memory")
+                refuse(
+                    f"{describe_error(error)}; a contestant has {MEMORY / 2**30:g} GiB of memory"
+                )
             except Exception as error:
-                refuse(reason_of(error))
+                refuse(describe_error(error))
             driver.send_bytes(DONE + answer)
 
 
-def _audit(
-    opened: set[str], start: Start, refuse: Callable[[str], None]
+def _make_audit_hook(
+    opened: set[str], start: ChildSettings, refuse: Callable[[str], None]
 ) -> Callable[[str, tuple[Any, ...]], None]:
     """Make the audit hook that notes what is opened outside the installation, or ends there."""
-    skipped = tuple(f"{os.path.realpath(each)}/" for each in {*_INSTALLED, *_SYSTEM, start.scratch})
+    skipped = tuple(
+        f"{os.path.realpath(folder)}/" for folder in {*_INSTALLED, *_SYSTEM, start.scratch}
+    )
 
     def hook(event: str, arguments: tuple[Any, ...]) -> None:
         place = _OPENS.get(event)
@@ -149,19 +153,19 @@ def _audit(
     return hook
 
 
-def confine(scratch: Path) -> None:
+def limit_process(scratch: Path) -> None:
     """Limit this process for good: its memory, and where it may write."""
-    for kind, most in (
+    for kind, limit in (
         (resource.RLIMIT_AS, MEMORY),
         (resource.RLIMIT_FSIZE, WRITTEN),
         (resource.RLIMIT_CORE, 0),
     ):
-        resource.setrlimit(kind, (most, most))
+        resource.setrlimit(kind, (limit, limit))
     if sys.platform == "linux":
         libc = ctypes.CDLL(None, use_errno=True)
         libc.prctl(1, 9, 0, 0, 0)  # PR_SET_PDEATHSIG: killed with the driver
         libc.prctl(38, 1, 0, 0, 0)  # PR_SET_NO_NEW_PRIVS
-        _landlock(libc, {scratch: _WRITES, Path(os.devnull): _WRITES & _OF_FILES})
+        _apply_landlock(libc, {scratch: _WRITES, Path(os.devnull): _WRITES & _OF_FILES})
 
 
 # Linux's Landlock (landlock(7)): its system calls, and the rights to change files.
@@ -172,7 +176,7 @@ _NEWER = {1: 1 << 13 | 1 << 14, 2: 1 << 14}  # rights that this version does not
 _SIGNALS = 0b11  # sockets and signals to processes outside
 
 
-def _landlock(libc: Any, rights: Mapping[Path, int]) -> None:
+def _apply_landlock(libc: Any, rights: Mapping[Path, int]) -> None:
     """Deny this process to change files, but for some below these paths, and to reach others.
 
     Nothing happens where the kernel has no Landlock.

@@ -11,17 +11,17 @@ from typing import Any
 
 from rich.console import Console
 
-from ..control.cells import REFERENCE_CONTROLLER, Cell
-from ..control.contests import Contest
+from ..control.cells import REFERENCE_CONTROLLER, ControlEntry
+from ..control.contests import ControlTask
 from ..control.episodes import Chunk
-from ..control.ladder import yardsticks
+from ..control.ladder import make_score_scales
 from ..control.run import Results, measure
-from ..control.seeds import salt_of, seeds_of_contests, tuning_seeds
-from ..control.tables import Standing, standings
+from ..control.seeds import make_salt, make_task_seeds, make_tuning_seeds
+from ..control.tables import Standing, rank_entries
 from ..harness.parallel import run_cases
-from .baselines import cells_of, on_file
-from .challenge import Challenge, Pair
-from .worker import drive_apart, drive_users, rehearse
+from .baselines import find_baselines, make_baseline_entries
+from .challenge import ComparisonRequest, UserEntry
+from .worker import run_isolated_chunk, run_rehearsal, run_user_chunk
 
 REHEARSED = 2  # episodes of a contest in which contestants show what they open
 
@@ -31,7 +31,7 @@ class Comparison:
     """The episodes of a challenge. salt: of the seeds, "" where the caller chose them. on_file:
     whether the baselines are the file's."""
 
-    challenge: Challenge
+    request: ComparisonRequest
     salt: str
     on_file: bool
     results: Results
@@ -43,20 +43,22 @@ class Comparison:
 
     def standings(self, tier: str | None) -> list[Standing]:
         """Everybody in a tier, None: in all of them, the best first."""
-        return standings(self.results.found, tier, yardsticks(self.results, self.contests))
+        return rank_entries(
+            self.results.outcomes, tier, make_score_scales(self.results, self.tasks)
+        )
 
     @property
-    def contests(self) -> list[Contest]:
+    def tasks(self) -> list[ControlTask]:
         """Those that were driven."""
-        return list(self.challenge.contests)
+        return list(self.request.tasks)
 
-    def of(self, pair: Pair) -> Standing:
+    def select(self, entry: UserEntry) -> Standing:
         """A contestant over all contests."""
-        return next(each for each in self.overall if each.label == pair.label)
+        return next(standing for standing in self.overall if standing.label == entry.label)
 
 
 def compare(
-    challenge: Challenge,
+    request: ComparisonRequest,
     jobs: int | None = None,
     console: Console | None = None,
     keep: Path | None = None,
@@ -65,37 +67,54 @@ def compare(
 
     A contestant of names and files drives in processes of its own, objects in this one.
     """
-    pairs, played = challenge.pairs, challenge.contests
+    entries, tasks = request.entries, request.tasks
     shared: dict[str, Any] = {"jobs": jobs, "console": console, "keep": keep}
-    controllers = any(pair.agent != REFERENCE_CONTROLLER for pair in pairs)
-    filters = any(pair.agent == REFERENCE_CONTROLLER for pair in pairs)
+    controllers = any(entry.agent != REFERENCE_CONTROLLER for entry in entries)
+    filters = any(entry.agent == REFERENCE_CONTROLLER for entry in entries)
     rivals = [
-        Cell(cell.contest, cell.estimator, cell.controller, played[cell.contest])
-        for cell in cells_of(list(played), controllers, filters)
+        ControlEntry(
+            control_entry.task,
+            control_entry.estimator,
+            control_entry.controller,
+            tasks[control_entry.task],
+        )
+        for control_entry in make_baseline_entries(list(tasks), controllers, filters)
     ]
-    own = [pair.cell(contest, options) for contest, options in played.items() for pair in pairs]
-    apart = [cell for cell in own if not cell.objects]
-    found = on_file(rivals, challenge.episodes, **shared) if challenge.is_as_shipped else None
+    user_entries = [
+        entry.make_entry(task, options) for task, options in tasks.items() for entry in entries
+    ]
+    isolated = [control_entry for control_entry in user_entries if not control_entry.objects]
+    baselines = (
+        find_baselines(rivals, request.episodes, **shared) if request.is_as_shipped else None
+    )
     allowed: frozenset[str] | None = None
-    salt = found[0] if found else challenge.salt or salt_of()
-    if challenge.fresh:
-        allowed = _find_opened_files(challenge, apart, jobs, console)
-        digests = [hashlib.sha256(Path(each).read_bytes()).hexdigest() for each in sorted(allowed)]
-        salt = salt_of(*digests, secrets.token_hex(16))
-    seeds = challenge.seeds or seeds_of_contests(salt, challenge.episodes)
-    results = found[1] if found else measure(rivals, seeds, title="baselines", **shared)
-    by = partial(drive_apart, limit=challenge.limit, allowed=allowed)
-    there = measure(apart, seeds, jobs=jobs, console=console, title="entrants", by=by)
-    here = measure([cell for cell in own if cell.objects], seeds, jobs=1, by=drive_users)
-    every = Results(results.found | there.found | here.found)
-    return Comparison(challenge, "" if challenge.seeds else salt, bool(found), every)
+    salt = baselines[0] if baselines else request.salt or make_salt()
+    if request.fresh:
+        allowed = _find_opened_files(request, isolated, jobs, console)
+        digests = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in sorted(allowed)]
+        salt = make_salt(*digests, secrets.token_hex(16))
+    seeds = request.seeds or make_task_seeds(salt, request.episodes)
+    results = baselines[1] if baselines else measure(rivals, seeds, title="baselines", **shared)
+    runner = partial(run_isolated_chunk, limit=request.limit, allowed=allowed)
+    remote = measure(isolated, seeds, jobs=jobs, console=console, title="entrants", runner=runner)
+    in_process = measure(
+        [control_entry for control_entry in user_entries if control_entry.objects],
+        seeds,
+        jobs=1,
+        runner=run_user_chunk,
+    )
+    all_results = Results(results.outcomes | remote.outcomes | in_process.outcomes)
+    return Comparison(request, "" if request.seeds else salt, bool(baselines), all_results)
 
 
 def _find_opened_files(
-    challenge: Challenge, cells: Sequence[Cell], jobs: int | None, console: Console | None
+    request: ComparisonRequest,
+    entries: Sequence[ControlEntry],
+    jobs: int | None,
+    console: Console | None,
 ) -> frozenset[str]:
     """Find the files that contestants open, theirs included, by a drive on tuning seeds."""
-    chunks = [Chunk(cell, tuple(tuning_seeds(REHEARSED))) for cell in cells]
-    by = partial(rehearse, limit=challenge.limit)
-    opened = [files for _, files in run_cases(by, chunks, "rehearsal", jobs, console)]
-    return frozenset().union(*opened, (os.path.realpath(each) for each in challenge.files))
+    chunks = [Chunk(entry, tuple(make_tuning_seeds(REHEARSED))) for entry in entries]
+    runner = partial(run_rehearsal, limit=request.limit)
+    opened = [files for _, files in run_cases(runner, chunks, "rehearsal", jobs, console)]
+    return frozenset().union(*opened, (os.path.realpath(path) for path in request.files))

@@ -18,8 +18,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
 from typing import Any
 
-from ...envs.backend.cache import LAYERS, kernel_folder
-from .child import DONE, Start
+from ...envs.backend.cache import LAYERS, find_kernel_folder
+from .child import DONE, ChildSettings
 
 _GRACE = 60.0  # s to start in
 _LONGEST = 2**16  # bytes of an answer beside its numbers
@@ -30,13 +30,13 @@ class ContestantError(Exception):
     """Why a contestant gave no answer."""
 
 
-class Child:
+class ChildProcess:
     """The process of a contestant, and the one way to ask it.
 
     Args:
         texts: What it is made of; its stack is searched for these files.
         limit: Seconds of wall time that all its answers may take.
-        allowed: Of `Start`.
+        allowed: Of `ChildSettings`.
     """
 
     def __init__(
@@ -51,31 +51,31 @@ class Child:
         variables |= {"XDG_CACHE_HOME": scratch, "TMPDIR": scratch}
         variables.pop("NUMBA_CACHE_DIR", None)
         for layer in LAYERS:  # kernels of its own: it may read ours, and write none of them
-            folder = kernel_folder(layer)
+            folder = find_kernel_folder(layer)
             if folder is not None:
                 copy = Path(scratch, "sideslip", "kernels", folder.name)
                 with suppress(OSError):  # one that is pruned meanwhile is compiled again
                     shutil.copytree(folder, copy, dirs_exist_ok=True)
-        self._pipe, there = Pipe()
-        with there:
+        self._pipe, child_end = Pipe()
+        with child_end:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-c", _START, str(there.fileno())],
+                [sys.executable, "-P", "-c", _START, str(child_end.fileno())],
                 env=variables,
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
                 stderr=self._log,
-                pass_fds=(there.fileno(),),
+                pass_fds=(child_end.fileno(),),
                 start_new_session=True,
             )
         for option in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):  # of a message that stops halfway
             with socket.socket(fileno=os.dup(self._pipe.fileno())) as end:
                 end.setsockopt(socket.SOL_SOCKET, option, struct.pack("ll", int(_GRACE), 0))
-        start = Start(scratch, None if allowed is None else frozenset(allowed))
+        start = ChildSettings(scratch, None if allowed is None else frozenset(allowed))
         self._left, self._limit = _GRACE, _GRACE
-        self._started = float(json.loads(self.ask(start)))
+        self._started = float(json.loads(self.call(start)))
         self._left = self._limit = limit
 
-    def ask(self, *message: Any, length: int | None = None) -> bytes:
+    def call(self, *message: Any, length: int | None = None) -> bytes:
         """Send a message and return the answer.
 
         Args:
@@ -90,17 +90,17 @@ class Child:
         """
         if self.reason:
             raise ContestantError(self.reason)
-        begun, late = time.monotonic(), False
+        start_time, late = time.monotonic(), False
         try:
             self._pipe.send(message)
             late = not self._pipe.poll(max(self._left, 0.0))
             answer = b"" if late else self._pipe.recv_bytes(_LONGEST + (length or 0))
         except (EOFError, OSError):
             answer = b""
-        self._left -= time.monotonic() - begun
+        self._left -= time.monotonic() - start_time
         kind, content = answer[:1], answer[1:]
         if not answer:
-            self.reason = self._last_words(late)
+            self.reason = self._find_reason(late)
         elif kind != DONE:
             self.reason = " ".join(content.decode(errors="replace").split())[:2000]
         elif length is not None and len(content) != length:
@@ -109,14 +109,14 @@ class Child:
             raise ContestantError(self.reason)
         return content
 
-    def __deepcopy__(self, memo: Any) -> "Child":
+    def __deepcopy__(self, memo: Any) -> "ChildProcess":
         return self  # in a copy of a wrapper's recorded arguments, too, there is one process
 
-    def _kill(self) -> None:
+    def _stop(self) -> None:
         with suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
 
-    def _last_words(self, late: bool) -> str:
+    def _find_reason(self, late: bool) -> str:
         """End the process; say why it gave no answer, from its log."""
         if late:
             before = os.fstat(self._log.fileno()).st_size
@@ -128,7 +128,7 @@ class Child:
         else:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(1.0)
-        self._kill()
+        self._stop()
         status = self._process.wait()
         self._log.seek(max(self._log.seek(0, os.SEEK_END) - _LONGEST, 0))
         text, _, stack = (
@@ -141,7 +141,7 @@ class Child:
 
     def close(self) -> float:
         """End the process and what it started; return its CPU seconds after its start."""
-        self._kill()
+        self._stop()
         usage = resource.getrusage(resource.RUSAGE_CHILDREN)
         self._process.wait()
         after = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -5,12 +5,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from ...envs.backend.extras import extra
+from ...envs.backend.extras import require_extra
 from ..control.cells import REFERENCE_FILTER
 from ..harness.stats import Estimate
-from .challenge import EPISODES, Challenge, Pair, usual_estimator
+from .challenge import EPISODES, ComparisonRequest, UserEntry, choose_estimator
 from .compare import compare
-from .verdict import sentence
+from .verdict import make_sentence
 from .worker import LIMIT
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class Score:
 
     def to_pandas(self) -> "pd.DataFrame":
         """A row a contest (needs pandas)."""
-        with extra("report", "to_pandas needs pandas"):
+        with require_extra("report", "to_pandas needs pandas"):
             import pandas as pd
 
         return pd.DataFrame(list(self.contests))
@@ -81,42 +81,43 @@ def score(
     both on which the matrix is driven. scenarios: names, files or mappings, or one; default: a
     contest or two of every tier. vehicle: a name, file or mapping instead of the contests' cars.
     episodes: a contest. jobs: processes, None for all processors.
-    seeds: instead of the benchmark's, whose baselines are on file. fresh, limit: of `Challenge`,
-    whose errors it raises. trust: whether a policy's zip may be read, which may run code.
+    seeds: instead of the benchmark's, whose baselines are on file. fresh, limit: of
+    `ComparisonRequest`, whose errors it raises. trust: whether a policy's zip may be read, which
+    may run code.
 
     What is a file drives in a process of its own, an object in this one. An error while it drives
     is the result's `error`.
     """
-    alone = isinstance(scenarios, str | os.PathLike | Mapping)
-    driven_in = (scenarios,) if alone else tuple(scenarios)
+    is_single = isinstance(scenarios, str | os.PathLike | Mapping)
+    scenario_list = (scenarios,) if is_single else tuple(scenarios)
     chosen = None if seeds is None else tuple(map(int, seeds))
     if estimator is None:
-        estimator = usual_estimator(agent) if isinstance(agent, str) else REFERENCE_FILTER
-    pair = Pair(agent, estimator, trust)
-    challenge = Challenge(
-        (pair,), vehicle, driven_in, env_id, episodes, chosen, fresh=fresh, limit=limit
+        estimator = choose_estimator(agent) if isinstance(agent, str) else REFERENCE_FILTER
+    entry = UserEntry(agent, estimator, trust)
+    request = ComparisonRequest(
+        (entry,), vehicle, scenario_list, env_id, episodes, chosen, fresh=fresh, limit=limit
     )
-    found = compare(challenge, jobs)
-    standing = found.of(pair)
+    comparison = compare(request, jobs)
+    standing = comparison.select(entry)
     rows = []
-    for contest, driven in standing.results.items():
-        numbers = standing.by_contest.get(contest, {})
+    for task, result in standing.results.items():
+        numbers = standing.by_task.get(task, {})
         row: dict[str, Any] = {
-            "tier": contest.tier, "env_id": contest.env_id, "scenario": contest.scenario
+            "tier": task.tier, "env_id": task.env_id, "scenario": task.scenario
         }  # fmt: skip
         for name, metric in _COLUMNS.items():
             number = numbers.get(metric, _NONE)
             row |= {name: number.value, f"{name}_low": number.low, f"{name}_high": number.high}
-        pairs = standing.pairs.get(contest)
-        rows.append(row | {"n": len(pairs[0]) if pairs else 0, "error": driven.error})
+        pairs = standing.pairs.get(task)
+        rows.append(row | {"n": len(pairs[0]) if pairs else 0, "error": result.error})
     overall = {name: standing.overall.get(metric, _NONE) for name, metric in _COLUMNS.items()}
     errors = [row["error"] for row in rows]
     return Score(
-        standing.cell.controller,
-        standing.cell.estimator,
+        standing.entry.controller,
+        standing.entry.estimator,
         **overall,
         n=standing.n,
         contests=tuple(rows),
         error=errors[0] if all(errors) else "",
-        text=sentence(standing),
+        text=make_sentence(standing),
     )

@@ -5,103 +5,113 @@ import math
 from ..control.cells import REFERENCE_FILTER
 from ..control.contests import NOMINAL
 from ..control.tables import Standing
-from ..harness.results import Table
+from ..harness.results import ResultTable
 from ..harness.stats import Estimate, geometric_mean
-from ..harness.verdict import percent
+from ..harness.verdict import format_percent
 from .compare import Comparison
 
-_MOST = 4  # contestants with a sentence
+_MAX_SENTENCES = 4  # contestants with a sentence
 
 
-def verdict(found: Comparison) -> list[str]:
+def compose_verdict(comparison: Comparison) -> list[str]:
     """At most five lines: the contestants, the best first, then how far to trust them."""
-    mine = {pair.label for pair in found.challenge.pairs}
-    own = [each for each in found.overall if each.label in mine]
-    places = {each.label: place for place, each in enumerate(found.overall, 1)}
-    of = len(found.overall)
-    lines = [f"Place {places[each.label]} of {of}: {sentence(each)}." for each in own[:_MOST]]
-    if len(own) > _MOST:
-        lines[-1] = f"{len(own) - _MOST + 1} more stand in the table."
-    return [*lines, _trust(found)]
+    labels = {entry.label for entry in comparison.request.entries}
+    user_standings = [standing for standing in comparison.overall if standing.label in labels]
+    places = {standing.label: place for place, standing in enumerate(comparison.overall, 1)}
+    count = len(comparison.overall)
+    lines = [
+        f"Place {places[standing.label]} of {count}: {make_sentence(standing)}."
+        for standing in user_standings[:_MAX_SENTENCES]
+    ]
+    if len(user_standings) > _MAX_SENTENCES:
+        lines[-1] = f"{len(user_standings) - _MAX_SENTENCES + 1} more stand in the table."
+    return [*lines, _describe_trust(comparison)]
 
 
-def sentence(each: Standing) -> str:
+def make_sentence(standing: Standing) -> str:
     """Where a contestant stands."""
-    cost = each.overall.get("cost_vs_nominal")
-    errors = [f"{c.name}: {r.error}" for c, r in each.results.items() if r.error]
+    cost = standing.overall.get("cost_vs_nominal")
+    errors = [f"{c.name}: {r.error}" for c, r in standing.results.items() if r.error]
     if cost is None or not math.isfinite(cost.value):
         yards = "nominal and oracle-state leave no episode to compare"
-        return f"{each.label}: not driven: {errors[0]}" if errors else f"{each.label}: {yards}"
-    names = dict.fromkeys(contest.tier for contest in each.pairs)
-    tiers = [f"tier {tier}: {100.0 * _cost(each, tier):.0f}" for tier in names if tier]
-    failed = each.overall["failure_rate"]
-    nominal = [each.yards[contest].nominal for contest in each.driven if contest in each.yards]
-    theirs = sum(float((run["failure"] != 0.0).sum()) for run in nominal)
+        return (
+            f"{standing.label}: not driven: {errors[0]}" if errors else f"{standing.label}: {yards}"
+        )
+    names = dict.fromkeys(task.tier for task in standing.pairs)
+    tiers = [f"tier {tier}: {100.0 * _compute_cost(standing, tier):.0f}" for tier in names if tier]
+    failed = standing.overall["failure_rate"]
+    nominal = [standing.scales[task].nominal for task in standing.drives if task in standing.scales]
+    nominal_failures = sum(float((run["failure"] != 0.0).sum()) for run in nominal)
     episodes = sum(len(run.costs) for run in nominal)
     parts = [
-        f"{percent(cost)} of nominal's cost" + (f" ({', '.join(tiers)})" if tiers[1:] else ""),
-        f"wins {100.0 * each.overall['share_won'].value:.0f} % of the episodes",
-        f"fails in {100.0 * failed.value:.1f} % (nominal {100.0 * theirs / episodes:.1f} %)",
-        _gap(each.overall["score"]),
+        f"{format_percent(cost)} of nominal's cost"
+        + (f" ({', '.join(tiers)})" if tiers[1:] else ""),
+        f"wins {100.0 * standing.overall['share_won'].value:.0f} % of the episodes",
+        f"fails in {100.0 * failed.value:.1f} % (nominal "
+        f"{100.0 * nominal_failures / episodes:.1f} %)",
+        _describe_gap(standing.overall["score"]),
     ]
-    text = f"{each.label}: {', '.join(parts)}"
+    text = f"{standing.label}: {', '.join(parts)}"
     if errors:
-        text += f"; not driven in {len(errors)} of {len(each.results)} contests: {errors[0]}"
+        text += f"; not driven in {len(errors)} of {len(standing.results)} contests: {errors[0]}"
     return text
 
 
-def _cost(each: Standing, tier: str) -> float:
+def _compute_cost(standing: Standing, tier: str) -> float:
     """Cost over nominal's in a tier."""
-    logs = [-r for contest, (r, _) in each.pairs.items() if contest.tier == tier]
+    logs = [-r for task, (r, _) in standing.pairs.items() if task.tier == tier]
     return geometric_mean(*logs).value
 
 
-def _gap(score: Estimate) -> str:
+def _describe_gap(score: Estimate) -> str:
     """How much of the way from nominal to oracle-state."""
     if not math.isfinite(score.value):
         return "and nothing is to be won here"
     if score.low > 0.0:
-        return f"closes {percent(score)} of the gap to oracle-state"
+        return f"closes {format_percent(score)} of the gap to oracle-state"
     if score.high < 0.0:
         return f"and is behind nominal (score {score.value:.2f}, oracle-state 1)"
     return f"and is not told apart from nominal (score {score.value:.2f}, oracle-state 1)"
 
 
-def _trust(found: Comparison) -> str:
+def _describe_trust(comparison: Comparison) -> str:
     """On what the numbers rest, and what they do not say."""
-    challenge = found.challenge
-    n = len(challenge.seeds or range(challenge.episodes))
-    count = len(found.contests)
+    request = comparison.request
+    n = len(request.seeds or range(request.episodes))
+    count = len(comparison.tasks)
     where = f"{count} contest{'s' if count > 1 else ''} x {n} episodes"
-    if challenge.fresh:
-        files = ", ".join(path.name for path in challenge.files)
+    if request.fresh:
+        files = ", ".join(path.name for path in request.files)
         return (
-            f"Publishable: {where} on seeds drawn after {files} were hashed; --salt {found.salt} "
+            f"Publishable: {where} on seeds drawn after {files} were hashed; --salt "
+            f"{comparison.salt} "
             "repeats them. Everybody driven anew. Not said: other cars, manoeuvres and sensors."
         )
-    whose = "the given" if challenge.salt else "the package's own"
-    seeds = f"of {whose} salt {found.salt}" if found.salt else "of the caller's choice"
-    rows = "on file, a sample driven again" if found.on_file else "driven now"
+    whose = "the given" if request.salt else "the package's own"
+    seeds = f"of {whose} salt {comparison.salt}" if comparison.salt else "of the caller's choice"
+    rows = "on file, a sample driven again" if comparison.on_file else "driven now"
     return (
         f"Not publishable: {where} on seeds {seeds}, which a contestant can be tuned on; --fresh "
         f"draws new ones. Baselines {rows}. Not said: other cars, manoeuvres and sensors."
     )
 
 
-def table(found: Comparison) -> Table:
+def make_table(comparison: Comparison) -> ResultTable:
     """Everybody over all contests, the best first; the user's own are marked."""
-    mine, cells = {pair.label for pair in found.challenge.pairs}, []
-    for each in found.overall:
-        numbers = [each.overall.get(name) for name in ("cost_vs_nominal", "share_won", "score")]
+    labels, cells = {entry.label for entry in comparison.request.entries}, []
+    for standing in comparison.overall:
+        numbers = [standing.overall.get(name) for name in ("cost_vs_nominal", "share_won", "score")]
         cost, won, score = (Estimate(math.nan) if n is None else n for n in numbers)
         cells.append(
             [
-                f"> {each.label}" if each.label in mine else _baseline(each.label),
-                _text(cost, 100.0, ".0f"),
-                _text(Estimate(won.value), 100.0, ".0f"),
-                _text(Estimate(each.overall["failure_rate"].value), 100.0, ".1f"),
-                _text(score, 1.0, ".2f"),
-                str(each.n),
+                f"> {standing.label}"
+                if standing.label in labels
+                else _label_baseline(standing.label),
+                _format_text(cost, 100.0, ".0f"),
+                _format_text(Estimate(won.value), 100.0, ".0f"),
+                _format_text(Estimate(standing.overall["failure_rate"].value), 100.0, ".1f"),
+                _format_text(score, 1.0, ".2f"),
+                str(standing.n),
             ]
         )
     header = ("contestant", "cost, % [95 %]", "won, %", "fails, %", "score [95 %]", "episodes")
@@ -110,12 +120,12 @@ def table(found: Comparison) -> Table:
         "nominal and oracle-state survive. won: cheaper than nominal. score: 0 nominal, an LQG "
         "that knows the nominal car, 1 oracle-state, which knows state and car."
     )
-    return Table("Your contestants and the package's", header, cells, note)
+    return ResultTable("Your contestants and the package's", header, cells, note)
 
 
-def _baseline(label: str) -> str:
+def _label_baseline(label: str) -> str:
     return f"{label} (lqr on {REFERENCE_FILTER})" if label == NOMINAL else label
 
 
-def _text(number: Estimate, scale: float, digits: str) -> str:
+def _format_text(number: Estimate, scale: float, digits: str) -> str:
     return number.inline(scale, digits) if math.isfinite(number.value) else ""

@@ -12,9 +12,9 @@ from ...agents.learned.files import ZIP
 from ...envs.sensors.link import SlowSensor
 from ...estimators.user_files import is_user_file
 from ...estimators.vector.foreign import ForeignBatch
-from ...estimators.wrappers.outputs import write
-from ..control.episodes import NUMBERS, Chunk, Driven, drive
-from .process import Child, ContestantError
+from ...estimators.wrappers.outputs import write_outputs
+from ..control.episodes import NUMBERS, Chunk, DriveResult, run_chunk
+from .process import ChildProcess, ContestantError
 
 LIMIT = 600.0  # s of wall time a cell
 
@@ -28,18 +28,18 @@ class RemoteAgent:
         trust: Whether the child may read a zip.
     """
 
-    def __init__(self, child: Child, source: str, trust: bool = False) -> None:
+    def __init__(self, child: ChildProcess, source: str, trust: bool = False) -> None:
         self._child, self._source, self._trust = child, source, trust
 
-    def __call__(self, env: Any, **options: Any) -> "_Answers":
+    def __call__(self, env: Any, **options: Any) -> "_RemotePolicy":
         """Let the child build its agent from the view of an env."""
         view = EnvView.from_env(env)
-        self._child.ask("agent", self._source, view, {"trust": self._trust, **options})
-        return _Answers(self._child, (view.num_envs, view.facts.width))
+        self._child.call("agent", self._source, view, {"trust": self._trust, **options})
+        return _RemotePolicy(self._child, (view.num_envs, view.facts.width))
 
 
-class _Answers:
-    def __init__(self, child: Child, shape: tuple[int, int]) -> None:
+class _RemotePolicy:
+    def __init__(self, child: ChildProcess, shape: tuple[int, int]) -> None:
         self._child, self._shape = child, shape
 
     def predict(
@@ -48,7 +48,7 @@ class _Answers:
     ) -> tuple[Any, Any]:  # fmt: skip
         """The child's actions, float32 (rows, width); its memory stays there."""
         length = 4 * self._shape[0] * self._shape[1]
-        answer = self._child.ask("predict", observation, episode_start, length=length)
+        answer = self._child.call("predict", observation, episode_start, length=length)
         return np.frombuffer(answer, np.float32).reshape(self._shape), None
 
 
@@ -60,7 +60,7 @@ class RemoteEstimators:
         source: The text of which the child makes them.
     """
 
-    def __init__(self, child: Child, source: str) -> None:
+    def __init__(self, child: ChildProcess, source: str) -> None:
         self._child, self.name, self._rows = child, source, 0
 
     def __call__(self, **arguments: Any) -> "_RemoteRow":
@@ -80,13 +80,13 @@ class RemoteBatch(ForeignBatch):
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
         remote: list[Any] = [self[i].inner for i in chosen.tolist()]
         records = [
-            (each.row, fast[i, : rows[i]], packets[i, : counts[i]])
-            for i, each in zip(chosen.tolist(), remote, strict=True)
+            (item.row, fast[i, : rows[i]], packets[i, : counts[i]])
+            for i, item in zip(chosen.tolist(), remote, strict=True)
         ]
         _RemoteRow.take(remote, records)
         for i in chosen.tolist():
-            beta, gamma, out, summary = (each[i] for each in others)
-            write(self[i], obs[i], inner, plan, limits, beta, gamma, out, summary)
+            beta, gamma, out, summary = (item[i] for item in others)
+            write_outputs(self[i], obs[i], inner, plan, limits, beta, gamma, out, summary)
 
 
 class _RemoteRow:
@@ -96,14 +96,16 @@ class _RemoteRow:
     x: Any = None
     P: Any = None
 
-    def __init__(self, child: Child, source: str, row: int, arguments: dict[str, Any]) -> None:
+    def __init__(
+        self, child: ChildProcess, source: str, row: int, arguments: dict[str, Any]
+    ) -> None:
         self.child, self.row = child, row
-        names = json.loads(child.ask("estimator", row, source, arguments))
+        names = json.loads(child.call("estimator", row, source, arguments))
         self.names = tuple(names) if isinstance(names, list) else ()
 
     def reset(self, sensors: Mapping[str, SlowSensor], first: int) -> None:
         """As `EstimatorLike.reset`."""
-        self.child.ask("reset", self.row, dict(sensors), first)
+        self.child.call("reset", self.row, dict(sensors), first)
 
     def step(self, rows: Any, packets: Any) -> None:
         """As `EstimatorLike.step`."""
@@ -115,9 +117,9 @@ class _RemoteRow:
         if not rows:
             return
         n = len(rows[0].names)
-        answer = rows[0].child.ask("step", records, length=8 * len(rows) * n * (n + 1))
-        for each, values in zip(rows, np.frombuffer(answer).reshape(len(rows), -1), strict=True):
-            each.x, each.P = values[:n], values[n:].reshape(n, n)
+        answer = rows[0].child.call("step", records, length=8 * len(rows) * n * (n + 1))
+        for row, values in zip(rows, np.frombuffer(answer).reshape(len(rows), -1), strict=True):
+            row.x, row.P = values[:n], values[n:].reshape(n, n)
 
 
 def is_foreign(source: Any) -> bool:
@@ -127,16 +129,20 @@ def is_foreign(source: Any) -> bool:
     )
 
 
-def drive_users(chunk: Chunk) -> Driven:
-    """`drive`; a cell of which every episode ends by an action that is none was not driven."""
-    driven = drive(chunk)
-    if not driven.error and driven.failed("bad-action").all():
-        return _undriven(chunk, "every action is NaN, or infinite, before an episode is over")
-    return driven
+def run_user_chunk(chunk: Chunk) -> DriveResult:
+    """`run_chunk`; a cell of which every episode ends by an action that is none was not driven."""
+    result = run_chunk(chunk)
+    if not result.error and result.mark_failures("bad-action").all():
+        return _make_failed_result(
+            chunk, "every action is NaN, or infinite, before an episode is over"
+        )
+    return result
 
 
-def drive_apart(chunk: Chunk, limit: float = LIMIT, allowed: Iterable[str] | None = None) -> Driven:
-    """`drive_users`, but what is not the package's code runs in a child of its own, agent and
+def run_isolated_chunk(
+    chunk: Chunk, limit: float = LIMIT, allowed: Iterable[str] | None = None
+) -> DriveResult:
+    """`run_user_chunk`, but what is not the package's code runs in a child of its own, agent and
     estimator apart.
 
     Args:
@@ -147,44 +153,44 @@ def drive_apart(chunk: Chunk, limit: float = LIMIT, allowed: Iterable[str] | Non
     Returns:
         The episodes.
     """
-    return _drive_apart(chunk, limit, allowed)[0]
+    return _run_isolated_chunk(chunk, limit, allowed)[0]
 
 
-def rehearse(chunk: Chunk, limit: float = LIMIT) -> tuple[Driven, set[str]]:
-    """Drive a chunk as `drive_apart`; return the files that its contestants opened, too."""
-    return _drive_apart(chunk, limit, None)
+def run_rehearsal(chunk: Chunk, limit: float = LIMIT) -> tuple[DriveResult, set[str]]:
+    """Drive a chunk as `run_isolated_chunk`; return the files that its contestants opened, too."""
+    return _run_isolated_chunk(chunk, limit, None)
 
 
-def _drive_apart(
+def _run_isolated_chunk(
     chunk: Chunk, limit: float, allowed: Iterable[str] | None
-) -> tuple[Driven, set[str]]:
-    cell, children, opened = chunk.cell, list[Child](), set[str]()
-    objects = dict(cell.objects)
+) -> tuple[DriveResult, set[str]]:
+    entry, children, opened = chunk.entry, list[ChildProcess](), set[str]()
+    objects = dict(entry.objects)
     try:
         for part in ("controller", "estimator"):
-            source = getattr(cell, part)
+            source = getattr(entry, part)
             if part in objects or not is_foreign(source):
                 continue
-            child = Child((cell.controller, cell.estimator), limit, allowed)
+            child = ChildProcess((entry.controller, entry.estimator), limit, allowed)
             children.append(child)
-            trust = bool(cell.best["controller"].get("trust"))
+            trust = bool(entry.best["controller"].get("trust"))
             agent = part == "controller"
             objects[part] = (
                 RemoteAgent(child, source, trust) if agent else RemoteEstimators(child, source)
             )
-        driven = drive_users(replace(chunk, cell=replace(cell, objects=objects)))
+        result = run_user_chunk(replace(chunk, entry=replace(entry, objects=objects)))
         for child in children:
             if not child.reason:
-                opened.update(json.loads(child.ask("opened")))
+                opened.update(json.loads(child.call("opened")))
     except ContestantError as error:
-        driven = _undriven(chunk, str(error))
+        result = _make_failed_result(chunk, str(error))
     finally:
         spent = sum(child.close() for child in children)
-    reason = next((child.reason for child in children if child.reason), driven.error)
+    reason = next((child.reason for child in children if child.reason), result.error)
     if reason:
-        return _undriven(chunk, reason), opened
-    return replace(driven, seconds=driven.seconds + spent), opened
+        return _make_failed_result(chunk, reason), opened
+    return replace(result, seconds=result.seconds + spent), opened
 
 
-def _undriven(chunk: Chunk, error: str) -> Driven:
-    return Driven(np.full((len(chunk.seeds), len(NUMBERS)), np.nan), np.nan, error=error)
+def _make_failed_result(chunk: Chunk, error: str) -> DriveResult:
+    return DriveResult(np.full((len(chunk.seeds), len(NUMBERS)), np.nan), np.nan, error=error)

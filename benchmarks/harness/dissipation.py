@@ -8,14 +8,14 @@ from ...envs.backend.arrays import read
 from ...envs.backend.decorators import jit
 from ...envs.backend.elementary import sincos
 from ...envs.engine.layout import P, Z
-from ...envs.engine.step import kind_of
-from ...envs.engine.tick import changed, standing_load
+from ...envs.engine.step import make_step_variant
+from ...envs.engine.tick import apply_tyre_change, compute_static_load
 from ...envs.record import Array
-from ...envs.vehicle.dynamics import gravity_at
-from ...envs.vehicle.tyres import tyre_forces
+from ...envs.vehicle.dynamics import compute_gravity
+from ...envs.vehicle.tyres import compute_tyre_forces
 
 
-def dissipated(params: Array, states: Array, switches: Any) -> Array:
+def compute_dissipation(params: Array, states: Array, switches: Any) -> Array:
     """(N,) W: lateral force times the speed across the wheel, both axles, of N cars now.
 
     params, states, switches: the engine's packed numbers, a row a car. Drive slip is not modelled.
@@ -29,12 +29,12 @@ def dissipated(params: Array, states: Array, switches: Any) -> Array:
 def _write(params: Any, states: Any, switches: Any, out: Any) -> None:
     for i in range(len(params)):
         p, z = params[i], states[i]
-        motion, drive, change = read(z, Z.motion), read(z, Z.drive), read(p, P.change)
-        kind = kind_of(p, switches[i])
-        car = changed(read(p, P.car), change, z[Z.clock.tick] >= change.tick)
-        _, g_y = gravity_at(motion, read(p, P.road), kind.small_angle)
-        load = standing_load(drive, car, kind)
-        F_yf, F_yr, _, _ = tyre_forces(
+        motion, drive, change = read(z, Z.motion), read(z, Z.drive), read(p, P.tyre_change)
+        kind = make_step_variant(p, switches[i])
+        car = apply_tyre_change(read(p, P.car), change, z[Z.clock.tick] >= change.tick)
+        _, g_y = compute_gravity(motion, read(p, P.road), kind.small_angle)
+        load = compute_static_load(drive, car, kind)
+        F_yf, F_yr, _, _ = compute_tyre_forces(
             motion, load, car, g_y, kind.small_angle, kind.law, kind.roll
         )
         sin_d, cos_d = sincos(drive.delta_f)

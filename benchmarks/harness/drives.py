@@ -9,7 +9,7 @@ import gymnasium as gym
 
 from ...envs.record import Log
 from ...estimators.estimates import UnobservableWarning
-from ...estimators.wrappers.arguments import setup_of
+from ...estimators.wrappers.arguments import make_spec
 from ...estimators.wrappers.estimate import EstimateObservation
 
 T = TypeVar("T")
@@ -18,19 +18,19 @@ SETTLED = 2.0  # s: errors of estimates count from here on
 
 
 @dataclass(frozen=True)
-class Drive:
+class LoggedEpisode:
     """An episode's log, and the arguments of `make_estimator` that belong to it."""
 
     log: Log
     facts: dict[str, Any]
 
 
-def filter_arguments(base: Any) -> dict[str, Any]:
-    """What `make_estimator` takes of an env's running episode: `Setup`, and dt in s."""
-    return setup_of(base)._asdict() | {"dt": base.dt}
+def make_filter_arguments(base: Any) -> dict[str, Any]:
+    """What `make_estimator` takes of an env's running episode: `EstimatorSpec`, and dt in s."""
+    return make_spec(base)._asdict() | {"dt": base.dt}
 
 
-def quietly(make: Callable[..., T], *args: Any, **options: Any) -> T:
+def call_quietly(make: Callable[..., T], *args: Any, **options: Any) -> T:
     """The filter, or env with a filter, that `make` returns, without `UnobservableWarning`."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnobservableWarning)
@@ -45,4 +45,6 @@ def make_env(
     estimate: options of `EstimateObservation`. options: of the env.
     """
     env: gym.Env[Any, Any] = gym.make(env_id, **{"on_bad_action": "fail", **options})
-    return quietly(EstimateObservation, env, estimator, **(estimate or {})) if estimator else env
+    return (
+        call_quietly(EstimateObservation, env, estimator, **(estimate or {})) if estimator else env
+    )

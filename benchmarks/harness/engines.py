@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import joblib
 
 from ...envs.arguments import check_choice
-from ...envs.backend.extras import extra
+from ...envs.backend.extras import require_extra
 
 Case = TypeVar("Case")
 Result = TypeVar("Result")
@@ -24,13 +24,13 @@ RETRIES = 3
 _CLUSTER: ContextVar[Any] = ContextVar("cluster", default=None)
 
 
-def cores() -> int:
+def count_cores() -> int:
     """The processors this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
-def engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
+def use_engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
     """What runs the cases within: of `ENGINES`.
 
     address: of an existing Ray cluster, "host:port"; "": the one that runs on this machine. Its
@@ -44,7 +44,7 @@ def engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
             raise ValueError(f"an address is of a Ray cluster (engine {RAY!r}), got {address!r}")
         yield
         return
-    with extra("scale", "the engine 'ray' needs ray"):
+    with require_extra("scale", "the engine 'ray' needs ray"):
         import ray
     quiet = {"env_vars": {"SIDESLIP_QUIET": "1", "OPENBLAS_NUM_THREADS": "1"}}
     try:
@@ -63,20 +63,22 @@ def engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
         ray.shutdown()
 
 
-def completed(
+def execute_cases(
     function: Callable[[Case], Result], cases: Sequence[Case], jobs: int | None = None
 ) -> Iterator[tuple[int, Result]]:
     """(place, function(case)) of every case as it is done; arguments of `run_cases`."""
     ray = _CLUSTER.get()
     if ray is None:
         # the number asked for is left alone: another one would end the processes of the last call
-        pool = joblib.Parallel(jobs or max(min(cores(), len(cases)), 1), return_as="generator")
+        pool = joblib.Parallel(
+            jobs or max(min(count_cores(), len(cases)), 1), return_as="generator"
+        )
         yield from enumerate(pool(joblib.delayed(function)(case) for case in cases))
         return
     remote = ray.remote(num_cpus=1, max_retries=RETRIES)(_call)  # a dead node's cases run again
-    asked, waiting = ray.put(function), {}
+    function_ref, waiting = ray.put(function), {}
     for place, case in enumerate(cases):
-        waiting[remote.remote(asked, case)] = place
+        waiting[remote.remote(function_ref, case)] = place
     while waiting:
         (done,), _ = ray.wait(list(waiting), num_returns=1)
         yield waiting.pop(done), ray.get(done)

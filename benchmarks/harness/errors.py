@@ -10,7 +10,7 @@ from gymnasium.error import Error as GymnasiumError
 from rich.console import Console
 from rich.markup import escape
 
-_OF_USERS = (
+_USER_ERRORS = (
     ValueError, TypeError, ModuleNotFoundError, OSError, RecursionError, GymnasiumError,
     FloatingPointError,
 )  # fmt: skip
@@ -19,21 +19,21 @@ _LONGEST = 1000  # letters of a message
 
 
 @contextmanager
-def one_line() -> Iterator[None]:
+def report_user_errors() -> Iterator[None]:
     """End the process with exit status 2 and the message of a user's error."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a result is not lost for a letter
             stream.reconfigure(errors="backslashreplace")
     try:
         yield
-    except _OF_USERS as error:
+    except _USER_ERRORS as error:
         Console(stderr=True, soft_wrap=True).print(
-            "[bold red]error:[/]", escape(_shorten(str(error))), highlight=False
+            "[bold red]error:[/]", escape(_truncate_message(str(error))), highlight=False
         )
         sys.exit(2)
 
 
-def _shorten(text: str) -> str:
+def _truncate_message(text: str) -> str:
     """A message of which the middle is left out where it is long."""
     if len(text) <= _LONGEST:
         return text

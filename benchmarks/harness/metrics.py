@@ -14,28 +14,28 @@ from ...envs.record import Array
 FULL = 0.999  # of an input's range: saturated
 
 
-class Moment(NamedTuple):
+class StepSample(NamedTuple):
     """An env-step of N cars.
 
-    asked: (N, 2) shares of the yaw moment and of the added steering. before: those of the last
+    command: (N, 2) shares of the yaw moment and of the added steering. before: those of the last
     step. reward: (N,). info, last: the env's infos after and before the step. full: (2,) N m and
     rad at a share of 1. dt: s. aside: (N,) m that the car is beside the path of its reference.
     power: (N,) W of the motors. heat: (N,) W dissipated by the tyres.
     """
 
-    asked: Array
-    before: Array
+    command: Array
+    last_command: Array
     reward: Array
     info: Mapping[str, Any]
     last: Mapping[str, Any]
-    full: Array
+    full_scale: Array
     dt: float
-    aside: Array
+    lateral_deviation: Array
     power: Array
-    heat: Array
+    tyre_dissipation: Array
 
 
-class Fold(NamedTuple):
+class Reduction(NamedTuple):
     """A reduction of the values of an episode's steps to one number, starting from 0.
 
     add: from the number so far and a step's value. finish: from the last of them and the steps.
@@ -45,16 +45,18 @@ class Fold(NamedTuple):
     finish: Callable[[Array, Array], Array]
 
 
-def _as_it_is(total: Array, _: Array) -> Array:
+def _keep_total(total: Array, _: Array) -> Array:
     return total
 
 
-FOLDS = {
-    "sum": Fold(np.add, _as_it_is),
-    "mean": Fold(np.add, np.divide),
-    "rms": Fold(lambda total, value: total + value * value, lambda t, steps: np.sqrt(t / steps)),
-    "max": Fold(np.maximum, _as_it_is),
-    "last": Fold(lambda _, value: value, _as_it_is),
+REDUCTIONS = {
+    "sum": Reduction(np.add, _keep_total),
+    "mean": Reduction(np.add, np.divide),
+    "rms": Reduction(
+        lambda total, value: total + value * value, lambda t, steps: np.sqrt(t / steps)
+    ),
+    "max": Reduction(np.maximum, _keep_total),
+    "last": Reduction(lambda _, value: value, _keep_total),
 }
 
 
@@ -62,15 +64,15 @@ FOLDS = {
 class Metric:
     """A number of an episode.
 
-    of: a step's value (N,) from its `Moment`. fold: a key of `FOLDS`. heading: of its column in
-    the matrix's table of motion, "" for none. scale, digits: of a number there. turning: whether
-    it means something only where the reference has a yaw rate.
+    compute: a step's value (N,) from its `StepSample`. fold: a key of `REDUCTIONS`. heading: of its
+    column in the matrix's table of motion, "" for none. scale, digits: of a number there. turning:
+    whether it means something only where the reference has a yaw rate.
     """
 
     name: str
     unit: str
-    of: Callable[[Moment], Array]
-    fold: str
+    compute: Callable[[StepSample], Array]
+    reduction: str
     heading: str = ""
     scale: float = 1.0
     digits: int = 1
@@ -81,13 +83,13 @@ class Metric:
         return f"{self.scale * value:.{self.digits}f}"
 
 
-def _error(name: str) -> Callable[[Moment], Array]:
+def _make_error(name: str) -> Callable[[StepSample], Array]:
     return lambda m: m.info[name] - m.info[f"{name}_ref"]
 
 
-def _change(i: int) -> Callable[[Moment], Array]:
+def _make_change(i: int) -> Callable[[StepSample], Array]:
     """The change of what is asked of an input, from one decision to the next."""
-    return lambda m: np.abs(m.asked[:, i] - m.before[:, i]) * m.full[i]
+    return lambda m: np.abs(m.command[:, i] - m.last_command[:, i]) * m.full_scale[i]
 
 
 _DEGREES = 180.0 / np.pi
@@ -97,19 +99,43 @@ EPISODE = (
     Metric(
         "peak_slip", "rad", lambda m: np.abs(m.info["beta"]), "max", "peak slip / deg", _DEGREES, 2
     ),
-    Metric("rms_slip_error", "rad", _error("beta"), "rms", "slip error / deg", _DEGREES, 2),
+    Metric("rms_slip_error", "rad", _make_error("beta"), "rms", "slip error / deg", _DEGREES, 2),
     Metric(
-        *("rms_yaw_error", "rad/s", _error("gamma"), "rms", "yaw error / (deg/s)", _DEGREES, 2),
+        *(
+            "rms_yaw_error",
+            "rad/s",
+            _make_error("gamma"),
+            "rms",
+            "yaw error / (deg/s)",
+            _DEGREES,
+            2,
+        ),
         turning=True,
     ),
     Metric(
-        *("path_error", "m", lambda m: np.abs(m.aside), "max", "off the path / m", 1.0, 2),
+        *(
+            "path_error",
+            "m",
+            lambda m: np.abs(m.lateral_deviation),
+            "max",
+            "off the path / m",
+            1.0,
+            2,
+        ),
         turning=True,
     ),
     Metric("motor_energy", "J", lambda m: m.power * m.dt, "sum", "motors / kJ", 1e-3),
-    Metric("tyre_dissipation", "J", lambda m: m.heat * m.dt, "sum", "tyres / kJ", 1e-3, 2),
     Metric(
-        "effort", "-", lambda m: (m.info["yaw_moment"] / m.full[0]) ** 2, "mean", "effort", 1, 3
+        "tyre_dissipation", "J", lambda m: m.tyre_dissipation * m.dt, "sum", "tyres / kJ", 1e-3, 2
+    ),
+    Metric(
+        "effort",
+        "-",
+        lambda m: (m.info["yaw_moment"] / m.full_scale[0]) ** 2,
+        "mean",
+        "effort",
+        1,
+        3,
     ),
     Metric(
         "moment_rate",
@@ -119,13 +145,13 @@ EPISODE = (
         "moment rate / (N m/s)",
         digits=0,
     ),
-    Metric("largest_step", "N m", _change(0), "max", "step / (N m)", digits=0),
-    Metric("steer_effort", "-", lambda m: m.asked[:, 1] ** 2, "mean"),
-    Metric("largest_steer_step", "rad", _change(1), "max", "steer step / mrad", 1e3),
+    Metric("largest_step", "N m", _make_change(0), "max", "step / (N m)", digits=0),
+    Metric("steer_effort", "-", lambda m: m.command[:, 1] ** 2, "mean"),
+    Metric("largest_steer_step", "rad", _make_change(1), "max", "steer step / mrad", 1e3),
     Metric(
         "saturation",
         "-",
-        lambda m: (np.abs(m.asked).max(axis=1) >= FULL).astype(np.float64),
+        lambda m: (np.abs(m.command).max(axis=1) >= FULL).astype(np.float64),
         "mean",
         "saturated / %",
         1e2,

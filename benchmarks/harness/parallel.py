@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from rich import progress
 from rich.console import Console
 
-from .engines import completed
+from .engines import execute_cases
 
 Case = TypeVar("Case")
 Result = TypeVar("Result")
@@ -17,7 +17,7 @@ Result = TypeVar("Result")
 _EVERY = 15.0  # s between two lines
 
 
-def chunked(seeds: int, size: int) -> list[tuple[int, ...]]:
+def split_seeds(seeds: int, size: int) -> list[tuple[int, ...]]:
     """The seeds 0 .. seeds-1 in tuples of at most `size`."""
     return [tuple(range(k, min(k + size, seeds))) for k in range(0, seeds, size)]
 
@@ -75,7 +75,7 @@ _SHARED: ContextVar[Bar | None] = ContextVar("shared", default=None)
 
 
 @contextmanager
-def one_bar(
+def use_shared_bar(
     console: Console | None, title: str, unit: str = "cases", total: int | None = None
 ) -> Iterator[Bar]:
     """One progress bar for what is done inside, at first under a title; every `run_cases` shows
@@ -100,14 +100,15 @@ def run_cases(
 
     function: importable by workers. jobs: processes (default: the processors at hand; a cluster has
     its own); 1 runs in this process. console: where the progress bar goes, unless inside
-    `one_bar`; None shows none. Where it is no terminal, standard error gets a line every 15 s.
+    `use_shared_bar`; None shows none. Where it is no terminal, standard error gets a line every 15
+    s.
     """
-    shared, found = _SHARED.get(), dict[int, Result]()
+    shared, results = _SHARED.get(), dict[int, Result]()
     with Bar(console) if shared is None else nullcontext(shared) as bar:
         for before in bar.task_ids:
             bar.remove_task(before)
         task = bar.add_task(title, total=len(cases), unit="cases")
-        for place, result in completed(function, cases, jobs):
-            found[place] = result
+        for place, result in execute_cases(function, cases, jobs):
+            results[place] = result
             bar.advance(task)
-    return [found[place] for place in range(len(cases))]
+    return [results[place] for place in range(len(cases))]

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...envs.arguments import check_choice
-from ...envs.backend.files import whole, write_whole
-from ...envs.documents import made_of as made_of
+from ...envs.backend.files import atomic_file, write_atomic
+from ...envs.documents import from_json as from_json
 from ...envs.record import Array
 from .explorer import Explorer
 from .metrics import METRICS
@@ -24,7 +24,7 @@ VERDICTS = ("", "reproduced", "partly", "not reproduced", "report only")
 
 
 @dataclass(frozen=True)
-class Row:
+class ResultRow:
     """One number of a benchmark.
 
     suite, scenario, estimator, controller, metric: what was measured. value with its 95 % interval
@@ -55,13 +55,13 @@ class Row:
         check_choice("verdict", self.verdict, VERDICTS)
 
     @classmethod
-    def of(cls, metric: str, number: Estimate, **columns: Any) -> "Row":
+    def from_estimate(cls, metric: str, number: Estimate, **columns: Any) -> "ResultRow":
         """A row of a number with its interval; columns: the others."""
         return cls(metric=metric, value=number.value, low=number.low, high=number.high, **columns)
 
 
 @dataclass
-class Table:
+class ResultTable:
     """A table for the screen and the report: texts, a header, and what each column means.
 
     keyed: whether the first column names estimators or controllers, which have their colour.
@@ -114,8 +114,8 @@ class Suite:
     name: str
     title: str
     text: str
-    rows: list[Row] = field(default_factory=list)
-    tables: list[Table] = field(default_factory=list)
+    rows: list[ResultRow] = field(default_factory=list)
+    tables: list[ResultTable] = field(default_factory=list)
     figures: list[tuple[str, Any, str]] = field(default_factory=list)
     explorers: list[Explorer] = field(default_factory=list)
     maps: list[ShareMap] = field(default_factory=list)
@@ -162,10 +162,10 @@ def check_writable(*paths: Path | None) -> None:
 
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file or nothing."""
-    write_whole(path, text.encode())
+    write_atomic(path, text.encode())
 
 
-def write_json(path: str | Path, rows: Sequence[Row]) -> None:
+def write_json(path: str | Path, rows: Sequence[ResultRow]) -> None:
     """The rows as a JSON list of objects; NaN becomes null."""
     plain = [
         {
@@ -177,12 +177,12 @@ def write_json(path: str | Path, rows: Sequence[Row]) -> None:
     write_text(path, json.dumps(plain, indent=1) + "\n")
 
 
-def read_json(path: str | Path) -> list[Row]:
+def read_json(path: str | Path) -> list[ResultRow]:
     """Rows that `write_json` wrote; ValueError, with file, row and column, for others."""
     rows = []
     for i, entry in enumerate(read_objects(path), 1):
         numbers = {name: math.nan if value is None else value for name, value in entry.items()}
-        rows.append(made_of(Row, numbers, f"{path}: row {i}"))
+        rows.append(from_json(ResultRow, numbers, f"{path}: row {i}"))
     return rows
 
 
@@ -192,15 +192,15 @@ def read_objects(path: str | Path) -> list[dict[str, Any]]:
         entries = json.loads(Path(path).read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no JSON, or is cut short: {error}") from None
-    if not isinstance(entries, list) or not all(isinstance(each, dict) for each in entries):
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise ValueError(f"{path}: expected a JSON list of objects")
     return entries
 
 
-def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
+def write_parquet(path: str | Path, rows: Sequence[ResultRow]) -> None:
     """The rows as a Parquet table (needs the extra `report`)."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    with whole(path) as file:
+    with atomic_file(path) as file:
         pq.write_table(pa.Table.from_pylist([asdict(row) for row in rows]), file)

@@ -17,10 +17,12 @@ from ...envs.record import Array
 
 LEVEL = 0.95
 WORST = 0.05
-"""The share of the episodes that `worst` takes the mean of."""
+"""The share of the episodes that `compute_tail_mean` takes the mean of."""
 _TAIL = 0.5 * (1.0 - LEVEL)
 _FEWEST = 4  # seeds, with fewer an interval spans orders of magnitude
-_LEAST = 25  # episodes in the tail, with fewer the interval of `worst` covers too rarely
+_MIN_TAIL = (
+    25  # episodes in the tail, with fewer the interval of `compute_tail_mean` covers too rarely
+)
 
 
 class Estimate(NamedTuple):
@@ -146,17 +148,17 @@ def average(*strata: Array) -> Estimate:
 
     NaN of none, and where a number is.
     """
-    there = [each for each in strata if len(each)]
-    if not there:
+    filled = [stratum for stratum in strata if len(stratum)]
+    if not filled:
         return Estimate(math.nan)
-    middle = float(np.mean([each.mean() for each in there]))
-    reach = margin_of_error(*(each / len(there) for each in there))
+    middle = float(np.mean([stratum.mean() for stratum in filled]))
+    reach = margin_of_error(*(stratum / len(filled) for stratum in filled))
     return Estimate(middle, middle - reach, middle + reach)
 
 
 def geometric_mean(*strata: Array) -> Estimate:
     """exp of the `average` of logarithms of paired ratios: strata of one weight."""
-    return Estimate(*(math.exp(each) for each in average(*strata)))
+    return Estimate(*(math.exp(log) for log in average(*strata)))
 
 
 def share(hits: npt.ArrayLike) -> Estimate:
@@ -176,19 +178,19 @@ def share(hits: npt.ArrayLike) -> Estimate:
     return Estimate(value, max(middle - reach, 0.0), min(middle + reach, 1.0))
 
 
-def won(costs: Array, others: Array) -> Estimate:
+def compute_win_rate(costs: Array, others: Array) -> Estimate:
     """The share of episodes that cost less than the other's on the same seed, a tie one half."""
     return share(np.where(costs == others, 0.5, np.less(costs, others)))
 
 
-def profile(values: Array, levels: Array) -> tuple[Array, Array, Array]:
+def compute_profile(values: Array, levels: Array) -> tuple[Array, Array, Array]:
     """The share of (n,) numbers that are at most each level (k,), with Wilson's interval: a
     performance profile (Dolan and Moré 2002). (k,) each: value, low, high; NaN counts as above."""
     value, low, high = np.array([share(values <= level) for level in levels]).T
     return value, low, high
 
 
-def worst(costs: Array) -> Estimate:
+def compute_tail_mean(costs: Array) -> Estimate:
     """The mean of the largest `WORST` of positive numbers (n,): the conditional value at risk.
 
     Its interval is that of the logarithm, from the influence of each number on the tail's mean;
@@ -199,7 +201,7 @@ def worst(costs: Array) -> Estimate:
     count = max(1, round(WORST * len(costs)))
     ordered = np.sort(costs)
     value = float(ordered[-count:].mean())
-    if count < _LEAST or value <= 0.0:
+    if count < _MIN_TAIL or value <= 0.0:
         return Estimate(value)
     beyond = np.maximum(costs - ordered[-count], 0.0)
     reach = math.exp(margin_of_error(len(costs) / count * beyond / value))
@@ -214,7 +216,7 @@ def ratio_of_sums(tops: Sequence[Array], bottoms: Sequence[Array]) -> Estimate:
     """
     if not tops or min(map(len, tops)) == 0:
         return Estimate(math.nan)
-    above, below = (sum(float(np.mean(each)) for each in side) for side in (tops, bottoms))
+    above, below = (sum(float(np.mean(stratum)) for stratum in side) for side in (tops, bottoms))
     if not below > 0.0:
         return Estimate(math.nan)
     ratio = above / below
@@ -223,7 +225,7 @@ def ratio_of_sums(tops: Sequence[Array], bottoms: Sequence[Array]) -> Estimate:
     return Estimate(ratio, ratio - reach, ratio + reach)
 
 
-def chance_of_no_less(logs: Array) -> float:
+def compute_p_value(logs: Array) -> float:
     """One-sided p of Student's test that the mean of (n,) paired differences is not below 0."""
     spread = float(np.std(logs, ddof=1)) if len(logs) > 1 else math.nan
     middle = float(np.mean(logs)) if len(logs) else math.nan
@@ -236,9 +238,9 @@ def chance_of_no_less(logs: Array) -> float:
 
 def holm(chances: Sequence[float], level: float = 1.0 - LEVEL) -> list[bool]:
     """Which of several p values are significant at a family-wise level, by Holm's step-down."""
-    found, order = [False] * len(chances), np.argsort(chances)
+    significant, order = [False] * len(chances), np.argsort(chances)
     for rank, i in enumerate(order):
         if not chances[i] <= level / (len(chances) - rank):
             break
-        found[i] = True
-    return found
+        significant[i] = True
+    return significant

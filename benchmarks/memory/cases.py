@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from ...agents.optimum import Optimum, optimum
+from ...agents.optimum import Optimum, compute_optimum
 from ...envs.arguments import check_choice
 
 ID = "sideslip/LinearYawVision-v0"
@@ -23,7 +23,7 @@ CONDITIONS: Mapping[str, Mapping[str, Any]] = {
 REPEATED, SEEDS = "100 ms", 3
 """The condition in which everybody trains on so many seeds; elsewhere on one."""
 SCHEDULES = 8  # whose arrivals the optimum is averaged over, where pictures are lost
-FILTER, PPO, ALONE = "lqg", "ppo", 8
+FILTER, PPO, LQG_FACTOR = "lqg", "ppo", 8
 """The optimum's own policy, as a check, on so many times the episodes; learning from rewards."""
 EPISODES, QUICK_EPISODES = 64, 16
 
@@ -47,10 +47,10 @@ QUICK = Budget(cars=32, rounds=2, epochs=1, ppo=0, duration=3.0)
 
 
 @dataclass(frozen=True)
-class Case:
+class MemoryCase:
     """Who, in which condition, trained with which seed and budget; so many episodes judge it."""
 
-    who: str
+    learner: str
     condition: str
     seed: int
     budget: Budget
@@ -64,40 +64,46 @@ class Case:
         return {"camera": camera, "scenario": spec["scenario"] | {"duration": self.budget.duration}}
 
     @property
-    def late(self) -> int:
+    def delay_steps(self) -> int:
         """Steps that a picture is old when it arrives."""
         return round(float(CONDITIONS[self.condition]["delays"][0]) / STEP)
 
     @property
     def best(self) -> Optimum:
         """The optimum."""
-        return _best(self.condition, self.budget)
+        return _compute_best(self.condition, self.budget)
 
 
 @cache
-def _best(condition: str, budget: Budget) -> Optimum:
-    options = Case("", condition, 0, budget, 1).options
-    return optimum(gym.make(ID, **options), SCHEDULES if "loss" in options["camera"] else 1)
+def _compute_best(condition: str, budget: Budget) -> Optimum:
+    options = MemoryCase("", condition, 0, budget, 1).options
+    return compute_optimum(gym.make(ID, **options), SCHEDULES if "loss" in options["camera"] else 1)
 
 
-def cases_of(
+def make_cases(
     quick: bool,
     episodes: int | None = None,
     conditions: Sequence[str] = (),
     seeds: int = SEEDS,
-) -> list[Case]:
+) -> list[MemoryCase]:
     """What a run trains, the repeated seeds last; arguments as of the suite's `run`."""
     from ...agents.training.memory.networks import MEMORIES
 
-    for each in conditions:
-        check_choice("condition", each, CONDITIONS)
-    budget, usual = (QUICK, (REPEATED,)) if quick else (Budget(), tuple(CONDITIONS))
-    conditions = list(dict.fromkeys((REPEATED, *conditions))) if conditions else usual
+    for item in conditions:
+        check_choice("condition", item, CONDITIONS)
+    budget, default = (QUICK, (REPEATED,)) if quick else (Budget(), tuple(CONDITIONS))
+    conditions = list(dict.fromkeys((REPEATED, *conditions))) if conditions else default
     count = episodes or (QUICK_EPISODES if quick else EPISODES)
-    who = (FILTER, *MEMORIES)
-    cases = [Case(name, where, 0, budget, count) for where in conditions for name in who]
+    learners = (FILTER, *MEMORIES)
+    cases = [
+        MemoryCase(name, condition, 0, budget, count)
+        for condition in conditions
+        for name in learners
+    ]
     if not quick:
-        cases.append(Case(PPO, REPEATED, 0, budget, count))
-        again = [each for each in cases if each.condition == REPEATED and each.who in MEMORIES]
-        cases += [replace(each, seed=seed) for seed in range(1, seeds) for each in again]
+        cases.append(MemoryCase(PPO, REPEATED, 0, budget, count))
+        repeated = [
+            item for item in cases if item.condition == REPEATED and item.learner in MEMORIES
+        ]
+        cases += [replace(item, seed=seed) for seed in range(1, seeds) for item in repeated]
     return cases

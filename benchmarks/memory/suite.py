@@ -14,11 +14,11 @@ from rich.console import Console
 
 from ... import __version__
 from ..harness.parallel import run_cases
-from ..harness.results import Row, Suite, Table
+from ..harness.results import ResultRow, ResultTable, Suite
 from ..harness.stats import Estimate, interval
-from ..harness.verdict import percent, verdict
-from .cases import ALONE, CONDITIONS, FILTER, ID, PPO, REPEATED, SEEDS, cases_of
-from .measure import Found, Kept
+from ..harness.verdict import format_percent, format_verdict
+from .cases import CONDITIONS, FILTER, ID, LQG_FACTOR, PPO, REPEATED, SEEDS, make_cases
+from .measure import CaseCache, MemoryResult
 
 NAME = "memory"
 _TEXT = (
@@ -30,7 +30,7 @@ _TEXT = (
     "it stands the plain difference of the costs to the optimal policy on the same seeds."
 )
 
-Results = Mapping[str, Mapping[str, Sequence[Found]]]
+Results = Mapping[str, Mapping[str, Sequence[MemoryResult]]]
 """By who and condition, of each training seed."""
 
 
@@ -53,41 +53,48 @@ def run(
     if find_spec("torch") is None:
         suite.verdict = 'Not trained: it needs torch, pip install "sideslip[train]".'
         return suite
-    cases = cases_of(quick, episodes, conditions, seeds)
-    found = run_cases(Kept(keep and keep.absolute()), cases, NAME, jobs, console)
-    results: dict[str, dict[str, list[Found]]] = {}
-    for case, each in zip(cases, found, strict=True):
-        results.setdefault(case.who, {}).setdefault(case.condition, []).append(each)
-    suite.verdict = answer(results)
-    _tabled(suite, results)
+    cases = make_cases(quick, episodes, conditions, seeds)
+    outcomes = run_cases(CaseCache(keep and keep.absolute()), cases, NAME, jobs, console)
+    results: dict[str, dict[str, list[MemoryResult]]] = {}
+    for case, outcome in zip(cases, outcomes, strict=True):
+        results.setdefault(case.learner, {}).setdefault(case.condition, []).append(outcome)
+    suite.verdict = make_verdict(results)
+    _add_tables(suite, results)
     _draw(suite, results)
     return suite
 
 
-def pooled(found: Sequence[Found]) -> Found:
+def average_seeds(runs: Sequence[MemoryResult]) -> MemoryResult:
     """The mean over training seeds, episode by episode."""
-    return Found(*(np.mean(each, axis=0) for each in zip(*found, strict=True)))
+    return MemoryResult(*(np.mean(arrays, axis=0) for arrays in zip(*runs, strict=True)))
 
 
-def answer(results: Results) -> str:
+def make_verdict(results: Results) -> str:
     """The verdict."""
-    learners = [who for who in results if who not in (FILTER, PPO)]
+    learners = [learner for learner in results if learner not in (FILTER, PPO)]
     gaps = {
-        who: {where: pooled(each).gap() for where, each in results[who].items()} for who in learners
+        learner: {
+            condition: average_seeds(item).gap() for condition, item in results[learner].items()
+        }
+        for learner in learners
     }
-    mean = {who: float(np.mean([each.value for each in gaps[who].values()])) for who in learners}
-    first, *others = sorted(learners, key=lambda who: mean[who])
-    rest = ", ".join(f"{who} {100.0 * mean[who]:.0f} %" for who in others)
-    hardest = max(gaps[first], key=lambda where: gaps[first][where].value)
+    mean = {
+        learner: float(np.mean([item.value for item in gaps[learner].values()]))
+        for learner in learners
+    }
+    first, *others = sorted(learners, key=lambda learner: mean[learner])
+    rest = ", ".join(f"{learner} {100.0 * mean[learner]:.0f} %" for learner in others)
+    hardest = max(gaps[first], key=lambda condition: gaps[first][condition].value)
     check = "; ".join(
-        f"{where} {percent(lqg_gap(each[0]))}" for where, each in list(results[FILTER].items())[:2]
+        f"{condition} {format_percent(compute_lqg_gap(item[0]))}"
+        for condition, item in list(results[FILTER].items())[:2]
     )
-    return verdict(
+    return format_verdict(
         f"Over the optimum: {first} {100.0 * mean[first]:.0f} %, {rest}.",
         f"Means of {len(gaps[first])} conditions; {first} is furthest from it at {hardest}: "
-        f"{percent(gaps[first][hardest])}.",
-        f"By rewards alone ppo, without memory: {percent(pooled(results[PPO][REPEATED]).gap())} at "
-        f"{REPEATED}."
+        f"{format_percent(gaps[first][hardest])}.",
+        "By rewards alone ppo, without memory: "
+        f"{format_percent(average_seeds(results[PPO][REPEATED]).gap())} at {REPEATED}."
         if PPO in results
         else "",
         f"Check, the optimal policy's own costs over it: {check}.",
@@ -95,69 +102,83 @@ def answer(results: Results) -> str:
     )
 
 
-def lqg_gap(found: Found) -> Estimate:
+def compute_lqg_gap(result: MemoryResult) -> Estimate:
     """Of the optimum's own policy: its costs over the computed optimum, less one."""
-    return interval(found.costs / found.best - 1.0)
+    return interval(result.costs / result.best - 1.0)
 
 
-def _shown(number: Estimate) -> str:
+def _format_gap(number: Estimate) -> str:
     return number.inline(100.0, ".1f")
 
 
-def _tabled(suite: Suite, results: Results) -> None:
+def _add_tables(suite: Suite, results: Results) -> None:
     conditions = list(results[FILTER])
-    alone = {where: found[0] for where, found in results[FILTER].items()}
+    reference = {condition: runs[0] for condition, runs in results[FILTER].items()}
     gaps, trainings = [], []
-    for who, mine in results.items():
+    for learner, learner_runs in results.items():
         numbers = {
-            where: lqg_gap(found[0]) if who == FILTER else pooled(found).gap()
-            for where, found in mine.items()
+            condition: compute_lqg_gap(runs[0]) if learner == FILTER else average_seeds(runs).gap()
+            for condition, runs in learner_runs.items()
         }
-        gaps.append([who, *(_shown(numbers[w]) if w in numbers else "" for w in conditions)])
-        for where, number in numbers.items():
-            columns = {"scenario": where, "controller": who, "n": len(mine[where][0].costs)}
+        gaps.append(
+            [learner, *(_format_gap(numbers[w]) if w in numbers else "" for w in conditions)]
+        )
+        for condition, number in numbers.items():
+            columns = {
+                "scenario": condition,
+                "controller": learner,
+                "n": len(learner_runs[condition][0].costs),
+            }
             common = {"suite": NAME, "salt": "fixed", "env_version": f"{ID} {__version__}"}
-            suite.rows.append(Row.of("gap", number, **columns, **common))
-        if who != FILTER:
-            found = mine[REPEATED]
-            seeds = ", ".join(f"{100.0 * each.gap().value:.1f}" for each in found)
-            plain = _shown(pooled(found).plain(alone[REPEATED]))
-            spent = np.mean([each.seconds for those in mine.values() for each in those])
-            trainings.append([who, seeds, plain, f"{found[0].steps:.0f}", f"{spent:.0f}"])
-    n = len(alone[REPEATED].costs) // ALONE
-    optima = ", ".join(f"{where} {1e3 * found.best:.1f}" for where, found in alone.items())
+            suite.rows.append(ResultRow.from_estimate("gap", number, **columns, **common))
+        if learner != FILTER:
+            runs = learner_runs[REPEATED]
+            seeds = ", ".join(f"{100.0 * result.gap().value:.1f}" for result in runs)
+            plain = _format_gap(average_seeds(runs).compute_paired_gap(reference[REPEATED]))
+            spent = np.mean(
+                [result.seconds for run_list in learner_runs.values() for result in run_list]
+            )
+            trainings.append([learner, seeds, plain, f"{runs[0].steps:.0f}", f"{spent:.0f}"])
+    n = len(reference[REPEATED].costs) // LQG_FACTOR
+    optima = ", ".join(
+        f"{condition} {1e3 * runs.best:.1f}" for condition, runs in reference.items()
+    )
     note = (
         f"Percent over the optimum, with 95 % intervals over {n} episodes, the same for all; "
-        f"{FILTER}: the optimal policy's plain costs on {n * ALONE}. "
+        f"{FILTER}: the optimal policy's plain costs on {n * LQG_FACTOR}. "
         f"The optimum in 10^-3: {optima}."
     )
     title = f"Trainings, at {REPEATED}"
     header = ("memory", "gap of each seed / %", "plain costs / %", "steps", "CPU-s")
     suite.tables += [
-        Table("Cost over the optimum", ("memory", *conditions), gaps, note),
-        Table(title, header, trainings, "CPU-s: mean of all conditions. plain costs: over lqg's."),
+        ResultTable("Cost over the optimum", ("memory", *conditions), gaps, note),
+        ResultTable(
+            title, header, trainings, "CPU-s: mean of all conditions. plain costs: over lqg's."
+        ),
     ]
 
 
 def _draw(suite: Suite, results: Results) -> None:
     """The gap over the delay; nothing where plotly is not installed or there is one delay only."""
     delays = {
-        1e3 * camera["delays"][0]: where
-        for where, camera in CONDITIONS.items()
-        if "loss" not in camera and where in results[FILTER]
+        1e3 * camera["delays"][0]: condition
+        for condition, camera in CONDITIONS.items()
+        if "loss" not in camera and condition in results[FILTER]
     }
     delays = dict(sorted(delays.items()))
     if find_spec("plotly") is None or len(delays) < 2:
         return
-    from ..report.figures import curves
+    from ..report.figures import draw_curves
 
     series = {}
-    for who in results:
-        if set(delays.values()) <= set(results[who]) and who != FILTER:
-            gaps = [pooled(results[who][where]).gap() for where in delays.values()]
+    for learner in results:
+        if set(delays.values()) <= set(results[learner]) and learner != FILTER:
+            gaps = [
+                average_seeds(results[learner][condition]).gap() for condition in delays.values()
+            ]
             value, low, high = 100.0 * np.array(gaps).T
-            series[who] = value, low, high
+            series[learner] = value, low, high
     labels = ("delay of the pictures / ms", "cost over the optimum / %")
-    figure = curves(np.array(list(delays)), series, *labels, log="y")
+    figure = draw_curves(np.array(list(delays)), series, *labels, log="y")
     question = "How much of the optimum does each memory find?"
     suite.answers.append((question, figure, suite.verdict.splitlines()[0]))

@@ -2,12 +2,12 @@
 
 from functools import partial
 
-from .ledger.claim import Bound, Part, claims_of, measured, smaller
-from .ledger.controllers import Following
-from .ledger.filters import Estimation, Filter
-from .ledger.plots import PaperFigure, course, curves
+from .ledger.claim import Bound, ClaimPart, make_claim_factory, make_number_part, make_smaller_part
+from .ledger.controllers import FollowingSimulation
+from .ledger.filters import EstimationSimulation, PaperFilter
+from .ledger.plots import PaperFigure, make_course, make_curves
 from .ledger.simulations import Analysis
-from .theory.observability import coms_ranks
+from .theory.observability import compute_coms_ranks
 
 PAPER = "dakf-stability"
 FIG6, FASTER, FIG8 = "dakf-fig6", "dakf-fig6-faster", "dakf-fig8"
@@ -18,78 +18,91 @@ WITHOUT, WITH, FEEDBACK = "without control", "with control", "with control, no r
 GYRO_BIAS = 8.7266e-4  # rad/s, 0.05 deg/s
 
 _ENV = "sideslip/YawGps-v0"
-_FILTERS = tuple(Filter(name, name) for name in (DAKF, KF, LOB))
+_FILTERS = tuple(PaperFilter(name, name) for name in (DAKF, KF, LOB))
 _AGENTS = {WITHOUT: {"agent": "none"}, WITH: {}}
 
 # fmt: off
 SIMULATIONS = (
-    Following(FIG7, FIG7, {**_AGENTS, FEEDBACK: {"rejection": False}}),
-    Following(LARGER, {"base": FIG7, "name": LARGER, "amplitude": 0.1}, _AGENTS, share=0.25),
-    Following(FIG9, FIG9, _AGENTS, share=0.5),
-    Estimation(FIG6, _ENV, FIG6, _FILTERS),
-    Estimation(FASTER, _ENV, {"base": FIG6, "name": FASTER, "frequency": 0.4}, _FILTERS),
-    Estimation(FIG8, _ENV, FIG8, _FILTERS),
-    Estimation(BIAS, _ENV,
+    FollowingSimulation(FIG7, FIG7, {**_AGENTS, FEEDBACK: {"rejection": False}}),
+    FollowingSimulation(LARGER, {"base": FIG7, "name": LARGER, "amplitude": 0.1}, _AGENTS,
+                        share=0.25),
+    FollowingSimulation(FIG9, FIG9, _AGENTS, share=0.5),
+    EstimationSimulation(FIG6, _ENV, FIG6, _FILTERS),
+    EstimationSimulation(FASTER, _ENV, {"base": FIG6, "name": FASTER, "frequency": 0.4}, _FILTERS),
+    EstimationSimulation(FIG8, _ENV, FIG8, _FILTERS),
+    EstimationSimulation(BIAS, _ENV,
         {"base": FIG6, "name": BIAS, "steering": "straight", "duration": 120.0, "wind_force": 0.0,
             "gps_outage": None, "disturbance_force": 0.0, "disturbance_moment": 0.0,
             "noise": {"gyro_bias": GYRO_BIAS}},
         _FILTERS[:2], control_period=100),
-    Analysis(RANKS, coms_ranks, random=False),
+    Analysis(RANKS, compute_coms_ranks, random=False),
 )
 # fmt: on
 
 
-def _tracks(scenario: str, beta: float | None, gamma: float | None) -> tuple[Part, ...]:
+def _make_tracking_parts(
+    scenario: str, beta: float | None, gamma: float | None
+) -> tuple[ClaimPart, ...]:
     return (
-        smaller("sideslip error, with / without", scenario, WITH, WITHOUT, beta, "rms_beta"),
-        smaller("yaw rate error, with / without", scenario, WITH, WITHOUT, gamma, "rms_gamma"),
+        make_smaller_part(
+            "sideslip error, with / without", scenario, WITH, WITHOUT, beta, "rms_beta"
+        ),
+        make_smaller_part(
+            "yaw rate error, with / without", scenario, WITH, WITHOUT, gamma, "rms_gamma"
+        ),
     )
 
 
-claim = claims_of(PAPER)
+claim = make_claim_factory(PAPER)
 # A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("Fig. 6", "the DAKF beats the three-state Kalman filter, and this the linear observer",
-        smaller("DAKF / KF", FIG6, DAKF, KF, 0.75),
-        smaller("KF / LOB", FIG6, KF, LOB, 0.80),
-        smaller("DAKF / KF at 0.4 Hz", FASTER, DAKF, KF),
-        smaller("KF / LOB at 0.4 Hz", FASTER, KF, LOB)),
+        make_smaller_part("DAKF / KF", FIG6, DAKF, KF, 0.75),
+        make_smaller_part("KF / LOB", FIG6, KF, LOB, 0.80),
+        make_smaller_part("DAKF / KF at 0.4 Hz", FASTER, DAKF, KF),
+        make_smaller_part("KF / LOB at 0.4 Hz", FASTER, KF, LOB)),
     claim("Fig. 6", "the DAKF is better during the outage too",
         *(
-            smaller(f"DAKF / {rival}, 4 to 6 s{text}", name, DAKF, filter_, metric="outage")
+            make_smaller_part(f"DAKF / {rival}, 4 to 6 s{text}", name, DAKF, filter_,
+                              metric="outage")
             for name, text in ((FIG6, ""), (FASTER, " at 0.4 Hz"))
             for rival, filter_ in (("KF", KF), ("LOB", LOB))
         )),
     claim("Sec. IV.D", "slip and disturbances are observable",
-        measured("rank, of 5 states", RANKS, "dakf", "rank", Bound("=", 5.0), Bound("=", 4.0),
+        make_number_part("rank, of 5 states", RANKS, "dakf", "rank", Bound("=", 5.0),
+                         Bound("=", 4.0),
             "rank"),
-        measured("slip error after 120 s with 0.05 deg/s of gyro bias, DAKF", BIAS, DAKF, "last",
+        make_number_part("slip error after 120 s with 0.05 deg/s of gyro bias, DAKF", BIAS, DAKF,
+                         "last",
             None, Bound(">=", 0.05), "drift"),
-        measured("the same, three-state KF", BIAS, KF, "last", None, Bound("<=", 0.01), "drift"),
+        make_number_part("the same, three-state KF", BIAS, KF, "last", None, Bound("<=", 0.01),
+                         "drift"),
         note="A constant slip is the same to the sensors as a heading the other way with constant "
         "d1 and d2."),
     claim("Fig. 7", "with control sideslip angle and yaw rate track their references",
-        *_tracks(FIG7, 0.80, 0.50),
-        smaller("peak of the slip, with / without", FIG7, WITH, WITHOUT, metric="peak_beta"),
-        measured("share of time at the yaw moment's limit", FIG7, WITH, "saturated",
+        *_make_tracking_parts(FIG7, 0.80, 0.50),
+        make_smaller_part("peak of the slip, with / without", FIG7, WITH, WITHOUT,
+                          metric="peak_beta"),
+        make_number_part("share of time at the yaw moment's limit", FIG7, WITH, "saturated",
             metric="share"),
-        measured("the same, a step of 0.1 rad", LARGER, WITH, "saturated", metric="share")),
+        make_number_part("the same, a step of 0.1 rad", LARGER, WITH, "saturated", metric="share")),
     claim("Sec. V.B", "disturbance rejection makes the car the nominal one",
         *(
-            smaller(f"{text} error, with / without rejection", FIG7, WITH, FEEDBACK, metric=metric)
+            make_smaller_part(f"{text} error, with / without rejection", FIG7, WITH, FEEDBACK,
+                              metric=metric)
             for text, metric in (("sideslip", "rms_beta"), ("yaw rate", "rms_gamma"))
         ),
         note="The feedback's integrals already take away what is constant."),
     claim("Fig. 8 (twin)", "the same order of the filters on the road, during the outage too",
-        smaller("DAKF / KF", FIG8, DAKF, KF),
-        smaller("KF / LOB", FIG8, KF, LOB),
-        smaller("DAKF / KF, 10.5 to 13 s", FIG8, DAKF, KF, metric="outage"),
-        smaller("DAKF / LOB, 10.5 to 13 s", FIG8, DAKF, LOB, metric="outage"),
+        make_smaller_part("DAKF / KF", FIG8, DAKF, KF),
+        make_smaller_part("KF / LOB", FIG8, KF, LOB),
+        make_smaller_part("DAKF / KF, 10.5 to 13 s", FIG8, DAKF, KF, metric="outage"),
+        make_smaller_part("DAKF / LOB, 10.5 to 13 s", FIG8, DAKF, LOB, metric="outage"),
         note="At 20 km/h, close to 20.7 km/h where the slip of the stationary turn changes its "
         "sign, there is little slip to see, and no course while it is there."),
     claim("Fig. 9 (twin)", "with control the car tracks on the road too",
-        *_tracks(FIG9, None, None)),
+        *_make_tracking_parts(FIG9, None, None)),
 )
 
 _SLIP, _RATE = "sideslip angle / rad", "yaw rate / (rad/s)"
@@ -101,30 +114,31 @@ FIGURES = (
             (FIG6, "Fig. 6", "Lane change at 25 km/h; wind from 4 to 8 s, no GPS from 4 to 6 s."),
             (FIG8, "Fig. 8 (twin)", "Lane change at 20 km/h; course unused from 10.5 to 13.0 s."))
         for panel, draw in (
-            ("(a): sideslip angle", curves("beta", _SLIP, ("truth", LOB, KF, DAKF))),
-            ("(b): course angle", course("course angle / rad", ("truth", KF, DAKF))))
+            ("(a): sideslip angle", make_curves("beta", _SLIP, ("truth", LOB, KF, DAKF))),
+            ("(b): course angle", make_course("course angle / rad", ("truth", KF, DAKF))))
     ),
-    figure("Sec. IV.D: slip with a gyro bias of 0.05 deg/s", BIAS, curves("beta", _SLIP),
+    figure("Sec. IV.D: slip with a gyro bias of 0.05 deg/s", BIAS, make_curves("beta", _SLIP),
         "Straight on at 25 km/h: the direction that the DAKF cannot see fills up."),
     *(
         figure(f"Fig. 7 {panel}", FIG7, draw, caption)
         for panel, draw, caption in (
-            ("(a): sideslip angle", curves("beta", _SLIP, ("reference", WITHOUT, WITH, FEEDBACK)),
+            ("(a): sideslip angle", make_curves("beta", _SLIP, ("reference", WITHOUT, WITH,
+                                                                FEEDBACK)),
                 "A step of 0.06 rad at 1 s, wind from 4 to 8 s."),
-            ("(b): yaw rate", curves("gamma", _RATE, ("reference", WITHOUT, WITH, FEEDBACK)),
+            ("(b): yaw rate", make_curves("gamma", _RATE, ("reference", WITHOUT, WITH, FEEDBACK)),
                 "Tyres 7000 real, 10000 N/rad nominal."),
             ("(c): front steering angle",
-                curves("steer", "front steering angle / rad", (WITHOUT, WITH, FEEDBACK)),
+                make_curves("steer", "front steering angle / rad", (WITHOUT, WITH, FEEDBACK)),
                 "Behind the EPS motor's lag of 30 ms."),
             ("(d): yaw moment",
-                curves("yaw_moment", "yaw moment / (N m)", (WITHOUT, WITH, FEEDBACK)),
+                make_curves("yaw_moment", "yaw moment / (N m)", (WITHOUT, WITH, FEEDBACK)),
                 "What the motors deliver."))
     ),
     *(
-        figure(f"Fig. 9 (twin) ({panel}): {text}: {who}", FIG9,
-            curves(signal, label, ("reference", who)),
+        figure(f"Fig. 9 (twin) ({panel}): {text}: {agent}", FIG9,
+            make_curves(signal, label, ("reference", agent)),
             "Cornering by wire at 20 km/h, with everything that the plant has.")
-        for panel, who, text, signal, label in (("a", WITHOUT, "sideslip angle", "beta", _SLIP),
+        for panel, agent, text, signal, label in (("a", WITHOUT, "sideslip angle", "beta", _SLIP),
             ("b", WITHOUT, "yaw rate", "gamma", _RATE),
             ("c", WITH, "sideslip angle", "beta", _SLIP), ("d", WITH, "yaw rate", "gamma", _RATE))
     ),

@@ -5,9 +5,9 @@ from functools import partial
 import numpy as np
 
 from ...estimators.filters import FILTERS
-from .ledger.claim import Bound, Part, claims_of, over_others, smaller
-from .ledger.filters import Estimation, Filter
-from .ledger.plots import PaperFigure, curves
+from .ledger.claim import Bound, ClaimPart, compare_others, make_claim_factory, make_smaller_part
+from .ledger.filters import EstimationSimulation, PaperFilter
+from .ledger.plots import PaperFigure, make_curves
 
 PAPER = "double-layer-gps"
 FIG9, FASTER, PERIODS = "double-layer-fig9", "double-layer-fig9-fast", "double-layer-fig9-periods"
@@ -22,10 +22,10 @@ _HDOP = {"hdop_table": FILTERS["double-layer"].hdop}
 _Q = {"q_beta": 1.1e-4, "q_gamma": 2.4e-6, "q_psi": 2.3e-5, "q_d1": 0.089, "q_d2": 0.46}
 _PREDICTED = {"intersample": "predict", **_Q}
 _FILTERS = (
-    Filter(PROPOSED, PROPOSED, _HDOP),
-    Filter(WALKS, PROPOSED, {**_PREDICTED, **_HDOP}),
-    *(Filter(name, name) for name in (THREE, LOB, ROLL, KINEMATIC)),
-    Filter(DESIGNED, KINEMATIC, {"q_v_x": 1e-5, "q_v_y": 1e-5}),  # 0.1 m/s2, white at 1 kHz
+    PaperFilter(PROPOSED, PROPOSED, _HDOP),
+    PaperFilter(WALKS, PROPOSED, {**_PREDICTED, **_HDOP}),
+    *(PaperFilter(name, name) for name in (THREE, LOB, ROLL, KINEMATIC)),
+    PaperFilter(DESIGNED, KINEMATIC, {"q_v_x": 1e-5, "q_v_y": 1e-5}),  # 0.1 m/s2, white at 1 kHz
 )
 _SLALOMS = ((FIG9, "0.2 Hz"), (FASTER, "0.4 Hz"), (PERIODS, "two single periods"))
 
@@ -40,54 +40,59 @@ _SKIES = (
 
 # fmt: off
 SIMULATIONS = (
-    *(Estimation(name, _ENV, name, _FILTERS) for name in (FIG9, FASTER, PERIODS, ROAD)),
-    Estimation(CALM, _ENV, CALM, (_FILTERS[0], Filter(ROLL, ROLL))),
+    *(EstimationSimulation(name, _ENV, name, _FILTERS) for name in (FIG9, FASTER, PERIODS, ROAD)),
+    EstimationSimulation(CALM, _ENV, CALM, (_FILTERS[0], PaperFilter(ROLL, ROLL))),
     *(
-        Estimation(name, _ENV,
+        EstimationSimulation(name, _ENV,
             {"base": FIG9, "name": name, "hdop": hdop, "hdop_spread": spread, "hdop_law": law},
-            (*_FILTERS[:2], Filter(WALKS + FIXED, PROPOSED, {**_PREDICTED, "hdop_table": None}),
-                Filter(PROPOSED + FIXED, PROPOSED, {"hdop_table": None})))
+            (*_FILTERS[:2], PaperFilter(WALKS + FIXED, PROPOSED, {**_PREDICTED,
+                                                                  "hdop_table": None}),
+                PaperFilter(PROPOSED + FIXED, PROPOSED, {"hdop_table": None})))
         for name, (hdop, spread), law, _ in _SKIES
     ),
 )
 # fmt: on
 
-claim = claims_of(PAPER)
+claim = make_claim_factory(PAPER)
 # A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("Fig. 9 (a)", "proposed < three-state filter < two-state observer, sideslip angle",
         *(
-            smaller(f"{who} / three-state, {text}", scenario, name, THREE, most)
+            make_smaller_part(f"{label} / three-state, {text}", scenario, name, THREE, max_ratio)
             for scenario, text in _SLALOMS
-            for who, name, most in (("disturbance KF", WALKS, 0.75),
+            for label, name, max_ratio in (("disturbance KF", WALKS, 0.75),
                 ("double layer", PROPOSED, 0.95))
         ),
-        *(smaller(f"three-state / two-state, {text}", name, THREE, LOB) for name, text in _SLALOMS),
+        *(make_smaller_part(f"three-state / two-state, {text}", name, THREE, LOB) for name,
+          text in _SLALOMS),
         note="The gain is that of the disturbance states. The disturbance KF is the double layer "
         "without its correction between courses, which adds no information and costs accuracy."),
     claim("Fig. 9 (b)", "the smallest error between courses",
         *(
-            smaller(f"double layer / disturbance KF, {text}", name, PROPOSED, WALKS)
+            make_smaller_part(f"double layer / disturbance KF, {text}", name, PROPOSED, WALKS)
             for name, text in _SLALOMS
         ),
         *(
-            smaller(f"jump at a course, double layer / three-state, {text}", name, PROPOSED, THREE,
+            make_smaller_part(f"jump at a course, double layer / three-state, {text}", name,
+                              PROPOSED, THREE,
                 metric="jump")
             for name, text in _SLALOMS
         ),
         note="The error over all milliseconds is that between courses: there are 200 to a course."),
     claim("Fig. 9 (c)", "the yaw angle at 1 kHz from courses at 5 Hz",
-        smaller("double layer / three-state", FIG9, PROPOSED, THREE, metric="psi")),
+        make_smaller_part("double layer / three-state", FIG9, PROPOSED, THREE, metric="psi")),
     claim("Fig. 9 (d)", "roll angle better than a two-state roll filter's",
-        smaller("double layer / roll KF, wind", FIG9, PROPOSED, ROLL, 0.55, "phi"),
-        smaller("double layer / roll KF, no wind", CALM, PROPOSED, ROLL, metric="phi"),
+        make_smaller_part("double layer / roll KF, wind", FIG9, PROPOSED, ROLL, 0.55, "phi"),
+        make_smaller_part("double layer / roll KF, no wind", CALM, PROPOSED, ROLL, metric="phi"),
         note="30 % on inertia, damping and stiffness cancel except in the input gain."),
     claim("Fig. 9 (e)-(f)", "velocities better than a kinematic filter's",
-        smaller("v_y, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, 0.30, "v_y"),
-        smaller("v_x, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, metric="v_x"),
+        make_smaller_part("v_y, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, 0.30,
+                          "v_y"),
+        make_smaller_part("v_x, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED,
+                          metric="v_x"),
         *(
-            smaller(f"{state}, the same, tuned", FIG9, PROPOSED, KINEMATIC, metric=state)
+            make_smaller_part(f"{state}, the same, tuned", FIG9, PROPOSED, KINEMATIC, metric=state)
             for state in ("v_y", "v_x")
         ),
         note="The kinematic KF with the process noise of its accelerometers, and with one tuned "
@@ -95,23 +100,25 @@ CLAIMS = (
         "layer the GPS's speed at 5 Hz."),
     claim("Sec. 4.3", "R from a table of HDOP beats a fixed R, sideslip angle",
         *(
-            smaller(f"{who}, {name}", name, filter_, filter_ + FIXED, threshold)
-            for who, filter_, limited in (("disturbance KF", WALKS, True),
+            make_smaller_part(f"{label}, {name}", name, filter_, filter_ + FIXED, threshold)
+            for label, filter_, limited in (("disturbance KF", WALKS, True),
                 ("double layer", PROPOSED, False))
-            for name, _, _, most in _SKIES
-            for threshold in (most if limited else None,)
+            for name, _, _, max_ratio in _SKIES
+            for threshold in (max_ratio if limited else None,)
         ),
         note="Table / R of HDOP 1. The table helps the disturbance KF where HDOP is high and the "
         "noise follows it; where the noise does not, it is a wrong R. The double layer, which "
         "corrects between courses, gains nothing. On three real receivers the spread hardly "
         "follows HDOP (docs/PAPERS.md)."),
     claim("Fig. 9 (twin)", "the proposed estimator is the best on the road",
-        Part("slip, double layer / best rival", ROAD,
-            over_others(ROAD, PROPOSED, (THREE, LOB), np.min), Bound("<", 1.0)),
-        smaller("slip, three-state / two-state", ROAD, THREE, LOB),
-        smaller("roll, double layer / roll KF", ROAD, PROPOSED, ROLL, metric="phi"),
-        smaller("v_y, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, metric="v_y"),
-        smaller("v_x, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC, metric="v_x")),
+        ClaimPart("slip, double layer / best rival", ROAD,
+            compare_others(ROAD, PROPOSED, (THREE, LOB), np.min), Bound("<", 1.0)),
+        make_smaller_part("slip, three-state / two-state", ROAD, THREE, LOB),
+        make_smaller_part("roll, double layer / roll KF", ROAD, PROPOSED, ROLL, metric="phi"),
+        make_smaller_part("v_y, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC,
+                          metric="v_y"),
+        make_smaller_part("v_x, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC,
+                          metric="v_x")),
 )
 
 _SLIP, _SLIPS = "sideslip angle / rad", ("truth", LOB, THREE, PROPOSED)
@@ -120,17 +127,18 @@ FIGURES = tuple(
     figure(f"Fig. 9 ({panel}){twin}: {text}", name, draw, caption)
     for name, twin in ((FIG9, ""), (ROAD, " (twin)"))
     for panel, text, draw, caption in (
-        ("a", "sideslip angle", curves("beta", _SLIP, _SLIPS), "Tyres 7000 real, 10000 nominal."),
-        ("b", "sideslip angle between courses", curves("beta", _SLIP, _SLIPS, (9.0, 10.0)),
+        ("a", "sideslip angle", make_curves("beta", _SLIP, _SLIPS),
+         "Tyres 7000 real, 10000 nominal."),
+        ("b", "sideslip angle between courses", make_curves("beta", _SLIP, _SLIPS, (9.0, 10.0)),
             "One second: five courses."),
-        ("c", "yaw angle", curves("psi", "yaw angle / rad", ("truth", PROPOSED)),
+        ("c", "yaw angle", make_curves("psi", "yaw angle / rad", ("truth", PROPOSED)),
             "At 1 kHz from 5 Hz."),
-        ("d", "roll angle", curves("phi", "roll angle / rad", ("truth", ROLL, PROPOSED)),
+        ("d", "roll angle", make_curves("phi", "roll angle / rad", ("truth", ROLL, PROPOSED)),
             "The roll model is 30 % off."),
         ("e", "longitudinal velocity",
-            curves("v_x", "longitudinal velocity / (m/s)", ("truth", KINEMATIC, PROPOSED)),
+            make_curves("v_x", "longitudinal velocity / (m/s)", ("truth", KINEMATIC, PROPOSED)),
             "The front wheels are the kinematic filter's reference."),
         ("f", "lateral velocity",
-            curves("v_y", "lateral velocity / (m/s)", ("truth", KINEMATIC, PROPOSED)),
+            make_curves("v_y", "lateral velocity / (m/s)", ("truth", KINEMATIC, PROPOSED)),
             "Roll puts gravity into the accelerometer."))
 )

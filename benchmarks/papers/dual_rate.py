@@ -2,9 +2,9 @@
 
 from functools import partial
 
-from .ledger.claim import Part, claims_of, smaller
-from .ledger.filters import Estimation, Filter
-from .ledger.plots import PaperFigure, course, curves
+from .ledger.claim import ClaimPart, make_claim_factory, make_smaller_part
+from .ledger.filters import EstimationSimulation, PaperFilter
+from .ledger.plots import PaperFigure, make_course, make_curves
 from .theory.dual_rate_gains import PAPER
 
 FIG4, FIG5 = "dual-rate-fig4", "dual-rate-fig5"
@@ -24,43 +24,49 @@ _TUNED = {
     )
 }
 _FILTERS = (
-    Filter(CONVENTIONAL, "dual-rate", {"intersample": "predict", **_TUNED[CONVENTIONAL]}),
-    Filter(HOLDING, "dual-rate", {"intersample": "hold", **_TUNED[HOLDING]}),
-    Filter(PSEUDO, "dual-rate", {"intersample": "pseudo", **_TUNED[PSEUDO]}),
-    Filter(PLAIN, "dual-rate", {"intersample": "predict", "disturbances": "none", **_TUNED[PLAIN]}),
+    PaperFilter(CONVENTIONAL, "dual-rate", {"intersample": "predict", **_TUNED[CONVENTIONAL]}),
+    PaperFilter(HOLDING, "dual-rate", {"intersample": "hold", **_TUNED[HOLDING]}),
+    PaperFilter(PSEUDO, "dual-rate", {"intersample": "pseudo", **_TUNED[PSEUDO]}),
+    PaperFilter(
+        PLAIN, "dual-rate", {"intersample": "predict", "disturbances": "none", **_TUNED[PLAIN]}
+    ),
 )
 
-SIMULATIONS = (Estimation(FIG4, _ENV, FIG4, _FILTERS), Estimation(FIG5, _ENV, FIG5, _FILTERS))
+SIMULATIONS = (
+    EstimationSimulation(FIG4, _ENV, FIG4, _FILTERS),
+    EstimationSimulation(FIG5, _ENV, FIG5, _FILTERS),
+)
 
 
-def _order(scenario: str, most: float | None) -> tuple[Part, ...]:
+def _make_order_parts(scenario: str, max_ratio: float | None) -> tuple[ClaimPart, ...]:
     return (
-        smaller("pseudo / conventional", scenario, PSEUDO, CONVENTIONAL, most),
-        smaller("pseudo / holding", scenario, PSEUDO, HOLDING),
-        smaller("holding / conventional", scenario, HOLDING, CONVENTIONAL),
+        make_smaller_part("pseudo / conventional", scenario, PSEUDO, CONVENTIONAL, max_ratio),
+        make_smaller_part("pseudo / holding", scenario, PSEUDO, HOLDING),
+        make_smaller_part("holding / conventional", scenario, HOLDING, CONVENTIONAL),
     )
 
 
-claim = claims_of(PAPER)
+claim = make_claim_factory(PAPER)
 # A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("Fig. 4",
         "the pseudo measurement is the most accurate, then holding, then prediction alone",
-        *_order(FIG4, 1.12),
+        *_make_order_parts(FIG4, 1.12),
         note="With a tuning of its own each rule reaches the same. Oh's rule (35) is the pseudo "
         "measurement (31) to rounding."),
     claim("Sec. 4.1",
         "slip can be estimated from the GPS's course alone, robustly by disturbance accommodation",
-        smaller("pseudo / the slip itself", FIG4, PSEUDO, "truth"),
-        smaller("with / without disturbance states", FIG4, CONVENTIONAL, PLAIN),
+        make_smaller_part("pseudo / the slip itself", FIG4, PSEUDO, "truth"),
+        make_smaller_part("with / without disturbance states", FIG4, CONVENTIONAL, PLAIN),
         note="At 25 km/h the course alone hardly tells slip from heading: an estimate of zero is "
         "about as good."),
     claim("Fig. 4 (c)", "the pseudo measurement is smoother",
-        smaller("jump at a course, pseudo / conventional", FIG4, PSEUDO, CONVENTIONAL, 0.15,
+        make_smaller_part("jump at a course, pseudo / conventional", FIG4, PSEUDO, CONVENTIONAL,
+                          0.15,
             "jump")),
     claim("Fig. 5 (twin)", "the pseudo measurement is the most accurate on the road",
-        *_order(FIG5, None)),
+        *_make_order_parts(FIG5, None)),
 )
 
 _SLIP, _ALL = "sideslip angle / rad", ("truth", CONVENTIONAL, HOLDING, PSEUDO)
@@ -70,7 +76,7 @@ FIGURES = tuple(
     for name, number, caption in (
         (FIG4, "Fig. 4", "A slalom at 25 km/h, wind from 4 to 8 s, tyres 1.3 times too stiff."),
         (FIG5, "Fig. 5 (twin)", "The road test's slalom, with everything that the plant has."))
-    for panel, draw in (("(a): course angle", course("course angle / rad", _ALL)),
-        ("(b): sideslip angle", curves("beta", _SLIP, _ALL)),
-        ("(c): inter-sample performance", curves("beta", _SLIP, _ALL, (6.0, 7.0))))
+    for panel, draw in (("(a): course angle", make_course("course angle / rad", _ALL)),
+        ("(b): sideslip angle", make_curves("beta", _SLIP, _ALL)),
+        ("(c): inter-sample performance", make_curves("beta", _SLIP, _ALL, (6.0, 7.0))))
 )

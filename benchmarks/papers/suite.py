@@ -7,13 +7,20 @@ from rich.console import Console
 
 from ... import __version__
 from ..harness.parallel import run_cases
-from ..harness.results import VERDICTS, Row, Suite, Table
+from ..harness.results import VERDICTS, ResultRow, ResultTable, Suite
 from ..harness.stats import Estimate
-from ..harness.verdict import some
-from ..harness.verdict import verdict as lines
+from ..harness.verdict import format_verdict as format_verdict
+from ..harness.verdict import summarise_names
 from .claims import CLAIMS, FIGURES, SIMULATIONS
-from .ledger.claim import Claim, Found, Measured, Results, find, verdict
-from .ledger.simulations import joined
+from .ledger.claim import (
+    Claim,
+    MeasuredPart,
+    Results,
+    SimulationResult,
+    evaluate_claim,
+    measure_parts,
+)
+from .ledger.simulations import join_results
 
 SEEDS = 20
 QUICK_SEEDS = 4
@@ -31,10 +38,10 @@ _TEXT = (
 )
 
 Case = tuple[str, tuple[int, ...]]
-Ledger = list[tuple[Claim, tuple[Found, ...]]]
+Ledger = list[tuple[Claim, tuple[MeasuredPart, ...]]]
 
 
-def measure(case: Case) -> Measured:
+def measure(case: Case) -> SimulationResult:
     """One simulation on a few of its seeds."""
     name, seeds = case
     return SIMULATIONS[name].measure(seeds)
@@ -43,33 +50,45 @@ def measure(case: Case) -> Measured:
 def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = None) -> Suite:
     """Every simulation once, then every claim on what it gave."""
     results = simulate(seeds, jobs, console)
-    ledger = [(claim, find(claim, results)) for claim in CLAIMS]
+    ledger = [(claim, measure_parts(claim, results)) for claim in CLAIMS]
     suite = Suite(NAME, "Which claims of the papers hold", _TEXT)
-    suite.verdict = answer(ledger)
-    suite.tables = [_verdicts(ledger), _notes(ledger)]
-    suite.tables += [_numbers(ledger, paper) for paper in dict.fromkeys(c.paper for c in CLAIMS)]
-    suite.rows = [_row(claim, each, verdict(found)) for claim, found in ledger for each in found]
-    _draw(suite, results)
+    suite.verdict = compose_verdict(ledger)
+    suite.tables = [_make_verdict_table(ledger), _make_note_table(ledger)]
+    suite.tables += [
+        _make_number_table(ledger, paper) for paper in dict.fromkeys(c.paper for c in CLAIMS)
+    ]
+    suite.rows = [
+        _make_row(claim, result, evaluate_claim(parts))
+        for claim, parts in ledger
+        for result in parts
+    ]
+    _draw_figures(suite, results)
     return suite
 
 
-def answer(ledger: Ledger) -> str:
+def compose_verdict(ledger: Ledger) -> str:
     """The verdict: how many claims hold, which do not."""
-    judged = [(claim, verdict(found)) for claim, found in ledger]
-    counted = Counter(each for _, each in judged)
-    papers = dict.fromkeys(claim.paper for claim, _ in judged)
+    verdicts = [(claim, evaluate_claim(parts)) for claim, parts in ledger]
+    counted = Counter(item for _, item in verdicts)
+    papers = dict.fromkeys(claim.paper for claim, _ in verdicts)
     whole = {
-        paper: [each for claim, each in judged if claim.paper == paper and each != VERDICTS[-1]]
+        paper: [item for claim, item in verdicts if claim.paper == paper and item != VERDICTS[-1]]
         for paper in papers
     }
-    held = [f"{p} {mine.count(VERDICTS[1])} of {len(mine)}" for p, mine in whole.items() if mine]
-    failed = [_where(claim) for claim, each in judged if each == "not reproduced"]
-    missed = sum(each.threshold_met is False for _, found in ledger for each in found)
+    held = [
+        f"{p} {paper_verdicts.count(VERDICTS[1])} of {len(paper_verdicts)}"
+        for p, paper_verdicts in whole.items()
+        if paper_verdicts
+    ]
+    failed = [_format_source(claim) for claim, item in verdicts if item == "not reproduced"]
+    missed = sum(item.meets_threshold is False for _, parts in ledger for item in parts)
     counts = ", ".join(f"{counted[name]} {name}" for name in VERDICTS if counted[name])
-    return lines(
+    return format_verdict(
         f"{len(ledger)} claims of {len(papers)} papers: {counts}.",
         f"Reproduced: {'; '.join(held)}.",
-        f"Not reproduced: {some(failed, 3)}. Reasons stand in the table Why." if failed else "",
+        f"Not reproduced: {summarise_names(failed, 3)}. Reasons stand in the table Why."
+        if failed
+        else "",
         f"{missed} of our own thresholds are missed." if missed else "All our thresholds are met.",
         "Not covered: the papers' own noise and tuning, which none of them prints.",
     )
@@ -77,18 +96,25 @@ def answer(ledger: Ledger) -> str:
 
 def simulate(seeds: int, jobs: int | None = None, console: Console | None = None) -> Results:
     """The results of every simulation and analysis, by name."""
-    cases = [(name, chunk) for name, each in SIMULATIONS.items() for chunk in each.chunks(seeds)]
-    parts: dict[str, list[Measured]] = {name: [] for name in SIMULATIONS}
+    cases = [
+        (name, chunk)
+        for name, simulation in SIMULATIONS.items()
+        for chunk in simulation.chunks(seeds)
+    ]
+    parts: dict[str, list[SimulationResult]] = {name: [] for name in SIMULATIONS}
     done = run_cases(measure, cases, NAME, jobs, console)
     for (name, _), measured in zip(cases, done, strict=True):
         parts[name].append(measured)
-    return {name: joined(chunks) for name, chunks in parts.items()}
+    return {name: join_results(chunks) for name, chunks in parts.items()}
 
 
-def _verdicts(ledger: Ledger) -> Table:
+def _make_verdict_table(ledger: Ledger) -> ResultTable:
     """One line a claim."""
-    cells = [[_where(claim), claim.text, verdict(found), _met(found)] for claim, found in ledger]
-    return Table(
+    cells = [
+        [_format_source(claim), claim.text, evaluate_claim(parts), _format_checks(parts)]
+        for claim, parts in ledger
+    ]
+    return ResultTable(
         "The claims and what became of them",
         ("paper", "claim", "verdict", "thresholds"),
         cells,
@@ -96,15 +122,20 @@ def _verdicts(ledger: Ledger) -> Table:
     )
 
 
-def _numbers(ledger: Ledger, paper: str) -> Table:
+def _make_number_table(ledger: Ledger, paper: str) -> ResultTable:
     """One line a part of a paper's claims."""
     cells = [
-        [f"{claim.source}: {each.part.label}", _spread(each), _stated(each), _checked(each)]
-        for claim, found in ledger
-        for each in found
+        [
+            f"{claim.source}: {result.part.label}",
+            _format_range(result),
+            _format_stated(result),
+            _format_check(result),
+        ]
+        for claim, parts in ledger
+        for result in parts
         if claim.paper == paper
     ]
-    return Table(
+    return ResultTable(
         f"{paper}: what was measured",
         ("number", "median [range]", "paper states", "threshold"),
         cells,
@@ -114,57 +145,62 @@ def _numbers(ledger: Ledger, paper: str) -> Table:
     )
 
 
-def _notes(ledger: Ledger) -> Table:
+def _make_note_table(ledger: Ledger) -> ResultTable:
     """Remarks on some claims."""
-    cells = [[_where(claim), claim.note] for claim, _ in ledger if claim.note]
-    return Table("Why", ("paper", "what was found"), cells, keyed=False)
+    cells = [[_format_source(claim), claim.note] for claim, _ in ledger if claim.note]
+    return ResultTable("Why", ("paper", "what was found"), cells, keyed=False)
 
 
-def _where(claim: Claim) -> str:
+def _format_source(claim: Claim) -> str:
     return f"{claim.paper} {claim.source}"
 
 
-def _spread(found: Found) -> str:
-    if found.low == found.high:
-        return _text(found.median)
-    return f"{_text(found.median)} [{_text(found.low)}, {_text(found.high)}]"
+def _format_range(result: MeasuredPart) -> str:
+    if result.low == result.high:
+        return _format_number(result.median)
+    median, low, high = map(_format_number, (result.median, result.low, result.high))
+    return f"{median} [{low}, {high}]"
 
 
-def _text(value: float) -> str:
+def _format_number(value: float) -> str:
     """Three digits; of rounding errors the order of magnitude is enough."""
     return f"{value:.0e}" if 0.0 < abs(value) < 1e-6 else f"{value:.3g}"
 
 
-def _stated(found: Found) -> str:
-    stated = found.part.stated
-    return "" if stated is None else f"{stated} ({100.0 * found.agreeing:.0f} %)"
+def _format_stated(result: MeasuredPart) -> str:
+    stated = result.part.stated
+    return "" if stated is None else f"{stated} ({100.0 * result.agreement:.0f} %)"
 
 
-def _checked(found: Found) -> str:
+def _format_check(result: MeasuredPart) -> str:
     met = {True: "met", False: "MISSED"}
     return (
-        "" if found.threshold_met is None else f"{found.part.threshold} {met[found.threshold_met]}"
+        ""
+        if result.meets_threshold is None
+        else f"{result.part.threshold} {met[result.meets_threshold]}"
     )
 
 
-def _met(found: tuple[Found, ...]) -> str:
+def _format_checks(parts: tuple[MeasuredPart, ...]) -> str:
     """Whether a claim's thresholds are met, or how many are not."""
-    checked = [each.threshold_met for each in found if each.threshold_met is not None]
+    checked = [result.meets_threshold for result in parts if result.meets_threshold is not None]
     if not checked:
         return ""
     return "met" if all(checked) else f"{checked.count(False)} of {len(checked)} MISSED"
 
 
-def _row(claim: Claim, found: Found, judged: str) -> Row:
+def _make_row(claim: Claim, result: MeasuredPart, judged: str) -> ResultRow:
     """low and high are the range over the seeds."""
-    number = Estimate(found.median, found.low, found.high)
-    where = {"suite": NAME, "scenario": found.part.scenario, "estimator": found.part.label}
-    paper = f"{_where(claim)}: {claim.text}"
+    number = Estimate(result.median, result.low, result.high)
+    where = {"suite": NAME, "scenario": result.part.scenario, "estimator": result.part.label}
+    paper = f"{_format_source(claim)}: {claim.text}"
     common = {"salt": "fixed", "env_version": __version__, "verdict": judged, "paper": paper}
-    return Row.of(found.part.metric, number, n=len(found.values), **where, **common)
+    return ResultRow.from_estimate(
+        result.part.metric, number, n=len(result.values), **where, **common
+    )
 
 
-def _draw(suite: Suite, results: Results) -> None:
+def _draw_figures(suite: Suite, results: Results) -> None:
     """The papers' figures; nothing where plotly is not installed."""
     try:
         from ..report import figures  # noqa: F401

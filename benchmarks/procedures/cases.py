@@ -10,7 +10,7 @@ NAME = "procedures"
 
 
 @dataclass(frozen=True)
-class Case:
+class ProcedureCase:
     """A drive: a procedure, a car or outside model, a contestant's index, seeds."""
 
     procedure: str
@@ -21,10 +21,10 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Sine:
+class SineDwellOutcome:
     """FMVSS 126 of a contestant, and one of its runs to look at."""
 
-    result: fmvss126.Result
+    result: fmvss126.SineDwellResult
     shown: Series
 
 
@@ -38,10 +38,10 @@ class Transient:
     linear_sweep: dict[str, Any]
 
 
-Done = dict[Case, Any]
+CaseResults = dict[ProcedureCase, Any]
 """The result of every case."""
 
 
-def of(done: Done, procedure: str) -> Done:
+def select_cases(done: CaseResults, procedure: str) -> CaseResults:
     """The cases of one procedure."""
-    return {case: found for case, found in done.items() if case.procedure == procedure}
+    return {case: result for case, result in done.items() if case.procedure == procedure}

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ...agents.learned.files import load_policy
-from ...envs.outside.plants import outside_vehicle
+from ...envs.outside.plants import make_outside_vehicle
 from ...envs.vehicle.vehicle import COMS, PASSENGER_CAR
-from .drive import Drive, TestCar, of_env
+from .drive import DriveFunction, TestCar, make_env_drive
 
 ENV_ID, OUTSIDE_ID = "sideslip/YawFusion-v0", "sideslip/Outside-v0"
 RATIO = 16.0  # steering wheel to front wheels, a usual rack's
@@ -20,13 +20,13 @@ CARS: dict[str, TestCar] = {
 }
 
 
-def outside_car() -> TestCar:
+def make_outside_car() -> TestCar:
     """CommonRoad's BMW 320i at 80 km/h (needs the extra `outside`)."""
-    return TestCar(outside_vehicle(), 80.0 / 3.6, RATIO, 4.508, 0.8)
+    return TestCar(make_outside_vehicle(), 80.0 / 3.6, RATIO, 4.508, 0.8)
 
 
 @dataclass(frozen=True)
-class Contestant:
+class ProcedureEntry:
     """A controller with the estimator it reads ("" where it reads none).
 
     estimate: options of the estimator's wrapper. slow: whether it plans, and is left out of a quick
@@ -40,7 +40,7 @@ class Contestant:
     slow: bool = False
     policies: Mapping[str, str] = field(default_factory=dict)
 
-    def on(self, car: str) -> tuple[str, str, Mapping[str, Any]]:
+    def get_configuration(self, car: str) -> tuple[str, str, Mapping[str, Any]]:
         """(agent, estimator, its options) on one of `CARS`; another car has the passenger car's."""
         if not self.policies:
             return self.agent, self.estimator, self.estimate
@@ -48,11 +48,11 @@ class Contestant:
         card = load_policy(name).card
         return name, card.estimator, card.estimator_options
 
-    def drive(self, car: str, seed: int = 0) -> Drive:
+    def drive(self, car: str, seed: int = 0) -> DriveFunction:
         """Drives of one of `CARS`; references stay within what friction can hold."""
         options: dict[str, Any] = {"vehicle": CARS[car].vehicle.to_dict(), "reference": "limited"}
-        agent, estimator, estimate = self.on(car)
-        return of_env(ENV_ID, agent, estimator, seed, estimate, **options)
+        agent, estimator, estimate = self.get_configuration(car)
+        return make_env_drive(ENV_ID, agent, estimator, seed, estimate, **options)
 
 
 _TYRES = {"outputs": ["beta", "gamma", "F_d", "N_d", "front_tyres", "rear_tyres"]}
@@ -60,15 +60,15 @@ _FRICTION = {
     "outputs": [*_TYRES["outputs"], "inverse_friction"],
     "options": {"inverse_friction_sd": 0.3},
 }
-CONTESTANTS = (
-    Contestant("none"),
-    Contestant("feedforward"),
-    Contestant("two-dof", "exact-kf"),
-    Contestant("lqr", "exact-kf"),
-    Contestant("esc"),
-    Contestant("adaptive-lqr", "joint", _TYRES),
-    Contestant("adaptive-nmpc", "joint", _FRICTION, slow=True),
-    Contestant(
+ENTRIES = (
+    ProcedureEntry("none"),
+    ProcedureEntry("feedforward"),
+    ProcedureEntry("two-dof", "exact-kf"),
+    ProcedureEntry("lqr", "exact-kf"),
+    ProcedureEntry("esc"),
+    ProcedureEntry("adaptive-lqr", "joint", _TYRES),
+    ProcedureEntry("adaptive-nmpc", "joint", _FRICTION, slow=True),
+    ProcedureEntry(
         "distilled", policies={"coms": "distill-coms-yaw", "passenger-car": "distill-car-yaw"}
     ),
 )

@@ -9,11 +9,16 @@ import numpy as np
 import numpy.typing as npt
 
 from ...agents import make_agent
-from ...agents.rollout import steps_of
-from ...envs.outside.plants import OUTSIDE_PLANTS, Acting, OutsidePlant
+from ...agents.rollout import iterate_steps
+from ...envs.outside.plants import OUTSIDE_PLANTS, OutsideInputs, OutsidePlant
 from ...envs.scenarios.draws import Draws
 from ...envs.scenarios.scenario import Scenario
-from ...envs.scenarios.steering import STEERING_KINDS, STEERING_WIDTH, steering_at, write_steering
+from ...envs.scenarios.steering import (
+    STEERING_KINDS,
+    STEERING_WIDTH,
+    compute_steering,
+    write_steering,
+)
 from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import Motion
 from ...envs.vehicle.vehicle import Vehicle
@@ -65,13 +70,13 @@ class Series:
         """The lateral acceleration in m/s2, v_y' + v_x gamma."""
         return np.gradient(self.v_y, self.t) + self.v_x * self.gamma
 
-    def at(self, name: str, time: float) -> float:
+    def interpolate(self, name: str, time: float) -> float:
         """A signal at a time in s, between two samples on the line; NaN after the end."""
         values = np.asarray(getattr(self, name))
         return float(np.interp(time, self.t, values, right=np.nan))
 
 
-Drive = Callable[[Fields], Series]
+DriveFunction = Callable[[Fields], Series]
 """From fields of a `Scenario` to what the car did."""
 
 Law = Callable[[Motion, float], float]
@@ -80,7 +85,7 @@ Law = Callable[[Motion, float], float]
 SPEED_GAIN = 10.0  # 1/s, of the speed that an outside plant's driver holds
 
 
-def of_env(
+def make_env_drive(
     env_id: str,
     agent: str = "none",
     estimator: str = "",
@@ -88,62 +93,64 @@ def of_env(
     estimate: Fields | None = None,
     agent_options: Fields | None = None,
     **options: Any,
-) -> Drive:
+) -> DriveFunction:
     """Drives of an environment of ours with a controller and, if named, its estimator.
 
     estimate: options of the estimator's wrapper. options: of the environment (vehicle, nominal,
     control_period, model of an outside plant).
     """
 
-    def drive(fields: Fields) -> Series:
+    def run_drive(fields: Fields) -> Series:
         env = make_env(env_id, estimator, estimate, scenario=CALM | dict(fields), **options)
-        return _episode(env, make_agent(agent, env, **(agent_options or {})), seed)
+        return _run_episode(env, make_agent(agent, env, **(agent_options or {})), seed)
 
-    return drive
+    return run_drive
 
 
-def _episode(env: gym.Env[Any, Any], agent: Any, seed: int) -> Series:
+def _run_episode(env: gym.Env[Any, Any], agent: Any, seed: int) -> Series:
     base: Any = env.unwrapped
     rows = []
-    for step in steps_of(env, agent, seed):
+    for step in iterate_steps(env, agent, seed):
         info = step.info
-        rows.append([info["t"], info["steer"], *_moving(base.motion), info["yaw_moment"]])
+        rows.append([info["t"], info["steer"], *_get_motion(base.motion), info["yaw_moment"]])
     env.close()
-    return _series(rows, bool(info["failure"]))
+    return _make_series(rows, bool(info["failure"]))
 
 
-def _series(rows: list[list[float]], failed: bool) -> Series:
+def _make_series(rows: list[list[float]], failed: bool) -> Series:
     t, steer, v_x, v_y, gamma, psi, X, Y, moment = np.array(rows).T
     return Series(t, steer, v_x, v_y, gamma, psi, X, Y, moment, failed)
 
 
-def _moving(m: Motion) -> tuple[float, ...]:
+def _get_motion(m: Motion) -> tuple[float, ...]:
     return m.v_x, m.v_y, m.gamma, m.psi, m.X, m.Y
 
 
-def of_plant(model: str, law: Law | None = None, friction: float | None = None) -> Drive:
+def make_plant_drive(
+    model: str, law: Law | None = None, friction: float | None = None
+) -> DriveFunction:
     """Drives of an outside plant alone, its steering angle prescribed and no actuator's lag.
 
     model: of `OUTSIDE_PLANTS`. law: a yaw moment every millisecond. friction: of its tyres. The
     field `acceleration` None holds the speed, 0 lets the car coast.
     """
 
-    def drive(fields: Fields) -> Series:
+    def run_drive(fields: Fields) -> Series:
         scenario = Scenario(**(CALM | dict(fields)))
-        programme = steering_programme(scenario)
-        return prescribed(
+        profile = make_steering_profile(scenario)
+        return simulate_plant(
             OUTSIDE_PLANTS[model](friction),
-            lambda t: float(steering_at(t / TICK, programme)),
+            lambda t: float(compute_steering(t / TICK, profile)),
             scenario.range("speed")[0],
             scenario.duration,
             scenario.acceleration is None,
             law,
         )
 
-    return drive
+    return run_drive
 
 
-def prescribed(
+def simulate_plant(
     plant: OutsidePlant,
     steering: Callable[[float], float],
     speed: float,
@@ -156,30 +163,30 @@ def prescribed(
     hold: a force keeps the speed (m/s); otherwise the car coasts.
     """
     plant.start(Motion(speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-    rows = [[0.0, steering(0.0), *_moving(plant.motion), 0.0]]
+    rows = [[0.0, steering(0.0), *_get_motion(plant.motion), 0.0]]
     for k in range(round(duration / TICK)):
         steer, motion = steering(k * TICK), plant.motion
         moment = 0.0 if law is None else law(motion, steer)
         push = plant.p.m * plant.p.R_w * SPEED_GAIN * (speed - motion.v_x) if hold else 0.0
         turn = plant.p.R_w / plant.p.T_r * moment
-        plant.step(Acting(steer, 0.5 * push - turn, 0.5 * push + turn), TICK)
-        if not plant.finite:
+        plant.step(OutsideInputs(steer, 0.5 * push - turn, 0.5 * push + turn), TICK)
+        if not plant.is_finite:
             break
-        rows.append([(k + 1) * TICK, steer, *_moving(plant.motion), moment])
-    return _series(rows, not plant.finite)
+        rows.append([(k + 1) * TICK, steer, *_get_motion(plant.motion), moment])
+    return _make_series(rows, not plant.is_finite)
 
 
-def steering_programme(scenario: Scenario) -> Array:
-    """The numbers that `steering_at` reads, of a scenario that draws nothing.
+def make_steering_profile(scenario: Scenario) -> Array:
+    """The numbers that `compute_steering` reads, of a scenario that draws nothing.
 
     Raises ValueError for a range: a procedure leaves nothing to the seed.
     """
-    low, high = scenario.draws()
+    low, high = scenario.get_draw_ranges()
     if (low != high).any():
         raise ValueError(f"scenario {scenario.name!r} draws; a procedure gives numbers")
-    programme = np.zeros(STEERING_WIDTH)
-    write_steering(STEERING_KINDS.index(scenario.steering), Draws(*low.tolist()), programme)
-    return programme
+    profile = np.zeros(STEERING_WIDTH)
+    write_steering(STEERING_KINDS.index(scenario.steering), Draws(*low.tolist()), profile)
+    return profile
 
 
 @dataclass(frozen=True)

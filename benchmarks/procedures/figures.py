@@ -6,75 +6,84 @@ import numpy as np
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
-from ...envs.rendering.palette import GREY, INK, colour
+from ...envs.rendering.palette import GREY, INK, find_colour
 from ...envs.scenarios.tracks import Section
 from ..harness.results import Suite
-from ..report.figures import time_series, track
+from ..report.figures import draw_time_series, draw_track
 from . import fmvss126, iso3888, iso7401
-from .cases import Case, Done, Sine, Transient, of
-from .contestants import CARS, CONTESTANTS
+from .cases import CaseResults, ProcedureCase, SineDwellOutcome, Transient, select_cases
+from .contestants import CARS, ENTRIES
 from .drive import Array
 
 
-def add(suite: Suite, done: Done) -> None:
+def add(suite: Suite, done: CaseResults) -> None:
     """Every figure of what was found."""
     for car in CARS:
-        mine = {case: found for case, found in done.items() if case.car == car}
+        car_results = {case: result for case, result in done.items() if case.car == car}
         title = f"FMVSS 126, {car}: yaw rate at 5 A over its own peak"
         text = (
             "Bars: at most 35 % and 20 % of the peak after the steer reversal may be left. A car "
             "that spins before completion of steer is left out."
         )
-        suite.figures.append((title, yaw_rates(of(mine, "fmvss-126")), text))
+        suite.figures.append((title, draw_yaw_rates(select_cases(car_results, "fmvss-126")), text))
         for name in iso3888.TRACKS:
-            runs = {case: _best(found) for case, found in of(mine, name).items()}
-            speeds = ", ".join(f"{_label(k)} {3.6 * run.speed:.0f} km/h" for k, run in runs.items())
+            runs = {
+                case: _choose_best(result)
+                for case, result in select_cases(car_results, name).items()
+            }
+            speeds = ", ".join(
+                f"{_get_label(k)} {3.6 * run.speed:.0f} km/h" for k, run in runs.items()
+            )
             text = f"The fastest clean run, or the slowest where none is clean: {speeds}."
-            suite.figures.append((f"{name}, {car}: way and cones", cones(runs), text))
-        for found in of(mine, "iso-7401").values():
+            suite.figures.append((f"{name}, {car}: way and cones", draw_cones(runs), text))
+        for result in select_cases(car_results, "iso-7401").values():
             text = "Dots: measured by a swept sine, no control. Line: the linear model."
             title = f"ISO 7401, {car}: frequency response to steering"
-            suite.figures.append((title, bode(found), text))
+            suite.figures.append((title, draw_bode(result), text))
 
 
-def yaw_rates(done: dict[Case, Sine]) -> Any:
+def draw_yaw_rates(done: dict[ProcedureCase, SineDwellOutcome]) -> Any:
     """Yaw rate at 5 A as a share of its peak after the reversal, with the two limits."""
-    t = max((found.shown.t for found in done.values()), key=len)
-    whole = {k: found for k, found in done.items() if found.shown.t[-1] >= fmvss126.COMPLETION}
-    series = {_label(case): _shares(found, t) for case, found in whole.items()}
-    figure = time_series(t, series, "yaw rate / its peak after the reversal")
-    for time, most in fmvss126.RATIOS:
-        at = fmvss126.COMPLETION + time
-        for level in (most, -most):
+    t = max((result.shown.t for result in done.values()), key=len)
+    complete = {
+        k: result for k, result in done.items() if result.shown.t[-1] >= fmvss126.COMPLETION
+    }
+    series = {_get_label(case): _compute_shares(result, t) for case, result in complete.items()}
+    figure = draw_time_series(t, series, "yaw rate / its peak after the reversal")
+    for time, max_ratio in fmvss126.RATIOS:
+        position = fmvss126.COMPLETION + time
+        for level in (max_ratio, -max_ratio):
             line = {"color": INK, "width": 3}
-            figure.add_shape(type="line", x0=at - 0.1, x1=at + 0.1, y0=level, y1=level, line=line)
+            figure.add_shape(
+                type="line", x0=position - 0.1, x1=position + 0.1, y0=level, y1=level, line=line
+            )
     figure.update_yaxes(range=[-1.5, 1.5])
     return figure
 
 
-def _shares(found: Sine, t: Array) -> Array:
+def _compute_shares(result: SineDwellOutcome, t: Array) -> Array:
     """The yaw rate over its peak at the times t; NaN after the drive's end."""
-    shown = found.shown
+    shown = result.shown
     steered = (shown.t >= fmvss126.REVERSAL) & (shown.t <= fmvss126.COMPLETION)
     peak = np.max(-shown.gamma[steered], initial=1e-9)  # the first half steers to the left
     return np.interp(t, shown.t, -shown.gamma / peak, right=np.nan)
 
 
-def _best(runs: list[iso3888.Pass]) -> iso3888.Pass:
+def _choose_best(runs: list[iso3888.TrackRun]) -> iso3888.TrackRun:
     """The fastest clean run, or the first of all."""
     return max((run for run in runs if run.passed), key=lambda run: run.speed, default=runs[0])
 
 
-def cones(done: dict[Case, iso3888.Pass]) -> Any:
+def draw_cones(done: dict[ProcedureCase, iso3888.TrackRun]) -> Any:
     """The ways of the centre of gravity, from where the first lane begins, and the cones."""
-    ways: dict[str, tuple[Array, Array]] = {}
+    paths: dict[str, tuple[Array, Array]] = {}
     lanes: tuple[Section, ...] = ()
     speed = 0.0
     for case, run in done.items():
         speed = run.speed
-        ways[_label(case)] = run.series.X - speed * iso3888.ONSET, run.series.Y
-        lanes = iso3888.lanes_of(CARS[case.car], case.procedure, speed)
-    figure = track(ways)
+        paths[_get_label(case)] = run.series.X - speed * iso3888.ONSET, run.series.Y
+        lanes = iso3888.make_lanes(CARS[case.car], case.procedure, speed)
+    figure = draw_track(paths)
     places = [
         (x - speed * iso3888.ONSET, lane.offset + side * 0.5 * lane.width)
         for lane in lanes
@@ -89,18 +98,18 @@ def cones(done: dict[Case, iso3888.Pass]) -> Any:
     return figure
 
 
-def bode(found: Transient) -> Any:
+def draw_bode(result: Transient) -> Any:
     """Magnitude and phase of both outputs over the frequency."""
     figure = make_subplots(rows=2, cols=2, shared_xaxes=True, vertical_spacing=0.06)
     for column, name in enumerate(iso7401.OUTPUTS, 1):
-        measured, linear = found.sweep[name], found.linear_sweep[name]
-        for H, mode, who in (
+        measured, linear = result.sweep[name], result.linear_sweep[name]
+        for H, mode, label in (
             (measured.H, "markers", "measured"),
             (linear, "lines", "linear model"),
         ):
             for row, values in ((1, np.abs(H)), (2, np.degrees(np.unwrap(np.angle(H))))):
-                legend = {"name": who, "legendgroup": who, "showlegend": row == column == 1}
-                pen = {"marker": {"color": colour("two-dof")}, "line": {"color": GREY}}
+                legend = {"name": label, "legendgroup": label, "showlegend": row == column == 1}
+                pen = {"marker": {"color": find_colour("two-dof")}, "line": {"color": GREY}}
                 trace = go.Scatter(x=measured.frequency, y=values, mode=mode, **legend, **pen)
                 figure.add_trace(trace, row=row, col=column)
     figure.update_xaxes(title_text="frequency / Hz", row=2, automargin=True)
@@ -112,5 +121,5 @@ def bode(found: Transient) -> Any:
     return figure
 
 
-def _label(case: Case) -> str:
-    return CONTESTANTS[case.contestant].agent
+def _get_label(case: ProcedureCase) -> str:
+    return ENTRIES[case.contestant].agent

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...envs.vehicle.vehicle import GRAVITY
-from .drive import Array, Drive, Fields, Series, TestCar
+from .drive import Array, DriveFunction, Fields, Series, TestCar
 
 FREQUENCY, DWELL = 0.7, 0.5  # Hz, s
 ONSET = 0.5  # s, straight ahead before
@@ -33,7 +33,7 @@ AFTER = 2.0  # s, recorded after completion of steer
 RAMP_RATE = math.radians(13.5)  # rad/s at the steering wheel
 A_AT, A_FROM, A_TO = 0.3 * GRAVITY, 0.1 * GRAVITY, 0.375 * GRAVITY
 FIRST, STEP, LAST = 1.5, 0.5, 6.5  # of A
-LEAST, MOST = math.radians(270.0), math.radians(300.0)  # at the steering wheel
+MIN_AMPLITUDE, MAX_AMPLITUDE = math.radians(270.0), math.radians(300.0)  # at the steering wheel
 RATIOS = ((1.0, 0.35), (1.75, 0.20))  # s after completion of steer, share of the peak
 RESPONSIVE = 5.0  # of A
 SIDEWAYS, SIDEWAYS_AT = 1.83, 1.07  # m, s after the beginning of steer
@@ -43,7 +43,7 @@ COMPLETION = ONSET + 1.0 / FREQUENCY + DWELL
 
 
 @dataclass(frozen=True)
-class Run:
+class SineDwellRun:
     """A sine with dwell: its amplitude at the steering wheel in rad, with its sign, and in A.
 
     ratio_1, ratio_2: the yaw rate at the two times over its peak. sideways: m. All NaN from where
@@ -72,8 +72,9 @@ class Run:
         return self.stable and self.responsive
 
 
-def slow_steer(car: TestCar, side: float, most: float = 0.5 * GRAVITY) -> Fields:
-    """The slowly increasing steer: until a linear car reaches `most` (m/s2), at least 2 s long."""
+def make_slow_steer(car: TestCar, side: float, max_acceleration: float = 0.5 * GRAVITY) -> Fields:
+    """The slowly increasing steer: until a linear car reaches `max_acceleration` (m/s2), at
+    least 2 s long."""
     seconds = 30.0
     return {
         "steering": "ramp",
@@ -81,32 +82,32 @@ def slow_steer(car: TestCar, side: float, most: float = 0.5 * GRAVITY) -> Fields
         "amplitude": side * RAMP_RATE / car.ratio * seconds,
         "hold": seconds,
         "speed": car.speed,
-        "duration": ONSET + seconds * min(1.0, most / (2.0 * GRAVITY)),
+        "duration": ONSET + seconds * min(1.0, max_acceleration / (2.0 * GRAVITY)),
     }
 
 
-def angle_at(series: Series, ratio: float) -> float:
+def fit_reference_angle(series: Series, ratio: float) -> float:
     """|A| in rad at the steering wheel: where the line through 0.1 to 0.375 g crosses 0.3 g.
 
     Raises ValueError where the car never gets there.
     """
     a_y = np.abs(series.a_y)
-    beyond = np.flatnonzero(a_y > A_TO)
-    if not len(beyond):
+    past_range = np.flatnonzero(a_y > A_TO)
+    if not len(past_range):
         raise ValueError(f"slowly increasing steer reached {a_y.max():.2f} m/s2, not {A_TO:.2f}")
-    there = np.flatnonzero(a_y[: beyond[0]] >= A_FROM)
-    slope, start = np.polyfit(a_y[there], ratio * np.abs(series.steer[there]), 1)
+    in_range = np.flatnonzero(a_y[: past_range[0]] >= A_FROM)
+    slope, start = np.polyfit(a_y[in_range], ratio * np.abs(series.steer[in_range]), 1)
     return float(start + slope * A_AT)
 
 
-def amplitudes(A: float) -> Array:
+def list_amplitudes(A: float) -> Array:
     """Steering wheel angles in rad of a series, from 1.5 A on."""
-    last = MOST if LAST * A > MOST else max(LAST * A, LEAST)
+    last = MAX_AMPLITUDE if LAST * A > MAX_AMPLITUDE else max(LAST * A, MIN_AMPLITUDE)
     count = math.ceil(round((last / A - FIRST) / STEP, 9))
     return np.append(A * (FIRST + STEP * np.arange(count)), last)
 
 
-def sine_with_dwell(car: TestCar, amplitude: float) -> Fields:
+def make_sine_with_dwell(car: TestCar, amplitude: float) -> Fields:
     """A run; amplitude: rad at the steering wheel, its sign the side of the first half."""
     return {
         "steering": "sine-with-dwell",
@@ -120,31 +121,33 @@ def sine_with_dwell(car: TestCar, amplitude: float) -> Fields:
     }
 
 
-def judge(series: Series, amplitude: float, A: float) -> Run:
+def evaluate_run(series: Series, amplitude: float, A: float) -> SineDwellRun:
     """The result of a run; amplitude and A: rad at the steering wheel."""
     towards = -math.copysign(1.0, amplitude)
     steered = (series.t >= REVERSAL) & (series.t <= COMPLETION)
     peak = float(np.max(towards * series.gamma[steered], initial=0.0))
-    later = [abs(series.at("gamma", COMPLETION + time)) for time, _ in RATIOS]
+    later = [abs(series.interpolate("gamma", COMPLETION + time)) for time, _ in RATIOS]
     ratio_1, ratio_2 = (rate / peak if peak > 0.0 else math.nan for rate in later)
     multiple = round(abs(amplitude) / A, 6)  # 5 A is no less than 5 A
-    return Run(amplitude, multiple, ratio_1, ratio_2, _sideways(series))
+    return SineDwellRun(amplitude, multiple, ratio_1, ratio_2, _compute_sideways(series))
 
 
-def _sideways(series: Series) -> float:
+def _compute_sideways(series: Series) -> float:
     """m across the heading at the beginning of steer."""
     end = ONSET + SIDEWAYS_AT
-    dX, dY = (series.at(name, end) - series.at(name, ONSET) for name in ("X", "Y"))
-    psi = series.at("psi", ONSET)
+    dX, dY = (
+        series.interpolate(name, end) - series.interpolate(name, ONSET) for name in ("X", "Y")
+    )
+    psi = series.interpolate("psi", ONSET)
     return abs(dY * math.cos(psi) - dX * math.sin(psi))
 
 
 @dataclass(frozen=True)
-class Result:
+class SineDwellResult:
     """A: rad at the steering wheel, the mean of both sides'. runs: as they were driven."""
 
     A: float
-    runs: tuple[Run, ...]
+    runs: tuple[SineDwellRun, ...]
 
     @property
     def passed(self) -> bool:
@@ -158,18 +161,23 @@ class Result:
         return max((run.multiple for run in self.runs if run.multiple < failed), default=0.0)
 
 
-def steering_for(drive: Drive, car: TestCar) -> float:
+def measure_reference_angle(drive: DriveFunction, car: TestCar) -> float:
     """A in rad at the steering wheel, the mean of a turn to the left and one to the right."""
-    found = [angle_at(drive(slow_steer(car, side)), car.ratio) for side in (1.0, -1.0)]
-    return float(np.mean(found))
+    angles = [
+        fit_reference_angle(drive(make_slow_steer(car, side)), car.ratio) for side in (1.0, -1.0)
+    ]
+    return float(np.mean(angles))
 
 
 def run(
-    drive: Drive, car: TestCar, A: float | None = None, multiples: Sequence[float] | None = None
-) -> Result:
+    drive: DriveFunction,
+    car: TestCar,
+    A: float | None = None,
+    multiples: Sequence[float] | None = None,
+) -> SineDwellResult:
     """The whole procedure. A: where it is known. multiples: of A, in place of the series."""
-    A = steering_for(drive, car) if A is None else A
-    angles = amplitudes(A) if multiples is None else A * np.asarray(multiples)
+    A = measure_reference_angle(drive, car) if A is None else A
+    angles = list_amplitudes(A) if multiples is None else A * np.asarray(multiples)
     signed = [side * angle for angle in angles.tolist() for side in (1.0, -1.0)]
-    runs = [judge(drive(sine_with_dwell(car, angle)), angle, A) for angle in signed]
-    return Result(A, tuple(runs))
+    runs = [evaluate_run(drive(make_sine_with_dwell(car, angle)), angle, A) for angle in signed]
+    return SineDwellResult(A, tuple(runs))

@@ -1,8 +1,8 @@
 """ISO 3888: double lane change (part 1) and obstacle avoidance (part 2), with a check for cones.
 
-The lanes are `tracks.sections`; a driver model steers. A car hits a cone where any part of
+The lanes are `tracks.make_sections`; a driver model steers. A car hits a cone where any part of
 its body, a rectangle, is outside a lane while within its length. Part 1 is driven at a held speed,
-part 2 coasting. A driver may try again: at every speed each driver of `TRIES` goes until one hits
+part 2 coasting. A driver may try again: at every speed each driver of `DRIVERS` goes until one hits
 no cone. The result is the highest speed of a clean run, which is that of the car and our drivers
 together: they do not reach what test drivers do.
 
@@ -16,21 +16,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...envs.scenarios.tracks import Section, sections
-from .drive import Array, Drive, Fields, Series, TestCar
+from ...envs.scenarios.tracks import Section, make_sections
+from .drive import Array, DriveFunction, Fields, Series, TestCar
 
 TRACKS = ("iso-3888-1", "iso-3888-2")
 STANDARD_SPEED = 80.0 / 3.6  # m/s
 ONSET = 1.0  # s, before the first lane
 RUN_OUT = 10.0  # m, after the last lane
-TRIES: tuple[Fields, ...] = tuple(
+DRIVERS: tuple[Fields, ...] = tuple(
     {"driver_preview": preview, "driver_gain": gain, "driver_lag": 0.05}
     for preview, gain in ((0.3, 0.6), (0.4, 0.8), (0.5, 1.0), (0.6, 1.0), (0.6, 1.2))
 )
 
 
 @dataclass(frozen=True)
-class Pass:
+class TrackRun:
     """One run through a track. speed: m/s.
 
     margins: m, by lane the least distance between the body and the lane's edge, negative where
@@ -42,18 +42,18 @@ class Pass:
     series: Series
 
     @property
-    def least(self) -> float:
+    def min_margin(self) -> float:
         """The least margin in m; minus infinity where the track was not driven to its end."""
-        whole = not self.series.failed and all(margin == margin for margin in self.margins)
-        return min(self.margins) if whole else -math.inf
+        is_complete = not self.series.failed and all(margin == margin for margin in self.margins)
+        return min(self.margins) if is_complete else -math.inf
 
     @property
     def passed(self) -> bool:
         """Without a cone, and not failed."""
-        return self.least >= 0.0
+        return self.min_margin >= 0.0
 
 
-def corners(series: Series, car: TestCar) -> Array:
+def compute_corners(series: Series, car: TestCar) -> Array:
     """(n, 4, 2) of the body's corners on the ground in m, going round it."""
     front = car.vehicle.front_arm + car.front_overhang
     half = 0.5 * car.vehicle.width
@@ -65,7 +65,7 @@ def corners(series: Series, car: TestCar) -> Array:
     return np.asarray(place[:, None, :] + np.einsum("ijn,kj->nki", turned, body))
 
 
-def margin(body: Array, lane: Section) -> float:
+def compute_margin(body: Array, lane: Section) -> float:
     """The least distance in m between a body (n, 4, 2) and the edges of a lane that it crosses.
 
     The body's sides are cut where the lane begins and ends: a side may touch the first or the
@@ -74,39 +74,39 @@ def margin(body: Array, lane: Section) -> float:
     start, end = lane.start, lane.start + lane.length
     if body[:, :, 0].max() < end:
         return float("nan")
-    here, there = body, np.roll(body, -1, axis=1)
-    along = there[..., 0] - here[..., 0]
-    safe = np.where(along == 0.0, 1.0, along)
-    cuts = np.sort([(start - here[..., 0]) / safe, (end - here[..., 0]) / safe], axis=0)
-    inside = (here[..., 0] >= start) & (here[..., 0] <= end)
-    first = np.where(along == 0.0, np.where(inside, 0.0, 2.0), np.maximum(cuts[0], 0.0))
-    last = np.where(along == 0.0, np.where(inside, 1.0, -1.0), np.minimum(cuts[1], 1.0))
-    across = there[..., 1] - here[..., 1]
-    most = -np.inf
+    corner, next_corner = body, np.roll(body, -1, axis=1)
+    dx = next_corner[..., 0] - corner[..., 0]
+    safe = np.where(dx == 0.0, 1.0, dx)
+    cuts = np.sort([(start - corner[..., 0]) / safe, (end - corner[..., 0]) / safe], axis=0)
+    inside = (corner[..., 0] >= start) & (corner[..., 0] <= end)
+    first = np.where(dx == 0.0, np.where(inside, 0.0, 2.0), np.maximum(cuts[0], 0.0))
+    last = np.where(dx == 0.0, np.where(inside, 1.0, -1.0), np.minimum(cuts[1], 1.0))
+    dy = next_corner[..., 1] - corner[..., 1]
+    max_offset = -np.inf
     for part in (first, last):
-        y = here[..., 1] + part * across - lane.offset
-        most = max(most, float(np.max(np.abs(y), where=first <= last, initial=-np.inf)))
-    return 0.5 * lane.width - most
+        y = corner[..., 1] + part * dy - lane.offset
+        max_offset = max(max_offset, float(np.max(np.abs(y), where=first <= last, initial=-np.inf)))
+    return 0.5 * lane.width - max_offset
 
 
-def lanes_of(car: TestCar, track: str, speed: float) -> tuple[Section, ...]:
+def make_lanes(car: TestCar, track: str, speed: float) -> tuple[Section, ...]:
     """The lanes where the car drives them at a speed in m/s."""
-    return sections(track, car.vehicle.width, speed * ONSET, shortened(car))
+    return make_sections(track, car.vehicle.width, speed * ONSET, compute_length_share(car))
 
 
-def shortened(car: TestCar) -> float:
+def compute_length_share(car: TestCar) -> float:
     """The share of the standards' lengths that the car drives."""
     return min(1.0, car.speed / STANDARD_SPEED)
 
 
-def lane_change(car: TestCar, track: str, speed: float) -> Fields:
+def make_lane_change(car: TestCar, track: str, speed: float) -> Fields:
     """A run through a track at a speed in m/s."""
-    last = sections(track, car.vehicle.width, 0.0, shortened(car))[-1]
+    last = make_sections(track, car.vehicle.width, 0.0, compute_length_share(car))[-1]
     way = last.start + last.length + RUN_OUT
     return {
         "steering": "driver",
         "path": track,
-        "path_speed": speed / shortened(car),
+        "path_speed": speed / compute_length_share(car),
         "onset": ONSET,
         "speed": speed,
         "acceleration": None if track == TRACKS[0] else 0.0,
@@ -114,31 +114,33 @@ def lane_change(car: TestCar, track: str, speed: float) -> Fields:
     }
 
 
-def check(series: Series, car: TestCar, track: str, speed: float) -> Pass:
+def evaluate_run(series: Series, car: TestCar, track: str, speed: float) -> TrackRun:
     """A run's margins."""
-    body = corners(series, car)
-    lanes = lanes_of(car, track, speed)
-    return Pass(speed, tuple(margin(body, lane) for lane in lanes), series)
+    body = compute_corners(series, car)
+    lanes = make_lanes(car, track, speed)
+    return TrackRun(speed, tuple(compute_margin(body, lane) for lane in lanes), series)
 
 
-def attempt(drive: Drive, car: TestCar, track: str, speed: float) -> Pass:
+def try_speed(drive: DriveFunction, car: TestCar, track: str, speed: float) -> TrackRun:
     """The first clean run of a driver at a speed in m/s, or the one that came closest to it."""
-    best: Pass | None = None
-    for driver in TRIES:
-        tried = check(drive({**lane_change(car, track, speed), **driver}), car, track, speed)
-        if tried.passed:
-            return tried
-        if best is None or tried.least > best.least:
-            best = tried
+    best: TrackRun | None = None
+    for driver in DRIVERS:
+        candidate = evaluate_run(
+            drive({**make_lane_change(car, track, speed), **driver}), car, track, speed
+        )
+        if candidate.passed:
+            return candidate
+        if best is None or candidate.min_margin > best.min_margin:
+            best = candidate
     assert best is not None
     return best
 
 
-def run(drive: Drive, car: TestCar, track: str, speeds: Sequence[float]) -> list[Pass]:
+def run(drive: DriveFunction, car: TestCar, track: str, speeds: Sequence[float]) -> list[TrackRun]:
     """One attempt at each of the speeds, m/s."""
-    return [attempt(drive, car, track, speed) for speed in speeds]
+    return [try_speed(drive, car, track, speed) for speed in speeds]
 
 
-def highest(runs: Sequence[Pass]) -> float:
+def find_highest_speed(runs: Sequence[TrackRun]) -> float:
     """The highest speed in m/s of a clean run; 0 where there is none."""
-    return max((each.speed for each in runs if each.passed), default=0.0)
+    return max((track_run.speed for track_run in runs if track_run.passed), default=0.0)

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...envs.task.reference import target_of
+from ...envs.task.reference import make_reference_params
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
-from .drive import Array, Drive, Fields, Series, TestCar
+from .drive import Array, DriveFunction, Fields, Series, TestCar
 
 SETTLE = 3.0  # s, at the first speed
 LINEAR_FROM, LINEAR_TO = 0.05 * GRAVITY, 0.25 * GRAVITY  # the range of the slope
@@ -27,12 +27,12 @@ class Handling:
     theory: float
 
 
-def gradient_of(vehicle: Vehicle) -> float:
+def compute_understeer_gradient(vehicle: Vehicle) -> float:
     """K in rad s2/m of the linear model."""
-    return float(target_of(vehicle).G) * vehicle.wheelbase
+    return float(make_reference_params(vehicle).G) * vehicle.wheelbase
 
 
-def circle(car: TestCar, steer: float, first: float, last: float, seconds: float) -> Fields:
+def make_circle(car: TestCar, steer: float, first: float, last: float, seconds: float) -> Fields:
     """A constant steering angle (rad) while the speed rises from the first to the last (m/s)."""
     return {
         "steering": "held-step",
@@ -46,7 +46,7 @@ def circle(car: TestCar, steer: float, first: float, last: float, seconds: float
     }
 
 
-def handling(series: Series, vehicle: Vehicle) -> Handling:
+def compute_handling(series: Series, vehicle: Vehicle) -> Handling:
     """The handling diagram of a circle, and the slope in its linear range.
 
     Raises ValueError where the car does not reach the linear range's end.
@@ -60,11 +60,17 @@ def handling(series: Series, vehicle: Vehicle) -> Handling:
     if a_y.max() < LINEAR_TO or linear.sum() < 2:
         raise ValueError(f"the circle reached {a_y.max():.2f} m/s2, not {LINEAR_TO:.2f}")
     slope = float(np.polyfit(a_y[linear], angle[linear], 1)[0])
-    return Handling(a_y, angle, -slope, gradient_of(vehicle))
+    return Handling(a_y, angle, -slope, compute_understeer_gradient(vehicle))
 
 
-def run(drive: Drive, car: TestCar, most: float = 0.5 * GRAVITY, seconds: float = 60.0) -> Handling:
-    """Drive a circle on which the linear car would reach `most` (m/s2) at the car's own speed."""
-    v, K = car.speed, gradient_of(car.vehicle)
-    steer = (car.vehicle.wheelbase / v**2 + K) * most
-    return handling(drive(circle(car, steer, 0.2 * v, v, seconds)), car.vehicle)
+def run(
+    drive: DriveFunction,
+    car: TestCar,
+    max_acceleration: float = 0.5 * GRAVITY,
+    seconds: float = 60.0,
+) -> Handling:
+    """Drive a circle on which the linear car would reach `max_acceleration` (m/s2) at the car's
+    own speed."""
+    v, K = car.speed, compute_understeer_gradient(car.vehicle)
+    steer = (car.vehicle.wheelbase / v**2 + K) * max_acceleration
+    return compute_handling(drive(make_circle(car, steer, 0.2 * v, v, seconds)), car.vehicle)

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.vehicle.linear import bicycle
+from ...envs.vehicle.linear import make_bicycle_model
 from ...envs.vehicle.vehicle import Vehicle
-from .drive import Array, Drive, Fields, Series, TestCar
+from .drive import Array, DriveFunction, Fields, Series, TestCar
 
 Complex = npt.NDArray[np.complex128]
 
@@ -48,7 +48,7 @@ class FrequencyResponse:
     sd: Array
 
 
-def step(car: TestCar, steer: float, seconds: float = 4.0) -> Fields:
+def make_step(car: TestCar, steer: float, seconds: float = 4.0) -> Fields:
     """A step of the steering angle (rad) that is held."""
     return {
         "steering": "held-step",
@@ -59,7 +59,7 @@ def step(car: TestCar, steer: float, seconds: float = 4.0) -> Fields:
     }
 
 
-def sweep(car: TestCar, steer: float, seconds: float = 100.0) -> Fields:
+def make_sweep(car: TestCar, steer: float, seconds: float = 100.0) -> Fields:
     """A sine of an amplitude (rad) whose frequency rises from 0.05 to 2.5 Hz.
 
     It has passed half a segment when it comes to the lowest frequency of the standard.
@@ -76,7 +76,7 @@ def sweep(car: TestCar, steer: float, seconds: float = 100.0) -> Fields:
     }
 
 
-def step_response(t: Array, steer: Array, output: Array) -> StepResponse:
+def compute_step_response(t: Array, steer: Array, output: Array) -> StepResponse:
     """The standard's numbers of a step that is held to the end; t, steer, output: (n,).
 
     The steady state is the mean of the last half second. Raises ValueError without a step.
@@ -86,17 +86,17 @@ def step_response(t: Array, steer: Array, output: Array) -> StepResponse:
         raise ValueError("a step response needs a steering angle at its end, got 0")
     steady = float(np.mean(output[t >= t[-1] - 0.5]))
     share = output / steady
-    start = _crossing(t, steer / end, 0.5)
+    start = _find_crossing(t, steer / end, 0.5)
     peak = int(np.argmax(share))
     return StepResponse(
         steady / end,
-        _crossing(t, share, 0.9) - start,
+        _find_crossing(t, share, 0.9) - start,
         float(t[peak]) - start,
         max(0.0, float(share[peak]) - 1.0),
     )
 
 
-def _crossing(t: Array, values: Array, level: float) -> float:
+def _find_crossing(t: Array, values: Array, level: float) -> float:
     """When the values first pass the level, on the line between two samples."""
     k = int(np.argmax(values >= level))
     if k == 0:
@@ -105,7 +105,9 @@ def _crossing(t: Array, values: Array, level: float) -> float:
     return float(t[k - 1] + part * (t[k] - t[k - 1]))
 
 
-def measured(t: Array, steer: Array, output: Array, segment: float = SEGMENT) -> FrequencyResponse:
+def estimate_frequency_response(
+    t: Array, steer: Array, output: Array, segment: float = SEGMENT
+) -> FrequencyResponse:
     """The frequency response of output to steering between 0.2 and 2 Hz; t, steer, output: (n,)."""
     from scipy.signal import csd, welch
 
@@ -113,21 +115,21 @@ def measured(t: Array, steer: Array, output: Array, segment: float = SEGMENT) ->
     length = round(segment * rate)
     if length > len(t):
         raise ValueError(f"a segment of {segment} s is longer than the {t[-1] - t[0]:.1f} s driven")
-    how = {"fs": rate, "nperseg": length, "detrend": False}
-    frequency, S_xx = welch(steer, **how)
-    S_yy, S_xy = welch(output, **how)[1], csd(steer, output, **how)[1]
+    options = {"fs": rate, "nperseg": length, "detrend": False}
+    frequency, S_xx = welch(steer, **options)
+    S_yy, S_xy = welch(output, **options)[1], csd(steer, output, **options)[1]
     half = 0.5 / segment  # between two lines: rounding decides nothing
-    seen = (frequency > LOWEST - half) & (frequency < HIGHEST + half)
-    H = (S_xy / S_xx)[seen]
-    coherence = (np.abs(S_xy) ** 2 / (S_xx * S_yy))[seen]
+    in_range = (frequency > LOWEST - half) & (frequency < HIGHEST + half)
+    H = (S_xy / S_xx)[in_range]
+    coherence = (np.abs(S_xy) ** 2 / (S_xx * S_yy))[in_range]
     segments = 2 * len(t) // length - 1  # they overlap by half
     sd = np.abs(H) * np.sqrt((1.0 - coherence) / (2.0 * coherence * segments))
-    return FrequencyResponse(frequency[seen], H, coherence, sd)
+    return FrequencyResponse(frequency[in_range], H, coherence, sd)
 
 
-def linear_response(vehicle: Vehicle, speed: float, frequency: Array) -> dict[str, Complex]:
+def compute_linear_response(vehicle: Vehicle, speed: float, frequency: Array) -> dict[str, Complex]:
     """(k,) of the linear model's yaw rate and lateral acceleration to steering, by output."""
-    model = bicycle(vehicle, speed)
+    model = make_bicycle_model(vehicle, speed)
     B = model.B[:, 0]
     turned = [np.linalg.solve(2j * np.pi * f * np.eye(2) - model.A, B) for f in frequency]
     beta, gamma = np.array(turned).T
@@ -135,26 +137,33 @@ def linear_response(vehicle: Vehicle, speed: float, frequency: Array) -> dict[st
     return {"gamma": gamma, "a_y": a_y}
 
 
-def linear_step(vehicle: Vehicle, speed: float, series: Series) -> dict[str, StepResponse]:
+def compute_linear_step(vehicle: Vehicle, speed: float, series: Series) -> dict[str, StepResponse]:
     """The numbers of the linear model under the same steering, by output."""
     from scipy.signal import lsim
 
-    model = bicycle(vehicle, speed)
+    model = make_bicycle_model(vehicle, speed)
     A, B = model.A, model.B[:, :1]
     C = np.vstack([[0.0, 1.0], speed * (A[0] + [0.0, 1.0])])
     D = np.array([[0.0], [speed * B[0, 0]]])
     outputs = lsim((A, B, C, D), series.steer, series.t)[1]
     return {
-        name: step_response(series.t, series.steer, outputs[:, i]) for i, name in enumerate(OUTPUTS)
+        name: compute_step_response(series.t, series.steer, outputs[:, i])
+        for i, name in enumerate(OUTPUTS)
     }
 
 
-def responses(series: Series) -> dict[str, StepResponse]:
+def compute_responses(series: Series) -> dict[str, StepResponse]:
     """The numbers of yaw rate and lateral acceleration after a step."""
-    return {name: step_response(series.t, series.steer, getattr(series, name)) for name in OUTPUTS}
+    return {
+        name: compute_step_response(series.t, series.steer, getattr(series, name))
+        for name in OUTPUTS
+    }
 
 
-def run_sweep(drive: Drive, car: TestCar, steer: float) -> dict[str, FrequencyResponse]:
+def run_sweep(drive: DriveFunction, car: TestCar, steer: float) -> dict[str, FrequencyResponse]:
     """The frequency responses of yaw rate and lateral acceleration."""
-    series = drive(sweep(car, steer))
-    return {name: measured(series.t, series.steer, getattr(series, name)) for name in OUTPUTS}
+    series = drive(make_sweep(car, steer))
+    return {
+        name: estimate_frequency_response(series.t, series.steer, getattr(series, name))
+        for name in OUTPUTS
+    }

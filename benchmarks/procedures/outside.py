@@ -11,13 +11,13 @@ from typing import Any
 
 from ...agents import make_agent
 from ...agents.rollout import rollout
-from ...envs.outside.plants import outside_vehicle
+from ...envs.outside.plants import make_outside_vehicle
 from ...envs.vehicle.dynamics import Motion
 from ...envs.vehicle.vehicle import GRAVITY
 from ..harness.drives import make_env
 from . import fmvss126
-from .contestants import OUTSIDE_ID, Contestant, outside_car
-from .drive import Law, of_plant
+from .contestants import OUTSIDE_ID, ProcedureEntry, make_outside_car
+from .drive import Law, make_plant_drive
 
 MODEL = "drift"
 LIMIT = 500.0  # N m
@@ -40,19 +40,21 @@ SCENARIO: dict[str, Any] = {
 """A lane change within what the outside car was made for, drawn by the seed."""
 
 
-def within_limit(motion: Motion, steer: float) -> float:
+def compute_limited_moment(motion: Motion, steer: float) -> float:
     """The check's yaw moment in N m."""
-    most = 0.85 * GRAVITY * outside_vehicle().friction / motion.v_x
-    goal = min(max(motion.v_x * steer / outside_vehicle().wheelbase, -most), most)
+    max_yaw_rate = 0.85 * GRAVITY * make_outside_vehicle().friction / motion.v_x
+    goal = min(
+        max(motion.v_x * steer / make_outside_vehicle().wheelbase, -max_yaw_rate), max_yaw_rate
+    )
     return float(min(max(GAIN * (goal - motion.gamma), -LIMIT), LIMIT))
 
 
 @dataclass(frozen=True)
-class Check:
+class OutsideCheck:
     """Both halves of the check, each steered to both sides."""
 
-    none: fmvss126.Result
-    law: fmvss126.Result
+    none: fmvss126.SineDwellResult
+    law: fmvss126.SineDwellResult
 
     @property
     def reproduced(self) -> bool:
@@ -60,19 +62,21 @@ class Check:
         return not any(run.passed for run in self.none.runs) and self.law.passed
 
 
-def check(model: str = MODEL) -> Check:
+def run_check(model: str = MODEL) -> OutsideCheck:
     """Drive it; A is the uncontrolled car's."""
-    car = outside_car()
-    A = fmvss126.steering_for(of_plant(model), car)
+    car = make_outside_car()
+    A = fmvss126.measure_reference_angle(make_plant_drive(model), car)
 
-    def at(multiple: float, law: Law | None) -> fmvss126.Result:
-        return fmvss126.run(of_plant(model, law), car, A, [multiple])
+    def run_multiple(multiple: float, law: Law | None) -> fmvss126.SineDwellResult:
+        return fmvss126.run(make_plant_drive(model, law), car, A, [multiple])
 
-    return Check(at(FAILS_AT, None), at(PASSES_AT, within_limit))
+    return OutsideCheck(
+        run_multiple(FAILS_AT, None), run_multiple(PASSES_AT, compute_limited_moment)
+    )
 
 
 @dataclass(frozen=True)
-class Episode:
+class OutsideEpisode:
     """One seed: the cost, whether it failed, the peak of the slip in rad."""
 
     cost: float
@@ -80,11 +84,11 @@ class Episode:
     peak: float
 
 
-def episodes(model: str, contestant: Contestant, seeds: Sequence[int]) -> list[Episode]:
+def run_episodes(model: str, entry: ProcedureEntry, seeds: Sequence[int]) -> list[OutsideEpisode]:
     """A contestant on an outside plant."""
     options: dict[str, Any] = {"model": model, "scenario": SCENARIO, "reference": "limited"}
-    who, estimator, estimate = contestant.on(model)
+    agent_name, estimator, estimate = entry.get_configuration(model)
     env = make_env(OUTSIDE_ID, estimator, estimate, **options)
-    agent = make_agent(who, env)
-    driven = [rollout(env, agent, seed) for seed in seeds]
-    return [Episode(d.cost, d.failed, float(abs(d["beta"]).max())) for d in driven]
+    agent = make_agent(agent_name, env)
+    rollouts = [rollout(env, agent, seed) for seed in seeds]
+    return [OutsideEpisode(d.cost, d.failed, float(abs(d["beta"]).max())) for d in rollouts]

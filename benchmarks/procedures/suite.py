@@ -10,10 +10,10 @@ from ...envs.outside.plants import OUTSIDE_PLANTS
 from ...envs.vehicle.vehicle import GRAVITY
 from ..harness.parallel import run_cases
 from ..harness.results import Suite
-from ..harness.verdict import some, verdict
+from ..harness.verdict import format_verdict, summarise_names
 from . import fmvss126, iso3888, iso4138, iso7401, outside, tables
-from .cases import NAME, Case, Done, Sine, Transient, of
-from .contestants import CARS, CONTESTANTS
+from .cases import NAME, CaseResults, ProcedureCase, SineDwellOutcome, Transient, select_cases
+from .contestants import CARS, ENTRIES
 
 SHOWN = 5.0  # of A: the sine with dwell in the figures
 QUICK_MULTIPLES = (1.5, 3.0, 5.0, 6.5)  # of A
@@ -36,70 +36,80 @@ _OUTSIDE = (
 _NONE_OUTSIDE = " Outside plants are left out: pip install 'sideslip[outside]'."
 
 
-def measure(case: Case) -> Any:
+def measure(case: ProcedureCase) -> Any:
     """Drive a case: what its procedure gives."""
     if case.procedure == "outside":
-        return outside.episodes(case.car, CONTESTANTS[case.contestant], case.seeds)
+        return outside.run_episodes(case.car, ENTRIES[case.contestant], case.seeds)
     if case.procedure == "check":
-        return outside.check()
-    car, drive = CARS[case.car], CONTESTANTS[case.contestant].drive(case.car)
+        return outside.run_check()
+    car, drive = CARS[case.car], ENTRIES[case.contestant].drive(case.car)
     if case.procedure == "fmvss-126":
-        A = fmvss126.steering_for(CONTESTANTS[0].drive(case.car), car)
+        A = fmvss126.measure_reference_angle(ENTRIES[0].drive(case.car), car)
         result = fmvss126.run(drive, car, A, QUICK_MULTIPLES if case.quick else None)
-        return Sine(result, drive(fmvss126.sine_with_dwell(car, SHOWN * A)))
+        return SineDwellOutcome(result, drive(fmvss126.make_sine_with_dwell(car, SHOWN * A)))
     if case.procedure in iso3888.TRACKS:
         shares = np.arange(0.5, 1.25, 0.15 if case.quick else 0.05)
         return iso3888.run(drive, car, case.procedure, (car.speed * shares).tolist())
     if case.procedure == "iso-4138":
         return iso4138.run(drive, car)
-    return _transient(case)
+    return _measure_transient(case)
 
 
-def _transient(case: Case) -> Transient:
-    car, drive = CARS[case.car], CONTESTANTS[case.contestant].drive(case.car)
-    per = car.vehicle.wheelbase / car.speed**2 + iso4138.gradient_of(car.vehicle)  # rad s2/m
-    stepped = drive(iso7401.step(car, per * STEP_AT))
+def _measure_transient(case: ProcedureCase) -> Transient:
+    car, drive = CARS[case.car], ENTRIES[case.contestant].drive(case.car)
+    per = car.vehicle.wheelbase / car.speed**2 + iso4138.compute_understeer_gradient(
+        car.vehicle
+    )  # rad s2/m
+    stepped = drive(iso7401.make_step(car, per * STEP_AT))
     sweep = iso7401.run_sweep(drive, car, per * SWEEP_AT)
     frequency = sweep[iso7401.OUTPUTS[0]].frequency
     return Transient(
-        iso7401.responses(stepped),
-        iso7401.linear_step(car.vehicle, car.speed, stepped),
+        iso7401.compute_responses(stepped),
+        iso7401.compute_linear_step(car.vehicle, car.speed, stepped),
         sweep,
-        iso7401.linear_response(car.vehicle, car.speed, frequency),
+        iso7401.compute_linear_response(car.vehicle, car.speed, frequency),
     )
 
 
-def cases_of(quick: bool) -> list[Case]:
+def make_cases(quick: bool) -> list[ProcedureCase]:
     """Everything that is driven; outside plants only where their extra is installed."""
-    contestants = [k for k, each in enumerate(CONTESTANTS) if not (quick and each.slow)]
+    indices = [k for k, entry in enumerate(ENTRIES) if not (quick and entry.slow)]
     driven = ("fmvss-126", *iso3888.TRACKS)
-    cases = [Case(p, car, k, (), quick) for p in driven for car in CARS for k in contestants]
-    cases += [Case(p, car) for p in ("iso-4138", "iso-7401") for car in CARS]
+    cases = [ProcedureCase(p, car, k, (), quick) for p in driven for car in CARS for k in indices]
+    cases += [ProcedureCase(p, car) for p in ("iso-4138", "iso-7401") for car in CARS]
     if find_spec("vehiclemodels") is None:
         return cases
-    cases.append(Case("check", outside.MODEL))
+    cases.append(ProcedureCase("check", outside.MODEL))
     seeds = tuple(range(QUICK_EPISODES if quick else EPISODES))
-    known = [k for k in contestants if CONTESTANTS[k].agent != "feedforward"]
-    cases += [Case("outside", model, k, seeds) for model in OUTSIDE_PLANTS for k in known]
+    known = [k for k in indices if ENTRIES[k].agent != "feedforward"]
+    cases += [ProcedureCase("outside", model, k, seeds) for model in OUTSIDE_PLANTS for k in known]
     return cases
 
 
-def answer(done: Done) -> str:
+def make_verdict(done: CaseResults) -> str:
     """The verdict: on each car, who passes the sine with dwell, and how fast the lanes are."""
     passed, lanes = [], []
     for car in CARS:
-        mine = {case: found for case, found in done.items() if case.car == car}
-        sines = {name_of(case): found.result for case, found in of(mine, "fmvss-126").items()}
-        whole = [name for name, each in sines.items() if each.passed]
-        least = min(sines, key=lambda name: sines[name].highest)
-        failing = f"; {least} fails above {sines[least].highest:.3g} A" * (least not in whole)
-        passed.append(f"{car}: {some(whole, 4)}{failing}.")
-        runs = of(mine, next(iter(iso3888.TRACKS)))
-        speeds = {name_of(case): 3.6 * iso3888.highest(each) for case, each in runs.items()}
-        most = max(speeds.values())
-        fast = some([name for name, speed in speeds.items() if speed == most])
-        lanes.append(f"{car} {most:.0f} with {fast} (none {speeds['none']:.0f})")
-    return verdict(
+        car_results = {case: result for case, result in done.items() if case.car == car}
+        sines = {
+            get_controller_name(case): result.result
+            for case, result in select_cases(car_results, "fmvss-126").items()
+        }
+        passing = [name for name, item in sines.items() if item.passed]
+        weakest = min(sines, key=lambda name: sines[name].highest)
+        failing = f"; {weakest} fails above {sines[weakest].highest:.3g} A" * (
+            weakest not in passing
+        )
+        passed.append(f"{car}: {summarise_names(passing, 4)}{failing}.")
+        runs = select_cases(car_results, next(iter(iso3888.TRACKS)))
+        speeds = {
+            get_controller_name(case): 3.6 * iso3888.find_highest_speed(item)
+            for case, item in runs.items()
+        }
+        max_speed = max(speeds.values())
+        fast = summarise_names([name for name, speed in speeds.items() if speed == max_speed])
+        lanes.append(f"{car} {max_speed:.0f} with {fast} (none {speeds['none']:.0f})")
+    return format_verdict(
         "FMVSS 126, no spin after a hard swerve of up to 6.5 A (A: the steering of 0.3 g), passes:",
         *passed,
         f"Fastest clean lane change, km/h: {'; '.join(lanes)}.",
@@ -107,19 +117,21 @@ def answer(done: Done) -> str:
     )
 
 
-def name_of(case: Case) -> str:
+def get_controller_name(case: ProcedureCase) -> str:
     """The controller of a case."""
-    return CONTESTANTS[case.contestant].agent
+    return ENTRIES[case.contestant].agent
 
 
 def run(quick: bool = False, jobs: int | None = None, console: Console | None = None) -> Suite:
     """Every procedure for both cars and every contestant, and the outside plants."""
-    cases = cases_of(quick)
+    cases = make_cases(quick)
     done = dict(zip(cases, run_cases(measure, cases, NAME, jobs, console), strict=True))
-    there = any(case.procedure == "outside" for case in cases)
-    suite = Suite(NAME, "Standard test procedures", _TEXT + (_OUTSIDE if there else _NONE_OUTSIDE))
+    has_outside = any(case.procedure == "outside" for case in cases)
+    suite = Suite(
+        NAME, "Standard test procedures", _TEXT + (_OUTSIDE if has_outside else _NONE_OUTSIDE)
+    )
     tables.add(suite, done)
-    suite.verdict = answer(done)
+    suite.verdict = make_verdict(done)
     try:
         from . import figures as draw
     except ModuleNotFoundError:

@@ -16,16 +16,16 @@ from scipy.stats import t as student
 
 from ...envs.backend.decorators import jit
 from ...envs.record import FAST, PACKET, Array, Log
-from ...envs.vehicle.dynamics import Car, Motion, Push, Road, derivative
+from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams, derivative
 from ...envs.vehicle.integration import rk4
-from ...envs.vehicle.tyres import LINEAR, TYRE_LAWS, Inputs, load_of
+from ...envs.vehicle.tyres import LINEAR, TYRE_LAWS, TyreInputs, compute_tyre_load
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
-from .emulate import ground_speed, heading
-from .noises import noise_levels
+from .emulate import compute_ground_speed, compute_heading
+from .noises import estimate_noise_levels
 
 STEP, SMOOTH = 0.01, 0.03  # s: of the fit's grid, of the mean over a log's rows
 BURN, WINDOW, MARGIN = 1.0, 4.0, 0.3  # s: forgets the start, counts, lets channels be late
-LEAST_SPEED = 4.0  # m/s, in a window
+MIN_SPEED = 4.0  # m/s, in a window
 STRETCHES = 40  # at most, of the log, which the intervals take for independent
 
 
@@ -78,17 +78,17 @@ class Windows:
     spread: Theta = PRIOR
 
     @property
-    def counted(self) -> npt.NDArray[np.int64]:
+    def scored_rows(self) -> npt.NDArray[np.int64]:
         """(count, rows): places of the rows that count."""
         first, count = round(BURN / self.dt), round(WINDOW / self.dt)
         return self.starts[:, None] + np.arange(first + 1, first + count + 1)
 
-    def some(self, wanted: npt.NDArray[np.bool_]) -> "Windows":
+    def select(self, wanted: npt.NDArray[np.bool_]) -> "Windows":
         """Those of a mask."""
         return replace(self, starts=self.starts[wanted], stretch=self.stretch[wanted])
 
 
-def windows_of(logs: Sequence[Log], left_out: Sequence[npt.NDArray[np.bool_]]) -> Windows:
+def make_windows(logs: Sequence[Log], left_out: Sequence[npt.NDArray[np.bool_]]) -> Windows:
     """Windows of drives of one dt; left_out: of each drive, the rows that are not to be used."""
     dt, first = logs[0].record.dt, 0
     every, width = max(round(STEP / dt), 1), max(round(SMOOTH / dt), 1)
@@ -97,18 +97,19 @@ def windows_of(logs: Sequence[Log], left_out: Sequence[npt.NDArray[np.bool_]]) -
     for log, out in zip(logs, left_out, strict=True):
         fast = log.record.fast.T
         rows = np.stack([
-            fast[FAST.gyro], fast[FAST.accel_y], ground_speed(log), fast[FAST.steer],
-            fast[FAST.torque_left], fast[FAST.torque_right], heading(log), np.zeros(len(log.time)),
+            fast[FAST.gyro], fast[FAST.accel_y], compute_ground_speed(log), fast[FAST.steer],
+            fast[FAST.torque_left], fast[FAST.torque_right], compute_heading(log),
+            np.zeros(len(log.time)),
         ])  # fmt: skip
         rows = uniform_filter1d(rows, width, axis=1, mode="nearest")
         if every > 1:  # an input acts for the whole step up to its row
             rows[3:6] = uniform_filter1d(rows[3:6], every, axis=1, origin=(every - 1) // 2)
         bad = np.maximum.reduceat(out, np.arange(0, len(out), every))
         rows = rows[:, ::every]
-        rows[7] = _courses(log, every, rows.shape[1])
+        rows[7] = _compute_courses(log, every, rows.shape[1])
         for start in range(before, rows.shape[1] - after, round(WINDOW / (every * dt))):
             piece = slice(start, start + after)
-            if not bad[piece].any() and rows[2, piece].min() >= LEAST_SPEED:
+            if not bad[piece].any() and rows[2, piece].min() >= MIN_SPEED:
                 starts.append(first + start)
         first += rows.shape[1]
         pieces.append(rows)
@@ -116,56 +117,58 @@ def windows_of(logs: Sequence[Log], left_out: Sequence[npt.NDArray[np.bool_]]) -
     stretch = np.arange(count) * min(STRETCHES, count) // max(count, 1)
     accel = all("accel_y" in log.record.present for log in logs)
     rows = np.ascontiguousarray(np.concatenate(pieces, axis=1))
-    made = Windows(rows, np.array(starts, np.int64), stretch, every * dt, accel, False)
-    return replace(made, course=bool(np.isfinite(rows[7][made.counted]).any()))
+    windows = Windows(rows, np.array(starts, np.int64), stretch, every * dt, accel, False)
+    return replace(windows, course=bool(np.isfinite(rows[7][windows.scored_rows]).any()))
 
 
-def _courses(log: Log, every: int, count: int) -> Array:
+def _compute_courses(log: Log, every: int, count: int) -> Array:
     """(count,): the GPS's course less the gyro's integral, in every so-manieth row of the log, NaN
     in those without a fix."""
     courses = np.full(count, np.nan)
-    packets = log.record.packets_of("gps")
+    packets = log.record.select_packets("gps")
     fixes = packets[(packets[:, PACKET.quality] > 0.0) & np.isfinite(packets[:, PACKET.value])]
     places = fixes[:, PACKET.captured] - log.record.first
-    turned = np.interp(places, np.arange(len(log.time)), heading(log))
+    turned = np.interp(places, np.arange(len(log.time)), compute_heading(log))
     near = np.clip(np.rint(places / every).astype(np.int64), 0, count - 1)
     courses[near] = np.unwrap(fixes[:, PACKET.value] - turned)
     return courses
 
 
 @jit
-def _load(rows: Any, i: Any, place: Any, theta: Any, car: Any) -> Any:
+def _compute_load(rows: Any, i: Any, place: Any, theta: Any, car: Any) -> Any:
     """The plant's load in row i with the steering logged at a place between the rows."""
     j = min(max(int(np.floor(place)), 0), rows.shape[1] - 2)
     logged = rows[3, j] + (place - j) * (rows[3, j + 1] - rows[3, j])
-    return load_of(Inputs(theta[3] * logged + theta[4], rows[4, i], rows[5, i]), car, 0, 1)
+    return compute_tyre_load(
+        TyreInputs(theta[3] * logged + theta[4], rows[4, i], rows[5, i]), car, 0, 1
+    )
 
 
 @jit
-def _drive(
+def _simulate_windows(
     rows: Any, starts: Any, theta: Any, fixed: Any, law: int, roll: int, h: float, out: Any
 ) -> None:
     """Fill out (3, windows, rows) with yaw rate, lateral specific force and sideslip angle at the
     GPS's antenna by the plant."""
     m, l_f, l_r, mu = fixed[0], fixed[2], fixed[3], fixed[9]
-    car = Car(
+    car = CarParams(
         m, fixed[1] * np.exp(theta[2]), l_f, l_r, fixed[4] * np.exp(theta[0]),
         fixed[5] * np.exp(theta[1]), fixed[6], fixed[7], fixed[8], 1.0, mu, 0.0,
         fixed[10], fixed[11], fixed[12], fixed[13], fixed[14], 0.0, 0.0, mu, 0.0, 0.0,
     )  # fmt: skip
-    road, push = Road(0.0, 0.0, 1.0, 0.0, 0.0, 0.0), Push(0.0, 0.0, 0.0)
+    road, push = RoadParams(0.0, 0.0, 1.0, 0.0, 0.0, 0.0), DisturbanceForces(0.0, 0.0, 0.0)
     for w in range(len(starts)):
         at = starts[w]
         V, gamma = rows[2, at], rows[0, at] - theta[5]
         v_y = l_r * gamma - m * l_f * V * V * gamma / (2.0 * car.C_r * (l_f + l_r))
         phi = phi_dot = 0.0
-        after = _load(rows, at, at + 0.5 + theta[8] / h, theta, car)
+        after = _compute_load(rows, at, at + 0.5 + theta[8] / h, theta, car)
         for k in range(out.shape[2]):
             i = at + k + 1
             V = 0.5 * (rows[2, i - 1] + rows[2, i])
             late = i + theta[8] / h  # a row's steering is that of the middle of its step
-            before, after = after, _load(rows, i, late + 0.5, theta, car)
-            loads = (before, _load(rows, i, late, theta, car), after)
+            before, after = after, _compute_load(rows, i, late + 0.5, theta, car)
+            loads = (before, _compute_load(rows, i, late, theta, car), after)
             motion = Motion(V, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_dot)
             motion = rk4(motion, loads, push, car, road, h, 0, law, roll)
             v_y, gamma, phi, phi_dot = motion.v_y, motion.gamma, motion.phi, motion.phi_dot
@@ -175,7 +178,7 @@ def _drive(
             out[2, w, k] = np.arctan2(v_y + fixed[15] * gamma, V)
 
 
-def residual(car: Vehicle, theta: Theta, w: Windows) -> Array:
+def compute_residual(car: Vehicle, theta: Theta, w: Windows) -> Array:
     """(windows, channels, rows): measured less predicted yaw rate and, if logged, acceleration and
     course, which begins anew in each window and is 0 in rows without a fix."""
     first, count = round(BURN / w.dt), round(WINDOW / w.dt)
@@ -187,38 +190,44 @@ def residual(car: Vehicle, theta: Theta, w: Windows) -> Array:
         car.gravity_height, car.antenna_ahead,
     ])  # fmt: skip
     law = TYRE_LAWS.index(w.tyres)
-    _drive(w.rows, w.starts, np.array(theta), fixed, law, int(law != LINEAR), w.dt, out)
+    _simulate_windows(w.rows, w.starts, np.array(theta), fixed, law, int(law != LINEAR), w.dt, out)
 
-    def late(values: Array, delay: float) -> Array:
+    def interpolate_late(values: Array, delay: float) -> Array:
         places = np.arange(first, first + count) - delay / w.dt
         below = np.clip(places.astype(np.int64), 0, out.shape[2] - 2)
         return np.asarray(
             values[:, below] + (places - below) * (values[:, below + 1] - values[:, below])
         )
 
-    rate = w.rows[0][w.counted] - out[0, :, first : first + count] - theta.gyro_bias
-    left = [rate]
+    rate = w.rows[0][w.scored_rows] - out[0, :, first : first + count] - theta.gyro_bias
+    channels = [rate]
     if w.accel:
-        felt = theta.accel_gain * late(out[1], theta.accel_delay) + theta.accel_bias
-        left.append(w.rows[1][w.counted] - felt)
+        felt = theta.accel_gain * interpolate_late(out[1], theta.accel_delay) + theta.accel_bias
+        channels.append(w.rows[1][w.scored_rows] - felt)
     if w.course:
         turned = w.rows[6][w.starts[:, None] + np.arange(1, out.shape[2] + 1)]
         moved = out[2] + turned - theta.gyro_bias * w.dt * np.arange(out.shape[2])
-        course = w.rows[7][w.counted] + w.rows[6][w.counted] - late(moved, theta.gps_delay)
+        course = (
+            w.rows[7][w.scored_rows]
+            + w.rows[6][w.scored_rows]
+            - interpolate_late(moved, theta.gps_delay)
+        )
         fixes = np.isfinite(course)
         course = np.where(fixes, course, 0.0)
         middle = course.sum(axis=1) / np.maximum(fixes.sum(axis=1), 1)
-        left.append(np.where(fixes, course - middle[:, None], 0.0))
-    return np.stack(left, axis=1)
+        channels.append(np.where(fixes, course - middle[:, None], 0.0))
+    return np.stack(channels, axis=1)
 
 
-def errors(car: Vehicle, theta: Theta, w: Windows) -> Array:
+def compute_errors(car: Vehicle, theta: Theta, w: Windows) -> Array:
     """RMS of the residual of yaw rate and, if logged, acceleration, in rad/s and m/s2."""
-    return np.asarray(np.sqrt(np.mean(residual(car, theta, w) ** 2, axis=(0, 2))))[: 1 + w.accel]
+    return np.asarray(np.sqrt(np.mean(compute_residual(car, theta, w) ** 2, axis=(0, 2))))[
+        : 1 + w.accel
+    ]
 
 
 @dataclass(frozen=True)
-class Fit:
+class BicycleFit:
     """A fitted `Theta`, its free ones, and every stretch's normal equations there.
 
     scale: of the channels' residuals, by which the fit is weighted. H (stretches, n, n), g
@@ -234,10 +243,10 @@ class Fit:
     prior: Array
     pull: Array
 
-    def without(self, gone: npt.NDArray[np.bool_]) -> Array:
+    def estimate_shift(self, left_out: npt.NDArray[np.bool_]) -> Array:
         """(n,) by how much the free ones move, to first order, when stretches are left out."""
-        rest = self.H[~gone].sum(axis=0) + np.diag(self.prior)
-        return np.asarray(-np.linalg.solve(rest, self.g[~gone].sum(axis=0) + self.pull))
+        rest = self.H[~left_out].sum(axis=0) + np.diag(self.prior)
+        return np.asarray(-np.linalg.solve(rest, self.g[~left_out].sum(axis=0) + self.pull))
 
     def half(self, name: str) -> float:
         """Half of the 95 % interval; infinite if it is not free: a jackknife over stretches, and
@@ -246,7 +255,7 @@ class Fit:
         if name not in self.free or count < 2:
             return float("inf")
         at = self.free.index(name)
-        moves = np.array([self.without(one) for one in np.eye(count, dtype=bool)])
+        moves = np.array([self.estimate_shift(one) for one in np.eye(count, dtype=bool)])
         pulled = np.linalg.inv(self.H.sum(axis=0) + np.diag(self.prior))[at]
         variance = (count - 1) / count * np.sum(moves[:, at] ** 2) + pulled**2 @ self.prior
         return float(student.ppf(0.975, count - 1) * np.sqrt(variance))
@@ -254,36 +263,41 @@ class Fit:
 
 def fit(
     car: Vehicle, w: Windows, start: Theta, free: Sequence[str], scale: Array | None = None
-) -> Fit:
+) -> BicycleFit:
     """Least squares of the `free` ones of `start`; scale: of the channels, None: found here."""
     at = [Theta._fields.index(name) for name in free]
     low, high, centre, sd = _LOW[at], _HIGH[at], np.array(w.centre)[at], np.array(w.spread)[at]
     steps = (_STEPS * (1, 1, 1, abs(start.gain), *7 * (1,)))[at]
 
-    def whole(x: Array) -> Theta:
+    def make_theta(x: Array) -> Theta:
         return start._replace(**dict(zip(free, x.tolist(), strict=True)))
 
-    def weighted(x: Array, scale: Array) -> Array:
-        left = residual(car, whole(x), w) / scale[:, None]
+    def compute_weighted(x: Array, scale: Array) -> Array:
+        left = compute_residual(car, make_theta(x), w) / scale[:, None]
         return np.concatenate([left.ravel(), (x - centre) / sd])
 
     def jacobian(x: Array, scale: Array) -> Array:
-        ahead = np.array([weighted(each, scale) for each in x + np.diag(steps)])
-        return np.asarray(((ahead - weighted(x, scale)) / steps[:, None]).T)
+        shifted = np.array([compute_weighted(point, scale) for point in x + np.diag(steps)])
+        return np.asarray(((shifted - compute_weighted(x, scale)) / steps[:, None]).T)
 
     x = np.clip(np.array(start)[at], low, high)
-    for most in (60,) if scale is not None else (10, 10, 60):
-        now = noise_levels(residual(car, whole(x), w), w.dt) if scale is None else scale
-        found = least_squares(
-            weighted, x, jacobian, (low, high), x_scale=10.0 * steps, args=(now,), max_nfev=most,
+    for max_evaluations in (60,) if scale is not None else (10, 10, 60):
+        now = (
+            estimate_noise_levels(compute_residual(car, make_theta(x), w), w.dt)
+            if scale is None
+            else scale
+        )
+        solution = least_squares(
+            compute_weighted, x, jacobian, (low, high), x_scale=10.0 * steps, args=(now,),
+            max_nfev=max_evaluations,
             xtol=1e-6, ftol=1e-7,
         )  # fmt: skip
-        x = found.x
+        x = solution.x
     J, r = (
         part[: -len(at)].reshape(len(w.starts), -1, *part.shape[1:])
-        for part in (found.jac, found.fun)
+        for part in (solution.jac, solution.fun)
     )
-    of = (w.stretch[:, None] == np.unique(w.stretch)).astype(float)  # (windows, stretches)
-    H = np.einsum("ws,wki,wkj->sij", of, J, J, optimize=True)
-    g = np.einsum("ws,wki,wk->si", of, J, r, optimize=True)
-    return Fit(whole(x), tuple(free), now, H, g, sd**-2.0, (x - centre) / sd**2)
+    membership = (w.stretch[:, None] == np.unique(w.stretch)).astype(float)  # (windows, stretches)
+    H = np.einsum("ws,wki,wkj->sij", membership, J, J, optimize=True)
+    g = np.einsum("ws,wki,wk->si", membership, J, r, optimize=True)
+    return BicycleFit(make_theta(x), tuple(free), now, H, g, sd**-2.0, (x - centre) / sd**2)

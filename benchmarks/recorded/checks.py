@@ -11,10 +11,10 @@ from scipy.stats import linregress
 
 from ...envs.record import FAST, Array, Log
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
-from .emulate import backward, course_steps, ground_speed
-from .emulate import moving as moving
+from .emulate import compute_course_steps, compute_ground_speed, find_backward
+from .emulate import find_moving as find_moving
 
-LEAST_RELATED = 0.5  # correlation, below which steering and yaw rate have nothing in common
+MIN_CORRELATION = 0.5  # correlation, below which steering and yaw rate have nothing in common
 TRUTH = "the sideslip truth"  # how a warning begins that puts the score in doubt
 COMPASS = "degrees from north, clockwise? --map course_degnorth=COLUMN reads it"
 FACTOR = 1.8  # by which a column may differ from what the others imply
@@ -46,52 +46,52 @@ _GUESSES = {  # a ratio of steering angles, and what it looks like from there on
 }
 
 
-def _raw(log: Log) -> dict[str, Array]:
+def _get_columns(log: Log) -> dict[str, Array]:
     """The columns that a log has, by name, (rows,) each."""
     names = {"gyro", "accel_y", "accel_x", "steer"} & set(log.record.present)
-    found = {name: log.record.fast[:, getattr(FAST, name)] for name in names}
-    found |= {TRUTH: log.truth["beta"]} if "beta" in log.truth else {}
-    return {"speed": ground_speed(log), **found}
+    columns = {name: log.record.fast[:, getattr(FAST, name)] for name in names}
+    columns |= {TRUTH: log.truth["beta"]} if "beta" in log.truth else {}
+    return {"speed": compute_ground_speed(log), **columns}
 
 
-def _jumps(log: Log, name: str) -> npt.NDArray[np.bool_]:
+def _find_jumps(log: Log, name: str) -> npt.NDArray[np.bool_]:
     """The rows of a column beside a jump that no car makes, or between two."""
-    x = _raw(log)[name]
-    known = np.isfinite(x) & (moving(log) | (name == "speed")) & ~backward(log)
+    x = _get_columns(log)[name]
+    known = np.isfinite(x) & (find_moving(log) | (name == "speed")) & ~find_backward(log)
     if known.sum() < _FEW:
         return np.zeros(len(x), np.bool_)
     x = np.interp(log.time, log.time[known], x[known])
     steps = np.abs(np.diff(x, prepend=x[0]))
     if name == TRUTH and np.abs(x).max() < 1.01 * math.pi:
         steps = np.minimum(steps, np.abs(2.0 * math.pi - steps))
-    least, rate = _JUMPS[name]
-    limit = max(least + rate * log.record.dt, 10.0 * float(np.percentile(steps, 90)))
+    min_step, rate = _JUMPS[name]
+    limit = max(min_step + rate * log.record.dt, 10.0 * float(np.percentile(steps, 90)))
     if (jumps := steps > limit).any():
         usual = median_filter(x, max(round(2.0 / log.record.dt), 3), mode="nearest")
         jumps |= np.abs(x - usual) > limit
     return np.asarray(jumps)
 
 
-def _columns(logs: Sequence[Log], *names: str) -> list[Array]:
+def _smooth_columns(logs: Sequence[Log], *names: str) -> list[Array]:
     """Smoothed columns where the car moves and nothing jumps, in all parts; "turning" is speed x
     yaw rate, "slipping" the change of speed x truth."""
-    found: list[list[Array]] = [[] for _ in names]
+    columns: list[list[Array]] = [[] for _ in names]
     for log in logs:
-        dt, own = log.record.dt, _raw(log)
+        dt, raw = log.record.dt, _get_columns(log)
         width, none = max(round(_SMOOTH / dt), 1), np.zeros(len(log.time))
-        bad = ~moving(log) | backward(log)
-        for name in _JUMPS.keys() & own.keys():
-            bad |= _jumps(log, name) | ~np.isfinite(own[name])
+        bad = ~find_moving(log) | find_backward(log)
+        for name in _JUMPS.keys() & raw.keys():
+            bad |= _find_jumps(log, name) | ~np.isfinite(raw[name])
         used = uniform_filter1d(bad.astype(float), width + 2, mode="nearest") < 1e-9
-        slipping = np.gradient(own["speed"] * np.nan_to_num(own.get(TRUTH, none)), dt)
-        own |= {"turning": own["speed"] * own["gyro"], "slipping": slipping}
-        for name, into in zip(names, found, strict=True):
-            smooth = uniform_filter1d(own.get(name, none), width, mode="nearest")
+        slipping = np.gradient(raw["speed"] * np.nan_to_num(raw.get(TRUTH, none)), dt)
+        raw |= {"turning": raw["speed"] * raw["gyro"], "slipping": slipping}
+        for name, into in zip(names, columns, strict=True):
+            smooth = uniform_filter1d(raw.get(name, none), width, mode="nearest")
             into.append(smooth[used][:: max(width // 2, 1)])
-    return [np.concatenate(each) for each in found]
+    return [np.concatenate(parts) for parts in columns]
 
 
-def _line(y: Array, x: Array, *beside: Array) -> Any:
+def _fit_line(y: Array, x: Array, *beside: Array) -> Any:
     """SciPy's line of y over x, after what others explain of both; None where one is constant."""
     others = np.column_stack([*beside, np.ones(len(y))])
     if len(y) < _FEW:
@@ -100,14 +100,14 @@ def _line(y: Array, x: Array, *beside: Array) -> Any:
     return linregress(x, y) if min(x.std(), y.std()) > 1e-9 else None
 
 
-def _contradiction(
+def _describe_contradiction(
     line: Any, column: str, implied: str, inverse: bool = False, factor: float = FACTOR
 ) -> list[str]:
     """A sentence if a line's slope, or its inverse, is surely not within a factor of 1."""
     margin = _SURE * line.stderr if line else math.inf
     if not line or 1.0 / factor - margin < line.slope < factor + margin:
         return []
-    if abs(line.rvalue) < LEAST_RELATED:
+    if abs(line.rvalue) < MIN_CORRELATION:
         return [f"{column} and {implied} are unrelated (correlation {line.rvalue:.2f})"]
     factor = 1.0 / line.slope if inverse else line.slope
     guess = "its sign?" if factor < 0.0 else "another unit?"
@@ -115,26 +115,26 @@ def _contradiction(
     return [f"{column} is {factor:.3g} times {implied}: {guess}"]
 
 
-def _steering(logs: Sequence[Log], car: Vehicle, steady: bool, tyres: float = 1.0) -> Any:
+def _fit_steering(logs: Sequence[Log], car: Vehicle, steady: bool, tyres: float = 1.0) -> Any:
     """The steering that the linear car needs for its yaw rate over the logged one. steady: not in
     hard turns, nor where accel_y is not speed x yaw rate. tyres: 0 for a neutral car."""
-    speed, gyro, steer, accel_y = _columns(logs, "speed", "gyro", "steer", "accel_y")
+    speed, gyro, steer, accel_y = _smooth_columns(logs, "speed", "gyro", "steer", "accel_y")
     bend = car.rear_arm / car.front_stiffness - car.front_arm / car.rear_stiffness
     under = tyres * max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
     slides = np.abs(accel_y - speed * gyro) > (1.0 if accel_y.any() else math.inf)
     used = (np.abs(speed * gyro) < _MILD) & ~slides
     used |= (used.sum() < _FEW) | (not steady)
-    return _line((gyro * (car.wheelbase / speed + under * speed))[used], steer[used])
+    return _fit_line((gyro * (car.wheelbase / speed + under * speed))[used], steer[used])
 
 
-def steering_gain(logs: Sequence[Log], car: Vehicle) -> tuple[float, float]:
+def estimate_steering_gain(logs: Sequence[Log], car: Vehicle) -> tuple[float, float]:
     """(gain, correlation): by how much the logged steering is to be multiplied to turn the car as
     its gyro shows, from steady turns of the linear car."""
-    line = _steering(logs, car, steady=False)
+    line = _fit_steering(logs, car, steady=False)
     return (float(line.slope), float(line.rvalue)) if line else (1.0, 0.0)
 
 
-def resolution(log: Log) -> float:
+def estimate_resolution(log: Log) -> float:
     """The step between the values of the gyro in rad/s, 0 for one too fine to be seen."""
     steps = np.diff(np.unique(log.record.fast[:, FAST.gyro]))
     step = float(np.median(steps)) if 2 <= len(steps) < len(log.time) / 3 else math.inf
@@ -142,24 +142,24 @@ def resolution(log: Log) -> float:
     return step if even and math.isfinite(step) and steps.min() > 0.5 * step else 0.0
 
 
-def saturated(log: Log) -> npt.NDArray[np.bool_]:
+def find_saturated(log: Log) -> npt.NDArray[np.bool_]:
     """The rows in which the gyro stays at its largest value, of either sign: much longer than at
     others, and many steps of its resolution from 0."""
     gyro = log.record.fast[:, FAST.gyro]
     runs = np.cumsum(np.diff(gyro, prepend=gyro[0]) != 0.0)
     length = np.bincount(runs)
     long = (length >= _LONG * np.percentile(length, 95))[runs]
-    far = np.abs(gyro) > max(0.05, _STEPS * resolution(log))
-    return np.asarray(long & far & ((gyro == gyro.max()) | (gyro == gyro.min())))
+    is_large = np.abs(gyro) > max(0.05, _STEPS * estimate_resolution(log))
+    return np.asarray(long & is_large & ((gyro == gyro.max()) | (gyro == gyro.min())))
 
 
-def swapped(logs: Sequence[Log]) -> str:
+def find_swapped(logs: Sequence[Log]) -> str:
     """What columns seem to be swapped, "" for none that can be seen."""
     present = set.intersection(*(set(log.record.present) for log in logs))
     names = ("speed", "turning", "accel_y", "accel_x", "steer")
-    speed, turning, accel_y, accel_x, steer = _columns(logs, *names)
-    turn, instead = _line(accel_y, turning), _line(accel_y, speed * steer)
-    across = _line(accel_x, turning)
+    speed, turning, accel_y, accel_x, steer = _smooth_columns(logs, *names)
+    turn, instead = _fit_line(accel_y, turning), _fit_line(accel_y, speed * steer)
+    across = _fit_line(accel_x, turning)
     if "accel_y" not in present or not turn or max(turning.std(), accel_y.std()) < _TURNING:
         return ""
     fits = instead and 0.5 < abs(instead.slope) < 2.0 and abs(instead.rvalue) > 0.8
@@ -171,13 +171,13 @@ def swapped(logs: Sequence[Log]) -> str:
     return ""
 
 
-def _zeros(logs: Sequence[Log], name: str) -> list[str]:
+def _describe_zeros(logs: Sequence[Log], name: str) -> list[str]:
     """A sentence if a column is filled with zeros where the car turns."""
-    x, moves = [np.zeros(0)], sum(moving(log).sum() for log in logs)
-    for log in (log for log in logs if name in _raw(log)):
-        own = _raw(log)
-        turns = np.hypot(own["speed"] * own["gyro"], own.get("accel_y", 0.0)) > 1.0
-        x.append(own[name][turns & moving(log)])
+    x, moves = [np.zeros(0)], sum(find_moving(log).sum() for log in logs)
+    for log in (log for log in logs if name in _get_columns(log)):
+        columns = _get_columns(log)
+        turns = np.hypot(columns["speed"] * columns["gyro"], columns.get("accel_y", 0.0)) > 1.0
+        x.append(columns[name][turns & find_moving(log)])
     values, counts = np.unique(np.concatenate(x), return_counts=True)
     zeros, others = counts[values == 0.0].sum(), counts[values != 0.0]
     if zeros <= max(_ZEROS[name] * moves, 5 * others.max(initial=1)):
@@ -185,16 +185,16 @@ def _zeros(logs: Sequence[Log], name: str) -> list[str]:
     return [f"{name} is 0 in {zeros} of {counts.sum()} rows in which the car turns"]
 
 
-def _fixes(logs: Sequence[Log]) -> list[str]:
+def _describe_fixes(logs: Sequence[Log]) -> list[str]:
     """What a course cannot be: held while the gyro turns, and elsewhere for a fix or two."""
-    before, after, change, turned, _ = course_steps(logs, 0.0)
+    before, after, change, turned, _ = compute_course_steps(logs, 0.0)
     runs, _ = label(change == 0.0)
     held = (runs > 0) & (np.bincount(runs, np.abs(turned), 1) > 0.1)[runs]
     if held.any():
         return [f"the course stands still in {held.sum()} fixes while the gyro turns"]
     beside = np.angle(np.exp(1j * (change - turned)))
-    for least, few in _BESIDE.items():
-        out = np.abs(beside) > least
+    for min_angle, few in _BESIDE.items():
+        out = np.abs(beside) > min_angle
         values, counts = np.unique((before[out], after[out]), return_counts=True)
         back = abs(beside[out].sum()) < 0.2 * np.abs(beside[out]).sum()
         if back and counts.max() >= max(few, 0.8 * np.count_nonzero(out)):
@@ -203,75 +203,83 @@ def _fixes(logs: Sequence[Log]) -> list[str]:
     return []
 
 
-def _steering_text(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[str]:
+def _describe_steering(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[str]:
     """What is wrong with the steering, by steady turns and all rows, by these and other tyres."""
-    line, *lines = (_steering(logs, car, *how) for how in ((steady,), (False,), (False, 0.0)))
-    found = _contradiction(line, "steering", "yaw rate")
-    if not all(_contradiction(each, "", "") for each in lines):
+    line, *lines = (_fit_steering(logs, car, *how) for how in ((steady,), (False,), (False, 0.0)))
+    sentences = _describe_contradiction(line, "steering", "yaw rate")
+    if not all(_describe_contradiction(candidate, "", "") for candidate in lines):
         return []
-    if not found or abs(line.rvalue) < LEAST_RELATED:
-        return found
-    ratio, found = 1.0 / abs(line.slope), []
+    if not sentences or abs(line.rvalue) < MIN_CORRELATION:
+        return sentences
+    ratio, sentences = 1.0 / abs(line.slope), []
     if line.slope < 0.0:
-        found.append("steering and yaw rate differ in sign (--steering-sign -1 turns it)")
+        sentences.append("steering and yaw rate differ in sign (--steering-sign -1 turns it)")
     if not 0.5 < ratio < 2.0:
-        guess = next(text for least, text in _GUESSES.items() if ratio >= least)
+        guess = next(text for min_ratio, text in _GUESSES.items() if ratio >= min_ratio)
         text = f"the logged steering is {ratio:.3g} times what the yaw rate needs: {guess}"
-        found.append(f"{text} (--steering-ratio {ratio:.3g} divides it)")
-    return found
+        sentences.append(f"{text} (--steering-ratio {ratio:.3g} divides it)")
+    return sentences
 
 
-def _course_text(line: Any, turned: Array) -> list[str]:
+def _describe_course(line: Any, turned: Array) -> list[str]:
     """What is wrong with the course, by its change over the integral of the gyro."""
     if len(turned) < _FEW or turned.std() < 0.02:
         return []
     related = line.rvalue if line else 0.0
-    if abs(related) < LEAST_RELATED:
+    if abs(related) < MIN_CORRELATION:
         return [f"the course does not follow the gyro (correlation {related:.2f})"]
     if -FACTOR < line.slope < -1.0 / FACTOR:
         return [f"the course turns against the gyro (correlation {related:.2f}): {COMPASS}"]
-    return _contradiction(line, "the change of the course", "the integral of the gyro")
+    return _describe_contradiction(line, "the change of the course", "the integral of the gyro")
 
 
-def remarks_of(logs: Sequence[Log]) -> list[str]:
+def make_remarks(logs: Sequence[Log]) -> list[str]:
     """What is no fault of a drive, but good to know: a gyro of coarse steps."""
-    step = math.degrees(max(map(resolution, logs)))
+    step = math.degrees(max(map(estimate_resolution, logs)))
     return [f"The gyro's resolution is {step:.3g} deg/s."] if step > 0.1 else []
 
 
-def warnings_of(logs: Sequence[Log], car: Vehicle) -> list[str]:
+def make_warnings(logs: Sequence[Log], car: Vehicle) -> list[str]:
     """What does not fit together in a drive, a sentence each."""
-    found = [f"columns seem to be swapped, {what}"] if (what := swapped(logs)) else []
-    if count := sum(saturated(log).sum() for log in logs):
-        found.append(f"the gyro is at its limit in {count} rows")
+    sentences = [f"columns seem to be swapped, {what}"] if (what := find_swapped(logs)) else []
+    if count := sum(find_saturated(log).sum() for log in logs):
+        sentences.append(f"the gyro is at its limit in {count} rows")
     for name in _JUMPS:
-        if count := sum(_jumps(log, name).sum() for log in logs if name in _raw(log)):
-            found.append(f"{name} jumps as in no car, in {count} rows")
+        if count := sum(_find_jumps(log, name).sum() for log in logs if name in _get_columns(log)):
+            sentences.append(f"{name} jumps as in no car, in {count} rows")
     judged = [log for log in logs if "beta" in log.truth] or logs
-    turning, accel_y, slipping = _columns(judged, "turning", "accel_y", "slipping")
+    turning, accel_y, slipping = _smooth_columns(judged, "turning", "accel_y", "slipping")
     if len(turning) < _FEW or max(np.std(turning), np.std(accel_y)) < _TURNING:
-        return found
-    found += [text for name in _ZEROS for text in _zeros(logs, name)] + _fixes(logs)
+        return sentences
+    sentences += [
+        text for name in _ZEROS for text in _describe_zeros(logs, name)
+    ] + _describe_fixes(logs)
     used = slipping.any() | (np.abs(turning) < _MILD)
-    accel = _line(accel_y[used], turning[used], slipping[used])
+    accel = _fit_line(accel_y[used], turning[used], slipping[used])
     if np.std(turning) < _TURNING and not (accel and abs(accel.rvalue) > 0.8):
-        return found
-    _, _, change, turned, slipped = course_steps(logs, 1.0)
-    course, wrong, unit = _line(change, turned, slipped), [], accel.slope if accel else 1.0
+        return sentences
+    _, _, change, turned, slipped = compute_course_steps(logs, 1.0)
+    course, wrong, unit = _fit_line(change, turned, slipped), [], accel.slope if accel else 1.0
     if accel and course and 0.67 < accel.slope / course.slope < 1.5:
-        wrong = _contradiction(accel, "the yaw rate", "what accel_y and course imply", True)
+        wrong = _describe_contradiction(
+            accel, "the yaw rate", "what accel_y and course imply", True
+        )
         unit = 1.0 if wrong else unit
     if not wrong:
         factor = FACTOR if slipping.any() else 3.0  # the faster the turns, the more they differ
-        wrong = _contradiction(accel, "accel_y", "speed x yaw rate", factor=factor)
-        wrong += _steering_text(logs, car, steady=not wrong) + _course_text(course, turned)
-    found += wrong
+        wrong = _describe_contradiction(accel, "accel_y", "speed x yaw rate", factor=factor)
+        wrong += _describe_steering(logs, car, steady=not wrong) + _describe_course(course, turned)
+    sentences += wrong
     if not slipping.any():
-        return found
-    in_course, by = _line(change, slipped, turned), "what gyro, accel_y and speed imply"
-    if not accel or abs(accel.rvalue) < LEAST_RELATED:
-        return found + _contradiction(in_course, TRUTH, "what gyro and course imply", True)
-    found += _contradiction(_line(accel_y / unit, slipping, turning), TRUTH, by, True)
+        return sentences
+    in_course, by = _fit_line(change, slipped, turned), "what gyro, accel_y and speed imply"
+    if not accel or abs(accel.rvalue) < MIN_CORRELATION:
+        return sentences + _describe_contradiction(
+            in_course, TRUTH, "what gyro and course imply", True
+        )
+    sentences += _describe_contradiction(
+        _fit_line(accel_y / unit, slipping, turning), TRUTH, by, True
+    )
     if course and in_course and in_course.slope < 1.0 / FACTOR - _SURE * in_course.stderr:
-        found += [] if found else ["the course shows no sideslip: is it the heading?"]
-    return found
+        sentences += [] if sentences else ["the course shows no sideslip: is it the heading?"]
+    return sentences

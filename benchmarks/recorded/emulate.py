@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.record import FAST, PACKET, Array, Log
-from ...envs.recordings.log_file import packet_rows
+from ...envs.recordings.log_file import make_packet_rows
 from ...envs.sensors.gps import COURSE_SPEED
 from ...envs.sensors.link import SlowSensor
 
@@ -55,13 +55,13 @@ class Emulation:
             )
         return round(1.0 / (self.course_rate * dt))
 
-    def with_gyro_bias(self, log: Log) -> Log:
+    def add_gyro_bias(self, log: Log) -> Log:
         """The log with the gyro's bias added."""
         fast = log.record.fast.copy()
         fast[:, FAST.gyro] += math.radians(self.gyro_bias_degps)
         return dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
 
-    def with_course(self, log: Log, seed: int) -> Log:
+    def add_course(self, log: Log, seed: int) -> Log:
         """The log with the gyro's bias and a GPS that measures the course, and nothing else.
 
         course = sideslip truth + integral of the logged yaw rate + bias + noise. Samples stand on
@@ -74,72 +74,76 @@ class Emulation:
         rows, late = self.rows(record.dt), round(self.delay / record.dt)
         captured = np.arange(-record.first % rows, len(beta), rows)
         noise = np.random.default_rng(seed).standard_normal(len(captured))
-        exact = (beta + heading(log))[captured] + math.radians(self.bias_deg)
+        exact = (beta + compute_heading(log))[captured] + math.radians(self.bias_deg)
         course = exact + math.radians(self.course_noise_deg) * noise
-        speed = ground_speed(log)[captured]
+        speed = compute_ground_speed(log)[captured]
         sent = np.isfinite(course) & (captured + late < len(beta))
         ticks = (record.first + captured[sent]).astype(np.float64)
         values = np.full((len(ticks), 4), np.nan)
         values[:, 0] = np.arctan2(np.sin(course[sent]), np.cos(course[sent]))
         quality = (speed[sent] >= COURSE_SPEED).astype(np.float64)
-        packets = packet_rows("gps", ticks, ticks + late, values, quality)
+        packets = make_packet_rows("gps", ticks, ticks + late, values, quality)
         gps = SlowSensor(period=rows * record.dt, delays=(late * record.dt,))
         quiet = dataclasses.replace(log, record=dataclasses.replace(record, packets=packets))
-        return self.with_gyro_bias(dataclasses.replace(quiet, slow={"gps": gps}))
+        return self.add_gyro_bias(dataclasses.replace(quiet, slow={"gps": gps}))
 
 
-def heading(log: Log) -> Array:
+def compute_heading(log: Log) -> Array:
     """The integral of the logged yaw rate in rad, 0 at the first row; (rows,)."""
     gamma = log.record.fast[:, FAST.gyro]
     steps = 0.5 * (gamma[1:] + gamma[:-1]) * log.record.dt
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def ground_speed(log: Log) -> Array:
+def compute_ground_speed(log: Log) -> Array:
     """The mean speed of the front wheels in m/s; (rows,)."""
     fast = log.record.fast
     return np.asarray(0.5 * (fast[:, FAST.wheel_left] + fast[:, FAST.wheel_right]))
 
 
-def moving(log: Log) -> npt.NDArray[np.bool_]:
+def find_moving(log: Log) -> npt.NDArray[np.bool_]:
     """The rows that are fast enough to judge."""
-    return np.asarray(ground_speed(log) > FAST_ENOUGH)
+    return np.asarray(compute_ground_speed(log) > FAST_ENOUGH)
 
 
-def backward(log: Log) -> npt.NDArray[np.bool_]:
+def find_backward(log: Log) -> npt.NDArray[np.bool_]:
     """The rows that are driven backward: at a negative speed, or with a truth about half a turn."""
     turn = np.abs(np.nan_to_num(log.truth.get("beta", np.zeros(len(log.time))))) / math.pi
-    return np.asarray((ground_speed(log) < 0.0) | ((turn > 0.75) & (turn < 1.01)))
+    return np.asarray((compute_ground_speed(log) < 0.0) | ((turn > 0.75) & (turn < 1.01)))
 
 
-def path(log: Log, beta: Array) -> tuple[Array, Array]:
+def compute_path(log: Log, beta: Array) -> tuple[Array, Array]:
     """Dead reckoning: (x, y) in m from speed, heading and a sideslip angle; (rows,) each."""
-    psi = heading(log)
-    v_x = ground_speed(log)
+    psi = compute_heading(log)
+    v_x = compute_ground_speed(log)
     v_y = v_x * np.tan(np.nan_to_num(beta))
     x_rate = v_x * np.cos(psi) - v_y * np.sin(psi)
     y_rate = v_x * np.sin(psi) + v_y * np.cos(psi)
     return np.cumsum(x_rate) * log.record.dt, np.cumsum(y_rate) * log.record.dt
 
 
-def course_steps(logs: Sequence[Log], lag: float) -> Array:
+def compute_course_steps(logs: Sequence[Log], lag: float) -> Array:
     """(5, steps) between fixes at least `lag` s apart, in rad: the course before and after, and the
     change of course, integral of the gyro and sideslip, by the truth or else by accel_y."""
-    found = [np.zeros((5, 0))]
+    parts = [np.zeros((5, 0))]
     for log in (log for log in logs if "gps" in log.slow):
-        fixes, speed, dt = log.record.packets_of("gps"), ground_speed(log), log.record.dt
+        fixes, speed, dt = (
+            log.record.select_packets("gps"),
+            compute_ground_speed(log),
+            log.record.dt,
+        )
         place = fixes[:, PACKET.captured].astype(int) - log.record.first
         good = (fixes[:, PACKET.quality] > 0.0) & (place >= 0) & (place < len(log.time))
-        good[good] &= (moving(log) & ~backward(log))[place[good]]
+        good[good] &= (find_moving(log) & ~find_backward(log))[place[good]]
         place, course = place[good], fixes[good, PACKET.value]
         if len(place) < 2:
             continue
         usual = max(float(np.median(np.diff(place))), 1.0)
         n = max(math.ceil(lag / (usual * dt) - 1e-9), 1)
         turned = np.cumsum(log.record.fast[:, FAST.accel_y] / np.maximum(speed, FAST_ENOUGH)) * dt
-        slip = (turned - heading(log)) * ("accel_y" in log.record.present)
+        slip = (turned - compute_heading(log)) * ("accel_y" in log.record.present)
         slip = log.truth.get("beta", slip)
-        columns = np.stack([np.unwrap(course), heading(log)[place], slip[place]])
+        columns = np.stack([np.unwrap(course), compute_heading(log)[place], slip[place]])
         steps = np.vstack([course[:-n], course[n:], columns[:, n:] - columns[:, :-n]])
-        found.append(steps[:, (place[n:] - place[:-n] < 1.5 * n * usual) & np.isfinite(steps[4])])
-    return np.concatenate(found, axis=1)
+        parts.append(steps[:, (place[n:] - place[:-n] < 1.5 * n * usual) & np.isfinite(steps[4])])
+    return np.concatenate(parts, axis=1)

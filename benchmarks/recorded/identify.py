@@ -9,24 +9,39 @@ import numpy as np
 from ...envs.record import Array, Log
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ...estimators.make import make_estimator
-from ..harness.results import Suite, Table
-from ..harness.verdict import verdict
-from .bicycle_fit import PRIOR, Fit, Theta, Windows, errors, fit, residual, windows_of
-from .checks import LEAST_RELATED, moving, saturated, steering_gain, swapped
-from .noises import LATE_WITHIN, WIDE, Finding, sensor_findings
+from ..harness.results import ResultTable, Suite
+from ..harness.verdict import format_verdict
+from .bicycle_fit import (
+    PRIOR,
+    BicycleFit,
+    Theta,
+    Windows,
+    compute_errors,
+    compute_residual,
+    fit,
+    make_windows,
+)
+from .checks import (
+    MIN_CORRELATION,
+    estimate_steering_gain,
+    find_moving,
+    find_saturated,
+    find_swapped,
+)
+from .noises import LATE_WITHIN, WIDE, Finding, make_sensor_findings
 from .run import GYRO_ONLY
-from .wires import Wires, corrected
+from .wires import SignalCalibration, apply_wires
 
 TYRES = ("linear", "fiala")
-LEAST_WINDOWS = 6
-LEAST_TURNING = 0.3  # m/s2, RMS of speed x yaw rate
+MIN_WINDOWS = 6
+MIN_TURNING = 0.3  # m/s2, RMS of speed x yaw rate
 MILD = 5.0  # m/s2; beyond, a saturating axle looks like another steering ratio
-GRIPS = 0.8  # of the stated friction's acceleration, beyond which that is in doubt
-NEAR = 2.5  # within this factor of the stated ratio, that one may be right
-PAYS = 0.98  # of the error on held-out stretches, at most, where a latency is applied
+MAX_FRICTION_SHARE = 0.8  # of the stated friction's acceleration, beyond which that is in doubt
+MAX_RATIO_FACTOR = 2.5  # within this factor of the stated ratio, that one may be right
+MAX_ERROR_RATIO = 0.98  # of the error on held-out stretches, at most, where a latency is applied
 FOLDS = 4
 POSSIBLE = (0.6, 1.3)  # I/(m l_f l_r) of cars
-TOLD = 0.5  # of the prior's interval, the widest one with which a number is told
+MAX_INTERVAL_SHARE = 0.5  # of the prior's interval, the widest one with which a number is told
 UNKNOWN_GAIN = 0.3  # standard deviation of its share, where no stated ratio is near
 _DELAYS = {"steer_delay": "steer", "accel_delay": "accel_y"}
 _OF_ACCEL = ("accel_bias", "accel_gain")
@@ -40,7 +55,7 @@ _NOTE = (
 
 
 @dataclass
-class Identified:
+class IdentificationResult:
     """What a log has shown.
 
     car, wires: the stated ones with the numbers that were found. rates: RMS in rad/s of what the
@@ -50,7 +65,7 @@ class Identified:
     """
 
     car: Vehicle
-    wires: Wires
+    wires: SignalCalibration
     findings: list[Finding] = field(default_factory=list)
     rates: tuple[float, ...] = ()
     slips: tuple[float, ...] = ()
@@ -59,8 +74,11 @@ class Identified:
 
 
 def identify(
-    logs: Sequence[Log], car: Vehicle, wires: Wires | None = None, tyres: str | None = None
-) -> Identified:
+    logs: Sequence[Log],
+    car: Vehicle,
+    wires: SignalCalibration | None = None,
+    tyres: str | None = None,
+) -> IdentificationResult:
     """Fit the car to the parts of a log, and the noise of its sensors.
 
     car, wires: the stated ones, where the search starts. tyres: "linear", as stiff as the log's
@@ -70,47 +88,47 @@ def identify(
     """
     if tyres not in (None, *TYRES):
         raise ValueError(f"tyres are {' or '.join(TYRES)}, got {tyres!r}")
-    if what := swapped(logs):
+    if what := find_swapped(logs):
         raise ValueError(f"{logs[0].name}: columns are swapped, {what}")
     car.check_roll()
-    stated = wires or Wires()
-    found = Identified(car, stated)
-    w = windows_of(logs, [saturated(log) for log in logs])
-    gain, related = steering_gain(logs, car)
-    if reason := _reason(w, related):
-        found.reason = reason
-        found.findings = [
+    stated = wires or SignalCalibration()
+    result = IdentificationResult(car, stated)
+    w = make_windows(logs, [find_saturated(log) for log in logs])
+    gain, related = estimate_steering_gain(logs, car)
+    if reason := _find_reason(w, related):
+        result.reason = reason
+        result.findings = [
             Finding(label, value, unit=unit, remark=reason)
-            for _, label, value, unit in _rows(car, stated)
+            for _, label, value, unit in _list_parameters(car, stated)
         ]
     else:
-        near = 1.0 / NEAR < gain / stated.gain < NEAR
+        near = 1.0 / MAX_RATIO_FACTOR < gain / stated.gain < MAX_RATIO_FACTOR
         start = Theta(gain=stated.gain if near else gain, offset=stated.offset)
         sd = abs(start.gain) * (PRIOR.gain if near else UNKNOWN_GAIN)
         w = replace(w, centre=start, spread=PRIOR._replace(gain=sd))
-        _fit_car(found, w, near, TYRES if tyres is None else (tyres,))
-    slips = _slips(logs, found.car, found.wires)
-    both = (_slips(logs, car, stated), slips)
-    found.slips = tuple(_beside_truth(logs, each) for each in both)
-    findings, noise, latency = sensor_findings(logs, slips)
-    found.findings += findings
-    found.wires = found.wires._replace(noise=noise, latency={**found.wires.latency, **latency})
-    return found
+        _fit_car(result, w, near, TYRES if tyres is None else (tyres,))
+    slips = _estimate_slips(logs, result.car, result.wires)
+    both = (_estimate_slips(logs, car, stated), slips)
+    result.slips = tuple(_compute_truth_error(logs, angles) for angles in both)
+    findings, noise, latency = make_sensor_findings(logs, slips)
+    result.findings += findings
+    result.wires = result.wires._replace(noise=noise, latency={**result.wires.latency, **latency})
+    return result
 
 
-def _reason(w: Windows, related: float) -> str:
+def _find_reason(w: Windows, related: float) -> str:
     """Why a log shows nothing of a car, "" if it may."""
-    if len(w.starts) < LEAST_WINDOWS:
-        return f"{len(w.starts)} of {LEAST_WINDOWS} windows of 5 s are fast enough and whole"
-    turns = w.rows[2][w.counted] * w.rows[0][w.counted]
-    if np.std(turns) < LEAST_TURNING:
+    if len(w.starts) < MIN_WINDOWS:
+        return f"{len(w.starts)} of {MIN_WINDOWS} windows of 5 s are fast enough and whole"
+    turns = w.rows[2][w.scored_rows] * w.rows[0][w.scored_rows]
+    if np.std(turns) < MIN_TURNING:
         return f"no excitation, speed x yaw rate has {np.std(turns):.2g} m/s2 RMS"
-    if abs(related) < LEAST_RELATED:
+    if abs(related) < MIN_CORRELATION:
         return f"steering and yaw rate are unrelated (correlation {related:.2f})"
     return ""
 
 
-def _rows(car: Vehicle, wires: Wires) -> list[tuple[str, str, float, str]]:
+def _list_parameters(car: Vehicle, wires: SignalCalibration) -> list[tuple[str, str, float, str]]:
     """(name in `Theta`, label, stated value, unit) of what the car's fit tells."""
     return [
         ("front", "front_stiffness_axle", 2.0 * car.front_stiffness, "N/rad"),
@@ -124,44 +142,47 @@ def _rows(car: Vehicle, wires: Wires) -> list[tuple[str, str, float, str]]:
     ]
 
 
-def _fit_car(found: Identified, w: Windows, near: bool, laws: Sequence[str]) -> None:
+def _fit_car(result: IdentificationResult, w: Windows, near: bool, laws: Sequence[str]) -> None:
     """Fill in all that the car's motion tells. near: whether the stated ratio may be right."""
-    car, stated = found.car, found.wires
-    hard = float(np.percentile(np.abs(w.rows[2] * w.rows[0])[w.counted], 95))
-    held = ["gain"] if near and hard > MILD else []
+    car, stated = result.car, result.wires
+    peak_accel = float(np.percentile(np.abs(w.rows[2] * w.rows[0])[w.scored_rows], 95))
+    held = ["gain"] if near and peak_accel > MILD else []
     without = (*held, *(() if w.accel else _OF_ACCEL), *(() if w.course else ("gps_delay",)))
     free = [name for name in (*Theta._fields[:8], "gps_delay") if name not in without]
-    if len(laws) > 1 and hard > GRIPS * car.friction * GRAVITY:
+    if len(laws) > 1 and peak_accel > MAX_FRICTION_SHARE * car.friction * GRAVITY:
         laws = TYRES[:1]  # the stated friction is not this log's, and Fiala's law lives by it
     fits = [
         (replace(w, tyres=law), fit(car, replace(w, tyres=law), w.centre, free)) for law in laws
     ]
     scale = fits[0][1].scale  # one for all laws
-    w, base = min(fits, key=lambda pair: np.linalg.norm(_held_out(car, *pair) / scale))
-    rows, best, free_too = _with_latency(car, w, base)
+    w, base = min(fits, key=lambda pair: np.linalg.norm(_evaluate_folds(car, *pair) / scale))
+    rows, best, free_too = _fit_latencies(car, w, base)
     theta, gain = best.theta, best.theta.gain
     values = {
         key: getattr(car, key) * math.exp(getattr(theta, name)) for name, key in _OF_CAR.items()
     }
     fitted = car.replace(**values, name=f"{car.name}-identified")
-    found.findings = _car_findings(car, stated, w, (best, free_too), held, hard) + rows
+    result.findings = _make_car_findings(car, stated, w, (best, free_too), held, peak_accel) + rows
     share = fitted.yaw_inertia / (car.mass * car.front_arm * car.rear_arm)
     if not POSSIBLE[0] <= share <= POSSIBLE[1]:
         low, high = POSSIBLE
-        found.reason = f"its fit has I/(m l_f l_r) = {share:.2f}, and cars have {low} to {high}"
-    elif not any(row.told for row in found.findings[:3]):
-        found.reason = "it tells neither the stiffnesses nor the yaw inertia"
-    if found.reason:
-        found.findings = [row._replace(told=False, remark=found.reason) for row in found.findings]
+        result.reason = f"its fit has I/(m l_f l_r) = {share:.2f}, and cars have {low} to {high}"
+    elif not any(row.is_determined for row in result.findings[:3]):
+        result.reason = "it tells neither the stiffnesses nor the yaw inertia"
+    if result.reason:
+        result.findings = [
+            row._replace(is_determined=False, remark=result.reason) for row in result.findings
+        ]
         return
-    found.car = fitted
+    result.car = fitted
     late = {channel: getattr(theta, name) for name, channel in _DELAYS.items() if name in best.free}
-    found.wires = Wires(1.0 / abs(gain), 1 if gain > 0.0 else -1, theta.offset, late)
+    result.wires = SignalCalibration(1.0 / abs(gain), 1 if gain > 0.0 else -1, theta.offset, late)
     first = Theta(gain=stated.gain, offset=stated.offset)
-    rates = [float(errors(car, each, w)[0]) for each in (first, theta)]
-    found.rates = (*rates, float(_held_out(car, w, best)[0]))
-    found.remarks.append(
-        f"{len(w.starts)} windows of 4 s, of whose rows 95 % turn with less than {hard:.1f} m/s2; "
+    rates = [float(compute_errors(car, parameters, w)[0]) for parameters in (first, theta)]
+    result.rates = (*rates, float(_evaluate_folds(car, w, best)[0]))
+    result.remarks.append(
+        f"{len(w.starts)} windows of 4 s, of whose rows 95 % turn with less than "
+        f"{peak_accel:.1f} m/s2; "
         f"{w.tyres} tyres" + (" err least on held-out stretches" if len(laws) > 1 else "")
         + (", whose stiffness is that of this drive" if w.tyres == TYRES[0] else
            ", as stiff as at small slips; estimators, whose tyres are linear, rather take "
@@ -169,116 +190,127 @@ def _fit_car(found: Identified, w: Windows, near: bool, laws: Sequence[str]) -> 
     )  # fmt: skip
 
 
-def _with_latency(car: Vehicle, w: Windows, base: Fit) -> tuple[list[Finding], Fit, Fit]:
+def _fit_latencies(
+    car: Vehicle, w: Windows, base: BicycleFit
+) -> tuple[list[Finding], BicycleFit, BicycleFit]:
     """Findings of the latencies of steering and accelerometer, the fit with those that pay, and
     the one in which all are free."""
     names = tuple(_DELAYS)[: 2 if w.accel else 1]
-    usual, pays, rows = np.linalg.norm(_held_out(car, w, base) / base.scale), [], []
+    usual, pays, rows = np.linalg.norm(_evaluate_folds(car, w, base) / base.scale), [], []
     free = fit(car, w, base.theta, (*base.free, *names), base.scale)
     for name in names:
         half, value = free.half(name), float(getattr(free.theta, name))
-        told, remark = half < LATE_WITHIN, "within its interval of 0"
-        if told and abs(value) > half:
-            alone = fit(car, w, base.theta, (*base.free, name), base.scale)
-            share = np.linalg.norm(_held_out(car, w, alone) / base.scale) / usual
-            pays += [name] if share < PAYS else []
+        is_determined, remark = half < LATE_WITHIN, "within its interval of 0"
+        if is_determined and abs(value) > half:
+            single_fit = fit(car, w, base.theta, (*base.free, name), base.scale)
+            share = np.linalg.norm(_evaluate_folds(car, w, single_fit) / base.scale) / usual
+            pays += [name] if share < MAX_ERROR_RATIO else []
             remark = f"{'' if name in pays else 'not '}applied: error held out x {share:.3f}"
         label = f"latency of {_DELAYS[name]}"
-        rows.append(Finding(label, 0.0, value, half, "s", told, remark if told else WIDE))
+        rows.append(
+            Finding(label, 0.0, value, half, "s", is_determined, remark if is_determined else WIDE)
+        )
     best = fit(car, w, base.theta, (*base.free, *pays), base.scale) if pays else base
     return rows, best, free
 
 
-def _held_out(car: Vehicle, w: Windows, best: Fit) -> Array:
+def _evaluate_folds(car: Vehicle, w: Windows, best: BicycleFit) -> Array:
     """`errors` on each fold of stretches, of the fit to others."""
     squares, labels = [], np.unique(w.stretch)
     for fold in range(FOLDS):
-        moves = best.without(labels % FOLDS == fold)
+        moves = best.estimate_shift(labels % FOLDS == fold)
         moved = {n: getattr(best.theta, n) + m for n, m in zip(best.free, moves, strict=True)}
-        mine = w.some(w.stretch % FOLDS == fold)
-        squares.append(np.mean(residual(car, best.theta._replace(**moved), mine) ** 2, axis=2))
+        fold_windows = w.select(w.stretch % FOLDS == fold)
+        squares.append(
+            np.mean(compute_residual(car, best.theta._replace(**moved), fold_windows) ** 2, axis=2)
+        )
     return np.asarray(np.sqrt(np.mean(np.concatenate(squares), axis=0)))
 
 
-def _car_findings(
-    car: Vehicle, stated: Wires, w: Windows, fits: tuple[Fit, Fit], held: Sequence[str], hard: float
+def _make_car_findings(
+    car: Vehicle,
+    stated: SignalCalibration,
+    w: Windows,
+    fits: tuple[BicycleFit, BicycleFit],
+    held: Sequence[str],
+    peak_accel: float,
 ) -> list[Finding]:
-    """The rows of `_rows` with what was found. An interval also has by how much its number moves
-    where the latencies are free, in the second fit."""
-    found, (best, free) = [], fits
-    for name, label, value, unit in _rows(car, stated):
+    """The rows of `_list_parameters` with what was found. An interval also has by how much its
+    number moves where the latencies are free, in the second fit."""
+    findings, (best, free) = [], fits
+    for name, label, value, unit in _list_parameters(car, stated):
         at = float(getattr(best.theta, name))
         half = math.hypot(best.half(name), float(getattr(free.theta, name)) - at)
-        told = half <= TOLD * 1.96 * getattr(w.spread, name)
-        remark = "" if told else WIDE
+        is_determined = half <= MAX_INTERVAL_SHARE * 1.96 * getattr(w.spread, name)
+        remark = "" if is_determined else WIDE
         if name in _OF_CAR:
             at, half = value * math.exp(at), value * math.exp(at) * half
         elif label == "steering sign":
-            told, at, half, remark = True, math.copysign(1.0, at), math.inf, ""
+            is_determined, at, half, remark = True, math.copysign(1.0, at), math.inf, ""
         elif name == "gain":
             at, half = 1.0 / abs(at), half / at**2
             if held:
-                remark = f"at {hard:.0f} m/s2 a saturating axle would look like another ratio"
+                remark = f"at {peak_accel:.0f} m/s2 a saturating axle would look like another ratio"
         elif unit.startswith("deg"):
             at, half = math.degrees(at), math.degrees(half)
-        found.append(Finding(label, value, at, half, unit, told, remark))
-    return found
+        findings.append(Finding(label, value, at, half, unit, is_determined, remark))
+    return findings
 
 
-def _slips(logs: Sequence[Log], car: Vehicle, wires: Wires) -> list[Array]:
+def _estimate_slips(logs: Sequence[Log], car: Vehicle, wires: SignalCalibration) -> list[Array]:
     """The sideslip angle of each log by the gyro alone, rad."""
     dt = logs[0].record.dt
     estimator = make_estimator(GYRO_ONLY, vehicle=car, dt=dt, q_beta=1e-3, q_gamma=0.1)
     steered = wires._replace(latency={})
-    return [estimator.run(corrected(log, steered))["beta"] for log in logs]
+    return [estimator.run(apply_wires(log, steered))["beta"] for log in logs]
 
 
-def _beside_truth(logs: Sequence[Log], slips: Sequence[Array]) -> float:
+def _compute_truth_error(logs: Sequence[Log], slips: Sequence[Array]) -> float:
     """RMS of sideslip beside the logs' own, in rad; NaN where they have none."""
     errors = [np.zeros(0)]
     for log, slip in zip(logs, slips, strict=True):
         if "beta" in log.truth:
-            errors.append((slip - log.truth["beta"])[moving(log)])
-    together = np.concatenate(errors)
-    together = together[np.isfinite(together)]
-    return float(np.sqrt(np.mean(together**2))) if len(together) else math.nan
+            errors.append((slip - log.truth["beta"])[find_moving(log)])
+    combined = np.concatenate(errors)
+    combined = combined[np.isfinite(combined)]
+    return float(np.sqrt(np.mean(combined**2))) if len(combined) else math.nan
 
 
-def suite_of(found: Identified, name: str) -> Suite:
+def make_suite(result: IdentificationResult, name: str) -> Suite:
     """The findings as a table with a verdict."""
-    suite = Suite("identify", f"The car of a recorded drive: {name}", "; ".join(found.remarks))
-    missing = [each.name for each in found.findings if not each.told]
-    if found.reason:
+    suite = Suite("identify", f"The car of a recorded drive: {name}", "; ".join(result.remarks))
+    missing = [finding.name for finding in result.findings if not finding.is_determined]
+    if result.reason:
         answer = (
-            f"Not identified. This log shows nothing of the car: {found.reason}. "
+            f"Not identified. This log shows nothing of the car: {result.reason}. "
             "It stays as stated."
         )
     else:
         rates = "{:.2f} deg/s of the yaw rate, the found one {:.2f} ({:.2f} held out)".format(
-            *map(math.degrees, found.rates)
+            *map(math.degrees, result.rates)
         )
         answer = f"The stated car leaves {rates}."
     slip = ""
-    if not any(map(math.isnan, found.slips)):
+    if not any(map(math.isnan, result.slips)):
         slip = "Beside the log's own sideslip, which was not used: {:.2f}, now {:.2f} deg.".format(
-            *map(math.degrees, found.slips)
+            *map(math.degrees, result.slips)
         )
-    suite.verdict = verdict(
+    suite.verdict = format_verdict(
         answer,
         slip,
         f"Not told by this log: {', '.join(missing) or 'nothing'}.",
         "Not covered: the mass, which scales all; drives beside the part that was used.",
     )
     header = ("number", "stated", "found", "95 %", "unit", "told by this log?")
-    cells = [_cells(each) for each in found.findings]
-    suite.tables = [Table("What the log shows", header, cells, _NOTE, keyed=False)]
+    cells = [_format_cells(finding) for finding in result.findings]
+    suite.tables = [ResultTable("What the log shows", header, cells, _NOTE, keyed=False)]
     return suite
 
 
-def _cells(row: Finding) -> list[str]:
+def _format_cells(row: Finding) -> list[str]:
     stated, value = (f"{x:.4g}" if math.isfinite(x) else "-" for x in (row.stated, row.value))
     ends = "-"
     if math.isfinite(row.half):
         ends = f"{row.value - row.half:.4g} .. {row.value + row.half:.4g}"
-    told = ": ".join(filter(None, ["yes" if row.told else "no", row.remark]))
-    return [row.name, stated, value, ends, row.unit or "-", told]
+    remark = ": ".join(filter(None, ["yes" if row.is_determined else "no", row.remark]))
+    return [row.name, stated, value, ends, row.unit or "-", remark]

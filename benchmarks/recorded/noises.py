@@ -8,7 +8,7 @@ import numpy as np
 
 from ...envs.record import FAST, PACKET, Array, Log
 from ..harness.stats import margin_of_error
-from .emulate import ground_speed, heading
+from .emulate import compute_ground_speed, compute_heading
 
 WIDE = "its interval is too wide"
 BLOCKS = 20  # of a log, which the intervals take for independent
@@ -29,7 +29,7 @@ class Finding(NamedTuple):
     value: float = math.nan
     half: float = math.inf
     unit: str = ""
-    told: bool = False
+    is_determined: bool = False
     remark: str = ""
 
 
@@ -40,38 +40,38 @@ def jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float
     return statistic(total), margin_of_error((count - 1.0) * without)
 
 
-def _root_mean(sums: Array) -> float:
+def _compute_root_mean(sums: Array) -> float:
     return math.sqrt(float(sums[0]) / max(float(sums[1]), 1.0))
 
 
-def white(parts: Sequence[Array]) -> tuple[float, float]:
+def estimate_white_noise(parts: Sequence[Array]) -> tuple[float, float]:
     """(standard deviation, half) of a channel's white noise: third differences of samples that are
     new (a slower sensor repeats its last one)."""
     blocks = []
     for values in parts:
         new = np.concatenate([[True], np.diff(values) != 0.0])
         third = np.diff(values if new.mean() > 0.7 else values[new], 3) / math.sqrt(20.0)
-        blocks += [np.array([each @ each, len(each)]) for each in np.array_split(third, BLOCKS)]
-    return jackknife(np.array(blocks), _root_mean)
+        blocks += [np.array([block @ block, len(block)]) for block in np.array_split(third, BLOCKS)]
+    return jackknife(np.array(blocks), _compute_root_mean)
 
 
-def noise_levels(left: Array, dt: float) -> Array:
+def estimate_noise_levels(left: Array, dt: float) -> Array:
     """(channels,): standard deviations of independent rows that would tell as little as those of a
     residual, which are alike for a while: of means over up to 1 s, by the root of their rows."""
     levels = [np.full(left.shape[1], 1e-9)]
     shown = np.maximum(np.mean(left != 0.0, axis=(0, 2)), 1e-9)
     for seconds in ALIKE:
         rows = max(round(seconds / dt), 1)
-        whole = left[:, :, : left.shape[2] // rows * rows]
-        means = whole.reshape(*left.shape[:2], -1, rows).mean(axis=3)
+        trimmed = left[:, :, : left.shape[2] // rows * rows]
+        means = trimmed.reshape(*left.shape[:2], -1, rows).mean(axis=3)
         levels.append(np.sqrt(rows * np.mean(means**2, axis=(0, 2)) / shown))
     return np.asarray(np.max(levels, axis=0))
 
 
-def _fixes(log: Log, value: int, signal: Array, part: Array, times: Array) -> list[Array]:
+def _collect_fixes(log: Log, value: int, signal: Array, part: Array, times: Array) -> list[Array]:
     """Blocks of sums over the differences d of two fixes' values less the signal's so much earlier,
     and p of `part`, whose size is not known: d^2, d p, p^2 and 1, each (times,)."""
-    packets = log.record.packets_of("gps")
+    packets = log.record.select_packets("gps")
     packets = packets[packets[:, PACKET.quality] > 0.0]
     rows, place = packets[:, PACKET.captured] - log.record.first, np.arange(float(len(signal)))
     earlier = rows[:, None] - times / log.record.dt
@@ -86,19 +86,19 @@ def _fixes(log: Log, value: int, signal: Array, part: Array, times: Array) -> li
         return []
     d, p = d[used] - np.median(d[used], axis=0), p[used]  # the median is a gyro's bias
     sums = np.stack([d * d, d * p, p * p, np.ones_like(d)])
-    return [each.sum(axis=1) for each in np.array_split(sums, BLOCKS, axis=1)]
+    return [block.sum(axis=1) for block in np.array_split(sums, BLOCKS, axis=1)]
 
 
-def _left(sums: Array, share: float | None = None) -> Array:
+def _compute_remainder(sums: Array, share: float | None = None) -> Array:
     """(times,): the mean of squares that a share of the part leaves; None: the best one."""
-    square, product, own, count = sums
-    shares = product / np.maximum(own, 1e-12) if share is None else share
-    return np.asarray((square - 2.0 * shares * product + shares**2 * own) / count)
+    square, product, part_square, count = sums
+    shares = product / np.maximum(part_square, 1e-12) if share is None else share
+    return np.asarray((square - 2.0 * shares * product + shares**2 * part_square) / count)
 
 
-def _least(times: Array, sums: Array, share: float | None = None) -> float:
+def _find_minimum(times: Array, sums: Array, share: float | None = None) -> float:
     """The time of the least that is left, between the samples by a parabola."""
-    lefts = _left(sums, share)
+    lefts = _compute_remainder(sums, share)
     i = int(np.clip(np.argmin(lefts), 1, len(times) - 2))
     left, middle, right = lefts[i - 1 : i + 2]
     bend = left - 2.0 * middle + right
@@ -106,7 +106,7 @@ def _least(times: Array, sums: Array, share: float | None = None) -> float:
     return float(times[i] + beside * (times[1] - times[0]))
 
 
-def sensor_findings(
+def make_sensor_findings(
     logs: Sequence[Log], slips: Sequence[Array]
 ) -> tuple[list[Finding], dict[str, float], dict[str, float]]:
     """Findings of the sensors, noise by the estimators' options, and latency by sensor.
@@ -117,33 +117,45 @@ def sensor_findings(
     noise: dict[str, float] = {}
     for channel, unit in _FAST.items():
         if all(channel in log.record.present for log in logs):
-            sd, half = white([log.record.fast[:, getattr(FAST, channel)] for log in logs])
-            told = half < 0.3 * sd
-            remark = "" if told else WIDE if sd > 0.0 else "none is seen"
-            findings.append(Finding(f"noise of {channel}", math.nan, sd, half, unit, told, remark))
-            noise |= {NOISES[channel]: sd} if told else {}
+            sd, half = estimate_white_noise(
+                [log.record.fast[:, getattr(FAST, channel)] for log in logs]
+            )
+            is_determined = half < 0.3 * sd
+            remark = "" if is_determined else WIDE if sd > 0.0 else "none is seen"
+            findings.append(
+                Finding(f"noise of {channel}", math.nan, sd, half, unit, is_determined, remark)
+            )
+            noise |= {NOISES[channel]: sd} if is_determined else {}
     times = np.arange(*LATE, max(logs[0].record.dt, 0.01))
     pairs = [pair for pair in zip(logs, slips, strict=True) if "gps" in pair[0].slow]
-    courses = [b for log, slip in pairs for b in _fixes(log, _COURSE, heading(log), slip, times)]
+    courses = [
+        b
+        for log, slip in pairs
+        for b in _collect_fixes(log, _COURSE, compute_heading(log), slip, times)
+    ]
     speeds = [
-        b for log, _ in pairs for b in _fixes(log, _SPEED, ground_speed(log), 0.0 * log.time, times)
+        b
+        for log, _ in pairs
+        for b in _collect_fixes(log, _SPEED, compute_ground_speed(log), 0.0 * log.time, times)
     ]
     if not courses:
         return findings, noise, {}
-    late, half = jackknife(np.array(courses), lambda sums: _least(times, sums))
+    late, half = jackknife(np.array(courses), lambda sums: _find_minimum(times, sums))
     half = math.hypot(
-        half, late - _least(times, np.sum(courses, axis=0), 1.0)
+        half, late - _find_minimum(times, np.sum(courses, axis=0), 1.0)
     )  # had the slip its size
-    told = half < LATE_WITHIN
-    pays = told and late > half
-    remark = ("applied" if pays else "within its interval of 0") if told else WIDE
-    findings.append(Finding("latency of gps", 0.0, late, half, "s", told, remark))
+    is_determined = half < LATE_WITHIN
+    pays = is_determined and late > half
+    remark = ("applied" if pays else "within its interval of 0") if is_determined else WIDE
+    findings.append(Finding("latency of gps", 0.0, late, half, "s", is_determined, remark))
     at = int(np.argmin(np.abs(times - late)))
     for name, unit, scale, blocks in (
         ("course", "deg", math.degrees(1.0), courses), ("gps_speed", "m/s", 1.0, speeds)
     ):  # fmt: skip
         if blocks:  # a difference has twice the variance
-            sd, half = jackknife(np.array(blocks), lambda sums: math.sqrt(0.5 * _left(sums)[at]))
+            sd, half = jackknife(
+                np.array(blocks), lambda sums: math.sqrt(0.5 * _compute_remainder(sums)[at])
+            )
             row = Finding(f"noise of {name}", math.nan, scale * sd, scale * half, unit, True)
             findings, noise = [*findings, row], noise | {NOISES[name]: sd}
     return findings, noise, {"gps": late} if pays else {}

@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 
 from ...envs.arguments import Mask
 from ...envs.record import Array
-from ...envs.recordings.geodesy import metres
+from ...envs.recordings.geodesy import to_metres
 from ...envs.recordings.nmea import Epoch
 from ...envs.sensors.gps import COURSE_SPEED, HDOP_LAWS
 from ...estimators.filters import FILTERS
@@ -25,10 +25,10 @@ from ..harness.stats import Estimate, interval
 SAME = "constant, same information"
 GAP = 10.0  # s without a fix, or back, after which the filter starts anew
 SETTLED = 3  # fixes after a start that are not scored
-LEAST = 120  # scored fixes
+MIN_FIXES = 120  # scored fixes
 BLOCK = 30  # fixes, whose mean is one number of an interval
-LEAST_NOISE = 1e-3  # in m or rad: r of a log that shows none
-_LIMITS = math.log(LEAST_NOISE), math.log(1e4)  # of q and r
+MIN_NOISE = 1e-3  # in m or rad: r of a log that shows none
+_LIMITS = math.log(MIN_NOISE), math.log(1e4)  # of q and r
 _GRID, _STEP = np.linspace(*_LIMITS, 8), 1.0
 
 
@@ -44,12 +44,12 @@ class Track(NamedTuple):
     hdop: Array
     satellites: Array
 
-    def of(self, shown: Mask) -> "Track":
+    def select(self, shown: Mask) -> "Track":
         """Some of the fixes."""
         return Track(self.origin, *(column[shown] for column in self[1:]))
 
 
-def track_of(epochs: Sequence[Epoch]) -> Track:
+def make_track(epochs: Sequence[Epoch]) -> Track:
     """The fixes around the first one; those without HDOP or out of order are left out.
 
     A step back beyond `GAP` is a clock that was set, and stays.
@@ -57,13 +57,13 @@ def track_of(epochs: Sequence[Epoch]) -> Track:
     shown, last = [], -math.inf
     for epoch in epochs:
         late = epoch.t > last or epoch.t < last - GAP
-        if epoch.fixed and late and math.isfinite(epoch.hdop):
+        if epoch.has_fix and late and math.isfinite(epoch.hdop):
             shown.append(epoch)
             last = epoch.t
     columns = np.array(shown, np.float64).reshape(-1, len(Epoch._fields)).T
     now = dict(zip(Epoch._fields, columns, strict=True))
     origin = (float(now["latitude"][0]), float(now["longitude"][0])) if shown else (0.0, 0.0)
-    east, north = metres(now["latitude"], now["longitude"], origin)
+    east, north = to_metres(now["latitude"], now["longitude"], origin)
     same = {name: now[name] for name in ("t", "course", "speed", "hdop", "satellites")}
     return Track(east=east, north=north, origin=origin, **same)
 
@@ -77,14 +77,14 @@ class Signal(NamedTuple):
     unit: str
     axes: int
     z: npt.NDArray[np.complex128]
-    own: Array
+    base_size: Array
     spread: float
     track: Track
     scored: Mask
     half: int = 0
 
 
-class Result(NamedTuple):
+class NoiseLawResult(NamedTuple):
     """A law's filter: r, the noise at HDOP 1; q; and per scored fix of the second half the
     prediction's error, its log-likelihood and normalised square."""
 
@@ -96,83 +96,87 @@ class Result(NamedTuple):
     hdop: Array
 
 
-def signals(track: Track) -> list[Signal]:
+def make_signals(track: Track) -> list[Signal]:
     """Position, scored where the car moves, and course, which has a meaning there alone; those
-    with `LEAST` fixes to score.
+    with `MIN_FIXES` fixes to score.
 
     Raises ValueError where position has fewer.
     """
     moving: Mask = ~(track.speed < COURSE_SPEED)  # an unknown speed may be one
-    where = np.asarray(track.east + 1j * track.north, np.complex128)
-    position = Signal("position", "m", 2, where, np.ones(len(where)), 20.0, track, moving)
-    part = track.of((track.speed >= COURSE_SPEED) & np.isfinite(track.course))
-    whole: Mask = np.ones(len(part.t), bool)
+    positions = np.asarray(track.east + 1j * track.north, np.complex128)
+    position = Signal("position", "m", 2, positions, np.ones(len(positions)), 20.0, track, moving)
+    part = track.select((track.speed >= COURSE_SPEED) & np.isfinite(track.course))
+    all_fixes: Mask = np.ones(len(part.t), bool)
     angle = np.asarray(part.course, np.complex128)
-    course = Signal("course", "rad", 1, angle, 1.0 / part.speed, 0.5, part, whole)
-    found = []
+    course = Signal("course", "rad", 1, angle, 1.0 / part.speed, 0.5, part, all_fixes)
+    scored = []
     for signal in (position, course):
-        known = signal.scored & np.isfinite(predictions(signal, signal.own**2, 1.0)[0])
+        known = signal.scored & np.isfinite(predict_fixes(signal, signal.base_size**2, 1.0)[0])
         rows = np.flatnonzero(known)
-        if len(rows) >= LEAST:
-            found.append(signal._replace(scored=known, half=int(rows[len(rows) // 2])))
+        if len(rows) >= MIN_FIXES:
+            scored.append(signal._replace(scored=known, half=int(rows[len(rows) // 2])))
         elif signal is position:
-            raise ValueError(f"{len(rows)} fixes to score, where the car moves; {LEAST} are needed")
-    return found
+            raise ValueError(
+                f"{len(rows)} fixes to score, where the car moves; {MIN_FIXES} are needed"
+            )
+    return scored
 
 
-def compare(signal: Signal) -> dict[str, Result]:
+def compare(signal: Signal) -> dict[str, NoiseLawResult]:
     """Each law of the noise, q and r at their maximum likelihood on the first half; and one noise
     for all with the average information of the law `table`."""
     half = signal.half
-    sizes = {name: law_size(signal.track.hdop, weight) for name, weight in HDOP_LAWS.items()}
-    found = {name: _best(signal, size) for name, size in sizes.items()}
-    table = (sizes["table"] * signal.own)[:half]
-    own = signal.own[:half]
-    r = found["table"].r * math.sqrt(np.mean(own**-2.0) / np.mean(table**-2.0))
-    found[SAME] = _best(signal, sizes["constant"], r)
-    return found
+    sizes = {
+        name: compute_law_size(signal.track.hdop, weight) for name, weight in HDOP_LAWS.items()
+    }
+    results = {name: _fit_law(signal, size) for name, size in sizes.items()}
+    table = (sizes["table"] * signal.base_size)[:half]
+    base = signal.base_size[:half]
+    r = results["table"].r * math.sqrt(np.mean(base**-2.0) / np.mean(table**-2.0))
+    results[SAME] = _fit_law(signal, sizes["constant"], r)
+    return results
 
 
-def law_size(hdop: Array, weight: float) -> Array:
+def compute_law_size(hdop: Array, weight: float) -> Array:
     """The noise's size by HDOP, of the table of double-layer: 1 + weight (table - 1)."""
     knots, factors = zip(*FILTERS["double-layer"].hdop, strict=True)
     return np.asarray(1.0 + weight * (np.interp(hdop, knots, factors) - 1.0))
 
 
-def gain(result: Result, other: Result) -> Estimate:
+def compute_gain(result: NoiseLawResult, other: NoiseLawResult) -> Estimate:
     """The mean log-likelihood less that of another law on the same fixes, by blocks of fixes."""
     difference = result.likelihood - other.likelihood
     blocks = np.array_split(difference, max(len(difference) // BLOCK, 1))
     return interval(np.array([block.mean() for block in blocks]))
 
 
-def _best(signal: Signal, size: Array, r: float | None = None) -> Result:
+def _fit_law(signal: Signal, size: Array, r: float | None = None) -> NoiseLawResult:
     """The filter at its maximum likelihood on the first half: the best of a grid, then refined."""
     half = signal.half
 
-    def scores(p: Array, count: int) -> tuple[Array, Array, Array]:
+    def compute_scores(p: Array, count: int) -> tuple[Array, Array, Array]:
         q, noise = np.exp(p)
-        error, S = predictions(signal, (noise * size * signal.own)[:count] ** 2, q)
+        error, S = predict_fixes(signal, (noise * size * signal.base_size)[:count] ** 2, q)
         square = error**2 / S / signal.axes
         return error, -0.5 * signal.axes * (square + np.log(2.0 * math.pi * S)), square
 
-    def cost(p: Array) -> float:
+    def compute_cost(p: Array) -> float:
         p = np.clip(p, *_LIMITS) if r is None else np.array([*p[:1], math.log(r)])
-        return -float(np.mean(scores(p, half)[1][signal.scored[:half]]))
+        return -float(np.mean(compute_scores(p, half)[1][signal.scored[:half]]))
 
     axes = [_GRID] * (2 if r is None else 1)
-    first = min(itertools.product(*axes), key=lambda p: cost(np.array(p)))
+    first = min(itertools.product(*axes), key=lambda p: compute_cost(np.array(p)))
     simplex = np.array([first, *(first + _STEP * np.eye(len(first)))])
-    p = minimize(cost, first, method="Nelder-Mead", options={"initial_simplex": simplex}).x
+    p = minimize(compute_cost, first, method="Nelder-Mead", options={"initial_simplex": simplex}).x
     p = np.clip(p, *_LIMITS) if r is None else np.array([p[0], math.log(r)])
-    error, likelihood, square = scores(p, len(signal.z))
+    error, likelihood, square = compute_scores(p, len(signal.z))
     late = signal.scored & (np.arange(len(signal.z)) >= half)
     q, noise = np.exp(p)
     hdop = signal.track.hdop
-    return Result(noise, q, error[late], likelihood[late], square[late], hdop[late])
+    return NoiseLawResult(noise, q, error[late], likelihood[late], square[late], hdop[late])
 
 
-def predictions(signal: Signal, R: Array, q: float) -> tuple[Array, Array]:
+def predict_fixes(signal: Signal, R: Array, q: float) -> tuple[Array, Array]:
     """(size of the error of predicting each fix from those before, its variance on an axis).
 
     R: (n,) variances. NaN while the filter settles.

@@ -9,35 +9,45 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from ... import __version__
-from ...envs.backend.files import whole
+from ...envs.backend.files import atomic_file
 from ...envs.record import Array
 from ...envs.recordings.nmea import HOUR, Counts
 from ...envs.recordings.sources import read_nmea
-from ..harness.results import Row, Suite, Table, write_text
+from ..harness.results import ResultRow, ResultTable, Suite, write_text
 from ..harness.stats import Estimate
-from ..harness.verdict import verdict
-from ..report.kml import track_kml
-from .receiver import LEAST_NOISE, SAME, Result, Signal, Track, compare, gain, signals, track_of
+from ..harness.verdict import format_verdict
+from ..report.kml import make_track_kml
+from .receiver import (
+    MIN_NOISE,
+    SAME,
+    NoiseLawResult,
+    Signal,
+    Track,
+    compare,
+    compute_gain,
+    make_signals,
+    make_track,
+)
 
 DEGREES = 180.0 / math.pi
 TUNED, FIXED = "table", "constant"
 CLASSES = {"HDOP below 2": (0.0, 2.0), "2 to 5": (2.0, 5.0), "5 and more": (5.0, math.inf)}
-_NO_SAY = 0.01  # of log-likelihood a fix: nobody would notice
-_LOOSE = 0.3  # a rank correlation that explains little
+_NEGLIGIBLE = 0.01  # of log-likelihood a fix: nobody would notice
+_WEAK_CORRELATION = 0.3  # a rank correlation that explains little
 _ROWS = {"position": "prediction_error", "course": "course_prediction_error"}
 _ALL = {"likelihood": "log_likelihood", "square": "nis"}
 
 
-class Replay(NamedTuple):
+class ReceiverReplay(NamedTuple):
     """A receiver's log: its fixes, and each signal with the results of the laws."""
 
     name: str
     track: Track
-    found: list[tuple[Signal, dict[str, Result]]]
+    outcomes: list[tuple[Signal, dict[str, NoiseLawResult]]]
     counts: Counts
 
 
-def replay_nmea(log: str | Path, *no_drive: object) -> Replay:
+def replay_nmea(log: str | Path, *no_drive: object) -> ReceiverReplay:
     """Read a receiver's log and compare the laws of its noise on it (needs the extra `wires`).
 
     no_drive: what only a drive with a gyro has, a vehicle and a mapping: None or empty. Raises what
@@ -47,17 +57,17 @@ def replay_nmea(log: str | Path, *no_drive: object) -> Replay:
     if any(no_drive):
         raise ValueError(f"{path}: a receiver's log takes no vehicle and no mapping")
     epochs, counts = read_nmea(path)
-    track = track_of(epochs)
+    track = make_track(epochs)
     try:
         if not len(track.t):
             raise ValueError("no fix has an HDOP: expected GGA, GNS or GSA sentences with one")
-        found = [(signal, compare(signal)) for signal in signals(track)]
+        outcomes = [(signal, compare(signal)) for signal in make_signals(track)]
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    return Replay(f"{path.resolve().parent.name}/{path.stem}", track, found, counts)
+    return ReceiverReplay(f"{path.resolve().parent.name}/{path.stem}", track, outcomes, counts)
 
 
-def receiver_suite(replay: Replay) -> Suite:
+def make_receiver_suite(replay: ReceiverReplay) -> Suite:
     """The answer, the counts, the numbers of each law, the track."""
     track = replay.track
     low, middle, high = np.percentile(track.hdop, (5, 50, 95))
@@ -72,72 +82,82 @@ def receiver_suite(replay: Replay) -> Suite:
         "half of the log; all numbers are of the second."
     )
     suite = Suite("replay", f"A receiver's log: {replay.name}", text)
-    suite.verdict = answer(replay)
-    suite.rows = [row for signal, found in replay.found for row in _rows(replay, signal, found)]
-    suite.tables = [_table(signal, found) for signal, found in replay.found]
+    suite.verdict = compose_verdict(replay)
+    suite.rows = [
+        row for signal, results in replay.outcomes for row in _make_rows(replay, signal, results)
+    ]
+    suite.tables = [_make_table(signal, results) for signal, results in replay.outcomes]
     counts = [[what, str(n)] for what, n in replay.counts.rows()]
     suite.tables.append(
-        Table("What came from the receiver", ("what", "count"), counts, keyed=False)
+        ResultTable("What came from the receiver", ("what", "count"), counts, keyed=False)
     )
-    suite.figures = _figures(replay)
+    suite.figures = _draw_figures(replay)
     return suite
 
 
-def answer(replay: Replay) -> str:
+def compose_verdict(replay: ReceiverReplay) -> str:
     """The verdict."""
-    tuned, fixed = (replay.found[0][1][law] for law in (TUNED, FIXED))
+    tuned, fixed = (replay.outcomes[0][1][law] for law in (TUNED, FIXED))
     rank = float(spearmanr(fixed.hdop, fixed.error).statistic)
     errors = [
-        f"{np.median(each.error):.2f} m ({np.percentile(each.error, 95):.1f} m)"
-        for each in (tuned, fixed)
+        f"{np.median(result.error):.2f} m ({np.percentile(result.error, 95):.1f} m)"
+        for result in (tuned, fixed)
     ]
-    why = "." if abs(rank) > _LOOSE else ", as of a receiver that smooths its fixes."
-    return verdict(
-        *(_pays(signal.name, found) for signal, found in replay.found),
+    why = "." if abs(rank) > _WEAK_CORRELATION else ", as of a receiver that smooths its fixes."
+    return format_verdict(
+        *(_describe_gain(signal.name, results) for signal, results in replay.outcomes),
         f"Error of the next fix, median (95 %): {errors[0]} tuned by HDOP, {errors[1]} constant.",
         f"Why: the rank correlation of that error with HDOP is {rank:.2f}{why}",
         "Not covered: how far fixes are from the truth; other receivers. Likelihood: nats a fix.",
     )
 
 
-def _pays(name: str, found: Mapping[str, Result]) -> str:
-    number = gain(found[TUNED], found[FIXED])
+def _describe_gain(name: str, results: Mapping[str, NoiseLawResult]) -> str:
+    number = compute_gain(results[TUNED], results[FIXED])
     value, low, high = number
     what = f"Tuning the noise of {name} by HDOP"
-    if max(abs(low), abs(high)) < _NO_SAY:
+    if max(abs(low), abs(high)) < _NEGLIGIBLE:
         return f"{what} changes nothing: log-likelihood {value:+.3f}."
     how = "pays" if low > 0.0 else "costs" if high < 0.0 else "is not seen to pay"
     return f"{what} {how}: log-likelihood {number.inline(digits='+.2f')}."
 
 
-def _rows(replay: Replay, signal: Signal, found: Mapping[str, Result]) -> list[Row]:
+def _make_rows(
+    replay: ReceiverReplay, signal: Signal, results: Mapping[str, NoiseLawResult]
+) -> list[ResultRow]:
     rows = []
-    for law, result in found.items():
+    for law, result in results.items():
         where = {
             "suite": "replay", "scenario": f"{replay.name}: {signal.name}", "estimator": law,
             "n": len(result.error), "env_version": f"replay {__version__}",
         }  # fmt: skip
         rms = Estimate(float(np.sqrt(np.mean(result.error**2))))
-        rows.append(Row.of(_ROWS[signal.name], rms, **where))
+        rows.append(ResultRow.from_estimate(_ROWS[signal.name], rms, **where))
         for column, metric in _ALL.items():
-            rows.append(Row.of(metric, Estimate(float(getattr(result, column).mean())), **where))
+            rows.append(
+                ResultRow.from_estimate(
+                    metric, Estimate(float(getattr(result, column).mean())), **where
+                )
+            )
         if law != FIXED:
-            rows.append(Row.of("difference", gain(result, found[FIXED]), **where))
+            rows.append(
+                ResultRow.from_estimate("difference", compute_gain(result, results[FIXED]), **where)
+            )
     return rows
 
 
-def _table(signal: Signal, found: Mapping[str, Result]) -> Table:
+def _make_table(signal: Signal, results: Mapping[str, NoiseLawResult]) -> ResultTable:
     scale, unit = (DEGREES, "deg") if signal.axes == 1 else (1.0, signal.unit)
     cells = []
-    for law, result in found.items():
+    for law, result in results.items():
         error = scale * result.error
         more = "-"
         if law != FIXED:
-            more = gain(result, found[FIXED]).inline(digits="+.3f")
+            more = compute_gain(result, results[FIXED]).inline(digits="+.3f")
         numbers = [np.median(error), np.sqrt(np.mean(error**2)), np.percentile(error, 95)]
         numbers += [result.likelihood.mean(), result.square.mean()]
-        noise = f"{scale * result.r:.3g}" if result.r > 1.5 * LEAST_NOISE else "none seen"
-        cells.append([law, noise, *(f"{each:.2f}" for each in numbers), more])
+        noise = f"{scale * result.r:.3g}" if result.r > 1.5 * MIN_NOISE else "none seen"
+        cells.append([law, noise, *(f"{number:.2f}" for number in numbers), more])
     header = ("noise", f"at HDOP 1 / {unit}", "median", "rms", "95 %", "log-likelihood", "NIS",
               "against constant")  # fmt: skip
     note = (
@@ -147,37 +167,43 @@ def _table(signal: Signal, found: Mapping[str, Result]) -> Table:
     )
     if signal.axes == 1:
         note += " The noise of course is that at 1 m/s, it falls with speed."
-    return Table(f"The next {signal.name}, predicted", header, cells, note, keyed=False)
+    return ResultTable(f"The next {signal.name}, predicted", header, cells, note, keyed=False)
 
 
-def write_kml(path: Path, replay: Replay) -> None:
+def write_kml(path: Path, replay: ReceiverReplay) -> None:
     """The fixes as a track for a map."""
     track = replay.track
     fixes = {"fixes": (track.east, track.north)}
-    write_text(path, track_kml(replay.name, fixes, origin=track.origin))
+    write_text(path, make_track_kml(replay.name, fixes, origin=track.origin))
 
 
-def _figures(replay: Replay) -> list[tuple[str, Any, str]]:
+def _draw_figures(replay: ReceiverReplay) -> list[tuple[str, Any, str]]:
     """The track by classes of HDOP, and HDOP over time; nothing without plotly."""
     try:
-        from ..report.figures import time_series, track
+        from ..report.figures import draw_time_series, draw_track
     except ModuleNotFoundError:
         return []
     now = replay.track
-    shown = {name: (_within(now, ends, now.east), now.north) for name, ends in CLASSES.items()}
+    shown = {
+        name: (_select_values(now, ends, now.east), now.north) for name, ends in CLASSES.items()
+    }
     time = now.t - now.t[0]
     return [
-        (f"{replay.name}: the track", track(shown), "East and north of the first fix, by HDOP."),
-        (f"{replay.name}: HDOP", time_series(time, {"HDOP": now.hdop}, "HDOP"), ""),
+        (
+            f"{replay.name}: the track",
+            draw_track(shown),
+            "East and north of the first fix, by HDOP.",
+        ),
+        (f"{replay.name}: HDOP", draw_time_series(time, {"HDOP": now.hdop}, "HDOP"), ""),
     ]
 
 
-def _within(track: Track, ends: tuple[float, float], values: Array) -> Array:
+def _select_values(track: Track, ends: tuple[float, float], values: Array) -> Array:
     """The values where HDOP lies within the ends, else NaN."""
     return np.where((track.hdop >= ends[0]) & (track.hdop < ends[1]), values, np.nan)
 
 
-def draw(path: Path, replay: Replay) -> None:
+def draw(path: Path, replay: ReceiverReplay) -> None:
     """The track and the errors of the next fix by HDOP, as a picture; needs the extra `report`."""
     try:
         from matplotlib.colors import LogNorm
@@ -186,7 +212,7 @@ def draw(path: Path, replay: Replay) -> None:
         raise ModuleNotFoundError(
             "pictures need matplotlib: pip install 'sideslip[report]'"
         ) from None
-    track, result = replay.track, replay.found[0][1][FIXED]
+    track, result = replay.track, replay.outcomes[0][1][FIXED]
     figure = Figure(figsize=(10, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(4, 3))
     look = {"c": track.hdop, "norm": LogNorm(1.0, 20.0), "cmap": "cividis_r", "s": 5}
@@ -199,5 +225,5 @@ def draw(path: Path, replay: Replay) -> None:
     right.plot(line, line * np.median(result.error / result.hdop), color="#D55E00")
     right.set(xscale="log", yscale="log", xlabel="HDOP", ylabel="error of the next fix / m")
     right.set_title("line: errors that follow HDOP", fontsize=10)
-    with whole(path) as file:
+    with atomic_file(path) as file:
         figure.savefig(file, format=path.suffix[1:] or "png", dpi=100)

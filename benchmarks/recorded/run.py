@@ -13,8 +13,8 @@ from ...envs.record import Array, Log
 from ...envs.sensors.link import SlowSensor
 from ...envs.vehicle.vehicle import Vehicle
 from ...estimators.make import make_estimator
-from ..harness.drives import SETTLED, quietly
-from .emulate import Emulation, backward
+from ..harness.drives import SETTLED, call_quietly
+from .emulate import Emulation, find_backward
 
 GYRO_ONLY = "bicycle-kf"
 ESTIMATORS: dict[str, tuple[str, ...]] = {
@@ -31,8 +31,8 @@ ESTIMATORS: dict[str, tuple[str, ...]] = {
 """The estimators of a replay and the slow sensors that serve them, the better one first."""
 
 OWN_NOISE = "joint-robust"  # brings its levels along and finds the accelerometer's as it drives
-LEAST_NOISE = 0.01  # deg, of the course, the least that estimators assume
-LEAST_GYRO = 0.002  # rad/s; below, what the model lacks weighs more than the sensor's noise
+MIN_COURSE_NOISE = 0.01  # deg, of the course, the least that estimators assume
+MIN_GYRO_NOISE = 0.002  # rad/s; below, what the model lacks weighs more than the sensor's noise
 _MOTION = ("beta", "gamma", "psi", "y_l", "course", "phi", "phi_rate", "F_d", "N_d")
 
 
@@ -64,8 +64,8 @@ class Settings(Emulation):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        asked = (*(self.estimators or ()), *self.options)
-        unknown = [name for name in asked if name not in ESTIMATORS]
+        requested = (*(self.estimators or ()), *self.options)
+        unknown = [name for name in requested if name not in ESTIMATORS]
         if unknown:
             raise ValueError(
                 f"unknown estimator {', '.join(unknown)}; known here: {', '.join(ESTIMATORS)}"
@@ -86,7 +86,7 @@ class Settings(Emulation):
 
 
 @dataclass
-class Result:
+class ReplayResult:
     """Errors of one vehicle's estimators on one drive.
 
     squares: by estimator, mean squared error in rad2 of each seed (empty without truth). cost: CPU
@@ -98,61 +98,61 @@ class Result:
     squares: dict[str, Array] = field(default_factory=dict)
     cost: dict[str, float] = field(default_factory=dict)
     traces: dict[str, Array] = field(default_factory=dict)
-    found: dict[str, list[tuple[str, float, float]]] = field(default_factory=dict)
+    outcomes: dict[str, list[tuple[str, float, float]]] = field(default_factory=dict)
     remarks: dict[str, str] = field(default_factory=dict)
 
     def rmse(self, name: str) -> tuple[float, float, float]:
         """Median, least and most over the seeds, in rad."""
-        return _spread(np.sqrt(self.squares[name]))
+        return _summarise_range(np.sqrt(self.squares[name]))
 
     def ratio(self, name: str, other: str = GYRO_ONLY) -> tuple[float, float, float]:
         """RMSE over another's, seed by seed: median, least and most."""
-        return _spread(np.sqrt(self.squares[name] / self.squares[other]))
+        return _summarise_range(np.sqrt(self.squares[name] / self.squares[other]))
 
 
-def _spread(values: Array) -> tuple[float, float, float]:
+def _summarise_range(values: Array) -> tuple[float, float, float]:
     return float(np.median(values)), float(np.min(values)), float(np.max(values))
 
 
-def drives_of(log: Log, how: Settings) -> list[Log]:
+def make_drives(log: Log, settings: Settings) -> list[Log]:
     """What the estimators see: a drive for each noise of the course, or the one that was logged.
 
     Raises ValueError for a log that is over before errors count.
     """
-    lasts = log.time[-1] - log.time[0]
-    if lasts < SETTLED:
+    duration = log.time[-1] - log.time[0]
+    if duration < SETTLED:
         raise ValueError(
-            f"{log.name}: the drive lasts {lasts:.3g} s, errors count from {SETTLED:g} s on"
+            f"{log.name}: the drive lasts {duration:.3g} s, errors count from {SETTLED:g} s on"
         )
-    if log.slow or "beta" not in log.truth or not how.emulated:
-        return [how.with_gyro_bias(log)]
-    return [how.with_course(log, how.seed + i) for i in range(how.seeds)]
+    if log.slow or "beta" not in log.truth or not settings.emulated:
+        return [settings.add_gyro_bias(log)]
+    return [settings.add_course(log, settings.seed + i) for i in range(settings.seeds)]
 
 
-def run_estimators(drives: Sequence[Log], vehicle: Vehicle, how: Settings) -> Result:
+def run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings) -> ReplayResult:
     """Every wanted estimator that the drives' slow sensors serve, over every drive."""
-    log, result = drives[0], Result()
-    counts = (log.time >= log.time[0] + SETTLED - 1e-9) & ~backward(log)
+    log, result = drives[0], ReplayResult()
+    counts = (log.time >= log.time[0] + SETTLED - 1e-9) & ~find_backward(log)
     truth = log.truth.get("beta")
     if truth is not None and not (counts := counts & np.isfinite(truth)).any():
         raise ValueError(
             f"{log.name}: the sideslip truth is unknown from {SETTLED:g} s on, driven forward"
         )
     for name, serves in ESTIMATORS.items():
-        if how.estimators is not None and name not in (GYRO_ONLY, *how.estimators):
+        if settings.estimators is not None and name not in (GYRO_ONLY, *settings.estimators):
             continue
         slow = next((sensor for sensor in serves if sensor in log.slow), None)
         if serves and slow is None and name != OWN_NOISE:  # which inertial sensors serve too
             result.remarks[name] = f"left out: needs {' or '.join(serves)}"
             continue
         try:
-            estimator = _estimator(name, slow, log, vehicle, how)
+            estimator = _make_estimator(name, slow, log, vehicle, settings)
         except ValueError as error:
             if name == GYRO_ONLY:
                 raise
             result.remarks[name] = f"left out: {str(error).removeprefix(f'{name}: ')}"
             continue
-        missing = [each for each in estimator.needs if each not in log.record.present]
+        missing = [column for column in estimator.needs if column not in log.record.present]
         if missing and name != GYRO_ONLY:
             result.remarks[name] = f"left out: needs the column {', '.join(missing)}"
             continue
@@ -167,7 +167,7 @@ def run_estimators(drives: Sequence[Log], vehicle: Vehicle, how: Settings) -> Re
             beta = estimates.x[:, estimates.names.index("beta")]
             result.traces.setdefault(name, beta)
             ends = zip(estimates.names, estimates.x[-1], estimates.std[-1], strict=True)
-            result.found[name] = [
+            result.outcomes[name] = [
                 (state, float(x), float(sd)) for state, x, sd in ends if state not in _MOTION
             ]
             if truth is not None:
@@ -177,18 +177,20 @@ def run_estimators(drives: Sequence[Log], vehicle: Vehicle, how: Settings) -> Re
     return result
 
 
-def _estimator(name: str, slow: str | None, log: Log, vehicle: Vehicle, how: Settings) -> Any:
+def _make_estimator(
+    name: str, slow: str | None, log: Log, vehicle: Vehicle, settings: Settings
+) -> Any:
     sensors: dict[str, SlowSensor] = {} if slow is None else {slow: log.slow[slow]}
-    options: dict[str, Any] = {"q_beta": how.q_beta, "q_gamma": how.q_gamma}
+    options: dict[str, Any] = {"q_beta": settings.q_beta, "q_gamma": settings.q_gamma}
     if slow is not None:
-        options |= {"slow": slow, "q_psi": how.q_psi}
+        options |= {"slow": slow, "q_psi": settings.q_psi}
     if name == OWN_NOISE:
         options = {"slow": slow} if slow is not None else {}
     if slow == "gps":
-        options["course_noise"] = math.radians(max(how.course_noise_deg, LEAST_NOISE))
-        options |= {key: how.noise[key] for key in ("course_noise",) if key in how.noise}
-    if "gyro_noise" in how.noise and name != OWN_NOISE:
-        options["gyro_noise"] = max(how.noise["gyro_noise"], LEAST_GYRO)
-    options |= how.options.get(name, {})
+        options["course_noise"] = math.radians(max(settings.course_noise_deg, MIN_COURSE_NOISE))
+        options |= {key: settings.noise[key] for key in ("course_noise",) if key in settings.noise}
+    if "gyro_noise" in settings.noise and name != OWN_NOISE:
+        options["gyro_noise"] = max(settings.noise["gyro_noise"], MIN_GYRO_NOISE)
+    options |= settings.options.get(name, {})
     facts = {"vehicle": vehicle, "sensors": sensors, "dt": log.record.dt}
-    return quietly(make_estimator, name, **facts, **options)  # the result names what is unseen
+    return call_quietly(make_estimator, name, **facts, **options)  # the result names what is unseen

@@ -11,11 +11,11 @@ from ... import __version__
 from ...envs.record import Log
 from ...envs.vehicle.vehicle import Vehicle
 from ..harness.drives import SETTLED
-from ..harness.results import Row, Suite, Table
+from ..harness.results import ResultRow, ResultTable, Suite
 from ..harness.stats import Estimate
-from ..harness.verdict import leader, verdict
-from .emulate import backward, path
-from .run import ESTIMATORS, GYRO_ONLY, Result, Settings, drives_of, run_estimators
+from ..harness.verdict import describe_leader, format_verdict
+from .emulate import compute_path, find_backward
+from .run import ESTIMATORS, GYRO_ONLY, ReplayResult, Settings, make_drives, run_estimators
 
 __all__ = ["Settings", "corners", "replay"]
 
@@ -40,17 +40,17 @@ def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     Raises TypeError for an unknown setting, ValueError for a bad one and for a drive under 2 s.
     """
     how = Settings(**settings)
-    car = vehicle.scaled(how.stiffness_factor)
-    drives = drives_of(log, how)
+    car = vehicle.scale_stiffness(how.stiffness_factor)
+    drives = make_drives(log, how)
     result = run_estimators(drives, car, how)
-    suite = Suite("replay", f"A recorded drive: {log.name}", _text(log, drives, car, how))
-    suite.rows = _rows(result, log.name, car, how)
-    suite.tables = [_table(result, log.name, car, len(drives))]
-    if any(result.found.values()):
-        suite.tables.append(_parameters(result, log.name))
-    suite.verdict = answer(result, "gps" in drives[0].slow and "gps" not in log.slow)
+    suite = Suite("replay", f"A recorded drive: {log.name}", _make_text(log, drives, car, how))
+    suite.rows = _make_rows(result, log.name, car, how)
+    suite.tables = [_make_table(result, log.name, car, len(drives))]
+    if any(result.outcomes.values()):
+        suite.tables.append(_make_parameter_table(result, log.name))
+    suite.verdict = compose_verdict(result, "gps" in drives[0].slow and "gps" not in log.slow)
     if how.figures:
-        suite.figures = _figures(result, log)
+        suite.figures = _draw_figures(result, log)
         if result.squares and suite.figures:
             (_, bars, text), *suite.figures = suite.figures
             title = f"Which estimator is closest on a recorded drive? ({log.name})"
@@ -58,10 +58,10 @@ def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     return suite
 
 
-def answer(result: Result, emulated: bool) -> str:
+def compose_verdict(result: ReplayResult, emulated: bool) -> str:
     """The verdict. emulated: whether the GPS course is made from the truth."""
     if not result.squares:
-        return verdict(
+        return format_verdict(
             f"Nobody wins: without the true sideslip angle {len(result.traces)} estimators are "
             "drawn, not scored.",
             "Not covered: how far off they are. A log with a true sideslip angle would show it.",
@@ -70,9 +70,9 @@ def answer(result: Result, emulated: bool) -> str:
     over = {name: Estimate(*result.ratio(first, name)) for name in rest}
     slow = [name for name in result.squares if name != GYRO_ONLY]
     gain = f"{GYRO_ONLY}, with the gyro alone, errs {DEGREES * result.rmse(GYRO_ONLY)[0]:.2f} deg"
-    return verdict(
+    return format_verdict(
         "An estimator infers the sideslip angle: between where the car points and where it goes.",
-        f"From the recorded angle {leader(first, over, 'stray')}.",
+        f"From the recorded angle {describe_leader(first, over, 'stray')}.",
         f"Its error: {DEGREES * result.rmse(first)[0]:.2f} deg; brackets: range over noises.",
         f"Why: {gain}; a slow sensor {'helps' if first in slow else 'does not help'} here.",
         "Not covered: other drives and cars"
@@ -89,30 +89,32 @@ def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     how = Settings(**settings)
     if "beta" not in log.truth:
         raise ValueError(f"{log.name}: corners are scored against sideslip truth; there is none")
-    drives = drives_of(log, how)
+    drives = make_drives(log, how)
     suite = Suite("replay", f"A recorded drive: {log.name}", "")
     results = {}
     for front, rear in CORNERS:
-        car = vehicle.scaled(how.stiffness_factor).scaled(front, rear)
+        car = vehicle.scale_stiffness(how.stiffness_factor).scale_stiffness(front, rear)
         result = results[f"{front} / {rear}"] = run_estimators(drives, car, how)
         scenario = f"{log.name}: {vehicle.name}, front x {front}, rear x {rear}"
-        suite.rows += _rows(result, scenario, car, how)
+        suite.rows += _make_rows(result, scenario, car, how)
     names = [name for name in ESTIMATORS if any(name in r.squares for r in results.values())]
     title = f"{log.name}, {vehicle.name} with front / rear stiffness x ...: RMSE / deg"
-    cells = [[name, *(_error(result, name) for result in results.values())] for name in names]
+    cells = [
+        [name, *(_format_error(result, name) for result in results.values())] for name in names
+    ]
     note = "The same process noise in all corners; medians over the noises."
-    suite.tables = [Table(title, ("estimator", *results), cells, note)]
+    suite.tables = [ResultTable(title, ("estimator", *results), cells, note)]
     return suite
 
 
-def _text(log: Log, drives: Sequence[Log], car: Vehicle, how: Settings) -> str:
-    lasts, rate = log.time[-1] - log.time[0], 1.0 / log.record.dt
-    text = [f"{lasts:.0f} s at {rate:.4g} Hz. The estimators are designed from {car.name!r}"]
-    if how.stiffness_factor != 1.0:
-        text.append(f"with both tyre stiffnesses x {how.stiffness_factor:g}")
+def _make_text(log: Log, drives: Sequence[Log], car: Vehicle, settings: Settings) -> str:
+    duration, rate = log.time[-1] - log.time[0], 1.0 / log.record.dt
+    text = [f"{duration:.0f} s at {rate:.4g} Hz. The estimators are designed from {car.name!r}"]
+    if settings.stiffness_factor != 1.0:
+        text.append(f"with both tyre stiffnesses x {settings.stiffness_factor:g}")
     text.append(
-        f"and one process noise: {how.q_beta:g} rad2/s on sideslip, {how.q_gamma:g} (rad/s)2/s on "
-        f"yaw rate, {how.q_psi:g} rad2/s on heading."
+        f"and one process noise: {settings.q_beta:g} rad2/s on sideslip, {settings.q_gamma:g} "
+        f"(rad/s)2/s on yaw rate, {settings.q_psi:g} rad2/s on heading."
     )
     if log.slow:
         text.append(f"Slow sensors are the log's own: {', '.join(log.slow)}.")
@@ -120,26 +122,28 @@ def _text(log: Log, drives: Sequence[Log], car: Vehicle, how: Settings) -> str:
         gps = drives[0].slow["gps"]
         text.append(
             f"A GPS course is emulated every {gps.period:.4g} s from the sideslip truth and the "
-            f"integral of the logged yaw rate: noise {how.course_noise_deg:g} deg, "
-            f"{gps.longest_delay:.4g} s late, bias {how.bias_deg:g} deg."
+            f"integral of the logged yaw rate: noise {settings.course_noise_deg:g} deg, "
+            f"{gps.longest_delay:.4g} s late, bias {settings.bias_deg:g} deg."
         )
-    elif how.emulated:
+    elif settings.emulated:
         text.append("The log has no slow sensor and no truth to emulate one from.")
-    if how.gyro_bias_degps:
-        text.append(f"{how.gyro_bias_degps:g} deg/s are added to the gyro.")
+    if settings.gyro_bias_degps:
+        text.append(f"{settings.gyro_bias_degps:g} deg/s are added to the gyro.")
     if "beta" in log.truth:
         text.append(f"Errors count from {SETTLED:g} s on.")
-        if count := int(backward(log).sum()):
+        if count := int(find_backward(log).sum()):
             text.append(f"{count} rows are driven backward, and not scored.")
     else:
         text.append("The log has no sideslip truth, so nothing is scored.")
     return " ".join(text)
 
 
-def _rows(result: Result, scenario: str, car: Vehicle, how: Settings) -> list[Row]:
+def _make_rows(
+    result: ReplayResult, scenario: str, car: Vehicle, settings: Settings
+) -> list[ResultRow]:
     """Every number of a result."""
-    spec = json.dumps({"vehicle": car.to_dict(), "settings": how.as_dict()})
-    common = {"salt": f"seed {how.seed}", "env_version": f"replay {__version__}", "spec": spec}
+    spec = json.dumps({"vehicle": car.to_dict(), "settings": settings.as_dict()})
+    common = {"salt": f"seed {settings.seed}", "env_version": f"replay {__version__}", "spec": spec}
     rows = []
     for name, cost in result.cost.items():
         measured = {"us_per_tick": Estimate(cost, math.nan, math.nan)}
@@ -148,21 +152,26 @@ def _rows(result: Result, scenario: str, car: Vehicle, how: Settings) -> list[Ro
             errors = {"rmse": Estimate(*result.rmse(name)), "ratio": Estimate(*result.ratio(name))}
             measured = errors | measured
         where = {"suite": "replay", "scenario": scenario, "estimator": name, "n": n}
-        rows += [Row.of(metric, number, **where, **common) for metric, number in measured.items()]
+        rows += [
+            ResultRow.from_estimate(metric, number, **where, **common)
+            for metric, number in measured.items()
+        ]
     return rows
 
 
-def _error(result: Result, name: str) -> str:
+def _format_error(result: ReplayResult, name: str) -> str:
     return f"{DEGREES * result.rmse(name)[0]:.2f}" if name in result.squares else "-"
 
 
-def _table(result: Result, name: str, car: Vehicle, noises: int) -> Table:
+def _make_table(result: ReplayResult, name: str, car: Vehicle, noises: int) -> ResultTable:
     """The estimators, best first; remarks in the note."""
     note = "; ".join(f"`{label}` {remark}" for label, remark in result.remarks.items())
     if not result.squares:
         cells = [[label, f"{cost:.3f}"] for label, cost in result.cost.items()]
         header: tuple[str, ...] = ("estimator", "us per tick")
-        return Table(f"{name}, designed from {car.name}: no truth, no score", header, cells, note)
+        return ResultTable(
+            f"{name}, designed from {car.name}: no truth, no score", header, cells, note
+        )
     header = ("estimator", "RMSE / deg", "least .. most", "of gyro only", "us per tick")
     cells = []
     for label in sorted(result.squares, key=lambda label: result.rmse(label)[0]):
@@ -171,56 +180,58 @@ def _table(result: Result, name: str, car: Vehicle, noises: int) -> Table:
         among = f"{low:.3f} .. {high:.3f}"
         cells.append([label, f"{value:.3f}", among, f"{ratio:.2f}", f"{cost:.3f}"])
     title = f"{name}, {car.name}: error of the sideslip angle (median of {noises} noises)"
-    return Table(title, header, cells, note)
+    return ResultTable(title, header, cells, note)
 
 
-def _parameters(result: Result, name: str) -> Table:
+def _make_parameter_table(result: ReplayResult, name: str) -> ResultTable:
     """What estimators found of the car and its sensors, at the end of the drive."""
     cells = [
         [label, state, f"{value:.4g}", f"{sd:.2g}"]
-        for label, states in result.found.items()
+        for label, states in result.outcomes.items()
         for state, value, sd in states
     ]
     note = "At the end of the drive, SI units; tyres are factors on the assumed stiffness."
     header = ("estimator", "state", "value", "deviation")
-    return Table(f"{name}: what the estimators found", header, cells, note)
+    return ResultTable(f"{name}: what the estimators found", header, cells, note)
 
 
-def _figures(result: Result, log: Log) -> list[tuple[str, Any, str]]:
+def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
     """Bars, sideslip, errors and tracks of the first noise; nothing without plotly."""
     try:
-        from ..report.figures import bars_with_interval, error_series, time_series, track
+        from ..report.figures import draw_bars, draw_error_series, draw_time_series, draw_track
     except ModuleNotFoundError:
         return []
     truth = log.truth.get("beta")
     traces = result.traces if truth is None else {"truth": truth} | result.traces
     slips = {name: DEGREES * beta for name, beta in traces.items()}
     label = "sideslip angle / deg"
-    most = log.time[np.nanargmax(np.abs(next(iter(slips.values()))))]
-    near = np.abs(log.time - most) <= WINDOW
+    peak_time = log.time[np.nanargmax(np.abs(next(iter(slips.values()))))]
+    near = np.abs(log.time - peak_time) <= WINDOW
     close = {name: beta[near] for name, beta in slips.items()}
-    paths = {name: path(log, beta) for name, beta in traces.items()}
-    whole = _few(time_series(log.time, slips, label), result)
+    paths = {name: compute_path(log, beta) for name, beta in traces.items()}
+    overview = _select_traces(draw_time_series(log.time, slips, label), result)
     shown = [
-        ("the sideslip angle and its estimates", whole, HIDDEN),
-        ("where the car slips most", time_series(log.time[near], close, label),
+        ("the sideslip angle and its estimates", overview, HIDDEN),
+        ("where the car slips most", draw_time_series(log.time[near], close, label),
             f"The {2 * WINDOW:g} s around the largest sideslip angle, all estimators."),
-        ("the track", _few(track(paths), result),
+        ("the track", _select_traces(draw_track(paths), result),
             "Dead reckoning from wheel speed, the integral of the logged yaw rate and each "
             f"sideslip angle: what a degree of sideslip is worth on the road. {HIDDEN}"),
     ]  # fmt: skip
     if truth is not None:
         errors = {name: DEGREES * (beta - truth) for name, beta in result.traces.items()}
-        figure = _few(error_series(log.time, errors, f"error of the {label}"), result)
+        figure = _select_traces(
+            draw_error_series(log.time, errors, f"error of the {label}"), result
+        )
         shown.insert(2, ("errors", figure, f"Estimate minus truth. {HIDDEN}"))
         value, low, high = (DEGREES * np.array([result.rmse(name) for name in result.squares])).T
-        bars = bars_with_interval(list(result.squares), value, low, high, f"RMSE of the {label}")
+        bars = draw_bars(list(result.squares), value, low, high, f"RMSE of the {label}")
         text = f"Median over the noises; whiskers: least and most. {GYRO_ONLY} has no slow sensor."
         shown.insert(0, ("error of each estimator", bars, text))
     return [(f"{log.name}: {title}", *more) for title, *more in shown]
 
 
-def _few(figure: Any, result: Result) -> Any:
+def _select_traces(figure: Any, result: ReplayResult) -> Any:
     """The figure with only truth, gyro-only and the best estimator in sight."""
     best = min(result.squares, key=lambda name: result.rmse(name)[0], default="exact-kf")
     for trace in figure.data:

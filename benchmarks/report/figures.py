@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.extras import extra
-from ...envs.rendering.palette import FACTS, GREY, INK, base, colour
+from ...envs.backend.extras import require_extra
+from ...envs.rendering.palette import FACTS, GREY, INK, find_base, find_colour
 from ..harness.stats import Estimate
-from .colours import line_styles
+from .colours import choose_line_styles
 
-with extra("report", "figures need plotly"):
+with require_extra("report", "figures need plotly"):
     from plotly import graph_objects as go
 
 Array = npt.NDArray[np.floating[Any]]
@@ -26,7 +26,7 @@ POINTS = 1000
 """The most points a line is drawn with: a figure is no wider in pixels."""
 
 
-def peaks(y: Array, limit: int = POINTS) -> npt.NDArray[np.intp]:
+def find_peaks(y: Array, limit: int = POINTS) -> npt.NDArray[np.intp]:
     """Indices of at most `limit` samples of y (n,) that draw the same line: the smallest and
     largest of each of limit/2 - 1 stretches, and both ends. A stretch of NaN stays a gap.
 
@@ -46,7 +46,7 @@ def peaks(y: Array, limit: int = POINTS) -> npt.NDArray[np.intp]:
     return np.unique(np.concatenate([starts + low, starts + high, [0, n - 1]]))
 
 
-def time_series(
+def draw_time_series(
     t: Array,
     series: Mapping[str, Array],
     unit_label: str,
@@ -62,29 +62,29 @@ def time_series(
     """
     t = np.asarray(t, float)
     figure = go.Figure()
-    for name, colour_and_dash in line_styles(series).items():
+    for name, colour_and_dash in choose_line_styles(series).items():
         y = np.asarray(series[name], float)
         if y.shape != t.shape:
             raise ValueError(f"series {name!r} has shape {y.shape}, its time {t.shape}")
-        there = ~np.isnan(y) if name in dots else np.ones(len(y), bool)
-        x, y = t[there], y[there]
-        shown = peaks(y)
-        trace = _line(name, x[shown], y[shown], *colour_and_dash, name in dots)
+        present = ~np.isnan(y) if name in dots else np.ones(len(y), bool)
+        x, y = t[present], y[present]
+        shown = find_peaks(y)
+        trace = _make_line(name, x[shown], y[shown], *colour_and_dash, name in dots)
         if len(y) > 4 * POINTS and name not in (*dots, *FACTS):
             trace.line.width = 1.0  # a dense line is noisy: leave room to see the others
         figure.add_trace(trace)
     figure.update_xaxes(range=[float(t[0]), float(t[-1])] if len(t) > 1 else None)
-    return _finish(_facts_last(figure), x_label, unit_label, 380, hovermode="x unified")
+    return _finish(_sort_facts(figure), x_label, unit_label, 380, hovermode="x unified")
 
 
-def error_series(t: Array, errors: Mapping[str, Array], unit_label: str) -> Any:
-    """Estimate minus truth over time, around a line at zero; arguments as of `time_series`."""
-    figure = time_series(t, errors, unit_label)
+def draw_error_series(t: Array, errors: Mapping[str, Array], unit_label: str) -> Any:
+    """Estimate minus truth over time, around a line at zero; arguments as of `draw_time_series`."""
+    figure = draw_time_series(t, errors, unit_label)
     figure.add_hline(y=0.0, line={"color": GREY, "width": 1}, layer="below")
     return figure
 
 
-def curves(
+def draw_curves(
     x: Array,
     series: Mapping[str, Array | tuple[Array, Array, Array]],
     x_label: str,
@@ -97,12 +97,12 @@ def curves(
     not as long as x.
     """
     figure = go.Figure()
-    for name, pen in line_styles(series).items():
-        found = series[name]
-        value, *bounds = found if isinstance(found, tuple) else (found,)
+    for name, pen in choose_line_styles(series).items():
+        line = series[name]
+        value, *bounds = line if isinstance(line, tuple) else (line,)
         if len(value) != len(x):
             raise ValueError(f"series {name!r} has {len(value)} values, x {len(x)}")
-        trace = _line(name, np.asarray(x, float), np.asarray(value, float), *pen)
+        trace = _make_line(name, np.asarray(x, float), np.asarray(value, float), *pen)
         trace.mode = "lines+markers"
         if bounds:
             ends = {"array": bounds[1] - value, "arrayminus": value - bounds[0], "symmetric": False}
@@ -113,24 +113,24 @@ def curves(
     return _finish(figure, x_label, y_label, 400, hovermode="x unified")
 
 
-def track(paths: Mapping[str, tuple[Array, Array]]) -> Any:
+def draw_track(paths: Mapping[str, tuple[Array, Array]]) -> Any:
     """Paths seen from above, a metre as long in x as in y.
 
     paths: name to (x, y), (n,) each. Raises ValueError for unequal lengths.
     """
     figure = go.Figure()
-    for name, colour_and_dash in line_styles(paths).items():
-        across, up = (np.asarray(values, float) for values in paths[name])
-        if across.shape != up.shape:
-            raise ValueError(f"track {name!r}: x has shape {across.shape}, y {up.shape}")
-        shown = np.unique(np.linspace(0, len(up) - 1, min(len(up), POINTS)).round().astype(int))
-        figure.add_trace(_line(name, across[shown], up[shown], *colour_and_dash))
+    for name, colour_and_dash in choose_line_styles(paths).items():
+        x, y = (np.asarray(values, float) for values in paths[name])
+        if x.shape != y.shape:
+            raise ValueError(f"track {name!r}: x has shape {x.shape}, y {y.shape}")
+        shown = np.unique(np.linspace(0, len(y) - 1, min(len(y), POINTS)).round().astype(int))
+        figure.add_trace(_make_line(name, x[shown], y[shown], *colour_and_dash))
     figure.update_yaxes(scaleanchor="x", scaleratio=1)
-    height = int(np.clip(120 + 900 * _slimness(figure), 280, 640))
-    return _finish(_facts_last(figure), "x / m", "y / m", height, hovermode="closest")
+    height = int(np.clip(120 + 900 * _compute_slimness(figure), 280, 640))
+    return _finish(_sort_facts(figure), "x / m", "y / m", height, hovermode="closest")
 
 
-def bars_with_interval(
+def draw_bars(
     labels: Sequence[str],
     values: Sequence[float],
     lows: Sequence[float],
@@ -169,7 +169,7 @@ def bars_with_interval(
         "customdata": text,
         "hovertemplate": "%{y}: %{customdata}<extra></extra>",
     }
-    colours = [colour(label) for label in labels]
+    colours = [find_colour(label) for label in labels]
     if log:
         trace = go.Scatter(mode="markers", marker={"color": colours, "size": 12}, **common)
     else:
@@ -180,7 +180,7 @@ def bars_with_interval(
     return _finish(figure, unit, "", 100 + 34 * len(labels), hovermode="closest")
 
 
-def groups_with_interval(
+def draw_groups(
     groups: Mapping[str, Mapping[str, Estimate]], unit: str, lines: Mapping[float, str]
 ) -> Any:
     """Dots with intervals on a logarithmic axis, group below group, each under its title.
@@ -197,13 +197,13 @@ def groups_with_interval(
             ticks[row] = name
             ends = {"array": [high - value], "arrayminus": [value - low], "symmetric": False}
             marker = {
-                "color": colour(name),
+                "color": find_colour(name),
                 "size": 10,
-                "line": {"width": 2, "color": colour(name)},
+                "line": {"width": 2, "color": find_colour(name)},
             }
-            marker["symbol"] = "circle" if base(name) in (name, None) else "circle-open"
+            marker["symbol"] = "circle" if find_base(name) in (name, None) else "circle-open"
             hover = f"{name}: {value:.3g} [{low:.3g}, {high:.3g}]<extra></extra>"
-            pen = {"type": "data", "color": colour(name), "thickness": 1.6, "width": 4}
+            pen = {"type": "data", "color": find_colour(name), "thickness": 1.6, "width": 4}
             figure.add_trace(
                 go.Scatter(x=[value], y=[row], error_x=pen | ends, marker=marker,
                            mode="markers", name=name, hovertemplate=hover, showlegend=False)
@@ -229,33 +229,33 @@ def groups_with_interval(
     return figure
 
 
-def _line(name: str, x: Array, y: Array, colour: str, dash: str, dots: bool = False) -> Any:
-    x, y = _single(x), _single(y)
+def _make_line(name: str, x: Array, y: Array, colour: str, dash: str, dots: bool = False) -> Any:
+    x, y = _reduce_precision(x), _reduce_precision(y)
     if dots:
         return go.Scatter(x=x, y=y, name=name, mode="markers", marker={"color": colour, "size": 4})
     pen = {"color": colour, "dash": dash, "width": 2.6 if name in FACTS else 1.8}
     return go.Scatter(x=x, y=y, name=name, mode="lines", line=pen)
 
 
-def _single(values: Array) -> Array:
+def _reduce_precision(values: Array) -> Array:
     """Single precision where nobody can see it, not for a small range far from zero."""
-    seen = values[np.isfinite(values)]
-    lost = np.abs(seen - seen.astype(np.float32))
-    far = len(seen) > 0 and lost.max() > 1e-4 * np.ptp(seen)
+    finite = values[np.isfinite(values)]
+    lost = np.abs(finite - finite.astype(np.float32))
+    far = len(finite) > 0 and lost.max() > 1e-4 * np.ptp(finite)
     return values if far else values.astype(np.float32)
 
 
-def _slimness(figure: Any) -> float:
+def _compute_slimness(figure: Any) -> float:
     """Height over width of all paths together."""
     spans = []
     for values in ([trace.y for trace in figure.data], [trace.x for trace in figure.data]):
-        seen = np.concatenate([*values, np.zeros(0)])
-        seen = seen[np.isfinite(seen)]
-        spans.append(float(np.ptp(seen)) if len(seen) else 0.0)
+        finite = np.concatenate([*values, np.zeros(0)])
+        finite = finite[np.isfinite(finite)]
+        spans.append(float(np.ptp(finite)) if len(finite) else 0.0)
     return spans[0] / max(spans[1], 1e-9)
 
 
-def _facts_last(figure: Any) -> Any:
+def _sort_facts(figure: Any) -> Any:
     """Truth on top of the estimates; the legend names it first."""
     figure.data = sorted(figure.data, key=lambda trace: trace.name in FACTS)
     figure.update_traces(legendrank=1, selector=lambda trace: trace.name in FACTS)

@@ -11,11 +11,11 @@ import numpy.typing as npt
 from rich.console import Console
 
 from ...agents import make_agent
-from ...agents.rollout import steps_of
-from ...envs.backend.extras import extra
-from ...envs.backend.files import whole
+from ...agents.rollout import iterate_steps
+from ...envs.backend.extras import require_extra
+from ...envs.backend.files import atomic_file
 from ...envs.ticks import TICK
-from ..harness.parallel import one_bar
+from ..harness.parallel import use_shared_bar
 from ..harness.results import check_writable
 
 Frame = npt.NDArray[np.uint8]
@@ -23,7 +23,7 @@ RATES = {".mp4": 50.0, ".gif": 12.5}  # pictures a second, by a file's ending
 _COLOURS = 128  # of a GIF
 
 
-class Driver(NamedTuple):
+class FilmDriver(NamedTuple):
     """Who drives which environment, and what the film calls it."""
 
     name: str
@@ -42,13 +42,13 @@ def check_film(path: Path | None) -> None:
     if path.suffix.lower() not in RATES:
         raise ValueError(f"a film ends in {' or '.join(RATES)}, got {str(path)!r}")
     check_writable(path)
-    with extra("render", "a film needs {}"):
+    with require_extra("render", "a film needs {}"):
         import moviepy  # noqa: F401
         import pygame  # noqa: F401
 
 
-def film_drive(
-    path: Path | None, driver: Driver, beside: str | None, seed: int | None, console: Console
+def write_drive_film(
+    path: Path | None, driver: FilmDriver, beside: str | None, seed: int | None, console: Console
 ) -> None:
     """The film of a drive, where there is a path for it; beside: an agent's name, for a ghost that
     drives in an env of the same kind. Raises as `film` and `make_agent`, ValueError for a ghost
@@ -61,13 +61,13 @@ def film_drive(
     if beside is not None:
         env = copy.deepcopy(driver.env)
         name = "no control" if beside == "none" else beside
-        drivers.append(Driver(name, env, make_agent(beside, env)))
-    film(path, drivers, seed, console)
+        drivers.append(FilmDriver(name, env, make_agent(beside, env)))
+    write_film(path, drivers, seed, console)
     console.print(f"wrote {path}", highlight=False, soft_wrap=True)
 
 
-def film(
-    path: Path, drivers: Sequence[Driver], seed: int | None = 0, console: Console | None = None
+def write_film(
+    path: Path, drivers: Sequence[FilmDriver], seed: int | None = 0, console: Console | None = None
 ) -> None:
     """Drive an episode and write its film, whole or not at all; a console shows the progress.
 
@@ -79,30 +79,33 @@ def film(
     step = base.control_period * TICK
     every = max(round(1.0 / (RATES[path.suffix.lower()] * step)), 1)
     total = base.config.base.scenario.duration / (every * step) + 1.0
-    with tempfile.TemporaryDirectory() as folder, one_bar(console, str(path), "pictures") as bar:
-        frames = bar.track(frames_of(drivers, seed, every), total, task_id=bar.task_ids[0])
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        use_shared_bar(console, str(path), "pictures") as bar,
+    ):
+        frames = bar.track(render_frames(drivers, seed, every), total, task_id=bar.task_ids[0])
         part = Path(folder, "film").with_suffix(path.suffix.lower())
         write = _write_gif if part.suffix == ".gif" else _write_mp4
         write(part, frames, 1.0 / (every * step))
-        with whole(path) as file:
+        with atomic_file(path) as file:
             file.write(part.read_bytes())
 
 
-def frames_of(drivers: Sequence[Driver], seed: int | None, every: int) -> Iterator[Frame]:
+def render_frames(drivers: Sequence[FilmDriver], seed: int | None, every: int) -> Iterator[Frame]:
     """A frame of every so many steps of the first driver's episode, and of its last one."""
-    from ...envs.rendering.canvas import pixels
-    from ...envs.rendering.picture import draw
+    from ...envs.rendering.canvas import read_pixels
+    from ...envs.rendering.picture import draw_picture
 
     bases = [driver.env.unwrapped for driver in drivers]
-    first, *others = (steps_of(driver.env, driver.agent, seed) for driver in drivers)
+    first, *others = (iterate_steps(driver.env, driver.agent, seed) for driver in drivers)
     for k, step in enumerate(first):
         for other in others:
             next(other, None)  # where its episode is over it stays where it is
-        main, *ghosts = [base.shot() for base in bases]
+        main, *ghosts = [base.make_render_state() for base in bases]
         if k % every == 0 or step.terminated or step.truncated:
             names = [driver.name for driver in drivers[1:]]
             named = list(zip(names, ghosts, strict=True))
-            yield pixels(draw(main, drivers[0].name if ghosts else "true", named))
+            yield read_pixels(draw_picture(main, drivers[0].name if ghosts else "true", named))
 
 
 def _write_mp4(path: Path, frames: Iterable[Frame], rate: float) -> None:
@@ -127,10 +130,10 @@ def _write_gif(path: Path, frames: Iterable[Frame], rate: float) -> None:
 
     pictures = [Image.fromarray(frame) for frame in frames]
     sample = np.concatenate(
-        [np.asarray(each)[::2, ::2] for each in pictures[:: len(pictures) // 6 or 1]]
+        [np.asarray(picture)[::2, ::2] for picture in pictures[:: len(pictures) // 6 or 1]]
     )
     palette = Image.fromarray(sample).quantize(_COLOURS, Image.Quantize.MEDIANCUT)
-    indexed = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures]
-    lasts = [round(1000.0 / rate)] * len(indexed)
-    lasts[-1] += 1500  # ms, before it begins anew
-    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=lasts, loop=0)
+    indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    durations = [round(1000.0 / rate)] * len(indexed)
+    durations[-1] += 1500  # ms, before it begins anew
+    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=durations, loop=0)

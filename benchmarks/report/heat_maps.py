@@ -17,14 +17,14 @@ Array = npt.NDArray[np.float64]
 _GOOD_TO_BAD = [(1.0 - at, shade) for at, shade in SHARE_SCALE][::-1]
 
 
-def heat_map(
+def draw_heat_map(
     names: Sequence[str], columns: Sequence[str], values: Array, unit: str, good: str = "high"
 ) -> Any:
     """Names down, columns across, the number in each field; NaN stays empty.
 
     values: (names, columns). good: "high" or "low" values are the good ones (blue).
     """
-    scale = [list(each) for each in _GOOD_TO_BAD]
+    scale = [list(stop) for stop in _GOOD_TO_BAD]
     if good == "high":
         scale = [[at, shade] for (at, _), (_, shade) in zip(scale, scale[::-1], strict=True)]
     text = [[f"{v:.2f}" if np.isfinite(v) else "" for v in row] for row in values]
@@ -53,28 +53,28 @@ def heat_map(
     return figure
 
 
-def share_maps(shown: ShareMap) -> Any:
+def draw_share_maps(share_map: ShareMap) -> Any:
     """Shares over two axes, a panel a name, with the line at one half."""
-    across = min(3, len(shown.shares))
-    down = -(-len(shown.shares) // across)
-    names = list(shown.shares)
-    gaps = {"horizontal_spacing": 0.06, "vertical_spacing": 0.28 / down}
-    figure = make_subplots(down, across, subplot_titles=names, shared_yaxes=True, **gaps)
-    for i, (name, share) in enumerate(shown.shares.items()):
-        place = {"row": i // across + 1, "col": i % across + 1}
+    n_columns = min(3, len(share_map.shares))
+    n_rows = -(-len(share_map.shares) // n_columns)
+    names = list(share_map.shares)
+    gaps = {"horizontal_spacing": 0.06, "vertical_spacing": 0.28 / n_rows}
+    figure = make_subplots(n_rows, n_columns, subplot_titles=names, shared_yaxes=True, **gaps)
+    for i, (name, share) in enumerate(share_map.shares.items()):
+        place = {"row": i // n_columns + 1, "col": i % n_columns + 1}
         hover = f"{name}<br>%{{x:.1f}}, %{{y:.1f}}: %{{z:.2f}}<extra></extra>"
-        axes: dict[str, Any] = {"x": shown.x, "y": shown.y, "z": share}
+        axes: dict[str, Any] = {"x": share_map.x, "y": share_map.y, "z": share}
         figure.add_trace(go.Heatmap(**axes, coloraxis="coloraxis", hovertemplate=hover), **place)
         half = {"start": 0.5, "end": 0.5, "size": 1.0, "coloring": "none"}
         line = {"color": INK, "width": 1.5}
         figure.add_trace(
             go.Contour(**axes, contours=half, line=line, showscale=False, hoverinfo="skip"), **place
         )
-        figure.update_xaxes(title_text=shown.x_label, **place)
+        figure.update_xaxes(title_text=share_map.x_label, **place)
         if place["col"] == 1:
-            figure.update_yaxes(title_text=shown.y_label, **place)
-    scale = [list(each) for each in SHARE_SCALE]
+            figure.update_yaxes(title_text=share_map.y_label, **place)
+    scale = [list(stop) for stop in SHARE_SCALE]
     bar = {"colorscale": scale, "cmin": 0.0, "cmax": 1.0, "colorbar": {"title": {"text": "share"}}}
-    figure.update_layout(height=120 + 230 * down, coloraxis=bar, showlegend=False, meta="scroll")
+    figure.update_layout(height=120 + 230 * n_rows, coloraxis=bar, showlegend=False, meta="scroll")
     figure.update_layout(margin={"t": 34, "l": 60, "b": 52})
     return figure

@@ -5,10 +5,10 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from ...envs.record import Array
-from ...envs.recordings.geodesy import degrees
+from ...envs.recordings.geodesy import to_degrees
 
 ORIGIN = (35.9015, 139.9378)  # deg north and east: a campus of the papers' authors, our choice
-_MOST = 2000  # points
+_MAX_POINTS = 2000  # points
 
 _DOCUMENT = """\
 <?xml version="1.0" encoding="UTF-8"?>
@@ -29,7 +29,7 @@ _PLACE = """\
 </Placemark>"""
 
 
-def track_kml(
+def make_track_kml(
     title: str,
     tracks: dict[str, tuple[Array, Array]],
     colours: dict[str, str] | None = None,
@@ -46,8 +46,8 @@ def track_kml(
     for name, (X, Y) in tracks.items():
         if X.shape != Y.shape or not (np.isfinite(X).all() and np.isfinite(Y).all()):
             raise ValueError(f"track {name!r}: X and Y must be finite and equally long")
-        shown = np.unique(np.linspace(0, len(X) - 1, min(len(X), _MOST)).round().astype(int))
-        latitude, longitude = degrees(X[shown], Y[shown], origin)
+        shown = np.unique(np.linspace(0, len(X) - 1, min(len(X), _MAX_POINTS)).round().astype(int))
+        latitude, longitude = to_degrees(X[shown], Y[shown], origin)
         points = "\n".join(f"{e:.8f},{n:.8f}" for n, e in zip(latitude, longitude, strict=True))
         rgb = (colours or {}).get(name, "#0072B2").lstrip("#")
         bgr = "ff" + rgb[4:6] + rgb[2:4] + rgb[0:2]  # KML: alpha, blue, green, red

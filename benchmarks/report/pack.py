@@ -12,12 +12,12 @@ _LONG = 40  # a shorter array is left as it is
 _LEVELS = {"x": 2**13, "y": 2**11}  # more than a screen has pixels
 
 
-def packed(text: str) -> str:
+def pack_text(text: str) -> str:
     """A text as the page's `unpack` takes it; the same text gives the same letters."""
     return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
 
 
-def steps(values: npt.ArrayLike, levels: int = _LEVELS["y"]) -> dict[str, Any]:
+def encode_steps(values: npt.ArrayLike, levels: int = _LEVELS["y"]) -> dict[str, Any]:
     """(n,) numbers as steps from one to the next in whole quanta, null for a gap.
 
     levels: how many quanta the range has.
@@ -26,17 +26,17 @@ def steps(values: npt.ArrayLike, levels: int = _LEVELS["y"]) -> dict[str, Any]:
     {'from': 1.0, 'by': 1.0, 'steps': [0, 1, None, 1]}
     """
     v = np.asarray(values, float)
-    there = np.isfinite(v)
-    least, most = (float(v[there].min()), float(v[there].max())) if there.any() else (0.0, 0.0)
-    by = (most - least) / (levels - 1) or 1.0
-    whole = np.round((v[there] - least) / by).astype(int)
-    found: list[int | None] = [None] * len(v)
-    for i, step in zip(np.flatnonzero(there), np.diff(whole, prepend=0), strict=True):
-        found[i] = int(step)
-    return {"from": least, "by": by, "steps": found}
+    finite = np.isfinite(v)
+    low, high = (float(v[finite].min()), float(v[finite].max())) if finite.any() else (0.0, 0.0)
+    by = (high - low) / (levels - 1) or 1.0
+    quanta = np.round((v[finite] - low) / by).astype(int)
+    encoded: list[int | None] = [None] * len(v)
+    for i, step in zip(np.flatnonzero(finite), np.diff(quanta, prepend=0), strict=True):
+        encoded[i] = int(step)
+    return {"from": low, "by": by, "steps": encoded}
 
 
-def figure_text(figure: Any) -> str:
+def encode_figure(figure: Any) -> str:
     """A plotly figure's data and layout as JSON, without the template and the title."""
     from plotly.utils import PlotlyJSONEncoder
 
@@ -47,7 +47,7 @@ def figure_text(figure: Any) -> str:
         for axis, levels in _LEVELS.items():
             values = getattr(trace, axis, None)
             if _is_line(values):
-                plain[axis] = steps(values, levels)
+                plain[axis] = encode_steps(values, levels)
     plain = {name: content[name] for name in ("data", "layout") if content.get(name)}
     return json.dumps(plain, cls=PlotlyJSONEncoder, separators=(",", ":"))
 

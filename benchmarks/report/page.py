@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from ..harness.results import Suite, Table, write_text
+from ..harness.results import ResultTable, Suite, write_text
 
 _FILL = partial(textwrap.fill, width=120, break_long_words=False, break_on_hyphens=False)
 _MARKED = r"(?<=^<!-- tables of {} -->\n).*?(?=^<!-- end -->$)"
 
 
-def table_markdown(table: Table) -> str:
+def format_table(table: ResultTable) -> str:
     """A heading, the table, and its note in lines of 120."""
     head, *rows = (
         [text.replace("|", r"\|") for text in row] for row in (table.header, *table.cells)
@@ -31,7 +31,7 @@ def check_page(path: Path | None, names: Sequence[str]) -> None:
     """Before the work: the page has marks for a suite that is asked for; ValueError otherwise."""
     if path is not None:
         text = path.read_text(encoding="utf-8")
-        if not any(_pattern(name).search(text) for name in names):
+        if not any(_compile_pattern(name).search(text) for name in names):
             raise ValueError(
                 f"{path}: expected the lines <!-- tables of SUITE --> and <!-- end --> for one of "
                 f"{', '.join(names)}"
@@ -43,11 +43,11 @@ def write_page(path: Path, suites: Sequence[Suite]) -> None:
     left out."""
     text = path.read_text(encoding="utf-8")
     for suite in suites:
-        made = "\n".join(table_markdown(each) for each in suite.tables if not each.detail)
-        before, *marked = _pattern(suite.name).split(text, maxsplit=1)
+        made = "\n".join(format_table(table) for table in suite.tables if not table.detail)
+        before, *marked = _compile_pattern(suite.name).split(text, maxsplit=1)
         text = f"\n{made}\n".join((before, *marked))
     write_text(path, text)
 
 
-def _pattern(name: str) -> re.Pattern[str]:
+def _compile_pattern(name: str) -> re.Pattern[str]:
     return re.compile(_MARKED.format(re.escape(name)), re.MULTILINE | re.DOTALL)

@@ -5,23 +5,23 @@ import re
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from ...envs.rendering.palette import INK, base, colour
-from ..harness.results import Table
+from ...envs.rendering.palette import INK, find_base, find_colour
+from ..harness.results import ResultTable
 
 
-def number(cell: str) -> float | None:
+def parse_number(cell: str) -> float | None:
     """The number a cell begins with, None for one that begins with none (or with NaN).
 
     >>> number("0.31 [0.29, 0.33]"), number("-1,250 N m"), number("< 2e-3"), number("2-dof")
     (0.31, -1250.0, 0.002, None)
     """
-    found = _NUMBER.match(cell)
-    if not found:
+    match = _NUMBER.match(cell)
+    if not match:
         return None
-    sign = -1.0 if found["sign"] in ("-", "\u2212") else 1.0
-    if found["inf"]:
+    sign = -1.0 if match["sign"] in ("-", "\u2212") else 1.0
+    if match["inf"]:
         return sign * math.inf
-    return sign * float(re.sub(r"[,\u00a0\u202f]", "", found["digits"]).replace("\u2212", "-"))
+    return sign * float(re.sub(r"[,\u00a0\u202f]", "", match["digits"]).replace("\u2212", "-"))
 
 
 _NUMBER = re.compile(
@@ -34,13 +34,13 @@ _LONG = 40  # letters: a longer cell wraps
 _BLANK = {"", "-", "\u2013", "\u2014", "nan", "n/a"}
 
 
-def numeric(cells: Iterable[str]) -> bool:
+def is_numeric(cells: Iterable[str]) -> bool:
     """Whether a column is one of numbers: some, and nothing else but blanks."""
     texts = [cell for cell in cells if cell.strip().lower() not in _BLANK]
-    return bool(texts) and all(number(cell) is not None for cell in texts)
+    return bool(texts) and all(parse_number(cell) is not None for cell in texts)
 
 
-def table_html(table: Table) -> str:
+def format_table(table: ResultTable) -> str:
     """A table, folded; ValueError for a row that is not as long as the header."""
     for row in table.cells:
         if len(row) != len(table.header):
@@ -48,13 +48,15 @@ def table_html(table: Table) -> str:
                 f"table {table.title!r}: {len(row)} cells under {len(table.header)} headers: {row}"
             )
     columns = list(zip(*table.cells, strict=True)) or [()] * len(table.header)
-    are_numbers = [numeric(column) for column in columns]
+    are_numbers = [is_numeric(column) for column in columns]
     heads = "".join(
-        f'<th scope="col" aria-sort="none"{_number_class(is_number)}>'
+        f'<th scope="col" aria-sort="none"{_format_class(is_number)}>'
         f'<button type="button">{escape(name)}</button></th>'
         for name, is_number in zip(table.header, are_numbers, strict=True)
     )
-    body = "\n".join(f"<tr>{_row(row, are_numbers, table.keyed)}</tr>" for row in table.cells)
+    body = "\n".join(
+        f"<tr>{_format_row(row, are_numbers, table.keyed)}</tr>" for row in table.cells
+    )
     title = escape(table.title)
     note = f'\n<p class="note">{inline(table.note)}</p>' if table.note else ""
     return (
@@ -65,31 +67,31 @@ def table_html(table: Table) -> str:
     )
 
 
-def _row(row: Sequence[str], numeric: Sequence[bool], keyed: bool) -> str:
+def _format_row(row: Sequence[str], numeric: Sequence[bool], keyed: bool) -> str:
     cells = []
     for i, (cell, is_number) in enumerate(zip(row, numeric, strict=True)):
-        value = number(cell) if is_number else None
-        data = "" if value is None else f' data-value="{_plain(value)}"'
-        tag, key = ('th scope="row"', _key(cell) if keyed else "") if i == 0 else ("td", "")
-        kind = ' class="long"' if len(cell) > _LONG else _number_class(is_number)
+        value = parse_number(cell) if is_number else None
+        data = "" if value is None else f' data-value="{_format_number(value)}"'
+        tag, key = ('th scope="row"', _format_key(cell) if keyed else "") if i == 0 else ("td", "")
+        kind = ' class="long"' if len(cell) > _LONG else _format_class(is_number)
         cells.append(f"<{tag}{kind}{data}>{key}{escape(cell)}</{tag[:2]}>")
     return "".join(cells)
 
 
-def _number_class(is_number: bool) -> str:
+def _format_class(is_number: bool) -> str:
     return ' class="number"' if is_number else ""
 
 
-def _plain(value: float) -> str:
+def _format_number(value: float) -> str:
     """A number as JavaScript reads it."""
     return repr(value) if math.isfinite(value) else "-Infinity" if value < 0 else "Infinity"
 
 
-def _key(cell: str) -> str:
+def _format_key(cell: str) -> str:
     """The colour of an estimator or controller in the figures, as a small square."""
-    if base(cell) is None:
+    if find_base(cell) is None:
         return ""
-    shade = colour(cell)
+    shade = find_colour(cell)
     return f'<i class="key" style="background:{"var(--ink)" if shade == INK else shade}"></i>'
 
 

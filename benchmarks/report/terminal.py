@@ -8,11 +8,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from ..harness.results import Suite, Table
-from .tables import numeric
+from ..harness.results import ResultTable, Suite
+from .tables import is_numeric
 
 _NAME = 32  # letters: a longer text in a table's first column is no name and may wrap
-_LEAST = 22  # letters that a column of text has at least, and the first one on a narrow screen
+_MIN_WIDTH = 22  # letters that a column of text has at least, and the first one on a narrow screen
 _NARROW = 80  # columns
 _FEW, _ROWS = 2, 20  # suites of a run whose tables are printed, and the rows of all of them
 
@@ -25,17 +25,21 @@ def print_run(console: Console, suites: Sequence[Suite], reported: bool) -> None
         suites: What was found. Of many a line of the verdict alone is printed.
         reported: Whether a report has the rest.
     """
-    few = len(suites) <= _FEW
+    is_short = len(suites) <= _FEW
     for suite in suites:
-        _title(console, suite)
-        whole = suite.headlines
-        lines = whole if few else whole[1:2] or whole  # a verdict's second line is the answer
+        _print_title(console, suite)
+        headlines = suite.headlines
+        lines = (
+            headlines if is_short else headlines[1:2] or headlines
+        )  # a verdict's second line is the answer
         console.print(f"[bold]{escape(chr(10).join(lines))}[/]\n", highlight=False)
-        for table in [each for each in suite.tables if not each.detail][: int(few)]:
-            most = _ROWS // len(suites)
-            left = len(table.cells) - most
-            cut = replace(table, cells=table.cells[:most]) if left > 0 else table
-            console.print(_rich(_parts(cut, console.width)[0], console.width))
+        for table in [candidate for candidate in suite.tables if not candidate.detail][
+            : int(is_short)
+        ]:
+            max_rows = _ROWS // len(suites)
+            left = len(table.cells) - max_rows
+            cut = replace(table, cells=table.cells[:max_rows]) if left > 0 else table
+            console.print(_make_rich_table(_split_table(cut, console.width)[0], console.width))
             if left > 0:
                 console.print(f"[dim]and {left} rows more[/]\n", highlight=False)
     count = sum(len(suite.tables) for suite in suites)
@@ -43,7 +47,7 @@ def print_run(console: Console, suites: Sequence[Suite], reported: bool) -> None
     console.print(f"All {count} tables, with notes and figures, are {where}.", highlight=False)
 
 
-def _title(console: Console, suite: Suite) -> None:
+def _print_title(console: Console, suite: Suite) -> None:
     if len(suite.title) + 4 <= console.width:
         console.rule(f"[bold]{escape(suite.title)}")
     else:  # a rule would cut it
@@ -52,15 +56,15 @@ def _title(console: Console, suite: Suite) -> None:
 
 def print_suite(console: Console, suite: Suite) -> None:
     """The title, the verdict, the text, and each table with its note, but for details."""
-    _title(console, suite)
+    _print_title(console, suite)
     if suite.verdict:
         console.print(f"[bold]{escape(chr(10).join(suite.headlines))}[/]\n", highlight=False)
     console.print(f"{escape(suite.text)}\n", highlight=False)
     for table in suite.tables:
         if table.detail:
             continue
-        for part in _parts(table, console.width):
-            console.print(_rich(part, console.width))
+        for part in _split_table(table, console.width):
+            console.print(_make_rich_table(part, console.width))
         if table.note:
             console.print(f"[dim]{escape(table.note)}[/]\n", highlight=False)
     if more := [table.title for table in suite.tables if table.detail]:
@@ -68,17 +72,17 @@ def print_suite(console: Console, suite: Suite) -> None:
         console.print(f"{count} in the report (--html).\n", highlight=False)
 
 
-def _parts(table: Table, width: int) -> list[Table]:
+def _split_table(table: ResultTable, width: int) -> list[ResultTable]:
     """The table as it fits into so many columns of text: some columns each, the first in all;
     texts wrap."""
     columns = list(zip(table.header, *table.cells, strict=True))
-    most = [max(map(len, column)) for column in columns]
+    lengths = [max(map(len, column)) for column in columns]
     widths = [
-        (each if numeric(column[1:]) else min(each, _LEAST)) + 2
-        for each, column in zip(most, columns, strict=True)
+        (length if is_numeric(column[1:]) else min(length, _MIN_WIDTH)) + 2
+        for length, column in zip(lengths, columns, strict=True)
     ]
     groups: list[list[int]] = [[0]]
-    used = first = min(widths[0], _first(width) + 2) + 2
+    used = first = min(widths[0], _choose_width(width) + 2) + 2
     for i in range(1, len(columns)):
         if used + widths[i] > width and len(groups[-1]) > 1:
             groups.append([0])
@@ -96,25 +100,25 @@ def _parts(table: Table, width: int) -> list[Table]:
     ]
 
 
-def _first(width: int) -> int:
+def _choose_width(width: int) -> int:
     """Letters that the first column has, if it needs them, on a screen of so many columns."""
-    return _NAME if width >= _NARROW else _LEAST
+    return _NAME if width >= _NARROW else _MIN_WIDTH
 
 
-def _rich(table: Table, width: int) -> RichTable:
+def _make_rich_table(table: ResultTable, width: int) -> RichTable:
     """Columns of numbers to the right and whole, those of text to the left, wrapped if long."""
     shown = RichTable(
         title=table.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
     )
     columns = zip(*table.cells, strict=True) if table.cells else [()] * len(table.header)
     for i, (name, column) in enumerate(zip(table.header, columns, strict=True)):
-        right = i > 0 and numeric(column)
+        right = i > 0 and is_numeric(column)
         longest = max(map(len, column), default=0)
         shown.add_column(
             name,
             justify="right" if right else "left",
             no_wrap=right,
-            min_width=min(longest, _first(width)) if i == 0 else None,
+            min_width=min(longest, _choose_width(width)) if i == 0 else None,
             overflow="fold",  # a long word goes on in the next line
         )
     for row in table.cells:

@@ -24,7 +24,7 @@ VECTORS = (
 were tried; no number changes."""
 
 
-def compiler() -> str:
+def find_compiler() -> str:
     """The C compiler: that of the variable CC, or the first one found.
 
     Raises AbsentError where there is none.
@@ -35,12 +35,12 @@ def compiler() -> str:
     raise AbsentError("no C compiler")
 
 
-def source() -> str:
+def read_source() -> str:
     """The text of `plant.c`."""
     return files(__package__).joinpath("plant.c").read_text(encoding="utf-8")
 
 
-def c_plant(block: int) -> Any:
+def load_c_plant(block: int) -> Any:
     """The function `plant` of `plant.c` for blocks of so many cars, loaded.
 
     Raises AbsentError where there is no compiler, or none that can compile it.
@@ -48,8 +48,8 @@ def c_plant(block: int) -> Any:
     with TemporaryDirectory() as folder:
         library = Path(folder) / "plant.so"
         flags = [*FLAGS, *VECTORS, f"-DBLOCK={block}", "-shared", "-fPIC"]
-        command = [compiler(), *flags, "-x", "c", "-", "-o", str(library)]
-        run = subprocess.run(command, input=source(), capture_output=True, text=True)
+        command = [find_compiler(), *flags, "-x", "c", "-", "-o", str(library)]
+        run = subprocess.run(command, input=read_source(), capture_output=True, text=True)
         if run.returncode:
             last = (run.stderr.strip().splitlines() or ["it gave no reason"])[-1]
             raise AbsentError(f"{command[0]} does not compile it: {last}")

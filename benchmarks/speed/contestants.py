@@ -3,8 +3,8 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from ..harness.results import Row, Suite, Table
-from .timing import Contestant, Effort, Taken, interleaved, spread
+from ..harness.results import ResultRow, ResultTable, Suite
+from .timing import Effort, Taken, Workload, compute_range, measure_interleaved
 
 
 class AbsentError(Exception):
@@ -12,16 +12,16 @@ class AbsentError(Exception):
 
 
 @dataclass
-class Field:
+class WorkloadSet:
     """Contestants by name; `absent`: why others are not among them."""
 
-    contestants: dict[str, Contestant] = field(default_factory=dict)
+    workloads: dict[str, Workload] = field(default_factory=dict)
     absent: dict[str, str] = field(default_factory=dict)
 
-    def add(self, name: str, make: Callable[[], Contestant], package: str | None = None) -> None:
+    def add(self, name: str, make: Callable[[], Workload], package: str | None = None) -> None:
         """Make a contestant; without the optional package that it comes from it is absent."""
         try:
-            self.contestants[name] = make()
+            self.workloads[name] = make()
         except AbsentError as error:
             self.absent[name] = str(error)
         except ModuleNotFoundError:
@@ -36,32 +36,41 @@ class Field:
 
         unit: "step" or "tick".
         """
-        taken, cells = interleaved(self.contestants, effort), []
+        taken, cells = measure_interleaved(self.workloads, effort), []
         for name, values in taken.items():
             middle, *ends = add_row(suite, name, f"us_per_{unit}", values)
-            cells.append([name, three(middle), " .. ".join(map(three, ends)), rate(middle)])
+            cells.append(
+                [
+                    name,
+                    format_three_digits(middle),
+                    " .. ".join(map(format_three_digits, ends)),
+                    format_rate(middle),
+                ]
+            )
         if cells:
             header = ("", f"us per {unit}", "range", "per CPU-s")
-            text = note + absences(self.absent)
-            suite.tables.append(Table(title, header, cells, text, keyed=False))
+            text = note + format_absences(self.absent)
+            suite.tables.append(ResultTable(title, header, cells, text, keyed=False))
         return taken, self.absent
 
 
 def add_row(suite: Suite, name: str, metric: str, values: Taken) -> tuple[float, float, float]:
     """Add a row of a suite; its (median, least, largest)."""
-    middle, low, high = spread(values)
-    suite.rows.append(Row(suite.name, name, metric, middle, low=low, high=high, n=len(values)))
+    middle, low, high = compute_range(values)
+    suite.rows.append(
+        ResultRow(suite.name, name, metric, middle, low=low, high=high, n=len(values))
+    )
     return middle, low, high
 
 
-def absences(absent: Mapping[str, str]) -> str:
+def format_absences(absent: Mapping[str, str]) -> str:
     """A sentence on those that could not come, or nothing."""
     if not absent:
         return ""
-    return f" Not measured: {'; '.join(f'{name} ({why})' for name, why in absent.items())}."
+    return f" Not measured: {'; '.join(f'{name} ({reason})' for name, reason in absent.items())}."
 
 
-def three(value: float) -> str:
+def format_three_digits(value: float) -> str:
     """A number to three digits, without an exponent.
 
     >>> three(0.04431), three(7.2), three(1004.0)
@@ -70,7 +79,7 @@ def three(value: float) -> str:
     return f"{float(f'{value:.3g}'):g}"
 
 
-def rate(microseconds: float) -> str:
+def format_rate(microseconds: float) -> str:
     """How many in a second, to three digits.
 
     >>> rate(0.0443), rate(7.25), rate(1210.0)

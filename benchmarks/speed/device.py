@@ -18,7 +18,7 @@ from rich.console import Console
 from ...envs.backend.on_torch import torch
 from ...envs.device.env import DeviceVectorEnv
 from ...envs.engine.layout import PARAMS_WIDTH
-from ..harness.errors import one_line
+from ..harness.errors import report_user_errors
 from ..harness.results import check_writable, write_text
 
 COUNTS = (1024, 16384, 65536, 262144, 1048576)
@@ -26,19 +26,19 @@ ROUNDS = 5
 _COPIED = 1 << 28  # bytes, beyond every cache
 
 
-class Measured(NamedTuple):
+class DeviceTiming(NamedTuple):
     """What a batch of `size` rows did."""
 
     size: int
     dtype: str
     rate: float  # env-steps a second of wall time: median, least and largest of the rounds
-    least: float
-    largest: float
+    min_rate: float
+    max_rate: float
     bytes_a_step: float  # of one row, each number moved once
     bandwidth: float  # bytes a second of a copy on the same device, read and written
 
 
-def _seconds(work: Callable[[], object], device: torch.device) -> float:
+def _measure_seconds(work: Callable[[], object], device: torch.device) -> float:
     start = time.perf_counter()
     work()
     if device.type == "cuda":
@@ -46,57 +46,59 @@ def _seconds(work: Callable[[], object], device: torch.device) -> float:
     return time.perf_counter() - start
 
 
-def bandwidth(device: torch.device) -> float:
+def measure_bandwidth(device: torch.device) -> float:
     """Bytes a second, read and written, of a copy within the device."""
     one = torch.ones(_COPIED, dtype=torch.uint8, device=device)
     other = torch.empty_like(one)
-    taken = [_seconds(lambda: other.copy_(one), device) for _ in range(4)]
+    taken = [_measure_seconds(lambda: other.copy_(one), device) for _ in range(4)]
     return 2.0 * _COPIED / min(taken[1:])
 
 
-def bytes_of(env: Any) -> float:
+def count_bytes(env: Any) -> float:
     """The least that a step of one row moves: its parameters and its state are read, the state,
     the observation and the record are written."""
     held, brought = env.tensors()
-    read = sum(each.nbytes for each in held) + env.num_envs * PARAMS_WIDTH * env.dtype.itemsize
-    written = sum(each.nbytes for each in (*held, *brought))
+    read = sum(tensor.nbytes for tensor in held) + env.num_envs * PARAMS_WIDTH * env.dtype.itemsize
+    written = sum(tensor.nbytes for tensor in (*held, *brought))
     return float((read + written) / env.num_envs)
 
 
-def measure(env: Any, copied: float, rounds: int, steps: int) -> Measured:
+def measure(env: Any, copied: float, rounds: int, steps: int) -> DeviceTiming:
     """Rounds of `steps` steps each, after one that does not count."""
     env.reset(seed=0)
     actions = torch.zeros(env.action_space.shape or (), device=env.device)
 
-    def several() -> None:
+    def run_steps() -> None:
         for _ in range(steps):
             env.step(actions)
 
-    taken = [_seconds(several, env.device) for _ in range(rounds + 1)][1:]
-    rates = [env.num_envs * steps / each for each in taken]
+    taken = [_measure_seconds(run_steps, env.device) for _ in range(rounds + 1)][1:]
+    rates = [env.num_envs * steps / seconds for seconds in taken]
     middle, dtype = statistics.median(rates), str(env.dtype).removeprefix("torch.")
-    return Measured(env.num_envs, dtype, middle, min(rates), max(rates), bytes_of(env), copied)
+    return DeviceTiming(
+        env.num_envs, dtype, middle, min(rates), max(rates), count_bytes(env), copied
+    )
 
 
-def table(found: Sequence[Measured]) -> str:
+def format_table(timings: Sequence[DeviceTiming]) -> str:
     """The measurements as Markdown."""
     lines = [
         "| N | floats | env-steps/s | range | us a step of all | bytes a row, at least "
         "| of a copy's bandwidth |",
         "|---|---|---|---|---|---|---|",
     ]
-    for each in found:
-        share = each.rate * each.bytes_a_step / each.bandwidth
-        microseconds = 1e6 * each.size / each.rate
+    for timing in timings:
+        share = timing.rate * timing.bytes_a_step / timing.bandwidth
+        microseconds = 1e6 * timing.size / timing.rate
         lines.append(
-            f"| {each.size} | {each.dtype} | {each.rate:.3g} "
-            f"| {each.least:.3g} .. {each.largest:.3g} | {microseconds:.4g} "
-            f"| {each.bytes_a_step:.0f} | {100.0 * share:.2g} % |"
+            f"| {timing.size} | {timing.dtype} | {timing.rate:.3g} "
+            f"| {timing.min_rate:.3g} .. {timing.max_rate:.3g} | {microseconds:.4g} "
+            f"| {timing.bytes_a_step:.0f} | {100.0 * share:.2g} % |"
         )
     return "\n".join(lines)
 
 
-def name_of(device: torch.device) -> str:
+def get_device_name(device: torch.device) -> str:
     """The device in words."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
@@ -119,24 +121,25 @@ def main(
     Episodes end and start anew where the steps are many enough; the resets are then part of it.
     """
     check_writable(out)
-    console, found = Console(), []
+    console, timings = Console(), []
     copied = 0.0
     engine = engine or ("cuda" if device.startswith("cuda") else "torch")
-    how: dict[str, Any] = {"engine": engine} | ({"compile": True} if compiled else {})
-    for kind, each in itertools.product(dtype or ("float32", "float64"), count or COUNTS):
+    options: dict[str, Any] = {"engine": engine} | ({"compile": True} if compiled else {})
+    for kind, size in itertools.product(dtype or ("float32", "float64"), count or COUNTS):
         batch = DeviceVectorEnv.make(
-            env, each, device=device, dtype=kind, on_bad_action="fail", **how
+            env, size, device=device, dtype=kind, on_bad_action="fail", **options
         )
-        copied = copied or bandwidth(batch.device)
-        found.append(measure(batch, copied, rounds, steps))
-        console.print(f"{each}, {kind}: {found[-1].rate:.3g} env-steps/s", highlight=False)
+        copied = copied or measure_bandwidth(batch.device)
+        timings.append(measure(batch, copied, rounds, steps))
+        console.print(f"{size}, {kind}: {timings[-1].rate:.3g} env-steps/s", highlight=False)
         del batch
     text = (
         f"`{shlex.join(['python', '-m', 'sideslip.benchmarks.speed.device', *sys.argv[1:]])}`\n\n"
-        f"{name_of(torch.device(device))}, torch {torch.__version__}; {env}, engine {engine}, "
+        f"{get_device_name(torch.device(device))}, torch {torch.__version__}; {env}, engine "
+        f"{engine}, "
         f"{'compiled' if compiled else 'not compiled'}. Median and range of {rounds} rounds of "
         f"{steps} steps, wall time. A copy on the device moves {copied / 1e9:.3g} GB/s.\n\n"
-        f"{table(found)}\n"
+        f"{format_table(timings)}\n"
     )
     console.print(text, highlight=False, markup=False, soft_wrap=True)
     if out is not None:
@@ -144,5 +147,5 @@ def main(
 
 
 if __name__ == "__main__":
-    with one_line():
+    with report_user_errors():
         typer.run(main)

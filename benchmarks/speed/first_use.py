@@ -9,7 +9,7 @@ import subprocess
 import sys
 from tempfile import TemporaryDirectory
 
-from ..harness.results import Suite, Table
+from ..harness.results import ResultTable, Suite
 from .contestants import AbsentError, add_row
 from .timing import Taken
 
@@ -67,29 +67,31 @@ run(EstimateObservations(gym.make_vec(id, num_envs=8), **how), (8, 1))
 """
 
 
-def warm() -> dict[str, float]:
+def measure_first_step() -> dict[str, float]:
     """CPU seconds of each thing a fresh process does up to its first step.
 
     Raises AbsentError where that takes minutes, because no kernels are cached on disk.
     """
     try:
-        marks: list[tuple[str, float]] = json.loads(_python(_WARM, limit=LIMIT))
+        marks: list[tuple[str, float]] = json.loads(_run_python(_WARM, limit=LIMIT))
     except subprocess.TimeoutExpired:
         raise AbsentError("no kernels are cached on disk here") from None
     before = [0.0, *(at for _, at in marks)]
     return {name: at - before[i] for i, (name, at) in enumerate(marks)}
 
 
-def cold(code: str = _COLD) -> list[tuple[str, float]]:
+def measure_compilation(code: str = _COLD) -> list[tuple[str, float]]:
     """(name, CPU seconds) of each kernel that some code has compiled with nothing on disk, without
     those of kernels that it calls as they stand."""
     with TemporaryDirectory() as folder:
-        here = {"XDG_CACHE_HOME": folder, "NUMBA_CACHE_DIR": ""}
-        printed = _python(f"{_WATCH}\n{code}\nprint(json.dumps(taken))", here)
+        environment = {"XDG_CACHE_HOME": folder, "NUMBA_CACHE_DIR": ""}
+        printed = _run_python(f"{_WATCH}\n{code}\nprint(json.dumps(taken))", environment)
     return [(str(name), float(seconds)) for name, seconds in json.loads(printed)]
 
 
-def _python(code: str, variables: dict[str, str] | None = None, limit: float | None = None) -> str:
+def _run_python(
+    code: str, variables: dict[str, str] | None = None, limit: float | None = None
+) -> str:
     """What code prints in an interpreter of its own that finds the same packages."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)} | (variables or {})
     command = [sys.executable, "-c", code]
@@ -107,14 +109,14 @@ def add(suite: Suite, runs: int, compiling: bool) -> tuple[dict[str, Taken], dic
     """
     columns, absent = dict[str, Taken](), dict[str, str]()
     try:
-        taken = [warm() for _ in range(runs + 1)][1:]
+        taken = [measure_first_step() for _ in range(runs + 1)][1:]
         columns = {f"first use: {name}": [run[name] for run in taken] for name in taken[0]}
-        ours = ("import numba", "gym.make", "first reset", "first step")
-        columns[FIRST] = [sum(run[name] for name in ours) for run in taken]
+        counted = ("import numba", "gym.make", "first reset", "first step")
+        columns[FIRST] = [sum(run[name] for name in counted) for run in taken]
     except AbsentError as error:
         absent[FIRST] = str(error)
     if compiling:
-        kernels = cold()
+        kernels = measure_compilation()
         columns["cold compile of all kernels"] = [sum(seconds for _, seconds in kernels)]
         columns[KERNEL] = [max(seconds for _, seconds in kernels)]
     else:
@@ -127,5 +129,7 @@ def add(suite: Suite, runs: int, compiling: bool) -> tuple[dict[str, Taken], dic
         "Fresh processes; the first gym.make imports numba, which is shown apart and counted. "
         "Cold: environment and exact-kf, single and batch, with nothing on disk."
     )
-    suite.tables.append(Table("Cost of the first use", ("", "CPU-s", "range"), cells, note, False))
+    suite.tables.append(
+        ResultTable("Cost of the first use", ("", "CPU-s", "range"), cells, note, False)
+    )
     return {name: columns[name] for name in (FIRST, KERNEL) if name in columns}, absent

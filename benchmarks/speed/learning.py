@@ -11,18 +11,18 @@ from typing import Any
 
 from ...envs.ticks import TICK
 from ..harness.results import Suite
-from .contestants import Field
-from .timing import Contestant, Effort, Taken
+from .contestants import WorkloadSet
+from .timing import Effort, Taken, Workload
 
 YAW, PENDULUM_ID = "sideslip/YawFusion-v0", "Pendulum-v1"
-OURS = "PPO, YawFusion-v0"
+PPO_YAW = "PPO, YawFusion-v0"
 PENDULUM = f"PPO, {PENDULUM_ID}"
 
 COUNT = 256  # environments
 ROUNDS = 5  # at most: a round takes long
 
 
-def _learner(name: str) -> Contestant:
+def _make_learner(name: str) -> Workload:
     """One of the two; a call is a rollout and its update."""
     from stable_baselines3 import PPO
     from stable_baselines3.common.env_util import make_vec_env
@@ -30,30 +30,30 @@ def _learner(name: str) -> Contestant:
     from ...agents.vec_env import env as bridge
 
     make, env_id = (make_vec_env, PENDULUM_ID) if name == PENDULUM else (bridge.make_vec_env, YAW)
-    model = PPO("MlpPolicy", make(env_id, COUNT, seed=0), seed=0, device="cpu", **_settings())
+    model = PPO("MlpPolicy", make(env_id, COUNT, seed=0), seed=0, device="cpu", **_get_settings())
     steps = COUNT * model.n_steps
 
-    def work() -> None:
+    def run_updates() -> None:
         model.learn(steps, reset_num_timesteps=False)
 
-    return Contestant(work, steps)
+    return Workload(run_updates, steps)
 
 
-def _settings() -> dict[str, Any]:
+def _get_settings() -> dict[str, Any]:
     """Those of `sideslip train`."""
-    from ...agents.training.algorithms import options_of, settings_of
+    from ...agents.training.algorithms import make_model_options, read_settings
 
-    options = options_of("ppo", settings_of("ppo", YAW), 10 * TICK, COUNT)
+    options = make_model_options("ppo", read_settings("ppo", YAW), 10 * TICK, COUNT)
     return {name: options[name] for name in ("n_steps", "n_epochs", "batch_size", "gamma")}
 
 
 def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
     """Rows and a table; what each contestant took, and why others are absent."""
-    field = Field()
-    for name in (OURS, PENDULUM):
-        field.add(name, partial(_learner, name), "stable-baselines3")
+    field = WorkloadSet()
+    for name in (PPO_YAW, PENDULUM):
+        field.add(name, partial(_make_learner, name), "stable-baselines3")
     settings = ", ".join(
-        f"{name} = {value}" for name, value in (_settings() if field.contestants else {}).items()
+        f"{name} = {value}" for name, value in (_get_settings() if field.workloads else {}).items()
     )
     note = (
         "PPO of stable-baselines3, rollout and gradient steps, on as many environments each: "

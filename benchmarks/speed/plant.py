@@ -11,28 +11,28 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.arrays import offsets, read, write
-from ...envs.backend.decorators import inlined, jit
+from ...envs.backend.arrays import make_offsets, read, write
+from ...envs.backend.decorators import inline, jit
 from ...envs.backend.simd import LANES
 from ...envs.engine.layout import P, Z
 from ...envs.ticks import TICK
-from ...envs.vehicle.actuators import lagged
-from ...envs.vehicle.dynamics import Car, Motion, Push, Road
+from ...envs.vehicle.actuators import apply_lag
+from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams
 from ...envs.vehicle.integration import kutta3, rk4
-from ...envs.vehicle.tyres import FIALA, Inputs, load_of, shifts
+from ...envs.vehicle.tyres import FIALA, TyreInputs, compute_tyre_load, has_load_shift
 from ..harness.results import Suite
-from .c_plant import c_plant
-from .contestants import Field
-from .timing import Contestant, Effort, Taken
+from .c_plant import load_c_plant
+from .contestants import WorkloadSet
+from .timing import Effort, Taken, Workload
 
 Array = npt.NDArray[np.float64]
 
 CARS, TICKS = 1024, 10  # cars at once; ticks a call
-OURS = "plant"
+PLANT = "plant"
 C = "plant in C"
 
 _CAR, _ROAD, _MOTION, _PUSH, _INPUTS = (
-    offsets(kind)[0] for kind in (Car, Road, Motion, Push, Inputs)
+    make_offsets(kind)[0] for kind in (CarParams, RoadParams, Motion, DisturbanceForces, TyreInputs)
 )
 
 
@@ -52,7 +52,7 @@ class Cars(NamedTuple):
     motions: Array
     acting: Array
 
-    def twin(self) -> "Cars":
+    def clone(self) -> "Cars":
         """The same cars, for another contestant."""
         return Cars(*(array.copy() for array in self))
 
@@ -61,7 +61,7 @@ Advance = Callable[[Cars, int], object]
 """Moves cars on by some ticks, in place."""
 
 
-def cars_of(count: int, seed: int = 0) -> Cars:
+def make_cars(count: int, seed: int = 0) -> Cars:
     """Cars that the seeds of `YawFusion-v0` draw, with commands of their own.
 
     count: a multiple of LANES.
@@ -71,22 +71,22 @@ def cars_of(count: int, seed: int = 0) -> Cars:
     p, z, rng = env.params, env.states, np.random.default_rng(seed)
     lags = [p[0, [lag.middle, lag.end]] for lag in (P.steering, P.motor)]
 
-    def blocks(rows: Array) -> Array:
+    def split_blocks(rows: Array) -> Array:
         return np.ascontiguousarray(rows.reshape(-1, LANES, rows.shape[1]).transpose(0, 2, 1))
 
     return Cars(
         np.concatenate(lags),
-        blocks(p[:, P.car]),
-        blocks(p[:, P.road]),
-        blocks(rng.normal(0.0, 1.0, (count, 3)) * [50.0, 20.0, 0.0]),
-        blocks(rng.uniform(-1.0, 1.0, (count, 3)) * [0.05, 20.0, 20.0]),
-        blocks(z[:, Z.motion]),
-        blocks(np.zeros((count, 3))),
+        split_blocks(p[:, P.car]),
+        split_blocks(p[:, P.road]),
+        split_blocks(rng.normal(0.0, 1.0, (count, 3)) * [50.0, 20.0, 0.0]),
+        split_blocks(rng.uniform(-1.0, 1.0, (count, 3)) * [0.05, 20.0, 20.0]),
+        split_blocks(z[:, Z.motion]),
+        split_blocks(np.zeros((count, 3))),
     )
 
 
-@inlined
-def tick(
+@inline
+def integrate_tick(
     first: Any,
     motion: Any,
     acting: Any,
@@ -99,18 +99,21 @@ def tick(
 ) -> Any:
     """(last, motion, acting) after a tick by the rule of so many stages; first and last: the Load
     at its start and end."""
-    between = Inputs(
-        lagged(command.delta_f, acting.delta_f, left[0]),
-        lagged(command.T_l, acting.T_l, left[2]),
-        lagged(command.T_r, acting.T_r, left[2]),
+    between = TyreInputs(
+        apply_lag(command.delta_f, acting.delta_f, left[0]),
+        apply_lag(command.T_l, acting.T_l, left[2]),
+        apply_lag(command.T_r, acting.T_r, left[2]),
     )
-    acting = Inputs(
-        lagged(command.delta_f, acting.delta_f, left[1]),
-        lagged(command.T_l, acting.T_l, left[3]),
-        lagged(command.T_r, acting.T_r, left[3]),
+    acting = TyreInputs(
+        apply_lag(command.delta_f, acting.delta_f, left[1]),
+        apply_lag(command.T_l, acting.T_l, left[3]),
+        apply_lag(command.T_r, acting.T_r, left[3]),
     )
-    shifting = shifts(0, FIALA, 1)
-    middle, last = load_of(between, car, 0, shifting), load_of(acting, car, 0, shifting)
+    shifting = has_load_shift(0, FIALA, 1)
+    middle, last = (
+        compute_tyre_load(between, car, 0, shifting),
+        compute_tyre_load(acting, car, 0, shifting),
+    )
     loads = (first, middle, last)
     if stages == 4:
         return last, rk4(motion, loads, push, car, road, TICK, 0, FIALA, 1), acting
@@ -133,54 +136,56 @@ def advance(
     for b in range(len(cars)):
         car, road = read(cars[b], _CAR), read(roads[b], _ROAD)
         push, command = read(pushes[b], _PUSH), read(commands[b], _INPUTS)
-        motion, now = read(motions[b], _MOTION), read(acting[b], _INPUTS)
-        load = load_of(now, car, 0, shifts(0, FIALA, 1))
+        motion, applied = read(motions[b], _MOTION), read(acting[b], _INPUTS)
+        load = compute_tyre_load(applied, car, 0, has_load_shift(0, FIALA, 1))
         for _ in range(ticks):
-            load, motion, now = tick(load, motion, now, command, push, car, road, left, stages)
+            load, motion, applied = integrate_tick(
+                load, motion, applied, command, push, car, road, left, stages
+            )
         write(motions[b], motion, _MOTION)
-        write(acting[b], now, _INPUTS)
+        write(acting[b], applied, _INPUTS)
 
 
-def ours(cars: Cars, ticks: int) -> None:
+def advance_in_lanes(cars: Cars, ticks: int) -> None:
     """The plant as the batch engine moves it, in lanes."""
     advance(*cars, ticks, 3)
 
 
-def in_c() -> Advance:
+def make_c_advance() -> Advance:
     """The same plant in C, once its numbers agree with ours.
 
     Raises AbsentError without a compiler, RuntimeError where the numbers differ.
     """
-    function = c_plant(LANES)
+    function = load_c_plant(LANES)
 
     def advance_in_c(cars: Cars, ticks: int) -> None:
         function(len(cars.cars), ticks, TICK, *(array.ctypes.data for array in cars))
 
-    mine = cars_of(LANES)
-    theirs = mine.twin()
-    ours(mine, 100)
-    advance_in_c(theirs, 100)
-    if not np.allclose(theirs.motions, mine.motions, rtol=1e-9, atol=1e-12):
-        off = np.abs(theirs.motions - mine.motions).max()
+    numba_cars = make_cars(LANES)
+    c_cars = numba_cars.clone()
+    advance_in_lanes(numba_cars, 100)
+    advance_in_c(c_cars, 100)
+    if not np.allclose(c_cars.motions, numba_cars.motions, rtol=1e-9, atol=1e-12):
+        off = np.abs(c_cars.motions - numba_cars.motions).max()
         raise RuntimeError(f"the plant in C is not ours: they differ by {off:.3g} after 0.1 s")
     return advance_in_c
 
 
-def _many(advance: Advance, cars: Cars) -> Contestant:
+def _make_workload(advance: Advance, cars: Cars) -> Workload:
     """Cars from the middle of their drives on, in every round the same ones."""
-    running = cars.twin()
+    running = cars.clone()
 
-    def start() -> None:
+    def reset_cars() -> None:
         running.motions[:], running.acting[:] = cars.motions, cars.acting
 
-    return Contestant(lambda: advance(running, TICKS), CARS * TICKS, start)
+    return Workload(lambda: advance(running, TICKS), CARS * TICKS, reset_cars)
 
 
 def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
     """Rows and a table; each contestant's time, and why others are absent."""
-    cars, field = cars_of(CARS), Field()
-    field.add(OURS, lambda: _many(ours, cars))
-    field.add(C, lambda: _many(in_c(), cars))
+    cars, field = make_cars(CARS), WorkloadSet()
+    field.add(PLANT, lambda: _make_workload(advance_in_lanes, cars))
+    field.add(C, lambda: _make_workload(make_c_advance(), cars))
     note = (
         f"One car, one millisecond: lag, load, Fiala tyres, roll, Kutta's rule; {CARS} cars at "
         "once. The C is the same text in blocks of as many cars, compiled on the spot "

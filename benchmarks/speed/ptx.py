@@ -15,32 +15,32 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from ...envs.cuda.kernel import how_of
-from ...envs.cuda.ptx import instructions, ptx_of
+from ...envs.cuda.kernel import make_constants
+from ...envs.cuda.ptx import count_opcodes, get_ptx
 from ...envs.vector import StabilityVectorEnv
 from ..harness.results import check_writable, write_text
 
 _ARITHMETIC = ("add", "sub", "mul", "fma", "div", "rcp", "sqrt")
 
 
-def counts(text: str) -> dict[str, Any]:
+def count_by_kind(text: str) -> dict[str, Any]:
     """What of a PTX text is counted, by name."""
-    found = instructions(text)
+    totals = count_opcodes(text)
 
-    def of(pattern: str) -> int:
-        return sum(count for name, count in found.items() if re.match(pattern, name))
+    def count_matching(pattern: str) -> int:
+        return sum(count for name, count in totals.items() if re.match(pattern, name))
 
-    any_of = "|".join(_ARITHMETIC)
+    arithmetic = "|".join(_ARITHMETIC)
     return {
-        "instructions": found.total(),
-        "on float64": of(rf"({any_of})\S*\.f64"),
-        "on float32": of(rf"({any_of})\S*\.f32"),
-        "fused": of("fma|mad"),
-        "divisions, roots": of(r"(div|rcp|sqrt)\S*\.f"),
+        "instructions": totals.total(),
+        "on float64": count_matching(rf"({arithmetic})\S*\.f64"),
+        "on float32": count_matching(rf"({arithmetic})\S*\.f32"),
+        "fused": count_matching("fma|mad"),
+        "divisions, roots": count_matching(r"(div|rcp|sqrt)\S*\.f"),
     }
 
 
-def assembled(text: str, capability: tuple[int, int]) -> dict[str, Any]:
+def assemble_kernel(text: str, capability: tuple[int, int]) -> dict[str, Any]:
     """Registers and bytes spilled of a thread, by `ptxas` where it is on the path."""
     if shutil.which("ptxas") is None:
         return {}
@@ -55,7 +55,7 @@ def assembled(text: str, capability: tuple[int, int]) -> dict[str, Any]:
         "stack, bytes": r"(\d+) bytes stack",
         "spilled, bytes": r"(\d+) bytes spill stores",
     }
-    return {name: re.findall(each, run.stderr)[-1] for name, each in patterns.items()}
+    return {name: re.findall(pattern, run.stderr)[-1] for name, pattern in patterns.items()}
 
 
 def main(
@@ -64,13 +64,15 @@ def main(
 ) -> None:
     """Count the kernel's instructions for an H200 (sm_90), in float64 and float32."""
     check_writable(out)
-    how = how_of(StabilityVectorEnv(1, **gym.spec(env).kwargs).config, "NextStep", record=False)
+    options = make_constants(
+        StabilityVectorEnv(1, **gym.spec(env).kwargs).config, "NextStep", record=False
+    )
     columns: list[dict[str, Any]] = []
     for real in (np.float64, np.float32):
-        text = ptx_of(how, real, (9, 0))
-        columns.append({"": real.__name__} | counts(text) | assembled(text, (9, 0)))
+        text = get_ptx(options, real, (9, 0))
+        columns.append({"": real.__name__} | count_by_kind(text) | assemble_kernel(text, (9, 0)))
     lines = [
-        f"| {name} | {' | '.join(str(each[name]) for each in columns)} |" for name in columns[0]
+        f"| {name} | {' | '.join(str(column[name]) for column in columns)} |" for name in columns[0]
     ]
     table = "\n".join([lines[0], "|---|---|---|", *lines[1:]]) + "\n"
     Console().print(table, highlight=False, markup=False, soft_wrap=True)

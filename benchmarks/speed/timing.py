@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Contestant:
+class Workload:
     """Some work and the number of units (steps, ticks, ...) that one call of it consists of.
 
     start: called before each round, not timed.
@@ -36,35 +36,37 @@ Taken = list[float]
 """CPU microseconds a unit, round by round."""
 
 
-def interleaved(contestants: Mapping[str, Contestant], effort: Effort) -> dict[str, Taken]:
+def measure_interleaved(workloads: Mapping[str, Workload], effort: Effort) -> dict[str, Taken]:
     """Each contestant's time in every round, after one that does not count."""
-    with one_thread():
-        calls = {name: _calls(each, effort.seconds) for name, each in contestants.items()}
-        taken: dict[str, Taken] = {name: [] for name in contestants}
+    with limit_threads():
+        calls = {
+            name: _count_calls(workload, effort.seconds) for name, workload in workloads.items()
+        }
+        taken: dict[str, Taken] = {name: [] for name in workloads}
         for _ in range(effort.rounds):
-            for name, each in contestants.items():
-                taken[name].append(_timed(each, calls[name]))
+            for name, workload in workloads.items():
+                taken[name].append(_measure_calls(workload, calls[name]))
     return taken
 
 
-def _timed(contestant: Contestant, calls: int) -> float:
+def _measure_calls(workload: Workload, calls: int) -> float:
     """CPU microseconds a unit of some calls of the work."""
-    contestant.start()
+    workload.start()
     start = time.process_time()
     for _ in range(calls):
-        contestant.work()
-    return 1e6 * (time.process_time() - start) / (calls * contestant.units)
+        workload.work()
+    return 1e6 * (time.process_time() - start) / (calls * workload.units)
 
 
-def _calls(contestant: Contestant, seconds: float) -> int:
+def _count_calls(workload: Workload, seconds: float) -> int:
     """How many calls take so many seconds, by the second call: the first may compile."""
-    _timed(contestant, 1)
-    once = _timed(contestant, 1) * contestant.units * 1e-6
+    _measure_calls(workload, 1)
+    once = _measure_calls(workload, 1) * workload.units * 1e-6
     return max(1, round(seconds / max(once, 1e-9)))
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def limit_threads() -> Iterator[None]:
     """Linear algebra and torch on one thread, where threadpoolctl is installed."""
     try:
         from threadpoolctl import threadpool_limits
@@ -75,6 +77,6 @@ def one_thread() -> Iterator[None]:
         yield
 
 
-def spread(values: Taken) -> tuple[float, float, float]:
+def compute_range(values: Taken) -> tuple[float, float, float]:
     """(median, least, largest)."""
     return statistics.median(values), min(values), max(values)

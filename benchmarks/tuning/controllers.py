@@ -18,19 +18,19 @@ import numpy as np
 from rich.console import Console
 
 from ... import __version__
-from ...agents.rungs import NOMINAL, RUNGS
+from ...agents.rungs import NOMINAL, ORACLES
 from ...agents.tuned import Options
-from ...envs.backend.cache import experiment_stamp
+from ...envs.backend.cache import hash_experiment
 from ...envs.record import Array
-from ..control.cells import ADAPTIVE, REFERENCE_FILTER, Cell
-from ..control.contests import Contest, candidates, contests
-from ..control.episodes import Chunk, Driven, drive
-from ..control.scores import gains
-from ..harness.engines import cores
+from ..control.cells import ADAPTIVE, REFERENCE_FILTER, ControlEntry
+from ..control.contests import ControlTask, list_candidates, list_scored_tasks
+from ..control.episodes import Chunk, DriveResult, run_chunk
+from ..control.scores import compute_log_ratios
+from ..harness.engines import count_cores
 from ..harness.parallel import run_cases
 from ..harness.results import Suite, write_text
-from .spaces import SLOW, Number, options_of, space
-from .suite import found_table
+from .spaces import SLOW, SearchNumber, get_space, make_options
+from .suite import make_result_table
 from .task import STORAGE
 
 TRIALS = 60
@@ -42,96 +42,106 @@ _UNTUNED: Options = {"filter": {}, "controller": {}}
 
 
 @dataclass(frozen=True)
-class Contestant:
+class ControllerTuning:
     """What is searched: a contestant's numbers, over a class's contests, on tuning seeds."""
 
     name: str
     kind: str
-    contests: tuple[Contest, ...]
+    contests: tuple[ControlTask, ...]
     seeds: tuple[int, ...]
-    numbers: tuple[Number, ...]
+    numbers: tuple[SearchNumber, ...]
 
     @property
     def study(self) -> str:
         """The study's name: the same for the same question asked of the same sources."""
-        stamp = f"{json.dumps(asdict(self), default=str)} {experiment_stamp()} {__version__}"
+        stamp = f"{json.dumps(asdict(self), default=str)} {hash_experiment()} {__version__}"
         digest = hashlib.sha256(stamp.encode()).hexdigest()[:12]
         return f"{self.name} in {self.kind} {digest}"
 
     @property
     def search(self) -> dict[str, tuple[float, float]]:
         """(low, high) by name."""
-        return {each.name: (each.low, each.high) for each in self.numbers}
+        return {number.name: (number.low, number.high) for number in self.numbers}
 
     @property
     def start(self) -> dict[str, float]:
         """Where the search starts."""
-        return {each.name: each.start for each in self.numbers}
+        return {number.name: number.start for number in self.numbers}
 
-    def options(self, found: dict[str, float]) -> Options:
+    def options(self, values: dict[str, float]) -> Options:
         """The options with some numbers, which have three digits."""
-        return options_of(self.numbers, {name: float(f"{v:.3g}") for name, v in found.items()})
+        return make_options(self.numbers, {name: float(f"{v:.3g}") for name, v in values.items()})
 
 
-def contestant(name: str, kind: str, seeds: Sequence[int]) -> Contestant:
+def make_controller_tuning(name: str, kind: str, seeds: Sequence[int]) -> ControllerTuning:
     """The question; ValueError for an unknown name or class, no contests and no seeds."""
-    numbers, found = space(name, kind), contests_of(name, kind)
-    if not found or not seeds:
-        raise ValueError(f"{kind}: {len(found)} contests, {len(seeds)} seeds; both are needed")
-    return Contestant(name, kind, tuple(found), tuple(seeds), numbers)
+    numbers, matching = get_space(name, kind), list_contests(name, kind)
+    if not matching or not seeds:
+        raise ValueError(f"{kind}: {len(matching)} contests, {len(seeds)} seeds; both are needed")
+    return ControllerTuning(name, kind, tuple(matching), tuple(seeds), numbers)
 
 
-def contests_of(name: str, kind: str) -> list[Contest]:
+def list_contests(name: str, kind: str) -> list[ControlTask]:
     """The scored contests of a class; of a rung, by which those are chosen, all candidates."""
-    return [each for each in (candidates() if name in RUNGS else contests()) if each.kind == kind]
+    return [
+        contest
+        for contest in (list_candidates() if name in ORACLES else list_scored_tasks())
+        if contest.kind == kind
+    ]
 
 
-def driven(contest: Contest, name: str, options: Options, seeds: tuple[int, ...]) -> Driven:
+def run_contestant(
+    contest: ControlTask, name: str, options: Options, seeds: tuple[int, ...]
+) -> DriveResult:
     """A contestant's episodes with some options."""
-    follows = {who: estimator for estimator, who in ADAPTIVE.items()}
-    estimator = "" if name in RUNGS else follows.get(name, REFERENCE_FILTER)
-    return drive(Chunk(Cell(contest, estimator, name, tuned=options), seeds))
+    follows = {controller: estimator for estimator, controller in ADAPTIVE.items()}
+    estimator = "" if name in ORACLES else follows.get(name, REFERENCE_FILTER)
+    return run_chunk(Chunk(ControlEntry(contest, estimator, name, tuned=options), seeds))
 
 
 @lru_cache(maxsize=64)
-def _nominal(contest: Contest, seeds: tuple[int, ...]) -> Array:
-    return driven(contest, NOMINAL, _UNTUNED, seeds).costs
+def _compute_nominal_costs(contest: ControlTask, seeds: tuple[int, ...]) -> Array:
+    return run_contestant(contest, NOMINAL, _UNTUNED, seeds).costs
 
 
-def objective(task: Contestant, seeds: tuple[int, ...], found: dict[str, float]) -> float:
+def compute_objective(
+    task: ControllerTuning, seeds: tuple[int, ...], values: dict[str, float]
+) -> float:
     """The mean over contests and some seeds, infinite where nothing can be designed."""
-    options, logs = task.options(found), []
+    options, log_ratios = task.options(values), []
     for contest in task.contests:
-        mine = driven(contest, task.name, options, seeds)
-        if mine.error:
+        result = run_contestant(contest, task.name, options, seeds)
+        if result.error:
             return math.inf
-        logs.append(-gains(_nominal(contest, seeds), mine))
-    value = float(np.mean(logs))
+        log_ratios.append(-compute_log_ratios(_compute_nominal_costs(contest, seeds), result))
+    value = float(np.mean(log_ratios))
     return value if math.isfinite(value) else math.inf
 
 
-def judge(
-    task: Contestant, jobs: int, batch: Sequence[dict[str, float]]
+def evaluate_trials(
+    task: ControllerTuning, jobs: int, batch: Sequence[dict[str, float]]
 ) -> list[tuple[float, int]]:
     """(objective, seeds driven) of each of a batch's trials.
 
     Of a slow contestant's the worse half is left after each of `STAGES` (successive halving); the
     others go on with the seeds that they have not driven.
     """
-    stages = [each for each in STAGES if task.name in SLOW and each < len(task.seeds)]
-    judged, going, done = [(0.0, 0)] * len(batch), list(range(len(batch))), 0
+    stages = [stage for stage in STAGES if task.name in SLOW and stage < len(task.seeds)]
+    results, remaining, done = [(0.0, 0)] * len(batch), list(range(len(batch))), 0
     for count in (*stages, len(task.seeds)):
         new = task.seeds[done:count]
-        values = run_cases(partial(objective, task, new), [batch[i] for i in going], jobs=jobs)
-        for i, value in zip(going, values, strict=True):
-            judged[i] = (judged[i][0] * done + value * len(new)) / count, count
+        values = run_cases(
+            partial(compute_objective, task, new), [batch[i] for i in remaining], jobs=jobs
+        )
+        for i, value in zip(remaining, values, strict=True):
+            results[i] = (results[i][0] * done + value * len(new)) / count, count
         done = count
-        going = sorted(going, key=lambda i: judged[i])[: (len(going) + 1) // 2]
-    return judged
+        remaining = sorted(remaining, key=lambda i: results[i])[: (len(remaining) + 1) // 2]
+    return results
 
 
 def tune(
-    task: Contestant,
+    task: ControllerTuning,
     trials: int = TRIALS,
     storage: str = STORAGE,
     seed: int = 0,
@@ -144,38 +154,47 @@ def tune(
     A stopped search goes on where it was. Raises ValueError for a contestant that cannot drive the
     contests, no trials, a storage that fails, and where no trial is finite.
     """
-    from .study import open_study, search_on
+    from .study import create_study, run_search
 
     if trials < 1:
         raise ValueError(f"trials must be at least 1, got {trials}")
     for contest in task.contests:  # what cannot be driven at all; kernels are compiled once
-        if error := driven(contest, task.name, task.options(task.start), task.seeds[:1]).error:
+        if error := run_contestant(
+            contest, task.name, task.options(task.start), task.seeds[:1]
+        ).error:
             raise ValueError(f"{task.name} in {contest.name}: {error}")
-    study = open_study(task, storage, "tpe", seed)
+    study = create_study(task, storage, "tpe", seed)
     if not study.trials:
         study.enqueue_trial(task.start)
-    search_on(study, task, trials, partial(judge, task, jobs or cores()), len(task.seeds), console)
-    return log_of(task, study.trials)
+    run_search(
+        study,
+        task,
+        trials,
+        partial(evaluate_trials, task, jobs or count_cores()),
+        len(task.seeds),
+        console,
+    )
+    return make_log(task, study.trials)
 
 
-def log_of(task: Contestant, trials: Sequence[Any]) -> dict[str, Any]:
+def make_log(task: ControllerTuning, trials: Sequence[Any]) -> dict[str, Any]:
     """The log of a study; trials: Optuna's."""
     rows: list[dict[str, Any]] = []
-    for each in trials:
-        if "seeds" in each.user_attrs:  # the others were stopped
-            found = {name: float(f"{value:.3g}") for name, value in each.params.items()}
-            value, count = each.user_attrs["objective"], each.user_attrs["seeds"]
+    for item in trials:
+        if "seeds" in item.user_attrs:  # the others were stopped
+            numbers = {name: float(f"{value:.3g}") for name, value in item.params.items()}
+            value, count = item.user_attrs["objective"], item.user_attrs["seeds"]
             known = round(value, 5) if math.isfinite(value) else None
-            rows.append({"numbers": found, "seeds": count, "objective": known})
-    whole = [r for r in rows if r["seeds"] == len(task.seeds) and r["objective"] is not None]
-    if not whole:
+            rows.append({"numbers": numbers, "seeds": count, "objective": known})
+    complete = [r for r in rows if r["seeds"] == len(task.seeds) and r["objective"] is not None]
+    if not complete:
         raise ValueError(f"none of {len(rows)} trials of {task.name} could be driven: {task.kind}")
-    best = min(whole, key=lambda row: float(row["objective"]))
+    best = min(complete, key=lambda row: float(row["objective"]))
     return {
         "contestant": task.name,
         "class": task.kind,
         "env_version": __version__,
-        "contests": [each.name for each in task.contests],
+        "contests": [item.name for item in task.contests],
         "seeds": list(task.seeds),
         "start": rows[0]["objective"],
         "best": best,
@@ -191,7 +210,7 @@ def write_log(path: Path, log: dict[str, Any]) -> None:
     write_text(path, f'{head[:-2]},\n "trials": [\n  {lines}\n ]\n}}\n')
 
 
-def suite_of(task: Contestant, log: dict[str, Any]) -> Suite:
+def make_suite(task: ControllerTuning, log: dict[str, Any]) -> Suite:
     """What a study found, as a table."""
     best = log["best"]
     start = math.inf if log["start"] is None else math.exp(log["start"])
@@ -201,5 +220,5 @@ def suite_of(task: Contestant, log: dict[str, Any]) -> Suite:
         f"the untuned nominal's (geometric mean, a failure counts 20), {100.0 * start:.1f} % at "
         "the start."
     )
-    table = found_table(best["numbers"], task.search)
+    table = make_result_table(best["numbers"], task.search)
     return Suite("tune", f"Tuning {task.name} in {task.kind}", text, tables=[table])

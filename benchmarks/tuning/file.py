@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ...agents.tuned import Options, read_tuned
-from ...envs.documents import toml_of
+from ...envs.documents import to_toml
 from ...estimators.design.tunings import read_tunings
 from ..harness.results import write_text
 
@@ -24,22 +24,22 @@ def update(path: str | Path, entry: dict[str, Any]) -> None:
     with them; that of what was chosen by hand does not.
     """
     target = Path(path)
-    entries = {_key(old): old for old in read_tunings(target)} if target.exists() else {}
-    old = entries.get(_key(entry), {})
+    entries = {_make_key(old): old for old in read_tunings(target)} if target.exists() else {}
+    old = entries.get(_make_key(entry), {})
     note = {"note": old["note"]} if {"note", "command"} <= old.keys() else {}
-    entries[_key(entry)] = note | entry
+    entries[_make_key(entry)] = note | entry
     text = target.read_text(encoding="utf-8") if target.exists() else ""
     head = text.partition("[[tuning]]")[0] or _HEAD + "\n"
-    write_text(target, head + "\n".join(map(_text, entries.values())))
+    write_text(target, head + "\n".join(map(_format_entry, entries.values())))
 
 
-def _key(entry: dict[str, Any]) -> tuple[str, str]:
+def _make_key(entry: dict[str, Any]) -> tuple[str, str]:
     return entry["estimator"], entry["sensors"]
 
 
-def _text(entry: dict[str, Any]) -> str:
-    there = [key for key in _KEYS if entry.get(key) not in (None, {})]
-    lines = "".join(f"{key} = {toml_of(entry[key])}\n" for key in there)
+def _format_entry(entry: dict[str, Any]) -> str:
+    present = [key for key in _KEYS if entry.get(key) not in (None, {})]
+    lines = "".join(f"{key} = {to_toml(entry[key])}\n" for key in present)
     return f"[[tuning]]\n{lines}"
 
 
@@ -48,19 +48,19 @@ _TUNED = """\
 """
 
 
-def put_tuned(path: str | Path, kind: str, name: str, options: Options) -> None:
+def write_tuned(path: str | Path, kind: str, name: str, options: Options) -> None:
     """Replace or add a contestant's options in a file that `agents.tuned` reads."""
     target = Path(path)
     read_tuned.cache_clear()
     classes = read_tuned(target) if target.exists() else {}
     classes = classes | {kind: classes.get(kind, {}) | {name: options}}
     tables = [
-        f"[{each}.{who}.{part}]\n"
-        + "".join(f"{option} = {json.dumps(value)}\n" for option, value in held.items())
-        for each, names in sorted(classes.items())
-        for who, parts in sorted(names.items())
-        for part, held in parts.items()
-        if held
+        f"[{class_name}.{contestant}.{part}]\n"
+        + "".join(f"{option} = {json.dumps(value)}\n" for option, value in part_options.items())
+        for class_name, names in sorted(classes.items())
+        for contestant, parts in sorted(names.items())
+        for part, part_options in parts.items()
+        if part_options
     ]
     write_text(target, _TUNED + "\n" + "\n".join(tables))
     read_tuned.cache_clear()

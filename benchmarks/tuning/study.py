@@ -16,13 +16,13 @@ from typing import Any, Protocol
 import joblib
 from rich.console import Console
 
-from ...envs.backend.extras import extra
-from ..harness.drives import Drive
-from ..harness.engines import cores
+from ...envs.backend.extras import require_extra
+from ..harness.drives import LoggedEpisode
+from ..harness.engines import count_cores
 from ..harness.parallel import Bar, run_cases
-from .task import SAMPLERS, STORAGE, Task, objective, squares
+from .task import SAMPLERS, STORAGE, EstimatorTuning, compute_objective, compute_squares
 
-with extra("tune", "tuning needs optuna"):
+with require_extra("tune", "tuning needs optuna"):
     import cmaes  # noqa: F401  Optuna imports it when it is too late
     import optuna
     from optuna.trial import FrozenTrial, TrialState
@@ -44,19 +44,19 @@ class Question(Protocol):
 
 
 @functools.lru_cache(maxsize=1)
-def _loaded(path: str) -> Any:
+def _load_drives(path: str) -> Any:
     return joblib.load(path)
 
 
-def score(path: str, task: Task, found: dict[str, float]) -> float:
+def evaluate_trial(path: str, task: EstimatorTuning, values: dict[str, float]) -> float:
     """`objective` with some numbers, on the drives in a file; infinite if unstable."""
     try:
-        return objective(squares(task, _loaded(path), found))
+        return compute_objective(compute_squares(task, _load_drives(path), values))
     except ValueError:  # a filter that diverges, a covariance that is none
         return math.inf
 
 
-def open_study(
+def create_study(
     task: Question, storage: str = STORAGE, sampler: str = SAMPLERS[0], seed: int = 0
 ) -> "optuna.Study":
     """The task's study, made if it is not there.
@@ -68,22 +68,22 @@ def open_study(
     url = storage if "://" in storage else f"sqlite:///{storage}"
     wait = {"connect_args": {"timeout": 60.0}} if url.startswith("sqlite") else {}
     others = (RuntimeError, ImportError)  # another Optuna's tables, no driver
-    with _quiet(), _storage_errors(storage, *others):
+    with _silence_optuna(), _convert_storage_errors(storage, *others):
         study = optuna.create_study(
             storage=optuna.storages.RDBStorage(url, engine_kwargs=wait),
             study_name=task.study,
             direction="minimize",
             load_if_exists=True,
         )
-        study.sampler = _sampler(sampler, seed + len(study.trials), len(task.search))
-        _finished(study, task)
+        study.sampler = _make_sampler(sampler, seed + len(study.trials), len(task.search))
+        _list_finished(study, task)
         return study
 
 
 def search(
     study: "optuna.Study",
-    task: Task,
-    drives: Sequence[Drive],
+    task: EstimatorTuning,
+    drives: Sequence[LoggedEpisode],
     trials: int,
     jobs: int | None = None,
     console: Console | None = None,
@@ -95,57 +95,57 @@ def search(
     with tempfile.TemporaryDirectory() as folder:
         path = str(Path(folder) / "drives")
         joblib.dump(list(drives), path)
-        many = min(jobs or cores(), BATCH)
+        n_jobs = min(jobs or count_cores(), BATCH)
 
-        def judge(batch: Sequence[dict[str, float]]) -> list[tuple[float, int]]:
-            values = run_cases(functools.partial(score, path, task), batch, jobs=many)
+        def evaluate_batch(batch: Sequence[dict[str, float]]) -> list[tuple[float, int]]:
+            values = run_cases(functools.partial(evaluate_trial, path, task), batch, jobs=n_jobs)
             return [(value, len(drives)) for value in values]
 
-        search_on(study, task, trials, judge, len(drives), console)
-    with _storage_errors(study.study_name):
+        run_search(study, task, trials, evaluate_batch, len(drives), console)
+    with _convert_storage_errors(study.study_name):
         best = study.best_trial
     if best.value is None or not math.isfinite(best.value):
-        squares(task, drives, best.params)  # the estimator's own words, if it has any
+        compute_squares(task, drives, best.params)  # the estimator's own words, if it has any
         raise ValueError(f"none of {trials} trials of {task.estimator} gave finite estimates")
     return {name: float(f"{v:.{DIGITS}g}") for name, v in best.params.items()}
 
 
-def search_on(
+def run_search(
     study: "optuna.Study",
     task: Question,
     trials: int,
-    judge: Callable[[Sequence[dict[str, float]]], Sequence[tuple[float, int]]],
-    whole: int,
+    evaluate: Callable[[Sequence[dict[str, float]]], Sequence[tuple[float, int]]],
+    n_drives: int,
     console: Console | None = None,
 ) -> None:
     """Ask for batches until the study has so many trials, those it holds included.
 
-    judge: from the numbers of a batch to (value, drives it is the mean of) of each. A trial that
-    drove fewer than `whole` counts as pruned; its user attributes have both.
+    evaluate: from the numbers of a batch to (value, drives it is the mean of) of each. A trial that
+    drove fewer than `n_drives` counts as pruned; its user attributes have both.
     """
     space: dict[str, optuna.distributions.BaseDistribution] = {
         name: optuna.distributions.FloatDistribution(*limits, log=True)
         for name, limits in task.search.items()
     }
-    with _quiet(), _storage_errors(study.study_name), Bar(console) as bar:
-        done = _finished(study, task)
-        shown = bar.add_task(_best_text(study), total=trials, completed=len(done), unit="trials")
+    with _silence_optuna(), _convert_storage_errors(study.study_name), Bar(console) as bar:
+        done = _list_finished(study, task)
+        shown = bar.add_task(_format_best(study), total=trials, completed=len(done), unit="trials")
         while len(done) < trials:
             batch = [study.ask(space) for _ in range(min(BATCH, trials - len(done)))]
-            judged = judge([trial.params for trial in batch])
-            for trial, (value, count) in zip(batch, judged, strict=True):
+            results = evaluate([trial.params for trial in batch])
+            for trial, (value, count) in zip(batch, results, strict=True):
                 trial.set_user_attr("seeds", count)
                 trial.set_user_attr("objective", value)
-                if count < whole:
+                if count < n_drives:
                     trial.report(value, count)
                     study.tell(trial, state=TrialState.PRUNED)
                 else:
                     study.tell(trial, value)
-            done = _finished(study, task)
-            bar.update(shown, completed=len(done), description=_best_text(study))
+            done = _list_finished(study, task)
+            bar.update(shown, completed=len(done), description=_format_best(study))
 
 
-def _finished(study: "optuna.Study", task: Question) -> list[FrozenTrial]:
+def _list_finished(study: "optuna.Study", task: Question) -> list[FrozenTrial]:
     states = (TrialState.COMPLETE, TrialState.PRUNED)
     done = study.get_trials(deepcopy=False, states=states)
     if len(study.directions) != 1 or any(set(t.params) != set(task.search) for t in done):
@@ -153,7 +153,7 @@ def _finished(study: "optuna.Study", task: Question) -> list[FrozenTrial]:
     return done
 
 
-def _sampler(name: str, seed: int, size: int) -> "optuna.samplers.BaseSampler":
+def _make_sampler(name: str, seed: int, size: int) -> "optuna.samplers.BaseSampler":
     """CMA-ES has no use for a single number."""
     if name not in SAMPLERS:
         raise ValueError(f"unknown sampler {name!r}; known: {', '.join(SAMPLERS)}")
@@ -163,7 +163,7 @@ def _sampler(name: str, seed: int, size: int) -> "optuna.samplers.BaseSampler":
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def _silence_optuna() -> Iterator[None]:
     """Without Optuna's log and its warnings of what is experimental."""
     before = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -176,7 +176,7 @@ def _quiet() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _storage_errors(storage: str, *others: type[Exception]) -> Iterator[None]:
+def _convert_storage_errors(storage: str, *others: type[Exception]) -> Iterator[None]:
     """ValueError, without the password, for what databases and Optuna raise."""
     kinds: tuple[type[Exception], ...] = (SQLAlchemyError, optuna.exceptions.OptunaError, *others)
     try:
@@ -191,7 +191,7 @@ def _storage_errors(storage: str, *others: type[Exception]) -> Iterator[None]:
         raise ValueError(f"the study's storage failed ({shown}): {reason}") from None
 
 
-def _best_text(study: "optuna.Study") -> str:
+def _format_best(study: "optuna.Study") -> str:
     try:
         return f"best {study.best_value:.4g}"
     except ValueError:

@@ -12,16 +12,16 @@ import numpy as np
 from rich.console import Console
 
 from ...estimators.design.tunings import TUNINGS
-from ..harness.drives import Drive
-from ..harness.results import Suite, Table
+from ..harness.drives import LoggedEpisode
+from ..harness.results import ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_roots, root_mean
-from .task import SAMPLERS, STORAGE, Array, Task, simulate, squares
+from .task import SAMPLERS, STORAGE, Array, EstimatorTuning, compute_squares, simulate
 
 _EDGE = 1.25  # times an end of its range or less: the number counts as being there
 
 
 def run(
-    task: Task,
+    task: EstimatorTuning,
     trials: int = 200,
     test_seeds: int = 20,
     storage: str = STORAGE,
@@ -32,17 +32,17 @@ def run(
 ) -> tuple[Suite, dict[str, float]]:
     """Search on the task's seeds, judge on the seeds 0 .. test_seeds-1; a suite and the numbers.
 
-    Raises ValueError for no trials or test seeds, and as `open_study` and `search`.
+    Raises ValueError for no trials or test seeds, and as `create_study` and `search`.
     """
-    from .study import open_study, search
+    from .study import create_study, search
 
     if trials < 1:
         raise ValueError(f"trials must be at least 1, got {trials}")
     if not 1 <= test_seeds <= task.seeds[0]:
         raise ValueError(f"test seeds are 1 to {task.seeds[0]}, got {test_seeds}")
-    study = open_study(task, storage, sampler, seed)
+    study = create_study(task, storage, sampler, seed)
     training = simulate(task, task.seeds, "training drives", jobs, console)
-    found = search(study, task, training, trials, jobs, console)
+    numbers = search(study, task, training, trials, jobs, console)
     test = simulate(task, range(test_seeds), "test drives", jobs, console)
     suite = Suite(
         "tune",
@@ -51,66 +51,78 @@ def run(
         f"{trials} trials. The default is make_estimator with no more than what is held "
         "fixed. Several scenarios count alike: the search makes the geometric mean of their RMSE "
         "least.",
-        tables=[*_comparisons(task, training, test, found), found_table(found, task.search)],
+        tables=[
+            *_make_comparisons(task, training, test, numbers),
+            make_result_table(numbers, task.search),
+        ],
     )
-    return suite, found
+    return suite, numbers
 
 
-def _comparisons(
-    task: Task, training: Sequence[Drive], test: Sequence[Drive], found: dict[str, float]
-) -> list[Table]:
+def _make_comparisons(
+    task: EstimatorTuning,
+    training: Sequence[LoggedEpisode],
+    test: Sequence[LoggedEpisode],
+    numbers: dict[str, float],
+) -> list[ResultTable]:
     """A table a scenario."""
-    default = [_squares(task, drives, {}) for drives in (training, test)]
-    tuned = [_squares(task, drives, found) for drives in (training, test)]
+    default = [_compute_squares(task, drives, {}) for drives in (training, test)]
+    tuned = [_compute_squares(task, drives, numbers) for drives in (training, test)]
     tables = []
     for i, scenario in enumerate(task.scenarios):
-        before, after = [each[i] for each in default], [each[i] for each in tuned]
+        before, after = [values[i] for values in default], [values[i] for values in tuned]
         ratio = (
             interval(after[1], ratio_of_roots, before[1])
             if np.isfinite(before[1]).all() and np.isfinite(after[1]).all()
             else Estimate(math.nan)
         )
         tables.append(
-            Table(
+            ResultTable(
                 f"{task.estimator} on {scenario} ({task.env_id})",
                 ("tuning", f"{before[0].size} training seeds", f"{before[1].size} test seeds"),
-                [["default", *map(_spread, before)], ["found", *map(_spread, after)]],
+                [["default", *map(_format_spread, before)], ["found", *map(_format_spread, after)]],
                 f"Found over default on the test seeds: {ratio.inline(digits='.3f')}.",
             )
         )
     return tables
 
 
-def _squares(task: Task, drives: Sequence[Drive], numbers: dict[str, float]) -> Array:
+def _compute_squares(
+    task: EstimatorTuning, drives: Sequence[LoggedEpisode], numbers: dict[str, float]
+) -> Array:
     """`squares`, infinite where the estimator diverges."""
     try:
-        return squares(task, drives, numbers)
+        return compute_squares(task, drives, numbers)
     except ValueError:
         return np.full((len(task.scenarios), len(drives) // len(task.scenarios)), np.inf)
 
 
-def _spread(errors: Array) -> str:
+def _format_spread(errors: Array) -> str:
     if not np.isfinite(errors).all():
         return "diverges"
     return interval(errors, root_mean).inline(digits=".4g")
 
 
-def found_table(found: Mapping[str, float], search: Mapping[str, tuple[float, float]]) -> Table:
+def make_result_table(
+    numbers: Mapping[str, float], search: Mapping[str, tuple[float, float]]
+) -> ResultTable:
     """The numbers that were found; one at the end of its range is marked."""
     cells = []
     for name, (low, high) in search.items():
-        value = found[name]
-        at = "at its end" if min(value / low, high / value) < _EDGE else ""
-        cells.append([name, f"{value:g}", f"{low:g} .. {high:g}", at])
+        value = numbers[name]
+        remark = "at its end" if min(value / low, high / value) < _EDGE else ""
+        cells.append([name, f"{value:g}", f"{low:g} .. {high:g}", remark])
     note = "A number at the end of its range: the optimum does without it, or lies beyond."
-    return Table("Found", ("option", "value", "range", ""), cells, note, keyed=False)
+    return ResultTable("Found", ("option", "value", "range", ""), cells, note, keyed=False)
 
 
-def entry(task: Task, found: dict[str, float], command: str, note: str = "") -> dict[str, Any]:
+def make_entry(
+    task: EstimatorTuning, numbers: dict[str, float], command: str, note: str = ""
+) -> dict[str, Any]:
     """The tuning that was found, as an entry of a tunings file."""
-    used = task.options | found
+    used = task.options | numbers
     q = {key.removeprefix("q_"): value for key, value in used.items() if key.startswith("q_")}
     q = TUNINGS.get((task.estimator, task.sensors), {}) | q
-    noise = {key: value for key, value in found.items() if not key.startswith("q_")}
-    made = {"estimator": task.estimator, "sensors": task.sensors, "command": command}
-    return made | {"q": q, "noise": noise} | ({"note": note} if note else {})
+    noise = {key: value for key, value in numbers.items() if not key.startswith("q_")}
+    result = {"estimator": task.estimator, "sensors": task.sensors, "command": command}
+    return result | {"q": q, "noise": noise} | ({"note": note} if note else {})

@@ -15,12 +15,12 @@ from rich.console import Console
 
 from ... import __version__
 from ...agents.rollout import rollout
-from ...envs.backend.cache import source_stamp
+from ...envs.backend.cache import hash_sources
 from ...estimators.estimator import Estimator
 from ...estimators.filters import FILTERS
 from ...estimators.make import ESTIMATORS, make_estimator
 from ..estimation import EXPERIMENTS
-from ..harness.drives import SETTLED, Drive, filter_arguments, quietly
+from ..harness.drives import SETTLED, LoggedEpisode, call_quietly, make_filter_arguments
 from ..harness.parallel import run_cases
 from ..harness.stats import root_mean
 
@@ -35,7 +35,7 @@ FIRST_SEED = 1000  # of training; the test seeds count from 0
 
 
 @dataclass(frozen=True)
-class Task:
+class EstimatorTuning:
     """A tuning: which options of an estimator are searched, on which drives, for what.
 
     scenarios: which count alike, each with every seed. options: held. search: option to (low,
@@ -62,12 +62,12 @@ class Task:
     def study(self) -> str:
         """The study's name: the same for the same question asked of the same sources."""
         question = json.dumps(dataclasses.asdict(self), sort_keys=True, default=str)
-        stamp = f"{question} {source_stamp('estimators')} {__version__}"
+        stamp = f"{question} {hash_sources('estimators')} {__version__}"
         digest = hashlib.sha256(stamp.encode()).hexdigest()[:12]
         return f"{self.estimator} on {self.subject} {digest}"
 
 
-def make_task(
+def make_estimator_tuning(
     estimator: str,
     scenarios: str | Sequence[str],
     env_id: str | None = None,
@@ -76,7 +76,7 @@ def make_task(
     search: Mapping[str, Range | None] | None = None,
     noises: Mapping[str, Range | None] | None = None,
     seeds: int = 12,
-) -> Task:
+) -> EstimatorTuning:
     """Check what a user asks for and fill in the rest.
 
     scenarios: one's name or several.
@@ -95,11 +95,11 @@ def make_task(
         raise ValueError(f"scenarios are one or more, each once, got {', '.join(scenarios)}")
     held = dict(options or {})
     ESTIMATORS.load(estimator)  # or ValueError
-    env_id, facts, filter_ = _fitting(estimator, scenarios, env_id, held)
+    env_id, facts, filter_ = _find_env(estimator, scenarios, env_id, held)
     states = filter_.names
     if target not in states:
         raise ValueError(f"{estimator} has no {target}; a target is one of {', '.join(states)}")
-    (drive,) = drives_of((env_id, scenarios[0], (FIRST_SEED,)))
+    (drive,) = simulate_case((env_id, scenarios[0], (FIRST_SEED,)))
     if target not in drive.log.truth:
         known = ", ".join(state for state in states if state in drive.log.truth) or "none"
         raise ValueError(f"the truth of {target} is not recorded; of its states: {known}")
@@ -107,7 +107,7 @@ def make_task(
         search = {
             f"q_{state}": None
             for state in states
-            if f"q_{state}" not in held and _takes(estimator, f"q_{state}", held, facts)
+            if f"q_{state}" not in held and _has_option(estimator, f"q_{state}", held, facts)
         }
     searched = {**search, **(noises or {})}
     if not searched:
@@ -115,9 +115,9 @@ def make_task(
     for option in searched:
         if option in held:
             raise ValueError(f"the option {option} is both held and searched")
-        if not _takes(estimator, option, held, facts):
-            build(estimator, facts, {**held, option: 1.0})  # raises with what it has
-    return Task(
+        if not _has_option(estimator, option, held, facts):
+            build_estimator(estimator, facts, {**held, option: 1.0})  # raises with what it has
+    return EstimatorTuning(
         estimator,
         scenarios,
         env_id,
@@ -125,32 +125,38 @@ def make_task(
         filter_.units[states.index(target)],
         ",".join(filter_.sensors),
         held,
-        {option: _range(option, limits) for option, limits in searched.items()},
+        {option: _check_range(option, limits) for option, limits in searched.items()},
         tuple(range(FIRST_SEED, FIRST_SEED + seeds)),
     )
 
 
-def _range(option: str, limits: Range | None) -> Range:
+def _check_range(option: str, limits: Range | None) -> Range:
     low, high = limits or (PROCESS_RANGE if option.startswith("q_") else NOISE_RANGE)
     if not 0.0 < low < high < math.inf:
         raise ValueError(f"the range of {option} is LOW:HIGH with 0 < LOW < HIGH, got {low}:{high}")
     return float(low), float(high)
 
 
-def build(estimator: str, facts: Mapping[str, Any], options: Mapping[str, Any]) -> Estimator:
+def build_estimator(
+    estimator: str, facts: Mapping[str, Any], options: Mapping[str, Any]
+) -> Estimator:
     """An estimator of an env's facts, without the warning of what it cannot see."""
-    return quietly(make_estimator, estimator, **facts, **options)
+    return call_quietly(make_estimator, estimator, **facts, **options)
 
 
-def _unstable(estimator: str) -> dict[str, bool]:
+def _make_unstable_option(estimator: str) -> dict[str, bool]:
     """The option of ours to be built whatever their error does; a user's own has none."""
     return {"allow_unstable": True} if estimator in FILTERS else {}
 
 
-def _takes(estimator: str, option: str, held: Mapping[str, Any], facts: Mapping[str, Any]) -> bool:
+def _has_option(
+    estimator: str, option: str, held: Mapping[str, Any], facts: Mapping[str, Any]
+) -> bool:
     """Whether the estimator has an option; whether the number suits is another matter."""
     try:
-        build(estimator, facts, {**_unstable(estimator), **held, option: 1e-3})
+        build_estimator(
+            estimator, facts, {**_make_unstable_option(estimator), **held, option: 1e-3}
+        )
     except TypeError:
         return False
     except ValueError:
@@ -158,12 +164,12 @@ def _takes(estimator: str, option: str, held: Mapping[str, Any], facts: Mapping[
     return True
 
 
-def _fitting(
+def _find_env(
     estimator: str, scenarios: Sequence[str], env_id: str | None, held: dict[str, Any]
 ) -> tuple[str, dict[str, Any], Estimator]:
     """The environment to use, and its facts and the estimator without tuning in the last
     scenario."""
-    first = [each.env_id for each in EXPERIMENTS if each.scenario in scenarios]
+    first = [experiment.env_id for experiment in EXPERIMENTS if experiment.scenario in scenarios]
     others = [name for name in gym.registry if name.startswith("sideslip/Yaw")]
     ids = list(dict.fromkeys([*first, *others])) if env_id is None else [env_id]
     refused: dict[str, str] = {}
@@ -172,46 +178,57 @@ def _fitting(
             for scenario in scenarios:
                 env: gym.Env[Any, Any] = gym.make(name, scenario=scenario)
                 env.reset(seed=FIRST_SEED)
-                facts = filter_arguments(env.unwrapped)
-                filter_ = build(estimator, facts, {**_unstable(estimator), **held})
+                facts = make_filter_arguments(env.unwrapped)
+                filter_ = build_estimator(
+                    estimator, facts, {**_make_unstable_option(estimator), **held}
+                )
         except ValueError as error:
             refused.setdefault(str(error), name)
         else:
             return name, facts, filter_
-    why = "; ".join(f"{name}: {text}" for text, name in refused.items())
-    raise ValueError(f"no environment of {', '.join(scenarios)} suits {estimator}: {why}")
+    reasons = "; ".join(f"{name}: {text}" for text, name in refused.items())
+    raise ValueError(f"no environment of {', '.join(scenarios)} suits {estimator}: {reasons}")
 
 
-def drives_of(case: tuple[str, str, tuple[int, ...]]) -> list[Drive]:
+def simulate_case(case: tuple[str, str, tuple[int, ...]]) -> list[LoggedEpisode]:
     """The drives of (env id, scenario, seeds)."""
     env_id, scenario, seeds = case
     env: gym.Env[Any, Any] = gym.make(env_id, scenario=scenario, control_period=1)
-    return [Drive(rollout(env, seed=seed).log, filter_arguments(env.unwrapped)) for seed in seeds]
+    return [
+        LoggedEpisode(rollout(env, seed=seed).log, make_filter_arguments(env.unwrapped))
+        for seed in seeds
+    ]
 
 
 def simulate(
-    task: Task, seeds: Sequence[int], title: str, jobs: int | None, console: Console | None
-) -> list[Drive]:
+    task: EstimatorTuning,
+    seeds: Sequence[int],
+    title: str,
+    jobs: int | None,
+    console: Console | None,
+) -> list[LoggedEpisode]:
     """The drives of some seeds in each scenario in turn, four a case, side by side."""
     fours = [tuple(seeds[i : i + 4]) for i in range(0, len(seeds), 4)]
     cases = [(task.env_id, scenario, four) for scenario in task.scenarios for four in fours]
-    done = run_cases(drives_of, cases, title, jobs, console)
+    done = run_cases(simulate_case, cases, title, jobs, console)
     return [drive for drives in done for drive in drives]
 
 
-def squares(task: Task, drives: Sequence[Drive], found: Mapping[str, float]) -> Array:
+def compute_squares(
+    task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: Mapping[str, float]
+) -> Array:
     """Mean squared error of the target from `SETTLED` s on: (scenarios, seeds).
 
     Raises ValueError where the estimator cannot be built. An estimate that is not finite counts as
     infinitely wrong.
     """
-    options, turn = task.options | dict(found), 2.0 * math.pi
+    options, turn = task.options | dict(values), 2.0 * math.pi
     errors, filters = np.empty(len(drives)), dict[str, Estimator]()
     for i, (log, facts) in enumerate((drive.log, drive.facts) for drive in drives):
         clocks = [dataclasses.replace(sensor, phase=0.0) for sensor in facts["sensors"].values()]
         key = repr(facts | {"sensors": clocks})  # a reset sets the clocks' phases
         if key not in filters:
-            filters[key] = build(task.estimator, facts, options)
+            filters[key] = build_estimator(task.estimator, facts, options)
         late = log.time >= SETTLED - 1e-9
         with np.errstate(all="ignore"):
             error = (filters[key].run(log)[task.target] - log.truth[task.target])[late]
@@ -222,6 +239,6 @@ def squares(task: Task, drives: Sequence[Drive], found: Mapping[str, float]) -> 
     return finite.reshape(len(task.scenarios), -1)
 
 
-def objective(errors: Array) -> float:
+def compute_objective(errors: Array) -> float:
     """What a search makes least: the geometric mean of the scenarios' RMSE, of `squares`."""
     return float(np.exp(np.mean(np.log(root_mean(errors)))))

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..harness.drives import SETTLED
 
-CAMERA, GPS, FUSION = (f"sideslip/Yaw{each}-v0" for each in ("Vision", "Gps", "Fusion"))
+CAMERA, GPS, FUSION = (f"sideslip/Yaw{sensors}-v0" for sensors in ("Vision", "Gps", "Fusion"))
 KMH = 1.0 / 3.6
 STIFF = {"front_stiffness": (0.6, 1.4), "rear_stiffness": (0.6, 1.4)}
 LINEAR = {"base": "random-steering", "small_angle": True, "tyres": "linear", "roll": False}
@@ -38,7 +38,7 @@ class Condition:
     options: Mapping[str, Any] = field(default_factory=dict)
     since: float = SETTLED
     bounded: bool = True
-    foreseen: bool = True
+    modelled: bool = True
     filters: Filters = field(default_factory=dict)
     vehicle: str = "coms"
     gyro_late: float = 0.0
@@ -61,20 +61,22 @@ GUSTY = {"levels": ((1.0, 1.0), (8.0, 2.0)), "disturbance_time": 1.0}
 """One member expects a force that is eight times as strong; both, one that lasts."""
 
 
-def pushed(factor: float) -> dict[str, Any]:
+def scale_disturbances(factor: float) -> dict[str, Any]:
     """Disturbances of a factor times the levels that filters assume."""
     return MIX | {"disturbance_force": 50.0 * factor, "disturbance_moment": 20.0 * factor}
 
 
-def biased(degrees: float) -> dict[str, Any]:
+def make_gyro_bias(degrees: float) -> dict[str, Any]:
     """A gyro that is off by so many deg/s."""
     return MIX | {"noise": {"gyro_bias": np.radians(degrees)}}
 
 
-def rolling(name: str, options: Mapping[str, Any], gust: Mapping[str, Any] = GUST) -> Condition:
+def make_rolling(
+    name: str, options: Mapping[str, Any], gust: Mapping[str, Any] = GUST
+) -> Condition:
     """A car whose accelerometer feels that it rolls; there is no bound."""
     scenario = MIX | {"roll": True} | dict(gust)
-    return Condition(name, CAMERA, scenario, options, bounded=False, foreseen=False)
+    return Condition(name, CAMERA, scenario, options, bounded=False, modelled=False)
 
 
 FIALA = {"tyres": "fiala", "friction": 0.9}
@@ -102,37 +104,39 @@ CONDITIONS = (
         filters=CAR_FILTERS,
         vehicle="passenger-car",
     ),
-    Condition("camera, gyro 60 ms late", CAMERA, MIX, foreseen=False, gyro_late=LATE),
+    Condition("camera, gyro 60 ms late", CAMERA, MIX, modelled=False, gyro_late=LATE),
     Condition("the same, configured", CAMERA, MIX, {"latency": {"gyro": LATE}}, gyro_late=LATE),
     Condition("the same, found", CAMERA, MIX, FIND, gyro_late=LATE),
     Condition("GPS, gyro 60 ms late, found", GPS, MIX, FIND, gyro_late=LATE),
     Condition("camera, a punctual gyro's found", CAMERA, MIX, FIND),
-    Condition("camera, gyro 0.5 deg/s off", CAMERA, biased(0.5), BIASED),
-    Condition("GPS, gyro 0.5 deg/s off", GPS, biased(0.5), BIASED),
+    Condition("camera, gyro 0.5 deg/s off", CAMERA, make_gyro_bias(0.5), BIASED),
+    Condition("GPS, gyro 0.5 deg/s off", GPS, make_gyro_bias(0.5), BIASED),
     Condition("camera 20, 15, 10, 25 ms late", CAMERA, MIX | UNEVEN),
     Condition("GPS out for 5 s", GPS, MIX | {"gps_outage": (3.0, 8.0)}),
-    Condition("half the disturbances it was told", CAMERA, pushed(0.5), foreseen=False),
-    Condition("twice the disturbances it was told", CAMERA, pushed(2.0), foreseen=False),
-    Condition("half the disturbances, three levels", CAMERA, pushed(0.5), THREE),
-    Condition("twice the disturbances, three levels", CAMERA, pushed(2.0), THREE),
-    Condition("a gust of unknown strength", CAMERA, MIX | GUST, foreseen=False),
-    Condition("the same gust, for a gust", CAMERA, MIX | GUST, GUSTY, foreseen=False),
-    Condition("the same gust, sudden", CAMERA, MIX | GUST, SUDDEN, foreseen=False),
-    Condition("a gust at 4.13 s, sudden", CAMERA, MIX | LATER_GUST, SUDDEN, foreseen=False),
-    rolling("the gust, car that rolls", {}),
-    rolling("the same, accelerometer", INERTIAL),
-    rolling("the same, accelerometer, for a gust", INERTIAL | GUSTY),
-    rolling("no gust, accelerometer, for a gust", INERTIAL | GUSTY, {}),
+    Condition("half the disturbances it was told", CAMERA, scale_disturbances(0.5), modelled=False),
+    Condition(
+        "twice the disturbances it was told", CAMERA, scale_disturbances(2.0), modelled=False
+    ),
+    Condition("half the disturbances, three levels", CAMERA, scale_disturbances(0.5), THREE),
+    Condition("twice the disturbances, three levels", CAMERA, scale_disturbances(2.0), THREE),
+    Condition("a gust of unknown strength", CAMERA, MIX | GUST, modelled=False),
+    Condition("the same gust, for a gust", CAMERA, MIX | GUST, GUSTY, modelled=False),
+    Condition("the same gust, sudden", CAMERA, MIX | GUST, SUDDEN, modelled=False),
+    Condition("a gust at 4.13 s, sudden", CAMERA, MIX | LATER_GUST, SUDDEN, modelled=False),
+    make_rolling("the gust, car that rolls", {}),
+    make_rolling("the same, accelerometer", INERTIAL),
+    make_rolling("the same, accelerometer, for a gust", INERTIAL | GUSTY),
+    make_rolling("no gust, accelerometer, for a gust", INERTIAL | GUSTY, {}),
     Condition("camera, four members", CAMERA, MIX, FOUR),
     Condition("camera, three levels", CAMERA, MIX, THREE),
     Condition("camera, sudden", CAMERA, MIX, SUDDEN),
     Condition("tyres change at 5 s, four members", CAMERA, MIX | CHANGE, FOUR),
     Condition("the same, sudden", CAMERA, MIX | CHANGE, SUDDEN),
     Condition("the same, three levels", CAMERA, MIX | CHANGE, THREE),
-    Condition("the same, one filter", CAMERA, MIX | CHANGE, foreseen=False),
+    Condition("the same, one filter", CAMERA, MIX | CHANGE, modelled=False),
     Condition("from the change on, four members", CAMERA, MIX | CHANGE, FOUR, CHANGED),
     Condition("from the change on, three levels", CAMERA, MIX | CHANGE, THREE, CHANGED),
-    Condition("from the change on, one filter", CAMERA, MIX | CHANGE, {}, CHANGED, foreseen=False),
+    Condition("from the change on, one filter", CAMERA, MIX | CHANGE, {}, CHANGED, modelled=False),
     Condition("tyres change at 5.37 s, four members", CAMERA, MIX | CHANGE | LATER, FOUR),
     Condition("tyres change at 5.37 s, sudden", CAMERA, MIX | CHANGE | LATER, SUDDEN),
     Condition("Fiala tyres, friction 0.9", CAMERA, MIX | FIALA, LIMITED, bounded=False),
@@ -147,48 +151,48 @@ class Curve:
     question: str
     label: str
     values: tuple[float, ...]
-    at: Callable[[float], Condition]
+    make_condition: Callable[[float], Condition]
     log: str = "y"
 
     def conditions(self) -> list[Condition]:
         """The condition at every value."""
-        return [self.at(value) for value in self.values]
+        return [self.make_condition(value) for value in self.values]
 
 
-def _stiff(factor: float) -> Condition:
+def _vary_stiffness(factor: float) -> Condition:
     same = dict.fromkeys(STIFF, factor)
     return Condition(f"both axles {factor:g} of nominal", CAMERA, MIX | same)
 
 
-def _steered(degrees: float) -> Condition:
+def _vary_steering(degrees: float) -> Condition:
     size = {"amplitude": np.radians(degrees), "amplitude_2": 0.6 * np.radians(degrees)}
     return Condition(f"steering of {degrees:g} deg", CAMERA, size)
 
 
-def _late(ms: float) -> Condition:
+def _vary_delay(ms: float) -> Condition:
     late = {"camera_delays": (1e-3 * ms,)}
     return Condition(f"camera {ms:g} ms late", CAMERA, MIX | late)
 
 
-def _slow(period: float) -> Condition:
+def _vary_period(period: float) -> Condition:
     return Condition(f"GPS every {period:g} s", GPS, MIX | {"gps_period": period})
 
 
-def _dark(seconds: float) -> Condition:
+def _vary_outage(seconds: float) -> Condition:
     out = {"gps_outage": (3.0, 3.0 + seconds)} if seconds else {}
     return Condition(f"no GPS for {seconds:g} s", GPS, MIX | out)
 
 
-def _off(degrees: float) -> Condition:
-    return Condition(f"gyro {degrees:g} deg/s off", CAMERA, biased(degrees), BIASED)
+def _vary_bias(degrees: float) -> Condition:
+    return Condition(f"gyro {degrees:g} deg/s off", CAMERA, make_gyro_bias(degrees), BIASED)
 
 
-def _noisy(factor: float) -> Condition:
+def _vary_noise(factor: float) -> Condition:
     """A car that rolls, since its accelerometer feels that: there is no bound."""
     noise = {"roll": True, "noise": {"accel": 0.1 * factor}}
-    own = INERTIAL | {"accel_time": 2.0}
+    options = INERTIAL | {"accel_time": 2.0}
     filters: Filters = {
-        "joint, finds the noise": ("joint", own),
+        "joint, finds the noise": ("joint", options),
         "exact-kf": ("exact-kf", INERTIAL),
         TRUE: ("exact-kf", INERTIAL | {"accel_y_noise": 0.1 * factor}),
     }
@@ -196,28 +200,30 @@ def _noisy(factor: float) -> Condition:
     return Condition(name, CAMERA, MIX | noise, INERTIAL, bounded=False, filters=filters)
 
 
-def _shaken(factor: float) -> Condition:
+def _vary_disturbances(factor: float) -> Condition:
     filters = {"joint, three levels": ("joint", THREE)}
-    return Condition(f"disturbances x {factor:g}", CAMERA, pushed(factor), filters=filters)
+    return Condition(
+        f"disturbances x {factor:g}", CAMERA, scale_disturbances(factor), filters=filters
+    )
 
 
 CURVES = (
     Curve("What do other tyres cost?", "stiffness of both axles / nominal",
-          (0.6, 0.8, 1.0, 1.2, 1.4), _stiff),
+          (0.6, 0.8, 1.0, 1.2, 1.4), _vary_stiffness),
     Curve("How much steering do the tyres need?", "steering amplitude / deg",
-          (0.125, 0.25, 0.5, 1.0, 2.0, 4.0), _steered, "xy"),
+          (0.125, 0.25, 0.5, 1.0, 2.0, 4.0), _vary_steering, "xy"),
     Curve("What does a late camera cost?", "delay of the camera / ms",
-          (0.0, 30.0, 60.0, 100.0, 150.0, 200.0), _late),
+          (0.0, 30.0, 60.0, 100.0, 150.0, 200.0), _vary_delay),
     Curve("What does a slow GPS cost?", "period of the GPS / s",
-          (0.05, 0.1, 0.2, 0.5, 1.0, 2.0), _slow, "xy"),
+          (0.05, 0.1, 0.2, 0.5, 1.0, 2.0), _vary_period, "xy"),
     Curve("What does a GPS that is out cost?", "length of the outage / s",
-          (0.0, 1.0, 2.0, 3.0, 4.0, 6.0), _dark),
+          (0.0, 1.0, 2.0, 3.0, 4.0, 6.0), _vary_outage),
     Curve("What does a gyro's bias cost?", "bias of the gyro / (deg/s)",
-          (0.0, 0.1, 0.2, 0.5, 1.0, 2.0), _off),
+          (0.0, 0.1, 0.2, 0.5, 1.0, 2.0), _vary_bias),
     Curve("What does another noise of the accelerometer cost?",
-          "accelerometer noise / data sheet's", (0.25, 0.5, 1.0, 2.0, 4.0), _noisy, "xy"),
+          "accelerometer noise / data sheet's", (0.25, 0.5, 1.0, 2.0, 4.0), _vary_noise, "xy"),
     Curve("What do other disturbances cost?", "disturbances / those assumed",
-          (0.5, 0.7, 1.0, 1.4, 2.0), _shaken, "xy"),
+          (0.5, 0.7, 1.0, 1.4, 2.0), _vary_disturbances, "xy"),
 )  # fmt: skip
 
 COMPLETE = INERTIAL | LIMITED | BIASED | {"accel_bias_sd": 0.3}
@@ -232,14 +238,14 @@ WITHOUT: dict[str, dict[str, Any]] = {
 """Options over `COMPLETE`: a state is left out or known at the start."""
 
 
-def _parts(name: str, env_id: str, scenario: Mapping[str, Any]) -> Condition:
+def _make_ablation(name: str, env_id: str, scenario: Mapping[str, Any]) -> Condition:
     filters = {label: ("joint", COMPLETE | left) for label, left in WITHOUT.items()}
     return Condition(name, env_id, {"roll": True} | dict(scenario), bounded=False, filters=filters)
 
 
 PARTS = (
-    _parts("camera, car that rolls", CAMERA, MIX),
-    _parts("GPS, car that rolls", GPS, MIX),
-    _parts("gyro 0.5 deg/s off, car that rolls", CAMERA, biased(0.5)),
-    _parts("Fiala tyres, car that rolls", CAMERA, MIX | FIALA),
+    _make_ablation("camera, car that rolls", CAMERA, MIX),
+    _make_ablation("GPS, car that rolls", GPS, MIX),
+    _make_ablation("gyro 0.5 deg/s off, car that rolls", CAMERA, make_gyro_bias(0.5)),
+    _make_ablation("Fiala tyres, car that rolls", CAMERA, MIX | FIALA),
 )

@@ -17,31 +17,31 @@ from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.vehicle.vehicle import Vehicle
 from ...estimators.design.levels import DISTURBANCE, NOISE
 from ...estimators.make import make_estimator
-from ..harness.drives import SETTLED, filter_arguments, quietly
+from ..harness.drives import SETTLED, call_quietly, make_filter_arguments
 from .conditions import CAMERA, LINEAR, MIX
-from .measure import drive_and_bound
+from .measure import run_with_bound
 
 DELAYS = {"camera at once": 0.0, "camera 30 ms late": 0.03}
 STATES = 8  # beta, gamma, psi, y_l, F_d, N_d, and both axles' factors
 
 
-class FilterPy:
+class FilterPyEkf:
     """ekf: FilterPy's filter. dt: s of a tick. speed: m/s, held."""
 
     def __init__(self, vehicle: Vehicle, speed: float, dt: float) -> None:
         self.car, self.V, self.dt = vehicle, speed, dt
         self.ekf: Any = ExtendedKalmanFilter(dim_x=STATES, dim_z=1)
-        force, moment, lasts = DISTURBANCE.values()
+        force, moment, time_constant = DISTURBANCE.values()
         self.ekf.x = np.array([0.0] * 6 + [1.0, 1.0])
         self.ekf.P = np.diag(np.square([0.0, 0.0, 0.0, 0.0, force, moment, 0.23, 0.23]))
-        self.keep = np.exp(-dt / lasts)
-        fresh = (1.0 - self.keep**2) * np.square([force, moment])
-        self.ekf.Q = np.diag([0.0] * 4 + [*fresh] + [0.0, 0.0])
+        self.decay = np.exp(-dt / time_constant)
+        noise_gain = (1.0 - self.decay**2) * np.square([force, moment])
+        self.ekf.Q = np.diag([0.0] * 4 + [*noise_gain] + [0.0, 0.0])
         self.ekf.predict_x = self._predict
         self.rows = np.eye(STATES)
         self.noise = [NOISE[f"{name}_noise"] ** 2 for name in ("gyro", "psi", "y_l")]
 
-    def _slopes(self, steer: float) -> tuple[Array, Array]:
+    def _compute_slopes(self, steer: float) -> tuple[Array, Array]:
         """dx and its Jacobian, without the decay of the disturbances."""
         car, V, (beta, gamma, psi, _, force, moment, front, rear) = self.car, self.V, self.ekf.x
         C_f, C_r = 2.0 * car.front_stiffness, 2.0 * car.rear_stiffness
@@ -66,11 +66,11 @@ class FilterPy:
 
     def _predict(self, u: float) -> None:
         dt = self.dt
-        dx, A = self._slopes(u)
+        dx, A = self._compute_slopes(u)
         self.ekf.F = np.eye(STATES) + dt * A + 0.5 * dt * dt * A @ A
         self.ekf.x = self.ekf.x + dt * dx + 0.5 * dt * dt * A @ dx
-        self.ekf.F[4, 4] = self.ekf.F[5, 5] = self.keep
-        self.ekf.x[4:6] *= self.keep
+        self.ekf.F[4, 4] = self.ekf.F[5, 5] = self.decay
+        self.ekf.x[4:6] *= self.decay
 
     def _update(self, state: int, value: float, r: float) -> None:
         row = self.rows[state : state + 1]
@@ -78,7 +78,7 @@ class FilterPy:
 
     def run(self, log: Log) -> Array:
         """beta at every row."""
-        record, found, came = log.record, np.empty(len(log.record.fast)), 0
+        record, slips, came = log.record, np.empty(len(log.record.fast)), 0
         for k, row in enumerate(record.fast):
             if k > 0:
                 self.ekf.predict(row[FAST.steer])
@@ -89,25 +89,25 @@ class FilterPy:
                 self._update(2, psi, self.noise[1])
                 self._update(3, y_l, self.noise[2])
                 came += 1
-            found[k] = self.ekf.x[0]
-        return found
+            slips[k] = self.ekf.x[0]
+        return slips
 
 
-def race(case: tuple[float, int]) -> Array:
+def compare_filters(case: tuple[float, int]) -> Array:
     """(filters, 2) mean squared error of beta and CPU us a tick, of joint and of FilterPy's, and
     the bound's mean square behind; case: the camera's delay in s, and a seed."""
     delay, seed = case
     env: Any = gym.make(CAMERA, scenario=LINEAR | MIX | {"camera_delays": (delay,)})
-    log, std = drive_and_bound(env, seed)
-    facts = filter_arguments(env.unwrapped)
-    ours = quietly(make_estimator, "joint", **facts)
-    ours.run(log)  # compiled, and its memory warm
-    rival = FilterPy(facts["vehicle"], facts["speed"], facts["dt"])
-    late, found = log.time >= SETTLED - 1e-9, []
-    runs: list[Callable[[], Array]] = [lambda: ours.run(log)["beta"], lambda: rival.run(log)]
+    log, std = run_with_bound(env, seed)
+    facts = make_filter_arguments(env.unwrapped)
+    joint = call_quietly(make_estimator, "joint", **facts)
+    joint.run(log)  # compiled, and its memory warm
+    rival = FilterPyEkf(facts["vehicle"], facts["speed"], facts["dt"])
+    settled, results = log.time >= SETTLED - 1e-9, []
+    runs: list[Callable[[], Array]] = [lambda: joint.run(log)["beta"], lambda: rival.run(log)]
     for run in runs:
         start = time.process_time()
         beta = run()
         us = 1e6 * (time.process_time() - start) / len(beta)
-        found.append([np.mean((beta - log.truth["beta"])[late] ** 2), us])
-    return np.array([*found, [np.mean(std[late] ** 2), np.nan]])
+        results.append([np.mean((beta - log.truth["beta"])[settled] ** 2), us])
+    return np.array([*results, [np.mean(std[settled] ** 2), np.nan]])

@@ -19,38 +19,38 @@ from collections.abc import Callable
 from pathlib import Path
 
 QUIET = "SIDESLIP_QUIET"
-"""The environment variable that keeps `notice` from writing to standard error."""
+"""The environment variable that keeps `report_once` from writing to standard error."""
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 LAYERS = ("envs", "estimators", "agents", "benchmarks")  # each calls only those before it
 _NOT_COMPILED = ("rendering", "highway")
-_DATA = (".toml", ".json")
-_VERSIONS = 12  # of the sources whose kernels stay on disk
+_DATA_SUFFIXES = (".toml", ".json")
+_MAX_VERSIONS = 12  # of the sources whose kernels stay on disk
 
 _logger = logging.getLogger("sideslip.compiler")
-_noticed: set[str] = set()
+_reported: set[str] = set()
 
 
 class UntrustedError(Exception):
     """What somebody else could have written."""
 
 
-def notice(subject: str, text: str, level: int = logging.WARNING) -> None:
+def report_once(subject: str, text: str, level: int = logging.WARNING) -> None:
     """Say something about a subject once in a process.
 
     A line on standard error; a record of the logger `sideslip.compiler` instead where the program
     has set up logging; nothing in worker processes or with SIDESLIP_QUIET set.
     """
-    if subject in _noticed or os.environ.get(QUIET):
+    if subject in _reported or os.environ.get(QUIET):
         return
-    _noticed.add(subject)
+    _reported.add(subject)
     if _logger.hasHandlers():
         _logger.log(level, "sideslip: %s", text)
     elif multiprocessing.parent_process() is None:
         print(f"sideslip: {text}", file=sys.stderr, flush=True)
 
 
-def source_stamp(layer: str = LAYERS[-1]) -> str:
+def hash_sources(layer: str = LAYERS[-1]) -> str:
     """The hash of all source files a layer's kernels may call, which names their folder.
 
     numba watches only the file of the function itself: an edit in a callee's module would
@@ -66,27 +66,27 @@ def source_stamp(layer: str = LAYERS[-1]) -> str:
     return digest.hexdigest()[:16]
 
 
-def experiment_stamp() -> str:
+def hash_experiment() -> str:
     """The hash of all that a drive's numbers depend on but tuned options and weights: the sources
     below the benchmarks, the ids with their options, and the cars and cameras in files."""
-    digest = hashlib.sha256(source_stamp("agents").encode())
-    files = [path for path in (_PACKAGE / "envs").rglob("*.*") if path.suffix in _DATA]
+    digest = hashlib.sha256(hash_sources("agents").encode())
+    files = [path for path in (_PACKAGE / "envs").rglob("*.*") if path.suffix in _DATA_SUFFIXES]
     for path in [_PACKAGE / "__init__.py", *sorted(files)]:
         digest.update(str(path.relative_to(_PACKAGE)).encode() + path.read_bytes())
     return digest.hexdigest()
 
 
 @functools.cache
-def kernel_folder(layer: str = LAYERS[-1]) -> Path | None:
+def find_kernel_folder(layer: str = LAYERS[-1]) -> Path | None:
     """The folder of a layer's kernels, made where it is missing; None where there can be none.
 
     One that can only be read is read. Older versions are pruned.
     """
     try:
-        folder = _base() / source_stamp(layer)
-        _make(folder)
+        folder = _find_cache_folder() / hash_sources(layer)
+        _make_folder(folder)
     except (UntrustedError, OSError) as error:
-        notice("cache", f"compiled kernels are not cached: {error}")
+        report_once("cache", f"compiled kernels are not cached: {error}")
         return None
     with contextlib.suppress(OSError):
         os.utime(folder)
@@ -95,7 +95,7 @@ def kernel_folder(layer: str = LAYERS[-1]) -> Path | None:
     return folder
 
 
-def _base() -> Path:
+def _find_cache_folder() -> Path:
     """The folder of all versions' folders, after the environment's variables.
 
     Raises UntrustedError where it is not absolute: a folder that was downloaded and is worked in
@@ -109,54 +109,54 @@ def _base() -> Path:
     if variable == "HOME":
         folder /= ".cache"
     if folder.is_symlink():  # of the user's own
-        _check(folder, folder.lstat(), stat.S_ISLNK)
+        _check_owner(folder, folder.lstat(), stat.S_ISLNK)
     folder = folder.resolve()
-    _make(folder, sticky=True)
+    _make_folder(folder, sticky=True)
     if variable != "NUMBA_CACHE_DIR":
         for name in ("sideslip", "kernels"):
             folder /= name
-            _make(folder)
+            _make_folder(folder)
     return folder
 
 
-def _make(folder: Path, sticky: bool = False) -> None:
+def _make_folder(folder: Path, sticky: bool = False) -> None:
     """Make a folder for the user alone where it is missing, and its parents.
 
     Raises UntrustedError where others could have made it, or can write in it; OSError where there
     is none. sticky: one where all may write, but none can replace what is another's.
     """
     if not folder.parent.exists():
-        _make(folder.parent)
+        _make_folder(folder.parent)
     with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)
-    os.close(_opened(folder, stat.S_ISDIR, sticky=sticky))
+    os.close(_open_if_trusted(folder, stat.S_ISDIR, sticky=sticky))
 
 
 def _prune(base: Path) -> None:
     with contextlib.suppress(OSError):  # another process may prune as well
         newest = sorted(base.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
-        for old in newest[_VERSIONS:]:
+        for old in newest[_MAX_VERSIONS:]:
             shutil.rmtree(old, ignore_errors=True)
 
 
-def read(path: Path) -> bytes | None:
+def read_trusted(path: Path) -> bytes | None:
     """A cached file's bytes; None where there is none, or one that others could have written."""
     try:
-        folder = _opened(path.parent, stat.S_ISDIR)
+        folder = _open_if_trusted(path.parent, stat.S_ISDIR)
         try:
-            opened = _opened(path, stat.S_ISREG, folder)
+            descriptor = _open_if_trusted(path, stat.S_ISREG, folder)
         finally:
             os.close(folder)
-        with open(opened, "rb") as file:
+        with open(descriptor, "rb") as file:
             return file.read()
     except FileNotFoundError:
         return None
     except (UntrustedError, OSError) as error:
-        notice("kernel", f"a cached kernel is compiled anew: {error}")
+        report_once("kernel", f"a cached kernel is compiled anew: {error}")
         return None
 
 
-def _opened(
+def _open_if_trusted(
     path: Path, kind: Callable[[int], bool], folder: int | None = None, sticky: bool = False
 ) -> int:
     """The descriptor of a folder, or of a file in an open folder, that nobody else can write.
@@ -165,20 +165,20 @@ def _opened(
     """
     flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
-        opened = os.open(path if folder is None else path.name, flags, dir_fd=folder)
+        descriptor = os.open(path if folder is None else path.name, flags, dir_fd=folder)
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise UntrustedError(f"{path} is a link") from None
         raise
     try:
-        _check(path, os.fstat(opened), kind, sticky)
+        _check_owner(path, os.fstat(descriptor), kind, sticky)
     except UntrustedError:
-        os.close(opened)
+        os.close(descriptor)
         raise
-    return opened
+    return descriptor
 
 
-def _check(
+def _check_owner(
     path: Path, status: os.stat_result, kind: Callable[[int], bool], sticky: bool = False
 ) -> None:
     mode, owner = status.st_mode, status.st_uid

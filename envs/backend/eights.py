@@ -7,7 +7,7 @@ functions take the lanes of one place, and `span` says that they go on by one co
 matrix of lanes only what stands on and above the diagonal counts.
 
 The functions are plain Python on NumPy arrays; below them stands what the compiler makes of each.
-Records of such matrices begin on cache lines, which eight numbers fill (`whole_lines`).
+Records of such matrices begin on cache lines, which eight numbers fill (`pad_to_cache_line`).
 """
 
 import math
@@ -21,29 +21,29 @@ from numba.core.imputils import lower_builtin
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.np.arrayobj import make_array, populate_array
 
-from .arrays import place, whole
-from .simd import EIGHT, FLOATS, LANES
+from .arrays import locate_element, make_index_types
+from .simd import FLOATS, FLOATS8, LANES
 
-LINE = 64  # bytes that a cache fetches at once, eight numbers
+LINE_BYTES = 64  # bytes that a cache fetches at once, eight numbers
 
 
-def eight(array: Any, *index: int) -> Any:
+def load8(array: Any, *index: int) -> Any:
     """Eight neighbours of a matrix's row or a vector, the first of them at an index."""
     *row, first = index
     return array[(*row, slice(first, first + 8))].copy()
 
 
-def across(matrix: Any, k: int, j: int) -> Any:
+def load8_symmetric(matrix: Any, k: int, j: int) -> Any:
     """`eight` of a symmetric matrix."""
-    return eight(matrix, k, j)
+    return load8(matrix, k, j)
 
 
-def rows_of(matrix: Any, rows: int, j: int) -> int:
+def count_upper_rows(matrix: Any, rows: int, j: int) -> int:
     """How many of its rows count in the columns from j on."""
     return rows
 
 
-def put_eight(array: Any, values: Any, *index: int) -> None:
+def store8(array: Any, values: Any, *index: int) -> None:
     """Write eight neighbours, or one number in the place of each."""
     *row, first = index
     array[(*row, slice(first, first + 8))] = values
@@ -60,92 +60,92 @@ def prefetch(array: Any, *index: int) -> None:
     """Have the cache line of a number fetched that is soon read; it may lie beyond the array."""
 
 
-def whole_lines(fields: Sequence[Any]) -> np.dtype[Any]:
+def pad_to_cache_line(fields: Sequence[Any]) -> np.dtype[Any]:
     """A structured dtype of these fields, as long as so many whole cache lines."""
-    rest = -np.dtype(list(fields)).itemsize % LINE
+    rest = -np.dtype(list(fields)).itemsize % LINE_BYTES
     return np.dtype([*fields, *([("to_line_end", np.int8, rest)] if rest else [])])
 
 
-def zeros_on_lines(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
+def allocate_aligned(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
     """A record array of zeros whose first record begins on a cache line, as its eights then do."""
     size = math.prod(shape) * dtype.itemsize
-    room = np.zeros(size + LINE, np.int8)
-    first = -room.ctypes.data % LINE
-    return room[first : first + size].view(dtype).reshape(shape).view(np.recarray)
+    buffer = np.zeros(size + LINE_BYTES, np.int8)
+    first = -buffer.ctypes.data % LINE_BYTES
+    return buffer[first : first + size].view(dtype).reshape(shape).view(np.recarray)
 
 
-def span(array: Any) -> int:
+def vector_width(array: Any) -> int:
     """How many columns of a matrix `eight` takes at once; one where they are lanes."""
     return 8
 
 
-def scratch(like: Any, rows: int, columns: int) -> Any:
+def allocate_scratch(template: Any, rows: int, columns: int) -> Any:
     """A matrix to work in, of constant shape and with any numbers in it, until the function ends.
 
-    like: a matrix of the same kind, of numbers or of lanes. Compiled, it lies on the stack.
+    template: a matrix of the same kind, of numbers or of lanes. Compiled, it lies on the stack.
     """
     return np.empty((rows, columns))
 
 
 def _is_row(array, indices):
     """Whether eight neighbours can be read there at once."""
-    return _kind_of(array, indices) is EIGHT
+    return _find_kind(array, indices) is FLOATS8
 
 
-def _kind_of(array, indices):
+def _find_kind(array, indices):
     """What stands at so many indices: eight neighbours, lanes, or None."""
     if not isinstance(array, types.Array) or array.dtype != types.float64 or array.layout != "C":
         return None
-    return {0: EIGHT, 1: FLOATS}.get(array.ndim - indices)
+    return {0: FLOATS8, 1: FLOATS}.get(array.ndim - indices)
 
 
-@infer_global(span)
-class _Span(AbstractTemplate):
+@infer_global(vector_width)
+class _VectorWidth(AbstractTemplate):
     def generic(self, args, kws):
         return signature(types.intp, *args)
 
 
-@lower_builtin(span, types.Array)
-def _lower_span(context, builder, sig, args):
+@lower_builtin(vector_width, types.Array)
+def _lower_vector_width(context, builder, sig, args):
     return context.get_constant(types.intp, 8 if sig.args[0].ndim == 2 else 1)
 
 
-@infer_global(eight)
-class _Eight(AbstractTemplate):
+@infer_global(load8)
+class _Load8(AbstractTemplate):
     def generic(self, args, kws):
         array, *index = args
-        kind = _kind_of(array, len(index))
-        return kind and signature(kind, array, *whole(index))
+        kind = _find_kind(array, len(index))
+        return kind and signature(kind, array, *make_index_types(index))
 
 
-@lower_builtin(eight, types.Array, types.VarArg(types.Any))
-def _lower_eight(context, builder, sig, args):
-    where = place(context, builder, sig.args[0], args[0], args[1:])
-    return builder.load(builder.bitcast(where, sig.return_type.value.as_pointer()), align=8)
+@lower_builtin(load8, types.Array, types.VarArg(types.Any))
+def _lower_load8(context, builder, sig, args):
+    pointer = locate_element(context, builder, sig.args[0], args[0], args[1:])
+    return builder.load(builder.bitcast(pointer, sig.return_type.value.as_pointer()), align=8)
 
 
-@infer_global(across)
-class _Across(_Eight):
+@infer_global(load8_symmetric)
+class _Load8Symmetric(_Load8):
     pass
 
 
-@lower_builtin(across, types.Array, types.Integer, types.Integer)
-def _lower_across(context, builder, sig, args):
+@lower_builtin(load8_symmetric, types.Array, types.Integer, types.Integer)
+def _lower_load8_symmetric(context, builder, sig, args):
     array, k, j = args
     if sig.args[0].ndim == 3:
         above = builder.icmp_signed("<", k, j)
         k, j = builder.select(above, k, j), builder.select(above, j, k)
-    return _lower_eight(context, builder, sig, [array, k, j])
+    return _lower_load8(context, builder, sig, [array, k, j])
 
 
-@infer_global(rows_of)
-class _RowsOf(AbstractTemplate):
+@infer_global(count_upper_rows)
+class _CountUpperRows(AbstractTemplate):
     def generic(self, args, kws):
-        return signature(types.intp, args[0], *whole(args[1:]))
+        return signature(types.intp, args[0], *make_index_types(args[1:]))
 
 
-@lower_builtin(rows_of, types.Array, types.Integer, types.Integer)
-def _lower_rows_of(context, builder, sig, args):
+@lower_builtin(count_upper_rows, types.Array, types.Integer, types.Integer)
+def _lower_count_upper_rows(context, builder, sig, args):
     _, rows, j = args
     if sig.args[0].ndim == 2:
         return rows
@@ -153,19 +153,19 @@ def _lower_rows_of(context, builder, sig, args):
     return builder.select(builder.icmp_signed("<", below, rows), below, rows)
 
 
-@infer_global(put_eight)
-class _PutEight(AbstractTemplate):
+@infer_global(store8)
+class _Store8(AbstractTemplate):
     def generic(self, args, kws):
         array, _, *index = args
-        kind = _kind_of(array, len(index))
-        return kind and signature(types.none, array, kind, *whole(index))
+        kind = _find_kind(array, len(index))
+        return kind and signature(types.none, array, kind, *make_index_types(index))
 
 
-@lower_builtin(put_eight, types.Array, EIGHT, types.VarArg(types.Any))
-@lower_builtin(put_eight, types.Array, FLOATS, types.VarArg(types.Any))
-def _lower_put_eight(context, builder, sig, args):
-    where = place(context, builder, sig.args[0], args[0], args[2:])
-    builder.store(args[1], builder.bitcast(where, sig.args[1].value.as_pointer()), align=8)
+@lower_builtin(store8, types.Array, FLOATS8, types.VarArg(types.Any))
+@lower_builtin(store8, types.Array, FLOATS, types.VarArg(types.Any))
+def _lower_store8(context, builder, sig, args):
+    pointer = locate_element(context, builder, sig.args[0], args[0], args[2:])
+    builder.store(args[1], builder.bitcast(pointer, sig.args[1].value.as_pointer()), align=8)
     return context.get_dummy_value()
 
 
@@ -173,7 +173,7 @@ def _lower_put_eight(context, builder, sig, args):
 class _Mirror(AbstractTemplate):
     def generic(self, args, kws):
         array, *index = args
-        return _kind_of(array, 2) and signature(types.none, array, *whole(index))
+        return _find_kind(array, 2) and signature(types.none, array, *make_index_types(index))
 
 
 @lower_builtin(mirror, types.Array, types.intp, types.intp)
@@ -182,26 +182,26 @@ def _lower_mirror(context, builder, sig, args):
     if sig.args[0].ndim == 3:
         return context.get_dummy_value()
 
-    def row(first, k, column):
+    def locate_row(first, k, column):
         at_k = builder.add(first, context.get_constant(types.intp, k))
-        where = place(context, builder, sig.args[0], array, [at_k, column])
-        return builder.bitcast(where, EIGHT.value.as_pointer())
+        pointer = locate_element(context, builder, sig.args[0], array, [at_k, column])
+        return builder.bitcast(pointer, FLOATS8.value.as_pointer())
 
-    def mixed(x, y, places):
+    def shuffle(x, y, places):
         indices = ir.Constant(ir.VectorType(ir.IntType(32), 8), places)
         return builder.shuffle_vector(x, y, indices)
 
-    above = [builder.load(row(i, k, j), align=8) for k in range(8)]
-    turned = list(above)
+    above = [builder.load(locate_row(i, k, j), align=8) for k in range(8)]
+    transposed = list(above)
     for s in (1, 2, 4):  # blocks of s by s change places across the diagonal of those of 2 s
         for k in (k for k in range(8) if not k & s):
-            x, y = turned[k], turned[k + s]
-            turned[k] = mixed(x, y, [m + 8 - s if m & s else m for m in range(8)])
-            turned[k + s] = mixed(x, y, [m + 8 if m & s else m + s for m in range(8)])
+            x, y = transposed[k], transposed[k + s]
+            transposed[k] = shuffle(x, y, [m + 8 - s if m & s else m for m in range(8)])
+            transposed[k + s] = shuffle(x, y, [m + 8 if m & s else m + s for m in range(8)])
     diagonal = builder.icmp_signed("==", i, j)
     for k in range(8):
-        lower = mixed(turned[k], above[k], [m if m < k else m + 8 for m in range(8)])
-        builder.store(builder.select(diagonal, lower, turned[k]), row(j, k, i), align=8)
+        lower = shuffle(transposed[k], above[k], [m if m < k else m + 8 for m in range(8)])
+        builder.store(builder.select(diagonal, lower, transposed[k]), locate_row(j, k, i), align=8)
     return context.get_dummy_value()
 
 
@@ -209,7 +209,11 @@ def _lower_mirror(context, builder, sig, args):
 class _Prefetch(AbstractTemplate):
     def generic(self, args, kws):
         array, *index = args
-        return signature(types.none, array, *whole(index)) if _is_row(array, len(index)) else None
+        return (
+            signature(types.none, array, *make_index_types(index))
+            if _is_row(array, len(index))
+            else None
+        )
 
 
 @lower_builtin(prefetch, types.Array, types.VarArg(types.Any))
@@ -217,34 +221,34 @@ def _lower_prefetch(context, builder, sig, args):
     byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
     kind = ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag])
     function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-    where = place(context, builder, sig.args[0], args[0], args[1:])
-    flags = [ir.Constant(flag, each) for each in (1, 3, 1)]  # to be written, to all caches, data
-    builder.call(function, [builder.bitcast(where, byte), *flags])
+    pointer = locate_element(context, builder, sig.args[0], args[0], args[1:])
+    flags = [ir.Constant(flag, value) for value in (1, 3, 1)]  # to be written, to all caches, data
+    builder.call(function, [builder.bitcast(pointer, byte), *flags])
     return context.get_dummy_value()
 
 
-@infer_global(scratch)
-class _Scratch(AbstractTemplate):
+@infer_global(allocate_scratch)
+class _AllocateScratch(AbstractTemplate):
     prefer_literal = True
 
     def generic(self, args, kws):
         like, *shape = args
-        if not all(isinstance(each, types.IntegerLiteral) for each in shape):
+        if not all(isinstance(size, types.IntegerLiteral) for size in shape):
             return None
         return signature(types.Array(types.float64, like.ndim, "C"), *args)
 
 
-@lower_builtin(scratch, types.Array, types.IntegerLiteral, types.IntegerLiteral)
-def _lower_scratch(context, builder, sig, args):
-    rows, columns = (each.literal_value for each in sig.args[1:])
+@lower_builtin(allocate_scratch, types.Array, types.IntegerLiteral, types.IntegerLiteral)
+def _lower_allocate_scratch(context, builder, sig, args):
+    rows, columns = (item.literal_value for item in sig.args[1:])
     shape = [rows, columns] if sig.args[0].ndim == 2 else [rows, columns, LANES]
     with builder.goto_entry_block():  # numba's own way fills it with zeros first
-        where = builder.alloca(ir.ArrayType(ir.DoubleType(), math.prod(shape)))
-    where.align = 64
+        pointer = builder.alloca(ir.ArrayType(ir.DoubleType(), math.prod(shape)))
+    pointer.align = 64
     made = make_array(sig.return_type)(context, builder)
     strides = [8 * math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
-    size = [context.get_constant(types.intp, each) for each in (*shape, *strides, 8)]
-    data = builder.bitcast(where, ir.DoubleType().as_pointer())
+    size = [context.get_constant(types.intp, item) for item in (*shape, *strides, 8)]
+    data = builder.bitcast(pointer, ir.DoubleType().as_pointer())
     axes = len(shape)
     populate_array(made, data, size[:axes], size[axes:-1], size[-1], None)
     return made._getvalue()

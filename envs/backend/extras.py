@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def extra(name: str, needs: str) -> Iterator[None]:
+def require_extra(name: str, needs: str) -> Iterator[None]:
     """Around imports: ModuleNotFoundError for a missing package names the extra to install.
 
     needs: what needs what, "pictures need pygame"; {} stands for the missing module's name.

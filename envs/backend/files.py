@@ -12,7 +12,7 @@ _OPEN = ("/dev/std", "/dev/fd/", "/proc/")  # what a process has open, by name
 
 
 @contextlib.contextmanager
-def whole(path: Path | str) -> Iterator[io.BufferedWriter]:
+def atomic_file(path: Path | str) -> Iterator[io.BufferedWriter]:
     """A binary file to write, which takes the place of `path` at the end, or none does on an error.
 
     Whoever is killed meanwhile leaves an older file as it was. Links are followed, an older file's
@@ -26,7 +26,7 @@ def whole(path: Path | str) -> Iterator[io.BufferedWriter]:
         with open(path, "ab") as file:
             yield file
         return
-    with replaced(Path(os.path.realpath(path))) as file:
+    with replace_file(Path(os.path.realpath(path))) as file:
         yield file
         if old:
             with contextlib.suppress(PermissionError):
@@ -35,7 +35,7 @@ def whole(path: Path | str) -> Iterator[io.BufferedWriter]:
 
 
 @contextlib.contextmanager
-def replaced(path: Path, mode: int = 0o666) -> Iterator[io.BufferedWriter]:
+def replace_file(path: Path, mode: int = 0o666) -> Iterator[io.BufferedWriter]:
     """The same for a plain file or a link, which is replaced itself; `mode` as the umask has it."""
     part = path.with_name(f".{path.name[:200]}.{uuid.uuid4().hex}.part")
     try:
@@ -48,7 +48,7 @@ def replaced(path: Path, mode: int = 0o666) -> Iterator[io.BufferedWriter]:
         part.unlink(missing_ok=True)
 
 
-def write_whole(path: Path | str, content: bytes) -> None:
+def write_atomic(path: Path | str, content: bytes) -> None:
     """Write a file or nothing."""
-    with whole(path) as file:
+    with atomic_file(path) as file:
         file.write(content)

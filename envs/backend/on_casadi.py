@@ -1,13 +1,13 @@
-"""The plant's own text on CasADi's symbols: `envs.backend.plain` with CasADi's primitives."""
+"""The plant's own text on CasADi's symbols: `envs.backend.as_python` with CasADi's primitives."""
 
 import types
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from .decorators import plain
-from .extras import extra
+from .decorators import as_python
+from .extras import require_extra
 
-with extra("mpc", "the plant on symbols needs CasADi"):
+with require_extra("mpc", "the plant on symbols needs CasADi"):
     import casadi as ca
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -20,7 +20,7 @@ SYMBOLS: dict[str, Callable[..., Any]] = {
     "sqrt": ca.sqrt,
     "select": ca.if_else,
     "to_float": lambda a: a * 1.0,
-    "anywhere": lambda condition: isinstance(condition, ca.SX | ca.MX) or condition,
+    "any_lane": lambda condition: isinstance(condition, ca.SX | ca.MX) or condition,
 }
 """The primitives for CasADi's SX and MX, by the names the equations use."""
 
@@ -31,16 +31,16 @@ _ELEMENTARY: dict[str, Callable[..., Any]] = {
 }
 """CasADi's own in place of our polynomials: they agree to 1e-15 and have short derivatives."""
 
-_OURS = __name__.rpartition(".envs")[0]
+_PACKAGE = __name__.rpartition(".envs")[0]
 
 
-def symbolic(function: F) -> F:
+def to_casadi(function: F) -> F:
     """The same text for CasADi expressions.
 
     Conditions may be compared and selected, but not joined by `&` or `|`, which CasADi's
     expressions lack; such a text raises TypeError when it is called.
     """
-    rebuilt = plain(function, SYMBOLS)
+    rebuilt = as_python(function, SYMBOLS)
     _replace(rebuilt, set())
     return rebuilt
 
@@ -55,7 +55,7 @@ def _replace(function: Any, done: set[int]) -> None:
             names[name] = _ELEMENTARY[name]
         elif (
             isinstance(callee, types.FunctionType)
-            and callee.__module__.startswith(_OURS)
+            and callee.__module__.startswith(_PACKAGE)
             and id(callee) not in done
         ):
             _replace(callee, done)

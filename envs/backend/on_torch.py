@@ -1,7 +1,7 @@
 """Tensors for the equations' text: torch's table of primitives.
 
-`plain(function, numbers(torch.float64))` is the plant's own text on tensors with a vehicle in each
-place. Both sides of a condition are computed, so nothing ever waits for the device.
+`as_python(function, numbers(torch.float64))` is the plant's own text on tensors with a vehicle in
+each place. Both sides of a condition are computed, so nothing ever waits for the device.
 """
 
 import math
@@ -9,16 +9,16 @@ from collections.abc import Callable
 from types import FunctionType, MethodType
 from typing import Any
 
-from .decorators import plain
-from .extras import extra
+from .decorators import as_python
+from .extras import require_extra
 
-with extra("train", "the device engine needs torch"):
+with require_extra("train", "the device engine needs torch"):
     import torch as torch  # for the other modules of the device engine
 
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
-def numbers(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
+def make_torch_primitives(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
     """The primitives for tensors whose floats are of `dtype`, by the names the equations use.
 
     Numbers that are no tensors are computed as Python's. What is not a number is treated as by the
@@ -43,8 +43,8 @@ def numbers(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
             (torch.int64, 52, 1022) if a.dtype == torch.float64 else (torch.int32, 23, 126)
         )
         bits, ones = a.view(integer), (1 << digits) - 1
-        half = (bits & ones) | (bias << digits)
-        m = half.view(a.dtype)
+        mantissa_bits = (bits & ones) | (bias << digits)
+        m = mantissa_bits.view(a.dtype)
         return torch.where(a < 0.0, -m, m), to_float(((bits >> digits) & (2 * bias + 3)) - bias)
 
     def sqrt(a: Any) -> Any:
@@ -52,11 +52,11 @@ def numbers(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
             return math.sqrt(a)
         if not a.requires_grad:
             return torch.sqrt(a)
-        none = a == 0.0  # where the slope is infinite, and 0 times it no number: here it is 0
-        return torch.where(none, 0.0, torch.sqrt(torch.where(none, 1.0, a)))
+        is_zero = a == 0.0  # where the slope is infinite, and 0 times it no number: here it is 0
+        return torch.where(is_zero, 0.0, torch.sqrt(torch.where(is_zero, 1.0, a)))
 
-    def read(array: Any, where: Any) -> Any:
-        return getattr(where, "_make", tuple)(array[where[0] : where[-1] + 1].unbind(0))
+    def read(array: Any, indices: Any) -> Any:
+        return getattr(indices, "_make", tuple)(array[indices[0] : indices[-1] + 1].unbind(0))
 
     return {
         "minimum": lambda a, b: select(a < b, a, b),
@@ -67,33 +67,33 @@ def numbers(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
         "select": select,
         "to_float": to_float,
         "frexp": frexp,
-        "whole": lambda a: a.to(torch.int64) if isinstance(a, torch.Tensor) else int(a),
-        "anywhere": lambda condition: isinstance(condition, torch.Tensor) or condition,
+        "to_int": lambda a: a.to(torch.int64) if isinstance(a, torch.Tensor) else int(a),
+        "any_lane": lambda condition: isinstance(condition, torch.Tensor) or condition,
         "read": read,
-        "at": lambda array, *index: array[index],
+        "load_element": lambda array, *index: array[index],
     }
 
 
-def on_tensors(dtype: torch.dtype, *functions: Callable[..., Any]) -> list[Any]:
+def to_torch(dtype: torch.dtype, *functions: Callable[..., Any]) -> list[Any]:
     """The functions' text on tensors whose floats are of `dtype`."""
-    table = numbers(dtype)
-    return [plain(function, table) for function in functions]
+    table = make_torch_primitives(dtype)
+    return [as_python(function, table) for function in functions]
 
 
-def compiled(function: Any) -> Any:
+def compile_method(function: Any) -> Any:
     """The bound method by `torch.compile`, whole.
 
     torch inlines what is short wherever it is used, and so again in that; where each of a chain's
     results is used several times, as in the logarithm's shifts, it would compile for an hour.
     What torch has compiled it counts by code object, and refuses a ninth: each env has its own.
     """
-    owner, text = function.__self__, function.__func__
-    own = FunctionType(
-        text.__code__.replace(),
-        text.__globals__,
-        text.__name__,
-        text.__defaults__,
-        text.__closure__,
+    owner, source = function.__self__, function.__func__
+    function_copy = FunctionType(
+        source.__code__.replace(),
+        source.__globals__,
+        source.__name__,
+        source.__defaults__,
+        source.__closure__,
     )
-    whole = MethodType(own, owner)
-    return torch.compile(whole, fullgraph=True, options={"realize_opcount_threshold": 16})
+    method_copy = MethodType(function_copy, owner)
+    return torch.compile(method_copy, fullgraph=True, options={"realize_opcount_threshold": 16})

@@ -16,7 +16,7 @@ from numba.core import cgutils, types
 from numba.core.imputils import lower_builtin
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 
-from .simd import BOOLS, FLOATS, INTS, LANES, Lanes, compare, meet
+from .simd import BOOLS, FLOATS, INTS, LANES, LaneType, compare, find_common_type
 
 
 def minimum(a: Any, b: Any) -> Any:
@@ -60,12 +60,12 @@ def frexp(a: Any) -> Any:
     return m, e * 1.0
 
 
-def whole(a: Any) -> Any:
+def to_int(a: Any) -> Any:
     """A whole number that is a float, as an integer."""
     return int(a)
 
 
-def word(a: Any) -> Any:
+def to_word(a: Any) -> Any:
     """The 32-bit word that a float stands for: its value; where floats have 32 bits, its bits."""
     return int(a)
 
@@ -75,7 +75,7 @@ def from_word(a: Any) -> Any:
     return a * 1.0
 
 
-def anywhere(condition: Any) -> Any:
+def any_lane(condition: Any) -> Any:
     """Whether a condition holds for any of the cars that are computed together."""
     return condition
 
@@ -89,21 +89,21 @@ ARRAYS: dict[str, Callable[..., Any]] = {
     "select": np.where,
     "to_float": lambda a: np.multiply(a, 1.0),
     "frexp": lambda a: np.multiply(np.frexp(a), 1.0),
-    "whole": lambda a: np.asarray(a).astype(np.int64),
-    "anywhere": np.any,
+    "to_int": lambda a: np.asarray(a).astype(np.int64),
+    "any_lane": np.any,
 }
 """The primitives for NumPy arrays, by the names the equations use."""
 
-_ABREAST = {types.float64: FLOATS, types.int64: INTS, types.boolean: BOOLS}
+_LANE_TYPES = {types.float64: FLOATS, types.int64: INTS, types.boolean: BOOLS}
 
 
-def _teach(
+def _register_primitive(
     primitive: Callable[..., Any], typing: Callable[..., Any], code: Callable[..., Any]
 ) -> None:
     """typing: from the arguments' types to a signature or None. code: of (builder, sig, args)."""
 
     @infer_global(primitive)
-    class _Typing(AbstractTemplate):
+    class _PrimitiveTyping(AbstractTemplate):
         def generic(self, args, kws):
             return typing(*args)
 
@@ -113,57 +113,57 @@ def _teach(
     lower_builtin(primitive, *[types.Any] * primitive.__code__.co_argcount)(lower)
 
 
-def _of_two(a, b):
-    kind = meet((a, b))
+def _infer_binary(a, b):
+    kind = find_common_type((a, b))
     return kind and signature(kind, kind, kind)
 
 
-def _of_float(a):
-    kind = meet((a,))
+def _infer_float(a):
+    kind = find_common_type((a,))
     if kind is None:
         return None
-    kind = FLOATS if isinstance(kind, Lanes) else types.float64
+    kind = FLOATS if isinstance(kind, LaneType) else types.float64
     return signature(kind, kind)
 
 
-def _of_fraction(a):
-    found = _of_float(a)
-    return found and signature(types.UniTuple(found.return_type, 2), *found.args)
+def _infer_frexp(a):
+    unary = _infer_float(a)
+    return unary and signature(types.UniTuple(unary.return_type, 2), *unary.args)
 
 
-def _of_choice(condition, a, b):
-    kind, asked = meet((a, b)), BOOLS if condition is BOOLS else types.boolean
-    if kind is None or not isinstance(condition, types.Boolean | Lanes):
+def _infer_select(condition, a, b):
+    kind, condition_type = find_common_type((a, b)), BOOLS if condition is BOOLS else types.boolean
+    if kind is None or not isinstance(condition, types.Boolean | LaneType):
         return None
-    if asked is BOOLS:
-        kind = _ABREAST.get(kind, kind)
-    return signature(kind, asked, kind, kind)
+    if condition_type is BOOLS:
+        kind = _LANE_TYPES.get(kind, kind)
+    return signature(kind, condition_type, kind, kind)
 
 
-def _converted(to: types.Type, to_lanes: Lanes) -> Callable[..., Any]:
+def _make_conversion(to: types.Type, to_lanes: LaneType) -> Callable[..., Any]:
     def typing(a):
-        kind = meet((a,))
-        lanes = isinstance(kind, Lanes)
+        kind = find_common_type((a,))
+        lanes = isinstance(kind, LaneType)
         return kind and signature(to_lanes if lanes else to, kind)
 
     return typing
 
 
-def _machine(name: str) -> Callable[..., Any]:
+def _make_intrinsic(name: str) -> Callable[..., Any]:
     """LLVM's own function of a float or of lanes of them."""
 
     def code(builder, sig, args):
-        of = args[0].type
-        suffix = f"v{LANES}f64" if isinstance(of, ir.VectorType) else "f64"
+        operand_type = args[0].type
+        suffix = f"v{LANES}f64" if isinstance(operand_type, ir.VectorType) else "f64"
         function = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(of, [of]), f"llvm.{name}.{suffix}"
+            builder.module, ir.FunctionType(operand_type, [operand_type]), f"llvm.{name}.{suffix}"
         )
         return builder.call(function, args)
 
     return code
 
 
-def _chosen(sign: str) -> Callable[..., Any]:
+def _make_selection(sign: str) -> Callable[..., Any]:
     """The first of two where it stands so to the second, else the second."""
     codes = compare(sign)
 
@@ -174,56 +174,58 @@ def _chosen(sign: str) -> Callable[..., Any]:
     return code
 
 
-def _as_float(builder, sig, args):
+def _lower_to_float(builder, sig, args):
     if sig.args[0] in (FLOATS, types.float64):
         return args[0]
     to = FLOATS.value if sig.return_type is FLOATS else ir.DoubleType()
     return builder.sitofp(args[0], to)
 
 
-def _as_whole(builder, sig, args):
+def _lower_to_int(builder, sig, args):
     if sig.args[0] in (INTS, types.int64):
         return args[0]
     to = INTS.value if sig.return_type is INTS else ir.IntType(64)
     return builder.fptosi(args[0], to)
 
 
-def _fraction(builder, sig, args):
+def _lower_frexp(builder, sig, args):
     """The bits of a normal number's fraction under the exponent of 0.5, and its own as a float."""
-    kind, of = sig.args[0], args[0].type
+    kind, operand_type = sig.args[0], args[0].type
     ints = INTS.value if kind is FLOATS else ir.IntType(64)
 
-    def constant(value):
+    def make_constant(value):
         return ir.Constant(ints, [value] * LANES if kind is FLOATS else value)
 
     bits = builder.bitcast(args[0], ints)
-    fraction = builder.or_(builder.and_(bits, constant((1 << 52) - 1)), constant(1022 << 52))
-    exponent = builder.sub(builder.lshr(bits, constant(52)), constant(1022))
+    fraction = builder.or_(
+        builder.and_(bits, make_constant((1 << 52) - 1)), make_constant(1022 << 52)
+    )
+    exponent = builder.sub(builder.lshr(bits, make_constant(52)), make_constant(1022))
     return cgutils.pack_array(
-        builder, [builder.bitcast(fraction, of), builder.sitofp(exponent, of)]
+        builder, [builder.bitcast(fraction, operand_type), builder.sitofp(exponent, operand_type)]
     )
 
 
-def _any(builder, sig, args):
+def _lower_any_lane(builder, sig, args):
     if sig.args[0] is not BOOLS:
         return args[0]
     bits = builder.bitcast(args[0], ir.IntType(LANES))
     return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
 
-_teach(minimum, _of_two, _chosen("<"))
-_teach(maximum, _of_two, _chosen(">"))
-_teach(absolute, _of_float, _machine("fabs"))
-_teach(floor, _of_float, _machine("floor"))
-_teach(sqrt, _of_float, _machine("sqrt"))
-_teach(select, _of_choice, lambda builder, sig, args: builder.select(*args))
-_teach(to_float, _converted(types.float64, FLOATS), _as_float)
-_teach(frexp, _of_fraction, _fraction)
-_teach(whole, _converted(types.int64, INTS), _as_whole)
-_teach(word, _converted(types.int64, INTS), _as_whole)
-_teach(from_word, _converted(types.float64, FLOATS), _as_float)
-_teach(
-    anywhere,
+_register_primitive(minimum, _infer_binary, _make_selection("<"))
+_register_primitive(maximum, _infer_binary, _make_selection(">"))
+_register_primitive(absolute, _infer_float, _make_intrinsic("fabs"))
+_register_primitive(floor, _infer_float, _make_intrinsic("floor"))
+_register_primitive(sqrt, _infer_float, _make_intrinsic("sqrt"))
+_register_primitive(select, _infer_select, lambda builder, sig, args: builder.select(*args))
+_register_primitive(to_float, _make_conversion(types.float64, FLOATS), _lower_to_float)
+_register_primitive(frexp, _infer_frexp, _lower_frexp)
+_register_primitive(to_int, _make_conversion(types.int64, INTS), _lower_to_int)
+_register_primitive(to_word, _make_conversion(types.int64, INTS), _lower_to_int)
+_register_primitive(from_word, _make_conversion(types.float64, FLOATS), _lower_to_float)
+_register_primitive(
+    any_lane,
     lambda a: signature(types.boolean, BOOLS if a is BOOLS else types.boolean),
-    _any,
+    _lower_any_lane,
 )

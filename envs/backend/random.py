@@ -57,7 +57,7 @@ def philox(key_low: int, key_high: int, a: int, b: int, c: int = 0, d: int = 0) 
 
 
 @jit
-def uniform(word: int) -> Any:
+def to_uniform(word: int) -> Any:
     """A number in (0, 1) from a 32-bit word; never 0, never 1."""
     return (to_float(word) + 0.5) / _2_32
 
@@ -79,7 +79,7 @@ def _log_uniform(word: int) -> Any:
 
 
 @jit
-def _normal_pair(first: int, second: int) -> Any:
+def _draw_normal_pair(first: int, second: int) -> Any:
     """Two standard normal numbers from two words (Box and Muller)."""
     radius = sqrt(maximum(-2.0 * _log_uniform(first), 0.0))  # below 0 by rounding in float32 alone
     turn = second + (1 << 29)  # the quarter turns are the two leading bits, exactly
@@ -90,16 +90,16 @@ def _normal_pair(first: int, second: int) -> Any:
 
 
 @jit
-def normals(key_low: int, key_high: int, tick: int, block: int) -> Any:
+def draw_normals(key_low: int, key_high: int, tick: int, block: int) -> Any:
     """Four independent standard normal numbers of a block at a tick."""
     a, b, c, d = philox(key_low, key_high, tick, block)
-    n0, n1 = _normal_pair(a, b)
-    n2, n3 = _normal_pair(c, d)
+    n0, n1 = _draw_normal_pair(a, b)
+    n2, n3 = _draw_normal_pair(c, d)
     return n0, n1, n2, n3
 
 
 @jit
-def uniforms(key_low: int, key_high: int, tick: int, block: int, index: int = 0) -> Any:
+def draw_uniforms(key_low: int, key_high: int, tick: int, block: int, index: int = 0) -> Any:
     """Four independent numbers, uniform in (0, 1), of a block at a tick."""
     a, b, c, d = philox(key_low, key_high, tick, block, index)
-    return uniform(a), uniform(b), uniform(c), uniform(d)
+    return to_uniform(a), to_uniform(b), to_uniform(c), to_uniform(d)

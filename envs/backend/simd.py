@@ -9,7 +9,7 @@ the number alone would have, however many they are. With AVX-512 there are sixte
 while one waits for a result the other is computed, a third faster than eight. Elsewhere there are
 eight: sixteen would be four registers of sixteen, and most numbers would go through memory.
 
-Eight neighbours of a matrix's row are a type of their own, `EIGHT`: with it the sums of one
+Eight neighbours of a matrix's row are a type of their own, `FLOATS8`: with it the sums of one
 filter's small matrices are taken for eight columns at once, in the order of each column alone.
 """
 
@@ -31,7 +31,7 @@ LANES = 16 if "+avx512f" in _FEATURES else 8
 _DOUBLE, _LONG, _BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
 
 
-class Lanes(types.Type):
+class LaneType(types.Type):
     """As many of a kind: "float", "int" or "bool"."""
 
     def __init__(
@@ -50,28 +50,30 @@ class Lanes(types.Type):
         return self if isinstance(other, self._taken) else None
 
 
-FLOATS = Lanes("float", _DOUBLE, types.float64, (types.Number, types.Boolean))
-INTS = Lanes("int", _LONG, types.int64, (types.Integer,))
-BOOLS = Lanes("bool", _BIT, types.boolean, (types.Boolean,))
-EIGHT = Lanes("eight", _DOUBLE, types.float64, (types.Number, types.Boolean), 8)
+FLOATS = LaneType("float", _DOUBLE, types.float64, (types.Number, types.Boolean))
+INTS = LaneType("int", _LONG, types.int64, (types.Integer,))
+BOOLS = LaneType("bool", _BIT, types.boolean, (types.Boolean,))
+FLOATS8 = LaneType("eight", _DOUBLE, types.float64, (types.Number, types.Boolean), 8)
 
 
-@register_model(Lanes)
+@register_model(LaneType)
 class _Model(models.PrimitiveModel):
-    def __init__(self, dmm: Any, fe_type: Lanes) -> None:
+    def __init__(self, dmm: Any, fe_type: LaneType) -> None:
         super().__init__(dmm, fe_type, fe_type.value)
 
 
-def splat(builder: Any, value: Any, of: Lanes) -> Any:
+def splat(builder: Any, value: Any, lane_type: LaneType) -> Any:
     """Lanes that are all equal to a machine value."""
-    none = ir.Constant(of.value, ir.Undefined)
-    one = builder.insert_element(none, value, ir.Constant(_LONG, 0))
-    zeros = ir.Constant(ir.VectorType(ir.IntType(32), of.value.count), [0] * of.value.count)
-    return builder.shuffle_vector(one, none, zeros)
+    undefined = ir.Constant(lane_type.value, ir.Undefined)
+    one = builder.insert_element(undefined, value, ir.Constant(_LONG, 0))
+    zeros = ir.Constant(
+        ir.VectorType(ir.IntType(32), lane_type.value.count), [0] * lane_type.value.count
+    )
+    return builder.shuffle_vector(one, undefined, zeros)
 
 
 @lower_cast(types.Number, FLOATS)
-@lower_cast(types.Number, EIGHT)
+@lower_cast(types.Number, FLOATS8)
 @lower_cast(types.Boolean, FLOATS)
 @lower_cast(types.Integer, INTS)
 @lower_cast(types.Boolean, BOOLS)
@@ -79,28 +81,30 @@ def _from_number(context, builder, fromty, toty, value):
     return splat(builder, context.cast(builder, value, fromty, toty.single), toty)
 
 
-def meet(args: tuple[Any, ...]) -> Any:
+def find_common_type(args: tuple[Any, ...]) -> Any:
     """The kind that numbers and lanes meet in, single if none of them is lanes; None for others."""
-    if not all(isinstance(each, Lanes | types.Number | types.Boolean) for each in args):
+    if not all(isinstance(arg, LaneType | types.Number | types.Boolean) for arg in args):
         return None
-    if EIGHT in args:
-        return EIGHT
-    floats = any(each is FLOATS or isinstance(each, types.Float) for each in args)
-    ints = any(each is INTS or isinstance(each, types.Integer) for each in args)
+    if FLOATS8 in args:
+        return FLOATS8
+    floats = any(arg is FLOATS or isinstance(arg, types.Float) for arg in args)
+    ints = any(arg is INTS or isinstance(arg, types.Integer) for arg in args)
     kind = FLOATS if floats else INTS if ints else BOOLS
-    return kind if any(isinstance(each, Lanes) for each in args) else kind.single
+    return kind if any(isinstance(arg, LaneType) for arg in args) else kind.single
 
 
-def _operator(op: Callable[..., Any], codes: dict[Lanes, Any], gives: Lanes | None = None) -> None:
+def _register_operator(
+    op: Callable[..., Any], codes: dict[LaneType, Any], result: LaneType | None = None
+) -> None:
     """Teach the compiler `op` for two lanes of each kind in `codes`."""
 
     @infer_global(op)
-    class _Typing(AbstractTemplate):
+    class _OperatorTyping(AbstractTemplate):
         def generic(self, args, kws):
-            kind = meet(args)
+            kind = find_common_type(args)
             if len(args) != 2 or kind not in codes:
                 return None
-            return signature(gives or kind, kind, kind)
+            return signature(result or kind, kind, kind)
 
     for kind, code in codes.items():
 
@@ -110,7 +114,7 @@ def _operator(op: Callable[..., Any], codes: dict[Lanes, Any], gives: Lanes | No
         lower_builtin(op, kind, kind)(lower)
 
 
-def compare(sign: str) -> dict[Lanes, Any]:
+def compare(sign: str) -> dict[LaneType, Any]:
     """The codes of a comparison; one with NaN is false, but `!=` is true."""
 
     def floats(builder, x, y):
@@ -120,8 +124,10 @@ def compare(sign: str) -> dict[Lanes, Any]:
     return {FLOATS: floats, INTS: lambda builder, x, y: builder.icmp_signed(sign, x, y)}
 
 
-def _of(floats: str | None, ints: str | None = None, bools: str | None = None) -> dict[Lanes, Any]:
-    names = {FLOATS: floats, EIGHT: floats, INTS: ints, BOOLS: bools}
+def _make_codes(
+    floats: str | None, ints: str | None = None, bools: str | None = None
+) -> dict[LaneType, Any]:
+    names = {FLOATS: floats, FLOATS8: floats, INTS: ints, BOOLS: bools}
     return {
         kind: lambda builder, x, y, name=name: getattr(builder, name)(x, y)
         for kind, name in names.items()
@@ -129,17 +135,17 @@ def _of(floats: str | None, ints: str | None = None, bools: str | None = None) -
     }
 
 
-_operator(operator.add, _of("fadd", "add"))
-_operator(operator.sub, _of("fsub", "sub"))
-_operator(operator.mul, _of("fmul", "mul"))
-_operator(operator.truediv, _of("fdiv"))
-_operator(operator.and_, _of(None, "and_", "and_"))
-_operator(operator.or_, _of(None, "or_", "or_"))
-_operator(operator.xor, _of(None, "xor", "xor"))
-_operator(operator.lshift, _of(None, "shl"))
-_operator(operator.rshift, _of(None, "ashr"))
+_register_operator(operator.add, _make_codes("fadd", "add"))
+_register_operator(operator.sub, _make_codes("fsub", "sub"))
+_register_operator(operator.mul, _make_codes("fmul", "mul"))
+_register_operator(operator.truediv, _make_codes("fdiv"))
+_register_operator(operator.and_, _make_codes(None, "and_", "and_"))
+_register_operator(operator.or_, _make_codes(None, "or_", "or_"))
+_register_operator(operator.xor, _make_codes(None, "xor", "xor"))
+_register_operator(operator.lshift, _make_codes(None, "shl"))
+_register_operator(operator.rshift, _make_codes(None, "ashr"))
 for _op, _sign in (
     (operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">="),
     (operator.eq, "=="), (operator.ne, "!="),
 ):  # fmt: skip
-    _operator(_op, compare(_sign), gives=BOOLS)
+    _register_operator(_op, compare(_sign), result=BOOLS)

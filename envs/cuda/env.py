@@ -10,22 +10,39 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ..arguments import actions_of, brief, count_of, mask_of, mode_of, named, options_of, seeds_of
+from ..arguments import (
+    check_int,
+    format_rows,
+    parse_actions,
+    parse_autoreset_mode,
+    parse_reset_mask,
+    parse_seeds,
+    short_repr,
+    split_options,
+)
 from ..backend.on_torch import torch
 from ..engine.layout import Z
 from ..engine.packing import EpisodeConfig
-from ..engine.step import kind_in
+from ..engine.step import get_start_variant
 from ..vector import StabilityVectorEnv
-from .generator import WORDS, words_of
-from .kernel import ASKED, RUNS, How, Memory, how_of, packed_starts, specification
-from .launch import kernel_on
-from .tensors import check_arguments, device_of, dtype_of, infos_in
+from .generator import WORDS, read_words
+from .kernel import (
+    ASKED,
+    RUNS,
+    DeviceArrays,
+    KernelConstants,
+    make_constants,
+    make_specification,
+    pack_starts,
+)
+from .launch import load_kernel
+from .tensors import check_arguments, parse_device, parse_dtype, read_infos
 from .text import SIMULATED
 
 Tensor = torch.Tensor
 Infos = dict[str, Any]
 
-_FRESH = ("actions", "rewards", "terminated", "truncated", "final_obs", "final_reports")
+_NEW_ARRAYS = ("actions", "rewards", "terminated", "truncated", "final_obs", "final_reports")
 """What is new in every step; all else stays where it is."""
 _TORCH = {np.uint8: torch.uint8, np.int64: torch.int64, np.float32: torch.float32}
 
@@ -34,10 +51,10 @@ class Snapshot(NamedTuple):
     """All that the rows of a `CudaVectorEnv` go on from."""
 
     num_envs: int
-    how: How
+    constants: KernelConstants
     dtype: torch.dtype
     started: bool
-    memory: Memory
+    memory: DeviceArrays
 
 
 class CudaVectorEnv(VectorEnv[Any, Any, Any]):
@@ -79,86 +96,86 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
         **arguments: Any,
     ) -> None:
         check_arguments(arguments)
-        self.num_envs = N = count_of("num_envs", num_envs, "environments")
-        self._mode = mode_of(autoreset_mode)
-        self.device, self.dtype = device_of(device), dtype_of(dtype)
+        self.num_envs = N = check_int("num_envs", num_envs, "environments")
+        self._mode = parse_autoreset_mode(autoreset_mode)
+        self.device, self.dtype = parse_device(device), parse_dtype(dtype)
         if (self.device.type == "cpu") != SIMULATED:
             runs = "in numba's simulator on 'cpu'" if SIMULATED else "on a CUDA device"
             raise ValueError(f"engine='cuda' runs {runs}, got {str(device)!r}")
-        one = StabilityVectorEnv(1, **arguments)
-        self.layout, self.control_period = one.layout, one.control_period
-        self.reference, self._config = one.reference, one.config
-        self.metadata = {**one.metadata, "autoreset_mode": self._mode}
-        self.single_observation_space = one.single_observation_space
-        self.single_action_space = one.single_action_space
+        template = StabilityVectorEnv(1, **arguments)
+        self.layout, self.control_period = template.layout, template.control_period
+        self.reference, self._config = template.reference, template.config
+        self.metadata = {**template.metadata, "autoreset_mode": self._mode}
+        self.single_observation_space = template.single_observation_space
+        self.single_action_space = template.single_action_space
         self.observation_space = batch_space(self.single_observation_space, N)
         self.action_space = batch_space(self.single_action_space, N)
-        self._how = how_of(self._config, self._mode.value, record)
+        self._constants = make_constants(self._config, self._mode.value, record)
         self._real = np.float64 if self.dtype == torch.float64 else np.float32
-        sizes = specification(self._how, self._real, N, 1)
+        sizes = make_specification(self._constants, self._real, N, 1)
         if not SIMULATED:
             check_memory(sizes, N, self.device)
-        self._kernel = kernel_on(self._how, self._real, self.device)
-        self._memory = Memory(*(self._made(*each) for each in sizes))
+        self._kernel = load_kernel(self._constants, self._real, self.device)
+        self._memory = DeviceArrays(*(self._allocate(*spec) for spec in sizes))
         words = np.random.default_rng().integers(0, 2**32, (WORDS, N))
         words[WORDS // 2] |= 1  # PCG64's increment is odd
         self._memory.generators.copy_(torch.as_tensor(words))
         self._memory.bounds.copy_(torch.as_tensor(self._config.bounds))
         self._started = False
 
-    def _made(self, kind: Any, shape: tuple[int, ...]) -> Tensor:
+    def _allocate(self, kind: Any, shape: tuple[int, ...]) -> Tensor:
         return torch.zeros(shape, dtype=_TORCH.get(kind, self.dtype), device=self.device)
 
     def reset(
         self, *, seed: Any = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Tensor, Infos]:
         """Start episodes; seeds, options and errors are those of `StabilityVectorEnv`."""
-        N, rest = self.num_envs, dict(options or {})
-        mask = rest.pop("reset_mask", None)
-        mask = mask_of(mask.cpu().numpy() if isinstance(mask, torch.Tensor) else mask, N)
-        seeds = seeds_of(seed, N)
+        N, remaining = self.num_envs, dict(options or {})
+        mask = remaining.pop("reset_mask", None)
+        mask = parse_reset_mask(mask.cpu().numpy() if isinstance(mask, torch.Tensor) else mask, N)
+        seeds = parse_seeds(seed, N)
         if not (self._started or mask.all()):
             raise ResetNeeded("reset all rows first: a reset_mask leaves out some of them")
-        configs, which = self._with_options(rest, mask)
-        seeded = [i for i in np.flatnonzero(mask).tolist() if seeds[i] is not None]
-        words = words_of([seeding.np_random(seeds[i])[0] for i in seeded])
-        self._memory.generators[:, seeded] = torch.as_tensor(words, device=self.device)
-        packed, switches = packed_starts([config.start for config in configs])
+        configs, start_index = self._make_configs(remaining, mask)
+        seeded_rows = [i for i in np.flatnonzero(mask).tolist() if seeds[i] is not None]
+        words = read_words([seeding.np_random(seeds[i])[0] for i in seeded_rows])
+        self._memory.generators[:, seeded_rows] = torch.as_tensor(words, device=self.device)
+        packed, switches = pack_starts([config.start for config in configs])
         self._memory = self._memory._replace(
-            which=torch.as_tensor(which, device=self.device),
+            which=torch.as_tensor(start_index, device=self.device),
             starts=torch.as_tensor(packed).to(self.device, self.dtype),
             switches=torch.as_tensor(switches, device=self.device),
         )
         self._memory.over[torch.as_tensor(mask, device=self.device)] = ASKED
         self._kernel(N, True, self._memory)
         self._started = True
-        return self._memory.obs.clone(), infos_in(self._memory.reports.clone())
+        return self._memory.obs.clone(), read_infos(self._memory.reports.clone())
 
-    def _with_options(
+    def _make_configs(
         self, options: Mapping[str, Any], mask: Any
     ) -> tuple[Sequence[EpisodeConfig], Any]:
         """The starts' configs, that without options first, and the place of each row's.
 
         Raises ValueError for a plant of another kind.
         """
-        configs, which = [self._config.base], np.zeros(self.num_envs, np.int64)
+        configs, start_index = [self._config.base], np.zeros(self.num_envs, np.int64)
         known: dict[tuple[Any, ...], int] = {}
-        for i, own in enumerate(options_of(options, self.num_envs) if options else ()):
-            key = (*own, *map(id, own.values()))
-            if own and mask[i]:
+        for i, row_options in enumerate(split_options(options, self.num_envs) if options else ()):
+            key = (*row_options, *map(id, row_options.values()))
+            if row_options and mask[i]:
                 if key not in known:
                     known[key] = len(configs)
-                    configs.append(self._config.with_options(own))
-                which[i] = known[key]
+                    configs.append(self._config.apply_options(row_options))
+                start_index[i] = known[key]
         for config in configs[1:]:
-            kind, width = kind_in(config.start), len(config.start.params)
-            if kind != self._how.kind or width != self._how.width:
+            kind, width = get_start_variant(config.start), len(config.start.params)
+            if kind != self._constants.kind or width != self._constants.width:
                 raise ValueError(
-                    f"on a device all rows have one kind of plant, {self._how.kind} with "
-                    f"{self._how.width} parameters; scenario {config.scenario.name!r} has {kind} "
-                    f"with {width}"
+                    f"on a device all rows have one kind of plant, {self._constants.kind} with "
+                    f"{self._constants.width} parameters; scenario {config.scenario.name!r} "
+                    f"has {kind} with {width}"
                 )
-        return configs, which
+        return configs, start_index
 
     def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Infos]:
         """Hold each row's action for one control period."""
@@ -167,25 +184,25 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
         memory = self._memory
         if self._mode == AutoresetMode.DISABLED and (memory.over != RUNS).any():
             raise ResetNeeded(
-                f"the episode is over in {named(memory.over.nonzero()[:, 0].tolist())}: "
+                f"the episode is over in {format_rows(memory.over.nonzero()[:, 0].tolist())}: "
                 "call reset() with a reset_mask"
             )
-        sizes = specification(self._how, self._real, self.num_envs, 1)
-        fresh = {name: self._made(*getattr(sizes, name)) for name in _FRESH[1:]}
-        self._memory = memory = memory._replace(actions=self._taken(actions), **fresh)
+        sizes = make_specification(self._constants, self._real, self.num_envs, 1)
+        new_arrays = {name: self._allocate(*getattr(sizes, name)) for name in _NEW_ARRAYS[1:]}
+        self._memory = memory = memory._replace(actions=self._parse_actions(actions), **new_arrays)
         self._kernel(self.num_envs, False, memory)
         ends = memory.terminated.view(torch.bool), memory.truncated.view(torch.bool)
-        infos = infos_in(memory.reports.clone())
+        infos = read_infos(memory.reports.clone())
         if self._mode == AutoresetMode.SAME_STEP:
-            infos |= {"final_obs": memory.final_obs, "final_info": infos_in(memory.final_reports)}
+            infos |= {"final_obs": memory.final_obs, "final_info": read_infos(memory.final_reports)}
             infos |= {f"_{key}": ends[0] | ends[1] for key in ("final_obs", "final_info")}
         return memory.obs.clone(), memory.rewards, *ends, infos
 
-    def _taken(self, actions: Any) -> Tensor:
+    def _parse_actions(self, actions: Any) -> Tensor:
         """Actions (N, width) as float32 on the device, checked."""
-        N, width, fail = self.num_envs, self._how.inputs, self._config.on_bad_action == "fail"
+        N, width, fail = self.num_envs, self._constants.inputs, self._config.on_bad_action == "fail"
         if not isinstance(actions, torch.Tensor):
-            actions = torch.as_tensor(actions_of(actions, N, width, fail)).to(self.device)
+            actions = torch.as_tensor(parse_actions(actions, N, width, fail)).to(self.device)
         if actions.device != self.device:
             raise ValueError(
                 f"actions are on {actions.device}, the env on {self.device}; nothing was stepped"
@@ -197,39 +214,39 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
                     "nothing was stepped"
                 )
             actions = torch.full((N, width), torch.nan, device=self.device)
-        taken: Tensor = actions.detach().to(torch.float32).contiguous()
+        commands: Tensor = actions.detach().to(torch.float32).contiguous()
         if not fail:
-            bad = ~torch.isfinite(taken).all(1) & (self._memory.over == RUNS)
+            bad = ~torch.isfinite(commands).all(1) & (self._memory.over == RUNS)
             if bad.any():  # here the host waits
                 rows = bad.nonzero()[:, 0].tolist()
                 raise ValueError(
-                    f"the action of {named(rows)} is not finite, {taken[rows[0]].tolist()}; "
-                    "nothing was stepped"
+                    f"the action of {format_rows(rows)} is not finite, "
+                    f"{commands[rows[0]].tolist()}; nothing was stepped"
                 )
-        return taken
+        return commands
 
     @property
     def rows(self) -> Tensor:
         """The fast rows of the newest record, (N, n, FAST_WIDTH); ValueError without `record`."""
-        return self._recorded(self._memory.rows).permute(2, 0, 1)
+        return self._get_record(self._memory.rows).permute(2, 0, 1)
 
     @property
     def packets(self) -> Tensor:
         """The packets of the newest record, (N, most, PACKET_WIDTH)."""
-        return self._recorded(self._memory.packets).permute(2, 0, 1)
+        return self._get_record(self._memory.packets).permute(2, 0, 1)
 
     @property
     def ticks_done(self) -> Tensor:
         """How many of `rows` are there, (N,)."""
-        return self._recorded(self._memory.counts)[0]
+        return self._get_record(self._memory.counts)[0]
 
     @property
     def delivered(self) -> Tensor:
         """How many of `packets` are there, (N,)."""
-        return self._recorded(self._memory.counts)[1]
+        return self._get_record(self._memory.counts)[1]
 
-    def _recorded(self, part: Tensor) -> Tensor:
-        if not self._how.record:
+    def _get_record(self, part: Tensor) -> Tensor:
+        if not self._constants.record:
             raise ValueError("there is no record: build the env with record=True")
         return part
 
@@ -247,8 +264,8 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
 
     def get_state(self) -> Snapshot:
         """A snapshot of all rows, on the device."""
-        memory = Memory(*(each.clone() for each in self._memory))
-        return Snapshot(self.num_envs, self._how, self.dtype, self._started, memory)
+        memory = DeviceArrays(*(array.clone() for array in self._memory))
+        return Snapshot(self.num_envs, self._constants, self.dtype, self._started, memory)
 
     def set_state(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot of this env, or of one built with the same arguments.
@@ -256,25 +273,27 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
         Raises ValueError for one of other rows, another dtype, plant, sensors or records.
         """
         if not isinstance(snapshot, Snapshot):
-            raise ValueError(f"a snapshot of this engine is a Snapshot, got {brief(snapshot)}")
-        theirs, ours = snapshot[:3], (self.num_envs, self._how, self.dtype)
-        if theirs != ours:
-            raise ValueError(f"the snapshot is of other rows, {theirs}, not {ours}")
-        self._memory = Memory(*(each.to(self.device, copy=True) for each in snapshot.memory))
+            raise ValueError(f"a snapshot of this engine is a Snapshot, got {short_repr(snapshot)}")
+        snapshot_facts, own_facts = snapshot[:3], (self.num_envs, self._constants, self.dtype)
+        if snapshot_facts != own_facts:
+            raise ValueError(f"the snapshot is of other rows, {snapshot_facts}, not {own_facts}")
+        self._memory = DeviceArrays(
+            *(array.to(self.device, copy=True) for array in snapshot.memory)
+        )
         self._started = snapshot.started
 
 
-def bytes_of(sizes: Memory) -> int:
+def count_bytes(sizes: DeviceArrays) -> int:
     """What an env needs of the device's memory: its own, and the results of three steps."""
     return sum(
-        math.prod(shape) * np.dtype(kind).itemsize * (3 if name in (*_FRESH, "obs") else 1)
+        math.prod(shape) * np.dtype(kind).itemsize * (3 if name in (*_NEW_ARRAYS, "obs") else 1)
         for name, (kind, shape) in sizes._asdict().items()
     )
 
 
-def check_memory(sizes: Memory, count: int, device: torch.device) -> None:
+def check_memory(sizes: DeviceArrays, count: int, device: torch.device) -> None:
     """MemoryError where these rows do not fit on the device."""
-    needed, free = bytes_of(sizes), torch.cuda.mem_get_info(device)[0]
+    needed, free = count_bytes(sizes), torch.cuda.mem_get_info(device)[0]
     if needed > free:
         row = -(-needed // count)
         raise MemoryError(

@@ -16,16 +16,16 @@ _MASK = 0xFFFFFFFF
 _M0, _M1, _M2, _M3 = 0x9FCCF645, 0x4385DF64, 0x1FC65DA4, 0x2360ED05
 
 
-def next_key(words: Any) -> Any:
+def draw_key(words: Any) -> Any:
     """The generator's next 64 bits as (low, high) of 32; its words (WORDS,) move on."""
     a, b, c, d = int(words[0]), int(words[1]), int(words[2]), int(words[3])
     aa, ab, ba = a * _M0, a * _M1, b * _M0
     ac, bb, ca = a * _M2, b * _M1, c * _M0
     low = (aa & _MASK) + int(words[4])
-    second = (low >> 32) + _high(aa) + (ab & _MASK) + (ba & _MASK) + int(words[5])
-    third = (second >> 32) + _high(ab) + _high(ba) + int(words[6])
+    second = (low >> 32) + _extract_high(aa) + (ab & _MASK) + (ba & _MASK) + int(words[5])
+    third = (second >> 32) + _extract_high(ab) + _extract_high(ba) + int(words[6])
     third = third + (ac & _MASK) + (bb & _MASK) + (ca & _MASK)
-    top = (third >> 32) + _high(ac) + _high(bb) + _high(ca) + int(words[7])
+    top = (third >> 32) + _extract_high(ac) + _extract_high(bb) + _extract_high(ca) + int(words[7])
     top = top + a * _M3 + b * _M2 + c * _M1 + d * _M0  # what is above its 32 bits is lost
     a, b, c, d = low & _MASK, second & _MASK, third & _MASK, top & _MASK
     words[0], words[1], words[2], words[3] = a, b, c, d
@@ -37,11 +37,11 @@ def next_key(words: Any) -> Any:
     return first, ((high >> turn) | (low << (32 - turn))) & _MASK
 
 
-def _high(product: int) -> int:
+def _extract_high(product: int) -> int:
     return (product >> 32) & _MASK
 
 
-def words_of(generators: Sequence[np.random.Generator]) -> npt.NDArray[np.int64]:
+def read_words(generators: Sequence[np.random.Generator]) -> npt.NDArray[np.int64]:
     """The words (WORDS, N) of generators as they are now."""
     words = np.empty((WORDS, len(generators)), np.int64)
     for i, generator in enumerate(generators):

@@ -14,21 +14,21 @@ import numpy.typing as npt
 from numba import cuda, types
 from numba.cuda.np.numpy_support import carray
 
-from ..backend.decorators import copied
-from ..engine.arrays import Row, Start
-from ..engine.batch import ends_of
+from ..backend.decorators import copy_into
+from ..engine.arrays import EpisodeArrays, EpisodeStart
+from ..engine.batch import read_ends
 from ..engine.config import EnvConfig
 from ..engine.layout import FLAGS, STATE_WIDTH, Switches
 from ..engine.reset import reset_vehicle
-from ..engine.step import conclude, drive_on, kind_in, refuse, shares_of
-from ..engine.tick import Kind
-from ..engine.window import foresee, window_of
+from ..engine.step import clip_action, finish_step, get_start_variant, integrate_step, reject_action
+from ..engine.tick import StepVariant
+from ..engine.window import make_window, precompute_window
 from ..record import FAST_WIDTH, PACKET_WIDTH, Array
 from ..scenarios.draws import DRAWS_WIDTH
 from ..task.info import REPORT
 from ..vehicle.dynamics import Motion
-from .generator import WORDS, next_key
-from .text import SIMULATED, on_device
+from .generator import WORDS, draw_key
+from .text import SIMULATED, to_cuda
 
 NAME = "sideslip_step"
 """The kernel's name in its PTX."""
@@ -39,12 +39,12 @@ _, NEXT_STEP, SAME_STEP = range(3)
 DRAWN = DRAWS_WIDTH, DRAWS_WIDTH, len(Motion._fields)  # of a packed start, behind the parameters
 
 
-class How(NamedTuple):
+class KernelConstants(NamedTuple):
     """What is the same for all rows and all steps: the compiler takes it for constants."""
 
     mode: int  # when rows that ended are reset
     n: int  # ticks of a control period
-    kind: Kind
+    kind: StepVariant
     switches: Switches
     width: int  # of the packed parameters, a trace included
     entries: int  # of an observation
@@ -53,30 +53,30 @@ class How(NamedTuple):
     record: int  # whether records are written to the device's memory
 
 
-def how_of(config: EnvConfig, mode: str, record: bool) -> How:
+def make_constants(config: EnvConfig, mode: str, record: bool) -> KernelConstants:
     """How an env's rows are stepped."""
     base = config.base
-    return How(
+    return KernelConstants(
         mode=MODES.index(mode),
         n=int(config.control_period),
-        kind=kind_in(base.start),
+        kind=get_start_variant(base.start),
         switches=Switches(*base.start.switches.tolist()),
         width=len(base.start.params),
         entries=len(config.layout),
         inputs=config.action_width,
-        packets=config.most_packets,
+        packets=config.max_packets,
         record=int(record),
     )
 
 
-class Memory(NamedTuple):
-    """What lies on the device, N rows; `specification` has types and shapes."""
+class DeviceArrays(NamedTuple):
+    """What lies on the device, N rows; `make_specification` has types and shapes."""
 
     params: Any
     states: Any
     reports: Any
     over: Any  # RUNS, OVER or ASKED
-    generators: Any  # `generator.next_key`
+    generators: Any  # `generator.draw_key`
     which: Any  # of a row that is asked for, its place in starts
     starts: Any  # packed one behind the other: parameters, low, high, motion; the first: no options
     switches: Any  # of the starts
@@ -93,7 +93,7 @@ class Memory(NamedTuple):
     counts: Any  # of ticks and of packets
 
 
-class Local(NamedTuple):
+class ThreadArrays(NamedTuple):
     """A thread's own working arrays, or its part of the record."""
 
     switches: Any
@@ -102,12 +102,12 @@ class Local(NamedTuple):
     packets: Any
 
 
-def specification(how: How, real: type, N: int, starts: int) -> Memory:
+def make_specification(constants: KernelConstants, real: type, N: int, starts: int) -> DeviceArrays:
     """(type, shape) of each array."""
-    width, byte, report = how.width + sum(DRAWN), np.uint8, len(REPORT)
-    ends, kept = N * (how.mode == SAME_STEP), N * how.record
-    return Memory(
-        params=(real, (how.width, N)),
+    width, byte, report = constants.width + sum(DRAWN), np.uint8, len(REPORT)
+    ends, n_record = N * (constants.mode == SAME_STEP), N * constants.record
+    return DeviceArrays(
+        params=(real, (constants.width, N)),
         states=(real, (STATE_WIDTH, N)),
         reports=(real, (report, N)),
         over=(byte, (N,)),
@@ -115,108 +115,134 @@ def specification(how: How, real: type, N: int, starts: int) -> Memory:
         which=(np.int64, (N,)),
         starts=(real, (starts, width)),
         switches=(np.int64, (starts, len(FLAGS))),
-        bounds=(real, (2, how.entries)),
-        actions=(np.float32, (N, how.inputs)),
-        obs=(np.float32, (N, how.entries)),
+        bounds=(real, (2, constants.entries)),
+        actions=(np.float32, (N, constants.inputs)),
+        obs=(np.float32, (N, constants.entries)),
         rewards=(real, (N,)),
         terminated=(byte, (N,)),
         truncated=(byte, (N,)),
-        final_obs=(np.float32, (ends, how.entries)),
+        final_obs=(np.float32, (ends, constants.entries)),
         final_reports=(real, (report, ends)),
-        rows=(real, (how.n, FAST_WIDTH, kept)),
-        packets=(real, (how.packets, PACKET_WIDTH, kept)),
-        counts=(np.int64, (2, kept)),
+        rows=(real, (constants.n, FAST_WIDTH, n_record)),
+        packets=(real, (constants.packets, PACKET_WIDTH, n_record)),
+        counts=(np.int64, (2, n_record)),
     )
 
 
-def packed_starts(starts: Sequence[Start]) -> tuple[Array, npt.NDArray[np.int64]]:
+def pack_starts(starts: Sequence[EpisodeStart]) -> tuple[Array, npt.NDArray[np.int64]]:
     """`Memory.starts` and `Memory.switches`."""
-    packed = [np.concatenate([each.params, each.low, each.high, each.motion]) for each in starts]
-    return np.stack(packed), np.stack([each.switches for each in starts])
+    packed = [
+        np.concatenate([start.params, start.low, start.high, start.motion]) for start in starts
+    ]
+    return np.stack(packed), np.stack([start.switches for start in starts])
 
 
-def step_row(i: int, resets: bool, how: How, m: Memory, local: Local) -> None:
+def step_row(
+    i: int, resets: bool, constants: KernelConstants, m: DeviceArrays, thread_arrays: ThreadArrays
+) -> None:
     """One env-step of row i; or its reset, if `resets` and it is ASKED."""
-    row = Row(
+    row = EpisodeArrays(
         m.params[:, i],
         m.states[:, i],
-        local.switches,
+        thread_arrays.switches,
         m.obs[i],
-        local.rows,
-        local.packets,
+        thread_arrays.rows,
+        thread_arrays.packets,
         m.reports[:, i],
     )
-    which, over = 0, int(m.over[i])
+    start_index, over = 0, int(m.over[i])
     if resets:
         if over != ASKED:
             return
-        which = int(m.which[i])
+        start_index = int(m.which[i])
     elif over != RUNS:
         m.rewards[i], m.terminated[i], m.truncated[i] = 0.0, 0, 0
-        if how.mode != NEXT_STEP:
+        if constants.mode != NEXT_STEP:
             return
     else:
-        copied(how.switches, local.switches)
-        done = _driven(row, m.actions[i], how, m.bounds, local.window)
-        reward, terminated, truncated = ends_of(row.report)
+        copy_into(constants.switches, thread_arrays.switches)
+        done = _run_row(row, m.actions[i], constants, m.bounds, thread_arrays.window)
+        reward, terminated, truncated = read_ends(row.report)
         m.rewards[i], m.terminated[i], m.truncated[i] = reward, int(terminated), int(truncated)
-        _count(i, how, m, done, row.report)
+        _count(i, constants, m, done, row.report)
         if not (terminated or truncated):
             return
-        if how.mode != SAME_STEP:
+        if constants.mode != SAME_STEP:
             m.over[i] = OVER
             return
-        copied(row.obs, m.final_obs[i])
-        copied(row.report, m.final_reports[:, i])
-    _restart(which, row, m.generators[:, i], how, m)
+        copy_into(row.obs, m.final_obs[i])
+        copy_into(row.report, m.final_reports[:, i])
+    _reset_row(start_index, row, m.generators[:, i], constants, m)
     m.over[i] = RUNS
-    _count(i, how, m, 1, row.report)
+    _count(i, constants, m, 1, row.report)
 
 
-def _driven(row: Any, action: Any, how: How, bounds: Any, window: Any) -> int:
+def _run_row(row: Any, action: Any, constants: KernelConstants, bounds: Any, window: Any) -> int:
     """An env-step of a row that runs; returns how many ticks it took."""
-    share, turn = shares_of(action)
-    if share != share:
-        refuse(row)
-        for k in range(how.entries):
+    yaw_share, steer_share = clip_action(action)
+    if yaw_share != yaw_share:
+        reject_action(row)
+        for k in range(constants.entries):
             row.obs[k] = 0.0
         return 0
-    foresee(row.p, row.z, how.n, how.kind.follows, window)
-    done = drive_on(row.p, row.z, how.kind, share, turn, how.n, row.rows, row.report, window, True)
-    conclude(row, how.n, done, bounds, window)
+    precompute_window(row.p, row.z, constants.n, constants.kind.has_driver, window)
+    done = integrate_step(
+        row.p,
+        row.z,
+        constants.kind,
+        yaw_share,
+        steer_share,
+        constants.n,
+        row.rows,
+        row.report,
+        window,
+        True,
+    )
+    finish_step(row, constants.n, done, bounds, window)
     return int(done)
 
 
-def _restart(which: int, row: Any, generator: Any, how: How, m: Memory) -> None:
+def _reset_row(
+    start_index: int, row: Any, generator: Any, constants: KernelConstants, m: DeviceArrays
+) -> None:
     """Start a row's next episode, with the next key of its generator."""
-    packed, low = m.starts[which], how.width
+    packed, low = m.starts[start_index], constants.width
     high = low + DRAWN[0]
     motion = high + DRAWN[1]
-    start = Start(
-        packed[:low], packed[low:high], packed[high:motion], m.switches[which], packed[motion:]
+    start = EpisodeStart(
+        packed[:low],
+        packed[low:high],
+        packed[high:motion],
+        m.switches[start_index],
+        packed[motion:],
     )
-    key_low, key_high = next_key(generator)
+    key_low, key_high = draw_key(generator)
     reset_vehicle(start, key_low, key_high, m.bounds, row)
 
 
-def _count(i: int, how: How, m: Memory, done: int, report: Any) -> None:
-    if how.record:
+def _count(i: int, constants: KernelConstants, m: DeviceArrays, done: int, report: Any) -> None:
+    if constants.record:
         m.counts[0, i], m.counts[1, i] = done, int(report[REPORT.packets])
 
 
-def kernel_of(how: How, real: type[np.floating[Any]]) -> Any:
+def make_kernel(constants: KernelConstants, real: type[np.floating[Any]]) -> Any:
     """The kernel's function, for numba-cuda or its simulator; arguments are N, whether rows are
     reset, and the pointers of `Memory`."""
-    step, shaped = on_device(step_row, real), _held if SIMULATED else carray
+    step, make_array = to_cuda(step_row, real), _get_numbers if SIMULATED else carray
     floats = types.float32 if real is np.float32 else types.float64
-    width, entries, inputs, report = how.width, how.entries, how.inputs, len(REPORT)
-    packed, flags, record = how.width + sum(DRAWN), len(FLAGS), how.record
-    window_shape = (len(window_of(1)), how.n)
-    rows_shape, packets_shape = (how.n, FAST_WIDTH), (how.packets, PACKET_WIDTH)
-    n, ticks, most, columns = how.n, FAST_WIDTH, how.packets, PACKET_WIDTH
-    alone_rows, alone_packets = (*rows_shape, 1), (*packets_shape, 1)
+    width, entries, inputs, report = (
+        constants.width,
+        constants.entries,
+        constants.inputs,
+        len(REPORT),
+    )
+    packed, flags, record = constants.width + sum(DRAWN), len(FLAGS), constants.record
+    window_shape = (len(make_window(1)), constants.n)
+    rows_shape, packets_shape = (constants.n, FAST_WIDTH), (constants.packets, PACKET_WIDTH)
+    n, ticks, max_packets, columns = constants.n, FAST_WIDTH, constants.packets, PACKET_WIDTH
+    thread_rows_shape, thread_packets_shape = (*rows_shape, 1), (*packets_shape, 1)
 
-    def fused(
+    def step_kernel(
         N, resets, params, states, reports, over, generators, which, starts, switches, bounds,
         actions, obs, rewards, terminated, truncated, final_obs, final_reports, rows, packets,
         counts,
@@ -224,43 +250,43 @@ def kernel_of(how: How, real: type[np.floating[Any]]) -> Any:
         i = cuda.grid(1)
         if i >= N:
             return
-        memory = Memory(
-            shaped(params, (width, N)),
-            shaped(states, (STATE_WIDTH, N)),
-            shaped(reports, (report, N)),
-            shaped(over, (N,)),
-            shaped(generators, (WORDS, N)),
-            shaped(which, (N,)),
-            shaped(starts, (N, packed)),
-            shaped(switches, (N, flags)),
-            shaped(bounds, (2, entries)),
-            shaped(actions, (N, inputs)),
-            shaped(obs, (N, entries)),
-            shaped(rewards, (N,)),
-            shaped(terminated, (N,)),
-            shaped(truncated, (N,)),
-            shaped(final_obs, (N, entries)),
-            shaped(final_reports, (report, N)),
-            shaped(rows, (n, ticks, N)),
-            shaped(packets, (most, columns, N)),
-            shaped(counts, (2, N)),
+        memory = DeviceArrays(
+            make_array(params, (width, N)),
+            make_array(states, (STATE_WIDTH, N)),
+            make_array(reports, (report, N)),
+            make_array(over, (N,)),
+            make_array(generators, (WORDS, N)),
+            make_array(which, (N,)),
+            make_array(starts, (N, packed)),
+            make_array(switches, (N, flags)),
+            make_array(bounds, (2, entries)),
+            make_array(actions, (N, inputs)),
+            make_array(obs, (N, entries)),
+            make_array(rewards, (N,)),
+            make_array(terminated, (N,)),
+            make_array(truncated, (N,)),
+            make_array(final_obs, (N, entries)),
+            make_array(final_reports, (report, N)),
+            make_array(rows, (n, ticks, N)),
+            make_array(packets, (max_packets, columns, N)),
+            make_array(counts, (2, N)),
         )
         if record:
             own_rows, own_packets = memory.rows[:, :, i], memory.packets[:, :, i]
         else:  # laid out like a part of the record, for one type of both
-            own_rows = cuda.local.array(alone_rows, floats)[:, :, 0]
-            own_packets = cuda.local.array(alone_packets, floats)[:, :, 0]
-        own = Local(
+            own_rows = cuda.local.array(thread_rows_shape, floats)[:, :, 0]
+            own_packets = cuda.local.array(thread_packets_shape, floats)[:, :, 0]
+        thread_arrays = ThreadArrays(
             cuda.local.array(flags, types.int64),
             cuda.local.array(window_shape, floats),
             own_rows,
             own_packets,
         )
-        step(i, resets, how, memory, own)
+        step(i, resets, constants, memory, thread_arrays)
 
-    return fused
+    return step_kernel
 
 
-def _held(array: Any, shape: Any) -> Any:
+def _get_numbers(array: Any, shape: Any) -> Any:
     """What a pointer stands for in the simulator."""
     return array.numbers

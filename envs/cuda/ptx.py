@@ -23,68 +23,73 @@ from numba.cuda.cudadrv.nvvm import NVVM
 from numba.cuda.np.numpy_support import from_dtype
 
 from ..backend import cache
-from ..backend.files import replaced
-from .kernel import NAME, How, kernel_of, specification
+from ..backend.files import replace_file
+from .kernel import NAME, KernelConstants, make_kernel, make_specification
 
 Capability = tuple[int, int]  # of a GPU: (9, 0) is an H200
 
 
-def ptx_of(how: How, real: type[np.floating[Any]], capability: Capability) -> str:
+def get_ptx(
+    constants: KernelConstants, real: type[np.floating[Any]], capability: Capability
+) -> str:
     """The PTX of a kernel for GPUs of a compute capability, from the disk where it is."""
-    folder = cache.kernel_folder("envs")
-    built = version("numba-cuda"), version("numba"), NVVM().get_version()
-    key = json.dumps([how, real.__name__, capability, built])
+    folder = cache.find_kernel_folder("envs")
+    versions = version("numba-cuda"), version("numba"), NVVM().get_version()
+    key = json.dumps([constants, real.__name__, capability, versions])
     path = folder / f"fused-{hashlib.sha256(key.encode()).hexdigest()[:16]}.ptx" if folder else None
-    if path and (data := cache.read(path)):
-        first, _, text = data.partition(b"\n")
-        if first == _first(key, text):  # else it is of another GPU, or not whole
+    if path and (data := cache.read_trusted(path)):
+        header, _, text = data.partition(b"\n")
+        if header == _make_header(key, text):  # else it is of another GPU, or not whole
             return text.decode()
-    found = _compiled(how, real, capability)
+    ptx = _compile_ptx(constants, real, capability)
     if path:
-        text = found.encode()
-        with contextlib.suppress(OSError), replaced(path) as file:
-            file.write(_first(key, text) + b"\n" + text)
-    return found
+        text = ptx.encode()
+        with contextlib.suppress(OSError), replace_file(path) as file:
+            file.write(_make_header(key, text) + b"\n" + text)
+    return ptx
 
 
-def _first(key: str, text: bytes) -> bytes:
+def _make_header(key: str, text: bytes) -> bytes:
     """The first line of a file: what it was compiled for, and its text's hash."""
     return f"// {key} {hashlib.sha256(text).hexdigest()}".encode()
 
 
-def _compiled(how: How, real: type[np.floating[Any]], capability: Capability) -> str:
+def _compile_ptx(
+    constants: KernelConstants, real: type[np.floating[Any]], capability: Capability
+) -> str:
     pointers = [
-        types.CPointer(from_dtype(np.dtype(dtype))) for dtype, _ in specification(how, real, 1, 1)
+        types.CPointer(from_dtype(np.dtype(dtype)))
+        for dtype, _ in make_specification(constants, real, 1, 1)
     ]
-    with _compiling_for(capability):
-        made = compile_cuda(
-            kernel_of(how, real),
+    with _set_capability(capability):
+        result = compile_cuda(
+            make_kernel(constants, real),
             types.void,
             (types.int64, types.boolean, *pointers),
             nvvm_options={"opt": 3, "fma": real is np.float32},
             cc=capability,
         )
-        library = made.library
-        kernel = library.get_function(made.fndesc.llvm_func_name)
+        library = result.library
+        kernel = library.get_function(result.fndesc.llvm_func_name)
         library._entry_name = kernel.name
         kernel_fixup(kernel, False)
         return str(library.get_asm_str(cc=capability)).replace(kernel.name, NAME)
 
 
 @contextlib.contextmanager
-def _compiling_for(capability: Capability) -> Iterator[None]:
+def _set_capability(capability: Capability) -> Iterator[None]:
     """numba-cuda asks the driver for which GPU a device function is: there may be none here."""
 
     class Device:
         compute_capability = capability
 
-    asked, dispatcher.get_current_device = dispatcher.get_current_device, lambda: Device
+    previous, dispatcher.get_current_device = dispatcher.get_current_device, lambda: Device
     try:
         yield
     finally:
-        dispatcher.get_current_device = asked
+        dispatcher.get_current_device = previous
 
 
-def instructions(ptx: str) -> Counter[str]:
+def count_opcodes(ptx: str) -> Counter[str]:
     """How many of each instruction there are in a PTX text."""
     return Counter(re.findall(r"^\t(?:@!?%\w+ )?([a-z][a-z0-9]*(?:\.[a-z0-9:]+)*)[\s;]", ptx, re.M))

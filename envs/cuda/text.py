@@ -13,64 +13,64 @@ from typing import Any
 import numpy as np
 from numba import cuda, types
 
-from ..backend.arrays import at, put, read, write
-from ..backend.decorators import plain
-from ..backend.extras import extra
+from ..backend.arrays import load_element, read, store_element, write
+from ..backend.decorators import as_python
+from ..backend.extras import require_extra
 
-with extra("cuda", "the CUDA engine needs numba-cuda"):
+with require_extra("cuda", "the CUDA engine needs numba-cuda"):
     import numba_cuda as numba_cuda  # numba's own `cuda` is another
 
 SIMULATED = bool(cuda.config.ENABLE_CUDASIM)
 """Whether numba simulates CUDA in Python (NUMBA_ENABLE_CUDASIM=1)."""
 
 
-def on_device(function: Any, real: type[np.floating[Any]]) -> Any:
+def to_cuda(function: Any, real: type[np.floating[Any]]) -> Any:
     """The text of a function and its callees as device functions whose floats are of `real`.
 
     In numba's simulator they stay plain Python.
     """
 
-    def finished(rebuilt: Any) -> Any:
+    def finish(rebuilt: Any) -> Any:
         if real is not np.float64:
-            _in_precision(rebuilt, real)
-        return rebuilt if SIMULATED else _device(rebuilt)
+            _set_precision(rebuilt, real)
+        return rebuilt if SIMULATED else _compile_device(rebuilt)
 
     if not SIMULATED:
-        return plain(function, _table(real), finished)
-    return plain(function, _SINGLE if real is np.float32 else None, finished)
+        return as_python(function, _make_table(real), finish)
+    return as_python(function, _SINGLE if real is np.float32 else None, finish)
 
 
 _SINGLE: dict[str, Callable[..., Any]] = {
-    "word": lambda a: int(np.float32(a).view(np.uint32)),
+    "to_word": lambda a: int(np.float32(a).view(np.uint32)),
     "from_word": lambda a: np.uint32(a).view(np.float32),
 }
 """Primitives of the simulator's float32: a word's 32 bits are those of a float."""
 
 
-def _in_precision(function: Any, real: Any) -> None:
+def _set_precision(function: Any, real: Any) -> None:
     """Give the function's literals and global numbers a precision: what meets a float64 becomes
     one."""
     names, code = function.__globals__, function.__code__
-    function.__code__ = code.replace(co_consts=_typed(code.co_consts, real))
+    function.__code__ = code.replace(co_consts=_convert_literals(code.co_consts, real))
     for name in code.co_names:
         if name == "float" or isinstance(names.get(name), float | tuple):
-            names[name] = real if name == "float" else _typed(names[name], real)
+            names[name] = real if name == "float" else _convert_literals(names[name], real)
 
 
-def _typed(value: Any, real: Any) -> Any:
+def _convert_literals(value: Any, real: Any) -> Any:
     if isinstance(value, float):
         return real(value)
     if isinstance(value, tuple) and not isinstance(value, CodeType):
         make = getattr(value, "_make", tuple)
-        return make([_typed(each, real) for each in value])
+        return make([_convert_literals(item, real) for item in value])
     return value
 
 
-def _device(function: Any) -> Any:
+def _compile_device(function: Any) -> Any:
     return cuda.jit(device=True, forceinline=True)(function)
 
 
-def _table(real: Any) -> dict[str, Callable[..., Any]]:
+def _make_table(real: Any) -> dict[str, Callable[..., Any]]:
     """The primitives that CUDA has its own text for, by the names that the equations use."""
     from numba.cuda import libdevice
 
@@ -88,60 +88,67 @@ def _table(real: Any) -> dict[str, Callable[..., Any]]:
         "select": lambda condition, a, b: a if condition else b,
         "to_float": lambda a: real(a),
         "frexp": lambda a: (frexp(a)[0], real(frexp(a)[1])),
-        "whole": lambda a: int(a),
-        "word": lambda a: int(a),
+        "to_int": lambda a: int(a),
+        "to_word": lambda a: int(a),
         "from_word": lambda a: real(a),
-        "anywhere": lambda condition: condition,
-        "abreast": lambda array: 1,
-        "along": lambda array, where, first: read(array, where, first),
-        "lane_count": lambda: 1,
-        "ramp": lambda first: first,
+        "any_lane": lambda condition: condition,
+        "lane_width": lambda array: 1,
+        "load_lanes": lambda array, where, first: read(array, where, first),
+        "count_lanes": lambda: 1,
+        "iota": lambda first: first,
     }
     if single:
-        texts["word"] = lambda a: int(libdevice.float_as_int(a))
+        texts["to_word"] = lambda a: int(libdevice.float_as_int(a))
         texts["from_word"] = lambda a: libdevice.int_as_float(np.int32(a))
-    return {name: _device(text) for name, text in texts.items()} | _access()
+    return {name: _compile_device(text) for name, text in texts.items()} | _register_access()
 
 
-def _access() -> dict[str, Callable[..., Any]]:
+def _register_access() -> dict[str, Callable[..., Any]]:
     """How packed arrays are read and written, taught to numba-cuda once."""
-    if not _taught:
+    if not _registered:
         from numba.cuda.extending import overload
 
-        inlined = {"forceinline": True}
-        for function, teach in ((read, _read), (write, _write), (at, _at), (put, _put)):
-            overload(function, jit_options=inlined)(teach)
-            _taught[function.__name__] = function
-    return _taught
+        jit_options = {"forceinline": True}
+        for function, typing in (
+            (read, _read),
+            (write, _write),
+            (load_element, _load_element),
+            (store_element, _store_element),
+        ):
+            overload(function, jit_options=jit_options)(typing)
+            _registered[function.__name__] = function
+    return _registered
 
 
-_taught: dict[str, Callable[..., Any]] = {}
+_registered: dict[str, Callable[..., Any]] = {}
 
 
-def _column(j: Any) -> str:
+def _format_column(j: Any) -> str:
     return "" if j is None or isinstance(j, types.Omitted | types.NoneType) else ", j"
 
 
-def _written(text: str, **names: Any) -> Any:
+def _build_function(text: str, **names: Any) -> Any:
     exec(text, names)  # of our own words alone
     return names["written"]
 
 
 def _read(array, where, j=None):
-    numbers = "".join(f"array[where[0] + {k}{_column(j)}], " for k in range(len(where)))
+    numbers = "".join(f"array[where[0] + {k}{_format_column(j)}], " for k in range(len(where)))
     made = getattr(where, "instance_class", None)
     body = f"made({numbers})" if made else f"({numbers})"
-    return _written(f"def written(array, where, j=None): return {body}", made=made)
+    return _build_function(f"def written(array, where, j=None): return {body}", made=made)
 
 
 def _write(array, values, where, j=None):
-    lines = [f"    array[where[{k}]{_column(j)}] = values[{k}]\n" for k in range(len(where))]
-    return _written(f"def written(array, values, where, j=None):\n{''.join(lines)}")
+    lines = [f"    array[where[{k}]{_format_column(j)}] = values[{k}]\n" for k in range(len(where))]
+    return _build_function(f"def written(array, values, where, j=None):\n{''.join(lines)}")
 
 
-def _at(array, i, j=None):
-    return _written(f"def written(array, i, j=None): return array[i{_column(j)}]")
+def _load_element(array, i, j=None):
+    return _build_function(f"def written(array, i, j=None): return array[i{_format_column(j)}]")
 
 
-def _put(array, value, i, j=None):
-    return _written(f"def written(array, value, i, j=None): array[i{_column(j)}] = value")
+def _store_element(array, value, i, j=None):
+    return _build_function(
+        f"def written(array, value, i, j=None): array[i{_format_column(j)}] = value"
+    )

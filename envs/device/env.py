@@ -8,21 +8,28 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from ..arguments import brief, check_choice, count_of, mask_of, mode_of, named
+from ..arguments import (
+    check_choice,
+    check_int,
+    format_rows,
+    parse_autoreset_mode,
+    parse_reset_mask,
+    short_repr,
+)
 from ..backend.arrays import read
 from ..backend.on_torch import torch
-from ..cuda.tensors import check_arguments, device_of, dtype_of, infos_in
+from ..cuda.tensors import check_arguments, parse_device, parse_dtype, read_infos
 from ..engine.layout import FLAGS, P
 from ..engine.packing import EpisodeConfig
-from ..engine.step import kind_in
+from ..engine.step import get_start_variant
 from ..sensors.link import Link
 from ..sensors.slow import SLOW_NAMES
 from ..vector import StabilityVectorEnv
-from .gradient import NOTHING, inputs_of
-from .packets import Capacity, capacity_of
-from .start import Start
-from .state import actions_on, compiles
-from .step import Outcome, State, Step
+from .gradient import NO_TENSORS, split_inputs
+from .packets import PacketCapacity, compute_capacity
+from .start import TorchReset
+from .state import is_compile_used, parse_device_actions
+from .step import StepOutcome, TorchState, TorchStep
 from .transfer import DeviceRows
 
 Tensor = torch.Tensor
@@ -79,8 +86,8 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         check_choice("engine", engine, ("torch", "cuda"))
         if engine == "torch":
             return super().__new__(cls)
-        if wrong := [name for name in ("compile", "grad") if named.pop(name, False)]:
-            raise ValueError(f"{wrong[0]} is of engine='torch', not of 'cuda'")
+        if unsupported := [name for name in ("compile", "grad") if named.pop(name, False)]:
+            raise ValueError(f"{unsupported[0]} is of engine='torch', not of 'cuda'")
         from ..cuda.env import CudaVectorEnv
 
         return CudaVectorEnv(*arguments, **named)
@@ -98,10 +105,10 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         **arguments: Any,
     ) -> None:
         check_arguments(arguments)
-        self.num_envs = count_of("num_envs", num_envs, "environments")
-        self._mode = mode_of(autoreset_mode)
-        self.device, self.dtype = device_of(device), dtype_of(dtype)
-        self._compiled = compiles(compile, self.device)
+        self.num_envs = check_int("num_envs", num_envs, "environments")
+        self._mode = parse_autoreset_mode(autoreset_mode)
+        self.device, self.dtype = parse_device(device), parse_dtype(dtype)
+        self._use_compile = is_compile_used(compile, self.device)
         self._grad = grad
         self._host = host = StabilityVectorEnv(num_envs, **arguments)  # it resets the rows
         self.layout, self.control_period = host.layout, host.control_period
@@ -111,12 +118,12 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         self.single_action_space = host.single_action_space
         self.observation_space = host.observation_space
         self.action_space = host.action_space
-        self._started = self._waiting = False
-        self._kind = kind_in(host.config.base.start)
+        self._started = self._has_over = False
+        self._kind = get_start_variant(host.config.base.start)
         slow = host.config.slow
         self._links: _Links = {i: set() for i, name in enumerate(SLOW_NAMES) if name in slow}
-        self._links, most = self._carried(host.configs)
-        self._build(most)
+        self._links, capacities = self._collect_links(host.configs)
+        self._build(capacities)
 
     @classmethod
     def make(cls, env_id: str, num_envs: int = 1, **arguments: Any) -> "DeviceVectorEnv":
@@ -126,101 +133,110 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
             raise ValueError(f"{env_id} has no environment on the device")
         return cls(num_envs, **{**spec.kwargs, **arguments})
 
-    def _carried(self, configs: Iterable[EpisodeConfig]) -> tuple[_Links, dict[int, Capacity]]:
+    def _collect_links(
+        self, configs: Iterable[EpisodeConfig]
+    ) -> tuple[_Links, dict[int, PacketCapacity]]:
         """The slow sensors' links in these configs and those before, and the room that they take;
         ValueError for a config of another kind of plant."""
         configs = list({id(config): config for config in configs}.values())
         for config in configs:
             if config.scenario.steering in ("trace", "wander"):
-                what = f"{config.scenario.name!r}: no {config.scenario.steering}"
-                raise ValueError(f"{what} is driven on a device")
-            kind = kind_in(config.start)
+                label = f"{config.scenario.name!r}: no {config.scenario.steering}"
+                raise ValueError(f"{label} is driven on a device")
+            kind = get_start_variant(config.start)
             if kind != self._kind:
-                why = f"scenario {config.scenario.name!r} has {kind}, not {self._kind}"
-                raise ValueError(f"on a device all rows have one kind of plant: {why}")
+                reason = f"scenario {config.scenario.name!r} has {kind}, not {self._kind}"
+                raise ValueError(f"on a device all rows have one kind of plant: {reason}")
         links = {
-            sensor: known | {read(config.start.params, P.slow[sensor]) for config in configs}
-            for sensor, known in self._links.items()
+            sensor: previous | {read(config.start.params, P.slow[sensor]) for config in configs}
+            for sensor, previous in self._links.items()
         }
         n = self.control_period
-        return links, {sensor: capacity_of(list(each), n) for sensor, each in links.items()}
+        return links, {
+            sensor: compute_capacity(list(sensor_links), n)
+            for sensor, sensor_links in links.items()
+        }
 
-    def _build(self, most: dict[int, Capacity]) -> None:
+    def _build(self, capacities: dict[int, PacketCapacity]) -> None:
         """The step with these capacities, and all rows on the device."""
         host = self._host
         switches = read(host.config.base.start.switches, FLAGS)
         obs_dtype = self.dtype if self._grad else torch.float32
-        how = self.dtype, obs_dtype, self.device, self._compiled
+        tensor_args = self.dtype, obs_dtype, self.device, self._use_compile
         n, bounds = self.control_period, host.config.bounds
-        self._step = step = Step(self._kind, n, most, switches, bounds, *how)
-        start = Start(step, tuple(most)) if self._grad else None
-        self._rows = DeviceRows(host, most, self.device, self.dtype, start)
+        self._step = step = TorchStep(self._kind, n, capacities, switches, bounds, *tensor_args)
+        start = TorchReset(step, tuple(capacities)) if self._grad else None
+        self._rows = DeviceRows(host, capacities, self.device, self.dtype, start)
 
     def reset(
         self, *, seed: Any = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Tensor, Infos]:
         """Start episodes; seeds, options and errors are those of `StabilityVectorEnv`."""
-        host, asked = self._host, dict(options or {})
-        mask = asked.get("reset_mask")
+        host, reset_options = self._host, dict(options or {})
+        mask = reset_options.get("reset_mask")
         if isinstance(mask, torch.Tensor):
-            mask = asked["reset_mask"] = mask.cpu().numpy()
-        chosen = np.flatnonzero(mask_of(mask, self.num_envs))
-        inputs = NOTHING
+            mask = reset_options["reset_mask"] = mask.cpu().numpy()
+        chosen = np.flatnonzero(parse_reset_mask(mask, self.num_envs))
+        inputs = NO_TENSORS
         if self._grad:
-            like = self._rows.params
-            asked, inputs = inputs_of(asked, host.config.base, self.num_envs, like)
-        free = {name: value for name, value in asked.items() if name != "reset_mask"}
-        configs, _ = host.with_options(free, chosen.tolist())
-        links, most = self._carried(configs)
-        wider = most != self._rows.most
-        if wider and self._grad and len(chosen) < self.num_envs:
-            why = "these sensors take more room than any before"
-            raise ValueError(f"{why}: reset all rows, or the others would lose their gradients")
-        if wider:
-            self._rows.give_back(host)
-        host.reset(seed=seed, options=asked)
+            template = self._rows.params
+            reset_options, inputs = split_inputs(
+                reset_options, host.config.base, self.num_envs, template
+            )
+        episode_options = {
+            name: value for name, value in reset_options.items() if name != "reset_mask"
+        }
+        configs, _ = host.apply_options(episode_options, chosen.tolist())
+        links, capacities = self._collect_links(configs)
+        needs_rebuild = capacities != self._rows.capacities
+        if needs_rebuild and self._grad and len(chosen) < self.num_envs:
+            reason = "these sensors take more room than any before"
+            raise ValueError(f"{reason}: reset all rows, or the others would lose their gradients")
+        if needs_rebuild:
+            self._rows.download(host)
+        host.reset(seed=seed, options=reset_options)
         self._links = links
-        if wider:
-            self._build(most)
-        self._rows.take_over(host, chosen, inputs)
-        self._started, self._waiting = True, bool(self._rows.state.over.any())
-        return self._rows.outcome.obs.clone(), self._infos()
+        if needs_rebuild:
+            self._build(capacities)
+        self._rows.upload(host, chosen, inputs)
+        self._started, self._has_over = True, bool(self._rows.state.over.any())
+        return self._rows.outcome.obs.clone(), self._make_infos()
 
     def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Infos]:
         """Hold each row's action for one control period."""
         if not self._started:
             raise ResetNeeded("no episode was started: call reset() first")
-        if self._waiting and self._mode == AutoresetMode.DISABLED:
+        if self._has_over and self._mode == AutoresetMode.DISABLED:
             over = self._rows.state.over.nonzero()[:, 0].tolist()
             raise ResetNeeded(
-                f"the episode is over in {named(over)}: call reset() with a reset_mask"
+                f"the episode is over in {format_rows(over)}: call reset() with a reset_mask"
             )
         config, rows = self._host.config, self._rows
         fail = config.on_bad_action == "fail"
-        asked = actions_on(
+        commands = parse_device_actions(
             actions, self.num_envs, config.action_width, fail, self.device, self.dtype, self._grad
         )
         with torch.set_grad_enabled(self._grad and torch.is_grad_enabled()):
-            state, outcome = self._step(rows.params, rows.keys, rows.state, asked)
+            state, outcome = self._step(rows.params, rows.keys, rows.state, commands)
         flags = torch.stack((outcome.refused.any(), state.over.any()))
         refused, ended = flags.tolist()  # the one time the device is waited for
         if refused and not fail:
-            bad = outcome.refused.nonzero()[:, 0].tolist()
+            bad_rows = outcome.refused.nonzero()[:, 0].tolist()
             raise ValueError(
-                f"the action of {named(bad)} is not finite, {asked[bad[0]].tolist()}; "
-                "nothing was stepped"
+                f"the action of {format_rows(bad_rows)} is not finite, "
+                f"{commands[bad_rows[0]].tolist()}; nothing was stepped"
             )
-        resting = rows.state.over if self._waiting else None
-        rows.state, rows.outcome, self._waiting = state, outcome, ended
+        over_rows = rows.state.over if self._has_over else None
+        rows.state, rows.outcome, self._has_over = state, outcome, ended
         infos: Infos = {}
-        if resting is not None:
-            self._restart(resting)
+        if over_rows is not None:
+            self._reset_rows(over_rows)
         if ended and self._mode == AutoresetMode.SAME_STEP:
-            infos = {"final_obs": outcome.obs, "final_info": self._infos()}
+            infos = {"final_obs": outcome.obs, "final_info": self._make_infos()}
             infos |= {f"_{key}": state.over.clone() for key in infos}
-            self._restart(state.over)
-            self._waiting = False
-        infos |= self._infos()
+            self._reset_rows(state.over)
+            self._has_over = False
+        infos |= self._make_infos()
         ends = outcome.terminated, outcome.truncated
         return rows.outcome.obs.clone(), outcome.rewards, *ends, infos
 
@@ -231,16 +247,16 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         """
         self._rows.detach()
 
-    def _restart(self, over: Tensor) -> None:
+    def _reset_rows(self, over: Tensor) -> None:
         """Reset these rows (N,) without options."""
         chosen = over.nonzero()[:, 0].cpu().numpy()
         self._host.reset_rows(chosen)
         self._host.over[chosen] = False
-        self._rows.take_over(self._host, chosen)
+        self._rows.upload(self._host, chosen)
 
-    def _infos(self) -> Infos:
+    def _make_infos(self) -> Infos:
         """The numbers of `info` of every row, (N,) each."""
-        return infos_in(self._rows.state.report.clone())
+        return read_infos(self._rows.state.report.clone())
 
     @property
     def rows(self) -> Tensor:
@@ -267,7 +283,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         """The true `Motion` of each row now, (N, len(Motion)), in SI units."""
         return self._rows.state.motion.T.clone()
 
-    def tensors(self) -> tuple[State, Outcome]:
+    def tensors(self) -> tuple[TorchState, StepOutcome]:
         """The state of the rows on the device and the newest step's outcome; the env's own."""
         return self._rows.state, self._rows.outcome
 
@@ -278,7 +294,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot of all rows, which `StabilityVectorEnv.set_state` takes too."""
-        self._rows.give_back(self._host)
+        self._rows.download(self._host)
         return self._host.get_state()
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
@@ -289,9 +305,9 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         whose rows have another kind of plant.
         """
         if not isinstance(snapshot, Mapping):
-            raise ValueError(f"a snapshot of this engine is a mapping, got {brief(snapshot)}")
-        links, most = self._carried(snapshot["configs"])
+            raise ValueError(f"a snapshot of this engine is a mapping, got {short_repr(snapshot)}")
+        links, capacities = self._collect_links(snapshot["configs"])
         self._host.set_state(snapshot)
         self._links = links
-        self._build(most)
-        self._started, self._waiting = snapshot["started"], bool(self._rows.state.over.any())
+        self._build(capacities)
+        self._started, self._has_over = snapshot["started"], bool(self._rows.state.over.any())

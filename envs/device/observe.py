@@ -3,18 +3,18 @@
 from typing import Any
 
 from ..backend.elementary import clip
-from ..backend.on_torch import on_tensors, torch
+from ..backend.on_torch import to_torch, torch
 from ..backend.primitives import select
-from ..engine.layout import IN_SLOW, Switches
+from ..engine.layout import SLOW_STATE, Switches
 from ..record import FAST, PACKET
 from ..sensors.slow import WIDTHS
-from ..task.cost import rest_of_cost
+from ..task.cost import compute_failure_cost
 from ..task.failures import BAD_ACTION, RUNNING
-from ..task.info import Report
-from ..task.observation import AGE_CAP, SAMPLED
+from ..task.info import StepReport
+from ..task.observation import AGE_CAP, N_SAMPLED
 from ..ticks import NEVER, TICK
 from .packets import Delivered
-from .ticks import Now, Shown
+from .ticks import InfoValues, TickState
 
 Tensor = torch.Tensor
 
@@ -37,17 +37,19 @@ class Observer:
         self._obs_dtype = obs_dtype
         self._sensors, self._switches = sensors, switches
         self._bounds = bounds[:, :, None]
-        self._clip, self._select, self._rest_of_cost = on_tensors(dtype, clip, select, rest_of_cost)
+        self._clip, self._select, self._compute_failure_cost = to_torch(
+            dtype, clip, select, compute_failure_cost
+        )
 
     def observe(
-        self, rows: Tensor, done: Tensor, now: Now, slow: Tensor, delivered: Delivered
+        self, rows: Tensor, done: Tensor, tick_state: TickState, slow: Tensor, delivered: Delivered
     ) -> Tensor:
         """The summary (N, k).
 
         rows: (n, FAST_WIDTH, N), of which the first `done` (N,) count. slow: as in `Under`.
         """
         entries: list[Tensor] = []
-        sampled = rows[:, :SAMPLED]
+        sampled = rows[:, :N_SAMPLED]
         if self._switches.all_samples:
             entries += sampled.transpose(0, 1).flatten(0, 1).unbind(0)
         else:
@@ -59,56 +61,58 @@ class Observer:
         if self._switches.with_map:
             entries.append(rows[-1, FAST.curvature])
         for sensor in self._sensors:
-            entries += self._sensor(sensor, now.tick, slow[sensor], delivered)
-        shown = Shown(*now.shown)
-        entries += [shown.beta_ref, shown.gamma_ref]
+            entries += self._read_sensor(sensor, tick_state.tick, slow[sensor], delivered)
+        info_values = InfoValues(*tick_state.shown)
+        entries += [info_values.beta_ref, info_values.gamma_ref]
         low, high = self._bounds.unbind(0)
         clipped: Tensor = self._clip(torch.stack(entries), low, high)
         return clipped.T.to(self._obs_dtype).contiguous()
 
-    def _sensor(
+    def _read_sensor(
         self, sensor: int, tick: Tensor, slow: Tensor, delivered: Delivered
     ) -> list[Tensor]:
         """Values, age and freshness of one sensor's newest sample."""
-        captured = slow[IN_SLOW.captured]
+        captured = slow[SLOW_STATE.captured]
         age = self._select(captured != NEVER, (tick - captured) * TICK, AGE_CAP)
         packets = delivered.packets
         place = torch.arange(len(packets), device=tick.device)[:, None]
-        newest = packets[:, PACKET.arrived] == slow[IN_SLOW.arrived]  # neither late nor a duplicate
-        fresh = (place < delivered.number) & (packets[:, PACKET.sensor] == sensor) & newest
-        values = [slow[i] for i in IN_SLOW.values[: WIDTHS[sensor]]]
-        return [*values, age, fresh.any(0).to(tick.dtype)]
+        is_newest = (
+            packets[:, PACKET.arrived] == slow[SLOW_STATE.arrived]
+        )  # neither late nor a duplicate
+        is_fresh = (place < delivered.number) & (packets[:, PACKET.sensor] == sensor) & is_newest
+        values = [slow[i] for i in SLOW_STATE.values[: WIDTHS[sensor]]]
+        return [*values, age, is_fresh.any(0).to(tick.dtype)]
 
-    def report(self, now: Now, duration: Tensor, count: Tensor) -> Tensor:
+    def report(self, tick_state: TickState, duration: Tensor, count: Tensor) -> Tensor:
         """The reports (len(Report), N) of rows that were stepped."""
-        rest = self._rest_of_cost(duration, now.tick)
-        cost = now.cost + self._select(now.failure != RUNNING, rest, 0.0)
-        shown = Shown(*now.shown)
-        named = {
-            "t": now.tick * TICK,
-            "beta": shown.beta,
-            "gamma": now.motion[2],
-            "psi": now.motion[3],
-            "beta_ref": shown.beta_ref,
-            "gamma_ref": shown.gamma_ref,
-            "steer": shown.steer,
-            "yaw_moment": shown.moment,
+        failure_cost = self._compute_failure_cost(duration, tick_state.tick)
+        cost = tick_state.cost + self._select(tick_state.failure != RUNNING, failure_cost, 0.0)
+        info_values = InfoValues(*tick_state.shown)
+        values = {
+            "t": tick_state.tick * TICK,
+            "beta": info_values.beta,
+            "gamma": tick_state.motion[2],
+            "psi": tick_state.motion[3],
+            "beta_ref": info_values.beta_ref,
+            "gamma_ref": info_values.gamma_ref,
+            "steer": info_values.steer,
+            "yaw_moment": info_values.moment,
             "cost": cost,
-            "failure": now.failure,
+            "failure": tick_state.failure,
             "packets": count.to(cost.dtype),
             "reward": -cost,
-            "ended": (now.tick >= duration).to(cost.dtype),
+            "ended": (tick_state.tick >= duration).to(cost.dtype),
         }
-        return torch.stack([named[name] for name in Report._fields])
+        return torch.stack([values[name] for name in StepReport._fields])
 
-    def refusal(self, now: Now, duration: Tensor, before: Tensor) -> Tensor:
+    def report_refusal(self, tick_state: TickState, duration: Tensor, before: Tensor) -> Tensor:
         """The reports of rows that an action which is not finite fails; the rest stays."""
-        cost = self._rest_of_cost(duration, now.tick)
-        named = dict(zip(Report._fields, before.unbind(0), strict=True))
-        named |= {
+        cost = self._compute_failure_cost(duration, tick_state.tick)
+        values = dict(zip(StepReport._fields, before.unbind(0), strict=True))
+        values |= {
             "cost": cost,
             "failure": torch.full_like(cost, BAD_ACTION),
             "packets": torch.zeros_like(cost),
             "reward": -cost,
         }
-        return torch.stack([named[name] for name in Report._fields])
+        return torch.stack([values[name] for name in StepReport._fields])

@@ -9,18 +9,18 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from ..backend.arrays import read
-from ..backend.on_torch import on_tensors, torch
+from ..backend.on_torch import to_torch, torch
 from ..backend.primitives import select
-from ..engine.layout import IN_SLOW, SLOW_WIDTH, P, Z
-from ..engine.packets import FAR, scene_of
+from ..engine.layout import SLOW_STATE, SLOW_WIDTH, P, Z
+from ..engine.packets import NEVER_DUE, make_measurement_context
 from ..record import PACKET, PACKET_WIDTH
-from ..sensors.link import Link, arrivals, most_under_way
-from ..sensors.slow import BLOCKS, SEES, VALUES, sample
+from ..sensors.link import Link, compute_arrivals, count_max_in_flight
+from ..sensors.slow import BLOCKS, NEEDS_QUALITY, VALUES, sample_sensor
 from ..ticks import NEVER
 from ..vehicle.dynamics import Motion
 
 Tensor = torch.Tensor
-_LATE = 1 << 62  # the place of what never arrives
+_NEVER_KEY = 1 << 62  # the place of what never arrives
 
 
 class SlowState(NamedTuple):
@@ -37,7 +37,7 @@ class Delivered(NamedTuple):
     number: Tensor  # (N,), how many of them are there
 
 
-class Window(NamedTuple):
+class TickWindow(NamedTuple):
     """The ticks of an env-step: after `first`, up to `last`, (N,) each."""
 
     first: Tensor
@@ -46,7 +46,7 @@ class Window(NamedTuple):
     track: Tensor  # (n, len(Motion), N), where the car was at each tick
 
 
-class Capacity(NamedTuple):
+class PacketCapacity(NamedTuple):
     """The most packets of a sensor."""
 
     frames: int  # captured in an env-step
@@ -54,11 +54,11 @@ class Capacity(NamedTuple):
     copies: int  # of a packet
 
 
-def capacity_of(links: Sequence[Link], n: int) -> Capacity:
+def compute_capacity(links: Sequence[Link], n: int) -> PacketCapacity:
     """The capacity for sensors with any of these links in an env-step of n ticks."""
-    return Capacity(
+    return PacketCapacity(
         max(-int(-n // link.period) for link in links),
-        max(most_under_way(link) for link in links),
+        max(count_max_in_flight(link) for link in links),
         2 if any(link.duplicate > 0.0 for link in links) else 1,
     )
 
@@ -66,105 +66,117 @@ def capacity_of(links: Sequence[Link], n: int) -> Capacity:
 class SlowSensors:
     """The slow sensors of a batch: those present, each with its capacity."""
 
-    def __init__(self, most: dict[int, Capacity], small_angle: int, dtype: torch.dtype) -> None:
-        self.most, self._small_angle = most, small_angle
-        self._sample, self._scene_of, self._arrivals, self._read, self._select = on_tensors(
-            dtype, sample, scene_of, arrivals, read, select
-        )
+    def __init__(
+        self, capacities: dict[int, PacketCapacity], small_angle: int, dtype: torch.dtype
+    ) -> None:
+        self.capacities, self._small_angle = capacities, small_angle
+        (
+            self._sample_sensor,
+            self._make_measurement_context,
+            self._compute_arrivals,
+            self._read,
+            self._select,
+        ) = to_torch(dtype, sample_sensor, make_measurement_context, compute_arrivals, read, select)
 
     def __call__(
-        self, p: Tensor, keys: Tensor, state: SlowState, window: Window
+        self, p: Tensor, keys: Tensor, state: SlowState, window: TickWindow
     ) -> tuple[SlowState, Delivered]:
         """The slow sensors' state after an env-step, and what arrived in it."""
-        sensors = [list(each.unbind(0)) for each in state.slow.unbind(0)]
-        new: list[Tensor] = []
-        for sensor, most in self.most.items():
-            for _ in range(most.frames):
-                sensors[sensor], packets = self._capture(sensor, p, keys, sensors[sensor], window)
-                new += packets
-        queue = in_order(torch.cat([state.queue, torch.stack(new)]))
+        sensors = [list(sensor_state.unbind(0)) for sensor_state in state.slow.unbind(0)]
+        new_packets: list[Tensor] = []
+        for sensor, capacity in self.capacities.items():
+            for _ in range(capacity.frames):
+                sensors[sensor], packets = self._capture_frame(
+                    sensor, p, keys, sensors[sensor], window
+                )
+                new_packets += packets
+        queue = sort_packets(torch.cat([state.queue, torch.stack(new_packets)]))
         arrived = queue[:, PACKET.arrived]
         due = (arrived != NEVER) & (arrived <= window.last) & window.running
         count = due.sum(0)
-        slow = self._newest(sensors, queue, due)
-        left = taken_off(queue, count)[: len(state.queue)]
-        return SlowState(slow, left), Delivered(queue, count)
+        slow = self._update_newest(sensors, queue, due)
+        remaining = remove_first(queue, count)[: len(state.queue)]
+        return SlowState(slow, remaining), Delivered(queue, count)
 
-    def _capture(
-        self, sensor: int, p: Tensor, keys: Tensor, slow: Sequence[Tensor], window: Window
+    def _capture_frame(
+        self, sensor: int, p: Tensor, keys: Tensor, slow: Sequence[Tensor], window: TickWindow
     ) -> tuple[list[Tensor], list[Tensor]]:
         """The next frame of a sensor where it falls into the window: (the sensor's state then, its
         packets, of which those that are none never arrive)."""
         pick = self._select
-        frame, tick = slow[IN_SLOW.frames], slow[IN_SLOW.next_capture]
+        frame, tick = slow[SLOW_STATE.frames], slow[SLOW_STATE.next_capture]
         active = window.running & (tick > window.first) & (tick <= window.last)
         when = tick.to(torch.int64)
         j = (when - window.first.to(torch.int64) - 1).clamp(0, len(window.track) - 1)
         width = window.track.shape[1]
-        place = j.expand(1, width, -1)
-        motion = Motion(*window.track.gather(0, place)[0].unbind(0))
+        row_index = j.expand(1, width, -1)
+        motion = Motion(*window.track.gather(0, row_index)[0].unbind(0))
         link = self._read(p, P.slow[sensor])
-        scene = self._scene_of(p, motion, self._small_angle, keys, tick)
-        values, quality, drift = self._sample(sensor, scene, link, slow[IN_SLOW.drift])
-        sent = [
-            each if isinstance(each, Tensor) else torch.full_like(tick, each)
-            for each in (quality, frame, *values)
+        context = self._make_measurement_context(p, motion, self._small_angle, keys, tick)
+        values, quality, drift = self._sample_sensor(sensor, context, link, slow[SLOW_STATE.drift])
+        fields = [
+            number if isinstance(number, Tensor) else torch.full_like(tick, number)
+            for number in (quality, frame, *values)
         ]
         packets = []
-        both = self._arrivals(link, frame, tick, keys[0], keys[1], BLOCKS[sensor].link)
-        for arrived in both[: self.most[sensor].copies]:
-            due = pick(active, arrived, NEVER)
-            packets.append(torch.stack((torch.full_like(tick, sensor), tick, due, *sent)))
-        after = list(slow)
-        after[IN_SLOW.frames] = pick(active, frame + 1.0, frame)
-        after[IN_SLOW.next_capture] = pick(active, tick + link.period, tick)
-        after[IN_SLOW.drift] = pick(active, drift, slow[IN_SLOW.drift])
-        return after, packets
+        arrival_ticks = self._compute_arrivals(
+            link, frame, tick, keys[0], keys[1], BLOCKS[sensor].link
+        )
+        for arrived in arrival_ticks[: self.capacities[sensor].copies]:
+            arrival_tick = pick(active, arrived, NEVER)
+            packets.append(
+                torch.stack((torch.full_like(tick, sensor), tick, arrival_tick, *fields))
+            )
+        next_state = list(slow)
+        next_state[SLOW_STATE.frames] = pick(active, frame + 1.0, frame)
+        next_state[SLOW_STATE.next_capture] = pick(active, tick + link.period, tick)
+        next_state[SLOW_STATE.drift] = pick(active, drift, slow[SLOW_STATE.drift])
+        return next_state, packets
 
-    def _newest(self, sensors: list[list[Tensor]], queue: Tensor, due: Tensor) -> Tensor:
+    def _update_newest(self, sensors: list[list[Tensor]], queue: Tensor, due: Tensor) -> Tensor:
         """The sensors' state, as in `SlowState`, once the due packets were looked at in order."""
         pick = self._select
         for i in range(len(queue)):
             packet = queue[i].unbind(0)
-            for sensor in self.most:
+            for sensor in self.capacities:
                 slow = sensors[sensor]
-                better = due[i] & (packet[PACKET.sensor] == sensor)
-                better = better & (packet[PACKET.captured] > slow[IN_SLOW.captured])
-                if SEES[sensor]:
-                    better = better & (packet[PACKET.quality] > 0.0)
+                is_newer = due[i] & (packet[PACKET.sensor] == sensor)
+                is_newer = is_newer & (packet[PACKET.captured] > slow[SLOW_STATE.captured])
+                if NEEDS_QUALITY[sensor]:
+                    is_newer = is_newer & (packet[PACKET.quality] > 0.0)
                 newest = (
                     packet[PACKET.captured],
                     *packet[PACKET.value : PACKET.value + VALUES],
                     packet[PACKET.arrived],
                 )
-                for k, value in enumerate(newest, IN_SLOW.captured):
-                    slow[k] = pick(better, value, slow[k])
-        return torch.stack([torch.stack(each) for each in sensors])
+                for k, value in enumerate(newest, SLOW_STATE.captured):
+                    slow[k] = pick(is_newer, value, slow[k])
+        return torch.stack([torch.stack(sensor_state) for sensor_state in sensors])
 
 
-def in_order(queue: Tensor) -> Tensor:
+def sort_packets(queue: Tensor) -> Tensor:
     """Packets (count, PACKET_WIDTH, N) by (arrived, captured, sensor), those that never arrive
     last."""
-    whole = queue[:, :3].to(torch.int64)
-    arrived = whole[:, PACKET.arrived]
-    key = (arrived << 32) + len(Z.slow) * whole[:, PACKET.captured] + whole[:, PACKET.sensor]
-    key = torch.where(queue[:, PACKET.arrived] == NEVER, _LATE, key)
+    stamps = queue[:, :3].to(torch.int64)
+    arrived = stamps[:, PACKET.arrived]
+    key = (arrived << 32) + len(Z.slow) * stamps[:, PACKET.captured] + stamps[:, PACKET.sensor]
+    key = torch.where(queue[:, PACKET.arrived] == NEVER, _NEVER_KEY, key)
     place = torch.arange(len(queue), device=queue.device)[:, None]
-    mine, other = key[:, None], key[None]
-    ahead = (other < mine) | ((other == mine) & (place[None] < place[:, None]))
-    rank = ahead.sum(1)
+    row_key, column_key = key[:, None], key[None]
+    is_before = (column_key < row_key) | ((column_key == row_key) & (place[None] < place[:, None]))
+    rank = is_before.sum(1)
     order = torch.empty_like(rank).scatter_(0, rank, place.expand_as(rank))
     return queue.gather(0, order[:, None].expand(-1, PACKET_WIDTH, -1))
 
 
-def taken_off(queue: Tensor, count: Tensor) -> Tensor:
+def remove_first(queue: Tensor, count: Tensor) -> Tensor:
     """The rest of packets in order, (capacity, PACKET_WIDTH, N), without the first `count` (N,)."""
     place = torch.arange(len(queue), device=queue.device)[:, None] + count
-    gone = place >= len(queue)
+    is_gone = place >= len(queue)
     place = place.clamp(max=len(queue) - 1)
-    left = queue.gather(0, place[:, None].expand(-1, PACKET_WIDTH, -1))
-    before, after = left[:, : PACKET.arrived], left[:, PACKET.arrived + 1 :]
-    arrived = left[:, PACKET.arrived].masked_fill(gone, NEVER)
+    remaining = queue.gather(0, place[:, None].expand(-1, PACKET_WIDTH, -1))
+    before, after = remaining[:, : PACKET.arrived], remaining[:, PACKET.arrived + 1 :]
+    arrived = remaining[:, PACKET.arrived].masked_fill(is_gone, NEVER)
     return torch.cat((before, arrived[:, None], after), 1)
 
 
@@ -177,7 +189,7 @@ def read_packed(states: Tensor, capacity: int) -> SlowState:
     queue = states[Z.queue : Z.driver].reshape(-1, PACKET_WIDTH, states.shape[1])[:capacity].clone()
     place = torch.arange(capacity, device=queue.device)[:, None]
     queue[:, PACKET.arrived].masked_fill_(place >= states[Z.under_way], NEVER)
-    return SlowState(slow.clone(), in_order(queue))
+    return SlowState(slow.clone(), sort_packets(queue))
 
 
 def write_packed(state: SlowState, states: Tensor) -> None:
@@ -189,4 +201,4 @@ def write_packed(state: SlowState, states: Tensor) -> None:
     states[Z.queue : Z.queue + len(flat)] = flat
     arrived = state.queue[:, PACKET.arrived]
     states[Z.under_way] = (arrived != NEVER).sum(0).to(states.dtype)
-    states[Z.clock.next_due] = torch.where(arrived[0] == NEVER, FAR, arrived[0])
+    states[Z.clock.next_due] = torch.where(arrived[0] == NEVER, NEVER_DUE, arrived[0])

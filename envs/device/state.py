@@ -9,26 +9,26 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arguments import actions_of
+from ..arguments import parse_actions
 from ..backend.on_torch import torch
 from ..engine.layout import Z
 from ..record import Array
 from .packets import read_packed, write_packed
-from .step import State
+from .step import TorchState
 
 Tensor = torch.Tensor
 _MOTION, _DRIVE, _REFS, _LEAD = (
-    slice(part[0], part[-1] + 1) for part in (Z.motion, Z.drive, Z.refs, Z.lead)
+    slice(part[0], part[-1] + 1) for part in (Z.motion, Z.drive, Z.refs, Z.nominal_motion)
 )
 _PACKED = _MOTION, _DRIVE, Z.driver, _REFS, _LEAD, Z.clock.tick, Z.clock.failure
-"""Where the first fields of a `State` lie in the packed state."""
+"""Where the first fields of a `TorchState` lie in the packed state."""
 
 
-def compiles(wanted: bool, device: torch.device) -> bool:
+def is_compile_used(is_wanted: bool, device: torch.device) -> bool:
     """Whether `torch.compile` is used: where it is wanted, and a C++ compiler is there for the
     CPU; without one a warning says so."""
     compiler = os.environ.get("CXX", "g++")  # where torch looks for it
-    if wanted and device.type == "cpu" and shutil.which(compiler) is None:
+    if is_wanted and device.type == "cpu" and shutil.which(compiler) is None:
         warnings.warn(
             f"compile=True needs a C++ compiler on the CPU, and there is no {compiler!r}: "
             "ticks are not compiled",
@@ -36,10 +36,10 @@ def compiles(wanted: bool, device: torch.device) -> bool:
             stacklevel=3,
         )
         return False
-    return wanted
+    return is_wanted
 
 
-def actions_on(
+def parse_device_actions(
     actions: Any,
     count: int,
     width: int,
@@ -55,7 +55,7 @@ def actions_on(
     is NaN. Anything else is brought to the device as the vector env takes it.
     """
     if not isinstance(actions, torch.Tensor):
-        rounded: Tensor = torch.as_tensor(actions_of(actions, count, width, fail))
+        rounded: Tensor = torch.as_tensor(parse_actions(actions, count, width, fail))
         return rounded.to(device, dtype)
     if actions.device != device:
         raise ValueError(
@@ -70,33 +70,37 @@ def actions_on(
         actions = torch.full((count, width), torch.nan, device=device)
     if not grad:
         actions = actions.detach().to(torch.float32)
-    taken: Tensor = actions.to(dtype)
-    return taken
+    commands: Tensor = actions.to(dtype)
+    return commands
 
 
-def state_of(
+def read_states(
     states: Array,
     over: npt.NDArray[np.bool_],
     reports: Array,
     capacity: int,
     device: torch.device,
     dtype: torch.dtype,
-) -> tuple[State, Tensor]:
+) -> tuple[TorchState, Tensor]:
     """The state on the device, and the keys (2, N), of packed states (N, STATE_WIDTH)."""
-    whole = torch.as_tensor(states.T.copy())
-    slow_state = read_packed(whole, capacity)
-    parts = [*(whole[part] for part in _PACKED), *slow_state]
+    packed = torch.as_tensor(states.T.copy())
+    slow_state = read_packed(packed, capacity)
+    parts = [*(packed[part] for part in _PACKED), *slow_state]
     parts += [torch.as_tensor(over.copy()), torch.as_tensor(reports.T.copy())]
-    moved = [each.to(device, None if each.dtype == torch.bool else dtype) for each in parts]
-    return State(*moved), whole[Z.clock.key_low : Z.clock.key_high + 1].to(device, torch.int64)
+    tensors = [tensor.to(device, None if tensor.dtype == torch.bool else dtype) for tensor in parts]
+    return TorchState(*tensors), packed[Z.clock.key_low : Z.clock.key_high + 1].to(
+        device, torch.int64
+    )
 
 
-def write_states(state: State, states: Array) -> None:
+def write_states(state: TorchState, states: Array) -> None:
     """Write the state into packed states (N, STATE_WIDTH), where keys and redraws already are."""
-    whole = torch.as_tensor(states.T.copy())
-    types = [None if each.dtype == torch.bool else torch.float64 for each in state]
-    here = State(*(each.to("cpu", to) for each, to in zip(state, types, strict=True)))
-    for part, values in zip(_PACKED, here, strict=False):
-        whole[part] = values
-    write_packed(here.slow_state, whole)
-    states[:] = whole.numpy().T
+    packed = torch.as_tensor(states.T.copy())
+    types = [None if tensor.dtype == torch.bool else torch.float64 for tensor in state]
+    host_state = TorchState(
+        *(tensor.to("cpu", target_dtype) for tensor, target_dtype in zip(state, types, strict=True))
+    )
+    for part, values in zip(_PACKED, host_state, strict=False):
+        packed[part] = values
+    write_packed(host_state.slow_state, packed)
+    states[:] = packed.numpy().T

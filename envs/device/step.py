@@ -4,29 +4,29 @@ that never waits for the device."""
 from typing import Any, NamedTuple
 
 from ..backend.elementary import clip
-from ..backend.on_torch import compiled, on_tensors, torch
+from ..backend.on_torch import compile_method, to_torch, torch
 from ..backend.primitives import select
 from ..engine.layout import P, Switches
-from ..engine.tick import Kind
+from ..engine.tick import StepVariant
 from ..record import Array
 from ..task.failures import BAD_ACTION, NOT_FINITE, RUNNING
 from ..task.info import REPORT
-from .gradient import Gate
+from .gradient import GradientGate
 from .observe import Observer
-from .packets import Capacity, SlowSensors, SlowState, Window
-from .ticks import Now, Ticks, start_of
+from .packets import PacketCapacity, SlowSensors, SlowState, TickWindow
+from .ticks import Ticks, TickState, make_tick_state
 
 Tensor = torch.Tensor
 
 
-class State(NamedTuple):
+class TorchState(NamedTuple):
     """The state of the rows that an env-step changes; the rows are the last axis."""
 
     motion: Tensor  # (len(Motion), N)
     drive: Tensor  # (len(Drive), N)
     driver: Tensor  # (N,)
     refs: Tensor  # (2, N)
-    lead: Tensor  # (len(Lead), N)
+    nominal_motion: Tensor  # (len(Lead), N)
     tick: Tensor
     failure: Tensor
     slow: Tensor  # the fields of `SlowState`
@@ -40,7 +40,7 @@ class State(NamedTuple):
         return SlowState(self.slow, self.queue)
 
 
-class Outcome(NamedTuple):
+class StepOutcome(NamedTuple):
     """The outcome of an env-step."""
 
     obs: Tensor  # (N, k); zeros where the row had no tick
@@ -54,7 +54,7 @@ class Outcome(NamedTuple):
     delivered: Tensor
 
 
-class Step:
+class TorchStep:
     """The env-steps of rows of one kind.
 
     kind: what chooses the plant's text. most: the slow sensors present, each with its
@@ -63,9 +63,9 @@ class Step:
 
     def __init__(
         self,
-        kind: Kind,
+        kind: StepVariant,
         n: int,
-        most: dict[int, Capacity],
+        capacities: dict[int, PacketCapacity],
         switches: Switches,
         bounds: Array,
         dtype: torch.dtype,
@@ -75,75 +75,86 @@ class Step:
     ) -> None:
         self.kind, self.n, self.dtype = kind, n, dtype
         self._ticks = Ticks(kind, dtype, compile)
-        self._slow = SlowSensors(most, kind.small_angle, dtype)
+        self._slow = SlowSensors(capacities, kind.small_angle, dtype)
         limits = torch.as_tensor(bounds, dtype=dtype, device=device)
-        self._observer = Observer(tuple(most), switches, limits, dtype, obs_dtype)
-        self._clip, self._select = on_tensors(dtype, clip, select)
-        self.conclude: Any = compiled(self._concluded) if compile else self._concluded
+        self._observer = Observer(tuple(capacities), switches, limits, dtype, obs_dtype)
+        self._clip, self._select = to_torch(dtype, clip, select)
+        self.finish_step: Any = compile_method(self._finish_step) if compile else self._finish_step
 
     def __call__(
-        self, p: Tensor, keys: Tensor, state: State, actions: Tensor
-    ) -> tuple[State, Outcome]:
+        self, p: Tensor, keys: Tensor, state: TorchState, actions: Tensor
+    ) -> tuple[TorchState, StepOutcome]:
         """(the state after one env-step, its outcome).
 
         p: (PARAMS_WIDTH, N). keys: (2, N), int64. actions: (N, width), of the floats of p; rows
         whose action is not finite fail. Rows that are over stand still.
         """
-        finite = torch.isfinite(actions).all(1)
-        gate = Gate()
-        p, state = gate(p), State(*map(gate, state))
-        shares = self._clip(torch.where(finite[:, None], actions, 0.0), -1.0, 1.0)
-        share, *turns = map(gate, shares.unbind(1))
-        turn = turns[0] if turns else torch.zeros_like(state.tick)
-        running = finite & ~state.over
-        where = state.motion, state.drive, state.driver, state.refs, state.lead, state.tick
-        start = start_of(*where, running)
-        now, rows, track = self._ticks.drive_on(p, keys, start, share, turn, self.n)
-        refused = ~finite & ~state.over
-        after: State
-        after, outcome = self.conclude(p, keys, state, now, rows, track, running, refused)
-        gate.open = after.failure != NOT_FINITE
-        return after, outcome
+        is_finite = torch.isfinite(actions).all(1)
+        gate = GradientGate()
+        p, state = gate(p), TorchState(*map(gate, state))
+        shares = self._clip(torch.where(is_finite[:, None], actions, 0.0), -1.0, 1.0)
+        yaw_share, *steer_shares = map(gate, shares.unbind(1))
+        steer_share = steer_shares[0] if steer_shares else torch.zeros_like(state.tick)
+        running = is_finite & ~state.over
+        start_fields = (
+            state.motion,
+            state.drive,
+            state.driver,
+            state.refs,
+            state.nominal_motion,
+            state.tick,
+        )
+        start = make_tick_state(*start_fields, running)
+        tick_state, rows, track = self._ticks.integrate_step(
+            p, keys, start, yaw_share, steer_share, self.n
+        )
+        is_refused = ~is_finite & ~state.over
+        next_state: TorchState
+        next_state, outcome = self.finish_step(
+            p, keys, state, tick_state, rows, track, running, is_refused
+        )
+        gate.open = next_state.failure != NOT_FINITE
+        return next_state, outcome
 
-    def _concluded(
+    def _finish_step(
         self,
         p: Tensor,
         keys: Tensor,
-        state: State,
-        now: Now,
+        state: TorchState,
+        tick_state: TickState,
         rows: Tensor,
         track: Tensor,
         running: Tensor,
         refused: Tensor,
-    ) -> tuple[State, Outcome]:
-        done, duration = now.tick - state.tick, p[P.task.duration]
-        window = Window(state.tick, now.tick, running, track)
+    ) -> tuple[TorchState, StepOutcome]:
+        done, duration = tick_state.tick - state.tick, p[P.task.duration]
+        window = TickWindow(state.tick, tick_state.tick, running, track)
         slow_state, delivered = self._slow(p, keys, state.slow_state, window)
-        obs = self._observer.observe(rows, done, now, slow_state.slow, delivered)
+        obs = self._observer.observe(rows, done, tick_state, slow_state.slow, delivered)
         obs = torch.where(running[:, None], obs, 0.0)
-        report = self._observer.report(now, duration, delivered.number)
+        report = self._observer.report(tick_state, duration, delivered.number)
         report = torch.where(running, report, state.report)
-        refusal = self._observer.refusal(now, duration, state.report)
+        refusal = self._observer.report_refusal(tick_state, duration, state.report)
         report = torch.where(refused, refusal, report)
-        failure = self._select(running, now.failure, state.failure)
+        failure = self._select(running, tick_state.failure, state.failure)
         failure = self._select(refused, BAD_ACTION * 1.0, failure)
         stepped = ~state.over
         terminated = stepped & (failure != RUNNING)
         truncated = running & (report[REPORT.ended] == 1.0) & ~terminated
-        after = State(
-            torch.stack(now.motion),
-            torch.stack(now.drive),
-            now.driver,
-            torch.stack(now.refs),
-            torch.stack(now.lead),
-            now.tick,
+        next_state = TorchState(
+            torch.stack(tick_state.motion),
+            torch.stack(tick_state.drive),
+            tick_state.driver,
+            torch.stack(tick_state.refs),
+            torch.stack(tick_state.nominal_motion),
+            tick_state.tick,
             failure,
             *slow_state,
             terminated | truncated,
             report,
         )
         rewards = torch.where(stepped, -report[REPORT.cost], 0.0)
-        return after, Outcome(
+        return next_state, StepOutcome(
             obs,
             rewards,
             terminated,

@@ -1,5 +1,5 @@
-"""The ticks of an env-step on tensors: the text of `advance` for all rows, each frozen where its
-episode ends.
+"""The ticks of an env-step on tensors: the text of `integrate_tick` for all rows, each frozen where
+its episode ends.
 
 A row that fails or whose time is over stands still from then on while the others drive on: nothing
 branches on values, so the device never waits for the host.
@@ -7,18 +7,18 @@ branches on values, so the device never waits for the host.
 
 from typing import Any, NamedTuple
 
-from ..backend.on_torch import compiled, on_tensors, torch
+from ..backend.on_torch import compile_method, to_torch, torch
 from ..backend.primitives import select
-from ..backend.random import CHANNELS, normals
-from ..engine.layout import Drive, P
-from ..engine.step import fixed_of
-from ..engine.tick import Kind, Moving, advance, changed
-from ..engine.window import judge
+from ..backend.random import CHANNELS, draw_normals
+from ..engine.layout import ActuatorState, P
+from ..engine.step import make_step_params
+from ..engine.tick import StepState, StepVariant, apply_tyre_change, integrate_tick
+from ..engine.window import compute_tick_cost
 from ..record import FAST_WIDTH
-from ..scenarios.roads import Lead
-from ..scenarios.steering import steering_at
-from ..sensors.inertial import Chance
-from ..task.failures import RUNNING, failure_of
+from ..scenarios.roads import NominalMotion
+from ..scenarios.steering import compute_steering
+from ..sensors.inertial import NormalDraws
+from ..task.failures import RUNNING, select_failure
 from ..ticks import TICK
 from ..vehicle.dynamics import Motion
 
@@ -26,7 +26,7 @@ Tensor = torch.Tensor
 Numbers = tuple[Tensor, ...]
 
 
-class Shown(NamedTuple):
+class InfoValues(NamedTuple):
     """Numbers of `info` from the last tick of a row; (N,) each."""
 
     beta: Any
@@ -36,7 +36,7 @@ class Shown(NamedTuple):
     moment: Any
 
 
-class Now(NamedTuple):
+class TickState(NamedTuple):
     """Where the rows are within an env-step; (N,) each, or tuples of such."""
 
     alive: Tensor  # not frozen yet
@@ -44,7 +44,7 @@ class Now(NamedTuple):
     drive: Numbers
     driver: Tensor
     refs: Numbers
-    lead: Numbers
+    nominal_motion: Numbers
     tick: Tensor
     failure: Tensor  # codes as floats
     cost: Tensor
@@ -57,117 +57,157 @@ class Ticks:
     """The ticks of rows of one kind. compile: a tick, and the chances of all ticks, are one call of
     `torch.compile` each."""
 
-    def __init__(self, kind: Kind, dtype: torch.dtype, compile: bool) -> None:
+    def __init__(self, kind: StepVariant, dtype: torch.dtype, compile: bool) -> None:
         self.kind = kind
-        self._normals, self._steering_at = on_tensors(dtype, normals, steering_at)
-        self._fixed, self._advance, self._changed = on_tensors(dtype, fixed_of, advance, changed)
-        self._failure_of, self._select = on_tensors(dtype, failure_of, select)
-        (self._judge,) = on_tensors(dtype, judge)
+        self._draw_normals, self._compute_steering = to_torch(dtype, draw_normals, compute_steering)
+        self._make_step_params, self._integrate_tick, self._apply_tyre_change = to_torch(
+            dtype, make_step_params, integrate_tick, apply_tyre_change
+        )
+        self._select_failure, self._select = to_torch(dtype, select_failure, select)
+        (self._compute_tick_cost,) = to_torch(dtype, compute_tick_cost)
         self._dtype = dtype
-        self.tick: Any = compiled(self._tick) if compile else self._tick
-        self.foresee: Any = compiled(self._foresee) if compile else self._foresee
+        self.tick: Any = compile_method(self._step_tick) if compile else self._step_tick
+        self.precompute_window: Any = (
+            compile_method(self._precompute_window) if compile else self._precompute_window
+        )
 
-    def _foresee(self, p: Tensor, keys: Tensor, first: Tensor, n: int) -> tuple[Numbers, Any]:
+    def _precompute_window(
+        self, p: Tensor, keys: Tensor, first: Tensor, n: int
+    ) -> tuple[Numbers, Any]:
         """(eight normal numbers, the programme's steering) of n ticks from `first` on, (n, N)."""
         ticks = first + torch.arange(n, device=first.device)[:, None]
-        whole = ticks.to(torch.int64)
-        inertial = self._normals(keys[0], keys[1], whole, CHANNELS.inertial)
-        wheels = self._normals(keys[0], keys[1], whole, CHANNELS.wheels)
-        if self.kind.follows:
+        tick_numbers = ticks.to(torch.int64)
+        inertial = self._draw_normals(keys[0], keys[1], tick_numbers, CHANNELS.inertial)
+        wheels = self._draw_normals(keys[0], keys[1], tick_numbers, CHANNELS.wheels)
+        if self.kind.has_driver:
             return inertial + wheels, None
-        programme = p[P.programme[0] :]
-        return inertial + wheels, self._steering_at(ticks.to(self._dtype), programme)
+        profile = p[P.steering_profile[0] :]
+        return inertial + wheels, self._compute_steering(ticks.to(self._dtype), profile)
 
-    def _tick(
-        self, p: Tensor, share: Tensor, turn: Tensor, now: Now, chance: Numbers, ahead: Any
-    ) -> Now:
+    def _step_tick(
+        self,
+        p: Tensor,
+        yaw_share: Tensor,
+        steer_share: Tensor,
+        tick_state: TickState,
+        draws: Numbers,
+        next_steer: Any,
+    ) -> TickState:
         """One tick of the rows that are alive.
 
         p: (PARAMS_WIDTH, N). share, turn: (N,), of the yaw moment and the added steering.
         """
         pick = self._select
-        fixed = self._fixed(p)
-        task = fixed.task
-        car = self._changed(fixed.car, fixed.change, now.tick > fixed.change.tick)
+        params = self._make_step_params(p)
+        task = params.task
+        car = self._apply_tyre_change(
+            params.car, params.tyre_change, tick_state.tick > params.tyre_change.tick
+        )
         # the load at the tick's start is computed anew where `anywhere` holds, and here it does
-        motion, drive, lead = Motion(*now.motion), Drive(*now.drive), Lead(*now.lead)
-        before = Moving(motion, drive, None, now.driver, car, now.refs, lead)
-        after, seen = self._advance(
-            fixed,
-            share * task.yaw_scale,
-            turn * task.authority,
-            before,
-            now.tick,
-            Chance(chance[:4], chance[4:]),
-            ahead,
+        motion, drive, nominal_motion = (
+            Motion(*tick_state.motion),
+            ActuatorState(*tick_state.drive),
+            NominalMotion(*tick_state.nominal_motion),
+        )
+        state = StepState(
+            motion, drive, None, tick_state.driver, car, tick_state.refs, nominal_motion
+        )
+        next_state, measured = self._integrate_tick(
+            params,
+            yaw_share * task.yaw_scale,
+            steer_share * task.authority,
+            state,
+            tick_state.tick,
+            NormalDraws(draws[:4], draws[4:]),
+            next_steer,
             self.kind,
         )
-        alive, fit = now.alive, now.alive & ~seen.lost
-        tick = now.tick + alive
-        found = self._judge(after.motion, seen.past, task, fixed.path, self.kind)
-        failure = self._failure_of(seen.lost, found.spun, found.off)
-        refs = [pick(seen.lost, 0.0, each) for each in seen.refs]
-        shown = (pick(seen.lost, 0.0, found.beta), *refs, seen.steer, seen.moment)
-
-        def chosen(where: Tensor, new: Any, old: Any) -> Numbers:
-            return tuple(pick(where, a, b) for a, b in zip(new, old, strict=True))
-
-        return Now(
-            alive & (failure == RUNNING) & (tick < task.duration),
-            chosen(fit, after.motion, now.motion),
-            chosen(alive, after.drive, now.drive),
-            pick(alive, after.driver, now.driver),
-            chosen(alive, refs, now.refs),
-            chosen(alive, after.lead, now.lead),
-            tick,
-            pick(alive, failure, now.failure),
-            now.cost + pick(alive, found.cost * TICK, 0.0),
-            chosen(alive, shown, now.shown),
-            chosen(alive, seen.row, now.row),
-            chosen(alive, after.motion, now.track),
+        alive, is_fit = tick_state.alive, tick_state.alive & ~measured.lost
+        tick = tick_state.tick + alive
+        tick_cost = self._compute_tick_cost(
+            next_state.motion, measured.cost_inputs, task, params.path, self.kind
+        )
+        failure = self._select_failure(measured.lost, tick_cost.spun, tick_cost.off)
+        refs = [pick(measured.lost, 0.0, ref) for ref in measured.refs]
+        info_values = (
+            pick(measured.lost, 0.0, tick_cost.beta),
+            *refs,
+            measured.steer,
+            measured.moment,
         )
 
-    def drive_on(
-        self, p: Tensor, keys: Tensor, start: Now, share: Tensor, turn: Tensor, n: int
-    ) -> tuple[Now, Tensor, Tensor]:
+        def select_rows(where: Tensor, new: Any, old: Any) -> Numbers:
+            return tuple(pick(where, a, b) for a, b in zip(new, old, strict=True))
+
+        return TickState(
+            alive & (failure == RUNNING) & (tick < task.duration),
+            select_rows(is_fit, next_state.motion, tick_state.motion),
+            select_rows(alive, next_state.drive, tick_state.drive),
+            pick(alive, next_state.driver, tick_state.driver),
+            select_rows(alive, refs, tick_state.refs),
+            select_rows(alive, next_state.nominal_motion, tick_state.nominal_motion),
+            tick,
+            pick(alive, failure, tick_state.failure),
+            tick_state.cost + pick(alive, tick_cost.cost * TICK, 0.0),
+            select_rows(alive, info_values, tick_state.shown),
+            select_rows(alive, measured.row, tick_state.row),
+            select_rows(alive, next_state.motion, tick_state.track),
+        )
+
+    def integrate_step(
+        self,
+        p: Tensor,
+        keys: Tensor,
+        start: TickState,
+        yaw_share: Tensor,
+        steer_share: Tensor,
+        n: int,
+    ) -> tuple[TickState, Tensor, Tensor]:
         """n ticks, fewer for rows that fail or end: (where they are then, the fast rows, the
         motions), of the latter (n, width, N); a row's last ones stand for those it does not have.
         """
-        chances, ahead = self.foresee(p, keys, start.tick + 1, n)
-        now, rows, track = start, [], []
+        all_draws, steering = self.precompute_window(p, keys, start.tick + 1, n)
+        tick_state, rows, track = start, [], []
         for j in range(n):
-            chance = tuple(each[j] for each in chances)
-            now = self.tick(p, share, turn, now, chance, None if ahead is None else ahead[j])
-            rows.append(torch.stack(now.row))
-            track.append(torch.stack(now.track))
-        return now, torch.stack(rows), torch.stack(track)
+            draws = tuple(normals_of[j] for normals_of in all_draws)
+            tick_state = self.tick(
+                p,
+                yaw_share,
+                steer_share,
+                tick_state,
+                draws,
+                None if steering is None else steering[j],
+            )
+            rows.append(torch.stack(tick_state.row))
+            track.append(torch.stack(tick_state.track))
+        return tick_state, torch.stack(rows), torch.stack(track)
 
 
-def start_of(
+def make_tick_state(
     motion: Tensor,
     drive: Tensor,
     driver: Tensor,
     refs: Tensor,
-    lead: Tensor,
+    nominal_motion: Tensor,
     tick: Tensor,
     alive: Tensor,
-) -> Now:
+) -> TickState:
     """Where rows are at the start of an env-step."""
-    zeros = tick.new_zeros((2 + len(Shown._fields) + FAST_WIDTH, len(tick)))
-    failure, cost, *others = zeros.unbind(0)
-    shown, row = others[: len(Shown._fields)], others[len(Shown._fields) :]
+    zeros = tick.new_zeros((2 + len(InfoValues._fields) + FAST_WIDTH, len(tick)))
+    failure, cost, *numbers = zeros.unbind(0)
+    info_values, row = numbers[: len(InfoValues._fields)], numbers[len(InfoValues._fields) :]
     # no tensor stands twice: torch.compile would compile the first tick and the others apart
-    return Now(
+    return TickState(
         alive,
         motion.unbind(0),
         drive.unbind(0),
         driver,
         refs.unbind(0),
-        lead.unbind(0),
+        nominal_motion.unbind(0),
         tick,
         failure,
         cost,
-        tuple(shown),
+        tuple(info_values),
         tuple(row),
         motion.unbind(0),
     )

@@ -5,80 +5,86 @@ from typing import Any
 import numpy as np
 
 from ..backend.on_torch import torch
-from ..engine.episodes import Episodes, Whole
+from ..engine.episodes import EpisodeBatch, IntArray
 from ..record import PACKET_WIDTH
-from .gradient import NOTHING, Attached, Inputs, with_motion
-from .packets import Capacity
-from .start import Start
-from .state import state_of, write_states
-from .step import Outcome, State
+from .gradient import NO_TENSORS, AttachedParameters, ResetTensors, replace_motion
+from .packets import PacketCapacity
+from .start import TorchReset
+from .state import read_states, write_states
+from .step import StepOutcome, TorchState
 
 Tensor = torch.Tensor
-_RECORD = Outcome._fields.index("rows")  # from here on the rows are the last axis
+_RECORD = StepOutcome._fields.index("rows")  # from here on the rows are the last axis
 
 
 class DeviceRows:
     """Parameters, keys, state and last outcome of episodes, as tensors on a device.
 
-    most: the slow sensors present and each one's capacity. start: tick 0 on tensors, for
+    capacities: the slow sensors present and each one's capacity. start: tick 0 on tensors, for
     gradients; without one parameters stay where they are, for a graph that reads them there.
     """
 
     def __init__(
         self,
-        episodes: Episodes,
-        most: dict[int, Capacity],
+        episodes: EpisodeBatch,
+        capacities: dict[int, PacketCapacity],
         device: torch.device,
         dtype: torch.dtype,
-        start: Start | None = None,
+        start: TorchReset | None = None,
     ) -> None:
-        self.most, self._device, self._dtype = most, device, dtype
-        self._start, self._attached = start, Attached()
+        self.capacities, self._device, self._dtype = capacities, device, dtype
+        self._start, self._attached = start, AttachedParameters()
         self._obs_dtype = dtype if start else torch.float32
-        self._capacity = sum(each.under_way for each in most.values())
-        self._packets = self._capacity + sum(each.frames * each.copies for each in most.values())
-        everything = np.arange(len(episodes.params))
-        self._numbers, self.keys, self.state, self.outcome = self._of(episodes, everything)
-        self.params = self._numbers
+        self._capacity = sum(capacity.under_way for capacity in capacities.values())
+        self._packets = self._capacity + sum(
+            capacity.frames * capacity.copies for capacity in capacities.values()
+        )
+        all_rows = np.arange(len(episodes.params))
+        self._packed_params, self.keys, self.state, self.outcome = self._read_rows(
+            episodes, all_rows
+        )
+        self.params = self._packed_params
 
-    def take_over(self, episodes: Episodes, rows: Whole, inputs: Inputs = NOTHING) -> None:
+    def upload(
+        self, episodes: EpisodeBatch, rows: IntArray, inputs: ResetTensors = NO_TENSORS
+    ) -> None:
         """Bring rows of the episodes that were reset to the device, and with them the inputs."""
-        params, keys, state, outcome = self._of(episodes, rows)
-        place = torch.as_tensor(rows, device=self._device)
+        params, keys, state, outcome = self._read_rows(episodes, rows)
+        row_index = torch.as_tensor(rows, device=self._device)
         if self._start is None:
-            self.params.index_copy_(-1, place, params)
+            self.params.index_copy_(-1, row_index, params)
         else:
-            self._numbers = self._numbers.index_copy(-1, place, params)
-            self._attached.put(place, episodes.configs, inputs.parameters)
-            self.params = self._attached.into(self._numbers)
-            state = state._replace(motion=with_motion(state.motion, inputs.state, place))
-            state, outcome = self._start(self.params[:, place], keys, state)
+            self._packed_params = self._packed_params.index_copy(-1, row_index, params)
+            self._attached.put(row_index, episodes.configs, inputs.parameters)
+            self.params = self._attached.insert_tensors(self._packed_params)
+            state = state._replace(motion=replace_motion(state.motion, inputs.state, row_index))
+            state, outcome = self._start(self.params[:, row_index], keys, state)
         if len(rows) == len(episodes.params):
             self.keys.copy_(keys)
             self.state, self.outcome = state, outcome
             return
 
-        def merged(old: Tensor, new: Tensor, axis: int = -1) -> Tensor:
-            return old.index_copy(axis, place, new)
+        def merge(old: Tensor, new: Tensor, axis: int = -1) -> Tensor:
+            return old.index_copy(axis, row_index, new)
 
-        self.keys.index_copy_(-1, place, keys)
-        self.state = State(*map(merged, self.state, state))
+        self.keys.index_copy_(-1, row_index, keys)
+        self.state = TorchState(*map(merge, self.state, state))
         before = self.outcome
-        record = map(merged, before[_RECORD:], outcome[_RECORD:])
-        self.outcome = Outcome(merged(before.obs, outcome.obs, 0), *before[1:_RECORD], *record)
+        record = map(merge, before[_RECORD:], outcome[_RECORD:])
+        self.outcome = StepOutcome(merge(before.obs, outcome.obs, 0), *before[1:_RECORD], *record)
 
     def detach(self) -> None:
         """State and outcome without their graph, and the parameters with a new one."""
-        self.state = State(*(each.detach() for each in self.state))
-        self.outcome = Outcome(*(each.detach() for each in self.outcome))
-        self.params = self._attached.into(self._numbers)
+        self.state = TorchState(*(tensor.detach() for tensor in self.state))
+        self.outcome = StepOutcome(*(tensor.detach() for tensor in self.outcome))
+        self.params = self._attached.insert_tensors(self._packed_params)
 
-    def give_back(self, episodes: Episodes) -> None:
+    def download(self, episodes: EpisodeBatch) -> None:
         """Write state, outcome and the inputs' numbers into the episodes."""
         self._attached.write(self.params, episodes.params)
-        state = State(*(each.detach() for each in self.state))
+        state = TorchState(*(tensor.detach() for tensor in self.state))
         write_states(state, episodes.states)
-        outcome = Outcome(*(each.detach().cpu() for each in self.outcome))
+        outcome = StepOutcome(*(tensor.detach().cpu() for tensor in self.outcome))
         packets = outcome.packets.permute(2, 0, 1)
         width = min(packets.shape[1], episodes.packets.shape[1])
         episodes.packets[:, :width] = packets[:, :width]
@@ -88,14 +94,16 @@ class DeviceRows:
         episodes.obs[:] = outcome.obs
         episodes.ticks_done[:], episodes.delivered[:] = outcome.done, outcome.delivered
 
-    def _of(self, episodes: Episodes, rows: Whole) -> tuple[Tensor, Tensor, State, Outcome]:
+    def _read_rows(
+        self, episodes: EpisodeBatch, rows: IntArray
+    ) -> tuple[Tensor, Tensor, TorchState, StepOutcome]:
         """(params, keys, state, the last step's outcome) of some rows."""
         device, dtype = self._device, self._dtype
 
-        def there(array: Any, *axes: int) -> Tensor:
+        def to_device(array: Any, *axes: int) -> Tensor:
             return torch.as_tensor(array.transpose(*axes).copy()).to(device, dtype)
 
-        state, keys = state_of(
+        state, keys = read_states(
             episodes.states[rows],
             episodes.over[rows],
             episodes.reports[rows],
@@ -106,16 +114,16 @@ class DeviceRows:
         packets = np.zeros((len(rows), self._packets, PACKET_WIDTH))
         width = min(self._packets, episodes.packets.shape[1])
         packets[:, :width] = episodes.packets[rows, :width]
-        none = torch.zeros(len(rows), dtype=torch.bool, device=device)
-        outcome = Outcome(
+        no_rows = torch.zeros(len(rows), dtype=torch.bool, device=device)
+        outcome = StepOutcome(
             torch.as_tensor(episodes.obs[rows]).to(device, self._obs_dtype),
             torch.zeros(len(rows), dtype=dtype, device=device),
-            none,
-            none,
-            none,
-            there(episodes.rows[rows], 1, 2, 0),
-            there(packets, 1, 2, 0),
+            no_rows,
+            no_rows,
+            no_rows,
+            to_device(episodes.rows[rows], 1, 2, 0),
+            to_device(packets, 1, 2, 0),
             torch.as_tensor(episodes.ticks_done[rows]).to(device),
             torch.as_tensor(episodes.delivered[rows]).to(device),
         )
-        return there(episodes.params[rows], 1, 0), keys, state, outcome
+        return to_device(episodes.params[rows], 1, 0), keys, state, outcome

@@ -4,18 +4,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..backend.arrays import integers, matrix, offsets, read, singles
-from ..backend.decorators import jit, plain
+from ..backend.arrays import as_float32, as_int64, as_matrix, make_offsets, read
+from ..backend.decorators import as_python, jit
 from ..record import FAST_WIDTH, PACKET_WIDTH, Array
 from ..task.info import REPORT
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH
-from .window import HEIGHT, columns_of
+from .window import WINDOW_HEIGHT, count_columns
 
 
-class Row(NamedTuple):
+class EpisodeArrays(NamedTuple):
     """One episode's arrays."""
 
-    p: Any  # (PARAMS_WIDTH,), packed as in `Params`; behind it a recorded trace, if there is one
+    # (PARAMS_WIDTH,), packed as in `EpisodeParams`; behind it a recorded trace, if there is one
+    p: Any
     z: Any  # (STATE_WIDTH,), packed as in `State`
     switches: Any  # (len(Switches),) int64
     obs: Any  # (k,) float32
@@ -24,95 +25,99 @@ class Row(NamedTuple):
     report: Any  # (len(Report),)
 
 
-class Sizes(NamedTuple):
+class WorkspaceSizes(NamedTuple):
     """What a workspace begins with."""
 
     n: Any  # ticks a step
-    entries: Any  # of an observation
-    most: Any  # packets of a step
+    n_entries: Any  # of an observation
+    max_packets: Any  # packets of a step
 
 
-SIZES, _START = offsets(Sizes)
+SIZES, _HEADER = make_offsets(WorkspaceSizes)
 
 
-def workspace_of(n: int, bounds: Array, most: int, trace: int = 0) -> Array:
+def make_workspace(n: int, bounds: Array, max_packets: int, trace_width: int = 0) -> Array:
     """The arrays of an episode, one behind the other in one vector: numba takes 0.04 us for every
-    array that it is handed. `parts_of` finds them.
+    array that it is handed. `split_workspace` finds them.
 
     bounds: (2, k), of an observation's entries. trace: the numbers behind the parameters.
     """
     k = bounds.shape[1]
-    width = _START + STATE_WIDTH + len(REPORT) + len(FLAGS) + 2 * k - (-k // 2)
-    width += n * FAST_WIDTH + most * PACKET_WIDTH + HEIGHT * columns_of(n)
-    work = np.zeros(width + PARAMS_WIDTH + trace)
-    work[:_START] = n, k, most
-    _parts_of(work)[1][:] = bounds
-    return work
+    width = _HEADER + STATE_WIDTH + len(REPORT) + len(FLAGS) + 2 * k - (-k // 2)
+    width += n * FAST_WIDTH + max_packets * PACKET_WIDTH + WINDOW_HEIGHT * count_columns(n)
+    workspace = np.zeros(width + PARAMS_WIDTH + trace_width)
+    workspace[:_HEADER] = n, k, max_packets
+    _split_workspace(workspace)[1][:] = bounds
+    return workspace
 
 
 @jit
-def parts_of(work: Any) -> Any:
+def split_workspace(workspace: Any) -> Any:
     """(the episode's Row, the bounds of its observation, its window) that lie in a workspace."""
-    sizes = read(work, SIZES)
-    n, k, most = int(sizes.n), int(sizes.entries), int(sizes.most)
-    report = _START + STATE_WIDTH
+    sizes = read(workspace, SIZES)
+    n, k, max_packets = int(sizes.n), int(sizes.n_entries), int(sizes.max_packets)
+    report = _HEADER + STATE_WIDTH
     flags = report + len(REPORT)
     bounds = flags + len(FLAGS)
     window = bounds + 2 * k
-    rows = window + HEIGHT * columns_of(n)
+    rows = window + WINDOW_HEIGHT * count_columns(n)
     packets = rows + n * FAST_WIDTH
-    obs = packets + most * PACKET_WIDTH
-    row = Row(
-        work[obs - (-k // 2) :],
-        work[_START:report],
-        integers(work, flags, len(FLAGS)),
-        singles(work, obs, k),
-        matrix(work, rows, n, FAST_WIDTH),
-        matrix(work, packets, most, PACKET_WIDTH),
-        work[report:flags],
+    obs = packets + max_packets * PACKET_WIDTH
+    row = EpisodeArrays(
+        workspace[obs - (-k // 2) :],
+        workspace[_HEADER:report],
+        as_int64(workspace, flags, len(FLAGS)),
+        as_float32(workspace, obs, k),
+        as_matrix(workspace, rows, n, FAST_WIDTH),
+        as_matrix(workspace, packets, max_packets, PACKET_WIDTH),
+        workspace[report:flags],
     )
-    return row, matrix(work, bounds, 2, k), matrix(work, window, HEIGHT, columns_of(n))
+    return (
+        row,
+        as_matrix(workspace, bounds, 2, k),
+        as_matrix(workspace, window, WINDOW_HEIGHT, count_columns(n)),
+    )
 
 
-_parts_of = plain(parts_of)
-_PARTS = (
+_split_workspace = as_python(split_workspace)
+_VIEW_NAMES = (
     "_row", "_params", "_state", "_switches", "_obs", "rows", "packets", "_report", "_bounds",
-    "_window", "_told", "_observation",
+    "_window", "_read_report", "_copy_observation",
 )  # fmt: skip
 
 
-class Packed:
-    """An environment of one car, whose arrays are parts of `_work`.
+class WorkspaceMixin:
+    """An environment of one car, whose arrays are parts of `_workspace`.
 
     `rows` and `packets` are the newest record's; `delivered` of the latter are there.
     """
 
     config: Any
     control_period: int
-    _work: Array | None = None
+    _workspace: Array | None = None
 
-    def _make_room(self, width: int) -> None:
+    def _allocate(self, width: int) -> None:
         """A workspace for parameters and a trace behind them, `width` numbers, where they are not
         as many as before."""
-        if self._work is None or len(self._params) != width:
+        if self._workspace is None or len(self._params) != width:
             config, trace = self.config, width - PARAMS_WIDTH
-            most = config.most_packets
-            self._work = workspace_of(self.control_period, config.bounds, most, trace)
-            self._lay_out()
+            max_packets = config.max_packets
+            self._workspace = make_workspace(self.control_period, config.bounds, max_packets, trace)
+            self._bind_views()
 
-    def _lay_out(self) -> None:
+    def _bind_views(self) -> None:
         """Name the parts, and the calls that read them in every step."""
-        self._row, self._bounds, self._window = _parts_of(self._work)
+        self._row, self._bounds, self._window = _split_workspace(self._workspace)
         self._params, self._state, self._switches, self._obs, *record = self._row
         self.rows, self.packets, self._report = record
-        self._told, self._observation = self._report.tolist, self._obs.copy
+        self._read_report, self._copy_observation = self._report.tolist, self._obs.copy
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: each for name, each in vars(self).items() if name not in _PARTS}
+        return {name: value for name, value in vars(self).items() if name not in _VIEW_NAMES}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self._lay_out()
+        self._bind_views()
 
     @property
     def delivered(self) -> int:
@@ -120,7 +125,7 @@ class Packed:
         return int(self._report[REPORT.packets])
 
 
-class Rows(NamedTuple):
+class BatchArrays(NamedTuple):
     """The arrays of N episodes, a row for each."""
 
     params: Any  # (N, ...), the rest as in `Row`
@@ -135,7 +140,7 @@ class Rows(NamedTuple):
     over: Any  # (N,) of bool: the episode has ended and was not reset yet
 
 
-class Records(NamedTuple):
+class RecordArrays(NamedTuple):
     """The records of N episodes."""
 
     rows: Any
@@ -144,7 +149,7 @@ class Records(NamedTuple):
     delivered: Any
 
 
-class Start(NamedTuple):
+class EpisodeStart(NamedTuple):
     """The packed start of an episode; of several, arrays have an axis more, the first."""
 
     params: Any  # as in `Row`, with what the scenario does not draw
@@ -155,23 +160,23 @@ class Start(NamedTuple):
 
 
 @jit
-def row_of(rows: Rows, i: int) -> Row:
+def get_episode_arrays(batch: BatchArrays, i: int) -> EpisodeArrays:
     """The arrays of an episode of several."""
-    return Row(
-        rows.params[i],
-        rows.states[i],
-        rows.switches[i],
-        rows.obs[i],
-        rows.rows[i],
-        rows.packets[i],
-        rows.reports[i],
+    return EpisodeArrays(
+        batch.params[i],
+        batch.states[i],
+        batch.switches[i],
+        batch.obs[i],
+        batch.rows[i],
+        batch.packets[i],
+        batch.reports[i],
     )
 
 
 @jit
-def start_of(starts: Start, i: int) -> Start:
+def get_episode_start(starts: EpisodeStart, i: int) -> EpisodeStart:
     """The start of one of several episodes."""
-    return Start(
+    return EpisodeStart(
         starts.params[i],
         starts.low[i],
         starts.high[i],

@@ -2,17 +2,17 @@
 
 from typing import Any
 
-from ..backend.arrays import lane_count
-from ..backend.decorators import copied, jit
+from ..backend.arrays import count_lanes
+from ..backend.decorators import copy_into, jit
 from ..task.failures import REFUSED, RUNNING
 from ..task.info import REPORT
-from .arrays import Records, Rows, Start, row_of, start_of
-from .lanes import Block, step_block
+from .arrays import BatchArrays, EpisodeStart, RecordArrays, get_episode_arrays, get_episode_start
+from .lanes import LaneBuffers, step_lanes
 from .layout import FLAGS
 from .reset import reset_vehicle
-from .step import kind_of, shares_of, step_vehicle, wild_of
+from .step import check_action_range, clip_action, make_step_variant, step_vehicle
 
-_FEW = 2  # up to so many vehicles are stepped one by one
+_MAX_SCALAR = 2  # up to so many vehicles are stepped one by one
 
 
 @jit
@@ -33,75 +33,83 @@ def step_rows(
     rewards: Any,
     terminated: Any,
     truncated: Any,
-    block: Block,
+    buffers: LaneBuffers,
 ) -> int:
     """One env-step of every row, and how many episodes ended.
 
-    The first ten are `Rows`, one by one as in `step_vehicle`. Rows whose episode is `over` stand
-    still, with reward 0, and do not end again; then those that ended in this step are. Adds WILD
-    for an action that is. Returns REFUSED, and steps nothing, where an action that is not to fail
-    its row is not finite.
+    The first ten are `BatchArrays`, one by one as in `step_vehicle`. Rows whose episode is `over`
+    stand still, with reward 0, and do not end again; then those that ended in this step are. Adds
+    WILD for an action that is. Returns REFUSED, and steps nothing, where an action that is not to
+    fail its row is not finite.
     """
-    ended = 0
-    every = Rows(params, states, switches, obs, rows, packets, reports, ticks_done, delivered, over)
+    n_ended = 0
+    batch = BatchArrays(
+        params, states, switches, obs, rows, packets, reports, ticks_done, delivered, over
+    )
     for i in range(len(over)):
         if switches[i, FLAGS.fail_bad] == 0 and not over[i]:
             for share in actions[i]:
                 if float(share) - float(share) != 0.0:
                     return REFUSED
         if not over[i]:
-            ended |= wild_of(actions[i])
-    waiting, last = 0, len(over) - 1
+            n_ended |= check_action_range(actions[i])
+    n_pending, last = 0, len(over) - 1
     for m in range(len(over)):
-        i = block.order[m]
+        i = buffers.order[m]
         if not over[i]:
-            share, _ = shares_of(actions[i])
+            share, _ = clip_action(actions[i])
             if share != share:
-                ticks_done[i] = _step_alone(i, every, actions, n, bounds, block)
+                ticks_done[i] = _step_single(i, batch, actions, n, bounds, buffers)
                 obs[i, :] = 0.0
             else:
-                block.members[waiting] = i
-                waiting += 1
-        if waiting and (waiting == lane_count() or m == last or _kinds_differ(m, every, block)):
-            together = False
-            if waiting > _FEW:
-                together = step_block(waiting, every, actions, n, bounds, block)
-            for lane in range(waiting):
-                i = block.members[lane]
-                done = n if together else _step_alone(i, every, actions, n, bounds, block)
+                buffers.members[n_pending] = i
+                n_pending += 1
+        if n_pending and (
+            n_pending == count_lanes() or m == last or _has_variant_change(m, batch, buffers)
+        ):
+            is_vectorised = False
+            if n_pending > _MAX_SCALAR:
+                is_vectorised = step_lanes(n_pending, batch, actions, n, bounds, buffers)
+            for lane in range(n_pending):
+                i = buffers.members[lane]
+                done = n if is_vectorised else _step_single(i, batch, actions, n, bounds, buffers)
                 ticks_done[i] = done
-            waiting = 0
+            n_pending = 0
     for i in range(len(over)):
         if over[i]:
             rewards[i], terminated[i], truncated[i], over[i] = 0.0, False, False, False
             continue
         report = reports[i]
         delivered[i] = int(report[REPORT.packets])
-        rewards[i], terminated[i], truncated[i] = ends_of(report)
+        rewards[i], terminated[i], truncated[i] = read_ends(report)
         over[i] = terminated[i] or truncated[i]
         if over[i]:
-            ended += 1
-    return ended
+            n_ended += 1
+    return n_ended
 
 
 @jit
-def ends_of(report: Any) -> tuple[float, bool, bool]:
+def read_ends(report: Any) -> tuple[float, bool, bool]:
     """(reward, terminated, truncated) of a step's report."""
     terminated = report[REPORT.failure] != RUNNING
     return -report[REPORT.cost], terminated, report[REPORT.ended] == 1.0 and not terminated
 
 
 @jit
-def _kinds_differ(m: int, rows: Rows, block: Block) -> bool:
+def _has_variant_change(m: int, batch: BatchArrays, buffers: LaneBuffers) -> bool:
     """Whether the next row in order has another text than this one."""
-    i, j = block.order[m], block.order[m + 1]
-    mine, next_one = rows.switches[i], rows.switches[j]
-    return bool(kind_of(rows.params[i], mine) != kind_of(rows.params[j], next_one))
+    i, j = buffers.order[m], buffers.order[m + 1]
+    flags, next_flags = batch.switches[i], batch.switches[j]
+    return bool(
+        make_step_variant(batch.params[i], flags) != make_step_variant(batch.params[j], next_flags)
+    )
 
 
 @jit
-def _step_alone(i: int, rows: Rows, actions: Any, n: int, bounds: Any, block: Block) -> int:
-    row = row_of(rows, i)
+def _step_single(
+    i: int, batch: BatchArrays, actions: Any, n: int, bounds: Any, buffers: LaneBuffers
+) -> int:
+    row = get_episode_arrays(batch, i)
     return int(
         step_vehicle(
             row.p,
@@ -114,27 +122,35 @@ def _step_alone(i: int, rows: Rows, actions: Any, n: int, bounds: Any, block: Bl
             actions[i],
             n,
             bounds,
-            block.alone,
+            buffers.single_window,
         )
     )
 
 
 @jit
 def reset_rows(
-    chosen: Any, of: Any, starts: Start, keys: Any, bounds: Any, rows: Rows, final: Records
+    chosen: Any,
+    start_index: Any,
+    starts: EpisodeStart,
+    keys: Any,
+    bounds: Any,
+    batch: BatchArrays,
+    final: RecordArrays,
 ) -> None:
     """Reset the chosen rows (M,), whose records go into `final` before.
 
-    of: (M,), each one's place in `starts`. keys: (M, 2), two words of 32 bits.
+    start_index: (M,), each one's place in `starts`. keys: (M, 2), two words of 32 bits.
     """
     for m in range(len(chosen)):
-        i, t = chosen[m], of[m]
-        for j in range(rows.ticks_done[i]):
-            copied(rows.rows[i, j], final.rows[i, j])
-        for j in range(rows.delivered[i]):
-            copied(rows.packets[i, j], final.packets[i, j])
-        final.ticks_done[i], final.delivered[i] = rows.ticks_done[i], rows.delivered[i]
+        i, t = chosen[m], start_index[m]
+        for j in range(batch.ticks_done[i]):
+            copy_into(batch.rows[i, j], final.rows[i, j])
+        for j in range(batch.delivered[i]):
+            copy_into(batch.packets[i, j], final.packets[i, j])
+        final.ticks_done[i], final.delivered[i] = batch.ticks_done[i], batch.delivered[i]
         key_low, key_high = int(keys[m, 0]), int(keys[m, 1])
-        reset_vehicle(start_of(starts, t), key_low, key_high, bounds, row_of(rows, i))
-        rows.ticks_done[i] = 1
-        rows.delivered[i] = int(rows.reports[i, REPORT.packets])
+        reset_vehicle(
+            get_episode_start(starts, t), key_low, key_high, bounds, get_episode_arrays(batch, i)
+        )
+        batch.ticks_done[i] = 1
+        batch.delivered[i] = int(batch.reports[i, REPORT.packets])

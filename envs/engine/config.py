@@ -8,25 +8,35 @@ from typing import Any
 
 import numpy as np
 
-from ..arguments import brief, check_choice, is_finite, listed, mapping_of, number_of, unknown_names
+from ..arguments import (
+    check_choice,
+    check_mapping,
+    check_number,
+    describe_unknown,
+    is_finite,
+    join_names,
+    short_repr,
+)
 from ..quantities import check_plausible
 from ..record import Array
-from ..scenarios.checks import SHORTEST_GPS_PERIOD
-from ..scenarios.draws import range_of
-from ..scenarios.manoeuvres import scenario_from
+from ..scenarios.checks import MIN_GPS_PERIOD
+from ..scenarios.draws import get_range
+from ..scenarios.manoeuvres import make_scenario
 from ..scenarios.scenario import Scenario
-from ..sensors.camera.detector import DELAYS, SLOWEST, VISIONS, detector, ticks_taken
-from ..sensors.link import IN_FLIGHT, SlowSensor
-from ..sensors.slow import SENSOR_SETS, SLOW_NAMES, with_changes
-from ..task.observation import Entry, observation_layout
-from ..ticks import TICK, ticks
+from ..sensors.camera.detector import DELAYS, MAX_DELAY, VISIONS, count_delay_ticks, load_detector
+from ..sensors.link import MAX_IN_FLIGHT, SlowSensor
+from ..sensors.slow import SENSOR_SETS, SLOW_NAMES, apply_changes
+from ..task.observation import ObservationEntry, make_observation_layout
+from ..ticks import TICK, count_ticks
 from ..vehicle.dynamics import Motion
 from ..vehicle.vehicle import Vehicle
-from ..vehicle.vehicles import vehicle_from
-from .packing import EpisodeConfig, episode_config
+from ..vehicle.vehicles import make_vehicle
+from .packing import EpisodeConfig, make_episode_config
 
 
-def in_scenario(sensors: dict[str, SlowSensor], scenario: Scenario) -> dict[str, SlowSensor]:
+def apply_scenario_clocks(
+    sensors: dict[str, SlowSensor], scenario: Scenario
+) -> dict[str, SlowSensor]:
     """The sensors with the clocks and delays of a scenario: its fields `<sensor>_period`,
     `<sensor>_delays` and, with these, `<sensor>_jitter`, and `<sensor>_loss`, where it has them. A
     drawn `<sensor>_latency` is described by the worst case: the least of it as a delay, the rest
@@ -41,7 +51,9 @@ def in_scenario(sensors: dict[str, SlowSensor], scenario: Scenario) -> dict[str,
             sensor = dataclasses.replace(sensor, delays=delays, jitter=jitter)
         if loss := getattr(scenario, f"{name}_loss", 0.0):
             sensor = dataclasses.replace(sensor, loss=loss)
-        low, high = (ticks(end) for end in range_of(getattr(scenario, f"{name}_latency", 0.0)))
+        low, high = (
+            count_ticks(end) for end in get_range(getattr(scenario, f"{name}_latency", 0.0))
+        )
         if high > 0.0:
             sensor = dataclasses.replace(
                 sensor,
@@ -52,27 +64,27 @@ def in_scenario(sensors: dict[str, SlowSensor], scenario: Scenario) -> dict[str,
     return changed
 
 
-def most_packets(sensor: SlowSensor, n: int) -> int:
+def count_max_packets(sensor: SlowSensor, n: int) -> int:
     """The worst case: all frames of a step, doubled, and all that were under way."""
-    period = min(sensor.period, SHORTEST_GPS_PERIOD)  # of any scenario
-    return 2 * (n // int(ticks(period)) + 1) + IN_FLIGHT
+    period = min(sensor.period, MIN_GPS_PERIOD)  # of any scenario
+    return 2 * (n // int(count_ticks(period)) + 1) + MAX_IN_FLIGHT
 
 
-def detected(camera: SlowSensor, delay: str | None) -> SlowSensor:
+def apply_detector_clock(camera: SlowSensor, delay: str | None) -> SlowSensor:
     """The camera whose pictures a detector looks at: its delay is described by its range.
 
     Raises ValueError where a picture would arrive as it is taken.
     """
     if delay == "link":
-        if ticks(min(camera.delays)) < 1:
+        if count_ticks(min(camera.delays)) < 1:
             raise ValueError("a picture takes a tick at least: camera delays of 0.001 s or more")
         return camera
-    least, most = (TICK, SLOWEST) if delay == "measured" else detector().range
-    first, last = ticks_taken(least), ticks_taken(most)
+    min_delay, max_delay = (TICK, MAX_DELAY) if delay == "measured" else load_detector().range
+    first, last = count_delay_ticks(min_delay), count_delay_ticks(max_delay)
     return dataclasses.replace(camera, delays=(first * TICK,), jitter=(last - first) * TICK)
 
 
-OPTIONS = ("scenario", "vehicle", "friction", "state", "duration")
+RESET_OPTIONS = ("scenario", "vehicle", "friction", "state", "duration")
 
 
 @dataclass(frozen=True)
@@ -103,20 +115,20 @@ class EnvConfig:
         check_choice("sensors", self.sensors, SENSOR_SETS)
         if unknown := [name for name in self.slow_changes if name not in SLOW_NAMES]:
             known = [entry.name for entry in dataclasses.fields(self)][:-1]
-            raise TypeError(unknown_names("argument", unknown, [*known, *SLOW_NAMES]))
+            raise TypeError(describe_unknown("argument", unknown, [*known, *SLOW_NAMES]))
         n = self.control_period
         if isinstance(n, bool) or not isinstance(n, int | np.integer):
-            raise TypeError(f"control_period is a number of ticks, got {brief(n)}")
+            raise TypeError(f"control_period is a number of ticks, got {short_repr(n)}")
         if not 1 <= n <= 1000:
-            raise ValueError(f"control_period is 1 to 1000 ticks, got {brief(n)}")
+            raise ValueError(f"control_period is 1 to 1000 ticks, got {short_repr(n)}")
         if not isinstance(self.fast, str) or self.fast not in ("summary", "all"):
-            raise ValueError(f"fast is 'summary' or 'all', got {brief(self.fast)}")
+            raise ValueError(f"fast is 'summary' or 'all', got {short_repr(self.fast)}")
         for name in ("steering", "yaw_first", "with_map", "strict"):
             if not isinstance(getattr(self, name), bool):
-                raise TypeError(f"{name} is True or False, got {brief(getattr(self, name))}")
+                raise TypeError(f"{name} is True or False, got {short_repr(getattr(self, name))}")
         bad = self.on_bad_action
         if not isinstance(bad, str) or bad not in ("raise", "fail"):
-            raise ValueError(f"on_bad_action is 'raise' or 'fail', got {brief(bad)}")
+            raise ValueError(f"on_bad_action is 'raise' or 'fail', got {short_repr(bad)}")
         check_choice("vision", self.vision, VISIONS)
         if self.vision == "image" and "camera" not in SENSOR_SETS[self.sensors]:
             raise ValueError(f"vision='image' needs a camera, and {self.sensors!r} has none")
@@ -128,13 +140,13 @@ class EnvConfig:
     @property
     def slow(self) -> dict[str, SlowSensor]:
         """The slow sensors, with what replaces the set's."""
-        return with_changes(SENSOR_SETS[self.sensors], self.slow_changes)
+        return apply_changes(SENSOR_SETS[self.sensors], self.slow_changes)
 
     @cached_property
-    def layout(self) -> tuple[Entry, ...]:
+    def layout(self) -> tuple[ObservationEntry, ...]:
         """The entries of an observation."""
         n, fast = int(self.control_period), self.fast
-        return observation_layout(tuple(self.slow), n, fast, self.with_map)
+        return make_observation_layout(tuple(self.slow), n, fast, self.with_map)
 
     @cached_property
     def bounds(self) -> Array:
@@ -142,10 +154,10 @@ class EnvConfig:
         return np.array([[entry.low, entry.high] for entry in self.layout]).T.copy()
 
     @property
-    def most_packets(self) -> int:
+    def max_packets(self) -> int:
         """The most packets of a step."""
         n = int(self.control_period)
-        return sum(most_packets(sensor, n) for sensor in self.slow.values())
+        return sum(count_max_packets(sensor, n) for sensor in self.slow.values())
 
     @property
     def action_width(self) -> int:
@@ -155,21 +167,22 @@ class EnvConfig:
     @cached_property
     def base(self) -> EpisodeConfig:
         """An episode without options."""
-        return self.episode(self.scenario, self.vehicle)
+        return self.make_episode(self.scenario, self.vehicle)
 
-    def episode(
+    def make_episode(
         self, scenario: Scenario, vehicle: Vehicle, motion: Array | None = None
     ) -> EpisodeConfig:
-        """An episode of a scenario with a true vehicle and a start, as of `motion_from`."""
+        """An episode of a scenario with a true vehicle and a start, as of
+        `parse_initial_motion`."""
         if self.strict:
             cars = vehicle.replace(**scenario.vehicle), self.nominal.replace(**scenario.nominal)
-            for each in (scenario, *cars):
-                check_plausible(each)
-        slow = in_scenario(self.slow, scenario)
+            for part in (scenario, *cars):
+                check_plausible(part)
+        slow = apply_scenario_clocks(self.slow, scenario)
         if self.vision == "image":
-            slow["camera"] = detected(slow["camera"], self.delay)
-            scenario = scenario.replace(noise={**scenario.noise, **detector().noise})
-        return episode_config(
+            slow["camera"] = apply_detector_clock(slow["camera"], self.delay)
+            scenario = scenario.replace(noise={**scenario.noise, **load_detector().noise})
+        return make_episode_config(
             scenario,
             vehicle,
             self.nominal,
@@ -182,35 +195,37 @@ class EnvConfig:
             self.on_bad_action == "fail",
         )
 
-    def with_options(self, options: Mapping[str, Any]) -> EpisodeConfig:
+    def apply_options(self, options: Mapping[str, Any]) -> EpisodeConfig:
         """An episode with options of reset; ValueError for an unknown option or state."""
         if not options:
             return self.base
-        unknown = sorted(map(str, set(options) - set(OPTIONS)))
+        unknown = sorted(map(str, set(options) - set(RESET_OPTIONS)))
         if unknown:
             raise ValueError(
-                f"unknown reset option {', '.join(unknown)}; known: {', '.join(OPTIONS)}"
+                f"unknown reset option {', '.join(unknown)}; known: {', '.join(RESET_OPTIONS)}"
             )
-        scenario = scenario_from(options.get("scenario", self.scenario))
-        vehicle = vehicle_from(options.get("vehicle", self.vehicle), self.strict)
+        scenario = make_scenario(options.get("scenario", self.scenario))
+        vehicle = make_vehicle(options.get("vehicle", self.vehicle), self.strict)
         if "friction" in options:
-            friction = number_of("reset option friction", options["friction"])
+            friction = check_number("reset option friction", options["friction"])
             scenario = scenario.replace(friction=friction)
         if "duration" in options:
-            duration = number_of("reset option duration", options["duration"])
+            duration = check_number("reset option duration", options["duration"])
             scenario = scenario.replace(duration=duration)
-        return self.episode(scenario, vehicle, motion_from(options.get("state", {}), scenario))
+        return self.make_episode(
+            scenario, vehicle, parse_initial_motion(options.get("state", {}), scenario)
+        )
 
 
-def motion_from(state: Mapping[str, Any], scenario: Scenario) -> Array:
+def parse_initial_motion(state: Mapping[str, Any], scenario: Scenario) -> Array:
     """A Motion's numbers (len(Motion),), NaN where the mapping has none; ValueError for a name
     that is no state's, a value that is no number, and roll where the scenario has none."""
-    left = dict(mapping_of("reset option state", state))
+    remaining = dict(check_mapping("reset option state", state))
     start = np.full(len(Motion._fields), np.nan)
     for i, name in enumerate(Motion._fields):
-        value = left.pop(name, None)
+        value = remaining.pop(name, None)
         if value is not None and not (is_finite(value) and abs(value) <= 1e6):
-            got = brief(value)
+            got = short_repr(value)
             raise ValueError(f"reset option state: {name} is {got}, not a number up to 1e6")
         start[i] = np.nan if value is None else value
         if name.startswith("phi") and value and not scenario.roll:
@@ -218,7 +233,7 @@ def motion_from(state: Mapping[str, Any], scenario: Scenario) -> Array:
                 f"reset option state: {name} is {value!r}, but scenario {scenario.name!r} "
                 "has no roll"
             )
-    if left:
+    if remaining:
         known = ", ".join(Motion._fields)
-        raise ValueError(f"unknown state {listed(map(str, left))}; known: {known}")
+        raise ValueError(f"unknown state {join_names(map(str, remaining))}; known: {known}")
     return start

@@ -7,26 +7,26 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import seeding
 
-from ..arguments import options_of
+from ..arguments import split_options
 from ..record import FAST_WIDTH, PACKET_WIDTH, Array, Record
 from ..scenarios.scenario import Scenario
 from ..sensors.link import SlowSensor
 from ..task.info import REPORT
 from ..ticks import TICK
 from ..vehicle.vehicle import Vehicle
-from .arrays import Records, Rows, Start
+from .arrays import BatchArrays, EpisodeStart, RecordArrays
 from .batch import reset_rows
 from .config import EnvConfig
-from .lanes import block_of
+from .lanes import make_lane_buffers
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, P, Z
-from .packing import EpisodeConfig, widened
-from .views import Each, record_in, slow_in, true_states_in, vehicle_in
+from .packing import EpisodeConfig, pad_params
+from .views import LazyRows, compute_true_states, get_slow_sensors, get_vehicle, make_record
 
-Whole = npt.NDArray[np.int64]
+IntArray = npt.NDArray[np.int64]
 T = TypeVar("T")
 
 
-class Episodes:
+class EpisodeBatch:
     """N episodes of an `EnvConfig` each: arrays with a row for each, and each one's generator.
 
     rows: of each row, which differ in scenario and vehicles alone; `config` is that of the first.
@@ -38,19 +38,19 @@ class Episodes:
 
     def __init__(self, rows: Sequence[EnvConfig]) -> None:
         config, N = rows[0], len(rows)
-        self.config, self._count, self._own = config, N, list(rows)
-        distinct = {id(each): each for each in rows}
-        self._distinct = list(distinct.values())
-        self._which = np.array([list(distinct).index(id(each)) for each in rows])
+        self.config, self._count, self._row_configs = config, N, list(rows)
+        distinct = {id(row_config): row_config for row_config in rows}
+        self._distinct_configs = list(distinct.values())
+        self._config_index = np.array([list(distinct).index(id(row_config)) for row_config in rows])
         self.control_period = int(config.control_period)
         self.layout = config.layout
-        self.arrays = Rows(
+        self.arrays = BatchArrays(
             params=np.zeros((N, PARAMS_WIDTH)),
             states=np.zeros((N, STATE_WIDTH)),
             switches=np.zeros((N, len(FLAGS)), np.int64),
             obs=np.zeros((N, len(self.layout)), np.float32),
             rows=np.zeros((N, self.control_period, FAST_WIDTH)),
-            packets=np.zeros((N, config.most_packets, PACKET_WIDTH)),
+            packets=np.zeros((N, config.max_packets, PACKET_WIDTH)),
             reports=np.zeros((N, len(REPORT))),
             ticks_done=np.zeros(N, np.int64),
             delivered=np.zeros(N, np.int64),
@@ -61,69 +61,71 @@ class Episodes:
         self.final_rows, self.final_packets = self.rows.copy(), self.packets.copy()
         self.final_ticks_done = self.ticks_done.copy()
         self.final_delivered = self.delivered.copy()
-        self._final = Records(
+        self._final = RecordArrays(
             self.final_rows, self.final_packets, self.final_ticks_done, self.final_delivered
         )
-        self.block = block_of(N, self.control_period, len(self.layout))
-        self.configs: list[EpisodeConfig] = [each.base for each in rows]
+        self.lane_buffers = make_lane_buffers(N, self.control_period, len(self.layout))
+        self.configs: list[EpisodeConfig] = [row_config.base for row_config in rows]
         self.generators: list[np.random.Generator | None] = [None] * N
         self.seeds: list[int | None] = [None] * N
 
-    def with_options(
+    def apply_options(
         self, options: Mapping[str, Any], chosen: Sequence[int]
-    ) -> tuple[list[EpisodeConfig], Whole]:
+    ) -> tuple[list[EpisodeConfig], IntArray]:
         """The configs that options of reset give the chosen rows, and which of them each one has.
 
-        Raises what `EnvConfig.with_options` raises, and ValueError for a list of another length.
+        Raises what `EnvConfig.apply_options` raises, and ValueError for a list of another length.
         """
-        each, places = options_of(options, self._count), []
+        row_options, places = split_options(options, self._count), []
         configs: list[EpisodeConfig] = []
         known: dict[tuple[Any, ...], int] = {}  # rows with the same objects as options share one
         for i in chosen:
-            key = (id(self._own[i]), *each[i], *map(id, each[i].values()))
+            key = (id(self._row_configs[i]), *row_options[i], *map(id, row_options[i].values()))
             if key not in known:
                 known[key] = len(configs)
-                configs.append(self._own[i].with_options(each[i]))
+                configs.append(self._row_configs[i].apply_options(row_options[i]))
             places.append(known[key])
         return configs, np.array(places, np.int64)
 
     def reset_rows(
         self,
-        chosen: Whole,
+        chosen: IntArray,
         configs: Sequence[EpisodeConfig] | None = None,
-        of: Whole | None = None,
+        config_index: IntArray | None = None,
     ) -> None:
         """Reset the chosen rows (M,) with the next keys of their generators, each with the config
-        of its place `of` in `configs` (None: without options)."""
-        if configs is None or of is None:
-            places, of = np.unique(self._which[chosen], return_inverse=True)
-            configs = [self._distinct[place].base for place in places]
+        of its place `config_index` in `configs` (None: without options)."""
+        if configs is None or config_index is None:
+            places, config_index = np.unique(self._config_index[chosen], return_inverse=True)
+            configs = [self._distinct_configs[place].base for place in places]
         keys = np.empty(len(chosen), np.uint64)
-        for m, (i, place) in enumerate(zip(chosen.tolist(), of.tolist(), strict=True)):
-            keys[m] = self.generator(i).integers(0, 2**64, dtype=np.uint64)
+        for m, (i, place) in enumerate(zip(chosen.tolist(), config_index.tolist(), strict=True)):
+            keys[m] = self.get_generator(i).integers(0, 2**64, dtype=np.uint64)
             self.configs[i] = configs[place]
         words = np.stack([keys & 0xFFFFFFFF, keys >> 32], 1).astype(np.int64)
         width = max(self.params.shape[1], *(len(config.start.params) for config in configs))
         if width > self.params.shape[1]:  # for a trace
-            self.hold(np.array([widened(row, width) for row in self.params]))
-        packed = [c.start._replace(params=widened(c.start.params, width)) for c in configs]
-        starts = Start(*map(np.stack, zip(*packed, strict=True)))
-        reset_rows(chosen, of, starts, words, self.config.bounds, self.arrays, self._final)
-        self.sort()
+            self.set_params(np.array([pad_params(row, width) for row in self.params]))
+        packed = [c.start._replace(params=pad_params(c.start.params, width)) for c in configs]
+        starts = EpisodeStart(*map(np.stack, zip(*packed, strict=True)))
+        reset_rows(
+            chosen, config_index, starts, words, self.config.bounds, self.arrays, self._final
+        )
+        self.group_by_variant()
 
-    def hold(self, params: Array) -> None:
+    def set_params(self, params: Array) -> None:
         """Take these packed parameters, (N, width)."""
         self.params = params
         self.arrays = self.arrays._replace(params=params)
 
-    def sort(self) -> None:
+    def group_by_variant(self) -> None:
         """Put rows whose ticks have the same text next to each other in the block's order."""
         lags = self.params[:, [P.motor.start, P.steering.start]] > 0.0
-        kinds = np.hstack([self.switches, lags])
-        mixed = (kinds != kinds[0]).any()
-        self.block.order[:] = np.lexsort(kinds.T) if mixed else np.arange(self._count)
+        variants = np.hstack([self.switches, lags])
+        is_mixed = (variants != variants[0]).any()
+        self.lane_buffers.order[:] = np.lexsort(variants.T) if is_mixed else np.arange(self._count)
 
-    def generator(self, i: int) -> np.random.Generator:
+    def get_generator(self, i: int) -> np.random.Generator:
         """A row's, which draws one 64-bit key a reset; seeded by chance if it never was."""
         generator = self.generators[i]
         if generator is None:
@@ -144,13 +146,13 @@ class Episodes:
     @property
     def true_state(self) -> Array:
         """The `TrueState` of each row now, (N, len(TrueState)); no sensor tells these."""
-        return true_states_in(self.params, self.states, self.switches)
+        return compute_true_states(self.params, self.states, self.switches)
 
     @property
     def record(self) -> Sequence[Record]:
         """Each row's `StabilityEnv.record`."""
-        return self._each(
-            lambda i: record_in(
+        return self._map_rows(
+            lambda i: make_record(
                 self.states[i],
                 self.rows[i, : self.ticks_done[i]],
                 self.packets[i, : self.delivered[i]],
@@ -160,27 +162,29 @@ class Episodes:
     @property
     def scenario(self) -> Sequence[Scenario]:
         """The scenario of each row's episode."""
-        return self._each(lambda i: self.configs[i].scenario)
+        return self._map_rows(lambda i: self.configs[i].scenario)
 
     @property
     def vehicle(self) -> Sequence[Vehicle]:
         """The true vehicle of each row's episode, with what its seed drew."""
-        return self._each(lambda i: vehicle_in(self.configs[i], self.params[i], self.states[i]))
+        return self._map_rows(
+            lambda i: get_vehicle(self.configs[i], self.params[i], self.states[i])
+        )
 
     @property
     def nominal(self) -> Sequence[Vehicle]:
         """The vehicle that estimators and controllers of each row are designed from."""
-        return self._each(lambda i: self.configs[i].nominal)
+        return self._map_rows(lambda i: self.configs[i].nominal)
 
     @property
     def held_speed(self) -> Sequence[float | None]:
         """Each row's speed in m/s that is held exactly (small-angle plant), or None."""
-        return self._each(lambda i: self.configs[i].held_speed)
+        return self._map_rows(lambda i: self.configs[i].held_speed)
 
     @property
     def slow_sensors(self) -> Sequence[dict[str, SlowSensor]]:
         """Each row's slow sensors by name, with the clock phases that its episode drew."""
-        return self._each(lambda i: slow_in(self.configs[i], self.states[i]))
+        return self._map_rows(lambda i: get_slow_sensors(self.configs[i], self.states[i]))
 
-    def _each(self, of: Callable[[int], T]) -> Each[T]:
-        return Each(self._count, of)
+    def _map_rows(self, make_item: Callable[[int], T]) -> LazyRows[T]:
+        return LazyRows(self._count, make_item)

@@ -1,28 +1,28 @@
 """State by name: where the numbers of an episode lie in its two packed vectors.
 
 `params` is constant within an episode, `state` is everything that changes: a copy of both is a
-complete snapshot. `P` and `Z` are `Params` and `State` whose leaves are indices: `p[P.car.mu]` and
-`z[Z.clock.tick]` are numbers, `read(z, Z.motion)` is a Motion.
+complete snapshot. `P` and `Z` are `EpisodeParams` and `EpisodeState` whose leaves are indices:
+`p[P.car.mu]` and `z[Z.clock.tick]` are numbers, `read(z, Z.motion)` is a Motion.
 """
 
 from typing import Annotated, Any, NamedTuple
 
-from ..backend.arrays import offsets
+from ..backend.arrays import make_offsets
 from ..record import PACKET_WIDTH
-from ..scenarios.driver import Driver
-from ..scenarios.roads import Lead
-from ..scenarios.speed import Pace
+from ..scenarios.driver import DriverParams
+from ..scenarios.roads import NominalMotion
+from ..scenarios.speed import SpeedProfile
 from ..scenarios.steering import STEERING_WIDTH
-from ..scenarios.tracks import Path
+from ..scenarios.tracks import TrackPath
 from ..scenarios.wind import Wind
-from ..sensors.camera import View
-from ..sensors.gps import Sky
-from ..sensors.link import IN_FLIGHT, Link
+from ..sensors.camera import FieldOfView
+from ..sensors.gps import SatelliteGeometry
+from ..sensors.link import MAX_IN_FLIGHT, Link
 from ..sensors.noise import Noise
 from ..sensors.slow import SLOW, VALUES
-from ..task.reference import Target
+from ..task.reference import ReferenceParams
 from ..vehicle.actuators import Lag
-from ..vehicle.dynamics import Car, Motion, Road
+from ..vehicle.dynamics import CarParams, Motion, RoadParams
 from ..vehicle.linear import Bicycle
 
 
@@ -31,11 +31,11 @@ class Disturbance(NamedTuple):
 
     force: Any  # N, standard deviation
     moment: Any  # N m
-    keep: Any  # what is left after a tick
-    fresh: Any  # sqrt(1 - keep^2)
+    decay: Any  # what is left after a tick
+    noise_gain: Any  # sqrt(1 - keep^2)
 
 
-class Task(NamedTuple):
+class TaskParams(NamedTuple):
     """The episode's length and limits."""
 
     duration: Any  # ticks
@@ -48,7 +48,7 @@ class Task(NamedTuple):
     stop: Any  # rad, of the whole steering angle
 
 
-class Change(NamedTuple):
+class TyreChange(NamedTuple):
     """Tyres that change in mid-run."""
 
     tick: Any  # from which on
@@ -56,7 +56,7 @@ class Change(NamedTuple):
     rear: Any
 
 
-class Drive(NamedTuple):
+class ActuatorState(NamedTuple):
     """Actuators, the driver's integral and the disturbances now acting."""
 
     T_l: Any
@@ -80,7 +80,7 @@ class Clock(NamedTuple):
     next_due: Any  # arrival tick of the next packet
 
 
-class Slow(NamedTuple):
+class SlowSensorState(NamedTuple):
     """Where one slow sensor stands, and its newest sample."""
 
     frames: Any  # captured so far
@@ -91,49 +91,51 @@ class Slow(NamedTuple):
     drift: Any  # what the sensor carries from sample to sample
 
 
-IN_SLOW, SLOW_WIDTH = offsets(Slow)
+SLOW_STATE, SLOW_WIDTH = make_offsets(SlowSensorState)
 
 
-class Params(NamedTuple):
+class EpisodeParams(NamedTuple):
     """Parameters, constant within an episode. New parts go at the end."""
 
-    car: Car
-    road: Road
+    car: CarParams
+    road: RoadParams
     motor: Lag
     steering: Lag
     wind: Wind
-    pace: Pace
+    speed_profile: SpeedProfile
     noise: Noise
     slow: Annotated[tuple[Link, ...], len(SLOW)]
-    target: Target
+    target: ReferenceParams
     disturbance: Disturbance
-    task: Task
-    programme: Annotated[tuple[Any, ...], STEERING_WIDTH]
-    sky: Sky  # of the GPS
-    driver: Driver
-    path: Path
-    change: Change
-    sight: View  # of the camera
-    leader: Bicycle  # nominal, which lays the road
+    task: TaskParams
+    steering_profile: Annotated[tuple[Any, ...], STEERING_WIDTH]
+    sky: SatelliteGeometry  # of the GPS
+    driver: DriverParams
+    path: TrackPath
+    tyre_change: TyreChange
+    field_of_view: FieldOfView  # of the camera
+    nominal_car: Bicycle  # nominal, which lays the road
 
 
-class State(NamedTuple):
+class EpisodeState(NamedTuple):
     """The state, which changes from tick to tick. A new part goes at the end or, where a tick of
     the plant changes it, before `slow`."""
 
     motion: Motion
-    drive: Drive
+    drive: ActuatorState
     clock: Clock
     refs: Annotated[tuple[Any, ...], 2]  # rad, rad/s, the references of beta and gamma
-    lead: Lead  # the nominal car where it lays the road
-    slow: Annotated[tuple[Slow, ...], len(SLOW)]
-    queue: Annotated[Any, len(SLOW) * IN_FLIGHT * PACKET_WIDTH]  # packets, columns as in `Packet`
+    nominal_motion: NominalMotion  # the nominal car where it lays the road
+    slow: Annotated[tuple[SlowSensorState, ...], len(SLOW)]
+    queue: Annotated[
+        Any, len(SLOW) * MAX_IN_FLIGHT * PACKET_WIDTH
+    ]  # packets, columns as in `Packet`
     driver: Any  # rad, the driver's steering command
     under_way: Any  # how many packets are in the queue
 
 
-P, PARAMS_WIDTH = offsets(Params)
-Z, STATE_WIDTH = offsets(State)
+P, PARAMS_WIDTH = make_offsets(EpisodeParams)
+Z, STATE_WIDTH = make_offsets(EpisodeState)
 
 
 class Switches(NamedTuple):
@@ -150,4 +152,4 @@ class Switches(NamedTuple):
     road: int  # of `scenarios.roads.ROADS`
 
 
-FLAGS, _ = offsets(Switches)
+FLAGS, _ = make_offsets(Switches)

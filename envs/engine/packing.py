@@ -6,29 +6,29 @@ from typing import Any
 
 import numpy as np
 
-from ..arguments import brief, check_choice
+from ..arguments import check_choice, short_repr
 from ..record import Array
-from ..scenarios.driver import Driver
+from ..scenarios.driver import DriverParams
 from ..scenarios.roads import ROADS
 from ..scenarios.scenario import Scenario
-from ..scenarios.speed import Pace
+from ..scenarios.speed import SpeedProfile
 from ..scenarios.steering import STEERING_KINDS, STEERING_WIDTH
-from ..scenarios.tracks import path_of
+from ..scenarios.tracks import make_path
 from ..scenarios.wind import Wind
-from ..sensors.camera import View
-from ..sensors.gps import HDOP_LAWS, Sky
-from ..sensors.link import Link, SlowSensor, link_of
+from ..sensors.camera import FieldOfView
+from ..sensors.gps import HDOP_LAWS, SatelliteGeometry
+from ..sensors.link import Link, SlowSensor, make_link
 from ..sensors.noise import Noise
 from ..sensors.slow import SLOW_NAMES
-from ..task.reference import REFERENCES, target_of
-from ..ticks import FOREVER, TICK, ticks
-from ..vehicle.actuators import lag_of
-from ..vehicle.dynamics import Car, Motion, Road
+from ..task.reference import REFERENCES, make_reference_params
+from ..ticks import FOREVER, TICK, count_ticks
+from ..vehicle.actuators import make_lag
+from ..vehicle.dynamics import CarParams, Motion, RoadParams
 from ..vehicle.linear import Bicycle
 from ..vehicle.tyres import TYRE_LAWS
 from ..vehicle.vehicle import GRAVITY, Vehicle
-from .arrays import Start
-from .layout import PARAMS_WIDTH, Change, Disturbance, Params, Switches, Task
+from .arrays import EpisodeStart
+from .layout import PARAMS_WIDTH, Disturbance, EpisodeParams, Switches, TaskParams, TyreChange
 
 SPIN_ANGLE = 0.5  # rad of sideslip: the car has spun
 
@@ -41,7 +41,7 @@ class EpisodeConfig:
     held_speed: m/s, where it is one number and held exactly.
     """
 
-    start: Start
+    start: EpisodeStart
     vehicle: Vehicle
     nominal: Vehicle
     scenario: Scenario
@@ -49,9 +49,9 @@ class EpisodeConfig:
     held_speed: float | None
 
 
-def car_of(vehicle: Vehicle) -> Car:
+def make_car(vehicle: Vehicle) -> CarParams:
     """The plant's parameters of a vehicle."""
-    return Car(
+    return CarParams(
         m=vehicle.mass,
         I=vehicle.yaw_inertia,
         l_f=vehicle.front_arm,
@@ -69,7 +69,7 @@ def car_of(vehicle: Vehicle) -> Car:
         K_x=vehicle.roll_stiffness,
         C_x=vehicle.roll_damping,
         h=vehicle.gravity_height,
-        ahead=vehicle.antenna_ahead,
+        forward=vehicle.antenna_ahead,
         left=vehicle.antenna_left,
         mu_r=vehicle.friction,
         P=vehicle.motor_power,
@@ -77,10 +77,10 @@ def car_of(vehicle: Vehicle) -> Car:
     )
 
 
-def task_of(vehicle: Vehicle, scenario: Scenario, yaw_first: bool) -> Task:
+def make_task_params(vehicle: Vehicle, scenario: Scenario, yaw_first: bool) -> TaskParams:
     """The episode's length and limits."""
-    return Task(
-        duration=ticks(scenario.duration),
+    return TaskParams(
+        duration=count_ticks(scenario.duration),
         half_width=scenario.half_width,
         yaw_scale=vehicle.yaw_moment_limit,
         yaw_first=float(yaw_first),
@@ -91,71 +91,73 @@ def task_of(vehicle: Vehicle, scenario: Scenario, yaw_first: bool) -> Task:
     )
 
 
-def _pace_of(scenario: Scenario) -> Pace:
+def _make_speed_profile(scenario: Scenario) -> SpeedProfile:
     """The driver's work along the road; the speed itself is drawn."""
-    pace = Pace(speed=0.0, hold=1.0, acceleration=0.0, start=0.0, end=FOREVER, k_p=2.0, k_i=0.5)
+    profile = SpeedProfile(
+        speed=0.0, hold=1.0, acceleration=0.0, start=0.0, end=FOREVER, k_p=2.0, k_i=0.5
+    )
     if scenario.acceleration is not None:
-        return pace._replace(hold=0.0, acceleration=scenario.acceleration)
+        return profile._replace(hold=0.0, acceleration=scenario.acceleration)
     if scenario.speed_change:
-        start = ticks(scenario.change_start)
-        pace = pace._replace(
+        start = count_ticks(scenario.change_start)
+        profile = profile._replace(
             acceleration=scenario.speed_change / scenario.change_length,
             start=start,
-            end=start + ticks(scenario.change_length),
+            end=start + count_ticks(scenario.change_length),
         )
-    return pace._replace(surge=scenario.surge, surge_rate=math.tau * scenario.surge_frequency)
+    return profile._replace(surge=scenario.surge, surge_rate=math.tau * scenario.surge_frequency)
 
 
-def _link_in(scenario: Scenario, name: str, sensor: SlowSensor | None) -> Link:
+def _make_link(scenario: Scenario, name: str, sensor: SlowSensor | None) -> Link:
     try:
-        return link_of(sensor, getattr(scenario, f"{name}_outage", None))
+        return make_link(sensor, getattr(scenario, f"{name}_outage", None))
     except ValueError as error:
-        raise ValueError(f"scenario {brief(scenario.name)}: {name}: {error}") from None
+        raise ValueError(f"scenario {short_repr(scenario.name)}: {name}: {error}") from None
 
 
-def _road_of(scenario: Scenario) -> Road:
+def _make_road(scenario: Scenario) -> RoadParams:
     """The road but for its curvature and bank, which are drawn."""
-    return Road(
+    return RoadParams(
         curvature=0.0,
         start=scenario.curve_start,
         ramp=scenario.curve_ramp,
-        across=0.0,
-        along=GRAVITY * math.sin(scenario.grade),
+        lateral=0.0,
+        longitudinal=GRAVITY * math.sin(scenario.grade),
     )
 
 
-def _sky_of(scenario: Scenario, link: Link) -> Sky:
+def _make_satellite_geometry(scenario: Scenario, link: Link) -> SatelliteGeometry:
     """The satellites of a scenario, at the GPS's own period."""
-    keep = math.exp(-link.period * TICK / scenario.hdop_time)
-    return Sky(
+    decay = math.exp(-link.period * TICK / scenario.hdop_time)
+    return SatelliteGeometry(
         median=math.log(scenario.hdop),
         spread=scenario.hdop_spread,
-        keep=keep,
-        fresh=math.sqrt(1.0 - keep * keep),
+        decay=decay,
+        noise_gain=math.sqrt(1.0 - decay * decay),
         weight=HDOP_LAWS[scenario.hdop_law],
     )
 
 
-def _numbers(part: Any) -> list[float]:
+def _list_numbers(part: Any) -> list[float]:
     """The numbers of nested tuples, in order."""
     if not isinstance(part, tuple):
         return [part]
-    return [number for each in part for number in _numbers(each)]
+    return [number for item in part for number in _list_numbers(item)]
 
 
-def _trace_of(scenario: Scenario) -> list[float]:
-    """What `steering.trace_at` reads, behind the packed parameters."""
+def _make_trace(scenario: Scenario) -> list[float]:
+    """What `steering.interpolate_trace` reads, behind the packed parameters."""
     trace = scenario.trace
     return [scenario.trace_step / TICK, *trace, trace[-1]] if trace else []
 
 
-def widened(params: Array, width: int) -> Array:
+def pad_params(params: Array, width: int) -> Array:
     """Packed parameters as long as with a longer trace: the last angle stays, none stays none."""
-    traced = len(params) > PARAMS_WIDTH
-    return np.pad(params, (0, width - len(params)), "edge" if traced else "constant")
+    has_trace = len(params) > PARAMS_WIDTH
+    return np.pad(params, (0, width - len(params)), "edge" if has_trace else "constant")
 
 
-def episode_config(
+def make_episode_config(
     scenario: Scenario,
     vehicle: Vehicle,
     nominal: Vehicle,
@@ -176,37 +178,37 @@ def episode_config(
     nominal = nominal.replace(**scenario.nominal)
     if scenario.roll:
         vehicle.check_roll()
-    keep = math.exp(-TICK / scenario.disturbance_time)
-    links = {name: _link_in(scenario, name, slow.get(name)) for name in SLOW_NAMES}
-    params = Params(
-        car=car_of(vehicle),
-        road=_road_of(scenario),
-        motor=lag_of(vehicle.motor_lag if scenario.lags else 0.0, TICK),
-        steering=lag_of(vehicle.steering_lag if scenario.lags else 0.0, TICK),
+    decay = math.exp(-TICK / scenario.disturbance_time)
+    links = {name: _make_link(scenario, name, slow.get(name)) for name in SLOW_NAMES}
+    params = EpisodeParams(
+        car=make_car(vehicle),
+        road=_make_road(scenario),
+        motor=make_lag(vehicle.motor_lag if scenario.lags else 0.0, TICK),
+        steering=make_lag(vehicle.steering_lag if scenario.lags else 0.0, TICK),
         wind=Wind(0.0, 0.0, 0.0, 0.0, scenario.wind_height),  # the rest is drawn
-        pace=_pace_of(scenario),
+        speed_profile=_make_speed_profile(scenario),
         noise=Noise()._replace(**scenario.noise),
         slow=tuple(links.values()),
-        target=target_of(nominal),
+        target=make_reference_params(nominal),
         disturbance=Disturbance(
             force=scenario.disturbance_force,
             moment=scenario.disturbance_moment,
-            keep=keep,
-            fresh=math.sqrt(1.0 - keep * keep),
+            decay=decay,
+            noise_gain=math.sqrt(1.0 - decay * decay),
         ),
-        task=task_of(vehicle, scenario, yaw_first),
-        programme=(0.0,) * STEERING_WIDTH,  # drawn
-        sky=_sky_of(scenario, links["gps"]),
-        driver=Driver(
+        task=make_task_params(vehicle, scenario, yaw_first),
+        steering_profile=(0.0,) * STEERING_WIDTH,  # drawn
+        sky=_make_satellite_geometry(scenario, links["gps"]),
+        driver=DriverParams(
             preview=scenario.driver_preview,
             gain=scenario.driver_gain,
-            rest=lag_of(scenario.driver_lag, TICK).end,
+            rest=make_lag(scenario.driver_lag, TICK).end,
             slew=scenario.driver_rate * TICK,
         ),
-        path=path_of(scenario.path, vehicle.width),
-        change=Change(FOREVER, 1.0, 1.0),  # drawn
-        sight=View(scenario.camera_heading, scenario.camera_offset),
-        leader=Bicycle(*nominal.lateral),
+        path=make_path(scenario.path, vehicle.width),
+        tyre_change=TyreChange(FOREVER, 1.0, 1.0),  # drawn
+        field_of_view=FieldOfView(scenario.camera_heading, scenario.camera_offset),
+        nominal_car=Bicycle(*nominal.lateral),
     )
     switches = Switches(
         small_angle=int(scenario.small_angle),
@@ -219,14 +221,16 @@ def episode_config(
         roll=int(scenario.roll),
         road=ROADS.index(scenario.road),
     )
-    low, high = scenario.draws()
-    start = Start(
-        params=np.array(_numbers(params) + _trace_of(scenario), np.float64),
+    low, high = scenario.get_draw_ranges()
+    start = EpisodeStart(
+        params=np.array(_list_numbers(params) + _make_trace(scenario), np.float64),
         low=low,
         high=high,
         switches=np.array(switches, np.int64),
         motion=np.full(len(Motion._fields), np.nan) if motion is None else motion,
     )
     assert len(start.params) == PARAMS_WIDTH or scenario.trace
-    held = scenario.held_speed if np.isnan(start.motion[0]) else None  # or it starts at another
-    return EpisodeConfig(start, vehicle, nominal, scenario, slow, held)
+    held_speed = (
+        scenario.held_speed if np.isnan(start.motion[0]) else None
+    )  # or it starts at another
+    return EpisodeConfig(start, vehicle, nominal, scenario, slow, held_speed)

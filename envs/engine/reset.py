@@ -3,28 +3,28 @@
 from typing import Any
 
 from ..backend.arrays import read, write
-from ..backend.decorators import apart, copied, jit
+from ..backend.decorators import copy_into, jit, noinline
 from ..backend.elementary import sincos
 from ..backend.primitives import from_word, select
-from ..backend.random import CHANNELS, normals
+from ..backend.random import CHANNELS, draw_normals
 from ..record import FAST
-from ..scenarios.draws import DRAWS, DRAWS_WIDTH, realise
-from ..scenarios.driver import wanted_angle
+from ..scenarios.draws import DRAWS, DRAWS_WIDTH, draw_stable
+from ..scenarios.driver import compute_target_angle
 from ..scenarios.steering import DRIVER, WANDER, write_steering
-from ..scenarios.tracks import laid
-from ..sensors.inertial import Chance, fast_row
-from ..sensors.link import clock_phase
-from ..sensors.slow import GPS, first_drift
+from ..scenarios.tracks import transform_path
+from ..sensors.inertial import NormalDraws, compute_fast_row
+from ..sensors.link import draw_clock_phase
+from ..sensors.slow import GPS, draw_first_drift
 from ..task.info import REPORT
-from ..task.reference import reference
-from ..ticks import FOREVER, NEVER, whole_ticks
-from ..vehicle.dynamics import curvature_beside, gravity_at, sideslip_angle
+from ..task.reference import compute_reference
+from ..ticks import FOREVER, NEVER, round_to_ticks
+from ..vehicle.dynamics import compute_car_curvature, compute_gravity, compute_sideslip_angle
 from ..vehicle.vehicle import GRAVITY
-from .arrays import Row, Start
+from .arrays import EpisodeArrays, EpisodeStart
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, P, Z
 from .observe import observe, write_report
-from .packets import FAR, sense_slow
-from .window import programmed
+from .packets import NEVER_DUE, sample_slow_sensors
+from .window import compute_profile_angle
 
 
 @jit
@@ -39,14 +39,14 @@ def _write_surroundings(p: Any, d: Any, s: Any, v_x: Any) -> None:
     p[P.car.mu_r] = select(mirrored, d.friction, right)
     p[P.wind.force] = select(d.wind_side < 0.5, -d.wind_force, d.wind_force)
     p[P.wind.arm] = d.wind_arm
-    p[P.wind.start] = whole_ticks(d.wind_start)
-    p[P.wind.end] = p[P.wind.start] + whole_ticks(d.wind_length)
+    p[P.wind.start] = round_to_ticks(d.wind_start)
+    p[P.wind.end] = p[P.wind.start] + round_to_ticks(d.wind_length)
     p[P.road.curvature] = select(mirrored, 0.0 - d.curvature, d.curvature)
-    across = GRAVITY * sincos(d.bank)[0]
-    p[P.road.across] = select(mirrored, 0.0 - across, across)
+    bank_gravity = GRAVITY * sincos(d.bank)[0]
+    p[P.road.lateral] = select(mirrored, 0.0 - bank_gravity, bank_gravity)
     scaled = d.path_speed > 0.0
     scale = select(scaled, d.speed, 1.0) / select(scaled, d.path_speed, 1.0)
-    path = laid(read(p, P.path), s + d.onset * v_x, scale, select(mirrored, -1.0, 1.0))
+    path = transform_path(read(p, P.path), s + d.onset * v_x, scale, select(mirrored, -1.0, 1.0))
     write(p, path, P.path)
 
 
@@ -55,11 +55,11 @@ def _write_sensors(p: Any, d: Any, low: Any, high: Any) -> None:
     """Biases, and the GPS's latency, which was packed as the worst case of low and high."""
     p[P.noise.gyro_bias] = p[P.noise.gyro_bias] + d.gyro_bias
     p[P.noise.accel_y_bias] = p[P.noise.accel_y_bias] + d.accel_y_bias
-    link, least = P.slow[GPS], whole_ticks(low[DRAWS.gps_latency])
-    late = whole_ticks(d.gps_latency) - least
+    link, min_latency = P.slow[GPS], round_to_ticks(low[DRAWS.gps_latency])
+    extra_latency = round_to_ticks(d.gps_latency) - min_latency
     for i in (link.delay_0, link.delay_1, link.delay_2, link.delay_3):
-        p[i] = p[i] + late
-    p[link.jitter] = p[link.jitter] - (whole_ticks(high[DRAWS.gps_latency]) - least)
+        p[i] = p[i] + extra_latency
+    p[link.jitter] = p[link.jitter] - (round_to_ticks(high[DRAWS.gps_latency]) - min_latency)
 
 
 @jit
@@ -77,33 +77,35 @@ def _write_motion(z: Any, d: Any, start: Any, small_angle: int) -> None:
 
 
 @jit
-def first_row(
-    motion: Any, steer: Any, road: Any, d_f: Any, noise: Any, chance: Any, small_angle: int
+def compute_first_row(
+    motion: Any, steer: Any, road: Any, d_f: Any, noise: Any, draws: Any, small_angle: int
 ) -> Any:
     """The fast sensors at tick 0, columns as in `Fast`: nothing has acted yet but the steering."""
-    acted = (steer, 0.0, 0.0, steer, 0.0, curvature_beside(motion, road))
-    g_x, g_y = gravity_at(motion, road, small_angle)
-    return fast_row(motion, (g_x, g_y + GRAVITY * motion.phi), acted, d_f, noise, chance)
+    applied = (steer, 0.0, 0.0, steer, 0.0, compute_car_curvature(motion, road))
+    g_x, g_y = compute_gravity(motion, road, small_angle)
+    return compute_fast_row(motion, (g_x, g_y + GRAVITY * motion.phi), applied, d_f, noise, draws)
 
 
-@apart
-def reset_vehicle(start: Start, key_low: int, key_high: int, bounds: Any, row: Row) -> None:
+@noinline
+def reset_vehicle(
+    start: EpisodeStart, key_low: int, key_high: int, bounds: Any, row: EpisodeArrays
+) -> None:
     """Draw the episode from a key, two words of 32 bits, and deliver tick 0."""
     p, z, rows, report = row.p, row.z, row.rows, row.report
-    copied(start.params, p)
-    copied(start.switches, row.switches)
+    copy_into(start.params, p)
+    copy_into(start.switches, row.switches)
     switches = row.switches
-    drawn = z[:DRAWS_WIDTH]  # until the state is written
-    d, redraws = realise(start.low, start.high, key_low, key_high, read(p, P.car), drawn)
+    scratch = z[:DRAWS_WIDTH]  # until the state is written
+    d, redraws = draw_stable(start.low, start.high, key_low, key_high, read(p, P.car), scratch)
     p[P.car.C_f] = p[P.car.C_f] * d.front_stiffness
     p[P.car.C_r] = p[P.car.C_r] * d.rear_stiffness
-    change = select(d.tyre_change_time > 0.0, whole_ticks(d.tyre_change_time), FOREVER)
-    write(p, (change, d.front_change, d.rear_change), P.change)
-    write_steering(switches[FLAGS.steering], d, p[P.programme[0] :])
+    change_tick = select(d.tyre_change_time > 0.0, round_to_ticks(d.tyre_change_time), FOREVER)
+    write(p, (change_tick, d.front_change, d.rear_change), P.tyre_change)
+    write_steering(switches[FLAGS.steering], d, p[P.steering_profile[0] :])
     if d.side < 0.5:
         for i in range(PARAMS_WIDTH + 1, len(p)):  # a trace
             p[i] = 0.0 - p[i]
-    p[P.pace.speed] = d.speed
+    p[P.speed_profile.speed] = d.speed
     for i in range(STATE_WIDTH):
         z[i] = 0.0
     small_angle = switches[FLAGS.small_angle]
@@ -111,42 +113,42 @@ def reset_vehicle(start: Start, key_low: int, key_high: int, bounds: Any, row: R
     _write_sensors(p, d, start.low, start.high)
     motion = read(z, Z.motion)
     _write_surroundings(p, d, motion.s, motion.v_x)
-    n = normals(key_low, key_high, 0, CHANNELS.initial)
+    n = draw_normals(key_low, key_high, 0, CHANNELS.initial)
     road, target = read(p, P.road), read(p, P.target)
-    steer = programmed(p, 0.0)
+    steer = compute_profile_angle(p, 0.0)
     if switches[FLAGS.steering] == DRIVER:
-        person, path = read(p, P.driver), read(p, P.path)
-        steer = wanted_angle(motion, path, road, target, person, p[P.task.stop])
+        driver, path = read(p, P.driver), read(p, P.path)
+        steer = compute_target_angle(motion, path, road, target, driver, p[P.task.stop])
     elif switches[FLAGS.steering] == WANDER:
-        steer = d.amplitude * normals(key_low, key_high, 0, CHANNELS.steering)[0]
+        steer = d.amplitude * draw_normals(key_low, key_high, 0, CHANNELS.steering)[0]
     z[Z.drive.delta_f] = steer
     z[Z.driver] = steer
     z[Z.drive.F_d] = p[P.disturbance.force] * n[0]
     z[Z.drive.N_d] = p[P.disturbance.moment] * n[1]
     z[Z.clock.key_low], z[Z.clock.key_high] = from_word(key_low), from_word(key_high)
-    z[Z.clock.redraws], z[Z.clock.next_due] = redraws, FAR
+    z[Z.clock.redraws], z[Z.clock.next_due] = redraws, NEVER_DUE
     for sensor in range(len(Z.slow)):
-        link, at = read(p, P.slow[sensor]), Z.slow[sensor]
-        phase = clock_phase(link, key_low, key_high, sensor)
-        z[at.next_capture] = select(link.period > 0.0, phase, NEVER)
-        z[at.captured] = NEVER
-        z[at.drift] = first_drift(sensor, read(p, P.sky), key_low, key_high)
-    beta = sideslip_angle(motion.v_x, motion.v_y, small_angle)
-    fast = normals(key_low, key_high, 0, CHANNELS.inertial)
-    wheels = normals(key_low, key_high, 0, CHANNELS.wheels)
-    chance, noise = Chance(fast, wheels), read(p, P.noise)
-    row_0 = first_row(motion, steer, road, p[P.car.d_f], noise, chance, small_angle)
+        link, column = read(p, P.slow[sensor]), Z.slow[sensor]
+        phase = draw_clock_phase(link, key_low, key_high, sensor)
+        z[column.next_capture] = select(link.period > 0.0, phase, NEVER)
+        z[column.captured] = NEVER
+        z[column.drift] = draw_first_drift(sensor, read(p, P.sky), key_low, key_high)
+    beta = compute_sideslip_angle(motion.v_x, motion.v_y, small_angle)
+    fast = draw_normals(key_low, key_high, 0, CHANNELS.inertial)
+    wheels = draw_normals(key_low, key_high, 0, CHANNELS.wheels)
+    draws, noise = NormalDraws(fast, wheels), read(p, P.noise)
+    row_0 = compute_first_row(motion, steer, road, p[P.car.d_f], noise, draws, small_angle)
     write(rows[0], row_0, FAST)
-    count = sense_slow(row, motion, 0.0, 0)
+    count = sample_slow_sensors(row, motion, 0.0, 0)
     v = 0.5 * (rows[0, FAST.wheel_left] + rows[0, FAST.wheel_right])
-    refs = reference(steer, v, target, switches[FLAGS.reference])
+    refs = compute_reference(steer, v, target, switches[FLAGS.reference])
     write(z, refs, Z.refs)
-    shown = 1
+    n_rows = 1
     if switches[FLAGS.all_samples]:  # tick 0 stands for all samples of a step
         for j in range(1, len(rows)):
-            copied(rows[0], rows[j])
-        shown = len(rows)
-    observe(row, shown, count, refs, bounds)
+            copy_into(rows[0], rows[j])
+        n_rows = len(rows)
+    observe(row, n_rows, count, refs, bounds)
     write_report(report, z)
     report[REPORT.beta] = beta
     report[REPORT.beta_ref], report[REPORT.gamma_ref] = refs

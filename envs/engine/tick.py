@@ -1,45 +1,53 @@
 """One tick of the car: commands, actuators, plant, fast sensors, cost and failures.
 
-The text is the same for one car, for cars in lanes, and for tensors of them. `advance` is a tick of
-our plant; `command` and `sense`, before and after the motion, serve a plant of another's too.
+The text is the same for one car, for cars in lanes, and for tensors of them. `integrate_tick` is a
+tick of our plant; `command` and `measure_tick`, before and after the motion, serve a plant of
+another's too.
 """
 
 from typing import Any, NamedTuple
 
-from ..backend.decorators import inlined
-from ..backend.primitives import anywhere, select
+from ..backend.decorators import inline
+from ..backend.primitives import any_lane, select
 from ..record import FAST
-from ..scenarios.driver import steered
-from ..scenarios.roads import NOMINAL_PATH, Lead, laid_by
-from ..scenarios.speed import acceleration_command, wanted_motion
-from ..scenarios.wind import wind_at
-from ..sensors.inertial import Chance, fast_row, specific_force
-from ..task.reference import followed, reference
+from ..scenarios.driver import compute_driver_angle
+from ..scenarios.roads import NOMINAL_PATH, NominalMotion, step_nominal_car
+from ..scenarios.speed import compute_acceleration_command, compute_speed_reference
+from ..scenarios.wind import compute_wind
+from ..sensors.inertial import NormalDraws, compute_fast_row, compute_specific_force
+from ..task.reference import compute_reference, filter_reference
 from ..ticks import TICK
-from ..vehicle.actuators import distribute, lagged, slewed, torque_limit, within_stop, yaw_moment
-from ..vehicle.dynamics import Car, Push, Road, curvature_beside
+from ..vehicle.actuators import (
+    allocate_torques,
+    apply_lag,
+    compute_torque_limit,
+    compute_yaw_moment,
+    limit_angle,
+    limit_rate,
+)
+from ..vehicle.dynamics import CarParams, DisturbanceForces, RoadParams, compute_car_curvature
 from ..vehicle.integration import kutta3
-from ..vehicle.tyres import Inputs, load_of
-from .layout import Drive
-from .window import Past
+from ..vehicle.tyres import TyreInputs, compute_tyre_load
+from .layout import ActuatorState
+from .window import CostInputs
 
-NO_LAG, ONE_LAGS = range(2)  # 2: both lag
+NO_LAG, ONE_LAG = range(2)  # 2: both lag
 
 
-class Kind(NamedTuple):
+class StepVariant(NamedTuple):
     """Integers that choose a tick's text: the same for all cars that are computed together."""
 
     small_angle: int
     law: int
     reference: int
     roll: int
-    follows: int  # the driver reacts to the car
+    has_driver: int  # the driver reacts to the car
     lag: int  # how many of motors and steering lag
-    shifting: int  # `tyres.shifts`
+    has_load_shift: int  # `tyres.shifts`
     road: int  # of `scenarios.roads.ROADS`
 
 
-class Fixed(NamedTuple):
+class StepParams(NamedTuple):
     """Parameters that are constant within an env-step; each a tuple of numbers."""
 
     car: Any
@@ -47,18 +55,18 @@ class Fixed(NamedTuple):
     motor: Any
     steering: Any
     wind: Any
-    pace: Any
+    speed_profile: Any
     target: Any
     disturbance: Any
     task: Any
     noise: Any
-    person: Any
+    driver: Any
     path: Any
-    change: Any
-    leader: Any
+    tyre_change: Any
+    nominal_car: Any
 
 
-class Moving(NamedTuple):
+class StepState(NamedTuple):
     """The state that a tick changes."""
 
     motion: Any
@@ -67,10 +75,10 @@ class Moving(NamedTuple):
     driver: Any  # rad, the driver's steering command
     car: Any  # with its tyres as they are now
     refs: Any  # rad, rad/s, the references of beta and gamma
-    lead: Any  # the nominal car that lays the road
+    nominal_motion: Any  # the nominal car that lays the road
 
 
-class Acted(NamedTuple):
+class AppliedInputs(NamedTuple):
     """What acts during a tick, means; the first six are columns of `Fast`, from `steer` on."""
 
     steer: Any  # rad, front wheels
@@ -84,204 +92,249 @@ class Acted(NamedTuple):
     effort: Any  # its share of full scale
 
 
-class Control(NamedTuple):
+class PlantInputs(NamedTuple):
     """Inputs of the plant during a tick."""
 
     steer: Any  # rad, command to the front wheels
     T_l: Any  # N m, command to the left motor
     T_r: Any
-    push: Any
-    acted: Any
+    disturbance: Any
+    applied: Any
     drive: Any  # at the tick's end
 
 
-class Seen(NamedTuple):
+class Measurements(NamedTuple):
     """Sensors at the end of a tick."""
 
     row: Any  # the fast sensors, columns as in `Fast`
     refs: Any
-    steer: Any  # rad, N m: of `Acted`
+    steer: Any  # rad, N m: of `AppliedInputs`
     moment: Any
     lost: Any  # whether the numbers are no longer finite
-    past: Past
+    cost_inputs: CostInputs
 
 
-@inlined
-def changed(car: Any, change: Any, now: Any) -> Any:
-    """The car, its tyres changed where `now` holds."""
-    C_f = select(now, car.C_f * change.front, car.C_f)
-    C_r = select(now, car.C_r * change.rear, car.C_r)
-    changed_tyres = (C_f, C_r)
-    return Car(*(car[:4] + changed_tyres + car[6:]))
+@inline
+def apply_tyre_change(car: Any, change: Any, is_changed: Any) -> Any:
+    """The car, its tyres changed where `is_changed` holds."""
+    C_f = select(is_changed, car.C_f * change.front, car.C_f)
+    C_r = select(is_changed, car.C_r * change.rear, car.C_r)
+    new_stiffness = (C_f, C_r)
+    return CarParams(*(car[:4] + new_stiffness + car[6:]))
 
 
-@inlined
-def standing_load(drive: Any, car: Any, kind: Kind) -> Any:
+@inline
+def compute_static_load(drive: Any, car: Any, variant: StepVariant) -> Any:
     """The Load of the actuators as they are now."""
-    inputs = Inputs(drive.delta_f, drive.T_l, drive.T_r)
-    return load_of(inputs, car, kind.small_angle, kind.shifting)
+    inputs = TyreInputs(drive.delta_f, drive.T_l, drive.T_r)
+    return compute_tyre_load(inputs, car, variant.small_angle, variant.has_load_shift)
 
 
-@inlined
-def load_at(steer: Any, T_l: Any, T_r: Any, drive: Any, rest: Any, car: Any, kind: Kind) -> Any:
+@inline
+def compute_lagged_load(
+    steer: Any, T_l: Any, T_r: Any, drive: Any, rest: Any, car: Any, variant: StepVariant
+) -> Any:
     """The Load at a front angle, `rest` of the motors' deviation from T_l and T_r being left."""
-    inputs = Inputs(steer, lagged(T_l, drive.T_l, rest), lagged(T_r, drive.T_r, rest))
-    return load_of(inputs, car, kind.small_angle, kind.shifting)
+    inputs = TyreInputs(steer, apply_lag(T_l, drive.T_l, rest), apply_lag(T_r, drive.T_r, rest))
+    return compute_tyre_load(inputs, car, variant.small_angle, variant.has_load_shift)
 
 
-@inlined
-def torques(
-    N_z: Any, tick: Any, v_x: Any, integral: Any, pace: Any, car: Any, yaw_first: Any
+@inline
+def compute_motor_torques(
+    N_z: Any, tick: Any, v_x: Any, integral: Any, profile: Any, car: Any, yaw_first: Any
 ) -> Any:
     """(T_l, T_r, a_x, integral): torques in N m for a yaw moment and the driver's acceleration."""
-    most = torque_limit(v_x, car)
-    limit = 2.0 * most / (car.m * car.r)
-    a_x, integral = acceleration_command(tick, v_x, integral, pace, limit)
-    T_l, T_r = distribute(N_z, a_x, car, yaw_first, most)
+    max_torque = compute_torque_limit(v_x, car)
+    limit = 2.0 * max_torque / (car.m * car.r)
+    a_x, integral = compute_acceleration_command(tick, v_x, integral, profile, limit)
+    T_l, T_r = allocate_torques(N_z, a_x, car, yaw_first, max_torque)
     return T_l, T_r, a_x, integral
 
 
-@inlined
-def _at_change(fixed: Fixed, now: Moving, tick: Any, kind: Kind) -> Moving:
+@inline
+def _apply_due_change(
+    params: StepParams, state: StepState, tick: Any, variant: StepVariant
+) -> StepState:
     """The state once the tyres have changed, if they do so at this tick."""
-    here, car, start = tick == fixed.change.tick, now.car, now.start
-    if anywhere(here):
-        car = changed(car, fixed.change, here)
-        start = standing_load(now.drive, car, kind)
-    return Moving(now.motion, now.drive, start, now.driver, car, now.refs, now.lead)
-
-
-@inlined
-def _road_laid(fixed: Fixed, now: Moving, tick: Any) -> tuple[Fixed, Lead]:
-    """(the parameters with the road as it turns during the tick, the nominal car at its end)."""
-    speed, _ = wanted_motion(tick, fixed.pace)
-    turn, lead = laid_by(now.lead, now.driver, speed, fixed.leader)
-    road, turns = fixed.road, (turn,)
-    laid = (Road(*(road[:5] + turns)),)
-    return Fixed(*(fixed[:1] + laid + fixed[2:])), lead
-
-
-@inlined
-def command(fixed: Fixed, N_z: Any, turn: Any, now: Moving, tick: Any, chance: Chance) -> Control:
-    """The plant's inputs during the tick that starts at `tick`; arguments as in `advance`."""
-    motor, steering, task, ou = fixed.motor, fixed.steering, fixed.task, fixed.disturbance
-    drive, driver, car = now.drive, now.driver, now.car
-    slewing = slewed(drive.slewing, turn, task.slew)
-    extra = within_stop(slewing, driver, task.stop)
-    steer = driver + extra
-    T_l, T_r, a_x, integral = torques(
-        N_z, tick, now.motion.v_x, drive.integral, fixed.pace, car, task.yaw_first
+    is_due, car, start = tick == params.tyre_change.tick, state.car, state.start
+    if any_lane(is_due):
+        car = apply_tyre_change(car, params.tyre_change, is_due)
+        start = compute_static_load(state.drive, car, variant)
+    return StepState(
+        state.motion, state.drive, start, state.driver, car, state.refs, state.nominal_motion
     )
-    F_w, N_w, N_x = wind_at(tick, fixed.wind)
-    left, right = lagged(T_l, drive.T_l, motor.mean), lagged(T_r, drive.T_r, motor.mean)
-    moment = yaw_moment(left, right, car)
-    acted = Acted(
-        lagged(steer, drive.delta_f, steering.mean),
+
+
+@inline
+def _follow_nominal_path(
+    params: StepParams, state: StepState, tick: Any
+) -> tuple[StepParams, NominalMotion]:
+    """(the parameters with the road as it turns during the tick, the nominal car at its end)."""
+    speed, _ = compute_speed_reference(tick, params.speed_profile)
+    turn_rate, nominal_motion = step_nominal_car(
+        state.nominal_motion, state.driver, speed, params.nominal_car
+    )
+    road, turn_part = params.road, (turn_rate,)
+    road_part = (RoadParams(*(road[:5] + turn_part)),)
+    return StepParams(*(params[:1] + road_part + params[2:])), nominal_motion
+
+
+@inline
+def compute_inputs(
+    params: StepParams,
+    N_z: Any,
+    steer_command: Any,
+    state: StepState,
+    tick: Any,
+    draws: NormalDraws,
+) -> PlantInputs:
+    """The plant's inputs during the tick that starts at `tick`; arguments as in
+    `integrate_tick`."""
+    motor, steering, task, ou = params.motor, params.steering, params.task, params.disturbance
+    drive, driver, car = state.drive, state.driver, state.car
+    slewing = limit_rate(drive.slewing, steer_command, task.slew)
+    limited_steer = limit_angle(slewing, driver, task.stop)
+    steer = driver + limited_steer
+    T_l, T_r, a_x, integral = compute_motor_torques(
+        N_z, tick, state.motion.v_x, drive.integral, params.speed_profile, car, task.yaw_first
+    )
+    F_w, N_w, N_x = compute_wind(tick, params.wind)
+    left, right = apply_lag(T_l, drive.T_l, motor.mean), apply_lag(T_r, drive.T_r, motor.mean)
+    moment = compute_yaw_moment(left, right, car)
+    applied = AppliedInputs(
+        apply_lag(steer, drive.delta_f, steering.mean),
         left,
         right,
         driver,
         a_x,
-        curvature_beside(now.motion, fixed.road),
-        lagged(extra, drive.added, steering.mean),
+        compute_car_curvature(state.motion, params.road),
+        apply_lag(limited_steer, drive.added, steering.mean),
         moment,
         moment * (1.0 / task.yaw_scale),
     )
-    after = Drive(
-        lagged(T_l, drive.T_l, motor.end),
-        lagged(T_r, drive.T_r, motor.end),
-        lagged(steer, drive.delta_f, steering.end),
+    next_drive = ActuatorState(
+        apply_lag(T_l, drive.T_l, motor.end),
+        apply_lag(T_r, drive.T_r, motor.end),
+        apply_lag(steer, drive.delta_f, steering.end),
         integral,
-        ou.keep * drive.F_d + ou.fresh * ou.force * chance.wheels[2],
-        ou.keep * drive.N_d + ou.fresh * ou.moment * chance.wheels[3],
+        ou.decay * drive.F_d + ou.noise_gain * ou.force * draws.wheels[2],
+        ou.decay * drive.N_d + ou.noise_gain * ou.moment * draws.wheels[3],
         slewing,
-        lagged(extra, drive.added, steering.end),
+        apply_lag(limited_steer, drive.added, steering.end),
     )
-    return Control(steer, T_l, T_r, Push(drive.F_d + F_w, drive.N_d + N_w, N_x), acted, after)
+    return PlantInputs(
+        steer,
+        T_l,
+        T_r,
+        DisturbanceForces(drive.F_d + F_w, drive.N_d + N_w, N_x),
+        applied,
+        next_drive,
+    )
 
 
-@inlined
-def _loads(fixed: Fixed, control: Control, now: Moving, kind: Kind) -> Any:
+@inline
+def _compute_loads(
+    params: StepParams, inputs: PlantInputs, state: StepState, variant: StepVariant
+) -> Any:
     """The Load at the start, the middle and the end of a tick."""
-    motor, steering, drive, car, start = fixed.motor, fixed.steering, now.drive, now.car, now.start
-    steer, T_l, T_r = control.steer, control.T_l, control.T_r
-    if kind.lag == NO_LAG:
-        start = load_of(Inputs(steer, T_l, T_r), car, kind.small_angle, kind.shifting)
+    motor, steering, drive, car, start = (
+        params.motor,
+        params.steering,
+        state.drive,
+        state.car,
+        state.start,
+    )
+    steer, T_l, T_r = inputs.steer, inputs.T_l, inputs.T_r
+    if variant.lag == NO_LAG:
+        start = compute_tyre_load(
+            TyreInputs(steer, T_l, T_r), car, variant.small_angle, variant.has_load_shift
+        )
         middle, end = start, start
     else:  # actuators that lag move continuously: a tick starts where the last one ended
-        if kind.lag == ONE_LAGS:  # the other one jumps
-            angle = lagged(steer, drive.delta_f, steering.start)
-            start = load_at(angle, T_l, T_r, drive, motor.start, car, kind)
-        angle = lagged(steer, drive.delta_f, steering.middle)
-        middle = load_at(angle, T_l, T_r, drive, motor.middle, car, kind)
-        angle = lagged(steer, drive.delta_f, steering.end)
-        end = load_at(angle, T_l, T_r, drive, motor.end, car, kind)
+        if variant.lag == ONE_LAG:  # the other one jumps
+            angle = apply_lag(steer, drive.delta_f, steering.start)
+            start = compute_lagged_load(angle, T_l, T_r, drive, motor.start, car, variant)
+        angle = apply_lag(steer, drive.delta_f, steering.middle)
+        middle = compute_lagged_load(angle, T_l, T_r, drive, motor.middle, car, variant)
+        angle = apply_lag(steer, drive.delta_f, steering.end)
+        end = compute_lagged_load(angle, T_l, T_r, drive, motor.end, car, variant)
     return start, middle, end
 
 
-@inlined
-def sense(
-    fixed: Fixed,
+@inline
+def measure_tick(
+    params: StepParams,
     motion: Any,
     accel: Any,
-    acted: Acted,
-    before: Any,
-    ahead: Any,
-    chance: Chance,
-    kind: Kind,
-) -> tuple[Any, Seen]:
+    applied: AppliedInputs,
+    refs_before: Any,
+    next_steer: Any,
+    draws: NormalDraws,
+    variant: StepVariant,
+) -> tuple[Any, Measurements]:
     """(the driver's command, what is Seen) at the end of a tick that led to a motion.
 
     accel: (a_x, a_y) in m/s2, specific forces. before: the references at the tick's start. The
-    others are as in `advance`.
+    others are as in `integrate_tick`.
     """
-    task = fixed.task
-    row = fast_row(motion, accel, acted, fixed.car.d_f, fixed.noise, chance)
+    task = params.task
+    row = compute_fast_row(motion, accel, applied, params.car.d_f, params.noise, draws)
     v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
-    driver = ahead
-    if kind.follows:
-        driver = steered(
-            acted.driver, motion, fixed.path, fixed.road, fixed.target, fixed.person, task.stop
+    driver = next_steer
+    if variant.has_driver:
+        driver = compute_driver_angle(
+            applied.driver,
+            motion,
+            params.path,
+            params.road,
+            params.target,
+            params.driver,
+            task.stop,
         )
-    steady = reference(driver, v, fixed.target, kind.reference)
-    refs = followed(before, steady, fixed.target, kind.reference)
+    steady = compute_reference(driver, v, params.target, variant.reference)
+    refs = filter_reference(refs_before, steady, params.target, variant.reference)
     size = motion.v_x * motion.v_x + motion.v_y * motion.v_y + motion.gamma * motion.gamma
     finite = size + motion.psi + motion.Y + motion.phi  # squares: the references take them too
-    seen = Seen(
+    measured = Measurements(
         row,
         refs,
-        acted.steer,
-        acted.moment,
+        applied.steer,
+        applied.moment,
         finite - finite != 0.0,
-        Past(refs[0], refs[1], acted.effort, acted.added),
+        CostInputs(refs[0], refs[1], applied.effort, applied.added),
     )
-    return driver, seen
+    return driver, measured
 
 
-@inlined
-def advance(
-    fixed: Fixed,
+@inline
+def integrate_tick(
+    params: StepParams,
     N_z: Any,
-    turn: Any,
-    now: Moving,
+    steer_command: Any,
+    state: StepState,
     tick: Any,
-    chance: Chance,
-    ahead: Any,
-    kind: Kind,
-) -> tuple[Moving, Seen]:
+    draws: NormalDraws,
+    next_steer: Any,
+    variant: StepVariant,
+) -> tuple[StepState, Measurements]:
     """(the state, what is Seen) at the end of the tick that starts at `tick`.
 
     N_z: N m and turn: rad, the commanded yaw moment and added steering. chance: the numbers of the
     next tick. ahead: rad, the programme's steering at the next tick, which counts where no driver
     reacts to the car.
     """
-    small_angle, law, roll = kind.small_angle, kind.law, kind.roll
-    now, lead = _at_change(fixed, now, tick, kind), now.lead
-    if kind.road == NOMINAL_PATH:
-        fixed, lead = _road_laid(fixed, now, tick)
-    control = command(fixed, N_z, turn, now, tick, chance)
-    loads = _loads(fixed, control, now, kind)
-    before, car, road = now.motion, now.car, fixed.road
-    motion = kutta3(before, loads, control.push, car, road, TICK, small_angle, law, roll)
-    accel = specific_force(before, motion, road, small_angle, roll)
-    driver, seen = sense(fixed, motion, accel, control.acted, now.refs, ahead, chance, kind)
-    return Moving(motion, control.drive, loads[2], driver, car, seen.refs, lead), seen
+    small_angle, law, roll = variant.small_angle, variant.law, variant.roll
+    state, nominal_motion = _apply_due_change(params, state, tick, variant), state.nominal_motion
+    if variant.road == NOMINAL_PATH:
+        params, nominal_motion = _follow_nominal_path(params, state, tick)
+    inputs = compute_inputs(params, N_z, steer_command, state, tick, draws)
+    loads = _compute_loads(params, inputs, state, variant)
+    before, car, road = state.motion, state.car, params.road
+    motion = kutta3(before, loads, inputs.disturbance, car, road, TICK, small_angle, law, roll)
+    accel = compute_specific_force(before, motion, road, small_angle, roll)
+    driver, measured = measure_tick(
+        params, motion, accel, inputs.applied, state.refs, next_steer, draws, variant
+    )
+    return StepState(
+        motion, inputs.drive, loads[2], driver, car, measured.refs, nominal_motion
+    ), measured

@@ -9,11 +9,11 @@ import numpy as np
 from ..backend.arrays import read
 from ..backend.decorators import jit
 from ..record import Array, Record
-from ..scenarios.wind import wind_at
+from ..scenarios.wind import compute_wind
 from ..sensors.link import SlowSensor
 from ..sensors.slow import SLOW_NAMES
-from ..ticks import TICK, ticks
-from ..vehicle.dynamics import Motion, gravity_at, sideslip_angle
+from ..ticks import TICK, count_ticks
+from ..vehicle.dynamics import Motion, compute_gravity, compute_sideslip_angle
 from ..vehicle.vehicle import Vehicle
 from .layout import FLAGS, P, Z
 from .packing import EpisodeConfig
@@ -21,32 +21,32 @@ from .packing import EpisodeConfig
 T = TypeVar("T")
 
 
-def vehicle_in(config: EpisodeConfig, params: Array, state: Array) -> Vehicle:
+def get_vehicle(config: EpisodeConfig, params: Array, state: Array) -> Vehicle:
     """The true vehicle now, with what the seed drew; friction is the mean of both sides'."""
-    car, change = read(params, P.car), read(params, P.change)
+    car, change = read(params, P.car), read(params, P.tyre_change)
     if not car.m > 0.0:  # not reset yet
         return config.vehicle
-    changed = state[Z.clock.tick] >= change.tick
+    is_changed = state[Z.clock.tick] >= change.tick
     return config.vehicle.replace(
-        front_stiffness=car.C_f * (change.front if changed else 1.0),
-        rear_stiffness=car.C_r * (change.rear if changed else 1.0),
+        front_stiffness=car.C_f * (change.front if is_changed else 1.0),
+        rear_stiffness=car.C_r * (change.rear if is_changed else 1.0),
         friction=0.5 * (car.mu + car.mu_r),
     )
 
 
-def slow_in(config: EpisodeConfig, state: Array) -> dict[str, SlowSensor]:
+def get_slow_sensors(config: EpisodeConfig, state: Array) -> dict[str, SlowSensor]:
     """The slow sensors by name, with the clock phase that the episode drew."""
     sensors = {}
     for name, sensor in config.slow.items():
         if sensor.phase is None:
-            at = Z.slow[SLOW_NAMES.index(name)]
-            first = state[at.next_capture] - state[at.frames] * ticks(sensor.period)
+            column = Z.slow[SLOW_NAMES.index(name)]
+            first = state[column.next_capture] - state[column.frames] * count_ticks(sensor.period)
             sensor = dataclasses.replace(sensor, phase=first * TICK)
         sensors[name] = sensor
     return sensors
 
 
-def motion_in(state: Array) -> Motion:
+def get_motion(state: Array) -> Motion:
     """The true velocities, heading, place and roll now, in SI units."""
     return read(state, Z.motion)
 
@@ -65,7 +65,7 @@ class TrueState(NamedTuple):
 TRUE_STATE = TrueState()
 
 
-def true_states_in(params: Array, states: Array, switches: Any) -> Array:
+def compute_true_states(params: Array, states: Array, switches: Any) -> Array:
     """The `TrueState` of N episodes now, (N, len(TrueState))."""
     out = np.empty((len(params), len(TRUE_STATE)))
     _write_true_states(params, states, switches, out)
@@ -77,25 +77,25 @@ def _write_true_states(params: Any, states: Any, switches: Any, out: Any) -> Non
     for i in range(len(params)):
         p, z = params[i], states[i]
         motion, small_angle = read(z, Z.motion), switches[i, FLAGS.small_angle]
-        F_w, N_w, _ = wind_at(z[Z.clock.tick], read(p, P.wind))
-        _, across = gravity_at(motion, read(p, P.road), small_angle)
-        out[i, TRUE_STATE.beta] = sideslip_angle(motion.v_x, motion.v_y, small_angle)
+        F_w, N_w, _ = compute_wind(z[Z.clock.tick], read(p, P.wind))
+        _, lateral_gravity = compute_gravity(motion, read(p, P.road), small_angle)
+        out[i, TRUE_STATE.beta] = compute_sideslip_angle(motion.v_x, motion.v_y, small_angle)
         out[i, TRUE_STATE.gamma] = motion.gamma
-        out[i, TRUE_STATE.F_d] = z[Z.drive.F_d] + F_w - p[P.car.m] * across
+        out[i, TRUE_STATE.F_d] = z[Z.drive.F_d] + F_w - p[P.car.m] * lateral_gravity
         out[i, TRUE_STATE.N_d] = z[Z.drive.N_d] + N_w
         out[i, TRUE_STATE.phi], out[i, TRUE_STATE.phi_rate] = motion.phi, motion.phi_dot
 
 
-def record_in(state: Array, rows: Array, packets: Array) -> Record:
+def make_record(state: Array, rows: Array, packets: Array) -> Record:
     """The record whose fast rows end now (copies)."""
     return Record(rows.copy(), packets.copy(), int(state[Z.clock.tick]) - len(rows) + 1)
 
 
-class Each(Sequence[T]):
+class LazyRows(Sequence[T]):
     """Something of every row of a batch, made when it is asked for."""
 
-    def __init__(self, count: int, of: Callable[[int], T]) -> None:
-        self._rows, self._of = range(count), of
+    def __init__(self, count: int, make_item: Callable[[int], T]) -> None:
+        self._rows, self._make_item = range(count), make_item
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -106,8 +106,8 @@ class Each(Sequence[T]):
     def __getitem__(self, i: slice) -> tuple[T, ...]: ...
     def __getitem__(self, i: int | slice) -> T | tuple[T, ...]:
         if isinstance(i, slice):
-            return tuple(map(self._of, self._rows[i]))
-        return self._of(self._rows[i])
+            return tuple(map(self._make_item, self._rows[i]))
+        return self._make_item(self._rows[i])
 
     def __repr__(self) -> str:
         return f"<{len(self)} rows>"

@@ -7,25 +7,25 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arguments import check_choice, count_of
+from ..arguments import check_choice, check_int
 from ..backend.arrays import read
 from ..engine.layout import P, Z
 from ..engine.window import WINDOW
-from ..rendering.trace import Shot
-from ..scenarios.manoeuvres import ScenarioSource, scenario_from
+from ..rendering.trace import RenderState
+from ..scenarios.manoeuvres import ScenarioSource, make_scenario
 from ..scenarios.scenario import Scenario
 from ..stability import StabilityEnv
-from ..task.cost import rest_of_cost
+from ..task.cost import compute_failure_cost
 from ..task.failures import COLLISION, DEPARTURE, RUNNING
 from ..task.info import REPORT
 from ..vehicle.dynamics import Motion
 from ..vehicle.vehicles import VehicleSource
 from .roads import ROADS
-from .traffic import PERIOD, Start, Traffic, hazard_from
+from .traffic import PERIOD, Traffic, TrafficStart, parse_hazard
 
-MOST = 40  # vehicles: a step of the road looks at every pair
-_OURS = ("road", "curvature", "path", "small_angle")
-_PLACE = ("s", "theta", "X", "Y")
+MAX_VEHICLES = 40  # vehicles: a step of the road looks at every pair
+_OWN_ROAD_FIELDS = ("road", "curvature", "path", "small_angle")
+_FIXED_STATE = ("s", "theta", "X", "Y")
 
 
 class HighwayEnv(StabilityEnv):
@@ -68,17 +68,17 @@ class HighwayEnv(StabilityEnv):
         **options: Any,
     ) -> None:
         check_choice("road", road, ROADS)
-        self.road, self.hazard = road, hazard_from(hazard)
-        self.traffic = count_of("traffic", traffic, "vehicles", 0, MOST)
-        on_road = self._on_road(scenario_from(scenario))
-        super().__init__(sensors, on_road, vehicle, reference=reference, **options)
-        self._around: Traffic | None = None
+        self.road, self.hazard = road, parse_hazard(hazard)
+        self.traffic = check_int("traffic", traffic, "vehicles", 0, MAX_VEHICLES)
+        adapted = self._adapt_scenario(make_scenario(scenario))
+        super().__init__(sensors, adapted, vehicle, reference=reference, **options)
+        self._traffic: Traffic | None = None
 
-    def _on_road(self, scenario: Scenario) -> Scenario:
+    def _adapt_scenario(self, scenario: Scenario) -> Scenario:
         """The scenario with its bank and grade from the beginning; ValueError where it has more of
         a road, or nobody to swerve."""
         defaults = Scenario(name="")
-        for field in _OURS:
+        for field in _OWN_ROAD_FIELDS:
             if (value := getattr(scenario, field)) != getattr(defaults, field):
                 raise ValueError(
                     f"scenario {scenario.name!r}: {field} {value!r} is of our own roads; here the "
@@ -95,85 +95,91 @@ class HighwayEnv(StabilityEnv):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Start an episode; see `StabilityEnv`."""
-        asked = dict(options or {})
-        if "scenario" in asked:
-            asked["scenario"] = self._on_road(scenario_from(asked["scenario"]))
-        state = asked.get("state", {})
+        reset_options = dict(options or {})
+        if "scenario" in reset_options:
+            reset_options["scenario"] = self._adapt_scenario(
+                make_scenario(reset_options["scenario"])
+            )
+        state = reset_options.get("state", {})
         if isinstance(state, Mapping):
-            if off := [name for name in _PLACE if name in state]:
-                raise ValueError(f"reset option state: {off[0]} is where the road begins; y may be")
+            if fixed_names := [name for name in _FIXED_STATE if name in state]:
+                raise ValueError(
+                    f"reset option state: {fixed_names[0]} is where the road begins; y may be"
+                )
             if "y" in state:
-                asked["state"] = {**state, "Y": state["y"]}
-        return super().reset(seed=seed, options=asked)
+                reset_options["state"] = {**state, "Y": state["y"]}
+        return super().reset(seed=seed, options=reset_options)
 
-    def _begin(self) -> None:
+    def _start_episode(self) -> None:
         """The road, the vehicles on it, and the driver's path around the one that brakes."""
         p, z = self._params, self._state
         friction = 0.5 * float(p[P.car.mu] + p[P.car.mu_r])
-        start = Start(self._now.vehicle, self.motion, float(p[P.pace.speed]), friction)
+        start = TrafficStart(
+            self._episode.vehicle, self.motion, float(p[P.speed_profile.speed]), friction
+        )
         key = int(z[Z.clock.key_low]) | int(z[Z.clock.key_high]) << 32
-        self._around = Traffic(self.road, start, self.hazard, self.traffic, key)
-        if self._around.path is not None:
-            p[list(P.path)] = self._around.path
-        super()._begin()
+        self._traffic = Traffic(self.road, start, self.hazard, self.traffic, key)
+        if self._traffic.path is not None:
+            p[list(P.path)] = self._traffic.path
+        super()._start_episode()
 
-    def _advance(self, force: npt.NDArray[np.float32]) -> int:
+    def _advance(self, command: npt.NDArray[np.float32]) -> int:
         """One control period of our car on the lane as it is here, then the road's steps in it."""
-        around, p, z = self._around, self._params, self._state
-        assert around is not None
-        here = around.place(self.motion)
-        z[Z.motion.y], z[Z.motion.theta] = here.y, here.theta
-        p[P.road.curvature] = here.curvature
+        traffic, p, z = self._traffic, self._params, self._state
+        assert traffic is not None
+        position = traffic.locate(self.motion)
+        z[Z.motion.y], z[Z.motion.theta] = position.y, position.theta
+        p[P.road.curvature] = position.curvature
         first = int(z[Z.clock.tick])
-        done = super()._advance(force)
-        running = done > 0 and self._report[REPORT.failure] == RUNNING
-        for tick in range(first + 1, first + done + 1) if running else ():
+        done = super()._advance(command)
+        is_running = done > 0 and self._report[REPORT.failure] == RUNNING
+        for tick in range(first + 1, first + done + 1) if is_running else ():
             if tick % PERIOD == 0:
-                around.follow(read(self._window, WINDOW.track, tick - first - 1))
-        if running and (around.crashed or around.departed):
-            self._fail(COLLISION if around.crashed else DEPARTURE)
+                traffic.step_road(read(self._window, WINDOW.track, tick - first - 1))
+        if is_running and (traffic.crashed or traffic.departed):
+            self._write_failure(COLLISION if traffic.crashed else DEPARTURE)
         return done
 
-    def _fail(self, failure: int) -> None:
+    def _write_failure(self, failure: int) -> None:
         """End the episode, the rest of it charged."""
         z, report = self._state, self._report
         z[Z.clock.failure] = report[REPORT.failure] = failure
-        report[REPORT.cost] += rest_of_cost(self._params[P.task.duration], z[Z.clock.tick])
+        report[REPORT.cost] += compute_failure_cost(self._params[P.task.duration], z[Z.clock.tick])
         report[REPORT.reward] = -report[REPORT.cost]
 
-    def shot(self, row: int = 0) -> Shot:
+    def make_render_state(self, row: int = 0) -> RenderState:
         """What a picture is drawn from, its road by highway-env's own graphics."""
-        return super().shot(row)._replace(world=self._world)
+        return super().make_render_state(row)._replace(world=self._draw_world)
 
-    def _world(self, size: tuple[int, int], others: list[Motion]) -> Any:
+    def _draw_world(self, size: tuple[int, int], others: list[Motion]) -> Any:
         """The road around our car as highway-env draws it, and others of ours as shadows on it."""
         import pygame
         from highway_env.road.graphics import RoadGraphics, WorldSurface
         from highway_env.vehicle.graphics import VehicleGraphics
 
-        assert self._around is not None
-        road, ours = self._around.road, self._around.ours
-        world = WorldSurface(size, 0, pygame.Surface(size))
-        world.scaling, world.centering_position = 10.0, [0.3, 0.5]
-        ours.put(self.motion)
-        world.move_display_window_to(ours.position)
-        RoadGraphics.display(road, world)
-        RoadGraphics.display_road_objects(road, world, offscreen=True)
+        assert self._traffic is not None
+        road, ego = self._traffic.road, self._traffic.ego
+        surface = WorldSurface(size, 0, pygame.Surface(size))
+        surface.scaling, surface.centering_position = 10.0, [0.3, 0.5]
+        ego.set_motion(self.motion)
+        surface.move_display_window_to(ego.position)
+        RoadGraphics.display(road, surface)
+        RoadGraphics.display_road_objects(road, surface, offscreen=True)
         for motion in others:
-            shadow = copy.copy(ours)
-            shadow.put(motion)
+            shadow = copy.copy(ego)
+            shadow.set_motion(motion)
             shadow.color = (170, 170, 170)
-            VehicleGraphics.display(shadow, world, offscreen=True)
-        RoadGraphics.display_traffic(road, world, offscreen=True)
-        return world
+            VehicleGraphics.display(shadow, surface, offscreen=True)
+        RoadGraphics.display_traffic(road, surface, offscreen=True)
+        return surface
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot that `set_state` continues from, bit for bit, traffic included."""
-        return super().get_state() | {"road": self.road, "around": copy.deepcopy(self._around)}
+        return super().get_state() | {"road": self.road, "around": copy.deepcopy(self._traffic)}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Go back to a snapshot of this env or of one built with the same arguments."""
         if snapshot.get("road") != self.road:
             raise ValueError(f"the snapshot is of road {snapshot.get('road')!r}, not {self.road!r}")
         super().set_state(snapshot)
-        self._around = copy.deepcopy(snapshot["around"])
+        self._traffic = copy.deepcopy(snapshot["around"])

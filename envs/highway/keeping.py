@@ -4,7 +4,7 @@ Its car is a linear bicycle whose steering alone acts, at a constant speed. Faul
 1.12.1 are worked around here, and `tests/envs/highway/test_keeping.py` has each:
 
 - it takes no argument `render_mode` (set here on the built environment);
-- its `step` returns the observation from before the step (`OwnObservation` takes either);
+- its `step` returns the observation from before the step (`NativeObservation` takes either);
 - its Runge-Kutta steps of 0.1 s are unstable below 5.5 m/s (here a step is a tick of 1 ms);
 - its linear model, half as strong in steering as the car, is not used.
 """
@@ -17,22 +17,22 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from ..backend.decorators import plain
+from ..backend.decorators import as_python
 from ..engine.layout import P, Z
 from ..outside.env import PlantEnv
-from ..outside.plants import Acting
+from ..outside.plants import OutsideInputs
 from ..scenarios.scenario import Scenario
-from ..sensors.camera import at_preview
-from ..task.observation import Entry, space_of
+from ..sensors.camera import compute_preview_offset
+from ..task.observation import ObservationEntry, make_space
 from ..ticks import TICK
 from ..vehicle.dynamics import Motion
 from ..vehicle.vehicle import Vehicle
-from .roads import place_on
+from .roads import locate_on_lane
 
 from highway_env.envs.lane_keeping_env import LaneKeepingEnv  # isort: skip  # after `roads`
 from highway_env.vehicle.dynamics import BicycleVehicle  # isort: skip
 
-_at_preview = plain(at_preview)
+_compute_preview_offset = as_python(compute_preview_offset)
 _MASS = 1000.0  # kg; theirs is 1 kg, and only ratios to it count
 KEEPING = Scenario(
     name="lane-keeping-v0",
@@ -47,7 +47,7 @@ KEEPING = Scenario(
 STATES = ("beta", "gamma", "psi", "y_l")
 
 
-def keeping_vehicle() -> Vehicle:
+def make_keeping_vehicle() -> Vehicle:
     """highway-env's bicycle as our `Vehicle`; what it has not (motors, roll, height) is assumed."""
     car = BicycleVehicle
     return Vehicle(
@@ -85,40 +85,43 @@ class KeepingPlant:
 
     def start(self, seed: int) -> None:
         """Begin its episode."""
-        self.returned, _ = self.env.reset(seed=seed)
+        self.last_observation, _ = self.env.reset(seed=seed)
         self.s = 0.0
         self.project()
 
     def project(self) -> None:
         """Find the car's place on the lane that highway-env has it keep; the next tick is a step of
         its own `step`."""
-        self._whole = True
+        self._is_full_step = True
         x, y, heading = self.env.vehicle.state[:3, 0].tolist()
-        place = place_on(self.env.lane, x, -y, -heading)
-        self.y, self.theta, self.curvature = place.y, place.theta, place.curvature
+        position = locate_on_lane(self.env.lane, x, -y, -heading)
+        self.y, self.theta, self.curvature = position.y, position.theta, position.curvature
 
-    def step(self, acting: Acting, h: float) -> None:
+    def step(self, inputs: OutsideInputs, h: float) -> None:
         """A tick; the place on the lane is carried along until it is projected again.
 
         The first tick of a control period is one of their `step`, which also takes the next lane
         and observes; the others are what it does to the car.
         """
-        action = np.array([-acting.steer / self.env.action_type.steering_range[1]])
+        action = np.array([-inputs.steer / self.env.action_type.steering_range[1]])
         before = self.motion
-        if self._whole:
-            self.returned, *_ = self.env.step(action)
+        if self._is_full_step:
+            self.last_observation, *_ = self.env.step(action)
         else:
             self.env.action_type.act(action)
             self.env.road.step(h)
-        self._whole, now = False, self.motion
-        along, across = (
-            0.5 * h * (a + b) for a, b in zip(_paces(before), _paces(now), strict=True)
+        self._is_full_step, after = False, self.motion
+        distance, sideways = (
+            0.5 * h * (a + b)
+            for a, b in zip(
+                _compute_road_velocity(before), _compute_road_velocity(after), strict=True
+            )
         )
-        ds = along / (1.0 - self.curvature * self.y)
+        ds = distance / (1.0 - self.curvature * self.y)
         self.s, self.theta = self.s + ds, self.theta + self.curvature * ds
-        self.y += across
+        self.y += sideways
         rate = -float(self.env.vehicle.derivative[4, 0])
-        self.specific_force = (-now.gamma * now.v_y, rate + now.gamma * now.v_x)
+        self.specific_force = (-after.gamma * after.v_y, rate + after.gamma * after.v_x)
 
     @property
     def motion(self) -> Motion:
@@ -127,20 +130,20 @@ class KeepingPlant:
         return Motion(speed, -slide, -turn, -heading, x, -y, self.s, self.y, self.theta)
 
     @property
-    def finite(self) -> bool:
+    def is_finite(self) -> bool:
         """Whether the state is made of numbers."""
         return bool(np.isfinite(self.env.vehicle.state).all())
 
-    def states(self, seen: Any, preview: float) -> tuple[float, ...]:
+    def states(self, observation: Any, preview: float) -> tuple[float, ...]:
         """`STATES` of an observation of theirs, y_l at a preview distance in m."""
-        lateral, heading, slide, turn = np.ravel(seen["state"]).tolist()
-        centre, lane = np.ravel(seen["reference_state"])[:2].tolist()
+        lateral, heading, slide, turn = np.ravel(observation["state"]).tolist()
+        centre, lane = np.ravel(observation["reference_state"])[:2].tolist()
         psi, speed = math.remainder(lane - heading, 2.0 * math.pi), float(self.env.vehicle.speed)
-        y_l = _at_preview(centre - lateral, psi, self.curvature, preview)
+        y_l = _compute_preview_offset(centre - lateral, psi, self.curvature, preview)
         return math.atan2(-slide, speed), -turn, psi, y_l
 
 
-def _paces(motion: Motion) -> tuple[float, float]:
+def _compute_road_velocity(motion: Motion) -> tuple[float, float]:
     """(along, across) in m/s, the velocity in the road's axes."""
     angle = motion.psi - motion.theta
     cos, sin = math.cos(angle), math.sin(angle)
@@ -151,7 +154,7 @@ class KeepingEnv(PlantEnv):
     """`StabilityEnv` whose car and lane are those of highway-env's `lane-keeping-v0`.
 
     Action (its second entry steers, the first moves nothing), observation, record and cost are
-    ours, so every estimator and `lane-keeping` run; `OwnObservation` has theirs. Needs the extra
+    ours, so every estimator and `lane-keeping` run; `NativeObservation` has theirs. Needs the extra
     `highway`. A snapshot is refused: highway-env's environment makes none.
 
     control_period: ticks; highway-env decides every 100. The others are those of `StabilityEnv`.
@@ -167,7 +170,11 @@ class KeepingEnv(PlantEnv):
         self.plant: KeepingPlant = KeepingPlant(render_mode)
         fixed: dict[str, Any] = {"steering": True, "reference": "zero-slip"}
         super().__init__(
-            sensors, KEEPING, keeping_vehicle(), control_period=control_period, **fixed | options
+            sensors,
+            KEEPING,
+            make_keeping_vehicle(),
+            control_period=control_period,
+            **fixed | options,
         )
 
     def reset(
@@ -179,23 +186,23 @@ class KeepingEnv(PlantEnv):
         self.plant.start(0)  # it always starts there
         return super().reset(seed=seed, options={"state": self.plant.motion._asdict()})
 
-    def _begin(self) -> None:
+    def _start_episode(self) -> None:
         self.plant.start(int(self._state[Z.clock.key_low]))
 
-    def _advance(self, force: npt.NDArray[np.float32]) -> int:
+    def _advance(self, command: npt.NDArray[np.float32]) -> int:
         """A control period on the lane as it is here, which camera and record then see."""
         plant, z = self.plant, self._state
         plant.project()
         self._params[P.road.curvature] = plant.curvature
         z[Z.motion.y], z[Z.motion.theta] = plant.y, plant.theta
-        return super()._advance(force)
+        return super()._advance(command)
 
     @property
     def truth(self) -> tuple[float, ...]:
         """The true `STATES`."""
         motion = self.motion
         psi = motion.psi - motion.theta
-        y_l = _at_preview(motion.y, psi, self.plant.curvature, self.vehicle.preview)
+        y_l = _compute_preview_offset(motion.y, psi, self.plant.curvature, self.vehicle.preview)
         return math.atan2(motion.v_y, motion.v_x), motion.gamma, psi, y_l
 
     def get_state(self) -> dict[str, Any]:
@@ -207,7 +214,7 @@ class KeepingEnv(PlantEnv):
         self.get_state()
 
 
-class OwnObservation(gym.ObservationWrapper[Any, Any, Any]):
+class NativeObservation(gym.ObservationWrapper[Any, Any, Any]):
     """A `KeepingEnv` whose estimates are highway-env's own observation.
 
     returned: as its `step` returns it, from before the step; else the newest.
@@ -218,14 +225,17 @@ class OwnObservation(gym.ObservationWrapper[Any, Any, Any]):
         self._returned = returned
         units = ("rad", "rad/s", "rad", "m")
         names = [f"{name}_hat" for name in STATES]
-        own = [Entry(name, unit, -200.0, 200.0) for name, unit in zip(names, units, strict=True)]
-        self.layout = (*env.get_wrapper_attr("layout"), *own)
-        self.observation_space = space_of(self.layout)
+        entries = [
+            ObservationEntry(name, unit, -200.0, 200.0)
+            for name, unit in zip(names, units, strict=True)
+        ]
+        self.layout = (*env.get_wrapper_attr("layout"), *entries)
+        self.observation_space = make_space(self.layout)
 
     def observation(self, observation: Any) -> Any:
         """Ours with theirs behind it."""
         base: Any = self.env.unwrapped
         plant = base.plant
-        seen = plant.returned if self._returned else plant.env.observation_type.observe()
-        own = plant.states(seen, base.vehicle.preview)
-        return np.concatenate([observation, np.asarray(own, np.float32)])
+        native = plant.last_observation if self._returned else plant.env.observation_type.observe()
+        states = plant.states(native, base.vehicle.preview)
+        return np.concatenate([observation, np.asarray(states, np.float32)])

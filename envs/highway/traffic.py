@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arguments import is_finite, mapping_of, unknown_names
-from ..rendering.road import body
-from ..scenarios.draws import Range, range_of
-from ..scenarios.tracks import Path
+from ..arguments import check_mapping, describe_unknown, is_finite
+from ..rendering.road import compute_body
+from ..scenarios.draws import Range, get_range
+from ..scenarios.tracks import TrackPath
 from ..vehicle.dynamics import Motion
 from ..vehicle.vehicle import GRAVITY, Vehicle
-from .roads import ROADS, WIDTH, Course, Place, place_on
+from .roads import ROADS, WIDTH, LanePosition, RoadLayout, locate_on_lane
 
 from highway_env.road.road import Road  # isort: skip  # after `roads`, which names the extra
 from highway_env.vehicle.behavior import IDMVehicle  # isort: skip
@@ -55,7 +55,7 @@ class Hazard:
             object.__setattr__(self, name, tuple(map(float, ends)))
 
 
-def hazard_from(source: Mapping[str, Any] | None) -> Hazard | None:
+def parse_hazard(source: Mapping[str, Any] | None) -> Hazard | None:
     """A hazard of a mapping of its fields, {} for the usual one; None for none.
 
     Raises TypeError for an unknown field, ValueError for a value out of place.
@@ -63,13 +63,13 @@ def hazard_from(source: Mapping[str, Any] | None) -> Hazard | None:
     if source is None:
         return None
     known = [entry.name for entry in dataclasses.fields(Hazard)]
-    values = dict(mapping_of("hazard", source))
+    values = dict(check_mapping("hazard", source))
     if unknown := [name for name in values if name not in known]:
-        raise TypeError(unknown_names("field of hazard", unknown, known))
+        raise TypeError(describe_unknown("field of hazard", unknown, known))
     return Hazard(**values)
 
 
-class Start(NamedTuple):
+class TrafficStart(NamedTuple):
     """What the engine drew for an episode."""
 
     vehicle: Vehicle
@@ -78,26 +78,28 @@ class Start(NamedTuple):
     friction: float
 
 
-class OurCar(HighwayVehicle):  # type: ignore[misc]
+class EgoVehicle(HighwayVehicle):  # type: ignore[misc]
     """Our car as the others see it: it is where it was put, and a vehicle like any other."""
 
     color = (50, 200, 0)  # highway-env's own for the car that is driven
 
-    def __init__(self, road: Any, start: Start) -> None:
-        front, rear, half = body(start.vehicle)
+    def __init__(self, road: Any, start: TrafficStart) -> None:
+        front, rear, half = compute_body(start.vehicle)
         self.LENGTH, self.WIDTH, self._centre = front - rear, 2.0 * half, 0.5 * (front + rear)
         self.target_speed = start.speed  # which those who would merge ahead of it ask for
         super().__init__(road, [0.0, 0.0])
-        self.put(start.motion)
+        self.set_motion(start.motion)
         self.on_state_update()
 
-    def put(self, motion: Motion) -> None:
+    def set_motion(self, motion: Motion) -> None:
         """Move to a Motion of ours; the body's centre is not the centre of gravity."""
-        ahead = np.array([math.cos(motion.psi), -math.sin(motion.psi)])
-        self.position = np.array([motion.X, -motion.Y]) + self._centre * ahead
+        direction = np.array([math.cos(motion.psi), -math.sin(motion.psi)])
+        self.position = np.array([motion.X, -motion.Y]) + self._centre * direction
         self.heading: float = -motion.psi
         self.speed: float = motion.v_x
-        self._velocity = motion.v_x * ahead + motion.v_y * np.array([ahead[1], -ahead[0]])
+        self._velocity = motion.v_x * direction + motion.v_y * np.array(
+            [direction[1], -direction[0]]
+        )
 
     @property
     def velocity(self) -> Any:
@@ -119,18 +121,18 @@ class BrakingVehicle(IDMVehicle):  # type: ignore[misc]
 
     def __init__(self, road: Any, position: Any, speed: float, onset: float, rate: float) -> None:
         super().__init__(road, position, speed=speed, target_speed=speed, enable_lane_change=False)
-        self.left, self.rate = onset, rate
+        self.time_left, self.rate = onset, rate
         self.speed: float = speed
 
     def act(self, action: Any = None) -> None:
         """Follow the road; brake when it is time."""
         super().act(action)
-        if self.left <= 0.0 and not self.crashed:
+        if self.time_left <= 0.0 and not self.crashed:
             self.action["acceleration"] = -self.rate
 
     def step(self, dt: float) -> None:
         """A step, of which none goes backwards."""
-        self.left -= dt
+        self.time_left -= dt
         super().step(dt)
         self.speed = max(self.speed, 0.0)
 
@@ -142,48 +144,48 @@ class Traffic:
     """
 
     def __init__(
-        self, road: str, start: Start, hazard: Hazard | None, others: int, key: int
+        self, road: str, start: TrafficStart, hazard: Hazard | None, others: int, key: int
     ) -> None:
         random = np.random.Generator(np.random.Philox(key=[key, 0]))
-        self.course: Course = ROADS[road](1 if random.random() < 0.5 else -1)
+        self.course: RoadLayout = ROADS[road](1 if random.random() < 0.5 else -1)
         self.road = Road(
             self.course.network, np_random=random, neighbour_vehicles_connected_lanes=True
         )
-        self.ours = OurCar(self.road, start)
-        self.road.vehicles.append(self.ours)
+        self.ego = EgoVehicle(self.road, start)
+        self.road.vehicles.append(self.ego)
         self._lane = 0
-        self.path: Path | None = None
+        self.path: TrackPath | None = None
         if hazard is not None:
-            self.path = self._endanger(hazard, start)
-        self._populate(others, start)
+            self.path = self._add_hazard(hazard, start)
+        self._add_vehicles(others, start)
 
-    def _endanger(self, hazard: Hazard, start: Start) -> Path:
+    def _add_hazard(self, hazard: Hazard, start: TrafficStart) -> TrackPath:
         """Put the vehicle that brakes ahead of us; the path of the driver who swerves around it."""
         random = self.road.np_random
-        draw = {name: random.uniform(*range_of(ends)) for name, ends in vars(hazard).items()}
+        draw = {name: random.uniform(*get_range(ends)) for name, ends in vars(hazard).items()}
         v, rate = start.speed, max(draw["braking"] * start.friction * GRAVITY, 0.1)
         gap = draw["headway"] * v
-        ahead = 0.5 * (self.ours.LENGTH + BrakingVehicle.LENGTH) + gap
-        place = np.array([self.ours.position[0] + ahead, 0.0])
-        self.road.vehicles.append(BrakingVehicle(self.road, place, v, draw["onset"], rate))
+        distance = 0.5 * (self.ego.LENGTH + BrakingVehicle.LENGTH) + gap
+        position = np.array([self.ego.position[0] + distance, 0.0])
+        self.road.vehicles.append(BrakingVehicle(self.road, position, v, draw["onset"], rate))
         meeting = math.sqrt(2.0 * gap / rate)  # s after the onset, while it still moves
         if meeting > v / rate:
             meeting = gap / v + 0.5 * v / rate
         begin = v * (draw["onset"] + draw["reaction"])
         length = v * max(draw["haste"] * (meeting - draw["reaction"]), _SHORTEST)
-        stands = place[0] + v * draw["onset"] + 0.5 * v * v / rate + BrakingVehicle.LENGTH
-        back = max(begin + length, stands) + v * draw["stay"]
-        shift = WIDTH if self.course.free < self.course.own else -WIDTH
-        return Path(shift, begin, length, -shift, back, length)
+        stop_position = position[0] + v * draw["onset"] + 0.5 * v * v / rate + BrakingVehicle.LENGTH
+        back = max(begin + length, stop_position) + v * draw["stay"]
+        shift = WIDTH if self.course.free_lane < self.course.own_lane else -WIDTH
+        return TrackPath(shift, begin, length, -shift, back, length)
 
-    def _populate(self, others: int, start: Start) -> None:
+    def _add_vehicles(self, others: int, start: TrafficStart) -> None:
         """IDM vehicles ahead and behind in both lanes, and on the ramp if there is one."""
         random, course = self.road.np_random, self.course
         slots = [
-            (course.free, 80.0),
-            (course.own, -35.0),
-            (course.own, 120.0),
-            (course.free, -45.0),
+            (course.free_lane, 80.0),
+            (course.own_lane, -35.0),
+            (course.own_lane, 120.0),
+            (course.free_lane, -45.0),
         ]
         for i in range(others):
             speed = start.speed * random.uniform(0.95, 1.05)
@@ -191,9 +193,9 @@ class Traffic:
                 lane = course.network.get_lane(course.ramp)
                 position = lane.position(110.0 - lane.start[0] - 60.0 * random.random(), 0.0)
             else:
-                index, ahead = slots[i % len(slots)]
-                far = ahead + math.copysign(45.0 * (i // len(slots)), ahead)
-                lateral = 0.0 if index == course.own else WIDTH * (index - course.own)
+                index, offset = slots[i % len(slots)]
+                far = offset + math.copysign(45.0 * (i // len(slots)), offset)
+                lateral = 0.0 if index == course.own_lane else WIDTH * (index - course.own_lane)
                 position = np.array([far + random.uniform(-8.0, 8.0), lateral])
             self.road.vehicles.append(
                 IDMVehicle(self.road, position, speed=speed, target_speed=speed)
@@ -202,28 +204,28 @@ class Traffic:
             end = course.network.graph["b"]["c"][-1]
             self.road.objects.append(Obstacle(self.road, end.position(end.length, 0.0)))
 
-    def follow(self, motion: Motion) -> None:
+    def step_road(self, motion: Motion) -> None:
         """A step of the road, at whose end our car is at a Motion."""
-        self.ours.put(motion)
+        self.ego.set_motion(motion)
         self.road.act()
         self.road.step(_STEP)
 
     @property
     def crashed(self) -> bool:
         """Whether our car hit another."""
-        return bool(self.ours.crashed)
+        return bool(self.ego.crashed)
 
     @property
     def departed(self) -> bool:
         """Whether the whole of our car's width is beyond the road's edge line."""
-        ours = self.ours
-        return not bool(ours.lane.on_lane(ours.position, margin=0.5 * ours.WIDTH))
+        ego = self.ego
+        return not bool(ego.lane.on_lane(ego.position, margin=0.5 * ego.WIDTH))
 
-    def place(self, motion: Motion) -> Place:
+    def locate(self, motion: Motion) -> LanePosition:
         """Our car's place on the lanes that it follows."""
         route = self.course.route
-        here = place_on(route[self._lane], motion.X, motion.Y, motion.psi)
-        while here.along > route[self._lane].length and self._lane + 1 < len(route):
+        position = locate_on_lane(route[self._lane], motion.X, motion.Y, motion.psi)
+        while position.longitudinal > route[self._lane].length and self._lane + 1 < len(route):
             self._lane += 1
-            here = place_on(route[self._lane], motion.X, motion.Y, motion.psi)
-        return here
+            position = locate_on_lane(route[self._lane], motion.X, motion.Y, motion.psi)
+        return position

@@ -4,13 +4,15 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from ..arguments import brief, is_finite, mapping_of
+from ..arguments import check_mapping, is_finite, short_repr
 from ..scenarios.scenario import Scenario
 
-CRAWL = 1.0  # m/s: the multi-body model's least speed; below 0.1 it freezes while its wheels spin
+MIN_SPEED = (
+    1.0  # m/s: the multi-body model's least speed; below 0.1 it freezes while its wheels spin
+)
 
 # Fields of a scenario that change our own plant or its road: only their defaults will do.
-_OURS = (
+_OWN_PLANT_FIELDS = (
     "road",
     "curvature",
     "bank",
@@ -27,7 +29,7 @@ def check_scenario(scenario: Scenario, model: str) -> None:
     """ValueError for a scenario field that only our plant has, or that this model has not."""
     name = f"scenario {scenario.name!r}"
     defaults = {entry.name: entry.default for entry in dataclasses.fields(Scenario)}
-    for field in _OURS:
+    for field in _OWN_PLANT_FIELDS:
         value = getattr(scenario, field)
         if value and value != defaults[field]:
             raise ValueError(
@@ -43,15 +45,15 @@ def check_scenario(scenario: Scenario, model: str) -> None:
         return
     if not scenario.roll:
         raise ValueError(f"{name}: roll False; the multi-body model always rolls")
-    slowest = slowest_of(scenario)
-    if slowest < CRAWL:
+    min_speed = find_min_speed(scenario)
+    if min_speed < MIN_SPEED:
         raise ValueError(
-            f"{name}: its speed comes down to {slowest:.3g} m/s; the multi-body model needs "
-            f"{CRAWL} m/s or more"
+            f"{name}: its speed comes down to {min_speed:.3g} m/s; the multi-body model needs "
+            f"{MIN_SPEED} m/s or more"
         )
 
 
-def slowest_of(scenario: Scenario) -> float:
+def find_min_speed(scenario: Scenario) -> float:
     """The least speed in m/s that a scenario's own changes of speed come down to."""
     change = scenario.speed_change + (scenario.acceleration or 0.0) * scenario.duration
     return scenario.range("speed")[0] + min(change, 0.0)
@@ -65,15 +67,15 @@ def check_options(options: Mapping[str, Any], model: str) -> None:
         raise ValueError(
             "reset option friction: the single-track model's tyres are linear and know none"
         )
-    state = mapping_of("reset option state", options.get("state", {}))
+    state = check_mapping("reset option state", options.get("state", {}))
     for name in ("s", "y", "theta"):
         if name in state:
             raise ValueError(f"reset option state: {name} follows from X and Y here")
     if model != "multi-body":
         if state.get("phi") or state.get("phi_dot"):
             raise ValueError(f"reset option state: the {model} model has no roll")
-    elif (v_x := state.get("v_x")) is not None and not (is_finite(v_x) and v_x >= CRAWL):
+    elif (v_x := state.get("v_x")) is not None and not (is_finite(v_x) and v_x >= MIN_SPEED):
         raise ValueError(
-            f"reset option state: v_x is {brief(v_x)} m/s; "
-            f"the multi-body model needs {CRAWL} or more"
+            f"reset option state: v_x is {short_repr(v_x)} m/s; "
+            f"the multi-body model needs {MIN_SPEED} or more"
         )

@@ -7,77 +7,109 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arguments import check_choice, warn_once
-from ..backend.arrays import at, read, write
-from ..backend.decorators import plain
+from ..backend.arrays import load_element, read, write
+from ..backend.decorators import as_python
 from ..engine.layout import P, Z
-from ..engine.step import conclude, fixed_of, kind_of, shares_of, wild_of, write_end
-from ..engine.tick import Fixed, Kind, Moving, command, sense
-from ..engine.window import WINDOW, chance_at, foresee, judge
+from ..engine.step import (
+    check_action_range,
+    clip_action,
+    finish_step,
+    make_step_params,
+    make_step_variant,
+    write_final_state,
+)
+from ..engine.tick import StepParams, StepState, StepVariant, compute_inputs, measure_tick
+from ..engine.window import WINDOW, compute_tick_cost, precompute_window, read_draws
 from ..record import FAST
-from ..scenarios.manoeuvres import ScenarioSource, scenario_from
+from ..scenarios.manoeuvres import ScenarioSource, make_scenario
 from ..stability import StabilityEnv
-from ..task.failures import RUNNING, failure_of
+from ..task.failures import RUNNING, select_failure
 from ..ticks import TICK
 from .checks import check_options, check_scenario
-from .plants import OUTSIDE_PLANTS, Acting, OutsidePlant, Plant, outside_vehicle
+from .plants import OUTSIDE_PLANTS, OutsideInputs, OutsidePlant, PlantProtocol, make_outside_vehicle
 
-_fixed_of, _kind_of, _write_end = plain(fixed_of), plain(kind_of), plain(write_end)
-_command, _sense, _judge = plain(command), plain(sense), plain(judge)
-_failure_of = plain(failure_of)
+_make_step_params, _make_step_variant, _write_final_state = (
+    as_python(make_step_params),
+    as_python(make_step_variant),
+    as_python(write_final_state),
+)
+_compute_inputs, _measure_tick, _compute_tick_cost = (
+    as_python(compute_inputs),
+    as_python(measure_tick),
+    as_python(compute_tick_cost),
+)
+_select_failure = as_python(select_failure)
 
 
 class PlantEnv(StabilityEnv):
     """`StabilityEnv` whose truth is the motion of `plant`, a loop in Python: sensors, references,
     cost and packets are ours."""
 
-    _our_tyres = False
-    plant: Plant
+    _has_tyre_forces = False
+    plant: PlantProtocol
 
-    def _advance(self, force: npt.NDArray[np.float32]) -> int:
+    def _advance(self, command: npt.NDArray[np.float32]) -> int:
         """One control period of the outside plant: `step_vehicle` with another motion."""
-        share, turn = shares_of(force)
-        if share != share:
-            return super()._advance(force)  # refuses or fails before it moves anything
-        if wild_of(force):
-            warn_once(self, force)
+        yaw_share, steer_share = clip_action(command)
+        if yaw_share != yaw_share:
+            return super()._advance(command)  # refuses or fails before it moves anything
+        if check_action_range(command):
+            warn_once(self, command)
         p, z, n = self._params, self._state, self.control_period
-        kind = _kind_of(p, self._switches)
-        foresee(p, z, n, kind.follows, self._window)
-        done = self._drive_on(_fixed_of(p), kind, share, turn)
-        conclude(self._row, n, done, self._bounds, self._window)
+        variant = _make_step_variant(p, self._switches)
+        precompute_window(p, z, n, variant.has_driver, self._window)
+        done = self._integrate_step(_make_step_params(p), variant, yaw_share, steer_share)
+        finish_step(self._row, n, done, self._bounds, self._window)
         return done
 
-    def _drive_on(self, fixed: Fixed, kind: Kind, share: float, turn: float) -> int:
-        """`step.drive_on` whose motion is the outside plant's; returns the ticks done."""
-        z, plant, task = self._state, self.plant, fixed.task
+    def _integrate_step(
+        self, params: StepParams, variant: StepVariant, yaw_share: float, steer_share: float
+    ) -> int:
+        """`step.integrate_step` whose motion is the outside plant's; returns the ticks done."""
+        z, plant, task = self._state, self.plant, params.task
         motion, drive, refs = read(z, Z.motion), read(z, Z.drive), read(z, Z.refs)
-        lead = read(z, Z.lead)
-        now = Moving(motion, drive, None, float(z[Z.driver]), fixed.car, refs, lead)
-        tick, cost, done, over, failure = float(z[Z.clock.tick]), 0.0, 0, False, 0.0
-        N_z, added = share * task.yaw_scale, turn * task.authority
-        while not over:
-            chance = chance_at(self._window, done)
-            control = _command(fixed, N_z, added, now, tick, chance)
-            acted = control.acted
+        nominal_motion = read(z, Z.nominal_motion)
+        state = StepState(motion, drive, None, float(z[Z.driver]), params.car, refs, nominal_motion)
+        tick, cost, done, is_over, failure = float(z[Z.clock.tick]), 0.0, 0, False, 0.0
+        N_z, added = yaw_share * task.yaw_scale, steer_share * task.authority
+        while not is_over:
+            draws = read_draws(self._window, done)
+            inputs = _compute_inputs(params, N_z, added, state, tick, draws)
+            applied = inputs.applied
             # a quotient, not the product of `command`: its last bit is that of all drives so far
-            acted = acted._replace(effort=acted.moment / task.yaw_scale)
-            plant.step(Acting(acted.steer, acted.T_l, acted.T_r, *control.push), TICK)
-            motion, force = now.motion, (0.0, 0.0)
-            if plant.finite:
+            applied = applied._replace(effort=applied.moment / task.yaw_scale)
+            plant.step(
+                OutsideInputs(applied.steer, applied.T_l, applied.T_r, *inputs.disturbance), TICK
+            )
+            motion, force = state.motion, (0.0, 0.0)
+            if plant.is_finite:
                 motion, force = plant.motion, plant.specific_force
-            ahead = at(self._window, WINDOW.ahead, done)
-            driver, seen = _sense(fixed, motion, force, acted, now.refs, ahead, chance, kind)
-            seen = seen._replace(lost=not plant.finite)
-            now = Moving(motion, control.drive, None, driver, now.car, seen.refs, lead)
-            write(self.rows[done], seen.row, FAST)
+            next_steer = load_element(self._window, WINDOW.steer, done)
+            driver, measured = _measure_tick(
+                params, motion, force, applied, state.refs, next_steer, draws, variant
+            )
+            measured = measured._replace(lost=not plant.is_finite)
+            state = StepState(
+                motion, inputs.drive, None, driver, state.car, measured.refs, nominal_motion
+            )
+            write(self.rows[done], measured.row, FAST)
             write(self._window, motion, WINDOW.track, done)
-            found = _judge(motion, seen.past, task, fixed.path, kind)
-            tick, cost, done = tick + 1.0, cost + found.cost * TICK, done + 1
-            failure = _failure_of(seen.lost, found.spun, found.off)
-            over = failure != RUNNING or tick >= task.duration or done == self.control_period
-        write(z, now.motion, Z.motion)
-        _write_end(
-            z, self._report, now, seen, failure, found.beta, seen.refs, tick, cost, task.duration
+            tick_cost = _compute_tick_cost(motion, measured.cost_inputs, task, params.path, variant)
+            tick, cost, done = tick + 1.0, cost + tick_cost.cost * TICK, done + 1
+            failure = _select_failure(measured.lost, tick_cost.spun, tick_cost.off)
+            is_over = failure != RUNNING or tick >= task.duration or done == self.control_period
+        write(z, state.motion, Z.motion)
+        _write_final_state(
+            z,
+            self._report,
+            state,
+            measured,
+            failure,
+            tick_cost.beta,
+            measured.refs,
+            tick,
+            cost,
+            task.duration,
         )
         return done
 
@@ -90,13 +122,13 @@ class OutsideEnv(PlantEnv):
     `outside`. A loop in Python, hundreds of times slower than ours.
 
     model: "single-track", "drift" or "multi-body". nominal: the vehicle that estimators and
-    controllers are designed from (default: `outside_vehicle()`). The other arguments are those of
-    `StabilityEnv`, but there is no `vehicle`: the true one is the model's. The scenario's friction
-    is the tyre's peak lateral friction, that of `vehicle`; on the single track, whose tyres are
-    linear, it has no effect, and there is no reset option "friction". One tyre serves both axles,
-    so its stiffness is scaled by the mean of the scenario's two factors. Motors and steering act
-    for a tick with their mean in the record. The multi-body model always rolls, the others never
-    do.
+    controllers are designed from (default: `make_outside_vehicle()`). The other arguments are those
+    of `StabilityEnv`, but there is no `vehicle`: the true one is the model's. The scenario's
+    friction is the tyre's peak lateral friction, that of `vehicle`; on the single track, whose
+    tyres are linear, it has no effect, and there is no reset option "friction". One tyre serves
+    both axles, so its stiffness is scaled by the mean of the scenario's two factors. Motors and
+    steering act for a tick with their mean in the record. The multi-body model always rolls, the
+    others never do.
 
     Raises ValueError for an unknown model, a scenario with a road or a plant that the model has
     not (curvature, bank, grade, small_angle, tyres, vehicle, friction_right,
@@ -118,27 +150,27 @@ class OutsideEnv(PlantEnv):
         if "vehicle" in options:
             raise TypeError("an outside plant is its own vehicle; only nominal can be given")
         self.model = model
-        check_scenario(scenario_from(scenario), model)
-        super().__init__(sensors, scenario, outside_vehicle(), reference=reference, **options)
+        check_scenario(make_scenario(scenario), model)
+        super().__init__(sensors, scenario, make_outside_vehicle(), reference=reference, **options)
         self.plant = OUTSIDE_PLANTS[model]()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Start an episode; see `StabilityEnv`."""
-        asked = dict(options or {})
-        check_options(asked, self.model)
-        check_scenario(self.config.with_options(asked).scenario, self.model)
-        if "state" in asked:  # s and y are X and Y on the straight road of these plants
-            state = asked["state"]
-            asked["state"] = {**state, "s": state.get("X", 0.0), "y": state.get("Y", 0.0)}
-        first = super().reset(seed=seed, options=asked)
-        p, base = self._params, self._now.vehicle
+        reset_options = dict(options or {})
+        check_options(reset_options, self.model)
+        check_scenario(self.config.apply_options(reset_options).scenario, self.model)
+        if "state" in reset_options:  # s and y are X and Y on the straight road of these plants
+            state = reset_options["state"]
+            reset_options["state"] = {**state, "s": state.get("X", 0.0), "y": state.get("Y", 0.0)}
+        result = super().reset(seed=seed, options=reset_options)
+        p, base = self._params, self._episode.vehicle
         scale = 0.5 * (p[P.car.C_f] / base.front_stiffness + p[P.car.C_r] / base.rear_stiffness)
         p[P.car.C_f], p[P.car.C_r] = scale * base.front_stiffness, scale * base.rear_stiffness
         self.plant = OUTSIDE_PLANTS[self.model](float(p[P.car.mu]), float(scale))
         self.plant.start(self.motion)
-        return first
+        return result
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot that `set_state` continues from, bit for bit."""

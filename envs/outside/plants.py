@@ -22,9 +22,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from ..backend.extras import extra
-from ..engine.packing import car_of
-from ..vehicle.actuators import yaw_moment
+from ..backend.extras import require_extra
+from ..engine.packing import make_car
+from ..vehicle.actuators import compute_yaw_moment
 from ..vehicle.dynamics import Motion
 from ..vehicle.vehicle import GRAVITY, Vehicle
 
@@ -32,11 +32,11 @@ Array = npt.NDArray[np.float64]
 
 BMW_320I = 2  # CommonRoad's number of the car
 MOTOR_TORQUE = 300.0  # N m of one in-wheel motor, which CommonRoad's car does not have: ours
-SLOWEST = 0.1  # m/s: below it the models switch to kinematics
-STABLE = 1.5  # of the fastest eigenvalue times the step; Runge-Kutta's limit is 2.78
+MIN_SPEED = 0.1  # m/s: below it the models switch to kinematics
+STABILITY_LIMIT = 1.5  # of the fastest eigenvalue times the step; Runge-Kutta's limit is 2.78
 
 
-class Acting(NamedTuple):
+class OutsideInputs(NamedTuple):
     """Inputs of the plant, constant during a step."""
 
     steer: float  # rad, front wheels
@@ -48,26 +48,26 @@ class Acting(NamedTuple):
 
 
 @functools.cache
-def _module(name: str) -> Any:
-    with extra("outside", "an outside plant needs commonroad-vehicle-models"):
+def _import_model(name: str) -> Any:
+    with require_extra("outside", "an outside plant needs commonroad-vehicle-models"):
         return import_module(f"vehiclemodels.{name}")
 
 
 @functools.cache
-def _parameters() -> Any:
+def _load_parameters() -> Any:
     """The BMW's parameters, with all drive and brake torque on the rear wheels."""
-    p = _module("vehicle_parameters").setup_vehicle_parameters(BMW_320I)
+    p = _import_model("vehicle_parameters").setup_vehicle_parameters(BMW_320I)
     return dataclasses.replace(p, T_sb=0.0, T_se=0.0)
 
 
 @functools.cache
-def outside_vehicle() -> Vehicle:
+def make_outside_vehicle() -> Vehicle:
     """The BMW 320i as our `Vehicle`: the nominal vehicle of estimators and controllers.
 
     Cornering stiffness is the Magic Formula's slope p_Ky1 F_z at the tyre's standing load. Roll
     stiffness is that of springs and anti-roll bars on top of the tyres' vertical springs.
     """
-    p = _parameters()
+    p = _load_parameters()
     per_arm = 0.5 * p.m * GRAVITY / (p.a + p.b)  # standing load of a tyre over the other axle's arm
     arm = p.h_s - 0.5 * (p.h_raf + p.h_rar)
     body = 0.5 * (p.T_f**2 * p.K_sf + p.T_r**2 * p.K_sr) - p.K_tsf - p.K_tsr  # N m/rad
@@ -96,7 +96,7 @@ def outside_vehicle() -> Vehicle:
     )
 
 
-class Plant(Protocol):
+class PlantProtocol(Protocol):
     """What moves a car in place of our own plant: `OutsidePlant` has a word on each."""
 
     specific_force: tuple[float, float]
@@ -106,16 +106,16 @@ class Plant(Protocol):
         """Where the car is, how fast, and on which road."""
 
     @property
-    def finite(self) -> bool:
+    def is_finite(self) -> bool:
         """Whether the state is made of numbers."""
 
-    def step(self, acting: Acting, h: float) -> None:
+    def step(self, inputs: OutsideInputs, h: float) -> None:
         """Move for h seconds."""
 
 
 class OutsidePlant(ABC):
-    """One of the models with its state `x` and the newest step's `specific_force`: (a_x, a_y) in
-    m/s2 as accelerometers at the centre of gravity feel them at its end.
+    """One of the models with its state `x` and the newest step's `compute_specific_force`: (a_x,
+    a_y) in m/s2 as accelerometers at the centre of gravity feel them at its end.
 
     friction: the tyre's peak lateral friction, in place of CommonRoad's 1.05 (None); the
     longitudinal one keeps its ratio to it. The single track's linear tyres know none: there it has
@@ -125,11 +125,11 @@ class OutsidePlant(ABC):
 
     law = ""  # the name of the model's module and function
     wheels = slice(0)  # wheel speeds in x, which may not be negative
-    loaded = 0.0  # the most of the car's weight that rests on one wheel speed
-    velocities: tuple[int, ...] = (3, 5)  # in x, with the yaw rate
+    wheel_load = 0.0  # the most of the car's weight that rests on one wheel speed
+    velocity_columns: tuple[int, ...] = (3, 5)  # in x, with the yaw rate
 
     def __init__(self, friction: float | None = None, stiffness: float = 1.0) -> None:
-        base = _parameters()
+        base = _load_parameters()
         tyre, scale = base.tire, 1.0 if friction is None else friction / base.tire.p_dy1
         tyre = dataclasses.replace(
             tyre,
@@ -138,10 +138,10 @@ class OutsidePlant(ABC):
             p_ky1=stiffness * tyre.p_ky1,
         )
         self.p = dataclasses.replace(base, tire=tyre)
-        self.car = car_of(outside_vehicle())
-        self._law: Callable[..., list[float]] = getattr(_module(self.law), self.law)
-        slope = self.loaded * self.p.m * GRAVITY * tyre.p_kx1  # N, of force over slip
-        self._fastest = self.p.R_w**2 * slope / self.p.I_y_w  # 1/s of the slip at 1 m/s
+        self.car = make_car(make_outside_vehicle())
+        self._law: Callable[..., list[float]] = getattr(_import_model(self.law), self.law)
+        slope = self.wheel_load * self.p.m * GRAVITY * tyre.p_kx1  # N, of force over slip
+        self._slip_rate = self.p.R_w**2 * slope / self.p.I_y_w  # 1/s of the slip at 1 m/s
         self.specific_force = (0.0, 0.0)
         self.x = np.zeros(0)
 
@@ -150,7 +150,7 @@ class OutsidePlant(ABC):
         """Put the car at a Motion's velocities, heading and place, wheels rolling."""
 
     @abstractmethod
-    def derivative(self, x: Array, acting: Acting) -> Array:
+    def derivative(self, x: Array, inputs: OutsideInputs) -> Array:
         """dx/dt of a state, which is left alone (the models themselves change it)."""
 
     @property
@@ -159,36 +159,36 @@ class OutsidePlant(ABC):
         """Where the car is, on a straight road along the ground's x axis."""
 
     @abstractmethod
-    def felt(self, acting: Acting) -> tuple[float, float]:
+    def compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:
         """The specific force of the state x under the inputs; raises what the models raise."""
 
     @property
-    def finite(self) -> bool:
+    def is_finite(self) -> bool:
         """Whether the state and the squares of its velocities, which references and sensors take,
         are numbers; a spun multi-body car's are not."""
-        squares = sum(v * v for v in (float(self.x[i]) for i in self.velocities))
+        squares = sum(v * v for v in (float(self.x[i]) for i in self.velocity_columns))
         return bool(np.isfinite(self.x).all()) and math.isfinite(squares)
 
-    def step(self, acting: Acting, h: float) -> None:
+    def step(self, inputs: OutsideInputs, h: float) -> None:
         """h seconds of the classical Runge-Kutta method, in as many parts as the wheels need."""
-        eigenvalue = self._fastest / max(abs(float(self.x[3])), SLOWEST)
-        parts = max(1, math.ceil(h * eigenvalue / STABLE)) if self.finite else 1
+        eigenvalue = self._slip_rate / max(abs(float(self.x[3])), MIN_SPEED)
+        parts = max(1, math.ceil(h * eigenvalue / STABILITY_LIMIT)) if self.is_finite else 1
         try:
             with np.errstate(over="ignore", invalid="ignore"):
                 for _ in range(parts):
-                    self.x = self._rk4(self.x, acting, h / parts)
+                    self.x = self._rk4(self.x, inputs, h / parts)
                     self.x[self.wheels] = np.maximum(self.x[self.wheels], 0.0)
-                self.specific_force = self.felt(acting)
+                self.specific_force = self.compute_specific_force(inputs)
         except (ArithmeticError, ValueError):  # a wheel at rest in a spin, the sine of infinity
             self.specific_force = (math.nan, math.nan)
         if not all(map(math.isfinite, self.specific_force)):
             self.x = np.full_like(self.x, np.nan)
 
-    def _rk4(self, x: Array, acting: Acting, h: float) -> Array:
-        a = self.derivative(x, acting)
-        b = self.derivative(x + 0.5 * h * a, acting)
-        c = self.derivative(x + 0.5 * h * b, acting)
-        d = self.derivative(x + h * c, acting)
+    def _rk4(self, x: Array, inputs: OutsideInputs, h: float) -> Array:
+        a = self.derivative(x, inputs)
+        b = self.derivative(x + 0.5 * h * a, inputs)
+        c = self.derivative(x + 0.5 * h * b, inputs)
+        d = self.derivative(x + h * c, inputs)
         return x + h / 6.0 * (a + 2.0 * (b + c) + d)
 
 
@@ -201,15 +201,15 @@ class SingleTrack(OutsidePlant):
         speed, slip = math.hypot(motion.v_x, motion.v_y), math.atan2(motion.v_y, motion.v_x)
         self.x = np.array([motion.X, motion.Y, 0.0, speed, motion.psi, motion.gamma, slip])
 
-    def derivative(self, x: Array, acting: Acting) -> Array:  # noqa: D102
+    def derivative(self, x: Array, inputs: OutsideInputs) -> Array:  # noqa: D102
         state = x.tolist()
-        state[2] = acting.steer
-        drive = (acting.T_l + acting.T_r) / (self.p.m * self.p.R_w)
+        state[2] = inputs.steer
+        drive = (inputs.T_l + inputs.T_r) / (self.p.m * self.p.R_w)
         rate = np.array(self._law(state, [0.0, drive], self.p))
-        push, slip = acting.F_y / self.p.m, state[6]
-        rate[3] += push * math.sin(slip)
-        rate[5] += (yaw_moment(acting.T_l, acting.T_r, self.car) + acting.N_z) / self.p.I_z
-        rate[6] += push * math.cos(slip) / max(state[3], SLOWEST)
+        lateral_acceleration, slip = inputs.F_y / self.p.m, state[6]
+        rate[3] += lateral_acceleration * math.sin(slip)
+        rate[5] += (compute_yaw_moment(inputs.T_l, inputs.T_r, self.car) + inputs.N_z) / self.p.I_z
+        rate[6] += lateral_acceleration * math.cos(slip) / max(state[3], MIN_SPEED)
         return rate
 
     @property
@@ -217,11 +217,13 @@ class SingleTrack(OutsidePlant):
         X, Y, _, v, psi, gamma, slip = self.x[:7].tolist()
         return Motion(v * math.cos(slip), v * math.sin(slip), gamma, psi, X, Y, X, Y, 0.0)
 
-    def felt(self, acting: Acting) -> tuple[float, float]:  # noqa: D102
-        rate, slip = self.derivative(self.x, acting), self.x[6]
-        along, across = rate[3], self.x[3] * (rate[6] + self.x[5])  # of the path
+    def compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:  # noqa: D102
+        rate, slip = self.derivative(self.x, inputs), self.x[6]
+        tangential, normal = rate[3], self.x[3] * (rate[6] + self.x[5])  # of the path
         sine, cosine = math.sin(slip), math.cos(slip)
-        return float(along * cosine - across * sine), float(along * sine + across * cosine)
+        return float(tangential * cosine - normal * sine), float(
+            tangential * sine + normal * cosine
+        )
 
 
 class Drift(SingleTrack):
@@ -229,7 +231,7 @@ class Drift(SingleTrack):
 
     law = "vehicle_dynamics_std"
     wheels = slice(7, 9)
-    loaded = 1.0
+    wheel_load = 1.0
 
     def start(self, motion: Motion) -> None:  # noqa: D102
         super().start(motion)
@@ -241,24 +243,24 @@ class MultiBody(OutsidePlant):
 
     law = "vehicle_dynamics_mb"
     wheels = slice(23, 27)
-    loaded = 0.5
-    velocities = (3, 5, 10)
+    wheel_load = 0.5
+    velocity_columns = (3, 5, 10)
 
     def start(self, motion: Motion) -> None:  # noqa: D102
         speed, slip = math.hypot(motion.v_x, motion.v_y), math.atan2(motion.v_y, motion.v_x)
         core = [motion.X, motion.Y, 0.0, speed, motion.psi, motion.gamma, slip]
-        self.x = np.array(_module("init_mb").init_mb(core, self.p), float)
+        self.x = np.array(_import_model("init_mb").init_mb(core, self.p), float)
         self.x[6], self.x[7] = -motion.phi, -motion.phi_dot
 
-    def derivative(self, x: Array, acting: Acting) -> Array:  # noqa: D102
+    def derivative(self, x: Array, inputs: OutsideInputs) -> Array:  # noqa: D102
         state = x.tolist()
-        state[2] = acting.steer
+        state[2] = inputs.steer
         rate = np.array(self._law(state, [0.0, 0.0], self.p))
-        rate[5] += acting.N_z / self.p.I_z
-        rate[7] -= acting.N_x / self.p.I_Phi_s
-        rate[10] += acting.F_y / self.p.m_s
-        rate[25] += acting.T_r / self.p.I_y_w  # called left rear
-        rate[26] += acting.T_l / self.p.I_y_w
+        rate[5] += inputs.N_z / self.p.I_z
+        rate[7] -= inputs.N_x / self.p.I_Phi_s
+        rate[10] += inputs.F_y / self.p.m_s
+        rate[25] += inputs.T_r / self.p.I_y_w  # called left rear
+        rate[26] += inputs.T_l / self.p.I_y_w
         return rate
 
     @property
@@ -266,8 +268,8 @@ class MultiBody(OutsidePlant):
         x = self.x.tolist()
         return Motion(x[3], x[10], x[5], x[4], x[0], x[1], x[0], x[1], 0.0, -x[6], -x[7])
 
-    def felt(self, acting: Acting) -> tuple[float, float]:  # noqa: D102
-        rate, x = self.derivative(self.x, acting), self.x
+    def compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:  # noqa: D102
+        rate, x = self.derivative(self.x, inputs), self.x
         a_x = rate[3] - x[5] * x[10]
         a_y = rate[10] + x[5] * x[3] - GRAVITY * math.sin(x[6])  # felt by the rolled body
         return float(a_x), float(a_y)

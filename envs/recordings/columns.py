@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ..arguments import brief, listed
+from ..arguments import join_names, short_repr
 from ..record import Array
 from ..vehicle.vehicle import GRAVITY
 from .dialect import find_unit
 from .samples import KINDS, find_samples
-from .tables import Table, read_table
+from .tables import LogTable, read_table
 
 _LARGEST = 1e15  # in SI units
 _SPEED = {"mps": 1.0, "kmh": 1.0 / 3.6}
@@ -62,19 +62,19 @@ _NAMES = {
 }
 
 
-def column_name(quantity: str) -> str:
+def make_column_name(quantity: str) -> str:
     """The name of a quantity's column in SI units."""
     return f"{quantity}_{next(iter(COLUMNS[quantity]))}"
 
 
-def quantity_of(name: str) -> tuple[str, float]:
+def parse_column_name(name: str) -> tuple[str, float]:
     """(quantity, factor to SI) of a column's name; ValueError if it is none of ours."""
     if name in _NAMES:
         return _NAMES[name]
     quantity = name.rpartition("_")[0]
     near = next((known for known in (name, quantity) if known in COLUMNS), None)
     known = (
-        [column_name(q) for q in COLUMNS]
+        [make_column_name(q) for q in COLUMNS]
         if near is None
         else [f"{near}_{u}" for u in COLUMNS[near]]
     )
@@ -88,13 +88,13 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
     """
     mapping: dict[str, str] = {}
     for text in texts:
-        ours, _, theirs = (part.strip() for part in text.partition("="))
-        if not (ours and theirs):
+        name, _, column = (part.strip() for part in text.partition("="))
+        if not (name and column):
             raise ValueError(f"expected NAME=COLUMN, such as steer_rad=Delta, got {text!r}")
-        if ours in mapping:
-            raise ValueError(f"{ours} is mapped twice, to {mapping[ours]!r} and to {theirs!r}")
-        quantity_of(ours)
-        mapping[ours] = theirs
+        if name in mapping:
+            raise ValueError(f"{name} is mapped twice, to {mapping[name]!r} and to {column!r}")
+        parse_column_name(name)
+        mapping[name] = column
     return mapping
 
 
@@ -111,14 +111,16 @@ def read_quantities(
     that is no finite number, NaN, and fewer than two rows. Rows count from 1 below the header.
     """
     wanted = {*COLUMNS, *map(str.casefold, mapping.values())}
-    table = read_table(path, lambda name: name.casefold() in wanted or bool(_match(name, "")))
+    table = read_table(
+        path, lambda name: name.casefold() in wanted or bool(_match_column(name, ""))
+    )
     remarks = [*table.remarks]
     try:
-        columns = _find(table, mapping, remarks)
-        missing = [column_name(name) for name in needed if name not in columns]
+        columns = _find_columns(table, mapping, remarks)
+        missing = [make_column_name(name) for name in needed if name not in columns]
         if missing:
             raise ValueError(
-                f"no column {' nor '.join(missing)}; {_there(table)}; "
+                f"no column {' nor '.join(missing)}; {_list_columns(table)}; "
                 f"--map {missing[0]}=COLUMN names one"
             )
         if len(table.frame) < 2:
@@ -126,7 +128,7 @@ def read_quantities(
             raise ValueError(f"the log has {rows}; a drive needs two or more")
         values = {}
         for quantity, (place, name) in columns.items():
-            column = _numbers(table, place, name, remarks)
+            column = _convert_column(table, place, name, remarks)
             if quantity in needed or not np.isnan(column).all():
                 values[quantity] = column
         _check_complete(values, ["time"])
@@ -144,14 +146,16 @@ def _check_complete(values: Mapping[str, Array], quantities: Sequence[str]) -> N
     for quantity in quantities:
         if (unknown := np.isnan(values[quantity])).any():
             row = int(np.argmax(unknown)) + 1
-            raise ValueError(f"column {column_name(quantity)!r} has no value (NaN) in row {row}")
+            raise ValueError(
+                f"column {make_column_name(quantity)!r} has no value (NaN) in row {row}"
+            )
 
 
-def _there(table: Table) -> str:
-    return f"the log has {listed(table.names)}"
+def _list_columns(table: LogTable) -> str:
+    return f"the log has {join_names(table.names)}"
 
 
-def _match(name: str, unit: str) -> str:
+def _match_column(name: str, unit: str) -> str:
     """Our name of a file's column, in whatever case, with its unit in it, in brackets or beside it;
     "" where it is none of ours."""
     folded = name.casefold()
@@ -161,24 +165,24 @@ def _match(name: str, unit: str) -> str:
     return folded if folded in _NAMES else ""
 
 
-def _find(
-    table: Table, mapping: Mapping[str, str], remarks: list[str]
+def _find_columns(
+    table: LogTable, mapping: Mapping[str, str], remarks: list[str]
 ) -> dict[str, tuple[int, str]]:
     """(place, our name) of each quantity's column: as mapped, else by our names, else by names and
     units; adds to the remarks."""
     names, quantities = [str(name) for name in table.frame.columns], set()
     for name, column in mapping.items():
         if column.casefold() not in map(str.casefold, names):
-            raise ValueError(f"no column {column!r} for {name}; {_there(table)}")
-        if quantity_of(name)[0] in quantities:
-            raise ValueError(f"{quantity_of(name)[0]} is mapped twice")
-        quantities.add(quantity_of(name)[0])
+            raise ValueError(f"no column {column!r} for {name}; {_list_columns(table)}")
+        if parse_column_name(name)[0] in quantities:
+            raise ValueError(f"{parse_column_name(name)[0]} is mapped twice")
+        quantities.add(parse_column_name(name)[0])
     best: dict[str, tuple[int, list[tuple[int, str]]]] = {}
     for place, (label, unit) in enumerate(zip(names, table.units, strict=True)):
-        match = _match(label, unit)
+        match = _match_column(label, unit)
         options = [(name, 0) for name, c in mapping.items() if c.casefold() == label.casefold()]
         for name, level in (*options, (match, 1 if match == label.casefold() else 2)):
-            quantity = quantity_of(name)[0] if name else ""
+            quantity = parse_column_name(name)[0] if name else ""
             if name and level < best.get(quantity, (3,))[0]:
                 best[quantity] = level, [(place, name)]
             elif name and level == best[quantity][0]:
@@ -186,8 +190,8 @@ def _find(
     columns = {}
     for quantity, (level, ((place, name), *others)) in best.items():
         label, unit = names[place], table.units[place]
-        own_unit = name.replace("degnorth", "deg").removeprefix(f"{quantity}_").split("_")[0]
-        if unit not in ("", "count", own_unit):
+        name_unit = name.replace("degnorth", "deg").removeprefix(f"{quantity}_").split("_")[0]
+        if unit not in ("", "count", name_unit):
             if level:
                 raise ValueError(
                     f"{label} has the unit {unit} in the file; --map {quantity}_{unit}={label} or "
@@ -207,7 +211,7 @@ def _find(
     return columns
 
 
-def _numbers(table: Table, place: int, name: str, remarks: list[str]) -> Array:
+def _convert_column(table: LogTable, place: int, name: str, remarks: list[str]) -> Array:
     """A column in SI units; ValueError names the first value that is no finite number. A time that
     is far off in its unit, but not in another since 1970, is read in that, which is remarked."""
     import pandas as pd
@@ -223,7 +227,7 @@ def _numbers(table: Table, place: int, name: str, remarks: list[str]) -> Array:
         except OverflowError as error:
             raise ValueError(f"column {label!r}: expected numbers, got {error}") from None
     values = np.array(numbers.to_numpy(np.float64, na_value=np.nan))
-    quantity, factor = quantity_of(name)
+    quantity, factor = parse_column_name(name)
     if quantity == "time" and abs(values[0]) * factor > 1e11:
         for unit, scale in COLUMNS["time"].items():
             if 3e8 < values[0] * scale < 4e9:
@@ -238,5 +242,7 @@ def _numbers(table: Table, place: int, name: str, remarks: list[str]) -> Array:
         text, expected = str(column.iloc[row]), f"a number up to {_LARGEST / abs(factor):g}"
         if is_none[row]:
             expected = "a number" + " with a decimal point alone" * ("," in text)
-        raise ValueError(f"column {label!r}, row {row + 1}: expected {expected}, got {brief(text)}")
+        raise ValueError(
+            f"column {label!r}, row {row + 1}: expected {expected}, got {short_repr(text)}"
+        )
     return values

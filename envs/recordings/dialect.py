@@ -60,36 +60,37 @@ def read_text(
         del body[0]
     tables = []
     for separator in declared[1] if declared else _SEPARATORS:
-        rows = {i: _split(line, separator) for i, line in body.items()}
+        rows = {i: _split_line(line, separator) for i, line in body.items()}
         widths = Counter(len(row) for row in rows.values() if len(row) > 1)
         n_rows, width = max(((n, w) for w, n in widths.items()), default=(0, 1))
         share = 0.5 if separator == " " else 1.0  # spaces stand beside other separators
         tables.append((share * n_rows, width, separator, rows))
     _, width, separator, rows = max(tables, key=lambda table: table[:2])
-    named = [
+    header_lines = [
         i for i, row in rows.items()
         if abs(len(row) - width) <= 1 and 2 * sum(map(bool, row)) >= len(row)
         and not any(map(_NUMBER.fullmatch, row))
     ]  # fmt: skip
     best, other = (
-        [i for i in of if any(map(is_wanted, rows[i]))] for of in (named, () if named else rows)
+        [i for i in lines_group if any(map(is_wanted, rows[i]))]
+        for lines_group in (header_lines, () if header_lines else rows)
     )
-    at = (best or named or other or list(rows))[0]
-    header, below = rows[at], {i: row for i, row in rows.items() if i > at}
-    if any(header[width:]) or any(any(row[len(header) :]) for row in below.values()):
+    header_line = (best or header_lines or other or list(rows))[0]
+    header, body_rows = rows[header_line], {i: row for i, row in rows.items() if i > header_line}
+    if any(header[width:]) or any(any(row[len(header) :]) for row in body_rows.values()):
         raise ValueError(
-            f"the header in line {at + 1} has {len(header)} names, and rows have {width} fields; "
-            "are numbers written with decimal commas between commas?"
+            f"the header in line {header_line + 1} has {len(header)} names, and rows have "
+            f"{width} fields; are numbers written with decimal commas between commas?"
         )
     units, skipped = [""] * len(header), []
-    for i, row in below.items():
+    for i, row in body_rows.items():
         known = sum(map(bool, map(find_unit, row))), sum(map(bool, row))
         is_units = 0 < known[1] <= 2 * known[0] and not any(map(_NUMBER.fullmatch, row))
         if len(row) > 1 and not is_units:
             break
         units = [*map(find_unit, row), *units[len(row) :]] if is_units else units
         skipped.append(i)
-    numbers = [x for row in below.values() for x in row if _NUMBER.fullmatch(x)]
+    numbers = [x for row in body_rows.values() for x in row if _NUMBER.fullmatch(x)]
     has_comma = any("," in x and not _THOUSANDS.fullmatch(x) for x in numbers)
     decimal = "," if has_comma and not any("." in x for x in numbers) else "."
     frame = pd.read_csv(
@@ -99,7 +100,7 @@ def read_text(
         encoding=encoding,
         header=0,
         names=list(range(len(header))),
-        skiprows=[*range(at), *skipped] or None,
+        skiprows=[*range(header_line), *skipped] or None,
         index_col=False,
         skipinitialspace=True,
         low_memory=False,
@@ -109,11 +110,11 @@ def read_text(
         f"{encoding.upper()} text": encoding != "utf-8-sig",
         f"columns between {_SEPARATORS.get(separator, separator)}": separator != ",",
         "decimal commas": decimal == ",",
-        f"the header in line {at + 1}": at > 0,
+        f"the header in line {header_line + 1}": header_line > 0,
         "units below it": any(units),
     }
-    said = ", ".join(aspect for aspect, is_so in aspects.items() if is_so)
-    return frame, units[: len(header)], [f"The table was read as: {said}."] if said else []
+    summary = ", ".join(aspect for aspect, is_so in aspects.items() if is_so)
+    return frame, units[: len(header)], [f"The table was read as: {summary}."] if summary else []
 
 
 def _find_encoding(data: bytes) -> str:
@@ -136,7 +137,7 @@ def _find_encoding(data: bytes) -> str:
     return "utf-8-sig"
 
 
-def _split(line: str, separator: str) -> list[str]:
+def _split_line(line: str, separator: str) -> list[str]:
     if '"' in line:
         line_fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
     else:

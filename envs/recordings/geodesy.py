@@ -10,24 +10,26 @@ EARTH = 6_378_137.0  # m, equatorial radius
 ECCENTRICITY_SQUARED = 6.694379990e-3
 
 
-def radii(latitude: float) -> tuple[float, float]:
+def compute_radii(latitude: float) -> tuple[float, float]:
     """m a radian (east, north) at a latitude in degrees: of the parallel and of the meridian."""
     phi = math.radians(latitude)
     w = 1.0 - ECCENTRICITY_SQUARED * math.sin(phi) ** 2
     return EARTH / math.sqrt(w) * math.cos(phi), EARTH * (1.0 - ECCENTRICITY_SQUARED) / w**1.5
 
 
-def metres(latitude: Array, longitude: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
-    """(east, north) in m of an origin (degrees north, east), the inverse of `degrees`."""
-    east, north = radii(origin[0])
-    around = (longitude - origin[1] + 180.0) % 360.0 - 180.0  # over the date line
-    return east * np.radians(around), north * np.radians(latitude - origin[0])
+def to_metres(
+    latitude: Array, longitude: Array, origin: tuple[float, float]
+) -> tuple[Array, Array]:
+    """(east, north) in m of an origin (degrees north, east), the inverse of `to_degrees`."""
+    east, north = compute_radii(origin[0])
+    delta = (longitude - origin[1] + 180.0) % 360.0 - 180.0  # over the date line
+    return east * np.radians(delta), north * np.radians(latitude - origin[0])
 
 
-def degrees(X: Array, Y: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
+def to_degrees(X: Array, Y: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
     """(latitude, longitude) in degrees of metres east and north of an origin.
 
     Within a kilometre the error is below 0.2 m.
     """
-    east, north = radii(origin[0])
+    east, north = compute_radii(origin[0])
     return origin[0] + np.degrees(Y / north), origin[1] + np.degrees(X / east)

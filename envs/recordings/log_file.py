@@ -10,10 +10,10 @@ from ..sensors.gps import COURSE_SPEED
 from ..sensors.link import SlowSensor
 from ..sensors.slow import SLOW_NAMES
 from ..ticks import TICK
-from .columns import COLUMNS, column_name, parse_mapping, read_quantities
+from .columns import COLUMNS, make_column_name, parse_mapping, read_quantities
 from .samples import SENSORS, SLOW_QUANTITIES, TRUTH
 
-__all__ = ["COLUMNS", "NEEDED", "column_name", "packet_rows", "parse_mapping", "read_log"]
+__all__ = ["COLUMNS", "NEEDED", "make_column_name", "make_packet_rows", "parse_mapping", "read_log"]
 
 NEEDED = ("time", "speed_x", "yaw_rate", "steer")
 """The quantities without which a log cannot be read."""
@@ -59,23 +59,25 @@ def read_log(path: str | Path, mapping: Mapping[str, str] | None = None) -> Log:
     source = Path(path)
     values, _ = read_quantities(source, mapping or {}, NEEDED, GAPS)
     try:
-        return log_of(values, source)
+        return make_log(values, source)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
 
 
-def log_of(values: dict[str, Array], source: Path, dt: float | None = None) -> Log:
+def make_log(values: dict[str, Array], source: Path, dt: float | None = None) -> Log:
     """The log of quantities in SI units, (n,) each, with the dt of its clock, or this one in s;
     ValueError for a bad clock."""
-    dt = clock_of(values["time"])[1] if dt is None else dt
+    dt = find_clock(values["time"])[1] if dt is None else dt
     first = max(round(float(values["time"][0]) / dt), 0)
-    fast, present = _fast(values)
-    packets, slow = _slow(values, first, dt)
+    fast, present = _make_fast_rows(values)
+    packets, slow = _make_packets(values, first, dt)
     record = Record(fast, packets, first, dt, present)
-    return Log(record, slow, _truth(values), f"{source.resolve().parent.name}/{source.stem}")
+    return Log(
+        record, slow, _compute_truth(values), f"{source.resolve().parent.name}/{source.stem}"
+    )
 
 
-def packet_rows(
+def make_packet_rows(
     sensor: str,
     captured: Array,
     arrived: Array,
@@ -96,34 +98,35 @@ def packet_rows(
     return packets
 
 
-def clock_of(time: Array) -> tuple[int, float]:
+def find_clock(time: Array) -> tuple[int, float]:
     """(first tick, dt in s) of an even clock; ValueError names the row where it is not."""
     steps = np.diff(time)
     typical = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
-    least = _STILL * typical
-    for wrong, what in (
-        (steps < -least, "runs backward"),
-        (np.abs(steps) <= least, "stands still"),
+    min_step = _STILL * typical
+    for is_wrong, what in (
+        (steps < -min_step, "runs backward"),
+        (np.abs(steps) <= min_step, "stands still"),
         (steps > _GAP * typical, f"jumps (a step is {typical:.6g} s)"),
     ):
-        if wrong.any():
-            row = int(np.argmax(wrong)) + 1
+        if is_wrong.any():
+            row = int(np.argmax(is_wrong)) + 1
             raise ValueError(
                 f"time {what} at row {row + 1}: {time[row]:.12g} s after {time[row - 1]:.12g} s"
             )
     dt = round(float(time[-1] - time[0]) / len(steps), 12)
-    beside = np.abs(time - time[0] - dt * np.arange(len(time)))
-    if beside.max() > dt + _DRIFT * (time[-1] - time[0]):
-        row = int(np.argmax(beside)) + 1
+    deviation = np.abs(time - time[0] - dt * np.arange(len(time)))
+    if deviation.max() > dt + _DRIFT * (time[-1] - time[0]):
+        row = int(np.argmax(deviation)) + 1
         raise ValueError(
-            f"time is uneven: row {row} is {beside.max():.6g} s beside a clock of {dt:.6g} s a row"
+            f"time is uneven: row {row} is {deviation.max():.6g} s beside a clock of {dt:.6g} "
+            "s a row"
         )
     if dt < TICK * (1.0 - 1e-6):
         raise ValueError(f"rows are {dt:.6g} s apart; the shortest step is {TICK} s")
     return max(round(float(time[0]) / dt), 0), dt
 
 
-def _fast(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
+def _make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
     """The record's fast rows and the names of those of its columns that carry something."""
     fast = np.zeros((len(values["time"]), FAST_WIDTH))
     if not {"wheel_left", "wheel_right"} <= values.keys():
@@ -141,7 +144,9 @@ def _fast(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
     return fast, tuple(name for name in Fast._fields if name in present)
 
 
-def _slow(values: dict[str, Array], first: int, dt: float) -> tuple[Array, dict[str, SlowSensor]]:
+def _make_packets(
+    values: dict[str, Array], first: int, dt: float
+) -> tuple[Array, dict[str, SlowSensor]]:
     """The packets of all slow sensors and their clocks."""
     packets, clocks = [np.zeros((0, PACKET_WIDTH))], {}
     for sensor, names in SENSORS.items():
@@ -155,15 +160,15 @@ def _slow(values: dict[str, Array], first: int, dt: float) -> tuple[Array, dict[
         if sensor == "gps":
             columns[:, 0] = np.arctan2(np.sin(columns[:, 0]), np.cos(columns[:, 0]))
             quality[values["speed_x"][known] < COURSE_SPEED] = 0.0
-        packets.append(packet_rows(sensor, ticks, ticks, columns, quality))
+        packets.append(make_packet_rows(sensor, ticks, ticks, columns, quality))
         rows = int(np.gcd.reduce(np.diff(known))) if len(known) > 1 else len(values["time"])
         clocks[sensor] = SlowSensor(period=rows * dt, phase=(first + int(known[0])) % rows * dt)
-    together = np.concatenate(packets)
-    order = np.lexsort((together[:, PACKET.sensor], together[:, PACKET.arrived]))
-    return together[order], clocks
+    all_packets = np.concatenate(packets)
+    order = np.lexsort((all_packets[:, PACKET.sensor], all_packets[:, PACKET.arrived]))
+    return all_packets[order], clocks
 
 
-def _truth(values: dict[str, Array]) -> dict[str, Array]:
+def _compute_truth(values: dict[str, Array]) -> dict[str, Array]:
     """The sideslip angle where the log knows it; 0 at a standstill."""
     v_x, v_y = values["speed_x"], values.get("speed_y")
     if "sideslip" in values:
@@ -172,5 +177,5 @@ def _truth(values: dict[str, Array]) -> dict[str, Array]:
         beta = np.arctan2(v_y, v_x)
     else:
         return {}
-    standing = np.hypot(v_x, 0.0 if v_y is None else np.nan_to_num(v_y)) <= _STANDING
-    return {"beta": np.where(standing, 0.0, beta)}
+    is_standing = np.hypot(v_x, 0.0 if v_y is None else np.nan_to_num(v_y)) <= _STANDING
+    return {"beta": np.where(is_standing, 0.0, beta)}

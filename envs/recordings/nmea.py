@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..sensors.gps import COURSE_SPEED
-from .sentences import DECODED, Sentence, is_unchecked, read_sentence, signed
+from .sentences import DECODED, Sentence, apply_sign, is_unchecked, read_sentence
 
 LONGEST = 1024  # bytes of a sentence; the standard has 82, some vendors' are longer
 KNOT = 1852.0 / 3600.0  # m/s
@@ -48,7 +48,7 @@ class Epoch(NamedTuple):
     age: float  # s since the newest fix, by t: 0 with a fix, NaN before the first or without a time
 
     @property
-    def fixed(self) -> bool:
+    def has_fix(self) -> bool:
         """Whether there is a position."""
         return math.isfinite(self.latitude)
 
@@ -119,37 +119,37 @@ class Decoder:
         self._in_leap, self._leaps = False, 0
         self._view: dict[str, int] = {}  # satellites, by system
 
-    def feed(self, chunk: bytes) -> list[Epoch]:
+    def decode_chunk(self, chunk: bytes) -> list[Epoch]:
         """The epochs that these bytes complete."""
         self.counts.received += len(chunk)
         outside, *pieces = (self._tail + chunk).split(b"$")
         self._tail = b""
         self._skip(outside)
-        found: list[Epoch] = []
+        epochs: list[Epoch] = []
         for i, piece in enumerate(pieces):
             text = piece.replace(b"\r", b"\n").split(b"\n", 1)[0]
-            ended = len(text) < len(piece)
+            is_ended = len(text) < len(piece)
             if len(text) > LONGEST:
                 self.counts.overlong += 1
                 self._skip(piece)
-            elif ended:
+            elif is_ended:
                 self._skip(piece[len(text) :])
-                found += self._sentence(text)
+                epochs += self._decode_sentence(text)
             elif i < len(pieces) - 1:  # the next one begins in its line
                 self.counts.truncated += 1
             else:
                 self._tail = b"$" + piece
-        return found
+        return epochs
 
     def finish(self) -> list[Epoch]:
         """The last epoch, where the stream ended without completing it or its line."""
         tail, self._tail = self._tail, b""
-        return (self._sentence(tail[1:]) if tail else []) + self._close()
+        return (self._decode_sentence(tail[1:]) if tail else []) + self._close()
 
     def _skip(self, outside: bytes) -> None:
         self.counts.garbage += len(outside) - sum(map(outside.count, (b"\r", b"\n")))
 
-    def _sentence(self, text: bytes) -> list[Epoch]:
+    def _decode_sentence(self, text: bytes) -> list[Epoch]:
         try:
             sentence = read_sentence(text)
         except ValueError:
@@ -162,13 +162,13 @@ class Decoder:
             return []
         self.counts.sentences[sentence.kind] += 1
         self.counts.emptied.update(f"{sentence.kind} {name}" for name in sentence.bad)
-        return self._take(sentence)
+        return self._add_sentence(sentence)
 
-    def _take(self, sentence: Sentence) -> list[Epoch]:
+    def _add_sentence(self, sentence: Sentence) -> list[Epoch]:
         """Add a sentence to its epoch; those without a time belong to the one at hand."""
         talker, kind, values, _ = sentence
         done: list[Epoch] = []
-        time, same = values.get("time"), self._parts.get(kind)
+        time, existing = values.get("time"), self._parts.get(kind)
         if kind not in DECODED or (kind == "GLL" and time is None):
             return done
         if kind == "GSV":
@@ -176,13 +176,13 @@ class Decoder:
             return done
         values = values | {"talker": talker}
         if kind in _TIMED:
-            if same and time is not None and time == self._time:
+            if existing and time is not None and time == self._time:
                 self.counts.repeated += 1
-                self._others |= {talker} - {same["talker"]}
+                self._others |= {talker} - {existing["talker"]}
                 return done
-            if same or (None not in (time, self._time) and time != self._time):
+            if existing or (None not in (time, self._time) and time != self._time):
                 done = self._close()
-        elif same and self._sent:
+        elif existing and self._sent:
             if talker not in self._others:
                 self._next[kind] = values
             return done
@@ -192,40 +192,48 @@ class Decoder:
             return done
         self._parts[kind] = values
         self._time = self._time if time is None else time
-        has = self._parts.keys()
-        hdop = "GSA" in has or any("HDOP" in part for part in self._parts.values())
-        if has & {"RMC", "VTG"} and has & {"GGA", "GNS"} and hdop and not self._sent:
-            done.append(self._epoch())
+        present_kinds = self._parts.keys()
+        hdop = "GSA" in present_kinds or any("HDOP" in part for part in self._parts.values())
+        if (
+            present_kinds & {"RMC", "VTG"}
+            and present_kinds & {"GGA", "GNS"}
+            and hdop
+            and not self._sent
+        ):
+            done.append(self._make_epoch())
         return done
 
     def _close(self) -> list[Epoch]:
         """End the epoch at hand: itself, if it was not handed out and is one."""
-        left = not self._sent and not self._parts.keys().isdisjoint(_TIMED)
-        done = [self._epoch()] if left else []
+        is_unsent = not self._sent and not self._parts.keys().isdisjoint(_TIMED)
+        done = [self._make_epoch()] if is_unsent else []
         self._parts, self._next, self._time, self._sent = self._next, {}, None, False
         self._others.clear()
         return done
 
-    def _epoch(self) -> Epoch:
+    def _make_epoch(self) -> Epoch:
         self._sent = True
-        t = math.nan if self._time is None else self._since_1970(self._time)
+        t = math.nan if self._time is None else self._convert_time(self._time)
         known = {k: v for kind in DECODED for k, v in self._parts.get(kind, {}).items()}
         flags = [known["status"] == "A"] if "status" in known else []
         flags += [known["quality"] not in _NOT_MEASURED] if "quality" in known else []
-        latitude, longitude = signed(known, "lat", "NS", "S"), signed(known, "lon", "EW", "W")
-        fixed = bool(flags) and all(flags) and math.isfinite(latitude + longitude)
+        latitude, longitude = (
+            apply_sign(known, "lat", "NS", "S"),
+            apply_sign(known, "lon", "EW", "W"),
+        )
+        has_fix = bool(flags) and all(flags) and math.isfinite(latitude + longitude)
         knots = known.get("spd", known.get("sogn", known.get("sogk", math.nan) / 1.852))
-        speed = KNOT * knots if fixed else math.nan
-        north = known.get("cog", known.get("cogt", math.nan)) if fixed else math.nan
+        speed = KNOT * knots if has_fix else math.nan
+        north = known.get("cog", known.get("cogt", math.nan)) if has_fix else math.nan
         hdop = known.get("HDOP", 0.0)
-        self._fix = t if fixed else self._fix
+        self._fix = t if has_fix else self._fix
         self.counts.epochs += 1
-        self.counts.without_fix += not fixed
+        self.counts.without_fix += not has_fix
         self.counts.without_time += math.isnan(t)
         return Epoch(
             t,
-            latitude if fixed else math.nan,
-            longitude if fixed else math.nan,
+            latitude if has_fix else math.nan,
+            longitude if has_fix else math.nan,
             math.radians(math.remainder(90.0 - north, 360.0)),
             speed,
             hdop if hdop > 0.0 else math.nan,
@@ -235,9 +243,11 @@ class Decoder:
             max(t - self._fix, 0.0),
         )
 
-    def _since_1970(self, time: float) -> float:
-        day, at = self._date
-        day += (time < at - DAY / 2) - (time > at + DAY / 2)  # midnight, without a date
+    def _convert_time(self, time: float) -> float:
+        day, newest_time = self._date
+        day += (time < newest_time - DAY / 2) - (
+            time > newest_time + DAY / 2
+        )  # midnight, without a date
         self._date = day, time
         self._leaps += self._in_leap and time < DAY
         self._in_leap = time >= DAY
@@ -248,7 +258,7 @@ class Decoder:
         return t
 
 
-def mend_dates(epochs: list[Epoch]) -> list[Epoch]:
+def correct_dates(epochs: list[Epoch]) -> list[Epoch]:
     """Date a log's epochs alike where the day jumps while the time of day goes on.
 
     Args:

@@ -43,12 +43,12 @@ def find_samples(
     Returns:
         Sentences on what was done.
     """
-    remarks = _sort(values, needed, is_strict)
+    remarks = _sort_rows(values, needed, is_strict)
     remarks += _keep_samples(values, kinds)
-    return remarks + _put_on_one_clock(values, needed)
+    return remarks + _align_clocks(values, needed)
 
 
-def _sort(values: dict[str, Array], needed: Collection[str], is_strict: bool) -> list[str]:
+def _sort_rows(values: dict[str, Array], needed: Collection[str], is_strict: bool) -> list[str]:
     time = values["time"]
     n_back = int(np.count_nonzero(np.diff(time) < 0.0))
     is_merged = n_back and not np.isfinite([values[name] for name in needed]).all(0).any()
@@ -101,50 +101,64 @@ def _find_period(lengths: Array) -> float:
     lost or repeated sample makes a multiple, a coarse value in every row irregular distances."""
     if len(lengths) < _MIN_INTERVALS:
         return 0.0
-    usual = float(np.quantile(lengths, 0.25, method="lower"))
-    period = float(np.mean(lengths[np.abs(lengths - usual) <= max(1.0, 0.1 * usual)]))
+    typical = float(np.quantile(lengths, 0.25, method="lower"))
+    period = float(np.mean(lengths[np.abs(lengths - typical) <= max(1.0, 0.1 * typical)]))
     tolerance = 0.6 if period < 4.0 else max(1.0, 0.2 * period)
-    beside = np.abs(lengths - period * np.maximum(np.rint(lengths / period), 1.0))
-    n_short, n_beside = (lengths < period - tolerance).sum(), (beside > tolerance).sum()
-    is_regular = usual > 1.0 and n_short <= 0.05 * len(lengths) and n_beside <= 0.15 * len(lengths)
+    deviation = np.abs(lengths - period * np.maximum(np.rint(lengths / period), 1.0))
+    n_short, n_beside = (lengths < period - tolerance).sum(), (deviation > tolerance).sum()
+    is_regular = (
+        typical > 1.0 and n_short <= 0.05 * len(lengths) and n_beside <= 0.15 * len(lengths)
+    )
     return period if is_regular else 0.0
 
 
-def _put_on_one_clock(values: dict[str, Array], needed: Collection[str]) -> list[str]:
-    since = np.append(0.0, np.cumsum(np.maximum(np.diff(values["time"]), 0.0)))
+def _align_clocks(values: dict[str, Array], needed: Collection[str]) -> list[str]:
+    elapsed = np.append(0.0, np.cumsum(np.maximum(np.diff(values["time"]), 0.0)))
     known = {name: np.isfinite(column) for name, column in values.items() if name != "time"}
     base = max(known.keys() & needed, key=lambda name: (known[name].sum(), name))
     is_base, joined, lines = known[base], {}, []
     if is_base.sum() < 2:
         return []
     for name in sorted(known.keys() - SLOW_QUANTITIES):
-        at, of = is_base, known[name]
-        if of[at].mean() > _COMPLETE or of.sum() < 2 or (name in TRUTH and not of[~at].any()):
+        base_mask, own_mask = is_base, known[name]
+        if (
+            own_mask[base_mask].mean() > _COMPLETE
+            or own_mask.sum() < 2
+            or (name in TRUTH and not own_mask[~base_mask].any())
+        ):
             continue
-        t, interval = since[of], float(np.median(np.diff(since[of])))
-        after = np.clip(np.searchsorted(t, since[at]), 1, len(t) - 1)
+        t, interval = elapsed[own_mask], float(np.median(np.diff(elapsed[own_mask])))
+        after = np.clip(np.searchsorted(t, elapsed[base_mask]), 1, len(t) - 1)
         is_near = t[after] - t[after - 1] <= min(1.9 * interval, 1.01 * LONGEST_GAP)
-        is_near = (is_near & (since[at] >= t[0]) & (since[at] <= t[-1])) | of[at]
-        if is_near.sum() > of[at].sum():
-            joined[name] = np.where(is_near, np.interp(since[at], t, values[name][of]), np.nan)
+        is_near = (
+            is_near & (elapsed[base_mask] >= t[0]) & (elapsed[base_mask] <= t[-1])
+        ) | own_mask[base_mask]
+        if is_near.sum() > own_mask[base_mask].sum():
+            joined[name] = np.where(
+                is_near, np.interp(elapsed[base_mask], t, values[name][own_mask]), np.nan
+            )
             lines.append(f"{name} (every {interval:.3g} s)")
     is_other = np.any(list(known.values()), axis=0)
     is_other &= ~np.any([known[n] for n in known.keys() - SLOW_QUANTITIES - TRUTH], axis=0)
     if not joined and not is_other.any():
         return []
     rows = np.flatnonzero(is_base if joined else ~is_other)
-    step = float(np.median(np.diff(since[rows])))
-    places = np.searchsorted(since[rows], since - 0.01 * step)
+    step = float(np.median(np.diff(elapsed[rows])))
+    places = np.searchsorted(elapsed[rows], elapsed - 0.01 * step)
     for name, column in list(values.items()):
         values[name] = joined[name] if name in joined else column[rows]
         if name in SLOW_QUANTITIES:
-            moved = np.flatnonzero(known[name] & (places < len(rows)))
+            moved_rows = np.flatnonzero(known[name] & (places < len(rows)))
             values[name] = np.full(len(rows), np.nan)
-            values[name][places[moved]] = column[moved]
-    whole = np.flatnonzero(np.isfinite([*(joined[n] for n in joined.keys() - TRUTH), rows]).all(0))
-    if not len(whole):
+            values[name][places[moved_rows]] = column[moved_rows]
+    complete_rows = np.flatnonzero(
+        np.isfinite([*(joined[n] for n in joined.keys() - TRUTH), rows]).all(0)
+    )
+    if not len(complete_rows):
         raise ValueError(f"{base}, {', '.join(joined)} are not known at the same time")
-    values.update({name: column[whole[0] : whole[-1] + 1] for name, column in values.items()})
+    values.update(
+        {name: column[complete_rows[0] : complete_rows[-1] + 1] for name, column in values.items()}
+    )
     remarks = [f"Interpolated in the rows of {base}: {', '.join(lines)}."] if joined else []
     if n_ends := len(rows) - len(values["time"]):
         remarks.append(f"{n_ends} rows at the ends, where these are unknown, were left out.")

@@ -12,9 +12,9 @@ from datetime import date
 from functools import cache
 from typing import Any, NamedTuple
 
-from ..backend.extras import extra
+from ..backend.extras import require_extra
 
-with extra("wires", "decoding NMEA needs pynmeagps"):
+with require_extra("wires", "decoding NMEA needs pynmeagps"):
     from pynmeagps import NMEAMessage, calc_checksum, get_parts
     from pynmeagps.exceptions import NMEAMessageError
     from pynmeagps.nmeatypes_core import NMEA_TALKERS
@@ -58,33 +58,37 @@ def read_sentence(text: bytes) -> Sentence | None:
     talker = talker if talker in NMEA_TALKERS else ""
     if kind == "GSV":  # a number of the signal may follow the satellites
         fields = fields[: 3 + (len(fields) - 3) // 4 * 4]
-    used = {"numSV": sum(map(bool, fields[2:14]))} if kind == "GSA" else {}
-    found = Sentence(talker, kind, used, [])
-    for (name, form), field in zip(_forms(kind), fields, strict=False):
+    initial_values = {"numSV": sum(map(bool, fields[2:14]))} if kind == "GSA" else {}
+    sentence = Sentence(talker, kind, initial_values, [])
+    for (name, form), field in zip(_list_forms(kind), fields, strict=False):
         if field:
-            value = _value(name, form, field)
+            value = _parse_value(name, form, field)
             if value is None:
-                found.bad.append(name)
+                sentence.bad.append(name)
             else:
-                found.values[name] = value
+                sentence.values[name] = value
     if kind == "GNS":
-        found.values["quality"] = int(bool(set(found.values.get("posMode", "N")) - set(_NO_FIX)))
-    if kind == "ZDA" and {"year", "month", "day"} <= found.values.keys():
+        sentence.values["quality"] = int(
+            bool(set(sentence.values.get("posMode", "N")) - set(_NO_FIX))
+        )
+    if kind == "ZDA" and {"year", "month", "day"} <= sentence.values.keys():
         try:
-            found.values["date"] = date(*(found.values[name] for name in ("year", "month", "day")))
+            sentence.values["date"] = date(
+                *(sentence.values[name] for name in ("year", "month", "day"))
+            )
         except ValueError:
-            found.bad.append("day")
-    return found
+            sentence.bad.append("day")
+    return sentence
 
 
 def is_unchecked(text: bytes) -> bool:
     """Whether a sentence of `DECODED` lacks its checksum alone; its last two fields are newer."""
     address, *fields = text.split(b",")
     kind = address[2:].decode("ascii", "replace")
-    return b"*" not in text and kind in DECODED and len(fields) >= len(_forms(kind)) - 2
+    return b"*" not in text and kind in DECODED and len(fields) >= len(_list_forms(kind)) - 2
 
 
-def signed(values: dict[str, Any], name: str, side: str, negative: str) -> float:
+def apply_sign(values: dict[str, Any], name: str, side: str, negative: str) -> float:
     """Degrees of "lat" or "lon" with the sign of their side; NaN where either is missing."""
     if name not in values or side not in values:
         return math.nan
@@ -92,23 +96,23 @@ def signed(values: dict[str, Any], name: str, side: str, negative: str) -> float
 
 
 @cache
-def _forms(kind: str) -> tuple[tuple[str, str], ...]:
+def _list_forms(kind: str) -> tuple[tuple[str, str], ...]:
     """(name, form) of each field of a kind, groups written out."""
 
-    def each(table: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    def iterate_fields(table: dict[str, Any]) -> Iterator[tuple[str, str]]:
         for name, form in table.items():
             if isinstance(form, tuple):  # (count or "None", fields): GSV has up to 4 satellites
                 yield from tuple(form[1].items()) * (form[0] if isinstance(form[0], int) else 4)
             else:
                 yield name, form
 
-    return tuple(each(NMEA_PAYLOADS_GET[kind]))
+    return tuple(iterate_fields(NMEA_PAYLOADS_GET[kind]))
 
 
-def _value(name: str, form: str, text: str) -> Any:
+def _parse_value(name: str, form: str, text: str) -> Any:
     """A field's value; None where the text is none."""
     try:
-        value = _seconds(text) if name == "time" else NMEAMessage.str2val(text, form)
+        value = _parse_time(text) if name == "time" else NMEAMessage.str2val(text, form)
     except ValueError:
         return None
     low, high = _RANGES.get(name, _ANY)
@@ -116,7 +120,7 @@ def _value(name: str, form: str, text: str) -> Any:
     return None if bad else value
 
 
-def _seconds(text: str) -> float:
+def _parse_time(text: str) -> float:
     """s of the day of hhmmss.ss; 23:59:60 is a leap second, which pynmeagps refuses."""
     match = _TIME.fullmatch(text)
     hour, minute, second = map(float, match.groups()) if match else (24.0, 0.0, 0.0)

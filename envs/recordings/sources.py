@@ -8,19 +8,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from ..arguments import brief
-from ..backend.extras import extra
+from ..arguments import short_repr
+from ..backend.extras import require_extra
 
 if TYPE_CHECKING:
     from .nmea import Counts, Epoch
 
 BAUD = 4800  # of NMEA 0183
 PAUSE = 0.5  # s without a byte after which b"" is handed out
-_MOST = 65_536  # bytes of a chunk, and those that show what a file holds
+_CHUNK_SIZE = 65_536  # bytes of a chunk, and those that show what a file holds
 _LINE = re.compile(rb"\$(?:[A-Z]{2}(?:RMC|GGA|GNS|GLL),|[A-Z]{3,6},[^$*\r\n]*\*[0-9A-Fa-f]{2})")
 
 
-class Line(NamedTuple):
+class Connection(NamedTuple):
     """An open file, port or connection."""
 
     read: Callable[[], bytes]
@@ -30,7 +30,7 @@ class Line(NamedTuple):
 
 
 @dataclass
-class Source:
+class ByteSource:
     """The bytes of a receiver in chunks, b"" where none came for a while; ends with a file alone.
 
     connect: opens the line. tries: how often a lost line is opened again before a byte comes, wait:
@@ -41,29 +41,29 @@ class Source:
     """
 
     name: str
-    connect: Callable[[], Line]
+    connect: Callable[[], Connection]
     tries: int = 5
     wait: float = 1.0
     losses: int = 0
 
     def __iter__(self) -> Iterator[bytes]:
-        line: Line | None = self.connect()
+        connection: Connection | None = self.connect()
         failures = 0
         try:
             while True:
                 chunk = b""
                 try:
-                    if line is None:
+                    if connection is None:
                         time.sleep(self.wait)
-                        line = self.connect()
-                    chunk = line.read()
+                        connection = self.connect()
+                    chunk = connection.read()
                 except EOFError:
                     return
                 except OSError as error:
-                    if line is not None:
+                    if connection is not None:
                         self.losses += 1
-                        line.close()
-                        line = None
+                        connection.close()
+                        connection = None
                     failures += 1
                     if failures > self.tries:
                         raise ConnectionError(
@@ -72,31 +72,33 @@ class Source:
                 failures = 0 if chunk else failures
                 yield chunk
         finally:
-            if line is not None:
-                line.close()
+            if connection is not None:
+                connection.close()
 
 
-def open_source(text: str, tries: int = 5, wait: float = 1.0) -> Source:
+def make_source(text: str, tries: int = 5, wait: float = 1.0) -> ByteSource:
     """The source of a text: a file's path, serial:PORT[:BAUD] (extra `wires`) or tcp:HOST:PORT.
 
-    tries, wait: of `Source`. Nothing is opened before it is iterated. Raises ValueError for a text
-    of another form, FileNotFoundError, and ValueError for a folder.
+    tries, wait: of `ByteSource`. Nothing is opened before it is iterated. Raises ValueError for a
+    text of another form, FileNotFoundError, and ValueError for a folder.
     """
     kind, _, rest = text.partition(":")
     head, _, number = rest.rpartition(":")
     if kind == "serial" and rest:
         port, baud = (head, int(number)) if head and number.isdecimal() else (rest, BAUD)
-        return Source(text, lambda: _serial(port, baud), tries, wait)
+        return ByteSource(text, lambda: _make_serial_connection(port, baud), tries, wait)
     if kind == "tcp":
         if not (head and number.isdecimal() and 0 < int(number) < 65_536):
-            raise ValueError(f"expected tcp:HOST:PORT, got {brief(text)}")
-        return Source(text, lambda: _tcp(head.strip("[]"), int(number)), tries, wait)
+            raise ValueError(f"expected tcp:HOST:PORT, got {short_repr(text)}")
+        return ByteSource(
+            text, lambda: _make_tcp_connection(head.strip("[]"), int(number)), tries, wait
+        )
     path = Path(text)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     if path.is_dir():
         raise ValueError(f"{path}: expected a file, found a folder")
-    return Source(text, lambda: _file(path), tries=0)
+    return ByteSource(text, lambda: _make_file_connection(path), tries=0)
 
 
 def is_nmea(path: str | Path) -> bool:
@@ -105,7 +107,7 @@ def is_nmea(path: str | Path) -> bool:
     if source.suffix.lower() == ".nmea" or not source.is_file():
         return source.suffix.lower() == ".nmea"
     with source.open("rb") as stream:
-        return bool(_LINE.search(stream.read(_MOST)))
+        return bool(_LINE.search(stream.read(_CHUNK_SIZE)))
 
 
 def read_nmea(path: str | Path) -> tuple[list["Epoch"], "Counts"]:
@@ -114,13 +116,13 @@ def read_nmea(path: str | Path) -> tuple[list["Epoch"], "Counts"]:
     Raises FileNotFoundError, and ValueError, with the path, for a folder and a file that is empty,
     has no valid sentence, or no epoch with a fix and a time.
     """
-    from .nmea import Decoder, mend_dates
+    from .nmea import Decoder, correct_dates
 
     decoder, sent = Decoder(), []
-    for chunk in open_source(str(Path(path).absolute())):
-        sent += decoder.feed(chunk)
+    for chunk in make_source(str(Path(path).absolute())):
+        sent += decoder.decode_chunk(chunk)
     sent += decoder.finish()
-    epochs, counts = mend_dates(sent), decoder.counts
+    epochs, counts = correct_dates(sent), decoder.counts
     counts.redated = sum(abs(new.t - old.t) > 0.0 for new, old in zip(epochs, sent, strict=True))
     if not counts.received:
         raise ValueError(f"{path}: the file is empty")
@@ -130,43 +132,45 @@ def read_nmea(path: str | Path) -> tuple[list["Epoch"], "Counts"]:
             f"with a bad checksum, {counts.unchecked} without a checksum, "
             f"{counts.truncated} cut short, {counts.overlong} overlong"
         )
-    if not any(epoch.fixed and epoch.t == epoch.t for epoch in epochs):
-        lacks = "both a fix and a time" if any(epoch.fixed for epoch in epochs) else "a fix"
+    if not any(epoch.has_fix and epoch.t == epoch.t for epoch in epochs):
+        lacks = "both a fix and a time" if any(epoch.has_fix for epoch in epochs) else "a fix"
         kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(counts.sentences.items()))
         raise ValueError(f"{path}: none of {len(epochs)} epochs has {lacks}; sentences: {kinds}")
     return epochs, counts
 
 
-def _file(path: Path) -> Line:
+def _make_file_connection(path: Path) -> Connection:
     stream = path.open("rb", buffering=0)
 
     def read() -> bytes:
-        chunk = stream.read(_MOST)
+        chunk = stream.read(_CHUNK_SIZE)
         if not chunk:
             raise EOFError
         return chunk
 
-    return Line(read, stream.close)
+    return Connection(read, stream.close)
 
 
-def _serial(port: str, baud: int) -> Line:
-    with extra("wires", "a serial port needs pyserial"):
+def _make_serial_connection(port: str, baud: int) -> Connection:
+    with require_extra("wires", "a serial port needs pyserial"):
         import serial
     device = serial.Serial(port, baud, timeout=PAUSE)
-    return Line(lambda: bytes(device.read(min(device.in_waiting or 1, _MOST))), device.close)
+    return Connection(
+        lambda: bytes(device.read(min(device.in_waiting or 1, _CHUNK_SIZE))), device.close
+    )
 
 
-def _tcp(host: str, port: int) -> Line:
+def _make_tcp_connection(host: str, port: int) -> Connection:
     peer = socket.create_connection((host, port), timeout=5.0)
     peer.settimeout(PAUSE)
 
     def read() -> bytes:
         try:
-            chunk = peer.recv(_MOST)
+            chunk = peer.recv(_CHUNK_SIZE)
         except TimeoutError:
             return b""
         if not chunk:
             raise ConnectionError("the peer closed")
         return chunk
 
-    return Line(read, peer.close)
+    return Connection(read, peer.close)

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..backend.extras import extra
+from ..backend.extras import require_extra
 from .dialect import find_unit, read_text
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-class Table(NamedTuple):
+class LogTable(NamedTuple):
     """A file's columns as they stand there.
 
     frame: the values; names may repeat. units: what the file says beside a column's name, "" for
@@ -27,14 +27,14 @@ class Table(NamedTuple):
     remarks: list[str]
 
 
-def read_table(path: Path, is_wanted: Callable[[str], bool]) -> Table:
+def read_table(path: Path, is_wanted: Callable[[str], bool]) -> LogTable:
     """The file's columns as they stand there.
 
     Text of any dialect, Parquet, MATLAB or MDF (needs `asammdf`), recognised by content. is_wanted:
     whether a column's name is one that is looked for. Raises ModuleNotFoundError without the extra,
     FileNotFoundError, and ValueError where the file is no table.
     """
-    with extra("report", "reading a log needs pandas"):
+    with require_extra("report", "reading a log needs pandas"):
         import pandas as pd
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
@@ -47,11 +47,11 @@ def read_table(path: Path, is_wanted: Callable[[str], bool]) -> Table:
     remarks: list[str] = []
     try:
         if data.startswith(b"MDF "):
-            return _mdf(path, is_wanted)
+            return _read_mdf(path, is_wanted)
         if data.startswith(b"PAR1"):
             frame = pd.read_parquet(path)
         elif data.startswith(b"MATLAB"):
-            frame = _matlab(path, data)
+            frame = _read_matlab(path, data)
         else:
             frame, units, remarks = read_text(data, is_wanted)
     except (MemoryError, ImportError):
@@ -63,10 +63,10 @@ def read_table(path: Path, is_wanted: Callable[[str], bool]) -> Table:
             f"{path}: expected CSV, Parquet, MATLAB or MDF, but {reason:.300}"
         ) from None
     names = [str(name).strip() for name in frame.columns]
-    return Table(frame.set_axis(names, axis=1), units or [""] * len(names), names, remarks)
+    return LogTable(frame.set_axis(names, axis=1), units or [""] * len(names), names, remarks)
 
 
-def _matlab(path: Path, head: bytes) -> "pd.DataFrame":
+def _read_matlab(path: Path, head: bytes) -> "pd.DataFrame":
     """The numeric vectors of the length that most have; ValueError for a file of version 7.3."""
     import pandas as pd
     from scipy.io import loadmat
@@ -79,13 +79,15 @@ def _matlab(path: Path, head: bytes) -> "pd.DataFrame":
         if isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype.kind in "fiub"
     }
     lengths = [len(values) for values in columns.values()]
-    most = max(set(lengths), key=lengths.count, default=0)
-    return pd.DataFrame({name: each for name, each in columns.items() if len(each) == most})
+    common_length = max(set(lengths), key=lengths.count, default=0)
+    return pd.DataFrame(
+        {name: column for name, column in columns.items() if len(column) == common_length}
+    )
 
 
-def _mdf(path: Path, is_wanted: Callable[[str], bool]) -> Table:
+def _read_mdf(path: Path, is_wanted: Callable[[str], bool]) -> LogTable:
     """The wanted channels in rows at the stamps of all their groups, NaN where a group has none."""
-    with extra("mdf", "reading MDF needs asammdf"):
+    with require_extra("mdf", "reading MDF needs asammdf"):
         from asammdf import MDF
     import pandas as pd
 
@@ -111,4 +113,4 @@ def _mdf(path: Path, is_wanted: Callable[[str], bool]) -> Table:
             columns[name] = column[~column.index.duplicated()]
             units.append(find_unit(signal.unit))
     frame = pd.concat(columns, axis=1, sort=True) if columns else pd.DataFrame()
-    return Table(frame.rename_axis("time_s").reset_index(), units, names, [])
+    return LogTable(frame.rename_axis("time_s").reset_index(), units, names, [])

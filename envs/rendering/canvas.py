@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..backend.extras import extra
+from ..backend.extras import require_extra
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-with extra("render", "pictures need pygame"):
+with require_extra("render", "pictures need pygame"):
     import pygame as pygame  # the other files of the room take it from here
 
 Points = npt.ArrayLike
@@ -22,7 +22,7 @@ Points = npt.ArrayLike
 Box = tuple[float, float, float, float]
 """Left, top, width and height in pixels."""
 
-_TIMES = 2
+_OVERSAMPLING = 2
 _FONTS = "dejavusans,notosans,liberationsans,arial,helveticaneue,segoeui"
 
 
@@ -32,68 +32,72 @@ class Canvas:
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
-        self._large = pygame.Surface((size[0] * _TIMES, size[1] * _TIMES), 0, 32)
+        self._large = pygame.Surface((size[0] * _OVERSAMPLING, size[1] * _OVERSAMPLING), 0, 32)
         self._texts: list[tuple[pygame.Surface, tuple[float, float]]] = []
 
-    def within(self, box: Box | None) -> None:
+    def set_clip(self, box: Box | None) -> None:
         """Draw only there from now on; None: everywhere. Text is drawn everywhere."""
-        self._large.set_clip(None if box is None else [round(_TIMES * each) for each in box])
+        self._large.set_clip(
+            None if box is None else [round(_OVERSAMPLING * value) for value in box]
+        )
 
-    def area(self, box: Box, colour: str, radius: float = 0.0) -> None:
+    def draw_box(self, box: Box, colour: str, radius: float = 0.0) -> None:
         """A filled box with round corners."""
-        scaled = pygame.Rect([round(_TIMES * each) for each in box])
-        pygame.draw.rect(self._large, colour, scaled, border_radius=round(_TIMES * radius))
+        scaled = pygame.Rect([round(_OVERSAMPLING * value) for value in box])
+        pygame.draw.rect(self._large, colour, scaled, border_radius=round(_OVERSAMPLING * radius))
 
-    def polygon(self, points: Points, colour: str) -> None:
+    def draw_polygon(self, points: Points, colour: str) -> None:
         """A filled polygon."""
-        scaled = _scaled(points)
+        scaled = _scale_points(points)
         pygame.draw.polygon(self._large, colour, scaled)
         pygame.draw.aalines(self._large, colour, True, scaled)
 
-    def line(self, points: Points, colour: str, width: float = 1.0) -> None:
+    def draw_line(self, points: Points, colour: str, width: float = 1.0) -> None:
         """A line through at least two points."""
-        scaled, thick = _scaled(points), max(round(_TIMES * width), 1)
+        scaled, thick = _scale_points(points), max(round(_OVERSAMPLING * width), 1)
         pygame.draw.lines(self._large, colour, False, scaled, thick)
         if thick > 4:
             for point in scaled:
                 pygame.draw.circle(self._large, colour, point, thick / 2)
 
-    def dashes(
-        self, points: Points, colour: str, width: float = 1.0, on: float = 6.0, off: float = 5.0
+    def draw_dashes(
+        self, points: Points, colour: str, width: float = 1.0, dash: float = 6.0, gap: float = 5.0
     ) -> None:
         """A dashed line: so many pixels drawn, so many not."""
-        along = np.asarray(points, float)
-        steps = np.hypot(*np.diff(along, axis=0).T)
+        vertices = np.asarray(points, float)
+        steps = np.hypot(*np.diff(vertices, axis=0).T)
         length = np.concatenate([[0.0], np.cumsum(steps)])
-        starts = np.arange(0.0, length[-1], on + off)
-        ends = np.stack([starts, np.minimum(starts + on, length[-1])], 1).ravel()
-        places = _scaled(np.stack([np.interp(ends, length, each) for each in along.T], 1))
+        starts = np.arange(0.0, length[-1], dash + gap)
+        ends = np.stack([starts, np.minimum(starts + dash, length[-1])], 1).ravel()
+        places = _scale_points(
+            np.stack([np.interp(ends, length, coordinate) for coordinate in vertices.T], 1)
+        )
         for start, end in zip(places[::2], places[1::2], strict=True):
-            pygame.draw.line(self._large, colour, start, end, max(round(_TIMES * width), 1))
+            pygame.draw.line(self._large, colour, start, end, max(round(_OVERSAMPLING * width), 1))
 
-    def disc(self, centre: Any, radius: float, colour: str) -> None:
+    def draw_disc(self, centre: Any, radius: float, colour: str) -> None:
         """A filled circle."""
-        pygame.draw.circle(self._large, colour, _scaled([centre])[0], _TIMES * radius)
+        pygame.draw.circle(self._large, colour, _scale_points([centre])[0], _OVERSAMPLING * radius)
 
-    def ring(self, centre: Any, radius: float, colour: str, width: float = 1.0) -> None:
+    def draw_ring(self, centre: Any, radius: float, colour: str, width: float = 1.0) -> None:
         """A circle."""
-        place, thick = _scaled([centre])[0], max(round(_TIMES * width), 1)
-        pygame.draw.circle(self._large, colour, place, _TIMES * radius + thick / 2, thick)
+        place, thick = _scale_points([centre])[0], max(round(_OVERSAMPLING * width), 1)
+        pygame.draw.circle(self._large, colour, place, _OVERSAMPLING * radius + thick / 2, thick)
 
-    def arrow(self, start: Any, end: Any, colour: str, width: float = 2.0) -> None:
+    def draw_arrow(self, start: Any, end: Any, colour: str, width: float = 2.0) -> None:
         """A line with a head at its end; the head shrinks with a short one."""
         a, b = np.asarray(start, float), np.asarray(end, float)
         length = float(np.hypot(*(b - a)))
         if length < 1.0:
             return
-        ahead = (b - a) / length
-        aside, head = np.array([-ahead[1], ahead[0]]), min(4.0 * width, 0.6 * length)
-        neck = b - head * ahead
-        half = 0.5 * width * aside
-        self.polygon([a + half, neck + half, neck - half, a - half], colour)
-        self.polygon([b, neck + 0.45 * head * aside, neck - 0.45 * head * aside], colour)
+        direction = (b - a) / length
+        normal, head = np.array([-direction[1], direction[0]]), min(4.0 * width, 0.6 * length)
+        neck = b - head * direction
+        half = 0.5 * width * normal
+        self.draw_polygon([a + half, neck + half, neck - half, a - half], colour)
+        self.draw_polygon([b, neck + 0.45 * head * normal, neck - 0.45 * head * normal], colour)
 
-    def text(
+    def draw_text(
         self,
         place: Any,
         words: str,
@@ -104,12 +108,12 @@ class Canvas:
     ) -> float:
         """Words whose middle line passes the place; align 0 begins there, 1 ends there. Returns
         their width."""
-        drawn = _words(words, colour, size, bold)
-        width, height = drawn.get_size()
-        self._texts.append((drawn, (place[0] - align * width, place[1] - 0.5 * height)))
+        surface = _render_words(words, colour, size, bold)
+        width, height = surface.get_size()
+        self._texts.append((surface, (place[0] - align * width, place[1] - 0.5 * height)))
         return float(width)
 
-    def finished(self) -> pygame.Surface:
+    def finish(self) -> pygame.Surface:
         """The picture; the canvas may be drawn upon anew."""
         small = pygame.transform.smoothscale(self._large, self.size)
         small.blits(self._texts)
@@ -117,21 +121,23 @@ class Canvas:
         return small
 
 
-def pixels(picture: pygame.Surface) -> npt.NDArray[np.uint8]:
+def read_pixels(picture: pygame.Surface) -> npt.NDArray[np.uint8]:
     """A picture as an array (height, width, 3)."""
     width, height = picture.get_size()
     flat = np.frombuffer(pygame.image.tobytes(picture, "RGB"), np.uint8)
     return flat.reshape(height, width, 3).copy()
 
 
-def _scaled(points: Points) -> list[tuple[int, int]]:
+def _scale_points(points: Points) -> list[tuple[int, int]]:
     """Places on the large surface; what lies far outside is drawn at its edge's other side."""
-    whole = np.rint(np.clip(np.asarray(points, float), -4000.0, 4000.0) * _TIMES).astype(int)
-    return [(x, y) for x, y in whole.tolist()]
+    rounded = np.rint(np.clip(np.asarray(points, float), -4000.0, 4000.0) * _OVERSAMPLING).astype(
+        int
+    )
+    return [(x, y) for x, y in rounded.tolist()]
 
 
 @functools.cache
-def _font(size: int, bold: bool) -> pygame.font.Font:
+def _load_font(size: int, bold: bool) -> pygame.font.Font:
     pygame.font.init()
     with warnings.catch_warnings():  # no list of fonts within a second, or none of these: its own
         warnings.simplefilter("ignore", UserWarning)
@@ -139,9 +145,9 @@ def _font(size: int, bold: bool) -> pygame.font.Font:
 
 
 @functools.lru_cache(512)
-def _words(words: str, colour: str, size: int, bold: bool) -> pygame.Surface:
+def _render_words(words: str, colour: str, size: int, bold: bool) -> pygame.Surface:
     try:
-        return _font(size, bold).render(words, True, colour)
+        return _load_font(size, bold).render(words, True, colour)
     except pygame.error:  # somebody's window called pygame.quit(), which ends all fonts
-        _font.cache_clear()
-        return _font(size, bold).render(words, True, colour)
+        _load_font.cache_clear()
+        return _load_font(size, bold).render(words, True, colour)

@@ -12,16 +12,16 @@ from ..engine.layout import P, Z
 from ..engine.packing import EpisodeConfig
 from ..record import Array
 from ..ticks import TICK
-from .trace import Shot, Trace
+from .trace import EpisodeTrace, RenderState
 
 Frame = npt.NDArray[np.uint8]
-Numbers = tuple[Array, Array, Any, Array, EpisodeConfig]
-"""The first fields of a `Shot`."""
+PackedArrays = tuple[Array, Array, Any, Array, EpisodeConfig]
+"""The first fields of a `RenderState`."""
 MODES = ("human", "rgb_array")
-_SHOWN = 20  # ticks of driving between two pictures in a window, or a control period
+_TICKS_PER_FRAME = 20  # ticks of driving between two pictures in a window, or a control period
 
 
-class Drawn:
+class RenderMixin:
     """An environment of one or more cars that draws them.
 
     render_mode: None, "rgb_array" (`render` returns frames, (540, 960, 3) bytes) or "human" (a
@@ -32,33 +32,33 @@ class Drawn:
     is missing, ResetNeeded where there was no reset. Without a display a window warns once.
     """
 
-    _our_tyres = True  # tyre forces can be drawn
+    _has_tyre_forces = True  # tyre forces can be drawn
     _has_shown = False  # a picture, in a window
     control_period: int
     render_mode: str | None
     metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 100}  # noqa: RUF012
 
-    def _draw_in(self, mode: str | None) -> None:
+    def _init_rendering(self, mode: str | None) -> None:
         """Take the render mode; `render_fps` is that of real time."""
         if mode is not None:
             check_choice("render_mode", mode, MODES)
         self.render_mode = mode
         rate = max(round(1.0 / (self.control_period * TICK)), 1)
         self.metadata = {**self.metadata, "render_fps": rate}
-        self._traces = [Trace()] if mode == "human" else []
+        self._traces = [EpisodeTrace()] if mode == "human" else []
 
-    def _numbers(self, row: int) -> Numbers:
+    def _get_packed_arrays(self, row: int) -> PackedArrays:
         """A car's packed numbers: views, which change with the car."""
         raise NotImplementedError
 
-    def _seen(self) -> None:
+    def _record_step(self) -> None:
         """Remember what a reset or a step led to, and show it in the window if there is one.
 
         Called where `_traces` has some. The window is an estimate behind: wrappers have not
         estimated yet.
         """
         for row, trace in enumerate(self._traces):
-            _, state, _, report, _ = self._numbers(row)
+            _, state, _, report, _ = self._get_packed_arrays(row)
             trace.add(report, state)
         if self.render_mode == "human":
             self._show()
@@ -66,30 +66,34 @@ class Drawn:
     def _show(self) -> None:
         from . import picture, window
 
-        n, now = self.control_period, self.shot(0)
-        between = n * max(-(-_SHOWN // n), 1)
-        if int(now.state[Z.clock.tick]) % between == 0:
+        n, render_state = self.control_period, self.make_render_state(0)
+        interval = n * max(-(-_TICKS_PER_FRAME // n), 1)
+        if int(render_state.state[Z.clock.tick]) % interval == 0:
             self._has_shown = True
-            window.show(picture.draw(now), 1.0 / (between * TICK))
+            window.show(picture.draw_picture(render_state), 1.0 / (interval * TICK))
 
-    def shot(self, row: int = 0) -> Shot:
+    def make_render_state(self, row: int = 0) -> RenderState:
         """What a car's picture is drawn from."""
         if not self._traces:
-            self._traces = [Trace() for _ in range(self._cars)]
-        now = Shot(*self._numbers(row), self._traces[row], self._our_tyres)
-        if not now.params[P.car.m] > 0.0:
+            self._traces = [EpisodeTrace() for _ in range(self._cars)]
+        render_state = RenderState(
+            *self._get_packed_arrays(row), self._traces[row], self._has_tyre_forces
+        )
+        if not render_state.params[P.car.m] > 0.0:
             raise ResetNeeded("there is nothing to draw yet: call reset() first")
-        if now.trace.empty:
-            now.trace.add(now.report, now.state)
-        return now
+        if render_state.trace.is_empty:
+            render_state.trace.add(render_state.report, render_state.state)
+        return render_state
 
-    def _frames(self) -> tuple[Frame, ...] | None:
+    def _render_frames(self) -> tuple[Frame, ...] | None:
         """A frame of each car; None where a window shows them or no mode was asked for."""
         if self.render_mode == "rgb_array":
-            from .canvas import pixels
-            from .picture import draw
+            from .canvas import read_pixels
+            from .picture import draw_picture
 
-            return tuple(pixels(draw(self.shot(row))) for row in range(self._cars))
+            return tuple(
+                read_pixels(draw_picture(self.make_render_state(row))) for row in range(self._cars)
+            )
         if self.render_mode == "human":
             self._show()
         else:
@@ -107,11 +111,11 @@ class Drawn:
             close()
 
 
-class DrawnOne(Drawn):
+class SingleRenderMixin(RenderMixin):
     """A single environment that draws its car."""
 
-    def _draw_in(self, mode: str | None) -> None:
-        super()._draw_in(mode)
+    def _init_rendering(self, mode: str | None) -> None:
+        super()._init_rendering(mode)
         self.annotations: dict[str, tuple[float, float]] = {}
 
     def annotate(self, label: str, beta: float, std: float) -> None:
@@ -119,11 +123,11 @@ class DrawnOne(Drawn):
         be drawn beside the truth under a label."""
         self.annotations[label] = beta, std
         if self._traces:
-            self._traces[0].estimate(label, beta, std)
+            self._traces[0].add_estimate(label, beta, std)
 
     def render(self) -> Frame | None:
         """The car's frame in the mode "rgb_array", else None."""
-        frames = self._frames()
+        frames = self._render_frames()
         return None if frames is None else frames[0]
 
     def close(self) -> None:
@@ -131,17 +135,17 @@ class DrawnOne(Drawn):
         self._close_window()
 
 
-class DrawnRows(Drawn):
+class VectorRenderMixin(RenderMixin):
     """A vector environment that draws its cars."""
 
     def annotate(self, label: str, beta: Array, std: Array, rows: npt.NDArray[np.bool_]) -> None:
         """The same as of a single environment, label, beta and std, for some rows, each (N,)."""
         for row in np.flatnonzero(rows[: len(self._traces)]):
-            self._traces[row].estimate(label, beta[row], std[row])
+            self._traces[row].add_estimate(label, beta[row], std[row])
 
     def render(self) -> tuple[Frame, ...] | None:
         """A frame of each car in the mode "rgb_array", else None."""
-        return self._frames()
+        return self._render_frames()
 
     def close_extras(self, **_: Any) -> None:
         """Close the window, if there is one."""

@@ -11,7 +11,7 @@ INK = "#000000"
 GREY = "#7F7F7F"
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Of things: Okabe and Ito's, safe for the colour-blind, without the yellow that white swallows."""
-STRANGERS = ("#AB1B99", "#907EFC", "#BD3F09", "#D87E12")
+OTHER_COLOURS = ("#AB1B99", "#907EFC", "#BD3F09", "#D87E12")
 """Of methods that are not ours, such as a user's own."""
 FILTERS = {
     "bicycle-kf": "#EA75FC",
@@ -65,7 +65,7 @@ CONTROLLERS = {
     "raw-coms-yaw": "#3D84B8",
     "raw-coms-steering": "#15698F",
 }
-RUNGS = {
+ORACLES = {
     "nominal": "#CF00B4",
     "oracle-parameters": "#63905A",
     "oracle-parameters-lqr": "#48905A",
@@ -86,18 +86,22 @@ _ALIASES = {
     "model-following": "with control, both",
     "truth": "true, reference, bound, ideal",
 }
-_OWN = {**FILTERS, **CONTROLLERS, **RUNGS, "truth": INK, "measured": GREY}
-COLOURS = _OWN | {
-    alias: _OWN[name] for name, aliases in _ALIASES.items() for alias in aliases.split(", ")
+_BASE_COLOURS = {**FILTERS, **CONTROLLERS, **ORACLES, "truth": INK, "measured": GREY}
+COLOURS = _BASE_COLOURS | {
+    alias: _BASE_COLOURS[name]
+    for name, aliases in _ALIASES.items()
+    for alias in aliases.split(", ")
 }
 """Estimators, controllers and facts by name."""
 
 FACTS = ("truth", "true")
-_WITHIN = sorted((name for name in COLOURS if name not in (*FACTS, "none")), key=len, reverse=True)
-_USUAL = "lqr on "  # the controller under which filters are compared
+_LONGEST_FIRST = sorted(
+    (name for name in COLOURS if name not in (*FACTS, "none")), key=len, reverse=True
+)
+_DEFAULT_PREFIX = "lqr on "  # the controller under which filters are compared
 
 
-def base(name: str) -> str | None:
+def find_base(name: str) -> str | None:
     """The name of `COLOURS` that a label speaks of, None for a stranger: of a controller on an
     estimator the controller, unless it is the usual one.
 
@@ -106,17 +110,23 @@ def base(name: str) -> str | None:
     >>> base("two-dof on multirate-kf"), base("lqr on dakf")
     ('two-dof', 'dakf')
     """
-    name = name.removeprefix(_USUAL).partition(" on ")[0]
-    return name if name in COLOURS else next((known for known in _WITHIN if known in name), None)
+    name = name.removeprefix(_DEFAULT_PREFIX).partition(" on ")[0]
+    return (
+        name
+        if name in COLOURS
+        else next((known for known in _LONGEST_FIRST if known in name), None)
+    )
 
 
-def colour(name: str) -> str:
+def find_colour(name: str) -> str:
     """The colour of a label, as "#RRGGBB"; a stranger always gets the same one."""
-    known = base(name)
-    return COLOURS[known] if known else STRANGERS[zlib.crc32(name.encode()) % len(STRANGERS)]
+    known = find_base(name)
+    return (
+        COLOURS[known] if known else OTHER_COLOURS[zlib.crc32(name.encode()) % len(OTHER_COLOURS)]
+    )
 
 
-def mixed(shade: str, with_shade: str, share: float) -> str:
+def mix_colours(shade: str, with_shade: str, share: float) -> str:
     """A share of one colour with the rest of another.
 
     >>> mixed("#000000", "#FFFFFF", 0.2)

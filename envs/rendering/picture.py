@@ -9,11 +9,11 @@ from ..task.reference import ZERO_SLIP
 from ..ticks import TICK
 from .canvas import Canvas, pygame
 from .closeup import PAPER, draw_closeup
-from .palette import GREY, INK, PALETTE, colour
-from .road import BLUE, ORANGE, SOFT, Driven, draw_road
-from .scene import Scene, scene_of
-from .strips import SPAN, draw_strips, strips_of
-from .trace import MOMENT, Shot
+from .palette import GREY, INK, PALETTE, find_colour
+from .road import BLUE, ORANGE, SOFT, CarTrack, draw_road
+from .scene import CarScene, make_car_scene
+from .strips import MAX_SPAN, draw_strips, make_strips
+from .trace import TRACE_POINT, RenderState
 
 SIZE = 960, 540
 _ROAD, _CLOSEUP, _STRIPS = (
@@ -23,71 +23,82 @@ _ROAD, _CLOSEUP, _STRIPS = (
 )
 
 
-def draw(shot: Shot, name: str = "true", ghosts: Sequence[tuple[str, Shot]] = ()) -> pygame.Surface:
+def draw_picture(
+    shot: RenderState, name: str = "true", ghosts: Sequence[tuple[str, RenderState]] = ()
+) -> pygame.Surface:
     """The picture of a car, under the name of its driver; ghosts drive beside it, with theirs."""
-    p, _, switches, _, config, trace, _, world = shot
-    now = trace.now
-    span = min(max(float(p[P.task.duration]) * TICK, 2.0), SPAN)
-    first = max(now[MOMENT.t] - span, 0.0)
-    truth, estimates = trace.since(first)
-    shades = _shades(estimates)
-    scene = scene_of(shot)
-    beside = [Driven(scene_of(each), each.trace.since(first)[0], GREY, who) for who, each in ghosts]
+    p, _, switches, _, config, trace, _, draw_world = shot
+    now = trace.newest
+    span = min(max(float(p[P.task.duration]) * TICK, 2.0), MAX_SPAN)
+    first = max(now[TRACE_POINT.t] - span, 0.0)
+    truth, estimates = trace.select_since(first)
+    shades = _choose_shades(estimates)
+    scene = make_car_scene(shot)
+    ghost_cars = [
+        CarTrack(make_car_scene(item), item.trace.select_since(first)[0], GREY, ghost_name)
+        for ghost_name, item in ghosts
+    ]
     canvas = Canvas(SIZE)
-    canvas.area((0.0, 0.0, *SIZE), PAPER)
-    if world is None:
-        draw_road(canvas, _ROAD, [*beside, Driven(scene, truth, BLUE, name if ghosts else "")])
-    newest = {label: (float(each[-1, 0]), shades[label]) for label, each in estimates.items()}
-    known = {label: each for label, each in newest.items() if math.isfinite(each[0])}
-    draw_closeup(canvas, _CLOSEUP, scene, now[MOMENT.beta], now[MOMENT.beta_ref], known)
-    judged = int(switches[FLAGS.reference]) != ZERO_SLIP
-    others = [(each.truth, each.colour) for each in beside]
-    full = float(p[P.task.yaw_scale])
-    strips = strips_of(truth, estimates, shades, others, full, judged)
+    canvas.draw_box((0.0, 0.0, *SIZE), PAPER)
+    if draw_world is None:
+        draw_road(
+            canvas, _ROAD, [*ghost_cars, CarTrack(scene, truth, BLUE, name if ghosts else "")]
+        )
+    newest = {label: (float(item[-1, 0]), shades[label]) for label, item in estimates.items()}
+    finite_estimates = {label: item for label, item in newest.items() if math.isfinite(item[0])}
+    draw_closeup(
+        canvas, _CLOSEUP, scene, now[TRACE_POINT.beta], now[TRACE_POINT.beta_ref], finite_estimates
+    )
+    has_yaw_reference = int(switches[FLAGS.reference]) != ZERO_SLIP
+    others = [(item.truth, item.colour) for item in ghost_cars]
+    full_scale = float(p[P.task.yaw_scale])
+    strips = make_strips(truth, estimates, shades, others, full_scale, has_yaw_reference)
     draw_strips(canvas, _STRIPS, strips, first, span)
-    _legend(canvas, name, [each for each, _ in ghosts], shades)
-    failures = [("", scene.failure), *((each.name, each.scene.failure) for each in beside)]
-    _heading(canvas, scene, config.scenario.name, now[MOMENT.t], failures)
-    picture = canvas.finished()
-    if world is not None:
+    _draw_legend(canvas, name, [item for item, _ in ghosts], shades)
+    failures = [("", scene.failure), *((item.name, item.scene.failure) for item in ghost_cars)]
+    _draw_heading(canvas, scene, config.scenario.name, now[TRACE_POINT.t], failures)
+    picture = canvas.finish()
+    if draw_world is not None:
         size = int(_ROAD[2]), int(_ROAD[3])
-        picture.blit(world(size, [each.scene.motion for each in beside]), _ROAD[:2])
+        picture.blit(draw_world(size, [item.scene.motion for item in ghost_cars]), _ROAD[:2])
     return picture
 
 
-def _shades(labels: Iterable[str]) -> dict[str, str]:
+def _choose_shades(labels: Iterable[str]) -> dict[str, str]:
     """A colour an estimator, its own where no other has it."""
     shades: dict[str, str] = {}
     for label in labels:
-        taken = shades.values()
-        choices = (colour(label), *PALETTE)
-        shades[label] = next((each for each in choices if each not in taken), choices[0])
+        used_shades = shades.values()
+        choices = (find_colour(label), *PALETTE)
+        shades[label] = next(
+            (choice for choice in choices if choice not in used_shades), choices[0]
+        )
     return shades
 
 
-def _legend(canvas: Canvas, name: str, ghosts: Sequence[str], shades: dict[str, str]) -> None:
+def _draw_legend(canvas: Canvas, name: str, ghosts: Sequence[str], shades: dict[str, str]) -> None:
     entries = [(name, INK, False), ("reference", INK, True)]
-    entries += [(each, GREY, False) for each in ghosts]
+    entries += [(ghost, GREY, False) for ghost in ghosts]
     entries += [(f"{label} ± 1 std", shade, False) for label, shade in shades.items()]
     x = _STRIPS[0] + 48.0
     for words, shade, dashed in entries:
-        draw = canvas.dashes if dashed else canvas.line
-        draw([(x, 272.0), (x + 20.0, 272.0)], shade, 2.5 if not dashed else 1.5)
-        x += 26.0 + canvas.text((x + 26.0, 272.0), words, INK, 12) + 18.0
+        draw_sample = canvas.draw_dashes if dashed else canvas.draw_line
+        draw_sample([(x, 272.0), (x + 20.0, 272.0)], shade, 2.5 if not dashed else 1.5)
+        x += 26.0 + canvas.draw_text((x + 26.0, 272.0), words, INK, 12) + 18.0
 
 
-def _heading(
-    canvas: Canvas, scene: Scene, scenario: str, t: float, failures: list[tuple[str, int]]
+def _draw_heading(
+    canvas: Canvas, scene: CarScene, scenario: str, t: float, failures: list[tuple[str, int]]
 ) -> None:
     """What is driven, by which car, how fast, and whose drive failed."""
-    x = 30.0 + canvas.text((16.0, 20.0), scenario, INK, 17, bold=True)
+    x = 30.0 + canvas.draw_text((16.0, 20.0), scenario, INK, 17, bold=True)
     speed = 3.6 * math.hypot(scene.motion.v_x, scene.motion.v_y)
     car = f"{scene.vehicle.name}, {speed:.0f} km/h, friction {scene.friction:.2f}"
-    x += 16.0 + canvas.text((x, 21.0), car, SOFT, 14)
+    x += 16.0 + canvas.draw_text((x, 21.0), car, SOFT, 14)
     for name, failure in failures:
         if failure:
             words = f"{name}: {FAILURES[failure]}" if name else FAILURES[failure]
-            width = canvas.text((x + 10.0, 20.0), words, "#FFFFFF", 13)
-            canvas.area((x, 9.0, width + 20.0, 22.0), ORANGE, 11.0)
+            width = canvas.draw_text((x + 10.0, 20.0), words, "#FFFFFF", 13)
+            canvas.draw_box((x, 9.0, width + 20.0, 22.0), ORANGE, 11.0)
             x += width + 30.0
-    canvas.text((SIZE[0] - 16.0, 20.0), f"{t:.2f} s", INK, 17, 1.0, True)
+    canvas.draw_text((SIZE[0] - 16.0, 20.0), f"{t:.2f} s", INK, 17, 1.0, True)

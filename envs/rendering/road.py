@@ -8,28 +8,31 @@ import numpy as np
 from ..record import Array
 from ..vehicle.vehicle import Vehicle
 from .canvas import Box, Canvas
-from .palette import INK, PALETTE, mixed
-from .scene import AHEAD, Scene
-from .trace import MOMENT
+from .palette import INK, PALETTE, mix_colours
+from .scene import DRAWN_LENGTH, CarScene
+from .trace import TRACE_POINT
 
 BLUE, ORANGE = PALETTE[0], PALETTE[1]
 ASPHALT, GRASS, PAINT, SOFT = "#D9DCE0", "#E2E9DA", "#FFFFFF", "#6B7177"
 TYRE = "#23272B"
-CAR, SCALES = 96.0, (22.0, 30.0)  # pixels of a car's length, and of a metre at least and at most
+CAR_LENGTH, SCALES = (
+    96.0,
+    (22.0, 30.0),
+)  # pixels of a car's length, and of a metre at least and at most
 LANE = 1.75  # m to either side of the centre line, where the scenario sets no limit
 OVERHANG = 1.62  # length of a car in wheelbases
 
 
-class Driven(NamedTuple):
+class CarTrack(NamedTuple):
     """A car to draw: where it is, where it was, the colour of its body, and a name beside it."""
 
-    scene: Scene
+    scene: CarScene
     truth: Array  # rows of `Moment`
     colour: str
     name: str = ""
 
 
-class View(NamedTuple):
+class GroundProjection(NamedTuple):
     """From the ground to pixels."""
 
     x: float  # m, the place on the ground that is drawn at `centre`
@@ -47,64 +50,66 @@ class View(NamedTuple):
         return np.stack([self.centre[0] + self.scale * right, self.centre[1] - self.scale * up], 1)
 
 
-class Road:
+class CentreLine:
     """The centre line: as it was driven along, and as it goes on."""
 
-    def __init__(self, scene: Scene, truth: Array) -> None:
-        s, y, theta = truth[:, MOMENT.s], truth[:, MOMENT.y], truth[:, MOMENT.theta]
-        X = truth[:, MOMENT.X] + y * np.sin(theta)
-        Y = truth[:, MOMENT.Y] - y * np.cos(theta)
-        back, on = np.arange(-float(AHEAD), 0.0), np.arange(1.0, AHEAD + 1.0)
-        turned = theta[-1] + np.cumsum(scene.bends)
-        middle = turned - 0.5 * scene.bends
-        ahead = X[-1] + np.cumsum(np.cos(middle)), Y[-1] + np.cumsum(np.sin(middle))
-        self._s = np.concatenate([s[0] + back, s, s[-1] + on])
-        self._X = np.concatenate([X[0] + back * np.cos(theta[0]), X, ahead[0]])
-        self._Y = np.concatenate([Y[0] + back * np.sin(theta[0]), Y, ahead[1]])
-        self._theta = np.concatenate([theta[0] + 0.0 * back, theta, turned])
+    def __init__(self, scene: CarScene, truth: Array) -> None:
+        s, y, theta = truth[:, TRACE_POINT.s], truth[:, TRACE_POINT.y], truth[:, TRACE_POINT.theta]
+        X = truth[:, TRACE_POINT.X] + y * np.sin(theta)
+        Y = truth[:, TRACE_POINT.Y] - y * np.cos(theta)
+        backward, forward = np.arange(-float(DRAWN_LENGTH), 0.0), np.arange(1.0, DRAWN_LENGTH + 1.0)
+        directions = theta[-1] + np.cumsum(scene.curvatures)
+        middle = directions - 0.5 * scene.curvatures
+        preview_xy = X[-1] + np.cumsum(np.cos(middle)), Y[-1] + np.cumsum(np.sin(middle))
+        self._s = np.concatenate([s[0] + backward, s, s[-1] + forward])
+        self._X = np.concatenate([X[0] + backward * np.cos(theta[0]), X, preview_xy[0]])
+        self._Y = np.concatenate([Y[0] + backward * np.sin(theta[0]), Y, preview_xy[1]])
+        self._theta = np.concatenate([theta[0] + 0.0 * backward, theta, directions])
 
-    def at(self, s: Array, y: Array) -> Array:
+    def locate(self, s: Array, y: Array) -> Array:
         """Places on the ground at distances s along the road and y to its left, (n, 2)."""
         theta = np.interp(s, self._s, self._theta)
         X, Y = np.interp(s, self._s, self._X), np.interp(s, self._s, self._Y)
         return np.stack([X - y * np.sin(theta), Y + y * np.cos(theta)], 1)
 
 
-def draw_road(canvas: Canvas, box: Box, cars: list[Driven]) -> None:
+def draw_road(canvas: Canvas, box: Box, cars: list[CarTrack]) -> None:
     """The road around the last of the cars, in a box; the others are ghosts beside it."""
     scene, truth, *_ = cars[-1]
-    motion, road = scene.motion, Road(scene, truth)
-    front, rear, _ = body(scene.vehicle)
-    scale = min(max(CAR / (front - rear), SCALES[0]), SCALES[1])
+    motion, road = scene.motion, CentreLine(scene, truth)
+    front, rear, _ = compute_body(scene.vehicle)
+    scale = min(max(CAR_LENGTH / (front - rear), SCALES[0]), SCALES[1])
     reach = box[3] / scale / 2.0 - 2.5  # the view follows a car that would leave it
     y = motion.y - min(max(motion.y, -reach), reach)
-    x_0, y_0 = road.at(np.array([motion.s]), np.array([y]))[0]
+    x_0, y_0 = road.locate(np.array([motion.s]), np.array([y]))[0]
     centre = box[0] + 0.3 * box[2], box[1] + 0.5 * box[3]
-    view = View(x_0, y_0, np.cos(motion.theta), np.sin(motion.theta), centre, scale)
+    view = GroundProjection(x_0, y_0, np.cos(motion.theta), np.sin(motion.theta), centre, scale)
     s = np.arange(motion.s - 16.0, motion.s + 34.0, 1.0)
-    canvas.within(box)
-    _surface(canvas, box, view, road, scene, s)
-    if scene.sight is not None:
-        _sight(canvas, view, road, scene)
-    _marks(canvas, box, view, road, scene, s)
+    canvas.set_clip(box)
+    _draw_surface(canvas, box, view, road, scene, s)
+    if scene.field_of_view is not None:
+        _draw_camera_overlay(canvas, view, road, scene)
+    _draw_markings(canvas, box, view, road, scene, s)
     for car in cars:
-        trail = view(car.truth[-400:, [MOMENT.X, MOMENT.Y]])
+        trail = view(car.truth[-400:, [TRACE_POINT.X, TRACE_POINT.Y]])
         if len(trail) > 1:
-            canvas.line(trail, mixed(car.colour, ASPHALT, 0.55), 2.0)
+            canvas.draw_line(trail, mix_colours(car.colour, ASPHALT, 0.55), 2.0)
     poses = [view(np.array([[car.scene.motion.X, car.scene.motion.Y]]))[0] for car in cars]
     for car, pose in zip(cars, poses, strict=True):
         heading = car.scene.motion.psi - motion.theta
         draw_car(canvas, pose, heading, scale, car.scene, car.colour)
     _names(canvas, box, cars, poses, scale)
-    canvas.within(None)
+    canvas.set_clip(None)
 
 
-def _names(canvas: Canvas, box: Box, cars: list[Driven], poses: list[Array], scale: float) -> None:
+def _names(
+    canvas: Canvas, box: Box, cars: list[CarTrack], poses: list[Array], scale: float
+) -> None:
     """The names of cars in the box: a ghost's on its side of the last car, whose own is on the
     other; each as near as it covers no car and no other name."""
     taken = []  # the middle, the half width and the half height of what is not to be covered
     for car, (x, y) in zip(cars, poses, strict=True):
-        front, rear, half = scale * np.array(body(car.scene.vehicle))
+        front, rear, half = scale * np.array(compute_body(car.scene.vehicle))
         heading = car.scene.motion.psi - cars[-1].scene.motion.theta
         cos, sin, long, ahead = np.cos(heading), np.sin(heading), front - rear, front + rear
         size = np.abs([[cos, sin], [sin, cos]]) @ (0.5 * long, half)
@@ -118,104 +123,116 @@ def _names(canvas: Canvas, box: Box, cars: list[Driven], poses: list[Array], sca
         for row in tries if seen else ():
             clear = all(abs(x - a) > half + c or abs(row - b) > 7.0 + d for a, b, c, d in taken)
             if clear and box[1] + 8.0 < row < box[1] + box[3] - 24.0:
-                canvas.text((x, row), car.name, mixed(car.colour, INK, 0.6), 12, 0.5)
+                canvas.draw_text((x, row), car.name, mix_colours(car.colour, INK, 0.6), 12, 0.5)
                 taken.append((x, row, half, 7.0))
                 break
 
 
-def _band(road: Road, view: View, s: Array, right: float, left: float) -> Array:
+def _make_band(
+    road: CentreLine, view: GroundProjection, s: Array, right: float, left: float
+) -> Array:
     """The outline of a strip of the road between two offsets."""
-    edges = road.at(s, np.full_like(s, right)), road.at(s[::-1], np.full_like(s, left))
+    edges = road.locate(s, np.full_like(s, right)), road.locate(s[::-1], np.full_like(s, left))
     return view(np.concatenate(edges))
 
 
-def _surface(canvas: Canvas, box: Box, view: View, road: Road, scene: Scene, s: Array) -> None:
+def _draw_surface(
+    canvas: Canvas, box: Box, view: GroundProjection, road: CentreLine, scene: CarScene, s: Array
+) -> None:
     """Grass and asphalt, or a wide proving ground; the lanes between cones are lighter."""
     wide = scene.half_width > 10.0
-    canvas.area(box, ASPHALT if wide or scene.lanes else GRASS)
+    canvas.draw_box(box, ASPHALT if wide or scene.lanes else GRASS)
     if not (wide or scene.lanes):
         edge = scene.half_width + 0.6
-        canvas.polygon(_band(road, view, s, -edge, edge), ASPHALT)
+        canvas.draw_polygon(_make_band(road, view, s, -edge, edge), ASPHALT)
     for lane in scene.lanes:
-        along = np.array([lane.start, lane.start + lane.length])
+        ends = np.array([lane.start, lane.start + lane.length])
         half = 0.5 * lane.width
-        outline = _band(road, view, along, lane.offset - half, lane.offset + half)
-        canvas.polygon(outline, mixed(PAINT, ASPHALT, 0.5))
+        outline = _make_band(road, view, ends, lane.offset - half, lane.offset + half)
+        canvas.draw_polygon(outline, mix_colours(PAINT, ASPHALT, 0.5))
 
 
-def _marks(canvas: Canvas, box: Box, view: View, road: Road, scene: Scene, s: Array) -> None:
+def _draw_markings(
+    canvas: Canvas, box: Box, view: GroundProjection, road: CentreLine, scene: CarScene, s: Array
+) -> None:
     """Lane markings, or cones with the driver's path; a thin line every ten metres."""
     for place in np.arange(10.0 * np.ceil(s[0] / 10.0), s[-1], 10.0):
-        across = view(road.at(np.full(2, place), np.array([-30.0, 30.0])))
-        canvas.line(across, mixed(PAINT, ASPHALT, 0.35), 1.0)
-        x, top = across[:, 0].mean(), box[1] + box[3]
-        canvas.text((x + 4.0, top - 10.0), f"{place:.0f} m", SOFT, 11)
+        cross_line = view(road.locate(np.full(2, place), np.array([-30.0, 30.0])))
+        canvas.draw_line(cross_line, mix_colours(PAINT, ASPHALT, 0.35), 1.0)
+        x, top = cross_line[:, 0].mean(), box[1] + box[3]
+        canvas.draw_text((x + 4.0, top - 10.0), f"{place:.0f} m", SOFT, 11)
     if scene.lanes:
         path = scene.path[(scene.path[:, 0] > s[0]) & (scene.path[:, 0] < s[-1])]
-        canvas.dashes(view(road.at(*path.T)), SOFT, 1.0, 2.0, 4.0)
+        canvas.draw_dashes(view(road.locate(*path.T)), SOFT, 1.0, 2.0, 4.0)
     else:
         edge = scene.half_width if scene.half_width <= 10.0 else LANE
         for side in (-edge, edge):
-            canvas.line(view(road.at(s, np.full_like(s, side))), PAINT, 2.0)
+            canvas.draw_line(view(road.locate(s, np.full_like(s, side))), PAINT, 2.0)
         for start in np.arange(9.0 * np.floor(s[0] / 9.0), s[-1], 9.0):
             dash = start + np.arange(4.0)
-            canvas.line(view(road.at(dash, 0.0 * dash)), PAINT, 2.0)
+            canvas.draw_line(view(road.locate(dash, 0.0 * dash)), PAINT, 2.0)
     for lane in scene.lanes:
         count = max(round(lane.length / 3.0), 2)
         for place in np.linspace(lane.start, lane.start + lane.length, count + 1):
             for side in (-0.5, 0.5):
-                at = np.array([place]), np.array([lane.offset + side * lane.width])
+                cone_position = np.array([place]), np.array([lane.offset + side * lane.width])
                 if abs(place - s.mean()) < 30.0:
-                    cone = view(road.at(*at))[0]
-                    canvas.disc(cone, 3.6, ORANGE)
-                    canvas.disc(cone, 1.4, PAINT)
+                    cone = view(road.locate(*cone_position))[0]
+                    canvas.draw_disc(cone, 3.6, ORANGE)
+                    canvas.draw_disc(cone, 1.4, PAINT)
 
 
-def _sight(canvas: Canvas, view: View, road: Road, scene: Scene) -> None:
+def _draw_camera_overlay(
+    canvas: Canvas, view: GroundProjection, road: CentreLine, scene: CarScene
+) -> None:
     """The camera's field of view to the preview point, and the offset there that it measures."""
-    m, sight = scene.motion, scene.sight
-    assert sight is not None
-    colour = PALETTE[5] if sight.sees else ORANGE
-    angles = m.psi + np.linspace(-sight.half_angle, sight.half_angle, 9)
-    reach = sight.ahead / np.cos(angles - m.psi)
+    m, overlay = scene.motion, scene.field_of_view
+    assert overlay is not None
+    colour = PALETTE[5] if overlay.has_lane else ORANGE
+    angles = m.psi + np.linspace(-overlay.half_angle, overlay.half_angle, 9)
+    reach = overlay.preview / np.cos(angles - m.psi)
     rim = np.stack([m.X + reach * np.cos(angles), m.Y + reach * np.sin(angles)], 1)
     wedge = np.concatenate([[[m.X, m.Y]], rim])
-    canvas.polygon(view(wedge), mixed(colour, ASPHALT, 0.2))
-    ahead = np.array([[m.X + sight.ahead * np.cos(m.psi), m.Y + sight.ahead * np.sin(m.psi)]])
-    if sight.sees:
-        lane = road.at(np.array([m.s + sight.ahead]), np.array([0.0]))
-        canvas.line(view(np.concatenate([lane, ahead])), colour, 2.5)
-        canvas.disc(view(lane)[0], 3.0, colour)
+    canvas.draw_polygon(view(wedge), mix_colours(colour, ASPHALT, 0.2))
+    preview_point = np.array(
+        [[m.X + overlay.preview * np.cos(m.psi), m.Y + overlay.preview * np.sin(m.psi)]]
+    )
+    if overlay.has_lane:
+        lane = road.locate(np.array([m.s + overlay.preview]), np.array([0.0]))
+        canvas.draw_line(view(np.concatenate([lane, preview_point])), colour, 2.5)
+        canvas.draw_disc(view(lane)[0], 3.0, colour)
 
 
 def draw_car(
-    canvas: Canvas, place: Array, heading: float, scale: float, scene: Scene, colour: str
+    canvas: Canvas, place: Array, heading: float, scale: float, scene: CarScene, colour: str
 ) -> None:
     """A car at a place in pixels; heading: rad from the picture's right, to the left positive."""
     cos, sin = np.cos(heading), np.sin(heading)
 
-    def on(points: Array) -> Array:
+    def to_pixels(points: Array) -> Array:
         x, y = np.asarray(points, float).T * scale
         return np.stack([place[0] + x * cos - y * sin, place[1] - x * sin - y * cos], 1)
 
-    front, rear, half = body(scene.vehicle)
+    front, rear, half = compute_body(scene.vehicle)
     for wheel in scene.wheels:  # further out than they are, to be seen
-        outline = wheel_outline(wheel.x, np.sign(wheel.y) * half, wheel.angle, scene.vehicle)
-        canvas.polygon(on(outline), TYRE)
-    canvas.polygon(on(rounded(rear, front, half)), colour)
-    glass, length = mixed(INK, colour, 0.55), front - rear
-    for back, ahead, tip, foot in ((0.62, 0.74, 0.72, 0.86), (0.14, 0.21, 0.86, 0.74)):
-        x, y = rear + np.array([back, ahead]) * length, np.array([foot, tip]) * half
-        canvas.polygon(on(np.stack([x[[0, 1, 1, 0]], [y[0], y[1], -y[1], -y[0]]], 1)), glass)
+        outline = make_wheel_outline(wheel.x, np.sign(wheel.y) * half, wheel.angle, scene.vehicle)
+        canvas.draw_polygon(to_pixels(outline), TYRE)
+    canvas.draw_polygon(to_pixels(make_body_outline(rear, front, half)), colour)
+    glass, length = mix_colours(INK, colour, 0.55), front - rear
+    for rear_share, front_share, tip, foot in ((0.62, 0.74, 0.72, 0.86), (0.14, 0.21, 0.86, 0.74)):
+        x, y = rear + np.array([rear_share, front_share]) * length, np.array([foot, tip]) * half
+        canvas.draw_polygon(
+            to_pixels(np.stack([x[[0, 1, 1, 0]], [y[0], y[1], -y[1], -y[0]]], 1)), glass
+        )
 
 
-def body(vehicle: Vehicle) -> tuple[float, float, float]:
+def compute_body(vehicle: Vehicle) -> tuple[float, float, float]:
     """(front, rear, half width) in m from the centre of gravity."""
     over = 0.5 * (OVERHANG - 1.0) * vehicle.wheelbase
     return vehicle.front_arm + over, -vehicle.rear_arm - over, 0.5 * vehicle.width
 
 
-def rounded(rear: float, front: float, half: float) -> Array:
+def make_body_outline(rear: float, front: float, half: float) -> Array:
     """A body's outline: a box whose corners are quarters of an ellipse, longer at the front."""
     turn = np.linspace(0.0, 0.5 * np.pi, 6)
     outline = []
@@ -228,10 +245,10 @@ def rounded(rear: float, front: float, half: float) -> Array:
     return np.concatenate([left, left[::-1] * (1.0, -1.0)])
 
 
-def wheel_outline(x: float, y: float, angle: float, vehicle: Vehicle) -> Array:
+def make_wheel_outline(x: float, y: float, angle: float, vehicle: Vehicle) -> Array:
     """A wheel's corners in car axes in m."""
     r, w = vehicle.wheel_radius, 0.3 * vehicle.wheel_radius
     corners = np.array([(r, w), (r, -w), (-r, -w), (-r, w)])
     cos, sin = np.cos(angle), np.sin(angle)
-    turned: Array = corners @ np.array([(cos, sin), (-sin, cos)]) + (x, y)
-    return turned
+    rotated: Array = corners @ np.array([(cos, sin), (-sin, cos)]) + (x, y)
+    return rotated

@@ -7,16 +7,16 @@ import numpy as np
 
 from ..record import Array
 from .canvas import Box, Canvas
-from .palette import INK, mixed
+from .palette import INK, mix_colours
 from .road import SOFT
-from .trace import MOMENT
+from .trace import TRACE_POINT
 
-SPAN = 10.0  # s that are shown at most
+MAX_SPAN = 10.0  # s that are shown at most
 _DEGREES = math.degrees(1.0)
 _GRID, _ROW = "#E3E6E9", 20.0
 
 
-class Line(NamedTuple):
+class ChartLine(NamedTuple):
     """A line of a strip: values over time, an estimate's standard deviation around it."""
 
     t: Array
@@ -32,42 +32,54 @@ class Strip(NamedTuple):
     share of the height."""
 
     title: str
-    least: float
+    min_limit: float
     share: float
-    lines: list[Line]
+    lines: list[ChartLine]
 
 
-def strips_of(
+def make_strips(
     truth: Array,
     estimates: dict[str, Array],
     colours: dict[str, str],
     ghosts: list[tuple[Array, str]],
-    most_moment: float,
-    judged: bool,
+    max_moment: float,
+    has_yaw_reference: bool,
 ) -> list[Strip]:
     """Sideslip angle, yaw rate and yaw moment of a car over time, with those of ghosts.
 
     estimates: by label (n, 2). ghosts: (truth, colour) of each. most_moment: N m, full scale.
-    judged: the yaw rate has a reference.
+    has_yaw_reference: the yaw rate has a reference.
     """
 
-    def of(column: int, factor: float) -> list[Line]:
-        others = [Line(g[:, MOMENT.t], factor * g[:, column], shade) for g, shade in ghosts]
-        return [*others, Line(t, factor * truth[:, column], INK, width=2.0)]
+    def make_lines(column: int, factor: float) -> list[ChartLine]:
+        others = [
+            ChartLine(g[:, TRACE_POINT.t], factor * g[:, column], shade) for g, shade in ghosts
+        ]
+        return [*others, ChartLine(t, factor * truth[:, column], INK, width=2.0)]
 
-    t = truth[:, MOMENT.t]
-    believed = [
-        Line(t, _DEGREES * hat, colours[name], deviation=_DEGREES * std)
-        for name, (hat, std) in ((name, each.T) for name, each in estimates.items())
+    t = truth[:, TRACE_POINT.t]
+    estimate_lines = [
+        ChartLine(t, _DEGREES * hat, colours[name], deviation=_DEGREES * std)
+        for name, (hat, std) in ((name, columns.T) for name, columns in estimates.items())
     ]
-    wanted = [
-        Line(t, _DEGREES * truth[:, column], INK, True, width=1.0)
-        for column in (MOMENT.beta_ref, MOMENT.gamma_ref)
+    reference_lines = [
+        ChartLine(t, _DEGREES * truth[:, column], INK, True, width=1.0)
+        for column in (TRACE_POINT.beta_ref, TRACE_POINT.gamma_ref)
     ]
     return [
-        Strip("sideslip angle / deg", 1.0, 1.6, [wanted[0], *of(MOMENT.beta, _DEGREES), *believed]),
-        Strip("yaw rate / (deg/s)", 10.0, 1.0, [*wanted[1:][:judged], *of(MOMENT.gamma, _DEGREES)]),
-        Strip("yaw moment / (N m)", 0.2 * most_moment, 1.0, of(MOMENT.yaw_moment, 1.0)),
+        Strip(
+            "sideslip angle / deg",
+            1.0,
+            1.6,
+            [reference_lines[0], *make_lines(TRACE_POINT.beta, _DEGREES), *estimate_lines],
+        ),
+        Strip(
+            "yaw rate / (deg/s)",
+            10.0,
+            1.0,
+            [*reference_lines[1:][:has_yaw_reference], *make_lines(TRACE_POINT.gamma, _DEGREES)],
+        ),
+        Strip("yaw moment / (N m)", 0.2 * max_moment, 1.0, make_lines(TRACE_POINT.yaw_moment, 1.0)),
     ]
 
 
@@ -78,54 +90,58 @@ def draw_strips(canvas: Canvas, box: Box, strips: list[Strip], first: float, spa
     y = top
     for strip in strips:
         inside = left + 48.0, y + _ROW, width - 60.0, strip.share * high - _ROW - 4.0
-        _strip(canvas, inside, strip, first, span)
+        _draw_strip(canvas, inside, strip, first, span)
         y += strip.share * high
     step = 1.0 if span <= 10.0 else 2.0
     for t in np.arange(math.ceil(first / step) * step, first + span + 1e-6, step):
         x = left + 48.0 + (width - 60.0) * (t - first) / span
-        canvas.text((x, top + height - 10.0), f"{t:g}", SOFT, 11, 0.5)
-    canvas.text((left, top + height - 10.0), "time / s", SOFT, 11)
+        canvas.draw_text((x, top + height - 10.0), f"{t:g}", SOFT, 11, 0.5)
+    canvas.draw_text((left, top + height - 10.0), "time / s", SOFT, 11)
 
 
-def _strip(canvas: Canvas, box: Box, strip: Strip, first: float, span: float) -> None:
+def _draw_strip(canvas: Canvas, box: Box, strip: Strip, first: float, span: float) -> None:
     left, top, width, height = box
-    largest = max((_largest(line) for line in strip.lines), default=0.0)
-    limit = _nice(max(strip.least, 1.05 * largest))
+    largest = max((_find_largest(line) for line in strip.lines), default=0.0)
+    limit = _find_nice_limit(max(strip.min_limit, 1.05 * largest))
 
-    def on(t: Array, values: Array) -> Array:
+    def to_pixels(t: Array, values: Array) -> Array:
         share = np.clip(values / limit, -1.1, 1.1)
         return np.stack([left + width * (t - first) / span, top + 0.5 * height * (1.0 - share)], 1)
 
-    canvas.area(box, "#FFFFFF")
+    canvas.draw_box(box, "#FFFFFF")
     for share in (-1.0, 0.0, 1.0):
         y = top + 0.5 * height * (1.0 - share)
-        canvas.line([(left, y), (left + width, y)], _GRID, 1.0)
-        canvas.text((left - 6.0, y), f"{share * limit:g}", SOFT, 11, 1.0)
-    canvas.text((left, top - 0.5 * _ROW + 2.0), strip.title, INK, 12)
-    canvas.within(box)
+        canvas.draw_line([(left, y), (left + width, y)], _GRID, 1.0)
+        canvas.draw_text((left - 6.0, y), f"{share * limit:g}", SOFT, 11, 1.0)
+    canvas.draw_text((left, top - 0.5 * _ROW + 2.0), strip.title, INK, 12)
+    canvas.set_clip(box)
     for line in strip.lines:
         if line.deviation is not None:
-            there = np.isfinite(line.values) & np.isfinite(line.deviation)
-            t, middle, std = line.t[there], line.values[there], line.deviation[there]
+            is_known = np.isfinite(line.values) & np.isfinite(line.deviation)
+            t, middle, std = line.t[is_known], line.values[is_known], line.deviation[is_known]
             if len(t) > 1:
-                edges = on(t, middle + std), on(t, middle - std)[::-1]
-                canvas.polygon(np.concatenate(edges), mixed(line.colour, "#FFFFFF", 0.25))
+                edges = to_pixels(t, middle + std), to_pixels(t, middle - std)[::-1]
+                canvas.draw_polygon(
+                    np.concatenate(edges), mix_colours(line.colour, "#FFFFFF", 0.25)
+                )
     for line in strip.lines:
-        there = np.isfinite(line.values)
-        points = on(line.t[there], line.values[there])
+        is_known = np.isfinite(line.values)
+        points = to_pixels(line.t[is_known], line.values[is_known])
         if len(points) > 1:
-            draw = canvas.dashes if line.dashed else canvas.line
-            draw(points, line.colour, line.width)
+            draw_points = canvas.draw_dashes if line.dashed else canvas.draw_line
+            draw_points(points, line.colour, line.width)
         if len(points) and not line.dashed:
-            canvas.disc(points[-1], 2.6, line.colour)
-    canvas.within(None)
+            canvas.draw_disc(points[-1], 2.6, line.colour)
+    canvas.set_clip(None)
 
 
-def _largest(line: Line) -> float:
+def _find_largest(line: ChartLine) -> float:
     return float(np.max(np.abs(line.values), initial=0.0, where=np.isfinite(line.values)))
 
 
-def _nice(limit: float) -> float:
+def _find_nice_limit(limit: float) -> float:
     """The next of 1, 2, 5, 10, ..., times a power of ten."""
     power = 10.0 ** math.floor(math.log10(limit))
-    return next(each * power for each in (1.0, 2.0, 3.0, 5.0, 10.0) if each * power >= limit - 1e-9)
+    return next(
+        factor * power for factor in (1.0, 2.0, 3.0, 5.0, 10.0) if factor * power >= limit - 1e-9
+    )

@@ -12,7 +12,7 @@ from ..task.info import REPORT
 from ..vehicle.dynamics import Motion
 
 
-class Moment(NamedTuple):
+class TracePoint(NamedTuple):
     """Columns of the truth."""
 
     t: int = 0  # s
@@ -28,61 +28,68 @@ class Moment(NamedTuple):
     theta: int = 10  # rad, its direction
 
 
-MOMENT = Moment()
-_OF_REPORT = [getattr(REPORT, name) for name in Moment._fields[: MOMENT.X]]
-_OF_STATE = [getattr(Z.motion, name) for name in Moment._fields[MOMENT.X :]]
+TRACE_POINT = TracePoint()
+_REPORT_COLUMNS = [getattr(REPORT, name) for name in TracePoint._fields[: TRACE_POINT.X]]
+_STATE_COLUMNS = [getattr(Z.motion, name) for name in TracePoint._fields[TRACE_POINT.X :]]
 
 
-class Trace:
+class EpisodeTrace:
     """The steps of an episode that were seen."""
 
     def __init__(self) -> None:
-        self._rows = np.empty((256, len(MOMENT)))
+        self._rows = np.empty((256, len(TRACE_POINT)))
         self._count = 0
         self._estimates: dict[str, Array] = {}
 
     def add(self, report: Array, state: Array) -> None:
         """Remember the moment; one that is not after the last begins a new episode."""
         t, k = report[REPORT.t], self._count
-        if k and t <= self._rows[k - 1, MOMENT.t]:
+        if k and t <= self._rows[k - 1, TRACE_POINT.t]:
             k, self._estimates = 0, {}
         if k == len(self._rows):
-            self._rows = _grown(self._rows)
-            self._estimates = {name: _grown(each) for name, each in self._estimates.items()}
-        self._rows[k, : MOMENT.X], self._rows[k, MOMENT.X :] = report[_OF_REPORT], state[_OF_STATE]
+            self._rows = _extend_rows(self._rows)
+            self._estimates = {
+                name: _extend_rows(estimates) for name, estimates in self._estimates.items()
+            }
+        self._rows[k, : TRACE_POINT.X], self._rows[k, TRACE_POINT.X :] = (
+            report[_REPORT_COLUMNS],
+            state[_STATE_COLUMNS],
+        )
         self._count = k + 1
 
-    def estimate(self, label: str, value: float, deviation: float) -> None:
+    def add_estimate(self, label: str, value: float, deviation: float) -> None:
         """An estimate of beta at the newest moment, and its standard deviation, rad."""
         if label not in self._estimates:
             self._estimates[label] = np.full((len(self._rows), 2), np.nan)
         self._estimates[label][self._count - 1] = value, deviation
 
     @property
-    def empty(self) -> bool:
+    def is_empty(self) -> bool:
         """Whether nothing was seen yet."""
         return self._count == 0
 
     @property
-    def now(self) -> Array:
+    def newest(self) -> Array:
         """The newest moment, (len(Moment),)."""
         newest: Array = self._rows[self._count - 1]
         return newest
 
-    def since(self, t: float, most: int = 400) -> tuple[Array, dict[str, Array]]:
+    def select_since(self, t: float, max_points: int = 400) -> tuple[Array, dict[str, Array]]:
         """The truth from a time on, (n, len(Moment)), and by label the estimates and their
-        deviations, (n, 2), NaN where there are none; thinned out to `most` moments or so."""
-        first = int(np.searchsorted(self._rows[: self._count, MOMENT.t], t))
-        step = max((self._count - first) // most, 1)
+        deviations, (n, 2), NaN where there are none; thinned out to `max_points` moments or so."""
+        first = int(np.searchsorted(self._rows[: self._count, TRACE_POINT.t], t))
+        step = max((self._count - first) // max_points, 1)
         chosen = np.arange(self._count - 1, first - 1, -step)[::-1]
-        return self._rows[chosen], {name: each[chosen] for name, each in self._estimates.items()}
+        return self._rows[chosen], {
+            name: estimates[chosen] for name, estimates in self._estimates.items()
+        }
 
 
-World = Callable[[tuple[int, int], list[Motion]], Any]
+RoadPainter = Callable[[tuple[int, int], list[Motion]], Any]
 """Draws a road around a car, and others at their motions, on a surface of so many pixels."""
 
 
-class Shot(NamedTuple):
+class RenderState(NamedTuple):
     """What a picture is drawn from: an episode's packed numbers, and what was seen of it."""
 
     params: Array  # of `engine.layout`
@@ -90,10 +97,10 @@ class Shot(NamedTuple):
     switches: Any
     report: Array
     config: EpisodeConfig
-    trace: Trace
-    ours: bool = True  # its tyres are those of our plant
-    world: World | None = None  # draws the road instead
+    trace: EpisodeTrace
+    has_tyre_forces: bool = True  # its tyres are those of our plant
+    world: RoadPainter | None = None  # draws the road instead
 
 
-def _grown(rows: Array) -> Array:
+def _extend_rows(rows: Array) -> Array:
     return np.concatenate([rows, np.full_like(rows, np.nan)])

@@ -11,11 +11,11 @@ _NO_WINDOW = ("offscreen", "dummy")  # SDL's drivers that show nothing
 
 
 @functools.cache
-def _clock() -> pygame.time.Clock:
+def _get_clock() -> pygame.time.Clock:
     return pygame.time.Clock()
 
 
-def _opened(size: tuple[int, int]) -> pygame.Surface:
+def _make_screen(size: tuple[int, int]) -> pygame.Surface:
     try:
         pygame.display.init()
         driver = pygame.display.get_driver()
@@ -31,18 +31,18 @@ def _opened(size: tuple[int, int]) -> pygame.Surface:
             "render_mode='rgb_array' returns frames"
         )
         os.environ["SDL_VIDEODRIVER"] = "dummy"
-        return _opened(size)
+        return _make_screen(size)
     pygame.display.set_caption("sideslip")
     return screen
 
 
 def show(picture: pygame.Surface, rate: float) -> None:
     """Show a picture, no sooner than 1 / rate seconds after the last one."""
-    screen = pygame.display.get_surface() or _opened(picture.get_size())
+    screen = pygame.display.get_surface() or _make_screen(picture.get_size())
     screen.blit(picture, (0, 0))
     pygame.event.pump()
     pygame.display.flip()
-    _clock().tick(rate)
+    _get_clock().tick(rate)
 
 
 def close() -> None:

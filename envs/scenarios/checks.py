@@ -5,22 +5,22 @@ import math
 from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import Any
 
-from ..arguments import brief, check_choice, is_finite, listed, unknown_names
+from ..arguments import check_choice, describe_unknown, is_finite, join_names, short_repr
 from ..sensors.gps import HDOP_LAWS
 from ..sensors.noise import Noise
 from ..ticks import TICK
 from ..vehicle.tyres import TYRE_LAWS
 from ..vehicle.vehicle import Vehicle
-from .draws import Draws, range_of
+from .draws import Draws, get_range
 from .roads import ROADS
 from .steering import STEERING_KINDS
 from .tracks import PATHS
 
 Fields = Mapping[str, Any]
 
-MOST_SLIP = 1.5  # rad: a start beyond it has no speed along the car
-SHORTEST_GPS_PERIOD = 0.05  # s; an env keeps room for its packets
-MOST_SAMPLES = 1_000_000  # of a trace
+MAX_SLIP = 1.5  # rad: a start beyond it has no speed along the car
+MIN_GPS_PERIOD = 0.05  # s; an env keeps room for its packets
+MAX_SAMPLES = 1_000_000  # of a trace
 SIDES = ("side", "wind_side")  # drawn, but no fields
 
 TIER_NAMES = ("", "1", "2a", "2b", "2c")
@@ -33,7 +33,7 @@ _CHOICES = {
     "tyres": TYRE_LAWS,
     "tier": TIER_NAMES,
 }
-_PARAMETERS = [each.name for each in dataclasses.fields(Vehicle)]
+_PARAMETERS = [entry.name for entry in dataclasses.fields(Vehicle)]
 _FLAGS = ("mirror", "small_angle", "lags", "roll")
 _NUMBERS_OR_NONE = ("acceleration", "gps_period")
 _DRAWS_OR_NONE = ("path_speed", "friction_right", "tyre_change_time")
@@ -46,14 +46,14 @@ _TIMES_OR_NONE = {  # how many
 }
 
 
-def check(fields: Fields, entries: Sequence[dataclasses.Field[Any]]) -> None:
+def check_fields(fields: Fields, entries: Sequence[dataclasses.Field[Any]]) -> None:
     """ValueError for a field out of place, TypeError for a vehicle's parameter that there is not,
     with the scenario's name and the field's. What is plausible above zero alone is positive.
 
     entries: the dataclass's. Those of type float are one number, neither drawn nor None.
     """
-    numbers = [each.name for each in entries if each.type is float]
-    positive = {each.name for each in entries if each.metadata.get("plausible", (0,))[0] > 0}
+    numbers = [spec.name for spec in entries if spec.type is float]
+    positive = {spec.name for spec in entries if spec.metadata.get("plausible", (0,))[0] > 0}
     try:
         _check_names(fields)
         _check_mappings(fields)
@@ -63,7 +63,7 @@ def check(fields: Fields, entries: Sequence[dataclasses.Field[Any]]) -> None:
         _check_sensors(fields)
         _check_trace(fields)
     except (TypeError, ValueError) as error:
-        raise type(error)(f"scenario {brief(fields['name'])}: {error}") from None
+        raise type(error)(f"scenario {short_repr(fields['name'])}: {error}") from None
 
 
 def _check_names(fields: Fields) -> None:
@@ -73,14 +73,14 @@ def _check_names(fields: Fields) -> None:
         check_choice(what, fields[what], known)
     for name in _FLAGS:
         if not isinstance(fields[name], bool):
-            raise ValueError(f"{name} is True or False, got {brief(fields[name])}")
+            raise ValueError(f"{name} is True or False, got {short_repr(fields[name])}")
     if fields["path"] != "road" and fields["steering"] != "driver":
         raise ValueError(
             f"path {fields['path']!r} needs the steering 'driver', got {fields['steering']!r}"
         )
     if fields["road"] == "nominal-path" and fields["steering"] == "driver":
         raise ValueError("road 'nominal-path' follows a programme's steering, not a driver's")
-    if fields["road"] == "nominal-path" and range_of(fields["curvature"]) != (0.0, 0.0):
+    if fields["road"] == "nominal-path" and get_range(fields["curvature"]) != (0.0, 0.0):
         raise ValueError(f"road 'nominal-path' has no curvature, got {fields['curvature']!r}")
     if fields["path_speed"] is not None and fields["path"] == "road":
         raise ValueError("path_speed needs a track as path; a road has no lengths to scale")
@@ -89,10 +89,10 @@ def _check_names(fields: Fields) -> None:
 def _check_trace(fields: Fields) -> None:
     trace, steering = fields["trace"], fields["steering"]
     if not isinstance(trace, tuple) or not all(map(is_finite, trace)):
-        raise ValueError(f"trace is angles in rad, finite ones, got {brief(trace)}")
-    if (len(trace) > 1) != (steering == "trace") or len(trace) > MOST_SAMPLES:
+        raise ValueError(f"trace is angles in rad, finite ones, got {short_repr(trace)}")
+    if (len(trace) > 1) != (steering == "trace") or len(trace) > MAX_SAMPLES:
         raise ValueError(
-            f"trace has 2 to {MOST_SAMPLES} angles where the steering is 'trace', else none; got "
+            f"trace has 2 to {MAX_SAMPLES} angles where the steering is 'trace', else none; got "
             f"{len(trace)} with {steering!r}"
         )
     if fields["trace_step"] < TICK:
@@ -103,19 +103,19 @@ def _check_mappings(fields: Fields) -> None:
     for name in ("vehicle", "nominal", "noise"):
         values = fields[name]
         if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
-            raise ValueError(f"{name} is a mapping of names to numbers, got {brief(values)}")
+            raise ValueError(f"{name} is a mapping of names to numbers, got {short_repr(values)}")
         if name != "noise" and (unknown := [key for key in values if key not in _PARAMETERS]):
-            raise TypeError(unknown_names(f"parameter of {name}", unknown, _PARAMETERS))
+            raise TypeError(describe_unknown(f"parameter of {name}", unknown, _PARAMETERS))
     unknown = sorted(set(fields["noise"]) - set(Noise._fields))
     if unknown:
-        raise ValueError(f"unknown noise {listed(unknown)}; known: {listed(Noise._fields)}")
+        raise ValueError(f"unknown noise {join_names(unknown)}; known: {join_names(Noise._fields)}")
     for name, value in fields["noise"].items():
         _check_number(f"noise {name}", value)
 
 
 def _check_number(name: str, value: Any) -> None:
     if not is_finite(value):
-        raise ValueError(f"{name} {brief(value)} is not finite")
+        raise ValueError(f"{name} {short_repr(value)} is not finite")
 
 
 def _check_numbers(fields: Fields, numbers: Iterable[str], positive: Container[str]) -> None:
@@ -126,7 +126,7 @@ def _check_numbers(fields: Fields, numbers: Iterable[str], positive: Container[s
         _check_number(name, 0.0 if fields[name] is None else fields[name])
     width = fields["half_width"]  # only compared with: it may be as wide as a float can be
     if not (is_finite(width) or (isinstance(width, float) and math.isfinite(width))):
-        raise ValueError(f"half_width {brief(width)} is not finite")
+        raise ValueError(f"half_width {short_repr(width)} is not finite")
     for name in ("camera_heading", "camera_offset"):
         if not (isinstance(fields[name], float) and fields[name] == math.inf):
             _check_number(name, fields[name])
@@ -146,38 +146,38 @@ def _check_draws(fields: Fields, positive: Container[str]) -> None:
         value = fields[name]
         ends = value if isinstance(value, tuple) else (value, value)
         if not (len(ends) == 2 and all(map(is_finite, ends)) and ends[0] <= ends[1]):
-            raise ValueError(f"{name} {brief(value)} is not finite, or its ends are swapped")
+            raise ValueError(f"{name} {short_repr(value)} is not finite, or its ends are swapped")
         if name in positive and ends[0] <= 0.0:
-            none = " or None" if name in _DRAWS_OR_NONE else ""
-            raise ValueError(f"{name} must be positive{none}, got {value!r}")
+            none_text = " or None" if name in _DRAWS_OR_NONE else ""
+            raise ValueError(f"{name} must be positive{none_text}, got {value!r}")
     for name in ("front_change", "rear_change"):
-        if fields["tyre_change_time"] is None and range_of(fields[name]) != (1.0, 1.0):
+        if fields["tyre_change_time"] is None and get_range(fields[name]) != (1.0, 1.0):
             raise ValueError(
                 f"{name} {fields[name]!r} needs a tyre_change_time, from which it acts"
             )
     steering, hold = fields["steering"], fields["hold"]
-    if steering in ("ramp", "sweep", "wander") and range_of(hold)[0] < TICK:
+    if steering in ("ramp", "sweep", "wander") and get_range(hold)[0] < TICK:
         raise ValueError(f"hold of a {steering} is 1 ms or more, got {hold!r}")
-    if steering == "sine-with-dwell" and range_of(hold)[0] < 0.0:
+    if steering == "sine-with-dwell" and get_range(hold)[0] < 0.0:
         raise ValueError(f"hold of a dwell is not negative, got {hold!r}")
 
 
 def _check_motion(fields: Fields) -> None:
-    slowest = range_of(fields["speed"])[0]
-    if slowest < 0.0 or slowest + fields["speed_change"] < 0.0:
+    min_speed = get_range(fields["speed"])[0]
+    if min_speed < 0.0 or min_speed + fields["speed_change"] < 0.0:
         raise ValueError("speed must not be negative, with speed_change or without")
     if not fields["change_length"] >= TICK:
         raise ValueError(f"change_length is {TICK:g} s at least, got {fields['change_length']!r}")
     if fields["acceleration"] is not None and (fields["speed_change"] or fields["surge"]):
         raise ValueError("speed_change and surge need the held speed (acceleration None)")
-    if fields["path_speed"] is not None and slowest <= 0.0:
+    if fields["path_speed"] is not None and min_speed <= 0.0:
         raise ValueError("path_speed needs a speed above zero")
     bank, grade = fields["bank"], fields["grade"]
-    if max(map(abs, (*range_of(bank), grade))) > 0.5:
+    if max(map(abs, (*get_range(bank), grade))) > 0.5:
         raise ValueError(f"bank and grade are up to 0.5 rad, got {bank!r}, {grade!r}")
     beta = fields["initial_beta"]
-    if max(map(abs, range_of(beta))) > MOST_SLIP:
-        raise ValueError(f"initial_beta is up to {MOST_SLIP} rad, got {beta!r}")
+    if max(map(abs, get_range(beta))) > MAX_SLIP:
+        raise ValueError(f"initial_beta is up to {MAX_SLIP} rad, got {beta!r}")
 
 
 def _check_sensors(fields: Fields) -> None:
@@ -187,12 +187,14 @@ def _check_sensors(fields: Fields) -> None:
         value = fields[name]
         fits = isinstance(value, tuple) and len(value) in counts and all(map(is_finite, value))
         if value is not None and not (fits and min(value) >= 0.0):
-            many = " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))
-            raise ValueError(f"{name} is {many} times in s, zero or more, got {brief(value)}")
+            count_text = " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))
+            raise ValueError(
+                f"{name} is {count_text} times in s, zero or more, got {short_repr(value)}"
+            )
     period = fields["gps_period"]
-    if period is not None and not period >= SHORTEST_GPS_PERIOD:
-        raise ValueError(f"gps_period is {SHORTEST_GPS_PERIOD} s or more, got {period!r}")
-    if range_of(fields["gps_latency"])[0] < 0.0:
+    if period is not None and not period >= MIN_GPS_PERIOD:
+        raise ValueError(f"gps_period is {MIN_GPS_PERIOD} s or more, got {period!r}")
+    if get_range(fields["gps_latency"])[0] < 0.0:
         raise ValueError(f"gps_latency is zero or more, got {fields['gps_latency']!r}")
     if fields["camera_jitter"] < 0.0:
         raise ValueError(f"camera_jitter is zero or more, got {fields['camera_jitter']!r}")

@@ -2,10 +2,10 @@
 
 from typing import Any, NamedTuple
 
-from ..backend.arrays import offsets, read
+from ..backend.arrays import make_offsets, read
 from ..backend.decorators import jit
 from ..backend.primitives import select
-from ..backend.random import CHANNELS, uniforms
+from ..backend.random import CHANNELS, draw_uniforms
 
 _ATTEMPTS = 64
 
@@ -45,46 +45,48 @@ class Draws(NamedTuple):
     initial_gamma: Any  # rad/s
 
 
-DRAWS, DRAWS_WIDTH = offsets(Draws)
+DRAWS, DRAWS_WIDTH = make_offsets(Draws)
 
 
 @jit
-def draw(low: Any, high: Any, key_low: int, key_high: int, attempt: int, drawn: Any) -> None:
-    """Fill `drawn` (len(Draws)) with numbers in [low, high]; fixed ones keep their bits."""
-    u = uniforms(key_low, key_high, attempt, CHANNELS.scenario, 0)
-    for i in range(len(drawn)):
+def draw_numbers(low: Any, high: Any, key_low: int, key_high: int, attempt: int, out: Any) -> None:
+    """Fill `out` (len(Draws)) with numbers in [low, high]; fixed ones keep their bits."""
+    u = draw_uniforms(key_low, key_high, attempt, CHANNELS.scenario, 0)
+    for i in range(len(out)):
         if i % 4 == 0:
-            u = uniforms(key_low, key_high, attempt, CHANNELS.scenario, i // 4)
-        drawn[i] = low[i] + (high[i] - low[i]) * u[i % 4]
+            u = draw_uniforms(key_low, key_high, attempt, CHANNELS.scenario, i // 4)
+        out[i] = low[i] + (high[i] - low[i]) * u[i % 4]
 
 
 @jit
-def stable(d: Any, car: Any) -> Any:
+def is_stable(d: Any, car: Any) -> Any:
     """Whether the drawn linear vehicle is stable at the drawn speed (with 5 % to spare), before
     its tyres change and after."""
     C_f, C_r = car.C_f * d.front_stiffness, car.C_r * d.rear_stiffness
-    changes = d.tyre_change_time > 0.0
-    later_f = C_f * select(changes, d.front_change, 1.0)
-    later_r = C_r * select(changes, d.rear_change, 1.0)
-    return _holds(C_f, C_r, d.speed, car) & _holds(later_f, later_r, d.speed, car)
+    has_change = d.tyre_change_time > 0.0
+    later_f = C_f * select(has_change, d.front_change, 1.0)
+    later_r = C_r * select(has_change, d.rear_change, 1.0)
+    return _is_below_critical(C_f, C_r, d.speed, car) & _is_below_critical(
+        later_f, later_r, d.speed, car
+    )
 
 
 @jit
-def _holds(C_f: Any, C_r: Any, speed: Any, car: Any) -> Any:
+def _is_below_critical(C_f: Any, C_r: Any, speed: Any, car: Any) -> Any:
     excess = C_f * car.l_f - C_r * car.l_r
     l, v = car.l_f + car.l_r, 1.05 * speed  # noqa: E741
     return car.m * v * v * excess < 2.0 * C_f * C_r * l * l
 
 
 @jit
-def realise(low: Any, high: Any, key_low: int, key_high: int, car: Any, drawn: Any) -> Any:
+def draw_stable(low: Any, high: Any, key_low: int, key_high: int, car: Any, out: Any) -> Any:
     """Draw until the vehicle is stable; returns (the draws, how many unstable ones were lost)."""
     attempt = 0
-    draw(low, high, key_low, key_high, attempt, drawn)
-    while attempt + 1 < _ATTEMPTS and not stable(read(drawn, DRAWS), car):
+    draw_numbers(low, high, key_low, key_high, attempt, out)
+    while attempt + 1 < _ATTEMPTS and not is_stable(read(out, DRAWS), car):
         attempt += 1
-        draw(low, high, key_low, key_high, attempt, drawn)
-    return read(drawn, DRAWS), attempt
+        draw_numbers(low, high, key_low, key_high, attempt, out)
+    return read(out, DRAWS), attempt
 
 
 Range = float | tuple[float, float]
@@ -93,7 +95,7 @@ Range = float | tuple[float, float]
 KMH = 1.0 / 3.6
 
 
-def range_of(value: Range | None) -> tuple[float, float]:
+def get_range(value: Range | None) -> tuple[float, float]:
     """(low, high) of a drawn quantity; zeros for None."""
     low, high = value if isinstance(value, tuple) else (value or 0.0, value or 0.0)
     return float(low), float(high)

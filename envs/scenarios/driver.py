@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 from ..backend.decorators import jit
 from ..backend.elementary import sincos
 from ..backend.primitives import maximum, minimum
-from ..vehicle.actuators import lagged, slewed
-from ..vehicle.dynamics import curvature_at
-from ..vehicle.tyres import SLOW
-from .tracks import path_offset
+from ..vehicle.actuators import apply_lag, limit_rate
+from ..vehicle.dynamics import compute_curvature
+from ..vehicle.tyres import MIN_SPEED
+from .tracks import compute_path_offset
 
-NEAR = 1.0  # wheelbases: a driver looks no nearer
+MIN_PREVIEW = 1.0  # wheelbases: a driver looks no nearer
 
 
-class Driver(NamedTuple):
+class DriverParams(NamedTuple):
     """How a driver steers."""
 
     preview: Any  # s, T
@@ -30,37 +30,39 @@ class Driver(NamedTuple):
 
 
 @jit
-def lateral_error(motion: Any, path: Any, road: Any, ahead: Any) -> Any:
-    """How far in m the path, `ahead` m on, lies to the left of where the car is going.
+def compute_lateral_error(motion: Any, path: Any, road: Any, preview: Any) -> Any:
+    """How far in m the path, `preview` m on, lies to the left of where the car is going.
 
     The road's own bend is the double integral of its curvature, exact on a clothoid too.
     """
     sin_r, cos_r = sincos(motion.psi - motion.theta)
-    slope = (motion.v_x * sin_r + motion.v_y * cos_r) / maximum(motion.v_x, SLOW)
-    bend = 0.5 * ahead * ahead * curvature_at(road, motion.s + ahead * (1.0 / 3.0))
-    return path_offset(path, motion.s + ahead) + bend - motion.y - ahead * slope
+    slope = (motion.v_x * sin_r + motion.v_y * cos_r) / maximum(motion.v_x, MIN_SPEED)
+    bend = 0.5 * preview * preview * compute_curvature(road, motion.s + preview * (1.0 / 3.0))
+    return compute_path_offset(path, motion.s + preview) + bend - motion.y - preview * slope
 
 
 @jit
-def wanted_angle(motion: Any, path: Any, road: Any, target: Any, driver: Any, stop: Any) -> Any:
+def compute_target_angle(
+    motion: Any, path: Any, road: Any, target: Any, driver: Any, stop: Any
+) -> Any:
     """The steering angle in rad, within +-stop, that brings the car onto the path."""
     v = motion.v_x
-    ahead = maximum(driver.preview * v, NEAR / target.per_l)
-    error = lateral_error(motion, path, road, ahead)
-    curvature = driver.gain * 2.0 * error / (ahead * ahead)
+    preview = maximum(driver.preview * v, MIN_PREVIEW / target.per_l)
+    error = compute_lateral_error(motion, path, road, preview)
+    curvature = driver.gain * 2.0 * error / (preview * preview)
     angle = curvature * maximum(1.0 + target.G * v * v, 0.2) / target.per_l  # dakf-stability (23)
     return minimum(maximum(angle, 0.0 - stop), stop)
 
 
 @jit
-def steered(
+def compute_driver_angle(
     angle: Any, motion: Any, path: Any, road: Any, target: Any, driver: Any, stop: Any
 ) -> Any:
     """The driver's steering angle in rad a tick after `angle`, at a Motion.
 
-    path: a `tracks.Path`. road: a `dynamics.Road`. target: a `reference.Target`, what the driver
-    knows of the car. stop: rad. Source: MacAdam, "Application of an optimal preview control for
-    simulation of closed-loop automobile driving", IEEE Trans. SMC 11 (1981).
+    path: a `tracks.TrackPath`. road: a `dynamics.Road`. target: a `reference.Target`, what the
+    driver knows of the car. stop: rad. Source: MacAdam, "Application of an optimal preview control
+    for simulation of closed-loop automobile driving", IEEE Trans. SMC 11 (1981).
     """
-    wanted = wanted_angle(motion, path, road, target, driver, stop)
-    return slewed(angle, lagged(wanted, angle, driver.rest), driver.slew)
+    target_angle = compute_target_angle(motion, path, road, target, driver, stop)
+    return limit_rate(angle, apply_lag(target_angle, angle, driver.rest), driver.slew)

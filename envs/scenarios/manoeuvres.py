@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..arguments import brief, check_choice, unknown_names
-from ..documents import ends_in, is_document, read_document
+from ..arguments import check_choice, describe_unknown, short_repr
+from ..documents import has_suffix, is_document, read_document
 from .draws import KMH
 from .papers import ROAD_TESTS, SIMULATIONS
 from .scenario import Scenario
@@ -19,9 +19,9 @@ from .tiers import (
     STEP,
     TIERS,
     WET_EVASION,
-    random_of,
+    make_random_steering,
 )
-from .traces import TABLES, trace_from
+from .traces import TABLE_SUFFIXES, read_trace
 
 _DRAWN: dict[str, Any] = {
     "mirror": True,
@@ -33,7 +33,7 @@ _DRAWN: dict[str, Any] = {
 # Above 28 km/h so many of the drawn cars are close to their critical speed that those which spin
 # would decide the mean cost of a harsh manoeuvre.
 _HARSH = _DRAWN | {"speed": (18.0 * KMH, 28.0 * KMH)}
-_RANDOM = random_of(0.005, 0.015)
+_RANDOM = make_random_steering(0.005, 0.015)
 _SLALOM = SLALOM | {"amplitude": (0.04, 0.1)}
 _LANE: dict[str, Any] = {"steering": "driver", "half_width": 1.75}
 _BEND: dict[str, Any] = {"curvature": (0.01, 0.03), "curve_start": 15.0, "curve_ramp": 10.0}
@@ -85,7 +85,7 @@ _MANOEUVRES = (
 )
 
 # Easier ones, to begin with.
-_OTHERS = (
+_EASY = (
     Scenario(name="straight", **_DRAWN),
     Scenario(
         name="sine",
@@ -128,19 +128,19 @@ _ROADS = (
 
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
-    for scenario in (*_MANOEUVRES, *_OTHERS, *_ROADS, *TIERS, *SIMULATIONS, *ROAD_TESTS)
+    for scenario in (*_MANOEUVRES, *_EASY, *_ROADS, *TIERS, *SIMULATIONS, *ROAD_TESTS)
 }
 
 
 ScenarioSource = str | os.PathLike[str] | Mapping[str, Any] | Scenario
-"""What `scenario_from` takes."""
+"""What `make_scenario` takes."""
 
 
-def scenario_from(source: ScenarioSource) -> Scenario:
+def make_scenario(source: ScenarioSource) -> Scenario:
     """A scenario from its name, a file, a mapping of fields, or a scenario itself.
 
     A TOML or JSON file holds such a mapping, `Scenario.write` makes one; a CSV or Parquet file is a
-    recorded drive, whose steering is driven again (`trace_from`). A mapping may start from another
+    recorded drive, whose steering is driven again (`read_trace`). A mapping may start from another
     scenario, a name or a file, under `base`. A file without a `name` has that of the file.
 
     Raises FileNotFoundError; ValueError for an unknown name, a file that cannot be read and a value
@@ -150,30 +150,30 @@ def scenario_from(source: ScenarioSource) -> Scenario:
     if isinstance(source, Scenario):
         return source
     if isinstance(source, Mapping):
-        return _scenario_of(dict(source))
-    if ends_in(source, TABLES):
-        return trace_from(source)
+        return _parse_scenario(dict(source))
+    if has_suffix(source, TABLE_SUFFIXES):
+        return read_trace(source)
     if is_document(source):
         values = read_document(source, "scenario")
         try:
-            return _scenario_of({"name": Path(source).stem} | values)
+            return _parse_scenario({"name": Path(source).stem} | values)
         except (TypeError, ValueError) as error:
             raise type(error)(f"{source}: {error}") from None
     if not isinstance(source, str):
         raise TypeError(
             "a scenario is a name, the path of a TOML, JSON, CSV or Parquet file or a mapping of "
-            f"fields, got {brief(source)}"
+            f"fields, got {short_repr(source)}"
         )
     check_choice("scenario", source, SCENARIOS)
     return SCENARIOS[source]
 
 
-def _scenario_of(values: dict[str, Any]) -> Scenario:
+def _parse_scenario(values: dict[str, Any]) -> Scenario:
     """A scenario of a mapping."""
     base = values.pop("base", None)
     known = [entry.name for entry in dataclasses.fields(Scenario)]
     if unknown := [key for key in values if key not in known]:
-        raise TypeError(unknown_names("scenario field", unknown, [*known, "base"]))
+        raise TypeError(describe_unknown("scenario field", unknown, [*known, "base"]))
     if base is not None:
-        return scenario_from(base).replace(**values)
+        return make_scenario(base).replace(**values)
     return Scenario(**{"name": "custom", **values})

@@ -13,7 +13,7 @@ from .draws import KMH
 from .scenario import Scenario
 
 
-def _tyres(stiffness: float) -> dict[str, float]:
+def _make_stiffness(stiffness: float) -> dict[str, float]:
     return {"front_stiffness": stiffness, "rear_stiffness": stiffness}
 
 
@@ -36,7 +36,7 @@ _FIG7 = Scenario(
     steering="sine",
     amplitude=0.1,
     frequency=0.5,
-    vehicle=_tyres(7200.0),
+    vehicle=_make_stiffness(7200.0),
     **_SIMULATED,
 )
 # given: a single lane change at 25 km/h
@@ -67,8 +67,8 @@ _DAKF = Scenario(
     frequency=0.2,
     wind_arm=0.2,
     gps_outage=(4.0, 6.0),
-    vehicle=_tyres(7000.0),
-    nominal=_tyres(10000.0),
+    vehicle=_make_stiffness(7000.0),
+    nominal=_make_stiffness(10000.0),
     **_WIND,
     **_SIMULATED,
 )
@@ -82,7 +82,7 @@ _DAKF_STEP = _DAKF.replace(
     half_width=1e3,  # the small-angle car leaves on a parabola
     gps_outage=None,
     lags=True,
-    vehicle={**_tyres(7000.0), "motor_lag": 0.0, "steering_lag": 0.03},
+    vehicle={**_make_stiffness(7000.0), "motor_lag": 0.0, "steering_lag": 0.03},
 )
 # given: slalom with wind; course alone and with the gyro
 _DUAL = Scenario(
@@ -93,8 +93,8 @@ _DUAL = Scenario(
     amplitude=0.1,
     frequency=0.25,
     gps_period=0.1,
-    vehicle=_tyres(7000.0),
-    nominal=_tyres(9100.0),
+    vehicle=_make_stiffness(7000.0),
+    nominal=_make_stiffness(9100.0),
     **_WIND,
     **_SIMULATED,
 )
@@ -117,15 +117,15 @@ _DOUBLE = Scenario(
     wind_length=6.0,
     surge=0.5,
     surge_frequency=0.1,
-    vehicle=_tyres(7000.0),
-    nominal={**_tyres(10000.0), **_TOO_STIFF},
+    vehicle=_make_stiffness(7000.0),
+    nominal={**_make_stiffness(10000.0), **_TOO_STIFF},
     **(_SIMULATED | {"roll": True}),
 )
 
 SIMULATIONS = (
     _FIG7,
     _FIG8,
-    _FIG8.replace(name="tie-vision-fig8-stiff", vehicle=_tyres(7200.0)),
+    _FIG8.replace(name="tie-vision-fig8-stiff", vehicle=_make_stiffness(7200.0)),
     _UNEVEN,
     _UNEVEN.replace(name="uneven-delay-fig5-noisy", noise={"camera_psi": 0.003, "camera_y": 0.03}),
     _DOUBLE,
@@ -149,7 +149,7 @@ _DRIVER = Scenario(
     speed_change=30.0 * KMH,
     change_start=1.0,
     change_length=20.0,
-    vehicle=_tyres(7200.0),
+    vehicle=_make_stiffness(7200.0),
     **_ON_THE_ROAD,
 )
 # given: a lane change by a steering motor, the slip without control almost 0.03 rad
@@ -160,7 +160,7 @@ _MOTOR = Scenario(
     onset=0.5,
     amplitude=0.108,
     frequency=0.5,
-    vehicle=_tyres(7200.0),
+    vehicle=_make_stiffness(7200.0),
     **_ON_THE_ROAD,
 )
 # given: tyres 7000 against 10000, the roll model 30 % off, course and speed at 5 Hz
@@ -171,8 +171,8 @@ _DOUBLE_ROAD = Scenario(
     onset=1.0,
     amplitude=0.1,
     frequency=0.3,
-    vehicle=_tyres(7000.0),
-    nominal={**_tyres(10000.0), **_TOO_STIFF},
+    vehicle=_make_stiffness(7000.0),
+    nominal={**_make_stiffness(10000.0), **_TOO_STIFF},
     **_ON_THE_ROAD,
 )
 # given: a slalom, RTK-GPS
@@ -184,8 +184,8 @@ _DUAL_ROAD = Scenario(
     amplitude=0.1,
     frequency=0.25,
     gps_period=0.1,
-    vehicle=_tyres(7000.0),
-    nominal=_tyres(9100.0),
+    vehicle=_make_stiffness(7000.0),
+    nominal=_make_stiffness(9100.0),
     **_ON_THE_ROAD,
 )
 # given: a lane change by the driver at 20 km/h, course unused 10.5-13.0 s, tyres 7000 against 10000
@@ -198,8 +198,8 @@ _DAKF_DRIVER = Scenario(
     frequency=0.4,
     speed=20.0 * KMH,
     gps_outage=(10.5, 13.0),
-    vehicle=_tyres(7000.0),
-    nominal=_tyres(10000.0),
+    vehicle=_make_stiffness(7000.0),
+    nominal=_make_stiffness(10000.0),
     **_ON_THE_ROAD,
 )
 # given: cornering by steer-by-wire at 20 km/h, tyres as in Fig. 8

@@ -12,8 +12,8 @@ import numpy as np
 from ..documents import write_document
 from ..quantities import quantity
 from ..record import Array
-from .checks import SIDES, check
-from .draws import DRAWS_WIDTH, KMH, Draws, Range, range_of
+from .checks import SIDES, check_fields
+from .draws import DRAWS_WIDTH, KMH, Draws, Range, get_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +78,7 @@ class Scenario:
     >>> Scenario(name="mine", steering="step", amplitude=(0.02, 0.05)).range("amplitude")
     (0.02, 0.05)
 
-    See also `scenario_from`, which takes a mapping over a named scenario.
+    See also `make_scenario`, which takes a mapping over a named scenario.
     """
 
     name: str
@@ -162,13 +162,13 @@ class Scenario:
             value = getattr(self, entry.name)
             if isinstance(value, list):
                 object.__setattr__(self, entry.name, tuple(value))
-        check(vars(self), dataclasses.fields(self))
+        check_fields(vars(self), dataclasses.fields(self))
 
     def range(self, name: str) -> tuple[float, float]:
         """(low, high) of a drawn quantity; zeros where it is None."""
-        return range_of(getattr(self, name))
+        return get_range(getattr(self, name))
 
-    def draws(self) -> tuple[Array, Array]:
+    def get_draw_ranges(self) -> tuple[Array, Array]:
         """(low, high) of every quantity of `Draws`, each (len(Draws),)."""
         low, high = np.empty(DRAWS_WIDTH), np.empty(DRAWS_WIDTH)
         for i, name in enumerate(Draws._fields):
@@ -182,20 +182,20 @@ class Scenario:
     def held_speed(self) -> float | None:
         """The speed in m/s where it is one number and held exactly, else None."""
         low, high = self.range("speed")
-        moved = self.speed_change or self.surge or self.grade or self.roll
-        fixed = low == high and self.acceleration is None and self.small_angle and not moved
-        return low if fixed else None
+        varies = self.speed_change or self.surge or self.grade or self.roll
+        is_fixed = low == high and self.acceleration is None and self.small_angle and not varies
+        return low if is_fixed else None
 
     def replace(self, **changes: Any) -> "Scenario":
         """A copy with some fields changed; TypeError on an unknown field."""
         return dataclasses.replace(self, **changes)
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write a TOML or JSON file, by its ending, that `scenario_from` reads back."""
+        """Write a TOML or JSON file, by its ending, that `make_scenario` reads back."""
         write_document(path, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON types only, defaults left out; `scenario_from` reads it back."""
+        """JSON types only, defaults left out; `make_scenario` reads it back."""
         values = {}
         for entry in dataclasses.fields(self):
             value = getattr(self, entry.name)

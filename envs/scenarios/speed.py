@@ -2,13 +2,13 @@
 
 from typing import Any, NamedTuple
 
-from ..backend.decorators import inlined
+from ..backend.decorators import inline
 from ..backend.elementary import sincos
-from ..backend.primitives import anywhere, maximum, minimum, select
+from ..backend.primitives import any_lane, maximum, minimum, select
 from ..ticks import TICK
 
 
-class Pace(NamedTuple):
+class SpeedProfile(NamedTuple):
     """The driver's longitudinal work: a speed held or followed by PI, or an acceleration."""
 
     speed: Any  # m/s, at the start and to hold
@@ -22,30 +22,32 @@ class Pace(NamedTuple):
     surge_rate: Any = 1.0  # rad/s
 
 
-@inlined
-def wanted_motion(tick: Any, pace: Any) -> Any:
+@inline
+def compute_speed_reference(tick: Any, profile: Any) -> Any:
     """(speed in m/s, acceleration in m/s2) that the driver wants at a tick."""
-    ahead = select((tick >= pace.start) & (tick < pace.end), pace.acceleration, 0.0)
-    since = (minimum(maximum(tick, pace.start), pace.end) - pace.start) * TICK
-    speed = pace.speed + pace.acceleration * since
-    if anywhere(pace.surge != 0.0):
-        s, c = sincos(pace.surge_rate * (tick * TICK))
-        ahead = ahead + pace.surge * s
-        speed = speed + pace.surge / pace.surge_rate * (1.0 - c)
-    return speed, ahead
+    acceleration = select((tick >= profile.start) & (tick < profile.end), profile.acceleration, 0.0)
+    elapsed = (minimum(maximum(tick, profile.start), profile.end) - profile.start) * TICK
+    speed = profile.speed + profile.acceleration * elapsed
+    if any_lane(profile.surge != 0.0):
+        s, c = sincos(profile.surge_rate * (tick * TICK))
+        acceleration = acceleration + profile.surge * s
+        speed = speed + profile.surge / profile.surge_rate * (1.0 - c)
+    return speed, acceleration
 
 
-@inlined
-def acceleration_command(tick: Any, v_x: Any, integral: Any, pace: Any, limit: Any) -> Any:
+@inline
+def compute_acceleration_command(
+    tick: Any, v_x: Any, integral: Any, profile: Any, limit: Any
+) -> Any:
     """(a_x command in m/s2, next integral): PI on the speed with the integral held at the limit.
 
-    The wanted speed starts at `pace.speed` and is the integral of the wanted acceleration, which
+    The wanted speed starts at `profile.speed` and is the integral of the wanted acceleration, which
     is fed forward.
     """
-    speed, ahead = wanted_motion(tick, pace)
+    speed, feedforward = compute_speed_reference(tick, profile)
     error = speed - v_x
-    wanted = pace.k_p * error + integral + pace.hold * ahead
-    held = minimum(maximum(wanted, 0.0 - limit), limit)
-    grown = integral + pace.k_i * error * TICK
-    integral = select(wanted == held, grown, integral)
-    return pace.hold * held + (1.0 - pace.hold) * ahead, integral
+    command = profile.k_p * error + integral + profile.hold * feedforward
+    limited = minimum(maximum(command, 0.0 - limit), limit)
+    next_integral = integral + profile.k_i * error * TICK
+    integral = select(command == limited, next_integral, integral)
+    return profile.hold * limited + (1.0 - profile.hold) * feedforward, integral

@@ -94,65 +94,66 @@ _ISO_3888_1: dict[str, Any] = {
 }
 
 
-def random_of(low: float, high: float) -> dict[str, Any]:
+def make_random_steering(low: float, high: float) -> dict[str, Any]:
     """A random steering whose pairs of sines have amplitudes (rad) within this range."""
     return RANDOM | {"amplitude": (low, high), "amplitude_2": (low, high)}
 
 
-def _turn(shape: dict[str, Any], low: float, high: float) -> dict[str, Any]:
+def _set_amplitude(shape: dict[str, Any], low: float, high: float) -> dict[str, Any]:
     return shape | {"amplitude": (low, high)}
 
 
-def _scenarios(tier: str, common: dict[str, Any], **shapes: dict[str, Any]) -> list[Scenario]:
+def _make_scenarios(tier: str, common: dict[str, Any], **shapes: dict[str, Any]) -> list[Scenario]:
     """The scenarios of a tier by their names, written with underscores; where no driver keeps to a
     track, the road follows the nominal car, so that the camera has a lane to see."""
-    found = []
+    scenarios = []
     for name, shape in shapes.items():
         road = "straight" if shape["steering"] == "driver" else "nominal-path"
         fields: dict[str, Any] = {"road": road} | common | shape
-        found.append(Scenario(name=name.replace("_", "-"), tier=tier, **fields))
-    return found
+        scenarios.append(Scenario(name=name.replace("_", "-"), tier=tier, **fields))
+    return scenarios
 
 
 # "gentle" and the step: what one yaw moment can hold at zero slip
-_ONE = _scenarios(
+_ONE = _make_scenarios(
     "1",
     _COMS,
-    coms_random=random_of(0.005, 0.015),
+    coms_random=make_random_steering(0.005, 0.015),
     coms_double_lane_change=DOUBLE_LANE_CHANGE,
-    coms_slalom=_turn(SLALOM, 0.04, 0.1),
-    coms_sine_with_dwell=_turn(SINE_WITH_DWELL, 0.05, 0.12),
-    coms_brake_in_turn=_turn(BRAKE_IN_TURN, 0.04, 0.1),
-    coms_gentle_slalom=_turn(SLALOM, 0.02, 0.05),
-    coms_step=_turn(STEP, 0.015, 0.05),
+    coms_slalom=_set_amplitude(SLALOM, 0.04, 0.1),
+    coms_sine_with_dwell=_set_amplitude(SINE_WITH_DWELL, 0.05, 0.12),
+    coms_brake_in_turn=_set_amplitude(BRAKE_IN_TURN, 0.04, 0.1),
+    coms_gentle_slalom=_set_amplitude(SLALOM, 0.02, 0.05),
+    coms_step=_set_amplitude(STEP, 0.015, 0.05),
 )
-_TWO_A = _scenarios(
+_TWO_A = _make_scenarios(
     "2a",
     _CAR | {"friction": (0.9, 1.0)},
-    car_random=random_of(0.002, 0.006),
-    car_slalom=_turn(SLALOM, 0.01, 0.025),
-    car_step=_turn(STEP, 0.008, 0.025),
-    car_sine_with_dwell=_turn(SINE_WITH_DWELL, 0.01, 0.03),
+    car_random=make_random_steering(0.002, 0.006),
+    car_slalom=_set_amplitude(SLALOM, 0.01, 0.025),
+    car_step=_set_amplitude(STEP, 0.008, 0.025),
+    car_sine_with_dwell=_set_amplitude(SINE_WITH_DWELL, 0.01, 0.03),
     car_iso_3888_1=_ISO_3888_1 | {"path_speed": (60.0 * KMH, 80.0 * KMH)},
 )
 # the nominal friction is the middle of what may come, as a designer would take it
-_TWO_B = _scenarios(
+_TWO_B = _make_scenarios(
     "2b",
     _CAR | {"friction": (0.3, 1.0), "nominal": _CAR_PLANT | {"friction": 0.65}},
-    any_friction_random=random_of(0.002, 0.006),
-    any_friction_slalom=_turn(SLALOM, 0.01, 0.025),
-    any_friction_step=_turn(STEP, 0.008, 0.025),
-    any_friction_sine_with_dwell=_turn(SINE_WITH_DWELL, 0.01, 0.03),
+    any_friction_random=make_random_steering(0.002, 0.006),
+    any_friction_slalom=_set_amplitude(SLALOM, 0.01, 0.025),
+    any_friction_step=_set_amplitude(STEP, 0.008, 0.025),
+    any_friction_sine_with_dwell=_set_amplitude(SINE_WITH_DWELL, 0.01, 0.03),
     # sections as long as they are for 35 to 50 km/h: at 80 friction 0.3 holds nobody on the track
     any_friction_iso_3888_1=_ISO_3888_1 | {"path_speed": (35.0 * KMH, 50.0 * KMH)},
 )
-_TWO_C = _scenarios(
+_TWO_C = _make_scenarios(
     "2c",
     _CAR | {"friction": (0.6, 1.0), "nominal": _CAR_PLANT | {"friction": 0.8}},
-    limit_slalom=_turn(SLALOM, 0.02, 0.06) | {"speed": (75.0 * KMH, 85.0 * KMH)},
-    limit_sine_with_dwell=_turn(SINE_WITH_DWELL, 0.03, 0.08) | {"speed": (75.0 * KMH, 85.0 * KMH)},
-    limit_step=_turn(STEP, 0.02, 0.06),
-    limit_random=random_of(0.01, 0.03) | {"speed": (55.0 * KMH, 65.0 * KMH)},
+    limit_slalom=_set_amplitude(SLALOM, 0.02, 0.06) | {"speed": (75.0 * KMH, 85.0 * KMH)},
+    limit_sine_with_dwell=_set_amplitude(SINE_WITH_DWELL, 0.03, 0.08)
+    | {"speed": (75.0 * KMH, 85.0 * KMH)},
+    limit_step=_set_amplitude(STEP, 0.02, 0.06),
+    limit_random=make_random_steering(0.01, 0.03) | {"speed": (55.0 * KMH, 65.0 * KMH)},
 )
 
 # Not scored, but mapped over where it starts: nobody steers, the car is caught or lost.

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from ..recordings.columns import read_quantities
-from ..recordings.log_file import clock_of
+from ..recordings.log_file import find_clock
 from .scenario import Scenario
 
-TABLES = (".csv", ".parquet")
+TABLE_SUFFIXES = (".csv", ".parquet")
 
 
-def trace_from(path: str | os.PathLike[str], mapping: Mapping[str, str] | None = None) -> Scenario:
+def read_trace(path: str | os.PathLike[str], mapping: Mapping[str, str] | None = None) -> Scenario:
     """A scenario that steers as a recorded drive, at its first speed, as long as it lasts.
 
     path: CSV or Parquet (needs the extra `report`) with the columns of `COLUMNS` for time and
@@ -27,17 +27,19 @@ def trace_from(path: str | os.PathLike[str], mapping: Mapping[str, str] | None =
     source = Path(path)
     values, _ = read_quantities(source, mapping or {}, ("time", "steer"), {"speed_x"})
     try:
-        _, step = clock_of(values["time"])
+        _, step = find_clock(values["time"])
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
     speed = values.get("speed_x", np.zeros(0))
-    known = speed[np.isfinite(speed)]
+    known_speed = speed[np.isfinite(speed)]
     trace = tuple(values["steer"].tolist())
-    made = Scenario(
+    scenario = Scenario(
         name=source.stem,
         steering="trace",
         trace=trace,
         trace_step=step,
         duration=round((len(trace) - 1) * step, 9),
     )
-    return made.replace(speed=max(float(known[0]), 0.0)) if len(known) else made  # noise at rest
+    return (
+        scenario.replace(speed=max(float(known_speed[0]), 0.0)) if len(known_speed) else scenario
+    )  # noise at rest

@@ -17,7 +17,9 @@ from typing import Any, NamedTuple
 from ..backend.decorators import jit
 from ..backend.elementary import smoothstep
 
-LEAD = 0.15  # of a gap's length: how far the path's transition reaches into the lanes beside it
+TRANSITION_OVERLAP = (
+    0.15  # of a gap's length: how far the path's transition reaches into the lanes beside it
+)
 
 
 class Section(NamedTuple):
@@ -29,7 +31,7 @@ class Section(NamedTuple):
     offset: float  # m, its centre line to the left of the road's
 
 
-class Path(NamedTuple):
+class TrackPath(NamedTuple):
     """A lateral offset from the road's centre line: two smooth transitions."""
 
     shift_1: Any  # m, to the left
@@ -40,7 +42,7 @@ class Path(NamedTuple):
     length_2: Any
 
 
-def _iso_3888_1(width: float) -> tuple[Section, ...]:
+def _make_iso_3888_1(width: float) -> tuple[Section, ...]:
     first, side, last = 1.1 * width + 0.25, 1.2 * width + 0.25, 1.3 * width + 0.25
     return (
         Section(0.0, 15.0, first, 0.0),
@@ -49,7 +51,7 @@ def _iso_3888_1(width: float) -> tuple[Section, ...]:
     )
 
 
-def _iso_3888_2(width: float) -> tuple[Section, ...]:
+def _make_iso_3888_2(width: float) -> tuple[Section, ...]:
     first, side, last = 1.1 * width + 0.25, width + 1.0, max(1.3 * width + 0.25, 3.0)
     return (
         Section(0.0, 12.0, first, 0.0),
@@ -59,13 +61,13 @@ def _iso_3888_2(width: float) -> tuple[Section, ...]:
 
 
 _TRACKS: dict[str, Callable[[float], tuple[Section, ...]]] = {
-    "iso-3888-1": _iso_3888_1,
-    "iso-3888-2": _iso_3888_2,
+    "iso-3888-1": _make_iso_3888_1,
+    "iso-3888-2": _make_iso_3888_2,
 }
 PATHS = ("road", *_TRACKS)
 
 
-def sections(
+def make_sections(
     track: str, width: float, start: float = 0.0, scale: float = 1.0, side: float = 1.0
 ) -> tuple[Section, ...]:
     """The lanes of a track for a vehicle's width in m, in the order of driving.
@@ -77,30 +79,39 @@ def sections(
         raise ValueError(f"unknown track {track!r}; known: {', '.join(PATHS)}")
     lanes = _TRACKS[track](width) if track in _TRACKS else ()
     return tuple(
-        Section(start + scale * each.start, scale * each.length, each.width, side * each.offset)
-        for each in lanes
+        Section(
+            start + scale * section.start,
+            scale * section.length,
+            section.width,
+            side * section.offset,
+        )
+        for section in lanes
     )
 
 
-def path_of(track: str, width: float) -> Path:
+def make_path(track: str, width: float) -> TrackPath:
     """The path through a track that begins at 0, in the standard's lengths.
 
-    It keeps to the centre of a lane but turns a little before its end and has not quite turned
-    back at its beginning (`LEAD`), as far as the sides of the car stay between the cones.
+    It keeps to the centre of a lane but turns a little before its end and has not quite turned back
+    at its beginning (`TRANSITION_OVERLAP`), as far as the sides of the car stay between the cones.
     """
     shifts = []
-    lanes = sections(track, width)
+    lanes = make_sections(track, width)
     for before, after in pairwise(lanes):
-        left = before.start + before.length
-        gap = after.start - left
-        shifts += [after.offset - before.offset, left - LEAD * gap, (1.0 + 2.0 * LEAD) * gap]
-    return Path(*(shifts or (0.0, 0.0, 1.0, 0.0, 0.0, 1.0)))
+        lane_end = before.start + before.length
+        gap = after.start - lane_end
+        shifts += [
+            after.offset - before.offset,
+            lane_end - TRANSITION_OVERLAP * gap,
+            (1.0 + 2.0 * TRANSITION_OVERLAP) * gap,
+        ]
+    return TrackPath(*(shifts or (0.0, 0.0, 1.0, 0.0, 0.0, 1.0)))
 
 
 @jit
-def laid(path: Any, start: Any, scale: Any, side: Any) -> Any:
+def transform_path(path: Any, start: Any, scale: Any, side: Any) -> Any:
     """The path of a track that begins at `start` m, its lengths scaled, mirrored by side -1."""
-    return Path(
+    return TrackPath(
         side * path.shift_1,
         start + scale * path.start_1,
         scale * path.length_1,
@@ -111,7 +122,7 @@ def laid(path: Any, start: Any, scale: Any, side: Any) -> Any:
 
 
 @jit
-def path_offset(path: Any, s: Any) -> Any:
+def compute_path_offset(path: Any, s: Any) -> Any:
     """The path's lateral offset in m at the distance s; its slope is continuous."""
     first = path.shift_1 * smoothstep((s - path.start_1) / path.length_1)
     return first + path.shift_2 * smoothstep((s - path.start_2) / path.length_2)

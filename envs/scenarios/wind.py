@@ -17,7 +17,7 @@ class Wind(NamedTuple):
 
 
 @jit
-def wind_at(tick: Any, wind: Any) -> Any:
+def compute_wind(tick: Any, wind: Any) -> Any:
     """(force in N, yaw moment, roll moment in N m) of the wind from this tick to the next."""
     force = select((tick >= wind.start) & (tick < wind.end), wind.force, 0.0)
     return force, force * wind.arm, 0.0 - force * wind.height

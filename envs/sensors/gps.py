@@ -6,19 +6,19 @@ from ..backend.decorators import jit
 from ..backend.elementary import PI, sincos, wrap
 from ..backend.primitives import floor, maximum, minimum, select, sqrt
 from ..backend.random import CHANNELS
-from ..vehicle.dynamics import sideslip_angle
-from ..vehicle.tyres import SLOW
-from .kind import Blocks, SlowKind, Value
+from ..vehicle.dynamics import compute_sideslip_angle
+from ..vehicle.tyres import MIN_SPEED
+from .kind import Blocks, PacketValue, SlowKind
 
 GPS_KIND = SlowKind(
     "gps",
     (
-        Value("course", "rad", PI),
-        Value("speed", "m/s", 100.0),
-        Value("X", "m", 1e5),
-        Value("Y", "m", 1e5),
-        Value("hdop", "-", 100.0),
-        Value("satellites", "-", 50.0),
+        PacketValue("course", "rad", PI),
+        PacketValue("speed", "m/s", 100.0),
+        PacketValue("X", "m", 1e5),
+        PacketValue("Y", "m", 1e5),
+        PacketValue("hdop", "-", 100.0),
+        PacketValue("satellites", "-", 50.0),
     ),
     Blocks(noise=CHANNELS.gps, link=CHANNELS.gps_link, drift=CHANNELS.sky),
 )
@@ -29,51 +29,58 @@ those of `Noise`, which are those at HDOP 1."""
 OUTAGE_JUMP = 3.0  # of the spread of log HDOP, upwards where an outage ends
 
 
-class Sky(NamedTuple):
+class SatelliteGeometry(NamedTuple):
     """The satellites over the GPS: log HDOP is an Ornstein-Uhlenbeck process."""
 
     median: Any  # log of the median HDOP
     spread: Any  # standard deviation of log HDOP
-    keep: Any  # what is left of a deviation after one period of the GPS
-    fresh: Any  # sqrt(1 - keep^2)
+    decay: Any  # what is left of a deviation after one period of the GPS
+    noise_gain: Any  # sqrt(1 - keep^2)
     weight: Any  # of HDOP in the noise, HDOP_LAWS
 
 
 @jit
-def sky_deviation(before: Any, sky: Any, link: Any, tick: Any, n: Any) -> Any:
+def compute_hdop_deviation(before: Any, sky: Any, link: Any, tick: Any, n: Any) -> Any:
     """The deviation of log HDOP at a capture, from that at the one before."""
-    back = (link.outage_end > link.outage_start) & (tick >= link.outage_end)
-    back = back & (tick - link.period < link.outage_end)
-    jump = select(back, OUTAGE_JUMP * sky.spread, 0.0)
-    return sky.keep * before + sky.fresh * sky.spread * n[0] + jump
+    is_after_outage = (link.outage_end > link.outage_start) & (tick >= link.outage_end)
+    is_after_outage = is_after_outage & (tick - link.period < link.outage_end)
+    jump = select(is_after_outage, OUTAGE_JUMP * sky.spread, 0.0)
+    return sky.decay * before + sky.noise_gain * sky.spread * n[0] + jump
 
 
 @jit
-def satellites_at(hdop: Any) -> Any:
+def count_satellites(hdop: Any) -> Any:
     """How many satellites a receiver sees at an HDOP: 12 at 1, 4 up to 5, fewer above."""
     return floor(2.0 + minimum(10.0 / hdop, 28.0))
 
 
 @jit
-def gps_sample(
-    motion: Any, ahead: Any, left: Any, hdop: Any, weight: Any, noise: Any, n: Any, small_angle: int
+def sample_gps(
+    motion: Any,
+    forward: Any,
+    left: Any,
+    hdop: Any,
+    weight: Any,
+    noise: Any,
+    n: Any,
+    small_angle: int,
 ) -> Any:
     """(course, speed, X, Y, hdop, satellites, quality) of an antenna at (ahead, left).
 
     course = psi + beta, dakf-stability (3), where beta, as all else, is the antenna's.
     """
-    v_x, v_y = motion.v_x - motion.gamma * left, motion.v_y + motion.gamma * ahead
+    v_x, v_y = motion.v_x - motion.gamma * left, motion.v_y + motion.gamma * forward
     s, c = sincos(motion.psi)
-    size = 1.0 + weight * (hdop - 1.0)
+    noise_scale = 1.0 + weight * (hdop - 1.0)
     v = sqrt(v_x * v_x + v_y * v_y)
-    angle = motion.psi + sideslip_angle(v_x, v_y, small_angle)
-    course = wrap(angle + noise.course * size / maximum(v, SLOW) * n[0])
+    angle = motion.psi + compute_sideslip_angle(v_x, v_y, small_angle)
+    course = wrap(angle + noise.course * noise_scale / maximum(v, MIN_SPEED) * n[0])
     return (
         course,
-        v + noise.gps_speed * size * n[1],
-        motion.X + (ahead * c - left * s) + noise.gps_position * size * n[2],
-        motion.Y + (ahead * s + left * c) + noise.gps_position * size * n[3],
+        v + noise.gps_speed * noise_scale * n[1],
+        motion.X + (forward * c - left * s) + noise.gps_position * noise_scale * n[2],
+        motion.Y + (forward * s + left * c) + noise.gps_position * noise_scale * n[3],
         hdop,
-        satellites_at(hdop),
+        count_satellites(hdop),
         select(v < COURSE_SPEED, 0.0, 1.0),
     )

@@ -2,22 +2,22 @@
 
 from typing import Any, NamedTuple
 
-from ..backend.decorators import inlined
-from ..backend.primitives import anywhere, select
+from ..backend.decorators import inline
+from ..backend.primitives import any_lane, select
 from ..ticks import TICK
-from ..vehicle.dynamics import gravity_at
+from ..vehicle.dynamics import compute_gravity
 from ..vehicle.vehicle import GRAVITY
 
 
-class Chance(NamedTuple):
+class NormalDraws(NamedTuple):
     """The random numbers of a tick, four standard normal ones each."""
 
     inertial: Any
     wheels: Any
 
 
-@inlined
-def specific_force(before: Any, after: Any, road: Any, small_angle: int, roll: int) -> Any:
+@inline
+def compute_specific_force(before: Any, after: Any, road: Any, small_angle: int, roll: int) -> Any:
     """(a_x, a_y) in m/s2, mean over a tick between two Motions: v', turning axes, gravity."""
     turn_x = 0.5 * (before.gamma * before.v_y + after.gamma * after.v_y)
     turn_y = 0.5 * (before.gamma * before.v_x + after.gamma * after.v_x)
@@ -26,20 +26,22 @@ def specific_force(before: Any, after: Any, road: Any, small_angle: int, roll: i
     a_y = (after.v_y - before.v_y) * (1.0 / TICK) + turn_y
     if roll:
         a_y = a_y + 0.5 * GRAVITY * (before.phi + after.phi)  # double-layer-gps (5)
-    if anywhere((road.along != 0.0) | (road.across != 0.0)):
-        first = gravity_at(before, road, small_angle)
-        last = gravity_at(after, road, small_angle)
+    if any_lane((road.longitudinal != 0.0) | (road.lateral != 0.0)):
+        first = compute_gravity(before, road, small_angle)
+        last = compute_gravity(after, road, small_angle)
         a_x, a_y = a_x + 0.5 * (first[0] + last[0]), a_y + 0.5 * (first[1] + last[1])
     return a_x, a_y
 
 
-@inlined
-def fast_row(motion: Any, accel: Any, acted: Any, d_f: Any, noise: Any, chance: Any) -> Any:
+@inline
+def compute_fast_row(
+    motion: Any, accel: Any, applied: Any, d_f: Any, noise: Any, draws: Any
+) -> Any:
     """The fast sensors at a tick, columns as in `Fast`.
 
     accel: (a_x, a_y) specific forces. acted: what acted, in the order of `Fast` from `steer` on.
     """
-    n, wheels = chance.inertial, chance.wheels
+    n, wheels = draws.inertial, draws.wheels
     half = 0.5 * d_f * motion.gamma
     return (
         motion.gamma + noise.gyro_bias + noise.gyro * n[0],
@@ -48,10 +50,10 @@ def fast_row(motion: Any, accel: Any, acted: Any, d_f: Any, noise: Any, chance: 
         motion.phi_dot + noise.roll_rate * n[3],
         motion.v_x - half + noise.wheel * wheels[0],
         motion.v_x + half + noise.wheel * wheels[1],
-        acted[0],
-        acted[1],
-        acted[2],
-        acted[3],
-        acted[4],
-        acted[5],
+        applied[0],
+        applied[1],
+        applied[2],
+        applied[3],
+        applied[4],
+        applied[5],
     )

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 
-class Value(NamedTuple):
+class PacketValue(NamedTuple):
     """One value of a slow sensor's packet."""
 
     name: str
@@ -23,6 +23,8 @@ class SlowKind(NamedTuple):
     """A row of the table of slow sensors, `slow.SLOW`."""
 
     name: str
-    values: tuple[Value, ...]
+    values: tuple[PacketValue, ...]
     blocks: Blocks | None = None  # None: of the sensor's place in the table
-    sees: bool = False  # at quality 0 it saw nothing: the observation holds the sample before
+    needs_quality: bool = (
+        False  # at quality 0 it saw nothing: the observation holds the sample before
+    )

@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from ..arguments import brief, is_finite
+from ..arguments import is_finite, short_repr
 from ..backend.decorators import jit
-from ..backend.primitives import anywhere, floor, select, whole
-from ..backend.random import CHANNELS, uniforms
-from ..ticks import NEVER, TICK, ticks
+from ..backend.primitives import any_lane, floor, select, to_int
+from ..backend.random import CHANNELS, draw_uniforms
+from ..ticks import NEVER, TICK, count_ticks
 
-IN_FLIGHT = 8  # packets of one sensor under way at once, duplicates included
+MAX_IN_FLIGHT = 8  # packets of one sensor under way at once, duplicates included
 
 
 @dataclass(frozen=True)
@@ -31,23 +31,23 @@ class SlowSensor:
 
     def __post_init__(self) -> None:
         if not isinstance(self.delays, list | tuple):
-            raise TypeError(f"a slow sensor's delays are a list, got {brief(self.delays)}")
+            raise TypeError(f"a slow sensor's delays are a list, got {short_repr(self.delays)}")
         if not (is_finite(self.period) and self.period >= TICK):
-            got = brief(self.period)
+            got = short_repr(self.period)
             raise ValueError(f"a slow sensor's period must be at least one tick, got {got}")
         if not 1 <= len(self.delays) <= 4:
-            raise ValueError(f"expected one to four delays, got {brief(self.delays)}")
+            raise ValueError(f"expected one to four delays, got {short_repr(self.delays)}")
         times = (*self.delays, self.jitter, 0.0 if self.phase is None else self.phase)
         if not all(is_finite(time) and time >= 0.0 for time in times):
             raise ValueError(
                 "a slow sensor's delays, jitter and phase must be finite and not negative, "
-                f"got {brief(times)}"
+                f"got {short_repr(times)}"
             )
         object.__setattr__(self, "delays", tuple(float(d) for d in self.delays))
         for name in ("loss", "duplicate"):
             value = getattr(self, name)
             if not (is_finite(value) and 0.0 <= value <= 1.0):
-                raise ValueError(f"{name} is a probability, got {brief(value)}")
+                raise ValueError(f"{name} is a probability, got {short_repr(value)}")
 
     @property
     def longest_delay(self) -> float:
@@ -60,7 +60,7 @@ class Link(NamedTuple):
 
     period: Any
     phase: Any  # -1: drawn at reset
-    patterns: Any  # how many of the four delays repeat
+    n_delays: Any  # how many of the four delays repeat
     delay_0: Any
     delay_1: Any
     delay_2: Any
@@ -72,69 +72,78 @@ class Link(NamedTuple):
     outage_end: Any
 
 
-def link_of(sensor: SlowSensor | None, outage: tuple[float, float] | None = None) -> Link:
+def make_link(sensor: SlowSensor | None, outage: tuple[float, float] | None = None) -> Link:
     """A Link from the public description; None: an absent sensor.
 
     Raises ValueError where more packets could be under way at once than the queue holds.
     """
     if sensor is None:
         return Link._make([0.0] * len(Link._fields))
-    delays = [ticks(delay) for delay in sensor.delays]
+    delays = [count_ticks(delay) for delay in sensor.delays]
     start, end = outage if outage is not None else (0.0, 0.0)
     d_0, d_1, d_2, d_3 = delays + [0.0] * (4 - len(delays))
     link = Link(
-        ticks(sensor.period),
-        -1.0 if sensor.phase is None else ticks(sensor.phase),
+        count_ticks(sensor.period),
+        -1.0 if sensor.phase is None else count_ticks(sensor.phase),
         float(len(delays)),
         d_0,
         d_1,
         d_2,
         d_3,
-        ticks(sensor.jitter),
+        count_ticks(sensor.jitter),
         sensor.loss,
         sensor.duplicate,
-        ticks(start),
-        ticks(end),
+        count_ticks(start),
+        count_ticks(end),
     )
-    most = most_under_way(link)
-    if most > IN_FLIGHT:
+    max_in_flight = count_max_in_flight(link)
+    if max_in_flight > MAX_IN_FLIGHT:
         raise ValueError(
             f"a period of {sensor.period} s with delays up to {sensor.longest_delay:g} s puts "
-            f"{most} packets under way at once; there is room for {IN_FLIGHT}"
+            f"{max_in_flight} packets under way at once; there is room for {MAX_IN_FLIGHT}"
         )
     return link
 
 
-def most_under_way(link: Link) -> int:
+def count_max_in_flight(link: Link) -> int:
     """How many packets of a sensor that is there are under way at once, duplicates included."""
     longest = max(link.delay_0, link.delay_1, link.delay_2, link.delay_3) + link.jitter
-    most = int(longest // link.period) + 1
-    return 2 * (most + 1) if link.duplicate > 0.0 else most
+    max_in_flight = int(longest // link.period) + 1
+    return 2 * (max_in_flight + 1) if link.duplicate > 0.0 else max_in_flight
 
 
 @jit
-def arrivals(link: Any, frame: Any, tick: Any, key_low: int, key_high: int, block: int) -> Any:
+def compute_arrivals(
+    link: Any, frame: Any, tick: Any, key_low: int, key_high: int, block: int
+) -> Any:
     """(first, second) arrival tick of the frame captured at `tick`; NEVER where there is none.
 
     Loss, outage, duplication, latency and jitter are this one function.
     """
-    late, lost, twice, again = 0.0, 0.0, 0.0, 0.0  # what a link without chance makes nothing of
-    if anywhere((link.jitter > 0.0) | (link.loss > 0.0) | (link.duplicate > 0.0)):
-        late, lost, twice, again = uniforms(key_low, key_high, whole(tick), block)
-    which = frame - link.patterns * floor(frame / link.patterns)
-    delay = select(which == 1.0, link.delay_1, link.delay_0)
-    delay = select(which == 2.0, link.delay_2, delay)
-    delay = select(which == 3.0, link.delay_3, delay)
-    first = tick + delay + floor(late * (link.jitter + 1.0))
-    out = (tick >= link.outage_start) & (tick < link.outage_end)
-    gone = out | (lost < link.loss)
-    second = first + 1.0 + floor(again * link.period)
-    first = select(gone, NEVER, first)
-    return first, select(gone | (twice >= link.duplicate), NEVER, second)
+    jitter_share, loss_share, duplicate_share, second_share = (
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    )  # what a link without chance makes nothing of
+    if any_lane((link.jitter > 0.0) | (link.loss > 0.0) | (link.duplicate > 0.0)):
+        jitter_share, loss_share, duplicate_share, second_share = draw_uniforms(
+            key_low, key_high, to_int(tick), block
+        )
+    delay_index = frame - link.n_delays * floor(frame / link.n_delays)
+    delay = select(delay_index == 1.0, link.delay_1, link.delay_0)
+    delay = select(delay_index == 2.0, link.delay_2, delay)
+    delay = select(delay_index == 3.0, link.delay_3, delay)
+    first = tick + delay + floor(jitter_share * (link.jitter + 1.0))
+    is_outage = (tick >= link.outage_start) & (tick < link.outage_end)
+    is_lost = is_outage | (loss_share < link.loss)
+    second = first + 1.0 + floor(second_share * link.period)
+    first = select(is_lost, NEVER, first)
+    return first, select(is_lost | (duplicate_share >= link.duplicate), NEVER, second)
 
 
 @jit
-def clock_phase(link: Any, key_low: int, key_high: int, which: int) -> Any:
+def draw_clock_phase(link: Any, key_low: int, key_high: int, sensor: int) -> Any:
     """The tick of the first capture: its phase, or drawn where that is -1."""
-    u = uniforms(key_low, key_high, 0, CHANNELS.initial, 1 + which)
+    u = draw_uniforms(key_low, key_high, 0, CHANNELS.initial, 1 + sensor)
     return select(link.phase < 0.0, floor(u[0] * link.period), link.phase)

@@ -8,13 +8,13 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from ..arguments import mapping_of, unknown_names
+from ..arguments import check_mapping, describe_unknown
 from ..backend.decorators import jit
 from ..backend.elementary import exp
-from ..backend.primitives import whole
-from ..backend.random import normals
-from .camera import CAMERA_KIND, camera_sample, lane_in_view
-from .gps import GPS_KIND, gps_sample, sky_deviation
+from ..backend.primitives import to_int
+from ..backend.random import draw_normals
+from .camera import CAMERA_KIND, compute_lane_quality, sample_camera
+from .gps import GPS_KIND, compute_hdop_deviation, sample_gps
 from .kind import Blocks
 from .link import SlowSensor
 
@@ -22,22 +22,22 @@ SLOW = (CAMERA_KIND, GPS_KIND)
 CAMERA, GPS = range(len(SLOW))
 SLOW_NAMES = tuple(kind.name for kind in SLOW)
 WIDTHS = tuple(len(kind.values) for kind in SLOW)  # values of each one's packets
-SEES = tuple(kind.sees for kind in SLOW)
+NEEDS_QUALITY = tuple(kind.needs_quality for kind in SLOW)
 VALUES = max(WIDTHS)  # of any packet; those of a sensor with fewer are filled up with zeros
 
-_FIRST_BLOCK, _BLOCKS_EACH = 1000, 10  # of random numbers, clear of `backend.random.CHANNELS`
+_FIRST_BLOCK, _BLOCKS_PER_SENSOR = 1000, 10  # of random numbers, clear of `backend.random.CHANNELS`
 
 
-def blocks_at(place: int) -> Blocks:
+def make_blocks(place: int) -> Blocks:
     """The random numbers of the sensor at a place of the table, where it names none itself."""
-    first = _FIRST_BLOCK + _BLOCKS_EACH * place
+    first = _FIRST_BLOCK + _BLOCKS_PER_SENSOR * place
     return Blocks(noise=first, link=first + 1, drift=first + 2)
 
 
-BLOCKS = tuple(kind.blocks or blocks_at(place) for place, kind in enumerate(SLOW))
+BLOCKS = tuple(kind.blocks or make_blocks(place) for place, kind in enumerate(SLOW))
 
 
-class Scene(NamedTuple):
+class MeasurementContext(NamedTuple):
     """The truth at a tick, and the noise and random numbers to measure it with."""
 
     motion: Any
@@ -45,7 +45,7 @@ class Scene(NamedTuple):
     car: Any
     noise: Any
     sky: Any  # the satellites
-    sight: Any  # the camera's View
+    field_of_view: Any  # the camera's View
     small_angle: int
     key_low: Any
     key_high: Any
@@ -61,29 +61,36 @@ class Sample(NamedTuple):
 
 
 @jit
-def sample(sensor: int, scene: Scene, link: Any, drift: Any) -> Sample:
+def sample_sensor(sensor: int, context: MeasurementContext, link: Any, drift: Any) -> Sample:
     """A sample of a slow sensor, from its clock and link and the drift of the sample before."""
-    blocks, when = BLOCKS[sensor], whole(scene.tick)
-    n = normals(scene.key_low, scene.key_high, when, blocks.noise)
+    blocks, tick = BLOCKS[sensor], to_int(context.tick)
+    n = draw_normals(context.key_low, context.key_high, tick, blocks.noise)
     if sensor == CAMERA:
-        psi, y_l = camera_sample(scene.motion, scene.road, scene.car.l_pre, scene.noise, n)
-        quality = lane_in_view(scene.motion, scene.sight)
+        psi, y_l = sample_camera(context.motion, context.road, context.car.l_pre, context.noise, n)
+        quality = compute_lane_quality(context.motion, context.field_of_view)
         return Sample((psi, y_l, 0.0, 0.0, 0.0, 0.0), quality, drift)
-    sky, car = scene.sky, scene.car
-    fresh = normals(scene.key_low, scene.key_high, when, blocks.drift)
-    drift = sky_deviation(drift, sky, link, scene.tick, fresh)
+    sky, car = context.sky, context.car
+    drift_noise = draw_normals(context.key_low, context.key_high, tick, blocks.drift)
+    drift = compute_hdop_deviation(drift, sky, link, context.tick, drift_noise)
     hdop = exp(sky.median + drift)
-    course, speed, X, Y, hdop, satellites, quality = gps_sample(
-        scene.motion, car.ahead, car.left, hdop, sky.weight, scene.noise, n, scene.small_angle
+    course, speed, X, Y, hdop, satellites, quality = sample_gps(
+        context.motion,
+        car.forward,
+        car.left,
+        hdop,
+        sky.weight,
+        context.noise,
+        n,
+        context.small_angle,
     )
     return Sample((course, speed, X, Y, hdop, satellites), quality, drift)
 
 
 @jit
-def first_drift(sensor: int, sky: Any, key_low: Any, key_high: Any) -> Any:
+def draw_first_drift(sensor: int, sky: Any, key_low: Any, key_high: Any) -> Any:
     """A slow sensor's drift when an episode begins."""
     if sensor == GPS:
-        return sky.spread * normals(key_low, key_high, 0, BLOCKS[sensor].drift)[1]
+        return sky.spread * draw_normals(key_low, key_high, 0, BLOCKS[sensor].drift)[1]
     return 0.0
 
 
@@ -99,7 +106,7 @@ SENSOR_SETS: dict[str, dict[str, SlowSensor]] = {
 }
 
 
-def with_changes(
+def apply_changes(
     sensors: dict[str, SlowSensor], changes: Mapping[str, Mapping[str, Any] | None]
 ) -> dict[str, SlowSensor]:
     """The sensors with some of their fields replaced; ValueError for a sensor that is absent,
@@ -111,7 +118,7 @@ def with_changes(
         if name not in sensors:
             raise ValueError(f"this id has no {name}; it has: {', '.join(sensors)}")
         known = [field.name for field in dataclasses.fields(sensors[name])]
-        if unknown := [each for each in mapping_of(name, fields) if each not in known]:
-            raise TypeError(unknown_names(f"number of the {name}", unknown, known))
+        if unknown := [key for key in check_mapping(name, fields) if key not in known]:
+            raise TypeError(describe_unknown(f"number of the {name}", unknown, known))
         changed[name] = dataclasses.replace(sensors[name], **fields)
     return changed

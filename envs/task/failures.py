@@ -9,13 +9,13 @@ RUNNING, SPIN, OFF_ROAD, NOT_FINITE, BAD_ACTION, COLLISION, DEPARTURE = range(7)
 FAILURES = ("none", "spin", "off-road", "not-finite", "bad-action", "collision", "departure")
 REFUSED = -1
 WILD = 1 << 30
-"""Added to what a step returns where an action was beyond `FAR`."""
-FAR = 10.0
+"""Added to what a step returns where an action was beyond `WILD_LIMIT`."""
+WILD_LIMIT = 10.0
 """An action beyond it, a share of full scale, is a mistake rather than a wish for all there is."""
 
 
 @jit
-def failure_of(lost: Any, spun: Any, off: Any) -> Any:
+def select_failure(lost: Any, spun: Any, off: Any) -> Any:
     """The failure's code, as a float: whether the numbers are no longer finite, the car spins or
     has left the road."""
     failure = select(spun, SPIN * 1.0, select(off, OFF_ROAD * 1.0, RUNNING * 1.0))

@@ -9,7 +9,7 @@ from ..record import Array
 from .failures import RUNNING
 
 
-class Report(NamedTuple):
+class StepReport(NamedTuple):
     """Columns of the numbers that go into `info`."""
 
     t: int = 0
@@ -27,7 +27,7 @@ class Report(NamedTuple):
     ended: int = 12  # 1 the time is over
 
 
-REPORT = Report()
+REPORT = StepReport()
 
 _NUMBERS = REPORT._fields[: REPORT.failure]  # of `info`; `failure` and `is_success` follow
 _KEYS = (*_NUMBERS, "failure", "is_success")
@@ -35,7 +35,7 @@ _RUNNING: dict[str, Any] = dict.fromkeys(_NUMBERS, 0.0) | {"failure": RUNNING, "
 _MASKS = tuple(f"_{key}" for key in _KEYS)
 
 
-def info_of(report: list[float]) -> dict[str, Any]:
+def make_info(report: list[float]) -> dict[str, Any]:
     """`info` of a step or a reset from a report, a number for each column."""
     info = _RUNNING.copy()  # a copy's keys need no sorting in
     (
@@ -49,7 +49,7 @@ def info_of(report: list[float]) -> dict[str, Any]:
     return info
 
 
-def infos_of(reports: Array, rows: npt.NDArray[np.bool_]) -> dict[str, Any]:
+def make_infos(reports: Array, rows: npt.NDArray[np.bool_]) -> dict[str, Any]:
     """The infos of some rows of a batch as Gymnasium's vector environments have them.
 
     reports: (N, len(Report)). rows: (N,) that are reported; the others have zeros. Every

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from ..backend.decorators import jit
 from ..backend.primitives import maximum, minimum
 from ..ticks import TICK
-from ..vehicle.actuators import lagged
+from ..vehicle.actuators import apply_lag
 from ..vehicle.vehicle import GRAVITY, Vehicle
 
 REFERENCES = ("zero-slip", "model", "limited", "lagged")
@@ -20,7 +20,7 @@ CHARACTERISTIC_SPEED = 35.0  # m/s
 REFERENCE_LAG = 0.1  # s
 
 
-class Target(NamedTuple):
+class ReferenceParams(NamedTuple):
     """Coefficients of the steady-state responses of the nominal vehicle."""
 
     b_0: Any  # l_r / l
@@ -32,13 +32,13 @@ class Target(NamedTuple):
     rest: Any  # what a tick leaves of its deviation from the steady state
 
 
-def target_of(nominal: Vehicle) -> Target:
+def make_reference_params(nominal: Vehicle) -> ReferenceParams:
     """The coefficients for a nominal vehicle."""
     l, M = nominal.wheelbase, nominal.mass  # noqa: E741
     C_f, C_r = nominal.front_stiffness, nominal.rear_stiffness
     l_f, l_r = nominal.front_arm, nominal.rear_arm
     G = M / (2.0 * l * l) * (C_r * l_r - C_f * l_f) / (C_f * C_r)  # dakf-stability (24)
-    return Target(
+    return ReferenceParams(
         l_r / l,
         M * l_f / (2.0 * l * C_r * l_r),
         G,
@@ -50,33 +50,35 @@ def target_of(nominal: Vehicle) -> Target:
 
 
 @jit
-def reference(steer: Any, v: Any, target: Any, kind: int) -> Any:
+def compute_reference(steer: Any, v: Any, target: Any, reference_kind: int) -> Any:
     """(beta_ref, gamma_ref) for a steering command at a measured speed.
 
     zero-slip: (0, 0), the yaw rate is not judged. model: the nominal steady state, with
     1 + G v^2 kept above 0.2. limited: the model within what friction can hold,
     |gamma| <= 0.85 mu g / v and |beta| <= 0.02 mu g (Rajamani, Vehicle Dynamics and Control).
-    lagged: what `followed` goes to, limited in the same way, with the stability factor of a car
-    that understeers.
+    lagged: what `filter_reference` goes to, limited in the same way, with the stability factor of a
+    car that understeers.
     """
-    if kind == ZERO_SLIP:
+    if reference_kind == ZERO_SLIP:
         return 0.0 * steer, 0.0 * steer
-    G = target.G_lagged if kind == LAGGED else target.G
+    G = target.G_lagged if reference_kind == LAGGED else target.G
     gain = steer / maximum(1.0 + G * v * v, 0.2)
     beta = (1.0 - target.b_1 * v * v) * target.b_0 * gain  # dakf-stability (23)
     gamma = v * target.per_l * gain  # dakf-stability (23)
-    if kind in (LIMITED, LAGGED):
-        most_beta = 0.02 * target.mu_g
-        most_gamma = 0.85 * target.mu_g / maximum(v, 1.0)
-        beta = minimum(maximum(beta, 0.0 - most_beta), most_beta)
-        gamma = minimum(maximum(gamma, 0.0 - most_gamma), most_gamma)
+    if reference_kind in (LIMITED, LAGGED):
+        max_beta = 0.02 * target.mu_g
+        max_gamma = 0.85 * target.mu_g / maximum(v, 1.0)
+        beta = minimum(maximum(beta, 0.0 - max_beta), max_beta)
+        gamma = minimum(maximum(gamma, 0.0 - max_gamma), max_gamma)
     return beta, gamma
 
 
 @jit
-def followed(before: Any, steady: Any, target: Any, kind: int) -> Any:
+def filter_reference(before: Any, steady: Any, target: Any, reference_kind: int) -> Any:
     """(beta_ref, gamma_ref) a tick after `before` for what `reference` gives now: the lagged one
     approaches it, the others are there at once."""
-    if kind == LAGGED:
-        return lagged(steady[0], before[0], target.rest), lagged(steady[1], before[1], target.rest)
+    if reference_kind == LAGGED:
+        return apply_lag(steady[0], before[0], target.rest), apply_lag(
+            steady[1], before[1], target.rest
+        )
     return steady

@@ -4,8 +4,8 @@ import math
 from typing import Any, NamedTuple
 
 from ..backend.decorators import jit
-from ..backend.primitives import absolute, anywhere, maximum, minimum, select
-from .tyres import SLOW
+from ..backend.primitives import absolute, any_lane, maximum, minimum, select
+from .tyres import MIN_SPEED
 
 
 class Lag(NamedTuple):
@@ -17,7 +17,7 @@ class Lag(NamedTuple):
     mean: Any  # Simpson's mean over the tick, which the record carries
 
 
-def lag_of(time_constant: float, tick: float) -> Lag:
+def make_lag(time_constant: float, tick: float) -> Lag:
     """The exact decay of a first-order lag at the start, middle and end of a tick (seconds)."""
     if time_constant == 0.0:
         return Lag(0.0, 0.0, 0.0, 0.0)
@@ -26,48 +26,48 @@ def lag_of(time_constant: float, tick: float) -> Lag:
 
 
 @jit
-def lagged(command: Any, value: Any, rest: Any) -> Any:
+def apply_lag(command: Any, value: Any, rest: Any) -> Any:
     """The actuator's value once `rest` of its deviation from the command is left."""
     return command + (value - command) * rest
 
 
 @jit
-def torque_limit(v_x: Any, car: Any) -> Any:
+def compute_torque_limit(v_x: Any, car: Any) -> Any:
     """N m that a motor can give at a speed, driving or braking: T_max, and P / |omega| of a wheel
     that rolls at v_x."""
-    most = car.T_max
-    if anywhere(car.P > 0.0):
-        at_speed = car.P * car.r / maximum(absolute(v_x), SLOW)
-        most = select(car.P > 0.0, minimum(most, at_speed), most)
-    return most
+    max_torque = car.T_max
+    if any_lane(car.P > 0.0):
+        at_speed = car.P * car.r / maximum(absolute(v_x), MIN_SPEED)
+        max_torque = select(car.P > 0.0, minimum(max_torque, at_speed), max_torque)
+    return max_torque
 
 
 @jit
-def distribute(N_z: Any, a_x: Any, car: Any, yaw_first: Any, most: Any) -> Any:
+def allocate_torques(N_z: Any, a_x: Any, car: Any, yaw_first: Any, max_torque: Any) -> Any:
     """(T_l, T_r) in N m for a yaw moment and an acceleration: tie-vision (3) in ISO axes.
 
-    A positive yaw moment drives the right wheel. Where both together pass `most`, what a motor
-    gives, the yaw moment keeps its share if `yaw_first` is 1, the acceleration if it is 0.
+    A positive yaw moment drives the right wheel. Where both together pass `max_torque`, what a
+    motor gives, the yaw moment keeps its share if `yaw_first` is 1, the acceleration if it is 0.
     """
-    turn = minimum(maximum(car.r * N_z / car.d_r, 0.0 - most), most)
-    drive = minimum(maximum(0.5 * car.m * car.r * a_x, 0.0 - most), most)
-    room_drive = most - absolute(turn)
-    room_turn = most - absolute(drive)
-    drive_kept = minimum(maximum(drive, 0.0 - room_drive), room_drive)
-    turn_kept = minimum(maximum(turn, 0.0 - room_turn), room_turn)
-    drive = yaw_first * drive_kept + (1.0 - yaw_first) * drive
-    turn = yaw_first * turn + (1.0 - yaw_first) * turn_kept
+    turn = minimum(maximum(car.r * N_z / car.d_r, 0.0 - max_torque), max_torque)
+    drive = minimum(maximum(0.5 * car.m * car.r * a_x, 0.0 - max_torque), max_torque)
+    drive_margin = max_torque - absolute(turn)
+    turn_margin = max_torque - absolute(drive)
+    limited_drive = minimum(maximum(drive, 0.0 - drive_margin), drive_margin)
+    limited_turn = minimum(maximum(turn, 0.0 - turn_margin), turn_margin)
+    drive = yaw_first * limited_drive + (1.0 - yaw_first) * drive
+    turn = yaw_first * turn + (1.0 - yaw_first) * limited_turn
     return drive - turn, drive + turn  # tie-vision (3)
 
 
 @jit
-def slewed(value: Any, wanted: Any, most: Any) -> Any:
-    """The value moved towards the wanted one by at most `most`."""
-    return value + minimum(maximum(wanted - value, 0.0 - most), most)
+def limit_rate(value: Any, command: Any, max_change: Any) -> Any:
+    """The value moved towards the wanted one by at most `max_change`."""
+    return value + minimum(maximum(command - value, 0.0 - max_change), max_change)
 
 
 @jit
-def within_stop(added: Any, driver: Any, stop: Any) -> Any:
+def limit_angle(added: Any, driver: Any, stop: Any) -> Any:
     """The part of an added steering angle (rad) that leaves the sum with the driver's in the stop.
 
     Where the driver's alone is beyond it, nothing is added to that side.
@@ -76,6 +76,6 @@ def within_stop(added: Any, driver: Any, stop: Any) -> Any:
 
 
 @jit
-def yaw_moment(T_l: Any, T_r: Any, car: Any) -> Any:
+def compute_yaw_moment(T_l: Any, T_r: Any, car: Any) -> Any:
     """N_z in N m that two motor torques produce."""
     return 0.5 * car.d_r / car.r * (T_r - T_l)

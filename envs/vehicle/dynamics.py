@@ -13,14 +13,14 @@ force, a_y = v_y' + v_x gamma + g phi, and a road banked by b adds g sin b.
 
 from typing import Any, NamedTuple
 
-from ..backend.decorators import inlined, jit
+from ..backend.decorators import inline, jit
 from ..backend.elementary import atan2, sincos
-from ..backend.primitives import anywhere, maximum, minimum, select
-from .tyres import SLOW, tyre_forces
+from ..backend.primitives import any_lane, maximum, minimum, select
+from .tyres import MIN_SPEED, compute_tyre_forces
 from .vehicle import GRAVITY
 
 
-class Car(NamedTuple):
+class CarParams(NamedTuple):
     """The true vehicle of an episode; letters as in the papers, stiffness per tyre."""
 
     m: Any
@@ -40,7 +40,7 @@ class Car(NamedTuple):
     K_x: Any
     C_x: Any
     h: Any
-    ahead: Any  # m, the GPS antenna from the centre of gravity
+    forward: Any  # m, the GPS antenna from the centre of gravity
     left: Any  # m
     mu_r: Any  # under the right wheels
     P: Any  # W, of one motor; 0: no limit
@@ -63,59 +63,59 @@ class Motion(NamedTuple):
     phi_dot: Any = 0.0  # rad/s
 
 
-class Road(NamedTuple):
+class RoadParams(NamedTuple):
     """A road that is straight and flat up to `start`; what follows comes in over `ramp` metres."""
 
     curvature: Any  # 1/m, left positive
     start: Any  # m
     ramp: Any  # m, positive
-    across: Any = 0.0  # m/s2, g sin(bank), left side up positive
-    along: Any = 0.0  # m/s2, g sin(grade), uphill positive
+    lateral: Any = 0.0  # m/s2, g sin(bank), left side up positive
+    longitudinal: Any = 0.0  # m/s2, g sin(grade), uphill positive
     turn: Any = 0.0  # rad/s, of its direction beside the car: of a road laid tick by tick
 
 
 @jit
-def _ramped(road: Any, s: Any) -> Any:
+def _compute_ramp(road: Any, s: Any) -> Any:
     return minimum(maximum((s - road.start) * (1.0 / road.ramp), 0.0), 1.0)
 
 
 @jit
-def curvature_at(road: Any, s: Any) -> Any:
+def compute_curvature(road: Any, s: Any) -> Any:
     """Curvature of the road in 1/m at the distance s."""
-    return road.curvature * _ramped(road, s)
+    return road.curvature * _compute_ramp(road, s)
 
 
 @jit
-def curvature_beside(motion: Any, road: Any) -> Any:
+def compute_car_curvature(motion: Any, road: Any) -> Any:
     """Curvature of the road in 1/m at the car: by how much its direction turns in a metre."""
-    kappa = curvature_at(road, motion.s)
-    if anywhere(road.turn != 0.0):
+    kappa = compute_curvature(road, motion.s)
+    if any_lane(road.turn != 0.0):
         kappa = kappa + road.turn / maximum(motion.v_x, 1.0)
     return kappa
 
 
-@inlined
-def gravity_felt(road: Any, s: Any, sin_r: Any, cos_r: Any) -> Any:
+@inline
+def rotate_gravity(road: Any, s: Any, sin_r: Any, cos_r: Any) -> Any:
     """(x, y) in m/s2 of what accelerometers in a car that does not roll feel of gravity.
 
     The car itself is accelerated by as much the other way. sin_r, cos_r: of its heading relative
     to the road.
     """
-    share = _ramped(road, s)
-    along, across = road.along * share, road.across * share
-    return along * cos_r + across * sin_r, across * cos_r - along * sin_r
+    share = _compute_ramp(road, s)
+    g_s, g_n = road.longitudinal * share, road.lateral * share
+    return g_s * cos_r + g_n * sin_r, g_n * cos_r - g_s * sin_r
 
 
 @jit
-def gravity_at(motion: Any, road: Any, small_angle: int) -> Any:
-    """`gravity_felt` at a Motion; the small-angle car heads along the road."""
+def compute_gravity(motion: Any, road: Any, small_angle: int) -> Any:
+    """`rotate_gravity` at a Motion; the small-angle car heads along the road."""
     if small_angle:
-        return gravity_felt(road, motion.s, 0.0, 1.0)
+        return rotate_gravity(road, motion.s, 0.0, 1.0)
     sin_r, cos_r = sincos(motion.psi - motion.theta)
-    return gravity_felt(road, motion.s, sin_r, cos_r)
+    return rotate_gravity(road, motion.s, sin_r, cos_r)
 
 
-class Push(NamedTuple):
+class DisturbanceForces(NamedTuple):
     """What disturbs the car during a tick."""
 
     F_d: Any  # N, lateral force at the centre of gravity
@@ -133,32 +133,39 @@ class Velocity(NamedTuple):
     phi_dot: Any
 
 
-@inlined
-def _roll_acceleration(motion: Any, F_y: Any, N_x: Any, car: Any, per_m: Any) -> Any:
+@inline
+def _compute_roll_acceleration(motion: Any, F_y: Any, N_x: Any, car: Any, per_m: Any) -> Any:
     """phi'' from (1) and (3) of double-layer-gps, solved for it: a_y depends on phi''.
 
     F_y: N, without gravity, whose pull on the body and on the whole car cancel in (3).
     """
-    rest = N_x - car.C_x * motion.phi_dot - car.K_x * motion.phi
+    body_moment = N_x - car.C_x * motion.phi_dot - car.K_x * motion.phi
     lever = car.S * (F_y * per_m + GRAVITY * motion.phi)
-    return (lever + rest) * (1.0 / (car.I_x - car.S * car.S * per_m))
+    return (lever + body_moment) * (1.0 / (car.I_x - car.S * car.S * per_m))
 
 
-@inlined
-def rates(
-    now: Any, load: Any, push: Any, car: Any, gravity: Any, small_angle: int, law: int, roll: int
+@inline
+def compute_rates(
+    motion: Any,
+    load: Any,
+    disturbance: Any,
+    car: Any,
+    gravity: Any,
+    small_angle: int,
+    law: int,
+    roll: int,
 ) -> Any:
-    """d(now)/dt as a Velocity. gravity: (x, y) in m/s2 of `gravity_felt`."""
+    """d(now)/dt as a Velocity. gravity: (x, y) in m/s2 of `rotate_gravity`."""
     per_m, per_I = 1.0 / car.m, 1.0 / car.I
-    v_x, v_y, gamma = now.v_x, now.v_y, now.gamma
+    v_x, v_y, gamma = motion.v_x, motion.v_y, motion.gamma
     g_x, g_y = gravity
-    F_yf, F_yr, F_x, N_z = tyre_forces(now, load, car, g_y, small_angle, law, roll)
+    F_yf, F_yr, F_x, N_z = compute_tyre_forces(motion, load, car, g_y, small_angle, law, roll)
     F_yc = F_yf if small_angle else F_yf * load.cos_d
-    F_y = F_yc + F_yr + push.F_d
+    F_y = F_yc + F_yr + disturbance.F_d
     phi_dot, phi_ddot = 0.0, 0.0
     if roll:
-        phi_dot = now.phi_dot
-        phi_ddot = _roll_acceleration(now, F_y, push.N_x, car, per_m)
+        phi_dot = motion.phi_dot
+        phi_ddot = _compute_roll_acceleration(motion, F_y, disturbance.N_x, car, per_m)
         F_y = F_y + car.S * phi_ddot  # double-layer-gps (1)
     if not small_angle:
         F_x = F_x - F_yf * load.sin_d
@@ -166,35 +173,35 @@ def rates(
     if roll or not small_angle:
         dv_x = dv_x + v_y * gamma  # double-layer-gps (4)
     dv_y = F_y * per_m - v_x * gamma - g_y  # tie-vision (1)
-    dgamma = (car.l_f * F_yc - car.l_r * F_yr + N_z + push.N_d) * per_I  # (2)
+    dgamma = (car.l_f * F_yc - car.l_r * F_yr + N_z + disturbance.N_d) * per_I  # (2)
     return Velocity(dv_x, dv_y, dgamma, phi_dot, phi_ddot)
 
 
-@inlined
-def course(motion: Any, v_x: Any, v_y: Any, road: Any, small_angle: int) -> Any:
+@inline
+def compute_course_rates(motion: Any, v_x: Any, v_y: Any, road: Any, small_angle: int) -> Any:
     """(dX, dY, ds, dy, dtheta)/dt at a Motion's place and heading, with these velocities."""
-    kappa = curvature_at(road, motion.s)
+    kappa = compute_curvature(road, motion.s)
     if small_angle:
         dY = v_x * motion.psi + v_y  # tie-vision (5), V_x (psi + beta)
         dy = v_x * (motion.psi - motion.theta) + v_y
         return v_x, dY, v_x, dy, v_x * kappa + road.turn
     sin_t, cos_t = sincos(motion.theta)
     sin_r, cos_r = sincos(motion.psi - motion.theta)
-    along = v_x * cos_r - v_y * sin_r  # in road axes
-    across = v_x * sin_r + v_y * cos_r
-    ds = along
-    if anywhere(road.curvature != 0.0):
-        ds = along / maximum(1.0 - kappa * motion.y, 0.1)
-    dX = along * cos_t - across * sin_t
-    dY = along * sin_t + across * cos_t
-    return dX, dY, ds, across, ds * kappa + road.turn
+    v_along = v_x * cos_r - v_y * sin_r  # in road axes
+    v_across = v_x * sin_r + v_y * cos_r
+    ds = v_along
+    if any_lane(road.curvature != 0.0):
+        ds = v_along / maximum(1.0 - kappa * motion.y, 0.1)
+    dX = v_along * cos_t - v_across * sin_t
+    dY = v_along * sin_t + v_across * cos_t
+    return dX, dY, ds, v_across, ds * kappa + road.turn
 
 
-@inlined
+@inline
 def derivative(
     motion: Any,
     load: Any,
-    push: Any,
+    disturbance: Any,
     car: Any,
     road: Any,
     small_angle: int,
@@ -202,18 +209,18 @@ def derivative(
     roll: int = 0,
 ) -> Any:
     """d(motion)/dt as a Motion."""
-    gravity = gravity_at(motion, road, small_angle)
-    rate = rates(motion, load, push, car, gravity, small_angle, law, roll)
-    dX, dY, ds, dy, turns = course(motion, motion.v_x, motion.v_y, road, small_angle)
+    gravity = compute_gravity(motion, road, small_angle)
+    rate = compute_rates(motion, load, disturbance, car, gravity, small_angle, law, roll)
+    dX, dY, ds, dy, dtheta = compute_course_rates(motion, motion.v_x, motion.v_y, road, small_angle)
     return Motion(
-        rate.v_x, rate.v_y, rate.gamma, motion.gamma, dX, dY, ds, dy, turns, rate.phi, rate.phi_dot
+        rate.v_x, rate.v_y, rate.gamma, motion.gamma, dX, dY, ds, dy, dtheta, rate.phi, rate.phi_dot
     )  # fmt: skip
 
 
-@inlined
-def sideslip_angle(v_x: Any, v_y: Any, small_angle: int) -> Any:
+@inline
+def compute_sideslip_angle(v_x: Any, v_y: Any, small_angle: int) -> Any:
     """beta in rad: atan2(v_y, v_x) above 0.5 m/s, else 0 (the ratio on the small-angle plant)."""
     if small_angle:
-        return select(v_x > SLOW, v_y / maximum(v_x, SLOW), 0.0)
-    moving = v_x * v_x + v_y * v_y > SLOW * SLOW
-    return select(moving, atan2(v_y, v_x), 0.0)
+        return select(v_x > MIN_SPEED, v_y / maximum(v_x, MIN_SPEED), 0.0)
+    is_moving = v_x * v_x + v_y * v_y > MIN_SPEED * MIN_SPEED
+    return select(is_moving, atan2(v_y, v_x), 0.0)

@@ -7,44 +7,51 @@ branches on values, as in `dynamics`.
 
 from typing import Any
 
-from ..backend.decorators import inlined, jit
+from ..backend.decorators import inline, jit
 from ..backend.elementary import sincos
-from ..backend.primitives import anywhere
-from .dynamics import Motion, Velocity, course, curvature_at, gravity_felt, rates
+from ..backend.primitives import any_lane
+from .dynamics import (
+    Motion,
+    Velocity,
+    compute_course_rates,
+    compute_curvature,
+    compute_rates,
+    rotate_gravity,
+)
 
 
 @jit
-def _after(now: Any, h: Any, rate: Any) -> Any:
+def _step_euler(start: Any, h: Any, rate: Any) -> Any:
     """now + h rate, written out so that it compiles for every number type."""
     return Velocity(
-        now.v_x + h * rate.v_x,
-        now.v_y + h * rate.v_y,
-        now.gamma + h * rate.gamma,
-        now.phi + h * rate.phi,
-        now.phi_dot + h * rate.phi_dot,
+        start.v_x + h * rate.v_x,
+        start.v_y + h * rate.v_y,
+        start.gamma + h * rate.gamma,
+        start.phi + h * rate.phi,
+        start.phi_dot + h * rate.phi_dot,
     )
 
 
 @jit
-def _mean(first: Any, middle: Any, last: Any) -> Any:
+def _average(first: Any, middle: Any, last: Any) -> Any:
     """Simpson's rule."""
     return (first + 4.0 * middle + last) * (1.0 / 6.0)
 
 
 @jit
-def _means(a: Any, b: Any, c: Any) -> Any:
+def _average_velocities(a: Any, b: Any, c: Any) -> Any:
     """Simpson's rule for each number of three Velocities."""
     return Velocity(
-        _mean(a.v_x, b.v_x, c.v_x),
-        _mean(a.v_y, b.v_y, c.v_y),
-        _mean(a.gamma, b.gamma, c.gamma),
-        _mean(a.phi, b.phi, c.phi),
-        _mean(a.phi_dot, b.phi_dot, c.phi_dot),
+        _average(a.v_x, b.v_x, c.v_x),
+        _average(a.v_y, b.v_y, c.v_y),
+        _average(a.gamma, b.gamma, c.gamma),
+        _average(a.phi, b.phi, c.phi),
+        _average(a.phi_dot, b.phi_dot, c.phi_dot),
     )
 
 
 @jit
-def _halfway(a: Any, b: Any) -> Any:
+def _average_two(a: Any, b: Any) -> Any:
     """The mean of two Velocities."""
     return Velocity(
         0.5 * (a.v_x + b.v_x),
@@ -55,25 +62,25 @@ def _halfway(a: Any, b: Any) -> Any:
     )
 
 
-@inlined
-def _gravity_between(motion: Any, road: Any, h: Any, small_angle: int) -> Any:
-    """`gravity_felt` in the middle of a step of h seconds, where the car will be by its start's
+@inline
+def _compute_mid_gravity(motion: Any, road: Any, h: Any, small_angle: int) -> Any:
+    """`rotate_gravity` in the middle of a step of h seconds, where the car will be by its start's
     speed: it stands for the whole step, in which the car turns by h gamma."""
-    ahead = motion.s + 0.5 * h * motion.v_x
-    if not anywhere((road.across != 0.0) | (road.along != 0.0)):
+    s_mid = motion.s + 0.5 * h * motion.v_x
+    if not any_lane((road.lateral != 0.0) | (road.longitudinal != 0.0)):
         return 0.0, 0.0
     if small_angle:
-        return gravity_felt(road, ahead, 0.0, 1.0)
-    turning = motion.gamma - motion.v_x * curvature_at(road, ahead) - road.turn
-    sin_r, cos_r = sincos(motion.psi - motion.theta + 0.5 * h * turning)
-    return gravity_felt(road, ahead, sin_r, cos_r)
+        return rotate_gravity(road, s_mid, 0.0, 1.0)
+    mid_turn_rate = motion.gamma - motion.v_x * compute_curvature(road, s_mid) - road.turn
+    sin_r, cos_r = sincos(motion.psi - motion.theta + 0.5 * h * mid_turn_rate)
+    return rotate_gravity(road, s_mid, sin_r, cos_r)
 
 
-@inlined
-def _moved(
-    motion: Any, middle: Any, now: Any, mean: Any, road: Any, h: Any, small_angle: int
+@inline
+def _integrate_motion(
+    motion: Any, middle: Any, end: Any, mean: Any, road: Any, h: Any, small_angle: int
 ) -> Any:
-    """The Motion after h seconds whose velocities were `middle` halfway, `now` at the end and
+    """The Motion after h seconds whose velocities were `middle` halfway, `end` at the end and
     `mean` in the mean.
 
     No force within a step depends on place and heading, so these follow at once. The mean of the
@@ -82,39 +89,41 @@ def _moved(
     turns is taken where the car is halfway by the start's velocity: h^3 v^2 / 8 times its change of
     curvature, below 1e-7 m a second at 1 ms.
     """
-    half, turned = 0.5 * h, h * mean.gamma
-    shorter, aside = 1.0 - turned * turned * (1.0 / 24.0), turned * (1.0 / 12.0)
-    v_x = shorter * mean.v_x - aside * (now.v_y - motion.v_y)
-    v_y = shorter * mean.v_y + aside * (now.v_x - motion.v_x)
+    half, angle = 0.5 * h, h * mean.gamma
+    shrink, side_gain = 1.0 - angle * angle * (1.0 / 24.0), angle * (1.0 / 12.0)
+    v_x = shrink * mean.v_x - side_gain * (end.v_y - motion.v_y)
+    v_y = shrink * mean.v_y + side_gain * (end.v_x - motion.v_x)
     psi = motion.psi + h * (motion.gamma + 2.0 * middle.gamma) * (1.0 / 6.0)  # in the mean
     s, y, theta = motion.s, motion.y, motion.theta
-    if anywhere(road.curvature != 0.0) or anywhere(road.turn != 0.0):
-        _, _, ds, dy, turns = course(motion, motion.v_x, motion.v_y, road, small_angle)
-        s, y, theta = s + half * ds, y + half * dy, theta + half * turns
-    between = Motion(
-        v_x, v_y, mean.gamma, psi, motion.X, motion.Y, s, y, theta, now.phi, now.phi_dot
+    if any_lane(road.curvature != 0.0) or any_lane(road.turn != 0.0):
+        _, _, ds, dy, dtheta = compute_course_rates(
+            motion, motion.v_x, motion.v_y, road, small_angle
+        )
+        s, y, theta = s + half * ds, y + half * dy, theta + half * dtheta
+    mid_motion = Motion(
+        v_x, v_y, mean.gamma, psi, motion.X, motion.Y, s, y, theta, end.phi, end.phi_dot
     )
-    dX, dY, ds, dy, turns = course(between, v_x, v_y, road, small_angle)
+    dX, dY, ds, dy, dtheta = compute_course_rates(mid_motion, v_x, v_y, road, small_angle)
     return Motion(
-        now.v_x,
-        now.v_y,
-        now.gamma,
-        motion.psi + turned,
+        end.v_x,
+        end.v_y,
+        end.gamma,
+        motion.psi + angle,
         motion.X + h * dX,
         motion.Y + h * dY,
         motion.s + h * ds,
         motion.y + h * dy,
-        motion.theta + h * turns,
-        now.phi,
-        now.phi_dot,
+        motion.theta + h * dtheta,
+        end.phi,
+        end.phi_dot,
     )
 
 
-@inlined
+@inline
 def kutta3(
     motion: Any,
     load: tuple[Any, Any, Any],
-    push: Any,
+    disturbance: Any,
     car: Any,
     road: Any,
     h: Any,
@@ -127,22 +136,30 @@ def kutta3(
     load: the Load at the start, the middle and the end of the step. Three stages at 1 ms err by
     less than what the plant's kinks cost any rule (docs/physics.md has the table).
     """
-    gravity = _gravity_between(motion, road, h, small_angle)
+    gravity = _compute_mid_gravity(motion, road, h, small_angle)
     start = Velocity(motion.v_x, motion.v_y, motion.gamma, motion.phi, motion.phi_dot)
-    a = rates(start, load[0], push, car, gravity, small_angle, law, roll)
-    middle = _after(start, 0.5 * h, a)
-    b = rates(middle, load[1], push, car, gravity, small_angle, law, roll)
-    end = _after(_after(start, 0.0 - h, a), 2.0 * h, b)
-    c = rates(end, load[2], push, car, gravity, small_angle, law, roll)
-    mean = _means(start, middle, end)
-    return _moved(motion, middle, _after(start, h, _means(a, b, c)), mean, road, h, small_angle)
+    a = compute_rates(start, load[0], disturbance, car, gravity, small_angle, law, roll)
+    middle = _step_euler(start, 0.5 * h, a)
+    b = compute_rates(middle, load[1], disturbance, car, gravity, small_angle, law, roll)
+    end = _step_euler(_step_euler(start, 0.0 - h, a), 2.0 * h, b)
+    c = compute_rates(end, load[2], disturbance, car, gravity, small_angle, law, roll)
+    mean = _average_velocities(start, middle, end)
+    return _integrate_motion(
+        motion,
+        middle,
+        _step_euler(start, h, _average_velocities(a, b, c)),
+        mean,
+        road,
+        h,
+        small_angle,
+    )
 
 
-@inlined
+@inline
 def rk4(
     motion: Any,
     load: tuple[Any, Any, Any],
-    push: Any,
+    disturbance: Any,
     car: Any,
     road: Any,
     h: Any,
@@ -151,16 +168,16 @@ def rk4(
     roll: int = 0,
 ) -> Any:
     """The same by the classical Runge-Kutta method: the plans', whose steps are longer."""
-    gravity = _gravity_between(motion, road, h, small_angle)
+    gravity = _compute_mid_gravity(motion, road, h, small_angle)
     start = Velocity(motion.v_x, motion.v_y, motion.gamma, motion.phi, motion.phi_dot)
-    a = rates(start, load[0], push, car, gravity, small_angle, law, roll)
-    first = _after(start, 0.5 * h, a)
-    b = rates(first, load[1], push, car, gravity, small_angle, law, roll)
-    second = _after(start, 0.5 * h, b)
-    c = rates(second, load[1], push, car, gravity, small_angle, law, roll)
-    end = _after(start, h, c)
-    d = rates(end, load[2], push, car, gravity, small_angle, law, roll)
-    middle, between = _halfway(first, second), _halfway(b, c)
-    mean = _means(start, middle, end)
-    now = _after(start, h, _means(a, between, d))
-    return _moved(motion, middle, now, mean, road, h, small_angle)
+    a = compute_rates(start, load[0], disturbance, car, gravity, small_angle, law, roll)
+    first = _step_euler(start, 0.5 * h, a)
+    b = compute_rates(first, load[1], disturbance, car, gravity, small_angle, law, roll)
+    second = _step_euler(start, 0.5 * h, b)
+    c = compute_rates(second, load[1], disturbance, car, gravity, small_angle, law, roll)
+    end = _step_euler(start, h, c)
+    d = compute_rates(end, load[2], disturbance, car, gravity, small_angle, law, roll)
+    middle, mid_rate = _average_two(first, second), _average_two(b, c)
+    mean = _average_velocities(start, middle, end)
+    last = _step_euler(start, h, _average_velocities(a, mid_rate, d))
+    return _integrate_motion(motion, middle, last, mean, road, h, small_angle)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..backend.decorators import jit, plain
+from ..backend.decorators import as_python, jit
 from .vehicle import GRAVITY, Vehicle
 
 if TYPE_CHECKING:
@@ -19,7 +19,8 @@ Array = npt.NDArray[np.float64]
 
 
 class Bicycle(NamedTuple):
-    """A linear bicycle: arguments of `bicycle_coefficients` in their order, letters as there."""
+    """A linear bicycle: arguments of `compute_bicycle_coefficients` in their order, letters as
+    there."""
 
     m: Any
     I: Any  # noqa: E741  the papers' letter
@@ -30,7 +31,7 @@ class Bicycle(NamedTuple):
 
 
 @jit
-def bicycle_coefficients(
+def compute_bicycle_coefficients(
     m: Any,
     I: Any,  # noqa: E741  the papers' letter
     l_f: Any,
@@ -52,9 +53,9 @@ def write_lateral(A: Any, B: Any, car: Any, V: Any, states: int, inputs: int, pr
     """beta and gamma, with more `states` psi and y_l, into A and B (columns delta_f, N_z and, with
     more `inputs`, the road's curvature).
 
-    car: the first six arguments of `bicycle_coefficients`. What is zero is left alone.
+    car: the first six arguments of `compute_bicycle_coefficients`. What is zero is left alone.
     """
-    a11, a12, a21, a22, b11, b21, b22 = bicycle_coefficients(
+    a11, a12, a21, a22, b11, b21, b22 = compute_bicycle_coefficients(
         car[0], car[1], car[2], car[3], car[4], car[5], V
     )
     A[0, 0], A[0, 1], A[1, 0], A[1, 1] = a11, a12, a21, a22
@@ -87,8 +88,8 @@ def write_kinematic(A: Any, B: Any, gamma: Any) -> None:
     B[0, 0], B[1, 1] = 1.0, 1.0
 
 
-_write_lateral, _write_roll = plain(write_lateral), plain(write_roll)
-_write_kinematic = plain(write_kinematic)
+_write_lateral, _write_roll = as_python(write_lateral), as_python(write_roll)
+_write_kinematic = as_python(write_kinematic)
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class LinearModel:
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
 
-    def discrete(self, dt: float) -> tuple[Array, Array]:
+    def discretise(self, dt: float) -> tuple[Array, Array]:
         """(G, H) of tie-vision (9) by exact zero-order hold over dt seconds."""
         from scipy.linalg import expm  # environments read this module too
 
@@ -130,7 +131,9 @@ class LinearModel:
         )
 
 
-def _lateral(vehicle: Vehicle, speed: float, states: int, inputs: int = 2) -> tuple[Array, Array]:
+def _make_lateral(
+    vehicle: Vehicle, speed: float, states: int, inputs: int = 2
+) -> tuple[Array, Array]:
     """A (states, states) and B (states, inputs) of `write_lateral`."""
     if not speed > 0.0:
         raise ValueError(f"a linear model needs a positive speed, got {speed!r} m/s")
@@ -139,50 +142,50 @@ def _lateral(vehicle: Vehicle, speed: float, states: int, inputs: int = 2) -> tu
     return A, B
 
 
-def bicycle(vehicle: Vehicle, speed: float) -> LinearModel:
+def make_bicycle_model(vehicle: Vehicle, speed: float) -> LinearModel:
     """beta and gamma, from steering and yaw moment: tie-vision (1)-(2). Output: gamma."""
-    A, B = _lateral(vehicle, speed, 2)
+    A, B = _make_lateral(vehicle, speed, 2)
     return LinearModel(
         A, B, np.array([[0.0, 1.0]]), ("beta", "gamma"), ("delta_f", "N_z"), ("gamma",)
     )
 
 
-def vision(vehicle: Vehicle, speed: float) -> LinearModel:
+def make_vision_model(vehicle: Vehicle, speed: float) -> LinearModel:
     """tie-vision (8): beta, gamma, psi (relative to the road) and y_l, from delta_f, N_z, kappa.
 
     The road's curvature kappa is the third input: psi' = gamma - V kappa, and
     y_l = y_cg + l_pre psi - kappa l_pre^2 / 2 moves as y_l' = V beta + l_pre psi' + V psi.
     """
-    A, B = _lateral(vehicle, speed, 4, 3)
+    A, B = _make_lateral(vehicle, speed, 4, 3)
     C = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     states = ("beta", "gamma", "psi", "y_l")
     return LinearModel(A, B, C, states, ("delta_f", "N_z", "kappa"), ("gamma", "psi", "y_l"))
 
 
-def course(vehicle: Vehicle, speed: float) -> LinearModel:
+def make_course_model(vehicle: Vehicle, speed: float) -> LinearModel:
     """beta, gamma, psi with the course angle psi + beta as output: dakf-stability (1)-(3)."""
-    A, B = _lateral(vehicle, speed, 3)
+    A, B = _make_lateral(vehicle, speed, 3)
     C = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
     return LinearModel(A, B, C, ("beta", "gamma", "psi"), ("delta_f", "N_z"), ("gamma", "course"))
 
 
-def _roll_shares(vehicle: Vehicle) -> tuple[float, float, float]:
+def _compute_roll_ratios(vehicle: Vehicle) -> tuple[float, float, float]:
     """Roll stiffness, damping and M_s h_s over the roll inertia."""
     I_x = vehicle.roll_inertia
     return vehicle.roll_stiffness / I_x, vehicle.roll_damping / I_x, vehicle.roll_moment_arm / I_x
 
 
-def roll(vehicle: Vehicle) -> LinearModel:
+def make_roll_model(vehicle: Vehicle) -> LinearModel:
     """phi and phi_dot from the measured specific force a_y: double-layer-gps (3). Output: phi_dot.
 
     The body's weight, M_s g h_s phi, is within a_y.
     """
     A, B = np.zeros((2, 2)), np.zeros((2, 1))
-    _write_roll(A, B, 0, 0, *_roll_shares(vehicle))
+    _write_roll(A, B, 0, 0, *_compute_roll_ratios(vehicle))
     return LinearModel(A, B, np.array([[0.0, 1.0]]), ("phi", "phi_dot"), ("a_y",), ("phi_dot",))
 
 
-def kinematic(gamma: float) -> LinearModel:
+def make_kinematic_model(gamma: float) -> LinearModel:
     """v_x and v_y from both specific forces at a yaw rate in rad/s: double-layer-gps (4)-(5).
 
     Without roll or bank. Output: v_x, as of the wheels; at zero yaw rate v_y is unobservable.
@@ -192,14 +195,14 @@ def kinematic(gamma: float) -> LinearModel:
     return LinearModel(A, B, np.array([[1.0, 0.0]]), ("v_x", "v_y"), ("a_x", "a_y"), ("v_x",))
 
 
-def velocity_and_roll(vehicle: Vehicle, gamma: float) -> LinearModel:
+def make_velocity_roll_model(vehicle: Vehicle, gamma: float) -> LinearModel:
     """v_x, v_y, phi and phi_dot from both specific forces: double-layer-gps (42), continuous.
 
     Outputs: v_x and v_y, which the GPS and the first layer measure, and phi_dot.
     """
     A, B, C = np.zeros((4, 4)), np.zeros((4, 2)), np.zeros((3, 4))
     _write_kinematic(A, B, gamma)
-    _write_roll(A, B, 2, 1, *_roll_shares(vehicle))
+    _write_roll(A, B, 2, 1, *_compute_roll_ratios(vehicle))
     A[1, 2] = -GRAVITY  # double-layer-gps (5)
     C[0, 0] = C[1, 1] = C[2, 3] = 1.0
     states, outputs = ("v_x", "v_y", "phi", "phi_dot"), ("v_x", "v_y", "phi_dot")

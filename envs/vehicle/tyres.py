@@ -1,25 +1,25 @@
 """Tyres: normal load, friction circle, slip and lateral force.
 
 Scalar functions over tuples, without branches on values, as in `dynamics`. A law of the lateral
-force has its name in `TYRE_LAWS` and its equation in `lateral_forces`. A filter that needs slopes
-has Fiala's once more, in `estimators.core.tyres`; a test holds both equal.
+force has its name in `TYRE_LAWS` and its equation in `compute_lateral_forces`. A filter that needs
+slopes has Fiala's once more, in `estimators.core.tyres`; a test holds both equal.
 """
 
 from typing import Any, NamedTuple
 
-from ..backend.decorators import inlined, jit
+from ..backend.decorators import inline, jit
 from ..backend.elementary import atan, sincos
-from ..backend.primitives import absolute, anywhere, maximum, minimum, sqrt
+from ..backend.primitives import absolute, any_lane, maximum, minimum, sqrt
 from .vehicle import GRAVITY
 
 TYRE_LAWS = ("linear", "fiala", "dugoff")
 """The laws by the names that `Scenario.tyres` takes; a law's code is its place."""
 LINEAR, FIALA, DUGOFF = range(len(TYRE_LAWS))
 
-SLOW = 0.5  # m/s: below it slip is computed as at this speed, and beta is zero
+MIN_SPEED = 0.5  # m/s: below it slip is computed as at this speed, and beta is zero
 
 
-class Inputs(NamedTuple):
+class TyreInputs(NamedTuple):
     """Steering angle and motor torques at one instant."""
 
     delta_f: Any  # rad, front steering angle
@@ -27,7 +27,7 @@ class Inputs(NamedTuple):
     T_r: Any  # N m, right motor
 
 
-class Load(NamedTuple):
+class TyreLoad(NamedTuple):
     """Steering, drive forces and lateral capacities of the tyres under one instant's Inputs.
 
     Computed once, used by several Runge-Kutta stages.
@@ -50,22 +50,22 @@ class Load(NamedTuple):
     F_r: Any
 
 
-@inlined
-def _squared_capacity(limit: Any, drive: Any) -> Any:
+@inline
+def _compute_squared_capacity(limit: Any, drive: Any) -> Any:
     """The square of the lateral capacity in N of a tyre that also drives: the friction circle, but
     the capacity is never below 5 %."""
     return maximum(limit * limit - drive * drive, 0.0025 * limit * limit)
 
 
 @jit
-def shifts(small_angle: int, law: int, roll: int) -> int:
+def has_load_shift(small_angle: int, law: int, roll: int) -> int:
     """1 where roll moves load from side to side: the tyres' limits are then those of the motion
     and not of the inputs alone. Tyres without a limit feel nothing of it."""
     return int(small_angle == 0 and law != LINEAR and roll == 1)
 
 
-@inlined
-def _axle_shift(F_l: Any, F_r: Any, rear_l: Any, rear_r: Any, weight: Any, car: Any) -> Any:
+@inline
+def _compute_axle_shift(F_l: Any, F_r: Any, rear_l: Any, rear_r: Any, weight: Any, car: Any) -> Any:
     """N by which each rear wheel's load grows, and each front one's falls: F_x h / 2 l.
 
     F_x is what the standing tyres let the motors bring to the road, so that it does not depend on
@@ -76,32 +76,32 @@ def _axle_shift(F_l: Any, F_r: Any, rear_l: Any, rear_r: Any, weight: Any, car: 
     return minimum(maximum(shift, -0.9 * weight * car.l_f), 0.9 * weight * car.l_r)
 
 
-@inlined
-def load_of(inputs: Any, car: Any, small_angle: int, shifting: int = 0) -> Any:
+@inline
+def compute_tyre_load(inputs: Any, car: Any, small_angle: int, load_shift: int = 0) -> Any:
     """The Load of the Inputs of one instant.
 
     The road may grip less on one side: each rear tyre has its own friction, which limits its
     motor's force; the front tyres share the mean. Drive force moves load between the axles, but
-    not on the small-angle plant. shifting: of `shifts`; with 1 the rear tyres'
+    not on the small-angle plant. shifting: of `has_load_shift`; with 1 the rear tyres'
     limits and slopes, drive force and moment are those of the inputs without any friction.
     """
     weight = car.m * GRAVITY / (2.0 * (car.l_f + car.l_r))
     front = 0.5 * (car.mu + car.mu_r) * weight * car.l_r
     rear_l, rear_r = car.mu * weight * car.l_f, car.mu_r * weight * car.l_f
-    asked_l, asked_r = inputs.T_l * (1.0 / car.r), inputs.T_r * (1.0 / car.r)
-    F_l, F_r = asked_l, asked_r
-    if not small_angle and anywhere(car.h_x > 0.0):
-        shift = _axle_shift(F_l, F_r, rear_l, rear_r, weight, car)
+    command_l, command_r = inputs.T_l * (1.0 / car.r), inputs.T_r * (1.0 / car.r)
+    F_l, F_r = command_l, command_r
+    if not small_angle and any_lane(car.h_x > 0.0):
+        shift = _compute_axle_shift(F_l, F_r, rear_l, rear_r, weight, car)
         front = front - 0.5 * (car.mu + car.mu_r) * shift
         rear_l, rear_r = rear_l + car.mu * shift, rear_r + car.mu_r * shift
     s, c = sincos(inputs.delta_f)
     left, right = rear_l, rear_r
-    if not small_angle and not shifting:
+    if not small_angle and not load_shift:
         F_l = minimum(maximum(F_l, 0.0 - rear_l), rear_l)
         F_r = minimum(maximum(F_r, 0.0 - rear_r), rear_r)
-        left = sqrt(_squared_capacity(rear_l, F_l))
-        right = sqrt(_squared_capacity(rear_r, F_r))
-    return Load(
+        left = sqrt(_compute_squared_capacity(rear_l, F_l))
+        right = sqrt(_compute_squared_capacity(rear_r, F_r))
+    return TyreLoad(
         s,
         c,
         inputs.delta_f,
@@ -115,8 +115,8 @@ def load_of(inputs: Any, car: Any, small_angle: int, shifting: int = 0) -> Any:
         car.C_r / (3.0 * right),
         rear_l,
         rear_r,
-        asked_l,
-        asked_r,
+        command_l,
+        command_r,
     )
 
 
@@ -156,8 +156,8 @@ def _dugoff(tyre: Any) -> Any:
     return tyre.limit * minimum(maximum(u, 0.0 - share), share)
 
 
-@inlined
-def lateral_forces(a: Any, b: Any, c: Any, d: Any, law: int, small_angle: int) -> Any:
+@inline
+def compute_lateral_forces(a: Any, b: Any, c: Any, d: Any, law: int, small_angle: int) -> Any:
     """Lateral forces in N of the four Tyres, front left and right, rear left and right.
 
     All at once: the law is chosen once for the four of them.
@@ -171,28 +171,28 @@ def lateral_forces(a: Any, b: Any, c: Any, d: Any, law: int, small_angle: int) -
 
 
 @jit
-def _slip_ratios(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
+def _compute_slip_ratios(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
     """Numerator and denominator of the tangent of the front slip angle, and of the rear one."""
     front = motion.v_y + car.l_f * motion.gamma
     rear = motion.v_y - car.l_r * motion.gamma
     if small_angle:
-        v = maximum(motion.v_x, SLOW)
+        v = maximum(motion.v_x, MIN_SPEED)
         # delta_f - beta - l_f gamma / V_x and l_r gamma / V_x - beta of tie-vision (1)
         return motion.v_x * load.steer - front, v, 0.0 - rear, v
-    along = maximum(absolute(motion.v_x * load.cos_d + front * load.sin_d), SLOW)
-    across = motion.v_x * load.sin_d - front * load.cos_d
-    return across, along, 0.0 - rear, maximum(absolute(motion.v_x), SLOW)
+    v_along = maximum(absolute(motion.v_x * load.cos_d + front * load.sin_d), MIN_SPEED)
+    v_across = motion.v_x * load.sin_d - front * load.cos_d
+    return v_across, v_along, 0.0 - rear, maximum(absolute(motion.v_x), MIN_SPEED)
 
 
 @jit
-def slips(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
+def compute_slips(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
     """Tangents of the front and rear slip angle (the small-angle plant's angles themselves)."""
-    across_f, along_f, across_r, along_r = _slip_ratios(motion, load, car, small_angle)
+    across_f, along_f, across_r, along_r = _compute_slip_ratios(motion, load, car, small_angle)
     return across_f / along_f, across_r / along_r
 
 
-@inlined
-def load_transfer(motion: Any, car: Any, g_y: Any) -> Any:
+@inline
+def compute_load_transfer(motion: Any, car: Any, g_y: Any) -> Any:
     """The share of its standing load by which the left wheels of (front, rear) are relieved.
 
     The right wheels get as much. The suspension passes K_x phi + C_x phi_dot on to the wheels; the
@@ -208,25 +208,25 @@ def load_transfer(motion: Any, car: Any, g_y: Any) -> Any:
     return minimum(maximum(front, -0.9), 0.9), minimum(maximum(rear, -0.9), 0.9)
 
 
-@inlined
-def tyre_forces(
+@inline
+def compute_tyre_forces(
     motion: Any, load: Any, car: Any, g_y: Any, small_angle: int, law: int, roll: int
 ) -> Any:
     """(F_yf, F_yr, F_x, N_z): lateral forces of the axles, drive force, moment of the motors.
 
-    The arguments are those of `tyres_at`.
+    The arguments are those of `compute_tyres`.
     """
-    if shifts(small_angle, law, roll):
-        a, b, c, d, F_x, N_z = _shifted_tyres(motion, load, car, g_y)
-        F_fl, F_fr, F_rl, F_rr = lateral_forces(a, b, c, d, law, 0)
+    if has_load_shift(small_angle, law, roll):
+        a, b, c, d, F_x, N_z = _compute_shifted_tyres(motion, load, car, g_y)
+        F_fl, F_fr, F_rl, F_rr = compute_lateral_forces(a, b, c, d, law, 0)
         return F_fl + F_fr, F_rl + F_rr, F_x, N_z
-    a, b, c, d, F_x, N_z = _standing_tyres(motion, load, car, small_angle)
-    F_fl, F_fr, F_rl, F_rr = lateral_forces(a, b, c, d, law, small_angle)
+    a, b, c, d, F_x, N_z = _compute_static_tyres(motion, load, car, small_angle)
+    F_fl, F_fr, F_rl, F_rr = compute_lateral_forces(a, b, c, d, law, small_angle)
     return F_fl + F_fr, F_rl + F_rr, F_x, N_z
 
 
-@inlined
-def tyres_at(
+@inline
+def compute_tyres(
     motion: Any, load: Any, car: Any, g_y: Any, small_angle: int, law: int, roll: int
 ) -> Any:
     """The four Tyres, front left and right, rear left and right; then the drive force in N and the
@@ -235,42 +235,47 @@ def tyres_at(
     g_y: m/s2, the road's bank as the car feels it. Roll moves load from side to side, which
     matters to tyres with a limit only, and is left out of the small-angle plant.
     """
-    if shifts(small_angle, law, roll):
-        return _shifted_tyres(motion, load, car, g_y)
-    return _standing_tyres(motion, load, car, small_angle)
+    if has_load_shift(small_angle, law, roll):
+        return _compute_shifted_tyres(motion, load, car, g_y)
+    return _compute_static_tyres(motion, load, car, small_angle)
 
 
-@inlined
-def _standing_tyres(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
-    """`tyres_at` where roll moves no load."""
-    t_f, t_r = slips(motion, load, car, small_angle)
+@inline
+def _compute_static_tyres(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
+    """`compute_tyres` where roll moves no load."""
+    t_f, t_r = compute_slips(motion, load, car, small_angle)
     front = Tyre(t_f, load.limit_f, load.slope_f)
     left = Tyre(t_r, load.limit_l, load.slope_l)
     right = Tyre(t_r, load.limit_r, load.slope_r)
     return front, front, left, right, load.F_x, load.N_z
 
 
-@inlined
-def _shifted_tyres(motion: Any, load: Any, car: Any, g_y: Any) -> Any:
-    """`tyres_at` where roll moves load from side to side.
+@inline
+def _compute_shifted_tyres(motion: Any, load: Any, car: Any, g_y: Any) -> Any:
+    """`compute_tyres` where roll moves load from side to side.
 
     A quotient costs ten products: the slips' and the slopes' are all taken from one.
     """
-    across_f, along_f, across_r, along_r = _slip_ratios(motion, load, car, 0)
-    e_f, e_r = load_transfer(motion, car, g_y)
-    narrow, wide = 1.0 - e_f, 1.0 + e_f
+    across_f, along_f, across_r, along_r = _compute_slip_ratios(motion, load, car, 0)
+    e_f, e_r = compute_load_transfer(motion, car, g_y)
+    relieved, burdened = 1.0 - e_f, 1.0 + e_f
     rear_l, rear_r = load.rear_l * (1.0 - e_r), load.rear_r * (1.0 + e_r)
     F_l = minimum(maximum(load.F_l, 0.0 - rear_l), rear_l)
     F_r = minimum(maximum(load.F_r, 0.0 - rear_r), rear_r)
-    square_l, square_r = _squared_capacity(rear_l, F_l), _squared_capacity(rear_r, F_r)
+    square_l, square_r = (
+        _compute_squared_capacity(rear_l, F_l),
+        _compute_squared_capacity(rear_r, F_r),
+    )
     left, right = sqrt(square_l), sqrt(square_r)
-    sides, squares = narrow * wide, square_l * square_r
-    per = 1.0 / (along_f * along_r * (sides * squares))
-    front = load.slope_f * (along_r * squares * per)  # C_f / 3 F_max of the standing tyre, 1/along
-    rear = car.C_r * (1.0 / 3.0) * (along_f * sides * per)
+    sides, squares = relieved * burdened, square_l * square_r
+    inv_product = 1.0 / (along_f * along_r * (sides * squares))
+    front = load.slope_f * (
+        along_r * squares * inv_product
+    )  # C_f / 3 F_max of the standing tyre, 1/along
+    rear = car.C_r * (1.0 / 3.0) * (along_f * sides * inv_product)
     return (
-        Tyre(across_f, load.limit_f * narrow, front * wide),
-        Tyre(across_f, load.limit_f * wide, front * narrow),
+        Tyre(across_f, load.limit_f * relieved, front * burdened),
+        Tyre(across_f, load.limit_f * burdened, front * relieved),
         Tyre(across_r, left, rear * square_r * left),
         Tyre(across_r, right, rear * square_l * right),
         F_l + F_r,

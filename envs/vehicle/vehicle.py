@@ -5,15 +5,22 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from ..arguments import LARGEST, brief, is_finite
+from ..arguments import MAX_NUMBER, is_finite, short_repr
 from ..quantities import quantity
 
 GRAVITY = 9.81
-LATERAL = ("mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness", "rear_stiffness")
+LATERAL_FIELDS = (
+    "mass",
+    "yaw_inertia",
+    "front_arm",
+    "rear_arm",
+    "front_stiffness",
+    "rear_stiffness",
+)
 """What a linear bicycle is made of, in the order of `linear.Bicycle`."""
-_POINTS = ("mass", "front_arm", "rear_arm")  # as inertia, that of two points over the axles
+_POINT_INERTIA = ("mass", "front_arm", "rear_arm")  # as inertia, that of two points over the axles
 
-_SMALLEST = 1.0 / LARGEST  # what is below is taken for zero: it is divided by
+_MIN_NUMBER = 1.0 / MAX_NUMBER  # what is below is taken for zero: it is divided by
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +29,7 @@ class Vehicle:
 
     Cornering stiffness is per tyre, as in the papers (an axle has 2 C). Letters of the papers
     stand in the descriptions: `Vehicle.__dataclass_fields__[name].metadata` has text and unit,
-    and the plausible range that `vehicle_from` and environments go by.
+    and the plausible range that `make_vehicle` and environments go by.
 
     Raises ValueError on a value that is not finite or not positive (lags, motor_power and
     transfer_height may be zero, the antenna's place may be negative).
@@ -30,7 +37,9 @@ class Vehicle:
 
     name: str = "vehicle"
     mass: float = quantity("kg", 0.01, 1e5, "m")
-    yaw_inertia: float = quantity("kg m2", 0.1, 10, "I, about the vertical axis", per=_POINTS)
+    yaw_inertia: float = quantity(
+        "kg m2", 0.1, 10, "I, about the vertical axis", per=_POINT_INERTIA
+    )
     front_arm: float = quantity("m", 0.01, 10, "l_f, centre of gravity to front axle")
     rear_arm: float = quantity("m", 0.01, 10, "l_r, centre of gravity to rear axle")
     front_stiffness: float = quantity("N/rad", 3, 600, "C_f, one front tyre", per=("mass",))
@@ -63,24 +72,24 @@ class Vehicle:
             value = getattr(self, entry.name)
             if entry.name == "name":
                 if not isinstance(value, str):
-                    raise TypeError(f"Vehicle.name: expected a text, got {brief(value)}")
+                    raise TypeError(f"Vehicle.name: expected a text, got {short_repr(value)}")
                 continue
             if not isinstance(value, int | float) or isinstance(value, bool):
-                raise TypeError(f"Vehicle.{entry.name}: expected a number, got {brief(value)}")
-            least, low_ok = "positive and ", value > _SMALLEST
+                raise TypeError(f"Vehicle.{entry.name}: expected a number, got {short_repr(value)}")
+            requirement, is_low_ok = "positive and ", value > _MIN_NUMBER
             if entry.metadata["plausible"][0] == 0:
-                least, low_ok = "zero or more and ", value > _SMALLEST or value == 0.0
+                requirement, is_low_ok = "zero or more and ", value > _MIN_NUMBER or value == 0.0
             elif entry.metadata["plausible"][0] < 0:
-                least, low_ok = "", True
-            if not (is_finite(value) and low_ok):
-                got = f"{brief(value)} {entry.metadata['unit']}"
-                raise ValueError(f"Vehicle.{entry.name}: {got} is not {least}finite")
+                requirement, is_low_ok = "", True
+            if not (is_finite(value) and is_low_ok):
+                got = f"{short_repr(value)} {entry.metadata['unit']}"
+                raise ValueError(f"Vehicle.{entry.name}: {got} is not {requirement}finite")
 
     def replace(self, **changes: Any) -> "Vehicle":
         """A copy with some parameters changed; TypeError on an unknown name."""
         return dataclasses.replace(self, **changes)
 
-    def scaled(self, front: float, rear: float | None = None) -> "Vehicle":
+    def scale_stiffness(self, front: float, rear: float | None = None) -> "Vehicle":
         """A copy whose cornering stiffnesses are `front` and `rear` (or `front`) times ours."""
         return self.replace(
             front_stiffness=self.front_stiffness * front,
@@ -89,8 +98,8 @@ class Vehicle:
 
     @property
     def lateral(self) -> tuple[float, ...]:
-        """The parameters of `LATERAL`."""
-        return tuple(getattr(self, name) for name in LATERAL)
+        """The parameters of `LATERAL_FIELDS`."""
+        return tuple(getattr(self, name) for name in LATERAL_FIELDS)
 
     @property
     def wheelbase(self) -> float:
@@ -104,18 +113,18 @@ class Vehicle:
 
     def check_roll(self) -> None:
         """ValueError where this body would roll over, or its inertia is none, on its suspension."""
-        least = self.roll_moment_arm * GRAVITY
-        if self.roll_stiffness <= least:
+        lower_limit = self.roll_moment_arm * GRAVITY
+        if self.roll_stiffness <= lower_limit:
             raise ValueError(
                 f"Vehicle.roll_stiffness: {self.roll_stiffness!r} N m/rad does not hold the body "
-                f"upright; its weight takes M_s g h_s = {least:.6g}"
+                f"upright; its weight takes M_s g h_s = {lower_limit:.6g}"
             )
-        least = self.roll_moment_arm**2 / self.mass
-        if self.roll_inertia <= least:
+        lower_limit = self.roll_moment_arm**2 / self.mass
+        if self.roll_inertia <= lower_limit:
             raise ValueError(
                 f"Vehicle.roll_inertia: {self.roll_inertia!r} kg m2 about the roll axis; a sprung "
                 f"mass of {self.sprung_mass!r} kg at {self.roll_arm!r} m on a car of "
-                f"{self.mass!r} kg has more than {least:.6g}"
+                f"{self.mass!r} kg has more than {lower_limit:.6g}"
             )
 
     @property
@@ -124,7 +133,7 @@ class Vehicle:
         return self.motor_torque * self.rear_track / self.wheel_radius
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON types only; `vehicle_from` reads it back."""
+        """JSON types only; `make_vehicle` reads it back."""
         return dataclasses.asdict(self)
 
 

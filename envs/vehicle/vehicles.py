@@ -6,23 +6,23 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..arguments import brief, check_choice, is_finite, unknown_names
+from ..arguments import check_choice, describe_unknown, is_finite, short_repr
 from ..documents import is_document, read_document
 from ..quantities import check_plausible
-from .vehicle import COMS, LATERAL, PASSENGER_CAR, Vehicle
+from .vehicle import COMS, LATERAL_FIELDS, PASSENGER_CAR, Vehicle
 
 VehicleSource = str | os.PathLike[str] | Mapping[str, Any] | Vehicle
-"""What `vehicle_from` takes."""
+"""What `make_vehicle` takes."""
 
 _STIFFNESS = ("front_stiffness", "rear_stiffness")
-WIRES = ("steering", "latency", "noise")
+WIRE_TABLES = ("steering", "latency", "noise")
 """Tables that a vehicle's file may hold beside the car: what `sideslip identify` found of its
 wires, which `sideslip replay` applies and everybody else leaves alone."""
 _CONVENTIONS = {"_per_tyre": 1.0, "_axle": 0.5}  # tyres' share of the number
 _FIELDS = [entry.name for entry in dataclasses.fields(Vehicle)]
 
 
-def vehicle_from(source: VehicleSource, strict: bool = True) -> Vehicle:
+def make_vehicle(source: VehicleSource, strict: bool = True) -> Vehicle:
     """A vehicle from its name in `VEHICLES`, a TOML or JSON file, or a mapping of parameters.
 
     Keys are those of `Vehicle`. A cornering stiffness is `front_stiffness_per_tyre` or
@@ -40,53 +40,61 @@ def vehicle_from(source: VehicleSource, strict: bool = True) -> Vehicle:
     if isinstance(source, Vehicle):
         return source
     if isinstance(source, Mapping):
-        return _vehicle_of(dict(source), strict, whole=all(name in source for name in _FIELDS))
+        return _parse_vehicle(
+            dict(source), strict, is_complete=all(name in source for name in _FIELDS)
+        )
     if is_document(source):
-        return _vehicle_in(Path(source), strict)
+        return _read_vehicle(Path(source), strict)
     if not isinstance(source, str):
         raise TypeError(
             "a vehicle is a name, the path of a TOML or JSON file or a mapping of parameters, "
-            f"got {brief(source)}"
+            f"got {short_repr(source)}"
         )
     check_choice("vehicle", source, VEHICLES)
     return VEHICLES[source]
 
 
-def _vehicle_in(path: Path, strict: bool = True) -> Vehicle:
+def _read_vehicle(path: Path, strict: bool = True) -> Vehicle:
     values = read_document(path, "vehicle")
-    values = {name: value for name, value in values.items() if name not in WIRES}
+    values = {name: value for name, value in values.items() if name not in WIRE_TABLES}
     try:
-        return _vehicle_of({"name": path.stem} | values, strict)
+        return _parse_vehicle({"name": path.stem} | values, strict)
     except (TypeError, ValueError) as error:
         raise type(error)(f"{path}: {error}") from None
 
 
-def _key(name: str) -> str:
+def _format_key(name: str) -> str:
     """A parameter's key, both where a stiffness has two."""
     return " or ".join(map(name.__add__, _CONVENTIONS)) if name in _STIFFNESS else name
 
 
-def _vehicle_of(values: dict[str, Any], strict: bool, whole: bool = False) -> Vehicle:
+def _parse_vehicle(values: dict[str, Any], strict: bool, is_complete: bool = False) -> Vehicle:
     """A vehicle of a mapping, whose stiffnesses become those of a tyre, and are if it is whole."""
-    based = "base" in values
-    base = vehicle_from(values.pop("base", PASSENGER_CAR.replace(name="vehicle")), strict)
+    has_base = "base" in values
+    base = make_vehicle(values.pop("base", PASSENGER_CAR.replace(name="vehicle")), strict)
     for name in _STIFFNESS:
-        there = [key for key in (name, *map(name.__add__, _CONVENTIONS)) if key in values]
-        if len(there) > 1:
-            raise ValueError(f"{' and '.join(there)} exclude each other: one convention an axle")
-        if name in there and not whole:
-            raise ValueError(f"{name} must name its convention: {_key(name)}")
+        present_keys = [key for key in (name, *map(name.__add__, _CONVENTIONS)) if key in values]
+        if len(present_keys) > 1:
+            raise ValueError(
+                f"{' and '.join(present_keys)} exclude each other: one convention an axle"
+            )
+        if name in present_keys and not is_complete:
+            raise ValueError(f"{name} must name its convention: {_format_key(name)}")
         for convention, share in _CONVENTIONS.items():
             if name + convention in values:
                 value = values.pop(name + convention)
                 values[name] = value * share if is_finite(value) else value  # refused by `Vehicle`
     if unknown := [key for key in values if key not in _FIELDS]:
-        keys = [*_FIELDS, "base", *(name + each for name in _STIFFNESS for each in _CONVENTIONS)]
-        raise TypeError(unknown_names("vehicle parameter", unknown, keys))
-    missing = [name for name in LATERAL if name not in values]
-    if missing and not based:
+        keys = [
+            *_FIELDS,
+            "base",
+            *(name + suffix for name in _STIFFNESS for suffix in _CONVENTIONS),
+        ]
+        raise TypeError(describe_unknown("vehicle parameter", unknown, keys))
+    missing = [name for name in LATERAL_FIELDS if name not in values]
+    if missing and not has_base:
         raise ValueError(
-            f"missing {', '.join(map(_key, missing))} (or name a vehicle under 'base')"
+            f"missing {', '.join(map(_format_key, missing))} (or name a vehicle under 'base')"
         )
     vehicle = base.replace(**values)
     if strict:
@@ -98,4 +106,4 @@ VEHICLES: dict[str, Vehicle] = {"coms": COMS, "passenger-car": PASSENGER_CAR}
 """Every vehicle that has a name: two presets, and those of recorded drives, from files."""
 
 for _path in sorted((Path(__file__).parent / "presets").glob("*.toml")):
-    VEHICLES[_path.stem] = _vehicle_in(_path)
+    VEHICLES[_path.stem] = _read_vehicle(_path)

@@ -19,7 +19,7 @@ from ...envs.record import PACKET, Record
 from ...envs.sensors.link import SlowSensor
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import Vehicle
-from ..design.models import states_for
+from ..design.models import select_states
 from ..estimates import UnobservableWarning
 from ..make import make_estimator
 
@@ -29,7 +29,7 @@ Array = npt.NDArray[np.float64]
 _MODEL = ("car", "A", "B", "G", "GT", "H", "HT", "C_fast", "D_fast")
 
 
-class Change(NamedTuple):
+class VehicleChange(NamedTuple):
     """Another vehicle from a time on, in s since the first row."""
 
     time: float
@@ -49,14 +49,14 @@ class Gust(NamedTuple):
     end: float
 
 
-def bound(
+def compute_error_bound(
     vehicle: Vehicle,
     *,
     record: Record,
     sensors: Mapping[str, SlowSensor],
     speed: float,
     dt: float = TICK,
-    change: Change | None = None,
+    change: VehicleChange | None = None,
     gust: Gust | None = None,
     **options: Any,
 ) -> Array:
@@ -73,7 +73,7 @@ def bound(
     late = any(options.get("latency", {}).values())
     if late and not (change is None and gust is None):
         raise ValueError("a bound with latency has no change and no gust")
-    prior = dict.fromkeys(states_for(tuple(sensors)), 0.0)
+    prior = dict.fromkeys(select_states(tuple(sensors)), 0.0)
     if gust is not None:  # a state that is a constant, as the road's bank is, but pushes as a force
         options |= {"bank_sd": gust.force_sd}
         prior |= {"bank": 0.0}
@@ -83,19 +83,19 @@ def bound(
     with warnings.catch_warnings():  # the gust's state is seen only where it blows
         warnings.simplefilter("ignore" if gust is not None else "default", UnobservableWarning)
         first, *later = (make_estimator("exact-kf", vehicle=car, **common) for car in cars)
-    record = first.accept(record)
+    record = first.prepare_record(record)
     events = list[tuple[float, Callable[[], None]]]()
     if gust is not None:
         for filter_ in (first, *later):
-            _push(filter_, gust.arm)
-        events += [(gust.start, lambda: _begin(first, gust.force_sd**2))]
-        events += [(gust.end, lambda: _begin(first, 0.0))]
+            _set_gust_input(filter_, gust.arm)
+        events += [(gust.start, lambda: _reset_gust(first, gust.force_sd**2))]
+        events += [(gust.end, lambda: _reset_gust(first, 0.0))]
     if change is not None:
-        events.append((change.time, lambda: _become(first, later[0])))
-    return _run(first, record, sorted(events, key=lambda event: event[0]))
+        events.append((change.time, lambda: _copy_model(first, later[0])))
+    return _run_events(first, record, sorted(events, key=lambda event: event[0]))
 
 
-def _push(filter_: Any, arm: float) -> None:
+def _set_gust_input(filter_: Any, arm: float) -> None:
     """The state `bank` pushes as F_d does, and as N_d by an arm in m."""
     f, names = filter_.filters[0], filter_.names
     gust, force, moment = (names.index(name) for name in ("bank", "F_d", "N_d"))
@@ -104,29 +104,31 @@ def _push(filter_: Any, arm: float) -> None:
     f.GT[gust] = f.G[:, gust]
 
 
-def _become(filter_: Any, later: Any) -> None:
+def _copy_model(filter_: Any, later: Any) -> None:
     for name in _MODEL:
         filter_.filters[0][name] = later.filters[0][name]
 
 
-def _begin(filter_: Any, variance: float) -> None:
+def _reset_gust(filter_: Any, variance: float) -> None:
     """What the gust is from now on has nothing to do with what was known before."""
-    f, at = filter_.filters[0], filter_.names.index("bank")
-    f.P[at], f.P[:, at] = 0.0, 0.0
-    f.P[at, at] = variance
+    f, index = filter_.filters[0], filter_.names.index("bank")
+    f.P[index], f.P[:, index] = 0.0, 0.0
+    f.P[index, index] = variance
 
 
-def _run(filter_: Any, record: Record, events: Sequence[tuple[float, Callable[[], None]]]) -> Array:
+def _run_events(
+    filter_: Any, record: Record, events: Sequence[tuple[float, Callable[[], None]]]
+) -> Array:
     """The deviations of beta of a run that goes on; each event is behind the row at its time."""
     fast, packets = np.ascontiguousarray(record.fast), np.ascontiguousarray(record.packets)
     X, S = (np.empty((len(fast), len(filter_.names))) for _ in range(2))
     ends = [min(round(time / record.dt) + 1, len(fast)) for time, _ in events]
-    row = came = 0
+    row = n_arrived = 0
     for i, end in enumerate([*ends, len(fast)]):
-        due = int(np.searchsorted(packets[:, PACKET.arrived], record.first + end))
-        span, late = slice(row, end), packets[came:due]
-        filter_.take(fast[span], end - row, late, len(late), X[span], S[span])
+        n_due = int(np.searchsorted(packets[:, PACKET.arrived], record.first + end))
+        span, due_packets = slice(row, end), packets[n_arrived:n_due]
+        filter_.take(fast[span], end - row, due_packets, len(due_packets), X[span], S[span])
         if i < len(events):
             events[i][1]()
-        row, came = end, due
+        row, n_arrived = end, n_due
     return S[:, 0]

@@ -17,14 +17,14 @@ import numpy.typing as npt
 from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH
 from ..core.delay import IGNORE
 from ..core.intersample import DUAL_RATE
-from ..core.memory import CORE, FILTER, INPUTS, ROWS
-from ..core.run import begin_all
+from ..core.memory import FILTER, N_CORE, N_INPUTS, N_ROWS
+from ..core.run import reset_filters
 from ..core.transition import LINEAR
-from ..design.dual_rate import GAINS, RULES, frame_map, shares_of, write_shares
-from ..design.error_map import MARGINAL, spectral_radius, unobservable
-from ..entry import advance_entry, receive_entry
+from ..design.dual_rate import GAINS, RULES, compute_shares, frame_map, write_shares
+from ..design.error_map import MARGINAL, find_unobservable, spectral_radius
+from ..entry import compile_advance, compile_process_packet
 from ..estimates import Estimates, UnobservableWarning
-from ..matrices import covariance, matrix, square, vector
+from ..matrices import parse_covariance, parse_matrix, parse_square, parse_vector
 
 Array = npt.NDArray[np.float64]
 
@@ -47,7 +47,7 @@ class DualRate:
     start: x at k = 0, (m,). allow_unstable: accept a filter whose error grows.
 
     `x` (m + d,), `names` and `k` are those of now; `spectral_radius` of the error from
-    sample to sample; `unobservable`: directions that the measurement cannot see. `shares`
+    sample to sample; `find_unobservable`: directions that the measurement cannot see. `shares`
     (r, m + d, q): L_{k+i} G_{k+i} of (14) and (19).
 
     Raises
@@ -75,8 +75,8 @@ class DualRate:
         start: npt.ArrayLike | None = None,
         allow_unstable: bool = False,
     ) -> None:
-        a, b, c = (matrix(name, M) for name, M in (("A", A), ("B", B), ("C", C)))
-        m, rows = len(a), _disturbed(disturbed, len(a))
+        a, b, c = (parse_matrix(name, M) for name, M in (("A", A), ("B", B), ("C", C)))
+        m, rows = len(a), _parse_disturbed(disturbed, len(a))
         _check_sizes(a, b, c, len(rows))
         if not ratio >= 1 or int(ratio) != ratio:
             raise ValueError(f"ratio is a whole number of steps, at least 1, got {ratio!r}")
@@ -84,27 +84,27 @@ class DualRate:
         F, drift = np.zeros((n, n)), np.zeros(n)
         F[:m, :m] = a
         F[rows, range(m, n)] = 1.0  # (5)
-        F[m:, m:] = square("leak", leak, d)  # (11)
-        drift[m:] = vector("rate", rate, d)
+        F[m:, m:] = parse_square("leak", leak, d)  # (11)
+        drift[m:] = parse_vector("rate", rate, d)
         noise = np.zeros((n, n))
-        noise[:m, :m] = covariance("Q", Q, m)  # (12)
-        noise[m:, m:] = covariance("Q_d", Q_d, d)
-        seen, r = np.hstack([c, np.zeros((q, d))]), covariance("R", R, q, definite=True)
-        wanted = _poles(intersample, gains, poles, n)
+        noise[:m, :m] = parse_covariance("Q", Q, m)  # (12)
+        noise[m:, m:] = parse_covariance("Q_d", Q_d, d)
+        measured, r = np.hstack([c, np.zeros((q, d))]), parse_covariance("R", R, q, definite=True)
+        placed = _parse_poles(intersample, gains, poles, n)
         with np.errstate(invalid="ignore", over="ignore"):
-            shares = shares_of(intersample, gains, wanted, F, noise, seen, r, int(ratio))
+            shares = compute_shares(intersample, gains, placed, F, noise, measured, r, int(ratio))
         self.names = tuple([*(f"x{i + 1}" for i in range(m)), *(f"d{i + 1}" for i in rows)])
         self.shares, self.ratio, self.inputs = shares, int(ratio), b.shape[1]
-        self._judge(F, seen, allow_unstable)
+        self._check_stability(F, measured, allow_unstable)
         self.gains = np.zeros((1, 1 + q + (1 + q) * self.ratio, n + n * (n + 1) // 2))
         self.gains[0, 0, 0] = 1.0
-        write_shares(F, noise, seen, r, shares, self.gains[0], 1 + q + self.ratio, n)
+        write_shares(F, noise, measured, r, shares, self.gains[0], 1 + q + self.ratio, n)
         self._start = np.zeros(n)
-        self._start[:m] = vector("start", 0.0 if start is None else start, m)
-        self._filters = _record(F, b, drift, seen, self.ratio)
+        self._start[:m] = parse_vector("start", 0.0 if start is None else start, m)
+        self._filters = _make_record(F, b, drift, measured, self.ratio)
         self.reset()
 
-    def _judge(self, F: Array, C: Array, allow_unstable: bool) -> None:
+    def _check_stability(self, F: Array, C: Array, allow_unstable: bool) -> None:
         """Refuse an error that grows; name what the measurement cannot see."""
         M = frame_map(F, C, self.shares)
         self.spectral_radius = spectral_radius(M) if np.isfinite(M).all() else np.inf
@@ -116,27 +116,27 @@ class DualRate:
                     "sample (allow_unstable=True builds it all the same)"
                 )
         elif self.spectral_radius >= 1.0 - MARGINAL:
-            self.unobservable = unobservable(M, self.names)
+            self.unobservable = find_unobservable(M, self.names)
             text = f"the measurement cannot see: {'; '.join(self.unobservable)}"
             warnings.warn(text, UnobservableWarning, stacklevel=3)
 
     def reset(self) -> None:
         """Back to k = 0, before the first sample."""
-        self._begin()
+        self._reset_filter()
         self._take(np.zeros((1, FAST_WIDTH)), _NO_PACKETS)
 
-    def _begin(self) -> None:
-        begin_all(self._filters, 0)
+    def _reset_filter(self) -> None:
+        reset_filters(self._filters, 0)
         self._filters[0].x[: len(self.names)] = self._start
 
     def _take(self, fast: Array, packets: Array, X: Array = _EMPTY, S: Array = _EMPTY) -> None:
-        advance, count = advance_entry(), len(packets)
+        advance, count = compile_advance(), len(packets)
         advance(self._filters, self.gains, fast, len(fast), packets, count, 0, X, S, _NO_NIS)
 
     def step(self, u: npt.ArrayLike) -> None:
         """From k to k+1 with the input u (p,) of the step: dual-rate (17), (19)."""
         fast = np.zeros((1, FAST_WIDTH))
-        fast[0, : self.inputs] = vector("u", u, self.inputs)
+        fast[0, : self.inputs] = parse_vector("u", u, self.inputs)
         self._take(fast, _NO_PACKETS)
 
     def update(self, y: npt.ArrayLike) -> None:
@@ -149,11 +149,11 @@ class DualRate:
             raise ValueError(f"a sample comes every {self.ratio} steps, this is step {f.tick}")
         if f.since == 0:
             raise ValueError(f"step {f.tick} has had its sample")
-        receive_entry()(
-            self._filters, self.gains, self._packet(vector("y", y, int(f.rows[_SENSOR])))
+        compile_process_packet()(
+            self._filters, self.gains, self._make_packet(parse_vector("y", y, int(f.rows[_SENSOR])))
         )
 
-    def _packet(self, y: Array) -> Array:
+    def _make_packet(self, y: Array) -> Array:
         packet = np.zeros(PACKET_WIDTH)
         packet[: PACKET.value] = _SENSOR, self.k, self.k, 1.0, 0.0
         packet[PACKET.value : PACKET.value + len(y)] = y
@@ -179,10 +179,10 @@ class DualRate:
         packets[:, PACKET.captured] = packets[:, PACKET.arrived] = np.arange(count) * self.ratio
         packets[:, PACKET.quality] = 1.0
         packets[:, PACKET.value : PACKET.value + q] = y
-        sound = ~np.isnan(y).any(axis=1)
-        self._begin()
+        is_present = ~np.isnan(y).any(axis=1)
+        self._reset_filter()
         X, S = (np.empty((len(fast), len(self.names))) for _ in range(2))
-        self._take(fast, np.ascontiguousarray(packets[sound]), X, S)
+        self._take(fast, np.ascontiguousarray(packets[is_present]), X, S)
         return Estimates(np.arange(float(len(fast))), X, S, self.names, np.full(count, np.nan))
 
     @property
@@ -196,7 +196,7 @@ class DualRate:
         return int(self._filters[0].tick)
 
 
-def _disturbed(rows: Sequence[int] | None, m: int) -> list[int]:
+def _parse_disturbed(rows: Sequence[int] | None, m: int) -> list[int]:
     """The rows of x that a disturbance pushes; ValueError for one that is not there or twice."""
     chosen = [] if rows is None else [int(row) for row in rows]
     if len(set(chosen)) != len(chosen) or any(not 0 <= row < m for row in chosen):
@@ -211,13 +211,13 @@ def _check_sizes(A: Array, B: Array, C: Array, d: int) -> None:
         raise ValueError(
             f"A, B and C have shapes (m, m), (m, p) and (q, m), got {A.shape}, {B.shape}, {C.shape}"
         )
-    there = (("states with their disturbances", m + d, CORE), ("inputs", B.shape[1], INPUTS))
-    for what, count, most in (*there, ("outputs", len(C), ROWS)):
-        if count > most:
-            raise ValueError(f"{count} {what} are more than a filter can have ({most})")
+    checked = (("states with their disturbances", m + d, N_CORE), ("inputs", B.shape[1], N_INPUTS))
+    for label, count, max_count in (*checked, ("outputs", len(C), N_ROWS)):
+        if count > max_count:
+            raise ValueError(f"{count} {label} are more than a filter can have ({max_count})")
 
 
-def _poles(
+def _parse_poles(
     intersample: str, gains: str, poles: npt.ArrayLike | None, n: int
 ) -> npt.NDArray[np.complex128] | None:
     """The poles to place, (n,); ValueError for an unknown rule or gain, or what does not fit it."""
@@ -230,13 +230,13 @@ def _poles(
         raise ValueError(f"poles are for gains='placed', got gains={gains!r} and poles={poles!r}")
     if poles is None:
         return None
-    wanted = np.array(poles, np.complex128)
-    if wanted.shape != (n,) or not np.isfinite(wanted).all():
+    placed = np.array(poles, np.complex128)
+    if placed.shape != (n,) or not np.isfinite(placed).all():
         raise ValueError(f"{n} states need {n} finite poles, got {poles!r}")
-    return wanted
+    return placed
 
 
-def _record(F: Array, B: Array, drift: Array, C: Array, ratio: int) -> Any:
+def _make_record(F: Array, B: Array, drift: Array, C: Array, ratio: int) -> Any:
     """The filter's memory: every state is dense, the slow sensor is the first."""
     filters = np.zeros(1, FILTER).view(np.recarray)
     f, n, q, p = filters[0], len(F), len(C), B.shape[1]

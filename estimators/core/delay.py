@@ -17,9 +17,9 @@ literally at 1 ms) or by a first-order lag of the delay. ignore: late samples ar
 """
 
 from ...envs.backend.decorators import jit
-from .covariance import clone_covariance, dot, expected, measure_state
-from .memory import COUNTERS, SEEN, SLOW, WINDOW, Memory, Row
-from .transition import variance
+from .covariance import clone_covariance, dot, predict_measurement, update_with_states
+from .memory import COUNTERS, N_SLOW, N_STAMPS, WINDOW, FilterRecord, Vector
+from .transition import compute_row_variance
 
 RULES = ("clone", "ignore", "stored", "constant", "larsen", "buffer", "literal", "lag")
 CLONE, IGNORE, STORED, CONSTANT, LARSEN, BUFFER = range(6)
@@ -31,107 +31,111 @@ STORED_ONE = -3  # it is compared with what was stored at its capture
 
 
 @jit
-def direct() -> int:
+def get_direct() -> int:
     """DIRECT, as a number: a literal argument would have every callee compiled once more."""
     return DIRECT
 
 
 @jit
-def _clone(f: Memory, s: int, slot: int) -> None:
+def _clone_states(f: FilterRecord, s: int, slot: int) -> None:
     """Clone what sensor s captured at the last tick: tie-vision (12) at a trigger."""
     f.speed_captured[s, slot] = f.speed_before
     for i in range(f.rows[s]):
         clone = f.first_clone[s] + slot * f.rows[s] + i
         row = f.C[s, i]
-        f.x[clone] = expected(f, s, i)
+        f.x[clone] = predict_measurement(f, s, i)
         f.e[clone] = dot(row, f.e, f.n)
         if f.periodic == 0:
             clone_covariance(f, row, clone)
 
 
 @jit
-def _take_covariance(f: Memory, s: int) -> None:
+def _update_covariance(f: FilterRecord, s: int) -> None:
     """Larsen's update at the capture: the covariance now, the states when the sample is here."""
     for i in range(f.rows[s]):
         row = f.C[s, i]
-        f.larsen_expected[s, i] = expected(f, s, i)
-        measure_state(f, row, variance(f, s, i, f.speed_before), 0.0)
+        f.larsen_expected[s, i] = predict_measurement(f, s, i)
+        update_with_states(f, row, compute_row_variance(f, s, i, f.speed_before), 0.0)
         for j in range(i):
-            _carry_gain(f, s, j, row)
+            _propagate_gain(f, s, j, row)
         for k in range(f.n):
             f.larsen_gain[s, i, k] = f.gain[k]
 
 
 @jit
-def _carry_gain(f: Memory, s: int, i: int, row: Row) -> None:
+def _propagate_gain(f: FilterRecord, s: int, i: int, row: Vector) -> None:
     """Larsen's M_k K_s of row i after a measurement `row` (n,) with the gain f.gain."""
-    along = dot(row, f.larsen_gain[s, i], f.n)
+    projected = dot(row, f.larsen_gain[s, i], f.n)
     for k in range(f.n):
-        f.larsen_gain[s, i, k] -= f.gain[k] * along
+        f.larsen_gain[s, i, k] -= f.gain[k] * projected
 
 
 @jit
-def carry_gains(f: Memory, row: Row) -> None:
-    """`_carry_gain` of every sample under way, past a measurement `row` (n,)."""
-    for s in range(SLOW):
+def propagate_larsen_gains(f: FilterRecord, row: Vector) -> None:
+    """`_propagate_gain` of every sample under way, past a measurement `row` (n,)."""
+    for s in range(N_SLOW):
         if f.stamp[s, 0] >= 0:
             for i in range(f.rows[s]):
-                _carry_gain(f, s, i, row)
+                _propagate_gain(f, s, i, row)
 
 
 @jit
-def latch_due(f: Memory, last: int) -> None:
+def store_due_captures(f: FilterRecord, last: int) -> None:
     """Store what every sensor measured that captured at the tick `last`; set its clock on."""
-    for s in range(SLOW):
+    for s in range(N_SLOW):
         if f.period[s] > 0 and last >= f.next[s]:
             frame = (f.next[s] - f.phase[s]) // f.period[s]
-            if f.frames[s] > 0 and last == f.next[s] and f.seen[s, frame % SEEN] != last:
+            if (
+                f.frames[s] > 0
+                and last == f.next[s]
+                and f.known_stamps[s, frame % N_STAMPS] != last
+            ):
                 slot = frame % f.frames[s]
                 if f.late == LARSEN:
-                    _take_covariance(f, s)
+                    _update_covariance(f, s)
                 else:
-                    _clone(f, s, slot)
+                    _clone_states(f, s, slot)
                 f.stamp[s, slot] = last
             f.next[s] += f.period[s]
 
 
 @jit
-def known(f: Memory, s: int, captured: int) -> bool:
+def is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
     """Whether a sample of a sensor on its clock came before or is refused; it is counted."""
     frame = (captured - f.phase[s]) // f.period[s]
     if f.phase[s] + frame * f.period[s] != captured:
         f.counts[COUNTERS.unknown] += 1
         return True
-    remembered = f.seen[s, frame % SEEN]
-    if remembered == captured:
+    last_stamp = f.known_stamps[s, frame % N_STAMPS]
+    if last_stamp == captured:
         f.counts[COUNTERS.duplicates] += 1
         return True
-    if captured < remembered:
+    if captured < last_stamp:
         f.counts[COUNTERS.refused] += 1
         return True
     return False
 
 
 @jit
-def find(f: Memory, s: int, captured: int) -> int:
+def find_clone(f: FilterRecord, s: int, captured: int) -> int:
     """The first clone that a sample measures, DIRECT for the states, STORED_ONE for what else was
     stored at its capture, or DROPPED (and counted)."""
-    if known(f, s, captured):
+    if is_duplicate(f, s, captured):
         return DROPPED
     frame = (captured - f.phase[s]) // f.period[s]
-    found = DROPPED
+    target = DROPPED
     if f.late == CONSTANT:
-        found = STORED_ONE
+        target = STORED_ONE
     elif f.late == IGNORE or captured == f.tick:
-        found = DIRECT
+        target = DIRECT
     elif f.late == STORED and f.tick - captured < WINDOW:
-        found = STORED_ONE
+        target = STORED_ONE
     elif f.frames[s] > 0 and f.stamp[s, frame % f.frames[s]] == captured:
         slot = frame % f.frames[s]
         f.stamp[s, slot] = -1
-        found = STORED_ONE if f.late == LARSEN else f.first_clone[s] + slot * f.rows[s]
-    if found == DROPPED:
+        target = STORED_ONE if f.late == LARSEN else f.first_clone[s] + slot * f.rows[s]
+    if target == DROPPED:
         f.counts[COUNTERS.refused] += 1
     else:
-        f.seen[s, frame % SEEN] = captured
-    return found
+        f.known_stamps[s, frame % N_STAMPS] = captured
+    return target

@@ -4,64 +4,66 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.arrays import at, put
-from ...envs.backend.decorators import apart, jit
-from ...envs.backend.eights import eight, put_eight, scratch, span
+from ...envs.backend.arrays import load_element, store_element
+from ...envs.backend.decorators import jit, noinline
+from ...envs.backend.eights import allocate_scratch, load8, store8, vector_width
 from ...envs.backend.primitives import absolute, maximum, minimum
 from ...envs.record import FAST
-from .covariance import measure_state, predict_covariance
-from .delay import BUFFER, LARSEN, carry_gains
+from .covariance import predict_covariance, update_with_states
+from .delay import BUFFER, LARSEN, propagate_larsen_gains
 from .intersample import (
     DUAL_RATE,
     PSEUDO,
+    apply_gain_shares,
+    apply_next_share,
     correct_between,
-    expect,
-    next_share,
-    share_between,
-    share_fast,
+    predict_slow_rows,
+    update_error,
 )
-from .memory import CORE, COUNTERS, SLOW, Gains, Memory, Row
-from .speed import cell_of, finite, measured_speed, moved, step_row
-from .transition import BETA, KINEMATIC, LINEAR, SLOWEST, VELOCITY_ROLL, build
+from .memory import COUNTERS, N_CORE, N_SLOW, FilterRecord, GainTables, Vector
+from .speed import filter_speed, find_cell, is_finite, is_model_outdated, locate_step_row
+from .transition import BETA, KINEMATIC, LINEAR, MIN_SPEED, VELOCITY_ROLL, build_model
 from .tyres import linearise
 
 
 @jit
-def signal(row: Row, column: Row, factor: Row) -> Any:
+def compute_signal(row: Vector, column: Vector, factor: Vector) -> Any:
     """A signal of a fast row (FAST_WIDTH,): the sum of two of its columns times their factors."""
-    return at(factor, 0) * at(row, at(column, 0)) + at(factor, 1) * at(row, at(column, 1))
+    return load_element(factor, 0) * load_element(row, load_element(column, 0)) + load_element(
+        factor, 1
+    ) * load_element(row, load_element(column, 1))
 
 
 @jit
-def _measure_noise(f: Memory, now: float) -> None:
+def _estimate_noise(f: FilterRecord, accel_y: float) -> None:
     """The variance of a_y from its second differences, which a car's motion hardly has.
 
     White noise of variance r gives them 6 r; what is far beyond counts as 9 times what is expected.
     """
-    second = now - 2.0 * f.y_past[0] + f.y_past[1]
-    if finite(second):
+    second_difference = accel_y - 2.0 * f.y_past[0] + f.y_past[1]
+    if is_finite(second_difference):
         r = f.r_fast[f.accel_row]
-        seen = minimum(second * second * (1.0 / 6.0), 9.0 * r)
-        f.r_fast[f.accel_row] = maximum(r + f.r_share * (seen - r), f.r_told)
-    f.y_past[1], f.y_past[0] = f.y_past[0], now
+        sample_variance = minimum(second_difference * second_difference * (1.0 / 6.0), 9.0 * r)
+        f.r_fast[f.accel_row] = maximum(r + f.r_share * (sample_variance - r), f.r_told)
+    f.y_past[1], f.y_past[0] = f.y_past[0], accel_y
 
 
 @jit
-def _scale(f: Memory) -> None:
+def _write_scale_column(f: FilterRecord) -> None:
     """The accelerometer's row has what it should measure now in the column of its scale's error;
     at a standstill nothing of the scale is seen."""
     row = f.C_fast[f.accel_row]
     row[f.scaled] = 0.0
-    if f.speed <= SLOWEST:
+    if f.speed <= MIN_SPEED:
         return
-    felt = f.rest_fast[f.accel_row] + f.D_fast[f.accel_row, 0] * f.u[0]
+    specific_force = f.rest_fast[f.accel_row] + f.D_fast[f.accel_row, 0] * f.u[0]
     for k in range(f.n):
-        felt += row[k] * f.x[k]
-    row[f.scaled] = felt
+        specific_force += row[k] * f.x[k]
+    row[f.scaled] = specific_force
 
 
 @jit
-def _check_steering(f: Memory) -> None:
+def _check_steering(f: FilterRecord) -> None:
     """A steering angle (the first input) that jumps is none until the next row confirms it."""
     steer = f.u_new[0]
     if absolute(steer - f.steer_before) > f.steer_jump:
@@ -70,72 +72,76 @@ def _check_steering(f: Memory) -> None:
 
 
 @jit
-def read(f: Memory, row: Row, now: float) -> None:
+def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
     """Take a fast row (FAST_WIDTH,): its inputs (the last finite ones), measurements and speed.
 
-    now: this sample of the speed, m/s. The model is built anew where it has to be.
+    wheel_speed: this sample of the speed, m/s. The model is built anew where it has to be.
     """
-    fine = True
+    is_sound = True
     for i in range(f.inputs):
-        f.u_new[i] = signal(row, f.u_column[i], f.u_factor[i])
+        f.u_new[i] = compute_signal(row, f.u_column[i], f.u_factor[i])
     if f.steer_jump > 0.0:
         _check_steering(f)
     for i in range(f.inputs):
-        fine = fine and finite(f.u_new[i])
-    if fine:
+        is_sound = is_sound and is_finite(f.u_new[i])
+    if is_sound:
         for i in range(f.inputs):
             f.u[i] = f.u_new[i]
     else:
         f.counts[COUNTERS.invalid] += 1
     for i in range(f.fasts):
-        f.y[i] = signal(row, f.y_column[i], f.y_factor[i])
+        f.y[i] = compute_signal(row, f.y_column[i], f.y_factor[i])
     if f.r_share > 0.0:
-        _measure_noise(f, f.y[f.accel_row])
+        _estimate_noise(f, f.y[f.accel_row])
     turning, f.speed_before = f.turning, f.model_speed
-    if (f.kind == KINEMATIC or f.kind == VELOCITY_ROLL) and finite(row[FAST.gyro]):
+    if (f.kind == KINEMATIC or f.kind == VELOCITY_ROLL) and is_finite(row[FAST.gyro]):
         turning = row[FAST.gyro]
-    renew = turning != f.turning
+    is_outdated = turning != f.turning
     if f.measured == 1:
-        f.speed = measured_speed(f, now)
-        if moved(f, f.speed):
-            renew = True
-            f.cell = cell_of(f, f.speed)
-    if renew:
-        build(f, f.speed if f.measured == 0 or moved(f, f.speed) else f.model_speed, turning)
+        f.speed = filter_speed(f, wheel_speed)
+        if is_model_outdated(f, f.speed):
+            is_outdated = True
+            f.cell = find_cell(f, f.speed)
+    if is_outdated:
+        build_model(
+            f,
+            f.speed if f.measured == 0 or is_model_outdated(f, f.speed) else f.model_speed,
+            turning,
+        )
 
 
 @jit
-def _predict(f: Memory, v: Row) -> None:
+def _predict(f: FilterRecord, v: Vector) -> None:
     """v <- F v on the states of a vector (n,) or longer."""
-    n, new, step = f.n, scratch(f.P, 1, CORE), span(f.P)
+    n, new, step = f.n, allocate_scratch(f.P, 1, N_CORE), vector_width(f.P)
     for j in range(0, n, step):
-        total = eight(f.keep, j) * eight(v, j)
+        total = load8(f.keep, j) * load8(v, j)
         for k in range(n):
-            total = total + at(v, k) * eight(f.GT, k, j)
-        put_eight(new, total, 0, j)
+            total = total + load_element(v, k) * load8(f.GT, k, j)
+        store8(new, total, 0, j)
     for j in range(0, n, step):
-        put_eight(v, eight(new, 0, j), j)
+        store8(v, load8(new, 0, j), j)
 
 
 @jit
-def propagate(f: Memory, u: Row) -> None:
+def propagate(f: FilterRecord, u: Vector) -> None:
     """x <- F x + H u for the inputs u (INPUTS,), and P with it."""
-    step = span(f.P)
+    step = vector_width(f.P)
     _predict(f, f.x)
     for j in range(0, f.dense, step):
-        total = eight(f.x, j)
+        total = load8(f.x, j)
         for k in range(f.inputs):
-            total = total + at(u, k) * eight(f.HT, k, j)
-        put_eight(f.x, total, j)
+            total = total + load_element(u, k) * load8(f.HT, k, j)
+        store8(f.x, total, j)
     if f.kind == LINEAR or f.tyres > 0:
         for j in range(0, f.n, step):
-            put_eight(f.x, eight(f.x, j) + eight(f.drift, j), j)
+            store8(f.x, load8(f.x, j) + load8(f.drift, j), j)
     if f.periodic == 0:
         predict_covariance(f)
 
 
 @jit
-def _change_speed(f: Memory) -> None:
+def _scale_beta(f: FilterRecord) -> None:
     """beta = v_y / V at the model's new speed V, since v_y is what stays."""
     f.x[BETA] *= f.stretch
     f.e[BETA] *= f.stretch
@@ -144,87 +150,89 @@ def _change_speed(f: Memory) -> None:
             f.P[BETA, i] *= f.stretch
         for i in range(f.total):
             f.P[i, BETA] *= f.stretch
-        for s in range(SLOW):
+        for s in range(N_SLOW):
             for i in range(f.rows[s]):
                 f.larsen_gain[s, i, BETA] *= f.stretch
     f.stretch = 1.0
 
 
-@apart
-def advance_state(f: Memory, u: Row) -> None:
+@noinline
+def advance_state(f: FilterRecord, u: Vector) -> None:
     """`propagate` with the model of now, and what else is carried along."""
     if f.stretch != 1.0:
-        _change_speed(f)
+        _scale_beta(f)
     if f.tyres > 0 and (f.tick % f.again == 0 or f.late == BUFFER):
         linearise(f, u[0])
-        build(f, f.model_speed, f.turning)
+        build_model(f, f.model_speed, f.turning)
         if f.scaled > 0:
-            _scale(f)
+            _write_scale_column(f)
     propagate(f, u)
     if f.between == PSEUDO:
         _predict(f, f.e)
     if f.periodic == 0 and f.late == LARSEN:
-        for s in range(SLOW):
+        for s in range(N_SLOW):
             if f.stamp[s, 0] >= 0:
                 for i in range(f.rows[s]):
                     _predict(f, f.larsen_gain[s, i])
 
 
 @jit
-def residual_of(f: Memory, i: int) -> Any:
+def compute_residual(f: FilterRecord, i: int) -> Any:
     """The residual of the fast measurement i."""
-    residual = at(f.y, i) - at(f.rest_fast, i)
+    residual = load_element(f.y, i) - load_element(f.rest_fast, i)
     for k in range(f.n):
-        residual = residual - at(f.C_fast, i, k) * at(f.x, k)
+        residual = residual - load_element(f.C_fast, i, k) * load_element(f.x, k)
     for j in range(f.inputs):
-        residual = residual - at(f.D_fast, i, j) * at(f.u, j)
+        residual = residual - load_element(f.D_fast, i, j) * load_element(f.u, j)
     return residual
 
 
 @jit
-def _correct_joint(f: Memory, gains: Gains) -> None:
+def _correct_joint(f: FilterRecord, gains: GainTables) -> None:
     """x += K residuals with residuals that are all taken before, in f.eps."""
     for i in range(f.fasts):
-        K = gains[f.cell, step_row(f) + i]
+        K = gains[f.cell, locate_step_row(f) + i]
         for j in range(f.total):
             f.x[j] += K[j] * f.eps[i]
 
 
-@apart
-def correct_fast(f: Memory, gains: Gains) -> None:
+@noinline
+def correct_fast(f: FilterRecord, gains: GainTables) -> None:
     """Correct by the fast measurements in f.y; what is not finite is counted and skipped."""
     for i in range(f.fasts):
-        if not finite(f.y[i]):
+        if not is_finite(f.y[i]):
             f.counts[COUNTERS.invalid] += 1
     if f.between == PSEUDO:
-        expect(f, f.first_slow)
+        predict_slow_rows(f, f.first_slow)
     if f.joint == 1:
         for i in range(f.fasts):
-            residual = residual_of(f, i)
-            f.eps[i] = residual if finite(residual) else 0.0
+            residual = compute_residual(f, i)
+            f.eps[i] = residual if is_finite(residual) else 0.0
         if f.between == PSEUDO:
             correct_between(f, gains, f.first_slow)
         else:
             _correct_joint(f, gains)
         return
     for i in range(f.fasts):
-        residual = residual_of(f, i)
-        if not finite(residual):
+        residual = compute_residual(f, i)
+        if not is_finite(residual):
             f.eps[i] = 0.0
             continue
         if f.periodic == 1:
-            step = step_row(f) + i
+            step = locate_step_row(f) + i
             for j in range(f.total):
-                put(f.x, at(f.x, j) + at(gains, f.cell, step, j) * residual, j)
+                store_element(
+                    f.x, load_element(f.x, j) + load_element(gains, f.cell, step, j) * residual, j
+                )
             continue
-        measure_state(f, f.C_fast[i], f.r_fast[i], residual)
+        update_with_states(f, f.C_fast[i], f.r_fast[i], residual)
         for j in range(0, f.total, 8):  # the design of periodic gains reads them, too
-            put_eight(f.share, eight(f.gain, j), i, j)
+            store8(f.share, load8(f.gain, j), i, j)
         if f.between == PSEUDO:
-            share_fast(f, i, residual)
+            update_error(f, i, residual)
         if f.late == LARSEN:
-            carry_gains(f, f.C_fast[i])
+            propagate_larsen_gains(f, f.C_fast[i])
     if f.between == PSEUDO:
-        share_between(f, f.first_slow)
+        apply_gain_shares(f, f.first_slow)
     elif f.between == DUAL_RATE:
-        next_share(f, gains, f.first_slow)
+        apply_next_share(f, gains, f.first_slow)

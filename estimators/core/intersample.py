@@ -11,39 +11,39 @@ innovation (`design.dual_rate`). single-rate: a filter that listens only at the 
 from typing import Any
 
 from ...envs.backend.decorators import jit
-from .covariance import dot, expected, measure_clone, measure_state
-from .innovation import noise_of
-from .memory import Gains, Memory, Row
-from .speed import frame_row
+from .covariance import dot, predict_measurement, update_with_clone, update_with_states
+from .innovation import compute_packet_variance
+from .memory import FilterRecord, GainTables, Vector
+from .speed import locate_frame_row
 
 NONE, PSEUDO, DUAL_RATE = range(3)
 """Codes of the field `between`."""
 
 
 @jit
-def _measured(f: Memory, s: int, i: int, v: Row) -> Any:
+def _apply_row(f: FilterRecord, s: int, i: int, v: Vector) -> Any:
     """Row i of sensor s applied to a vector of states and clones (total,): its clone, if it has."""
     return v[f.first_clone[s] + i] if f.frames[s] > 0 else dot(f.C[s, i], v, f.n)
 
 
 @jit
-def expect(f: Memory, s: int) -> None:
+def predict_slow_rows(f: FilterRecord, s: int) -> None:
     """What the slow rows are expected to be, and their pseudo-residuals: tie-vision (22)."""
     for i in range(f.rows[s]):
-        cloned = f.frames[s] > 0
-        f.expected[i] = f.x[f.first_clone[s] + i] if cloned else expected(f, s, i)
-        f.eps[f.fasts + i] = _measured(f, s, i, f.e)  # C G e
+        has_clones = f.frames[s] > 0
+        f.expected[i] = f.x[f.first_clone[s] + i] if has_clones else predict_measurement(f, s, i)
+        f.eps[f.fasts + i] = _apply_row(f, s, i, f.e)  # C G e
 
 
 @jit
-def correct_between(f: Memory, gains: Gains, s: int) -> None:
+def correct_between(f: FilterRecord, gains: GainTables, s: int) -> None:
     """Correct x and e, both predicted, by the fast residuals in f.eps and the pseudo-residuals.
 
     gains: in the present table, rows of K^T and then of the inverse's transpose stand behind those
     of the steps and frames.
     """
     x, e, N, m = f.x, f.e, f.total, f.fasts
-    first = frame_row(f, s, f.pattern)
+    first = locate_frame_row(f, s, f.pattern)
     for i in range(m):
         f.e_seen[i] = dot(f.C_fast[i], e, f.n)
     for i in range(m):
@@ -59,10 +59,10 @@ def correct_between(f: Memory, gains: Gains, s: int) -> None:
 
 
 @jit
-def correct_sample(f: Memory, gains: Gains, s: int) -> None:
+def correct_sample(f: FilterRecord, gains: GainTables, s: int) -> None:
     """A sample has come in this tick: its residuals replace the pseudo ones, and e starts anew."""
     m, N, rows = f.fasts, f.total, f.rows[s]
-    first = frame_row(f, s, f.pattern)
+    first = locate_frame_row(f, s, f.pattern)
     for i in range(rows):
         K, real = gains[f.cell, first + m + i], f.residual[i]  # tie-vision (19)
         for j in range(N):
@@ -77,16 +77,16 @@ def correct_sample(f: Memory, gains: Gains, s: int) -> None:
 
 
 @jit
-def share_fast(f: Memory, i: int, residual: float) -> None:
+def update_error(f: FilterRecord, i: int, residual: float) -> None:
     """A fast row's gain f.share[i] was used on x: the same for e."""
-    ahead = dot(f.C_fast[i], f.e, f.n)
+    projected = dot(f.C_fast[i], f.e, f.n)
     f.eps[i] = residual
     for j in range(f.total):
-        f.e[j] -= f.share[i, j] * ahead
+        f.e[j] -= f.share[i, j] * projected
 
 
 @jit
-def share_between(f: Memory, s: int) -> None:
+def apply_gain_shares(f: FilterRecord, s: int) -> None:
     """Correct x and e by the pseudo-residuals with the share of the last sample's gain."""
     for i in range(f.fasts, f.fasts + f.rows[s]):
         for j in range(f.total):
@@ -95,7 +95,7 @@ def share_between(f: Memory, s: int) -> None:
 
 
 @jit
-def share_sample(f: Memory, s: int, first: int, packet: Row) -> None:
+def split_sample_gain(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
     """`correct_sample` with the covariance's gain of this packet (PACKET_WIDTH,), in even shares
     over a period."""
     m, N, rows = f.fasts, f.total, f.rows[s]
@@ -104,15 +104,15 @@ def share_sample(f: Memory, s: int, first: int, packet: Row) -> None:
         for j in range(N):
             f.x[j] -= f.share[m + i, j] * f.eps[m + i]
     for i in range(rows):
-        r = noise_of(f, s, i, packet)
+        r = compute_packet_variance(f, s, i, packet)
         if first >= 0:
-            measure_clone(f, first + i, r, 0.0)
+            update_with_clone(f, first + i, r, 0.0)
         else:
-            measure_state(f, f.C[s, i], r, 0.0)
+            update_with_states(f, f.C[s, i], r, 0.0)
         for k in range(i):  # the rows before it correct what it measures
-            moved = _measured(f, s, i, f.share[m + k])
+            correction = _apply_row(f, s, i, f.share[m + k])
             for j in range(N):
-                f.share[m + k, j] -= f.gain[j] * moved
+                f.share[m + k, j] -= f.gain[j] * correction
         for j in range(N):
             f.share[m + i, j] = f.gain[j] / steps
         f.eps[m + i] = f.residual[i]
@@ -125,9 +125,9 @@ def share_sample(f: Memory, s: int, first: int, packet: Row) -> None:
 
 
 @jit
-def _use_share(f: Memory, gains: Gains, s: int) -> None:
+def _apply_share(f: FilterRecord, gains: GainTables, s: int) -> None:
     """x += the share of the last innovation that is due now."""
-    first = frame_row(f, s, f.pattern) + f.since * f.rows[s]
+    first = locate_frame_row(f, s, f.pattern) + f.since * f.rows[s]
     for i in range(f.rows[s]):
         K = gains[f.cell, first + i]
         for j in range(f.total):
@@ -135,18 +135,18 @@ def _use_share(f: Memory, gains: Gains, s: int) -> None:
 
 
 @jit
-def begin_shares(f: Memory, gains: Gains, s: int) -> None:
+def start_shares(f: FilterRecord, gains: GainTables, s: int) -> None:
     """A sample has come: store its innovation and use its first share."""
     for i in range(f.rows[s]):
         f.innovation[i] = f.residual[i]
     f.since = 0
-    _use_share(f, gains, s)
+    _apply_share(f, gains, s)
 
 
 @jit
-def next_share(f: Memory, gains: Gains, s: int) -> None:
+def apply_next_share(f: FilterRecord, gains: GainTables, s: int) -> None:
     """The next share, as long as there is one."""
     if f.since >= 0:
         f.since += 1
         if f.since < f.cycle:
-            _use_share(f, gains, s)
+            _apply_share(f, gains, s)

@@ -21,26 +21,28 @@ seen only after some tenths of a second: until then merging lets the hypothesis 
 from math import exp, log
 from typing import Any
 
-from ...envs.backend.decorators import apart, copied, jit
-from ...envs.backend.eights import eight, put_eight
+from ...envs.backend.decorators import copy_into, jit, noinline
+from ...envs.backend.eights import load8, store8
 from ...envs.backend.elementary import sincos
 from ...envs.backend.primitives import maximum
 from ...envs.record import PACKET
-from .innovation import dilution, loosen
-from .memory import COUNTERS, WINDOW, Filters, Gains, Memory, Row
-from .packets import receive, receive_sample
-from .speed import finite
+from .innovation import inflate_covariance, interpolate_hdop
+from .memory import COUNTERS, WINDOW, FilterRecord, FilterRecords, GainTables, Vector
+from .packets import process_packet, process_sample
+from .speed import is_finite
 from .transition import BETA
 
-LEAST = -60.0  # of a member's weight, below the likeliest
+MIN_LOG_WEIGHT = -60.0  # of a member's weight, below the likeliest
 CALM, GUSTY, CHANGED, SETTLING = range(1, 5)
 """Layers of the members that interact."""
-GUSTS, LULLS = 0.03, 0.3  # 1/s, of gusts that begin and end
-CHANGES, SETTLES, TRUSTS = 0.1, 2.0, 0.3  # 1/s, of tyres: into CHANGED, SETTLING, CALM
+GUST_RATE, LULL_RATE = 0.03, 0.3  # 1/s, of gusts that begin and end
+CHANGE_RATE, SETTLE_RATE, TRUST_RATE = 0.1, 2.0, 0.3  # 1/s, of tyres: into CHANGED, SETTLING, CALM
 
 
 @jit
-def pass_on(first: Memory, second: Memory, gains: Gains, packet: Row) -> None:
+def update_second_layer(
+    first: FilterRecord, second: FilterRecord, gains: GainTables, packet: Vector
+) -> None:
     """Correct the second layer by a packet (PACKET_WIDTH,) that the first has used, as a velocity:
     v_x = V cos(beta), v_y = V sin(beta).
 
@@ -54,35 +56,35 @@ def pass_on(first: Memory, second: Memory, gains: Gains, packet: Row) -> None:
         beta = first.predicted[captured % WINDOW, BETA]
     sine, cosine = sincos(beta)
     V = packet[first.speed_column[s]]
-    if not finite(V):
+    if not is_finite(V):
         first.counts[COUNTERS.invalid] += 1
         return
     velocity = second.sample
-    copied(packet, velocity)
+    copy_into(packet, velocity)
     velocity[PACKET.value] = V * cosine
     velocity[PACKET.value + 1] = V * sine
-    factor = dilution(first, s, packet)
-    along = second.r_speed * factor * factor
-    second.r[s, 0] = along
-    second.r[s, 1] = V * V * first.P[BETA, BETA] + along * sine * sine
-    receive_sample(second, gains)
+    factor = interpolate_hdop(first, s, packet)
+    speed_variance = second.r_speed * factor * factor
+    second.r[s, 0] = speed_variance
+    second.r[s, 1] = V * V * first.P[BETA, BETA] + speed_variance * sine * sine
+    process_sample(second, gains)
 
 
 @jit
-def own(layers: Filters) -> int:
+def first_member(layers: FilterRecords) -> int:
     """The first layer that measures: 1 where there is a bank, else 0."""
     return 1 if layers[0].members > 0 else 0
 
 
 @jit
-def receive_beside(layers: Filters, gains: Gains, packet: Row) -> None:
-    """`receive` a packet by every member behind the first one."""
+def process_packet_members(layers: FilterRecords, gains: GainTables, packet: Vector) -> None:
+    """`process_packet` a packet by every member behind the first one."""
     for m in range(2, len(layers)):
-        receive(layers[m], gains, packet)
+        process_packet(layers[m], gains, packet)
 
 
 @jit
-def _likeliest(layers: Filters) -> int:
+def _find_likeliest(layers: FilterRecords) -> int:
     best = 1
     for m in range(2, len(layers)):
         if layers[m].weight > layers[best].weight:
@@ -91,21 +93,24 @@ def _likeliest(layers: Filters) -> int:
 
 
 @jit
-def _set_level(f: Memory, i: int, level: Any) -> None:
+def _set_level(f: FilterRecord, i: int, level: Any) -> None:
     """Disturbance i comes with `level` of its configured variance."""
-    at, more = f.dense + i, level / f.level[i]
+    index, ratio = f.dense + i, level / f.level[i]
     f.level[i] = level
-    f.q_known[i] *= more
-    f.Q[at, at] *= more
+    f.q_known[i] *= ratio
+    f.Q[index, index] *= ratio
 
 
-@apart
-def respawn(layers: Filters) -> None:
+@noinline
+def replace_least_likely(layers: FilterRecords) -> None:
     """The least likely member becomes the likeliest, but for tyres that may be others now."""
-    best = _likeliest(layers)
-    top, worst = layers[best].weight, 1
+    best = _find_likeliest(layers)
+    max_weight, worst = layers[best].weight, 1
     for m in range(1, len(layers)):
-        layers[m].weight, layers[m].fresh = maximum(layers[m].weight - top, LEAST), 0.0
+        layers[m].weight, layers[m].fresh = (
+            maximum(layers[m].weight - max_weight, MIN_LOG_WEIGHT),
+            0.0,
+        )
         if layers[m].weight <= layers[worst].weight and m != best:
             worst = m
     f = layers[worst]
@@ -118,118 +123,126 @@ def respawn(layers: Filters) -> None:
         _set_level(f, 1, moment)
         f.prior[i, i], f.prior[i + 1, i + 1] = first
     for i in range(2):
-        loosen(f, f.tyres + i, f.spread)
+        inflate_covariance(f, f.tyres + i, f.spread)
     f.weight, f.fresh = f.hazard, f.alert
 
 
 @jit
-def _copy_moments(source: Memory, target: Memory) -> None:
+def _copy_moments(source: FilterRecord, target: FilterRecord) -> None:
     """Mean and covariance of states and clones."""
     for j in range(0, source.total, 8):
-        put_eight(target.x, eight(source.x, j), j)
+        store8(target.x, load8(source.x, j), j)
         for i in range(source.total):
-            put_eight(target.P, eight(source.P, i, j), i, j)
+            store8(target.P, load8(source.P, i, j), i, j)
 
 
 @jit
-def _give(source: Memory, share: Any) -> Any:
+def _split_weight(source: FilterRecord, share: Any) -> Any:
     """The probability (a member's `weight`, here) that leaves it."""
-    left = share * source.weight
-    source.weight -= left
-    return left
+    moved = share * source.weight
+    source.weight -= moved
+    return moved
 
 
 @jit
-def _merge(source: Memory, probability: Any, target: Memory) -> Any:
+def _merge(source: FilterRecord, probability: Any, target: FilterRecord) -> Any:
     """Mean and covariance of a member with what comes from a source; the source's share."""
     target.weight += probability
     share = probability / target.weight
-    both = share * (1.0 - share)
+    product = share * (1.0 - share)
     for j in range(0, target.total, 8):
-        off = eight(source.x, j) - eight(target.x, j)
+        offset = load8(source.x, j) - load8(target.x, j)
         for i in range(target.total):
-            own, more = eight(target.P, i, j), (source.x[i] - target.x[i]) * off * both
-            put_eight(target.P, own + (eight(source.P, i, j) - own) * share + more, i, j)
+            target_entry, spread = (
+                load8(target.P, i, j),
+                (source.x[i] - target.x[i]) * offset * product,
+            )
+            store8(
+                target.P,
+                target_entry + (load8(source.P, i, j) - target_entry) * share + spread,
+                i,
+                j,
+            )
     for i in range(target.total):
         target.x[i] += share * (source.x[i] - target.x[i])
     return share
 
 
 @jit
-def _calm_down(f: Memory) -> None:
+def _remove_gust(f: FilterRecord) -> None:
     """Force and moment are what they are without a gust, whatever they were."""
     for i in range(2):
-        at = f.dense + i
-        f.x[at] = 0.0
+        index = f.dense + i
+        f.x[index] = 0.0
         for j in range(f.total):
-            f.P[at, j] = 0.0
-            f.P[j, at] = 0.0
-        f.P[at, at] = f.q_known[i] / f.q_share
+            f.P[index, j] = 0.0
+            f.P[j, index] = 0.0
+        f.P[index, index] = f.q_known[i] / f.q_share
 
 
-@apart
-def interact(layers: Filters) -> None:
+@noinline
+def run_imm_step(layers: FilterRecords) -> None:
     """The members' moments and weights after a step of the chain; layer 0 is its scratch."""
-    best, aside = _likeliest(layers), layers[0]
+    best, calmed = _find_likeliest(layers), layers[0]
     calm, gusty, changed = layers[CALM], layers[GUSTY], layers[CHANGED]
-    settling, top, time = layers[SETTLING], layers[best].weight, calm.respawn * calm.step
+    settling, max_weight, time = layers[SETTLING], layers[best].weight, calm.respawn * calm.step
     for m in range(1, len(layers)):
-        layers[m].weight = exp(maximum(layers[m].weight - top, LEAST))
-    _copy_moments(gusty, aside)
-    _calm_down(aside)
-    lulled = _give(gusty, LULLS * time)
-    share = _merge(calm, _give(calm, GUSTS * time), gusty)
+        layers[m].weight = exp(maximum(layers[m].weight - max_weight, MIN_LOG_WEIGHT))
+    _copy_moments(gusty, calmed)
+    _remove_gust(calmed)
+    calm_probability = _split_weight(gusty, LULL_RATE * time)
+    share = _merge(calm, _split_weight(calm, GUST_RATE * time), gusty)
     for i in range(2):
-        loosen(gusty, gusty.dense + i, share * gusty.burst[i])
-    _merge(aside, lulled, calm)
-    _copy_moments(calm, aside)
-    forgotten = _give(calm, CHANGES * time)
-    _merge(settling, _give(settling, TRUSTS * time), calm)
-    _merge(changed, _give(changed, SETTLES * time), settling)
-    share = _merge(aside, forgotten, changed)
+        inflate_covariance(gusty, gusty.dense + i, share * gusty.burst[i])
+    _merge(calmed, calm_probability, calm)
+    _copy_moments(calm, calmed)
+    change_probability = _split_weight(calm, CHANGE_RATE * time)
+    _merge(settling, _split_weight(settling, TRUST_RATE * time), calm)
+    _merge(changed, _split_weight(changed, SETTLE_RATE * time), settling)
+    share = _merge(calmed, change_probability, changed)
     for i in range(2):
-        loosen(changed, changed.tyres + i, share * changed.spread)
+        inflate_covariance(changed, changed.tyres + i, share * changed.spread)
     for m in range(1, len(layers)):
         layers[m].weight = log(layers[m].weight)
 
 
 @jit
-def renew(layers: Filters) -> None:
+def update_bank(layers: FilterRecords) -> None:
     """The bank's own step, now and then."""
     if layers[0].burst[0] > 0.0:
-        interact(layers)
+        run_imm_step(layers)
     else:
-        respawn(layers)
+        replace_least_likely(layers)
 
 
 @jit
-def _share(layers: Filters, m: int, best: int) -> Any:
-    return exp(maximum(layers[m].weight - layers[best].weight, LEAST))
+def _compute_likelihood(layers: FilterRecords, m: int, best: int) -> Any:
+    return exp(maximum(layers[m].weight - layers[best].weight, MIN_LOG_WEIGHT))
 
 
-@apart
-def mix(layers: Filters) -> None:
+@noinline
+def compute_mixture(layers: FilterRecords) -> None:
     """The mean and covariance of the mixture into layer 0."""
-    best = _likeliest(layers)
-    out, front = layers[best], layers[0]
-    total, n = 0.0, out.n
+    best = _find_likeliest(layers)
+    likeliest, mixture = layers[best], layers[0]
+    total, n = 0.0, likeliest.n
     for m in range(1, len(layers)):
-        total += _share(layers, m, best)
+        total += _compute_likelihood(layers, m, best)
     for i in range(n):
-        front.x[i] = 0.0
+        mixture.x[i] = 0.0
         for j in range(0, n, 8):
-            put_eight(front.P, 0.0, i, j)
+            store8(mixture.P, 0.0, i, j)
     for m in range(1, len(layers)):
-        share = _share(layers, m, best) / total
+        share = _compute_likelihood(layers, m, best) / total
         for i in range(n):
-            front.x[i] += share * layers[m].x[i]
+            mixture.x[i] += share * layers[m].x[i]
     for m in range(1, len(layers)):
-        share, f = _share(layers, m, best) / total, layers[m]
+        share, f = _compute_likelihood(layers, m, best) / total, layers[m]
         for j in range(0, n, 8):
-            off = eight(f.x, j) - eight(front.x, j)
+            offset = load8(f.x, j) - load8(mixture.x, j)
             for i in range(n):
-                spread = eight(f.P, i, j) + (f.x[i] - front.x[i]) * off
-                put_eight(front.P, eight(front.P, i, j) + share * spread, i, j)
-    front.tick, front.speed, front.nis = out.tick, out.speed, layers[1].nis
-    for i in range(len(front.counts)):
-        front.counts[i] = layers[1].counts[i]
+                spread = load8(f.P, i, j) + (f.x[i] - mixture.x[i]) * offset
+                store8(mixture.P, load8(mixture.P, i, j) + share * spread, i, j)
+    mixture.tick, mixture.speed, mixture.nis = likeliest.tick, likeliest.speed, layers[1].nis
+    for i in range(len(mixture.counts)):
+        mixture.counts[i] = layers[1].counts[i]

@@ -8,27 +8,37 @@ refused and counted. The gate judges a sample once, by what was known of the tim
 that it refuses leaves everything as it was.
 """
 
-from ...envs.backend.decorators import apart, copied, jit
+from ...envs.backend.decorators import copy_into, jit, noinline
 from ...envs.backend.primitives import maximum
 from ...envs.record import PACKET
-from .delay import direct
+from .delay import get_direct
 from .fast import advance_state, correct_fast
-from .memory import COUNTERS, EVERY, RECENT, SLOW, SNAPSHOTS, WINDOW, Gains, Memory, Row
-from .transition import VELOCITY_ROLL, build
-from .update import measure
+from .memory import (
+    COUNTERS,
+    N_RECENT,
+    N_SLOW,
+    N_SNAPSHOTS,
+    SNAPSHOT_INTERVAL,
+    WINDOW,
+    FilterRecord,
+    GainTables,
+    Vector,
+)
+from .transition import VELOCITY_ROLL, build_model
+from .update import update_filter
 
-_GONE = -1  # the captured tick of a place that is empty
-_NOW = SNAPSHOTS  # the snapshot of now, while the past is filtered anew
+_EMPTY_STAMP = -1  # the captured tick of a place that is empty
+_NOW_SLOT = N_SNAPSHOTS  # the snapshot of now, while the past is filtered anew
 
 
 @jit
-def _slot(f: Memory, tick: int) -> int:
+def _find_slot(f: FilterRecord, tick: int) -> int:
     """The snapshot after the fast row of a tick, before its samples."""
-    return int((tick - f.start) // EVERY % SNAPSHOTS)
+    return int((tick - f.start) // SNAPSHOT_INTERVAL % N_SNAPSHOTS)
 
 
 @jit
-def _snapshot(f: Memory, slot: int) -> None:
+def _store_snapshot(f: FilterRecord, slot: int) -> None:
     """Store states and covariance in a snapshot."""
     for i in range(f.n):
         f.snapshot_x[slot, i] = f.x[i]
@@ -37,7 +47,7 @@ def _snapshot(f: Memory, slot: int) -> None:
 
 
 @jit
-def _restore(f: Memory, slot: int) -> None:
+def _restore(f: FilterRecord, slot: int) -> None:
     """The states and covariance of a snapshot."""
     for i in range(f.n):
         f.x[i] = f.snapshot_x[slot, i]
@@ -46,61 +56,61 @@ def _restore(f: Memory, slot: int) -> None:
 
 
 @jit
-def remember(f: Memory) -> None:
+def store_history(f: FilterRecord) -> None:
     """Store the inputs, fast measurements and model of the present tick."""
     slot = f.tick % WINDOW
-    copied(f.u, f.past_u[slot])
-    copied(f.y, f.past_y[slot])
+    copy_into(f.u, f.past_u[slot])
+    copy_into(f.y, f.past_y[slot])
     f.past_speed[slot], f.past_turning[slot] = f.model_speed, f.turning
     f.past_road_turn[slot] = f.road_turn
-    if (f.tick - f.start) % EVERY == 0:
-        _snapshot(f, _slot(f, f.tick))
+    if (f.tick - f.start) % SNAPSHOT_INTERVAL == 0:
+        _store_snapshot(f, _find_slot(f, f.tick))
 
 
 @jit
-def _recall(f: Memory, tick: int) -> None:
+def _restore_history(f: FilterRecord, tick: int) -> None:
     """Inputs, fast measurements and model of a tick."""
     slot = tick % WINDOW
-    copied(f.past_u[slot], f.u)
-    copied(f.past_y[slot], f.y)
+    copy_into(f.past_u[slot], f.u)
+    copy_into(f.past_y[slot], f.y)
     f.road_turn = f.past_road_turn[slot]
     speed, turning = f.past_speed[slot], f.past_turning[slot]
     if speed != f.model_speed or turning != f.turning:
-        build(f, speed, turning)
+        build_model(f, speed, turning)
 
 
 @jit
-def _oldest(f: Memory) -> int:
+def _find_oldest(f: FilterRecord) -> int:
     """The place to store a packet in: an empty one, or that of the earliest captured."""
     place = 0
-    for i in range(RECENT):
+    for i in range(N_RECENT):
         if f.recent[i, PACKET.captured] < f.recent[place, PACKET.captured]:
             place = i
     return place
 
 
 @jit
-def _store(f: Memory, s: int, packet: Row, place: int) -> None:
+def _store_packet(f: FilterRecord, s: int, packet: Vector, place: int) -> None:
     """Store a packet and its noise; what stood in its place is lost."""
     f.lost = maximum(f.lost, int(f.recent[place, PACKET.captured]))
-    copied(packet, f.recent[place])
-    copied(f.r[s], f.recent_r[place])
+    copy_into(packet, f.recent[place])
+    copy_into(f.r[s], f.recent_r[place])
 
 
 @jit
-def _twice(f: Memory, s: int, captured: int) -> bool:
+def _is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
     """Whether a sample is a duplicate of a stored one."""
-    for i in range(RECENT):
+    for i in range(N_RECENT):
         if f.recent[i, PACKET.captured] == captured and f.recent[i, PACKET.sensor] == s:
             return True
     return False
 
 
 @jit
-def _since(f: Memory, first: int) -> int:
+def _collect_samples(f: FilterRecord, first: int) -> int:
     """Collect in f.replay the good samples captured at `first` or later; returns how many."""
     count = 0
-    for i in range(RECENT):
+    for i in range(N_RECENT):
         if f.recent[i, PACKET.captured] >= first and f.recent[i, PACKET.quality] > 0.0:
             f.replay[count] = i
             count += 1
@@ -108,77 +118,81 @@ def _since(f: Memory, first: int) -> int:
 
 
 @jit
-def _measure(f: Memory, gains: Gains, s: int, place: int, new: bool) -> bool:
+def _apply_stored(f: FilterRecord, gains: GainTables, s: int, place: int, is_new: bool) -> bool:
     """Use a stored sample; False if it is new and the gate refuses it, now and for ever."""
     if f.kind == VELOCITY_ROLL:  # its noise comes with each packet
-        copied(f.recent_r[place], f.r[s])
-    copied(f.recent[place], f.sample)
-    passed = measure(f, gains, s, direct(), f.sample, new)
+        copy_into(f.recent_r[place], f.r[s])
+    copy_into(f.recent[place], f.sample)
+    passed = update_filter(f, gains, s, get_direct(), f.sample, is_new)
     if not passed:
         f.recent[place, PACKET.quality] = 0.0
     return passed
 
 
 @jit
-def _measure_again(f: Memory, gains: Gains, tick: int, count: int, new: int) -> bool:
-    """Use the samples captured at a tick, one sensor after the other; False as `_measure`."""
-    for s in range(SLOW):
+def _apply_tick_samples(
+    f: FilterRecord, gains: GainTables, tick: int, count: int, new_place: int
+) -> bool:
+    """Use the samples captured at a tick, one sensor after the other; False as `_apply_stored`."""
+    for s in range(N_SLOW):
         for i in range(count):
             place = f.replay[i]
             due = f.recent[place, PACKET.captured] == tick and f.recent[place, PACKET.sensor] == s
-            if due and not _measure(f, gains, s, place, place == new):
+            if due and not _apply_stored(f, gains, s, place, place == new_place):
                 return False
     return True
 
 
 @jit
-def _filter_anew(f: Memory, gains: Gains, first: int, new: int) -> bool:
+def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: int) -> bool:
     """Filter anew from the snapshot at `first` to now; False, and back to now, if the gate refuses
-    the sample at the place `new`."""
-    now, invalid, count = f.tick, f.counts[COUNTERS.invalid], _since(f, first)
-    _snapshot(f, _NOW)
-    _restore(f, _slot(f, first))
+    the sample at the place `new_place`."""
+    now, invalid, count = f.tick, f.counts[COUNTERS.invalid], _collect_samples(f, first)
+    _store_snapshot(f, _NOW_SLOT)
+    _restore(f, _find_slot(f, first))
     passed = True
     for tick in range(first, now + 1):
-        _recall(f, tick)
+        _restore_history(f, tick)
         if tick > first:
             advance_state(f, f.u)
             correct_fast(f, gains)
-            if (tick - f.start) % EVERY == 0:
-                _snapshot(f, _slot(f, tick))
+            if (tick - f.start) % SNAPSHOT_INTERVAL == 0:
+                _store_snapshot(f, _find_slot(f, tick))
         f.stretch = 1.0  # what was restored is of this tick's speed
-        if not _measure_again(f, gains, tick, count, new):  # no snapshot was changed before
+        if not _apply_tick_samples(
+            f, gains, tick, count, new_place
+        ):  # no snapshot was changed before
             passed = False
             break
     f.counts[COUNTERS.invalid] = invalid  # each row was counted when it came
     if not passed:
-        _recall(f, now)
-        _restore(f, _NOW)
+        _restore_history(f, now)
+        _restore(f, _NOW_SLOT)
         f.stretch = 1.0
     return passed
 
 
-@apart
-def take_late(f: Memory, gains: Gains, s: int, packet: Row) -> bool:
+@noinline
+def rewind_update(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -> bool:
     """Use a packet (PACKET_WIDTH,) of any age within the window; whether it was used."""
     captured = int(packet[PACKET.captured])
-    first = f.start + (captured - f.start) // EVERY * EVERY
-    if _twice(f, s, captured):
+    first = f.start + (captured - f.start) // SNAPSHOT_INTERVAL * SNAPSHOT_INTERVAL
+    if _is_duplicate(f, s, captured):
         f.counts[COUNTERS.duplicates] += 1
         return False
-    place = _oldest(f)
+    place = _find_oldest(f)
     if f.tick - first >= WINDOW or first <= maximum(f.lost, int(f.recent[place, PACKET.captured])):
         f.counts[COUNTERS.refused] += 1
         return False
-    _store(f, s, packet, place)
+    _store_packet(f, s, packet, place)
     if captured == f.tick:
-        return _measure(f, gains, s, place, captured == f.tick)
-    return _filter_anew(f, gains, first, place)
+        return _apply_stored(f, gains, s, place, captured == f.tick)
+    return _replay_window(f, gains, first, place)
 
 
 @jit
-def forget(f: Memory) -> None:
+def clear_history(f: FilterRecord) -> None:
     """Empty the window."""
-    f.lost = _GONE
-    for i in range(RECENT):
-        f.recent[i, PACKET.captured] = _GONE
+    f.lost = _EMPTY_STAMP
+    for i in range(N_RECENT):
+        f.recent[i, PACKET.captured] = _EMPTY_STAMP

@@ -9,49 +9,49 @@ from typing import Any
 
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute, maximum, minimum
-from .memory import Memory
-from .transition import SLOWEST
+from .memory import FilterRecord
+from .transition import MIN_SPEED
 
-LARGEST = 1e15  # of a number that a filter takes: below it, whole floats are exact as int
-MOVED = 0.005  # the model is built anew where the speed moved by this share
+MAX_NUMBER = 1e15  # of a number that a filter takes: below it, whole floats are exact as int
+SPEED_TOLERANCE = 0.005  # the model is built anew where the speed moved by this share
 
 
 @jit
-def finite(value: float) -> Any:
+def is_finite(value: float) -> Any:
     """Whether a number is one to calculate with: not NaN, infinite or beyond all measure."""
-    return absolute(value) < LARGEST
+    return absolute(value) < MAX_NUMBER
 
 
 @jit
-def low_passed(speed: Any, now: Any, share: Any) -> Any:
+def smooth_speed(speed: Any, sample: Any, share: Any) -> Any:
     """The low-passed speed in m/s after this sample, which counts by a share."""
-    return speed + share * (now - speed)
+    return speed + share * (sample - speed)
 
 
 @jit
-def off(speed: Any, model_speed: Any) -> Any:
+def is_speed_changed(speed: Any, model_speed: Any) -> Any:
     """Whether a speed in m/s is too far from the model's."""
-    return absolute(maximum(speed, SLOWEST) - model_speed) > MOVED * model_speed
+    return absolute(maximum(speed, MIN_SPEED) - model_speed) > SPEED_TOLERANCE * model_speed
 
 
 @jit
-def measured_speed(f: Memory, now: float) -> Any:
+def filter_speed(f: FilterRecord, sample: float) -> Any:
     """The low-passed mean of the front wheels' speeds in m/s, with this sample of it."""
-    if not finite(now):
+    if not is_finite(sample):
         return f.speed
     if f.model_speed == 0.0:
-        return now
-    return low_passed(f.speed, now, f.smoothing)
+        return sample
+    return smooth_speed(f.speed, sample, f.smoothing)
 
 
 @jit
-def moved(f: Memory, speed: float) -> Any:
+def is_model_outdated(f: FilterRecord, speed: float) -> Any:
     """Whether the model has to be built anew for this speed in m/s."""
-    return off(speed, f.model_speed)
+    return is_speed_changed(speed, f.model_speed)
 
 
 @jit
-def cell_of(f: Memory, speed: float) -> Any:
+def find_cell(f: FilterRecord, speed: float) -> Any:
     """The table of gains nearest to a speed in m/s."""
     if f.spacing == 0.0:
         return 0
@@ -60,23 +60,23 @@ def cell_of(f: Memory, speed: float) -> Any:
 
 
 @jit
-def next_cell(f: Memory, now: float) -> Any:
+def find_next_cell(f: FilterRecord, sample: float) -> Any:
     """The table of gains that a row with this sample of the speed, m/s, will ask for."""
     if f.measured == 1:
-        speed = measured_speed(f, now)
-        if moved(f, speed):
-            return cell_of(f, speed)
+        speed = filter_speed(f, sample)
+        if is_model_outdated(f, speed):
+            return find_cell(f, speed)
     return f.cell
 
 
 @jit
-def step_row(f: Memory) -> Any:
+def locate_step_row(f: FilterRecord) -> Any:
     """The table's row with the gain of the first fast measurement in this step."""
     return 1 + f.at * maximum(f.fasts, 1)
 
 
 @jit
-def frame_row(f: Memory, s: int, frame: int) -> Any:
+def locate_frame_row(f: FilterRecord, s: int, frame: int) -> Any:
     """The row with the gain of sensor s's first row for a frame of the pattern.
 
     frame = pattern: the first row of the rule between samples.

@@ -2,14 +2,14 @@
 
 from typing import Any
 
-from ...envs.backend.arrays import at, put
-from ...envs.backend.decorators import apart, jit
-from ...envs.backend.eights import eight, put_eight, scratch
+from ...envs.backend.arrays import load_element, store_element
+from ...envs.backend.decorators import jit, noinline
+from ...envs.backend.eights import allocate_scratch, load8, store8
 from ...envs.backend.primitives import absolute, maximum
 from ...envs.vehicle.linear import write_kinematic, write_lateral, write_roll
 from ...envs.vehicle.vehicle import GRAVITY
-from .covariance import times
-from .memory import CAR, CORE, INPUTS, SLOW, WIDE, Memory, Row
+from .covariance import multiply_rows
+from .memory import CAR, N_CORE, N_DRIVERS, N_INPUTS, N_SLOW, FilterRecord, Vector
 
 LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES, LINEAR = range(7)
 """Kinds of models; LINEAR is any linear system, whose matrices are arguments."""
@@ -18,17 +18,17 @@ BETA, GAMMA, PSI, Y_L = range(4)
 CURVATURE = 2
 """Place of the road's curvature among a bicycle's inputs."""
 
-SLOWEST = 1.5  # m/s: below it the model stays that of this speed
+MIN_SPEED = 1.5  # m/s: below it the model stays that of this speed
 
 
 @jit
-def _lateral(f: Memory, V: Any) -> None:
+def _build_lateral(f: FilterRecord, V: Any) -> None:
     """tie-vision (8), dakf-stability (5)-(11), a body that rolls and what a_y feels of it."""
     A, B = f.A, f.B
     rolling = 2 if f.rolling > 0 else 0
     write_lateral(A, B, f.car, V, f.dense - f.delayed - rolling, f.inputs, f.preview)
     if f.forces == 1:
-        B[0, INPUTS], B[1, INPUTS + 1] = 1.0 / (f.car[CAR.mass] * V), B[1, 1]
+        B[0, N_INPUTS], B[1, N_INPUTS + 1] = 1.0 / (f.car[CAR.mass] * V), B[1, 1]
     if rolling > 0:
         _write_body(f, V)
     if f.accel_row > 0:
@@ -36,11 +36,11 @@ def _lateral(f: Memory, V: Any) -> None:
     if f.tyres > 0:
         _write_tyres(f, V)
     if f.banked >= 0:  # gravity, which an accelerometer does not feel and the body does not roll by
-        B[0, INPUTS + f.banked] = -GRAVITY / V
+        B[0, N_INPUTS + f.banked] = -GRAVITY / V
 
 
 @jit
-def _write_body(f: Memory, V: Any) -> None:
+def _write_body(f: FilterRecord, V: Any) -> None:
     """phi and phi_rate, and how they push beta: double-layer-gps (1), (3), solved for phi''."""
     A, B, i = f.A, f.B, f.rolling
     share = 1.0 / (1.0 - f.roll_arm * f.sway)
@@ -48,29 +48,29 @@ def _write_body(f: Memory, V: Any) -> None:
     stiffness = share * (f.roll_stiffness - f.roll_arm * GRAVITY)
     write_roll(A, B, i, 0, stiffness, share * f.roll_damping, lift * V * B[0, 0])
     A[i + 1, BETA], A[i + 1, GAMMA] = lift * V * A[0, BETA], lift * V * (A[0, GAMMA] + 1.0)
-    B[i + 1, INPUTS] = lift * V * B[0, INPUTS]  # the force that pushes beta
+    B[i + 1, N_INPUTS] = lift * V * B[0, N_INPUTS]  # the force that pushes beta
     for j in range(f.dense):
         A[0, j] += lag * A[i + 1, j]
     B[0, 0] += lag * B[i + 1, 0]
-    B[0, INPUTS] += lag * B[i + 1, INPUTS]
+    B[0, N_INPUTS] += lag * B[i + 1, N_INPUTS]
 
 
 @jit
-def _write_accel(f: Memory, V: Any) -> None:
+def _write_accel(f: FilterRecord, V: Any) -> None:
     """The specific force a_y = V (beta' + gamma) + g phi, a row with feed-through of steering."""
     row = f.C_fast[f.accel_row]
     for j in range(f.dense):
         row[j] = V * f.A[0, j]
     row[GAMMA] = V * (f.A[0, GAMMA] + 1.0)
     if f.pushed[0] >= 0:  # what comes first behind is no bias
-        row[f.dense] = V * f.B[0, INPUTS]
+        row[f.dense] = V * f.B[0, N_INPUTS]
     if f.rolling > 0:
         row[f.rolling] += GRAVITY
     f.D_fast[f.accel_row, 0] = V * f.B[0, 0]
 
 
 @jit
-def _pushed(f: Memory, V: Any, front: Any, rear: Any) -> Any:
+def _compute_rates(f: FilterRecord, V: Any, front: Any, rear: Any) -> Any:
     """(beta', gamma', phi_rate') by forces of the axles in N."""
     beta = (front + rear) / (f.car[CAR.mass] * V)
     gamma = (f.car[CAR.front_arm] * front - f.car[CAR.rear_arm] * rear) / f.car[CAR.yaw_inertia]
@@ -81,20 +81,20 @@ def _pushed(f: Memory, V: Any, front: Any, rear: Any) -> Any:
 
 
 @jit
-def _write_tyres(f: Memory, V: Any) -> None:
+def _write_tyres(f: FilterRecord, V: Any) -> None:
     """What the estimated tyres do besides their slope by slip: columns of B, and f.push."""
     for j in range(3):  # both factors, then the grip
         if j < 2 or f.grip > 0:
             front = f.per_tyre[0, j // 2] if j != 1 else 0.0
             rear = f.per_tyre[1, j // 2] if j != 0 else 0.0
             column = (f.tyres + j if j < 2 else f.grip) - f.dense
-            beta, gamma, phi_rate = _pushed(f, V, front, rear)
-            f.B[0, INPUTS + column], f.B[1, INPUTS + column] = beta, gamma
+            beta, gamma, phi_rate = _compute_rates(f, V, front, rear)
+            f.B[0, N_INPUTS + column], f.B[1, N_INPUTS + column] = beta, gamma
             if f.rolling > 0:
-                f.B[f.rolling + 1, INPUTS + column] = phi_rate
+                f.B[f.rolling + 1, N_INPUTS + column] = phi_rate
             if f.accel_row > 0:
                 f.C_fast[f.accel_row, f.dense + column] = V * beta
-    beta, gamma, phi_rate = _pushed(f, V, f.rest[0], f.rest[1])
+    beta, gamma, phi_rate = _compute_rates(f, V, f.rest[0], f.rest[1])
     f.push[0], f.push[1] = beta, gamma
     if f.rolling > 0:
         f.push[f.rolling + 1] = phi_rate
@@ -102,20 +102,20 @@ def _write_tyres(f: Memory, V: Any) -> None:
 
 
 @jit
-def continuous(f: Memory, V: Any, turning: Any) -> None:
+def build_continuous(f: FilterRecord, V: Any, turning: Any) -> None:
     """f.A and f.B = [inputs, disturbances] at a speed V in m/s and a yaw rate in rad/s."""
     A, B = f.A, f.B
     for i in range(f.dense):
-        for j in range(0, CORE, 8):
-            put_eight(A, 0.0, i, j)
-        for j in range(0, WIDE, 8):
-            put_eight(B, 0.0, i, j)
+        for j in range(0, N_CORE, 8):
+            store8(A, 0.0, i, j)
+        for j in range(0, N_DRIVERS, 8):
+            store8(B, 0.0, i, j)
     if f.forces == 0:
         for j in range(f.n - f.dense):
             if f.pushed[j] >= 0:
-                B[f.pushed[j], INPUTS + j] = 1.0
+                B[f.pushed[j], N_INPUTS + j] = 1.0
     if f.kind == LATERAL:
-        _lateral(f, V)
+        _build_lateral(f, V)
     elif f.kind == ROLL or f.kind == VELOCITY_ROLL:
         i = 0 if f.kind == ROLL else 2
         write_roll(A, B, i, f.inputs - 1, f.roll_stiffness, f.roll_damping, f.roll_arm)
@@ -126,38 +126,42 @@ def continuous(f: Memory, V: Any, turning: Any) -> None:
     if f.kind == YAW or f.kind == FORCES:
         I = f.car[CAR.yaw_inertia]  # noqa: E741  the papers' letter
         B[0, 0] = 1.0 / I
-        B[0, INPUTS] = 1.0 / I
+        B[0, N_INPUTS] = 1.0 / I
         if f.kind == FORCES:
-            B[0, INPUTS], B[0, INPUTS + 1] = f.car[CAR.front_arm] / I, -f.car[CAR.rear_arm] / I
+            B[0, N_INPUTS], B[0, N_INPUTS + 1] = f.car[CAR.front_arm] / I, -f.car[CAR.rear_arm] / I
 
 
 @jit
-def _product(a: Row, b: Row, c: Row, n: int, m: int) -> None:
+def _multiply(a: Vector, b: Vector, c: Vector, n: int, m: int) -> None:
     """c = a b for a (n, n) and b (n, m), in the corners of larger arrays."""
     for j in range(0, m, 8):
         for i in range(0, n, 4):
-            first, second, third, fourth = times(a, i, b, n, j, 0.0, 0.0, 0.0, 0.0)
-            put_eight(c, first, i, j)
-            put_eight(c, second, i + 1, j)
-            put_eight(c, third, i + 2, j)
-            put_eight(c, fourth, i + 3, j)
+            first, second, third, fourth = multiply_rows(a, i, b, n, j, 0.0, 0.0, 0.0, 0.0)
+            store8(c, first, i, j)
+            store8(c, second, i + 1, j)
+            store8(c, third, i + 2, j)
+            store8(c, fourth, i + 3, j)
 
 
 @jit
-def discretise(f: Memory) -> None:
+def discretise(f: FilterRecord) -> None:
     """f.G and f.H of tie-vision (9): exact for inputs and disturbances held over the step.
 
     Phi = integral of e^(A t) over the step by its Taylor series, after halving the step until
     ||A h|| <= 1/2 and doubling back; G = I + A Phi. Accurate to rounding (relative 1e-14).
     """
-    n, m = f.dense - f.delayed, INPUTS + f.n - f.dense
-    E, Phi, T = scratch(f.A, CORE, WIDE), scratch(f.A, CORE, WIDE), scratch(f.A, CORE, WIDE)
-    one = scratch(f.A, CORE, CORE)  # h I
+    n, m = f.dense - f.delayed, N_INPUTS + f.n - f.dense
+    E, Phi, T = (
+        allocate_scratch(f.A, N_CORE, N_DRIVERS),
+        allocate_scratch(f.A, N_CORE, N_DRIVERS),
+        allocate_scratch(f.A, N_CORE, N_DRIVERS),
+    )
+    one = allocate_scratch(f.A, N_CORE, N_CORE)  # h I
     norm = 0.0
     for i in range(n):
         total = 0.0
         for j in range(n):
-            total += absolute(at(f.A, i, j))
+            total += absolute(load_element(f.A, i, j))
         norm = maximum(norm, total * f.step)
     h, doublings = f.step, 0
     while norm > 0.5:
@@ -166,51 +170,51 @@ def discretise(f: Memory) -> None:
         doublings += 1
     for i in range(n):
         for j in range(0, n, 8):
-            put_eight(one, 0.0, i, j)
-        put(one, h, i, i)
+            store8(one, 0.0, i, j)
+        store_element(one, h, i, i)
         for j in range(0, n, 8):
-            put_eight(Phi, eight(one, i, j), i, j)
+            store8(Phi, load8(one, i, j), i, j)
     for order in range(15 if norm > 0.05 else 9, 1, -1):  # Horner: h (I + A h / 2 (I + ...))
-        _product(f.A, Phi, T, n, n)
+        _multiply(f.A, Phi, T, n, n)
         share = h / order
         for i in range(n):
             for j in range(0, n, 8):
-                put_eight(Phi, eight(T, i, j) * share + eight(one, i, j), i, j)
+                store8(Phi, load8(T, i, j) * share + load8(one, i, j), i, j)
     for _ in range(doublings):  # the integral over 2 h is (I + e^(A h)) times that over h
-        _product(f.A, Phi, E, n, n)
+        _multiply(f.A, Phi, E, n, n)
         for i in range(n):
-            put(E, at(E, i, i) + 2.0, i, i)
-        _product(E, Phi, T, n, n)
+            store_element(E, load_element(E, i, i) + 2.0, i, i)
+        _multiply(E, Phi, T, n, n)
         for i in range(n):
             for j in range(0, n, 8):
-                put_eight(Phi, eight(T, i, j), i, j)
-    _product(f.A, Phi, E, n, n)
-    _product(Phi, f.B, T, n, m)
+                store8(Phi, load8(T, i, j), i, j)
+    _multiply(f.A, Phi, E, n, n)
+    _multiply(Phi, f.B, T, n, m)
     for i in range(n):
-        put(E, at(E, i, i) + 1.0, i, i)
+        store_element(E, load_element(E, i, i) + 1.0, i, i)
         drift = 0.0
         for j in range(n):
-            put(f.G, at(E, i, j), i, j)
-            drift += at(Phi, i, j) * at(f.push, j)
-        put(f.drift, drift, i)
+            store_element(f.G, load_element(E, i, j), i, j)
+            drift += load_element(Phi, i, j) * load_element(f.push, j)
+        store_element(f.drift, drift, i)
         for j in range(f.inputs):
-            put(f.H, at(T, i, j), i, j)
+            store_element(f.H, load_element(T, i, j), i, j)
         for j in range(f.n - f.dense):
-            put(f.G, at(T, i, INPUTS + j), i, f.dense + j)
+            store_element(f.G, load_element(T, i, N_INPUTS + j), i, f.dense + j)
 
 
 @jit
-def _transpose(f: Memory) -> None:
+def _transpose(f: FilterRecord) -> None:
     """f.GT and f.HT, by which states and covariance are predicted."""
     for i in range(f.dense):
         for k in range(f.n):
-            put(f.GT, at(f.G, i, k), k, i)
+            store_element(f.GT, load_element(f.G, i, k), k, i)
         for k in range(f.inputs):
-            put(f.HT, at(f.H, i, k), k, i)
+            store_element(f.HT, load_element(f.H, i, k), k, i)
 
 
 @jit
-def _lagging(f: Memory) -> None:
+def _set_delayed_rows(f: FilterRecord) -> None:
     """The delayed states follow what the camera sees: tie-vision (12), at every step."""
     first = f.dense - f.delayed
     for i in range(f.delayed):
@@ -221,30 +225,30 @@ def _lagging(f: Memory) -> None:
 
 
 @jit
-def road_turned(V: Any, curvature: Any, step: Any) -> Any:
+def compute_road_turn(V: Any, curvature: Any, step: Any) -> Any:
     """The angle in rad by which a road of a curvature in 1/m turns within a step of so many s."""
     return V * curvature * step
 
 
 @jit
-def variance(f: Memory, s: int, i: int, V: Any) -> Any:
+def compute_row_variance(f: FilterRecord, s: int, i: int, V: Any) -> Any:
     """The variance of row i of sensor s at a speed of the model in m/s."""
-    over = f.noise_over_speed[s, i]
-    return over / (V * V) if over > 0.0 else f.r[s, i]
+    scaled = f.noise_over_speed[s, i]
+    return scaled / (V * V) if scaled > 0.0 else f.r[s, i]
 
 
-@apart
-def build(f: Memory, speed: Any, turning: Any) -> None:
+@noinline
+def build_model(f: FilterRecord, speed: Any, turning: Any) -> None:
     """The model at a speed in m/s and a yaw rate in rad/s, and the noise that goes with 1/V."""
-    V = maximum(speed, SLOWEST)
+    V = maximum(speed, MIN_SPEED)
     if f.kind == LATERAL and f.model_speed > 0.0:
         f.stretch *= f.model_speed / V
     f.model_speed, f.turning = V, turning
     if f.kind != LINEAR:
-        continuous(f, V, turning)
+        build_continuous(f, V, turning)
         discretise(f)
-        _lagging(f)
+        _set_delayed_rows(f)
     _transpose(f)
-    for s in range(SLOW):
+    for s in range(N_SLOW):
         for i in range(f.rows[s]):
-            f.r[s, i] = variance(f, s, i, V)
+            f.r[s, i] = compute_row_variance(f, s, i, V)

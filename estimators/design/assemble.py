@@ -11,24 +11,24 @@ from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ..core.delay import CONSTANT, STORED
 from ..core.intersample import DUAL_RATE, NONE, PSEUDO
-from ..core.layers import CHANGED, GUSTY, LEAST
-from ..core.memory import FILTER, ROWS, Memory
-from ..core.transition import KINEMATIC, SLOWEST, VELOCITY_ROLL
+from ..core.layers import CHANGED, GUSTY, MIN_LOG_WEIGHT
+from ..core.memory import FILTER, N_ROWS, FilterRecord
+from ..core.transition import KINEMATIC, MIN_SPEED, VELOCITY_ROLL
 from .config import FilterConfig
-from .kalman import gain
-from .late_samples import check_window, place_clones
+from .kalman import kalman_gain
+from .late_samples import allocate_clones, check_window
 from .models import NONLINEAR, write_model
-from .periodic import measured_rows
-from .schedule import NO_SENSOR, Schedule, schedules, whole_ticks
+from .periodic import build_measurement_rows
+from .schedule import NO_SENSOR, Schedule, count_ticks, make_schedules
 
 SMOOTHING_TIME = 0.015  # s, of the measured speed
-FASTEST = 80.0  # m/s, of the tables of gains
+MAX_SPEED = 80.0  # m/s, of the tables of gains
 SPACING = 0.5  # m/s between them
-RESPAWN = 0.5  # s between two members of a bank that begin anew
+REPLACE_TIME = 0.5  # s between two members of a bank that begin anew
 HAZARD = 0.2  # 1/s, of tyres that change
-FORGOTTEN = 0.06  # variance of their factors
-ALERT = 0.02  # 1/s, of the factors of a new member until the next one: the change may be later
-INTERACT = 0.2  # s between two steps of members that interact
+TYRE_VARIANCE = 0.06  # variance of their factors
+TYRE_WALK = 0.02  # 1/s, of the factors of a new member until the next one: the change may be later
+IMM_TIME = 0.2  # s between two steps of members that interact
 GUST = (8.0, 2.0)  # times the usual force and moment
 
 
@@ -45,30 +45,30 @@ def assemble(
     for f, model in zip(layers, config.models, strict=True):
         _write_clocks(f, config, dt)
         n, step = len(model.names), f.stride * dt
-        own = slice(first, first + n)
-        noise = _scaled(config, vehicle), config.noise_over_speed
-        write_model(f, model, vehicle, step, *noise, config.Q[own, own])
+        block = slice(first, first + n)
+        noise = _scale_noise(config, vehicle), config.noise_over_speed
+        write_model(f, model, vehicle, step, *noise, config.Q[block, block])
         f.decay[f.dense : n - len(model.biases)] *= math.exp(-config.leak * f.stride * dt)
         f.prior[:n, :n] = np.diag([config.prior[state] ** 2 for state in model.names])
         for state, time in config.times.items():
             if time > 0.0:
-                i, keep = model.names.index(state), math.exp(-step / time)
-                f.decay[i], f.Q[i, i] = keep, (1.0 - keep * keep) * f.prior[i, i]
-        place_clones(f, config)
+                i, decay = model.names.index(state), math.exp(-step / time)
+                f.decay[i], f.Q[i, i] = decay, (1.0 - decay * decay) * f.prior[i, i]
+        allocate_clones(f, config)
         f.measured, f.speed = int(speed is None), speed or 0.0
         f.smoothing = 1.0 - math.exp(-dt / SMOOTHING_TIME)
         _write_trust(f, config)
         first += n
-    planned = _schedules(layers[0], config, dt)
+    planned = _make_schedules(layers[0], config, dt)
     for f in layers:
         f.assumed = layers[0].assumed
         _write_rules(f, config, planned)
         check_window(f, config)
     layers[0].store_predictions |= len(layers) > 1
-    return _members(layers, config, dt), planned
+    return _build_bank(layers, config, dt), planned
 
 
-def _scaled(config: FilterConfig, vehicle: Vehicle) -> dict[str, float]:
+def _scale_noise(config: FilterConfig, vehicle: Vehicle) -> dict[str, float]:
     """Noise with the shares of the car's weight in it."""
     noise, weight = dict(config.noise), vehicle.mass * GRAVITY
     arm = 0.5 * (vehicle.front_arm + vehicle.rear_arm)
@@ -78,16 +78,18 @@ def _scaled(config: FilterConfig, vehicle: Vehicle) -> dict[str, float]:
     return noise
 
 
-def _members(layers: Any, config: FilterConfig, dt: float) -> Any:
+def _build_bank(layers: Any, config: FilterConfig, dt: float) -> Any:
     """The mixture and the members of a bank of the filter; the filter itself without one."""
     if config.members < 2:
         return layers
     f = layers[0]
-    f.members, f.respawn, f.spread = config.members, round(RESPAWN / dt), FORGOTTEN
-    f.hazard, f.level[:], f.alert = math.log(HAZARD * RESPAWN), 1.0, ALERT * f.step
+    f.members, f.respawn, f.spread = config.members, round(REPLACE_TIME / dt), TYRE_VARIANCE
+    f.hazard, f.level[:], f.alert = math.log(HAZARD * REPLACE_TIME), 1.0, TYRE_WALK * f.step
     bank = np.repeat(layers, 1 + config.members).view(np.recarray)
     for m, f in enumerate(bank[1:]):
-        f.odds = LEAST if m >= len(config.levels) else 0.0  # a twin of another begins anew first
+        f.odds = (
+            MIN_LOG_WEIGHT if m >= len(config.levels) else 0.0
+        )  # a twin of another begins anew first
         f.level[:] = np.square(config.levels[m % len(config.levels)])
         if f.forces:
             both = range(f.dense, f.dense + 2)
@@ -95,44 +97,44 @@ def _members(layers: Any, config: FilterConfig, dt: float) -> Any:
             f.Q[both, both] *= f.level
             f.prior[both, both] *= f.level
     if config.sudden:
-        _interacting(bank, dt)
+        _set_imm_members(bank, dt)
     return bank
 
 
-def _interacting(bank: Any, dt: float) -> None:
+def _set_imm_members(bank: Any, dt: float) -> None:
     """What the members that interact differ in."""
-    bank.respawn = round(INTERACT / dt)
+    bank.respawn = round(IMM_TIME / dt)
     for f in bank:
         f.burst[:] = np.square(GUST) * f.q_known / f.q_share
     gusty, changed = bank[GUSTY], bank[CHANGED]
     gusty.decay[gusty.dense : gusty.dense + 2] = 1.0
-    changed.q_tyres[:2] += ALERT * changed.step
+    changed.q_tyres[:2] += TYRE_WALK * changed.step
 
 
-def alone(config: FilterConfig) -> FilterConfig:
+def select_first_sensor(config: FilterConfig) -> FilterConfig:
     """The same filter with its first slow sensor alone."""
     return replace(config, sensors=dict(list(config.sensors.items())[:1]))
 
 
-def told_tyres(config: FilterConfig) -> FilterConfig:
+def remove_tyre_states(config: FilterConfig) -> FilterConfig:
     """The same filter with nominal tyres and scale instead of states: that one is linear."""
     if not any(name in NONLINEAR for name in config.states):
         return config
-    left = [i for i, name in enumerate(config.states) if name not in NONLINEAR]
+    indices = [i for i, name in enumerate(config.states) if name not in NONLINEAR]
     models = tuple(
         replace(model, biases=tuple(name for name in model.biases if name not in NONLINEAR))
         for model in config.models
     )
     prior = {name: sd for name, sd in config.prior.items() if name not in NONLINEAR}
-    Q = config.Q[np.ix_(left, left)]
+    Q = config.Q[np.ix_(indices, indices)]
     return replace(config, models=models, Q=Q, prior=prior, members=1)
 
 
-def _write_clocks(f: Memory, config: FilterConfig, dt: float) -> None:
+def _write_clocks(f: FilterRecord, config: FilterConfig, dt: float) -> None:
     """Periods, the filter's own step, and by how much late states follow in it."""
     for name, sensor in config.sensors.items():
-        what = f"{config.name}: the {name}'s period"
-        f.period[SLOW_NAMES.index(name)] = whole_ticks(sensor.period, dt, what)
+        label = f"{config.name}: the {name}'s period"
+        f.period[SLOW_NAMES.index(name)] = count_ticks(sensor.period, dt, label)
     f.pace = int(f.period.max()) if config.intersample == "single-rate" else 1
     f.stride = f.pace if config.between == "hold" else 1
     f.relax = 1.0
@@ -142,7 +144,7 @@ def _write_clocks(f: Memory, config: FilterConfig, dt: float) -> None:
         f.relax = 1.0 - math.exp(-dt / max(delay, dt))
 
 
-def _write_trust(f: Memory, config: FilterConfig) -> None:
+def _write_trust(f: FilterRecord, config: FilterConfig) -> None:
     """What is known of a sample's noise, and which ones are skipped."""
     f.least_satellites, f.adapt, f.robust = config.satellites, config.adapt, config.robust
     f.steer_jump = config.steer_rate * f.step
@@ -153,42 +155,46 @@ def _write_trust(f: Memory, config: FilterConfig) -> None:
     if config.gate is not None:
         from scipy.stats import chi2  # slow to load
 
-        f.gate[1:] = chi2.ppf(config.gate, np.arange(1, ROWS + 1))
+        f.gate[1:] = chi2.ppf(config.gate, np.arange(1, N_ROWS + 1))
     knots = config.hdop_table if f.kind != VELOCITY_ROLL else ()  # applied by the first layer
     f.knots = len(knots)
     for i, (hdop, factor) in enumerate(knots):
         f.hdop[i], f.hdop_factor[i] = hdop, factor
 
 
-def _schedules(f: Memory, config: FilterConfig, dt: float) -> tuple[Schedule, ...]:
+def _make_schedules(f: FilterRecord, config: FilterConfig, dt: float) -> tuple[Schedule, ...]:
     """Of the first slow sensor: one, or two extremes where delays are random."""
     if not config.sensors:
         return (NO_SENSOR,)
     name, sensor = next(iter(config.sensors.items()))
     if config.delay == "constant":
-        f.assumed = whole_ticks(config.assumed_delay, dt, f"{config.name}: assumed_delay")
+        f.assumed = count_ticks(config.assumed_delay, dt, f"{config.name}: assumed_delay")
         sensor = SlowSensor(sensor.period, (config.assumed_delay,), sensor.phase)
     if config.row.intersample == "dual-rate":  # knows of no delay
         sensor = SlowSensor(sensor.period, (0.0,), sensor.phase)
-    who = f"{config.name}: the {name}"
-    return schedules(who, sensor, dt, int(f.stride), int(f.pace), int(f.frames[f.first_slow]))
+    label = f"{config.name}: the {name}"
+    return make_schedules(
+        label, sensor, dt, int(f.stride), int(f.pace), int(f.frames[f.first_slow])
+    )
 
 
-def _write_rules(f: Memory, config: FilterConfig, planned: tuple[Schedule, ...]) -> None:
+def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule, ...]) -> None:
     """The codes that choose what compiled code does; ValueError for what does not go together."""
     f.cycle, f.pattern = planned[-1].cycle, max(1, len(planned[-1].lags))
     pseudo = config.intersample == "pseudo-residual"
     shared = config.row.intersample == "dual-rate"
     f.between = PSEUDO if pseudo else DUAL_RATE if shared else NONE
-    f.periodic = _periodic(f, config, len(planned) > 1)
+    f.periodic = _is_periodic(f, config, len(planned) > 1)
     f.joint = config.row.gains == "placed" or (pseudo and f.periodic)
     f.store_predictions = f.late in (STORED, CONSTANT)
     if f.measured and f.periodic:
-        f.low, f.high, f.spacing = SLOWEST, FASTEST, SPACING
+        f.low, f.high, f.spacing = MIN_SPEED, MAX_SPEED, SPACING
     if pseudo:
-        C = measured_rows(f, 0)
-        f.inverse[: len(C), : f.total] = gain(np.eye(f.total), C, np.zeros((len(C), len(C)))).T
-    if _needs_covariance(config) and (f.periodic or f.between != NONE):
+        C = build_measurement_rows(f, 0)
+        f.inverse[: len(C), : f.total] = kalman_gain(
+            np.eye(f.total), C, np.zeros((len(C), len(C)))
+        ).T
+    if _is_covariance_needed(config) and (f.periodic or f.between != NONE):
         raise ValueError(
             f"{config.name}: gate, adapt, latency, delay='larsen' and delay='buffer' need "
             f"gains='covariance' and no correction between samples; got gate={config.gate}, "
@@ -198,29 +204,29 @@ def _write_rules(f: Memory, config: FilterConfig, planned: tuple[Schedule, ...])
         raise ValueError(f"{config.name}: adapt needs delay='clone', got delay={config.delay!r}")
 
 
-def _needs_covariance(config: FilterConfig) -> bool:
-    judges = config.gate is not None or config.adapt > 0.0 or bool(config.latency)
-    return judges or config.delay in ("larsen", "buffer")
+def _is_covariance_needed(config: FilterConfig) -> bool:
+    uses_innovation = config.gate is not None or config.adapt > 0.0 or bool(config.latency)
+    return uses_innovation or config.delay in ("larsen", "buffer")
 
 
-def _periodic(f: Memory, config: FilterConfig, random: bool) -> bool:
+def _is_periodic(f: FilterRecord, config: FilterConfig, random: bool) -> bool:
     """Whether the gains are precomputed; ValueError where that was asked for and cannot be.
 
     random: the first slow sensor's delay is.
     """
 
-    def refused(why: str) -> ValueError:
-        return ValueError(f"{config.name}: no gains={config.gains!r}: {why}")
+    def refuse(reason: str) -> ValueError:
+        return ValueError(f"{config.name}: no gains={config.gains!r}: {reason}")
 
     if f.between == DUAL_RATE or config.row.gains == "placed":
         return True
-    several, blind = len(config.sensors) > 1, f.frames.max() == 0  # blind: to the lag
+    is_multi_sensor, ignores_lag = len(config.sensors) > 1, f.frames.max() == 0  # blind: to the lag
     impossible = ""
     if f.kind in (KINEMATIC, VELOCITY_ROLL) or config.row.second:
         impossible = "its model changes with the yaw rate"
     elif f.between == PSEUDO:
         if config.gains == "covariance":
-            raise refused("it has one constant gain")
+            raise refuse("it has one constant gain")
         if f.frames.max() > 1:
             raise ValueError(
                 f"{config.name}: a sample must arrive before the next one is captured, got "
@@ -229,11 +235,11 @@ def _periodic(f: Memory, config: FilterConfig, random: bool) -> bool:
         return True
     elif any(model.biases for model in config.models):
         impossible = "a constant bias has no settled gain"
-    elif several or (random and not blind):
-        impossible = "two slow sensors" if several else "random delay"
+    elif is_multi_sensor or (random and not ignores_lag):
+        impossible = "two slow sensors" if is_multi_sensor else "random delay"
     if impossible:
         if config.gains == "periodic":
-            raise refused(f"{impossible}; use gains='covariance'")
+            raise refuse(f"{impossible}; use gains='covariance'")
         return False
-    usual = "covariance" if _needs_covariance(config) else config.row.gains
-    return (config.gains or usual) == "periodic"
+    default = "covariance" if _is_covariance_needed(config) else config.row.gains
+    return (config.gains or default) == "periodic"

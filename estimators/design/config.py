@@ -1,4 +1,5 @@
-"""The options of a filter: `FilterConfig` has them complete, `configure` parses and checks them."""
+"""The options of a filter: `FilterConfig` has them complete, `parse_config` parses and checks
+them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,10 +11,10 @@ import numpy.typing as npt
 from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
 from ..core.delay import RULES
-from ..filters import Filter
+from ..filters import FilterDefinition
 from . import dual_rate
 from .kalman import INVERSES
-from .levels import bank_of, hdop_table, noise_levels, prior_of, process_noise
+from .levels import parse_bank, parse_hdop_table, parse_noise, parse_prior, parse_process_noise
 from .models import (
     BIASES,
     DISTURBANCES,
@@ -23,16 +24,16 @@ from .models import (
     STATES,
     TYRES,
     WANDER,
-    Model,
-    bicycle_model,
+    FilterModel,
+    make_bicycle_model,
 )
-from .options import Options, latency_of
+from .options import OptionReader, parse_latency
 from .tunings import TUNINGS
 
 Array = npt.NDArray[np.float64]
 
-CERTAIN = 1.0 - 1e-9
-SATELLITES = 4.0  # double-layer-gps 4.3
+GATE_PROBABILITY = 1.0 - 1e-9
+MIN_SATELLITES = 4.0  # double-layer-gps 4.3
 ASSUMED_DELAY = 0.033  # s
 
 
@@ -107,9 +108,9 @@ class FilterConfig:
     """
 
     name: str
-    row: Filter
+    row: FilterDefinition
     sensors: Mapping[str, SlowSensor]  # `slow`, in the order of SLOW_NAMES
-    models: tuple[Model, ...]  # of each layer
+    models: tuple[FilterModel, ...]  # of each layer
     gains: str  # "": the row's, where that can be
     delay: str
     assumed_delay: float
@@ -145,8 +146,8 @@ class FilterConfig:
         return tuple(self.prior)
 
 
-def configure(
-    name: str, row: Filter, sensors: Mapping[str, SlowSensor], options: Mapping[str, Any]
+def parse_config(
+    name: str, row: FilterDefinition, sensors: Mapping[str, SlowSensor], options: Mapping[str, Any]
 ) -> FilterConfig:
     """The config of a filter from its row, the slow sensors that are there, and options.
 
@@ -154,15 +155,15 @@ def configure(
     that is absent, a value out of range and options that exclude each other; each names filter,
     option and value.
     """
-    read = Options(name, dict(row.options) | dict(options))
-    used = _slow_sensors(row, sensors, read)
-    rules = _rules(row, used, read)
-    fast, biases = _inertial(row, read)
-    models = _models(row, used, rules["delay"], fast, tuple(biases), read)
+    reader = OptionReader(name, dict(row.options) | dict(options))
+    used = _select_slow_sensors(row, sensors, reader)
+    rules = _parse_rules(row, used, reader)
+    fast, biases = _parse_inertial(row, reader)
+    models = _make_models(row, used, rules["delay"], fast, tuple(biases), reader)
     states = [state for model in models for state in model.names]
     if rules["poles"] and len(rules["poles"]) != len(states):
-        raise read.wrong("poles", f"are one for each of {', '.join(states)}", rules["poles"])
-    noise, noise_over_speed = noise_levels(models[0].forces, read)
+        raise reader.make_error("poles", f"are one for each of {', '.join(states)}", rules["poles"])
+    noise, noise_over_speed = parse_noise(models[0].forces, reader)
     steered = models[0].inputs[0] == "steer"
     config = FilterConfig(
         name=name,
@@ -170,80 +171,93 @@ def configure(
         sensors={sensor: sensors[sensor] for sensor in used},
         models=models,
         **rules,
-        leak=read.not_negative("leak", "1/s"),
-        Q=process_noise(states, TUNINGS.get((name, ",".join(used)), {}), read),
+        leak=reader.read_non_negative("leak", "1/s"),
+        Q=parse_process_noise(states, TUNINGS.get((name, ",".join(used)), {}), reader),
         noise=noise,
         noise_over_speed=noise_over_speed,
-        hdop_table=hdop_table(row, read),
-        satellites=read.number("satellites", SATELLITES),
-        **_gate(rules["delay"], read),
-        **bank_of(states, models[0].forces, rules["delay"], read),
-        robust=read.not_negative("robust", "standard deviations"),
-        steer_rate=read.not_negative("steer_rate", "rad/s") if steered else 0.0,
-        model_error=read.not_negative("model_error", "shares of a force"),
-        accel_time=read.not_negative("accel_time", "s"),
-        shares=(read.not_negative("force_share", "1"), read.not_negative("moment_share", "1")),
-        times={name: read.not_negative(f"{name}_time", "s") for name in biases if name in WANDER},
-        adapt=read.number("adapt", 0.0, "is a share from 0 to 1", lambda v: 0.0 <= v < 1.0),
-        prior=prior_of(states, noise, biases, read),
-        latency=latency_of(read, bool(used) and TYRES[0] in states),
-        allow_unstable=bool(read.value("allow_unstable", False)),
+        hdop_table=parse_hdop_table(row, reader),
+        satellites=reader.read_number("satellites", MIN_SATELLITES),
+        **_parse_gate(rules["delay"], reader),
+        **parse_bank(states, models[0].forces, rules["delay"], reader),
+        robust=reader.read_non_negative("robust", "standard deviations"),
+        steer_rate=reader.read_non_negative("steer_rate", "rad/s") if steered else 0.0,
+        model_error=reader.read_non_negative("model_error", "shares of a force"),
+        accel_time=reader.read_non_negative("accel_time", "s"),
+        shares=(
+            reader.read_non_negative("force_share", "1"),
+            reader.read_non_negative("moment_share", "1"),
+        ),
+        times={
+            name: reader.read_non_negative(f"{name}_time", "s") for name in biases if name in WANDER
+        },
+        adapt=reader.read_number("adapt", 0.0, "is a share from 0 to 1", lambda v: 0.0 <= v < 1.0),
+        prior=parse_prior(states, noise, biases, reader),
+        latency=parse_latency(reader, bool(used) and TYRES[0] in states),
+        allow_unstable=bool(reader.read_value("allow_unstable", False)),
     )
-    read.done()
+    reader.check_unread()
     return config
 
 
-def _slow_sensors(row: Filter, there: Mapping[str, SlowSensor], read: Options) -> tuple[str, ...]:
+def _select_slow_sensors(
+    row: FilterDefinition, available: Mapping[str, SlowSensor], reader: OptionReader
+) -> tuple[str, ...]:
     """The slow sensors to use, in the order of `SLOW_NAMES`."""
-    slow = read.value("slow", None)
+    slow = reader.read_value("slow", None)
     if not row.slow:
         if slow is not None:
-            raise ValueError(f"{read.name} uses no slow sensor, got slow={slow!r}")
+            raise ValueError(f"{reader.name} uses no slow sensor, got slow={slow!r}")
         return ()
     if slow is None:
-        wanted = [sensor for sensor in row.slow if sensor in there][:1]
+        requested = [sensor for sensor in row.slow if sensor in available][:1]
         inertial = "accel_y" in dict(row.options).get("fast", row.fast)
-        if not wanted and (there or not inertial):
-            wanted = [" or ".join(row.slow)]
+        if not requested and (available or not inertial):
+            requested = [" or ".join(row.slow)]
     else:
-        wanted = list(slow) if isinstance(slow, list | tuple) else [slow]
-    for sensor in wanted:
+        requested = list(slow) if isinstance(slow, list | tuple) else [slow]
+    for sensor in requested:
         if slow is not None and sensor not in row.slow:
-            raise ValueError(f"{read.name} can use {' or '.join(row.slow)}, got slow={slow!r}")
-        if sensor not in there:
-            present = ", ".join(there) or "none"
-            raise ValueError(f"{read.name} needs the slow sensor {sensor}; there is: {present}")
-    return tuple(sensor for sensor in SLOW_NAMES if sensor in wanted)
+            raise ValueError(f"{reader.name} can use {' or '.join(row.slow)}, got slow={slow!r}")
+        if sensor not in available:
+            present_names = ", ".join(available) or "none"
+            raise ValueError(
+                f"{reader.name} needs the slow sensor {sensor}; there is: {present_names}"
+            )
+    return tuple(sensor for sensor in SLOW_NAMES if sensor in requested)
 
 
-def _rules(row: Filter, used: Sequence[str], read: Options) -> dict[str, Any]:
+def _parse_rules(
+    row: FilterDefinition, used: Sequence[str], reader: OptionReader
+) -> dict[str, Any]:
     """How gains are found, and what happens to late samples and between samples."""
-    shared, placed = row.intersample == "dual-rate", row.gains == "placed"
+    is_dual_rate, is_placed = row.intersample == "dual-rate", row.gains == "placed"
     intersample, between, assumed, poles = row.intersample, "hold", 0.0, row.poles
-    if shared:
-        intersample = read.one_of("intersample", "pseudo", dual_rate.RULES)
+    if is_dual_rate:
+        intersample = reader.read_choice("intersample", "pseudo", dual_rate.RULES)
     elif row.second:
-        intersample = read.one_of("intersample", intersample, (intersample, "predict"))
-    known = dual_rate.GAINS if shared else ("", "periodic", "covariance")
-    gains = row.gains if placed else read.one_of("gains", known[0], known)
+        intersample = reader.read_choice("intersample", intersample, (intersample, "predict"))
+    known_gains = dual_rate.GAINS if is_dual_rate else ("", "periodic", "covariance")
+    gains = row.gains if is_placed else reader.read_choice("gains", known_gains[0], known_gains)
     if gains == "from-29" and intersample != "pseudo":
-        raise read.wrong("intersample", "is 'pseudo' for gains='from-29'", intersample)
+        raise reader.make_error("intersample", "is 'pseudo' for gains='from-29'", intersample)
     if intersample == "single-rate":
-        between = read.one_of("between", between, ("hold", "predict"))
+        between = reader.read_choice("between", between, ("hold", "predict"))
         if between == "hold" and len(used) > 1:
-            raise read.wrong("slow", "is one sensor for between='hold'", used)
-    inverse = read.one_of("inverse", INVERSES[0], INVERSES)
-    delay = read.one_of("delay", row.delay, RULES)
+            raise reader.make_error("slow", "is one sensor for between='hold'", used)
+    inverse = reader.read_choice("inverse", INVERSES[0], INVERSES)
+    delay = reader.read_choice("delay", row.delay, RULES)
     if delay in ("literal", "lag") and "camera" not in used:
-        raise read.wrong("delay", "needs the camera for tie-vision's rules", delay)
+        raise reader.make_error("delay", "needs the camera for tie-vision's rules", delay)
     if delay == "constant":
-        assumed = read.positive("assumed_delay", ASSUMED_DELAY)
+        assumed = reader.read_positive("assumed_delay", ASSUMED_DELAY)
     if gains == "placed":
-        chosen = read.numbers("poles", read.value("poles", poles))
-        negative = (chosen < 0.0) & np.isfinite(chosen)
-        if chosen.ndim != 1 or not len(chosen) or not negative.all():
-            raise read.wrong("poles", "are negative numbers in rad/s", chosen.tolist())
-        poles = tuple(chosen.tolist())
+        requested_poles = reader.read_array("poles", reader.read_value("poles", poles))
+        negative = (requested_poles < 0.0) & np.isfinite(requested_poles)
+        if requested_poles.ndim != 1 or not len(requested_poles) or not negative.all():
+            raise reader.make_error(
+                "poles", "are negative numbers in rad/s", requested_poles.tolist()
+            )
+        poles = tuple(requested_poles.tolist())
     return {
         "gains": gains,
         "delay": delay,
@@ -255,46 +269,52 @@ def _rules(row: Filter, used: Sequence[str], read: Options) -> dict[str, Any]:
     }
 
 
-def _inertial(row: Filter, read: Options) -> tuple[tuple[str, ...], dict[str, float]]:
+def _parse_inertial(
+    row: FilterDefinition, reader: OptionReader
+) -> tuple[tuple[str, ...], dict[str, float]]:
     """The fast sensors, and the standard deviations of their biases by state."""
     if row.model != "bicycle" or row.gains != "covariance" or row.second:
         return row.fast, {}
-    fast = read.some_of("fast", row.fast, INERTIAL)
-    biases = {name: read.not_negative(f"{name}_sd", STATES[name].unit) for name in BIASES}
-    known = [name for name in TYRES if not biases[name] > 0.0]
-    if known not in (list(TYRES), list(TYRES[2:]), []):
-        raise ValueError(f"{read.name}: {known[0]}_sd is above 0 where another tyre's state is")
-    if biases[SCALE] > 0.0 and TYRES[0] in known:
-        raise ValueError(f"{read.name}: {SCALE}_sd needs tyres among the states: {TYRES[0]}_sd")
+    fast = reader.read_choices("fast", row.fast, INERTIAL)
+    biases = {name: reader.read_non_negative(f"{name}_sd", STATES[name].unit) for name in BIASES}
+    known_tyres = [name for name in TYRES if not biases[name] > 0.0]
+    if known_tyres not in (list(TYRES), list(TYRES[2:]), []):
+        raise ValueError(
+            f"{reader.name}: {known_tyres[0]}_sd is above 0 where another tyre's state is"
+        )
+    if biases[SCALE] > 0.0 and TYRES[0] in known_tyres:
+        raise ValueError(f"{reader.name}: {SCALE}_sd needs tyres among the states: {TYRES[0]}_sd")
     for name, sd in biases.items():
         if sd > 0.0 and BIASES[name] not in (*fast, ""):
-            raise ValueError(f"{read.name}: {name}_sd needs {BIASES[name]} among fast, got {fast}")
+            raise ValueError(
+                f"{reader.name}: {name}_sd needs {BIASES[name]} among fast, got {fast}"
+            )
     return fast, {name: sd for name, sd in biases.items() if sd > 0.0}
 
 
-def _models(
-    row: Filter,
+def _make_models(
+    row: FilterDefinition,
     used: tuple[str, ...],
     delay: str,
     fast: tuple[str, ...],
     biases: tuple[str, ...],
-    read: Options,
-) -> tuple[Model, ...]:
+    reader: OptionReader,
+) -> tuple[FilterModel, ...]:
     """The model of each layer."""
     if row.model != "bicycle":
         return (MODELS[row.model],)
-    disturbances = read.one_of("disturbances", row.disturbances, DISTURBANCES)
+    disturbances = reader.read_choice("disturbances", row.disturbances, DISTURBANCES)
     late, rolls = delay in ("literal", "lag"), fast != row.fast
-    first = bicycle_model(used, fast, disturbances, late, rolls, biases)
+    first = make_bicycle_model(used, fast, disturbances, late, rolls, biases)
     return (first, MODELS[row.second]) if row.second else (first,)
 
 
-def _gate(delay: str, read: Options) -> dict[str, Any]:
+def _parse_gate(delay: str, reader: OptionReader) -> dict[str, Any]:
     """`gate` and `wary` of a `FilterConfig`."""
-    count = read.number("wary", 0.0, "is a number of samples", lambda v: v in range(1000))
+    count = reader.read_number("wary", 0.0, "is a number of samples", lambda v: v in range(1000))
     wary = int(count) if delay in ("clone", "buffer") else 0
-    gate = read.value("gate", CERTAIN if wary else None)
+    gate = reader.read_value("gate", GATE_PROBABILITY if wary else None)
     if gate is not None:
         expected = "is a probability between 0 and 1"
-        gate = read.checked("gate", gate, expected, lambda v: 0.0 < v < 1.0)
+        gate = reader.check_number("gate", gate, expected, lambda v: 0.0 < v < 1.0)
     return {"gate": gate, "wary": wary}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from . import kalman
-from .kalman import Array, inverse
+from .kalman import Array, compute_inverse
 from .pole_placement import observer_gain
 
 RULES = ("predict", "hold", "oh", "pseudo")
@@ -17,36 +17,36 @@ GAINS = ("constant", "from-29", "placed")
 _CYCLES, _SETTLED = 400, 1e-12
 
 
-def sampled_gain(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
+def compute_sampled_gain(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
     """The Kalman gain (n, q) of a sample every `steps`, prediction alone in between: its limit."""
     n = len(F)
-    over, noise = np.eye(n), np.zeros((n, n))
+    power, noise = np.eye(n), np.zeros((n, n))
     for _ in range(steps):
-        over, noise = F @ over, F @ noise @ F.T + Q
+        power, noise = F @ power, F @ noise @ F.T + Q
     P, K = noise.copy(), np.zeros((n, len(C)))
     for _ in range(_CYCLES):
-        before, K = K, kalman.gain(P, C, R)
-        P = over @ kalman.joseph(P, K, C, R) @ over.T + noise
+        before, K = K, kalman.kalman_gain(P, C, R)
+        P = power @ kalman.joseph_form(P, K, C, R) @ power.T + noise
         if np.abs(K - before).max() <= _SETTLED * np.abs(K).max():
             break
     return K
 
 
-def hold(F: Array, C: Array, K: Array, steps: int) -> Array:
+def compute_hold_shares(F: Array, C: Array, K: Array, steps: int) -> Array:
     """Hara: the innovation is held, B_i = L for all i; (steps, n, q).
 
     K (n, q): the gain of the single-rate filter with the low-rate measurement. L gives the error
     from sample to sample its poles and its very map: F^r - sum_{i=1}^{r} F^i L C = F^r (I - K C).
     """
-    over, total = np.eye(len(F)), np.zeros_like(F)
+    power, total = np.eye(len(F)), np.zeros_like(F)
     for _ in range(steps):
-        over = F @ over
-        total = total + over
-    L = np.linalg.solve(total, over @ K)
+        power = F @ power
+        total = total + power
+    L = np.linalg.solve(total, power @ K)
     return np.repeat(L[None], steps, axis=0)
 
 
-def pseudo(F: Array, C: Array, L: Array, first: Array, steps: int) -> Array:
+def compute_pseudo_shares(F: Array, C: Array, L: Array, first: Array, steps: int) -> Array:
     """B_i of the pseudo measurement with one gain L (n, q): dual-rate (31) and Oh's (35).
 
     B_i = L C F [(I - L C) F]^(i-1) E, with E = `first` (n, q), the estimated error after the
@@ -54,20 +54,20 @@ def pseudo(F: Array, C: Array, L: Array, first: Array, steps: int) -> Array:
     """
     shares, e = [L], first
     for _ in range(1, steps):
-        ahead = F @ e
-        shares.append(L @ C @ ahead)
-        e = ahead - L @ C @ ahead
+        propagated = F @ e
+        shares.append(L @ C @ propagated)
+        e = propagated - L @ C @ propagated
     return np.array(shares)
 
 
-def from_29(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
+def compute_shares_29(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
     """B_i = L_i G_i with G_i of (31) and L_i the Kalman gain for the pseudo noise of (29): limits.
 
     The covariance recursion is the paper's, which takes pseudo measurements for independent ones;
     its error can grow (by 1.17 to 1.22 a sample for a course alone). Returns (steps, n, q).
     """
     n, q = len(F), len(C)
-    pinv = inverse("moore-penrose", C, np.eye(n), R)
+    pinv = compute_inverse("moore-penrose", C, np.eye(n), R)
     P, shares = Q.copy(), np.zeros((steps, n, q))
     for _ in range(_CYCLES):
         before = shares.copy()
@@ -84,15 +84,15 @@ def from_29(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
                 v = G + C @ Lambda
                 noise = C @ Upsilon @ C.T + v @ R @ v.T  # (29)
                 P = F @ P @ F.T + Q
-            L = kalman.gain(P, C, noise)
-            P = kalman.joseph(P, L, C, noise)
+            L = kalman.kalman_gain(P, C, noise)
+            P = kalman.joseph_form(P, L, C, noise)
             shares[i] = L @ G
         if np.abs(shares - before).max() <= _SETTLED * np.abs(shares).max():
             break
     return shares
 
 
-def shares_of(
+def compute_shares(
     rule: str, gains: str, poles: Any, F: Array, Q: Array, C: Array, R: Array, steps: int
 ) -> Array:
     """B_i (steps, n, q) of a rule of `RULES` with gains of `GAINS`.
@@ -100,22 +100,24 @@ def shares_of(
     poles: (n,) of the z-plane for one step, for gains "placed": of the fast-rate filter (I - L C) F
     where samples are made up in between, of the single-rate one (to the power of `steps`) else.
     """
-    single = rule in ("predict", "hold")
+    is_single_rate = rule in ("predict", "hold")
     if gains == "from-29":
-        return from_29(F, Q, C, R, steps)
+        return compute_shares_29(F, Q, C, R, steps)
     if gains == "placed":
         assert poles is not None
-        over = steps if single else 1
-        L = observer_gain(np.linalg.matrix_power(F, over), C, poles**over)
+        exponent = steps if is_single_rate else 1
+        L = observer_gain(np.linalg.matrix_power(F, exponent), C, poles**exponent)
     else:
-        L = sampled_gain(F, Q, C, R, steps)
+        L = compute_sampled_gain(F, Q, C, R, steps)
     if rule == "hold":
-        return hold(F, C, L, steps)
+        return compute_hold_shares(F, C, L, steps)
     if rule == "predict":
         return np.concatenate([L[None], np.zeros((steps - 1, *L.shape))])
     if gains == "constant":
         L = L / steps  # every step takes its even share
-    return pseudo(F, C, L, inverse("moore-penrose", C, np.eye(len(F)), R) - L, steps)
+    return compute_pseudo_shares(
+        F, C, L, compute_inverse("moore-penrose", C, np.eye(len(F)), R) - L, steps
+    )
 
 
 def frame_map(F: Array, C: Array, shares: Array) -> Array:
@@ -135,27 +137,27 @@ def write_shares(
     """
     steps, n, q = B.shape
     table[first : first + steps * q, :n] = B.transpose(0, 2, 1).reshape(steps * q, n)
-    _covariances(F, Q, C, R, B, table, behind)
+    _write_covariances(F, Q, C, R, B, table, behind)
 
 
-def _covariances(
+def _write_covariances(
     F: Array, Q: Array, C: Array, R: Array, B: Array, table: Array, behind: int
 ) -> None:
     """The covariance of the error after each step, from what is left of a long recursion."""
     n, q = F.shape[0], len(C)
     upper = np.triu_indices(n)
     P = np.zeros((n + q, n + q))  # of the error and the last innovation
-    move = np.eye(n + q)
-    move[:n, :n] = F
+    predict_map = np.eye(n + q)
+    predict_map[:n, :n] = F
     for _ in range(30):
         for i, share in enumerate(B):
-            P = move @ P @ move.T
+            P = predict_map @ P @ predict_map.T
             P[:n, :n] += Q
             if i == 0:
-                see = np.block([[np.eye(n), np.zeros((n, q))], [C, np.zeros((q, q))]])
-                P = see @ P @ see.T
+                measure_map = np.block([[np.eye(n), np.zeros((n, q))], [C, np.zeros((q, q))]])
+                P = measure_map @ P @ measure_map.T
                 P[n:, n:] += R
-            take = np.eye(n + q)
-            take[:n, n:] = -share
-            P = take @ P @ take.T
+            correct_map = np.eye(n + q)
+            correct_map[:n, n:] = -share
+            P = correct_map @ P @ correct_map.T
             table[1 + i, behind:] = P[:n, :n][upper]

@@ -12,11 +12,11 @@ import numpy as np
 
 from ..core.delay import CLONE, CONSTANT, STORED
 from ..core.intersample import DUAL_RATE, PSEUDO
-from ..core.memory import Memory
+from ..core.memory import FilterRecord
 from .config import FilterConfig
 from .dual_rate import frame_map
 from .kalman import Array
-from .periodic import design, measured_rows
+from .periodic import build_measurement_rows, design_gains
 from .pole_placement import transition_matrix
 from .schedule import Schedule
 
@@ -28,80 +28,82 @@ def spectral_radius(M: Array) -> float:
     return float(np.abs(np.linalg.eigvals(M)).max())
 
 
-def unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
+def find_unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
     """The directions in which an error stays for ever, each as "beta 1, psi -1, ..."."""
     values, vectors = np.linalg.eig(M)
-    found = []
+    directions = []
     for i in np.flatnonzero(np.abs(values) > 1.0 - MARGINAL):
         v = np.real(vectors[: len(names), i])
         largest = np.abs(v).max()
-        lead = v[0] if abs(v[0]) > 1e-6 * largest else v[np.argmax(np.abs(v))]
-        parts = zip(names, v / lead, strict=True)
-        found.append(", ".join(f"{name} {part:.4g}" for name, part in parts if abs(part) > 1e-6))
-    return tuple(found)
+        leading = v[0] if abs(v[0]) > 1e-6 * largest else v[np.argmax(np.abs(v))]
+        parts = zip(names, v / leading, strict=True)
+        directions.append(
+            ", ".join(f"{name} {part:.4g}" for name, part in parts if abs(part) > 1e-6)
+        )
+    return tuple(directions)
 
 
 @dataclass(frozen=True)
-class _Task:
+class _DesignKey:
     """What a table of gains depends on: key has all of it."""
 
     key: bytes
-    f: Memory = field(compare=False)
+    f: FilterRecord = field(compare=False)
     schedule: Schedule = field(compare=False)
     speed: float = field(compare=False)
     config: FilterConfig = field(compare=False)
 
 
 @lru_cache(maxsize=64)  # the same filter drives in many envs
-def _designed(task: _Task) -> tuple[Array, Array]:
-    table, there = design(task.f, task.schedule, task.speed, task.config)
-    return table, error_map(there, table, task.schedule)
+def _design_cached(task: _DesignKey) -> tuple[Array, Array]:
+    table, record = design_gains(task.f, task.schedule, task.speed, task.config)
+    return table, compute_error_map(record, table, task.schedule)
 
 
-def designed(
-    f: Memory, schedule: Schedule, speed: float, config: FilterConfig
+def design_and_map(
+    f: FilterRecord, schedule: Schedule, speed: float, config: FilterConfig
 ) -> tuple[Array, Array]:
     """The table of gains and the map of the error at a speed in m/s, to be read alone."""
     key = pickle.dumps((f.tobytes(), schedule, speed, config))
-    return _designed(_Task(key, f, schedule, speed, config))
+    return _design_cached(_DesignKey(key, f, schedule, speed, config))
 
 
-def error_map(f: Memory, table: Array, schedule: Schedule) -> Array:
+def compute_error_map(f: FilterRecord, table: Array, schedule: Schedule) -> Array:
     """The error after one cycle over that before it, (size, size); what else a rule carries on
     (the estimated error e, the last innovation, stored predictions) stands behind it.
 
-    table (rows, columns) and f: from `periodic.design`, at one speed.
+    table (rows, columns) and f: from `periodic.design_gains`, at one speed.
     """
     size, s = int(f.total), int(f.first_slow)
     F = np.eye(size)
     F[: f.n, : f.n] = transition_matrix(f, f.G[: f.dense, : f.n])
     if f.between == DUAL_RATE:
-        return _dual_rate_map(f, table, F, schedule)
+        return _build_dual_rate_map(f, table, F, schedule)
     late = f.late in (STORED, CONSTANT) and s >= 0
     stored = max(schedule.lags) // schedule.period + 1 if late else 0  # the newest first
     rows = int(f.rows[s]) if s >= 0 else 0
-    twice = 2 if f.between == PSEUDO else 1
-    width = twice * size + stored * rows
+    n_errors = 2 if f.between == PSEUDO else 1
+    width = n_errors * size + stored * rows
     total: Array = np.eye(width)
     for step in range(schedule.cycle):
         move = np.eye(width)
-        one = F @ _latched(f, schedule, step)
-        for k in range(twice):
-            move[k * size : (k + 1) * size, k * size : (k + 1) * size] = one
+        step_map = F @ _build_clone_map(f, schedule, step)
+        for k in range(n_errors):
+            move[k * size : (k + 1) * size, k * size : (k + 1) * size] = step_map
         if stored and step % schedule.period == 0:  # the prediction of what is captured now
-            at, end = twice * size, width - rows
+            at, end = n_errors * size, width - rows
             store = np.eye(width)
             store[at:] = 0.0
             store[at + rows :, at:end] = np.eye(end - at)
             store[at : at + rows, : f.n] = f.C[s, :rows, : f.n]
             move = store @ move
-        correct = _pseudo_correction if f.between == PSEUDO else _correction
-        stored_at = twice * size if stored else -1
+        correct = _build_pseudo_correction if f.between == PSEUDO else _build_correction
+        stored_at = n_errors * size if stored else -1
         total = np.asarray(correct(f, table, schedule, step, width, stored_at) @ move @ total)
     return total
 
 
-def _latched(f: Memory, schedule: Schedule, step: int) -> Array:
+def _build_clone_map(f: FilterRecord, schedule: Schedule, step: int) -> Array:
     """Clones of what was captured in the step before."""
     L, s = np.eye(int(f.total)), int(f.first_slow)
     frame, rest = divmod((step - 1) % schedule.cycle, schedule.period)
@@ -113,31 +115,33 @@ def _latched(f: Memory, schedule: Schedule, step: int) -> Array:
     return L
 
 
-def _seen(f: Memory, schedule: Schedule, frame: int, width: int, stored_at: int) -> Array:
+def _build_residual_rows(
+    f: FilterRecord, schedule: Schedule, frame: int, width: int, stored_at: int
+) -> Array:
     """What the residuals of a step see of the whole error, (m + p, width).
 
     stored_at: where stored predictions start in the error; -1: there are none.
     """
     lag = schedule.lags[frame] if schedule.lags else 0
-    own = measured_rows(f, frame, lag)
-    C = np.zeros((len(own), width))
-    C[:, : own.shape[1]] = own
+    measured = build_measurement_rows(f, frame, lag)
+    C = np.zeros((len(measured), width))
+    C[:, : measured.shape[1]] = measured
     if stored_at >= 0:
-        m, p = int(f.fasts), len(own) - int(f.fasts)
+        m, p = int(f.fasts), len(measured) - int(f.fasts)
         C[m:] = 0.0
         at = stored_at + lag // schedule.period * p
         C[m:, at : at + p] = np.eye(p)
     return C
 
 
-def _correction(
-    f: Memory, table: Array, schedule: Schedule, step: int, width: int, stored_at: int
+def _build_correction(
+    f: FilterRecord, table: Array, schedule: Schedule, step: int, width: int, stored_at: int
 ) -> Array:
     """(I - K C) of the fast rows and of the frames that arrive in a step."""
     size, m = int(f.total), int(f.fasts)
     I = np.eye(width)  # noqa: E741
     M = I.copy()
-    fast = _seen(f, schedule, 0, width, stored_at)[:m]
+    fast = _build_residual_rows(f, schedule, 0, width, stored_at)[:m]
     joint = np.zeros((width, width))
     for i in range(m):
         K = np.zeros(width)
@@ -147,38 +151,42 @@ def _correction(
         else:
             M = (I - np.outer(K, fast[i])) @ M
     M = (I - joint) @ M
-    for frame in schedule.arriving(step):
-        C = _seen(f, schedule, frame, width, stored_at)[m:]
-        own = measured_rows(f, frame, 0 if stored_at >= 0 else schedule.lags[frame])[m:]
+    for frame in schedule.find_arriving(step):
+        C = _build_residual_rows(f, schedule, frame, width, stored_at)[m:]
+        measured = build_measurement_rows(f, frame, 0 if stored_at >= 0 else schedule.lags[frame])[
+            m:
+        ]
         first = 1 + schedule.cycle * max(m, 1) + frame * len(C)
-        total, passed = np.zeros((width, len(C))), np.eye(len(C))
+        total, residual_map = np.zeros((width, len(C))), np.eye(len(C))
         for i in range(len(C)):  # row i's correction changes the residuals of those behind it
             K = np.zeros(width)
             K[:size] = table[first + i, :size]
-            total += np.outer(K, passed[i])
-            passed -= np.outer(own @ K[:size], passed[i]) * (np.arange(len(C)) > i)[:, None]
+            total += np.outer(K, residual_map[i])
+            residual_map -= (
+                np.outer(measured @ K[:size], residual_map[i]) * (np.arange(len(C)) > i)[:, None]
+            )
         M = (I - total @ C) @ M
     return M
 
 
-def _pseudo_correction(
-    f: Memory, table: Array, schedule: Schedule, step: int, width: int, stored_at: int
+def _build_pseudo_correction(
+    f: FilterRecord, table: Array, schedule: Schedule, step: int, width: int, stored_at: int
 ) -> Array:
     """(error, e, ...) -> (error, e, ...): tie-vision (19)-(22)."""
     size, m = int(f.total), int(f.fasts)
-    C = measured_rows(f, 0)
+    C = build_measurement_rows(f, 0)
     first = 1 + schedule.cycle * max(m, 1) + (len(C) - m) * len(schedule.lags)
     K = table[first : first + len(C), :size].T
     inverse = table[first + len(C) : first + 2 * len(C), :size].T
     M, error, e = np.eye(width), slice(0, size), slice(size, 2 * size)
-    arriving = schedule.arriving(step)
+    arriving = schedule.find_arriving(step)
     if arriving:
-        see = np.zeros((len(C), width))
-        see[:, :size] = C
+        residual_rows = np.zeros((len(C), width))
+        residual_rows[:, :size] = C
         if stored_at >= 0:
-            see = _seen(f, schedule, arriving[-1], width, stored_at)
-        M[error] -= K @ see  # (19)
-        M[e] = (inverse - K) @ see  # (20)
+            residual_rows = _build_residual_rows(f, schedule, arriving[-1], width, stored_at)
+        M[error] -= K @ residual_rows  # (19)
+        M[e] = (inverse - K) @ residual_rows  # (20)
         return M
     M[error, error] -= K[:, :m] @ C[:m]  # the fast rows' residuals are real
     M[error, e] -= K[:, m:] @ C[m:]  # (22)
@@ -186,7 +194,7 @@ def _pseudo_correction(
     return M
 
 
-def _dual_rate_map(f: Memory, table: Array, F: Array, schedule: Schedule) -> Array:
+def _build_dual_rate_map(f: FilterRecord, table: Array, F: Array, schedule: Schedule) -> Array:
     """From sample to sample, with the shares in the table."""
     n, s, r = int(f.n), int(f.first_slow), schedule.period
     q = int(f.rows[s])

@@ -12,7 +12,7 @@ RIDGE = 1e-3  # lambda of Tikhonov's inverse, in SI units squared
 INVERSES = ("moore-penrose", "p-weighted", "tikhonov", "bayes")
 
 
-def gain(P: Array, C: Array, R: Array) -> Array:
+def kalman_gain(P: Array, C: Array, R: Array) -> Array:
     """K = P C^T (C P C^T + R)^-1, (n, p).
 
     With R = 0 it is a generalised inverse of C: the Moore-Penrose one for P = I, the P-weighted
@@ -22,7 +22,7 @@ def gain(P: Array, C: Array, R: Array) -> Array:
     return np.asarray(np.linalg.solve((C @ PC + R).T, PC.T).T, np.float64)
 
 
-def joseph(P: Array, K: Array, C: Array, R: Array) -> Array:
+def joseph_form(P: Array, K: Array, C: Array, R: Array) -> Array:
     """Covariance after a correction by any gain K: (I - K C) P (I - K C)^T + K R K^T.
 
     A sum of two squares stays symmetric and positive semidefinite under rounding.
@@ -32,7 +32,7 @@ def joseph(P: Array, K: Array, C: Array, R: Array) -> Array:
     return after
 
 
-def inverse(kind: str, C: Array, P: Array, R: Array) -> Array:
+def compute_inverse(kind: str, C: Array, P: Array, R: Array) -> Array:
     """The generalised inverse of C (p, n) that (20) needs; (n, p).
 
     C has full row rank only, so C^T C of the printed (20) is singular; the Moore-Penrose inverse is
@@ -42,12 +42,12 @@ def inverse(kind: str, C: Array, P: Array, R: Array) -> Array:
     """
     I, zero = np.eye(C.shape[1]), np.zeros((len(C), len(C)))  # noqa: E741
     if kind == "moore-penrose":
-        return gain(I, C, zero)
+        return kalman_gain(I, C, zero)
     if kind == "p-weighted":
-        return gain(P, C, zero)
+        return kalman_gain(P, C, zero)
     if kind == "bayes":
-        return gain(P, C, R)
-    return gain(I, C, RIDGE * np.eye(len(C)))
+        return kalman_gain(P, C, R)
+    return kalman_gain(I, C, RIDGE * np.eye(len(C)))
 
 
 def constant_gain(K_fast: Array, K_slow: Array, steps: int) -> Array:

@@ -13,7 +13,7 @@ from ...envs.sensors.slow import SLOW, SLOW_NAMES
 COURSE_SPEED = 60.0 / 3.6  # m/s at which the receivers' course noise is quoted
 
 
-class Row(NamedTuple):
+class MeasurementRow(NamedTuple):
     """One value of a packet as a measurement: a sum of states.
 
     noise: its standard deviation is the option `<noise>_noise`. sd: that option's default, in the
@@ -38,25 +38,31 @@ class Measurement:
     second layer. heading_fix: its first sample, where it is far off, sets psi.
     """
 
-    rows: tuple[Row, ...]
-    velocities: tuple[Row, ...] = ()
+    rows: tuple[MeasurementRow, ...]
+    velocities: tuple[MeasurementRow, ...] = ()
     heading_fix: bool = False
 
 
 MEASUREMENTS: dict[str, Measurement] = {
     "camera": Measurement(
-        (Row(("psi",), "psi", 3.5e-3, angle=True), Row(("y_l",), "y_l", 0.02)),
+        (
+            MeasurementRow(("psi",), "psi", 3.5e-3, angle=True),
+            MeasurementRow(("y_l",), "y_l", 0.02),
+        ),
     ),
     "gps": Measurement(
-        (Row(("beta", "psi"), "course", math.radians(0.14), True, True, ground=True),),
-        (Row(("v_x",), "gps_speed", 0.05), Row(("v_y",), "gps_speed", 0.05)),  # (41)
+        (MeasurementRow(("beta", "psi"), "course", math.radians(0.14), True, True, ground=True),),
+        (
+            MeasurementRow(("v_x",), "gps_speed", 0.05),
+            MeasurementRow(("v_y",), "gps_speed", 0.05),
+        ),  # (41)
         heading_fix=True,
     ),
 }
 """By the sensor's name. (41): double-layer-gps."""
 
 
-def packet_column(sensor: str, value: str) -> int:
+def find_packet_column(sensor: str, value: str) -> int:
     """The column of a sensor's packets that holds a value; 0 where it sends none of that name."""
-    names = [each.name for each in SLOW[SLOW_NAMES.index(sensor)].values]
+    names = [field.name for field in SLOW[SLOW_NAMES.index(sensor)].values]
     return PACKET.value + names.index(value) if value in names else 0

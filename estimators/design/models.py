@@ -14,16 +14,16 @@ import numpy.typing as npt
 
 from ...envs.record import FAST
 from ...envs.sensors.slow import SLOW_NAMES
-from ...envs.vehicle.linear import roll
+from ...envs.vehicle.linear import make_roll_model
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
-from ..core.memory import Car, Memory
+from ..core.memory import CarIndex, FilterRecord
 from ..core.transition import FORCES, KINEMATIC, LATERAL, ROLL, VELOCITY_ROLL, YAW
-from .measurements import MEASUREMENTS, packet_column
+from .measurements import MEASUREMENTS, find_packet_column
 
 Array = npt.NDArray[np.float64]
 
 
-class State(NamedTuple):
+class StateInfo(NamedTuple):
     """A state: unit, usual standard deviation at the start, and bound of estimates observed."""
 
     unit: str
@@ -32,45 +32,45 @@ class State(NamedTuple):
 
 
 STATES = {
-    "beta": State("rad", 0.02, np.pi / 2.0),
-    "gamma": State("rad/s", 0.05, 10.0),
-    "psi": State("rad", 0.05, np.pi),
-    "y_l": State("m", 0.3, 200.0),
-    "psi_late": State("rad", 0.05, np.pi),
-    "y_l_late": State("m", 0.3, 200.0),
-    "v_x": State("m/s", 0.1, 100.0),
-    "v_y": State("m/s", 0.1, 100.0),
-    "phi": State("rad", 0.02, np.pi / 2.0),
-    "phi_rate": State("rad/s", 0.05, 10.0),
-    "F_yf": State("N", 500.0, 1e5),
-    "F_yr": State("N", 500.0, 1e5),
-    "d1": State("rad/s", 0.1, 100.0),
-    "d2": State("rad/s2", 1.0, 1000.0),
-    "d3": State("rad/s", 0.1, 100.0),
-    "d": State("rad/s2", 1.0, 1000.0),
-    "F_d": State("N", 0.0, 1e5),
-    "N_d": State("N m", 100.0, 1e5),
-    "bias": State("rad/s", 0.0, 10.0),
-    "accel_bias": State("m/s2", 0.0, 50.0),
-    "accel_scale": State("-", 0.0, 1.0),
-    "bank": State("rad", 0.0, 1.0),
-    "front_tyres": State("-", 0.0, 5.0),
-    "rear_tyres": State("-", 0.0, 5.0),
-    "inverse_friction": State("-", 0.0, 5.0),
+    "beta": StateInfo("rad", 0.02, np.pi / 2.0),
+    "gamma": StateInfo("rad/s", 0.05, 10.0),
+    "psi": StateInfo("rad", 0.05, np.pi),
+    "y_l": StateInfo("m", 0.3, 200.0),
+    "psi_late": StateInfo("rad", 0.05, np.pi),
+    "y_l_late": StateInfo("m", 0.3, 200.0),
+    "v_x": StateInfo("m/s", 0.1, 100.0),
+    "v_y": StateInfo("m/s", 0.1, 100.0),
+    "phi": StateInfo("rad", 0.02, np.pi / 2.0),
+    "phi_rate": StateInfo("rad/s", 0.05, 10.0),
+    "F_yf": StateInfo("N", 500.0, 1e5),
+    "F_yr": StateInfo("N", 500.0, 1e5),
+    "d1": StateInfo("rad/s", 0.1, 100.0),
+    "d2": StateInfo("rad/s2", 1.0, 1000.0),
+    "d3": StateInfo("rad/s", 0.1, 100.0),
+    "d": StateInfo("rad/s2", 1.0, 1000.0),
+    "F_d": StateInfo("N", 0.0, 1e5),
+    "N_d": StateInfo("N m", 100.0, 1e5),
+    "bias": StateInfo("rad/s", 0.0, 10.0),
+    "accel_bias": StateInfo("m/s2", 0.0, 50.0),
+    "accel_scale": StateInfo("-", 0.0, 1.0),
+    "bank": StateInfo("rad", 0.0, 1.0),
+    "front_tyres": StateInfo("-", 0.0, 5.0),
+    "rear_tyres": StateInfo("-", 0.0, 5.0),
+    "inverse_friction": StateInfo("-", 0.0, 5.0),
 }
 """All states of all models, by name."""
-FOREIGN_STATE = State("-", 0.0, 1e6)
+FOREIGN_STATE = StateInfo("-", 0.0, 1e6)
 """Any other, which only a user's estimator has."""
 
 
 @dataclass(frozen=True)
-class Model:
+class FilterModel:
     """States by name, what drives them and what is measured.
 
     kind: of `transition`. states: those that follow the model. disturbances: name of each state
     behind them and the state that it pushes, or, for "forces", an Ornstein-Uhlenbeck force and
     moment. late: the states that lag behind the camera's (tie-vision (12)). biases: the last
-    states, of `BIASES`. inputs, fast: names of `signals`.
+    states, of `BIASES`. inputs, fast: names of `make_signals`.
     """
 
     kind: int
@@ -85,8 +85,10 @@ class Model:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all states."""
-        behind = ("F_d", "N_d") if self.forces else tuple(name for name, _ in self.disturbances)
-        return self.states + self.late + behind + self.biases
+        disturbance_names = (
+            ("F_d", "N_d") if self.forces else tuple(name for name, _ in self.disturbances)
+        )
+        return self.states + self.late + disturbance_names + self.biases
 
 
 ORDER = ("beta", "gamma", "psi", "y_l")
@@ -104,31 +106,31 @@ WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
 WALK_ALL = (*WALK, ("d3", "psi"))  # dual-rate (4): one for every state of (37)
 DISTURBANCES = ("none", "walk", "walk-all", "forces")
 
-MODELS: dict[str, Model] = {
-    "roll": Model(ROLL, ("phi", "phi_rate"), ("accel_y",), ("roll_rate",)),
-    "kinematic": Model(KINEMATIC, ("v_x", "v_y"), ("accel_x", "accel_y"), ("wheel",)),
-    "velocity-roll": Model(
+MODELS: dict[str, FilterModel] = {
+    "roll": FilterModel(ROLL, ("phi", "phi_rate"), ("accel_y",), ("roll_rate",)),
+    "kinematic": FilterModel(KINEMATIC, ("v_x", "v_y"), ("accel_x", "accel_y"), ("wheel",)),
+    "velocity-roll": FilterModel(
         VELOCITY_ROLL,
         ("v_x", "v_y", "phi", "phi_rate"),
         ("accel_x", "accel_y"),
         ("roll_rate",),
         (("d", "phi_rate"),),
     ),
-    "yaw-moment": Model(YAW, ("gamma",), ("N_z",), ("gyro",), (("N_d", "gamma"),)),
-    "tyre-forces": Model(
+    "yaw-moment": FilterModel(YAW, ("gamma",), ("N_z",), ("gyro",), (("N_d", "gamma"),)),
+    "tyre-forces": FilterModel(
         FORCES, ("gamma",), ("N_z",), ("gyro", "accel_y"), (("F_yf", "gamma"), ("F_yr", "gamma"))
     ),
 }
 """Models other than the bicycle's, by name."""
 
-EXPANDED = 0.004  # s between two expansions of the tyres' forces
+EXPANSION_TIME = 0.004  # s between two expansions of the tyres' forces
 
 _LATE = {"psi": "psi_late", "y_l": "y_l_late"}
 
 Signal = tuple[tuple[int, float], tuple[int, float]]
 
 
-def signals(vehicle: Vehicle) -> dict[str, Signal]:
+def make_signals(vehicle: Vehicle) -> dict[str, Signal]:
     """Sums of two columns of a fast row, as (column, factor), by name."""
     arm = vehicle.rear_track / (2.0 * vehicle.wheel_radius)  # N_z = arm (T_r - T_l)
     single = ("gyro", "accel_y", "accel_x", "roll_rate", "steer", "curvature")
@@ -140,37 +142,39 @@ def signals(vehicle: Vehicle) -> dict[str, Signal]:
     return table
 
 
-def states_for(sensors: tuple[str, ...]) -> tuple[str, ...]:
+def select_states(sensors: tuple[str, ...]) -> tuple[str, ...]:
     """The fewest of a bicycle's states that these slow sensors measure: the first of `ORDER`."""
     rows = [row for sensor in sensors for row in MEASUREMENTS[sensor].rows]
     return ORDER[: max([2, *(1 + ORDER.index(state) for row in rows for state in row.states)])]
 
 
-def bicycle_model(
+def make_bicycle_model(
     sensors: tuple[str, ...],
     fast: tuple[str, ...],
     disturbances: str,
     late: bool,
     body: bool = False,
     biases: tuple[str, ...] = (),
-) -> Model:
+) -> FilterModel:
     """The bicycle with what these slow sensors need.
 
     disturbances: of `DISTURBANCES`; "walk" has d_1 and d_2, "walk-all" every state's. late: the
     camera measures states that lag (tie-vision (12)-(13)). body: it rolls. biases: of `BIASES`.
     """
     walks = {"walk": WALK, "walk-all": WALK_ALL}.get(disturbances, ())
-    states = states_for(sensors)
-    lagging = tuple(_LATE[s] for s in states if s in _LATE) if late and "camera" in sensors else ()
+    states = select_states(sensors)
+    late_states = (
+        tuple(_LATE[s] for s in states if s in _LATE) if late and "camera" in sensors else ()
+    )
     walks = tuple((name, state) for name, state in walks if state in states)
     inputs = ("steer", "N_z", "curvature") if "psi" in states else ("steer", "N_z")
     forces, states = disturbances == "forces", states + BODY * body
-    return Model(LATERAL, states, inputs, fast, walks, forces, lagging, biases)
+    return FilterModel(LATERAL, states, inputs, fast, walks, forces, late_states, biases)
 
 
 def write_model(
-    f: Memory,
-    model: Model,
+    f: FilterRecord,
+    model: FilterModel,
     vehicle: Vehicle,
     step: float,
     noise: Mapping[str, float],
@@ -191,8 +195,8 @@ def write_model(
     f.pushed[n - len(model.biases) - dense : n - dense] = -1
     f.banked = names.index("bank") - dense if "bank" in model.biases else -1
     f.rolling = names.index("phi") if model.kind == LATERAL and "phi" in names else 0
-    f.car[:] = [getattr(vehicle, name) for name in Car._fields]
-    body = roll(vehicle)
+    f.car[:] = [getattr(vehicle, name) for name in CarIndex._fields]
+    body = make_roll_model(vehicle)
     f.roll_stiffness, f.roll_damping, f.roll_arm = -body.A[1, 0], -body.A[1, 1], body.B[1, 0]
     f.sway = vehicle.roll_moment_arm / vehicle.mass
     f.preview = vehicle.preview
@@ -200,24 +204,24 @@ def write_model(
     f.Q[:n, :n] = Q * step
     f.decay[:] = 1.0
     if model.forces:  # exact discretisation of the process
-        keep = math.exp(-step / noise["time"])
-        f.decay[dense : dense + 2] = keep
-        f.Q[dense, dense] += (1.0 - keep * keep) * noise["force"] ** 2
-        f.Q[dense + 1, dense + 1] += (1.0 - keep * keep) * noise["moment"] ** 2
-        f.q_known[:], f.q_share = np.diag(f.Q)[dense : dense + 2], 1.0 - keep * keep
+        decay = math.exp(-step / noise["time"])
+        f.decay[dense : dense + 2] = decay
+        f.Q[dense, dense] += (1.0 - decay * decay) * noise["force"] ** 2
+        f.Q[dense + 1, dense + 1] += (1.0 - decay * decay) * noise["moment"] ** 2
+        f.q_known[:], f.q_share = np.diag(f.Q)[dense : dense + 2], 1.0 - decay * decay
     f.speed_state = names.index("v_x") if "v_x" in names else -1
     _write_tyres(f, model, vehicle)
     _write_signals(f, model, vehicle, noise)
     _write_rows(f, model, noise, noise_over_speed)
 
 
-def _write_tyres(f: Memory, model: Model, vehicle: Vehicle) -> None:
+def _write_tyres(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> None:
     """Where the tyres' states stand and start: at the nominal ones."""
     names = model.names
     if TYRES[0] not in names:
         return
     f.tyres, f.grip = names.index(TYRES[0]), names.index(TYRES[2]) if TYRES[2] in names else 0
-    f.again = max(1, round(EXPANDED / f.step))
+    f.again = max(1, round(EXPANSION_TIME / f.step))
     f.stiffness[:] = 2.0 * vehicle.front_stiffness, 2.0 * vehicle.rear_stiffness
     wheelbase = vehicle.front_arm + vehicle.rear_arm
     arms = np.array([vehicle.rear_arm, vehicle.front_arm])
@@ -229,18 +233,20 @@ def _write_tyres(f: Memory, model: Model, vehicle: Vehicle) -> None:
         f.first[f.grip] = 1.0 / vehicle.friction
 
 
-def _write_signals(f: Memory, model: Model, vehicle: Vehicle, noise: Mapping[str, float]) -> None:
+def _write_signals(
+    f: FilterRecord, model: FilterModel, vehicle: Vehicle, noise: Mapping[str, float]
+) -> None:
     """Inputs and fast measurements; rows that depend on the speed are `transition.build`'s."""
-    table, names = signals(vehicle), model.names
+    table, names = make_signals(vehicle), model.names
     f.inputs, f.fasts = len(model.inputs), len(model.fast)
     for i, name in enumerate(model.inputs):
         f.u_column[i], f.u_factor[i] = zip(*table[name], strict=True)
-    state_of = {"gyro": "gamma", "roll_rate": "phi_rate", "wheel": "v_x"}
+    measured_state = {"gyro": "gamma", "roll_rate": "phi_rate", "wheel": "v_x"}
     for i, name in enumerate(model.fast):
         f.y_column[i], f.y_factor[i] = zip(*table[name], strict=True)
         f.r_fast[i] = noise[name] ** 2
-        if name in state_of:
-            f.C_fast[i, names.index(state_of[name])] = 1.0
+        if name in measured_state:
+            f.C_fast[i, names.index(measured_state[name])] = 1.0
     f.scaled = names.index(SCALE) if SCALE in model.biases else 0
     for bias in filter(WANDER.get, model.biases):
         f.C_fast[model.fast.index(BIASES[bias]), names.index(bias)] = 1.0
@@ -251,7 +257,10 @@ def _write_signals(f: Memory, model: Model, vehicle: Vehicle, noise: Mapping[str
 
 
 def _write_rows(
-    f: Memory, model: Model, noise: Mapping[str, float], noise_over_speed: Mapping[str, float]
+    f: FilterRecord,
+    model: FilterModel,
+    noise: Mapping[str, float],
+    noise_over_speed: Mapping[str, float],
 ) -> None:
     """What the slow sensors that are used measure."""
     used = [s for s in range(len(SLOW_NAMES)) if f.period[s] > 0]
@@ -261,9 +270,9 @@ def _write_rows(
         second = model.kind == VELOCITY_ROLL
         rows = sensor.velocities if second else sensor.rows
         f.rows[s], f.heading_fix[s] = len(rows), sensor.heading_fix and not second
-        f.hdop_column[s] = packet_column(SLOW_NAMES[s], "hdop")
-        f.satellites_column[s] = packet_column(SLOW_NAMES[s], "satellites")
-        f.speed_column[s] = packet_column(SLOW_NAMES[s], "speed")
+        f.hdop_column[s] = find_packet_column(SLOW_NAMES[s], "hdop")
+        f.satellites_column[s] = find_packet_column(SLOW_NAMES[s], "satellites")
+        f.speed_column[s] = find_packet_column(SLOW_NAMES[s], "speed")
         for i, row in enumerate(rows):
             f.angle[s, i], f.ground[s, i] = row.angle, row.ground
             f.r[s, i] = noise[row.noise] ** 2

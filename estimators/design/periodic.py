@@ -12,25 +12,31 @@ import numpy as np
 
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute, maximum
-from ..core.covariance import measure_clone, measure_state
-from ..core.delay import CLONE, DIRECT, DROPPED, IGNORE, find
+from ..core.covariance import update_with_clone, update_with_states
+from ..core.delay import CLONE, DIRECT, DROPPED, IGNORE, find_clone
 from ..core.intersample import DUAL_RATE, NONE, PSEUDO
-from ..core.memory import Filters, Gains, Memory, Row
-from ..core.run import begin, begin_all, tick
+from ..core.memory import FilterRecord, FilterRecords, GainTables, Vector
+from ..core.run import reset_filter, reset_filters, run_tick
 from .config import FilterConfig
-from .dual_rate import shares_of, write_shares
-from .kalman import Array, constant_gain, inverse
-from .pole_placement import place, transition_matrix
+from .dual_rate import compute_shares, write_shares
+from .kalman import Array, compute_inverse, constant_gain
+from .pole_placement import transition_matrix, write_placed_gains
 from .schedule import Schedule
 
-SETTLED = 1e-12
-LONGEST = 600.0  # s of the recursion
-WALKED = 10.0  # s in which a bias walks by its prior where a filter is checked
+GAIN_TOLERANCE = 1e-12
+MAX_RECURSION = 600.0  # s of the recursion
+BIAS_WALK_TIME = 10.0  # s in which a bias walks by its prior where a filter is checked
 
 
 @jit
-def settle(
-    filters: Filters, s: int, lags: Any, cycles: int, table: Any, before: Any, gains: Gains
+def iterate_gains(
+    filters: FilterRecords,
+    s: int,
+    lags: Any,
+    cycles: int,
+    table: Any,
+    before: Any,
+    gains: GainTables,
 ) -> int:
     """Run a covariance filter over its schedule and write its gains; returns cycles used.
 
@@ -40,43 +46,45 @@ def settle(
     read.
     """
     f = filters[0]
-    begin(f, 0)
+    reset_filter(f, 0)
     n, size, cycle, width = f.n, f.total, f.cycle, maximum(f.fasts, 1)
-    for done in range(cycles):
+    for cycle_index in range(cycles):
         change = 0.0
-        for at in range(cycle):
-            tick(f, gains)
+        for step in range(cycle):
+            run_tick(f, gains)
             if f.tick % f.pace == 0:
                 for i in range(f.fasts):
-                    change = maximum(change, _copy(f.share[i], table[1 + at * width + i], size))
+                    change = maximum(
+                        change, _copy_gain(f.share[i], table[1 + step * width + i], size)
+                    )
             for frame in range(len(lags)):
                 captured = f.tick - lags[frame]
                 if (captured - frame * f.period[s]) % cycle != 0 or captured < 0:
                     continue
-                first = find(f, s, captured)
+                first = find_clone(f, s, captured)
                 if first == DROPPED:
                     continue
                 for i in range(size):
-                    _copy(f.P[i], before[i], size)
+                    _copy_gain(f.P[i], before[i], size)
                 for i in range(f.rows[s]):
                     if first == DIRECT:
-                        measure_state(f, f.C[s, i], f.r[s, i], 0.0)
+                        update_with_states(f, f.C[s, i], f.r[s, i], 0.0)
                     else:
-                        measure_clone(f, first + i, f.r[s, i], 0.0)
+                        update_with_clone(f, first + i, f.r[s, i], 0.0)
                     to = table[1 + cycle * width + frame * f.rows[s] + i]
-                    change = maximum(change, _copy(f.gain, to, size))
+                    change = maximum(change, _copy_gain(f.gain, to, size))
             k = size
             for i in range(n):
                 for j in range(i, n):
-                    table[1 + at * width, k] = f.P[i, j]
+                    table[1 + step * width, k] = f.P[i, j]
                     k += 1
-        if change < SETTLED:
-            return done + 1
+        if change < GAIN_TOLERANCE:
+            return cycle_index + 1
     return cycles
 
 
 @jit
-def _copy(source: Row, target: Row, size: int) -> Any:
+def _copy_gain(source: Vector, target: Vector, size: int) -> Any:
     """Copy `size` entries of a gain; returns the largest relative change."""
     change = 0.0
     for i in range(size):
@@ -86,7 +94,7 @@ def _copy(source: Row, target: Row, size: int) -> Any:
     return change
 
 
-def table_shape(f: Memory, schedule: Schedule) -> tuple[int, int]:
+def compute_table_shape(f: FilterRecord, schedule: Schedule) -> tuple[int, int]:
     """Rows and columns of a table of gains."""
     p, m = int(f.rows.max()), int(f.fasts)
     extra = {NONE: 0, PSEUDO: 2 * (m + p), DUAL_RATE: schedule.cycle * p}[int(f.between)]
@@ -94,24 +102,24 @@ def table_shape(f: Memory, schedule: Schedule) -> tuple[int, int]:
     return rows, int(f.total + f.n * (f.n + 1) // 2)
 
 
-def design(
-    f: Memory, schedule: Schedule, speed: float, config: FilterConfig
-) -> tuple[Array, Memory]:
+def design_gains(
+    f: FilterRecord, schedule: Schedule, speed: float, config: FilterConfig
+) -> tuple[Array, FilterRecord]:
     """The table of gains (rows, columns) at a speed in m/s, and the filter's memory with the
     transition G and the rows C_fast that it has there.
 
     f: left as it is.
     """
-    table, copy = _settled(f, schedule, speed, config)
-    there: Memory = np.array([f]).view(np.recarray)[0]
-    there.G[:], there.C_fast[:] = copy.G, copy.C_fast  # an accelerometer's row has the speed
-    return table, there
+    table, copy = _design_settled(f, schedule, speed, config)
+    record: FilterRecord = np.array([f]).view(np.recarray)[0]
+    record.G[:], record.C_fast[:] = copy.G, copy.C_fast  # an accelerometer's row has the speed
+    return table, record
 
 
-def _settled(
-    f: Memory, schedule: Schedule, speed: float, config: FilterConfig
-) -> tuple[Array, Memory]:
-    filters: Filters = np.array([f])
+def _design_settled(
+    f: FilterRecord, schedule: Schedule, speed: float, config: FilterConfig
+) -> tuple[Array, FilterRecord]:
+    filters: FilterRecords = np.array([f])
     copy = filters.view(np.recarray)[0]
     copy.periodic = copy.measured = copy.origin = copy.joint = copy.between = 0
     copy.pace = 1 if f.stride > 1 else f.pace
@@ -120,38 +128,38 @@ def _settled(
     copy.cycle, copy.pattern = schedule.cycle, max(1, len(schedule.lags))
     copy.period[copy.period > 0] = schedule.period
     copy.phase[:] = 0
-    _stir(copy)
+    _add_bias_walk(copy)
     s = int(f.first_slow)
-    table = np.zeros(table_shape(f, schedule))
+    table = np.zeros(compute_table_shape(f, schedule))
     table[0, 0] = 1.0
     if f.between == DUAL_RATE or config.poles:
-        begin_all(filters, 0)
+        reset_filters(filters, 0)
         G: Array = copy.G[: copy.dense, : copy.n].copy()
         if f.between == DUAL_RATE:
             _write_shares(copy, G, schedule, config, table)
         else:
-            place(copy, G, config.poles, table)
+            write_placed_gains(copy, G, config.poles, table)
         return table, copy
     lags = np.array(schedule.lags, np.int64) * int(f.late == CLONE)
-    cycles = max(2, int(LONGEST / float(copy.step)) // schedule.cycle)
+    cycles = max(2, int(MAX_RECURSION / float(copy.step)) // schedule.cycle)
     before = np.zeros((int(f.total), int(f.total)))
-    settle(filters, s, lags, cycles, table, before, np.zeros((1, 1, 1)))
+    iterate_gains(filters, s, lags, cycles, table, before, np.zeros((1, 1, 1)))
     if f.between == PSEUDO:
-        C = measured_rows(f, 0)
+        C = build_measurement_rows(f, 0)
         R = np.diag([*copy.r_fast[: copy.fasts], *copy.r[s, : copy.rows[s]]])
-        _pseudo_gains(copy, schedule, table, inverse(config.inverse, C, before, R))
+        _write_pseudo_gains(copy, schedule, table, compute_inverse(config.inverse, C, before, R))
     return table, copy
 
 
-def _stir(f: Memory) -> None:
+def _add_bias_walk(f: FilterRecord) -> None:
     """Let a constant bias walk by its prior in 10 s: what never moves has no settled gain, but
     whether it is seen is the same. Only a filter with gains of its own has one."""
     for i in range(int(f.dense), int(f.n)):
         if f.pushed[i - f.dense] < 0:
-            f.Q[i, i] += f.prior[i, i] * f.step / WALKED
+            f.Q[i, i] += f.prior[i, i] * f.step / BIAS_WALK_TIME
 
 
-def measured_rows(f: Memory, frame: int, lag: int = 1) -> Array:
+def build_measurement_rows(f: FilterRecord, frame: int, lag: int = 1) -> Array:
     """C over states and clones, (m + p, size): the fast rows, then the slow rows of a frame.
 
     A frame without lag, or where there are no clones, measures the states.
@@ -169,32 +177,34 @@ def measured_rows(f: Memory, frame: int, lag: int = 1) -> Array:
 
 
 def _write_shares(
-    f: Memory, G: Array, schedule: Schedule, config: FilterConfig, table: Array
+    f: FilterRecord, G: Array, schedule: Schedule, config: FilterConfig, table: Array
 ) -> None:
     """Append the shares of an innovation of the dual-rate rules."""
     n, s, total = int(f.n), int(f.first_slow), int(f.total)
     q = int(f.rows[s])
     F, C, Q, R = transition_matrix(f, G), f.C[s, :q, :n], f.Q[:n, :n], np.diag(f.r[s, :q])
     poles = np.exp(np.array(config.poles) * float(f.step)) if config.poles else None
-    B = shares_of(config.intersample, config.gains, poles, F, Q, C, R, schedule.period)
+    B = compute_shares(config.intersample, config.gains, poles, F, Q, C, R, schedule.period)
     first = 1 + schedule.cycle + q * len(schedule.lags)
     write_shares(F, Q, C, R, B, table, first, total)
 
 
-def _pseudo_gains(f: Memory, schedule: Schedule, table: Array, inverse: Array) -> None:
+def _write_pseudo_gains(f: FilterRecord, schedule: Schedule, table: Array, inverse: Array) -> None:
     """Append the constant gain and the generalised inverse of the pseudo-residual rule."""
     p, m, total = int(f.rows[f.first_slow]), int(f.fasts), int(f.total)
     cycle, frames, width = schedule.cycle, len(schedule.lags), max(int(f.fasts), 1)
     first = 1 + cycle * width + p * frames
-    turns = table[1 + cycle * width : first, :total].reshape(frames, p, total)
-    slow = np.mean([together(gains, measured_rows(f, 0)[m:]) for gains in turns], axis=0)
+    frame_gains = table[1 + cycle * width : first, :total].reshape(frames, p, total)
+    slow = np.mean(
+        [combine_gains(gains, build_measurement_rows(f, 0)[m:]) for gains in frame_gains], axis=0
+    )
     fast = table[1 : 1 + cycle * width, :total].reshape(cycle, width, total)[:, :m]
     K = constant_gain(fast, slow, schedule.period)
     table[first : first + m + p, :total] = K.T
     table[first + m + p :, :total] = inverse.T
 
 
-def together(K: Array, C: Array) -> Array:
+def combine_gains(K: Array, C: Array) -> Array:
     """The gains (p, n) of rows that correct together from those of one after the other."""
     joint = np.zeros_like(K)
     for i in range(len(K)):

@@ -3,11 +3,11 @@
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
-from ..core.memory import Memory
+from ..core.memory import FilterRecord
 from .kalman import Array
 
 
-def transition_matrix(f: Memory, G: Array) -> Array:
+def transition_matrix(f: FilterRecord, G: Array) -> Array:
     """F (n, n) of a step: G (dense, n) on the dense states, the others decay."""
     n, dense = int(f.n), len(G)
     F = np.zeros((n, n))
@@ -27,13 +27,13 @@ def observer_gain(F: Array, C: Array, poles: Array) -> Array:
         K: Array = place_poles(F.T, (C @ F).T, poles).gain_matrix.T
     except ValueError as error:
         raise ValueError(f"the poles {np.round(poles, 6)} cannot be placed: {error}") from None
-    reached = np.linalg.eigvals((np.eye(len(F)) - K @ C) @ F)
-    if np.abs(np.sort_complex(reached) - np.sort_complex(poles)).max() > 1e-6:
+    placed = np.linalg.eigvals((np.eye(len(F)) - K @ C) @ F)
+    if np.abs(np.sort_complex(placed) - np.sort_complex(poles)).max() > 1e-6:
         raise ValueError(f"the poles {np.round(poles, 6)} cannot be placed: not observable")
     return K
 
 
-def place(f: Memory, G: Array, poles: tuple[float, ...], table: Array) -> None:
+def write_placed_gains(f: FilterRecord, G: Array, poles: tuple[float, ...], table: Array) -> None:
     """Write the gains of the fast rows and the error's covariance into a table of gains.
 
     G: (dense, n). poles: (n,) in rad/s, negative real. table: (rows, columns), as in `periodic`.

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from ...envs.sensors.link import SlowSensor
 
 
-def whole_ticks(seconds: float, dt: float, what: str) -> int:
+def count_ticks(seconds: float, dt: float, label: str) -> int:
     """A time as a number of ticks; ValueError, naming it, where it is no whole number of them."""
     count = round(seconds / dt)
     if abs(seconds / dt - count) > 1e-6 * max(1.0, count):
-        raise ValueError(f"{what} of {seconds:g} s is no whole number of ticks of {dt:g} s")
+        raise ValueError(f"{label} of {seconds:g} s is no whole number of ticks of {dt:g} s")
     return count
 
 
@@ -29,33 +29,33 @@ class Schedule:
         """Steps after which everything repeats, the slots of the clones included."""
         return self.period * max(1, len(self.lags))
 
-    def arriving(self, step: int) -> list[int]:
+    def find_arriving(self, step: int) -> list[int]:
         """The frames that arrive in a step of the cycle."""
-        due = ((i * self.period + lag) % self.cycle for i, lag in enumerate(self.lags))
-        return [i for i, at in enumerate(due) if at == step]
+        arrival_steps = ((i * self.period + lag) % self.cycle for i, lag in enumerate(self.lags))
+        return [i for i, arrival_step in enumerate(arrival_steps) if arrival_step == step]
 
 
 NO_SENSOR = Schedule(1, ())
 
 
-def schedules(
-    who: str, sensor: SlowSensor, dt: float, stride: int, pace: int, frames: int
+def make_schedules(
+    label: str, sensor: SlowSensor, dt: float, stride: int, pace: int, frames: int
 ) -> tuple[Schedule, ...]:
     """What the sensor's schedule can be: one where it repeats, else its two extremes.
 
-    who: the sensor, in errors. stride: ticks of a filter's step. pace: ticks between steps that
+    label: the sensor, in errors. stride: ticks of a filter's step. pace: ticks between steps that
     listen; a sample is used in the first of them at or after its arrival. frames: stored captures,
     whose slots take turns; 0 for a filter that does not look at the lag.
     """
-    period = whole_ticks(sensor.period, dt, f"{who}'s period") // stride
-    late = [whole_ticks(delay, dt, f"a delay: {who}'s") for delay in sensor.delays]
-    jitter = whole_ticks(sensor.jitter, dt, f"{who}'s jitter")
+    period = count_ticks(sensor.period, dt, f"{label}'s period") // stride
+    late = [count_ticks(delay, dt, f"a delay: {label}'s") for delay in sensor.delays]
+    jitter = count_ticks(sensor.jitter, dt, f"{label}'s jitter")
 
-    def lagging(extra: int) -> Schedule:
+    def make_schedule(extra: int) -> Schedule:
         lags = [math.ceil((lag + extra) / pace) * pace // stride for lag in late]
         if len(set(lags)) == 1:
             lags = lags[:1]
         return Schedule(period, tuple(lags * (math.lcm(len(lags), max(1, frames)) // len(lags))))
 
-    shortest, longest = lagging(0), lagging(jitter)
+    shortest, longest = make_schedule(0), make_schedule(jitter)
     return (longest,) if shortest == longest else (shortest, longest)

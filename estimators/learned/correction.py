@@ -13,17 +13,17 @@ from ...envs.sensors.link import SlowSensor
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import Vehicle
 from ..core.memory import FILTER
-from ..entry import entry
+from ..entry import compile_call
 from ..estimator import Estimator
 from ..make import make_estimator
 from . import kernel
 from .files import Correction, load_correction
-from .kernel import EXAMPLE, begin, filter_and_correct, memory_size, net_of
+from .kernel import EXAMPLE, compute_memory_size, filter_and_correct, make_net, reset_memory
 
 Array = npt.NDArray[np.float64]
 
 
-class Learned:
+class LearnedEstimator:
     """A filter whose beta and its deviation a network corrects, as an `EstimatorLike`.
 
     Every 10 ticks the network reads what the filter and the fast sensors gave in the last 0.4 s,
@@ -36,30 +36,30 @@ class Learned:
     """
 
     def __init__(self, base: Estimator, correction: Correction, vehicle: Vehicle) -> None:
-        card, there = correction.card, base.names[: int(base.filters[0].n)]
+        card, base_states = correction.card, base.names[: int(base.filters[0].n)]
         if not base.compiled:
             raise ValueError(f"{base.name} with latency={base.config.latency} has no correction")
-        if base.name != card.base or not set(card.states) <= set(there) or base.dt != TICK:
+        if base.name != card.base or not set(card.states) <= set(base_states) or base.dt != TICK:
             raise ValueError(
                 f"the correction was trained on {card.base} with {', '.join(card.states)} and "
-                f"ticks of {TICK:g} s; this is {base.name} with {', '.join(there)} and ticks of "
-                f"{base.dt:g} s"
+                f"ticks of {TICK:g} s; this is {base.name} with {', '.join(base_states)} and "
+                f"ticks of {base.dt:g} s"
             )
         self.base, self.names, self.correction = base, base.names, correction
-        self.net = net_of(correction, base.names)
-        self.memory = np.zeros(memory_size(self.net, len(base.names)))
+        self.net = make_net(correction, base.names)
+        self.memory = np.zeros(compute_memory_size(self.net, len(base.names)))
         self.memory[kernel.MASS] = vehicle.mass
         self.reset(base.sensors, 0)
 
     def reset(self, sensors: Mapping[str, SlowSensor] | None, first: int) -> None:
         """Forget everything; as `EstimatorLike.reset`, None for the clocks of the last time."""
         self.base.reset(sensors, first)
-        begin(self.memory, first)
+        reset_memory(self.memory, first)
 
     def step(self, rows: Array, packets: Array) -> None:
         """Take fast rows and packets; as `EstimatorLike.step`."""
         record = rows, len(rows), packets.reshape(-1, PACKET_WIDTH), len(packets)
-        _step_entry()(self.base.filters, self.base.gains, *record, self.memory, self.net)
+        _compile_step()(self.base.filters, self.base.gains, *record, self.memory, self.net)
 
     @property
     def x(self) -> Array:
@@ -78,11 +78,11 @@ class Learned:
 
 
 @functools.cache
-def _step_entry() -> Any:
+def _compile_step() -> Any:
     """`filter_and_correct` as a plain call."""
     record = np.zeros((1, 1)), 0, np.zeros((1, 1)), 0
     layers = np.zeros(1, FILTER), np.zeros((1, 1, 1))
-    return entry(filter_and_correct, *layers, *record, np.zeros(1), EXAMPLE)
+    return compile_call(filter_and_correct, *layers, *record, np.zeros(1), EXAMPLE)
 
 
 def learned(
@@ -93,7 +93,7 @@ def learned(
     speed: float | None = None,
     file: str | Path | Correction = "joint",
     **options: Any,
-) -> Learned:
+) -> LearnedEstimator:
     """An `EstimatorFactory`: the filter that a correction was trained on, with that correction.
 
     file: a shipped correction's name, a file's path, or a `Correction`. The filter takes all slow
@@ -104,7 +104,7 @@ def learned(
     settings = {"slow": list(sensors)} | correction.card.base_options | options
     facts: dict[str, Any] = {"vehicle": vehicle, "sensors": sensors, "dt": dt, "speed": speed}
     base = make_estimator(correction.card.base, **facts, **settings)
-    return Learned(base, correction, vehicle)
+    return LearnedEstimator(base, correction, vehicle)
 
 
 learned_exact_kf = functools.partial(learned, file="exact-kf")

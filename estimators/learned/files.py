@@ -7,11 +7,18 @@ from typing import Any
 
 from safetensors.numpy import save
 
-from ...envs.backend.files import write_whole
-from ...envs.documents import made_of
+from ...envs.backend.files import write_atomic
+from ...envs.documents import from_json
 from ..filters import FILTERS
 from .network import Network
-from .network_file import ENDING, architecture_of, json_object, network_of, read_tensors, tensors_of
+from .network_file import (
+    SUFFIX,
+    build_network,
+    collect_tensors,
+    describe_network,
+    parse_json_object,
+    read_tensors,
+)
 
 FORMAT = "1"
 """Counts up where what a network reads (`kernel`) or its card changes."""
@@ -47,14 +54,16 @@ class CorrectionCard:
     sideslip: str = ""
 
     def __post_init__(self) -> None:
-        known = [name for name, row in FILTERS.items() if row.gains == "covariance"]
-        if self.base not in known:
-            raise ValueError(f"a correction's base is {', '.join(known)}, got {self.base!r}")
+        allowed = [name for name, row in FILTERS.items() if row.gains == "covariance"]
+        if self.base not in allowed:
+            raise ValueError(f"a correction's base is {', '.join(allowed)}, got {self.base!r}")
         if not isinstance(self.states, list | tuple) or "beta" not in self.states:
             raise ValueError(f"a correction reads its filter's beta, got states {self.states!r}")
-        told = sorted({"vehicle", "sensors", "dt", "speed"} & self.base_options.keys())
-        if told:
-            raise ValueError(f"base_options hold what the env tells a filter: {', '.join(told)}")
+        reserved = sorted({"vehicle", "sensors", "dt", "speed"} & self.base_options.keys())
+        if reserved:
+            raise ValueError(
+                f"base_options hold what the env tells a filter: {', '.join(reserved)}"
+            )
 
     @property
     def inputs(self) -> int:
@@ -73,26 +82,26 @@ class Correction:
 
     def __post_init__(self) -> None:
         net, inputs = self.network, self.card.inputs
-        found = net.inputs, net.width, net.memory, net.activation, net.output, net.clip is None
-        if found != (inputs, 2, 0, "relu", "linear", False) or any(n % 4 for n in net.hidden):
+        actual = net.inputs, net.width, net.memory, net.activation, net.output, net.clip is None
+        if actual != (inputs, 2, 0, "relu", "linear", False) or any(n % 4 for n in net.hidden):
             raise ValueError(
                 f"a correction's network takes {inputs} numbers and gives 2, is relu with layers "
-                f"of whole fours, clips and has no memory; this is {found} with {net.hidden}"
+                f"of whole fours, clips and has no memory; this is {actual} with {net.hidden}"
             )
 
 
-def shipped() -> list[str]:
+def list_shipped() -> list[str]:
     """The names of the corrections that come with the package: their filters'."""
-    return sorted(path.stem for path in FOLDER.glob(f"*{ENDING}"))
+    return sorted(path.stem for path in FOLDER.glob(f"*{SUFFIX}"))
 
 
 def save_correction(path: str | Path, correction: Correction) -> None:
     """Write the whole file or none; ValueError for another ending than `.safetensors`."""
-    if Path(path).suffix != ENDING:
-        raise ValueError(f"a correction's file is NAME{ENDING}, got {path}")
-    content = asdict(correction.card) | {"network": architecture_of(correction.network)}
+    if Path(path).suffix != SUFFIX:
+        raise ValueError(f"a correction's file is NAME{SUFFIX}, got {path}")
+    content = asdict(correction.card) | {"network": describe_network(correction.network)}
     metadata = {"format": FORMAT, "correction": json.dumps(content, allow_nan=False)}
-    write_whole(path, save(tensors_of(correction.network), metadata))
+    write_atomic(path, save(collect_tensors(correction.network), metadata))
 
 
 def load_correction(path: str | Path) -> Correction:
@@ -101,19 +110,19 @@ def load_correction(path: str | Path) -> Correction:
     Raises FileNotFoundError where there is none; ValueError for a file that is no correction, is
     cut short, has another format, or whose card and tensors do not fit together.
     """
-    found = FOLDER / f"{path}{ENDING}" if str(path) in shipped() else Path(path)
-    if not found.is_file():
-        names = ", ".join(shipped()) or "none"
+    file = FOLDER / f"{path}{SUFFIX}" if str(path) in list_shipped() else Path(path)
+    if not file.is_file():
+        names = ", ".join(list_shipped()) or "none"
         raise FileNotFoundError(f"there is no correction {path}; shipped ones: {names}")
-    tensors, metadata = read_tensors(found, "correction")
+    tensors, metadata = read_tensors(file, "correction")
     try:
         if metadata.get("format") != FORMAT or "correction" not in metadata:
             raise ValueError(f"safetensors without the card of a correction of format {FORMAT}")
-        content = json_object(metadata["correction"])
+        content = parse_json_object(metadata["correction"])
         architecture = content.pop("network", None)
-        if content.keys() != {each.name for each in fields(CorrectionCard)}:
+        if content.keys() != {card_field.name for card_field in fields(CorrectionCard)}:
             raise ValueError(f"the card has other fields than a correction's: {sorted(content)}")
-        card = made_of(CorrectionCard, content, "the card")
-        return Correction(card, network_of(architecture, card.inputs, tensors))
+        card = from_json(CorrectionCard, content, "the card")
+        return Correction(card, build_network(architecture, card.inputs, tensors))
     except ValueError as error:
-        raise ValueError(f"{found}: {error}") from None
+        raise ValueError(f"{file}: {error}") from None

@@ -10,18 +10,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.decorators import counted, jit
+from ...envs.backend.decorators import jit, jit_nrt
 from ...envs.backend.elementary import clip, exp
 from ...envs.backend.primitives import maximum, minimum
-from .memory import Array, Memory
+from .memory import Array, MemoryLayer
 
 ACTIVATIONS = ("tanh", "relu", "elu", "leaky-relu", "silu")
 OUTPUTS = ("tanh", "linear")
 TANH, RELU, ELU, LEAKY, SILU = range(len(ACTIVATIONS))
-_LARGE = 40.0  # where e^-x is nothing beside 1
+_MAX_EXPONENT = 40.0  # where e^-x is nothing beside 1
 
 
-class Packed(NamedTuple):
+class PackedNetwork(NamedTuple):
     """A network as compiled code takes it.
 
     mean, scale: of a frame, or of the stack. clip: infinite for none. inputs: of a frame. history:
@@ -42,26 +42,26 @@ class Packed(NamedTuple):
     numbers: Array
 
 
-def packed(
+def pack_network(
     scaling: tuple[Array, Array, float | None],
     history: int,
-    cells: Sequence[Memory],
+    cells: Sequence[MemoryLayer],
     layers: Sequence[tuple[Array, Array]],
     activation: str,
     output: str,
-) -> Packed:
+) -> PackedNetwork:
     """scaling: mean, scale and clip. layers: weights (outputs, inputs) and biases of each."""
-    mean, scale, most = scaling
-    first = cells[0].weight_in if cells else layers[0][0]
+    mean, scale, max_abs = scaling
+    first_weights = cells[0].weight_in if cells else layers[0][0]
     numbers = [cell.numbers for cell in cells]
     numbers += [part.T.ravel() for layer in layers for part in layer]
-    return Packed(
+    return PackedNetwork(
         mean,
         scale,
-        np.inf if most is None else float(most),
-        first.shape[1] // history,
+        np.inf if max_abs is None else float(max_abs),
+        first_weights.shape[1] // history,
         history,
-        np.array([each.form for each in cells], np.int64).reshape(-1, 4),
+        np.array([memory_layer.form for memory_layer in cells], np.int64).reshape(-1, 4),
         np.array([layers[0][0].shape[1], *(len(b) for _, b in layers)], np.int64),
         ACTIVATIONS.index(activation),
         OUTPUTS.index(output),
@@ -71,16 +71,16 @@ def packed(
 
 @jit
 def _tanh(x: Any) -> Any:
-    return 1.0 - 2.0 / (1.0 + exp(clip(x + x, 0.0 - _LARGE, _LARGE)))
+    return 1.0 - 2.0 / (1.0 + exp(clip(x + x, 0.0 - _MAX_EXPONENT, _MAX_EXPONENT)))
 
 
 @jit
 def _sigmoid(x: Any) -> Any:
-    return 1.0 / (1.0 + exp(clip(0.0 - x, 0.0 - _LARGE, _LARGE)))
+    return 1.0 / (1.0 + exp(clip(0.0 - x, 0.0 - _MAX_EXPONENT, _MAX_EXPONENT)))
 
 
 @jit
-def _bent(x: Any, kind: int) -> Any:
+def _apply_activation(x: Any, kind: int) -> Any:
     """An activation with torch's default arguments."""
     if kind == TANH:
         return _tanh(x)
@@ -90,73 +90,78 @@ def _bent(x: Any, kind: int) -> Any:
         return maximum(x, 0.01 * x)
     if kind == SILU:
         return x * _sigmoid(x)
-    return x if x > 0.0 else exp(maximum(x, 0.0 - _LARGE)) - 1.0
+    return x if x > 0.0 else exp(maximum(x, 0.0 - _MAX_EXPONENT)) - 1.0
 
 
 @jit
-def _sums(z: Any, numbers: Any, at: int, out: Any) -> int:
+def _apply_dense(z: Any, numbers: Any, offset: int, out: Any) -> int:
     """out = W z + b with the numbers at a place; the place behind them."""
     n = len(out)
-    bias = at + len(z) * n
+    bias = offset + len(z) * n
     for o in range(n):
         out[o] = numbers[bias + o]
     for i in range(len(z)):
-        row, x = numbers[at + i * n : at + i * n + n], z[i]
+        row, x = numbers[offset + i * n : offset + i * n + n], z[i]
         for o in range(n):
             out[o] += row[o] * x
     return bias + n
 
 
-@counted
-def _cell(z: Any, h: Any, gates: int, numbers: Any, at: int) -> int:
+@jit_nrt
+def _step_cell(z: Any, h: Any, gates: int, numbers: Any, offset: int) -> int:
     """A step of torch's GRU (3 gates) or LSTM (4); h: its state, updated; the place behind."""
     n = len(h) // (gates - 2)
-    taken, held = np.empty(gates * n), np.empty(gates * n)
-    at = _in_turn(z, h[:n], numbers, at, taken, held)
+    from_input, from_state = np.empty(gates * n), np.empty(gates * n)
+    offset = _compute_gates(z, h[:n], numbers, offset, from_input, from_state)
     for i in range(n):
         if gates == 3:
-            reset = _sigmoid(taken[i] + held[i])
-            update = _sigmoid(taken[n + i] + held[n + i])
-            candidate = _tanh(taken[2 * n + i] + reset * held[2 * n + i])
+            reset = _sigmoid(from_input[i] + from_state[i])
+            update = _sigmoid(from_input[n + i] + from_state[n + i])
+            candidate = _tanh(from_input[2 * n + i] + reset * from_state[2 * n + i])
             h[i] = (1.0 - update) * candidate + update * h[i]
         else:
             enter, forget, candidate, leave = (
-                taken[i] + held[i],
-                taken[n + i] + held[n + i],
-                taken[2 * n + i] + held[2 * n + i],
-                taken[3 * n + i] + held[3 * n + i],
+                from_input[i] + from_state[i],
+                from_input[n + i] + from_state[n + i],
+                from_input[2 * n + i] + from_state[2 * n + i],
+                from_input[3 * n + i] + from_state[3 * n + i],
             )
             h[n + i] = _sigmoid(forget) * h[n + i] + _sigmoid(enter) * _tanh(candidate)
             h[i] = _sigmoid(leave) * _tanh(h[n + i])
-    return at
+    return offset
 
 
 @jit
-def _in_turn(z: Any, h: Any, numbers: Any, at: int, taken: Any, held: Any) -> int:
-    """What a cell takes of its input and of its state, whose arrays stand as in `PARTS`."""
-    n, wide = len(taken), len(z) + len(h)
+def _compute_gates(
+    z: Any, h: Any, numbers: Any, offset: int, from_input: Any, from_state: Any
+) -> int:
+    """What a cell takes of its input and of its state, whose arrays stand as in `CELL_WEIGHTS`."""
+    n, n_inputs = len(from_input), len(z) + len(h)
     for o in range(n):
-        taken[o] = numbers[at + wide * n + o]
-        held[o] = numbers[at + (wide + 1) * n + o]
-    for i in range(wide):
-        row, into = numbers[at + i * n : at + i * n + n], taken if i < len(z) else held
+        from_input[o] = numbers[offset + n_inputs * n + o]
+        from_state[o] = numbers[offset + (n_inputs + 1) * n + o]
+    for i in range(n_inputs):
+        row, target = (
+            numbers[offset + i * n : offset + i * n + n],
+            from_input if i < len(z) else from_state,
+        )
         x = z[i] if i < len(z) else h[i - len(z)]
         for o in range(n):
-            into[o] += row[o] * x
-    return at + (wide + 2) * n
+            target[o] += row[o] * x
+    return offset + (n_inputs + 2) * n
 
 
-@counted
-def _traced(z: Any, m: Any, form: Any, numbers: Any, at: int) -> Any:
-    """(a step of `Traces`, the place behind); m: steps so far and means, updated."""
+@jit_nrt
+def _step_averages(z: Any, m: Any, form: Any, numbers: Any, offset: int) -> Any:
+    """(a step of `MovingAverages`, the place behind); m: steps so far and means, updated."""
     units, times = form[1], form[3]
     out = np.empty(units * (1 + times))
-    end = _sums(z, numbers, at + times, out[:units])
+    end = _apply_dense(z, numbers, offset + times, out[:units])
     for i in range(units - form[2], units):
-        out[i] = _bent(out[i], SILU)
+        out[i] = _apply_activation(out[i], SILU)
     m[0] += 1.0
     for j in range(times):
-        share = maximum(numbers[at + j], 1.0 / m[0])
+        share = maximum(numbers[offset + j], 1.0 / m[0])
         for i in range(units):
             k = j * units + i
             m[1 + k] += share * (out[i] - m[1 + k])
@@ -164,7 +169,7 @@ def _traced(z: Any, m: Any, form: Any, numbers: Any, at: int) -> Any:
     return out, end
 
 
-@counted
+@jit_nrt
 def forward(net: Any, x: Any, state: Any, out: Any) -> None:
     """out (N, width) of observations x (N, inputs); state (N, memory) is updated."""
     k, stacked, last = net.inputs, net.inputs * net.history, len(net.sizes) - 1
@@ -183,23 +188,25 @@ def forward(net: Any, x: Any, state: Any, out: Any) -> None:
         else:
             for i in range(frames):
                 m[i] = m[i + k] if i + k < frames else x[row, i + k - frames]
-        number, at = 0, frames
+        offset, position = 0, frames
         for c in range(len(net.cells)):
             gates, size = net.cells[c, 0], net.cells[c, 1]
             if gates == 0:
-                wide = 1 + size * net.cells[c, 3]
-                z, number = _traced(z, m[at : at + wide], net.cells[c], net.numbers, number)
+                n_state = 1 + size * net.cells[c, 3]
+                z, offset = _step_averages(
+                    z, m[position : position + n_state], net.cells[c], net.numbers, offset
+                )
             else:
-                wide = size * (gates - 2)
-                number = _cell(z, m[at : at + wide], gates, net.numbers, number)
-                z = m[at : at + size].copy()
-            at += wide
+                n_state = size * (gates - 2)
+                offset = _step_cell(z, m[position : position + n_state], gates, net.numbers, offset)
+                z = m[position : position + size].copy()
+            position += n_state
         for layer in range(last):
             y = np.empty(net.sizes[layer + 1])
-            number = _sums(z, net.numbers, number, y)
+            offset = _apply_dense(z, net.numbers, offset, y)
             kind = net.activation if layer < last - 1 else net.output
             if layer < last - 1 or net.output == TANH:
                 for i in range(len(y)):
-                    y[i] = _bent(y[i], kind)
+                    y[i] = _apply_activation(y[i], kind)
             z = y
         out[row] = z

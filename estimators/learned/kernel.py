@@ -10,18 +10,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...envs.backend.decorators import apart, copied, jit
+from ...envs.backend.decorators import copy_into, jit, noinline
 from ...envs.backend.elementary import clip, exp
 from ...envs.backend.primitives import maximum
 from ...envs.record import FAST, PACKET
-from ..core.run import advance, deviation
+from ..core.run import advance, compute_deviation
 from .files import FAST_INPUTS, LAGS, Correction
 
-PACE = 10  # ticks
-RING = max(LAGS) + 1  # frames
+FRAME_TICKS = 10  # ticks
+RING_FRAMES = max(LAGS) + 1  # frames
 COLUMNS = tuple(getattr(FAST, name) for name in FAST_INPUTS)
-LEAST = -8.0  # log of the least deviation, 0.02 degrees
-SLOWEST = 1.0  # m/s, below which a_y / v is a_y
+MIN_LOG_DEVIATION = -8.0  # log of the least deviation, 0.02 degrees
+MIN_SPEED = 1.0  # m/s, below which a_y / v is a_y
 
 TICK, COUNT, FRAMES, SHIFT, DEVIATION, MASS, SLIP_RATE = range(7)
 """Places in a memory: of the last fast row, rows in the sums, frames since the history began, what
@@ -30,7 +30,7 @@ is added to beta (rad), the deviation of the sum (rad, 0: there is no correction
 HISTORY = SLIP_RATE + 1 + len(COLUMNS)
 
 
-class Net(NamedTuple):
+class CorrectionNet(NamedTuple):
     """A correction as compiled code takes it.
 
     states: places of the filter's that are read, beta's among them. sizes: of the layers, inputs
@@ -46,16 +46,16 @@ class Net(NamedTuple):
     numbers: Any
 
 
-_WHOLE, _REAL = np.zeros(1, np.int64), np.zeros(1)
-EXAMPLE = Net(_WHOLE, 0, _REAL, _REAL, 1.0, _WHOLE, _REAL)
+_INTEGERS, _FLOATS = np.zeros(1, np.int64), np.zeros(1)
+EXAMPLE = CorrectionNet(_INTEGERS, 0, _FLOATS, _FLOATS, 1.0, _INTEGERS, _FLOATS)
 """For `entry`: all nets have these types."""
 
 
-def net_of(correction: Correction, states: tuple[str, ...]) -> Net:
+def make_net(correction: Correction, states: tuple[str, ...]) -> CorrectionNet:
     """The net for a filter with these states, all of the card's among them."""
     network = correction.network
     layers = zip(network.weights, network.biases, strict=True)
-    return Net(
+    return CorrectionNet(
         np.array([states.index(name) for name in correction.card.states], np.int64),
         states.index("beta"),
         np.array(network.mean),
@@ -67,18 +67,18 @@ def net_of(correction: Correction, states: tuple[str, ...]) -> Net:
 
 
 @jit
-def stack_at(net: Any) -> Any:
+def locate_stack(net: Any) -> Any:
     """Where the stack of frames, which is the network's input, begins in a memory."""
-    return HISTORY + net.sizes[0] // len(LAGS) * RING
+    return HISTORY + net.sizes[0] // len(LAGS) * RING_FRAMES
 
 
-def memory_size(net: Net, states: int) -> int:
+def compute_memory_size(net: CorrectionNet, states: int) -> int:
     """Numbers of a car's memory, in whole cache lines; at its end a filter's, states + 1."""
-    return (int(stack_at(net) + net.sizes.sum()) + states + 8) // 8 * 8
+    return (int(locate_stack(net) + net.sizes.sum()) + states + 8) // 8 * 8
 
 
 @jit
-def begin(m: Any, first: int) -> None:
+def reset_memory(m: Any, first: int) -> None:
     """A fresh memory of the same car, whose first row is the tick `first`."""
     for i in range(len(m)):
         m[i] *= 1.0 if i == MASS else 0.0
@@ -93,64 +93,68 @@ def _gather(m: Any, row: Any) -> None:
     for i in range(len(COLUMNS)):
         m[SLIP_RATE + 1 + i] += row[COLUMNS[i]]
     v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
-    m[SLIP_RATE] += row[FAST.accel_y] / maximum(v, SLOWEST) - row[FAST.gyro]
+    m[SLIP_RATE] += row[FAST.accel_y] / maximum(v, MIN_SPEED) - row[FAST.gyro]
 
 
 @jit
-def _frame(f: Any, gains: Any, m: Any, net: Any, at: int) -> int:
+def _write_frame(f: Any, gains: Any, m: Any, net: Any, offset: int) -> int:
     """Write the frame of this pace at a place; how many of its numbers are not finite."""
     k, n = len(COLUMNS) + 1, len(net.states)
     for i in range(k):  # the slip rate stands before the columns
-        m[at + i] = m[SLIP_RATE + i] / m[COUNT]
+        m[offset + i] = m[SLIP_RATE + i] / m[COUNT]
         m[SLIP_RATE + i] = 0.0
     for i in range(n):
-        m[at + k + i] = f.x[net.states[i]]
-    m[at + k + n], m[at + k + n + 1] = deviation(f, gains, net.beta), m[MASS]
-    m[COUNT], strange = 0.0, 0
+        m[offset + k + i] = f.x[net.states[i]]
+    m[offset + k + n], m[offset + k + n + 1] = compute_deviation(f, gains, net.beta), m[MASS]
+    m[COUNT], n_invalid = 0.0, 0
     for i in range(k + n + 2):
-        strange += 0 if m[at + i] - m[at + i] == 0.0 else 1
-    return strange
+        n_invalid += 0 if m[offset + i] - m[offset + i] == 0.0 else 1
+    return n_invalid
 
 
 @jit
-def _layers(m: Any, net: Any, at: int) -> int:
+def _run_layers(m: Any, net: Any, offset: int) -> int:
     """Run the network on the stack at a place, which it normalises; where its outputs are."""
-    inputs, number = net.sizes[0], 0
+    inputs, weight_offset = net.sizes[0], 0
     for i in range(inputs):
-        m[at + i] = clip((m[at + i] - net.mean[i]) * net.scale[i], 0.0 - net.clip, net.clip)
+        m[offset + i] = clip((m[offset + i] - net.mean[i]) * net.scale[i], 0.0 - net.clip, net.clip)
     for layer in range(len(net.sizes) - 1):
         outputs = net.sizes[layer + 1]
-        z, sums = m[at : at + inputs], m[at + inputs : at + inputs + outputs]
-        copied(net.numbers[number + inputs * outputs :][:outputs], sums)
+        z, sums = m[offset : offset + inputs], m[offset + inputs : offset + inputs + outputs]
+        copy_into(net.numbers[weight_offset + inputs * outputs :][:outputs], sums)
         for i in range(0, inputs, 4):  # four at once: sums are loaded and stored less often
             a, b, c, d = z[i], z[i + 1], z[i + 2], z[i + 3]
             if layer > 0:
                 a, b, c, d = maximum(a, 0.0), maximum(b, 0.0), maximum(c, 0.0), maximum(d, 0.0)
-            first = net.numbers[number + i * outputs :]
+            first = net.numbers[weight_offset + i * outputs :]
             second, third, fourth = first[outputs:], first[2 * outputs :], first[3 * outputs :]
             for o in range(outputs):
                 sums[o] = sums[o] + a * first[o] + b * second[o] + c * third[o] + d * fourth[o]
-        number, at, inputs = number + (inputs + 1) * outputs, at + inputs, outputs
-    return at
+        weight_offset, offset, inputs = (
+            weight_offset + (inputs + 1) * outputs,
+            offset + inputs,
+            outputs,
+        )
+    return offset
 
 
 @jit
-def _renew(f: Any, gains: Any, m: Any, net: Any) -> None:
+def _update_correction(f: Any, gains: Any, m: Any, net: Any) -> None:
     """The correction of this pace."""
-    width, at, newest = net.sizes[0] // len(LAGS), stack_at(net), int(m[FRAMES])
-    if _frame(f, gains, m, net, HISTORY + width * (newest % RING)) > 0:
+    width, stack, newest = net.sizes[0] // len(LAGS), locate_stack(net), int(m[FRAMES])
+    if _write_frame(f, gains, m, net, HISTORY + width * (newest % RING_FRAMES)) > 0:
         m[FRAMES], m[SHIFT], m[DEVIATION] = 0.0, 0.0, 0.0
         return
     m[FRAMES] += 1.0
     for lag in range(len(LAGS)):  # before the first frame there were more like it
-        source = HISTORY + width * (maximum(newest - LAGS[lag], 0) % RING)
-        copied(m[source : source + width], m[at + lag * width :])
-    out = _layers(m, net, at)
+        source = HISTORY + width * (maximum(newest - LAGS[lag], 0) % RING_FRAMES)
+        copy_into(m[source : source + width], m[stack + lag * width :])
+    out = _run_layers(m, net, stack)
     m[SHIFT] = m[out]
-    m[DEVIATION] = exp(clip(m[out + 1], LEAST, 0.0))
+    m[DEVIATION] = exp(clip(m[out + 1], MIN_LOG_DEVIATION, 0.0))
 
 
-@apart
+@noinline
 def filter_and_correct(
     filters: Any, gains: Any, fast: Any, rows: int, packets: Any, count: int, m: Any, net: Any
 ) -> None:
@@ -158,30 +162,45 @@ def filter_and_correct(
 
     m: the memory, (memory_size(net, states),).
     """
-    start, begun, nothing, last = 0, 0, fast[:0], m[TICK] + rows
+    start, first_packet, empty, last = 0, 0, fast[:0], m[TICK] + rows
     for j in range(rows):
         _gather(m, fast[j])
-        due, ends, end = int(m[TICK]) % PACE == 0, j == rows - 1, begun
-        if due or ends:
-            while end < count and (ends or not m[TICK] < packets[end, PACKET.arrived] <= last):
+        is_due, is_last, end = int(m[TICK]) % FRAME_TICKS == 0, j == rows - 1, first_packet
+        if is_due or is_last:
+            while end < count and (is_last or not m[TICK] < packets[end, PACKET.arrived] <= last):
                 end += 1
-            ours, own, some = fast[start : j + 1], packets[begun:end], end - begun
-            advance(filters, gains, ours, len(ours), own, some, 0, nothing, nothing, m[:0])
-            start, begun = j + 1, end
-        if due:
-            _renew(filters[0], gains, m, net)
+            fast_rows, due_packets, n_due = (
+                fast[start : j + 1],
+                packets[first_packet:end],
+                end - first_packet,
+            )
+            advance(
+                filters,
+                gains,
+                fast_rows,
+                len(fast_rows),
+                due_packets,
+                n_due,
+                0,
+                empty,
+                empty,
+                m[:0],
+            )
+            start, first_packet = j + 1, end
+        if is_due:
+            _update_correction(filters[0], gains, m, net)
     if rows == 0:
-        advance(filters, gains, fast, 0, packets, count, 0, nothing, nothing, m[:0])
+        advance(filters, gains, fast, 0, packets, count, 0, empty, empty, m[:0])
 
 
 @jit
-def lend(f: Any, m: Any, net: Any) -> None:
+def apply_correction(f: Any, m: Any, net: Any) -> None:
     """Put the correction into a filter's record, whose own numbers go to the memory's end.
 
     How the sum's error depends on those of the other states is not known: covariances are zero.
     """
     b, n, row = net.beta, f.n, m[len(m) - f.n - 1 :]
-    copied(f.P[b, :n], row)
+    copy_into(f.P[b, :n], row)
     row[n] = f.x[b]
     if m[DEVIATION] > 0.0:
         f.x[b] += m[SHIFT]
@@ -191,9 +210,9 @@ def lend(f: Any, m: Any, net: Any) -> None:
 
 
 @jit
-def take_back(f: Any, m: Any, net: Any) -> None:
+def remove_correction(f: Any, m: Any, net: Any) -> None:
     """Give a filter's record its own numbers back."""
     b, n, row = net.beta, f.n, m[len(m) - f.n - 1 :]
-    copied(row[:n], f.P[b])
-    copied(row[:n], f.P[:, b])
+    copy_into(row[:n], f.P[b])
+    copy_into(row[:n], f.P[:, b])
     f.x[b] = row[n]

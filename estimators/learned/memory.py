@@ -12,13 +12,13 @@ Array = npt.NDArray[np.float64]
 GATES = {"gru": 3, "lstm": 4}
 """Gates of a kind of cell, in torch's order: reset, update, candidate; or input, forget,
 candidate, output."""
-LONGEST = 1e9  # steps of a mean: beyond any drive, and a number that arrays hold
-PARTS = ("weight_in", "weight_state", "bias_in", "bias_state")
+MAX_TIME = 1e9  # steps of a mean: beyond any drive, and a number that arrays hold
+CELL_WEIGHTS = ("weight_in", "weight_state", "bias_in", "bias_state")
 """The arrays of a cell: torch's weight_ih, weight_hh, bias_ih and bias_hh."""
 
 
 @dataclass(frozen=True, eq=False)
-class Cell:
+class RecurrentCell:
     """One layer of cells, whose state is all zero where an episode begins.
 
     kind: of `GATES`. weight_in: (gates size, inputs), weight_state: (gates size, size), bias_in,
@@ -27,7 +27,7 @@ class Cell:
     Raises ValueError for another kind, or shapes that do not fit together.
     """
 
-    parts: ClassVar[tuple[str, ...]] = PARTS
+    parts: ClassVar[tuple[str, ...]] = CELL_WEIGHTS
     kind: str
     weight_in: Array
     weight_state: Array
@@ -37,12 +37,12 @@ class Cell:
     def __post_init__(self) -> None:
         if self.kind not in GATES:
             raise ValueError(f"unknown cell {self.kind!r}; known: {', '.join(GATES)}")
-        for name in PARTS:
+        for name in CELL_WEIGHTS:
             single = np.array(getattr(self, name), np.float32)
             object.__setattr__(self, name, single.astype(np.float64))
         size, inputs = self.weight_state.shape[-1], self.weight_in.shape[-1]
-        shapes = {name: getattr(self, name).shape for name in PARTS}
-        if shapes != cell_shapes(self.kind, size, inputs):
+        shapes = {name: getattr(self, name).shape for name in CELL_WEIGHTS}
+        if shapes != compute_cell_shapes(self.kind, size, inputs):
             raise ValueError(f"the arrays of a {self.kind} cell do not fit together: {shapes}")
 
     @property
@@ -57,17 +57,18 @@ class Cell:
 
     @property
     def form(self) -> tuple[int, int, int, int]:
-        """Gates, size, and two numbers of `Traces` alone."""
+        """Gates, size, and two numbers of `MovingAverages` alone."""
         return GATES[self.kind], self.size, 0, 0
 
     @property
     def numbers(self) -> Array:
-        """As compiled code takes them: each of `PARTS`, weights (inputs, outputs) row by row."""
-        return np.concatenate([getattr(self, name).T.ravel() for name in PARTS])
+        """As compiled code takes them: each of `CELL_WEIGHTS`, weights (inputs, outputs) row by
+        row."""
+        return np.concatenate([getattr(self, name).T.ravel() for name in CELL_WEIGHTS])
 
 
 @dataclass(frozen=True, eq=False)
-class Traces:
+class MovingAverages:
     """Units u = W z + b, of which the last ones are bent by SiLU, and running means of each.
 
     A mean is that of the episode so far, and from its time on a leaky one: a new u counts for
@@ -84,7 +85,7 @@ class Traces:
     parts: ClassVar[tuple[str, ...]] = ("weight_in", "bias_in")
     weight_in: Array
     bias_in: Array
-    bent: int
+    n_silu: int
     times: Sequence[float]
 
     def __post_init__(self) -> None:
@@ -97,11 +98,11 @@ class Traces:
             raise ValueError(
                 f"traces have weights (units, inputs) and biases (units,), got {shapes}"
             )
-        if not 0 <= self.bent <= len(self.bias_in):
-            raise ValueError(f"of {len(self.bias_in)} units {self.bent} cannot be bent")
-        if not self.times or not all(0.0 < each <= LONGEST for each in self.times):
+        if not 0 <= self.n_silu <= len(self.bias_in):
+            raise ValueError(f"of {len(self.bias_in)} units {self.n_silu} cannot be bent")
+        if not self.times or not all(0.0 < time <= MAX_TIME for time in self.times):
             raise ValueError(
-                f"traces last one time or more, each above 0 steps and {LONGEST:g} at most, got "
+                f"traces last one time or more, each above 0 steps and {MAX_TIME:g} at most, got "
                 f"{self.times}"
             )
 
@@ -118,7 +119,7 @@ class Traces:
     @property
     def form(self) -> tuple[int, int, int, int]:
         """No gates, units, how many are bent, and times."""
-        return 0, len(self.bias_in), self.bent, len(self.times)
+        return 0, len(self.bias_in), self.n_silu, len(self.times)
 
     @property
     def numbers(self) -> Array:
@@ -128,11 +129,11 @@ class Traces:
         return np.concatenate([shares, self.weight_in.T.ravel(), self.bias_in])
 
 
-Memory = Cell | Traces
+MemoryLayer = RecurrentCell | MovingAverages
 """What a network has between its observation and its dense layers."""
 
 
-def cell_shapes(kind: str, size: int, inputs: int) -> dict[str, tuple[int, ...]]:
-    """The shape of each of `PARTS`."""
+def compute_cell_shapes(kind: str, size: int, inputs: int) -> dict[str, tuple[int, ...]]:
+    """The shape of each of `CELL_WEIGHTS`."""
     rows = GATES[kind] * size
-    return dict(zip(PARTS, ((rows, inputs), (rows, size), (rows,), (rows,)), strict=True))
+    return dict(zip(CELL_WEIGHTS, ((rows, inputs), (rows, size), (rows,), (rows,)), strict=True))

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from .forward import ACTIVATIONS as ACTIVATIONS
-from .forward import OUTPUTS, Packed, forward, packed
-from .memory import Array, Memory
+from .forward import OUTPUTS, PackedNetwork, forward, pack_network
+from .memory import Array, MemoryLayer
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,14 +36,14 @@ class Network:
     output: str = "linear"
     clip: float | None = None
     history: int = 1
-    cells: Sequence[Memory] = ()
+    cells: Sequence[MemoryLayer] = ()
 
     def __post_init__(self) -> None:
         for name in ("mean", "scale"):
             object.__setattr__(self, name, np.array(getattr(self, name), np.float64))
         for name in ("weights", "biases"):
-            single = [np.array(each, np.float32) for each in getattr(self, name)]
-            object.__setattr__(self, name, tuple(each.astype(np.float64) for each in single))
+            single = [np.array(array, np.float32) for array in getattr(self, name)]
+            object.__setattr__(self, name, tuple(array.astype(np.float64) for array in single))
         object.__setattr__(self, "cells", tuple(self.cells))
         for name, known in (("activation", ACTIVATIONS), ("output", OUTPUTS)):
             if getattr(self, name) not in known:
@@ -72,17 +72,17 @@ class Network:
                 f"mean and scale are (inputs,) or (history inputs,) with {self.inputs} inputs, "
                 f"got {self.mean.shape} and {self.scale.shape}"
             )
-        wide = stacked
+        width = stacked
         for i, cell in enumerate(self.cells):
-            if cell.weight_in.shape[1] != wide:
-                raise ValueError(f"cell {i} takes {cell.weight_in.shape[1]} inputs, not {wide}")
-            wide = cell.size
+            if cell.weight_in.shape[1] != width:
+                raise ValueError(f"cell {i} takes {cell.weight_in.shape[1]} inputs, not {width}")
+            width = cell.size
         for i, (W, b) in enumerate(zip(self.weights, self.biases, strict=True)):
-            if W.shape != (*b.shape, wide) or b.ndim != 1:
+            if W.shape != (*b.shape, width) or b.ndim != 1:
                 raise ValueError(
-                    f"layer {i} takes {wide} inputs, got weights {W.shape} and biases {b.shape}"
+                    f"layer {i} takes {width} inputs, got weights {W.shape} and biases {b.shape}"
                 )
-            wide = len(b)
+            width = len(b)
 
     def _check_numbers(self) -> None:
         arrays = {"mean": self.mean, "scale": self.scale}
@@ -126,24 +126,24 @@ class Network:
         """(inputs,) the entries of an observation that are read in any frame."""
         return np.asarray((self.scale.reshape(-1, self.inputs) > 0.0).any(axis=0))
 
-    def reading(self, entries: npt.NDArray[np.bool_]) -> "Network":
+    def select_inputs(self, entries: npt.NDArray[np.bool_]) -> "Network":
         """The same network of these entries alone, the others at their mean; entries: (inputs,)."""
         columns = np.tile(entries, self.history)
-        own = columns if len(self.mean) == len(columns) else entries
+        selected = columns if len(self.mean) == len(columns) else entries
         cells, weights = list(self.cells), list(self.weights)
         if cells:
             cells[0] = replace(cells[0], weight_in=cells[0].weight_in[:, columns])
         else:
             weights[0] = weights[0][:, columns]
         return replace(
-            self, mean=self.mean[own], scale=self.scale[own], weights=weights, cells=cells
+            self, mean=self.mean[selected], scale=self.scale[selected], weights=weights, cells=cells
         )
 
     @cached_property
-    def _packed(self) -> Packed:
+    def _network_arrays(self) -> PackedNetwork:
         scaling, kinds = (self.mean, self.scale, self.clip), (self.activation, self.output)
         layers = list(zip(self.weights, self.biases, strict=True))
-        return packed(scaling, self.history, self.cells, layers, *kinds)
+        return pack_network(scaling, self.history, self.cells, layers, *kinds)
 
     @property
     def dense(self) -> "Network":
@@ -151,19 +151,19 @@ class Network:
         if not self.cells:
             return self
         width = self.weights[0].shape[1]
-        plain = np.zeros(width), np.ones(width)
-        return replace(self, mean=plain[0], scale=plain[1], clip=None, history=1, cells=())
+        scaling = np.zeros(width), np.ones(width)
+        return replace(self, mean=scaling[0], scale=scaling[1], clip=None, history=1, cells=())
 
-    def ending(self, dense: "Network") -> "Network":
+    def replace_dense(self, dense: "Network") -> "Network":
         """The same network with other dense layers, those of a network of what they read."""
         layers = replace(self, weights=dense.weights, biases=dense.biases)
         return replace(layers, activation=dense.activation, output=dense.output)
 
-    def remembered(self, x: Array, state: Array) -> Array:
+    def compute_features(self, x: Array, state: Array) -> Array:
         """(N, k) what the first dense layer reads, arguments as of a call."""
-        before = self._packed._replace(sizes=self._packed.sizes[:1])
-        out = np.empty((len(x), int(before.sizes[0])))
-        forward(before, x, state, out)
+        memory_part = self._network_arrays._replace(sizes=self._network_arrays.sizes[:1])
+        out = np.empty((len(x), int(memory_part.sizes[0])))
+        forward(memory_part, x, state, out)
         return out
 
     def __call__(self, x: Array, state: Array | None = None) -> Array:
@@ -174,5 +174,5 @@ class Network:
         if state is None:
             state = np.zeros((len(x), self.memory))
         out = np.empty((len(x), self.width))
-        forward(self._packed, x, state, out)
+        forward(self._network_arrays, x, state, out)
         return out

@@ -12,13 +12,20 @@ import numpy as np
 import numpy.typing as npt
 from safetensors import SafetensorError, safe_open
 
-from .memory import GATES, PARTS, Cell, Memory, Traces, cell_shapes
+from .memory import (
+    CELL_WEIGHTS,
+    GATES,
+    MemoryLayer,
+    MovingAverages,
+    RecurrentCell,
+    compute_cell_shapes,
+)
 from .network import Network
 
-MOST_BYTES = 2**26
+MAX_BYTES = 2**26
 """A larger file is not opened; tensors lie in it as they are, so that it bounds their sizes too."""
-ENDING = ".safetensors"
-MEMORY: dict[str, Any] = {"history": 1, "cells": []}
+SUFFIX = ".safetensors"
+NO_MEMORY: dict[str, Any] = {"history": 1, "cells": []}
 """What the card says of a network without memory."""
 _DENSE = ("hidden", "activation", "output", "clip", "action_width")
 Tensors = dict[str, npt.NDArray[Any]]
@@ -26,10 +33,10 @@ Tensors = dict[str, npt.NDArray[Any]]
 
 def read_tensors(path: Path, what: str) -> tuple[Tensors, dict[str, str]]:
     """The tensors and the metadata of a file of `what`; ValueError where it is none, is cut short
-    or is larger than `MOST_BYTES`."""
+    or is larger than `MAX_BYTES`."""
     size = path.stat().st_size
-    if size > MOST_BYTES:
-        raise ValueError(f"{path} has {size} bytes, a {what} has at most {MOST_BYTES}")
+    if size > MAX_BYTES:
+        raise ValueError(f"{path} has {size} bytes, a {what} has at most {MAX_BYTES}")
     try:
         with safe_open(path, "numpy") as file:
             metadata = file.metadata() or {}
@@ -38,7 +45,7 @@ def read_tensors(path: Path, what: str) -> tuple[Tensors, dict[str, str]]:
         raise ValueError(f"{path} is no safetensors file, or is cut short: {error}") from None
 
 
-def json_object(text: str) -> dict[str, Any]:
+def parse_json_object(text: str) -> dict[str, Any]:
     """A card's JSON object; ValueError for anything else."""
     try:
         fields = json.loads(text)
@@ -49,7 +56,7 @@ def json_object(text: str) -> dict[str, Any]:
     return fields
 
 
-def architecture_of(network: Network) -> dict[str, Any]:
+def describe_network(network: Network) -> dict[str, Any]:
     """What a card holds of a network."""
     return dict(
         hidden=list(network.hidden),
@@ -58,23 +65,23 @@ def architecture_of(network: Network) -> dict[str, Any]:
         clip=network.clip,
         action_width=network.width,
         history=network.history,
-        cells=[_described(cell) for cell in network.cells],
+        cells=[_describe_cell(cell) for cell in network.cells],
     )
 
 
-def _described(cell: Memory) -> list[Any]:
-    if isinstance(cell, Traces):
-        return [cell.kind, len(cell.bias_in), cell.bent, list(cell.times)]
+def _describe_cell(cell: MemoryLayer) -> list[Any]:
+    if isinstance(cell, MovingAverages):
+        return [cell.kind, len(cell.bias_in), cell.n_silu, list(cell.times)]
     return [cell.kind, cell.size]
 
 
-def network_of(fields: Any, inputs: int, tensors: Tensors) -> Network:
+def build_network(fields: Any, inputs: int, tensors: Tensors) -> Network:
     """The network of so many inputs that a card describes, from tensors of the shapes it has.
 
     Raises ValueError where they do not fit together.
     """
-    if not isinstance(fields, dict) or set(fields) != {*_DENSE, *MEMORY}:
-        names = ", ".join((*_DENSE, *MEMORY))
+    if not isinstance(fields, dict) or set(fields) != {*_DENSE, *NO_MEMORY}:
+        names = ", ".join((*_DENSE, *NO_MEMORY))
         raise ValueError(f"the card's network holds {names}, got {fields!r}")
     hidden, cells, clip = fields["hidden"], fields["cells"], fields["clip"]
     sizes = [*hidden, fields["action_width"]] if isinstance(hidden, list) else []
@@ -83,12 +90,12 @@ def network_of(fields: Any, inputs: int, tensors: Tensors) -> Network:
         raise ValueError(f"the card's layer sizes are positive integers, got {fields!r}")
     if not (isinstance(cells, list) and all(map(_is_cell, cells))):
         raise ValueError(
-            f"the card's cells are pairs of {', '.join(GATES)} and a size, or {Traces.kind} with "
-            f"units, how many are bent, and times: {cells!r}"
+            f"the card's cells are pairs of {', '.join(GATES)} and a size, or "
+            f"{MovingAverages.kind} with units, how many are bent, and times: {cells!r}"
         )
     if not (clip is None or type(clip) in (int, float)):
         raise ValueError(f"clip is above zero or None, got {clip!r}")
-    _check_tensors(tensors, _shapes(inputs, history, cells, sizes))
+    _check_tensors(tensors, _compute_shapes(inputs, history, cells, sizes))
     return Network(
         tensors["mean"],
         tensors["scale"],
@@ -98,7 +105,7 @@ def network_of(fields: Any, inputs: int, tensors: Tensors) -> Network:
         str(fields["output"]),
         clip,
         history,
-        [_memory(f"cell_{i}_", *cell, tensors=tensors) for i, cell in enumerate(cells)],
+        [_build_cell(f"cell_{i}_", *cell, tensors=tensors) for i, cell in enumerate(cells)],
     )
 
 
@@ -106,55 +113,57 @@ def _is_cell(cell: Any) -> bool:
     if not isinstance(cell, list) or not cell:
         return False
     kind, *numbers = cell
-    if kind == Traces.kind and len(numbers) == 3 and isinstance(numbers[2], list):
+    if kind == MovingAverages.kind and len(numbers) == 3 and isinstance(numbers[2], list):
         times = numbers.pop()
-        sized = all(type(each) is int for each in numbers) and numbers[0] > 0
-        return sized and all(type(each) in (int, float) for each in times)
+        has_sizes = all(type(value) is int for value in numbers) and numbers[0] > 0
+        return has_sizes and all(type(value) in (int, float) for value in times)
     return kind in tuple(GATES) and len(numbers) == 1 and type(numbers[0]) is int and numbers[0] > 0
 
 
-def _memory(prefix: str, kind: str, _: int, *traces: Any, tensors: Tensors) -> Memory:
-    parts = Traces.parts if traces else PARTS
+def _build_cell(prefix: str, kind: str, _: int, *traces: Any, tensors: Tensors) -> MemoryLayer:
+    parts = MovingAverages.parts if traces else CELL_WEIGHTS
     arrays: list[Any] = [tensors[prefix + part] for part in parts]
-    return Traces(*arrays, *traces) if traces else Cell(kind, *arrays)
+    return MovingAverages(*arrays, *traces) if traces else RecurrentCell(kind, *arrays)
 
 
 _Shapes = dict[str, tuple[tuple[int, ...], ...]]
 
 
-def _shapes(inputs: int, history: int, cells: list[Any], sizes: list[int]) -> _Shapes:
+def _compute_shapes(inputs: int, history: int, cells: list[Any], sizes: list[int]) -> _Shapes:
     """The shapes that each tensor may have."""
-    wide = inputs * history
-    shapes: _Shapes = dict.fromkeys(("mean", "scale"), ((inputs,), (wide,)))
+    width = inputs * history
+    shapes: _Shapes = dict.fromkeys(("mean", "scale"), ((inputs,), (width,)))
     for i, (kind, size, *traces) in enumerate(cells):
         if traces:
-            own = dict(zip(Traces.parts, ((size, wide), (size,)), strict=True))
+            part_shapes = dict(zip(MovingAverages.parts, ((size, width), (size,)), strict=True))
         else:
-            own = cell_shapes(kind, size, wide)
-        shapes |= {f"cell_{i}_{part}": (shape,) for part, shape in own.items()}
-        wide = size * (1 + len(traces[1])) if traces else size
+            part_shapes = compute_cell_shapes(kind, size, width)
+        shapes |= {f"cell_{i}_{part}": (shape,) for part, shape in part_shapes.items()}
+        width = size * (1 + len(traces[1])) if traces else size
     for i, size in enumerate(sizes):
-        shapes |= {f"weight_{i}": ((size, wide),), f"bias_{i}": ((size,),)}
-        wide = size
+        shapes |= {f"weight_{i}": ((size, width),), f"bias_{i}": ((size,),)}
+        width = size
     return shapes
 
 
 def _check_tensors(tensors: Tensors, shapes: _Shapes) -> None:
     """ValueError for tensors of other names, shapes or types."""
     if shapes.keys() != tensors.keys():
-        missing, more = shapes.keys() - tensors.keys(), tensors.keys() - shapes.keys()
-        raise ValueError(f"missing tensors: {sorted(missing)}; unexpected ones: {sorted(more)}")
+        missing, unexpected = shapes.keys() - tensors.keys(), tensors.keys() - shapes.keys()
+        raise ValueError(
+            f"missing tensors: {sorted(missing)}; unexpected ones: {sorted(unexpected)}"
+        )
     for name, allowed in shapes.items():
         kind = np.dtype(np.float64 if name in ("mean", "scale") else np.float32)
-        found = tensors[name]
-        if found.shape not in allowed or found.dtype != kind:
+        tensor = tensors[name]
+        if tensor.shape not in allowed or tensor.dtype != kind:
             raise ValueError(
-                f"tensor {name} has shape {found.shape} of {found.dtype}, "
+                f"tensor {name} has shape {tensor.shape} of {tensor.dtype}, "
                 f"the card has {' or '.join(map(str, dict.fromkeys(allowed)))} of {kind}"
             )
 
 
-def tensors_of(network: Network) -> Tensors:
+def collect_tensors(network: Network) -> Tensors:
     """What a file holds of a network."""
     tensors: Tensors = {"mean": network.mean, "scale": network.scale}
     for i, cell in enumerate(network.cells):

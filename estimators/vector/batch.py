@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.eights import zeros_on_lines
+from ...envs.backend.eights import allocate_aligned
 from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Log, Record
 from ...envs.sensors.link import SlowSensor
-from ..core.memory import FILTER, Counters
+from ..core.memory import FILTER, SkipCounters
 from ..estimates import Estimates
-from ..wrappers.arguments import Setup
-from .designs import Build, Designs
-from .kernel import batch_entry, nothing_observed
-from .lanes import blocks
+from ..wrappers.arguments import EstimatorSpec
+from .designs import Build, GainPool
+from .kernel import compile_observe_batch, make_empty_outputs
+from .lanes import make_blocks
 
 Array = npt.NDArray[np.float64]
-Whole = npt.NDArray[np.int64]
+IntArray = npt.NDArray[np.int64]
 Sensors = Mapping[str, SlowSensor]
 
 
@@ -33,51 +33,51 @@ class BatchEstimator:
     Raises ValueError if the filters have different states.
     """
 
-    def __init__(self, name: str, setups: Sequence[Setup], dt: float, build: Build) -> None:
+    def __init__(self, name: str, specs: Sequence[EstimatorSpec], dt: float, build: Build) -> None:
         self.name, self.dt = name, dt
-        self._designs = Designs(build)
-        self._setups: list[Setup] = list(setups)
-        self._of: list[Any] = [None] * len(setups)  # each row's design
-        first = self._designs.built(setups[0])
+        self._designs = GainPool(build)
+        self._specs: list[EstimatorSpec] = list(specs)
+        self._design_keys: list[Any] = [None] * len(specs)  # each row's design
+        first = self._designs.get_estimator(specs[0])
         self.names, self.units = first.names, first.units
-        self.filters = zeros_on_lines((len(setups), len(first.filters)), FILTER)
-        self.configure(range(len(setups)), setups)
+        self.filters = allocate_aligned((len(specs), len(first.filters)), FILTER)
+        self.configure(range(len(specs)), specs)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """A copy's records lie on cache lines, too, and its lanes are empty."""
         self.__dict__.update(state)
-        filters, self.filters = self.filters, zeros_on_lines(self.filters.shape, FILTER)
-        self.filters[:], self._lanes = filters, blocks(len(filters))
+        filters, self.filters = self.filters, allocate_aligned(self.filters.shape, FILTER)
+        self.filters[:], self._lanes = filters, make_blocks(len(filters))
 
     def __len__(self) -> int:
         return len(self.filters)
 
     def __getitem__(self, i: int) -> Any:
-        design = self._of[i]
+        design = self._design_keys[i]
         estimator = copy.copy(self._designs[design])
-        estimator.sensors = {name: self._setups[i].sensors[name] for name in estimator.sensors}
+        estimator.sensors = {name: self._specs[i].sensors[name] for name in estimator.sensors}
         estimator.filters, estimator.gains = self.filters[i], self._designs.gains(design)
         return estimator
 
     def __iter__(self) -> Iterator[Any]:
         return (self[i] for i in range(len(self)))
 
-    def configure(self, rows: Iterable[int], setups: Iterable[Setup]) -> None:
+    def configure(self, rows: Iterable[int], specs: Iterable[EstimatorSpec]) -> None:
         """Fit the filters of some rows to their setups; to be reset then.
 
         A filter whose setup differs in more than the phases of its clocks is built anew.
         """
-        changed = False
-        for i, each in zip(rows, setups, strict=True):
-            self._setups[i], design = each, each.design
-            if design == self._of[i]:
+        has_changed = False
+        for i, spec in zip(rows, specs, strict=True):
+            self._specs[i], design = spec, spec.design
+            if design == self._design_keys[i]:
                 continue
-            built = self._designs.built(each)
+            built = self._designs.get_estimator(spec)
             self._check_states(i, built.names)
-            self._of[i], self.filters[i], changed = design, built.filters, True
-        if changed:
-            self._lanes = blocks(len(self))  # empty: they hold models
-            self._places = self._designs.place(self._of)
+            self._design_keys[i], self.filters[i], has_changed = design, built.filters, True
+        if has_changed:
+            self._lanes = make_blocks(len(self))  # empty: they hold models
+            self._places = self._designs.place(self._design_keys)
 
     def _check_states(self, i: int, names: tuple[str, ...]) -> None:
         if names != self.names:
@@ -96,9 +96,9 @@ class BatchEstimator:
 
         sensors: slow sensors whose clocks have a new phase, of all filters or a list (N,).
         """
-        for i in _rows_of(mask, len(self)):
-            own = sensors if sensors is None or isinstance(sensors, Mapping) else sensors[i]
-            self[i].reset(own, first)
+        for i in _parse_mask(mask, len(self)):
+            row_sensors = sensors if sensors is None or isinstance(sensors, Mapping) else sensors[i]
+            self[i].reset(row_sensors, first)
 
     def step(
         self,
@@ -117,15 +117,15 @@ class BatchEstimator:
         packets = np.ascontiguousarray(packets, np.float64)
         _check_shape("fast rows", fast, N, FAST_WIDTH)
         _check_shape("packets", packets, N, PACKET_WIDTH)
-        rows = _how_many("rows", fast.shape[1] if rows is None else rows, N, fast.shape[1])
-        counts = _how_many(
+        rows = _parse_counts("rows", fast.shape[1] if rows is None else rows, N, fast.shape[1])
+        counts = _parse_counts(
             "counts", packets.shape[1] if counts is None else counts, N, packets.shape[1]
         )
-        self.take(None, fast, rows, packets, counts, *self._unread)
+        self.take(None, fast, rows, packets, counts, *self._empty_outputs)
 
     @functools.cached_property
-    def _unread(self) -> tuple[Any, ...]:
-        return nothing_observed(len(self))
+    def _empty_outputs(self) -> tuple[Any, ...]:
+        return make_empty_outputs(len(self))
 
     def run(self, sources: Sequence[Log | Record]) -> list[Estimates]:
         """`Estimator.run` of each filter on a record of its own."""
@@ -137,9 +137,9 @@ class BatchEstimator:
         self,
         mask: npt.NDArray[np.bool_] | None,
         fast: Array,
-        rows: Whole,
+        rows: IntArray,
         packets: Array,
-        counts: Whole,
+        counts: IntArray,
         *observed: Any,
     ) -> None:
         """`step` of the filters of a mask without any checks of C-contiguous arrays.
@@ -148,12 +148,12 @@ class BatchEstimator:
         """
         done = np.full(len(self), -1) if mask is None else np.where(mask, -1, rows)
         memory = self.filters, self._designs.pool, self._places, done, self._lanes
-        while batch_entry()(*memory, fast, rows, packets, counts, *observed) > 0:
+        while compile_observe_batch()(*memory, fast, rows, packets, counts, *observed) > 0:
             self._design_missing(np.flatnonzero(done < rows))
 
-    def _design_missing(self, rows: Whole) -> None:
+    def _design_missing(self, rows: IntArray) -> None:
         """Make the tables of gains that compiled code has just asked for, each once."""
-        wanted = {(self._of[i], int(self.filters[i, 0].wanted)): int(i) for i in rows}
+        wanted = {(self._design_keys[i], int(self.filters[i, 0].wanted)): int(i) for i in rows}
         for i in wanted.values():
             self[i].design_missing()
 
@@ -168,41 +168,41 @@ class BatchEstimator:
     @property
     def x(self) -> Array:
         """The states now, (N, n)."""
-        return np.array([each.x for each in self])
+        return np.array([estimator.x for estimator in self])
 
     @property
     def P(self) -> Array:
         """Their covariances now, (N, n, n), as `Estimator.P`."""
-        return np.array([each.P for each in self])
+        return np.array([estimator.P for estimator in self])
 
     @property
-    def counts(self) -> dict[str, Whole]:
+    def counts(self) -> dict[str, IntArray]:
         """All counters by name, each (N,)."""
-        counts = [each.counts for each in self]
-        return {name: np.array([each[name] for each in counts]) for name in Counters._fields}
+        counts = [row.counts for row in self]
+        return {name: np.array([row[name] for row in counts]) for name in SkipCounters._fields}
 
     def __repr__(self) -> str:
         return f"<{len(self)} x {self.name}: {', '.join(self.names)}>"
 
 
-def _rows_of(mask: npt.ArrayLike | None, count: int) -> list[int]:
+def _parse_mask(mask: npt.ArrayLike | None, count: int) -> list[int]:
     if mask is None:
         return list(range(count))
-    chosen = np.asarray(mask)
-    if chosen.shape != (count,) or chosen.dtype != np.bool_:
+    flags = np.asarray(mask)
+    if flags.shape != (count,) or flags.dtype != np.bool_:
         raise ValueError(
-            f"a mask has shape ({count},) and dtype bool, got {chosen.shape} and {chosen.dtype}"
+            f"a mask has shape ({count},) and dtype bool, got {flags.shape} and {flags.dtype}"
         )
-    return [int(i) for i in np.flatnonzero(chosen)]
+    return [int(i) for i in np.flatnonzero(flags)]
 
 
-def _check_shape(what: str, array: Array, count: int, width: int) -> None:
+def _check_shape(label: str, array: Array, count: int, width: int) -> None:
     if array.ndim != 3 or array.shape[::2] != (count, width):
-        raise ValueError(f"{what} have shape ({count}, k, {width}), got {array.shape}")
+        raise ValueError(f"{label} have shape ({count}, k, {width}), got {array.shape}")
 
 
-def _how_many(what: str, value: npt.ArrayLike, count: int, largest: int) -> Whole:
+def _parse_counts(label: str, value: npt.ArrayLike, count: int, max_count: int) -> IntArray:
     numbers = np.ascontiguousarray(np.broadcast_to(np.asarray(value, np.int64), (count,)))
-    if numbers.min() < 0 or numbers.max() > largest:
-        raise ValueError(f"{what} are 0 to {largest}, got {numbers.min()} to {numbers.max()}")
+    if numbers.min() < 0 or numbers.max() > max_count:
+        raise ValueError(f"{label} are 0 to {max_count}, got {numbers.min()} to {numbers.max()}")
     return numbers

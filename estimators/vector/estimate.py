@@ -11,15 +11,22 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ...envs.task.observation import Entry, space_of
+from ...envs.task.observation import ObservationEntry, make_space
 from ...envs.vehicle.vehicles import VehicleSource
-from ..wrappers.arguments import Arguments, Setup, Source
+from ..wrappers.arguments import Arguments, EstimatorSource, EstimatorSpec
 from ..wrappers.estimate import EstimateObservation as Single
-from ..wrappers.outputs import BETA, NEES, STD, outputs_of, titled
-from ..wrappers.truth import as_built, set_stiffness
-from .make import batch_of
-from .records import BatchedRecords, Records, SyncRecords, records_of, state_of, true_vehicles
-from .spec import vector_spec
+from ..wrappers.outputs import BETA, NEES, STD, make_outputs, make_title
+from ..wrappers.truth import choose_vehicle, set_stiffness
+from .make import build_batch
+from .records import (
+    BatchedRecords,
+    RecordBatch,
+    SyncRecords,
+    get_env_state,
+    get_true_vehicles,
+    make_record_source,
+)
+from .spec import make_vector_spec
 
 Observations = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -34,7 +41,7 @@ class EstimateObservation(
     `sideslip.estimators.EstimateObservation` of all rows, with the same arguments: every row gets
     the bits that the single wrapper would give it. It must be the innermost wrapper; others of its
     class may be stacked, each with its own `name`. It works on `SyncVectorEnv` and on a vector env
-    that offers what `records.Batched` lists. A factory is called once for each row, and again
+    that offers what `records.BatchedEnv` lists. A factory is called once for each row, and again
     where a row's car changes; one object cannot serve them all.
 
     A row whose episode ended starts a new one with a fresh filter: in the next step, or within
@@ -52,7 +59,7 @@ class EstimateObservation(
     def __init__(
         self,
         env: VectorEnv[Any, Any, Any],
-        estimator: Source | None = None,
+        estimator: EstimatorSource | None = None,
         outputs: Sequence[str] = ("beta", "gamma"),
         std: bool = True,
         replace: bool = False,
@@ -61,8 +68,8 @@ class EstimateObservation(
         name: str | None = None,
         **misplaced: Any,
     ) -> None:
-        self._records = _records_below(env)
-        clocks = self._records.setups([0])[0].sensors
+        self._records = _find_records(env)
+        clocks = self._records.make_specs([0])[0].sensors
         self._arguments = arguments = Arguments(
             estimator, outputs, std, replace, vehicle, options, name, clocks, misplaced
         )
@@ -77,16 +84,16 @@ class EstimateObservation(
         if mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
             raise ValueError(f"the vector env must reset rows itself; its autoreset_mode is {mode}")
         self._same_step = mode == AutoresetMode.SAME_STEP
-        setups = self._setups(range(env.num_envs))
-        self._built = setups[0].vehicle
+        specs = self._make_specs(range(env.num_envs))
+        self._first_vehicle = specs[0].vehicle
         dt = self._records.dt
-        self.estimator = batch_of(arguments.source, setups, dt, arguments.options)
+        self.estimator = build_batch(arguments.source, specs, dt, arguments.options)
         inner = () if replace else getattr(env, "layout", self._records.layout)
         states = self.estimator.names
-        self._outputs = outputs_of(arguments.label, states, outputs, std, name, inner)
-        self._title = titled(arguments.label, name)
-        self.layout: tuple[Entry, ...] = self._outputs.layout
-        self.single_observation_space = space_of(self.layout)
+        self._outputs = make_outputs(arguments.label, states, outputs, std, name, inner)
+        self._title = make_title(arguments.label, name)
+        self.layout: tuple[ObservationEntry, ...] = self._outputs.layout
+        self.single_observation_space = make_space(self.layout)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._out = np.zeros((env.num_envs, len(self.layout)), np.float32)
         self._ended: Mask | None = None  # rows that the next step resets; None: all are to be reset
@@ -94,7 +101,7 @@ class EstimateObservation(
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]  # as in VectorWrapper
         """The env's with the single wrapper; JSON-able, None where the env has none."""
-        return vector_spec(self.env.spec, Single, self._saved_kwargs)
+        return make_vector_spec(self.env.spec, Single, self._saved_kwargs)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -102,48 +109,50 @@ class EstimateObservation(
         """Reset the rows (those of options["reset_mask"]) and their estimators; take tick 0."""
         mask = None if options is None else options.get("reset_mask")
         rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
-        before, self._ended = self._ended, None
-        if before is None and not rows.all():
+        ended_before, self._ended = self._ended, None
+        if ended_before is None and not rows.all():
             raise ResetNeeded(
                 "reset all rows first: no step succeeded since then, or none was made"
             )
         try:
             obs, infos = self.env.reset(seed=seed, options=options)
         except (TypeError, ValueError):
-            self._keep(before)
+            self._restore_ended(ended_before)
             raise
-        self._ended = np.zeros(self.num_envs, np.bool_) if before is None else before & ~rows
-        self._restart(rows)
-        self._observe(self._records.newest(), obs, infos, rows, self._out)
+        self._ended = (
+            np.zeros(self.num_envs, np.bool_) if ended_before is None else ended_before & ~rows
+        )
+        self._reset_rows(rows)
+        self._observe(self._records.read_latest(), obs, infos, rows, self._out)
         return self._out.copy(), infos
 
     def step(self, actions: Any) -> Step:
         """One step of all rows, whose records the estimators take before observations are made."""
-        before, self._ended = self._ended, None  # an error on the way leaves rows apart
-        if before is None:
+        ended_before, self._ended = self._ended, None  # an error on the way leaves rows apart
+        if ended_before is None:
             raise ResetNeeded(
                 "call reset() first: before the first step, and after one that failed"
             )
         try:
             obs, rewards, terminated, truncated, infos = self.env.step(actions)
         except ValueError:
-            self._keep(before)
+            self._restore_ended(ended_before)
             raise
         ended = np.logical_or(terminated, truncated)
         if not self._same_step:
-            self._restart(before)
+            self._reset_rows(ended_before)
         elif ended.any():
             self._finish(infos, ended)
-            self._restart(ended)
-        everyone = np.ones(self.num_envs, np.bool_)
-        self._observe(self._records.newest(), obs, infos, everyone, self._out)
+            self._reset_rows(ended)
+        all_rows = np.ones(self.num_envs, np.bool_)
+        self._observe(self._records.read_latest(), obs, infos, all_rows, self._out)
         self._ended = ended
         return self._out.copy(), rewards, terminated, truncated, infos
 
-    def _keep(self, before: Mask | None) -> None:
-        """After what the inner env refused: a `Batched` one does before it moves any row."""
+    def _restore_ended(self, ended_before: Mask | None) -> None:
+        """After what the inner env refused: a `BatchedEnv` one does before it moves any row."""
         if isinstance(self._records, BatchedRecords):
-            self._ended = before
+            self._ended = ended_before
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot of env and estimators that `set_state` continues from, bit for bit.
@@ -151,7 +160,7 @@ class EstimateObservation(
         Raises TypeError where the vector env makes none.
         """
         return {
-            "env": state_of(self.env),
+            "env": get_env_state(self.env),
             "estimator": self.estimator.get_state(),
             "out": self._out.copy(),
             "ended": None if self._ended is None else self._ended.copy(),
@@ -161,39 +170,39 @@ class EstimateObservation(
         """Go back to a snapshot of this env or of one built with the same arguments."""
         env: Any = self.env
         env.set_state(snapshot["env"])
-        self._configure(range(self.num_envs))
+        self._update_cars(range(self.num_envs))
         self.estimator.set_state(snapshot["estimator"])
         self._out[:], ended = snapshot["out"], snapshot["ended"]
         self._ended = None if ended is None else ended.copy()
 
-    def _setups(self, rows: Sequence[int]) -> list[Setup]:
+    def _make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
         """What the estimators of some rows are built for."""
-        setups = self._records.setups(rows)
+        specs = self._records.make_specs(rows)
         if self._arguments.truth:
-            cars = true_vehicles(self.unwrapped, rows)
-            return [each._replace(vehicle=car) for each, car in zip(setups, cars, strict=True)]
+            cars = get_true_vehicles(self.unwrapped, rows)
+            return [spec._replace(vehicle=car) for spec, car in zip(specs, cars, strict=True)]
         if self._arguments.vehicle is None:
-            return setups
-        return [each._replace(vehicle=self._arguments.vehicle) for each in setups]
+            return specs
+        return [spec._replace(vehicle=self._arguments.vehicle) for spec in specs]
 
-    def _configure(self, rows: Sequence[int]) -> None:
+    def _update_cars(self, rows: Sequence[int]) -> None:
         """Fit the estimators of some rows to the cars of their present episodes."""
-        setups = self._setups(rows)
+        specs = self._make_specs(rows)
         if not self._arguments.truth:
-            self.estimator.configure(rows, setups)
+            self.estimator.configure(rows, specs)
             return
         first = self.estimator[0]
-        cars = [as_built(first, self._built, each.vehicle) for each in setups]
-        built = zip(setups, cars, strict=True)
-        self.estimator.configure(rows, [each._replace(vehicle=car) for each, car in built])
-        for i, each in zip(rows, setups, strict=True):
-            set_stiffness(self.estimator[i], each.vehicle)
+        cars = [choose_vehicle(first, self._first_vehicle, spec.vehicle) for spec in specs]
+        pairs = zip(specs, cars, strict=True)
+        self.estimator.configure(rows, [spec._replace(vehicle=car) for spec, car in pairs])
+        for i, spec in zip(rows, specs, strict=True):
+            set_stiffness(self.estimator[i], spec.vehicle)
 
-    def _restart(self, mask: Mask) -> None:
+    def _reset_rows(self, mask: Mask) -> None:
         """Reset the estimators of some rows with the clocks of their new episodes."""
         rows = np.flatnonzero(mask).tolist()
         if rows:
-            self._configure(rows)
+            self._update_cars(rows)
             self.estimator.reset(mask)
 
     def _finish(self, infos: dict[str, Any], ended: Mask) -> None:
@@ -202,13 +211,13 @@ class EstimateObservation(
         obs = np.zeros((self.num_envs, inner), np.float32)
         if inner > 0:
             obs[ended] = np.stack(infos["final_obs"][ended])
-        self._observe(self._records.final(ended), obs, infos["final_info"], ended, out)
+        self._observe(self._records.read_final(ended), obs, infos["final_info"], ended, out)
         for i in np.flatnonzero(ended):
             infos["final_obs"][i] = out[i].copy()
 
     def _observe(
         self,
-        records: Records,
+        records: RecordBatch,
         obs: Observations,
         infos: dict[str, Any],
         mask: Mask,
@@ -217,24 +226,24 @@ class EstimateObservation(
         """Take the records of some rows; write their observations and their part of `infos`."""
         outputs, N = self._outputs, self.num_envs
         beta, gamma = infos.get("beta"), infos.get("gamma")
-        known = beta is not None and gamma is not None
-        truth = (beta, gamma) if known else (np.zeros(N), np.zeros(N))
+        has_truth = beta is not None and gamma is not None
+        truth = (beta, gamma) if has_truth else (np.zeros(N), np.zeros(N))
         summary, inner = np.zeros((N, 3)), np.ascontiguousarray(obs, np.float32)
-        what = inner, outputs.inner, outputs.plan, outputs.limits, *truth, out, summary
-        self.estimator.take(mask, *records, *what)
-        for key, place in outputs.keys:
-            if place == NEES and not known:
+        observe_args = inner, outputs.inner, outputs.plan, outputs.limits, *truth, out, summary
+        self.estimator.take(mask, *records, *observe_args)
+        for key, index in outputs.keys:
+            if index == NEES and not has_truth:
                 continue
-            values, present = summary[:, place].copy(), mask.copy()
-            if place == NEES:  # the truth of some rows may be missing
+            values, present = summary[:, index].copy(), mask.copy()
+            if index == NEES:  # the truth of some rows may be missing
                 present &= infos.get("_beta", True)
                 values[~present] = 0.0
             infos[key], infos[f"_{key}"] = values, present
-            if place == BETA:
+            if index == BETA:
                 self._records.annotate(self._title, values, summary[:, STD], mask)
 
 
-def _records_below(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:
+def _find_records(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:
     """The records; TypeError if anything that may hide ticks from the estimators is in between."""
     if not isinstance(env, VectorEnv):
         raise TypeError(
@@ -249,4 +258,4 @@ def _records_below(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecord
                 f"environment; inside it is {type(layer).__name__}"
             )
         layer = layer.env
-    return records_of(layer)
+    return make_record_source(layer)

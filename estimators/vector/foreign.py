@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..wrappers.arguments import AnyEstimator, Setup
-from ..wrappers.outputs import write
-from .batch import Array, BatchEstimator, Whole
+from ..wrappers.arguments import AnyEstimator, EstimatorSpec
+from ..wrappers.outputs import write_outputs
+from .batch import Array, BatchEstimator, IntArray
 from .designs import Build
 
 
@@ -19,13 +19,13 @@ class ForeignBatch(BatchEstimator):
     """
 
     def __init__(
-        self, first: AnyEstimator, setups: Sequence[Setup], dt: float, build: Build
+        self, first: AnyEstimator, specs: Sequence[EstimatorSpec], dt: float, build: Build
     ) -> None:
         self.name, self.dt, self.names, self.units = first.name, dt, first.names, first.units
         self._build = build
-        self._estimators: list[AnyEstimator] = [first, *(build(each) for each in setups[1:])]
-        self._of = [each.design for each in setups]
-        self.configure(range(len(setups)), setups)
+        self._estimators: list[AnyEstimator] = [first, *(build(spec) for spec in specs[1:])]
+        self._design_keys = [spec.design for spec in specs]
+        self.configure(range(len(specs)), specs)
 
     def __len__(self) -> int:
         return len(self._estimators)
@@ -33,36 +33,36 @@ class ForeignBatch(BatchEstimator):
     def __getitem__(self, i: int) -> AnyEstimator:
         return self._estimators[i]
 
-    def configure(self, rows: Iterable[int], setups: Iterable[Setup]) -> None:
+    def configure(self, rows: Iterable[int], specs: Iterable[EstimatorSpec]) -> None:
         """As `BatchEstimator.configure`."""
-        for i, setup in zip(rows, setups, strict=True):
-            if setup.design != self._of[i]:
-                self._estimators[i], self._of[i] = self._build(setup), setup.design
+        for i, spec in zip(rows, specs, strict=True):
+            if spec.design != self._design_keys[i]:
+                self._estimators[i], self._design_keys[i] = self._build(spec), spec.design
             self._check_states(i, self[i].names)
-            self[i].sensors = dict(setup.sensors)
+            self[i].sensors = dict(spec.sensors)
 
     def take(
         self,
         mask: npt.NDArray[np.bool_] | None,
         fast: Array,
-        rows: Whole,
+        rows: IntArray,
         packets: Array,
-        counts: Whole,
+        counts: IntArray,
         *observed: Any,
     ) -> None:
         """As `BatchEstimator.take`."""
-        obs, inner, plan, limits, *others = observed
+        obs, inner, plan, limits, *row_arrays = observed
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
         for i in chosen.tolist():
-            own, (beta, gamma, out, summary) = self[i], (each[i] for each in others)
-            own.step(fast[i, : rows[i]], packets[i, : counts[i]])
-            write(own, obs[i], inner, plan, limits, beta, gamma, out, summary)
+            estimator, (beta, gamma, out, summary) = self[i], (array[i] for array in row_arrays)
+            estimator.step(fast[i, : rows[i]], packets[i, : counts[i]])
+            write_outputs(estimator, obs[i], inner, plan, limits, beta, gamma, out, summary)
 
     def get_state(self) -> Any:
         """As `BatchEstimator.get_state`: deep copies of the users' objects."""
-        return [each.get_state() for each in self._estimators]
+        return [estimator.get_state() for estimator in self._estimators]
 
     def set_state(self, snapshot: Any) -> None:
         """As `BatchEstimator.set_state`."""
-        for own, state in zip(self._estimators, snapshot, strict=True):
-            own.set_state(state)
+        for estimator, state in zip(self._estimators, snapshot, strict=True):
+            estimator.set_state(state)

@@ -8,55 +8,56 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.arrays import lane_count
-from ...envs.backend.decorators import counted, jit
+from ...envs.backend.arrays import count_lanes
+from ...envs.backend.decorators import jit, jit_nrt
 from ...envs.backend.eights import prefetch
 from ...envs.backend.primitives import maximum, minimum
 from ...envs.backend.simd import LANES
-from ..core.memory import FILTER, OFTEN, SMALL, WIDTH, Memory
-from ..entry import entry
+from ..core.memory import FILTER, N_SMALL, N_TOTAL, X_OFFSET, FilterRecord
+from ..entry import compile_call
 from ..wrappers.kernel import observe
-from .designs import gains_of
-from .lanes import Block, blocks, joins
+from .designs import get_gains
+from .lanes import LaneBlock, is_lane_compatible, make_blocks
 from .ticks import advance_block
 
-_FEW = 4  # filters that are computed alone in less time than in lanes
+_MIN_LANES = 4  # filters that are computed alone in less time than in lanes
 
 
 @jit
-def _fetch(f: Memory, like: Memory) -> None:
-    """Have the caches fetch what a tick reads of a filter, whose states are as many as `like`'s."""
-    for i in range(0, OFTEN + like.total, 8):
-        prefetch(f.ahead, i)
-    for i in range(0, SMALL, 8):
-        prefetch(f.P, WIDTH, i)
-    for j in range(0, like.total, 8):
-        for i in range(like.total):
+def _fetch(f: FilterRecord, template: FilterRecord) -> None:
+    """Have the caches fetch what a tick reads of a filter, whose states are as many as
+    `template`'s."""
+    for i in range(0, X_OFFSET + template.total, 8):
+        prefetch(f.padding, i)
+    for i in range(0, N_SMALL, 8):
+        prefetch(f.P, N_TOTAL, i)
+    for j in range(0, template.total, 8):
+        for i in range(template.total):
             prefetch(f.P, i, j)
-    for j in range(0, like.n, 8):
-        for i in range(like.n):
+    for j in range(0, template.n, 8):
+        for i in range(template.n):
             prefetch(f.Q, i, j)
             prefetch(f.G, i, j)
             prefetch(f.GT, i, j)
 
 
 @jit
-def _gather(b: Block, first: int, filters: Any, done: Any, rows: Any) -> int:
+def _select_lanes(b: LaneBlock, first: int, filters: Any, done: Any, rows: Any) -> int:
     """Which filters from `first` on do their rows in the lanes of a block, equally many, into
     b.here; returns how many rows."""
-    together, count = 0, 0
-    for lane in range(lane_count()):
+    n_rows, count = 0, 0
+    for lane in range(count_lanes()):
         i = first + lane
         b.here[lane] = 0.0
         if i < len(filters) and done[i] == -1 and rows[i] > 0:
-            same = count == 0 or rows[i] == together
-            if same and len(filters[i]) == 1 and joins(b, lane, filters[i, 0]):
-                b.here[lane], together = 1.0, rows[i]
+            is_same = count == 0 or rows[i] == n_rows
+            if is_same and len(filters[i]) == 1 and is_lane_compatible(b, lane, filters[i, 0]):
+                b.here[lane], n_rows = 1.0, rows[i]
                 count += 1
-    return together if count >= _FEW else 0
+    return n_rows if count >= _MIN_LANES else 0
 
 
-@counted
+@jit_nrt
 def observe_batch(
     filters: Any,
     pool: Any,
@@ -78,45 +79,49 @@ def observe_batch(
 ) -> int:
     """`observe` for every filter that has not done its rows; returns how many still have not.
 
-    filters: (N, L). places: (N, 4), see `gains_of`. done: (N,) rows done, -1 where a filter has
-    not started. lanes: of `lanes.blocks`. fast: (N, k, FAST_WIDTH). packets: (N, capacity,
+    filters: (N, L). places: (N, 4), see `get_gains`. done: (N,) rows done, -1 where a filter has
+    not started. lanes: of `lanes.make_blocks`. fast: (N, k, FAST_WIDTH). packets: (N, capacity,
     PACKET_WIDTH). All others but inner, plan and limits have one row for each filter, too.
 
     Filters of one shape do their rows in lanes, others alone.
     """
-    waiting = 0
-    for first in range(0, len(filters), lane_count()):  # without the compiler one by one
+    n_waiting = 0
+    for first in range(0, len(filters), count_lanes()):  # without the compiler one by one
         b = lanes[first // LANES]
-        together, ahead = _gather(b, first, filters, done, rows), 0
-        if together > 0:
-            ahead = advance_block(b, first, filters, pool, places, fast, together, packets, counts)
-        for lane in range(minimum(lane_count(), len(filters) - first)):
+        n_rows, n_done = _select_lanes(b, first, filters, done, rows), 0
+        if n_rows > 0:
+            n_done = advance_block(b, first, filters, pool, places, fast, n_rows, packets, counts)
+        for lane in range(minimum(count_lanes(), len(filters) - first)):
             i = first + lane
             if done[i] < rows[i]:
-                f, gains = filters[i], gains_of(pool, places[i])
-                start = ahead if b.here[lane] == 1.0 else maximum(done[i], 0)
-                own = obs[i], inner, plan, limits, beta[i], gamma[i], out[i], summary[i]
-                if ahead == 0 and i + 1 < len(filters):
+                f, gains = filters[i], get_gains(pool, places[i])
+                start = n_done if b.here[lane] == 1.0 else maximum(done[i], 0)
+                outputs = obs[i], inner, plan, limits, beta[i], gamma[i], out[i], summary[i]
+                if n_done == 0 and i + 1 < len(filters):
                     for layer in range(len(f)):
                         _fetch(filters[i + 1, layer], f[layer])
-                done[i] = observe(f, gains, fast[i], rows[i], packets[i], counts[i], start, *own)
-                waiting += 1 if done[i] < rows[i] else 0
-    return waiting
+                done[i] = observe(
+                    f, gains, fast[i], rows[i], packets[i], counts[i], start, *outputs
+                )
+                n_waiting += 1 if done[i] < rows[i] else 0
+    return n_waiting
 
 
-def nothing_observed(count: int) -> tuple[Any, ...]:
+def make_empty_outputs(count: int) -> tuple[Any, ...]:
     """The arguments of `observe_batch` after `counts` for filters whose outputs nobody reads."""
-    none, plan, truth = (
+    empty, plan, truth = (
         np.zeros((count, 0), np.float32),
         np.zeros((0, 3), np.int64),
         np.zeros(count),
     )
-    return none, 0, plan, np.zeros(0), truth, truth, none, np.zeros((count, 3))
+    return empty, 0, plan, np.zeros(0), truth, truth, empty, np.zeros((count, 3))
 
 
 @cache
-def batch_entry() -> Any:
+def compile_observe_batch() -> Any:
     """`observe_batch` as a plain call."""
-    filters, whole, cube = np.zeros((1, 1), FILTER), np.zeros(1, np.int64), np.zeros((1, 1, 1))
-    memory = filters, np.zeros(1), np.zeros((1, 4), np.int64), whole, blocks(1)
-    return entry(observe_batch, *memory, cube, whole, cube, whole, *nothing_observed(1))
+    filters, integers, cube = np.zeros((1, 1), FILTER), np.zeros(1, np.int64), np.zeros((1, 1, 1))
+    memory = filters, np.zeros(1), np.zeros((1, 4), np.int64), integers, make_blocks(1)
+    return compile_call(
+        observe_batch, *memory, cube, integers, cube, integers, *make_empty_outputs(1)
+    )

@@ -11,41 +11,41 @@ from typing import Any
 import numpy as np
 
 from ...envs.backend.decorators import jit
-from ...envs.backend.eights import whole_lines, zeros_on_lines
+from ...envs.backend.eights import allocate_aligned, pad_to_cache_line
 from ...envs.backend.simd import LANES
 from ...envs.record import FAST, FAST_WIDTH
-from ..core.delay import BUFFER, LARSEN, latch_due
+from ..core.delay import BUFFER, LARSEN, store_due_captures
 from ..core.intersample import NONE
-from ..core.memory import CORE, FASTS, INPUTS, SLOW, WINDOW, Memory
+from ..core.memory import N_CORE, N_FAST, N_INPUTS, N_SLOW, WINDOW, FilterRecord
 from ..core.transition import KINEMATIC, VELOCITY_ROLL
 
-Block = Any
+LaneBlock = Any
 """One record of the dtype `BLOCK`; `b` in compiled code."""
 
-_MOST = 16  # states and clones
-_ROW = _MOST + 1  # as long as a power of two, rows would share few places of the cache
+_MAX_STATES = 16  # states and clones
+_ROW_LENGTH = _MAX_STATES + 1  # as long as a power of two, rows would share few places of the cache
 _FLOATS = {
-    "x": (_ROW,),
-    "P": (_MOST, _ROW),  # on and above the diagonal
-    "G": (CORE, _ROW),
-    "GT": (CORE, _ROW),
-    "HT": (INPUTS, _ROW),
-    "Q": (CORE, _ROW),  # on and above the diagonal
-    "keep": (_ROW,),
-    "decay": (_ROW,),
-    "drift": (_ROW,),
-    "PC": (_ROW,),
-    "gain": (_ROW,),
-    "K": (FASTS, _ROW),  # periodic gains of this tick
-    "C_fast": (FASTS, _ROW),
-    "D_fast": (FASTS, INPUTS),
-    "rest_fast": (FASTS,),
-    "r_fast": (FASTS,),
-    "u_factor": (INPUTS, 2),
-    "y_factor": (FASTS, 2),
-    "u": (INPUTS,),
-    "u_new": (INPUTS,),
-    "y": (FASTS,),
+    "x": (_ROW_LENGTH,),
+    "P": (_MAX_STATES, _ROW_LENGTH),  # on and above the diagonal
+    "G": (N_CORE, _ROW_LENGTH),
+    "GT": (N_CORE, _ROW_LENGTH),
+    "HT": (N_INPUTS, _ROW_LENGTH),
+    "Q": (N_CORE, _ROW_LENGTH),  # on and above the diagonal
+    "keep": (_ROW_LENGTH,),
+    "decay": (_ROW_LENGTH,),
+    "drift": (_ROW_LENGTH,),
+    "PC": (_ROW_LENGTH,),
+    "gain": (_ROW_LENGTH,),
+    "K": (N_FAST, _ROW_LENGTH),  # periodic gains of this tick
+    "C_fast": (N_FAST, _ROW_LENGTH),
+    "D_fast": (N_FAST, N_INPUTS),
+    "rest_fast": (N_FAST,),
+    "r_fast": (N_FAST,),
+    "u_factor": (N_INPUTS, 2),
+    "y_factor": (N_FAST, 2),
+    "u": (N_INPUTS,),
+    "u_new": (N_INPUTS,),
+    "y": (N_FAST,),
     "row": (FAST_WIDTH,),  # of this tick
     "speed": (),
     "speed_before": (),
@@ -72,52 +72,52 @@ _FIELDS = (
     [(name, np.float64, (*shape, LANES)) for name, shape in _FLOATS.items()]
     + [(name, np.int64, (LANES,)) for name in _INTS]
     + [(name, np.float64 if name == "robust" else np.int64) for name in _SHAPE]
-    + [("u_column", np.int64, (INPUTS, 2)), ("y_column", np.int64, (FASTS, 2))]
+    + [("u_column", np.int64, (N_INPUTS, 2)), ("y_column", np.int64, (N_FAST, 2))]
     + [("column", np.int64, (FAST_WIDTH,)), ("columns", np.int64)]  # of a fast row, that are read
 )
-BLOCK = whole_lines(_FIELDS)
+BLOCK = pad_to_cache_line(_FIELDS)
 
 
-def blocks(count: int) -> Any:
+def make_blocks(count: int) -> Any:
     """Blocks for so many filters, nothing in them."""
-    return zeros_on_lines((-(-count // LANES),), BLOCK)
+    return allocate_aligned((-(-count // LANES),), BLOCK)
 
 
 @jit
-def joins(b: Block, lane: int, f: Memory) -> Any:
+def is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Any:
     """Whether a filter's ticks are computed in its lane now; the first that does shapes the block.
 
     Lanes compute models that change by speed alone, of which every tick predicts and corrects,
     nothing is done between samples, and nothing of the past is stored but predictions.
     """
     if b.shaped[lane] == 0:
-        steady = f.tyres == 0 and f.kind != KINEMATIC and f.kind != VELOCITY_ROLL
-        plain = f.stride == 1 and f.pace == 1 and f.between == NONE and f.joint == 0
-        told = f.r_share == 0.0 and f.steer_jump == 0.0
-        fits = f.late != BUFFER and f.late != LARSEN and f.total <= _MOST
-        fits = fits and steady and plain and told
-        if fits and b.n == 0:
-            _shape(b, f)
-        b.shaped[lane] = 1 if fits and _alike(b, f) else -1
-    return b.shaped[lane] == 1 and f.begun == 1 and f.model_speed > 0.0
+        is_steady = f.tyres == 0 and f.kind != KINEMATIC and f.kind != VELOCITY_ROLL
+        is_plain = f.stride == 1 and f.pace == 1 and f.between == NONE and f.joint == 0
+        has_fixed_noise = f.r_share == 0.0 and f.steer_jump == 0.0
+        is_supported = f.late != BUFFER and f.late != LARSEN and f.total <= _MAX_STATES
+        is_supported = is_supported and is_steady and is_plain and has_fixed_noise
+        if is_supported and b.n == 0:
+            _set_shape(b, f)
+        b.shaped[lane] = 1 if is_supported and _is_same_shape(b, f) else -1
+    return b.shaped[lane] == 1 and f.has_started == 1 and f.model_speed > 0.0
 
 
 @jit
-def _alike(b: Block, f: Memory) -> Any:
-    same = f.n == b.n and f.dense == b.dense and f.total == b.total and f.inputs == b.inputs
-    same = same and f.fasts == b.fasts and f.kind == b.kind and f.periodic == b.periodic
-    same = same and f.measured == b.measured and f.cycle == b.cycle and f.robust == b.robust
-    same = same and f.store_predictions == b.store_predictions
+def _is_same_shape(b: LaneBlock, f: FilterRecord) -> Any:
+    is_same = f.n == b.n and f.dense == b.dense and f.total == b.total and f.inputs == b.inputs
+    is_same = is_same and f.fasts == b.fasts and f.kind == b.kind and f.periodic == b.periodic
+    is_same = is_same and f.measured == b.measured and f.cycle == b.cycle and f.robust == b.robust
+    is_same = is_same and f.store_predictions == b.store_predictions
     for k in range(2):
         for i in range(f.inputs):
-            same = same and f.u_column[i, k] == b.u_column[i, k]
+            is_same = is_same and f.u_column[i, k] == b.u_column[i, k]
         for i in range(f.fasts):
-            same = same and f.y_column[i, k] == b.y_column[i, k]
-    return same
+            is_same = is_same and f.y_column[i, k] == b.y_column[i, k]
+    return is_same
 
 
 @jit
-def _shape(b: Block, f: Memory) -> None:
+def _set_shape(b: LaneBlock, f: FilterRecord) -> None:
     """What all filters of a block share."""
     b.n, b.dense, b.total, b.inputs, b.fasts = f.n, f.dense, f.total, f.inputs, f.fasts
     b.kind, b.periodic, b.measured, b.cycle = f.kind, f.periodic, f.measured, f.cycle
@@ -136,7 +136,7 @@ def _shape(b: Block, f: Memory) -> None:
 
 
 @jit
-def _add_column(b: Block, column: int) -> None:
+def _add_column(b: LaneBlock, column: int) -> None:
     for i in range(b.columns):
         if b.column[i] == column:
             return
@@ -145,7 +145,7 @@ def _add_column(b: Block, column: int) -> None:
 
 
 @jit
-def _load_model(b: Block, lane: int, f: Memory) -> None:
+def _load_model(b: LaneBlock, lane: int, f: FilterRecord) -> None:
     """What a filter's ticks read and do not write."""
     n, dense = f.n, f.dense
     for i in range(n):
@@ -174,7 +174,7 @@ def _load_model(b: Block, lane: int, f: Memory) -> None:
 
 
 @jit
-def load(b: Block, lane: int, f: Memory) -> None:
+def load_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
     """A filter into its lane."""
     if b.model_speed[lane] != f.model_speed:
         _load_model(b, lane, f)
@@ -187,7 +187,7 @@ def load(b: Block, lane: int, f: Memory) -> None:
 
 
 @jit
-def _load_states(b: Block, lane: int, f: Memory) -> None:
+def _load_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
     N = b.total
     for i in range(N):
         b.x[i, lane] = f.x[i]
@@ -198,17 +198,17 @@ def _load_states(b: Block, lane: int, f: Memory) -> None:
 
 
 @jit
-def _load_clock(b: Block, lane: int, f: Memory) -> None:
+def _load_clock(b: LaneBlock, lane: int, f: FilterRecord) -> None:
     """When the next capture is."""
     first = np.inf
-    for s in range(SLOW):
+    for s in range(N_SLOW):
         if f.period[s] > 0:
             first = min(first, float(f.next[s]))
     b.next[lane] = first
 
 
 @jit
-def store(b: Block, lane: int, f: Memory) -> None:
+def store_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
     """The state of a lane into its filter's record."""
     _store_states(b, lane, f)
     for k in range(b.inputs):
@@ -220,7 +220,7 @@ def store(b: Block, lane: int, f: Memory) -> None:
 
 
 @jit
-def _store_states(b: Block, lane: int, f: Memory) -> None:
+def _store_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
     N = b.total
     for i in range(N):
         f.x[i] = b.x[i, lane]
@@ -231,17 +231,17 @@ def _store_states(b: Block, lane: int, f: Memory) -> None:
 
 
 @jit
-def capture(b: Block, lane: int, f: Memory) -> None:
+def store_captures(b: LaneBlock, lane: int, f: FilterRecord) -> None:
     """Store by its record what a lane's filter captured at its last tick; before the next one."""
     _store_states(b, lane, f)
     f.road_turn, f.speed_before = b.road_turn[lane], f.model_speed
-    latch_due(f, b.tick[lane])
+    store_due_captures(f, b.tick[lane])
     _load_states(b, lane, f)
     _load_clock(b, lane, f)
 
 
 @jit
-def remember_prediction(b: Block, lane: int, f: Memory) -> None:
+def store_prediction(b: LaneBlock, lane: int, f: FilterRecord) -> None:
     """Store a lane's prediction of this tick, before its fast measurements."""
     slot = b.tick[lane] % WINDOW
     f.past_road_turn[slot] = b.road_turn[lane]

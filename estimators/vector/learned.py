@@ -7,41 +7,41 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import counted
+from ...envs.backend.decorators import jit_nrt
 from ..core.memory import FILTER
-from ..entry import entry
-from ..learned.correction import Learned
+from ..entry import compile_call
+from ..learned.correction import LearnedEstimator
 from ..learned.kernel import EXAMPLE, MASS
 from ..protocol import ForeignEstimator
-from ..wrappers.arguments import Setup
+from ..wrappers.arguments import EstimatorSpec
 from ..wrappers.kernel import observe_corrected
 from .batch import BatchEstimator
-from .designs import Build, gains_of
-from .kernel import nothing_observed
+from .designs import Build, get_gains
+from .kernel import make_empty_outputs
 
 
-@counted
+@jit_nrt
 def correct_batch(
-    filters: Any, pool: Any, places: Any, chosen: Any, record: Any, observed: Any, own: Any
+    filters: Any, pool: Any, places: Any, chosen: Any, record: Any, observed: Any, corrections: Any
 ) -> None:
     """`observe_corrected` for the chosen filters.
 
     record, observed: the arguments of `kernel.observe_batch` from `fast` to `counts` and behind.
-    own: memory (N, memory_size), net.
+    corrections: memory (N, memory_size), net.
     """
     fast, rows, packets, counts = record
     obs, inner, plan, limits, beta, gamma, out, summary = observed
-    memory, net = own
+    memory, net = corrections
     for k in range(len(chosen)):
         i = chosen[k]
-        one, gains = (fast[i], rows[i], packets[i], counts[i]), gains_of(pool, places[i])
-        told = obs[i], inner, plan, limits, beta[i], gamma[i], out[i], summary[i]
-        observe_corrected(filters[i], gains, one, memory[i], net, told)
+        row_record, gains = (fast[i], rows[i], packets[i], counts[i]), get_gains(pool, places[i])
+        outputs = obs[i], inner, plan, limits, beta[i], gamma[i], out[i], summary[i]
+        observe_corrected(filters[i], gains, row_record, memory[i], net, outputs)
 
 
-def _base(build: Build, setup: Setup) -> Any:
+def _build_base(build: Build, spec: EstimatorSpec) -> Any:
     """The filter inside of a learned estimator, by a name that pickle finds."""
-    return build(setup).inner.base  # type: ignore[union-attr]
+    return build(spec).inner.base  # type: ignore[union-attr]
 
 
 class LearnedBatch(BatchEstimator):
@@ -51,28 +51,30 @@ class LearnedBatch(BatchEstimator):
     """
 
     def __init__(
-        self, first: ForeignEstimator, setups: Sequence[Setup], dt: float, build: Build
+        self, first: ForeignEstimator, specs: Sequence[EstimatorSpec], dt: float, build: Build
     ) -> None:
-        self.first: Learned = first.inner  # type: ignore[assignment]
-        self.memory = np.zeros((len(setups), len(self.first.memory)))
-        super().__init__(first.name, setups, dt, functools.partial(_base, build))
+        self.first: LearnedEstimator = first.inner  # type: ignore[assignment]
+        self.memory = np.zeros((len(specs), len(self.first.memory)))
+        super().__init__(first.name, specs, dt, functools.partial(_build_base, build))
 
     def __getitem__(self, i: int) -> Any:
-        own = copy.copy(self.first)
-        own.base, own.memory = super().__getitem__(i), self.memory[i]
-        return ForeignEstimator(own, self.name, self.dt, own.base.sensors)
+        estimator = copy.copy(self.first)
+        estimator.base, estimator.memory = super().__getitem__(i), self.memory[i]
+        return ForeignEstimator(estimator, self.name, self.dt, estimator.base.sensors)
 
-    def configure(self, rows: Iterable[int], setups: Iterable[Setup]) -> None:
+    def configure(self, rows: Iterable[int], specs: Iterable[EstimatorSpec]) -> None:
         """As `BatchEstimator.configure`."""
-        rows, setups = list(rows), list(setups)
-        super().configure(rows, setups)
-        self.memory[rows, MASS] = [each.vehicle.mass for each in setups]
+        rows, specs = list(rows), list(specs)
+        super().configure(rows, specs)
+        self.memory[rows, MASS] = [spec.vehicle.mass for spec in specs]
 
     def take(self, mask: Any, *arguments: Any) -> None:
         """As `BatchEstimator.take`."""
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
         layers = self.filters, self._designs.pool, self._places, chosen
-        _entry()(*layers, arguments[:4], arguments[4:], (self.memory, self.first.net))
+        _compile_correct_batch()(
+            *layers, arguments[:4], arguments[4:], (self.memory, self.first.net)
+        )
 
     def get_state(self) -> Any:
         """The filters and their corrections."""
@@ -84,9 +86,11 @@ class LearnedBatch(BatchEstimator):
 
 
 @functools.cache
-def _entry() -> Any:
+def _compile_correct_batch() -> Any:
     """`correct_batch` as a plain call."""
-    whole, cube = np.zeros(1, np.int64), np.zeros((1, 1, 1))
-    layers = np.zeros((1, 1), FILTER), np.zeros(1), np.zeros((1, 4), np.int64), whole
-    own = np.zeros((1, 1)), EXAMPLE
-    return entry(correct_batch, *layers, (cube, whole, cube, whole), nothing_observed(1), own)
+    integers, cube = np.zeros(1, np.int64), np.zeros((1, 1, 1))
+    layers = np.zeros((1, 1), FILTER), np.zeros(1), np.zeros((1, 4), np.int64), integers
+    corrections = np.zeros((1, 1)), EXAMPLE
+    return compile_call(
+        correct_batch, *layers, (cube, integers, cube, integers), make_empty_outputs(1), corrections
+    )

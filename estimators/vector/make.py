@@ -9,35 +9,38 @@ import numpy as np
 
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import COMS, Vehicle
-from ...envs.vehicle.vehicles import VehicleSource, vehicle_from
+from ...envs.vehicle.vehicles import VehicleSource, make_vehicle
 from ..filters import FILTERS
-from ..learned.correction import Learned
-from ..protocol import EstimatorFactory, ForeignEstimator, label_of
-from ..wrappers.arguments import Setup, build
+from ..learned.correction import LearnedEstimator
+from ..protocol import EstimatorFactory, ForeignEstimator, get_label
+from ..wrappers.arguments import EstimatorSpec, build_estimator
 from .batch import BatchEstimator, Sensors
 from .foreign import ForeignBatch
 from .learned import LearnedBatch
 
 
-def batch_of(
-    source: str | EstimatorFactory, setups: Sequence[Setup], dt: float, options: Mapping[str, Any]
+def build_batch(
+    source: str | EstimatorFactory,
+    specs: Sequence[EstimatorSpec],
+    dt: float,
+    options: Mapping[str, Any],
 ) -> BatchEstimator:
     """An estimator for each setup: a compiled batch where they are ours and no channel is late,
     else one of objects.
 
     source, options, errors: as in `make_estimator`.
     """
-    each = functools.partial(build, source, dict(options), dt)
+    build_one = functools.partial(build_estimator, source, dict(options), dt)
     if not (isinstance(source, str) and source in FILTERS) or options.get("latency"):
-        first = each(setups[0])
-        if isinstance(first, ForeignEstimator) and isinstance(first.inner, Learned):
-            return LearnedBatch(first, setups, dt, each)
+        first = build_one(specs[0])
+        if isinstance(first, ForeignEstimator) and isinstance(first.inner, LearnedEstimator):
+            return LearnedBatch(first, specs, dt, build_one)
         if isinstance(first, ForeignEstimator):
             kind = getattr(first.inner, "batch", ForeignBatch)  # one that takes all rows at once
-            return kind(first, setups, dt, each)
+            return kind(first, specs, dt, build_one)
         if not first.compiled:
-            return ForeignBatch(first, setups, dt, each)
-    return BatchEstimator(label_of(source), setups, dt, each)
+            return ForeignBatch(first, specs, dt, build_one)
+    return BatchEstimator(get_label(source), specs, dt, build_one)
 
 
 def make_batch(
@@ -56,19 +59,24 @@ def make_batch(
     `make_estimator` raises, and ValueError for a list of another length.
     """
     if count < 1:
-        raise ValueError(f"{label_of(name)}: a batch has at least one filter, got {count}")
-    cars = _each("vehicle", vehicle, count, (Vehicle, str, os.PathLike, Mapping))
-    clocks = _each("sensors", sensors or {}, count, (Mapping,))
-    speeds = _each("speed", speed, count, (int, float, np.number, type(None)))
-    setups = [Setup(vehicle_from(c), s, v) for c, s, v in zip(cars, clocks, speeds, strict=True)]
-    batch = batch_of(name, setups, dt, options)
-    batch.reset(None, clocks)
+        raise ValueError(f"{get_label(name)}: a batch has at least one filter, got {count}")
+    cars = _expand_argument("vehicle", vehicle, count, (Vehicle, str, os.PathLike, Mapping))
+    row_sensors = _expand_argument("sensors", sensors or {}, count, (Mapping,))
+    speeds = _expand_argument("speed", speed, count, (int, float, np.number, type(None)))
+    specs = [
+        EstimatorSpec(make_vehicle(c), s, v)
+        for c, s, v in zip(cars, row_sensors, speeds, strict=True)
+    ]
+    batch = build_batch(name, specs, dt, options)
+    batch.reset(None, row_sensors)
     return batch
 
 
-def _each(what: str, value: Any, count: int, alone: tuple[type, ...]) -> list[Any]:
-    if isinstance(value, alone):
+def _expand_argument(
+    label: str, value: Any, count: int, single_types: tuple[type, ...]
+) -> list[Any]:
+    if isinstance(value, single_types):
         return [value] * count
     if len(value) != count:
-        raise ValueError(f"{what}: one or a list of {count}, got {len(value)}")
+        raise ValueError(f"{label}: one or a list of {count}, got {len(value)}")
     return list(value)

@@ -9,25 +9,25 @@ from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
 
 from ...envs.record import FAST_WIDTH, PACKET_WIDTH
 from ...envs.sensors.link import SlowSensor
-from ...envs.task.observation import Entry
+from ...envs.task.observation import ObservationEntry
 from ...envs.vehicle.vehicle import Vehicle
-from ..wrappers.arguments import Setup, setup_of
-from ..wrappers.estimate import base_of
+from ..wrappers.arguments import EstimatorSpec, make_spec
+from ..wrappers.estimate import find_base_env
 
 Array = npt.NDArray[np.float64]
-Whole = npt.NDArray[np.int64]
+IntArray = npt.NDArray[np.int64]
 
 
-class Records(NamedTuple):
+class RecordBatch(NamedTuple):
     """The records of N cars' newest step."""
 
     fast: Array  # (N, k, FAST_WIDTH)
-    rows: Whole  # (N,), how many of them are there
+    rows: IntArray  # (N,), how many of them are there
     packets: Array  # (N, capacity, PACKET_WIDTH)
-    counts: Whole  # (N,)
+    counts: IntArray  # (N,)
 
 
-class Batched(Protocol):
+class BatchedEnv(Protocol):
     """What a vector env that steps all cars at once offers.
 
     slow_sensors, nominal and held_speed: of each car, (N,). The final_... ones are a row's record
@@ -35,44 +35,44 @@ class Batched(Protocol):
     """
 
     rows: Array
-    ticks_done: Whole
+    ticks_done: IntArray
     packets: Array
-    delivered: Whole
+    delivered: IntArray
     final_rows: Array
-    final_ticks_done: Whole
+    final_ticks_done: IntArray
     final_packets: Array
-    final_delivered: Whole
+    final_delivered: IntArray
     slow_sensors: Sequence[Mapping[str, SlowSensor]]
     nominal: Sequence[Vehicle]
     held_speed: Sequence[float | None]
-    layout: tuple[Entry, ...]
+    layout: tuple[ObservationEntry, ...]
     dt: float
 
 
 class BatchedRecords:
-    """The records of a `Batched` env."""
+    """The records of a `BatchedEnv` env."""
 
     def __init__(self, env: Any) -> None:
         self._env = env
-        self.layout: tuple[Entry, ...] = env.layout
+        self.layout: tuple[ObservationEntry, ...] = env.layout
         self.dt: float = env.dt
 
-    def newest(self) -> Records:
+    def read_latest(self) -> RecordBatch:
         """Of the newest step, or of tick 0 where a car was reset."""
         env = self._env
-        return _contiguous(env.rows, env.ticks_done, env.packets, env.delivered)
+        return _make_contiguous(env.rows, env.ticks_done, env.packets, env.delivered)
 
-    def final(self, ended: npt.NDArray[np.bool_]) -> Records:
+    def read_final(self, ended: npt.NDArray[np.bool_]) -> RecordBatch:
         """Of the last step of the episodes that ended in this step."""
         env = self._env
-        return _contiguous(
+        return _make_contiguous(
             env.final_rows, env.final_ticks_done, env.final_packets, env.final_delivered
         )
 
-    def setups(self, rows: Sequence[int]) -> list[Setup]:
+    def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
         """What the env offers to the estimators of some rows."""
         env = self._env
-        return [Setup(env.nominal[i], env.slow_sensors[i], env.held_speed[i]) for i in rows]
+        return [EstimatorSpec(env.nominal[i], env.slow_sensors[i], env.held_speed[i]) for i in rows]
 
     def annotate(self, label: str, beta: Array, std: Array, rows: npt.NDArray[np.bool_]) -> None:
         """Estimates of some rows to draw beside the truth, by an env that draws."""
@@ -84,24 +84,24 @@ class SyncRecords:
     """The records of the environments in a `SyncVectorEnv`, copied into one array each."""
 
     def __init__(self, env: SyncVectorEnv[Any, Any]) -> None:
-        self._bases = [base_of(each) for each in env.envs]
-        layouts = [each.get_wrapper_attr("layout") for each in env.envs]
+        self._bases = [find_base_env(sub_env) for sub_env in env.envs]
+        layouts = [sub_env.get_wrapper_attr("layout") for sub_env in env.envs]
         for i, layout in enumerate(layouts):
             if layout != layouts[0]:
                 raise ValueError(f"environment {i} of the vector env has another layout than 0")
-        self.layout: tuple[Entry, ...] = layouts[0]
+        self.layout: tuple[ObservationEntry, ...] = layouts[0]
         self.dt: float = self._bases[0].dt
         N = len(self._bases)
         ticks = max(len(base.rows) for base in self._bases)
         capacity = max(len(base.packets) for base in self._bases)
-        self._records = Records(
+        self._records = RecordBatch(
             np.zeros((N, ticks, FAST_WIDTH)),
             np.zeros(N, np.int64),
             np.zeros((N, capacity, PACKET_WIDTH)),
             np.zeros(N, np.int64),
         )
 
-    def newest(self) -> Records:
+    def read_latest(self) -> RecordBatch:
         """Of the newest step, or of tick 0 where a car was reset."""
         fast, rows, packets, counts = self._records
         for i, base in enumerate(self._bases):
@@ -110,7 +110,7 @@ class SyncRecords:
             rows[i], counts[i] = n, m
         return self._records
 
-    def final(self, ended: npt.NDArray[np.bool_]) -> Records:
+    def read_final(self, ended: npt.NDArray[np.bool_]) -> RecordBatch:
         """Of the last step of the episodes that ended in this step."""
         fast, rows, packets, counts = self._records
         for i in np.flatnonzero(ended):
@@ -120,9 +120,9 @@ class SyncRecords:
             rows[i], counts[i] = n, m
         return self._records
 
-    def setups(self, rows: Sequence[int]) -> list[Setup]:
+    def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
         """What the environments of some rows offer to their estimators."""
-        return [setup_of(self._bases[i]) for i in rows]
+        return [make_spec(self._bases[i]) for i in rows]
 
     def annotate(self, label: str, beta: Array, std: Array, rows: npt.NDArray[np.bool_]) -> None:
         """Estimates of some rows to draw beside the truth."""
@@ -130,7 +130,7 @@ class SyncRecords:
             self._bases[i].annotate(label, float(beta[i]), float(std[i]))
 
 
-def true_vehicles(base: Any, rows: Sequence[int]) -> list[Vehicle]:
+def get_true_vehicles(base: Any, rows: Sequence[int]) -> list[Vehicle]:
     """The true vehicles that some rows of a bare vector env drive in this episode.
 
     Raises TypeError where they are out of reach.
@@ -142,7 +142,7 @@ def true_vehicles(base: Any, rows: Sequence[int]) -> list[Vehicle]:
     return [base.vehicle[i] for i in rows]
 
 
-def true_states(base: Any) -> Array:
+def get_true_states(base: Any) -> Array:
     """The `TrueState` of every row of a bare vector env now; TypeError where out of reach."""
     if isinstance(base, SyncVectorEnv):
         return np.array([env.unwrapped.true_state for env in base.envs])  # type: ignore[attr-defined]
@@ -151,9 +151,9 @@ def true_states(base: Any) -> Array:
     return np.asarray(base.true_state)
 
 
-def _contiguous(fast: Any, rows: Any, packets: Any, counts: Any) -> Records:
+def _make_contiguous(fast: Any, rows: Any, packets: Any, counts: Any) -> RecordBatch:
     """Arrays as compiled code takes them, copied only where they are not."""
-    return Records(
+    return RecordBatch(
         np.ascontiguousarray(fast, np.float64),
         np.ascontiguousarray(rows, np.int64),
         np.ascontiguousarray(packets, np.float64),
@@ -161,7 +161,7 @@ def _contiguous(fast: Any, rows: Any, packets: Any, counts: Any) -> Records:
     )
 
 
-def records_of(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:
+def make_record_source(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:
     """The records of a bare vector env.
 
     Raises TypeError for workers, whose records are out of reach, and where there are no records.
@@ -175,7 +175,7 @@ def records_of(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:
         )
     if isinstance(env, SyncVectorEnv):
         return SyncRecords(env)
-    missing = [name for name in Batched.__annotations__ if not hasattr(env, name)]
+    missing = [name for name in BatchedEnv.__annotations__ if not hasattr(env, name)]
     if missing:
         raise TypeError(
             "EstimateObservation reads the records of a sideslip vector environment; "
@@ -184,7 +184,7 @@ def records_of(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:
     return BatchedRecords(env)
 
 
-def state_of(env: Any) -> Any:
+def get_env_state(env: Any) -> Any:
     """The snapshot of a vector env, wrapped or not; TypeError where it makes none."""
     if not hasattr(env, "get_state"):
         raise TypeError(

@@ -8,7 +8,9 @@ from gymnasium.envs.registration import EnvSpec, VectorizeMode, WrapperSpec
 from gymnasium.vector import AutoresetMode
 
 
-def vector_spec(spec: EnvSpec | None, single: Any, kwargs: Mapping[str, Any]) -> EnvSpec | None:
+def make_vector_spec(
+    spec: EnvSpec | None, single: Any, kwargs: Mapping[str, Any]
+) -> EnvSpec | None:
     """The spec of a vector env whose rows wear the wrapper `single(**kwargs)`; None without one.
 
     JSON-able. `gym.make_vec` of it makes environments that are wrapped one by one: it puts no
@@ -26,7 +28,7 @@ def vector_spec(spec: EnvSpec | None, single: Any, kwargs: Mapping[str, Any]) ->
         if "autoreset_mode" in spec.kwargs:
             mode = spec.kwargs.pop("autoreset_mode")
             spec.kwargs["vector_kwargs"] = {"autoreset_mode": mode}
-    how = spec.kwargs.get("vector_kwargs", {})
-    if isinstance(how.get("autoreset_mode"), AutoresetMode):
-        how["autoreset_mode"] = how["autoreset_mode"].value
+    vector_kwargs = spec.kwargs.get("vector_kwargs", {})
+    if isinstance(vector_kwargs.get("autoreset_mode"), AutoresetMode):
+        vector_kwargs["autoreset_mode"] = vector_kwargs["autoreset_mode"].value
     return spec

@@ -8,72 +8,78 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.arrays import at, lane_count, put
-from ...envs.backend.decorators import apart, counted, jit
+from ...envs.backend.arrays import count_lanes, load_element, store_element
+from ...envs.backend.decorators import jit, jit_nrt, noinline
 from ...envs.backend.eights import prefetch
-from ...envs.backend.primitives import anywhere, maximum, minimum, select
+from ...envs.backend.primitives import any_lane, maximum, minimum, select
 from ...envs.record import FAST, FAST_WIDTH, PACKET
-from ..core.covariance import condition, project
-from ..core.fast import propagate, read, residual_of, signal
-from ..core.memory import OFTEN, Gains, Memory, Row
-from ..core.packets import receive
-from ..core.run import tick
-from ..core.speed import finite, low_passed, next_cell, off
-from ..core.transition import CURVATURE, LATERAL, road_turned
-from .designs import gains_of
-from .lanes import Block, capture, load, remember_prediction, store
+from ..core.covariance import correct_scalar, project
+from ..core.fast import compute_residual, compute_signal, propagate, read_fast_row
+from ..core.memory import X_OFFSET, FilterRecord, GainTables, Vector
+from ..core.packets import process_packet
+from ..core.run import run_tick
+from ..core.speed import find_next_cell, is_finite, is_speed_changed, smooth_speed
+from ..core.transition import CURVATURE, LATERAL, compute_road_turn
+from .designs import get_gains
+from .lanes import LaneBlock, load_lane, store_captures, store_lane, store_prediction
 
 
 @jit
-def _fetch_next(b: Block, first: int, filters: Any, fast: Any, j: int, rows: int) -> None:
+def _fetch_next(b: LaneBlock, first: int, filters: Any, fast: Any, j: int, rows: int) -> None:
     """Have the caches fetch what the next block, of the filters from `first` on, reads at tick j,
     and its share of their states."""
-    last = minimum(first + lane_count(), len(filters))
+    last = minimum(first + count_lanes(), len(filters))
     for i in range(first, last):
         for k in range(0, FAST_WIDTH, 5):  # a row lies on two cache lines or three
             prefetch(fast, i, j, k)
-    for lane in range(lane_count() * j // rows, lane_count() * (j + 1) // rows):
+    for lane in range(count_lanes() * j // rows, count_lanes() * (j + 1) // rows):
         if first + lane < last:
             f = filters[first + lane, 0]
-            for k in range(0, OFTEN + b.total, 8):
-                prefetch(f.ahead, k)
+            for k in range(0, X_OFFSET + b.total, 8):
+                prefetch(f.padding, k)
             for i in range(b.total if b.periodic == 0 else 0):
                 for k in range(0, b.total, 8):
                     prefetch(f.P, i, k)
 
 
 @jit
-def _read(b: Block, first: int, fast: Any, j: int) -> None:
+def _read_rows(b: LaneBlock, first: int, fast: Any, j: int) -> None:
     """Row j of each lane's filter into b.row."""
-    for lane in range(lane_count()):
+    for lane in range(count_lanes()):
         if b.here[lane] == 1.0:
             for k in range(b.columns):
                 b.row[b.column[k], lane] = fast[first + lane, j, b.column[k]]
-    put(b.now, at(b.now) + 1.0)
+    store_element(b.now, load_element(b.now) + 1.0)
 
 
 @jit
-def _sense(b: Block) -> Any:
+def _read_signals(b: LaneBlock) -> Any:
     """Inputs into b.u_new, measurements into b.y; (speeds, whether a lane's tick stands apart)."""
-    odd = at(b.here) != 1.0  # nowhere, as far as anybody looks at it
+    is_outlier = load_element(b.here) != 1.0  # nowhere, as far as anybody looks at it
     for i in range(b.inputs):
-        put(b.u_new, signal(b.row, b.u_column[i], b.u_factor[i]), i)
-        odd = odd | (finite(at(b.u_new, i)) ^ True)
+        store_element(b.u_new, compute_signal(b.row, b.u_column[i], b.u_factor[i]), i)
+        is_outlier = is_outlier | (is_finite(load_element(b.u_new, i)) ^ True)
     for i in range(b.fasts):
-        put(b.y, signal(b.row, b.y_column[i], b.y_factor[i]), i)
-        odd = odd | (finite(at(b.y, i)) ^ True)
-    speed = at(b.speed)
+        store_element(b.y, compute_signal(b.row, b.y_column[i], b.y_factor[i]), i)
+        is_outlier = is_outlier | (is_finite(load_element(b.y, i)) ^ True)
+    speed = load_element(b.speed)
     if b.measured == 1:
-        now = 0.5 * (at(b.row, FAST.wheel_left) + at(b.row, FAST.wheel_right))
-        speed = low_passed(speed, now, at(b.smoothing))
-        odd = odd | (finite(now) ^ True) | off(speed, at(b.model_speed))
-    return speed, odd & (at(b.here) == 1.0)
+        wheel_speed = 0.5 * (
+            load_element(b.row, FAST.wheel_left) + load_element(b.row, FAST.wheel_right)
+        )
+        speed = smooth_speed(speed, wheel_speed, load_element(b.smoothing))
+        is_outlier = (
+            is_outlier
+            | (is_finite(wheel_speed) ^ True)
+            | is_speed_changed(speed, load_element(b.model_speed))
+        )
+    return speed, is_outlier & (load_element(b.here) == 1.0)
 
 
 @jit
-def _gather(b: Block, first: int, pool: Row, places: Any) -> None:
+def _gather_gains(b: LaneBlock, first: int, pool: Vector, places: Any) -> None:
     """The periodic gains of this tick into b.K."""
-    for lane in range(lane_count()):
+    for lane in range(count_lanes()):
         if b.here[lane] == 1.0:
             place = places[first + lane]
             row = b.cell[lane] * place[2] + 1 + b.at[lane] * maximum(b.fasts, 1)
@@ -83,129 +89,143 @@ def _gather(b: Block, first: int, pool: Row, places: Any) -> None:
 
 
 @jit
-def _correct(b: Block, first: int, filters: Any) -> None:
+def _correct(b: LaneBlock, first: int, filters: Any) -> None:
     """The fast measurements of all lanes; a lane whose residual is not finite stays as it is."""
     for i in range(b.fasts):
-        residual = residual_of(b, i)
-        wild = (finite(residual) ^ True) & (at(b.apart) == 0.0) & (at(b.here) == 1.0)
-        some = anywhere(wild)
-        if some:
-            put(b.wild, select(wild, 1.0, 0.0))
-            for lane in range(lane_count()):
+        residual = compute_residual(b, i)
+        is_invalid = (
+            (is_finite(residual) ^ True)
+            & (load_element(b.apart) == 0.0)
+            & (load_element(b.here) == 1.0)
+        )
+        has_invalid = any_lane(is_invalid)
+        if has_invalid:
+            store_element(b.wild, select(is_invalid, 1.0, 0.0))
+            for lane in range(count_lanes()):
                 if b.wild[lane] == 1.0:
-                    store(b, lane, filters[first + lane, 0])
+                    store_lane(b, lane, filters[first + lane, 0])
         if b.periodic == 1:
             for j in range(b.total):
-                put(b.x, at(b.x, j) + at(b.K, i, j) * residual, j)
+                store_element(b.x, load_element(b.x, j) + load_element(b.K, i, j) * residual, j)
         else:
-            variance = project(b, b.C_fast[i]) + at(b.r_fast, i)
-            condition(b, variance, residual)
-        if some:
-            for lane in range(lane_count()):
+            variance = project(b, b.C_fast[i]) + load_element(b.r_fast, i)
+            correct_scalar(b, variance, residual)
+        if has_invalid:
+            for lane in range(count_lanes()):
                 if b.wild[lane] == 1.0:
-                    load(b, lane, filters[first + lane, 0])
+                    load_lane(b, lane, filters[first + lane, 0])
 
 
 @jit
-def _capture(b: Block, first: int, filters: Any) -> None:
+def _store_captures(b: LaneBlock, first: int, filters: Any) -> None:
     """What lanes that do this tick together captured at the last one."""
-    if anywhere((at(b.now) > at(b.next)) & (at(b.here) == 1.0)):
-        for lane in range(lane_count()):
-            due = b.now[lane] > b.next[lane]
-            if due and b.here[lane] == 1.0 and b.apart[lane] == 0.0:
-                capture(b, lane, filters[first + lane, 0])
+    if any_lane((load_element(b.now) > load_element(b.next)) & (load_element(b.here) == 1.0)):
+        for lane in range(count_lanes()):
+            is_due = b.now[lane] > b.next[lane]
+            if is_due and b.here[lane] == 1.0 and b.apart[lane] == 0.0:
+                store_captures(b, lane, filters[first + lane, 0])
 
 
 @jit
-def _together(b: Block, first: int, filters: Any, pool: Row, places: Any, speed: Any) -> None:
+def _step_lanes(
+    b: LaneBlock, first: int, filters: Any, pool: Vector, places: Any, speed: Any
+) -> None:
     """A tick of all lanes."""
-    put(b.speed_before, at(b.model_speed))
-    put(b.speed, speed)
+    store_element(b.speed_before, load_element(b.model_speed))
+    store_element(b.speed, speed)
     for k in range(b.inputs):
-        put(b.u, at(b.u_new, k), k)
+        store_element(b.u, load_element(b.u_new, k), k)
     if b.kind == LATERAL and b.inputs > CURVATURE:
-        turn = road_turned(at(b.model_speed), at(b.u, CURVATURE), at(b.step))
-        put(b.road_turn, at(b.road_turn) + turn)
+        turn = compute_road_turn(
+            load_element(b.model_speed), load_element(b.u, CURVATURE), load_element(b.step)
+        )
+        store_element(b.road_turn, load_element(b.road_turn) + turn)
     propagate(b, b.u)
-    for lane in range(lane_count()):
+    for lane in range(count_lanes()):
         b.tick[lane] += 1
         b.at[lane] = b.at[lane] + 1 if b.at[lane] + 1 < b.cycle else 0
     if b.store_predictions == 1:
-        for lane in range(lane_count()):
+        for lane in range(count_lanes()):
             if b.here[lane] == 1.0 and b.apart[lane] == 0.0:
-                remember_prediction(b, lane, filters[first + lane, 0])
+                store_prediction(b, lane, filters[first + lane, 0])
     if b.periodic == 1:
-        _gather(b, first, pool, places)
+        _gather_gains(b, first, pool, places)
     _correct(b, first, filters)
 
 
 @jit
-def _speed_of(row: Row) -> Any:
+def _average_wheel_speed(row: Vector) -> Any:
     return 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
 
 
 @jit
-def _leave(b: Block, first: int, filters: Any, pool: Any, places: Any, fast: Any, j: int) -> bool:
+def _store_outliers(
+    b: LaneBlock, first: int, filters: Any, pool: Any, places: Any, fast: Any, j: int
+) -> bool:
     """Lanes whose tick stands apart into their records; False, and nothing is changed, where the
     gains of one of them are missing."""
     if b.periodic == 1:
-        for lane in range(lane_count()):
+        for lane in range(count_lanes()):
             if b.apart[lane] == 1.0:
                 i = first + lane
                 f = filters[i, 0]
                 f.speed = b.speed[lane]
-                cell = next_cell(f, _speed_of(fast[i, j]))
+                cell = find_next_cell(f, _average_wheel_speed(fast[i, j]))
                 if pool[places[i, 0] + cell * places[i, 2] * places[i, 3]] == 0.0:
                     return False
-    for lane in range(lane_count()):
+    for lane in range(count_lanes()):
         if b.apart[lane] == 1.0:
-            store(b, lane, filters[first + lane, 0])
+            store_lane(b, lane, filters[first + lane, 0])
     return True
 
 
-@apart
-def _tick_apart(f: Memory, gains: Gains, row: Row) -> None:
+@noinline
+def _step_filter(f: FilterRecord, gains: GainTables, row: Vector) -> None:
     """A tick of a filter alone."""
-    read(f, row, _speed_of(row))
-    tick(f, gains)
+    read_fast_row(f, row, _average_wheel_speed(row))
+    run_tick(f, gains)
 
 
 @jit
-def _return(b: Block, first: int, filters: Any, pool: Any, places: Any, fast: Any, j: int) -> None:
+def _step_outliers(
+    b: LaneBlock, first: int, filters: Any, pool: Any, places: Any, fast: Any, j: int
+) -> None:
     """The tick of the lanes that stand apart, by their records, which the lanes take over."""
-    for lane in range(lane_count()):
+    for lane in range(count_lanes()):
         if b.apart[lane] == 1.0:
             i = first + lane
-            _tick_apart(filters[i, 0], gains_of(pool, places[i]), fast[i, j])
-            load(b, lane, filters[i, 0])
+            _step_filter(filters[i, 0], get_gains(pool, places[i]), fast[i, j])
+            load_lane(b, lane, filters[i, 0])
 
 
 @jit
-def _await(b: Block, lane: int, packets: Any, count: int) -> None:
+def _set_next_due(b: LaneBlock, lane: int, packets: Any, count: int) -> None:
     """When the lane's next packet is taken; one that no tick of this call waits for at the next."""
-    k, due = b.cursor[lane], np.inf
+    k, due_tick = b.cursor[lane], np.inf
     if k < count:
         arrived = packets[k, PACKET.arrived]
-        due = arrived if b.now[lane] < arrived <= b.last[lane] else -np.inf
-    b.due[lane] = due
+        due_tick = arrived if b.now[lane] < arrived <= b.last[lane] else -np.inf
+    b.due[lane] = due_tick
 
 
 @jit
-def _receive(b: Block, lane: int, f: Memory, gains: Gains, packets: Any, count: int) -> None:
+def _process_packets(
+    b: LaneBlock, lane: int, f: FilterRecord, gains: GainTables, packets: Any, count: int
+) -> None:
     """The packets of a lane's filter that are here now, by its record."""
     k = b.cursor[lane]
-    store(b, lane, f)
+    store_lane(b, lane, f)
     while k < count and not (f.tick < packets[k, PACKET.arrived] <= b.last[lane]):
-        receive(f, gains, packets[k])
+        process_packet(f, gains, packets[k])
         k += 1
     b.cursor[lane] = k
-    load(b, lane, f)
-    _await(b, lane, packets, count)
+    load_lane(b, lane, f)
+    _set_next_due(b, lane, packets, count)
 
 
-@counted
+@jit_nrt
 def advance_block(
-    b: Block,
+    b: LaneBlock,
     first: int,
     filters: Any,
     pool: Any,
@@ -221,36 +241,36 @@ def advance_block(
     `kernel.observe_batch`. Returns the rows done, of all alike: fewer than `rows` where one of them
     has no gains.
     """
-    put(b.due, np.inf)
-    for lane in range(lane_count()):
+    store_element(b.due, np.inf)
+    for lane in range(count_lanes()):
         if b.here[lane] == 1.0:
             i = first + lane
-            load(b, lane, filters[i, 0])
+            load_lane(b, lane, filters[i, 0])
             b.cursor[lane], b.now[lane] = 0, float(b.tick[lane])
             b.last[lane] = b.tick[lane] + rows
-            _await(b, lane, packets[i], counts[i])
+            _set_next_due(b, lane, packets[i], counts[i])
     for j in range(rows):
-        _fetch_next(b, first + lane_count(), filters, fast, j, rows)
-        _read(b, first, fast, j)
-        speed, odd = _sense(b)
-        some = anywhere(odd)
-        put(b.apart, select(odd, 1.0, 0.0))
-        if some and not _leave(b, first, filters, pool, places, fast, j):
+        _fetch_next(b, first + count_lanes(), filters, fast, j, rows)
+        _read_rows(b, first, fast, j)
+        speed, is_outlier = _read_signals(b)
+        has_outlier = any_lane(is_outlier)
+        store_element(b.apart, select(is_outlier, 1.0, 0.0))
+        if has_outlier and not _store_outliers(b, first, filters, pool, places, fast, j):
             rows = j
             break
-        _capture(b, first, filters)
-        _together(b, first, filters, pool, places, speed)
-        if some:
-            _return(b, first, filters, pool, places, fast, j)
-        if anywhere(at(b.now) >= at(b.due)):
-            for lane in range(lane_count()):
+        _store_captures(b, first, filters)
+        _step_lanes(b, first, filters, pool, places, speed)
+        if has_outlier:
+            _step_outliers(b, first, filters, pool, places, fast, j)
+        if any_lane(load_element(b.now) >= load_element(b.due)):
+            for lane in range(count_lanes()):
                 if b.here[lane] == 1.0 and b.now[lane] >= b.due[lane]:
                     i = first + lane
-                    own = filters[i, 0], gains_of(pool, places[i]), packets[i]
-                    _receive(b, lane, *own, counts[i])
-    for lane in range(lane_count()):
+                    lane_args = filters[i, 0], get_gains(pool, places[i]), packets[i]
+                    _process_packets(b, lane, *lane_args, counts[i])
+    for lane in range(count_lanes()):
         if b.here[lane] == 1.0:
             f = filters[first + lane, 0]
-            store(b, lane, f)
+            store_lane(b, lane, f)
             f.cursor = b.cursor[lane]
     return rows

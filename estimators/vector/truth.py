@@ -10,11 +10,11 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ...envs.task.observation import space_of
-from ..wrappers.truth import STIFFNESSES, parameters_of, states_of, truth_entries
+from ...envs.task.observation import make_space
+from ..wrappers.truth import STIFFNESSES, make_truth_entries, read_parameters, read_states
 from ..wrappers.truth import TruthObservation as Single
-from .records import state_of, true_states, true_vehicles
-from .spec import vector_spec
+from .records import get_env_state, get_true_states, get_true_vehicles
+from .spec import make_vector_spec
 
 Observations = npt.NDArray[np.float32]
 
@@ -48,8 +48,8 @@ class TruthObservation(
                 "sideslip.estimators.vector.EstimateObservation first"
             )
         self._parameters, self._states = tuple(parameters), tuple(states)
-        self.layout = truth_entries(self._parameters, self._states, env.layout)
-        self.single_observation_space = space_of(self.layout)
+        self.layout = make_truth_entries(self._parameters, self._states, env.layout)
+        self.single_observation_space = make_space(self.layout)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._same_step = env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP
         if self._same_step and states:
@@ -60,7 +60,7 @@ class TruthObservation(
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]  # as in VectorWrapper
         """The env's with the single wrapper; JSON-able, None where the env has none."""
-        return vector_spec(self.env.spec, Single, self._saved_kwargs)
+        return make_vector_spec(self.env.spec, Single, self._saved_kwargs)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -69,15 +69,15 @@ class TruthObservation(
         mask = None if options is None else options.get("reset_mask")
         rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
         obs, infos = self.env.reset(seed=seed, options=options)
-        self._read(rows)
+        self._read_cars(rows)
         self._ended &= ~rows
-        return self._observed(obs), infos
+        return self._append_truth(obs), infos
 
-    def _observed(self, obs: Observations) -> Observations:
+    def _append_truth(self, obs: Observations) -> Observations:
         if not self._states:
             return np.hstack([obs, self._values])
-        true = true_states(self.unwrapped)
-        return np.hstack([obs, self._values, states_of(true, self._states)])
+        states = get_true_states(self.unwrapped)
+        return np.hstack([obs, self._values, read_states(states, self._states)])
 
     def step(self, actions: Any) -> tuple[Observations, Any, Any, Any, dict[str, Any]]:
         """One step of all rows."""
@@ -86,16 +86,16 @@ class TruthObservation(
         if self._same_step:
             for i in np.flatnonzero(ended):
                 infos["final_obs"][i] = np.concatenate([infos["final_obs"][i], self._values[i]])
-            self._read(ended)
+            self._read_cars(ended)
         else:
-            self._read(self._ended)
+            self._read_cars(self._ended)
         self._ended = ended
-        return self._observed(obs), rewards, terminated, truncated, infos
+        return self._append_truth(obs), rewards, terminated, truncated, infos
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot that `set_state` continues from; TypeError where the env makes none."""
-        own = {"values": self._values.copy(), "ended": self._ended.copy()}
-        return own | {"env": state_of(self.env)}
+        arrays = {"values": self._values.copy(), "ended": self._ended.copy()}
+        return arrays | {"env": get_env_state(self.env)}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Go back to a snapshot of this env or of one built with the same arguments."""
@@ -103,8 +103,8 @@ class TruthObservation(
         env.set_state(snapshot["env"])
         self._values, self._ended = snapshot["values"].copy(), snapshot["ended"].copy()
 
-    def _read(self, mask: npt.NDArray[np.bool_]) -> None:
+    def _read_cars(self, mask: npt.NDArray[np.bool_]) -> None:
         rows = np.flatnonzero(mask)
-        cars = true_vehicles(self.unwrapped, rows.tolist())
+        cars = get_true_vehicles(self.unwrapped, rows.tolist())
         for i, car in zip(rows, cars, strict=True):
-            self._values[i] = parameters_of(car, self._parameters)
+            self._values[i] = read_parameters(car, self._parameters)

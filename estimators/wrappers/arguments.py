@@ -4,23 +4,23 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, NoReturn
 
-from ...envs.arguments import brief, unknown_names
+from ...envs.arguments import describe_unknown, short_repr
 from ...envs.sensors.link import SlowSensor
 from ...envs.vehicle.vehicle import Vehicle
-from ...envs.vehicle.vehicles import VehicleSource, vehicle_from
+from ...envs.vehicle.vehicles import VehicleSource, make_vehicle
 from ..estimator import Estimator
 from ..make import make_estimator
-from ..protocol import EstimatorFactory, EstimatorLike, ForeignEstimator, label_of
-from ..registry import entry_point_of
+from ..protocol import EstimatorFactory, EstimatorLike, ForeignEstimator, get_label
+from ..registry import find_entry_point
 from .truth import TRUTH
 
-Source = str | EstimatorFactory | EstimatorLike
+EstimatorSource = str | EstimatorFactory | EstimatorLike
 """What `EstimateObservation` takes for its estimator: a name, a factory or an object."""
 AnyEstimator = Estimator | ForeignEstimator
-_OWN = ("estimator", "outputs", "std", "replace", "vehicle", "options", "name")
+_PARAMETERS = ("estimator", "outputs", "std", "replace", "vehicle", "options", "name")
 
 
-class Setup(NamedTuple):
+class EstimatorSpec(NamedTuple):
     """What an estimator is built for: the vehicle as it believes it to be, the slow sensors, and
     the speed in m/s where it is held."""
 
@@ -35,16 +35,16 @@ class Setup(NamedTuple):
         return self.vehicle, tuple(sorted(clocks)), self.speed
 
 
-def setup_of(base: Any) -> Setup:
+def make_spec(base: Any) -> EstimatorSpec:
     """What a bare single env offers to estimators in its present episode."""
-    return Setup(base.nominal, base.slow_sensors, getattr(base, "held_speed", None))
+    return EstimatorSpec(base.nominal, base.slow_sensors, getattr(base, "held_speed", None))
 
 
-def build(
-    source: str | EstimatorFactory, options: Mapping[str, Any], dt: float, setup: Setup
+def build_estimator(
+    source: str | EstimatorFactory, options: Mapping[str, Any], dt: float, spec: EstimatorSpec
 ) -> AnyEstimator:
     """`make_estimator` of a name or a factory for a setup."""
-    vehicle, sensors, speed = setup
+    vehicle, sensors, speed = spec
     return make_estimator(source, vehicle=vehicle, sensors=sensors, dt=dt, speed=speed, **options)
 
 
@@ -59,7 +59,7 @@ class Arguments:
 
     def __init__(
         self,
-        estimator: Source | None,
+        estimator: EstimatorSource | None,
         outputs: Sequence[str],
         std: bool,
         replace: bool,
@@ -69,29 +69,31 @@ class Arguments:
         slow_sensors: Mapping[str, SlowSensor],
         misplaced: Mapping[str, Any],
     ) -> None:
-        source: Any = usual_estimator(slow_sensors) if estimator is None else estimator
+        source: Any = choose_estimator(slow_sensors) if estimator is None else estimator
         recorded = source
         if misplaced:
-            wrong = unknown_names("argument of EstimateObservation", misplaced, _OWN)
+            wrong = describe_unknown("argument of EstimateObservation", misplaced, _PARAMETERS)
             if isinstance(source, str) and "did you mean" not in wrong:
                 make_estimator(
                     source, sensors=slow_sensors, **misplaced
                 )  # names the nearest option
-                wrong = f"options of an estimator are passed as options={brief(dict(misplaced))}"
+                wrong = (
+                    f"options of an estimator are passed as options={short_repr(dict(misplaced))}"
+                )
             raise TypeError(wrong)
         self.options = dict(options or {})
         self.truth = isinstance(vehicle, str) and vehicle == TRUTH
-        self.vehicle = None if vehicle is None or self.truth else vehicle_from(vehicle)
-        self.source, self.object, self.label = source, None, label_of(source)
+        self.vehicle = None if vehicle is None or self.truth else make_vehicle(vehicle)
+        self.source, self.object, self.label = source, None, get_label(source)
         if not _is_object(source):
-            recorded = source if isinstance(source, str) else entry_point_of(source) or source
+            recorded = source if isinstance(source, str) else find_entry_point(source) or source
         else:
             if vehicle is not None or self.options:
                 raise ValueError(
                     f"{self.label} is built already: a vehicle and options go to a name or a "
                     "factory"
                 )
-            self.source, self.object, recorded = None, source, Unrecorded(self.label)
+            self.source, self.object, recorded = None, source, NotSerializable(self.label)
         car = vehicle.to_dict() if isinstance(vehicle, Vehicle) else vehicle
         self.recorded = {
             "estimator": recorded,
@@ -103,21 +105,21 @@ class Arguments:
             "name": name,
         }
 
-    def build(self, setup: Setup, dt: float) -> AnyEstimator:
+    def build(self, spec: EstimatorSpec, dt: float) -> AnyEstimator:
         """An estimator for a setup and ticks of dt seconds; where one object is used, that one."""
         if self.object is None:
-            return build(self.source, self.options, dt, setup)
+            return build_estimator(self.source, self.options, dt, spec)
         if not isinstance(self.object, AnyEstimator):
-            self.object = ForeignEstimator(self.object, self.label, dt, setup.sensors)
+            self.object = ForeignEstimator(self.object, self.label, dt, spec.sensors)
         elif abs(self.object.dt - dt) > 1e-9:
             raise ValueError(
                 f"{self.label} was built for ticks of {self.object.dt:g} s, the env has {dt:g} s"
             )
-        fixed: AnyEstimator = self.object
-        return fixed
+        estimator: AnyEstimator = self.object
+        return estimator
 
 
-class Unrecorded:
+class NotSerializable:
     """In a spec in the place of an object: whoever builds from that spec gets the reason."""
 
     def __init__(self, label: str) -> None:
@@ -131,7 +133,7 @@ class Unrecorded:
         )
 
 
-def usual_estimator(slow_sensors: Iterable[str]) -> str:
+def choose_estimator(slow_sensors: Iterable[str]) -> str:
     """The estimator where none is named: `dakf` where there is a GPS, else `exact-kf`."""
     return "dakf" if "gps" in slow_sensors else "exact-kf"
 

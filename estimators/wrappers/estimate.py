@@ -9,20 +9,20 @@ import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
-from ...envs.task.observation import Entry, space_of
+from ...envs.task.observation import ObservationEntry, make_space
 from ...envs.vehicle.vehicles import VehicleSource
 from ..estimator import Estimator
-from ..learned.correction import Learned
-from .arguments import AnyEstimator, Arguments, Setup, Source, setup_of
-from .kernel import observe_entry
-from .outputs import BETA, STD, Outputs, outputs_of, titled, write
-from .truth import as_built, set_stiffness
+from ..learned.correction import LearnedEstimator
+from .arguments import AnyEstimator, Arguments, EstimatorSource, EstimatorSpec, make_spec
+from .kernel import compile_observe
+from .outputs import BETA, STD, Outputs, make_outputs, make_title, write_outputs
+from .truth import choose_vehicle, set_stiffness
 
-_MAY_STAND_BETWEEN = (PassiveEnvChecker, OrderEnforcing, TimeLimit)
+_ALLOWED_WRAPPERS = (PassiveEnvChecker, OrderEnforcing, TimeLimit)
 # stable-baselines3's make_vec_env and rl-zoo put it directly around the environment. It only counts
 # and is known by name: this module loads nothing of theirs.
 _MONITOR = ("stable_baselines3.common.monitor", "Monitor")
-_OFFERED = (
+_BASE_MEMBERS = (
     *("rows", "ticks_done", "packets", "delivered", "slow_sensors", "nominal", "layout", "dt"),
     "annotate",
 )
@@ -39,7 +39,7 @@ class EstimateObservation(
 
     estimator: a name of `make_estimator`, an entry point "package.module:Name", a factory (see
     `EstimatorFactory`) or an object (see `EstimatorLike`), which is reset at every episode but
-    hears of no other car; None: `usual_estimator` of the env's sensors. outputs: states to append,
+    hears of no other car; None: `choose_estimator` of the env's sensors. outputs: states to append,
     each as `<state>_hat`, then, if `std`, each one's standard deviation as `<state>_std`. replace:
     the observation is these alone. vehicle: as the estimator believes it to be (a preset, a
     mapping; default the env's nominal; "truth": the true car of each episode, as it is at the
@@ -68,7 +68,7 @@ class EstimateObservation(
     def __init__(
         self,
         env: gym.Env[Any, Any],
-        estimator: Source | None = None,
+        estimator: EstimatorSource | None = None,
         outputs: Sequence[str] = ("beta", "gamma"),
         std: bool = True,
         replace: bool = False,
@@ -77,36 +77,38 @@ class EstimateObservation(
         name: str | None = None,
         **misplaced: Any,
     ) -> None:
-        self._base = base_of(env)
+        self._base = find_base_env(env)
         clocks = self._base.slow_sensors
         self._arguments = Arguments(
             estimator, outputs, std, replace, vehicle, options, name, clocks, misplaced
         )
         RecordConstructorArgs.__init__(self, **self._arguments.recorded)
         gym.Wrapper.__init__(self, env)
-        self._setup: Setup | None = None
-        self.estimator: AnyEstimator = self._configured()
-        inner: tuple[Entry, ...] = () if replace else env.get_wrapper_attr("layout")
+        self._estimator_spec: EstimatorSpec | None = None
+        self.estimator: AnyEstimator = self._update_estimator()
+        inner: tuple[ObservationEntry, ...] = () if replace else env.get_wrapper_attr("layout")
         states, label = self.estimator.names, self._arguments.label
-        self.outputs: Outputs = outputs_of(label, states, outputs, std, name, inner)
-        self.layout: tuple[Entry, ...] = self.outputs.layout
-        self.observation_space = space_of(self.layout)
-        self._width, self._title = len(self.layout), titled(label, name)
+        self.outputs: Outputs = make_outputs(label, states, outputs, std, name, inner)
+        self.layout: tuple[ObservationEntry, ...] = self.outputs.layout
+        self.observation_space = make_space(self.layout)
+        self._width, self._title = len(self.layout), make_title(label, name)
         self._summary = np.zeros(3)
 
-    def _configured(self) -> AnyEstimator:
+    def _update_estimator(self) -> AnyEstimator:
         """The estimator for the env's present setup; the one at hand where nothing changed."""
-        base, arguments, before = self._base, self._arguments, self._setup
-        setup = setup_of(base)
+        base, arguments, previous = self._base, self._arguments, self._estimator_spec
+        spec = make_spec(base)
         if arguments.vehicle is not None:
-            setup = setup._replace(vehicle=arguments.vehicle)
+            spec = spec._replace(vehicle=arguments.vehicle)
         elif arguments.truth:
             car = base.vehicle
-            fits = car if before is None else as_built(self.estimator, before.vehicle, car)
-            setup = setup._replace(vehicle=fits)
-        if before is None or setup.design != before.design:
-            self.estimator, self._setup = arguments.build(setup, base.dt), setup
-            self._ours = isinstance(self.estimator, Estimator) and self.estimator.compiled
+            vehicle = (
+                car if previous is None else choose_vehicle(self.estimator, previous.vehicle, car)
+            )
+            spec = spec._replace(vehicle=vehicle)
+        if previous is None or spec.design != previous.design:
+            self.estimator, self._estimator_spec = arguments.build(spec, base.dt), spec
+            self._is_native = isinstance(self.estimator, Estimator) and self.estimator.compiled
         if arguments.truth:
             set_stiffness(self.estimator, base.vehicle)
         return self.estimator
@@ -116,13 +118,13 @@ class EstimateObservation(
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Reset the env, then the estimator with this episode's clocks, and take tick 0."""
         obs, info = self.env.reset(seed=seed, options=options)
-        self._configured().reset(self._base.slow_sensors)
-        return self._observed(obs, info), info
+        self._update_estimator().reset(self._base.slow_sensors)
+        return self._append_estimates(obs, info), info
 
     def step(self, action: Any) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
         """One env-step, whose record the estimator takes before the observation is made."""
         obs, reward, terminated, truncated, info = self.env.step(action)
-        return self._observed(obs, info), reward, terminated, truncated, info
+        return self._append_estimates(obs, info), reward, terminated, truncated, info
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot of the env and the estimator that `set_state` continues from."""
@@ -132,52 +134,52 @@ class EstimateObservation(
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Go back to a snapshot of this env or of one built with the same arguments."""
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
-        self._configured().set_state(snapshot["estimator"])
+        self._update_estimator().set_state(snapshot["estimator"])
 
-    def _observed(
+    def _append_estimates(
         self, obs: npt.NDArray[np.float32], info: dict[str, Any]
     ) -> npt.NDArray[np.float32]:
         """The estimator takes the newest step; the observation with its outputs, (width,)."""
         base, outputs, summary = self._base, self.outputs, self._summary
         estimator: Any = self.estimator
-        inner = None if self._ours else getattr(estimator, "inner", None)
+        inner = None if self._is_native else getattr(estimator, "inner", None)
         out, rows, done = np.empty(self._width, np.float32), base.ticks_done, 0
         record = base.rows, rows, base.packets, base.delivered
-        shown = outputs.inner, outputs.plan, outputs.limits
-        what = obs, *shown, info["beta"], info["gamma"], out, summary
-        if isinstance(inner, Learned):
+        layout_args = outputs.inner, outputs.plan, outputs.limits
+        observe_args = obs, *layout_args, info["beta"], info["gamma"], out, summary
+        if isinstance(inner, LearnedEstimator):
             memory = inner.base.filters, inner.base.gains
-            observe_entry(corrected=True)(*memory, record, inner.memory, inner.net, what)
-        elif not self._ours:
+            compile_observe(corrected=True)(*memory, record, inner.memory, inner.net, observe_args)
+        elif not self._is_native:
             estimator.step(base.rows[:rows], base.packets[: base.delivered])
-            write(estimator, *what)
-        while self._ours:
+            write_outputs(estimator, *observe_args)
+        while self._is_native:
             memory = estimator.filters, estimator.gains
-            done = observe_entry()(*memory, *record, done, *what)
+            done = compile_observe()(*memory, *record, done, *observe_args)
             if done == rows:  # which a refused action leaves at none
                 break
             estimator.design_missing()
         values = summary.tolist()
-        for key, place in outputs.keys:
-            info[key] = values[place]
-            if place == BETA:
+        for key, index in outputs.keys:
+            info[key] = values[index]
+            if index == BETA:
                 base.annotate(self._title, values[BETA], values[STD])
         return out
 
 
-def base_of(env: gym.Env[Any, Any]) -> Any:
+def find_base_env(env: gym.Env[Any, Any]) -> Any:
     """The base env; TypeError if anything that may hide ticks from the estimator is in between."""
     layer = env
     while isinstance(layer, gym.Wrapper):
         kind = type(layer)
-        known = isinstance(layer, (*_MAY_STAND_BETWEEN, EstimateObservation))
-        if not known and (kind.__module__, kind.__name__) != _MONITOR:
+        is_allowed = isinstance(layer, (*_ALLOWED_WRAPPERS, EstimateObservation))
+        if not is_allowed and (kind.__module__, kind.__name__) != _MONITOR:
             raise TypeError(
                 "EstimateObservation must be the innermost wrapper, directly around the "
                 f"environment; inside it is {kind.__name__}"
             )
         layer = layer.env
-    missing = [name for name in _OFFERED if not hasattr(layer, name)]
+    missing = [name for name in _BASE_MEMBERS if not hasattr(layer, name)]
     if missing:
         raise TypeError(
             f"EstimateObservation reads the record of a sideslip environment; "

@@ -5,42 +5,42 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import apart, jit
+from ...envs.backend.decorators import jit, noinline
 from ...envs.backend.elementary import wrap
 from ...envs.backend.primitives import maximum, minimum
 from ..core.memory import FILTER
-from ..core.run import advance, covariance_of, deviation
-from ..entry import entry
-from ..learned.kernel import EXAMPLE, filter_and_correct, lend, take_back
+from ..core.run import advance, compute_deviation, read_covariance
+from ..entry import compile_call
+from ..learned.kernel import EXAMPLE, apply_correction, filter_and_correct, remove_correction
 
 
 @jit
-def _clipped(value: Any, limit: Any) -> Any:
+def _clip_symmetric(value: Any, limit: Any) -> Any:
     """The value within +-limit; NaN stays, so that a filter that failed is seen."""
     return value if value != value else minimum(maximum(value, 0.0 - limit), limit)
 
 
 @jit
-def _nees(f: Any, gains: Any, i: int, j: int, beta: Any, gamma: Any) -> Any:
+def _compute_nees(f: Any, gains: Any, i: int, j: int, beta: Any, gamma: Any) -> Any:
     """e^T P^-1 e of the states i (beta) and j (gamma), per state; 0 if P is singular.
 
     i, j: -1 where it is not to be judged. beta, gamma: the true ones.
     """
     if i >= 0 and j >= 0:
         a, b = f.x[i] - beta, f.x[j] - gamma
-        p, q = covariance_of(f, gains, i, i), covariance_of(f, gains, j, j)
-        r = covariance_of(f, gains, i, j)
+        p, q = read_covariance(f, gains, i, i), read_covariance(f, gains, j, j)
+        r = read_covariance(f, gains, i, j)
         det = p * q - r * r
         return 0.5 * (a * a * q - 2.0 * a * b * r + b * b * p) / det if det > 0.0 else 0.0
     k = maximum(i, j)
     if k < 0:
         return 0.0
     a = f.x[k] - (beta if i >= 0 else gamma)
-    p = covariance_of(f, gains, k, k)
+    p = read_covariance(f, gains, k, k)
     return a * a / p if p > 0.0 else 0.0
 
 
-@apart
+@noinline
 def observe(
     filters: Any,
     gains: Any,
@@ -81,38 +81,40 @@ def observe(
         value = f.x[state]
         if plan[i, 1] == 1:
             value = wrap(value)
-        out[inner + i] = _clipped(value, limits[i])
+        out[inner + i] = _clip_symmetric(value, limits[i])
         if len(out) > inner + m:
-            out[inner + m + i] = _clipped(deviation(f, gains, state), limits[i])
+            out[inner + m + i] = _clip_symmetric(compute_deviation(f, gains, state), limits[i])
         if plan[i, 2] == 1:
             beta_at = state
         elif plan[i, 2] == 2:
             gamma_at = state
     f = filters[0]
-    summary[0], summary[1] = f.x[0], deviation(f, gains, 0)
-    summary[2] = _nees(f, gains, beta_at, gamma_at, beta, gamma)
+    summary[0], summary[1] = f.x[0], compute_deviation(f, gains, 0)
+    summary[2] = _compute_nees(f, gains, beta_at, gamma_at, beta, gamma)
     return done
 
 
 @jit
-def observe_corrected(filters: Any, gains: Any, record: Any, m: Any, net: Any, rest: Any) -> None:
+def observe_corrected(
+    filters: Any, gains: Any, record: Any, m: Any, net: Any, outputs: Any
+) -> None:
     """`filter_and_correct`, and what `observe` writes of the sums.
 
-    record, rest: the arguments of `observe` before and behind `start`.
+    record, outputs: the arguments of `observe` before and behind `start`.
     """
     fast, rows, packets, count = record
     filter_and_correct(filters, gains, fast, rows, packets, count, m, net)
-    lend(filters[0], m, net)
-    observe(filters, gains, fast, 0, packets, 0, 0, *rest)
-    take_back(filters[0], m, net)
+    apply_correction(filters[0], m, net)
+    observe(filters, gains, fast, 0, packets, 0, 0, *outputs)
+    remove_correction(filters[0], m, net)
 
 
 @cache
-def observe_entry(corrected: bool = False) -> Any:
+def compile_observe(corrected: bool = False) -> Any:
     """`observe`, or `observe_corrected`, as a plain call."""
     small, wide, matrix = np.zeros(1, np.float32), np.zeros(1), np.zeros((1, 1))
     memory, record = (np.zeros(1, FILTER), np.zeros((1, 1, 1))), (matrix, 0, matrix, 0)
     outputs = small, 0, np.zeros((1, 3), np.int64), wide, 0.0, 0.0, small, wide
     if corrected:
-        return entry(observe_corrected, *memory, record, wide, EXAMPLE, outputs)
-    return entry(observe, *memory, *record, 0, *outputs)
+        return compile_call(observe_corrected, *memory, record, wide, EXAMPLE, outputs)
+    return compile_call(observe, *memory, *record, 0, *outputs)

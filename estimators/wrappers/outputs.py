@@ -6,19 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.decorators import plain
+from ...envs.backend.decorators import as_python
 from ...envs.backend.elementary import wrap
 from ...envs.backend.primitives import ARRAYS
-from ...envs.task.observation import Entry
+from ...envs.task.observation import ObservationEntry
 from ..design.models import FOREIGN_STATE, STATES
-from ..protocol import EstimatorLike, deviations
+from ..protocol import EstimatorLike, compute_std
 
 Array = npt.NDArray[np.float64]
 
 TRUTHS = {"beta": 1, "gamma": 2}  # states whose truth stands in the info
 BETA, STD, NEES = 0, 1, 2  # places in the summary of a step
 _WRAPPED = ("psi", "psi_late")
-_wrap = plain(wrap, ARRAYS)
+_wrap = as_python(wrap, ARRAYS)
 
 
 @dataclass(frozen=True)
@@ -31,20 +31,20 @@ class Outputs:
     known.
     """
 
-    layout: tuple[Entry, ...]
+    layout: tuple[ObservationEntry, ...]
     inner: int
     plan: npt.NDArray[np.int64]
     limits: npt.NDArray[np.float64]
     keys: tuple[tuple[str, int], ...]
 
 
-def outputs_of(
+def make_outputs(
     estimator: str,
     states: tuple[str, ...],
     outputs: Sequence[str],
     std: bool,
     name: str | None,
-    inner: tuple[Entry, ...],
+    inner: tuple[ObservationEntry, ...],
 ) -> Outputs:
     """The outputs of an estimator with these states after the entries of an inner observation.
 
@@ -53,16 +53,18 @@ def outputs_of(
     for output in outputs:
         if output not in states:
             raise ValueError(f"{estimator} has no state {output!r}; it has: {', '.join(states)}")
-    before = "" if name is None else f"{name}_"
+    prefix = "" if name is None else f"{name}_"
     kinds = [STATES.get(s, FOREIGN_STATE) for s in outputs]
-    each = list(zip(outputs, kinds, strict=True))
-    hats = [Entry(f"{before}{s}_hat", kind.unit, -kind.bound, kind.bound) for s, kind in each]
-    stds = [Entry(f"{before}{s}_std", kind.unit, 0.0, kind.bound) for s, kind in each]
+    item = list(zip(outputs, kinds, strict=True))
+    hats = [
+        ObservationEntry(f"{prefix}{s}_hat", kind.unit, -kind.bound, kind.bound) for s, kind in item
+    ]
+    stds = [ObservationEntry(f"{prefix}{s}_std", kind.unit, 0.0, kind.bound) for s, kind in item]
     layout = (*inner, *hats, *(stds if std else ()))
-    names = [each.name for each in layout]
-    twice = sorted({each for each in names if names.count(each) > 1})
-    if twice:
-        raise ValueError(f"{', '.join(twice)} would stand twice; give this wrapper a name=...")
+    names = [item.name for item in layout]
+    duplicates = sorted({item for item in names if names.count(item) > 1})
+    if duplicates:
+        raise ValueError(f"{', '.join(duplicates)} would stand twice; give this wrapper a name=...")
     truths = [TRUTHS.get(s, 0) for s in outputs]
     columns = [states.index(s) for s in outputs], [s in _WRAPPED for s in outputs], truths
     keys = [("beta_hat", BETA), ("beta_std", STD)] if "beta" in states else []
@@ -72,16 +74,16 @@ def outputs_of(
         len(inner),
         np.array(columns, np.int64).T.copy(),
         np.array([kind.bound for kind in kinds]).astype(np.float32).astype(np.float64),
-        tuple((before + key, place) for key, place in keys),
+        tuple((prefix + key, place) for key, place in keys),
     )
 
 
-def titled(label: str, name: str | None) -> str:
+def make_title(label: str, name: str | None) -> str:
     """What a wrapper's estimates are called in pictures."""
     return label if name is None else f"{label} ({name})"
 
 
-def write(
+def write_outputs(
     estimator: EstimatorLike,
     obs: npt.NDArray[np.float32],
     inner: int,
@@ -97,7 +99,7 @@ def write(
     Raises as `ForeignEstimator.x`.
     """
     x, P = np.asarray(estimator.x), np.asarray(estimator.P)
-    std, states, m = deviations(P), plan[:, 0], len(plan)
+    std, states, m = compute_std(P), plan[:, 0], len(plan)
     out[:inner] = obs[:inner]
     with np.errstate(invalid="ignore"):
         values = np.where(plan[:, 1] == 1, _wrap(x[states]), x[states])
@@ -105,8 +107,8 @@ def write(
     if len(out) > inner + m:
         out[inner + m :] = np.clip(std[states], -limits, limits)
     first = estimator.names.index("beta") if "beta" in estimator.names else 0
-    judged = plan[plan[:, 2] > 0]
-    e = x[judged[:, 0]] - np.where(judged[:, 2] == 1, beta, gamma)
-    S = P[np.ix_(judged[:, 0], judged[:, 0])]
+    truth_plan = plan[plan[:, 2] > 0]
+    e = x[truth_plan[:, 0]] - np.where(truth_plan[:, 2] == 1, beta, gamma)
+    S = P[np.ix_(truth_plan[:, 0], truth_plan[:, 0])]
     nees = e @ np.linalg.solve(S, e) / len(e) if len(e) and np.linalg.det(S) > 0.0 else 0.0
     summary[:] = x[first], std[first], nees

@@ -11,66 +11,70 @@ import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
 
 from ...envs.engine.views import TRUE_STATE
-from ...envs.task.observation import Entry, space_of
+from ...envs.task.observation import ObservationEntry, make_space
 from ...envs.vehicle.vehicle import Vehicle
 from ..estimator import Estimator
 from ..protocol import ForeignEstimator
 
 TRUTH = "truth"  # in place of a vehicle: the one that is driven
 STIFFNESSES = ("front_stiffness", "rear_stiffness")
-LARGEST = 1e7  # of any parameter of a vehicle, SI
+MAX_PARAMETER = 1e7  # of any parameter of a vehicle, SI
 _STATES = {
     "beta": ("rad", math.pi),
     "gamma": ("rad/s", 20.0),
-    "F_d": ("N", LARGEST),
-    "N_d": ("N m", LARGEST),
+    "F_d": ("N", MAX_PARAMETER),
+    "N_d": ("N m", MAX_PARAMETER),
     "phi": ("rad", math.pi),
     "phi_rate": ("rad/s", 100.0),
 }
 
 
-def truth_entries(
-    parameters: Sequence[str], states: Sequence[str], inner: Sequence[Entry]
-) -> tuple[Entry, ...]:
+def make_truth_entries(
+    parameters: Sequence[str], states: Sequence[str], inner: Sequence[ObservationEntry]
+) -> tuple[ObservationEntry, ...]:
     """`true_<parameter>` of each parameter of a `Vehicle` and `<state>_hat` of each state of a
     `TrueState`, after the entries of an observation.
 
     Raises ValueError for an unknown parameter or state, or where a name would stand twice.
     """
-    fields = {each.name: each.metadata.get("unit") for each in dataclasses.fields(Vehicle)}
+    fields = {field.name: field.metadata.get("unit") for field in dataclasses.fields(Vehicle)}
     entries = []
     for name in parameters:
         unit = fields.get(name)
         if unit is None:
             known = ", ".join(key for key, value in fields.items() if value is not None)
             raise ValueError(f"a vehicle has no parameter {name!r}; it has: {known}")
-        entries.append(Entry(f"true_{name}", unit, -LARGEST, LARGEST))
+        entries.append(ObservationEntry(f"true_{name}", unit, -MAX_PARAMETER, MAX_PARAMETER))
     for name in states:
         if name not in _STATES:
             raise ValueError(f"there is no true state {name!r}; there is: {', '.join(_STATES)}")
-        unit, most = _STATES[name]
-        entries.append(Entry(f"{name}_hat", unit, -most, most))
+        unit, limit = _STATES[name]
+        entries.append(ObservationEntry(f"{name}_hat", unit, -limit, limit))
     names = [entry.name for entry in (*inner, *entries)]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(f"{', '.join(twice)} would stand twice in the observation")
+    duplicates = sorted({name for name in names if names.count(name) > 1})
+    if duplicates:
+        raise ValueError(f"{', '.join(duplicates)} would stand twice in the observation")
     return (*inner, *entries)
 
 
-def parameters_of(vehicle: Vehicle, parameters: Sequence[str]) -> npt.NDArray[np.float32]:
+def read_parameters(vehicle: Vehicle, parameters: Sequence[str]) -> npt.NDArray[np.float32]:
     """The values of some parameters, (len(parameters),)."""
     return np.array([getattr(vehicle, name) for name in parameters], np.float32)
 
 
-def states_of(true_state: Any, states: Sequence[str]) -> npt.NDArray[np.float32]:
+def read_states(true_state: Any, states: Sequence[str]) -> npt.NDArray[np.float32]:
     """Some states of an array (..., len(TrueState)), within their bounds, (..., len(states))."""
-    most = np.array([_STATES[name][1] for name in states])
+    limits = np.array([_STATES[name][1] for name in states])
     columns = [getattr(TRUE_STATE, name) for name in states]
-    chosen: npt.NDArray[np.float32] = true_state[..., columns].clip(-most, most).astype(np.float32)
-    return chosen
+    values: npt.NDArray[np.float32] = (
+        true_state[..., columns].clip(-limits, limits).astype(np.float32)
+    )
+    return values
 
 
-def as_built(estimator: Estimator | ForeignEstimator, built: Vehicle, vehicle: Vehicle) -> Vehicle:
+def choose_vehicle(
+    estimator: Estimator | ForeignEstimator, built: Vehicle, vehicle: Vehicle
+) -> Vehicle:
     """The car to build an estimator for, so that the one at hand serves wherever it can.
 
     Where gains follow P nothing is designed from the stiffnesses: `set_stiffness` will do.
@@ -115,8 +119,8 @@ class TruthObservation(
         gym.Wrapper.__init__(self, env)
         self._parameters, self._states = tuple(parameters), tuple(states)
         inner = env.get_wrapper_attr("layout")
-        self.layout = truth_entries(self._parameters, self._states, inner)
-        self.observation_space = space_of(self.layout)
+        self.layout = make_truth_entries(self._parameters, self._states, inner)
+        self.observation_space = make_space(self.layout)
         self._values = np.zeros(len(self._parameters), np.float32)
 
     def reset(
@@ -125,19 +129,19 @@ class TruthObservation(
         """Reset the env and read its car."""
         obs, info = self.env.reset(seed=seed, options=options)
         base: Any = self.unwrapped
-        self._values = parameters_of(base.vehicle, self._parameters)
-        return self._observed(obs), info
+        self._values = read_parameters(base.vehicle, self._parameters)
+        return self._append_truth(obs), info
 
-    def _observed(self, obs: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def _append_truth(self, obs: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         if not self._states:
             return np.concatenate([obs, self._values])
         base: Any = self.unwrapped
-        return np.concatenate([obs, self._values, states_of(base.true_state, self._states)])
+        return np.concatenate([obs, self._values, read_states(base.true_state, self._states)])
 
     def step(self, action: Any) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
         """One env-step."""
         obs, reward, terminated, truncated, info = self.env.step(action)
-        return self._observed(obs), reward, terminated, truncated, info
+        return self._append_truth(obs), reward, terminated, truncated, info
 
     def get_state(self) -> dict[str, Any]:
         """A snapshot of the env and the parameters that `set_state` continues from."""

@@ -14,7 +14,7 @@ from gymnasium.wrappers import vector
 
 import sideslip
 from sideslip.agents import make_agent
-from sideslip.agents.env_facts import facts_of, layout_of
+from sideslip.agents.env_facts import get_env_facts, get_layout
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.vector import EstimateObservation as BatchEstimate
 from sideslip.estimators.vector.truth import TruthObservation as BatchTruth
@@ -81,8 +81,8 @@ SINGLE: dict[str, Wrap] = {
 @pytest.mark.parametrize("wrap", SINGLE.values(), ids=SINGLE)
 def test_an_agent_behind_a_transparent_wrapper_acts_as_without(wrap: Wrap) -> None:
     env, bare = wrap(single()), single()
-    layout = facts_of(bare).layout
-    assert facts_of(env).layout[: len(layout)] == layout  # entries of ours stand behind
+    layout = get_env_facts(bare).layout
+    assert get_env_facts(env).layout[: len(layout)] == layout  # entries of ours stand behind
     assert driven(env) == driven(bare)
 
 
@@ -167,7 +167,7 @@ def test_a_wrapper_itself_may_be_declared_transparent() -> None:
     env = Counted(single())
     env.transparent = False
     with pytest.raises(ValueError, match="Counted"):
-        facts_of(env)
+        get_env_facts(env)
 
 
 BATCH: dict[str, Wrap] = {
@@ -187,7 +187,7 @@ def test_an_agent_behind_a_transparent_vector_wrapper_acts_as_without(wrap: Wrap
 
 def test_infos_as_a_list_change_no_action() -> None:
     env = vector.DictInfoToList(batch())
-    assert facts_of(env) == facts_of(batch())
+    assert get_env_facts(env) == get_env_facts(batch())
 
 
 VECTOR_REFUSED: dict[str, Wrap] = {
@@ -203,7 +203,7 @@ VECTOR_REFUSED: dict[str, Wrap] = {
 @pytest.mark.parametrize("name", VECTOR_REFUSED)
 def test_another_vector_wrapper_is_refused_by_name(name: str) -> None:
     env = vector.RecordEpisodeStatistics(VECTOR_REFUSED[name](batch()))
-    for read in (facts_of, layout_of):
+    for read in (get_env_facts, get_layout):
         with pytest.raises(ValueError, match=f"^{name} may change"):
             read(env)
 
@@ -214,9 +214,9 @@ def test_wrappers_of_the_rows_are_looked_at_too() -> None:
 
     rows = {wrap: functools.partial(make, wrap) for wrap in (wrappers.Autoreset, Doubled)}
     same, other = rows.values()
-    assert facts_of(SyncVectorEnv([same])) == facts_of(make(lambda env: env))
+    assert get_env_facts(SyncVectorEnv([same])) == get_env_facts(make(lambda env: env))
     with pytest.raises(ValueError, match="Doubled may change"):
-        facts_of(SyncVectorEnv([same, other]))
+        get_env_facts(SyncVectorEnv([same, other]))
 
 
 @pytest.mark.parametrize("name", ["Autoreset", "NormalizeObservation", "ClipAction"])
@@ -224,10 +224,10 @@ def test_rows_in_other_processes_show_it_by_their_spaces(name: str) -> None:
     env: Any = AsyncVectorEnv([functools.partial(_wrapped, name)] * 2)
     try:
         if name == "Autoreset":
-            assert facts_of(env) == facts_of(gym.make(ID))
+            assert get_env_facts(env) == get_env_facts(gym.make(ID))
         else:
             with pytest.raises(ValueError, match="a wrapper within AsyncVectorEnv may change"):
-                facts_of(env)
+                get_env_facts(env)
     finally:
         env.close()
 

@@ -8,11 +8,11 @@ import pytest
 from typer.testing import CliRunner
 
 from sideslip.agents import AGENTS, Agent, Controller, make_agent, register_agent
-from sideslip.agents.rollout import costs_of, rollout
+from sideslip.agents.rollout import evaluate_costs, rollout
 from sideslip.benchmarks.cli.main import app
 from sideslip.benchmarks.control.build import make_cars
-from sideslip.benchmarks.control.cells import Cell
-from sideslip.benchmarks.control.contests import Contest
+from sideslip.benchmarks.control.cells import ControlEntry
+from sideslip.benchmarks.control.contests import ControlTask
 from sideslip.estimators import register_estimator
 from sideslip.estimators.make import ESTIMATORS
 from tests.envs.helpers import bits
@@ -61,10 +61,10 @@ def test_a_registered_controller_drives_single_and_vector_alike(factory: Any) ->
     seeds = [4, 5, 6]
     options: dict[str, Any] = {"scenario": {"base": "sine-with-dwell", "duration": 1.5}}
     single, rows = gym.make(VISION, **options), gym.make_vec(VISION, num_envs=3, **options)
-    costs = costs_of(rows, make_agent("yaw-damper", rows, gain=2.0), seeds)
+    costs = evaluate_costs(rows, make_agent("yaw-damper", rows, gain=2.0), seeds)
     alone = [rollout(single, make_agent("yaw-damper", single, gain=2.0), s).cost for s in seeds]
     assert costs == pytest.approx(alone, rel=1e-12)
-    assert (costs != costs_of(rows, make_agent("none", rows), seeds)).all()
+    assert (costs != evaluate_costs(rows, make_agent("none", rows), seeds)).all()
 
 
 def test_whatever_predicts_is_an_agent() -> None:
@@ -82,7 +82,9 @@ def test_a_matrix_cell_of_foreign_parts() -> None:
     register_agent("yaw-damper", YAW_DAMPER)
     register_estimator("constant", CONSTANT)
     for estimator, controller in (("constant", "yaw-damper"), (CONSTANT, YAW_DAMPER)):
-        env, agent = make_cars(Cell(Contest(scenario="step-steer"), estimator, controller), 2)
+        env, agent = make_cars(
+            ControlEntry(ControlTask(scenario="step-steer"), estimator, controller), 2
+        )
         obs, _ = env.reset(seed=1)
         actions, _ = agent.predict(obs)
         damper = getattr(agent, "agent", agent)  # a file's or an entry point's is checked

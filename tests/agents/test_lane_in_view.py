@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.agents.rungs import make_rung
+from sideslip.agents.rungs import make_oracle
 from sideslip.envs import SCENARIOS
 from sideslip.envs.record import PACKET
 from sideslip.envs.scenarios.scenario import Scenario
@@ -24,7 +24,7 @@ def share_seen(scenario: Scenario) -> float:
     """Of the camera's frames, under the rung that knows the nominal car."""
     car = "coms" if scenario.tier == "1" else "passenger-car"
     env: Any
-    env, agent = make_rung(
+    env, agent = make_oracle(
         "nominal",
         "sideslip/YawFusion-v0",
         CARS,

@@ -7,7 +7,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents.optimum import Lqg, Optimum, estimated, optimum, plant_of
+from sideslip.agents.optimum import (
+    Lqg,
+    Optimum,
+    compute_optimum,
+    make_linear_plant,
+    wrap_optimal_estimate,
+)
 from sideslip.agents.rungs import OUTPUTS
 from sideslip.envs.record import FAST
 from sideslip.estimators.vector.truth import TruthObservation
@@ -18,7 +24,7 @@ LINEAR: Any = gym.spec(IDS[0]).kwargs["scenario"]
 
 @cache
 def best(env_id: str) -> Optimum:
-    return optimum(gym.make(env_id))
+    return compute_optimum(gym.make(env_id))
 
 
 def forwards(found: Optimum, gains: Any) -> float:
@@ -61,8 +67,8 @@ def test_the_linear_plant_is_the_envs_step_and_its_cost(n: int) -> None:
     still = {} if n == 1 else {"disturbance_force": 1e-9, "disturbance_moment": 1e-9}
     env = gym.make(IDS[0], scenario=LINEAR | still | {"hold": 1e-3 * n}, control_period=n)
     base: Any = env.unwrapped
-    model = plant_of(env).model
-    names, rng = model.purpose.states, np.random.default_rng(0)
+    model = make_linear_plant(env).model
+    names, rng = model.design_spec.states, np.random.default_rng(0)
     env.reset(seed=0, options={"state": {"v_y": 0.2, "gamma": 0.1}})
     for _ in range(20):
         x = np.zeros(len(names))
@@ -89,25 +95,25 @@ def test_the_committed_threshold_is_the_optimum(env_id: str) -> None:
 def test_every_other_gain_costs_more_and_as_much_as_added_up(env_id: str) -> None:
     found, rng = best(env_id), np.random.default_rng(1)
     assert forwards(found, found.gains) == pytest.approx(found.cost, rel=1e-9)
-    steady = found.cost_of(found.gains[0])
+    steady = found.compute_cost(found.gains[0])
     assert found.cost < steady < 1.001 * found.cost  # what the last steps could save
     for size in (1e-3, 0.1, 1.0):
         gains = found.gains * (1.0 + size * rng.standard_normal(found.gains.shape))
-        assert found.cost_of(gains) > found.cost
-        assert forwards(found, gains) == pytest.approx(found.cost_of(gains), rel=1e-9)
+        assert found.compute_cost(gains) > found.cost
+        assert forwards(found, gains) == pytest.approx(found.compute_cost(gains), rel=1e-9)
 
 
 @pytest.mark.parametrize("count", [64, pytest.param(1024, marks=pytest.mark.long)])
 @pytest.mark.parametrize("env_id", IDS)
 def test_the_lqg_meets_it_and_what_binds_is_rare(env_id: str, count: int) -> None:
-    found, env = best(env_id), estimated(gym.make_vec(env_id, count))
+    found, env = best(env_id), wrap_optimal_estimate(gym.make_vec(env_id, count))
     costs, actions, largest = drive(env, Lqg(env))
-    assert agree(costs, found.cost) and agree(costs, found.cost_of(found.gains[0]))
+    assert agree(costs, found.cost) and agree(costs, found.compute_cost(found.gains[0]))
     assert np.mean(np.abs(actions) >= 1.0) < 1e-4
     assert largest < 10.0  # a tenth of the cap
     weaker = 0.1 * found.gains[0]
     costs, *_ = drive(env, Lqg(env, weaker))
-    assert agree(costs, found.cost_of(weaker)) and not agree(costs, found.cost)
+    assert agree(costs, found.compute_cost(weaker)) and not agree(costs, found.cost)
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -120,7 +126,7 @@ def test_only_who_sees_the_state_costs_less(env_id: str) -> None:
 
 def test_late_rare_and_lost_pictures_cost_more() -> None:
     def cost(schedules: int = 1, **camera: Any) -> float:
-        return optimum(gym.make(IDS[0], camera={"period": 0.04} | camera), schedules).cost
+        return compute_optimum(gym.make(IDS[0], camera={"period": 0.04} | camera), schedules).cost
 
     prompt, late, later = (cost(delays=[delay]) for delay in (0.0, 0.1, 0.3))
     assert prompt < late < later
@@ -142,7 +148,7 @@ def test_late_rare_and_lost_pictures_cost_more() -> None:
 )
 def test_what_has_no_known_optimum_is_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        plant_of(gym.make(IDS[0], scenario=LINEAR | changes))
+        make_linear_plant(gym.make(IDS[0], scenario=LINEAR | changes))
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -151,8 +157,12 @@ def test_a_policy_costs_the_weighed_squares_of_its_errors_more(
     env_id: str, share: float, noise: float
 ) -> None:
     """The performance difference of an LQG problem, against the costs of the same seeds and against
-    what `cost_of` says of a gain; the squares scatter less."""
-    found, env, rng = best(env_id), estimated(gym.make_vec(env_id, 64)), np.random.default_rng(2)
+    what `compute_cost` says of a gain; the squares scatter less."""
+    found, env, rng = (
+        best(env_id),
+        wrap_optimal_estimate(gym.make_vec(env_id, 64)),
+        np.random.default_rng(2),
+    )
     names = [entry.name for entry in env.layout]
     agent, columns = Lqg(env, share * found.gains[0]), [names.index(each) for each in Lqg.needs]
     obs, _ = env.reset(seed=0)
@@ -169,4 +179,4 @@ def test_a_policy_costs_the_weighed_squares_of_its_errors_more(
     assert excess.mean() > 5.0 * np.std(costs - optimal - excess) / 8.0  # so that it is tested
     assert excess.std() < 0.8 * (costs - optimal).std() or share == 0.0
     if not noise:
-        assert agree(excess, found.cost_of(share * found.gains[0]) - found.cost)
+        assert agree(excess, found.compute_cost(share * found.gains[0]) - found.cost)

@@ -10,7 +10,7 @@ import pytest
 
 import sideslip
 from sideslip.agents import make_agent
-from sideslip.agents.rollout import costs_of, steps_of
+from sideslip.agents.rollout import evaluate_costs, iterate_steps
 
 
 @pytest.mark.smoke
@@ -44,12 +44,12 @@ def test_steps_of_a_batch_are_each_rows_first_episode() -> None:
     envs = gym.make_vec("sideslip/YawVision-v0", num_envs=3, **options)
     env = gym.make("sideslip/YawVision-v0", **options)
     drives = [sideslip.rollout(env, None, seed) for seed in (1, 2, 3)]
-    reset, *steps = steps_of(envs, Idle(), [1, 2, 3])
+    reset, *steps = iterate_steps(envs, Idle(), [1, 2, 3])
     assert not np.any(reset.reward) and not reset.action.any() and reset.running.all()
     lengths = np.sum([step.running for step in steps], axis=0)
     assert lengths.tolist() == [len(drive["t"]) - 1 for drive in drives]
     assert len(set(lengths)) > 1 and len(steps) == max(lengths)
-    costs = costs_of(envs, Idle(), [1, 2, 3])
+    costs = evaluate_costs(envs, Idle(), [1, 2, 3])
     assert costs == pytest.approx([drive.cost for drive in drives], rel=1e-12)
     starts = np.array(seen[: len(steps)])
     assert starts[0].all()

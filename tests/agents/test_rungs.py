@@ -8,8 +8,8 @@ import pytest
 
 from sideslip.agents.controllers.base import Controller
 from sideslip.agents.controllers.lqr import Lqr
-from sideslip.agents.design.sampled_model import design_model, regulator
-from sideslip.agents.rungs import RUNGS, levels_of, make_rung
+from sideslip.agents.design.sampled_model import compute_regulator, make_design_model
+from sideslip.agents.rungs import ORACLES, make_noise_options, make_oracle
 from sideslip.envs import COMS
 from sideslip.envs.scenarios.manoeuvres import SCENARIOS
 from tests.envs.helpers import bits
@@ -21,7 +21,7 @@ LINEAR = {"base": "random-steering", "tyres": "linear"}
 
 def costs(rung: str, count: int, **env: Any) -> np.ndarray:
     """J of the seeds from 0 on."""
-    envs, agent = make_rung(rung, FUSION, num_envs=count, **env)
+    envs, agent = make_oracle(rung, FUSION, num_envs=count, **env)
     obs, _ = envs.reset(seed=list(range(count)))
     J, alive, state = np.zeros(count), np.ones(count, bool), None
     while alive.any():
@@ -32,16 +32,16 @@ def costs(rung: str, count: int, **env: Any) -> np.ndarray:
     return J
 
 
-OFTEN = [*((rung, FUSION) for rung in RUNGS), ("oracle-state-lqr", AFS), ("nominal", VISION)]
-RARELY = [each for each in itertools.product(RUNGS, (AFS, VISION)) if each not in OFTEN]
+OFTEN = [*((rung, FUSION) for rung in ORACLES), ("oracle-state-lqr", AFS), ("nominal", VISION)]
+RARELY = [each for each in itertools.product(ORACLES, (AFS, VISION)) if each not in OFTEN]
 
 
 @pytest.mark.parametrize(
     ("rung", "env_id"), [*OFTEN, *(pytest.param(*each, marks=pytest.mark.long) for each in RARELY)]
 )
 def test_rows_of_a_vector_env_have_the_bits_of_single_ones(rung: str, env_id: str) -> None:
-    envs, agent = make_rung(rung, env_id, num_envs=2)
-    env, alone = make_rung(rung, env_id)
+    envs, agent = make_oracle(rung, env_id, num_envs=2)
+    env, alone = make_oracle(rung, env_id)
     assert isinstance(agent, Controller) and agent.grip
     obs, state = envs.reset(seed=7)[0], None
     one, own = env.reset(seed=8)[0], None
@@ -55,20 +55,20 @@ def test_rows_of_a_vector_env_have_the_bits_of_single_ones(rung: str, env_id: st
 
 def test_gains_between_the_knots_are_those_of_the_true_car() -> None:
     """Interpolated over speed and both stiffnesses, against a design for the car at hand."""
-    _, agent = make_rung("oracle-parameters-lqr", FUSION)
+    _, agent = make_oracle("oracle-parameters-lqr", FUSION)
     assert isinstance(agent, Lqr)
     rng = np.random.default_rng(0)
     for _ in range(20):
         speed, front, rear = rng.uniform((5.0, 0.6, 0.6), (10.0, 1.4, 1.4))
-        car = COMS.scaled(front, rear)
+        car = COMS.scale_stiffness(front, rear)
         K = agent.gains(speed, car.front_stiffness, car.rear_stiffness)
-        wanted = regulator(design_model(car, speed, agent.purpose))[0]
+        wanted = compute_regulator(make_design_model(car, speed, agent.design_spec))[0]
         assert np.abs(K[:, :4] - wanted[:, :4]).max() < 0.02 * np.abs(wanted[:, :4]).max()
 
 
 def test_nominal_reads_the_nominal_car_alone() -> None:
     """Whatever the true tyres are, its filter and its gains are the nominal car's."""
-    env, agent = make_rung("nominal", FUSION)
+    env, agent = make_oracle("nominal", FUSION)
     env.reset(seed=0)
     believed = env.get_wrapper_attr("estimator").filters[0].car
     assert list(believed[4:6]) == [COMS.front_stiffness, COMS.rear_stiffness]
@@ -77,20 +77,20 @@ def test_nominal_reads_the_nominal_car_alone() -> None:
 
 def test_options_go_to_the_filter_and_the_controller() -> None:
     options: Any = {"filter": {"force_sd": 7.0, "slow": ["gps"]}, "controller": {"grip": 0.3}}
-    env, agent = make_rung("nominal", FUSION, options=options)
+    env, agent = make_oracle("nominal", FUSION, options=options)
     recorded = env.spec.additional_wrappers[-1].kwargs["options"]
     assert recorded["force_sd"] == 7.0 and recorded["slow"] == ["gps"] and agent.grip == 0.3
     with pytest.raises(TypeError, match="'filter' and 'controller'"):
-        make_rung("nominal", FUSION, options={"gains": {}})
+        make_oracle("nominal", FUSION, options={"gains": {}})
     with pytest.raises(ValueError, match="rung"):
-        make_rung("clairvoyant", FUSION)
+        make_oracle("clairvoyant", FUSION)
 
 
 def test_levels_are_the_scenarios() -> None:
     scenario = SCENARIOS["straight"].replace(
         disturbance_force=7.0, noise={"gyro": 0.1}, hdop_law="table"
     )
-    levels = levels_of(scenario)
+    levels = make_noise_options(scenario)
     assert levels["force_sd"] == 7.0 and levels["gyro_noise"] == 0.1
     assert levels["hdop_table"] == [(1.0, 1.0), (101.0, 101.0)]
 
@@ -99,7 +99,7 @@ def test_biases_are_taken_away_for_the_oracle_alone() -> None:
     biased = {"base": "straight", "noise": {"gyro_bias": 0.2, "gyro": 1e-9}, "speed": 7.0}
     biased |= {"gyro_bias": 0.1, "accel_y_bias": (0.1, 0.2)}
     for rung, wanted in (("nominal", 0.3), ("oracle-parameters-lqr", 0.0)):
-        env, _ = make_rung(rung, FUSION, scenario=biased)
+        env, _ = make_oracle(rung, FUSION, scenario=biased)
         obs, _ = env.reset(seed=0)
         assert obs[0] == pytest.approx(wanted, abs=1e-3)
         assert env.unwrapped.scenario.noise["gyro"] == 1e-9
@@ -108,7 +108,7 @@ def test_biases_are_taken_away_for_the_oracle_alone() -> None:
 def test_one_table_serves_all_who_ask_for_it() -> None:
     """The design takes a second."""
     rungs = [
-        make_rung("oracle-parameters-lqr", FUSION, scenario=name)[1] for name in ("sine", "gust")
+        make_oracle("oracle-parameters-lqr", FUSION, scenario=name)[1] for name in ("sine", "gust")
     ]
     assert all(isinstance(each, Lqr) for each in rungs)
     assert rungs[0].table is rungs[1].table  # type: ignore[attr-defined]
@@ -118,7 +118,7 @@ def test_one_table_serves_all_who_ask_for_it() -> None:
 def test_knowing_pays_on_the_linear_car() -> None:
     """Where the LQG is the optimum each rung costs less than the one below: three errors."""
     plain = LINEAR | {"small_angle": True, "roll": False}
-    found = [np.log(costs(rung, 64, scenario=plain)) for rung in RUNGS[:3]]
+    found = [np.log(costs(rung, 64, scenario=plain)) for rung in ORACLES[:3]]
     for lower, upper in itertools.pairwise(found):
         gap = lower - upper
         assert gap.mean() > 3.0 * gap.std(ddof=1) / len(gap) ** 0.5

@@ -10,18 +10,18 @@ import pytest
 
 pytest.importorskip("torch")
 from sideslip.agents.learned.files import Policy, save_policy
-from sideslip.agents.training.task import Task
+from sideslip.agents.training.task import TrainingTask
 from sideslip.benchmarks import distillation
 from sideslip.benchmarks.control.build import make_cars
-from sideslip.benchmarks.control.cells import ADAPTIVE, Cell
-from sideslip.benchmarks.control.contests import changed, contests
+from sideslip.benchmarks.control.cells import ADAPTIVE, ControlEntry
+from sideslip.benchmarks.control.contests import list_scored_tasks, vary_scenario
 from sideslip.benchmarks.distillation import (
     FILTERS,
     VARIED,
-    card_of,
-    contests_of,
-    lessons_of,
-    start_and_task,
+    list_tasks,
+    make_card,
+    make_lessons,
+    prepare_start,
 )
 from sideslip.envs.vehicle.vehicles import VEHICLES
 from sideslip.estimators.learned.network import Network
@@ -31,9 +31,9 @@ from tests.benchmarks.conftest import Run
 def test_a_class_is_lessons_with_one_observation_and_the_cards() -> None:
     """So one network serves them all."""
     for estimator in FILTERS:
-        lessons = lessons_of("coms-zero-slip", "oracle-state-lqr", estimator, 2)
-        assert len(lessons) == len(contests_of("coms-zero-slip")) == 7
-        card = card_of("coms-zero-slip", estimator)
+        lessons = make_lessons("coms-zero-slip", "oracle-state-lqr", estimator, 2)
+        assert len(lessons) == len(list_tasks("coms-zero-slip")) == 7
+        card = make_card("coms-zero-slip", estimator)
         for each in lessons:
             assert tuple((e.name, e.unit) for e in each.cars.layout) == card.observation
             assert each.teacher.width == 1
@@ -43,26 +43,26 @@ def test_what_a_student_sees_besides_is_told_its_lessons_its_card_and_its_contes
     tmp_path: Path,
 ) -> None:
     seen: dict[str, Any] = {"with_map": True, "fast": "all"}
-    card = card_of("coms-zero-slip", "", seen=seen)
-    lesson = lessons_of("coms-zero-slip", "none", "", 2, seen=seen)[0]
+    card = make_card("coms-zero-slip", "", observation_options=seen)
+    lesson = make_lessons("coms-zero-slip", "none", "", 2, observation_options=seen)[0]
     assert tuple((e.name, e.unit) for e in lesson.cars.layout) == card.observation
     assert ("curvature", "1/m") in card.observation and ("gyro_9", "rad/s") in card.observation
     assert "curvature" not in [entry.name for entry in lesson.teachers.layout]
     k = len(card.observation)
     network = Network(np.zeros(k), np.ones(k), [np.full((1, k), 0.1)], [np.zeros(1)])
     save_policy(tmp_path / "sees.safetensors", network, card)
-    contest = contests_of("coms-zero-slip")[1]
-    cell = Cell(contest, "", str(tmp_path / "sees.safetensors"))
+    contest = list_tasks("coms-zero-slip")[1]
+    cell = ControlEntry(contest, "", str(tmp_path / "sees.safetensors"))
     env, agent = make_cars(cell, 2)
     assert "curvature" in agent.needs and agent.predict(env.reset(seed=0)[0])[0].shape == (2, 1)
     assert cell.env_options["scenario"] == contest.scenario
-    assert not set(seen) & Cell(contest, "", "distill-coms-yaw").env_options.keys()
+    assert not set(seen) & ControlEntry(contest, "", "distill-coms-yaw").env_options.keys()
 
 
 @pytest.mark.parametrize("teacher", ADAPTIVE.values())
 def test_a_student_on_joint_reads_what_its_teacher_reads(teacher: str) -> None:
     """To the bit, or it would learn to guess what its teacher's filter says."""
-    cars, twins, agent = lessons_of("coms-zero-slip", teacher, "joint", 2)[0]
+    cars, twins, agent = make_lessons("coms-zero-slip", teacher, "joint", 2)[0]
     seen = [env.reset(seed=[3, 4])[0] for env in (cars, twins)]
     for _ in range(60):
         seen = [env.step(np.full((2, 1), 0.2, np.float32))[0] for env in (cars, twins)]
@@ -75,15 +75,15 @@ def test_a_student_on_joint_reads_what_its_teacher_reads(teacher: str) -> None:
 
 def test_a_policy_teaches_on_the_filter_of_its_card() -> None:
     """So that one without a filter learns from one that has it, which costs little to ask."""
-    cars, twins, agent = lessons_of("coms-zero-slip", "distill-coms-yaw", "", 2)[0]
+    cars, twins, agent = make_lessons("coms-zero-slip", "distill-coms-yaw", "", 2)[0]
     there = [{entry.name for entry in env.layout} for env in (cars, twins)]
     assert set(agent.needs) <= there[1] and "beta_hat" in there[1] - there[0]
 
 
 def test_varied_lessons_differ_in_what_training_is_to_cover() -> None:
     """Tyres, mass, camera and GPS are others; not the observation, nor the teacher's cars."""
-    lessons = lessons_of("coms-zero-slip", "none", "", 32, varied=1)
-    assert len(lessons) == 2 * len(contests_of("coms-zero-slip"))
+    lessons = make_lessons("coms-zero-slip", "none", "", 32, varied=1)
+    assert len(lessons) == 2 * len(list_tasks("coms-zero-slip"))
     masses, late = set(), set()
     for plain, varied in zip(lessons[::2], lessons[1::2], strict=True):
         assert plain.cars.layout == varied.cars.layout
@@ -103,7 +103,7 @@ def test_varied_lessons_differ_in_what_training_is_to_cover() -> None:
 
 def test_gps_or_camera_of_a_varied_lesson_is_out_for_seconds() -> None:
     """One of them, and each in some lesson."""
-    lessons = lessons_of("coms-zero-slip", "none", "", 4, 4)
+    lessons = make_lessons("coms-zero-slip", "none", "", 4, 4)
     assert [lesson.cars.num_envs for lesson in lessons[:5]] == [4, 1, 1, 1, 1]
     names = [entry.name for entry in lessons[0].cars.layout]
     columns = [names.index(f"{sensor}_age") for sensor in ("gps", "camera")]
@@ -119,14 +119,14 @@ def test_gps_or_camera_of_a_varied_lesson_is_out_for_seconds() -> None:
 
 
 def test_the_wind_of_a_varied_lesson_blows_from_both_sides() -> None:
-    contest = contests_of("coms-zero-slip")[0]
-    _, drawn = distillation._changes(1, np.random.default_rng(0))
+    contest = list_tasks("coms-zero-slip")[0]
+    _, drawn = distillation._draw_changes(1, np.random.default_rng(0))
     change = {key: value for key, value in drawn.items() if not key.endswith("_outage")}
     change |= {"mirror": False}  # which would turn every other wind round by itself
     calm = {key: value for key, value in change.items() if not key.startswith("wind_")}
     aside = []
     for each in (change, calm):
-        options = contest.env_options | {"scenario": changed(contest, each)}
+        options = contest.env_options | {"scenario": vary_scenario(contest, each)}
         cars: Any = gym.make_vec(contest.env_id, num_envs=8, **options).unwrapped
         cars.reset(seed=list(range(8)))
         column = [entry.name for entry in cars.layout].index("gps_Y")
@@ -138,18 +138,18 @@ def test_the_wind_of_a_varied_lesson_blows_from_both_sides() -> None:
 
 def test_who_cannot_drive_a_contest_is_no_number_of_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(distillation, "load_policy", Mock())
-    monkeypatch.setattr(distillation, "salted_seeds", lambda *_: [0])
-    monkeypatch.setattr(distillation, "drive", lambda _: Mock(error="no camera"))
-    contest = contests_of("coms-model")[0]
+    monkeypatch.setattr(distillation, "make_salted_seeds", lambda *_: [0])
+    monkeypatch.setattr(distillation, "run_chunk", lambda _: Mock(error="no camera"))
+    contest = list_tasks("coms-model")[0]
     with pytest.raises(ValueError, match=f"policy cannot drive {contest.name}: no camera"):
-        distillation._judged(Path("mine"), contest, 1)
+        distillation._evaluate_task(Path("mine"), contest, 1)
 
 
 def test_every_contest_is_in_one_class() -> None:
-    kinds = dict.fromkeys(each.kind for each in contests())
-    assert sum(len(contests_of(kind)) for kind in kinds) == len(contests())
+    kinds = dict.fromkeys(each.kind for each in list_scored_tasks())
+    assert sum(len(list_tasks(kind)) for kind in kinds) == len(list_scored_tasks())
     for kind in kinds:
-        assert len({(each.env_id, each.vehicle) for each in contests_of(kind)}) == 1
+        assert len({(each.env_id, each.vehicle) for each in list_tasks(kind)}) == 1
 
 
 @pytest.mark.parametrize(
@@ -173,9 +173,9 @@ def test_a_distillation_that_cannot_be_is_one_line(
 
 def test_a_policy_goes_on_in_the_contests_that_its_algorithm_can_drive() -> None:
     """All of its class, but on tensors those of one kind of plant."""
-    policy, task = start_and_task(Path("raw-car-yaw"))
+    policy, task = prepare_start(Path("raw-car-yaw"))
     assert isinstance(policy, Policy)
-    names = [each.scenario for each in contests_of("car-yaw")]
+    names = [each.scenario for each in list_tasks("car-yaw")]
     driven = task(algo="gradient").scenarios
     assert len(driven) == 8 and set(names) - set(driven) == {
         "car-iso-3888-1",
@@ -183,15 +183,15 @@ def test_a_policy_goes_on_in_the_contests_that_its_algorithm_can_drive() -> None
     }
     alone = task(algo="gradient", env_options={"scenario": "car-step"})
     assert not alone.scenarios and alone.env_options["vehicle"] == "passenger-car"
-    assert start_and_task(Path("distill-car-yaw"))[1]().scenarios == names
-    assert start_and_task(None) == (None, Task)
-    assert start_and_task(Path("here/best_model.zip")) == (Path("here/best_model.zip"), Task)
+    assert prepare_start(Path("distill-car-yaw"))[1]().scenarios == names
+    assert prepare_start(None) == (None, TrainingTask)
+    assert prepare_start(Path("here/best_model.zip")) == (Path("here/best_model.zip"), TrainingTask)
 
 
 def test_where_it_is_said_contests_are_varied_too() -> None:
     """Each so often, by the training's seed, and not as a distillation's lessons are."""
-    _, task = start_and_task(Path("raw-coms-yaw"), 2)
-    names = [each.scenario for each in contests_of("coms-zero-slip")]
+    _, task = prepare_start(Path("raw-coms-yaw"), 2)
+    names = [each.scenario for each in list_tasks("coms-zero-slip")]
     found = task().scenarios
     varied = [each for each in found if not isinstance(each, str)]
     assert [each for each in found if isinstance(each, str)] == names
@@ -200,7 +200,7 @@ def test_where_it_is_said_contests_are_varied_too() -> None:
     assert {"gps_outage", "camera_outage"} < {key for each in varied for key in each}
     assert task(seed=0).scenarios == found != task(seed=1).scenarios
     rng = np.random.default_rng(0)
-    taught = [each for _ in names for each in distillation._changes(2, rng) if each]
+    taught = [each for _ in names for each in distillation._draw_changes(2, rng) if each]
     outages = [
         {each[key] for each in those for key in each if key.endswith("_outage")}
         for those in (varied, taught)
@@ -213,4 +213,4 @@ def test_where_it_is_said_contests_are_varied_too() -> None:
         (Path("raw-coms-yaw"), {"env_options": {"scenario": "coms-step"}}, "without other"),
     ):
         with pytest.raises(ValueError, match=said):
-            start_and_task(agent, 2)[1](**fields)
+            prepare_start(agent, 2)[1](**fields)

@@ -8,7 +8,7 @@ import pytest
 
 from sideslip.benchmarks import estimation
 from sideslip.benchmarks.harness.parallel import run_cases
-from sideslip.benchmarks.papers.ledger.filters import filters_for
+from sideslip.benchmarks.papers.ledger.filters import make_filters
 
 
 def _ratio(squares: np.ndarray, of: int, to: int) -> float:
@@ -17,7 +17,7 @@ def _ratio(squares: np.ndarray, of: int, to: int) -> float:
 
 def test_dakf_beats_the_kalman_filter() -> None:
     """dakf-stability: DAKF < KF, at most 0.75 of its error."""
-    (measured,) = run_cases(estimation.measure, [estimation.Seeds(1, tuple(range(8)))], "", 1)
+    (measured,) = run_cases(estimation.measure, [estimation.SeedChunk(1, tuple(range(8)))], "", 1)
     labels = [each.label for each in estimation.EXPERIMENTS[1].filters]
     assert _ratio(measured.squares, labels.index("dakf"), labels.index("course-kf")) <= 0.75
 
@@ -26,7 +26,7 @@ def test_dakf_beats_the_kalman_filter() -> None:
 def test_exact_filter_of_the_true_model_is_at_the_bound() -> None:
     """tie-vision-fig7, 100 fixed seeds: within 3 % of the bound; the others in the paper's order
     as far as it is true."""
-    cases = [estimation.Seeds(0, tuple(range(k, k + 10))) for k in range(0, 100, 10)]
+    cases = [estimation.SeedChunk(0, tuple(range(k, k + 10))) for k in range(0, 100, 10)]
     results = run_cases(estimation.measure, cases, "", None)
     squares = np.concatenate([each.squares for each in results])
     bound = np.sqrt(np.concatenate([each.bound for each in results]).mean())
@@ -44,6 +44,6 @@ def test_exact_filter_of_the_true_model_is_at_the_bound() -> None:
 def test_an_experiments_filters_exist_at_its_speed(experiment: estimation.Experiment) -> None:
     base: Any = gym.make(experiment.env_id, scenario=experiment.scenario).unwrapped
     assert base.held_speed == pytest.approx(25 / 3.6)
-    made = filters_for(experiment.filters, base)
+    made = make_filters(experiment.filters, base)
     assert list(made) == [each.label for each in experiment.filters]
     assert {"exact-kf", "joint"} < {each.name for each in made.values()}

@@ -3,17 +3,25 @@
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.following import BANDWIDTHS, KEEPERS, follow, keep_lane, loop_radius
+from sideslip.benchmarks.following import (
+    BANDWIDTHS,
+    LANE_CONTROLLERS,
+    compute_loop_radius,
+    keep_lane,
+    track_reference,
+)
 from sideslip.envs import COMS
-from sideslip.envs.vehicle.linear import bicycle
+from sideslip.envs.vehicle.linear import make_bicycle_model
 
 
 def test_a_slow_loop_has_the_poles_of_its_design() -> None:
     """With true tyres and no lag the poles are those of K and of the car, dakf-stability (31)."""
     scenario = {"base": "dakf-fig7", "lags": False, "vehicle": {}, "nominal": {}}
-    slowest = max(bicycle(COMS, 25 / 3.6).to_control().poles().real)
+    slowest = max(make_bicycle_model(COMS, 25 / 3.6).to_control().poles().real)
     for K in (1.0, 5.0):
-        pole = np.log(loop_radius(scenario, K)) / 1e-3  # 1/s; sampling moves it by a hundredth
+        pole = (
+            np.log(compute_loop_radius(scenario, K)) / 1e-3
+        )  # 1/s; sampling moves it by a hundredth
         assert pole == pytest.approx(max(slowest, -K), rel=0.01)
 
 
@@ -21,19 +29,19 @@ def test_the_loop_is_stable_below_the_critical_speed_only() -> None:
     """63.3 km/h: what V.D overlooks, for the feedback cancels the car's own poles."""
     bare = {"base": "dakf-fig7", "vehicle": {}, "nominal": {}}
     for K in BANDWIDTHS:
-        assert loop_radius("dakf-fig7", K) < 1.0
-        assert loop_radius(bare | {"speed": 60 / 3.6}, K) < 1.0
-        assert loop_radius(bare | {"speed": 67 / 3.6}, K) > 1.0
+        assert compute_loop_radius("dakf-fig7", K) < 1.0
+        assert compute_loop_radius(bare | {"speed": 60 / 3.6}, K) < 1.0
+        assert compute_loop_radius(bare | {"speed": 67 / 3.6}, K) > 1.0
 
 
 def test_an_episode_gives_its_numbers() -> None:
-    none, ours = follow((0.0, 1)), follow((5.0, 1))
+    none, ours = track_reference((0.0, 1)), track_reference((5.0, 1))
     assert np.isfinite(none).all() and np.isfinite(ours).all()
     assert ours[1] < 0.5 * none[1] and ours[3] == 0.0
 
 
 def test_lanes_are_kept_and_nobody_keeps_them_without_control() -> None:
-    numbers = {KEEPERS[k][:2]: keep_lane(k, 8) for k in (0, 1, 2)}
+    numbers = {LANE_CONTROLLERS[k][:2]: keep_lane(k, 8) for k in (0, 1, 2)}
     assert numbers["none", "uneven-delay-kf"][:, 2].all()
     for what in ("steering alone", "both"):
         kept = numbers[what, "uneven-delay-kf"]

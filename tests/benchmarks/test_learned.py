@@ -8,45 +8,45 @@ import pytest
 
 from sideslip.agents.learned.files import load_policy
 from sideslip.benchmarks import learned
-from sideslip.benchmarks.control.build import estimate_options
-from sideslip.benchmarks.control.cells import LEARNED, Cell
-from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, contests
-from sideslip.benchmarks.control.episodes import NUMBERS, Driven
-from sideslip.benchmarks.distillation import VARIED, _changes
+from sideslip.benchmarks.control.build import make_estimate_options
+from sideslip.benchmarks.control.cells import LEARNED, ControlEntry
+from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, list_scored_tasks
+from sideslip.benchmarks.control.episodes import NUMBERS, DriveResult
+from sideslip.benchmarks.distillation import VARIED, _draw_changes
 from sideslip.benchmarks.learned import (
     CONDITIONS,
     LATELY_MET,
     NEVER_MET,
     TRAINED,
-    Found,
-    chosen,
-    scenario_in,
+    TransferResult,
+    make_condition_scenario,
+    select_tasks,
 )
-from sideslip.envs.scenarios.manoeuvres import scenario_from
+from sideslip.envs.scenarios.manoeuvres import make_scenario
 
 
 @pytest.mark.parametrize("kind", LEARNED)
 @pytest.mark.parametrize("condition", CONDITIONS)
 def test_a_condition_changes_the_drive_and_no_filter_hears_of_it(kind: str, condition: str) -> None:
-    for contest in chosen(kind):
-        scenario = scenario_in(contest, condition)
-        same = scenario_from(scenario) == scenario_from(contest.scenario)
+    for contest in select_tasks(kind):
+        scenario = make_condition_scenario(contest, condition)
+        same = make_scenario(scenario) == make_scenario(contest.scenario)
         assert same == (condition == TRAINED)
-        for estimator, who in learned.contestants(kind):
+        for estimator, who in learned.list_entries(kind):
             if estimator:
                 plain, now = (
-                    estimate_options(Cell(contest, estimator, who, options))
+                    make_estimate_options(ControlEntry(contest, estimator, who, options))
                     for options in ({}, {"scenario": scenario})
                 )
                 assert plain == now
 
 
 def test_the_heavier_car_is_heavier_than_controllers_know() -> None:
-    contest = chosen("car-yaw")[0]
-    scenario = scenario_in(contest, "a quarter heavier")
+    contest = select_tasks("car-yaw")[0]
+    scenario = make_condition_scenario(contest, "a quarter heavier")
     env: Any = gym.make(contest.env_id, **contest.env_options | {"scenario": scenario}).unwrapped
     assert env.vehicle.mass == pytest.approx(1.25 * env.nominal.mass)
-    assert env.scenario.front_stiffness == scenario_from(contest.scenario).front_stiffness
+    assert env.scenario.front_stiffness == make_scenario(contest.scenario).front_stiffness
 
 
 def test_what_training_met_is_what_varied_lessons_vary() -> None:
@@ -72,17 +72,17 @@ def test_what_training_met_is_what_varied_lessons_vary() -> None:
             assert new == ("camera_outage" in met) == ("wind_force" in met)
             assert not (new and (estimator, name) == policies[0])  # of whom the verdict speaks
     rng = np.random.default_rng(0)
-    varied = {key for change in _changes(20, rng) for key in change}
+    varied = {key for change in _draw_changes(20, rng) for key in change}
     for name in NEVER_MET:
         assert not varied & set(CONDITIONS[name])
     assert {key for each in kept.values() for key in each} == varied | {"camera_jitter"}
 
 
-def driven(costs: Any, failed: Any = 0.0) -> Driven:
+def driven(costs: Any, failed: Any = 0.0) -> DriveResult:
     numbers = np.zeros((len(costs), len(NUMBERS)))
     numbers[:, NUMBERS.index("cost")] = costs
     numbers[:, NUMBERS.index("failure")] = failed
-    return Driven(numbers, 0.0)
+    return DriveResult(numbers, 0.0)
 
 
 def test_the_share_is_of_the_gap_between_nominal_and_the_car_that_is_known() -> None:
@@ -92,21 +92,23 @@ def test_the_share_is_of_the_gap_between_nominal_and_the_car_that_is_known() -> 
     mine = {name: driven(factor * nominal) for name, factor in cases.items()}
     mine["fails"] = driven(0.25 * nominal, rng.random(400) < 0.1)
     small = mine | {PARAMETERS: driven(0.95 * nominal)}
-    found = Found("car-yaw", {TRAINED: [mine], "a quarter heavier": [small]})
-    assert np.isnan(found.shared("half", "a quarter heavier").value)
+    found = TransferResult("car-yaw", {TRAINED: [mine], "a quarter heavier": [small]})
+    assert np.isnan(found.score_condition("half", "a quarter heavier").value)
     expected = {NOMINAL: 0.0, PARAMETERS: 1.0, "half": 0.5, "dearer": -0.5}
     for name, share in expected.items():
-        assert found.shared(name, TRAINED).value == pytest.approx(share, abs=2e-3)
-    assert found.shared("fails", TRAINED).high < 0.9
+        assert found.score_condition(name, TRAINED).value == pytest.approx(share, abs=2e-3)
+    assert found.score_condition("fails", TRAINED).high < 0.9
     gone = {name: driven(nominal, 1.0) for name in mine}
-    assert Found("car-yaw", {TRAINED: [mine, gone]}).shared("half", TRAINED) == found.shared(
+    assert TransferResult("car-yaw", {TRAINED: [mine, gone]}).score_condition(
         "half", TRAINED
+    ) == found.score_condition("half", TRAINED)
+    assert np.isnan(
+        TransferResult("car-yaw", {TRAINED: [gone]}).score_condition("half", TRAINED).value
     )
-    assert np.isnan(Found("car-yaw", {TRAINED: [gone]}).shared("half", TRAINED).value)
-    found.driven.pop("a quarter heavier")
-    assert found.failed("fails").mean() == pytest.approx(0.1, abs=0.05)
+    found.drives.pop("a quarter heavier")
+    assert found.mark_failures("fails").mean() == pytest.approx(0.1, abs=0.05)
     ratios = found.ratios("fails")
-    assert np.isinf(ratios).mean() == found.failed("fails").mean()
+    assert np.isinf(ratios).mean() == found.mark_failures("fails").mean()
     assert ratios[np.isfinite(ratios)] == pytest.approx(0.25, abs=1e-3)
 
 
@@ -114,22 +116,22 @@ def test_the_verdict_tells_what_training_met_from_what_it_never_did() -> None:
     nominal = np.random.default_rng(0).uniform(1.0, 2.0, 400)
     (_, policy), *_ = LEARNED["car-yaw"]
     costs = {TRAINED: 0.25, "a quarter heavier": 0.5, "no camera from 2 to 7 s": 2.0}
-    found = Found("car-yaw")
+    found = TransferResult("car-yaw")
     for condition, factor in costs.items():
         cases = {NOMINAL: 1.0, PARAMETERS: 0.25, policy: factor, learned.RIVALS[0]: 0.3}
-        found.driven[condition] = [{who: driven(each * nominal) for who, each in cases.items()}]
-    said = learned.answer([found])
+        found.drives[condition] = [{who: driven(each * nominal) for who, each in cases.items()}]
+    said = learned.compose_verdict([found])
     assert f"{policy} closes 1.00 of the gap; at worst 0.50 where it trained, -0.50 where" in said
     assert "beats adaptive-lqr in 33 %" in said
-    found.driven.pop("no camera from 2 to 7 s")
-    assert "at worst 0.50 where it trained, - where never" in learned.answer([found])
+    found.drives.pop("no camera from 2 to 7 s")
+    assert "at worst 0.50 where it trained, - where never" in learned.compose_verdict([found])
 
 
 @pytest.mark.parametrize("kind", LEARNED)
 def test_three_contests_of_a_class_are_driven(kind: str) -> None:
     """One of each tier where there are three; else evenly apart, none twice."""
-    there = [each for each in contests() if each.kind == kind]
-    tiers, found = dict.fromkeys(each.tier for each in there), chosen(kind)
+    there = [each for each in list_scored_tasks() if each.kind == kind]
+    tiers, found = dict.fromkeys(each.tier for each in there), select_tasks(kind)
     assert len(set(found)) == len(found) == 3 and set(found) <= set(there)
     assert len({each.tier for each in found}) == len(tiers)
     if len(tiers) == 1:

@@ -12,68 +12,76 @@ pytest.importorskip("vehiclemodels")
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks import learned_outside as outside_suite
-from sideslip.benchmarks.control.build import estimate_options
-from sideslip.benchmarks.control.cells import ADAPTIVE, LEARNED, Cell
-from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, contests
-from sideslip.benchmarks.control.episodes import NUMBERS, Chunk, Driven
+from sideslip.benchmarks.control.build import make_estimate_options
+from sideslip.benchmarks.control.cells import ADAPTIVE, LEARNED, ControlEntry
+from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, list_scored_tasks
+from sideslip.benchmarks.control.episodes import NUMBERS, Chunk, DriveResult
 from sideslip.benchmarks.control.run import CachedDrive, measure
 from sideslip.benchmarks.harness.drives import make_env
-from sideslip.benchmarks.learned import Found, contestants
-from sideslip.benchmarks.learned_outside import KINDS, MANOEUVRE, OUTSIDE_ID, drive, outside
-from sideslip.envs.outside.plants import OUTSIDE_PLANTS, outside_vehicle
-from sideslip.envs.scenarios.manoeuvres import scenario_from
+from sideslip.benchmarks.learned import TransferResult, list_entries
+from sideslip.benchmarks.learned_outside import (
+    KINDS,
+    MANOEUVRE,
+    OUTSIDE_ID,
+    make_outside_task,
+    run_chunk,
+)
+from sideslip.envs.outside.plants import OUTSIDE_PLANTS, make_outside_vehicle
+from sideslip.envs.scenarios.manoeuvres import make_scenario
 
 FLAT = {"name", "road", "bank", "vehicle", "nominal"}
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_only_the_car_and_the_road_are_others(kind: str) -> None:
-    contest = outside(kind, "drift")
-    like = next(c for c in contests() if (c.kind, c.scenario) == (kind, MANOEUVRE))
+    contest = make_outside_task(kind, "drift")
+    like = next(c for c in list_scored_tasks() if (c.kind, c.scenario) == (kind, MANOEUVRE))
     assert contest.kind == kind and contest.reference == like.reference
-    ours, theirs = (scenario_from(c.env_options["scenario"]) for c in (like, contest))
+    ours, theirs = (make_scenario(c.env_options["scenario"]) for c in (like, contest))
     for field in dataclasses.fields(ours):
         same = getattr(ours, field.name) == getattr(theirs, field.name)
         assert same or field.name in FLAT, field.name
-    for estimator, who in contestants(kind):
-        here, there = Cell(contest, estimator, who), Cell(like, estimator, who)
+    for estimator, who in list_entries(kind):
+        here, there = ControlEntry(contest, estimator, who), ControlEntry(like, estimator, who)
         assert here.best == there.best or who == PARAMETERS  # a rung that was not measured here
         if estimator:
-            mine, those = (estimate_options(cell)["options"] for cell in (here, there))
+            mine, those = (make_estimate_options(cell)["options"] for cell in (here, there))
             assert {**mine, "bank_sd": 0.0} == {**those, "bank_sd": 0.0}  # a flat road's levels
 
 
 def test_designers_have_the_outside_car_and_its_actuators_are_the_class_s() -> None:
     for kind, width in zip(KINDS, (2, 1), strict=True):
-        env: Any = make_env(OUTSIDE_ID, **outside(kind, "single-track").env_options)
+        env: Any = make_env(OUTSIDE_ID, **make_outside_task(kind, "single-track").env_options)
         assert env.action_space.shape == (width,)
-        assert env.unwrapped.nominal.mass == outside_vehicle().mass
+        assert env.unwrapped.nominal.mass == make_outside_vehicle().mass
         assert env.unwrapped.nominal.friction == 0.65
 
 
 def test_a_finished_case_is_found_again(tmp_path: Path) -> None:
     """Though it has neither series nor all numbers; by another driver it is another case."""
-    cell, driven = Cell(outside("car-yaw", "drift"), "", NOMINAL), list[Chunk]()
+    cell, driven = ControlEntry(make_outside_task("car-yaw", "drift"), "", NOMINAL), list[Chunk]()
 
-    def drive_it(chunk: Chunk) -> Driven:
+    def drive_it(chunk: Chunk) -> DriveResult:
         driven.append(chunk)
         numbers = np.full((len(chunk.seeds), len(NUMBERS)), np.nan)
         numbers[:, NUMBERS.index("cost")] = 0.5
-        return Driven(numbers, 1.0)
+        return DriveResult(numbers, 1.0)
 
     for _ in range(2):
-        found = measure([cell], (3, 4), jobs=1, keep=tmp_path, by=drive_it).found[cell]
+        found = measure([cell], (3, 4), jobs=1, keep=tmp_path, runner=drive_it).outcomes[cell]
         assert found.costs.tolist() == [0.5, 0.5]
     assert len(driven) == 1
     chunk = Chunk(cell, (3, 4))
-    assert CachedDrive(tmp_path, drive_it)._path(chunk) != CachedDrive(tmp_path, drive)._path(chunk)
+    assert CachedDrive(tmp_path, drive_it)._make_path(chunk) != CachedDrive(
+        tmp_path, run_chunk
+    )._make_path(chunk)
 
 
 def test_a_drive_costs_what_the_single_car_s_costs() -> None:
     """On a road so narrow that the cars leave it one after the other: what follows is no cost."""
-    contest, seeds = outside("car-yaw", "drift"), (3, 5)
+    contest, seeds = make_outside_task("car-yaw", "drift"), (3, 5)
     narrow = {"scenario": contest.env_options["scenario"] | {"half_width": 0.5}}
-    driven = drive(Chunk(Cell(contest, "", "raw-car-yaw", narrow), seeds))
+    driven = run_chunk(Chunk(ControlEntry(contest, "", "raw-car-yaw", narrow), seeds))
     assert not driven.error
     env = make_env(OUTSIDE_ID, **contest.env_options | narrow)
     alone = [rollout(env, make_agent("raw-car-yaw", env), seed) for seed in seeds]
@@ -83,37 +91,37 @@ def test_a_drive_costs_what_the_single_car_s_costs() -> None:
 
 
 def test_a_reason_is_the_drive_s_error() -> None:
-    driven = drive(Chunk(Cell(outside("car-yaw", "drift"), "", "lqr"), (0,)))
+    driven = run_chunk(Chunk(ControlEntry(make_outside_task("car-yaw", "drift"), "", "lqr"), (0,)))
     assert "beta_hat" in driven.error and np.isnan(driven.costs).all()
 
 
-def driven_at(costs: Any, failed: Any = 0.0) -> Driven:
+def driven_at(costs: Any, failed: Any = 0.0) -> DriveResult:
     numbers = np.zeros((len(costs), len(NUMBERS)))
     numbers[:, NUMBERS.index("cost")] = costs
     numbers[:, NUMBERS.index("failure")] = failed
-    return Driven(numbers, 0.0)
+    return DriveResult(numbers, 0.0)
 
 
 def test_ratios_are_paired_over_each_rival_and_a_failure_counts() -> None:
     (_, policy), *_ = LEARNED["car-yaw"]
     planner = ADAPTIVE["joint, friction"]
-    rng, found = np.random.default_rng(0), Found("car-yaw")
+    rng, found = np.random.default_rng(0), TransferResult("car-yaw")
     for model in OUTSIDE_PLANTS:
         nominal = rng.uniform(100.0, 200.0, 400)
-        factors = dict.fromkeys((who for _, who in contestants("car-yaw")), 1.0)
+        factors = dict.fromkeys((who for _, who in list_entries("car-yaw")), 1.0)
         factors |= {planner: 0.5, policy: 2.0}
         mine = {who: driven_at(factor * nominal) for who, factor in factors.items()}
         gone = np.arange(400) < 100
         mine["two-dof"] = driven_at(nominal, gone)
         mine[planner] = driven_at(0.5 * nominal, gone)
-        found.driven[model] = [mine]
-    table = outside_suite._ratios(found, "car-yaw")
+        found.drives[model] = [mine]
+    table = outside_suite._make_ratio_table(found, "car-yaw")
     rows = {who: row for who, *row in table.cells}
     assert [cell.split()[0] for cell in rows[policy]] == ["200", "400"] * 3
     assert rows[NOMINAL][0] == rows[planner][1] == ""
     fails = f"{100.0 * math.exp(0.25 * math.log(20.0)):.0f}"
     assert [cell.split()[0] for cell in rows["two-dof"]] == [fails, "200"] * 3
-    said = outside_suite.answer([found])
+    said = outside_suite.compose_verdict([found])
     assert f"{policy} costs 200 [200, 200] % of nominal's, 400 [400, 400] % of {planner}'s" in said
     assert "0 % fail" in said
 

@@ -4,26 +4,28 @@ from pathlib import Path
 
 import pytest
 
-from sideslip.benchmarks.control.contests import contests
-from sideslip.benchmarks.harness.results import Row, Suite
-from sideslip.benchmarks.picture import in_part, write_picture
+from sideslip.benchmarks.control.contests import list_scored_tasks
+from sideslip.benchmarks.harness.results import ResultRow, Suite
+from sideslip.benchmarks.picture import find_partial_entries, write_picture
 
-MINE = [each.name for each in contests() if each.tier == "2a"]
+MINE = [each.name for each in list_scored_tasks() if each.tier == "2a"]
 STEERING = [name for name in MINE if name.endswith("steering")]
 
 
-def driven(who: str, names: list[str]) -> list[Row]:
-    return [Row("control", name, "score", 0.5, controller=who) for name in (*names, "tier 2a")]
+def driven(who: str, names: list[str]) -> list[ResultRow]:
+    return [
+        ResultRow("control", name, "score", 0.5, controller=who) for name in (*names, "tier 2a")
+    ]
 
 
 def test_a_score_over_a_part_of_a_tiers_contests_is_marked(tmp_path: Path) -> None:
     """Of this tier: what anybody drives of another one is no part of it."""
     assert 0 < len(STEERING) < len(MINE)
-    elsewhere = next(each.name for each in contests() if each.tier == "1")
+    elsewhere = next(each.name for each in list_scored_tasks() if each.tier == "1")
     rows = driven("lqr", MINE) + driven("model-following", STEERING)
-    rows += [Row("control", elsewhere, "score", 0.5, controller="lqr")]
-    assert in_part(rows, "tier 2a") == {"model-following"}
-    assert in_part(rows, "tier 1") == set()
+    rows += [ResultRow("control", elsewhere, "score", 0.5, controller="lqr")]
+    assert find_partial_entries(rows, "tier 2a") == {"model-following"}
+    assert find_partial_entries(rows, "tier 1") == set()
     pytest.importorskip("matplotlib")
     for ending, head in (("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")):
         path = tmp_path / f"bench.{ending}"

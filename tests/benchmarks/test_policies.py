@@ -11,16 +11,21 @@ import pytest
 import sideslip
 from sideslip.agents import make_agent
 from sideslip.agents.learned.card import Card
-from sideslip.agents.learned.files import load_policy, save_policy, shipped
+from sideslip.agents.learned.files import list_shipped, load_policy, save_policy
 from sideslip.benchmarks.control import seeds
 from sideslip.benchmarks.control import suite as control
-from sideslip.benchmarks.control.build import estimate_options, make_cars
-from sideslip.benchmarks.control.cells import LEARNED, Cell
-from sideslip.benchmarks.control.contests import Contest
+from sideslip.benchmarks.control.build import make_cars, make_estimate_options
+from sideslip.benchmarks.control.cells import LEARNED, ControlEntry
+from sideslip.benchmarks.control.contests import ControlTask
 from sideslip.benchmarks.control.episodes import Chunk
 from sideslip.benchmarks.control.run import CachedDrive
-from sideslip.benchmarks.control.seeds import salt_of, salted_seeds
-from sideslip.benchmarks.policies import enjoy, evaluate, evaluation, suite_of
+from sideslip.benchmarks.control.seeds import make_salt, make_salted_seeds
+from sideslip.benchmarks.policies import (
+    evaluate_policy,
+    make_suite,
+    record_evaluation,
+    summarise_evaluation,
+)
 from sideslip.estimators.learned.network import Network
 from tests.benchmarks.conftest import Run
 
@@ -30,7 +35,9 @@ HERE = "sideslip/YawVision-v0"
 
 def a_file(folder: Path, estimator: str = "", **options: Any) -> Path:
     """A damper: the yaw moment opposes the gyro."""
-    card = Card.of(HERE, {"scenario": SHORT}, estimator, options, steps=1, command="by hand")
+    card = Card.from_env_id(
+        HERE, {"scenario": SHORT}, estimator, options, steps=1, command="by hand"
+    )
     names = [name for name, _ in card.observation]
     scale = np.array([float(name == "gyro") for name in names])
     network = Network(np.zeros(len(names)), scale, [-0.3 * scale[None]], [np.zeros(1)])
@@ -41,31 +48,31 @@ def a_file(folder: Path, estimator: str = "", **options: Any) -> Path:
 
 def test_everybody_drives_the_same_seeds_which_the_weights_make(tmp_path: Path) -> None:
     path = a_file(tmp_path)
-    found = enjoy(str(path), 6)
-    assert list(found.driven) == ["damper", "lqr on exact-kf", "none"] and found.left_out == {}
+    found = evaluate_policy(str(path), 6)
+    assert list(found.drives) == ["damper", "lqr on exact-kf", "none"] and found.left_out == {}
     assert found.salt == load_policy(path).salt
-    assert found.seeds == salted_seeds(found.salt, 6)
+    assert found.seeds == make_salted_seeds(found.salt, 6)
     env = gym.make(HERE, scenario=SHORT)
     for name, agent in (("damper", make_agent(str(path), env)), ("none", None)):
         alone = [sideslip.rollout(env, agent, seed).cost for seed in found.seeds]
         assert found.costs(name) == pytest.approx(alone, rel=1e-12)
     assert found.costs("lqr on exact-kf").mean() < found.costs("none").mean()
-    assert enjoy(str(path), 3, seed=7).seeds == [7, 8, 9]
+    assert evaluate_policy(str(path), 3, seed=7).seeds == [7, 8, 9]
 
 
 def test_a_policy_may_not_be_called_what_it_is_held_against(tmp_path: Path) -> None:
     path = a_file(tmp_path).rename(tmp_path / "none.safetensors")
     with pytest.raises(ValueError, match="is called 'none', as what it is held against"):
-        enjoy(str(path), 1)
+        evaluate_policy(str(path), 1)
 
 
 def test_the_evaluation_goes_into_the_card_and_leaves_the_weights(tmp_path: Path) -> None:
     path = a_file(tmp_path)
     before = load_policy(path)
-    found = evaluate(path, 5)
+    found = record_evaluation(path, 5)
     after = load_policy(path)
     assert after.salt == before.salt
-    assert after.card == replace(before.card, evaluation=evaluation(found))
+    assert after.card == replace(before.card, evaluation=summarise_evaluation(found))
     told = after.card.evaluation
     assert told["episodes"] == 5 and told["salt"] == before.salt
     for name, costs in told["cost"].items():
@@ -74,8 +81,10 @@ def test_the_evaluation_goes_into_the_card_and_leaves_the_weights(tmp_path: Path
 
 
 def test_the_suite_tells_it_in_rows_table_and_pictures(tmp_path: Path) -> None:
-    found = enjoy(str(a_file(tmp_path)), 4, env_id="sideslip/YawFusion-v0", scenario="gust")
-    suite = suite_of(found)
+    found = evaluate_policy(
+        str(a_file(tmp_path)), 4, env_id="sideslip/YawFusion-v0", scenario="gust"
+    )
+    suite = make_suite(found)
     (table,) = suite.tables
     assert [line[0] for line in table.cells] == ["damper", "lqr on exact-kf", "none"]
     assert all(len(line) == len(table.header) for line in table.cells)
@@ -95,16 +104,16 @@ def test_without_the_classical_line_the_rest_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sideslip.benchmarks.policies.FILTER", "nobody-kf")
-    found = enjoy(str(a_file(tmp_path)), 2)
-    assert list(found.driven) == ["damper", "none"]
-    assert "lqr on nobody-kf was not driven" in suite_of(found).tables[0].note
+    found = evaluate_policy(str(a_file(tmp_path)), 2)
+    assert list(found.drives) == ["damper", "none"]
+    assert "lqr on nobody-kf was not driven" in make_suite(found).tables[0].note
 
 
-@pytest.mark.parametrize("name", shipped())
+@pytest.mark.parametrize("name", list_shipped())
 def test_what_a_shipped_card_says_is_so(name: str) -> None:
     """The first of its test seeds again: the uncontrolled mean is that of all of them."""
     told = load_policy(name).card.evaluation
-    found = enjoy(name, 16)
+    found = evaluate_policy(name, 16)
     assert found.salt == told["salt"]
     none = found.costs("none")
     error = none.std(ddof=1) / 4.0
@@ -115,15 +124,15 @@ def test_what_a_shipped_card_says_is_so(name: str) -> None:
 
 def test_a_policy_of_the_matrix_is_shipped_and_its_training_noted() -> None:
     policies = [policy for pairs in LEARNED.values() for _, policy in pairs]
-    assert policies and {*policies} <= {*shipped()}
-    for policy, note in zip(policies, control._learned(), strict=True):
+    assert policies and {*policies} <= {*list_shipped()}
+    for policy, note in zip(policies, control._describe_policies(), strict=True):
         assert load_policy(policy).card.env_id in note and "reference" in note
 
 
 def test_a_policy_in_a_cell_gets_the_estimate_it_was_trained_on(tmp_path: Path) -> None:
     path = a_file(tmp_path, "multirate-kf", outputs=["beta"], std=True)
-    cell = Cell(Contest(scenario="gust"), "multirate-kf", str(path))
-    assert estimate_options(cell) == {"outputs": ["beta"], "std": True}
+    cell = ControlEntry(ControlTask(scenario="gust"), "multirate-kf", str(path))
+    assert make_estimate_options(cell) == {"outputs": ["beta"], "std": True}
     env, agent = make_cars(cell, 2)
     assert [entry.name for entry in env.layout[-2:]] == ["beta_hat", "beta_std"]  # type: ignore[attr-defined]
     assert agent.needs == ("gyro",)
@@ -133,7 +142,7 @@ def test_seeds_and_cached_cases_are_of_these_weights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = a_file(tmp_path)
-    cell = Cell(Contest(scenario="gust"), "", str(path), {"scenario": SHORT})
+    cell = ControlEntry(ControlTask(scenario="gust"), "", str(path), {"scenario": SHORT})
     cached = CachedDrive(tmp_path / "cached")
     first = cached(Chunk(cell, (1, 2)))
     assert np.array_equal(cached(Chunk(cell, (1, 2))).numbers, first.numbers)
@@ -141,9 +150,9 @@ def test_seeds_and_cached_cases_are_of_these_weights(
     other = replace(policy.network, biases=[np.ones(1)])
     save_policy(path, other, policy.card)
     assert not np.array_equal(cached(Chunk(cell, (1, 2))).numbers, first.numbers)
-    salt = salt_of()
+    salt = make_salt()
     monkeypatch.setattr(seeds, "_CONTESTANTS", {"estimators": (".py", ".toml"), "agents": (".py",)})
-    assert salt_of() != salt
+    assert make_salt() != salt
 
 
 def test_the_command_shows_writes_and_tells_the_card(run: Run, tmp_path: Path) -> None:

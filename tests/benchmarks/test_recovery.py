@@ -9,7 +9,15 @@ import pytest
 
 from sideslip.benchmarks import recovery
 from sideslip.benchmarks.picture import write_picture
-from sideslip.benchmarks.recovery import CARS, CLAIRVOYANT, ORACLES, Begun, Case, grid, saved
+from sideslip.benchmarks.recovery import (
+    CARS,
+    CLAIRVOYANT,
+    ORACLES,
+    PulseThenAgent,
+    RecoveryCase,
+    compute_recovery_mask,
+    make_grid,
+)
 from sideslip.benchmarks.report.html import write_report
 
 CAR, COMS = CARS
@@ -19,7 +27,9 @@ def test_feedback_saves_cars_that_nothing_saves() -> None:
     """The uncontrolled COMS above its critical slip is lost in places where lqr catches it."""
     points = (9, 7)
     for car in CARS:
-        none, lqr = (saved(Case(car, name, points, 4)) for name in ("none", "lqr"))
+        none, lqr = (
+            compute_recovery_mask(RecoveryCase(car, name, points, 4)) for name in ("none", "lqr")
+        )
         assert none.shape == lqr.shape == (7, 9, 4)
         assert none.mean() < lqr.mean(), car
         assert (lqr[3, 4] == 1.0).all() and (none[3, 4] == 1.0).all()  # straight ahead, at rest
@@ -27,7 +37,7 @@ def test_feedback_saves_cars_that_nothing_saves() -> None:
 
 def test_a_slide_that_turns_further_out_is_lost_and_one_that_turns_back_is_saved() -> None:
     """beta' = ... - gamma: a yaw rate against the slip's sign makes it grow."""
-    found = saved(Case(CAR, "none", (3, 3), 4))
+    found = compute_recovery_mask(RecoveryCase(CAR, "none", (3, 3), 4))
     assert found[0, 2].max() == found[2, 0].max() == 0.0
     assert found[2, 2].mean() > 0.0 and found[0, 0].mean() > 0.0
 
@@ -40,7 +50,11 @@ def test_after_a_beginning_the_agent_takes_over() -> None:
             count = 0.0 if state is None else state + 1.0
             return np.full((3, 1), 0.1 * count, np.float32), count
 
-    begun, state, taken = Begun(Counts(), np.array([1.0, -1.0, 1.0]), np.array([2, 1, 0])), None, []
+    begun, state, taken = (
+        PulseThenAgent(Counts(), np.array([1.0, -1.0, 1.0]), np.array([2, 1, 0])),
+        None,
+        [],
+    )
     for _ in range(3):
         action, state = begun.predict(np.zeros((3, 2)), state, None)
         taken.append(action[:, 0])
@@ -49,9 +63,13 @@ def test_after_a_beginning_the_agent_takes_over() -> None:
 
 def test_of_several_beginnings_the_best_counts() -> None:
     points, tries = (3, 3), ((1.0, 0.0), (1.0, 0.5), (-1.0, 1.5))
-    found = [saved(Case(CAR, ORACLES[0], points, 4, (each,))) for each in tries]
-    np.testing.assert_array_equal(found[0], saved(Case(CAR, ORACLES[0], points, 4)))
-    both = saved(Case(CAR, ORACLES[0], points, 4, tries))
+    found = [
+        compute_recovery_mask(RecoveryCase(CAR, ORACLES[0], points, 4, (each,))) for each in tries
+    ]
+    np.testing.assert_array_equal(
+        found[0], compute_recovery_mask(RecoveryCase(CAR, ORACLES[0], points, 4))
+    )
+    both = compute_recovery_mask(RecoveryCase(CAR, ORACLES[0], points, 4, tries))
     np.testing.assert_array_equal(both, np.maximum.reduce(found))
 
 
@@ -63,11 +81,11 @@ def test_starts_are_what_the_axes_say(monkeypatch: pytest.MonkeyPatch) -> None:
         seen.extend([seeds, info["beta"], info["gamma"]])
         return iter(())
 
-    monkeypatch.setattr(recovery, "steps_of", steps)
-    saved(Case(COMS, "none", (3, 2), 2))
+    monkeypatch.setattr(recovery, "iterate_steps", steps)
+    compute_recovery_mask(RecoveryCase(COMS, "none", (3, 2), 2))
     seeds, beta, gamma = seen
     assert seeds == [recovery.FIRST_SEED, recovery.FIRST_SEED + 1] * 6
-    betas, gammas = grid((3, 2))
+    betas, gammas = make_grid((3, 2))
     np.testing.assert_allclose(beta.reshape(2, 3, 2)[1, :, 0], betas, atol=1e-9)
     np.testing.assert_allclose(gamma.reshape(2, 3, 2)[:, 1, 1], gammas, atol=1e-9)
 
@@ -87,7 +105,7 @@ def test_table_rows_maps_and_picture(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert sure and all(0.0 <= row.low <= row.value <= row.high <= 1.0 for row in sure)
     for each in suite.maps:
         assert "deg" in each.x_label and "deg/s" in each.y_label
-        assert each.x[-1] == pytest.approx(np.degrees(recovery.MOST[0]))
+        assert each.x[-1] == pytest.approx(np.degrees(recovery.MAX_START[0]))
         assert {share.shape for share in each.shares.values()} == {(3, 3)}
     pytest.importorskip("matplotlib")
     write_picture(tmp_path / "maps.png", [suite])

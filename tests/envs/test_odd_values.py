@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.arguments import brief, listed
+from sideslip.envs.arguments import join_names, short_repr
 from sideslip.envs.scenarios.scenario import Scenario
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.stability import StabilityEnv
 from sideslip.envs.vehicle.vehicle import Vehicle
-from sideslip.envs.vehicle.vehicles import vehicle_from
+from sideslip.envs.vehicle.vehicles import make_vehicle
 
 HUGE = 10**400
 ODD: tuple[Any, ...] = (
@@ -34,7 +34,7 @@ def refused(try_it: Callable[[Any], Any], field: str) -> int:
         except (ValueError, TypeError) as error:
             assert type(error) in (ValueError, TypeError), repr(error)
             message = str(error)
-            assert field in message and len(message) < 500, (brief(value), message[:600])
+            assert field in message and len(message) < 500, (short_repr(value), message[:600])
             count += 1
     return count
 
@@ -106,9 +106,9 @@ def test_an_argument(argument: str) -> None:
 
 def test_what_a_message_says_is_short() -> None:
     for value in ODD:
-        assert len(brief(value)) < 200
-    assert brief(10**5000) == "<int>"
-    assert len(listed(str(i) for i in range(1000))) <= 250
-    assert listed(["a", "b"]) == "a, b"
+        assert len(short_repr(value)) < 200
+    assert short_repr(10**5000) == "<int>"
+    assert len(join_names(str(i) for i in range(1000))) <= 250
+    assert join_names(["a", "b"]) == "a, b"
     with pytest.raises(ValueError, match="unknown vehicle 'tank'; known: coms, "):
-        vehicle_from("tank")
+        make_vehicle("tank")

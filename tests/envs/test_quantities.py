@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.envs import COMS, PASSENGER_CAR, SCENARIOS, VEHICLES, StabilityEnv, vehicle_from
+from sideslip.envs import COMS, PASSENGER_CAR, SCENARIOS, VEHICLES, StabilityEnv, make_vehicle
 from sideslip.envs.quantities import check_plausible
 from sideslip.envs.scenarios.scenario import Scenario
 from sideslip.envs.vehicle.vehicle import Vehicle
@@ -55,7 +55,7 @@ def test_every_scenario_is_plausible_with_its_cars(name: str) -> None:
 @pytest.mark.plain
 @pytest.mark.parametrize("car", [CAR, MODEL, LORRY, CAR | {"friction": 1.9}])
 def test_small_and_large_cars_are_plausible(car: dict[str, Any]) -> None:
-    assert vehicle_from(car).mass == car["mass"]
+    assert make_vehicle(car).mass == car["mass"]
 
 
 @pytest.mark.plain
@@ -110,8 +110,8 @@ def test_a_parameter_in_another_unit_is_refused(change: dict[str, float], messag
               not in change}  # fmt: skip
     source = values | change
     with pytest.raises(ValueError, match=rf"^Vehicle\.{message}.*; strict=False takes it$"):
-        vehicle_from(source)
-    loose = vehicle_from(source, strict=False)
+        make_vehicle(source)
+    loose = make_vehicle(source, strict=False)
     straight = {"base": "straight", "roll": False}
     for argument in ("vehicle", "nominal"):
         for given in (source, loose):

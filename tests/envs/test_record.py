@@ -7,7 +7,7 @@ import pytest
 
 from sideslip.envs import COMS, Log, Record, SlowSensor, StabilityEnv
 from sideslip.envs.engine.layout import Z
-from sideslip.envs.engine.packing import car_of
+from sideslip.envs.engine.packing import make_car
 from sideslip.envs.record import (
     FAST,
     FAST_UNITS,
@@ -19,10 +19,10 @@ from sideslip.envs.record import (
 )
 from sideslip.envs.sensors.slow import SLOW, VALUES
 from sideslip.envs.ticks import TICK
-from sideslip.envs.vehicle.dynamics import Motion, Push, Road
+from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams
 from sideslip.envs.vehicle.integration import kutta3
 from sideslip.envs.vehicle.tyres import LINEAR as LINEAR_TYRES
-from sideslip.envs.vehicle.tyres import Inputs, load_of
+from sideslip.envs.vehicle.tyres import TyreInputs, compute_tyre_load
 
 from .helpers import IDS, LINEAR, bits, play, unwrapped
 
@@ -80,14 +80,14 @@ def test_inputs_of_the_rows_and_the_wind_replay_the_drive_bit_for_bit() -> None:
     wind = {"wind_force": 200.0, "wind_arm": 0.2, "wind_start": 0.1, "wind_length": 0.15}
     env = StabilityEnv(scenario=LINEAR | SWERVING | wind, control_period=10)
     env.reset(seed=3)
-    car, road = car_of(COMS), Road(0.0, 20.0, 20.0)
+    car, road = make_car(COMS), RoadParams(0.0, 20.0, 20.0)
     state = Motion(25.0 / 3.6, *[0.0] * 8)
     for moment in play(env, np.random.default_rng(1).uniform(-1.0, 1.0, 30)):
         for tick, row in zip(moment.record.ticks, moment.record.fast.tolist(), strict=True):
-            inputs = Inputs(row[FAST.steer], row[FAST.torque_left], row[FAST.torque_right])
-            load = load_of(inputs, car, 1)
+            inputs = TyreInputs(row[FAST.steer], row[FAST.torque_left], row[FAST.torque_right])
+            load = compute_tyre_load(inputs, car, 1)
             blows = 100 < tick <= 250  # it acts from tick 100 to tick 250
-            push = Push(200.0, 0.2 * 200.0) if blows else Push(0.0, 0.0)
+            push = DisturbanceForces(200.0, 0.2 * 200.0) if blows else DisturbanceForces(0.0, 0.0)
             state = kutta3(state, (load, load, load), push, car, road, TICK, 1, LINEAR_TYRES)
         assert (state.gamma, state.psi) == (moment.info["gamma"], moment.info["psi"])
     truth = env.get_state()["state"][[*Z.motion]]
@@ -149,8 +149,8 @@ def test_concatenate_refuses_gaps_and_repetitions() -> None:
 
 def test_packets_of_picks_one_sensor() -> None:
     record = concatenate(records(StabilityEnv(), [0.0] * 50))
-    assert bits(record.packets_of("camera")) == bits(record.packets)
-    assert record.packets_of("gps").shape == (0, PACKET_WIDTH)
+    assert bits(record.select_packets("camera")) == bits(record.packets)
+    assert record.select_packets("gps").shape == (0, PACKET_WIDTH)
 
 
 def test_columns_have_units_and_fit() -> None:

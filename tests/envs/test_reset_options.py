@@ -121,7 +121,7 @@ def test_empty_options_are_none(env: StabilityEnv) -> None:
 def test_nominal_is_what_the_references_use() -> None:
     turning = LINEAR | {"steering": "sine", "amplitude": 0.05}
     seen = []
-    for nominal in (None, "coms", COMS.scaled(1.5, 1.0)):
+    for nominal in (None, "coms", COMS.scale_stiffness(1.5, 1.0)):
         env = StabilityEnv(scenario=turning, nominal=nominal, reference="model")
         env.reset(seed=0)
         seen.append(play(env, [0.0] * 100)[-1].info)

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("cv2")
 import sideslip
 from sideslip.envs.record import PACKET, Record, concatenate
-from sideslip.envs.sensors.camera.detector import Detector, detector
+from sideslip.envs.sensors.camera.detector import Detector, load_detector
 from sideslip.estimators import EstimateObservation
 
 assert sideslip.__version__
@@ -42,8 +42,8 @@ def test_only_the_cameras_values_differ_from_the_analytic_cameras(env_id: str) -
     np.testing.assert_array_equal(seen.fast, exact.fast)
     for part in (slice(PACKET.quality), slice(PACKET.sequence, PACKET.value)):
         np.testing.assert_array_equal(seen.packets[:, part], exact.packets[:, part])
-    np.testing.assert_array_equal(seen.packets_of("gps"), exact.packets_of("gps"))
-    found, truth = seen.packets_of("camera"), exact.packets_of("camera")
+    np.testing.assert_array_equal(seen.select_packets("gps"), exact.select_packets("gps"))
+    found, truth = seen.select_packets("camera"), exact.select_packets("camera")
     assert len(found) >= 7 and (found[:, PACKET.quality] > 0.5).all()
     assert np.abs(truth[:, PACKET.value + 1]).max() > 0.2  # a wrong sign would show
     error = np.abs(found - truth)[:, VALUE]
@@ -63,7 +63,7 @@ def test_the_record_is_the_same_for_every_control_period(period: int) -> None:
 
 def test_delays_are_drawn_from_the_file_by_the_key() -> None:
     record, _ = drive(made(vision="image"), 60)
-    packets = record.packets_of("camera")
+    packets = record.select_packets("camera")
     late = packets[:, PACKET.arrived] - packets[:, PACKET.captured]
     sensor = made(vision="image").unwrapped.slow_sensors["camera"]
     assert len(set(late)) > 2
@@ -71,18 +71,22 @@ def test_delays_are_drawn_from_the_file_by_the_key() -> None:
     assert late.max() <= np.ceil(1e3 * sensor.longest_delay)
     again, _ = drive(made(vision="image"), 60)
     np.testing.assert_array_equal(again.packets, record.packets)
-    assert (drive(made(vision="image"), 60, 5)[0].packets_of("camera")[:, 2] != packets[:, 2]).any()
+    assert (
+        drive(made(vision="image"), 60, 5)[0].select_packets("camera")[:, 2] != packets[:, 2]
+    ).any()
 
 
 def test_the_distribution_on_file() -> None:
-    on_file = detector()
+    on_file = load_detector()
     shares = np.linspace(0.001, 0.999, 99)
-    times = np.array([on_file.delay(share) for share in shares])
+    times = np.array([on_file.compute_delay(share) for share in shares])
     assert (np.diff(times) >= 0.0).all()
     assert times[0] >= on_file.range[0] and times[-1] <= on_file.range[1] < 0.033
     values = {"shift": 0.01, "log_mean": np.log(0.005), "log_sd": 0.5, "range": [0.0, 1.0]}
     errors = {"psi_rad": 1e-3, "y_l_m": 0.01}
-    assert Detector.of({"seconds": values, "errors": errors}).delay(0.5) == pytest.approx(0.015)
+    assert Detector.from_dict({"seconds": values, "errors": errors}).compute_delay(
+        0.5
+    ) == pytest.approx(0.015)
 
 
 def test_a_snapshot_and_a_copy_continue_bit_for_bit() -> None:
@@ -105,14 +109,14 @@ def test_its_spec_comes_back_and_filters_take_it() -> None:
     other, again = drive(gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json())), 10)
     np.testing.assert_array_equal(one.packets, other.packets)
     np.testing.assert_array_equal(seen, again)
-    assert env.unwrapped.scenario.noise.items() >= detector().noise.items()
+    assert env.unwrapped.scenario.noise.items() >= load_detector().noise.items()
     assert not env.spec.nondeterministic and "nondeterministic" not in env.reset(seed=0)[1]
 
 
 def test_a_measured_delay_makes_it_nondeterministic() -> None:
     env = made(vision="image", delay="measured")
     record, _ = drive(env, 20)
-    packets = record.packets_of("camera")
+    packets = record.select_packets("camera")
     late = packets[:, PACKET.arrived] - packets[:, PACKET.captured]
     assert (late >= 1).all() and (late <= 100).all()
     assert env.spec.nondeterministic and env.unwrapped.metadata["nondeterministic"]
@@ -123,7 +127,7 @@ def test_a_road_without_paint_and_a_lane_out_of_view_are_quality_0() -> None:
     for scenario, look in ((BEND, {"wear": 1.0}), (BEND | {"camera_offset": 1e-3}, {})):
         env = made(scenario=scenario, vision="image", appearance=look)
         record, observations = drive(env, 12)
-        packets = record.packets_of("camera")
+        packets = record.select_packets("camera")
         assert len(packets) and not packets[:, PACKET.quality].any() and not packets[:, VALUE].any()
         names = [entry.name for entry in env.unwrapped.layout]
         assert not observations[-1][names.index("camera_fresh")]
@@ -132,7 +136,10 @@ def test_a_road_without_paint_and_a_lane_out_of_view_are_quality_0() -> None:
 def test_the_newest_picture_is_there_and_no_vector_engine_takes_it() -> None:
     env = made(vision="image")
     drive(env, 1)
-    assert env.unwrapped.eye.picture.shape == (720, 1280) and env.unwrapped.eye.lane.quality > 0.5
+    assert (
+        env.unwrapped.camera.picture.shape == (720, 1280)
+        and env.unwrapped.camera.lane.quality > 0.5
+    )
     with pytest.raises(ValueError, match="vectorization_mode='sync'"):
         gym.make_vec(ID, 2, vision="image")
     rows: Any = gym.make_vec(ID, 2, vectorization_mode="sync", scenario=BEND, vision="image")

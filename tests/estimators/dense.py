@@ -13,7 +13,7 @@ from scipy.linalg import expm, solve_triangular
 
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Record
 from sideslip.envs.sensors.slow import SLOW_NAMES
-from sideslip.envs.vehicle.linear import vision
+from sideslip.envs.vehicle.linear import make_vision_model
 from sideslip.envs.vehicle.vehicle import COMS
 
 STATES = ("beta", "gamma", "psi", "y_l", "phi", "phi_rate")
@@ -32,7 +32,7 @@ def continuous(behind: Any, V: float, rolls: bool) -> Any:
     A body that rolls leaves beta' and phi'' in one pair of equations, double-layer-gps (1) and (3):
     M V (beta' + gamma) - S phi'' = F_y, I_x phi'' = S a_y - ...
     """
-    model, at = vision(COMS, V), 9
+    model, at = make_vision_model(COMS, V), 9
     rows = np.zeros((7, at + len(behind)))
     rows[:4, :4], rows[:4, 6:9] = model.A, model.B
     for j, name in enumerate(behind, at):

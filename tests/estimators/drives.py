@@ -12,7 +12,7 @@ from sideslip.envs import Log, SlowSensor, StabilityEnv
 from sideslip.envs.record import FAST, PACKET, Record, concatenate
 from sideslip.envs.scenarios.scenario import Scenario
 from sideslip.envs.sensors.noise import Noise
-from sideslip.envs.vehicle.linear import LinearModel, vision
+from sideslip.envs.vehicle.linear import LinearModel, make_vision_model
 
 STATES = ("beta", "gamma", "psi", "y_l", "F_d", "N_d")
 _PERFECT: dict[str, Any] = {
@@ -46,14 +46,16 @@ class Drives:
 
     def _truth(self, record: Record) -> np.ndarray:
         """`STATES` (K - 1, 6) of a record (K rows) of perfect sensors."""
-        seen = [record.packets_of(sensor)[:, PACKET.value :] for sensor in ("camera", "gps")]
+        seen = [record.select_packets(sensor)[:, PACKET.value :] for sensor in ("camera", "gps")]
         psi, y_l = seen[0][:, 0], seen[0][:, 1]
         x = np.column_stack([seen[1][:, 0] - psi, record.fast[:, FAST.gyro], psi, y_l])
-        car, model = self.vehicle, vision(self.vehicle, self.speed)
+        car, model = self.vehicle, make_vision_model(self.vehicle, self.speed)
         push = np.zeros((4, 2))
         push[0, 0], push[1, 1] = 1.0 / (car.mass * self.speed), 1.0 / car.yaw_inertia
-        G, H = model.discrete(record.dt)
-        _, D = LinearModel(model.A, push, model.C, model.states, ("F", "N"), ()).discrete(record.dt)
+        G, H = model.discretise(record.dt)
+        _, D = LinearModel(model.A, push, model.C, model.states, ("F", "N"), ()).discretise(
+            record.dt
+        )
         rest = x[1:] - x[:-1] @ G.T - np.outer(record.fast[1:, FAST.steer], H[:, 0])
         force = rest @ np.linalg.pinv(D).T
         # the plant is that linear model, but for Kutta's error

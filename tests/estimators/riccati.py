@@ -8,9 +8,9 @@ import numpy.typing as npt
 
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.ticks import TICK
-from sideslip.envs.vehicle.linear import LinearModel, vision
+from sideslip.envs.vehicle.linear import LinearModel, make_vision_model
 from sideslip.envs.vehicle.vehicle import Vehicle
-from sideslip.estimators.design.kalman import gain, joseph
+from sideslip.estimators.design.kalman import joseph_form, kalman_gain
 from sideslip.estimators.design.levels import DISTURBANCE, NOISE
 from tests.estimators.dense import MEASURED
 
@@ -65,19 +65,19 @@ def riccati(
 
 def updated(P: Array, C: Array, R: Array) -> Array:
     """The covariance after a measurement y = C x + v, by Joseph's form."""
-    return joseph(P, gain(P, C, R), C, R)
+    return joseph_form(P, kalman_gain(P, C, R), C, R)
 
 
 def _disturbed(
     vehicle: Vehicle, speed: float, dt: float, sd: Mapping[str, float]
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """F, Q of the vision model with a force and a moment that are held over a tick, and names."""
-    model = vision(vehicle, speed)
+    model = make_vision_model(vehicle, speed)
     push = np.zeros((4, 2))
     push[0, 0] = 1.0 / (vehicle.mass * speed)
     push[1, 1] = 1.0 / vehicle.yaw_inertia
     states = (*model.states, "F_d", "N_d")
-    A, D = LinearModel(model.A, push, model.C, model.states, states[4:], ()).discrete(dt)
+    A, D = LinearModel(model.A, push, model.C, model.states, states[4:], ()).discretise(dt)
     keep = math.exp(-dt / sd["disturbance_time"])
     F = np.block([[A, D], [np.zeros((2, 4)), keep * np.eye(2)]])
     fresh = (1.0 - keep * keep) * np.array([sd["force_sd"], sd["moment_sd"]]) ** 2

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Log, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.sensors.slow import SLOW_NAMES
-from sideslip.envs.vehicle.linear import LinearModel, vision
+from sideslip.envs.vehicle.linear import LinearModel, make_vision_model
 from sideslip.envs.vehicle.vehicle import COMS, GRAVITY, Vehicle
 
 KMH = 1.0 / 3.6
@@ -72,13 +72,13 @@ def simulate(
     dt, V = 0.001, drive.speed
     K = round(drive.duration / dt)
     car = drive.truth
-    model = vision(car, V)
+    model = make_vision_model(car, V)
     push = np.zeros((4, 2))
     push[0, 0], push[1, 1] = 1.0 / (car.mass * V), 1.0 / car.yaw_inertia
     wide = type(model)(
         model.A, np.hstack([model.B, push]), model.C, model.states, (), model.outputs
     )
-    G, H = wide.discrete(dt)
+    G, H = wide.discretise(dt)
     t = np.arange(K + 1) * dt
     on = (t >= drive.onset) & ((t - drive.onset) * drive.frequency < drive.periods)
     steer = drive.amplitude * np.sin(2.0 * math.pi * drive.frequency * (t - drive.onset)) * on
@@ -123,7 +123,7 @@ def _bodily(
     A = np.array([[0.0, 1.0], [lift * GRAVITY - car.roll_stiffness / car.roll_inertia, 0.0]])
     A[1, 1] = -car.roll_damping / car.roll_inertia
     roll = LinearModel(A, np.array([[0.0], [lift]]), np.eye(2), ("phi", "phi_rate"), (), ())
-    G, H = roll.discrete(0.001)
+    G, H = roll.discretise(0.001)
     phi = np.zeros((len(x), 2))
     for k in range(len(x) - 1):
         phi[k + 1] = G @ phi[k] + H[:, 0] * across[k]

@@ -9,7 +9,7 @@ import pytest
 from sideslip.envs.record import FAST, PACKET, Log, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import Estimator, make_estimator
-from sideslip.estimators.analysis.bound import Change, bound
+from sideslip.estimators.analysis.bound import VehicleChange, compute_error_bound
 from sideslip.estimators.late import LateEstimator
 from sideslip.estimators.vector.make import make_batch
 from tests.estimators.core.test_conditioning import CASES, EXACT, differences
@@ -131,17 +131,19 @@ def test_behind_it_is_the_punctual_filter_on_the_punctual_record() -> None:
     late.run(log)
     plain.run(Log(Record(punctual[:1930], log.record.packets[here]), log.slow))
     assert isinstance(late, LateEstimator)
-    assert (late.behind[0].x[:8] == plain.x).all()
+    assert (late.delayed_filters[0].x[:8] == plain.x).all()
 
 
 def test_the_bound_that_knows_it_is_a_bound() -> None:
     """A late gyro costs, a punctual one that is slower costs no less; the filter reaches it."""
     log, facts = drive()
     told: Any = {"record": log.record, "sensors": facts["sensors"], "speed": FIG7.speed}
-    best = [bound(FIG7.truth, **told, latency=how) for how in ({}, LATE, {"gyro": 0.12})]
+    best = [
+        compute_error_bound(FIG7.truth, **told, latency=how) for how in ({}, LATE, {"gyro": 0.12})
+    ]
     assert (best[0][500:] < best[1][500:]).all() and (best[1][500:] < best[2][500:]).all()
     with pytest.raises(ValueError, match="a bound with latency has no change"):
-        bound(FIG7.truth, **told, latency=LATE, change=Change(1.0, FIG7.truth))
+        compute_error_bound(FIG7.truth, **told, latency=LATE, change=VehicleChange(1.0, FIG7.truth))
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import sideslip
 from sideslip.agents import AGENTS, register_agent
 from sideslip.estimators import FILTERS, make_estimator, register_estimator
 from sideslip.estimators.make import ESTIMATORS
-from sideslip.estimators.registry import Registry, entry_point_of, imported
+from sideslip.estimators.registry import Registry, find_entry_point, import_entry_point
 from tests.estimators.wrappers.constant import Constant
 
 CONSTANT = "tests.estimators.wrappers.constant:Constant"
@@ -75,7 +75,7 @@ def test_what_cannot_be_registered(register: Any) -> None:
 
 
 def test_an_entry_point_is_imported_when_asked_for(module: str) -> None:
-    assert imported("tests.estimators.wrappers.constant:Constant.reset") is Constant.reset
+    assert import_entry_point("tests.estimators.wrappers.constant:Constant.reset") is Constant.reset
     for text, message in (
         ("nowhere:Thing", "'nowhere:Thing': there is no module 'nowhere'"),
         ("tests.nowhere.at_all:Thing", "there is no module 'tests.nowhere'"),
@@ -85,18 +85,18 @@ def test_an_entry_point_is_imported_when_asked_for(module: str) -> None:
         with pytest.raises(ValueError, match=message):
             make_estimator(f"broken-{text.count('.')}")
     with pytest.raises(TypeError, match="is no factory but of type tuple"):
-        imported(f"{CONSTANT}.names")
+        import_entry_point(f"{CONSTANT}.names")
     with pytest.raises(ModuleNotFoundError, match="nowhere_to_be_found"):  # the user's own error
         make_estimator(f"{module}:Thing")
 
 
 def test_what_can_be_found_again_has_an_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert entry_point_of(Constant) == CONSTANT
+    assert find_entry_point(Constant) == CONSTANT
     monkeypatch.setattr(Constant, "__module__", "__main__")  # another process has another one
-    assert entry_point_of(Constant) is None
+    assert find_entry_point(Constant) is None
     nameless: Any
     for nameless in (lambda: None, Constant(), Constant().reset):
-        assert entry_point_of(nameless) is None
+        assert find_entry_point(nameless) is None
 
 
 def test_names_are_those_of_one_registry() -> None:

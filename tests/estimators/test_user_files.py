@@ -8,7 +8,7 @@ import pytest
 
 from sideslip.agents import make_agent, register_agent
 from sideslip.estimators import make_estimator
-from sideslip.estimators.user_files import find_class, is_user_file, load_user_class, reason_of
+from sideslip.estimators.user_files import describe_error, find_class, is_user_file, load_user_class
 
 AGENT = """
 class Still:
@@ -98,5 +98,5 @@ def test_a_reason_has_the_line_of_the_users_file(tmp_path: Path) -> None:
     )
     with pytest.raises(ZeroDivisionError) as caught:
         build(0)
-    assert reason_of(caught.value) == "ZeroDivisionError: division by zero (my.py, line 3)"
-    assert reason_of(ValueError("ours")) == "ValueError: ours"
+    assert describe_error(caught.value) == "ZeroDivisionError: division by zero (my.py, line 3)"
+    assert describe_error(ValueError("ours")) == "ValueError: ours"

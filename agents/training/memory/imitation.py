@@ -11,21 +11,34 @@ from typing import Any
 
 import numpy as np
 
-from ..distill import DISTILLING, SEEDS, Lesson, Round, drive
-from ..student import LONGER, Course, fitted
-from ..traces.drives import Array, Drives, Scaling, Single, normalised, scaling_of
-from .networks import Memory, make_memory
+from ..distill import (
+    DISTILL_SEEDS,
+    SEEDS_PER_TRAINING,
+    DistillTask,
+    RoundResult,
+    collect_demonstrations,
+)
+from ..student import LAST_ROUND_FACTOR, DistillConfig, fit_model
+from ..traces.drives import (
+    Array,
+    Demonstrations,
+    Scaling,
+    Single,
+    compute_scaling,
+    normalise_inputs,
+)
+from .networks import MemoryNetwork, make_memory
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 
 
-class Remembering:
+class MemoryAgent:
     """A memory that acts: stable-baselines3's `predict` on plain observations (N, k).
 
     mean, scale: (k,) of the observations.
     """
 
-    def __init__(self, model: Memory, mean: Array, scale: Array) -> None:
+    def __init__(self, model: MemoryNetwork, mean: Array, scale: Array) -> None:
         self.model, self.mean, self.scale = model, mean, scale
 
     def predict(
@@ -36,7 +49,7 @@ class Remembering:
         deterministic: bool = True,
     ) -> tuple[Single, Any]:
         """The actions (N, 1) and the next state; where an episode starts the state is zero."""
-        z = torch.from_numpy(normalised(observation, self.mean, self.scale))[:, None]
+        z = torch.from_numpy(normalise_inputs(observation, self.mean, self.scale))[:, None]
         if state is not None and episode_start is not None and np.any(episode_start):
             state = state.clone()
             state[torch.from_numpy(np.asarray(episode_start))] = 0.0
@@ -45,46 +58,54 @@ class Remembering:
         return actions[:, 0].clamp(-1.0, 1.0).numpy(), state
 
 
-def imitated(
+def train_memory(
     name: str,
-    lesson: Lesson,
-    course: Course,
-    late: int,
+    task: DistillTask,
+    config: DistillConfig,
+    delay_steps: int,
     weight: float = 1.0,
-    report: Callable[[Round], None] = lambda _: None,
-) -> Remembering:
+    report: Callable[[RoundResult], None] = lambda _: None,
+) -> MemoryAgent:
     """A memory of `MEMORIES` that learned to act as a lesson's teacher, by DAgger.
 
-    course: all but `cells` and `hidden`. late: steps that a packet is old when it arrives. weight:
+    config: all but `cells` and `hidden`. late: steps that a packet is old when it arrives. weight:
     S, what the square of an error costs. report: called after each round.
 
     Raises ValueError for an unknown name, or a lesson whose observation does not say whether a
     packet arrived; FloatingPointError, with the step, where the training diverges.
     """
-    cars = lesson.cars
+    cars = task.cars
     names = [entry.name for entry in cars.layout]
-    fresh = [i for i, each in enumerate(names) if each.endswith("_fresh")]
-    if len(fresh) != 1:
-        raise ValueError(f"a memory knows one sensor with packets, got {len(fresh)} in {names}")
+    fresh_columns = [i for i, label in enumerate(names) if label.endswith("_fresh")]
+    if len(fresh_columns) != 1:
+        raise ValueError(
+            f"a memory knows one sensor with packets, got {len(fresh_columns)} in {names}"
+        )
     torch.set_num_threads(1)
-    torch.manual_seed(course.seed)
-    model = make_memory(name, len(names), fresh[0], late)
-    seeds = itertools.count(DISTILLING + course.seed * SEEDS, cars.num_envs)
-    drives: list[Drives] = []
+    torch.manual_seed(config.seed)
+    model = make_memory(name, len(names), fresh_columns[0], delay_steps)
+    seeds = itertools.count(DISTILL_SEEDS + config.seed * SEEDS_PER_TRAINING, cars.num_envs)
+    drives: list[Demonstrations] = []
     agent, steps = None, 0
     scaling: Scaling | None = None
-    for i in range(course.rounds):
+    for i in range(config.rounds):
         first = next(seeds)
-        seen = drive(lesson, agent, range(first, first + cars.num_envs), course.noise)
-        drives.append(seen._replace(curvature=np.full((1, 1), weight, np.float32)))
-        steps += int((seen.weights > 0.0).sum())
+        demo = collect_demonstrations(
+            task, agent, range(first, first + cars.num_envs), config.noise
+        )
+        drives.append(demo._replace(curvature=np.full((1, 1), weight, np.float32)))
+        steps += int((demo.weights > 0.0).sum())
         if scaling is None:
-            mean, scale, _ = scaling_of(drives, cars.layout, lesson.teacher.needs, usual_ages=False)
+            mean, scale, _ = compute_scaling(
+                drives, cars.layout, task.teacher.needs, usual_ages=False
+            )
             scaling = Scaling(mean, scale, np.eye(len(mean)))  # memories mix by themselves
-            model.whiten(drives, mean, scale)
-        last = i == course.rounds - 1
-        loss = fitted(model, drives, scaling, course, course.epochs * (LONGER if last else 1))
-        agent = Remembering(model, scaling.mean, scaling.scale)
-        report(Round(steps, float(seen.costs.mean()), loss))
+            model.fit_whitening(drives, mean, scale)
+        last = i == config.rounds - 1
+        loss = fit_model(
+            model, drives, scaling, config, config.epochs * (LAST_ROUND_FACTOR if last else 1)
+        )
+        agent = MemoryAgent(model, scaling.mean, scaling.scale)
+        report(RoundResult(steps, float(demo.costs.mean()), loss))
     assert agent is not None
     return agent

@@ -8,22 +8,22 @@ import numpy.typing as npt
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ....envs.task.observation import AGE_CAP, Entry, space_of
+from ....envs.task.observation import AGE_CAP, ObservationEntry, make_space
 
 Single = npt.NDArray[np.float32]
 
 SILENT = ("accel_", "wheel_", "roll_rate", "gps_X", "gps_Y", "gps_speed", "gps_satellites")
 """Entries of sensors that the linear scenarios drown in noise, or that stand still there."""
 OFFSET, RATE, AGE = "camera_y_l", "camera_y_l_rate", "camera_age"
-LATEST = 1.0  # s, from which on an age is no older
+MAX_AGE = 1.0  # s, from which on an age is no older
 
 
-class Prepared(VectorWrapper[Any, Any, Any, Any, Any]):
+class CompactObservation(VectorWrapper[Any, Any, Any, Any, Any]):
     """A vector env whose observations networks learn from more easily.
 
     The lateral offset wanders over metres and is measured to a millimetre, so it becomes its mean
     rate between the last two pictures, zero until there are two: with the pictures' ages the same
-    information, but for the first one's. Ages end at `LATEST`; entries that begin as in `SILENT`
+    information, but for the first one's. Ages end at `MAX_AGE`; entries that begin as in `SILENT`
     and the references are left out.
     """
 
@@ -32,16 +32,16 @@ class Prepared(VectorWrapper[Any, Any, Any, Any, Any]):
         base: Any = env.unwrapped
         inner = base.layout
         self._period: float = base.control_period * base.dt
-        left_out = (*SILENT, "beta_ref", "gamma_ref")
-        chosen = [i for i, entry in enumerate(inner) if not entry.name.startswith(left_out)]
+        excluded = (*SILENT, "beta_ref", "gamma_ref")
+        chosen = [i for i, entry in enumerate(inner) if not entry.name.startswith(excluded)]
         names = [inner[i].name for i in chosen]
         self._columns = np.array(chosen)
         self._ages = [i for i, name in enumerate(names) if name.endswith("_age")]
         self._offset = names.index(OFFSET) if OFFSET in names else None
         self._at = names.index(AGE) if AGE in names else None
-        rate = Entry(RATE, "m/s", -100.0, 100.0)
+        rate = ObservationEntry(RATE, "m/s", -100.0, 100.0)
         self.layout = tuple(rate if inner[i].name == OFFSET else inner[i] for i in chosen)
-        self.single_observation_space = space_of(self.layout)
+        self.single_observation_space = make_space(self.layout)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._last = np.full((3, env.num_envs), AGE_CAP)  # offset, its rate, age of the picture
 
@@ -60,11 +60,11 @@ class Prepared(VectorWrapper[Any, Any, Any, Any, Any]):
     def _read(self, obs: Single) -> Single:
         x = obs[:, self._columns]
         if self._offset is not None and self._at is not None:
-            x[:, self._offset] = self._rate(x[:, self._offset], x[:, self._at])
-        x[:, self._ages] = np.minimum(x[:, self._ages], LATEST)
+            x[:, self._offset] = self._compute_rate(x[:, self._offset], x[:, self._at])
+        x[:, self._ages] = np.minimum(x[:, self._ages], MAX_AGE)
         return x
 
-    def _rate(self, offset: Single, age: Single) -> Any:
+    def _compute_rate(self, offset: Single, age: Single) -> Any:
         before, rate, aged = self._last
         between = aged + self._period - age  # from the last picture to this one
         new = between > 0.5 * self._period

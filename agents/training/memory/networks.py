@@ -13,20 +13,20 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ....envs.arguments import check_choice
-from ....envs.backend.extras import extra
-from ..traces.drives import Array, Drives, normalised
-from ..traces.mixing import whitening
+from ....envs.backend.extras import require_extra
+from ..traces.drives import Array, Demonstrations, normalise_inputs
+from ..traces.mixing import compute_whitening
 
-with extra("train", "memories need torch"):
+with require_extra("train", "memories need torch"):
     import torch
     from torch import nn
 
 HIDDEN = (64, 64)  # of the layers behind a memory
-_LEAST = 1e-2  # deviation of a mix of inputs below which it is not scaled up further
-_STEPS = (2.0, 300.0)  # over which a linear memory fades to 1/e when it is new
+_MIN_STD = 1e-2  # deviation of a mix of inputs below which it is not scaled up further
+_FADE_STEPS = (2.0, 300.0)  # over which a linear memory fades to 1/e when it is new
 
 
-class Memory(nn.Module):
+class MemoryNetwork(nn.Module):
     """What all have in common: inputs without correlation, a memory, layers that act.
 
     inputs: entries of an observation. fresh: which of them says that a packet arrived. late:
@@ -38,34 +38,36 @@ class Memory(nn.Module):
     recurrent: ClassVar[bool] = True
     mix: Any
 
-    def __init__(self, inputs: int, fresh: int, late: int) -> None:
+    def __init__(self, inputs: int, fresh_index: int, delay_steps: int) -> None:
         super().__init__()
-        self.inputs, self.fresh, self.late = inputs, fresh, late
+        self.inputs, self.fresh_index, self.delay_steps = inputs, fresh_index, delay_steps
         self.register_buffer("mix", torch.eye(inputs))
-        self.head: nn.Module = dense(self._built() + inputs, *HIDDEN, 1)
+        self.head: nn.Module = make_dense_layers(self._build_memory() + inputs, *HIDDEN, 1)
 
-    def _built(self) -> int:
-        """Make the memory; the width of what `_remember` gives."""
+    def _build_memory(self) -> int:
+        """Make the memory; the width of what `_update_memory` gives."""
         return 0
 
-    def _remember(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
         """What is known after each step (B, T, m), and the next state, of inputs z (B, T, k);
         arrived: (B, T, 1) whether a packet came."""
         return z[..., :0], state
 
-    def whiten(self, drives: Sequence[Drives], mean: Array, scale: Array) -> None:
+    def fit_whitening(self, drives: Sequence[Demonstrations], mean: Array, scale: Array) -> None:
         """Mix the inputs so that their covariance on drives is one."""
-        seen = np.concatenate([normalised(each.obs, mean, scale) for each in drives])
-        self.mix.copy_(torch.from_numpy(whitening(seen.reshape(-1, self.inputs), _LEAST**2)))
+        inputs = np.concatenate([normalise_inputs(demo.obs, mean, scale) for demo in drives])
+        self.mix.copy_(
+            torch.from_numpy(compute_whitening(inputs.reshape(-1, self.inputs), _MIN_STD**2))
+        )
 
     def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
         """(actions (B, T, 1), the next state) of normalised observations (B, T, k)."""
-        arrived, z = (z[..., self.fresh, None] > 0.0).to(z.dtype), z @ self.mix
-        known, state = self._remember(z, arrived, state)
+        arrived, z = (z[..., self.fresh_index, None] > 0.0).to(z.dtype), z @ self.mix
+        known, state = self._update_memory(z, arrived, state)
         return self.head(torch.cat([known, z], -1)), state
 
 
-def dense(*sizes: int) -> nn.Sequential:
+def make_dense_layers(*sizes: int) -> nn.Sequential:
     """Layers of these sizes with SiLU between them."""
     layers: list[nn.Module] = []
     for a, b in itertools.pairwise(sizes):
@@ -73,71 +75,71 @@ def dense(*sizes: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-class Last(Memory):
+class LastObservation(MemoryNetwork):
     """No memory: layers on the last observation."""
 
     recurrent = False
 
 
-class Frames(Memory):
+class FrameStack(MemoryNetwork):
     """The last 32 observations side by side."""
 
     rate, count = 5e-3, 32
 
-    def _built(self) -> int:
+    def _build_memory(self) -> int:
         return (self.count - 1) * self.inputs
 
-    def _remember(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
         before = z.new_zeros(len(z), self.count - 1, self.inputs) if state is None else state
         frames = torch.cat([before, z], 1)
         past = frames[:, :-1].unfold(1, self.count - 1, 1).flatten(2)
         return past, frames[:, 1 - self.count :]
 
 
-class Gru(Memory):
+class Gru(MemoryNetwork):
     """A gated recurrent unit of 48 cells."""
 
     size = 48
 
-    def _built(self) -> int:
+    def _build_memory(self) -> int:
         self.cell = nn.GRU(self.inputs, self.size, batch_first=True)
         return self.size
 
-    def _remember(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
         known, state = self.cell(z, None if state is None else state[None])
         return known, state[0]
 
 
-class LinearRnn(Memory):
+class LinearRnn(MemoryNetwork):
     """32 complex numbers that turn and fade, each at its own rate, whatever arrives (the LRU of
     Orvieto et al., ICML 2023)."""
 
     size = 32
 
-    def _built(self) -> int:
-        first, last = (math.log10(each) for each in _STEPS)
+    def _build_memory(self) -> int:
+        first, last = (math.log10(limit) for limit in _FADE_STEPS)
         fades = torch.logspace(first, last, self.size)
         self.fade = nn.Parameter(-torch.log(fades))
         self.turn = nn.Parameter(0.3 * torch.rand(self.size))
         self.read = nn.Linear(self.inputs, 2 * self.size, bias=False)
         return 2 * self.size
 
-    def _powers(self, steps: int) -> Any:
+    def _compute_powers(self, steps: int) -> Any:
         """What 0 to steps - 1 steps leave of each number, (steps, n)."""
         once = torch.complex(-torch.exp(self.fade), self.turn)
         return torch.exp(torch.arange(steps)[:, None] * once)
 
-    def _pushes(self, z: Any) -> Any:
+    def _project_inputs(self, z: Any) -> Any:
         """What inputs add, (B, T, n), so scaled that white ones give states of one size."""
         unit = torch.sqrt(1.0 - torch.exp(-2.0 * torch.exp(self.fade)))
         return torch.view_as_complex(self.read(z).unflatten(-1, (self.size, 2))) * unit
 
-    def _remember(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
         steps = z.shape[1]
-        powers, ages = self._powers(steps + 1), torch.arange(steps)
+        powers, ages = self._compute_powers(steps + 1), torch.arange(steps)
         past = ages[:, None] - ages
         weights = torch.where(past[..., None] >= 0, powers[past.clamp(min=0)], 0.0)
-        known = torch.einsum("tsn,bsn->btn", weights, self._pushes(z))
+        known = torch.einsum("tsn,bsn->btn", weights, self._project_inputs(z))
         if state is not None:
             known = known + powers[1:] * state[:, None]
         return torch.view_as_real(known).flatten(2), known[:, -1]
@@ -154,86 +156,88 @@ class Kalman(LinearRnn):
     """
 
     size, outputs = 16, 4
-    soon = 10.0  # steps without a packet in which the gains come half way to their last values
+    gain_rise_steps = (
+        10.0  # steps without a packet in which the gains come half way to their last values
+    )
 
-    def __init__(self, inputs: int, fresh: int, late: int) -> None:
-        super().__init__(inputs, fresh, late)
+    def __init__(self, inputs: int, fresh_index: int, delay_steps: int) -> None:
+        super().__init__(inputs, fresh_index, delay_steps)
         self.head = nn.Linear(2 * self.size + inputs, 1)
 
-    def _built(self) -> int:
-        width = super()._built()
+    def _build_memory(self) -> int:
+        width = super()._build_memory()
         self.measure = nn.Linear(self.inputs, self.outputs)
         self.expect = nn.Parameter(torch.zeros(width, self.outputs))
         self.gains = nn.Parameter(0.1 * torch.randn(2, self.outputs, width))
         return width
 
-    def _remember(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
-        n, late, steps = self.size, self.late, z.shape[1]
+    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+        n, delay_steps, steps = self.size, self.delay_steps, z.shape[1]
         if state is None:
-            state = z.new_zeros(len(z), 2 + late, n, dtype=torch.complex64)
+            state = z.new_zeros(len(z), 2 + delay_steps, n, dtype=torch.complex64)
         since, x, waiting = state[:, 0].real, state[:, 1], state[:, 2:]
-        pushes = torch.cat([waiting, self._pushes(z)], 1)
-        powers, measured = self._powers(late + 2), self.measure(z)
-        comes, known = arrived.amax((0, 2)).tolist(), []
+        pushes = torch.cat([waiting, self._project_inputs(z)], 1)
+        powers, measured = self._compute_powers(delay_steps + 2), self.measure(z)
+        has_packet, known = arrived.amax((0, 2)).tolist(), []
         for t in range(steps):
             x, since = powers[1] * x + pushes[:, t], since + 1.0
-            if comes[t]:
+            if has_packet[t]:
                 new = measured[:, t] - torch.view_as_real(x).flatten(1) @ self.expect
-                grown = (since / (since + self.soon))[:, :1]
-                told = new @ self.gains[0] + grown * (new @ self.gains[1])
-                told = torch.view_as_complex(told.unflatten(1, (n, 2)))
-                x, since = x + arrived[:, t] * told, since * (1.0 - arrived[:, t])
+                grown = (since / (since + self.gain_rise_steps))[:, :1]
+                correction = new @ self.gains[0] + grown * (new @ self.gains[1])
+                correction = torch.view_as_complex(correction.unflatten(1, (n, 2)))
+                x, since = x + arrived[:, t] * correction, since * (1.0 - arrived[:, t])
             known.append(x)
-        now = torch.stack(known, 1) * powers[late]
-        if late:
-            inside = pushes[:, 1:].unfold(1, late, 1)  # (B, T, n, late), oldest first
-            now = now + torch.einsum("btnk,kn->btn", inside, powers[:late].flip(0))
+        now = torch.stack(known, 1) * powers[delay_steps]
+        if delay_steps:
+            inside = pushes[:, 1:].unfold(1, delay_steps, 1)  # (B, T, n, late), oldest first
+            now = now + torch.einsum("btnk,kn->btn", inside, powers[:delay_steps].flip(0))
         state = torch.cat([torch.complex(since, 0.0 * since)[:, None], x[:, None]], 1)
         state = torch.cat([state, pushes[:, steps:]], 1)
         return torch.view_as_real(now).flatten(2), state
 
 
-class Transformer(Memory):
+class Transformer(MemoryNetwork):
     """Two layers of causal attention over the last 64 steps, with a learned bias for each age."""
 
     rate, window, layers, width, heads = 3e-3, 64, 2, 32, 2
 
-    def _built(self) -> int:
-        width, each = self.width, range(self.layers)
+    def _build_memory(self) -> int:
+        width, layers = self.width, range(self.layers)
         self.embed = nn.Linear(self.inputs, width)
-        self.ask = nn.ModuleList(nn.Linear(width, 3 * width) for _ in each)
-        self.answer = nn.ModuleList(nn.Linear(width, width) for _ in each)
-        self.think = nn.ModuleList(dense(width, 64, width) for _ in each)
+        self.attention_inputs = nn.ModuleList(nn.Linear(width, 3 * width) for _ in layers)
+        self.attention_outputs = nn.ModuleList(nn.Linear(width, width) for _ in layers)
+        self.feedforward = nn.ModuleList(make_dense_layers(width, 64, width) for _ in layers)
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(2 * self.layers))
         self.bias = nn.Parameter(torch.zeros(self.layers, self.heads, self.window))
         return width
 
-    def _remember(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
         batch, steps, _ = z.shape
         before, width = self.window - 1, self.width
         if state is None:
             state = z.new_zeros(batch, self.layers, before, 2 * width)
         age = torch.arange(steps)[:, None] + before - torch.arange(steps + before)
-        seen = (age >= 0) & (age < self.window)
-        x, kept = self.embed(z), []
+        visible = (age >= 0) & (age < self.window)
+        x, cached = self.embed(z), []
         for i in range(self.layers):
-            asked: Any = self.ask[i](self.norms[2 * i](x))
-            query, pair = asked[..., :width], asked[..., width:]
+            projected: Any = self.attention_inputs[i](self.norms[2 * i](x))
+            query, pair = projected[..., :width], projected[..., width:]
             pairs = torch.cat([state[:, i], pair], 1)
-            kept.append(pairs[:, -before:])
+            cached.append(pairs[:, -before:])
             parts = (query, pairs[..., :width], pairs[..., width:])
-            q, k, v = (each.unflatten(-1, (self.heads, -1)).transpose(1, 2) for each in parts)
-            bias = torch.where(seen, self.bias[i][:, age.clamp(0, before)], -torch.inf)
+            q, k, v = (part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in parts)
+            bias = torch.where(visible, self.bias[i][:, age.clamp(0, before)], -torch.inf)
             scores = q @ k.mT * (width / self.heads) ** -0.5 + bias
-            found = (scores.softmax(-1) @ v).transpose(1, 2).flatten(2)
-            x = x + self.answer[i](found)
-            x = x + self.think[i](self.norms[2 * i + 1](x))
-        return x, torch.stack(kept, 1)
+            attended = (scores.softmax(-1) @ v).transpose(1, 2).flatten(2)
+            x = x + self.attention_outputs[i](attended)
+            x = x + self.feedforward[i](self.norms[2 * i + 1](x))
+        return x, torch.stack(cached, 1)
 
 
-MEMORIES: dict[str, type[Memory]] = {
-    "mlp": Last,
-    "frames": Frames,
+MEMORIES: dict[str, type[MemoryNetwork]] = {
+    "mlp": LastObservation,
+    "frames": FrameStack,
     "gru": Gru,
     "linear-rnn": LinearRnn,
     "kalman": Kalman,
@@ -241,12 +245,13 @@ MEMORIES: dict[str, type[Memory]] = {
 }
 
 
-def make_memory(name: str, inputs: int, fresh: int, late: int) -> Memory:
+def make_memory(name: str, inputs: int, fresh_index: int, delay_steps: int) -> MemoryNetwork:
     """A new network of `MEMORIES`, arguments as of `Memory`; ValueError for an unknown name, or
     numbers that are out of range."""
     check_choice("memory", name, MEMORIES)
-    if not 0 <= fresh < inputs or late < 0:
+    if not 0 <= fresh_index < inputs or delay_steps < 0:
         raise ValueError(
-            f"fresh is one of {inputs} inputs and late at least 0, got fresh {fresh}, late {late}"
+            f"fresh is one of {inputs} inputs and late at least 0, got fresh {fresh_index}, "
+            f"late {delay_steps}"
         )
-    return MEMORIES[name](inputs, fresh, late)
+    return MEMORIES[name](inputs, fresh_index, delay_steps)

@@ -1,4 +1,4 @@
-"""Running means by torch, for training: `Traces` of the runtime, whole episodes at once."""
+"""Running means by torch, for training: `MovingAverages` of the runtime, whole episodes at once."""
 
 import functools
 from collections.abc import Sequence
@@ -6,18 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from ....envs.backend.extras import extra
-from ....estimators.learned.memory import Array, Traces
-from .mixing import APART, SMALL, whitening
+from ....envs.backend.extras import require_extra
+from ....estimators.learned.memory import Array, MovingAverages
+from .mixing import MIN_VARIANCE, SAMPLE_STRIDE, compute_whitening
 
-with extra("train", "training needs torch"):
+with require_extra("train", "training needs torch"):
     import torch
     from torch import nn
 
 TIMES = (3, 10, 30, 100, 300)
 """Steps of the means: of control periods of 10 ms from the motors' lag to half a drive."""
 _BLOCK = 50  # steps whose means are one product of matrices
-_LEAST = 1e-300  # instead of nothing: what a first step leaves of what was before
+_MIN_SHARE = 1e-300  # instead of nothing: what a first step leaves of what was before
 
 
 class TraceLayer(nn.Module):
@@ -28,15 +28,15 @@ class TraceLayer(nn.Module):
     changes, is the small difference of two of them.
     """
 
-    def __init__(self, inputs: int, bent: int, times: Sequence[float] = TIMES) -> None:
+    def __init__(self, inputs: int, n_silu: int, times: Sequence[float] = TIMES) -> None:
         super().__init__()
         self.inputs, self.times = inputs, tuple(times)
-        self.unit = nn.Linear(inputs, bent)
-        plain = inputs * (1 + len(self.times))
+        self.unit = nn.Linear(inputs, n_silu)
+        n_linear = inputs * (1 + len(self.times))
         self.mean: torch.Tensor
-        self.register_buffer("mean", torch.zeros(plain))
+        self.register_buffer("mean", torch.zeros(n_linear))
         self.mixing: torch.Tensor
-        self.register_buffer("mixing", torch.eye(plain))
+        self.register_buffer("mixing", torch.eye(n_linear))
 
     @property
     def size(self) -> int:
@@ -51,54 +51,56 @@ class TraceLayer(nn.Module):
         u = torch.cat([z, nn.functional.silu(self.unit(z))], -1)
         if state is None:
             state = u.new_zeros(len(u), len(self.times), u.shape[-1] + 1)
-        first, means, found = int(state[0, 0, -1]), state[..., :-1], []
+        first, means, blocks = int(state[0, 0, -1]), state[..., :-1], []
         for part in torch.split(u, _BLOCK, 1):
-            new, old = _weights(self.times, first, part.shape[1])
-            each = torch.einsum("nts,bsk->bntk", new, part) + old[..., None] * means[:, :, None]
-            found.append(each)
-            first, means = first + part.shape[1], each[:, :, -1]
-        all_of = torch.cat([u[:, None], torch.cat(found, 2)], 1).transpose(1, 2)
-        plain, bent = (each.flatten(2) for each in all_of.tensor_split([self.inputs], -1))
+            new, old = _compute_weights(self.times, first, part.shape[1])
+            values = torch.einsum("nts,bsk->bntk", new, part) + old[..., None] * means[:, :, None]
+            blocks.append(values)
+            first, means = first + part.shape[1], values[:, :, -1]
+        all_values = torch.cat([u[:, None], torch.cat(blocks, 2)], 1).transpose(1, 2)
+        linear, silu = (values.flatten(2) for values in all_values.tensor_split([self.inputs], -1))
         age = means.new_full((*means.shape[:-1], 1), float(first))
-        mixed = (plain - self.mean) @ self.mixing
-        return torch.cat([mixed, bent], -1), torch.cat([means, age], -1)
+        mixed = (linear - self.mean) @ self.mixing
+        return torch.cat([mixed, silu], -1), torch.cat([means, age], -1)
 
-    def whiten(self, seen: Sequence[tuple[Any, Any]]) -> None:
+    def fit_whitening(self, samples: Sequence[tuple[Any, Any]]) -> None:
         """Mix by what the plain part is on inputs (B, T, k) where a mask (B, T) says so."""
         with torch.no_grad():
-            found = [
-                self(torch.from_numpy(z))[0][..., : len(self.mean)][torch.from_numpy(there)][
-                    ::APART
+            outputs = [
+                self(torch.from_numpy(z))[0][..., : len(self.mean)][torch.from_numpy(mask)][
+                    ::SAMPLE_STRIDE
                 ]
-                for z, there in seen
+                for z, mask in samples
             ]
-        plain = torch.cat(found).numpy()
-        self.mean.copy_(torch.from_numpy(plain.mean(0)))
-        self.mixing.copy_(torch.from_numpy(whitening(plain, SMALL)))
+        linear = torch.cat(outputs).numpy()
+        self.mean.copy_(torch.from_numpy(linear.mean(0)))
+        self.mixing.copy_(torch.from_numpy(compute_whitening(linear, MIN_VARIANCE)))
 
-    def cell(self, mixing: Array) -> Traces:
+    def cell(self, mixing: Array) -> MovingAverages:
         """The units of inputs that are mixed first, (k, k), by NumPy."""
-        bent = self.unit.weight.detach().numpy() @ mixing
+        silu_weights = self.unit.weight.detach().numpy() @ mixing
         bias = np.concatenate([np.zeros(self.inputs), self.unit.bias.detach().numpy()])
-        return Traces(np.concatenate([mixing, bent]), bias, self.unit.out_features, self.times)
+        return MovingAverages(
+            np.concatenate([mixing, silu_weights]), bias, self.unit.out_features, self.times
+        )
 
-    def behind(self, weight: Array, bias: Array) -> tuple[Array, Array]:
+    def convert_weights(self, weight: Array, bias: Array) -> tuple[Array, Array]:
         """Weights (m, size) and biases (m,) of the next layer for what `cell` gives: time by time,
         plain units before bent ones, not mixed."""
         size, times = len(self.mean), 1 + len(self.times)
-        plain = weight[:, :size] @ self.mixing.numpy().astype(np.float64).T
-        bias = bias - plain @ self.mean.numpy()
-        parts = [each.reshape(len(bias), times, -1) for each in (plain, weight[:, size:])]
+        linear = weight[:, :size] @ self.mixing.numpy().astype(np.float64).T
+        bias = bias - linear @ self.mean.numpy()
+        parts = [block.reshape(len(bias), times, -1) for block in (linear, weight[:, size:])]
         return np.concatenate(parts, -1).reshape(len(bias), -1), bias
 
 
 @functools.cache
-def _weights(times: tuple[float, ...], first: int, steps: int) -> tuple[Any, Any]:
+def _compute_weights(times: tuple[float, ...], first: int, steps: int) -> tuple[Any, Any]:
     """What each step of a block counts for in the means of each, (times, T, T), and what was
     before, (times, T); first: steps before the block."""
     ages = first + 1.0 + np.arange(steps)
     shares = np.maximum(1.0 / ages, -np.expm1(-1.0 / np.array(times))[:, None])
-    left = np.log(np.maximum(1.0 - shares, _LEAST)).cumsum(-1)
+    left = np.log(np.maximum(1.0 - shares, _MIN_SHARE)).cumsum(-1)
     since = left[:, :, None] - left[:, None, :]
     new = np.tril(np.exp(np.minimum(since, 0.0))) * shares[:, None, :]
     return (

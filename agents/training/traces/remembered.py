@@ -8,12 +8,12 @@ import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ....envs.task.observation import Entry, space_of
+from ....envs.task.observation import ObservationEntry, make_space
 from ....estimators.learned.memory import Array
 from ....estimators.learned.network import Network
-from .mixing import APART, SMALL, whitening
+from .mixing import MIN_VARIANCE, SAMPLE_STRIDE, compute_whitening
 
-Driving = Callable[[Any], Any]
+PolicyFunction = Callable[[Any], Any]
 
 
 class Mixing(NamedTuple):
@@ -22,23 +22,25 @@ class Mixing(NamedTuple):
     mean: Array
     mixing: Array
 
-    def without(self, network: Network) -> Network:
+    def adapt_to_mixed(self, network: Network) -> Network:
         """A network of mixed x that gives what one of plain x does."""
         first = network.weights[0] @ np.linalg.inv(self.mixing)
-        return _beginning(network, first, network.biases[0] + network.weights[0] @ self.mean)
+        return _replace_first_layer(
+            network, first, network.biases[0] + network.weights[0] @ self.mean
+        )
 
-    def within(self, network: Network) -> Network:
+    def adapt_to_plain(self, network: Network) -> Network:
         """A network of plain x that gives what one of mixed x does."""
         first = network.weights[0] @ self.mixing
-        return _beginning(network, first, network.biases[0] - first @ self.mean)
+        return _replace_first_layer(network, first, network.biases[0] - first @ self.mean)
 
 
-def _beginning(network: Network, weights: Array, biases: Array) -> Network:
+def _replace_first_layer(network: Network, weights: Array, biases: Array) -> Network:
     rest = network.weights[1:], network.biases[1:]
     return replace(network, weights=[weights, *rest[0]], biases=[biases, *rest[1]])
 
 
-class Remembered(VectorWrapper[Any, Any, Any, Any, Any]):
+class MemoryObservation(VectorWrapper[Any, Any, Any, Any, Any]):
     """A vector env whose observations (N, k) are what a network's dense layers read.
 
     env: resets a row in the step that ends it; its observation is the network's. What the network
@@ -50,8 +52,10 @@ class Remembered(VectorWrapper[Any, Any, Any, Any, Any]):
     ) -> None:
         super().__init__(env)
         width = network.dense.inputs
-        self.layout = tuple(Entry(f"memory_{i}", "-", -np.inf, np.inf) for i in range(width))
-        self.single_observation_space = space_of(self.layout)
+        self.layout = tuple(
+            ObservationEntry(f"memory_{i}", "-", -np.inf, np.inf) for i in range(width)
+        )
+        self.single_observation_space = make_space(self.layout)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._network, self._state = network, np.zeros((env.num_envs, network.memory))
         self._mixing = mixing and Mixing(mixing.mean, mixing.mixing.astype(np.float32))
@@ -59,12 +63,12 @@ class Remembered(VectorWrapper[Any, Any, Any, Any, Any]):
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """The inner env's; rows that a `reset_mask` leaves out go on, and are not read twice."""
-        anew = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_)))
+        mask = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_)))
         obs, infos = self.env.reset(seed=seed, options=options)
-        begun, found = np.zeros_like(self._state[anew]), self._last.copy()
-        found[anew] = self._read(obs[anew], begun)
-        self._state[anew], self._last = begun, found
-        return found.copy(), infos
+        new_state, updated = np.zeros_like(self._state[mask]), self._last.copy()
+        updated[mask] = self._read(obs[mask], new_state)
+        self._state[mask], self._last = new_state, updated
+        return updated.copy(), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """The inner env's; `final_obs` of its infos too."""
@@ -72,11 +76,11 @@ class Remembered(VectorWrapper[Any, Any, Any, Any, Any]):
         over = terminated | truncated
         if over.any():
             last = np.full(len(over), None)
-            seen = np.stack(infos["final_obs"][over])
-            for i, each in zip(
-                np.flatnonzero(over), self._read(seen, self._state[over]), strict=True
+            final_obs = np.stack(infos["final_obs"][over])
+            for i, final in zip(
+                np.flatnonzero(over), self._read(final_obs, self._state[over]), strict=True
             ):
-                last[i] = each
+                last[i] = final
             infos = infos | {"final_obs": last}
             self._state[over] = 0.0
         self._last = self._read(obs, self._state)
@@ -84,24 +88,26 @@ class Remembered(VectorWrapper[Any, Any, Any, Any, Any]):
 
     def _read(self, obs: Any, state: Any) -> Any:
         """(N, k) float32; state (N, memory) is updated."""
-        x = self._network.remembered(obs.astype(np.float64), state)
+        x = self._network.compute_features(obs.astype(np.float64), state)
         if self._mixing is None:
             return x.astype(np.float32)
         return (x - self._mixing.mean).astype(np.float32) @ self._mixing.mixing
 
 
-def mixing_of(env: VectorEnv[Any, Any, Any], network: Network, drive: Driving, seed: int) -> Mixing:
+def measure_mixing(
+    env: VectorEnv[Any, Any, Any], network: Network, drive: PolicyFunction, seed: int
+) -> Mixing:
     """By what a network remembers in its own drives: one episode of each row, from a seed on.
 
-    env: as of `Remembered`. drive: gives actions of what its dense layers read.
+    env: as of `MemoryObservation`. drive: gives actions of what its dense layers read.
     """
-    seen, found = Remembered(env, network), []
-    obs, _ = seen.reset(seed=seed)
+    wrapped, collected = MemoryObservation(env, network), []
+    obs, _ = wrapped.reset(seed=seed)
     running, step = np.ones(env.num_envs, np.bool_), 0
     while running.any():
-        if step % APART == 0:
-            found.append(obs[running])
-        obs, _, terminated, truncated, _ = seen.step(drive(obs))
+        if step % SAMPLE_STRIDE == 0:
+            collected.append(obs[running])
+        obs, _, terminated, truncated, _ = wrapped.step(drive(obs))
         running, step = running & ~(terminated | truncated), step + 1
-    x = np.concatenate(found).astype(np.float64)
-    return Mixing(x.mean(0), whitening(x, SMALL))
+    x = np.concatenate(collected).astype(np.float64)
+    return Mixing(x.mean(0), compute_whitening(x, MIN_VARIANCE))

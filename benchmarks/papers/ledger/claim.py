@@ -38,7 +38,7 @@ class Example:
 
 
 @dataclass
-class Measured:
+class SimulationResult:
     """The result of a simulation or an analysis.
 
     numbers: (seeds,) by who and metric. example: None but for the chunk with the first seed.
@@ -48,10 +48,10 @@ class Measured:
     example: Example | None = None
 
 
-Results = Mapping[str, Measured]
+Results = Mapping[str, SimulationResult]
 """Results by the name of the simulation or analysis."""
 
-MOST = 0.9  # of the seeds
+MIN_AGREEMENT = 0.9  # of the seeds
 
 _RELATIONS: dict[str, Callable[[Array, float], npt.NDArray[np.bool_]]] = {
     "<": np.less,
@@ -79,7 +79,7 @@ class Bound:
                 f"got {self.relation!r} {self.value!r}"
             )
 
-    def met(self, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def is_met(self, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Which of the values meet it; NaN never does."""
         return np.asarray(_RELATIONS[self.relation](np.asarray(values, float), self.value))
 
@@ -88,7 +88,7 @@ class Bound:
 
 
 @dataclass(frozen=True)
-class Part:
+class ClaimPart:
     """One measured number of a claim.
 
     label: who against whom. of: from the results to one number a seed. scenario: the name of the
@@ -97,7 +97,7 @@ class Part:
 
     label: str
     scenario: str
-    of: Callable[[Results], Array]
+    compute: Callable[[Results], Array]
     stated: Bound | None = None
     threshold: Bound | None = None
     metric: str = "ratio"
@@ -113,7 +113,7 @@ class Claim:
     paper: str
     source: str
     text: str
-    parts: tuple[Part, ...]
+    parts: tuple[ClaimPart, ...]
     note: str = ""
 
     def __post_init__(self) -> None:
@@ -121,20 +121,20 @@ class Claim:
             raise ValueError(f"{self.paper} {self.source}: a claim needs at least one part")
 
 
-def claims_of(paper: str) -> Callable[..., Claim]:
+def make_claim_factory(paper: str) -> Callable[..., Claim]:
     """A maker of a paper's claims, from source, text, their parts and a note."""
 
-    def claim(source: str, text: str, *parts: Part, note: str = "") -> Claim:
+    def make_claim(source: str, text: str, *parts: ClaimPart, note: str = "") -> Claim:
         return Claim(paper, source, text, parts, note)
 
-    return claim
+    return make_claim
 
 
 @dataclass(frozen=True)
-class Found:
+class MeasuredPart:
     """A part with its numbers, (seeds,)."""
 
-    part: Part
+    part: ClaimPart
     values: Array
 
     @property
@@ -153,86 +153,97 @@ class Found:
         return float(np.max(self.values))
 
     @property
-    def agreeing(self) -> float:
+    def agreement(self) -> float:
         """The share of seeds that meet what the paper states; NaN where that is nothing."""
         stated = self.part.stated
-        return math.nan if stated is None else float(np.mean(stated.met(self.values)))
+        return math.nan if stated is None else float(np.mean(stated.is_met(self.values)))
 
     @property
-    def in_the_median(self) -> bool:
+    def holds_in_median(self) -> bool:
         """Whether the median meets what the paper states."""
-        return self.part.stated is not None and bool(self.part.stated.met(self.median))
+        return self.part.stated is not None and bool(self.part.stated.is_met(self.median))
 
     @property
-    def threshold_met(self) -> bool | None:
+    def meets_threshold(self) -> bool | None:
         """Whether the median meets the threshold; None where there is none."""
         threshold = self.part.threshold
-        return None if threshold is None else bool(threshold.met(self.median))
+        return None if threshold is None else bool(threshold.is_met(self.median))
 
 
-def find(claim: Claim, results: Results) -> tuple[Found, ...]:
+def measure_parts(claim: Claim, results: Results) -> tuple[MeasuredPart, ...]:
     """Every part of a claim, measured. Raises ValueError for a part without numbers."""
-    found = []
+    parts = []
     for part in claim.parts:
-        values = np.atleast_1d(np.asarray(part.of(results), np.float64))
+        values = np.atleast_1d(np.asarray(part.compute(results), np.float64))
         if values.ndim != 1 or not len(values):
             raise ValueError(f"{claim.paper} {claim.source}, {part.label}: {values.shape} numbers")
-        found.append(Found(part, values))
-    return tuple(found)
+        parts.append(MeasuredPart(part, values))
+    return tuple(parts)
 
 
-def verdict(found: Sequence[Found]) -> str:
+def evaluate_claim(parts: Sequence[MeasuredPart]) -> str:
     """The verdict on a claim: the rule of this module."""
-    judged = [each for each in found if each.part.stated is not None]
-    if not judged:
+    stated_parts = [result for result in parts if result.part.stated is not None]
+    if not stated_parts:
         return "report only"
-    if all(each.agreeing >= MOST for each in judged):
+    if all(result.agreement >= MIN_AGREEMENT for result in stated_parts):
         return "reproduced"
-    if any(each.in_the_median for each in judged):
+    if any(result.holds_in_median for result in stated_parts):
         return "partly"
     return "not reproduced"
 
 
-def number(scenario: str, who: str, metric: str) -> Callable[[Results], Array]:
+def select_number(scenario: str, subject: str, metric: str) -> Callable[[Results], Array]:
     """A measured number as it stands."""
-    return lambda results: results[scenario].numbers[who, metric]
+    return lambda results: results[scenario].numbers[subject, metric]
 
 
-def measured(
+def make_number_part(
     label: str,
     scenario: str,
-    who: str,
-    what: str,
+    subject: str,
+    quantity: str,
     stated: Bound | None = None,
     threshold: Bound | None = None,
     metric: str = "ratio",
-) -> Part:
+) -> ClaimPart:
     """A measured number as a part of a claim."""
-    return Part(label, scenario, number(scenario, who, what), stated, threshold, metric)
+    return ClaimPart(
+        label, scenario, select_number(scenario, subject, quantity), stated, threshold, metric
+    )
 
 
-def ratio(scenario: str, one: str, other: str, metric: str = "beta") -> Callable[[Results], Array]:
+def select_ratio(
+    scenario: str, one: str, other: str, metric: str = "beta"
+) -> Callable[[Results], Array]:
     """One's number over the other's, seed by seed."""
-    return over_others(scenario, one, (other,), np.min, metric)
+    return compare_others(scenario, one, (other,), np.min, metric)
 
 
-def over_others(
+def compare_others(
     scenario: str, one: str, others: Sequence[str], pick: Callable[..., Array], metric: str = "beta"
 ) -> Callable[[Results], Array]:
     """One's number over the best (pick: np.min) or the poorest (np.max) of the others'."""
 
-    def of(results: Results) -> Array:
+    def compute_ratio(results: Results) -> Array:
         numbers = results[scenario].numbers
         return np.asarray(
             numbers[one, metric] / pick([numbers[other, metric] for other in others], axis=0)
         )
 
-    return of
+    return compute_ratio
 
 
-def smaller(
-    label: str, scenario: str, one: str, other: str, most: float | None = None, metric: str = "beta"
-) -> Part:
+def make_smaller_part(
+    label: str,
+    scenario: str,
+    one: str,
+    other: str,
+    max_ratio: float | None = None,
+    metric: str = "beta",
+) -> ClaimPart:
     """The paper has one's number smaller than the other's; most: the ratio's threshold."""
-    threshold = None if most is None else Bound("<=", most)
-    return Part(label, scenario, ratio(scenario, one, other, metric), Bound("<", 1.0), threshold)
+    threshold = None if max_ratio is None else Bound("<=", max_ratio)
+    return ClaimPart(
+        label, scenario, select_ratio(scenario, one, other, metric), Bound("<", 1.0), threshold
+    )

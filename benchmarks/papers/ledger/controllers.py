@@ -8,12 +8,12 @@ import numpy as np
 
 from ....agents import make_agent
 from ....agents.rollout import Rollout, rollout
-from ....envs.scenarios.manoeuvres import scenario_from
+from ....envs.scenarios.manoeuvres import make_scenario
 from ...harness.drives import make_env
-from ...harness.parallel import chunked
+from ...harness.parallel import split_seeds
 from . import tracking
-from .claim import Array, Example, Measured
-from .simulations import FIRST, Numbers, rms, stacked
+from .claim import Array, Example, SimulationResult
+from .simulations import FIRST, Numbers, collect_numbers, rms
 
 SIGNALS = ("beta", "gamma", "steer", "yaw_moment")
 CONTESTANTS: dict[str, tuple[str, str, dict[str, Any]]] = {
@@ -28,7 +28,7 @@ _NOISE = {"camera_psi": "psi_noise", "camera_y": "y_l_noise"}
 
 
 @dataclass(frozen=True)
-class Slip:
+class SlipSimulation:
     """tie-vision's controllers on the same seeds of a lane change, each with a filter that knows
     the camera's noise.
 
@@ -45,25 +45,27 @@ class Slip:
 
     def chunks(self, seeds: int) -> list[tuple[int, ...]]:
         """The seeds of each case."""
-        return chunked(seeds, 2)
+        return split_seeds(seeds, 2)
 
-    def measure(self, seeds: tuple[int, ...]) -> Measured:
+    def measure(self, seeds: tuple[int, ...]) -> SimulationResult:
         """Drive every contestant on each seed."""
-        return _measured(seeds, self.contestants, self._drive)
+        return _measure_agents(seeds, self.contestants, self._run_episode)
 
-    def _drive(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
+    def _run_episode(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
         agent, estimator, options = CONTESTANTS[label.partition(",")[0]]
-        noise = scenario_from(self.scenario).noise
+        noise = make_scenario(self.scenario).noise
         known = {option: noise[name] for name, option in _NOISE.items() if name in noise}
         how: dict[str, Any] = {"scenario": self.scenario, "control_period": 1}
         env = make_env("sideslip/YawVision-v0", estimator, {"options": known}, **how)
         more = self.options.get(label, {})
         drive = rollout(env, make_agent(agent, env, **{**options, **more}), seed)
         base: Any = env.unwrapped
-        return drive, _effort(drive["beta"], drive["yaw_moment"], base.vehicle.yaw_moment_limit)
+        return drive, _compute_effort(
+            drive["beta"], drive["yaw_moment"], base.vehicle.yaw_moment_limit
+        )
 
 
-def _effort(slip: Array, moment: Array, limit: float) -> dict[str, float]:
+def _compute_effort(slip: Array, moment: Array, limit: float) -> dict[str, float]:
     change = np.abs(np.diff(moment))
     return {
         "rms_slip": rms(slip),
@@ -74,31 +76,31 @@ def _effort(slip: Array, moment: Array, limit: float) -> dict[str, float]:
     }
 
 
-def _measured(
+def _measure_agents(
     seeds: tuple[int, ...],
     labels: Iterable[str],
     drive: Callable[[str, int], tuple[Rollout, dict[str, float]]],
-) -> Measured:
+) -> SimulationResult:
     """The numbers of every contestant on each seed, and the signals of the first seed."""
     lines, example = [], None
     for seed in seeds:
         numbers: Numbers = {}
         curves: dict[str, dict[str, Array]] = {}
         for label in labels:
-            driven, found = drive(label, seed)
-            if driven.failed:  # fewer ticks are no better drive
+            episode, values = drive(label, seed)
+            if episode.failed:  # fewer ticks are no better drive
                 raise RuntimeError(f"{label}: the car of seed {seed} failed")
-            numbers |= {(label, name): value for name, value in found.items()}
-            curves[label] = {name: driven[name] for name in SIGNALS}
+            numbers |= {(label, name): value for name, value in values.items()}
+            curves[label] = {name: episode[name] for name in SIGNALS}
         lines.append(numbers)
         if seed == FIRST:
-            curves["reference"] = {name: driven[f"{name}_ref"] for name in ("beta", "gamma")}
-            example = Example(driven["t"], curves)
-    return Measured(stacked(lines), example)
+            curves["reference"] = {name: episode[f"{name}_ref"] for name in ("beta", "gamma")}
+            example = Example(episode["t"], curves)
+    return SimulationResult(collect_numbers(lines), example)
 
 
 @dataclass(frozen=True)
-class Following:
+class FollowingSimulation:
     """dakf-stability's controller by wire, with and without parts of it.
 
     agents: options of `tracking.drive` by label. share: of the seeds that are driven. Numbers of
@@ -112,13 +114,13 @@ class Following:
 
     def chunks(self, seeds: int) -> list[tuple[int, ...]]:
         """The seeds of each case."""
-        return chunked(max(1, round(self.share * seeds)), 2)
+        return split_seeds(max(1, round(self.share * seeds)), 2)
 
-    def measure(self, seeds: tuple[int, ...]) -> Measured:
+    def measure(self, seeds: tuple[int, ...]) -> SimulationResult:
         """Drive every agent on each seed."""
-        return _measured(seeds, self.agents, self._drive)
+        return _measure_agents(seeds, self.agents, self._run_episode)
 
-    def _drive(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
-        drive = tracking.drive(seed, self.scenario, **self.agents[label])
-        found = vars(tracking.tracking(drive))
-        return drive, {name: float(value) for name, value in found.items()}
+    def _run_episode(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
+        drive = tracking.run_episode(seed, self.scenario, **self.agents[label])
+        values = vars(tracking.measure_tracking(drive))
+        return drive, {name: float(value) for name, value in values.items()}

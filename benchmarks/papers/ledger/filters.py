@@ -10,15 +10,15 @@ import numpy as np
 
 from ....agents.rollout import rollout
 from ....envs.record import PACKET, Log
-from ....envs.scenarios.manoeuvres import scenario_from
-from ....estimators.analysis.bound import bound
+from ....envs.scenarios.manoeuvres import make_scenario
+from ....estimators.analysis.bound import compute_error_bound
 from ....estimators.design.tunings import read_tunings
 from ....estimators.estimator import Estimator
 from ....estimators.make import make_estimator
-from ...harness.drives import SETTLED, filter_arguments, quietly
-from ...harness.parallel import chunked
-from .claim import Array, Example, Measured
-from .simulations import CHUNK, FIRST, Numbers, rms, stacked
+from ...harness.drives import SETTLED, call_quietly, make_filter_arguments
+from ...harness.parallel import split_seeds
+from .claim import Array, Example, SimulationResult
+from .simulations import CHUNK, FIRST, Numbers, collect_numbers, rms
 
 _TUNED = {
     entry["estimator"]: {f"q_{state}": value for state, value in entry["q"].items()}
@@ -26,14 +26,14 @@ _TUNED = {
 }
 
 
-def tuned_for_paper(name: str) -> Mapping[str, float]:
+def get_paper_tuning(name: str) -> Mapping[str, float]:
     """Options of `make_estimator` by which a filter is tuned for its paper's own simulation; none
     for one whose default tuning is that."""
     return _TUNED.get(name, {})
 
 
 @dataclass(frozen=True)
-class Filter:
+class PaperFilter:
     """label: its name in tables. name, options: of `make_estimator`. vehicle: the "nominal" one or
     the "true" one, for which it is built."""
 
@@ -43,19 +43,19 @@ class Filter:
     vehicle: str = "nominal"
 
 
-def filters_for(filters: Sequence[Filter], base: Any) -> dict[str, Estimator]:
+def make_filters(filters: Sequence[PaperFilter], base: Any) -> dict[str, Estimator]:
     """The filters by label, tuned for their papers and built for the running episode of an env."""
-    cars, facts = {"nominal": base.nominal, "true": base.vehicle}, filter_arguments(base)
-    found = {}
-    for each in filters:
-        options = {**facts, "vehicle": cars[each.vehicle]}
-        options |= {**tuned_for_paper(each.name), **each.options}
-        found[each.label] = quietly(make_estimator, each.name, **options)
-    return found
+    cars, facts = {"nominal": base.nominal, "true": base.vehicle}, make_filter_arguments(base)
+    by_label = {}
+    for spec in filters:
+        options = {**facts, "vehicle": cars[spec.vehicle]}
+        options |= {**get_paper_tuning(spec.name), **spec.options}
+        by_label[spec.label] = call_quietly(make_estimator, spec.name, **options)
+    return by_label
 
 
 @dataclass(frozen=True)
-class Estimation:
+class EstimationSimulation:
     """Filters over the drives of a scenario, without control.
 
     Numbers of each filter: the RMSE of every state whose truth is known, from `SETTLED` on;
@@ -71,20 +71,20 @@ class Estimation:
     name: str
     env_id: str
     scenario: str | Mapping[str, Any]
-    filters: tuple[Filter, ...]
+    filters: tuple[PaperFilter, ...]
     bound: bool = False
     times: int = 1
     control_period: int = 10
 
     def __post_init__(self) -> None:
-        if self.bound and scenario_from(self.scenario).tyre_change_time is not None:
+        if self.bound and make_scenario(self.scenario).tyre_change_time is not None:
             raise ValueError(f"{self.name}: no bound is known where the tyres change on the way")
 
     def chunks(self, seeds: int) -> list[tuple[int, ...]]:
         """The seeds of each case."""
-        return chunked(self.times * seeds, CHUNK)
+        return split_seeds(self.times * seeds, CHUNK)
 
-    def measure(self, seeds: tuple[int, ...]) -> Measured:
+    def measure(self, seeds: tuple[int, ...]) -> SimulationResult:
         """Drive each seed once and run every filter over its record."""
         env: gym.Env[Any, Any] = gym.make(
             self.env_id, scenario=self.scenario, control_period=self.control_period
@@ -97,35 +97,36 @@ class Estimation:
             if drive.failed:
                 raise RuntimeError(f"{self.name}: the car of seed {seed} failed without control")
             truth = drive.log.truth
-            numbers: Numbers = {("truth", "beta"): _settled_rms(truth["beta"], drive.log)}
+            numbers: Numbers = {("truth", "beta"): _compute_settled_rms(truth["beta"], drive.log)}
             curves = {"truth": truth}
-            estimators = estimators or filters_for(self.filters, base)
+            estimators = estimators or make_filters(self.filters, base)
             for label, estimator in estimators.items():
                 estimates = estimator.run(drive.log)
                 curves[label] = {name: estimates[name] for name in estimates.names}
-                numbers |= _errors(label, curves[label], truth, drive.log, base.scenario)
+                numbers |= _compute_errors(label, curves[label], truth, drive.log, base.scenario)
             if self.bound:
-                std = bound(
-                    record=drive.log.record, **filter_arguments(base) | {"vehicle": base.vehicle}
+                std = compute_error_bound(
+                    record=drive.log.record,
+                    **make_filter_arguments(base) | {"vehicle": base.vehicle},
                 )
-                numbers["bound", "beta"] = _settled_rms(std, drive.log)
+                numbers["bound", "beta"] = _compute_settled_rms(std, drive.log)
             lines.append(numbers)
             if seed == FIRST:
                 record = drive.log.record
-                packets = {sensor: record.packets_of(sensor) for sensor in drive.log.slow}
+                packets = {sensor: record.select_packets(sensor) for sensor in drive.log.slow}
                 example = Example(drive.log.time, curves, packets)
-        return Measured(stacked(lines), example)
+        return SimulationResult(collect_numbers(lines), example)
 
 
-def _settled_rms(values: Array, log: Log) -> float:
+def _compute_settled_rms(values: Array, log: Log) -> float:
     return rms(values[log.time >= SETTLED - 1e-9])
 
 
-def _errors(
+def _compute_errors(
     label: str, estimates: Mapping[str, Array], truth: Mapping[str, Array], log: Log, scenario: Any
 ) -> Numbers:
     errors = {name: estimates[name] - truth[name] for name in truth if name in estimates}
-    numbers = {(label, name): _settled_rms(error, log) for name, error in errors.items()}
+    numbers = {(label, name): _compute_settled_rms(error, log) for name, error in errors.items()}
     if "beta" not in estimates:
         return numbers
     t, beta = log.time, estimates["beta"]

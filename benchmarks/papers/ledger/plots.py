@@ -23,45 +23,45 @@ class PaperFigure:
     caption: str
 
 
-def _lines(
+def _draw_lines(
     example: Example,
     series: Mapping[str, Array],
     y_label: str,
     window: tuple[float, float] | None = None,
     **more: Any,
 ) -> Any:
-    """Lines over time, in a window (s) of it; more: of `time_series`."""
-    from ...report.figures import time_series
+    """Lines over time, in a window (s) of it; more: of `draw_time_series`."""
+    from ...report.figures import draw_time_series
 
     t = example.time
     inside = (t >= window[0]) & (t <= window[1]) if window else np.ones(len(t), bool)
     shown = {name: signal[inside] for name, signal in series.items()}
-    return time_series(t[inside], shown, y_label, **more)
+    return draw_time_series(t[inside], shown, y_label, **more)
 
 
-def curves(
+def make_curves(
     signal: str,
     y_label: str,
-    who: Sequence[str] = (),
+    labels: Sequence[str] = (),
     window: tuple[float, float] | None = None,
     x_label: str = "time / s",
 ) -> Draw:
     """A signal of everybody (or of those named) over time. window: s, of the time axis."""
 
     def draw(example: Example) -> Any:
-        signals = {name: example.curves.get(name, {}) for name in who or example.curves}
-        series = {name: each[signal] for name, each in signals.items() if signal in each}
-        return _lines(example, series, y_label, window, x_label=x_label)
+        signals = {name: example.curves.get(name, {}) for name in labels or example.curves}
+        series = {name: values[signal] for name, values in signals.items() if signal in values}
+        return _draw_lines(example, series, y_label, window, x_label=x_label)
 
     return draw
 
 
-def loops(y_label: str) -> Draw:
+def make_loops(y_label: str) -> Draw:
     """Open loops over frequency in Hz, on a logarithmic axis."""
 
     def draw(example: Example) -> Any:
         series = {name: signals["magnitude"] for name, signals in example.curves.items()}
-        figure = _lines(example, series, y_label, x_label="frequency / Hz")
+        figure = _draw_lines(example, series, y_label, x_label="frequency / Hz")
         ends = np.log10(example.time[[0, -1]])
         figure.update_xaxes(type="log", range=[float(end) for end in ends])
         return figure
@@ -69,27 +69,29 @@ def loops(y_label: str) -> Draw:
     return draw
 
 
-def course(y_label: str, who: Sequence[str]) -> Draw:
+def make_course(y_label: str, labels: Sequence[str]) -> Draw:
     """The course psi + beta: the truth, the receiver's samples and each filter's."""
 
     def draw(example: Example) -> Any:
-        series = {name: example.curves[name]["psi"] + example.curves[name]["beta"] for name in who}
-        series["measured"] = samples(example, "gps", 0, "arrived")
-        return _lines(example, series, y_label, dots=("measured",))
+        series = {
+            name: example.curves[name]["psi"] + example.curves[name]["beta"] for name in labels
+        }
+        series["measured"] = extract_samples(example, "gps", 0, "arrived")
+        return _draw_lines(example, series, y_label, dots=("measured",))
 
     return draw
 
 
-def samples(example: Example, sensor: str, row: int, at: str) -> Array:
+def extract_samples(example: Example, sensor: str, row: int, at: str) -> Array:
     """A slow sensor's values at the ticks they were `captured` or `arrived`, NaN elsewhere."""
     values = np.full(len(example.time), np.nan)
     ticks = example.packets[sensor][:, getattr(PACKET, at)].astype(int)
-    there = ticks < len(values)
-    values[ticks[there]] = example.packets[sensor][there, PACKET.value + row]
+    in_range = ticks < len(values)
+    values[ticks[in_range]] = example.packets[sensor][in_range, PACKET.value + row]
     return values
 
 
-def held(values: Array) -> Array:
+def repeat_samples(values: Array) -> Array:
     """Samples held until the next one, as a controller without an estimator sees them."""
     known = np.flatnonzero(~np.isnan(values))
     last = np.searchsorted(known, np.arange(len(values)), side="right") - 1
@@ -98,21 +100,21 @@ def held(values: Array) -> Array:
     return out
 
 
-def measured_offset(y_label: str, who: Sequence[str], window: tuple[float, float]) -> Draw:
+def make_offset(y_label: str, labels: Sequence[str], window: tuple[float, float]) -> Draw:
     """The lateral offset: truth, the camera's held late samples, and each filter's."""
 
     def draw(example: Example) -> Any:
-        series = {name: example.curves[name]["y_l"] for name in who}
-        series["measured, held"] = held(samples(example, "camera", 1, "arrived"))
-        return _lines(example, series, y_label, window)
+        series = {name: example.curves[name]["y_l"] for name in labels}
+        series["measured, held"] = repeat_samples(extract_samples(example, "camera", 1, "arrived"))
+        return _draw_lines(example, series, y_label, window)
 
     return draw
 
 
-def delays(example: Example) -> Any:
+def draw_delays(example: Example) -> Any:
     """The delay of the newest frame over the time of its capture, for the first second."""
     packets = example.packets["camera"]
     late = np.full(len(example.time), np.nan)
     ticks = packets[:, PACKET.captured].astype(int)
     late[ticks] = packets[:, PACKET.arrived] - packets[:, PACKET.captured]
-    return _lines(example, {"camera": held(late)}, "delay / ms", (0.0, 1.0))
+    return _draw_lines(example, {"camera": repeat_samples(late)}, "delay / ms", (0.0, 1.0))

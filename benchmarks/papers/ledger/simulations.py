@@ -1,6 +1,6 @@
 """A simulation of the ledger: seeds in cases, and the numbers that they give.
 
-A simulation is data and gives the same `Measured` whatever it is: filters over one drive
+A simulation is data and gives the same `SimulationResult` whatever it is: filters over one drive
 (`filters`), controllers over the same manoeuvre (`controllers`), or a computation without a car
 (`Analysis`).
 """
@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from ...harness.parallel import chunked
-from .claim import Array, Measured
+from ...harness.parallel import split_seeds
+from .claim import Array, SimulationResult
 
 FIRST = 0  # the seed of the figures
 CHUNK = 5  # seeds of a case that is over in seconds
@@ -30,25 +30,26 @@ class Simulation(Protocol):
 
     def chunks(self, seeds: int) -> list[tuple[int, ...]]: ...  # noqa: D102
 
-    def measure(self, seeds: tuple[int, ...]) -> Measured: ...  # noqa: D102
+    def measure(self, seeds: tuple[int, ...]) -> SimulationResult: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """A computation without noise of sensors. function: importable, from seeds to `Measured`.
+    """A computation without noise of sensors. function: importable, from seeds to
+    `SimulationResult`.
 
     random: whether the seeds mean anything to it; else it is called once.
     """
 
     name: str
-    function: Callable[[tuple[int, ...]], Measured]
+    function: Callable[[tuple[int, ...]], SimulationResult]
     random: bool = True
 
     def chunks(self, seeds: int) -> list[tuple[int, ...]]:
         """The seeds of each case."""
-        return chunked(seeds if self.random else 1, CHUNK)
+        return split_seeds(seeds if self.random else 1, CHUNK)
 
-    def measure(self, seeds: tuple[int, ...]) -> Measured:
+    def measure(self, seeds: tuple[int, ...]) -> SimulationResult:
         """The function's result."""
         return self.function(seeds)
 
@@ -58,13 +59,15 @@ def rms(values: npt.ArrayLike) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def stacked(lines: list[Numbers]) -> dict[tuple[str, str], Array]:
+def collect_numbers(lines: list[Numbers]) -> dict[tuple[str, str], Array]:
     """(seeds,) of each number, from the numbers of each seed."""
     return {name: np.array([line[name] for line in lines]) for name in lines[0]}
 
 
-def joined(chunks: list[Measured]) -> Measured:
+def join_results(chunks: list[SimulationResult]) -> SimulationResult:
     """The chunks of one simulation as one."""
     names = chunks[0].numbers
     numbers = {name: np.concatenate([chunk.numbers[name] for chunk in chunks]) for name in names}
-    return Measured(numbers, next((c.example for c in chunks if c.example is not None), None))
+    return SimulationResult(
+        numbers, next((c.example for c in chunks if c.example is not None), None)
+    )

@@ -10,7 +10,7 @@ from ....agents import make_agent
 from ....agents.rollout import Rollout, rollout
 from ....envs.scenarios.scenario import Scenario
 from ...harness.drives import make_env
-from .filters import tuned_for_paper
+from .filters import get_paper_tuning
 from .simulations import rms
 
 Manoeuvre = str | Mapping[str, Any] | Scenario
@@ -36,7 +36,7 @@ class Tracking:
     failed: bool
 
 
-def drive(
+def run_episode(
     seed: int,
     scenario: Manoeuvre = "dakf-fig7",
     agent: str = "model-following",
@@ -48,14 +48,14 @@ def drive(
     agent: "none" is the steer-by-wire car without control. options: of the agent (`bandwidth`,
     `rejection`).
     """
-    tuned = dict(tuned_for_paper(estimator))
+    tuned = dict(get_paper_tuning(estimator))
     estimate = {"outputs": STATES, "options": {"slow": "gps"} | tuned}
     env = make_env(ENV_ID, estimator, estimate, scenario=scenario, control_period=1)
     return rollout(env, make_agent(agent, env, **options), seed)
 
 
-def tracking(episode: Rollout) -> Tracking:
-    """The numbers of an episode of `drive`."""
+def measure_tracking(episode: Rollout) -> Tracking:
+    """The numbers of an episode of `run_episode`."""
     moment, steering = np.abs(episode["action_0"]), np.abs(episode["action_1"])
     return Tracking(
         rms_beta=rms(episode["beta"] - episode["beta_ref"]),

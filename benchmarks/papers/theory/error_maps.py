@@ -7,10 +7,10 @@ error X~_{k|k-1} at the sample, without noise.
 import numpy as np
 
 from ....envs.record import Array
-from ....estimators.design import dual_rate as spread
+from ....estimators.design import dual_rate as dual_rate
 
 
-def fast(A: Array, C: Array, L: Array, r: int) -> list[Array]:
+def make_fast_maps(A: Array, C: Array, L: Array, r: int) -> list[Array]:
     """Maps to X~_{k+i|k+i}, i = 0 .. r-1, with a measurement at every step: (22) repeated."""
     left = np.eye(len(A)) - L @ C
     maps = [left]
@@ -19,7 +19,7 @@ def fast(A: Array, C: Array, L: Array, r: int) -> list[Array]:
     return maps
 
 
-def shared(A: Array, C: Array, shares: Array) -> list[Array]:
+def make_shared_maps(A: Array, C: Array, shares: Array) -> list[Array]:
     """Maps to X~_{k+i|k+i} with corrections by shares (r, n, q) of the sample's innovation."""
     error, maps = np.eye(len(A)), []
     for i, share in enumerate(shares):
@@ -28,17 +28,19 @@ def shared(A: Array, C: Array, shares: Array) -> list[Array]:
     return maps
 
 
-def pseudo(A: Array, C: Array, L: Array, r: int) -> list[Array]:
+def make_pseudo_maps(A: Array, C: Array, L: Array, r: int) -> list[Array]:
     """Maps with pseudo measurements (14), G from (31)."""
-    return shared(A, C, spread.pseudo(A, C, L, np.linalg.pinv(C) - L, r))
+    return make_shared_maps(
+        A, C, dual_rate.compute_pseudo_shares(A, C, L, np.linalg.pinv(C) - L, r)
+    )
 
 
-def predicted(A: Array, C: Array, L: Array, r: int) -> list[Array]:
+def make_predicted_maps(A: Array, C: Array, L: Array, r: int) -> list[Array]:
     """Maps with no correction between samples: (34)."""
-    return shared(A, C, np.concatenate([L[None], np.zeros((r - 1, *L.shape))]))
+    return make_shared_maps(A, C, np.concatenate([L[None], np.zeros((r - 1, *L.shape))]))
 
 
-def difference(ours: list[Array], others: list[Array]) -> float:
+def compute_difference(maps: list[Array], others: list[Array]) -> float:
     """The largest difference of two sequences of maps, over the largest of the others."""
-    size = max(float(np.linalg.norm(each)) for each in others)
-    return max(float(np.linalg.norm(a - b)) / size for a, b in zip(ours, others, strict=True))
+    size = max(float(np.linalg.norm(matrix)) for matrix in others)
+    return max(float(np.linalg.norm(a - b)) / size for a, b in zip(maps, others, strict=True))

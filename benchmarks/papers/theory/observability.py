@@ -8,7 +8,7 @@ import numpy as np
 from ....envs.scenarios.draws import KMH
 from ....envs.vehicle import linear
 from ....envs.vehicle.vehicle import COMS
-from ..ledger.claim import Measured
+from ..ledger.claim import SimulationResult
 
 Matrix = list[list[Fraction]]
 
@@ -33,24 +33,24 @@ def rank(matrix: Sequence[Sequence[Fraction | int]]) -> int:
     return done
 
 
-def observable(A: Matrix, C: Sequence[Sequence[Fraction | int]]) -> int:
+def compute_observability_rank(A: Matrix, C: Sequence[Sequence[Fraction | int]]) -> int:
     """The rank of [C; C A; ...; C A^(n-1)]: dakf-stability IV.D.
 
     For the continuous A; exact sampling cannot raise it, since e^(A T) keeps every A-invariant
     subspace, nor lower it but for special sampling times.
     """
     block: Matrix = [[Fraction(entry) for entry in row] for row in C]
-    every = list(block)
+    stacked = list(block)
     for _ in range(len(A) - 1):
         block = [
             [sum((a * A[k][j] for k, a in enumerate(row)), Fraction(0)) for j in range(len(A))]
             for row in block
         ]
-        every += block
-    return rank(every)
+        stacked += block
+    return rank(stacked)
 
 
-def with_disturbances(A: Matrix, rows: int) -> Matrix:
+def add_disturbances(A: Matrix, rows: int) -> Matrix:
     """A with a constant disturbance behind each of its first rows: dakf-stability (15)-(17)."""
     n = len(A)
     ends = [[Fraction(int(i == j)) for j in range(rows)] for i in range(n)]
@@ -59,17 +59,21 @@ def with_disturbances(A: Matrix, rows: int) -> Matrix:
     ]
 
 
-def coms_ranks(_: tuple[int, ...]) -> Measured:
+def compute_coms_ranks(_: tuple[int, ...]) -> SimulationResult:
     """Rank of each paper's observability matrix for the COMS at 25 km/h, taken as it is rounded."""
-    vision = [[Fraction(entry) for entry in row] for row in linear.vision(COMS, 25.0 * KMH).A]
+    vision = [
+        [Fraction(entry) for entry in row] for row in linear.make_vision_model(COMS, 25.0 * KMH).A
+    ]
     course = [row[:3] for row in vision[:3]]
     models: dict[str, tuple[Matrix, list[list[int]]]] = {
-        "dakf": (with_disturbances(course, 2), [[0, 1, 0], [1, 0, 1]]),  # gyro and course
-        "dual-rate": (with_disturbances(course, 3), [[1, 0, 1]]),
+        "dakf": (add_disturbances(course, 2), [[0, 1, 0], [1, 0, 1]]),  # gyro and course
+        "dual-rate": (add_disturbances(course, 3), [[1, 0, 1]]),
         "vision": (vision, [[0, 0, 1, 0], [0, 0, 0, 1]]),
     }
     ranks = {
-        name: observable(A, [row + [0] * (len(A) - len(row)) for row in C])
+        name: compute_observability_rank(A, [row + [0] * (len(A) - len(row)) for row in C])
         for name, (A, C) in models.items()
     }
-    return Measured({(name, "rank"): np.array([float(each)]) for name, each in ranks.items()})
+    return SimulationResult(
+        {(name, "rank"): np.array([float(value)]) for name, value in ranks.items()}
+    )

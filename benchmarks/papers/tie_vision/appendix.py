@@ -11,15 +11,15 @@ from functools import reduce
 
 import numpy as np
 
-from ..ledger.claim import Array, Measured
-from ..ledger.simulations import Numbers, stacked
+from ..ledger.claim import Array, SimulationResult
+from ..ledger.simulations import Numbers, collect_numbers
 
 STEPS = 6
 STATES, OUTPUTS = 4, 3
 
 
 @dataclass
-class Drive:
+class RandomSystem:
     """Steps 0 .. n of a random system: G, w of the step to i+1; K, v of step i (0 unused)."""
 
     G: list[Array]
@@ -30,58 +30,58 @@ class Drive:
     e: Array  # at step 0
 
 
-def random_drive(seed: int) -> Drive:
+def draw_system(seed: int) -> RandomSystem:
     """One system, with gains that make the error neither vanish nor explode."""
     rng = np.random.default_rng(seed)
 
-    def several(*shape: int) -> list[Array]:
+    def draw_arrays(*shape: int) -> list[Array]:
         return [rng.normal(size=shape) for _ in range(STEPS + 1)]
 
-    G = [np.eye(STATES) + 0.2 * g for g in several(STATES, STATES)]
-    K = [0.2 * k for k in several(STATES, OUTPUTS)]
+    G = [np.eye(STATES) + 0.2 * g for g in draw_arrays(STATES, STATES)]
+    K = [0.2 * k for k in draw_arrays(STATES, OUTPUTS)]
     C = rng.normal(size=(OUTPUTS, STATES))
-    return Drive(G, C, K, several(STATES), several(OUTPUTS), rng.normal(size=STATES))
+    return RandomSystem(G, C, K, draw_arrays(STATES), draw_arrays(OUTPUTS), rng.normal(size=STATES))
 
 
-def product(factors: list[Array]) -> Array:
+def compute_product(factors: list[Array]) -> Array:
     """The product with the newest factor on the left, as the appendix has it."""
     return reduce(lambda total, factor: factor @ total, factors, np.eye(STATES))
 
 
-def residual(found: Array, simulated: Array) -> float:
+def compute_residual(formula: Array, simulated: Array) -> float:
     """The largest difference over the largest entry."""
-    return float(np.abs(found - simulated).max() / np.abs(simulated).max())
+    return float(np.abs(formula - simulated).max() / np.abs(simulated).max())
 
 
-def ideal(d: Drive) -> dict[str, float]:
+def check_ideal(d: RandomSystem) -> dict[str, float]:
     """Case 1: a measurement at every step."""
     n, e = STEPS, d.e
     for i in range(1, n + 1):
         predicted = d.G[i - 1] @ e + d.w[i - 1]
         e = predicted - d.K[i] @ (d.C @ predicted + d.v[i])  # (17)-(18)
     M = [np.eye(STATES) - K @ d.C for K in d.K]
-    closed = product([M[i] @ d.G[i - 1] for i in range(1, n + 1)]) @ d.e
+    closed = compute_product([M[i] @ d.G[i - 1] for i in range(1, n + 1)]) @ d.e
     for p in range(n):
-        after = product([M[i + 1] @ d.G[i] for i in range(p + 1, n)])
+        after = compute_product([M[i + 1] @ d.G[i] for i in range(p + 1, n)])
         closed = closed + after @ M[p + 1] @ d.w[p]
     for p in range(1, n + 1):
-        after = product([M[i] @ d.G[i - 1] for i in range(p + 1, n + 1)])
+        after = compute_product([M[i] @ d.G[i - 1] for i in range(p + 1, n + 1)])
         closed = closed - after @ d.K[p] @ d.v[p]
-    return {"case 1": residual(closed, e)}
+    return {"case 1": compute_residual(closed, e)}
 
 
-def predicted_only(d: Drive) -> dict[str, float]:
+def check_predicted(d: RandomSystem) -> dict[str, float]:
     """Case 2: no correction between samples."""
     e = d.e
     for i in range(STEPS):
         e = d.G[i] @ e + d.w[i]
-    closed = product(d.G[:STEPS]) @ d.e
+    closed = compute_product(d.G[:STEPS]) @ d.e
     for p in range(STEPS):
-        closed = closed + product(d.G[p + 1 : STEPS]) @ d.w[p]
-    return {"case 2": residual(closed, e)}
+        closed = closed + compute_product(d.G[p + 1 : STEPS]) @ d.w[p]
+    return {"case 2": compute_residual(closed, e)}
 
 
-def compensated(d: Drive) -> dict[str, float]:
+def check_compensated(d: RandomSystem) -> dict[str, float]:
     """Case 3: any pseudo-residual; then the exact one, C G e."""
     n, e = STEPS, d.e
     for i in range(1, n + 1):  # v stands for any pseudo-residual: the first form is an identity
@@ -89,30 +89,30 @@ def compensated(d: Drive) -> dict[str, float]:
     sums = {}
     for label, held in (("case 3 (a)", False), ("case 3 (a), printed", True)):
         G = [d.G[1] if held else g for g in d.G]
-        closed = product(d.G[:n]) @ d.e
+        closed = compute_product(d.G[:n]) @ d.e
         for p in range(n):
-            closed = closed + product(G[p + 1 : n]) @ d.w[p]
+            closed = closed + compute_product(G[p + 1 : n]) @ d.w[p]
         for p in range(1, n + 1):
-            closed = closed - product(G[p:n]) @ d.K[p] @ d.v[p]
-        sums[label] = residual(closed, e)
+            closed = closed - compute_product(G[p:n]) @ d.K[p] @ d.v[p]
+        sums[label] = compute_residual(closed, e)
     M = [np.eye(STATES) - K @ d.C for K in d.K]
     e = d.e
     for i in range(1, n + 1):
         e = M[i] @ d.G[i - 1] @ e + d.w[i - 1]  # with the exact residual C G e
-    start = product([M[i] @ d.G[i - 1] for i in range(1, n + 1)]) @ d.e
+    start = compute_product([M[i] @ d.G[i - 1] for i in range(1, n + 1)]) @ d.e
     for label, factor in (("case 3 (b)", False), ("case 3 (b), printed", True)):
         closed = start
         for p in range(n):
-            after = product([M[i + 1] @ d.G[i] for i in range(p + 1, n)])
+            after = compute_product([M[i + 1] @ d.G[i] for i in range(p + 1, n)])
             closed = closed + after @ (M[p + 1] @ d.w[p] if factor else d.w[p])
-        sums[label] = residual(closed, e)
+        sums[label] = compute_residual(closed, e)
     return sums
 
 
-def residuals(seeds: tuple[int, ...]) -> Measured:
+def compute_residuals(seeds: tuple[int, ...]) -> SimulationResult:
     """Every formula's residual on each seed's system."""
     lines: list[Numbers] = []
-    for drive in map(random_drive, seeds):
-        found = ideal(drive) | predicted_only(drive) | compensated(drive)
-        lines.append({(label, "residual"): value for label, value in found.items()})
-    return Measured(stacked(lines))
+    for drive in map(draw_system, seeds):
+        by_case = check_ideal(drive) | check_predicted(drive) | check_compensated(drive)
+        lines.append({(label, "residual"): value for label, value in by_case.items()})
+    return SimulationResult(collect_numbers(lines))

@@ -13,15 +13,22 @@ from scipy.linalg import solve_discrete_are
 
 from ....envs.scenarios.draws import KMH
 from ....envs.sensors.slow import CAMERA_33_30
-from ....envs.vehicle.linear import vision
+from ....envs.vehicle.linear import make_vision_model
 from ....envs.vehicle.vehicle import COMS
 from ....estimators.design import kalman
 from ....estimators.make import make_estimator
-from ..ledger.claim import Array, Bound, Example, Measured, claims_of, measured
-from ..ledger.plots import PaperFigure, curves
+from ..ledger.claim import (
+    Array,
+    Bound,
+    Example,
+    SimulationResult,
+    make_claim_factory,
+    make_number_part,
+)
+from ..ledger.plots import PaperFigure, make_curves
 from ..ledger.simulations import FIRST, Analysis
 from ..theory import error_maps
-from .appendix import residuals
+from .appendix import compute_residuals
 
 PAPER = "tie-vision"
 MAPS, TUNINGS, APPENDIX = "tie-vision-maps", "tie-vision-tunings", "tie-vision-appendix"
@@ -34,26 +41,26 @@ C = np.zeros((3, 6))  # of (13): gamma and the delayed psi and y_l
 C[0, 1] = C[1, 4] = C[2, 5] = 1.0
 
 
-def transitions() -> tuple[Array, Array]:
+def make_transitions() -> tuple[Array, Array]:
     """G of (13) at 1 ms: with the delayed states held, and in the step after a trigger (12)."""
     held = np.eye(6)
-    held[:4, :4], _ = vision(COMS, SPEED).discrete(1e-3)
+    held[:4, :4], _ = make_vision_model(COMS, SPEED).discretise(1e-3)
     latched = held.copy()
     latched[4:] = 0.0
     latched[4, 2] = latched[5, 3] = 1.0
     return held, latched
 
 
-def literal_gain(Q: Array) -> Array:
+def compute_literal_gain(Q: Array) -> Array:
     """The Kalman gain of (13) at 1 ms with a measurement at every step, (6, 3)."""
-    _, latched = transitions()
+    _, latched = make_transitions()
     noise = np.diag([*Q, 0.0, 0.0]) * 1e-3
-    return kalman.gain(solve_discrete_are(latched.T, C.T, noise, R), C, R)
+    return kalman.kalman_gain(solve_discrete_are(latched.T, C.T, noise, R), C, R)
 
 
-def spectral_radius(K: Array) -> float:
+def compute_spectral_radius(K: Array) -> float:
     """Growth of (error, estimated error e) over a frame: (19)-(22) with the gyro at 1 ms."""
-    held, latched = transitions()
+    held, latched = make_transitions()
     I, zero = np.eye(6), np.zeros((6, 6))  # noqa: E741
     inverse = C.T @ np.linalg.inv(C @ C.T)
     sample = np.block([[I - K @ C, zero], [(inverse - K) @ C, zero]])  # (19)-(20)
@@ -66,7 +73,7 @@ def spectral_radius(K: Array) -> float:
     return float(np.abs(np.linalg.eigvals(total)).max())
 
 
-def random_tunings(seeds: tuple[int, ...], batch: int = 20) -> Measured:
+def measure_tunings(seeds: tuple[int, ...], batch: int = 20) -> SimulationResult:
     """The share of random tunings with which the error grows; a batch a seed.
 
     Process noise of each state log-uniform over eight decades up to 1 (unit)^2/s.
@@ -76,15 +83,15 @@ def random_tunings(seeds: tuple[int, ...], batch: int = 20) -> Measured:
         rng = np.random.default_rng(seed)
         tunings = 10.0 ** rng.uniform(-8.0, 0.0, (batch, 4))
         radii = {
-            LITERAL: [spectral_radius(literal_gain(Q)) for Q in tunings],
-            SPREAD: [_shipped(Q) for Q in tunings],
+            LITERAL: [compute_spectral_radius(compute_literal_gain(Q)) for Q in tunings],
+            SPREAD: [_compute_shipped_radius(Q) for Q in tunings],
         }
-        for name, found in radii.items():
-            shares[name].append(float(np.mean(np.array(found) > 1.0 + 1e-9)))
-    return Measured({(name, "share"): np.array(values) for name, values in shares.items()})
+        for name, tuning_radii in radii.items():
+            shares[name].append(float(np.mean(np.array(tuning_radii) > 1.0 + 1e-9)))
+    return SimulationResult({(name, "share"): np.array(values) for name, values in shares.items()})
 
 
-def _shipped(Q: Array) -> float:
+def _compute_shipped_radius(Q: Array) -> float:
     return make_estimator(
         "multirate-residual-kf",
         vehicle=COMS,
@@ -95,51 +102,54 @@ def _shipped(Q: Array) -> float:
     ).spectral_radius
 
 
-def intersample_maps(seeds: tuple[int, ...]) -> Measured:
+def measure_maps(seeds: tuple[int, ...]) -> SimulationResult:
     """The difference of the error dynamics with pseudo-residuals from those of a fast camera.
 
     The vision model at 1 ms, every row slow, a Kalman gain of random process noise a seed. The
     example has the size of the maps of the appendix's three cases, of the first seed.
     """
-    model = vision(COMS, SPEED)
-    G, _ = model.discrete(1e-3)
-    found, example = [], None
+    model = make_vision_model(COMS, SPEED)
+    G, _ = model.discretise(1e-3)
+    differences, example = [], None
     for seed in seeds:
         Q = 1e-3 * np.diag(10.0 ** np.random.default_rng(seed).uniform(-8.0, 0.0, 4))
-        K = kalman.gain(solve_discrete_are(G.T, model.C.T, Q, R), model.C, R)
+        K = kalman.kalman_gain(solve_discrete_are(G.T, model.C.T, Q, R), model.C, R)
         cases = {
-            "ideal": error_maps.fast(G, model.C, K, PERIOD),
-            "none": error_maps.predicted(G, model.C, K, PERIOD),
-            "pseudo-residuals": error_maps.pseudo(G, model.C, K, PERIOD),
+            "ideal": error_maps.make_fast_maps(G, model.C, K, PERIOD),
+            "none": error_maps.make_predicted_maps(G, model.C, K, PERIOD),
+            "pseudo-residuals": error_maps.make_pseudo_maps(G, model.C, K, PERIOD),
         }
-        found.append(error_maps.difference(cases["pseudo-residuals"], cases["ideal"]))
+        differences.append(error_maps.compute_difference(cases["pseudo-residuals"], cases["ideal"]))
         if seed == FIRST:
-            whole = np.linalg.norm(np.eye(len(G)))
+            initial_size = np.linalg.norm(np.eye(len(G)))
             sizes = {
-                name: {"error": np.array([np.linalg.norm(each) / whole for each in maps])}
+                name: {
+                    "error": np.array([np.linalg.norm(matrix) / initial_size for matrix in maps])
+                }
                 for name, maps in cases.items()
             }
             example = Example(np.arange(float(PERIOD)), sizes)
-    return Measured({("pseudo-residuals", "difference"): np.array(found)}, example)
+    return SimulationResult({("pseudo-residuals", "difference"): np.array(differences)}, example)
 
 
 SIMULATIONS = (
-    Analysis(TUNINGS, random_tunings),
-    Analysis(MAPS, intersample_maps),
-    Analysis(APPENDIX, residuals),
+    Analysis(TUNINGS, measure_tunings),
+    Analysis(MAPS, measure_maps),
+    Analysis(APPENDIX, compute_residuals),
 )
 
 _zero = Bound("<=", 1e-12)
-claim = claims_of(PAPER)
+claim = make_claim_factory(PAPER)
 # A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
     claim("Appendix",
         "pseudo-residuals let the estimate converge, as measurements at every step would",
-        measured("error dynamics, difference from a fast camera", MAPS, "pseudo-residuals",
+        make_number_part("error dynamics, difference from a fast camera", MAPS, "pseudo-residuals",
             "difference", Bound("<=", 1e-9), metric="difference"),
         *(
-            measured(f"share of random tunings that diverge, {gain}", TUNINGS, gain, "share",
+            make_number_part(f"share of random tunings that diverge, {gain}", TUNINGS, gain,
+                             "share",
                 Bound("=", 0.0), metric="share")
             for gain in (LITERAL, SPREAD)
         ),
@@ -148,7 +158,8 @@ CLAIMS = (
         "leaves open."),
     claim("Appendix", "the error recursions of the three cases",
         *(
-            measured(f"{case}, residual", APPENDIX, case, "residual", None if corrected else _zero,
+            make_number_part(f"{case}, residual", APPENDIX, case, "residual",
+                             None if corrected else _zero,
                 _zero if corrected or not case.endswith("printed") else None, "residual")
             for case, corrected in (("case 1", False), ("case 2", False), ("case 3 (a)", True),
                 ("case 3 (a), printed", False), ("case 3 (b)", True),
@@ -161,7 +172,7 @@ CLAIMS = (
 figure = partial(PaperFigure, PAPER)
 FIGURES = (
     figure("Appendix: what is left of an error between samples", MAPS,
-        curves("error", "size of the error / its size before the sample", x_label="time / ms"),
+        make_curves("error", "size of the error / its size before the sample", x_label="time / ms"),
         "A sample at 0 ms, the next after 33 ms. Ideal: a fast camera (case 1); none: no "
         "correction in between (case 2); pseudo-residuals: case 3. Without noise."),
 )

@@ -4,9 +4,17 @@ from functools import partial
 
 import numpy as np
 
-from ..ledger.claim import Bound, Measured, Part, claims_of, over_others, ratio, smaller
-from ..ledger.filters import Estimation, Filter
-from ..ledger.plots import PaperFigure, curves
+from ..ledger.claim import (
+    Bound,
+    ClaimPart,
+    SimulationResult,
+    compare_others,
+    make_claim_factory,
+    make_smaller_part,
+    select_ratio,
+)
+from ..ledger.filters import EstimationSimulation, PaperFilter
+from ..ledger.plots import PaperFigure, make_curves
 
 PAPER = "tie-vision"
 FIG7, FIG9 = "tie-vision-fig7", "tie-vision-fig9"
@@ -15,62 +23,66 @@ PROPOSED, EXACT = "multirate-residual-kf", "exact-kf, true model"
 NO_DELAY = "multirate-kf, delay ignored"
 RETUNED = "multirate-kf, delay ignored, tuned for it"
 
-_PAPERS_OWN = tuple(Filter(name, name) for name in (BICYCLE, SINGLE, MULTI, PROPOSED))
+_PAPERS_OWN = tuple(PaperFilter(name, name) for name in (BICYCLE, SINGLE, MULTI, PROPOSED))
 # as tunings.toml, but with psi and y_l's noise free too: seeds 1000 to 1011 of this drive
 _Q = {"q_beta": 8.8e-3, "q_gamma": 0.15, "q_psi": 2.9e-8, "q_y_l": 1.3e-7}
 _FOR_NO_DELAY = {**_Q, "psi_noise": 1.5e-3, "y_l_noise": 2.2}
 
 # fmt: off
 SIMULATIONS = (
-    Estimation(FIG7, "sideslip/YawVision-v0", FIG7,
-        (*_PAPERS_OWN, Filter(NO_DELAY, MULTI, {"delay": "ignore"}),
-            Filter(RETUNED, MULTI, {"delay": "ignore", **_FOR_NO_DELAY}),
-            Filter(EXACT, "exact-kf", vehicle="true")),
+    EstimationSimulation(FIG7, "sideslip/YawVision-v0", FIG7,
+        (*_PAPERS_OWN, PaperFilter(NO_DELAY, MULTI, {"delay": "ignore"}),
+            PaperFilter(RETUNED, MULTI, {"delay": "ignore", **_FOR_NO_DELAY}),
+            PaperFilter(EXACT, "exact-kf", vehicle="true")),
         bound=True, times=5),
-    Estimation(FIG9, "sideslip/YawVision-v0", FIG9, _PAPERS_OWN),
+    EstimationSimulation(FIG9, "sideslip/YawVision-v0", FIG9, _PAPERS_OWN),
 )
 # fmt: on
 
 
-def _poorest(scenario: str, threshold: Bound | None) -> Part:
-    return Part(
+def _make_poorest_part(scenario: str, threshold: Bound | None) -> ClaimPart:
+    return ClaimPart(
         "bicycle / poorest vision filter",
         scenario,
-        over_others(scenario, BICYCLE, (SINGLE, MULTI, PROPOSED), np.max),
+        compare_others(scenario, BICYCLE, (SINGLE, MULTI, PROPOSED), np.max),
         Bound(">", 1.0),
         threshold,
     )
 
 
-def _best(scenario: str, most: float | None) -> tuple[Part, ...]:
+def _make_best_parts(scenario: str, max_ratio: float | None) -> tuple[ClaimPart, ...]:
     return (
-        smaller("proposed / bicycle", scenario, PROPOSED, BICYCLE),
-        smaller("proposed / single-rate", scenario, PROPOSED, SINGLE),
-        smaller("proposed / multirate", scenario, PROPOSED, MULTI, most),
+        make_smaller_part("proposed / bicycle", scenario, PROPOSED, BICYCLE),
+        make_smaller_part("proposed / single-rate", scenario, PROPOSED, SINGLE),
+        make_smaller_part("proposed / multirate", scenario, PROPOSED, MULTI, max_ratio),
     )
 
 
-def _pooled(measured: Measured, one: str, other: str) -> np.ndarray:
+def _compute_pooled_ratio(measured: SimulationResult, one: str, other: str) -> np.ndarray:
     """The ratio of RMS values over all seeds together, (1,)."""
-    squares = [np.mean(measured.numbers[who, "beta"] ** 2) for who in (one, other)]
+    squares = [np.mean(measured.numbers[label, "beta"] ** 2) for label in (one, other)]
     return np.array([np.sqrt(squares[0] / squares[1])])
 
 
-claim = claims_of(PAPER)
+claim = make_claim_factory(PAPER)
 # A claim a paragraph, a part a line: by hand.
 # fmt: off
 CLAIMS = (
-    claim("Fig. 7", "the bicycle model's filter is the poorest", _poorest(FIG7, Bound(">=", 1.05))),
+    claim("Fig. 7", "the bicycle model's filter is the poorest",
+          _make_poorest_part(FIG7, Bound(">=", 1.05))),
     claim("Fig. 7", "the multirate filter with pseudo-residuals is the best",
-        *_best(FIG7, 1.10),
+        *_make_best_parts(FIG7, 1.10),
         note="For an optimal gain the expected error given the residual is zero: the correction "
         "adds no information, it is a change of gain."),
     claim("Fig. 7", "how far from the best possible, and what the delay costs",
-        Part("exact filter of the true model / bound, pooled", FIG7,
-            lambda results: _pooled(results[FIG7], EXACT, "bound"), threshold=Bound("<=", 1.03)),
-        Part("multirate / bound: the stiffness error", FIG7, ratio(FIG7, MULTI, "bound")),
-        Part("delay ignored / multirate", FIG7, ratio(FIG7, NO_DELAY, MULTI)),
-        Part("delay ignored, tuned for it / multirate", FIG7, ratio(FIG7, RETUNED, MULTI)),
+        ClaimPart("exact filter of the true model / bound, pooled", FIG7,
+            lambda results: _compute_pooled_ratio(results[FIG7], EXACT, "bound"),
+            threshold=Bound("<=", 1.03)),
+        ClaimPart("multirate / bound: the stiffness error", FIG7,
+                  select_ratio(FIG7, MULTI, "bound")),
+        ClaimPart("delay ignored / multirate", FIG7, select_ratio(FIG7, NO_DELAY, MULTI)),
+        ClaimPart("delay ignored, tuned for it / multirate", FIG7,
+                  select_ratio(FIG7, RETUNED, MULTI)),
         note="docs/PAPERS.md has 2.7 for the stiffness error and 1.64 for the ignored delay. The "
         "exact filter reaches our bound, so that 2.7 belongs to another bound. What ignoring the "
         "delay costs is a matter of tuning: more than twice the error with the gains of the "
@@ -78,18 +90,18 @@ CLAIMS = (
         "ignoring it, since on a single sine the lag that is left cancels the lag of too soft "
         "tyres."),
     claim("Fig. 9 (twin)", "on the road the bicycle model's filter is the poorest",
-        _poorest(FIG9, None)),
+        _make_poorest_part(FIG9, None)),
     claim("Fig. 9 (twin)", "on the road the filter with pseudo-residuals is the best",
-        *_best(FIG9, None)),
+        *_make_best_parts(FIG9, None)),
 )
 
 _BETA = "body slip angle / rad"
 _SHOWN = ("truth", BICYCLE, SINGLE, MULTI, PROPOSED)
 figure = partial(PaperFigure, PAPER)
 FIGURES = (
-    figure("Fig. 7: body slip angle, estimators", FIG7, curves("beta", _BETA, _SHOWN),
+    figure("Fig. 7: body slip angle, estimators", FIG7, make_curves("beta", _BETA, _SHOWN),
         "Sine steering at 25 km/h, tyres 1.2 times stiffer than the filters believe."),
     figure("Fig. 9 (twin): body slip angle, estimators", FIG9,
-        curves("beta", _BETA, _SHOWN, (8.0, 20.0)),
+        make_curves("beta", _BETA, _SHOWN, (8.0, 20.0)),
         "The driver's sine while the car goes from 0 to 30 km/h; 12 of 30 s."),
 )

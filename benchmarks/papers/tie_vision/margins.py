@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _DECADES, _POINTS = 6, 4000  # of the frequency grid, below half the sampling rate
 
 
-def crossings(loop: "Loop") -> Array:
+def find_crossings(loop: "Loop") -> Array:
     """(n, 2): factors on the loop that bring it to -1, and rad/s, in the order of frequency.
 
     L is real at z = -1: where it is negative there, half the sampling rate is a phase crossover.
@@ -37,32 +37,36 @@ def crossings(loop: "Loop") -> Array:
     dt = float(loop.dt)
     top = math.pi / dt
 
-    def at(omega: float) -> complex:
-        return complex(_response(loop, np.exp(1j * np.array([omega * dt])))[0])
+    def evaluate_loop(omega: float) -> complex:
+        return complex(_compute_response(loop, np.exp(1j * np.array([omega * dt])))[0])
 
     grid = top * np.logspace(-_DECADES, 0.0, _POINTS)[:-1]
-    signs = np.sign(_response(loop, np.exp(1j * grid * dt)).imag)
-    found = [
-        float(brentq(lambda w: at(w).imag, low, high, xtol=1e-14 * low, rtol=1e-14))
+    signs = np.sign(_compute_response(loop, np.exp(1j * grid * dt)).imag)
+    frequencies = [
+        float(brentq(lambda w: evaluate_loop(w).imag, low, high, xtol=1e-14 * low, rtol=1e-14))
         for low, high, changes in zip(grid, grid[1:], signs[:-1] * signs[1:] < 0.0, strict=False)
         if changes
     ]
-    factors = [(1.0 / abs(at(omega)), omega) for omega in found if at(omega).real < 0.0]
-    end = at(top).real
+    factors = [
+        (1.0 / abs(evaluate_loop(omega)), omega)
+        for omega in frequencies
+        if evaluate_loop(omega).real < 0.0
+    ]
+    end = evaluate_loop(top).real
     return np.reshape([*factors, *([(-1.0 / end, top)] if end < 0.0 else [])], (-1, 2))
 
 
-def gain_margin(loop: "Loop") -> tuple[float, float]:
+def compute_gain_margin(loop: "Loop") -> tuple[float, float]:
     """(dB, rad/s) of the smallest gain above 1 that reaches -1; (inf, nan) where none does."""
-    found = crossings(loop)
-    rising = found[found[:, 0] > 1.0]
+    margins = find_crossings(loop)
+    rising = margins[margins[:, 0] > 1.0]
     if not len(rising):
         return math.inf, math.nan
     factor, omega = rising[np.argmin(rising[:, 0])]
     return 20.0 * math.log10(factor), float(omega)
 
 
-def _response(loop: "Loop", z: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
+def _compute_response(loop: "Loop", z: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
     """The loop at the points z, (n,); python-control's own takes a state space point by point."""
     if not hasattr(loop, "A"):
         return np.asarray(loop(z))

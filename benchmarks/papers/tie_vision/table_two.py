@@ -19,10 +19,10 @@ from ....agents.design.pi import PI, PLACEMENTS, POLE, design_pi
 from ....envs.record import Array
 from ....envs.scenarios.draws import KMH
 from ....envs.ticks import TICK
-from ....envs.vehicle.linear import bicycle, vision
+from ....envs.vehicle.linear import make_bicycle_model, make_vision_model
 from ....envs.vehicle.vehicle import Vehicle
-from ....estimators.design.kalman import gain
-from .margins import gain_margin
+from ....estimators.design.kalman import kalman_gain
+from .margins import compute_gain_margin
 
 if TYPE_CHECKING:
     from control import StateSpace
@@ -53,29 +53,29 @@ class LoopDesign:
     noise: float = 1e-9
 
 
-def _direct(pi: PI, dt: float, integral: str) -> float:
+def _compute_direct_gain(pi: PI, dt: float, integral: str) -> float:
     """The PI's direct gain; its sum grows by k_i dt error in all three forms."""
     return pi.k_p + INTEGRALS[integral] * pi.k_i * dt
 
 
-def plain_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
+def make_plain_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
     """PI and plant with beta measured without delay; yaw moment held over dt seconds."""
     import control
 
     pi = _pi(vehicle, design.speed, design.pole, design.placement)
-    G, H = bicycle(vehicle, design.speed).discrete(dt)
+    G, H = make_bicycle_model(vehicle, design.speed).discretise(dt)
     plant = control.StateSpace(G, H[:, 1:], [[1.0, 0.0]], 0.0, dt)
-    direct = _direct(pi, dt, design.integral)
+    direct = _compute_direct_gain(pi, dt, design.integral)
     return plant * control.StateSpace(1.0, pi.k_i * dt, 1.0, direct, dt)
 
 
 @lru_cache(maxsize=1024)
-def _filter(
+def _make_filter(
     vehicle: Vehicle, speed: float, sensors: str, q_ratio: float, noise: float, dt: float
 ) -> tuple[Array, Array, Array, Array]:
     """(G, H, C, K): from the yaw moment to what the filter measures, and its steady gain."""
-    model = (bicycle if sensors == "gyro" else vision)(vehicle, speed)
-    G, H = model.discrete(dt)
+    model = (make_bicycle_model if sensors == "gyro" else make_vision_model)(vehicle, speed)
+    G, H = model.discretise(dt)
     H, C = H[:, 1:2], model.C
     if sensors == "vision-delayed":
         G = np.block([[G, np.zeros((4, 2))], [np.eye(6)[2:4]]])  # tie-vision (12)
@@ -85,17 +85,19 @@ def _filter(
     driven = min(len(G), 4)  # what (12) only remembers is not driven
     Q[range(driven), range(driven)] = [q_ratio, 1.0, 1.0, 1.0][:driven]
     R = noise * np.eye(len(C))
-    return G, H, C, gain(solve_discrete_are(G.T, C.T, Q, R), C, R)
+    return G, H, C, kalman_gain(solve_discrete_are(G.T, C.T, Q, R), C, R)
 
 
 _pi = lru_cache(maxsize=256)(design_pi)
 
 
-def _opened(vehicle: Vehicle, design: LoopDesign, dt: float) -> tuple[Parts, Parts]:
+def _split_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> tuple[Parts, Parts]:
     """(A, B, C, D) of the plant and, with the sign of negative feedback, of filter and PI."""
     pi = _pi(vehicle, design.speed, design.pole, design.placement)
-    G, H, C, K = _filter(vehicle, design.speed, design.sensors, design.q_ratio, design.noise, dt)
-    F, direct = np.eye(len(G)) - K @ C, _direct(pi, dt, design.integral)
+    G, H, C, K = _make_filter(
+        vehicle, design.speed, design.sensors, design.q_ratio, design.noise, dt
+    )
+    F, direct = np.eye(len(G)) - K @ C, _compute_direct_gain(pi, dt, design.integral)
     beta_x, beta_y = F[:1], K[:1]  # the estimate of beta from the prediction and from y
     one = np.ones((1, 1))
     A = np.block([[G @ F - direct * H @ beta_x, H], [-pi.k_i * dt * beta_x, one]])
@@ -106,7 +108,7 @@ def _opened(vehicle: Vehicle, design: LoopDesign, dt: float) -> tuple[Parts, Par
     )
 
 
-def estimator_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
+def make_estimator_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
     """Plant, Kalman filter and PI, opened where the yaw moment enters the plant.
 
     The filter's input is the moment that the PI asks for: opened behind both, a filter with the
@@ -115,11 +117,11 @@ def estimator_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpa
     """
     import control
 
-    plant, asks = _opened(vehicle, design, dt)
+    plant, asks = _split_loop(vehicle, design, dt)
     return control.StateSpace(*asks, dt) * control.StateSpace(*plant, dt)
 
 
-def _at_the_end(parts: tuple[Parts, Parts]) -> float:
+def _evaluate_nyquist(parts: tuple[Parts, Parts]) -> float:
     """The loop at z = -1, where it is real."""
     value = np.eye(1)
     for A, B, C, D in parts:
@@ -127,10 +129,13 @@ def _at_the_end(parts: tuple[Parts, Parts]) -> float:
     return float(value[0, 0])
 
 
-def table_two(vehicle: Vehicle, design: LoopDesign) -> list[tuple[float, float]]:
+def compute_margins(vehicle: Vehicle, design: LoopDesign) -> list[tuple[float, float]]:
     """Gain margins (dB, rad/s) of the loop at the camera's 33 ms and at 1 ms, the same PI and
     variances in both."""
-    return [gain_margin(estimator_loop(vehicle, design, dt)) for dt in (CAMERA_PERIOD, TICK)]
+    return [
+        compute_gain_margin(make_estimator_loop(vehicle, design, dt))
+        for dt in (CAMERA_PERIOD, TICK)
+    ]
 
 
 GRID: dict[str, tuple[float | str, ...]] = {
@@ -143,7 +148,7 @@ GRID: dict[str, tuple[float | str, ...]] = {
 
 
 @dataclass(frozen=True)
-class Found:
+class LoopMatch:
     """A design and its two margins in dB, single-rate and multirate."""
 
     design: LoopDesign
@@ -155,7 +160,7 @@ class Found:
         return max(abs(a - b) for a, b in zip(self.decibels, PRINTED, strict=True))
 
 
-def search(vehicle: Vehicle, within: float = 0.5) -> list[Found]:
+def search(vehicle: Vehicle, within: float = 0.5) -> list[LoopMatch]:
     """The designs of `GRID` whose margins both lie within some dB of Table II, the best first.
 
     Both crossovers are at half the sampling rate and the closed loops are stable, as in the paper.
@@ -163,22 +168,24 @@ def search(vehicle: Vehicle, within: float = 0.5) -> list[Found]:
     hits = []
     for values in itertools.product(*GRID.values()):
         options: dict[str, Any] = dict(zip(GRID, values, strict=True))
-        design, found = LoopDesign(**options), []
+        design, margins = LoopDesign(**options), []
         for dt, printed in zip((CAMERA_PERIOD, TICK), PRINTED, strict=True):
-            end = _at_the_end(_opened(vehicle, design, dt))  # a screen, before all crossings
+            end = _evaluate_nyquist(
+                _split_loop(vehicle, design, dt)
+            )  # a screen, before all crossings
             if end >= 0.0 or abs(-20.0 * math.log10(-end) - printed) > within:
                 break
-            loop = estimator_loop(vehicle, design, dt)
-            decibels, omega = gain_margin(loop)
-            if abs(omega * dt - math.pi) > 1e-9 or not _stable(loop):
+            loop = make_estimator_loop(vehicle, design, dt)
+            decibels, omega = compute_gain_margin(loop)
+            if abs(omega * dt - math.pi) > 1e-9 or not _is_stable(loop):
                 break
-            found.append(decibels)
-        if len(found) == len(PRINTED):
-            hits.append(Found(design, (found[0], found[1])))
+            margins.append(decibels)
+        if len(margins) == len(PRINTED):
+            hits.append(LoopMatch(design, (margins[0], margins[1])))
     return sorted(hits, key=lambda hit: hit.off)
 
 
-def _stable(loop: "StateSpace") -> bool:
+def _is_stable(loop: "StateSpace") -> bool:
     import control
 
     return bool(np.abs(control.feedback(loop, 1).poles()).max() < 1.0)

@@ -3,9 +3,9 @@
 """How kernels are compiled: each function's text once, each kernel's machine code once.
 
 numba by itself runs LLVM's whole pipeline and emits machine code for every function a kernel calls,
-with everything below it, level by level. Here a function that another one calls is a `Part`: its
-LLVM text stays as numba lowered it. What Python calls links the parts below it, and is optimised
-and emitted then; that alone is cached on disk.
+with everything below it, level by level. Here a function that another one calls is a
+`UnlinkedLibrary`: its LLVM text stays as numba lowered it. What Python calls links the parts below
+it, and is optimised and emitted then; that alone is cached on disk.
 
 All this uses numba's insides, which change: `decorators` does without where they are others.
 """
@@ -29,7 +29,7 @@ from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
 from numba.core.typing import make_concrete_template
 
-from ..cache import notice
+from ..cache import report_once
 from . import kernel_file
 from .passes import lean_passes, quickly
 
@@ -37,7 +37,7 @@ _logger = logging.getLogger("sideslip.compiler")
 _spent = [0.0]  # CPU-s on kernels so far, to tell a kernel's own from those it waited for
 
 
-class Part(JITCodeLibrary):
+class UnlinkedLibrary(JITCodeLibrary):
     """The LLVM text of one function, neither optimised nor linked with those that it calls."""
 
     def finalize(self) -> None:
@@ -46,17 +46,21 @@ class Part(JITCodeLibrary):
         self._finalize_dynamic_globals()
         self._finalized = True
 
-    def bare(self) -> Any:
+    def get_own_module(self) -> Any:
         """The LLVM module of this function alone, for linking."""
         return super()._get_module_for_linking()
 
     def _get_module_for_linking(self) -> Any:
         """What a function that numba compiles by itself links: this one and all below it."""
-        module = self.bare().clone()
-        for each in _with_callees(self)[1:]:
-            if not isinstance(each, _Apart):
-                below = each.bare() if isinstance(each, Part) else each._get_module_for_linking()
-                module.link_in(below, preserve=True)
+        module = self.get_own_module().clone()
+        for callee in _collect_callees(self)[1:]:
+            if not isinstance(callee, _ExternalLibrary):
+                callee_module = (
+                    callee.get_own_module()
+                    if isinstance(callee, UnlinkedLibrary)
+                    else callee._get_module_for_linking()
+                )
+                module.link_in(callee_module, preserve=True)
         return module
 
 
@@ -72,20 +76,20 @@ class Whole(JITCodeLibrary):
         passes.run(self._final_module, options)
 
 
-class _Bare:
+class _BareLibrary:
     """A part as a kernel of ours links it, which links each part itself."""
 
-    def __init__(self, part: Part) -> None:
+    def __init__(self, part: UnlinkedLibrary) -> None:
         self._part, self._reload_init = part, part._reload_init
 
     def _ensure_finalized(self) -> None:
         self._part._ensure_finalized()
 
     def _get_module_for_linking(self) -> Any:
-        return self._part.bare()
+        return self._part.get_own_module()
 
 
-class _Apart:
+class _ExternalLibrary:
     """A kernel that callers find as machine code: nothing is linked into them."""
 
     def __init__(self, path: Path | None) -> None:
@@ -100,7 +104,7 @@ class _Apart:
         return binding.parse_assembly("")
 
 
-class _PartPipeline(Compiler):
+class _UnlinkedPipeline(Compiler):
     def define_pipelines(self) -> Any:
         """numba's own, but only the passes that find something to do in a function that neither
         counts references nor holds another one."""
@@ -109,11 +113,11 @@ class _PartPipeline(Compiler):
         return [lean_passes()]
 
     def compile_extra(self, func: Any) -> Any:
-        self.state.library = Part(self.state.targetctx.codegen(), func.__qualname__)
+        self.state.library = UnlinkedLibrary(self.state.targetctx.codegen(), func.__qualname__)
         return super().compile_extra(func)
 
 
-class _ApartPipeline(_PartPipeline):
+class _ExternalPipeline(_UnlinkedPipeline):
     def compile_extra(self, func: Any) -> Any:
         """Callers' files know the function by a name that is the same in every process: numba's
         counts functions and types as they come."""
@@ -126,7 +130,7 @@ class _ApartPipeline(_PartPipeline):
         return super().compile_extra(func)
 
 
-class _PartCompiler(_FunctionCompiler):
+class _UnlinkedCompiler(_FunctionCompiler):
     def _customize_flags(self, flags: Any) -> Any:
         flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
         return flags
@@ -151,23 +155,25 @@ class Kernel(CPUDispatcher):
         super().__init__(py_func, locals, targetoptions, pipeline_class)
         self.folder, self.apart = folder, apart
         self.parts: dict[Any, Any] = {}
-        self._part_compiler = _PartCompiler(
+        self._unlinked_compiler = _UnlinkedCompiler(
             py_func,
             self.targetdescr,
             self.targetoptions,
             self.locals,
-            _ApartPipeline if apart else _PartPipeline,
+            _ExternalPipeline if apart else _UnlinkedPipeline,
         )
 
-    def part(self, args: tuple[types.Type, ...]) -> Any:
+    def get_part(self, args: tuple[types.Type, ...]) -> Any:
         """What callers link, for arguments of these types."""
         with global_compiler_lock, self._compiling_counter:
             if args not in self.parts:
                 if self.apart:
                     self.compile(args)
-                    part = self.overloads[args]._replace(library=_Apart(self._path(args)))
+                    part = self.overloads[args]._replace(
+                        library=_ExternalLibrary(self._find_path(args))
+                    )
                 else:
-                    part = self._part_compiler.compile(args, None)
+                    part = self._unlinked_compiler.compile(args, None)
                 part = part._replace(entry_point=part.library)  # the key of its code for callers
                 self.targetctx.insert_user_function(part.entry_point, part.fndesc, [part.library])
                 self.parts[args] = part
@@ -180,13 +186,13 @@ class Kernel(CPUDispatcher):
         an integer.
         """
         pysig, args = self._compiler.fold_argument_types(args, kws)
-        part = self.part(tuple(map(types.unliteral, args)))
+        part = self.get_part(tuple(map(types.unliteral, args)))
         name = self.py_func.__name__
         return make_concrete_template(name, key=name, signatures=[part.signature]), pysig, args, {}
 
     def get_overload(self, sig: Any) -> Any:
         """What numba asks when it writes a call: the key of the part."""
-        return self.part(tuple(normalize_signature(sig)[0])).entry_point
+        return self.get_part(tuple(normalize_signature(sig)[0])).entry_point
 
     def compile(self, sig: Any) -> Any:
         """The call for arguments of these types, from the disk where it is kept."""
@@ -195,83 +201,87 @@ class Kernel(CPUDispatcher):
             if args not in self.overloads:
                 if not self._can_compile:
                     raise RuntimeError("compilation disabled")
-                self.add_overload(self._found(args))
+                self.add_overload(self._load_or_build(args))
             return self.overloads[args].entry_point
 
-    def _key(self, args: tuple[types.Type, ...]) -> str:
-        return kernel_file.key_of(self.py_func, args, self.targetctx.codegen())
+    def _make_key(self, args: tuple[types.Type, ...]) -> str:
+        return kernel_file.make_key(self.py_func, args, self.targetctx.codegen())
 
-    def _path(self, args: tuple[types.Type, ...]) -> Path | None:
+    def _find_path(self, args: tuple[types.Type, ...]) -> Path | None:
         if self.folder is None:
             return None
-        return kernel_file.path_of(self.folder, self.py_func, self._key(args))
+        return kernel_file.make_path(self.folder, self.py_func, self._make_key(args))
 
-    def _found(self, args: tuple[types.Type, ...]) -> Any:
-        path, key = self._path(args), self._key(args)
+    def _load_or_build(self, args: tuple[types.Type, ...]) -> Any:
+        path, key = self._find_path(args), self._make_key(args)
         if path is None:
-            return self._built(args)[0]
-        found = kernel_file.load(path, key, self.py_func, args, self.targetctx)
-        if found is None:
-            found, environments, needs = self._built(args)
-            nameless = self.apart and str(found.signature.return_type) not in kernel_file.RETURNS
+            return self._build(args)[0]
+        result = kernel_file.load(path, key, self.py_func, args, self.targetctx)
+        if result is None:
+            result, environments, needs = self._build(args)
+            nameless = self.apart and str(result.signature.return_type) not in kernel_file.RETURNS
             if None not in needs and not nameless:
-                names = [(each.parent.name, each.name) for each in needs]
-                kernel_file.save(path, key, found, environments, names)
-        return found
+                names = [(kernel_path.parent.name, kernel_path.name) for kernel_path in needs]
+                kernel_file.save(path, key, result, environments, names)
+        return result
 
-    def _built(self, args: tuple[types.Type, ...]) -> tuple[Any, dict[str, Any], list[Any]]:
-        """What `_linked` returns, compiled while the user waits."""
-        where = f"cached in {self.folder.parent}" if self.folder else "not cached"
-        notice(
+    def _build(self, args: tuple[types.Type, ...]) -> tuple[Any, dict[str, Any], list[Any]]:
+        """What `_link_library` returns, compiled while the user waits."""
+        location = f"cached in {self.folder.parent}" if self.folder else "not cached"
+        report_once(
             "compiling",
-            f"compiling kernels for this machine, 10 s to a minute ({where}) ...",
+            f"compiling kernels for this machine, 10 s to a minute ({location}) ...",
             logging.INFO,
         )
         start, nested = time.process_time(), _spent[0]
         with quickly():
-            result = _linked(
-                self._part_compiler.compile(args, None) if self.apart else self.part(args)
+            result = _link_library(
+                self._unlinked_compiler.compile(args, None) if self.apart else self.get_part(args)
             )
         spent = time.process_time() - start
-        own, _spent[0] = spent - (_spent[0] - nested), nested + spent
-        _logger.info("compiled %s in %.1f CPU-s", self.py_func.__qualname__, own)
+        own_time, _spent[0] = spent - (_spent[0] - nested), nested + spent
+        _logger.info("compiled %s in %.1f CPU-s", self.py_func.__qualname__, own_time)
         return result
 
 
-def _linked(part: Any) -> tuple[Any, dict[str, Any], list[Path | None]]:
+def _link_library(part: Any) -> tuple[Any, dict[str, Any], list[Path | None]]:
     """A part with everything below it, optimised and emitted; all their environments; the files of
     the kernels apart that it calls."""
     target = part.target_context
     library = Whole(target.codegen(), part.library.name)
     library.enable_object_caching()
-    own, *callees = _with_callees(part.library)
-    library.add_llvm_module(own._final_module.clone())  # where others find the function by name
-    library._reload_init.update(own._reload_init)
-    needs = [each.path for each in callees if isinstance(each, _Apart)]
-    for each in callees:
-        if not isinstance(each, _Apart):
-            library.add_linking_library(_Bare(each) if isinstance(each, Part) else each)
+    root, *callees = _collect_callees(part.library)
+    library.add_llvm_module(root._final_module.clone())  # where others find the function by name
+    library._reload_init.update(root._reload_init)
+    needs = [item.path for item in callees if isinstance(item, _ExternalLibrary)]
+    for item in callees:
+        if not isinstance(item, _ExternalLibrary):
+            library.add_linking_library(
+                _BareLibrary(item) if isinstance(item, UnlinkedLibrary) else item
+            )
     target.create_cpython_wrapper(library, part.fndesc, part.environment, part.call_helper)
     entry = target.get_executable(library, part.fndesc, part.environment)
-    found = {each: lookup_environment(each) for each in kernel_file.environment_names(library)}
-    environments = {name: each for name, each in found.items() if each is not None}
-    kernel_file.link_environments(library, environments)
+    all_environments = {
+        item: lookup_environment(item) for item in kernel_file.list_environments(library)
+    }
+    environments = {name: item for name, item in all_environments.items() if item is not None}
+    kernel_file.set_environments(library, environments)
     return part._replace(library=library, entry_point=entry), environments, needs
 
 
-def _with_callees(library: Any) -> list[Any]:
+def _collect_callees(library: Any) -> list[Any]:
     """A part and all it calls, directly or not, callers first.
 
     LLVM's linker leaves out what nothing refers to yet.
     """
-    done: dict[Any, None] = {}
+    visited: dict[Any, None] = {}
 
-    def visit(each: Any) -> None:
-        if isinstance(each, Part):
-            for callee in each._linking_libraries:
-                if callee not in done:
+    def visit(node: Any) -> None:
+        if isinstance(node, UnlinkedLibrary):
+            for callee in node._linking_libraries:
+                if callee not in visited:
                     visit(callee)
-        done[each] = None
+        visited[node] = None
 
     visit(library)
-    return list(reversed(done))
+    return list(reversed(visited))

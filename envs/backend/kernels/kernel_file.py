@@ -24,8 +24,8 @@ from numba.core.itanium_mangler import prepend_namespace
 from numba.core.runtime import rtsys
 from numba.core.typing import signature
 
-from ..cache import notice, read
-from ..files import replaced
+from ..cache import read_trusted, report_once
+from ..files import replace_file
 
 RETURNS = {str(kind): kind for kind in (types.none, types.float64, types.int64, types.boolean)}
 """What a function may return that callers find by name."""
@@ -33,7 +33,7 @@ RETURNS = {str(kind): kind for kind in (types.none, types.float64, types.int64, 
 _ENVIRONMENTS = "_ZN08NumbaEnv"  # begins the names of the globals that point to environments
 _DIGEST = hashlib.sha256().digest_size
 _ENVIRONMENT = Environment({})  # of all kernels from files: those whose own are empty
-_linked: dict[str, tuple["Header", Any]] = {}  # in this process's memory, by file
+_libraries: dict[str, tuple["Header", Any]] = {}  # in this process's memory, by file
 
 
 class Header(NamedTuple):
@@ -50,13 +50,13 @@ class Header(NamedTuple):
     """Folder and file of each kernel whose machine code it calls."""
 
 
-def key_of(function: Any, args: Any, codegen: Any) -> str:
+def make_key(function: Any, args: Any, codegen: Any) -> str:
     """What tells a kernel from all others: function, argument types, versions, machine."""
-    built = numba.__version__, llvmlite.__version__, sys.version, codegen.magic_tuple()
-    return repr((function.__module__, function.__qualname__, str(args), built))
+    versions = numba.__version__, llvmlite.__version__, sys.version, codegen.magic_tuple()
+    return repr((function.__module__, function.__qualname__, str(args), versions))
 
 
-def path_of(folder: Path, function: Any, key: str) -> Path:
+def make_path(folder: Path, function: Any, key: str) -> Path:
     """The file of the kernel of this key."""
     name = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}"
     return folder / f"{name}-{hashlib.sha256(key.encode()).hexdigest()[:16]}.kernel"
@@ -71,25 +71,25 @@ def save(
 ) -> None:
     """Write a kernel; one that cannot be written is compiled again next time."""
     library, descriptor = result.library, result.fndesc
-    constants = any(each.consts for each in environments.values())
+    constants = any(environment.consts for environment in environments.values())
     if constants or library.has_dynamic_globals or result.reload_init:
         return  # addresses and objects of this process
-    own, returns = descriptor.env_name, str(result.signature.return_type)
-    names = [own, *(name for name in environment_names(library) if name != own)]
+    own_name, returns = descriptor.env_name, str(result.signature.return_type)
+    names = [own_name, *(name for name in list_environments(library) if name != own_name)]
     header = Header(key, descriptor.mangled_name, returns, names, needs)
     data = json.dumps(header).encode() + b"\n" + library._get_compiled_object()
-    _linked[str(path)] = header, library
-    with contextlib.suppress(OSError), replaced(path, mode=0o600) as file:
+    _libraries[str(path)] = header, library
+    with contextlib.suppress(OSError), replace_file(path, mode=0o600) as file:
         file.write(hashlib.sha256(data).digest() + data)
 
 
 def load(path: Path, key: str, function: Any, args: Any, target: Any) -> Any:
     """A kernel from its file; None where there is none, or only a damaged or foreign one."""
     rtsys.initialize(target)  # what arrays need, without all that a compiler needs
-    found = _link(path, target.codegen(), key)
-    if found is None:
+    linked = _load_library(path, target.codegen(), key)
+    if linked is None:
         return None
-    header, library = found
+    header, library = linked
     returns = RETURNS.get(header.returns, types.undefined)
     descriptor = PythonFunctionDescriptor(
         native=True,
@@ -120,40 +120,40 @@ def load(path: Path, key: str, function: Any, args: Any, target: Any) -> Any:
     )
 
 
-def _link(path: Path, codegen: Any, key: str | None = None) -> tuple[Header, Any] | None:
+def _load_library(path: Path, codegen: Any, key: str | None = None) -> tuple[Header, Any] | None:
     """A file's machine code, with that of the kernels it needs, in this process's memory."""
-    if str(path) in _linked:
-        return _linked[str(path)]
-    data = read(path)
+    if str(path) in _libraries:
+        return _libraries[str(path)]
+    data = read_trusted(path)
     if data is None or hashlib.sha256(data[_DIGEST:]).digest() != data[:_DIGEST]:
         return None
-    head, _, code = data[_DIGEST:].partition(b"\n")
+    header_line, _, code = data[_DIGEST:].partition(b"\n")
     try:
-        header = Header(*json.loads(head))
+        header = Header(*json.loads(header_line))
         if key not in (None, header.kernel):
             raise ValueError("it is another kernel's")
         for folder, name in header.needs:
-            if _link(path.parents[1] / Path(folder).name / name, codegen) is None:
+            if _load_library(path.parents[1] / Path(folder).name / name, codegen) is None:
                 return None
     except (ValueError, TypeError, RecursionError) as error:
-        notice("kernel", f"{path} is no cached kernel, which is compiled anew: {error}"[:500])
+        report_once("kernel", f"{path} is no cached kernel, which is compiled anew: {error}"[:500])
         return None
     library = codegen.create_library(header.symbol)
     library.enable_object_caching()
     library._set_compiled_object(code)  # only its entry is called: its LLVM text is not needed
     library._finalize_final_module()
     codegen._engine._defined_symbols.add(prepend_namespace(header.symbol, ns="cpython"))
-    link_environments(library, dict.fromkeys(header.environments, _ENVIRONMENT))
-    return _linked.setdefault(str(path), (header, library))
+    set_environments(library, dict.fromkeys(header.environments, _ENVIRONMENT))
+    return _libraries.setdefault(str(path), (header, library))
 
 
-def link_environments(library: Any, environments: dict[str, Any]) -> None:
+def set_environments(library: Any, environments: dict[str, Any]) -> None:
     """Tell emitted code where the environments of its functions are."""
     for name, environment in environments.items():
         library.codegen.set_env(name, environment)
 
 
-def environment_names(library: Any) -> list[str]:
+def list_environments(library: Any) -> list[str]:
     """The names of the environments that a library's code refers to."""
     return [
         variable.name

@@ -6,6 +6,20 @@ height, `chessboard` the intrinsics, `films` reads files. Only `analytic` is loa
 package; what works on pictures needs the extra of OpenCV.
 """
 
-from .analytic import CAMERA_KIND, View, at_preview, camera_sample, lane_in_view, lane_offset
+from .analytic import (
+    CAMERA_KIND,
+    FieldOfView,
+    compute_lane_offset,
+    compute_lane_quality,
+    compute_preview_offset,
+    sample_camera,
+)
 
-__all__ = ["CAMERA_KIND", "View", "at_preview", "camera_sample", "lane_in_view", "lane_offset"]
+__all__ = [
+    "CAMERA_KIND",
+    "FieldOfView",
+    "compute_lane_offset",
+    "compute_lane_quality",
+    "compute_preview_offset",
+    "sample_camera",
+]

@@ -2,22 +2,22 @@
 
 from typing import Any, NamedTuple
 
-from ...backend.decorators import inlined, jit
+from ...backend.decorators import inline, jit
 from ...backend.elementary import PI, wrap
 from ...backend.primitives import absolute, select
 from ...backend.random import CHANNELS
-from ...vehicle.dynamics import curvature_at
-from ..kind import Blocks, SlowKind, Value
+from ...vehicle.dynamics import compute_curvature
+from ..kind import Blocks, PacketValue, SlowKind
 
 CAMERA_KIND = SlowKind(
     "camera",
-    (Value("psi", "rad", PI), Value("y_l", "m", 200.0)),
+    (PacketValue("psi", "rad", PI), PacketValue("y_l", "m", 200.0)),
     Blocks(noise=CHANNELS.camera, link=CHANNELS.camera_link, drift=CHANNELS.camera),  # no drift
-    sees=True,
+    needs_quality=True,
 )
 
 
-class View(NamedTuple):
+class FieldOfView(NamedTuple):
     """The camera's field of view: beyond it there is no lane in the picture."""
 
     heading: Any  # rad, relative to the road, either side
@@ -25,14 +25,14 @@ class View(NamedTuple):
 
 
 @jit
-def lane_in_view(motion: Any, sight: Any) -> Any:
+def compute_lane_quality(motion: Any, field_of_view: Any) -> Any:
     """The quality of a picture: 1, or 0 where the lane is out of view."""
-    turned = absolute(wrap(motion.psi - motion.theta)) > sight.heading
-    return select(turned | (absolute(motion.y) > sight.offset), 0.0, 1.0)
+    is_turned = absolute(wrap(motion.psi - motion.theta)) > field_of_view.heading
+    return select(is_turned | (absolute(motion.y) > field_of_view.offset), 0.0, 1.0)
 
 
-@inlined
-def at_preview(y: Any, psi: Any, kappa: Any, l_pre: Any) -> Any:
+@inline
+def compute_preview_offset(y: Any, psi: Any, kappa: Any, l_pre: Any) -> Any:
     """Lateral offset y_l in m at the preview point, positive to the left of the lane's centre line.
 
     y: m, of the centre of gravity. psi: rad, relative to the lane. kappa: 1/m. l_pre: m.
@@ -41,13 +41,15 @@ def at_preview(y: Any, psi: Any, kappa: Any, l_pre: Any) -> Any:
 
 
 @jit
-def lane_offset(motion: Any, road: Any, l_pre: Any) -> Any:
-    """`at_preview` of a Motion on a road."""
-    return at_preview(motion.y, motion.psi - motion.theta, curvature_at(road, motion.s), l_pre)
+def compute_lane_offset(motion: Any, road: Any, l_pre: Any) -> Any:
+    """`compute_preview_offset` of a Motion on a road."""
+    return compute_preview_offset(
+        motion.y, motion.psi - motion.theta, compute_curvature(road, motion.s), l_pre
+    )
 
 
 @jit
-def camera_sample(motion: Any, road: Any, l_pre: Any, noise: Any, n: Any) -> Any:
-    """(psi, y_l): heading relative to the road, and `lane_offset`."""
-    psi, y_l = motion.psi - motion.theta, lane_offset(motion, road, l_pre)
+def sample_camera(motion: Any, road: Any, l_pre: Any, noise: Any, n: Any) -> Any:
+    """(psi, y_l): heading relative to the road, and `compute_lane_offset`."""
+    psi, y_l = motion.psi - motion.theta, compute_lane_offset(motion, road, l_pre)
     return wrap(psi + noise.camera_psi * n[0]), y_l + noise.camera_y * n[1]

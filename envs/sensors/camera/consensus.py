@@ -14,10 +14,10 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.floating[Any]]
 
-DRAWS = 3000  # triples of points, of which those that a lane can be are tried
-TRIED, COUNTED = 160, 320  # triples, and points that they are counted on
-SLOPE, BEND = 0.55, 0.06  # the most of |b| and of |a| in 1/m
-STARTS = 4
+N_DRAWS = 3000  # triples of points, of which those that a lane can be are tried
+MAX_TRIPLES, MAX_COUNTED = 160, 320  # triples, and points that they are counted on
+MAX_SLOPE, MAX_BEND = 0.55, 0.06  # the most of |b| and of |a| in 1/m
+MAX_STARTS = 4
 PITCHES = np.radians([0.0, -0.6, 0.6, -1.2, 1.2])
 WIDTHS = (1.0, 0.88, 1.12)  # of the lane's: a body that rolls beside its middle
 PITCH_SD, ROLL_SD = np.radians([1.0, 1.0])  # rad, of the priors
@@ -25,7 +25,7 @@ _SPAN = 4.0  # m, of X, that a triple covers at least
 _SIDE = 0.15  # of a score, lost for every lane's width that the car would be off the lane
 
 
-class Fit(NamedTuple):
+class LaneFit(NamedTuple):
     """A lane's heading, offset and curvature, and what they rest on."""
 
     psi: float  # rad, of the car against the lane
@@ -36,94 +36,104 @@ class Fit(NamedTuple):
     side: npt.NDArray[np.int64]  # of each point: 1 on the left marking, -1 on the right one, or 0
     error: Array  # (2,), standard errors of psi in rad and of y_l in m
 
-    def held(self, weight: Array) -> float:
+    def compute_support(self, weight: Array) -> float:
         """The weight of the points on both markings, the weaker one's above all."""
         left, right = (float(np.sum(weight[self.side == side])) for side in (1, -1))
         return min(left, right) + 0.25 * (left + right)
 
 
-class Start(NamedTuple):
+class FitStart(NamedTuple):
     """Where a fit begins: psi, y, kappa, pitch and roll, and what speaks for it."""
 
     score: float
     values: Array  # (5,)
 
 
-class Place(NamedTuple):
+class CameraMount(NamedTuple):
     """Where a camera is, and what it looks for."""
 
     height: float  # m
-    ahead: float  # m
+    forward: float  # m
     preview: float  # m, at which y_l is measured
     width: float  # m, of the lane
 
 
-def reach_of(x: Array) -> Array:
+def compute_tolerance(x: Array) -> Array:
     """How far in m from a marking a point belongs to it, X metres ahead."""
     return 0.05 + 0.006 * x
 
 
-def _triples(x: Array, y: Array, weight: Array, rng: np.random.Generator) -> Array:
+def _draw_triples(x: Array, y: Array, weight: Array, rng: np.random.Generator) -> Array:
     """(a, b, c) (3, n) of parabolas through three points each, of those that a marking can be."""
     sums = np.cumsum(weight)
-    draws = np.searchsorted(sums, rng.random((3, DRAWS)) * sums[-1]).clip(max=len(x) - 1)
+    draws = np.searchsorted(sums, rng.random((3, N_DRAWS)) * sums[-1]).clip(max=len(x) - 1)
     X, Y = x[draws], y[draws]
     with np.errstate(all="ignore"):
         first = (Y[1] - Y[0]) / (X[1] - X[0])
         a = 2.0 * ((Y[2] - Y[0]) / (X[2] - X[0]) - first) / (X[2] - X[1])
         b = first - 0.5 * a * (X[0] + X[1])
         c = Y[0] - b * X[0] - 0.5 * a * X[0] ** 2
-    marking = (np.abs(a) < BEND) & (np.abs(b) < SLOPE) & (np.ptp(X, axis=0) > _SPAN)
-    return np.stack([a, b, c])[:, np.flatnonzero(marking)[:TRIED]]
+    is_marking = (np.abs(a) < MAX_BEND) & (np.abs(b) < MAX_SLOPE) & (np.ptp(X, axis=0) > _SPAN)
+    return np.stack([a, b, c])[:, np.flatnonzero(is_marking)[:MAX_TRIPLES]]
 
 
-def search(x: Array, y: Array, weight: Array, place: Place) -> list[Start]:
-    """Starts for `fit`: pairs of markings that hold many of the points, the best first; none where
-    no three points can be a marking. The draws are the same for as many points."""
+def search_starts(x: Array, y: Array, weight: Array, mount: CameraMount) -> list[FitStart]:
+    """Starts for `fit_lane`: pairs of markings that hold many of the points, the best first; none
+    where no three points can be a marking. The draws are the same for as many points."""
     if len(x) < 6:
         return []
     rng = np.random.Generator(np.random.SFC64(len(x)))
-    a, b, c = _triples(x, y, weight, rng).astype(np.float32)[..., None]
+    a, b, c = _draw_triples(x, y, weight, rng).astype(np.float32)[..., None]
     if not len(a):
         return []
-    if len(x) > COUNTED:
-        some = rng.permutation(len(x))[:COUNTED]
-        x, y, weight = x[some], y[some], weight[some]
-    x, y, weight = (each.astype(np.float32) for each in (x, y, weight))
-    off, reach = y - (c + b * x + 0.5 * a * x * x), reach_of(x)
-    own = (np.abs(off) < reach) @ weight
+    if len(x) > MAX_COUNTED:
+        subset = rng.permutation(len(x))[:MAX_COUNTED]
+        x, y, weight = x[subset], y[subset], weight[subset]
+    x, y, weight = (array.astype(np.float32) for array in (x, y, weight))
+    residual, reach = y - (c + b * x + 0.5 * a * x * x), compute_tolerance(x)
+    own_score = (np.abs(residual) < reach) @ weight
     starts = []
-    for pitch, wide in itertools.product(PITCHES, WIDTHS):
-        apart = np.float32(wide * place.width) * np.sqrt(1.0 + b * b)
-        grown = apart * (1.0 + x * np.float32(pitch / place.height))
+    for pitch, width_factor in itertools.product(PITCHES, WIDTHS):
+        lane_width = np.float32(width_factor * mount.width) * np.sqrt(1.0 + b * b)
+        pitched_width = lane_width * (1.0 + x * np.float32(pitch / mount.height))
         for sign in (1.0, -1.0):  # the marking is the right one, the left one
-            other = (np.abs(off - np.float32(sign) * grown) < reach + 0.04) @ weight
-            middle = (c + 0.5 * sign * apart)[:, 0]
-            score = np.minimum(own, other) + 0.25 * (own + other)
-            score *= 1.0 - _SIDE * np.minimum(np.abs(middle) / place.width, 3.0)
+            other = (np.abs(residual - np.float32(sign) * pitched_width) < reach + 0.04) @ weight
+            middle = (c + 0.5 * sign * lane_width)[:, 0]
+            score = np.minimum(own_score, other) + 0.25 * (own_score + other)
+            score *= 1.0 - _SIDE * np.minimum(np.abs(middle) / mount.width, 3.0)
             i = int(np.argmax(score))
-            slope = b[i, 0] - c[i, 0] * pitch / place.height  # of the marking on the road
+            slope = b[i, 0] - c[i, 0] * pitch / mount.height  # of the marking on the road
             cosine = 1.0 / np.sqrt(1.0 + slope * slope)
             offset = -middle[i] * cosine
-            tipped = 0.5 * (wide - 1.0) * place.height * offset / (offset * offset + 0.1)
-            values = -np.arctan(slope), offset, a[i, 0] * cosine**3, pitch, tipped
-            starts.append(Start(float(score[i]), np.array(values, float)))
-    return sorted(starts, key=lambda start: -start.score)[:STARTS]
+            roll_guess = (
+                0.5 * (width_factor - 1.0) * mount.height * offset / (offset * offset + 0.1)
+            )
+            values = -np.arctan(slope), offset, a[i, 0] * cosine**3, pitch, roll_guess
+            starts.append(FitStart(float(score[i]), np.array(values, float)))
+    return sorted(starts, key=lambda start: -start.score)[:MAX_STARTS]
 
 
-def levelled(x: Array, y: Array, pitch: float, roll: float, place: Place) -> tuple[Array, Array]:
+def correct_attitude(
+    x: Array, y: Array, pitch: float, roll: float, mount: CameraMount
+) -> tuple[Array, Array]:
     """Points of the road from where they seem to be without pitch and roll."""
     (sp, cp), (sr, cr) = ((np.sin(angle), np.cos(angle)) for angle in (pitch, roll))
-    x, up = x - place.ahead, -place.height
+    x, up = x - mount.forward, -mount.height
     y, up = y * cr - up * sr, y * sr + up * cr
     x, up = x * cp + up * sp, up * cp - x * sp
-    high = place.height * cr
-    eye = place.ahead * cp + high * sp, -place.height * sr, high * cp - place.ahead * sp
-    reach = eye[2] / np.maximum(-up, 1e-3)
-    return eye[0] + reach * x, eye[1] + reach * y
+    lens_height = mount.height * cr
+    lens = (
+        mount.forward * cp + lens_height * sp,
+        -mount.height * sr,
+        lens_height * cp - mount.forward * sp,
+    )
+    reach = lens[2] / np.maximum(-up, 1e-3)
+    return lens[0] + reach * x, lens[1] + reach * y
 
 
-def across(x: Array, y: Array, psi: float, offset: float, kappa: float) -> tuple[Array, Array]:
+def project_to_lane(
+    x: Array, y: Array, psi: float, offset: float, kappa: float
+) -> tuple[Array, Array]:
     """(along, across) in m of points against the middle of a lane of constant curvature."""
     u = x * np.cos(psi) - y * np.sin(psi)
     v = offset + x * np.sin(psi) + y * np.cos(psi)
@@ -131,42 +141,52 @@ def across(x: Array, y: Array, psi: float, offset: float, kappa: float) -> tuple
     return u, w / (1.0 + np.sqrt(np.maximum(1.0 - kappa * w, 0.0)))
 
 
-def fit(x: Array, y: Array, deviation: Array, start: Array, place: Place) -> Fit | None:
+def fit_lane(
+    x: Array, y: Array, deviation: Array, start: Array, mount: CameraMount
+) -> LaneFit | None:
     """The least squares from a start (5,), by Gauss and Newton; None where the points do not hold
     both markings. deviation: m, of each point across."""
-    values, half = start, 0.5 * place.width
+    values, half = start, 0.5 * mount.width
     prior = np.array([0.0, 0.0, 0.0, PITCH_SD**-2, ROLL_SD**-2])
     inverse: Array = np.zeros((5, 5))
     step = 1e-4  # rad, of the derivatives by both angles
 
-    def seen(pitch: float, roll: float) -> tuple[Array, Array]:
-        return across(*levelled(x, y, pitch, roll, place), *values[:3])
+    def project_points(pitch: float, roll: float) -> tuple[Array, Array]:
+        return project_to_lane(*correct_attitude(x, y, pitch, roll, mount), *values[:3])
 
     for scale in (2.0, 1.5, 1.2, 1.0, 0.8, 0.8):
         if not (np.abs(values) < [1.0, 50.0, 0.5, 0.1, 0.2]).all():  # nor is NaN
             return None
         pitch, roll = values[3:]
-        u, d = seen(pitch, roll)
-        rest, bound = d - half * np.sign(d), scale * reach_of(x)
-        on = np.abs(rest) < bound
-        if min(np.sum(on & (d > 0.0)), np.sum(on & (d < 0.0))) < 3:
+        u, d = project_points(pitch, roll)
+        residual, bound = d - half * np.sign(d), scale * compute_tolerance(x)
+        is_inlier = np.abs(residual) < bound
+        if min(np.sum(is_inlier & (d > 0.0)), np.sum(is_inlier & (d < 0.0))) < 3:
             return None
         slopes = [
-            (each - d) / step for _, each in (seen(pitch + step, roll), seen(pitch, roll + step))
+            (shifted - d) / step
+            for _, shifted in (
+                project_points(pitch + step, roll),
+                project_points(pitch, roll + step),
+            )
         ]
-        rows = np.stack([u, np.ones_like(u), -0.5 * u * u, *slopes], 1)[on]
-        far = rest[on] / deviation[on]
-        scatter = max(1.0, float(np.mean(far * far)))  # of worn paint, against the priors
-        weight = (1.0 - (rest[on] / bound[on]) ** 2) ** 2 / (deviation[on] ** 2 * scatter)  # Tukey
+        rows = np.stack([u, np.ones_like(u), -0.5 * u * u, *slopes], 1)[is_inlier]
+        normalised = residual[is_inlier] / deviation[is_inlier]
+        scatter = max(
+            1.0, float(np.mean(normalised * normalised))
+        )  # of worn paint, against the priors
+        weight = (1.0 - (residual[is_inlier] / bound[is_inlier]) ** 2) ** 2 / (
+            deviation[is_inlier] ** 2 * scatter
+        )  # Tukey
         try:
             inverse = np.linalg.inv(rows.T @ (weight[:, None] * rows) + np.diag(prior))
         except np.linalg.LinAlgError:
             return None
-        values = values - inverse @ (rows.T @ (weight * rest[on]) + prior * values)
-    _, d = seen(*values[3:])
-    side = np.sign(d) * (np.abs(d - half * np.sign(d)) < 0.8 * reach_of(x))
-    l_pre = place.preview
-    at_preview = np.array([l_pre, 1.0, -0.5 * l_pre * l_pre])
-    error = np.sqrt(np.array([inverse[0, 0], at_preview @ inverse[:3, :3] @ at_preview]))
+        values = values - inverse @ (rows.T @ (weight * residual[is_inlier]) + prior * values)
+    _, d = project_points(*values[3:])
+    side = np.sign(d) * (np.abs(d - half * np.sign(d)) < 0.8 * compute_tolerance(x))
+    l_pre = mount.preview
+    preview_row = np.array([l_pre, 1.0, -0.5 * l_pre * l_pre])
+    error = np.sqrt(np.array([inverse[0, 0], preview_row @ inverse[:3, :3] @ preview_row]))
     psi, offset, kappa, pitch, roll = map(float, values)
-    return Fit(psi, offset, kappa, pitch, roll, side.astype(np.int64), error)
+    return LaneFit(psi, offset, kappa, pitch, roll, side.astype(np.int64), error)

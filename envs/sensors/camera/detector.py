@@ -12,7 +12,7 @@ from ...ticks import TICK
 FILE = Path(__file__).with_suffix(".json")
 VISIONS = ("analytic", "image")
 DELAYS = ("fitted", "measured", "link")
-SLOWEST = 0.1  # s: a measured delay counts as no more
+MAX_DELAY = 0.1  # s: a measured delay counts as no more
 
 
 @dataclass(frozen=True)
@@ -27,14 +27,14 @@ class Detector:
     noise: dict[str, float]  # by the names of `Noise`
 
     @classmethod
-    def of(cls, values: dict[str, Any]) -> "Detector":
+    def from_dict(cls, values: dict[str, Any]) -> "Detector":
         """From what the file holds."""
-        times, found = values["seconds"], values["errors"]
-        noise = {"camera_psi": found["psi_rad"], "camera_y": found["y_l_m"]}
-        least, most = times["range"]
-        return cls(times["shift"], times["log_mean"], times["log_sd"], (least, most), noise)
+        times, errors = values["seconds"], values["errors"]
+        noise = {"camera_psi": errors["psi_rad"], "camera_y": errors["y_l_m"]}
+        shortest, longest = times["range"]
+        return cls(times["shift"], times["log_mean"], times["log_sd"], (shortest, longest), noise)
 
-    def delay(self, share: float) -> float:
+    def compute_delay(self, share: float) -> float:
         """Seconds, at a share in (0, 1) of the distribution."""
         from statistics import NormalDist  # 2 ms that every import of the package would pay
 
@@ -42,12 +42,12 @@ class Detector:
         return min(max(drawn, self.range[0]), self.range[1])
 
 
-def ticks_taken(seconds: float) -> int:
+def count_delay_ticks(seconds: float) -> int:
     """Whole ticks after which what took so long arrives, one at least."""
     return max(math.ceil(seconds / TICK - 1e-9), 1)
 
 
 @functools.cache
-def detector() -> Detector:
+def load_detector() -> Detector:
     """The one on file."""
-    return Detector.of(json.loads(FILE.read_text()))
+    return Detector.from_dict(json.loads(FILE.read_text()))

@@ -18,7 +18,7 @@ def read_picture(path: "str | os.PathLike[str]") -> Image:
 
     Raises FileNotFoundError, and ValueError for a file that is no whole picture.
     """
-    _check(path)
+    _check_file(path)
     data = np.fromfile(path, np.uint8)
     picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
     if picture is None:
@@ -27,68 +27,68 @@ def read_picture(path: "str | os.PathLike[str]") -> Image:
 
 
 class Film:
-    """The frames of a film, as pictures; `promised` is how many its header promises.
+    """The frames of a film, as pictures; `frame_count` is how many its header promises.
 
     Raises FileNotFoundError, and ValueError for a file without a first frame.
     """
 
     def __init__(self, path: "str | os.PathLike[str]") -> None:
-        _check(path)
+        _check_file(path)
         self._path = str(path)
         self._reader = cv2.VideoCapture(self._path)
-        self.promised = max(int(self._reader.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
+        self.frame_count = max(int(self._reader.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
         self.rate = float(self._reader.get(cv2.CAP_PROP_FPS)) or 30.0
-        there, first = self._reader.read()
-        if not there:
+        has_frame, first = self._reader.read()
+        if not has_frame:
             raise ValueError(f"{path}: this is no film that can be read")
-        self._ahead = [np.asarray(first, np.uint8)]
+        self._buffer = [np.asarray(first, np.uint8)]
 
-    def head(self, count: int) -> list[Image]:
+    def read_head(self, count: int) -> list[Image]:
         """The first frames, at most so many, which `iter` has again."""
-        while len(self._ahead) < count:
-            there, frame = self._reader.read()
-            if not there:
+        while len(self._buffer) < count:
+            has_frame, frame = self._reader.read()
+            if not has_frame:
                 break
-            self._ahead.append(np.asarray(frame, np.uint8))
-        return list(self._ahead)
+            self._buffer.append(np.asarray(frame, np.uint8))
+        return list(self._buffer)
 
     def __iter__(self) -> Iterator[Image]:
         """The frames, once; it ends where the file does, or what is whole of it."""
-        while self._ahead:
-            yield self._ahead.pop(0)
+        while self._buffer:
+            yield self._buffer.pop(0)
         while True:
-            there, frame = self._reader.read()
-            if not there:
+            has_frame, frame = self._reader.read()
+            if not has_frame:
                 return
             yield np.asarray(frame, np.uint8)
 
 
-def drawn(picture: Image, finder: LaneFinder, lane: Lane) -> Image:
+def draw_lane(picture: Image, finder: LaneFinder, lane: Lane) -> Image:
     """A copy of a picture in colour with the markings that the finder found in it just now."""
     shown = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) if picture.ndim == 2 else picture.copy()
     thick = max(shown.shape[1] // 400, 1)
     if finder.fit is not None:
         edges = [
-            finder.camera.pixels_of(finder.rows_ahead, finder.marking(finder.fit, side))
+            finder.camera.project_points(finder.rows_ahead, finder.locate_marking(finder.fit, side))
             for side in (1, -1)
         ]
         left, right = (np.round(edge[np.isfinite(edge[:, 0])]).astype(np.int32) for edge in edges)
-        lit = shown.copy()
-        cv2.fillPoly(lit, [np.concatenate([left, right[::-1]])], (80, 160, 0))
-        shown = cv2.addWeighted(lit, 0.3, shown, 0.7, 0.0)
+        filled = shown.copy()
+        cv2.fillPoly(filled, [np.concatenate([left, right[::-1]])], (80, 160, 0))
+        shown = cv2.addWeighted(filled, 0.3, shown, 0.7, 0.0)
         for edge, colour in ((left, (0, 120, 255)), (right, (255, 160, 0))):
             cv2.polylines(shown, [edge], False, colour, 2 * thick, cv2.LINE_AA)
     size = 0.3 * thick
     place = int(30 * size), int(50 * size)
     for colour, width in (((0, 0, 0), 3 * thick), ((255, 255, 255), thick)):
         cv2.putText(
-            shown, described(lane), place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, width,
+            shown, describe_lane(lane), place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, width,
             cv2.LINE_AA,
         )  # fmt: skip
     return np.asarray(shown, np.uint8)
 
 
-def described(lane: Lane) -> str:
+def describe_lane(lane: Lane) -> str:
     """A line on a lane."""
     if lane.quality == 0.0:
         return "no lane"
@@ -98,7 +98,7 @@ def described(lane: Lane) -> str:
     )
 
 
-def _check(path: "str | os.PathLike[str]") -> None:
+def _check_file(path: "str | os.PathLike[str]") -> None:
     if not Path(path).exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     if not Path(path).is_file():

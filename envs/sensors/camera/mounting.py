@@ -10,13 +10,13 @@ from math import atan, cos
 import cv2
 import numpy as np
 
-from .analytic import View
+from .analytic import FieldOfView
 from .consensus import Array
 from .finder import LaneFinder
 from .pinhole import WORKING_WIDTH, Pinhole, resample
 from .road_image import Image
 
-TRIED, LEAST = 4000, 20  # pairs of points, and points
+MAX_PAIRS, MIN_POINTS = 4000, 20  # pairs of points, and points
 _TOP, _BOTTOM = 0.55, 0.92  # of the picture's height: the road, without the bonnet
 _NEAR = 0.004  # of the focal length, from a line
 _SLOPES = 0.35, 4.0  # across over down, of a lane's own markings
@@ -25,37 +25,39 @@ NEAR, FAR, HEADING = 6.0, 30.0, 0.12  # m, m, rad: beyond a bonnet, where markin
 _STRAIGHT = 0.003, 0.01, 0.05  # 1/m, rad, rad: curvature, pitch and roll of the lane that shows it
 
 
-def default_camera(size: tuple[int, int]) -> Pinhole:
+def make_default_camera(size: tuple[int, int]) -> Pinhole:
     """A camera of which nothing is known: 58 degrees wide, without distortion, level."""
     width, height = size
     K = ((0.9 * width, 0.0, width / 2), (0.0, 0.9 * width, height / 2), (0.0, 0.0, 1.0))
     return Pinhole(K=K, dist=(0.0,) * 5, size=size, tilt=0.0, ahead=0.0)
 
 
-def mounted(camera: Pinhole, picture: Image, lane_width: float) -> Pinhole:
+def estimate_mounting(camera: Pinhole, picture: Image, lane_width: float) -> Pinhole:
     """The camera with the tilt and the height that a picture of a straight lane shows.
 
     Raises ValueError where two markings are not found in it, or no car sees them so.
     """
-    points, weight = _ridges(camera, picture)
-    pair = _pair(points, weight)
+    points, weight = _find_ridges(camera, picture)
+    pair = _find_pair(points, weight)
     if pair is None:
         raise ValueError("no lane: no pair of markings was found: pass tilt and height")
     (a, b), (c, d) = pair  # across = a + b down, left and right
     down = (a - c) / (d - b)
     tilt = atan(-down)
     height = lane_width * cos(tilt) / (d - b)
-    found = dataclasses.replace(camera, tilt=tilt, height=height)
-    finder = LaneFinder(found, lane_width, NEAR, FAR, view=View(HEADING, 0.5 * lane_width))
+    mounted_camera = dataclasses.replace(camera, tilt=tilt, height=height)
+    finder = LaneFinder(
+        mounted_camera, lane_width, NEAR, FAR, view=FieldOfView(HEADING, 0.5 * lane_width)
+    )
     finder.find(picture)
     straight = finder.fit is not None and (np.abs(finder.fit[2:5]) < _STRAIGHT).all()
     if not (straight and _HEIGHTS[0] < height < _HEIGHTS[1]):
         what = f"for a camera {height:.2f} m high and tilted by {tilt:.3f} rad"
         raise ValueError(f"no lane: the best markings are no straight one's {what}: pass both")
-    return found
+    return mounted_camera
 
 
-def _ridges(camera: Pinhole, picture: Image) -> tuple[Array, Array]:
+def _find_ridges(camera: Pinhole, picture: Image) -> tuple[Array, Array]:
     """(points (n, 2) on the plane one unit ahead, weight): bright ridges across the rows."""
     grey = resample(picture if picture.ndim == 2 else picture.max(2))
     rows = slice(int(_TOP * len(grey)), int(_BOTTOM * len(grey)))
@@ -63,36 +65,40 @@ def _ridges(camera: Pinhole, picture: Image) -> tuple[Array, Array]:
     light = -16.0 * cv2.Laplacian(smooth, cv2.CV_32F)
     middle = light[:, 1:-1]
     level = max(8.0, 4.0 * 1.4826 * float(np.median(np.abs(middle))))
-    top = (middle > level) & (middle >= light[:, :-2]) & (middle > light[:, 2:])
-    row, column = np.nonzero(top[::2])
+    is_ridge = (middle > level) & (middle >= light[:, :-2]) & (middle > light[:, 2:])
+    row, column = np.nonzero(is_ridge[::2])
     pixels = np.stack([column + 1.5, 2.0 * row + rows.start + 0.5], 1)
     pixels = pixels * camera.size[0] / WORKING_WIDTH - 0.5
     weight = np.minimum(middle[::2][row, column], 40.0).astype(float)
-    return camera.undistorted(pixels) if len(pixels) else pixels, weight
+    return camera.undistort(pixels) if len(pixels) else pixels, weight
 
 
-def _pair(points: Array, weight: Array) -> tuple[Array, Array] | None:
+def _find_pair(points: Array, weight: Array) -> tuple[Array, Array] | None:
     """(left, right): each (2,), a and b of across = a + b down, by random consensus."""
-    if len(points) < LEAST:
+    if len(points) < MIN_POINTS:
         return None
     across, down = points.T
     rng = np.random.Generator(np.random.SFC64(len(points)))
     sums = np.cumsum(weight)
-    i, j = np.searchsorted(sums, rng.random((2, TRIED)) * sums[-1]).clip(max=len(points) - 1)
+    i, j = np.searchsorted(sums, rng.random((2, MAX_PAIRS)) * sums[-1]).clip(max=len(points) - 1)
     with np.errstate(all="ignore"):
         b = (across[j] - across[i]) / (down[j] - down[i])
-    keep = (np.abs(down[j] - down[i]) > 0.05) & (np.abs(b) > _SLOPES[0]) & (np.abs(b) < _SLOPES[1])
-    b = b[keep, None]
-    a = across[i[keep], None] - b * down[i[keep], None]
-    held = (np.abs(across - a - b * down) < _NEAR * (1.0 + np.abs(b))) @ weight
+    is_marking = (
+        (np.abs(down[j] - down[i]) > 0.05) & (np.abs(b) > _SLOPES[0]) & (np.abs(b) < _SLOPES[1])
+    )
+    b = b[is_marking, None]
+    a = across[i[is_marking], None] - b * down[i[is_marking], None]
+    support = (np.abs(across - a - b * down) < _NEAR * (1.0 + np.abs(b))) @ weight
     a, b = a[:, 0], b[:, 0]
     left, right = np.flatnonzero(b < 0.0), np.flatnonzero(b > 0.0)
     if not (len(left) and len(right)):
         return None
     spread = b[right] - b[left, None]  # a lane's: a wider pair holds another lane too
-    score = np.minimum(held[left, None], held[right]) + 0.25 * (held[left, None] + held[right])
-    tilted = np.arctan((a[right] - a[left, None]) / spread)
-    score *= ((tilted > _TILTS[0]) & (tilted < _TILTS[1])) / (1.0 + 0.1 * spread)
+    score = np.minimum(support[left, None], support[right]) + 0.25 * (
+        support[left, None] + support[right]
+    )
+    tilts = np.arctan((a[right] - a[left, None]) / spread)
+    score *= ((tilts > _TILTS[0]) & (tilts < _TILTS[1])) / (1.0 + 0.1 * spread)
     best_left, best_right = np.unravel_index(np.argmax(score), score.shape)
     lines = []
     for k in (left[best_left], right[best_right]):

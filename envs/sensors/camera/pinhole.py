@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ...arguments import brief, is_finite, unknown_names
+from ...arguments import describe_unknown, is_finite, short_repr
 from ...documents import read_document, write_document
 
 Array = npt.NDArray[np.floating[Any]]
@@ -43,15 +43,15 @@ class Pinhole:
     def __post_init__(self) -> None:
         K, dist = np.array(self.K, float), np.array(self.dist, float).ravel()
         if K.shape != (3, 3) or not (np.isfinite(K).all() and K[0, 0] > 0.0 and K[1, 1] > 0.0):
-            raise ValueError(f"K is a 3 x 3 camera matrix in pixels, got {brief(self.K)}")
+            raise ValueError(f"K is a 3 x 3 camera matrix in pixels, got {short_repr(self.K)}")
         if len(dist) not in (4, 5) or not np.isfinite(dist).all():
-            raise ValueError(f"dist is k1, k2, p1, p2 and perhaps k3, got {brief(self.dist)}")
+            raise ValueError(f"dist is k1, k2, p1, p2 and perhaps k3, got {short_repr(self.dist)}")
         size = tuple(self.size)
         if len(size) != 2 or not all(isinstance(n, int) and 16 <= n <= 1 << 14 for n in size):
-            raise ValueError(f"size is (width, height) in pixels, got {brief(self.size)}")
+            raise ValueError(f"size is (width, height) in pixels, got {short_repr(self.size)}")
         for name in ("height", "tilt", "ahead", "preview", "rate"):
             if not is_finite(getattr(self, name)):
-                raise ValueError(f"{name} is a number, got {brief(getattr(self, name))}")
+                raise ValueError(f"{name} is a number, got {short_repr(getattr(self, name))}")
         if not (self.height > 0.0 and self.rate > 0.0 and abs(self.tilt) < 1.0):
             raise ValueError(
                 "height and rate are positive and the tilt is within 1 rad, got "
@@ -66,7 +66,7 @@ class Pinhole:
         """A camera from names and values; ValueError for an unknown name and for none of K."""
         known = [field.name for field in dataclasses.fields(cls)]
         if unknown := [name for name in values if name not in (*known, *_MEASURED)]:
-            raise ValueError(unknown_names("camera field", unknown, known))
+            raise ValueError(describe_unknown("camera field", unknown, known))
         try:
             return cls(**{name: values[name] for name in values if name in known})
         except (TypeError, ValueError) as error:
@@ -87,39 +87,39 @@ class Pinhole:
         """Write a file that `read` reads back; measured: what else a calibration found."""
         write_document(path, dataclasses.asdict(self) | measured)
 
-    def undistorted(self, pixels: Array) -> Array:
+    def undistort(self, pixels: Array) -> Array:
         """Points on the plane one unit ahead of the lens, (..., 2), of pixels (..., 2)."""
         points = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
         criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-9)
-        found = cv2.undistortPoints(
+        undistorted = cv2.undistortPoints(
             points, np.array(self.K), np.array(self.dist), criteria=criteria
         )
-        return np.asarray(found, float).reshape(np.shape(pixels))
+        return np.asarray(undistorted, float).reshape(np.shape(pixels))
 
-    def pixels_of(self, x: Array, y: Array) -> Array:
+    def project_points(self, x: Array, y: Array) -> Array:
         """The pixels (..., 2) of points of the road, in m ahead and to the left of the car; NaN
         where they lie outside the picture."""
         x, y = np.broadcast_arrays(np.asarray(x, float) - self.ahead, np.asarray(y, float))
         depth = x * cos(self.tilt) + self.height * sin(self.tilt)
         down = self.height * cos(self.tilt) - x * sin(self.tilt)
-        seen = depth > 0.1
-        points = np.stack([-y, down, np.where(seen, depth, 1.0)], -1).reshape(-1, 1, 3)
+        is_in_front = depth > 0.1
+        points = np.stack([-y, down, np.where(is_in_front, depth, 1.0)], -1).reshape(-1, 1, 3)
         pixels, _ = cv2.projectPoints(
             points, np.zeros(3), np.zeros(3), np.array(self.K), np.array(self.dist)
         )
         pixels = np.asarray(pixels, float).reshape(*x.shape, 2)
         width, height = self.size
         corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
-        edge = np.linalg.norm(self.undistorted(corners), axis=1).max()  # the polynomial's folds
-        inside = np.hypot(y, down) <= 1.02 * edge * depth
-        inside &= (pixels >= 0.0).all(-1) & (pixels <= np.array([width, height]) - 1.0).all(-1)
-        return np.where((seen & inside)[..., None], pixels, np.nan)
+        edge = np.linalg.norm(self.undistort(corners), axis=1).max()  # the polynomial's folds
+        is_inside = np.hypot(y, down) <= 1.02 * edge * depth
+        is_inside &= (pixels >= 0.0).all(-1) & (pixels <= np.array([width, height]) - 1.0).all(-1)
+        return np.where((is_in_front & is_inside)[..., None], pixels, np.nan)
 
-    def rays(self, first: int, last: int) -> Array:
+    def compute_rays(self, first: int, last: int) -> Array:
         """Directions (rows, width, 3) of the pixels of the rows first to last - 1 in car axes, of
         unit depth."""
         grid = np.stack(np.meshgrid(np.arange(self.size[0]), np.arange(first, last)), -1)
-        across, down = np.moveaxis(self.undistorted(grid.astype(float)), -1, 0)
+        across, down = np.moveaxis(self.undistort(grid.astype(float)), -1, 0)
         s, c = sin(self.tilt), cos(self.tilt)
         return np.stack([c - s * down, -across, -s - c * down], -1)
 
@@ -127,5 +127,5 @@ class Pinhole:
 def resample(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     """Resample a picture to `WORKING_WIDTH`, in its proportions."""
     size = WORKING_WIDTH, round(picture.shape[0] * WORKING_WIDTH / picture.shape[1])
-    way = cv2.INTER_AREA if picture.shape[1] > WORKING_WIDTH else cv2.INTER_CUBIC
-    return np.asarray(cv2.resize(picture, size, interpolation=way), np.uint8)
+    method = cv2.INTER_AREA if picture.shape[1] > WORKING_WIDTH else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(picture, size, interpolation=method), np.uint8)

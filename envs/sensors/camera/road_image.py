@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ...arguments import brief, is_finite
-from ...vehicle.dynamics import Road
+from ...arguments import is_finite, short_repr
+from ...vehicle.dynamics import RoadParams
 from .pinhole import Pinhole
 
 Image = npt.NDArray[np.uint8]
@@ -42,14 +42,14 @@ class Appearance:
         for field in fields(self):
             value = getattr(self, field.name)
             if not (is_finite(value) and value >= 0.0):
-                raise ValueError(f"{field.name} is zero or more, got {brief(value)}")
+                raise ValueError(f"{field.name} is zero or more, got {short_repr(value)}")
         if max(self.shadow, self.wear) > 1.0:
             raise ValueError(f"shadow and wear are shares, got {self.shadow} and {self.wear}")
         if not min(self.lane_width, self.marking_width, self.dash) > 0.0:
             raise ValueError("lane_width, marking_width and dash are positive")
 
 
-class Scene(NamedTuple):
+class RoadScene(NamedTuple):
     """Where the car is against the road, and the road's bend."""
 
     psi: float = 0.0  # rad, heading against the road, to the left positive
@@ -57,15 +57,15 @@ class Scene(NamedTuple):
     s: float = 0.0  # m, along the road
     roll: float = 0.0  # rad, left side up positive, about the road below the car
     pitch: float = 0.0  # rad, nose down positive
-    road: Road = Road(0.0, 0.0, 1.0)
+    road: RoadParams = RoadParams(0.0, 0.0, 1.0)
 
     @classmethod
-    def bend(cls, curvature: float, **places: float) -> "Scene":
+    def make_bend(cls, curvature: float, **places: float) -> "RoadScene":
         """On a road of constant curvature in 1/m."""
-        return cls(road=Road(curvature, -1e6, 1.0), **places)
+        return cls(road=RoadParams(curvature, -1e6, 1.0), **places)
 
 
-class Painter:
+class RoadRenderer:
     """Renders a camera's pictures; rows: the first and the last row that is painted, the rest stays
     black (default: all)."""
 
@@ -78,62 +78,64 @@ class Painter:
         self.camera, self.appearance = camera, appearance or Appearance()
         first, last = rows or (0, camera.size[1])
         self.rows = slice(first, last)
-        self._rays = np.moveaxis(camera.rays(first, last), -1, 0).astype(np.float32).copy()
+        self._rays = np.moveaxis(camera.compute_rays(first, last), -1, 0).astype(np.float32).copy()
 
-    def picture(self, scene: Scene, seed: Any = 0) -> Image:
+    def render_picture(self, scene: RoadScene, seed: Any = 0) -> Image:
         """The picture (height, width) in grey levels; seed: of `np.random.Philox`, a number or a
         pair (key, tick), for the noise."""
-        camera, look = self.camera, self.appearance
-        light = self._road(scene)
-        if look.blur > 0.0:
-            light = np.asarray(cv2.GaussianBlur(light, (0, 0), look.blur), np.float32)
-        if look.noise > 0.0:
+        camera, style = self.camera, self.appearance
+        light = self._render_road(scene)
+        if style.blur > 0.0:
+            light = np.asarray(cv2.GaussianBlur(light, (0, 0), style.blur), np.float32)
+        if style.noise > 0.0:
             key, tick = seed if isinstance(seed, tuple) else (int(seed), 0)
-            numbers = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, tick]))
-            light += look.noise * numbers.standard_normal(light.shape, np.float32)
-        whole = np.zeros(camera.size[::-1], np.uint8)
-        whole[self.rows] = np.clip(light + 0.5, 0.0, 255.0)
-        return whole
+            rng = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, tick]))
+            light += style.noise * rng.standard_normal(light.shape, np.float32)
+        image = np.zeros(camera.size[::-1], np.uint8)
+        image[self.rows] = np.clip(light + 0.5, 0.0, 255.0)
+        return image
 
-    def _road(self, scene: Scene) -> Flat:
+    def _render_road(self, scene: RoadScene) -> Flat:
         """Brightness of the painted rows without blur and noise."""
-        camera, look = self.camera, self.appearance
-        turn = _attitude(scene.roll, scene.pitch)
-        eye = turn @ [camera.ahead, 0.0, camera.height]
-        ahead, left, up = np.tensordot(turn.astype(np.float32), self._rays, 1)
-        reach = np.float32(eye[2]) / np.maximum(-up, 1e-4)
-        X, Y = np.float32(eye[0]) + reach * ahead, np.float32(eye[1]) + reach * left
-        seen = (up < -1e-3) & (X < _FAR)
-        d, s = _lane_coordinates(X, Y, scene)
-        wide = reach / np.float32(camera.K[0][0])  # m of a pixel, across and along the view
-        long = wide * np.maximum(X, 1.0) / np.float32(eye[2])
-        across = np.hypot(wide, long * np.float32(sin(scene.psi)))
-        paint = _stripe(d + 0.5 * look.lane_width, look.marking_width, across)  # right, solid
-        dashes = _stripe(d - 0.5 * look.lane_width, look.marking_width, across)
-        period = look.dash + look.gap
-        place = np.mod(s + np.float32(scene.s % period) + 0.5 * look.gap, period)
-        paint += dashes * _stripe(place - 0.5 * period, look.dash, long)
-        if look.wear > 0.0:
+        camera, style = self.camera, self.appearance
+        rotation = _make_rotation(scene.roll, scene.pitch)
+        lens = rotation @ [camera.ahead, 0.0, camera.height]
+        forward, left, up = np.tensordot(rotation.astype(np.float32), self._rays, 1)
+        reach = np.float32(lens[2]) / np.maximum(-up, 1e-4)
+        X, Y = np.float32(lens[0]) + reach * forward, np.float32(lens[1]) + reach * left
+        is_road = (up < -1e-3) & (X < _FAR)
+        d, s = _compute_lane_coordinates(X, Y, scene)
+        pixel_width = reach / np.float32(camera.K[0][0])  # m of a pixel, across and along the view
+        pixel_length = pixel_width * np.maximum(X, 1.0) / np.float32(lens[2])
+        footprint_width = np.hypot(pixel_width, pixel_length * np.float32(sin(scene.psi)))
+        paint = _compute_coverage(
+            d + 0.5 * style.lane_width, style.marking_width, footprint_width
+        )  # right, solid
+        dashes = _compute_coverage(d - 0.5 * style.lane_width, style.marking_width, footprint_width)
+        period = style.dash + style.gap
+        place = np.mod(s + np.float32(scene.s % period) + 0.5 * style.gap, period)
+        paint += dashes * _compute_coverage(place - 0.5 * period, style.dash, pixel_length)
+        if style.wear > 0.0:
             first = int(np.floor(scene.s / _PATCH))
             patches = np.floor((s + np.float32(scene.s - first * _PATCH)) / _PATCH)
-            paint *= _hash(patches.astype(np.int64) + first, d / _FLAKE) >= look.wear
+            paint *= _hash_cells(patches.astype(np.int64) + first, d / _FLAKE) >= style.wear
         light = ASPHALT + (PAINT - ASPHALT) * paint
-        if look.shadow > 0.0:
+        if style.shadow > 0.0:
             bands = np.mod(s + np.float32(scene.s % 11.0) + 0.7 * d, 11.0) < 4.5
-            light *= 1.0 - np.float32(look.shadow) * bands
-        verge = np.abs(d) > 0.5 * look.lane_width + VERGE
-        light = np.where(seen, np.where(verge, np.float32(GRASS), light), np.float32(SKY))
+            light *= 1.0 - np.float32(style.shadow) * bands
+        verge = np.abs(d) > 0.5 * style.lane_width + VERGE
+        light = np.where(is_road, np.where(verge, np.float32(GRASS), light), np.float32(SKY))
         return np.asarray(light, np.float32)
 
 
-def _attitude(roll: float, pitch: float) -> Any:
+def _make_rotation(roll: float, pitch: float) -> Any:
     """From body axes to those of the road."""
-    over = np.array([[1, 0, 0], [0, cos(roll), -sin(roll)], [0, sin(roll), cos(roll)]])
-    nod = np.array([[cos(pitch), 0, sin(pitch)], [0, 1, 0], [-sin(pitch), 0, cos(pitch)]])
-    return nod @ over
+    roll_matrix = np.array([[1, 0, 0], [0, cos(roll), -sin(roll)], [0, sin(roll), cos(roll)]])
+    pitch_matrix = np.array([[cos(pitch), 0, sin(pitch)], [0, 1, 0], [-sin(pitch), 0, cos(pitch)]])
+    return pitch_matrix @ roll_matrix
 
 
-def _lane_coordinates(X: Flat, Y: Flat, scene: Scene) -> tuple[Flat, Flat]:
+def _compute_lane_coordinates(X: Flat, Y: Flat, scene: RoadScene) -> tuple[Flat, Flat]:
     """(d, s): m left of the lane's middle and along it from the car, of points in car axes.
 
     Exact on the osculating circle; where the curvature changes ahead, to first order about it.
@@ -154,16 +156,16 @@ def _lane_coordinates(X: Flat, Y: Flat, scene: Scene) -> tuple[Flat, Flat]:
     return d.astype(np.float32), np.asarray(s, np.float32)
 
 
-def _stripe(offset: Flat, width: float, footprint: Flat) -> Flat:
+def _compute_coverage(offset: Flat, width: float, footprint: Flat) -> Flat:
     """The share of a footprint that a stripe covers."""
     share = np.clip((0.5 * width - np.abs(offset)) / footprint + 0.5, 0.0, 1.0)
     return np.asarray(np.minimum(share, width / footprint), np.float32)
 
 
-def _hash(along: npt.NDArray[np.int64], across: Flat) -> Flat:
+def _hash_cells(cells_s: npt.NDArray[np.int64], cells_d: Flat) -> Flat:
     """A number in [0, 1) for each cell of the road."""
-    word = along.astype(np.uint32) * np.uint32(0x9E3779B1)
-    word ^= np.floor(across).astype(np.int64).astype(np.uint32) * np.uint32(0x85EBCA77)
+    word = cells_s.astype(np.uint32) * np.uint32(0x9E3779B1)
+    word ^= np.floor(cells_d).astype(np.int64).astype(np.uint32) * np.uint32(0x85EBCA77)
     word ^= word >> np.uint32(15)
     word *= np.uint32(0x2C1B3C6D)
     word ^= word >> np.uint32(13)

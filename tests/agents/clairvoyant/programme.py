@@ -14,8 +14,14 @@ import numpy.typing as npt
 import osqp
 from scipy import sparse
 
-from sideslip.agents.clairvoyant.foresight import Fixed, Forecast, Known, State
-from sideslip.agents.clairvoyant.plant import advance, carried, node_cost, node_errors, scales
+from sideslip.agents.clairvoyant.foresight import Forecast, PlanParams, PlanState, PreviewStep
+from sideslip.agents.clairvoyant.plant import (
+    advance,
+    compute_node_cost,
+    compute_node_errors,
+    get_state_scales,
+    list_active_states,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -52,31 +58,31 @@ class Programme:
 
 
 @functools.lru_cache(maxsize=8)
-def _expansion(fixed: Fixed, steps: int, v_x: float) -> tuple[Any, Any]:
-    """Two functions of `Known`: of a period, and of the episode's end.
+def _expansion(fixed: PlanParams, steps: int, v_x: float) -> tuple[Any, Any]:
+    """Two functions of `PreviewStep`: of a period, and of the episode's end.
 
     They return (next state, its slope, cost, its gradient, its Hessian) at zero, and (cost,
     gradient, Hessian).
     """
-    names = tuple(name for name in carried(fixed) if name not in ("v_x", "integral"))
-    scale, size = scales(fixed, names), len(names)
+    names = tuple(name for name in list_active_states(fixed) if name not in ("v_x", "integral"))
+    scale, size = get_state_scales(fixed, names), len(names)
     w = ca.SX.sym("w", size + fixed.width)
-    known = ca.SX.sym("known", len(Known._fields), steps)
-    rest = State(*(0.0,) * len(State._fields))._replace(v_x=v_x)
+    known = ca.SX.sym("known", len(PreviewStep._fields), steps)
+    rest = PlanState(*(0.0,) * len(PlanState._fields))._replace(v_x=v_x)
     x = rest._replace(**{name: scale[i] * w[i] for i, name in enumerate(names)})
     first, cost = x, ca.SX(0.0)
     for j in range(steps):
-        here = Known(*ca.vertsplit(known[:, j]))
+        here = PreviewStep(*ca.vertsplit(known[:, j]))
         step = advance(fixed, x, ca.vertsplit(w[size:]), here)
-        cost += node_cost(fixed, node_errors(fixed, x, here), here) + step.effort
+        cost += compute_node_cost(fixed, compute_node_errors(fixed, x, here), here) + step.effort
         x = rest._replace(**{name: getattr(step.state, name) for name in names})
     after = ca.vertcat(*(getattr(x, name) for name in names)) / scale
     H, g = ca.hessian(cost, w)
     zero = ca.DM.zeros(w.shape)
     slope = ca.jacobian(after, w)
     inside = ca.Function("inside", [w, known], [after, slope, cost, g, H])
-    here = Known(*ca.vertsplit(known[:, 0]))
-    last = node_cost(fixed, node_errors(fixed, first, here), here)
+    here = PreviewStep(*ca.vertsplit(known[:, 0]))
+    last = compute_node_cost(fixed, compute_node_errors(fixed, first, here), here)
     H, g = ca.hessian(last, w)
     end = ca.Function("end", [w, known], [last, g, H])
 
@@ -91,10 +97,10 @@ def programme_of(forecast: Forecast, steps: int) -> Programme:
     fixed, start = forecast.fixed, forecast.start
     if fixed.ticks != 1:
         raise ValueError(f"the linear plan is made of ticks, got steps of {fixed.ticks}")
-    names = tuple(name for name in carried(fixed) if name not in ("v_x", "integral"))
+    names = tuple(name for name in list_active_states(fixed) if name not in ("v_x", "integral"))
     size, K = len(names), fixed.periods // steps
     inside, end = _expansion(fixed, steps, start.v_x)
-    known = forecast.known[:, :-1].reshape(len(Known._fields), K, steps)
+    known = forecast.known[:, :-1].reshape(len(PreviewStep._fields), K, steps)
     n = size + fixed.width
     q, constant, offsets = np.zeros(K * n + size), 0.0, np.empty((K, size))
     for k in range(K):
@@ -106,7 +112,7 @@ def programme_of(forecast: Forecast, steps: int) -> Programme:
     q[K * n :], constant = g.ravel()[:size], constant + cost.item()
     blocks = [sparse.csc_matrix(H)] * K
     P = sparse.block_diag([*blocks, H_end[:size, :size]], format="csc")
-    x_0 = np.array([getattr(start, name) for name in names]) / scales(fixed, names)
+    x_0 = np.array([getattr(start, name) for name in names]) / get_state_scales(fixed, names)
     ahead = sparse.kron(sparse.eye(K, K), slope, format="csc")
     forward = sparse.hstack([ahead, sparse.csc_matrix((K * size, size))])
     pick_x = sparse.hstack([sparse.eye(size), sparse.csc_matrix((size, fixed.width))])

@@ -9,19 +9,26 @@ import pytest
 import sideslip
 from sideslip.envs.backend.arrays import read
 from sideslip.envs.engine.layout import P, Z
-from sideslip.envs.scenarios.wind import Wind, wind_at
-from sideslip.envs.vehicle.actuators import distribute
+from sideslip.envs.scenarios.wind import Wind, compute_wind
+from sideslip.envs.vehicle.actuators import allocate_torques
 from sideslip.estimators import EstimateObservation
 
 ca = pytest.importorskip("casadi")
 pytest.importorskip("osqp")
 from sideslip.agents import make_agent  # noqa: E402
 from sideslip.agents.clairvoyant import plan as clairvoyant  # noqa: E402
-from sideslip.agents.clairvoyant.foresight import Known, State, forecast_of  # noqa: E402
-from sideslip.agents.clairvoyant.plan import Replay, actions_of, ceiling, drive, plan, replay  # noqa: E402
+from sideslip.agents.clairvoyant.foresight import PlanState, PreviewStep, make_forecast  # noqa: E402
+from sideslip.agents.clairvoyant.plan import (  # noqa: E402
+    PlanReplay,
+    compute_clairvoyant,
+    evaluate_actions,
+    record_actions,
+    simulate_run,
+    solve_ilqr,
+)
 from sideslip.agents.clairvoyant.plant import advance  # noqa: E402
 from sideslip.agents.rollout import rollout  # noqa: E402
-from sideslip.envs.backend.on_casadi import symbolic  # noqa: E402
+from sideslip.envs.backend.on_casadi import to_casadi  # noqa: E402
 
 assert sideslip.__version__
 ID = "sideslip/YawFusion-v0"
@@ -49,13 +56,15 @@ def test_a_symbolic_tick_is_the_envs(scenario: str, small_angle: bool, lags: boo
     }
     env = make(scenario, 0.2, 1, **changes)
     env.reset(seed=2)
-    forecast = forecast_of(env.unwrapped)
-    w = ca.SX.sym("w", len(State._fields))
-    u, known = ca.SX.sym("u"), ca.SX.sym("known", len(Known._fields))
-    step = advance(forecast.fixed, State(*ca.vertsplit(w)), [u], Known(*ca.vertsplit(known)))
+    forecast = make_forecast(env.unwrapped)
+    w = ca.SX.sym("w", len(PlanState._fields))
+    u, known = ca.SX.sym("u"), ca.SX.sym("known", len(PreviewStep._fields))
+    step = advance(
+        forecast.fixed, PlanState(*ca.vertsplit(w)), [u], PreviewStep(*ca.vertsplit(known))
+    )
     tick = ca.Function("tick", [w, u, known], [ca.vertcat(*step.state)])
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 1))
-    run = drive(env, 2, actions).trajectory
+    run = simulate_run(env, 2, actions).trajectory
     for k in range(200):
         after = tick(run.states[k], run.actions[k], forecast.known[:, k]).full()[:, 0]
         np.testing.assert_allclose(after, run.states[k + 1], rtol=1e-9, atol=2e-8)
@@ -87,12 +96,14 @@ def test_a_symbolic_tick_is_the_envs_where_the_road_the_tyres_or_the_driver_act(
     env = gymnasium.make(ID, scenario=changes | {"duration": 0.2}, control_period=1)
     env.reset(seed=2)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 1))
-    forecast = forecast_of(env.unwrapped, actions)
-    w = ca.SX.sym("w", len(State._fields))
-    u, known = ca.SX.sym("u"), ca.SX.sym("known", len(Known._fields))
-    step = advance(forecast.fixed, State(*ca.vertsplit(w)), [u], Known(*ca.vertsplit(known)))
+    forecast = make_forecast(env.unwrapped, actions)
+    w = ca.SX.sym("w", len(PlanState._fields))
+    u, known = ca.SX.sym("u"), ca.SX.sym("known", len(PreviewStep._fields))
+    step = advance(
+        forecast.fixed, PlanState(*ca.vertsplit(w)), [u], PreviewStep(*ca.vertsplit(known))
+    )
     tick = ca.Function("tick", [w, u, known], [ca.vertcat(*step.state)])
-    run = drive(env, 2, actions).trajectory
+    run = simulate_run(env, 2, actions).trajectory
     for k in range(200):
         after = tick(run.states[k], run.actions[k], forecast.known[:, k]).full()[:, 0]
         np.testing.assert_allclose(after, run.states[k + 1], rtol=1e-9, atol=2e-8)
@@ -102,14 +113,14 @@ def test_the_forecast_is_what_the_car_meets() -> None:
     """The disturbances of a run with other actions are those that were listed."""
     env = make("gust", 0.5, 1)
     env.reset(seed=5)
-    forecast = forecast_of(env.unwrapped)
+    forecast = make_forecast(env.unwrapped)
     state: Any = env.unwrapped
     snapshot = state.get_state()
     wind = read(snapshot["params"], P.wind)
     for k in range(500):
         z = state.get_state()["state"]
-        force = z[Z.drive.F_d] + wind_at(float(k), wind)[0]
-        assert forecast.known[Known._fields.index("F_d"), k] == force
+        force = z[Z.drive.F_d] + compute_wind(float(k), wind)[0]
+        assert forecast.known[PreviewStep._fields.index("F_d"), k] == force
         env.step(np.array([0.7], np.float32))
 
 
@@ -120,8 +131,8 @@ def test_a_lagged_reference_is_the_envs() -> None:
     )
     env.reset(seed=5)
     names = ("beta_ref", "gamma_ref")
-    forecast = forecast_of(env.unwrapped, np.zeros((3000, 1)))
-    known = forecast.known[[Known._fields.index(name) for name in names]]
+    forecast = make_forecast(env.unwrapped, np.zeros((3000, 1)))
+    known = forecast.known[[PreviewStep._fields.index(name) for name in names]]
     assert np.ptp(known, axis=1).min() > 0.002
     for k in range(1, 3000):
         *_, info = env.step(np.full(1, 0.1, np.float32))
@@ -140,15 +151,15 @@ def test_no_run_is_better(scenario: str) -> None:
     agent = make_agent("two-dof", sensed)
     rng = np.random.default_rng(1)
     for seed in range(2):
-        best = ceiling(env, seed, {"two-dof": actions_of(sensed, agent, seed)})
+        best = compute_clairvoyant(env, seed, {"two-dof": record_actions(sensed, agent, seed)})
         assert best.winner.startswith("from ")
-        assert best.cost == replay(env, seed, best.actions)
+        assert best.cost == evaluate_actions(env, seed, best.actions)
         assert best.cost <= min(best.costs["none"], best.costs["two-dof"])
         for size in (0.01, 0.05):
             for _ in range(4):
                 held = np.repeat(rng.normal(0.0, size, (30, 1)), 10, axis=0)
                 other = np.clip(best.actions + held, -1.0, 1.0)
-                assert replay(env, seed, other) > (1.0 - 1e-3) * best.cost
+                assert evaluate_actions(env, seed, other) > (1.0 - 1e-3) * best.cost
 
 
 @pytest.mark.long
@@ -156,24 +167,24 @@ def test_a_car_that_is_lost_is_saved() -> None:
     """The uncontrolled car leaves the lane; the plan that starts from that run does not."""
     env = make("lane-change", 6.0)
     none = np.zeros((600, 1))
-    lost = drive(env, 2, none)
-    found = plan(env, 2)
+    lost = simulate_run(env, 2, none)
+    found = solve_ilqr(env, 2)
     assert found.cost < 0.3 * lost.cost
-    assert found.cost == replay(env, 2, found.actions)
+    assert found.cost == evaluate_actions(env, 2, found.actions)
 
 
 @pytest.mark.long
 def test_steering_too() -> None:
     """Two actions do better than one, and the steering that is found was within its rate."""
-    alone = plan(make("lane-change"), 0)
+    alone = solve_ilqr(make("lane-change"), 0)
     env = gymnasium.make(
         "sideslip/AfsYawFusion-v0", scenario={"base": "lane-change", "duration": 2.0}
     )
-    both = plan(env, 0)
+    both = solve_ilqr(env, 0)
     assert both.actions.shape == (200, 2)
     assert both.cost < 0.5 * alone.cost
-    run = drive(env, 0, both.actions.astype(np.float64)).trajectory
-    stands = run.states[:, State._fields.index("slewing")] / 0.1  # rad of full scale
+    run = simulate_run(env, 0, both.actions.astype(np.float64)).trajectory
+    stands = run.states[:, PlanState._fields.index("slewing")] / 0.1  # rad of full scale
     assert np.abs(np.diff(stands)).max() == pytest.approx(0.08)  # 0.8 rad/s, 10 ms: it binds
     beyond = np.abs(both.actions[:, 1] - stands[1:]) > 1e-6
     assert beyond.mean() < 0.1  # hardly any action asks for more than the rate gives
@@ -182,9 +193,11 @@ def test_steering_too() -> None:
 def test_a_plan_is_an_agent() -> None:
     env = make("sine", 0.5)
     actions = np.random.default_rng(3).uniform(-1.0, 1.0, (50, 1)).astype(np.float32)
-    agent = Replay(env, actions)
-    assert rollout(env, agent, 4).cost == pytest.approx(replay(env, 4, actions), rel=1e-12)
-    np.testing.assert_array_equal(actions_of(env, agent, 4), actions)
+    agent = PlanReplay(env, actions)
+    assert rollout(env, agent, 4).cost == pytest.approx(
+        evaluate_actions(env, 4, actions), rel=1e-12
+    )
+    np.testing.assert_array_equal(record_actions(env, agent, 4), actions)
     obs = np.zeros((3, len(env.get_wrapper_attr("layout"))), np.float32)
     taken, state = agent.predict(obs, np.array([[0.0], [7.0], [50.0]]))
     np.testing.assert_array_equal(taken[:, 0], [actions[0, 0], actions[7, 0], 0.0])
@@ -194,27 +207,27 @@ def test_a_plan_is_an_agent() -> None:
 def test_an_unfinished_plan_has_its_status_and_the_better_run_stands(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(clairvoyant, "MOST_SWEEPS", 1)
+    monkeypatch.setattr(clairvoyant, "MAX_ITERATIONS", 1)
     env = make("sine", 1.0)
-    found = ceiling(env, 0, {"other": np.full((100, 1), 0.1)})
+    found = compute_clairvoyant(env, 0, {"other": np.full((100, 1), 0.1)})
     assert found.statuses == {"other": "stopped"}
     assert found.cost == min(found.costs.values()) == found.costs[found.winner]
-    monkeypatch.setattr(clairvoyant, "LENGTHS", (0.0,))  # steps that go nowhere
-    stuck = plan(env, 0)
-    assert stuck.status == "stuck" and stuck.cost == replay(env, 0, np.zeros((100, 1)))
+    monkeypatch.setattr(clairvoyant, "STEP_LENGTHS", (0.0,))  # steps that go nowhere
+    stuck = solve_ilqr(env, 0)
+    assert stuck.status == "stuck" and stuck.cost == evaluate_actions(env, 0, np.zeros((100, 1)))
 
 
 def test_bad_input() -> None:
     env = make("sine", 0.2)
     with pytest.raises(ValueError, match=r"shape \(20, 1\), got \(3, 1\)"):
-        plan(env, 0, np.zeros((3, 1)))
+        solve_ilqr(env, 0, np.zeros((3, 1)))
     env.step(np.zeros(1, np.float32))
     with pytest.raises(ValueError, match="call reset"):
-        forecast_of(env.unwrapped)
+        make_forecast(env.unwrapped)
     for wrong in (np.zeros(5), np.zeros((5, 2)), np.full((5, 1), np.nan)):
         with pytest.raises(ValueError, match="a plan is finite numbers"):
-            Replay(env, wrong)
-    joined = symbolic(wind_at)
+            PlanReplay(env, wrong)
+    joined = to_casadi(compute_wind)
     with pytest.raises(TypeError, match="&"):
         joined(ca.SX.sym("tick"), Wind(1.0, 0.0, 0.0, 1.0))
-    assert symbolic(distribute) is not distribute
+    assert to_casadi(allocate_torques) is not allocate_torques

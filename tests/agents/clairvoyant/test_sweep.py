@@ -6,8 +6,8 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
 
 pytest.importorskip("casadi")
-from sideslip.agents.clairvoyant.slopes import Limits, Slopes
-from sideslip.agents.clairvoyant.sweep import cheapest, sweep
+from sideslip.agents.clairvoyant.slopes import Limits, Linearisation
+from sideslip.agents.clairvoyant.sweep import run_backward_pass, solve_input_qp
 
 
 def test_the_cheapest_step_is_that_of_bounded_least_squares() -> None:
@@ -16,7 +16,7 @@ def test_the_cheapest_step_is_that_of_bounded_least_squares() -> None:
     for _ in range(300):
         root, target = rng.normal(size=(2, 2)), rng.normal(size=2)
         low, high = -rng.uniform(0.0, 2.0, 2), rng.uniform(0.0, 2.0, 2)
-        found = cheapest(root.T @ root, -root.T @ target, low, high)
+        found = solve_input_qp(root.T @ root, -root.T @ target, low, high)
         best = lsq_linear(root, target, (low - 1e-12, high + 1e-12), tol=1e-14).x
         cost = [np.sum((root @ each - target) ** 2) for each in (found[:2], best)]
         assert cost[0] <= cost[1] + 1e-9
@@ -26,14 +26,14 @@ def test_the_cheapest_step_is_that_of_bounded_least_squares() -> None:
     assert len(sides) == 4  # free, at either limit, in a corner
 
 
-def episode(K: int = 400) -> tuple[Slopes, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def episode(K: int = 400) -> tuple[Linearisation, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(1)
     A, B = np.eye(3) + 0.1 * rng.normal(size=(3, 3)), rng.normal(size=(3, 2))
     Q, R = np.diag([1.0, 2.0, 0.5]), np.diag([0.3, 0.7])
     F = np.tile(np.hstack([A, B]), (K, 1, 1))
     H = np.zeros((K + 1, 5, 5))
     H[:, :3, :3], H[:, 3:, 3:] = Q, R
-    return Slopes(F, np.zeros((K + 1, 5)), H), A, B, Q, R
+    return Linearisation(F, np.zeros((K + 1, 5)), H), A, B, Q, R
 
 
 def test_the_gains_are_the_regulators() -> None:
@@ -42,7 +42,7 @@ def test_the_gains_are_the_regulators() -> None:
     K, zero = 400, np.zeros(400)
     limits = Limits(np.full((K, 2), -9.0), np.full((K, 2), 9.0), zero, zero, 0, 0.0)
     d, G = np.empty((K, 2)), np.empty((K, 2, 3))
-    sweep(slopes, limits, np.zeros((K, 2)), K, 0.0, d, G)
+    run_backward_pass(slopes, limits, np.zeros((K, 2)), K, 0.0, d, G)
     P = solve_discrete_are(A, B, Q, R)
     gain = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     np.testing.assert_allclose(G[0], -gain, rtol=1e-9)
@@ -58,7 +58,7 @@ def test_limits_hold_and_steering_at_the_end_of_its_rate_follows_its_past() -> N
     inputs = np.full((K, 2), 0.1)
     d, G = np.empty((K, 2)), np.empty((K, 2, 3))
     limits = Limits(low, high, rate_low, rate_high, 2, 0.4)
-    sweep(slopes, limits, inputs, 300, 1e-3, d, G)
+    run_backward_pass(slopes, limits, inputs, 300, 1e-3, d, G)
     steering = inputs[:300, 1] + d[:300, 1]
     assert np.all((steering >= -0.2 - 1e-12) & (steering <= 0.3 + 1e-12))
     assert np.all(np.abs(inputs[:300, 0] + d[:300, 0]) <= 1.0 + 1e-12)

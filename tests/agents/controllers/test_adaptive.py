@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.adaptive import GRIP, TYRES
-from sideslip.agents.controllers.lqr import IN, predicted_state
-from sideslip.agents.rungs import levels_of
-from sideslip.benchmarks.control.cells import Cell
-from sideslip.benchmarks.control.contests import STEERING, Contest
-from sideslip.benchmarks.control.episodes import Chunk, drive
-from sideslip.envs import scenario_from
+from sideslip.agents.controllers.adaptive import INVERSE_FRICTION, TYRES
+from sideslip.agents.controllers.lqr import IN, make_design_state
+from sideslip.agents.rungs import make_noise_options
+from sideslip.benchmarks.control.cells import ControlEntry
+from sideslip.benchmarks.control.contests import STEERING, ControlTask
+from sideslip.benchmarks.control.episodes import Chunk, run_chunk
+from sideslip.envs import make_scenario
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.vector import EstimateObservation as Vector
 
-STEERED = Contest("2a", STEERING, "passenger-car", "lagged", "car-slalom")
+STEERED = ControlTask("2a", STEERING, "passenger-car", "lagged", "car-slalom")
 
 
 def env_of(cars: int | None = None, friction: float = 0.3) -> Any:
-    options = levels_of(scenario_from("car-slalom")) | {"slow": ["camera", "gps"]}
+    options = make_noise_options(make_scenario("car-slalom")) | {"slow": ["camera", "gps"]}
     outputs = ["beta", "gamma", "F_d", "N_d", "front_tyres", "rear_tyres"]
     if friction:
         options["inverse_friction_sd"] = friction
@@ -50,8 +50,8 @@ def test_the_gains_are_those_of_the_stiffness_estimated(front: float, rear: floa
     obs = changed(env, obs, **small, **dict(zip(TYRES, (front, rear), strict=True)))
     action, _ = agent.predict(obs)
     x = obs[agent._columns].astype(float)
-    z = np.empty(len(agent.purpose.states))
-    predicted_state(x, agent.share, z)
+    z = np.empty(len(agent.design_spec.states))
+    make_design_state(x, agent.share, z)
     car = agent.vehicle
     speed = 0.5 * (x[IN.wheel_left] + x[IN.wheel_right])
     K = agent.gains(speed, front * car.front_stiffness, rear * car.rear_stiffness)
@@ -64,7 +64,7 @@ def test_the_grip_follows_the_friction_estimated() -> None:
     agent: Any = make_agent("adaptive-lqr", env, grip=0.5)
     obs, _ = env.reset(seed=0)
     pushes = [
-        abs(agent.predict(changed(env, obs, beta_hat=0.5, **{GRIP: w}))[0][0])
+        abs(agent.predict(changed(env, obs, beta_hat=0.5, **{INVERSE_FRICTION: w}))[0][0])
         for w in (1.25, 2.5, 1e3)
     ]
     assert pushes[0] == pytest.approx(2.0 * pushes[1], rel=1e-4)
@@ -95,7 +95,7 @@ def test_without_tyres_in_the_observation_it_says_so() -> None:
 def test_knowing_its_tyres_is_worth_a_third_of_the_cost() -> None:
     seeds = tuple(range(700, 712))
     costs = [
-        drive(Chunk(Cell(STEERED, estimator, who), seeds)).costs
+        run_chunk(Chunk(ControlEntry(STEERED, estimator, who), seeds)).costs
         for estimator, who in (("", "nominal"), ("joint", "adaptive-lqr"))
     ]
     assert np.mean(np.log(costs[0] / costs[1])) > 0.4

@@ -16,7 +16,7 @@ from scipy.stats import norm
 
 from sideslip.agents import Lqr, make_agent
 from sideslip.envs.ticks import TICK
-from sideslip.envs.vehicle.linear import LinearModel, bicycle
+from sideslip.envs.vehicle.linear import LinearModel, make_bicycle_model
 from sideslip.estimators import EstimateObservation
 from tests.estimators.riccati import riccati
 
@@ -61,10 +61,10 @@ def mean_cost(env: Any, K: np.ndarray, first: int = 0) -> float:
     first: the step from which on cost counts.
     """
     vehicle, sensors = env.unwrapped.vehicle, env.unwrapped.slow_sensors
-    model = bicycle(vehicle, V)
+    model = make_bicycle_model(vehicle, V)
     push = np.diag([1.0 / (vehicle.mass * V), 1.0 / vehicle.yaw_inertia])
     B = np.hstack([model.B[:, 1:] * vehicle.yaw_moment_limit, push])
-    plane, inputs = LinearModel(model.A, B, np.eye(2), ("beta", "gamma"), (), ()).discrete(TICK)
+    plane, inputs = LinearModel(model.A, B, np.eye(2), ("beta", "gamma"), (), ()).discretise(TICK)
     keep = math.exp(-TICK / LEVELS["disturbance_time"])
     F, H = np.eye(4), np.zeros((4, 1))
     F[:2, :2], F[:2, 2:], H[:2] = plane, inputs[:, 1:], inputs[:, :1]

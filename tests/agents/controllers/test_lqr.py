@@ -11,13 +11,13 @@ from sideslip.agents import Lqr, make_agent
 from sideslip.agents.design.gain_schedule import SPEEDS
 from sideslip.agents.design.sampled_model import (
     DYNAMIC,
-    Purpose,
-    design_model,
-    regulator,
+    DesignSpec,
+    compute_regulator,
+    make_design_model,
 )
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.task.reference import MODEL, ZERO_SLIP, reference, target_of
-from sideslip.envs.vehicle.linear import bicycle
+from sideslip.envs.task.reference import MODEL, ZERO_SLIP, compute_reference, make_reference_params
+from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation
 
 SMALL = {
@@ -33,7 +33,7 @@ SMALL = {
     "disturbance_moment": 0.0,
     "noise": {"wheel": 0.0},
 }
-BOTH = Purpose(10, COMS.yaw_moment_limit, True, MODEL, "forces")
+BOTH = DesignSpec(10, COMS.yaw_moment_limit, True, MODEL, "forces")
 
 
 def estimating(env: Any, *disturbances: str) -> Any:
@@ -61,8 +61,10 @@ def test_the_model_is_the_plant_and_its_cost_the_envs(period: int, lag: float) -
     env: Any = gym.make("sideslip/AfsYawFusion-v0", scenario=scenario, **built)
     env.reset(seed=0)
     vehicle = env.unwrapped.vehicle
-    model = design_model(vehicle, 7.0, Purpose(period, vehicle.yaw_moment_limit, True, MODEL))
-    refs = reference(0.01, 7.0, target_of(vehicle), MODEL)
+    model = make_design_model(
+        vehicle, 7.0, DesignSpec(period, vehicle.yaw_moment_limit, True, MODEL)
+    )
+    refs = compute_reference(0.01, 7.0, make_reference_params(vehicle), MODEL)
     x = np.array([0.0, 0.0, 0.0, 0.01, 0.01, *refs])
     for action in ([0.1, 0.05], [-0.2, 0.1]):
         *_, info = env.step(np.array(action, np.float32))
@@ -81,20 +83,22 @@ def test_gains_are_python_controls_for_all_states_at_once(
     speed: float, kind: int, steers: bool
 ) -> None:
     """`dlqr` itself needs states that can be brought to rest: what is held decays slowly there."""
-    purpose = Purpose(10, COMS.yaw_moment_limit, steers, kind, "rates")
-    model = design_model(COMS, speed, purpose)
+    purpose = DesignSpec(10, COMS.yaw_moment_limit, steers, kind, "rates")
+    model = make_design_model(COMS, speed, purpose)
     G = model.G.copy()
     held = range(len(DYNAMIC), len(G))
     G[held, held] *= 1.0 - 1e-8
     wanted, _, _ = control.dlqr(G, model.H, model.Q, model.R, model.N)
     scale = np.abs(wanted).max()
-    assert regulator(model)[0] / scale == pytest.approx(np.asarray(wanted) / scale, abs=1e-6)
+    assert compute_regulator(model)[0] / scale == pytest.approx(
+        np.asarray(wanted) / scale, abs=1e-6
+    )
 
 
 def test_tabled_gains_are_the_designed_ones(steered: Any) -> None:
     agent = agent_of(steered)
     for speed in (SPEEDS[3], SPEEDS[20]):
-        wanted = regulator(design_model(COMS, speed, agent.purpose))[0]
+        wanted = compute_regulator(make_design_model(COMS, speed, agent.design_spec))[0]
         assert agent.gains(speed) == pytest.approx(wanted, rel=1e-12)
     assert (agent.gains(0.1) == agent.gains(SPEEDS[0])).all()
     assert (agent.gains(99.0) == agent.gains(SPEEDS[-1])).all()
@@ -104,12 +108,12 @@ def test_tabled_gains_are_the_designed_ones(steered: Any) -> None:
 @pytest.mark.parametrize("steers", [False, True])
 def test_the_closed_loop_is_stable_over_the_speeds(car: Any, steers: bool) -> None:
     """At the tabled speeds and between; the COMS alone is unstable above 17.6 m/s."""
-    purpose = Purpose(10, car.yaw_moment_limit, steers, MODEL)
-    gains = [regulator(design_model(car, speed, purpose))[0] for speed in SPEEDS[::4]]
+    purpose = DesignSpec(10, car.yaw_moment_limit, steers, MODEL)
+    gains = [compute_regulator(make_design_model(car, speed, purpose))[0] for speed in SPEEDS[::4]]
     for i, (low, high) in enumerate(zip(SPEEDS[::4], SPEEDS[4::4], strict=False)):
         for share in (0.0, 0.5):
             K = (1.0 - share) * gains[i] + share * gains[i + 1]
-            model = design_model(car, low + share * (high - low), purpose)
+            model = make_design_model(car, low + share * (high - low), purpose)
             moved = slice(len(DYNAMIC))  # the states that inputs move
             closed = model.G[moved, moved] - model.H[moved] @ K[:, moved]
             assert np.abs(np.linalg.eigvals(closed)).max() < 1.0
@@ -117,9 +121,9 @@ def test_the_closed_loop_is_stable_over_the_speeds(car: Any, steers: bool) -> No
 
 def test_it_follows_the_references_where_they_can_be_had(steered: Any) -> None:
     """With both inputs free of limits, beta and gamma reach the model's steady state."""
-    model = design_model(COMS, 7.0, agent_of(steered).purpose)
-    K, d = regulator(model)[0], len(DYNAMIC)
-    refs = reference(0.01, 7.0, target_of(COMS), MODEL)
+    model = make_design_model(COMS, 7.0, agent_of(steered).design_spec)
+    K, d = compute_regulator(model)[0], len(DYNAMIC)
+    refs = compute_reference(0.01, 7.0, make_reference_params(COMS), MODEL)
     held = np.array([0.01, *refs])
     closed = model.G - model.H @ K
     rest = np.linalg.solve(np.eye(d) - closed[:d, :d], closed[:d, d : d + 3] @ held)
@@ -179,7 +183,7 @@ def test_a_held_disturbance_is_met_by_the_best_held_yaw_moment() -> None:
     """Where everything rests, 0 = A x + B u + d, the action is the u that costs least there."""
     env = disturbed("rates")
     agent, v = agent_of(env), SPEEDS[10]
-    model = bicycle(COMS, v)
+    model = make_bicycle_model(COMS, v)
     B = model.B[:, 1] * COMS.yaw_moment_limit
     d, refs = np.array([0.03, -0.1]), np.array([0.002, 0.01])
     scale = np.array([0.02, 0.1])  # of slip and yaw rate in the cost; effort counts 0.01
@@ -201,10 +205,10 @@ def test_a_held_disturbance_is_met_by_the_best_held_yaw_moment() -> None:
 def test_disturbances_and_gyro_are_read_where_they_are() -> None:
     plain = gym.make("sideslip/YawGps-v0")
     assert "gyro" in agent_of(EstimateObservation(plain, "dakf", outputs=["beta"])).needs
-    assert agent_of(estimating(plain)).purpose.disturbances == "none"
-    assert agent_of(estimating(plain, "F_d", "N_d")).purpose.disturbances == "forces"
+    assert agent_of(estimating(plain)).design_spec.disturbances == "none"
+    assert agent_of(estimating(plain, "F_d", "N_d")).design_spec.disturbances == "forces"
     walks = EstimateObservation(plain, "dakf", outputs=["beta", "gamma", "d1", "d2"])
-    assert agent_of(walks).purpose.disturbances == "rates"
+    assert agent_of(walks).design_spec.disturbances == "rates"
 
 
 def test_bad_input(steered: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -219,27 +223,27 @@ def test_bad_input(steered: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(TypeError, match="weight"):
         make_agent("lqr", steered, weight=1.0)
     with pytest.raises(ValueError, match="positive speed"):
-        design_model(COMS, 0.0, BOTH)
+        make_design_model(COMS, 0.0, BOTH)
 
 
 def test_another_action_costs_what_the_curvature_says_and_moves_the_rate_limit() -> None:
-    """`regulator`'s S, in shares of the yaw moment and of the authority; steering that was added
-    by somebody else is what the next decision may differ from by a step of the rate."""
+    """`compute_regulator`'s S, in shares of the yaw moment and of the authority; steering that was
+    added by somebody else is what the next decision may differ from by a step of the rate."""
     env = estimating(gym.make("sideslip/AfsYawFusion-v0", reference="model"), "F_d", "N_d")
     agent, speed = Lqr(env), float(SPEEDS[8])
-    _, S = regulator(design_model(agent.vehicle, speed, agent.purpose))
+    _, S = compute_regulator(make_design_model(agent.vehicle, speed, agent.design_spec))
     per = np.diag([1.0, agent.authority])
     assert agent.curvature(speed) == pytest.approx(per @ S @ per, rel=1e-9)
     obs = np.array([each.low if each.name == "steer_command" else 0.0 for each in
                     env.get_wrapper_attr("layout")], np.float32)  # fmt: skip
     memory = np.zeros((1, 1))
     free, _ = agent.predict(obs, memory)
-    agent.acted(memory, np.array([[0.0, 0.5]], np.float32))
+    agent.record_action(memory, np.array([[0.0, 0.5]], np.float32))
     taken, _ = agent.predict(obs, memory)
     assert memory[0, 0] == pytest.approx(0.5 * agent.authority)
     planner = make_agent("mpc", env)
     memory, most = np.zeros((1, planner.memory)), np.array([[0.0, 1.0]], np.float32)
-    planner.acted(memory, most)
+    planner.record_action(memory, most)
     step = COMS.steering_rate * 0.01 / agent.authority
     assert planner.predict(obs, memory)[0][1] > 1.0 - step - 1e-6
     assert abs(free[1]) <= step + 1e-6 and abs(taken[1] - 0.5) <= step + 1e-6

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.model_following import ModelFollowing, feedback_gains
+from sideslip.agents.controllers.model_following import ModelFollowing, compute_feedback_gains
 from sideslip.envs import COMS, critical_speed
-from sideslip.envs.task.reference import MODEL, reference, target_of
-from sideslip.envs.vehicle.linear import LinearModel, bicycle
+from sideslip.envs.task.reference import MODEL, compute_reference, make_reference_params
+from sideslip.envs.vehicle.linear import LinearModel, make_bicycle_model
 from sideslip.estimators import EstimateObservation
 
 V = 25.0 / 3.6
@@ -21,12 +21,12 @@ OMEGA = np.logspace(-2.0, 3.0, 40)
 
 def plant(speed: float) -> Any:
     """P_n of (27): both inputs to both states."""
-    model = bicycle(COMS, speed)
+    model = make_bicycle_model(COMS, speed)
     return control.StateSpace(model.A, model.B, np.eye(2), np.zeros((2, 2)))
 
 
 def feedback(speed: float, bandwidth: tuple[float, float]) -> Any:
-    P, I = feedback_gains(COMS, speed, bandwidth)  # noqa: E741
+    P, I = compute_feedback_gains(COMS, speed, bandwidth)  # noqa: E741
     return control.StateSpace(np.zeros((2, 2)), np.eye(2), I, P)
 
 
@@ -64,7 +64,7 @@ def test_closed_loop_is_the_wanted_model(speed: float) -> None:
 
 @pytest.mark.parametrize("bandwidth", [(5.0, 5.0), K])
 def test_the_printed_feedback_agrees_for_equal_bandwidths_only(bandwidth: Any) -> None:
-    model = bicycle(COMS, V)
+    model = make_bicycle_model(COMS, V)
     (a11, a12), (a21, a22) = model.A
     (b11, _), (b21, b22) = model.B
     K_b, K_g = bandwidth
@@ -96,7 +96,7 @@ def test_the_papers_own_check_overlooks_the_cancelled_poles() -> None:
     speed = 1.1 * critical_speed(COMS)
     closed = control.feedback(plant(speed) * feedback(speed, K), np.eye(2))
     assert closed.poles().real.max() > 0.1
-    model, s = bicycle(COMS, speed), 1j * OMEGA[:, None, None]
+    model, s = make_bicycle_model(COMS, speed), 1j * OMEGA[:, None, None]
     wanted = np.array([np.diag([K[0] / (w + K[0]), K[1] / (w + K[1])]) for w in 1j * OMEGA])
     first = np.linalg.solve(model.B, (s * np.eye(2) - model.A) @ wanted)
     # P^-1 T = B^-1 (diag(K) - (diag(K) + A) T): a proper function whose only poles are T's
@@ -107,7 +107,7 @@ def test_the_papers_own_check_overlooks_the_cancelled_poles() -> None:
 def test_the_agent_has_these_gains() -> None:
     """Its proportional part at the first decision, and its integral's growth in a millisecond."""
     agent, names = agent_for(bandwidth=K)
-    P, I = feedback_gains(COMS, V, K)  # noqa: E741
+    P, I = compute_feedback_gains(COMS, V, K)  # noqa: E741
     for i, name in enumerate(("beta_hat", "gamma_hat")):
         obs = np.zeros(len(names), np.float32)
         obs[[names.index("wheel_left"), names.index("wheel_right")]] = V
@@ -127,17 +127,19 @@ def test_disturbances_are_rejected_through_the_inverse_of_b() -> None:
         obs[[names.index("wheel_left"), names.index("wheel_right")]] = V
         obs[names.index("d1_hat")], obs[names.index("d2_hat")] = 0.02, -0.3
         action, _ = agent.predict(obs)
-        undone = bicycle(COMS, V).B @ commands(action) + float(rejection) * np.array([0.02, -0.3])
+        undone = make_bicycle_model(COMS, V).B @ commands(action) + float(rejection) * np.array(
+            [0.02, -0.3]
+        )
         assert undone == pytest.approx(0.0, abs=1e-6)  # float32
 
 
 def driven(agent: Any, names: list[str], model: LinearModel, steering: Any) -> np.ndarray:
     """beta, gamma and their references, (ticks, 4): the agent on a linear car that it sees."""
-    G, H = model.discrete(1e-3)
+    G, H = model.discretise(1e-3)
     x, state, rows = np.zeros(2), None, []
     at = {name: names.index(name) for name in names}
     for driver in steering:
-        refs = reference(driver, V, target_of(COMS), MODEL)
+        refs = compute_reference(driver, V, make_reference_params(COMS), MODEL)
         obs = np.zeros(len(names), np.float32)
         obs[[at["wheel_left"], at["wheel_right"]]] = V
         obs[at["steer_command"]] = driver
@@ -160,19 +162,21 @@ def test_feedforward_inverts_the_nominal_plant() -> None:
     """(28)-(29) with the references' derivatives: the nominal car follows as if it had no lag."""
     agent, names = agent_for(bandwidth=(1e-9, 1e-9))  # no feedback to speak of
     t = np.arange(1500) * 1e-3
-    rows = driven(agent, names, bicycle(COMS, V), 0.02 * np.sin(np.pi * t) ** 2)
+    rows = driven(agent, names, make_bicycle_model(COMS, V), 0.02 * np.sin(np.pi * t) ** 2)
     error = np.abs(rows[:, :2] - rows[:, 2:]).max(axis=0)
     # one millisecond late: the derivative is the last one, and the action holds
     slope = np.abs(np.diff(rows[:, 2:], axis=0)).max(axis=0)
     assert (error < 1.5 * slope).all()
-    alone = driven(Nothing(), names, bicycle(COMS, V), 0.02 * np.sin(np.pi * t) ** 2)
+    alone = driven(Nothing(), names, make_bicycle_model(COMS, V), 0.02 * np.sin(np.pi * t) ** 2)
     assert (np.abs(alone[:, :2] - alone[:, 2:]).max(axis=0) > 20.0 * error).all()
 
 
 def test_with_feedback_a_wrong_car_ends_up_where_the_model_says() -> None:
     """Integral action: no error is left by tyres 30 % softer than the nominal ones."""
     agent, names = agent_for(bandwidth=K)
-    rows = driven(agent, names, bicycle(COMS.scaled(0.7), V), np.full(4000, 0.02))
+    rows = driven(
+        agent, names, make_bicycle_model(COMS.scale_stiffness(0.7), V), np.full(4000, 0.02)
+    )
     assert rows[-1, :2] == pytest.approx(rows[-1, 2:], rel=1e-4)
 
 

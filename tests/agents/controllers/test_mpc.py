@@ -50,9 +50,9 @@ def test_without_a_limit_it_is_the_lqr(steers: bool, told: dict[str, float], hor
     agent = agent_of(env, horizon=horizon)
     lqr = Lqr(env)
     obs = observed(env, **told)
-    program = agent.program(V)
+    program = agent.get_program(V)
     K = lqr.gains(V) / np.array([1.0, COMS.steering_authority])[: agent.width, None]
-    x = np.zeros(len(agent.purpose.states))
+    x = np.zeros(len(agent.design_spec.states))
     for name, value in told.items():
         at = {"beta_hat": 0, "gamma_hat": 1, "steer": 3, "steer_command": 4}[name]
         x[at] = value

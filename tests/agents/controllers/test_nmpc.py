@@ -9,20 +9,20 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 
 from sideslip.agents import Nmpc, make_agent
-from sideslip.agents.controllers.nmpc import _shifted, problem_of
+from sideslip.agents.controllers.nmpc import _shift_plan, prepare_prediction
 from sideslip.agents.design.gauss_newton import (
     DIFFERENCE,
     LIMIT,
-    _normal_equations,
-    damped_step,
-    improved,
-    lanes_of,
-    roll_all,
+    _compute_normal_equations,
+    make_plan_batch,
+    simulate_batch,
+    solve_damped_step,
+    update_plan,
 )
-from sideslip.agents.design.prediction import roll_out
-from sideslip.agents.design.prediction_model import blocks_of
-from sideslip.agents.rungs import make_rung
-from sideslip.envs.backend.on_casadi import SYMBOLS, symbolic
+from sideslip.agents.design.prediction import simulate_plans
+from sideslip.agents.design.prediction_model import make_blocks
+from sideslip.agents.rungs import make_oracle
+from sideslip.envs.backend.on_casadi import SYMBOLS, to_casadi
 from sideslip.estimators.wrappers.truth import TruthObservation
 
 YAW, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"
@@ -58,15 +58,17 @@ def problem(agent: Nmpc, obs: np.ndarray) -> Any:
     """(start, K, T) of an observation."""
     x = obs[agent._columns].astype(np.float64)
     friction, roll = x[agent.needs.index("true_friction")], x[-3:-1]
-    return problem_of(agent.design, x, friction, roll, 0.0, agent._most(x[None])[0])
+    return prepare_prediction(
+        agent.design, x, friction, roll, 0.0, agent._compute_max_moment(x[None])[0]
+    )
 
 
 def cost_of(agent: Nmpc, found: Any, plan: np.ndarray) -> float:
     start, K, T = found
     blocks = agent.design.blocks
-    all = lanes_of(len(plan), blocks, 1)
+    all = make_plan_batch(len(plan), blocks, 1)
     all.plans[:, 0] = plan
-    roll_all(agent.design.model, start, K, T, blocks, all)
+    simulate_batch(agent.design.model, start, K, T, blocks, all)
     return float((all.residuals**2).sum())
 
 
@@ -83,7 +85,9 @@ def solved_by_ipopt(agent: Nmpc, found: Any, monkeypatch: pytest.MonkeyPatch) ->
     residuals: dict[int, Any] = {}
     pokes = np.zeros(plan.numel())
     start, K, T = found
-    symbolic(roll_out)(agent.design.model, start, K, T, blocks, plan, pokes, residuals, {}, {})
+    to_casadi(simulate_plans)(
+        agent.design.model, start, K, T, blocks, plan, pokes, residuals, {}, {}
+    )
     objective = ca.sumsqr(ca.vertcat(*residuals.values()))
     options = {"ipopt.print_level": 0, "print_time": False, "ipopt.max_iter": 200}
     solver = ca.nlpsol("plan", "ipopt", {"x": plan, "f": objective}, options)
@@ -112,7 +116,7 @@ def test_ipopt_finds_nothing_much_cheaper(
     plan = np.zeros(agent.width * len(agent.design.blocks))
     zeros = cost_of(agent, found, plan)
     start, K, T = found
-    J, _, _ = improved(agent.design.model, start, K, T, agent.design.blocks, plan, 8)
+    J, _, _ = update_plan(agent.design.model, start, K, T, agent.design.blocks, plan, 8)
     assert pytest.approx(cost_of(agent, found, plan), rel=1e-9) == J
     assert 1.05 * least >= J
     assert zeros >= J
@@ -142,8 +146,8 @@ def test_what_it_foresees_is_what_comes() -> None:
     blocks = agent.design.blocks
     for _ in range(5):
         start, K, T = problem(agent, obs)
-        all = lanes_of(len(blocks), blocks, 1)
-        roll_all(agent.design.model, start, K, T, blocks, all)
+        all = make_plan_batch(len(blocks), blocks, 1)
+        simulate_batch(agent.design.model, start, K, T, blocks, all)
         obs, _, _, _, info = env.step(all.first[:1, 0].astype(np.float32))
         foreseen = all.residuals[:2, 0] / np.sqrt(0.01) * [0.02, 0.1]
         came = [info["beta"] - info["beta_ref"], info["gamma"] - info["gamma_ref"]]
@@ -177,7 +181,7 @@ def test_predict_reads_its_memory_alone() -> None:
 
 
 def costs(rung: str, count: int, **env: Any) -> np.ndarray:
-    envs, agent = make_rung(rung, YAW, num_envs=count, **env)
+    envs, agent = make_oracle(rung, YAW, num_envs=count, **env)
     obs, _ = envs.reset(seed=list(range(count)))
     J, alive, state = np.zeros(count), np.ones(count, bool), None
     while alive.any():
@@ -199,7 +203,7 @@ def test_at_the_limit_it_is_better_than_lqr() -> None:
 
 @pytest.mark.parametrize(("steps", "count"), [(50, 15), (50, 7), (3, 15), (1, 7)])
 def test_blocks_fill_the_horizon_and_grow(steps: int, count: int) -> None:
-    blocks = blocks_of(steps, count)
+    blocks = make_blocks(steps, count)
     assert blocks.sum() == steps and 1 <= len(blocks) <= count and (np.diff(blocks) >= -1).all()
 
 
@@ -208,7 +212,7 @@ def test_a_damped_step_is_the_solution() -> None:
     J, r = rng.normal(size=(30, 6)), rng.normal(size=30)
     J[:, 2] = 0.0  # a variable that changes nothing
     A, g, d = J.T @ J, J.T @ r, np.empty(6)
-    damped_step(A, g, 0.1, np.empty((6, 6)), d)
+    solve_damped_step(A, g, 0.1, np.empty((6, 6)), d)
     wanted = np.linalg.solve(A + 0.1 * np.diag(np.diag(A)) + 1e-9 * np.eye(6), -g)
     assert d == pytest.approx(wanted, rel=1e-6) and d[2] == 0.0
 
@@ -217,14 +221,14 @@ def test_a_variable_that_a_limit_holds_is_left_out_of_the_step() -> None:
     """At a limit beyond which it would be cheaper; where it is cheaper within, it moves."""
     rng = np.random.default_rng(3)
     blocks = np.array([3, 2])
-    all = lanes_of(4, blocks, 5)
+    all = make_plan_batch(4, blocks, 5)
     J, r = rng.normal(size=(len(all.residuals), 4)), rng.normal(size=len(all.residuals))
     all.residuals[:] = r[:, None] + DIFFERENCE * np.insert(J, 0, 0.0, axis=1)
     falls = -np.sign(J.T @ r)  # where the cost falls
     all.limits[1, 0], all.limits[2, 0] = falls[1], -falls[2]
     A, g, d = np.empty((4, 4)), np.empty(4), np.empty(4)
-    _normal_equations(all, A, g)
-    damped_step(A, g, 0.0, np.empty((4, 4)), d)
+    _compute_normal_equations(all, A, g)
+    solve_damped_step(A, g, 0.0, np.empty((4, 4)), d)
     free = [0, 2, 3]
     assert d[1] == 0.0
     assert d[free] == pytest.approx(np.linalg.lstsq(J[:, free], -r)[0], rel=1e-6)
@@ -239,7 +243,7 @@ def test_no_plan_is_dearer_than_the_regulators_own() -> None:
     zeros = cost_of(agent, found, np.zeros(len(blocks)))
     assert cost_of(agent, found, plan) > 2.0 * zeros
     start, K, T = found
-    J, _, _ = improved(agent.design.model, start, K, T, blocks, plan, 1)
+    J, _, _ = update_plan(agent.design.model, start, K, T, blocks, plan, 1)
     assert zeros >= J
 
 
@@ -251,7 +255,7 @@ def test_a_plan_is_shifted_by_the_time_that_passed() -> None:
     later = np.vstack([ahead[1:], ahead[-1:]])
     wanted = [part.mean(axis=0) for part in np.split(later, np.cumsum(blocks)[:-1])]
     shifted = plan.ravel().copy()
-    _shifted(shifted, blocks, 2, 1.0)
+    _shift_plan(shifted, blocks, 2, 1.0)
     assert shifted == pytest.approx(np.ravel(wanted))
 
 
@@ -264,7 +268,9 @@ def test_where_roll_is_not_measured_it_is_that_of_a_steady_turn() -> None:
     for _ in range(250):
         obs, *_ = env.step(np.zeros(1, np.float32))
     x, motion = obs[agent._columns].astype(np.float64), env.unwrapped.motion
-    start, _, _ = problem_of(agent.design, x, 0.9, np.full(2, np.nan), 0.0, agent._most(x[None])[0])
+    start, _, _ = prepare_prediction(
+        agent.design, x, 0.9, np.full(2, np.nan), 0.0, agent._compute_max_moment(x[None])[0]
+    )
     assert abs(motion.phi) > 1e-3
     assert (start.motion.phi, start.motion.phi_dot) == pytest.approx((motion.phi, 0.0), rel=0.02)
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.sliding_mode import SlidingMode, surface
-from sideslip.agents.design.nominal_car import Plant
+from sideslip.agents.controllers.sliding_mode import SlidingMode, compute_surface_slope
+from sideslip.agents.design.nominal_car import BicyclePlant
 from sideslip.envs import COMS, critical_speed
-from sideslip.envs.vehicle.linear import bicycle
+from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation
 
 T = 0.01
@@ -36,9 +36,9 @@ def agent_of(env: Any, **options: float) -> SlidingMode:
     return agent
 
 
-def coefficients(speed: float) -> Plant:
-    A, B = bicycle(COMS, speed).A, bicycle(COMS, speed).B
-    return Plant(A[0, 0], A[0, 1], A[1, 0], A[1, 1], B[0, 0], B[1, 0], B[1, 1])
+def coefficients(speed: float) -> BicyclePlant:
+    A, B = make_bicycle_model(COMS, speed).A, make_bicycle_model(COMS, speed).B
+    return BicyclePlant(A[0, 0], A[0, 1], A[1, 0], A[1, 1], B[0, 0], B[1, 0], B[1, 1])
 
 
 @pytest.mark.parametrize("reference", ["model", "zero-slip"])
@@ -50,15 +50,15 @@ def test_the_distance_to_the_surface_decays_at_its_rate(
     env = env_of(reference)
     agent = agent_of(env, rate=8.0, layer=10.0)
     N_z = moment(env, agent, beta_hat=state[0], gamma_hat=state[1])
-    model = bicycle(COMS, 7.0)
+    model = make_bicycle_model(COMS, 7.0)
     moved = model.A @ state + model.B @ [0.0, N_z]
-    xi = surface(coefficients(7.0), agent.pole)
+    xi = compute_surface_slope(coefficients(7.0), agent.pole)
     s, ds = state[1] + xi * state[0], moved[1] + xi * moved[0]
     assert ds == pytest.approx(-8.0 * s, rel=1e-4)
 
 
 def test_on_the_surface_the_slip_decays_at_its_pole() -> None:
-    xi = surface(coefficients(7.0), 15.0)
+    xi = compute_surface_slope(coefficients(7.0), 15.0)
     a11, a12 = coefficients(7.0)[:2]
     assert a11 - a12 * xi == pytest.approx(-15.0)
 
@@ -77,11 +77,11 @@ def test_the_sampled_loop_is_stable_over_the_speeds() -> None:
     defaults = agent_of(env_of("model"))
     lag = np.exp(-T / COMS.motor_lag)
     for speed in np.arange(2.0, 0.95 * critical_speed(COMS), 1.0):
-        model = bicycle(COMS, float(speed))
-        xi = surface(coefficients(float(speed)), defaults.pole)
+        model = make_bicycle_model(COMS, float(speed))
+        xi = compute_surface_slope(coefficients(float(speed)), defaults.pole)
         row = np.array([xi, 1.0])
         K = COMS.yaw_inertia * (row @ model.A + defaults.rate * row)
-        G, H = model.discrete(T)
+        G, H = model.discretise(T)
         closed = np.zeros((3, 3))
         closed[:2, :2], closed[:2, 2] = G, H[:, 1]
         closed[2] = *(-(1.0 - lag) * K), lag

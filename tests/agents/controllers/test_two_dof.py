@@ -12,7 +12,7 @@ from sideslip.agents import make_agent
 from sideslip.agents.controllers.two_dof import feedforward_gain
 from sideslip.agents.design.pi import POLE, design_pi, sample_pi
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.vehicle.linear import bicycle
+from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation
 
 KMH = 1 / 3.6
@@ -22,7 +22,7 @@ KMH = 1 / 3.6
 def test_feedforward_is_the_ratio_of_dc_gains() -> None:
     """(24): -G_delta(0) / G_N(0), whose printed middle has the wrong sign."""
     for kmh in (10.0, 20.0, 25.0, 45.0):
-        model = bicycle(COMS, kmh * KMH)
+        model = make_bicycle_model(COMS, kmh * KMH)
         static = -np.linalg.solve(model.A, model.B)[0]  # beta over delta_f and N_z
         assert feedforward_gain(COMS, kmh * KMH) == pytest.approx(-static[0] / static[1], rel=1e-12)
 
@@ -65,7 +65,7 @@ def test_the_feedforward_agent_brings_static_slip_to_zero(kmh: float) -> None:
 
 @pytest.mark.parametrize("kmh", [15.0, 25.0, 40.0])
 def test_closed_loop_poles_are_where_they_were_placed(kmh: float) -> None:
-    model = bicycle(COMS, kmh * KMH)
+    model = make_bicycle_model(COMS, kmh * KMH)
     pi = design_pi(COMS, kmh * KMH)
     plant = control.StateSpace(model.A, model.B[:, 1:], [[1.0, 0.0]], 0.0)
     loop = control.feedback(control.tf(plant) * control.tf([pi.k_p, pi.k_i], [1.0, 0.0]), 1)
@@ -84,10 +84,10 @@ def test_sampled_poles_are_where_they_were_placed(
     kmh: float, period: float, placement: str
 ) -> None:
     """The loop with the moment held, its poles taken back to s = ln z / T."""
-    model = bicycle(COMS, kmh * KMH)
+    model = make_bicycle_model(COMS, kmh * KMH)
     slow, fast = np.sort(-model.to_control().poles().real)
     pi = sample_pi(COMS, kmh * KMH, period, POLE, placement)
-    G, H = model.discrete(period)
+    G, H = model.discretise(period)
     # states beta, gamma and the integral, which the moment takes before it grows
     closed = np.zeros((3, 3))
     closed[:2, :2] = G - pi.k_p * np.outer(H[:, 1], [1.0, 0.0])
@@ -155,7 +155,7 @@ def test_forward_to_the_reference_the_nominal_car_holds_it(kmh: float) -> None:
         gym.make("sideslip/YawFusion-v0", reference="model"), "exact-kf", std=False
     )
     names = [entry.name for entry in env.layout]
-    model, delta, v = bicycle(COMS, kmh * KMH), 0.01, kmh * KMH
+    model, delta, v = make_bicycle_model(COMS, kmh * KMH), 0.01, kmh * KMH
     for beta in (0.0, 2e-3, -1e-3):
         obs = np.zeros(len(names), np.float32)
         values = {"wheel_left": v, "wheel_right": v, "steer_command": delta}

@@ -17,7 +17,7 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from sideslip.agents.learned.card import Card
-from sideslip.agents.learned.files import FORMAT, load_policy, save_policy, shipped
+from sideslip.agents.learned.files import FORMAT, list_shipped, load_policy, save_policy
 from sideslip.estimators.learned.network import Network
 
 pytestmark = pytest.mark.plain
@@ -90,12 +90,12 @@ def test_the_salt_is_of_the_weights_alone(file: Path) -> None:
 
 
 @pytest.mark.compiled  # their filters' gains are found by thousands of ticks
-@pytest.mark.parametrize("name", shipped())
+@pytest.mark.parametrize("name", list_shipped())
 def test_shipped_policies_can_be_read(name: str) -> None:
     policy = load_policy(name)
     card = policy.card
     assert policy.name == name and card.command and card.steps > 0 and card.cpu_seconds > 0.0
-    again = Card.of(card.env_id, card.env_options, card.estimator, card.estimator_options)
+    again = Card.from_env_id(card.env_id, card.env_options, card.estimator, card.estimator_options)
     assert again.observation == card.observation and again.reference == card.reference
     assert card.evaluation["salt"] == policy.salt
     assert {"none", "lqr on exact-kf", name} <= card.evaluation["cost"].keys()
@@ -109,7 +109,7 @@ def test_a_kill_during_a_save_keeps_the_old_file(file: Path) -> None:
         "from sideslip.agents.learned.files import load_policy, save_policy\n"
         "policy = load_policy(sys.argv[1])\n"
         "os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)\n"
-        "save_policy(sys.argv[1], policy.network.reading(policy.reads), policy.card)\n"
+        "save_policy(sys.argv[1], policy.network.select_inputs(policy.reads), policy.card)\n"
     )
     command = [sys.executable, "-c", code, str(file)]
     env = os.environ | {"PYTHONPATH": ":".join(sys.path)}
@@ -236,7 +236,7 @@ def test_a_file_of_the_first_format_is_a_network_without_memory(file: Path) -> N
 
 
 def test_a_file_too_large_is_not_opened(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sideslip.estimators.learned.network_file.MOST_BYTES", 1000)
+    monkeypatch.setattr("sideslip.estimators.learned.network_file.MAX_BYTES", 1000)
     with pytest.raises(ValueError, match=r"bytes, a policy has at most 1000"):
         load_policy(file)
 

@@ -8,10 +8,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents import Learned
+from sideslip.agents import PolicyController
 from sideslip.agents.learned.card import Card
 from sideslip.agents.learned.files import Policy, load_policy, save_policy
-from sideslip.estimators.learned.memory import GATES, PARTS, Cell
+from sideslip.estimators.learned.memory import CELL_WEIGHTS, GATES, RecurrentCell
 from sideslip.estimators.learned.network import ACTIVATIONS, Network
 
 torch = pytest.importorskip("torch")
@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env.stacked_observations import (  # noqa: E40
 )
 
 ID, ROWS, STEPS = "sideslip/YawVision-v0", 5, 200
-CARD = Card.of(ID)
+CARD = Card.from_env_id(ID)
 WIDE = len(CARD.observation)
 RNG = np.random.default_rng(0)
 
@@ -53,18 +53,18 @@ def torchs(kind: str, layers: int, wide: int = WIDE, size: int = 7) -> Any:
     return {"gru": torch.nn.GRU, "lstm": torch.nn.LSTM}[kind](wide, size, layers)
 
 
-def cells_of(module: Any) -> list[Cell]:
+def cells_of(module: Any) -> list[RecurrentCell]:
     kind = type(module).__name__.lower()
     names = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
     return [
-        Cell(kind, *(getattr(module, f"{name}_l{i}").detach().numpy() for name in names))
+        RecurrentCell(kind, *(getattr(module, f"{name}_l{i}").detach().numpy() for name in names))
         for i in range(module.num_layers)
     ]
 
 
 def driven(network: Network, x: np.ndarray, starts: np.ndarray = STARTS) -> np.ndarray:
-    """Actions of `Learned.predict`, (steps, rows)."""
-    agent = Learned(gym.make(ID), Policy("mine", network, CARD))
+    """Actions of `PolicyController.predict`, (steps, rows)."""
+    agent = PolicyController(gym.make(ID), Policy("mine", network, CARD))
     state, actions = None, []
     for obs, start in zip(x, starts, strict=True):
         action, state = agent.predict(obs, state, start)
@@ -108,9 +108,12 @@ def test_the_order_of_the_gates_counts(kind: str) -> None:
     order = [1, 0, *range(2, GATES[kind])]
     swapped = [
         np.concatenate([np.split(getattr(cell, part), GATES[kind])[i] for i in order])
-        for part in PARTS
+        for part in CELL_WEIGHTS
     ]
-    assert np.abs(driven(dense(WIDE, cells=[Cell(kind, *swapped)]), inputs()) - right).max() > 1e-3
+    assert (
+        np.abs(driven(dense(WIDE, cells=[RecurrentCell(kind, *swapped)]), inputs()) - right).max()
+        > 1e-3
+    )
 
 
 @pytest.mark.parametrize("framewise", [True, False], ids=["frames scaled", "stack scaled"])
@@ -144,7 +147,7 @@ def remembering() -> Network:
 def test_a_row_of_a_batch_is_its_single_drive() -> None:
     network, x = remembering(), inputs()
     together = driven(network, x)
-    agent = Learned(gym.make(ID), Policy("mine", network, CARD))
+    agent = PolicyController(gym.make(ID), Policy("mine", network, CARD))
     for row in range(ROWS):
         state = None
         for step in range(60):
@@ -155,7 +158,7 @@ def test_a_row_of_a_batch_is_its_single_drive() -> None:
 
 
 def test_predict_is_pure_and_a_row_with_a_nan_keeps_its_memory() -> None:
-    agent = Learned(gym.make(ID), Policy("mine", remembering(), CARD))
+    agent = PolicyController(gym.make(ID), Policy("mine", remembering(), CARD))
     x = inputs()
     _, state = agent.predict(x[0])
     before = state.copy()
@@ -175,7 +178,7 @@ def test_what_is_not_read_is_left_out_of_every_frame(framewise: bool) -> None:
     network = replace(remembering(), mean=np.zeros(len(scale)), scale=scale)
     assert list(np.flatnonzero(~network.reads)) == [1, 5]
     x = inputs().astype(np.float64)
-    state, less = np.zeros((ROWS, network.memory)), network.reading(network.reads)
+    state, less = np.zeros((ROWS, network.memory)), network.select_inputs(network.reads)
     other = np.zeros((ROWS, less.memory))
     for obs in x[:20]:
         assert less(obs[:, network.reads], other) == pytest.approx(network(obs, state), abs=1e-12)

@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents import Learned, make_agent
+from sideslip.agents import PolicyController, make_agent
 from sideslip.agents.learned.card import Card
 from sideslip.agents.learned.files import Policy, save_policy
 from sideslip.estimators import EstimateObservation
@@ -33,7 +33,7 @@ def a_policy(card: Card, width: int = 1, scale: float = 1.0) -> Policy:
 
 @pytest.fixture(scope="module")
 def policy() -> Policy:
-    return a_policy(Card.of(VISION))
+    return a_policy(Card.from_env_id(VISION))
 
 
 def named(env: Any, values: dict[str, float]) -> np.ndarray:
@@ -43,7 +43,7 @@ def named(env: Any, values: dict[str, float]) -> np.ndarray:
 
 def test_a_row_is_its_single_observation_to_rounding(policy: Policy) -> None:
     """And whatever the batch around it; the rounding is double precision's."""
-    agent = Learned(gym.make(VISION), policy)
+    agent = PolicyController(gym.make(VISION), policy)
     rng = np.random.default_rng(1)
     x = rng.normal(size=(300, policy.network.inputs)).astype(np.float32)
     together = agent.network(x.astype(np.float64))
@@ -59,7 +59,7 @@ def test_a_row_is_its_single_observation_to_rounding(policy: Policy) -> None:
 
 
 def test_predict_is_pure(policy: Policy) -> None:
-    agent = Learned(gym.make(VISION), policy)
+    agent = PolicyController(gym.make(VISION), policy)
     rng = np.random.default_rng(2)
     x = rng.normal(size=(4, policy.network.inputs)).astype(np.float32)
     kept = x.copy()
@@ -70,7 +70,7 @@ def test_predict_is_pure(policy: Policy) -> None:
 
 
 def test_actions_are_clipped_and_only_rows_with_a_nan_are_lost(policy: Policy) -> None:
-    agent = Learned(gym.make(VISION), policy)
+    agent = PolicyController(gym.make(VISION), policy)
     x = np.random.default_rng(3).normal(size=(50, policy.network.inputs)) * 100.0
     x[7, 3] = np.nan
     action, _ = agent.predict(x.astype(np.float32))
@@ -84,9 +84,9 @@ def test_entries_are_read_by_name_from_a_wider_observation(policy: Policy) -> No
     narrow, wide, steering = (gym.make(each) for each in (VISION, FUSION, STEERING))
     rng = np.random.default_rng(4)
     values = {name: float(rng.normal()) for name, _ in policy.card.observation}
-    action, _ = Learned(narrow, policy).predict(named(narrow, values))
-    assert np.array_equal(Learned(wide, policy).predict(named(wide, values))[0], action)
-    steered, _ = Learned(steering, policy).predict(named(steering, values))
+    action, _ = PolicyController(narrow, policy).predict(named(narrow, values))
+    assert np.array_equal(PolicyController(wide, policy).predict(named(wide, values))[0], action)
+    steered, _ = PolicyController(steering, policy).predict(named(steering, values))
     assert steered[0] == action[0] and steered[1] == 0.0
 
 
@@ -94,7 +94,9 @@ def test_an_entry_that_never_varied_is_not_read(policy: Policy) -> None:
     scale = np.ones(policy.network.inputs)
     names = [name for name, _ in policy.card.observation]
     scale[names.index("beta_ref")] = 0.0
-    agent = Learned(gym.make(VISION), replace(policy, network=replace(policy.network, scale=scale)))
+    agent = PolicyController(
+        gym.make(VISION), replace(policy, network=replace(policy.network, scale=scale))
+    )
     assert set(names) - set(agent.needs) == {"beta_ref"}
     x = np.random.default_rng(5).normal(size=len(names))
     whole = replace(policy.network, scale=scale)(x[None])
@@ -105,33 +107,35 @@ def test_an_entry_that_never_varied_is_not_read(policy: Policy) -> None:
 
 def test_a_policy_of_an_estimate_needs_it() -> None:
     options: dict[str, Any] = {"outputs": ["beta", "gamma"], "std": False}
-    card = Card.of(VISION, {}, "multirate-kf", options)
+    card = Card.from_env_id(VISION, {}, "multirate-kf", options)
     assert card.observation[-2:] == (("beta_hat", "rad"), ("gamma_hat", "rad/s"))
     policy = a_policy(card)
     with pytest.raises(ValueError, match=r"needs beta_hat, gamma_hat .*EstimateObservation"):
-        Learned(gym.make(VISION), policy)
+        PolicyController(gym.make(VISION), policy)
     env = EstimateObservation(gym.make(VISION), "multirate-kf", **options)
-    assert Learned(env, policy).needs[-1] == "gamma_hat"
+    assert PolicyController(env, policy).needs[-1] == "gamma_hat"
 
 
 def test_a_vector_env_takes_it_too(policy: Policy) -> None:
     env = gym.make_vec(FUSION, num_envs=3)
     obs, _ = env.reset(seed=0)
-    action, _ = Learned(env, policy).predict(obs)
+    action, _ = PolicyController(env, policy).predict(obs)
     assert env.action_space.contains(action)
 
 
 def test_an_env_that_does_not_fit_is_refused(policy: Policy) -> None:
     layouts = r"needs camera_psi, .* mine was trained on gyro, .*camera_psi.*; here are gyro, .*gps"
     with pytest.raises(ValueError, match=layouts):
-        Learned(gym.make("sideslip/YawGps-v0"), policy)
+        PolicyController(gym.make("sideslip/YawGps-v0"), policy)
     with pytest.raises(ValueError, match=r"mine was trained with .* of 10 ticks, this env has 5"):
-        Learned(gym.make(VISION, control_period=5), policy)
+        PolicyController(gym.make(VISION, control_period=5), policy)
     with pytest.raises(ValueError, match="gives 2 numbers, the env's action has 1"):
-        Learned(gym.make(VISION), a_policy(policy.card, width=2))
+        PolicyController(gym.make(VISION), a_policy(policy.card, width=2))
     entries = (("gyro", "deg/s"), *policy.card.observation[1:])
     with pytest.raises(ValueError, match=r"trained on gyro in deg/s \(here rad/s\)"):
-        Learned(gym.make(VISION), replace(policy, card=replace(policy.card, observation=entries)))
+        PolicyController(
+            gym.make(VISION), replace(policy, card=replace(policy.card, observation=entries))
+        )
     with pytest.raises(TypeError, match="speed"):
         make_agent("learned", gym.make(VISION), speed=1)
 
@@ -141,7 +145,7 @@ def test_make_agent_takes_a_path(policy: Policy, tmp_path: Any) -> None:
     save_policy(path, policy.network, policy.card)
     env = gym.make(VISION)
     obs, _ = env.reset(seed=0)
-    action, _ = Learned(env, policy).predict(obs)
+    action, _ = PolicyController(env, policy).predict(obs)
     for agent in (make_agent(str(path), env), make_agent("learned", env, policy=path)):
         assert np.array_equal(agent.predict(obs)[0], action)
 

@@ -9,31 +9,31 @@ import pytest
 
 from sideslip.agents.learned.card import Card
 from sideslip.agents.learned.files import load_policy, save_policy
-from sideslip.estimators.learned.memory import Traces
+from sideslip.estimators.learned.memory import MovingAverages
 from sideslip.estimators.learned.network import Network
 
 pytest.importorskip("torch")
 import torch
 
-from sideslip.agents.training.student import Course, Student, _Episodes
-from sideslip.agents.training.traces.drives import Drives, Scaling
+from sideslip.agents.training.student import DistillConfig, Student, _EpisodeBatches
+from sideslip.agents.training.traces.drives import Demonstrations, Scaling
 from sideslip.agents.training.traces.layer import TraceLayer
 
-CARD = Card.of("sideslip/YawVision-v0")
+CARD = Card.from_env_id("sideslip/YawVision-v0")
 WIDE, RNG = len(CARD.observation), np.random.default_rng(0)
 TIMES = (1.5, 30.0)
 
 
-def traces(wide: int = WIDE, **change: Any) -> Traces:
+def traces(wide: int = WIDE, **change: Any) -> MovingAverages:
     rng = np.random.default_rng(1)
     numbers: dict[str, Any] = {
         "weight_in": rng.normal(size=(5, wide)),
         "bias_in": rng.normal(size=5),
     }
-    return Traces(**numbers | {"bent": 2, "times": TIMES} | change)
+    return MovingAverages(**numbers | {"bent": 2, "times": TIMES} | change)
 
 
-def network(cell: Traces) -> Network:
+def network(cell: MovingAverages) -> Network:
     rng = np.random.default_rng(2)
     weights, biases = [rng.normal(size=(1, cell.size))], [rng.normal(size=1)]
     return Network(np.zeros(WIDE), np.ones(WIDE), weights, biases, cells=[cell])
@@ -47,7 +47,7 @@ def test_a_mean_is_that_of_the_episode_and_then_fades() -> None:
     u = x @ cell.weight_in.T + cell.bias_in
     u[..., 3:] = u[..., 3:] / (1.0 + np.exp(-u[..., 3:]))
     for step in range(60):
-        seen = net.remembered(x[step], state)
+        seen = net.compute_features(x[step], state)
         assert seen.shape == (3, cell.size) and seen[:, :5] == pytest.approx(u[step], abs=1e-12)
         for j, time in enumerate(TIMES):
             means, share = np.zeros((3, 5)), 1.0 - np.exp(-1.0 / time)
@@ -58,25 +58,25 @@ def test_a_mean_is_that_of_the_episode_and_then_fades() -> None:
             if step + 1 < 1.0 / share:
                 assert own == pytest.approx(u[: step + 1].mean(0), abs=1e-12)
     state[1] = 0.0  # an episode begins: its first units are its means
-    assert np.ptp(net.remembered(x[0], state)[1].reshape(3, 5), axis=0) == pytest.approx(0.0)
+    assert np.ptp(net.compute_features(x[0], state)[1].reshape(3, 5), axis=0) == pytest.approx(0.0)
 
 
 def test_dense_layers_alone_act_on_what_is_remembered() -> None:
     net, x = network(traces()), RNG.normal(size=(4, WIDE))
     state, same = np.zeros((4, net.memory)), np.zeros((4, net.memory))
-    assert net.dense(net.remembered(x, state)) == pytest.approx(net(x, same), abs=1e-12)
+    assert net.dense(net.compute_features(x, state)) == pytest.approx(net(x, same), abs=1e-12)
     alone = net.dense
     assert np.array_equal(state, same) and alone.dense is alone
     other = replace(alone, biases=[net.biases[0] + 1.0])
-    assert net.ending(other)(x) == pytest.approx(net(x) + 1.0, abs=1e-6)
-    assert net.ending(other).cells == net.cells
+    assert net.replace_dense(other)(x) == pytest.approx(net(x) + 1.0, abs=1e-6)
+    assert net.replace_dense(other).cells == net.cells
 
 
 def test_what_is_not_read_is_left_out() -> None:
     scale = np.ones(WIDE)
     scale[[1, 5]] = 0.0
     net = replace(network(traces()), scale=scale)
-    x, less = RNG.normal(size=(4, WIDE)), net.reading(net.reads)
+    x, less = RNG.normal(size=(4, WIDE)), net.select_inputs(net.reads)
     assert less.inputs == WIDE - 2
     assert less(x[:, net.reads]) == pytest.approx(net(x), abs=1e-12)
 
@@ -85,12 +85,12 @@ def test_what_is_not_read_is_left_out() -> None:
 def test_the_network_is_torchs(cut: int) -> None:
     """Over blocks of its matrices and, where an episode is cut, with the state handed on."""
     torch.manual_seed(0)
-    student, rng = Student(5, 2, Course(traces=7, hidden=(9, 4))), np.random.default_rng(1)
+    student, rng = Student(5, 2, DistillConfig(traces=7, hidden=(9, 4))), np.random.default_rng(1)
     mixing = np.eye(5) + 0.3 * np.ones((5, 5))
     scaling = Scaling(rng.normal(size=5), rng.uniform(0.5, 2.0, 5), mixing)
     x = rng.normal(size=(3, 150, 5)).astype(np.float32)
-    student.whiten([drives_of(x)], scaling)
-    z, net = torch.from_numpy(scaling.mixed(x)), student.network(scaling)
+    student.fit_whitening([drives_of(x)], scaling)
+    z, net = torch.from_numpy(scaling.mix_inputs(x)), student.network(scaling)
     first, between = student(z[:, :cut])
     parts = [first] + ([student(z[:, cut:], between)[0]] if cut < 150 else [])
     theirs, state = torch.cat(parts, 1).detach().numpy(), np.zeros((3, net.memory))
@@ -98,11 +98,13 @@ def test_the_network_is_torchs(cut: int) -> None:
     assert np.abs(ours - theirs).max() < 1e-6 < np.abs(np.diff(ours, axis=1)).max()
 
 
-def drives_of(x: np.ndarray) -> Drives:
+def drives_of(x: np.ndarray) -> Demonstrations:
     """Of which one is over early: what it shows then is not counted."""
     weights = np.ones(x.shape[:2], np.float32)
     weights[0, 100:] = 0.0
-    return Drives(x, x[..., :2], x[..., :0], weights, np.eye(2, dtype=np.float32), np.ones(len(x)))
+    return Demonstrations(
+        x, x[..., :2], x[..., :0], weights, np.eye(2, dtype=np.float32), np.ones(len(x))
+    )
 
 
 def test_what_is_plain_goes_on_without_correlation() -> None:
@@ -112,16 +114,16 @@ def test_what_is_plain_goes_on_without_correlation() -> None:
     x[..., 0] = x[..., 0].cumsum(1) / 10.0
     scaling = Scaling(x.mean((0, 1)), 1.0 / x.std((0, 1)), np.eye(3))
     x[0, 100:] = 1e3  # where it is over
-    student, z = Student(3, 1, Course(traces=4)), torch.from_numpy(scaling.mixed(x))
+    student, z = Student(3, 1, DistillConfig(traces=4)), torch.from_numpy(scaling.mix_inputs(x))
     layer: Any = student.traces
     there = drives_of(x).weights > 0.0
     before = layer(z)[0].detach().numpy()[there][:, :18]
-    student.whiten([drives_of(x)], scaling)
+    student.fit_whitening([drives_of(x)], scaling)
     mixed = layer(z)[0].detach().numpy()[there][:, :18]
     assert np.abs(np.corrcoef(before.T) - np.eye(18)).max() > 0.99
     assert np.cov(mixed.T) == pytest.approx(np.eye(18), abs=0.3)  # what hardly varies less
     assert mixed.mean(0) == pytest.approx(0.0, abs=0.05)
-    Student(3, 1, Course()).whiten([], scaling)  # nothing remembered, nothing to mix
+    Student(3, 1, DistillConfig()).fit_whitening([], scaling)  # nothing remembered, nothing to mix
 
 
 def test_the_slope_reaches_the_first_step() -> None:
@@ -138,7 +140,7 @@ def test_an_episode_is_learned_through_whole(course: dict[str, Any], steps: int)
     """By a GRU in windows."""
     x = RNG.normal(size=(3, 150, 5)).astype(np.float32)
     scaling = Scaling(np.zeros(5), np.ones(5), np.eye(5))
-    first, *_ = _Episodes([drives_of(x)], scaling, Course(batch=3, **course))
+    first, *_ = _EpisodeBatches([drives_of(x)], scaling, DistillConfig(batch=3, **course))
     assert first[0].shape == (3, steps, 5)
 
 
@@ -147,7 +149,7 @@ def test_a_file_holds_the_traces(tmp_path: Path) -> None:
     save_policy(path, net, CARD)
     policy, x = load_policy(path), RNG.normal(size=(4, WIDE))
     (cell,) = policy.network.cells
-    assert isinstance(cell, Traces) and (cell.bent, cell.times) == (2, TIMES)
+    assert isinstance(cell, MovingAverages) and (cell.n_silu, cell.times) == (2, TIMES)
     assert np.array_equal(policy.network(x), net(x))
 
 

@@ -7,13 +7,13 @@ from typing import Any
 import gymnasium as gym
 
 from sideslip.agents import make_agent
-from sideslip.agents.live.assemble import PATIENCE, Arrival, Assembler, Tick
-from sideslip.agents.live.datagrams import FIELDS, STAMP, Kind, encode
+from sideslip.agents.live.assemble import PATIENCE, Arrival, StreamSynchroniser, Tick
+from sideslip.agents.live.datagrams import FIELDS, TICK_US, DatagramKind, encode
 from sideslip.agents.live.loop import Loop
-from sideslip.agents.live.onboard import Onboard
+from sideslip.agents.live.onboard import OnboardController
 from sideslip.agents.live.port import Port
 from sideslip.agents.live.session import Recorder
-from sideslip.agents.live.simulate import Wires, simulate
+from sideslip.agents.live.simulate import WireAgent, simulate
 from sideslip.agents.rollout import Rollout
 from sideslip.estimators import EstimateObservation
 
@@ -30,16 +30,18 @@ def contestant(env_id: str, estimator: Any, agent: Any, **options: Any) -> tuple
 
 def drive(
     env_id: str,
-    onboard: Onboard,
+    onboard: OnboardController,
     step: bool = True,
     recorder: Recorder | None = None,
     watch: Callable[[Tick], None] | None = None,
     speed: float = 1.0,
     **options: Any,
-) -> tuple[Rollout, Wires, Loop]:
+) -> tuple[Rollout, WireAgent, Loop]:
     """A drive over loopback, its wires and the loop at the car's end."""
     with Port() as car, Port() as other:
-        loop = Loop(onboard, Assembler(None if step else round(PATIENCE / speed)), car, step=step)
+        loop = Loop(
+            onboard, StreamSynchroniser(None if step else round(PATIENCE / speed)), car, step=step
+        )
         loop.recorder, loop.watch = recorder, watch
         thread = Thread(target=loop.run)
         thread.start()
@@ -52,12 +54,12 @@ def drive(
 
 def inertial(number: int, sequence: int | None = None, gyro: float = 0.0) -> Arrival:
     """The datagram of a fast row at 7 m/s."""
-    values = [gyro, 0.0, 0.0, 0.0, 7.0, 7.0] + [0.0] * (len(FIELDS[Kind.INERTIAL]) - 6)
+    values = [gyro, 0.0, 0.0, 0.0, 7.0, 7.0] + [0.0] * (len(FIELDS[DatagramKind.INERTIAL]) - 6)
     sequence = number if sequence is None else sequence
-    return Arrival(0, encode(Kind.INERTIAL, sequence, number * STAMP, values), "car")
+    return Arrival(0, encode(DatagramKind.INERTIAL, sequence, number * TICK_US, values), "car")
 
 
 def camera(sequence: int, age: float = 0.03, psi: float = 0.0, stamp: int = 0) -> Arrival:
     """The datagram of a camera's sample."""
-    values = [psi] + [0.0] * (len(FIELDS[Kind.CAMERA]) - 3) + [age, 1.0]
-    return Arrival(0, encode(Kind.CAMERA, sequence, stamp, values), "camera")
+    values = [psi] + [0.0] * (len(FIELDS[DatagramKind.CAMERA]) - 3) + [age, 1.0]
+    return Arrival(0, encode(DatagramKind.CAMERA, sequence, stamp, values), "camera")

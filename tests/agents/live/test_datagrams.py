@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from sideslip.agents.live.datagrams import (
     FIELDS,
     HEADER,
-    LATEST,
     LIMIT,
-    MOST,
+    MAX_BYTES,
+    MAX_STAMP,
     SENSORS,
     VERSION,
-    Bad,
-    Kind,
+    DatagramKind,
     Message,
+    RejectReason,
     decode,
     encode,
 )
@@ -33,12 +33,22 @@ SOUND = inertial(7).data
 
 
 @given(
-    st.sampled_from([Kind.INERTIAL, Kind.CONTROL, Kind.END, Kind.STATUS, *SENSORS]),
+    st.sampled_from(
+        [
+            DatagramKind.INERTIAL,
+            DatagramKind.CONTROL,
+            DatagramKind.END,
+            DatagramKind.STATUS,
+            *SENSORS,
+        ]
+    ),
     st.integers(0, 2**32 - 1),
-    st.integers(0, LATEST),
+    st.integers(0, MAX_STAMP),
     st.data(),
 )
-def test_a_message_comes_back(kind: Kind, sequence: int, stamp: int, data: st.DataObject) -> None:
+def test_a_message_comes_back(
+    kind: DatagramKind, sequence: int, stamp: int, data: st.DataObject
+) -> None:
     width = len(FIELDS[kind])
     values = data.draw(st.lists(NUMBER, min_size=width, max_size=width))
     if kind in SENSORS:
@@ -49,7 +59,7 @@ def test_a_message_comes_back(kind: Kind, sequence: int, stamp: int, data: st.Da
 @given(st.lists(st.from_regex(r"[a-z_][a-z_0-9]{0,8}", fullmatch=True), min_size=1, max_size=20))
 def test_estimates_come_back_with_their_names(names: list[str]) -> None:
     values = [float(i) for i in range(2 * len(names))]
-    found = decode(encode(Kind.ESTIMATE, 1, 2, values, names))
+    found = decode(encode(DatagramKind.ESTIMATE, 1, 2, values, names))
     assert isinstance(found, Message) and found.names == (*names,) and found.values == (*values,)
 
 
@@ -60,28 +70,31 @@ def changed(at: int, *new: int) -> bytes:
 @pytest.mark.parametrize(
     ("data", "why"),
     [
-        (b"", Bad.FOREIGN),
-        (SOUND[: HEADER.size - 1], Bad.FOREIGN),
-        (changed(0, 0x73), Bad.FOREIGN),
-        (changed(4, VERSION + 1), Bad.VERSION),
-        (changed(5, 0), Bad.KIND),
-        (changed(5, 200), Bad.KIND),
-        (SOUND[:-1], Bad.LENGTH),
-        (SOUND + b"\0", Bad.LENGTH),
-        (changed(6, 0, 1), Bad.LENGTH),
-        (encode(Kind.ESTIMATE, 0, 0, [1.0, 2.0, 3.0], ["beta"]), Bad.LENGTH),
-        (encode(Kind.ESTIMATE, 0, 0, [1.0, 2.0], ["a", "b"]), Bad.LENGTH),
-        (SOUND + bytes(MOST), Bad.OVERSIZED),
-        (inertial(0, gyro=math.nan).data, Bad.NOT_FINITE),
-        (inertial(0, gyro=math.inf).data, Bad.NOT_FINITE),
-        (inertial(0, gyro=2 * LIMIT).data, Bad.RANGE),
-        (inertial(-1, 0).data, Bad.RANGE),
-        (encode(Kind.INERTIAL, 0, 2**63 - 1, [0.0] * len(FIELDS[Kind.INERTIAL])), Bad.RANGE),
-        (camera(0, age=-0.01).data, Bad.RANGE),
-        (camera(0, age=11.0).data, Bad.RANGE),
+        (b"", RejectReason.FOREIGN),
+        (SOUND[: HEADER.size - 1], RejectReason.FOREIGN),
+        (changed(0, 0x73), RejectReason.FOREIGN),
+        (changed(4, VERSION + 1), RejectReason.VERSION),
+        (changed(5, 0), RejectReason.KIND),
+        (changed(5, 200), RejectReason.KIND),
+        (SOUND[:-1], RejectReason.LENGTH),
+        (SOUND + b"\0", RejectReason.LENGTH),
+        (changed(6, 0, 1), RejectReason.LENGTH),
+        (encode(DatagramKind.ESTIMATE, 0, 0, [1.0, 2.0, 3.0], ["beta"]), RejectReason.LENGTH),
+        (encode(DatagramKind.ESTIMATE, 0, 0, [1.0, 2.0], ["a", "b"]), RejectReason.LENGTH),
+        (SOUND + bytes(MAX_BYTES), RejectReason.OVERSIZED),
+        (inertial(0, gyro=math.nan).data, RejectReason.NOT_FINITE),
+        (inertial(0, gyro=math.inf).data, RejectReason.NOT_FINITE),
+        (inertial(0, gyro=2 * LIMIT).data, RejectReason.RANGE),
+        (inertial(-1, 0).data, RejectReason.RANGE),
+        (
+            encode(DatagramKind.INERTIAL, 0, 2**63 - 1, [0.0] * len(FIELDS[DatagramKind.INERTIAL])),
+            RejectReason.RANGE,
+        ),
+        (camera(0, age=-0.01).data, RejectReason.RANGE),
+        (camera(0, age=11.0).data, RejectReason.RANGE),
     ],
 )
-def test_every_fault_has_its_name(data: bytes, why: Bad) -> None:
+def test_every_fault_has_its_name(data: bytes, why: RejectReason) -> None:
     assert decode(data) is why
 
 
@@ -108,8 +121,10 @@ def test_the_format_is_the_documented_one() -> None:
     text = DOCUMENT.read_text()
     assert f"version {VERSION}" in text
     for kind, fields in FIELDS.items():
-        row = re.search(rf"^\| {kind:d} \| {Kind(kind).name.lower()} \| ([^|]*)\|", text, re.M)
+        row = re.search(
+            rf"^\| {kind:d} \| {DatagramKind(kind).name.lower()} \| ([^|]*)\|", text, re.M
+        )
         assert row and [each.strip(" `") for each in row[1].split(",")] == list(fields or ("-",))
-    assert FIELDS[Kind.INERTIAL][:-1] == FAST._fields
+    assert FIELDS[DatagramKind.INERTIAL][:-1] == FAST._fields
     for kind, place in SENSORS.items():
         assert FIELDS[kind][:-2] == tuple(value.name for value in SLOW[place].values)

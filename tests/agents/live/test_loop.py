@@ -8,23 +8,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.agents.live.assemble import Arrival, Assembler
-from sideslip.agents.live.datagrams import FIELDS, STAMP, Kind, Message, decode
+from sideslip.agents.live.assemble import Arrival, StreamSynchroniser
+from sideslip.agents.live.datagrams import FIELDS, TICK_US, DatagramKind, Message, decode
 from sideslip.agents.live.loop import PERIOD, Histogram, Loop
-from sideslip.agents.live.onboard import Onboard
-from sideslip.agents.live.port import MOST_AT_ONCE, Port, address_of, clock
+from sideslip.agents.live.onboard import OnboardController
+from sideslip.agents.live.port import MAX_BATCH, Port, clock, parse_address
 from tests.agents.live.both_ends import SEED, VISION, camera, contestant, inertial
 
-ROW = [0.0, 0.0, 0.0, 0.0, 7.0, 7.0] + [0.0] * (len(FIELDS[Kind.INERTIAL]) - 6)
+ROW = [0.0, 0.0, 0.0, 0.0, 7.0, 7.0] + [0.0] * (len(FIELDS[DatagramKind.INERTIAL]) - 6)
 
 
-def onboard() -> Onboard:
-    return Onboard(*contestant(VISION, "exact-kf", "lqr"), SEED)
+def onboard() -> OnboardController:
+    return OnboardController(*contestant(VISION, "exact-kf", "lqr"), SEED)
 
 
 def test_no_inertial_data_is_an_error_with_the_address() -> None:
     with Port() as port:
-        loop = Loop(onboard(), Assembler(), port, patience=0.2)
+        loop = Loop(onboard(), StreamSynchroniser(), port, patience=0.2)
         with pytest.raises(
             TimeoutError, match=rf"no inertial datagram came to .*{port.address[1]}"
         ):
@@ -34,8 +34,8 @@ def test_no_inertial_data_is_an_error_with_the_address() -> None:
 def test_inertial_data_that_ends_ends_the_loop_after_a_while() -> None:
     """Meanwhile the last row is held, and every tick is counted."""
     with Port() as port, Port() as car:
-        loop = Loop(onboard(), Assembler(), port, patience=0.3)
-        car.send(port.address, Kind.INERTIAL, 0, ROW)
+        loop = Loop(onboard(), StreamSynchroniser(), port, patience=0.3)
+        car.send(port.address, DatagramKind.INERTIAL, 0, ROW)
         loop.run()
         assert loop.ended == "no inertial data for 0.3 s"
         assert loop.statistics.ticks == loop.assembler.counts["held"] + 1 > 10
@@ -43,7 +43,7 @@ def test_inertial_data_that_ends_ends_the_loop_after_a_while() -> None:
 
 def test_it_stops_when_asked_and_when_the_time_is_over() -> None:
     with Port() as port:
-        loop = Loop(onboard(), Assembler(), port)
+        loop = Loop(onboard(), StreamSynchroniser(), port)
         loop.run(lambda: True)
         assert loop.ended == "stopped"
         loop.run(duration=0.05)
@@ -52,18 +52,20 @@ def test_it_stops_when_asked_and_when_the_time_is_over() -> None:
 
 def test_estimates_go_to_everybody_and_controls_back_to_the_car() -> None:
     with Port() as port, Port() as car, Port() as user, Port() as viewer:
-        loop = Loop(onboard(), Assembler(None), port, [user.address], viewer.address, step=True)
+        loop = Loop(
+            onboard(), StreamSynchroniser(None), port, [user.address], viewer.address, step=True
+        )
         for number in range(201):
-            car.send(port.address, Kind.INERTIAL, number * STAMP, ROW)
-        car.send(port.address, Kind.END, 0)
+            car.send(port.address, DatagramKind.INERTIAL, number * TICK_US, ROW)
+        car.send(port.address, DatagramKind.END, 0)
         loop.run()
         sent, shown, controls = ([decode(each.data) for each in end.wait(1.0)]
                                  for end in (user, viewer, car))  # fmt: skip
     assert all(isinstance(each, Message) for each in (*sent, *shown, *controls))
-    stamps = [each.stamp // STAMP for each in controls if isinstance(each, Message)]
+    stamps = [each.stamp // TICK_US for each in controls if isinstance(each, Message)]
     assert stamps == list(range(0, 201, 10))
     kinds = [each.kind for each in shown if isinstance(each, Message)]
-    assert kinds.count(Kind.ESTIMATE) == 21 and kinds.count(Kind.STATUS) == 3
+    assert kinds.count(DatagramKind.ESTIMATE) == 21 and kinds.count(DatagramKind.STATUS) == 3
     assert len(sent) == 201 and isinstance(sent[-1], Message)
     assert sent[-1].names == loop.onboard.names
     assert sent[-1].values == (*loop.onboard.x, *loop.onboard.std)
@@ -72,7 +74,7 @@ def test_estimates_go_to_everybody_and_controls_back_to_the_car() -> None:
 def test_controls_follow_a_sender_that_begins_anew() -> None:
     """From another address, as after a restart; a camera at a third one gets none."""
     with Port() as port, Port() as car, Port() as restarted, Port() as eye:
-        loop = Loop(onboard(), Assembler(None), port, step=True)
+        loop = Loop(onboard(), StreamSynchroniser(None), port, step=True)
         for sender, first in ((car, 5_000), (restarted, 0)):
             loop._take([inertial(k, first + k)._replace(sender=sender.address) for k in range(11)])
             loop._take([camera(first)._replace(sender=eye.address)])
@@ -82,35 +84,35 @@ def test_controls_follow_a_sender_that_begins_anew() -> None:
 
 def test_a_busy_loop_counts_the_deadlines_it_missed_and_catches_none_up() -> None:
     with Port() as port, Port() as car:
-        loop = Loop(onboard(), Assembler(), port)
+        loop = Loop(onboard(), StreamSynchroniser(), port)
         loop.watch = lambda tick: time.sleep(0.0205) if tick.number == 1 else None
-        car.send(port.address, Kind.INERTIAL, 0, ROW)
+        car.send(port.address, DatagramKind.INERTIAL, 0, ROW)
         assert loop._take(port.wait(1.0)) == 1
-        car.send(port.address, Kind.INERTIAL, STAMP, ROW)
+        car.send(port.address, DatagramKind.INERTIAL, TICK_US, ROW)
         deadline = clock() + PERIOD
-        following = loop._tick(deadline)
+        following = loop._run_tick(deadline)
         assert following > clock() - 5 * PERIOD
         assert loop.statistics.deadlines == 1 + loop.statistics.misses >= 21
         assert (following - deadline - PERIOD * (1 + loop.statistics.misses)) < PERIOD / 100
-        assert loop.statistics.latency.most > 20_000
+        assert loop.statistics.latency.largest > 20_000
 
 
 def test_the_phase_follows_the_senders_clock() -> None:
     """A deadline is drawn towards LEAD behind the rows, a little each tick."""
-    from sideslip.agents.live.loop import LEAD, MOST_PULL, PULL
+    from sideslip.agents.live.loop import LEAD, MAX_PHASE_STEP, PHASE_GAIN
 
     class Fake(Port):
         def until(self, when: int) -> list[Arrival]:
-            sound = super().until(when)
+            sound = super().receive_until(when)
             return [each._replace(at=when - 900_000) for each in sound]
 
     with Fake() as port, Port() as car:
-        loop = Loop(onboard(), Assembler(), port)
-        car.send(port.address, Kind.INERTIAL, 0, ROW)
+        loop = Loop(onboard(), StreamSynchroniser(), port)
+        car.send(port.address, DatagramKind.INERTIAL, 0, ROW)
         start = clock() + 50_000_000
-        following = loop._tick(start)
+        following = loop._run_tick(start)
         drawn = following - start - PERIOD * (1 + loop.statistics.misses)
-        assert drawn == max(-MOST_PULL, round(PULL * (LEAD - 900_000))) < 0
+        assert drawn == max(-MAX_PHASE_STEP, round(PHASE_GAIN * (LEAD - 900_000))) < 0
 
 
 def test_quantiles_are_those_of_the_times() -> None:
@@ -123,7 +125,7 @@ def test_quantiles_are_those_of_the_times() -> None:
         exact = np.quantile(times, share, method="inverted_cdf")
         assert exact <= histogram.quantile(share) <= exact + 1.0
     histogram.add(1e9)
-    assert histogram.most == histogram.quantile(1.0) == 1e9
+    assert histogram.largest == histogram.quantile(1.0) == 1e9
 
 
 def test_a_port_in_use_is_an_error_and_a_flood_ends() -> None:
@@ -133,9 +135,9 @@ def test_a_port_in_use_is_an_error_and_a_flood_ends() -> None:
         with pytest.raises(OSError, match=r"of 192.0.2.1 is none"):
             Port("192.0.2.1", 0)
         assert port.address[0] == "127.0.0.1"
-        for _ in range(MOST_AT_ONCE + 100):
-            other.send(port.address, Kind.END, 0)
-        assert len(port.wait(1.0)) <= MOST_AT_ONCE
+        for _ in range(MAX_BATCH + 100):
+            other.send(port.address, DatagramKind.END, 0)
+        assert len(port.wait(1.0)) <= MAX_BATCH
 
 
 @pytest.mark.parametrize(
@@ -148,20 +150,20 @@ def test_a_port_in_use_is_an_error_and_a_flood_ends() -> None:
     ],
 )
 def test_addresses(text: str, found: Any) -> None:
-    assert address_of(text) == found
+    assert parse_address(text) == found
 
 
 @pytest.mark.parametrize("text", ["", "h", "h:", "h:x", "h:70000", "h:-1", "[::1]:2"])
 def test_what_is_no_address(text: str) -> None:
     with pytest.raises(ValueError, match="address"):
-        address_of(text)
+        parse_address(text)
 
 
 def test_a_thread_that_stops_leaves_the_collector_as_it_was() -> None:
     import gc
 
     with Port() as port:
-        loop = Loop(onboard(), Assembler(), port)
+        loop = Loop(onboard(), StreamSynchroniser(), port)
         thread = Thread(target=loop.run, kwargs={"duration": 0.01})
         thread.start()
         thread.join()

@@ -9,9 +9,9 @@ import pytest
 
 pytest.importorskip("pynmeagps")
 
-from sideslip.agents.live.datagrams import FIELDS, Kind, Message, decode
+from sideslip.agents.live.datagrams import FIELDS, DatagramKind, Message, decode
 from sideslip.agents.live.port import Port
-from sideslip.agents.live.relay import WORST_HDOP, Relay
+from sideslip.agents.live.relay import MAX_HDOP, Relay
 
 
 def sentence(text: str) -> bytes:
@@ -38,8 +38,8 @@ def received(port: Port, count: int) -> list[dict[str, float]]:
     while len(found) < count and (arrivals := port.wait(5.0)):
         for each in arrivals:
             message = decode(each.data)
-            assert isinstance(message, Message) and message.kind == Kind.GPS
-            found.append(dict(zip(FIELDS[Kind.GPS], message.values, strict=True)))
+            assert isinstance(message, Message) and message.kind == DatagramKind.GPS
+            found.append(dict(zip(FIELDS[DatagramKind.GPS], message.values, strict=True)))
     return found
 
 
@@ -57,7 +57,7 @@ def test_a_files_epochs_arrive_in_our_axes(tmp_path: Path) -> None:
     assert (first["X"], first["Y"]) == (0.0, 0.0)
     assert math.isclose(second["Y"], math.radians(0.001 / 60) * 6_371_000, rel_tol=1e-3)
     assert (first["hdop"], first["satellites"], first["age"]) == (1.3, 8.0, 0.25)
-    assert (first["quality"], lost["quality"], lost["hdop"]) == (1.0, 0.0, WORST_HDOP)
+    assert (first["quality"], lost["quality"], lost["hdop"]) == (1.0, 0.0, MAX_HDOP)
     assert math.isclose(lost["age"], 1.25)
 
 

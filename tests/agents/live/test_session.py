@@ -9,13 +9,13 @@ import pytest
 
 from sideslip.agents.live import session
 from sideslip.agents.live.assemble import PATIENCE
-from sideslip.agents.live.onboard import Onboard
+from sideslip.agents.live.onboard import OnboardController
 from sideslip.agents.live.session import (
     _BLOCK,
     _ITEM,
     _MAGIC,
     Recorder,
-    blocks_of,
+    read_blocks,
     read_setup,
     replay,
 )
@@ -28,8 +28,8 @@ SETUP: dict[str, Any] = {
 }
 
 
-def onboard() -> Onboard:
-    return Onboard(*contestant(STEERING, "dakf", "lqr"), SEED)
+def onboard() -> OnboardController:
+    return OnboardController(*contestant(STEERING, "dakf", "lqr"), SEED)
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["lock-step", "real time"])
@@ -61,7 +61,7 @@ def test_a_file_that_is_cut_anywhere_is_read_up_to_there(
 ) -> None:
     path, estimates, patience = driven
     data, cut = path.read_bytes(), tmp_path / "cut.session"
-    blocks, car, lengths = list(blocks_of(path)), onboard(), set()
+    blocks, car, lengths = list(read_blocks(path)), onboard(), set()
     assert len(blocks) >= 5
     beginning = data.index(b"BLOK")
     for size in [*range(beginning, len(data), len(data) // 23), len(data) - 1]:
@@ -69,7 +69,7 @@ def test_a_file_that_is_cut_anywhere_is_read_up_to_there(
         found = replay(cut, car, patience)
         assert found.same and len(found.ticks) < len(estimates)
         assert np.array_equal(np.hstack([found.x, found.std]), estimates[: len(found.ticks)])
-        lengths.add(len(list(blocks_of(cut))))
+        lengths.add(len(list(read_blocks(cut))))
     assert lengths <= set(range(len(blocks))) and len(lengths) > 3
     for size in range(beginning):
         cut.write_bytes(data[:size])
@@ -86,7 +86,7 @@ def test_a_damaged_block_ends_the_replay_and_another_filter_is_found_out(
     damaged = tmp_path / "damaged.session"
     damaged.write_bytes(data)
     assert 0 < len(replay(damaged, onboard(), patience).ticks) < len(estimates)
-    other = Onboard(*contestant(STEERING, "exact-kf", "lqr"), SEED)
+    other = OnboardController(*contestant(STEERING, "exact-kf", "lqr"), SEED)
     assert not replay(path, other, patience).same
 
 
@@ -97,7 +97,7 @@ def test_a_block_that_somebody_made_up_ends_the_replay(tmp_path: Path, items: by
     Recorder(path, {}).close()
     with path.open("ab") as file:
         file.write(_BLOCK.pack(_MAGIC, 2, len(items), zlib.crc32(items), 0) + items)
-    assert list(blocks_of(path)) == []
+    assert list(read_blocks(path)) == []
 
 
 @pytest.mark.parametrize(
@@ -123,9 +123,9 @@ def test_after_a_crash_all_but_the_last_block_is_there(tmp_path: Path) -> None:
     """Nothing waits in memory but the block at hand."""
     path = tmp_path / "a.session"
     recorder = Recorder(path, SETUP)
-    for i in range(3 * session.BATCHES + 7):
+    for i in range(3 * session.MAX_BATCHES + 7):
         recorder.take([bytes([i % 256])])
-    batches = [batch for block in blocks_of(path) for batch in block.batches]
+    batches = [batch for block in read_blocks(path) for batch in block.batches]
     assert [batch[0].data[0] for batch in batches] == [i % 256 for i in range(300)]
     recorder.close()
-    assert sum(len(block.batches) for block in blocks_of(path)) == 307
+    assert sum(len(block.batches) for block in read_blocks(path)) == 307

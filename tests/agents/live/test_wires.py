@@ -7,9 +7,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents.live.onboard import Onboard
+from sideslip.agents.live.onboard import OnboardController
 from sideslip.agents.live.port import Port
-from sideslip.agents.live.simulate import MOST_TICKS, simulate
+from sideslip.agents.live.simulate import MAX_TICKS, simulate
 from sideslip.agents.rollout import Rollout, rollout
 from sideslip.envs.record import FAST
 from tests.agents.live.both_ends import SEED, SHORT, STEERING, VISION, contestant, drive
@@ -73,7 +73,7 @@ def assert_same(live: Rollout, offline: Rollout) -> None:
 def test_in_lock_step_the_drive_is_the_offline_one(case: str) -> None:
     env_id, estimator, agent, options = CASES[case]
     offline = rollout(*contestant(env_id, estimator, agent, **options), SEED)
-    onboard = Onboard(*contestant(env_id, estimator, agent, **options), SEED)
+    onboard = OnboardController(*contestant(env_id, estimator, agent, **options), SEED)
     found, wires, loop = drive(env_id, onboard, **options)
     assert_same(found, offline)
     assert loop.statistics.ticks == 501 and wires.periods == len(offline["t"]) - 1
@@ -84,7 +84,7 @@ def test_estimates_are_those_of_the_offline_filter_at_every_tick() -> None:
     env, agent = contestant(VISION, "exact-kf", "lqr")
     offline = rollout(env, agent, SEED)
     expected = env.estimator.run(offline.log)
-    onboard = Onboard(*contestant(VISION, "exact-kf", "lqr"), SEED)
+    onboard = OnboardController(*contestant(VISION, "exact-kf", "lqr"), SEED)
     x, std = [], []
 
     def watch(_: Any) -> None:
@@ -98,7 +98,7 @@ def test_estimates_are_those_of_the_offline_filter_at_every_tick() -> None:
 def test_in_real_time_only_late_controls_make_a_difference() -> None:
     """At a tenth of the speed a control has ten times as long."""
     offline = rollout(*contestant(VISION, "exact-kf", "lqr"), SEED)
-    onboard = Onboard(*contestant(VISION, "exact-kf", "lqr"), SEED)
+    onboard = OnboardController(*contestant(VISION, "exact-kf", "lqr"), SEED)
     found, wires, loop = drive(VISION, onboard, step=False, speed=0.1)
     assert wires.late or loop.assembler.counts["held"] or found["beta"].shape == (51,)
     if not (wires.late or loop.assembler.counts["held"]):
@@ -108,7 +108,7 @@ def test_in_real_time_only_late_controls_make_a_difference() -> None:
 
 def test_garbage_between_the_datagrams_changes_nothing() -> None:
     offline = rollout(*contestant(VISION, "exact-kf", "lqr"), SEED)
-    onboard = Onboard(*contestant(VISION, "exact-kf", "lqr"), SEED)
+    onboard = OnboardController(*contestant(VISION, "exact-kf", "lqr"), SEED)
     over = Event()
 
     def throw(address: Any) -> None:
@@ -138,10 +138,10 @@ def test_garbage_between_the_datagrams_changes_nothing() -> None:
 
 def test_nobody_at_the_other_end_is_an_error() -> None:
     with Port() as port, Port() as nobody, pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sideslip.agents.live.simulate.ANSWER", 0.2)
+        patch.setattr("sideslip.agents.live.simulate.CONTROL_TIMEOUT", 0.2)
         with pytest.raises(TimeoutError, match=r"no control came .* --step"):
             simulate(gym.make(VISION, scenario=SHORT), port, nobody.address, step=True)
-        period = MOST_TICKS + 1
+        period = MAX_TICKS + 1
         with pytest.raises(ValueError, match="at most"):
             env = gym.make(VISION, scenario=SHORT, control_period=period)
             simulate(env, port, nobody.address, step=True)
@@ -149,4 +149,4 @@ def test_nobody_at_the_other_end_is_an_error() -> None:
 
 def test_an_onboard_is_built_on_an_estimate() -> None:
     with pytest.raises(TypeError, match="EstimateObservation"):
-        Onboard(gym.make(VISION))
+        OnboardController(gym.make(VISION))

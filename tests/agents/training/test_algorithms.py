@@ -14,43 +14,50 @@ pytest.importorskip("sb3_contrib")
 import torch
 
 from sideslip.agents.learned.files import load_policy
-from sideslip.agents.learned.policy import Learned
+from sideslip.agents.learned.policy import PolicyController
 from sideslip.agents.training import keeper, train
 from sideslip.agents.training.algorithms import (
     ALGORITHMS,
-    BEGUN,
-    BEGUN_TRACES,
     HYPERPARAMS,
-    algorithm_of,
+    WARM_START_ENTRY,
+    WARM_START_TRACES_ENTRY,
     check_settings,
-    options_of,
-    settings_of,
+    get_algorithm,
+    make_model_options,
+    read_settings,
 )
 from sideslip.agents.training.checkpoint import read_state
-from sideslip.agents.training.train import BEST, CHECKPOINT, POLICY, Means, Progress, Task
+from sideslip.agents.training.train import (
+    BEST,
+    CHECKPOINT,
+    POLICY,
+    Progress,
+    RunOptions,
+    TrainingTask,
+)
 
 SMALL: dict[str, Any] = {"n_steps": 16, "learning_starts": 64, "buffer_size": 4096}
 ROLLOUT, VISION = 128, "sideslip/YawVision-v0"
-EACH = Means(eval_freq=ROLLOUT)
+EACH = RunOptions(eval_freq=ROLLOUT)
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(keeper, "_MEASURED", 8)
+    monkeypatch.setattr(keeper, "_SCALING_ENVS", 8)
     threads = torch.get_num_threads()
     yield
     torch.set_num_threads(threads)
 
 
-def tiny(algo: str, **more: Any) -> Task:
+def tiny(algo: str, **more: Any) -> TrainingTask:
     """Eight environments, rollouts of 128 steps or fewer that divide them, small buffers."""
-    settings = settings_of(algo, VISION)
+    settings = read_settings(algo, VISION)
     settings |= {name: value for name, value in SMALL.items() if name in settings}
     settings |= {"train_freq": 16, "gradient_steps": 4} if "train_freq" in settings else {}
     scenario: dict[str, Any] = {"scenario": {"base": "sine-with-dwell", "duration": 0.5}}
     if "compile" in settings:  # on tensors a tick costs a thousand small operations
         settings["compile"], scenario["control_period"] = False, 2
-    return Task(VISION, algo, "", scenario, 3, 8, settings=settings | more, n_eval_envs=4)
+    return TrainingTask(VISION, algo, "", scenario, 3, 8, settings=settings | more, n_eval_envs=4)
 
 
 def tensors(model: Any) -> dict[str, Any]:
@@ -70,8 +77,8 @@ def trained(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     """(task, folder, model) of two rollouts."""
     task, folder = tiny(request.param), tmp_path_factory.mktemp(request.param)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(keeper, "_MEASURED", 8)
-        model = train.train(task, 2 * ROLLOUT, folder, means=EACH).model
+        patch.setattr(keeper, "_SCALING_ENVS", 8)
+        model = train.train(task, 2 * ROLLOUT, folder, run_options=EACH).model
     return task, folder, model
 
 
@@ -83,7 +90,7 @@ def test_it_goes_on_where_the_checkpoint_is(trained: Any) -> None:
     assert all(torch.equal(one[name], other[name]) for name in one)
     assert any("log_ent_coef" in name for name in one) == (task.algo in ("sac", "tqc"))
     before = {name: value.clone() for name, value in other.items()}
-    more = train.train(task, 4 * ROLLOUT, folder, resume=True, means=EACH)
+    more = train.train(task, 4 * ROLLOUT, folder, resume=True, run_options=EACH)
     assert [each.steps // ROLLOUT for each in more.evaluations] == [0, 1, 2, 3, 4]
     moved = tensors(more.model)
     actor = [name for name in moved if "policy " in name and name.endswith(".weight")]
@@ -94,10 +101,10 @@ def test_numpys_policy_drives_as_torchs(trained: Any) -> None:
     """Through an episode's end and with the memory of each, where there is one."""
     task, folder, _ = trained
     card = load_policy(folder / POLICY).card
-    model: Any = algorithm_of(card.algorithm).load().load(folder / BEST, device="cpu")  # type: ignore[attr-defined]
+    model: Any = get_algorithm(card.algorithm).load().load(folder / BEST, device="cpu")  # type: ignore[attr-defined]
     other = {"scenario": {"base": "step-steer", "duration": 0.5}}
-    env = Task(VISION, env_options=task.env_options | other).vector_env(4)
-    ours = Learned(env, folder / POLICY)
+    env = TrainingTask(VISION, env_options=task.env_options | other).vector_env(4)
+    ours = PolicyController(env, folder / POLICY)
     obs, _ = env.reset(seed=0)
     mine, theirs, start = None, None, np.ones(4, np.bool_)
     acted = []
@@ -113,7 +120,7 @@ def test_numpys_policy_drives_as_torchs(trained: Any) -> None:
 
 def test_the_same_seed_trains_the_same(trained: Any, tmp_path: Path) -> None:
     task, _, model = trained
-    here = train.train(task, 2 * ROLLOUT, tmp_path, means=EACH)
+    here = train.train(task, 2 * ROLLOUT, tmp_path, run_options=EACH)
     one, other = tensors(model), tensors(here.model)
     assert all(torch.equal(one[name], other[name]) for name in one)
 
@@ -121,7 +128,7 @@ def test_the_same_seed_trains_the_same(trained: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_weights_of_nan_stop_it(algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the step; the checkpoint is that of the last evaluation."""
-    models, real = list[Any](), train.Keeper.build
+    models, real = list[Any](), train.EvalCallback.build
 
     def built(*arguments: Any) -> Any:
         models.append(real(*arguments))
@@ -132,10 +139,10 @@ def test_weights_of_nan_stop_it(algo: str, tmp_path: Path, monkeypatch: pytest.M
             with torch.no_grad():
                 next(models[0].policy.parameters()).fill_(float("nan"))
 
-    monkeypatch.setattr(train.Keeper, "build", built)
-    means = Means(eval_freq=ROLLOUT, report=spoil)
+    monkeypatch.setattr(train.EvalCallback, "build", built)
+    means = RunOptions(eval_freq=ROLLOUT, report=spoil)
     with pytest.raises(FloatingPointError, match=f"after step {2 * ROLLOUT}; .*{CHECKPOINT}"):
-        train.train(tiny(algo), 4 * ROLLOUT, tmp_path, means=means)
+        train.train(tiny(algo), 4 * ROLLOUT, tmp_path, run_options=means)
     assert read_state(tmp_path / CHECKPOINT)["steps"] == ROLLOUT
 
 
@@ -145,7 +152,7 @@ def test_without_its_package_an_algorithm_names_the_extra(
 ) -> None:
     monkeypatch.setitem(sys.modules, "sb3_contrib", None)
     with pytest.raises(ModuleNotFoundError, match=r"sb3_contrib: pip install 'sideslip\[train\]'"):
-        Task(algo=algo)
+        TrainingTask(algo=algo)
 
 
 def test_the_packages_settings_are_of_ids_there_are() -> None:
@@ -153,11 +160,11 @@ def test_the_packages_settings_are_of_ids_there_are() -> None:
 
     for name, algorithm in ALGORITHMS.items():
         entries = yaml.safe_load((HYPERPARAMS / f"{algorithm.zoo}.yml").read_text())
-        ours = {"default", BEGUN, BEGUN_TRACES}
+        ours = {"default", WARM_START_ENTRY, WARM_START_TRACES_ENTRY}
         assert "default" in entries and set(entries) - ours <= set(gym.registry)
         for key in entries:
             check_settings(name, entries[key])
-            assert settings_of(name, key) == entries[key]
+            assert read_settings(name, key) == entries[key]
     assert len(list(HYPERPARAMS.iterdir())) == len(ALGORITHMS)
 
 
@@ -185,13 +192,13 @@ def test_a_fault_in_a_file_of_settings_is_named(text: str, said: str, tmp_path: 
     path = tmp_path / "mine.yml"
     path.write_text(text)
     with pytest.raises(ValueError, match=said) as caught:
-        settings_of("ppo", VISION, path)
+        read_settings("ppo", VISION, path)
     assert str(caught.value).startswith(str(path))
 
 
 def test_a_batch_divides_a_rollout_where_there_is_one() -> None:
     """n_steps of sac and tqc is that of returns, and a batch is drawn from the buffer."""
-    ppo = options_of("ppo", {"n_steps": 3, "batch_size": 256}, 0.01, 64)
+    ppo = make_model_options("ppo", {"n_steps": 3, "batch_size": 256}, 0.01, 64)
     assert ppo["batch_size"] == 192
     replayed = {"n_steps": 3, "batch_size": 256}
-    assert options_of("sac", replayed, 0.01, 64)["batch_size"] == 256
+    assert make_model_options("sac", replayed, 0.01, 64)["batch_size"] == 256

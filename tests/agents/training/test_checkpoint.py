@@ -12,10 +12,10 @@ from safetensors.torch import save
 
 from sideslip import __version__
 from sideslip.agents.training.checkpoint import FORMAT, STATE
-from sideslip.agents.training.train import CHECKPOINT, Task, aim_in, task_in
+from sideslip.agents.training.train import CHECKPOINT, TrainingTask, read_run_record, read_task
 
 WHOLE: dict[str, object] = dict.fromkeys(sorted(STATE), 0)
-WHOLE |= {"format": FORMAT, "task": dataclasses.asdict(Task()), "sideslip": __version__}
+WHOLE |= {"format": FORMAT, "task": dataclasses.asdict(TrainingTask()), "sideslip": __version__}
 
 
 def without(key: str, values: dict[str, object]) -> dict[str, object]:
@@ -24,7 +24,7 @@ def without(key: str, values: dict[str, object]) -> dict[str, object]:
 
 def of(**change: object) -> dict[str, object]:
     """A state whose task has something else."""
-    return WHOLE | {"task": dataclasses.asdict(Task()) | change}
+    return WHOLE | {"task": dataclasses.asdict(TrainingTask()) | change}
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,7 @@ def of(**change: object) -> dict[str, object]:
         *((without(key, WHOLE), f": the checkpoint's state lacks {key}") for key in sorted(STATE)),
         *(
             (WHOLE | {"task": without(each.name, WHOLE["task"])}, f"'s task lacks {each.name}")  # type: ignore[arg-type]
-            for each in dataclasses.fields(Task)
+            for each in dataclasses.fields(TrainingTask)
         ),
         (without("format", WHOLE), "is no checkpoint of this format"),
         ([1], "is no checkpoint of this format"),
@@ -55,14 +55,14 @@ def test_what_a_checkpoint_lacks_is_named(state: object, message: str, tmp_path:
     text = "{" if state == "cut" else json.dumps(state)
     (tmp_path / CHECKPOINT).write_bytes(save({"a": torch.zeros(1)}, {"checkpoint": text}))
     with pytest.raises(ValueError, match=message) as caught:
-        task_in(tmp_path)
+        read_task(tmp_path)
     assert str(caught.value).startswith(str(tmp_path / CHECKPOINT))
 
 
 def test_a_whole_checkpoint_is_read(tmp_path: Path) -> None:
     state = {"checkpoint": json.dumps(WHOLE)}
     (tmp_path / CHECKPOINT).write_bytes(save({"a": torch.zeros(1)}, state))
-    assert task_in(tmp_path) == Task()
+    assert read_task(tmp_path) == TrainingTask()
 
 
 def test_what_a_training_was_told_is_typed(tmp_path: Path) -> None:
@@ -73,4 +73,4 @@ def test_what_a_training_was_told_is_typed(tmp_path: Path) -> None:
         state = {"checkpoint": json.dumps(WHOLE | {"aim": aim})}
         (tmp_path / CHECKPOINT).write_bytes(save({"a": torch.zeros(1)}, state))
         with pytest.raises(ValueError, match=said):
-            aim_in(tmp_path)
+            read_run_record(tmp_path)

@@ -13,36 +13,36 @@ import torch
 
 from sideslip.agents.learned.card import Card
 from sideslip.agents.learned.files import load_policy
-from sideslip.agents.rollout import FLOOR
-from sideslip.agents.rungs import make_rung
+from sideslip.agents.rollout import COST_FLOOR
+from sideslip.agents.rungs import make_oracle
 from sideslip.agents.training import distill as training
-from sideslip.agents.training.distill import Lesson, distill, drive
-from sideslip.agents.training.student import Course, Student, fitted
+from sideslip.agents.training.distill import DistillTask, collect_demonstrations, distill
+from sideslip.agents.training.student import DistillConfig, Student, fit_model
 from sideslip.agents.training.traces.drives import (
     UNREAD,
-    Drives,
+    Demonstrations,
     Scaling,
-    normalised,
-    scaling_of,
+    compute_scaling,
+    normalise_inputs,
 )
-from sideslip.envs.task.observation import Entry
+from sideslip.envs.task.observation import ObservationEntry
 
 ID, CARS = "sideslip/YawFusion-v0", 16
 SHORT = {"base": "coms-step", "duration": 1.2, "onset": 0.1}
 OPTIONS: dict[str, Any] = {"scenario": SHORT, "reference": "zero-slip"}
-COURSE = Course(rounds=3, epochs=25, cells=8, hidden=(8,), learning_rate=1e-2)
+COURSE = DistillConfig(rounds=3, epochs=25, cells=8, hidden=(8,), learning_rate=1e-2)
 
 
-def lesson(**options: Any) -> Lesson:
+def lesson(**options: Any) -> DistillTask:
     cars = gym.make_vec(ID, num_envs=CARS, **OPTIONS)
-    return Lesson(cars, *make_rung("oracle-state-lqr", ID, CARS, **OPTIONS | options))
+    return DistillTask(cars, *make_oracle("oracle-state-lqr", ID, CARS, **OPTIONS | options))
 
 
 @pytest.fixture(scope="module", params=[8, 0], ids=["GRU", "no memory"])
 def learned(request: Any, tmp_path_factory: pytest.TempPathFactory) -> Any:
     path = tmp_path_factory.mktemp("distilled") / "student.safetensors"
     course = replace(COURSE, cells=request.param)
-    return distill(Card.of(ID, OPTIONS), [lesson()], course, path), path
+    return distill(Card.from_env_id(ID, OPTIONS), [lesson()], course, path), path
 
 
 def test_a_student_comes_nearer_to_its_teacher_on_seeds_it_has_not_seen(learned: Any) -> None:
@@ -51,10 +51,12 @@ def test_a_student_comes_nearer_to_its_teacher_on_seeds_it_has_not_seen(learned:
     nothing = {name: [0.0 * x for x in getattr(last, name)] for name in ("weights", "biases")}
     idle = replace(last, **nothing)
     ours, none = (
-        drive(lesson(), replace(found.policy, network=each), seeds, 0.0).costs.mean()
+        collect_demonstrations(
+            lesson(), replace(found.policy, network=each), seeds, 0.0
+        ).costs.mean()
         for each in (last, idle)
     )
-    teachers = drive(lesson(), None, seeds, 0.0).costs.mean()
+    teachers = collect_demonstrations(lesson(), None, seeds, 0.0).costs.mean()
     assert teachers < ours < teachers + 0.5 * (none - teachers)
 
 
@@ -67,11 +69,11 @@ def test_a_student_with_traces_mixes_them_once_by_the_first_drives(
         whole(self, drives, scaling)
         asked.append((drives, self.traces))
 
-    whole = Student.whiten
-    monkeypatch.setattr(Student, "whiten", whiten)
+    whole = Student.fit_whitening
+    monkeypatch.setattr(Student, "fit_whitening", whiten)
     course = replace(COURSE, rounds=2, epochs=1, cells=0, traces=3, told=0.5)
     path = tmp_path / "student.safetensors"
-    found = distill(Card.of(ID, OPTIONS), [lesson()], course, path)
+    found = distill(Card.from_env_id(ID, OPTIONS), [lesson()], course, path)
     ((drives, traces),) = asked
     assert len(drives) == 1 and traces.mean.abs().max() > 0.0
     (cell,) = load_policy(path).network.cells
@@ -95,11 +97,14 @@ def test_the_file_is_the_last_rounds_and_its_card_has_the_numbers(learned: Any) 
 @pytest.mark.parametrize("cells", [0, 7])
 def test_the_network_is_torchs(cells: int) -> None:
     torch.manual_seed(0)
-    student, rng = Student(5, 2, Course(cells=cells, hidden=(9, 4))), np.random.default_rng(1)
+    student, rng = (
+        Student(5, 2, DistillConfig(cells=cells, hidden=(9, 4))),
+        np.random.default_rng(1),
+    )
     mixing = np.eye(5) + 0.3 * np.ones((5, 5))
     scaling = Scaling(rng.normal(size=5), rng.uniform(0.5, 2.0, 5), mixing)
     x = rng.normal(size=(3, 150, 5)).astype(np.float32)
-    theirs = student(torch.from_numpy(scaling.mixed(x)))[0].detach().numpy()
+    theirs = student(torch.from_numpy(scaling.mix_inputs(x)))[0].detach().numpy()
     ours = np.stack(rolled(student.network(scaling), x), axis=1)
     assert np.abs(ours - theirs).max() < 1e-6 < np.abs(np.diff(ours, axis=1)).max()
 
@@ -108,48 +113,54 @@ def test_with_nothing_left_to_be_told_no_drive_is_made(tmp_path: Path) -> None:
     _, twins, teacher = lesson()
     course, path = replace(COURSE, told=0.5), tmp_path / "student.safetensors"
     with pytest.raises(ValueError, match="nothing is left to be told"):
-        distill(Card.of(ID, OPTIONS), [Lesson(twins, twins, teacher)], course, path)
+        distill(Card.from_env_id(ID, OPTIONS), [DistillTask(twins, twins, teacher)], course, path)
 
 
 def test_what_is_told_is_what_the_teacher_reads_and_the_student_does_not_see() -> None:
     """On seeds that it has not seen, the cells know the yaw rate, which so short a training shows
     them; the policy's file has nothing of it."""
-    seen, other = (drive(lesson(), None, range(at, at + CARS), 0.1) for at in (0, 900))
+    seen, other = (
+        collect_demonstrations(lesson(), None, range(at, at + CARS), 0.1) for at in (0, 900)
+    )
     cars, _, teacher = lesson()
     names = [entry.name for entry in cars.layout]
     told = [name for name in teacher.needs if name not in names]
-    assert {"beta_hat", "gamma_hat"} <= set(told) and len(told) == seen.told.shape[2]
-    rates = seen.told[..., told.index("gamma_hat")], seen.obs[..., names.index("gyro")]
+    assert {"beta_hat", "gamma_hat"} <= set(told) and len(told) == seen.privileged.shape[2]
+    rates = seen.privileged[..., told.index("gamma_hat")], seen.obs[..., names.index("gyro")]
     assert np.corrcoef(rates[0].ravel(), rates[1].ravel())[0, 1] > 0.9
-    mean, scale = seen.told.mean((0, 1)), 1.0 / np.maximum(seen.told.std((0, 1)), 1e-9)
-    seen, other = (x._replace(told=normalised(x.told, mean, scale)) for x in (seen, other))
+    mean, scale = seen.privileged.mean((0, 1)), 1.0 / np.maximum(seen.privileged.std((0, 1)), 1e-9)
+    seen, other = (
+        x._replace(privileged=normalise_inputs(x.privileged, mean, scale)) for x in (seen, other)
+    )
     course = replace(COURSE, told=1.0)
     torch.manual_seed(0)
     model = Student(len(names), 1, course, len(told))
-    scaling = scaling_of([seen], cars.layout, ("beta_hat",))
-    fitted(model, [seen], scaling, course, 60)
-    out = model(torch.from_numpy(scaling.mixed(other.obs)))[0].detach().numpy()
-    missed, varies = (x.mean((0, 1)) for x in ((out[..., 1:] - other.told) ** 2, other.told**2))
+    scaling = compute_scaling([seen], cars.layout, ("beta_hat",))
+    fit_model(model, [seen], scaling, course, 60)
+    out = model(torch.from_numpy(scaling.mix_inputs(other.obs)))[0].detach().numpy()
+    missed, varies = (
+        x.mean((0, 1)) for x in ((out[..., 1:] - other.privileged) ** 2, other.privileged**2)
+    )
     rate = told.index("gamma_hat")
     assert missed[rate] < 0.3 * varies[rate]
     assert model.network(scaling).width == 1
-    assert Student(5, 1, COURSE, 2).tell is None
+    assert Student(5, 1, COURSE, 2).auxiliary_head is None
 
 
 def test_windows_in_which_every_episode_is_over_tell_nothing() -> None:
     """Such as those of a car that spins early, in a batch of its own."""
-    seen = drive(lesson(), None, range(CARS), 0.1)
+    seen = collect_demonstrations(lesson(), None, range(CARS), 0.1)
     weights = seen.weights.copy()
     weights[:, 1:] = 0.0
     course = replace(COURSE, cells=4, told=1.0, batch=1)
-    model = Student(seen.obs.shape[2], 1, course, seen.told.shape[2])
-    scaling = scaling_of([seen], lesson()[0].layout, ("beta_hat",))
-    assert np.isfinite(fitted(model, [seen._replace(weights=weights)], scaling, course, 1))
+    model = Student(seen.obs.shape[2], 1, course, seen.privileged.shape[2])
+    scaling = compute_scaling([seen], lesson()[0].layout, ("beta_hat",))
+    assert np.isfinite(fit_model(model, [seen._replace(weights=weights)], scaling, course, 1))
 
 
 def test_a_teacher_of_other_cars_is_refused() -> None:
     with pytest.raises(ValueError, match="cars are others than the student's"):
-        drive(lesson(scenario=SHORT | {"friction": 0.5}), None, range(CARS), 0.0)
+        collect_demonstrations(lesson(scenario=SHORT | {"friction": 0.5}), None, range(CARS), 0.0)
 
 
 class Watched:
@@ -181,7 +192,7 @@ def test_a_teacher_is_told_what_was_done_and_teaches_what_it_knows() -> None:
         return step(action)
 
     plain.cars.step = noted
-    seen = drive(plain._replace(teacher=watched), None, range(CARS), 0.01)
+    seen = collect_demonstrations(plain._replace(teacher=watched), None, range(CARS), 0.01)
     assert np.array_equal(watched.acts, done) and len(done) == seen.labels.shape[1]
     assert not seen.weights[3].any() and (np.delete(seen.weights, 3, axis=0) > 0.0).all()
     shaken = np.stack(done, axis=1)[..., 0] - seen.labels[..., 0]
@@ -190,24 +201,28 @@ def test_a_teacher_is_told_what_was_done_and_teaches_what_it_knows() -> None:
 
 def test_what_the_teachers_sensors_do_changes_no_car() -> None:
     """`oracle-parameters` has sensors without biases: another record of the same motion."""
-    knowing = make_rung("oracle-parameters-lqr", ID, CARS, **OPTIONS)
-    seen = drive(lesson()._replace(teachers=knowing[0], teacher=knowing[1]), None, range(CARS), 0.1)
+    knowing = make_oracle("oracle-parameters-lqr", ID, CARS, **OPTIONS)
+    seen = collect_demonstrations(
+        lesson()._replace(teachers=knowing[0], teacher=knowing[1]), None, range(CARS), 0.1
+    )
     assert (seen.weights > 0.0).all() and np.ptp(seen.labels) > 0.0
 
 
 def test_a_drive_that_is_lost_weighs_as_a_usual_one() -> None:
     """So that what led there is learned, however much it cost."""
-    plain, capped = (drive(lesson(), None, range(CARS), 0.1, most) for most in (np.inf, 0.0))
-    assert np.allclose(plain.weights[:, 0], 1.0 / (plain.costs + FLOOR))
-    assert np.allclose(capped.weights, 1.0 / FLOOR) and (capped.costs == plain.costs).all()
+    plain, capped = (
+        collect_demonstrations(lesson(), None, range(CARS), 0.1, most) for most in (np.inf, 0.0)
+    )
+    assert np.allclose(plain.weights[:, 0], 1.0 / (plain.costs + COST_FLOOR))
+    assert np.allclose(capped.weights, 1.0 / COST_FLOOR) and (capped.costs == plain.costs).all()
 
 
 def test_a_student_that_sees_what_its_teacher_reads_reads_nothing_else() -> None:
     cars = lesson().cars
-    seen = [drive(lesson(), None, range(CARS), 0.1)]
+    seen = [collect_demonstrations(lesson(), None, range(CARS), 0.1)]
     names = [entry.name for entry in cars.layout]
     for needs, there in ((("steer", "beta_ref"), {"steer"}), (("beta_hat",), None)):
-        scaling = scaling_of(seen, cars.layout, needs)
+        scaling = compute_scaling(seen, cars.layout, needs)
         reads = {name for name, each in zip(names, scaling.scale, strict=True) if each > 0.0}
         assert reads == there if there else "gyro" in reads and not reads & set(UNREAD)
 
@@ -216,15 +231,17 @@ def test_an_age_is_scaled_as_it_varies_while_packets_come() -> None:
     """Ten seconds that stand for none yet, and an outage, would else hide a step of 10 ms."""
     ages = np.tile(np.arange(12) * 0.01 + 0.05, 25)[None, :, None].astype(np.float32)
     ages[:, :20], ages[:, 200:] = 10.0, np.arange(100)[:, None] * 0.01 + 0.17
-    layout = [Entry(name, "-", -10.0, 10.0) for name in ("gps_age", "gyro")]
+    layout = [ObservationEntry(name, "-", -10.0, 10.0) for name in ("gps_age", "gyro")]
     obs = np.concatenate([ages, np.sin(ages)], axis=-1)
-    drives = Drives(
+    drives = Demonstrations(
         obs, obs, obs, np.ones((1, 300), np.float32), np.eye(2, dtype=np.float32), np.ones(1)
     )
-    usual, deviation = (scaling_of([drives], layout, ("beta",), each) for each in (True, False))
+    usual, deviation = (
+        compute_scaling([drives], layout, ("beta",), each) for each in (True, False)
+    )
     ends = np.percentile(ages, (16, 50))  # the usual age is 0, a soon one a deviation before it
     assert (ends - usual.mean[0]) * usual.scale[0] == pytest.approx([-1.0, 0.0])
-    z, plain = (normalised(obs, x.mean, x.scale)[0, :, 0] for x in (usual, deviation))
+    z, plain = (normalise_inputs(obs, x.mean, x.scale)[0, :, 0] for x in (usual, deviation))
     assert z[:20].min() == 8.0 == z[-1] and np.abs(z[20:200]).max() < 4.0
     assert np.diff(z[24:36]).min() > 0.1 > 20.0 * np.diff(plain[24:36]).max()
 
@@ -232,8 +249,8 @@ def test_an_age_is_scaled_as_it_varies_while_packets_come() -> None:
 def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, real = tmp_path / "student.safetensors", fitted
-    drives = [drive(lesson(), None, range(CARS), 0.0)]
+    path, real = tmp_path / "student.safetensors", fit_model
+    drives = [collect_demonstrations(lesson(), None, range(CARS), 0.0)]
     names, model = len(drives[0].obs[0, 0]), Student(len(drives[0].obs[0, 0]), 1, COURSE)
     with pytest.raises(FloatingPointError, match=r"the loss is nan at step \d+"):
         scaling = Scaling(np.full(names, np.nan), np.ones(names), np.eye(names))
@@ -246,10 +263,10 @@ def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_f
             raise FloatingPointError("the loss is nan at step 3")
         return real(*arguments)
 
-    monkeypatch.setattr(training, "fitted", second)
+    monkeypatch.setattr(training, "fit_model", second)
     quick = replace(COURSE, epochs=1)
     with pytest.raises(FloatingPointError):
-        distill(Card.of(ID, OPTIONS), [lesson()], quick, path)
+        distill(Card.from_env_id(ID, OPTIONS), [lesson()], quick, path)
     assert load_policy(path).card.steps == CARS * 120
 
 
@@ -270,24 +287,24 @@ def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_f
 )
 def test_a_course_out_of_range_is_refused(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Course(**wrong)
+        DistillConfig(**wrong)
 
 
 def test_nothing_to_learn_from_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no lessons"):
-        distill(Card.of(ID, OPTIONS), [], COURSE, tmp_path / "student.safetensors")
+        distill(Card.from_env_id(ID, OPTIONS), [], COURSE, tmp_path / "student.safetensors")
 
 
 def test_mixed_inputs_show_what_two_of_them_differ_by() -> None:
     """As course less heading, whose difference is a tenth of either: it varies like the rest."""
     cars = lesson().cars
-    seen = drive(lesson(), None, range(CARS), 0.1)
+    seen = collect_demonstrations(lesson(), None, range(CARS), 0.1)
     names, rng = [entry.name for entry in cars.layout], np.random.default_rng(0)
     a, b = (names.index(name) for name in ("gps_course", "camera_psi"))
     seen.obs[..., a] = rng.normal(size=seen.obs.shape[:2])
     apart = 0.1 * rng.normal(size=seen.obs.shape[:2])
     seen.obs[..., b] = seen.obs[..., a] + apart
-    z = scaling_of([seen], cars.layout, ("beta_hat",)).mixed(seen.obs)
+    z = compute_scaling([seen], cars.layout, ("beta_hat",)).mix_inputs(seen.obs)
     shown = z[..., b] - z[..., a]
     assert 1.2 < shown.std() < 1.6  # of two that vary by 1, the square root of 2
     assert np.corrcoef(shown.ravel(), apart.ravel())[0, 1] > 0.99

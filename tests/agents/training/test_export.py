@@ -9,7 +9,7 @@ import pytest
 from gymnasium import spaces
 
 import sideslip  # noqa: F401  registers the ids
-from sideslip.agents.training.export import network_from_sb3
+from sideslip.agents.training.export import convert_sb3_policy
 
 stable_baselines3 = pytest.importorskip("stable_baselines3")
 import torch  # noqa: E402
@@ -73,7 +73,7 @@ def test_actions_of_a_drive_equal_torchs(name: str) -> None:
     model = made(name, env)
     x = observations(env)
     theirs, _ = model.predict(env.normalize_obs(x), deterministic=True)
-    ours = np.clip(network_from_sb3(model, env)(x.astype(np.float64)), -1.0, 1.0)
+    ours = np.clip(convert_sb3_policy(model, env)(x.astype(np.float64)), -1.0, 1.0)
     assert (np.abs(theirs) < 1.0).sum() > 300 and np.ptp(theirs) > 0.1  # few are clipped
     assert np.abs(ours - theirs).max() < 1e-6
 
@@ -84,7 +84,7 @@ def test_it_is_torchs_function_where_torch_is_in_double_precision(name: str) -> 
     env = normalised(norm_obs=False)
     model = made(name, env)
     x = np.random.default_rng(0).normal(size=(200, 22)) * 10.0
-    ours = network_from_sb3(model, env)(x)
+    ours = convert_sb3_policy(model, env)(x)
     policy = model.policy
     if name.startswith(("ppo", "a2c")):
         layers = [policy.mlp_extractor.policy_net, policy.action_net]
@@ -99,7 +99,7 @@ def test_it_is_torchs_function_where_torch_is_in_double_precision(name: str) -> 
 
 def test_what_never_varied_is_not_read() -> None:
     env = normalised()
-    network = network_from_sb3(stable_baselines3.PPO("MlpPolicy", env, device="cpu"), env)
+    network = convert_sb3_policy(stable_baselines3.PPO("MlpPolicy", env, device="cpu"), env)
     names = [entry.name for entry in gym.make(ID).get_wrapper_attr("layout")]
     unread = {name for name, scale in zip(names, network.scale, strict=True) if scale == 0.0}
     assert unread == {"beta_ref", "gamma_ref"}
@@ -119,14 +119,14 @@ def test_what_is_no_dense_actor_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
     ]
     for model, normaliser, said in cases:
         with pytest.raises(ValueError, match=said):
-            network_from_sb3(model, normaliser)
+            convert_sb3_policy(model, normaliser)
     other = VecNormalize(DummyVecEnv([lambda: gym.make("sideslip/YawFusion-v0")]))
     with pytest.raises(ValueError, match="of another observation"):
-        network_from_sb3(ppo("MlpPolicy", env), other)
+        convert_sb3_policy(ppo("MlpPolicy", env), other)
     wide = ppo("MlpPolicy", env)
     wide.policy.action_space = spaces.Box(-2.0, 2.0, (1,), np.float32)
     with pytest.raises(ValueError, match=r"within \[-1, 1\]"):
-        network_from_sb3(wide, env)
+        convert_sb3_policy(wide, env)
     monkeypatch.setitem(sys.modules, "stable_baselines3.common.torch_layers", None)
     with pytest.raises(ModuleNotFoundError, match=r"sideslip\[train\]"):
-        network_from_sb3(wide, env)
+        convert_sb3_policy(wide, env)

@@ -10,11 +10,16 @@ pytest.importorskip("stable_baselines3")
 import torch
 
 from sideslip.agents.learned.files import load_policy
-from sideslip.agents.learned.policy import Learned
-from sideslip.agents.training.gradient import Gradient, GruPolicy, Source, driven
-from sideslip.agents.training.keeper import Keeper, Means
-from sideslip.agents.training.rewards import Rates
-from sideslip.agents.training.task import Task
+from sideslip.agents.learned.policy import PolicyController
+from sideslip.agents.training.gradient import (
+    AnalyticPolicyGradient,
+    GruPolicy,
+    TrainingSource,
+    unroll_window,
+)
+from sideslip.agents.training.keeper import EvalCallback, RunOptions
+from sideslip.agents.training.rewards import RewardScale
+from sideslip.agents.training.task import TrainingTask
 from sideslip.agents.vec_env.env import make_vec_env
 from sideslip.envs.device import DeviceVectorEnv
 
@@ -47,8 +52,8 @@ def policy_of(cars: Any) -> Any:
 
 def paid_by(policy: Any, cars: Any, weights: Any, steps: int) -> Any:
     obs, _ = cars.reset(seed=list(range(cars.num_envs)))
-    rates = Rates([[each] for each in weights.tolist()])
-    return driven(policy, cars, obs, policy.begin(cars.num_envs).double(), rates, steps)
+    rates = RewardScale([[each] for each in weights.tolist()])
+    return unroll_window(policy, cars, obs, policy.begin(cars.num_envs).double(), rates, steps)
 
 
 def test_the_slope_is_that_of_the_cost() -> None:
@@ -80,7 +85,7 @@ def test_a_car_of_weight_zero_teaches_nothing() -> None:
     paid, *_ = paid_by(policy, cars, torch.tensor([0.0, 1.0], dtype=torch.float64), 4)
     alone = cars_of(1)
     obs, _ = alone.reset(seed=[1])
-    one, *_ = driven(policy, alone, obs, policy.begin(1).double(), Rates([[1.0]]), 4)
+    one, *_ = unroll_window(policy, alone, obs, policy.begin(1).double(), RewardScale([[1.0]]), 4)
     assert paid.item() == pytest.approx(0.5 * one.item(), rel=1e-12) and one.item() > 0.0
 
 
@@ -94,12 +99,12 @@ def test_where_an_episode_ends_the_memory_does_too() -> None:
 CAR = {"vehicle": "passenger-car", "nominal": "passenger-car", "reference": "lagged"}
 
 
-def tuned_task(**more: Any) -> Task:
+def tuned_task(**more: Any) -> TrainingTask:
     """Of the form and the observation of `raw-car-yaw`."""
     settings = {"policy": "GruPolicy", "n_timesteps": 9, "n_envs": 2}
     settings |= {"policy_kwargs": {"cells": 96, "net_arch": [64, 64]}, **more}
     options = {"scenario": "car-step", **CAR}
-    return Task(FUSION, "gradient", "", options, settings=settings, n_eval_envs=4)
+    return TrainingTask(FUSION, "gradient", "", options, settings=settings, n_eval_envs=4)
 
 
 def test_a_drive_has_a_weight_of_its_own() -> None:
@@ -109,19 +114,21 @@ def test_a_drive_has_a_weight_of_its_own() -> None:
     for rates in ([2.0, 0.0], [0.0, 3.0], [2.0, 3.0]):
         obs, _ = cars.reset(seed=[0])
         start = policy.begin(1).double()
-        paid, *_ = driven(policy, cars, obs, start, Rates([rates]), 20)  # an episode has 15
+        paid, *_ = unroll_window(
+            policy, cars, obs, start, RewardScale([rates]), 20
+        )  # an episode has 15
         parts.append(paid.item())
     assert min(parts) > 0.0 and parts[2] == pytest.approx(parts[0] + parts[1], rel=1e-6)
 
 
-def begun(task: Task, folder: Path) -> Any:
-    return Keeper(task, folder, None, Means(), 1, load_policy("raw-car-yaw")).build(None)
+def begun(task: TrainingTask, folder: Path) -> Any:
+    return EvalCallback(task, folder, None, RunOptions(), 1, load_policy("raw-car-yaw")).build(None)
 
 
 def test_what_begins_with_a_distilled_policy_acts_as_it_does(tmp_path: Path) -> None:
     task = tuned_task()
     model, env = begun(task, tmp_path), task.vector_env(4)
-    ours = Learned(env, "raw-car-yaw")
+    ours = PolicyController(env, "raw-car-yaw")
     obs, _ = env.reset(seed=0)
     mine, theirs, start = None, None, np.ones(4, np.bool_)
     for _ in range(100):
@@ -161,14 +168,16 @@ def made(source: Any, **more: Any) -> Any:
     env = make_vec_env(VISION, 2)
     k = env.observation_space.shape[0]  # type: ignore[index]
     scaling = {"features_extractor_kwargs": {"mean": [0.0] * k, "scale": [0.1] * k}}
-    return Gradient("GruPolicy", env, source=source, policy_kwargs=scaling, device="cpu", **more)
+    return AnalyticPolicyGradient(
+        "GruPolicy", env, source=source, policy_kwargs=scaling, device="cpu", **more
+    )
 
 
 def test_a_slope_that_is_not_finite_stops_it_at_its_step() -> None:
     width = made(None).observation_space.shape[0]
 
-    def torn(device: Any, compile: bool) -> Source:
-        return Source(Torn(width), [0, 1], Rates([[1.0], [1.0]]))
+    def torn(device: Any, compile: bool) -> TrainingSource:
+        return TrainingSource(Torn(width), [0, 1], RewardScale([[1.0], [1.0]]))
 
     model = made(torn, n_steps=3)
     before = [each.clone() for each in model.policy.parameters()]
@@ -179,7 +188,7 @@ def test_a_slope_that_is_not_finite_stops_it_at_its_step() -> None:
 
 def test_what_it_cannot_do_is_said() -> None:
     with pytest.raises(ValueError, match="gradient reads sensors alone: no estimator runs on"):
-        Task(VISION, "gradient", "exact-kf")
+        TrainingTask(VISION, "gradient", "exact-kf")
     with pytest.raises(ValueError, match="n_steps is at least 1, got 0"):
         made(None, n_steps=0)
     with pytest.raises(ValueError, match="needs their source"):

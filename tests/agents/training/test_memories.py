@@ -9,18 +9,18 @@ import pytest
 pytest.importorskip("torch")
 import torch
 
-from sideslip.agents.optimum import Lqg, estimated
-from sideslip.agents.training.distill import Lesson, drive
-from sideslip.agents.training.memory.imitation import Remembering, imitated
-from sideslip.agents.training.memory.inputs import LATEST, RATE, Prepared
+from sideslip.agents.optimum import Lqg, wrap_optimal_estimate
+from sideslip.agents.training.distill import DistillTask, collect_demonstrations
+from sideslip.agents.training.memory.imitation import MemoryAgent, train_memory
+from sideslip.agents.training.memory.inputs import MAX_AGE, RATE, CompactObservation
 from sideslip.agents.training.memory.networks import MEMORIES, Kalman, make_memory
-from sideslip.agents.training.student import Course
-from sideslip.agents.training.traces.drives import normalised, scaling_of
+from sideslip.agents.training.student import DistillConfig
+from sideslip.agents.training.traces.drives import compute_scaling, normalise_inputs
 
 ID, CARS, INPUTS, FRESH, STEPS = "sideslip/LinearYawVision-v0", 16, 5, 4, 90
 CAMERA = {"period": 0.04, "delays": [0.03], "loss": 0.3}
 SHORT = gym.spec(ID).kwargs["scenario"] | {"duration": 1.0}
-COURSE = Course(rounds=2, epochs=10, learning_rate=5e-3, noise=0.3)
+COURSE = DistillConfig(rounds=2, epochs=10, learning_rate=5e-3, noise=0.3)
 
 
 @pytest.fixture(params=MEMORIES)
@@ -70,7 +70,7 @@ def test_windows_and_single_steps_are_the_whole(name: str) -> None:
 
 def test_an_episode_begins_without_the_last_ones_memory(name: str) -> None:
     model, z = made(name)
-    agent, x = Remembering(model, np.zeros(INPUTS), np.ones(INPUTS)), z.numpy()
+    agent, x = MemoryAgent(model, np.zeros(INPUTS), np.ones(INPUTS)), z.numpy()
     state = None
     for t in range(20):
         _, state = agent.predict(x[:, t], state, np.zeros(2, bool))
@@ -89,24 +89,24 @@ def test_without_packets_an_observer_that_is_late_knows_what_a_prompt_one_knows(
     for late in (0, 7):
         torch.manual_seed(1)
         with torch.no_grad():
-            known.append(Kalman(INPUTS, FRESH, late)._remember(z, none, None)[0])
+            known.append(Kalman(INPUTS, FRESH, late)._update_memory(z, none, None)[0])
     assert (known[0] - known[1]).abs().max() < 1e-5 < known[0].abs().max()
 
 
-def lesson(**camera: Any) -> Lesson:
+def lesson(**camera: Any) -> DistillTask:
     options: dict[str, Any] = {"camera": CAMERA | camera, "scenario": SHORT}
-    twins = estimated(gym.make_vec(ID, CARS, **options))
-    return Lesson(Prepared(gym.make_vec(ID, CARS, **options)), twins, Lqg(twins))
+    twins = wrap_optimal_estimate(gym.make_vec(ID, CARS, **options))
+    return DistillTask(CompactObservation(gym.make_vec(ID, CARS, **options)), twins, Lqg(twins))
 
 
 def test_inputs_are_whitened() -> None:
     mine = lesson()
-    seen = [drive(mine, None, range(CARS), 0.3)]
-    mean, scale, _ = scaling_of(seen, mine.cars.layout, mine.teacher.needs, usual_ages=False)
+    seen = [collect_demonstrations(mine, None, range(CARS), 0.3)]
+    mean, scale, _ = compute_scaling(seen, mine.cars.layout, mine.teacher.needs, usual_ages=False)
     inputs = len(mine.cars.layout)
     model = make_memory("mlp", inputs, inputs - 1, 0)
-    model.whiten(seen, mean, scale)
-    z = normalised(seen[0].obs, mean, scale).reshape(-1, inputs) @ model.mix.numpy()
+    model.fit_whitening(seen, mean, scale)
+    z = normalise_inputs(seen[0].obs, mean, scale).reshape(-1, inputs) @ model.mix.numpy()
     spread = np.linalg.eigvalsh(np.cov(z.T))
     assert spread.max() == pytest.approx(1.0, abs=1e-3)
     assert np.sum(spread > 0.99) == inputs - 2  # both torques, and both angles, are one
@@ -114,7 +114,7 @@ def test_inputs_are_whitened() -> None:
 
 def test_the_offset_becomes_the_rate_between_two_pictures_and_is_forgotten_at_a_reset() -> None:
     options: dict[str, Any] = {"camera": CAMERA | {"loss": 0.0}, "scenario": SHORT}
-    cars, plain = Prepared(gym.make_vec(ID, 2, **options)), gym.make_vec(ID, 2, **options)
+    cars, plain = CompactObservation(gym.make_vec(ID, 2, **options)), gym.make_vec(ID, 2, **options)
     base: Any = plain
     ours = [entry.name for entry in cars.layout]
     theirs = [entry.name for entry in base.layout]
@@ -126,7 +126,7 @@ def test_the_offset_becomes_the_rate_between_two_pictures_and_is_forgotten_at_a_
     rates, pictures = [], []
     for step in range(120):  # into the next episode
         assert np.array_equal(x[:, ours.index("gyro_9")], y[:, theirs.index("gyro_9")])
-        assert x[:, ours.index("camera_age")].max() <= LATEST
+        assert x[:, ours.index("camera_age")].max() <= MAX_AGE
         if y[0, theirs.index("camera_fresh")]:
             pictures.append((step, float(y[0, theirs.index("camera_y_l")])))
             rates.append(float(x[0, ours.index(RATE)]))
@@ -140,11 +140,11 @@ def test_the_offset_becomes_the_rate_between_two_pictures_and_is_forgotten_at_a_
 
 def test_a_memory_comes_nearer_to_the_filter() -> None:
     rounds: list[Any] = []
-    agent = imitated("frames", lesson(), COURSE, 3, 3e-4, rounds.append)
+    agent = train_memory("frames", lesson(), COURSE, 3, 3e-4, rounds.append)
     assert [each.steps for each in rounds] == [CARS * 100, 2 * CARS * 100]
     ours, idle = (
-        np.square(drive(lesson(), each, range(CARS), 0.0).labels).sum()
-        for each in (agent, Remembering(_still(agent.model), agent.mean, agent.scale))
+        np.square(collect_demonstrations(lesson(), each, range(CARS), 0.0).labels).sum()
+        for each in (agent, MemoryAgent(_still(agent.model), agent.mean, agent.scale))
     )
     assert ours < 0.7 * idle  # what remains to be done about the car
 
@@ -157,8 +157,8 @@ def _still(model: Any) -> Any:
 
 
 def test_the_same_seed_learns_the_same() -> None:
-    course = Course(rounds=1, epochs=1, noise=0.3)
-    first, second = (imitated("gru", lesson(), course, 3).model.state_dict() for _ in range(2))
+    course = DistillConfig(rounds=1, epochs=1, noise=0.3)
+    first, second = (train_memory("gru", lesson(), course, 3).model.state_dict() for _ in range(2))
     assert all(torch.equal(first[key], second[key]) for key in first)
 
 
@@ -179,4 +179,4 @@ def test_a_lesson_without_packets_is_refused() -> None:
     mine = lesson()
     mine.cars.layout = tuple(e for e in mine.cars.layout if not e.name.endswith("_fresh"))
     with pytest.raises(ValueError, match="one sensor with packets, got 0"):
-        imitated("gru", mine, COURSE, 3)
+        train_memory("gru", mine, COURSE, 3)

@@ -6,13 +6,13 @@ import pytest
 pytest.importorskip("stable_baselines3")
 import torch
 
-from sideslip.agents.training.normalise import CLIP, Standardised, measured
-from sideslip.agents.training.train import Task
+from sideslip.agents.training.normalise import CLIP, Standardised, measure_scaling
+from sideslip.agents.training.train import TrainingTask
 
 
 def test_observations_are_standardised_by_the_network() -> None:
-    env = Task(env_options={"scenario": "sine-with-dwell"}, seed=3).vector_env(16)
-    mean, scale, clip, mixing = measured(env, 0.4, 5)
+    env = TrainingTask(env_options={"scenario": "sine-with-dwell"}, seed=3).vector_env(16)
+    mean, scale, clip, mixing = measure_scaling(env, 0.4, 5)
     assert mixing is None  # nobody asked for it
     names = [entry.name for entry in env.unwrapped.layout]  # type: ignore[attr-defined]
     assert scale[names.index("gamma_ref")] == 0.0  # zero-slip: it never varies
@@ -29,8 +29,8 @@ def test_observations_are_standardised_by_the_network() -> None:
 
 def test_what_is_read_has_no_correlation() -> None:
     """On other cars than it was measured on, too: nearly all mixtures vary by about one."""
-    env = Task().vector_env(64)
-    mean, scale, clip, mixing = measured(env, 0.4, 5, mixed=True)
+    env = TrainingTask().vector_env(64)
+    mean, scale, clip, mixing = measure_scaling(env, 0.4, 5, mixed=True)
     rng, noise, seen = np.random.default_rng(6), np.zeros((64, 1)), []
     env.reset(seed=6)
     for step in range(400):
@@ -49,22 +49,22 @@ def test_what_is_read_has_no_correlation() -> None:
 
 
 def test_a_network_reads_what_it_is_told_to_and_nothing_else() -> None:
-    env = Task().vector_env(8)
-    plain = measured(env, 0.4, 5)
+    env = TrainingTask().vector_env(8)
+    plain = measure_scaling(env, 0.4, 5)
     names = [entry.name for entry in env.unwrapped.layout]  # type: ignore[attr-defined]
-    some = measured(env, 0.4, 5, ["gyro", "steer"])
+    some = measure_scaling(env, 0.4, 5, ["gyro", "steer"])
     read = np.isin(names, ["gyro", "steer"])
     assert np.array_equal(some[1], np.where(read, plain[1], 0.0)) and some[0] == plain[0]
     assert np.count_nonzero(some[1]) == 2 < np.count_nonzero(plain[1])
     with pytest.raises(ValueError, match=r"the observation has no beta_hat to read; it has gyro, "):
-        measured(env, 0.4, 5, ["gyro", "beta_hat"])
+        measure_scaling(env, 0.4, 5, ["gyro", "beta_hat"])
     with pytest.raises(ValueError, match="nothing of what the network reads varies within 4 s"):
-        measured(env, 0.4, 5, ["gamma_ref"])  # zero-slip
+        measure_scaling(env, 0.4, 5, ["gamma_ref"])  # zero-slip
 
 
 def test_scales_are_of_seconds_however_short_a_control_period_is() -> None:
     """In 0.4 s nobody steers: what was measured over steps was never read."""
     options = {"scenario": "sine-with-dwell", "control_period": 1}
-    env = Task(env_options=options).vector_env(4)
+    env = TrainingTask(env_options=options).vector_env(4)
     names = [entry.name for entry in env.unwrapped.layout]  # type: ignore[attr-defined]
-    assert measured(env, 0.4, 5)[1][names.index("steer_command")] > 0.0
+    assert measure_scaling(env, 0.4, 5)[1][names.index("steer_command")] > 0.0

@@ -12,13 +12,18 @@ import torch
 
 from sideslip.agents.learned.card import Card
 from sideslip.agents.learned.files import Policy, load_policy
-from sideslip.agents.rollout import costs_of
-from sideslip.agents.training.export import network_from_sb3
-from sideslip.agents.training.keeper import _SCALING, BEGUN_WITH, Means, evaluation_seeds
-from sideslip.agents.training.starts import Begun, Driver, task_from
-from sideslip.agents.training.student import Course, Student
+from sideslip.agents.rollout import evaluate_costs
+from sideslip.agents.training.export import convert_sb3_policy
+from sideslip.agents.training.keeper import (
+    _SCALING_SEEDS,
+    WARM_START_FILE,
+    RunOptions,
+    make_evaluation_seeds,
+)
+from sideslip.agents.training.starts import NetworkAgent, PolicyWarmStart, make_finetune_task
+from sideslip.agents.training.student import DistillConfig, Student
 from sideslip.agents.training.traces.drives import Scaling
-from sideslip.agents.training.traces.remembered import Remembered, mixing_of
+from sideslip.agents.training.traces.remembered import MemoryObservation, measure_mixing
 from sideslip.agents.training.train import train
 
 ID = "sideslip/YawFusion-v0"
@@ -35,39 +40,41 @@ def cars(count: int) -> Any:
 def policy() -> Policy:
     """Random weights: it acts in some way that what is remembered decides."""
     torch.manual_seed(0)
-    card, rng = Card.of(ID, OPTIONS), np.random.default_rng(0)
+    card, rng = Card.from_env_id(ID, OPTIONS), np.random.default_rng(0)
     wide = len(card.observation)
     scaling = Scaling(rng.normal(size=wide), np.full(wide, 0.3), np.eye(wide))
-    student = Student(wide, 1, Course(traces=6, hidden=(8, 4)))
+    student = Student(wide, 1, DistillConfig(traces=6, hidden=(8, 4)))
     return Policy("traced", student.network(scaling), card)
 
 
 def test_an_observation_is_what_is_remembered_across_episodes(policy: Policy) -> None:
     """The last one of an episode too, which the row's next episode does not see."""
-    bare, env = cars(3), Remembered(cars(3), policy.network)
+    bare, env = cars(3), MemoryObservation(cars(3), policy.network)
     state = np.zeros((3, policy.network.memory))
     seen, (obs, _) = bare.reset(seed=5)[0], env.reset(seed=5)
     ended = 0
     for step in range(1, 2 * STEPS + 3):
-        assert obs == pytest.approx(policy.network.remembered(seen.astype(float), state), abs=1e-5)
+        assert obs == pytest.approx(
+            policy.network.compute_features(seen.astype(float), state), abs=1e-5
+        )
         action = np.full((3, 1), 0.1, np.float32)
         seen, _, _, over, bares = bare.step(action)
         obs, _, _, same, infos = env.step(action)
         assert np.array_equal(over, same) and obs in env.observation_space
         if over.any():
             last = np.stack(bares["final_obs"][over]).astype(float)
-            theirs = policy.network.remembered(last, state[over].copy())
+            theirs = policy.network.compute_features(last, state[over].copy())
             assert np.stack(infos["final_obs"][over]) == pytest.approx(theirs, abs=1e-5)
             state[over], ended = 0.0, ended + 1
             assert step % STEPS == 0
     assert ended == 2
     env.reset(seed=5)
-    first = policy.network.remembered(bare.reset(seed=5)[0].astype(float), 0.0 * state)
+    first = policy.network.compute_features(bare.reset(seed=5)[0].astype(float), 0.0 * state)
     assert env.reset(seed=5)[0] == pytest.approx(first, abs=1e-5)
 
 
 def test_a_row_that_is_not_reset_goes_on_with_its_memory(policy: Policy) -> None:
-    rows, mask = [Remembered(cars(3), policy.network) for _ in range(2)], np.arange(3) == 1
+    rows, mask = [MemoryObservation(cars(3), policy.network) for _ in range(2)], np.arange(3) == 1
     action = np.full((3, 1), 0.1, np.float32)
     seen = []
     for env in rows:
@@ -78,7 +85,9 @@ def test_a_row_that_is_not_reset_goes_on_with_its_memory(policy: Policy) -> None
     seen[0][:] = 9.0  # whoever has an observation may write into it
     first = rows[0].reset(seed=[None, 8, None], options={"reset_mask": mask})[0]
     assert np.array_equal(first[~mask], before[~mask])
-    assert np.array_equal(first[mask], Remembered(cars(3), policy.network).reset(seed=7)[0][mask])
+    assert np.array_equal(
+        first[mask], MemoryObservation(cars(3), policy.network).reset(seed=7)[0][mask]
+    )
     ours, theirs = (env.step(action)[0] for env in rows)
     assert np.array_equal(ours[~mask], theirs[~mask]) and (ours[mask] != theirs[mask]).any()
 
@@ -86,44 +95,48 @@ def test_a_row_that_is_not_reset_goes_on_with_its_memory(policy: Policy) -> None
 def test_mixed_and_back_a_network_is_the_same(policy: Policy) -> None:
     """And what is remembered in its own drives varies alike, mixed."""
     net = policy.network
-    drive = Driver(net.dense)
-    mixing = mixing_of(cars(60), net, lambda obs: drive.predict(obs)[0], 3)
-    mixed, x = mixing.without(net), np.random.default_rng(1).normal(size=(5, net.dense.inputs))
+    drive = NetworkAgent(net.dense)
+    mixing = measure_mixing(cars(60), net, lambda obs: drive.predict(obs)[0], 3)
+    mixed, x = (
+        mixing.adapt_to_mixed(net),
+        np.random.default_rng(1).normal(size=(5, net.dense.inputs)),
+    )
     theirs = net.dense(x)
     assert mixed.dense((x - mixing.mean) @ mixing.mixing) == pytest.approx(theirs, abs=1e-5)
     assert np.abs(mixed.dense(x) - theirs).max() > 1e-3
-    assert mixing.within(mixed).dense(x) == pytest.approx(theirs, abs=1e-4)
-    env = Remembered(cars(60), net, mixing)
+    assert mixing.adapt_to_plain(mixed).dense(x) == pytest.approx(theirs, abs=1e-4)
+    env = MemoryObservation(cars(60), net, mixing)
     seen, (obs, _) = [], env.reset(seed=3)
     for _ in range(STEPS):
         seen.append(obs)
-        obs, *_ = env.step(Driver(mixed.dense).predict(obs)[0])
+        obs, *_ = env.step(NetworkAgent(mixed.dense).predict(obs)[0])
     found = np.concatenate(seen[::7])
     assert np.abs(found.mean(0)).max() < 0.05 and np.var(found, axis=0).max() < 1.1
 
 
 def test_ppo_goes_on_behind_the_traces(policy: Policy, tmp_path: Path) -> None:
-    settings = task_from(policy).settings | {"n_steps": 8, "batch_size": 16, "n_epochs": 1}
+    settings = make_finetune_task(policy).settings | {"n_steps": 8, "batch_size": 16, "n_epochs": 1}
     assert settings["learning_rate"] == "lin_1e-4"  # of the entry for hundreds of inputs
-    task = task_from(policy, settings=settings, num_envs=4, n_eval_envs=4)
-    found = train(task, 64, tmp_path, means=Means(eval_freq=64), trained_agent=policy)
+    task = make_finetune_task(policy, settings=settings, num_envs=4, n_eval_envs=4)
+    found = train(task, 64, tmp_path, run_options=RunOptions(eval_freq=64), trained_agent=policy)
     assert found.evaluations[0].of_start == pytest.approx(1.0, abs=1e-6)
     kept = load_policy(tmp_path / "policy.safetensors").network
     for part in ("weight_in", "bias_in"):
         assert np.array_equal(*(getattr(each.cells[0], part) for each in (kept, policy.network)))
     assert np.array_equal(kept.mean, policy.network.mean)
-    begun = Begun(policy, task, task.vector_env(4), _SCALING + task.seed)
-    last = begun.whole(network_from_sb3(found.model))
-    seeds = evaluation_seeds(4)
+    begun = PolicyWarmStart(policy, task, task.vector_env(4), _SCALING_SEEDS + task.seed)
+    last = begun.merge_network(convert_sb3_policy(found.model))
+    seeds = make_evaluation_seeds(4)
     begins, ours, best = (
-        costs_of(task.vector_env(4), Driver(each), seeds) for each in (policy.network, last, kept)
+        evaluate_costs(task.vector_env(4), NetworkAgent(each), seeds)
+        for each in (policy.network, last, kept)
     )
-    theirs = costs_of(begun.around(task.vector_env(4)), found.model, seeds)
+    theirs = evaluate_costs(begun.wrap_env(task.vector_env(4)), found.model, seeds)
     assert ours == pytest.approx(theirs, rel=1e-5) and ours != pytest.approx(begins, rel=1e-4)
     first = found.best is found.evaluations[0]
     assert best == pytest.approx(begins if first else ours, rel=1e-5)
     layer: Any = found.model.policy.action_net
     moved = np.abs(layer.weight.detach().numpy() - policy.network.weights[-1])
-    assert moved.max() > 1e-5 and (tmp_path / BEGUN_WITH).exists()
+    assert moved.max() > 1e-5 and (tmp_path / WARM_START_FILE).exists()
     again = train(task, 96, tmp_path, resume=True)
     assert again.evaluations[:2] == found.evaluations and len(again.evaluations) == 3

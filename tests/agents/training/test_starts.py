@@ -13,21 +13,21 @@ import torch
 from stable_baselines3.common.logger import configure
 
 from sideslip.agents.learned.files import Policy, load_policy
-from sideslip.agents.rollout import FLOOR, costs_of
+from sideslip.agents.rollout import COST_FLOOR, evaluate_costs
 from sideslip.agents.training import keeper
 from sideslip.agents.training.algorithms import HYPERPARAMS
 from sideslip.agents.training.keeper import (
-    BEGUN_WITH,
     CHECKPOINT,
+    WARM_START_FILE,
+    EvalCallback,
     Evaluation,
-    Keeper,
-    Means,
-    evaluation_seeds,
+    RunOptions,
+    make_evaluation_seeds,
 )
-from sideslip.agents.training.rewards import Rated, Rates, paid_by
-from sideslip.agents.training.starts import Driver, settings_in, task_from
-from sideslip.agents.training.task import Task
-from sideslip.agents.training.train import start_in, task_in, train
+from sideslip.agents.training.rewards import RewardScale, RewardScaleWrapper, measure_reward_scale
+from sideslip.agents.training.starts import NetworkAgent, make_finetune_task, resolve_settings
+from sideslip.agents.training.task import TrainingTask
+from sideslip.agents.training.train import load_initial_policy, read_task, train
 from sideslip.agents.vec_env.env import make_vec_env
 from sideslip.envs.device import DeviceVectorEnv
 
@@ -37,41 +37,41 @@ COMS = {"vehicle": "coms", "nominal": "coms", "reference": "zero-slip"}
 FEW = {"num_envs": 4, "n_eval_envs": 4, "env_options": COMS | SHORT}
 
 
-def started(task: Task, folder: Path, policy: Policy = POLICY) -> Any:
-    return Keeper(task, folder, None, Means(), 16, policy).build(None)
+def started(task: TrainingTask, folder: Path, policy: Policy = POLICY) -> Any:
+    return EvalCallback(task, folder, None, RunOptions(), 16, policy).build(None)
 
 
 def test_the_task_is_that_of_the_card(tmp_path: Path) -> None:
     card = POLICY.card
-    task = task_from(POLICY)
+    task = make_finetune_task(POLICY)
     assert (task.env_id, task.estimator) == (card.env_id, card.estimator) and not task.scenarios
     assert task.env_options == card.env_options and task.settings["n_steps"] == 64
     assert task.settings["policy_kwargs"]["activation_fn"] == "silu"
-    mixed = task_from(POLICY, scenarios=["coms-slalom", "coms-step"], seed=3)
+    mixed = make_finetune_task(POLICY, scenarios=["coms-slalom", "coms-step"], seed=3)
     assert "scenario" not in mixed.env_options and mixed.seed == 3
-    one = task_from(load_policy("ppo-coms-yaw"), env_options={"scenario": "coms-step"})
+    one = make_finetune_task(load_policy("ppo-coms-yaw"), env_options={"scenario": "coms-step"})
     assert one.env_options == COMS | {"scenario": "coms-step"} and not one.scenarios
-    assert len(task_from(load_policy("ppo-coms-yaw")).scenarios) == 7
+    assert len(make_finetune_task(load_policy("ppo-coms-yaw")).scenarios) == 7
     for other in ("exact-kf", ""):
-        behind = task_from(POLICY, estimator=other)
+        behind = make_finetune_task(POLICY, estimator=other)
         assert (behind.estimator, behind.estimator_options) == (other, {})
     with pytest.raises(ValueError, match="sac begins with a zip, not with policy distill-coms-yaw"):
-        task_from(POLICY, algo="sac")
+        make_finetune_task(POLICY, algo="sac")
     with pytest.raises(ValueError, match=r"ppo goes on from .* of raw-car-yaw are .*'gru'"):
-        task_from(load_policy("raw-car-yaw"))
+        make_finetune_task(load_policy("raw-car-yaw"))
     with pytest.raises(ValueError, match=r"gradient goes on from .* of distill-coms-yaw are .*"):
-        task_from(POLICY, algo="gradient")
+        make_finetune_task(POLICY, algo="gradient")
     tanh = dataclasses.replace(load_policy("raw-car-yaw").network, activation="tanh")
     with pytest.raises(ValueError, match="gradient goes on from layers of silu, not of tanh"):
-        task_from(dataclasses.replace(POLICY, network=tanh), algo="gradient")
+        make_finetune_task(dataclasses.replace(POLICY, network=tanh), algo="gradient")
 
 
 def test_a_model_acts_as_the_policy_that_it_begins_with(tmp_path: Path) -> None:
-    task = task_from(POLICY, **FEW)
+    task = make_finetune_task(POLICY, **FEW)
     model, env = started(task, tmp_path), task.vector_env(4)
     obs, _ = env.reset(seed=0)
     for _ in range(20):
-        actions, _ = Driver(POLICY.network).predict(obs)
+        actions, _ = NetworkAgent(POLICY.network).predict(obs)
         assert np.abs(model.predict(obs, deterministic=True)[0] - actions).max() < 1e-5
         obs, *_ = env.step(actions)
     assert np.ptp(actions) > 1e-4
@@ -80,8 +80,8 @@ def test_a_model_acts_as_the_policy_that_it_begins_with(tmp_path: Path) -> None:
 
 def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
     """Before anybody drives."""
-    task = task_from(POLICY, **FEW)
-    plain = dataclasses.replace(task, settings=Task().settings)
+    task = make_finetune_task(POLICY, **FEW)
+    plain = dataclasses.replace(task, settings=TrainingTask().settings)
     with pytest.raises(ValueError, match="'activation_fn': 'silu'}, and the settings say"):
         started(plain, tmp_path)
     raw = dataclasses.replace(task, estimator="", estimator_options={})
@@ -89,32 +89,32 @@ def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
         started(raw, tmp_path)
     kwargs = {"policy_kwargs": {"activation_fn": "nn.SiLU"}}
     with pytest.raises(ValueError, match=r"unknown activation_fn 'nn\.SiLU'"):
-        Task(settings=Task().settings | kwargs)
+        TrainingTask(settings=TrainingTask().settings | kwargs)
     kwargs = {"policy_kwargs": {"activation_fn": "silu"}}
     with pytest.raises(ValueError, match="the layers of gradient are of silu: it has no activ"):
-        Task(algo="gradient", settings=Task(algo="gradient").settings | kwargs)
+        TrainingTask(algo="gradient", settings=TrainingTask(algo="gradient").settings | kwargs)
 
 
 def test_a_file_of_settings_has_an_entry_for_going_on() -> None:
     file = HYPERPARAMS / "ppo.yml"
-    assert settings_in(file, "ppo", "sideslip/YawVision-v0", POLICY)["n_steps"] == 64
-    assert settings_in(file, "ppo", "sideslip/YawVision-v0", None)["n_steps"] == 32
-    assert settings_in(None, "ppo", "", POLICY) == task_from(POLICY).settings
+    assert resolve_settings(file, "ppo", "sideslip/YawVision-v0", POLICY)["n_steps"] == 64
+    assert resolve_settings(file, "ppo", "sideslip/YawVision-v0", None)["n_steps"] == 32
+    assert resolve_settings(None, "ppo", "", POLICY) == make_finetune_task(POLICY).settings
 
 
 def test_each_drive_weighs_by_what_the_policy_pays_in_it() -> None:
     """Driven by the policy itself, each whole drive is paid -1 a step in the mean, but for the
     floor."""
-    task = task_from(POLICY, **FEW)
-    driver = Driver(POLICY.network)
+    task = make_finetune_task(POLICY, **FEW)
+    driver = NetworkAgent(POLICY.network)
 
     def cars() -> Any:
         options = task.options(4)
-        return make_vec_env(task.env_id, 4, estimator=task.around, env_kwargs=options)
+        return make_vec_env(task.env_id, 4, estimator=task.estimator_kwargs, env_kwargs=options)
 
-    table = paid_by(driver, cars(), 7, 100)  # an episode has 30
+    table = measure_reward_scale(driver, cars(), 7, 100)  # an episode has 30
     assert all(len(each) == 4 for each in table) and len({x for row in table for x in row}) == 12
-    rated, state = Rated(cars(), Rates(table)), None
+    rated, state = RewardScaleWrapper(cars(), RewardScale(table)), None
     rated.seed(7)
     obs: Any = rated.reset()
     start = np.ones(4, np.bool_)
@@ -126,7 +126,7 @@ def test_each_drive_weighs_by_what_the_policy_pays_in_it() -> None:
         if start.all():
             costs[:, step // 30] = [-info["episode"]["r"] for info in infos]
     assert start.all() and np.ptp(costs) > 0.5 * costs.mean()
-    assert paid == pytest.approx(30.0 * costs / (costs + FLOOR), rel=1e-4)
+    assert paid == pytest.approx(30.0 * costs / (costs + COST_FLOOR), rel=1e-4)
 
 
 @pytest.mark.parametrize("algo, name", [("ppo", "distill-coms-yaw"), ("gradient", "raw-car-yaw")])
@@ -140,14 +140,14 @@ def test_what_a_training_drives_is_what_the_policy_drove(
     base = "coms-slalom" if algo == "ppo" else "car-step"
     options = car | {"scenario": {"base": base, "duration": 0.3}}
     more: dict[str, Any] = {"num_envs": 4, "n_eval_envs": 4, "env_options": options}
-    task = task_from(policy, algo=algo, **more)
+    task = make_finetune_task(policy, algo=algo, **more)
     monkeypatch.setattr(keeper, "load_parameters", lambda *_: None)
     network, saved = policy.network, None
     if steps:
         scaling = network.mean.tolist(), network.scale.tolist(), network.clip, None
         saved = {"steps": steps, "scaling": scaling, "evaluations": []}
-    model: Any = Keeper(task, tmp_path, saved, Means(), 400, policy).build(saved)
-    driver, cars = Driver(network), model.get_env()
+    model: Any = EvalCallback(task, tmp_path, saved, RunOptions(), 400, policy).build(saved)
+    driver, cars = NetworkAgent(network), model.get_env()
     paid, costs, state, start = np.zeros(4), np.zeros(4), None, np.ones(4, np.bool_)
     if algo == "gradient":
         tensors, seeds, rates = model.source(device="cpu", compile=False)
@@ -168,13 +168,15 @@ def test_what_a_training_drives_is_what_the_policy_drove(
             paid -= rewards
             costs = np.array([-i["episode"]["r"] for i in infos]) if start.all() else costs
         if step % 30 == 29:
-            assert start.all() and paid == pytest.approx(30.0 * costs / (costs + FLOOR), rel=3e-3)
+            assert start.all() and paid == pytest.approx(
+                30.0 * costs / (costs + COST_FLOOR), rel=3e-3
+            )
             paid, costs = np.zeros(4), np.zeros(4)
 
 
 def test_what_cars_meet_does_not_depend_on_who_drives_them_nor_on_what() -> None:
     """Else a drive would have another drive's weight: episode after episode, on tensors too."""
-    task = task_from(POLICY, **FEW | {"estimator": "", "estimator_options": {}})
+    task = make_finetune_task(POLICY, **FEW | {"estimator": "", "estimator_options": {}})
     firsts = []
     for action in (0.0, 1.0):
         env: Any = task.vector_env(2)
@@ -192,34 +194,38 @@ def test_what_cars_meet_does_not_depend_on_who_drives_them_nor_on_what() -> None
 
 
 def test_a_training_from_a_policy_goes_on_after_a_stop(tmp_path: Path) -> None:
-    settings = task_from(POLICY).settings | {"n_steps": 8, "batch_size": 16, "n_epochs": 1}
-    task = task_from(POLICY, settings=settings, **FEW)
-    found = train(task, 64, tmp_path, means=Means(eval_freq=32), trained_agent=POLICY)
+    settings = make_finetune_task(POLICY).settings | {"n_steps": 8, "batch_size": 16, "n_epochs": 1}
+    task = make_finetune_task(POLICY, settings=settings, **FEW)
+    found = train(task, 64, tmp_path, run_options=RunOptions(eval_freq=32), trained_agent=POLICY)
     first = found.evaluations[0]
     assert first.of_start == pytest.approx(1.0, abs=1e-6) and found.best.of_start == min(
         each.of_start or np.inf for each in found.evaluations
     )
-    assert np.array_equal(load_policy(tmp_path / BEGUN_WITH).network.scale, POLICY.network.scale)
-    env, seeds = task.vector_env(4), evaluation_seeds(4)
-    start, now = (costs_of(env, each, seeds) for each in (Driver(POLICY.network), found.model))
-    ratio = np.exp(np.log((now + FLOOR) / (start + FLOOR)).mean())
+    assert np.array_equal(
+        load_policy(tmp_path / WARM_START_FILE).network.scale, POLICY.network.scale
+    )
+    env, seeds = task.vector_env(4), make_evaluation_seeds(4)
+    start, now = (
+        evaluate_costs(env, each, seeds) for each in (NetworkAgent(POLICY.network), found.model)
+    )
+    ratio = np.exp(np.log((now + COST_FLOOR) / (start + COST_FLOOR)).mean())
     assert found.evaluations[-1].of_start == pytest.approx(ratio, rel=1e-12)
-    assert ratio != 1.0 and task_in(tmp_path) == task
+    assert ratio != 1.0 and read_task(tmp_path) == task
     again = train(task, 96, tmp_path, resume=True)
     card = load_policy(tmp_path / "policy.safetensors").card
     assert card.algorithm_options["begun_with"] == "distill-coms-yaw"
-    assert start_in(tmp_path) is not None
+    assert load_initial_policy(tmp_path) is not None
     assert again.evaluations[: len(found.evaluations)] == found.evaluations
     assert again.evaluations[-1].of_start is not None
     lines = (tmp_path / "curve.jsonl").read_text().splitlines()
     assert json.loads(lines[0])["of_start"] == first.of_start
-    (tmp_path / BEGUN_WITH).rename(tmp_path / "aside")
+    (tmp_path / WARM_START_FILE).rename(tmp_path / "aside")
     with pytest.raises(FileNotFoundError, match="began with policy distill-coms-yaw, and needs it"):
         train(task, 128, tmp_path, resume=True)
-    (tmp_path / "aside").rename(tmp_path / BEGUN_WITH)
+    (tmp_path / "aside").rename(tmp_path / WARM_START_FILE)
     (tmp_path / CHECKPOINT).unlink()  # stopped before it had one: the folder begins anew
-    train(dataclasses.replace(task, settings=Task().settings), 1, tmp_path)
-    assert not (tmp_path / BEGUN_WITH).exists()
+    train(dataclasses.replace(task, settings=TrainingTask().settings), 1, tmp_path)
+    assert not (tmp_path / WARM_START_FILE).exists()
 
 
 @pytest.mark.parametrize("ratio, kept", [(2.0, True), (0.5, False)])
@@ -227,7 +233,9 @@ def test_the_best_is_that_of_the_score_not_of_the_mean(
     ratio: float, kept: bool, tmp_path: Path
 ) -> None:
     """An older evaluation is beaten by its ratio to the start, whatever its cost was."""
-    other = Keeper(task_from(POLICY, **FEW), tmp_path, None, Means(), 16, POLICY)
+    other = EvalCallback(
+        make_finetune_task(POLICY, **FEW), tmp_path, None, RunOptions(), 16, POLICY
+    )
     other.build(None).set_logger(configure(None, []))
     cost = 0.0 if kept else 1e9
     other.evaluations.append(Evaluation(0, 0.0, cost=cost, of_none=cost, of_start=ratio))

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.agents.learned.policy import Learned
-from sideslip.agents.rollout import costs_of
+from sideslip.agents.learned.policy import PolicyController
+from sideslip.agents.rollout import evaluate_costs
 from sideslip.envs.vector import StabilityVectorEnv
 
 pytest.importorskip("stable_baselines3")
@@ -25,29 +25,29 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sideslip.agents.training import keeper, train
-from sideslip.agents.training.algorithms import options_of
+from sideslip.agents.training.algorithms import make_model_options
 from sideslip.agents.training.checkpoint import read_state
-from sideslip.agents.training.export import network_from_sb3
+from sideslip.agents.training.export import convert_sb3_policy
 from sideslip.agents.training.train import (
     BEST,
     CHECKPOINT,
     CURVE,
     POLICY,
-    Means,
     Progress,
-    Task,
-    task_in,
+    RunOptions,
+    TrainingTask,
+    read_task,
 )
 from sideslip.agents.vec_env.env import make_vec_env
 
-TINY = Task(num_envs=8, env_options={"scenario": "sine-with-dwell"}, seed=3, n_eval_envs=4)
+TINY = TrainingTask(num_envs=8, env_options={"scenario": "sine-with-dwell"}, seed=3, n_eval_envs=4)
 ROLLOUT = 256  # steps of 8 environments
-EACH = Means(eval_freq=ROLLOUT)
+EACH = RunOptions(eval_freq=ROLLOUT)
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(keeper, "_MEASURED", 8)
+    monkeypatch.setattr(keeper, "_SCALING_ENVS", 8)
     threads = torch.get_num_threads()
     yield
     torch.set_num_threads(threads)
@@ -58,8 +58,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Of a training of three rollouts."""
     path = tmp_path_factory.mktemp("trained")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(keeper, "_MEASURED", 8)
-        train.train(TINY, 3 * ROLLOUT, path, means=EACH)
+        patch.setattr(keeper, "_SCALING_ENVS", 8)
+        train.train(TINY, 3 * ROLLOUT, path, run_options=EACH)
     yield path
 
 
@@ -81,30 +81,30 @@ def test_the_best_evaluation_is_kept(folder: Path) -> None:
     assert np.all(np.diff([line["cpu_seconds"] for line in lines]) > 0.0)
     model = PPO.load(folder / BEST, device="cpu")
     env = TINY.vector_env(4)
-    seeds = keeper.evaluation_seeds(4)
+    seeds = keeper.make_evaluation_seeds(4)
     best = min(line["cost"] for line in lines)
-    assert costs_of(env, model, seeds).mean() == pytest.approx(best, rel=1e-6)
-    policy = Learned(env, folder / POLICY)
-    assert costs_of(env, policy, seeds).mean() == pytest.approx(best, rel=1e-4)
+    assert evaluate_costs(env, model, seeds).mean() == pytest.approx(best, rel=1e-6)
+    policy = PolicyController(env, folder / POLICY)
+    assert evaluate_costs(env, policy, seeds).mean() == pytest.approx(best, rel=1e-4)
     card, kept = policy.policy.card, min(lines, key=lambda line: line["cost"])
     assert (card.steps, card.cpu_seconds) == (kept["steps"], kept["cpu_seconds"])
     assert card.env_id == TINY.env_id and card.env_options == TINY.env_options
     assert not policy.policy.reads[-1]  # gamma_ref: with zero slip it never varies
     still: Any = type("Still", (), {"predict": lambda *_, **__: (np.zeros((4, 1)), None)})()
-    none = costs_of(env, still, seeds).mean()
+    none = evaluate_costs(env, still, seeds).mean()
     assert lines[0]["of_none"] == pytest.approx(lines[0]["cost"] / none, rel=1e-12)
     assert sorted(os.listdir(folder)) == sorted([BEST, CHECKPOINT, CURVE, POLICY])
 
 
 def test_training_goes_on_where_the_checkpoint_is(folder: Path, tmp_path: Path) -> None:
     """Weights, the optimiser's moments, the step size, the count, the evaluations."""
-    first = train.train(TINY, 2 * ROLLOUT, tmp_path, means=EACH)
+    first = train.train(TINY, 2 * ROLLOUT, tmp_path, run_options=EACH)
     again = train.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)  # there is nothing to do
     assert again.evaluations == first.evaluations
     one, other = parameters(first.model), parameters(again.model)
     assert one.keys() == other.keys() and len(one) > 30
     assert all(torch.equal(one[name], other[name]) for name in one)
-    more = train.train(TINY, 5 * ROLLOUT, tmp_path, resume=True, means=EACH)
+    more = train.train(TINY, 5 * ROLLOUT, tmp_path, resume=True, run_options=EACH)
     assert more.model.num_timesteps == 5 * ROLLOUT
     assert more.evaluations[:3] == first.evaluations
     assert [each.steps // ROLLOUT for each in more.evaluations] == [0, 1, 2, 3, 4, 5]
@@ -118,7 +118,7 @@ def test_training_goes_on_where_the_checkpoint_is(folder: Path, tmp_path: Path) 
 
 
 def test_the_same_seed_trains_the_same(folder: Path, tmp_path: Path) -> None:
-    here = train.train(TINY, 3 * ROLLOUT, tmp_path, means=EACH)
+    here = train.train(TINY, 3 * ROLLOUT, tmp_path, run_options=EACH)
     assert [each.cost for each in here.evaluations] == [line["cost"] for line in curve(folder)]
 
 
@@ -136,7 +136,7 @@ def test_no_seed_serves_two_purposes(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(StabilityVectorEnv, "reset", watched)
     train.train(TINY, ROLLOUT, tmp_path)
     train.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)
-    tested = set(keeper.evaluation_seeds(4))
+    tested = set(keeper.make_evaluation_seeds(4))
     others = [seed for seed in told if seed not in tested]
     assert len(others) == len(set(others)) == 8 + 8 + 8  # scaling, training, going on
     assert min(told) >= 2**63
@@ -144,8 +144,8 @@ def test_no_seed_serves_two_purposes(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_progress_is_told_after_every_rollout(tmp_path: Path) -> None:
     told: list[Progress] = []
-    task = Task(num_envs=40, env_options=TINY.env_options, n_eval_envs=4)
-    train.train(task, 20 * 40 * 32, tmp_path, means=Means(report=told.append))
+    task = TrainingTask(num_envs=40, env_options=TINY.env_options, n_eval_envs=4)
+    train.train(task, 20 * 40 * 32, tmp_path, run_options=RunOptions(report=told.append))
     assert [each.steps for each in told] == [40 * 32 * i for i in range(1, 21)]
     assert told[0].cost is None and told[0].evaluations[0].steps == 0
     assert told[-1].cost is not None and told[-1].cost > 0.0  # 640 steps: episodes have 600
@@ -207,8 +207,8 @@ def test_a_kill_at_any_time_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> 
 )
 def test_a_checkpoint_of_another_training_is_refused(folder: Path, name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=f"is of {name} .*, not .*: train that in another"):
-        task_in(folder, **{name: value})
-    assert task_in(folder) == TINY
+        read_task(folder, **{name: value})
+    assert read_task(folder) == TINY
     with pytest.raises(ValueError, match="train that in another folder"):
         train.train(dataclasses.replace(TINY, **{name: value}), 10, folder, resume=True)
 
@@ -227,24 +227,24 @@ def test_a_file_that_is_no_checkpoint_says_so(folder: Path, tmp_path: Path) -> N
     for content in (b"", b"no", whole[:-100]):
         (tmp_path / CHECKPOINT).write_bytes(content)
         with pytest.raises(ValueError, match="is no checkpoint, or is cut short"):
-            task_in(tmp_path)
+            read_task(tmp_path)
     (tmp_path / CHECKPOINT).write_bytes(save({"a": torch.zeros(1)}))
     with pytest.raises(ValueError, match="is no checkpoint of this format"):
-        task_in(tmp_path)
+        read_task(tmp_path)
 
 
 def test_what_cannot_be_trained_says_why_and_leaves_no_checkpoint(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="unknown algorithm 'dqn'; known: ppo, sac, tqc"):
-        Task(algo="dqn")
+        TrainingTask(algo="dqn")
     with pytest.raises(ValueError, match="seed is at least 0, got -1"):
-        Task(seed=-1)
+        TrainingTask(seed=-1)
     with pytest.raises(ValueError, match="steps is at least 1, got 0"):
         train.train(TINY, 0, tmp_path)
     for task, said in (
-        (Task(estimator="dakf"), "dakf needs the slow sensor gps"),
-        (Task(estimator="kf"), "kf"),
-        (Task(env_options={"scenario": "moon"}), "unknown scenario 'moon'"),
-        (Task("CartPole-v1"), "has no native vector env"),
+        (TrainingTask(estimator="dakf"), "dakf needs the slow sensor gps"),
+        (TrainingTask(estimator="kf"), "kf"),
+        (TrainingTask(env_options={"scenario": "moon"}), "unknown scenario 'moon'"),
+        (TrainingTask("CartPole-v1"), "has no native vector env"),
     ):
         with pytest.raises(ValueError, match=said):
             train.train(task, 10, tmp_path)
@@ -253,7 +253,7 @@ def test_what_cannot_be_trained_says_why_and_leaves_no_checkpoint(tmp_path: Path
 
 def test_the_network_of_the_file_standardises_as_torch_does(folder: Path) -> None:
     model = PPO.load(folder / BEST, device="cpu")
-    network = network_from_sb3(model)
+    network = convert_sb3_policy(model)
     env = TINY.vector_env(8)
     obs, _ = env.reset(seed=0)
     for _ in range(50):
@@ -264,13 +264,13 @@ def test_the_network_of_the_file_standardises_as_torch_does(folder: Path) -> Non
         obs, *_ = env.step(actions)
     twice = VecNormalize(make_vec_env(TINY.env_id, 2))
     with pytest.raises(ValueError, match="normalised twice"):
-        network_from_sb3(model, twice)
+        convert_sb3_policy(model, twice)
 
 
 @pytest.mark.parametrize("num_envs", [1, 7, 100, 256, 1000])
 def test_batches_divide_a_rollout(num_envs: int) -> None:
-    settings = Task().settings
-    told = options_of("ppo", settings, 0.02, num_envs)
+    settings = TrainingTask().settings
+    told = make_model_options("ppo", settings, 0.02, num_envs)
     assert num_envs * told["n_steps"] % told["batch_size"] == 0
     assert told["batch_size"] <= settings["batch_size"]
     assert told["gamma"] == pytest.approx(settings["gamma"] ** 2, rel=1e-12)  # a longer period
@@ -278,5 +278,5 @@ def test_batches_divide_a_rollout(num_envs: int) -> None:
 
 @pytest.mark.long
 def test_ppo_passes_a_quarter_of_none_within_a_minute(tmp_path: Path) -> None:
-    found = train.train(Task(), 250_000, tmp_path).best
+    found = train.train(TrainingTask(), 250_000, tmp_path).best
     assert found.of_none < 0.25

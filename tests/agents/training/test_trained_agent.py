@@ -14,16 +14,16 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sideslip.agents.training import keeper, train
 from sideslip.agents.training.normalise import CLIP
-from sideslip.agents.training.train import BEST, Means, Task
+from sideslip.agents.training.train import BEST, RunOptions, TrainingTask
 from sideslip.agents.vec_env.env import make_vec_env
 
 SHORT: dict[str, Any] = {"scenario": {"base": "sine-with-dwell", "duration": 0.3}}
-TASK = Task(num_envs=4, env_options=SHORT, n_eval_envs=4)
+TASK = TrainingTask(num_envs=4, env_options=SHORT, n_eval_envs=4)
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(keeper, "_MEASURED", 8)
+    monkeypatch.setattr(keeper, "_SCALING_ENVS", 8)
 
 
 def observations() -> Any:
@@ -36,7 +36,7 @@ def begun(tmp_path: Path, zipped: Path, trust: bool = False) -> Any:
     """The model before its first step."""
     place = tmp_path / "new"
     place.mkdir()
-    return train.Keeper(TASK, place, None, Means()).build(None, zipped, trust)
+    return train.EvalCallback(TASK, place, None, RunOptions()).build(None, zipped, trust)
 
 
 def foreign(path: Path, normalised: bool, **options: Any) -> Any:

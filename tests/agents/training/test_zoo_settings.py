@@ -9,10 +9,10 @@ import pytest
 
 pytest.importorskip("rl_zoo3")
 from sideslip.agents.learned.files import load_policy
-from sideslip.agents.rollout import costs_of
+from sideslip.agents.rollout import evaluate_costs
 from sideslip.agents.training.algorithms import ALGORITHMS, HYPERPARAMS
-from sideslip.agents.training.starts import Driver
-from sideslip.agents.training.train import POLICY, Means, Task, train
+from sideslip.agents.training.starts import NetworkAgent
+from sideslip.agents.training.train import POLICY, RunOptions, TrainingTask, train
 
 THEIRS = [name for name, each in ALGORITHMS.items() if not each.on_tensors]
 FEW = {"n_envs": 4, "n_steps": 16, "batch_size": 32, "learning_starts": 32, "buffer_size": 1000}
@@ -22,7 +22,7 @@ FEW = {"n_envs": 4, "n_steps": 16, "batch_size": 32, "learning_starts": 32, "buf
 @pytest.mark.parametrize("algo", THEIRS)
 def test_the_zoo_takes_our_settings_and_we_its_zip(algo: str, tmp_path: Path) -> None:
     zoo = ALGORITHMS[algo].zoo
-    settings = Task(algo=algo).settings
+    settings = TrainingTask(algo=algo).settings
     few = [f"{name}:{value}" for name, value in FEW.items() if name in settings]
     command = [
         *(sys.executable, "-m", "rl_zoo3.train", "--algo", zoo, "--env", "sideslip/YawVision-v0"),
@@ -34,7 +34,7 @@ def test_the_zoo_takes_our_settings_and_we_its_zip(algo: str, tmp_path: Path) ->
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     (zipped,) = (tmp_path / zoo / "sideslip-YawVision-v0_1").glob("sideslip*.zip")
-    task = Task(algo=algo, num_envs=4, n_eval_envs=4)
+    task = TrainingTask(algo=algo, num_envs=4, n_eval_envs=4)
     train(task, 64, tmp_path / "on", trained_agent=zipped, trust=True)
 
 
@@ -42,18 +42,18 @@ def test_the_zoo_takes_our_settings_and_we_its_zip(algo: str, tmp_path: Path) ->
 @pytest.mark.parametrize("algo", THEIRS)
 def test_the_zoo_finds_and_drives_what_we_left(algo: str, tmp_path: Path) -> None:
     """The best model, on seed 0, at the cost of our own file of it."""
-    task = Task(
+    task = TrainingTask(
         algo=algo,
         env_options={"scenario": "sine-with-dwell"},
         estimator="exact-kf",
         num_envs=4,
         n_eval_envs=4,
     )
-    folder = task.zoo_folder(tmp_path)
+    folder = task.find_zoo_folder(tmp_path)
     task.describe_for_zoo(folder, 64, 64)
-    train(task, 64, folder, means=Means(eval_freq=64))
+    train(task, 64, folder, run_options=RunOptions(eval_freq=64))
     cars = task.vector_env(1)
-    cost = costs_of(cars, Driver(load_policy(folder / POLICY).network), [0])[0]
+    cost = evaluate_costs(cars, NetworkAgent(load_policy(folder / POLICY).network), [0])[0]
     command = [
         *(sys.executable, "-m", "rl_zoo3.enjoy", "--algo", ALGORITHMS[algo].zoo, "--no-render"),
         *("--env", "sideslip/YawVision-v0", "--gym-packages", "sideslip", "-f", str(tmp_path)),

@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import (
     VecVideoRecorder,
 )
 
-from sideslip.agents.training.rewards import Rated, Rates
+from sideslip.agents.training.rewards import RewardScale, RewardScaleWrapper
 from sideslip.agents.vec_env.env import make_vec_env
 
 VISION = "sideslip/YawVision-v0"
@@ -34,7 +34,7 @@ def within(wrapper: Any) -> Any:
 
 def test_a_controller_is_not_designed_on_changed_observations(tmp_path: Path) -> None:
     env, single = make_vec_env(VISION, 2, 0), DummyVecEnv([lambda: Monitor(gym.make(VISION))])
-    rated = Rated(env, Rates([[1.0, 1.0]]))
+    rated = RewardScaleWrapper(env, RewardScale([[1.0, 1.0]]))
     drawn = make_vec_env(VISION, 2, 0, env_kwargs={"render_mode": "rgb_array"})
     film = VecVideoRecorder(drawn, str(tmp_path), lambda _: False)
     rewards = VecNormalize(env, norm_obs=False)

@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sideslip.agents.vec_env.env import NOTHING, NativeVecEnv, make_vec_env
+from sideslip.agents.vec_env.env import EMPTY_INFO, NativeVecEnv, make_vec_env
 
 VISION, FUSION = "sideslip/YawVision-v0", "sideslip/AfsYawFusion-v0"
 SHORT: dict[str, Any] = {"base": "random-steering", "duration": 0.25}
@@ -78,7 +78,7 @@ def test_it_has_the_bits_of_the_single_environments(name: str, wish: Any, scenar
         assert [bits(each) for each in one[:3]] == [bits(each) for each in other[:3]]
         for i, done in enumerate(one[2]):
             if not done:
-                assert one[3][i] is NOTHING
+                assert one[3][i] is EMPTY_INFO
                 continue
             assert bits(one[3][i]) == bits(other[3][i])
             causes.add(one[3][i]["TimeLimit.truncated"])
@@ -172,7 +172,7 @@ def test_wrappers_are_known_by_the_single_ones_class() -> None:
 
 
 def test_the_empty_info_refuses_to_be_written_into() -> None:
-    info: Any = NOTHING
+    info: Any = EMPTY_INFO
     writes: tuple[Any, ...] = (
         lambda: info.__setitem__("episode", 1),
         lambda: info.update(episode=1),

@@ -12,16 +12,16 @@ import yaml
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
-from sideslip.agents.rollout import costs_of
+from sideslip.agents.rollout import evaluate_costs
 from sideslip.agents.training import keeper
-from sideslip.agents.training.keeper import evaluation_seeds
-from sideslip.agents.training.train import Means, Task, train
+from sideslip.agents.training.keeper import make_evaluation_seeds
+from sideslip.agents.training.train import RunOptions, TrainingTask, train
 from sideslip.agents.vec_env import zoo
 from tests.agents.vec_env.test_zoo import wrapper_of
 
 ENV = "sideslip/YawGps-v0"
 NAME = "sideslip-YawGps-v0"
-TASK = Task(
+TASK = TrainingTask(
     env_id=ENV,
     estimator="exact-kf",
     estimator_options={"outputs": ["beta"], "std": False},
@@ -36,10 +36,10 @@ TASK = Task(
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A training of two evaluations."""
     patch = pytest.MonkeyPatch()
-    patch.setattr(keeper, "_MEASURED", 8)
-    place = TASK.zoo_folder(tmp_path_factory.mktemp("logs"))
+    patch.setattr(keeper, "_SCALING_ENVS", 8)
+    place = TASK.find_zoo_folder(tmp_path_factory.mktemp("logs"))
     TASK.describe_for_zoo(place, 256, 128)
-    train(TASK, 128, place, means=Means(eval_freq=128))
+    train(TASK, 128, place, run_options=RunOptions(eval_freq=128))
     patch.undo()
     return place
 
@@ -55,11 +55,11 @@ def test_every_file_is_where_the_zoo_has_it(folder: Path) -> None:
 
 def test_the_next_number_is_one_above_the_largest(tmp_path: Path) -> None:
     """As `get_latest_run_id`: other ids' numbers and words count for nothing."""
-    assert zoo.next_folder(tmp_path, "sac", ENV) == tmp_path / "sac" / f"{NAME}_1"
+    assert zoo.find_next_folder(tmp_path, "sac", ENV) == tmp_path / "sac" / f"{NAME}_1"
     for name in (f"{NAME}_2", f"{NAME}_9", f"{NAME}_x", f"{NAME}_11_b", "other_40", f"a{NAME}_50"):
         (tmp_path / "sac" / name).mkdir(parents=True)
-    assert zoo.next_folder(tmp_path, "sac", ENV).name == f"{NAME}_10"
-    assert zoo.next_folder(tmp_path, "ppo", ENV).name == f"{NAME}_1"
+    assert zoo.find_next_folder(tmp_path, "sac", ENV).name == f"{NAME}_10"
+    assert zoo.find_next_folder(tmp_path, "ppo", ENV).name == f"{NAME}_1"
 
 
 def enjoyed(folder: Path, model: str) -> tuple[Any, Any]:
@@ -79,7 +79,7 @@ def enjoyed(folder: Path, model: str) -> tuple[Any, Any]:
 def test_what_enjoy_makes_of_it_drives_as_the_evaluation_did(folder: Path, model: str) -> None:
     """The network's scales are in the zip; the mixture's first scenario is driven."""
     env, loaded = enjoyed(folder, model)
-    seed = evaluation_seeds(1)[0]
+    seed = make_evaluation_seeds(1)[0]
     cost, done = 0.0, False
     env.seed(seed)
     obs = env.reset()
@@ -87,7 +87,9 @@ def test_what_enjoy_makes_of_it_drives_as_the_evaluation_did(folder: Path, model
         action, _ = loaded.predict(obs, deterministic=True)
         obs, rewards, dones, _ = env.step(action)
         cost, done = cost - float(rewards[0]), bool(dones[0])
-    assert cost == pytest.approx(costs_of(TASK.vector_env(4), loaded, evaluation_seeds(4))[0])
+    assert cost == pytest.approx(
+        evaluate_costs(TASK.vector_env(4), loaded, make_evaluation_seeds(4))[0]
+    )
     if model != "best_model.zip":
         with np.load(folder / zoo.EVALUATIONS) as found:
             assert cost == pytest.approx(-found["results"][-1, 0], rel=1e-4)
@@ -105,18 +107,18 @@ def test_evaluations_are_as_eval_callback_has_them_and_go_on(folder: Path) -> No
     short = round(3.0 / 0.01)  # the mixture's second
     assert (first["results"] < 0.0).all() and (first["ep_lengths"][:, 1] == short).all()
     assert (first["ep_lengths"][:, 0] > short).all()
-    train(TASK, 256, folder, resume=True, means=Means(eval_freq=128))
+    train(TASK, 256, folder, resume=True, run_options=RunOptions(eval_freq=128))
     assert found()["timesteps"].tolist() == [0, 128, 256]
     assert np.array_equal(found()["results"][:2], first["results"])
 
 
 def test_another_folder_gets_none_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(keeper, "_MEASURED", 8)
-    train(Task(num_envs=4, n_eval_envs=2), 64, tmp_path / "plain")
+    monkeypatch.setattr(keeper, "_SCALING_ENVS", 8)
+    train(TrainingTask(num_envs=4, n_eval_envs=2), 64, tmp_path / "plain")
     assert not list((tmp_path / "plain").glob("sideslip*"))
     assert not (tmp_path / "plain" / zoo.EVALUATIONS).exists()
 
 
 def test_an_algorithm_of_ours_alone_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="rl-baselines3-zoo has no gradient"):
-        Task(algo="gradient").zoo_folder(tmp_path)
+        TrainingTask(algo="gradient").find_zoo_folder(tmp_path)

@@ -7,11 +7,16 @@ from typing import Any
 import pytest
 
 from sideslip.benchmarks.control import calibration
-from sideslip.benchmarks.control.calibration import Entry, Episode, read_calibration, seeds_of
-from sideslip.benchmarks.control.contests import contests
+from sideslip.benchmarks.control.calibration import (
+    CalibrationRecord,
+    ClairvoyantEpisode,
+    derive_seeds,
+    read_calibration,
+)
+from sideslip.benchmarks.control.contests import list_scored_tasks
 from tests.benchmarks.conftest import Run
 
-FIRST = contests()[0]
+FIRST = list_scored_tasks()[0]
 
 
 @pytest.fixture(autouse=True)
@@ -21,8 +26,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(calibration, "FILE", tmp_path / "package" / "clairvoyant.json")
     (tmp_path / "package").mkdir()
 
-    def stand_in(case: Any) -> Episode:
-        return Episode(case.seed, 1.0, "from none", {"none": 2.0}, {"none": "ok"}, 0.0)
+    def stand_in(case: Any) -> ClairvoyantEpisode:
+        return ClairvoyantEpisode(case.seed, 1.0, "from none", {"none": 2.0}, {"none": "ok"}, 0.0)
 
     monkeypatch.setattr(calibration, "solve", stand_in)
     return tmp_path
@@ -47,7 +52,7 @@ def test_it_writes_beside_the_user(
     assert status == 0 and "wrote " in out
     assert files(here) == [written]
     (entry,) = read_calibration(here / written).values()
-    assert entry.contest == FIRST and [e.seed for e in entry.episodes] == seeds_of(FIRST, 2)
+    assert entry.task == FIRST and [e.seed for e in entry.episodes] == derive_seeds(FIRST, 2)
     assert entry.command.startswith("sideslip calibrate")
 
 
@@ -68,7 +73,8 @@ def test_a_mistake_is_one_line_and_writes_nothing(
 
 
 def test_the_matrix_refuses_a_stale_file_before_it_drives(run: Run, here: Path) -> None:
-    old = Entry(*(FIRST.tier, FIRST.env_id, FIRST.vehicle, FIRST.reference, FIRST.scenario),
+    old = CalibrationRecord(*(FIRST.tier, FIRST.env_id, FIRST.vehicle, FIRST.reference,
+                              FIRST.scenario),
                 "0.0.1", "by hand", ())  # fmt: skip
     (here / "old.json").write_text(json.dumps([vars(old)]))
     status, _, err = run("bench", "control", "--quick", "--clairvoyant", "old.json")

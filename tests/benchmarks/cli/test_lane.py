@@ -15,11 +15,11 @@ pytest.importorskip("cv2")
 import cv2
 
 from sideslip.envs.sensors.camera.pinhole import Pinhole
-from sideslip.envs.sensors.camera.road_image import Painter, Scene
+from sideslip.envs.sensors.camera.road_image import RoadRenderer, RoadScene
 from tests.benchmarks.conftest import Run
 
 CAMERA = Pinhole()
-PAINTER = Painter(CAMERA)
+PAINTER = RoadRenderer(CAMERA)
 WIDE = ("--lane-width", 3.5)
 
 
@@ -34,14 +34,14 @@ def filmed(path: Path, count: int) -> Path:
     code = cv2.VideoWriter.fourcc(*"MJPG")
     writer = cv2.VideoWriter(str(path), code, 30.0, CAMERA.size)
     for k in range(count):
-        picture = PAINTER.picture(Scene(psi=0.03, y=0.1 * k, s=float(k)), k)
+        picture = PAINTER.render_picture(RoadScene(psi=0.03, y=0.1 * k, s=float(k)), k)
         writer.write(cv2.cvtColor(picture * (k != 2), cv2.COLOR_GRAY2BGR))
     writer.release()
     return path
 
 
 def test_a_picture_is_read_drawn_and_written(run: Run, camera: Path, tmp_path: Path) -> None:
-    picture = PAINTER.picture(Scene(psi=0.05, y=-0.4))
+    picture = PAINTER.render_picture(RoadScene(psi=0.05, y=-0.4))
     cv2.imwrite(str(tmp_path / "road.png"), picture)
     out, numbers = tmp_path / "found.png", tmp_path / "found.json"
     status, text, _ = run(
@@ -65,10 +65,10 @@ def test_a_picture_is_read_drawn_and_written(run: Run, camera: Path, tmp_path: P
 
 def test_geometry_that_no_car_has_is_no_lane(run: Run, camera: Path, tmp_path: Path) -> None:
     for scene, said in (
-        (Scene(psi=0.08), "quality"), (Scene(psi=0.2), "no lane"),
-        (Scene(y=1.5), "quality"), (Scene(y=2.0), "no lane"),
+        (RoadScene(psi=0.08), "quality"), (RoadScene(psi=0.2), "no lane"),
+        (RoadScene(y=1.5), "quality"), (RoadScene(y=2.0), "no lane"),
     ):  # fmt: skip
-        cv2.imwrite(str(tmp_path / "road.png"), PAINTER.picture(scene))
+        cv2.imwrite(str(tmp_path / "road.png"), PAINTER.render_picture(scene))
         status, text, _ = run("lane", tmp_path / "road.png", "--intrinsics", camera, *WIDE)
         assert status == 0 and said in text
 
@@ -95,7 +95,7 @@ def test_what_cannot_be_read_is_one_line_and_nothing_is_written(
     run: Run, camera: Path, tmp_path: Path
 ) -> None:
     broken = tmp_path / "broken.png"
-    cv2.imwrite(str(broken), PAINTER.picture(Scene()))
+    cv2.imwrite(str(broken), PAINTER.render_picture(RoadScene()))
     whole = broken.read_bytes()
     small, no_film = tmp_path / "small.png", tmp_path / "none.mp4"
     cv2.imwrite(str(small), np.zeros((90, 160), np.uint8))
@@ -142,7 +142,7 @@ def test_a_small_file_with_a_huge_picture_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_number_of_400_digits_is_a_line(run: Run, tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "road.png"), PAINTER.picture(Scene()))
+    cv2.imwrite(str(tmp_path / "road.png"), PAINTER.render_picture(RoadScene()))
     path = tmp_path / "camera.json"
     K = f"[[1{400 * '0'}, 0, 1], [0, 1, 1], [0, 0, 1]]"
     path.write_text(f'{{"K": {K}, "dist": [0, 0, 0, 0, 0], "size": [1280, 720]}}')

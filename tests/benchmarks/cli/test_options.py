@@ -15,7 +15,7 @@ import typer
 
 from sideslip.agents.tuned import FILE as TUNED
 from sideslip.benchmarks.cli import main as cli
-from sideslip.benchmarks.control.seeds import tuning_seeds
+from sideslip.benchmarks.control.seeds import make_tuning_seeds
 
 CLI = "benchmarks.cli"
 DISTIL, TUNE = "distill mine --class coms-model", "tune controller lqr --class coms-model"
@@ -151,7 +151,7 @@ CASES = [
          ("--seed 4", "seed", 4)),
     *_of("tune controller lqr", "benchmarks.tuning.controllers.contestant",
          ("--class car-yaw", "kind", "car-yaw"),
-         ("--seeds 3", "seeds", tuning_seeds(3))),
+         ("--seeds 3", "seeds", make_tuning_seeds(3))),
     *_of(TUNE, "benchmarks.tuning.controllers.tune",
          ("--trials 5", "trials", 5),
          ("--storage a.db", "storage", "a.db"),

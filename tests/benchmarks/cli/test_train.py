@@ -14,9 +14,9 @@ pytest.importorskip("stable_baselines3")
 from sideslip.agents.training import keeper, train
 from sideslip.benchmarks import policies as enjoy
 from sideslip.benchmarks.cli import train as train_command
-from sideslip.benchmarks.cli.options import options_of
-from sideslip.benchmarks.cli.output import folder_of, words_of
-from sideslip.benchmarks.distillation import contests_of
+from sideslip.benchmarks.cli.options import parse_options
+from sideslip.benchmarks.cli.output import choose_folder, make_command
+from sideslip.benchmarks.distillation import list_tasks
 from tests.benchmarks.conftest import Run
 
 TINY = ("--num-envs", 8, "--option", "scenario=sine-with-dwell", "--n-eval-envs", 4)
@@ -25,7 +25,7 @@ TINY = ("--num-envs", 8, "--option", "scenario=sine-with-dwell", "--n-eval-envs"
 @pytest.fixture
 def run(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     """Call `sideslip train` in an empty folder; gives (exit status, stdout, stderr)."""
-    monkeypatch.setattr(keeper, "_MEASURED", 8)
+    monkeypatch.setattr(keeper, "_SCALING_ENVS", 8)
     monkeypatch.setattr(train_command, "EPISODES", 4)
     monkeypatch.chdir(tmp_path)
     return partial(run, "train")
@@ -50,8 +50,8 @@ def test_the_policys_card_says_how_it_was_made_and_what_it_costs(run: Run) -> No
 def test_it_goes_on_with_what_the_folder_holds(
     run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(enjoy, "evaluate", lambda *_: None)
-    monkeypatch.setattr(enjoy, "evaluation", lambda _: {"cost": {}})
+    monkeypatch.setattr(enjoy, "record_evaluation", lambda *_: None)
+    monkeypatch.setattr(enjoy, "summarise_evaluation", lambda _: {"cost": {}})
     folder = "train-YawVision-v0-ppo-sine-with-dwell-0"
     assert run(*TINY, "--steps", 256, "--eval-freq", 256)[0] == 0
     status, _, err = run("--resume", "--out", folder, "-n", 512, "-P")
@@ -59,10 +59,10 @@ def test_it_goes_on_with_what_the_folder_holds(
     assert len((tmp_path / folder / train.CURVE).read_text().splitlines()) == 3
     status, _, err = run("--resume", "--out", folder, "-n", 768, "--eval-freq", 512)
     assert status == 0, err
-    aim = train.aim_in(folder)
+    aim = train.read_run_record(folder)
     assert (aim.steps, aim.eval_freq) == (768, 512) and aim.command.count("sideslip train") == 3
     assert run("--resume", "--out", folder)[0] == 0  # nothing is left to do
-    assert train.aim_in(folder) == aim
+    assert train.read_run_record(folder) == aim
     status, _, err = run(*TINY, "--steps", 256)
     assert status == 2 and "holds a training already" in err
     settings = (tmp_path / "mine.yml", "sideslip/YawGps-v0:\n  n_envs: 8\n  policy: MlpPolicy\n")
@@ -131,28 +131,28 @@ def test_without_the_extra_the_command_names_it(
 
 def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
     told = {"outputs": ["beta", "F_d"], "options": {"fast": ["gyro", "accel_y"]}}
-    task = train.Task(estimator="exact-kf", estimator_options=told)
-    words = words_of(task, 10)
+    task = train.TrainingTask(estimator="exact-kf", estimator_options=told)
+    words = make_command(task, 10)
     found = [words[i + 1] for i, word in enumerate(words) if word == "--estimator-option"]
-    assert options_of(found) == told
+    assert parse_options(found) == told
     status, _, err = run("--estimator-option", found[0])
     assert status == 2 and "options of an estimator need an estimator" in err
 
 
 def test_the_folder_is_named_by_what_is_trained() -> None:
-    task = train.Task("sideslip/YawGps-v0", "ppo", "dakf", {"scenario": "gust"}, 7)
-    assert folder_of(task, "", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-7")
-    assert folder_of(task, "mine", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-mine-7")
-    assert folder_of(task, "", Path("here"), None) == Path("here")
-    zoos = folder_of(task, "", None, Path("logs"))
+    task = train.TrainingTask("sideslip/YawGps-v0", "ppo", "dakf", {"scenario": "gust"}, 7)
+    assert choose_folder(task, "", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-7")
+    assert choose_folder(task, "mine", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-mine-7")
+    assert choose_folder(task, "", Path("here"), None) == Path("here")
+    zoos = choose_folder(task, "", None, Path("logs"))
     assert zoos == Path("logs/ppo/sideslip-YawGps-v0_1")
 
 
 def test_a_log_folder_is_the_zoo_s_and_numbered(
     run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(enjoy, "evaluate", lambda *_: None)
-    monkeypatch.setattr(enjoy, "evaluation", lambda _: {"cost": {}})
+    monkeypatch.setattr(enjoy, "record_evaluation", lambda *_: None)
+    monkeypatch.setattr(enjoy, "summarise_evaluation", lambda _: {"cost": {}})
     for number in (1, 2):
         status, out, err = run(*TINY, "--steps", 64, "-f", "logs")
         assert status == 0, err
@@ -174,22 +174,22 @@ def test_a_log_folder_is_the_zoo_s_and_numbered(
 def test_it_goes_on_from_a_distilled_policy_in_all_contests_of_its_class(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(enjoy, "evaluate", lambda *_: None)
-    monkeypatch.setattr(enjoy, "evaluation", lambda _: {"cost": {}})
+    monkeypatch.setattr(enjoy, "record_evaluation", lambda *_: None)
+    monkeypatch.setattr(enjoy, "summarise_evaluation", lambda _: {"cost": {}})
     asked: list[Any] = []
 
     def judged(*about: Any) -> str:
         asked.append(about)
         return "judged"
 
-    monkeypatch.setattr(train_command, "judged", judged)
+    monkeypatch.setattr(train_command, "make_task_table", judged)
     small = ("--num-envs", 7, "--n-eval-envs", 7, "--steps", 448, "--out", "on")
     status, out, err = run("-i", "distill-coms-yaw", *small)
     assert status == 0, err
     assert "of its start's" in out and " 1.000" in out and "judged" in out
     assert asked == [(Path("on") / train.POLICY, "coms-zero-slip", 32)]
-    task = train.task_in("on")
-    known = [each.scenario for each in contests_of("coms-zero-slip")]
+    task = train.read_task("on")
+    known = [each.scenario for each in list_tasks("coms-zero-slip")]
     assert (task.scenarios, task.estimator) == (known, "joint")
     words = shlex.split(load_policy(f"on/{train.POLICY}").card.command)[2:]
     assert words[-2:] == ["--trained-agent", "distill-coms-yaw"]

@@ -10,11 +10,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents.rollout import FLOOR, costs_of
-from sideslip.benchmarks.control.contests import YAW, Contest
-from sideslip.benchmarks.control.seeds import salt_of, seeds_of_contests
+from sideslip.agents.rollout import COST_FLOOR, evaluate_costs
+from sideslip.benchmarks.control.contests import YAW, ControlTask
+from sideslip.benchmarks.control.seeds import make_salt, make_task_seeds
 
-CONTEST = Contest("1", YAW, "coms", "zero-slip", "coms-random")
+CONTEST = ControlTask("1", YAW, "coms", "zero-slip", "coms-random")
 PUBLIC = (0, 1, 2)
 KNOTS, TRIES, BEST, TURNS = 24, 96, 12, 12
 
@@ -67,7 +67,7 @@ def plan_for(seed: int, env: Any, steps: int) -> Any:
     for _ in range(TURNS):
         tries = np.clip(rng.normal(middle, spread, (TRIES, KNOTS)), -1.0, 1.0)
         tries[0] = middle
-        costs = costs_of(env, OpenLoop(tries, steps), [seed] * TRIES)
+        costs = evaluate_costs(env, OpenLoop(tries, steps), [seed] * TRIES)
         best = tries[np.argsort(costs)[:BEST]]
         middle, spread = best.mean(axis=0), best.std(axis=0) + 0.01
     return middle
@@ -75,8 +75,8 @@ def plan_for(seed: int, env: Any, steps: int) -> Any:
 
 def gained(env: Any, agent: Any, seeds: Any) -> Any:
     """(N,) paired log ratios of no control's cost to an agent's."""
-    none, own = (costs_of(env, each, seeds) for each in (None, agent))
-    return np.log((none + FLOOR) / (own + FLOOR))
+    none, own = (evaluate_costs(env, each, seeds) for each in (None, agent))
+    return np.log((none + COST_FLOOR) / (own + COST_FLOOR))
 
 
 @pytest.mark.long
@@ -87,6 +87,6 @@ def test_what_is_known_by_heart_is_worth_nothing_on_salted_seeds() -> None:
     first, _ = few.reset(seed=list(PUBLIC))
     cheater = Cheater(plans, steps, first)
     known = gained(few, cheater, PUBLIC)
-    salted = gained(env, cheater, seeds_of_contests(salt_of(), TRIES)(CONTEST))
+    salted = gained(env, cheater, make_task_seeds(make_salt(), TRIES)(CONTEST))
     assert known.min() > 1.0
     assert salted.mean() < 0.1

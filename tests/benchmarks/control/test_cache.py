@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.agents.learned.files import ENDING
+from sideslip.agents.learned.files import SUFFIX
 from sideslip.benchmarks.control import episodes, run
-from sideslip.benchmarks.control.cells import Cell
-from sideslip.benchmarks.control.contests import Contest
-from sideslip.benchmarks.control.episodes import Chunk, Driven
+from sideslip.benchmarks.control.cells import ControlEntry
+from sideslip.benchmarks.control.contests import ControlTask
+from sideslip.benchmarks.control.episodes import Chunk, DriveResult
 from sideslip.benchmarks.control.run import CachedDrive
 from sideslip.envs.backend import cache
 
@@ -74,13 +74,13 @@ def test_a_damaged_case_is_driven_again(
     numbers, series = rng.normal(size=(len(SEEDS), NUMBERS)), rng.normal(size=(9, SIGNALS))
     driven: list[Chunk] = []
 
-    def drive_it(chunk: Chunk) -> Driven:
+    def drive_it(chunk: Chunk) -> DriveResult:
         driven.append(chunk)
-        return Driven(numbers, 1.0, series)
+        return DriveResult(numbers, 1.0, series)
 
-    monkeypatch.setattr("sideslip.benchmarks.control.run.drive", drive_it)
+    monkeypatch.setattr("sideslip.benchmarks.control.run.run_chunk", drive_it)
     cached = CachedDrive(tmp_path)
-    chunk = Chunk(Cell(Contest(scenario="gust"), "", "none"), SEEDS, keep=True)
+    chunk = Chunk(ControlEntry(ControlTask(scenario="gust"), "", "none"), SEEDS, keep=True)
     cached(chunk)
     (path,) = tmp_path.iterdir()
     DAMAGE[damage](path)
@@ -98,14 +98,14 @@ def test_other_options_of_an_id_and_another_car_s_file_are_another_case(
     """A scratch package: an id's options stand at its root, cars and cameras in files."""
     monkeypatch.setattr(cache, "_PACKAGE", tmp_path)
     (tmp_path / "__init__.py").write_text("a")
-    seen = [cache.experiment_stamp()]
+    seen = [cache.hash_experiment()]
     for path in ("__init__.py", "envs/vehicle/car.toml", "envs/camera.json", "envs/tick.py"):
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_text("b")
-        seen.append(cache.experiment_stamp())
+        seen.append(cache.hash_experiment())
     assert len(set(seen)) == 5
     (tmp_path / "envs/notes.txt").write_text("b")
-    assert cache.experiment_stamp() == seen[-1]
+    assert cache.hash_experiment() == seen[-1]
 
 
 def test_other_tuned_options_are_another_case(
@@ -113,21 +113,25 @@ def test_other_tuned_options_are_another_case(
 ) -> None:
     """The salt follows them, and a case's name the salt: a tuning makes old cases nobody's."""
     drive = CachedDrive(tmp_path)
-    chunk = Chunk(Cell(Contest(scenario="gust"), "", "nominal"), SEEDS)
+    chunk = Chunk(ControlEntry(ControlTask(scenario="gust"), "", "nominal"), SEEDS)
     names = []
     for salt in ("one", "another", "one"):
-        monkeypatch.setattr(run, "salt_of", lambda salt=salt: salt)
-        run.sources.cache_clear()
-        names.append(drive._path(chunk).name)
-    run.sources.cache_clear()
+        monkeypatch.setattr(run, "make_salt", lambda salt=salt: salt)
+        run.hash_sources.cache_clear()
+        names.append(drive._make_path(chunk).name)
+    run.hash_sources.cache_clear()
     assert names[0] == names[2] != names[1]
 
 
 def test_another_policy_in_the_same_file_is_another_case(tmp_path: Path) -> None:
     """A policy that is trained further keeps its path, not its episodes."""
-    file, drive = tmp_path / f"mine{ENDING}", CachedDrive(tmp_path / "cases")
+    file, drive = tmp_path / f"mine{SUFFIX}", CachedDrive(tmp_path / "cases")
     names = []
     for weights in (b"one", b"another", b"one"):
         file.write_bytes(weights)
-        names.append(drive._path(Chunk(Cell(Contest(scenario="gust"), "", str(file)), SEEDS)).name)
+        names.append(
+            drive._make_path(
+                Chunk(ControlEntry(ControlTask(scenario="gust"), "", str(file)), SEEDS)
+            ).name
+        )
     assert names[0] == names[2] != names[1]

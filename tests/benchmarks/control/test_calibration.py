@@ -13,25 +13,25 @@ pytest.importorskip("casadi")
 pytest.importorskip("osqp")
 from sideslip.agents import rungs
 from sideslip.agents.clairvoyant import plan as clairvoyant
-from sideslip.agents.clairvoyant.plan import Ceiling
+from sideslip.agents.clairvoyant.plan import ClairvoyantResult
 from sideslip.benchmarks.control import calibration
 from sideslip.benchmarks.control.calibration import (
     calibrate,
-    cases_of,
-    check_fresh,
-    driven_there,
-    forget,
-    leads,
+    check_current,
+    compute_regrets,
+    derive_seeds,
+    make_cases,
+    measure_calibrated,
     read_calibration,
-    seeds_of,
+    remove_cases,
     update,
 )
-from sideslip.benchmarks.control.cells import Cell
-from sideslip.benchmarks.control.contests import NOMINAL, STATE, YAW, Contest
+from sideslip.benchmarks.control.cells import ControlEntry
+from sideslip.benchmarks.control.contests import NOMINAL, STATE, YAW, ControlTask
 from sideslip.benchmarks.control.run import measure
 
-GUST = Contest("1", YAW, "coms", "zero-slip", "gust")
-SINE = Contest("1", YAW, "coms", "zero-slip", "sine")
+GUST = ControlTask("1", YAW, "coms", "zero-slip", "gust")
+SINE = ControlTask("1", YAW, "coms", "zero-slip", "sine")
 
 
 @pytest.fixture
@@ -39,39 +39,41 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The seeds that a ceiling was sought for; its cost is the seed's last digit."""
     seeds: list[int] = []
 
-    def stand_in(env: Any, seed: int, starts: Any) -> Ceiling:
+    def stand_in(env: Any, seed: int, starts: Any) -> ClairvoyantResult:
         assert set(starts) == {NOMINAL, STATE}
         seeds.append(seed)
         cost = float(seed % 10)
         costs = {"none": 20.0, "from none": cost}
-        return Ceiling(np.zeros((1, 1), np.float32), cost, "from none", costs, {"none": "ok"}, 0.0)
+        return ClairvoyantResult(
+            np.zeros((1, 1), np.float32), cost, "from none", costs, {"none": "ok"}, 0.0
+        )
 
-    monkeypatch.setattr(clairvoyant, "ceiling", stand_in)
-    monkeypatch.setattr(clairvoyant, "actions_of", lambda *_: np.zeros((1, 1)))
-    monkeypatch.setattr(rungs, "make_rung", lambda *_, **__: (None, None))
+    monkeypatch.setattr(clairvoyant, "compute_clairvoyant", stand_in)
+    monkeypatch.setattr(clairvoyant, "record_actions", lambda *_: np.zeros((1, 1)))
+    monkeypatch.setattr(rungs, "make_oracle", lambda *_, **__: (None, None))
     return seeds
 
 
 def test_seeds_are_its_own_and_follow_the_version(monkeypatch: pytest.MonkeyPatch) -> None:
-    few, many = seeds_of(GUST, 4), seeds_of(GUST)
+    few, many = derive_seeds(GUST, 4), derive_seeds(GUST)
     assert many[:4] == few and len(set(many)) == 64
     assert min(many) > 10**6
-    assert not set(many) & set(seeds_of(SINE))
+    assert not set(many) & set(derive_seeds(SINE))
     monkeypatch.setattr(calibration, "__version__", "9.9.9")
-    assert not set(many) & set(seeds_of(GUST))
+    assert not set(many) & set(derive_seeds(GUST))
 
 
 def test_a_stopped_run_goes_on(asked: list[int], tmp_path: Path) -> None:
     folder = tmp_path / "cases"
     calibrate([GUST], folder, seeds=3, jobs=1)
     (entry,) = calibrate([GUST], folder, seeds=5, jobs=1)
-    assert asked == seeds_of(GUST, 5)  # each once
+    assert asked == derive_seeds(GUST, 5)  # each once
     assert entry.costs.tolist() == [seed % 10 for seed in asked]
     calibrate([SINE], folder, seeds=3, jobs=1)
     assert len(asked) == 8  # another question
-    forget(cases_of([GUST], folder, 5))
+    remove_cases(make_cases([GUST], folder, 5))
     assert len(list(folder.iterdir())) == 3  # the other question's
-    forget(cases_of([SINE], folder, 3))
+    remove_cases(make_cases([SINE], folder, 3))
     assert not folder.exists()
 
 
@@ -121,25 +123,29 @@ def test_where_the_plant_has_changed_the_file_is_stale(asked: list[int], tmp_pat
     """Whatever its version: the uncontrolled car no longer costs what it did."""
     (entry,) = calibrate([GUST], tmp_path / "cases", seeds=2, jobs=1)
     with pytest.raises(ValueError, match="file: gust, yaw is stale: the uncontrolled car costs"):
-        check_fresh({GUST: entry}, "file")
-    none = measure([Cell(GUST, "", "none")], seeds_of(GUST, 2), jobs=1).of(GUST, "none").costs
+        check_current({GUST: entry}, "file")
+    none = (
+        measure([ControlEntry(GUST, "", "none")], derive_seeds(GUST, 2), jobs=1)
+        .select(GUST, "none")
+        .costs
+    )
     episodes = tuple(
         dataclasses.replace(episode, costs={"none": cost})
         for episode, cost in zip(entry.episodes, none.tolist(), strict=True)
     )
-    check_fresh({GUST: dataclasses.replace(entry, episodes=episodes)}, "file")
+    check_current({GUST: dataclasses.replace(entry, episodes=episodes)}, "file")
 
 
 def test_everybody_is_paired_with_the_clairvoyant_on_its_seeds(
     asked: list[int], tmp_path: Path
 ) -> None:
     (entry,) = calibrate([GUST], tmp_path / "cases", seeds=4, jobs=1)
-    none = Cell(GUST, "", "none")
-    there = driven_there({GUST: entry}, [none, Cell(SINE, "", "none")], jobs=1)
-    assert list(there.found) == [none]
-    costs = measure([none], seeds_of(GUST, 4), jobs=1).of(GUST, "none").costs
+    none = ControlEntry(GUST, "", "none")
+    there = measure_calibrated({GUST: entry}, [none, ControlEntry(SINE, "", "none")], jobs=1)
+    assert list(there.outcomes) == [none]
+    costs = measure([none], derive_seeds(GUST, 4), jobs=1).select(GUST, "none").costs
     expected = np.clip(np.log((costs + 0.001) / (entry.costs + 0.001)), -3.0, 3.0)
-    assert leads({GUST: entry}, there)[none] == pytest.approx(expected)
+    assert compute_regrets({GUST: entry}, there)[none] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

@@ -8,57 +8,59 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.control import contests as module
-from sideslip.benchmarks.control.cells import Cell
-from sideslip.benchmarks.control.choice import judged, rungs_of
+from sideslip.benchmarks.control.cells import ControlEntry
+from sideslip.benchmarks.control.choice import make_oracle_entries, measure_task
 from sideslip.benchmarks.control.contests import (
     NOMINAL,
     ORACLES,
     PARAMETERS,
     STATE,
     TIERS,
-    Contest,
-    Measured,
-    candidates,
-    contests,
-    read_contests,
-    write_contests,
+    ControlTask,
+    TaskMeasurement,
+    list_candidates,
+    list_scored_tasks,
+    read_tasks,
+    write_tasks,
 )
-from sideslip.benchmarks.control.episodes import NUMBERS, Driven
+from sideslip.benchmarks.control.episodes import NUMBERS, DriveResult
 from sideslip.benchmarks.control.run import Results, measure
-from sideslip.benchmarks.control.scores import Yardstick
-from sideslip.benchmarks.control.seeds import salted_seeds
+from sideslip.benchmarks.control.scores import ScoreScale
+from sideslip.benchmarks.control.seeds import make_salted_seeds
 from sideslip.benchmarks.harness.stats import average
 from sideslip.envs import FAILURES, SCENARIOS
 
-ONE = candidates()[0]
+ONE = list_candidates()[0]
 STATES = ORACLES[STATE]
-LIMIT = next(contest for contest in candidates() if contest.tier == "2c")
+LIMIT = next(contest for contest in list_candidates() if contest.tier == "2c")
 
 
-def driven(costs: np.ndarray, failed: int = 0, error: str = "") -> Driven:
+def driven(costs: np.ndarray, failed: int = 0, error: str = "") -> DriveResult:
     numbers = np.ones((len(costs), len(NUMBERS)))
     numbers[:, NUMBERS.index("cost")] = costs
     code = np.where(np.arange(len(costs)) < failed, FAILURES.index("spin"), 0)
     numbers[:, NUMBERS.index("failure")] = code
-    return Driven(numbers, 1.0, error=error)
+    return DriveResult(numbers, 1.0, error=error)
 
 
-def found(contest: Contest, levels: dict[str, float], **failed: int) -> Measured:
+def found(contest: ControlTask, levels: dict[str, float], **failed: int) -> TaskMeasurement:
     """What is made of nominal's and both oracles' costs on 40 seeds."""
     seeds = np.random.default_rng(0).lognormal(0.0, 1.0, 40) + 1.0
     made = {
-        Cell(contest, "", name): driven(level * seeds, failed.get(name.replace("-", "_"), 0))
+        ControlEntry(contest, "", name): driven(
+            level * seeds, failed.get(name.replace("-", "_"), 0)
+        )
         for name, level in levels.items()
     }
-    for cell in rungs_of(contest):
+    for cell in make_oracle_entries(contest):
         made.setdefault(cell, driven(np.full(40, np.nan), error="no plant"))
-    return judged(Results(made), contest)
+    return measure_task(Results(made), contest)
 
 
 def test_every_tier_asks_its_question_in_five_manoeuvres_or_more() -> None:
     for tier in ("1", "2a", "2b"):
-        assert len({each.scenario for each in contests() if each.tier == tier}) >= 5
-    assert len([each for each in contests() if each.tier == "2c"]) >= 5
+        assert len({each.scenario for each in list_scored_tasks() if each.tier == tier}) >= 5
+    assert len([each for each in list_scored_tasks() if each.tier == "2c"]) >= 5
 
 
 def test_a_contest_is_scored_where_the_rungs_lie_apart() -> None:
@@ -91,7 +93,7 @@ def test_a_rung_that_cannot_be_computed_leaves_the_other_or_the_reason() -> None
 
 
 @pytest.mark.parametrize("contest", [ONE, LIMIT])
-def test_where_every_car_fails_nothing_is_scored(contest: Contest) -> None:
+def test_where_every_car_fails_nothing_is_scored(contest: ControlTask) -> None:
     lost = found(contest, {NOMINAL: 2.0, STATES[0]: 1.0}, nominal=40)
     assert lost.verdict != "scored" and lost.judged == 0 and lost.failing == 1.0
 
@@ -101,8 +103,8 @@ def test_the_file_holds_every_number_and_is_refused_where_it_is_another_versions
 ) -> None:
     path = tmp_path / "contests.json"
     entry = found(ONE, {NOMINAL: 2.0, STATES[0]: 1.0})
-    write_contests([entry], path)
-    assert read_contests(path) == (entry,)
+    write_tasks([entry], path)
+    assert read_tasks(path) == (entry,)
     for change, message in (
         ({"env_version": "0.0.1"}, "measured with version 0.0.1, this is"),
         ({"scenario": "moon"}, "is no contest of this version"),
@@ -113,28 +115,28 @@ def test_the_file_holds_every_number_and_is_refused_where_it_is_another_versions
     ):
         path.write_text(json.dumps([dataclasses.asdict(entry) | change]))
         with pytest.raises(ValueError, match=message) as caught:
-            read_contests(path)
+            read_tasks(path)
         assert str(path) in str(caught.value)
     path.write_text("[")
     with pytest.raises(ValueError, match="cut short"):
-        read_contests(path)
+        read_tasks(path)
 
 
 def test_every_tier_has_its_contests_and_they_can_be_built() -> None:
-    assert {contest.tier for contest in candidates()} == set(TIERS)
-    assert len({contest.name for contest in candidates()}) == len(candidates())
-    assert {each.contest for each in read_contests()} == set(candidates())
-    for contest in contests():
+    assert {contest.tier for contest in list_candidates()} == set(TIERS)
+    assert len({contest.name for contest in list_candidates()}) == len(list_candidates())
+    assert {each.task for each in read_tasks()} == set(list_candidates())
+    for contest in list_scored_tasks():
         assert SCENARIOS[contest.scenario].tier == contest.tier
         assert (contest.env_id, contest.vehicle, contest.reference) in TIERS[contest.tier]
 
 
-SCORED = contests() if module.FILE.is_file() else ()
+SCORED = list_scored_tasks() if module.FILE.is_file() else ()
 ENDS = {contest.tier: contest for contest in SCORED[::-1] if contest.tier in ("1", "2c")}
 
 
 @pytest.mark.parametrize("contest", ENDS.values(), ids=ENDS)
-def test_the_ladder_falls_in_a_sample(contest: Contest) -> None:
+def test_the_ladder_falls_in_a_sample(contest: ControlTask) -> None:
     """Nominal costs more than oracle-state, paired, in a contest of the mildest and one of the
     hardest tier."""
     falls(contest, 24)
@@ -142,16 +144,16 @@ def test_the_ladder_falls_in_a_sample(contest: Contest) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("contest", SCORED, ids=[contest.name for contest in SCORED])
-def test_the_ladder_falls_in_every_scored_contest(contest: Contest) -> None:
+def test_the_ladder_falls_in_every_scored_contest(contest: ControlTask) -> None:
     falls(contest, 64)
 
 
-def falls(contest: Contest, episodes: int) -> None:
+def falls(contest: ControlTask, episodes: int) -> None:
     """On seeds the contests were not chosen on, the same in every version: with the salt's, one
     version in a hundred failed by chance."""
-    cells = [Cell(contest, "", rung) for rung in (NOMINAL, STATE)]
-    there = measure(cells, salted_seeds("0", episodes), jobs=1)
-    assert not any(each.error for each in there.found.values())
-    yard = Yardstick(there.of(contest, NOMINAL), there.of(contest, STATE))
-    gap = average(yard.paired(yard.oracle)[1])
+    cells = [ControlEntry(contest, "", rung) for rung in (NOMINAL, STATE)]
+    there = measure(cells, make_salted_seeds("0", episodes), jobs=1)
+    assert not any(each.error for each in there.outcomes.values())
+    yard = ScoreScale(there.select(contest, NOMINAL), there.select(contest, STATE))
+    gap = average(yard.compute_paired_ratios(yard.oracle)[1])
     assert gap.low > 0.0, (contest.name, gap)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from sideslip.agents import Controller
-from sideslip.benchmarks.control.build import decision_time
-from sideslip.benchmarks.control.cells import Cell
-from sideslip.benchmarks.control.contests import Contest
-from sideslip.benchmarks.control.ladder import yardsticks
+from sideslip.benchmarks.control.build import measure_decision_time
+from sideslip.benchmarks.control.cells import ControlEntry
+from sideslip.benchmarks.control.contests import ControlTask
+from sideslip.benchmarks.control.ladder import make_score_scales
 from sideslip.benchmarks.control.run import measure
-from sideslip.benchmarks.control.tables import rows_of, standings
+from sideslip.benchmarks.control.tables import make_rows, rank_entries
 
 MINE: dict[str, Any] = {
     "name": "my bend",
@@ -32,11 +32,11 @@ class Damper(Controller):
         action[:, 0] = 20.0 * inputs[:, 0]
 
 
-BEND = Contest(scenario=MINE["name"])
+BEND = ControlTask(scenario=MINE["name"])
 
 
-def cell(controller: str, estimator: str = "") -> Cell:
-    return Cell(BEND, estimator, controller, {"scenario": MINE})
+def cell(controller: str, estimator: str = "") -> ControlEntry:
+    return ControlEntry(BEND, estimator, controller, {"scenario": MINE})
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -44,14 +44,14 @@ def test_a_users_controller_on_a_users_scenario_stands_in_the_tables(jobs: int) 
     mine = cell(f"{__name__}:Damper", "bicycle-kf")
     asked = [mine, *(cell(who) for who in ("none", "nominal", "oracle-state"))]
     found = measure(asked, range(6), jobs=jobs)
-    assert not any(driven.error for driven in found.found.values())
-    ours, none = found.found[mine], found.found[cell("none")]
+    assert not any(driven.error for driven in found.outcomes.values())
+    ours, none = found.outcomes[mine], found.outcomes[cell("none")]
     assert np.median(ours["rms_slip"] / none["rms_slip"]) < 0.95  # it does what it is for
-    table = standings(found.found, "", yardsticks(found, [BEND]))
-    standing = {each.cell.controller: each for each in table}[mine.controller]
-    rows = rows_of(standing, "ab")
+    table = rank_entries(found.outcomes, "", make_score_scales(found, [BEND]))
+    standing = {each.entry.controller: each for each in table}[mine.controller]
+    rows = make_rows(standing, "ab")
     assert {row.scenario for row in rows} == {"my bend, yaw", "tier "}
     assert {row.metric for row in rows} >= {"score", "cost_vs_nominal", "share_won"}
     assert {row.controller for row in rows} == {mine.controller}
     assert all("my bend" in row.spec for row in rows if row.scenario == BEND.name)
-    assert decision_time(mine) > 0.0
+    assert measure_decision_time(mine) > 0.0

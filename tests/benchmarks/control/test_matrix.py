@@ -12,24 +12,30 @@ from sideslip.agents.rollout import rollout
 from sideslip.benchmarks.control import build
 from sideslip.benchmarks.control import episodes as drive
 from sideslip.benchmarks.control import suite as control
-from sideslip.benchmarks.control.cells import LEARNED, REFERENCE_FILTER, RUNGS, Cell, cells
+from sideslip.benchmarks.control.cells import (
+    LEARNED,
+    ORACLE_NAMES,
+    REFERENCE_FILTER,
+    ControlEntry,
+    make_entries,
+)
 from sideslip.benchmarks.control.contests import (
     PARAMETERS,
     STATE,
     YAW,
-    Contest,
-    contests,
-    oracle_of,
+    ControlTask,
+    find_oracle,
+    list_scored_tasks,
 )
 from sideslip.benchmarks.control.episodes import Chunk
 from sideslip.benchmarks.control.run import CachedDrive, measure
-from sideslip.benchmarks.control.seeds import salt_of
+from sideslip.benchmarks.control.seeds import make_salt
 from sideslip.envs import COMS, FAILURES, SCENARIOS
-from sideslip.envs.scenarios.manoeuvres import scenario_from
+from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.estimators import EstimateObservation
 
 SEEDS = (3, 4, 2**32 - 1)
-GUST, DWELL = (Contest(scenario=name) for name in ("gust", "sine-with-dwell"))
+GUST, DWELL = (ControlTask(scenario=name) for name in ("gust", "sine-with-dwell"))
 PAIRS = (
     ("", "none"),
     ("multirate-residual-kf", "two-dof"),
@@ -40,18 +46,18 @@ PAIRS = (
 
 def test_a_correction_gives_controllers_what_its_filter_gives() -> None:
     for name, base in (("exact-kf", "exact-kf"), ("joint", "joint, friction")):
-        assert build.outputs_for(f"learned-{name}") == build.outputs_for(base)
-    assert build.outputs_for("joint")[-2:] == ("front_tyres", "rear_tyres")
+        assert build.list_outputs(f"learned-{name}") == build.list_outputs(base)
+    assert build.list_outputs("joint")[-2:] == ("front_tyres", "rear_tyres")
 
 
 @pytest.mark.parametrize(("estimator", "controller"), PAIRS)
 def test_a_cell_is_its_single_episodes(estimator: str, controller: str) -> None:
-    cell = Cell(DWELL, estimator, controller, tuned={"filter": {}, "controller": {}})
-    driven = drive.drive(Chunk(cell, SEEDS, keep=True))
+    cell = ControlEntry(DWELL, estimator, controller, tuned={"filter": {}, "controller": {}})
+    driven = drive.run_chunk(Chunk(cell, SEEDS, keep=True))
     assert driven.error == ""
-    env: gym.Env[Any, Any] = gym.make(YAW, scenario=cell.contest.scenario)
+    env: gym.Env[Any, Any] = gym.make(YAW, scenario=cell.task.scenario)
     if estimator:
-        outputs = build.outputs_for(estimator)
+        outputs = build.list_outputs(estimator)
         env = EstimateObservation(env, estimator, outputs=outputs, std=False)
     agent = make_agent(controller, env)
     for i, seed in enumerate(SEEDS):
@@ -72,27 +78,27 @@ def test_a_cell_is_its_single_episodes(estimator: str, controller: str) -> None:
 
 
 def test_every_contest_has_its_rungs_and_no_cell_stands_twice() -> None:
-    all_ = list(cells(contests()))
+    all_ = list(make_entries(list_scored_tasks()))
     assert len(set(all_)) == len(all_)
-    for contest in contests():
-        mine = [cell for cell in all_ if cell.contest == contest]
-        assert {cell.controller for cell in mine} >= {*RUNGS, "none", "lqr"}
+    for contest in list_scored_tasks():
+        mine = [cell for cell in all_ if cell.task == contest]
+        assert {cell.controller for cell in mine} >= {*ORACLE_NAMES, "none", "lqr"}
         assert sum(cell.estimator == REFERENCE_FILTER for cell in mine) >= 4
         assert {(cell.estimator, cell.controller) for cell in mine} >= {
             *LEARNED.get(contest.kind, ())
         }
-    fast = list(cells(contests(), quick=True))
-    assert set(fast) < set(all_) and not any(cell.slow and not cell.rung for cell in fast)
+    fast = list(make_entries(list_scored_tasks(), quick=True))
+    assert set(fast) < set(all_) and not any(cell.slow and not cell.oracle for cell in fast)
 
 
 @pytest.mark.parametrize("estimator", [REFERENCE_FILTER, "joint"])
 def test_a_filter_drives_a_car_that_does_not_roll(estimator: str) -> None:
     """Its levels are the scenario's, which has no accelerometer then."""
-    contest = Contest(scenario="tie-vision-fig8")
-    assert not scenario_from("tie-vision-fig8").roll
-    options = build.estimate_options(Cell(contest, estimator, "lqr"))["options"]
+    contest = ControlTask(scenario="tie-vision-fig8")
+    assert not make_scenario("tie-vision-fig8").roll
+    options = build.make_estimate_options(ControlEntry(contest, estimator, "lqr"))["options"]
     assert "fast" not in options and "accel_y_noise" not in options
-    driven = drive.drive(Chunk(Cell(contest, estimator, "lqr"), (1,)))
+    driven = drive.run_chunk(Chunk(ControlEntry(contest, estimator, "lqr"), (1,)))
     assert not driven.error and np.isfinite(driven.costs).all()
 
 
@@ -104,19 +110,20 @@ def test_who_is_not_tuned_takes_over_what_means_the_same(monkeypatch: pytest.Mon
     }
     nothing: dict[str, Any] = {"filter": {}, "controller": {}}
     monkeypatch.setattr(
-        "sideslip.benchmarks.control.cells.tuned", lambda _, name: found.get(name, nothing)
+        "sideslip.benchmarks.control.cells.get_tuned_options",
+        lambda _, name: found.get(name, nothing),
     )
-    one = {oracle_of(each, PARAMETERS)[-4:]: each for each in contests()}
+    one = {find_oracle(each, PARAMETERS)[-4:]: each for each in list_scored_tasks()}
     contest = one["nmpc"]
-    assert Cell(contest, "joint, friction", "adaptive-nmpc").best == found["adaptive-nmpc"]
-    assert Cell(one["-lqr"], "", PARAMETERS).best == found["adaptive-lqr"]
-    parameters, state = (Cell(contest, "", each).best for each in (PARAMETERS, STATE))
+    assert ControlEntry(contest, "joint, friction", "adaptive-nmpc").best == found["adaptive-nmpc"]
+    assert ControlEntry(one["-lqr"], "", PARAMETERS).best == found["adaptive-lqr"]
+    parameters, state = (ControlEntry(contest, "", each).best for each in (PARAMETERS, STATE))
     assert parameters == {"filter": {}, "controller": {"grip": 0.6, "horizon": 0.3}}
     assert state == {"filter": {}, "controller": {"horizon": 0.3}}
 
 
 def test_truth_is_told_without_error() -> None:
-    env, _ = build.make_cars(Cell(GUST, "truth", "two-dof"), 2)
+    env, _ = build.make_cars(ControlEntry(GUST, "truth", "two-dof"), 2)
     obs, infos = env.reset(seed=[1, 2])  # type: ignore[arg-type]
     names = [entry.name for entry in env.layout]  # type: ignore[attr-defined]
     for _ in range(30):
@@ -161,8 +168,11 @@ def test_the_moment_rate_is_what_the_motors_delivered_and_the_step_what_was_aske
     """From limit to limit five times a second: ten times the limit, in N m/s, whatever the lag."""
     scenario = {"base": "straight", "duration": 4.0, "speed": 8.0}
     broken(monkeypatch, SquareWave())
-    driven = drive.drive(
-        Chunk(Cell(Contest(scenario="straight"), "", "none", {"scenario": scenario}), SEEDS)
+    driven = drive.run_chunk(
+        Chunk(
+            ControlEntry(ControlTask(scenario="straight"), "", "none", {"scenario": scenario}),
+            SEEDS,
+        )
     )
     limit = COMS.yaw_moment_limit
     assert driven["moment_rate"] == pytest.approx(np.full(3, 2.0 * limit / 0.2), rel=0.05)
@@ -171,10 +181,10 @@ def test_the_moment_rate_is_what_the_motors_delivered_and_the_step_what_was_aske
 
 
 def test_nan_ends_its_car_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    cell = Cell(GUST, "", "none")
-    whole = drive.drive(Chunk(cell, SEEDS))
+    cell = ControlEntry(GUST, "", "none")
+    whole = drive.run_chunk(Chunk(cell, SEEDS))
     broken(monkeypatch, Broken())
-    driven = drive.drive(Chunk(cell, SEEDS))
+    driven = drive.run_chunk(Chunk(cell, SEEDS))
     assert FAILURES[int(driven["failure"][0])] == "bad-action"
     assert driven["cost"][0] > 90.0 * (SCENARIOS["gust"].duration - 0.1)
     assert np.array_equal(driven.numbers[1:], whole.numbers[1:])
@@ -182,44 +192,44 @@ def test_nan_ends_its_car_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_actions_of_the_wrong_shape_are_failures_too(monkeypatch: pytest.MonkeyPatch) -> None:
     broken(monkeypatch, Broken("wrong"))
-    driven = drive.drive(Chunk(Cell(GUST, "", "none"), SEEDS))
+    driven = drive.run_chunk(Chunk(ControlEntry(GUST, "", "none"), SEEDS))
     assert driven.error == ""
     assert {FAILURES[int(code)] for code in driven["failure"]} == {"bad-action"}
 
 
 def test_a_cell_that_cannot_be_built_says_why_and_the_rest_goes_on() -> None:
-    asked = [Cell(GUST, "", "none"), Cell(GUST, "nobody-kf", "two-dof")]
+    asked = [ControlEntry(GUST, "", "none"), ControlEntry(GUST, "nobody-kf", "two-dof")]
     found = measure(asked, range(4), jobs=1)
-    assert np.isfinite(found.of(GUST, "none").costs).all()
-    assert "nobody-kf" in found.of(GUST, "two-dof", "nobody-kf").error
+    assert np.isfinite(found.select(GUST, "none").costs).all()
+    assert "nobody-kf" in found.select(GUST, "two-dof", "nobody-kf").error
 
 
 def test_standing_car_and_diverging_plant_end_finite() -> None:
     still = {"base": "gust", "speed": 0.0}
     thrown = {"base": "random-steering", "speed": 60.0, "amplitude": 0.5}
     for scenario, name in ((still, "none"), (thrown, "spin")):
-        cell = Cell(GUST, "exact-kf", "lqr", {"scenario": scenario})
-        driven = drive.drive(Chunk(cell, SEEDS))
+        cell = ControlEntry(GUST, "exact-kf", "lqr", {"scenario": scenario})
+        driven = drive.run_chunk(Chunk(cell, SEEDS))
         assert driven.error == "" and np.isfinite(driven.numbers).all()
         assert FAILURES[int(driven["failure"][0])] == name
 
 
 def test_a_stopped_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    chunk = Chunk(Cell(GUST, "", "none"), SEEDS, keep=True)
+    chunk = Chunk(ControlEntry(GUST, "", "none"), SEEDS, keep=True)
     cached = CachedDrive(tmp_path)
     first = cached(chunk)
-    monkeypatch.setattr("sideslip.benchmarks.control.run.drive", None)
+    monkeypatch.setattr("sideslip.benchmarks.control.run.run_chunk", None)
     again = cached(chunk)
     assert np.array_equal(first.numbers, again.numbers)
     assert first.series is not None and again.series is not None
     assert np.array_equal(first.series, again.series)
     with pytest.raises(TypeError):  # another chunk is driven
-        cached(Chunk(chunk.cell, SEEDS[:2], keep=True))
-    monkeypatch.setattr("sideslip.benchmarks.control.run.sources", lambda: "edited")
+        cached(Chunk(chunk.entry, SEEDS[:2], keep=True))
+    monkeypatch.setattr("sideslip.benchmarks.control.run.hash_sources", lambda: "edited")
     with pytest.raises(TypeError):  # other sources: driven again
         cached(chunk)
     monkeypatch.undo()
-    monkeypatch.setattr("sideslip.benchmarks.control.run.drive", None)
+    monkeypatch.setattr("sideslip.benchmarks.control.run.run_chunk", None)
     (found,) = tmp_path.iterdir()
     found.write_bytes(found.read_bytes()[:100])  # cut short by a kill or a full disk
     with pytest.raises(TypeError):
@@ -228,19 +238,23 @@ def test_a_stopped_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tables, rows, figures, menus, tracks; a contestant that cannot drive leaves the rest."""
-    few = [Contest(tier, YAW, "coms", "zero-slip", f"coms-{name}")
+    few = [ControlTask(tier, YAW, "coms", "zero-slip", f"coms-{name}")
            for tier, name in (("", "step"), ("2a", "random"))]  # fmt: skip
-    some = [Cell(c, "", rung) for c in few for rung in (*RUNGS, "none")]
-    some += [Cell(c, name, "lqr") for c in few for name in ("exact-kf", "bicycle-kf", "nobody-kf")]
-    monkeypatch.setattr(control, "contests", lambda: few)
-    monkeypatch.setattr(control, "cells", lambda *_: some)
+    some = [ControlEntry(c, "", rung) for c in few for rung in (*ORACLE_NAMES, "none")]
+    some += [
+        ControlEntry(c, name, "lqr")
+        for c in few
+        for name in ("exact-kf", "bicycle-kf", "nobody-kf")
+    ]
+    monkeypatch.setattr(control, "list_scored_tasks", lambda: few)
+    monkeypatch.setattr(control, "make_entries", lambda *_: some)
     monkeypatch.setattr(control, "TITLES", {"": "no tier", "2a": "a tier"})
     for room in ("ladder", "figures"):
         named = {"": "no tier", "2a": "a"}
         monkeypatch.setattr(f"sideslip.benchmarks.control.{room}.TITLES", named)
-    monkeypatch.setattr(control, "price_of_delay", lambda *_, **__: ([], []))
+    monkeypatch.setattr(control, "measure_delay_cost", lambda *_, **__: ([], []))
     suite = control.run(4, jobs=1)
-    assert {row.salt for row in suite.rows} == {salt_of()}
+    assert {row.salt for row in suite.rows} == {make_salt()}
     assert {row.metric for row in suite.rows} >= {"score", "cost_vs_nominal", "failure_rate"}
     assert [row for row in suite.rows if not np.isfinite(row.value)] == []
     assert suite.verdict.startswith("Controllers drive on") and len(suite.verdict.splitlines()) <= 5

@@ -10,44 +10,45 @@ import numpy as np
 import pytest
 
 import sideslip
-from sideslip.agents.learned.files import ENDING
+from sideslip.agents.learned.files import SUFFIX
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks import readme, recovery
 from sideslip.benchmarks.control import calibration, ladder, run, seeds
-from sideslip.benchmarks.control.cells import Cell
-from sideslip.benchmarks.control.contests import Contest, candidates, contests
-from sideslip.benchmarks.control.episodes import NUMBERS, Driven
+from sideslip.benchmarks.control.cells import ControlEntry
+from sideslip.benchmarks.control.contests import ControlTask, list_candidates, list_scored_tasks
+from sideslip.benchmarks.control.episodes import NUMBERS, DriveResult
 from sideslip.benchmarks.control.run import measure
 from sideslip.benchmarks.control.seeds import (
-    salt_of,
-    salted_seeds,
-    seeds_of_contests,
-    tuning_seeds,
+    make_salt,
+    make_salted_seeds,
+    make_task_seeds,
+    make_tuning_seeds,
 )
-from sideslip.benchmarks.learned_outside import KINDS, outside
+from sideslip.benchmarks.learned_outside import KINDS, make_outside_task
 from sideslip.benchmarks.suites import SALTED, SUITES, Request, run_suite
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS
 
 ONE, OTHER = "0123456789abcdef", "fedcba9876543210"
 SHORT = {"base": "gust", "duration": 0.5}
-GUST = Contest(scenario="gust")
-NONE, SLOW = (Cell(GUST, "", who, {"scenario": SHORT}) for who in ("none", "mpc"))
+GUST = ControlTask(scenario="gust")
+NONE, SLOW = (ControlEntry(GUST, "", who, {"scenario": SHORT}) for who in ("none", "mpc"))
 
 
 @pytest.mark.parametrize("salt", [ONE, OTHER])
 def test_the_episodes_are_those_of_the_salt(salt: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """In order and across chunks: each costs what the env alone does on that seed."""
     monkeypatch.setattr(run, "CHUNK", 3)
-    costs = measure([NONE], salted_seeds(salt, 5), jobs=1).of(GUST, "none").costs
+    costs = measure([NONE], make_salted_seeds(salt, 5), jobs=1).select(GUST, "none").costs
     env = gym.make(GUST.env_id, scenario=SHORT)
-    alone = [rollout(env, None, seed).cost for seed in salted_seeds(salt, 5)]
+    alone = [rollout(env, None, seed).cost for seed in make_salted_seeds(salt, 5)]
     assert costs == pytest.approx(alone, rel=1e-12)
     assert len(set(costs)) == 5
 
 
 def test_another_salt_is_other_episodes() -> None:
     one, other = (
-        measure([NONE], salted_seeds(salt, 3), jobs=1).of(GUST, "none") for salt in (ONE, OTHER)
+        measure([NONE], make_salted_seeds(salt, 3), jobs=1).select(GUST, "none")
+        for salt in (ONE, OTHER)
     )
     assert not set(one.costs) & set(other.costs)
 
@@ -56,9 +57,9 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """The cases that are to be driven from now on; none is, and all numbers are 1."""
     cases: list[Any] = []
 
-    def stand_in(function: Any, chunks: Any, *_: Any) -> list[Driven]:
+    def stand_in(function: Any, chunks: Any, *_: Any) -> list[DriveResult]:
         cases.extend((function, chunk) for chunk in chunks)
-        return [Driven(np.ones((len(chunk.seeds), len(NUMBERS))), 0.0) for chunk in chunks]
+        return [DriveResult(np.ones((len(chunk.seeds), len(NUMBERS))), 0.0) for chunk in chunks]
 
     monkeypatch.setattr(run, "run_cases", stand_in)
     return cases
@@ -67,9 +68,9 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 def test_everybody_drives_the_same_seeds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Slow controllers the first ones."""
     cases = asked(monkeypatch)
-    first = salted_seeds(ONE, 300)
+    first = make_salted_seeds(ONE, 300)
     measure([NONE, SLOW], first, keep=tmp_path)
-    driven: dict[Cell, list[int]] = {}
+    driven: dict[ControlEntry, list[int]] = {}
     for kept, chunk in cases:
         driven.setdefault(chunk.cell, []).extend(chunk.seeds)
         assert kept.folder == tmp_path
@@ -79,12 +80,12 @@ def test_everybody_drives_the_same_seeds(monkeypatch: pytest.MonkeyPatch, tmp_pa
 def test_contests_share_no_car(monkeypatch: pytest.MonkeyPatch) -> None:
     """An interval over contests takes them for independent, and a seed draws the car."""
     cases = asked(monkeypatch)
-    scored = contests()[:6]
-    cells = [Cell(each, "", who) for each in scored for who in ("none", "nominal")]
-    measure(cells, seeds_of_contests(ONE, 50))
-    driven: dict[Contest, set[tuple[int, ...]]] = {}
+    scored = list_scored_tasks()[:6]
+    cells = [ControlEntry(each, "", who) for each in scored for who in ("none", "nominal")]
+    measure(cells, make_task_seeds(ONE, 50))
+    driven: dict[ControlTask, set[tuple[int, ...]]] = {}
     for _, chunk in cases:
-        driven.setdefault(chunk.cell.contest, set()).add(chunk.seeds)
+        driven.setdefault(chunk.cell.task, set()).add(chunk.seeds)
     assert all(len(mine) == 1 for mine in driven.values())  # in a contest everybody the same
     every = [seed for mine in driven.values() for own in mine for seed in own]
     assert len(set(every)) == len(every) == 6 * 50
@@ -92,9 +93,9 @@ def test_contests_share_no_car(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_price_of_delay_is_taken_on_the_salts_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
     cases = asked(monkeypatch)
-    ladder.price_of_delay(salted_seeds(OTHER, 4))
+    ladder.measure_delay_cost(make_salted_seeds(OTHER, 4))
     assert len(cases) == len(ladder.DELAYS) * len(ladder.CONTESTANTS)
-    assert {chunk.seeds for _, chunk in cases} == {tuple(salted_seeds(OTHER, 4))}
+    assert {chunk.seeds for _, chunk in cases} == {tuple(make_salted_seeds(OTHER, 4))}
 
 
 @pytest.mark.parametrize("name", [*SALTED, "readme"])
@@ -104,7 +105,7 @@ def test_a_suite_drives_the_salt_that_it_is_given(
     """Rows from before and after a change of the sources compare; without one it follows them."""
     found: list[list[int]] = []
 
-    def stand_in(cells: list[Cell], seeds: Any, **_: Any) -> None:
+    def stand_in(cells: list[ControlEntry], seeds: Any, **_: Any) -> None:
         found.append(seeds(GUST)[:4])
         raise StopIteration
 
@@ -115,10 +116,10 @@ def test_a_suite_drives_the_salt_that_it_is_given(
     for salt in (ONE, OTHER, ""):
         with pytest.raises(StopIteration):
             if module is readme:
-                readme.drive_first(salt=salt)
+                readme.measure_first(salt=salt)
             run_suite(name, Request(quick=True, episodes=4, salt=salt))
     assert found == [
-        salted_seeds(salt or salt_of(), 4, GUST.seed_text) for salt in (ONE, OTHER, "")
+        make_salted_seeds(salt or make_salt(), 4, GUST.seed_text) for salt in (ONE, OTHER, "")
     ]
 
 
@@ -129,24 +130,24 @@ def test_the_salt_follows_every_file_of_the_contestants(
         "estimators/core/a.py",
         "estimators/b.toml",
         "agents/c/d.py",
-        f"agents/e{ENDING}",
-        f"estimators/learned/h{ENDING}",
+        f"agents/e{SUFFIX}",
+        f"estimators/learned/h{SUFFIX}",
     )
     others = ("envs/f.py", "benchmarks/g.py", "agents/notes.md")
     for name in contestants + others:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("one")
     monkeypatch.setattr(seeds, "_PACKAGE", tmp_path)
-    salts = [salt_of()]
+    salts = [make_salt()]
     for name in contestants:
         (tmp_path / name).write_text("two")
-        salts.append(salt_of())
+        salts.append(make_salt())
     assert len(set(salts)) == 1 + len(contestants)
     for name in others:
         (tmp_path / name).write_text("two")
-    assert salt_of() == salts[-1]
+    assert make_salt() == salts[-1]
     (tmp_path / contestants[0]).rename(tmp_path / "estimators/core/renamed.py")
-    assert salt_of() not in salts
+    assert make_salt() not in salts
 
 
 def test_the_contestants_are_this_packages() -> None:
@@ -159,16 +160,16 @@ def test_the_contestants_are_this_packages() -> None:
 @pytest.mark.parametrize("salt", ["", "not a salt", "0xab", "AB", "-1"])
 def test_a_salt_that_is_none_is_refused(salt: str) -> None:
     with pytest.raises(ValueError, match="a salt is hexadecimal digits, got"):
-        salted_seeds(salt, 3)
+        make_salted_seeds(salt, 3)
 
 
 def test_seeds_follow_the_salt_and_only_grow() -> None:
-    salt = salt_of()
-    assert salt == salt_of() and salt != salt_of("more")
-    assert salted_seeds(salt, 10) == salted_seeds(salt, 30)[:10]
-    assert salted_seeds(salt_of("more"), 10) != salted_seeds(salt, 10)
-    assert len(set(salted_seeds(salt, 1000))) == 1000
-    assert not set(salted_seeds(salt, 1000)) & set(tuning_seeds(64))
+    salt = make_salt()
+    assert salt == make_salt() and salt != make_salt("more")
+    assert make_salted_seeds(salt, 10) == make_salted_seeds(salt, 30)[:10]
+    assert make_salted_seeds(make_salt("more"), 10) != make_salted_seeds(salt, 10)
+    assert len(set(make_salted_seeds(salt, 1000))) == 1000
+    assert not set(make_salted_seeds(salt, 1000)) & set(make_tuning_seeds(64))
 
 
 def digest(seeds: list[list[int]]) -> str:
@@ -180,16 +181,16 @@ def digest(seeds: list[list[int]]) -> str:
 
 def test_seeds_stay_whatever_the_fields_of_a_contest_are_called() -> None:
     """The files of calibrations and baselines hold costs on these seeds."""
-    every = [Contest(), *candidates()]
-    every += [outside(kind, model) for kind in KINDS for model in OUTSIDE_PLANTS]
-    drawn = [seeds_of_contests(ONE, 4)(each) for each in every]
+    every = [ControlTask(), *list_candidates()]
+    every += [make_outside_task(kind, model) for kind in KINDS for model in OUTSIDE_PLANTS]
+    drawn = [make_task_seeds(ONE, 4)(each) for each in every]
     assert digest(drawn) == "609de1ab608afa91"
-    assert digest([calibration.seeds_of(each, 4) for each in every]) == "ed882dd353bfd184"
+    assert digest([calibration.derive_seeds(each, 4) for each in every]) == "ed882dd353bfd184"
 
 
 def test_tuning_seeds_are_nobody_elses() -> None:
     """Suites and users count theirs from 0: what they look at, nobody tuned on."""
-    tuned = tuning_seeds(4096)
-    assert tuned[:64] == tuning_seeds(64) and len(set(tuned)) == 4096
+    tuned = make_tuning_seeds(4096)
+    assert tuned[:64] == make_tuning_seeds(64) and len(set(tuned)) == 4096
     for first in (0, recovery.FIRST_SEED, calibration._FIRST):
         assert set(tuned).isdisjoint(range(first, first + 2**20))

@@ -6,61 +6,63 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.control.answer import answer, best_controller
-from sideslip.benchmarks.control.cells import REFERENCE_FILTER, Cell
-from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, STATE, Contest
-from sideslip.benchmarks.control.episodes import NUMBERS, Driven
+from sideslip.benchmarks.control.answer import compose_verdict, find_best_controller
+from sideslip.benchmarks.control.cells import REFERENCE_FILTER, ControlEntry
+from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, STATE, ControlTask
+from sideslip.benchmarks.control.episodes import NUMBERS, DriveResult
 from sideslip.benchmarks.control.ladder import (
-    below_the_clairvoyant,
-    findings,
-    knowledge_table,
-    ladder_table,
-    refusals_of,
-    yardsticks,
+    describe_findings,
+    find_below_optimum,
+    list_failures,
+    make_knowledge_table,
+    make_oracle_table,
+    make_score_scales,
 )
 from sideslip.benchmarks.control.run import Results
 from sideslip.benchmarks.control.tables import (
     Standing,
-    contest_table,
-    main_table,
-    motion_table,
-    rows_of,
-    standings,
+    make_main_table,
+    make_motion_table,
+    make_rows,
+    make_task_table,
+    rank_entries,
 )
 from sideslip.benchmarks.harness.metrics import EPISODE
 from sideslip.envs import FAILURES
 
-ONE, TWO = Contest("1", scenario="gust"), Contest("1", scenario="straight")
+ONE, TWO = ControlTask("1", scenario="gust"), ControlTask("1", scenario="straight")
 BEST = {NOMINAL: 8.0, PARAMETERS: 4.0, STATE: 1.0, "lqr": 2.0, "esc": 6.0, "none": 12.0}
 COST, FAILURE = NUMBERS.index("cost"), NUMBERS.index("failure")
 
 
-def episodes(level: float, failed: int = 0, code: str = "spin", n: int = 40) -> Driven:
+def episodes(level: float, failed: int = 0, code: str = "spin", n: int = 40) -> DriveResult:
     """Costs about a level on common seeds, the first of which failed."""
     seeds, own = np.random.default_rng(0), np.random.default_rng(int(100 * level))
     numbers = np.ones((n, len(NUMBERS)))
     numbers[:, COST] = level * seeds.lognormal(0.0, 1.0, n) * own.lognormal(0.0, 0.1, n)
     numbers[:, FAILURE] = np.where(np.arange(n) < failed, FAILURES.index(code), 0)
-    return Driven(numbers, 1.0)
+    return DriveResult(numbers, 1.0)
 
 
-def results(*contests: Contest, **failed: int) -> Results:
+def results(*contests: ControlTask, **failed: int) -> Results:
     found = Results()
     for contest in contests or (ONE, TWO):
         for who, level in BEST.items():
             filter_ = REFERENCE_FILTER if who in ("lqr", "esc") else ""
-            found.found[Cell(contest, filter_, who)] = episodes(level, failed.get(who, 0))
-        found.found[Cell(contest, "dakf", "lqr")] = episodes(3.0)
+            found.outcomes[ControlEntry(contest, filter_, who)] = episodes(
+                level, failed.get(who, 0)
+            )
+        found.outcomes[ControlEntry(contest, "dakf", "lqr")] = episodes(3.0)
     return found
 
 
-def table(found: Results, *contests: Contest) -> list[Standing]:
-    return standings(found.found, "1", yardsticks(found, contests or (ONE, TWO)))
+def table(found: Results, *contests: ControlTask) -> list[Standing]:
+    return rank_entries(found.outcomes, "1", make_score_scales(found, contests or (ONE, TWO)))
 
 
 def test_the_best_come_first_with_their_numbers() -> None:
     standing = table(results())
-    labels = [each.cell.controller for each in standing]
+    labels = [each.entry.controller for each in standing]
     assert labels == [STATE, "lqr", "lqr", PARAMETERS, "esc", NOMINAL, "none"]
     lqr = standing[1].overall
     assert lqr["score"].value == pytest.approx(2.0 / 3.0, abs=0.02)  # log 4 / log 8
@@ -73,12 +75,12 @@ def test_the_best_come_first_with_their_numbers() -> None:
 def test_won_are_episodes_that_count() -> None:
     """Of those that nominal fails nothing is compared, cheap as they may be."""
     found = results(nominal=8)
-    for cell, driven in found.found.items():
+    for cell, driven in found.outcomes.items():
         if cell.controller == "lqr":
             driven.numbers[:8, COST] = 1e3  # lost, where nominal fails
-    lqr = next(each for each in table(found) if each.cell.controller == "lqr")
+    lqr = next(each for each in table(found) if each.entry.controller == "lqr")
     assert lqr.n == 64 and lqr.overall["share_won"].value == 1.0
-    assert all(each["share_won"].value == 1.0 for each in lqr.by_contest.values())
+    assert all(each["share_won"].value == 1.0 for each in lqr.by_task.values())
 
 
 def test_failures_are_of_all_episodes_and_rank_where_nominal_fails_often() -> None:
@@ -87,10 +89,10 @@ def test_failures_are_of_all_episodes_and_rank_where_nominal_fails_often() -> No
     lqr = standing[f"lqr on {REFERENCE_FILTER}"]
     assert lqr.overall["failure_rate"].value == 3 / 40
     assert (lqr.n, lqr.excluded) == (76, 4)
-    assert [each.cell.controller for each in table(some)][:2] == [STATE, "lqr"]
+    assert [each.entry.controller for each in table(some)][:2] == [STATE, "lqr"]
     often = results(nominal=6, lqr=30)
-    assert [each.cell.controller for each in table(often)][-1] == "lqr"  # the one that failed
-    found = main_table("", table(often))
+    assert [each.entry.controller for each in table(often)][-1] == "lqr"  # the one that failed
+    found = make_main_table("", table(often))
     assert found.header[1] == "fails / %"
     assert [float(line[1]) for line in found.cells] == sorted(float(x[1]) for x in found.cells)
 
@@ -101,99 +103,101 @@ def test_an_adaptive_controller_is_compared_on_the_filter_it_follows(
 ) -> None:
     found = results()
     for contest in (ONE, TWO):
-        found.found[Cell(contest, filter_, "adaptive-lqr")] = episodes(1.5)
-    assert best_controller({"1": table(found)}) == best
+        found.outcomes[ControlEntry(contest, filter_, "adaptive-lqr")] = episodes(1.5)
+    assert find_best_controller({"1": table(found)}) == best
 
 
 def test_a_cell_that_was_not_driven_says_so_and_the_rest_goes_on() -> None:
     found = results()
-    cell = Cell(TWO, "dakf", "lqr")
-    found.found[cell] = Driven(np.full((40, len(NUMBERS)), np.nan), np.nan, error="no GPS")
-    standing = next(each for each in table(found) if each.cell.estimator == "dakf")
+    cell = ControlEntry(TWO, "dakf", "lqr")
+    found.outcomes[cell] = DriveResult(np.full((40, len(NUMBERS)), np.nan), np.nan, error="no GPS")
+    standing = next(each for each in table(found) if each.entry.estimator == "dakf")
     assert np.isfinite(standing.overall["score"].value)
-    assert main_table("", [standing]).cells[0][9] == "1 of 2"
-    assert contest_table("", [standing], [ONE, TWO]).cells[0][2] == "not driven"
-    assert ["1", TWO.name, "lqr on dakf", "not driven: no GPS"] in refusals_of(found)
-    assert all(np.isfinite(row.value) for row in rows_of(standing, "ab"))
+    assert make_main_table("", [standing]).cells[0][9] == "1 of 2"
+    assert make_task_table("", [standing], [ONE, TWO]).cells[0][2] == "not driven"
+    assert ["1", TWO.name, "lqr on dakf", "not driven: no GPS"] in list_failures(found)
+    assert all(np.isfinite(row.value) for row in make_rows(standing, "ab"))
 
 
 def test_a_contest_in_which_every_car_fails_counts_nowhere_and_says_so() -> None:
     found = results()
     for who in (NOMINAL, STATE):
-        found.found[Cell(TWO, "", who)] = episodes(9.0, 40)
+        found.outcomes[ControlEntry(TWO, "", who)] = episodes(9.0, 40)
     standing = table(found)
     assert all(len(each.pairs) == 1 for each in standing)
-    shown = contest_table("", standing, [TWO]).cells
+    shown = make_task_table("", standing, [TWO]).cells
     assert [NOMINAL, "no episode counts (100)"] in shown and [
         "none",
         "no episode counts (0)",
     ] in shown
-    lines = ladder_table(found, [ONE, TWO], {}).cells
+    lines = make_oracle_table(found, [ONE, TWO], {}).cells
     assert [line[-1] for line in lines] == [
         "yes",
         "no episode that nominal and oracle-state survive",
     ]
-    assert ["1", TWO.name, NOMINAL, "every car fails"] in refusals_of(found)
+    assert ["1", TWO.name, NOMINAL, "every car fails"] in list_failures(found)
     assert all(np.isfinite(each.overall["score"].value) for each in standing)
 
 
 def test_a_rung_that_cannot_be_computed_leaves_its_contest_without_score() -> None:
     found = results()
-    found.found[Cell(TWO, "", STATE)] = Driven(
+    found.outcomes[ControlEntry(TWO, "", STATE)] = DriveResult(
         np.full((40, len(NUMBERS)), np.nan), np.nan, error="no plant"
     )
     standing = table(found)
-    lqr = next(each for each in standing if each.cell.controller == "lqr")
+    lqr = next(each for each in standing if each.entry.controller == "lqr")
     assert list(lqr.pairs) == [ONE] and np.isfinite(lqr.overall["score"].value)
-    assert contest_table("", [lqr], [TWO]).cells[0][1].startswith("no yardstick")
-    assert ladder_table(found, [ONE, TWO], {}).cells[1][-1] == "no plant"
+    assert make_task_table("", [lqr], [TWO]).cells[0][1].startswith("no yardstick")
+    assert make_oracle_table(found, [ONE, TWO], {}).cells[1][-1] == "no plant"
 
 
 def test_a_nan_of_a_contestant_is_a_failure_that_is_not_the_cars() -> None:
     found = results()
-    found.found[Cell(ONE, "dakf", "lqr")] = episodes(3.0, 10, "bad-action")
-    assert ["1", ONE.name, "lqr on dakf", "bad-action 25.0 %"] in refusals_of(found)
-    standing = next(each for each in table(found) if each.cell.estimator == "dakf")
-    assert standing.by_contest[ONE]["bad_action_rate"].value == 0.25
+    found.outcomes[ControlEntry(ONE, "dakf", "lqr")] = episodes(3.0, 10, "bad-action")
+    assert ["1", ONE.name, "lqr on dakf", "bad-action 25.0 %"] in list_failures(found)
+    standing = next(each for each in table(found) if each.entry.estimator == "dakf")
+    assert standing.by_task[ONE]["bad_action_rate"].value == 0.25
     assert standing.overall["score"].value < 0.35
 
 
 def test_nothing_to_win_is_said() -> None:
     found = results()
     for who in (NOMINAL, STATE):
-        found.found[Cell(TWO, "", who)] = episodes(5.0)
-    assert contest_table("", table(found)[:1], [TWO]).cells[0][1].startswith("nothing to win here")
-    assert ladder_table(found, [TWO], {}).cells[0][-1] == "nothing to win here"
+        found.outcomes[ControlEntry(TWO, "", who)] = episodes(5.0)
+    assert (
+        make_task_table("", table(found)[:1], [TWO]).cells[0][1].startswith("nothing to win here")
+    )
+    assert make_oracle_table(found, [TWO], {}).cells[0][-1] == "nothing to win here"
 
 
 def test_who_is_above_the_oracle_is_a_finding() -> None:
-    assert findings(table(results())) == []
+    assert describe_findings(table(results())) == []
     found = results()
     for contest in (ONE, TWO):
-        found.found[Cell(contest, "dakf", "lqr")] = episodes(0.5)
-    (said,) = findings(table(found))
+        found.outcomes[ControlEntry(contest, "dakf", "lqr")] = episodes(0.5)
+    (said,) = describe_findings(table(found))
     assert "lqr on dakf costs less than oracle-state in tier 1" in said
 
 
 def test_who_is_surely_below_the_clairvoyant_is_named() -> None:
     rng = np.random.default_rng(0)
     leads = [rng.normal(0.3, 0.3, 64), rng.normal(-0.3, 0.3, 64), rng.normal(0.0, 0.3, 64)]
-    assert below_the_clairvoyant(["above", "below", "level"], leads) == ["below"]
+    assert find_below_optimum(["above", "below", "level"], leads) == ["below"]
     many = [rng.normal(0.0, 0.3, 64) for _ in range(40)]
-    assert below_the_clairvoyant([str(k) for k in range(40)], many) == []
+    assert find_below_optimum([str(k) for k in range(40)], many) == []
 
 
 def test_the_ladders_steps_are_ratios_of_costs() -> None:
     ahead = {ONE: np.full(8, np.log(1.5))}
-    made = knowledge_table(results(), {"1": [ONE, TWO]}, ahead)
+    made = make_knowledge_table(results(), {"1": [ONE, TWO]}, ahead)
     assert [float(re.split(" ", text)[0]) for text in made.cells[0][1:]] == pytest.approx(
         [2.0, 4.0, 1.5], rel=0.05
     )
-    assert knowledge_table(results(), {"1": [ONE, TWO]}, {}).cells[0][3] == ""
+    assert make_knowledge_table(results(), {"1": [ONE, TWO]}, {}).cells[0][3] == ""
 
 
 def test_the_answer_names_the_best_and_by_how_much() -> None:
-    _, controller, estimator, why, rest = answer({"1": table(results())}).splitlines()
+    _, controller, estimator, why, rest = compose_verdict({"1": table(results())}).splitlines()
     best = REFERENCE_FILTER.replace(", ", " with ")
     assert f"controller, {best} costs least, 6" in estimator and "as much as dakf" in estimator
     assert "controllers lqr costs least, 33 % [" in controller and "as much as esc" in controller
@@ -205,44 +209,44 @@ def test_the_answer_names_the_best_and_by_how_much() -> None:
 def test_the_answer_calls_a_tie_a_tie_and_names_who_leads_elsewhere() -> None:
     found, other = results(), results()
     for contest in (ONE, TWO):
-        found.found[Cell(contest, "dakf", "lqr")] = episodes(2.0)
-        other.found[Cell(contest, REFERENCE_FILTER, "esc")] = episodes(1.5)
-        found.found[Cell(contest, REFERENCE_FILTER, "esc")] = episodes(60.0)
-    _, _, estimator, *_ = answer({"1": table(found)}).splitlines()
+        found.outcomes[ControlEntry(contest, "dakf", "lqr")] = episodes(2.0)
+        other.outcomes[ControlEntry(contest, REFERENCE_FILTER, "esc")] = episodes(1.5)
+        found.outcomes[ControlEntry(contest, REFERENCE_FILTER, "esc")] = episodes(60.0)
+    _, _, estimator, *_ = compose_verdict({"1": table(found)}).splitlines()
     assert "cost least, too close to tell apart" in estimator and "dakf" in estimator
-    two = [replace(each, yards=table(found)[0].yards) for each in table(found)]
-    elsewhere = {Contest("2", scenario=c.scenario): c for c in (ONE, TWO)}
+    two = [replace(each, scales=table(found)[0].scales) for each in table(found)]
+    elsewhere = {ControlTask("2", scenario=c.scenario): c for c in (ONE, TWO)}
     for each, there in zip(two, [{e.label: e for e in table(other)}] * len(two), strict=True):
         each.__dict__["pairs"] = {k: there[each.label].pairs[c] for k, c in elsewhere.items()}
-    *_, rest = answer({"1": table(found), "2": two}).splitlines()
+    *_, rest = compose_verdict({"1": table(found), "2": two}).splitlines()
     assert rest.startswith("It costs less with esc in tier 2. ")
 
 
 def test_who_drives_a_part_of_the_contests_is_not_the_best_but_is_named() -> None:
     """A policy of one class of contests, however little it costs there."""
     found = results()
-    found.found[Cell(TWO, "joint", "distill-car-yaw")] = episodes(1.2)
-    _, controller, *_, rest = answer({"1": table(found)}).splitlines()
+    found.outcomes[ControlEntry(TWO, "joint", "distill-car-yaw")] = episodes(1.2)
+    _, controller, *_, rest = compose_verdict({"1": table(found)}).splitlines()
     assert "controllers lqr costs least, 33 % [" in controller
     assert rest.startswith("It costs less with distill-car-yaw on its own manoeuvres. ")
-    found.found[Cell(ONE, "joint", "distill-car-yaw")] = episodes(1.2)
-    _, controller, *_, rest = answer({"1": table(found)}).splitlines()
+    found.outcomes[ControlEntry(ONE, "joint", "distill-car-yaw")] = episodes(1.2)
+    _, controller, *_, rest = compose_verdict({"1": table(found)}).splitlines()
     assert "controllers distill-car-yaw costs" in controller and rest.startswith("Not covered")
 
 
 def test_without_an_episode_that_counts_nobody_wins() -> None:
     found = results()
     for contest in (ONE, TWO):
-        found.found[Cell(contest, "", STATE)] = episodes(9.0, 40)
-    _, controller, estimator, *_ = answer({"1": table(found)}).splitlines()
+        found.outcomes[ControlEntry(contest, "", STATE)] = episodes(9.0, 40)
+    _, controller, estimator, *_ = compose_verdict({"1": table(found)}).splitlines()
     assert "nobody has a score" in estimator and "nobody has a score" in controller
 
 
 def test_a_metric_of_the_table_has_its_rows_and_its_column() -> None:
     standing = table(results())
-    metrics = {row.metric for row in rows_of(standing[0], "ab")}
+    metrics = {row.metric for row in make_rows(standing[0], "ab")}
     assert {metric.name for metric in EPISODE} - {"failure"} <= metrics
-    shown = motion_table("", standing)
+    shown = make_motion_table("", standing)
     for metric in EPISODE:
         if metric.heading:
             column = list(shown.header).index(metric.heading)

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from sideslip.benchmarks.control.cells import Cell
-from sideslip.benchmarks.control.contests import Contest
+from sideslip.benchmarks.control.cells import ControlEntry
+from sideslip.benchmarks.control.contests import ControlTask
 from sideslip.benchmarks.control.episodes import Chunk
-from sideslip.benchmarks.entrants.worker import drive_apart, rehearse
+from sideslip.benchmarks.entrants.worker import run_isolated_chunk, run_rehearsal
 
 SEEDS = (918273645, 918273646)
 LANDLOCK = ctypes.CDLL(None).syscall(444, None, 0, 1) if sys.platform == "linux" else 0
@@ -43,12 +43,14 @@ def cheat(folder: Path, init: str, predict: str = "") -> Chunk:
     ]
     (folder / "mine.py").write_text("\n".join(lines))
     options = {"scenario": {"base": "gust", "duration": 0.05}}
-    return Chunk(Cell(Contest(scenario="gust"), "", str(folder / "mine.py"), options), SEEDS)
+    return Chunk(
+        ControlEntry(ControlTask(scenario="gust"), "", str(folder / "mine.py"), options), SEEDS
+    )
 
 
 def test_neither_env_nor_seeds_nor_files_of_the_driver_are_in_reach(tmp_path: Path) -> None:
     (tmp_path / "result.npz").write_bytes(b"right")
-    driven = drive_apart(cheat(tmp_path, f"""
+    driven = run_isolated_chunk(cheat(tmp_path, f"""
 base, parent = env.unwrapped, f"/proc/{{os.getppid()}}"
 found = {{
     "state": attempt(lambda: base.states),
@@ -87,14 +89,14 @@ raise ValueError(json.dumps(found))
 def test_a_hang_ends_with_what_it_started(tmp_path: Path) -> None:
     """At the limit, and the reason says where it was."""
     body = 'subprocess.Popen(["sleep", "91827.364"])\nwhile True: pass'
-    driven = drive_apart(cheat(tmp_path, body), limit=2.0)
+    driven = run_isolated_chunk(cheat(tmp_path, body), limit=2.0)
     assert re.fullmatch(r"no end within 2 s, still in mine.py, line \d+", driven.error)
     running = [path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline") if path.exists()]
     assert not any(b"91827.364" in text for text in running)
 
 
 def test_memory_ends_at_a_stated_limit(tmp_path: Path) -> None:
-    driven = drive_apart(cheat(tmp_path, "self.kept = bytearray(5 * 2**30)"))
+    driven = run_isolated_chunk(cheat(tmp_path, "self.kept = bytearray(5 * 2**30)"))
     stated = r"MemoryError: .mine.py, line \d+.; a contestant has 4 GiB of memory"
     assert re.fullmatch(stated, driven.error)
 
@@ -106,11 +108,11 @@ def test_what_it_opens_shows_in_a_rehearsal_or_ends_it(when: str, tmp_path: Path
     (tmp_path / "table.txt").write_text("2")
     read = f"open({str(tmp_path / 'table.txt')!r}).read()"
     if when == "before":
-        driven, opened = rehearse(cheat(tmp_path, f"import neighbour\n{read}"))
+        driven, opened = run_rehearsal(cheat(tmp_path, f"import neighbour\n{read}"))
         names = {"mine.py", "neighbour.py", "table.txt"}
         assert not driven.error and opened == {str(tmp_path / name) for name in names}
         return
     allowed = [str(tmp_path / name) for name in ("mine.py", "neighbour.py")]
-    driven = drive_apart(cheat(tmp_path, "import neighbour", read), allowed=allowed)
+    driven = run_isolated_chunk(cheat(tmp_path, "import neighbour", read), allowed=allowed)
     right = f"it opened {tmp_path}/table.txt, which it had not opened in the rehearsal"
     assert driven.error == right

@@ -10,15 +10,26 @@ import pandas as pd
 import pytest
 
 import sideslip
-from sideslip.benchmarks.control.build import agent_options
-from sideslip.benchmarks.control.cells import REFERENCE_FILTER, Cell, some_of
-from sideslip.benchmarks.control.contests import NOMINAL, STEERING, YAW, Contest, contests
-from sideslip.benchmarks.control.episodes import NUMBERS, Chunk, Driven, drive
+from sideslip.benchmarks.control.build import make_agent_options
+from sideslip.benchmarks.control.cells import REFERENCE_FILTER, ControlEntry, select_quick_tasks
+from sideslip.benchmarks.control.contests import (
+    NOMINAL,
+    STEERING,
+    YAW,
+    ControlTask,
+    list_scored_tasks,
+)
+from sideslip.benchmarks.control.episodes import NUMBERS, Chunk, DriveResult, run_chunk
 from sideslip.benchmarks.control.run import Results
-from sideslip.benchmarks.control.seeds import Seeds, salt_of, seeds_of_contests
+from sideslip.benchmarks.control.seeds import Seeds, make_salt, make_task_seeds
 from sideslip.benchmarks.entrants import baselines, compare
-from sideslip.benchmarks.entrants.challenge import EPISODES, Challenge, Pair, pairs_of
-from sideslip.benchmarks.entrants.verdict import sentence, table, verdict
+from sideslip.benchmarks.entrants.challenge import (
+    EPISODES,
+    ComparisonRequest,
+    UserEntry,
+    make_user_entries,
+)
+from sideslip.benchmarks.entrants.verdict import compose_verdict, make_sentence, make_table
 
 COST, FAILURE = NUMBERS.index("cost"), NUMBERS.index("failure")
 PD = """
@@ -43,9 +54,9 @@ def wrapped(folder: Path, options: dict[str, Any]) -> str:
 
 def test_a_wrapped_controller_has_the_shipped_ones_row(tmp_path: Path, run: Run) -> None:
     """Bit for bit, by command and by `score`; so it is nominal, whose design LQR is."""
-    contest = Contest("", YAW, "coms", "zero-slip", "gust")
-    shipped = Cell(contest, REFERENCE_FILTER, "lqr")
-    mine = wrapped(tmp_path, agent_options(shipped))
+    contest = ControlTask("", YAW, "coms", "zero-slip", "gust")
+    shipped = ControlEntry(contest, REFERENCE_FILTER, "lqr")
+    mine = wrapped(tmp_path, make_agent_options(shipped))
     rows = tmp_path / "rows.json"
     arguments = ("--scenario", "gust", "--env", YAW, "--episodes", 4, "--jobs", 1, "--json", rows)
     status, out, error = run("bench", "control", "--agent", mine, *arguments)
@@ -55,8 +66,8 @@ def test_a_wrapped_controller_has_the_shipped_ones_row(tmp_path: Path, run: Run)
         for row in json.loads(rows.read_text())
         if row["controller"] == mine and row["scenario"] == contest.name
     }
-    seeds = tuple(seeds_of_contests(salt_of(), 4)(contest))
-    costs = drive(Chunk(shipped, seeds)).costs
+    seeds = tuple(make_task_seeds(make_salt(), 4)(contest))
+    costs = run_chunk(Chunk(shipped, seeds)).costs
     assert number["cost"] == np.mean(costs)
     assert number["score"] == 0.0 and number["cost_vs_nominal"] == 1.0
     words = " ".join(out.split())
@@ -72,12 +83,12 @@ def test_a_wrapped_controller_has_the_shipped_ones_row(tmp_path: Path, run: Run)
 
 
 @pytest.fixture
-def driven(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Cell, tuple[int, ...]]]:
+def driven(monkeypatch: pytest.MonkeyPatch) -> list[tuple[ControlEntry, tuple[int, ...]]]:
     """Every cell that is to be driven with its seeds; none is. Whom the user brings costs half."""
-    asked: list[tuple[Cell, tuple[int, ...]]] = []
+    asked: list[tuple[ControlEntry, tuple[int, ...]]] = []
 
-    def stand_in(cells: Sequence[Cell], seeds: Seeds, **_: Any) -> Results:
-        mine = [(c, tuple(seeds(c.contest) if callable(seeds) else seeds)) for c in cells]
+    def stand_in(cells: Sequence[ControlEntry], seeds: Seeds, **_: Any) -> Results:
+        mine = [(c, tuple(seeds(c.task) if callable(seeds) else seeds)) for c in cells]
         asked.extend(mine)
         return Results({cell: episodes(cell, len(each)) for cell, each in mine})
 
@@ -86,26 +97,28 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Cell, tuple[int, ...]]
     return asked
 
 
-def episodes(cell: Cell, n: int) -> Driven:
+def episodes(cell: ControlEntry, n: int) -> DriveResult:
     levels = {NOMINAL: 4.0, "oracle-state": 1.0, "none": 20.0}
     numbers = np.zeros((n, len(NUMBERS)))
     numbers[:, COST] = levels.get(cell.controller, 2.0) * (1.0 + 0.1 * np.arange(n) % 3)
     numbers[: n // 3, FAILURE] = cell.controller.endswith("e.py")
     if "broken" in cell.controller:
-        return Driven(np.full_like(numbers, np.nan), np.nan, error="ValueError: no (pd.py, line 3)")
-    return Driven(numbers, 0.0)
+        return DriveResult(
+            np.full_like(numbers, np.nan), np.nan, error="ValueError: no (pd.py, line 3)"
+        )
+    return DriveResult(numbers, 0.0)
 
 
-def challenge(folder: Path, **options: Any) -> Challenge:
+def challenge(folder: Path, **options: Any) -> ComparisonRequest:
     (folder / "pd.py").write_text(PD)
-    return Challenge((Pair(f"{folder}/pd.py:Pd"),), **options)
+    return ComparisonRequest((UserEntry(f"{folder}/pd.py:Pd"),), **options)
 
 
 def on_file(folder: Path, monkeypatch: pytest.MonkeyPatch, change: float = 1.0) -> None:
     """A file of baselines with 8 episodes of a salt of its own, their costs times `change`."""
     monkeypatch.setattr(baselines, "FILE", folder / "baselines.json")
     monkeypatch.setattr(baselines, "EPISODES", 8)
-    monkeypatch.setattr(baselines, "salt_of", lambda: "abcd")
+    monkeypatch.setattr(baselines, "make_salt", lambda: "abcd")
     baselines.write_baselines(folder / "baselines.json")
     text = json.loads((folder / "baselines.json").read_text())
     for entry in text:
@@ -113,13 +126,15 @@ def on_file(folder: Path, monkeypatch: pytest.MonkeyPatch, change: float = 1.0) 
     (folder / "baselines.json").write_text(json.dumps(text))
 
 
-def salted(salt: str, n: int, cell: Cell) -> tuple[int, ...]:
+def salted(salt: str, n: int, cell: ControlEntry) -> tuple[int, ...]:
     """A contest's test seeds."""
-    return tuple(seeds_of_contests(salt, n)(cell.contest))
+    return tuple(make_task_seeds(salt, n)(cell.task))
 
 
 def test_committed_baselines_serve_where_a_sample_costs_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, driven: list[tuple[Cell, tuple[int, ...]]]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    driven: list[tuple[ControlEntry, tuple[int, ...]]],
 ) -> None:
     on_file(tmp_path, monkeypatch)
     del driven[:]
@@ -130,7 +145,7 @@ def test_committed_baselines_serve_where_a_sample_costs_the_same(
     again = [(cell, seeds) for cell, seeds in driven if not cell.is_users]
     assert again and all(seeds == salted("abcd", 2, cell) for cell, seeds in again)
     assert {cell.controller for cell, _ in again} == {NOMINAL, "oracle-state", "none", "esc"}
-    assert "on file, a sample driven again" in verdict(found)[-1]
+    assert "on file, a sample driven again" in compose_verdict(found)[-1]
 
 
 @pytest.mark.parametrize("why", ["costs", "episodes", "vehicle", "scenario", "seeds", "fresh"])
@@ -138,7 +153,7 @@ def test_otherwise_they_drive_anew_on_everybodys_seeds(
     why: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    driven: list[tuple[Cell, tuple[int, ...]]],
+    driven: list[tuple[ControlEntry, tuple[int, ...]]],
 ) -> None:
     on_file(tmp_path, monkeypatch, change=1.01 if why == "costs" else 1.0)
     changes: dict[str, dict[str, Any]] = {
@@ -153,11 +168,13 @@ def test_otherwise_they_drive_anew_on_everybodys_seeds(
     found = compare.compare(challenge(tmp_path, **{"episodes": 8} | options))
     assert not found.on_file
     everyone = {cell: seeds for cell, seeds in driven}  # the last time
-    assert set(everyone) == set(found.results.found)
-    contests = {cell.contest for cell in everyone}
+    assert set(everyone) == set(found.results.outcomes)
+    contests = {cell.task for cell in everyone}
     assert len(set(everyone.values())) == (1 if why == "seeds" else len(contests))
     if why in ("costs", "episodes", "vehicle", "scenario"):
-        assert all(seeds == salted(salt_of(), len(seeds), cell) for cell, seeds in everyone.items())
+        assert all(
+            seeds == salted(make_salt(), len(seeds), cell) for cell, seeds in everyone.items()
+        )
     if why == "seeds":
         assert set(everyone.values()) == {(5, 6, 7)} and found.salt == ""
     if why == "vehicle":
@@ -165,11 +182,13 @@ def test_otherwise_they_drive_anew_on_everybodys_seeds(
             cell.env_options[car]["mass"] for cell in everyone for car in ("vehicle", "nominal")
         }
         assert masses == {900.0}
-    assert ("Publishable" in verdict(found)[-1]) == (why == "fresh")
+    assert ("Publishable" in compose_verdict(found)[-1]) == (why == "fresh")
 
 
 def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, driven: list[tuple[Cell, tuple[int, ...]]]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    driven: list[tuple[ControlEntry, tuple[int, ...]]],
 ) -> None:
     """Other ones each time; with the bytes that the driver drew, others for another file."""
     rehearsed = frozenset({str((tmp_path / "pd.py").resolve())})
@@ -177,8 +196,8 @@ def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
     found = [compare.compare(challenge(tmp_path, fresh=True)) for _ in range(2)]
     assert found[0].salt != found[1].salt
     again = compare.compare(challenge(tmp_path, salt=found[0].salt))
-    assert again.salt == found[0].salt and "Not publishable" in verdict(again)[-1]
-    assert f"--salt {found[0].salt} repeats them" in verdict(found[0])[-1]
+    assert again.salt == found[0].salt and "Not publishable" in compose_verdict(again)[-1]
+    assert f"--salt {found[0].salt} repeats them" in compose_verdict(found[0])[-1]
     mine = [seeds for cell, seeds in driven if cell.is_users]
     third = len(mine) // 3
     assert mine[:third] == mine[2 * third :] != mine[third : 2 * third]
@@ -186,76 +205,79 @@ def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
     salts = set()
     for text in (PD, PD + "# better\n"):
         (tmp_path / "pd.py").write_text(text)
-        salts.add(compare.compare(Challenge((Pair(f"{tmp_path}/pd.py"),), fresh=True)).salt)
+        salts.add(
+            compare.compare(ComparisonRequest((UserEntry(f"{tmp_path}/pd.py"),), fresh=True)).salt
+        )
     assert len(salts) == 2
 
 
 def test_the_verdict_has_a_sentence_for_each_and_five_lines_at_most(
-    tmp_path: Path, driven: list[tuple[Cell, tuple[int, ...]]]
+    tmp_path: Path, driven: list[tuple[ControlEntry, tuple[int, ...]]]
 ) -> None:
-    pairs = [Pair(f"{tmp_path}/{name}.py") for name in ("a", "broken", "c", "d", "e")]
+    pairs = [UserEntry(f"{tmp_path}/{name}.py") for name in ("a", "broken", "c", "d", "e")]
     for pair in pairs:
         Path(pair.agent).write_text(PD)
-    found = compare.compare(Challenge(tuple(pairs), seeds=(1, 2, 3)))
-    lines = verdict(found)
+    found = compare.compare(ComparisonRequest(tuple(pairs), seeds=(1, 2, 3)))
+    lines = compose_verdict(found)
     assert len(lines) == 5 and "2 more stand in the table" in lines[3]
-    mine = found.of(pairs[0])
-    assert lines[0] == f"Place 3 of 9: {sentence(mine)}."
+    mine = found.select(pairs[0])
+    assert lines[0] == f"Place 3 of 9: {make_sentence(mine)}."
     assert "50 % [50, 50] of nominal's cost (tier 1: 50, tier 2a: 50, tier 2b: 50" in lines[0]
     assert "closes 50 % [50, 50] of the gap" in lines[0] and "fails in 0.0 %" in lines[0]
-    assert "fails in 33.3 % (nominal 0.0 %)" in sentence(found.of(pairs[4]))
-    broken = sentence(found.of(pairs[1]))
+    assert "fails in 33.3 % (nominal 0.0 %)" in make_sentence(found.select(pairs[4]))
+    broken = make_sentence(found.select(pairs[1]))
     assert "not driven: " in broken and broken.endswith("ValueError: no (pd.py, line 3)")
-    cells = table(found).cells
+    cells = make_table(found).cells
     assert sum(line[0].startswith("> ") for line in cells) == 5
     assert len(cells) == 5 + 4
 
 
 def test_an_agent_drives_on_the_estimators_and_these_under_lqr() -> None:
-    assert pairs_of(["esc"], []) == [Pair("esc", REFERENCE_FILTER)]
-    found = pairs_of(["esc", "two-dof"], ["dakf", ""])
+    assert make_user_entries(["esc"], []) == [UserEntry("esc", REFERENCE_FILTER)]
+    found = make_user_entries(["esc", "two-dof"], ["dakf", ""])
     assert [(pair.agent, pair.estimator) for pair in found] == [
         *(("esc", "dakf"), ("esc", ""), ("two-dof", "dakf"), ("two-dof", "")),
         ("lqr", "dakf"),
     ]
-    assert pairs_of(["ppo-yaw-vision"], [])[0].estimator == ""
+    assert make_user_entries(["ppo-yaw-vision"], [])[0].estimator == ""
 
 
 def test_contests_are_those_of_the_id() -> None:
-    esc = (Pair("esc"),)
-    assert list(Challenge(esc).contests) == some_of(contests())
-    steering = Challenge(esc, env_id=STEERING).contests
+    esc = (UserEntry("esc"),)
+    assert list(ComparisonRequest(esc).tasks) == select_quick_tasks(list_scored_tasks())
+    steering = ComparisonRequest(esc, env_id=STEERING).tasks
     assert {contest.env_id for contest in steering} == {STEERING} and len(steering) == 4
-    vision = list(Challenge(esc, env_id="sideslip/YawVision-v0").contests)
+    vision = list(ComparisonRequest(esc, env_id="sideslip/YawVision-v0").tasks)
     assert {contest.env_id for contest in vision} == {"sideslip/YawVision-v0"}
     assert [contest.tier for contest in vision] == ["1", "2a", "2b", "2c"]
-    scored = list(Challenge(esc, scenarios=("car-slalom",)).contests)
-    assert scored and set(scored) <= set(contests())
-    own = Challenge(esc, vehicle="passenger-car", scenarios=("gust",)).contests
+    scored = list(ComparisonRequest(esc, scenarios=("car-slalom",)).tasks)
+    assert scored and set(scored) <= set(list_scored_tasks())
+    own = ComparisonRequest(esc, vehicle="passenger-car", scenarios=("gust",)).tasks
     assert {contest.reference for contest in own} == {"lagged"}
     gusts = [{"base": "gust", "name": name, "duration": s} for name, s in (("a", 1.0), ("b", 2.0))]
-    assert len(Challenge(esc, scenarios=tuple(gusts)).contests) == 4
+    assert len(ComparisonRequest(esc, scenarios=tuple(gusts)).tasks) == 4
     with pytest.raises(ValueError, match="two scenarios are called 'b': give each a name"):
-        assert Challenge(esc, scenarios=(*gusts, gusts[0] | {"name": "b"})).contests
+        assert ComparisonRequest(esc, scenarios=(*gusts, gusts[0] | {"name": "b"})).tasks
 
 
 def test_a_users_agent_has_nominals_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     """As it was tuned, and no tuned options of its own."""
     tuned = {NOMINAL: {"filter": {"force_sd": 7.0}, "controller": {"grip": 0.6}}}
     monkeypatch.setattr(
-        "sideslip.benchmarks.control.cells.tuned", lambda kind, name: tuned.get(name, {})
+        "sideslip.benchmarks.control.cells.get_tuned_options",
+        lambda kind, name: tuned.get(name, {}),
     )
-    mine = Pair("my.py:Pd").cell(Contest())
+    mine = UserEntry("my.py:Pd").make_entry(ControlTask())
     assert mine.best == {"filter": {"force_sd": 7.0}, "controller": {}}
-    assert mine.is_users and not Pair("esc").cell(Contest()).is_users
-    assert not Pair(NOMINAL, "").cell(Contest()).is_users
+    assert mine.is_users and not UserEntry("esc").make_entry(ControlTask()).is_users
+    assert not UserEntry(NOMINAL, "").make_entry(ControlTask()).is_users
 
 
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
-    "agent": ({"pairs": (Pair("lqrr"),)}, "unknown agent 'lqrr'"),
-    "estimator": ({"pairs": (Pair("lqr", "dakff"),)}, "unknown estimator 'dakff'"),
-    "zip": ({"pairs": (Pair("mine.zip"),)}, "mine.zip"),
-    "file": ({"pairs": (Pair("mine.py:A"),)}, "there is no file mine.py"),
+    "agent": ({"pairs": (UserEntry("lqrr"),)}, "unknown agent 'lqrr'"),
+    "estimator": ({"pairs": (UserEntry("lqr", "dakff"),)}, "unknown estimator 'dakff'"),
+    "zip": ({"pairs": (UserEntry("mine.zip"),)}, "mine.zip"),
+    "file": ({"pairs": (UserEntry("mine.py:A"),)}, "there is no file mine.py"),
     "id": ({"env_id": "YawFusion"}, "env"),
     "one episode": ({"episodes": 1}, "two episodes"),
     "no files": ({"fresh": True}, "there is none"),
@@ -271,7 +293,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 def test_a_challenge_that_cannot_be_driven_is_refused_before_it_is(case: str) -> None:
     options, message = WRONG[case]
     with pytest.raises((ValueError, TypeError, FileNotFoundError), match=message):
-        Challenge(**{"pairs": (Pair("esc"),)} | options)
+        ComparisonRequest(**{"pairs": (UserEntry("esc"),)} | options)
 
 
 @pytest.mark.parametrize(
@@ -294,6 +316,6 @@ def test_options_that_do_not_go_together(
 @pytest.mark.long
 def test_the_baselines_on_file_still_cost_the_same() -> None:
     """Else: `python -m sideslip.benchmarks.entrants.baselines`."""
-    cells = baselines.cells_of(some_of(contests()))
+    cells = baselines.make_baseline_entries(select_quick_tasks(list_scored_tasks()))
     assert len(baselines.read_baselines()) == len(cells)
-    assert baselines.on_file(cells, EPISODES) is not None
+    assert baselines.find_baselines(cells, EPISODES) is not None

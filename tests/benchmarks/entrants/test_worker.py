@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.control.cells import Cell
-from sideslip.benchmarks.control.contests import Contest
+from sideslip.benchmarks.control.cells import ControlEntry
+from sideslip.benchmarks.control.contests import ControlTask
 from sideslip.benchmarks.control.episodes import Chunk
 from sideslip.benchmarks.entrants.process import find_place
-from sideslip.benchmarks.entrants.worker import drive_apart, drive_users
+from sideslip.benchmarks.entrants.worker import run_isolated_chunk, run_user_chunk
 
 SHORT = {"scenario": {"base": "gust", "duration": 0.05}}
 HEAD = """
@@ -30,7 +30,9 @@ class Mine:
 
 def chunk(folder: Path, body: str, estimator: str = "") -> Chunk:
     (folder / "mine.py").write_text(f"{HEAD}        {body}\n")
-    cell = Cell(Contest(scenario="gust"), estimator, str(folder / "mine.py"), dict(SHORT))
+    cell = ControlEntry(
+        ControlTask(scenario="gust"), estimator, str(folder / "mine.py"), dict(SHORT)
+    )
     return Chunk(cell, (0, 1, 2), keep=True)
 
 
@@ -52,28 +54,28 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_an_agent_that_goes_wrong_was_not_driven(case: str, tmp_path: Path) -> None:
     body, reason = WRONG[case]
-    driven = drive_users(chunk(tmp_path, body))
+    driven = run_user_chunk(chunk(tmp_path, body))
     assert np.isnan(driven.numbers).all()
     assert re.search(reason, driven.error), driven.error
 
 
 def test_one_nan_ends_its_episode_alone(tmp_path: Path) -> None:
     """As the env has it: a failure of that episode, no end of the others."""
-    driven = drive_users(chunk(tmp_path, "action[1] = np.nan; return action, state"))
+    driven = run_user_chunk(chunk(tmp_path, "action[1] = np.nan; return action, state"))
     assert not driven.error
-    assert driven.failed("bad-action").tolist() == [0.0, 1.0, 0.0]
+    assert driven.mark_failures("bad-action").tolist() == [0.0, 1.0, 0.0]
 
 
 def test_what_it_does_to_its_process_is_its_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It ends, or never returns; the numbers of one that drives are those of this process."""
-    gone = drive_apart(chunk(tmp_path, "os._exit(3)"))
+    gone = run_isolated_chunk(chunk(tmp_path, "os._exit(3)"))
     assert gone.error == "its process ended with status 3"
     asleep = chunk(tmp_path, "import time; time.sleep(1e6)")
-    assert drive_apart(asleep, limit=1.0).error.startswith("no end within 1 s")
+    assert run_isolated_chunk(asleep, limit=1.0).error.startswith("no end within 1 s")
     fine = chunk(tmp_path, "print('hello'); action[:] = 0.1; return action, state")
-    apart, here = drive_apart(fine), drive_users(fine)
+    apart, here = run_isolated_chunk(fine), run_user_chunk(fine)
     assert not apart.error
     assert np.array_equal(apart.numbers, here.numbers)
     assert apart.series is not None and np.array_equal(apart.series, here.series)  # type: ignore[arg-type]
@@ -109,7 +111,9 @@ class Integrator:
 
 def test_a_filter_in_a_child_gives_the_bits_of_one_in_this_process(tmp_path: Path) -> None:
     (tmp_path / "filter.py").write_text(FILTER)
-    cell = Cell(Contest(scenario="gust"), str(tmp_path / "filter.py"), "lqr", dict(SHORT))
-    apart, here = (drive(Chunk(cell, (0, 1, 2))) for drive in (drive_apart, drive_users))
+    cell = ControlEntry(
+        ControlTask(scenario="gust"), str(tmp_path / "filter.py"), "lqr", dict(SHORT)
+    )
+    apart, here = (drive(Chunk(cell, (0, 1, 2))) for drive in (run_isolated_chunk, run_user_chunk))
     assert not apart.error
     assert np.array_equal(apart.numbers, here.numbers)

@@ -7,8 +7,8 @@ from zipfile import ZipFile
 import pytest
 
 import sideslip
-from sideslip.benchmarks.control.contests import YAW, Contest
-from sideslip.benchmarks.entrants.challenge import Challenge, pairs_of
+from sideslip.benchmarks.control.contests import YAW, ControlTask
+from sideslip.benchmarks.entrants.challenge import ComparisonRequest, make_user_entries
 
 
 def test_a_zip_drives_as_its_export_does(tmp_path: Path) -> None:
@@ -35,9 +35,11 @@ def test_a_zip_is_read_where_it_is_trusted(tmp_path: Path) -> None:
     with ZipFile(mine, "w") as archive:
         archive.writestr("data", "{}")
         archive.writestr("policy.pth", "")
-    (pair, other) = pairs_of([mine, "esc"], [], trust=True)
-    assert pair.estimator == "" and pair.cell(Contest()).best["controller"] == {"trust": True}
+    (pair, other) = make_user_entries([mine, "esc"], [], trust=True)
+    assert pair.estimator == "" and pair.make_entry(ControlTask()).best["controller"] == {
+        "trust": True
+    }
     assert not other.trust
-    Challenge((pair,))
+    ComparisonRequest((pair,))
     with pytest.raises(PermissionError, match=r"`sideslip export .*mine.zip --trust`"):
-        Challenge(tuple(pairs_of([mine], [])))
+        ComparisonRequest(tuple(make_user_entries([mine], [])))

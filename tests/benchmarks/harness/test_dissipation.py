@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import sideslip
-from sideslip.benchmarks.harness.dissipation import dissipated
+from sideslip.benchmarks.harness.dissipation import compute_dissipation
 
 assert sideslip.__version__
 COASTING = {
@@ -35,7 +35,7 @@ def test_it_is_the_kinetic_energy_that_a_coasting_car_loses(tyres: str) -> None:
         env.step(np.zeros((2, 1), np.float32))
         v_x, v_y, gamma = base.motion[:, :3].T
         energy.append(0.5 * m * (v_x**2 + v_y**2) + 0.5 * inertia * gamma**2)
-        heat.append(dissipated(base.params, base.states, base.switches))
+        heat.append(compute_dissipation(base.params, base.states, base.switches))
     lost = energy[0] - energy[-1]
     found = np.trapezoid(heat, dx=1e-3, axis=0)
     assert lost.min() > 20.0

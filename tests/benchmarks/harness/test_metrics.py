@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.metrics import EPISODE, FOLDS, METRICS, Metric
+from sideslip.benchmarks.harness.metrics import EPISODE, METRICS, REDUCTIONS, Metric
 
 VALUES = np.array([[0.3, -2.0], [-1.5, 0.5], [0.2, 0.1]])  # of 3 steps and 2 cars
 
@@ -21,13 +21,13 @@ VALUES = np.array([[0.3, -2.0], [-1.5, 0.5], [0.2, 0.1]])  # of 3 steps and 2 ca
 def test_a_fold_is_what_its_name_is(fold: str, expected: np.ndarray) -> None:
     total = np.zeros(2)
     for step in VALUES:
-        total = FOLDS[fold].add(total, np.abs(step) if fold == "max" else step)
-    assert FOLDS[fold].finish(total, np.full(2, 3.0)) == pytest.approx(expected)
+        total = REDUCTIONS[fold].add(total, np.abs(step) if fold == "max" else step)
+    assert REDUCTIONS[fold].finish(total, np.full(2, 3.0)) == pytest.approx(expected)
 
 
 def test_every_metric_of_an_episode_has_a_unit_and_a_fold() -> None:
     names = [metric.name for metric in EPISODE]
     assert len(set(names)) == len(names)
     for metric in EPISODE:
-        assert METRICS[metric.name] == metric.unit and metric.fold in FOLDS
+        assert METRICS[metric.name] == metric.unit and metric.reduction in REDUCTIONS
     assert Metric("x", "rad", lambda m: m.reward, "sum", scale=1e3).text(0.01234) == "12.3"

@@ -10,7 +10,9 @@ from scipy.stats import binom, trim_mean, ttest_1samp, ttest_ind
 from sideslip.benchmarks.harness.stats import (
     Estimate,
     average,
-    chance_of_no_less,
+    compute_p_value,
+    compute_tail_mean,
+    compute_win_rate,
     geometric_mean,
     holm,
     interval,
@@ -20,8 +22,6 @@ from sideslip.benchmarks.harness.stats import (
     ratio_of_roots,
     ratio_of_sums,
     share,
-    won,
-    worst,
 )
 
 Array = np.ndarray
@@ -91,8 +91,8 @@ OF_STRATA: dict[str, tuple[Callable[[Random, Sequence[int]], Estimate], Sequence
     "score, 8 to 64": (lambda rng, n: score(unlike(rng, n, 0.05)), (8, 16, 32, 64)),
     "score, 8 strata of 8": (lambda rng, n: score(unlike(rng, n, 0.05)), (8,) * 8),
     "gap": (lambda rng, n: average(logs(rng, n[0])[1]), (8,)),
-    "share won": (lambda rng, n: won(*costs(rng, n[0])[1::-1]), (64,)),
-    "worst 5 %": (lambda rng, n: worst(costs(rng, n[0])[1]), (500,)),
+    "share won": (lambda rng, n: compute_win_rate(*costs(rng, n[0])[1::-1]), (64,)),
+    "worst 5 %": (lambda rng, n: compute_tail_mean(costs(rng, n[0])[1]), (500,)),
 }
 TIGHT = ("geometric mean", "score", "share won", "worst 5 %")
 """Of so many that the interval is not wider than it need be."""
@@ -192,10 +192,14 @@ def test_what_the_numbers_are() -> None:
     ratio = geometric_mean(np.log(mine / nominal))
     assert ratio.value == pytest.approx(np.prod((mine / nominal) ** (1.0 / 500)))
     assert ratio.low * ratio.high == pytest.approx(ratio.value**2)
-    assert won(np.array([1.0, 2.0, 3.0]), np.array([2.0, 2.0, 2.0])).value == 0.5
-    assert worst(mine).value == pytest.approx(np.sort(mine)[-25:].mean())
-    assert worst(mine).low < worst(mine).value < worst(mine).high
-    assert worst(np.where(mine < np.median(mine), 0.1 * mine, mine)) == worst(mine)
+    assert compute_win_rate(np.array([1.0, 2.0, 3.0]), np.array([2.0, 2.0, 2.0])).value == 0.5
+    assert compute_tail_mean(mine).value == pytest.approx(np.sort(mine)[-25:].mean())
+    assert (
+        compute_tail_mean(mine).low < compute_tail_mean(mine).value < compute_tail_mean(mine).high
+    )
+    assert compute_tail_mean(
+        np.where(mine < np.median(mine), 0.1 * mine, mine)
+    ) == compute_tail_mean(mine)
     sums = ratio_of_sums([r, 2.0 * r], [gap, gap])
     assert sums.value == pytest.approx(3.0 * r.mean() / (2.0 * gap.mean()))
     assert trim_mean(r, 0.25) / gap.mean() != pytest.approx(sums.value, rel=1e-3)  # no middle
@@ -231,19 +235,21 @@ def test_holm_accuses_nobody_in_19_of_20_tables() -> None:
     """Twenty contestants as good as the best, 500 times: at most one table in 20 accuses one."""
     rng = np.random.default_rng(5)
     wrong = sum(
-        any(holm([chance_of_no_less(rng.laplace(size=64)) for _ in range(20)])) for _ in range(500)
+        any(holm([compute_p_value(rng.laplace(size=64)) for _ in range(20)])) for _ in range(500)
     )
     assert wrong / 500 < 0.08
-    assert holm([chance_of_no_less(rng.normal(-0.5, 1.0, 64)) for _ in range(20)]).count(True) > 10
+    assert holm([compute_p_value(rng.normal(-0.5, 1.0, 64)) for _ in range(20)]).count(True) > 10
 
 
 @pytest.mark.parametrize("n", [0, 1])
 def test_nothing_to_count_is_no_number(n: int) -> None:
     few = np.ones(n)
-    for found in (geometric_mean(few), ratio_of_sums([few], [few]), worst(few)):
+    for found in (geometric_mean(few), ratio_of_sums([few], [few]), compute_tail_mean(few)):
         assert math.isnan(found.value) == (n == 0) and math.isnan(found.low)
     assert math.isnan(share(few).value) == (n == 0)
-    assert chance_of_no_less(few) == 1.0
+    assert compute_p_value(few) == 1.0
     assert math.isnan(ratio_of_sums([], []).value)
     assert math.isnan(ratio_of_sums([np.ones(4)], [-np.ones(4)]).value)
-    assert all(math.isnan(each(np.array([1.0, np.nan])).value) for each in (share, worst))
+    assert all(
+        math.isnan(each(np.array([1.0, np.nan])).value) for each in (share, compute_tail_mean)
+    )

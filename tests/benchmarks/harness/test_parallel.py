@@ -18,8 +18,8 @@ from rich.console import Console
 
 from sideslip.benchmarks.estimation import run
 from sideslip.benchmarks.harness import engines, parallel
-from sideslip.benchmarks.harness.engines import completed, engine
-from sideslip.benchmarks.harness.parallel import one_bar, run_cases
+from sideslip.benchmarks.harness.engines import execute_cases, use_engine
+from sideslip.benchmarks.harness.parallel import run_cases, use_shared_bar
 
 CASES = [float(k) for k in range(12)]
 
@@ -47,14 +47,17 @@ def test_results_come_in_the_order_of_the_cases(tmp_path: Path, jobs: int) -> No
 
 
 def test_an_engine_that_is_none_is_refused() -> None:
-    with pytest.raises(ValueError, match="unknown engine 'rai'"), engine("rai"):
+    with pytest.raises(ValueError, match="unknown engine 'rai'"), use_engine("rai"):
         pass
-    with pytest.raises(ValueError, match="an address is of a Ray cluster"), engine(address="x:1"):
+    with (
+        pytest.raises(ValueError, match="an address is of a Ray cluster"),
+        use_engine(address="x:1"),
+    ):
         pass
 
 
 class Deadly:
-    """Ray's calls that `completed` makes; the worker of each case dies so many times."""
+    """Ray's calls that `execute_cases` makes; the worker of each case dies so many times."""
 
     def __init__(self, deaths: int) -> None:
         self.deaths = deaths
@@ -80,10 +83,10 @@ class Deadly:
 def test_a_case_outlives_so_many_deaths_of_its_worker_and_no_more() -> None:
     token = engines._CLUSTER.set(Deadly(engines.RETRIES))
     try:
-        assert dict(completed(abs, [-1, -2, -3])) == {0: 1, 1: 2, 2: 3}
+        assert dict(execute_cases(abs, [-1, -2, -3])) == {0: 1, 1: 2, 2: 3}
         engines._CLUSTER.set(Deadly(engines.RETRIES + 1))
         with pytest.raises(ChildProcessError):
-            list(completed(abs, [-1]))
+            list(execute_cases(abs, [-1]))
     finally:
         engines._CLUSTER.reset(token)
 
@@ -105,9 +108,9 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 @pytest.mark.long
 def test_a_node_that_dies_loses_nothing(cluster: Any, tmp_path: Path) -> None:
     nodes, second = cluster
-    with engine("ray", nodes.address):
+    with use_engine("ray", nodes.address):
         found: list[float] = []
-        for _, result in completed(partial(noted, str(tmp_path), 1.0), CASES):
+        for _, result in execute_cases(partial(noted, str(tmp_path), 1.0), CASES):
             found.append(result)
             if len(found) == 4:
                 before = counted(tmp_path, "done")
@@ -125,7 +128,7 @@ def test_a_case_that_ends_its_process_ends_the_work(
     from ray.exceptions import WorkerCrashedError
 
     monkeypatch.setattr(engines, "RETRIES", 1)
-    with pytest.raises(WorkerCrashedError), engine("ray", cluster[0].address):
+    with pytest.raises(WorkerCrashedError), use_engine("ray", cluster[0].address):
         run_cases(os._exit, [1])
 
 
@@ -162,7 +165,7 @@ def test_a_driver_that_is_killed_goes_on(cluster: Any, tmp_path: Path) -> None:
 def test_a_suite_has_the_same_rows_on_a_cluster(cluster: Any) -> None:
     nodes, _ = cluster
     alone = run(1, jobs=2)
-    with engine("ray", nodes.address):
+    with use_engine("ray", nodes.address):
         there = run(1)
     timed = "us_per_tick"
     rows = [[repr(row) for row in each.rows if row.metric != timed] for each in (alone, there)]
@@ -172,7 +175,7 @@ def test_a_suite_has_the_same_rows_on_a_cluster(cluster: Any) -> None:
 def test_a_cluster_that_is_not_there_is_named() -> None:
     with (
         pytest.raises(ValueError, match=r"no Ray cluster at 127\.0\.0\.1:1"),
-        engine("ray", "127.0.0.1:1"),
+        use_engine("ray", "127.0.0.1:1"),
     ):
         pass
 
@@ -181,7 +184,7 @@ def test_a_run_has_one_progress_bar() -> None:
     """It shows what runs; nothing of the phases before it stays."""
     written = io.StringIO()
     console = Console(file=written, width=80, force_terminal=True)
-    with one_bar(console, "bench"):
+    with use_shared_bar(console, "bench"):
         for phase in ("first", "second", "third"):
             assert run_cases(abs, [-1, -2], phase, jobs=1, console=console) == [1, 2]
     last = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written.getvalue()).splitlines()[-1]
@@ -216,7 +219,7 @@ def test_a_line_says_what_is_done_and_how_long_it_takes_still(
 ) -> None:
     """As long for each as the last ones took, without those before the first line."""
     monkeypatch.setattr(parallel, "_EVERY", 0.05)
-    with one_bar(Console(file=io.StringIO()), "work", "rounds", 400) as bar:
+    with use_shared_bar(Console(file=io.StringIO()), "work", "rounds", 400) as bar:
         time.sleep(0.1)
         bar.advance(bar.task_ids[0], 100)  # an earlier run's
         time.sleep(0.2)

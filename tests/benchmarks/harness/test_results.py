@@ -8,9 +8,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from sideslip.benchmarks.harness.results import (
-    Row,
+    ResultRow,
+    ResultTable,
     Suite,
-    Table,
     check_writable,
     read_json,
     write_json,
@@ -19,8 +19,8 @@ from sideslip.benchmarks.harness.results import (
 )
 
 ROWS = [
-    Row("estimation", "tie-vision-fig7", "rmse", 0.005, "dakf", low=0.004, high=0.006, n=100),
-    Row("speed", "x", "us_per_step", 2.5, verdict="report only"),
+    ResultRow("estimation", "tie-vision-fig7", "rmse", 0.005, "dakf", low=0.004, high=0.006, n=100),
+    ResultRow("speed", "x", "us_per_step", 2.5, verdict="report only"),
 ]
 
 
@@ -35,7 +35,7 @@ def test_rows_round_trip_through_json(tmp_path: Path) -> None:
 
 
 def test_a_notebook_shows_verdict_and_table_and_pandas_has_the_rows() -> None:
-    table = Table("Costs", ("who", "cost"), [["a < b", "1.0"]], "n = 3")
+    table = ResultTable("Costs", ("who", "cost"), [["a < b", "1.0"]], "n = 3")
     suite = Suite("s", "A suite", "", ROWS, [table], verdict="a wins.\nb does not.")
     html = suite._repr_html_()
     for text in ("<p>a wins.</p>", "A suite", "a &lt; b", "n = 3"):
@@ -68,9 +68,9 @@ def test_a_failed_write_leaves_the_old_file(
 
 def test_words_outside_the_vocabulary_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="unknown metric 'swiftness'"):
-        Row("a", "b", "swiftness", 1.0)
+        ResultRow("a", "b", "swiftness", 1.0)
     with pytest.raises(ValueError, match="unknown verdict 'good'"):
-        Row("a", "b", "rmse", 1.0, verdict="good")
+        ResultRow("a", "b", "rmse", 1.0, verdict="good")
 
 
 @pytest.mark.parametrize(

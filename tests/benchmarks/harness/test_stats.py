@@ -6,13 +6,13 @@ from scipy.stats import mannwhitneyu, ttest_1samp
 
 from sideslip.benchmarks.harness.parallel import run_cases
 from sideslip.benchmarks.harness.stats import (
+    compute_profile,
+    compute_win_rate,
     interval,
     mean,
     mean_share,
-    profile,
     ratio_of_roots,
     root_mean,
-    won,
 )
 
 
@@ -86,14 +86,14 @@ def test_definitions_are_those_of_rliable() -> None:
     rng = np.random.default_rng(7)
     costs, others = (rng.integers(0, 6, 80).astype(float) for _ in range(2))
     U = [mannwhitneyu([-a], [-b]).statistic for a, b in zip(costs, others, strict=True)]
-    assert won(costs, others).value == pytest.approx(np.mean(U), abs=1e-12)
+    assert compute_win_rate(costs, others).value == pytest.approx(np.mean(U), abs=1e-12)
     levels = np.array([-1.0, 0.0, 2.5, 5.0])
     above = [np.mean(-costs >= -level) for level in levels]
-    assert profile(costs, levels)[0] == pytest.approx(above, abs=1e-12)
+    assert compute_profile(costs, levels)[0] == pytest.approx(above, abs=1e-12)
 
 
 def test_a_profile_rises_to_all_that_do_not_fail() -> None:
     values = np.array([0.5, 1.0, 2.0, np.inf, np.nan])
-    value, low, high = profile(values, np.array([0.1, 0.5, 1.0, 100.0]))
+    value, low, high = compute_profile(values, np.array([0.1, 0.5, 1.0, 100.0]))
     assert value == pytest.approx([0.0, 0.2, 0.4, 0.6])
     assert np.all(low <= value) and np.all(value <= high)

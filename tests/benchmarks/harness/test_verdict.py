@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks import estimation, following, recovery
-from sideslip.benchmarks.harness.results import Table
+from sideslip.benchmarks.harness.results import ResultTable
 from sideslip.benchmarks.harness.stats import Estimate
-from sideslip.benchmarks.harness.verdict import LETTERS, LINES, leader, verdict
+from sideslip.benchmarks.harness.verdict import LETTERS, LINES, describe_leader, format_verdict
 from sideslip.benchmarks.papers import suite as papers
-from sideslip.benchmarks.papers.ledger.claim import Bound, Claim, Found, Part
+from sideslip.benchmarks.papers.ledger.claim import Bound, Claim, ClaimPart, MeasuredPart
 from sideslip.benchmarks.procedures import iso3888
 from sideslip.benchmarks.procedures import suite as procedures
-from sideslip.benchmarks.procedures.cases import Case, Sine
-from sideslip.benchmarks.procedures.contestants import CARS, CONTESTANTS
-from sideslip.benchmarks.procedures.fmvss126 import Result, Run
+from sideslip.benchmarks.procedures.cases import ProcedureCase, SineDwellOutcome
+from sideslip.benchmarks.procedures.contestants import CARS, ENTRIES
+from sideslip.benchmarks.procedures.fmvss126 import SineDwellResult, SineDwellRun
 from sideslip.benchmarks.recorded import suite as recorded
-from sideslip.benchmarks.recorded.run import Result as Replayed
+from sideslip.benchmarks.recorded.run import ReplayResult as Replayed
 from sideslip.benchmarks.speed import env_steps
 from sideslip.benchmarks.speed import suite as speed
 
@@ -34,19 +34,19 @@ def fits(text: str) -> list[str]:
 
 
 def test_a_verdict_has_five_lines_at_most() -> None:
-    assert verdict("a", "", "b") == "a\nb"
+    assert format_verdict("a", "", "b") == "a\nb"
     with pytest.raises(ValueError, match=r"at most 5 lines, got 6"):
-        verdict(*"abcdef")
+        format_verdict(*"abcdef")
 
 
 def test_an_interval_that_reaches_one_is_a_tie() -> None:
     sure, unsure = Estimate(0.7, 0.6, 0.8), Estimate(0.9, 0.8, 1.01)
-    assert leader("a", {"b": sure}, "cost") == "a costs least, 70 % [60, 80] as much as b"
+    assert describe_leader("a", {"b": sure}, "cost") == "a costs least, 70 % [60, 80] as much as b"
     tie = "a and {} cost least, too close to tell apart"
-    assert leader("a", {"b": unsure, "c": sure}, "cost") == tie.format("b")
-    assert leader("a", {"b": sure, "c": Estimate(0.9)}, "cost") == tie.format("c")
-    assert leader("a", {"b": Estimate(0.999, 0.998, 0.9995)}, "cost") == tie.format("b")
-    assert leader("a", {}, "cost") == "a costs least"
+    assert describe_leader("a", {"b": unsure, "c": sure}, "cost") == tie.format("b")
+    assert describe_leader("a", {"b": sure, "c": Estimate(0.9)}, "cost") == tie.format("c")
+    assert describe_leader("a", {"b": Estimate(0.999, 0.998, 0.9995)}, "cost") == tie.format("b")
+    assert describe_leader("a", {}, "cost") == "a costs least"
 
 
 def errors(levels: dict[str, float], experiment: estimation.Experiment) -> Any:
@@ -65,7 +65,7 @@ def test_the_best_estimator_is_named_for_each_experiment() -> None:
         errors({"multirate-kf": 4.0, "bicycle-kf": 64.0} | true, estimation.EXPERIMENTS[0]),
         errors({"dakf": 4.0, "course-kf": 4.0} | true, estimation.EXPERIMENTS[1]),
     ]
-    _, camera, gps, why, _ = fits(estimation.answer(found))
+    _, camera, gps, why, _ = fits(estimation.compose_verdict(found))
     assert camera.startswith("Late camera: multirate-kf errs least, 50 % [")
     assert "2.00 times the least possible" in camera
     assert "err least, too close to tell apart" in gps and "dakf" in gps and "course-kf" in gps
@@ -82,11 +82,13 @@ def test_recovery_names_who_saves_most_and_what_the_oracles_do() -> None:
     cars = {"a car": {name: shares(level) for name, level in levels.items()}}
     cars["a car"][recovery.CLAIRVOYANT] = np.full((5, 5, 8), 0.95)
     cars["another"] = cars["a car"] | {"lqr": cars["a car"]["esc"]}
-    _, first, second, why, _ = fits(recovery.answer(cars))
+    _, first, second, why, _ = fits(recovery.compose_verdict(cars))
     assert first == "a car: esc 70 %; lqr 50 %, none 20 %."
     assert second.startswith("another: esc and lqr 70 %; two-dof 30 %")
     assert "saves 90 % and 90 %, foresight too 95 % and 95 %" in why
-    assert len(fits(recovery.answer({"a car": {"none": shares(0.1)}}))) == 2  # nothing driven
+    assert (
+        len(fits(recovery.compose_verdict({"a car": {"none": shares(0.1)}}))) == 2
+    )  # nothing driven
 
 
 def test_following_takes_the_bandwidth_that_errs_least_and_never_fails() -> None:
@@ -96,24 +98,24 @@ def test_following_takes_the_bandwidth_that_errs_least_and_never_fails() -> None
     found[..., 3] = 0.0
     found[6:, 0, 3] = 1.0  # K = 50 and 100: a run fails
     lanes = [np.full((30, 3), 5.0)]
-    for i in range(1, len(following.KEEPERS)):
+    for i in range(1, len(following.LANE_CONTROLLERS)):
         lanes.append(np.column_stack([RNG.normal(1.0 if i != 4 else 0.5, 0.05, 30)] * 3))
-    _, follows, lane, why, _ = fits(following.answer(found, lanes))
+    _, follows, lane, why, _ = fits(following.compose_verdict(found, lanes))
     assert "K = 20 rad/s errs least, 10 %" in follows and "fail at 50, 100" in follows
     assert lane.startswith("Lanes: both on multirate-residual-kf strays least, 5")
     assert "m by -4" in why and "5.0 m" in why
     found[..., 3] = 1.0
-    assert "every bandwidth" in following.answer(found, lanes)
+    assert "every bandwidth" in following.compose_verdict(found, lanes)
 
 
 def claim(paper: str, stated: str, value: float) -> Any:
-    part = Part("x", "s", lambda _: np.empty(0), Bound(stated, 1.0), Bound("<", 9.0))
-    return Claim(paper, "Fig. 1", "smaller", (part,)), (Found(part, np.full(4, value)),)
+    part = ClaimPart("x", "s", lambda _: np.empty(0), Bound(stated, 1.0), Bound("<", 9.0))
+    return Claim(paper, "Fig. 1", "smaller", (part,)), (MeasuredPart(part, np.full(4, value)),)
 
 
 def test_claims_are_counted_and_those_that_do_not_hold_named() -> None:
     ledger = [claim("one", "<", 0.5), claim("one", ">", 0.5), claim("two", "<", 0.1)]
-    counts, by, failed, missed, _ = fits(papers.answer(ledger))
+    counts, by, failed, missed, _ = fits(papers.compose_verdict(ledger))
     assert counts == "3 claims of 2 papers: 2 reproduced, 1 not reproduced."
     assert "one 1 of 2; two 1 of 1" in by
     assert failed.startswith("Not reproduced: one Fig. 1.")
@@ -123,26 +125,28 @@ def test_claims_are_counted_and_those_that_do_not_hold_named() -> None:
 def test_procedures_name_who_passes_and_who_is_fastest(monkeypatch: pytest.MonkeyPatch) -> None:
     def sine(fails: bool) -> Any:
         ratio = 0.9 if fails else 0.1
-        runs = (Run(1.0, 3.0, 0.1, 0.1, 2.0), Run(2.0, 6.0, ratio, 0.1, 2.0))
-        return Sine(Result(0.3, runs), None)  # type: ignore[arg-type]
+        runs = (SineDwellRun(1.0, 3.0, 0.1, 0.1, 2.0), SineDwellRun(2.0, 6.0, ratio, 0.1, 2.0))
+        return SineDwellOutcome(SineDwellResult(0.3, runs), None)  # type: ignore[arg-type]
 
     track = next(iter(iso3888.TRACKS))
-    monkeypatch.setattr(iso3888, "highest", lambda runs: runs)
-    done: dict[Case, Any] = {}
+    monkeypatch.setattr(iso3888, "find_highest_speed", lambda runs: runs)
+    done: dict[ProcedureCase, Any] = {}
     for car in CARS:
-        for k in range(len(CONTESTANTS)):
-            done[Case("fmvss-126", car, k)] = sine(fails=k not in (2, 3, 4))
-            done[Case(track, car, k)] = 30.0 if k == 3 else 20.0
-    lines = fits(procedures.answer(done))
+        for k in range(len(ENTRIES)):
+            done[ProcedureCase("fmvss-126", car, k)] = sine(fails=k not in (2, 3, 4))
+            done[ProcedureCase(track, car, k)] = 30.0 if k == 3 else 20.0
+    lines = fits(procedures.make_verdict(done))
     assert "coms: two-dof, lqr and esc; none fails above 3 A" in lines[1]
     assert "coms 108 with lqr (none 72)" in " ".join(lines)
 
 
 def test_a_replay_without_truth_has_no_winner() -> None:
     traces = {"bicycle-kf": np.zeros(3), "exact-kf": np.zeros(3)}
-    assert fits(recorded.answer(Replayed(traces=traces), False))[0].startswith("Nobody wins")
+    assert fits(recorded.compose_verdict(Replayed(traces=traces), False))[0].startswith(
+        "Nobody wins"
+    )
     squares = {"bicycle-kf": np.full(3, 4e-4), "exact-kf": np.array([0.9, 1.0, 1.1]) * 1e-4}
-    lines = fits(recorded.answer(Replayed(squares=squares, traces=traces), True))
+    lines = fits(recorded.compose_verdict(Replayed(squares=squares, traces=traces), True))
     assert "exact-kf strays least, 50 % [47, 52] as much as bicycle-kf" in lines[1]
     assert "0.57 deg" in lines[2] and "1.15 deg" in lines[3] and "drawn noise" in lines[4]
 
@@ -151,7 +155,7 @@ def test_speed_counts_its_goals_and_names_those_that_are_missed() -> None:
     taken = {env_steps.FUSION: [9.0, 10.0, 11.0], env_steps.AT_ONCE: [0.5], env_steps.LANE: [300.0]}
     cells = [["a", ">= 2 x", "3", "", "met"], ["b", ">= 9 x", "3", "", "not met"]]
     cells.append(["c", ">= 1 x", "", "", "not measured"])
-    lines = fits(speed.answer(taken, Table("Targets", ("",) * 5, cells)))
+    lines = fits(speed.make_verdict(taken, ResultTable("Targets", ("",) * 5, cells)))
     assert lines[0].startswith("10 ms of driving cost 10 us on one core, 0.5 us a car")
     assert "it is 30 for lane-keeping" in lines[1]
     assert lines[2] == "1 of 3 goals are met; not met: b (3 of >= 9 x)."

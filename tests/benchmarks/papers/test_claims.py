@@ -13,28 +13,31 @@ from sideslip.benchmarks.papers.claims import CLAIMS, FIGURES, SIMULATIONS
 from sideslip.benchmarks.papers.ledger.claim import (
     Bound,
     Claim,
-    Measured,
-    Part,
-    find,
-    number,
-    over_others,
-    ratio,
-    verdict,
+    ClaimPart,
+    SimulationResult,
+    compare_others,
+    evaluate_claim,
+    measure_parts,
+    select_number,
+    select_ratio,
 )
-from sideslip.benchmarks.papers.ledger.simulations import joined
+from sideslip.benchmarks.papers.ledger.simulations import join_results
 from sideslip.benchmarks.papers.theory import observability
-from sideslip.benchmarks.papers.tie_vision.appendix import residuals
+from sideslip.benchmarks.papers.tie_vision.appendix import compute_residuals
 
 
 def judged(*parts: tuple[Any, Any]) -> str:
     """The verdict on parts of (numbers, bound)."""
-    results = {"s": Measured({(str(i), "m"): np.array(v) for i, (v, _) in enumerate(parts)})}
+    results = {
+        "s": SimulationResult({(str(i), "m"): np.array(v) for i, (v, _) in enumerate(parts)})
+    }
     claim = Claim(
         "p", "(1)", "t", tuple(
-            Part("l", "s", number("s", str(i), "m"), bound) for i, (_, bound) in enumerate(parts)
+            ClaimPart("l", "s", select_number("s", str(i), "m"), bound) for i,
+            (_, bound) in enumerate(parts)
         ),
     )  # fmt: skip
-    return verdict(find(claim, results))
+    return evaluate_claim(measure_parts(claim, results))
 
 
 BELOW = Bound("<", 1.0)
@@ -61,20 +64,22 @@ def test_the_verdict_follows_from_the_numbers(parts: Any, expected: str) -> None
 
 
 def test_a_threshold_is_one_of_the_median_and_not_of_the_verdict() -> None:
-    results = {"s": Measured({("a", "m"): np.array([0.7, 0.8, 5.0])})}
-    part = Part("l", "s", number("s", "a", "m"), BELOW, Bound("<=", 0.75))
-    found = find(Claim("p", "(1)", "t", (part,)), results)
+    results = {"s": SimulationResult({("a", "m"): np.array([0.7, 0.8, 5.0])})}
+    part = ClaimPart("l", "s", select_number("s", "a", "m"), BELOW, Bound("<=", 0.75))
+    found = measure_parts(Claim("p", "(1)", "t", (part,)), results)
     assert (found[0].median, found[0].low, found[0].high) == (0.8, 0.7, 5.0)
-    assert found[0].threshold_met is False
-    assert verdict(found) == "partly"
+    assert found[0].meets_threshold is False
+    assert evaluate_claim(found) == "partly"
 
 
 def test_ratios_are_taken_seed_by_seed() -> None:
     numbers = {("a", "beta"): [1.0, 2.0], ("b", "beta"): [2.0, 1.0], ("c", "beta"): [4.0, 8.0]}
-    results = {"s": Measured({key: np.array(value) for key, value in numbers.items()})}
-    np.testing.assert_array_equal(ratio("s", "a", "b")(results), [0.5, 2.0])
-    np.testing.assert_array_equal(over_others("s", "a", ("b", "c"), np.max)(results), [0.25, 0.25])
-    np.testing.assert_array_equal(over_others("s", "a", ("b", "c"), np.min)(results), [0.5, 2.0])
+    results = {"s": SimulationResult({key: np.array(value) for key, value in numbers.items()})}
+    np.testing.assert_array_equal(select_ratio("s", "a", "b")(results), [0.5, 2.0])
+    np.testing.assert_array_equal(
+        compare_others("s", "a", ("b", "c"), np.max)(results), [0.25, 0.25]
+    )
+    np.testing.assert_array_equal(compare_others("s", "a", ("b", "c"), np.min)(results), [0.5, 2.0])
 
 
 def test_bad_claims_are_refused() -> None:
@@ -84,9 +89,9 @@ def test_bad_claims_are_refused() -> None:
         Bound("<", float("inf"))
     with pytest.raises(ValueError, match="at least one part"):
         Claim("p", "(1)", "t", ())
-    empty = Part("l", "s", lambda results: np.zeros(0))
+    empty = ClaimPart("l", "s", lambda results: np.zeros(0))
     with pytest.raises(ValueError, match=r"\(0,\) numbers"):
-        find(Claim("p", "(1)", "t", (empty,)), {})
+        measure_parts(Claim("p", "(1)", "t", (empty,)), {})
 
 
 def test_the_ledger_names_what_exists() -> None:
@@ -113,13 +118,13 @@ def test_chunks_cover_every_seed_once() -> None:
 
 
 def test_joined_chunks_keep_the_order_of_the_seeds() -> None:
-    parts = [Measured({("a", "m"): np.arange(k, k + 2.0)}) for k in (0, 2)]
-    np.testing.assert_array_equal(joined(parts).numbers["a", "m"], np.arange(4.0))
+    parts = [SimulationResult({("a", "m"): np.arange(k, k + 2.0)}) for k in (0, 2)]
+    np.testing.assert_array_equal(join_results(parts).numbers["a", "m"], np.arange(4.0))
 
 
 def test_exact_ranks() -> None:
     """docs/PAPERS.md section 3: dakf 4 of 5, dual-rate 4 of 6, vision alone 4 of 4."""
-    numbers = observability.coms_ranks(()).numbers
+    numbers = observability.compute_coms_ranks(()).numbers
     ranks = {name: float(value[0]) for (name, _), value in numbers.items()}
     assert ranks == {"dakf": 4.0, "dual-rate": 4.0, "vision": 4.0}
     singular = [[Fraction(1, 3), Fraction(2, 3)], [Fraction(1), Fraction(2)]]
@@ -128,7 +133,7 @@ def test_exact_ranks() -> None:
 
 def test_the_appendix_holds_as_corrected_and_fails_as_printed() -> None:
     """tie-vision's appendix on random time-varying systems."""
-    for (label, _), values in residuals((0, 1, 2)).numbers.items():
+    for (label, _), values in compute_residuals((0, 1, 2)).numbers.items():
         if label.endswith("printed"):
             assert values.min() > 0.01, label
         else:

@@ -5,9 +5,9 @@ import numpy.typing as npt
 import pytest
 
 from sideslip.benchmarks.papers.theory import error_maps
-from sideslip.benchmarks.papers.theory.dual_rate_gains import COURSE_SD, RATIO, extended
+from sideslip.benchmarks.papers.theory.dual_rate_gains import COURSE_SD, RATIO, make_extended_model
 from sideslip.estimators.design import dual_rate as spread
-from sideslip.estimators.design.kalman import gain
+from sideslip.estimators.design.kalman import kalman_gain
 
 Array = npt.NDArray[np.float64]
 
@@ -18,9 +18,9 @@ def test_pseudo_measurements_equal_fast_ones_for_square_c_only() -> None:
     A = 0.97 * np.linalg.qr(rng.normal(size=(3, 3)))[0]
     for outputs, equal in ((3, True), (2, False)):
         C = rng.normal(size=(outputs, 3))
-        L = gain(np.eye(3), C, np.eye(outputs))
-        ours = error_maps.pseudo(A, C, L, 10)
-        off = error_maps.difference(ours, error_maps.fast(A, C, L, 10))
+        L = kalman_gain(np.eye(3), C, np.eye(outputs))
+        ours = error_maps.make_pseudo_maps(A, C, L, 10)
+        off = error_maps.compute_difference(ours, error_maps.make_fast_maps(A, C, L, 10))
         assert off < 1e-12 if equal else off > 0.1
 
 
@@ -29,7 +29,7 @@ def test_the_maps_are_what_a_simulated_error_does() -> None:
     rng = np.random.default_rng(6)
     A, C = 0.3 * rng.normal(size=(3, 3)), rng.normal(size=(1, 3))
     L = 0.3 * rng.normal(size=(3, 1))
-    maps = error_maps.pseudo(A, C, L, 3)
+    maps = error_maps.make_pseudo_maps(A, C, L, 3)
     x, start = rng.normal(size=3), rng.normal(size=3)
     hat = x - start
     innovation = C @ (x - hat)  # (13)
@@ -52,7 +52,7 @@ def test_prediction_alone_moves_what_the_sample_left() -> None:
     """(34)."""
     rng = np.random.default_rng(7)
     A, C, L = rng.normal(size=(3, 3)), rng.normal(size=(2, 3)), rng.normal(size=(3, 2))
-    maps = error_maps.predicted(A, C, L, 4)
+    maps = error_maps.make_predicted_maps(A, C, L, 4)
     np.testing.assert_allclose(maps[3], A @ A @ A @ (np.eye(3) - L @ C))
 
 
@@ -61,7 +61,7 @@ def radius_of_29(q: Array, printed: bool, frames: int = 30) -> float:
 
     printed: the noise term is (I + C Lambda) V_k, as printed; else (G + C Lambda) V_k.
     """
-    A, C = extended()
+    A, C = make_extended_model()
     I, one, R, Q = np.eye(6), np.eye(1), np.array([[COURSE_SD**2]]), np.diag(q) * 1e-3  # noqa: E741
     P = 0.01 * np.eye(6)
     for _ in range(frames):
@@ -72,7 +72,7 @@ def radius_of_29(q: Array, printed: bool, frames: int = 30) -> float:
                 G = C @ Psi @ C.T @ np.linalg.inv(C @ C.T)  # (31)
                 of_v = (one if printed else G) + C @ Lambda
                 R_star = C @ noise @ C.T + of_v @ R @ of_v.T  # of V*, (29)
-            L = gain(P, C, R_star)
+            L = kalman_gain(P, C, R_star)
             P = (I - L @ C) @ P
             P = A @ (0.5 * (P + P.T)) @ A.T + Q
             Psi = A @ (Psi - L @ G @ C)  # (26)
@@ -85,8 +85,8 @@ def radius_of_29(q: Array, printed: bool, frames: int = 30) -> float:
 def test_gains_from_the_pseudo_noise_grow(strength: float) -> None:
     """docs/PAPERS.md found a radius of 1.17 to 1.22, as printed and as corrected."""
     q = np.array([1e-4, 1e-4, 1e-4, strength, strength, strength])
-    A, C = extended()
-    shares = spread.from_29(A, np.diag(q) * 1e-3, C, np.array([[COURSE_SD**2]]), RATIO)
+    A, C = make_extended_model()
+    shares = spread.compute_shares_29(A, np.diag(q) * 1e-3, C, np.array([[COURSE_SD**2]]), RATIO)
     ours = float(np.abs(np.linalg.eigvals(spread.frame_map(A, C, shares))).max())
     corrected, printed = radius_of_29(q, False), radius_of_29(q, True)
     assert ours == pytest.approx(corrected, rel=1e-3)

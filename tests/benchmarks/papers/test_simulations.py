@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.harness.drives import SETTLED, filter_arguments, quietly
-from sideslip.benchmarks.harness.parallel import chunked
-from sideslip.benchmarks.papers.ledger.controllers import Following, Slip
+from sideslip.benchmarks.harness.drives import SETTLED, call_quietly, make_filter_arguments
+from sideslip.benchmarks.harness.parallel import split_seeds
+from sideslip.benchmarks.papers.ledger.controllers import FollowingSimulation, SlipSimulation
 from sideslip.benchmarks.papers.ledger.filters import (
-    Estimation,
-    Filter,
-    filters_for,
-    tuned_for_paper,
+    EstimationSimulation,
+    PaperFilter,
+    get_paper_tuning,
+    make_filters,
 )
 from sideslip.estimators import make_estimator
 
@@ -23,8 +23,8 @@ SHORT: dict[str, Any] = {"base": "tie-vision-fig7", "name": "short", "duration":
 
 
 def test_numbers_of_an_estimation_are_those_of_its_drives() -> None:
-    filters = (Filter("a", "multirate-kf"), Filter("b", "bicycle-kf", vehicle="true"))
-    found = Estimation("short", VISION, SHORT, filters, bound=True).measure((3, 5))
+    filters = (PaperFilter("a", "multirate-kf"), PaperFilter("b", "bicycle-kf", vehicle="true"))
+    found = EstimationSimulation("short", VISION, SHORT, filters, bound=True).measure((3, 5))
     env = gym.make(VISION, scenario=SHORT, control_period=10)
     base: Any = env.unwrapped
     for i, seed in enumerate((3, 5)):
@@ -48,14 +48,18 @@ def test_numbers_of_an_estimation_are_those_of_its_drives() -> None:
 def test_a_car_that_fails_is_no_estimation() -> None:
     scenario = SHORT | {"half_width": 0.3}
     with pytest.raises(RuntimeError, match="narrow: the car of seed 0 failed"):
-        Estimation("narrow", VISION, scenario, (Filter("a", "bicycle-kf"),)).measure((0,))
+        EstimationSimulation("narrow", VISION, scenario, (PaperFilter("a", "bicycle-kf"),)).measure(
+            (0,)
+        )
     with pytest.raises(ValueError, match="soft: no bound is known where the tyres change on the"):
-        Estimation("soft", VISION, "stiffness-step", (), bound=True)
+        EstimationSimulation("soft", VISION, "stiffness-step", (), bound=True)
 
 
 def test_options_of_a_contestant_reach_its_agent() -> None:
     label = "multirate, stronger"
-    slip = Slip("s", "tie-vision-fig8", ("none", "multirate", label), {label: {"gain": 5.0}})
+    slip = SlipSimulation(
+        "s", "tie-vision-fig8", ("none", "multirate", label), {label: {"gain": 5.0}}
+    )
     numbers = slip.measure((0,)).numbers
     assert numbers["none", "saturation"] == 0.0
     assert numbers[label, "rms_slip"] < 0.9 * numbers["multirate", "rms_slip"]
@@ -65,7 +69,7 @@ def test_options_of_a_contestant_reach_its_agent() -> None:
 @pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 def test_following_has_the_reference_beside_the_car() -> None:
     scenario = {"base": "dakf-fig7", "name": "short", "duration": 1.5}
-    found = Following("f", scenario, {"without": {"agent": "none"}}).measure((0,))
+    found = FollowingSimulation("f", scenario, {"without": {"agent": "none"}}).measure((0,))
     assert found.example is not None
     curves = found.example.curves
     error = curves["without"]["gamma"] - curves["reference"]["gamma"]
@@ -75,19 +79,19 @@ def test_following_has_the_reference_beside_the_car() -> None:
 
 
 def test_seeds_are_split_and_shared() -> None:
-    assert chunked(7, 3) == [(0, 1, 2), (3, 4, 5), (6,)]
-    assert Following("f", "dakf-fig7", {}, share=0.25).chunks(8) == [(0, 1)]
-    assert Following("f", "dakf-fig7", {}, share=0.25).chunks(1) == [(0,)]
+    assert split_seeds(7, 3) == [(0, 1, 2), (3, 4, 5), (6,)]
+    assert FollowingSimulation("f", "dakf-fig7", {}, share=0.25).chunks(8) == [(0, 1)]
+    assert FollowingSimulation("f", "dakf-fig7", {}, share=0.25).chunks(1) == [(0,)]
 
 
 def test_claims_are_judged_with_the_papers_tuning() -> None:
     """What a figure's own tuning has of dakf is in its filter, and is not the package's."""
     env: Any = gym.make("sideslip/YawGps-v0", scenario="dakf-fig6")
     env.reset(seed=0)
-    facts = filter_arguments(env.unwrapped)
-    (ours,) = filters_for([Filter("dakf", "dakf")], env.unwrapped).values()
-    package = quietly(make_estimator, "dakf", **facts)
-    wanted = quietly(make_estimator, "dakf", **facts, **tuned_for_paper("dakf"))
+    facts = make_filter_arguments(env.unwrapped)
+    (ours,) = make_filters([PaperFilter("dakf", "dakf")], env.unwrapped).values()
+    package = call_quietly(make_estimator, "dakf", **facts)
+    wanted = call_quietly(make_estimator, "dakf", **facts, **get_paper_tuning("dakf"))
     Q = [np.diag(each.filters[0].Q)[:5] for each in (ours, wanted, package)]
     assert np.array_equal(Q[0], Q[1])
     assert (Q[0] != Q[2]).all()

@@ -8,27 +8,27 @@ import numpy as np
 import pytest
 
 from sideslip.agents.design.pi import PLACEMENTS, POLE, design_pi
-from sideslip.benchmarks.papers.tie_vision.margins import gain_margin
+from sideslip.benchmarks.papers.tie_vision.margins import compute_gain_margin
 from sideslip.benchmarks.papers.tie_vision.table_two import (
     INTEGRALS,
     PRINTED,
     SENSORS,
     LoopDesign,
-    estimator_loop,
-    plain_loop,
+    compute_margins,
+    make_estimator_loop,
+    make_plain_loop,
     search,
-    table_two,
 )
 from sideslip.envs import COMS
-from sideslip.envs.vehicle.linear import bicycle, vision
-from sideslip.estimators.design.kalman import gain, joseph
+from sideslip.envs.vehicle.linear import make_bicycle_model, make_vision_model
+from sideslip.estimators.design.kalman import joseph_form, kalman_gain
 
 V = 25.0 / 3.6
 DESIGN = LoopDesign()
 
 
 def test_a_real_pole_is_where_it_was_placed() -> None:
-    model, pi = bicycle(COMS, V), design_pi(COMS, V, POLE, "real")
+    model, pi = make_bicycle_model(COMS, V), design_pi(COMS, V, POLE, "real")
     plant = control.StateSpace(model.A, model.B[:, 1:], [[1.0, 0.0]], 0.0)
     poles = control.feedback(control.tf([pi.k_p, pi.k_i], [1.0, 0.0]) * plant, 1).poles()
     slow, fast = np.sort(-model.to_control().poles().real)
@@ -42,13 +42,13 @@ def test_the_loop_is_what_a_step_by_step_controller_does(sensors: str, integral:
     """An impulse of yaw moment on the plant; the filter's gain from its covariance recursion."""
     design = dataclasses.replace(DESIGN, sensors=sensors, integral=integral, noise=1e-3)
     dt = 0.033
-    loop = estimator_loop(COMS, design, dt)
+    loop = make_estimator_loop(COMS, design, dt)
     steps = 40
     _, response = control.impulse_response(loop, np.arange(steps) * dt)
     pi = design_pi(COMS, V, design.pole, design.placement)
 
-    model = bicycle(COMS, V) if sensors == "gyro" else vision(COMS, V)
-    G, H = model.discrete(dt)
+    model = make_bicycle_model(COMS, V) if sensors == "gyro" else make_vision_model(COMS, V)
+    G, H = model.discretise(dt)
     n, late = len(G), sensors == "vision-delayed"
     C, Q = model.C, np.diag([design.q_ratio, 1.0, 1.0, 1.0][:n])
     F, measured = G, C
@@ -57,8 +57,8 @@ def test_the_loop_is_what_a_step_by_step_controller_does(sensors: str, integral:
         measured, Q = np.eye(6)[[1, 4, 5]], np.diag([*np.diag(Q), 0.0, 0.0])
     P, R = np.eye(len(F)), design.noise * np.eye(len(measured))
     for _ in range(3000):
-        K = gain(P, measured, R)
-        P = F @ joseph(P, K, measured, R) @ F.T + Q
+        K = kalman_gain(P, measured, R)
+        P = F @ joseph_form(P, K, measured, R) @ F.T + Q
     x, seen, hat, total, out = np.zeros(n), np.zeros(2), np.zeros(len(F)), 0.0, []
     for k in range(steps):
         y = C @ x if not late else np.array([x[1], *seen])
@@ -79,10 +79,10 @@ def test_the_loop_is_what_a_step_by_step_controller_does(sensors: str, integral:
 
 def test_a_filter_that_sees_the_true_moment_does_not_show() -> None:
     """Why the loop is opened at the plant only: the plain loop is the limit of a perfect filter."""
-    loop = plain_loop(COMS, DESIGN, 0.001)
+    loop = make_plain_loop(COMS, DESIGN, 0.001)
     pi = design_pi(COMS, V, DESIGN.pole, DESIGN.placement)
     z = np.exp(1j * np.array([1.0, 10.0, 100.0]) * 0.001)
-    G, H = bicycle(COMS, V).discrete(0.001)
+    G, H = make_bicycle_model(COMS, V).discretise(0.001)
     plant = np.array([np.linalg.solve(w * np.eye(2) - G, H[:, 1])[0] for w in z])
     expected = plant * (pi.k_p + pi.k_i * 0.001 / (z - 1.0))
     assert loop(z) == pytest.approx(expected, rel=1e-9)
@@ -90,7 +90,7 @@ def test_a_filter_that_sees_the_true_moment_does_not_show() -> None:
 
 def test_table_ii_within_half_a_decibel() -> None:
     """PAPERS section 3: 5.92 and 22.8 dB, both crossovers at half the sampling rate."""
-    found = zip(table_two(COMS, DESIGN), PRINTED, (0.033, 0.001), strict=True)
+    found = zip(compute_margins(COMS, DESIGN), PRINTED, (0.033, 0.001), strict=True)
     for (decibels, omega), printed, dt in found:
         assert decibels == pytest.approx(printed, abs=0.5)
         assert omega == pytest.approx(math.pi / dt, rel=1e-12)
@@ -100,7 +100,9 @@ def test_table_ii_within_half_a_decibel() -> None:
 def test_the_multirate_loop_has_the_larger_gain_margin_with_the_same_pi(placement: str) -> None:
     """PAPERS section 3: by 20 dB at least."""
     design = dataclasses.replace(DESIGN, placement=placement)
-    slow, fast = (gain_margin(plain_loop(COMS, design, dt))[0] for dt in (0.033, 0.001))
+    slow, fast = (
+        compute_gain_margin(make_plain_loop(COMS, design, dt))[0] for dt in (0.033, 0.001)
+    )
     assert fast - slow >= 20.0
 
 

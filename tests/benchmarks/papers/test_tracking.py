@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.papers.ledger.tracking import drive, tracking
+from sideslip.benchmarks.papers.ledger.tracking import measure_tracking, run_episode
 
 FIG7: dict[str, Any] = {
     "base": "dakf-fig6",
@@ -32,12 +32,12 @@ pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.Unobservabl
 def compared(seeds: Iterable[int], scenario: Any, **options: Any) -> dict[str, Any]:
     """With control over without it, (seeds,) each: RMS errors of beta and gamma, peak of beta.
 
-    `saturated` and `failed` are those with control. options: of `drive`.
+    `saturated` and `failed` are those with control. options: of `run_episode`.
     """
     rows = []
     for seed in seeds:
-        none = tracking(drive(seed, scenario, "none"))
-        ours = tracking(drive(seed, scenario, **options))
+        none = measure_tracking(run_episode(seed, scenario, "none"))
+        ours = measure_tracking(run_episode(seed, scenario, **options))
         rows.append(
             {
                 "rms_beta": ours.rms_beta / none.rms_beta,
@@ -51,8 +51,8 @@ def compared(seeds: Iterable[int], scenario: Any, **options: Any) -> dict[str, A
 
 
 def test_the_numbers_are_those_of_the_episode() -> None:
-    episode = drive(0, FIG7 | {"duration": 2.0})
-    found = tracking(episode)
+    episode = run_episode(0, FIG7 | {"duration": 2.0})
+    found = measure_tracking(episode)
     assert found.rms_beta == np.sqrt(np.mean((episode["beta"] - episode["beta_ref"]) ** 2))
     assert found.rms_gamma == np.sqrt(np.mean((episode["gamma"] - episode["gamma_ref"]) ** 2))
     assert found.peak_beta == np.max(np.abs(episode["beta"]))
@@ -60,7 +60,7 @@ def test_the_numbers_are_those_of_the_episode() -> None:
     assert episode["t"][-1] == 2.0
     assert len(episode["t"]) == 2001
     assert 0.0 < found.steered < 1.0
-    none = tracking(drive(0, FIG7 | {"duration": 2.0}, "none"))
+    none = measure_tracking(run_episode(0, FIG7 | {"duration": 2.0}, "none"))
     assert (none.saturated, none.steered) == (0.0, 0.0)
 
 

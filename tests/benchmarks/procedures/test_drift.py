@@ -7,13 +7,20 @@ import pytest
 
 pytest.importorskip("vehiclemodels")
 from sideslip.benchmarks.procedures import fmvss126
-from sideslip.benchmarks.procedures.drive import Drive, Fields, Law, Series, TestCar, prescribed
-from sideslip.envs.outside.plants import Drift, outside_vehicle
+from sideslip.benchmarks.procedures.drive import (
+    DriveFunction,
+    Fields,
+    Law,
+    Series,
+    TestCar,
+    simulate_plant,
+)
+from sideslip.envs.outside.plants import Drift, make_outside_vehicle
 from sideslip.envs.vehicle.dynamics import Motion
 from sideslip.envs.vehicle.vehicle import GRAVITY
 
 V = 80.0 / 3.6
-BMW = TestCar(outside_vehicle(), V, 16.0, 4.508, 0.8)
+BMW = TestCar(make_outside_vehicle(), V, 16.0, 4.508, 0.8)
 MOST = 500.0  # N m
 
 
@@ -30,10 +37,12 @@ def steering(fields: Fields, t: float) -> float:
     return float(amplitude * math.sin(math.tau * phase)) if phase < 1.0 else 0.0
 
 
-def drive_with(law: Law | None) -> Drive:
+def drive_with(law: Law | None) -> DriveFunction:
     def drive(fields: Fields) -> Series:
         hold = fields["steering"] == "ramp"
-        return prescribed(Drift(), lambda t: steering(fields, t), V, fields["duration"], hold, law)
+        return simulate_plant(
+            Drift(), lambda t: steering(fields, t), V, fields["duration"], hold, law
+        )
 
     return drive
 
@@ -41,13 +50,13 @@ def drive_with(law: Law | None) -> Drive:
 def within_500(motion: Motion, steer: float) -> float:
     """Yaw rate error against what neutral steering and friction allow, saturated."""
     most = 0.85 * GRAVITY / motion.v_x
-    wanted = np.clip(motion.v_x * steer / outside_vehicle().wheelbase, -most, most)
+    wanted = np.clip(motion.v_x * steer / make_outside_vehicle().wheelbase, -most, most)
     return float(np.clip(2e4 * (wanted - motion.gamma), -MOST, MOST))
 
 
 @pytest.fixture(scope="module")
 def A() -> float:
-    return fmvss126.steering_for(drive_with(None), BMW)
+    return fmvss126.measure_reference_angle(drive_with(None), BMW)
 
 
 def test_without_control_the_car_fails_at_5_a(A: float) -> None:
@@ -64,6 +73,6 @@ def test_a_yaw_moment_of_500_n_m_passes_at_6_5_a(A: float) -> None:
 
 def test_a_belongs_to_0_3_g_of_the_steady_car(A: float) -> None:
     """Within the lag of a slow ramp and what the Magic Formula loses by 0.3 g."""
-    car = outside_vehicle()
+    car = make_outside_vehicle()
     steady = 0.3 * GRAVITY * car.wheelbase / V**2  # of a neutral car
     assert A / BMW.ratio == pytest.approx(steady, rel=0.2)

@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.procedures import fmvss126, iso3888, iso4138, iso7401
-from sideslip.benchmarks.procedures.contestants import CARS, CONTESTANTS
-from sideslip.benchmarks.procedures.drive import CALM, Drive, Series, of_env, steering_programme
+from sideslip.benchmarks.procedures.contestants import CARS, ENTRIES
+from sideslip.benchmarks.procedures.drive import (
+    CALM,
+    DriveFunction,
+    Series,
+    make_env_drive,
+    make_steering_profile,
+)
 from sideslip.envs import Scenario
-from sideslip.envs.scenarios.steering import steering_at
+from sideslip.envs.scenarios.steering import compute_steering
 from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.vehicle import GRAVITY
 
@@ -17,16 +23,16 @@ EACH = pytest.mark.parametrize("name", CARS)
 LINEAR = {"small_angle": True, "tyres": "linear", "lags": False, "roll": False}
 
 
-def linear(name: str) -> Drive:
+def linear(name: str) -> DriveFunction:
     """Drives of the small-angle car with linear tyres and no lag."""
-    drive = CONTESTANTS[0].drive(name)
+    drive = ENTRIES[0].drive(name)
     return lambda fields: drive({**fields, **LINEAR})
 
 
 def slow(name: str) -> float:
     """The steering angle in rad of 0.1 g, slowly."""
     car = CARS[name]
-    per = car.vehicle.wheelbase / car.speed**2 + iso4138.gradient_of(car.vehicle)
+    per = car.vehicle.wheelbase / car.speed**2 + iso4138.compute_understeer_gradient(car.vehicle)
     return 0.1 * GRAVITY * per
 
 
@@ -36,7 +42,7 @@ def test_the_measured_frequency_response_is_that_of_the_matrices(name: str, outp
     """C (j w I - A)^-1 B, within the estimate's error."""
     car = CARS[name]
     found = iso7401.run_sweep(linear(name), car, slow(name))[output]
-    theory = iso7401.linear_response(car.vehicle, car.speed, found.frequency)[output]
+    theory = iso7401.compute_linear_response(car.vehicle, car.speed, found.frequency)[output]
     assert (np.abs(found.H - theory) < 3.0 * found.sd).all()
     np.testing.assert_allclose(found.H, theory, rtol=0.03)
 
@@ -44,9 +50,9 @@ def test_the_measured_frequency_response_is_that_of_the_matrices(name: str, outp
 @EACH
 def test_the_linear_plant_steps_as_the_linear_model_does(name: str) -> None:
     car = CARS[name]
-    driven = linear(name)(iso7401.step(car, slow(name)))
-    theory = iso7401.linear_step(car.vehicle, car.speed, driven)["gamma"]
-    found = iso7401.responses(driven)["gamma"]
+    driven = linear(name)(iso7401.make_step(car, slow(name)))
+    theory = iso7401.compute_linear_step(car.vehicle, car.speed, driven)["gamma"]
+    found = iso7401.compute_responses(driven)["gamma"]
     assert vars(found) == pytest.approx(vars(theory), rel=0.02, abs=1e-3)
 
 
@@ -60,8 +66,8 @@ def test_a_slow_circle_of_the_linear_plant_has_its_gradient(name: str) -> None:
 def test_the_kernels_sine_with_dwell_is_the_standards(side: float) -> None:
     """One period of 0.7 Hz that waits for 0.5 s at the second peak."""
     car = CARS["passenger-car"]
-    fields = fmvss126.sine_with_dwell(car, side * 2.0)
-    programme = steering_programme(Scenario(**(CALM | dict(fields))))
+    fields = fmvss126.make_sine_with_dwell(car, side * 2.0)
+    programme = make_steering_profile(Scenario(**(CALM | dict(fields))))
 
     def angle(t: float) -> float:
         phase = 0.7 * (t - fmvss126.ONSET)
@@ -70,7 +76,7 @@ def test_the_kernels_sine_with_dwell_is_the_standards(side: float) -> None:
 
     ticks = np.arange(round(fields["duration"] / TICK))
     expected = [angle(tick * TICK) for tick in ticks]
-    found = [steering_at(float(tick), programme) for tick in ticks]
+    found = [compute_steering(float(tick), programme) for tick in ticks]
     np.testing.assert_allclose(found, expected, atol=1e-3 * 2.0 / car.ratio)
 
 
@@ -78,8 +84,8 @@ def test_the_kernels_sine_with_dwell_is_the_standards(side: float) -> None:
 def test_uncontrolled_cars_pass_small_amplitudes_and_fail_large_ones(
     name: str, large: float
 ) -> None:
-    car, drive = CARS[name], CONTESTANTS[0].drive(name)
-    A = fmvss126.steering_for(drive, car)
+    car, drive = CARS[name], ENTRIES[0].drive(name)
+    A = fmvss126.measure_reference_angle(drive, car)
     result = fmvss126.run(drive, car, A, [1.5, large])
     assert [run.passed for run in result.runs] == [True, True, False, False]
     one, other = result.runs[:2]
@@ -90,12 +96,12 @@ def test_uncontrolled_cars_pass_small_amplitudes_and_fail_large_ones(
 @pytest.mark.parametrize("track", iso3888.TRACKS)
 def test_a_slow_driver_touches_no_cone(name: str, track: str) -> None:
     car = CARS[name]
-    runs = iso3888.run(CONTESTANTS[0].drive(name), car, track, [0.45 * car.speed, 1.1 * car.speed])
+    runs = iso3888.run(ENTRIES[0].drive(name), car, track, [0.45 * car.speed, 1.1 * car.speed])
     assert [run.passed for run in runs] == [True, False]
 
 
 def test_a_failed_episode_is_told_and_ends_early() -> None:
-    drive = of_env("sideslip/YawFusion-v0", vehicle="passenger-car")
+    drive = make_env_drive("sideslip/YawFusion-v0", vehicle="passenger-car")
     spun = drive({"steering": "held-step", "amplitude": 0.5, "speed": 30.0, "duration": 5.0})
     assert spun.failed
     assert spun.t[-1] < 5.0
@@ -104,7 +110,7 @@ def test_a_failed_episode_is_told_and_ends_early() -> None:
 def test_a_procedure_leaves_nothing_to_the_seed() -> None:
     scenario = Scenario(name="drawn", speed=(10.0, 20.0))
     with pytest.raises(ValueError, match="'drawn' draws; a procedure gives numbers"):
-        steering_programme(scenario)
+        make_steering_profile(scenario)
 
 
 def test_a_series_is_one_value_a_time() -> None:
@@ -116,5 +122,5 @@ def test_a_series_is_one_value_a_time() -> None:
 def test_a_signal_after_the_end_is_no_number() -> None:
     t = np.arange(3.0)
     series = Series(t, t, t, t, 2.0 * t, t, t, t, t)
-    assert series.at("gamma", 1.5) == pytest.approx(3.0)
-    assert math.isnan(series.at("gamma", 2.5))
+    assert series.interpolate("gamma", 1.5) == pytest.approx(3.0)
+    assert math.isnan(series.interpolate("gamma", 2.5))

@@ -6,19 +6,19 @@ pytest.importorskip("vehiclemodels")
 from sideslip.agents import make_agent
 from sideslip.benchmarks.harness.drives import make_env
 from sideslip.benchmarks.procedures import outside, suite
-from sideslip.benchmarks.procedures.cases import Case
-from sideslip.benchmarks.procedures.contestants import CARS, CONTESTANTS, ENV_ID
+from sideslip.benchmarks.procedures.cases import ProcedureCase
+from sideslip.benchmarks.procedures.contestants import CARS, ENTRIES, ENV_ID
 from sideslip.benchmarks.suites import SUITES
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS
 
 
 def test_every_contestant_drives_every_procedure_that_has_a_verdict() -> None:
     assert "procedures" in SUITES
-    cases = suite.cases_of(quick=False)
+    cases = suite.make_cases(quick=False)
     assert len(set(cases)) == len(cases)
     for procedure in ("fmvss-126", "iso-3888-1", "iso-3888-2"):
         mine = {(case.car, case.contestant) for case in cases if case.procedure == procedure}
-        assert mine == {(car, k) for car in CARS for k in range(len(CONTESTANTS))}
+        assert mine == {(car, k) for car in CARS for k in range(len(ENTRIES))}
     driven = {case.car: case.seeds for case in cases if case.procedure == "outside"}
     assert set(driven) == set(OUTSIDE_PLANTS)
     assert {len(seeds) for seeds in driven.values()} == {20}
@@ -27,31 +27,31 @@ def test_every_contestant_drives_every_procedure_that_has_a_verdict() -> None:
 @pytest.mark.parametrize("car", [*CARS, "drift"])
 def test_each_contestant_has_what_it_reads(car: str) -> None:
     """Policies drive the car that they learned on, outside cars as the passenger car."""
-    names = [each.on(car)[0] for each in CONTESTANTS]
+    names = [each.get_configuration(car)[0] for each in ENTRIES]
     assert names[-1] == ("distill-coms-yaw" if car == "coms" else "distill-car-yaw")
-    for each in CONTESTANTS:
-        agent, estimator, estimate = each.on(car)
+    for each in ENTRIES:
+        agent, estimator, estimate = each.get_configuration(car)
         options = {"vehicle": "coms"} if car == "coms" else {"vehicle": "passenger-car"}
         env = make_env(ENV_ID, estimator, estimate, **options)
         make_agent(agent, env)
 
 
 def test_who_plans_is_left_out_of_a_quick_run() -> None:
-    driven = {CONTESTANTS[case.contestant].agent for case in suite.cases_of(quick=True)}
+    driven = {ENTRIES[case.contestant].agent for case in suite.make_cases(quick=True)}
     assert "adaptive-nmpc" not in driven
     assert {"adaptive-lqr", "distilled"} <= driven
 
 
 def test_without_the_extra_outside_plants_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(suite, "find_spec", lambda name: None)
-    kinds = {case.procedure for case in suite.cases_of(quick=True)}
+    kinds = {case.procedure for case in suite.make_cases(quick=True)}
     assert kinds == {"fmvss-126", "iso-3888-1", "iso-3888-2", "iso-4138", "iso-7401"}
 
 
 @pytest.mark.long
 def test_the_check_on_the_drift_model_is_reproduced() -> None:
     """FMVSS 126 at 80 km/h: no control fails at 5 A, 500 N m pass at 6.5 A, on both sides."""
-    found = outside.check()
+    found = outside.run_check()
     assert found.reproduced
     assert not any(run.stable for run in found.none.runs)
     assert len(found.law.runs) == 2
@@ -60,9 +60,9 @@ def test_the_check_on_the_drift_model_is_reproduced() -> None:
 @pytest.mark.long
 def test_tables_rows_and_figures_of_the_uncontrolled_cars(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("plotly")
-    known = [case for case in suite.cases_of(quick=True) if case.contestant == 0]
+    known = [case for case in suite.make_cases(quick=True) if case.contestant == 0]
     cases = [case for case in known if case.car != "multi-body"]
-    monkeypatch.setattr(suite, "cases_of", lambda quick: cases)
+    monkeypatch.setattr(suite, "make_cases", lambda quick: cases)
     found = suite.run(quick=True, jobs=1)
     assert [table.title.split(",")[0] for table in found.tables[:2]] == ["FMVSS 126", "ISO 3888"]
     for table in found.tables:
@@ -71,4 +71,4 @@ def test_tables_rows_and_figures_of_the_uncontrolled_cars(monkeypatch: pytest.Mo
     assert metrics >= {"amplitude", "speed", "understeer_gradient", "overshoot", "cost", "share"}
     assert [row.verdict for row in found.rows if row.verdict] == ["reproduced", "reproduced"]
     assert len(found.figures) == 4 * len(CARS)
-    assert Case("check", outside.MODEL) in cases
+    assert ProcedureCase("check", outside.MODEL) in cases

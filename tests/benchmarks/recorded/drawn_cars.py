@@ -9,7 +9,7 @@ import numpy as np
 import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.envs.record import FAST, PACKET, Array, Log
-from sideslip.envs.vehicle.vehicle import LATERAL, PASSENGER_CAR, Vehicle, critical_speed
+from sideslip.envs.vehicle.vehicle import LATERAL_FIELDS, PASSENGER_CAR, Vehicle, critical_speed
 
 assert sideslip.__version__
 EVERY, STEP = 10, 0.01  # ticks to a row; s of a steering trace
@@ -58,7 +58,7 @@ def scenario_of(car: Vehicle) -> dict[str, Any]:
         "disturbance_moment": 150.0,
         "front_stiffness": 1.0,
         "rear_stiffness": 1.0,
-        "vehicle": {name: getattr(car, name) for name in (*LATERAL, "sprung_mass")},
+        "vehicle": {name: getattr(car, name) for name in (*LATERAL_FIELDS, "sprung_mass")},
     }
 
 
@@ -70,7 +70,7 @@ def simulate(scenario: dict[str, Any], seed: int) -> Log:
     fast = whole[EVERY - 1 :: EVERY].copy()
     rows = len(fast)
     fast[:, FAST.steer] = whole[: rows * EVERY, FAST.steer].reshape(-1, EVERY).mean(axis=1)
-    packets = log.record.packets_of("gps").copy()
+    packets = log.record.select_packets("gps").copy()
     arrived = np.ceil(packets[:, PACKET.arrived] / EVERY)
     packets[:, PACKET.captured] = packets[:, PACKET.arrived] = arrived
     packets = packets[(arrived >= 1) & (arrived <= rows)]
@@ -114,7 +114,7 @@ def _drawn(rng: np.random.Generator, seed: int, duration: float, held_out: float
         front, rear = rng.uniform(0.6, 1.4, 2)
         ratio, load = rng.uniform(0.7, 1.1), rng.uniform(0.0, 0.25)
         mass = stated.mass * (1.0 + load)
-        car = stated.scaled(front, rear).replace(
+        car = stated.scale_stiffness(front, rear).replace(
             mass=mass,
             sprung_mass=stated.sprung_mass + load * stated.mass,
             yaw_inertia=ratio * mass * stated.front_arm * stated.rear_arm,

@@ -56,7 +56,7 @@ def decimated(log: Log, every: int = EVERY) -> Log:
     fast = whole[every - 1 :: every].copy()
     steer = whole[:, FAST.steer][: len(fast) * every].reshape(-1, every).mean(axis=1)
     fast[:, FAST.steer] = steer
-    packets = log.record.packets_of("gps").copy()
+    packets = log.record.select_packets("gps").copy()
     ticks = [PACKET.captured, PACKET.arrived]
     packets[:, ticks] = np.ceil(packets[:, ticks] / every)
     within = (packets[:, PACKET.captured] >= 1) & (packets[:, PACKET.arrived] <= len(fast))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sideslip.envs.vehicle.linear import bicycle
+from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.envs.vehicle.vehicle import PASSENGER_CAR
 
 Array = npt.NDArray[np.float64]
@@ -17,7 +17,7 @@ SLALOM = 0.02 * np.sin(2.0 * np.pi * 0.4 * DT * np.arange(ROWS))
 
 def columns() -> dict[str, Array]:
     """A slalom of the linear passenger car: row k's steering acts from k to k+1."""
-    G, H = bicycle(PASSENGER_CAR, SPEED).discrete(DT)
+    G, H = make_bicycle_model(PASSENGER_CAR, SPEED).discretise(DT)
     x = np.zeros((ROWS, 2))
     for k in range(ROWS - 1):
         x[k + 1] = G @ x[k] + H[:, 0] * SLALOM[k]

@@ -18,17 +18,17 @@ from sideslip.agents.rollout import rollout
 from sideslip.benchmarks.recorded.checks import (
     COMPASS,
     TRUTH,
-    remarks_of,
-    resolution,
-    saturated,
-    warnings_of,
+    estimate_resolution,
+    find_saturated,
+    make_remarks,
+    make_warnings,
 )
-from sideslip.benchmarks.recorded.emulate import backward, heading
-from sideslip.benchmarks.recorded.replay_file import DOUBT, replay_file
+from sideslip.benchmarks.recorded.emulate import compute_heading, find_backward
+from sideslip.benchmarks.recorded.replay_file import TRUTH_WARNING, replay_file
 from sideslip.benchmarks.report.html import write_report
 from sideslip.benchmarks.report.terminal import print_suite
 from sideslip.envs.record import FAST, PACKET, Array, Log
-from sideslip.envs.recordings.log_file import packet_rows
+from sideslip.envs.recordings.log_file import make_packet_rows
 from sideslip.envs.vehicle.vehicle import PASSENGER_CAR, Vehicle
 
 from .simulated import decimated
@@ -115,21 +115,21 @@ def filled(log: Log, value: float) -> Log:
     courses = np.full((len(log.time), 1), value)
     courses[(fixes[:, PACKET.captured] - log.record.first).astype(int), 0] = fixes[:, PACKET.value]
     ticks = log.record.ticks.astype(np.float64)
-    packets = packet_rows("gps", ticks, ticks, courses, np.ones(len(courses)))
+    packets = make_packet_rows("gps", ticks, ticks, courses, np.ones(len(courses)))
     return dataclasses.replace(log, record=dataclasses.replace(log.record, packets=packets))
 
 
 def of_heading(log: Log) -> Log:
     noise = np.random.default_rng(0).normal(0.0, 0.002, len(log.record.packets))
     rows = (log.record.packets[:, PACKET.captured] - log.record.first).astype(int)
-    return changed(log, course=lambda x: heading(log)[rows] + noise)
+    return changed(log, course=lambda x: compute_heading(log)[rows] + noise)
 
 
 @pytest.mark.parametrize("every", [1, 10, 50])
 @pytest.mark.parametrize("seed", range(4))
 def test_a_clean_drive_has_no_warning(seed: int, every: int) -> None:
     log, car = drive(seed)
-    assert warnings_of([decimated(log, every)], car) == []
+    assert make_warnings([decimated(log, every)], car) == []
 
 
 @pytest.mark.long
@@ -138,9 +138,9 @@ def test_fifty_clean_drives_have_no_warning(seed: int) -> None:
     log, car = drive(seed)
     for every in (1, 10, 50):
         short = decimated(log, every)
-        assert warnings_of([short], car) == []
-        assert warnings_of([dataclasses.replace(short, truth={})], car) == []
-        assert remarks_of([short]) == []
+        assert make_warnings([short], car) == []
+        assert make_warnings([dataclasses.replace(short, truth={})], car) == []
+        assert make_remarks([short]) == []
 
 
 @pytest.mark.parametrize(
@@ -169,10 +169,10 @@ def test_fifty_clean_drives_have_no_warning(seed: int) -> None:
     ],
 )  # fmt: skip
 def test_a_column_beside_the_others_is_warned_of(text: str, spoil: Callable[[Log], Log]) -> None:
-    found = warnings_of([spoil(clean())], PASSENGER_CAR)
+    found = make_warnings([spoil(clean())], PASSENGER_CAR)
     assert any(re.search(text, each) for each in found), found
     assert not any(each.startswith(TRUTH) for each in found) or "gyro is 0" in text
-    assert warnings_of([clean()], PASSENGER_CAR) == []
+    assert make_warnings([clean()], PASSENGER_CAR) == []
 
 
 @pytest.mark.parametrize(
@@ -193,8 +193,8 @@ def test_a_truth_beside_the_others_is_warned_of(text: str, truth: Change, withou
     present = tuple(name for name in record.present if name != without)
     log = dataclasses.replace(clean(), record=dataclasses.replace(record, present=present))
     log = changed(log, {without: times(0.0)} if without else {})
-    assert warnings_of([log], PASSENGER_CAR) == []
-    found = warnings_of([changed(log, truth=truth)], PASSENGER_CAR)
+    assert make_warnings([log], PASSENGER_CAR) == []
+    found = make_warnings([changed(log, truth=truth)], PASSENGER_CAR)
     assert any(re.match(f"{TRUTH} {text}", each) for each in found) or (
         without and "unrelated" in text
     ), found
@@ -204,13 +204,13 @@ def test_a_gyro_of_coarse_steps_is_not_at_its_limit() -> None:
     """Its steps are said instead; a fine one is, and one that holds its samples is not."""
     step = 1.28 * DEG
     coarse = changed(clean(), {"gyro": lambda x: step * np.rint(x / step)})
-    assert not saturated(coarse).any() and warnings_of([coarse], PASSENGER_CAR) == []
-    assert remarks_of([coarse]) == ["The gyro's resolution is 1.28 deg/s."]
-    assert resolution(clean()) == 0.0 and remarks_of([clean()]) == []
+    assert not find_saturated(coarse).any() and make_warnings([coarse], PASSENGER_CAR) == []
+    assert make_remarks([coarse]) == ["The gyro's resolution is 1.28 deg/s."]
+    assert estimate_resolution(clean()) == 0.0 and make_remarks([clean()]) == []
     held = changed(clean(), {"gyro": lambda x: x[::10].repeat(10)[: len(x)]})
-    assert not saturated(held).any()
+    assert not find_saturated(held).any()
     clipped = changed(clean(), {"gyro": lambda x: np.clip(x, -0.5 * x.max(), 0.5 * x.max())})
-    assert saturated(clipped).sum() > 20
+    assert find_saturated(clipped).sum() > 20
 
 
 def reversing(signed: bool) -> dict[str, Array]:
@@ -234,7 +234,7 @@ def test_rows_driven_backward_are_not_scored(tmp_path: Path, signed: bool) -> No
     (row,) = (r for r in suite.rows if r.metric == "rmse" and "front" not in r.scenario)
     assert row.value < 1.0 * DEG
     assert "450 rows are driven backward, and not scored" in suite.text
-    assert not backward(clean()).any()
+    assert not find_backward(clean()).any()
 
 
 def test_warnings_stand_over_the_verdict(tmp_path: Path) -> None:
@@ -247,14 +247,14 @@ def test_warnings_stand_over_the_verdict(tmp_path: Path) -> None:
     file = saved(tmp_path, **spoilt)
     suite = replay_file(file, vehicle, estimators=["bicycle-kf"], figures=False)
     assert len(suite.warnings) == 1 and suite.warnings[0].startswith(TRUTH)
-    assert suite.verdict.splitlines()[0] == DOUBT and len(suite.verdict.splitlines()) <= 5
+    assert suite.verdict.splitlines()[0] == TRUTH_WARNING and len(suite.verdict.splitlines()) <= 5
     console = Console(record=True, width=200)
     print_suite(console, suite)
     lines = console.export_text().splitlines()
     at = next(i for i, line in enumerate(lines) if "WARNING: the sideslip truth" in line)
-    assert lines[at].endswith("?") and lines[at + 1] == DOUBT
+    assert lines[at].endswith("?") and lines[at + 1] == TRUTH_WARNING
     write_report(tmp_path / "report.html", [suite], "sideslip replay", {})
     page = (tmp_path / "report.html").read_text()
-    assert page.index("<li>WARNING: ") < page.index(f"<li>{DOUBT}")
+    assert page.index("<li>WARNING: ") < page.index(f"<li>{TRUTH_WARNING}")
     right = replay_file(saved(tmp_path), vehicle, estimators=["bicycle-kf"], figures=False)
-    assert right.warnings == [] and DOUBT not in right.verdict
+    assert right.warnings == [] and TRUTH_WARNING not in right.verdict

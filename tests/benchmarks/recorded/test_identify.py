@@ -8,18 +8,18 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.recorded.bicycle_fit import Theta, errors, fit, windows_of
-from sideslip.benchmarks.recorded.checks import saturated, swapped, warnings_of
-from sideslip.benchmarks.recorded.identify import Identified, identify, suite_of
-from sideslip.benchmarks.recorded.noises import Finding, jackknife, white
-from sideslip.benchmarks.recorded.wires import Wires
+from sideslip.benchmarks.recorded.bicycle_fit import Theta, compute_errors, fit, make_windows
+from sideslip.benchmarks.recorded.checks import find_saturated, find_swapped, make_warnings
+from sideslip.benchmarks.recorded.identify import IdentificationResult, identify, make_suite
+from sideslip.benchmarks.recorded.noises import Finding, estimate_white_noise, jackknife
+from sideslip.benchmarks.recorded.wires import SignalCalibration
 from sideslip.envs.record import FAST, Array, Log
 from sideslip.envs.vehicle.vehicle import PASSENGER_CAR
 
 from .simulated import drive
 
 
-def row(found: Identified, name: str) -> Finding:
+def row(found: IdentificationResult, name: str) -> Finding:
     return next(each for each in found.findings if each.name == name)
 
 
@@ -48,7 +48,7 @@ def test_a_known_car_is_found_within_its_intervals(plain: bool) -> None:
         ("noise of accel_y", 0.1, 0.1),
     ):
         finding = row(found, name)
-        assert finding.told, finding
+        assert finding.is_determined, finding
         assert abs(finding.value - true) < within * true, finding
         assert abs(finding.value - true) < 2.0 * finding.half, finding
     assert found.wires.sign == -1 and found.wires.ratio == row(found, "steering ratio").value
@@ -59,7 +59,8 @@ def test_a_known_car_is_found_within_its_intervals(plain: bool) -> None:
 def test_the_start_does_not_matter_where_the_log_tells() -> None:
     log, _ = drive(1)
     ends = [
-        identify([log], PASSENGER_CAR.scaled(*at), tyres="fiala") for at in ((0.7, 1.3), (1.3, 0.7))
+        identify([log], PASSENGER_CAR.scale_stiffness(*at), tyres="fiala")
+        for at in ((0.7, 1.3), (1.3, 0.7))
     ]
     one, two = (
         np.array([e.car.front_stiffness, e.car.rear_stiffness, e.car.yaw_inertia]) for e in ends
@@ -70,10 +71,10 @@ def test_the_start_does_not_matter_where_the_log_tells() -> None:
 def test_the_fit_is_exact_on_the_plant_itself() -> None:
     """What is left of the true car is the sensors' noise and the disturbances."""
     log, car = drive(2, disturbance_force=0.0, disturbance_moment=0.0)
-    w = dataclasses.replace(windows_of([log], [saturated(log)]), tyres="fiala")
+    w = dataclasses.replace(make_windows([log], [find_saturated(log)]), tyres="fiala")
     found = fit(car, w, Theta(), ("front", "rear", "inertia"))
     assert np.abs(np.array(found.theta[:3])).max() < 0.02
-    rate, accel = errors(car, Theta(), w)
+    rate, accel = compute_errors(car, Theta(), w)
     assert rate < 0.005 and accel < 0.11
 
 
@@ -88,9 +89,9 @@ def test_the_jackknife_of_a_mean_is_its_standard_error() -> None:
 def test_white_noise_under_a_smooth_signal_and_of_a_slower_sensor() -> None:
     noise = np.random.default_rng(1).normal(0.0, 0.01, 20000)
     smooth = np.sin(np.arange(20000) / 500.0)
-    assert white([smooth + noise])[0] == pytest.approx(0.01, rel=0.05)
+    assert estimate_white_noise([smooth + noise])[0] == pytest.approx(0.01, rel=0.05)
     slower = (smooth + noise)[::4].repeat(4)
-    assert white([slower])[0] == pytest.approx(0.01, rel=0.1)
+    assert estimate_white_noise([slower])[0] == pytest.approx(0.01, rel=0.1)
 
 
 def straight(log: Log) -> Log:
@@ -118,14 +119,14 @@ def slow(log: Log) -> Log:
 def test_what_is_not_there_is_not_told(spoil: Callable[[Log], Log], reason: str) -> None:
     found = identify([spoil(drive(1)[0])], PASSENGER_CAR)
     assert reason in found.reason and found.car == PASSENGER_CAR and found.wires.gain == 1.0
-    assert not any(each.told for each in found.findings[:8])
-    assert "shows nothing of the car" in suite_of(found, "x").verdict
+    assert not any(each.is_determined for each in found.findings[:8])
+    assert "shows nothing of the car" in make_suite(found, "x").verdict
 
 
 def test_a_stated_ratio_stays_where_hard_turns_hide_it() -> None:
     log, _ = drive(1, amplitude=0.03, amplitude_2=0.02)
-    found = identify([log], PASSENGER_CAR, Wires(ratio=1.1))
-    assert found.wires.ratio == 1.1 and not row(found, "steering ratio").told
+    found = identify([log], PASSENGER_CAR, SignalCalibration(ratio=1.1))
+    assert found.wires.ratio == 1.1 and not row(found, "steering ratio").is_determined
     assert "a saturating axle" in row(found, "steering ratio").remark
 
 
@@ -138,21 +139,23 @@ def test_swapped_columns_are_refused() -> None:
     ):
         with pytest.raises(ValueError, match=f"columns are swapped, {message}"):
             identify([spoilt], PASSENGER_CAR)
-        assert any("swapped" in text for text in warnings_of([spoilt], PASSENGER_CAR))
-    assert swapped([log]) == ""
+        assert any("swapped" in text for text in make_warnings([spoilt], PASSENGER_CAR))
+    assert find_swapped([log]) == ""
 
 
 def test_a_gyro_at_its_limit_is_counted_and_left_out() -> None:
     log, car = drive(1)
     gyro = log.record.fast[:, FAST.gyro]
     clipped = changed(log, gyro=np.clip(gyro, -0.3, 0.9 * gyro.max()))
-    out = saturated(clipped)
+    out = find_saturated(clipped)
     assert (
         out.any() and (gyro[out] >= 0.9 * gyro.max() - 1e-12).sum() + (gyro[out] <= -0.3).sum() > 0
     )
-    assert not saturated(log).any()
-    assert any(f"limit in {out.sum()} rows" in t for t in warnings_of([clipped], car))
-    whole, less = (len(windows_of([each], [saturated(each)]).starts) for each in (log, clipped))
+    assert not find_saturated(log).any()
+    assert any(f"limit in {out.sum()} rows" in t for t in make_warnings([clipped], car))
+    whole, less = (
+        len(make_windows([each], [find_saturated(each)]).starts) for each in (log, clipped)
+    )
     assert less < whole
 
 
@@ -167,6 +170,6 @@ def test_a_gyro_at_its_limit_is_counted_and_left_out() -> None:
     ],
 )
 def test_steering_of_another_sign_or_size_is_warned_of(ratio: float, message: str) -> None:
-    (text,) = warnings_of([drive(1, ratio)[0]], PASSENGER_CAR)
+    (text,) = make_warnings([drive(1, ratio)[0]], PASSENGER_CAR)
     assert re.search(message, text), text
-    assert warnings_of([drive(1)[0]], PASSENGER_CAR) == []
+    assert make_warnings([drive(1)[0]], PASSENGER_CAR) == []

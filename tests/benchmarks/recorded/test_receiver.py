@@ -12,21 +12,21 @@ from sideslip.benchmarks.recorded.receiver import (
     Signal,
     Track,
     compare,
-    gain,
-    law_size,
-    predictions,
-    signals,
-    track_of,
+    compute_gain,
+    compute_law_size,
+    make_signals,
+    make_track,
+    predict_fixes,
 )
 from sideslip.benchmarks.recorded.receiver_suite import (
-    answer,
+    compose_verdict,
     draw,
-    receiver_suite,
+    make_receiver_suite,
     replay_nmea,
     write_kml,
 )
 from sideslip.benchmarks.recorded.replay_file import replay_file
-from sideslip.envs.recordings.geodesy import degrees
+from sideslip.envs.recordings.geodesy import to_degrees
 from sideslip.envs.recordings.nmea import Epoch
 from tests.envs.recordings.receiver import ABSENT, REASON, RECORDINGS, sentence
 
@@ -45,11 +45,11 @@ def drive(weight: float, count: int = 700, seed: int = 0) -> list[Epoch]:
         x = np.array([[1.0, 1.0], [0.0, 1.0]]) @ x + np.linalg.cholesky(force) @ rng.normal(
             size=(2, 2)
         )
-        size = NOISE * law_size(hdop[k : k + 1], weight)[0]
+        size = NOISE * compute_law_size(hdop[k : k + 1], weight)[0]
         place = x[0] + size * rng.normal(size=2)
         speed = math.hypot(*x[1])
         course = math.atan2(x[1, 1], x[1, 0]) + 0.05 * size / speed * rng.normal()
-        (north,), (east,) = degrees(place[:1], place[1:], ORIGIN)
+        (north,), (east,) = to_degrees(place[:1], place[1:], ORIGIN)
         epochs.append(Epoch(1e9 + k, north, east, course, speed, hdop[k], 8, 10, 1, 0.0))
     return epochs
 
@@ -80,11 +80,11 @@ def position_of(track: Track) -> Signal:
 
 def test_predictions_are_gaussian_conditioning() -> None:
     """On all fixes between the first, where the filter starts, and the one that is predicted."""
-    n, track = 12, track_of(drive(1.0, 12))
+    n, track = 12, make_track(drive(1.0, 12))
     R = (NOISE * track.hdop) ** 2
     signal = position_of(track)
     where = signal.z
-    error, variance = predictions(signal, R, Q)
+    error, variance = predict_fixes(signal, R, Q)
     assert np.isnan(error[:4]).all() and np.isfinite(error[4:]).all()
     step = np.array([[1.0, 1.0], [0.0, 1.0]])
     state, full = np.diag([R[0], 400.0]), np.zeros((2 * n, 2 * n))
@@ -103,27 +103,30 @@ def test_predictions_are_gaussian_conditioning() -> None:
 
 
 def test_likelihood_finds_the_noise_and_who_follows_hdop_rightly_wins() -> None:
-    (position, _) = signals(track_of(drive(1.0)))
+    (position, _) = make_signals(make_track(drive(1.0)))
     found = compare(position)
     table = found["table"]
     assert table.r == pytest.approx(NOISE, rel=0.15)
     assert table.q == pytest.approx(Q, rel=0.35)
     assert table.square.mean() == pytest.approx(1.0, abs=0.15)
-    assert gain(table, found[SAME]).low > 0.0 and gain(table, found["constant"]).low > 0.0
+    assert (
+        compute_gain(table, found[SAME]).low > 0.0
+        and compute_gain(table, found["constant"]).low > 0.0
+    )
     assert np.median(table.error) < np.median(found["constant"].error)
 
 
 def test_where_the_noise_is_constant_tuning_by_hdop_costs() -> None:
-    (position, _) = signals(track_of(drive(0.0)))
+    (position, _) = make_signals(make_track(drive(0.0)))
     found = compare(position)
     assert found["constant"].r == pytest.approx(NOISE, rel=0.15)
-    assert gain(found["table"], found["constant"]).high < 0.0
+    assert compute_gain(found["table"], found["constant"]).high < 0.0
 
 
 def test_the_same_information_is_the_mean_of_the_inverse_variances() -> None:
-    (position, _) = signals(track_of(drive(1.0, 300)))
+    (position, _) = make_signals(make_track(drive(1.0, 300)))
     found = compare(position)
-    sizes = law_size(position.track.hdop, 1.0)[: position.half]
+    sizes = compute_law_size(position.track.hdop, 1.0)[: position.half]
     variances = (found["table"].r * sizes) ** 2
     assert found[SAME].r ** -2 == pytest.approx(np.mean(1.0 / variances), rel=1e-9)
 
@@ -133,19 +136,19 @@ def test_a_track_leaves_out_what_steps_back_and_starts_anew_where_the_clock_is_s
     blind = epochs[5]._replace(hdop=math.nan)
     lost = epochs[6]._replace(latitude=math.nan)
     set_back = [each._replace(t=each.t - 500.0) for each in epochs[20:]]
-    track = track_of(
+    track = make_track(
         [*epochs[:5], blind, lost, *epochs[7:10], epochs[9], *epochs[10:20], *set_back]
     )
     assert len(track.t) == 38 and track.t[18] < track.t[17] - 400.0
     assert track.east[0] == track.north[0] == 0.0
-    scored = np.isfinite(predictions(position_of(track), np.ones(38), Q)[0])
+    scored = np.isfinite(predict_fixes(position_of(track), np.ones(38), Q)[0])
     assert not scored[[0, 1, 2, 3, 18, 19, 20, 21]].any() and scored[22:].all()
 
 
 def test_a_log_is_answered_drawn_and_laid_on_the_map(tmp_path: Path) -> None:
     path = log_of(drive(1.0, 400), tmp_path / "drive.txt")
     replay = replay_nmea(path)
-    suite = receiver_suite(replay)
+    suite = make_receiver_suite(replay)
     lines = suite.verdict.splitlines()
     assert len(lines) <= LINES and max(map(len, lines)) <= LETTERS
     assert lines[0].startswith("Tuning the noise of position by HDOP pays: log-likelihood +")
@@ -179,6 +182,6 @@ def test_a_log_without_hdop_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_the_recordings_are_answered(name: str) -> None:
     replay = replay_nmea(RECORDINGS[name])
-    lines = answer(replay).splitlines()
+    lines = compose_verdict(replay).splitlines()
     assert len(lines) <= LINES and max(map(len, lines)) <= LETTERS
     assert " costs: " in lines[0] if "munich" in name else " changes nothing: " in lines[0]

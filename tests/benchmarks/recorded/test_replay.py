@@ -10,14 +10,14 @@ import pytest
 from pandas import read_csv
 
 from sideslip.benchmarks.harness.results import Suite, read_json, write_json
-from sideslip.benchmarks.recorded.emulate import Emulation, heading
+from sideslip.benchmarks.recorded.emulate import Emulation, compute_heading
 from sideslip.benchmarks.recorded.replay_file import replay_file
 from sideslip.benchmarks.recorded.run import ESTIMATORS, GYRO_ONLY
 from sideslip.benchmarks.recorded.suite import corners, replay
 from sideslip.envs.record import Log
 from sideslip.envs.recordings.log_file import read_log
 from sideslip.envs.vehicle.vehicle import PASSENGER_CAR
-from sideslip.envs.vehicle.vehicles import vehicle_from
+from sideslip.envs.vehicle.vehicles import make_vehicle
 from sideslip.estimators import make_estimator
 
 from .slalom import ROWS, VEHICLE, columns, saved
@@ -68,12 +68,12 @@ def test_told_the_true_car_the_drive_is_followed_exactly(log: Log) -> None:
 
 
 def test_rows_hold_what_the_estimator_gives_by_itself(log: Log) -> None:
-    soft = PASSENGER_CAR.scaled(0.7)
+    soft = PASSENGER_CAR.scale_stiffness(0.7)
     settings: dict[str, Any] = {"estimators": ["multirate-kf"], "seeds": 3, "seed": 5}
     suite = replay(log, PASSENGER_CAR, stiffness_factor=0.7, figures=False, **settings)
     errors = []
     for seed in (5, 6, 7):
-        seen = Emulation().with_course(log, seed)
+        seen = Emulation().add_course(log, seed)
         estimator = make_estimator(
             "multirate-kf",
             vehicle=soft,
@@ -140,7 +140,9 @@ def test_a_log_without_truth_or_slow_sensors_runs_and_says_what_it_leaves_out(
 def test_a_logged_course_is_used_as_it_is(tmp_path: Path) -> None:
     course = np.full(ROWS, np.nan)
     plain = read_log(saved(tmp_path))
-    course[::20] = (plain.truth["beta"] + heading(plain))[::20] + 0.7  # another zero of heading
+    course[::20] = (plain.truth["beta"] + compute_heading(plain))[
+        ::20
+    ] + 0.7  # another zero of heading
     log = read_log(saved(tmp_path, course_rad=course))
     suite = replay(log, PASSENGER_CAR, figures=False)
     assert "Slow sensors are the log's own: gps" in suite.text
@@ -196,7 +198,7 @@ def test_the_stanford_drive_reaches_its_numbers() -> None:
     """Told the fitted car x 0.7: PAPERS section 4 has 1.11 deg gyro only, multirate 0.50-0.53."""
     suite = replay(
         read_log(STANFORD),
-        vehicle_from("ferrari-250lm-fitted"),
+        make_vehicle("ferrari-250lm-fitted"),
         stiffness_factor=0.7,
         estimators=["multirate-kf"],
         seeds=3,

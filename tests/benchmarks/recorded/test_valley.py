@@ -12,12 +12,12 @@ from scipy.stats import t as student
 from typer.testing import CliRunner
 
 from sideslip.benchmarks.cli.main import app
-from sideslip.benchmarks.recorded.bicycle_fit import Fit, Theta, fit, windows_of
-from sideslip.benchmarks.recorded.checks import saturated
+from sideslip.benchmarks.recorded.bicycle_fit import BicycleFit, Theta, fit, make_windows
+from sideslip.benchmarks.recorded.checks import find_saturated
 from sideslip.benchmarks.recorded.identify import POSSIBLE, TYRES, identify
-from sideslip.benchmarks.recorded.noises import noise_levels
+from sideslip.benchmarks.recorded.noises import estimate_noise_levels
 from sideslip.benchmarks.recorded.run import Settings, run_estimators
-from sideslip.benchmarks.recorded.wires import Wires, corrected
+from sideslip.benchmarks.recorded.wires import SignalCalibration, apply_wires
 from sideslip.envs.record import FAST, Array, Log
 from sideslip.envs.vehicle.vehicle import PASSENGER_CAR, Vehicle
 
@@ -67,7 +67,7 @@ def test_a_yaw_rate_alone_does_not_lead_down_the_valley() -> None:
     """A gyro behind a low-pass is what no model here has; the stated tyres are 1.3 times too stiff.
     Without priors tyres and inertia stay 1.3 and 1.5 times the true ones, within 5 %."""
     log = with_lagging_gyro(without(driven(NEUTRAL), accel=True, course=True), 0.08)
-    found = identify([log], NEUTRAL.scaled(1.3))
+    found = identify([log], NEUTRAL.scale_stiffness(1.3))
     true = (2.0 * NEUTRAL.front_stiffness, 2.0 * NEUTRAL.rear_stiffness, NEUTRAL.yaw_inertia)
     for row, value in zip(found.findings[:3], true, strict=True):
         assert abs(row.value - value) < row.half, row
@@ -76,7 +76,7 @@ def test_a_yaw_rate_alone_does_not_lead_down_the_valley() -> None:
 
 def test_the_priors_bound_what_a_disturbed_yaw_rate_leaves_open() -> None:
     log = with_lagging_gyro(without(driven(NEUTRAL, 1.0), accel=True, course=True), 0.08)
-    w = dataclasses.replace(windows_of([log], [saturated(log)]), tyres="fiala")
+    w = dataclasses.replace(make_windows([log], [find_saturated(log)]), tyres="fiala")
     found = fit(NEUTRAL, w, Theta(), ("front", "rear", "inertia", "gyro_bias"))
     for name, sd in (("front", 0.4), ("rear", 0.4), ("inertia", 0.2)):
         assert abs(getattr(found.theta, name)) < sd and found.half(name) < 2.3 * sd, name
@@ -84,19 +84,19 @@ def test_the_priors_bound_what_a_disturbed_yaw_rate_leaves_open() -> None:
 
 def test_the_course_tells_what_the_yaw_rate_leaves_open() -> None:
     log = driven(NEUTRAL)
-    stated = NEUTRAL.scaled(1.3)
+    stated = NEUTRAL.scale_stiffness(1.3)
     alone, course = (
         identify([without(log, accel=True, course=not kept)], stated) for kept in (False, True)
     )
     for row, row_alone in zip(course.findings[:2], alone.findings[:2], strict=True):
-        assert row.told and row.half < 0.7 * row_alone.half
+        assert row.is_determined and row.half < 0.7 * row_alone.half
     assert course.wires.latency["gps"] == pytest.approx(0.2, abs=0.03)
     assert course.car.rear_stiffness == pytest.approx(NEUTRAL.rear_stiffness, rel=0.15)
 
 
 def test_an_interval_without_data_is_that_of_the_prior() -> None:
     """And a prior belongs to no stretch: it stays when one is left out."""
-    nothing = Fit(
+    nothing = BicycleFit(
         Theta(front=0.1),
         ("front",),
         np.ones(1),
@@ -108,7 +108,7 @@ def test_an_interval_without_data_is_that_of_the_prior() -> None:
     assert nothing.half("front") == pytest.approx(student.ppf(0.975, 19) * 0.4)
     pulled = dataclasses.replace(nothing, H=nothing.H + 1.0, pull=np.array([0.3 * 0.4**-2]))
     gone = np.arange(20) < 15
-    assert pulled.without(gone)[0] == pytest.approx(-0.3 * 0.4**-2 / (5.0 + 0.4**-2))
+    assert pulled.estimate_shift(gone)[0] == pytest.approx(-0.3 * 0.4**-2 / (5.0 + 0.4**-2))
 
 
 def test_rows_that_are_alike_count_once() -> None:
@@ -116,7 +116,7 @@ def test_rows_that_are_alike_count_once() -> None:
     held = np.repeat(white[:, :, ::25], 25, axis=2)
     seldom = np.where(np.arange(400) % 10 == 0, white, 0.0)
     for rows, level in ((white, 0.2), (held, 0.2 * 5.0), (seldom, 0.2)):
-        assert noise_levels(rows, 0.01)[0] == pytest.approx(level, rel=0.15)
+        assert estimate_noise_levels(rows, 0.01)[0] == pytest.approx(level, rel=0.15)
 
 
 def test_a_car_that_cannot_be_is_not_identified(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_a_car_that_cannot_be_is_not_identified(tmp_path: Path) -> None:
     found = identify([log], PASSENGER_CAR)
     assert "I/(m l_f l_r) = 0." in found.reason
     assert found.car == PASSENGER_CAR and found.wires.gain == 1.0
-    assert not any(row.told for row in found.findings[:8])
+    assert not any(row.is_determined for row in found.findings[:8])
     path, out = tmp_path / "drive.csv", tmp_path / "car.toml"
     as_table(log).to_csv(path, index=False)
     run = CliRunner().invoke(app, ["identify", str(path), "--out", str(out)])
@@ -146,9 +146,9 @@ def test_five_rows_identify_nothing(tmp_path: Path) -> None:
     assert "Not identified." in run.output
 
 
-def slip_errors(log: Log, car: Vehicle, wires: Wires) -> Array:
+def slip_errors(log: Log, car: Vehicle, wires: SignalCalibration) -> Array:
     how = Settings(estimators=ESTIMATORS, seeds=1, noise=wires.noise)
-    squares = run_estimators([corrected(log, wires)], car, how).squares
+    squares = run_estimators([apply_wires(log, wires)], car, how).squares
     return np.array([squares[name][0] for name in ESTIMATORS])
 
 
@@ -169,8 +169,10 @@ def test_estimators_do_not_get_worse_on_another_drive(
     outside = []
     for seed in seeds:
         drawn = drawn_car(seed)
-        own = Wires(latency={"gps": drawn.late})
-        stated = [slip_errors(drawn.held_out, PASSENGER_CAR, each) for each in (Wires(), own)]
+        own = SignalCalibration(latency={"gps": drawn.late})
+        stated = [
+            slip_errors(drawn.held_out, PASSENGER_CAR, each) for each in (SignalCalibration(), own)
+        ]
         for tyres in laws:
             found = identify([drawn.log], PASSENGER_CAR, tyres=tyres)
             now = [slip_errors(drawn.held_out, found.car, each) for each in (found.wires, own)]

@@ -8,23 +8,28 @@ import pytest
 from typer.testing import CliRunner
 
 from sideslip.benchmarks.cli.main import app
-from sideslip.benchmarks.cli.recorded import estimator_options
+from sideslip.benchmarks.cli.recorded import parse_estimator_options
 from sideslip.benchmarks.recorded.replay_file import replay_file
-from sideslip.benchmarks.recorded.wires import Wires, corrected, wires_of, write_vehicle
+from sideslip.benchmarks.recorded.wires import (
+    SignalCalibration,
+    apply_wires,
+    read_wires,
+    write_vehicle,
+)
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.vehicle.vehicle import PASSENGER_CAR
-from sideslip.envs.vehicle.vehicles import vehicle_from
+from sideslip.envs.vehicle.vehicles import make_vehicle
 
 from .simulated import as_table, drive
 from .slalom import columns, saved
 
 
 def test_a_file_keeps_the_car_and_the_wires(tmp_path: Path) -> None:
-    wires = Wires(15.0, -1, 0.01, {"gps": 0.2, "steer": -0.02}, {"gyro_noise": 0.004})
+    wires = SignalCalibration(15.0, -1, 0.01, {"gps": 0.2, "steer": -0.02}, {"gyro_noise": 0.004})
     write_vehicle(tmp_path / "car.toml", PASSENGER_CAR, wires)
-    assert vehicle_from(tmp_path / "car.toml") == PASSENGER_CAR
-    assert wires_of(tmp_path / "car.toml") == wires
-    assert wires_of("coms") == wires_of(None) == Wires()
+    assert make_vehicle(tmp_path / "car.toml") == PASSENGER_CAR
+    assert read_wires(tmp_path / "car.toml") == wires
+    assert read_wires("coms") == read_wires(None) == SignalCalibration()
 
 
 @pytest.mark.parametrize(
@@ -47,7 +52,7 @@ def test_bad_wires_are_refused(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "car.toml"
     path.write_text(f'base = "coms"\n{text}\n')
     with pytest.raises((ValueError, TypeError), match=message) as caught:
-        wires_of(path)
+        read_wires(path)
     assert str(caught.value).startswith(f"{path}: ")
 
 
@@ -57,7 +62,7 @@ def test_a_log_is_put_right() -> None:
     late = wrong.record.fast.copy()
     late[5:, FAST.accel_y] = wrong.record.fast[:-5, FAST.accel_y]
     wrong.record.fast[:] = late
-    made = corrected(wrong, Wires(15.0, -1, 0.01, {"gps": 0.2, "accel_y": 0.05}))
+    made = apply_wires(wrong, SignalCalibration(15.0, -1, 0.01, {"gps": 0.2, "accel_y": 0.05}))
     for column in (FAST.steer, FAST.accel_y):
         ours, true = made.record.fast[:-5, column], right.record.fast[:-5, column]
         np.testing.assert_allclose(ours, true, atol=1e-12)
@@ -75,9 +80,9 @@ def test_identify_writes_what_replay_reads(tmp_path: Path) -> None:
     as_table(log).to_csv(path, index=False)
     run = CliRunner().invoke(app, ["identify", str(path), "--out", str(tmp_path / "car.toml")])
     assert run.exit_code == 0, run.output
-    car = vehicle_from(tmp_path / "car.toml")
+    car = make_vehicle(tmp_path / "car.toml")
     assert car.front_stiffness == pytest.approx(true.front_stiffness, rel=0.1)
-    assert wires_of(tmp_path / "car.toml").latency["gps"] == pytest.approx(0.2, abs=0.03)
+    assert read_wires(tmp_path / "car.toml").latency["gps"] == pytest.approx(0.2, abs=0.03)
     for vehicle in ([str(tmp_path / "car.toml")], ["identify", "--until", "30"]):
         more = ["--estimator", "joint", "--estimator-option", "joint.members=2"]
         run = CliRunner().invoke(app, ["replay", str(path), "--vehicle", *vehicle, *more])
@@ -97,7 +102,7 @@ def test_parts_are_replayed_by_themselves(tmp_path: Path) -> None:
 
 
 def test_options_of_estimators() -> None:
-    found = estimator_options(["joint.members=4", "dakf.q_beta=1e-4", "joint.gate=0.9"])
+    found = parse_estimator_options(["joint.members=4", "dakf.q_beta=1e-4", "joint.gate=0.9"])
     assert found == {"joint": {"members": 4, "gate": 0.9}, "dakf": {"q_beta": 1e-4}}
     with pytest.raises(ValueError, match=r"ESTIMATOR\.NAME=VALUE, got 'members=4'"):
-        estimator_options(["members=4"])
+        parse_estimator_options(["members=4"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.harness.explorer import Explorer, Panel
-from sideslip.benchmarks.harness.results import Suite, Table
+from sideslip.benchmarks.harness.results import ResultTable, Suite
 from sideslip.benchmarks.harness.stats import Estimate
 
 HOSTILE = "</script><b>1 & 2</b>"
@@ -32,8 +32,10 @@ def estimation(figures: bool = True) -> Suite:
         "Which estimator comes closest to the sideslip angle",
         "Root mean square error from 2 s on; `exact-kf` knows the delay.\n\nIntervals are 95 %.",
         tables=[
-            Table("tie-vision Fig. 7 (100 seeds)", header, cells, "Sine steering at 25 km/h."),
-            Table("Odd texts", ("name", HOSTILE), [[HOSTILE, "a < b"]], HOSTILE),
+            ResultTable(
+                "tie-vision Fig. 7 (100 seeds)", header, cells, "Sine steering at 25 km/h."
+            ),
+            ResultTable("Odd texts", ("name", HOSTILE), [[HOSTILE, "a < b"]], HOSTILE),
         ],
     )
     suite.verdict = f"Best estimator: `exact-kf`.\nNot covered: {HOSTILE}."
@@ -59,7 +61,7 @@ def control() -> Suite:
         ["multirate", "3.98", "0.32", "11.2"],
     ]
     header = ("controller", "RMS slip / mrad", "over none", "largest 1 ms step / N m")
-    table = Table("tie-vision Fig. 8, tyres as believed (20 seeds)", header, cells)
+    table = ResultTable("tie-vision Fig. 8, tyres as believed (20 seeds)", header, cells)
     text = "A single lane change at 25 km/h."
     suite = Suite("control", "Which controller keeps it small", text, tables=[table])
     suite.verdict = "Best controller: multirate."

@@ -8,37 +8,40 @@ import pytest
 
 from sideslip.agents import AGENTS, rungs
 from sideslip.benchmarks.control.cells import LEARNED
-from sideslip.benchmarks.control.cells import RUNGS as MATRIX_RUNGS
+from sideslip.benchmarks.control.cells import ORACLE_NAMES as MATRIX_RUNGS
 from sideslip.benchmarks.harness.stats import Estimate
-from sideslip.benchmarks.report.colours import line_styles
+from sideslip.benchmarks.report.colours import choose_line_styles
 from sideslip.envs.rendering.palette import (
     COLOURS,
     CONTROLLERS,
     FILTERS,
     INK,
-    RUNGS,
-    STRANGERS,
-    colour,
+    ORACLES,
+    OTHER_COLOURS,
+    find_colour,
 )
 from sideslip.estimators.make import ESTIMATORS
 
 
 def test_colours_stay_with_their_names() -> None:
-    assert colour("the bound") == colour("truth") == INK
-    assert colour("exact-kf, true model") == COLOURS["exact-kf"]
-    assert colour("somebody-else") == colour("somebody-else")
+    assert find_colour("the bound") == find_colour("truth") == INK
+    assert find_colour("exact-kf, true model") == COLOURS["exact-kf"]
+    assert find_colour("somebody-else") == find_colour("somebody-else")
     names = [*COLOURS, "somebody-else", "two-dof (1 ms)", "two-dof (33 ms)"]
-    styles = line_styles(names)
+    styles = choose_line_styles(names)
     assert len(set(styles.values())) == len(names)
-    assert line_styles(["multirate-kf"])["multirate-kf"] == (COLOURS["multirate-kf"], "solid")
+    assert choose_line_styles(["multirate-kf"])["multirate-kf"] == (
+        COLOURS["multirate-kf"],
+        "solid",
+    )
 
 
 def test_every_filter_controller_and_rung_has_a_colour_of_its_own() -> None:
     """All names of the package, no two alike, none the strangers'; to be seen on white and dark."""
     assert set(FILTERS) == set(ESTIMATORS)
     assert {*CONTROLLERS} >= {*AGENTS, *(name for pairs in LEARNED.values() for _, name in pairs)}
-    assert {*RUNGS} >= {*MATRIX_RUNGS, *rungs.RUNGS}
-    own = [*FILTERS.values(), *CONTROLLERS.values(), *RUNGS.values(), *STRANGERS, INK]
+    assert {*ORACLES} >= {*MATRIX_RUNGS, *rungs.ORACLES}
+    own = [*FILTERS.values(), *CONTROLLERS.values(), *ORACLES.values(), *OTHER_COLOURS, INK]
     assert len(set(own)) == len(own)
     for shade in own[:-1]:
         light = luminance(shade)

@@ -14,24 +14,30 @@ from PIL import Image
 from rich.console import Console
 
 from sideslip.agents import make_agent
-from sideslip.benchmarks.report.film import Driver, check_film, film, film_drive, frames_of
+from sideslip.benchmarks.report.film import (
+    FilmDriver,
+    check_film,
+    render_frames,
+    write_drive_film,
+    write_film,
+)
 from sideslip.envs.rendering.palette import GREY
 
 SHORT: dict[str, Any] = {"scenario": {"base": "slalom", "duration": 0.4, "onset": 0.0}}
 
 
-def driver(name: str = "none") -> Driver:
+def driver(name: str = "none") -> FilmDriver:
     env = gym.make("sideslip/YawVision-v0", **SHORT)
-    return Driver(name, env, make_agent(name, env))
+    return FilmDriver(name, env, make_agent(name, env))
 
 
 def test_a_film_lasts_as_long_as_the_drive(tmp_path: Path) -> None:
     mp4, gif = tmp_path / "a.mp4", tmp_path / "a.GIF"
-    film(mp4, [driver()], seed=1)
+    write_film(mp4, [driver()], seed=1)
     with VideoFileClip(str(mp4)) as clip:
         assert clip.size == [960, 540] and clip.fps == 50.0
         assert clip.duration == pytest.approx(0.42, abs=0.021)
-    film_drive(gif, driver(), "none", 1, Console(quiet=True))
+    write_drive_film(gif, driver(), "none", 1, Console(quiet=True))
     with Image.open(gif) as picture:
         assert picture.size == (960, 540) and picture.n_frames == 6
         assert picture.info["duration"] == 80
@@ -40,8 +46,8 @@ def test_a_film_lasts_as_long_as_the_drive(tmp_path: Path) -> None:
 
 def test_a_ghost_is_the_drive_that_it_would_be_alone() -> None:
     alone, beside = driver(), driver()
-    list(frames_of([alone], 3, 10))
-    frames = list(frames_of([driver("feedforward"), beside], 3, 10))
+    list(render_frames([alone], 3, 10))
+    frames = list(render_frames([driver("feedforward"), beside], 3, 10))
     assert bytes(alone.env.unwrapped._state) == bytes(beside.env.unwrapped._state)
     grey = [int(GREY[i : i + 2], 16) for i in (1, 3, 5)]
     assert (frames[-1][262:] == grey).all(2).sum() > 30  # its lines and its name
@@ -57,7 +63,7 @@ def test_nothing_is_half_written(tmp_path: Path) -> None:
     path = tmp_path / "old.mp4"
     path.write_bytes(b"older")
     with pytest.raises(RuntimeError, match="broken"):
-        film(path, [driver()._replace(agent=Broken())])
+        write_film(path, [driver()._replace(agent=Broken())])
     assert path.read_bytes() == b"older" and len(list(tmp_path.iterdir())) == 1
 
 
@@ -84,4 +90,4 @@ def test_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
 
 def test_a_ghost_without_a_film_is_refused() -> None:
     with pytest.raises(ValueError, match="'none' can only drive beside in a film: --video names"):
-        film_drive(None, driver(), "none", 0, Console(quiet=True))
+        write_drive_film(None, driver(), "none", 0, Console(quiet=True))

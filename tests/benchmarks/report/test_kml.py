@@ -5,14 +5,14 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.report.kml import ORIGIN, track_kml
+from sideslip.benchmarks.report.kml import ORIGIN, make_track_kml
 
 NAMES = {"kml": "http://www.opengis.net/kml/2.2"}
 
 
 def test_document_holds_every_track_and_hostile_names() -> None:
     x = np.linspace(0.0, 100.0, 5000)
-    text = track_kml("a < b", {"one & two": (x, x), "none": (x, -x)}, {"none": "#102030"})
+    text = make_track_kml("a < b", {"one & two": (x, x), "none": (x, -x)}, {"none": "#102030"})
     root = ElementTree.fromstring(text.encode())
     names = [node.text for node in root.iterfind(".//kml:Placemark/kml:name", NAMES)]
     assert names == ["one & two", "none"]
@@ -35,4 +35,4 @@ def test_document_holds_every_track_and_hostile_names() -> None:
 )
 def test_bad_tracks_are_refused(tracks: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
     with pytest.raises(ValueError, match="track"):
-        track_kml("x", tracks)
+        make_track_kml("x", tracks)

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.results import Suite, Table
+from sideslip.benchmarks.harness.results import ResultTable, Suite
 from sideslip.benchmarks.report import html as report
 from sideslip.benchmarks.report.html import write_report
-from sideslip.benchmarks.report.tables import inline, number
+from sideslip.benchmarks.report.tables import inline, parse_number
 
 from .demo import COMMAND, HOSTILE, VERSIONS, answered, control, estimation, matrix
 
@@ -189,19 +189,21 @@ def test_every_cell_is_there_thinned(tmp_path: Path) -> None:
     ],
 )
 def test_number_of_a_cell(cell: str, expected: float | None) -> None:
-    assert number(cell) == expected
+    assert parse_number(cell) == expected
 
 
 def test_columns_of_numbers_are_marked_for_sorting(tmp_path: Path) -> None:
     cells = [["b", "9.5", "1"], ["a", "10 [9, 11]", "x"], ["c", "-", "2"], ["d", "inf", ""]]
-    page = written(tmp_path, [Suite("s", "S", "", tables=[Table("t", ("n", "v", "m"), cells)])])
+    page = written(
+        tmp_path, [Suite("s", "S", "", tables=[ResultTable("t", ("n", "v", "m"), cells)])]
+    )
     heads = re.findall(r'<th scope="col" aria-sort="none"(.*?)><button', page)[:3]
     assert heads == ["", ' class="number"', ""]
     assert re.findall('data-value="(.*?)"', page)[:3] == ["9.5", "10.0", "Infinity"]
 
 
 def test_wrong_tables_and_empty_reports_are_refused(tmp_path: Path) -> None:
-    wrong = Suite("s", "S", "", tables=[Table("short row", ("a", "b"), [["1"]])])
+    wrong = Suite("s", "S", "", tables=[ResultTable("short row", ("a", "b"), [["1"]])])
     with pytest.raises(ValueError, match=r"short row.*1 cells under 2 headers"):
         written(tmp_path, [wrong])
     with pytest.raises(ValueError, match="at least one suite"):
@@ -219,7 +221,7 @@ def test_failure_leaves_the_old_report(
         raise OSError("No space left on device")
 
     if failing == "drawing":
-        monkeypatch.setattr(report, "figure_text", fail)
+        monkeypatch.setattr(report, "encode_figure", fail)
     else:
         monkeypatch.setattr(os, "fsync", fail)
     with pytest.raises(OSError, match="No space left"):

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from sideslip.benchmarks.harness.results import Suite, Table
+from sideslip.benchmarks.harness.results import ResultTable, Suite
 from sideslip.benchmarks.report.terminal import print_run, print_suite
 from sideslip.estimators.make import ESTIMATORS
 
@@ -19,7 +19,7 @@ ROWS = [[f"contestant {k} on a filter", *(f"{100 * k + i}.5" for i in range(12))
 def test_nothing_of_a_wide_table_is_cut(width: int) -> None:
     """It is printed in parts, each with the names."""
     suite = Suite("wide", "A wide table", "")
-    suite.tables.append(Table("Numbers", HEADER, ROWS))
+    suite.tables.append(ResultTable("Numbers", HEADER, ROWS))
     written = io.StringIO()
     print_suite(Console(file=written, width=width), suite)
     text = written.getvalue()
@@ -33,7 +33,7 @@ def test_nothing_of_a_wide_table_is_cut(width: int) -> None:
 
 def test_long_texts_wrap_and_are_no_part_of_their_own() -> None:
     suite = Suite("wordy", "Words", "")
-    suite.tables.append(Table("Errors", ("tier", "what"), [["1", "its error grows " * 9]]))
+    suite.tables.append(ResultTable("Errors", ("tier", "what"), [["1", "its error grows " * 9]]))
     written = io.StringIO()
     print_suite(Console(file=written, width=80), suite)
     assert "(continued)" not in written.getvalue()
@@ -42,8 +42,8 @@ def test_long_texts_wrap_and_are_no_part_of_their_own() -> None:
 
 def test_details_are_in_the_report_alone() -> None:
     suite = Suite("long", "Details", "")
-    suite.tables += [Table("Main", ("who", "cost"), [["a", "1"]])]
-    suite.tables += [Table("Contests", ("who", "cost"), [["b", "2"]], detail=True)]
+    suite.tables += [ResultTable("Main", ("who", "cost"), [["a", "1"]])]
+    suite.tables += [ResultTable("Contests", ("who", "cost"), [["b", "2"]], detail=True)]
     written = io.StringIO()
     print_suite(Console(file=written, width=80), suite)
     assert "Main" in written.getvalue() and "Contests" not in written.getvalue()
@@ -62,7 +62,7 @@ def test_no_name_is_lost_on_a_narrow_screen(width: int, colour: Any) -> None:
     header = ("controller and estimator", "score", "95 % interval", "remark")
     title = "A title that is longer than a narrow screen"
     suite = Suite("names", title, "Text.", verdict="Best: `a`.\nNot covered: [b].")
-    suite.tables.append(Table("Numbers", header, cells))
+    suite.tables.append(ResultTable("Numbers", header, cells))
     written = io.StringIO()
     print_suite(
         Console(file=written, width=width, force_terminal=bool(colour), color_system=colour), suite
@@ -90,7 +90,7 @@ def line_end(text: str, width: int) -> int:
 def test_a_run_fits_on_a_screen_and_says_where_the_rest_is(count: int) -> None:
     """At 80 columns, whatever the tables hold; the verdicts stand there."""
     cells = [[f"filter-{i}", *["0.123456"] * 12] for i in range(50)]
-    table = Table("errors", ("estimator", *"abcdefghijkl"), cells, "a note " * 40)
+    table = ResultTable("errors", ("estimator", *"abcdefghijkl"), cells, "a note " * 40)
     verdict = "\n".join(["It is so. " * 9, "And so. " * 9, *["More of it. " * 9] * 3])
     suites = [Suite(f"s{i}", f"Suite {i}", "a text", tables=[table] * 3) for i in range(count)]
     for suite in suites:

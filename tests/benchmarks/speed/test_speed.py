@@ -76,9 +76,9 @@ def test_every_filter_of_the_catalogue_has_its_line() -> None:
 
 def test_the_lane_keeping_environment_runs() -> None:
     pytest.importorskip("highway_env")
-    contestants = field.Field()
-    contestants.add(env_steps.LANE, env_steps._lane_keeping, "highway-env")
-    contestants.contestants[env_steps.LANE].work()
+    contestants = field.WorkloadSet()
+    contestants.add(env_steps.LANE, env_steps._make_lane_keeping, "highway-env")
+    contestants.workloads[env_steps.LANE].work()
     assert contestants.absent == {}
 
 
@@ -89,21 +89,21 @@ def test_poles_stay_up_so_that_no_reset_is_measured() -> None:
     env: Any = gym.make("CartPole-v1")
     obs, _ = env.reset(seed=0)
     for _ in range(400):
-        obs, _, terminated, _, _ = env.step(int(env_steps.upright(obs)))
+        obs, _, terminated, _, _ = env.step(int(env_steps.choose_upright_action(obs)))
         assert not terminated
 
 
 @compiler
 def test_the_plant_in_c_is_ours() -> None:
     """To rounding, over half a second of cars that slide, roll, brake and turn."""
-    mine = plant.cars_of(32, seed=3)
+    mine = plant.make_cars(32, seed=3)
     mine.motions[:, 1] += np.linspace(-3.0, 3.0, 32).reshape(-1, LANES)  # m/s of v_y: tyres slide
     mine.roads[0] = np.array(
         [[0.01], [0.5], [2.0], [0.3], [0.2], [0.0]]
     )  # the others: straight, flat
-    theirs = mine.twin()
-    plant.ours(mine, 500)
-    plant.in_c()(theirs, 500)
+    theirs = mine.clone()
+    plant.advance_in_lanes(mine, 500)
+    plant.make_c_advance()(theirs, 500)
     assert np.isfinite(mine.motions).all()
     scale = np.abs(mine.motions).max(axis=(0, 2), keepdims=True)
     np.testing.assert_allclose(theirs.motions / scale, mine.motions / scale, rtol=0.0, atol=1e-11)
@@ -112,17 +112,17 @@ def test_the_plant_in_c_is_ours() -> None:
 
 @compiler
 def test_another_plant_in_c_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    other = yardstick.source().replace("GRAVITY = 9.81", "GRAVITY = 9.8")
-    monkeypatch.setattr(yardstick, "source", lambda: other)
+    other = yardstick.read_source().replace("GRAVITY = 9.81", "GRAVITY = 9.8")
+    monkeypatch.setattr(yardstick, "read_source", lambda: other)
     with pytest.raises(RuntimeError, match="the plant in C is not ours"):
-        plant.in_c()
+        plant.make_c_advance()
 
 
 @compiler
 def test_a_compiler_that_fails_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(yardstick, "source", lambda: "no C at all")
+    monkeypatch.setattr(yardstick, "read_source", lambda: "no C at all")
     with pytest.raises(field.AbsentError, match=r"does not compile it: .*error"):
-        plant.in_c()
+        plant.make_c_advance()
 
 
 def test_without_a_compiler_the_line_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,7 +130,7 @@ def test_without_a_compiler_the_line_is_absent(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.delenv("CC", raising=False)
     measured = Suite("speed", "", "")
     taken, absent = plant.add(measured, SHORT)
-    assert set(taken) == {plant.OURS}
+    assert set(taken) == {plant.PLANT}
     assert absent == {plant.C: "no C compiler"}
     assert "no C compiler" in measured.tables[0].note
 
@@ -155,11 +155,11 @@ def outer(x):
     return inner(x) * 2
 outer(1); outer(1.0); outer(2); inner(1)
 """
-    found = first_use.cold(code)
+    found = first_use.measure_compilation(code)
     assert [name for name, _ in found] == ["outer", "outer", "inner"]
     assert all(seconds > 0.0 for _, seconds in found)
     with pytest.raises(RuntimeError, match="no such thing"):
-        first_use.cold("raise ValueError('no such thing')")
+        first_use.measure_compilation("raise ValueError('no such thing')")
 
 
 def test_where_no_kernels_are_on_disk_the_first_step_is_absent(
@@ -177,7 +177,7 @@ def test_ratios_are_taken_round_by_round() -> None:
     target = targets.TARGETS[0]
     taken = {
         target.over: [20.0, 300.0, 80.0],
-        target.ours: [1.0, 10.0, 2.0],
+        target.workload: [1.0, 10.0, 2.0],
     }
     measured = Suite("speed", "", "")
     targets.add(measured, taken, {}, {})
@@ -211,7 +211,7 @@ def test_every_target_stands_in_the_table() -> None:
 
 
 def test_a_price_is_met_from_below() -> None:
-    price = next(target for target in targets.TARGETS if target.most == 1.1)
+    price = next(target for target in targets.TARGETS if target.max_value == 1.1)
     assert price.met(1.05) and not price.met(1.15)
     goal = targets.TARGETS[0]
     assert goal.met(31.0) and not goal.met(29.0)
@@ -220,20 +220,20 @@ def test_a_price_is_met_from_below() -> None:
 def test_rounds_are_interleaved_and_the_first_calls_do_not_count() -> None:
     order: list[str] = []
     contestants = {
-        "a": timing.Contestant(lambda: order.append("a"), 1),
-        "b": timing.Contestant(lambda: order.append("b"), 2, lambda: order.append("start of b")),
+        "a": timing.Workload(lambda: order.append("a"), 1),
+        "b": timing.Workload(lambda: order.append("b"), 2, lambda: order.append("start of b")),
     }
-    taken = timing.interleaved(contestants, timing.Effort(3, 0.0))
+    taken = timing.measure_interleaved(contestants, timing.Effort(3, 0.0))
     b = ["start of b", "b"]
     assert order == ["a", "a", *b, *b] + ["a", *b] * 3
     assert {name: len(each) for name, each in taken.items()} == {"a": 3, "b": 3}
-    assert timing.spread([3.0, 1.0, 2.0]) == (2.0, 1.0, 3.0)
+    assert timing.compute_range([3.0, 1.0, 2.0]) == (2.0, 1.0, 3.0)
 
 
 def test_learning_runs_on_one_thread() -> None:
     torch = pytest.importorskip("torch")
     pytest.importorskip("threadpoolctl")
-    with timing.one_thread():
+    with timing.limit_threads():
         assert torch.get_num_threads() == 1
 
 
@@ -249,7 +249,7 @@ def test_targets_are_held_beside_all_parts(monkeypatch: pytest.MonkeyPatch) -> N
         own = {part.__name__: (1.0,)}, {part.__name__: "not there"}
         monkeypatch.setattr(part, "add", lambda *_, own=own, **__: own)
     monkeypatch.setattr(targets, "add", judge)
-    monkeypatch.setattr(suite, "answer", lambda *_: "")
+    monkeypatch.setattr(suite, "make_verdict", lambda *_: "")
     suite.run(quick=True)
     taken, seconds, absent = held
     assert list(taken) == [part.__name__ for part in (env_steps, plant, learning)]

@@ -11,24 +11,32 @@ import pytest
 
 pytest.importorskip("optuna")
 
-from sideslip.agents.tuned import FILE, read_tuned, tuned
-from sideslip.benchmarks.control.build import estimate_options
-from sideslip.benchmarks.control.cells import Cell
-from sideslip.benchmarks.control.contests import Contest
-from sideslip.benchmarks.control.episodes import NUMBERS, Driven
-from sideslip.benchmarks.control.seeds import tuning_seeds
+from sideslip.agents.tuned import FILE, get_tuned_options, read_tuned
+from sideslip.benchmarks.control.build import make_estimate_options
+from sideslip.benchmarks.control.cells import ControlEntry
+from sideslip.benchmarks.control.contests import ControlTask
+from sideslip.benchmarks.control.episodes import NUMBERS, DriveResult
+from sideslip.benchmarks.control.seeds import make_tuning_seeds
 from sideslip.benchmarks.tuning import controllers, spaces
-from sideslip.benchmarks.tuning.controllers import Contestant, contests_of, driven, objective, tune
-from sideslip.benchmarks.tuning.file import put_tuned
-from sideslip.benchmarks.tuning.spaces import KINDS, SPACES, Number, options_of
+from sideslip.benchmarks.tuning.controllers import (
+    ControllerTuning,
+    compute_objective,
+    list_contests,
+    run_contestant,
+    tune,
+)
+from sideslip.benchmarks.tuning.file import write_tuned
+from sideslip.benchmarks.tuning.spaces import KINDS, SPACES, SearchNumber, make_options
 from tests.benchmarks.conftest import Run
 
-SHORT = Contest(scenario="sine-with-dwell")
-SEEDS = tuple(tuning_seeds(2))
+SHORT = ControlTask(scenario="sine-with-dwell")
+SEEDS = tuple(make_tuning_seeds(2))
 
 
-def task(*numbers: Number, name: str = "two-dof", seeds: tuple[int, ...] = SEEDS) -> Contestant:
-    return Contestant(name, "coms-model", (SHORT,), seeds, numbers)
+def task(
+    *numbers: SearchNumber, name: str = "two-dof", seeds: tuple[int, ...] = SEEDS
+) -> ControllerTuning:
+    return ControllerTuning(name, "coms-model", (SHORT,), seeds, numbers)
 
 
 def storage(folder: Path) -> str:
@@ -37,7 +45,7 @@ def storage(folder: Path) -> str:
 
 def test_a_planted_bad_weight_is_found_and_left(tmp_path: Path) -> None:
     """An LQR that may use a hundredth of the tyres' grip does nothing: the search leaves it."""
-    planted = task(Number("grip", 0.01, 0.01, 1.0), name="lqr")
+    planted = task(SearchNumber("grip", 0.01, 0.01, 1.0), name="lqr")
     log = tune(planted, 12, storage(tmp_path), jobs=1)
     assert len(log["trials"]) == 12
     assert log["trials"][0]["numbers"] == {"grip": 0.01}  # the start is the first trial
@@ -45,50 +53,52 @@ def test_a_planted_bad_weight_is_found_and_left(tmp_path: Path) -> None:
     assert log["best"]["objective"] < log["start"] - 0.5
     assert log["best"]["numbers"]["grip"] > 0.1
     best = log["options"]["controller"]
-    assert objective(planted, SEEDS, best) == pytest.approx(log["best"]["objective"], abs=1e-4)
-    assert "cost" in controllers.suite_of(planted, log).text
+    assert compute_objective(planted, SEEDS, best) == pytest.approx(
+        log["best"]["objective"], abs=1e-4
+    )
+    assert "cost" in controllers.make_suite(planted, log).text
 
 
 def test_the_objective_is_the_mean_log_of_paired_costs() -> None:
-    gain = task(Number("gain", 1.0, 0.1, 10.0))
+    gain = task(SearchNumber("gain", 1.0, 0.1, 10.0))
     nothing: dict[str, dict[str, Any]] = {"filter": {}, "controller": {}}
-    costs = driven(SHORT, "two-dof", nothing | {"controller": {"gain": 3.0}}, SEEDS).costs
-    nominal = driven(SHORT, "nominal", nothing, SEEDS).costs
+    costs = run_contestant(SHORT, "two-dof", nothing | {"controller": {"gain": 3.0}}, SEEDS).costs
+    nominal = run_contestant(SHORT, "nominal", nothing, SEEDS).costs
     wanted = np.clip(np.log((costs + 1e-3) / (nominal + 1e-3)), -3.0, 3.0).mean()
-    assert objective(gain, SEEDS, {"gain": 3.0}) == pytest.approx(wanted, rel=1e-12)
+    assert compute_objective(gain, SEEDS, {"gain": 3.0}) == pytest.approx(wanted, rel=1e-12)
 
 
 def test_an_adaptive_contestant_is_tuned_with_the_filter_it_follows(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Its numbers reach that filter, and nobody else's on the same one."""
-    asked: list[Cell] = []
-    monkeypatch.setattr(controllers, "drive", lambda chunk: asked.append(chunk.cell))
-    asked_of = controllers.contestant("adaptive-nmpc", "car-yaw", (1,))
+    asked: list[ControlEntry] = []
+    monkeypatch.setattr(controllers, "run_chunk", lambda chunk: asked.append(chunk.cell))
+    asked_of = controllers.make_controller_tuning("adaptive-nmpc", "car-yaw", (1,))
     options = asked_of.options(asked_of.start | {"force_sd": 77.0})
-    driven(asked_of.contests[0], asked_of.name, options, (1,))
+    run_contestant(asked_of.contests[0], asked_of.name, options, (1,))
     (cell,) = asked
-    assert estimate_options(cell)["options"]["force_sd"] == 77.0
-    assert estimate_options(replace(cell, controller="lqr"))["options"]["force_sd"] != 77.0
+    assert make_estimate_options(cell)["options"]["force_sd"] == 77.0
+    assert make_estimate_options(replace(cell, controller="lqr"))["options"]["force_sd"] != 77.0
 
 
 def test_a_failure_costs_twenty_times_nominal(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fake(contest: Contest, name: str, *_: Any) -> Driven:
+    def fake(contest: ControlTask, name: str, *_: Any) -> DriveResult:
         numbers = np.zeros((2, len(NUMBERS)))
         numbers[:, NUMBERS.index("cost")] = [0.5, 900.0] if name == "two-dof" else 1.0
         numbers[:, NUMBERS.index("failure")] = [0.0, 1.0] if name == "two-dof" else 0.0
-        return Driven(numbers, 0.0)
+        return DriveResult(numbers, 0.0)
 
-    monkeypatch.setattr(controllers, "driven", fake)
-    controllers._nominal.cache_clear()
-    found = objective(task(Number("gain", 1.0, 0.1, 10.0)), SEEDS, {"gain": 1.0})
-    controllers._nominal.cache_clear()
+    monkeypatch.setattr(controllers, "run_contestant", fake)
+    controllers._compute_nominal_costs.cache_clear()
+    found = compute_objective(task(SearchNumber("gain", 1.0, 0.1, 10.0)), SEEDS, {"gain": 1.0})
+    controllers._compute_nominal_costs.cache_clear()
     assert found == pytest.approx(0.5 * (math.log(0.501 / 1.001) + math.log(20.0)))
 
 
 def test_what_cannot_be_designed_is_infinitely_dear(monkeypatch: pytest.MonkeyPatch) -> None:
-    bad = task(Number("pole", 1.0, 0.1, 10.0))
-    assert objective(bad, SEEDS, {"pole": -1.0}) == math.inf
+    bad = task(SearchNumber("pole", 1.0, 0.1, 10.0))
+    assert compute_objective(bad, SEEDS, {"pole": -1.0}) == math.inf
 
 
 def test_of_a_slow_contestant_the_worse_half_stops_early(
@@ -97,13 +107,15 @@ def test_of_a_slow_contestant_the_worse_half_stops_early(
     """The rest goes on with new seeds, and is judged by the mean of all that it has driven."""
     asked: list[tuple[int, ...]] = []
 
-    def fake(task: Contestant, seeds: tuple[int, ...], found: dict[str, float]) -> float:
+    def fake(task: ControllerTuning, seeds: tuple[int, ...], found: dict[str, float]) -> float:
         asked.append(seeds)
         return abs(math.log(found["grip"] / 0.5)) + float(seeds[0] == first)
 
-    monkeypatch.setattr(controllers, "objective", fake)
-    monkeypatch.setattr(controllers, "driven", lambda *_: Driven(np.zeros((1, 1)), 0.0))
-    slow = task(Number("grip", 0.9, 0.3, 1.0), name="mpc", seeds=tuple(tuning_seeds(16)))
+    monkeypatch.setattr(controllers, "compute_objective", fake)
+    monkeypatch.setattr(
+        controllers, "run_contestant", lambda *_: DriveResult(np.zeros((1, 1)), 0.0)
+    )
+    slow = task(SearchNumber("grip", 0.9, 0.3, 1.0), name="mpc", seeds=tuple(make_tuning_seeds(16)))
     first = slow.seeds[0]
     log = tune(slow, 16, storage(tmp_path), jobs=1)
     parts = [slow.seeds[low:high] for low, high in ((0, 2), (2, 4), (4, 8), (8, 16))]
@@ -120,14 +132,14 @@ def test_of_a_slow_contestant_the_worse_half_stops_early(
 def test_a_stopped_search_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     calls: list[float] = []
 
-    def fake(task: Contestant, seeds: tuple[int, ...], found: dict[str, float]) -> float:
+    def fake(task: ControllerTuning, seeds: tuple[int, ...], found: dict[str, float]) -> float:
         if len(calls) == 11:
             raise KeyboardInterrupt
         calls.append(found["gain"])
         return found["gain"]
 
-    monkeypatch.setattr(controllers, "objective", fake)
-    once = task(Number("gain", 1.0, 0.1, 10.0))
+    monkeypatch.setattr(controllers, "compute_objective", fake)
+    once = task(SearchNumber("gain", 1.0, 0.1, 10.0))
     with pytest.raises(KeyboardInterrupt):
         tune(once, 16, storage(tmp_path), jobs=1)
     before, calls[:] = calls[:8], []  # a whole batch
@@ -140,23 +152,23 @@ def test_a_stopped_search_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_class_has_contests_and_every_start_lies_within(kind: str) -> None:
     for name in SPACES:
-        assert len(contests_of(name, kind)) >= 5
-        numbers = spaces.space(name, kind)
+        assert len(list_contests(name, kind)) >= 5
+        numbers = spaces.get_space(name, kind)
         assert all(0.0 < each.low <= each.start <= each.high for each in numbers)
         steers = any(each.steering for each in numbers)
         assert not (steers and kind not in spaces.STEERING)
 
 
 def test_numbers_become_options() -> None:
-    both = Number("disturbance_time", 0.3, 0.1, 1.0, ("filter", "controller"))
+    both = SearchNumber("disturbance_time", 0.3, 0.1, 1.0, ("filter", "controller"))
     numbers = (
-        Number("bandwidth.0", 5.0, 1.0, 9.0),
-        Number("bandwidth.1", 5.0, 1.0, 9.0),
-        Number("horizon", 30, 10, 60, whole=True),
+        SearchNumber("bandwidth.0", 5.0, 1.0, 9.0),
+        SearchNumber("bandwidth.1", 5.0, 1.0, 9.0),
+        SearchNumber("horizon", 30, 10, 60, is_integer=True),
         both,
     )
     found = {"bandwidth.0": 2.0, "bandwidth.1": 3.0, "horizon": 20.4, "disturbance_time": 0.2}
-    assert options_of(numbers, found) == {
+    assert make_options(numbers, found) == {
         "filter": {"disturbance_time": 0.2},
         "controller": {"bandwidth": [2.0, 3.0], "horizon": 20, "disturbance_time": 0.2},
     }
@@ -165,9 +177,9 @@ def test_numbers_become_options() -> None:
 def test_options_are_written_beside_others_and_read(tmp_path: Path) -> None:
     path = tmp_path / "tuned.toml"
     options: dict[str, Any] = {"filter": {"force_sd": 1e-05}, "controller": {"bandwidth": [1, 2]}}
-    put_tuned(path, "car-yaw", "lqr", options)
-    put_tuned(path, "car-yaw", "model-following", {"filter": {}, "controller": {"grip": 0.5}})
-    put_tuned(path, "car-yaw", "lqr", options | {"filter": {"force_sd": 2.5}})
+    write_tuned(path, "car-yaw", "lqr", options)
+    write_tuned(path, "car-yaw", "model-following", {"filter": {}, "controller": {"grip": 0.5}})
+    write_tuned(path, "car-yaw", "lqr", options | {"filter": {"force_sd": 2.5}})
     assert read_tuned(path)["car-yaw"] == {
         "lqr": {"filter": {"force_sd": 2.5}, "controller": {"bandwidth": [1, 2]}},
         "model-following": {"controller": {"grip": 0.5}},
@@ -180,7 +192,7 @@ def test_options_are_written_beside_others_and_read(tmp_path: Path) -> None:
 
 
 def test_defaults_stand_where_nothing_was_tuned() -> None:
-    assert tuned("coms-model", "nobody") == {"filter": {}, "controller": {}}
+    assert get_tuned_options("coms-model", "nobody") == {"filter": {}, "controller": {}}
     for kind, names in read_tuned(FILE).items():
         for name, parts in names.items():
             log = json.loads((controllers.LOGS / f"{kind}.{name}.json").read_text())
@@ -218,11 +230,11 @@ def test_the_command_writes_options_and_log(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(controllers, "contests_of", lambda *_: [SHORT])
+    monkeypatch.setattr(controllers, "list_contests", lambda *_: [SHORT])
     few = ("--class", "coms-model", "--trials", 2, "--seeds", 1, "--jobs", 1)
     status, out, _ = run("tune", "controller", "two-dof", *few, "--out", "t.toml", "--log", "logs")
     assert status == 0 and "untuned nominal" in " ".join(out.split())
     log = json.loads(Path("logs/coms-model.two-dof.json").read_text())
-    assert len(log["trials"]) == 2 and log["seeds"] == tuning_seeds(1)
+    assert len(log["trials"]) == 2 and log["seeds"] == make_tuning_seeds(1)
     held = {part: options for part, options in log["options"].items() if options}
     assert read_tuned(Path("t.toml"))["coms-model"]["two-dof"] == held

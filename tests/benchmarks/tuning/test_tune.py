@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.drives import Drive
+from sideslip.benchmarks.harness.drives import LoggedEpisode
 from sideslip.benchmarks.tuning import file as tune_file
 from sideslip.benchmarks.tuning import study as tune_study
 from sideslip.benchmarks.tuning import suite as tune
 from sideslip.benchmarks.tuning import task as tune_task
-from sideslip.benchmarks.tuning.task import Task
+from sideslip.benchmarks.tuning.task import EstimatorTuning
 from sideslip.estimators import make_estimator
 from sideslip.estimators.design import tunings
 
@@ -23,12 +23,12 @@ optuna = pytest.importorskip("optuna")
 
 
 @pytest.fixture(scope="module")
-def task() -> Task:
-    return tune_task.make_task("bicycle-kf", SCENARIO, seeds=2)
+def task() -> EstimatorTuning:
+    return tune_task.make_estimator_tuning("bicycle-kf", SCENARIO, seeds=2)
 
 
 @pytest.fixture(scope="module")
-def drives(task: Task) -> list[Drive]:
+def drives(task: EstimatorTuning) -> list[LoggedEpisode]:
     return tune_task.simulate(task, task.seeds, "", 1, None)
 
 
@@ -36,31 +36,40 @@ def storage(folder: Path) -> str:
     return f"sqlite:///{folder}/study.db"
 
 
-def tried(task: Task, url: str) -> list[Any]:
-    return tune_study.open_study(task, url).trials
+def tried(task: EstimatorTuning, url: str) -> list[Any]:
+    return tune_study.create_study(task, url).trials
 
 
-def test_error_is_the_mean_square_from_two_seconds_on(task: Task, drives: list[Drive]) -> None:
+def test_error_is_the_mean_square_from_two_seconds_on(
+    task: EstimatorTuning, drives: list[LoggedEpisode]
+) -> None:
     found = {"q_beta": 1e-3, "q_gamma": 1e-2}
     for i, drive in enumerate(drives):
         filter_ = make_estimator("bicycle-kf", **(drive.facts | found))
         error = filter_.run(drive.log)["beta"] - drive.log.truth["beta"]
         wanted = np.mean(error[drive.log.time > 1.9995] ** 2)
-        assert tune_task.squares(task, drives, found)[0, i] == pytest.approx(wanted, rel=1e-12)
+        assert tune_task.compute_squares(task, drives, found)[0, i] == pytest.approx(
+            wanted, rel=1e-12
+        )
 
 
-def test_angles_are_compared_on_the_circle(task: Task, drives: list[Drive]) -> None:
+def test_angles_are_compared_on_the_circle(
+    task: EstimatorTuning, drives: list[LoggedEpisode]
+) -> None:
     log = drives[0].log
     turned = dataclasses.replace(log, truth={"beta": log.truth["beta"] + 4.0 * np.pi})
     there, back = (
-        tune_task.squares(task, [Drive(each, drives[0].facts)], {}) for each in (log, turned)
+        tune_task.compute_squares(task, [LoggedEpisode(each, drives[0].facts)], {})
+        for each in (log, turned)
     )
     assert back == pytest.approx(there, rel=1e-9)
 
 
-def test_found_is_the_best_that_was_tried(task: Task, drives: list[Drive], tmp_path: Path) -> None:
+def test_found_is_the_best_that_was_tried(
+    task: EstimatorTuning, drives: list[LoggedEpisode], tmp_path: Path
+) -> None:
     url = storage(tmp_path)
-    found = tune_study.search(tune_study.open_study(task, url), task, drives, 12, 1)
+    found = tune_study.search(tune_study.create_study(task, url), task, drives, 12, 1)
     trials = tried(task, url)
     assert len(trials) == 12
     best = min(trials, key=lambda trial: trial.value)
@@ -68,19 +77,19 @@ def test_found_is_the_best_that_was_tried(task: Task, drives: list[Drive], tmp_p
         low, high = task.search[name]
         assert low <= value <= high
         assert value == pytest.approx(best.params[name], rel=5e-3)  # three digits
-    error = np.sqrt(tune_task.squares(task, drives, best.params).mean())
+    error = np.sqrt(tune_task.compute_squares(task, drives, best.params).mean())
     assert best.value == pytest.approx(error, rel=1e-12)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("sampler", ["cma", "tpe"])
 def test_the_search_is_the_same_for_any_number_of_jobs(
-    task: Task, drives: list[Drive], tmp_path: Path, sampler: str
+    task: EstimatorTuning, drives: list[LoggedEpisode], tmp_path: Path, sampler: str
 ) -> None:
     found = []
     for jobs in (1, 2):
         url = storage(tmp_path) + str(jobs)
-        study = tune_study.open_study(task, url, sampler)
+        study = tune_study.create_study(task, url, sampler)
         found.append(tune_study.search(study, task, drives, 40, jobs))
     assert found[0] == found[1]
 
@@ -88,41 +97,48 @@ def test_the_search_is_the_same_for_any_number_of_jobs(
 @pytest.mark.long
 def test_the_shipped_tuning_of_the_bicycle_model_is_found_again(tmp_path: Path) -> None:
     """Other seeds, another sampler, fewer trials: the minimum is flat, its error is the same."""
-    task = tune_task.make_task("bicycle-kf", "tie-vision-fig7", seeds=8)
+    task = tune_task.make_estimator_tuning("bicycle-kf", "tie-vision-fig7", seeds=8)
     drives = tune_task.simulate(task, range(8), "", 1, None)
-    study = tune_study.open_study(task, storage(tmp_path), "tpe", seed=1)
+    study = tune_study.create_study(task, storage(tmp_path), "tpe", seed=1)
     found = tune_study.search(study, task, drives, 120, 1)
-    error, shipped = (tune_task.squares(task, drives, numbers).mean() for numbers in (found, {}))
+    error, shipped = (
+        tune_task.compute_squares(task, drives, numbers).mean() for numbers in (found, {})
+    )
     assert error == pytest.approx(shipped, rel=0.02)
 
 
 def test_a_stopped_search_goes_on(
-    task: Task, drives: list[Drive], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    task: EstimatorTuning,
+    drives: list[LoggedEpisode],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     url, count = storage(tmp_path), iter(range(12))
-    score = tune_study.score
+    score = tune_study.evaluate_trial
 
     def stopping(*arguments: Any) -> float:
         if next(count) == 11:
             raise KeyboardInterrupt
         return score(*arguments)
 
-    monkeypatch.setattr(tune_study, "score", stopping)
+    monkeypatch.setattr(tune_study, "evaluate_trial", stopping)
     with pytest.raises(KeyboardInterrupt):
-        tune_study.search(tune_study.open_study(task, url), task, drives, 16, 1)
-    monkeypatch.setattr(tune_study, "score", score)
+        tune_study.search(tune_study.create_study(task, url), task, drives, 16, 1)
+    monkeypatch.setattr(tune_study, "evaluate_trial", score)
     kept = [trial.params for trial in tried(task, url) if trial.value is not None]
     assert len(kept) == 8  # a whole batch
-    tune_study.search(tune_study.open_study(task, url), task, drives, 16, 1)
+    tune_study.search(tune_study.create_study(task, url), task, drives, 16, 1)
     finished = [trial.params for trial in tried(task, url) if trial.value is not None]
     assert len(finished) == 16 and finished[:8] == kept
     assert len({tuple(params.values()) for params in finished}) == 16  # nothing is tried twice
-    monkeypatch.setattr(tune_study, "score", lambda *_: pytest.fail("there is nothing to do"))
-    tune_study.search(tune_study.open_study(task, url), task, drives, 16, 1)
+    monkeypatch.setattr(
+        tune_study, "evaluate_trial", lambda *_: pytest.fail("there is nothing to do")
+    )
+    tune_study.search(tune_study.create_study(task, url), task, drives, 16, 1)
 
 
 def test_a_diverging_filter_is_infinitely_wrong_and_says_why(tmp_path: Path) -> None:
-    task = tune_task.make_task(
+    task = tune_task.make_estimator_tuning(
         "multirate-residual-kf",
         SCENARIO,
         options={"q_gamma": 0.57, "q_psi": 2e-4, "q_y_l": 7e-5},
@@ -130,14 +146,14 @@ def test_a_diverging_filter_is_infinitely_wrong_and_says_why(tmp_path: Path) -> 
         seeds=1,
     )
     (drive,) = tune_task.simulate(task, task.seeds, "", 1, None)
-    fast = [Drive(drive.log, drive.facts | {"speed": 40.0})]
-    study = tune_study.open_study(task, storage(tmp_path))
+    fast = [LoggedEpisode(drive.log, drive.facts | {"speed": 40.0})]
+    study = tune_study.create_study(task, storage(tmp_path))
     with pytest.raises(ValueError, match="its error grows by a factor"):
         tune_study.search(study, task, fast, 3, 1)
     assert [trial.value for trial in tried(task, storage(tmp_path))] == [np.inf] * 3
 
 
-def test_a_study_is_of_one_question(task: Task) -> None:
+def test_a_study_is_of_one_question(task: EstimatorTuning) -> None:
     others = [
         dataclasses.replace(task, scenarios=("sine",)),
         dataclasses.replace(task, options={"delay": "ignore"}),
@@ -148,7 +164,7 @@ def test_a_study_is_of_one_question(task: Task) -> None:
 
 
 def test_everything_not_held_is_searched_and_noise_on_demand() -> None:
-    task = tune_task.make_task(
+    task = tune_task.make_estimator_tuning(
         "multirate-kf", SCENARIO, options={"q_psi": 1e-6}, noises={"psi_noise": (1e-4, 1e-2)}
     )
     assert list(task.search) == ["q_beta", "q_gamma", "q_y_l", "psi_noise"]
@@ -161,12 +177,12 @@ def test_everything_not_held_is_searched_and_noise_on_demand() -> None:
     [("dakf", "sideslip/YawGps-v0"), ("multirate-kf", "sideslip/YawVision-v0")],
 )
 def test_the_environment_has_the_sensors_the_filter_needs(name: str, env_id: str) -> None:
-    assert tune_task.make_task(name, "slalom", seeds=1).env_id == env_id
+    assert tune_task.make_estimator_tuning(name, "slalom", seeds=1).env_id == env_id
 
 
 def test_the_table_shows_both_tunings_and_marks_the_end_of_a_range(tmp_path: Path) -> None:
     held = {"q_gamma": 1e-2}
-    task = tune_task.make_task(
+    task = tune_task.make_estimator_tuning(
         "bicycle-kf", SCENARIO, options=held, search={"q_beta": (1e-12, 1.2e-12)}, seeds=2
     )
     suite, found = tune.run(task, 8, 3, storage(tmp_path), jobs=1)
@@ -174,7 +190,7 @@ def test_the_table_shows_both_tunings_and_marks_the_end_of_a_range(tmp_path: Pat
     assert comparison.header == ("tuning", "2 training seeds", "3 test seeds")
     assert [row[0] for row in comparison.cells] == ["default", "found"]
     assert numbers.cells[0][0] == "q_beta" and "over default" in comparison.note
-    entry = tune.entry(task, found, "a command")
+    entry = tune.make_entry(task, found, "a command")
     assert entry["q"] == {"gamma": 1e-2, "beta": found["q_beta"]}
     assert numbers.cells[0][3] == "at its end"
 
@@ -245,38 +261,40 @@ def test_a_shipped_tuning_says_how_it_was_found(entry: dict[str, Any]) -> None:
 # The command line.
 
 
-def test_a_study_that_holds_something_else_is_refused(task: Task, tmp_path: Path) -> None:
+def test_a_study_that_holds_something_else_is_refused(
+    task: EstimatorTuning, tmp_path: Path
+) -> None:
     url = storage(tmp_path)
     study = optuna.create_study(storage=url, study_name=task.study)
     study.add_trial(optuna.trial.create_trial(value=1.0))
     with pytest.raises(ValueError, match="holds something else"):
-        tune_study.open_study(task, url)
+        tune_study.create_study(task, url)
 
 
-def test_a_damaged_study_is_one_line(task: Task, tmp_path: Path) -> None:
+def test_a_damaged_study_is_one_line(task: EstimatorTuning, tmp_path: Path) -> None:
     url = storage(tmp_path)
-    tune_study.open_study(task, url)
+    tune_study.create_study(task, url)
     with (tmp_path / "study.db").open("r+b") as database:
         database.seek(2000)
         database.write(b"?" * 20000)
     with pytest.raises(ValueError, match="malformed"):
-        tune_study.open_study(task, url)
+        tune_study.create_study(task, url)
 
 
 def test_several_scenarios_count_alike() -> None:
     """Rows are scenarios, each as if it were alone; the objective is their geometric mean."""
     names = ("tie-vision-fig8", "sine")
-    task = tune_task.make_task("bicycle-kf", names, seeds=2)
+    task = tune_task.make_estimator_tuning("bicycle-kf", names, seeds=2)
     drives = tune_task.simulate(task, task.seeds, "", 1, None)
-    both = tune_task.squares(task, drives, {})
+    both = tune_task.compute_squares(task, drives, {})
     alone = []
     for name in names:
         single = dataclasses.replace(task, scenarios=(name,))
         own = tune_task.simulate(single, task.seeds, "", 1, None)
-        alone.append(tune_task.squares(single, own, {})[0])
+        alone.append(tune_task.compute_squares(single, own, {})[0])
     assert np.array_equal(both, alone)
     roots = np.sqrt(np.mean(alone, axis=1))
-    assert tune_task.objective(both) == pytest.approx(np.sqrt(roots[0] * roots[1]))
+    assert tune_task.compute_objective(both) == pytest.approx(np.sqrt(roots[0] * roots[1]))
     assert task.study != dataclasses.replace(task, scenarios=names[::-1]).study
     with pytest.raises(ValueError, match="scenarios are one or more, each once, got sine, sine"):
-        tune_task.make_task("bicycle-kf", ("sine", "sine"))
+        tune_task.make_estimator_tuning("bicycle-kf", ("sine", "sine"))

@@ -41,7 +41,7 @@ def test_a_condition_is_a_drive_and_bounded_where_its_car_is_linear(condition: A
 
 
 def test_a_curve_changes_what_it_says() -> None:
-    late, *_ = (each for each in CURVES if "late" in each.at(1.0).name)
+    late, *_ = (each for each in CURVES if "late" in each.make_condition(1.0).name)
     for ms, condition in zip(late.values, late.conditions(), strict=True):
         assert condition.scenario == MIX | {"camera_delays": (pytest.approx(1e-3 * ms),)}
         assert condition.name == f"camera {ms:g} ms late"
@@ -137,8 +137,8 @@ def test_an_episode_that_ends_early_is_left_out_and_counted() -> None:
 def test_filterpys_filter_errs_as_ours_where_the_camera_is_at_once() -> None:
     """The same model and noise; where frames are late, which it does not know, it errs more."""
     pytest.importorskip("filterpy")
-    from sideslip.benchmarks.unknown.rival import race
+    from sideslip.benchmarks.unknown.rival import compare_filters
 
     for late in (0.0, 0.03):
-        (ours, _), (theirs, _), _ = race((late, 1))
+        (ours, _), (theirs, _), _ = compare_filters((late, 1))
         assert np.sqrt(theirs / ours) > 1.5 if late else theirs == pytest.approx(ours, rel=0.1)

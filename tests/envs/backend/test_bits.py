@@ -9,16 +9,16 @@ import pytest
 from sideslip.envs import COMS, PASSENGER_CAR, stability
 from sideslip.envs.backend import elementary
 from sideslip.envs.backend import random as noise
-from sideslip.envs.backend.decorators import plain
+from sideslip.envs.backend.decorators import as_python
 from sideslip.envs.backend.primitives import ARRAYS
 from sideslip.envs.engine import reset as restart
 from sideslip.envs.engine import step as kernel
-from sideslip.envs.engine.packing import car_of
+from sideslip.envs.engine.packing import make_car
 from sideslip.envs.scenarios import steering as programme
 from sideslip.envs.ticks import FOREVER
 from sideslip.envs.vehicle import dynamics, integration, tyres
-from sideslip.envs.vehicle.dynamics import Motion, Push, Road
-from sideslip.envs.vehicle.tyres import TYRE_LAWS, Inputs
+from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams
+from sideslip.envs.vehicle.tyres import TYRE_LAWS, TyreInputs
 
 from ..helpers import FULL, IDS, LINEAR, bits, play, unwrapped
 
@@ -26,8 +26,8 @@ pytestmark = pytest.mark.plain
 
 RNG = np.random.default_rng(7)
 N = 60
-CARS = {"coms": car_of(COMS), "passenger-car": car_of(PASSENGER_CAR)}
-ROAD, PUSH = Road(0.01, -5.0, 20.0, 0.5, -0.3), Push(50.0, -20.0, 30.0)
+CARS = {"coms": make_car(COMS), "passenger-car": make_car(PASSENGER_CAR)}
+ROAD, PUSH = RoadParams(0.01, -5.0, 20.0, 0.5, -0.3), DisturbanceForces(50.0, -20.0, 30.0)
 LAWS = range(len(TYRE_LAWS))
 PLANTS = [(a, law, roll) for a in (0, 1) for law in LAWS for roll in (0, 1)]
 SPREAD = np.array([9.0, 2.0, 1.0, 2.0, 50.0, 50.0, 20.0, 3.0, 2.0, 0.3, 1.0])
@@ -41,8 +41,8 @@ def motions() -> list[Motion]:
     return [Motion(*row) for row in rows.tolist()]
 
 
-def inputs() -> list[Inputs]:
-    return [Inputs(*row) for row in (RNG.normal(size=(N, 3)) * (0.2, 200.0, 200.0)).tolist()]
+def inputs() -> list[TyreInputs]:
+    return [TyreInputs(*row) for row in (RNG.normal(size=(N, 3)) * (0.2, 200.0, 200.0)).tolist()]
 
 
 def lanes(values: list[Any]) -> Any:
@@ -55,9 +55,9 @@ def lanes(values: list[Any]) -> Any:
 def agree(function: Any, lists: list[list[Any]], call: Callable[..., Any]) -> list[Any]:
     """Assert that the three backends' bits are equal; returns the compiled values."""
     compiled = [call(function, *each) for each in zip(*lists, strict=True)]
-    python = [call(plain(function), *each) for each in zip(*lists, strict=True)]
+    python = [call(as_python(function), *each) for each in zip(*lists, strict=True)]
     assert bits(python) == bits(compiled)
-    arrays = call(plain(function, ARRAYS), *map(lanes, lists))
+    arrays = call(as_python(function, ARRAYS), *map(lanes, lists))
     if isinstance(arrays, tuple):
         arrays = np.array([np.broadcast_to(column, len(compiled)) for column in arrays]).T
     assert bits(arrays) == bits(np.array(compiled))
@@ -77,7 +77,7 @@ def test_plant(car: str, small_angle: int, law: int, roll: int) -> None:
         return function(motion, (a, b, c), PUSH, CARS[car], ROAD, 1e-3, small_angle, law, roll)
 
     state = motions()
-    load = agree(tyres.load_of, [inputs()], load_of)
+    load = agree(tyres.compute_tyre_load, [inputs()], load_of)
     agree(dynamics.derivative, [state, load], derivative)
     loads = [load, load[1:] + load[:1], load[2:] + load[:2]]
     for rule in (integration.kutta3, integration.rk4):
@@ -87,7 +87,7 @@ def test_plant(car: str, small_angle: int, law: int, roll: int) -> None:
 @pytest.mark.parametrize("small_angle", [0, 1])
 def test_sideslip_angle(small_angle: int) -> None:
     speeds = [list(column) for column in zip(*[m[:2] for m in motions()], strict=True)]
-    agree(dynamics.sideslip_angle, speeds, lambda f, v_x, v_y: f(v_x, v_y, small_angle))
+    agree(dynamics.compute_sideslip_angle, speeds, lambda f, v_x, v_y: f(v_x, v_y, small_angle))
 
 
 def test_steering() -> None:
@@ -96,10 +96,10 @@ def test_steering() -> None:
     numbers[4 : 5 * programme.SINES : 5] = 900.0, FOREVER, 1200.0, 50.0
     numbers[5 * programme.SINES + 2 :: 3] = 200.0
     ticks = [float(tick) for tick in range(0, 2000, 7)]
-    agree(programme.steering_at, [ticks], lambda f, tick: f(tick, numbers))
+    agree(programme.compute_steering, [ticks], lambda f, tick: f(tick, numbers))
 
 
-@pytest.mark.parametrize("name", ["normals", "uniforms"])
+@pytest.mark.parametrize("name", ["draw_normals", "draw_uniforms"])
 def test_noise(name: str) -> None:
     words = [[2**32 - 3] * N, [2**31 + 11] * N, list(range(N)), [3] * N]
     agree(getattr(noise, name), words, lambda f, *counter: f(*counter))
@@ -139,6 +139,6 @@ def test_whole_steps(name: str, arguments: dict[str, Any], monkeypatch: pytest.M
         return bits((start, first, moments, env.get_state()["state"], env.get_state()["params"]))
 
     compiled = episode()
-    monkeypatch.setattr(stability, "reset_vehicle", plain(restart.reset_vehicle))
-    monkeypatch.setattr(stability, "step_packed", plain(kernel.step_packed))
+    monkeypatch.setattr(stability, "reset_vehicle", as_python(restart.reset_vehicle))
+    monkeypatch.setattr(stability, "step_workspace", as_python(kernel.step_workspace))
     assert episode() == compiled

@@ -169,7 +169,7 @@ def test_a_damaged_file_is_compiled_again(
     left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def kernel() -> Any:
-        monkeypatch.setattr(kernel_file, "_linked", {})  # as in a process of its own
+        monkeypatch.setattr(kernel_file, "_libraries", {})  # as in a process of its own
         return Kernel(_tripled, targetoptions={"nopython": True}, folder=tmp_path)
 
     assert kernel()(2.0) == 6.0

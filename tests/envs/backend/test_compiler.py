@@ -13,7 +13,7 @@ from numba.core.dispatcher import Dispatcher
 from sideslip.envs.backend import cache, decorators
 
 PACKAGE = cache._PACKAGE
-kernel_folder = cache.kernel_folder.__wrapped__  # asked anew each time
+kernel_folder = cache.find_kernel_folder.__wrapped__  # asked anew each time
 FOLDERS = ("envs", "estimators", "agents", "benchmarks")
 
 
@@ -47,18 +47,18 @@ def run(code: str, home: Path, **variables: str) -> str:
 
 @pytest.mark.smoke
 def test_stamp_is_that_of_the_sources(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stamp = cache.source_stamp()
+    stamp = cache.hash_sources()
     monkeypatch.setattr(cache, "_PACKAGE", copy)
-    assert cache.source_stamp() == stamp
+    assert cache.hash_sources() == stamp
     seen = {stamp}
     # one more byte in any module of any folder
     for module in (*(f"{folder}/__init__.py" for folder in FOLDERS), "benchmarks/speed/plant.py"):
         with open(copy / module, "a") as source:
             source.write("\n")
-        seen.add(cache.source_stamp())
+        seen.add(cache.hash_sources())
     room = copy / "envs" / "vehicle"
     (room / "linear.py").rename(room / "linear_2.py")
-    seen.add(cache.source_stamp())
+    seen.add(cache.hash_sources())
     assert len(seen) == 7
 
 
@@ -69,7 +69,8 @@ print(path_offset(Path(1.0, 0.0, 1.0, 0.0, 0.0, 1.0), 0.25))
 
 
 def test_an_edit_in_a_callee_reaches_its_cached_callers(copy: Path, tmp_path: Path) -> None:
-    """Numba alone would answer from the stale kernel: `path_offset` itself did not change."""
+    """Numba alone would answer from the stale kernel: `compute_path_offset` itself did not
+    change."""
     cache = tmp_path / "cache"
     variables = {"XDG_CACHE_HOME": str(cache)}
     exact = 0.25**2 * (3.0 - 2.0 * 0.25)
@@ -105,15 +106,15 @@ def test_old_versions_are_pruned_but_not_in_a_folder_of_the_users_own(
         monkeypatch.delenv(variable, raising=False)
         base = tmp_path / variable
         kernels = base / "sideslip" / "kernels" if variable == "XDG_CACHE_HOME" else base
-        for age in range(cache._VERSIONS + 3):
+        for age in range(cache._MAX_VERSIONS + 3):
             old = kernels / f"version-{age}"
             old.mkdir(parents=True)
             os.utime(old, (1e9 - age, 1e9 - age))
         monkeypatch.setenv(variable, str(base))
-        assert kernel_folder() == kernels / cache.source_stamp()
-        left = {path.name for path in kernels.iterdir()} - {cache.source_stamp()}
+        assert kernel_folder() == kernels / cache.hash_sources()
+        left = {path.name for path in kernels.iterdir()} - {cache.hash_sources()}
         # our own newest folder is one of those that stay
-        stay = cache._VERSIONS + (-1 if variable == "XDG_CACHE_HOME" else 3)
+        stay = cache._MAX_VERSIONS + (-1 if variable == "XDG_CACHE_HOME" else 3)
         assert left == {f"version-{age}" for age in range(stay)}
 
 
@@ -126,7 +127,7 @@ def test_compiling_leaves_numbas_own_settings_alone() -> None:
 def test_plain_replaces_every_callee_and_leaves_the_original_alone() -> None:
     from sideslip.envs.vehicle.integration import kutta3
 
-    function = decorators.plain(kutta3)
+    function = decorators.as_python(kutta3)
     seen: set[str] = set()
     todo: list[Any] = [function]
     while todo:
@@ -138,14 +139,14 @@ def test_plain_replaces_every_callee_and_leaves_the_original_alone() -> None:
             if hasattr(callee, "__code__") and callee.__name__ not in seen:
                 todo.append(callee)
     assert {"kutta3", "rates", "slips", "sincos", "minimum", "floor"} <= seen
-    assert decorators.plain(kutta3) is not function
+    assert decorators.as_python(kutta3) is not function
 
 
 def test_a_folder_that_can_only_be_read_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    folder = tmp_path / cache.source_stamp("envs")
+    folder = tmp_path / cache.hash_sources("envs")
     assert kernel_folder("envs") == folder  # made
 
     def refuse(*_: object, **__: object) -> None:

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from sideslip.envs.backend.decorators import jit
-from sideslip.envs.backend.eights import eight, mirror, put_eight, scratch
+from sideslip.envs.backend.eights import allocate_scratch, load8, mirror, store8
 
 
 @jit
 def _product(a: Any, b: Any, c: Any) -> None:
-    work = scratch(a, 2, 8)
+    work = allocate_scratch(a, 2, 8)
     for i in range(len(a)):
-        put_eight(work, 0.0, 1, 0)
+        store8(work, 0.0, 1, 0)
         for k in range(len(b)):
-            put_eight(work, eight(work, 1, 0) + a[i, k] * eight(b, k, 8), 1, 0)
-        put_eight(c, eight(work, 1, 0), i, 8)
+            store8(work, load8(work, 1, 0) + a[i, k] * load8(b, k, 8), 1, 0)
+        store8(c, load8(work, 1, 0), i, 8)
 
 
 @jit

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs.backend import elementary
-from sideslip.envs.backend.decorators import plain
+from sideslip.envs.backend.decorators import as_python
 from sideslip.envs.backend.elementary import PI
 from sideslip.envs.backend.primitives import (
     ARRAYS,
@@ -31,7 +31,7 @@ reals = st.floats(-1e15, 1e15)
 
 
 def on_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
-    return plain(function, ARRAYS)
+    return as_python(function, ARRAYS)
 
 
 def worst(value: np.ndarray, exact: np.ndarray) -> float:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from sideslip.envs.backend import files
-from sideslip.envs.backend.files import whole, write_whole
+from sideslip.envs.backend.files import atomic_file, write_atomic
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def mode_of(path: Path) -> int:
 def test_a_new_file_has_the_umasks_mode(path: Path) -> None:
     old = os.umask(0o027)
     try:
-        write_whole(path, b"new")
+        write_atomic(path, b"new")
     finally:
         os.umask(old)
     assert path.read_bytes() == b"new" and mode_of(path) == 0o640
@@ -38,7 +38,7 @@ def test_a_new_file_has_the_umasks_mode(path: Path) -> None:
 def test_an_older_files_mode_stays(mode: int, path: Path) -> None:
     path.write_bytes(b"old")
     path.chmod(mode)
-    write_whole(path, b"new")
+    write_atomic(path, b"new")
     assert path.read_bytes() == b"new" and mode_of(path) == mode
 
 
@@ -47,7 +47,7 @@ def test_an_older_files_owner_stays(path: Path) -> None:
     path.write_bytes(b"old")
     os.chown(path, 12345, 12346)
     path.chmod(0o600)
-    write_whole(path, b"new")
+    write_atomic(path, b"new")
     found = path.stat()
     assert (found.st_uid, found.st_gid, mode_of(path)) == (12345, 12346, 0o600)
 
@@ -62,7 +62,7 @@ def test_a_link_stays_and_its_target_is_written(there: bool, path: Path) -> None
         target.chmod(0o600)
     path.symlink_to("folder/target")
     link.symlink_to("file")  # a link to a link
-    write_whole(link, b"new")
+    write_atomic(link, b"new")
     assert link.is_symlink() and path.is_symlink()
     assert target.read_bytes() == b"new" and os.listdir(folder) == ["target"]
     assert not there or mode_of(target) == 0o600
@@ -73,7 +73,7 @@ def test_a_pipe_is_written_and_stays(path: Path) -> None:
     read: list[bytes] = []
     reader = threading.Thread(target=lambda: read.append(path.read_bytes()), daemon=True)
     reader.start()
-    write_whole(path, b"new")
+    write_atomic(path, b"new")
     reader.join(timeout=10)
     assert read == [b"new"] and stat.S_ISFIFO(path.stat().st_mode)
     assert os.listdir(path.parent) == ["file"]
@@ -81,7 +81,7 @@ def test_a_pipe_is_written_and_stays(path: Path) -> None:
 
 def test_a_device_is_written_and_stays() -> None:
     ours, theirs = pty.openpty()
-    write_whole(os.ttyname(theirs), b"new")
+    write_atomic(os.ttyname(theirs), b"new")
     assert os.read(ours, 3) == b"new" and stat.S_ISCHR(os.stat(os.ttyname(theirs)).st_mode)
     os.close(ours)
     os.close(theirs)
@@ -113,7 +113,7 @@ def test_standard_output_is_written_where_it_goes(name: str, to: str, path: Path
 
 def test_nothing_is_written_where_the_writer_fails(path: Path) -> None:
     path.write_bytes(b"old")
-    with pytest.raises(ValueError, match="no more"), whole(path) as file:
+    with pytest.raises(ValueError, match="no more"), atomic_file(path) as file:
         file.write(b"half of it")
         raise ValueError("no more")
     assert path.read_bytes() == b"old" and os.listdir(path.parent) == ["file"]
@@ -126,14 +126,14 @@ def test_a_full_disk_leaves_the_older_file(path: Path, monkeypatch: pytest.Monke
     path.write_bytes(b"old")
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space left"):
-        write_whole(path, b"new")
+        write_atomic(path, b"new")
     assert path.read_bytes() == b"old" and os.listdir(path.parent) == ["file"]
 
 
 def test_a_folder_is_refused(path: Path) -> None:
     path.mkdir()
     with pytest.raises(IsADirectoryError):
-        write_whole(path, b"new")
+        write_atomic(path, b"new")
     assert os.listdir(path) == [] and os.listdir(path.parent) == ["file"]
 
 
@@ -143,7 +143,7 @@ def test_writers_at_once_leave_one_whole_file(path: Path) -> None:
     started = threading.Barrier(len(contents))
 
     def write(content: bytes) -> None:
-        with whole(path) as file:
+        with atomic_file(path) as file:
             started.wait(timeout=10)  # all are at it
             file.write(content)
 
@@ -154,5 +154,5 @@ def test_writers_at_once_leave_one_whole_file(path: Path) -> None:
 
 def test_a_long_name_is_written(path: Path) -> None:
     long = path.with_name("n" * 255)
-    write_whole(long, b"new")
+    write_atomic(long, b"new")
     assert long.read_bytes() == b"new"

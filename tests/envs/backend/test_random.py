@@ -9,9 +9,9 @@ import pytest
 from scipy import stats
 
 from sideslip.envs.backend import random as noise
-from sideslip.envs.backend.decorators import plain
+from sideslip.envs.backend.decorators import as_python
 from sideslip.envs.backend.primitives import ARRAYS
-from sideslip.envs.backend.random import CHANNELS, normals, philox, uniform, uniforms
+from sideslip.envs.backend.random import CHANNELS, draw_normals, draw_uniforms, philox, to_uniform
 
 pytestmark = pytest.mark.plain
 
@@ -34,7 +34,7 @@ KNOWN = [
 
 
 def on_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
-    return plain(function, ARRAYS)
+    return as_python(function, ARRAYS)
 
 
 def words(text: str) -> list[int]:
@@ -45,7 +45,7 @@ def words(text: str) -> list[int]:
 @pytest.mark.parametrize(("counter", "key", "answer"), KNOWN)
 def test_philox_gives_the_published_answers(counter: str, key: str, answer: str) -> None:
     assert list(philox(*words(key), *words(counter))) == words(answer)
-    assert list(plain(philox)(*words(key), *words(counter))) == words(answer)
+    assert list(as_python(philox)(*words(key), *words(counter))) == words(answer)
     lanes: list[Any] = [np.full(3, word, np.int64) for word in words(key) + words(counter)]
     for lane, word in zip(on_arrays(philox)(*lanes), words(answer), strict=True):
         assert lane.tolist() == [word] * 3
@@ -55,16 +55,16 @@ def sample(block: int, count: int = N) -> np.ndarray:
     """(4, count) normals of a block at ticks 0, 1, 2, ..."""
     ticks = np.arange(count, dtype=np.int64)
     key: Any = [np.full(count, word, np.int64) for word in KEY]
-    return np.stack(on_arrays(normals)(*key, ticks, np.full(count, block, np.int64)))
+    return np.stack(on_arrays(draw_normals)(*key, ticks, np.full(count, block, np.int64)))
 
 
 def test_uniforms_lie_strictly_inside_the_unit_interval() -> None:
-    assert 0.0 < uniform(0) < uniform(0xFFFFFFFF) < 1.0
-    assert uniform(0) == 0.5 / 2.0**32
+    assert 0.0 < to_uniform(0) < to_uniform(0xFFFFFFFF) < 1.0
+    assert to_uniform(0) == 0.5 / 2.0**32
 
 
 def test_uniforms_are_uniform() -> None:
-    u = np.array([uniforms(*KEY, tick, CHANNELS.camera_link) for tick in range(20_000)])
+    u = np.array([draw_uniforms(*KEY, tick, CHANNELS.camera_link) for tick in range(20_000)])
     for column in u.T:
         assert stats.kstest(column, "uniform").pvalue > LEAST_P
 
@@ -114,14 +114,14 @@ def test_sine_and_cosine_halves_have_no_joint_structure() -> None:
 
 def test_every_argument_changes_the_numbers() -> None:
     base = (*KEY, 17, CHANNELS.gps)
-    seen = {normals(*base)}
+    seen = {draw_normals(*base)}
     for place in range(4):
         for bit in (0, 5, 20):
             changed = list(base)
             changed[place] ^= 1 << bit
-            seen.add(normals(*changed))
+            seen.add(draw_normals(*changed))
     assert len(seen) == 13
-    assert len({uniforms(*base, index) for index in range(100)}) == 100
+    assert len({draw_uniforms(*base, index) for index in range(100)}) == 100
 
 
 def test_channels_do_not_share_blocks() -> None:

@@ -16,15 +16,15 @@ from sideslip.envs.backend import cache
 from sideslip.envs.backend.kernels import kernel_file
 from sideslip.envs.backend.kernels.compiler import Kernel
 
-kernel_folder = cache.kernel_folder.__wrapped__  # asked anew each time
-LEVELS = ("", "sideslip", "sideslip/kernels", f"sideslip/kernels/{cache.source_stamp('envs')}")
+kernel_folder = cache.find_kernel_folder.__wrapped__  # asked anew each time
+LEVELS = ("", "sideslip", "sideslip/kernels", f"sideslip/kernels/{cache.hash_sources('envs')}")
 
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """As in a process of its own, in which nothing was said yet."""
-    monkeypatch.setattr(kernel_file, "_linked", {})
-    monkeypatch.setattr(cache, "_noticed", {"compiling"})
+    monkeypatch.setattr(kernel_file, "_libraries", {})
+    monkeypatch.setattr(cache, "_reported", {"compiling"})
     monkeypatch.setattr(cache._logger, "hasHandlers", lambda: False)
     for name in ("NUMBA_CACHE_DIR", "SIDESLIP_QUIET"):
         monkeypatch.delenv(name, raising=False)
@@ -37,7 +37,7 @@ def planted(tmp_path: Path) -> Path:
     """The file of a cached kernel, in a folder of the user's."""
     compiled(tmp_path / "kernels")
     (path,) = (tmp_path / "kernels").iterdir()
-    kernel_file._linked.clear()
+    kernel_file._libraries.clear()
     return path
 
 
@@ -81,7 +81,7 @@ def test_a_pickle_is_not_opened(
     for content in (pickle.dumps(_Bomb()), pickle.dumps((b"", _Bomb(), (), ()), protocol=0)):
         planted.write_bytes(digested(content))
         assert compiled(planted.parent)
-        kernel_file._linked.clear()
+        kernel_file._libraries.clear()
     assert not (tmp_path / "exploded").exists()
     assert capsys.readouterr().err.count(str(planted)) == 1
     assert not compiled(planted.parent)  # the file is a kernel's again
@@ -93,7 +93,7 @@ def test_another_kernels_file_is_not_run(
     compiled(tmp_path / "other", _halved)
     (other,) = (tmp_path / "other").iterdir()
     planted.write_bytes(other.read_bytes())
-    kernel_file._linked.clear()
+    kernel_file._libraries.clear()
     assert compiled(planted.parent)
     assert "another kernel's" in capsys.readouterr().err
 
@@ -131,7 +131,7 @@ def test_a_file_that_others_could_have_written_is_not_read(
             os.mkfifo(planted)  # whoever opens it waits for a writer
         else:
             planted.mkdir()
-    assert cache.read(planted) is None
+    assert cache.read_trusted(planted) is None
     message = capsys.readouterr().err
     assert str(planted) in message and len(message.splitlines()) == 1
     assert compiled(planted.parent)
@@ -154,7 +154,7 @@ def test_what_is_checked_is_what_is_read(planted: Path, monkeypatch: pytest.Monk
 
     for first in (True, False):
         monkeypatch.setattr(os, "open", exchanged)
-        assert cache.read(planted) == (None if first else whole)
+        assert cache.read_trusted(planted) == (None if first else whole)
         monkeypatch.setattr(os, "open", really)
         assert planted.read_bytes() == b"exchanged"
         planted.write_bytes(whole)
@@ -204,7 +204,7 @@ def test_where_no_folder_can_be_made_the_reason_is_said(
 
 def test_a_kernels_folder_is_checked_whenever_it_is_read(planted: Path) -> None:
     planted.parent.chmod(0o777)
-    assert cache.read(planted) is None
+    assert cache.read_trusted(planted) is None
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ pytest.importorskip("numba_cuda")
 from sideslip.envs import StabilityVectorEnv  # noqa: E402
 from sideslip.envs.cuda import env, launch  # noqa: E402
 from sideslip.envs.cuda.env import CudaVectorEnv  # noqa: E402
-from sideslip.envs.cuda.kernel import how_of, specification  # noqa: E402
+from sideslip.envs.cuda.kernel import make_constants, make_specification  # noqa: E402
 from sideslip.envs.cuda.text import SIMULATED  # noqa: E402
 
 pytestmark = pytest.mark.skipif(SIMULATED, reason="of real devices")
@@ -35,8 +35,10 @@ def test_rows_that_do_not_fit_are_refused_with_how_many_would(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     config = StabilityVectorEnv(1).config
-    sizes = specification(how_of(config, "NextStep", record=False), np.float64, 1000, 1)
-    needed = env.bytes_of(sizes)
+    sizes = make_specification(
+        make_constants(config, "NextStep", record=False), np.float64, 1000, 1
+    )
+    needed = env.count_bytes(sizes)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (needed // 2, needed))
     with pytest.raises(MemoryError, match=r"1000 rows of \d+ bytes .* on cuda:0.*at most 499 rows"):
         env.check_memory(sizes, 1000, torch.device("cuda:0"))
@@ -72,13 +74,13 @@ def driver(monkeypatch: pytest.MonkeyPatch) -> Callable[..., SimpleNamespace]:
     monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
     stream = SimpleNamespace(cuda_stream=77)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
-    monkeypatch.setattr(launch, "ready", lambda device: None)
+    monkeypatch.setattr(launch, "make_context_current", lambda device: None)
     return fake
 
 
 def test_a_launch_has_a_thread_for_each_row_and_one_address_for_each_array(driver: Any) -> None:
     fake = driver()
-    loaded = launch.Loaded("// PTX", torch.device("cuda:0"), fake)
+    loaded = launch.DriverKernel("// PTX", torch.device("cuda:0"), fake)
     assert fake.calls["cuModuleLoadData"] == (b"// PTX\0",)
     assert fake.calls["cuModuleGetFunction"] == ("module", b"sideslip_step")
     arrays = [torch.zeros(3), torch.zeros(0)]
@@ -102,4 +104,4 @@ def test_a_launch_has_a_thread_for_each_row_and_one_address_for_each_array(drive
 def test_what_the_driver_refuses_is_said(driver: Any, call: str, code: str, error: Any) -> None:
     fake = driver(**{call: code})
     with pytest.raises(error, match=f"on cuda:0: {code}"):
-        launch.Loaded("// PTX", torch.device("cuda:0"), fake)(5, False, [])
+        launch.DriverKernel("// PTX", torch.device("cuda:0"), fake)(5, False, [])

@@ -5,16 +5,16 @@ import pytest
 
 pytest.importorskip("numba_cuda")
 
-from sideslip.envs.cuda.generator import next_key, words_of
+from sideslip.envs.cuda.generator import draw_key, read_words
 
 pytestmark = pytest.mark.plain
 
 
 def test_keys_are_those_of_numpys_generator() -> None:
     generators = [np.random.default_rng(seed) for seed in range(200)]
-    words = words_of(generators)
+    words = read_words(generators)
     for i, generator in enumerate(generators):
         for _ in range(5):
             key = int(generator.integers(0, 2**64, dtype=np.uint64))
-            assert next_key(words[:, i]) == (key & 0xFFFFFFFF, key >> 32)
-    assert np.array_equal(words, words_of(generators))  # and it stands where NumPy's does
+            assert draw_key(words[:, i]) == (key & 0xFFFFFFFF, key >> 32)
+    assert np.array_equal(words, read_words(generators))  # and it stands where NumPy's does

@@ -13,24 +13,24 @@ pytest.importorskip("numba_cuda")
 from sideslip.envs import StabilityVectorEnv
 from sideslip.envs.backend import cache
 from sideslip.envs.cuda import ptx
-from sideslip.envs.cuda.kernel import NAME, How, Memory, how_of
+from sideslip.envs.cuda.kernel import NAME, DeviceArrays, KernelConstants, make_constants
 
 H200 = (9, 0)
 ARITHMETIC = re.compile(r"^\t(?:@!?%\w+ )?(?:add|sub|mul|fma|div|rcp|sqrt)\S*\.(f32|f64)\s", re.M)
 
 
-def how() -> How:
+def how() -> KernelConstants:
     env = StabilityVectorEnv(1, sensors="fusion", reference="model", scenario="random-steering")
-    return how_of(env.config, "NextStep", record=False)
+    return make_constants(env.config, "NextStep", record=False)
 
 
 def test_float64_has_no_contraction_and_rounds_as_ieee_asks() -> None:
-    text = ptx.ptx_of(how(), np.float64, H200)
-    found = ptx.instructions(text)
+    text = ptx.get_ptx(how(), np.float64, H200)
+    found = ptx.count_opcodes(text)
     assert ".target sm_90" in text
     head = text[text.index(f".visible .entry {NAME}(") :].partition(")")[0]
-    kinds = re.findall(r"\.param \.(\w+)", head)  # what `launch.Loaded` hands over
-    assert kinds == ["u64", "u8", *["u64"] * len(Memory._fields)]
+    kinds = re.findall(r"\.param \.(\w+)", head)  # what `launch.DriverKernel` hands over
+    assert kinds == ["u64", "u8", *["u64"] * len(DeviceArrays._fields)]
     assert not [each for each in found if each.startswith(("fma", "mad"))]
     floats = [each for each in found if re.match(r"(add|sub|mul|div|rcp|sqrt)\S*\.f", each)]
     assert len(floats) >= 6
@@ -41,8 +41,8 @@ def test_float64_has_no_contraction_and_rounds_as_ieee_asks() -> None:
 
 
 def test_float32_has_no_double_in_the_ticks() -> None:
-    text = ptx.ptx_of(how(), np.float32, H200)
-    assert ptx.instructions(text)["fma.rn.f32"] > 500
+    text = ptx.get_ptx(how(), np.float32, H200)
+    assert ptx.count_opcodes(text)["fma.rn.f32"] > 500
     kinds = ARITHMETIC.findall(text)
     assert kinds.count("f64") < 0.02 * kinds.count("f32")
     longest = max("".join("s" if each == "f32" else " " for each in kinds).split(), key=len)
@@ -59,16 +59,16 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         made.append(arguments)
         return f"text {len(made)}"
 
-    monkeypatch.setattr(ptx, "_compiled", compiled)
-    monkeypatch.setattr(cache, "kernel_folder", lambda layer: tmp_path)
+    monkeypatch.setattr(ptx, "_compile_ptx", compiled)
+    monkeypatch.setattr(cache, "find_kernel_folder", lambda layer: tmp_path)
     return tmp_path
 
 
 def test_each_gpu_has_its_own_file(folder: Path) -> None:
-    assert ptx.ptx_of(how(), np.float64, H200) == "text 1"
-    assert ptx.ptx_of(how(), np.float64, H200) == "text 1"
-    assert ptx.ptx_of(how(), np.float64, (8, 0)) == "text 2"
-    assert ptx.ptx_of(how(), np.float32, H200) == "text 3"
+    assert ptx.get_ptx(how(), np.float64, H200) == "text 1"
+    assert ptx.get_ptx(how(), np.float64, H200) == "text 1"
+    assert ptx.get_ptx(how(), np.float64, (8, 0)) == "text 2"
+    assert ptx.get_ptx(how(), np.float32, H200) == "text 3"
     assert len(list(folder.iterdir())) == 3
 
 
@@ -86,8 +86,8 @@ def test_each_gpu_has_its_own_file(folder: Path) -> None:
 def test_a_file_of_another_gpu_or_not_whole_is_compiled_anew(
     folder: Path, left: Callable[[bytes], bytes]
 ) -> None:
-    ptx.ptx_of(how(), np.float64, H200)
+    ptx.get_ptx(how(), np.float64, H200)
     (path,) = folder.iterdir()
     path.write_bytes(left(path.read_bytes()))
-    assert ptx.ptx_of(how(), np.float64, H200) == "text 2"
+    assert ptx.get_ptx(how(), np.float64, H200) == "text 2"
     assert path.read_bytes().endswith(b"text 2")

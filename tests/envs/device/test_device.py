@@ -12,7 +12,7 @@ from ..helpers import FULL, IDS, unwrapped
 torch = pytest.importorskip("torch")
 
 from sideslip.envs.backend import random as noise  # noqa: E402
-from sideslip.envs.backend.on_torch import on_tensors  # noqa: E402
+from sideslip.envs.backend.on_torch import to_torch  # noqa: E402
 from sideslip.envs.device.env import DeviceVectorEnv  # noqa: E402
 from sideslip.envs.engine.layout import Z  # noqa: E402
 from sideslip.envs.record import FAST  # noqa: E402
@@ -40,14 +40,14 @@ def test_the_noise_has_the_same_words_and_the_same_numbers_to_rounding(device: s
     rng = np.random.default_rng(3)
     keys, ticks = rng.integers(0, 2**32, (2, 500)), rng.integers(0, 10**7, 500)
     told = [torch.as_tensor(each, device=device) for each in (*keys, ticks)]
-    exact, normals = on_tensors(torch.float64, noise.philox, noise.normals)
-    (rough,) = on_tensors(torch.float32, noise.normals)
+    exact, normals = to_torch(torch.float64, noise.philox, noise.draw_normals)
+    (rough,) = to_torch(torch.float32, noise.draw_normals)
     words = torch.stack(exact(*told, 5)).cpu().numpy()
     found = torch.stack(normals(*told, 5)).cpu().numpy()
     single = torch.stack(rough(*told, 5)).cpu().numpy()
     for i, (low, high, tick) in enumerate(zip(*keys.tolist(), ticks.tolist(), strict=True)):
         assert tuple(words[:, i].tolist()) == noise.philox(low, high, tick, 5)
-        wanted = noise.normals(low, high, tick, 5)
+        wanted = noise.draw_normals(low, high, tick, 5)
         assert np.abs(found[:, i] - wanted).max() < 1e-13
         assert np.abs(single[:, i] - wanted).max() < 2e-5
 
@@ -55,7 +55,7 @@ def test_the_noise_has_the_same_words_and_the_same_numbers_to_rounding(device: s
 @pytest.mark.plain
 def test_the_largest_word_has_a_normal_number_in_float32() -> None:
     """Its logarithm is rounded to above zero there."""
-    (pair,) = on_tensors(torch.float32, noise._normal_pair)
+    (pair,) = to_torch(torch.float32, noise._draw_normal_pair)
     words = torch.full((4,), 2**32 - 1), torch.arange(4) << 30
     assert torch.isfinite(torch.stack(pair(*words))).all()
 

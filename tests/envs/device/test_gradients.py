@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from sideslip.envs.device.env import DeviceVectorEnv  # noqa: E402
-from sideslip.envs.device.gradient import Gate  # noqa: E402
+from sideslip.envs.device.gradient import GradientGate  # noqa: E402
 from sideslip.envs.record import PACKET  # noqa: E402
 
 from .moments import DRIVEN, FUSION  # noqa: E402
@@ -47,7 +47,7 @@ def drive(env: DeviceVectorEnv, inputs: dict[str, Any]) -> Any:
 @pytest.mark.parametrize("shape", [(4,), (2, 4)])
 def test_a_gate_lets_slopes_through_to_the_open_rows_alone(shape: tuple[int, ...]) -> None:
     """A row that is over gets zero, finite slopes or not; an open row all that is a number."""
-    gate = Gate()
+    gate = GradientGate()
     value = torch.ones(shape, requires_grad=True)
     passed = gate(value)
     gate.open = torch.tensor([True, False, True, False])  # as late as the gradients

@@ -114,7 +114,7 @@ def test_numbers_that_overflow_leave_the_other_rows_their_gradients() -> None:
     actions.requires_grad_()
     total: Any = 0.0
     for _ in range(5):
-        env._waiting = False  # rows that are over stand still
+        env._has_over = False  # rows that are over stand still
         obs, rewards, *_, infos = env.step(actions)
         total = total + rewards + infos["gamma"] + torch.nan_to_num(obs).sum(1)
     assert infos["failure"].tolist() == [3, 0, 4]

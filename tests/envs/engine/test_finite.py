@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sideslip.envs import FAILURES, SCENARIOS, StabilityEnv, vehicle_from
+from sideslip.envs import FAILURES, SCENARIOS, StabilityEnv, make_vehicle
 from sideslip.envs.engine.layout import P
 from sideslip.envs.vehicle.tyres import TYRE_LAWS
 
@@ -96,7 +96,7 @@ def test_vehicles_that_nobody_builds(
     """Also where 1 ms is far too long a step for the integrator."""
     small_angle, lags, roll = plant
     try:
-        vehicle_from({"base": "coms", **vehicle}, strict=False).check_roll()
+        make_vehicle({"base": "coms", **vehicle}, strict=False).check_roll()
     except ValueError:
         roll = False
     scenario = FULL | {

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from sideslip.envs.backend import random as noise
-from sideslip.envs.backend.arrays import at, write
+from sideslip.envs.backend.arrays import load_element, write
 from sideslip.envs.backend.decorators import jit
 from sideslip.envs.backend.elementary import atan, atan2, exp, sincos, smoothstep, wrap
 from sideslip.envs.backend.primitives import (
     absolute,
-    anywhere,
+    any_lane,
     floor,
     frexp,
     maximum,
@@ -20,9 +20,9 @@ from sideslip.envs.backend.primitives import (
     select,
     sqrt,
     to_float,
-    whole,
+    to_int,
 )
-from sideslip.envs.backend.random import normals, uniforms
+from sideslip.envs.backend.random import draw_normals, draw_uniforms
 from sideslip.envs.backend.simd import LANES
 from sideslip.envs.engine.layout import FLAGS
 
@@ -34,7 +34,7 @@ FUSION = "sideslip/YawFusion-v0"
 
 @jit
 def _operators(x: Any, y: Any) -> Any:
-    i, j = whole(floor(x)), whole(floor(y))
+    i, j = to_int(floor(x)), to_int(floor(y))
     both = (x < y) & (x != 2.0) | (y >= 1.0)
     words = (((i * 3) & 255) << 2) ^ (j >> 1) | (i - j)
     return (
@@ -53,12 +53,12 @@ def _primitives(x: Any, y: Any) -> Any:
 
 @jit
 def _random(x: Any, y: Any) -> Any:
-    return normals(whole(x * x), 77, whole(floor(y * y)), 3)
+    return draw_normals(to_int(x * x), 77, to_int(floor(y * y)), 3)
 
 
 @jit
 def _uniform(x: Any, y: Any) -> Any:
-    return uniforms(5, whole(x * x), whole(floor(y * y)), noise.CHANNELS.gps_link, 2)
+    return draw_uniforms(5, to_int(x * x), to_int(floor(y * y)), noise.CHANNELS.gps_link, 2)
 
 
 @jit
@@ -70,7 +70,7 @@ def _turned(x: Any, y: Any) -> Any:
 @jit
 def _stepped(x: Any, y: Any) -> Any:
     shape = 0.0
-    if anywhere(x > 0.0):  # a variable that is a number on one way and lanes on the other
+    if any_lane(x > 0.0):  # a variable that is a number on one way and lanes on the other
         shape = shape + smoothstep(x)
     return shape, y
 
@@ -96,7 +96,7 @@ def test_lanes_hold_the_bits_of_single_numbers(function: Callable[..., Any]) -> 
 
     @jit
     def abreast(x: Any, y: Any, out: Any) -> None:
-        write(out, function(at(x, 0), at(y, 0)), where)
+        write(out, function(load_element(x, 0), load_element(y, 0)), where)
 
     out = np.empty((width, LANES))
     for start in range(0, len(x), LANES):
@@ -119,10 +119,10 @@ def test_rows_are_computed_abreast() -> None:
     """The others of these tests would pass without any lanes."""
     env = batch(FUSION, 2 * LANES)
     env.reset(seed=0)
-    assert not env.block.rows.any()
+    assert not env.lane_buffers.rows.any()
     obs = env.step(np.zeros((2 * LANES, 1)))[0]
-    assert sorted(env.block.members) == list(range(LANES, 2 * LANES))
-    assert bits(env.block.rows[:, 0, :].T) == bits(env.rows[LANES:, :, 0])
+    assert sorted(env.lane_buffers.members) == list(range(LANES, 2 * LANES))
+    assert bits(env.lane_buffers.rows[:, 0, :].T) == bits(env.rows[LANES:, :, 0])
     assert obs[LANES:, 0].tolist() == env.rows[LANES:, -1, 0].astype(np.float32).tolist()
 
 
@@ -169,14 +169,14 @@ def test_scenarios_of_one_kind_stand_next_to_each_other() -> None:
     count = 6 * LANES
     env = batch(FUSION, count)
     env.reset(seed=0, options={"scenario": ["gust", "curved-road-driver"] * (count // 2)})
-    follows = env.switches[env.block.order][:, FLAGS.steering]
+    follows = env.switches[env.lane_buffers.order][:, FLAGS.steering]
     assert (np.diff(follows) != 0).sum() == 1  # all drivers together, all programmes together
-    assert sorted(env.block.order) == list(range(count))
-    snapshot, sorted_order = env.get_state(), env.block.order.copy()
+    assert sorted(env.lane_buffers.order) == list(range(count))
+    snapshot, sorted_order = env.get_state(), env.lane_buffers.order.copy()
     env.reset(seed=0)
-    assert env.block.order.tolist() == list(range(count))
+    assert env.lane_buffers.order.tolist() == list(range(count))
     env.set_state(snapshot)
-    assert env.block.order.tolist() == sorted_order.tolist()
+    assert env.lane_buffers.order.tolist() == sorted_order.tolist()
 
 
 def test_a_block_with_a_car_that_fails_is_stepped_car_by_car() -> None:

@@ -6,21 +6,21 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import pytest
 
-from sideslip.envs.backend.arrays import offsets, read, write
+from sideslip.envs.backend.arrays import make_offsets, read, write
 from sideslip.envs.backend.decorators import jit
 from sideslip.envs.engine.layout import (
     FLAGS,
-    IN_SLOW,
     PARAMS_WIDTH,
+    SLOW_STATE,
     SLOW_WIDTH,
     STATE_WIDTH,
     P,
     Z,
 )
 from sideslip.envs.record import PACKET_WIDTH
-from sideslip.envs.sensors.link import IN_FLIGHT
+from sideslip.envs.sensors.link import MAX_IN_FLIGHT
 
-QUEUE = len(Z.slow) * IN_FLIGHT * PACKET_WIDTH
+QUEUE = len(Z.slow) * MAX_IN_FLIGHT * PACKET_WIDTH
 
 
 def leaves(part: Any) -> Iterator[int]:
@@ -32,7 +32,7 @@ def leaves(part: Any) -> Iterator[int]:
 
 
 @pytest.mark.parametrize(
-    ("part", "width"), [(P, PARAMS_WIDTH), (IN_SLOW, SLOW_WIDTH), (FLAGS, len(FLAGS))]
+    ("part", "width"), [(P, PARAMS_WIDTH), (SLOW_STATE, SLOW_WIDTH), (FLAGS, len(FLAGS))]
 )
 def test_every_number_has_a_place_of_its_own(part: Any, width: int) -> None:
     assert list(leaves(part)) == list(range(width))
@@ -45,7 +45,9 @@ def test_of_the_state_only_the_queue_has_room_for_more_numbers_than_names() -> N
 
 def test_what_a_tick_of_the_plant_changes_lies_before_the_slow_sensors() -> None:
     """The lanes copy that alone, and the driver's angle."""
-    assert max(leaves((Z.motion, Z.drive, Z.clock, Z.refs, Z.lead))) + 1 == Z.slow[0].frames
+    assert (
+        max(leaves((Z.motion, Z.drive, Z.clock, Z.refs, Z.nominal_motion))) + 1 == Z.slow[0].frames
+    )
 
 
 class Wheel(NamedTuple):
@@ -60,7 +62,7 @@ class Cart(NamedTuple):
     last: Any
 
 
-CART, CART_WIDTH = offsets(Cart)
+CART, CART_WIDTH = make_offsets(Cart)
 
 
 @jit

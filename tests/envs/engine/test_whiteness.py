@@ -17,7 +17,7 @@ from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.sensors.noise import Noise
 from sideslip.envs.sensors.slow import CAMERA, GPS
 from sideslip.envs.ticks import TICK
-from sideslip.envs.vehicle.linear import LinearModel, bicycle
+from sideslip.envs.vehicle.linear import LinearModel, make_bicycle_model
 
 from ..batches import batch
 from ..helpers import LINEAR, fast_rows, packets, play
@@ -120,9 +120,9 @@ def test_force_and_moment_are_driven_by_fresh_numbers(n: int) -> None:
     turn = 0.5 * SPEED * (gamma[1:] + gamma[:-1])
     v_y = np.cumsum(TICK * (a_y[1:] - turn))  # but for where it starts, which decays
     x = np.stack([v_y / SPEED, gamma[1:]])
-    model = bicycle(COMS, SPEED)
+    model = make_bicycle_model(COMS, SPEED)
     push = np.diag([1.0 / (COMS.mass * SPEED), 1.0 / COMS.yaw_inertia])
-    G, H = LinearModel(model.A, push, np.eye(2), model.states, (), ()).discrete(TICK)
+    G, H = LinearModel(model.A, push, np.eye(2), model.states, (), ()).discretise(TICK)
     acting = np.linalg.solve(H, x[:, 1:] - G @ x[:, :-1])[:, 1000:] / levels[:, None]
     keep = np.exp(-TICK / 0.05)
     fresh = (acting[:, 1:] - keep * acting[:, :-1]) / np.sqrt(1.0 - keep**2)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from sideslip.envs import StabilityEnv
-from sideslip.envs.backend.decorators import plain
-from sideslip.envs.engine.arrays import parts_of, workspace_of
+from sideslip.envs.backend.decorators import as_python
+from sideslip.envs.engine.arrays import make_workspace, split_workspace
 
 from ..helpers import bits
 
@@ -20,8 +20,8 @@ SPINS = {"v_x": 15.0, "v_y": 8.0, "gamma": -1.0}
 @pytest.mark.parametrize("entries", [4, 5])
 @pytest.mark.parametrize("n", [1, 10, 33])
 def test_every_part_has_a_place_of_its_own(n: int, entries: int) -> None:
-    work = workspace_of(n, np.zeros((2, entries)), most=3, trace=2)
-    row, bounds, window = plain(parts_of)(work)
+    work = make_workspace(n, np.zeros((2, entries)), max_packets=3, trace_width=2)
+    row, bounds, window = as_python(split_workspace)(work)
     parts = [row.p, row.z, row.switches, row.obs, row.report, row.rows, row.packets, bounds, window]
     for k, part in enumerate(parts):
         part[...] = k + 1
@@ -38,7 +38,7 @@ def test_a_copy_has_an_episode_of_its_own() -> None:
     obs = other.step([0.1])[0]
     assert bits(env.get_state()["state"]) == before
     assert bits(env.step([0.1])[0]) == bits(obs)
-    assert np.shares_memory(other.rows, other._work)
+    assert np.shares_memory(other.rows, other._workspace)
 
 
 @pytest.mark.parametrize("n", [7, 10, 50])

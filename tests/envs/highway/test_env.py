@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
 from sideslip.envs import FAILURES
-from sideslip.envs.highway.env import MOST, HighwayEnv
+from sideslip.envs.highway.env import MAX_VEHICLES, HighwayEnv
 from sideslip.envs.highway.roads import ANGLE, ENTRY, RADIUS
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.task.failures import COLLISION, DEPARTURE
@@ -66,7 +66,7 @@ def test_the_same_seed_has_the_same_bits(road: str) -> None:
     scenario = {"base": "wet-evasion", "duration": 2.0}
     first, again = (made(road=road, scenario=scenario, traffic=5) for _ in range(2))
     assert bits(drive(first, 7, 200)) == bits(drive(again, 7, 200))
-    others = [[v.position.tolist() for v in env._around.road.vehicles] for env in (first, again)]  # type: ignore[union-attr]
+    others = [[v.position.tolist() for v in env._traffic.road.vehicles] for env in (first, again)]  # type: ignore[union-attr]
     assert others[0] == others[1] and len(others[0]) == 7
     assert bits(drive(first, 8, 200)) != bits(drive(again, 7, 200))
 
@@ -93,8 +93,8 @@ def test_what_others_do_does_not_depend_on_the_control_period() -> None:
         env.reset(seed=2)
         for _ in range(2000 // period):
             env.step([0.0])
-        assert env._around is not None
-        found.append([v.position.tolist() for v in env._around.road.vehicles[1:]])
+        assert env._traffic is not None
+        found.append([v.position.tolist() for v in env._traffic.road.vehicles[1:]])
     assert found[0] == found[1] == found[2]
 
 
@@ -115,7 +115,7 @@ def test_the_camera_sees_a_bend_as_our_own_road_has_it() -> None:
     for env in (ours, theirs):
         steps = drive(env, 1, 800)
         assert 1.2 * ENTRY < env.motion.s < RADIUS * ANGLE
-        seen.append(np.concatenate([record.packets_of("camera") for *_, record in steps]))
+        seen.append(np.concatenate([record.select_packets("camera") for *_, record in steps]))
         assert steps[-1][-1].fast[-1, FAST.curvature] == pytest.approx(1.0 / RADIUS)
     assert seen[0].shape == seen[1].shape
     late = np.abs(seen[0][:, PACKET.captured] - 1000.0 * ENTRY / 16.0) > 15.0
@@ -133,7 +133,7 @@ def test_a_planted_collision_ends_the_episode_at_the_full_charge() -> None:
     found = drive(env, 0, 600)
     info = found[-1][-2]
     assert FAILURES[info["failure"]] == "collision" and info["failure"] == COLLISION
-    front, other = env._around.road.vehicles  # type: ignore[union-attr]
+    front, other = env._traffic.road.vehicles  # type: ignore[union-attr]
     gap = other.position[0] - front.position[0] - 0.5 * (front.LENGTH + other.LENGTH)
     assert -2.0 < gap < 0.1
     assert info["cost"] == pytest.approx(100.0 * (6.0 - info["t"]), rel=0.05)
@@ -144,8 +144,8 @@ def test_leaving_all_lanes_is_a_departure() -> None:
     env = made(scenario=scenario | {"speed": 20.0, "amplitude": 0.02}, **ALONE)
     info = drive(env, 0, 800)[-1][-2]
     assert info["failure"] == DEPARTURE
-    ours = env._around.ours  # type: ignore[union-attr]
-    edge = 2.0 if env._around.course.free > env._around.course.own else 6.0  # type: ignore[union-attr]
+    ours = env._traffic.ego  # type: ignore[union-attr]
+    edge = 2.0 if env._traffic.course.free_lane > env._traffic.course.own_lane else 6.0  # type: ignore[union-attr]
     assert edge < env.motion.y < edge + 2.0 * ours.WIDTH
 
 
@@ -183,7 +183,7 @@ def test_steering_is_added_where_it_is_asked_for() -> None:
     ("changes", "words"),
     [
         ({"road": "gravel"}, "gravel"),
-        ({"traffic": -1}, f"0 to {MOST}"),
+        ({"traffic": -1}, f"0 to {MAX_VEHICLES}"),
         ({"traffic": 2.5}, "number of vehicles"),
         ({"hazard": {"gap": 1.0}}, "gap"),
         ({"hazard": {"headway": -1.0}}, "headway"),

@@ -17,11 +17,11 @@ from sideslip.envs.highway.keeping import (
     STATES,
     KeepingEnv,
     KeepingPlant,
-    OwnObservation,
-    keeping_vehicle,
+    NativeObservation,
+    make_keeping_vehicle,
 )
-from sideslip.envs.outside.plants import Acting
-from sideslip.envs.vehicle.linear import bicycle
+from sideslip.envs.outside.plants import OutsideInputs
+from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation
 
 from ..helpers import bits
@@ -82,7 +82,7 @@ def test_our_vehicle_has_the_dynamics_of_theirs() -> None:
         return car.derivative[[4, 5], 0] * [1.0 / speed, 1.0]
 
     columns = [rates(h * speed, 0.0, 0.0), rates(0.0, h, 0.0), rates(0.0, 0.0, h)]
-    model = bicycle(keeping_vehicle(), speed)
+    model = make_bicycle_model(make_keeping_vehicle(), speed)
     assert np.stack(columns[:2], 1) / h == pytest.approx(model.A, rel=1e-5, abs=1e-6)
     assert columns[2] / h == pytest.approx(model.B[:, 0], rel=1e-5)
 
@@ -92,7 +92,7 @@ def test_a_tick_moves_their_car_and_its_place_on_the_lane() -> None:
     plant = KeepingPlant()
     plant.start(0)
     for _ in range(3000):
-        plant.step(Acting(0.01), 1e-3)
+        plant.step(OutsideInputs(0.01), 1e-3)
     carried = (plant.y, plant.theta)
     plant.project()
     assert carried == pytest.approx((plant.y, plant.theta), abs=1e-4)
@@ -105,7 +105,7 @@ def test_the_environment_keeps_gymnasiums_contract() -> None:
 def test_the_same_seed_has_the_same_bits() -> None:
     found = []
     for _ in range(2):
-        env = OwnObservation(KeepingEnv(), returned=False)
+        env = NativeObservation(KeepingEnv(), returned=False)
         first = env.reset(seed=3)
         found.append([first, *(env.step([0.0, 0.1]) for _ in range(20))])
     assert bits(found[0]) == bits(found[1])
@@ -116,7 +116,7 @@ def test_accelerometer_and_gyro_are_those_of_the_motion() -> None:
     plant, speeds, felt = KeepingPlant(), [], []
     plant.start(0)
     for _ in range(400):
-        plant.step(Acting(0.05), 1e-3)
+        plant.step(OutsideInputs(0.05), 1e-3)
         motion = plant.motion
         speeds.append((motion.v_y, motion.gamma * motion.v_x))
         felt.append(plant.specific_force[1])
@@ -132,7 +132,7 @@ def test_our_filter_keeps_the_lane_where_their_observation_does_not() -> None:
     for name in ("multirate-residual-kf", "returned"):
         base: Any = KeepingEnv()
         env: Any = (
-            OwnObservation(base, returned=True)
+            NativeObservation(base, returned=True)
             if name == "returned"
             else EstimateObservation(base, name, outputs=STATES, std=False)
         )

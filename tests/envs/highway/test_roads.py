@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from sideslip.envs.highway.roads import ROADS, Place, place_on
+from sideslip.envs.highway.roads import ROADS, LanePosition, locate_on_lane
 
 from highway_env.road.lane import PolyLane, SineLane, StraightLane  # isort: skip
 
@@ -27,8 +27,8 @@ def test_a_route_is_one_smooth_line_from_the_origin(road: str, side: int) -> Non
 def test_the_free_lane_is_on_the_side_that_was_asked_for(road: str, side: int) -> None:
     course = ROADS[road](side)
     lanes = course.network.graph["a"]["b"]
-    assert lanes[course.own] is course.route[0]
-    assert -lanes[course.free].position(0.0, 0.0)[1] == side * 4.0  # our y points to the left
+    assert lanes[course.own_lane] is course.route[0]
+    assert -lanes[course.free_lane].position(0.0, 0.0)[1] == side * 4.0  # our y points to the left
 
 
 LANES = {
@@ -52,11 +52,11 @@ def test_a_place_is_the_foot_of_the_perpendicular(name: str) -> None:
     tangent = (after - before) / np.hypot(*(after - before))
     left = np.array([tangent[1], -tangent[0]])
     X, Y = centre + y * left
-    found = place_on(lane, X, -Y, 0.0)
+    found = locate_on_lane(lane, X, -Y, 0.0)
     theta = -math.atan2(tangent[1], tangent[0])
     assert found.y == pytest.approx(y, abs=1e-6)
     assert found.theta == pytest.approx(theta, abs=1e-6)
-    assert found.along == pytest.approx(along, abs=1e-5)
+    assert found.longitudinal == pytest.approx(along, abs=1e-5)
     last, first = after - centre, centre - before
     turn = (first[1] * last[0] - first[0] * last[1]) / np.hypot(*last) ** 3
     assert found.curvature == pytest.approx(turn, abs=2e-5)
@@ -66,17 +66,17 @@ def test_the_curvature_of_a_sine_is_the_formulas() -> None:
     lane, x = LANES["sine"], 20.0
     A, w, phase = 5.0, 2.0 * math.pi / 100.0, 0.3
     slope, second = A * w * math.cos(w * x + phase), -A * w**2 * math.sin(w * x + phase)
-    found = place_on(lane, x, -A * math.sin(w * x + phase), 0.0)
+    found = locate_on_lane(lane, x, -A * math.sin(w * x + phase), 0.0)
     assert found.curvature == pytest.approx(-second / (1.0 + slope**2) ** 1.5, rel=1e-4)
 
 
 def test_a_place_on_a_spline_is_near_it() -> None:
     lane = LANES["spline"]
-    place = place_on(lane, 45.0, -lane.position(45.0, 0.0)[1], 0.0)
+    place = locate_on_lane(lane, 45.0, -lane.position(45.0, 0.0)[1], 0.0)
     assert abs(place.y) < 0.5 and abs(place.theta) < 0.5
 
 
 def test_directions_are_those_nearest_to_the_car() -> None:
     lane = StraightLane([0.0, 0.0], [100.0, 0.0])
-    assert place_on(lane, 1.0, 2.0, 0.1) == Place(1.0, 2.0, 0.0, 0.0)
-    assert place_on(lane, 1.0, 2.0, 6.3).theta == 2.0 * math.pi
+    assert locate_on_lane(lane, 1.0, 2.0, 0.1) == LanePosition(1.0, 2.0, 0.0, 0.0)
+    assert locate_on_lane(lane, 1.0, 2.0, 6.3).theta == 2.0 * math.pi

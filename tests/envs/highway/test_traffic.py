@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from sideslip.envs import vehicle_from
-from sideslip.envs.highway.traffic import PERIOD, BrakingVehicle, Hazard, Start, Traffic
+from sideslip.envs import make_vehicle
+from sideslip.envs.highway.traffic import PERIOD, BrakingVehicle, Hazard, Traffic, TrafficStart
 from sideslip.envs.vehicle.dynamics import Motion
 
 V = 20.0
-CAR = vehicle_from("passenger-car")
+CAR = make_vehicle("passenger-car")
 AHEAD = Motion(V, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-START = Start(CAR, AHEAD, V, 0.5)
+START = TrafficStart(CAR, AHEAD, V, 0.5)
 
 
 def traffic(hazard: Hazard | None = None, others: int = 0, road: str = "straight") -> Traffic:
@@ -20,13 +20,13 @@ def traffic(hazard: Hazard | None = None, others: int = 0, road: str = "straight
 def coasting(around: Traffic, seconds: float) -> None:
     """Drive straight on."""
     for k in range(round(1000.0 * seconds) // PERIOD):
-        around.follow(AHEAD._replace(X=V * 1e-3 * PERIOD * (k + 1)))
+        around.step_road(AHEAD._replace(X=V * 1e-3 * PERIOD * (k + 1)))
 
 
 def test_our_car_is_where_its_body_is() -> None:
     """y to the left is highway-env's minus y, the box is centred between the bumpers."""
-    ours = traffic().ours
-    ours.put(AHEAD._replace(X=10.0, Y=2.0, psi=0.3, v_y=1.0))
+    ours = traffic().ego
+    ours.set_motion(AHEAD._replace(X=10.0, Y=2.0, psi=0.3, v_y=1.0))
     centre = 0.5 * (CAR.front_arm - CAR.rear_arm)
     assert ours.position == pytest.approx(
         [10.0 + centre * np.cos(0.3), -2.0 - centre * np.sin(0.3)]
@@ -41,11 +41,11 @@ def test_the_one_ahead_brakes_as_it_was_drawn_and_never_backs_up() -> None:
     around = traffic(hazard)
     lead = around.road.vehicles[1]
     assert isinstance(lead, BrakingVehicle)
-    gap = lead.position[0] - around.ours.position[0] - 0.5 * (lead.LENGTH + around.ours.LENGTH)
+    gap = lead.position[0] - around.ego.position[0] - 0.5 * (lead.LENGTH + around.ego.LENGTH)
     assert gap == pytest.approx(V)
     speeds = []
     for k in range(140):
-        around.follow(AHEAD._replace(X=V * 1e-3 * PERIOD * (k + 1), Y=6.0))
+        around.step_road(AHEAD._replace(X=V * 1e-3 * PERIOD * (k + 1), Y=6.0))
         speeds.append(lead.speed)
     assert -np.diff(speeds[20:40]) == pytest.approx(0.8 * 0.5 * 9.81 * 0.05)
     assert speeds[-1] == 0.0 and min(speeds) == 0.0
@@ -57,7 +57,7 @@ def test_those_behind_see_our_car_and_brake_or_pass() -> None:
     behind = [v for v in others if v.position[0] < 0.0 and abs(v.position[1]) < 1.0]
     slowest = V
     for _ in range(300):
-        around.follow(AHEAD._replace(v_x=0.0))
+        around.step_road(AHEAD._replace(v_x=0.0))
         slowest = min([slowest, *(v.speed for v in behind)])
     assert len(behind) == 1 and slowest < 0.6 * V
     assert not any(v.crashed for v in (ours, *others))
@@ -76,11 +76,11 @@ def test_an_impact_that_highway_env_foresees_is_a_crash_to_both() -> None:
     around = traffic(Hazard(headway=1.0, onset=0.0, braking=1.0))
     lead = around.road.vehicles[1]
     lead.speed = 0.0
-    reach = 0.5 * (lead.LENGTH + around.ours.LENGTH) + around.ours._centre
+    reach = 0.5 * (lead.LENGTH + around.ego.LENGTH) + around.ego._centre
     near = AHEAD._replace(X=lead.position[0] - reach - 0.5 * V * 1e-3 * PERIOD)
-    around.follow(near)
+    around.step_road(near)
     assert not around.crashed and not lead.crashed
-    around.follow(near._replace(Y=9.0))
+    around.step_road(near._replace(Y=9.0))
     assert around.crashed and lead.crashed
 
 
@@ -88,8 +88,8 @@ def test_an_impact_that_highway_env_foresees_is_a_crash_to_both() -> None:
 def test_a_car_has_departed_whose_width_is_beyond_the_edge(away: float) -> None:
     """The edge line is 2 m to the side where no lane is free, the car 1.8 m wide."""
     around = traffic()
-    side = -1.0 if around.course.free < around.course.own else 1.0
-    around.follow(AHEAD._replace(Y=side * away))
+    side = -1.0 if around.course.free_lane < around.course.own_lane else 1.0
+    around.step_road(AHEAD._replace(Y=side * away))
     assert around.departed == (away > 2.0 + 0.5 * CAR.width)
-    around.follow(AHEAD._replace(Y=-side * away))  # in the free lane
+    around.step_road(AHEAD._replace(Y=-side * away))  # in the free lane
     assert not around.departed

@@ -11,7 +11,7 @@ from ..helpers import SILENT
 
 pytest.importorskip("vehiclemodels")
 from sideslip.envs.outside.env import OutsideEnv
-from sideslip.envs.outside.plants import OUTSIDE_PLANTS, Acting
+from sideslip.envs.outside.plants import OUTSIDE_PLANTS, OutsideInputs
 
 MODELS = tuple(OUTSIDE_PLANTS)
 V = 80.0 / 3.6
@@ -32,7 +32,7 @@ def outside(model: str, **changes: Any) -> OutsideEnv:
     return env
 
 
-def driven(model: str, acting: Acting, seconds: float = 1.0, speed: float = V) -> Any:
+def driven(model: str, acting: OutsideInputs, seconds: float = 1.0, speed: float = V) -> Any:
     """The plant after so long of the same inputs from straight ahead at 80 km/h."""
     plant = OUTSIDE_PLANTS[model]()
     plant.start(Motion(speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))

@@ -13,14 +13,19 @@ from sideslip.agents.rollout import rollout
 from sideslip.envs import FAILURES
 from sideslip.envs.backend.arrays import read
 from sideslip.envs.engine.layout import Z
-from sideslip.envs.sensors.inertial import specific_force
-from sideslip.envs.vehicle.dynamics import Car, Motion, Push, Road
+from sideslip.envs.sensors.inertial import compute_specific_force
+from sideslip.envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams
 from sideslip.envs.vehicle.integration import kutta3
-from sideslip.envs.vehicle.tyres import FIALA, Inputs, load_of
+from sideslip.envs.vehicle.tyres import FIALA, TyreInputs, compute_tyre_load
 from sideslip.estimators import EstimateObservation
 
 pytest.importorskip("vehiclemodels")
-from sideslip.envs.outside.plants import OUTSIDE_PLANTS, Acting, OutsidePlant, outside_vehicle
+from sideslip.envs.outside.plants import (
+    OUTSIDE_PLANTS,
+    OutsideInputs,
+    OutsidePlant,
+    make_outside_vehicle,
+)
 
 from ..helpers import bits
 from .cars import CALM, MODELS, STEP, V, driven, outside
@@ -33,14 +38,14 @@ def test_the_environment_keeps_gymnasiums_contract(model: str) -> None:
 
 
 def test_an_outside_plant_is_drawn_without_tyre_forces() -> None:
-    from sideslip.envs.rendering.scene import scene_of
+    from sideslip.envs.rendering.scene import make_car_scene
 
     env = outside("drift", scenario=STEP | {"duration": 0.3}, render_mode="rgb_array")
     env.reset(seed=0)
     env.step([1.0])
     frame = env.render()
     assert frame is not None and frame.std() > 10.0
-    scene = scene_of(env.shot())
+    scene = make_car_scene(env.make_render_state())
     assert [wheel[3:] for wheel in scene.wheels] == [(0.0, 0.0, 0.0)] * 4
     assert scene.motion == env.motion and scene.torques[1] > 0.0
 
@@ -49,7 +54,7 @@ def test_an_outside_plant_is_drawn_without_tyre_forces() -> None:
 def test_sensors_and_disturbances_draw_what_ours_draw(model: str) -> None:
     scenario = STEP | {"noise": {}, "duration": 0.2}
     scenario |= {"disturbance_force": 300.0, "disturbance_moment": 100.0}
-    vehicle = outside_vehicle().to_dict()
+    vehicle = make_outside_vehicle().to_dict()
     ours: Any = gym.make("sideslip/YawFusion-v0", scenario=scenario, vehicle=vehicle).unwrapped
     env = outside(model, scenario=scenario)
     errors, disturbances = [], []
@@ -71,27 +76,30 @@ class OwnPlant(OutsidePlant):
     """Our own plant as an outside one: Fiala tyres, roll, inputs held over a tick."""
 
     law = "vehicle_dynamics_std"  # loaded, not used
-    car: Car
+    car: CarParams
 
     def start(self, motion: Motion) -> None:
         self.x = np.array(motion)
 
-    def derivative(self, x: Any, acting: Acting) -> Any:
+    def derivative(self, x: Any, acting: OutsideInputs) -> Any:
         raise NotImplementedError
 
     @property
     def motion(self) -> Motion:
         return Motion(*self.x.tolist())
 
-    def felt(self, acting: Acting) -> tuple[float, float]:
+    def compute_specific_force(self, acting: OutsideInputs) -> tuple[float, float]:
         raise NotImplementedError
 
-    def step(self, acting: Acting, h: float) -> None:
+    def step(self, acting: OutsideInputs, h: float) -> None:
         car = self.car._replace(mu=self.p.tire.p_dy1, mu_r=self.p.tire.p_dy1)
-        load = load_of(Inputs(*acting[:3]), car, 0, 1)
-        before, push, road = self.motion, Push(*acting[3:]), Road(0.0, 0.0, 1.0)
+        load = compute_tyre_load(TyreInputs(*acting[:3]), car, 0, 1)
+        before, push, road = self.motion, DisturbanceForces(*acting[3:]), RoadParams(0.0, 0.0, 1.0)
         after = kutta3(before, (load, load, load), push, car, road, h, 0, FIALA, 1)
-        self.x, self.specific_force = np.array(after), specific_force(before, after, road, 0, 1)
+        self.x, self.specific_force = (
+            np.array(after),
+            compute_specific_force(before, after, road, 0, 1),
+        )
 
 
 @pytest.mark.parametrize("base", ["random-steering", "double-lane-change", "gust"])
@@ -103,7 +111,7 @@ def test_around_our_own_plant_it_is_our_own_environment(
     scenario = {"base": base, "duration": 3.0, "lags": False, "wind_height": 0.0, "speed": 20.0}
     scenario |= {"front_stiffness": 1.0, "rear_stiffness": 1.0}
     arguments: dict[str, Any] = {"scenario": scenario, "steering": True, "reference": "model"}
-    vehicle = outside_vehicle().to_dict()
+    vehicle = make_outside_vehicle().to_dict()
     ours: Any = gym.make("sideslip/AfsYawFusion-v0", vehicle=vehicle, **arguments).unwrapped
     env = outside("drift", **arguments)
     assert bits(ours.reset(seed=5)) == bits(env.reset(seed=5))
@@ -136,7 +144,9 @@ def test_yaw_moment_acts_and_is_told(model: str) -> None:
     env.reset(seed=0)
     for _ in range(10):
         *_, info = env.step([0.5])
-    assert info["yaw_moment"] == pytest.approx(0.5 * outside_vehicle().yaw_moment_limit, rel=1e-3)
+    assert info["yaw_moment"] == pytest.approx(
+        0.5 * make_outside_vehicle().yaw_moment_limit, rel=1e-3
+    )
     assert info["gamma"] > 0.01
 
 
@@ -211,10 +221,10 @@ def test_a_state_whose_squares_are_no_numbers_is_not_finite() -> None:
     """As in our kernel: the references and sensors take them."""
     for model, places in (("drift", (3, 5)), ("multi-body", (3, 5, 10))):
         for place in places:
-            plant = driven(model, Acting(0.0), 0.001)
-            assert plant.finite
+            plant = driven(model, OutsideInputs(0.0), 0.001)
+            assert plant.is_finite
             plant.x[place] = 1e160
-            assert not plant.finite
+            assert not plant.is_finite
 
 
 def test_a_force_that_cannot_be_told_makes_the_state_no_number(
@@ -225,20 +235,20 @@ def test_a_force_that_cannot_be_told_makes_the_state_no_number(
     env.reset(seed=0)
     env.step([0.0])
 
-    def nothing(acting: Acting) -> tuple[float, float]:
+    def nothing(acting: OutsideInputs) -> tuple[float, float]:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(env.plant, "felt", nothing)
+    monkeypatch.setattr(env.plant, "compute_specific_force", nothing)
     *_, info = env.step([0.0])
     assert FAILURES[info["failure"]] == "not-finite"
     assert np.isfinite(env.record.fast).all()
 
 
 def test_a_wheel_at_rest_in_a_spin_makes_the_state_no_number() -> None:
-    plant = driven("multi-body", Acting(0.0), 0.01)
+    plant = driven("multi-body", OutsideInputs(0.0), 0.01)
     plant.x[3], plant.x[5] = 1.0, 2.0 / plant.p.T_r  # the inner rear wheel stands still
-    plant.step(Acting(0.0), 1e-3)
-    assert not plant.finite
+    plant.step(OutsideInputs(0.0), 1e-3)
+    assert not plant.is_finite
 
 
 @pytest.mark.parametrize(

@@ -46,5 +46,5 @@ def decoded(data: bytes, step: int | None = None) -> tuple[list[Epoch], Counts]:
     decoder = Decoder()
     epochs = []
     for i in range(0, len(data), step or max(len(data), 1)):
-        epochs += decoder.feed(data[i : i + (step or len(data))])
+        epochs += decoder.decode_chunk(data[i : i + (step or len(data))])
     return epochs + decoder.finish(), decoder.counts

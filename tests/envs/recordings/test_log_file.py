@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.recordings.columns import COLUMNS, column_name, parse_mapping
+from sideslip.envs.recordings.columns import COLUMNS, make_column_name, parse_mapping
 from sideslip.envs.recordings.log_file import read_log
 from sideslip.envs.sensors.slow import GPS
 
@@ -107,7 +107,7 @@ def test_logged_slow_sensors_become_packets(tmp_path: Path) -> None:
     table["gps_speed_mps"] = table["speed_x_mps"]
     table.loc[:10, "speed_x_mps"] = 0.5
     log = read_log(saved(table, tmp_path))
-    packets = log.record.packets_of("gps")
+    packets = log.record.select_packets("gps")
     np.testing.assert_array_equal(packets[:, PACKET.sensor], GPS)
     np.testing.assert_array_equal(packets[:, PACKET.captured], [305, 325, 345, 385])
     np.testing.assert_array_equal(packets[:, PACKET.arrived], packets[:, PACKET.captured])
@@ -155,7 +155,7 @@ def test_time_from_below_zero_counts_from_the_first_row(tmp_path: Path) -> None:
 
 
 def test_every_column_has_a_name_of_its_own() -> None:
-    names = [column_name(quantity) for quantity in COLUMNS]
+    names = [make_column_name(quantity) for quantity in COLUMNS]
     assert len(set(names)) == len(names)
 
 
@@ -181,7 +181,7 @@ def test_roll_rate_hdop_and_satellites_are_read(tmp_path: Path) -> None:
     assert "roll_rate" in log.record.present
     rate = log.record.fast[:, FAST.roll_rate]
     np.testing.assert_allclose(rate, DEG * table["roll_rate_degps"], rtol=1e-15)
-    packets = log.record.packets_of("gps")
+    packets = log.record.select_packets("gps")
     np.testing.assert_array_equal(packets[:, PACKET.value + 4], table["gps_hdop_count"][5::20])
     np.testing.assert_array_equal(packets[:, PACKET.value + 5], [0, 2, 4, 6, 8])
     np.testing.assert_array_equal(packets[:, PACKET.quality], 1.0)  # few satellites or not

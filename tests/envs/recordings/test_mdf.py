@@ -51,7 +51,7 @@ def test_a_slow_group_has_its_own_samples(tmp_path: Path, version: str, late: fl
     csv = read_log(saved(TABLE, tmp_path))
     for read in (log, read_log(path)):
         np.testing.assert_array_equal(read.record.fast, csv.record.fast)
-        packets = read.record.packets_of("gps")
+        packets = read.record.select_packets("gps")
         np.testing.assert_array_equal(packets[:, PACKET.captured] - 300, ROWS + (late > 0.0))
         np.testing.assert_allclose(packets[:, PACKET.value] / DEG, COURSE, rtol=1e-12)
     assert log.time[0] == pytest.approx(3.0) and remarks == []
@@ -73,7 +73,7 @@ def test_the_fastest_group_has_the_rows(tmp_path: Path) -> None:
 def test_one_group_that_holds_its_course(tmp_path: Path) -> None:
     held = signal("course_deg", TIME, np.repeat(np.append(np.zeros(10), COURSE), 20))
     (log,), remarks = read_parts(written(tmp_path, [*fast(), held]))
-    captured = log.record.packets_of("gps")[:, PACKET.captured] - 300
+    captured = log.record.select_packets("gps")[:, PACKET.captured] - 300
     np.testing.assert_array_equal(captured, ROWS)
     assert "course is held" in remarks[0]
 
@@ -83,7 +83,7 @@ def test_what_is_not_valid_is_unknown_and_text_is_ignored(tmp_path: Path) -> Non
     course = signal("course_deg", TIME[ROWS], np.where(bad, 99.0, COURSE), invalidation_bits=bad)
     text = signal("gps_speed_mps", TIME[:2], np.array([b"a", b"b"]), encoding="utf-8")
     (log,), _ = read_parts(written(tmp_path, fast(), [course], [text]))
-    captured = log.record.packets_of("gps")[:, PACKET.captured] - 300
+    captured = log.record.select_packets("gps")[:, PACKET.captured] - 300
     np.testing.assert_array_equal(captured, ROWS[~bad])
 
 
@@ -92,7 +92,7 @@ def test_channels_of_one_name_are_told_apart(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"--map one of course_deg \(group 1\), .* \(group 2\)"):
         read_log(path)
     log = read_log(path, {"course_deg": "course_deg (group 2)"})
-    captured = log.record.packets_of("gps")[:, PACKET.captured] - 300
+    captured = log.record.select_packets("gps")[:, PACKET.captured] - 300
     np.testing.assert_array_equal(captured, ROWS + 5)
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sideslip.envs.recordings.nmea import DAY, LONGEST, Decoder, mend_dates
+from sideslip.envs.recordings.nmea import DAY, LONGEST, Decoder, correct_dates
 from sideslip.envs.recordings.sentences import DECODED
 
 from .receiver import ABSENT, REASON, RECORDINGS, decoded, gga, rmc, sentence, zda
@@ -69,23 +69,23 @@ def test_satellites_in_view_are_those_of_all_systems() -> None:
 
 def test_an_epoch_comes_with_the_sentence_that_completes_it() -> None:
     decoder = Decoder()
-    assert not decoder.feed(rmc())
-    assert not decoder.feed(gga()[:-2])
-    assert len(decoder.feed(gga()[-2:])) == 1
+    assert not decoder.decode_chunk(rmc())
+    assert not decoder.decode_chunk(gga()[:-2])
+    assert len(decoder.decode_chunk(gga()[-2:])) == 1
     assert not decoder.finish()
 
 
 def test_an_incomplete_epoch_comes_when_the_next_begins() -> None:
     decoder = Decoder()
-    assert not decoder.feed(rmc("120000"))
-    (epoch,) = decoder.feed(rmc("120001"))
-    assert epoch.t % 60.0 == 0.0 and math.isnan(epoch.hdop) and epoch.fixed
+    assert not decoder.decode_chunk(rmc("120000"))
+    (epoch,) = decoder.decode_chunk(rmc("120001"))
+    assert epoch.t % 60.0 == 0.0 and math.isnan(epoch.hdop) and epoch.has_fix
 
 
 def test_a_bad_field_is_emptied_and_counted_and_its_sentence_stays() -> None:
     data = rmc(cog="0NaN") + gga(hdop="0NaN") + sentence(GSA.replace("1.7", "inf"))
     (epoch,), counts = decoded(data)
-    assert epoch.fixed and epoch.speed > 5.0 and epoch.satellites == 8
+    assert epoch.has_fix and epoch.speed > 5.0 and epoch.satellites == 8
     assert math.isnan(epoch.course) and math.isnan(epoch.hdop) and epoch.quality == 0
     assert counts.emptied == {"RMC cog": 1, "GGA HDOP": 1, "GSA HDOP": 1}
 
@@ -95,14 +95,14 @@ def test_a_bad_field_is_emptied_and_counted_and_its_sentence_stays() -> None:
 )
 def test_a_bad_time_is_emptied(time: str) -> None:
     (epoch,), counts = decoded(rmc(time) + gga(""))
-    assert math.isnan(epoch.t) and epoch.fixed
+    assert math.isnan(epoch.t) and epoch.has_fix
     assert counts.emptied == {"RMC time": 1} and counts.without_time == 1
 
 
 def test_without_a_fix_nothing_but_satellites_is_known() -> None:
     data = rmc() + gga() + rmc("120003", status="V") + gga("120003", quality="0", used="02")
     first, second = decoded(data)[0]
-    assert first.fixed and not second.fixed
+    assert first.has_fix and not second.has_fix
     assert all(math.isnan(x) for x in (second.latitude, second.course, second.speed))
     assert (second.satellites, second.quality, second.age) == (2, 0, 3.0)
     set_back, unknown = decoded(data + rmc("110000", status="V") + rmc("", status="V"))[0][2:]
@@ -112,13 +112,13 @@ def test_without_a_fix_nothing_but_satellites_is_known() -> None:
 @pytest.mark.parametrize(("status", "quality"), [("V", "1"), ("A", "0"), ("A", "6")])
 def test_a_fix_needs_the_consent_of_both_sentences(status: str, quality: str) -> None:
     (epoch,), counts = decoded(rmc(status=status) + gga(quality=quality))
-    assert not epoch.fixed and counts.without_fix == 1
+    assert not epoch.has_fix and counts.without_fix == 1
 
 
 @pytest.mark.parametrize(("knots", "quality"), [("1.9", 0), ("2.0", 1), ("", 0)])
 def test_below_one_metre_a_second_a_course_has_no_quality(knots: str, quality: int) -> None:
     (epoch,), _ = decoded(rmc(spd=knots) + gga())
-    assert epoch.fixed and epoch.quality == quality
+    assert epoch.has_fix and epoch.quality == quality
 
 
 def test_elapsed_time_goes_over_midnight_and_a_leap_second() -> None:
@@ -144,7 +144,7 @@ def clocks(*times: str) -> list[tuple[float, float]]:
     data = b"".join((rmc(*each) if len(each) > 1 else b"") + gga(each[0]) for each in parts)
     epochs = decoded(data)[0]
     assert len(epochs) == len(times)
-    return [(old.t, new.t) for old, new in zip(epochs, mend_dates(epochs), strict=True)]
+    return [(old.t, new.t) for old, new in zip(epochs, correct_dates(epochs), strict=True)]
 
 
 def test_midnight_without_a_date_is_passed_forward_and_backward() -> None:
@@ -186,7 +186,7 @@ def test_a_date_that_is_late_or_early_at_midnight_is_mended() -> None:
 def test_a_pause_of_days_and_a_log_of_another_era_remain() -> None:
     for times in (("120000 010124", "090000 030124"), ("120000 170504", "120001 170504")):
         assert all(old == new for old, new in clocks(*times))
-    assert mend_dates([]) == []
+    assert correct_dates([]) == []
 
 
 def test_a_jump_forward_is_counted_like_one_backward_and_the_first_date_is_none() -> None:
@@ -242,7 +242,7 @@ def test_any_bytes_in_any_chunks_give_what_they_give_at_once(
     cuts = draw.draw(st.lists(st.integers(0, len(data)), max_size=20).map(sorted))
     decoder, epochs = Decoder(), []
     for low, high in zip([0, *cuts], [*cuts, len(data)], strict=True):
-        epochs += decoder.feed(data[low:high])
+        epochs += decoder.decode_chunk(data[low:high])
         assert len(decoder._tail) <= LONGEST + 1  # what it holds
     epochs += decoder.finish()
     assert repr(epochs) == repr(whole)  # NaN included
@@ -253,8 +253,8 @@ def test_memory_is_bounded_whatever_comes() -> None:
     decoder = Decoder()
     for i in range(3000):
         system = f"{chr(65 + i // 60)}{chr(65 + i % 60)}"
-        decoder.feed(sentence(f"{system}GSV,1,1,{i % 100}") + sentence(f"XY{i:04d},1"))
-        decoder.feed(sentence(f"GPRMC,{i}x,{i}y") + b"$" + b"y" * 500)
+        decoder.decode_chunk(sentence(f"{system}GSV,1,1,{i % 100}") + sentence(f"XY{i:04d},1"))
+        decoder.decode_chunk(sentence(f"GPRMC,{i}x,{i}y") + b"$" + b"y" * 500)
     assert len(decoder._view) <= 100 and len(decoder._tail) <= LONGEST + 1
     assert len(decoder.counts.sentences) <= 8 and len(decoder.counts.emptied) <= 20
 
@@ -284,6 +284,6 @@ def test_every_valid_sentence_of_the_recordings_is_decoded(name: str) -> None:
     assert counts.backward == munich
     emptied = {"GGA HDOP": 1, "GSA HDOP": 1, "GSA PDOP": 1}
     assert counts.emptied == (emptied if munich else {})
-    t = [epoch.t for epoch in epochs if epoch.fixed]
+    t = [epoch.t for epoch in epochs if epoch.has_fix]
     assert t[-1] - t[0] == (1864.0 if munich else 1576.0)
-    assert all(48.0 < e.latitude < 50.0 and 11.0 < e.longitude < 13.0 for e in epochs if e.fixed)
+    assert all(48.0 < e.latitude < 50.0 and 11.0 < e.longitude < 13.0 for e in epochs if e.has_fix)

@@ -28,7 +28,7 @@ def with_course(every: float = EVERY, first: int = 0, wrap: bool = False) -> pd.
 
 def samples(log: Log) -> tuple[np.ndarray, np.ndarray]:
     """(rows, courses in deg) of the packets."""
-    packets = log.record.packets_of("gps")
+    packets = log.record.select_packets("gps")
     np.testing.assert_array_equal(packets[:, PACKET.captured], packets[:, PACKET.arrived])
     return packets[:, PACKET.captured] - log.record.first, packets[:, PACKET.value] / DEG
 
@@ -114,7 +114,7 @@ def test_what_never_changes_is_left_alone(tmp_path: Path) -> None:
     camera = np.random.default_rng(4).normal(0.0, 0.01, ROWS)
     table = drive(ROWS).assign(camera_psi_rad=0.0, camera_y_l_m=camera)
     (log,), remarks = read_parts(saved(table, tmp_path))
-    assert len(log.record.packets_of("camera")) == ROWS and not remarks
+    assert len(log.record.select_packets("camera")) == ROWS and not remarks
 
 
 def test_the_kind_of_samples_by_hand(tmp_path: Path) -> None:

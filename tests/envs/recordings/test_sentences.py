@@ -23,8 +23,8 @@ def test_a_position_comes_from_gns_or_gll_where_there_is_no_gga() -> None:
     for mode, fixed in (("AAN", True), ("NN", False), ("E", False), ("R", True)):
         gns = sentence(f"GNGNS,120000.00,{place},{mode},11,0.9,500.0,46.0,,")
         decoder = Decoder()
-        (epoch,) = decoder.feed(rmc() + gns)
-        assert (epoch.fixed, epoch.hdop, epoch.satellites) == (fixed, 0.9, 11)
+        (epoch,) = decoder.decode_chunk(rmc() + gns)
+        assert (epoch.has_fix, epoch.hdop, epoch.satellites) == (fixed, 0.9, 11)
     vtg = sentence("GPVTG,90.0,T,,M,10.0,N,,K,A")
     for status, fixed in (("A", True), ("V", False)):
         epochs, _ = decoded(
@@ -33,11 +33,11 @@ def test_a_position_comes_from_gns_or_gll_where_there_is_no_gga() -> None:
                 for k in range(3)
             )
         )
-        assert [(e.t % 60.0, e.fixed, e.hdop) for e in epochs] == [
+        assert [(e.t % 60.0, e.has_fix, e.hdop) for e in epochs] == [
             (k, fixed, 1.7) for k in range(3)
         ]
     (epoch,), _ = decoded(rmc() + gga() + sentence("GPGLL,,,,,120000.00,V,N"))
-    assert epoch.fixed  # what a receiver says of its other sentences does not count
+    assert epoch.has_fix  # what a receiver says of its other sentences does not count
 
 
 def test_several_talkers_make_one_epoch_of_one_time() -> None:

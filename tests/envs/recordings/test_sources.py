@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from sideslip.envs.recordings.nmea import Decoder, Epoch
-from sideslip.envs.recordings.sources import Line, Source, is_nmea, open_source, read_nmea
+from sideslip.envs.recordings.sources import ByteSource, Connection, is_nmea, make_source, read_nmea
 
 from .receiver import gga, rmc, sentence
 
@@ -20,11 +20,11 @@ SECONDS = [f"1200{i:02d}" for i in range(20)]
 LOG = b"".join(rmc(time) + gga(time) for time in SECONDS)
 
 
-def collected(source: Source, count: int) -> list[Epoch]:
+def collected(source: ByteSource, count: int) -> list[Epoch]:
     """The first so many epochs, however long they take."""
     decoder, epochs = Decoder(), []
     for chunk in source:
-        epochs += decoder.feed(chunk)
+        epochs += decoder.decode_chunk(chunk)
         if len(epochs) >= count:
             break
     return epochs
@@ -52,7 +52,7 @@ def peer(serve: Callable[[socket.socket], None], times: int) -> Iterator[str]:
 def test_a_file_ends(tmp_path: Path) -> None:
     path = tmp_path / "drive.nmea"
     path.write_bytes(LOG)
-    assert b"".join(open_source(str(path))) == LOG
+    assert b"".join(make_source(str(path))) == LOG
     epochs, counts = read_nmea(path)
     assert len(epochs) == counts.epochs == len(SECONDS)
 
@@ -70,7 +70,7 @@ def test_a_log_is_dated_by_its_last_date_and_how_many_epochs_were_is_counted(
 def test_a_serial_port_that_vanishes_ends_clearly() -> None:
     ours, theirs = os.openpty()
     name = os.ttyname(theirs)
-    source = open_source(f"serial:{name}:9600", tries=2, wait=0.01)
+    source = make_source(f"serial:{name}:9600", tries=2, wait=0.01)
     chunks = iter(source)
     assert next(chunks) == b""  # open: what came before is flushed
     os.write(ours, LOG[:1000])
@@ -87,7 +87,7 @@ def test_a_serial_port_that_vanishes_ends_clearly() -> None:
 
 def test_a_quiet_port_hands_out_nothing_again_and_again() -> None:
     ours, theirs = os.openpty()
-    chunks = iter(open_source(f"serial:{os.ttyname(theirs)}"))
+    chunks = iter(make_source(f"serial:{os.ttyname(theirs)}"))
     assert next(chunks) == b"" == next(chunks)
     os.write(ours, b"$GP")
     assert next(chunks)[:1] == b"$"
@@ -99,14 +99,14 @@ def test_a_peer_that_closes_is_called_again_and_nothing_whole_is_lost() -> None:
     half = len(LOG) // 2  # amid a sentence
     parts = iter([LOG[:half], LOG[half:]])
     with peer(lambda connection: connection.sendall(next(parts)), 2) as text:
-        source = open_source(text, tries=2, wait=0.01)
+        source = make_source(text, tries=2, wait=0.01)
         epochs = collected(source, len(SECONDS))
     assert len(epochs) == len(SECONDS) and source.losses == 1
 
 
 def test_a_peer_that_only_closes_is_given_up() -> None:
     with peer(lambda connection: None, 4) as text:
-        source = open_source(text, tries=3, wait=0.01)
+        source = make_source(text, tries=3, wait=0.01)
         with pytest.raises(ConnectionError, match="not back after 3 tries"):
             list(source)
     assert 1 <= source.losses <= 4
@@ -118,40 +118,40 @@ def test_a_line_is_opened_again_so_many_times_and_no_more() -> None:
     def lost() -> bytes:
         raise ConnectionResetError("reset")
 
-    def connect() -> Line:
+    def connect() -> Connection:
         opened.append(1)
-        return Line(lost, lambda: None)
+        return Connection(lost, lambda: None)
 
     with pytest.raises(ConnectionError, match="quiet: lost, and not back after 3 tries: reset"):
-        list(Source("quiet", connect, tries=3, wait=0.0))
+        list(ByteSource("quiet", connect, tries=3, wait=0.0))
     assert len(opened) == 1 + 3
 
 
 def test_garbage_of_a_peer_is_counted_and_what_follows_decoded() -> None:
     garbage = os.urandom(1 << 20)
     with peer(lambda connection: connection.sendall(garbage + b"\r\n" + LOG), 1) as text:
-        epochs = collected(open_source(text, wait=0.01), len(SECONDS))
+        epochs = collected(make_source(text, wait=0.01), len(SECONDS))
     assert [epoch.t % 60.0 for epoch in epochs[-20:]] == [float(i) for i in range(20)]
 
 
 def test_a_line_that_cannot_be_opened_is_an_error_at_once(tmp_path: Path) -> None:
     with pytest.raises(OSError, match=r"/no/such/port"):
-        list(open_source("serial:/no/such/port"))
+        list(make_source("serial:/no/such/port"))
     server = socket.create_server(("127.0.0.1", 0))
     port = server.getsockname()[1]
     server.close()
     with pytest.raises(ConnectionRefusedError):
-        list(open_source(f"tcp:127.0.0.1:{port}"))
+        list(make_source(f"tcp:127.0.0.1:{port}"))
     with pytest.raises(FileNotFoundError, match=r"gone\.nmea: there is no such file"):
-        open_source(str(tmp_path / "gone.nmea"))
+        make_source(str(tmp_path / "gone.nmea"))
     with pytest.raises(ValueError, match="found a folder"):
-        open_source(str(tmp_path))
+        make_source(str(tmp_path))
 
 
 @pytest.mark.parametrize("text", ["tcp:", "tcp:host", "tcp::80", "tcp:host:0", "tcp:host:65536"])
 def test_a_text_of_another_form_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="expected tcp:HOST:PORT"):
-        open_source(text)
+        make_source(text)
 
 
 @pytest.mark.parametrize(

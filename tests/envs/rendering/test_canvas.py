@@ -23,8 +23,8 @@ def test_text_is_drawn_without_a_warning_where_no_font_is_listed(
     monkeypatch.setattr(sysfont, "is_init", False)
     monkeypatch.setattr(sysfont, "Sysfonts", {})
     monkeypatch.setattr(sysfont, "Sysalias", {})
-    canvas._font.cache_clear()
-    canvas._words.cache_clear()
-    assert canvas.Canvas((80, 40)).text((5, 20), "12 m", "#000000", 19) > 10.0
-    canvas._font.cache_clear()
-    canvas._words.cache_clear()
+    canvas._load_font.cache_clear()
+    canvas._render_words.cache_clear()
+    assert canvas.Canvas((80, 40)).draw_text((5, 20), "12 m", "#000000", 19) > 10.0
+    canvas._load_font.cache_clear()
+    canvas._render_words.cache_clear()

@@ -11,7 +11,7 @@ from sideslip.envs import StabilityEnv
 from sideslip.envs.rendering.canvas import Canvas
 from sideslip.envs.rendering.closeup import MAGNIFIED, draw_closeup
 from sideslip.envs.rendering.palette import INK, PALETTE
-from sideslip.envs.rendering.scene import Scene, scene_of
+from sideslip.envs.rendering.scene import CarScene, make_car_scene
 
 BOX = (0.0, 0.0, 400.0, 300.0)
 WIND = PALETTE[3]
@@ -26,10 +26,10 @@ class Noted(Canvas):
         self.arrows: list[tuple[Any, Any, str]] = []
         self.lines: list[tuple[Any, Any, str]] = []
 
-    def arrow(self, start: Any, end: Any, colour: str, width: float = 2.0) -> None:
+    def draw_arrow(self, start: Any, end: Any, colour: str, width: float = 2.0) -> None:
         self.arrows.append((_up(start), _up(end), colour))
 
-    def line(self, points: Any, colour: str, width: float = 1.0) -> None:
+    def draw_line(self, points: Any, colour: str, width: float = 1.0) -> None:
         self.lines.append((_up(points[0]), _up(points[-1]), colour))
 
 
@@ -37,17 +37,17 @@ def _up(place: Any) -> Any:
     return np.array([place[0], 0.5 * BOX[3] - place[1]])
 
 
-def still() -> Scene:
+def still() -> CarScene:
     """A car at a standstill on which nothing acts."""
     env = StabilityEnv(scenario="straight", render_mode="rgb_array")
     env.reset(seed=0)
     env.render()
-    now = scene_of(env.shot())
+    now = make_car_scene(env.make_render_state())
     wheels = tuple(each._replace(angle=0.0, F_x=0.0, F_y=0.0) for each in now.wheels)
     return now._replace(wheels=wheels, wind=0.0, torques=(0.0, 0.0))
 
 
-def drawn(scene: Scene, beta: float = 0.0, estimate: float = 0.0) -> Noted:
+def drawn(scene: CarScene, beta: float = 0.0, estimate: float = 0.0) -> Noted:
     canvas = Noted()
     draw_closeup(canvas, BOX, scene, beta, 0.0, {"filter": (estimate, ESTIMATE)})
     return canvas

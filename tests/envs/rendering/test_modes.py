@@ -177,7 +177,7 @@ def test_a_copy_draws_the_same() -> None:
     other = copy.deepcopy(env)
     assert np.array_equal(np.asarray(env.render()), np.asarray(other.render()))
     other.step([1.0])
-    assert len(env.shot().trace.since(0.0)[0]) == 2
+    assert len(env.make_render_state().trace.select_since(0.0)[0]) == 2
 
 
 def test_pygame_is_asked_for_by_the_name_of_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,13 +8,13 @@ import pytest
 
 pytest.importorskip("pygame")
 from sideslip.envs import StabilityEnv
-from sideslip.envs.engine.step import kind_of
-from sideslip.envs.rendering.palette import GREY, INK, colour, mixed
-from sideslip.envs.rendering.picture import _CLOSEUP, _ROAD, _STRIPS, SIZE, draw
+from sideslip.envs.engine.step import make_step_variant
+from sideslip.envs.rendering.palette import GREY, INK, find_colour, mix_colours
+from sideslip.envs.rendering.picture import _CLOSEUP, _ROAD, _STRIPS, SIZE, draw_picture
 from sideslip.envs.rendering.road import BLUE, ORANGE
-from sideslip.envs.rendering.scene import scene_of
-from sideslip.envs.rendering.strips import SPAN
-from sideslip.envs.rendering.trace import MOMENT, Trace
+from sideslip.envs.rendering.scene import make_car_scene
+from sideslip.envs.rendering.strips import MAX_SPAN
+from sideslip.envs.rendering.trace import TRACE_POINT, EpisodeTrace
 from sideslip.estimators import EstimateObservation
 
 from ..helpers import FULL, bits, play
@@ -43,7 +43,7 @@ def seen(env: StabilityEnv) -> Any:
 
 
 def scene(env: StabilityEnv) -> Any:
-    return scene_of(env.shot())
+    return make_car_scene(env.make_render_state())
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -93,7 +93,7 @@ def test_forces_are_the_plants_and_stay_in_their_circles() -> None:
 def test_linear_tyres_have_no_circle() -> None:
     env = started(FULL | {"tyres": "linear"})
     assert [wheel.capacity for wheel in scene(env).wheels] == [0.0] * 4
-    assert kind_of(env._params, env._switches).law == 0
+    assert make_step_variant(env._params, env._switches).law == 0
 
 
 def test_the_chart_has_the_truth_and_an_estimate_where_a_wrapper_makes_one() -> None:
@@ -104,7 +104,7 @@ def test_the_chart_has_the_truth_and_an_estimate_where_a_wrapper_makes_one() -> 
         for _ in range(60):
             env.step(np.zeros(1, np.float32))
         frames.append(env.render())
-        lines = [len(painted(frame, colour("exact-kf"), _STRIPS)) for frame in frames]
+        lines = [len(painted(frame, find_colour("exact-kf"), _STRIPS)) for frame in frames]
         assert (lines[1] > 20) == (env is not bare)
         truth = [len(painted(frame, INK, _STRIPS)) for frame in frames]
         assert truth[1] > truth[0] + 100
@@ -121,24 +121,28 @@ def test_the_chart_begins_anew_with_an_episode_and_slides() -> None:
     assert env.render() is not None
     for _ in range(1100):
         env.step([0.0])
-    trace = env.shot().trace
-    assert len(trace.since(0.0, 10_000)[0]) == 1101
-    assert len(trace.since(0.0)[0]) <= 800
-    assert trace.now[MOMENT.t] - trace.since(trace.now[MOMENT.t] - SPAN)[0][0, 0] <= SPAN
+    trace = env.make_render_state().trace
+    assert len(trace.select_since(0.0, 10_000)[0]) == 1101
+    assert len(trace.select_since(0.0)[0]) <= 800
+    assert (
+        trace.newest[TRACE_POINT.t]
+        - trace.select_since(trace.newest[TRACE_POINT.t] - MAX_SPAN)[0][0, 0]
+        <= MAX_SPAN
+    )
     env.reset()
-    assert len(env.shot().trace.since(0.0)[0]) == 1
+    assert len(env.make_render_state().trace.select_since(0.0)[0]) == 1
 
 
 def test_estimates_are_of_their_moment_and_nan_before() -> None:
-    trace, state = Trace(), np.zeros(500)
+    trace, state = EpisodeTrace(), np.zeros(500)
     for k in range(300):
         trace.add(np.full(13, 0.01 * k), state)
         if k > 250:
-            trace.estimate("mine", float(k), 0.1)
-    truth, estimates = trace.since(2.0, 1000)
+            trace.add_estimate("mine", float(k), 0.1)
+    truth, estimates = trace.select_since(2.0, 1000)
     hats = estimates["mine"][:, 0]
     known = np.isfinite(hats)
-    assert known.sum() == 49 and np.allclose(hats[known], 100.0 * truth[known, MOMENT.t])
+    assert known.sum() == 49 and np.allclose(hats[known], 100.0 * truth[known, TRACE_POINT.t])
 
 
 def test_drawing_changes_no_bit() -> None:
@@ -161,7 +165,7 @@ def test_nothing_is_remembered_before_the_first_picture() -> None:
     assert env._traces == []
     env.render()
     env.step([0.0])
-    assert len(env.shot().trace.since(0.0)[0]) == 2
+    assert len(env.make_render_state().trace.select_since(0.0)[0]) == 2
 
 
 def test_every_road_is_drawn() -> None:
@@ -179,16 +183,22 @@ def test_every_road_is_drawn() -> None:
         assert seen(env).shape == (*SIZE[::-1], 3) and seen(env).dtype == np.uint8
     assert len(painted(seen(cones), ORANGE, _ROAD)) > 50
     assert len(painted(seen(bend), ORANGE, _ROAD)) == 0
-    assert scene(windy).wind != 0.0 and scene(windy).sight is None and scene(bend).sight.sees
+    assert (
+        scene(windy).wind != 0.0
+        and scene(windy).field_of_view is None
+        and scene(bend).field_of_view.sees
+    )
 
 
 def test_a_ghost_drives_beside() -> None:
     one, other = started(), started(y=2.0, Y=2.0)
     alone = painted(seen(one), GREY, _ROAD)
-    picture = draw(one.shot(), "with control", [("without", other.shot())])
-    from sideslip.envs.rendering.canvas import pixels
+    picture = draw_picture(
+        one.make_render_state(), "with control", [("without", other.make_render_state())]
+    )
+    from sideslip.envs.rendering.canvas import read_pixels
 
-    both = painted(pixels(picture), GREY, _ROAD)
+    both = painted(read_pixels(picture), GREY, _ROAD)
     assert len(both) > len(alone) + 500
     assert both[:, 1].mean() < 0.5 * _ROAD[3]
 
@@ -198,13 +208,13 @@ def test_a_ghost_drives_beside() -> None:
 def test_both_cars_are_named_and_no_name_covers_a_car_or_the_other_name(
     y: float, psi: float
 ) -> None:
-    from sideslip.envs.rendering.canvas import pixels
+    from sideslip.envs.rendering.canvas import read_pixels
 
-    one, other = started().shot(), started(y=y, Y=y, psi=psi).shot()
-    bare = pixels(draw(one, "", [("", other)]))
-    named = pixels(draw(one, "lqr", [("no control", other)]))
+    one, other = started().make_render_state(), started(y=y, Y=y, psi=psi).make_render_state()
+    bare = read_pixels(draw_picture(one, "", [("", other)]))
+    named = read_pixels(draw_picture(one, "lqr", [("no control", other)]))
     lines = np.unique(np.nonzero((named != bare).any(2)[: int(_ROAD[1] + _ROAD[3])])[0])
     assert (np.diff(lines) > 2).sum() == 1  # two names, one below the other
     for shade in (BLUE, GREY):
-        assert len(painted(named, mixed(shade, INK, 0.6), _ROAD)) > 0
+        assert len(painted(named, mix_colours(shade, INK, 0.6), _ROAD)) > 0
         assert np.array_equal(painted(named, shade, _ROAD), painted(bare, shade, _ROAD))

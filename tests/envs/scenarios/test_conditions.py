@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs import StabilityEnv, scenario_from
+from sideslip.envs import StabilityEnv, make_scenario
 from sideslip.envs.record import FAST, PACKET
 from sideslip.estimators import EstimateObservation
 
@@ -141,6 +141,6 @@ def test_older_draws_keep_their_bits() -> None:
 
 
 def test_recovery_has_nobody_who_steers_and_a_car_that_slides() -> None:
-    scenario = scenario_from("recovery")
+    scenario = make_scenario("recovery")
     assert (scenario.steering, scenario.tier) == ("straight", "")
     assert scenario.range("initial_beta")[0] > 0.0

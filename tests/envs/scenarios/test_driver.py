@@ -9,21 +9,29 @@ import pytest
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv
 from sideslip.envs.backend.arrays import read
-from sideslip.envs.backend.decorators import plain
+from sideslip.envs.backend.decorators import as_python
 from sideslip.envs.backend.primitives import ARRAYS
 from sideslip.envs.engine.layout import P
-from sideslip.envs.scenarios.driver import Driver, steered, wanted_angle
-from sideslip.envs.scenarios.tracks import laid, path_of, path_offset, sections
-from sideslip.envs.task.reference import target_of
-from sideslip.envs.vehicle.dynamics import Motion, Road
+from sideslip.envs.scenarios.driver import DriverParams, compute_driver_angle, compute_target_angle
+from sideslip.envs.scenarios.tracks import (
+    compute_path_offset,
+    make_path,
+    make_sections,
+    transform_path,
+)
+from sideslip.envs.task.reference import make_reference_params
+from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 
 from ..helpers import FULL, LINEAR, Moment, bits, play
 
 T = 1.0
-QUICK = Driver(T, 1.0, 0.0, 1.0)
-TARGET = target_of(COMS)
-STRAIGHT, TRACK = path_of("road", 1.0), laid(path_of("iso-3888-2", 1.095), 3.0, 0.5, 1.0)
-FLAT, CLOTHOID = Road(0.0, 0.0, 1.0), Road(0.02, 0.0, 40.0)
+QUICK = DriverParams(T, 1.0, 0.0, 1.0)
+TARGET = make_reference_params(COMS)
+STRAIGHT, TRACK = (
+    make_path("road", 1.0),
+    transform_path(make_path("iso-3888-2", 1.095), 3.0, 0.5, 1.0),
+)
+FLAT, CLOTHOID = RoadParams(0.0, 0.0, 1.0), RoadParams(0.02, 0.0, 40.0)
 KEEPING = {"steering": "driver", "half_width": 1.75}
 
 
@@ -59,33 +67,35 @@ def test_the_wanted_angle_is_that_of_the_circle_through_the_preview_point() -> N
         bend = (
             np.mean(0.02 * (s + x) / 40.0 * (7.0 * T - x)) * 7.0 * T
         )  # curvature twice integrated
-        error = path_offset(TRACK, s + 7.0 * T) + bend - (y + T * y_dot)
+        error = compute_path_offset(TRACK, s + 7.0 * T) + bend - (y + T * y_dot)
         expected = 2.0 * error / T**2 * l * (1.0 + G * 49.0) / 49.0
-        angle = wanted_angle(here, TRACK, CLOTHOID, TARGET, QUICK, 10.0)
+        angle = compute_target_angle(here, TRACK, CLOTHOID, TARGET, QUICK, 10.0)
         assert angle == pytest.approx(expected, abs=1e-10)  # the midpoint rule's error
 
 
 @pytest.mark.plain
 def test_arms_follow_with_their_lag_and_within_their_rate() -> None:
     here, rest = motion(y=-0.1), math.exp(-1e-3 / 0.15)
-    wanted = wanted_angle(here, STRAIGHT, FLAT, TARGET, QUICK, 1.0)
+    wanted = compute_target_angle(here, STRAIGHT, FLAT, TARGET, QUICK, 1.0)
     arms = QUICK._replace(rest=rest)
-    angle = steered(0.01, here, STRAIGHT, FLAT, TARGET, arms, 1.0)
+    angle = compute_driver_angle(0.01, here, STRAIGHT, FLAT, TARGET, arms, 1.0)
     assert angle == pytest.approx(wanted + (0.01 - wanted) * rest, rel=1e-12)
     slow = arms._replace(slew=1e-5)
-    assert steered(0.0, here, STRAIGHT, FLAT, TARGET, slow, 1.0) == 1e-5
-    assert steered(0.9, here, STRAIGHT, FLAT, TARGET, slow, 1.0) == 0.9 - 1e-5
-    assert wanted_angle(motion(y=-50.0), STRAIGHT, FLAT, TARGET, QUICK, 0.6) == 0.6
-    assert wanted_angle(motion(y=50.0), STRAIGHT, FLAT, TARGET, QUICK, 0.6) == -0.6
+    assert compute_driver_angle(0.0, here, STRAIGHT, FLAT, TARGET, slow, 1.0) == 1e-5
+    assert compute_driver_angle(0.9, here, STRAIGHT, FLAT, TARGET, slow, 1.0) == 0.9 - 1e-5
+    assert compute_target_angle(motion(y=-50.0), STRAIGHT, FLAT, TARGET, QUICK, 0.6) == 0.6
+    assert compute_target_angle(motion(y=50.0), STRAIGHT, FLAT, TARGET, QUICK, 0.6) == -0.6
 
 
 @pytest.mark.plain
 def test_a_mirrored_world_is_steered_the_other_way() -> None:
     here = motion(s=8.0, y=0.2, psi=0.03, v_y=-0.1)
     mirrored = here._replace(y=-0.2, psi=-0.03, v_y=0.1)
-    other = laid(path_of("iso-3888-2", 1.095), 3.0, 0.5, -1.0)
-    a = steered(0.02, here, TRACK, CLOTHOID, TARGET, QUICK, 0.6)
-    b = steered(-0.02, mirrored, other, CLOTHOID._replace(curvature=-0.02), TARGET, QUICK, 0.6)
+    other = transform_path(make_path("iso-3888-2", 1.095), 3.0, 0.5, -1.0)
+    a = compute_driver_angle(0.02, here, TRACK, CLOTHOID, TARGET, QUICK, 0.6)
+    b = compute_driver_angle(
+        -0.02, mirrored, other, CLOTHOID._replace(curvature=-0.02), TARGET, QUICK, 0.6
+    )
     assert a == pytest.approx(-b, rel=1e-12)
 
 
@@ -97,9 +107,11 @@ def test_compiled_plain_and_arrays_give_the_same_bits() -> None:
     def call(function: Any, state: Any) -> Any:
         return function(0.01, state, TRACK, CLOTHOID, TARGET, arms, 0.6)
 
-    compiled = [call(steered, Motion(*row)) for row in rows.tolist()]
-    assert [call(plain(steered), Motion(*row)) for row in rows.tolist()] == compiled
-    arrays = call(plain(steered, ARRAYS), Motion(*rows.T))
+    compiled = [call(compute_driver_angle, Motion(*row)) for row in rows.tolist()]
+    assert [
+        call(as_python(compute_driver_angle), Motion(*row)) for row in rows.tolist()
+    ] == compiled
+    arrays = call(as_python(compute_driver_angle, ARRAYS), Motion(*rows.T))
     assert bits(arrays) == bits(np.array(compiled))
 
 
@@ -157,7 +169,7 @@ def test_the_car_stays_between_the_cones_of_its_track(side: float) -> None:
         snapshot["params"][P.path[i]] *= side
     env.set_state(snapshot)
     v = 25.0 / 3.6
-    lanes = sections("iso-3888-2", COMS.width, 0.5 * v, v / 8.0, side)
+    lanes = make_sections("iso-3888-2", COMS.width, 0.5 * v, v / 8.0, side)
     seen = 0
     for _ in range(800):
         play(env, [0.0])
@@ -181,18 +193,18 @@ def test_the_track_lies_where_onset_speed_and_side_put_it() -> None:
     for seed in range(8):
         env.reset(seed=seed)
         packed = read(env.get_state()["params"], P.path)
-        own, v = path_of("iso-3888-2", COMS.width), env.motion.v_x
+        own, v = make_path("iso-3888-2", COMS.width), env.motion.v_x
         scale = packed.length_1 / own.length_1
         assert v / 9.0 <= scale <= v / 7.0
         onset = (packed.start_1 - scale * own.start_1) / v
         assert 0.5 <= onset <= 1.0
         side = math.copysign(1.0, packed.shift_1)
-        assert packed == pytest.approx(laid(own, onset * v, scale, side), rel=1e-12)
+        assert packed == pytest.approx(transform_path(own, onset * v, scale, side), rel=1e-12)
         sides.add(side)
         env.reset(seed=seed, options={"state": {"s": 7.0, "v_x": v + 0.5}})
         started = read(env.get_state()["params"], P.path)
         begin = 7.0 + onset * (v + 0.5)
-        assert started == pytest.approx(laid(own, begin, scale, side), rel=1e-12)
+        assert started == pytest.approx(transform_path(own, begin, scale, side), rel=1e-12)
     assert sides == {-1.0, 1.0}
     env.reset(seed=0, options={"scenario": {"base": "double-lane-change", "path_speed": None}})
     assert env.get_state()["params"][P.path.length_1] == own.length_1  # the standard's
@@ -205,7 +217,7 @@ def test_who_leaves_the_path_ends_the_episode_there() -> None:
     env, moments, places = driven(scene)
     assert FAILURES[moments[-1].info["failure"]] == "off-road"
     packed = read(env.get_state()["params"], P.path)
-    off = places[:, 1] - [path_offset(packed, s) for s in places[:, 0]]
+    off = places[:, 1] - [compute_path_offset(packed, s) for s in places[:, 0]]
     assert abs(off[-1]) > 2.0
     assert np.all(np.abs(off[:-1]) <= 2.0)
     assert abs(places[-1, 1]) < 1.0

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, StabilityEnv, stability
-from sideslip.envs.backend.decorators import plain
+from sideslip.envs.backend.decorators import as_python
 from sideslip.envs.engine import reset as restart
 from sideslip.envs.engine import step as kernel
 from sideslip.envs.engine.layout import P
-from sideslip.envs.engine.packing import car_of
+from sideslip.envs.engine.packing import make_car
 from sideslip.envs.ticks import FOREVER
-from sideslip.envs.vehicle.tyres import Inputs, load_of
+from sideslip.envs.vehicle.tyres import TyreInputs, compute_tyre_load
 
 from ..helpers import FULL, LINEAR, bits, play
 
@@ -60,8 +60,8 @@ def test_whole_steps_have_the_same_bits_without_the_compiler(
         return bits((start, moments, env.get_state()["state"], env.get_state()["params"]))
 
     compiled = episode()
-    monkeypatch.setattr(stability, "reset_vehicle", plain(restart.reset_vehicle))
-    monkeypatch.setattr(stability, "step_packed", plain(kernel.step_packed))
+    monkeypatch.setattr(stability, "reset_vehicle", as_python(restart.reset_vehicle))
+    monkeypatch.setattr(stability, "step_workspace", as_python(kernel.step_workspace))
     assert episode() == compiled
 
 
@@ -80,7 +80,7 @@ def test_the_plant_is_another_from_the_tick_of_the_change_on(
     snapshot = changing.get_state()
     snapshot["params"][P.car.C_f] *= 0.7
     snapshot["params"][P.car.C_r] *= 1.2
-    snapshot["params"][P.change.tick] = FOREVER
+    snapshot["params"][P.tyre_change.tick] = FOREVER
     later = states(changing, 60)
     assert later[0] != states(same, 1)[0]
     changing.set_state(snapshot)
@@ -109,10 +109,10 @@ def test_the_env_tells_its_tyres_now() -> None:
 
 
 def test_each_rear_tyre_has_its_sides_grip_and_the_front_ones_the_mean() -> None:
-    car = car_of(COMS)._replace(mu=0.9, mu_r=0.3)
-    load = load_of(Inputs(0.0, -100.0, -100.0), car, 0)
-    high = load_of(Inputs(0.0, -100.0, -100.0), car._replace(mu_r=0.9), 0)
-    low = load_of(Inputs(0.0, -100.0, -100.0), car._replace(mu=0.3), 0)
+    car = make_car(COMS)._replace(mu=0.9, mu_r=0.3)
+    load = compute_tyre_load(TyreInputs(0.0, -100.0, -100.0), car, 0)
+    high = compute_tyre_load(TyreInputs(0.0, -100.0, -100.0), car._replace(mu_r=0.9), 0)
+    low = compute_tyre_load(TyreInputs(0.0, -100.0, -100.0), car._replace(mu=0.3), 0)
     assert (load.rear_l, load.limit_l, load.slope_l) == (high.rear_l, high.limit_l, high.slope_l)
     assert (load.rear_r, load.limit_r, load.slope_r) == (low.rear_r, low.limit_r, low.slope_r)
     assert load.limit_f == pytest.approx(0.5 * (high.limit_f + low.limit_f), rel=1e-14)

@@ -61,7 +61,7 @@ def test_twins_of_road_tests_drive_the_whole_plant(name: str) -> None:
     assert scenario.lags
     assert scenario.roll
     assert scenario.hdop_law == "half"
-    low, high = scenario.draws()
+    low, high = scenario.get_draw_ranges()
     np.testing.assert_array_equal(low, high)
     _, seen, _ = uncontrolled(name)
     assert seen[-1, 0] == scenario.duration

@@ -126,7 +126,7 @@ def test_papers_simulations_are_as_PAPERS_gives_them(name: str) -> None:
     )
     assert dict(scenario.noise) == noise
     assert scenario.wind_force == fields.get("wind_force", 0.0)
-    low, high = scenario.draws()
+    low, high = scenario.get_draw_ranges()
     np.testing.assert_array_equal(low, high)  # nothing is drawn
     env = StabilityEnv("fusion", scenario=name)
     for seed in (0, 1):

@@ -11,8 +11,8 @@ from scipy.integrate import solve_ivp
 from sideslip.envs import COMS, Scenario, StabilityEnv
 from sideslip.envs.engine.layout import P, Z
 from sideslip.envs.record import FAST, PACKET, concatenate
-from sideslip.envs.scenarios.steering import steering_at
-from sideslip.envs.vehicle.linear import bicycle
+from sideslip.envs.scenarios.steering import compute_steering
+from sideslip.envs.vehicle.linear import make_bicycle_model
 
 SLALOM: dict[str, Any] = {"base": "slalom", "amplitude": 0.05, "duration": 4.0}
 WINDING = SLALOM | {"road": "nominal-path"}
@@ -33,11 +33,11 @@ def drive(scenario: Any, action: float = 0.0, steps: int = 400, **more: Any) -> 
 def test_its_direction_is_that_of_the_nominal_cars_path() -> None:
     """psi + beta of the linear bicycle, integrated by another's integrator."""
     _, states, p = drive(WINDING)
-    programme, V = p[P.programme[0] :], float(p[P.pace.speed])
-    model = bicycle(COMS, V)
+    programme, V = p[P.steering_profile[0] :], float(p[P.speed_profile.speed])
+    model = make_bicycle_model(COMS, V)
 
     def slope(t: float, x: Any) -> Any:
-        return [*(model.A @ x[:2] + model.B[:, 0] * steering_at(1000.0 * t, programme)), x[1]]
+        return [*(model.A @ x[:2] + model.B[:, 0] * compute_steering(1000.0 * t, programme)), x[1]]
 
     times = np.arange(len(states)) * 0.01
     found = solve_ivp(slope, (0.0, times[-1]), np.zeros(3), t_eval=times, rtol=1e-9, atol=1e-12)
@@ -48,7 +48,7 @@ def test_its_direction_is_that_of_the_nominal_cars_path() -> None:
 
 def test_it_is_the_seeds_and_not_the_controls() -> None:
     calm, loud = drive(WINDING), drive(WINDING, action=0.3)
-    for part in (Z.lead.beta, Z.lead.gamma):
+    for part in (Z.nominal_motion.beta, Z.nominal_motion.gamma):
         np.testing.assert_array_equal(calm[1][:, part], loud[1][:, part])
     theta = Z.motion.theta
     np.testing.assert_allclose(calm[1][:, theta], loud[1][:, theta], atol=1e-14)
@@ -81,7 +81,7 @@ def test_the_plant_itself_does_not_notice() -> None:
 def test_the_camera_reports_y_l_without_the_bend() -> None:
     quiet = {"noise": {"camera_psi": 0.0, "camera_y": 0.0}}
     record, states, _ = drive(WINDING | quiet, camera={"period": 0.01, "delays": (0.0,)})
-    psi, y_l = record.packets_of("camera")[:, PACKET.value : PACKET.value + 2].T
+    psi, y_l = record.select_packets("camera")[:, PACKET.value : PACKET.value + 2].T
     relative = states[:, Z.motion.psi] - states[:, Z.motion.theta]
     np.testing.assert_allclose(psi, relative, atol=1e-14)
     np.testing.assert_allclose(y_l, states[:, Z.motion.y] + 5.135 * relative, atol=1e-14)
@@ -121,7 +121,10 @@ def test_braking_cars_are_followed_at_the_speed_that_their_drivers_want() -> Non
     _, states, _ = drive(brake)
     even = drive(WINDING)[1]
     late = slice(300, None)
-    assert np.abs(states[late, Z.lead.gamma]).max() < 0.8 * np.abs(even[late, Z.lead.gamma]).max()
+    assert (
+        np.abs(states[late, Z.nominal_motion.gamma]).max()
+        < 0.8 * np.abs(even[late, Z.nominal_motion.gamma]).max()
+    )
     assert math.isfinite(float(np.abs(states[:, Z.motion.theta]).max()))
 
 

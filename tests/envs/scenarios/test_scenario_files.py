@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from sideslip.envs import SCENARIOS, Scenario, StabilityEnv, scenario_from
+from sideslip.envs import SCENARIOS, Scenario, StabilityEnv, make_scenario
 
 pytestmark = pytest.mark.plain
 
@@ -25,13 +25,13 @@ def test_what_is_written_is_read_back(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"it.{ending}"
     for scenario in (*SCENARIOS.values(), ODD):
         scenario.write(path)
-        assert scenario_from(path) == scenario_from(str(path)) == scenario
+        assert make_scenario(path) == make_scenario(str(path)) == scenario
 
 
 def test_a_file_starts_from_a_name_or_a_file_beside_it(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text('base = "gust"\nspeed = [4.0, 5.0]\n')
     (tmp_path / "other.json").write_text('{"base": "mine.toml", "friction": 0.5, "name": "o"}')
-    mine, other = (scenario_from(tmp_path / name) for name in ("mine.toml", "other.json"))
+    mine, other = (make_scenario(tmp_path / name) for name in ("mine.toml", "other.json"))
     assert mine == SCENARIOS["gust"].replace(name="mine", speed=(4.0, 5.0))
     assert other == mine.replace(name="o", friction=0.5)
     env = StabilityEnv(scenario=str(tmp_path / "mine.toml"))
@@ -63,18 +63,18 @@ def test_a_bad_file_is_refused(
     path.write_text(content)
     (tmp_path / "good.toml").write_text('base = "bad.toml"')
     with pytest.raises(error, match=message) as caught:
-        scenario_from(path)
+        make_scenario(path)
     assert str(path) in str(caught.value)
 
 
 def test_what_is_no_scenario(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"nowhere\.toml: there is no such scenario file"):
-        scenario_from("nowhere.toml")
+        make_scenario("nowhere.toml")
     with pytest.raises(FileNotFoundError, match=r"nowhere\.csv"):
-        scenario_from("nowhere.csv")
+        make_scenario("nowhere.csv")
     with pytest.raises(ValueError, match=r"ends in \.toml or \.json"):
-        scenario_from(tmp_path / "drive.txt")
+        make_scenario(tmp_path / "drive.txt")
     with pytest.raises(ValueError, match=r"ends in \.toml or \.json"):
         ODD.write(tmp_path / "it.yaml")
     with pytest.raises(TypeError, match="a scenario is a name, the path of"):
-        scenario_from(5)  # type: ignore[arg-type]
+        make_scenario(5)  # type: ignore[arg-type]

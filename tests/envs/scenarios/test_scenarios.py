@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sideslip.envs import COMS, PASSENGER_CAR, SCENARIOS, Scenario, StabilityEnv, scenario_from
-from sideslip.envs.engine.packing import car_of
-from sideslip.envs.scenarios.draws import DRAWS_WIDTH, Draws, realise, stable
+from sideslip.envs import COMS, PASSENGER_CAR, SCENARIOS, Scenario, StabilityEnv, make_scenario
+from sideslip.envs.engine.packing import make_car
+from sideslip.envs.scenarios.draws import DRAWS_WIDTH, Draws, draw_stable, is_stable
 
 from ..helpers import play
 
 pytestmark = pytest.mark.plain
 
-CAR = car_of(COMS)
+CAR = make_car(COMS)
 TRACK: dict[str, Any] = {"steering": "driver", "path": "iso-3888-2"}
 DRAWN = [name for name, scenario in SCENARIOS.items() if scenario.mirror]
 UNSCORED = [name for name in DRAWN if not SCENARIOS[name].tier]
@@ -25,12 +25,12 @@ UNSCORED = [name for name in DRAWN if not SCENARIOS[name].tier]
 
 def draws(name: str, count: int, first: int = 0) -> tuple[list[Draws], list[int]]:
     """(drawn numbers, unstable attempts) of the keys first, first + 1, ..."""
-    low, high = SCENARIOS[name].draws()
+    low, high = SCENARIOS[name].get_draw_ranges()
     fast = SCENARIOS[name].tier.startswith("2") or name == "wet-evasion"
-    car = car_of(PASSENGER_CAR) if fast else CAR
+    car = make_car(PASSENGER_CAR) if fast else CAR
     drawn, lost = [], []
     for key in range(first, first + count):
-        each, attempts = realise(low, high, key, 77, car, np.zeros(DRAWS_WIDTH))
+        each, attempts = draw_stable(low, high, key, 77, car, np.zeros(DRAWS_WIDTH))
         drawn.append(each)
         lost.append(attempts)
     return drawn, lost
@@ -39,7 +39,7 @@ def draws(name: str, count: int, first: int = 0) -> tuple[list[Draws], list[int]
 @pytest.mark.parametrize("name", DRAWN)
 def test_draws_lie_in_their_ranges_and_fill_them(name: str) -> None:
     values = np.array(draws(name, 400)[0])
-    low, high = SCENARIOS[name].draws()
+    low, high = SCENARIOS[name].get_draw_ranges()
     assert np.all((low <= values) & (values <= high))
     fixed = low == high
     assert np.all(values[:, fixed] == low[fixed])  # bit for bit, without rounding
@@ -50,7 +50,7 @@ def test_draws_lie_in_their_ranges_and_fill_them(name: str) -> None:
 
 @pytest.mark.parametrize("name", UNSCORED)
 def test_every_drawn_scenario_draws_what_a_table_of_actions_would_need(name: str) -> None:
-    low, high = SCENARIOS[name].draws()
+    low, high = SCENARIOS[name].get_draw_ranges()
     drawn = {Draws._fields[i] for i in np.flatnonzero(low < high)}
     expected = {"speed", "friction", "front_stiffness", "rear_stiffness", "side", "wind_side"}
     turns = {"onset", "amplitude"}
@@ -89,7 +89,7 @@ def test_the_same_key_draws_the_same_and_another_draws_anew() -> None:
 
 def test_quantities_are_drawn_independently() -> None:
     values = np.array(draws("random-steering", 3000)[0])
-    low, high = SCENARIOS["random-steering"].draws()
+    low, high = SCENARIOS["random-steering"].get_draw_ranges()
     skip = [Draws._fields.index(name) for name in ("speed", "front_stiffness", "rear_stiffness")]
     free = [i for i in np.flatnonzero(low < high) if i not in skip]  # redraws tie those three
     ranks = values[:, free]
@@ -110,12 +110,12 @@ def test_half_of_the_draws_are_mirrored() -> None:
 
 def test_unstable_draws_are_drawn_again_and_counted() -> None:
     drawn, lost = draws("straight", 1000)
-    assert all(stable(each, CAR) for each in drawn)
+    assert all(is_stable(each, CAR) for each in drawn)
     share = sum(lost) / (1000 + sum(lost))
     assert 0.0 < share < 0.15  # 15 % at 40 km/h, where these are fastest
-    fast = scenario_from({"base": "straight", "speed": 40.0 / 3.6})
-    low, high = fast.draws()
-    lost = [realise(low, high, key, 1, CAR, np.zeros(DRAWS_WIDTH))[1] for key in range(2000)]
+    fast = make_scenario({"base": "straight", "speed": 40.0 / 3.6})
+    low, high = fast.get_draw_ranges()
+    lost = [draw_stable(low, high, key, 1, CAR, np.zeros(DRAWS_WIDTH))[1] for key in range(2000)]
     share = sum(lost) / (2000 + sum(lost))
     # independently: U(0.6, 1.4) twice and the critical speed, with 5 % of speed to spare
     rng = np.random.default_rng(0)
@@ -180,9 +180,9 @@ def test_the_axles_draws_are_independent() -> None:
 def test_round_trip_through_json(name: str) -> None:
     scenario = SCENARIOS[name]
     values = json.loads(json.dumps(scenario.to_dict()))
-    assert scenario_from(values) == scenario
-    assert scenario_from(scenario) is scenario_from(name) is scenario
-    assert scenario_from({"base": name, "duration": 3.0}) == scenario.replace(duration=3.0)
+    assert make_scenario(values) == scenario
+    assert make_scenario(scenario) is make_scenario(name) is scenario
+    assert make_scenario({"base": name, "duration": 3.0}) == scenario.replace(duration=3.0)
 
 
 @pytest.mark.parametrize(
@@ -264,15 +264,15 @@ def test_values_that_cannot_be_are_refused_by_name(changes: dict[str, Any], mess
 
 def test_unknown_scenario_and_field_are_refused() -> None:
     with pytest.raises(ValueError, match=r"unknown scenario 'slalon'; did you mean 'slalom'"):
-        scenario_from("slalon")
+        make_scenario("slalon")
     with pytest.raises(TypeError, match="unknown scenario field 'speeed'"):
-        scenario_from({"base": "sine", "speeed": 1.0})
+        make_scenario({"base": "sine", "speeed": 1.0})
     with pytest.raises(TypeError, match="speeed"):
         SCENARIOS["sine"].replace(speeed=1.0)
     with pytest.raises(
         TypeError, match="'mine': unknown parameter of nominal 'masss'; did you mean"
     ):
-        scenario_from({"base": "sine", "name": "mine", "nominal": {"masss": 1.0}})
+        make_scenario({"base": "sine", "name": "mine", "nominal": {"masss": 1.0}})
 
 
 def test_a_scenario_is_frozen() -> None:

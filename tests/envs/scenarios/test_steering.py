@@ -8,17 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv, critical_speed
-from sideslip.envs.engine.packing import car_of
+from sideslip.envs.engine.packing import make_car
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.scenarios.draws import DRAWS_WIDTH, Draws, stable
-from sideslip.envs.scenarios.speed import Pace, acceleration_command
+from sideslip.envs.scenarios.draws import DRAWS_WIDTH, Draws, is_stable
+from sideslip.envs.scenarios.speed import SpeedProfile, compute_acceleration_command
 from sideslip.envs.scenarios.steering import (
     STEERING_KINDS,
     STEERING_WIDTH,
-    steering_at,
+    compute_steering,
     write_steering,
 )
-from sideslip.envs.scenarios.wind import Wind, wind_at
+from sideslip.envs.scenarios.wind import Wind, compute_wind
 from sideslip.envs.ticks import FOREVER, TICK
 
 from ..helpers import FULL, LINEAR, fast_rows, packets, play
@@ -45,7 +45,9 @@ def steering(kind: str, seconds: float = 10.0, **changes: float) -> np.ndarray:
     """The steering angle at every tick."""
     programme = np.zeros(STEERING_WIDTH)
     write_steering(STEERING_KINDS.index(kind), DRAWN._replace(**changes), programme)
-    return np.array([steering_at(float(tick), programme) for tick in range(round(seconds / TICK))])
+    return np.array(
+        [compute_steering(float(tick), programme) for tick in range(round(seconds / TICK))]
+    )
 
 
 def sine(start: float, hertz: float, t: np.ndarray) -> np.ndarray:
@@ -150,14 +152,14 @@ def test_so_the_linear_car_does_too(kind: str) -> None:
 def test_draws_are_stable_up_to_the_critical_speed_less_5_percent(
     front: float, rear: float
 ) -> None:
-    drawn, car = DRAWN._replace(front_stiffness=front, rear_stiffness=rear), car_of(COMS)
-    limit = critical_speed(COMS.scaled(front, rear)) / 1.05
+    drawn, car = DRAWN._replace(front_stiffness=front, rear_stiffness=rear), make_car(COMS)
+    limit = critical_speed(COMS.scale_stiffness(front, rear)) / 1.05
     if limit == math.inf:
-        assert stable(drawn._replace(speed=1e3), car)
+        assert is_stable(drawn._replace(speed=1e3), car)
     else:
         # the speed enters squared: the boundary is known to some roundings
-        assert stable(drawn._replace(speed=limit * (1.0 - 1e-12)), car)
-        assert not stable(drawn._replace(speed=limit * (1.0 + 1e-12)), car)
+        assert is_stable(drawn._replace(speed=limit * (1.0 - 1e-12)), car)
+        assert not is_stable(drawn._replace(speed=limit * (1.0 + 1e-12)), car)
 
 
 @given(st.floats(0.7, 1.5), st.floats(0.7, 1.5), st.floats(0.5, 1.5), st.floats(0.5, 1.5))
@@ -167,31 +169,35 @@ def test_a_car_whose_tyres_change_is_stable_before_and_after(
     drawn = DRAWN._replace(speed=9.0, front_stiffness=front, rear_stiffness=rear)
     later = drawn._replace(front_stiffness=front * later_front, rear_stiffness=rear * later_rear)
     changes = drawn._replace(tyre_change_time=4.0, front_change=later_front, rear_change=later_rear)
-    car = car_of(COMS)
-    assert stable(changes, car) == (stable(drawn, car) and stable(later, car))
-    assert stable(changes._replace(tyre_change_time=0.0), car) == stable(drawn, car)
+    car = make_car(COMS)
+    assert is_stable(changes, car) == (is_stable(drawn, car) and is_stable(later, car))
+    assert is_stable(changes._replace(tyre_change_time=0.0), car) == is_stable(drawn, car)
 
 
 def test_wind_blows_from_its_start_up_to_its_end_at_its_arm_and_height() -> None:
     wind = Wind(200.0, 0.2, 4000.0, 8000.0, 0.5)
     for tick, force in ((3999.0, 0.0), (4000.0, 200.0), (7999.0, 200.0), (8000.0, 0.0)):
         # to the left and above the roll axis: it rolls the body to the left, which is negative
-        assert wind_at(tick, wind) == (force, pytest.approx(0.2 * force, rel=1e-15), -0.5 * force)
+        assert compute_wind(tick, wind) == (
+            force,
+            pytest.approx(0.2 * force, rel=1e-15),
+            -0.5 * force,
+        )
 
 
-def pace(**changes: float) -> Pace:
-    return Pace(7.0, 1.0, 0.0, 0.0, FOREVER, 2.0, 0.5)._replace(**changes)
+def pace(**changes: float) -> SpeedProfile:
+    return SpeedProfile(7.0, 1.0, 0.0, 0.0, FOREVER, 2.0, 0.5)._replace(**changes)
 
 
 def test_pi_holds_the_integral_while_the_motors_are_at_their_limit() -> None:
-    assert acceleration_command(0.0, 7.0, 0.0, pace(), 2.0) == (0.0, 0.0)
-    a_x, integral = acceleration_command(0.0, 6.9, 0.1, pace(), 2.0)
+    assert compute_acceleration_command(0.0, 7.0, 0.0, pace(), 2.0) == (0.0, 0.0)
+    a_x, integral = compute_acceleration_command(0.0, 6.9, 0.1, pace(), 2.0)
     assert (a_x, integral) == (pytest.approx(0.3, rel=1e-14), pytest.approx(0.10005, rel=1e-14))
-    assert acceleration_command(0.0, 0.0, 0.1, pace(), 2.0) == (2.0, 0.1)
-    assert acceleration_command(0.0, 20.0, 0.1, pace(), 2.0) == (-2.0, 0.1)
+    assert compute_acceleration_command(0.0, 0.0, 0.1, pace(), 2.0) == (2.0, 0.1)
+    assert compute_acceleration_command(0.0, 20.0, 0.1, pace(), 2.0) == (-2.0, 0.1)
     given_a_x = pace(hold=0.0, acceleration=0.7, start=10.0, end=20.0)
     for tick, expected in ((9.0, 0.0), (10.0, 0.7), (19.0, 0.7), (20.0, 0.0)):
-        assert acceleration_command(tick, 3.0, 0.0, given_a_x, 2.0)[0] == expected
+        assert compute_acceleration_command(tick, 3.0, 0.0, given_a_x, 2.0)[0] == expected
 
 
 @pytest.mark.compiled
@@ -236,11 +242,11 @@ def test_a_car_driven_backwards_is_no_spun_one_and_stays_finite() -> None:
 def test_a_speed_that_changes_is_followed_with_its_acceleration_fed_forward() -> None:
     ramp = pace(acceleration=0.5, start=1000.0, end=3000.0)
     for tick, speed, a_x in ((0.0, 7.0, 0.0), (2000.0, 7.5, 0.5), (9000.0, 8.0, 0.0)):
-        assert acceleration_command(tick, speed, 0.0, ramp, 2.0) == (a_x, 0.0)
+        assert compute_acceleration_command(tick, speed, 0.0, ramp, 2.0) == (a_x, 0.0)
     sway = pace(surge=0.5, surge_rate=2.0)
     for tick in (0.0, 400.0, 1500.0):
         t = tick * TICK
         speed = 7.0 + 0.5 / 2.0 * (1.0 - math.cos(2.0 * t))
-        a_x, integral = acceleration_command(tick, speed, 0.0, sway, 2.0)
+        a_x, integral = compute_acceleration_command(tick, speed, 0.0, sway, 2.0)
         assert a_x == pytest.approx(0.5 * math.sin(2.0 * t), abs=1e-14)
         assert integral == pytest.approx(0.0, abs=1e-17)

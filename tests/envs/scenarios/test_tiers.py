@@ -35,7 +35,7 @@ def test_every_tier_has_at_least_four_and_both_classes_five() -> None:
 def test_a_table_of_actions_would_need_every_draw(name: str) -> None:
     """Onset, side, speed, tyres and friction, and the manoeuvre's size and its pace."""
     scenario = SCENARIOS[name]
-    low, high = scenario.draws()
+    low, high = scenario.get_draw_ranges()
     drawn = {Draws._fields[i] for i in np.flatnonzero(low < high)}
     assert {"gyro_bias", "accel_y_bias", "gps_latency", "bank"} <= drawn
     assert {"onset", "side", "speed", "friction", "front_stiffness", "rear_stiffness"} <= drawn

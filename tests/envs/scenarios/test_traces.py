@@ -7,11 +7,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents.clairvoyant.foresight import forecast_of
-from sideslip.envs import StabilityEnv, scenario_from
+from sideslip.agents.clairvoyant.foresight import make_forecast
+from sideslip.envs import StabilityEnv, make_scenario
 from sideslip.envs.device.env import DeviceVectorEnv
 from sideslip.envs.record import FAST
-from sideslip.envs.scenarios.traces import trace_from
+from sideslip.envs.scenarios.traces import read_trace
 
 from ..helpers import bits, drive_alike
 from ..recordings.drives import drive, saved
@@ -35,8 +35,8 @@ def test_a_log_is_driven_again(tmp_path: Path) -> None:
     """Its angles at its times, from its first row on, at its first speed."""
     table = drive(rows=41, dt=0.02)
     path = saved(table, tmp_path)
-    scenario = scenario_from(str(path))
-    assert scenario == trace_from(path)
+    scenario = make_scenario(str(path))
+    assert scenario == read_trace(path)
     assert scenario.duration == 0.8 and scenario.name == "drive"
     assert scenario.speed == pytest.approx(table["speed_x_mps"][0], rel=1e-12)
     driven = commands(StabilityEnv(scenario=str(path), vehicle="passenger-car"))
@@ -48,13 +48,13 @@ def test_a_log_is_driven_again(tmp_path: Path) -> None:
 def test_a_log_needs_time_and_steering_alone_and_a_mapping_changes_the_rest(tmp_path: Path) -> None:
     table = drive()[["time_s", "steer_rad"]].rename(columns={"steer_rad": "delta"})
     path = saved(table, tmp_path)
-    made = trace_from(path, {"steer_rad": "delta"})
+    made = read_trace(path, {"steer_rad": "delta"})
     assert made.trace == tuple(table["delta"])
     with pytest.raises(ValueError, match=r"drive\.csv: no column steer_rad"):
-        scenario_from(path)
+        make_scenario(path)
     saved(table.rename(columns={"delta": "steer_rad"}), tmp_path)
     (tmp_path / "icy.toml").write_text('base = "drive.csv"\nfriction = 0.3\n')
-    assert scenario_from(tmp_path / "icy.toml") == made.replace(name="icy", friction=0.3)
+    assert make_scenario(tmp_path / "icy.toml") == made.replace(name="icy", friction=0.3)
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_a_bad_log_is_refused(tmp_path: Path, column: str, value: float, message
     table = drive()
     table.loc[7, column] = value
     with pytest.raises(ValueError, match=rf"drive\.csv: .*{message}"):
-        scenario_from(saved(table, tmp_path))
+        make_scenario(saved(table, tmp_path))
 
 
 def test_the_last_angle_stays_and_a_mirrored_trace_is_its_negative() -> None:
@@ -114,7 +114,7 @@ def test_a_forecast_knows_the_trace_and_a_device_refuses_it() -> None:
     env = StabilityEnv(scenario=TRACE)
     env.reset(seed=0)
     expected = np.interp(np.arange(200), 10 * np.arange(4), TRACE["trace"])
-    np.testing.assert_allclose(forecast_of(env).driver.ravel(), expected, rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(make_forecast(env).driver.ravel(), expected, rtol=0.0, atol=1e-15)
     pytest.importorskip("torch")
     with pytest.raises(ValueError, match="'custom': no trace is driven on a device"):
         DeviceVectorEnv.make(VISION, scenario=TRACE)

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents.clairvoyant.foresight import forecast_of
+from sideslip.agents.clairvoyant.foresight import make_forecast
 from sideslip.envs import StabilityEnv
 from sideslip.envs.device.env import DeviceVectorEnv
 from sideslip.envs.record import FAST
@@ -67,7 +67,7 @@ def test_rows_of_a_batch_are_the_environment_alone() -> None:
 def test_a_forecast_knows_the_angles_and_a_device_refuses_them() -> None:
     env = StabilityEnv(scenario=WANDER)
     env.reset(seed=0)
-    assert bits(forecast_of(env).driver.ravel()) == bits(commands())
+    assert bits(make_forecast(env).driver.ravel()) == bits(commands())
     pytest.importorskip("torch")
     with pytest.raises(ValueError, match="'custom': no wander is driven on a device"):
         DeviceVectorEnv.make("sideslip/YawVision-v0", scenario=WANDER)

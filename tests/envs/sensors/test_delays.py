@@ -9,8 +9,8 @@ from scipy import stats
 
 from sideslip.envs import SlowSensor, StabilityEnv
 from sideslip.envs.record import PACKET
-from sideslip.envs.scenarios.checks import SHORTEST_GPS_PERIOD
-from sideslip.envs.sensors.link import IN_FLIGHT, link_of
+from sideslip.envs.scenarios.checks import MIN_GPS_PERIOD
+from sideslip.envs.sensors.link import MAX_IN_FLIGHT, make_link
 from sideslip.envs.sensors.slow import CAMERA, GPS, SENSOR_SETS
 
 from ..helpers import IDS, LINEAR, packets, play, unwrapped
@@ -212,15 +212,17 @@ def test_there_is_room_for_the_worst_case(camera: dict[str, Any], n: int) -> Non
     ],
 )
 def test_more_packets_under_way_than_there_is_room_for_are_refused(changes: Any) -> None:
-    with pytest.raises(ValueError, match=rf"packets under way at once; .* room for {IN_FLIGHT}"):
-        link_of(SlowSensor(**changes))
+    with pytest.raises(
+        ValueError, match=rf"packets under way at once; .* room for {MAX_IN_FLIGHT}"
+    ):
+        make_link(SlowSensor(**changes))
     with pytest.raises(ValueError, match="under way"):
         StabilityEnv(camera=changes)
 
 
 @pytest.mark.parametrize("n", [1, 10, 1000])
 def test_a_scenario_sets_the_gps_clock_and_its_packets_have_room(n: int) -> None:
-    clock = {"gps_period": SHORTEST_GPS_PERIOD, "gps_delays": [0.12, 0.05, 0.1], "duration": 60.0}
+    clock = {"gps_period": MIN_GPS_PERIOD, "gps_delays": [0.12, 0.05, 0.1], "duration": 60.0}
     env = StabilityEnv("fusion", control_period=n, gps={"duplicate": 1.0, "delays": [0.0]})
     env.reset(seed=0, options={"scenario": LINEAR | clock})
     told = env.slow_sensors["gps"]

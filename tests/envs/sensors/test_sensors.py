@@ -9,10 +9,10 @@ from scipy import stats
 
 from sideslip.envs import COMS, StabilityEnv
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.sensors.camera import camera_sample
-from sideslip.envs.sensors.gps import HDOP_LAWS, OUTAGE_JUMP, gps_sample, satellites_at
+from sideslip.envs.sensors.camera import sample_camera
+from sideslip.envs.sensors.gps import HDOP_LAWS, OUTAGE_JUMP, count_satellites, sample_gps
 from sideslip.envs.sensors.noise import Noise
-from sideslip.envs.vehicle.dynamics import Motion, Road
+from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 
 from ..helpers import FULL, LINEAR, SILENT, fast_rows, packets, play
 
@@ -75,7 +75,7 @@ def test_camera_and_gps_hold_the_state_at_their_capture() -> None:
 def test_camera_sample_is_tie_vision_4_with_curvature() -> None:
     motion = Motion(7.0, 0.2, 0.1, 0.5, 30.0, 4.0, 31.0, 1.5, 0.44)
     for kappa, bend in ((0.0, 0.0), (0.02, 0.02)):
-        psi, y_l = camera_sample(motion, Road(kappa, 0.0, 1.0), 5.135, QUIET, CALM)
+        psi, y_l = sample_camera(motion, RoadParams(kappa, 0.0, 1.0), 5.135, QUIET, CALM)
         assert psi == pytest.approx(0.06, abs=1e-15)
         # y_l = y_cg + l_pre psi - kappa l_pre^2 / 2
         assert y_l == pytest.approx(1.5 + 5.135 * 0.06 - bend * 5.135**2 / 2.0, abs=1e-14)
@@ -86,7 +86,7 @@ def test_y_l_is_where_the_road_is_seen_at_the_preview_distance() -> None:
     """On a circle the formula errs by the fourth order of the angles, geometry written out."""
     kappa, psi, y, l_pre = 0.01, 0.02, 0.5, 5.135
     motion = Motion(7.0, 0.0, 0.0, psi, 0.0, y, 0.0, y, 0.0)
-    _, y_l = camera_sample(motion, Road(kappa, -1e3, 1.0), l_pre, QUIET, CALM)
+    _, y_l = sample_camera(motion, RoadParams(kappa, -1e3, 1.0), l_pre, QUIET, CALM)
     ahead = np.array([l_pre * math.cos(psi), y + l_pre * math.sin(psi)])
     left_of_road = 1.0 / kappa - math.hypot(ahead[0], ahead[1] - 1.0 / kappa)
     # kappa l^2/2 against the arc of (1 - kappa y): kappa^2 l^2 y / 2 = 7e-4, and l psi^3 / 6
@@ -97,7 +97,7 @@ def gps(motion: Motion, noise: Noise = QUIET, n: Any = CALM, **how: Any) -> Any:
     """A GPS sample; `how` changes ahead, left, hdop, weight or small_angle."""
     place = how.get("ahead", 0.0), how.get("left", 0.0)
     sky = how.get("hdop", 1.0), how.get("weight", 0.5)
-    return gps_sample(motion, *place, *sky, noise, n, how.get("small_angle", 0))
+    return sample_gps(motion, *place, *sky, noise, n, how.get("small_angle", 0))
 
 
 @pytest.mark.plain
@@ -154,9 +154,9 @@ def test_gps_noise_follows_hdop_as_its_law_says(law: str, weight: float) -> None
 
 @pytest.mark.plain
 def test_satellites_fall_with_hdop_below_four() -> None:
-    seen = [satellites_at(hdop) for hdop in (0.5, 1.0, 1.4, 2.0, 5.0, 5.01, 11.0, 1e9)]
+    seen = [count_satellites(hdop) for hdop in (0.5, 1.0, 1.4, 2.0, 5.0, 5.01, 11.0, 1e9)]
     assert seen == [22.0, 12.0, 9.0, 7.0, 4.0, 3.0, 2.0, 2.0]
-    assert satellites_at(1e-300) == 30.0
+    assert count_satellites(1e-300) == 30.0
 
 
 def test_accelerometers_feel_the_forces_not_the_turning_axes() -> None:
@@ -264,6 +264,6 @@ def test_hdop_jumps_where_an_outage_ends() -> None:
     for tick, packet in cut.items():
         jump = math.log(packet[HDOP] / calm[tick][HDOP])
         assert jump == pytest.approx(OUTAGE_JUMP * 0.5 if tick >= 1100 else 0.0, abs=1e-6)
-        assert packet[SATELLITES] == satellites_at(packet[HDOP])
+        assert packet[SATELLITES] == count_satellites(packet[HDOP])
         assert packet[PACKET.quality] == 1.0  # the filter refuses few satellites, not the sensor
     assert min(packet[SATELLITES] for packet in cut.values()) < 4.0

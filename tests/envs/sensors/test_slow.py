@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs import StabilityEnv
-from sideslip.envs.backend.random import CHANNELS, uniforms
+from sideslip.envs.backend.random import CHANNELS, draw_uniforms
 from sideslip.envs.record import PACKET
 from sideslip.envs.sensors.slow import (
     BLOCKS,
@@ -13,16 +13,16 @@ from sideslip.envs.sensors.slow import (
     SLOW_NAMES,
     VALUES,
     WIDTHS,
-    blocks_at,
+    make_blocks,
 )
-from sideslip.envs.task.observation import observation_layout
+from sideslip.envs.task.observation import make_observation_layout
 
 pytestmark = pytest.mark.plain
 
 
 def test_no_two_uses_share_random_numbers() -> None:
     """A sensor's three blocks may be one where it makes no use of the others."""
-    later = map(blocks_at, range(len(SLOW), 20))
+    later = map(make_blocks, range(len(SLOW), 20))
     of_slow = [number for own in (*BLOCKS, *later) for number in sorted(set(own))]
     of_others = [CHANNELS.inertial, CHANNELS.wheels, CHANNELS.initial, CHANNELS.scenario]
     assert len(set(of_slow + of_others)) == len(of_slow + of_others)
@@ -37,7 +37,7 @@ def test_sensors_that_were_there_keep_their_random_words() -> None:
 @pytest.mark.parametrize("sensors", SENSOR_SETS)
 def test_the_observation_has_each_sensors_values_in_the_order_of_the_table(sensors: str) -> None:
     present = tuple(SENSOR_SETS[sensors])
-    names = [entry.name for entry in observation_layout(present, 10, "summary")]
+    names = [entry.name for entry in make_observation_layout(present, 10, "summary")]
     expected = [
         f"{kind.name}_{name}"
         for kind in SLOW
@@ -47,7 +47,7 @@ def test_the_observation_has_each_sensors_values_in_the_order_of_the_table(senso
     first = names.index(expected[0])
     assert names[first : first + len(expected)] == expected
     assert len(names) == len(set(names))
-    bounds = {entry.name: entry for entry in observation_layout(present, 10, "summary")}
+    bounds = {entry.name: entry for entry in make_observation_layout(present, 10, "summary")}
     for kind in SLOW:
         for value in kind.values if kind.name in present else ():
             entry = bounds[f"{kind.name}_{value.name}"]
@@ -71,5 +71,5 @@ def test_a_packet_is_filled_up_with_zeros() -> None:
 
 def test_sensors_lose_packets_independently() -> None:
     """Each link has numbers of its own."""
-    lost = [[uniforms(1, 2, tick, blocks.link)[1] for tick in range(400)] for blocks in BLOCKS]
+    lost = [[draw_uniforms(1, 2, tick, blocks.link)[1] for tick in range(400)] for blocks in BLOCKS]
     assert abs(np.corrcoef(lost)[0, 1]) < 0.15

@@ -6,11 +6,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.envs.backend.decorators import plain
+from sideslip.envs.backend.decorators import as_python
 from sideslip.envs.record import PACKET, Record, concatenate
-from sideslip.envs.sensors.camera import View, camera_sample, lane_in_view, lane_offset
+from sideslip.envs.sensors.camera import (
+    FieldOfView,
+    compute_lane_offset,
+    compute_lane_quality,
+    sample_camera,
+)
 from sideslip.envs.sensors.noise import Noise
-from sideslip.envs.vehicle.dynamics import Motion, Road
+from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 from sideslip.estimators import make_estimator
 
 from ..helpers import SILENT
@@ -38,13 +43,15 @@ def drive(view: Any, steps: int = 250, **arguments: Any) -> Any:
 @pytest.mark.plain
 def test_where_the_road_leads_changes_nothing_that_is_seen_of_it() -> None:
     """A road and a car that are both turned: heading and offset are relative to the road."""
-    road, still = Road(0.0, 0.0, 1.0), (0.0,) * 3
+    road, still = RoadParams(0.0, 0.0, 1.0), (0.0,) * 3
     seen = []
     for turned in (0.0, 0.7, -2.0):
         motion = Motion(*still, turned + 0.1, 0.0, 0.0, 0.0, 0.4, turned)
-        assert plain(lane_offset)(motion, road, 5.0) == pytest.approx(0.4 + 5.0 * 0.1)
-        assert plain(lane_in_view)(motion, View(0.15, 1.0)) == 1.0
-        seen.append(plain(camera_sample)(motion, road, 5.0, Noise()._replace(**SILENT), (0.0,) * 4))
+        assert as_python(compute_lane_offset)(motion, road, 5.0) == pytest.approx(0.4 + 5.0 * 0.1)
+        assert as_python(compute_lane_quality)(motion, FieldOfView(0.15, 1.0)) == 1.0
+        seen.append(
+            as_python(sample_camera)(motion, road, 5.0, Noise()._replace(**SILENT), (0.0,) * 4)
+        )
     np.testing.assert_allclose(seen, [(0.1, 0.9)] * 3)
 
 
@@ -55,7 +62,7 @@ def test_quality_is_0_beyond_the_view_and_1_within(view: Any) -> None:
     record, _, infos, _ = drive(view, **every)
     free, _, _, _ = drive({}, **every)
     np.testing.assert_array_equal(record.fast, free.fast)
-    packets = record.packets_of("camera")
+    packets = record.select_packets("camera")
     psi = np.array([info["psi"] for info in infos])
     quality = packets[:, PACKET.quality]
     if "camera_heading" in view:
@@ -65,12 +72,12 @@ def test_quality_is_0_beyond_the_view_and_1_within(view: Any) -> None:
         sure = np.abs(np.abs(y) - OFFSET) > 0.1
         np.testing.assert_array_equal(quality[sure], (np.abs(y) <= OFFSET)[sure])
     assert 0.1 < quality.mean() < 0.9
-    np.testing.assert_array_equal(packets[:, PACKET.value :], free.packets_of("camera")[:, 5:])
+    np.testing.assert_array_equal(packets[:, PACKET.value :], free.select_packets("camera")[:, 5:])
 
 
 def test_the_observation_holds_the_newest_sample_of_quality_1() -> None:
     record, seen, _, _ = drive({"camera_heading": HEADING})
-    good = [p for p in record.packets_of("camera") if p[PACKET.quality] > 0.0]
+    good = [p for p in record.select_packets("camera") if p[PACKET.quality] > 0.0]
     last = good[-1]
     assert last[PACKET.arrived] < 2000
     assert seen["camera_psi"][-1] == np.float32(last[PACKET.value])
@@ -97,7 +104,7 @@ def test_a_filter_counts_it_and_is_where_it_would_be_without(delay: str) -> None
 def test_a_scenario_loses_frames() -> None:
     record, _, _, sensors = drive({"camera_loss": 0.3})
     whole, _, _, _ = drive({})
-    share = len(record.packets_of("camera")) / len(whole.packets_of("camera"))
+    share = len(record.select_packets("camera")) / len(whole.select_packets("camera"))
     assert sensors["camera"].loss == 0.3 and 0.5 < share < 0.9
-    assert len(record.packets_of("gps")) == len(whole.packets_of("gps"))
+    assert len(record.select_packets("gps")) == len(whole.select_packets("gps"))
     assert drive({}, 1, camera={"loss": 0.2})[3]["camera"].loss == 0.2  # the id's stands

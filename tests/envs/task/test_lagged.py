@@ -15,10 +15,10 @@ from sideslip.envs.task.reference import (
     LIMITED,
     MODEL,
     REFERENCE_LAG,
-    Target,
-    followed,
-    reference,
-    target_of,
+    ReferenceParams,
+    compute_reference,
+    filter_reference,
+    make_reference_params,
 )
 from sideslip.envs.ticks import TICK
 
@@ -27,7 +27,10 @@ from ..helpers import FULL, bits, fast_rows, play
 pytestmark = pytest.mark.plain
 
 TURNING: dict[str, Any] = {"steering": "sine", "amplitude": 0.3, "frequency": 0.7, "duration": 3.0}
-TARGETS = {"coms": target_of(COMS), "passenger-car": target_of(PASSENGER_CAR)}
+TARGETS = {
+    "coms": make_reference_params(COMS),
+    "passenger-car": make_reference_params(PASSENGER_CAR),
+}
 
 
 @pytest.mark.parametrize("name", TARGETS)
@@ -35,19 +38,19 @@ def test_a_step_is_answered_by_one_minus_exp(name: str) -> None:
     """Of a command so large that friction limits what is asked for, too."""
     target = TARGETS[name]
     for steer in (0.01, 0.4):
-        steady = reference(steer, 20.0, target, LAGGED)
+        steady = compute_reference(steer, 20.0, target, LAGGED)
         refs = (0.0, 0.0)
         for tick in range(1, 400):
-            refs = followed(refs, steady, target, LAGGED)
+            refs = filter_reference(refs, steady, target, LAGGED)
             share = 1.0 - math.exp(-tick * TICK / REFERENCE_LAG)
             # roundings of 400 multiplications
             assert refs == pytest.approx([share * each for each in steady], rel=1e-12)
-    assert followed((5.0, 5.0), (0.1, 0.2), target, LIMITED) == (0.1, 0.2)
+    assert filter_reference((5.0, 5.0), (0.1, 0.2), target, LIMITED) == (0.1, 0.2)
 
 
 @given(st.sampled_from(list(TARGETS.values())), st.floats(0.0, 60.0), st.floats(-1.0, 1.0))
-def test_friction_limits_it(target: Target, v: float, steer: float) -> None:
-    beta, gamma = reference(steer, v, target, LAGGED)
+def test_friction_limits_it(target: ReferenceParams, v: float, steer: float) -> None:
+    beta, gamma = compute_reference(steer, v, target, LAGGED)
     assert abs(beta) <= 0.02 * target.mu_g
     assert abs(gamma) <= 0.85 * target.mu_g / max(v, 1.0)
 
@@ -57,13 +60,13 @@ def test_its_car_turns_most_at_the_characteristic_speed(name: str) -> None:
     """There an understeering car turns half as much as a neutral one; above it, less again."""
     target, gains = TARGETS[name], []
     for v in (34.0, 35.0, 36.0):
-        gains.append(reference(1e-6, v, target, LAGGED)[1] / 1e-6)
+        gains.append(compute_reference(1e-6, v, target, LAGGED)[1] / 1e-6)
     assert gains[1] == max(gains)
     assert gains[1] == pytest.approx(0.5 * 35.0 * target.per_l, rel=1e-12)
     # understeering, but slightly: the passenger car itself turns 2 % more at 80 km/h
     v = 80.0 / 3.6
-    ratio = reference(0.01, v, TARGETS["passenger-car"], MODEL)[1]
-    ratio /= reference(0.01, v, TARGETS["passenger-car"], LAGGED)[1]
+    ratio = compute_reference(0.01, v, TARGETS["passenger-car"], MODEL)[1]
+    ratio /= compute_reference(0.01, v, TARGETS["passenger-car"], LAGGED)[1]
     assert 1.0 < ratio < 1.03
 
 
@@ -77,7 +80,7 @@ def test_in_the_env_it_follows_the_record_tick_by_tick() -> None:
         row, info = moment.record.fast[0], moment.info
         v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])  # noise-free here
         command = 0.3 * math.sin(2.0 * math.pi * 0.7 * info["t"])
-        steady = np.array(reference(command, v, target_of(COMS), LAGGED))
+        steady = np.array(compute_reference(command, v, make_reference_params(COMS), LAGGED))
         refs = steady + (refs - steady) * rest
         assert (info["beta_ref"], info["gamma_ref"]) == pytest.approx(refs.tolist(), abs=1e-12)
         assert moment.obs[-2:].tolist() == np.float32(refs).tolist()

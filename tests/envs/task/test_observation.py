@@ -10,7 +10,7 @@ import pytest
 from sideslip.envs import Record, SlowSensor, StabilityEnv
 from sideslip.envs.record import FAST, PACKET, Fast
 from sideslip.envs.sensors.slow import SENSOR_SETS, SLOW, SLOW_NAMES
-from sideslip.envs.task.observation import AGE_CAP, SAMPLED
+from sideslip.envs.task.observation import AGE_CAP, N_SAMPLED
 from sideslip.envs.ticks import TICK
 
 from ..helpers import FULL, IDS, LINEAR, play, unwrapped
@@ -26,7 +26,7 @@ def expected(
 ) -> dict[str, float]:
     """The observation by name. `seen`: each sensor's newest (captured tick, values), kept here."""
     values: dict[str, float] = {}
-    for column in range(SAMPLED):
+    for column in range(N_SAMPLED):
         name = Fast._fields[column]
         values[name] = record.fast[-1, column]
         values[f"{name}_mean"] = float(np.sum(record.fast[:, column]) / len(record.fast))
@@ -105,7 +105,7 @@ def test_late_and_doubled_packets_are_not_fresh(monkeypatch: pytest.MonkeyPatch)
         for moment in play(env, [0.1] * 300):
             by_name = expected(env, moment.record, seen, moment.info)
             compare(env, moment.obs, by_name)
-            arrived = len(moment.record.packets_of("camera"))
+            arrived = len(moment.record.select_packets("camera"))
             stale += arrived > 0 and by_name["camera_fresh"] == 0.0
         assert stale > 10
 
@@ -131,16 +131,16 @@ def test_before_the_first_packet_the_age_is_at_its_cap() -> None:
 def test_fast_all_gives_every_sample_and_leaves_the_rest_alone(name: str, n: int) -> None:
     every, summary = (unwrapped(name, control_period=n, fast=fast) for fast in ("all", "summary"))
     (obs, _), _ = every.reset(seed=2), summary.reset(seed=2)
-    start = every.record.fast[0, :SAMPLED]
+    start = every.record.fast[0, :N_SAMPLED]
     # tick 0 stands for a whole period
     np.testing.assert_array_equal(
-        obs[: SAMPLED * n].reshape(SAMPLED, n), np.float32(np.tile(start, (n, 1)).T)
+        obs[: N_SAMPLED * n].reshape(N_SAMPLED, n), np.float32(np.tile(start, (n, 1)).T)
     )
     actions = [0.4] * 20
     for one, other in zip(play(every, actions), play(summary, actions), strict=True):
-        samples = one.obs[: SAMPLED * n].reshape(SAMPLED, n)
-        np.testing.assert_array_equal(samples, np.float32(one.record.fast[:, :SAMPLED].T))
-        np.testing.assert_array_equal(one.obs[SAMPLED * n :], other.obs[SAMPLED * 2 :])
+        samples = one.obs[: N_SAMPLED * n].reshape(N_SAMPLED, n)
+        np.testing.assert_array_equal(samples, np.float32(one.record.fast[:, :N_SAMPLED].T))
+        np.testing.assert_array_equal(one.obs[N_SAMPLED * n :], other.obs[N_SAMPLED * 2 :])
         assert one.info == other.info
 
 
@@ -149,8 +149,8 @@ def test_fast_all_repeats_the_last_sample_after_an_early_end() -> None:
     env.reset(seed=0)
     last = play(env, [0.5, 0.5])[-1]
     assert last.truncated
-    samples = last.obs[: SAMPLED * 10].reshape(SAMPLED, 10)
-    np.testing.assert_array_equal(samples[:, :5], np.float32(last.record.fast[:, :SAMPLED].T))
+    samples = last.obs[: N_SAMPLED * 10].reshape(N_SAMPLED, 10)
+    np.testing.assert_array_equal(samples[:, :5], np.float32(last.record.fast[:, :N_SAMPLED].T))
     for j in range(5, 10):
         np.testing.assert_array_equal(samples[:, j], samples[:, 4])
 

@@ -10,8 +10,14 @@ from hypothesis import strategies as st
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv, Vehicle
 from sideslip.envs.record import FAST
-from sideslip.envs.task.cost import cost_rate
-from sideslip.envs.task.reference import LIMITED, MODEL, ZERO_SLIP, reference, target_of
+from sideslip.envs.task.cost import compute_cost_rate
+from sideslip.envs.task.reference import (
+    LIMITED,
+    MODEL,
+    ZERO_SLIP,
+    compute_reference,
+    make_reference_params,
+)
 from sideslip.envs.ticks import TICK
 
 from ..helpers import FULL, IDS, LINEAR, fast_rows, play, unwrapped
@@ -37,30 +43,30 @@ def dakf_23_24(nominal: Vehicle, v_x: float, delta_cmd: float) -> tuple[float, f
 @given(st.floats(0.0, 14.0), st.floats(-0.3, 0.3))
 def test_model_is_dakf_23_and_24(v: float, steer: float) -> None:
     """Up to 14 m/s: above 15.7 m/s the COMS has 1 + G v^2 < 0.2, which is kept there."""
-    got = reference(steer, v, target_of(COMS), MODEL)
+    got = compute_reference(steer, v, make_reference_params(COMS), MODEL)
     # roundings of numbers up to 1 rad and 10 rad/s
     assert got == pytest.approx(dakf_23_24(COMS, v, steer), abs=1e-14)
 
 
 def test_near_the_critical_speed_the_gain_is_kept_finite() -> None:
-    target = target_of(COMS)
+    target = make_reference_params(COMS)
     for v in (16.0, 17.58, 30.0, 100.0):
-        _, gamma = reference(0.1, v, target, MODEL)
+        _, gamma = compute_reference(0.1, v, target, MODEL)
         assert gamma == pytest.approx(v / 1.4 * 0.1 / 0.2, rel=1e-14)  # roundings
 
 
 @given(st.floats(-1.0, 60.0), st.floats(-1.0, 1.0), st.floats(0.01, 1.0))
 def test_limited_is_the_model_within_what_friction_holds(v: float, steer: float, mu: float) -> None:
-    target = target_of(COMS.replace(friction=mu))
-    beta, gamma = reference(steer, v, target, LIMITED)
-    free = reference(steer, v, target, MODEL)
+    target = make_reference_params(COMS.replace(friction=mu))
+    beta, gamma = compute_reference(steer, v, target, LIMITED)
+    free = compute_reference(steer, v, target, MODEL)
     most_beta, most_gamma = 0.02 * mu * 9.81, 0.85 * mu * 9.81 / max(v, 1.0)
     assert beta == pytest.approx(min(max(free[0], -most_beta), most_beta), abs=1e-15)
     assert gamma == pytest.approx(min(max(free[1], -most_gamma), most_gamma), rel=1e-14)
 
 
 def test_zero_slip_asks_for_none() -> None:
-    assert reference(0.3, 20.0, target_of(COMS), ZERO_SLIP) == (0.0, 0.0)
+    assert compute_reference(0.3, 20.0, make_reference_params(COMS), ZERO_SLIP) == (0.0, 0.0)
 
 
 @given(errors, errors, st.floats(-1.0, 1.0), st.floats(-0.1, 0.1))
@@ -70,13 +76,13 @@ def test_cost_is_designs_formula(e_beta: float, e_gamma: float, share: float, st
     # roundings of sums up to 700
     for kind, c in ((ZERO_SLIP, rest), (MODEL, whole), (LIMITED, whole)):
         capped = pytest.approx(min(c, 100.0), abs=1e-12)
-        assert cost_rate(e_beta, e_gamma, share, steer, kind) == capped
+        assert compute_cost_rate(e_beta, e_gamma, share, steer, kind) == capped
 
 
 def test_cost_is_capped_whatever_comes() -> None:
     for worst in (1e200, -1e200, math.inf, math.nan):
-        assert cost_rate(worst, 0.0, 0.0, 0.0, MODEL) == 100.0
-        assert cost_rate(0.0, worst, 0.0, 0.0, MODEL) == 100.0
+        assert compute_cost_rate(worst, 0.0, 0.0, 0.0, MODEL) == 100.0
+        assert compute_cost_rate(0.0, worst, 0.0, 0.0, MODEL) == 100.0
 
 
 @pytest.mark.parametrize("kind", ["zero-slip", "model", "limited"])
@@ -88,7 +94,7 @@ def test_reward_is_minus_the_cost_written_out_from_the_record(kind: str) -> None
         row, info = moment.record.fast[0], moment.info
         v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])  # noise-free here
         command = 0.1 * math.sin(2.0 * math.pi * 0.5 * info["t"])
-        refs = reference(command, v, target_of(COMS), code)
+        refs = compute_reference(command, v, make_reference_params(COMS), code)
         # the polynomial sine's stated error, on 0.1 rad, times the reference's gain
         assert (info["beta_ref"], info["gamma_ref"]) == pytest.approx(refs, abs=1e-14)
         N_z = 0.5 * COMS.rear_track / COMS.wheel_radius
@@ -96,7 +102,7 @@ def test_reward_is_minus_the_cost_written_out_from_the_record(kind: str) -> None
         assert info["yaw_moment"] == pytest.approx(N_z, abs=1e-12)
         share = N_z / COMS.yaw_moment_limit
         e_beta, e_gamma = info["beta"] - info["beta_ref"], info["gamma"] - info["gamma_ref"]
-        c = cost_rate(e_beta, e_gamma, share, 0.0, code)
+        c = compute_cost_rate(e_beta, e_gamma, share, 0.0, code)
         assert info["cost"] == pytest.approx(c * TICK, rel=1e-12)
         assert moment.reward == -info["cost"]
 

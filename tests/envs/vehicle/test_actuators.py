@@ -9,17 +9,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR, StabilityEnv
-from sideslip.envs.engine.packing import car_of
+from sideslip.envs.engine.packing import make_car
 from sideslip.envs.record import FAST
 from sideslip.envs.ticks import TICK
-from sideslip.envs.vehicle.actuators import Lag, distribute, lag_of, lagged, yaw_moment
-from sideslip.envs.vehicle.linear import bicycle
+from sideslip.envs.vehicle.actuators import (
+    Lag,
+    allocate_torques,
+    apply_lag,
+    compute_yaw_moment,
+    make_lag,
+)
+from sideslip.envs.vehicle.linear import make_bicycle_model
 
 from ..helpers import FULL, LINEAR, fast_rows, play
 
 pytestmark = pytest.mark.plain
 
-CAR = car_of(COMS)
+CAR = make_car(COMS)
 m, r, d_r, T_MAX = CAR.m, CAR.r, CAR.d_r, CAR.T_max
 moments, accelerations = st.floats(-2000.0, 2000.0), st.floats(-20.0, 20.0)
 
@@ -37,11 +43,11 @@ def test_within_the_limits_it_is_the_papers_law(N_z: float, a_x: float) -> None:
     for yaw_first in (0.0, 1.0):
         # the same operations in another order, on numbers up to 100 N m
         expected = pytest.approx(tie_vision_3(a_x, -N_z), abs=1e-13)
-        assert distribute(N_z, a_x, CAR, yaw_first, CAR.T_max) == expected
+        assert allocate_torques(N_z, a_x, CAR, yaw_first, CAR.T_max) == expected
 
 
 def test_a_positive_moment_drives_the_right_wheel_and_turns_left() -> None:
-    T_l, T_r = distribute(100.0, 0.0, CAR, 1.0, CAR.T_max)
+    T_l, T_r = allocate_torques(100.0, 0.0, CAR, 1.0, CAR.T_max)
     assert T_r > 0.0 > T_l
     assert T_l == -T_r
     env = StabilityEnv(scenario=LINEAR)
@@ -51,16 +57,18 @@ def test_a_positive_moment_drives_the_right_wheel_and_turns_left() -> None:
 
 @given(moments, accelerations, st.sampled_from([0.0, 1.0]))
 def test_no_motor_passes_its_limit(N_z: float, a_x: float, yaw_first: float) -> None:
-    for torque in distribute(N_z, a_x, CAR, yaw_first, CAR.T_max):
+    for torque in allocate_torques(N_z, a_x, CAR, yaw_first, CAR.T_max):
         assert abs(torque) <= T_MAX * (1.0 + 2e-16)  # the sum of two parts rounds
 
 
 @given(moments, accelerations)
 def test_yaw_moment_keeps_its_share_first(N_z: float, a_x: float) -> None:
-    T_l, T_r = distribute(N_z, a_x, CAR, 1.0, CAR.T_max)
+    T_l, T_r = allocate_torques(N_z, a_x, CAR, 1.0, CAR.T_max)
     most = T_MAX * d_r / r
     kept = min(max(N_z, -most), most)
-    assert yaw_moment(T_l, T_r, CAR) == pytest.approx(kept, abs=1e-12)  # roundings of 370 N m
+    assert compute_yaw_moment(T_l, T_r, CAR) == pytest.approx(
+        kept, abs=1e-12
+    )  # roundings of 370 N m
     room = T_MAX - abs(kept) * r / d_r
     drive = min(max(m * r * a_x / 2.0, -room), room)
     assert 0.5 * (T_l + T_r) == pytest.approx(drive, abs=1e-13)
@@ -68,12 +76,12 @@ def test_yaw_moment_keeps_its_share_first(N_z: float, a_x: float) -> None:
 
 @given(moments, accelerations)
 def test_or_acceleration_keeps_its_share(N_z: float, a_x: float) -> None:
-    T_l, T_r = distribute(N_z, a_x, CAR, 0.0, CAR.T_max)
+    T_l, T_r = allocate_torques(N_z, a_x, CAR, 0.0, CAR.T_max)
     drive = min(max(m * r * a_x / 2.0, -T_MAX), T_MAX)
     assert 0.5 * (T_l + T_r) == pytest.approx(drive, abs=1e-13)
     room = (T_MAX - abs(drive)) * d_r / r
     kept = min(max(N_z, -room), room)
-    assert yaw_moment(T_l, T_r, CAR) == pytest.approx(kept, abs=1e-12)
+    assert compute_yaw_moment(T_l, T_r, CAR) == pytest.approx(kept, abs=1e-12)
 
 
 @pytest.mark.parametrize(("yaw_first", "share"), [(True, 1.0), (False, 0.0)])
@@ -92,22 +100,22 @@ def test_the_env_hands_the_priority_on(yaw_first: bool, share: float) -> None:
 
 def test_yaw_moment_limit_is_that_of_two_full_motors() -> None:
     assert COMS.yaw_moment_limit == pytest.approx(372.7, abs=0.05)  # printed to 0.1
-    T_l, T_r = distribute(COMS.yaw_moment_limit, 0.0, CAR, 1.0, CAR.T_max)
+    T_l, T_r = allocate_torques(COMS.yaw_moment_limit, 0.0, CAR, 1.0, CAR.T_max)
     assert (T_l, T_r) == pytest.approx((-100.0, 100.0), rel=1e-15)
     for vehicle in (COMS, PASSENGER_CAR):
         T_max = vehicle.motor_torque
-        assert yaw_moment(-T_max, T_max, car_of(vehicle)) == pytest.approx(
+        assert compute_yaw_moment(-T_max, T_max, make_car(vehicle)) == pytest.approx(
             vehicle.yaw_moment_limit, rel=1e-15
         )
 
 
 @given(st.floats(1e-4, 10.0), st.floats(-100.0, 100.0), st.floats(-100.0, 100.0))
 def test_lag_is_the_exact_exponential(tau: float, command: float, value: float) -> None:
-    lag = lag_of(tau, TICK)
+    lag = make_lag(tau, TICK)
     error = 1e-13  # roundings of numbers up to 200
     for rest, time in ((lag.start, 0.0), (lag.middle, 0.5 * TICK), (lag.end, TICK)):
         exact = command + (value - command) * math.exp(-time / tau)
-        assert lagged(command, value, rest) == pytest.approx(exact, abs=error)
+        assert apply_lag(command, value, rest) == pytest.approx(exact, abs=error)
     assert lag.mean == pytest.approx((1.0 + 4.0 * lag.middle + lag.end) / 6.0, rel=1e-15)
     # Simpson's error on exp(-t/tau) over a tick: (TICK / tau)^4 / 2880
     exact = tau / TICK * -math.expm1(-TICK / tau)
@@ -115,8 +123,8 @@ def test_lag_is_the_exact_exponential(tau: float, command: float, value: float) 
 
 
 def test_no_lag_is_no_rest() -> None:
-    assert lag_of(0.0, TICK) == Lag(0.0, 0.0, 0.0, 0.0)
-    assert lagged(3.0, -7.0, 0.0) == 3.0
+    assert make_lag(0.0, TICK) == Lag(0.0, 0.0, 0.0, 0.0)
+    assert apply_lag(3.0, -7.0, 0.0) == 3.0
 
 
 def applied(vehicle: Any, scenario: dict[str, Any], n: int = 40) -> np.ndarray:
@@ -164,7 +172,7 @@ def test_without_a_lag_the_torque_acts_at_once(lags: dict[str, float]) -> None:
     env.reset(seed=0)
     (moment,) = play(env, [1.0])
     assert moment.record.fast[0, FAST.torque_right] == pytest.approx(100.0, rel=1e-15)
-    _, H = bicycle(COMS, 25.0 / 3.6).discrete(TICK)
+    _, H = make_bicycle_model(COMS, 25.0 / 3.6).discretise(TICK)
     exact = H[1, 1] * COMS.yaw_moment_limit
     # Kutta's error: (14 / s x 1 ms)^3 / 24 = 1.14e-7 of it; a late torque misses a sixth
     assert moment.info["gamma"] == pytest.approx(exact, rel=1.2e-7)

@@ -11,7 +11,7 @@ import pytest
 from sideslip.envs import COMS, FAILURES, StabilityEnv
 from sideslip.envs.record import FAST, concatenate
 from sideslip.envs.ticks import TICK
-from sideslip.envs.vehicle.linear import bicycle
+from sideslip.envs.vehicle.linear import make_bicycle_model
 
 from ..helpers import FULL, IDS, LINEAR, bits, fast_rows, play
 
@@ -84,7 +84,7 @@ def test_the_front_wheels_follow_driver_and_added_angle_by_one_lag() -> None:
 
 def test_it_moves_the_car_as_the_linear_model_says() -> None:
     rows = play(steered(LINEAR), [(0.2, -1.0)] * 500)
-    G, H = bicycle(COMS, 25.0 / 3.6).discrete(TICK)
+    G, H = make_bicycle_model(COMS, 25.0 / 3.6).discretise(TICK)
     x = np.zeros(2)
     for moment in rows:
         x = G @ x + H @ [moment.record.fast[0, FAST.steer], moment.info["yaw_moment"]]

@@ -7,9 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR, StabilityEnv
-from sideslip.envs.engine.packing import car_of
-from sideslip.envs.vehicle.dynamics import Car, Motion
-from sideslip.envs.vehicle.tyres import FIALA, Inputs, Load, load_of, shifts, tyre_forces
+from sideslip.envs.engine.packing import make_car
+from sideslip.envs.vehicle.dynamics import CarParams, Motion
+from sideslip.envs.vehicle.tyres import (
+    FIALA,
+    TyreInputs,
+    TyreLoad,
+    compute_tyre_forces,
+    compute_tyre_load,
+    has_load_shift,
+)
 from sideslip.envs.vehicle.vehicle import GRAVITY
 
 from ..helpers import FULL, bits, play
@@ -23,7 +30,7 @@ hundreds = st.integers(-30, 30).map(lambda each: 100.0 * each)
 cars = st.sampled_from(HIGH)
 
 
-def plain_shift(car: Car, T_l: float, T_r: float) -> float:
+def plain_shift(car: CarParams, T_l: float, T_r: float) -> float:
     """F_x h / l in N, where F_x is what friction lets a standing car's rear wheels pass on."""
     per_wheel = 0.5 * car.m * GRAVITY * car.l_f / (car.l_f + car.l_r)
     limits = (car.mu * per_wheel, car.mu_r * per_wheel)
@@ -36,8 +43,10 @@ def plain_shift(car: Car, T_l: float, T_r: float) -> float:
 def test_the_axles_exchange_F_x_h_over_l(
     vehicle: Any, T_l: float, T_r: float, mu: float, mu_r: float
 ) -> None:
-    car = car_of(vehicle)._replace(mu=mu, mu_r=mu_r)
-    still, load = (load_of(Inputs(0.0, *T), car, 0, 1) for T in ((0.0, 0.0), (T_l, T_r)))
+    car = make_car(vehicle)._replace(mu=mu, mu_r=mu_r)
+    still, load = (
+        compute_tyre_load(TyreInputs(0.0, *T), car, 0, 1) for T in ((0.0, 0.0), (T_l, T_r))
+    )
     moved = plain_shift(car, T_l, T_r)
     mean = 0.5 * (mu + mu_r)
     for ours, theirs in (
@@ -52,32 +61,34 @@ def test_the_axles_exchange_F_x_h_over_l(
     assert min(load.limit_f, load.rear_l, load.rear_r) > 0.0
 
 
-def rear_force(car: Car, T: float, roll: int) -> float:
+def rear_force(car: CarParams, T: float, roll: int) -> float:
     """N of the rear axle's lateral force at a large slip, both motors at T."""
-    load: Load = load_of(Inputs(0.0, T, T), car, 0, shifts(0, FIALA, roll))
+    load: TyreLoad = compute_tyre_load(
+        TyreInputs(0.0, T, T), car, 0, has_load_shift(0, FIALA, roll)
+    )
     sliding = Motion(15.0, -6.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    return float(tyre_forces(sliding, load, car, 0.0, 0, FIALA, roll)[1])
+    return float(compute_tyre_forces(sliding, load, car, 0.0, 0, FIALA, roll)[1])
 
 
 @pytest.mark.parametrize("roll", [0, 1])
 @pytest.mark.parametrize("vehicle", HIGH, ids=lambda car: str(car.name))
 def test_hard_braking_unloads_the_rear_and_driving_loads_it(vehicle: Any, roll: int) -> None:
-    flat = car_of(vehicle.replace(transfer_height=0.0))
+    flat = make_car(vehicle.replace(transfer_height=0.0))
     T = 0.4 * vehicle.motor_torque
     assert rear_force(flat, -T, roll) == rear_force(flat, T, roll)  # the friction circle alone
-    assert rear_force(car_of(vehicle), -T, roll) < 0.97 * rear_force(flat, -T, roll)
-    assert rear_force(car_of(vehicle), T, roll) > 1.01 * rear_force(flat, T, roll)
+    assert rear_force(make_car(vehicle), -T, roll) < 0.97 * rear_force(flat, -T, roll)
+    assert rear_force(make_car(vehicle), T, roll) > 1.01 * rear_force(flat, T, roll)
 
 
 @given(hundreds, hundreds, st.sampled_from([0, 1]), st.sampled_from([0, 1]))
 def test_without_a_height_and_at_small_angles_nothing_moves(
     T_l: float, T_r: float, small_angle: int, shifting: int
 ) -> None:
-    inputs = Inputs(0.03, T_l, T_r)
+    inputs = TyreInputs(0.03, T_l, T_r)
     for flat, high in zip(FLAT, HIGH, strict=True):
-        none = load_of(inputs, car_of(flat), small_angle, shifting)
-        some = load_of(inputs, car_of(high), small_angle, shifting)
-        rests = small_angle or plain_shift(car_of(high), T_l, T_r) == 0.0
+        none = compute_tyre_load(inputs, make_car(flat), small_angle, shifting)
+        some = compute_tyre_load(inputs, make_car(high), small_angle, shifting)
+        rests = small_angle or plain_shift(make_car(high), T_l, T_r) == 0.0
         assert (bits(none) == bits(some)) == bool(rests)
 
 

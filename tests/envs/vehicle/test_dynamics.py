@@ -9,24 +9,30 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.engine.packing import car_of
-from sideslip.envs.vehicle.dynamics import Car, Motion, Push, Road, derivative
+from sideslip.envs.engine.packing import make_car
+from sideslip.envs.vehicle.dynamics import (
+    CarParams,
+    DisturbanceForces,
+    Motion,
+    RoadParams,
+    derivative,
+)
 from sideslip.envs.vehicle.integration import kutta3, rk4
 from sideslip.envs.vehicle.tyres import (
     FIALA,
     LINEAR,
     TYRE_LAWS,
-    Inputs,
     Tyre,
-    lateral_forces,
-    load_of,
+    TyreInputs,
+    compute_lateral_forces,
+    compute_tyre_load,
 )
 
 pytestmark = pytest.mark.plain
 
-CAR = car_of(COMS)
-STRAIGHT, CIRCLE = Road(0.0, 0.0, 1.0), Road(0.02, -1e6, 1.0)
-CALM = Push(0.0, 0.0)
+CAR = make_car(COMS)
+STRAIGHT, CIRCLE = RoadParams(0.0, 0.0, 1.0), RoadParams(0.02, -1e6, 1.0)
+CALM = DisturbanceForces(0.0, 0.0)
 PLANTS = [(small_angle, law) for small_angle in (0, 1) for law in range(len(TYRE_LAWS))]
 speeds = st.floats(-3.0, 3.0)
 
@@ -39,14 +45,14 @@ def slope(state: Motion, steer: float = 0.0, T: Any = (0.0, 0.0), **how: Any) ->
     """The derivative of a state; `how` changes push, car, road, small_angle or law."""
     push, car, road = how.get("push", CALM), how.get("car", CAR), how.get("road", STRAIGHT)
     small_angle, law = how.get("small_angle", 0), how.get("law", FIALA)
-    load = load_of(Inputs(steer, *T), car, small_angle)
+    load = compute_tyre_load(TyreInputs(steer, *T), car, small_angle)
     return derivative(state, load, push, car, road, small_angle, law)
 
 
 def drive(
-    state: Motion, seconds: float, h: float, steer: float = 0.0, car: Car = CAR, **how: Any
+    state: Motion, seconds: float, h: float, steer: float = 0.0, car: CarParams = CAR, **how: Any
 ) -> Motion:
-    load = load_of(Inputs(steer, 0.0, 0.0), car, 0)
+    load = compute_tyre_load(TyreInputs(steer, 0.0, 0.0), car, 0)
     road, law, rule = how.get("road", STRAIGHT), how.get("law", FIALA), how.get("rule", kutta3)
     for _ in range(round(seconds / h)):
         state = rule(state, (load, load, load), CALM, car, road, h, 0, law)
@@ -78,7 +84,7 @@ def forces(state: Motion, steer: float, T: Any, small: int, law: int) -> list[fl
             found.append(left * (3.0 * z - 3.0 * z * abs(z) + z**3))
         else:
             tyre = Tyre(t, left, C / (3.0 * left))
-            found.append(lateral_forces(tyre, tyre, tyre, tyre, law, small)[0])
+            found.append(compute_lateral_forces(tyre, tyre, tyre, tyre, law, small)[0])
     return [2.0 * found[0], *found[1:], *along[1:]]
 
 
@@ -91,7 +97,7 @@ def test_equations_written_out_slowly(
     state = motion(v_x=v_x, v_y=v_y, gamma=gamma, psi=psi, theta=0.3, y=2.0)
     for small, law in PLANTS:
         how = {"small_angle": small, "law": law, "road": CIRCLE}
-        rate = slope(state, steer, T, push=Push(30.0, -7.0), **how)
+        rate = slope(state, steer, T, push=DisturbanceForces(30.0, -7.0), **how)
         F_yf, F_l, F_r, F_xl, F_xr = forces(state, steer, T, small, law)
         s, c = (0.0, 1.0) if small else (math.sin(steer), math.cos(steer))
         turning = 0.0 if small else v_y * gamma
@@ -125,7 +131,7 @@ def test_standing_still_stays_so(small_angle: int, law: int) -> None:
 @pytest.mark.parametrize(("small_angle", "law"), PLANTS)
 def test_pushes_and_moments_act_as_newton_says(small_angle: int, law: int) -> None:
     how = {"small_angle": small_angle, "law": law}
-    rate = slope(motion(v_x=10.0), push=Push(190.0, 40.0), T=(-11.0, 11.0), **how)
+    rate = slope(motion(v_x=10.0), push=DisturbanceForces(190.0, 40.0), T=(-11.0, 11.0), **how)
     assert rate.v_y == pytest.approx(190.0 / CAR.m, rel=1e-15)
     # the motors' moment: two forces of 11 N m / r at half a track from the middle
     assert rate.gamma == pytest.approx((40.0 + 11.0 / CAR.r * CAR.d_r) / CAR.I, rel=1e-15)
@@ -165,8 +171,8 @@ def test_mirrored_car_moves_as_the_mirror_image(
     how = {"small_angle": plant[0], "law": plant[1]}
     left = motion(v_x=7.0, v_y=v_y, gamma=gamma, psi=psi, y=2.0)
     right = motion(v_x=7.0, v_y=-v_y, gamma=-gamma, psi=-psi, y=-2.0)
-    one = slope(left, steer, (20.0, -5.0), push=Push(30.0, 4.0), **how)
-    other = slope(right, -steer, (-5.0, 20.0), push=Push(-30.0, -4.0), **how)
+    one = slope(left, steer, (20.0, -5.0), push=DisturbanceForces(30.0, 4.0), **how)
+    other = slope(right, -steer, (-5.0, 20.0), push=DisturbanceForces(-30.0, -4.0), **how)
     assert other == one._replace(
         v_y=-one.v_y, gamma=-one.gamma, psi=-one.psi, Y=-one.Y, y=-one.y, theta=-one.theta
     )
@@ -199,10 +205,10 @@ def test_road_coordinates_and_ground_agree_after_a_long_bend() -> None:
     assert end.theta == pytest.approx(0.02 * end.s, abs=1e-11)  # as many, up to 5 rad
 
 
-@pytest.mark.parametrize("car", [CAR, car_of(PASSENGER_CAR)])
+@pytest.mark.parametrize("car", [CAR, make_car(PASSENGER_CAR)])
 @pytest.mark.parametrize("law", [LINEAR, FIALA])
 @pytest.mark.parametrize(("rule", "order"), [(kutta3, 3), (rk4, 4)])
-def test_the_rules_have_their_orders(rule: Any, order: int, car: Car, law: int) -> None:
+def test_the_rules_have_their_orders(rule: Any, order: int, car: CarParams, law: int) -> None:
     """Slip angles keep their signs here: at zero Fiala's curve has a jump in its second slope."""
     start = motion(v_x=12.0, v_y=-0.2, gamma=0.3)
     steps = [0.008, 0.004, 0.002]
@@ -218,7 +224,7 @@ def test_the_rules_have_their_orders(rule: Any, order: int, car: Car, law: int) 
 @pytest.mark.parametrize("mu", [1e-9, 0.9])
 def test_any_speed_and_hardly_any_friction_stay_finite(speed: float, mu: float) -> None:
     car = CAR._replace(mu=mu, mu_r=mu)
-    load = load_of(Inputs(0.4, -100.0, 100.0), car, 0)
+    load = compute_tyre_load(TyreInputs(0.4, -100.0, 100.0), car, 0)
     state = motion(v_x=speed)
     for _ in range(3000):
         state = kutta3(state, (load, load, load), CALM, car, CIRCLE, 1e-3, 0, FIALA)

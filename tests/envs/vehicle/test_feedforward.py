@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, StabilityEnv, Vehicle
-from sideslip.envs.engine.packing import car_of
-from sideslip.envs.vehicle.dynamics import Motion, Push, Road, derivative
+from sideslip.envs.engine.packing import make_car
+from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, derivative
 from sideslip.envs.vehicle.integration import kutta3
-from sideslip.envs.vehicle.linear import bicycle
-from sideslip.envs.vehicle.tyres import LINEAR, Inputs, load_of
+from sideslip.envs.vehicle.linear import make_bicycle_model
+from sideslip.envs.vehicle.tyres import LINEAR, TyreInputs, compute_tyre_load
 
 from .. import helpers
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.plain
 KMH = 1.0 / 3.6
 SPEEDS = [v * KMH for v in (10.0, 15.0, 20.0, 20.73, 25.0, 30.0, 35.0, 40.0, 45.0)]
 DELTA = 0.001
-ROAD, CALM = Road(0.0, 0.0, 1.0), Push(0.0, 0.0)
+ROAD, CALM = RoadParams(0.0, 0.0, 1.0), DisturbanceForces(0.0, 0.0)
 
 
 def gain(vehicle: Vehicle, V_x: float) -> float:
@@ -33,7 +33,7 @@ def gain(vehicle: Vehicle, V_x: float) -> float:
 @pytest.mark.parametrize("V_x", SPEEDS)
 def test_it_is_minus_the_ratio_of_the_static_gains(V_x: float) -> None:
     """The middle of (24) lacks this minus: PAPERS section 2."""
-    model = bicycle(COMS, V_x)
+    model = make_bicycle_model(COMS, V_x)
     (from_delta, from_moment), _ = np.linalg.solve(model.A, -model.B)
     scale = max(abs(gain(COMS, V_x)), 1e3)  # near 20.73 km/h the numerator is a difference
     assert -from_delta / from_moment == pytest.approx(gain(COMS, V_x), abs=1e-12 * scale)
@@ -47,12 +47,12 @@ def test_numbers_of_the_paper_car() -> None:
 @pytest.mark.smoke
 @pytest.mark.parametrize("V_x", SPEEDS)
 def test_the_plant_rests_at_zero_slip(V_x: float) -> None:
-    model, N_z = bicycle(COMS, V_x), gain(COMS, V_x) * DELTA
+    model, N_z = make_bicycle_model(COMS, V_x), gain(COMS, V_x) * DELTA
     gamma = -(model.B[1] @ [DELTA, N_z]) / model.A[1, 1]
     T = 0.5 * N_z * COMS.wheel_radius / (0.5 * COMS.rear_track)
-    load = load_of(Inputs(DELTA, -T, T), car_of(COMS), 1)
+    load = compute_tyre_load(TyreInputs(DELTA, -T, T), make_car(COMS), 1)
     state = Motion(V_x, 0.0, gamma, *[0.0] * 6)
-    rate = derivative(state, load, CALM, car_of(COMS), ROAD, 1, LINEAR)
+    rate = derivative(state, load, CALM, make_car(COMS), ROAD, 1, LINEAR)
     # sums of forces of some 10 N and moments of some 10 N m that cancel, over m and I
     assert abs(rate.v_y) < 1e-15
     assert abs(rate.gamma) < 1e-15
@@ -62,10 +62,10 @@ def test_the_plant_rests_at_zero_slip(V_x: float) -> None:
 def test_and_goes_there_from_straight_driving(V_x: float) -> None:
     N_z = gain(COMS, V_x) * DELTA
     T = 0.5 * N_z * COMS.wheel_radius / (0.5 * COMS.rear_track)
-    load = load_of(Inputs(DELTA, -T, T), car_of(COMS), 1)
+    load = compute_tyre_load(TyreInputs(DELTA, -T, T), make_car(COMS), 1)
     state, most = Motion(V_x, *[0.0] * 8), 0.0
     for _ in range(10_000):
-        state = kutta3(state, (load, load, load), CALM, car_of(COMS), ROAD, 0.001, 1, LINEAR)
+        state = kutta3(state, (load, load, load), CALM, make_car(COMS), ROAD, 0.001, 1, LINEAR)
         most = max(most, abs(state.v_y / V_x))
     assert most > 1e-6
     # PAPERS section 3; at 45 km/h the slowest pole, 1.65 / s, leaves 7e-8 of some 1e-4 after 10 s

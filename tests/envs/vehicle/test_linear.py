@@ -9,32 +9,32 @@ import pytest
 from scipy.signal import cont2discrete
 
 from sideslip.envs import COMS, PASSENGER_CAR, Vehicle, critical_speed
-from sideslip.envs.engine.packing import car_of
-from sideslip.envs.sensors.camera import camera_sample
-from sideslip.envs.sensors.gps import gps_sample
+from sideslip.envs.engine.packing import make_car
+from sideslip.envs.sensors.camera import sample_camera
+from sideslip.envs.sensors.gps import sample_gps
 from sideslip.envs.sensors.noise import Noise
-from sideslip.envs.task.reference import target_of
-from sideslip.envs.vehicle.dynamics import Motion, Push, Road, derivative
+from sideslip.envs.task.reference import make_reference_params
+from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, derivative
 from sideslip.envs.vehicle.linear import (
     LinearModel,
-    bicycle,
-    course,
-    kinematic,
-    roll,
-    velocity_and_roll,
-    vision,
+    make_bicycle_model,
+    make_course_model,
+    make_kinematic_model,
+    make_roll_model,
+    make_velocity_roll_model,
+    make_vision_model,
 )
-from sideslip.envs.vehicle.tyres import LINEAR, Inputs, load_of
+from sideslip.envs.vehicle.tyres import LINEAR, TyreInputs, compute_tyre_load
 
 pytestmark = pytest.mark.plain
 
 KMH = 1.0 / 3.6
 SPEEDS = [v * KMH for v in range(5, 46, 5)]
-VEHICLES = [COMS, COMS.scaled(0.7, 1.3), PASSENGER_CAR]
+VEHICLES = [COMS, COMS.scale_stiffness(0.7, 1.3), PASSENGER_CAR]
 MODELS: dict[str, Callable[[Vehicle, float], LinearModel]] = {
-    "bicycle": bicycle,
-    "vision": vision,
-    "course": course,
+    "bicycle": make_bicycle_model,
+    "vision": make_vision_model,
+    "course": make_course_model,
 }
 SILENT = Noise()._replace(gyro=0.0, camera_psi=0.0, camera_y=0.0, course=0.0)
 
@@ -48,22 +48,22 @@ def seen(
     """
     beta, gamma, psi, y_l = np.append(x, [0.0] * (4 - len(x))).tolist()
     delta_f, N_z, kappa = np.append(u, [0.0] * (3 - len(u))).tolist()
-    car, l_pre = car_of(vehicle), vehicle.preview
-    road = Road(kappa, -1e3, 1.0)
+    car, l_pre = make_car(vehicle), vehicle.preview
+    road = RoadParams(kappa, -1e3, 1.0)
     bend = 0.5 * kappa * l_pre**2
     v_x, v_y = (v, v * beta) if small_angle else (v * math.cos(beta), v * math.sin(beta))
     state = Motion(v_x, v_y, gamma, psi, 0.0, 0.0, 0.0, y_l - l_pre * psi + bend, 0.0)
     T = 0.5 * N_z * car.r / (0.5 * car.d_r)
-    load = load_of(Inputs(delta_f, -T, T), car, small_angle)
-    rate = derivative(state, load, Push(0.0, 0.0), car, road, small_angle, LINEAR)
+    load = compute_tyre_load(TyreInputs(delta_f, -T, T), car, small_angle)
+    rate = derivative(state, load, DisturbanceForces(0.0, 0.0), car, road, small_angle, LINEAR)
     if small_angle:  # the held speed: tie-vision (1)
         dbeta = rate.v_y / v
     else:
         dbeta = (v_x * rate.v_y - v_y * rate.v_x) / (v_x**2 + v_y**2)
     dpsi = rate.psi - rate.theta
     dx = [dbeta, rate.gamma, dpsi, rate.y + l_pre * dpsi]
-    psi_seen, y_seen = camera_sample(state, road, l_pre, SILENT, (0.0, 0.0))
-    course_seen = gps_sample(state, 0.0, 0.0, 1.0, 0.0, SILENT, (0.0,) * 4, small_angle)[0]
+    psi_seen, y_seen = sample_camera(state, road, l_pre, SILENT, (0.0, 0.0))
+    course_seen = sample_gps(state, 0.0, 0.0, 1.0, 0.0, SILENT, (0.0,) * 4, small_angle)[0]
     outputs = {"gamma": gamma, "psi": psi_seen, "y_l": y_seen, "course": course_seen}
     names = MODELS[model](vehicle, v).outputs
     return np.array(dx[: len(x)]), np.array([outputs[name] for name in names])
@@ -121,7 +121,7 @@ def test_vision_is_tie_vision_8_letter_by_letter(V_x: float) -> None:
     )
     B = np.array([[2 * C_f / (m * V_x), 2 * C_f * l_f / I, 0, 0], [0, 1 / I, 0, 0]]).T
     C = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    model = vision(COMS, V_x)
+    model = make_vision_model(COMS, V_x)
     # the same operations in another order: a few roundings
     np.testing.assert_allclose(model.A, A, rtol=1e-15, atol=0.0)
     np.testing.assert_allclose(model.B[:, :2], B, rtol=1e-15, atol=0.0)
@@ -131,7 +131,7 @@ def test_vision_is_tie_vision_8_letter_by_letter(V_x: float) -> None:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_the_models_agree_where_they_overlap(name: str) -> None:
-    small, large = bicycle(COMS, 7.0), MODELS[name](COMS, 7.0)
+    small, large = make_bicycle_model(COMS, 7.0), MODELS[name](COMS, 7.0)
     np.testing.assert_array_equal(large.A[:2, :2], small.A)
     np.testing.assert_array_equal(large.B[:2, :2], small.B)
     assert large.states[:2] == small.states
@@ -142,13 +142,13 @@ def test_the_models_agree_where_they_overlap(name: str) -> None:
 @pytest.mark.parametrize("dt", [0.001, 0.033, 0.2])
 def test_discrete_is_the_exact_zero_order_hold(name: str, dt: float) -> None:
     model = MODELS[name](COMS, 25.0 * KMH)
-    G, H = model.discrete(dt)
+    G, H = model.discretise(dt)
     D = np.zeros((len(model.outputs), len(model.inputs)))
     expected = cont2discrete((model.A, model.B, model.C, D), dt)  # zero-order hold
     # two calls of one matrix exponential, whose own error is some roundings of its largest entry
     assert np.abs(G - expected[0]).max() <= 1e-14 * np.abs(G).max()
     assert np.abs(H - expected[1]).max() <= 1e-14 * np.abs(H).max()
-    twice_G, twice_H = model.discrete(2.0 * dt)
+    twice_G, twice_H = model.discretise(2.0 * dt)
     assert np.abs(G @ G - twice_G).max() <= 1e-14 * np.abs(twice_G).max()
     assert np.abs(G @ H + H - twice_H).max() <= 1e-14 * np.abs(twice_H).max()
 
@@ -170,7 +170,7 @@ def test_to_control_keeps_matrices_and_names(name: str) -> None:
 @pytest.mark.parametrize("vehicle", VEHICLES, ids=lambda each: each.name)
 @pytest.mark.parametrize("v", SPEEDS)
 def test_references_are_the_models_steady_state(vehicle: Vehicle, v: float) -> None:
-    model, target = bicycle(vehicle, v), target_of(vehicle)
+    model, target = make_bicycle_model(vehicle, v), make_reference_params(vehicle)
     beta, gamma = np.linalg.solve(model.A, -model.B[:, 0])
     # a 2 x 2 system, ill-conditioned as the speed nears the critical one
     error = 1e-15 * float(np.linalg.cond(model.A))
@@ -181,9 +181,9 @@ def test_references_are_the_models_steady_state(vehicle: Vehicle, v: float) -> N
 
 def test_poles_cross_the_axis_at_the_critical_speed() -> None:
     v = critical_speed(COMS)
-    assert np.linalg.eigvals(bicycle(COMS, 0.999 * v).A).real.max() < 0.0
-    assert np.linalg.eigvals(bicycle(COMS, 1.001 * v).A).real.max() > 0.0
-    A = bicycle(COMS, v).A
+    assert np.linalg.eigvals(make_bicycle_model(COMS, 0.999 * v).A).real.max() < 0.0
+    assert np.linalg.eigvals(make_bicycle_model(COMS, 1.001 * v).A).real.max() > 0.0
+    A = make_bicycle_model(COMS, v).A
     determinant = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
     assert abs(determinant) < 1e-14 * abs(A[0, 0] * A[1, 1])  # roundings of the two products
 
@@ -197,11 +197,11 @@ def test_a_speed_that_is_not_positive_is_refused(v: float) -> None:
 
 def second_layer(x: Any, u: Any, gamma: float, vehicle: Vehicle) -> Any:
     """(dx/dt, a_x, a_y) of the plant: x = v_x, v_y, phi, phi_dot; u = drive and side force in N."""
-    car = car_of(vehicle)
+    car = make_car(vehicle)
     state = Motion(x[0], x[1], gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, x[2], x[3])
     T = 0.5 * car.r * u[0]
-    load = load_of(Inputs(0.0, T, T), car, 1)
-    road, push = Road(0.0, 0.0, 1.0), Push(u[1], 0.0)
+    load = compute_tyre_load(TyreInputs(0.0, T, T), car, 1)
+    road, push = RoadParams(0.0, 0.0, 1.0), DisturbanceForces(u[1], 0.0)
     rate = derivative(state, load, push, car, road, 1, LINEAR, 1)
     a_x = rate.v_x - gamma * x[1]  # double-layer-gps (4)
     a_y = rate.v_y + gamma * x[0] + 9.81 * x[2]  # (5)
@@ -215,7 +215,7 @@ def test_the_second_layers_matrices_are_the_plants_jacobian(gamma: float, vehicl
 
     The small-angle plant is linear in these but for the tyres' v_y / v_x, which acts through a_y.
     """
-    model = velocity_and_roll(vehicle, gamma)
+    model = make_velocity_roll_model(vehicle, gamma)
     x, u = np.array([8.0, 0.2, 0.03, 0.1]), np.array([100.0, 200.0])
     start = second_layer(x, u, gamma, vehicle)
     for j in range(6):
@@ -224,7 +224,7 @@ def test_the_second_layers_matrices_are_the_plants_jacobian(gamma: float, vehicl
         moved = second_layer(x + step[:4], u + step[4:], gamma, vehicle) - start
         expected = model.A @ step[:4] + model.B @ moved[4:]
         np.testing.assert_allclose(moved[:4], expected, rtol=0.0, atol=1e-11)  # rates up to 100
-    body, plane = roll(vehicle), kinematic(gamma)
+    body, plane = make_roll_model(vehicle), make_kinematic_model(gamma)
     np.testing.assert_array_equal(model.A[2:, 2:], body.A)
     np.testing.assert_array_equal(model.A[:2, :2], plane.A)
     np.testing.assert_array_equal(model.B[2:, 1:], body.B)
@@ -234,7 +234,7 @@ def test_the_second_layers_matrices_are_the_plants_jacobian(gamma: float, vehicl
         assert each.B.shape == (len(each.states), len(each.inputs))
         names = [each.states[int(np.argmax(row))] for row in each.C]
         assert tuple(names) == each.outputs
-        G, H = each.discrete(0.001)
+        G, H = each.discretise(0.001)
         for exact, first in ((G - np.eye(len(G)), 0.001 * each.A), (H, 0.001 * each.B)):
             assert np.abs(exact - first).max() <= 2e-2 * np.abs(first).max()
 
@@ -246,5 +246,5 @@ def test_slip_cannot_be_seen_from_the_wheels_alone_at_zero_yaw_rate() -> None:
         powers = [np.linalg.matrix_power(model.A, k) for k in range(len(model.A))]
         return int(np.linalg.matrix_rank(np.vstack([model.C @ power for power in powers])))
 
-    assert (rank(kinematic(0.0)), rank(kinematic(0.1))) == (1, 2)
-    assert rank(velocity_and_roll(COMS, 0.0)) == 4
+    assert (rank(make_kinematic_model(0.0)), rank(make_kinematic_model(0.1))) == (1, 2)
+    assert rank(make_velocity_roll_model(COMS, 0.0)) == 4

@@ -7,20 +7,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, StabilityEnv
-from sideslip.envs.engine.packing import car_of
-from sideslip.envs.engine.tick import torques
+from sideslip.envs.engine.packing import make_car
+from sideslip.envs.engine.tick import compute_motor_torques
 from sideslip.envs.record import FAST
-from sideslip.envs.scenarios.speed import Pace
+from sideslip.envs.scenarios.speed import SpeedProfile
 from sideslip.envs.ticks import FOREVER
-from sideslip.envs.vehicle.actuators import torque_limit, yaw_moment
+from sideslip.envs.vehicle.actuators import compute_torque_limit, compute_yaw_moment
 
 from ..helpers import FULL, play
 
 pytestmark = pytest.mark.plain
 
 WEAK = COMS.replace(motor_power=2000.0)
-CAR, FREE = car_of(WEAK), car_of(COMS)
-HOLD = Pace(speed=7.0, hold=1.0, acceleration=0.0, start=0.0, end=FOREVER, k_p=2.0, k_i=0.5)
+CAR, FREE = make_car(WEAK), make_car(COMS)
+HOLD = SpeedProfile(speed=7.0, hold=1.0, acceleration=0.0, start=0.0, end=FOREVER, k_p=2.0, k_i=0.5)
 speeds, either = st.floats(-40.0, 40.0), st.sampled_from([0.0, 1.0])
 
 
@@ -30,21 +30,21 @@ def test_no_wheel_takes_or_gives_more_than_its_power(
 ) -> None:
     """P = T omega, omega = v / r, whatever moment and acceleration are asked for."""
     pace = HOLD._replace(speed=v + asked, hold=hold, acceleration=asked * (1.0 - hold))
-    T_l, T_r, _, _ = torques(N_z, 0.0, v, 0.0, pace, CAR, yaw_first)
+    T_l, T_r, _, _ = compute_motor_torques(N_z, 0.0, v, 0.0, pace, CAR, yaw_first)
     for torque in (T_l, T_r):
         assert abs(torque * v / WEAK.wheel_radius) <= 2000.0 * (1.0 + 1e-14)  # roundings
         assert abs(torque) <= WEAK.motor_torque * (1.0 + 1e-14)
     if abs(v) > 0.5:
         most = 2000.0 * WEAK.rear_track / abs(v)
-        assert abs(yaw_moment(T_l, T_r, CAR)) <= most * (1.0 + 1e-14)
+        assert abs(compute_yaw_moment(T_l, T_r, CAR)) <= most * (1.0 + 1e-14)
 
 
 @given(speeds)
 def test_up_to_P_over_T_max_the_torque_is_what_limits(v: float) -> None:
     corner = 2000.0 / 100.0 * 0.22  # m/s
     expected = 100.0 if abs(v) <= corner else 2000.0 * 0.22 / abs(v)
-    assert torque_limit(v, CAR) == pytest.approx(expected, rel=1e-15)
-    assert torque_limit(v, FREE) == 100.0  # 0: no limit, bit for bit
+    assert compute_torque_limit(v, CAR) == pytest.approx(expected, rel=1e-15)
+    assert compute_torque_limit(v, FREE) == 100.0  # 0: no limit, bit for bit
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])

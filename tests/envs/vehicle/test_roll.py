@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from sideslip.envs import COMS, PASSENGER_CAR, StabilityEnv
 from sideslip.envs.backend.arrays import read
 from sideslip.envs.engine.layout import P
-from sideslip.envs.engine.packing import car_of
+from sideslip.envs.engine.packing import make_car
 from sideslip.envs.record import FAST
 from sideslip.envs.vehicle.dynamics import (
-    Car,
+    CarParams,
+    DisturbanceForces,
     Motion,
-    Push,
-    Road,
+    RoadParams,
+    compute_gravity,
     derivative,
-    gravity_at,
 )
 from sideslip.envs.vehicle.integration import kutta3, rk4
 from sideslip.envs.vehicle.tyres import (
@@ -27,10 +27,10 @@ from sideslip.envs.vehicle.tyres import (
     FIALA,
     LINEAR,
     TYRE_LAWS,
-    Inputs,
-    load_of,
-    load_transfer,
-    tyre_forces,
+    TyreInputs,
+    compute_load_transfer,
+    compute_tyre_forces,
+    compute_tyre_load,
 )
 from sideslip.envs.vehicle.vehicle import GRAVITY
 
@@ -39,18 +39,26 @@ from ..helpers import fast_rows, play, unwrapped
 
 pytestmark = pytest.mark.plain
 
-CAR = car_of(COMS)
-CARS = [CAR, car_of(PASSENGER_CAR)]
-FLAT = Road(0.0, 0.0, 1.0)
-BANKED = Road(0.0, -1e6, 1.0, 9.81 * math.sin(0.2), 9.81 * math.sin(-0.1))
-CALM = Push(0.0, 0.0)
+CAR = make_car(COMS)
+CARS = [CAR, make_car(PASSENGER_CAR)]
+FLAT = RoadParams(0.0, 0.0, 1.0)
+BANKED = RoadParams(0.0, -1e6, 1.0, 9.81 * math.sin(0.2), 9.81 * math.sin(-0.1))
+CALM = DisturbanceForces(0.0, 0.0)
 small = st.floats(-0.3, 0.3)
 PLANTS = [(small_angle, law) for small_angle in (0, 1) for law in range(len(TYRE_LAWS))]
 
 
-def slope(state: Motion, push: Push = CALM, car: Car = CAR, road: Road = FLAT, **how: Any) -> Any:
+def slope(
+    state: Motion,
+    push: DisturbanceForces = CALM,
+    car: CarParams = CAR,
+    road: RoadParams = FLAT,
+    **how: Any,
+) -> Any:
     small_angle, law = how.get("small_angle", 0), how.get("law", LINEAR)
-    load = load_of(Inputs(how.get("steer", 0.0), *how.get("T", (0.0, 0.0))), car, small_angle)
+    load = compute_tyre_load(
+        TyreInputs(how.get("steer", 0.0), *how.get("T", (0.0, 0.0))), car, small_angle
+    )
     return derivative(state, load, push, car, road, small_angle, law, 1)
 
 
@@ -61,7 +69,7 @@ def test_double_layer_1_to_7_written_out(
     """On the papers' plant; a_y is what an accelerometer measures."""
     state = Motion(v_x, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_dot)
     F_yd, N_zd, N_xd, T = 50.0, -20.0, 30.0, (20.0, 60.0)
-    rate = slope(state, Push(F_yd, N_zd, N_xd), steer=steer, T=T, small_angle=1)
+    rate = slope(state, DisturbanceForces(F_yd, N_zd, N_xd), steer=steer, T=T, small_angle=1)
     beta, M, g = v_y / v_x, CAR.m, 9.81
     F_yf = -2.0 * CAR.C_f * (beta + CAR.l_f / v_x * gamma - steer)  # (6)
     F_yr = -2.0 * CAR.C_r * (beta - CAR.l_r / v_x * gamma)  # (7)
@@ -80,18 +88,18 @@ def test_double_layer_1_to_7_written_out(
 
 @given(small, small, st.floats(-2.0, 2.0), st.sampled_from(CARS), st.sampled_from(PLANTS))
 def test_both_laws_hold_on_every_plant_and_on_a_bank(
-    v_y: float, phi: float, phi_dot: float, car: Car, plant: tuple[int, int]
+    v_y: float, phi: float, phi_dot: float, car: CarParams, plant: tuple[int, int]
 ) -> None:
     state = Motion(9.0, v_y, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_dot)
     how: dict[str, Any] = {"car": car, "road": BANKED, "small_angle": plant[0], "law": plant[1]}
-    rate = slope(state, Push(70.0, 0.0, 25.0), **how)
-    felt = gravity_at(state, BANKED, plant[0])
+    rate = slope(state, DisturbanceForces(70.0, 0.0, 25.0), **how)
+    felt = compute_gravity(state, BANKED, plant[0])
     a_y = rate.v_y + 0.2 * 9.0 + felt[1] + 9.81 * phi
     body = car.I_x * rate.phi_dot + car.C_x * phi_dot + car.K_x * phi
     # roundings of moments up to 1e5 N m
     assert body == pytest.approx(car.S * a_y + 25.0, abs=1e-9)
-    load = load_of(Inputs(0.0, 0.0, 0.0), car, plant[0])
-    F_yf, F_yr, _, _ = tyre_forces(state, load, car, felt[1], *plant, 1)
+    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, plant[0])
+    F_yf, F_yr, _, _ = compute_tyre_forces(state, load, car, felt[1], *plant, 1)
     a = rate.v_y + 0.2 * 9.0 + felt[1]
     assert car.m * a - car.S * rate.phi_dot == pytest.approx(F_yf + F_yr + 70.0, abs=1e-8)
 
@@ -106,15 +114,15 @@ def test_a_bank_is_felt_and_pulls_down_and_a_grade_pulls_back() -> None:
         ground = c * rate.v_x - s * rate.v_y, s * rate.v_x + c * rate.v_y
         # bank 0.2: the left side is up, the car slides right; grade -0.1: downhill, forward
         assert ground == pytest.approx((9.81 * math.sin(0.1), -9.81 * math.sin(0.2)), abs=1e-12)
-        felt = gravity_at(state, BANKED, 0)
+        felt = compute_gravity(state, BANKED, 0)
         assert (rate.v_x + felt[0], rate.v_y + felt[1]) == pytest.approx((0.0, 0.0), abs=1e-12)
 
 
 def test_bank_and_grade_come_in_along_the_road() -> None:
-    road = Road(0.0, 10.0, 20.0, 2.0, 1.0)
+    road = RoadParams(0.0, 10.0, 20.0, 2.0, 1.0)
     for s, share in ((0.0, 0.0), (10.0, 0.0), (15.0, 0.25), (30.0, 1.0), (90.0, 1.0)):
         state = Motion(*[0.0] * 9)._replace(s=s)
-        assert gravity_at(state, road, 1) == (share, 2.0 * share)
+        assert compute_gravity(state, road, 1) == (share, 2.0 * share)
 
 
 def test_a_mirrored_bend_leans_to_the_other_side() -> None:
@@ -124,15 +132,15 @@ def test_a_mirrored_bend_leans_to_the_other_side() -> None:
     for seed in range(8):
         env.reset(seed=seed)
         road = read(env.get_state()["params"], P.road)
-        assert road.across == math.copysign(across, road.curvature)
-        assert road.along == GRAVITY * math.sin(0.05)
+        assert road.lateral == math.copysign(across, road.curvature)
+        assert road.longitudinal == GRAVITY * math.sin(0.05)
         leans.add(road.curvature)
     assert leans == {-0.01, 0.01}
 
 
 def test_an_undamped_body_on_tyres_without_force_keeps_its_energy() -> None:
     car = CAR._replace(C_f=0.0, C_r=0.0, C_x=0.0)
-    load = load_of(Inputs(0.0, 0.0, 0.0), car, 0)
+    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, 0)
     state = Motion(7.0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.5)
 
     def energy(x: Motion) -> float:
@@ -163,10 +171,12 @@ def test_a_left_turn_rolls_the_body_to_the_right_to_its_static_angle() -> None:
 @pytest.mark.parametrize("car", CARS)
 @pytest.mark.parametrize("law", [LINEAR, FIALA])
 @pytest.mark.parametrize(("rule", "order"), [(kutta3, 3), (rk4, 4)])
-def test_the_rules_have_their_orders_with_roll(rule: Any, order: int, car: Car, law: int) -> None:
+def test_the_rules_have_their_orders_with_roll(
+    rule: Any, order: int, car: CarParams, law: int
+) -> None:
     """Where no wheel's grip ends: there Fiala's curve has a jump in its third slope."""
     start = Motion(12.0, -0.2, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    load = load_of(Inputs(0.06, 0.0, 0.0), car, 0)
+    load = compute_tyre_load(TyreInputs(0.06, 0.0, 0.0), car, 0)
 
     def drive(h: float) -> np.ndarray:
         state = start
@@ -183,11 +193,11 @@ def test_the_rules_have_their_orders_with_roll(rule: Any, order: int, car: Car, 
 
 @given(small, st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.sampled_from(CARS))
 def test_loads_move_by_the_moment_and_keep_their_sum(
-    phi: float, phi_dot: float, gamma: float, car: Car
+    phi: float, phi_dot: float, gamma: float, car: CarParams
 ) -> None:
     phi *= 0.1
     state = Motion(8.0, 0.0, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, 0.1 * phi_dot)
-    front, rear = load_transfer(state, car, 0.5)
+    front, rear = compute_load_transfer(state, car, 0.5)
     weight = car.m * 9.81
     on_front, on_rear = (
         weight * car.l_r / (car.l_f + car.l_r),
@@ -205,15 +215,15 @@ def test_load_transfer_costs_tyres_with_a_limit_grip_and_nothing_else() -> None:
     upright = Motion(8.0, -0.8, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     leaning = upright._replace(phi=0.15)
     for small_angle, law in PLANTS:
-        load = load_of(Inputs(0.0, 0.0, 0.0), CAR, small_angle)
-        flat = tyre_forces(upright, load, CAR, 0.0, small_angle, law, 0)
-        held = tyre_forces(upright, load, CAR, 0.0, small_angle, law, 1)
-        lost = tyre_forces(leaning, load, CAR, 0.0, small_angle, law, 1)
+        load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), CAR, small_angle)
+        flat = compute_tyre_forces(upright, load, CAR, 0.0, small_angle, law, 0)
+        held = compute_tyre_forces(upright, load, CAR, 0.0, small_angle, law, 1)
+        lost = compute_tyre_forces(leaning, load, CAR, 0.0, small_angle, law, 1)
         np.testing.assert_allclose(held, flat, rtol=1e-14, atol=0.0)
         if law != LINEAR and not small_angle:
             assert 0.0 < lost[0] < 0.99 * flat[0]
             assert 0.0 < lost[1] < 0.99 * flat[1]
-            mirror = tyre_forces(leaning._replace(phi=-0.15), load, CAR, 0.0, 0, law, 1)
+            mirror = compute_tyre_forces(leaning._replace(phi=-0.15), load, CAR, 0.0, 0, law, 1)
             np.testing.assert_allclose(mirror, lost, rtol=1e-14)
         else:
             assert lost == flat
@@ -225,9 +235,9 @@ def test_rear_tyres_stay_within_the_friction_circle_of_their_own_load(
     law: int, T_l: float, T_r: float, phi: float, v_y: float
 ) -> None:
     state = Motion(8.0, 10.0 * v_y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi)
-    load = load_of(Inputs(0.0, T_l, T_r), CAR, 0)
-    _, F_yr, F_x, N_z = tyre_forces(state, load, CAR, 0.0, 0, law, 1)
-    share = load_transfer(state, CAR, 0.0)[1]
+    load = compute_tyre_load(TyreInputs(0.0, T_l, T_r), CAR, 0)
+    _, F_yr, F_x, N_z = compute_tyre_forces(state, load, CAR, 0.0, 0, law, 1)
+    share = compute_load_transfer(state, CAR, 0.0)[1]
     left, right = load.rear_l * (1.0 - share), load.rear_r * (1.0 + share)
     F_l, F_r = 0.5 * F_x - N_z / CAR.d_r, 0.5 * F_x + N_z / CAR.d_r
     assert abs(F_l) <= left * (1.0 + 1e-12)

@@ -9,25 +9,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.engine.packing import car_of
-from sideslip.envs.vehicle.dynamics import Car, Motion, sideslip_angle
+from sideslip.envs.engine.packing import make_car
+from sideslip.envs.vehicle.dynamics import CarParams, Motion, compute_sideslip_angle
 from sideslip.envs.vehicle.tyres import (
     DUGOFF,
     FIALA,
     LINEAR,
-    SLOW,
+    MIN_SPEED,
     TYRE_LAWS,
-    Inputs,
     Tyre,
-    lateral_forces,
-    load_of,
-    slips,
+    TyreInputs,
+    compute_lateral_forces,
+    compute_slips,
+    compute_tyre_load,
 )
 from sideslip.envs.vehicle.vehicle import GRAVITY
 
 pytestmark = pytest.mark.plain
 
-CARS = [car_of(COMS), car_of(PASSENGER_CAR)]
+CARS = [make_car(COMS), make_car(PASSENGER_CAR)]
 LAWS = range(len(TYRE_LAWS))
 LIMITED = [FIALA, DUGOFF]
 tangents = st.floats(-50.0, 50.0)
@@ -46,7 +46,7 @@ def lateral_force(
     for place in range(4):
         arguments: list[Any] = [other, other, other, other, law, small_angle]
         arguments[place] = tyre
-        found.append(lateral_forces(*arguments)[place])
+        found.append(compute_lateral_forces(*arguments)[place])
     assert found == found[:1] * 4
     return float(found[0])
 
@@ -110,8 +110,8 @@ def test_fiala_is_the_printed_law(tangent: float, C: float, limit: float) -> Non
 
 @pytest.mark.smoke
 @pytest.mark.parametrize("car", CARS)
-def test_fiala_reaches_mu_F_z_exactly_and_no_more(car: Car) -> None:
-    load = load_of(Inputs(0.0, 0.0, 0.0), car, 0)
+def test_fiala_reaches_mu_F_z_exactly_and_no_more(car: CarParams) -> None:
+    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, 0)
     for limit, slope in ((load.limit_f, load.slope_f), (load.limit_l, load.slope_l)):
         edge = 1.0 / slope
         assert lateral_force(1e9, limit, slope, FIALA) == limit
@@ -121,8 +121,8 @@ def test_fiala_reaches_mu_F_z_exactly_and_no_more(car: Car) -> None:
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("car", CARS)
-def test_initial_slope_is_the_cornering_stiffness(car: Car, law: int) -> None:
-    load = load_of(Inputs(0.0, 0.0, 0.0), car, 0)
+def test_initial_slope_is_the_cornering_stiffness(car: CarParams, law: int) -> None:
+    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, 0)
     for C, limit, slope in (
         (car.C_f, load.limit_f, load.slope_f),
         (car.C_r, load.limit_r, load.slope_r),
@@ -133,7 +133,7 @@ def test_initial_slope_is_the_cornering_stiffness(car: Car, law: int) -> None:
 
 
 def test_linear_tyres_have_no_limit() -> None:
-    load = load_of(Inputs(0.0, 0.0, 0.0), CARS[0], 1)
+    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), CARS[0], 1)
     # one rounding each for slope and product
     force = lateral_force(10.0, load.limit_f, load.slope_f, LINEAR, 1)
     assert force == pytest.approx(60000.0, rel=1e-15)
@@ -142,8 +142,8 @@ def test_linear_tyres_have_no_limit() -> None:
 
 
 @pytest.mark.parametrize("car", CARS)
-def test_the_four_wheels_carry_the_car_on_friction_mu(car: Car) -> None:
-    load = load_of(Inputs(0.0, 0.0, 0.0), car, 0)
+def test_the_four_wheels_carry_the_car_on_friction_mu(car: CarParams) -> None:
+    load = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, 0)
     total = 2.0 * load.limit_f + load.limit_l + load.limit_r
     assert total == pytest.approx(car.mu * car.m * GRAVITY, rel=1e-15)
     # moments about the centre of gravity balance
@@ -157,8 +157,8 @@ def test_rear_tyres_stay_within_the_friction_circle(
     law: int, T_l: float, T_r: float, slip: float
 ) -> None:
     car = CARS[0]
-    still = load_of(Inputs(0.0, 0.0, 0.0), car, 0)
-    load = load_of(Inputs(0.0, T_l, T_r), car, 0)
+    still = compute_tyre_load(TyreInputs(0.0, 0.0, 0.0), car, 0)
+    load = compute_tyre_load(TyreInputs(0.0, T_l, T_r), car, 0)
     difference = 2.0 * load.N_z / car.d_r
     for along, limit, slope in (
         (0.5 * (load.F_x - difference), load.limit_l, load.slope_l),
@@ -171,8 +171,8 @@ def test_rear_tyres_stay_within_the_friction_circle(
 
 
 def test_the_small_angle_plant_knows_no_circle() -> None:
-    load = load_of(Inputs(0.1, 1e4, -1e4), CARS[0], 1)
-    still = load_of(Inputs(0.1, 0.0, 0.0), CARS[0], 1)
+    load = compute_tyre_load(TyreInputs(0.1, 1e4, -1e4), CARS[0], 1)
+    still = compute_tyre_load(TyreInputs(0.1, 0.0, 0.0), CARS[0], 1)
     assert load.limit_l == load.limit_r == still.limit_l
     assert load.F_x == 0.0
     assert load.N_z == pytest.approx(-1e4 / 0.22 * 0.82, rel=1e-15)
@@ -181,32 +181,36 @@ def test_the_small_angle_plant_knows_no_circle() -> None:
 def test_slip_angles_are_those_of_the_wheels_velocities() -> None:
     car, steer = CARS[0], 0.2
     state = motion(6.0, 0.8, 0.5)
-    load = load_of(Inputs(steer, 0.0, 0.0), car, 0)
+    load = compute_tyre_load(TyreInputs(steer, 0.0, 0.0), car, 0)
     front = steer - math.atan2(0.8 + car.l_f * 0.5, 6.0)
     rear = -math.atan2(0.8 - car.l_r * 0.5, 6.0)
     expected = math.tan(front), math.tan(rear)
-    assert slips(state, load, car, 0) == pytest.approx(expected, rel=1e-14)  # a few roundings
+    assert compute_slips(state, load, car, 0) == pytest.approx(
+        expected, rel=1e-14
+    )  # a few roundings
 
 
 @pytest.mark.smoke
 @pytest.mark.parametrize("small_angle", [0, 1])
 def test_nothing_divides_by_zero_at_any_speed(small_angle: int) -> None:
-    load = load_of(Inputs(0.3, 50.0, -50.0), CARS[0], small_angle)
-    for v_x in (-5.0, -SLOW, -1e-300, -0.0, 0.0, 1e-300, 1e-9, SLOW, 5.0):
+    load = compute_tyre_load(TyreInputs(0.3, 50.0, -50.0), CARS[0], small_angle)
+    for v_x in (-5.0, -MIN_SPEED, -1e-300, -0.0, 0.0, 1e-300, 1e-9, MIN_SPEED, 5.0):
         for v_y in (-3.0, 0.0, 1e-300, 3.0):
             state = motion(v_x, v_y, 0.7)
-            found = slips(state, load, CARS[0], small_angle)
+            found = compute_slips(state, load, CARS[0], small_angle)
             assert np.all(np.isfinite(found))
             for law in LAWS:
                 force = lateral_force(found[0], load.limit_f, load.slope_f, law, small_angle)
                 assert math.isfinite(force)
-            assert math.isfinite(sideslip_angle(v_x, v_y, small_angle))
+            assert math.isfinite(compute_sideslip_angle(v_x, v_y, small_angle))
 
 
 def test_sideslip_is_zero_below_half_a_metre_per_second() -> None:
     for small_angle in (0, 1):
-        assert sideslip_angle(0.49, 0.0, small_angle) == 0.0
-        assert sideslip_angle(0.3, 0.3, small_angle) == 0.0
-    assert sideslip_angle(4.0, 0.4, 1) == 0.1
-    assert sideslip_angle(4.0, 0.4, 0) == pytest.approx(math.atan(0.1), abs=1e-15)  # see atan2
-    assert sideslip_angle(-4.0, 0.0, 0) == math.pi
+        assert compute_sideslip_angle(0.49, 0.0, small_angle) == 0.0
+        assert compute_sideslip_angle(0.3, 0.3, small_angle) == 0.0
+    assert compute_sideslip_angle(4.0, 0.4, 1) == 0.1
+    assert compute_sideslip_angle(4.0, 0.4, 0) == pytest.approx(
+        math.atan(0.1), abs=1e-15
+    )  # see atan2
+    assert compute_sideslip_angle(-4.0, 0.0, 0) == math.pi

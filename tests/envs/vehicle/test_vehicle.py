@@ -70,9 +70,9 @@ def test_what_is_no_number_is_refused(value: Any) -> None:
 
 
 def test_scaled_scales_the_stiffness_only() -> None:
-    soft = COMS.scaled(0.7)
+    soft = COMS.scale_stiffness(0.7)
     assert (soft.front_stiffness, soft.rear_stiffness) == (4200.0, 4200.0)
-    apart = COMS.scaled(0.7, 1.3)
+    apart = COMS.scale_stiffness(0.7, 1.3)
     assert (apart.front_stiffness, apart.rear_stiffness) == (4200.0, 7800.0)
     assert apart.replace(front_stiffness=6000.0, rear_stiffness=6000.0) == COMS
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 
-from sideslip.envs import COMS, PASSENGER_CAR, VEHICLES, Vehicle, vehicle_from
+from sideslip.envs import COMS, PASSENGER_CAR, VEHICLES, Vehicle, make_vehicle
 from sideslip.envs.documents import write_document
 
 pytestmark = pytest.mark.plain
@@ -29,30 +29,30 @@ def test_a_file_is_toml_or_json(tmp_path: Path) -> None:
     values = {key: json.loads(value) for key, _, value in lines}
     other.write_text(json.dumps(values))
     expected = PASSENGER_CAR.replace(name="mine")
-    assert vehicle_from(toml) == vehicle_from(str(other)) == vehicle_from(values) == expected
+    assert make_vehicle(toml) == make_vehicle(str(other)) == make_vehicle(values) == expected
     toml.write_text(TOML.partition("\n")[2])
-    assert vehicle_from(toml).name == "mine"  # the file's
+    assert make_vehicle(toml).name == "mine"  # the file's
     other.write_text('{"base": "mine.toml", "mass": 1600}')  # beside it
-    assert vehicle_from(other) == expected.replace(mass=1600)
+    assert make_vehicle(other) == expected.replace(mass=1600)
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=VEHICLES)
 def test_round_trip(tmp_path: Path, vehicle: Vehicle) -> None:
-    assert vehicle_from(json.loads(json.dumps(vehicle.to_dict()))) == vehicle
-    assert vehicle_from(vehicle.name) is vehicle_from(vehicle) is vehicle
+    assert make_vehicle(json.loads(json.dumps(vehicle.to_dict()))) == vehicle
+    assert make_vehicle(vehicle.name) is make_vehicle(vehicle) is vehicle
     keys = {f"{axle}_stiffness": f"{axle}_stiffness_per_tyre" for axle in ("front", "rear")}
     values = {keys.get(key, key): value for key, value in vehicle.to_dict().items()}
     for ending in ("toml", "json"):
         write_document(tmp_path / f"car.{ending}", values)
-        assert vehicle_from(tmp_path / f"car.{ending}") == vehicle
+        assert make_vehicle(tmp_path / f"car.{ending}") == vehicle
 
 
 def test_a_mapping_may_start_from_another_vehicle() -> None:
-    assert vehicle_from({"base": "coms", "mass": 400.0}) == COMS.replace(mass=400.0)
-    assert vehicle_from({"base": COMS}) == COMS
+    assert make_vehicle({"base": "coms", "mass": 400.0}) == COMS.replace(mass=400.0)
+    assert make_vehicle({"base": COMS}) == COMS
     axle = {"front_stiffness_axle": 9000.0, "rear_stiffness_per_tyre": 5000.0}
-    assert vehicle_from({"base": "coms"} | axle).front_stiffness == 4500.0
-    assert vehicle_from({"base": "coms"} | axle).rear_stiffness == 5000.0
+    assert make_vehicle({"base": "coms"} | axle).front_stiffness == 4500.0
+    assert make_vehicle({"base": "coms"} | axle).rear_stiffness == 5000.0
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_a_mapping_may_start_from_another_vehicle() -> None:
 )
 def test_what_is_no_vehicle(values: object, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
-        vehicle_from(values)  # type: ignore[arg-type]
+        make_vehicle(values)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -115,24 +115,24 @@ def test_a_bad_file_is_refused(
     file = tmp_path / "mine.toml"
     file.write_text(content)
     with pytest.raises(error, match=message) as caught:
-        vehicle_from(file)
+        make_vehicle(file)
     assert str(file) in str(caught.value) and len(str(caught.value)) < 700
 
 
 def test_a_file_that_is_none(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"nowhere\.toml: there is no such vehicle file"):
-        vehicle_from(tmp_path / "nowhere.toml")
+        make_vehicle(tmp_path / "nowhere.toml")
     with pytest.raises(ValueError, match=r"ends in \.toml or \.json"):
-        vehicle_from(tmp_path)
+        make_vehicle(tmp_path)
     (tmp_path / "folder.toml").mkdir()
     with pytest.raises(ValueError, match="found a folder"):
-        vehicle_from(tmp_path / "folder.toml")
+        make_vehicle(tmp_path / "folder.toml")
 
 
 @pytest.mark.smoke
 def test_the_vehicles_of_the_stanford_log_come_with_the_package() -> None:
     """Figures of the recording's source: axle stiffness is twice a tyre's."""
-    nominal, fitted = map(vehicle_from, ("ferrari-250lm-nominal", "ferrari-250lm-fitted"))
+    nominal, fitted = map(make_vehicle, ("ferrari-250lm-nominal", "ferrari-250lm-fitted"))
     assert (nominal.mass, nominal.yaw_inertia) == (982.0, 1605.0)
     assert (nominal.front_stiffness, nominal.rear_stiffness) == (0.35e5, 0.6e5)
     assert (fitted.front_stiffness, fitted.rear_stiffness) == (2.165e4, 4.29e4)
@@ -140,14 +140,14 @@ def test_the_vehicles_of_the_stanford_log_come_with_the_package() -> None:
 
 
 def test_a_whole_mapping_is_per_tyre_and_builds_the_env_again() -> None:
-    soft = COMS.scaled(0.8)
+    soft = COMS.scale_stiffness(0.8)
     env = gym.make("sideslip/YawVision-v0", vehicle=soft.to_dict())
     assert env.spec is not None
     again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert again.get_wrapper_attr("config").vehicle == soft
     scenario = {"base": "straight", "vehicle": {"front_stiffness": 7000.0}}  # as of `Vehicle`
     env = gym.make("sideslip/YawVision-v0", scenario=scenario)
-    assert env.get_wrapper_attr("_now").vehicle.front_stiffness == 7000.0
+    assert env.get_wrapper_attr("_episode").vehicle.front_stiffness == 7000.0
 
 
 def test_an_env_takes_what_the_reader_takes(tmp_path: Path) -> None:

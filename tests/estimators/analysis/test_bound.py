@@ -10,9 +10,9 @@ from scipy.linalg import expm
 
 from sideslip.envs.record import PACKET
 from sideslip.envs.sensors.link import SlowSensor
-from sideslip.envs.vehicle.linear import vision
+from sideslip.envs.vehicle.linear import make_vision_model
 from sideslip.estimators import make_estimator
-from sideslip.estimators.analysis.bound import Change, Gust, bound
+from sideslip.estimators.analysis.bound import Gust, VehicleChange, compute_error_bound
 from tests.estimators.riccati import riccati
 from tests.estimators.simulation import CAMERA, FIG7, GPS, error, simulate
 
@@ -28,7 +28,7 @@ SETS = {
 def test_the_recursion_along_the_arrivals_equals_the_riccati_limit(which: Any) -> None:
     sensors = SETS[which]
     log = simulate(FIG7, sensors, 0)
-    along = bound(FIG7.truth, record=log.record, sensors=sensors, speed=FIG7.speed)
+    along = compute_error_bound(FIG7.truth, record=log.record, sensors=sensors, speed=FIG7.speed)
     P, names = riccati(FIG7.truth, sensors=sensors, speed=FIG7.speed, seconds=4.0)
     assert names[0] == "beta"
     np.testing.assert_allclose(along[3000:4000], np.sqrt(P[3000:, 0, 0]), rtol=1e-10)
@@ -45,7 +45,9 @@ def test_the_exact_filters_error_is_its_covariance() -> None:
         errors.append(error(estimates, log))
         e = (estimates["beta"] - log.truth["beta"])[2000:]
         nees.append(np.mean(e**2 / estimates.std[2000:, 0] ** 2))
-    best = bound(FIG7.truth, record=log.record, sensors=sensors, speed=FIG7.speed)[2000:]
+    best = compute_error_bound(FIG7.truth, record=log.record, sensors=sensors, speed=FIG7.speed)[
+        2000:
+    ]
     assert np.sqrt(np.mean(errors) / np.mean(best**2)) <= 1.03
     assert np.mean(nees) == pytest.approx(1.0, abs=0.05)
 
@@ -53,9 +55,9 @@ def test_the_exact_filters_error_is_its_covariance() -> None:
 def test_lost_frames_raise_the_bound() -> None:
     log = simulate(FIG7, {"camera": CAMERA}, 0)
     common: dict[str, Any] = {"sensors": log.slow, "speed": FIG7.speed}
-    full = bound(FIG7.truth, record=log.record, **common)
+    full = compute_error_bound(FIG7.truth, record=log.record, **common)
     log.record.packets = log.record.packets[::3]
-    assert (bound(FIG7.truth, record=log.record, **common)[100:] >= full[100:]).all()
+    assert (compute_error_bound(FIG7.truth, record=log.record, **common)[100:] >= full[100:]).all()
 
 
 CHANGED = 0.1  # s
@@ -89,7 +91,7 @@ def dense(what: str, log: Any, gust: Gust, later: Any) -> float:
 def _step(car: Any, V: float) -> Any:
     """beta, gamma, psi, y_l, F_d, N_d a tick later."""
     whole = np.zeros((6, 6))
-    whole[:4, :4] = vision(car, V).A
+    whole[:4, :4] = make_vision_model(car, V).A
     whole[0, 4], whole[1, 5] = 1.0 / (car.mass * V), 1.0 / car.yaw_inertia
     F = expm(1e-3 * whole)
     F[4:, 4:] = math.exp(-1e-3 / 0.3) * np.eye(2)
@@ -104,12 +106,15 @@ def test_what_changes_on_the_way_is_dense_conditioning(what: str) -> None:
     came = record.packets[record.packets[:, PACKET.arrived] < 250]
     record = dataclasses.replace(record, fast=record.fast[:250], packets=came)
     log = dataclasses.replace(log, record=record, truth={})
-    later = FIG7.truth.scaled(0.6, 1.3).replace(name="later")
+    later = FIG7.truth.scale_stiffness(0.6, 1.3).replace(name="later")
     gust = Gust(400.0, 0.3, 0.04, 0.14)
-    extra: dict[str, Any] = {"change": {"change": Change(CHANGED, later)}, "gust": {"gust": gust}}
+    extra: dict[str, Any] = {
+        "change": {"change": VehicleChange(CHANGED, later)},
+        "gust": {"gust": gust},
+    }
     common: dict[str, Any] = {"record": record, "sensors": log.slow, "speed": FIG7.speed}
-    plain = bound(FIG7.truth, **common)
-    found = bound(FIG7.truth, **common, **extra.get(what, {}))
+    plain = compute_error_bound(FIG7.truth, **common)
+    found = compute_error_bound(FIG7.truth, **common, **extra.get(what, {}))
     assert found[-1] == pytest.approx(dense(what, log, gust, later), rel=1e-8)
     np.testing.assert_array_equal(found[:40], plain[:40])
     assert what == "nothing" or abs(found[-1] / plain[-1] - 1.0) > 0.01
@@ -119,8 +124,8 @@ def test_a_bound_without_a_change_is_the_bound() -> None:
     """A car that becomes itself, a gust that is over before the first row."""
     log = simulate(FIG7, {"camera": CAMERA}, 0)
     common: dict[str, Any] = {"record": log.record, "sensors": log.slow, "speed": FIG7.speed}
-    plain = bound(FIG7.truth, **common)
-    same = bound(FIG7.truth, **common, change=Change(1.0, FIG7.truth))
+    plain = compute_error_bound(FIG7.truth, **common)
+    same = compute_error_bound(FIG7.truth, **common, change=VehicleChange(1.0, FIG7.truth))
     np.testing.assert_array_equal(same, plain)
-    over = bound(FIG7.truth, **common, gust=Gust(400.0, 0.0, 0.0, 0.0))
+    over = compute_error_bound(FIG7.truth, **common, gust=Gust(400.0, 0.0, 0.0, 0.0))
     np.testing.assert_allclose(over, plain, rtol=1e-12)

@@ -12,7 +12,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from sideslip.envs.record import FAST, PACKET, Array, Record
-from sideslip.envs.vehicle.linear import LinearModel, vision
+from sideslip.envs.vehicle.linear import LinearModel, make_vision_model
 from sideslip.envs.vehicle.vehicle import Vehicle
 
 Q = {"beta": 2e-3, "gamma": 2e-2, "psi": 1e-6, "y_l": 1e-4}  # per second
@@ -29,17 +29,17 @@ OURS: dict[str, dict[str, Any]] = {
 
 def four_states(vehicle: Vehicle, speed: float, dt: float) -> Any:
     """A KalmanFilter of beta, gamma, psi, y_l, inputs delta_f and N_z, measuring the gyro."""
-    F, B = vision(vehicle, speed).discrete(dt)
+    F, B = make_vision_model(vehicle, speed).discretise(dt)
     return _filter(F, B[:, :2], dt * np.diag(list(Q.values())), list(PRIOR.values()))
 
 
 def six_states(vehicle: Vehicle, speed: float, dt: float) -> Any:
     """The same with an Ornstein-Uhlenbeck force and moment instead of process noise."""
-    model, push = vision(vehicle, speed), np.zeros((4, 2))
+    model, push = make_vision_model(vehicle, speed), np.zeros((4, 2))
     push[0, 0], push[1, 1] = 1.0 / (vehicle.mass * speed), 1.0 / vehicle.yaw_inertia
-    F, B = model.discrete(dt)
+    F, B = model.discretise(dt)
     pushed = LinearModel(model.A, push, model.C, model.states, ("F_d", "N_d"), model.outputs)
-    D = pushed.discrete(dt)[1]
+    D = pushed.discretise(dt)[1]
     keep = math.exp(-dt / DISTURBANCE["disturbance_time"])
     sd = [DISTURBANCE["force_sd"], DISTURBANCE["moment_sd"]]
     F = np.block([[F, D], [np.zeros((2, 4)), keep * np.eye(2)]])

@@ -14,18 +14,18 @@ from scipy.stats import chi2, kstest
 
 from sideslip.envs import Log
 from sideslip.envs.record import PACKET
-from sideslip.envs.scenarios.manoeuvres import scenario_from
+from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.estimators import Estimator, make_estimator
 from sideslip.estimators.design.levels import DISTURBANCE, NOISE
 from sideslip.estimators.design.measurements import MEASUREMENTS
-from sideslip.estimators.design.models import states_for
+from sideslip.estimators.design.models import select_states
 from tests.estimators.drives import Drives, told
 from tests.estimators.riccati import riccati
 
 RUNS = 128
 SURE = 0.999
 SETS = [("camera",), ("gps",), ("camera", "gps")]
-FIG7 = scenario_from("tie-vision-fig7")
+FIG7 = make_scenario("tie-vision-fig7")
 LATE = {  # out of order, and three fixes under way at once
     "camera": {"delays": (0.010,), "jitter": 0.040},
     "gps": {"period": 0.1, "delays": (0.25,)},
@@ -34,7 +34,7 @@ LATE = {  # out of order, and three fixes under way at once
 
 def exact(drives: Drives, log: Log, sensors: tuple[str, ...], **options: Any) -> Estimator:
     """exact-kf told the truth, which starts from the known start as the bound does."""
-    options.setdefault("prior", dict.fromkeys(states_for(sensors), 0.0))
+    options.setdefault("prior", dict.fromkeys(select_states(sensors), 0.0))
     return make_estimator(
         "exact-kf",
         vehicle=drives.vehicle,

@@ -8,10 +8,10 @@ import pytest
 
 from sideslip.envs.record import FAST, PACKET, Record
 from sideslip.envs.sensors.link import SlowSensor
-from sideslip.envs.vehicle.linear import vision
+from sideslip.envs.vehicle.linear import make_vision_model
 from sideslip.envs.vehicle.vehicle import COMS
 from sideslip.estimators import FILTERS, make_estimator
-from sideslip.estimators.filters import Filter
+from sideslip.estimators.filters import FilterDefinition
 from tests.estimators.simulation import CAMERA, FIG7, Drive, simulate
 
 V = FIG7.speed
@@ -34,7 +34,9 @@ def gaps(x: Any, other: Any) -> Any:
 def test_larsen_is_optimal_when_its_one_sample_is_here(
     fast: Any, delays: Any, monkeypatch: Any
 ) -> None:
-    row = Filter(slow=("camera",), fast=fast, gains="covariance", disturbances="forces", source="")
+    row = FilterDefinition(
+        slow=("camera",), fast=fast, gains="covariance", disturbances="forces", source=""
+    )
     monkeypatch.setitem(FILTERS, "ours", row)
     sensors = {"camera": SlowSensor(0.033, delays)}
     log = simulate(QUICK, sensors, 0)
@@ -74,7 +76,7 @@ def held_residuals(log: Any, age: Any) -> Any:
 
     age: of a packet that arrives at tick k, in ticks.
     """
-    G, H = vision(COMS, V).discrete(0.001)
+    G, H = make_vision_model(COMS, V).discretise(0.001)
     gyro, camera = np.eye(1, 4, 1), np.eye(2, 4, 2)
     x, P = np.zeros(4), np.diag([0.02**2, 0.05**2, 0.05**2, 0.3**2])
     due = {int(packet[PACKET.arrived]): packet for packet in log.record.packets}
@@ -145,7 +147,7 @@ def test_late_states_that_follow_at_every_step(rule: Any) -> None:
     log = simulate(QUICK, {"camera": UNEVEN}, 4)
     mean = (0.020 + 0.015 + 0.010 + 0.025) / 4.0
     follow = 1.0 if rule == "literal" else 1.0 - math.exp(-0.001 / mean)
-    G, H = vision(COMS, V).discrete(0.001)
+    G, H = make_vision_model(COMS, V).discretise(0.001)
     G_a = np.zeros((6, 6))  # (13)
     G_a[:4, :4] = G
     G_a[4, 2] = G_a[5, 3] = follow

@@ -5,7 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.estimators.core.layers import CALM, CHANGED, GUSTY, LEAST, interact, mix
+from sideslip.estimators.core.layers import (
+    CALM,
+    CHANGED,
+    GUSTY,
+    MIN_LOG_WEIGHT,
+    compute_mixture,
+    run_imm_step,
+)
 
 from .test_tyres import CHANGED as CHANGE
 from .test_tyres import SETTLED, built, drives, squares
@@ -21,11 +28,11 @@ def test_merging_leaves_the_mixture_as_it_is() -> None:
     filter_.run(log)
     members = filter_.filters[1:]
     members.burst, members.spread = 0.0, 0.0
-    members.weight[:] = [0.0, LEAST, -0.5, -1.0]
-    mix(filter_.filters)
+    members.weight[:] = [0.0, MIN_LOG_WEIGHT, -0.5, -1.0]
+    compute_mixture(filter_.filters)
     x, P, total = filter_.x, filter_.P, np.exp(members.weight).sum()
-    interact(filter_.filters)
-    mix(filter_.filters)
+    run_imm_step(filter_.filters)
+    compute_mixture(filter_.filters)
     assert np.exp(members.weight).sum() == pytest.approx(total, rel=1e-12)
     np.testing.assert_allclose(filter_.x, x, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(filter_.P, P, rtol=1e-9, atol=1e-12 * np.abs(P).max())
@@ -38,7 +45,7 @@ def test_the_likeliest_member_is_what_happens() -> None:
         right = 0
         for log, _ in made:
             filter_ = built(base, log, sudden=True)
-            record = filter_.accept(log)
+            record = filter_.prepare_record(log)
             due = record.packets[:, 2] <= record.first + until
             filter_.step(record.fast[:until], record.packets[due])
             right += 1 + int(np.argmax(filter_.filters.weight[1:])) in expected

@@ -8,7 +8,7 @@ import pytest
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator
-from sideslip.estimators.core.memory import EVERY, RECENT, WINDOW
+from sideslip.estimators.core.memory import N_RECENT, SNAPSHOT_INTERVAL, WINDOW
 from tests.estimators.simulation import CAMERA, FIG7
 
 V = FIG7.speed
@@ -35,7 +35,7 @@ def test_buffer_goes_back_as_far_as_its_window_and_no_further() -> None:
     late = make_estimator("exact-kf", sensors=sensors, speed=V, delay="buffer")
     in_time = make_estimator("exact-kf", sensors=sensors, speed=V, delay="buffer")
     now = 3 * WINDOW + 7
-    for age in (1, EVERY, WINDOW // 2, WINDOW - EVERY):
+    for age in (1, SNAPSHOT_INTERVAL, WINDOW // 2, WINDOW - SNAPSHOT_INTERVAL):
         late.reset()
         late.step(rows(now + 1), NO_PACKETS)
         late.update(sample(now - age))
@@ -56,15 +56,15 @@ def test_buffer_goes_back_as_far_as_its_window_and_no_further() -> None:
 def test_buffer_refuses_what_is_older_than_a_sample_it_had_to_give_up() -> None:
     """More samples than there is room for: none is ever left out of what is told again."""
     filter_ = make_estimator("exact-kf", sensors={"gps": SlowSensor(0.2)}, speed=V, delay="buffer")
-    packets = [sample(k) for k in range(100, 100 + 2 * RECENT)]
+    packets = [sample(k) for k in range(100, 100 + 2 * N_RECENT)]
     filter_.run(Record(rows(300), np.array(packets)))
     before = filter_.x
-    filter_.update(sample(100 + RECENT - 1 - EVERY))
+    filter_.update(sample(100 + N_RECENT - 1 - SNAPSHOT_INTERVAL))
     assert filter_.refused == 1
     np.testing.assert_array_equal(filter_.x, before)
     filter_.update(sample(100))  # it was used; that is forgotten, but not that it was
     assert filter_.refused == 2
-    filter_.update(sample(120 + RECENT + EVERY))
+    filter_.update(sample(120 + N_RECENT + SNAPSHOT_INTERVAL))
     assert filter_.duplicates == 1
     filter_.update(sample(250))
     assert filter_.refused == 2

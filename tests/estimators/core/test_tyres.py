@@ -11,12 +11,12 @@ import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.envs import Log
 from sideslip.envs.record import PACKET
-from sideslip.envs.vehicle.tyres import FIALA, Tyre, lateral_forces
+from sideslip.envs.vehicle.tyres import FIALA, Tyre, compute_lateral_forces
 from sideslip.estimators import Estimator, make_estimator
-from sideslip.estimators.analysis.bound import bound
-from sideslip.estimators.core.layers import respawn
-from sideslip.estimators.core.tyres import axle_force
-from sideslip.estimators.design.assemble import HAZARD, RESPAWN
+from sideslip.estimators.analysis.bound import compute_error_bound
+from sideslip.estimators.core.layers import replace_least_likely
+from sideslip.estimators.core.tyres import compute_axle_force
+from sideslip.estimators.design.assemble import HAZARD, REPLACE_TIME
 
 assert sideslip.__version__
 LINEAR: dict[str, Any] = {
@@ -68,17 +68,19 @@ def test_the_law_is_the_plants_and_its_slopes_are_differences(
     C, F_z = 24000.0, 4000.0
     for alpha in (-0.3, -0.02, -0.001, 0.004, 0.05, 0.2):
         at = (alpha, factor, 1.0 / friction)
-        force, *slopes = axle_force(C, F_z, *at)
+        force, *slopes = compute_axle_force(C, F_z, *at)
         tyre = Tyre(alpha, friction * F_z / 2, C * factor / 2 / (3.0 * friction * F_z / 2))
-        pair = lateral_forces(tyre, tyre, tyre, tyre, FIALA, 0)
+        pair = compute_lateral_forces(tyre, tyre, tyre, tyre, FIALA, 0)
         assert force == pytest.approx(pair[0] + pair[1], rel=1e-12)
         whole = abs(alpha) * C * factor / (3.0 * F_z * friction)
         for i, slope in enumerate(slopes):
             step = 1e-6 * (np.arange(3) == i)
-            ahead, back = (axle_force(C, F_z, *(np.array(at) + s))[0] for s in (step, -step))
+            ahead, back = (
+                compute_axle_force(C, F_z, *(np.array(at) + s))[0] for s in (step, -step)
+            )
             if whole < 0.85 or i == 2:  # where it slides the slope by slip is kept above zero
                 assert slope == pytest.approx((ahead - back) / 2e-6, rel=1e-5, abs=1e-3)
-    assert axle_force(C, F_z, 0.1, factor, 0.0)[0] == pytest.approx(C * factor * 0.1)
+    assert compute_axle_force(C, F_z, 0.1, factor, 0.0)[0] == pytest.approx(C * factor * 0.1)
 
 
 def test_with_known_tyres_it_is_the_linear_filter() -> None:
@@ -101,7 +103,9 @@ def test_unknown_tyres_cost_a_tenth_and_not_a_factor_of_five() -> None:
         ours.append(error)
         nees.append(consistent)
         nominal.append(squares(built(base, log, "exact-kf"), log)[0])
-        least = bound(truth, record=log.record, sensors=log.slow, speed=base.held_speed)
+        least = compute_error_bound(
+            truth, record=log.record, sensors=log.slow, speed=base.held_speed
+        )
         best.append(np.mean(least[SETTLED:] ** 2))
     assert np.sqrt(np.mean(ours) / np.mean(best)) < 1.25
     assert np.sqrt(np.mean(nominal) / np.mean(best)) > 3.0
@@ -135,7 +139,7 @@ def test_what_a_member_remembers_of_its_tyres_is_forgotten_too() -> None:
     """Or a late sample, for which the past is filtered anew, brings them back."""
     base, ((log, _), *_) = drives(1)
     filter_ = built(base, log, members=2, delay="buffer")
-    record = filter_.accept(log)
+    record = filter_.prepare_record(log)
     filter_.reset(log.slow, record.first)
     due = record.packets[:, PACKET.arrived] <= record.first + 4500
     filter_.step(record.fast[:4501], record.packets[due])
@@ -149,9 +153,9 @@ def test_a_member_begins_anew_at_the_odds_of_a_change_since_the_last_one() -> No
     filter_.run(log)
     weight = filter_.filters.weight
     weight[1:] = [-1.0, 2.0, -9.0]
-    respawn(filter_.filters)
+    replace_least_likely(filter_.filters)
     assert weight[1:3].tolist() == [-3.0, 0.0]
-    assert np.exp(weight[3]) == pytest.approx(HAZARD * RESPAWN)
+    assert np.exp(weight[3]) == pytest.approx(HAZARD * REPLACE_TIME)
 
 
 def test_no_member_of_a_bank_is_another_s_twin() -> None:
@@ -212,7 +216,7 @@ def test_a_bank_step_by_step_and_from_a_snapshot_is_the_same(options: dict[str, 
     base, ((log, _), *_) = drives(1, **CHANGED)
     whole, parts = built(base, log, **options), built(base, log, **options)
     expected = whole.run(log).x
-    record = parts.accept(log)
+    record = parts.prepare_record(log)
     ends = np.searchsorted(record.packets[:, PACKET.arrived], record.ticks, "right")
     start = 0
     for k in range(0, 5000, 7):

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.papers.ledger.filters import tuned_for_paper
+from sideslip.benchmarks.papers.ledger.filters import get_paper_tuning
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.vehicle import COMS
 from sideslip.estimators import UnobservableWarning, make_estimator
-from sideslip.estimators.design.error_map import error_map, spectral_radius
-from sideslip.estimators.design.periodic import design
+from sideslip.estimators.design.error_map import compute_error_map, spectral_radius
+from sideslip.estimators.design.periodic import design_gains
 from sideslip.estimators.estimator import CHECKED_SPEEDS
 from tests.estimators.simulation import CAMERA, FIG6, GPS, Drive, simulate
 
@@ -65,8 +65,8 @@ def test_the_error_map_is_what_the_compiled_filter_does() -> None:
         filter_ = make_estimator(name, vehicle=COMS, sensors=sensors, speed=7.0)
         filter_.P  # noqa: B018  designs the table
         f, schedule = filter_.filters[0], filter_._schedules[0]
-        table, there = design(f, schedule, 7.0, filter_.config)
-        M = error_map(there, table, schedule)
+        table, there = design_gains(f, schedule, 7.0, filter_.config)
+        M = compute_error_map(there, table, schedule)
         N, n = int(f.total), int(f.n)
         cycle = schedule.cycle
         rows = np.zeros((5 * cycle, FAST_WIDTH))
@@ -116,7 +116,7 @@ def test_a_gyro_bias_drives_dakf_off() -> None:
     bias = np.radians(0.05)
     log = simulate(still, {"gps": GPS}, 0, gyro_bias=bias, disturbed=False, quiet=True)
     common: dict[str, Any] = {"vehicle": FIG6.told, "sensors": log.slow, "speed": still.speed}
-    tuned = {name: dict(tuned_for_paper(name)) for name in ("dakf", "course-kf")}
+    tuned = {name: dict(get_paper_tuning(name)) for name in ("dakf", "course-kf")}
     tuned["dakf"]["q_psi"] = 1e-8  # psi is gamma's integral
     dakf, three = (
         make_estimator(name, **common, **options).run(log)["beta"]
@@ -163,7 +163,7 @@ def test_a_filter_is_checked_with_the_rows_of_the_speed() -> None:
         maps = []
         for each in (anywhere, alone):
             schedule = each._schedules[0]
-            table, there = design(each.filters[0], schedule, speed, each.config)
-            maps.append(error_map(there, table, schedule))
+            table, there = design_gains(each.filters[0], schedule, speed, each.config)
+            maps.append(compute_error_map(there, table, schedule))
         np.testing.assert_allclose(maps[0], maps[1], rtol=1e-9, atol=1e-12)
         assert alone.spectral_radius < 1.0

@@ -10,8 +10,13 @@ from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.sensors.slow import CAMERA, GPS, SLOW, SLOW_NAMES
 from sideslip.estimators import make_estimator
 from sideslip.estimators.design import measurements
-from sideslip.estimators.design.measurements import MEASUREMENTS, Measurement, Row, packet_column
-from sideslip.estimators.design.models import states_for
+from sideslip.estimators.design.measurements import (
+    MEASUREMENTS,
+    Measurement,
+    MeasurementRow,
+    find_packet_column,
+)
+from sideslip.estimators.design.models import select_states
 from tests.estimators.simulation import Drive, simulate
 
 LATE = SlowSensor(0.1, (0.050,))
@@ -23,8 +28,8 @@ def log() -> Any:
     log = simulate(Drive(duration=3.0), {"gps": LATE}, 2)
     packets, rng = log.record.packets, np.random.default_rng(0)
     packets[:, PACKET.value] += 2.0
-    packets[:, packet_column("gps", "hdop")] = rng.uniform(0.5, 6.0, len(packets))
-    packets[:, packet_column("gps", "satellites")] = rng.integers(2, 12, len(packets))
+    packets[:, find_packet_column("gps", "hdop")] = rng.uniform(0.5, 6.0, len(packets))
+    packets[:, find_packet_column("gps", "satellites")] = rng.integers(2, 12, len(packets))
     wheels = [FAST.wheel_left, FAST.wheel_right]
     log.record.fast[:, wheels] *= np.linspace(0.5, 2.0, len(log.record.fast))[:, None]
     return log
@@ -53,9 +58,9 @@ def test_a_gps_in_the_cameras_place_gives_the_same_bits(
 
 def test_a_sensor_is_what_its_entry_says(log: Any, monkeypatch: Any) -> None:
     """A lane offset alone in the GPS's place: its states, its noise, no fix, angle or 1/V."""
-    lane = Measurement((Row(("y_l",), "y_l", 0.02),))
+    lane = Measurement((MeasurementRow(("y_l",), "y_l", 0.02),))
     monkeypatch.setitem(MEASUREMENTS, "gps", lane)
-    assert states_for(("gps",)) == ("beta", "gamma", "psi", "y_l")
+    assert select_states(("gps",)) == ("beta", "gamma", "psi", "y_l")
     filter_ = make_estimator("exact-kf", sensors={"gps": LATE}, speed=7.0, y_l_noise=0.3)
     f = filter_.filters[0]
     np.testing.assert_array_equal(f.C[GPS, 0, : f.n], [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
@@ -63,7 +68,7 @@ def test_a_sensor_is_what_its_entry_says(log: Any, monkeypatch: Any) -> None:
     assert not f.heading_fix[GPS] and not f.angle[GPS].any() and not f.noise_over_speed[GPS].any()
     packets, quiet = log.record.packets, [FAST.gyro, FAST.steer]
     packets[:, PACKET.value], log.record.fast[:, quiet] = 3.0, 0.0
-    packets[:, packet_column("gps", "satellites")] = 12.0
+    packets[:, find_packet_column("gps", "satellites")] = 12.0
     assert filter_.run(log)["y_l"][-1] == pytest.approx(3.0, abs=0.3)
 
 
@@ -73,6 +78,6 @@ def test_every_slow_sensor_has_an_entry() -> None:
     for kind in SLOW:
         rows = MEASUREMENTS[kind.name].rows
         assert len(rows) <= len(kind.values)
-        assert states_for((kind.name,))[:2] == ("beta", "gamma")
-    assert packet_column("gps", "hdop") == PACKET.value + 4
-    assert packet_column("camera", "hdop") == 0
+        assert select_states((kind.name,))[:2] == ("beta", "gamma")
+    assert find_packet_column("gps", "hdop") == PACKET.value + 4
+    assert find_packet_column("camera", "hdop") == 0

@@ -7,16 +7,20 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from sideslip.envs.backend.decorators import plain
-from sideslip.envs.engine.packing import car_of
+from sideslip.envs.backend.decorators import as_python
+from sideslip.envs.engine.packing import make_car
 from sideslip.envs.record import FAST
 from sideslip.envs.sensors.link import SlowSensor
-from sideslip.envs.vehicle.actuators import yaw_moment
-from sideslip.envs.vehicle.linear import course, velocity_and_roll, vision
+from sideslip.envs.vehicle.actuators import compute_yaw_moment
+from sideslip.envs.vehicle.linear import (
+    make_course_model,
+    make_velocity_roll_model,
+    make_vision_model,
+)
 from sideslip.envs.vehicle.vehicle import COMS, PASSENGER_CAR
 from sideslip.estimators import make_estimator
-from sideslip.estimators.core.transition import build, discretise
-from sideslip.estimators.design.models import signals
+from sideslip.estimators.core.transition import build_model, discretise
+from sideslip.estimators.design.models import make_signals
 from tests.estimators.simulation import CAMERA, GPS
 
 STEPS = (0.001, 0.01, 0.033, 0.1, 0.2)
@@ -36,14 +40,14 @@ def model_of(name: Any, vehicle: Any, speed: Any, step: Any, sensors: Any) -> An
 @pytest.mark.parametrize("vehicle", [COMS, PASSENGER_CAR], ids=["coms", "passenger-car"])
 def test_discretisation_is_the_exact_zero_order_hold(vehicle: Any, speed: Any, step: Any) -> None:
     G, H = model_of("multirate-kf", vehicle, speed, step, {"camera": CAMERA})
-    exact_G, exact_H = vision(vehicle, speed).discrete(step)
+    exact_G, exact_H = make_vision_model(vehicle, speed).discretise(step)
     assert np.abs(G - exact_G).max() < 1e-12 * max(1.0, np.abs(exact_G).max())
     assert np.abs(H - exact_H[:, :2]).max() < 1e-12 * np.abs(exact_H).max()
 
 
 def test_below_walking_pace_the_model_stays() -> None:
     G, _ = model_of("multirate-kf", COMS, 0.0, 0.001, {"camera": CAMERA})
-    np.testing.assert_allclose(G, vision(COMS, 1.5).discrete(0.001)[0], atol=1e-13)
+    np.testing.assert_allclose(G, make_vision_model(COMS, 1.5).discretise(0.001)[0], atol=1e-13)
 
 
 def test_dakf_is_the_papers_discrete_model() -> None:
@@ -84,7 +88,7 @@ def rank(A: Any, C: Any) -> Any:
 def test_dakf_sees_four_of_five_directions() -> None:
     """The paper's IV.D claims five."""
     V = 25.0 / 3.6
-    model = course(COMS, V)
+    model = make_course_model(COMS, V)
     A = np.zeros((5, 5))
     A[:3, :3] = model.A
     A[0, 3] = A[1, 4] = 1.0
@@ -101,7 +105,7 @@ def test_dakf_sees_four_of_five_directions() -> None:
 
 
 def test_vision_sees_everything() -> None:
-    model = vision(COMS, 25.0 / 3.6)
+    model = make_vision_model(COMS, 25.0 / 3.6)
     assert rank(model.A, model.C) == 4
     assert rank(model.A, model.C[1:]) == 4  # from vision alone
     assert make_estimator("multirate-kf", sensors={"camera": CAMERA}, speed=7.0).unobservable == ()
@@ -131,9 +135,11 @@ def test_process_noise_means_the_same_at_every_tick() -> None:
 @pytest.mark.parametrize("vehicle", [COMS, PASSENGER_CAR], ids=["coms", "passenger-car"])
 def test_the_yaw_moment_of_a_fast_row_is_the_plants(vehicle: Any) -> None:
     row = np.random.default_rng(0).normal(size=len(FAST))
-    found = sum(factor * row[column] for column, factor in signals(vehicle)["N_z"])
+    found = sum(factor * row[column] for column, factor in make_signals(vehicle)["N_z"])
     torques = row[FAST.torque_left], row[FAST.torque_right]
-    assert found == pytest.approx(plain(yaw_moment)(*torques, car_of(vehicle)), rel=1e-12)
+    assert found == pytest.approx(
+        as_python(compute_yaw_moment)(*torques, make_car(vehicle)), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("turning", [0.0, 0.3, -1.2])
@@ -142,8 +148,8 @@ def test_the_second_layer_is_the_linear_model_at_every_yaw_rate(turning: float) 
     with pytest.warns(UserWarning, match="cannot see"):
         filter_ = make_estimator("double-layer", sensors={"gps": GPS}, speed=7.0)
     f = filter_.filters[1]
-    build(f, 7.0, turning)
-    model = velocity_and_roll(COMS, turning)
-    G, H = model.discrete(float(f.step))
+    build_model(f, 7.0, turning)
+    model = make_velocity_roll_model(COMS, turning)
+    G, H = model.discretise(float(f.step))
     np.testing.assert_allclose(f.G[:4, :4], G, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(f.H[:4, :2], H, rtol=1e-12, atol=1e-15)

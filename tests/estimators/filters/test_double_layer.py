@@ -9,7 +9,7 @@ from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.vehicle import COMS, GRAVITY
 from sideslip.estimators import make_estimator
-from sideslip.estimators.design.periodic import design
+from sideslip.estimators.design.periodic import design_gains
 from sideslip.estimators.design.schedule import NO_SENSOR
 from tests.estimators.filters.literal import (
     COURSE,
@@ -266,7 +266,7 @@ def test_the_two_state_observer() -> None:
     reached = np.linalg.eigvals((np.eye(2) - K @ C) @ G)
     np.testing.assert_allclose(np.sort(reached), np.sort(poles), rtol=1e-9)
     filter_ = make_estimator("lob-2", speed=V)
-    table, _ = design(filter_.filters[0], NO_SENSOR, V, filter_.config)
+    table, _ = design_gains(filter_.filters[0], NO_SENSOR, V, filter_.config)
     np.testing.assert_allclose(table[1, :2], K[:, 0], rtol=1e-9)
     x: Any = np.zeros(2)
     wanted: Any = []

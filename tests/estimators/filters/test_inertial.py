@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.engine.packing import car_of
-from sideslip.envs.scenarios.manoeuvres import scenario_from
-from sideslip.envs.vehicle.dynamics import Motion, Push, Road, derivative
-from sideslip.envs.vehicle.tyres import LINEAR, Inputs, load_of
+from sideslip.envs.engine.packing import make_car
+from sideslip.envs.scenarios.manoeuvres import make_scenario
+from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, derivative
+from sideslip.envs.vehicle.tyres import LINEAR, TyreInputs, compute_tyre_load
 from sideslip.envs.vehicle.vehicle import GRAVITY
 from sideslip.estimators import EstimateObservation, make_estimator, vector
 from tests.estimators.drives import Drives, told
@@ -26,10 +26,12 @@ STATES = ("beta", "gamma", "psi", "y_l", "phi", "phi_rate", "F_d", "N_d", "bias"
 def slope(x: Any, steer: float, F_d: float, vehicle: Any, V: float) -> Any:
     """(beta', gamma', phi', phi'', a_y) of the plant, small angles, linear tyres, rolling."""
     beta, gamma, phi, phi_rate = x
-    car = car_of(vehicle)
+    car = make_car(vehicle)
     at = Motion(V, V * beta, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, phi_rate)
-    load = load_of(Inputs(steer, 0.0, 0.0), car, 1)
-    rate = derivative(at, load, Push(F_d, 0.0), car, Road(0.0, 0.0, 1.0), 1, LINEAR, 1)
+    load = compute_tyre_load(TyreInputs(steer, 0.0, 0.0), car, 1)
+    rate = derivative(
+        at, load, DisturbanceForces(F_d, 0.0), car, RoadParams(0.0, 0.0, 1.0), 1, LINEAR, 1
+    )
     a_y = rate.v_y + V * gamma + GRAVITY * phi
     return np.array([rate.v_y / V, rate.gamma, rate.phi, rate.phi_dot, a_y])
 
@@ -57,7 +59,7 @@ RUNS = 48
 
 def test_a_bias_is_recovered_by_the_state_alone() -> None:
     """NEES of beta and gamma, and the bias within its own deviation; the plain one is far off."""
-    fig7 = scenario_from("tie-vision-fig7").replace(duration=4.0, noise={"gyro_bias": BIAS})
+    fig7 = make_scenario("tie-vision-fig7").replace(duration=4.0, noise={"gyro_bias": BIAS})
     drives = Drives(fig7)
     logs = [drives.run(seed) for seed in range(RUNS)]
     common: Any = {"vehicle": drives.vehicle, "speed": drives.speed}

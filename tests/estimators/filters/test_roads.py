@@ -9,10 +9,10 @@ import pytest
 from sideslip.envs import StabilityEnv
 from sideslip.envs.engine.layout import Z
 from sideslip.envs.record import FAST, Record, concatenate
-from sideslip.envs.scenarios.manoeuvres import scenario_from
+from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.estimators import Estimator, make_estimator
 
-WINDING = scenario_from("tie-vision-fig7").replace(road="nominal-path", duration=4.0)
+WINDING = make_scenario("tie-vision-fig7").replace(road="nominal-path", duration=4.0)
 RUNS = 24
 SETS = [("camera",), ("gps",), ("camera", "gps")]
 LATE: dict[str, Any] = {"gps": {"delays": (0.25,)}}

@@ -12,7 +12,7 @@ import numpy as np
 
 from sideslip.envs import Log, StabilityEnv
 from sideslip.envs.record import PACKET, Fast, concatenate
-from sideslip.envs.scenarios.manoeuvres import scenario_from
+from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.envs.vehicle.vehicle import Vehicle
 from sideslip.estimators import FILTERS, UnobservableWarning, make_estimator
 
@@ -31,7 +31,7 @@ Table = tuple[list[str], np.ndarray]
 def drive() -> tuple[Log, Vehicle]:
     """5 s that excite every model, and the vehicle that filters are told: a slalom whose speed
     wanders, tyres and roll model 30 % off, camera and GPS."""
-    scenario = scenario_from("double-layer-fig9").replace(duration=5.0)
+    scenario = make_scenario("double-layer-fig9").replace(duration=5.0)
     env = StabilityEnv("fusion", scenario, control_period=1000)
     env.reset(seed=4)
     records, over = [env.record], False

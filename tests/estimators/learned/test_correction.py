@@ -13,16 +13,16 @@ from sideslip.envs.record import FAST, Log
 from sideslip.envs.sensors.slow import SENSOR_SETS
 from sideslip.envs.vehicle.vehicle import COMS
 from sideslip.estimators import EstimateObservation, make_estimator, vector
-from sideslip.estimators.learned.correction import Learned, learned
+from sideslip.estimators.learned.correction import LearnedEstimator, learned
 from sideslip.estimators.learned.files import (
     FAST_INPUTS,
     LAGS,
     Correction,
     CorrectionCard,
+    list_shipped,
     load_correction,
-    shipped,
 )
-from sideslip.estimators.learned.kernel import PACE, RING
+from sideslip.estimators.learned.kernel import FRAME_TICKS, RING_FRAMES
 from sideslip.estimators.learned.network import Network
 
 ID = "sideslip/YawFusion-v0"
@@ -60,7 +60,7 @@ def filtered(log: Log, source: Any, **options: Any) -> tuple[Any, Any]:
 
 def frame(fast: Any, own: Any, tick: int) -> Any:
     """Written out slowly: means over a pace, the filter's states at its end, the car's mass."""
-    rows = fast[max(tick - PACE + 1, 0) : tick + 1]
+    rows = fast[max(tick - FRAME_TICKS + 1, 0) : tick + 1]
     v = rows[:, [FAST.wheel_left, FAST.wheel_right]].mean(axis=1)
     rate = rows[:, FAST.accel_y] / np.maximum(v, 1.0) - rows[:, FAST.gyro]
     means = [rows[:, getattr(FAST, name)].mean() for name in FAST_INPUTS]
@@ -82,17 +82,17 @@ def test_it_is_the_network_on_frames_of_the_last_tenths_of_a_second(log: Log) ->
     fast = log.record.fast
     frames, shift, deviation = [], 0.0, 0.0
     for tick in range(len(fast)):
-        if tick % PACE == 0:
+        if tick % FRAME_TICKS == 0:
             frames.append(frame(fast, own, tick))
             shift, deviation = corrected(frames)
         assert found["beta"][tick] == pytest.approx(own["beta"][tick] + shift, abs=1e-11), tick
         assert found.std[tick, 0] == pytest.approx(deviation, rel=1e-9)
-    assert len(frames) > RING
+    assert len(frames) > RING_FRAMES
     assert np.array_equal(found.x[:, 1:], own.x[:, 1:])
     assert np.array_equal(found.std[:, 1:], own.std[:, 1:])
 
 
-@pytest.mark.parametrize("name", ["", *shipped()])
+@pytest.mark.parametrize("name", ["", *list_shipped()])
 def test_torch_computes_what_numpy_does(name: str) -> None:
     torch = pytest.importorskip("torch")
     network = (load_correction(name) if name else correction()).network
@@ -122,7 +122,7 @@ def test_the_estimate_of_a_tick_is_the_same_for_every_control_period(
         assert np.array_equal(np.sqrt(np.diag(built.P)), every.std[end - 1])
 
 
-@pytest.mark.parametrize("name", shipped())
+@pytest.mark.parametrize("name", list_shipped())
 @pytest.mark.parametrize("control_period", [1, 7, 10])
 def test_an_observation_is_what_numpy_makes_of_the_estimate(name: str, control_period: int) -> None:
     """One compiled call takes the step and writes: here the filter's twin takes it, and NumPy."""
@@ -189,7 +189,7 @@ def test_a_number_that_is_not_finite_drops_the_correction_and_its_history(log: L
         without = np.array_equal(estimator.x, own.x[tick])
         assert without == (510 <= tick < 520), tick
         assert np.isfinite(estimator.x).all() and np.isfinite(estimator.P).all()
-        if tick >= 520 and tick % PACE == 0:
+        if tick >= 520 and tick % FRAME_TICKS == 0:
             frames.append(frame(broken, own, tick))
             shift, _ = corrected(frames)
             assert estimator.x[0] == pytest.approx(own["beta"][tick] + shift, abs=1e-11), tick
@@ -206,9 +206,9 @@ def test_the_sum_varies_with_no_other_state(log: Log) -> None:
 def test_what_it_was_not_trained_on_is_refused() -> None:
     base = make_estimator("exact-kf", sensors=SENSORS)
     with pytest.raises(ValueError, match=r"was trained on joint with beta.* this is exact-kf"):
-        Learned(base, correction("joint"), COMS)
+        LearnedEstimator(base, correction("joint"), COMS)
     with pytest.raises(ValueError, match=r"with beta, front_tyres and ticks.*this is exact-kf"):
-        Learned(base, correction(states=("beta", "front_tyres")), COMS)
+        LearnedEstimator(base, correction(states=("beta", "front_tyres")), COMS)
     with pytest.raises(ValueError, match=r"ticks of 0.001 s.*ticks of 0.01 s"):
         make_estimator(FACTORY, sensors={"gps": SENSORS["gps"]}, dt=0.01)
     with pytest.raises(TypeError, match="unknown option"):

@@ -13,9 +13,9 @@ from safetensors.numpy import save_file
 from sideslip.estimators.learned.files import (
     Correction,
     CorrectionCard,
+    list_shipped,
     load_correction,
     save_correction,
-    shipped,
 )
 from tests.estimators.learned.test_correction import correction
 
@@ -31,7 +31,7 @@ def test_what_is_saved_is_what_is_loaded(tmp_path: Path) -> None:
     assert np.array_equal(found.network(x), written.network(x))
 
 
-@pytest.mark.parametrize("name", shipped())
+@pytest.mark.parametrize("name", list_shipped())
 def test_a_shipped_correction_has_a_card_that_says_how_it_was_made(name: str) -> None:
     card = load_correction(name).card
     assert card.base == name and f"train-estimator {name}" in card.command

@@ -13,7 +13,7 @@ from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.vector.batch import BatchEstimator
 from sideslip.estimators.vector.make import make_batch
-from sideslip.estimators.wrappers.arguments import Setup
+from sideslip.estimators.wrappers.arguments import EstimatorSpec
 from tests.estimators.simulation import CAMERA, FIG7, GPS, KMH, simulate
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
@@ -66,7 +66,7 @@ def same_bits(batch: BatchEstimator, singles: list[Any]) -> None:
 def test_every_row_is_the_filter_alone(name: Any, speed: Any) -> None:
     """Own phases, own noise, own car; gains that are missing are made on the way."""
     logs = drives(3, *home(name))
-    cars = [COMS, COMS.scaled(0.9), COMS]
+    cars = [COMS, COMS.scale_stiffness(0.9), COMS]
     told = [log.slow for log in logs]
     batch = make_batch(name, 3, vehicle=cars, sensors=told, speed=speed)
     singles = [
@@ -122,7 +122,7 @@ def test_a_row_without_ticks_and_packets_stands_still() -> None:
 
 
 def test_rows_that_are_told_the_same_share_their_gains() -> None:
-    cars = [COMS, COMS.scaled(0.9), COMS, COMS.scaled(0.9)]
+    cars = [COMS, COMS.scale_stiffness(0.9), COMS, COMS.scale_stiffness(0.9)]
     batch = make_batch("multirate-kf", 4, vehicle=cars, sensors={"camera": CAMERA}, speed=SPEED)
     first, other = batch[0].gains, batch[1].gains
     assert np.shares_memory(first, batch[2].gains) and np.shares_memory(other, batch[3].gains)
@@ -136,7 +136,7 @@ def test_a_row_that_is_told_something_new_is_the_filter_for_that() -> None:
     later = simulate(dataclasses.replace(FIG7, duration=0.3), {"camera": uneven}, 9)
     batch = make_batch("multirate-kf", 2, sensors=[log.slow for log in logs], speed=SPEED)
     feed(batch, logs, 10, 0, 150)
-    batch.configure([1], [Setup(COMS, later.slow, SPEED)])
+    batch.configure([1], [EstimatorSpec(COMS, later.slow, SPEED)])
     batch.reset([False, True])
     fast, packets = later.record.fast[:100], later.record.packets
     for k in range(0, 100, 10):

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS
-from sideslip.envs.backend.eights import whole_lines
+from sideslip.envs.backend.eights import pad_to_cache_line
 from sideslip.envs.backend.simd import LANES
 from sideslip.envs.record import FAST, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
-from sideslip.estimators.core.memory import FILTER, OFTEN, SMALL, WIDTH
+from sideslip.estimators.core.memory import FILTER, N_SMALL, N_TOTAL, X_OFFSET
 from sideslip.estimators.vector import kernel
-from sideslip.estimators.vector.lanes import BLOCK, blocks
+from sideslip.estimators.vector.lanes import BLOCK, make_blocks
 from sideslip.estimators.vector.make import make_batch
 from tests.estimators.simulation import CAMERA, GPS
 from tests.estimators.vector.test_batch import drives, feed, home, same_bits
@@ -49,7 +49,7 @@ def same_as_alone(
     name: str, n: int, speed: float | None, logs: list[Any] | None = None, **options: Any
 ) -> None:
     logs = troubled(name) if logs is None else logs
-    cars = [COMS.scaled(1.0 - 0.1 * (i % 2)) for i in range(COUNT)]
+    cars = [COMS.scale_stiffness(1.0 - 0.1 * (i % 2)) for i in range(COUNT)]
     told = [log.slow for log in logs]
     batch = make_batch(name, COUNT, vehicle=cars, sensors=told, speed=speed, **options)
     feed(batch, logs, n)
@@ -151,9 +151,9 @@ def test_which_filters_are_in_lanes() -> None:
         assert (batch._lanes["shaped"][0] == 1).sum() == there
         assert (batch._lanes["here"][0] == 1.0).sum() == there
     few = make_batch(
-        "exact-kf", kernel._FEW - 1, sensors={"camera": logs[0].slow["camera"]}, speed=7.0
+        "exact-kf", kernel._MIN_LANES - 1, sensors={"camera": logs[0].slow["camera"]}, speed=7.0
     )
-    feed(few, logs[: kernel._FEW - 1], 10)
+    feed(few, logs[: kernel._MIN_LANES - 1], 10)
     assert (few._lanes["model_speed"] == 0.0).all()
 
 
@@ -173,7 +173,7 @@ def test_a_capture_leaves_its_tick_in_lanes() -> None:
 
 def test_blocks_and_records_lie_on_cache_lines() -> None:
     """A copy's, too, and next to each other what is fetched together."""
-    made, batch = blocks(33), make_batch("exact-kf", 3, sensors={"camera": CAMERA}, speed=7.0)
+    made, batch = make_blocks(33), make_batch("exact-kf", 3, sensors={"camera": CAMERA}, speed=7.0)
     assert len(made) == -(-33 // LANES) and made.dtype == BLOCK
     copies = [batch, copy.deepcopy(batch), pickle.loads(pickle.dumps(batch))]
     for array in (made, *(each.filters for each in copies), *(each._lanes for each in copies)):
@@ -184,15 +184,15 @@ def test_blocks_and_records_lie_on_cache_lines() -> None:
     assert FILTER.names is not None and FILTER.fields is not None
     places = [FILTER.fields[name] for name in FILTER.names[FILTER.names.index("x") :]]
     (x, P), behind = (each[1] // 8 for each in places[:2]), places[2:]
-    assert x == OFTEN and P == OFTEN + WIDTH
+    assert x == X_OFFSET and P == X_OFFSET + N_TOTAL
     small = list(itertools.takewhile(lambda each: each[0].itemsize <= 64 * 8, behind))
-    assert small[-1][1] + small[-1][0].itemsize == 8 * (P + WIDTH * WIDTH + SMALL)
+    assert small[-1][1] + small[-1][0].itemsize == 8 * (P + N_TOTAL * N_TOTAL + N_SMALL)
     assert len(small) > 80
 
 
 def test_a_dtype_is_whole_lines_whatever_its_fields_are() -> None:
     """They are many as a filter's are, or few; what is filled up has no name of theirs."""
     for count in (1, 7, 8, 9):
-        made = whole_lines([("rest", np.float64, (count,)), ("x", np.int64)])
+        made = pad_to_cache_line([("rest", np.float64, (count,)), ("x", np.int64)])
         assert made.itemsize == 64 * -(-(count + 1) // 8) and made.names is not None
         assert made.names[:2] == ("rest", "x")

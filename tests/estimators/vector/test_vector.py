@@ -69,7 +69,7 @@ def test_other_control_periods(control_period: Any, mode: Any) -> None:
 def test_rows_may_be_different_cars(mode: Any) -> None:
     """Own nominal vehicle, own plant with a held speed, own delays: filters of three designs."""
     changes: list[dict[str, Any]] = [
-        {"nominal": COMS.scaled(0.8).to_dict()},
+        {"nominal": COMS.scale_stiffness(0.8).to_dict()},
         {"scenario": {"base": "tie-vision-fig7", "duration": 0.15}},
         {"scenario": {"base": "uneven-delay-fig5", "duration": 0.1}},
     ]
@@ -109,7 +109,7 @@ def test_a_masked_reset_leaves_the_other_rows_alone(mode: Any) -> None:
 def test_several_estimators_stand_side_by_side(mode: Any) -> None:
     layers: list[dict[str, Any]] = [
         {"estimator": "bicycle-kf", "name": "plain", "outputs": ["gamma"]},
-        {"estimator": "exact-kf", "std": False, "vehicle": COMS.scaled(1.2)},
+        {"estimator": "exact-kf", "std": False, "vehicle": COMS.scale_stiffness(1.2)},
         {"estimator": "multirate-kf", "name": "last", "outputs": ["psi"]},
     ]
     alone, together = pair(VISION, 2, mode, layers)
@@ -146,7 +146,7 @@ def test_the_spec_builds_environments_wrapped_one_by_one(count: Any) -> None:
     made = gym.make_vec(VISION, num_envs=count, vectorization_mode="sync", vector_kwargs=how)
     options = {"q_beta": 1e-3}
     together: Any = EstimateObservation(
-        made, "multirate-kf", outputs=("beta",), vehicle=COMS.scaled(0.8), options=options
+        made, "multirate-kf", outputs=("beta",), vehicle=COMS.scale_stiffness(0.8), options=options
     )
     text = together.spec.to_json()
     json.loads(text)
@@ -170,7 +170,7 @@ def test_copies_continue_bit_for_bit() -> None:
 
 
 class Native(VectorEnv[Any, Any, Any]):
-    """A vector env that offers its records as arrays of all cars, as `records.Batched` says."""
+    """A vector env that offers its records as arrays of all cars, as `records.BatchedEnv` says."""
 
     held = ("rows", "packets", "ticks_done", "delivered")
 

@@ -12,8 +12,8 @@ from gymnasium.envs.registration import EnvSpec
 
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.harness.drives import Drive, filter_arguments
-from sideslip.benchmarks.tuning.task import make_task, squares
+from sideslip.benchmarks.harness.drives import LoggedEpisode, make_filter_arguments
+from sideslip.benchmarks.tuning.task import compute_squares, make_estimator_tuning
 from sideslip.envs import COMS
 from sideslip.estimators import (
     EstimateObservation,
@@ -128,7 +128,11 @@ def test_it_gets_the_whole_record_and_what_the_env_offers() -> None:
     """Every tick once and in order, every packet, the clocks drawn at the reset; as copies."""
     env: Any = gym.make(VISION, camera={"phase": None}, control_period=7)
     wrapped: Any = EstimateObservation(
-        env, Constant, outputs=["gamma", "mu"], vehicle=COMS.scaled(0.8), options={"gain": 3}
+        env,
+        Constant,
+        outputs=["gamma", "mu"],
+        vehicle=COMS.scale_stiffness(0.8),
+        options={"gain": 3},
     )
     base, records = env.unwrapped, []
     for seed in (1, 2):
@@ -147,7 +151,7 @@ def test_it_gets_the_whole_record_and_what_the_env_offers() -> None:
     own.calls[-1][0][:] = np.nan
     assert np.isfinite(base.rows).all()
     told = own.arguments
-    assert told["vehicle"] == COMS.scaled(0.8) and told["gain"] == 3
+    assert told["vehicle"] == COMS.scale_stiffness(0.8) and told["gain"] == 3
     assert (told["dt"], told["speed"]) == (base.dt, base.held_speed)
 
 
@@ -229,11 +233,13 @@ def test_it_can_be_tuned() -> None:
     """By its own options; a smaller error of the sideslip angle is a smaller number."""
     ukf()
     search: dict[str, Any] = {"gyro": None}
-    task = make_task(UKF, "tie-vision-fig7", search=search, seeds=1)
+    task = make_estimator_tuning(UKF, "tie-vision-fig7", search=search, seeds=1)
     assert (task.unit, task.env_id) == ("rad", VISION)
     log = rollout(gym.make(VISION, **FIG7), seed=3, options={"duration": 2.2}).log
     base: Any = gym.make(VISION, **FIG7).unwrapped
-    drives = [Drive(log, filter_arguments(base))]
-    assert squares(task, drives, {"gyro": 0.005}) < squares(task, drives, {"gyro": 1.0})
+    drives = [LoggedEpisode(log, make_filter_arguments(base))]
+    assert compute_squares(task, drives, {"gyro": 0.005}) < compute_squares(
+        task, drives, {"gyro": 1.0}
+    )
     with pytest.raises(ValueError, match="has no process noise to search; name the options"):
-        make_task(UKF, "tie-vision-fig7", seeds=1)
+        make_estimator_tuning(UKF, "tie-vision-fig7", seeds=1)

@@ -158,7 +158,7 @@ def test_one_json_string_names_env_and_estimator() -> None:
         gym.make(VISION, **FIG7),
         "multirate-kf",
         outputs=("beta",),
-        vehicle=COMS.scaled(0.8),
+        vehicle=COMS.scale_stiffness(0.8),
         options={"q_beta": 1e-3},
         name="mine",
     )

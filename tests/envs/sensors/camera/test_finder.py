@@ -11,43 +11,45 @@ import pytest
 pytest.importorskip("cv2")
 import cv2
 
-from sideslip.envs.backend.decorators import plain
-from sideslip.envs.sensors.camera import View, lane_offset
-from sideslip.envs.sensors.camera.consensus import Place, search
+from sideslip.envs.backend.decorators import as_python
+from sideslip.envs.sensors.camera import FieldOfView, compute_lane_offset
+from sideslip.envs.sensors.camera.consensus import CameraMount, search_starts
 from sideslip.envs.sensors.camera.finder import Lane, LaneFinder
 from sideslip.envs.sensors.camera.pinhole import Pinhole
-from sideslip.envs.sensors.camera.road_image import Appearance, Painter, Scene
+from sideslip.envs.sensors.camera.road_image import Appearance, RoadRenderer, RoadScene
 from sideslip.envs.vehicle.dynamics import Motion
 
-VIEW = View(0.35, 4.0)  # of the scored scenarios
+VIEW = FieldOfView(0.35, 4.0)  # of the scored scenarios
 CAMERA = Pinhole()
 FINDER = LaneFinder(CAMERA)
-CLEAR = Painter(CAMERA, Appearance(), FINDER.rows)
+CLEAR = RoadRenderer(CAMERA, Appearance(), FINDER.rows)
 
 
-def truth(scene: Scene) -> tuple[float, float]:
+def truth(scene: RoadScene) -> tuple[float, float]:
     """(psi, y_l) as the analytic camera has them, without noise."""
     still = (0.0,) * 3
     motion = Motion(*still, scene.psi, 0.0, 0.0, scene.s, scene.y, 0.0)
-    return scene.psi, plain(lane_offset)(motion, scene.road, CAMERA.preview)
+    return scene.psi, as_python(compute_lane_offset)(motion, scene.road, CAMERA.preview)
 
 
-def errors(scenes: Iterable[Scene], painter: Painter = CLEAR) -> tuple[float, float, list[Lane]]:
+def errors(
+    scenes: Iterable[RoadScene], painter: RoadRenderer = CLEAR
+) -> tuple[float, float, list[Lane]]:
     """(rms of psi in degrees, rms of y_l in cm, the lanes); what is lost counts for nothing."""
     lanes, rest = [], []
     for seed, scene in enumerate(scenes):
-        lanes.append(FINDER.find(painter.picture(scene, seed)))
+        lanes.append(FINDER.find(painter.render_picture(scene, seed)))
         if lanes[-1].quality > 0.0:
             rest.append(np.subtract(lanes[-1][:2], truth(scene)))
     psi, y_l = np.sqrt(np.mean(np.square(rest), axis=0))
     return np.degrees(psi), 100.0 * y_l, lanes
 
 
-def draws(count: int, bend: float = 0.0, view: View = VIEW) -> list[Scene]:
+def draws(count: int, bend: float = 0.0, view: FieldOfView = VIEW) -> list[RoadScene]:
     rng = np.random.default_rng(5)
     low = np.array([-view.heading, -view.offset, 0.0, -bend])
     return [
-        Scene.bend(kappa, psi=psi, y=y, s=s)
+        RoadScene.make_bend(kappa, psi=psi, y=y, s=s)
         for psi, y, s, kappa in rng.uniform(
             low, [view.heading, view.offset, 500.0, bend], (count, 4)
         )
@@ -57,7 +59,7 @@ def draws(count: int, bend: float = 0.0, view: View = VIEW) -> list[Scene]:
 def test_over_the_field_of_view_within_a_fifth_of_a_degree_and_two_centimetres() -> None:
     headings, offsets = np.linspace(-1.0, 1.0, 7), np.linspace(-1.0, 1.0, 7)
     grid = [
-        Scene(psi=VIEW.heading * a, y=VIEW.offset * b, s=3.0 * k)
+        RoadScene(psi=VIEW.heading * a, y=VIEW.offset * b, s=3.0 * k)
         for k, (a, b) in enumerate(product(headings, offsets))
     ]
     for scenes in (grid, draws(60)):
@@ -67,7 +69,7 @@ def test_over_the_field_of_view_within_a_fifth_of_a_degree_and_two_centimetres()
 
 
 def test_bends_are_found_with_their_curvature() -> None:
-    scenes = draws(60, 0.02, View(0.15, 1.2))
+    scenes = draws(60, 0.02, FieldOfView(0.15, 1.2))
     psi, y_l, lanes = errors(scenes)
     assert psi < 0.2 and y_l < 2.0 and all(lane.quality > 0.5 for lane in lanes)
     kappa = [scene.road.curvature for scene in scenes]
@@ -83,20 +85,22 @@ def test_bends_are_found_with_their_curvature() -> None:
     ],
 )
 def test_it_degrades_gently(look: Appearance, psi: float, y_l: float) -> None:
-    found = errors(draws(40), Painter(CAMERA, look, FINDER.rows))
+    found = errors(draws(40), RoadRenderer(CAMERA, look, FINDER.rows))
     assert found[0] < psi and found[1] < y_l
     assert np.mean([lane.quality > 0.0 for lane in found[2]]) > 0.9
 
 
 def test_pitch_and_roll_are_told_from_the_lane() -> None:
-    for scene in draws(10, view=View(0.1, 1.0)):
-        assert FINDER.find(CLEAR.picture(scene)).quality > 0.0 and FINDER.fit is not None
+    for scene in draws(10, view=FieldOfView(0.1, 1.0)):
+        assert FINDER.find(CLEAR.render_picture(scene)).quality > 0.0 and FINDER.fit is not None
         assert abs(FINDER.fit.pitch) < radians(0.1)  # a tilt that is wrong would be seen here
     for pitch in (-0.015, 0.015):
-        lane = FINDER.find(CLEAR.picture(Scene(psi=0.05, y=0.3, pitch=pitch)))
+        lane = FINDER.find(CLEAR.render_picture(RoadScene(psi=0.05, y=0.3, pitch=pitch)))
         assert FINDER.fit is not None and FINDER.fit.pitch == pytest.approx(pitch, abs=2e-3)
         assert lane.y_l == pytest.approx(0.3 + 5.135 * 0.05, abs=0.02)
-    lane = FINDER.find(CLEAR.picture(Scene(y=1.5, roll=0.02)))  # in its middle nothing shows it
+    lane = FINDER.find(
+        CLEAR.render_picture(RoadScene(y=1.5, roll=0.02))
+    )  # in its middle nothing shows it
     assert FINDER.fit is not None and FINDER.fit.roll == pytest.approx(0.02, abs=4e-3)
     assert lane.y_l == pytest.approx(1.5, abs=0.04)
 
@@ -108,30 +112,30 @@ def test_of_two_lanes_the_cars_own_is_taken(side: float) -> None:
     x = np.tile(np.linspace(6.0, 30.0, 60), 3)
     y = np.repeat(side * width * np.array([-0.5, 0.5, 1.5]), 60)
     weight = np.repeat([1.0, 1.2, 1.1], 60)
-    best = search(x, y, weight, Place(1.2, 1.5, 5.0, width))[0]
+    best = search_starts(x, y, weight, CameraMount(1.2, 1.5, 5.0, width))[0]
     assert best.values[1] == pytest.approx(0.0, abs=0.05)
 
 
 @pytest.mark.parametrize("noise", [0.0, 2.0, 30.0])
 def test_without_markings_the_lane_is_lost_and_no_number_is_wild(noise: float) -> None:
-    bare = Painter(CAMERA, Appearance(wear=1.0, noise=noise, shadow=0.5), FINDER.rows)
+    bare = RoadRenderer(CAMERA, Appearance(wear=1.0, noise=noise, shadow=0.5), FINDER.rows)
     for seed in range(5):
-        assert FINDER.find(bare.picture(Scene(psi=0.1), seed)) == Lane() == (0.0,) * 5
+        assert FINDER.find(bare.render_picture(RoadScene(psi=0.1), seed)) == Lane() == (0.0,) * 5
     assert FINDER.find(np.zeros((720, 1280), np.uint8)).quality == 0.0
     chance = np.random.default_rng(1).integers(0, 256, (720, 1280), np.uint8)
     assert FINDER.find(chance).quality == 0.0
 
 
 def test_beyond_the_field_of_view_it_is_lost() -> None:
-    narrow = LaneFinder(CAMERA, view=View(0.1, 1.0))
-    for scene, seen in ((Scene(psi=0.08), 1), (Scene(psi=0.12), 0), (Scene(y=-1.1), 0)):
-        assert (narrow.find(CLEAR.picture(scene)).quality > 0.0) == seen
+    narrow = LaneFinder(CAMERA, view=FieldOfView(0.1, 1.0))
+    for scene, seen in ((RoadScene(psi=0.08), 1), (RoadScene(psi=0.12), 0), (RoadScene(y=-1.1), 0)):
+        assert (narrow.find(CLEAR.render_picture(scene)).quality > 0.0) == seen
 
 
 def test_one_picture_one_answer_in_grey_and_in_colour() -> None:
-    picture = CLEAR.picture(Scene(psi=0.05, y=0.2), 1)
+    picture = CLEAR.render_picture(RoadScene(psi=0.05, y=0.2), 1)
     first = FINDER.find(picture)
-    FINDER.find(CLEAR.picture(Scene(psi=-0.3, y=2.0), 2))
+    FINDER.find(CLEAR.render_picture(RoadScene(psi=-0.3, y=2.0), 2))
     assert FINDER.find(picture) == first
     assert FINDER.find(np.repeat(picture[..., None], 3, 2)) == first
 
@@ -148,8 +152,8 @@ def scaled(width: int) -> Pinhole:
 def test_one_working_scale_finds_the_same_lane_in_a_picture_of_any_size(width: int) -> None:
     finder = LaneFinder(scaled(width))
     way = cv2.INTER_AREA if width < 1280 else cv2.INTER_LINEAR
-    for scene in (Scene(psi=0.05, y=-0.4, s=3.0), Scene.bend(0.006, psi=-0.04, y=0.5)):
-        picture = CLEAR.picture(scene, 1)
+    for scene in (RoadScene(psi=0.05, y=-0.4, s=3.0), RoadScene.make_bend(0.006, psi=-0.04, y=0.5)):
+        picture = CLEAR.render_picture(scene, 1)
         whole = FINDER.find(picture)
         other = cv2.resize(picture, finder.camera.size, interpolation=way)
         lane = finder.find(np.asarray(other, np.uint8))
@@ -163,14 +167,14 @@ def test_a_working_scale_asks_for_as_many_rows_and_points_whatever_the_picture()
 
 
 def test_quality_falls_with_what_was_seen() -> None:
-    picture = CLEAR.picture(Scene(psi=0.05, y=0.2), 1)
+    picture = CLEAR.render_picture(RoadScene(psi=0.05, y=0.2), 1)
     full = FINDER.find(picture)
     glare, near = picture.copy(), picture.copy()
     glare[:, 900:] = 255  # beside the lane
     lane = FINDER.find(glare)
     assert full.quality == 1.0 and 0.0 < lane.quality < 0.8
     assert lane[:2] == pytest.approx(full[:2], abs=0.01)
-    row = float(CAMERA.pixels_of(np.array(10.0), np.array(0.0))[1])
+    row = float(CAMERA.project_points(np.array(10.0), np.array(0.0))[1])
     near[: round(row)] = 85  # nothing is painted beyond
     assert 0.0 < FINDER.find(near).quality < 0.35
 

@@ -10,12 +10,12 @@ import pytest
 pytest.importorskip("cv2")
 import cv2
 
-from sideslip.envs.sensors.camera.chessboard import calibrated
+from sideslip.envs.sensors.camera.chessboard import calibrate_camera
 from sideslip.envs.sensors.camera.films import read_picture
 from sideslip.envs.sensors.camera.finder import Lane, LaneFinder
-from sideslip.envs.sensors.camera.mounting import default_camera, mounted
+from sideslip.envs.sensors.camera.mounting import estimate_mounting, make_default_camera
 from sideslip.envs.sensors.camera.pinhole import Pinhole
-from sideslip.envs.sensors.camera.road_image import Image, Painter, Scene
+from sideslip.envs.sensors.camera.road_image import Image, RoadRenderer, RoadScene
 
 ROOT = Path(__file__).resolve().parents[4]
 PLACES = [folder / "shared" / "data" / "lane_images" for folder in (ROOT, ROOT.parent)]
@@ -27,12 +27,12 @@ WIDTH = 3.7  # m, of the recordings' lanes
 @pytest.mark.parametrize("tilt", [0.0, radians(8.0)])
 def test_the_vanishing_point_has_tilt_and_height(tilt: float) -> None:
     camera = Pinhole(tilt=tilt, height=1.2)
-    picture = Painter(camera).picture(Scene(psi=0.02, y=0.2, s=1.0))
-    found = mounted(replace(camera, tilt=0.05, height=2.0), picture, 3.5)
+    picture = RoadRenderer(camera).render_picture(RoadScene(psi=0.02, y=0.2, s=1.0))
+    found = estimate_mounting(replace(camera, tilt=0.05, height=2.0), picture, 3.5)
     assert found.tilt == pytest.approx(tilt, abs=radians(0.6))
     assert found.height == pytest.approx(1.2, rel=0.05)
     with pytest.raises(ValueError, match="no pair of markings"):
-        mounted(camera, np.zeros((720, 1280), np.uint8), 3.5)
+        estimate_mounting(camera, np.zeros((720, 1280), np.uint8), 3.5)
 
 
 CAR = Pinhole(tilt=0.05, height=1.2)
@@ -41,31 +41,35 @@ CAR = Pinhole(tilt=0.05, height=1.2)
 @pytest.mark.parametrize(
     ("scene", "camera"),
     [
-        (Scene(psi=0.16, y=0.2), CAR),  # no heading in a lane
-        (Scene.bend(0.008), CAR),  # not straight
-        (Scene(y=0.2), replace(CAR, height=4.0)),
-        (Scene(y=0.2), replace(CAR, height=0.6)),
-        (Scene(y=0.2), replace(CAR, tilt=-0.18)),
+        (RoadScene(psi=0.16, y=0.2), CAR),  # no heading in a lane
+        (RoadScene.make_bend(0.008), CAR),  # not straight
+        (RoadScene(y=0.2), replace(CAR, height=4.0)),
+        (RoadScene(y=0.2), replace(CAR, height=0.6)),
+        (RoadScene(y=0.2), replace(CAR, tilt=-0.18)),
     ],
 )
-def test_geometry_that_no_car_has_is_no_lane(scene: Scene, camera: Pinhole) -> None:
+def test_geometry_that_no_car_has_is_no_lane(scene: RoadScene, camera: Pinhole) -> None:
     with pytest.raises(ValueError, match="no lane"):
-        mounted(camera, Painter(camera).picture(scene), 3.5)
+        estimate_mounting(camera, RoadRenderer(camera).render_picture(scene), 3.5)
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])
 def test_a_picture_on_its_side_or_its_head_is_no_lane(turns: int) -> None:
-    picture = np.rot90(Painter(Pinhole(tilt=0.0)).picture(Scene(y=0.2)), turns).copy()
+    picture = np.rot90(
+        RoadRenderer(Pinhole(tilt=0.0)).render_picture(RoadScene(y=0.2)), turns
+    ).copy()
     with pytest.raises(ValueError, match="no lane"):
-        mounted(default_camera((picture.shape[1], picture.shape[0])), picture, 3.5)
+        estimate_mounting(make_default_camera((picture.shape[1], picture.shape[0])), picture, 3.5)
 
 
 @pytest.mark.parametrize("width", [320, 640, 3840])
 def test_one_working_scale_has_the_mounting_at_any_size(width: int) -> None:
-    camera = replace(default_camera((1280, 720)), height=1.3)
-    picture = Painter(camera).picture(Scene(psi=0.02, y=0.2, s=1.0))
+    camera = replace(make_default_camera((1280, 720)), height=1.3)
+    picture = RoadRenderer(camera).render_picture(RoadScene(psi=0.02, y=0.2, s=1.0))
     size = width, width * 9 // 16
-    found = mounted(default_camera(size), np.asarray(cv2.resize(picture, size), np.uint8), 3.5)
+    found = estimate_mounting(
+        make_default_camera(size), np.asarray(cv2.resize(picture, size), np.uint8), 3.5
+    )
     assert found.size == size and found.tilt == pytest.approx(0.0, abs=radians(0.6))
     assert found.height == pytest.approx(1.3, rel=0.05)
 
@@ -77,7 +81,9 @@ def test_a_recording_has_one_lane_at_any_size_mirrored_and_none_on_its_side(name
     height, width = picture.shape[:2]
 
     def lane(picture: Image) -> Lane:
-        camera = mounted(default_camera((picture.shape[1], picture.shape[0])), picture, WIDTH)
+        camera = estimate_mounting(
+            make_default_camera((picture.shape[1], picture.shape[0])), picture, WIDTH
+        )
         return LaneFinder(camera, WIDTH, near=6.0, far=30.0).find(picture)
 
     whole = lane(picture)
@@ -96,7 +102,9 @@ def test_a_recording_has_one_lane_at_any_size_mirrored_and_none_on_its_side(name
 def test_both_lines_of_the_calibrated_recording() -> None:
     """Its README reads -1.42 deg and a height of 1.25 m."""
     picture = read_picture(IMAGES / "straight_lines1.jpg")
-    camera = mounted(Pinhole.read(IMAGES / "udacity_1280x720_intrinsics.json"), picture, WIDTH)
+    camera = estimate_mounting(
+        Pinhole.read(IMAGES / "udacity_1280x720_intrinsics.json"), picture, WIDTH
+    )
     lane = LaneFinder(camera, WIDTH, near=6.0, far=30.0).find(picture)
     assert camera.height == pytest.approx(1.25, abs=0.05)
     assert np.degrees(lane.psi) == pytest.approx(-1.42, abs=0.3)
@@ -106,7 +114,7 @@ def test_both_lines_of_the_calibrated_recording() -> None:
 @recorded
 def test_both_lines_of_the_recording_without_intrinsics() -> None:
     picture = read_picture(IMAGES / "solidWhiteRight.jpg")
-    camera = mounted(default_camera((960, 540)), picture, WIDTH)
+    camera = estimate_mounting(make_default_camera((960, 540)), picture, WIDTH)
     lane = LaneFinder(camera, WIDTH, near=6.0, far=30.0).find(picture)
     assert lane.quality > 0.5 and abs(lane.y) < 0.4 and abs(np.degrees(lane.psi)) < 2.0
     assert 0.8 < camera.height < 1.8
@@ -115,7 +123,7 @@ def test_both_lines_of_the_recording_without_intrinsics() -> None:
 @recorded
 def test_six_chessboards_give_the_intrinsics_on_file() -> None:
     known = Pinhole.read(IMAGES / "udacity_1280x720_intrinsics.json")
-    found, error = calibrated(sorted((IMAGES / "camera_cal").glob("*.jpg")))
+    found, error = calibrate_camera(sorted((IMAGES / "camera_cal").glob("*.jpg")))
     np.testing.assert_allclose(np.diag(found.K), np.diag(known.K), rtol=0.01)
     assert found.size == known.size and error < 1.0
 
@@ -123,4 +131,4 @@ def test_six_chessboards_give_the_intrinsics_on_file() -> None:
 def test_too_few_boards_are_refused(tmp_path: Path) -> None:
     (tmp_path / "board.jpg").write_bytes(b"none")
     with pytest.raises(ValueError, match="0 of 1 files show a chessboard of 9 x 6"):
-        calibrated([tmp_path / "board.jpg"])
+        calibrate_camera([tmp_path / "board.jpg"])

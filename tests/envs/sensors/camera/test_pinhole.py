@@ -23,22 +23,22 @@ def test_a_point_lies_where_its_angles_put_it(x: float, y: float) -> None:
     below = atan2(1.3, x - 0.2)
     row = 359.5 + 640.0 * tan(below - radians(8.0))
     depth = hypot(1.3, x - 0.2) * cos(below - radians(8.0))
-    found = PLAIN.pixels_of(np.array(x), np.array(y))
+    found = PLAIN.project_points(np.array(x), np.array(y))
     np.testing.assert_allclose(found, [639.5 - 640.0 * y / depth, row], atol=1e-9)
 
 
 def test_rays_meet_the_road_where_its_points_are_seen() -> None:
     camera = Pinhole()
-    rays = camera.rays(400, 601)
+    rays = camera.compute_rays(400, 601)
     rows, columns = np.array([400, 450, 600]), np.array([80, 700, 1250])
     ray = rays[rows - 400, columns]
     reach = -camera.height / ray[:, 2]
     x, y = camera.ahead + reach * ray[:, 0], reach * ray[:, 1]
-    np.testing.assert_allclose(camera.pixels_of(x, y), np.stack([columns, rows], 1), atol=1e-3)
+    np.testing.assert_allclose(camera.project_points(x, y), np.stack([columns, rows], 1), atol=1e-3)
 
 
 def test_what_is_behind_or_beside_is_not_seen() -> None:
-    found = Pinhole().pixels_of(np.array([-5.0, 5.0, 5.0]), np.array([0.0, 60.0, 0.0]))
+    found = Pinhole().project_points(np.array([-5.0, 5.0, 5.0]), np.array([0.0, 60.0, 0.0]))
     np.testing.assert_array_equal(np.isnan(found[:, 0]), [True, True, False])
 
 

@@ -9,15 +9,20 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("cv2")
 from sideslip.envs.sensors.camera.pinhole import Pinhole
-from sideslip.envs.sensors.camera.road_image import Appearance, Painter, Scene, _attitude
-from sideslip.envs.vehicle.dynamics import Road
+from sideslip.envs.sensors.camera.road_image import (
+    Appearance,
+    RoadRenderer,
+    RoadScene,
+    _make_rotation,
+)
+from sideslip.envs.vehicle.dynamics import RoadParams
 
 CAMERA = Pinhole()
 CLEAR = Appearance(noise=0.0, blur=0.0)
-PAINTER = Painter(CAMERA, CLEAR)
+PAINTER = RoadRenderer(CAMERA, CLEAR)
 
 
-def walked(scene: Scene, ahead: float, aside: float) -> tuple[float, float]:
+def walked(scene: RoadScene, ahead: float, aside: float) -> tuple[float, float]:
     """A point of the road in car axes, by small steps along its middle from beside the car."""
     x, y, theta, step = 0.0, -scene.y, 0.0, 1e-3
     road = scene.road
@@ -33,19 +38,19 @@ def walked(scene: Scene, ahead: float, aside: float) -> tuple[float, float]:
 @pytest.mark.parametrize(
     "scene",
     [
-        Scene(psi=0.1, y=0.5),
-        Scene(psi=-0.2, y=-1.0, s=7.3),
-        Scene.bend(0.02, psi=0.05, y=-0.4),
-        Scene(s=12.0, road=Road(-0.03, 20.0, 20.0)),  # the ramp begins 8 m ahead
-        Scene(s=27.0, psi=-0.1, road=Road(0.02, 20.0, 20.0)),  # the car is on it
+        RoadScene(psi=0.1, y=0.5),
+        RoadScene(psi=-0.2, y=-1.0, s=7.3),
+        RoadScene.make_bend(0.02, psi=0.05, y=-0.4),
+        RoadScene(s=12.0, road=RoadParams(-0.03, 20.0, 20.0)),  # the ramp begins 8 m ahead
+        RoadScene(s=27.0, psi=-0.1, road=RoadParams(0.02, 20.0, 20.0)),  # the car is on it
     ],
 )
-def test_the_solid_marking_lies_where_a_walk_along_the_road_ends(scene: Scene) -> None:
-    picture = PAINTER.picture(scene)
+def test_the_solid_marking_lies_where_a_walk_along_the_road_ends(scene: RoadScene) -> None:
+    picture = PAINTER.render_picture(scene)
     for ahead in (5.0, 8.0, 12.0, 15.0):
         for aside, bright in ((-1.75, True), (-1.55, False), (-1.95, False), (0.0, False)):
             x, y = walked(scene, ahead, aside)
-            column, row = np.round(CAMERA.pixels_of(np.array(x), np.array(y))).astype(int)
+            column, row = np.round(CAMERA.project_points(np.array(x), np.array(y))).astype(int)
             assert (picture[row, column] > 150) == bright, (ahead, aside)
 
 
@@ -53,39 +58,41 @@ def test_a_body_rolls_and_then_nods() -> None:
     """Left side up and nose down are positive; a rotation keeps lengths and angles."""
     for roll, pitch in ((0.3, 0.0), (0.0, 0.2), (-0.1, 0.05)):
         turned = Rotation.from_euler("YX", [pitch, roll]).as_matrix()
-        np.testing.assert_allclose(_attitude(roll, pitch), turned, atol=1e-15)
-    assert _attitude(0.1, 0.0)[2, 1] > 0.0 > _attitude(0.0, 0.1)[2, 0]
+        np.testing.assert_allclose(_make_rotation(roll, pitch), turned, atol=1e-15)
+    assert _make_rotation(0.1, 0.0)[2, 1] > 0.0 > _make_rotation(0.0, 0.1)[2, 0]
 
 
 def test_dashes_move_with_the_car() -> None:
     def bright(s: float) -> list[bool]:
-        pixels = CAMERA.pixels_of(np.arange(5.0, 15.0, 0.5), np.array(1.75))
+        pixels = CAMERA.project_points(np.arange(5.0, 15.0, 0.5), np.array(1.75))
         columns, rows = np.round(pixels).astype(int).T
-        return [bool(light > 150) for light in PAINTER.picture(Scene(s=s))[rows, columns]]
+        return [
+            bool(light > 150) for light in PAINTER.render_picture(RoadScene(s=s))[rows, columns]
+        ]
 
     assert bright(2.0)[:-4] == bright(0.0)[4:] and bright(9.0) == bright(0.0)
     assert 0.3 < np.mean([bright(s) for s in range(9)]) < 0.6
 
 
 def test_one_seed_one_picture() -> None:
-    noisy = Painter(CAMERA, Appearance(noise=5.0), rows=(300, 500))
-    first = noisy.picture(Scene(), (7, 33))
-    np.testing.assert_array_equal(first, noisy.picture(Scene(), (7, 33)))
+    noisy = RoadRenderer(CAMERA, Appearance(noise=5.0), rows=(300, 500))
+    first = noisy.render_picture(RoadScene(), (7, 33))
+    np.testing.assert_array_equal(first, noisy.render_picture(RoadScene(), (7, 33)))
     for other in ((7, 34), (8, 33)):
-        assert (first != noisy.picture(Scene(), other)).mean() > 0.2
+        assert (first != noisy.render_picture(RoadScene(), other)).mean() > 0.2
     assert not first[:300].any() and not first[500:].any()
-    clear = Painter(CAMERA, CLEAR, rows=(300, 500)).picture(Scene())
-    np.testing.assert_array_equal(clear[300:500], PAINTER.picture(Scene())[300:500])
+    clear = RoadRenderer(CAMERA, CLEAR, rows=(300, 500)).render_picture(RoadScene())
+    np.testing.assert_array_equal(clear[300:500], PAINTER.render_picture(RoadScene())[300:500])
     spread = (first.astype(float) - clear)[320:480][(clear == 85)[320:480]].std()
     assert spread == pytest.approx(5.0, rel=0.05)
 
 
 def test_wear_takes_paint_and_shadow_light() -> None:
-    whole = PAINTER.picture(Scene())[320:]
+    whole = PAINTER.render_picture(RoadScene())[320:]
     for wear in (0.3, 1.0):
-        worn = Painter(CAMERA, replace(CLEAR, wear=wear)).picture(Scene())[320:]
+        worn = RoadRenderer(CAMERA, replace(CLEAR, wear=wear)).render_picture(RoadScene())[320:]
         assert (worn > 150).sum() / (whole > 150).sum() == pytest.approx(1.0 - wear, abs=0.1)
-    dark = Painter(CAMERA, replace(CLEAR, shadow=0.5)).picture(Scene())[320:]
+    dark = RoadRenderer(CAMERA, replace(CLEAR, shadow=0.5)).render_picture(RoadScene())[320:]
     assert 0.1 < (dark < whole).mean() < 0.7 and dark[dark < whole].max() <= 108
 
 
