@@ -70,7 +70,7 @@ class Relay:
 
     def _make_values(self, epoch: Any) -> list[float]:
         """The doubles of a datagram; an unknown number is 0, an unknown HDOP the worst."""
-        X, Y = self._compute_position(epoch) if epoch.fixed else (0.0, 0.0)
+        X, Y = self._compute_position(epoch) if epoch.has_fix else (0.0, 0.0)
         hdop = epoch.hdop if math.isfinite(epoch.hdop) else MAX_HDOP
         course, speed = (value if math.isfinite(value) else 0.0 for value in epoch[3:5])
         age = epoch.age + self.latency

@@ -53,13 +53,13 @@ def compose_verdict(
     )
 
 
-def costs(found: Mapping[str, Sequence[Standing]]) -> dict[str, Estimate]:
+def compute_relative_costs(standings: Mapping[str, Sequence[Standing]]) -> dict[str, Estimate]:
     """The cost over nominal's in % of who drives everywhere, the best first."""
-    drivers = select_complete(_group_controllers(found))
+    drivers = select_complete(_group_controllers(standings))
     logs = {name: [-r for r in drivers[name].values()] for name in _rank_entries(drivers)}
     return {
-        name: Estimate(*(100.0 * each for each in geometric_mean(*mine)))
-        for name, mine in logs.items()
+        name: Estimate(*(100.0 * value for value in geometric_mean(*ratios)))
+        for name, ratios in logs.items()
     }
 
 

@@ -15,7 +15,7 @@ from ..harness.explorer import Explorer, Panel
 from ..harness.results import Suite
 from ..harness.stats import Estimate, geometric_mean
 from ..report.kml import make_track_kml
-from .answer import costs, find_best_controller, is_default_filter
+from .answer import compute_relative_costs, find_best_controller, is_default_filter
 from .build import get_filter_name, make_agent_options, make_estimate_options
 from .cells import ORACLE_NAMES, REFERENCE_CONTROLLER, TRUTH, ControlEntry
 from .contests import NOMINAL, TITLES, ControlTask
@@ -59,7 +59,7 @@ def add_figures(
     except ModuleNotFoundError:
         return
     questions = (
-        ("Which controller holds the car?", {"All contests": costs(by_tier)}),
+        ("Which controller holds the car?", {"All contests": compute_relative_costs(by_tier)}),
         ("Which controller holds it in each tier?", _group_costs(by_tier, _controller)),
         ("Which estimator does a controller drive best with?", _group_costs(by_tier, _estimator)),
         ("What would knowing more save?", _group_oracles(by_tier, foresight)),
@@ -106,8 +106,8 @@ def _estimator(cell: ControlEntry) -> str:
 
 
 def _controller(cell: ControlEntry) -> str:
-    own = is_default_filter(cell.controller, cell.estimator) and cell.controller != NOMINAL
-    return cell.controller if own and cell.estimator != TRUTH else ""
+    has_default = is_default_filter(cell.controller, cell.estimator) and cell.controller != NOMINAL
+    return cell.controller if has_default and cell.estimator != TRUTH else ""
 
 
 def _group_oracles(

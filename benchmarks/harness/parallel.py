@@ -59,10 +59,10 @@ class Bar(progress.Progress):
     def _say(self) -> None:
         for task in self.tasks[-1:] if self._speaks else ():
             passed, text = task.elapsed or 0.0, ""
-            told, since, done = self._before
+            last_id, since, done = self._before
             if task.total is not None:
                 text = f"{task.completed:,.0f} of {task.total:,.0f} {task.fields['unit']}, "
-            if task.id != told or not done:  # what a stopped run has done took no time in this one
+            if task.id != last_id or not done:  # what a stopped run has done took no time in this one
                 self._before = task.id, passed, task.completed
             elif task.total is not None and task.completed > done:
                 pace = (passed - since) / (task.completed - done)

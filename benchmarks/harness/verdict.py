@@ -26,9 +26,9 @@ def describe_leader(name: str, ratios: Mapping[str, Estimate], verb: str) -> str
     ratios: what it has over each rival's, 1 for as much, the closest rival first. verb: what is
     better done little, "err". A rival ties whose interval all but reaches 1.
 
-    >>> leader("lqr", {"esc": Estimate(0.71, 0.65, 0.77)}, "cost")
+    >>> describe_leader("lqr", {"esc": Estimate(0.71, 0.65, 0.77)}, "cost")
     'lqr costs least, 71 % [65, 77] as much as esc'
-    >>> leader("lqr", {"esc": Estimate(0.98, 0.9, 1.05)}, "cost")
+    >>> describe_leader("lqr", {"esc": Estimate(0.98, 0.9, 1.05)}, "cost")
     'lqr and esc cost least, too close to tell apart'
     """
     ties = [rival for rival, ratio in ratios.items() if not ratio.high < _SURE]
@@ -41,7 +41,7 @@ def describe_leader(name: str, ratios: Mapping[str, Estimate], verb: str) -> str
 def format_percent(ratio: Estimate) -> str:
     """A ratio in percent with its interval, if it has one.
 
-    >>> percent(Estimate(0.71, 0.65, 0.77)), percent(Estimate(0.5))
+    >>> format_percent(Estimate(0.71, 0.65, 0.77)), format_percent(Estimate(0.5))
     ('71 % [65, 77]', '50 %')
     """
     value, low, high = (f"{100.0 * number:.0f}" for number in ratio)
@@ -51,7 +51,7 @@ def format_percent(ratio: Estimate) -> str:
 def summarise_names(names: Sequence[str], limit: int = _NAMES) -> str:
     """Names in a sentence, the later ones counted.
 
-    >>> some(["a"]), some(["a", "b"]), some(["a", "b", "c", "d"])
+    >>> summarise_names(["a"]), summarise_names(["a", "b"]), summarise_names(["a", "b", "c", "d"])
     ('a', 'a and b', 'a, b and 2 more')
     """
     shown = list(names[:limit])

@@ -14,7 +14,7 @@ _ORDER = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot")
 def choose_line_styles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
     """(colour, dash) of each line of a figure: no two alike, a variant of a known name dashed.
 
-    >>> [dash for _, dash in line_styles(["exact-kf", "exact-kf, true model"]).values()]
+    >>> [dash for _, dash in choose_line_styles(["exact-kf", "exact-kf, true model"]).values()]
     ['solid', 'dash']
     """
     styles: dict[str, tuple[str, str]] = {}

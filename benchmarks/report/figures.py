@@ -30,7 +30,7 @@ def find_peaks(y: Array, limit: int = POINTS) -> npt.NDArray[np.intp]:
     """Indices of at most `limit` samples of y (n,) that draw the same line: the smallest and
     largest of each of limit/2 - 1 stretches, and both ends. A stretch of NaN stays a gap.
 
-    >>> peaks(np.array([0.0, 9.0, 0.0, 1.0, 1.0, -9.0, 0.0, 1.0]), limit=6)
+    >>> find_peaks(np.array([0.0, 9.0, 0.0, 1.0, 1.0, -9.0, 0.0, 1.0]), limit=6)
     array([0, 1, 4, 5, 7])
     """
     n = len(y)

@@ -22,7 +22,7 @@ def encode_steps(values: npt.ArrayLike, levels: int = _LEVELS["y"]) -> dict[str,
 
     levels: how many quanta the range has.
 
-    >>> steps([1.0, 2.0, float("nan"), 3.0], levels=3)
+    >>> encode_steps([1.0, 2.0, float("nan"), 3.0], levels=3)
     {'from': 1.0, 'by': 1.0, 'steps': [0, 1, None, 1]}
     """
     v = np.asarray(values, float)

@@ -73,7 +73,7 @@ def format_absences(absent: Mapping[str, str]) -> str:
 def format_three_digits(value: float) -> str:
     """A number to three digits, without an exponent.
 
-    >>> three(0.04431), three(7.2), three(1004.0)
+    >>> format_three_digits(0.04431), format_three_digits(7.2), format_three_digits(1004.0)
     ('0.0443', '7.2', '1000')
     """
     return f"{float(f'{value:.3g}'):g}"
@@ -82,7 +82,7 @@ def format_three_digits(value: float) -> str:
 def format_rate(microseconds: float) -> str:
     """How many in a second, to three digits.
 
-    >>> rate(0.0443), rate(7.25), rate(1210.0)
+    >>> format_rate(0.0443), format_rate(7.25), format_rate(1210.0)
     ('22,600,000', '138,000', '826')
     """
     return f"{float(f'{1e6 / microseconds:.3g}'):,.0f}"

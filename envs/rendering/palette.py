@@ -105,9 +105,9 @@ def find_base(name: str) -> str | None:
     """The name of `COLOURS` that a label speaks of, None for a stranger: of a controller on an
     estimator the controller, unless it is the usual one.
 
-    >>> base("exact-kf, true model"), base("the bound"), base("a stranger")
+    >>> find_base("exact-kf, true model"), find_base("the bound"), find_base("a stranger")
     ('exact-kf', 'bound', None)
-    >>> base("two-dof on multirate-kf"), base("lqr on dakf")
+    >>> find_base("two-dof on multirate-kf"), find_base("lqr on dakf")
     ('two-dof', 'dakf')
     """
     name = name.removeprefix(_DEFAULT_PREFIX).partition(" on ")[0]
@@ -129,7 +129,7 @@ def find_colour(name: str) -> str:
 def mix_colours(shade: str, with_shade: str, share: float) -> str:
     """A share of one colour with the rest of another.
 
-    >>> mixed("#000000", "#FFFFFF", 0.2)
+    >>> mix_colours("#000000", "#FFFFFF", 0.2)
     '#cccccc'
     """
     pairs = [(int(shade[i : i + 2], 16), int(with_shade[i : i + 2], 16)) for i in (1, 3, 5)]

@@ -118,9 +118,9 @@ def _names(
         x, y, _, tall = taken[i]
         below = poses[i % (len(cars) - 1 or 1)][1] > poses[-1][1]
         side, half = 1.0 if below != (car is cars[-1]) else -1.0, 3.5 * len(car.name)
-        seen = car.name and 0.0 < x - box[0] < box[2] and 0.0 < y - box[1] < box[3]
+        is_visible = car.name and 0.0 < x - box[0] < box[2] and 0.0 < y - box[1] < box[3]
         tries = [y + sign * (tall + 10.0 + k) for sign in (side, -side) for k in range(99)]
-        for row in tries if seen else ():
+        for row in tries if is_visible else ():
             clear = all(abs(x - a) > half + c or abs(row - b) > 7.0 + d for a, b, c, d in taken)
             if clear and box[1] + 8.0 < row < box[1] + box[3] - 24.0:
                 canvas.draw_text((x, row), car.name, mix_colours(car.colour, INK, 0.6), 12, 0.5)

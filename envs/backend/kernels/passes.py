@@ -34,8 +34,8 @@ class _Passes(PassManager):
 def lean_passes() -> PassManager:
     """Those that a function needs that neither counts references nor holds another one."""
     passes = _Passes("part")
-    for each in _PASSES:
-        passes.add_pass(each, each.__name__)
+    for pass_class in _PASSES:
+        passes.add_pass(pass_class, pass_class.__name__)
     passes.finalize()
     return passes
 

@@ -72,7 +72,7 @@ def test_everybody_drives_the_same_seeds(monkeypatch: pytest.MonkeyPatch, tmp_pa
     measure([NONE, SLOW], first, keep=tmp_path)
     driven: dict[ControlEntry, list[int]] = {}
     for kept, chunk in cases:
-        driven.setdefault(chunk.cell, []).extend(chunk.seeds)
+        driven.setdefault(chunk.entry, []).extend(chunk.seeds)
         assert kept.folder == tmp_path
     assert driven == {NONE: first, SLOW: first[:64]}
 
@@ -85,7 +85,7 @@ def test_contests_share_no_car(monkeypatch: pytest.MonkeyPatch) -> None:
     measure(cells, make_task_seeds(ONE, 50))
     driven: dict[ControlTask, set[tuple[int, ...]]] = {}
     for _, chunk in cases:
-        driven.setdefault(chunk.cell.task, set()).add(chunk.seeds)
+        driven.setdefault(chunk.entry.task, set()).add(chunk.seeds)
     assert all(len(mine) == 1 for mine in driven.values())  # in a contest everybody the same
     every = [seed for mine in driven.values() for own in mine for seed in own]
     assert len(set(every)) == len(every) == 6 * 50

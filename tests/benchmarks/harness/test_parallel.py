@@ -135,13 +135,13 @@ def test_a_case_that_ends_its_process_ends_the_work(
 DRIVER = """
 import sys
 from pathlib import Path
-from sideslip.benchmarks.control.cells import Cell
-from sideslip.benchmarks.control.contests import contests
+from sideslip.benchmarks.control.cells import ControlEntry
+from sideslip.benchmarks.control.list_scored_tasks import list_scored_tasks
 from sideslip.benchmarks.control.run import CHUNK, measure
-from sideslip.benchmarks.harness.engines import engine
+from sideslip.benchmarks.harness.engines import use_engine
 
-with engine("ray", sys.argv[1]):
-    cells = [Cell(contest, "", "none") for contest in contests()[:6]]
+with use_engine("ray", sys.argv[1]):
+    cells = [ControlEntry(contest, "", "none") for contest in list_scored_tasks()[:6]]
     measure(cells, range(4 * CHUNK), keep=Path(sys.argv[2]))
 """
 

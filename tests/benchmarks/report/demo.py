@@ -49,7 +49,7 @@ def answered() -> tuple[str, Any, str]:
     figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     numbers = {name: Estimate(*each[:3]) for name, each in ESTIMATORS.items()}
     groups = {"Late camera": numbers, HOSTILE: numbers}
-    drawn = figures.groups_with_interval(groups, "error / the least possible", {2.0: "twice"})
+    drawn = figures.draw_groups(groups, "error / the least possible", {2.0: "twice"})
     return "Which estimator is the best?", drawn, "Best estimator: `exact-kf`."
 
 
@@ -89,19 +89,19 @@ def drawn() -> list[tuple[str, Any, str]]:
     paths = {"truth": (x, y), "multirate-kf": (x, y + 0.02 * t), "bicycle-kf": (x, y + 0.2 * t)}
     course = {"truth": beta, "camera": seen} | lines
     return [
-        ("Error of each estimator", figures.bars_with_interval(names, *bars), "Shorter is better."),
-        ("The same on a log axis", figures.bars_with_interval(names, *bars, log=True), ""),
+        ("Error of each estimator", figures.draw_bars(names, *bars), "Shorter is better."),
+        ("The same on a log axis", figures.draw_bars(names, *bars, log=True), ""),
         (
             "The sideslip angle",
-            figures.time_series(t, course, label, dots=["camera"]),
+            figures.draw_time_series(t, course, label, dots=["camera"]),
             f"The paper's figure, redrawn: {HOSTILE}",
         ),
         (
             "Errors (seed 0)",
-            figures.error_series(t, errors, f"error of the {label}"),
+            figures.draw_error_series(t, errors, f"error of the {label}"),
             "Estimate minus truth.",
         ),
-        ("The track", figures.track(paths), "Dead reckoning with each estimate."),
+        ("The track", figures.draw_track(paths), "Dead reckoning with each estimate."),
     ]
 
 
@@ -129,8 +129,12 @@ def matrix() -> Suite:
         "Which controller and estimator hold the car",
         "Made up.",
         figures=[
-            ("Scores", pictures.heat_map(["none", "lqr"], ["gust", HOSTILE, "x"], values, "s"), ""),
-            ("Delay", figures.curves(delays, {"lqr": line}, "delay / ms", "score"), ""),
+            (
+                "Scores",
+                pictures.draw_heat_map(["none", "lqr"], ["gust", HOSTILE, "x"], values, "s"),
+                "",
+            ),
+            ("Delay", figures.draw_curves(delays, {"lqr": line}, "delay / ms", "score"), ""),
         ],
         explorers=[Explorer("Any two", ("manoeuvre",), cells, panels, "One.", ("none", HOSTILE))],
         files=[("run.kml", "application/vnd.google-earth.kml+xml", HOSTILE)],

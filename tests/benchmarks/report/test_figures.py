@@ -84,7 +84,7 @@ def oklab(rgb: np.ndarray) -> np.ndarray:
 def test_groups_stand_below_each_other_with_their_intervals() -> None:
     figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     numbers = {"dakf": Estimate(2.0, 1.5, 3.0), "exact-kf, gps": Estimate(4.0, 3.0, 5.0)}
-    figure = figures.groups_with_interval({"A": numbers, "B": numbers}, "ratio", {1.0: "one"})
+    figure = figures.draw_groups({"A": numbers, "B": numbers}, "ratio", {1.0: "one"})
     assert [trace.y[0] for trace in figure.data] == [1, 2, 4, 5]
     assert list(figure.layout.yaxis.ticktext) == [*numbers, *numbers]
     first, second, *_ = figure.data
@@ -108,7 +108,7 @@ def test_time_series_keep_every_peak_and_gap() -> None:
     y = np.sin(t)
     y[54_321], y[77_777] = 5.0, -4.0
     y[20_000:30_000] = np.nan
-    figure = figures.time_series(t, {"dakf": y, "truth": np.sin(t)}, "angle / rad")
+    figure = figures.draw_time_series(t, {"dakf": y, "truth": np.sin(t)}, "angle / rad")
     line, truth = figure.data  # the truth on top of the estimate
     assert (truth.name, truth.line.color) == ("truth", INK)
     assert truth.line.width > line.line.width
@@ -127,7 +127,7 @@ def test_small_ranges_far_from_zero_keep_their_shape() -> None:
     t = 1.6e9 + np.arange(1000) * 0.01
     nothing = np.full(t.size, np.nan)
     series = {"dakf": np.sin(t), "lost": nothing}
-    line, _ = figures.time_series(t, series, "angle / rad").data
+    line, _ = figures.draw_time_series(t, series, "angle / rad").data
     np.testing.assert_array_equal(line.x, t)
     assert line.y.dtype == np.float32
 
@@ -135,31 +135,33 @@ def test_small_ranges_far_from_zero_keep_their_shape() -> None:
 def test_figures_refuse_unequal_lengths() -> None:
     figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     with pytest.raises(ValueError, match="'dakf' has shape"):
-        figures.time_series(np.arange(3.0), {"dakf": np.arange(2.0)}, "angle / rad")
+        figures.draw_time_series(np.arange(3.0), {"dakf": np.arange(2.0)}, "angle / rad")
     with pytest.raises(ValueError, match="track 'truth'"):
-        figures.track({"truth": (np.arange(3.0), np.arange(2.0))})
+        figures.draw_track({"truth": (np.arange(3.0), np.arange(2.0))})
     with pytest.raises(ValueError, match="differ in length"):
-        figures.bars_with_interval(["a"], [1.0], [], [], "m")
+        figures.draw_bars(["a"], [1.0], [], [], "m")
 
 
 def test_curves_stand_on_logarithmic_axes() -> None:
     figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     x, y = np.array([1.0, 1024.0, 65536.0]), np.array([8.0, 1.0, 1.0])
-    figure = figures.curves(x, {"gym.make": y}, "environments", "CPU time / us", "xy")
+    figure = figures.draw_curves(x, {"gym.make": y}, "environments", "CPU time / us", "xy")
     (line,) = figure.data
     assert list(line.x) == list(x) and list(line.y) == list(y)
     assert line.mode == "lines+markers"
     assert figure.layout.xaxis.type == figure.layout.yaxis.type == "log"
     assert figure.layout.yaxis.title.text == "CPU time / us"
-    whiskers = figures.curves(x, {"gym.make": (y, y - 1.0, y + 2.0)}, "n", "us").data[0].error_y
+    whiskers = (
+        figures.draw_curves(x, {"gym.make": (y, y - 1.0, y + 2.0)}, "n", "us").data[0].error_y
+    )
     assert list(whiskers.array) == [2.0] * 3 and list(whiskers.arrayminus) == [1.0] * 3
     with pytest.raises(ValueError, match="has 3 values, x 2"):
-        figures.curves(x[:2], {"gym.make": y}, "environments", "CPU time / us")
+        figures.draw_curves(x[:2], {"gym.make": y}, "environments", "CPU time / us")
 
 
 def test_tracks_have_equal_axes() -> None:
     figures = pytest.importorskip("sideslip.benchmarks.report.figures")
-    figure = figures.track({"truth": (np.arange(5000.0), np.arange(5000.0))})
+    figure = figures.draw_track({"truth": (np.arange(5000.0), np.arange(5000.0))})
     assert figure.layout.yaxis.scaleanchor == "x"
     assert len(figure.data[0].x) == figures.POINTS
     assert figure.data[0].x[-1] == 4999
@@ -167,7 +169,7 @@ def test_tracks_have_equal_axes() -> None:
 
 def test_whiskers_are_the_interval() -> None:
     figures = pytest.importorskip("sideslip.benchmarks.report.figures")
-    (bar,) = figures.bars_with_interval(
+    (bar,) = figures.draw_bars(
         ["a", "b", "c"], [2.0, 3.0, 4.0], [1.5, np.nan, 4.0], [3.0, np.nan, 4.0], "m"
     ).data
     np.testing.assert_array_equal(bar.error_x.array, [1.0, np.nan, np.nan])

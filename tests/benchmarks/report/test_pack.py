@@ -42,11 +42,11 @@ def test_a_line_comes_back_within_half_a_quantum(offset: float) -> None:
 def test_a_figure_is_steps_where_its_lines_are_long() -> None:
     figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     t = np.arange(2000) * 0.01
-    text = encode_figure(figures.time_series(t, {"dakf": np.sin(t)}, "angle / rad"))
+    text = encode_figure(figures.draw_time_series(t, {"dakf": np.sin(t)}, "angle / rad"))
     found = json.loads(text)
     assert "template" not in found["layout"] and "title" not in found["layout"]
     x, y = (values_of(found["data"][0][axis]) for axis in "xy")
     np.testing.assert_allclose(y, np.sin(x), atol=0.01)
     assert len(text) < 10_000
-    short = json.loads(encode_figure(figures.curves(t[:5], {"dakf": t[:5]}, "x", "y")))
+    short = json.loads(encode_figure(figures.draw_curves(t[:5], {"dakf": t[:5]}, "x", "y")))
     assert "steps" not in short["data"][0]["x"]

@@ -63,8 +63,8 @@ def test_stamp_is_that_of_the_sources(copy: Path, monkeypatch: pytest.MonkeyPatc
 
 
 SHIFT = """
-from sideslip.envs.scenarios.tracks import Path, path_offset
-print(path_offset(Path(1.0, 0.0, 1.0, 0.0, 0.0, 1.0), 0.25))
+from sideslip.envs.scenarios.tracks import TrackPath, compute_path_offset
+print(compute_path_offset(TrackPath(1.0, 0.0, 1.0, 0.0, 0.0, 1.0), 0.25))
 """
 
 

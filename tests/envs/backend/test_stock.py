@@ -9,8 +9,8 @@ import pytest
 
 SOURCE = Path(__file__).resolve().parents[3] / "src"
 USE = """
-from sideslip.envs.scenarios.tracks import Path, path_offset
-print(path_offset(Path(1.0, 0.3, 1.0, 0.7, 0.1, 1.0), 0.85).hex(), path_offset.signatures != [])
+from sideslip.envs.scenarios.tracks import TrackPath, compute_path_offset
+print(compute_path_offset(TrackPath(1.0, 0.3, 1.0, 0.7, 0.1, 1.0), 0.85).hex(), compute_path_offset.signatures != [])
 print("sideslip.envs.backend.kernels.compiler" in sys.modules)
 """
 

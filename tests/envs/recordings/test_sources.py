@@ -191,10 +191,10 @@ def test_a_missing_library_is_named_with_its_extra(library: str, tmp_path: Path)
     code = f"""
 import sys
 sys.modules[{library!r}] = None
-from sideslip.envs.recordings.sources import open_source, read_nmea
+from sideslip.envs.recordings.sources import make_source, read_nmea
 try:
     read_nmea("a.nmea")
-    list(open_source("serial:/no/such/port"))
+    list(make_source("serial:/no/such/port"))
 except ModuleNotFoundError as error:
     print(error)
 """

@@ -149,7 +149,7 @@ def test_adapt_is_a_share(adapt: Any) -> None:
 
 def scales(filter_: Any, log: Any) -> Any:
     """The scales of the camera's R, (k, 2), after every 100 ticks."""
-    filter_.accept(log)
+    filter_.prepare_record(log)
     found: Any = []
     record, at = log.record, 0
     for start in range(0, len(record.fast) - 1, 100):

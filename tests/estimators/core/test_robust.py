@@ -100,7 +100,7 @@ def test_on_a_strange_car_its_intervals_mean_something() -> None:
     scenario = {"base": "random-steering", "speed": 25.0, "amplitude": 0.005, "noise": noise}
     env: Any = gym.make("sideslip/Outside-v0", model="multi-body", sensors="gps", scenario=scenario)
     log = rollout(env, seed=2, options={"duration": 12.0}).log
-    car, beta = env.unwrapped.nominal.scaled(0.7, 1.3), log.truth["beta"]
+    car, beta = env.unwrapped.nominal.scale_stiffness(0.7, 1.3), log.truth["beta"]
     nees = []
     for name in ("joint-robust", "joint"):
         known = {"sensors": log.slow, "slow": ["gps"], "course_noise": math.radians(0.5)}
