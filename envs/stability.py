@@ -265,7 +265,7 @@ class StabilityEnv(
 
     @property
     def motion(self) -> Motion:
-        """The true velocities, heading, place and roll now, in SI units; no sensor measures these."""
+        """The true velocities, heading, place and roll now, in SI units."""
         return get_motion(self._state)
 
     @property

@@ -95,7 +95,15 @@ _ISO_3888_1: dict[str, Any] = {
 
 
 def make_random_steering(low: float, high: float) -> dict[str, Any]:
-    """A random steering whose pairs of sines have amplitudes (rad) within this range."""
+    """Make the fields of a random steering whose pairs of sines have amplitudes in a range.
+
+    Args:
+        low: Smallest amplitude (rad).
+        high: Largest amplitude (rad).
+
+    Returns:
+        Fields of a `Scenario`.
+    """
     return RANDOM | {"amplitude": (low, high), "amplitude_2": (low, high)}
 
 
@@ -104,8 +112,10 @@ def _set_amplitude(shape: dict[str, Any], low: float, high: float) -> dict[str, 
 
 
 def _make_scenarios(tier: str, common: dict[str, Any], **shapes: dict[str, Any]) -> list[Scenario]:
-    """The scenarios of a tier by their names, written with underscores; where no driver keeps to a
-    track, the road follows the nominal car, so that the camera has a lane to see."""
+    """Make the scenarios of a tier by their names, written with underscores.
+
+    Without a driver on a track the road follows the nominal car, so that the camera sees a lane.
+    """
     scenarios = []
     for name, shape in shapes.items():
         road = "straight" if shape["steering"] == "driver" else "nominal-path"

@@ -16,7 +16,15 @@ WILD_LIMIT = 10.0
 
 @jit
 def select_failure(lost: Any, spun: Any, off: Any) -> Any:
-    """The failure's code, as a float: whether the numbers are no longer finite, the car spins or
-    has left the road."""
+    """Select the failure's code.
+
+    Args:
+        lost: Whether the numbers are no longer finite.
+        spun: Whether the car spins.
+        off: Whether it has left the road.
+
+    Returns:
+        The code, as a float; the first that applies, in this order.
+    """
     failure = select(spun, SPIN * 1.0, select(off, OFF_ROAD * 1.0, RUNNING * 1.0))
     return select(lost, NOT_FINITE * 1.0, failure)
