@@ -48,15 +48,15 @@ def is_document(source: object) -> bool:
 def read_document(source: "str | os.PathLike[str]", what: str) -> dict[str, Any]:
     """Read the mapping in a TOML or JSON file; a file named under `base` is looked for beside it.
 
+    Raises FileNotFoundError, and ValueError for a folder, another ending, a `base` that leads back
+    to the file, and a file that is no TOML or JSON or holds no mapping.
+
     Args:
         source: Path of the file.
         what: Kind of content, for messages.
 
     Returns:
         Names and values of the file.
-
-    Raises FileNotFoundError, and ValueError for a folder, another ending, a `base` that leads back
-    to the file, and a file that is no TOML or JSON or holds no mapping.
     """
     path = Path(source)
     values = _parse_file(path, what)
