@@ -31,7 +31,7 @@ class DriverParams(NamedTuple):
 
 @jit
 def compute_lateral_error(motion: Any, path: Any, road: Any, preview: Any) -> Any:
-    """Compute how far the previewed path lies to the left of where the car is heading.
+    """Compute how far the previewed path lies to the left of the car's course.
 
     The road's own bend is the double integral of its curvature, exact on a clothoid too.
 
