@@ -43,7 +43,7 @@ KEEPING = Scenario(
     disturbance_force=0.0,
     disturbance_moment=0.0,
 )
-"""Nobody steers but the controller; the car and its lane are highway-env's."""
+"""Only the controller steers; the car and its lane are highway-env's."""
 STATES = ("beta", "gamma", "psi", "y_l")
 
 

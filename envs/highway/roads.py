@@ -192,6 +192,6 @@ def locate_on_lane(lane: Any, X: float, Y: float, psi: float) -> LanePosition:
 
 
 def _compute_scale(lane: Any, longitudinal: float) -> float:
-    """How many metres a unit of a lane's own coordinate is."""
+    """Compute the metres of a unit of a lane's own coordinate."""
     chord = lane.position(longitudinal + _STEP, 0.0) - lane.position(longitudinal - _STEP, 0.0)
     return float(np.hypot(*chord)) / (2.0 * _STEP)

@@ -80,7 +80,7 @@ def draw_closeup(
 
 
 def _draw_forces(canvas: Canvas, scene: CarScene, to_pixels: ToPixels, per_newton: float) -> None:
-    """An arrow a tyre, from green to orange as it nears its limit, and the share of it in use."""
+    """Draw an arrow a tyre, from green to orange as it nears its limit, and the fraction in use."""
     for wheel in scene.wheels:
         cos, sin = math.cos(wheel.angle), math.sin(wheel.angle)
         forward = cos * wheel.F_x - sin * wheel.F_y

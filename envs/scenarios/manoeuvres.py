@@ -119,7 +119,7 @@ _ROADS = (
         **_LANE,
         **(_HARSH | {"speed": (22.0 * KMH, 30.0 * KMH)}),
     ),
-    Scenario(  # nobody steers but the controller
+    Scenario(  # only the controller steers
         name="curved-road", half_width=1.75, **_BEND, **_HARSH
     ),
     Scenario(name="curved-road-driver", **_LANE, **_BEND, **_HARSH),

@@ -153,7 +153,7 @@ _TWO_B = _make_scenarios(
     any_friction_slalom=_set_amplitude(SLALOM, 0.01, 0.025),
     any_friction_step=_set_amplitude(STEP, 0.008, 0.025),
     any_friction_sine_with_dwell=_set_amplitude(SINE_WITH_DWELL, 0.01, 0.03),
-    # sections as long as they are for 35 to 50 km/h: at 80 friction 0.3 holds nobody on the track
+    # sections as long as they are for 35 to 50 km/h: at 80 friction 0.3 holds no car on the track
     any_friction_iso_3888_1=_ISO_3888_1 | {"path_speed": (35.0 * KMH, 50.0 * KMH)},
 )
 _TWO_C = _make_scenarios(
@@ -166,7 +166,7 @@ _TWO_C = _make_scenarios(
     limit_random=make_random_steering(0.01, 0.03) | {"speed": (55.0 * KMH, 65.0 * KMH)},
 )
 
-# Not scored, but mapped over where it starts: nobody steers, the car is caught or lost.
+# Not scored, but mapped over where it starts: the driver does not steer, the car is caught or lost.
 _RECOVERY = Scenario(
     name="recovery",
     duration=5.0,

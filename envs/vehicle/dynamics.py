@@ -48,7 +48,7 @@ class CarParams(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """What the plant integrates: velocities, heading, place on the ground and on the road."""
+    """The integrated state of the plant: velocities, heading, place on ground and road, roll."""
 
     v_x: Any  # m/s
     v_y: Any  # m/s

@@ -158,8 +158,10 @@ def _linear(tyre: Any, small_angle: int) -> Any:
 
 @jit
 def _fiala(tyre: Any) -> Any:
-    """z = clip(C t / 3 F_max, -1, 1), F_y = F_max z (3 - 3 |z| + z^2), which needs neither branch
-    nor arctangent (Pacejka, Tire and Vehicle Dynamics, 3)."""
+    """F_y = F_max z (3 - 3 |z| + z^2), z = clip(C t / 3 F_max, -1, 1): no branch, no arctangent.
+
+    Source: Pacejka, Tire and Vehicle Dynamics, 3.
+    """
     z = minimum(maximum(tyre.slope * tyre.tangent, -1.0), 1.0)
     return tyre.limit * z * (3.0 - 3.0 * absolute(z) + z * z)
 
