@@ -131,8 +131,7 @@ class OutsidePlant(ABC):
 
     Args:
         friction: Peak lateral friction of the tyre; None for CommonRoad's 1.05. The longitudinal
-            one
-            keeps its ratio to it. The single track's linear tyres ignore it.
+            one keeps its ratio to it. The single track's linear tyres ignore it.
         stiffness: Factor on the cornering stiffness of all tyres.
     """
 

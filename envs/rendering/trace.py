@@ -94,8 +94,7 @@ class EpisodeTrace:
 
         Returns:
             The truth, shape (n, len(TracePoint)), and by label estimates and deviations (rad),
-            shape
-            (n, 2), NaN where there are none.
+            shape (n, 2), NaN where there are none.
         """
         first = int(np.searchsorted(self._rows[: self._count, TRACE_POINT.t], t))
         step = max((self._count - first) // max_points, 1)

@@ -30,11 +30,9 @@ class Scenario:
         name: Name of the scenario.
         duration: Length of the episode (s).
         steering: Kind of the steering programme, of `STEERING_KINDS`. "random" is two pairs of
-            sines,
-            of amplitude and amplitude_2. "driver" keeps to `path` by preview. "wander" is a zero-
-            mean
-            Ornstein-Uhlenbeck process of standard deviation amplitude and corner frequency
-            `frequency`, held for `hold` from one angle to the next.
+            sines, of amplitude and amplitude_2. "driver" keeps to `path` by preview. "wander" is a
+            zero-mean Ornstein-Uhlenbeck process of standard deviation amplitude and corner
+            frequency `frequency`, held for `hold` from one angle to the next.
         trace: Recorded angles at the wheels (rad) for "trace": straight between them, the last
             stays.
         trace_step: Time between the trace's samples (s).

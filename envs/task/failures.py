@@ -11,7 +11,7 @@ REFUSED = -1
 WILD = 1 << 30
 """Added to what a step returns where an action was beyond `WILD_LIMIT`."""
 WILD_LIMIT = 10.0
-"""An action beyond it, a fraction of full scale, is a mistake rather than a request for all of it."""
+"""An action beyond it, a fraction of full scale, is a mistake, not a request for all of it."""
 
 
 @jit

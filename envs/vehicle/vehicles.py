@@ -42,8 +42,8 @@ def make_vehicle(source: VehicleSource, strict: bool = True) -> Vehicle:
 
     Raises:
         TypeError: For an unknown parameter, one that is no number, or another kind of source;
-            ValueError for an unknown name, a missing parameter, or a stiffness of no convention
-            or of two.
+            ValueError for an unknown name, a missing parameter, or a stiffness of no convention or
+            of two.
     """
     if isinstance(source, Vehicle):
         return source
