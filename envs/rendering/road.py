@@ -27,7 +27,7 @@ class CarTrack(NamedTuple):
     """A car to draw: its scene, its past, the colour of its body, and a name beside it."""
 
     scene: CarScene
-    truth: Array  # rows of `Moment`
+    truth: Array  # rows of `TracePoint`
     colour: str
     name: str = ""
 

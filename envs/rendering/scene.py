@@ -86,7 +86,7 @@ class CarScene(NamedTuple):
     field_of_view: CameraOverlay | None  # None without a camera
     lanes: tuple[Section, ...]  # between cones
     path: Array  # the driver's, rows (s, y) in m; (0, 2) where it is the road's centre line
-    curvatures: Array  # 1/m, the road's curvature at each of the next AHEAD metres
+    curvatures: Array  # 1/m, the road's curvature at each of the next DRAWN_LENGTH metres
     half_width: float  # m
     failure: int
 

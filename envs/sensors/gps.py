@@ -35,7 +35,7 @@ class SatelliteGeometry(NamedTuple):
     median: Any  # log of the median HDOP
     spread: Any  # standard deviation of log HDOP
     decay: Any  # what is left of a deviation after one period of the GPS
-    noise_gain: Any  # sqrt(1 - keep^2)
+    noise_gain: Any  # sqrt(1 - decay^2)
     weight: Any  # of HDOP in the noise, HDOP_LAWS
 
 

@@ -1,6 +1,6 @@
 """The slow sensors: the table of them, one sample of any of them, and which each id has.
 
-A new one is a file beside `camera` and `gps`, a row of `SLOW` and a branch of `sample`: packets,
+A new one is a file beside `camera` and `gps`, a row of `SLOW` and a branch of `sample_sensor`: packets,
 observation, random numbers, reset and the device engine follow from the table.
 """
 
@@ -52,7 +52,7 @@ class MeasurementContext(NamedTuple):
     car: Any
     noise: Any
     sky: Any  # the satellites
-    field_of_view: Any  # the camera's View
+    field_of_view: Any  # the camera's `FieldOfView`
     small_angle: int
     key_low: Any
     key_high: Any
