@@ -8,7 +8,7 @@ import numpy.typing as npt
 from ..record import Array
 
 Mask = npt.NDArray[np.bool_]
-SENSORS = {  # the values of a packet, as in `sensors.slow.SLOW`; the first tells where there is a sample
+SENSORS = {  # the values of a packet, as in `SLOW`; the first shows where a sample is
     "camera": ("camera_psi", "camera_y_l"),
     "gps": ("course", "gps_speed", "gps_x", "gps_y", "gps_hdop", "gps_satellites"),
 }

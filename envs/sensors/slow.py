@@ -1,7 +1,7 @@
 """The slow sensors: the table of them, one sample of any of them, and which each id has.
 
-A new one is a file beside `camera` and `gps`, a row of `SLOW` and a branch of `sample_sensor`: packets,
-observation, random numbers, reset and the device engine follow from the table.
+A new one is a file beside `camera` and `gps`, a row of `SLOW` and a branch of `sample_sensor`:
+packets, observation, random numbers, reset and the device engine follow from the table.
 """
 
 import dataclasses
