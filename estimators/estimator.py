@@ -326,7 +326,7 @@ class Estimator:
 
     @property
     def tick(self) -> int:
-        """The tick of the last fast row; one before the first if there was none yet."""
+        """Tick of the last fast row; one before the first if there was none yet."""
         return int(self._f.tick)
 
     @property
@@ -336,8 +336,10 @@ class Estimator:
 
     @property
     def nis(self) -> float:
-        """The normalised innovation squared of the last packet; NaN where it was not used or the
-        gains are precomputed."""
+        """Normalised innovation squared of the last packet; NaN where there is none.
+
+        There is none where the packet was not used or the gains are precomputed.
+        """
         return float(self._f.nis)
 
     def __getattr__(self, name: str) -> int:

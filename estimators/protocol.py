@@ -1,4 +1,4 @@
-"""What an estimator is to the package: the protocol, and the checked face of a user's own."""
+"""The protocol of an estimator, and a user's own behind it, checked."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence

@@ -60,7 +60,7 @@ def find_class(text: str) -> tuple[Path, str]:
 
 
 def _iterate_bindings(tree: ast.Module) -> Iterator[str]:
-    """The names that a file binds somewhere."""
+    """Iterate over the names that a file binds somewhere."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ClassDef | ast.FunctionDef):
             yield node.name

@@ -103,7 +103,7 @@ def _store_packet(f: FilterRecord, s: int, packet: Vector, place: int) -> None:
 
 @jit
 def _is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
-    """Whether a sample is a duplicate of a stored one."""
+    """Return whether a sample is a duplicate of a stored one."""
     for i in range(N_RECENT):
         if f.recent[i, PACKET.captured] == captured and f.recent[i, PACKET.sensor] == s:
             return True
@@ -149,8 +149,10 @@ def _apply_tick_samples(
 
 @jit
 def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: int) -> bool:
-    """Filter anew from the snapshot at `first` to now; False, and back to now, if the gate refuses
-    the sample at the place `new_place`."""
+    """Filter anew from the snapshot at `first` to now, with a new sample.
+
+    Returns False, and all is as before, if the gate refuses the sample at the place `new_place`.
+    """
     now, invalid, count = f.tick, f.counts[COUNTERS.invalid], _collect_samples(f, first)
     _store_snapshot(f, _NOW_SLOT)
     _restore(f, _find_slot(f, first))

@@ -39,7 +39,7 @@ ASSUMED_DELAY = 0.033  # s
 
 @dataclass(frozen=True, kw_only=True)
 class FilterConfig:
-    """What is decided about a filter before it is designed: its name in `FILTERS` and its options.
+    """Decisions about a filter before its design: its name in `FILTERS` and its options.
 
     Options, as `make_estimator` takes them
     ---------------------------------------

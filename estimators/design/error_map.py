@@ -60,7 +60,7 @@ def find_unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _DesignKey:
-    """What a table of gains depends on: key has all of it."""
+    """All that a table of gains depends on; `key` has all of it."""
 
     key: bytes
     f: FilterRecord = field(compare=False)

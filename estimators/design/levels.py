@@ -1,4 +1,4 @@
-"""What a filter believes of noise: sensors, disturbances, Q, and deviations at the start."""
+"""A filter's noise levels: sensors, disturbances, Q, and deviations at the start."""
 
 import math
 from collections.abc import Mapping, Sequence

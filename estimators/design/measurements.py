@@ -1,4 +1,4 @@
-"""What each slow sensor measures: its rows of C and their noise.
+"""Measurements of the slow sensors: their rows of C and their noise.
 
 A new slow sensor is an entry of `MEASUREMENTS`: options, states and compiled code follow it.
 """

@@ -173,8 +173,10 @@ def _design_settled(
 
 
 def _add_bias_walk(f: FilterRecord) -> None:
-    """Let a constant bias walk by its prior in 10 s: what never moves has no settled gain, but
-    whether it is seen is the same. Only a filter with gains of its own has one."""
+    """Let a constant bias walk by its prior in 10 s, for a filter that has gains of its own.
+
+    What never moves has no settled gain, but whether it is seen is the same.
+    """
     for i in range(int(f.dense), int(f.n)):
         if f.pushed[i - f.dense] < 0:
             f.Q[i, i] += f.prior[i, i] * f.step / BIAS_WALK_TIME

@@ -32,7 +32,7 @@ LAGS = (0, 1, 2, 4, 6, 9, 13, 17, 22, 27, 33, 40)
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectionCard:
-    """What a correction reads and how it was made; JSON types only.
+    """The inputs of a correction and how it was made; JSON types only.
 
     Attributes:
         base: The filter, a name of `FILTERS` with gains "covariance".

@@ -1,4 +1,4 @@
-"""What a policy's network remembers with: torch's GRU and LSTM, and running means (traces)."""
+"""Memory of a policy's network: torch's GRU and LSTM, and running means (traces)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

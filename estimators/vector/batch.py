@@ -52,7 +52,7 @@ class BatchEstimator:
         self.configure(range(len(specs)), specs)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """A copy's records lie on cache lines, too, and its lanes are empty."""
+        """Restore a copy: its records lie on cache lines, too, and its lanes are empty."""
         self.__dict__.update(state)
         filters, self.filters = self.filters, allocate_aligned(self.filters.shape, FILTER)
         self.filters[:], self._lanes = filters, make_blocks(len(filters))

@@ -25,8 +25,7 @@ _MIN_LANES = 4  # filters that are computed alone in less time than in lanes
 
 @jit
 def _fetch(f: FilterRecord, template: FilterRecord) -> None:
-    """Have the caches fetch what a tick reads of a filter, whose states are as many as
-    `template`'s."""
+    """Have the caches fetch what a tick reads of a filter with as many states as `template`."""
     for i in range(0, X_OFFSET + template.total, 8):
         prefetch(f.padding, i)
     for i in range(0, N_SMALL, 8):

@@ -62,8 +62,8 @@ _FLOATS = {
     "wild": (),  # 1: its residual is none
 }
 _INTS = ("shaped", "tick", "at", "cell", "cursor")
-"""Of a lane: 1 where its filter is known to have the block's shape, -1 where it has not, 0 where
-nobody looked; tick, step within the cycle, table of gains and packets done."""
+"""Of a lane: 1 where its filter is known to have the block's shape, -1 where it has not, 0 before
+the first look; tick, step within the cycle, table of gains and packets done."""
 _SHAPE = (
     *("n", "dense", "total", "inputs", "fasts", "kind", "periodic", "measured", "cycle"),
     *("store_predictions", "tyres", "robust"),

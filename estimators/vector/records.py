@@ -1,4 +1,4 @@
-"""Where a batch of estimators finds the records of a vector env's cars."""
+"""Records of a vector env's cars, as a batch of estimators reads them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -28,7 +28,7 @@ class RecordBatch(NamedTuple):
 
 
 class BatchedEnv(Protocol):
-    """What a vector env that steps all cars at once offers.
+    """The members of a vector env that steps all cars at once.
 
     The final_... ones are a row's record before its newest reset. They are read in the step that
     ended its episode.

@@ -1,4 +1,4 @@
-"""What a vector wrapper's spec names: the single wrapper around each environment."""
+"""The spec of a vector wrapper: it names the single wrapper around each environment."""
 
 import copy
 from collections.abc import Mapping

@@ -26,8 +26,10 @@ from .lanes import LaneBlock, load_lane, store_captures, store_lane, store_predi
 
 @jit
 def _fetch_next(b: LaneBlock, first: int, filters: Any, fast: Any, j: int, rows: int) -> None:
-    """Have the caches fetch what the next block, of the filters from `first` on, reads at tick j,
-    and its share of their states."""
+    """Have the caches fetch what the next block reads at tick j, and a part of its states.
+
+    first: the first filter of that block.
+    """
     last = minimum(first + count_lanes(), len(filters))
     for i in range(first, last):
         for k in range(0, FAST_WIDTH, 5):  # a row lies on two cache lines or three
@@ -55,7 +57,7 @@ def _read_rows(b: LaneBlock, first: int, fast: Any, j: int) -> None:
 @jit
 def _read_signals(b: LaneBlock) -> Any:
     """Inputs into b.u_new, measurements into b.y; (speeds, whether a lane's tick stands apart)."""
-    is_outlier = load_element(b.here) != 1.0  # nowhere, as far as anybody looks at it
+    is_outlier = load_element(b.here) != 1.0  # lanes without a filter: masked below
     for i in range(b.inputs):
         store_element(b.u_new, compute_signal(b.row, b.u_column[i], b.u_factor[i]), i)
         is_outlier = is_outlier | (is_finite(load_element(b.u_new, i)) ^ True)

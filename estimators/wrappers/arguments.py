@@ -21,7 +21,7 @@ _PARAMETERS = ("estimator", "outputs", "std", "replace", "vehicle", "options", "
 
 
 class EstimatorSpec(NamedTuple):
-    """What an estimator is built for.
+    """Vehicle, sensors and speed for which an estimator is built.
 
     Attributes:
         vehicle: The vehicle as the estimator believes it to be.
@@ -198,7 +198,7 @@ def choose_estimator(slow_sensors: Iterable[str]) -> str:
 
 
 def _is_object(source: Any) -> bool:
-    """Whether this is an estimator, well made or not, rather than what builds one."""
+    """Return whether this is an estimator, well made or not, rather than what builds one."""
     if isinstance(source, str | type):
         return False
     return not callable(source) or hasattr(source, "step") or hasattr(source, "reset")

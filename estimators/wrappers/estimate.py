@@ -101,7 +101,7 @@ class EstimateObservation(
         self._summary = np.zeros(3)
 
     def _update_estimator(self) -> AnyEstimator:
-        """The estimator for the env's present setup; the one at hand where nothing changed."""
+        """Return the estimator for the env's present spec; that at hand where nothing changed."""
         base, arguments, previous = self._base, self._arguments, self._estimator_spec
         spec = make_spec(base)
         if arguments.vehicle is not None:

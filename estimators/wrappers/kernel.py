@@ -1,4 +1,4 @@
-"""What an estimator adds to an observation, compiled: one call takes the step and writes it."""
+"""An estimator's part of an observation, compiled: one call takes the step and writes it."""
 
 from functools import cache
 from typing import Any
@@ -16,7 +16,7 @@ from ..learned.kernel import EXAMPLE, apply_correction, filter_and_correct, remo
 
 @jit
 def _clip_symmetric(value: Any, limit: Any) -> Any:
-    """The value within +-limit; NaN stays, so that a filter that failed is seen."""
+    """Clip the value to +-limit; NaN stays, so that a filter that failed is seen."""
     return value if value != value else minimum(maximum(value, 0.0 - limit), limit)
 
 

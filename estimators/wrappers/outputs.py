@@ -1,4 +1,4 @@
-"""What an estimator adds to an observation: states, under which names, within which bounds."""
+"""An estimator's part of an observation: states, under which names, within which bounds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
