@@ -1,6 +1,6 @@
-"""The rungs of the ladder: reference controllers that are given more and more of the truth.
+"""The oracles: reference controllers that know more and more of the truth.
 
-Every contestant is scored between `nominal`, a well-designed LQG that knows the nominal car alone,
+Every entry is scored between `nominal`, a well-designed LQG that knows the nominal car alone,
 and the better of the two that know state, disturbances and car: "Cost and score" of
 docs/ARCHITECTURE.md.
 """
@@ -48,10 +48,13 @@ _NOISE = {
 
 
 def make_noise_options(scenario: Scenario) -> dict[str, Any]:
-    """Options of `exact-kf`: the noise and the disturbances of a scenario.
+    """Make options of `exact-kf` from the noise and the disturbances of a scenario.
 
-    The course's noise follows the HDOP that comes with each packet, as far as the scenario's does.
-    The accelerometer is read where the body rolls, as the filter then believes.
+    The course's noise follows each packet's HDOP as far as the scenario's does. The accelerometer
+    is read where the body rolls, as the filter then assumes.
+
+    Args:
+        scenario: Scenario whose noise the filter knows.
     """
     noise = dict(scenario.noise)
     share = HDOP_LAWS[scenario.hdop_law]
@@ -72,13 +75,22 @@ def make_noise_options(scenario: Scenario) -> dict[str, Any]:
 
 
 def remove_biases(scenario: Scenario) -> Scenario:
-    """The scenario as a filter meets it that knows the sensors' biases and takes them away."""
+    """Remove the sensors' biases from a scenario, for a filter that knows and subtracts them.
+
+    Args:
+        scenario: Scenario with biases.
+    """
     noise = {key: value for key, value in scenario.noise.items() if not key.endswith("_bias")}
     return scenario.replace(noise=noise, gyro_bias=0.0, accel_y_bias=0.0)
 
 
 def compute_range_rms(scenario: Scenario, name: str) -> float:
-    """Root mean square of a quantity that is drawn evenly from its range."""
+    """Compute the root mean square of a quantity that is uniform over its range.
+
+    Args:
+        scenario: Scenario that holds the range.
+        name: Name of the quantity, whose unit the result has.
+    """
     low, high = scenario.range(name)
     return math.sqrt((low * low + low * high + high * high) / 3.0)
 
@@ -91,16 +103,24 @@ def make_oracle(
     options: Mapping[str, Mapping[str, Any]] | None = None,
     **env_kwargs: Any,
 ) -> tuple[Any, Controller]:
-    """(env, agent): a rung of `ORACLES` and the env whose observation it needs.
+    """Make an oracle and the env whose observation it needs.
 
-    num_envs: a vector env of so many rows, whose own arguments are vector_kwargs; None: a single
-    one. options: {"filter": of `exact-kf`, "controller": of the agent}, over the defaults: all of
-    the id's slow sensors, `make_noise_options` the scenario, a grip limit. env_kwargs:
-    of the env (scenario, vehicle, ...). Of the true car, stiffness and friction may differ between
-    episodes; the rest is the env's.
+    Args:
+        name: Name in `ORACLES`.
+        env_id: Id of the env.
+        num_envs: Rows of a vector env; None: a single env.
+        vector_kwargs: Arguments of the vector env.
+        options: {"filter": of `exact-kf`, "controller": of the agent}, over the defaults: all slow
+            sensors of the id, `make_noise_options` of the scenario, a grip limit.
+        env_kwargs: Arguments of the env (scenario, vehicle, ...). Stiffness and friction of the
+            true car may differ between episodes; its other parameters are the env's.
 
-    Raises ValueError for another name, TypeError for other options, and what `gym.make`, the filter
-    and the agent raise.
+    Returns:
+        The env and the agent.
+
+    Raises:
+        ValueError: The name is unknown.
+        TypeError: The options have another key.
     """
     check_choice("rung", name, ORACLES)
     chosen: dict[str, Mapping[str, Any]] = {"filter": {}, "controller": {}} | dict(options or {})
