@@ -39,8 +39,9 @@ def compute_yaw_gains(
 ) -> tuple[float, float]:
     """Compute k_p (N m s/rad) and k_i (N m/rad) of the yaw moment on the yaw rate's error.
 
-    Both poles of the yaw equation with its own damping are at the bandwidth: s^2 + (k_p / I - a22)
-    s + k_i / I = (s + bandwidth)^2. Where the damping alone is more, k_p is zero.
+    Both poles of the yaw equation with its own damping are at the bandwidth:
+    s^2 + (k_p / I - a22) s + k_i / I = (s + bandwidth)^2.
+    Where the damping alone is more, k_p is zero.
 
     Args:
         vehicle: Vehicle of the design.
