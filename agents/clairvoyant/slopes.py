@@ -149,7 +149,7 @@ def linearise_run(problem: IlqrProblem, known: Array, run: Trajectory) -> Linear
 
 
 def compute_limits(problem: IlqrProblem, forecast: Forecast, run: Trajectory) -> Limits:
-    """Compute limits by full scale, the wheels' stop, and the steering's rate from its angle in a run.
+    """Compute limits by full scale, the wheels' stop, and the steering's rate from a run's angle.
 
     Args:
         problem: Functions of the episode.

@@ -64,7 +64,7 @@ class DesignSpec:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs: fraction of the yaw moment, and steering added to the driver's (rad)."""
+        """Names of the inputs: fraction of the yaw moment, and added steering (rad)."""
         return ("N_z", "delta_f") if self.steers else ("N_z",)
 
 

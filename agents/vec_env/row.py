@@ -94,6 +94,7 @@ class VecEnvRow:
         Args:
             name: Name of the value.
             value: Value for `get_wrapper_attr`.
+            _: Without effect.
 
         Raises:
             AttributeError: The name is the env's.

@@ -1,4 +1,4 @@
-"""Moving averages by torch, for training: `MovingAverages` of the runtime, whole episodes at once."""
+"""Moving averages by torch, for training: `MovingAverages` of the runtime, by whole episodes."""
 
 import functools
 from collections.abc import Sequence
@@ -120,9 +120,10 @@ class TraceLayer(nn.Module):
 
 @functools.cache
 def _compute_weights(times: tuple[float, ...], first: int, steps: int) -> tuple[Any, Any]:
-    """Compute each step's weight in the averages of a block, (times, T, T), and the past's, (times, T).
+    """Compute the weights of a block's moving averages.
 
-    first: steps before the block.
+    Returns each step's weight (times, T, T) and the past's (times, T). first: steps before the
+    block.
     """
     ages = first + 1.0 + np.arange(steps)
     shares = np.maximum(1.0 / ages, -np.expm1(-1.0 / np.array(times))[:, None])
