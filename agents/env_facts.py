@@ -241,7 +241,7 @@ def _iterate_wrappers(env: Any) -> Iterator[Any]:
 
 
 def _is_transparent(wrapper: Any) -> bool:
-    """Whether a wrapper is known, or says itself, to leave observations and actions alone."""
+    """Return whether a wrapper is known, or declared, to keep observations and actions."""
     if "transparent" in vars(wrapper):
         return wrapper.transparent is True
     for base_class in type(wrapper).__mro__:

@@ -26,18 +26,17 @@ NOMINAL = "nominal"
 PARAMETER_ORACLES = ("oracle-parameters-lqr", "oracle-parameters-nmpc")
 STATE_ORACLES = ("oracle-state-lqr", "oracle-state-nmpc")
 ORACLES = (NOMINAL, *PARAMETER_ORACLES, *STATE_ORACLES)
-"""From the bottom up: those of `PARAMETER_ORACLES` know car, friction, noise and biases, those of
-`STATE_ORACLES` also the state and what pushes the car; neither controller is always the better
-one."""
+"""Oracles by rising knowledge: `PARAMETER_ORACLES` know car, friction, noise and biases,
+`STATE_ORACLES` also the state and the disturbances; neither controller is always the better one."""
 
 FILTER = "exact-kf"
 TYRE_FILTER = "joint"
 TYRE_FILTER_OPTIONS = dict.fromkeys(("front_tyres_sd", "rear_tyres_sd", "inverse_friction_sd"), 0.1)
-"""The filter of tyres that have a limit, which it knows to a tenth: so much does its law lack of
-the plant's. To a thousandth it believes itself, and costs 1.1 to 4 times as much."""
+"""Options of the filter for tyres with a limit: it knows them to a tenth, for its tyre law differs
+from the plant's. To a thousandth it is overconfident, and costs 1.1 to 4 times as much."""
 OUTPUTS = ("beta", "gamma", "F_d", "N_d")
 STATES = (*OUTPUTS, "phi", "phi_rate")
-GRIP = 0.7  # share of the rear tyres' grip for the yaw moment; 0.71 of it is left across
+GRIP = 0.7  # fraction of the rear tyres' grip for the yaw moment; 0.71 of it is left across
 STEER_WEIGHT = 100.0  # of added steering, which `lqr`'s design does not know the rate limit of
 _NOISE = {
     "gyro": "gyro_noise",
@@ -156,7 +155,7 @@ def make_oracle(
 
 
 def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, Any]) -> Any:
-    """The env with a filter on all of its slow sensors, that of the true tyres where it is told."""
+    """Add a filter on all slow sensors, with the true tyres where it knows them."""
     levels = make_noise_options(base.scenario) | {"slow": list(base.slow_sensors)}
     if "gps" not in base.slow_sensors:
         del levels["hdop_table"]

@@ -55,7 +55,11 @@ class PreviewStep(NamedTuple):
 
 
 class PlanState(NamedTuple):
-    """States of a plan: motion, actuators, the driver's integral."""
+    """States of a plan in SI units: motion, actuators, the driver's integral.
+
+    `slewing` is the commanded added steering, `added` the applied one (rad). T_l and T_r are the
+    motors' torques (N m).
+    """
 
     v_x: Any
     v_y: Any

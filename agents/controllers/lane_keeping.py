@@ -32,8 +32,8 @@ Inputs = namedtuple(
 Lane = namedtuple("Lane", "beta gamma psi y N_z delta_f integral driver kappa")
 """States of the lane model: the inputs move the first seven, the others move by themselves.
 
-psi: relative to the road. y: m, of the centre of gravity from the road's centre line, and its
-integral in m s. N_z: share of full scale.
+psi is relative to the road (rad). y is the offset of the centre of gravity from the road's centre
+line (m), and integral is its integral (m s). N_z is a fraction of full scale.
 """
 Memory = namedtuple("Memory", "integral rate heading started")
 """The integral, the filtered gamma / V and psi that the curvature is from, whether it began."""
@@ -54,10 +54,10 @@ def make_lane_model(
 
     Inputs are the fraction of the full yaw moment, and rad added to the driver's steering. The cost
     rate is the env's of beta and of both inputs, with gamma against V kappa. It adds the squares of
-    the offset over 0.1 m and of its integral over 0.2 m s. It also adds haste times the square of
-    the steering command's lead over the applied angle, per angle that the rate covers in a period
-    and a lag: else a linear law commands what the rate cannot give. It is taken at each period's
-    end.
+    the offset over 0.1 m and of its integral over 0.2 m s. A last term is haste times the square of
+    the steering command's lead over the applied angle. Its unit is the angle that the rate covers
+    in a period and a lag: without it a linear law commands what the rate cannot give. The cost is
+    taken at each period's end.
 
     Args:
         vehicle: Vehicle of the design.

@@ -98,15 +98,16 @@ class Lqr(Controller):
     x has the estimates beta_hat and gamma_hat (without the latter the gyro), the applied torques
     and steering, the driver's command, and the references. It has the disturbances F_d_hat, N_d_hat
     or d1_hat, d2_hat where the observation has either pair. On a Kalman filter's estimate this is
-    LQG. Where the env steers and an input would pass its limit, or the steering its rate, the two
-    are optimal within these limits, if none were met later. The memory is the steering last added.
+    LQG. Where the env steers, an input may pass its limit, or the steering its rate. Both inputs
+    are then optimal within these limits, if none were met later. The memory is the steering last
+    added.
 
     Args:
         env: Env of the controller.
         disturbance_time: Time in which F_d and N_d decay (s).
         vehicle: Vehicle of the design; None: the env's nominal one.
-        stiffness: Two entries of the observation, front and rear cornering stiffness (N/rad), on
-            which the gains are scheduled too.
+        stiffness: Two entries of the observation, front and rear cornering stiffness of a tyre
+            (N/rad), on which the gains are scheduled too.
         span: Range of the stiffness schedule, as factors of the vehicle's.
         knots: Knots of each stiffness axis; the table is designed once.
         steer_weight: Factor on the cost of added steering, for the rate limit that the design

@@ -35,7 +35,7 @@ STATUSES = ("unknown", "solved", "the observation is not finite", "diverged")
 UNKNOWN, SOLVED, NOT_FINITE, DIVERGED = range(len(STATUSES))
 
 Memory = namedtuple("Memory", "slewing status")
-"""rad of steering last added, and of `STATUSES`; the plan stands behind."""
+"""Steering last added (rad) and index in `STATUSES`; the plan stands behind."""
 
 LAST = Memory(*range(2))
 PLAN = len(Memory._fields)

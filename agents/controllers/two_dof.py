@@ -28,7 +28,7 @@ FEEDFORWARDS = ("reference", "zero-slip")
 Inputs = namedtuple("Inputs", "wheel_left wheel_right steer_command beta_hat beta_ref")
 """Columns of the laws' inputs; the feedforward reads the first three alone."""
 Memory = namedtuple("Memory", "integral wait share")
-"""The integral in N m, the decisions until the next update, the share held until then."""
+"""The integral (N m), decisions until the next update, and the fraction held until then."""
 
 
 IN = Inputs(*range(5))
@@ -64,8 +64,9 @@ def _compute_slip_gain(car: Any, V: Any) -> Any:
 def feedforward_gain(vehicle: Vehicle, speed: float) -> float:
     """Compute the yaw moment per steering angle that makes the static slip zero, C_FF (N m/rad).
 
-    Where the yaw moment has no static effect on beta (m V^2 = 2 (l_r C_r - l_f C_f), for
-    understeering cars only), the denominator is at least 5 % of its terms. Source: tie-vision (24).
+    For an understeering car there is a speed at which the yaw moment has no static effect on beta,
+    m V^2 = 2 (l_r C_r - l_f C_f). So the denominator is at least 5 % of its terms.
+    Source: tie-vision (24).
 
     Args:
         vehicle: Vehicle of the design.

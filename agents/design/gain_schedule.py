@@ -19,7 +19,7 @@ from .sampled_model import (
 )
 
 SPEEDS = tuple(np.geomspace(2.0, 60.0, 48).tolist())
-"""m/s: gains are designed at these, interpolated between and held beyond."""
+"""Speeds of the designs (m/s); gains are interpolated between and held beyond."""
 
 
 @jit

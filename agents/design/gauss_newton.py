@@ -19,7 +19,15 @@ STEP_LENGTHS = (1.0, 0.3)  # each step is tried whole and in part
 
 
 class PlanBatch(NamedTuple):
-    """Plans side by side and their results, one column for each."""
+    """Plans side by side and their results, one column for each.
+
+    Attributes:
+        plans: Variables, shape (variables, count).
+        perturbations: Changes beyond the limits, shape (variables, count).
+        limits: 1 or -1 where a block starts at a limit, shape (variables, count).
+        residuals: Residuals, whose squares sum to J, shape (residuals, count).
+        first: First yaw moment (fraction) and added steering (rad), shape (2, count).
+    """
 
     plans: Any  # (variables, count)
     perturbations: Any

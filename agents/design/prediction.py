@@ -31,7 +31,19 @@ N_TERMINAL = 4  # residuals behind the last step
 
 
 class PredictionState(NamedTuple):
-    """A prediction's state between steps."""
+    """A prediction's state between steps.
+
+    Attributes:
+        motion: Motion of the car.
+        T_l: Torque of the left motor (N m).
+        T_r: Torque of the right motor (N m).
+        delta_f: Applied steering angle (rad).
+        slewing: Added steering that was last commanded (rad).
+        beta_ref: Reference of the sideslip angle (rad).
+        gamma_ref: Reference of the yaw rate (rad/s).
+        F_d: Disturbance force (N).
+        N_d: Disturbance moment (N m).
+    """
 
     motion: Any
     T_l: Any

@@ -42,7 +42,22 @@ class PredictionModel(NamedTuple):
 
 
 class PredictionStart(NamedTuple):
-    """The state and the held quantities at the start of a prediction."""
+    """The state and the held quantities at the start of a prediction.
+
+    Attributes:
+        car: `CarParams` of the car.
+        motion: Motion of the car.
+        T_l: Torque of the left motor (N m).
+        T_r: Torque of the right motor (N m).
+        delta_f: Applied steering angle (rad).
+        slewing: Added steering that was last commanded (rad).
+        driver: Driver's steering angle, held (rad).
+        a_x: Acceleration, held (m/s^2).
+        refs: beta_ref (rad) and gamma_ref (rad/s) now.
+        steady: Values that a lagged reference approaches.
+        push: Disturbance forces.
+        max_moment: Largest yaw moment as a fraction of full scale.
+    """
 
     car: Any
     motion: Any

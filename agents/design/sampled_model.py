@@ -252,7 +252,7 @@ def solve_lqr(G: Array, H: Array, Q: Array, R: Array, N: Array, moved: int) -> t
         moved: Number of the states that inputs move.
 
     Returns:
-        K (m, n) and V (n, n), as of `compute_cost_to_go`.
+        K (m, n) and V (n, n), as for `compute_cost_to_go`.
     """
     from scipy.linalg import solve, solve_discrete_are
 

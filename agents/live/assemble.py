@@ -28,8 +28,8 @@ MAX_WAITING = 64  # packets of slow sensors before a fast row
 _INPUTS = (DatagramKind.INERTIAL, DatagramKind.END, *SENSORS)
 NO_PACKETS = np.zeros((0, PACKET_WIDTH))
 BRIDGED = ("lost", "restarted", "held", "late", "begun anew", "dropped")
-"""What is counted beside `RejectReason`: sequence numbers that never came, senders that began anew,
-ticks without a row, rows behind their tick, gaps too long to be bridged, packets without a row."""
+"""Counts beside `RejectReason`: sequence numbers that never came, senders that restarted, ticks
+without a row, rows behind their tick, gaps too long to be bridged, packets without a row."""
 
 
 class Arrival(NamedTuple):

@@ -12,11 +12,11 @@ from .datagrams import MAX_BYTES, DatagramKind, encode
 
 LOOPBACK, PORT = "127.0.0.1", 47001
 BUFFER = 1 << 22  # bytes of the kernel's, as far as it grants them
-MAX_BATCH = 512  # datagrams of a batch: whoever floods the port does not stop the loop
+MAX_BATCH = 512  # datagrams of a batch: a flood of them does not stop the loop
 SPIN = 150_000  # ns before a point in time, which sleeping alone would miss
 
 clock = time.monotonic_ns
-"""ns of the clock that nobody sets."""
+"""Time of the monotonic clock, which is never set (ns)."""
 
 
 def parse_address(text: str, host: str = LOOPBACK) -> tuple[str, int]:

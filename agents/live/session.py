@@ -31,7 +31,7 @@ _SETUP: dict[str, Any] = {
     "seed": int,
     "patience": (int, type(None)),
 }
-"""What the setup of a session has, by type."""
+"""Types of a session's setup, by key."""
 
 
 class Recorder:

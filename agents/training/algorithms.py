@@ -1,5 +1,4 @@
-"""The algorithms of `sideslip train`: stable-baselines3's and one of ours, with settings that learn
-here.
+"""The algorithms of `sideslip train`: stable-baselines3's and an own one, with their settings.
 
 The settings stand in `hyperparams/`, in rl-baselines3-zoo's format, and were chosen on YawVision-v0
 with seed 0. PPO on its sensors alone (600,000 steps, about 20 CPU-s; mean cost over none's on 256
@@ -41,8 +40,8 @@ Settings = dict[str, Any]
 
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
 PERIOD = 0.01  # s, of control: of the environments whose discount stands in the files
-WARM_START_ENTRY = "begun"  # the entry of a training that goes on from a policy
-WARM_START_TRACES_ENTRY = "begun-traces"  # from one with traces
+WARM_START_ENTRY = "begun"  # the entry of training a policy further
+WARM_START_TRACES_ENTRY = "begun-traces"  # one with moving averages
 UNIFORM_LOG_STD = -0.55  # log of the deviation of actions drawn evenly
 
 _TRAINING_SETTINGS = ("n_timesteps", "n_envs", "policy", "normalize")

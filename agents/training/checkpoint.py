@@ -18,9 +18,9 @@ with require_extra("train", "training needs {}"):
 
 FORMAT = 3
 VARIABLES = "variables"
-"""The part of the tensors that belong to no module, as the logarithm of an entropy's weight."""
+"""Part of the tensors that belong to no module, such as the logarithm of an entropy's weight."""
 STATE = {"groups", "sideslip", "task", "steps", "aim", "scaling", "evaluations"}
-"""What a training goes on from, besides the tensors."""
+"""Keys of a resumed training's state, besides the tensors."""
 
 
 def save_checkpoint(path: Path, model: Any, rest: dict[str, Any]) -> None:

@@ -110,8 +110,8 @@ ACTORS: dict[str, Callable[[Any], _Actor]] = {
     "sb3_contrib.common.recurrent.policies.RecurrentActorCriticPolicy": _find_recurrent_actor,
     f"{__package__}.gradient.GruPolicy": _find_gru_actor,
 }
-"""The policies whose actor is known: "MlpPolicy" and "MlpLstmPolicy" of PPO, A2C, SAC, TD3, DDPG,
-TQC and RecurrentPPO, and ours. A subclass may compute anything and is none of them."""
+"""Readers of the known actors: "MlpPolicy" and "MlpLstmPolicy" of PPO, A2C, SAC, TD3, DDPG, TQC and
+RecurrentPPO, and `GruPolicy`. A subclass may compute anything and is none of them."""
 
 
 def find_actor_reader(kind: type) -> Callable[[Any], _Actor]:

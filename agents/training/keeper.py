@@ -51,7 +51,7 @@ _SCALING_ENVS = 64  # environments whose observations make the scaling
 _WEIGHT_SEEDS, _EVALUATION_SEEDS, _SCALING_SEEDS, _TRAINING_SEEDS = 2**63, 2**64, 2**65, 2**66
 _SEEDS_PER_TRAINING = (
     2**40
-)  # seeds of a training: it takes those from its steps on when it starts or goes on
+)  # seeds of a training: a start or resumption takes those from its steps on
 
 
 def make_evaluation_seeds(episodes: int) -> list[int]:

@@ -26,7 +26,7 @@ WINDOW = 50  # steps through which the gradient goes back in time
 SAMPLES = 512  # steps of a batch without memory
 LAST_ROUND_FACTOR = 3  # times as many epochs in the last round
 Batch = tuple[Any, Any, Any, Any, Any, bool]
-"""Mixed observations (B, T, k), labels (B, T, m), what is told (B, T, q), weights (B, T),
+"""Mixed observations (B, T, k), labels (B, T, m), privileged inputs (B, T, q), weights (B, T),
 curvatures (B, m, m), and whether it begins the episodes."""
 
 

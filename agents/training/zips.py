@@ -1,7 +1,7 @@
-"""Zips of stable-baselines3 and sb3-contrib as policies of ours; reading one runs code.
+"""Zips of stable-baselines3 and sb3-contrib as policies; reading one can run code.
 
-A zip holds pickles, and what unpickles them does whatever their maker wrote. So nothing is read
-without `trust`, and `export_zip` writes a file that anybody can read without it.
+A zip holds pickles, and unpickling runs the code in them. So nothing is read without `trust`, and
+`export_zip` writes a file that is read without it.
 """
 
 import json

@@ -179,13 +179,13 @@ EPISODE = (
 )
 """The metrics of an episode.
 
-path_error: the largest distance from the path that the reference's yaw rate and slip would drive
-from the same start. motor_energy: mechanical, both motors' work without regard to its sign.
-tyre_dissipation: by sliding sideways, both axles.
-effort: mean square share of the yaw moment that was delivered. moment_rate: how fast the delivered
-yaw moment changes, on average. steer_effort: mean square share of the added steering that was asked
-for. largest_step, largest_steer_step: between two decisions. saturation: share of the decisions
-that ask for all of an input. failure: a code of `FAILURES`.
+path_error: largest distance from the path that the reference's yaw rate and slip would drive from
+the same start. motor_energy: mechanical work of both motors, without regard to its sign.
+tyre_dissipation: energy of sliding sideways, both axles. effort: mean square of the delivered yaw
+moment as a fraction. moment_rate: mean rate of the delivered yaw moment. steer_effort: mean square
+of the added steering command as a fraction. largest_step, largest_steer_step: between two
+decisions. saturation: fraction of the decisions with an input at its limit. failure: a code of
+`FAILURES`.
 """
 
 _OTHERS = {

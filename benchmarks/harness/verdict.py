@@ -7,7 +7,7 @@ from .stats import Estimate
 
 LINES = 5
 LETTERS = 110
-"""Of a line with our names; a user's may make one longer."""
+"""Letters of a line with the package's names; a user's may make one longer."""
 _NAMES = 2  # of those that tie
 _SURE = 0.995  # a ratio below it is a lead, one above it none to a reader
 

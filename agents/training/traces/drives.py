@@ -14,7 +14,7 @@ Single = npt.NDArray[np.float32]
 
 CLIP = 8.0  # of an input, scaled
 UNREAD = ("gps_X", "gps_Y", "gps_satellites")
-"""Where the car is says nothing of how to hold it."""
+"""Entries without information for control, as they only locate the car."""
 _MIN_VARIANCE = 1e-3  # variance, of what varies by 1, that a mixture of inputs has at least
 _EARLY, _MEDIAN = 16.0, 50.0  # percentiles of an age
 
