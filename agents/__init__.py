@@ -63,7 +63,7 @@ __all__ = [
 
 
 class Agent(Protocol):
-    """What acts in an env: stable-baselines3's models, our controllers, or a user's own object."""
+    """An actor in an env: a model of stable-baselines3, a controller, or a user's own object."""
 
     def predict(
         self,
@@ -72,10 +72,16 @@ class Agent(Protocol):
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Any, Any]:
-        """The action (width,) for an observation (k,), or (N, width) for (N, k); the next state.
+        """Compute the action for an observation.
 
-        state: as returned by the last call, None at first; the agent's memory, if it has one.
-        episode_start: (N,) of bool, the rows whose episode has just begun.
+        Args:
+            observation: Observation, shape (k,) or (N, k).
+            state: Memory from the last call; None at first.
+            episode_start: Rows whose episode has just begun, bool, shape (N,).
+            deterministic: Whether to take the mean action instead of a sample.
+
+        Returns:
+            Action of shape (width,) or (N, width), and the next state.
         """
 
 
@@ -90,16 +96,24 @@ def make_agent(name: Agent | Callable[..., Agent], env: AnyEnv, **options: Any) 
 def make_agent(
     name: str | Agent | Callable[..., Agent], env: AnyEnv, *, trust: bool = False, **options: Any
 ) -> Controller | Agent:
-    """An agent for an env, single or vector; ours are designed from the env's nominal vehicle.
+    """Make an agent for an env, single or vector; controllers are designed for its nominal vehicle.
 
-    name: of `AGENTS`, a shipped policy, the path of one (`.../NAME.safetensors`), a zip of
-    stable-baselines3 trained on this env (`.../NAME.zip`), an entry point "package.module:Name", or
-    a class in a file, "FILE.py:Name"; or a factory, called with the env and the options; or an
-    `Agent`, which is returned. trust: whether a zip may be read, which runs code of its maker's.
-    options: arguments of that controller, or of `agents.training.zips.policy_from_zip`.
-    Raises ValueError for an unknown name or an observation without what the controller needs,
-    TypeError for an unknown option, options beside an `Agent`, or what has no `predict`,
-    PermissionError for a zip without trust.
+    Args:
+        name: Name in `AGENTS`, shipped policy, path `.../NAME.safetensors`, zip of a
+            stable-baselines3 model trained on this env (`.../NAME.zip`), entry point
+            "package.module:Name" or class "FILE.py:Name"; a factory, called with the env and the
+            options; or an `Agent`, which is returned.
+        env: Env of this package.
+        trust: Whether a zip may be read, which can run code of its author.
+        options: Arguments of the controller, or of `agents.training.zips.policy_from_zip`.
+
+    Returns:
+        The agent.
+
+    Raises:
+        ValueError: The name is unknown, or the observation lacks what the controller needs.
+        TypeError: An option is unknown or stands beside an `Agent`, or there is no `predict`.
+        PermissionError: The name is a zip and `trust` is False.
 
     >>> import gymnasium as gym
     >>> env = gym.make("sideslip/YawVision-v0")
@@ -108,7 +122,7 @@ def make_agent(
     >>> action.shape
     (1,)
 
-    See also `Controller`, the base class of ours, and `sideslip.rollout`.
+    See also `Controller`, the base class of the controllers, and `sideslip.rollout`.
     """
     agent: Any = name
     if isinstance(name, str):
@@ -131,13 +145,17 @@ def make_agent(
 
 
 def register_agent(name: str, factory: Callable[..., Agent] | str) -> None:
-    """Give an agent of your own a name that works wherever an agent's name does.
+    """Give a user's agent a name that works wherever an agent's name does.
 
-    factory: called with the env and options, as the classes of `AGENTS` are; or
-    "package.module:Name", which is imported when first asked for. A name is known in this process
-    alone; worker processes and `sideslip`'s command line take the entry point itself for a name.
-    Raises TypeError or ValueError for a name or factory that is none, ValueError for a name that is
-    taken.
+    Args:
+        name: New name, known in this process alone; worker processes and the command line take the
+            entry point itself.
+        factory: Called with the env and options, as the classes of `AGENTS` are; or
+            "package.module:Name", which is imported at its first use.
+
+    Raises:
+        TypeError: The name or the factory has a wrong type.
+        ValueError: The name or the factory is invalid, or the name is taken.
     """
     if isinstance(name, str) and (is_policy(name) or name.endswith(ZIP)):
         raise ValueError(f"{name!r} is the name of a policy")

@@ -39,11 +39,16 @@ _CHANGES = {"reset", "step", "step_async", "step_wait", "observation", "observat
 
 @dataclass(frozen=True)
 class EnvFacts:
-    """What controllers are designed from, the same for all rows of a vector env.
+    """The facts that controllers are designed from, the same for all rows of a vector env.
 
-    layout: of an observation. nominal: the vehicle as controllers know it. full_scale: N m of
-    the action 1. authority: rad of added steering of the action 1. control_period: ticks.
-    reference: of `envs.task.reference.REFERENCES`. width: of an action.
+    Attributes:
+        layout: Entries of an observation.
+        nominal: Vehicle as controllers know it.
+        full_scale: Yaw moment at an action of 1 (N m).
+        authority: Added steering angle at an action of 1 (rad).
+        control_period: Ticks between two decisions.
+        reference: Name in `envs.task.reference.REFERENCES`.
+        width: Number of entries of an action.
     """
 
     layout: tuple[ObservationEntry, ...]
@@ -56,7 +61,7 @@ class EnvFacts:
 
 
 class PlantKind(NamedTuple):
-    """The text of a plant, as nonlinear MPC predicts with it."""
+    """The variant of a plant, for the prediction of nonlinear MPC."""
 
     tyres: str
     """The tyre law, of `TYRE_LAWS`."""
@@ -72,15 +77,15 @@ class PlantKind(NamedTuple):
 class EnvView:
     """The spaces and facts of a vector environment, from which an agent is built elsewhere.
 
-    `make_agent`, `get_env_facts` and our controllers take it for an env. It has no `reset`, no
+    `make_agent`, `get_env_facts` and the controllers accept it as an env. It has no `reset`, no
     `step` and no seed: an agent built from it learns of the true car by observations alone.
 
     Attributes:
-        num_envs: Number of rows, a car each.
+        num_envs: Number of rows, one car each.
         facts: Observation layout, nominal car and limits of the actuators.
-        plants: The kinds of plant among the rows.
-        single_observation_space: Of one row.
-        single_action_space: Of one row.
+        plants: Kinds of plant among the rows.
+        single_observation_space: Observation space of one row.
+        single_action_space: Action space of one row.
     """
 
     num_envs: int
@@ -91,28 +96,32 @@ class EnvView:
 
     @classmethod
     def from_env(cls, env: VectorEnv[Any, Any, Any]) -> "EnvView":
-        """Take the view of a vector env, with its wrappers."""
+        """Make the view of a vector env.
+
+        Args:
+            env: Vector env with its wrappers.
+        """
         spaces = env.single_observation_space, env.single_action_space
         return cls(env.num_envs, get_env_facts(env), list_plant_kinds(env), *spaces)
 
     @property
     def unwrapped(self) -> "EnvView":
-        """The view itself: nothing lies inside."""
+        """The view itself, which has no wrappers."""
         return self
 
     @property
     def observation_space(self) -> gym.Space[Any]:
-        """Of all rows."""
+        """Observation space of all rows."""
         return batch_space(self.single_observation_space, self.num_envs)
 
     @property
     def action_space(self) -> gym.Space[Any]:
-        """Of all rows."""
+        """Action space of all rows."""
         return batch_space(self.single_action_space, self.num_envs)
 
     @property
     def layout(self) -> tuple[ObservationEntry, ...]:
-        """The observation's entries: names, units and bounds."""
+        """Entries of the observation: names, units and bounds."""
         return self.facts.layout
 
     @property
@@ -122,7 +131,15 @@ class EnvView:
 
 
 def make_env(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
-    """The env of an id; what its arguments lack is said as the env says it, and no longer."""
+    """Make the env of an id, with the env's own short message for a missing or unknown argument.
+
+    Args:
+        env_id: Id of a registered env.
+        options: Arguments of `gym.make`.
+
+    Raises:
+        TypeError: An argument is missing or unknown.
+    """
     try:
         return gym.make(env_id, **options)
     except TypeError as error:  # of which Gymnasium makes a longer one
@@ -130,14 +147,18 @@ def make_env(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
 
 
 def get_env_facts(env: AnyEnv | EnvView) -> EnvFacts:
-    """The facts of an env, a vector env, a stable-baselines3 `VecEnv` or an `EnvView`.
+    """Collect the facts of an env, a vector env, a stable-baselines3 `VecEnv` or an `EnvView`.
 
-    Every wrapper is of a class that is known to leave observations and actions as they are, or has
-    `transparent = True`, as an attribute of its own or of its class. A subclass that defines how it
-    steps, resets, observes or acts anew is none of that class until it says so itself.
+    Every wrapper must be of a class that is known to keep observations and actions, or have
+    `transparent = True` on itself or its class. A subclass that overrides how it steps, resets,
+    observes or acts must set it anew.
 
-    Raises TypeError for what is no env of this package; ValueError for another wrapper, and where
-    the rows of a vector env have different nominal cars or limits.
+    Args:
+        env: Env of this package, wrapped or bare.
+
+    Raises:
+        TypeError: `env` is no env of this package.
+        ValueError: Another wrapper, or rows with different nominal cars or limits.
     """
     try:
         return _collect_facts(env)
@@ -185,7 +206,11 @@ def _collect_facts(env: Any) -> EnvFacts:
 
 
 def list_plant_kinds(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
-    """The kinds of plant among the rows of an env."""
+    """Collect the kinds of plant among the rows of an env.
+
+    Args:
+        env: Env, vector env, `VecEnv` or `EnvView`.
+    """
     if isinstance(env, EnvView):
         return env.plants
     scenarios = ((config.scenario, config.yaw_first) for config in list_configs(env))
@@ -196,7 +221,11 @@ def list_plant_kinds(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
 
 
 def list_configs(env: AnyEnv) -> Sequence[EnvConfig]:
-    """The arguments of an env, or of each environment in a vector env that has no one for all."""
+    """List the configurations of an env, one for all rows or one for each sub-environment.
+
+    Args:
+        env: Env, vector env or `VecEnv`.
+    """
     base: Any = env.unwrapped
     return [base.config] if hasattr(base, "config") else base.get_attr("config")
 
@@ -212,7 +241,7 @@ def _iterate_wrappers(env: Any) -> Iterator[Any]:
 
 
 def _is_transparent(wrapper: Any) -> bool:
-    """Whether a wrapper is known, or says itself, to leave observations and actions alone."""
+    """Return whether a wrapper is known, or declared, to keep observations and actions."""
     if "transparent" in vars(wrapper):
         return wrapper.transparent is True
     for base_class in type(wrapper).__mro__:
@@ -252,8 +281,14 @@ def _check_wrappers(env: Any, layout: tuple[ObservationEntry, ...]) -> None:
 
 
 def get_layout(env: VectorEnv[Any, Any, Any]) -> tuple[ObservationEntry, ...]:
-    """The outermost layout that a layer offers, else that of the sub-environments; ValueError for
-    a wrapper that `get_env_facts` refuses."""
+    """Read the layout of the outermost layer that has one, else that of the sub-environments.
+
+    Args:
+        env: Vector env with its wrappers.
+
+    Raises:
+        ValueError: `get_env_facts` refuses a wrapper, or the rows have different layouts.
+    """
     layer: Any = env
     while "layout" not in vars(layer) and isinstance(layer, VectorWrapper):
         layer = layer.env

@@ -55,10 +55,14 @@ _MIN_NOISE = {"accel": 1e4, "wheel": 100.0, "gps_speed": 100.0, "gps_position": 
 
 @dataclass(frozen=True)
 class LinearPlant:
-    """A linear scenario at the control's instants: x+ = G x + H u + w, w of covariance W.
+    """A linear scenario at the decisions: x+ = G x + H u + w, with w of covariance W.
 
-    model: as designs have it, the driver's angle decaying. rest: what noise within a period costs,
-    whatever the policy. start: covariance of x at the start. steps: periods of an episode.
+    Attributes:
+        model: Design model in which the driver's angle decays.
+        W: Covariance of w, shape (n, n).
+        rest: Cost of the noise within a period, under every policy.
+        start: Covariance of x at the start, shape (n, n).
+        steps: Control periods of an episode.
     """
 
     model: DesignModel
@@ -69,21 +73,25 @@ class LinearPlant:
 
     @property
     def driver(self) -> int:
-        """The place of the driver's angle in x."""
+        """Index of the driver's angle in x."""
         return self.model.design_spec.states.index("driver")
 
     @property
     def decay(self) -> float:
-        """The share of the driver's angle that is left a period later, on average."""
+        """Factor by which the driver's angle decays in a period, on average."""
         return float(self.model.G[self.driver, self.driver])
 
 
 @dataclass(frozen=True)
 class Optimum:
-    """The best policy, u = -K_j E[x_j | what was measured], and what it costs.
+    """The optimal policy, u = -K_j E[x_j | measurements], and its cost.
 
-    cost: expected, of an episode. gains: K_j (steps, n). weights: S_j (steps,), what another input
-    costs: S_j du^2. errors: covariance of the best estimate, by schedule, (schedules, steps, n, n).
+    Attributes:
+        plant: Linear plant of the scenario.
+        cost: Expected cost of an episode.
+        gains: K_j, shape (steps, n).
+        weights: S_j, shape (steps,): an input that differs by du costs S_j du^2 more.
+        errors: Covariance of the optimal estimate, shape (schedules, steps, n, n).
     """
 
     plant: LinearPlant
@@ -93,7 +101,11 @@ class Optimum:
     errors: Array
 
     def compute_cost(self, gains: Array) -> float:
-        """Expected cost of u = -L_j E[x_j | ...] for gains (steps, n), or (n,) of all steps."""
+        """Compute the expected cost of u = -L_j E[x_j | measurements].
+
+        Args:
+            gains: L_j, shape (steps, n), or (n,) for all steps.
+        """
         model, W = self.plant.model, self.plant.W
         L = np.broadcast_to(gains, self.gains.shape)
         total = 0.0
@@ -107,10 +119,16 @@ class Optimum:
         return self.cost + total / len(self.errors)
 
     def excess(self, read: Array, actions: Array) -> Array:
-        """What actions (N, steps) cost more than the best ones would have, by episode (N,).
+        """Compute the expected cost of actions above the optimal ones', by episode.
 
-        Whoever acts: in expectation his cost less the optimum, and much less scattered. read: what
-        `Lqg` reads in his cars, (N, steps, 5). Actions are those that the motors deliver.
+        It equals the cost less the optimum in expectation, for any agent, and scatters much less.
+
+        Args:
+            read: Inputs of `Lqg` in these episodes, shape (N, steps, 5).
+            actions: Delivered actions, shape (N, steps).
+
+        Returns:
+            Excess cost, shape (N,).
         """
         read_gains = _select_gains(self.plant, self.gains)
         read_gains[0, -1] /= self.plant.decay  # the first angle is seen before it acts
@@ -119,7 +137,14 @@ class Optimum:
 
 
 def make_linear_plant(env: AnyEnv) -> LinearPlant:
-    """The linear plant of an env, single or vector; ValueError where its scenario is not linear."""
+    """Make the linear plant of an env.
+
+    Args:
+        env: Env, single or vector.
+
+    Raises:
+        ValueError: The scenario is not linear.
+    """
     config = list_configs(env)[0]
     scenario, n = config.scenario, int(config.control_period)
     _check(config)
@@ -177,7 +202,11 @@ def _check(config: EnvConfig) -> None:
 
 
 def make_true_options(env: AnyEnv) -> dict[str, Any]:
-    """Options of `exact-kf` that know the noise, the disturbances and where an episode starts."""
+    """Make options of `exact-kf` with the true noise, disturbances and start of an episode.
+
+    Args:
+        env: Env, single or vector.
+    """
     config = list_configs(env)[0]
     start = dict.fromkeys(select_states(tuple(config.slow)), 0.0)
     options = make_noise_options(config.scenario) | {"slow": list(config.slow), "prior": start}
@@ -188,10 +217,15 @@ def make_true_options(env: AnyEnv) -> dict[str, Any]:
 
 
 def compute_optimum(env: gym.Env[Any, Any], schedules: int = 1) -> Optimum:
-    """The optimum of a linear scenario of a single env, which is driven to see what arrives when.
+    """Compute the optimum of a linear scenario; the env runs to show what arrives when.
 
-    schedules: seeds 0 .. schedules-1 whose arrivals are averaged over; one will do where nothing is
-    lost or late by chance. Raises ValueError as `make_linear_plant`.
+    Args:
+        env: Single env.
+        schedules: Number of seeds from 0 whose arrivals are averaged; one is enough where nothing
+            is lost or late by chance.
+
+    Raises:
+        ValueError: As `make_linear_plant`.
     """
     plant = make_linear_plant(env)
     gains, weights, cost = _solve_regulator(plant)
@@ -247,11 +281,14 @@ def _select_gains(plant: LinearPlant, gains: Array) -> Array:
 
 
 class Lqg(Controller):
-    """The best policy of a linear scenario that goes on for ever, on `wrap_optimal_estimate` of its
-    env.
+    """The optimal policy of a linear scenario without end, for the env of `wrap_optimal_estimate`.
 
-    It lacks the last steps, when nothing is to come, and takes the first angle for a last one.
-    `gains` (n,) is what `Optimum.compute_cost` prices, but for that.
+    It differs from `Optimum` in the last steps, whose cost has no future, and takes the first angle
+    for a later one. But for that, `Optimum.compute_cost` of `gains` is its cost.
+
+    Args:
+        env: Env, single or vector, with the optimal estimate in its observation.
+        gains: Gains of all steps, shape (n,); None: the optimal ones.
     """
 
     needs = (*(f"{name}_hat" for name in OUTPUTS), "steer_command")
@@ -267,6 +304,10 @@ class Lqg(Controller):
 
 
 def wrap_optimal_estimate(env: Any) -> Any:
-    """The env, single or vector, with the optimal estimate in its observation."""
+    """Wrap an env, single or vector, so that its observation has the optimal estimate.
+
+    Args:
+        env: Env of a linear scenario.
+    """
     wrapper: Any = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation
     return wrapper(env, FILTER, outputs=OUTPUTS, std=False, options=make_true_options(env))

@@ -25,10 +25,18 @@ COST_FLOOR = 0.001  # of an episode's cost, in logarithms and ratios: what diffe
 
 
 class EpisodeStep(NamedTuple):
-    """The outcome of an env-step, as the env returns it; of a vector env a row a car.
+    """The outcome of an env-step as the env returns it; of a vector env, one row for each car.
 
-    The first one is the reset: its action and reward are zero. running: (N,) the rows whose first
-    episode this is; a vector env starts the others anew meanwhile.
+    The first one is the reset, whose action and reward are zero.
+
+    Attributes:
+        obs: Observation, shape (k,) or (N, k).
+        info: Info of the env.
+        action: Action before this outcome, shape (width,) or (N, width).
+        reward: Reward, of the row or shape (N,).
+        terminated: Whether the episode ended by itself.
+        truncated: Whether the episode reached its time limit.
+        running: Rows that are in their first episode, shape (N,); a vector env restarts others.
     """
 
     obs: Any
@@ -46,10 +54,19 @@ def iterate_steps(
     seeds: Any = None,
     options: dict[str, Any] | None = None,
 ) -> Iterator[EpisodeStep]:
-    """The steps of an episode, or of each row's first one, until the last row's is over.
+    """Iterate over the steps of each row's first episode, until the last row's is over.
 
-    agent: anything with stable-baselines3's `predict`; None leaves the cars alone. seeds, options:
-    of the env's reset. Raises TypeError for an agent without `predict`.
+    Args:
+        env: Env, single or vector.
+        agent: Object with stable-baselines3's `predict`; None leaves the cars uncontrolled.
+        seeds: Seed or seeds of the env's reset.
+        options: Options of the env's reset.
+
+    Yields:
+        The reset, then every step.
+
+    Raises:
+        TypeError: The agent has no `predict`.
     """
     if not (agent is None or hasattr(agent, "predict")):
         raise TypeError(
@@ -72,7 +89,16 @@ def iterate_steps(
 def evaluate_episodes(
     env: VectorEnv[Any, Any, Any], agent: Any, seeds: Sequence[int]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """The cost J of each seed's first episode, (N,), and its steps; agent: of `iterate_steps`."""
+    """Evaluate the cost and length of each seed's first episode.
+
+    Args:
+        env: Vector env of N rows.
+        agent: Agent, as for `iterate_steps`.
+        seeds: N seeds.
+
+    Returns:
+        Costs J, shape (N,), and numbers of steps, shape (N,).
+    """
     costs, lengths = np.zeros(env.num_envs), np.full(env.num_envs, -1.0)  # the reset is no step
     for step in iterate_steps(env, agent, list(seeds)):
         costs -= np.where(step.running, step.reward, 0.0)
@@ -83,14 +109,25 @@ def evaluate_episodes(
 def evaluate_costs(
     env: VectorEnv[Any, Any, Any], agent: Any, seeds: Sequence[int]
 ) -> npt.NDArray[np.float64]:
-    """The costs of `evaluate_episodes`."""
+    """Evaluate the cost J of each seed's first episode, shape (N,).
+
+    Args:
+        env: Vector env of N rows.
+        agent: Agent, as for `iterate_steps`.
+        seeds: N seeds.
+    """
     return evaluate_episodes(env, agent, seeds)[0]
 
 
 def compute_cost_ratios(
     costs: npt.NDArray[np.float64], others: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """Costs over others' on the same seeds, (N,), as every score compares them."""
+    """Compute ratios of costs on the same seeds, each with `COST_FLOOR` added.
+
+    Args:
+        costs: Costs J, shape (N,).
+        others: Costs J to compare with, shape (N,).
+    """
     return np.asarray((costs + COST_FLOOR) / (others + COST_FLOOR))
 
 
@@ -109,11 +146,13 @@ TRUTH = ("beta", "gamma", "psi", "v_x", "v_y", "phi", "y_l")
 
 @dataclass(frozen=True, repr=False)
 class Rollout:
-    """An episode. Row 0 is the reset, row k the state after the k-th step.
+    """An episode: row 0 is the reset, row k the state after the k-th step.
 
-    columns: arrays of one value a row: the numbers of `info` and the true motion, then every entry
-    of the observation (`obs_...`), the action that led to the row and its reward. units: by column.
-    log: the record of every tick, with the truth at the ticks of the rows.
+    Attributes:
+        columns: Arrays of one value for each row: numbers of `info`, true motion, entries of the
+            observation (`obs_...`), the action that led to the row, and its reward.
+        units: Units by column.
+        log: Record of every tick, with the truth at the ticks of the rows.
     """
 
     columns: dict[str, npt.NDArray[np.float64]]
@@ -140,7 +179,7 @@ class Rollout:
         return bool(self.columns["failure"][-1])
 
     def _repr_png_(self) -> bytes | None:
-        """What a notebook shows; None without matplotlib."""
+        """Draw the picture that a notebook shows; None without matplotlib."""
         try:
             figure = self.plot()
         except ModuleNotFoundError:
@@ -150,7 +189,7 @@ class Rollout:
         return picture.getvalue()
 
     def to_pandas(self) -> "DataFrame":
-        """The table, a row a step, units in its attribute `attrs["units"]` (needs `report`)."""
+        """Make the table, a row for each step, with units in `attrs["units"]` (needs `report`)."""
         with require_extra("report", "to_pandas needs pandas"):
             from pandas import DataFrame
 
@@ -159,7 +198,11 @@ class Rollout:
         return table
 
     def to_parquet(self, path: str | Path) -> None:
-        """Write the table; units stand in the columns' metadata (needs the extra `report`)."""
+        """Write the table, with units in the columns' metadata (needs the extra `report`).
+
+        Args:
+            path: File to write.
+        """
         with require_extra("report", "to_parquet needs pyarrow"):
             import pyarrow as pa
             import pyarrow.parquet as pq
@@ -173,7 +216,7 @@ class Rollout:
             pq.write_table(table, file)
 
     def plot(self) -> "Figure":
-        """Sideslip angle, yaw rate, yaw moment and steering over time (needs `report`)."""
+        """Plot sideslip angle, yaw rate, yaw moment and steering over time (needs `report`)."""
         with require_extra("report", "plot needs matplotlib"):
             from matplotlib.figure import Figure
 
@@ -229,8 +272,14 @@ def rollout(
 ) -> Rollout:
     """Run one episode.
 
-    env: an environment or its id. agent, options: of `iterate_steps`; seed: of the reset. Raises
-    TypeError for a vector env, or one that is not of this package.
+    Args:
+        env: Env of this package, or its id.
+        agent: Agent, as for `iterate_steps`.
+        seed: Seed of the reset.
+        options: Options of the reset.
+
+    Raises:
+        TypeError: A vector env, or an env of another package.
     """
     if isinstance(env, str):
         with contextlib.closing(gym.make(env)) as new_env:
@@ -261,7 +310,11 @@ def rollout(
 
 
 def get_motion(base: Any) -> dict[str, float]:
-    """The rest of the motion, not in `info`: v_x, v_y (m/s), phi (rad), y_l and place X, Y (m)."""
+    """Read the motion that `info` lacks: v_x, v_y (m/s), phi (rad), y_l and place X, Y (m).
+
+    Args:
+        base: Unwrapped single env.
+    """
     motion = base.motion
     return {
         "v_x": motion.v_x,

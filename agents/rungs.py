@@ -1,6 +1,6 @@
-"""The rungs of the ladder: reference controllers that are given more and more of the truth.
+"""The oracles: reference controllers that know more and more of the truth.
 
-Every contestant is scored between `nominal`, a well-designed LQG that knows the nominal car alone,
+Every entry is scored between `nominal`, a well-designed LQG that knows the nominal car alone,
 and the better of the two that know state, disturbances and car: "Cost and score" of
 docs/ARCHITECTURE.md.
 """
@@ -26,18 +26,17 @@ NOMINAL = "nominal"
 PARAMETER_ORACLES = ("oracle-parameters-lqr", "oracle-parameters-nmpc")
 STATE_ORACLES = ("oracle-state-lqr", "oracle-state-nmpc")
 ORACLES = (NOMINAL, *PARAMETER_ORACLES, *STATE_ORACLES)
-"""From the bottom up: those of `PARAMETER_ORACLES` know car, friction, noise and biases, those of
-`STATE_ORACLES` also the state and what pushes the car; neither controller is always the better
-one."""
+"""Oracles by rising knowledge: `PARAMETER_ORACLES` know car, friction, noise and biases,
+`STATE_ORACLES` also the state and the disturbances; neither controller is always the better one."""
 
 FILTER = "exact-kf"
 TYRE_FILTER = "joint"
 TYRE_FILTER_OPTIONS = dict.fromkeys(("front_tyres_sd", "rear_tyres_sd", "inverse_friction_sd"), 0.1)
-"""The filter of tyres that have a limit, which it knows to a tenth: so much does its law lack of
-the plant's. To a thousandth it believes itself, and costs 1.1 to 4 times as much."""
+"""Options of the filter for tyres with a limit: it knows them to a tenth, for its tyre law differs
+from the plant's. To a thousandth it is overconfident, and costs 1.1 to 4 times as much."""
 OUTPUTS = ("beta", "gamma", "F_d", "N_d")
 STATES = (*OUTPUTS, "phi", "phi_rate")
-GRIP = 0.7  # share of the rear tyres' grip for the yaw moment; 0.71 of it is left across
+GRIP = 0.7  # fraction of the rear tyres' grip for the yaw moment; 0.71 of it is left across
 STEER_WEIGHT = 100.0  # of added steering, which `lqr`'s design does not know the rate limit of
 _NOISE = {
     "gyro": "gyro_noise",
@@ -48,10 +47,13 @@ _NOISE = {
 
 
 def make_noise_options(scenario: Scenario) -> dict[str, Any]:
-    """Options of `exact-kf`: the noise and the disturbances of a scenario.
+    """Make options of `exact-kf` from the noise and the disturbances of a scenario.
 
-    The course's noise follows the HDOP that comes with each packet, as far as the scenario's does.
-    The accelerometer is read where the body rolls, as the filter then believes.
+    The course's noise follows each packet's HDOP as far as the scenario's does. The accelerometer
+    is read where the body rolls, as the filter then assumes.
+
+    Args:
+        scenario: Scenario whose noise the filter knows.
     """
     noise = dict(scenario.noise)
     share = HDOP_LAWS[scenario.hdop_law]
@@ -72,13 +74,22 @@ def make_noise_options(scenario: Scenario) -> dict[str, Any]:
 
 
 def remove_biases(scenario: Scenario) -> Scenario:
-    """The scenario as a filter meets it that knows the sensors' biases and takes them away."""
+    """Remove the sensors' biases from a scenario, for a filter that knows and subtracts them.
+
+    Args:
+        scenario: Scenario with biases.
+    """
     noise = {key: value for key, value in scenario.noise.items() if not key.endswith("_bias")}
     return scenario.replace(noise=noise, gyro_bias=0.0, accel_y_bias=0.0)
 
 
 def compute_range_rms(scenario: Scenario, name: str) -> float:
-    """Root mean square of a quantity that is drawn evenly from its range."""
+    """Compute the root mean square of a quantity that is uniform over its range.
+
+    Args:
+        scenario: Scenario that holds the range.
+        name: Name of the quantity, whose unit the result has.
+    """
     low, high = scenario.range(name)
     return math.sqrt((low * low + low * high + high * high) / 3.0)
 
@@ -91,16 +102,24 @@ def make_oracle(
     options: Mapping[str, Mapping[str, Any]] | None = None,
     **env_kwargs: Any,
 ) -> tuple[Any, Controller]:
-    """(env, agent): a rung of `ORACLES` and the env whose observation it needs.
+    """Make an oracle and the env whose observation it needs.
 
-    num_envs: a vector env of so many rows, whose own arguments are vector_kwargs; None: a single
-    one. options: {"filter": of `exact-kf`, "controller": of the agent}, over the defaults: all of
-    the id's slow sensors, `make_noise_options` the scenario, a grip limit. env_kwargs:
-    of the env (scenario, vehicle, ...). Of the true car, stiffness and friction may differ between
-    episodes; the rest is the env's.
+    Args:
+        name: Name in `ORACLES`.
+        env_id: Id of the env.
+        num_envs: Rows of a vector env; None: a single env.
+        vector_kwargs: Arguments of the vector env.
+        options: {"filter": of `exact-kf`, "controller": of the agent}, over the defaults: all slow
+            sensors of the id, `make_noise_options` of the scenario, a grip limit.
+        env_kwargs: Arguments of the env (scenario, vehicle, ...). Stiffness and friction of the
+            true car may differ between episodes; its other parameters are the env's.
 
-    Raises ValueError for another name, TypeError for other options, and what `gym.make`, the filter
-    and the agent raise.
+    Returns:
+        The env and the agent.
+
+    Raises:
+        ValueError: The name is unknown.
+        TypeError: The options have another key.
     """
     check_choice("rung", name, ORACLES)
     chosen: dict[str, Mapping[str, Any]] = {"filter": {}, "controller": {}} | dict(options or {})
@@ -136,7 +155,7 @@ def make_oracle(
 
 
 def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, Any]) -> Any:
-    """The env with a filter on all of its slow sensors, that of the true tyres where it is told."""
+    """Add a filter on all slow sensors, with the true tyres where it knows them."""
     levels = make_noise_options(base.scenario) | {"slow": list(base.slow_sensors)}
     if "gps" not in base.slow_sensors:
         del levels["hdop_table"]

@@ -1,6 +1,6 @@
-"""Tuned options of the contestants, by the class of contests that they drive: `tuned.toml`.
+"""Tuned options of the entries, by the class of tasks that they drive: `tuned.toml`.
 
-`sideslip tune controller` finds them. A class is a car with what acts on it and what judges it,
+`sideslip tune controller` finds them. A class is a car with its disturbances and its reference,
 such as "coms-model" or "car-steering".
 """
 
@@ -18,9 +18,14 @@ Options = dict[str, dict[str, Any]]
 
 @cache
 def read_tuned(path: Path = FILE) -> dict[str, dict[str, Options]]:
-    """The options of a file by class and contestant.
+    """Read the options of a file, by class and entry.
 
-    Raises FileNotFoundError, and ValueError, with the path, for a file that holds something else.
+    Args:
+        path: TOML file.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file holds something else; the message has the path.
     """
     try:
         classes: Any = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -35,6 +40,11 @@ def read_tuned(path: Path = FILE) -> dict[str, dict[str, Options]]:
 
 
 def get_tuned_options(contest_class: str, name: str) -> Options:
-    """{"filter": options, "controller": options} of a contestant; empty where none was tuned."""
+    """Get the tuned options of an entry by part, empty where none was tuned.
+
+    Args:
+        contest_class: Class of tasks.
+        name: Name of the entry.
+    """
     options = read_tuned().get(contest_class, {}).get(name, {})
     return {part: dict(options.get(part, {})) for part in PARTS}

@@ -21,20 +21,42 @@ SUFFIXES = (".toml", ".json")
 
 
 def has_suffix(source: object, suffixes: tuple[str, ...]) -> bool:
-    """Whether a value is a text or a `Path` with one of these endings."""
+    """Check whether a value is a text or a `Path` with one of these endings.
+
+    Args:
+        source: Any value.
+        suffixes: Endings in lower case, with the dot.
+
+    Returns:
+        True if it ends in one of them, in upper or lower case.
+    """
     return isinstance(source, str | os.PathLike) and str(source).lower().endswith(suffixes)
 
 
 def is_document(source: object) -> bool:
-    """Whether a value is a path: any `Path`, or a text with an ending, which no name has."""
+    """Check whether a value is a path: any `Path`, or a text with an ending, which no name has.
+
+    Args:
+        source: Any value.
+
+    Returns:
+        True for a path.
+    """
     return isinstance(source, os.PathLike) or (isinstance(source, str) and "." in source[-8:])
 
 
 def read_document(source: "str | os.PathLike[str]", what: str) -> dict[str, Any]:
-    """The mapping in a file; a file named under `base` is looked for beside it.
+    """Read the mapping in a TOML or JSON file; a file named under `base` is looked for beside it.
 
-    what: is in the file, for messages. Raises FileNotFoundError, and ValueError for a folder,
-    another ending, and a file that is no TOML or JSON or holds no mapping.
+    Raises FileNotFoundError, and ValueError for a folder, another ending, a `base` that leads back
+    to the file, and a file that is no TOML or JSON or holds no mapping.
+
+    Args:
+        source: Path of the file.
+        what: Kind of content, for messages.
+
+    Returns:
+        Names and values of the file.
     """
     path = Path(source)
     values = _parse_file(path, what)
@@ -88,9 +110,14 @@ def _check_base_cycle(path: Path, base: Path | None, what: str) -> None:
 
 
 def write_document(path: "str | os.PathLike[str]", values: Mapping[str, Any]) -> None:
-    """Write a mapping of numbers, texts, lists and such mappings, which `read_document` reads back.
+    """Write a mapping to a TOML or JSON file, which `read_document` reads back.
 
-    Raises ValueError for another ending.
+    Args:
+        path: Path of the file, whose ending chooses the format.
+        values: Numbers, texts, lists and mappings of these by name.
+
+    Raises:
+        ValueError: For another ending.
     """
     kind = Path(path).suffix.lower()
     if kind not in SUFFIXES:
@@ -105,7 +132,14 @@ def write_document(path: "str | os.PathLike[str]", values: Mapping[str, Any]) ->
 
 
 def to_toml(value: Any) -> str:
-    """A number, text, list or mapping as TOML writes it behind a key."""
+    """Format a value as TOML writes it behind a key.
+
+    Args:
+        value: Number, text, list or mapping.
+
+    Returns:
+        The text.
+    """
     if isinstance(value, Mapping):
         pairs = (f"{_format_key(name)} = {to_toml(item)}" for name, item in value.items())
         return f"{{ {', '.join(pairs)} }}"
@@ -121,10 +155,18 @@ def _format_key(name: str) -> str:
 
 
 def from_json(kind: type[DataclassT], entry: Any, where: str) -> DataclassT:
-    """A dataclass's instance from a JSON object, whose lists may stand for tuples.
+    """Make a dataclass's instance from a JSON object, whose lists may stand for tuples.
 
-    Raises ValueError, with the place and the field, for an unknown or missing field and a value of
-    another type.
+    Args:
+        kind: The dataclass.
+        entry: The parsed JSON value.
+        where: Place of the value, for messages.
+
+    Returns:
+        The instance.
+
+    Raises:
+        ValueError: For an unknown or missing field and a value of another type.
     """
     if not isinstance(entry, dict):
         raise ValueError(f"{where}: expected a JSON object, got {short_repr(entry)}")
@@ -143,7 +185,16 @@ def from_json(kind: type[DataclassT], entry: Any, where: str) -> DataclassT:
 
 
 def check_types(kind: "type[DataclassInstance]", values: Mapping[str, Any], where: str) -> None:
-    """ValueError, with the place and the field, for a value of another type than a dataclass's."""
+    """Check that values have the types of a dataclass's fields.
+
+    Args:
+        kind: The dataclass.
+        values: Values by the names of fields.
+        where: Place of the values, for messages.
+
+    Raises:
+        ValueError: For a value of another type, with the place and the field.
+    """
     types: dict[str, Any] = {spec.name: spec.type for spec in fields(kind)}
     for name, value in values.items():
         expected = get_origin(types[name]) or types[name]

@@ -56,9 +56,13 @@ PACKET_WIDTH = PACKET.value + VALUES
 class Record:
     """Fast rows and packets of consecutive ticks.
 
-    fast: (n, FAST_WIDTH), columns as in `Fast`. packets: (count, PACKET_WIDTH), columns as in
-    `Packet`, ordered by arrival, then captured tick, then sensor. `first` is the tick of row 0,
-    `dt` the tick in seconds. `present` names the fast columns that carry something.
+    Attributes:
+        fast: Fast rows, shape (n, FAST_WIDTH), columns as in `Fast`.
+        packets: Packets, shape (count, PACKET_WIDTH), columns as in `Packet`, ordered by arrival,
+            then captured tick, then sensor.
+        first: Tick of row 0.
+        dt: Length of a tick (s).
+        present: Names of the fast columns that carry something.
     """
 
     fast: Array
@@ -73,13 +77,30 @@ class Record:
         return np.arange(self.first, self.first + len(self.fast))
 
     def select_packets(self, sensor: str) -> Array:
-        """The packets of one slow sensor, (count, PACKET_WIDTH)."""
+        """Select the packets of one slow sensor.
+
+        Args:
+            sensor: Name of the sensor, "camera" or "gps".
+
+        Returns:
+            Its packets, shape (count, PACKET_WIDTH).
+        """
         is_wanted = self.packets[:, PACKET.sensor] == SLOW_NAMES.index(sensor)
         return np.asarray(self.packets[is_wanted], np.float64)
 
 
 def concatenate(records: list[Record]) -> Record:
-    """One record of consecutive ones; ValueError where ticks do not follow."""
+    """Concatenate records of consecutive ticks.
+
+    Args:
+        records: Records in the order of time; each begins a tick after the one before it.
+
+    Returns:
+        One record of all their rows and packets.
+
+    Raises:
+        ValueError: If ticks do not follow.
+    """
     for before, after in itertools.pairwise(records):
         if after.first != before.first + len(before.fast):
             raise ValueError(
@@ -95,9 +116,13 @@ def concatenate(records: list[Record]) -> Record:
 
 @dataclass
 class Log:
-    """A recorded drive or episode: a record, its slow sensors, and the truth where known.
+    """A recorded drive or episode: a record, its slow sensors, and the truth where it is known.
 
-    truth: columns by name ("beta", "psi", ...), each of one value a row, in SI units.
+    Attributes:
+        record: Fast rows and packets.
+        slow: Slow sensors by name.
+        truth: True values by name ("beta", "psi", ...), each of shape (n,), in SI units.
+        name: Name of the log.
     """
 
     record: Record
@@ -107,5 +132,5 @@ class Log:
 
     @property
     def time(self) -> Array:
-        """Seconds of each row."""
+        """Time of each row (s), shape (n,)."""
         return np.asarray(self.record.ticks * self.record.dt, np.float64)

@@ -51,9 +51,9 @@ class StabilityEnv(
     """Keep a car's sideslip angle where it should be, by two motors and, if asked, by steering.
 
     ## Action
-    `Box(-1, 1, (1,), float32)`: the yaw moment as a share of its full scale (372.7 N m for the
+    `Box(-1, 1, (1,), float32)`: the yaw moment as a fraction of its full scale (372.7 N m for the
     COMS; positive turns left). With `steering` it is `Box(-1, 1, (2,), float32)`: the second
-    entry is the steering angle *added* to the driver's, as a share of its full scale (0.1 rad,
+    entry is the steering angle *added* to the driver's, as a fraction of its full scale (0.1 rad,
     positive to the left; at most 0.8 rad/s, within the stop). Zero is the uncontrolled car; values
     outside are clipped, the first beyond +-10 with a warning. What is not finite, no numbers or of
     a wrong shape raises ValueError and steps nothing; with `on_bad_action="fail"` it ends the
@@ -98,16 +98,26 @@ class StabilityEnv(
     `scenario`, `vehicle`, `friction`, `duration` (s), `state` (mapping of `v_x, v_y, gamma, psi, X,
     Y, s, y, theta`, and `phi, phi_dot` where the car rolls); unknown keys raise ValueError.
 
-    ## Arguments
-    sensors: "vision", "vision-uneven", "gps" or "fusion" (camera and GPS). scenario: as of
-    `make_scenario`. vehicle: the true one, as of `make_vehicle`; nominal: that of estimators and
-    controllers (default: vehicle). control_period: ticks of 1 ms. reference: "zero-slip", "model"
-    (its steady state), "limited" (by friction) or "lagged" (so limited, understeering, lag 0.1 s).
-    fast: "summary" or "all". with_map: the road's curvature is seen, which estimators are always
-    told. slow, by name ("camera", "gps"): fields of `SlowSensor` that replace the id's. yaw_first:
-    yaw moment before acceleration where both pass the motors' limit. steering: the action may steer
-    too. vision, delay, appearance: as of `CameraMixin`. render_mode: of `RenderMixin`. strict:
-    whether implausible numbers of scenario and vehicles are refused.
+    Args:
+        sensors: "vision", "vision-uneven", "gps" or "fusion" (camera and GPS).
+        scenario: Name, file, mapping or `Scenario`, as `make_scenario` reads it.
+        vehicle: The true vehicle: name, file, mapping or `Vehicle`, as `make_vehicle` reads it.
+        nominal: The vehicle of estimators and controllers; None for the true one.
+        control_period: Ticks of 1 ms between two decisions.
+        reference: "zero-slip", "model" (the nominal steady state), "limited" (that, by friction) or
+            "lagged" (limited, never oversteering, with a lag of 0.1 s).
+        fast: "summary" (last sample and mean) or "all" (every sample of the fast sensors).
+        with_map: Whether the observation has the road's curvature; records have it in any case.
+        yaw_first: Whether the yaw moment precedes acceleration where both pass the motors' limit.
+        steering: Whether the action has the added steering angle.
+        on_bad_action: "raise" or "fail".
+        vision: "analytic" or "image" (rendered pictures and a lane finder).
+        delay: Delay of "image": "fitted" (drawn from measured times; default), "measured" (not
+            deterministic) or "link" (the camera's own).
+        appearance: With "image", fields of `Appearance` that replace the clear road's.
+        render_mode: None, "rgb_array" or "human".
+        strict: Whether implausible numbers of the scenario and vehicles are refused.
+        slow: By sensor ("camera", "gps"), fields of `SlowSensor` that replace the id's.
     """
 
     config: EnvConfig
@@ -158,7 +168,15 @@ class StabilityEnv(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start an episode; see the class docstring for the options."""
+        """Start an episode.
+
+        Args:
+            seed: Seed of the env's generator; None continues it.
+            options: Options of reset, listed in the class docstring.
+
+        Returns:
+            The observation and the info at tick 0.
+        """
         config = self.config.apply_options(options or {})
         super().reset(seed=seed)  # refused options leave everything as it was
         self._episode = config
@@ -180,7 +198,18 @@ class StabilityEnv(
     def step(
         self, action: npt.ArrayLike
     ) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Hold the action for one control period."""
+        """Hold the action for one control period.
+
+        Args:
+            action: Fractions of full scale, shape (1,), or (2,) with `steering`.
+
+        Returns:
+            Observation, reward, terminated, truncated and info.
+
+        Raises:
+            ResetNeeded: If no episode is running.
+            ValueError: If the action is refused; nothing is stepped.
+        """
         if self._over:
             raise ResetNeeded("the episode is over or was never started: call reset() first")
         command = parse_action(action, self._action_width, self._fail_on_bad_action)
@@ -215,7 +244,7 @@ class StabilityEnv(
 
     @property
     def record(self) -> Record:
-        """What the wires carried in the newest step, or at tick 0 after a reset (a copy)."""
+        """The record of the newest step, or of tick 0 after a reset (a copy)."""
         rows, packets = self.rows[: self.ticks_done], self.packets[: self.delivered]
         return make_record(self._state, rows, packets)
 
@@ -236,12 +265,12 @@ class StabilityEnv(
 
     @property
     def motion(self) -> Motion:
-        """The true velocities, heading, place and roll now, in SI units; no sensor tells these."""
+        """The true velocities, heading, place and roll now, in SI units."""
         return get_motion(self._state)
 
     @property
     def true_state(self) -> Array:
-        """The `TrueState` now, (len(TrueState),); no sensor tells these."""
+        """The `TrueState` now, shape (len(TrueState),); no sensor measures these."""
         rows = self._params[None], self._state[None], self._switches[None]
         return np.asarray(compute_true_states(*rows)[0])
 
@@ -262,14 +291,14 @@ class StabilityEnv(
 
     @property
     def redraws(self) -> int:
-        """Unstable draws thrown away at this reset."""
+        """Number of unstable draws that this reset rejected."""
         return int(self._state[Z.clock.redraws])
 
     def _get_packed_arrays(self, row: int) -> PackedArrays:
         return self._params, self._state, self._switches, self._report, self._episode
 
     def get_state(self) -> dict[str, Any]:
-        """A snapshot that `set_state` continues from, bit for bit."""
+        """Copy the state of env and generator, from which `set_state` continues bit for bit."""
         return {
             "params": self._params.copy(),
             "state": self._state.copy(),
@@ -284,7 +313,14 @@ class StabilityEnv(
         }
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Go back to a snapshot of this env or of one built with the same arguments."""
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Return value of `get_state`.
+
+        Raises:
+            ValueError: If it has another control period, other sensors or another observation.
+        """
         if np.shape(snapshot["rows"]) != self.rows.shape:
             raise ValueError(
                 f"the snapshot has {len(snapshot['rows'])} ticks a step, this env {len(self.rows)}"

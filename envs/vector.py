@@ -46,15 +46,8 @@ class StabilityVectorEnv(
     """`num_envs` environments, each of which is a `StabilityEnv(**arguments)` bit for bit.
 
     Observations, rewards, ends, infos and records are those of `SyncVectorEnv`: row i of
-    `reset(seed=s)` is the single environment of `reset(seed=s + i)`, and its episodes go on from
-    its own generator. `gym.make_vec(id, num_envs=N, **arguments)` builds it.
-
-    ## Arguments
-    arguments: those of `StabilityEnv`; scenario and vehicle may each be a list (N,), one a row, for
-    all its episodes. max_episode_steps: as of `TimeLimit` around each row. autoreset_mode:
-    "NextStep", "SameStep" or "Disabled" (rows that ended wait for `reset` with a `reset_mask`), or
-    the enum. info: "all" has the infos of every row in every step, as `SyncVectorEnv` does; "ends"
-    only those of the last step of an episode, and none at resets. render_mode: of `RenderMixin`.
+    `reset(seed=s)` is the single environment of `reset(seed=s + i)`, and its later episodes come
+    from its own generator. `gym.make_vec(id, num_envs=N, **arguments)` builds it.
 
     ## Reset
     `seed`: an int, or a list (N,) of int or None. `options`: those of `StabilityEnv`, each one for
@@ -68,14 +61,26 @@ class StabilityVectorEnv(
     the values are not read.
 
     ## Records
-    `rows` (N, n, FAST_WIDTH) of which `ticks_done` (N,) are there, `packets` (N, most,
+    `rows` (N, n, FAST_WIDTH) of which `ticks_done` (N,) are filled, `packets` (N, most,
     PACKET_WIDTH) of which `delivered` (N,) are; `final_...` are those before a row's newest reset.
     `record[i]` is a row's `Record`.
 
     `vehicle`, `nominal`, `held_speed`, `slow_sensors`, `scenario` and `record` are sequences of N
-    whose items are made when asked for; `motion` is (N, len(Motion)).
+    whose items are made on access; `motion` is (N, len(Motion)).
 
-    Raises TypeError or ValueError for an argument out of place.
+    Args:
+        num_envs: Number of rows N.
+        autoreset_mode: "NextStep", "SameStep" or "Disabled" (rows that ended wait for `reset` with
+            a `reset_mask`), or the enum.
+        info: "all" has the infos of every row in every step, as `SyncVectorEnv` does; "ends" only
+            those of the last step of an episode, and none at resets.
+        render_mode: None, "rgb_array" or "human".
+        max_episode_steps: Steps after which a row is truncated, as by `TimeLimit`; None: no limit.
+        arguments: Arguments of `StabilityEnv`; scenario and vehicle may each be a list (N,), one a
+            row, for all its episodes.
+
+    Raises:
+        ValueError: For an argument out of place; TypeError for one of another type.
     """
 
     def __init__(
@@ -110,11 +115,16 @@ class StabilityVectorEnv(
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What `gym.make_vec` builds this env from; JSON types where the arguments are."""
+        """The spec that `gym.make_vec` builds this env from; JSON types where the arguments are."""
         return self._spec
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
+        """Set the spec, its autoreset mode as JSON writes it.
+
+        Args:
+            spec: Gymnasium's spec of this env.
+        """
         if spec is not None and "autoreset_mode" in spec.kwargs:
             spec.kwargs["autoreset_mode"] = self._mode.value
         self._spec = spec
@@ -124,10 +134,17 @@ class StabilityVectorEnv(
     def reset(
         self, *, seed: Any = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observations, Infos]:
-        """Start episodes; see the class docstring for seeds and options.
+        """Start episodes; where it raises, everything stays as it was.
 
-        Raises TypeError or ValueError for what is out of place, ResetNeeded where a mask leaves
-        out rows that were never started; then everything is as it was.
+        Args:
+            seed: An int s (row i gets s + i), or a list (N,) of int or None.
+            options: Options of `StabilityEnv`, each one or a list (N,), and `reset_mask`.
+
+        Returns:
+            Observations (N, width), and the infos of the rows that were reset.
+
+        Raises:
+            ResetNeeded: If a mask leaves out rows that were never started.
         """
         N, remaining = self.num_envs, dict(options or {})
         seeds, mask = parse_seeds(seed, N), parse_reset_mask(remaining.pop("reset_mask", None), N)
@@ -148,7 +165,18 @@ class StabilityVectorEnv(
         return self.obs.copy(), make_infos(self.reports, mask) if self._all_infos else {}
 
     def step(self, actions: npt.ArrayLike) -> tuple[Observations, Array, Flags, Flags, Infos]:
-        """Hold each row's action for one control period."""
+        """Hold each row's action for one control period.
+
+        Args:
+            actions: Fractions of full scale, shape (N, 1), or (N, 2) with `steering`.
+
+        Returns:
+            Observations, rewards (N,), terminated (N,), truncated (N,) and infos.
+
+        Raises:
+            ResetNeeded: If no episode was started, or a row that ended waits for its reset.
+            ValueError: If an action is refused; nothing is stepped.
+        """
         N = self.num_envs
         if not self._started:
             raise ResetNeeded("no episode was started: call reset() first")
@@ -224,13 +252,13 @@ class StabilityVectorEnv(
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
-        """What each row's generator was seeded with."""
+        """The seed of each row's generator."""
         for i in range(self.num_envs):
             self.get_generator(i)  # a row without one gets one now
         return tuple(self.seeds)
 
     def get_state(self) -> dict[str, Any]:
-        """A snapshot of all rows that `set_state` continues from, bit for bit."""
+        """Copy the state of all rows, from which `set_state` continues bit for bit."""
         arrays = {name: array.copy() for name, array in self.arrays._asdict().items()}
         return arrays | {
             "layout": self.layout,
@@ -241,9 +269,13 @@ class StabilityVectorEnv(
         }
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Go back to a snapshot of this env or of one built with the same arguments.
+        """Restore a snapshot of this env or of one built with the same arguments.
 
-        Raises ValueError for one of another number of rows, control period or observation.
+        Args:
+            snapshot: Return value of `get_state`.
+
+        Raises:
+            ValueError: If it has another number of rows, control period or observation.
         """
         shape, own_shape = np.shape(snapshot["rows"]), self.rows.shape
         if shape != own_shape:

@@ -13,10 +13,17 @@ from .core.run import advance, process_packet_all, step_all, write_estimate
 
 
 def compile_call(function: Any, *example_args: Any) -> Any:
-    """The compiled call of a function for arguments of the example's types.
+    """Return the compiled call of a function for arguments of the example's types.
 
     numba finds out the types of the arguments at every call, which costs more than a filter's
-    step; this is the call without it, so arguments must have exactly these types and layouts.
+    step. This is the call without it, so arguments must have exactly these types and layouts.
+
+    Args:
+        function: A jitted function; any other is returned as it is.
+        *example_args: Arguments whose types and layouts the call takes.
+
+    Returns:
+        A callable with the same positional arguments.
     """
     if not is_jitted(function):
         return function
@@ -29,25 +36,25 @@ def _make_example() -> tuple[Any, Any]:
 
 @cache
 def compile_advance() -> Any:
-    """`advance` as a plain call."""
+    """Return `advance` as a plain call."""
     matrix, vector = np.zeros((1, 1)), np.zeros(1)
     return compile_call(advance, *_make_example(), matrix, 0, matrix, 0, 0, matrix, matrix, vector)
 
 
 @cache
 def compile_estimate() -> Any:
-    """`write_estimate` as a plain call."""
+    """Return `write_estimate` as a plain call."""
     return compile_call(write_estimate, *_make_example(), np.zeros(1), np.zeros((1, 1)))
 
 
 @cache
 def compile_process_packet() -> Any:
-    """`process_packet_all` as a plain call."""
+    """Return `process_packet_all` as a plain call."""
     return compile_call(process_packet_all, *_make_example(), np.zeros(PACKET_WIDTH))
 
 
 @cache
 def compile_step() -> Any:
-    """`step_all` as a plain call."""
+    """Return `step_all` as a plain call."""
     matrix = np.zeros((1, 1))
     return compile_call(step_all, *_make_example(), matrix, matrix, 0)

@@ -16,8 +16,13 @@ class UnobservableWarning(UserWarning):
 class Estimates:
     """A filter's states at every row of a record.
 
-    time: (K,) s. x, std: (K, n), states and standard deviations. names: of the n states. nis:
-    (packets,), the normalised innovation squared of each; NaN where it was not used.
+    Attributes:
+        time: Time (s), shape (K,).
+        x: States, shape (K, n).
+        std: Their standard deviations, shape (K, n).
+        names: Names of the n states.
+        nis: Normalised innovation squared of each packet, shape (packets,); NaN where it is not
+            used.
     """
 
     time: Array
@@ -27,5 +32,5 @@ class Estimates:
     nis: Array
 
     def __getitem__(self, name: str) -> Array:
-        """One state by name, (K,)."""
+        """Return one state by name, shape (K,)."""
         return self.x[:, self.names.index(name)]

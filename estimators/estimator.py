@@ -34,15 +34,27 @@ _NO_PACKETS = np.zeros((0, PACKET_WIDTH))
 class Estimator:
     """A filter at work; built by `make_estimator`.
 
-    `name`, `config`, schedules (of each layer): what it was built from. `names` and `units` of its
-    n states; `x` (n,) and `P` (n, n) at "now"; `tick`, of the last fast row. `find_unobservable`:
-    directions that its sensors cannot see. `spectral_radius` of its error over a cycle. `dt`:
-    seconds of a tick. `needs`: the fast columns it reads. `filters` (layers,), `gains` (cells,
-    rows, columns): its memory and its tables, as compiled code takes them.
-    Counters of what was skipped: `refused` (older than the filter's window), `duplicates`,
-    `future`, `invalid` (not finite), `poor` (quality 0, too few satellites), `unknown` (sensor or
-    stamp), `gated` (an innovation that the gate does not believe), `stuck` (the last packet again).
-    `compiled`: whether compiled code may run it by `filters` and `gains` alone.
+    Args:
+        config: Parsed options of the filter.
+        dt: Tick (s).
+        filters: Memory of the filter, dtype `FILTER`, shape (layers,).
+        schedules: Schedules of the samples; the last one has the gains in use.
+
+    Attributes:
+        name: Name of the filter.
+        names: Names of its n states; `units` has their units.
+        gains: Tables of gains, shape (cells, rows, columns), as compiled code takes them.
+        unobservable: Directions that its sensors cannot see.
+        spectral_radius: Spectral radius of its error over a cycle.
+        compiled: Whether compiled code may run it by `filters` and `gains` alone.
+        refused: Number of packets older than the filter's window.
+        duplicates: Number of packets with a captured tick that came before.
+        future: Number of packets captured or arriving after the present tick.
+        invalid: Number of packets and fast rows that are not finite.
+        poor: Number of packets of quality 0 or with too few satellites.
+        unknown: Number of packets of an unknown sensor or with an unknown time stamp.
+        gated: Number of packets whose innovation fails the chi-square gate.
+        stuck: Number of packets that repeat the values of the last one.
     """
 
     compiled = True
@@ -81,9 +93,12 @@ class Estimator:
         return tuple(FAST._fields[column] for column in sorted(columns))
 
     def check(self, filters: FilterRecords) -> None:
-        """Refuse a filter that diverges with a ValueError; warn of what it cannot see.
+        """Check that the filter converges, and warn of what it cannot see.
 
-        filters: its memory, or that of the same filter with its first slow sensor alone.
+        A ValueError says that the estimation error diverges.
+
+        Args:
+            filters: Its memory, or that of the same filter with its first slow sensor alone.
         """
         first = 0
         for f in filters:
@@ -103,7 +118,7 @@ class Estimator:
     def _design_table(
         self, f: FilterRecord, schedule: Schedule, speed: float
     ) -> tuple[Array, Array]:
-        """The table of gains at a speed and the map of the error; ValueError if that grows."""
+        """Compute the table of gains at a speed and the error's map; ValueError if that grows."""
         try:
             table, M = design_and_map(f, schedule, speed, self.config)
         except ValueError as error:
@@ -117,7 +132,7 @@ class Estimator:
         return table, M
 
     def design_missing(self) -> None:
-        """Make the table of gains that compiled code has just asked for."""
+        """Compute the table of gains that compiled code has just asked for."""
         self._design_cell(int(self._f.wanted))
 
     def _design_cell(self, cell: int) -> None:
@@ -127,10 +142,14 @@ class Estimator:
         self.gains[cell] = self._design_table(f, self._schedules[-1], speed)[0]
 
     def reset(self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0) -> None:
-        """Forget everything; the next fast row is the tick `first`.
+        """Set the filter back to its prior.
 
-        sensors: slow sensors whose clocks have a new phase. Raises ValueError if anything but the
-        phase differs from what the filter was built for.
+        Args:
+            sensors: Slow sensors by name, whose clocks have a new phase; None keeps the phases.
+            first: Tick of the next fast row.
+
+        Raises:
+            ValueError: A sensor differs in more than its phase from that of the construction.
         """
         for name, sensor in self.sensors.items():
             new = sensor if sensors is None else sensors.get(name)
@@ -146,9 +165,15 @@ class Estimator:
         reset_filters(self.filters, first)
 
     def step(self, fast: Array, packets: Array, count: int | None = None) -> None:
-        """Take fast rows (k, FAST_WIDTH) and the first `count` packets (all if None).
+        """Process fast rows and packets, which follow the last ones taken.
 
-        The rows follow the last ones taken; the packets are ordered as in a `Record`.
+        Args:
+            fast: Fast rows, shape (k, FAST_WIDTH).
+            packets: Packets ordered as in a `Record`, shape (capacity, PACKET_WIDTH).
+            count: Number of packets to take; None takes all.
+
+        Raises:
+            ValueError: An array has another shape, or `count` is out of range.
         """
         fast = np.ascontiguousarray(fast, np.float64)
         packets = np.ascontiguousarray(packets, np.float64)
@@ -179,10 +204,16 @@ class Estimator:
         S: Array = EMPTY,
         nis: Array = NO_NIS,
     ) -> None:
-        """`step` without any checks: the first rows and packets of C-contiguous float64 arrays.
+        """Process rows and packets as `step` does, without any checks.
 
-        X, S: (rows, n), to be filled with states and standard deviations, or empty. nis: (count,),
-        to be filled with the normalised innovation squared of each packet, or empty.
+        Args:
+            fast: Fast rows, C-contiguous float64, shape (k, FAST_WIDTH).
+            rows: Number of fast rows to take.
+            packets: Packets, C-contiguous float64, shape (capacity, PACKET_WIDTH).
+            count: Number of packets to take.
+            X: Output for the states, shape (rows, n), or empty.
+            S: Output for the standard deviations, shape (rows, n), or empty.
+            nis: Output for each packet's normalised innovation squared, shape (count,), or empty.
         """
         record, outputs = (fast, rows, packets, count), (X, S, nis)
         done = compile_advance()(self.filters, self.gains, *record, 0, *outputs)
@@ -190,7 +221,7 @@ class Estimator:
             self._finish_rows(done, rows, record, outputs)
 
     def _finish_rows(self, done: int, rows: int, record: Any, outputs: Any) -> None:
-        """The rest of the rows, designing the gains that are asked for on the way.
+        """Process the rest of the rows and compute missing gains on the way.
 
         record, outputs: the arguments of `advance` before and behind the rows done.
         """
@@ -199,11 +230,22 @@ class Estimator:
             done = compile_advance()(self.filters, self.gains, *record, done, *outputs)
 
     def predict(self, fast_row: npt.ArrayLike) -> None:
-        """Take one fast row: from the last tick to this one, with the gyro."""
+        """Process one fast row: from the last tick to this one, with the gyro.
+
+        Args:
+            fast_row: Fast row of this tick, shape (FAST_WIDTH,).
+        """
         self.step(np.atleast_2d(np.asarray(fast_row, np.float64)), _NO_PACKETS)
 
     def update(self, packet: npt.ArrayLike) -> None:
-        """Take one packet that is here now, after the fast row of this tick."""
+        """Process one packet that has arrived, after the fast row of this tick.
+
+        Args:
+            packet: Packet, shape (PACKET_WIDTH,).
+
+        Raises:
+            ValueError: The packet has another shape.
+        """
         values = np.ascontiguousarray(packet, np.float64)
         if values.shape != (PACKET_WIDTH,):
             raise ValueError(f"a packet has shape ({PACKET_WIDTH},), got {values.shape}")
@@ -213,9 +255,13 @@ class Estimator:
         compile_process_packet()(self.filters, self.gains, packet)
 
     def run(self, source: Log | Record) -> Estimates:
-        """Reset, then filter a whole record.
+        """Reset, then filter a whole record; errors as in `prepare_record`.
 
-        Raises ValueError if the record is empty, has another tick than `dt`, or lacks a column.
+        Args:
+            source: Record, or a log that has one.
+
+        Returns:
+            States, standard deviations and NIS of the record.
         """
         record = self.prepare_record(source)
         fast, packets = (np.ascontiguousarray(a, np.float64) for a in (record.fast, record.packets))
@@ -225,7 +271,17 @@ class Estimator:
         return Estimates(np.asarray(record.ticks * record.dt, np.float64), X, S, self.names, nis)
 
     def prepare_record(self, source: Log | Record) -> Record:
-        """Reset for a record, which is returned; raises as `run`."""
+        """Reset for a record and check that it fits.
+
+        Args:
+            source: Record, or a log that has one.
+
+        Returns:
+            The record.
+
+        Raises:
+            ValueError: The record is empty, has another tick than `dt`, or lacks a column.
+        """
         record = source.record if isinstance(source, Log) else source
         if len(record.fast) == 0:
             raise ValueError(f"{self.name}: the record is empty")
@@ -240,25 +296,29 @@ class Estimator:
         return record
 
     def get_state(self) -> Any:
-        """A snapshot that `set_state` continues from, bit for bit."""
+        """Return a snapshot, from which `set_state` restores every bit."""
         return self.filters.copy()
 
     def set_state(self, snapshot: Any) -> None:
-        """Go back to a snapshot of this estimator or of one built with the same arguments."""
+        """Restore a snapshot of this estimator or of one built with the same arguments.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         self.filters[:] = snapshot
 
     @property
     def x(self) -> Array:
-        """The states now, (n,)."""
+        """The present states, shape (n,)."""
         return self._read_estimate(0)[0]
 
     @property
     def P(self) -> Array:
-        """Their covariance now, (n, n); with periodic gains that of the settled cycle."""
+        """Their present covariance, shape (n, n); with periodic gains that of the settled cycle."""
         return self._read_estimate(len(self.names))[1]
 
     def _read_estimate(self, width: int) -> tuple[Array, Array]:
-        """The states (n,) and their covariance (width, width): width is n, or 0 for none."""
+        """Read the states (n,) and their covariance (width, width): width is n, or 0 for none."""
         x, P = np.empty(len(self.names)), np.zeros((width, width))
         while not compile_estimate()(self.filters, self.gains, x, P):
             self._design_cell(int(self._f.cell))
@@ -266,7 +326,7 @@ class Estimator:
 
     @property
     def tick(self) -> int:
-        """The tick of the last fast row; one before the first if there was none yet."""
+        """Tick of the last fast row; one before the first if there was none yet."""
         return int(self._f.tick)
 
     @property
@@ -276,8 +336,10 @@ class Estimator:
 
     @property
     def nis(self) -> float:
-        """The normalised innovation squared of the last packet; NaN where it was not used or the
-        gains are precomputed."""
+        """Normalised innovation squared of the last packet; NaN where there is none.
+
+        There is none where the packet was not used or the gains are precomputed.
+        """
         return float(self._f.nis)
 
     def __getattr__(self, name: str) -> int:

@@ -21,15 +21,22 @@ from ..envs.sensors.slow import SLOW_NAMES
 
 @dataclass(frozen=True, kw_only=True)
 class FilterDefinition:
-    """One row: what a filter is, and the defaults of its options.
+    """One row of the table: what a filter is, and the defaults of its options.
 
-    slow: slow sensors it can use, the preferred first (none: fast ones alone). model: "bicycle" or
-    a name of `models.MODELS`. fast: what it measures in every row. intersample: "predict",
-    "pseudo-residual", "dual-rate" or "single-rate" (`core.intersample`). gains: "periodic",
-    "covariance" or "placed". disturbances: of `models.DISTURBANCES`. delay: of `delay.RULES`.
-    options: pairs (option, its default), where that is another than for most.
-    poles: rad/s, where gains are placed. second: the model of a second layer. hdop: pairs (HDOP,
-    factor on the GPS's noise). source: where it comes from, with the equations.
+    Attributes:
+        slow: Slow sensors it can use, the preferred first; without any it uses fast ones alone.
+        model: "bicycle" or a name of `models.MODELS`.
+        fast: What it measures in every row.
+        intersample: "predict", "pseudo-residual", "dual-rate" or "single-rate"
+            (`core.intersample`).
+        gains: "periodic", "covariance" or "placed".
+        disturbances: A name of `models.DISTURBANCES`.
+        delay: A name of `delay.RULES`.
+        poles: Poles (rad/s), where gains are placed.
+        second: Model of a second layer; "" for none.
+        options: Pairs (option, its default) that differ from the common defaults.
+        hdop: Pairs (HDOP, factor on the GPS's noise).
+        source: Paper with the equations.
     """
 
     slow: tuple[str, ...] = ()
@@ -69,7 +76,7 @@ ROBUST = (
     ("accel_scale_sd", 0.045),
     ("steer_rate", 3.0),
 )
-"""For a car that nobody has measured: levels of `benchmarks.tuning.robust`, found on simulated
+"""For a car of unknown parameters: levels of `benchmarks.tuning.robust`, found on simulated
 drives alone."""
 
 FILTERS: dict[str, FilterDefinition] = {

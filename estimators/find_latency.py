@@ -27,8 +27,15 @@ MIN_LOG_RATIO = 8.0  # of a logarithm of a likelihood ratio
 
 
 def align_rows(rows: Array, lags: dict[int, int]) -> Array:
-    """Fast rows (k, FAST_WIDTH) with each late column (ticks by column) at the time when it was
-    true; NaN where it has not come yet."""
+    """Shift each late column of fast rows to the time when it was true.
+
+    Args:
+        rows: Fast rows, shape (k, FAST_WIDTH).
+        lags: Latency (ticks) by column.
+
+    Returns:
+        Aligned rows, shape (k, FAST_WIDTH); NaN where a value has not come yet.
+    """
     result = rows.copy()
     for column, lag in lags.items():
         split = max(len(rows) - lag, 0)
@@ -37,10 +44,19 @@ def align_rows(rows: Array, lags: dict[int, int]) -> Array:
 
 
 class LatencySearch:
-    """A latency of some columns that is looked for. dt: s of a tick.
+    """Search for the latency of some columns.
 
-    `lag`: in force, ticks. `sd`: its standard deviation in ticks, infinite before it is known.
-    `done`: whether it needs no more looks.
+    Args:
+        columns: Columns of the fast row that are late together.
+        dt: Tick (s).
+
+    Attributes:
+        lag: Latency in force (ticks).
+        sd: Its standard deviation (ticks), infinite before it is known.
+        done: Whether it needs no more looks.
+
+    Raises:
+        ValueError: The tick is too long to find a latency.
     """
 
     def __init__(self, columns: tuple[int, ...], dt: float) -> None:
@@ -55,25 +71,42 @@ class LatencySearch:
         self.lag, self.sd, self.done = 0, np.inf, False
 
     def begin(self, filters: Any, rows: Array, packets: Array) -> None:
-        """A new stretch, from a memory on; rows, packets: those that it has not taken yet."""
+        """Begin a new stretch at a filter's memory.
+
+        Args:
+            filters: Memory of the filter, shape (layers,).
+            rows: Fast rows that it has not taken yet, shape (k, FAST_WIDTH).
+            packets: Packets that it has not taken yet, one a row.
+        """
         self._start, self._rows, self._packets = filters.copy(), [rows], [packets]
         self._count = len(rows)
 
     def count_until_look(self) -> int:
-        """Rows until the next look."""
+        """Return the number of rows until the next look."""
         return min(look for look in self._looks if look > self._count) - self._count
 
     def take(self, rows: Array, packets: Array) -> None:
-        """More rows, no further than the next look, and packets, as the memory takes them."""
+        """Store rows, no further than the next look, and packets, as the memory takes them.
+
+        Args:
+            rows: Fast rows, shape (k, FAST_WIDTH).
+            packets: Packets, one a row.
+        """
         self._rows.append(rows)
         self._packets.append(packets)
         self._count += len(rows)
 
     def look(self, delayed_filters: Any, rows: Array, packets: Array, gains: Any) -> Any:
-        """The memory `delayed_filters`, or where another latency was found, what it would be with
-        that one.
+        """Compare latencies where a look is due.
 
-        rows, packets: those that it has not taken yet, with which a new stretch would begin.
+        Args:
+            delayed_filters: Memory of the filter, shape (layers,).
+            rows: Fast rows that it has not taken yet; a new stretch begins with them.
+            packets: Packets that it has not taken yet.
+            gains: Tables of gains, shape (cells, rows, columns).
+
+        Returns:
+            `delayed_filters`, or the memory for another latency that was found.
         """
         if self._count in self._looks:
             delayed_filters = self._compare(delayed_filters, gains)
@@ -104,8 +137,10 @@ class LatencySearch:
         return memory
 
     def _minimise_nis(self, sum_nis: Any) -> tuple[int, float, float]:
-        """The lag that surprises least, the second derivative there (0: none), and by how much
-        less than the best that is far from it."""
+        """Find the lag of least NIS, the second derivative there (0: none), and its margin.
+
+        The margin is to the best lag that is far from it.
+        """
         max_lag, (coarse, *finer) = self.max_lag, self._steps
         grid = range(0, max_lag + 1, coarse)
         best, step = min(grid, key=sum_nis), coarse
@@ -122,7 +157,7 @@ class LatencySearch:
         return best, curvature, distant_nis - sum_nis(best)
 
     def _filter_stretch(self, lag: int, rows: Array, gains: Any) -> tuple[float, int, Any]:
-        """The stretch with a lag: the sum of its packets' NIS, of how many numbers, the memory."""
+        """Filter the stretch with a lag: sum of its packets' NIS, count of numbers, memory."""
         filters, count = self._start.copy(), len(rows) - self.max_lag
         fast = align_rows(rows, dict.fromkeys(self.columns, lag))[:count]
         packets = np.concatenate(self._packets)[:, :PACKET_WIDTH]

@@ -25,12 +25,15 @@ class LateEstimator(Estimator):
     """A filter with the option `latency`; built by `make_estimator`.
 
     `delayed_filters`, a memory, is the filter at the time t - L of the latest channel, with every
-    channel at the time when it was true. The estimate at t is a copy of it that goes on to t with
-    what is known by then: the inputs, channels that are less late, the packets. So it is the
-    conditional mean of a linear system, as without latencies. A step costs L / dt ticks more.
+    channel at the time when it was true. The estimate at t is a copy, propagated to t with all that
+    has come: inputs, channels that are less late, packets. So it is the conditional mean of a
+    linear system, as without latencies. A step costs L / dt ticks more.
 
-    `latency`: s by channel in force; `latency_sd`: s, of the one that is looked for, infinite
-    while it is not known and the channel is taken as punctual.
+    Args:
+        config: Parsed options of the filter, with a latency.
+        dt: Tick (s).
+        filters: Memory of the filter, shape (layers,).
+        schedules: Schedules of the samples.
     """
 
     compiled = False
@@ -47,7 +50,12 @@ class LateEstimator(Estimator):
         super().__init__(config, dt, filters, schedules)
 
     def reset(self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0) -> None:
-        """As `Estimator.reset`; a latency is looked for anew."""
+        """Reset as `Estimator.reset` does; the search for a latency begins anew.
+
+        Args:
+            sensors: Slow sensors by name, whose clocks have a new phase; None keeps the phases.
+            first: Tick of the next fast row.
+        """
         super().reset(sensors, first)
         self.delayed_filters = self.filters.copy()
         self._rows, self._waiting = np.zeros((0, FAST_WIDTH)), np.zeros((0, _INDEX_COLUMN + 1))
@@ -87,7 +95,19 @@ class LateEstimator(Estimator):
         S: Array = EMPTY,
         nis: Array = NO_NIS,
     ) -> None:
-        """As `Estimator.take`; a packet that `delayed_filters` uses in a later call has no NIS."""
+        """Process rows and packets as `Estimator.take` does.
+
+        A packet that `delayed_filters` uses in a later call has no NIS.
+
+        Args:
+            fast: Fast rows, shape (k, FAST_WIDTH).
+            rows: Number of fast rows to take.
+            packets: Packets, shape (capacity, PACKET_WIDTH).
+            count: Number of packets to take.
+            X: Output for the states, shape (rows, n), or empty.
+            S: Output for the standard deviations, shape (rows, n), or empty.
+            nis: Output for each packet's normalised innovation squared, shape (count,), or empty.
+        """
         remaining: Array = np.column_stack((packets[:count], np.arange(float(count))))
         self._waiting[:, _INDEX_COLUMN] = -1.0
         tick, start = self.tick, 0
@@ -108,7 +128,7 @@ class LateEstimator(Estimator):
         self.filters["counts"] = self.delayed_filters["counts"]
 
     def _update_delayed(self, fast: Array, packets: Array, now: int, nis: Array) -> None:
-        """Take rows up to the tick `now`, and packets: `delayed_filters` what is due there."""
+        """Process rows up to the tick `now`, and packets; `delayed_filters` takes what is due."""
         rows = np.concatenate((self._rows, fast))
         n_due = max(len(rows) - self._max_lag, 0)
         pending = np.concatenate((self._waiting, packets))
@@ -125,7 +145,7 @@ class LateEstimator(Estimator):
             )
 
     def _process_delayed(self, fast: Array, pending: Array, nis: Array) -> None:
-        """Rows and packets to `delayed_filters`."""
+        """Pass rows and packets to `delayed_filters`."""
         packets, pending_nis = (
             np.ascontiguousarray(pending[:, :_INDEX_COLUMN]),
             np.full(len(pending), np.nan),
@@ -141,7 +161,7 @@ class LateEstimator(Estimator):
             nis[pending[is_new, _INDEX_COLUMN].astype(int)] = pending_nis[is_new]
 
     def _predict_current(self) -> None:
-        """From `delayed_filters` to now, with what has come."""
+        """Propagate a copy of `delayed_filters` to the present tick, with what has come."""
         current, delayed = (
             records.view(np.uint8).reshape(len(records), -1)
             for records in (self.filters, self.delayed_filters)
@@ -157,7 +177,7 @@ class LateEstimator(Estimator):
 
     @property
     def latency(self) -> dict[str, float]:
-        """Seconds by channel, as they are in force."""
+        """Latency in force (s) by channel."""
         return {
             channel: self._lags[find_columns(channel)[0]] * self.dt
             for channel in self.config.latency
@@ -165,15 +185,22 @@ class LateEstimator(Estimator):
 
     @property
     def latency_sd(self) -> float:
-        """Seconds, of the latency that is looked for; 0 where all are known."""
+        """Standard deviation (s) of the latency that is searched for.
+
+        It is infinite while the channel is taken as punctual, and 0 where all latencies are known.
+        """
         return float(self._search.sd) * self.dt if self._search else 0.0
 
     def get_state(self) -> Any:
-        """As `Estimator.get_state`."""
+        """Return a snapshot as `Estimator.get_state` does."""
         state = self.filters, self.delayed_filters, self._rows, self._waiting, self._search
         return copy.deepcopy(state)
 
     def set_state(self, snapshot: Any) -> None:
-        """As `Estimator.set_state`."""
+        """Restore a snapshot as `Estimator.set_state` does.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         filters, delayed_filters, self._rows, self._waiting, self._search = copy.deepcopy(snapshot)
         self.filters[:], self.delayed_filters[:] = filters, delayed_filters

@@ -37,19 +37,24 @@ def make_estimator(
 ) -> Estimator | ForeignEstimator:
     """Build an estimator by name (`sideslip.estimators.FILTERS` lists them).
 
-    name: of `FILTERS`; or a registered name, an entry point "package.module:Name", a class in a
-    file, "FILE.py:Name", or a factory, which is called with the arguments below: what it builds
-    comes as a `ForeignEstimator`. vehicle: the filter's, as `make_vehicle` takes it. sensors: the
-    slow sensors that are there, by name ("camera", "gps"). dt: seconds of a tick. speed: m/s if it
-    is held; None measures it with the front wheels. options: of a filter of `FILTERS`, those that
-    `FilterConfig` lists.
+    An unknown option raises TypeError.
 
-    Raises
-    ------
-    ValueError: unknown name, a sensor that is absent, a Q or noise that is no covariance, a
-        schedule that does not repeat, a sensor that can be later than the filter's window, options
-        that exclude each other, a filter that diverges.
-    TypeError: unknown option.
+    Args:
+        name: Name of `FILTERS`, registered name, entry point "package.module:Name", class in a
+            file, "FILE.py:Name", or a factory. A factory is called with the arguments below.
+        vehicle: The filter's vehicle, as `make_vehicle` takes it.
+        sensors: Available slow sensors by name ("camera", "gps").
+        dt: Tick (s).
+        speed: Speed (m/s) if it is held; None measures it with the front wheels.
+        **options: Options of a filter of `FILTERS`, which `FilterConfig` lists, or of the factory.
+
+    Returns:
+        The estimator; what a factory builds comes as a `ForeignEstimator`.
+
+    Raises:
+        ValueError: Unknown name, a sensor that is absent, a Q or noise that is no covariance, a
+            schedule that does not repeat, a sensor that can be later than the filter's window,
+            options that exclude each other, a filter that diverges.
     """
     available, label = dict(sensors or {}), get_label(name)
     if not dt > 0.0:
@@ -90,10 +95,13 @@ ESTIMATORS = Registry(
 
 
 def register_estimator(name: str, factory: EstimatorFactory | str) -> None:
-    """Give an estimator of your own a name that works wherever an estimator's name does.
+    """Register an estimator of your own under a name that works wherever an estimator's name does.
 
-    factory: as `EstimatorFactory`, or "package.module:Name", which is imported when first asked
-    for. A name is known in this process alone; worker processes and `sideslip`'s command line take
-    the entry point itself for a name. Raises as `Registry.register`.
+    A name is known in this process alone. Worker processes and `sideslip`'s command line take the
+    entry point itself for a name. Errors are those of `Registry.register`.
+
+    Args:
+        name: New name, without a colon.
+        factory: An `EstimatorFactory`, or "package.module:Name", imported at its first use.
     """
     ESTIMATORS.register(name, factory)

@@ -7,7 +7,18 @@ Array = npt.NDArray[np.float64]
 
 
 def parse_matrix(name: str, value: npt.ArrayLike) -> Array:
-    """A finite matrix; ValueError for anything else."""
+    """Parse a finite matrix.
+
+    Args:
+        name: Name for messages.
+        value: Numbers of shape (k, m).
+
+    Returns:
+        Matrix, shape (k, m).
+
+    Raises:
+        ValueError: It is no finite matrix.
+    """
     M = np.array(value, np.float64)
     if M.ndim != 2 or not M.size or not np.isfinite(M).all():
         raise ValueError(f"{name} is a finite matrix, got {value!r}")
@@ -15,7 +26,19 @@ def parse_matrix(name: str, value: npt.ArrayLike) -> Array:
 
 
 def parse_vector(name: str, value: npt.ArrayLike, n: int) -> Array:
-    """A finite vector (n,), or a number that stands for n equal ones; ValueError otherwise."""
+    """Parse a finite vector.
+
+    Args:
+        name: Name for messages.
+        value: Numbers of shape (n,), or a number that stands for n equal ones.
+        n: Number of elements.
+
+    Returns:
+        Vector, shape (n,).
+
+    Raises:
+        ValueError: It is not finite or has another shape.
+    """
     v = np.array(value, np.float64)
     v = np.full(n, v) if v.ndim == 0 else v
     if v.shape != (n,) or not np.isfinite(v).all():
@@ -24,7 +47,19 @@ def parse_vector(name: str, value: npt.ArrayLike, n: int) -> Array:
 
 
 def parse_square(name: str, value: npt.ArrayLike, n: int) -> Array:
-    """A finite (n, n), from that, its diagonal (n,) or a number on it; ValueError otherwise."""
+    """Parse a finite square matrix.
+
+    Args:
+        name: Name for messages.
+        value: Numbers of shape (n, n), a diagonal (n,) or one number for the diagonal.
+        n: Number of rows.
+
+    Returns:
+        Matrix, shape (n, n).
+
+    Raises:
+        ValueError: It is not finite or has another shape.
+    """
     M = np.array(value, np.float64)
     M = np.diag(parse_vector(name, M, n)) if M.ndim < 2 else M
     if M.shape != (n, n) or not np.isfinite(M).all():
@@ -33,7 +68,16 @@ def parse_square(name: str, value: npt.ArrayLike, n: int) -> Array:
 
 
 def check_covariance(name: str, M: Array, definite: bool = False) -> None:
-    """ValueError unless M is finite, symmetric and positive semidefinite (or definite)."""
+    """Check that a matrix is a covariance.
+
+    Args:
+        name: Name for messages.
+        M: Matrix, shape (n, n).
+        definite: Whether it must be positive definite.
+
+    Raises:
+        ValueError: It is not finite, symmetric and positive semidefinite (or definite).
+    """
     if not np.isfinite(M).all():
         raise ValueError(f"{name} is not finite")
     if not np.allclose(M, M.T, rtol=1e-9, atol=0.0):
@@ -48,7 +92,17 @@ def check_covariance(name: str, M: Array, definite: bool = False) -> None:
 
 
 def parse_covariance(name: str, value: npt.ArrayLike, n: int, definite: bool = False) -> Array:
-    """A covariance (n, n), from that, its diagonal (n,) or a number on it; ValueError otherwise."""
+    """Parse a covariance; errors as in `parse_square` and `check_covariance`.
+
+    Args:
+        name: Name for messages.
+        value: Numbers of shape (n, n), a diagonal (n,) or one number for the diagonal.
+        n: Number of rows.
+        definite: Whether it must be positive definite.
+
+    Returns:
+        Covariance, shape (n, n).
+    """
     M = parse_square(name, value, n)
     check_covariance(name, M, definite)
     return M

@@ -1,4 +1,4 @@
-"""What an estimator is to the package: the protocol, and the checked face of a user's own."""
+"""The protocol of an estimator, and a user's own behind it, checked."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
@@ -24,34 +24,37 @@ class EstimatorLike(Protocol):
 
     @property
     def names(self) -> Sequence[str]:
-        """Of the n states; "beta" and "gamma" are the sideslip angle and the yaw rate.
+        """Names of the n states; "beta" and "gamma" are the sideslip angle and the yaw rate.
 
         States with a name of `design.models.STATES` are in that unit; others have the unit "-".
         """
 
     @property
     def x(self) -> npt.ArrayLike:
-        """The estimate, (n,). NaN means that the filter failed: it is passed on, never hidden."""
+        """The estimate, shape (n,); NaN, which is passed on, means that the filter failed."""
 
     @property
     def P(self) -> npt.ArrayLike:
-        """Its covariance, (n, n); a diagonal one where only standard deviations are known."""
+        """Its covariance, shape (n, n); a diagonal one where only standard deviations are known."""
 
     def reset(self, sensors: Mapping[str, SlowSensor], first: int, /) -> None:
-        """Forget everything: an episode begins, whose first fast row is the tick `first`.
+        """Set the estimator back for a new episode.
 
-        sensors: clock and link of each slow sensor in this episode, "camera" and "gps".
+        Args:
+            sensors: Clock and link of each slow sensor in this episode, "camera" and "gps".
+            first: Tick of the first fast row.
         """
 
     def step(self, rows: Array, packets: Array, /) -> None:
-        """Take what the car's wires carried since the last call.
+        """Process what the car's wires carried since the last call, in SI units; arrays are copies.
 
-        rows: (k, FAST_WIDTH), the fast rows of k ticks in order, columns as in `envs.record.Fast`;
-        row j holds the inputs that acted from the tick before it to its own. k is 1 at the reset
-        and 0 where the env refused an action. packets: (count, PACKET_WIDTH), what slow sensors
-        delivered in these ticks, columns as in `envs.record.Packet`, ordered by arrival. A packet
-        that arrived at a tick follows that tick's row; its values are of the tick at which it was
-        captured. SI units; both arrays are copies.
+        Args:
+            rows: Fast rows of k ticks in order, columns of `envs.record.Fast`, shape (k,
+                FAST_WIDTH). Row j holds the inputs that acted from the tick before it to its own. k
+                is 1 at the reset and 0 where the env refused an action.
+            packets: Packets of slow sensors in these ticks, columns of `envs.record.Packet`,
+                ordered by arrival, shape (count, PACKET_WIDTH). A packet that arrived at a tick
+                follows that tick's row; its values are of the tick at which it was captured.
         """
 
 
@@ -64,8 +67,18 @@ EstimatorFactory = Callable[..., EstimatorLike]
 class ForeignEstimator:
     """A user's estimator behind the names that it shares with `Estimator`, its states checked.
 
-    inner: the user's object. `names`, `units`: of its states. `sensors`: slow ones of this episode.
-    Raises TypeError where `inner` lacks a member, ValueError for names that are not distinct words.
+    Args:
+        inner: The user's object.
+        name: Name for messages.
+        dt: Tick (s).
+        sensors: Slow sensors of this episode by name.
+
+    Attributes:
+        names: Names of its n states; `units` has their units.
+
+    Raises:
+        TypeError: `inner` lacks a member.
+        ValueError: Its names are not distinct words.
     """
 
     unobservable: tuple[str, ...] = ()
@@ -87,22 +100,32 @@ class ForeignEstimator:
         self.units = tuple(STATES.get(state, FOREIGN_STATE).unit for state in self.names)
 
     def reset(self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0) -> None:
-        """Forget everything; as `EstimatorLike.reset`, None for the clocks of the last time."""
+        """Reset as `EstimatorLike.reset` does.
+
+        Args:
+            sensors: Slow sensors of this episode by name; None keeps those of the last one.
+            first: Tick of the first fast row.
+        """
         self.sensors = self.sensors if sensors is None else dict(sensors)
         self.inner.reset(self.sensors, first)
 
     def step(self, rows: Array, packets: Array) -> None:
-        """Take fast rows (k, FAST_WIDTH) and packets (count, PACKET_WIDTH), which are copied."""
+        """Process copies of fast rows and packets.
+
+        Args:
+            rows: Fast rows, shape (k, FAST_WIDTH).
+            packets: Packets, shape (count, PACKET_WIDTH).
+        """
         self.inner.step(np.array(rows, np.float64), np.array(packets, np.float64))
 
     @property
     def x(self) -> Array:
-        """The states now, (n,); ValueError for another shape, TypeError where there are none."""
+        """States now, shape (n,); another shape raises ValueError, no numbers TypeError."""
         return self._read_member("x", (len(self.names),))
 
     @property
     def P(self) -> Array:
-        """Their covariance now, (n, n); errors as those of `x`."""
+        """Their present covariance, shape (n, n); errors as those of `x`."""
         return self._read_member("P", (len(self.names),) * 2)
 
     def _read_member(self, member: str, shape: tuple[int, ...]) -> Array:
@@ -120,7 +143,14 @@ class ForeignEstimator:
     def run(self, source: Log | Record) -> Estimates:
         """Reset, then filter a whole record tick by tick.
 
-        Raises ValueError if the record is empty or has another tick than `dt`.
+        Args:
+            source: Record, or a log that has one.
+
+        Returns:
+            States and standard deviations of the record; NIS is NaN.
+
+        Raises:
+            ValueError: The record is empty or has another tick than `dt`.
         """
         record = source.record if isinstance(source, Log) else source
         if len(record.fast) == 0 or abs(record.dt - self.dt) > 1e-9:
@@ -138,11 +168,15 @@ class ForeignEstimator:
         return Estimates(np.asarray(record.ticks * record.dt, np.float64), x, std, self.names, nis)
 
     def get_state(self) -> Any:
-        """A deep copy of the user's object, from which `set_state` continues."""
+        """Return a deep copy of the user's object for `set_state`."""
         return copy.deepcopy(self.inner)
 
     def set_state(self, snapshot: Any) -> None:
-        """Go on with a copy of a snapshot in the place of `inner`."""
+        """Replace `inner` by a copy of a snapshot.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         self.inner = copy.deepcopy(snapshot)
 
     def __repr__(self) -> str:
@@ -150,7 +184,14 @@ class ForeignEstimator:
 
 
 def get_label(source: Any) -> str:
-    """What messages call an estimator or its factory: a name, or that of its class."""
+    """Return the name of an estimator or its factory for messages.
+
+    Args:
+        source: Name, factory or estimator.
+
+    Returns:
+        Its name, or that of its class.
+    """
     if isinstance(source, str):
         return source
     name = getattr(source, "name", None)
@@ -159,5 +200,12 @@ def get_label(source: Any) -> str:
 
 
 def compute_std(P: Array) -> Array:
-    """Standard deviations (n,) of a covariance (n, n); NaN stays."""
+    """Compute the standard deviations of a covariance; NaN stays.
+
+    Args:
+        P: Covariance, shape (n, n).
+
+    Returns:
+        Standard deviations, shape (n,).
+    """
     return np.sqrt(np.maximum(np.diag(P), 0.0))

@@ -12,9 +12,11 @@ Factory = Callable[..., Any]
 
 
 class Registry:
-    """Factories of one kind of thing by name.
+    """Factories of one kind of thing by name; iterates over all names.
 
-    kind: what they make, for messages. ours: the package's own. Iterates over all names.
+    Args:
+        kind: What they make, for messages.
+        builtin: The package's own factories or entry points by name.
     """
 
     def __init__(self, kind: str, builtin: Mapping[str, Factory | str]) -> None:
@@ -22,11 +24,17 @@ class Registry:
         self._factories: dict[str, Factory | str] = dict(builtin)
 
     def register(self, name: str, factory: Factory | str) -> None:
-        """Make a name known; the same factory once more changes nothing.
+        """Register a name; the same factory once more changes nothing.
 
-        factory: a callable, or "package.module:Name" or "FILE.py:Name", which is loaded when first
-        asked for. Raises TypeError for another kind of name or factory; ValueError for a name that
-        is empty, has a colon or belongs to another factory, and a string that is no entry point.
+        Args:
+            name: New name, without a colon.
+            factory: A callable, or "package.module:Name" or "FILE.py:Name", loaded at its first
+                use.
+
+        Raises:
+            TypeError: The name is no str, or the factory neither a callable nor a str.
+            ValueError: The name is empty, has a colon or belongs to another factory, or the string
+                is no entry point.
         """
         if not isinstance(name, str):
             raise TypeError(f"the name of an {self._kind} is a str, got {name!r}")
@@ -45,11 +53,17 @@ class Registry:
             raise ValueError(f"the {self._kind} {name!r} is registered already, as {known!r}")
 
     def load(self, name: str, others: Iterable[str] = ()) -> Factory:
-        """The factory of a name, an entry point "package.module:Name" or "FILE.py:Name".
+        """Load the factory of a name or an entry point; errors as in `import_entry_point`.
 
-        others: further names that may have been meant. Raises ValueError for a name that nobody
-        registered or an entry point that leads nowhere, TypeError where no callable is there; for
-        files as `load_user_class`.
+        Args:
+            name: Registered name, "package.module:Name" or "FILE.py:Name" (see `load_user_class`).
+            others: Further names that may have been meant, for messages.
+
+        Returns:
+            The factory.
+
+        Raises:
+            ValueError: The name is not registered.
         """
         factory = self._factories.get(name, name)
         if not isinstance(factory, str):
@@ -78,7 +92,19 @@ def _split_entry_point(entry_point: str) -> tuple[str, str]:
 
 
 def import_entry_point(entry_point: str) -> Factory:
-    """What stands at "package.module:Name"; errors as `Registry.load`."""
+    """Import the factory at an entry point.
+
+    Args:
+        entry_point: "package.module:Name".
+
+    Returns:
+        The factory.
+
+    Raises:
+        ModuleNotFoundError: The module needs another one that is missing.
+        TypeError: The object is not callable.
+        ValueError: There is no such module or name.
+    """
     module, name = _split_entry_point(entry_point)
     try:
         imported_module = importlib.import_module(module)
@@ -96,7 +122,14 @@ def import_entry_point(entry_point: str) -> Factory:
 
 
 def find_entry_point(factory: Factory) -> str | None:
-    """ "package.module:Name" of a factory that `import_entry_point` finds there, else None."""
+    """Find the entry point of a factory.
+
+    Args:
+        factory: A class or a function.
+
+    Returns:
+        "package.module:Name", from which `import_entry_point` loads the factory, else None.
+    """
     text = f"{getattr(factory, '__module__', '')}:{getattr(factory, '__qualname__', '')}"
     try:
         return (

@@ -14,15 +14,30 @@ _PREFIX = "sideslip_user_file_"  # of the modules' names
 
 
 def is_user_file(text: str) -> bool:
-    """Whether it is "FILE.py" or "FILE.py:Name"."""
+    """Return whether a text names a user's file.
+
+    Args:
+        text: Name of an agent or estimator.
+
+    Returns:
+        True for "FILE.py" and "FILE.py:Name".
+    """
     return text.endswith(SUFFIX) or text.rpartition(":")[0].endswith(SUFFIX)
 
 
 def find_class(text: str) -> tuple[Path, str]:
-    """(file, name) of "FILE.py:Name", or of the only class of "FILE.py"; the file is not run.
+    """Find the class of a user's file, without running the file.
 
-    Raises FileNotFoundError where there is no such file; ValueError, with file and line, for what
-    is no Python, has no such name, or defines no class or several and none is named.
+    Args:
+        text: "FILE.py:Name", or "FILE.py" for its only class.
+
+    Returns:
+        File and name of the class.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: With file and line: it is no Python, has no such name, or defines no class or
+            several and none is named.
     """
     file, _, name = (text, "", "") if text.endswith(SUFFIX) else text.rpartition(":")
     path = Path(file)
@@ -45,7 +60,7 @@ def find_class(text: str) -> tuple[Path, str]:
 
 
 def _iterate_bindings(tree: ast.Module) -> Iterator[str]:
-    """The names that a file binds somewhere."""
+    """Iterate over the names that a file binds somewhere."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ClassDef | ast.FunctionDef):
             yield node.name
@@ -56,11 +71,19 @@ def _iterate_bindings(tree: ast.Module) -> Iterator[str]:
 
 
 def load_user_class(text: str) -> Callable[..., Any]:
-    """The class, or another factory, of "FILE.py:Name"; "FILE.py" means its only class.
+    """Load the class, or another factory, of a user's file.
 
-    The file is run once a process as long as it is the same, and may import its neighbours.
-    Raises as `find_class`; ValueError, with the line, for a file that raises; TypeError where the
-    name is not callable.
+    The file is run once a process as long as its content stays. It may import its neighbours.
+
+    Args:
+        text: "FILE.py:Name", or "FILE.py" for its only class.
+
+    Returns:
+        The factory.
+
+    Raises:
+        ValueError: As `find_class`, or the file raises; the message has the line.
+        TypeError: The name is not callable.
     """
     path, name = find_class(text)
     try:
@@ -91,7 +114,14 @@ def _load_module(path: Path) -> ModuleType:
 
 
 def describe_error(error: BaseException) -> str:
-    """An error's kind and text, and the line of the user's file in which it arose, if it did."""
+    """Describe an error for messages.
+
+    Args:
+        error: A raised exception.
+
+    Returns:
+        Its kind and text, and the line of the user's file in which it arose, if it did.
+    """
     text, location, trace = f"{type(error).__name__}: {error}", "", error.__traceback__
     while trace is not None:
         if str(trace.tb_frame.f_globals.get("__name__", "")).startswith(_PREFIX):

@@ -1,4 +1,4 @@
-"""Forecast of an episode before it begins: driver, wind and disturbances, step by step."""
+"""The preview of an episode at its start: driver, wind and disturbances, step by step."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -30,8 +30,10 @@ Array = npt.NDArray[np.float64]
 
 
 class PreviewStep(NamedTuple):
-    """Inputs and parameters of one step of the plan that no action changes, or hardly
-    (`beta_ref`, `gamma_ref`); `command` and `weight` are of the step's start."""
+    """Inputs and parameters of one step of the plan, which actions change hardly or not at all.
+
+    `beta_ref` and `gamma_ref` may change; `command` and `weight` are those of the step's start.
+    """
 
     steer_start: Any  # rad, front steering angle without the added one
     steer_middle: Any
@@ -53,7 +55,11 @@ class PreviewStep(NamedTuple):
 
 
 class PlanState(NamedTuple):
-    """States of a plan: motion, actuators, the driver's integral."""
+    """States of a plan in SI units: motion, actuators, the driver's integral.
+
+    `slewing` is the commanded added steering, `added` the applied one (rad). T_l and T_r are the
+    motors' torques (N m).
+    """
 
     v_x: Any
     v_y: Any
@@ -74,11 +80,22 @@ class PlanState(NamedTuple):
 
 
 class PlanParams(NamedTuple):
-    """Parameters that are constant within an episode; hashable, so that they are a solver's key.
+    """Parameters that are constant within an episode; hashable, as the key of a solver.
 
-    car: with zeros for the fields of `PreviewStep`. motor, steering: of a step; motor_tick,
-    steering_tick: of a tick. ticks: of a step, a control period. periods: of the episode. width:
-    of the action.
+    Attributes:
+        car: Car, with zeros for the fields of `PreviewStep`.
+        road: Road.
+        speed_profile: Speed profile, with zeros for the fields of `PreviewStep`.
+        motor: Lag of the motors over a step.
+        steering: Lag of the steering over a step.
+        motor_tick: Lag of the motors over a tick.
+        steering_tick: Lag of the steering over a tick.
+        target: Reference of the task.
+        task: Parameters of the task.
+        kind: Variant of the plant.
+        width: Entries of an action.
+        ticks: Ticks of a step, the control period.
+        periods: Steps of the episode.
     """
 
     car: CarParams
@@ -98,10 +115,14 @@ class PlanParams(NamedTuple):
 
 @dataclass(frozen=True)
 class Forecast:
-    """An episode as a plan sees it.
+    """An episode as a plan has it.
 
-    known: (len(Known), periods + 1), the last column of the episode's end. start: the state at
-    tick 0. driver: (periods, n) rad, the driver's command at every tick.
+    Attributes:
+        fixed: Parameters of the episode.
+        known: Columns of `PreviewStep`, shape (len(PreviewStep), periods + 1); the last one is of
+            the episode's end.
+        start: State at tick 0.
+        driver: Driver's steering command at every tick (rad), shape (periods, n).
     """
 
     fixed: PlanParams
@@ -111,11 +132,15 @@ class Forecast:
 
 
 def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
-    """The rest of an episode that was just reset.
+    """Make the forecast of an episode that was just reset.
 
-    base: the unwrapped env at tick 0. actions: (K, width), none: zero; a driver who reacts to the
-    car steers as in the run of these actions. Raises ValueError for an env that is not at the start
-    of an episode.
+    Args:
+        base: Unwrapped env at tick 0.
+        actions: Actions of a run, shape (K, width), to which a driver reacts who steers by the car;
+            None: zeros.
+
+    Raises:
+        ValueError: The env is not at the start of an episode.
     """
     n = base.control_period
     snapshot = base.get_state()
@@ -136,7 +161,11 @@ def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
 
 
 def read_plan_state(z: Array) -> PlanState:
-    """The State in a packed state vector of the env."""
+    """Read the `PlanState` in a packed state of the env.
+
+    Args:
+        z: Packed state of one car.
+    """
     motion, drive = read(z, Z.motion), read(z, Z.drive)
     return PlanState._make(
         (*motion, drive.T_l, drive.T_r, drive.integral, drive.slewing, drive.added)
@@ -169,10 +198,11 @@ def _make_plan_params(base: Any, p: Array, switches: Any, ticks: int) -> PlanPar
 def _simulate_actions(
     base: Any, snapshot: Any, actions: Array, n: int
 ) -> tuple[Array, Array, Array]:
-    """(K n + 1, len(Drive)), the driver's angle (K n + 1,) and the references (K n + 1, 2): the
-    env's own ticks under actions.
+    """Simulate actions by the env's own ticks.
 
-    Disturbances, and a programme's front wheels without the added angle, do not depend on them.
+    Returns actuator states (K n + 1, len(ActuatorState)), the driver's angle (K n + 1,) and the
+    references (K n + 1, 2). Disturbances, and a steering profile's front wheels without the added
+    angle, do not depend on the actions.
     """
     z, window = snapshot["state"], make_window(1)
     bounds = np.array([[entry.low, entry.high] for entry in base.layout]).T.copy()
@@ -200,14 +230,14 @@ def _simulate_actions(
 def _compute_preview(
     p: Array, fixed: PlanParams, drive: Array, command: Array, refs: Array
 ) -> Array:
-    """(len(Known), steps of the plan + 1)."""
+    """Compute the columns of `PreviewStep`, shape (len(PreviewStep), periods + 1)."""
     q, last = fixed.ticks, len(command) - 1
     nodes = np.arange(0, last, q)
     names = ActuatorState._fields
     angle = drive[:, names.index("delta_f")] - drive[:, names.index("added")]
 
     def compute_wheel_angle(ticks: Any, rest: float) -> Array:
-        """The front wheels without the added angle, once `rest` of a tick's deviation is left."""
+        """Compute the front wheels' angle without the added one, after a tick's lag."""
         return np.asarray(as_python(apply_lag)(command[ticks], angle[ticks], rest))
 
     lag, middle = fixed.steering_tick, nodes + q // 2
@@ -250,7 +280,7 @@ def _compute_preview(
 
 
 def _compute_road_turns(p: Array, kind: StepVariant, command: Array) -> Array:
-    """(ticks,) rad/s, by how much the road turns in each tick, where a nominal car lays it."""
+    """Compute by how much a nominal car's path turns in each tick (rad/s), shape (ticks,)."""
     turns, path = np.zeros(len(command)), NominalMotion(0.0, 0.0)
     if kind.road == NOMINAL_PATH:
         speed_profile, nominal_car = read(p, P.speed_profile), read(p, P.nominal_car)
@@ -266,7 +296,7 @@ def _compute_road_turns(p: Array, kind: StepVariant, command: Array) -> Array:
 
 
 def _compute_set_point(tick: float, speed_profile: SpeedProfile) -> tuple[float, float]:
-    """The driver's (speed in m/s, acceleration in m/s2 fed forward) at a tick."""
+    """Compute the driver's speed (m/s) and feedforward acceleration (m/s^2) at a tick."""
     feedforward_profile = speed_profile._replace(hold=1.0, k_p=0.0, k_i=0.0)
     feedforward = compute_acceleration_command(tick, 0.0, 0.0, feedforward_profile, np.inf)[0]
     total = compute_acceleration_command(
@@ -276,9 +306,9 @@ def _compute_set_point(tick: float, speed_profile: SpeedProfile) -> tuple[float,
 
 
 def _compute_weights(nodes: npt.NDArray[np.int_], fixed: PlanParams) -> Array:
-    """Seconds for which the cost rate at each step's start stands in the sum over ticks 1 .. T.
+    """Compute the weight of each step's cost rate in the sum over ticks 1 .. T (s).
 
-    The sum over every q-th tick by the trapezoid rule, its end apart; exact for q = 1.
+    It sums over every q-th tick by the trapezoid rule, without the end; exact for q = 1.
     """
     q = fixed.ticks
     weights = np.where(nodes < fixed.task.duration, q * TICK, 0.0)

@@ -1,9 +1,9 @@
-"""The ceiling: the best actions for a known car, road and every disturbance ahead.
+"""The clairvoyant oracle: the best actions for a known car, road and all future disturbances.
 
-Iterative LQR on the env itself: slopes of the plant's text along a run, a backward sweep within the
-limits, and runs of the env that try the new actions with the sweep's gains. What is found is a run
-and costs what the env says, cap and failures included; it is a local optimum, sought from several
-starts.
+Iterative LQR on the env itself: linearisation of the plant along a run, a backward pass within
+the limits, and runs of the env that try the new actions with the pass's gains. The result is a
+run and costs what the env computes, cap and failures included. It is a local optimum, sought from
+several starts.
 """
 
 import time
@@ -35,10 +35,13 @@ STALL_RULE = (1e-3, 3)  # so little gained, relative, in so many steps in a row:
 
 @dataclass(frozen=True)
 class Plan:
-    """Actions (K, width) for an episode, the best run that a start led to.
+    """Actions for an episode: the best run that a start led to.
 
-    cost: of the run in the env. status: "settled", "stuck" (no step was cheaper) or "stopped"
-    (after `MAX_ITERATIONS` steps). seconds: of CPU time.
+    Attributes:
+        actions: Actions, shape (K, width).
+        cost: Cost of the run in the env.
+        status: "settled", "stuck" (no step was cheaper) or "stopped" (after `MAX_ITERATIONS`).
+        seconds: CPU time (s).
     """
 
     actions: Actions
@@ -49,7 +52,13 @@ class Plan:
 
 @dataclass(frozen=True)
 class PlanRun:
-    """The env's run of actions; length: periods until it ended."""
+    """The env's run of actions.
+
+    Attributes:
+        trajectory: States and applied actions.
+        cost: Cost J.
+        length: Periods until it ended.
+    """
 
     trajectory: Trajectory
     cost: float
@@ -59,7 +68,14 @@ class PlanRun:
 def simulate_run(
     env: gym.Env[Any, Any], seed: int, actions: Array, feedback: tuple[Array, Array] | None = None
 ) -> PlanRun:
-    """One episode in the env. follow: (states, gains) to which the actions are corrected."""
+    """Simulate one episode in the env.
+
+    Args:
+        env: Single env.
+        seed: Seed of the episode.
+        actions: Actions, shape (K, width).
+        feedback: States (K + 1, n) and gains (K, width, n) by which the actions are corrected.
+    """
     env.reset(seed=seed)
     base: Any = env.unwrapped
     applied = np.array(actions, np.float32)
@@ -80,14 +96,27 @@ def simulate_run(
 
 
 def evaluate_actions(env: gym.Env[Any, Any], seed: int, actions: npt.ArrayLike) -> float:
-    """The cost of actions (K, width) in an episode of the env."""
+    """Evaluate the cost of actions in an episode of the env.
+
+    Args:
+        env: Single env.
+        seed: Seed of the episode.
+        actions: Actions, shape (K, width).
+    """
     return simulate_run(env, seed, np.asarray(actions, np.float64)).cost
 
 
 def solve_ilqr(env: gym.Env[Any, Any], seed: int, start: npt.ArrayLike | None = None) -> Plan:
-    """The best that can be found for an episode from a start.
+    """Solve for the best plan of an episode that a start leads to.
 
-    start: actions (K, width), None: zero. Raises ModuleNotFoundError without the extra `mpc`.
+    Args:
+        env: Single env.
+        seed: Seed of the episode.
+        start: Actions, shape (K, width); None: zeros.
+
+    Raises:
+        ModuleNotFoundError: The extra `mpc` is not installed.
+        ValueError: The start has another shape.
     """
     start_time = time.process_time()
     env.reset(seed=seed)
@@ -104,7 +133,7 @@ def solve_ilqr(env: gym.Env[Any, Any], seed: int, start: npt.ArrayLike | None = 
 def _search(
     env: gym.Env[Any, Any], seed: int, forecast: Forecast, actions: Array
 ) -> tuple[PlanRun, str]:
-    """The best run that the steps from a start lead to, and how they ended."""
+    """Search the best run that the steps from a start lead to, and return how they ended."""
     problem, best, damping, n_stalled = (
         make_problem(forecast.fixed),
         simulate_run(env, seed, actions),
@@ -133,7 +162,7 @@ def _run_line_search(
     run: PlanRun,
     damping: float,
 ) -> tuple[PlanRun, float]:
-    """(the first cheaper run, the damping for the next step); the run itself where none is."""
+    """Return the first cheaper run, else the run itself, and the damping for the next step."""
     fixed, size = problem.fixed, len(problem.names)
     nominal_run = _use_achieved_steering(problem, run.trajectory)
     slopes = linearise_run(problem, forecast.known, nominal_run)
@@ -159,7 +188,7 @@ def _run_line_search(
 
 
 def _use_achieved_steering(problem: IlqrProblem, run: Trajectory) -> Trajectory:
-    """A run whose steering asks for no more than it got: the slopes know no limit of its rate."""
+    """Replace a run's steering by what its rate achieved: the linearisation has no rate limit."""
     if run.actions.shape[1] < N_INPUTS:
         return run
     actions, column = run.actions.copy(), PlanState._fields.index("slewing")
@@ -169,10 +198,15 @@ def _use_achieved_steering(problem: IlqrProblem, run: Trajectory) -> Trajectory:
 
 @dataclass(frozen=True)
 class ClairvoyantResult:
-    """The best run found of an episode.
+    """The best run of an episode.
 
-    winner: a label of costs. costs: of every start's own run ("two-dof") and of the plan from it
-    ("from two-dof"). statuses: of the plans.
+    Attributes:
+        actions: Actions, shape (K, width).
+        cost: Cost of the run in the env.
+        winner: Label in `costs`.
+        costs: Costs of every start's own run ("two-dof") and of its plan ("from two-dof").
+        statuses: Statuses of the plans by start.
+        seconds: CPU time (s).
     """
 
     actions: Actions
@@ -186,10 +220,12 @@ class ClairvoyantResult:
 def compute_clairvoyant(
     env: gym.Env[Any, Any], seed: int, starts: Mapping[str, npt.ArrayLike] | None = None
 ) -> ClairvoyantResult:
-    """The best of the plans from other methods' runs, and of those runs themselves.
+    """Compute the best of the plans from other methods' runs, and of those runs themselves.
 
-    starts: actions (K, width) by method; without any the plan starts from zero. A method that no
-    plan beats is the ceiling.
+    Args:
+        env: Single env.
+        seed: Seed of the episode.
+        starts: Actions, shape (K, width), by method; without any the plan starts from zeros.
     """
     start_time, base = time.process_time(), env.unwrapped
     env.reset(seed=seed)
@@ -214,7 +250,13 @@ def compute_clairvoyant(
 
 
 def record_actions(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
-    """(K, width): the actions of an agent in an episode; zeros after a failure."""
+    """Record an agent's actions in an episode, shape (K, width), zeros after a failure.
+
+    Args:
+        env: Single env.
+        agent: Agent, as for `iterate_steps`.
+        seed: Seed of the episode.
+    """
     base: Any = env.unwrapped
     _, *steps = iterate_steps(env, agent, seed)
     actions = np.zeros((_count_periods(base), *base.action_space.shape), np.float32)
@@ -223,14 +265,19 @@ def record_actions(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
 
 
 def _count_periods(base: Any) -> int:
-    """Control periods of the episode that was last reset."""
+    """Count the control periods of the episode that was last reset."""
     return -int(-base.get_state()["params"][P.task.duration] // base.control_period)
 
 
 class PlanReplay(Controller):
-    """A plan as an agent: the actions of one episode, whatever is observed; zeros after them.
+    """A plan as an agent: the actions of one episode for every observation, then zeros.
 
-    actions: (K, width) shares of full scale.
+    Args:
+        env: Env of the controller.
+        actions: Fractions of full scale, shape (K, width).
+
+    Raises:
+        ValueError: The actions are not finite or have another shape.
     """
 
     memory = 1

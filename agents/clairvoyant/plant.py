@@ -44,7 +44,11 @@ class PlanStep(NamedTuple):
 
 
 def list_active_states(fixed: PlanParams) -> tuple[str, ...]:
-    """The states that matter to the cost in an episode, in the order of `PlanState`."""
+    """List the states that matter to an episode's cost, in the order of `PlanState`.
+
+    Args:
+        fixed: Parameters of the episode.
+    """
     road = fixed.road
     active = {"v_x", "v_y", "gamma", *TORQUES}
     if fixed.kind.roll:
@@ -59,7 +63,13 @@ def list_active_states(fixed: PlanParams) -> tuple[str, ...]:
 
 
 def compute_node_errors(fixed: PlanParams, x: PlanState, known: PreviewStep) -> tuple[Any, Any]:
-    """(e_beta, e_gamma) of the motion at a step's start."""
+    """Compute the errors of sideslip angle (rad) and yaw rate (rad/s) at a step's start.
+
+    Args:
+        fixed: Parameters of the episode.
+        x: State at the step's start.
+        known: Inputs of the step.
+    """
     kind = fixed.kind
     beta = _slip(x.v_x, x.v_y, kind.small_angle)
     beta_ref, gamma_ref = known.beta_ref, known.gamma_ref
@@ -69,15 +79,26 @@ def compute_node_errors(fixed: PlanParams, x: PlanState, known: PreviewStep) -> 
 
 
 def compute_node_cost(fixed: PlanParams, errors: tuple[Any, Any], known: PreviewStep) -> Any:
-    """Cost of the errors at a step's start, without the cap, for the seconds it stands for."""
+    """Compute the cost of the errors at a step's start, by its weight and without the cap.
+
+    Args:
+        fixed: Parameters of the episode.
+        errors: e_beta (rad) and e_gamma (rad/s).
+        known: Inputs of the step.
+    """
     return known.weight * _uncapped_cost_rate(*errors, 0.0, 0.0, fixed.kind.reference)
 
 
 def advance(fixed: PlanParams, x: PlanState, action: Any, known: PreviewStep) -> PlanStep:
-    """One step of the plan: a Runge-Kutta step of the env's own plant over `fixed.ticks` ticks.
+    """Advance a plan by one Runge-Kutta step of the env's own plant over `fixed.ticks` ticks.
 
-    action: shares of full scale, as the env takes them. The driver's acceleration is that of the
-    step's start; added steering acts by its mean over the step.
+    The driver's acceleration is that of the step's start; added steering acts by its mean.
+
+    Args:
+        fixed: Parameters of the episode.
+        x: State at the step's start.
+        action: Fractions of full scale, shape (width,), as the env takes them.
+        known: Inputs of the step.
     """
     car = fixed.car._replace(C_f=known.C_f, C_r=known.C_r, mu=known.mu, mu_r=known.mu_r)
     task, kind, q = fixed.task, fixed.kind, fixed.ticks
@@ -135,6 +156,11 @@ def advance(fixed: PlanParams, x: PlanState, action: Any, known: PreviewStep) ->
 
 
 def get_state_scales(fixed: PlanParams, names: tuple[str, ...]) -> list[float]:
-    """Physical units of one unit of each state in the solver: all are of order one."""
+    """Get the unit of each state in the solver, in which all are of order one.
+
+    Args:
+        fixed: Parameters of the episode.
+        names: Names of states.
+    """
     small = {"phi": 0.1, "phi_dot": 0.5, "slewing": 0.1, "added": 0.1}
     return [fixed.car.T_max if name in TORQUES else small.get(name, 1.0) for name in names]

@@ -1,4 +1,4 @@
-"""Slopes of an episode along a run: the plant's and the cost's, for every control period."""
+"""Linearisation of an episode along a run: the plant and the cost, for every control period."""
 
 import functools
 from dataclasses import dataclass
@@ -27,18 +27,24 @@ N_INPUTS = 2  # in a sweep: share of the moment and of the steering, which may b
 
 @dataclass(frozen=True)
 class Trajectory:
-    """States (K + 1, len(State)) at the start of every period and at the end, actions (K, width)
-    as shares of full scale."""
+    """A run of an episode.
+
+    Attributes:
+        states: `PlanState` at the start of every period and at the end, shape (K + 1, n).
+        actions: Fractions of full scale, shape (K, width).
+    """
 
     states: Array
     actions: Array
 
 
 class Linearisation(NamedTuple):
-    """Of n = len(names) + INPUTS variables, the states in their scales, then the inputs.
+    """The derivatives along a run, for n = size + N_INPUTS variables: scaled states, then inputs.
 
-    F: (K, len(names), n), of the state after each period. g, H: (K + 1, n), (K + 1, n, n),
-    gradient of the cost and Gauss and Newton's Hessian; the last are of the episode's end.
+    Attributes:
+        F: Derivative of the state after each period, shape (K, size, n).
+        g: Gradient of the cost, shape (K + 1, n); the last one is of the episode's end.
+        H: Gauss-Newton's Hessian of the cost, shape (K + 1, n, n), likewise.
     """
 
     F: Array
@@ -47,8 +53,16 @@ class Linearisation(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Of the inputs in every period: (K, INPUTS) low and high; (K,) the steering's again where its
-    rate ends, with how much of it a unit of the state at `column` moves."""
+    """The limits of the inputs in every period.
+
+    Attributes:
+        low: Lower limits, shape (K, N_INPUTS).
+        high: Upper limits, shape (K, N_INPUTS).
+        rate_low: Lower limit of the steering by its rate, shape (K,).
+        rate_high: Upper limit of the steering by its rate, shape (K,).
+        column: State that moves the rate's limits.
+        slope: Change of these limits per unit of that state.
+    """
 
     low: Array
     high: Array
@@ -60,7 +74,14 @@ class Limits(NamedTuple):
 
 @dataclass(frozen=True)
 class IlqrProblem:
-    """What is the same in every episode with the same Fixed."""
+    """The functions that all episodes with the same `PlanParams` share.
+
+    Attributes:
+        fixed: Parameters of the episode.
+        names: Names of the active states.
+        scale: Unit of each active state, shape (size,).
+        slopes: CasADi's function of the derivatives, for all nodes at once.
+    """
 
     fixed: PlanParams
     names: tuple[str, ...]
@@ -69,13 +90,17 @@ class IlqrProblem:
 
     @property
     def state_indices(self) -> list[int]:
-        """Where the carried states stand in a State."""
+        """Indices of the active states in a `PlanState`."""
         return [PlanState._fields.index(name) for name in self.names]
 
 
 @functools.lru_cache(maxsize=8)
 def make_problem(fixed: PlanParams) -> IlqrProblem:
-    """The functions, cached for each of the newest few kinds of episode."""
+    """Make the functions, cached for the newest few kinds of episode.
+
+    Args:
+        fixed: Parameters of the episode.
+    """
     names = list_active_states(fixed)
     scale, size = np.array(get_state_scales(fixed, names)), len(names)
     w, known = ca.SX.sym("w", size + fixed.width), ca.SX.sym("known", len(PreviewStep._fields))
@@ -101,7 +126,13 @@ def make_problem(fixed: PlanParams) -> IlqrProblem:
 
 
 def linearise_run(problem: IlqrProblem, known: Array, run: Trajectory) -> Linearisation:
-    """Of every period of a run; an input that the action lacks has none but its own square."""
+    """Linearise every period of a run; an input that the action lacks has a unit Hessian alone.
+
+    Args:
+        problem: Functions of the episode.
+        known: Columns of `PreviewStep`, shape (len(PreviewStep), K + 1).
+        run: States and actions.
+    """
     size, K, width = len(problem.names), problem.fixed.periods, problem.fixed.width
     points = np.zeros((size + width, K + 1))
     points[:size] = (run.states[:, problem.state_indices] / problem.scale).T
@@ -118,7 +149,13 @@ def linearise_run(problem: IlqrProblem, known: Array, run: Trajectory) -> Linear
 
 
 def compute_limits(problem: IlqrProblem, forecast: Forecast, run: Trajectory) -> Limits:
-    """Full scale, the stop of the wheels, and the steering's rate from where it stands in a run."""
+    """Compute limits by full scale, the wheels' stop, and the steering's rate from a run's angle.
+
+    Args:
+        problem: Functions of the episode.
+        forecast: Forecast with the driver's command.
+        run: States and actions.
+    """
     fixed, K = problem.fixed, problem.fixed.periods
     low, high, zero = np.zeros((K, N_INPUTS)), np.zeros((K, N_INPUTS)), np.zeros(K)
     low[:, : fixed.width], high[:, : fixed.width] = -1.0, 1.0

@@ -1,4 +1,4 @@
-"""The backward sweep of differential dynamic programming within limits of the inputs.
+"""The backward pass of differential dynamic programming within limits of the inputs.
 
 Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
 """
@@ -13,9 +13,16 @@ from ...envs.backend.decorators import jit
 
 @jit
 def solve_input_qp(Q: Any, q: Any, low: Any, high: Any) -> Any:
-    """(d_0, d_1, whether each is free): least q'd + d'Qd / 2 with low <= d <= high.
+    """Minimise q'd + d'Qd / 2 with low <= d <= high.
 
-    Q: (2, 2), positive definite; the rest (2,).
+    Args:
+        Q: Positive definite matrix, shape (2, 2).
+        q: Gradient, shape (2,).
+        low: Lower limits, shape (2,).
+        high: Upper limits, shape (2,).
+
+    Returns:
+        d_0, d_1, and whether each is free of its limits.
     """
     det = Q[0, 0] * Q[1, 1] - Q[0, 1] * Q[0, 1]
     x = (Q[0, 1] * q[1] - Q[1, 1] * q[0]) / det
@@ -42,11 +49,18 @@ def solve_input_qp(Q: Any, q: Any, low: Any, high: Any) -> Any:
 def run_backward_pass(
     slopes: Any, limits: Any, inputs: Any, length: int, damping: float, d: Any, G: Any
 ) -> None:
-    """Fill d (K, 2) with the changes of the inputs and G (K, 2, size) with the gains on the state.
+    """Run the backward pass over a run's linearisation.
 
-    slopes: a `Linearisation`. limits: a `Limits`. inputs: (K, 2), of the run. length: periods of
-    the run; behind it nothing changes. damping: added to the inputs' curvature. Where the steering
-    is at the end of its rate it follows the state it has come from.
+    Where the steering's rate is at its limit, its gain follows the state that it came from.
+
+    Args:
+        slopes: `Linearisation` of the run.
+        limits: `Limits` of the run.
+        inputs: Inputs of the run, shape (K, 2).
+        length: Periods of the run; later ones get zeros.
+        damping: Number added to the inputs' curvature.
+        d: Changes of the inputs, shape (K, 2), filled.
+        G: Gains on the state, shape (K, 2, size), filled.
     """
     size = slopes.F.shape[1]
     V, v = slopes.H[length][:size, :size].copy(), slopes.g[length][:size].copy()

@@ -15,12 +15,18 @@ MIN_FRICTION, MAX_FRICTION = 0.2, 1.2  # of the friction that is believed
 
 
 class AdaptiveLqr(Lqr):
-    """`Lqr` scheduled on the factors of stiffness front_tyres_hat and rear_tyres_hat of `joint`.
+    """`Lqr` scheduled on the stiffness factors front_tyres_hat and rear_tyres_hat of `joint`.
 
-    Where the observation has inverse_friction_hat (`joint` with inverse_friction_sd), limits go by
-    that friction, within 0.2 to 1.2. grip: of `Controller`. options: of `Lqr`.
+    Where the observation has inverse_friction_hat (`joint` with inverse_friction_sd), limits use
+    that friction, within 0.2 to 1.2.
 
-    Raises what `Lqr` does, and ValueError where the tyres are not in the observation.
+    Args:
+        env: Env of the controller, with both factors in its observation.
+        grip: Grip limit, as for `Controller`.
+        options: Other arguments of `Lqr`.
+
+    Raises:
+        ValueError: The tyres are not in the observation, or as `Lqr`.
     """
 
     def __init__(self, env: AnyEnv, grip: float | None = 0.7, **options: Any) -> None:
@@ -45,7 +51,10 @@ class AdaptiveLqr(Lqr):
 
 
 class AdaptiveNmpc(AdaptiveLqr, Nmpc):
-    """`Nmpc` that foresees the tyres, and the friction, which `joint` estimates; as `AdaptiveLqr`.
+    """`Nmpc` that predicts with the tyres and the friction of `joint`, as `AdaptiveLqr` has them.
 
-    grip: of `Controller`. options: of `Nmpc`.
+    Args:
+        env: Env of the controller, with both factors in its observation.
+        grip: Grip limit, as for `Controller`.
+        options: Other arguments of `Nmpc`.
     """

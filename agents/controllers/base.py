@@ -23,22 +23,29 @@ FRICTION = "true_friction"  # the entry whose friction a grip limit goes by, whe
 
 
 class Controller(ABC):
-    """Stable-baselines3's `predict` around a compiled law.
+    """The base of controllers: stable-baselines3's `predict` around a compiled law.
 
     A subclass names its inputs (`needs`, entries of the env's layout) and how many numbers it
     remembers (`memory`), and fills `_law`. `predict` is pure: all memory is in `state`, an array
     (N, memory).
 
     A controller serves a single env or all rows of a vector env, which then share its design.
-    Where a needed entry is not finite the action is NaN and the memory stays as it was, so that an
-    estimator that fails is seen: an env with `on_bad_action="fail"` ends the episode, others raise.
+    Where a needed entry is not finite the action is NaN and the memory stays as it was, which makes
+    a failed estimator visible: an env with `on_bad_action="fail"` ends the episode, others raise.
 
-    grip: the share of what friction lets the rear tyres transmit that the yaw moment may take, so
-    that lateral force is left to them; None: no limit but the motors'. The friction is the nominal
-    car's or, where the observation has `true_friction`, that.
+    Args:
+        env: Env whose nominal car and layout the controller is designed for.
+        grip: Fraction, for the yaw moment, of the force that friction lets the rear tyres transmit;
+            the rest is left for lateral force. None: the motors limit the moment alone. The
+            friction is the observation's `true_friction`, or else the nominal car's.
 
-    Raises ValueError when the env's observation lacks a needed entry, for a grip that is not
-    positive, or where the rows of a vector env have different nominal cars.
+    Attributes:
+        needs: Entries of the observation that the controller reads.
+        memory: Numbers of memory for each row.
+
+    Raises:
+        ValueError: The observation lacks a needed entry, `grip` is not positive, or the rows of a
+            vector env have different nominal cars.
     """
 
     needs: tuple[str, ...] = ()
@@ -80,12 +87,15 @@ class Controller(ABC):
         return make_car(self.vehicle)
 
     def _get_friction(self, inputs: Array) -> Array:
-        """(N,) the friction that a grip limit goes by."""
+        """Friction that a grip limit uses, shape (N,)."""
         return inputs[:, -1] if self._true_friction else np.full(len(inputs), self.nominal.friction)
 
     def _compute_max_moment(self, inputs: Array) -> Array:
-        """(N,) the largest yaw moment as a share of full scale: what the motors' power at the
-        measured speed (columns 0 and 1, the front wheels) and `grip` leave of it."""
+        """Compute the largest yaw moment as a fraction of full scale, shape (N,).
+
+        The motors' power at the measured speed (columns 0 and 1, the front wheels) and `grip` limit
+        it.
+        """
         car, max_moment = self.vehicle, np.ones(len(inputs))
         if car.motor_power > 0.0:
             max_moment = _torque_limit(inputs[:, :2].mean(axis=1), self._car) / car.motor_torque
@@ -97,18 +107,27 @@ class Controller(ABC):
 
     @abstractmethod
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        """Fill action (N, width), which is zero, and update state (N, memory) in place.
+        """Compute the action and the next memory, in place.
 
-        inputs: (N, len(needs)), finite. A NaN that the law leaves in an action means that it
-        failed. The action's first column is the yaw moment as a share of full scale, its second,
-        where the env has one, the added steering as a share of the vehicle's authority.
+        A NaN in an action means that the law failed.
+
+        Args:
+            inputs: Entries of `needs`, finite, shape (N, len(needs)).
+            state: Memory, shape (N, memory), updated.
+            action: Zeros of shape (N, width), to be filled: yaw moment as a fraction of full scale
+                and, where the env steers, added steering as a fraction of the vehicle's authority.
         """
 
     def _mark_not_finite(self, rows: Any, state: Array) -> None:  # noqa: B027
         """Note the rows (N,) whose inputs are not finite, in the state (N, memory) or elsewhere."""
 
     def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:  # noqa: B027
-        """Note in the state (N, memory) that the action taken (N, width) is not the own one."""
+        """Note in the state that the env gets an action other than the controller's own.
+
+        Args:
+            state: Memory, shape (N, memory), updated.
+            action: Action that the env gets, shape (N, width).
+        """
 
     def predict(
         self,
@@ -117,10 +136,19 @@ class Controller(ABC):
         episode_start: npt.NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[npt.NDArray[np.float32], Array]:
-        """The action for an observation (k,) or a batch (N, k), and the next state.
+        """Compute the action for an observation or a batch.
 
-        state: (N, memory), None at the start. episode_start: (N,) rows whose memory is cleared.
-        Raises ValueError for an observation of another width.
+        Args:
+            observation: Observation, shape (k,) or (N, k).
+            state: Memory, shape (N, memory); None at the start.
+            episode_start: Rows whose memory is cleared, shape (N,).
+            deterministic: Without effect.
+
+        Returns:
+            Action in [-1, 1], shape (width,) or (N, width), and the next state.
+
+        Raises:
+            ValueError: The observation has another width.
         """
         obs = np.asarray(observation)
         if obs.shape[-1] != self._width or obs.ndim > 2:
@@ -145,7 +173,7 @@ class Controller(ABC):
 
 
 def _describe_wrapper(missing: list[str]) -> str:
-    """The wrapper whose observation has these entries."""
+    """Describe the wrapper whose observation has these entries."""
     if any(name.startswith("true_") for name in missing):
         return "; wrap the env in sideslip.estimators.wrappers.truth.TruthObservation"
     if any(name.endswith("_hat") for name in missing):
@@ -154,19 +182,39 @@ def _describe_wrapper(missing: list[str]) -> str:
 
 
 def list_entry_names(env: AnyEnv) -> set[str]:
-    """The names in the env's observation."""
+    """Collect the names of the entries in the env's observation.
+
+    Args:
+        env: Env, single or vector.
+    """
     return {entry.name for entry in get_env_facts(env).layout}
 
 
 def check_positive(name: str, value: float) -> float:
-    """The value; ValueError unless it is positive and finite."""
+    """Return a number that must be positive and finite.
+
+    Args:
+        name: Name of the option, for the message.
+        value: Number to check.
+
+    Raises:
+        ValueError: The number is not positive and finite.
+    """
     if not 0.0 < value < math.inf:
         raise ValueError(f"{name} is a positive number, got {value!r}")
     return float(value)
 
 
 def check_not_negative(name: str, value: float) -> float:
-    """The value; ValueError unless it is finite and zero or more."""
+    """Return a number that must be finite and not negative.
+
+    Args:
+        name: Name of the option, for the message.
+        value: Number to check.
+
+    Raises:
+        ValueError: The number is negative or not finite.
+    """
     if not 0.0 <= value < math.inf:
         raise ValueError(f"{name} is a number of zero or more, got {value!r}")
     return float(value)
@@ -174,7 +222,14 @@ def check_not_negative(name: str, value: float) -> float:
 
 @jit
 def integrate_antiwindup(integral: Any, step: Any, unlimited: Any, limited: Any) -> Any:
-    """An integral after a step, which is dropped where it would push further past the limit."""
+    """Integrate a step, unless it would push the output further past its limit.
+
+    Args:
+        integral: Integral before the step.
+        step: Increment of the integral.
+        unlimited: Output before its limits.
+        limited: Output within its limits.
+    """
     if unlimited == limited or (unlimited > limited) != (step > 0.0):
         return integral + step
     return integral

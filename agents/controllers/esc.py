@@ -37,10 +37,16 @@ IN = Inputs(*range(5))
 def compute_yaw_gains(
     vehicle: Vehicle, speed: float, bandwidth: float = BANDWIDTH
 ) -> tuple[float, float]:
-    """(k_p, k_i) of the yaw moment on the yaw rate's error, N m s/rad and N m/rad.
+    """Compute k_p (N m s/rad) and k_i (N m/rad) of the yaw moment on the yaw rate's error.
 
-    Both poles of the yaw equation with its own damping at the bandwidth: s^2 + (k_p / I - a22) s +
-    k_i / I = (s + bandwidth)^2; where the damping alone is more, k_p is zero.
+    Both poles of the yaw equation with its own damping are at the bandwidth:
+    s^2 + (k_p / I - a22) s + k_i / I = (s + bandwidth)^2.
+    Where the damping alone is more, k_p is zero.
+
+    Args:
+        vehicle: Vehicle of the design.
+        speed: Speed (m/s).
+        bandwidth: Double pole of the closed loop (rad/s).
     """
     I = vehicle.yaw_inertia  # noqa: E741
     a22 = compute_plant_python(make_nominal_car(vehicle), speed).a22
@@ -49,7 +55,12 @@ def compute_yaw_gains(
 
 @jit
 def apply_dead_zone(value: Any, band: Any) -> Any:
-    """The part of a value outside of +-band, with its sign."""
+    """Compute the part of a value outside of a dead zone, with its sign.
+
+    Args:
+        value: Value of any unit.
+        band: Half width of the zone, in the same unit.
+    """
     if value > band:
         return value - band
     if value < -band:
@@ -95,14 +106,21 @@ def _esc_law(
 class Esc(Controller):
     """Yaw-rate control with a dead band, and a bound on the sideslip angle.
 
-    The yaw rate follows that of the nominal car within what friction holds,
-    |gamma| <= 0.85 mu g / v (Rajamani, Vehicle Dynamics and Control, 8.2), whatever the env's own
-    reference is, by a PI that starts outside +-`band` (rad/s) and lets its integral go within.
-    Beyond +-`slip` (rad) a moment of `stiffness` (N m/rad; default: the full moment at twice the
-    bound) drives beta back, where the observation has beta_hat; without, it does without.
+    The yaw rate follows that of the nominal car within what friction holds, |gamma| <= 0.85 mu g /
+    v, under every reference of the env. The PI acts outside of the dead band, within which its
+    integral decays. Beyond the bound of the slip a moment drives beta back, where the observation
+    has beta_hat. Source: Rajamani, Vehicle Dynamics and Control, 8.2.
 
-    bandwidth: rad/s, of `compute_yaw_gains`. grip: of `Controller`. Memory: the integral. Raises
-    ValueError for an option out of range.
+    Args:
+        env: Env of the controller.
+        bandwidth: Double pole of the yaw-rate loop (rad/s), as for `compute_yaw_gains`.
+        band: Half width of the yaw rate's dead band (rad/s).
+        slip: Bound of the sideslip angle (rad).
+        stiffness: Yaw moment per angle beyond the bound (N m/rad); None: full moment at twice it.
+        grip: Grip limit, as for `Controller`.
+
+    Raises:
+        ValueError: An option is out of range.
     """
 
     memory = 1

@@ -32,8 +32,8 @@ Inputs = namedtuple(
 Lane = namedtuple("Lane", "beta gamma psi y N_z delta_f integral driver kappa")
 """States of the lane model: the inputs move the first seven, the others move by themselves.
 
-psi: relative to the road. y: m, of the centre of gravity from the road's centre line, and its
-integral in m s. N_z: share of full scale.
+psi is relative to the road (rad). y is the offset of the centre of gravity from the road's centre
+line (m), and integral is its integral (m s). N_z is a fraction of full scale.
 """
 Memory = namedtuple("Memory", "integral rate heading started")
 """The integral, the filtered gamma / V and psi that the curvature is from, whether it began."""
@@ -50,13 +50,24 @@ OFFSET_SCALE, INTEGRAL_SCALE = 0.1, 0.2  # m, m s
 def make_lane_model(
     vehicle: Vehicle, speed: float, period: int, full_scale: float, haste: float
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """(G, H, Q, R, N) of `Lane` over `period` ticks, as `solve_lqr` takes them.
+    """Make the model of `Lane` over a period and its cost, as `solve_lqr` takes them.
 
-    Inputs: the share of the full yaw moment in N m, and rad added to the driver's steering. The
-    cost rate is the env's of beta and of both inputs, with gamma against V kappa, the offset over
-    0.1 m and its integral over 0.2 m s squared, and haste times the square of how far the steering
-    asked for is ahead of the applied, in what its rate covers in a period and a lag: without it a
-    linear law asks for what the rate cannot give. It is taken at the end of each period.
+    Inputs are the fraction of the full yaw moment, and rad added to the driver's steering. The cost
+    rate is the env's of beta and of both inputs, with gamma against V kappa. It adds the squares of
+    the offset over 0.1 m and of its integral over 0.2 m s. A last term is haste times the square of
+    the steering command's lead over the applied angle. Its unit is the angle that the rate covers
+    in a period and a lag: without it a linear law commands what the rate cannot give. The cost is
+    taken at each period's end.
+
+    Args:
+        vehicle: Vehicle of the design.
+        speed: Speed (m/s).
+        period: Control period in ticks.
+        full_scale: Full yaw moment (N m).
+        haste: Weight of the steering command's lead.
+
+    Returns:
+        G (n, n), H (n, 2), Q (n, n), R (2, 2) and N (n, 2).
     """
     n, T = len(AT), period * TICK
     plane = make_vision_model(vehicle, speed)
@@ -142,15 +153,18 @@ def _lane_keeping_law(
 class LaneKeeping(Controller):
     """LQR on beta, gamma, psi, y and the integral of y, with the road's curvature fed forward.
 
-    It reads a vision filter's beta_hat, gamma_hat, psi_hat and y_l_hat. The curvature is what the
-    yaw rate and the turning of the heading leave, psi' = gamma - V kappa, filtered over
-    `curvature_time` seconds; what that lacks, the integral makes up. y is the offset of the centre
-    of gravity, not of the preview point, which on a curve is never zero for a car in its lane.
+    It reads a vision filter's beta_hat, gamma_hat, psi_hat and y_l_hat. The curvature follows from
+    psi' = gamma - V kappa, filtered; the integral makes up its error. y is the offset of the centre
+    of gravity: on a curve, that of the preview point is not zero for a car in its lane.
 
-    moment: also by the yaw moment, else by steering alone. haste: of `make_lane_model`.
+    Args:
+        env: Env of the controller, whose action steers.
+        moment: Whether to use the yaw moment beside the steering.
+        curvature_time: Time constant of the curvature's filter (s).
+        haste: Weight of the steering command's lead, as for `make_lane_model`.
 
-    Raises ValueError for an env whose action does not steer, a missing entry or an option out of
-    range.
+    Raises:
+        ValueError: The action does not steer, an entry is missing, or an option is out of range.
     """
 
     needs = Inputs._fields

@@ -31,9 +31,13 @@ IN = Inputs(*range(14))
 
 @jit
 def make_design_state(x: Any, share: Any, z: Any) -> None:
-    """Fill z, the states of the design model, from a row of `Inputs`.
+    """Fill the states of the design model from a row of `Inputs`.
 
-    share: what 1 N m of difference between the motors is of the full yaw moment.
+    Args:
+        x: Row of `Inputs`.
+        share: Yaw moment per difference of the motors' torques, as a fraction of full scale (1/N
+            m).
+        z: States of the design model, shape (n,), filled.
     """
     z[0], z[1] = x[IN.beta_hat], x[IN.gamma_hat]
     z[2] = share * (x[IN.torque_right] - x[IN.torque_left])
@@ -56,8 +60,12 @@ def _lqr_law(
     slew: Any,
     front_arm: Any,
 ) -> None:
-    """x: `Inputs`. state: rad of steering last added, where the car steers. most, slides: (N,),
-    of the yaw moment as a share, and rad of slip at which the front tyres only slide."""
+    """Compute the actions of LQR within the limits.
+
+    x: `Inputs`. state: steering last added (rad), where the car steers. max_moment: yaw moment as a
+    fraction of full scale, shape (N,). sliding_slip: slip at which the front tyres slide (rad),
+    (N,).
+    """
     m, n = table.shape[3], table.shape[4] - table.shape[3]
     KS, z = np.empty((m, n + m)), np.empty(n)
     for row in range(len(x)):
@@ -87,20 +95,28 @@ def _lqr_law(
 class Lqr(Controller):
     """u = -K(v) x for the nominal vehicle as `make_design_model` predicts it.
 
-    x: the estimates beta_hat and gamma_hat (without the latter the gyro), the applied torques and
-    steering, the driver's command, the references, and the disturbances F_d_hat, N_d_hat or
-    d1_hat, d2_hat where the observation has either pair. On a Kalman filter's estimate this is
-    LQG. Where the env steers and an input would pass its limit, or the steering its rate, the two
-    are the best within these limits, if none were met later; memory: the steering last added.
+    x has the estimates beta_hat and gamma_hat (without the latter the gyro), the applied torques
+    and steering, the driver's command, and the references. It has the disturbances F_d_hat, N_d_hat
+    or d1_hat, d2_hat where the observation has either pair. On a Kalman filter's estimate this is
+    LQG. Where the env steers, an input may pass its limit, or the steering its rate. Both inputs
+    are then optimal within these limits, if none were met later. The memory is the steering last
+    added.
 
-    disturbance_time: s, in which F_d and N_d decay. vehicle: designed for this instead of the
-    env's nominal. stiffness: two entries of the observation with the front and the rear cornering
-    stiffness, on which the gains are then scheduled too, within `span` times the vehicle's, on
-    `knots` knots each; the table is designed once. steer_weight: of added steering, times the
-    cost's: the rate limit, which the design does not know, punishes haste. grip: of `Controller`;
-    with it no steering is added that only slides the front tyres either.
+    Args:
+        env: Env of the controller.
+        disturbance_time: Time in which F_d and N_d decay (s).
+        vehicle: Vehicle of the design; None: the env's nominal one.
+        stiffness: Two entries of the observation, front and rear cornering stiffness of a tyre
+            (N/rad), on which the gains are scheduled too.
+        span: Range of the stiffness schedule, as factors of the vehicle's.
+        knots: Knots of each stiffness axis; the table is designed once.
+        steer_weight: Factor on the cost of added steering, for the rate limit that the design
+            lacks.
+        grip: Grip limit, as for `Controller`; it also keeps added steering from making the front
+            tyres slide.
 
-    Raises ValueError for a missing entry or an option out of range.
+    Raises:
+        ValueError: An entry is missing, or an option is out of range.
     """
 
     min_period = 1  # ticks, of the period that the gains are designed for
@@ -158,18 +174,30 @@ class Lqr(Controller):
         self._design = self.table, self.axes, int(self.scheduled), self.share, *limits
 
     def _list_extra_entries(self, names: set[str]) -> tuple[str, ...]:
-        """Entries of an observation that a subclass reads behind `Inputs`."""
+        """List entries of an observation that a subclass reads behind `Inputs`."""
         return ()
 
     def gains(self, speed: float, front: float = 0.0, rear: float = 0.0) -> Array:
-        """K (m, n) at a speed in m/s, and at stiffnesses in N/rad where it is scheduled on them."""
+        """Compute the gains K, shape (m, n).
+
+        Args:
+            speed: Speed (m/s).
+            front: Front cornering stiffness of a tyre (N/rad), where the gains are scheduled on it.
+            rear: Rear cornering stiffness of a tyre (N/rad), likewise.
+        """
         KS = np.empty(self.table.shape[3:])
         interpolate_gains(self.table, self.axes, float(speed), float(front), float(rear), KS)
         return KS[:, : len(self.design_spec.states)]
 
     def curvature(self, speed: float) -> Array:
-        """S (width, width) at a speed in m/s: an action that differs by e from the best one adds
-        e' S e to the cost of what follows, while the car is linear and nothing limits it."""
+        """Compute S, the weight of an action's error, shape (width, width).
+
+        An action that differs by e from the best one costs e' S e more. This holds while the car is
+        linear and no input is limited.
+
+        Args:
+            speed: Speed (m/s).
+        """
         KS = np.empty(self.table.shape[3:])
         car, per = self.vehicle, np.array([1.0, self.authority])[: self.width]
         interpolate_gains(
@@ -178,7 +206,12 @@ class Lqr(Controller):
         return np.asarray(KS[:, len(self.design_spec.states) :] * np.outer(per, per))
 
     def record_action(self, state: Array, action: Any) -> None:
-        """The steering that the rate limit goes by is what was added."""
+        """Note the added steering, from which the rate limit counts.
+
+        Args:
+            state: Memory, shape (N, memory), updated.
+            action: Action that the env gets, shape (N, width).
+        """
         if self.width == 2:
             state[:, 0] = action[:, 1] * self.authority
 
@@ -187,8 +220,10 @@ class Lqr(Controller):
         _lqr_law(inputs, state, action, *limits, *self._design)
 
     def _compute_sliding_slip(self, inputs: Array) -> Array:
-        """(N,) rad of slip beyond which the front tyres' force grows no more (Fiala's), infinite
-        without a grip limit."""
+        """Compute the slip at which the front tyres' force stops growing (Fiala), rad, shape (N,).
+
+        It is infinite without a grip limit.
+        """
         if self.grip is None:
             return np.full(len(inputs), np.inf)
         car = self.vehicle
@@ -207,10 +242,20 @@ def _clip(value: Any, low: Any, high: Any) -> Any:
 def solve_box_qp(
     s_uu: Any, s_uw: Any, s_ww: Any, u: Any, w: Any, max_u: Any, low: Any, high: Any
 ) -> Any:
-    """The point with |u| <= most and low <= w <= high that is nearest to (u, w).
+    """Find the point with |u| <= max_u and low <= w <= high that is nearest to (u, w).
 
-    Nearest in du^2 s_uu + 2 du dw s_uw + dw^2 s_ww, positive definite: (u, w) itself where it is
-    within, else the least of the four edges' own minima.
+    The distance is du^2 s_uu + 2 du dw s_uw + dw^2 s_ww, positive definite. The point is (u, w)
+    itself where it is within, else the least of the four edges' own minima.
+
+    Args:
+        s_uu: Weight of du^2.
+        s_uw: Weight of du dw, halved.
+        s_ww: Weight of dw^2.
+        u: First coordinate.
+        w: Second coordinate.
+        max_u: Limit of |u|.
+        low: Lower limit of w.
+        high: Upper limit of w.
     """
     if absolute(u) <= max_u and low <= w <= high:
         return u, w

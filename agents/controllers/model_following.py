@@ -54,12 +54,20 @@ LAST = Memory(*range(4))
 def compute_feedback_gains(
     vehicle: Vehicle, speed: float, bandwidth: Sequence[float] = BANDWIDTH
 ) -> tuple[Array, Array]:
-    """(P, I), each (2, 2), of C_fb = P + I / s from errors of beta, gamma to delta_f, N_z.
+    """Compute P and I of C_fb = P + I / s, from errors of beta and gamma to delta_f and N_z.
 
     (31) solved for C_fb gives P_n^-1 diag(K / s) = B^-1 diag(K) - B^-1 A diag(K) / s, a proper
     PI. The closed loop is diag(K / (s + K)) and the poles of A, which the PI's zeros cancel: it is
     internally stable where the nominal car is, below its critical speed. The printed (32) is this
     for equal K only.
+
+    Args:
+        vehicle: Vehicle of the design.
+        speed: Speed (m/s).
+        bandwidth: K_beta and K_gamma (rad/s).
+
+    Returns:
+        P and I, each of shape (2, 2).
     """
     plant = compute_plant_python(make_nominal_car(vehicle), float(speed))
     columns = np.diag(np.asarray(bandwidth, np.float64))
@@ -138,17 +146,23 @@ def _model_following_law(
 class ModelFollowing(Controller):
     """Steering and yaw moment by dakf-stability (33), for an env whose action has both.
 
-    bandwidth: K_beta and K_gamma in rad/s. rejection: subtract the effect of d1_hat and d2_hat,
-    (26). grip: of `Controller`. The yaw rate is gamma_hat where the observation has it, else the
-    gyro's. The references are the env's; their derivatives are those of the driver's steering at
-    the measured speed, whose noise would drown a difference of references.
+    The yaw rate is gamma_hat where the observation has it, else the gyro's. The references are the
+    env's. Their derivatives are those of the driver's steering at the measured speed, whose noise
+    would drown a difference of references.
 
-    Memory: `Memory`. Anti-windup is conditional integration, each input for itself: an integral
-    holds while its input is at the limit (yaw moment: full scale; steering: the authority around
-    the driver's) and the error would push it further out.
+    Anti-windup is conditional integration of each input: an integral holds while its input is at
+    the limit (yaw moment: full scale; steering: the authority around the driver's) and the error
+    would push it further out.
 
-    Raises ValueError for an env whose action does not steer, a bandwidth that is not two positive
-    numbers, or an observation without a needed entry.
+    Args:
+        env: Env of the controller, whose action steers.
+        bandwidth: K_beta and K_gamma (rad/s).
+        rejection: Whether to subtract the effect of d1_hat and d2_hat, (26).
+        grip: Grip limit, as for `Controller`.
+
+    Raises:
+        ValueError: The action does not steer, the bandwidth is not two positive numbers, or an
+            entry is missing.
     """
 
     memory = len(Memory._fields)

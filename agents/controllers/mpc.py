@@ -43,18 +43,24 @@ class Mpc(Lqr):
     """Predictive control: `lqr`'s cost over a horizon with limits, then as if there were none.
 
     Limits are those of the yaw moment and, where the env steers, of the added angle and its rate.
-    Where none is met this is the LQR. The program is that of the nearest speed of `SPEEDS`.
+    Where none is met this is the LQR. The program is that of the nearest speed of `SPEEDS`. The
+    memory is the last fraction of added steering and the last solution, from which the next starts.
 
-    horizon: steps of a control period, or of 10 ms where that is shorter. iterations: the solver's
-    most. disturbance_time: of `lqr`. grip: of `Controller`.
+    Args:
+        env: Env of the controller.
+        horizon: Steps of a control period, or of 10 ms where that is shorter.
+        iterations: Maximum of the solver's iterations.
+        disturbance_time: Time in which F_d and N_d decay (s).
+        grip: Grip limit, as for `Controller`.
 
-    status: of each row of the last call, "solved", "solved inaccurate" (ten times the tolerance of
-    1e-4 of full scale) or why there is no solution: then the row's action is NaN. solve_time: of
-    the solver for each, s. Memory: the last share of added steering, and the last solution, which
-    the next one starts from.
+    Attributes:
+        status: Status of each row in the last call: "solved", "solved inaccurate" (ten times the
+            tolerance of 1e-4 of full scale), or why there is no solution and the action is NaN.
+        solve_time: Time of the solver for each row (s).
 
-    Raises ModuleNotFoundError without the extras `mpc` and `design`, ValueError for a missing entry
-    or an option out of range.
+    Raises:
+        ModuleNotFoundError: The extras `mpc` and `design` are not installed.
+        ValueError: An entry is missing, or an option is out of range.
     """
 
     def __init__(
@@ -91,17 +97,21 @@ class Mpc(Lqr):
         self.solve_time: list[float] = []
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the solvers, which cannot be copied; they are set up anew."""
+        """Leave out the solvers, which cannot be copied and are set up anew."""
         return self.__dict__ | {"_ready_for": {}, "_osqp": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """With the solver's module, which cannot be copied either."""
+        """Import the solver's module, which cannot be copied either."""
         import osqp
 
         self.__dict__.update(state | {"_osqp": osqp})
 
     def get_program(self, speed: float) -> QuadraticProgram:
-        """The quadratic program for a speed in m/s, that of the nearest of `SPEEDS`."""
+        """Get the quadratic program of the nearest speed of `SPEEDS`.
+
+        Args:
+            speed: Speed (m/s).
+        """
         nearest = _find_nearest_speed(speed)
         return _make_program(self.nominal, nearest, self.prediction, self.horizon, self.authority)
 
@@ -121,15 +131,19 @@ class Mpc(Lqr):
             self.solve_time.append(seconds)
 
     def record_action(self, state: Array, action: Any) -> None:
-        """As of `Lqr`; here it is a share of the full steering."""
+        """Note the added steering as a fraction of the authority, from which the rate limit counts.
+
+        Args:
+            state: Memory, shape (N, memory), updated.
+            action: Action that the env gets, shape (N, width).
+        """
         if self.width == 2:
             state[:, 0] = action[:, 1]
 
     def _solve(
         self, speed: float, z: Array, memory: Array, row_action: Array, max_moment: float
     ) -> tuple[str, float]:
-        """Fill the action `row_action` (m,) and the memory of a row; the solver's status and
-        time."""
+        """Solve for a row's action (m,) and memory, in place; return status and time (s)."""
         m, count = self.width, self.horizon * self.width
         low, high = -np.ones(self._rows), np.ones(self._rows)
         low[:count:m], high[:count:m] = -max_moment, max_moment
@@ -153,13 +167,13 @@ class Mpc(Lqr):
         return str(solution.info.status), float(solution.info.run_time)
 
     def _shift_solution(self, values: Array, width: int) -> Array:
-        """A solution a step later, the last step repeated."""
+        """Shift a solution by a step, with the last step repeated."""
         if not self._shift or len(values) == 0:
             return values
         return np.concatenate([values[width:], values[-width:]])
 
     def _get_solver(self, speed: float) -> tuple[QuadraticProgram, Any]:
-        """The program of a speed of `SPEEDS` and its solver, set up when first needed."""
+        """Get the program of a speed of `SPEEDS` and its solver, set up at its first use."""
         if speed not in self._ready_for:
             program, solver = self.get_program(speed), self._osqp.OSQP()
             solver.setup(

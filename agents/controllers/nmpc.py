@@ -35,14 +35,14 @@ STATUSES = ("unknown", "solved", "the observation is not finite", "diverged")
 UNKNOWN, SOLVED, NOT_FINITE, DIVERGED = range(len(STATUSES))
 
 Memory = namedtuple("Memory", "slewing status")
-"""rad of steering last added, and of `STATUSES`; the plan stands behind."""
+"""Steering last added (rad) and index in `STATUSES`; the plan stands behind."""
 
 LAST = Memory(*range(2))
 PLAN = len(Memory._fields)
 
 
 class Design(NamedTuple):
-    """What all decisions of a controller share."""
+    """The parts that all decisions of a controller share."""
 
     model: PredictionModel
     target: ReferenceParams
@@ -58,14 +58,14 @@ class Design(NamedTuple):
 
 @jit
 def _shift_plan(plan: Any, blocks: Any, m: int, steps: float) -> None:
-    """Move a plan on by so many steps of the prediction, each block towards its next."""
+    """Shift a plan by so many steps of the prediction, each block towards its next."""
     for i in range(len(plan) - m):
         plan[i] += (plan[i + m] - plan[i]) * min(1.0, steps / blocks[i // m])
 
 
 @jit
 def _interpolate_regulator(table: Any, axes: Any, v: Any, front: Any, rear: Any, per: Any) -> Any:
-    """(rows, 9) of a table: columns of the states with forces, which may be rates in the table."""
+    """Interpolate a table's rows, shape (rows, 9), for states with forces instead of rates."""
     values, padded = np.empty(table.shape[3:]), np.zeros((table.shape[3], 9))
     interpolate_gains(table, axes, v, front, rear, values)
     for i in range(len(values)):
@@ -80,9 +80,18 @@ def _interpolate_regulator(table: Any, axes: Any, v: Any, front: Any, rear: Any,
 def prepare_prediction(
     design: Design, x: Any, friction: Any, roll: Any, slewing: Any, max_moment: Any
 ) -> Any:
-    """(where the prediction starts, K, T) for a row of `lqr.Inputs`.
+    """Prepare a row's prediction and its regulator.
 
-    roll: rad, rad/s; NaN where they are not measured. slewing: rad of steering last added.
+    Args:
+        design: Parts that all decisions share.
+        x: Row of `lqr.Inputs`.
+        friction: Friction of the road.
+        roll: Roll angle and rate (rad, rad/s), shape (2,); NaN where they are not measured.
+        slewing: Steering last added (rad).
+        max_moment: Largest yaw moment as a fraction of full scale.
+
+    Returns:
+        `PredictionStart`, K (m, 9), and T (4, 9) of the terminal cost |T x|^2.
     """
     model, disturbed = design.model, design.disturbed
     v = max(0.5 * (x[IN.wheel_left] + x[IN.wheel_right]), MIN_SPEED)
@@ -127,7 +136,10 @@ def prepare_prediction(
 def _nmpc_law(
     x: Any, state: Any, action: Any, max_moment: Any, friction: Any, rolls: Any, design: Design
 ) -> None:
-    """x: `lqr.Inputs`. state: `Memory` and the plan. rolls: (N, 2), as in `prepare_prediction`."""
+    """Compute the actions of nonlinear MPC.
+
+    x: `lqr.Inputs`. state: `Memory` and the plan. rolls: (N, 2), as in `prepare_prediction`.
+    """
     blocks, m = design.blocks, design.gains.shape[3]
     for row in range(len(x)):
         slewing = state[row, LAST.slewing]
@@ -153,22 +165,33 @@ def _nmpc_law(
 
 
 class Nmpc(Lqr):
-    """Real-time Gauss-Newton iterations on the env's own plant and cost, held by `lqr` behind.
+    """Real-time Gauss-Newton iterations on the env's own plant and cost, with `lqr`'s cost to go.
 
-    The plant is foreseen for `horizon` seconds in steps of a control period or of 10 ms where that
-    is shorter: its tyres, roll, motors and limits are those of the nominal car or, where the
-    observation tells them, of the true one (`stiffness`, `true_friction`); the driver's command
-    and acceleration are held. What follows costs what the linear car would under `lqr`. Optimised
-    is what is added to `lqr`'s answer, within the limits of moment, `grip`, steering and its rate;
-    where none is met and nothing is bent the action is `lqr`'s. `iterations` from the last plan,
-    more at an episode's first decision.
+    The prediction has steps of a control period, or of 10 ms where that is shorter. Tyres, roll,
+    motors and limits are those of the nominal car, or of the true one where the observation has
+    them (`stiffness`, `true_friction`). The driver's command and acceleration are held. The plan is
+    added to `lqr`'s action, within the limits of moment, `grip`, steering and its rate. Where no
+    limit is met and the car is linear the action is `lqr`'s. Each decision starts from the last
+    plan.
 
-    The other options are those of `lqr`, whose entries it reads, and phi_hat and phi_rate_hat where
-    they are there. Memory: `Memory` and the plan. `status` names a row's: where no prediction is
-    finite the action is NaN.
+    It reads the entries of `lqr`, and phi_hat and phi_rate_hat where they are there. The memory is
+    `Memory` and the plan. Where no prediction is finite the action is NaN.
 
-    Raises ValueError for a missing entry or an option out of range, or where the rows of a vector
-    env have different plants.
+    Args:
+        env: Env of the controller.
+        horizon: Length of the prediction (s).
+        iterations: Iterations of a decision; an episode's first one has more.
+        disturbance_time: Time in which F_d and N_d decay (s).
+        vehicle: Vehicle of the design, as for `Lqr`.
+        stiffness: Entries of front and rear cornering stiffness, as for `Lqr`.
+        span: Range of the stiffness schedule, as for `Lqr`.
+        knots: Knots of each stiffness axis, as for `Lqr`.
+        steer_weight: Factor on the cost of added steering, as for `Lqr`.
+        grip: Grip limit, as for `Controller`.
+
+    Raises:
+        ValueError: An entry is missing, an option is out of range, or the rows of a vector env have
+            different plants.
     """
 
     min_period = MIN_STEP
@@ -225,7 +248,11 @@ class Nmpc(Lqr):
         state[rows, LAST.status] = NOT_FINITE
 
     def status(self, state: Array) -> list[str]:
-        """Of each row of a state, what became of its last decision: of `STATUSES`."""
+        """List the status of each row's last decision, of `STATUSES`.
+
+        Args:
+            state: Memory, shape (N, memory).
+        """
         return [STATUSES[int(code)] for code in state[:, LAST.status]]
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
@@ -239,7 +266,7 @@ class Nmpc(Lqr):
 
 
 def _read_plant_kind(env: AnyEnv, reference: int) -> tuple[StepVariant, bool, bool]:
-    """(the plant's text, whether its actuators lag, whether the yaw moment comes first)."""
+    """Read the plant's variant, whether actuators lag, and whether the yaw moment comes first."""
     plants = list_plant_kinds(env)
     if len(plants) != 1:
         raise ValueError("the rows of a vector env share one prediction, but their plants differ")

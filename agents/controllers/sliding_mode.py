@@ -37,18 +37,25 @@ LAST = Memory(*range(3))
 
 @jit
 def compute_surface_slope(plant: Any, pole: Any) -> Any:
-    """xi of s = gamma - gamma_ref + xi (beta - beta_ref): on s = 0 beta's error decays at `pole`.
+    """Compute xi of s = gamma - gamma_ref + xi (beta - beta_ref), for an error's pole on s = 0.
 
-    There beta' = a11 beta + a12 gamma makes its error's pole a11 - a12 xi. With a12 near -1, xi is
-    negative where the error shall decay faster than the car's own.
+    There beta' = a11 beta + a12 gamma makes the pole of beta's error a11 - a12 xi. With a12 near
+    -1, xi is negative where the error shall decay faster than the car's own.
+
+    Args:
+        plant: `BicyclePlant` at the speed.
+        pole: Decay rate of beta's error (rad/s).
     """
     return (plant.a11 + pole) / plant.a12
 
 
 @jit
 def _compute_reference(x: Any, v: Any, plant: Any, target: Any, kind: int) -> Any:
-    """(beta_ref, gamma_ref) of a row: a lagged reference is the observation's, and where the yaw
-    rate is free it is the one that keeps beta_ref."""
+    """Compute (beta_ref, gamma_ref) of a row.
+
+    A lagged reference is the observation's. Where the yaw rate is free, it is the one that keeps
+    beta_ref.
+    """
     if kind == LAGGED:
         return x[IN.beta_ref], x[IN.gamma_ref]
     beta, gamma = compute_reference(x[IN.steer_command], v, target, kind)
@@ -99,13 +106,21 @@ def _sliding_mode_law(
 class SlidingMode(Controller):
     """s = gamma - gamma_ref + xi (beta - beta_ref) to zero by the yaw moment.
 
-    Rajamani, Vehicle Dynamics and Control, 8.3: the equivalent control of the nominal car at the
-    measured speed keeps s constant, and within a boundary layer of `layer` rad/s s decays at `rate`
-    rad/s (outside at rate x layer rad/s2). xi is `compute_surface_slope` for the `pole` in rad/s.
-    Where the yaw rate is not judged, gamma_ref is the yaw rate that keeps beta_ref. Reads beta_hat,
-    and gamma_hat or else the gyro. grip: of `Controller`. Memory: `Memory`.
+    The equivalent control of the nominal car at the measured speed keeps s constant. Within the
+    boundary layer s decays at `rate`, outside at rate x layer (rad/s2). xi is
+    `compute_surface_slope`. Where the yaw rate is not judged, gamma_ref is the yaw rate that keeps
+    beta_ref. Reads beta_hat, and gamma_hat or else the gyro.
+    Source: Rajamani, Vehicle Dynamics and Control, 8.3.
 
-    Raises ValueError for an option that is not positive, or an observation without beta_hat.
+    Args:
+        env: Env of the controller, with beta_hat in its observation.
+        pole: Decay rate of beta's error on s = 0 (rad/s).
+        rate: Decay rate of s within the boundary layer (rad/s).
+        layer: Half width of the boundary layer (rad/s).
+        grip: Grip limit, as for `Controller`.
+
+    Raises:
+        ValueError: An option is not positive, or the observation lacks beta_hat.
     """
 
     memory = len(Memory._fields)

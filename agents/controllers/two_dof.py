@@ -28,7 +28,7 @@ FEEDFORWARDS = ("reference", "zero-slip")
 Inputs = namedtuple("Inputs", "wheel_left wheel_right steer_command beta_hat beta_ref")
 """Columns of the laws' inputs; the feedforward reads the first three alone."""
 Memory = namedtuple("Memory", "integral wait share")
-"""The integral in N m, the decisions until the next update, the share held until then."""
+"""The integral (N m), decisions until the next update, and the fraction held until then."""
 
 
 IN = Inputs(*range(5))
@@ -37,7 +37,7 @@ LAST = Memory(*range(3))
 
 @jit
 def _compute_denominator(car: Any, V: Any) -> Any:
-    """-a12 m V^2, kept from zero, where the yaw moment has no static effect on the slip."""
+    """Compute -a12 m V^2, kept from zero, where the yaw moment has no static effect on the slip."""
     mV2, excess = car[CAR.m] * V * V, car[CAR.l_f] * car[CAR.C_f] - car[CAR.l_r] * car[CAR.C_r]
     denominator, min_size = mV2 + 2.0 * excess, 0.05 * (mV2 + 2.0 * absolute(excess))
     if absolute(denominator) < min_size:
@@ -55,17 +55,22 @@ def _compute_static_gain(car: Any, V: Any) -> Any:
 
 @jit
 def _compute_slip_gain(car: Any, V: Any) -> Any:
-    """N m/rad: the yaw moment that holds a sideslip angle, beside (24)'s that makes it zero."""
+    """Compute the yaw moment that holds a sideslip angle (N m/rad), beside that of (24)."""
     plant, m = compute_plant(car, V), car[CAR.m]
     yaw_rate = plant.a11 * m * V * V / _compute_denominator(car, V)  # that keeps it, -a11 / a12
     return -(plant.a21 + plant.a22 * yaw_rate) / plant.b22
 
 
 def feedforward_gain(vehicle: Vehicle, speed: float) -> float:
-    """C_FF in N m/rad: the yaw moment per steering angle that brings static slip to zero.
+    """Compute the yaw moment per steering angle that makes the static slip zero, C_FF (N m/rad).
 
-    Where the yaw moment has no static effect on beta (m V^2 = 2 (l_r C_r - l_f C_f), which exists
-    for understeering cars only) the gain is limited to what 5 % of the terms would give.
+    For an understeering car there is a speed at which the yaw moment has no static effect on beta,
+    m V^2 = 2 (l_r C_r - l_f C_f). So the denominator is at least 5 % of its terms.
+    Source: tie-vision (24).
+
+    Args:
+        vehicle: Vehicle of the design.
+        speed: Speed (m/s).
     """
     return float(_compute_static_gain(make_nominal_car(vehicle), float(speed)))
 
@@ -73,7 +78,7 @@ def feedforward_gain(vehicle: Vehicle, speed: float) -> float:
 def _make_pi_table(
     vehicle: Vehicle, gain: float, pole: float, placement: str, period: float | None
 ) -> Array:
-    """(len(SPEEDS), 2) of k_p and k_i."""
+    """Make the table of k_p and k_i, shape (len(SPEEDS), 2)."""
     if period is None:
         gains = [design_pi(vehicle, float(v), pole, placement) for v in SPEEDS]
     else:
@@ -83,7 +88,7 @@ def _make_pi_table(
 
 @jit
 def _interpolate_column(table: Any, v: Any) -> Any:
-    """A column of a table over SPEEDS, interpolated at v and held beyond its ends."""
+    """Interpolate a column of a table over SPEEDS at v, held beyond its ends."""
     position = min(max((v - MIN_SPEED) / 0.5, 0.0), len(table) - 1.000001)
     i = int(position)
     return table[i] + (position - i) * (table[i + 1] - table[i])
@@ -134,7 +139,11 @@ def _two_dof_law(
 
 
 class Feedforward(Controller):
-    """The yaw moment of tie-vision (24) for the driver's steering command."""
+    """The yaw moment of tie-vision (24) for the driver's steering command.
+
+    Args:
+        env: Env of the controller.
+    """
 
     needs = Inputs._fields[: IN.beta_hat]
 
@@ -149,15 +158,19 @@ class Feedforward(Controller):
 class TwoDof(Controller):
     """Feedforward plus a PI on beta_ref - beta_hat, tie-vision section V.
 
-    feedforward: "reference" holds beta_ref in the steady turn of the nominal car, "zero-slip" is
-    (24) whatever the reference is; where beta_ref is zero they are the same.
-    rate: "control" updates at every decision of the env, "camera" every 33 ms (held between;
-    for a control period that is no divisor of it, the next decision). gain: a factor on the PI.
-    pole (rad/s), placement: of `design_pi`. sampled: place the poles of the loop as sampled at
-    that rate (`sample_pi`) instead of the continuous one's. grip: of `Controller`. Memory:
-    `Memory`.
+    Args:
+        env: Env of the controller, with beta_hat in its observation.
+        rate: "control" updates at every decision, "camera" at the first decision after 33 ms.
+        gain: Factor on the PI's gains.
+        pole: Pole of the closed loop (rad/s), as for `design_pi`.
+        placement: Rule of the pole, as for `design_pi`.
+        sampled: Whether to place the poles of the sampled loop (`sample_pi`).
+        grip: Grip limit, as for `Controller`.
+        feedforward: "reference" holds beta_ref in the steady turn of the nominal car, "zero-slip"
+            is (24) for every reference; where beta_ref is zero they are equal.
 
-    Raises ValueError for an unknown rate or placement or an env whose observation lacks beta_hat.
+    Raises:
+        ValueError: A rate, placement or feedforward is unknown, or beta_hat is missing.
     """
 
     needs = Inputs._fields

@@ -13,9 +13,14 @@ from .sampled_model import DesignModel, compute_cost_to_go
 class QuadraticProgram:
     """Minimise a'P a / 2 + (F x)'a over the inputs a (h m,) of h steps from the state x (n,).
 
-    Inputs stand step by step, as shares of their limits. The cost is scaled, so that the mean of
-    P's diagonal is 1. A (rows, h m) are the inputs themselves, then, where the car steers, the
-    change of the steering share in each step.
+    Inputs stand step by step, as fractions of their limits. The cost is scaled so that the mean of
+    P's diagonal is 1.
+
+    Attributes:
+        P: Hessian, shape (h m, h m).
+        F: Effect of the state on the gradient, shape (h m, n).
+        A: Constrained combinations, shape (rows, h m): the inputs themselves, then, where the car
+            steers, the change of the steering fraction in each step.
     """
 
     P: Array
@@ -24,9 +29,12 @@ class QuadraticProgram:
 
 
 def condense_qp(model: DesignModel, horizon: int, limits: Array) -> QuadraticProgram:
-    """The program over `horizon` steps of a model, with the regulator's cost of what follows.
+    """Condense a model's steps into a program, with the regulator's cost to go at its end.
 
-    limits: (m,), the inputs at a share of 1.
+    Args:
+        model: Design model.
+        horizon: Number of steps.
+        limits: Inputs at a fraction of 1, shape (m,).
     """
     n, m = model.H.shape
     Sx, Su = np.zeros(((horizon + 1) * n, n)), np.zeros(((horizon + 1) * n, horizon * m))

@@ -19,12 +19,20 @@ from .sampled_model import (
 )
 
 SPEEDS = tuple(np.geomspace(2.0, 60.0, 48).tolist())
-"""m/s: gains are designed at these, interpolated between and held beyond."""
+"""Speeds of the designs (m/s); gains are interpolated between and held beyond."""
 
 
 @jit
 def find_cell(axis: Any, value: Any) -> Any:
-    """(i, share): where a value lies in an axis, held at its ends; (0, 0) of a single knot."""
+    """Find the cell of a value in an axis, held at its ends.
+
+    Args:
+        axis: Rising knots.
+        value: Value in the axis's unit.
+
+    Returns:
+        Index of the cell's first knot, and the fraction of the cell; (0, 0) for a single knot.
+    """
     if len(axis) < 2:
         return 0, 0.0
     i = 0
@@ -36,7 +44,16 @@ def find_cell(axis: Any, value: Any) -> Any:
 
 @jit
 def interpolate_gains(table: Any, axes: Any, v: Any, front: Any, rear: Any, K: Any) -> None:
-    """Fill K (m, n) from a table (speeds, fronts, rears, m, n), linear along each axis."""
+    """Interpolate a table of gains, linear along each axis.
+
+    Args:
+        table: Table, shape (speeds, fronts, rears, m, n).
+        axes: Knots of the three axes.
+        v: Speed (m/s).
+        front: Front cornering stiffness of a tyre (N/rad).
+        rear: Rear cornering stiffness of a tyre (N/rad).
+        K: Gains, shape (m, n), filled.
+    """
     i, a = find_cell(axes[0], v)
     j, b = find_cell(axes[1], front)
     k, c = find_cell(axes[2], rear)
@@ -49,7 +66,7 @@ def interpolate_gains(table: Any, axes: Any, v: Any, front: Any, rear: Any, K: A
 
 
 class GainTables(NamedTuple):
-    """What the regulator is on a grid, (speeds, fronts, rears, ...): see `regulator`."""
+    """The regulators on a grid, shape (speeds, fronts, rears, ...): see `compute_regulator`."""
 
     gains: Array  # [K S], (..., m, n + m)
     terminal: Array  # T, (..., d, n): what is to come costs |T x|^2, but for what no input changes
@@ -63,9 +80,14 @@ def make_gain_table(
     fronts: Sequence[float],
     rears: Sequence[float],
 ) -> GainTables:
-    """The regulators of a car over speeds in m/s and stiffnesses.
+    """Make the regulators of a car over speeds and stiffnesses.
 
-    fronts, rears: stiffnesses in N/rad, none: the vehicle's.
+    Args:
+        vehicle: Vehicle of the design.
+        design_spec: Parameters of the design.
+        speeds: Speeds (m/s).
+        fronts: Front stiffnesses (N/rad); empty: the vehicle's.
+        rears: Rear stiffnesses (N/rad); empty: the vehicle's.
     """
     shape = len(speeds), max(len(fronts), 1), max(len(rears), 1)
     gains, terminal = [], []
@@ -83,7 +105,7 @@ def make_gain_table(
 
 
 def _factor_cost(V: Array) -> Array:
-    """T (d, n) with |T x|^2 = x'Vx but for the part of the states that no input moves."""
+    """Factor V: T (d, n) with |T x|^2 = x'Vx but for the states that no input moves."""
     d = len(DYNAMIC)
     P = V[:d, :d] + 1e-9 * np.diag(np.diag(V)[:d]) + 1e-15 * np.eye(d)  # without lag: singular
     L = np.linalg.cholesky(P)

@@ -1,4 +1,4 @@
-"""Gauss-Newton on plans of `prediction`: slopes by differences, steps by trial, both in lanes."""
+"""Gauss-Newton on plans of `prediction`: gradients by differences, steps by trial, in lanes."""
 
 import math
 from typing import Any, NamedTuple
@@ -19,7 +19,15 @@ STEP_LENGTHS = (1.0, 0.3)  # each step is tried whole and in part
 
 
 class PlanBatch(NamedTuple):
-    """Plans side by side, and what came of them: a column for each."""
+    """Plans side by side and their results, one column for each.
+
+    Attributes:
+        plans: Variables, shape (variables, count).
+        perturbations: Changes beyond the limits, shape (variables, count).
+        limits: 1 or -1 where a block starts at a limit, shape (variables, count).
+        residuals: Residuals, whose squares sum to J, shape (residuals, count).
+        first: First yaw moment (fraction) and added steering (rad), shape (2, count).
+    """
 
     plans: Any  # (variables, count)
     perturbations: Any
@@ -30,7 +38,13 @@ class PlanBatch(NamedTuple):
 
 @jit
 def make_plan_batch(variables: int, blocks: Any, count: int) -> PlanBatch:
-    """So many columns, of zeros."""
+    """Make a batch of plans of zeros.
+
+    Args:
+        variables: Variables of a plan.
+        blocks: Steps of each block, shape (blocks,).
+        count: Number of plans.
+    """
     return PlanBatch(
         np.zeros((variables, count)),
         np.zeros((variables, count)),
@@ -49,7 +63,16 @@ def simulate_batch(
     blocks: Any,
     batch: PlanBatch,
 ) -> None:
-    """`simulate_plans` of any number of plans, as many at a time as there are lanes."""
+    """Simulate any number of plans by `simulate_plans`, as many at a time as there are lanes.
+
+    Args:
+        model: Numbers that all predictions share.
+        start: Start of the prediction.
+        K: Gains of the regulator, shape (m, 9).
+        terminal: T of the terminal cost |T x|^2, shape (4, 9).
+        blocks: Steps of each block, shape (blocks,).
+        batch: Plans and perturbations, whose results are filled.
+    """
     width, (variables, count) = count_lanes(), batch.plans.shape
     chunk = make_plan_batch(variables, blocks, width)
     for c in range(0, count, width):
@@ -80,9 +103,9 @@ def _sum_squares(residuals: Any, J: Any) -> None:
 
 @jit
 def _compute_normal_equations(batch: PlanBatch, A: Any, g: Any) -> None:
-    """Fill A = J'J and g = J'r; column i + 1 pokes variable i of the plan in the first.
+    """Fill A = J'J and g = J'r; column i + 1 perturbs variable i of the plan in the first.
 
-    A variable that is at a limit, and would be cheaper beyond it, is left where it is.
+    A variable that is at a limit, and would be cheaper beyond it, does not move.
     """
     n, residuals = len(g), batch.residuals
     slope = np.empty(n)
@@ -101,9 +124,14 @@ def _compute_normal_equations(batch: PlanBatch, A: Any, g: Any) -> None:
 
 @jit
 def solve_damped_step(A: Any, g: Any, damping: float, L: Any, d: Any) -> None:
-    """Fill d with the solution of (A + damping diag A) d = -g; zeros where there is none.
+    """Solve (A + damping diag A) d = -g; d is zero where there is no solution.
 
-    A: positive semidefinite; a variable without an effect stays. L: (n, n) to work in.
+    Args:
+        A: Positive semidefinite matrix, shape (n, n); a variable without an effect does not move.
+        g: Gradient, shape (n,).
+        damping: Levenberg-Marquardt's damping.
+        L: Scratch, shape (n, n).
+        d: Step, shape (n,), filled.
     """
     n = len(g)
     d[:] = 0.0
@@ -131,7 +159,7 @@ def solve_damped_step(A: Any, g: Any, damping: float, L: Any, d: Any) -> None:
 
 @jit
 def _fill_perturbations(plan: Any, batch: PlanBatch) -> None:
-    """Fill every column with the plan; a column pokes one variable, the first none."""
+    """Fill every column with the plan; a column perturbs one variable, the first none."""
     for i in range(len(plan)):
         batch.plans[i, :] = plan[i]
         batch.perturbations[i, i + 1] = DIFFERENCE
@@ -161,10 +189,22 @@ def update_plan(
     plan: Any,
     iterations: int,
 ) -> Any:
-    """(J, share, rad of added steering): the cost of the improved plan and its first commands.
+    """Improve a plan by Gauss-Newton iterations.
 
-    plan: (variables,), improved in place: never dearer, as predicted, than it was or than zeros.
-    J is not finite where no plan was; then the plan is as it was.
+    The plan is never costlier, as predicted, than it was or than zeros.
+
+    Args:
+        model: Numbers that all predictions share.
+        start: Start of the prediction.
+        K: Gains of the regulator, shape (m, 9).
+        terminal: T of the terminal cost |T x|^2, shape (4, 9).
+        blocks: Steps of each block, shape (blocks,).
+        plan: Plan, shape (variables,), improved in place.
+        iterations: Number of iterations.
+
+    Returns:
+        Cost J of the improved plan, not finite where no plan's was and the plan is unchanged; its
+        first yaw moment (fraction of full scale) and added steering (rad).
     """
     n = len(plan)
     batch, A, g, J = (

@@ -15,7 +15,17 @@ CAR, _ = make_offsets(Bicycle)
 
 
 class BicyclePlant(NamedTuple):
-    """A and B of tie-vision (8): beta and gamma, from the steering angle and the yaw moment."""
+    """A and B of tie-vision (8): beta and gamma, from the steering angle and the yaw moment.
+
+    Attributes:
+        a11: Effect of beta on beta' (1/s).
+        a12: Effect of gamma on beta'.
+        a21: Effect of beta on gamma' (1/s^2).
+        a22: Effect of gamma on gamma' (1/s).
+        b11: Effect of the steering angle on beta' (1/s).
+        b21: Effect of the steering angle on gamma' (1/s^2).
+        b22: Effect of the yaw moment on gamma' (1/(kg m^2)).
+    """
 
     a11: Any
     a12: Any
@@ -27,13 +37,22 @@ class BicyclePlant(NamedTuple):
 
 
 def make_nominal_car(vehicle: Vehicle) -> Array:
-    """The numbers at `CAR`, (6,)."""
+    """Make the array of the numbers at `CAR`, shape (6,).
+
+    Args:
+        vehicle: Nominal vehicle.
+    """
     return np.array(vehicle.lateral)
 
 
 @jit
 def compute_plant(car: Any, V: Any) -> Any:
-    """The plant at a speed in m/s."""
+    """Compute the bicycle plant at a speed.
+
+    Args:
+        car: Numbers at `CAR`, shape (6,).
+        V: Speed (m/s).
+    """
     a11, a12, a21, a22, b11, b21, b22 = compute_bicycle_coefficients(
         car[CAR.m], car[CAR.I], car[CAR.l_f], car[CAR.l_r], car[CAR.C_f], car[CAR.C_r], V
     )
@@ -46,18 +65,38 @@ compute_plant_python = as_python(compute_plant)
 
 @jit
 def compute_drift(plant: Any, beta: Any, gamma: Any) -> Any:
-    """A [beta, gamma]."""
+    """Compute A [beta, gamma], the rates without inputs (rad/s, rad/s^2).
+
+    Args:
+        plant: `BicyclePlant` at the speed.
+        beta: Sideslip angle (rad).
+        gamma: Yaw rate (rad/s).
+    """
     return plant.a11 * beta + plant.a12 * gamma, plant.a21 * beta + plant.a22 * gamma
 
 
 @jit
 def compute_steady_yaw_rate(plant: Any, beta: Any, delta: Any) -> Any:
-    """The yaw rate at which a sideslip angle stays as it is under a steering angle."""
+    """Compute the yaw rate (rad/s) that keeps a sideslip angle constant.
+
+    Args:
+        plant: `BicyclePlant` at the speed.
+        beta: Sideslip angle (rad).
+        delta: Steering angle (rad).
+    """
     return -(plant.a11 * beta + plant.b11 * delta) / plant.a12
 
 
 @jit
 def solve_inputs(plant: Any, first: Any, second: Any) -> Any:
-    """B^-1 [first, second]: steering angle and yaw moment of this effect, dakf-stability (26)."""
+    """Solve B u = [first, second] for steering angle (rad) and yaw moment (N m).
+
+    Source: dakf-stability (26).
+
+    Args:
+        plant: `BicyclePlant` at the speed.
+        first: Effect on beta' (rad/s).
+        second: Effect on gamma' (rad/s^2).
+    """
     delta_f = first / plant.b11
     return delta_f, (second - plant.b21 * delta_f) / plant.b22

@@ -14,24 +14,35 @@ PLACEMENTS = ("radius", "real")
 
 @dataclass(frozen=True)
 class PI:
-    """Gains of the yaw moment on the slip error: k_p in N m/rad, k_i in N m/(rad s)."""
+    """Gains of the yaw moment on the slip error.
+
+    Attributes:
+        k_p: Proportional gain (N m/rad).
+        k_i: Integral gain (N m/(rad s)).
+    """
 
     k_p: float
     k_i: float
 
 
 def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str = "radius") -> PI:
-    """A PI whose zero lies on the plant's slow pole, with closed-loop poles at `pole` rad/s.
+    """Design a PI whose zero lies on the plant's slow pole, with closed-loop poles at `pole`.
 
     With G = k / ((s + p_1)(s + p_2)), p_1 < p_2, and C = k_p (s + p_1) / s the closed loop is
-    s^2 + p_2 s + k k_p. placement "radius": k k_p = pole^2 puts both poles on the circle of that
-    radius. They have a damping of a half at least, which a slow plant reaches at a smaller
-    radius, and are real where p_2 > 2 pole. placement "real": k k_p = pole (p_2 - pole) puts one
-    of two real poles there (both at p_2 / 2 where pole is beyond p_2). Gains are capped at the full
-    yaw moment for 0.01 rad (near the speed where the yaw moment does not move beta, k is nearly
-    zero).
+    s^2 + p_2 s + k k_p. Gains are capped at the full yaw moment for 0.01 rad: k is nearly zero near
+    the speed where the yaw moment does not move beta.
 
-    Raises ValueError for another placement or pole.
+    Args:
+        vehicle: Vehicle of the design.
+        speed: Speed (m/s).
+        pole: Radius or place of the closed-loop poles (rad/s).
+        placement: "radius": k k_p = pole^2 puts both poles on that circle. Their damping is at
+            least a half, which a slow plant reaches at a smaller radius; they are real where p_2 >
+            2 pole. "real": k k_p = pole (p_2 - pole) puts one of two real poles there, or both at
+            p_2 / 2 where pole is beyond p_2.
+
+    Raises:
+        ValueError: The placement is unknown, or the pole is not positive.
     """
     _check(pole, placement)
     model = make_bicycle_model(vehicle, speed)
@@ -62,12 +73,21 @@ def _limit_gain(vehicle: Vehicle, k_p: float) -> float:
 def sample_pi(
     vehicle: Vehicle, speed: float, period: float, pole: float = POLE, placement: str = "radius"
 ) -> PI:
-    """`design_pi` for a loop sampled every `period` seconds, with the moment held between.
+    """Design the PI of `design_pi` for a sampled loop with the moment held between.
 
     The PI is k_p + k_i T / (z - 1), its zero lies on the plant's slow pole a_1, and the poles of
     (z - a_2)(z - 1) + k_p (b_1 z + b_0) are placed: with ln z = s T, "radius" makes the product of
-    the two s pole^2, "real" puts one s at -pole. It tends to `design_pi` for a short period and
-    raises as that does.
+    the two s pole^2, "real" puts one s at -pole. It tends to `design_pi` for a short period.
+
+    Args:
+        vehicle: Vehicle of the design.
+        speed: Speed (m/s).
+        period: Sampling period T (s).
+        pole: Radius or place of the closed-loop poles (rad/s).
+        placement: "radius" or "real".
+
+    Raises:
+        ValueError: As `design_pi`.
     """
     _check(pole, placement)
     model = make_bicycle_model(vehicle, speed)

@@ -1,8 +1,8 @@
-"""The car as nonlinear predictive control foresees it: the plant's own text, many plans at once.
+"""Predictions of nonlinear predictive control: the plant's own source, many plans at once.
 
-A plan is what is added to the linear regulator's answer, constant in blocks of steps; the sum is
-limited as the plant limits it. So the plan of zeros is the regulator itself, and where nothing is
-limited or bent it is the best one. As many plans as a SIMD value has lanes are rolled out at once.
+A plan is added to the linear regulator's action, constant in blocks of steps. The sum is limited
+as the plant limits it. So the plan of zeros is the regulator itself, which is optimal where the
+car is linear and no limit is met. As many plans as a SIMD value has lanes are simulated at once.
 """
 
 import math
@@ -31,7 +31,19 @@ N_TERMINAL = 4  # residuals behind the last step
 
 
 class PredictionState(NamedTuple):
-    """A prediction's state between steps."""
+    """A prediction's state between steps.
+
+    Attributes:
+        motion: Motion of the car.
+        T_l: Torque of the left motor (N m).
+        T_r: Torque of the right motor (N m).
+        delta_f: Applied steering angle (rad).
+        slewing: Added steering that was last commanded (rad).
+        beta_ref: Reference of the sideslip angle (rad).
+        gamma_ref: Reference of the yaw rate (rad/s).
+        F_d: Disturbance force (N).
+        N_d: Disturbance moment (N m).
+    """
 
     motion: Any
     T_l: Any
@@ -46,13 +58,24 @@ class PredictionState(NamedTuple):
 
 @inline
 def clip_symmetric(value: Any, limit: Any) -> Any:
-    """The value within +-most."""
+    """Clip a value to +-limit.
+
+    Args:
+        value: Value to clip.
+        limit: Limit, in the same unit.
+    """
     return minimum(maximum(value, 0.0 - limit), limit)
 
 
 @inline
 def detect_limit(value: Any, low: Any, high: Any) -> Any:
-    """1 or -1 where the value is at the upper or the lower limit, else 0."""
+    """Detect a limit: 1 or -1 where the value is at the upper or the lower one, else 0.
+
+    Args:
+        value: Value to test.
+        low: Lower limit.
+        high: Upper limit.
+    """
     close = 1e-9 * (high - low)
     return select(value >= high - close, 1.0, select(value <= low + close, -1.0, 0.0))
 
@@ -61,7 +84,16 @@ def detect_limit(value: Any, low: Any, high: Any) -> Any:
 def multiply_row(
     M: Any, row: int, model: PredictionModel, driver: Any, state: PredictionState, beta: Any
 ) -> Any:
-    """A row of M (rows, 9) times the states of the design model with forces."""
+    """Multiply a row of a matrix by the states of the design model with forces.
+
+    Args:
+        M: Matrix, shape (rows, 9).
+        row: Index of the row.
+        model: Numbers that all predictions share.
+        driver: Driver's steering angle (rad).
+        state: State of the prediction.
+        beta: Sideslip angle (rad).
+    """
     share = 0.5 * model.car.d_r / model.car.r / model.full_scale * (state.T_r - state.T_l)
     lateral = M[row, 0] * beta + M[row, 1] * state.motion.gamma + M[row, 2] * share
     held = M[row, 3] * state.delta_f + M[row, 4] * driver + M[row, 5] * state.beta_ref
@@ -79,10 +111,19 @@ def compute_commands(
     added: Any,
     turn: Any,
 ) -> Any:
-    """(share of full scale, rad of added steering, which of both are at a limit): the regulator's
-    answer and a plan's part.
+    """Compute the commands of the regulator and a plan, within the limits.
 
-    Where nothing steers K has one row, and there is no turn. At a limit: 1 or -1.
+    Args:
+        model: Numbers that all predictions share.
+        start: Start of the prediction.
+        K: Gains of the regulator, shape (m, 9); one row where the car does not steer.
+        state: State of the prediction.
+        beta: Sideslip angle (rad).
+        added: Plan's yaw moment as a fraction of full scale.
+        turn: Plan's steering as a fraction of the authority, where the car steers.
+
+    Returns:
+        Yaw moment (fraction of full scale), added steering (rad), and for each 1 or -1 at a limit.
     """
     max_moment = start.max_moment
     share = (
@@ -113,9 +154,19 @@ def predict_step(
     share_beyond: Any,
     steer_beyond: Any,
 ) -> Any:
-    """(the state after a step, the effort's four residuals) for commands held over it.
+    """Predict one step with held commands.
 
-    share_beyond, steer_beyond: of share and wheel, beyond every limit of theirs.
+    Args:
+        model: Numbers that all predictions share.
+        start: Start of the prediction.
+        state: State before the step.
+        share: Yaw moment as a fraction of full scale.
+        wheel: Added steering (rad).
+        share_beyond: Further yaw moment that no limit applies to.
+        steer_beyond: Further steering (rad) that no limit applies to.
+
+    Returns:
+        State after the step, and the effort's four residuals.
     """
     kind, motor, steering, h = model.kind, model.motor, model.steering, model.step
     car, driver = start.car, start.driver
@@ -181,15 +232,24 @@ def simulate_plans(
     limits: Any,
     first: Any,
 ) -> None:
-    """Roll out plans (variables, lanes): fill their residuals and their first commands.
+    """Simulate plans: fill their residuals and their first commands.
 
-    perturbations: (variables, lanes), which change the commands beyond their limits, for slopes
-    that a limit does not hide. limits: (variables, lanes), filled with whether a block starts at
-    one.
+    The variables of a plan are, for every block, the fraction of the yaw moment and, where the car
+    steers, that of the authority.
 
-    blocks: steps of each. Variables: of every block the share of the yaw moment and, where the car
-    steers, that of the authority. residuals: (RESIDUALS steps + TERMINAL, lanes), whose squares
-    sum to J but for its cap. first: (2, lanes).
+    Args:
+        model: Numbers that all predictions share.
+        start: Start of the prediction.
+        K: Gains of the regulator, shape (m, 9).
+        terminal: T of the terminal cost |T x|^2, shape (4, 9).
+        blocks: Steps of each block, shape (blocks,).
+        plans: Plans, shape (variables, lanes).
+        perturbations: Changes of the commands beyond their limits, shape (variables, lanes), for
+            gradients that a limit does not hide.
+        residuals: Residuals, shape (N_RESIDUALS steps + N_TERMINAL, lanes), filled; their squares
+            sum to J without its cap.
+        limits: 1 or -1 where a block starts at a limit, shape (variables, lanes), filled.
+        first: First commands, shape (2, lanes), filled.
     """
     zero, m, start_motion = 0.0 * load_element(plans, 0), len(K), start.motion
     motion = Motion(

@@ -1,4 +1,4 @@
-"""What nonlinear predictive control knows of the car, and where a prediction starts."""
+"""The model of the car in nonlinear predictive control, and the start of a prediction."""
 
 import math
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from ...envs.vehicle.vehicle import Vehicle
 
 
 class PredictionModel(NamedTuple):
-    """What all predictions share: numbers alone."""
+    """The numbers that all predictions share."""
 
     car: CarParams  # the nominal one
     road: RoadParams  # straight and flat
@@ -42,7 +42,22 @@ class PredictionModel(NamedTuple):
 
 
 class PredictionStart(NamedTuple):
-    """Where a prediction starts."""
+    """The state and the held quantities at the start of a prediction.
+
+    Attributes:
+        car: `CarParams` of the car.
+        motion: Motion of the car.
+        T_l: Torque of the left motor (N m).
+        T_r: Torque of the right motor (N m).
+        delta_f: Applied steering angle (rad).
+        slewing: Added steering that was last commanded (rad).
+        driver: Driver's steering angle, held (rad).
+        a_x: Acceleration, held (m/s^2).
+        refs: beta_ref (rad) and gamma_ref (rad/s) now.
+        steady: Values that a lagged reference approaches.
+        push: Disturbance forces.
+        max_moment: Largest yaw moment as a fraction of full scale.
+    """
 
     car: Any
     motion: Any
@@ -59,7 +74,12 @@ class PredictionStart(NamedTuple):
 
 
 def compute_lag_moments(time_constant: float, ticks: int) -> tuple[float, float]:
-    """Mean and standard deviation over a step's ticks of what is left of a deviation."""
+    """Compute mean and standard deviation, over a step's ticks, of a deviation's rest.
+
+    Args:
+        time_constant: Time constant of the lag (s).
+        ticks: Ticks of the step.
+    """
     tick = make_lag(time_constant, TICK)
     left = tick.mean * tick.end ** np.arange(ticks)
     return float(left.mean()), float(left.std())
@@ -77,7 +97,20 @@ def make_prediction_model(
     authority: float,
     yaw_first: bool,
 ) -> PredictionModel:
-    """The model of a car in steps of some ticks; the cost is that of `sampled_model`."""
+    """Make the model of a car in steps of some ticks, with the cost of `sampled_model`.
+
+    Args:
+        vehicle: Vehicle of the predictions.
+        kind: Variant of the plant.
+        ticks: Ticks of a step.
+        lags: Whether the actuators lag.
+        disturbance_time: Time in which disturbances decay (s).
+        ref_rest: Fraction of a lagged reference's deviation that a tick leaves.
+        steer_weight: Factor on the cost of added steering.
+        full_scale: Yaw moment at an action of 1 (N m).
+        authority: Added steering at an action of 1 (rad).
+        yaw_first: Whether the yaw moment comes before the drive torque.
+    """
     step = ticks * TICK
     motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
     return PredictionModel(
@@ -104,13 +137,25 @@ def make_prediction_model(
 
 
 def make_blocks(steps: int, count: int) -> Array:
-    """Lengths of at most `count` blocks of a horizon of so many steps, growing to its end."""
+    """Make lengths of at most `count` blocks that grow towards the end of a horizon.
+
+    Args:
+        steps: Steps of the horizon.
+        count: Maximum of blocks.
+    """
     ends = np.unique(np.rint(np.geomspace(1.0, steps, count)).astype(np.int64))
     return np.diff(ends, prepend=0)
 
 
 @jit
 def replace_tyres(car: Any, C_f: Any, C_r: Any, mu: Any) -> Any:
-    """The car with other stiffnesses and another friction."""
+    """Replace stiffnesses and friction of a car.
+
+    Args:
+        car: `CarParams` of the car.
+        C_f: Front cornering stiffness of a tyre (N/rad).
+        C_r: Rear cornering stiffness of a tyre (N/rad).
+        mu: Friction of the road, at both axles.
+    """
     tyres, road, other = (C_f, C_r), (mu,), (mu,)
     return CarParams(*(car[:4] + tyres + car[6:10] + road + car[11:19] + other + car[20:]))

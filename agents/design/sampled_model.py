@@ -39,9 +39,14 @@ them, or d_1 and d_2 in rad/s and rad/s2, which stay: dakf-stability (8)-(9), (1
 class DesignSpec:
     """The parameters of a design, but for the car and its speed.
 
-    period: ticks. full_scale: N m of the first input. steers: whether steering is the second.
-    kind: of `REFERENCES` by number. disturbances: of `DISTURBANCES`.
-    disturbance_time: s, in which forces decay. steer_weight: of added steering, times the cost's.
+    Attributes:
+        period: Control period in ticks.
+        full_scale: Yaw moment at a first input of 1 (N m).
+        steers: Whether steering is the second input.
+        kind: Index in `REFERENCES`.
+        disturbances: Key of `DISTURBANCES`.
+        disturbance_time: Time in which forces decay (s).
+        steer_weight: Factor on the cost of added steering.
     """
 
     period: int
@@ -59,16 +64,23 @@ class DesignSpec:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs: share of the yaw moment, and rad added to the driver's steering."""
+        """Names of the inputs: fraction of the yaw moment, and added steering (rad)."""
         return ("N_z", "delta_f") if self.steers else ("N_z",)
 
 
 @dataclass(frozen=True)
 class DesignModel:
-    """x+ = G x + H u over a period, costing x'Qx + u'Ru + 2 x'Nu in units of J.
+    """The model x+ = G x + H u over a period, with the cost x'Qx + u'Ru + 2 x'Nu in units of J.
 
-    G (n, n), H (n, m), Q (n, n), R (m, m), N (n, m), states and inputs as the purpose names them.
-    The first len(DYNAMIC) states are moved by the inputs, the others by themselves alone.
+    The inputs move the first len(DYNAMIC) states; the others move by themselves alone.
+
+    Attributes:
+        G: Transition of the states, shape (n, n).
+        H: Effect of the inputs, shape (n, m).
+        Q: Weight of the states, shape (n, n).
+        R: Weight of the inputs, shape (m, m).
+        N: Cross weight, shape (n, m).
+        design_spec: Parameters that name states and inputs.
     """
 
     G: Array
@@ -80,7 +92,16 @@ class DesignModel:
 
 
 def make_design_model(vehicle: Vehicle, speed: float, design_spec: DesignSpec) -> DesignModel:
-    """The model of a vehicle at a speed in m/s; ValueError unless that is positive."""
+    """Make the model of a vehicle at a speed.
+
+    Args:
+        vehicle: Vehicle of the design.
+        speed: Speed (m/s).
+        design_spec: Parameters of the design.
+
+    Raises:
+        ValueError: The speed is not positive.
+    """
     G1, H1, C, D = make_tick_model(vehicle, speed, design_spec)
     n, m = H1.shape
     W = TICK * np.diag(compute_cost_weights(design_spec))
@@ -100,10 +121,18 @@ def make_design_model(vehicle: Vehicle, speed: float, design_spec: DesignSpec) -
 def make_tick_model(
     vehicle: Vehicle, speed: float, design_spec: DesignSpec
 ) -> tuple[Array, Array, Array, Array]:
-    """(G, H) of a tick, and (C, D) from state and input at its start to what the cost judges.
+    """Make the model of one tick, and its outputs that the cost judges.
 
-    Judged at the tick's end: e_beta, e_gamma, and the means over the tick of the delivered share
-    of the yaw moment and of the added steering, which is the applied less the driver's.
+    The outputs at the tick's end are e_beta, e_gamma, and the means over the tick of the delivered
+    fraction of the yaw moment and of the added steering (the applied less the driver's).
+
+    Args:
+        vehicle: Vehicle of the design.
+        speed: Speed (m/s).
+        design_spec: Parameters of the design.
+
+    Returns:
+        G (n, n) and H (n, m) of a tick; C (4, n) and D (4, m), from its start to the outputs.
     """
     lags = [make_lag(tau, TICK) for tau in (vehicle.motor_lag, vehicle.steering_lag)]
     plane, push = _discretise_plane(vehicle, speed, design_spec)
@@ -132,8 +161,11 @@ def make_tick_model(
 def _discretise_plane(
     vehicle: Vehicle, speed: float, design_spec: DesignSpec
 ) -> tuple[Array, Array]:
-    """beta and gamma after a tick: (2, 6) from themselves, both actuators and both commands, and
-    (2, 2) from the disturbances. An actuator without lag is its command."""
+    """Discretise beta and gamma over a tick.
+
+    Returns (2, 6), from themselves, both actuators and both commands, and (2, 2) from the
+    disturbances. An actuator without lag is its command.
+    """
     model = make_bicycle_model(vehicle, speed)
     scale = np.array([design_spec.full_scale, 1.0])
     B = model.B[:, ::-1] * scale  # columns N_z, delta_f, as the inputs stand
@@ -153,7 +185,11 @@ def _discretise_plane(
 
 
 def compute_cost_weights(design_spec: DesignSpec) -> Sequence[float]:
-    """The weights of the four that the cost judges: docs/ARCHITECTURE.md, "Cost and score"."""
+    """Compute the weights of the four outputs of the cost: docs/ARCHITECTURE.md, "Cost and score".
+
+    Args:
+        design_spec: Parameters of the design.
+    """
     return (
         1.0 / BETA_SCALE**2,
         0.0 if design_spec.kind == ZERO_SLIP else 1.0 / GAMMA_SCALE**2,
@@ -163,29 +199,60 @@ def compute_cost_weights(design_spec: DesignSpec) -> Sequence[float]:
 
 
 def compute_regulator(model: DesignModel) -> tuple[Array, Array]:
-    """K (m, n) of u = -K x, which minimises the sum of the model's cost, and S (m, m): another
-    input for one period costs (u + K x)'S(u + K x) more. See `compute_cost_to_go`."""
+    """Compute the regulator u = -K x of least cost, and the cost of another input.
+
+    Another input for one period costs (u + K x)'S(u + K x) more. See `compute_cost_to_go`.
+
+    Args:
+        model: Design model.
+
+    Returns:
+        K (m, n) and S (m, m).
+    """
     K, V = compute_cost_to_go(model)
     return K, compute_input_cost(model, V)
 
 
 def compute_input_cost(model: DesignModel, V: Array) -> Array:
-    """S (m, m) of `compute_regulator`, for the cost to go V."""
+    """Compute S (m, m) of `compute_regulator`.
+
+    Args:
+        model: Design model.
+        V: Cost to go, shape (n, n).
+    """
     return model.R + model.H.T @ V @ model.H
 
 
 def compute_cost_to_go(model: DesignModel) -> tuple[Array, Array]:
-    """K (m, n) of u = -K x, which minimises the sum of the model's cost, and V (n, n): what is
-    to come costs x'Vx, but for a part that no input changes. See `solve_lqr`.
+    """Compute the regulator u = -K x of least cost, and its cost to go x'Vx.
+
+    The cost to go lacks a part that no input changes. See `solve_lqr`.
+
+    Args:
+        model: Design model.
+
+    Returns:
+        K (m, n) and V (n, n).
     """
     return solve_lqr(model.G, model.H, model.Q, model.R, model.N, len(DYNAMIC))
 
 
 def solve_lqr(G: Array, H: Array, Q: Array, R: Array, N: Array, moved: int) -> tuple[Array, Array]:
-    """`compute_cost_to_go` of any model whose inputs move its first `moved` states alone.
+    """Solve the regulator of a model whose inputs move its first `moved` states alone.
 
-    These have the gains of `control.dlqr`; to the others, which move by themselves and need not
-    decay, the optimal answer follows from a linear equation for their part of the cost to go.
+    These have the gains of `control.dlqr`. The others move by themselves and need not decay; their
+    optimal gains follow from a linear equation for their part of the cost to go.
+
+    Args:
+        G: Transition of the states, shape (n, n).
+        H: Effect of the inputs, shape (n, m).
+        Q: Weight of the states, shape (n, n).
+        R: Weight of the inputs, shape (m, m).
+        N: Cross weight, shape (n, m).
+        moved: Number of the states that inputs move.
+
+    Returns:
+        K (m, n) and V (n, n), as for `compute_cost_to_go`.
     """
     from scipy.linalg import solve, solve_discrete_are
 

@@ -16,17 +16,28 @@ JsonMap = dict[str, Any]
 
 @dataclass(frozen=True)
 class Card:
-    """What stands beside the weights; JSON types only.
+    """The card of a policy: what it was trained on, how, and its evaluation; JSON types only.
 
-    env_id, env_options: of `gym.make`. estimator, estimator_options: of `EstimateObservation`
-    around it, "" for none. observation: (name, unit) of each entry that the network takes.
-    control_period: ticks. reference: of `envs.task.reference.REFERENCES`, by which it was judged.
-    algorithm, algorithm_options: how it was trained. command: the line that made it. seeds: by
-    purpose ("training", ...). steps: of the environment. cpu_seconds: of the training. sideslip:
-    the version. evaluation: of `benchmarks.policies.evaluation`: seeds, and mean costs of the
-    policy, of none and of the best classical line on them.
+    Attributes:
+        env_id: Id of the env.
+        observation: (name, unit) of each entry that the network takes.
+        control_period: Ticks between two decisions.
+        reference: Name in `envs.task.reference.REFERENCES`, by which the policy was judged.
+        env_options: Arguments of `gym.make`.
+        estimator: Estimator of `EstimateObservation` around the env, "" for none.
+        estimator_options: Other arguments of `EstimateObservation`.
+        algorithm: Name of the training's algorithm.
+        algorithm_options: Options of the training.
+        command: Command line of the training.
+        seeds: Seeds by purpose ("training", ...).
+        steps: Steps of the environment.
+        cpu_seconds: CPU time of the training (s).
+        sideslip: Version of the package.
+        evaluation: Result of `benchmarks.policies.evaluation`: seeds, and mean costs on them of the
+            policy, of no control and of the best classical line.
 
-    Raises ValueError for a value of another type, or one that JSON has not.
+    Raises:
+        ValueError: A value has another type, or one that JSON does not have.
     """
 
     env_id: str
@@ -65,7 +76,15 @@ class Card:
         estimator_options: Mapping[str, Any] | None = None,
         **rest: Any,
     ) -> "Card":
-        """A card with the observation of this env and estimator; rest: the other fields."""
+        """Make a card with the observation of an env and its estimator.
+
+        Args:
+            env_id: Id of the env.
+            env_options: Arguments of `gym.make`.
+            estimator: Estimator around the env, "" for none.
+            estimator_options: Other arguments of `EstimateObservation`.
+            rest: Other fields of the card.
+        """
         options: JsonMap = {
             "env_id": env_id,
             "env_options": dict(env_options or {}),
@@ -81,8 +100,12 @@ class Card:
 
     @classmethod
     def from_env(cls, env: AnyEnv, **rest: Any) -> "Card":
-        """A card with the observation, control period and reference of an env, single or vector;
-        rest: the other fields."""
+        """Make a card with the observation, control period and reference of an env.
+
+        Args:
+            env: Env, single or vector.
+            rest: Other fields of the card.
+        """
         facts = get_env_facts(env)
         entries = tuple((entry.name, entry.unit) for entry in facts.layout)
         return cls(
@@ -93,7 +116,14 @@ class Card:
         )
 
     def to_json(self, **extra: Any) -> str:
-        """The card as a JSON object, with further fields."""
+        """Convert the card to a JSON object.
+
+        Args:
+            extra: Further fields.
+
+        Raises:
+            ValueError: The card or a field has a value that JSON does not have.
+        """
         try:
             return json.dumps(asdict(self) | extra, allow_nan=False)
         except (TypeError, ValueError) as error:
@@ -101,7 +131,16 @@ class Card:
 
 
 def check_names_no_code(env_id: str, estimator: str, estimator_options: JsonMap) -> None:
-    """ValueError where a file from elsewhere names code to be imported instead of what is there."""
+    """Check that a foreign file names no code to import.
+
+    Args:
+        env_id: Id of a registered env.
+        estimator: Name of an estimator, or "".
+        estimator_options: Arguments of `EstimateObservation`, without an estimator.
+
+    Raises:
+        ValueError: The id or the estimator is an entry point or a file.
+    """
     if "estimator" in estimator_options:
         raise ValueError("estimator_options holds an estimator, which is none of its options")
     if ":" in env_id:

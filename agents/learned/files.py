@@ -36,7 +36,13 @@ FOLDER = Path(__file__).resolve().with_name("policies")
 
 @dataclass(frozen=True)
 class Policy:
-    """A network and its card; name: of the file, without its ending."""
+    """A network and its card.
+
+    Attributes:
+        name: Name of the file without its ending.
+        network: Network that computes the action.
+        card: Card of its training.
+    """
 
     name: str
     network: Network
@@ -44,12 +50,12 @@ class Policy:
 
     @property
     def reads(self) -> npt.NDArray[np.bool_]:
-        """(inputs,) the entries of the card's observation that the network reads."""
+        """Whether the network reads each entry of the card's observation, shape (inputs,)."""
         return self.network.reads
 
     @property
     def salt(self) -> str:
-        """A hash of the network, from which its test seeds are made (hexadecimal)."""
+        """Hexadecimal hash of the network, from which its test seeds are made."""
         digest = hashlib.sha256()
         for name, values in collect_tensors(self.network).items():
             digest.update(name.encode() + values.tobytes())
@@ -57,27 +63,41 @@ class Policy:
 
 
 def list_shipped() -> list[str]:
-    """The names of the policies that come with the package."""
+    """List the names of the policies that come with the package."""
     return sorted(path.stem for path in FOLDER.glob(f"*{SUFFIX}"))
 
 
 def is_policy(name: str) -> bool:
-    """Whether `load_policy` would look for this: a shipped name, or a path by its ending."""
+    """Return whether a name is a shipped policy's, or a path with a policy's ending.
+
+    Args:
+        name: Name or path.
+    """
     return name.endswith(SUFFIX) or name in list_shipped()
 
 
 def hash_policy(name: str) -> str:
-    """A hash of a policy's file, "" for a name that is no policy's."""
+    """Compute the hash of a policy's file, "" for a name that is no policy's.
+
+    Args:
+        name: Shipped name or path.
+    """
     path = FOLDER / f"{name}{SUFFIX}" if name in list_shipped() else Path(name)
     exists = is_policy(name) and path.is_file()
     return hashlib.sha256(path.read_bytes()).hexdigest() if exists else ""
 
 
 def save_policy(path: str | Path, network: Network, card: Card) -> None:
-    """Write the whole file or none; a save that is stopped leaves an older file as it was.
+    """Write a policy's file; a save that is stopped leaves an older file unchanged.
 
-    path: ends in `.safetensors`. Raises ValueError for another ending, or a card whose observation
-    is not as wide as the network's input.
+    Args:
+        path: Path that ends in `.safetensors`.
+        network: Network to write.
+        card: Card of its training.
+
+    Raises:
+        ValueError: The ending is another, or the card's observation has another width than the
+            network's input.
     """
     target = Path(path)
     if target.suffix != SUFFIX:
@@ -92,11 +112,15 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
 
 
 def load_policy(path: str | Path) -> Policy:
-    """A policy from its file, or a shipped one by its name.
+    """Load a policy from its file, or a shipped one by its name.
 
-    Raises FileNotFoundError where there is none, ValueError for a file that is no policy, is cut
-    short, is larger than `MAX_BYTES`, has another format, or whose card and tensors do not fit
-    together.
+    Args:
+        path: Path or shipped name.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is no policy, is cut short, is larger than `MAX_BYTES` or has another
+            format, or its card and tensors do not fit together.
     """
     file = _find_file(path)
     tensors, metadata = read_tensors(file, "policy")

@@ -12,16 +12,19 @@ DEFAULT = "ppo-yaw-vision"
 class PolicyController(Controller):
     """The deterministic action of a policy's network, clipped to [-1, 1].
 
-    What the network remembers of an episode (frames, cells) is in the state of `predict`.
-    It reads the entries of its training by name, so a wider observation serves as well; what never
-    varied in training is not read. Where the env steers and the policy does not, the steering is
-    left alone. Single and batch agree to rounding in double precision, before the action becomes
-    single precision (`Network`).
+    The network's memory of an episode (frames, cells) is in the state of `predict`. It reads the
+    entries of its training by name, so a wider observation serves as well. Entries that never
+    varied in training are not read. Where the env steers and the policy does not, the added
+    steering is zero. Single and batch agree to rounding in double precision, before the action
+    becomes single precision (`Network`).
 
-    policy: a shipped name, a file's path, or a `Policy`.
+    Args:
+        env: Env of the controller.
+        policy: Shipped name, file's path, or `Policy`.
 
-    Raises ValueError for an env without an entry that the policy reads or with another unit of it,
-    with another control period, or whose action is narrower; and what `load_policy` raises.
+    Raises:
+        ValueError: The env lacks an entry that the policy reads or has another unit of it, has
+            another control period, or its action is narrower; or as `load_policy`.
     """
 
     def __init__(self, env: AnyEnv, policy: str | Path | Policy = DEFAULT) -> None:

@@ -1,10 +1,10 @@
-"""From datagrams to ticks: fast rows and packets as estimators take them, whatever came.
+"""From datagrams to ticks: fast rows and packets as estimators take them, in any order of arrival.
 
 Time is that of the inertial stamps, so that two clocks may drift apart. A fast row ends its tick;
-packets of slow sensors go with the next row. They were captured their age before their stamp, or
-before that row where the stamp is 0: their sender has another clock. What is lost or late is
-counted and bridged by the last row, held. The same batches give the same ticks, which is how a
-session is replayed.
+packets of slow sensors belong to the next row. They were captured their age before their stamp,
+or before that row where the stamp is 0: their sender has another clock. Lost and late datagrams
+are counted and bridged by the last row, held. Equal batches give equal ticks, so that a session
+can be replayed.
 """
 
 from collections import Counter
@@ -28,12 +28,18 @@ MAX_WAITING = 64  # packets of slow sensors before a fast row
 _INPUTS = (DatagramKind.INERTIAL, DatagramKind.END, *SENSORS)
 NO_PACKETS = np.zeros((0, PACKET_WIDTH))
 BRIDGED = ("lost", "restarted", "held", "late", "begun anew", "dropped")
-"""What is counted beside `RejectReason`: sequence numbers that never came, senders that began anew,
-ticks without a row, rows behind their tick, gaps too long to be bridged, packets without a row."""
+"""Counts beside `RejectReason`: sequence numbers that never came, senders that restarted, ticks
+without a row, rows behind their tick, gaps too long to be bridged, packets without a row."""
 
 
 class Arrival(NamedTuple):
-    """A datagram, when it came in ns of the monotonic clock, and from where."""
+    """A datagram and its arrival.
+
+    Attributes:
+        at: Time of the monotonic clock (ns).
+        data: Bytes of the datagram.
+        sender: Address of its sender.
+    """
 
     at: int
     data: bytes
@@ -41,7 +47,7 @@ class Arrival(NamedTuple):
 
 
 class Tick(NamedTuple):
-    """What the wires carried at a tick."""
+    """The data of one tick."""
 
     number: int
     row: Array  # (FAST_WIDTH,)
@@ -51,12 +57,18 @@ class Tick(NamedTuple):
 
 
 class StreamSynchroniser:
-    """Makes ticks of datagrams.
+    """Makes ticks from datagrams.
 
-    patience: calls of `take` without a fast row, from which on the last one is held; None: for
-    ever. `counts`: of what was ignored, by `RejectReason` and `BRIDGED`. `sender`: of the newest
-    row. `accepted`: datagrams of the newest batch. `over`: whether the drive's end came. `silent`:
-    calls since the last fast row.
+    Args:
+        patience: Calls of `take` without a fast row after which the last one is held; None: no
+            limit.
+
+    Attributes:
+        counts: Counts of ignored datagrams, by `RejectReason` and `BRIDGED`.
+        sender: Sender of the newest row.
+        accepted: Datagrams of the newest batch.
+        over: Whether the drive's end came.
+        silent: Calls since the last fast row.
     """
 
     def __init__(self, patience: int | None = PATIENCE) -> None:
@@ -71,7 +83,11 @@ class StreamSynchroniser:
         self._behind = 0
 
     def take(self, batch: Sequence[Arrival]) -> Iterator[Tick]:
-        """The ticks that a batch of datagrams completes; to be called once a period."""
+        """Take a batch of datagrams and yield the ticks that it completes; called once a period.
+
+        Args:
+            batch: Datagrams in the order of their arrival.
+        """
         before, self.silent = self.silent, self.silent + 1
         self.accepted.clear()
         for arrival in batch:
@@ -99,7 +115,7 @@ class StreamSynchroniser:
                 yield self._finish_tick(last)
 
     def _check_order(self, message: Message) -> bool:
-        """Whether this is the newest of its kind; else it is counted."""
+        """Return whether a message is the newest of its kind; count it otherwise."""
         newest = self._newest.get(message.kind)
         if newest is not None:
             advance = (message.sequence - newest) & 0xFFFFFFFF
@@ -116,7 +132,7 @@ class StreamSynchroniser:
         return True
 
     def _process_row(self, message: Message) -> Iterator[Tick]:
-        """The tick of a fast row, after those that are missing before it."""
+        """Yield the tick of a fast row, after those that are missing before it."""
         row, number, last = message.values, round(message.stamp / TICK_US), self._last
         begins = last is None
         if last is not None:
@@ -138,7 +154,7 @@ class StreamSynchroniser:
         yield self._finish_tick(Tick(number, fast, row[-1], NO_PACKETS, begins))
 
     def _finish_tick(self, tick: Tick) -> Tick:
-        """The tick with the packets that wait for one."""
+        """Add the waiting packets to a tick."""
         packets = NO_PACKETS
         if self._waiting:
             packets = np.zeros((len(self._waiting), PACKET_WIDTH))
@@ -155,7 +171,7 @@ class StreamSynchroniser:
         return self._last
 
     def _remove_oldest(self, limit: int) -> None:
-        """The oldest packets go where no row takes them."""
+        """Remove the oldest packets where no row takes them."""
         while len(self._waiting) > limit:
             self.counts["dropped"] += 1
             del self._waiting[0]

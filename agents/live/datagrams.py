@@ -33,7 +33,7 @@ TICK_US = 1000  # us a tick
 
 
 class DatagramKind(IntEnum):
-    """What a datagram holds."""
+    """The kinds of datagrams."""
 
     INERTIAL = 1  # a fast row: the tick is complete with it
     CAMERA = 2
@@ -45,7 +45,7 @@ class DatagramKind(IntEnum):
 
 
 class RejectReason(StrEnum):
-    """Why a datagram is ignored; every one is counted."""
+    """The reasons to ignore a datagram; each is counted."""
 
     FOREIGN = "foreign"  # shorter than a header, or without the magic
     VERSION = "version"
@@ -59,7 +59,7 @@ class RejectReason(StrEnum):
 
 
 class LoopStatus(NamedTuple):
-    """What a loop has counted, as the doubles of a datagram; latencies and jitter in us."""
+    """The counts of a loop, as the doubles of a datagram; latencies and jitter in us."""
 
     ticks: float = 0.0
     misses: float = 0.0
@@ -88,7 +88,7 @@ FIELDS: dict[int, tuple[str, ...]] = {
 
 
 class Message(NamedTuple):
-    """What a sound datagram holds."""
+    """The content of a valid datagram."""
 
     kind: int
     sequence: int
@@ -100,14 +100,29 @@ class Message(NamedTuple):
 def encode(
     kind: int, sequence: int, stamp: int, values: Sequence[float], names: Sequence[str] = ()
 ) -> bytes:
-    """The datagram of a message; sequence: is taken modulo 2^32. stamp: us."""
+    """Encode a message.
+
+    Args:
+        kind: Kind of the datagram.
+        sequence: Sequence number, taken modulo 2^32.
+        stamp: Time stamp (us).
+        values: Values of `FIELDS`, in SI units.
+        names: Names of states, for estimates.
+    """
     count = len(values)
     head = HEADER.pack(MAGIC, VERSION, kind, count, sequence & 0xFFFFFFFF, stamp)
     return head + struct.pack(f"!{count}d", *values) + ",".join(names).encode()
 
 
 def decode(data: bytes) -> Message | RejectReason:
-    """The message of a datagram, or why there is none."""
+    """Decode a datagram; it raises nothing.
+
+    Args:
+        data: Bytes of the datagram.
+
+    Returns:
+        Message, or the reason to ignore it.
+    """
     if len(data) > MAX_BYTES:
         return RejectReason.OVERSIZED
     if len(data) < HEADER.size or data[:4] != MAGIC:

@@ -1,4 +1,4 @@
-"""The loop: a tick every millisecond of the monotonic clock, and what it missed."""
+"""The loop: a tick every millisecond of the monotonic clock, and its missed deadlines."""
 
 import gc
 import math
@@ -26,20 +26,28 @@ _TOP = 100_000  # us
 
 
 class Histogram:
-    """Times in us of any number of ticks, counted by whole ones; the newest and the largest."""
+    """Histogram of times in us, by whole ones; `newest` and `largest` are kept exactly."""
 
     def __init__(self) -> None:
         self.counts, self.number = [0] * (_TOP + 1), 0
         self.newest = self.largest = 0.0
 
     def add(self, us: float) -> None:
-        """Count a time."""
+        """Count a time.
+
+        Args:
+            us: Time (us).
+        """
         self.counts[min(max(int(us), 0), _TOP)] += 1
         self.number += 1
         self.newest, self.largest = us, max(self.largest, us)
 
     def quantile(self, share: float) -> float:
-        """The time that a share of all do not exceed, to 1 us; NaN of none."""
+        """Compute a quantile to 1 us (us); NaN without times.
+
+        Args:
+            share: Fraction of the times that do not exceed it.
+        """
         left = math.ceil(share * self.number)
         for us, count in enumerate(self.counts):
             left -= count
@@ -48,7 +56,7 @@ class Histogram:
         return math.nan
 
     def summarise(self) -> dict[str, float]:
-        """Median, 99.9 % and the largest."""
+        """Compute median, 99.9 % quantile and maximum (us)."""
         if not self.number:
             return {}
         return {"median": self.quantile(0.5), "p999": self.quantile(0.999), "max": self.largest}
@@ -60,12 +68,18 @@ TIMES = ("jitter", "latency", "work")
 
 @dataclass
 class Statistics:
-    """What a loop measured. Times in us.
+    """The measurements of a loop.
 
-    jitter: from a deadline to waking up. latency: from a batch's oldest datagram to the estimates
-    sent. work: of a tick. deadlines: all that were due; misses: those that passed before the one
-    before was done with, which nothing woke for.
-    suspensions: of more than a second. ticks: of the estimator. seconds: that it ran.
+    Attributes:
+        jitter: Times from a deadline to waking up (us).
+        latency: Times from a batch's oldest datagram to the estimates sent (us).
+        work: Times of a tick's work (us).
+        deadlines: Number of deadlines that were due.
+        misses: Deadlines that passed during the work of an earlier one.
+        suspensions: Number of misses of more than a second.
+        ticks: Ticks of the estimator.
+        actions: Number of controls sent.
+        seconds: Duration of the run (s).
     """
 
     jitter: Histogram = field(default_factory=Histogram)
@@ -90,12 +104,20 @@ def _format_counts(counts: Mapping[str, int]) -> str:
 
 @dataclass
 class Loop:
-    """An Onboard on a port.
+    """An on-board controller on a port.
 
-    targets: addresses that get every estimate; viewer: one that gets every tenth and the status.
-    step: in the time of the stamps instead of that of the clock: whatever comes is computed at
-    once. recorder: writes the session. watch: is called after each tick. patience: s without a
-    fast row, after which `run` ends, with TimeoutError if there was none at all. `ended`: why.
+    Attributes:
+        onboard: Estimator and agent.
+        assembler: Synchroniser of the datagrams.
+        port: Port that receives and sends.
+        targets: Addresses that get every estimate.
+        viewer: Address that gets every tenth estimate and the status.
+        step: Whether time is that of the stamps: each datagram is processed at its arrival.
+        recorder: Recorder of the session.
+        watch: Function that is called after each tick.
+        patience: Time without a fast row after which `run` ends (s).
+        statistics: Measurements of the loop.
+        ended: Reason of the end.
     """
 
     onboard: OnboardController
@@ -111,9 +133,14 @@ class Loop:
     ended: str = ""
 
     def run(self, stop: Callable[[], bool] = lambda: False, duration: float = math.inf) -> None:
-        """Take what comes until the drive is over, `stop` or `duration` s; `ended` has the reason.
+        """Run until the drive is over, and set `ended`.
 
-        Raises TimeoutError where no inertial data comes at all.
+        Args:
+            stop: Function that returns whether to stop.
+            duration: Longest duration (s).
+
+        Raises:
+            TimeoutError: No inertial data comes at all.
         """
         start_time = last_heard = time.monotonic()
         had_gc = gc.isenabled()
@@ -155,7 +182,7 @@ class Loop:
         self.ended = f"no inertial data for {self.patience:g} s"
 
     def _run_tick(self, deadline: int) -> int:
-        """Wait for a deadline and take what came; the next one."""
+        """Wait for a deadline, process the arrivals, and return the next deadline."""
         batch, statistics = self.port.receive_until(deadline), self.statistics
         wake_time = clock()
         rows = self._take(batch)
@@ -178,7 +205,7 @@ class Loop:
         return deadline
 
     def _take(self, batch: list[Arrival]) -> int:
-        """The ticks of a batch: estimates and controls are sent; how many there were."""
+        """Process a batch, send estimates and controls, and return the number of its ticks."""
         onboard, statistics, ticks = self.onboard, self.statistics, 0
         for tick in self.assembler.take(batch):
             onboard.take(tick)
@@ -213,7 +240,7 @@ class Loop:
             self.port.send(self.viewer, DatagramKind.STATUS, stamp, self.status())
 
     def status(self) -> LoopStatus:
-        """What the loop has counted so far."""
+        """Collect the counts so far."""
         statistics, counts = self.statistics, self.assembler.counts
         bad = sum(counts[reason] for reason in RejectReason)
         numbers = statistics.ticks, statistics.misses, counts["held"], bad, counts["lost"]
@@ -221,14 +248,18 @@ class Loop:
         return LoopStatus._make(map(float, (*numbers, *times)))
 
     def numbers(self) -> dict[str, Any]:
-        """All that was measured, as JSON takes it."""
+        """Collect all measurements, in JSON types."""
         statistics = self.statistics
         times = {f"{name}_us": getattr(statistics, name).summarise() for name in TIMES}
         counts = {"counts": dict(self.assembler.counts), "refused": self.onboard.refused}
         return {name: getattr(statistics, name) for name in COUNTERS} | times | counts
 
     def lines(self, name: str) -> list[str]:
-        """The beginning of a verdict on the loop of an estimator of that name."""
+        """Format the first lines of a verdict on the loop.
+
+        Args:
+            name: Name of the estimator.
+        """
         m, counts = self.statistics, self.assembler.counts
         ended = f"{name}: {m.ticks} ticks in {m.seconds:.1f} s, {self.ended}"
         ignored, refused = map(_format_counts, (counts, self.onboard.refused))

@@ -1,4 +1,4 @@
-"""The car's computer: estimates at every tick, an observation and an action a control period."""
+"""The car's computer: estimates at every tick, an observation and an action per control period."""
 
 from typing import Any
 
@@ -29,14 +29,23 @@ Array = npt.NDArray[np.float64]
 
 
 class OnboardController:
-    """An estimator and an agent on what the wires carry.
+    """An estimator and an agent on the wires' data.
 
-    env: an `EstimateObservation`, which has the sensors' clocks, the nominal car, the references
-    and the control period; nothing is driven in it. agent: of `make_agent` for it, None: without
-    control. seed: of the env, whose reset draws the sensors' phases. What it makes of the same
-    ticks is the same, bit for bit, as in the env. `x`, `std` (n,): the estimate now; `names`.
-    `action` (width,): the newest, None before the first; `fresh`: whether it is of this tick.
-    Raises TypeError for another env.
+    For equal ticks its results equal those in the env, bit for bit.
+
+    Args:
+        env: `EstimateObservation` with the sensors' clocks, the nominal car, the references and the
+            control period; it is not driven.
+        agent: Agent of `make_agent` for the env; None: without control.
+        seed: Seed of the env, whose reset draws the sensors' phases.
+
+    Attributes:
+        names: Names of the states.
+        action: Newest action, shape (width,), None before the first.
+        has_new_action: Whether the action is of this tick.
+
+    Raises:
+        TypeError: The env is another one.
     """
 
     def __init__(self, env: gym.Env[Any, Any], agent: Any = None, seed: int | None = 0) -> None:
@@ -61,23 +70,27 @@ class OnboardController:
 
     @property
     def x(self) -> Array:
-        """The estimate now, (n,)."""
+        """Estimated states, shape (n,)."""
         estimate: Array = self._X[0]
         return estimate
 
     @property
     def std(self) -> Array:
-        """Its standard deviations, (n,)."""
+        """Standard deviations of the estimated states, shape (n,)."""
         deviation: Array = self._S[0]
         return deviation
 
     @property
     def refused(self) -> dict[str, int]:
-        """What the estimator, one of ours, has counted of packets that it did not use."""
+        """Counts of packets that the estimator did not use, for one of this package."""
         return self.estimator.counts if self._is_native else {}
 
     def begin(self, first: int) -> None:
-        """Forget everything; the next tick is `first`."""
+        """Clear all memory.
+
+        Args:
+            first: Number of the next tick.
+        """
         self.estimator.reset(self.sensors, first)
         self._z, self._refs = np.zeros(STATE_WIDTH), None
         for sensor in Z.slow:
@@ -88,7 +101,11 @@ class OnboardController:
         self.has_new_action = False
 
     def take(self, tick: Tick) -> None:
-        """A tick: the estimate and, at the end of a control period, the agent's action."""
+        """Process a tick: the estimate and, at the end of a control period, the agent's action.
+
+        Args:
+            tick: Data of the tick.
+        """
         if tick.begins:
             self.begin(tick.number)
         n, row = self.facts.control_period, tick.row
@@ -124,7 +141,11 @@ class OnboardController:
         self.action, self._memory = prediction
 
     def make_observation(self, number: int) -> npt.NDArray[np.float32]:
-        """What the env's agents would see now, at the tick `number`."""
+        """Make the observation that the env's agents would get.
+
+        Args:
+            number: Number of the tick.
+        """
         done, outputs = self._count, self.outputs
         packets = np.concatenate(self._packets)
         self._rows[done:] = self._rows[done - 1]
@@ -145,7 +166,7 @@ class OnboardController:
         return out
 
     def _warm_up(self) -> None:
-        """Compile what the first ticks need."""
+        """Compile the code of the first ticks."""
         row, packet = self.base.record.fast[0], np.zeros((1, NO_PACKETS.shape[1]))
         for number in range(self.facts.control_period + 1):
             self.take(Tick(number, row, 0.0, packet, number == 0))

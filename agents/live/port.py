@@ -12,15 +12,23 @@ from .datagrams import MAX_BYTES, DatagramKind, encode
 
 LOOPBACK, PORT = "127.0.0.1", 47001
 BUFFER = 1 << 22  # bytes of the kernel's, as far as it grants them
-MAX_BATCH = 512  # datagrams of a batch: whoever floods the port does not stop the loop
+MAX_BATCH = 512  # datagrams of a batch: a flood of them does not stop the loop
 SPIN = 150_000  # ns before a point in time, which sleeping alone would miss
 
 clock = time.monotonic_ns
-"""ns of the clock that nobody sets."""
+"""Time of the monotonic clock, which is never set (ns)."""
 
 
 def parse_address(text: str, host: str = LOOPBACK) -> tuple[str, int]:
-    """The IPv4 address of HOST:PORT or PORT; ValueError for another text or an unknown host."""
+    """Parse HOST:PORT or PORT to an IPv4 address.
+
+    Args:
+        text: Text of the address.
+        host: Host of a text without one.
+
+    Raises:
+        ValueError: The text is no address, or the host is unknown.
+    """
     host_text, _, number = text.rpartition(":")
     if not (number.isascii() and number.isdigit() and 0 <= int(number) < 65536):
         raise ValueError(f"an address is HOST:PORT or PORT, got {text!r}")
@@ -31,7 +39,11 @@ def parse_address(text: str, host: str = LOOPBACK) -> tuple[str, int]:
 
 
 def wait_until(deadline: int) -> None:
-    """Return at a point in time of `clock`."""
+    """Wait until a point in time.
+
+    Args:
+        deadline: Time of `clock` (ns).
+    """
     if (left := deadline - clock() - SPIN) > 0:
         time.sleep(left * 1e-9)
     while clock() < deadline:
@@ -39,10 +51,18 @@ def wait_until(deadline: int) -> None:
 
 
 class Port:
-    """A UDP port that listens on one of this machine's addresses, and numbers what it sends.
+    """A UDP port that listens on one of this machine's addresses, and numbers its datagrams.
 
-    host, port: where it is bound, port 0 for any. `address` (host, port). `unsent`: datagrams
-    that the network did not take. Raises OSError for a port that is in use or a host that is none.
+    Args:
+        host: Host to bind.
+        port: Number to bind, 0 for any.
+
+    Attributes:
+        address: Bound host and port.
+        unsent: Datagrams that the network did not take.
+
+    Raises:
+        OSError: The port is in use, or the host is unknown.
     """
 
     def __init__(self, host: str = LOOPBACK, port: int = 0) -> None:
@@ -64,7 +84,15 @@ class Port:
     def send(
         self, to: Any, kind: DatagramKind, stamp: int, values: Sequence[float] = (), names: Any = ()
     ) -> None:
-        """Send a message; stamp: us."""
+        """Send a message.
+
+        Args:
+            to: Address of the receiver.
+            kind: Kind of the datagram.
+            stamp: Time stamp (us).
+            values: Values of `FIELDS`, in SI units.
+            names: Names of states, for estimates.
+        """
         number = self._sent[kind] = self._sent.get(kind, -1) + 1
         try:
             self._socket.sendto(encode(kind, number, stamp, values, names), to)
@@ -72,7 +100,11 @@ class Port:
             self.unsent += 1
 
     def receive_available(self, batch: list[Arrival]) -> list[Arrival]:
-        """The batch with what has arrived, up to MOST_AT_ONCE."""
+        """Append the datagrams that have arrived to a batch, up to `MAX_BATCH`.
+
+        Args:
+            batch: Datagrams so far, extended.
+        """
         while len(batch) < MAX_BATCH:
             try:
                 data, sender = self._socket.recvfrom(MAX_BYTES + 1)
@@ -84,12 +116,20 @@ class Port:
         return batch
 
     def wait(self, seconds: float) -> list[Arrival]:
-        """What arrives first, or nothing after so long."""
+        """Wait for the first datagrams, and return none after a timeout.
+
+        Args:
+            seconds: Timeout (s).
+        """
         select.select([self._socket], [], [], max(seconds, 0.0))
         return self.receive_available([])
 
     def receive_until(self, deadline: int) -> list[Arrival]:
-        """What arrives until a point in time of `clock`, each with the time it came."""
+        """Receive datagrams until a point in time, each with its time of arrival.
+
+        Args:
+            deadline: Time of `clock` (ns).
+        """
         batch: list[Arrival] = []
         while (left := deadline - clock() - SPIN) > 0:
             if len(batch) >= MAX_BATCH:
@@ -102,7 +142,7 @@ class Port:
         return self.receive_available(batch)
 
     def close(self) -> None:
-        """Free the port."""
+        """Close the port."""
         self._socket.close()
 
     def __enter__(self) -> "Port":

@@ -17,12 +17,19 @@ MAX_PAUSE = 10.0  # s between two epochs of a file
 
 @dataclass
 class Relay:
-    """Sends the epochs of a source, as `envs.recordings.sources.make_source` takes it.
+    """Sends the epochs of a source as datagrams.
 
-    port: from which it sends, to the address `to`. latency: s from an epoch to its sentences, which
-    the receiver adds. speed: of a file, which is played in the time of its epochs. A lost line is
-    opened again; `error` has why the relay ended, "" at a file's end. `sent`: datagrams. `counts`:
-    of the decoder. Raises what `make_source` does.
+    A lost line is opened again.
+
+    Attributes:
+        source: Source, as for `envs.recordings.sources.make_source`, whose errors it raises.
+        port: Port that sends.
+        to: Address of the receiver.
+        latency: Delay from an epoch to its sentences (s), added to the age.
+        speed: Speed of a file's clock, 1 for real time.
+        sent: Number of datagrams.
+        error: Reason of the end, "" at a file's end.
+        counts: Counts of the decoder.
     """
 
     source: str
@@ -39,7 +46,11 @@ class Relay:
         self._chunks = make_source(self.source)
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Relay until the source ends, is lost for good, or `stop`."""
+        """Relay until the source ends or is lost.
+
+        Args:
+            stop: Function that returns whether to stop.
+        """
         is_file = not self.source.startswith(("serial:", "tcp:"))
         last_time, due = math.nan, time.monotonic()
         try:
@@ -58,7 +69,7 @@ class Relay:
             self.error = str(error)
 
     def _iterate_epochs(self) -> Iterator[Any]:
-        """The epochs, and None after each chunk of bytes."""
+        """Iterate over the epochs, with None after each chunk of bytes."""
         from ...envs.recordings.nmea import Decoder
 
         decoder = Decoder()
@@ -69,7 +80,7 @@ class Relay:
         yield from decoder.finish()
 
     def _make_values(self, epoch: Any) -> list[float]:
-        """The doubles of a datagram; an unknown number is 0, an unknown HDOP the worst."""
+        """Make the doubles of a datagram; an unknown number is 0, an unknown HDOP the worst."""
         X, Y = self._compute_position(epoch) if epoch.has_fix else (0.0, 0.0)
         hdop = epoch.hdop if math.isfinite(epoch.hdop) else MAX_HDOP
         course, speed = (value if math.isfinite(value) else 0.0 for value in epoch[3:5])
@@ -78,7 +89,7 @@ class Relay:
         return [course, speed, X, Y, hdop, float(epoch.satellites), age, float(epoch.quality)]
 
     def _compute_position(self, epoch: Any) -> tuple[float, float]:
-        """m to the east and north of the first fix."""
+        """Compute the position east and north of the first fix (m)."""
         if self._origin is None:
             self._origin = epoch.latitude, epoch.longitude
         east, north = to_metres(epoch.latitude, epoch.longitude, self._origin)

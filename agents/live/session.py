@@ -1,9 +1,9 @@
-"""A session on disk: every datagram accepted with its tick, and its replay bit for bit.
+"""A session on disk: every accepted datagram with its tick, and its replay bit for bit.
 
 A file is a head (MAGIC, the length of its JSON, the JSON) and blocks that are appended as they are
-full: a crash loses the last one at most, and a file that is cut anywhere is read up to there. A
-block carries a checksum of itself and one of all estimates so far, by which a replay checks
-itself. Nothing in a file is run.
+full. A crash loses the last one at most, and a file that is cut is read up to there. A block has
+a checksum of itself and one of all estimates so far, by which a replay checks itself. Nothing in a
+file is run.
 """
 
 import json
@@ -31,13 +31,18 @@ _SETUP: dict[str, Any] = {
     "seed": int,
     "patience": (int, type(None)),
 }
-"""What the setup of a session has, by type."""
+"""Types of a session's setup, by key."""
 
 
 class Recorder:
-    """Writes a session. setup: what it takes to replay it, as JSON takes it.
+    """Writes a session.
 
-    Raises FileExistsError for a file that is there: a session is never overwritten.
+    Args:
+        path: File to write.
+        setup: Setup of the replay, in JSON types.
+
+    Raises:
+        FileExistsError: The file exists; a session is never overwritten.
     """
 
     def __init__(self, path: Path | str, setup: Mapping[str, Any]) -> None:
@@ -47,11 +52,19 @@ class Recorder:
         self._items, self._batches, self._digest = bytearray(), 0, 0
 
     def note(self, onboard: OnboardController) -> None:
-        """An estimate, for the checksum."""
+        """Add an estimate to the checksum.
+
+        Args:
+            onboard: On-board controller after a tick.
+        """
         self._digest = update_digest(onboard, self._digest)
 
     def take(self, accepted: list[bytes]) -> None:
-        """The datagrams of a batch that were accepted."""
+        """Record the accepted datagrams of a batch.
+
+        Args:
+            accepted: Datagrams of the batch.
+        """
         for data in accepted:
             self._items += _ITEM.pack(self._batches, len(data)) + data
         self._batches += 1
@@ -64,26 +77,43 @@ class Recorder:
         self._items, self._batches = bytearray(), 0
 
     def close(self) -> None:
-        """Write the last block."""
+        """Write the last block and close the file."""
         if self._batches:
             self._write()
         self._file.close()
 
 
 def update_digest(onboard: OnboardController, digest: int) -> int:
-    """A checksum of an estimate and of all before it."""
+    """Update the checksum of all estimates by the newest one.
+
+    Args:
+        onboard: On-board controller after a tick.
+        digest: Checksum of the estimates before.
+    """
     return zlib.crc32(onboard.std.tobytes(), zlib.crc32(onboard.x.tobytes(), digest))
 
 
 class SessionBlock(NamedTuple):
-    """A block: its batches of datagrams, and the checksum of the estimates after it."""
+    """A block of a session.
+
+    Attributes:
+        batches: Batches of datagrams.
+        digest: Checksum of all estimates after the block.
+    """
 
     batches: list[list[Arrival]]
     digest: int
 
 
 def read_setup(path: Path | str) -> dict[str, Any]:
-    """The setup of a session; ValueError for a file that is none, or lacks some of it."""
+    """Read the setup of a session.
+
+    Args:
+        path: File of the session.
+
+    Raises:
+        ValueError: The file is no session, or its setup is incomplete.
+    """
     with open(path, "rb") as file:
         setup = _read_header(path, file)
     wrong = [name for name, kind in _SETUP.items() if not isinstance(setup.get(name, ...), kind)]
@@ -106,7 +136,11 @@ def _read_header(path: Path | str, file: Any) -> dict[str, Any]:
 
 
 def read_blocks(path: Path | str) -> Iterator[SessionBlock]:
-    """The blocks of a session up to its end, or to where it was cut or damaged."""
+    """Read the blocks of a session up to its end, or to where it was cut or damaged.
+
+    Args:
+        path: File of the session.
+    """
     with open(path, "rb") as file:
         _read_header(path, file)
         while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
@@ -121,7 +155,7 @@ def read_blocks(path: Path | str) -> Iterator[SessionBlock]:
 
 
 def _parse_batches(data: bytes, count: int) -> list[list[Arrival]] | None:
-    """The datagrams of each batch; None where somebody made up what the checksum is of."""
+    """Parse the datagrams of each batch; None for data that no recorder wrote."""
     batches: list[list[Arrival]] = [[] for _ in range(count)]
     offset = 0
     while len(data) - offset >= _ITEM.size:
@@ -134,8 +168,14 @@ def _parse_batches(data: bytes, count: int) -> list[list[Arrival]] | None:
 
 
 class SessionReplay(NamedTuple):
-    """What a replay gives: ticks (T,), x and std (T, n), and whether every block's checksum of the
-    estimates is the session's."""
+    """The result of a replay.
+
+    Attributes:
+        ticks: Numbers of the ticks, shape (T,).
+        x: Estimates, shape (T, n).
+        std: Standard deviations, shape (T, n).
+        same: Whether every block's checksum of the estimates is the session's.
+    """
 
     ticks: npt.NDArray[np.int64]
     x: npt.NDArray[np.float64]
@@ -144,7 +184,13 @@ class SessionReplay(NamedTuple):
 
 
 def replay(path: Path | str, onboard: OnboardController, patience: int | None) -> SessionReplay:
-    """Take a session again; patience: of its `StreamSynchroniser`."""
+    """Replay a session.
+
+    Args:
+        path: File of the session.
+        onboard: On-board controller of the session's setup.
+        patience: Patience of the `StreamSynchroniser`.
+    """
     assembler, digest, same = StreamSynchroniser(patience), 0, True
     ticks: list[int] = []
     numbers: list[list[npt.NDArray[np.float64]]] = [[], []]

@@ -1,4 +1,4 @@
-"""The other end: a simulated car that sends what its sensors measure and takes controls."""
+"""The other end: a simulated car that sends its measurements and takes controls."""
 
 import gc
 import signal
@@ -28,12 +28,17 @@ _KINDS = {place: kind for kind, place in SENSORS.items()}
 
 @dataclass
 class WireAgent:
-    """What drives an env in the place of an agent: its record goes out, controls come in.
+    """An agent on the wires: it sends the env's record and returns the controls that arrive.
 
-    env: a `StabilityEnv`, bare. port: from which it sends, to the address `to`. step: lock-step,
-    which waits for the control of every period; else a tick lasts a millisecond over `speed`, and
-    a control that is not there when the period begins is late: the newest one acts on. `late`,
-    `periods`: how many.
+    Attributes:
+        env: Bare `StabilityEnv`.
+        port: Port that sends.
+        to: Address of the receiver.
+        step: Lock-step, which waits for the control of every period. Otherwise a tick lasts a
+            millisecond over `speed`, and the last action holds where a control is late.
+        speed: Speed of the clock, 1 for real time.
+        late: Number of late controls.
+        periods: Number of control periods.
     """
 
     env: gym.Env[Any, Any]
@@ -53,7 +58,14 @@ class WireAgent:
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: Any = 1
     ) -> tuple[npt.NDArray[np.float32], Any]:
-        """The action that comes back for the newest record; as of stable-baselines3."""
+        """Return the action that comes back for the newest record.
+
+        Args:
+            observation: Without effect.
+            state: Returned unchanged.
+            episode_start: Without effect.
+            deterministic: Without effect.
+        """
         if not self.periods:
             self._action = np.zeros(self._facts.width, np.float32)
             self._start_time = clock() + round(1e9 * TICK)
@@ -69,7 +81,7 @@ class WireAgent:
         return self._action.copy(), state
 
     def send(self) -> int:
-        """Send the newest record, each tick when it is due; the last tick."""
+        """Send the newest record, each tick when it is due, and return the last tick."""
         base: Any = self.env.unwrapped
         record = base.record
         command = base.get_state()["state"][Z.driver]  # which the next fast row carries
@@ -87,7 +99,7 @@ class WireAgent:
         return int(record.ticks[-1])
 
     def end(self) -> None:
-        """Send what the last step left, and that the drive is over."""
+        """Send the record of the last step, and the end of the drive."""
         self.port.send(self.to, DatagramKind.END, self.send() * TICK_US)
 
     def _get_due_time(self, tick: int) -> int:
@@ -132,12 +144,25 @@ def simulate(
     step: bool = False,
     speed: float = 1.0,
 ) -> tuple[Rollout, WireAgent]:
-    """One episode of an env whose agent is at the other end of the wires, and the wires.
+    """Simulate one episode whose agent is at the other end of the wires.
 
     In lock-step the drive is that of `rollout` with the same agent, bit for bit; in real time it
-    differs by the controls that came late alone. Arguments: of `Wires`; seed: of the reset.
-    Raises ValueError for a control period too long for lock-step, TimeoutError where no control
-    comes.
+    differs by late controls alone.
+
+    Args:
+        env: Bare `StabilityEnv`.
+        port: Port that sends.
+        to: Address of the receiver.
+        seed: Seed of the reset.
+        step: Whether to run in lock-step.
+        speed: Speed of the clock, 1 for real time.
+
+    Returns:
+        The episode, and the agent with its counts.
+
+    Raises:
+        ValueError: The control period is too long for lock-step.
+        TimeoutError: No control comes.
     """
     if step and get_env_facts(env).control_period > MAX_TICKS:
         raise ValueError(f"in lock-step a control period has at most {MAX_TICKS} ticks")
@@ -148,9 +173,13 @@ def simulate(
 
 
 class SimulatedCarProcess:
-    """The other end in a process of its own, ready before it starts.
+    """The simulated car in a process of its own, ready before it starts.
 
-    Arguments: the env's id and options, those of `simulate`. Raises what the env raises.
+    Args:
+        arguments: Id and options of the env, then `to`, `seed`, `step` and `speed` of `simulate`.
+
+    Raises:
+        Exception: As the env.
     """
 
     def __init__(self, *arguments: Any) -> None:
@@ -164,11 +193,11 @@ class SimulatedCarProcess:
         self._receive()
 
     def start_drive(self) -> None:
-        """Begin."""
+        """Start the drive."""
         self._pipe.send("go")
 
     def result(self) -> Any:
-        """(columns of the drive, controls late, periods), when it is over."""
+        """Wait for the drive's end, and return its columns, late controls and periods."""
         return self._receive()
 
     def _receive(self) -> Any:

@@ -1,6 +1,7 @@
-"""What a loop's estimates look like: a table in the terminal, a page in the browser.
+"""Views of a loop's estimates: a table in the terminal, a page in the browser.
 
-A process of its own, which the loop sends datagrams: drawing would cost it its deadlines.
+The viewer is a process of its own that receives datagrams: drawing would cost the loop its
+deadlines.
 """
 
 import asyncio
@@ -31,8 +32,15 @@ _POLICY = (
 
 
 class ViewerProtocol(asyncio.DatagramProtocol):
-    """The newest datagrams. samples: (s, estimates, standard deviations), in degrees where states
-    are angles; count: of all so far."""
+    """The newest datagrams of a loop.
+
+    Attributes:
+        names: Names of the states.
+        samples: Time (s), estimates and standard deviations, with angles in degrees.
+        status: Newest status of the loop.
+        count: Number of samples so far.
+        over: Event of the drive's end.
+    """
 
     def __init__(self) -> None:
         self.names: tuple[str, ...] = ()
@@ -40,7 +48,12 @@ class ViewerProtocol(asyncio.DatagramProtocol):
         self.status, self.count, self.over = LoopStatus(), 0, asyncio.Event()
 
     def datagram_received(self, data: bytes, _: Any) -> None:
-        """Take a datagram of the loop."""
+        """Process a datagram of the loop.
+
+        Args:
+            data: Bytes of the datagram.
+            _: Address of the sender.
+        """
         message = decode(data)
         if isinstance(message, RejectReason):
             return
@@ -62,12 +75,21 @@ class ViewerProtocol(asyncio.DatagramProtocol):
 
 
 def get_unit(name: str) -> str:
-    """The unit in which a state is shown."""
+    """Get the unit in which a state is shown.
+
+    Args:
+        name: Name of the state.
+    """
     return STATES.get(name, FOREIGN_STATE).unit.replace("rad", "deg")
 
 
 def make_table(protocol: ViewerProtocol, title: str) -> Any:
-    """The estimates, and what the loop has counted."""
+    """Make the table of the estimates and the loop's counts.
+
+    Args:
+        protocol: Newest datagrams.
+        title: Title of the table.
+    """
     from rich.table import Table
     from rich.text import Text
 
@@ -87,8 +109,15 @@ def make_table(protocol: ViewerProtocol, title: str) -> Any:
 
 
 def make_event(protocol: ViewerProtocol, sent: int) -> tuple[str, int]:
-    """What came after the first `sent` samples as JSON, all of them where none were sent; and how
-    many there are now."""
+    """Make an event of new samples as JSON; of all samples where none were sent.
+
+    Args:
+        protocol: Newest datagrams.
+        sent: Number of samples that were sent.
+
+    Returns:
+        JSON, and the number of samples so far.
+    """
     n_new = min(protocol.count - sent, len(protocol.samples))
     event = {
         "all": sent == 0,
@@ -100,7 +129,7 @@ def make_event(protocol: ViewerProtocol, sent: int) -> tuple[str, int]:
 
 
 async def _send_events(protocol: ViewerProtocol, request: Any) -> Any:
-    """Server-sent events: what is new, twenty times a second."""
+    """Send server-sent events of new samples, twenty times a second."""
     from aiohttp import web
 
     response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
@@ -126,16 +155,13 @@ async def _render_page(title: str, protocol: ViewerProtocol, _: Any) -> Any:
 
 
 def is_same_origin(host: str, origin: str | None) -> bool:
-    """Say whether a request is for this server and from its own page.
+    """Return whether a request is for this server and from its own page.
 
-    A page elsewhere that lets its name resolve to this address has that name as the host.
+    A foreign page whose name resolves to this address has that name as the host.
 
     Args:
         host: The request's Host, "name:port".
         origin: Its Origin, None where it has none.
-
-    Returns:
-        Whether both are of this server.
     """
     name = host.rpartition(":")[0].strip("[]") or host
     with suppress(ValueError):
@@ -194,9 +220,18 @@ def _run_process(title: str, page: tuple[str, int] | None, screen: bool, pipe: A
 class Viewer:
     """The process that shows a loop's estimates.
 
-    title: above them. page: (host, port) of the page, port 0 for any; None: without. screen:
-    whether the terminal has a table. `address`: to which the loop sends. `url`: of the page.
-    Raises OSError for a port in use, ModuleNotFoundError without aiohttp.
+    Args:
+        title: Title above the estimates.
+        page: Host and port of the page, port 0 for any; None: no page.
+        screen: Whether the terminal has a table.
+
+    Attributes:
+        address: Address that receives the loop's datagrams.
+        url: Address of the page.
+
+    Raises:
+        OSError: The port is in use.
+        ModuleNotFoundError: aiohttp is not installed.
     """
 
     def __init__(self, title: str, page: tuple[str, int] | None, screen: bool) -> None:

@@ -1,5 +1,4 @@
-"""The algorithms of `sideslip train`: stable-baselines3's and one of ours, with settings that learn
-here.
+"""The algorithms of `sideslip train`: stable-baselines3's and an own one, with their settings.
 
 The settings stand in `hyperparams/`, in rl-baselines3-zoo's format, and were chosen on YawVision-v0
 with seed 0. PPO on its sensors alone (600,000 steps, about 20 CPU-s; mean cost over none's on 256
@@ -41,8 +40,8 @@ Settings = dict[str, Any]
 
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
 PERIOD = 0.01  # s, of control: of the environments whose discount stands in the files
-WARM_START_ENTRY = "begun"  # the entry of a training that goes on from a policy
-WARM_START_TRACES_ENTRY = "begun-traces"  # from one with traces
+WARM_START_ENTRY = "begun"  # the entry of training a policy further
+WARM_START_TRACES_ENTRY = "begun-traces"  # one with moving averages
 UNIFORM_LOG_STD = -0.55  # log of the deviation of actions drawn evenly
 
 _TRAINING_SETTINGS = ("n_timesteps", "n_envs", "policy", "normalize")
@@ -60,15 +59,24 @@ _MANAGED_ARGUMENTS = {
 
 @dataclass(frozen=True)
 class Algorithm:
-    """Where the class is, "module:name", how rl-baselines3-zoo calls it or would, and whether it
-    follows gradients through cars on tensors."""
+    """An algorithm of `sideslip train`.
+
+    Attributes:
+        kind: Class as "module:name".
+        zoo: Name in rl-baselines3-zoo.
+        on_tensors: Whether it follows gradients through cars on tensors.
+    """
 
     kind: str
     zoo: str
     on_tensors: bool = False
 
     def load(self) -> Callable[..., BaseAlgorithm]:
-        """The class; ModuleNotFoundError without its package."""
+        """Import the class.
+
+        Raises:
+            ModuleNotFoundError: Its package is not installed.
+        """
         module, name = self.kind.split(":")
         with require_extra("train", "training needs {}"):
             algorithm_class: Callable[..., BaseAlgorithm] = getattr(import_module(module), name)
@@ -87,16 +95,29 @@ ALGORITHMS = {
 
 
 def get_algorithm(name: str) -> Algorithm:
-    """An algorithm by its name; ValueError for another."""
+    """Get an algorithm.
+
+    Args:
+        name: Name in `ALGORITHMS`.
+
+    Raises:
+        ValueError: The name is unknown.
+    """
     check_choice("algorithm", name, ALGORITHMS)
     return ALGORITHMS[name]
 
 
 def read_settings(algo: str, env_id: str, file: str | Path | None = None) -> Settings:
-    """An environment's settings, or those of "default", from a file of rl-baselines3-zoo's format.
+    """Read an environment's settings, or "default", from a file in rl-baselines3-zoo's format.
 
-    file: default: the package's own. Raises what `check_settings` raises, FileNotFoundError, and
-    ValueError for a file that is no such YAML or has neither entry.
+    Args:
+        algo: Name of the algorithm.
+        env_id: Id of the env.
+        file: YAML file; None: the package's own.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is no such YAML or has neither entry, or as `check_settings`.
     """
     with require_extra("train", "settings need {}"):
         import yaml
@@ -120,7 +141,15 @@ def read_settings(algo: str, env_id: str, file: str | Path | None = None) -> Set
 
 
 def check_settings(algo: str, settings: Any) -> None:
-    """ValueError for settings that the algorithm has not, or that say code instead of a value."""
+    """Check that an algorithm has all settings, and that none is code instead of a value.
+
+    Args:
+        algo: Name of the algorithm.
+        settings: Settings to check.
+
+    Raises:
+        ValueError: A setting is unknown, missing or of another type.
+    """
     if not isinstance(settings, Mapping):
         raise ValueError(f"settings are {{name: value}}, got {settings!r}")
     arguments = inspect.signature(get_algorithm(algo).load()).parameters
@@ -146,13 +175,25 @@ def check_settings(algo: str, settings: Any) -> None:
 
 
 def compute_action_std(settings: Settings) -> float:
-    """Standard deviation of the actions that a training begins with."""
+    """Compute the standard deviation of a training's first actions.
+
+    Args:
+        settings: Settings of `read_settings`.
+    """
     return math.exp(settings.get("policy_kwargs", {}).get("log_std_init", UNIFORM_LOG_STD))
 
 
 def make_model_options(algo: str, settings: Settings, seconds: float, num_envs: int) -> Settings:
-    """Arguments of the class, in JSON types, for a control period and a number of environments:
-    gamma forgets as much in a second as in the file, a batch divides a rollout."""
+    """Make the arguments of an algorithm's class, in JSON types.
+
+    `gamma` discounts as much in a second as in the file, and a batch divides a rollout.
+
+    Args:
+        algo: Name of the algorithm.
+        settings: Settings of `read_settings`.
+        seconds: Control period (s).
+        num_envs: Number of environments.
+    """
     options = {name: value for name, value in settings.items() if name not in _TRAINING_SETTINGS}
     if "gamma" in options:
         options["gamma"] = options["gamma"] ** (seconds / PERIOD)
@@ -174,8 +215,17 @@ def make_model(
     seed: int,
     **rest: Any,
 ) -> BaseAlgorithm:
-    """An untrained model. settings: of `read_settings`. seconds: of a control period. scaling: of
-    `Standardised`. rest: further arguments of the class, as its device."""
+    """Make an untrained model.
+
+    Args:
+        algo: Name of the algorithm.
+        settings: Settings of `read_settings`.
+        env: Environments of the training.
+        seconds: Control period (s).
+        scaling: Scaling of `Standardised`.
+        seed: Seed of the model.
+        rest: Further arguments of the class, such as its device.
+    """
     options = make_model_options(algo, settings, seconds, env.num_envs)
     options |= {name: _make_schedule(name, options[name]) for name in _SCHEDULED if name in options}
     mean, scale, clip, mixing = scaling
@@ -193,7 +243,7 @@ def make_model(
 
 
 def _make_schedule(name: str, value: Any) -> Any:
-    """A number as it is, "lin_NUMBER" as a schedule that falls to zero."""
+    """Return a number, or for "lin_NUMBER" a schedule that falls to zero."""
     word, _, number = str(value).rpartition("_")
     try:
         start = float(number)
@@ -205,7 +255,14 @@ def _make_schedule(name: str, value: Any) -> Any:
 
 
 def check_device(name: str) -> None:
-    """ValueError for a name that is no device of torch's, or one that is not at hand."""
+    """Check that torch has a device.
+
+    Args:
+        name: Name of the device.
+
+    Raises:
+        ValueError: The name is no device of torch's, or the device is not available.
+    """
     try:
         device = get_device(name)  # the CPU where there is no CUDA
     except RuntimeError:

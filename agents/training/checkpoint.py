@@ -18,14 +18,19 @@ with require_extra("train", "training needs {}"):
 
 FORMAT = 3
 VARIABLES = "variables"
-"""The part of the tensors that belong to no module, as the logarithm of an entropy's weight."""
+"""Part of the tensors that belong to no module, such as the logarithm of an entropy's weight."""
 STATE = {"groups", "sideslip", "task", "steps", "aim", "scaling", "evaluations"}
-"""What a training goes on from, besides the tensors."""
+"""Keys of a resumed training's state, besides the tensors."""
 
 
 def save_checkpoint(path: Path, model: Any, rest: dict[str, Any]) -> None:
-    """A stable-baselines3 model's parameters and optimisers, and the rest of the training's state,
-    in JSON types."""
+    """Save a model's parameters and optimisers, and the rest of the training's state.
+
+    Args:
+        path: File to write.
+        model: Model of stable-baselines3.
+        rest: Rest of the state, in JSON types.
+    """
     tensors: dict[str, torch.Tensor] = {}
     groups: dict[str, Any] = {}
     for part, state in model.get_parameters().items():
@@ -42,7 +47,14 @@ def save_checkpoint(path: Path, model: Any, rest: dict[str, Any]) -> None:
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """The training's state without the tensors; ValueError for a file that is no checkpoint."""
+    """Read a training's state without the tensors.
+
+    Args:
+        path: Checkpoint.
+
+    Raises:
+        ValueError: The file is no checkpoint of this format, or is cut short.
+    """
     try:
         with safe_open(path, "pt") as file:
             text = (file.metadata() or {}).get("checkpoint")
@@ -61,12 +73,17 @@ def read_state(path: Path) -> dict[str, Any]:
 
 
 def _get_variables(model: Any) -> dict[str, torch.Tensor]:
-    """What `get_parameters` leaves out, though a model's zip has it."""
+    """Get the tensors that `get_parameters` leaves out, though a model's zip has them."""
     return {name: getattr(model, name) for name in model._get_torch_save_params()[1]}
 
 
 def load_parameters(path: Path, model: Any) -> None:
-    """Give a model the parameters and the state of the optimisers of a checkpoint."""
+    """Load a checkpoint's parameters and optimisers into a model.
+
+    Args:
+        path: Checkpoint.
+        model: Model of stable-baselines3.
+    """
     groups = read_state(path)["groups"]
     parts: dict[str, dict[str, Any]] = {part: {} for part in model.get_parameters()}
     variables = _get_variables(model)

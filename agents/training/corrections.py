@@ -1,9 +1,10 @@
 """Training of a correction of a filter's sideslip angle, on simulated drives.
 
-The closed loop's distribution is covered by who drives: nobody, LQR on the filter, LQR whose action
-is shaken, and LQR on the correction that these taught. The network learns mean and variance of the
-filter's error by the beta-NLL of Seitzer et al. (arXiv 2203.09168), beta = 0.5; then one factor on
-its deviation is found on held-out seeds, so that 95 % of their errors lie within 1.96 deviations.
+The drivers cover the closed loop's distribution: no control, LQR on the filter, LQR with noise on
+its action, and LQR on the correction that these taught. The network learns mean and variance of
+the filter's error by the beta-NLL of Seitzer et al. (arXiv 2203.09168), beta = 0.5. Then one
+factor on its deviation is fitted on held-out seeds, so that 95 % of their errors lie within 1.96
+deviations.
 """
 
 import functools
@@ -50,8 +51,12 @@ DriveSpec = tuple[str, dict[str, Any]]
 
 
 class Samples(NamedTuple):
-    """inputs: (k, inputs) float32, as the network normalises them. errors: (k,) rad, what is to be
-    added to the filter's beta."""
+    """Samples of a filter's error.
+
+    Attributes:
+        inputs: Inputs that the network normalises, float32, shape (k, inputs).
+        errors: Numbers to add to the filter's sideslip angle (rad), shape (k,).
+    """
 
     inputs: Any
     errors: Array
@@ -65,7 +70,7 @@ class _NoisyLqr(Lqr):
         self._rng, self._noise = np.random.default_rng(0), np.zeros(())
 
     def predict(self, *arguments: Any, **options: Any) -> Any:
-        """LQR's action and the noise, clipped."""
+        """Compute LQR's action with noise, clipped."""
         action, state = super().predict(*arguments, **options)
         white_noise = self._rng.standard_normal(action.shape) * (1.0 - _MEMORY**2) ** 0.5
         self._noise = _MEMORY * self._noise + _NOISE_STD * white_noise
@@ -82,7 +87,15 @@ def collect_samples(
     seed: int,
     episodes: int,
 ) -> Samples:
-    """Samples of every drive in every way on a correction, each with so many seeds of its own."""
+    """Collect samples of every drive with every driver on a correction.
+
+    Args:
+        correction: Correction behind the filter.
+        drives: Scenarios, as ids and options of `gym.make`.
+        drivers: Pairs of a key of `AGENTS` and slow sensors.
+        seed: First seed.
+        episodes: Seeds of each drive and driver.
+    """
     seeds, collected = itertools.count(seed, episodes), list[Samples]()
     for (env_id, options), (driver, sensors) in itertools.product(drives, drivers):
         options = {"sensors": sensors, "on_bad_action": "fail", **options}
@@ -96,7 +109,7 @@ def collect_samples(
 
 
 def _iterate_samples(env: Any, agent: Any, seed: int) -> Iterator[Samples]:
-    """Samples of the first episodes' steps, one of `EVERY`."""
+    """Iterate over samples of the first episodes' steps, one of `EVERY`."""
     batch, seeds = env.estimator, list(range(seed, seed + env.num_envs))
     net = batch.first.net
     stack = slice(locate_stack(net), locate_stack(net) + int(net.sizes[0]))
@@ -118,11 +131,17 @@ def train_correction(
     epochs: int = 20,
     report: Callable[[str], None] = lambda _: None,
 ) -> Correction:
-    """Train on drives with the card's seed; the same numbers give the same bits.
+    """Train a correction on drives with the card's seed; equal arguments give equal bits.
 
-    episodes: of each drive and way, an eighth as many held out. epochs: passes over all samples, of
-    the first network half of them. report: called with what is done next. Raises ValueError for
-    none of these, and what the filter and the envs raise.
+    Args:
+        card: Card of the correction.
+        drives: Scenarios, as ids and options of `gym.make`.
+        episodes: Seeds of each drive and driver; an eighth as many are held out.
+        epochs: Passes over all samples; the first network has half of them.
+        report: Function that is called with the name of the next stage.
+
+    Raises:
+        ValueError: There are no drives, episodes or epochs; or as the filter and the envs.
     """
     if not drives or episodes < 1 or epochs < 1:
         raise ValueError(f"{len(drives)} drives, {episodes} episodes, {epochs} epochs: 1 at least")
@@ -164,7 +183,7 @@ def train_correction(
 
 
 def _fit_network(data: Samples, mean: Array, scale: Array, epochs: int, seed: int) -> Network:
-    """A network that learned from samples, whose inputs are normalised by mean and scale."""
+    """Fit a network to samples whose inputs are normalised by mean and scale."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     sizes = [data.inputs.shape[1], *HIDDEN, 2]
@@ -192,7 +211,12 @@ def _fit_network(data: Samples, mean: Array, scale: Array, epochs: int, seed: in
 
 
 def compute_errors(correction: Correction, data: Samples) -> tuple[Array, Array]:
-    """(errors of the sum, its deviations) by NumPy, of samples driven on the correction; rad."""
+    """Compute the corrected errors and their deviations by NumPy (rad), shape (k,) each.
+
+    Args:
+        correction: Correction on which the samples were driven.
+        data: Samples.
+    """
     ones = np.ones(correction.card.inputs)
     plain = replace(correction.network, mean=0.0 * ones, scale=ones)
     added, logarithm = plain(data.inputs.astype(np.float64)).T
@@ -200,8 +224,12 @@ def compute_errors(correction: Correction, data: Samples) -> tuple[Array, Array]
 
 
 def compute_quality(correction: Correction, data: Samples) -> dict[str, float]:
-    """RMSE of the filter and of the sum (rad), coverage of 95 % intervals, mean squared error over
-    variance, of samples driven on a correction."""
+    """Compute RMSE of the filter and of the correction (rad), 95 % coverage and NEES.
+
+    Args:
+        correction: Correction on which the samples were driven.
+        data: Samples.
+    """
     errors, deviations = compute_errors(correction, data)
     squares = (errors / deviations) ** 2
     return {

@@ -1,9 +1,9 @@
-"""Distillation: a policy with memory learns to act as a teacher that sees more, by DAgger.
+"""Distillation: a policy with memory imitates a teacher with more information, by DAgger.
 
-A teacher drives cars of its own, with whatever sensors, filter or truth it needs, in lockstep with
-the student's: the same seeds and the same actions, hence the same motion to the last bit. In the
-first round the teacher acts, shaken by coloured noise, in later ones the student; the teacher's
-action is the label everywhere (Ross et al., AISTATS 2011).
+A teacher drives cars of its own, with any sensors, filter or truth, in lockstep with the
+student's: equal seeds and actions give equal motion to the last bit. In the first round the
+teacher acts, with coloured noise, in later ones the student; the teacher's action is always the
+label (Ross et al., AISTATS 2011).
 """
 
 import itertools
@@ -34,7 +34,10 @@ _MEMORY = 0.95  # share of the noise left after a step
 class DistillTask(NamedTuple):
     """Cars that a student drives, the same cars as the teacher sees them, and the teacher.
 
-    Vector envs of as many rows that reset themselves; a `Controller`.
+    Attributes:
+        cars: Vector env of the student, which resets itself.
+        teachers: Vector env of the teacher, of as many rows, which resets itself.
+        teacher: `Controller`.
     """
 
     cars: Any
@@ -43,8 +46,13 @@ class DistillTask(NamedTuple):
 
 
 class RoundResult(NamedTuple):
-    """What a round came to: steps of the student's envs so far, mean cost of its episodes, and the
-    loss, relative to their cost, of the last epoch."""
+    """The result of a round.
+
+    Attributes:
+        steps: Steps of the student's envs so far.
+        cost: Mean cost of the round's episodes.
+        loss: Loss of the last epoch, relative to the episodes' cost.
+    """
 
     steps: int
     cost: float
@@ -58,13 +66,17 @@ def collect_demonstrations(
     noise: float,
     max_cost: float = np.inf,
 ) -> Demonstrations:
-    """Each seed's first episode, driven by a policy, or by the teacher, shaken, without one.
+    """Collect each seed's first episode, driven by a policy, or by the teacher with noise.
 
-    policy: a `Policy`, anything with stable-baselines3's `predict`, or None. usual: the cost by
-    which errors are judged where an episode costs more: one that fails, or is lost, is what there
-    is most to learn from.
+    Args:
+        task: Cars and teacher.
+        policy: `Policy`, object with stable-baselines3's `predict`, or None for the teacher.
+        seeds: Seeds of the rows.
+        noise: Largest standard deviation of the teacher's noise.
+        max_cost: Maximum of the cost that divides errors: failed or lost episodes teach most.
 
-    Raises ValueError where the teacher's cars are not those of the student.
+    Raises:
+        ValueError: The teacher's cars differ from the student's.
     """
     cars, twins, teacher = task
     student = PolicyController(cars, policy) if isinstance(policy, Policy) else policy
@@ -105,13 +117,13 @@ def collect_demonstrations(
 
 
 def _list_privileged_columns(task: DistillTask) -> list[int]:
-    """Columns of what the teacher reads that is not in the student's observation."""
+    """List the columns of the teacher's inputs that the student's observation lacks."""
     names, known = ([e.name for e in env.layout] for env in (task.teachers, task.cars))
     return [names.index(name) for name in task.teacher.needs if name not in known]
 
 
 def _compute_curvature(cars: Any, teacher: Any, obs: Single) -> Single:
-    """The Riccati matrix of the teacher's design at the drives' mean speed; without one, unity."""
+    """Compute the Riccati matrix of the teacher's design at the mean speed, else the identity."""
     if not isinstance(teacher, Lqr):
         return np.eye(teacher.width, dtype=np.float32)
     names = [entry.name for entry in cars.layout]
@@ -120,7 +132,7 @@ def _compute_curvature(cars: Any, teacher: Any, obs: Single) -> Single:
 
 
 class DistillResult(NamedTuple):
-    """The policy, and what each round came to."""
+    """The policy, and the result of each round."""
 
     policy: Policy
     rounds: tuple[RoundResult, ...]
@@ -133,15 +145,21 @@ def distill(
     path: str | Path,
     report: Callable[[RoundResult], None] = lambda _: None,
 ) -> DistillResult:
-    """Train a policy on all lessons and write it to a file after every round.
+    """Train a policy on all tasks and write it to a file after every round.
 
-    card: of what the lessons' cars are; the training's numbers are filled in. path: ends in
-    `.safetensors`. report: called after each round. The same numbers give the same bits.
+    Equal arguments give equal bits.
 
-    Raises ValueError for no lesson, for a course that tells where the student sees all that the
-    teacher reads, for a teacher whose cars are others than the student's, and
-    FloatingPointError, with the step, where the loss or the weights are not finite: the file then
-    holds the round before.
+    Args:
+        card: Card of the student's cars, to which the training's numbers are added.
+        tasks: Cars and teachers.
+        config: Configuration of the student and its training.
+        path: Path that ends in `.safetensors`.
+        report: Function that is called after each round.
+
+    Raises:
+        ValueError: There is no task, `config.told` is set where the student sees all of the
+            teacher's inputs, or the teacher's cars differ from the student's.
+        FloatingPointError: Loss or weights are not finite; the file has the round before.
     """
     if not tasks:
         raise ValueError("no lessons: there is nothing to learn from")

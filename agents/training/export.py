@@ -14,16 +14,19 @@ _PRIOR = 1e-4  # samples that a VecNormalize starts with, of mean 0 and variance
 
 
 def convert_sb3_policy(model: Any, normaliser: Any = None, history: int = 1) -> Network:
-    """What `model.predict(..., deterministic=True)` computes of a `normaliser`'s observations.
+    """Convert the deterministic actor of a model to a network.
 
-    model: one of stable-baselines3 or sb3-contrib, or its policy, of a class in `ACTORS`; an action
-    within [-1, 1]; `Standardised` before the layers or nothing. normaliser: the VecNormalize of the
-    training, or None. history: frames that a VecFrameStack stacked, inside or outside of the
-    normaliser. An entry that never varied in training taught the network nothing and is not read:
-    scale 0.
+    Entries that never varied in training are not read: their scale is 0.
 
-    Raises ValueError for a model that is none of these, or an observation of another width,
-    ModuleNotFoundError without torch.
+    Args:
+        model: Model of stable-baselines3 or sb3-contrib, or its policy, of a class in `ACTORS`,
+            with actions within [-1, 1] and at most `Standardised` before its layers.
+        normaliser: VecNormalize of the training, or None.
+        history: Frames that a VecFrameStack stacked, inside or outside of the normaliser.
+
+    Raises:
+        ValueError: The model is none of these, or has an observation of another width.
+        ModuleNotFoundError: torch is not installed.
     """
     with require_extra("train", "networks come from stable-baselines3"):
         from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -67,7 +70,7 @@ def convert_sb3_policy(model: Any, normaliser: Any = None, history: int = 1) -> 
 
 
 class _Actor(NamedTuple):
-    """What acts in a policy: layers, whether tanh follows, features extractor, recurrent layers."""
+    """The actor of a policy: layers, whether tanh follows, features extractor, recurrent layers."""
 
     layers: list[Any]
     squashed: bool
@@ -107,12 +110,19 @@ ACTORS: dict[str, Callable[[Any], _Actor]] = {
     "sb3_contrib.common.recurrent.policies.RecurrentActorCriticPolicy": _find_recurrent_actor,
     f"{__package__}.gradient.GruPolicy": _find_gru_actor,
 }
-"""The policies whose actor is known: "MlpPolicy" and "MlpLstmPolicy" of PPO, A2C, SAC, TD3, DDPG,
-TQC and RecurrentPPO, and ours. A subclass may compute anything and is none of them."""
+"""Readers of the known actors: "MlpPolicy" and "MlpLstmPolicy" of PPO, A2C, SAC, TD3, DDPG, TQC and
+RecurrentPPO, and `GruPolicy`. A subclass may compute anything and is none of them."""
 
 
 def find_actor_reader(kind: type) -> Callable[[Any], _Actor]:
-    """How the actor of this class of policy is found; ValueError for a class not in `ACTORS`."""
+    """Find the function that reads the actor of a class of policies.
+
+    Args:
+        kind: Class of the policy.
+
+    Raises:
+        ValueError: The class is not in `ACTORS`.
+    """
     name = f"{kind.__module__}.{kind.__qualname__}"
     if name not in ACTORS:
         known = ", ".join(path.rpartition(".")[2] for path in ACTORS)
@@ -121,7 +131,7 @@ def find_actor_reader(kind: type) -> Callable[[Any], _Actor]:
 
 
 def _convert_cells(module: Any) -> list[RecurrentCell]:
-    """The cells of torch's GRU or LSTM, none for a policy without them."""
+    """Convert the cells of torch's GRU or LSTM; none for a policy without them."""
     if module is None:
         return []
     if module.bidirectional or module.proj_size or module.batch_first or not module.bias:
@@ -140,7 +150,7 @@ def _to_array(parameter: Any) -> Any:
 
 
 def list_activations() -> dict[str, type]:
-    """Torch's classes of what bends between layers, by their names in a `Network`."""
+    """Collect torch's classes of activations, by their names in a `Network`."""
     from torch import nn
 
     kinds = nn.Tanh, nn.ReLU, nn.ELU, nn.LeakyReLU, nn.SiLU
@@ -148,7 +158,7 @@ def list_activations() -> dict[str, type]:
 
 
 def _convert_dense(layers: list[Any]) -> tuple[list[Any], list[Any], list[str], str]:
-    """(weights, biases, activations between, output) of a stack of linear layers."""
+    """Convert linear layers to weights, biases, activations between them, and the output's."""
     from torch import nn
 
     names = {kind: name for name, kind in list_activations().items()}
@@ -173,7 +183,7 @@ def _convert_dense(layers: list[Any]) -> tuple[list[Any], list[Any], list[str], 
 
 
 def _has_default_arguments(activation: Any) -> bool:
-    """Whether an activation has torch's default arguments."""
+    """Return whether an activation has torch's default arguments."""
     return getattr(activation, "alpha", 1.0) == 1.0 and (
         getattr(activation, "negative_slope", 0.01) == 0.01
     )
@@ -182,9 +192,12 @@ def _has_default_arguments(activation: Any) -> bool:
 def read_normalisation(
     normaliser: Any, n_inputs: int, history: int
 ) -> tuple[Any, Any, float | None]:
-    """(mean, scale, clip) of a VecNormalize or None, around the stack of frames or inside of it.
+    """Read mean, scale and clip of a VecNormalize, around the stack of frames or inside of it.
 
-    n_inputs: entries that the network reads, of all frames together. history: frames.
+    Args:
+        normaliser: VecNormalize or None.
+        n_inputs: Entries that the network reads, of all frames together.
+        history: Number of frames.
     """
     if normaliser is None or not normaliser.norm_obs:
         return np.zeros(n_inputs), np.ones(n_inputs), None

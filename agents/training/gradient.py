@@ -1,9 +1,9 @@
-"""Policies by the slope of the cost itself, through cars, actuators and late sensors.
+"""Policies by the gradient of the cost itself, through cars, actuators and late sensors.
 
-Many cars on tensors are driven for a window of control periods, and the mean cost rate is led back
-through all of it to the weights: truncated back-propagation through time. It is the short-horizon
-actor-critic (Xu et al., ICLR 2022) without its critic, which was no help in a first look, at other
-windows and step sizes than these (docs/training.md).
+Many cars on tensors are driven for a window of control periods, and the mean cost rate is
+propagated back through all of it to the weights: truncated back-propagation through time. It is
+the short-horizon actor-critic (Xu et al., ICLR 2022) without its critic. The critic did not help
+in a first look, at other windows and step sizes than these (docs/training.md).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,8 +25,13 @@ _MAX_GRADIENT_NORM = 1.0  # norm of a step's gradient
 
 
 class TrainingSource(NamedTuple):
-    """What a training drives: a `DeviceVectorEnv` with gradients that resets itself in the same
-    step; the seeds of its cars; what a car's reward is multiplied by."""
+    """The cars of a training.
+
+    Attributes:
+        cars: `DeviceVectorEnv` with gradients that resets itself in the same step.
+        seeds: Seeds of the cars.
+        reward_scale: Factor of each car's reward.
+    """
 
     cars: Any
     seeds: list[int]
@@ -36,7 +41,15 @@ class TrainingSource(NamedTuple):
 def make_source(
     task: TrainingTask, first: int, reward_scale: RewardScale, device: Any, compile: bool
 ) -> TrainingSource:
-    """A task's environments on tensors; first: seed of row 0."""
+    """Make a task's environments on tensors.
+
+    Args:
+        task: Task of the training.
+        first: Seed of row 0.
+        reward_scale: Factor of each car's reward.
+        device: torch's device.
+        compile: Whether to compile the step, as for `DeviceVectorEnv`.
+    """
     options: dict[str, Any] = {
         "device": device,
         "dtype": "float32",
@@ -51,7 +64,14 @@ def make_source(
 class GruPolicy(BasePolicy):
     """A GRU on standardised observations, and dense layers behind it.
 
-    cells: of the GRU. net_arch: sizes of the layers. The others are stable-baselines3's.
+    Args:
+        observation_space: Space of the observation.
+        action_space: Space of the action.
+        lr_schedule: Learning rate by the remaining fraction of the training.
+        cells: Cells of the GRU.
+        net_arch: Sizes of the dense layers.
+        features_extractor_class: Class before the GRU.
+        features_extractor_kwargs: Arguments of that class.
     """
 
     def __init__(
@@ -80,13 +100,22 @@ class GruPolicy(BasePolicy):
         self.optimizer = torch.optim.Adam(self.parameters(), lr_schedule(1.0), betas=(0.7, 0.95))
 
     def forward(self, observations: Any, state: Any) -> tuple[Any, Any]:
-        """(actions (N, m), the next state (N, cells)) of observations (N, k)."""
+        """Compute actions (N, m) and the next state (N, cells).
+
+        Args:
+            observations: Observations, shape (N, k).
+            state: State, shape (N, cells).
+        """
         z = self.features_extractor(observations)
         _, after = self.cell(z[None], state[None])
         return self.layers(after[0]), after[0]
 
     def begin(self, count: int) -> Any:
-        """The state of so many cars at the start of an episode."""
+        """Make the state of an episode's start, zeros of shape (count, cells).
+
+        Args:
+            count: Number of cars.
+        """
         return torch.zeros(count, self.cell.hidden_size, device=self.device)
 
     def predict(
@@ -96,7 +125,14 @@ class GruPolicy(BasePolicy):
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Any, Any]:
-        """(actions within [-1, 1], the next state), as stable-baselines3's; nothing is drawn."""
+        """Compute deterministic actions within [-1, 1] and the next state.
+
+        Args:
+            observation: Observation, shape (k,) or (N, k).
+            state: State from the last call; None at the start.
+            episode_start: Rows whose state is cleared, shape (N,).
+            deterministic: Without effect.
+        """
         obs_tensor, is_single = self.obs_to_tensor(observation)[0], np.ndim(observation) == 1
         before = self.begin(len(obs_tensor)) if state is None else torch.as_tensor(state[0])
         if state is not None and episode_start is not None:
@@ -120,11 +156,26 @@ class GruPolicy(BasePolicy):
 
 
 class AnalyticPolicyGradient(BaseAlgorithm):
-    """Stable-baselines3's form of an algorithm that follows the cost's slope.
+    """The algorithm that follows the cost's gradient, in stable-baselines3's form.
 
-    policy: "GruPolicy". env: its spaces count. learning_rate: of Adam. n_steps: control periods of
-    a window. compile: of `DeviceVectorEnv`. source: called with `device` and `compile`, makes what
-    is driven; not needed to load a zip. The others are stable-baselines3's.
+    Args:
+        policy: "GruPolicy", or a class.
+        env: Env whose spaces count.
+        learning_rate: Learning rate of Adam.
+        n_steps: Control periods of a window.
+        compile: Whether to compile the step, as for `DeviceVectorEnv`.
+        source: Function that makes the cars, called with `device` and `compile`; not needed to load
+            a zip.
+        stats_window_size: As in stable-baselines3.
+        tensorboard_log: As in stable-baselines3.
+        policy_kwargs: Arguments of the policy.
+        verbose: As in stable-baselines3.
+        seed: Seed of weights.
+        device: torch's device.
+        _init_setup_model: As in stable-baselines3.
+
+    Raises:
+        ValueError: `n_steps` is below 1.
     """
 
     policy_aliases = {"GruPolicy": GruPolicy}  # noqa: RUF012  as in stable-baselines3
@@ -180,10 +231,19 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> "AnalyticPolicyGradient":
-        """Windows until so many steps are driven, as of every algorithm.
+        """Train until a number of steps, window by window.
 
-        Raises ValueError without a source, FloatingPointError, with the step, where the slope is
-        not finite.
+        Args:
+            total_timesteps: Steps of all cars.
+            callback: Callback of stable-baselines3.
+            log_interval: Windows between two logs.
+            tb_log_name: Name of the run in TensorBoard.
+            reset_num_timesteps: Whether the steps count from 0.
+            progress_bar: Whether to show a bar.
+
+        Raises:
+            ValueError: There is no source.
+            FloatingPointError: The gradient is not finite; the message has the step.
         """
         if self.source is None:
             raise ValueError("Gradient drives cars on tensors: it needs their source")
@@ -216,7 +276,7 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         return self
 
     def _update_weights(self, mean_cost: Any) -> None:
-        """One step of the weights down the slope of what a window cost."""
+        """Update the weights by one step down the gradient of a window's cost."""
         optimizer = self.policy.optimizer
         self._update_learning_rate(optimizer)
         optimizer.zero_grad()
@@ -238,10 +298,18 @@ class AnalyticPolicyGradient(BaseAlgorithm):
 def unroll_window(
     policy: Any, cars: Any, obs: Any, state: Any, reward_scale: RewardScale, steps: int
 ) -> tuple[Any, Any, Any]:
-    """(mean of the weighted costs of so many steps, with its graph, last observations and state).
+    """Drive cars for a window, and keep the graph of their mean weighted cost.
 
-    policy: a `GruPolicy`. cars, rates: of a `TrainingSource`. obs: (N, k). state: (N, cells), zero
-    where an episode begins.
+    Args:
+        policy: `GruPolicy`.
+        cars: Cars of a `TrainingSource`.
+        obs: Observations, shape (N, k).
+        state: State, shape (N, cells), zero where an episode begins.
+        reward_scale: Factor of each car's reward.
+        steps: Control periods of the window.
+
+    Returns:
+        Mean cost with its graph, last observations, and last state.
     """
     mean_cost = torch.zeros((), dtype=cars.dtype, device=cars.device)
     for _ in range(steps):

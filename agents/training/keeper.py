@@ -1,4 +1,4 @@
-"""What is done between rollouts: evaluations on other seeds, the best policy, a checkpoint."""
+"""The callback of a training: evaluations on other seeds, the best policy, a checkpoint."""
 
 import json
 import time
@@ -51,20 +51,30 @@ _SCALING_ENVS = 64  # environments whose observations make the scaling
 _WEIGHT_SEEDS, _EVALUATION_SEEDS, _SCALING_SEEDS, _TRAINING_SEEDS = 2**63, 2**64, 2**65, 2**66
 _SEEDS_PER_TRAINING = (
     2**40
-)  # seeds of a training: it takes those from its steps on when it starts or goes on
+)  # seeds of a training: a start or resumption takes those from its steps on
 
 
 def make_evaluation_seeds(episodes: int) -> list[int]:
-    """Of the episodes of an evaluation."""
+    """Make the seeds of an evaluation.
+
+    Args:
+        episodes: Number of seeds.
+    """
     return [_EVALUATION_SEEDS + i for i in range(episodes)]
 
 
 class Evaluation(NamedTuple):
-    """Of the deterministic policy: mean cost, its share of the uncontrolled car's on these seeds.
+    """An evaluation of the deterministic policy.
 
-    Of a mixture the share is the mean of its scenarios' shares, and the cost the same share of
-    their mean uncontrolled one. cpu_seconds: of the training up to here, evaluations apart.
-    of_start: geometric mean of the costs over those of the policy that the training began with.
+    For a mixture `of_none` is the mean over scenarios, and `cost` is that times their mean
+    uncontrolled cost.
+
+    Attributes:
+        steps: Steps of the training so far.
+        cpu_seconds: CPU time of the training so far, without evaluations (s).
+        cost: Mean cost J.
+        of_none: Cost as a fraction of the uncontrolled car's on these seeds.
+        of_start: Geometric mean of costs over those of the initial policy, None without one.
     """
 
     steps: int
@@ -75,13 +85,18 @@ class Evaluation(NamedTuple):
 
     @property
     def criterion(self) -> float:
-        """By which the best one is chosen."""
+        """Number whose minimum chooses the best evaluation."""
         return self.cost if self.of_start is None else self.of_start
 
 
 class Progress(NamedTuple):
-    """Where a training stands: its newest episodes' mean cost with exploration (None: no episode
-    ended yet), and its evaluations."""
+    """The progress of a training.
+
+    Attributes:
+        steps: Steps so far.
+        cost: Mean cost of the newest episodes with exploration; None before the first one's end.
+        evaluations: Evaluations so far.
+    """
 
     steps: int
     cost: float | None
@@ -90,13 +105,18 @@ class Progress(NamedTuple):
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What may be another when a training goes on.
+    """The options of a run, which may change when a training resumes.
 
-    eval_freq: steps from one evaluation to the next. device: torch's name. tensorboard_log: a
-    folder for TensorBoard. report: called after every rollout. command: for the policy's card.
-    track: a project of Weights & Biases, "" for none.
+    Attributes:
+        eval_freq: Steps between two evaluations.
+        device: torch's name of the device.
+        tensorboard_log: Folder for TensorBoard.
+        report: Function that is called after every rollout.
+        command: Command line, for the policy's card.
+        track: Project of Weights & Biases, "" for none.
 
-    Raises ValueError for evaluations that are less than a step apart, or no device of torch's.
+    Raises:
+        ValueError: `eval_freq` is below 1, or the device is none of torch's.
     """
 
     eval_freq: int = 250_000
@@ -114,8 +134,14 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """What a training was told besides its task: steps, those between two evaluations, the command
-    for the policy's card, the name of the policy that it began with."""
+    """The record of a run beside its task.
+
+    Attributes:
+        steps: Steps of the whole training.
+        eval_freq: Steps between two evaluations.
+        command: Command line, for the policy's card.
+        begun_with: Name of the initial policy, "" for none.
+    """
 
     steps: int
     eval_freq: int
@@ -124,11 +150,15 @@ class RunRecord:
 
 
 class EvalCallback(BaseCallback):
-    """Builds the model; evaluates it between rollouts and keeps what is needed to go on.
+    """Build the model, evaluate it between rollouts, and save what a resumed training needs.
 
-    checkpoint: the state of one, None for a new training. steps: as many as it is to have.
-    initial_policy: the policy that the training began with: each drive weighs by what it pays
-    there.
+    Args:
+        task: Task of the training.
+        folder: Folder of the training.
+        checkpoint: State of a checkpoint, None for a new training.
+        run_options: Options of this run.
+        steps: Steps of the whole training.
+        initial_policy: Policy that the training starts from; its costs weigh the drives.
     """
 
     def __init__(
@@ -176,8 +206,13 @@ class EvalCallback(BaseCallback):
         trained_agent: str | Path | None = None,
         trust: bool = False,
     ) -> BaseAlgorithm:
-        """The model, new, of the checkpoint, a zip or a policy, with the environments it is
-        trained on."""
+        """Build the model, new or of the checkpoint, a zip or a policy, with its environments.
+
+        Args:
+            checkpoint: State of a checkpoint, None for a new training.
+            trained_agent: Zip to start from, None for none.
+            trust: Whether a pickle of VecNormalize beside the zip may be read.
+        """
         task, run_options = self.task, self.run_options
         start = None
         if trained_agent is not None:
@@ -227,7 +262,7 @@ class EvalCallback(BaseCallback):
         return model
 
     def _make_reward_scale(self, env: VecEnv, first: int, steps: int) -> RewardScale:
-        """What is paid for the cars' costs, from this seed and step on."""
+        """Make the scale of the rewards, from this seed and step on."""
         if self.warm_start is not None:
             n_steps = -(-(self.run_record.steps - steps) // env.num_envs)
             return RewardScale(measure_reward_scale(self.warm_start.driver, env, first, n_steps))
@@ -235,7 +270,7 @@ class EvalCallback(BaseCallback):
         return RewardScale(rate[:, None].tolist())
 
     def _average_scenarios(self, costs: Array) -> Array:
-        """Of the evaluation's drives of each scenario, (k,)."""
+        """Average the costs of an evaluation by scenario, shape (k,)."""
         k = max(len(self.task.scenarios), 1)
         return np.array([costs[i::k].mean() for i in range(k)])
 
@@ -256,7 +291,11 @@ class EvalCallback(BaseCallback):
             self.run_options.report(progress)
 
     def check(self) -> None:
-        """FloatingPointError where the weights are not finite."""
+        """Check that the weights are finite.
+
+        Raises:
+            FloatingPointError: A weight is not finite.
+        """
         if not all(
             bool(parameter.isfinite().all()) for parameter in self.model.policy.parameters()
         ):
@@ -266,7 +305,7 @@ class EvalCallback(BaseCallback):
             )
 
     def evaluate(self) -> None:
-        """Cost of the policy as it is; the best one so far and the checkpoint are written."""
+        """Evaluate the policy, and write the checkpoint and the best policy so far."""
         self.check()
         self.spent += time.process_time() - self.since
         costs, lengths = evaluate_episodes(self.eval_env, self.model, self.seeds)

@@ -1,10 +1,10 @@
-"""What a network reads instead of SI units: standardised observations.
+"""The input of a network instead of SI units: standardised observations.
 
-Scales and mixing are measured once, before the training, and stay: they are part of the network,
-which reads plain observations. What varies little while its parts vary much, as course less
-heading, is what a policy needs; mixed, it varies as much as they do. Whoever follows the cost's
-slope needs that; PPO behind a filter did no better with it (three seeds: 0.97, 1.05, 1.09 of the
-cost without).
+Scales and mixing are measured once, before the training, and are part of the network, which
+reads plain observations. Differences that vary little while their parts vary much, such as
+course less heading, matter to a policy; mixing scales them up. Algorithms that follow the cost's
+gradient need that. PPO behind a filter did no better with it (three seeds: 0.97, 1.05, 1.09 of
+the cost without).
 """
 
 import math
@@ -38,8 +38,12 @@ _CONSTANT = 1e-9  # what varies less is not read
 class Standardised(FlattenExtractor):
     """A network's first layer, which is not trained: clip((x - mean) scale, +-clip) mixing.
 
-    mean, scale: one number an entry of the observation; an entry of scale 0 is not read. clip: None
-    for none. mixing: (k, k), None for none.
+    Args:
+        observation_space: Space of the observation, of k entries.
+        mean: Mean of each entry.
+        scale: Factor of each entry; one of scale 0 is not read.
+        clip: Limit in standard deviations, None for none.
+        mixing: Mixing, shape (k, k), None for none.
     """
 
     def __init__(
@@ -63,14 +67,18 @@ class Standardised(FlattenExtractor):
 
     @property
     def numbers(self) -> tuple[Array, Array, float | None]:
-        """(mean, scale, clip) as they are used."""
+        """Mean, scale and clip in use."""
         mean, scale = (
             tensor.cpu().numpy().astype(np.float64) for tensor in (self.mean, self.scale)
         )
         return mean, scale, float(self.clip) if self.clip.isfinite() else None
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """(N, k) of observations (N, k)."""
+        """Standardise observations.
+
+        Args:
+            observations: Observations, shape (N, k).
+        """
         z = torch.clamp((observations - self.mean) * self.scale, -self.clip, self.clip)
         return z @ self.mixing
 
@@ -82,11 +90,17 @@ def measure_scaling(
     reads: Sequence[str] = (),
     mixed: bool = False,
 ) -> Scaling:
-    """Of each entry, under random actions of this standard deviation.
+    """Measure the scaling of each entry under random actions.
 
-    reads: names of the entries that are read, none for all. mixed: whether they are mixed, so that
-    under actions that are held for a while nothing is correlated. Raises ValueError for a name that
-    the observation has not, and where nothing of what is read varies.
+    Args:
+        env: Vector env.
+        spread: Standard deviation of the actions.
+        seed: Seed of actions and episodes.
+        reads: Entries that the network reads; empty: all.
+        mixed: Whether to whiten the entries under actions that are held for a while.
+
+    Raises:
+        ValueError: The observation lacks an entry of `reads`, or none of them varies.
     """
     names = [entry.name for entry in get_layout(env)]  # rows may believe in other nominal cars
     base: Any = env.unwrapped
@@ -117,7 +131,7 @@ def measure_scaling(
 def _collect_observations(
     env: VectorEnv[Any, Any, Any], spread: float, seed: int, period: float, decay: float
 ) -> Array:
-    """Observations (n, k) under noise, of which so much is kept from a step to the next."""
+    """Collect observations (n, k) under noise that decays by `decay` in each step."""
     rng, observations = np.random.default_rng(seed), []
     noise = np.zeros(env.action_space.shape or ())
     env.reset(seed=seed)

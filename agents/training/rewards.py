@@ -1,8 +1,8 @@
-"""What a policy is paid: its cost rate, so weighed that what counts alike in a score does so here.
+"""The reward of a policy: its cost rate, weighted so that drives count as they do in a score.
 
-The score compares logarithms of costs, and their slope is that of the cost over the cost. So the
-scenarios of a mixture weigh by what the uncontrolled car pays there, and where a training goes on
-from a policy each drive weighs by what that policy pays in the very same drive.
+The score compares logarithms of costs, whose derivative is that of the cost over the cost. So the
+scenarios of a mixture are weighted by the uncontrolled car's cost. Where a training starts from a
+policy, each drive is weighted by that policy's cost in the same drive.
 """
 
 from collections.abc import Sequence
@@ -26,13 +26,23 @@ _MIN_COST_SHARE = 0.05  # of the mean: a scenario that costs less uncontrolled w
 
 
 def compute_equal_weights(costs: Array) -> Array:
-    """Weights with which scenarios' costs (k,) are the same: dear ones would outweigh others."""
+    """Compute weights that make scenarios' costs equal, so that costly ones do not outweigh others.
+
+    Args:
+        costs: Mean costs of the scenarios, shape (k,).
+    """
     return np.asarray(costs.mean() / np.maximum(costs, _MIN_COST_SHARE * costs.mean()))
 
 
 def compute_scenario_weights(task: TrainingTask, first: int) -> Array:
-    """Of each scenario's costs, (k,), by what the uncontrolled car pays there in a control period;
-    one of a task without a mixture. first: of the seeds of those drives."""
+    """Compute each scenario's weight by the uncontrolled cost of a control period, shape (k,).
+
+    It is 1 for a task without a mixture.
+
+    Args:
+        task: Task of the training.
+        first: First seed of the uncontrolled drives.
+    """
     k = len(task.scenarios)
     if not k:
         return np.ones(1)
@@ -45,9 +55,14 @@ def compute_scenario_weights(task: TrainingTask, first: int) -> Array:
 
 
 class RewardScale:
-    """What each car's costs are multiplied by: `now` (N,) float32, another one from drive to drive.
+    """The factors of the cars' rewards, which change from drive to drive.
 
-    drive_scales: of each car's first, second, ... drive; the last one serves for all after it.
+    Args:
+        drive_scales: Factors of each car's first, second, ... drive; the last one serves for all
+            further drives.
+
+    Attributes:
+        now: Present factors, float32, shape (N,).
     """
 
     def __init__(self, drive_scales: Sequence[Sequence[float]]) -> None:
@@ -56,12 +71,16 @@ class RewardScale:
         self.begin()
 
     def begin(self) -> None:
-        """Every car is in its first drive."""
+        """Start every car's first drive."""
         self._drive[:] = 0
         self._update_scale(range(len(self._drive)))
 
     def start_next_drives(self, rows: npt.NDArray[np.bool_]) -> None:
-        """These cars, (N,), begin their next drive."""
+        """Start the next drive of some cars.
+
+        Args:
+            rows: Whether a car starts its next drive, shape (N,).
+        """
         if rows.any():
             chosen = np.flatnonzero(rows).tolist()
             self._drive[chosen] += 1
@@ -74,10 +93,13 @@ class RewardScale:
 
 
 def measure_reward_scale(agent: Any, env: VecEnv, seed: int, steps: int) -> list[list[float]]:
-    """`RewardScale` with which an agent is paid -1 in the mean of each drive.
+    """Measure the factors with which an agent's mean reward is -1 in each drive.
 
-    env: resets itself; what its cars meet does not depend on who drives. seed: of row 0. steps: of
-    each row; what a row drives later has the median of its drives.
+    Args:
+        agent: Agent, as for `iterate_steps`.
+        env: Env that resets itself, whose scenarios do not depend on the agent.
+        seed: Seed of row 0.
+        steps: Steps of each row; further drives have the median of the row's factors.
     """
     scales: list[list[float]] = [[] for _ in range(env.num_envs)]
     costs, lengths = np.zeros(env.num_envs), np.zeros(env.num_envs)
@@ -99,9 +121,13 @@ def measure_reward_scale(agent: Any, env: VecEnv, seed: int, steps: int) -> list
 
 
 class RewardScaleWrapper(VecEnvWrapper):
-    """Rewards times `RewardScale`: of the order of one, whatever the control period.
+    """Rewards times `RewardScale`: of the order of one for every control period.
 
     It stands outside of the monitor, which counts costs.
+
+    Args:
+        venv: Env of stable-baselines3.
+        reward_scale: Factors of the rewards.
     """
 
     def __init__(self, venv: VecEnv, reward_scale: RewardScale) -> None:
@@ -109,12 +135,12 @@ class RewardScaleWrapper(VecEnvWrapper):
         self.reward_scale = reward_scale
 
     def reset(self) -> Observations:
-        """The inner env's."""
+        """Reset the inner env and the factors."""
         self.reward_scale.begin()
         return np.asarray(self.venv.reset())
 
     def step_wait(self) -> Any:
-        """The inner env's, with other rewards."""
+        """Step the inner env and scale its rewards."""
         obs, rewards, dones, infos = self.venv.step_wait()
         scaled = rewards * self.reward_scale.now
         self.reward_scale.start_next_drives(dones)

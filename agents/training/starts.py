@@ -1,4 +1,4 @@
-"""What a training begins with: a zip of stable-baselines3, or a policy's file."""
+"""The warm start of a training: a zip of stable-baselines3, or a policy's file."""
 
 import math
 from collections.abc import Sequence
@@ -34,9 +34,15 @@ _GRU = [f"cell.{part}_l0" for part in ("weight_ih", "weight_hh", "bias_ih", "bia
 
 
 class WarmStart(NamedTuple):
-    """A zip or policy by its name: weights and optimisers, by their names in `get_parameters`, a
-    zip's further tensors, the scaling of what they read, and whether the rest of the model stays
-    as it is."""
+    """The tensors of a zip or policy for a new model.
+
+    Attributes:
+        name: Path of the zip or name of the policy.
+        parameters: Weights and optimisers by their names in `get_parameters`.
+        variables: Further tensors of a zip.
+        scaling: Scaling of the observations.
+        partial: Whether the rest of the model stays unchanged.
+    """
 
     name: str
     parameters: dict[str, Any]
@@ -46,10 +52,16 @@ class WarmStart(NamedTuple):
 
 
 def read_warm_start(path: str | Path, width: int, trust: bool = False) -> WarmStart:
-    """The tensors of a zip, which are read without running code of its maker's.
+    """Read the tensors of a zip without running code from it.
 
-    width: of the observation. trust: whether a pickle of VecNormalize beside the zip may be read.
-    Raises what `check_zip` raises; PermissionError for such a pickle without trust.
+    Args:
+        path: Path of the zip.
+        width: Entries of the observation.
+        trust: Whether a pickle of VecNormalize beside the zip may be read.
+
+    Raises:
+        PermissionError: There is such a pickle and no trust.
+        ValueError: The zip cannot be read, or as `check_zip`.
     """
     file = Path(path)
     check_zip(file)
@@ -85,13 +97,15 @@ def read_warm_start(path: str | Path, width: int, trust: bool = False) -> WarmSt
 
 
 def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
-    """The task of going on from a policy: its card's environment, filter and mixture, and settings
-    with its network's form.
+    """Make the task of training a policy further, from its card and its network's form.
 
-    fields: of `Task`, in place of the card's; but `env_options` come to the card's, with a scenario
-    instead of its mixture, and another estimator has no options of the card's.
+    Args:
+        policy: Policy to train further.
+        fields: Fields of `TrainingTask` that replace the card's. `env_options` add to the card's, a
+            scenario there replaces its mixture, and another estimator drops the card's options.
 
-    Raises ValueError for an algorithm that begins with no policy, or one of another form.
+    Raises:
+        ValueError: The algorithm cannot start from a policy, or from one of this form.
     """
     card, algo = policy.card, fields.get("algo", "ppo")
     options = dict(card.env_options) | fields.pop("env_options", {})
@@ -115,16 +129,24 @@ def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
 
 
 def resolve_settings(file: str | Path | None, algo: str, env_id: str, start: Any) -> Settings:
-    """Settings from a file, None for the package's own: of an environment, or, where start is a
-    policy, of going on from it, with its form. Raises as `read_settings` and
-    `make_finetune_task`."""
+    """Resolve the settings of an environment, or of training a policy further.
+
+    Args:
+        file: File of settings; None: the package's own.
+        algo: Name of the algorithm.
+        env_id: Id of the env.
+        start: Policy to train further, or anything else for a new training.
+
+    Raises:
+        ValueError: As `read_settings` and `make_finetune_task`.
+    """
     if not isinstance(start, Policy):
         return read_settings(algo, env_id, file)
     return _add_policy_form(read_settings(algo, _choose_entry(start), file), start, algo)
 
 
 def _choose_entry(policy: Policy) -> str:
-    """The settings of going on from it."""
+    """Choose the settings' entry for training a policy further."""
     return (
         WARM_START_TRACES_ENTRY
         if MovingAverages.kind in [cell.kind for cell in policy.network.cells]
@@ -138,7 +160,7 @@ def _add_policy_form(settings: Settings, policy: Policy, algo: str) -> Settings:
 
 
 def _get_policy_form(policy: Policy, algo: str) -> dict[str, Any]:
-    """The `policy_kwargs` of a model whose actor is a policy's network."""
+    """Get the `policy_kwargs` of a model whose actor is a policy's network."""
     network, on_tensors = policy.network, get_algorithm(algo).on_tensors
     kinds = [cell.kind for cell in network.cells]
     if algo != "ppo" and not on_tensors:
@@ -162,10 +184,15 @@ def _get_policy_form(policy: Policy, algo: str) -> dict[str, Any]:
 def make_warm_start(
     policy: Policy, task: TrainingTask, layout: Sequence[ObservationEntry]
 ) -> WarmStart:
-    """What the actor of a task's model begins with; its critic, if it has one, stays as it is.
+    """Make the warm start of a task's actor from a policy; a critic stays unchanged.
 
-    layout: of the task's observation.
-    Raises ValueError for a policy of another form than the settings', or another observation.
+    Args:
+        policy: Policy to train further.
+        task: Task of the training.
+        layout: Entries of the task's observation.
+
+    Raises:
+        ValueError: The policy has another form than the settings, or another observation.
     """
     network, policy_entries = policy.network, [name for name, _ in policy.card.observation]
     names = [entry.name for entry in layout]
@@ -198,7 +225,15 @@ def make_warm_start(
 
 
 def load_warm_start(start: WarmStart, model: Any) -> None:
-    """Give a model what it starts with; ValueError where that is of another network."""
+    """Load a warm start into a model.
+
+    Args:
+        start: Tensors to load.
+        model: Model of stable-baselines3.
+
+    Raises:
+        ValueError: The tensors are of another network.
+    """
     unchanged = {
         name: x
         for name, x in model.get_parameters()["policy"].items()
@@ -219,7 +254,11 @@ def load_warm_start(start: WarmStart, model: Any) -> None:
 
 
 class NetworkAgent:
-    """A network at the wheel, which reads its observation as it is: rows may be of any cars."""
+    """A network as an agent on its plain observation; rows may be of any cars.
+
+    Args:
+        network: Network that computes the action.
+    """
 
     def __init__(self, network: Network) -> None:
         self.network = network
@@ -227,7 +266,17 @@ class NetworkAgent:
     def predict(
         self, obs: Any, state: Any = None, start: Any = None, deterministic: bool = True
     ) -> tuple[Any, Any]:
-        """As stable-baselines3's: actions (N, m) within [-1, 1], and the next state."""
+        """Compute actions within [-1, 1], with the signature of stable-baselines3.
+
+        Args:
+            obs: Observations, shape (N, k).
+            state: Memory, shape (N, memory); None at the start.
+            start: Rows whose memory is cleared, shape (N,).
+            deterministic: Without effect.
+
+        Returns:
+            Actions (N, m) and the next state.
+        """
         memory = np.zeros((len(obs), self.network.memory)) if state is None else state.copy()
         if start is not None:
             memory[np.asarray(start, np.bool_)] = 0.0
@@ -236,12 +285,23 @@ class NetworkAgent:
 
 
 class PolicyWarmStart:
-    """A policy that a training goes on from, and how.
+    """The warm start of a training from a policy.
 
-    start: of the model; driver: at the wheel as the policy is. PPO has no memory: traces, which
-    stay as they are, are part of its environments, mixed as the policy's own drives show them.
+    PPO has no memory: moving averages stay unchanged as part of its environments, whitened by the
+    policy's own drives.
 
-    env: of the task, without them. seed: of those drives. Raises what `make_warm_start` raises.
+    Args:
+        policy: Policy to train further.
+        task: Task of the training.
+        env: Vector env of the task, without moving averages.
+        seed: Seed of the drives.
+
+    Attributes:
+        start: Warm start of the model.
+        driver: Agent that drives as the policy does.
+
+    Raises:
+        ValueError: As `make_warm_start`.
     """
 
     def __init__(
@@ -263,11 +323,19 @@ class PolicyWarmStart:
             self.driver = NetworkAgent(mixed.dense)
 
     def wrap_env(self, env: VectorEnv[Any, Any, Any]) -> VectorEnv[Any, Any, Any]:
-        """A vector env as the model sees it."""
+        """Wrap a vector env so that it has the model's observation.
+
+        Args:
+            env: Vector env of the task.
+        """
         return MemoryObservation(env, self._network, self._mixing) if self._mixing else env
 
     def merge_network(self, network: Network) -> Network:
-        """The network of plain observations, of the model's."""
+        """Merge a model's network with the policy's memory, for plain observations.
+
+        Args:
+            network: Network of the model.
+        """
         return (
             self._network.replace_dense(self._mixing.adapt_to_plain(network))
             if self._mixing

@@ -1,6 +1,6 @@
 """The student of a distillation: its network, and one round of learning.
 
-The loss is what the error of an action adds to the cost of the rest of the drive, by the Riccati
+The loss is what an action's error adds to the cost of the rest of the drive, by the Riccati
 matrix of the teacher's design, over the cost of the episode: the score's logarithm, linearised.
 """
 
@@ -26,25 +26,30 @@ WINDOW = 50  # steps through which the gradient goes back in time
 SAMPLES = 512  # steps of a batch without memory
 LAST_ROUND_FACTOR = 3  # times as many epochs in the last round
 Batch = tuple[Any, Any, Any, Any, Any, bool]
-"""Mixed observations (B, T, k), labels (B, T, m), what is told (B, T, q), weights (B, T),
+"""Mixed observations (B, T, k), labels (B, T, m), privileged inputs (B, T, q), weights (B, T),
 curvatures (B, m, m), and whether it begins the episodes."""
 
 
 @dataclass(frozen=True)
 class DistillConfig:
-    """How a student learns.
+    """The configuration of a student and its training.
 
-    rounds: of driving and learning, the first one with the teacher at the wheel. epochs: passes
-    over all drives in a round, `LAST_ROUND_FACTOR` times as many in the last one. cells: of a GRU;
-    traces: bent units of `MovingAverages`; neither for a student without memory. hidden: sizes of
-    the dense layers.
-    learning_rate: of Adam, falling to a fiftieth in each round. noise: largest standard deviation
-    of what shakes the teacher's actions. seed: of weights and episodes. batch: episodes, for a
-    student with memory. told: how much the squared errors count of what a student with memory has
-    to say, all that the teacher reads and it does not see, in standard deviations, where the errors
-    of doing nothing count 1.
+    Attributes:
+        rounds: Rounds of driving and learning; in the first one the teacher drives.
+        epochs: Passes over all drives in a round, `LAST_ROUND_FACTOR` times as many in the last
+            one.
+        cells: Cells of a GRU, 0 for none.
+        hidden: Sizes of the dense layers.
+        learning_rate: Learning rate of Adam, which falls to a fiftieth in each round.
+        noise: Largest standard deviation of the noise on the teacher's actions.
+        seed: Seed of weights and episodes.
+        batch: Episodes of a batch, for a student with memory.
+        told: Weight of the auxiliary loss: squared errors, in standard deviations, of the teacher's
+            inputs that a student with memory does not see. The loss of zero actions counts 1.
+        traces: SiLU units of `MovingAverages`, 0 for none.
 
-    Raises ValueError for a number out of range, cells and traces, or something to tell without.
+    Raises:
+        ValueError: A number is out of range, there are cells and traces, or `told` without memory.
     """
 
     rounds: int = 7
@@ -72,22 +77,26 @@ class DistillConfig:
             raise ValueError("a student without memory has nothing to say: told is for those with")
 
     def describe(self) -> dict[str, Any]:
-        """All numbers but the seed, in JSON types."""
+        """Collect all numbers but the seed, in JSON types."""
         numbers = asdict(self) | {"hidden": list(self.hidden)}
         del numbers["seed"]
         return numbers
 
     @property
     def window(self) -> int:
-        """Steps through which the gradient goes back in time; through traces all of them."""
+        """Steps of truncated back-propagation; with traces all of them."""
         return sys.maxsize if self.traces else WINDOW
 
 
 class Student(nn.Module):
-    """A GRU or traces, if there are any, and dense layers behind, on mixed observations.
+    """A GRU or moving averages, if there are any, and dense layers, on whitened observations.
 
-    n_privileged: so many more numbers, linear in what the cells, or behind traces the last layer
-    but one, hold, are of use in training alone.
+    Args:
+        inputs: Number of inputs.
+        width: Entries of an action.
+        config: Configuration of the student.
+        n_privileged: Outputs of the auxiliary head, linear in the cells or, with moving averages,
+            in the last hidden layer; they serve in training alone.
     """
 
     def __init__(
@@ -105,7 +114,12 @@ class Student(nn.Module):
         self.recurrent = bool(memory_size)
 
     def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
-        """(actions and what is told (B, T, m + q), the next state) of inputs (B, T, k)."""
+        """Compute actions and auxiliary outputs (B, T, m + q), and the next state.
+
+        Args:
+            z: Inputs, shape (B, T, k).
+            state: State from the last call; None at the start.
+        """
         memory = self.cell or self.traces
         if memory is not None:
             z, state = memory(z, state)
@@ -120,14 +134,23 @@ class Student(nn.Module):
         return torch.cat([self.dense[-1](z), *auxiliary], dim=-1), state
 
     def fit_whitening(self, drives: Sequence[Demonstrations], scaling: Scaling) -> None:
-        """Mix what traces hold plain, so that nothing of it is correlated on these drives."""
+        """Fit the whitening of the moving averages' linear part on drives.
+
+        Args:
+            drives: Demonstrations.
+            scaling: Scaling of the inputs.
+        """
         if self.traces is not None:
             self.traces.fit_whitening(
                 [(scaling.mix_inputs(demo.obs), demo.weights > 0.0) for demo in drives]
             )
 
     def network(self, scaling: Scaling) -> Network:
-        """The same function of plain observations, by NumPy."""
+        """Convert the student to a network of plain observations, by NumPy.
+
+        Args:
+            scaling: Scaling of the inputs.
+        """
         numbers = {name: value.detach().numpy().copy() for name, value in self.named_parameters()}
         names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
         first = "cell.weight_ih_l0" if self.cell else "dense.0.weight"
@@ -157,7 +180,7 @@ def _concatenate(parts: Sequence[Single]) -> Any:
 
 
 class _EpisodeBatches:
-    """Some episodes of a few lessons at once, cut into windows that the state goes through."""
+    """Batches of episodes, cut into windows through which the state is carried."""
 
     def __init__(
         self, drives: Sequence[Demonstrations], scaling: Scaling, config: DistillConfig
@@ -189,7 +212,7 @@ class _EpisodeBatches:
 
 
 class _StepBatches:
-    """`SAMPLES` single steps of all drives at once, as if each were an episode."""
+    """Batches of `SAMPLES` single steps of all drives, each like an episode."""
 
     def __init__(
         self, drives: Sequence[Demonstrations], scaling: Scaling, _: DistillConfig
@@ -219,10 +242,17 @@ def fit_model(
     config: DistillConfig,
     epochs: int,
 ) -> float:
-    """Train a model on drives; the loss of the last epoch. Raises FloatingPointError where it
-    diverges.
+    """Fit a model to drives, and return the loss of the last epoch.
 
-    model: gives actions and state as a `Student`; `recurrent` says whether steps belong together.
+    Args:
+        model: Network with the outputs of a `Student`; `recurrent` says whether it has memory.
+        drives: Demonstrations.
+        scaling: Scaling of the inputs.
+        config: Configuration of the training.
+        epochs: Passes over all drives.
+
+    Raises:
+        FloatingPointError: The loss is not finite.
     """
     optimiser = torch.optim.Adam(model.parameters(), config.learning_rate)
     batches = (_EpisodeBatches if model.recurrent else _StepBatches)(drives, scaling, config)

@@ -1,4 +1,4 @@
-"""What a training is of: it stays the same when it goes on."""
+"""The task of a training, which stays the same when the training resumes."""
 
 import itertools
 from dataclasses import dataclass, field
@@ -15,18 +15,24 @@ from .algorithms import Settings, check_settings, get_algorithm, read_settings
 
 @dataclass(frozen=True)
 class TrainingTask:
-    """What is trained: it stays the same when a training goes on.
+    """The task of a training, which stays the same when the training resumes.
 
-    env_id: of a native vector env. algo: a name of `ALGORITHMS`. estimator: of
-    `EstimateObservation`, "" for none, and estimator_options its other arguments. env_options: of
-    `gym.make`; JSON types. seed: of the weights, the episodes and the exploration. num_envs: side
-    by side, 0: as many as the settings say. scenarios: a mixture, which the environments have in
-    turn, each one for all its episodes. settings: of `read_settings`; empty: the package's own.
-    n_eval_envs: episodes of an evaluation, side by side. reads: names of the observation's entries
-    that the network reads, empty: all of them.
+    Attributes:
+        env_id: Id of a native vector env.
+        algo: Name in `ALGORITHMS`.
+        estimator: Estimator of `EstimateObservation`, "" for none.
+        env_options: Arguments of `gym.make`, in JSON types.
+        seed: Seed of the weights, the episodes and the exploration.
+        num_envs: Environments side by side; 0: the number in the settings.
+        scenarios: Mixture, of which each environment has one scenario for all its episodes.
+        estimator_options: Other arguments of `EstimateObservation`.
+        settings: Settings of `read_settings`; empty: the package's own.
+        n_eval_envs: Episodes of an evaluation, side by side.
+        reads: Entries of the observation that the network reads; empty: all.
 
-    Raises ValueError for an unknown algorithm, setting or scenario, a negative seed, no
-    environment, fewer of them than scenarios, or an estimator where cars are driven on tensors.
+    Raises:
+        ValueError: An algorithm, setting or scenario is unknown, the seed is negative, there is no
+            environment or fewer than scenarios, or an estimator is set with cars on tensors.
     """
 
     env_id: str = "sideslip/YawVision-v0"
@@ -73,28 +79,47 @@ class TrainingTask:
         return self.estimator_options | {"estimator": self.estimator} if self.estimator else None
 
     def options(self, num_envs: int) -> dict[str, Any]:
-        """Options of a vector env of so many rows."""
+        """Make the options of a vector env.
+
+        Args:
+            num_envs: Number of rows.
+        """
         if not self.scenarios:
             return self.env_options
         turns = itertools.islice(itertools.cycle(self.scenarios), num_envs)
         return self.env_options | {"scenario": list(turns)}
 
     def vector_env(self, num_envs: int) -> VectorEnv[Any, Any, Any]:
-        """Another vector env of the task, not the one that is trained on."""
+        """Make a vector env of the task, apart from the one of the training.
+
+        Args:
+            num_envs: Number of rows.
+        """
         options = self.options(num_envs)
         return make_native_env(self.env_id, num_envs, self.estimator_kwargs, options)
 
     def find_zoo_folder(self, logs: Path) -> Path:
-        """Where rl-baselines3-zoo would leave the next training of this kind; ValueError for an
-        algorithm that it has not."""
+        """Find the folder that rl-baselines3-zoo would use for the next training of this kind.
+
+        Args:
+            logs: Folder of all trainings.
+
+        Raises:
+            ValueError: The zoo does not have the algorithm.
+        """
         algorithm = get_algorithm(self.algo)
         if algorithm.on_tensors:
             raise ValueError(f"rl-baselines3-zoo has no {self.algo}: its folder is no use")
         return zoo.find_next_folder(logs, algorithm.zoo, self.env_id)
 
     def describe_for_zoo(self, folder: Path, steps: int, eval_freq: int) -> None:
-        """Make a folder of `find_zoo_folder` with what the zoo's `enjoy` reads; of a mixture it
-        drives the first."""
+        """Make a folder of `find_zoo_folder` with the files of the zoo's `enjoy`.
+
+        Args:
+            folder: Folder to make.
+            steps: Steps of the training.
+            eval_freq: Steps between two evaluations.
+        """
         first = {"scenario": self.scenarios[0]} if self.scenarios else {}
         arguments = {
             "algo": get_algorithm(self.algo).zoo,

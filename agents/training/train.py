@@ -1,9 +1,9 @@
 """Training of a policy: rollouts on the batch engine, evaluations on other seeds, a checkpoint.
 
-A training's folder holds `checkpoint.safetensors` (what `resume` needs), `policy.safetensors` (the
+A training's folder holds `checkpoint.safetensors` (for `resume`), `policy.safetensors` (the
 network of the best evaluation, with its card), `best_model.zip` (the same model in
 stable-baselines3's format), `curve.jsonl` (the evaluations), and `begun_with.safetensors` where it
-began with a policy.
+started from a policy.
 """
 
 from dataclasses import asdict, fields, replace
@@ -61,7 +61,7 @@ class TrainResult(NamedTuple):
 
     @property
     def best(self) -> Evaluation:
-        """The evaluation whose model is kept."""
+        """Evaluation whose model is saved."""
         return min(self.evaluations, key=lambda evaluation: evaluation.criterion)
 
 
@@ -74,19 +74,28 @@ def train(
     trained_agent: str | Path | Policy | None = None,
     trust: bool = False,
 ) -> TrainResult:
-    """Train up to a number of steps (rounded up to whole rollouts), in a folder.
+    """Train up to a number of steps in a folder.
 
-    resume: go on from the folder's checkpoint: weights, optimisers, step size, steps and
-    evaluations are those of the checkpoint, episodes are new; a replay buffer begins empty and is
-    filled as at the start, by `learning_starts` steps of random actions, before weights change.
-    trained_agent: a zip of stable-baselines3 whose weights a new training begins with; or, for
-    `ppo` and `gradient`, a `Policy` or its name (`make_finetune_task` makes its task). Each drive
-    then weighs by what the policy pays in it, and the best evaluation is that of the least
-    geometric mean over the policy's costs. trust: of `starts.start_of`.
+    A resumed training has weights, optimisers, step size, steps and evaluations of the checkpoint,
+    and new episodes. A replay buffer starts empty and fills by `learning_starts` steps of random
+    actions before weights change.
 
-    Raises ValueError where the folder holds another training, FileNotFoundError where there is
-    none to go on with, FloatingPointError, with the step, where weights are not finite any more
-    (the folder holds the last evaluation's), and what `make_vec_env` and `start_of` raise.
+    Args:
+        task: Task of the training.
+        steps: Number of steps, rounded up to whole rollouts.
+        folder: Folder of the training.
+        resume: Whether to resume from the folder's checkpoint.
+        run_options: Options of this run.
+        trained_agent: Zip of stable-baselines3 with the first weights; or, for `ppo` and
+            `gradient`, a `Policy` or its name (`make_finetune_task` makes its task). A policy's
+            costs weigh the drives, and the best evaluation has the least geometric mean over these
+            costs.
+        trust: Whether a pickle of VecNormalize beside the zip may be read.
+
+    Raises:
+        ValueError: The folder holds another training, or arguments contradict each other.
+        FileNotFoundError: There is no checkpoint to resume from.
+        FloatingPointError: Weights are not finite; the folder has those of the last evaluation.
     """
     chosen_options = run_options or RunOptions()
     if steps < 1:
@@ -134,9 +143,14 @@ def train(
 
 
 def load_initial_policy(folder: str | Path) -> Policy | None:
-    """The policy that a folder's training began with, None for another training.
+    """Load the policy that a folder's training started from, None for another training.
 
-    Raises as `read_task`, and FileNotFoundError where its copy is not in the folder any more.
+    Args:
+        folder: Folder of the training.
+
+    Raises:
+        FileNotFoundError: The copy of the policy is missing.
+        ValueError: As `read_task`.
     """
     name, file = read_run_record(folder).begun_with, Path(folder) / WARM_START_FILE
     if not name:
@@ -147,7 +161,7 @@ def load_initial_policy(folder: str | Path) -> Policy | None:
 
 
 def _resolve_initial_policy(folder: Path, resume: bool, agent: Any) -> Policy | None:
-    """The policy that a training began with; a copy of it stays in the folder."""
+    """Resolve the policy that a training starts from, and save a copy in the folder."""
     if resume:
         return load_initial_policy(folder)
     if not isinstance(agent, Policy):
@@ -158,16 +172,23 @@ def _resolve_initial_policy(folder: Path, resume: bool, agent: Any) -> Policy | 
 
 
 def read_run_record(folder: str | Path) -> RunRecord:
-    """Of a folder's checkpoint. Raises as `read_task`."""
+    """Read the run's record from a folder's checkpoint.
+
+    Args:
+        folder: Folder of the training.
+
+    Raises:
+        ValueError: As `read_task`.
+    """
     read_task(folder)
     path = Path(folder) / CHECKPOINT
     return from_json(RunRecord, read_state(path)["aim"], f"{path}: the aim")
 
 
 class _WandbCallback(BaseCallback):
-    """Hands what stable-baselines3 logs to a run of Weights & Biases.
+    """Write the log of stable-baselines3 to a run of Weights & Biases.
 
-    project, name: the run's. config: told to it. Raises ModuleNotFoundError without wandb.
+    project, name: of the run. config: its configuration. ModuleNotFoundError without wandb.
     """
 
     def __init__(self, project: str, name: str, config: dict[str, Any]) -> None:
@@ -190,7 +211,7 @@ class _WandbCallback(BaseCallback):
         return True
 
     def finish(self) -> None:
-        """End the run, if one began; the last evaluation comes after the training's end."""
+        """End the run, if there is one; the last evaluation comes after the training's end."""
         if self._run is not None:
             self._run.finish()
 
@@ -203,13 +224,19 @@ class _WandbWriter(KVWriter):
         self._run.log(dict(key_values), step=step)  # the logger empties its own
 
     def close(self) -> None:
-        """Nothing: the run ends with the training."""
+        """Do nothing: the run ends with the training."""
 
 
 def read_task(folder: str | Path, **arguments: Any) -> TrainingTask:
-    """The task of a folder's checkpoint; ValueError where an argument differs from it.
+    """Read the task of a folder's checkpoint.
 
-    Raises FileNotFoundError where there is no checkpoint, ValueError for one of another version.
+    Args:
+        folder: Folder of the training.
+        arguments: Fields of the task that must agree with it.
+
+    Raises:
+        FileNotFoundError: There is no checkpoint.
+        ValueError: A field differs, or the checkpoint is of another version.
     """
     path = Path(folder) / CHECKPOINT
     if not path.is_file():
@@ -240,7 +267,7 @@ def read_task(folder: str | Path, **arguments: Any) -> TrainingTask:
 
 
 def _prepare_folder(task: TrainingTask, folder: Path, resume: bool) -> dict[str, Any] | None:
-    """The checkpoint's state, None for a new training in a folder that is ready for it."""
+    """Return the checkpoint's state, or prepare the folder of a new training and return None."""
     if resume:
         read_task(folder, **asdict(task))
         return read_state(folder / CHECKPOINT)

@@ -1,7 +1,7 @@
-"""Zips of stable-baselines3 and sb3-contrib as policies of ours; reading one runs code.
+"""Zips of stable-baselines3 and sb3-contrib as policies; reading one can run code.
 
-A zip holds pickles, and what unpickles them does whatever their maker wrote. So nothing is read
-without `trust`, and `export_zip` writes a file that anybody can read without it.
+A zip holds pickles, and unpickling runs the code in them. So nothing is read without `trust`, and
+`export_zip` writes a file that is read without it.
 """
 
 import json
@@ -35,17 +35,24 @@ def policy_from_zip(
     normalise: str | Path | None = None,
     **about: Any,
 ) -> Policy:
-    """The deterministic actor of a stable-baselines3 zip, for the env that it was trained on.
-
-    env: single or vector; its observation names what the zip merely numbers. trust: whether code in
-    the zip may run. normalise: a pickle of the training's VecNormalize; default: NAME.pkl or
-    vecnormalize.pkl beside the zip, if there is one. about: fields of the policy's `Card`.
+    """Read the deterministic actor of a stable-baselines3 zip, for the env of its training.
 
     A policy trained on a VecFrameStack around the env has that many frames of history.
 
-    Raises FileNotFoundError where there is no file, PermissionError without trust, ValueError for a
-    file that is no such zip, a policy trained on another observation, or one that
-    `convert_sb3_policy` refuses, ModuleNotFoundError without stable-baselines3.
+    Args:
+        path: Path of the zip.
+        env: Env, single or vector, whose observation names the zip's numbered entries.
+        trust: Whether code in the zip may run.
+        normalise: Pickle of the training's VecNormalize; None: NAME.pkl or vecnormalize.pkl beside
+            the zip, if there is one.
+        about: Fields of the policy's `Card`.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        PermissionError: `trust` is False.
+        ValueError: The file is no such zip, its policy has another observation, or
+            `convert_sb3_policy` refuses it.
+        ModuleNotFoundError: stable-baselines3 is not installed.
     """
     file = Path(path)
     check_trusted(file, trust)
@@ -73,10 +80,21 @@ def export_zip(
     normalise: str | Path | None = None,
     command: str = "",
 ) -> Policy:
-    """Write a zip's actor as a policy's file, which runs no code where it is read.
+    """Export a zip's actor to a policy's file, which runs no code where it is read.
 
-    env_id, env_options, estimator: what it was trained on. command: for the card. Raises what
-    `policy_from_zip` and `save_policy` raise.
+    Args:
+        path: Path of the zip.
+        target: Path of the policy's file.
+        env_id: Id of the training's env.
+        env_options: Arguments of `gym.make` for that env.
+        estimator: Estimator of the training, "" for none.
+        trust: Whether code in the zip may run.
+        normalise: Pickle of VecNormalize, as for `policy_from_zip`.
+        command: Command line, for the card.
+
+    Raises:
+        ValueError: The target has another ending; or as `policy_from_zip` and `save_policy`.
+        PermissionError: `trust` is False.
     """
     check_trusted(Path(path), trust)
     if Path(target).suffix != SUFFIX:
@@ -93,7 +111,12 @@ def export_zip(
 
 
 def find_normaliser(path: Path, normalise: str | Path | None = None) -> Path | None:
-    """The pickle of a zip's VecNormalize: the argument, else one beside the zip, else None."""
+    """Find the pickle of a zip's VecNormalize: the argument, else one beside the zip, else None.
+
+    Args:
+        path: Path of the zip.
+        normalise: Path of the pickle, None to look for it.
+    """
     if normalise is not None:
         return Path(normalise)
     candidates = (
@@ -105,8 +128,16 @@ def find_normaliser(path: Path, normalise: str | Path | None = None) -> Path | N
 
 
 def check_trusted(file: Path, trust: bool) -> None:
-    """PermissionError for a zip that is to be unpickled without trust; raises what `check_zip`
-    does, too."""
+    """Check that a zip may be unpickled.
+
+    Args:
+        file: Path of the zip.
+        trust: Whether code in the zip may run.
+
+    Raises:
+        PermissionError: `trust` is False.
+        ValueError: As `check_zip`.
+    """
     check_zip(file)
     if not trust:
         raise PermissionError(
@@ -117,8 +148,15 @@ def check_trusted(file: Path, trust: bool) -> None:
 
 
 def check_zip(file: Path) -> None:
-    """What can be known of a file before anything in it is read: FileNotFoundError, ValueError for
-    what is no zip of stable-baselines3."""
+    """Check a zip by its list of members, before anything in it is read.
+
+    Args:
+        file: Path of the zip.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is no zip of stable-baselines3.
+    """
     if not file.is_file():
         raise FileNotFoundError(f"{file}: {'a folder' if file.is_dir() else 'no such file'}")
     try:
@@ -134,7 +172,7 @@ def check_zip(file: Path) -> None:
 
 
 def _read(file: Path) -> tuple[dict[str, Any], Any]:
-    """(what the zip holds about the model, the policy's weights); nothing else is unpickled."""
+    """Read the model's data and the policy's weights; nothing else is unpickled."""
     from .normalise import Standardised  # noqa: F401  first: it says which extra is missing
 
     from stable_baselines3.common.save_util import load_from_zip_file  # isort: skip
@@ -157,7 +195,7 @@ def _read(file: Path) -> tuple[dict[str, Any], Any]:
 
 
 def _build_policy(file: Path, content: dict[str, Any], weights: Any) -> Any:
-    """The policy with its weights, without the algorithm and its environments."""
+    """Build the policy with its weights, without the algorithm and its environments."""
     from stable_baselines3.common.policies import ActorCriticPolicy
 
     kind = content["policy_class"]
@@ -180,7 +218,15 @@ def _build_policy(file: Path, content: dict[str, Any], weights: Any) -> Any:
 
 
 def load_normaliser(file: Path) -> Any:
-    """A VecNormalize."""
+    """Load a VecNormalize from its pickle, which can run code.
+
+    Args:
+        file: Path of the pickle.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file holds no VecNormalize.
+    """
     from stable_baselines3.common.vec_env import VecNormalize
 
     if not file.is_file():
@@ -195,7 +241,7 @@ def load_normaliser(file: Path) -> Any:
 
 
 def _count_frames(file: Path, space: Any, layout: Sequence[ObservationEntry]) -> int:
-    """How many frames of the layout the policy takes; ValueError where it takes something else."""
+    """Count the layout's frames in the policy's observation; ValueError for another observation."""
     if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
         raise ValueError(f"{file} was trained on {space}, not on an observation of one dimension")
     frames, rest = divmod(space.shape[0], len(layout))
@@ -211,7 +257,7 @@ def _count_frames(file: Path, space: Any, layout: Sequence[ObservationEntry]) ->
 
 
 def _describe_matching_env(space: Any) -> str:
-    """The id of ours that has this observation, with the names, as far as there is one."""
+    """Describe the registered env that has this observation, if there is one."""
     for env_id in [name for name in gym.registry if name.startswith("sideslip/")]:
         try:
             layout = get_env_facts(gym.make(env_id)).layout

@@ -45,17 +45,22 @@ EMPTY_INFO = _EmptyInfo()
 class NativeVecEnv(VecEnv):
     """stable-baselines3's `VecEnv` over a `StabilityVectorEnv`, wrapped or bare.
 
-    What stable-baselines3 would get of its `DummyVecEnv` around single environments with the same
-    seeds, bit for bit, but for one thing: where no episode ends, `infos` holds one empty dict that
-    all rows share (`EMPTY_INFO`; it refuses to be written into, `infos` itself is a fresh list).
-    Where one ends, its row has the whole info of the last step, `terminal_observation` and
+    It equals stable-baselines3's `DummyVecEnv` around single environments with the same seeds, bit
+    for bit, but for one thing: where no episode ends, `infos` holds one empty dict that all rows
+    share (`EMPTY_INFO`; it refuses to be written into, `infos` itself is a fresh list). Where one
+    ends, its row has the whole info of the last step, `terminal_observation` and
     `TimeLimit.truncated`. `reset_infos` are those of each row's newest reset.
 
-    vector_env: with autoreset in the same step; `make_vec_env` builds one. `get_attr` reads what
-    `Row` tells of each row; `set_attr` keeps values for `get_attr`; `env_method` calls methods of
-    `Row`. `set_options` takes what `reset` of a single env does, for all rows or a list of them.
+    `get_attr` reads what `VecEnvRow` has of each row; `set_attr` stores values for `get_attr`;
+    `env_method` calls methods of `VecEnvRow`. `set_options` takes the options of a single env's
+    `reset`, for all rows or a list of them.
 
-    Raises TypeError for another kind of env, ValueError for another autoreset mode.
+    Args:
+        vector_env: Vector env with autoreset in the same step; `make_vec_env` builds one.
+
+    Raises:
+        TypeError: The env is of another kind.
+        ValueError: The env has another autoreset mode.
     """
 
     def __init__(self, vector_env: VectorEnv[Any, Any, Any]) -> None:
@@ -83,7 +88,7 @@ class NativeVecEnv(VecEnv):
 
     @property
     def spec(self) -> Any:
-        """Of the vector env, wrappers included."""
+        """Spec of the vector env, wrappers included."""
         return self.vector_env.spec
 
     def reset(self) -> Observations:
@@ -96,14 +101,21 @@ class NativeVecEnv(VecEnv):
         return np.asarray(obs)
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
-        """Take the actions (N, width); `step_wait` steps."""
+        """Store the actions for `step_wait`.
+
+        Args:
+            actions: Actions, shape (N, width).
+        """
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Hold each row's action for one control period.
+        """Apply each row's action for one control period.
 
-        Returns observations (N, k) and rewards (N,) as float32, dones (N,) and N infos.
-        Raises ValueError for actions of another shape or not finite, and steps nothing.
+        Returns:
+            Observations (N, k) and rewards (N,) as float32, dones (N,) and N infos.
+
+        Raises:
+            ValueError: The actions have another shape or are not finite; then no row steps.
         """
         actions, self._actions = self._actions, None
         obs, rewards, terminated, truncated, infos = self.vector_env.step(actions)
@@ -120,18 +132,22 @@ class NativeVecEnv(VecEnv):
         return obs, rewards.astype(np.float32), dones, row_infos
 
     def _store_infos(self, rows: Sequence[int], infos: Mapping[str, Any]) -> None:
-        """Remember the infos that the resets of these rows returned."""
+        """Store the infos that the resets of these rows returned."""
         reset_infos = {key: value for key, value in infos.items() if "final_" not in key}
         for i, info in zip(rows, _split_infos(reset_infos, rows), strict=True):
             self.reset_infos[i] = make_info(self._base.reports[i].tolist()) | info
 
     def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:
-        """A frame of each row, of render_mode="rgb_array"."""
+        """Get a frame of each row, with render_mode="rgb_array"."""
         frames: Any = self.vector_env.render()
         return frames or ()
 
     def render(self, mode: str | None = None) -> npt.NDArray[np.uint8] | None:
-        """All rows' frames as one; of render_mode="human" None, for `step` shows the first row."""
+        """Render all rows as one frame; None with render_mode="human", where `step` shows row 0.
+
+        Args:
+            mode: Passed to stable-baselines3, which warns where it differs from `render_mode`.
+        """
         return None if self.render_mode == "human" else super().render(mode)
 
     def close(self) -> None:
@@ -139,25 +155,57 @@ class NativeVecEnv(VecEnv):
         self.vector_env.close()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """What `Row` tells of each row; AttributeError for a name that is not among it."""
+        """Get an attribute of each row, as `VecEnvRow` has it.
+
+        Args:
+            attr_name: Name of the attribute.
+            indices: Rows, None for all.
+
+        Raises:
+            AttributeError: The rows do not have it.
+        """
         return [row.get_wrapper_attr(attr_name) for row in self._get_rows(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Keep a value beside the rows; AttributeError for a name that is the environment's."""
+        """Set a value beside each row, under a name that the env does not have.
+
+        Args:
+            attr_name: Name of the value.
+            value: Value for `get_attr`.
+            indices: Rows, None for all.
+
+        Raises:
+            AttributeError: The name is the env's.
+        """
         for row in self._get_rows(indices):
             row.set_wrapper_attr(attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of `Row` for each row; AttributeError for another."""
+        """Call a method of `VecEnvRow` for each row.
+
+        Args:
+            method_name: Name of the method.
+            method_args: Positional arguments.
+            indices: Rows, None for all.
+            method_kwargs: Keyword arguments.
+
+        Raises:
+            AttributeError: `VecEnvRow` has no such method.
+        """
         chosen = [row.get_wrapper_attr(method_name) for row in self._get_rows(indices)]
         return [method(*method_args, **method_kwargs) for method in chosen]
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Indices = None
     ) -> list[bool]:
-        """Whether the rows wear a wrapper: a single one's class stands for its vector twin."""
+        """Return for each row whether it has a wrapper or its vector twin.
+
+        Args:
+            wrapper_class: Class of a wrapper.
+            indices: Rows, None for all.
+        """
         return [row.is_wrapped(wrapper_class) for row in self._get_rows(indices)]
 
     def _get_rows(self, indices: Indices) -> list[VecEnvRow]:
@@ -174,15 +222,20 @@ def make_vec_env(
     info_keywords: Sequence[str] = (),
     wrapper_class: Wrapping | None = None,
 ) -> VecMonitor:
-    """As stable-baselines3's function of this name, on the native vector env.
+    """Make stable-baselines3's `VecEnv` on the native vector env, like its function of this name.
 
-    seed: of row 0; row i gets seed + i at the first reset. estimator: a name, or arguments of
-    `EstimateObservation`. env_kwargs: of the environment. monitor_file: a CSV file of episodes,
-    with the `info_keywords` of their last step. wrapper_class: called with the native vector env,
-    its estimator around it, gives what is bridged.
+    Args:
+        env_id: Id of an env with a native vector env.
+        num_envs: Number of rows.
+        seed: Seed of row 0; row i gets seed + i at the first reset.
+        estimator: Name of an estimator, or arguments of `EstimateObservation`.
+        env_kwargs: Arguments of the environment.
+        monitor_file: CSV file of episodes.
+        info_keywords: Keys of the last step's info that go into that file.
+        wrapper_class: Called with the native vector env in its estimator; returns what is bridged.
 
-    Raises ValueError for an id without a native vector env, and what `gym.make_vec` and
-    `EstimateObservation` raise.
+    Raises:
+        ValueError: The id has no native vector env; or as `gym.make_vec` and `EstimateObservation`.
     """
     env = make_native_env(env_id, num_envs, estimator, env_kwargs)
     bridge = NativeVecEnv(env if wrapper_class is None else wrapper_class(env))
@@ -197,7 +250,17 @@ def make_native_env(
     estimator: str | Mapping[str, Any] | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
 ) -> VectorEnv[Any, Any, Any]:
-    """What `make_vec_env` bridges: a vector env, with its estimator around it; the same errors."""
+    """Make the vector env that `make_vec_env` bridges, with its estimator around it.
+
+    Args:
+        env_id: Id of an env with a native vector env.
+        num_envs: Number of rows.
+        estimator: Name of an estimator, or arguments of `EstimateObservation`.
+        env_kwargs: Arguments of the environment.
+
+    Raises:
+        ValueError: As `make_vec_env`.
+    """
     entry = gym.spec(env_id).vector_entry_point
     kind = load_env_creator(entry) if isinstance(entry, str) else entry
     if not (isinstance(kind, type) and issubclass(kind, StabilityVectorEnv)):
@@ -216,7 +279,7 @@ def make_native_env(
 
 
 def _split_infos(infos: Mapping[str, Any], rows: Sequence[int]) -> list[dict[str, Any]]:
-    """A vector env's infos of some rows, as the single env's infos."""
+    """Split a vector env's infos of some rows into the single envs' infos."""
     singles: list[dict[str, Any]] = [{} for _ in rows]
     for key, column in infos.items():
         if not key.startswith("_"):
@@ -228,6 +291,6 @@ def _split_infos(infos: Mapping[str, Any], rows: Sequence[int]) -> list[dict[str
 
 
 def _merge_options(options: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """The rows' options as the vector env takes them, None where there are none."""
+    """Merge the rows' options into those of the vector env, None where there are none."""
     names = dict.fromkeys(name for row_options in options for name in row_options)
     return {name: [row_options.get(name) for row_options in options] for name in names} or None

@@ -29,10 +29,14 @@ _TWINS: dict[type, type] = {
 
 
 class VecEnvRow:
-    """Row i of a vector env: its attributes are those of the single env of the same name.
+    """One row of a vector env, with the attributes of the single env under the same names.
 
-    Attributes: those of `_ROW_ATTRIBUTES`, `_SHARED_ATTRIBUTES` and `_SPACES`, the methods, and
-    what was set here.
+    It has those of `_ROW_ATTRIBUTES`, `_SHARED_ATTRIBUTES` and `_SPACES`, the methods, and values
+    set here.
+
+    Args:
+        env: Vector env, wrapped or bare.
+        i: Index of the row.
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any], i: int) -> None:
@@ -40,7 +44,7 @@ class VecEnvRow:
         self._set: dict[str, Any] = {}
 
     def _iterate_layers(self) -> Iterator[VectorEnv[Any, Any, Any]]:
-        """From the outermost to the bare vector env."""
+        """Iterate from the outermost wrapper to the bare vector env."""
         layer = self._env
         while isinstance(layer, VectorWrapper):
             yield layer
@@ -48,7 +52,14 @@ class VecEnvRow:
         yield layer
 
     def get_wrapper_attr(self, name: str) -> Any:
-        """An attribute of this row, of the outermost layer that has it; or AttributeError."""
+        """Get an attribute of this row from the outermost layer that has it.
+
+        Args:
+            name: Name of the attribute.
+
+        Raises:
+            AttributeError: No layer has it.
+        """
         if name in self._set:
             return self._set[name]
         if name in _METHODS:
@@ -66,7 +77,11 @@ class VecEnvRow:
         return Motion(*value[self._i].tolist()) if name == "motion" else value[self._i]
 
     def has_wrapper_attr(self, name: str) -> bool:
-        """Whether `get_wrapper_attr` would find it."""
+        """Return whether `get_wrapper_attr` finds an attribute.
+
+        Args:
+            name: Name of the attribute.
+        """
         try:
             self.get_wrapper_attr(name)
         except AttributeError:
@@ -74,7 +89,16 @@ class VecEnvRow:
         return True
 
     def set_wrapper_attr(self, name: str, value: Any, **_: Any) -> None:
-        """Keep a value under a name that the environment does not have; else AttributeError."""
+        """Set a value beside the env, under a name that the env does not have.
+
+        Args:
+            name: Name of the value.
+            value: Value for `get_wrapper_attr`.
+            _: Without effect.
+
+        Raises:
+            AttributeError: The name is the env's.
+        """
         if name not in self._set and self.has_wrapper_attr(name):
             raise AttributeError(
                 f"{name!r} is the environment's and is not set from outside; options of reset "
@@ -85,7 +109,15 @@ class VecEnvRow:
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start a new episode in this row alone; its observation (k,) and info."""
+        """Start a new episode in this row alone.
+
+        Args:
+            seed: Seed of the row.
+            options: Options of the reset.
+
+        Returns:
+            Observation of shape (k,), and info.
+        """
         mask = np.arange(self._env.num_envs) == self._i
         seeds: Any = [seed if is_row else None for is_row in mask]
         more = {name: [value] * len(mask) for name, value in (options or {}).items()}
@@ -94,6 +126,10 @@ class VecEnvRow:
         return obs[self._i], make_info(base.reports[self._i].tolist())
 
     def is_wrapped(self, wrapper_class: type) -> bool:
-        """Whether one of the layers is of this class, or the twin of this single wrapper."""
+        """Return whether a layer has a class, or is the vector twin of a single wrapper.
+
+        Args:
+            wrapper_class: Class of a wrapper.
+        """
         wanted = _TWINS.get(wrapper_class, wrapper_class)
         return any(isinstance(layer, wanted) for layer in self._iterate_layers())

@@ -21,12 +21,22 @@ WRAPPER = "sideslip.estimators.EstimateObservation"
 
 
 def make_file_name(env_id: str) -> str:
-    """The id as a file's name."""
+    """Make a file's name from an id.
+
+    Args:
+        env_id: Id of an env.
+    """
     return env_id.replace("/", "-")
 
 
 def find_next_folder(logs: Path, algo: str, env_id: str) -> Path:
-    """Where the next training belongs; algo: as the zoo calls it."""
+    """Find the folder of the next training.
+
+    Args:
+        logs: Folder of all trainings.
+        algo: Algorithm's name in the zoo.
+        env_id: Id of the env.
+    """
     numbered = re.compile(re.escape(make_file_name(env_id)) + r"_(\d+)")
     entries = (logs / algo).iterdir() if (logs / algo).is_dir() else ()
     taken = [int(match[1]) for path in entries if (match := numbered.fullmatch(path.name))]
@@ -36,11 +46,14 @@ def find_next_folder(logs: Path, algo: str, env_id: str) -> Path:
 def describe(
     folder: Path, settings: Mapping[str, Any], estimator_kwargs: Any, arguments: Mapping[str, Any]
 ) -> None:
-    """Make the folder, with all that `enjoy` asks for before it loads a model.
+    """Make a training's folder with the files that `enjoy` reads before it loads a model.
 
-    settings: in the zoo's format; `normalize` is none of the model's, whose scales are its own.
-    estimator_kwargs: arguments of `EstimateObservation`, or None. arguments: of the command line,
-    "env" and "env_kwargs" among them. All in JSON types.
+    Args:
+        folder: Folder to make.
+        settings: Settings in the zoo's format, in JSON types; `normalize` becomes False, for the
+            model has its own scales.
+        estimator_kwargs: Arguments of `EstimateObservation`, or None.
+        arguments: Arguments of the command line, "env" and "env_kwargs" among them.
     """
     with require_extra("train", "a folder of the zoo's needs {}"):
         import yaml
@@ -54,9 +67,17 @@ def describe(
 
 
 def write_evaluation(folder: Path, env_id: str, model: Any, costs: Array, lengths: Array) -> None:
-    """Keep an evaluation's model and its episodes' costs and steps, where the folder is the zoo's.
+    """Write an evaluation's model, costs and lengths, where the folder is the zoo's.
 
-    A later evaluation than this one, of a training that was stopped before its checkpoint, goes.
+    Later evaluations in the file, of a training that was stopped before its checkpoint, are
+    removed.
+
+    Args:
+        folder: Folder of the training.
+        env_id: Id of the env.
+        model: Model of stable-baselines3.
+        costs: Costs J of the episodes, shape (N,).
+        lengths: Steps of the episodes, shape (N,).
     """
     if not (folder / make_file_name(env_id)).is_dir():
         return

@@ -1,4 +1,4 @@
-"""`sideslip.score`: a contestant's score as a Python object."""
+"""`sideslip.score`: an entry's score as a Python object."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -19,12 +19,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Score:
-    """Where a contestant stands between nominal, 0, and oracle-state, 1.
+    """The score of an entry between nominal, 0, and oracle-state, 1.
 
-    score, cost (over nominal's), won (share of the episodes cheaper than nominal's), failures
-    (share of all episodes): each an `Estimate` with its 95 % interval, NaN where there is none. n:
-    episodes that count. contests: a row each, the same numbers by contest. error: why it was not
-    driven, "" where it was, in one contest or more. text: the sentence of the benchmark.
+    Attributes:
+        agent: Name of the agent.
+        estimator: Name of the estimator.
+        score: Score; like the next three an `Estimate` with its 95 % interval, NaN where unknown.
+        cost: Cost over nominal's.
+        won: Fraction of the episodes that cost less than nominal's.
+        failures: Fraction of all episodes that failed.
+        n: Episodes that count.
+        contests: A row for each task with the same numbers.
+        error: Reason why no task was driven, "" otherwise.
+        text: Sentence of the benchmark.
     """
 
     agent: str
@@ -42,7 +49,7 @@ class Score:
         return f"<{self.text}>"
 
     def to_pandas(self) -> "pd.DataFrame":
-        """A row a contest (needs pandas)."""
+        """Make a table with one row for each task (needs pandas)."""
         with require_extra("report", "to_pandas needs pandas"):
             import pandas as pd
 
@@ -74,19 +81,23 @@ def score(
 ) -> Score:
     """Score a controller, a policy or a filter as `sideslip bench control` does.
 
-    agent: a name, a file's class ("my.py:MyController") or a path, as `make_agent` takes them, or
-    an agent, its class or another factory. estimator: in front of it, a name, a file's class or a
-    factory, "" for none; None: the one that a policy was trained on, nominal's for others; a filter
-    is scored under "lqr". env_id: the contests of one id; default:
-    both on which the matrix is driven. scenarios: names, files or mappings, or one; default: a
-    contest or two of every tier. vehicle: a name, file or mapping instead of the contests' cars.
-    episodes: a contest. jobs: processes, None for all processors.
-    seeds: instead of the benchmark's, whose baselines are on file. fresh, limit: of
-    `ComparisonRequest`, whose errors it raises. trust: whether a policy's zip may be read, which
-    may run code.
+    A file drives in a process of its own, an object in this one. An error while it drives becomes
+    the result's `error`.
 
-    What is a file drives in a process of its own, an object in this one. An error while it drives
-    is the result's `error`.
+    Args:
+        agent: Name, file's class ("my.py:MyController") or path, as for `make_agent`; or an agent,
+            its class or another factory.
+        env_id: Id whose tasks are driven; "": both ids of the matrix.
+        scenarios: Names, files or mappings, or one of them; empty: a task or two of every tier.
+        vehicle: Name, file or mapping instead of the tasks' cars.
+        estimator: Name, file's class or factory in front of the agent, "" for none; None: the one
+            of the policy's training, or nominal's. A filter is scored under "lqr".
+        episodes: Episodes of each task.
+        seeds: Seeds instead of the benchmark's, whose baselines are on file.
+        fresh: As in `ComparisonRequest`, whose errors it raises.
+        limit: As in `ComparisonRequest`.
+        trust: Whether a policy's zip may be read, which can run code.
+        jobs: Number of processes, None for all processors.
     """
     is_single = isinstance(scenarios, str | os.PathLike | Mapping)
     scenario_list = (scenarios,) if is_single else tuple(scenarios)

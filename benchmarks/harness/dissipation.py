@@ -16,9 +16,15 @@ from ...envs.vehicle.tyres import compute_tyre_forces
 
 
 def compute_dissipation(params: Array, states: Array, switches: Any) -> Array:
-    """(N,) W: lateral force times the speed across the wheel, both axles, of N cars now.
+    """Compute the power that N cars' tyres dissipate (W), shape (N,).
 
-    params, states, switches: the engine's packed numbers, a row a car. Drive slip is not modelled.
+    It is the lateral force times the speed across the wheel, at both axles. Drive slip is not
+    modelled.
+
+    Args:
+        params: Packed parameters of the engine, one row for each car.
+        states: Packed states of the engine, likewise.
+        switches: Packed switches of the engine, likewise.
     """
     out = np.empty(len(params))
     _write(params, states, switches, out)

@@ -26,12 +26,25 @@ class LoggedEpisode:
 
 
 def make_filter_arguments(base: Any) -> dict[str, Any]:
-    """What `make_estimator` takes of an env's running episode: `EstimatorSpec`, and dt in s."""
+    """Make the arguments of `make_estimator` from an env's running episode.
+
+    Args:
+        base: Unwrapped env.
+
+    Returns:
+        Fields of `EstimatorSpec`, and dt (s).
+    """
     return make_spec(base)._asdict() | {"dt": base.dt}
 
 
 def call_quietly(make: Callable[..., T], *args: Any, **options: Any) -> T:
-    """The filter, or env with a filter, that `make` returns, without `UnobservableWarning`."""
+    """Call a maker of a filter, or of an env with one, without `UnobservableWarning`.
+
+    Args:
+        make: Function to call.
+        args: Positional arguments.
+        options: Keyword arguments.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnobservableWarning)
         return make(*args, **options)
@@ -40,9 +53,13 @@ def call_quietly(make: Callable[..., T], *args: Any, **options: Any) -> T:
 def make_env(
     env_id: str, estimator: str = "", estimate: Mapping[str, Any] | None = None, **options: Any
 ) -> gym.Env[Any, Any]:
-    """An env whose bad actions end the episode, with an estimator in front ("" for none).
+    """Make an env whose bad actions end the episode, with an estimator in front.
 
-    estimate: options of `EstimateObservation`. options: of the env.
+    Args:
+        env_id: Id of the env.
+        estimator: Name of the estimator, "" for none.
+        estimate: Other arguments of `EstimateObservation`.
+        options: Arguments of the env.
     """
     env: gym.Env[Any, Any] = gym.make(env_id, **{"on_bad_action": "fail", **options})
     return (

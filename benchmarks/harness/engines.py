@@ -1,6 +1,6 @@
-"""What runs a list of independent cases: processes of this machine, or an existing Ray cluster.
+"""The engines of independent cases: processes of this machine, or an existing Ray cluster.
 
-The same results on any engine and with any number of workers.
+Every engine and every number of workers give the same results.
 """
 
 import os
@@ -25,18 +25,22 @@ _CLUSTER: ContextVar[Any] = ContextVar("cluster", default=None)
 
 
 def count_cores() -> int:
-    """The processors this process may use."""
+    """Count the processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
 def use_engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
-    """What runs the cases within: of `ENGINES`.
+    """Use an engine for the cases within.
 
-    address: of an existing Ray cluster, "host:port"; "": the one that runs on this machine. Its
-    nodes need this version of sideslip, and a folder for finished cases that all of them see.
-    Raises ValueError for another name, an address without Ray, and a cluster that is not there;
-    ModuleNotFoundError without ray.
+    Args:
+        name: Name in `ENGINES`.
+        address: Existing Ray cluster, "host:port"; "": the one on this machine. Its nodes need this
+            version of sideslip and a shared folder for finished cases.
+
+    Raises:
+        ValueError: The name is unknown, an address without Ray, or there is no such cluster.
+        ModuleNotFoundError: ray is not installed.
     """
     check_choice("engine", name, ENGINES)
     if name == PROCESSES:
@@ -66,7 +70,13 @@ def use_engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
 def execute_cases(
     function: Callable[[Case], Result], cases: Sequence[Case], jobs: int | None = None
 ) -> Iterator[tuple[int, Result]]:
-    """(place, function(case)) of every case as it is done; arguments of `run_cases`."""
+    """Execute cases, and yield the index and result of each when it is done.
+
+    Args:
+        function: Function of a case, importable by workers.
+        cases: Cases.
+        jobs: Number of processes; None: one for each processor at most. A cluster has its own.
+    """
     ray = _CLUSTER.get()
     if ray is None:
         # the number asked for is left alone: another one would end the processes of the last call

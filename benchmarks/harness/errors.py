@@ -1,5 +1,4 @@
-"""A user's error as one line: what came, what was expected, where; everything else is ours and
-keeps its traceback."""
+"""A user's error as one line; every other error keeps its traceback."""
 
 import io
 import sys
@@ -34,7 +33,7 @@ def report_user_errors() -> Iterator[None]:
 
 
 def _truncate_message(text: str) -> str:
-    """A message of which the middle is left out where it is long."""
+    """Truncate a long message in its middle."""
     if len(text) <= _LONGEST:
         return text
     return f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"

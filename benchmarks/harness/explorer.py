@@ -11,10 +11,12 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Panel:
-    """One of the plots above each other: quantity with unit, and its lines.
+    """One of the plots above each other.
 
-    lines: (name of a signal, what the legend calls it); the first in the contestant's colour, a
-    "reference" dashed.
+    Attributes:
+        label: Quantity with its unit.
+        lines: Names of signals and their texts in the legend; the first has the entry's colour, a
+            "reference" is dashed.
     """
 
     label: str
@@ -25,11 +27,19 @@ class Panel:
 class Explorer:
     """Time series of which two are shown beside each other.
 
-    menus: what each part of a cell's key but the last is called; both sides share them. The last is
-    the contestant. cells: key to signals, each (n,), with the time under "t"; with X, Y (m) and psi
-    (rad) it is shown in motion. panels: what is drawn of them. pair: the two contestants to begin
-    with. bodies: length and width of the car in m by the shared part of the key. caption: a
-    sentence.
+    Attributes:
+        title: Title of the figure.
+        menus: Label of each part of a cell's key but the last, for both sides; the last is the
+            entry.
+        cells: Signals of shape (n,) by key, with the time under "t" (s); with X, Y (m) and psi
+            (rad) a cell is shown in motion.
+        panels: Plots of the signals.
+        caption: Caption, a sentence.
+        pair: The two entries at the start.
+        bodies: Length and width of the car (m) by the shared part of the key.
+
+    Raises:
+        ValueError: There are no cells, or a cell lacks a signal or a part of its key.
     """
 
     title: str

@@ -1,4 +1,4 @@
-"""The vocabulary of metrics with their units, and how an episode's own are taken, step by step.
+"""The vocabulary of metrics with their units, and the metrics of an episode, step by step.
 
 A new metric of the matrix is one entry of `EPISODE`: its rows, its column and its unit follow.
 """
@@ -17,10 +17,17 @@ FULL = 0.999  # of an input's range: saturated
 class StepSample(NamedTuple):
     """An env-step of N cars.
 
-    command: (N, 2) shares of the yaw moment and of the added steering. before: those of the last
-    step. reward: (N,). info, last: the env's infos after and before the step. full: (2,) N m and
-    rad at a share of 1. dt: s. aside: (N,) m that the car is beside the path of its reference.
-    power: (N,) W of the motors. heat: (N,) W dissipated by the tyres.
+    Attributes:
+        command: Fractions of yaw moment and added steering, shape (N, 2).
+        last_command: Those of the last step, shape (N, 2).
+        reward: Rewards, shape (N,).
+        info: Info of the env after the step.
+        last: Info of the env before the step.
+        full_scale: Yaw moment (N m) and added steering (rad) at a fraction of 1, shape (2,).
+        dt: Control period (s).
+        lateral_deviation: Distance from the path of the reference (m), shape (N,).
+        power: Power of the motors (W), shape (N,).
+        tyre_dissipation: Power that the tyres dissipate (W), shape (N,).
     """
 
     command: Array
@@ -36,9 +43,11 @@ class StepSample(NamedTuple):
 
 
 class Reduction(NamedTuple):
-    """A reduction of the values of an episode's steps to one number, starting from 0.
+    """A reduction of the values of an episode's steps to one number, which starts at 0.
 
-    add: from the number so far and a step's value. finish: from the last of them and the steps.
+    Attributes:
+        add: Function of the number so far and a step's value.
+        finish: Function of the last number and the count of steps.
     """
 
     add: Callable[[Array, Array], Array]
@@ -64,9 +73,15 @@ REDUCTIONS = {
 class Metric:
     """A number of an episode.
 
-    compute: a step's value (N,) from its `StepSample`. fold: a key of `REDUCTIONS`. heading: of its
-    column in the matrix's table of motion, "" for none. scale, digits: of a number there. turning:
-    whether it means something only where the reference has a yaw rate.
+    Attributes:
+        name: Name of the metric.
+        unit: Unit of the number.
+        compute: Function from a `StepSample` to values, shape (N,).
+        reduction: Key of `REDUCTIONS`.
+        heading: Heading of its column in the matrix's table of motion, "" for none.
+        scale: Factor of a number there.
+        digits: Decimal places of a number there.
+        turning: Whether it is meaningful only where the reference has a yaw rate.
     """
 
     name: str
@@ -79,7 +94,11 @@ class Metric:
     turning: bool = False
 
     def text(self, value: float) -> str:
-        """A value as its column shows it."""
+        """Format a value for its column.
+
+        Args:
+            value: Value in the metric's unit.
+        """
         return f"{self.scale * value:.{self.digits}f}"
 
 
@@ -88,7 +107,7 @@ def _make_error(name: str) -> Callable[[StepSample], Array]:
 
 
 def _make_change(i: int) -> Callable[[StepSample], Array]:
-    """The change of what is asked of an input, from one decision to the next."""
+    """Make the change of an input's command from one decision to the next."""
     return lambda m: np.abs(m.command[:, i] - m.last_command[:, i]) * m.full_scale[i]
 
 
@@ -160,13 +179,13 @@ EPISODE = (
 )
 """The metrics of an episode.
 
-path_error: the largest distance from the path that the reference's yaw rate and slip would drive
-from the same start. motor_energy: mechanical, both motors' work without regard to its sign.
-tyre_dissipation: by sliding sideways, both axles.
-effort: mean square share of the yaw moment that was delivered. moment_rate: how fast the delivered
-yaw moment changes, on average. steer_effort: mean square share of the added steering that was asked
-for. largest_step, largest_steer_step: between two decisions. saturation: share of the decisions
-that ask for all of an input. failure: a code of `FAILURES`.
+path_error: largest distance from the path that the reference's yaw rate and slip would drive from
+the same start. motor_energy: mechanical work of both motors, without regard to its sign.
+tyre_dissipation: energy of sliding sideways, both axles. effort: mean square of the delivered yaw
+moment as a fraction. moment_rate: mean rate of the delivered yaw moment. steer_effort: mean square
+of the added steering command as a fraction. largest_step, largest_steer_step: between two
+decisions. saturation: fraction of the decisions with an input at its limit. failure: a code of
+`FAILURES`.
 """
 
 _OTHERS = {

@@ -18,13 +18,23 @@ _EVERY = 15.0  # s between two lines
 
 
 def split_seeds(seeds: int, size: int) -> list[tuple[int, ...]]:
-    """The seeds 0 .. seeds-1 in tuples of at most `size`."""
+    """Split the seeds 0 .. seeds-1 into tuples.
+
+    Args:
+        seeds: Number of seeds.
+        size: Maximum of seeds in a tuple.
+    """
     return [tuple(range(k, min(k + size, seeds))) for k in range(0, seeds, size)]
 
 
 class Bar(progress.Progress):
-    """A progress bar, none without a console; where none can be drawn, a line on standard error for
-    each task and every 15 s, with the time that is left as the task went so far."""
+    """A progress bar, or lines on standard error where no bar can be drawn.
+
+    There is a line for each task and every 15 s, with the remaining time at the task's rate so far.
+
+    Args:
+        console: Console of the bar; None: nothing is shown.
+    """
 
     def __init__(self, console: Console | None) -> None:
         shown = console is not None and console.is_interactive
@@ -36,19 +46,24 @@ class Bar(progress.Progress):
         self._before = progress.TaskID(-1), 0.0, 0.0  # the newest task as it was first seen
 
     def add_task(self, *args: Any, **options: Any) -> progress.TaskID:
-        """Add a task; the newest one is spoken of. unit: of what it counts."""
+        """Add a task, which lines then report.
+
+        Args:
+            args: Arguments of rich's `add_task`.
+            options: Keyword arguments of rich's `add_task`, and the unit of its count, `unit`.
+        """
         made = super().add_task(*args, **options)
         self._say()
         return made
 
     def start(self) -> None:
-        """Begin to draw or to speak."""
+        """Start to draw or to print lines."""
         super().start()
         if self._speaks:
             Thread(target=self._speak, daemon=True).start()
 
     def stop(self) -> None:
-        """End it."""
+        """Stop the bar."""
         self._over.set()
         super().stop()
 
@@ -78,8 +93,14 @@ _SHARED: ContextVar[Bar | None] = ContextVar("shared", default=None)
 def use_shared_bar(
     console: Console | None, title: str, unit: str = "cases", total: int | None = None
 ) -> Iterator[Bar]:
-    """One progress bar for what is done inside, at first under a title; every `run_cases` shows
-    its own cases in it."""
+    """Show one progress bar for the work inside; every `run_cases` shows its cases in it.
+
+    Args:
+        console: Console of the bar; None: nothing is shown.
+        title: First title.
+        unit: Unit of the count.
+        total: Total of the count, None if unknown.
+    """
     with Bar(console) as bar:
         bar.add_task(title, total=total, unit=unit)
         token = _SHARED.set(bar)
@@ -96,12 +117,16 @@ def run_cases(
     jobs: int | None = None,
     console: Console | None = None,
 ) -> list[Result]:
-    """function(case) for every case, in the order of the cases.
+    """Run a function on every case, and return the results in the order of the cases.
 
-    function: importable by workers. jobs: processes (default: the processors at hand; a cluster has
-    its own); 1 runs in this process. console: where the progress bar goes, unless inside
-    `use_shared_bar`; None shows none. Where it is no terminal, standard error gets a line every 15
-    s.
+    Args:
+        function: Function of a case, importable by workers.
+        cases: Cases.
+        title: Title of the progress bar.
+        jobs: Number of processes, None for the available processors, 1 for this process; a cluster
+            has its own.
+        console: Console of the progress bar, unless inside `use_shared_bar`; None: nothing is
+            shown.
     """
     shared, results = _SHARED.get(), dict[int, Result]()
     with Bar(console) if shared is None else nullcontext(shared) as bar:

@@ -1,4 +1,4 @@
-"""The row: one measured number with everything needed to find it again."""
+"""The row: one measured number with everything needed to reproduce it."""
 
 import json
 import math
@@ -27,12 +27,27 @@ VERDICTS = ("", "reproduced", "partly", "not reproduced", "report only")
 class ResultRow:
     """One number of a benchmark.
 
-    suite, scenario, estimator, controller, metric: what was measured. value with its 95 % interval
-    [low, high] over n runs (NaN bounds where there is none); for a claim, which has a verdict, and
-    a replay the median and range over n seeds. salt: what salted the seeds.
-    spec: the env's JSON, "" where no env was run. verdict and paper: for claims.
+    For a claim, which has a verdict, and a replay, value and bounds are median and range over n
+    seeds.
 
-    Raises ValueError for a metric or verdict outside the vocabulary.
+    Attributes:
+        suite: Name of the suite.
+        scenario: Name of the scenario.
+        metric: Name of the metric, in `METRICS`.
+        value: Number in the metric's unit.
+        estimator: Name of the estimator.
+        controller: Name of the controller.
+        low: Lower bound of the 95 % interval, NaN without one.
+        high: Upper bound of the 95 % interval, NaN without one.
+        n: Number of runs.
+        salt: Salt of the seeds.
+        env_version: Version of the env.
+        spec: JSON of the env, "" where no env was run.
+        verdict: Verdict on a claim, in `VERDICTS`.
+        paper: Paper of a claim.
+
+    Raises:
+        ValueError: The metric or verdict is outside of the vocabulary.
     """
 
     suite: str
@@ -56,16 +71,27 @@ class ResultRow:
 
     @classmethod
     def from_estimate(cls, metric: str, number: Estimate, **columns: Any) -> "ResultRow":
-        """A row of a number with its interval; columns: the others."""
+        """Make a row of a number with its interval.
+
+        Args:
+            metric: Name of the metric.
+            number: Number and interval.
+            columns: Other fields.
+        """
         return cls(metric=metric, value=number.value, low=number.low, high=number.high, **columns)
 
 
 @dataclass
 class ResultTable:
-    """A table for the screen and the report: texts, a header, and what each column means.
+    """A table for the screen and the report.
 
-    keyed: whether the first column names estimators or controllers, which have their colour.
-    detail: whether it stands in the report alone, too long for a screen.
+    Attributes:
+        title: Title of the table.
+        header: Headings of the columns.
+        cells: Texts, row by row.
+        note: Meaning of the columns.
+        keyed: Whether the first column names estimators or controllers, which have their colour.
+        detail: Whether it stands in the report alone, too long for a screen.
     """
 
     title: str
@@ -76,20 +102,29 @@ class ResultTable:
     detail: bool = False
 
     def to_pandas(self) -> "DataFrame":
-        """The texts as a pandas table (needs the extra `report`)."""
+        """Convert the texts to a pandas table (needs the extra `report`)."""
         from pandas import DataFrame
 
         return DataFrame(self.cells, columns=list(self.header))
 
     def _repr_html_(self) -> str:
-        """What a notebook shows."""
+        """Format the table for a notebook."""
         table = self.to_pandas().to_html(index=False, border=0)
         return f"<b>{escape(self.title)}</b>{table}<p>{escape(self.note)}</p>"
 
 
 @dataclass(frozen=True)
 class ShareMap:
-    """Shares between 0 and 1 over two axes: shares by name, each (y, x)."""
+    """Fractions between 0 and 1 over two axes.
+
+    Attributes:
+        title: Title of the map.
+        x: Values of the horizontal axis.
+        y: Values of the vertical axis.
+        shares: Fractions by name, each of shape (y, x).
+        x_label: Label of the horizontal axis.
+        y_label: Label of the vertical axis.
+    """
 
     title: str
     x: Array
@@ -103,12 +138,22 @@ class ShareMap:
 class Suite:
     """The result of a benchmark module: rows for machines, tables and figures for people.
 
-    verdict: the answer in plain words, at most five lines (`harness.verdict`). warnings: of the
-    input, that stand over it. answers: figures that answer a question each: (question, plotly
-    figure, the answer in a sentence). figures: the others, (title, figure, what to see). Both are
-    empty where the extra `report` is not installed or pictures were not asked for. explorers:
-    figures with menus. maps: for the summary's PNG. files: what the report offers to save, (file
-    name, media type, text).
+    `answers` and `figures` are empty without the extra `report` or where pictures were not
+    requested.
+
+    Attributes:
+        name: Name of the suite.
+        title: Title of the suite.
+        text: Text of the report.
+        rows: Rows of all numbers.
+        tables: Tables of the report.
+        figures: Title, plotly figure, and what to see in it.
+        explorers: Figures with menus.
+        maps: Maps for the summary's PNG.
+        files: Files that the report offers: name, media type, text.
+        verdict: Answer in plain words, at most five lines (`harness.verdict`).
+        warnings: Warnings about the input, which stand above the verdict.
+        answers: Question, plotly figure, and the answer in a sentence.
     """
 
     name: str
@@ -126,18 +171,18 @@ class Suite:
 
     @property
     def headlines(self) -> list[str]:
-        """The warnings and the verdict, line by line."""
+        """Warnings and verdict, line by line."""
         ended = (text if text.endswith("?") else f"{text}." for text in self.warnings)
         return [*(f"WARNING: {text}" for text in ended), *self.verdict.splitlines()]
 
     def to_pandas(self) -> "DataFrame":
-        """The rows as a pandas table (needs the extra `report`)."""
+        """Convert the rows to a pandas table (needs the extra `report`)."""
         from pandas import DataFrame
 
         return DataFrame([asdict(row) for row in self.rows])
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: the verdict and the first table."""
+        """Format the verdict and the first table for a notebook."""
         lines = "".join(f"<p>{escape(line)}</p>" for line in self.headlines)
         return f"<h3>{escape(self.title)}</h3>{lines}" + "".join(
             table._repr_html_() for table in self.tables[:1]
@@ -145,7 +190,14 @@ class Suite:
 
 
 def check_writable(*paths: Path | None) -> None:
-    """OSError before the work, not after it, where a result cannot be written."""
+    """Check that results can be written, before the work.
+
+    Args:
+        paths: Files to write; None is skipped.
+
+    Raises:
+        OSError: A file cannot be written.
+    """
     for path in paths:
         if path is None:
             continue
@@ -161,12 +213,22 @@ def check_writable(*paths: Path | None) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file or nothing."""
+    """Write a text file or nothing.
+
+    Args:
+        path: File to write.
+        text: Content of the file.
+    """
     write_atomic(path, text.encode())
 
 
 def write_json(path: str | Path, rows: Sequence[ResultRow]) -> None:
-    """The rows as a JSON list of objects; NaN becomes null."""
+    """Write rows as a JSON list of objects; NaN becomes null.
+
+    Args:
+        path: File to write.
+        rows: Rows.
+    """
     plain = [
         {
             key: None if isinstance(value, float) and not math.isfinite(value) else value
@@ -178,7 +240,14 @@ def write_json(path: str | Path, rows: Sequence[ResultRow]) -> None:
 
 
 def read_json(path: str | Path) -> list[ResultRow]:
-    """Rows that `write_json` wrote; ValueError, with file, row and column, for others."""
+    """Read rows that `write_json` wrote.
+
+    Args:
+        path: File to read.
+
+    Raises:
+        ValueError: The file holds others; the message has file, row and column.
+    """
     rows = []
     for i, entry in enumerate(read_objects(path), 1):
         numbers = {name: math.nan if value is None else value for name, value in entry.items()}
@@ -187,7 +256,14 @@ def read_json(path: str | Path) -> list[ResultRow]:
 
 
 def read_objects(path: str | Path) -> list[dict[str, Any]]:
-    """A file's JSON list of objects; ValueError, with the path, for another file."""
+    """Read a JSON list of objects.
+
+    Args:
+        path: File to read.
+
+    Raises:
+        ValueError: The file holds something else; the message has the path.
+    """
     try:
         entries = json.loads(Path(path).read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
@@ -198,7 +274,12 @@ def read_objects(path: str | Path) -> list[dict[str, Any]]:
 
 
 def write_parquet(path: str | Path, rows: Sequence[ResultRow]) -> None:
-    """The rows as a Parquet table (needs the extra `report`)."""
+    """Write rows as a Parquet table (needs the extra `report`).
+
+    Args:
+        path: File to write.
+        rows: Rows.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -1,9 +1,9 @@
 """Intervals over seeds, 95 %, paired where two columns share their seeds.
 
-All but shares have Student's, from what each episode contributes to the estimate's error
-(`margin_of_error`); of positive numbers on a logarithmic scale. Their coverage on skewed costs and
-in small strata is tested by simulation. No interval of a mean holds for rare failures of which no
-episode is one: failures are counted, and `share` bounds their rate.
+All but fractions have Student's, from each episode's contribution to the estimate's error
+(`margin_of_error`); of positive numbers on a logarithmic scale. Simulations test their coverage
+on skewed costs and in small strata. No interval of a mean holds for rare failures that did not
+occur: failures are counted, and `share` bounds their rate.
 """
 
 import math
@@ -34,39 +34,59 @@ class Estimate(NamedTuple):
 
     @property
     def half_width(self) -> float:
-        """Half the interval."""
+        """Half the width of the interval."""
         return 0.5 * (self.high - self.low)
 
     def text(self, scale: float = 1.0, digits: str = ".3f") -> tuple[str, str]:
-        """The number and its interval, as two cells of a table; the second empty without one."""
+        """Format the number and its interval, if there is one, as two cells of a table.
+
+        Args:
+            scale: Factor of the numbers.
+            digits: Format specification.
+        """
         value, low, high = (f"{scale * number:{digits}}" for number in self)
         return value, f"{low} .. {high}" if math.isfinite(self.low) else ""
 
     def inline(self, scale: float = 1.0, digits: str = ".2f") -> str:
-        """The number and its interval, if there is one, in brackets."""
+        """Format the number and, in brackets, its interval if there is one.
+
+        Args:
+            scale: Factor of the numbers.
+            digits: Format specification.
+        """
         value, low, high = (f"{scale * number:{digits}}" for number in self)
         return f"{value} [{low}, {high}]" if math.isfinite(self.low) else value
 
 
 def root_mean(squares: Array, axis: int = -1) -> Array:
-    """The square root of the mean: RMSE from each seed's mean squared error."""
+    """Compute the square root of the mean: RMSE from each seed's mean squared error.
+
+    Args:
+        squares: Mean squared errors.
+        axis: Axis of the seeds.
+    """
     return np.asarray(np.sqrt(np.mean(squares, axis=axis)))
 
 
 def mean(values: Array, axis: int = -1) -> Array:
-    """The mean, a statistic of `interval`."""
+    """Compute the mean, a statistic of `interval`.
+
+    Args:
+        values: Numbers.
+        axis: Axis of the seeds.
+    """
     return np.asarray(np.mean(values, axis=axis))
 
 
 def margin_of_error(*strata: Array) -> float:
-    """Half of the 95 % interval of the sum of independent means, by Student's t.
+    """Compute half of the 95 % interval of the sum of independent means, by Student's t.
 
     The variances add up with the degrees of freedom of Welch and Satterthwaite. A variance that few
     numbers carry has fewer of them, by its kurtosis (O'Neill 2014, Some useful moment results in
     sampling problems).
 
     Args:
-        strata: The numbers of each mean, shape (n_i,).
+        strata: Numbers of each mean, shape (n_i,).
 
     Returns:
         Half of the interval's width; NaN where a mean is of fewer than two numbers.
@@ -93,18 +113,19 @@ def margin_of_error(*strata: Array) -> float:
 def interval(
     values: Array, statistic: Callable[..., Array] = mean, paired: Array | None = None
 ) -> Estimate:
-    """A statistic over seeds with its 95 % interval, by the jackknife.
+    """Compute a statistic over seeds with its 95 % interval, by the jackknife.
 
-    Where no number is negative, it is that of the statistic's logarithm.
+    Where no number is negative, the interval is that of the statistic's logarithm.
 
     Args:
-        values: A number a seed, shape (n,).
-        statistic: Of values, and of paired where it is given.
-        paired: Numbers of the same seeds, shape (n,), left out together with values.
+        values: Numbers of the seeds, shape (n,).
+        statistic: Function of `values`, and of `paired` unless that is None.
+        paired: Numbers of the same seeds, shape (n,), left out together with `values`.
 
     Returns:
-        The statistic and its interval; without one for fewer than four seeds, and where the
-        statistic of the others is not finite.
+        The statistic and its interval; no interval for fewer than four seeds, and where the
+            statistic
+        of the others is not finite.
     """
     data = (values,) if paired is None else (values, paired)
     estimate, n = float(statistic(*data, axis=-1)), len(values)
@@ -122,31 +143,51 @@ def interval(
 
 
 def mean_share(values: Array) -> Estimate:
-    """The mean of shares (n,) that are not only 0 and 1; its interval is that of the odds."""
+    """Compute the mean of fractions that are not only 0 and 1; its interval is that of the odds.
+
+    Args:
+        values: Fractions, shape (n,).
+    """
     if not 0.0 < np.mean(values) < 1.0:
         return interval(values)
     return Estimate(*(odds / (1.0 + odds) for odds in interval(values, _odds)))
 
 
 def _odds(values: Array, axis: int = -1) -> Array:
-    """The mean of shares over the mean of what is left of them."""
+    """Compute the mean of fractions over the mean of their complements."""
     return ratio_of_means(values, 1.0 - values, axis)
 
 
 def ratio_of_roots(squares: Array, reference: Array, axis: int = -1) -> Array:
-    """RMSE over the RMSE of a reference on the same seeds."""
+    """Compute the RMSE over the RMSE of a reference on the same seeds.
+
+    Args:
+        squares: Mean squared errors.
+        reference: Mean squared errors of the reference.
+        axis: Axis of the seeds.
+    """
     return np.asarray(root_mean(squares, axis) / root_mean(reference, axis))
 
 
 def ratio_of_means(values: Array, reference: Array, axis: int = -1) -> Array:
-    """The mean over the mean of a reference on the same seeds."""
+    """Compute the mean over the mean of a reference on the same seeds.
+
+    Args:
+        values: Numbers.
+        reference: Numbers of the reference.
+        axis: Axis of the seeds.
+    """
     return np.asarray(mean(values, axis) / mean(reference, axis))
 
 
 def average(*strata: Array) -> Estimate:
-    """The mean over strata of the means of their numbers (n_i,), such as clipped logarithms.
+    """Average the means of strata, such as those of clipped logarithms.
 
-    NaN of none, and where a number is.
+    Args:
+        strata: Numbers of each stratum, shape (n_i,).
+
+    Returns:
+        Mean and interval; NaN without strata, and where a number is NaN.
     """
     filled = [stratum for stratum in strata if len(stratum)]
     if not filled:
@@ -157,14 +198,22 @@ def average(*strata: Array) -> Estimate:
 
 
 def geometric_mean(*strata: Array) -> Estimate:
-    """exp of the `average` of logarithms of paired ratios: strata of one weight."""
+    """Compute the geometric mean: exp of the `average` of logarithms of paired ratios.
+
+    Args:
+        strata: Logarithms of each stratum, shape (n_i,); strata have equal weight.
+    """
     return Estimate(*(math.exp(log) for log in average(*strata)))
 
 
 def share(hits: npt.ArrayLike) -> Estimate:
-    """The mean of (n,) numbers that are 0 or 1, a tie one half, with Wilson's interval.
+    """Compute the mean of numbers that are 0 or 1, a tie one half, with Wilson's interval.
 
-    NaN where one is, or of none.
+    Args:
+        hits: Numbers, shape (n,).
+
+    Returns:
+        Mean and interval; NaN without numbers, and where one is NaN.
     """
     from scipy.stats import norm
 
@@ -179,22 +228,39 @@ def share(hits: npt.ArrayLike) -> Estimate:
 
 
 def compute_win_rate(costs: Array, others: Array) -> Estimate:
-    """The share of episodes that cost less than the other's on the same seed, a tie one half."""
+    """Compute the fraction of episodes that cost less than the other's, a tie one half.
+
+    Args:
+        costs: Costs, shape (n,).
+        others: The other's costs on the same seeds, shape (n,).
+    """
     return share(np.where(costs == others, 0.5, np.less(costs, others)))
 
 
 def compute_profile(values: Array, levels: Array) -> tuple[Array, Array, Array]:
-    """The share of (n,) numbers that are at most each level (k,), with Wilson's interval: a
-    performance profile (Dolan and Moré 2002). (k,) each: value, low, high; NaN counts as above."""
+    """Compute the fraction of numbers that are at most each level, with Wilson's interval.
+
+    Source: performance profiles of Dolan and Moré 2002. NaN counts as above.
+
+    Args:
+        values: Numbers, shape (n,).
+        levels: Levels, shape (k,).
+
+    Returns:
+        Value, lower and upper bound, shape (k,) each.
+    """
     value, low, high = np.array([share(values <= level) for level in levels]).T
     return value, low, high
 
 
 def compute_tail_mean(costs: Array) -> Estimate:
-    """The mean of the largest `WORST` of positive numbers (n,): the conditional value at risk.
+    """Compute the mean of the largest `WORST` of positive numbers: the conditional value at risk.
 
-    Its interval is that of the logarithm, from the influence of each number on the tail's mean;
-    there is none where the tail has fewer than 25.
+    Its interval is that of the logarithm, from each number's influence on the tail's mean; there is
+    none where the tail has fewer than 25.
+
+    Args:
+        costs: Costs, shape (n,).
     """
     if len(costs) == 0 or np.isnan(costs).any():
         return Estimate(math.nan)
@@ -209,10 +275,17 @@ def compute_tail_mean(costs: Array) -> Estimate:
 
 
 def ratio_of_sums(tops: Sequence[Array], bottoms: Sequence[Array]) -> Estimate:
-    """Sum over strata of the mean top / that of the mean bottom, tops and bottoms paired (n_i,).
+    """Compute the sum over strata of the mean top over that of the mean bottom.
 
     The interval is that of the mean residual top - ratio x bottom, in which an episode's top and
-    bottom stay together. NaN without strata or where a sum of bottoms is not positive.
+    bottom stay together.
+
+    Args:
+        tops: Numerators of each stratum, shape (n_i,).
+        bottoms: Denominators of the same episodes, shape (n_i,).
+
+    Returns:
+        Ratio and interval; NaN without strata, or where the sum of bottoms is not positive.
     """
     if not tops or min(map(len, tops)) == 0:
         return Estimate(math.nan)
@@ -226,7 +299,11 @@ def ratio_of_sums(tops: Sequence[Array], bottoms: Sequence[Array]) -> Estimate:
 
 
 def compute_p_value(logs: Array) -> float:
-    """One-sided p of Student's test that the mean of (n,) paired differences is not below 0."""
+    """Compute the one-sided p of Student's test that a mean is not below 0.
+
+    Args:
+        logs: Paired differences, shape (n,).
+    """
     spread = float(np.std(logs, ddof=1)) if len(logs) > 1 else math.nan
     middle = float(np.mean(logs)) if len(logs) else math.nan
     if not spread > 0.0:
@@ -237,7 +314,15 @@ def compute_p_value(logs: Array) -> float:
 
 
 def holm(chances: Sequence[float], level: float = 1.0 - LEVEL) -> list[bool]:
-    """Which of several p values are significant at a family-wise level, by Holm's step-down."""
+    """Test several p values at a family-wise level, by Holm's step-down.
+
+    Args:
+        chances: p values.
+        level: Family-wise level.
+
+    Returns:
+        Whether each is significant.
+    """
     significant, order = [False] * len(chances), np.argsort(chances)
     for rank, i in enumerate(order):
         if not chances[i] <= level / (len(chances) - rank):

@@ -7,13 +7,20 @@ from .stats import Estimate
 
 LINES = 5
 LETTERS = 110
-"""Of a line with our names; a user's may make one longer."""
+"""Letters of a line with the package's names; a user's may make one longer."""
 _NAMES = 2  # of those that tie
 _SURE = 0.995  # a ratio below it is a lead, one above it none to a reader
 
 
 def format_verdict(*lines: str) -> str:
-    """The lines that are not empty, one below the other; ValueError for more than LINES."""
+    """Join the lines that are not empty.
+
+    Args:
+        lines: Lines, of which at most LINES are not empty.
+
+    Raises:
+        ValueError: There are more lines.
+    """
     filled = [line for line in lines if line]
     if len(filled) > LINES:
         raise ValueError(f"a verdict has at most {LINES} lines, got {len(filled)}: {filled}")
@@ -21,10 +28,14 @@ def format_verdict(*lines: str) -> str:
 
 
 def describe_leader(name: str, ratios: Mapping[str, Estimate], verb: str) -> str:
-    """Who is first, by how much before the next, or with whom it ties.
+    """Describe the first entry and its lead, or with which others it ties.
 
-    ratios: what it has over each rival's, 1 for as much, the closest rival first. verb: what is
-    better done little, "err". A rival ties whose interval all but reaches 1.
+    A rival ties where the interval reaches, or nearly reaches, 1.
+
+    Args:
+        name: Name of the first.
+        ratios: Its number over each rival's, the closest rival first.
+        verb: Verb for what is better done little, such as "err".
 
     >>> describe_leader("lqr", {"esc": Estimate(0.71, 0.65, 0.77)}, "cost")
     'lqr costs least, 71 % [65, 77] as much as esc'
@@ -39,7 +50,10 @@ def describe_leader(name: str, ratios: Mapping[str, Estimate], verb: str) -> str
 
 
 def format_percent(ratio: Estimate) -> str:
-    """A ratio in percent with its interval, if it has one.
+    """Format a ratio in percent with its interval, if it has one.
+
+    Args:
+        ratio: Ratio, 1 for 100 %.
 
     >>> format_percent(Estimate(0.71, 0.65, 0.77)), format_percent(Estimate(0.5))
     ('71 % [65, 77]', '50 %')
@@ -49,7 +63,11 @@ def format_percent(ratio: Estimate) -> str:
 
 
 def summarise_names(names: Sequence[str], limit: int = _NAMES) -> str:
-    """Names in a sentence, the later ones counted.
+    """Join names for a sentence, with a count of the later ones.
+
+    Args:
+        names: Names.
+        limit: Maximum of names that are shown.
 
     >>> summarise_names(["a"]), summarise_names(["a", "b"]), summarise_names(["a", "b", "c", "d"])
     ('a', 'a and b', 'a, b and 2 more')

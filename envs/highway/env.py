@@ -34,18 +34,8 @@ class HighwayEnv(StabilityEnv):
     By default the vehicle ahead brakes hard on a wet road, and a late driver swerves around it into
     the free lane and back; the yaw moment decides whether that ends in a collision, off the road,
     or well. Action, observation, record, reward, info and estimators are those of `StabilityEnv`;
-    camera, driver and the record's curvature see the lane that our car follows, which begins as its
-    own and stays so while the driver swerves. Needs the extra `highway`.
-
-    ## Episode end
-    `terminated` also by a "collision", or a "departure" of the whole car beyond the road's edge,
-    charged as every failure is.
-
-    ## Arguments
-    road: "straight", "curved" (bends of 400 m) or "merging" (others join from a ramp). hazard:
-    fields of `Hazard`, {} for the usual ones, None for no vehicle that brakes. traffic: how many
-    vehicles besides, of highway-env's IDM. The others are those of `StabilityEnv`. The scenario has
-    a driver where there is a hazard; bank and grade are there from the beginning.
+    camera, driver and the record's curvature refer to the lane that our car follows, which begins
+    as its own and stays so while the driver swerves. Needs the extra `highway`.
 
     The seed draws on which side the free lane is, the hazard and the traffic from the episode's
     key, and highway-env's own random numbers come from there too. The road is stepped every 50 ms
@@ -54,6 +44,21 @@ class HighwayEnv(StabilityEnv):
     Raises ModuleNotFoundError without highway-env, ValueError for an unknown road, a number of
     vehicles out of place, a scenario with a road of its own or of small angles, one without a
     driver beside a hazard, and a start off the road's own (reset option state: s, theta, X, Y).
+
+    ## Episode end
+    `terminated` also by a "collision", or a "departure" of the whole car beyond the road's edge,
+    charged as every failure is.
+
+    Args:
+        road: "straight", "curved" (bends of 400 m) or "merging" (others join from a ramp).
+        hazard: Fields of `Hazard`, {} for the usual ones, None for no vehicle that brakes.
+        traffic: Number of further vehicles, of highway-env's IDM, at most 40.
+        sensors: "vision", "vision-uneven", "gps" or "fusion".
+        scenario: Scenario as `make_scenario` reads it, with a driver where there is a hazard; bank
+            and grade are there from the beginning.
+        vehicle: The true vehicle, as `make_vehicle` reads it.
+        reference: "zero-slip", "model", "limited" or "lagged".
+        options: Further arguments of `StabilityEnv`.
     """
 
     def __init__(
@@ -75,8 +80,7 @@ class HighwayEnv(StabilityEnv):
         self._traffic: Traffic | None = None
 
     def _adapt_scenario(self, scenario: Scenario) -> Scenario:
-        """The scenario with its bank and grade from the beginning; ValueError where it has more of
-        a road, or nobody to swerve."""
+        """Set bank and grade from the beginning; ValueError for a road of its own or no driver."""
         defaults = Scenario(name="")
         for field in _OWN_ROAD_FIELDS:
             if (value := getattr(scenario, field)) != getattr(defaults, field):
@@ -94,7 +98,18 @@ class HighwayEnv(StabilityEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start an episode; see `StabilityEnv`."""
+        """Start an episode.
+
+        Args:
+            seed: Seed of the env's generator; None continues it.
+            options: Options of reset of `StabilityEnv`; state has no s, theta, X and Y.
+
+        Returns:
+            The observation and the info at tick 0.
+
+        Raises:
+            ValueError: If the state has a place along the road.
+        """
         reset_options = dict(options or {})
         if "scenario" in reset_options:
             reset_options["scenario"] = self._adapt_scenario(
@@ -148,7 +163,14 @@ class HighwayEnv(StabilityEnv):
         report[REPORT.reward] = -report[REPORT.cost]
 
     def make_render_state(self, row: int = 0) -> RenderState:
-        """What a picture is drawn from, its road by highway-env's own graphics."""
+        """Make what a picture is drawn from, its road by highway-env's own graphics.
+
+        Args:
+            row: Number of the car, 0.
+
+        Returns:
+            The state.
+        """
         return super().make_render_state(row)._replace(world=self._draw_world)
 
     def _draw_world(self, size: tuple[int, int], others: list[Motion]) -> Any:
@@ -174,11 +196,18 @@ class HighwayEnv(StabilityEnv):
         return surface
 
     def get_state(self) -> dict[str, Any]:
-        """A snapshot that `set_state` continues from, bit for bit, traffic included."""
+        """Copy the state, traffic included, from which `set_state` continues bit for bit."""
         return super().get_state() | {"road": self.road, "around": copy.deepcopy(self._traffic)}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Go back to a snapshot of this env or of one built with the same arguments."""
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Return value of `get_state`.
+
+        Raises:
+            ValueError: If it is of another road.
+        """
         if snapshot.get("road") != self.road:
             raise ValueError(f"the snapshot is of road {snapshot.get('road')!r}, not {self.road!r}")
         super().set_state(snapshot)

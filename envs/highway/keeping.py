@@ -43,12 +43,12 @@ KEEPING = Scenario(
     disturbance_force=0.0,
     disturbance_moment=0.0,
 )
-"""Nobody steers but the controller; the car and its lane are highway-env's."""
+"""Only the controller steers; the car and its lane are highway-env's."""
 STATES = ("beta", "gamma", "psi", "y_l")
 
 
 def make_keeping_vehicle() -> Vehicle:
-    """highway-env's bicycle as our `Vehicle`; what it has not (motors, roll, height) is assumed."""
+    """Make highway-env's bicycle as our `Vehicle`; the motors, roll and height are assumed."""
     car = BicycleVehicle
     return Vehicle(
         name="highway-env's bicycle",
@@ -74,7 +74,11 @@ def make_keeping_vehicle() -> Vehicle:
 
 
 class KeepingPlant:
-    """The car of a `lane-keeping-v0`, a step of which is a tick; pushes and torques do nothing."""
+    """The car of a `lane-keeping-v0`, stepped by ticks; disturbances and torques do nothing.
+
+    Args:
+        render_mode: Render mode of highway-env's environment.
+    """
 
     def __init__(self, render_mode: str | None = None) -> None:
         rate = round(1.0 / TICK)
@@ -84,24 +88,34 @@ class KeepingPlant:
         self.s = 0.0
 
     def start(self, seed: int) -> None:
-        """Begin its episode."""
+        """Begin an episode.
+
+        Args:
+            seed: Seed of highway-env's environment.
+        """
         self.last_observation, _ = self.env.reset(seed=seed)
         self.s = 0.0
         self.project()
 
     def project(self) -> None:
-        """Find the car's place on the lane that highway-env has it keep; the next tick is a step of
-        its own `step`."""
+        """Project the car onto the lane that highway-env has it keep.
+
+        The next tick is a step of highway-env's own `step`.
+        """
         self._is_full_step = True
         x, y, heading = self.env.vehicle.state[:3, 0].tolist()
         position = locate_on_lane(self.env.lane, x, -y, -heading)
         self.y, self.theta, self.curvature = position.y, position.theta, position.curvature
 
     def step(self, inputs: OutsideInputs, h: float) -> None:
-        """A tick; the place on the lane is carried along until it is projected again.
+        """Step the car over a tick; its place on the lane is integrated until projected again.
 
-        The first tick of a control period is one of their `step`, which also takes the next lane
-        and observes; the others are what it does to the car.
+        The first tick of a control period is one of highway-env's `step`, which also takes the next
+        lane and observes; the others are what it does to the car.
+
+        Args:
+            inputs: Inputs, of which the steering angle acts.
+            h: Length of the tick (s).
         """
         action = np.array([-inputs.steer / self.env.action_type.steering_range[1]])
         before = self.motion
@@ -125,7 +139,7 @@ class KeepingPlant:
 
     @property
     def motion(self) -> Motion:
-        """Its state in our axes."""
+        """The car's state in our axes."""
         x, y, heading, speed, slide, turn = self.env.vehicle.state[:, 0].tolist()
         return Motion(speed, -slide, -turn, -heading, x, -y, self.s, self.y, self.theta)
 
@@ -135,7 +149,15 @@ class KeepingPlant:
         return bool(np.isfinite(self.env.vehicle.state).all())
 
     def states(self, observation: Any, preview: float) -> tuple[float, ...]:
-        """`STATES` of an observation of theirs, y_l at a preview distance in m."""
+        """Compute `STATES` of an observation of highway-env's.
+
+        Args:
+            observation: Its observation.
+            preview: Preview distance of y_l (m).
+
+        Returns:
+            beta (rad), gamma (rad/s), psi (rad) and y_l (m).
+        """
         lateral, heading, slide, turn = np.ravel(observation["state"]).tolist()
         centre, lane = np.ravel(observation["reference_state"])[:2].tolist()
         psi, speed = math.remainder(lane - heading, 2.0 * math.pi), float(self.env.vehicle.speed)
@@ -157,7 +179,11 @@ class KeepingEnv(PlantEnv):
     ours, so every estimator and `lane-keeping` run; `NativeObservation` has theirs. Needs the extra
     `highway`. A snapshot is refused: highway-env's environment makes none.
 
-    control_period: ticks; highway-env decides every 100. The others are those of `StabilityEnv`.
+    Args:
+        sensors: "vision", "vision-uneven", "gps" or "fusion".
+        control_period: Ticks of 1 ms between two decisions; highway-env decides every 100.
+        render_mode: Render mode of highway-env's environment.
+        options: Further arguments of `StabilityEnv`.
     """
 
     def __init__(
@@ -180,7 +206,18 @@ class KeepingEnv(PlantEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start an episode where highway-env has it start; no options."""
+        """Start an episode where highway-env has it start.
+
+        Args:
+            seed: Seed of the env's generator; None continues it.
+            options: None or empty.
+
+        Returns:
+            The observation and the info at tick 0.
+
+        Raises:
+            ValueError: For any option.
+        """
         if options:
             raise ValueError(f"lane-keeping-v0 starts as it is, got {', '.join(options)}")
         self.plant.start(0)  # it always starts there
@@ -206,18 +243,25 @@ class KeepingEnv(PlantEnv):
         return math.atan2(motion.v_y, motion.v_x), motion.gamma, psi, y_l
 
     def get_state(self) -> dict[str, Any]:
-        """Refused."""
+        """Refuse: TypeError, since highway-env makes no snapshots."""
         raise TypeError("highway-env's lane-keeping-v0 makes no snapshots")
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Refused."""
+        """Refuse: TypeError, since highway-env makes no snapshots.
+
+        Args:
+            snapshot: Not used.
+        """
         self.get_state()
 
 
 class NativeObservation(gym.ObservationWrapper[Any, Any, Any]):
     """A `KeepingEnv` whose estimates are highway-env's own observation.
 
-    returned: as its `step` returns it, from before the step; else the newest.
+    Args:
+        env: A `KeepingEnv`.
+        returned: Whether it is the one that highway-env's `step` returns, from before the step;
+            else the newest.
     """
 
     def __init__(self, env: gym.Env[Any, Any], returned: bool) -> None:
@@ -233,7 +277,14 @@ class NativeObservation(gym.ObservationWrapper[Any, Any, Any]):
         self.observation_space = make_space(self.layout)
 
     def observation(self, observation: Any) -> Any:
-        """Ours with theirs behind it."""
+        """Append highway-env's `STATES` to an observation.
+
+        Args:
+            observation: Observation of the `KeepingEnv`.
+
+        Returns:
+            Both, float32.
+        """
         base: Any = self.env.unwrapped
         plant = base.plant
         native = plant.last_observation if self._returned else plant.env.observation_type.observe()

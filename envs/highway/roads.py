@@ -27,9 +27,14 @@ _STEP = 0.05  # m, of differences along a lane
 
 
 class RoadLayout(NamedTuple):
-    """A network and the lanes that our car follows in it, one after the other.
+    """A network and the lanes that our car follows in it.
 
-    own_lane, free_lane: the index of our lane and of the one beside it, among those of each road.
+    Attributes:
+        network: highway-env's network.
+        route: Our lanes, one after the other.
+        own_lane: Index of our lane among those of each road.
+        free_lane: Index of the lane beside it.
+        ramp: Index of the lane from which others merge; None without a ramp.
     """
 
     network: Any
@@ -40,7 +45,7 @@ class RoadLayout(NamedTuple):
 
 
 class LanePosition(NamedTuple):
-    """Where a point lies on a lane, in our axes."""
+    """Position of a point on a lane, in our axes."""
 
     longitudinal: float  # the lane's own coordinate, which need not be an arc length
     y: float  # m, left of the lane's centre line
@@ -49,7 +54,14 @@ class LanePosition(NamedTuple):
 
 
 def make_straight(side: int) -> RoadLayout:
-    """Two lanes straight ahead."""
+    """Make two lanes straight ahead.
+
+    Args:
+        side: Side of the free lane, 1 left or -1 right.
+
+    Returns:
+        The layout.
+    """
     network = RoadNetwork()
     _add_straight(network, "start", "a", side, BEHIND, 0.0)
     route = _add_straight(network, "a", "b", side, 0.0, BEYOND)
@@ -57,7 +69,14 @@ def make_straight(side: int) -> RoadLayout:
 
 
 def make_curved(side: int) -> RoadLayout:
-    """Two lanes through a bend to the left and one to the right, with circular arcs."""
+    """Make two lanes through a bend to the left and one to the right, with circular arcs.
+
+    Args:
+        side: Side of the free lane, 1 left or -1 right.
+
+    Returns:
+        The layout.
+    """
     network, route = RoadNetwork(), []
     _add_straight(network, "start", "a", side, BEHIND, 0.0)
     route += _add_straight(network, "a", "b", side, 0.0, ENTRY)
@@ -77,7 +96,14 @@ def make_curved(side: int) -> RoadLayout:
 
 
 def make_merging(side: int) -> RoadLayout:
-    """Two lanes straight ahead that others join from a ramp on the right, as on `merge-v0`."""
+    """Make two lanes straight ahead that others join from a ramp on the right, as on `merge-v0`.
+
+    Args:
+        side: Side of the free lane, 1 left or -1 right.
+
+    Returns:
+        The layout.
+    """
     network, route = RoadNetwork(), []
     _add_straight(network, "start", "a", side, BEHIND, 0.0)
     for first, last, start, end in (("a", "b", 0.0, 200.0), ("b", "c", 200.0, 350.0)):
@@ -128,10 +154,19 @@ def _add_straight(
 
 
 def locate_on_lane(lane: Any, X: float, Y: float, psi: float) -> LanePosition:
-    """The foot of a point of our axes on a lane of highway-env's; psi: rad, our heading there.
+    """Locate a point of our axes on a lane of highway-env's.
 
     `local_coordinates` is exact on straight and circular lanes. On others, whose coordinate is no
     arc length or whose lateral is not at right angles, Newton's method finds the foot.
+
+    Args:
+        lane: Lane of highway-env.
+        X: Place on the ground in our axes (m).
+        Y: Place on the ground in our axes (m).
+        psi: Heading in our axes (rad), to whose turn the lane's direction is unwrapped.
+
+    Returns:
+        The position.
     """
     point = np.array([X, -Y])
     longitudinal, right = lane.local_coordinates(point)
@@ -157,6 +192,6 @@ def locate_on_lane(lane: Any, X: float, Y: float, psi: float) -> LanePosition:
 
 
 def _compute_scale(lane: Any, longitudinal: float) -> float:
-    """How many metres a unit of a lane's own coordinate is."""
+    """Compute the metres of a unit of a lane's own coordinate."""
     chord = lane.position(longitudinal + _STEP, 0.0) - lane.position(longitudinal - _STEP, 0.0)
     return float(np.hypot(*chord)) / (2.0 * _STEP)

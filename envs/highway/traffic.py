@@ -29,13 +29,15 @@ _SHORTEST = 0.8  # s, in which no driver changes lanes faster
 class Hazard:
     """The vehicle ahead that brakes, and the driver who swerves around it late.
 
-    Each is a range that the seed draws from. headway: s between the bumpers, both cars being as
-    fast. onset: s at which it brakes. braking: share of the road's grip that it brakes with.
-    reaction: s after which our driver swerves. haste: time of the lane change over the time that is
-    left until the cars would meet. stay: s in the free lane, behind the standing vehicle, before
-    the driver comes back.
+    Each field is a range that the seed draws from; another value raises ValueError.
 
-    Raises ValueError for what is no range of positive numbers.
+    Attributes:
+        headway: Time between the bumpers at equal speed (s).
+        onset: Time at which the vehicle brakes (s).
+        braking: Fraction of the road's grip that it brakes with.
+        reaction: Time after which our driver swerves (s).
+        haste: Time of the lane change over the time that is left until the cars would meet.
+        stay: Time in the free lane, behind the standing vehicle, before the driver returns (s).
     """
 
     headway: Range = (0.5, 0.8)
@@ -56,9 +58,16 @@ class Hazard:
 
 
 def parse_hazard(source: Mapping[str, Any] | None) -> Hazard | None:
-    """A hazard of a mapping of its fields, {} for the usual one; None for none.
+    """Parse a hazard from a mapping of its fields.
 
-    Raises TypeError for an unknown field, ValueError for a value out of place.
+    Args:
+        source: Values by the names of `Hazard`'s fields, {} for the usual ones; None for no hazard.
+
+    Returns:
+        The hazard, or None.
+
+    Raises:
+        TypeError: For an unknown field.
     """
     if source is None:
         return None
@@ -70,7 +79,7 @@ def parse_hazard(source: Mapping[str, Any] | None) -> Hazard | None:
 
 
 class TrafficStart(NamedTuple):
-    """What the engine drew for an episode."""
+    """The drawn start of an episode."""
 
     vehicle: Vehicle
     motion: Motion
@@ -79,7 +88,12 @@ class TrafficStart(NamedTuple):
 
 
 class EgoVehicle(HighwayVehicle):  # type: ignore[misc]
-    """Our car as the others see it: it is where it was put, and a vehicle like any other."""
+    """Our car as the others see it: it is where it was put, and a vehicle like any other.
+
+    Args:
+        road: highway-env's road.
+        start: Drawn start of the episode.
+    """
 
     color = (50, 200, 0)  # highway-env's own for the car that is driven
 
@@ -92,7 +106,11 @@ class EgoVehicle(HighwayVehicle):  # type: ignore[misc]
         self.on_state_update()
 
     def set_motion(self, motion: Motion) -> None:
-        """Move to a Motion of ours; the body's centre is not the centre of gravity."""
+        """Move to a Motion of ours; the body's centre is not the centre of gravity.
+
+        Args:
+            motion: Motion of our car.
+        """
         direction = np.array([math.cos(motion.psi), -math.sin(motion.psi)])
         self.position = np.array([motion.X, -motion.Y]) + self._centre * direction
         self.heading: float = -motion.psi
@@ -103,21 +121,38 @@ class EgoVehicle(HighwayVehicle):  # type: ignore[misc]
 
     @property
     def velocity(self) -> Any:
-        """With the sideslip that other vehicles have none of."""
+        """Velocity with the sideslip that other vehicles do not have."""
         return self._velocity
 
     def act(self, action: Any = None) -> None:
-        """Nothing: its driver is ours."""
+        """Do nothing: its driver is ours.
+
+        Args:
+            action: Not used.
+        """
 
     def step(self, dt: float) -> None:
-        """Take part in a step of the road; an impact foreseen in the last one is a crash, as it is
-        to highway-env's own vehicles."""
+        """Take part in a step of the road.
+
+        An impact foreseen in the last step is a crash, as it is to highway-env's own vehicles.
+
+        Args:
+            dt: Length of the step (s).
+        """
         self.crashed |= self.impact is not None
         self.on_state_update()
 
 
 class BrakingVehicle(IDMVehicle):  # type: ignore[misc]
-    """An IDM vehicle in its lane that from a time on brakes until it stands."""
+    """An IDM vehicle in its lane that from a time on brakes until it stands.
+
+    Args:
+        road: highway-env's road.
+        position: Place in highway-env's axes (m), shape (2,).
+        speed: Speed (m/s).
+        onset: Time at which it brakes (s).
+        rate: Deceleration (m/s2).
+    """
 
     def __init__(self, road: Any, position: Any, speed: float, onset: float, rate: float) -> None:
         super().__init__(road, position, speed=speed, target_speed=speed, enable_lane_change=False)
@@ -125,13 +160,21 @@ class BrakingVehicle(IDMVehicle):  # type: ignore[misc]
         self.speed: float = speed
 
     def act(self, action: Any = None) -> None:
-        """Follow the road; brake when it is time."""
+        """Follow the road; brake from the onset on.
+
+        Args:
+            action: Action of highway-env's, or None.
+        """
         super().act(action)
         if self.time_left <= 0.0 and not self.crashed:
             self.action["acceleration"] = -self.rate
 
     def step(self, dt: float) -> None:
-        """A step, of which none goes backwards."""
+        """Step the vehicle, which never goes backwards.
+
+        Args:
+            dt: Length of the step (s).
+        """
         self.time_left -= dt
         super().step(dt)
         self.speed = max(self.speed, 0.0)
@@ -140,7 +183,12 @@ class BrakingVehicle(IDMVehicle):  # type: ignore[misc]
 class Traffic:
     """A road with its vehicles in an episode, and our car's place on its lanes.
 
-    All that is random is drawn from `key`. others: how many vehicles beside the braking one.
+    Args:
+        road: Name of the road, of `ROADS`.
+        start: Drawn start of the episode.
+        hazard: The vehicle that brakes; None for none.
+        others: Number of vehicles beside the braking one.
+        key: Key of the episode, from which all that is random is drawn.
     """
 
     def __init__(
@@ -160,7 +208,7 @@ class Traffic:
         self._add_vehicles(others, start)
 
     def _add_hazard(self, hazard: Hazard, start: TrafficStart) -> TrackPath:
-        """Put the vehicle that brakes ahead of us; the path of the driver who swerves around it."""
+        """Add the vehicle that brakes ahead of us; return the path of the swerving driver."""
         random = self.road.np_random
         draw = {name: random.uniform(*get_range(ends)) for name, ends in vars(hazard).items()}
         v, rate = start.speed, max(draw["braking"] * start.friction * GRAVITY, 0.1)
@@ -205,7 +253,11 @@ class Traffic:
             self.road.objects.append(Obstacle(self.road, end.position(end.length, 0.0)))
 
     def step_road(self, motion: Motion) -> None:
-        """A step of the road, at whose end our car is at a Motion."""
+        """Step the road, at whose end our car is at a Motion.
+
+        Args:
+            motion: Motion of our car.
+        """
         self.ego.set_motion(motion)
         self.road.act()
         self.road.step(_STEP)
@@ -222,7 +274,14 @@ class Traffic:
         return not bool(ego.lane.on_lane(ego.position, margin=0.5 * ego.WIDTH))
 
     def locate(self, motion: Motion) -> LanePosition:
-        """Our car's place on the lanes that it follows."""
+        """Locate our car on the lanes that it follows.
+
+        Args:
+            motion: Motion of our car.
+
+        Returns:
+            The position.
+        """
         route = self.course.route
         position = locate_on_lane(route[self._lane], motion.X, motion.Y, motion.psi)
         while position.longitudinal > route[self._lane].length and self._lane + 1 < len(route):

@@ -26,7 +26,15 @@ _OWN_PLANT_FIELDS = (
 
 
 def check_scenario(scenario: Scenario, model: str) -> None:
-    """ValueError for a scenario field that only our plant has, or that this model has not."""
+    """Check that a model can drive a scenario.
+
+    Args:
+        scenario: The scenario.
+        model: Name of the model, of `OUTSIDE_PLANTS`.
+
+    Raises:
+        ValueError: For a field that only our plant has, or that this model has not.
+    """
     name = f"scenario {scenario.name!r}"
     defaults = {entry.name: entry.default for entry in dataclasses.fields(Scenario)}
     for field in _OWN_PLANT_FIELDS:
@@ -54,13 +62,28 @@ def check_scenario(scenario: Scenario, model: str) -> None:
 
 
 def find_min_speed(scenario: Scenario) -> float:
-    """The least speed in m/s that a scenario's own changes of speed come down to."""
+    """Find the lowest speed that a scenario's own changes of speed lead to.
+
+    Args:
+        scenario: The scenario.
+
+    Returns:
+        Speed (m/s).
+    """
     change = scenario.speed_change + (scenario.acceleration or 0.0) * scenario.duration
     return scenario.range("speed")[0] + min(change, 0.0)
 
 
 def check_options(options: Mapping[str, Any], model: str) -> None:
-    """ValueError for an option of reset that this model cannot follow."""
+    """Check that a model can follow the options of reset.
+
+    Args:
+        options: Options of reset.
+        model: Name of the model, of `OUTSIDE_PLANTS`.
+
+    Raises:
+        ValueError: For an option that it cannot follow.
+    """
     if "vehicle" in options:
         raise ValueError("reset option vehicle: an outside plant is its own vehicle")
     if "friction" in options and model == "single-track":

@@ -42,8 +42,10 @@ _select_failure = as_python(select_failure)
 
 
 class PlantEnv(StabilityEnv):
-    """`StabilityEnv` whose truth is the motion of `plant`, a loop in Python: sensors, references,
-    cost and packets are ours."""
+    """`StabilityEnv` whose true motion is that of `plant`, in a Python loop.
+
+    Sensors, references, cost and packets are ours.
+    """
 
     _has_tyre_forces = False
     plant: PlantProtocol
@@ -121,19 +123,25 @@ class OutsideEnv(PlantEnv):
     plant whose state is no longer finite ends the episode as "not-finite". Needs the extra
     `outside`. A loop in Python, hundreds of times slower than ours.
 
-    model: "single-track", "drift" or "multi-body". nominal: the vehicle that estimators and
-    controllers are designed from (default: `make_outside_vehicle()`). The other arguments are those
-    of `StabilityEnv`, but there is no `vehicle`: the true one is the model's. The scenario's
-    friction is the tyre's peak lateral friction, that of `vehicle`; on the single track, whose
-    tyres are linear, it has no effect, and there is no reset option "friction". One tyre serves
-    both axles, so its stiffness is scaled by the mean of the scenario's two factors. Motors and
-    steering act for a tick with their mean in the record. The multi-body model always rolls, the
-    others never do.
+    There is no argument `vehicle`: the true one is the model's. The scenario's friction is the
+    tyre's peak lateral friction, that of `vehicle`; on the single track, whose tyres are linear, it
+    has no effect, and there is no reset option "friction". One tyre serves both axles, so its
+    stiffness is scaled by the mean of the scenario's two factors. Motors and steering act for a
+    tick with their mean in the record. The multi-body model always rolls, the others never do.
 
-    Raises ValueError for an unknown model, a scenario with a road or a plant that the model has
-    not (curvature, bank, grade, small_angle, tyres, vehicle, friction_right,
-    tyre_change_time; wind_height but for the multi-body model), one that has the multi-body model
-    below 1 m/s or without roll, the reset option "vehicle" or a start off the road's own frame.
+    Args:
+        model: "single-track", "drift" or "multi-body".
+        sensors: "vision", "vision-uneven", "gps" or "fusion".
+        scenario: Scenario as `make_scenario` reads it.
+        reference: "zero-slip", "model", "limited" or "lagged".
+        options: Further arguments of `StabilityEnv`; nominal is `make_outside_vehicle()` by
+            default.
+
+    Raises:
+        TypeError: For the argument vehicle; ValueError for an unknown model and for a scenario with
+            a road or a plant that the model has not (curvature, bank, grade, small_angle, tyres,
+            vehicle, friction_right, tyre_change_time; wind_height but for the multi-body model), or
+            that has the multi-body model below 1 m/s or without roll.
     """
 
     plant: OutsidePlant
@@ -157,7 +165,16 @@ class OutsideEnv(PlantEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Start an episode; see `StabilityEnv`."""
+        """Start an episode; ValueError for an option that the model cannot follow.
+
+        Args:
+            seed: Seed of the env's generator; None continues it.
+            options: Options of reset of `StabilityEnv`, but no vehicle, and no s, y and theta in
+                state.
+
+        Returns:
+            The observation and the info at tick 0.
+        """
         reset_options = dict(options or {})
         check_options(reset_options, self.model)
         check_scenario(self.config.apply_options(reset_options).scenario, self.model)
@@ -173,12 +190,19 @@ class OutsideEnv(PlantEnv):
         return result
 
     def get_state(self) -> dict[str, Any]:
-        """A snapshot that `set_state` continues from, bit for bit."""
+        """Copy the state, plant included, from which `set_state` continues bit for bit."""
         plant = (self.plant.p, self.plant.specific_force, self.plant.x.copy())
         return super().get_state() | {"outside": plant, "model": self.model}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Go back to a snapshot of this env or of one built with the same arguments."""
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Return value of `get_state`.
+
+        Raises:
+            ValueError: If it is of another model.
+        """
         if snapshot.get("model") != self.model:
             raise ValueError(f"the snapshot is of {snapshot.get('model')!r}, not {self.model!r}")
         super().set_state(snapshot)

@@ -62,7 +62,7 @@ def _load_parameters() -> Any:
 
 @functools.cache
 def make_outside_vehicle() -> Vehicle:
-    """The BMW 320i as our `Vehicle`: the nominal vehicle of estimators and controllers.
+    """Make the BMW 320i as our `Vehicle`: the nominal vehicle of estimators and controllers.
 
     Cornering stiffness is the Magic Formula's slope p_Ky1 F_z at the tyre's standing load. Roll
     stiffness is that of springs and anti-roll bars on top of the tyres' vertical springs.
@@ -97,30 +97,42 @@ def make_outside_vehicle() -> Vehicle:
 
 
 class PlantProtocol(Protocol):
-    """What moves a car in place of our own plant: `OutsidePlant` has a word on each."""
+    """A car that moves in place of our own plant.
+
+    Attributes:
+        specific_force: (a_x, a_y) at the end of the newest step (m/s2).
+    """
 
     specific_force: tuple[float, float]
 
     @property
     def motion(self) -> Motion:
-        """Where the car is, how fast, and on which road."""
+        """Velocities, place and road of the car."""
 
     @property
     def is_finite(self) -> bool:
         """Whether the state is made of numbers."""
 
     def step(self, inputs: OutsideInputs, h: float) -> None:
-        """Move for h seconds."""
+        """Step the car.
+
+        Args:
+            inputs: Inputs, constant during the step.
+            h: Length of the step (s).
+        """
 
 
 class OutsidePlant(ABC):
-    """One of the models with its state `x` and the newest step's `compute_specific_force`: (a_x,
-    a_y) in m/s2 as accelerometers at the centre of gravity feel them at its end.
+    """One of the models with its state.
 
-    friction: the tyre's peak lateral friction, in place of CommonRoad's 1.05 (None); the
-    longitudinal one keeps its ratio to it. The single track's linear tyres know none: there it has
-    no effect. stiffness: a factor on the cornering stiffness of all tyres. A state that is no
-    longer finite stays so (`finite`).
+    `x` is the state and `specific_force` (a_x, a_y) in m/s2 at the newest step's end, as
+    accelerometers at the centre of gravity feel it. A state that is no longer finite stays so
+    (`is_finite`).
+
+    Args:
+        friction: Peak lateral friction of the tyre; None for CommonRoad's 1.05. The longitudinal
+            one keeps its ratio to it. The single track's linear tyres ignore it.
+        stiffness: Factor on the cornering stiffness of all tyres.
     """
 
     law = ""  # the name of the model's module and function
@@ -147,30 +159,53 @@ class OutsidePlant(ABC):
 
     @abstractmethod
     def start(self, motion: Motion) -> None:
-        """Put the car at a Motion's velocities, heading and place, wheels rolling."""
+        """Set the car to a Motion's velocities, heading and place, wheels rolling.
+
+        Args:
+            motion: Motion of the car.
+        """
 
     @abstractmethod
     def derivative(self, x: Array, inputs: OutsideInputs) -> Array:
-        """dx/dt of a state, which is left alone (the models themselves change it)."""
+        """Compute dx/dt of a state, which is left unchanged (the models themselves change it).
+
+        Args:
+            x: State of the model.
+            inputs: Inputs of the plant.
+
+        Returns:
+            The derivative, in the shape of x.
+        """
 
     @property
     @abstractmethod
     def motion(self) -> Motion:
-        """Where the car is, on a straight road along the ground's x axis."""
+        """Velocities and place of the car, on a straight road along the ground's x axis."""
 
     @abstractmethod
     def compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:
-        """The specific force of the state x under the inputs; raises what the models raise."""
+        """Compute the specific force of the state x; the models' own errors pass.
+
+        Args:
+            inputs: Inputs of the plant.
+
+        Returns:
+            (a_x, a_y) (m/s2).
+        """
 
     @property
     def is_finite(self) -> bool:
-        """Whether the state and the squares of its velocities, which references and sensors take,
-        are numbers; a spun multi-body car's are not."""
+        """Whether the state and the squares of its velocities, which sensors take, are finite."""
         squares = sum(v * v for v in (float(self.x[i]) for i in self.velocity_columns))
         return bool(np.isfinite(self.x).all()) and math.isfinite(squares)
 
     def step(self, inputs: OutsideInputs, h: float) -> None:
-        """h seconds of the classical Runge-Kutta method, in as many parts as the wheels need."""
+        """Step by the classical Runge-Kutta method, in as many parts as the wheels need.
+
+        Args:
+            inputs: Inputs, constant during the step.
+            h: Length of the step (s).
+        """
         eigenvalue = self._slip_rate / max(abs(float(self.x[3])), MIN_SPEED)
         parts = max(1, math.ceil(h * eigenvalue / STABILITY_LIMIT)) if self.is_finite else 1
         try:
@@ -197,11 +232,25 @@ class SingleTrack(OutsidePlant):
 
     law = "vehicle_dynamics_st"
 
-    def start(self, motion: Motion) -> None:  # noqa: D102
+    def start(self, motion: Motion) -> None:
+        """Set the car to a Motion.
+
+        Args:
+            motion: Motion of the car.
+        """
         speed, slip = math.hypot(motion.v_x, motion.v_y), math.atan2(motion.v_y, motion.v_x)
         self.x = np.array([motion.X, motion.Y, 0.0, speed, motion.psi, motion.gamma, slip])
 
-    def derivative(self, x: Array, inputs: OutsideInputs) -> Array:  # noqa: D102
+    def derivative(self, x: Array, inputs: OutsideInputs) -> Array:
+        """Compute dx/dt of a state.
+
+        Args:
+            x: State of the model.
+            inputs: Inputs of the plant.
+
+        Returns:
+            The derivative, in the shape of x.
+        """
         state = x.tolist()
         state[2] = inputs.steer
         drive = (inputs.T_l + inputs.T_r) / (self.p.m * self.p.R_w)
@@ -217,7 +266,15 @@ class SingleTrack(OutsidePlant):
         X, Y, _, v, psi, gamma, slip = self.x[:7].tolist()
         return Motion(v * math.cos(slip), v * math.sin(slip), gamma, psi, X, Y, X, Y, 0.0)
 
-    def compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:  # noqa: D102
+    def compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:
+        """Compute the specific force of the state x.
+
+        Args:
+            inputs: Inputs of the plant.
+
+        Returns:
+            (a_x, a_y) (m/s2).
+        """
         rate, slip = self.derivative(self.x, inputs), self.x[6]
         tangential, normal = rate[3], self.x[3] * (rate[6] + self.x[5])  # of the path
         sine, cosine = math.sin(slip), math.cos(slip)
@@ -233,7 +290,12 @@ class Drift(SingleTrack):
     wheels = slice(7, 9)
     wheel_load = 1.0
 
-    def start(self, motion: Motion) -> None:  # noqa: D102
+    def start(self, motion: Motion) -> None:
+        """Set the car to a Motion.
+
+        Args:
+            motion: Motion of the car.
+        """
         super().start(motion)
         self.x = np.append(self.x, np.full(2, motion.v_x / self.p.R_w))
 
@@ -246,13 +308,27 @@ class MultiBody(OutsidePlant):
     wheel_load = 0.5
     velocity_columns = (3, 5, 10)
 
-    def start(self, motion: Motion) -> None:  # noqa: D102
+    def start(self, motion: Motion) -> None:
+        """Set the car to a Motion.
+
+        Args:
+            motion: Motion of the car.
+        """
         speed, slip = math.hypot(motion.v_x, motion.v_y), math.atan2(motion.v_y, motion.v_x)
         core = [motion.X, motion.Y, 0.0, speed, motion.psi, motion.gamma, slip]
         self.x = np.array(_import_model("init_mb").init_mb(core, self.p), float)
         self.x[6], self.x[7] = -motion.phi, -motion.phi_dot
 
-    def derivative(self, x: Array, inputs: OutsideInputs) -> Array:  # noqa: D102
+    def derivative(self, x: Array, inputs: OutsideInputs) -> Array:
+        """Compute dx/dt of a state.
+
+        Args:
+            x: State of the model.
+            inputs: Inputs of the plant.
+
+        Returns:
+            The derivative, in the shape of x.
+        """
         state = x.tolist()
         state[2] = inputs.steer
         rate = np.array(self._law(state, [0.0, 0.0], self.p))
@@ -268,7 +344,15 @@ class MultiBody(OutsidePlant):
         x = self.x.tolist()
         return Motion(x[3], x[10], x[5], x[4], x[0], x[1], x[0], x[1], 0.0, -x[6], -x[7])
 
-    def compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:  # noqa: D102
+    def compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:
+        """Compute the specific force of the state x.
+
+        Args:
+            inputs: Inputs of the plant.
+
+        Returns:
+            (a_x, a_y) (m/s2).
+        """
         rate, x = self.derivative(self.x, inputs), self.x
         a_x = rate[3] - x[5] * x[10]
         a_y = rate[10] + x[5] * x[3] - GRAVITY * math.sin(x[6])  # felt by the rolled body

@@ -63,12 +63,29 @@ _NAMES = {
 
 
 def make_column_name(quantity: str) -> str:
-    """The name of a quantity's column in SI units."""
+    """Make the name of a quantity's column in SI units.
+
+    Args:
+        quantity: Name of the quantity, of `COLUMNS`.
+
+    Returns:
+        The name, such as "yaw_rate_radps".
+    """
     return f"{quantity}_{next(iter(COLUMNS[quantity]))}"
 
 
 def parse_column_name(name: str) -> tuple[str, float]:
-    """(quantity, factor to SI) of a column's name; ValueError if it is none of ours."""
+    """Parse the name of a column.
+
+    Args:
+        name: Name in lower case, such as "yaw_rate_degps".
+
+    Returns:
+        Name of the quantity and the unit's factor to SI.
+
+    Raises:
+        ValueError: If it is none of ours.
+    """
     if name in _NAMES:
         return _NAMES[name]
     quantity = name.rpartition("_")[0]
@@ -82,9 +99,16 @@ def parse_column_name(name: str) -> tuple[str, float]:
 
 
 def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
-    """{"yaw_rate_radps": "MyColumn"} from texts such as "yaw_rate_radps=MyColumn".
+    """Parse a mapping of column names: "yaw_rate_radps=MyColumn" to {"yaw_rate_radps": "MyColumn"}.
 
-    Raises ValueError for a text of another form, an unknown name and a quantity given twice.
+    Args:
+        texts: Texts of the form NAME=COLUMN.
+
+    Returns:
+        Our column names to the log's.
+
+    Raises:
+        ValueError: For a text of another form, an unknown name and a name mapped twice.
     """
     mapping: dict[str, str] = {}
     for text in texts:
@@ -101,14 +125,24 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
 def read_quantities(
     path: Path, mapping: Mapping[str, str], needed: Sequence[str], gaps: Collection[str] | None
 ) -> tuple[dict[str, Array], list[str]]:
-    """The file's known quantities in SI units, (n,) each, and sentences on how they were read.
+    """Read the file's known quantities in SI units, and describe how they were read.
 
-    mapping: our column name, unit included, to the file's; other columns are ignored. needed:
-    quantities that must be there. gaps: quantities that may hold NaN, any other is complete; None:
-    all but the time, and shuffled rows are sorted. An empty column counts as absent.
+    An empty column counts as absent. A file that `read_table` refuses raises its errors. Rows in
+    messages count from 1 below the header.
 
-    Raises what `read_table` does, and ValueError for a missing column, one given twice, a value
-    that is no finite number, NaN, and fewer than two rows. Rows count from 1 below the header.
+    Args:
+        path: Path of the table.
+        mapping: Our column names, unit included, to the file's; other columns are ignored.
+        needed: Quantities that must be present.
+        gaps: Quantities that may hold NaN, any other is complete; None: all but the time, and
+            shuffled rows are sorted.
+
+    Returns:
+        Quantities by name, shape (n,) each, and sentences on how they were read.
+
+    Raises:
+        ValueError: For a missing column, one given twice, a value that is no finite number, NaN,
+            and fewer than two rows.
     """
     wanted = {*COLUMNS, *map(str.casefold, mapping.values())}
     table = read_table(
@@ -156,8 +190,10 @@ def _list_columns(table: LogTable) -> str:
 
 
 def _match_column(name: str, unit: str) -> str:
-    """Our name of a file's column, in whatever case, with its unit in it, in brackets or beside it;
-    "" where it is none of ours."""
+    """Match a file's column to our name, in upper or lower case, "" where it is none of ours.
+
+    Its unit may be in the name, in brackets or beside it.
+    """
     folded = name.casefold()
     if folded not in _NAMES:
         base, _, bracket = folded.rstrip("])").replace("(", "[").partition("[")
@@ -168,8 +204,10 @@ def _match_column(name: str, unit: str) -> str:
 def _find_columns(
     table: LogTable, mapping: Mapping[str, str], remarks: list[str]
 ) -> dict[str, tuple[int, str]]:
-    """(place, our name) of each quantity's column: as mapped, else by our names, else by names and
-    units; adds to the remarks."""
+    """Find the place and our name of each quantity's column, and add to the remarks.
+
+    The mapping comes first, then our names, then names with units.
+    """
     names, quantities = [str(name) for name in table.frame.columns], set()
     for name, column in mapping.items():
         if column.casefold() not in map(str.casefold, names):
@@ -212,8 +250,11 @@ def _find_columns(
 
 
 def _convert_column(table: LogTable, place: int, name: str, remarks: list[str]) -> Array:
-    """A column in SI units; ValueError names the first value that is no finite number. A time that
-    is far off in its unit, but not in another since 1970, is read in that, which is remarked."""
+    """Convert a column to SI units; ValueError names the first value that is no finite number.
+
+    A time that is far off in its unit, but not in another since 1970, is read in that, which is
+    remarked.
+    """
     import pandas as pd
 
     column, label = table.frame.iloc[:, place], str(table.frame.columns[place])

@@ -27,22 +27,29 @@ _UNITS = {
 
 
 def find_unit(text: str) -> str:
-    """Translate a unit such as "[km/h]" or "°/s" to that of our column names, "" if unknown."""
+    """Translate a unit such as "[km/h]" or "°/s" to that of our column names.
+
+    Args:
+        text: Unit as a file writes it.
+
+    Returns:
+        Our unit, "" if unknown.
+    """
     return _UNITS.get(re.sub(r"[\s\[\]()·*]", "", text.casefold().translate(_SIGNS)), "")
 
 
 def read_text(
     data: bytes, is_wanted: Callable[[str], bool]
 ) -> tuple["pd.DataFrame", list[str], list[str]]:
-    """Read a text table in whatever dialect it is written.
+    """Read a text table in any dialect.
 
     Args:
-        data: The file.
-        is_wanted: Whether a column's name is one that is looked for; such names tell the header.
+        data: Content of the file.
+        is_wanted: Whether a column's name is looked for; such names identify the header.
 
     Returns:
         The table, whose names may repeat; the units of its columns, "" for unknown ones; and a
-        sentence that says what the file was taken for, unless it is plain CSV.
+        sentence that describes the dialect, unless it is plain CSV.
 
     Raises:
         ValueError: For a binary file, and where header and rows differ in length.
@@ -118,7 +125,10 @@ def read_text(
 
 
 def _find_encoding(data: bytes) -> str:
-    """By its mark, by its zeros, UTF-8, or else Windows-1252; ValueError for a binary file."""
+    """Find the encoding: by its mark, by its zeros, UTF-8, or else Windows-1252.
+
+    A binary file raises ValueError.
+    """
     head = data[:_HEAD_BYTES]
     even, odd = head[::2].count(0), head[1::2].count(0)
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):

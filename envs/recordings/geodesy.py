@@ -11,7 +11,14 @@ ECCENTRICITY_SQUARED = 6.694379990e-3
 
 
 def compute_radii(latitude: float) -> tuple[float, float]:
-    """m a radian (east, north) at a latitude in degrees: of the parallel and of the meridian."""
+    """Compute the radii of the parallel and of the meridian at a latitude.
+
+    Args:
+        latitude: Latitude (degrees north).
+
+    Returns:
+        Metres a radian (east, north).
+    """
     phi = math.radians(latitude)
     w = 1.0 - ECCENTRICITY_SQUARED * math.sin(phi) ** 2
     return EARTH / math.sqrt(w) * math.cos(phi), EARTH * (1.0 - ECCENTRICITY_SQUARED) / w**1.5
@@ -20,16 +27,31 @@ def compute_radii(latitude: float) -> tuple[float, float]:
 def to_metres(
     latitude: Array, longitude: Array, origin: tuple[float, float]
 ) -> tuple[Array, Array]:
-    """(east, north) in m of an origin (degrees north, east), the inverse of `to_degrees`."""
+    """Convert places to metres east and north of an origin, the inverse of `to_degrees`.
+
+    Args:
+        latitude: Latitude (degrees north), shape (n,).
+        longitude: Longitude (degrees east), shape (n,).
+        origin: Origin (degrees north, degrees east).
+
+    Returns:
+        (east, north) (m), shape (n,) each.
+    """
     east, north = compute_radii(origin[0])
     delta = (longitude - origin[1] + 180.0) % 360.0 - 180.0  # over the date line
     return east * np.radians(delta), north * np.radians(latitude - origin[0])
 
 
 def to_degrees(X: Array, Y: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
-    """(latitude, longitude) in degrees of metres east and north of an origin.
+    """Convert metres east and north of an origin to degrees, within 0.2 m up to 1 km.
 
-    Within a kilometre the error is below 0.2 m.
+    Args:
+        X: Metres east (m), shape (n,).
+        Y: Metres north (m), shape (n,).
+        origin: Origin (degrees north, degrees east).
+
+    Returns:
+        (latitude, longitude) (degrees), shape (n,) each.
     """
     east, north = compute_radii(origin[0])
     return origin[0] + np.degrees(Y / north), origin[1] + np.degrees(X / east)

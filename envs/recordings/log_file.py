@@ -38,10 +38,6 @@ _STANDING = 0.5  # m/s; below it the sideslip angle is 0
 def read_log(path: str | Path, mapping: Mapping[str, str] | None = None) -> Log:
     """Read a recorded drive from a table of `read_table` (needs the extra `report`).
 
-    path: columns are named as in `COLUMNS`; those of `NEEDED` must be there, unknown ones are
-    ignored. mapping: our column name, unit included, to the log's ({"yaw_rate_degps": "GyroZ"});
-    `parse_mapping` makes it from texts.
-
     The record's dt is the mean step of time, its first tick that of the first row (0 where time
     starts below 0: ticks are never negative). A logged input (steering, torque, command) acts from
     its own row to the next, so it stands one row later in the record. Without both wheel speeds
@@ -49,12 +45,21 @@ def read_log(path: str | Path, mapping: Mapping[str, str] | None = None) -> Log:
     sample is captured and arrives in its row, and the sensor's period is the longest that has every
     sample on its clock. truth["beta"] is the sideslip angle, or atan2(speed_y, speed_x) where only
     that is logged; 0 at 0.5 m/s and below, NaN where unknown, left out where the log has neither.
-    name is the file's with its folder's.
+    The name is the file's with its folder's. ModuleNotFoundError is raised without the extra.
 
-    Raises ModuleNotFoundError without the extra, FileNotFoundError, and ValueError, with the path,
-    for a file that is no table, a missing column, a value that is no number, fewer than two rows,
-    and a clock that runs backward, stands still, jumps or is uneven. Rows in messages count from 1
-    below the header.
+    Args:
+        path: Table with columns named as in `COLUMNS`; those of `NEEDED` must be present, unknown
+            ones are ignored.
+        mapping: Our column names, unit included, to the log's ({"yaw_rate_degps": "GyroZ"});
+            `parse_mapping` makes it from texts.
+
+    Returns:
+        The log.
+
+    Raises:
+        ValueError: For a file that is no table, a missing column, a value that is no number, fewer
+            than two rows, and a clock that runs backward, stands still, jumps or is uneven. Rows in
+            messages count from 1 below the header.
     """
     source = Path(path)
     values, _ = read_quantities(source, mapping or {}, NEEDED, GAPS)
@@ -65,8 +70,16 @@ def read_log(path: str | Path, mapping: Mapping[str, str] | None = None) -> Log:
 
 
 def make_log(values: dict[str, Array], source: Path, dt: float | None = None) -> Log:
-    """The log of quantities in SI units, (n,) each, with the dt of its clock, or this one in s;
-    ValueError for a bad clock."""
+    """Make the log of quantities in SI units; ValueError for a bad clock.
+
+    Args:
+        values: Quantities by name, shape (n,) each.
+        source: Path of the file, for the log's name.
+        dt: Step of the clock (s); None finds it.
+
+    Returns:
+        The log.
+    """
     dt = find_clock(values["time"])[1] if dt is None else dt
     first = max(round(float(values["time"][0]) / dt), 0)
     fast, present = _make_fast_rows(values)
@@ -84,9 +97,17 @@ def make_packet_rows(
     values: Array,
     quality: Array,
 ) -> Array:
-    """Packets of one sensor in capture order, (count, PACKET_WIDTH).
+    """Make the packets of one sensor in capture order.
 
-    captured, arrived: (count,) ticks. values: (count, up to VALUES), quality: (count,).
+    Args:
+        sensor: Name of the sensor, "camera" or "gps".
+        captured: Ticks of capture, shape (count,).
+        arrived: Ticks of arrival, shape (count,).
+        values: Values in SI units, shape (count, up to VALUES).
+        quality: Quality, shape (count,).
+
+    Returns:
+        Packets, shape (count, PACKET_WIDTH).
     """
     packets = np.zeros((len(captured), PACKET_WIDTH))
     packets[:, PACKET.sensor] = SLOW_NAMES.index(sensor)
@@ -99,7 +120,17 @@ def make_packet_rows(
 
 
 def find_clock(time: Array) -> tuple[int, float]:
-    """(first tick, dt in s) of an even clock; ValueError names the row where it is not."""
+    """Find the first tick and the step of an even clock.
+
+    Args:
+        time: Time of each row (s), shape (n,).
+
+    Returns:
+        First tick and dt (s).
+
+    Raises:
+        ValueError: If the clock is uneven, with the row.
+    """
     steps = np.diff(time)
     typical = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
     min_step = _STILL * typical

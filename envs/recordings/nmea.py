@@ -1,8 +1,8 @@
 """NMEA 0183, what satellite receivers send: bytes as they come, decoded into epochs.
 
     decoder = Decoder()
-    for chunk in open_source("serial:/dev/ttyUSB0:4800"):
-        for epoch in decoder.feed(chunk):
+    for chunk in make_source("serial:/dev/ttyUSB0:4800"):
+        for epoch in decoder.decode_chunk(chunk):
             ...
 
 Degrees from north, knots and times of day live here and in `sentences` alone.
@@ -23,7 +23,7 @@ LONGEST = 1024  # bytes of a sentence; the standard has 82, some vendors' are lo
 KNOT = 1852.0 / 3600.0  # m/s
 DAY = 86_400.0  # s
 HOUR = 3600.0  # s, from which a step forward is counted
-CONTINUOUS = 60.0  # s: a time of day within these goes on, whatever its date
+CONTINUOUS = 60.0  # s: a time of day within these is continuous, whatever its date
 ROLLOVER = 7 * 1024  # days, after which a receiver's count of weeks begins anew
 _EPOCH = date(1970, 1, 1).toordinal()
 _FIRST = DAY * (date(1980, 1, 6).toordinal() - _EPOCH)  # s: GPS has no earlier date
@@ -32,7 +32,7 @@ _TIMED = ("GLL", "RMC", "GNS", "GGA")  # with a position
 
 
 class Epoch(NamedTuple):
-    """What a receiver measured at one time; NaN is unknown."""
+    """A receiver's measurements at one time; NaN is unknown."""
 
     t: float
     """UTC in s since 1970, since the first epoch's midnight where no date was sent. Leap seconds
@@ -55,10 +55,24 @@ class Epoch(NamedTuple):
 
 @dataclass
 class Counts:
-    """What came in, and what was wrong with it.
+    """Counts of received sentences and epochs, and of their faults.
 
-    sentences: by type, with a right checksum; those outside `DECODED` were skipped. emptied: bad
-    fields, by type and name. garbage: bytes outside sentences, line ends apart.
+    Attributes:
+        received: Bytes.
+        garbage: Bytes outside sentences, line ends apart.
+        sentences: Sentences by type, with a right checksum; those outside `DECODED` were skipped.
+        bad_checksum: Sentences with a wrong checksum.
+        truncated: Sentences cut short.
+        unchecked: Sentences without a checksum.
+        overlong: Sentences longer than `LONGEST`.
+        emptied: Bad fields, by type and name.
+        epochs: Epochs.
+        without_fix: Epochs without a fix.
+        without_time: Epochs without a time.
+        backward: Steps of time backward.
+        forward: Steps of time forward by an hour or more.
+        redated: Epochs dated by others.
+        repeated: Sentences repeated in an epoch.
     """
 
     received: int = 0
@@ -78,7 +92,7 @@ class Counts:
     repeated: int = 0
 
     def rows(self) -> list[tuple[str, int]]:
-        """(what, how many), for a table."""
+        """List names and counts for a table."""
         return [
             ("bytes", self.received),
             *((f"sentences {name}", n) for name, n in sorted(self.sentences.items())),
@@ -99,9 +113,9 @@ class Counts:
 
 
 class Decoder:
-    """Decodes a stream of bytes, cut anywhere, into epochs; never raises on what it is fed.
+    """Decodes a stream of bytes, cut anywhere, into epochs; never raises on bad input.
 
-    An epoch is handed out with the sentence that completes it: motion (RMC or VTG) and GGA or GNS,
+    An epoch is returned with the sentence that completes it: motion (RMC or VTG) and GGA or GNS,
     and GSA where these have no HDOP; an incomplete one when the next begins. Of several talkers the
     first makes the epoch. At most `LONGEST` bytes and one epoch are held.
     """
@@ -120,7 +134,14 @@ class Decoder:
         self._view: dict[str, int] = {}  # satellites, by system
 
     def decode_chunk(self, chunk: bytes) -> list[Epoch]:
-        """The epochs that these bytes complete."""
+        """Decode some bytes.
+
+        Args:
+            chunk: The next bytes of the stream.
+
+        Returns:
+            The epochs that they complete.
+        """
         self.counts.received += len(chunk)
         outside, *pieces = (self._tail + chunk).split(b"$")
         self._tail = b""
@@ -142,7 +163,7 @@ class Decoder:
         return epochs
 
     def finish(self) -> list[Epoch]:
-        """The last epoch, where the stream ended without completing it or its line."""
+        """Decode the last epoch, where the stream ended without completing it or its line."""
         tail, self._tail = self._tail, b""
         return (self._decode_sentence(tail[1:]) if tail else []) + self._close()
 
@@ -259,10 +280,10 @@ class Decoder:
 
 
 def correct_dates(epochs: list[Epoch]) -> list[Epoch]:
-    """Date a log's epochs alike where the day jumps while the time of day goes on.
+    """Date a log's epochs alike where the day jumps while the time of day continues.
 
     Args:
-        epochs: Those of a whole log, as `Decoder` hands them out.
+        epochs: Epochs of a whole log, as `Decoder` returns them.
 
     Returns:
         The epochs by their last date, or one newer by whole rollovers. A real pause remains.

@@ -24,16 +24,26 @@ def read_parts(
     start: float = 0.0,
     end: float | None = None,
 ) -> tuple[list[Log], list[str]]:
-    """Read a recorded drive as `read_log` does, but mend its clock: (whole drives, what was done).
+    """Read a recorded drive as `read_log` does, but mend its clock and divide it at long holes.
 
     Shuffled rows are sorted. Rows without a value in a column that must be complete, and rows whose
-    time is not after that of those before, are dropped; a file that has mostly such rows here and
-    there is refused. Holes up to `MAX_HOLE` s are filled by interpolation on an even clock; longer
-    ones, and a clock that is set back by more, divide the log, and parts under `MIN_PART` s are
-    left out. All parts have the dt of the longest; one without a slow sensor's sample lacks the
-    sensor.
-    start, end: s after the first row, what is read. Raises what `read_log` does for all else, and
-    ValueError where no part is left.
+    time is not after that of those before, are dropped; a file of which most rows lack a value at
+    irregular places is refused. Holes up to `MAX_HOLE` s are filled by interpolation on an even
+    clock; longer ones, and a clock that is set back by more, divide the log, and parts under
+    `MIN_PART` s are left out. All parts have the dt of the longest; one without a slow sensor's
+    sample lacks the sensor.
+
+    Args:
+        path: Table as `read_log` reads it.
+        mapping: Our column names, unit included, to the log's.
+        start: Time after the first row from which it is read (s).
+        end: Time after the first row up to which it is read (s); None: to its end.
+
+    Returns:
+        Whole drives, and sentences on what was done.
+
+    Raises:
+        ValueError: If no part is left, and for all else that `read_log` refuses.
     """
     source = Path(path)
     values, remarks = read_quantities(source, mapping or {}, NEEDED, None)
@@ -73,7 +83,7 @@ def read_parts(
 
 
 def _split_pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], list[tuple[int, str]]]:
-    """The log's whole drives on even clocks, and (how often, what) was done to have them."""
+    """Split the log into whole drives on even clocks; list (count, text) of what was done."""
     time, pieces, short, dropped, holes = values["time"], [], 0, 0, 0
     steps = np.diff(time)
     if not (steps > 0.0).any():
@@ -116,8 +126,10 @@ def _split_pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], lis
 def _resample_evenly(
     values: dict[str, Array], dt: float, tolerance: float = math.inf
 ) -> dict[str, Array]:
-    """The quantities on an even clock: interpolated, a slow sensor's samples in the nearest row;
-    those whose clock is even already, and within this share of dt, as they are."""
+    """Resample the quantities to an even clock: interpolated, slow samples in the nearest row.
+
+    Those whose clock is even already, and within this fraction of dt, stay as they are.
+    """
     time = values["time"]
     try:
         if abs(find_clock(time)[1] / dt - 1.0) <= tolerance:

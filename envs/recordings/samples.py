@@ -8,7 +8,7 @@ import numpy.typing as npt
 from ..record import Array
 
 Mask = npt.NDArray[np.bool_]
-SENSORS = {  # the values of a packet, as in SLOW_VALUES; the first tells where there is a sample
+SENSORS = {  # the values of a packet, as in `SLOW`; the first shows where a sample is
     "camera": ("camera_psi", "camera_y_l"),
     "gps": ("course", "gps_speed", "gps_x", "gps_y", "gps_hdop", "gps_satellites"),
 }
@@ -19,7 +19,7 @@ KINDS = ("fresh", "held", "interpolated")
 LONGEST_GAP = 1.0  # s between values of a fast quantity that are joined by a line
 _COMPLETE = 0.75  # of the rows, above which a quantity is one of every row
 _SHUFFLED = 0.05  # of the rows, which step back in time
-_MIN_INTERVALS = 5  # between samples, from which their period is told
+_MIN_INTERVALS = 5  # between samples, from which their period is found
 
 
 def find_samples(
@@ -89,7 +89,7 @@ def _keep_samples(values: dict[str, Array], kinds: Mapping[str, str]) -> list[st
 
 
 def _find_knots(values: Array) -> npt.NDArray[np.int64]:
-    """Where an angle's slope changes, +-180 deg being one, by more than values are rounded."""
+    """Find where an angle's slope changes by more than rounding; +-180 deg are one."""
     gaps, scale = np.diff(np.unique(values)), float(np.abs(values).max())
     resolution = gaps[gaps > 1e-12 * scale].min(initial=np.pi)
     bends = np.abs(np.diff(np.unwrap(values), 2))
@@ -97,8 +97,10 @@ def _find_knots(values: Array) -> npt.NDArray[np.int64]:
 
 
 def _find_period(lengths: Array) -> float:
-    """The period of sampling in rows, from the rows between changes, 0.0 where there is none: a
-    lost or repeated sample makes a multiple, a coarse value in every row irregular distances."""
+    """Find the period of sampling in rows, 0.0 where there is none, from the rows between changes.
+
+    A lost or repeated sample makes a multiple, a coarse value in every row irregular distances.
+    """
     if len(lengths) < _MIN_INTERVALS:
         return 0.0
     typical = float(np.quantile(lengths, 0.25, method="lower"))

@@ -46,7 +46,17 @@ class Sentence(NamedTuple):
 
 
 def read_sentence(text: bytes) -> Sentence | None:
-    """The sentence; None for a wrong checksum. Raises ValueError for one without a checksum."""
+    """Read a sentence and check it.
+
+    Args:
+        text: Bytes between "$" and the line's end.
+
+    Returns:
+        The sentence; None for a wrong checksum.
+
+    Raises:
+        ValueError: For one without a checksum.
+    """
     try:
         content, talker, kind, fields, checksum = get_parts(text)
     except NMEAMessageError:
@@ -82,14 +92,31 @@ def read_sentence(text: bytes) -> Sentence | None:
 
 
 def is_unchecked(text: bytes) -> bool:
-    """Whether a sentence of `DECODED` lacks its checksum alone; its last two fields are newer."""
+    """Check whether a sentence of `DECODED` lacks only its checksum; its last two fields are newer.
+
+    Args:
+        text: Bytes between "$" and the line's end.
+
+    Returns:
+        True if it does.
+    """
     address, *fields = text.split(b",")
     kind = address[2:].decode("ascii", "replace")
     return b"*" not in text and kind in DECODED and len(fields) >= len(_list_forms(kind)) - 2
 
 
 def apply_sign(values: dict[str, Any], name: str, side: str, negative: str) -> float:
-    """Degrees of "lat" or "lon" with the sign of their side; NaN where either is missing."""
+    """Apply the sign of its side to a latitude or longitude.
+
+    Args:
+        values: Fields of an epoch.
+        name: Name of the field, "lat" or "lon" (degrees).
+        side: Name of the side's field, "NS" or "EW".
+        negative: Side that is negative, "S" or "W".
+
+    Returns:
+        Degrees; NaN where either field is missing.
+    """
     if name not in values or side not in values:
         return math.nan
     return float(-values[name] if values[side] == negative else values[name])

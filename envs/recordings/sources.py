@@ -31,13 +31,17 @@ class Connection(NamedTuple):
 
 @dataclass
 class ByteSource:
-    """The bytes of a receiver in chunks, b"" where none came for a while; ends with a file alone.
-
-    connect: opens the line. tries: how often a lost line is opened again before a byte comes, wait:
-    s before each. losses: how often it was lost.
+    """The bytes of a receiver in chunks, b"" where none came for a while; only a file ends.
 
     Iterating raises OSError where the line cannot be opened at first, ConnectionError where it was
     lost and does not come back; leaving the loop closes it.
+
+    Attributes:
+        name: Name of the source, for messages.
+        connect: Opens the line.
+        tries: Number of times that a lost line is opened again before a byte comes.
+        wait: Time before each (s).
+        losses: Number of times that it was lost.
     """
 
     name: str
@@ -77,10 +81,19 @@ class ByteSource:
 
 
 def make_source(text: str, tries: int = 5, wait: float = 1.0) -> ByteSource:
-    """The source of a text: a file's path, serial:PORT[:BAUD] (extra `wires`) or tcp:HOST:PORT.
+    """Make the source that a text names; nothing is opened before it is iterated.
 
-    tries, wait: of `ByteSource`. Nothing is opened before it is iterated. Raises ValueError for a
-    text of another form, FileNotFoundError, and ValueError for a folder.
+    Args:
+        text: A file's path, serial:PORT[:BAUD] (extra `wires`) or tcp:HOST:PORT.
+        tries: Number of times that a lost line is opened again before a byte comes.
+        wait: Time before each (s).
+
+    Returns:
+        The source.
+
+    Raises:
+        ValueError: For a text of another form, and for a folder.
+        FileNotFoundError: For a file that does not exist.
     """
     kind, _, rest = text.partition(":")
     head, _, number = rest.rpartition(":")
@@ -102,7 +115,14 @@ def make_source(text: str, tries: int = 5, wait: float = 1.0) -> ByteSource:
 
 
 def is_nmea(path: str | Path) -> bool:
-    """Whether a file is called .nmea or a sentence stands near its beginning, valid or not."""
+    """Check whether a file is NMEA, by its ending or a sentence near its beginning, valid or not.
+
+    Args:
+        path: Path of the file.
+
+    Returns:
+        True if it is.
+    """
     source = Path(path)
     if source.suffix.lower() == ".nmea" or not source.is_file():
         return source.suffix.lower() == ".nmea"
@@ -111,10 +131,17 @@ def is_nmea(path: str | Path) -> bool:
 
 
 def read_nmea(path: str | Path) -> tuple[list["Epoch"], "Counts"]:
-    """All epochs of a file, their dates mended, and what was found in it (extra `wires`).
+    """Read all epochs of a file, their dates mended (extra `wires`); FileNotFoundError without it.
 
-    Raises FileNotFoundError, and ValueError, with the path, for a folder and a file that is empty,
-    has no valid sentence, or no epoch with a fix and a time.
+    Args:
+        path: Path of the file.
+
+    Returns:
+        The epochs, and counts of what the file holds.
+
+    Raises:
+        ValueError: For a folder and a file that is empty, has no valid sentence, or no epoch with a
+            fix and a time.
     """
     from .nmea import Decoder, correct_dates
 

@@ -16,9 +16,11 @@ if TYPE_CHECKING:
 class LogTable(NamedTuple):
     """A file's columns as they stand there.
 
-    frame: the values; names may repeat. units: what the file says beside a column's name, "" for
-    nothing. names: of all columns; an MDF's frame has only those that are wanted. remarks: what the
-    file was taken for.
+    Attributes:
+        frame: Values; names may repeat.
+        units: Unit of each column, "" for unknown.
+        names: Names of all columns; an MDF's frame has only the wanted ones.
+        remarks: Sentences on how the file was read.
     """
 
     frame: "pd.DataFrame"
@@ -28,11 +30,22 @@ class LogTable(NamedTuple):
 
 
 def read_table(path: Path, is_wanted: Callable[[str], bool]) -> LogTable:
-    """The file's columns as they stand there.
+    """Read a file's columns: text of any dialect, Parquet, MATLAB or MDF, recognised by content.
 
-    Text of any dialect, Parquet, MATLAB or MDF (needs `asammdf`), recognised by content. is_wanted:
-    whether a column's name is one that is looked for. Raises ModuleNotFoundError without the extra,
-    FileNotFoundError, and ValueError where the file is no table.
+    MDF needs `asammdf`.
+
+    Args:
+        path: Path of the file.
+        is_wanted: Whether a column's name is looked for.
+
+    Returns:
+        The table.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is no table.
+        ImportError: If an extra is missing.
+        MemoryError: If it does not fit into memory.
     """
     with require_extra("report", "reading a log needs pandas"):
         import pandas as pd

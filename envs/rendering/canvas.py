@@ -27,8 +27,13 @@ _FONTS = "dejavusans,notosans,liberationsans,arial,helveticaneue,segoeui"
 
 
 class Canvas:
-    """A picture of `size` pixels, (width, height). Places and widths are in pixels of the result,
-    x to the right and y down; colours are "#RRGGBB"."""
+    """A picture that shapes and text are drawn on.
+
+    Places and widths are in pixels of the result, x to the right and y down; colours are "#RRGGBB".
+
+    Args:
+        size: Width and height of the picture (px).
+    """
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
@@ -36,24 +41,45 @@ class Canvas:
         self._texts: list[tuple[pygame.Surface, tuple[float, float]]] = []
 
     def set_clip(self, box: Box | None) -> None:
-        """Draw only there from now on; None: everywhere. Text is drawn everywhere."""
+        """Limit the drawing of shapes to a box; text is drawn everywhere.
+
+        Args:
+            box: The box; None: the whole picture.
+        """
         self._large.set_clip(
             None if box is None else [round(_OVERSAMPLING * value) for value in box]
         )
 
     def draw_box(self, box: Box, colour: str, radius: float = 0.0) -> None:
-        """A filled box with round corners."""
+        """Draw a filled box with round corners.
+
+        Args:
+            box: The box.
+            colour: Its colour.
+            radius: Radius of its corners (px).
+        """
         scaled = pygame.Rect([round(_OVERSAMPLING * value) for value in box])
         pygame.draw.rect(self._large, colour, scaled, border_radius=round(_OVERSAMPLING * radius))
 
     def draw_polygon(self, points: Points, colour: str) -> None:
-        """A filled polygon."""
+        """Draw a filled polygon.
+
+        Args:
+            points: Its corners (px), shape (n, 2).
+            colour: Its colour.
+        """
         scaled = _scale_points(points)
         pygame.draw.polygon(self._large, colour, scaled)
         pygame.draw.aalines(self._large, colour, True, scaled)
 
     def draw_line(self, points: Points, colour: str, width: float = 1.0) -> None:
-        """A line through at least two points."""
+        """Draw a line through at least two points.
+
+        Args:
+            points: Points (px), shape (n, 2).
+            colour: Its colour.
+            width: Its width (px).
+        """
         scaled, thick = _scale_points(points), max(round(_OVERSAMPLING * width), 1)
         pygame.draw.lines(self._large, colour, False, scaled, thick)
         if thick > 4:
@@ -63,7 +89,15 @@ class Canvas:
     def draw_dashes(
         self, points: Points, colour: str, width: float = 1.0, dash: float = 6.0, gap: float = 5.0
     ) -> None:
-        """A dashed line: so many pixels drawn, so many not."""
+        """Draw a dashed line.
+
+        Args:
+            points: Points (px), shape (n, 2).
+            colour: Its colour.
+            width: Its width (px).
+            dash: Length of a dash (px).
+            gap: Length between two dashes (px).
+        """
         vertices = np.asarray(points, float)
         steps = np.hypot(*np.diff(vertices, axis=0).T)
         length = np.concatenate([[0.0], np.cumsum(steps)])
@@ -76,16 +110,36 @@ class Canvas:
             pygame.draw.line(self._large, colour, start, end, max(round(_OVERSAMPLING * width), 1))
 
     def draw_disc(self, centre: Any, radius: float, colour: str) -> None:
-        """A filled circle."""
+        """Draw a filled circle.
+
+        Args:
+            centre: Its centre (px), shape (2,).
+            radius: Its radius (px).
+            colour: Its colour.
+        """
         pygame.draw.circle(self._large, colour, _scale_points([centre])[0], _OVERSAMPLING * radius)
 
     def draw_ring(self, centre: Any, radius: float, colour: str, width: float = 1.0) -> None:
-        """A circle."""
+        """Draw a circle.
+
+        Args:
+            centre: Its centre (px), shape (2,).
+            radius: Radius to the middle of the line (px).
+            colour: Its colour.
+            width: Its width (px).
+        """
         place, thick = _scale_points([centre])[0], max(round(_OVERSAMPLING * width), 1)
         pygame.draw.circle(self._large, colour, place, _OVERSAMPLING * radius + thick / 2, thick)
 
     def draw_arrow(self, start: Any, end: Any, colour: str, width: float = 2.0) -> None:
-        """A line with a head at its end; the head shrinks with a short one."""
+        """Draw a line with a head at its end; the head shrinks with a short one.
+
+        Args:
+            start: Its start (px), shape (2,).
+            end: Its tip (px), shape (2,).
+            colour: Its colour.
+            width: Its width (px).
+        """
         a, b = np.asarray(start, float), np.asarray(end, float)
         length = float(np.hypot(*(b - a)))
         if length < 1.0:
@@ -106,15 +160,26 @@ class Canvas:
         align: float = 0.0,
         bold: bool = False,
     ) -> float:
-        """Words whose middle line passes the place; align 0 begins there, 1 ends there. Returns
-        their width."""
+        """Draw words whose middle line passes a place.
+
+        Args:
+            place: The place (px), shape (2,).
+            words: The words.
+            colour: Their colour.
+            size: Size of the font (px).
+            align: 0 begins at the place, 1 ends there.
+            bold: Whether they are bold.
+
+        Returns:
+            Their width (px).
+        """
         surface = _render_words(words, colour, size, bold)
         width, height = surface.get_size()
         self._texts.append((surface, (place[0] - align * width, place[1] - 0.5 * height)))
         return float(width)
 
     def finish(self) -> pygame.Surface:
-        """The picture; the canvas may be drawn upon anew."""
+        """Finish the picture and return it; the canvas may be drawn upon anew."""
         small = pygame.transform.smoothscale(self._large, self.size)
         small.blits(self._texts)
         self._texts = []
@@ -122,14 +187,21 @@ class Canvas:
 
 
 def read_pixels(picture: pygame.Surface) -> npt.NDArray[np.uint8]:
-    """A picture as an array (height, width, 3)."""
+    """Read the pixels of a picture.
+
+    Args:
+        picture: The picture.
+
+    Returns:
+        Red, green and blue, shape (height, width, 3).
+    """
     width, height = picture.get_size()
     flat = np.frombuffer(pygame.image.tobytes(picture, "RGB"), np.uint8)
     return flat.reshape(height, width, 3).copy()
 
 
 def _scale_points(points: Points) -> list[tuple[int, int]]:
-    """Places on the large surface; what lies far outside is drawn at its edge's other side."""
+    """Scale places to the large surface; what lies far outside is clipped at 4000 pixels."""
     rounded = np.rint(np.clip(np.asarray(points, float), -4000.0, 4000.0) * _OVERSAMPLING).astype(
         int
     )

@@ -28,7 +28,16 @@ def draw_closeup(
     reference: float,
     estimates: dict[str, tuple[float, str]],
 ) -> None:
-    """The close-up in a box; angles in rad, estimates by label with their colour."""
+    """Draw the close-up of a car in a box.
+
+    Args:
+        canvas: The canvas.
+        box: The box.
+        scene: The car.
+        beta: Sideslip angle (rad).
+        reference: Reference of the sideslip angle (rad).
+        estimates: By label, estimate of the sideslip angle (rad) and its colour.
+    """
     front, rear, half = compute_body(scene.vehicle)
     scale = _LENGTH / (front - rear)
     x_0 = box[0] + 0.52 * box[2] - 0.5 * scale * (front + rear)
@@ -71,7 +80,7 @@ def draw_closeup(
 
 
 def _draw_forces(canvas: Canvas, scene: CarScene, to_pixels: ToPixels, per_newton: float) -> None:
-    """An arrow a tyre, from green to orange as it nears its limit, and the share of it in use."""
+    """Draw an arrow a tyre, from green to orange as it nears its limit, and the fraction in use."""
     for wheel in scene.wheels:
         cos, sin = math.cos(wheel.angle), math.sin(wheel.angle)
         forward = cos * wheel.F_x - sin * wheel.F_y
@@ -106,7 +115,7 @@ def _draw_directions(
     reference: float,
     estimates: dict[str, tuple[float, str]],
 ) -> None:
-    """Where the car goes, where it should, and where the estimates believe it goes."""
+    """Draw the directions of the velocity, of its reference and of the estimates."""
 
     foot = np.array(centre)
 

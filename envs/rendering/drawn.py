@@ -24,12 +24,12 @@ _TICKS_PER_FRAME = 20  # ticks of driving between two pictures in a window, or a
 class RenderMixin:
     """An environment of one or more cars that draws them.
 
-    render_mode: None, "rgb_array" (`render` returns frames, (540, 960, 3) bytes) or "human" (a
+    `render_mode` is None, "rgb_array" (`render` returns frames, (540, 960, 3) bytes) or "human" (a
     window in which `reset` and `step` show the first car, in real time). The drawing reads what the
     engine wrote and changes nothing of it. The strip charts begin at an episode's first picture.
 
-    Raises ValueError for an unknown mode; with the first picture ModuleNotFoundError where pygame
-    is missing, ResetNeeded where there was no reset. Without a display a window warns once.
+    An unknown mode raises ValueError; the first picture raises ModuleNotFoundError where pygame is
+    missing, ResetNeeded where there was no reset. Without a display a window warns once.
     """
 
     _has_tyre_forces = True  # tyre forces can be drawn
@@ -52,7 +52,7 @@ class RenderMixin:
         raise NotImplementedError
 
     def _record_step(self) -> None:
-        """Remember what a reset or a step led to, and show it in the window if there is one.
+        """Record what a reset or a step led to, and show it in the window if there is one.
 
         Called where `_traces` has some. The window is an estimate behind: wrappers have not
         estimated yet.
@@ -73,7 +73,17 @@ class RenderMixin:
             window.show(picture.draw_picture(render_state), 1.0 / (interval * TICK))
 
     def make_render_state(self, row: int = 0) -> RenderState:
-        """What a car's picture is drawn from."""
+        """Make what a car's picture is drawn from.
+
+        Args:
+            row: Number of the car.
+
+        Returns:
+            The state, of views that change with the car.
+
+        Raises:
+            ResetNeeded: If there was no reset.
+        """
         if not self._traces:
             self._traces = [EpisodeTrace() for _ in range(self._cars)]
         render_state = RenderState(
@@ -119,14 +129,19 @@ class SingleRenderMixin(RenderMixin):
         self.annotations: dict[str, tuple[float, float]] = {}
 
     def annotate(self, label: str, beta: float, std: float) -> None:
-        """A wrapper's estimate of the sideslip angle now and its standard deviation std, in rad, to
-        be drawn beside the truth under a label."""
+        """Annotate the newest step with a wrapper's estimate, to be drawn beside the truth.
+
+        Args:
+            label: Label of the estimate.
+            beta: Sideslip angle (rad).
+            std: Standard deviation (rad).
+        """
         self.annotations[label] = beta, std
         if self._traces:
             self._traces[0].add_estimate(label, beta, std)
 
     def render(self) -> Frame | None:
-        """The car's frame in the mode "rgb_array", else None."""
+        """Return the car's frame in the mode "rgb_array", else None."""
         frames = self._render_frames()
         return None if frames is None else frames[0]
 
@@ -139,12 +154,19 @@ class VectorRenderMixin(RenderMixin):
     """A vector environment that draws its cars."""
 
     def annotate(self, label: str, beta: Array, std: Array, rows: npt.NDArray[np.bool_]) -> None:
-        """The same as of a single environment, label, beta and std, for some rows, each (N,)."""
+        """Annotate the newest step of some rows with a wrapper's estimates.
+
+        Args:
+            label: Label of the estimates.
+            beta: Sideslip angles (rad), shape (N,).
+            std: Standard deviations (rad), shape (N,).
+            rows: Whether a row has an estimate, shape (N,).
+        """
         for row in np.flatnonzero(rows[: len(self._traces)]):
             self._traces[row].add_estimate(label, beta[row], std[row])
 
     def render(self) -> tuple[Frame, ...] | None:
-        """A frame of each car in the mode "rgb_array", else None."""
+        """Return a frame of each car in the mode "rgb_array", else None."""
         return self._render_frames()
 
     def close_extras(self, **_: Any) -> None:

@@ -102,13 +102,20 @@ _DEFAULT_PREFIX = "lqr on "  # the controller under which filters are compared
 
 
 def find_base(name: str) -> str | None:
-    """The name of `COLOURS` that a label speaks of, None for a stranger: of a controller on an
-    estimator the controller, unless it is the usual one.
+    """Find the name of `COLOURS` in a label, None for an unknown one.
+
+    Of a controller on an estimator it is the controller, unless that is the usual one.
 
     >>> find_base("exact-kf, true model"), find_base("the bound"), find_base("a stranger")
     ('exact-kf', 'bound', None)
     >>> find_base("two-dof on multirate-kf"), find_base("lqr on dakf")
     ('two-dof', 'dakf')
+
+    Args:
+        name: The label.
+
+    Returns:
+        The name.
     """
     name = name.removeprefix(_DEFAULT_PREFIX).partition(" on ")[0]
     return (
@@ -119,7 +126,14 @@ def find_base(name: str) -> str | None:
 
 
 def find_colour(name: str) -> str:
-    """The colour of a label, as "#RRGGBB"; a stranger always gets the same one."""
+    """Find the colour of a label; an unknown one always gets the same.
+
+    Args:
+        name: The label.
+
+    Returns:
+        "#RRGGBB".
+    """
     known = find_base(name)
     return (
         COLOURS[known] if known else OTHER_COLOURS[zlib.crc32(name.encode()) % len(OTHER_COLOURS)]
@@ -127,10 +141,18 @@ def find_colour(name: str) -> str:
 
 
 def mix_colours(shade: str, with_shade: str, share: float) -> str:
-    """A share of one colour with the rest of another.
+    """Mix two colours.
 
     >>> mix_colours("#000000", "#FFFFFF", 0.2)
     '#cccccc'
+
+    Args:
+        shade: One colour, "#RRGGBB".
+        with_shade: The other colour.
+        share: Fraction of the first, from 0 to 1.
+
+    Returns:
+        "#RRGGBB" in lower case.
     """
     pairs = [(int(shade[i : i + 2], 16), int(with_shade[i : i + 2], 16)) for i in (1, 3, 5)]
     return "#" + "".join(f"{round(a * share + b * (1.0 - share)):02x}" for a, b in pairs)

@@ -26,7 +26,16 @@ _ROAD, _CLOSEUP, _STRIPS = (
 def draw_picture(
     shot: RenderState, name: str = "true", ghosts: Sequence[tuple[str, RenderState]] = ()
 ) -> pygame.Surface:
-    """The picture of a car, under the name of its driver; ghosts drive beside it, with theirs."""
+    """Draw the picture of a car, with ghosts that drive beside it.
+
+    Args:
+        shot: State of the car.
+        name: Name of its driver.
+        ghosts: Name and state of each ghost.
+
+    Returns:
+        The picture.
+    """
     p, _, switches, _, config, trace, _, draw_world = shot
     now = trace.newest
     span = min(max(float(p[P.task.duration]) * TICK, 2.0), MAX_SPAN)
@@ -65,7 +74,7 @@ def draw_picture(
 
 
 def _choose_shades(labels: Iterable[str]) -> dict[str, str]:
-    """A colour an estimator, its own where no other has it."""
+    """Choose a colour for each estimator, its own where no other has it."""
     shades: dict[str, str] = {}
     for label in labels:
         used_shades = shades.values()
@@ -90,7 +99,7 @@ def _draw_legend(canvas: Canvas, name: str, ghosts: Sequence[str], shades: dict[
 def _draw_heading(
     canvas: Canvas, scene: CarScene, scenario: str, t: float, failures: list[tuple[str, int]]
 ) -> None:
-    """What is driven, by which car, how fast, and whose drive failed."""
+    """Draw the names of scenario and car, the speed, and whose drive failed."""
     x = 30.0 + canvas.draw_text((16.0, 20.0), scenario, INK, 17, bold=True)
     speed = 3.6 * math.hypot(scene.motion.v_x, scene.motion.v_y)
     car = f"{scene.vehicle.name}, {speed:.0f} km/h, friction {scene.friction:.2f}"

@@ -24,16 +24,16 @@ OVERHANG = 1.62  # length of a car in wheelbases
 
 
 class CarTrack(NamedTuple):
-    """A car to draw: where it is, where it was, the colour of its body, and a name beside it."""
+    """A car to draw: its scene, its past, the colour of its body, and a name beside it."""
 
     scene: CarScene
-    truth: Array  # rows of `Moment`
+    truth: Array  # rows of `TracePoint`
     colour: str
     name: str = ""
 
 
 class GroundProjection(NamedTuple):
-    """From the ground to pixels."""
+    """A projection from the ground to pixels."""
 
     x: float  # m, the place on the ground that is drawn at `centre`
     y: float
@@ -43,7 +43,7 @@ class GroundProjection(NamedTuple):
     scale: float  # pixels a metre
 
     def __call__(self, points: Array) -> Array:
-        """Pixels of places on the ground, (n, 2)."""
+        """Project places on the ground to pixels, shapes (n, 2)."""
         rel = np.asarray(points, float) - (self.x, self.y)
         right = rel[:, 0] * self.cos + rel[:, 1] * self.sin
         up = rel[:, 1] * self.cos - rel[:, 0] * self.sin
@@ -51,7 +51,12 @@ class GroundProjection(NamedTuple):
 
 
 class CentreLine:
-    """The centre line: as it was driven along, and as it goes on."""
+    """The centre line of the road: as it was driven along, and its continuation.
+
+    Args:
+        scene: The car, with the curvatures ahead.
+        truth: Rows of `TracePoint`, shape (n, len(TracePoint)).
+    """
 
     def __init__(self, scene: CarScene, truth: Array) -> None:
         s, y, theta = truth[:, TRACE_POINT.s], truth[:, TRACE_POINT.y], truth[:, TRACE_POINT.theta]
@@ -67,14 +72,28 @@ class CentreLine:
         self._theta = np.concatenate([theta[0] + 0.0 * backward, theta, directions])
 
     def locate(self, s: Array, y: Array) -> Array:
-        """Places on the ground at distances s along the road and y to its left, (n, 2)."""
+        """Compute the places on the ground of points of the road.
+
+        Args:
+            s: Distance along the road (m), shape (n,).
+            y: Distance to the left of the centre line (m), shape (n,).
+
+        Returns:
+            Places (m), shape (n, 2).
+        """
         theta = np.interp(s, self._s, self._theta)
         X, Y = np.interp(s, self._s, self._X), np.interp(s, self._s, self._Y)
         return np.stack([X - y * np.sin(theta), Y + y * np.cos(theta)], 1)
 
 
 def draw_road(canvas: Canvas, box: Box, cars: list[CarTrack]) -> None:
-    """The road around the last of the cars, in a box; the others are ghosts beside it."""
+    """Draw the road around the last of the cars, in a box; the others are ghosts beside it.
+
+    Args:
+        canvas: The canvas.
+        box: The box.
+        cars: The cars, at least one.
+    """
     scene, truth, *_ = cars[-1]
     motion, road = scene.motion, CentreLine(scene, truth)
     front, rear, _ = compute_body(scene.vehicle)
@@ -105,8 +124,10 @@ def draw_road(canvas: Canvas, box: Box, cars: list[CarTrack]) -> None:
 def _names(
     canvas: Canvas, box: Box, cars: list[CarTrack], poses: list[Array], scale: float
 ) -> None:
-    """The names of cars in the box: a ghost's on its side of the last car, whose own is on the
-    other; each as near as it covers no car and no other name."""
+    """Draw the names of cars in the box, each as near as it covers no car and no other name.
+
+    A ghost's name is on its side of the last car, whose own is on the other.
+    """
     taken = []  # the middle, the half width and the half height of what is not to be covered
     for car, (x, y) in zip(cars, poses, strict=True):
         front, rear, half = scale * np.array(compute_body(car.scene.vehicle))
@@ -206,7 +227,16 @@ def _draw_camera_overlay(
 def draw_car(
     canvas: Canvas, place: Array, heading: float, scale: float, scene: CarScene, colour: str
 ) -> None:
-    """A car at a place in pixels; heading: rad from the picture's right, to the left positive."""
+    """Draw a car.
+
+    Args:
+        canvas: The canvas.
+        place: Place of its centre of gravity (px), shape (2,).
+        heading: Heading from the picture's right (rad), left positive.
+        scale: Pixels of a metre.
+        scene: The car.
+        colour: Colour of its body.
+    """
     cos, sin = np.cos(heading), np.sin(heading)
 
     def to_pixels(points: Array) -> Array:
@@ -227,13 +257,29 @@ def draw_car(
 
 
 def compute_body(vehicle: Vehicle) -> tuple[float, float, float]:
-    """(front, rear, half width) in m from the centre of gravity."""
+    """Compute the extent of a car's body from its centre of gravity.
+
+    Args:
+        vehicle: The vehicle.
+
+    Returns:
+        Front, rear (negative) and half width (m).
+    """
     over = 0.5 * (OVERHANG - 1.0) * vehicle.wheelbase
     return vehicle.front_arm + over, -vehicle.rear_arm - over, 0.5 * vehicle.width
 
 
 def make_body_outline(rear: float, front: float, half: float) -> Array:
-    """A body's outline: a box whose corners are quarters of an ellipse, longer at the front."""
+    """Make a body's outline: a box with elliptic corners, longer at the front.
+
+    Args:
+        rear: Place of the rear (m), negative.
+        front: Place of the front (m).
+        half: Half the width (m).
+
+    Returns:
+        Points in car axes (m), shape (n, 2).
+    """
     turn = np.linspace(0.0, 0.5 * np.pi, 6)
     outline = []
     for x, y, a, b in ((front, half, 0.45, 0.4), (rear, half, 0.2, 0.25)):
@@ -246,7 +292,17 @@ def make_body_outline(rear: float, front: float, half: float) -> Array:
 
 
 def make_wheel_outline(x: float, y: float, angle: float, vehicle: Vehicle) -> Array:
-    """A wheel's corners in car axes in m."""
+    """Make the corners of a wheel.
+
+    Args:
+        x: Place ahead of the centre of gravity (m).
+        y: Place to its left (m).
+        angle: Steering angle (rad).
+        vehicle: The vehicle.
+
+    Returns:
+        Points in car axes (m), shape (4, 2).
+    """
     r, w = vehicle.wheel_radius, 0.3 * vehicle.wheel_radius
     corners = np.array([(r, w), (r, -w), (-r, -w), (-r, w)])
     cos, sin = np.cos(angle), np.sin(angle)

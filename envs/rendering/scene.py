@@ -65,7 +65,7 @@ class Wheel(NamedTuple):
 
 
 class CameraOverlay(NamedTuple):
-    """The camera's picture."""
+    """The camera's field of view, drawn over the road."""
 
     preview: float  # m, its preview distance
     half_angle: float  # rad
@@ -86,13 +86,20 @@ class CarScene(NamedTuple):
     field_of_view: CameraOverlay | None  # None without a camera
     lanes: tuple[Section, ...]  # between cones
     path: Array  # the driver's, rows (s, y) in m; (0, 2) where it is the road's centre line
-    curvatures: Array  # 1/m, the road's curvature at each of the next AHEAD metres
+    curvatures: Array  # 1/m, the road's curvature at each of the next DRAWN_LENGTH metres
     half_width: float  # m
     failure: int
 
 
 def make_car_scene(shot: RenderState) -> CarScene:
-    """The Scene of a Shot."""
+    """Make the scene of a car from its packed numbers.
+
+    Args:
+        shot: State of the car.
+
+    Returns:
+        The scene.
+    """
     p, z, switches, _, config, _, has_tyre_forces, _ = shot
     params, variant = _make_step_params(p), _make_step_variant(p, switches)
     motion, drive, tick = read(z, Z.motion), read(z, Z.drive), float(z[Z.clock.tick])
@@ -141,7 +148,7 @@ def _make_camera_overlay(p: Array, motion: Motion) -> CameraOverlay:
 
 
 def _find_lanes(path: TrackPath, config: EpisodeConfig) -> tuple[Section, ...]:
-    """The lanes between the cones of the episode's track, as its seed laid them."""
+    """Find the lanes between the cones of the episode's track, as its seed placed them."""
     track, width = config.scenario.path, config.vehicle.width
     standard = make_path(track, width)
     if config.scenario.steering != "driver" or standard.shift_1 == 0.0:
@@ -157,7 +164,7 @@ def _sample_path(path: TrackPath, s: float) -> Array:
 
 
 def _sample_curvatures(params: StepParams, z: Array, motion: Motion, road: int) -> Array:
-    """The scenario's; a road that is laid tick by tick is taken to go on turning as it does now."""
+    """Sample the curvature ahead; a nominal path is assumed to keep its present turning rate."""
     nominal_curvature = 0.0
     if road == NOMINAL_PATH:
         turn_rate, _ = _step_nominal_car(

@@ -28,8 +28,14 @@ class ChartLine(NamedTuple):
 
 
 class Strip(NamedTuple):
-    """A chart: its title with a unit, the least that its axis reaches to either side, and its
-    share of the height."""
+    """A chart.
+
+    Attributes:
+        title: Title with a unit.
+        min_limit: Least that its axis reaches to either side, in that unit.
+        share: Weight of its height among all strips.
+        lines: Its lines.
+    """
 
     title: str
     min_limit: float
@@ -45,10 +51,18 @@ def make_strips(
     max_moment: float,
     has_yaw_reference: bool,
 ) -> list[Strip]:
-    """Sideslip angle, yaw rate and yaw moment of a car over time, with those of ghosts.
+    """Make the charts of a car's sideslip angle, yaw rate and yaw moment, with those of ghosts.
 
-    estimates: by label (n, 2). ghosts: (truth, colour) of each. most_moment: N m, full scale.
-    has_yaw_reference: the yaw rate has a reference.
+    Args:
+        truth: Rows of `TracePoint`, shape (n, len(TracePoint)).
+        estimates: By label, estimates and standard deviations (rad), shape (n, 2).
+        colours: Colours by label.
+        ghosts: Rows of `TracePoint` and colour of each ghost.
+        max_moment: Full scale of the yaw moment (N m).
+        has_yaw_reference: Whether the yaw rate has a reference.
+
+    Returns:
+        The charts.
     """
 
     def make_lines(column: int, factor: float) -> list[ChartLine]:
@@ -84,7 +98,15 @@ def make_strips(
 
 
 def draw_strips(canvas: Canvas, box: Box, strips: list[Strip], first: float, span: float) -> None:
-    """The strips below one another in a box, over `span` seconds from the `first` on."""
+    """Draw strips below one another in a box.
+
+    Args:
+        canvas: The canvas.
+        box: The box.
+        strips: The charts.
+        first: Time at their left end (s).
+        span: Time that they show (s).
+    """
     left, top, width, height = box
     high = (height - _ROW) / sum(strip.share for strip in strips)
     y = top

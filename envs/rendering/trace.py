@@ -13,7 +13,7 @@ from ..vehicle.dynamics import Motion
 
 
 class TracePoint(NamedTuple):
-    """Columns of the truth."""
+    """Columns of the truth at an instant."""
 
     t: int = 0  # s
     beta: int = 1  # rad
@@ -34,7 +34,7 @@ _STATE_COLUMNS = [getattr(Z.motion, name) for name in TracePoint._fields[TRACE_P
 
 
 class EpisodeTrace:
-    """The steps of an episode that were seen."""
+    """The recorded steps of an episode: truth and estimates."""
 
     def __init__(self) -> None:
         self._rows = np.empty((256, len(TRACE_POINT)))
@@ -42,7 +42,12 @@ class EpisodeTrace:
         self._estimates: dict[str, Array] = {}
 
     def add(self, report: Array, state: Array) -> None:
-        """Remember the moment; one that is not after the last begins a new episode."""
+        """Add a step; one that is not after the last begins a new episode.
+
+        Args:
+            report: Report of the step, shape (len(StepReport),).
+            state: Packed state of the car.
+        """
         t, k = report[REPORT.t], self._count
         if k and t <= self._rows[k - 1, TRACE_POINT.t]:
             k, self._estimates = 0, {}
@@ -58,25 +63,39 @@ class EpisodeTrace:
         self._count = k + 1
 
     def add_estimate(self, label: str, value: float, deviation: float) -> None:
-        """An estimate of beta at the newest moment, and its standard deviation, rad."""
+        """Add an estimate of the sideslip angle to the newest step.
+
+        Args:
+            label: Label of the estimate.
+            value: Sideslip angle (rad).
+            deviation: Standard deviation (rad).
+        """
         if label not in self._estimates:
             self._estimates[label] = np.full((len(self._rows), 2), np.nan)
         self._estimates[label][self._count - 1] = value, deviation
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing was seen yet."""
+        """Whether no step is recorded."""
         return self._count == 0
 
     @property
     def newest(self) -> Array:
-        """The newest moment, (len(Moment),)."""
+        """The truth of the newest step, shape (len(TracePoint),)."""
         newest: Array = self._rows[self._count - 1]
         return newest
 
     def select_since(self, t: float, max_points: int = 400) -> tuple[Array, dict[str, Array]]:
-        """The truth from a time on, (n, len(Moment)), and by label the estimates and their
-        deviations, (n, 2), NaN where there are none; thinned out to `max_points` moments or so."""
+        """Select the steps from a time on, thinned out.
+
+        Args:
+            t: Time (s).
+            max_points: Number of steps that remain, or up to twice as many.
+
+        Returns:
+            The truth, shape (n, len(TracePoint)), and by label estimates and deviations (rad),
+            shape (n, 2), NaN where there are none.
+        """
         first = int(np.searchsorted(self._rows[: self._count, TRACE_POINT.t], t))
         step = max((self._count - first) // max_points, 1)
         chosen = np.arange(self._count - 1, first - 1, -step)[::-1]
@@ -90,7 +109,7 @@ RoadPainter = Callable[[tuple[int, int], list[Motion]], Any]
 
 
 class RenderState(NamedTuple):
-    """What a picture is drawn from: an episode's packed numbers, and what was seen of it."""
+    """State that a picture is drawn from: an episode's packed numbers and its recorded steps."""
 
     params: Array  # of `engine.layout`
     state: Array

@@ -37,7 +37,12 @@ def _make_screen(size: tuple[int, int]) -> pygame.Surface:
 
 
 def show(picture: pygame.Surface, rate: float) -> None:
-    """Show a picture, no sooner than 1 / rate seconds after the last one."""
+    """Show a picture, no sooner than 1 / rate seconds after the last one.
+
+    Args:
+        picture: The picture.
+        rate: Pictures a second.
+    """
     screen = pygame.display.get_surface() or _make_screen(picture.get_size())
     screen.blit(picture, (0, 0))
     pygame.event.pump()

@@ -47,10 +47,17 @@ _TIMES_OR_NONE = {  # how many
 
 
 def check_fields(fields: Fields, entries: Sequence[dataclasses.Field[Any]]) -> None:
-    """ValueError for a field out of place, TypeError for a vehicle's parameter that there is not,
-    with the scenario's name and the field's. What is plausible above zero alone is positive.
+    """Check the fields of a scenario; messages have its name and the field's.
 
-    entries: the dataclass's. Those of type float are one number, neither drawn nor None.
+    What is plausible above zero alone must be positive.
+
+    Args:
+        fields: Values by the names of fields.
+        entries: Fields of the dataclass; those of type float are one number, neither drawn nor
+            None.
+
+    Raises:
+        type: ValueError for a field out of place, TypeError for an unknown vehicle parameter.
     """
     numbers = [spec.name for spec in entries if spec.type is float]
     positive = {spec.name for spec in entries if spec.metadata.get("plausible", (0,))[0] > 0}

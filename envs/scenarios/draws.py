@@ -11,7 +11,7 @@ _ATTEMPTS = 64
 
 
 class Draws(NamedTuple):
-    """The quantities a scenario gives as a number or a range."""
+    """The quantities that a scenario gives as a number or a range."""
 
     speed: Any  # m/s
     friction: Any
@@ -50,7 +50,16 @@ DRAWS, DRAWS_WIDTH = make_offsets(Draws)
 
 @jit
 def draw_numbers(low: Any, high: Any, key_low: int, key_high: int, attempt: int, out: Any) -> None:
-    """Fill `out` (len(Draws)) with numbers in [low, high]; fixed ones keep their bits."""
+    """Draw uniform numbers in [low, high]; where both are equal they keep their bits.
+
+    Args:
+        low: Lower ends, shape (len(Draws),).
+        high: Upper ends, shape (len(Draws),).
+        key_low: Lower 32 bits of the episode's key.
+        key_high: Upper 32 bits of the episode's key.
+        attempt: Number of the attempt, from 0.
+        out: Array for the draws, shape (len(Draws),).
+    """
     u = draw_uniforms(key_low, key_high, attempt, CHANNELS.scenario, 0)
     for i in range(len(out)):
         if i % 4 == 0:
@@ -60,8 +69,17 @@ def draw_numbers(low: Any, high: Any, key_low: int, key_high: int, attempt: int,
 
 @jit
 def is_stable(d: Any, car: Any) -> Any:
-    """Whether the drawn linear vehicle is stable at the drawn speed (with 5 % to spare), before
-    its tyres change and after."""
+    """Check whether the drawn linear vehicle is stable at the drawn speed, with 5 % to spare.
+
+    It must be before its tyres change and after.
+
+    Args:
+        d: `Draws`.
+        car: `CarParams`, to whose stiffness the drawn factors apply.
+
+    Returns:
+        True if it is stable.
+    """
     C_f, C_r = car.C_f * d.front_stiffness, car.C_r * d.rear_stiffness
     has_change = d.tyre_change_time > 0.0
     later_f = C_f * select(has_change, d.front_change, 1.0)
@@ -80,7 +98,19 @@ def _is_below_critical(C_f: Any, C_r: Any, speed: Any, car: Any) -> Any:
 
 @jit
 def draw_stable(low: Any, high: Any, key_low: int, key_high: int, car: Any, out: Any) -> Any:
-    """Draw until the vehicle is stable; returns (the draws, how many unstable ones were lost)."""
+    """Draw until the vehicle is stable, at most 64 times.
+
+    Args:
+        low: Lower ends, shape (len(Draws),).
+        high: Upper ends, shape (len(Draws),).
+        key_low: Lower 32 bits of the episode's key.
+        key_high: Upper 32 bits of the episode's key.
+        car: `CarParams`.
+        out: Array for the draws, shape (len(Draws),).
+
+    Returns:
+        The `Draws`, and the number of draws that were rejected.
+    """
     attempt = 0
     draw_numbers(low, high, key_low, key_high, attempt, out)
     while attempt + 1 < _ATTEMPTS and not is_stable(read(out, DRAWS), car):
@@ -96,6 +126,13 @@ KMH = 1.0 / 3.6
 
 
 def get_range(value: Range | None) -> tuple[float, float]:
-    """(low, high) of a drawn quantity; zeros for None."""
+    """Get the ends of a drawn quantity; zeros for None.
+
+    Args:
+        value: A number, a range or None.
+
+    Returns:
+        (low, high), equal for a number.
+    """
     low, high = value if isinstance(value, tuple) else (value or 0.0, value or 0.0)
     return float(low), float(high)

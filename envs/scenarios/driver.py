@@ -21,7 +21,7 @@ MIN_PREVIEW = 1.0  # wheelbases: a driver looks no nearer
 
 
 class DriverParams(NamedTuple):
-    """How a driver steers."""
+    """Parameters of a driver who steers by preview."""
 
     preview: Any  # s, T
     gain: Any
@@ -31,9 +31,18 @@ class DriverParams(NamedTuple):
 
 @jit
 def compute_lateral_error(motion: Any, path: Any, road: Any, preview: Any) -> Any:
-    """How far in m the path, `preview` m on, lies to the left of where the car is going.
+    """Compute how far the previewed path lies to the left of the car's course.
 
     The road's own bend is the double integral of its curvature, exact on a clothoid too.
+
+    Args:
+        motion: `Motion` of the car.
+        path: `TrackPath`.
+        road: `RoadParams`.
+        preview: Preview distance (m).
+
+    Returns:
+        Lateral error (m).
     """
     sin_r, cos_r = sincos(motion.psi - motion.theta)
     slope = (motion.v_x * sin_r + motion.v_y * cos_r) / maximum(motion.v_x, MIN_SPEED)
@@ -45,7 +54,19 @@ def compute_lateral_error(motion: Any, path: Any, road: Any, preview: Any) -> An
 def compute_target_angle(
     motion: Any, path: Any, road: Any, target: Any, driver: Any, stop: Any
 ) -> Any:
-    """The steering angle in rad, within +-stop, that brings the car onto the path."""
+    """Compute the steering angle that brings the car onto the path.
+
+    Args:
+        motion: `Motion` of the car.
+        path: `TrackPath`.
+        road: `RoadParams`.
+        target: `ReferenceParams`, what the driver knows of the car.
+        driver: `DriverParams`.
+        stop: Largest angle (rad).
+
+    Returns:
+        Angle at the wheels (rad), within +-stop.
+    """
     v = motion.v_x
     preview = maximum(driver.preview * v, MIN_PREVIEW / target.per_l)
     error = compute_lateral_error(motion, path, road, preview)
@@ -58,11 +79,22 @@ def compute_target_angle(
 def compute_driver_angle(
     angle: Any, motion: Any, path: Any, road: Any, target: Any, driver: Any, stop: Any
 ) -> Any:
-    """The driver's steering angle in rad a tick after `angle`, at a Motion.
+    """Compute the driver's steering angle a tick later, at a Motion.
 
-    path: a `tracks.TrackPath`. road: a `dynamics.Road`. target: a `reference.Target`, what the
-    driver knows of the car. stop: rad. Source: MacAdam, "Application of an optimal preview control
-    for simulation of closed-loop automobile driving", IEEE Trans. SMC 11 (1981).
+    Source: MacAdam, "Application of an optimal preview control for simulation of closed-loop
+    automobile driving", IEEE Trans. SMC 11 (1981).
+
+    Args:
+        angle: Present angle at the wheels (rad).
+        motion: `Motion` of the car.
+        path: `TrackPath`.
+        road: `RoadParams`.
+        target: `ReferenceParams`, what the driver knows of the car.
+        driver: `DriverParams`.
+        stop: Largest angle (rad).
+
+    Returns:
+        The next angle (rad).
     """
     target_angle = compute_target_angle(motion, path, road, target, driver, stop)
     return limit_rate(angle, apply_lag(target_angle, angle, driver.rest), driver.slew)

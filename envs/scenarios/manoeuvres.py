@@ -119,7 +119,7 @@ _ROADS = (
         **_LANE,
         **(_HARSH | {"speed": (22.0 * KMH, 30.0 * KMH)}),
     ),
-    Scenario(  # nobody steers but the controller
+    Scenario(  # only the controller steers
         name="curved-road", half_width=1.75, **_BEND, **_HARSH
     ),
     Scenario(name="curved-road-driver", **_LANE, **_BEND, **_HARSH),
@@ -137,15 +137,23 @@ ScenarioSource = str | os.PathLike[str] | Mapping[str, Any] | Scenario
 
 
 def make_scenario(source: ScenarioSource) -> Scenario:
-    """A scenario from its name, a file, a mapping of fields, or a scenario itself.
+    """Make a scenario from its name, a file, a mapping of fields, or a scenario itself.
 
     A TOML or JSON file holds such a mapping, `Scenario.write` makes one; a CSV or Parquet file is a
     recorded drive, whose steering is driven again (`read_trace`). A mapping may start from another
-    scenario, a name or a file, under `base`. A file without a `name` has that of the file.
+    scenario, a name or a file, under `base`. A file without a `name` has that of the file. A file
+    that is missing raises FileNotFoundError, an unknown name and a value out of place ValueError;
+    messages name the file.
 
-    Raises FileNotFoundError; ValueError for an unknown name, a file that cannot be read and a value
-    out of place, TypeError for an unknown field and for another kind of source. Messages name the
-    file.
+    Args:
+        source: Name in `SCENARIOS`, path, mapping of fields, or a `Scenario`, returned as it is.
+
+    Returns:
+        The scenario.
+
+    Raises:
+        TypeError: For an unknown field or another kind of source.
+        type: The reader's error, with the file's name.
     """
     if isinstance(source, Scenario):
         return source

@@ -13,7 +13,7 @@ _MIN_SPEED = 1.0  # m/s, of the nominal car
 
 
 class NominalMotion(NamedTuple):
-    """The nominal car that lays the road."""
+    """State of the nominal car whose path is the road."""
 
     beta: Any  # rad
     gamma: Any  # rad/s
@@ -23,11 +23,19 @@ class NominalMotion(NamedTuple):
 def step_nominal_car(
     nominal_motion: NominalMotion, steer: Any, speed: Any, car: Bicycle
 ) -> tuple[Any, NominalMotion]:
-    """(by how much the road turns in rad/s during a tick, the Lead at its end): explicit Euler.
+    """Step the nominal car, whose path is the road, over a tick by explicit Euler.
 
-    The direction of the nominal car's path is psi + beta, so it turns by gamma + beta'. steer: rad,
-    held over the tick. It is a function of time, and so of the seed alone: the road unrolls beside
-    the true car as the nominal car lays it, whatever the true car does.
+    The direction of its path is psi + beta, so it turns by gamma + beta'. The road is a function of
+    time, and so of the seed alone: what the true car does has no effect on it.
+
+    Args:
+        nominal_motion: `NominalMotion` at the start of the tick.
+        steer: Steering angle held over the tick (rad).
+        speed: Speed (m/s), taken as at least 1.
+        car: `Bicycle` of the nominal vehicle.
+
+    Returns:
+        Turning rate of the road during the tick (rad/s), and the `NominalMotion` at its end.
     """
     V = maximum(speed, _MIN_SPEED)
     a11, a12, a21, a22, b11, b21, _ = compute_bicycle_coefficients(

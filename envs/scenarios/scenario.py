@@ -18,67 +18,101 @@ from .draws import DRAWS_WIDTH, KMH, Draws, Range, get_range
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """What happens in an episode. Ranges are drawn by the seed; SI units, in plausible
-    ranges, which environments check unless `strict=False`.
+    """A manoeuvre: what happens in an episode. A (low, high) range is drawn from by the seed.
 
-    An episode is `duration` s long. Steering is a kind of `STEERING_KINDS`, built from onset,
-    amplitude, frequency (random: two pairs of sines, of amplitude and amplitude_2, of frequency,
-    frequency_2, frequency_3 and frequency_4; sweep: to frequency_2) and hold (of a step, a dwell, a
-    ramp or a sweep, or from one lane change to the next); "trace" follows the angles of `trace`
-    (rad at the wheels, recorded every trace_step seconds, straight between them) and holds the
-    last. "wander" is a zero-mean Ornstein-Uhlenbeck process of standard deviation amplitude and
-    corner frequency `frequency`, held for `hold` s from one angle to the next. mirror: the seed
-    draws the side of steering, track, bend, bank, friction_right and start, and that of the wind.
-    initial_beta, initial_gamma: sideslip angle in rad and yaw rate in rad/s that the car starts
-    with.
-
-    The steering "driver" keeps to a path of `PATHS` (`driver.py`): the road's centre line, or a
-    track that begins where the car is at the onset at the speed it starts with, for the vehicle's
-    width; path_speed: m/s at which it has its standard's lengths, which grow with the speed drawn
-    (None: at every speed).
-    driver_preview (s), driver_gain, driver_lag (s) and driver_rate (rad/s at the wheels). An
-    episode ends where the car is half_width off the path (without a driver, off the road's centre
-    line).
-
-    acceleration: None holds the speed. speed_change: m/s by which the held speed changes at an
-    even rate, from change_start over change_length. surge, surge_frequency: a sine of the driver's
-    acceleration, which the held speed follows.
-
-    Car: front_stiffness and rear_stiffness are factors on the vehicle's; draws that make the car
-    unstable at the drawn speed are drawn again and counted. From tyre_change_time (s, None: never,
-    and then they are 1) on front_change and rear_change are further factors. vehicle and nominal:
-    parameters that replace those of the env. tyres: a law of `TYRE_LAWS`. small_angle, lags, roll:
-    the rest of the plant.
-
-    Surroundings: friction is the road's and replaces the vehicle's; friction_right, if given, is
-    that under the right wheels. curvature, bank (rad, left side up) and grade (rad, uphill) come
-    in from curve_start over curve_ramp metres; a negative curve_start has them from the beginning.
-    road: "straight", or "nominal-path", which bends as the nominal linear car would drive the
-    programme's steering at the speed that the driver wants (`roads.py`); its camera reports y_l
-    without that bend.
-    wind_force (N) from wind_start for wind_length s: a side wind, wind_arm ahead of the centre of
-    gravity and wind_height above the roll axis. disturbance_force (N), disturbance_moment (N m),
-    disturbance_time (s): an Ornstein-Uhlenbeck force and moment.
-
-    Sensors: noise replaces the default; gyro_bias (rad/s) and accel_y_bias (m/s2) add to its
-    biases. camera_delays: a repeating pattern that replaces the id's, and camera_jitter with it;
-    gps_period and gps_delays likewise. camera_outage, gps_outage: (from, to) s without packets.
-    camera_loss: the probability that a frame is lost (0: the
-    id's). camera_heading (rad, against the road) and camera_offset (m, of the car from the lane's
-    centre): beyond either no lane is in view, and a packet's quality is 0. gps_latency: s by which
-    all GPS packets of the episode arrive later, their stamps being true; `slow_sensors` describes
-    its range as a delay and a jitter. hdop, hdop_spread, hdop_time: median of the GPS's HDOP,
-    standard deviation of its logarithm, and the time in which that forgets. hdop_law of
-    `HDOP_LAWS`: how much of the noise follows HDOP.
-
-    tier: of `TIER_NAMES`, the one in whose score the scenario may stand, "" for none.
-
-    Raises ValueError for a value out of place and names the field.
+    Numbers must be plausible, which environments check unless `strict=False`. A value out of place
+    raises ValueError and names the field. `make_scenario` takes a mapping over a named scenario.
 
     >>> Scenario(name="mine", steering="step", amplitude=(0.02, 0.05)).range("amplitude")
     (0.02, 0.05)
 
-    See also `make_scenario`, which takes a mapping over a named scenario.
+    Attributes:
+        name: Name of the scenario.
+        duration: Length of the episode (s).
+        steering: Kind of the steering programme, of `STEERING_KINDS`. "random" is two pairs of
+            sines, of amplitude and amplitude_2. "driver" keeps to `path` by preview. "wander" is a
+            zero-mean Ornstein-Uhlenbeck process of standard deviation amplitude and corner
+            frequency `frequency`, held for `hold` from one angle to the next.
+        trace: Recorded angles at the wheels (rad) for "trace": straight between them, the last
+            stays.
+        trace_step: Time between the trace's samples (s).
+        onset: Time at which steering begins (s).
+        amplitude: Amplitude at the wheels (rad).
+        amplitude_2: Amplitude of the second pair of a random steering (rad).
+        frequency: Frequency (Hz).
+        frequency_2: Second frequency of a random steering, or the end of a sweep (Hz).
+        frequency_3: Third frequency of a random steering (Hz).
+        frequency_4: Fourth frequency of a random steering (Hz).
+        hold: Time of a step, dwell, ramp or sweep, or from one lane change to the next (s).
+        mirror: Whether the seed draws the side of steering, track, bend, bank, friction_right and
+            start, and that of the wind.
+        path: Path of the driver, of `PATHS`: the road's centre line, or a track for the vehicle's
+            width that begins where the car is at the onset at the speed it starts with.
+        path_speed: Speed (m/s) at which a track has its standard's lengths, which grow with the
+            speed drawn; None: these lengths at every speed.
+        driver_preview: Preview time of the driver (s).
+        driver_gain: Gain of the driver.
+        driver_lag: Time constant of the driver's arms (s).
+        driver_rate: Largest rate of the driver's angle at the wheels (rad/s).
+        initial_beta: Sideslip angle at the start (rad).
+        initial_gamma: Yaw rate at the start (rad/s).
+        speed: Speed at the start (m/s).
+        acceleration: Acceleration (m/s2); None holds the speed.
+        speed_change: Change of the held speed at an even rate (m/s).
+        change_start: Time at which that change begins (s).
+        change_length: Time that it takes (s).
+        surge: Amplitude of a sine of the driver's acceleration, which the held speed follows
+            (m/s2).
+        surge_frequency: Frequency of that sine (Hz).
+        friction: Friction of the road, which replaces the vehicle's.
+        friction_right: Friction under the right wheels; None: as on the left.
+        front_stiffness: Factor on the front stiffness; draws of an unstable car are drawn again.
+        rear_stiffness: Factor on the rear stiffness.
+        tyre_change_time: Time at which the tyres change (s); None: never.
+        front_change: Further factor on the front stiffness from then on.
+        rear_change: Further factor on the rear stiffness from then on.
+        wind_force: Force of a side wind (N).
+        wind_arm: Its arm ahead of the centre of gravity (m).
+        wind_start: Time at which it begins (s).
+        wind_length: Time that it lasts (s).
+        wind_height: Its height above the roll axis (m).
+        disturbance_force: Standard deviation of an Ornstein-Uhlenbeck force (N).
+        disturbance_moment: Standard deviation of an Ornstein-Uhlenbeck moment (N m).
+        disturbance_time: Time constant of both (s).
+        road: "straight", or "nominal-path", which bends as the nominal linear car would drive the
+            programme's steering at the wanted speed; its camera reports y_l without that bend.
+        curvature: Curvature of the bend (1/m), left positive.
+        curve_start: Place where curvature, bank and grade begin (m); negative: from the beginning.
+        curve_ramp: Length over which they come in (m).
+        bank: Bank of the road (rad), left side up.
+        grade: Grade of the road (rad), uphill.
+        half_width: Distance from the driver's path, else from the road's centre line, that ends the
+            episode (m).
+        camera_delays: Repeating pattern of delays that replaces the id's, and its jitter (s).
+        camera_jitter: Jitter of these delays (s).
+        camera_loss: Probability that a frame is lost; 0: the id's.
+        camera_heading: Heading against the road (rad) beyond which no lane is in view (quality 0).
+        camera_offset: Offset from the lane's centre (m) beyond which no lane is in view.
+        camera_outage: (from, to) without packets (s).
+        gps_period: Period that replaces the id's (s).
+        gps_delays: Repeating pattern of delays that replaces the id's (s).
+        gps_outage: (from, to) without packets (s).
+        gps_latency: Further delay of all GPS packets of the episode, whose stamps are true (s);
+            `slow_sensors` describes its range as a delay and a jitter.
+        gyro_bias: Addition to the noise's bias of the gyro (rad/s).
+        accel_y_bias: Addition to the noise's bias of the lateral accelerometer (m/s2).
+        hdop: Median of the GPS's HDOP.
+        hdop_spread: Standard deviation of its logarithm.
+        hdop_time: Correlation time of its logarithm (s).
+        hdop_law: How much of the GPS's noise follows HDOP, of `HDOP_LAWS`.
+        small_angle: Whether the plant is that of the papers' small angles.
+        tyres: Tyre law, of `TYRE_LAWS`.
+        lags: Whether motors and steering have lags.
+        roll: Whether the body rolls.
+        tier: Tier in whose score the scenario may stand, of `TIER_NAMES`; "" for none.
+        vehicle: Parameters that replace those of the env's vehicle.
+        nominal: Parameters that replace those of the env's nominal vehicle.
+        noise: Numbers that replace the default `Noise`.
     """
 
     name: str
@@ -165,11 +199,22 @@ class Scenario:
         check_fields(vars(self), dataclasses.fields(self))
 
     def range(self, name: str) -> tuple[float, float]:
-        """(low, high) of a drawn quantity; zeros where it is None."""
+        """Get the ends of a drawn quantity; zeros where it is None.
+
+        Args:
+            name: Name of the field.
+
+        Returns:
+            (low, high), equal for a number.
+        """
         return get_range(getattr(self, name))
 
     def get_draw_ranges(self) -> tuple[Array, Array]:
-        """(low, high) of every quantity of `Draws`, each (len(Draws),)."""
+        """Collect the ends of every quantity of `Draws`.
+
+        Returns:
+            (low, high), each of shape (len(Draws),).
+        """
         low, high = np.empty(DRAWS_WIDTH), np.empty(DRAWS_WIDTH)
         for i, name in enumerate(Draws._fields):
             if name in SIDES:
@@ -187,15 +232,26 @@ class Scenario:
         return low if is_fixed else None
 
     def replace(self, **changes: Any) -> "Scenario":
-        """A copy with some fields changed; TypeError on an unknown field."""
+        """Copy the scenario with some fields changed; TypeError on an unknown field.
+
+        Args:
+            changes: New values by the names of fields.
+
+        Returns:
+            The copy.
+        """
         return dataclasses.replace(self, **changes)
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write a TOML or JSON file, by its ending, that `make_scenario` reads back."""
+        """Write a TOML or JSON file that `make_scenario` reads back.
+
+        Args:
+            path: Path of the file, whose ending chooses the format.
+        """
         write_document(path, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON types only, defaults left out; `make_scenario` reads it back."""
+        """Convert to JSON types without defaults, which `make_scenario` reads back."""
         values = {}
         for entry in dataclasses.fields(self):
             value = getattr(self, entry.name)

@@ -24,7 +24,15 @@ class SpeedProfile(NamedTuple):
 
 @inline
 def compute_speed_reference(tick: Any, profile: Any) -> Any:
-    """(speed in m/s, acceleration in m/s2) that the driver wants at a tick."""
+    """Compute the speed and the acceleration that the driver wants at a tick.
+
+    Args:
+        tick: Tick since the start of the episode.
+        profile: `SpeedProfile`.
+
+    Returns:
+        Speed (m/s) and acceleration (m/s2).
+    """
     acceleration = select((tick >= profile.start) & (tick < profile.end), profile.acceleration, 0.0)
     elapsed = (minimum(maximum(tick, profile.start), profile.end) - profile.start) * TICK
     speed = profile.speed + profile.acceleration * elapsed
@@ -39,10 +47,20 @@ def compute_speed_reference(tick: Any, profile: Any) -> Any:
 def compute_acceleration_command(
     tick: Any, v_x: Any, integral: Any, profile: Any, limit: Any
 ) -> Any:
-    """(a_x command in m/s2, next integral): PI on the speed with the integral held at the limit.
+    """Compute the driver's acceleration command: PI on the speed, its integral held at the limit.
 
     The wanted speed starts at `profile.speed` and is the integral of the wanted acceleration, which
     is fed forward.
+
+    Args:
+        tick: Tick since the start of the episode.
+        v_x: Measured speed (m/s).
+        integral: Integral part of the command (m/s2).
+        profile: `SpeedProfile`.
+        limit: Largest acceleration of the motors (m/s2).
+
+    Returns:
+        The command and the next integral (m/s2).
     """
     speed, feedforward = compute_speed_reference(tick, profile)
     error = speed - v_x

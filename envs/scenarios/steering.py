@@ -27,10 +27,17 @@ RISE = 0.2  # s, of a step
 
 @jit
 def compute_steering(tick: Any, profile: Any) -> Any:
-    """The driver's steering command in rad at a tick.
+    """Compute the driver's steering command at a tick.
 
-    profile: an array that begins with STEERING_WIDTH numbers. A tuple would go through memory at
-    every call, and a loop's index into it is a jump table.
+    The programme is an array, since a tuple would go through memory at every call, and a loop's
+    index into it is a jump table.
+
+    Args:
+        tick: Tick since the start of the episode.
+        profile: Array that begins with the STEERING_WIDTH numbers of `write_steering`.
+
+    Returns:
+        Angle at the wheels (rad).
     """
     angle = 0.0
     for i in range(SINES):
@@ -67,9 +74,14 @@ def compute_steering(tick: Any, profile: Any) -> Any:
 
 @jit
 def interpolate_trace(tick: Any, trace: Any) -> Any:
-    """The angle in rad of a recorded trace at a tick, straight between its samples.
+    """Interpolate a recorded trace at a tick, linearly between its samples.
 
-    trace: ticks from sample to sample, the samples, and the last one again, which stays.
+    Args:
+        tick: Tick since the start of the episode.
+        trace: Ticks from sample to sample, the samples (rad), and the last one again, which stays.
+
+    Returns:
+        Angle at the wheels (rad).
     """
     position = minimum(tick / trace[0], len(trace) - 2.0)
     k = int(minimum(floor(position), len(trace) - 3.0))
@@ -78,8 +90,18 @@ def interpolate_trace(tick: Any, trace: Any) -> Any:
 
 @jit
 def compute_wander_gains(amplitude: Any, hertz: Any, hold: Any) -> Any:
-    """(keep, fresh) of a driver who wanders: after `hold` s the angle is keep times what it was
-    plus fresh rad times a standard normal number; it has the standard deviation `amplitude`."""
+    """Compute decay and noise gain of a wandering driver's angle over one hold.
+
+    The next angle is decay times the last one plus noise gain times a standard normal number.
+
+    Args:
+        amplitude: Standard deviation of the angle (rad).
+        hertz: Corner frequency (Hz).
+        hold: Time from one angle to the next (s).
+
+    Returns:
+        Decay, and noise gain (rad).
+    """
     decay = exp(maximum(-2.0 * PI * hertz * hold, -7.5))  # where `exp` ends
     return decay, amplitude * sqrt(1.0 - decay * decay)
 
@@ -112,8 +134,10 @@ def _write_dwell(profile: Any, a: Any, hertz: Any, start: Any, dwell: Any) -> No
 
 @jit
 def write_steering(kind: int, d: Any, profile: Any) -> None:
-    """Fill the steering programme of a kind from drawn numbers; a driver's and a
-    trace's are empty, and one who wanders steers by `compute_wander_gains` (`engine.window`).
+    """Write the steering programme of a kind from drawn numbers.
+
+    A driver's and a trace's programme is empty; a wandering driver's has the numbers of
+    `compute_wander_gains`.
 
     The slalom, the lane changes, the step and the random steering leave the car on its old
     heading: the slalom starts with a half wave of half the amplitude, the step is followed by its
@@ -121,6 +145,11 @@ def write_steering(kind: int, d: Any, profile: Any) -> None:
     angles cancel. The sine with dwell stays at its second peak for `hold` (FMVSS 126). The ramp
     reaches its amplitude after `hold`, the held step after 0.2 s, and both stay there. The sweep
     goes from `frequency` to `frequency_2` within `hold`, evenly in Hz, and stays at that.
+
+    Args:
+        kind: Place of the kind in `STEERING_KINDS`.
+        d: `Draws`.
+        profile: Array for the programme, at least STEERING_WIDTH long.
     """
     for i in range(SINES):
         _write_sine(profile, i, 0.0, 0.0, 0.0, 0.0)

@@ -95,7 +95,15 @@ _ISO_3888_1: dict[str, Any] = {
 
 
 def make_random_steering(low: float, high: float) -> dict[str, Any]:
-    """A random steering whose pairs of sines have amplitudes (rad) within this range."""
+    """Make the fields of a random steering whose pairs of sines have amplitudes in a range.
+
+    Args:
+        low: Smallest amplitude (rad).
+        high: Largest amplitude (rad).
+
+    Returns:
+        Fields of a `Scenario`.
+    """
     return RANDOM | {"amplitude": (low, high), "amplitude_2": (low, high)}
 
 
@@ -104,8 +112,10 @@ def _set_amplitude(shape: dict[str, Any], low: float, high: float) -> dict[str, 
 
 
 def _make_scenarios(tier: str, common: dict[str, Any], **shapes: dict[str, Any]) -> list[Scenario]:
-    """The scenarios of a tier by their names, written with underscores; where no driver keeps to a
-    track, the road follows the nominal car, so that the camera has a lane to see."""
+    """Make the scenarios of a tier by their names, written with underscores.
+
+    Without a driver on a track the road follows the nominal car, so that the camera sees a lane.
+    """
     scenarios = []
     for name, shape in shapes.items():
         road = "straight" if shape["steering"] == "driver" else "nominal-path"
@@ -143,7 +153,7 @@ _TWO_B = _make_scenarios(
     any_friction_slalom=_set_amplitude(SLALOM, 0.01, 0.025),
     any_friction_step=_set_amplitude(STEP, 0.008, 0.025),
     any_friction_sine_with_dwell=_set_amplitude(SINE_WITH_DWELL, 0.01, 0.03),
-    # sections as long as they are for 35 to 50 km/h: at 80 friction 0.3 holds nobody on the track
+    # sections as long as they are for 35 to 50 km/h: at 80 friction 0.3 holds no car on the track
     any_friction_iso_3888_1=_ISO_3888_1 | {"path_speed": (35.0 * KMH, 50.0 * KMH)},
 )
 _TWO_C = _make_scenarios(
@@ -156,7 +166,7 @@ _TWO_C = _make_scenarios(
     limit_random=make_random_steering(0.01, 0.03) | {"speed": (55.0 * KMH, 65.0 * KMH)},
 )
 
-# Not scored, but mapped over where it starts: nobody steers, the car is caught or lost.
+# Not scored, but mapped over where it starts: the driver does not steer, the car is caught or lost.
 _RECOVERY = Scenario(
     name="recovery",
     duration=5.0,

@@ -14,15 +14,22 @@ TABLE_SUFFIXES = (".csv", ".parquet")
 
 
 def read_trace(path: str | os.PathLike[str], mapping: Mapping[str, str] | None = None) -> Scenario:
-    """A scenario that steers as a recorded drive, at its first speed, as long as it lasts.
+    """Read a scenario that steers as a recorded drive, at its first speed, as long as it lasts.
 
-    path: CSV or Parquet (needs the extra `report`) with the columns of `COLUMNS` for time and
-    steering angle (time_s, steer_rad or steer_deg) and, if it is there, speed (speed_x_mps).
-    mapping: our column names to the log's. Everything else is `Scenario`'s default; a mapping over
-    it (`{"base": "drive.csv", "friction": 0.4}`) changes that.
+    Everything else is `Scenario`'s default; a mapping over it
+    (`{"base": "drive.csv", "friction": 0.4}`) changes that.
 
-    Raises what `read_log` does: for a file that is no table, a missing column, NaN, and a clock
-    that runs backward, stands still, jumps or is uneven.
+    Args:
+        path: CSV or Parquet (needs the extra `report`) with the columns of `COLUMNS` for time and
+            steering angle (time_s, steer_rad or steer_deg) and optionally speed (speed_x_mps).
+        mapping: Our column names to the log's.
+
+    Returns:
+        The scenario.
+
+    Raises:
+        ValueError: For a clock that runs backward, stands still, jumps or is uneven, and for what
+            `read_log` refuses: a file that is no table, a missing column, NaN.
     """
     source = Path(path)
     values, _ = read_quantities(source, mapping or {}, ("time", "steer"), {"speed_x"})

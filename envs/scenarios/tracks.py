@@ -70,10 +70,20 @@ PATHS = ("road", *_TRACKS)
 def make_sections(
     track: str, width: float, start: float = 0.0, scale: float = 1.0, side: float = 1.0
 ) -> tuple[Section, ...]:
-    """The lanes of a track for a vehicle's width in m, in the order of driving.
+    """Make the lanes of a track for a vehicle's width, in the order of driving.
 
-    start: m, where the first begins. scale: of the lengths. side: -1 mirrors the track. The road
-    itself has none. Raises ValueError for an unknown track.
+    Args:
+        track: Name of the track, of `PATHS`; "road" has no lanes.
+        width: Width of the vehicle (m).
+        start: Place along the road where the first lane begins (m).
+        scale: Factor on the lengths.
+        side: 1, or -1 to mirror the track.
+
+    Returns:
+        The lanes.
+
+    Raises:
+        ValueError: For an unknown track.
     """
     if track not in PATHS:
         raise ValueError(f"unknown track {track!r}; known: {', '.join(PATHS)}")
@@ -90,10 +100,17 @@ def make_sections(
 
 
 def make_path(track: str, width: float) -> TrackPath:
-    """The path through a track that begins at 0, in the standard's lengths.
+    """Make the path through a track that begins at 0, in the standard's lengths.
 
     It keeps to the centre of a lane but turns a little before its end and has not quite turned back
     at its beginning (`TRANSITION_OVERLAP`), as far as the sides of the car stay between the cones.
+
+    Args:
+        track: Name of the track, of `PATHS`.
+        width: Width of the vehicle (m).
+
+    Returns:
+        The path.
     """
     shifts = []
     lanes = make_sections(track, width)
@@ -110,7 +127,17 @@ def make_path(track: str, width: float) -> TrackPath:
 
 @jit
 def transform_path(path: Any, start: Any, scale: Any, side: Any) -> Any:
-    """The path of a track that begins at `start` m, its lengths scaled, mirrored by side -1."""
+    """Shift, scale and mirror the path of a track.
+
+    Args:
+        path: `TrackPath` that begins at 0.
+        start: Place along the road where it begins (m).
+        scale: Factor on the lengths.
+        side: 1, or -1 to mirror it.
+
+    Returns:
+        The `TrackPath`.
+    """
     return TrackPath(
         side * path.shift_1,
         start + scale * path.start_1,
@@ -123,6 +150,14 @@ def transform_path(path: Any, start: Any, scale: Any, side: Any) -> Any:
 
 @jit
 def compute_path_offset(path: Any, s: Any) -> Any:
-    """The path's lateral offset in m at the distance s; its slope is continuous."""
+    """Compute the path's lateral offset from the road's centre line; its slope is continuous.
+
+    Args:
+        path: `TrackPath`.
+        s: Distance along the road (m).
+
+    Returns:
+        Offset (m), to the left.
+    """
     first = path.shift_1 * smoothstep((s - path.start_1) / path.length_1)
     return first + path.shift_2 * smoothstep((s - path.start_2) / path.length_2)

@@ -18,6 +18,14 @@ class Wind(NamedTuple):
 
 @jit
 def compute_wind(tick: Any, wind: Any) -> Any:
-    """(force in N, yaw moment, roll moment in N m) of the wind from this tick to the next."""
+    """Compute force and moments of the wind from this tick to the next.
+
+    Args:
+        tick: Tick since the start of the episode.
+        wind: `Wind`.
+
+    Returns:
+        Force (N), yaw moment and roll moment (N m).
+    """
     force = select((tick >= wind.start) & (tick < wind.end), wind.force, 0.0)
     return force, force * wind.arm, 0.0 - force * wind.height

@@ -35,13 +35,24 @@ class SatelliteGeometry(NamedTuple):
     median: Any  # log of the median HDOP
     spread: Any  # standard deviation of log HDOP
     decay: Any  # what is left of a deviation after one period of the GPS
-    noise_gain: Any  # sqrt(1 - keep^2)
+    noise_gain: Any  # sqrt(1 - decay^2)
     weight: Any  # of HDOP in the noise, HDOP_LAWS
 
 
 @jit
 def compute_hdop_deviation(before: Any, sky: Any, link: Any, tick: Any, n: Any) -> Any:
-    """The deviation of log HDOP at a capture, from that at the one before."""
+    """Compute the deviation of log HDOP from its median at a capture.
+
+    Args:
+        before: Deviation at the capture before.
+        sky: `SatelliteGeometry`.
+        link: `Link` of the GPS.
+        tick: Tick of the capture.
+        n: Standard normal numbers, of which the first is used.
+
+    Returns:
+        The deviation.
+    """
     is_after_outage = (link.outage_end > link.outage_start) & (tick >= link.outage_end)
     is_after_outage = is_after_outage & (tick - link.period < link.outage_end)
     jump = select(is_after_outage, OUTAGE_JUMP * sky.spread, 0.0)
@@ -50,7 +61,14 @@ def compute_hdop_deviation(before: Any, sky: Any, link: Any, tick: Any, n: Any) 
 
 @jit
 def count_satellites(hdop: Any) -> Any:
-    """How many satellites a receiver sees at an HDOP: 12 at 1, 4 up to 5, fewer above."""
+    """Count the satellites that a receiver sees at an HDOP: 12 at 1, 4 up to 5, fewer above.
+
+    Args:
+        hdop: Horizontal dilution of precision.
+
+    Returns:
+        Number of satellites.
+    """
     return floor(2.0 + minimum(10.0 / hdop, 28.0))
 
 
@@ -65,9 +83,22 @@ def sample_gps(
     n: Any,
     small_angle: int,
 ) -> Any:
-    """(course, speed, X, Y, hdop, satellites, quality) of an antenna at (ahead, left).
+    """Sample the GPS at its antenna, with noise.
 
     course = psi + beta, dakf-stability (3), where beta, as all else, is the antenna's.
+
+    Args:
+        motion: `Motion` of the car.
+        forward: Place of the antenna ahead of the centre of gravity (m).
+        left: Place of the antenna left of it (m).
+        hdop: Horizontal dilution of precision.
+        weight: Fraction of the noise that follows HDOP, of `HDOP_LAWS`.
+        noise: `Noise`.
+        n: Four standard normal numbers.
+        small_angle: 1 for the small-angle plant, else 0.
+
+    Returns:
+        Course (rad), speed (m/s), X (m), Y (m), HDOP, satellites and quality.
     """
     v_x, v_y = motion.v_x - motion.gamma * left, motion.v_y + motion.gamma * forward
     s, c = sincos(motion.psi)

@@ -18,7 +18,18 @@ class NormalDraws(NamedTuple):
 
 @inline
 def compute_specific_force(before: Any, after: Any, road: Any, small_angle: int, roll: int) -> Any:
-    """(a_x, a_y) in m/s2, mean over a tick between two Motions: v', turning axes, gravity."""
+    """Compute the mean specific force over a tick: v', turning axes, gravity.
+
+    Args:
+        before: `Motion` at the start of the tick.
+        after: `Motion` at its end.
+        road: `RoadParams`.
+        small_angle: 1 for the small-angle plant, else 0.
+        roll: 1 if the body rolls, else 0.
+
+    Returns:
+        (a_x, a_y) (m/s2).
+    """
     turn_x = 0.5 * (before.gamma * before.v_y + after.gamma * after.v_y)
     turn_y = 0.5 * (before.gamma * before.v_x + after.gamma * after.v_x)
     turns_x = (small_angle == 0) | (roll == 1)  # tie-vision holds v_x; double-layer-gps (4)
@@ -37,9 +48,18 @@ def compute_specific_force(before: Any, after: Any, road: Any, small_angle: int,
 def compute_fast_row(
     motion: Any, accel: Any, applied: Any, d_f: Any, noise: Any, draws: Any
 ) -> Any:
-    """The fast sensors at a tick, columns as in `Fast`.
+    """Compute the fast sensors' samples at a tick, columns as in `Fast`.
 
-    accel: (a_x, a_y) specific forces. acted: what acted, in the order of `Fast` from `steer` on.
+    Args:
+        motion: `Motion` of the car.
+        accel: Specific force (a_x, a_y) (m/s2).
+        applied: Applied inputs and commands, in the order of `Fast` from `steer` on.
+        d_f: Front track (m).
+        noise: `Noise`.
+        draws: `NormalDraws` of the tick.
+
+    Returns:
+        FAST_WIDTH numbers.
     """
     n, wheels = draws.inertial, draws.wheels
     half = 0.5 * d_f * motion.gamma

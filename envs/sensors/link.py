@@ -14,12 +14,19 @@ MAX_IN_FLIGHT = 8  # packets of one sensor under way at once, duplicates include
 
 @dataclass(frozen=True)
 class SlowSensor:
-    """A slow sensor's clock and link, as estimators know it; times in seconds.
+    """A slow sensor's clock and link, as estimators know it.
 
-    A sample is captured every `period` from `phase` on (None: drawn at each reset; the running
-    env's `slow_sensors` have the drawn one). Frame i arrives `delays[i % len(delays)]` plus a
-    random share of `jitter` later, unless it is lost (`loss`, a probability) or captured within
-    an outage. `duplicate` is the probability that it arrives a second time.
+    A sample is captured every `period` from `phase` on. Frame i arrives `delays[i % len(delays)]`
+    plus a random fraction of `jitter` later, unless it is lost or captured within an outage.
+
+    Attributes:
+        period: Time from sample to sample (s).
+        delays: One to four delays that repeat (s).
+        phase: Time of the first sample (s); None: drawn at each reset (the running env's
+            `slow_sensors` have the drawn one).
+        jitter: Largest random addition to a delay (s).
+        loss: Probability that a packet is lost.
+        duplicate: Probability that it arrives a second time.
     """
 
     period: float
@@ -51,7 +58,7 @@ class SlowSensor:
 
     @property
     def longest_delay(self) -> float:
-        """The longest delay in seconds, jitter included."""
+        """The longest delay, jitter included (s)."""
         return max(self.delays) + self.jitter
 
 
@@ -73,9 +80,17 @@ class Link(NamedTuple):
 
 
 def make_link(sensor: SlowSensor | None, outage: tuple[float, float] | None = None) -> Link:
-    """A Link from the public description; None: an absent sensor.
+    """Convert a slow sensor to ticks.
 
-    Raises ValueError where more packets could be under way at once than the queue holds.
+    Args:
+        sensor: Clock and link; None: an absent sensor.
+        outage: (from, to) without packets (s).
+
+    Returns:
+        The link.
+
+    Raises:
+        ValueError: If more packets could be under way at once than the queue holds.
     """
     if sensor is None:
         return Link._make([0.0] * len(Link._fields))
@@ -106,7 +121,14 @@ def make_link(sensor: SlowSensor | None, outage: tuple[float, float] | None = No
 
 
 def count_max_in_flight(link: Link) -> int:
-    """How many packets of a sensor that is there are under way at once, duplicates included."""
+    """Count the packets of a sensor that may be under way at once, duplicates included.
+
+    Args:
+        link: Clock and link of a sensor that is present.
+
+    Returns:
+        Largest number of packets.
+    """
     longest = max(link.delay_0, link.delay_1, link.delay_2, link.delay_3) + link.jitter
     max_in_flight = int(longest // link.period) + 1
     return 2 * (max_in_flight + 1) if link.duplicate > 0.0 else max_in_flight
@@ -116,9 +138,18 @@ def count_max_in_flight(link: Link) -> int:
 def compute_arrivals(
     link: Any, frame: Any, tick: Any, key_low: int, key_high: int, block: int
 ) -> Any:
-    """(first, second) arrival tick of the frame captured at `tick`; NEVER where there is none.
+    """Compute when a frame arrives: loss, outage, duplication, latency and jitter.
 
-    Loss, outage, duplication, latency and jitter are this one function.
+    Args:
+        link: `Link` of the sensor.
+        frame: Number of the frame, from 0.
+        tick: Tick of its capture.
+        key_low: Lower 32 bits of the episode's key.
+        key_high: Upper 32 bits of the episode's key.
+        block: The sensor's channel of random numbers for its link.
+
+    Returns:
+        Ticks of the first and the second arrival; NEVER for none.
     """
     jitter_share, loss_share, duplicate_share, second_share = (
         0.0,
@@ -144,6 +175,16 @@ def compute_arrivals(
 
 @jit
 def draw_clock_phase(link: Any, key_low: int, key_high: int, sensor: int) -> Any:
-    """The tick of the first capture: its phase, or drawn where that is -1."""
+    """Compute the tick of the first capture: the phase, or a drawn one where that is -1.
+
+    Args:
+        link: `Link` of the sensor.
+        key_low: Lower 32 bits of the episode's key.
+        key_high: Upper 32 bits of the episode's key.
+        sensor: Place of the sensor in `SLOW`.
+
+    Returns:
+        The tick.
+    """
     u = draw_uniforms(key_low, key_high, 0, CHANNELS.initial, 1 + sensor)
     return select(link.phase < 0.0, floor(u[0] * link.period), link.phase)

@@ -1,7 +1,7 @@
 """The slow sensors: the table of them, one sample of any of them, and which each id has.
 
-A new one is a file beside `camera` and `gps`, a row of `SLOW` and a branch of `sample`: packets,
-observation, random numbers, reset and the device engine follow from the table.
+A new one is a file beside `camera` and `gps`, a row of `SLOW` and a branch of `sample_sensor`:
+packets, observation, random numbers, reset and the device engine follow from the table.
 """
 
 import dataclasses
@@ -29,7 +29,14 @@ _FIRST_BLOCK, _BLOCKS_PER_SENSOR = 1000, 10  # of random numbers, clear of `back
 
 
 def make_blocks(place: int) -> Blocks:
-    """The random numbers of the sensor at a place of the table, where it names none itself."""
+    """Make the channels of random numbers of a sensor that names none itself.
+
+    Args:
+        place: Place of the sensor in `SLOW`.
+
+    Returns:
+        The channels.
+    """
     first = _FIRST_BLOCK + _BLOCKS_PER_SENSOR * place
     return Blocks(noise=first, link=first + 1, drift=first + 2)
 
@@ -45,7 +52,7 @@ class MeasurementContext(NamedTuple):
     car: Any
     noise: Any
     sky: Any  # the satellites
-    field_of_view: Any  # the camera's View
+    field_of_view: Any  # the camera's `FieldOfView`
     small_angle: int
     key_low: Any
     key_high: Any
@@ -62,7 +69,17 @@ class Sample(NamedTuple):
 
 @jit
 def sample_sensor(sensor: int, context: MeasurementContext, link: Any, drift: Any) -> Sample:
-    """A sample of a slow sensor, from its clock and link and the drift of the sample before."""
+    """Sample a slow sensor.
+
+    Args:
+        sensor: Place of the sensor in `SLOW`.
+        context: Truth, noise and random numbers of the tick.
+        link: `Link` of the sensor.
+        drift: Drift of the sample before.
+
+    Returns:
+        The sample.
+    """
     blocks, tick = BLOCKS[sensor], to_int(context.tick)
     n = draw_normals(context.key_low, context.key_high, tick, blocks.noise)
     if sensor == CAMERA:
@@ -88,7 +105,17 @@ def sample_sensor(sensor: int, context: MeasurementContext, link: Any, drift: An
 
 @jit
 def draw_first_drift(sensor: int, sky: Any, key_low: Any, key_high: Any) -> Any:
-    """A slow sensor's drift when an episode begins."""
+    """Draw a slow sensor's drift at the start of an episode.
+
+    Args:
+        sensor: Place of the sensor in `SLOW`.
+        sky: `SatelliteGeometry`.
+        key_low: Lower 32 bits of the episode's key.
+        key_high: Upper 32 bits of the episode's key.
+
+    Returns:
+        The drift: deviation of log HDOP for the GPS, else 0.
+    """
     if sensor == GPS:
         return sky.spread * draw_normals(key_low, key_high, 0, BLOCKS[sensor].drift)[1]
     return 0.0
@@ -109,8 +136,19 @@ SENSOR_SETS: dict[str, dict[str, SlowSensor]] = {
 def apply_changes(
     sensors: dict[str, SlowSensor], changes: Mapping[str, Mapping[str, Any] | None]
 ) -> dict[str, SlowSensor]:
-    """The sensors with some of their fields replaced; ValueError for a sensor that is absent,
-    TypeError for a field that it has not."""
+    """Replace some fields of slow sensors.
+
+    Args:
+        sensors: Slow sensors by name.
+        changes: By sensor, new values by the names of `SlowSensor`'s fields; None for no change.
+
+    Returns:
+        Slow sensors by name.
+
+    Raises:
+        ValueError: For a sensor that is absent.
+        TypeError: For an unknown field.
+    """
     changed = dict(sensors)
     for name, fields in changes.items():
         if fields is None:

@@ -15,9 +15,19 @@ EFFORT_WEIGHT, COST_CAP = 0.01, 100.0
 def compute_cost_rate(
     e_beta: Any, e_gamma: Any, moment_share: Any, steer_added: Any, reference_kind: int
 ) -> Any:
-    """The cost per second of a tick, capped at 100.
+    """Compute the cost rate of a tick, capped at 100 per second.
 
     c = (e_beta/0.02)^2 + (e_gamma/0.1)^2 + 0.01 (N_z/N_max)^2 + 0.01 (steer/0.05)^2
+
+    Args:
+        e_beta: Error of the sideslip angle (rad).
+        e_gamma: Error of the yaw rate (rad/s), not judged with "zero-slip".
+        moment_share: Yaw moment as a fraction of its full scale.
+        steer_added: Added steering angle (rad).
+        reference_kind: Place of the reference in `REFERENCES`.
+
+    Returns:
+        Cost rate (1/s).
     """
     b, s = e_beta * (1.0 / BETA_SCALE), steer_added * (1.0 / STEER_SCALE)
     c = b * b + EFFORT_WEIGHT * (moment_share * moment_share) + EFFORT_WEIGHT * (s * s)
@@ -29,5 +39,13 @@ def compute_cost_rate(
 
 @jit
 def compute_failure_cost(duration: Any, tick: Any) -> Any:
-    """What an episode of `duration` ticks costs besides where it fails: failing never pays."""
+    """Compute the cost of the rest of a failed episode, so that failing never pays.
+
+    Args:
+        duration: Length of the episode (ticks).
+        tick: Tick at which it failed.
+
+    Returns:
+        The cost.
+    """
     return COST_CAP * (duration - tick) * TICK

@@ -10,7 +10,7 @@ from .failures import RUNNING
 
 
 class StepReport(NamedTuple):
-    """Columns of the numbers that go into `info`."""
+    """Columns of the report of a step, from which `info` is made."""
 
     t: int = 0
     beta: int = 1
@@ -36,7 +36,14 @@ _MASKS = tuple(f"_{key}" for key in _KEYS)
 
 
 def make_info(report: list[float]) -> dict[str, Any]:
-    """`info` of a step or a reset from a report, a number for each column."""
+    """Make `info` of a step or a reset.
+
+    Args:
+        report: Report of the step, a number for each column of `StepReport`.
+
+    Returns:
+        The info.
+    """
     info = _RUNNING.copy()  # a copy's keys need no sorting in
     (
         info["t"], info["beta"], info["gamma"], info["psi"], info["beta_ref"], info["gamma_ref"],
@@ -50,10 +57,14 @@ def make_info(report: list[float]) -> dict[str, Any]:
 
 
 def make_infos(reports: Array, rows: npt.NDArray[np.bool_]) -> dict[str, Any]:
-    """The infos of some rows of a batch as Gymnasium's vector environments have them.
+    """Make the infos of some rows of a batch as Gymnasium's vector environments have them.
 
-    reports: (N, len(Report)). rows: (N,) that are reported; the others have zeros. Every
-    key has an array (N,) and, with an underscore before it, a mask.
+    Args:
+        reports: Reports, shape (N, len(StepReport)).
+        rows: Rows that are reported, shape (N,); the others have zeros.
+
+    Returns:
+        An array (N,) for every key and, with an underscore before it, a mask.
     """
     if rows.all():
         columns = reports.T.copy()

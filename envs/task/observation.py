@@ -11,7 +11,14 @@ from ..sensors.slow import SLOW
 
 
 class ObservationEntry(NamedTuple):
-    """One number of an observation: its name, unit and finite bounds, low and high."""
+    """One number of an observation.
+
+    Attributes:
+        name: Name of the entry.
+        unit: Its unit.
+        low: Lower bound, finite.
+        high: Upper bound, finite.
+    """
 
     name: str
     unit: str
@@ -29,7 +36,15 @@ _LAST_ONLY = ("steer", "torque_left", "torque_right", "steer_command")  # seen a
 
 
 def make_space(layout: Sequence[ObservationEntry], frames: int = 1) -> "gym.spaces.Box[np.float32]":
-    """The space of an observation; of a stack of frames each bound is repeated in place."""
+    """Make the space of an observation; of a stack of frames each bound is repeated in place.
+
+    Args:
+        layout: Entries of the observation.
+        frames: Number of frames in the stack.
+
+    Returns:
+        A box of shape (len(layout) * frames,).
+    """
     low, high = np.array([entry[2:] for entry in layout]).T.astype(np.float32)
     return gym.spaces.Box(np.repeat(low, frames), np.repeat(high, frames), dtype=np.float32)
 
@@ -37,11 +52,16 @@ def make_space(layout: Sequence[ObservationEntry], frames: int = 1) -> "gym.spac
 def make_observation_layout(
     slow: tuple[str, ...], n: int, fast: str, with_map: bool = False
 ) -> tuple[ObservationEntry, ...]:
-    """The entries of an observation.
+    """Make the entries of an observation.
 
-    slow: names of the slow sensors present. n: ticks of a control period. fast: "summary" (last
-    sample and mean over the step) or "all" (every sample of the step). with_map: the road's
-    curvature is seen.
+    Args:
+        slow: Names of the slow sensors present.
+        n: Ticks of a control period.
+        fast: "summary" (last sample and mean over the step) or "all" (every sample of the step).
+        with_map: Whether the road's curvature is an entry.
+
+    Returns:
+        The entries in their order.
     """
     entries = []
     for column in range(N_SAMPLED):

@@ -33,7 +33,14 @@ class ReferenceParams(NamedTuple):
 
 
 def make_reference_params(nominal: Vehicle) -> ReferenceParams:
-    """The coefficients for a nominal vehicle."""
+    """Compute the coefficients of the references for a nominal vehicle.
+
+    Args:
+        nominal: The nominal vehicle.
+
+    Returns:
+        The coefficients.
+    """
     l, M = nominal.wheelbase, nominal.mass  # noqa: E741
     C_f, C_r = nominal.front_stiffness, nominal.rear_stiffness
     l_f, l_r = nominal.front_arm, nominal.rear_arm
@@ -51,13 +58,22 @@ def make_reference_params(nominal: Vehicle) -> ReferenceParams:
 
 @jit
 def compute_reference(steer: Any, v: Any, target: Any, reference_kind: int) -> Any:
-    """(beta_ref, gamma_ref) for a steering command at a measured speed.
+    """Compute the steady-state reference for a steering command at a measured speed.
 
     zero-slip: (0, 0), the yaw rate is not judged. model: the nominal steady state, with
     1 + G v^2 kept above 0.2. limited: the model within what friction can hold,
     |gamma| <= 0.85 mu g / v and |beta| <= 0.02 mu g (Rajamani, Vehicle Dynamics and Control).
-    lagged: what `filter_reference` goes to, limited in the same way, with the stability factor of a
-    car that understeers.
+    lagged: the steady state of `filter_reference`, limited in the same way, with the stability
+    factor of a car that understeers.
+
+    Args:
+        steer: The driver's steering command (rad).
+        v: Measured speed (m/s).
+        target: `ReferenceParams`.
+        reference_kind: Place of the reference in `REFERENCES`.
+
+    Returns:
+        beta_ref (rad) and gamma_ref (rad/s).
     """
     if reference_kind == ZERO_SLIP:
         return 0.0 * steer, 0.0 * steer
@@ -75,8 +91,17 @@ def compute_reference(steer: Any, v: Any, target: Any, reference_kind: int) -> A
 
 @jit
 def filter_reference(before: Any, steady: Any, target: Any, reference_kind: int) -> Any:
-    """(beta_ref, gamma_ref) a tick after `before` for what `reference` gives now: the lagged one
-    approaches it, the others are there at once."""
+    """Filter the reference over a tick: the lagged one approaches the steady state, others jump.
+
+    Args:
+        before: (beta_ref, gamma_ref) of the tick before (rad, rad/s).
+        steady: Result of `compute_reference` (rad, rad/s).
+        target: `ReferenceParams`.
+        reference_kind: Place of the reference in `REFERENCES`.
+
+    Returns:
+        beta_ref (rad) and gamma_ref (rad/s).
+    """
     if reference_kind == LAGGED:
         return apply_lag(steady[0], before[0], target.rest), apply_lag(
             steady[1], before[1], target.rest

@@ -9,7 +9,7 @@ from .tyres import MIN_SPEED
 
 
 class Lag(NamedTuple):
-    """What is left of a deviation from the command within one tick; all zero without lag."""
+    """Remaining fractions of a deviation from the command within a tick; all zero without lag."""
 
     start: Any
     middle: Any
@@ -18,7 +18,15 @@ class Lag(NamedTuple):
 
 
 def make_lag(time_constant: float, tick: float) -> Lag:
-    """The exact decay of a first-order lag at the start, middle and end of a tick (seconds)."""
+    """Compute the exact decay of a first-order lag within a tick.
+
+    Args:
+        time_constant: Time constant of the lag (s); 0 for none.
+        tick: Length of the tick (s).
+
+    Returns:
+        Fractions at the start, middle and end of the tick, and their mean.
+    """
     if time_constant == 0.0:
         return Lag(0.0, 0.0, 0.0, 0.0)
     half = math.exp(-0.5 * tick / time_constant)
@@ -27,14 +35,30 @@ def make_lag(time_constant: float, tick: float) -> Lag:
 
 @jit
 def apply_lag(command: Any, value: Any, rest: Any) -> Any:
-    """The actuator's value once `rest` of its deviation from the command is left."""
+    """Compute the actuator's value from what remains of its deviation from the command.
+
+    Args:
+        command: Commanded value.
+        value: Value at the start of the tick, in the command's unit.
+        rest: Fraction of the deviation that remains.
+
+    Returns:
+        The value, in the command's unit.
+    """
     return command + (value - command) * rest
 
 
 @jit
 def compute_torque_limit(v_x: Any, car: Any) -> Any:
-    """N m that a motor can give at a speed, driving or braking: T_max, and P / |omega| of a wheel
-    that rolls at v_x."""
+    """Compute the torque limit of one motor at a speed, driving or braking.
+
+    Args:
+        v_x: Longitudinal speed (m/s).
+        car: `CarParams`.
+
+    Returns:
+        T_max, or P / |omega| of a wheel that rolls at v_x where that is less (N m).
+    """
     max_torque = car.T_max
     if any_lane(car.P > 0.0):
         at_speed = car.P * car.r / maximum(absolute(v_x), MIN_SPEED)
@@ -44,10 +68,19 @@ def compute_torque_limit(v_x: Any, car: Any) -> Any:
 
 @jit
 def allocate_torques(N_z: Any, a_x: Any, car: Any, yaw_first: Any, max_torque: Any) -> Any:
-    """(T_l, T_r) in N m for a yaw moment and an acceleration: tie-vision (3) in ISO axes.
+    """Distribute a yaw moment and an acceleration over two motors: tie-vision (3) in ISO axes.
 
-    A positive yaw moment drives the right wheel. Where both together pass `max_torque`, what a
-    motor gives, the yaw moment keeps its share if `yaw_first` is 1, the acceleration if it is 0.
+    A positive yaw moment drives the right wheel.
+
+    Args:
+        N_z: Yaw moment (N m).
+        a_x: Longitudinal acceleration (m/s2).
+        car: `CarParams`.
+        yaw_first: Where both pass the limit, 1 keeps the yaw moment and 0 the acceleration.
+        max_torque: Torque limit of one motor (N m).
+
+    Returns:
+        (T_l, T_r), torques of the left and the right motor (N m).
     """
     turn = minimum(maximum(car.r * N_z / car.d_r, 0.0 - max_torque), max_torque)
     drive = minimum(maximum(0.5 * car.m * car.r * a_x, 0.0 - max_torque), max_torque)
@@ -62,20 +95,46 @@ def allocate_torques(N_z: Any, a_x: Any, car: Any, yaw_first: Any, max_torque: A
 
 @jit
 def limit_rate(value: Any, command: Any, max_change: Any) -> Any:
-    """The value moved towards the wanted one by at most `max_change`."""
+    """Move a value towards a command by at most `max_change`.
+
+    Args:
+        value: Present value.
+        command: Wanted value.
+        max_change: Largest change, in the unit of both.
+
+    Returns:
+        The new value.
+    """
     return value + minimum(maximum(command - value, 0.0 - max_change), max_change)
 
 
 @jit
 def limit_angle(added: Any, driver: Any, stop: Any) -> Any:
-    """The part of an added steering angle (rad) that leaves the sum with the driver's in the stop.
+    """Limit an added steering angle so that the sum with the driver's stays within the stop.
 
-    Where the driver's alone is beyond it, nothing is added to that side.
+    Where the driver's angle alone is beyond the stop, nothing is added to that side.
+
+    Args:
+        added: Added steering angle (rad).
+        driver: The driver's angle (rad).
+        stop: Largest angle of the sum (rad).
+
+    Returns:
+        The limited added angle (rad).
     """
     return minimum(maximum(added, minimum(0.0 - stop - driver, 0.0)), maximum(stop - driver, 0.0))
 
 
 @jit
 def compute_yaw_moment(T_l: Any, T_r: Any, car: Any) -> Any:
-    """N_z in N m that two motor torques produce."""
+    """Compute the yaw moment of two motor torques.
+
+    Args:
+        T_l: Torque of the left motor (N m).
+        T_r: Torque of the right motor (N m).
+        car: `CarParams`.
+
+    Returns:
+        N_z (N m).
+    """
     return 0.5 * car.d_r / car.r * (T_r - T_l)

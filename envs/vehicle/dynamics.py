@@ -21,7 +21,7 @@ from .vehicle import GRAVITY
 
 
 class CarParams(NamedTuple):
-    """The true vehicle of an episode; letters as in the papers, stiffness per tyre."""
+    """The true vehicle of an episode in SI units; letters as in the papers, stiffness per tyre."""
 
     m: Any
     I: Any  # noqa: E741  the papers' letter
@@ -48,7 +48,7 @@ class CarParams(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """What the plant integrates: velocities, heading, place on the ground and on the road."""
+    """The integrated state of the plant: velocities, heading, place on ground and road, roll."""
 
     v_x: Any  # m/s
     v_y: Any  # m/s
@@ -81,13 +81,29 @@ def _compute_ramp(road: Any, s: Any) -> Any:
 
 @jit
 def compute_curvature(road: Any, s: Any) -> Any:
-    """Curvature of the road in 1/m at the distance s."""
+    """Compute the curvature of the road at a distance along it.
+
+    Args:
+        road: `RoadParams`.
+        s: Distance along the road (m).
+
+    Returns:
+        Curvature (1/m), positive to the left.
+    """
     return road.curvature * _compute_ramp(road, s)
 
 
 @jit
 def compute_car_curvature(motion: Any, road: Any) -> Any:
-    """Curvature of the road in 1/m at the car: by how much its direction turns in a metre."""
+    """Compute the curvature of the road at the car: by how much its direction turns in a metre.
+
+    Args:
+        motion: `Motion` of the car.
+        road: `RoadParams`.
+
+    Returns:
+        Curvature (1/m), positive to the left.
+    """
     kappa = compute_curvature(road, motion.s)
     if any_lane(road.turn != 0.0):
         kappa = kappa + road.turn / maximum(motion.v_x, 1.0)
@@ -96,10 +112,18 @@ def compute_car_curvature(motion: Any, road: Any) -> Any:
 
 @inline
 def rotate_gravity(road: Any, s: Any, sin_r: Any, cos_r: Any) -> Any:
-    """(x, y) in m/s2 of what accelerometers in a car that does not roll feel of gravity.
+    """Compute the gravity that accelerometers feel in a car that does not roll.
 
-    The car itself is accelerated by as much the other way. sin_r, cos_r: of its heading relative
-    to the road.
+    The car itself is accelerated by as much the other way.
+
+    Args:
+        road: `RoadParams`.
+        s: Distance along the road (m).
+        sin_r: Sine of the heading relative to the road.
+        cos_r: Cosine of the heading relative to the road.
+
+    Returns:
+        (x, y) in the car's axes (m/s2).
     """
     share = _compute_ramp(road, s)
     g_s, g_n = road.longitudinal * share, road.lateral * share
@@ -108,7 +132,16 @@ def rotate_gravity(road: Any, s: Any, sin_r: Any, cos_r: Any) -> Any:
 
 @jit
 def compute_gravity(motion: Any, road: Any, small_angle: int) -> Any:
-    """`rotate_gravity` at a Motion; the small-angle car heads along the road."""
+    """Compute `rotate_gravity` at a Motion; the small-angle car heads along the road.
+
+    Args:
+        motion: `Motion` of the car.
+        road: `RoadParams`.
+        small_angle: 1 for the small-angle plant, else 0.
+
+    Returns:
+        (x, y) in the car's axes (m/s2).
+    """
     if small_angle:
         return rotate_gravity(road, motion.s, 0.0, 1.0)
     sin_r, cos_r = sincos(motion.psi - motion.theta)
@@ -116,7 +149,7 @@ def compute_gravity(motion: Any, road: Any, small_angle: int) -> Any:
 
 
 class DisturbanceForces(NamedTuple):
-    """What disturbs the car during a tick."""
+    """Force and moments that disturb the car during a tick."""
 
     F_d: Any  # N, lateral force at the centre of gravity
     N_d: Any  # N m, yaw moment
@@ -124,7 +157,7 @@ class DisturbanceForces(NamedTuple):
 
 
 class Velocity(NamedTuple):
-    """The part of a Motion that forces change, and that forces depend on."""
+    """The part of a Motion that forces change and depend on, with a Motion's units."""
 
     v_x: Any
     v_y: Any
@@ -155,7 +188,21 @@ def compute_rates(
     law: int,
     roll: int,
 ) -> Any:
-    """d(now)/dt as a Velocity. gravity: (x, y) in m/s2 of `rotate_gravity`."""
+    """Compute the time derivative of the velocities and the roll.
+
+    Args:
+        motion: `Motion` or `Velocity` of the car.
+        load: `TyreLoad` of the inputs.
+        disturbance: `DisturbanceForces`.
+        car: `CarParams`.
+        gravity: (x, y) of `rotate_gravity` (m/s2).
+        small_angle: 1 for the small-angle plant, else 0.
+        law: Code of the tyre law, its place in `TYRE_LAWS`.
+        roll: 1 if the body rolls, else 0.
+
+    Returns:
+        The derivative as a `Velocity`.
+    """
     per_m, per_I = 1.0 / car.m, 1.0 / car.I
     v_x, v_y, gamma = motion.v_x, motion.v_y, motion.gamma
     g_x, g_y = gravity
@@ -179,7 +226,18 @@ def compute_rates(
 
 @inline
 def compute_course_rates(motion: Any, v_x: Any, v_y: Any, road: Any, small_angle: int) -> Any:
-    """(dX, dY, ds, dy, dtheta)/dt at a Motion's place and heading, with these velocities."""
+    """Compute the time derivative of place and road direction at a Motion's place and heading.
+
+    Args:
+        motion: `Motion` of the car.
+        v_x: Longitudinal velocity (m/s).
+        v_y: Lateral velocity (m/s).
+        road: `RoadParams`.
+        small_angle: 1 for the small-angle plant, else 0.
+
+    Returns:
+        (dX, dY, ds, dy, dtheta)/dt (m/s, rad/s).
+    """
     kappa = compute_curvature(road, motion.s)
     if small_angle:
         dY = v_x * motion.psi + v_y  # tie-vision (5), V_x (psi + beta)
@@ -208,7 +266,21 @@ def derivative(
     law: int,
     roll: int = 0,
 ) -> Any:
-    """d(motion)/dt as a Motion."""
+    """Compute the time derivative of a Motion.
+
+    Args:
+        motion: `Motion` of the car.
+        load: `TyreLoad` of the inputs.
+        disturbance: `DisturbanceForces`.
+        car: `CarParams`.
+        road: `RoadParams`.
+        small_angle: 1 for the small-angle plant, else 0.
+        law: Code of the tyre law, its place in `TYRE_LAWS`.
+        roll: 1 if the body rolls, else 0.
+
+    Returns:
+        The derivative as a `Motion`.
+    """
     gravity = compute_gravity(motion, road, small_angle)
     rate = compute_rates(motion, load, disturbance, car, gravity, small_angle, law, roll)
     dX, dY, ds, dy, dtheta = compute_course_rates(motion, motion.v_x, motion.v_y, road, small_angle)
@@ -219,7 +291,16 @@ def derivative(
 
 @inline
 def compute_sideslip_angle(v_x: Any, v_y: Any, small_angle: int) -> Any:
-    """beta in rad: atan2(v_y, v_x) above 0.5 m/s, else 0 (the ratio on the small-angle plant)."""
+    """Compute the sideslip angle: atan2(v_y, v_x) above 0.5 m/s, else 0.
+
+    Args:
+        v_x: Longitudinal velocity (m/s).
+        v_y: Lateral velocity (m/s).
+        small_angle: 1 for the small-angle plant, whose angle is the ratio; else 0.
+
+    Returns:
+        beta (rad).
+    """
     if small_angle:
         return select(v_x > MIN_SPEED, v_y / maximum(v_x, MIN_SPEED), 0.0)
     is_moving = v_x * v_x + v_y * v_y > MIN_SPEED * MIN_SPEED

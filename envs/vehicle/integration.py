@@ -22,7 +22,7 @@ from .dynamics import (
 
 @jit
 def _step_euler(start: Any, h: Any, rate: Any) -> Any:
-    """now + h rate, written out so that it compiles for every number type."""
+    """Compute start + h rate, written out so that it compiles for every number type."""
     return Velocity(
         start.v_x + h * rate.v_x,
         start.v_y + h * rate.v_y,
@@ -64,8 +64,10 @@ def _average_two(a: Any, b: Any) -> Any:
 
 @inline
 def _compute_mid_gravity(motion: Any, road: Any, h: Any, small_angle: int) -> Any:
-    """`rotate_gravity` in the middle of a step of h seconds, where the car will be by its start's
-    speed: it stands for the whole step, in which the car turns by h gamma."""
+    """Compute `rotate_gravity` in the middle of a step of h seconds, for the whole step.
+
+    The car's place is extrapolated by its speed at the start; in the step it turns by h gamma.
+    """
     s_mid = motion.s + 0.5 * h * motion.v_x
     if not any_lane((road.lateral != 0.0) | (road.longitudinal != 0.0)):
         return 0.0, 0.0
@@ -80,8 +82,7 @@ def _compute_mid_gravity(motion: Any, road: Any, h: Any, small_angle: int) -> An
 def _integrate_motion(
     motion: Any, middle: Any, end: Any, mean: Any, road: Any, h: Any, small_angle: int
 ) -> Any:
-    """The Motion after h seconds whose velocities were `middle` halfway, `end` at the end and
-    `mean` in the mean.
+    """Compute the Motion after h seconds from its velocities halfway, at the end and in the mean.
 
     No force within a step depends on place and heading, so these follow at once. The mean of the
     turning velocity is the mean velocity in the mean direction, but for its length, 1 - r^2 / 24 of
@@ -131,10 +132,24 @@ def kutta3(
     law: int,
     roll: int = 0,
 ) -> Any:
-    """A step of h seconds by Kutta's third-order rule: the plant's, of a millisecond.
+    """Integrate the plant over h seconds by Kutta's third-order rule.
 
-    load: the Load at the start, the middle and the end of the step. Three stages at 1 ms err by
-    less than what the plant's kinks cost any rule (docs/physics.md has the table).
+    Three stages at 1 ms err by less than what the plant's kinks cost any rule (docs/physics.md has
+    the table).
+
+    Args:
+        motion: `Motion` at the start.
+        load: `TyreLoad` at the start, the middle and the end of the step.
+        disturbance: `DisturbanceForces` of the whole step.
+        car: `CarParams`.
+        road: `RoadParams`.
+        h: Length of the step (s).
+        small_angle: 1 for the small-angle plant, else 0.
+        law: Code of the tyre law, its place in `TYRE_LAWS`.
+        roll: 1 if the body rolls, else 0.
+
+    Returns:
+        The `Motion` at the end.
     """
     gravity = _compute_mid_gravity(motion, road, h, small_angle)
     start = Velocity(motion.v_x, motion.v_y, motion.gamma, motion.phi, motion.phi_dot)
@@ -167,7 +182,24 @@ def rk4(
     law: int,
     roll: int = 0,
 ) -> Any:
-    """The same by the classical Runge-Kutta method: the plans', whose steps are longer."""
+    """Integrate the plant over h seconds by the classical Runge-Kutta method.
+
+    It serves plans, whose steps are longer than the plant's.
+
+    Args:
+        motion: `Motion` at the start.
+        load: `TyreLoad` at the start, the middle and the end of the step.
+        disturbance: `DisturbanceForces` of the whole step.
+        car: `CarParams`.
+        road: `RoadParams`.
+        h: Length of the step (s).
+        small_angle: 1 for the small-angle plant, else 0.
+        law: Code of the tyre law, its place in `TYRE_LAWS`.
+        roll: 1 if the body rolls, else 0.
+
+    Returns:
+        The `Motion` at the end.
+    """
     gravity = _compute_mid_gravity(motion, road, h, small_angle)
     start = Velocity(motion.v_x, motion.v_y, motion.gamma, motion.phi, motion.phi_dot)
     a = compute_rates(start, load[0], disturbance, car, gravity, small_angle, law, roll)

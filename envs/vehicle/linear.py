@@ -19,8 +19,7 @@ Array = npt.NDArray[np.float64]
 
 
 class Bicycle(NamedTuple):
-    """A linear bicycle: arguments of `compute_bicycle_coefficients` in their order, letters as
-    there."""
+    """A linear bicycle: the first arguments of `compute_bicycle_coefficients`, letters as there."""
 
     m: Any
     I: Any  # noqa: E741  the papers' letter
@@ -40,7 +39,20 @@ def compute_bicycle_coefficients(
     C_r: Any,
     V: Any,
 ) -> Any:
-    """(a11, a12, a21, a22, b11, b21, b22) of tie-vision (8) at the speed V in m/s."""
+    """Compute the coefficients of the linear bicycle, tie-vision (8).
+
+    Args:
+        m: Mass (kg).
+        I: Yaw inertia (kg m2).
+        l_f: Distance from the centre of gravity to the front axle (m).
+        l_r: Distance from the centre of gravity to the rear axle (m).
+        C_f: Cornering stiffness of one front tyre (N/rad).
+        C_r: Cornering stiffness of one rear tyre (N/rad).
+        V: Speed (m/s).
+
+    Returns:
+        (a11, a12, a21, a22, b11, b21, b22) of the states beta, gamma and inputs delta_f, N_z.
+    """
     a11 = -2.0 * (C_f + C_r) / (m * V)
     a12 = -1.0 - 2.0 * (C_f * l_f - C_r * l_r) / (m * V * V)
     a21 = -2.0 * (C_f * l_f - C_r * l_r) / I
@@ -50,10 +62,18 @@ def compute_bicycle_coefficients(
 
 @jit
 def write_lateral(A: Any, B: Any, car: Any, V: Any, states: int, inputs: int, preview: Any) -> None:
-    """beta and gamma, with more `states` psi and y_l, into A and B (columns delta_f, N_z and, with
-    more `inputs`, the road's curvature).
+    """Write the linear lateral model into A and B; entries that are zero are left alone.
 
-    car: the first six arguments of `compute_bicycle_coefficients`. What is zero is left alone.
+    States are beta, gamma, psi and y_l; inputs are delta_f, N_z and the road's curvature.
+
+    Args:
+        A: State matrix, at least (states, states).
+        B: Input matrix, at least (states, inputs).
+        car: `Bicycle`, or its six numbers.
+        V: Speed (m/s).
+        states: Number of states, 2 to 4.
+        inputs: Number of inputs, 2 or 3.
+        preview: Preview distance l_pre of the camera (m).
     """
     a11, a12, a21, a22, b11, b21, b22 = compute_bicycle_coefficients(
         car[0], car[1], car[2], car[3], car[4], car[5], V
@@ -72,9 +92,16 @@ def write_lateral(A: Any, B: Any, car: Any, V: Any, states: int, inputs: int, pr
 
 @jit
 def write_roll(A: Any, B: Any, i: int, column: int, K: Any, C: Any, S: Any) -> None:
-    """phi and phi_dot from the row i on, driven by a_y in a column of B: double-layer-gps (3).
+    """Write phi and phi_dot, driven by a_y, into A and B: double-layer-gps (3).
 
-    K, C, S: roll stiffness, damping and M_s h_s, each over the roll inertia.
+    Args:
+        A: State matrix.
+        B: Input matrix.
+        i: Row of phi; phi_dot follows.
+        column: Column of a_y in B.
+        K: Roll stiffness over roll inertia (1/s2).
+        C: Roll damping over roll inertia (1/s).
+        S: M_s h_s over roll inertia (1/m).
     """
     A[i, i + 1] = 1.0
     A[i + 1, i], A[i + 1, i + 1] = -K, -C
@@ -83,7 +110,13 @@ def write_roll(A: Any, B: Any, i: int, column: int, K: Any, C: Any, S: Any) -> N
 
 @jit
 def write_kinematic(A: Any, B: Any, gamma: Any) -> None:
-    """v_x and v_y, driven by a_x and a_y: double-layer-gps (4)-(5)."""
+    """Write v_x and v_y, driven by a_x and a_y, into A and B: double-layer-gps (4)-(5).
+
+    Args:
+        A: State matrix, v_x and v_y first.
+        B: Input matrix, columns a_x and a_y.
+        gamma: Yaw rate (rad/s).
+    """
     A[0, 1], A[1, 0] = gamma, -gamma
     B[0, 0], B[1, 1] = 1.0, 1.0
 
@@ -94,9 +127,15 @@ _write_kinematic = as_python(write_kinematic)
 
 @dataclass(frozen=True)
 class LinearModel:
-    """dx/dt = A x + B u, y = C x, with names.
+    """A linear model dx/dt = A x + B u, y = C x, with names.
 
-    Shapes: A (n, n), B (n, m), C (p, n).
+    Attributes:
+        A: State matrix, shape (n, n).
+        B: Input matrix, shape (n, m).
+        C: Output matrix, shape (p, n).
+        states: Names of the n states.
+        inputs: Names of the m inputs.
+        outputs: Names of the p outputs.
     """
 
     A: Array
@@ -107,7 +146,14 @@ class LinearModel:
     outputs: tuple[str, ...]
 
     def discretise(self, dt: float) -> tuple[Array, Array]:
-        """(G, H) of tie-vision (9) by exact zero-order hold over dt seconds."""
+        """Discretise by exact zero-order hold, tie-vision (9).
+
+        Args:
+            dt: Length of a step (s).
+
+        Returns:
+            (G, H), shapes (n, n) and (n, m).
+        """
         from scipy.linalg import expm  # environments read this module too
 
         n, m = self.B.shape
@@ -143,7 +189,17 @@ def _make_lateral(
 
 
 def make_bicycle_model(vehicle: Vehicle, speed: float) -> LinearModel:
-    """beta and gamma, from steering and yaw moment: tie-vision (1)-(2). Output: gamma."""
+    """Make the linear bicycle of beta and gamma, tie-vision (1)-(2).
+
+    Inputs are delta_f and N_z, the output is gamma.
+
+    Args:
+        vehicle: The vehicle.
+        speed: Longitudinal speed (m/s), positive.
+
+    Returns:
+        The model.
+    """
     A, B = _make_lateral(vehicle, speed, 2)
     return LinearModel(
         A, B, np.array([[0.0, 1.0]]), ("beta", "gamma"), ("delta_f", "N_z"), ("gamma",)
@@ -151,10 +207,18 @@ def make_bicycle_model(vehicle: Vehicle, speed: float) -> LinearModel:
 
 
 def make_vision_model(vehicle: Vehicle, speed: float) -> LinearModel:
-    """tie-vision (8): beta, gamma, psi (relative to the road) and y_l, from delta_f, N_z, kappa.
+    """Make the model of beta, gamma, psi (relative to the road) and y_l, tie-vision (8).
 
-    The road's curvature kappa is the third input: psi' = gamma - V kappa, and
+    Inputs are delta_f, N_z and kappa, the road's curvature: psi' = gamma - V kappa, and
     y_l = y_cg + l_pre psi - kappa l_pre^2 / 2 moves as y_l' = V beta + l_pre psi' + V psi.
+    Outputs are gamma, psi and y_l.
+
+    Args:
+        vehicle: The vehicle.
+        speed: Longitudinal speed (m/s), positive.
+
+    Returns:
+        The model.
     """
     A, B = _make_lateral(vehicle, speed, 4, 3)
     C = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -163,7 +227,17 @@ def make_vision_model(vehicle: Vehicle, speed: float) -> LinearModel:
 
 
 def make_course_model(vehicle: Vehicle, speed: float) -> LinearModel:
-    """beta, gamma, psi with the course angle psi + beta as output: dakf-stability (1)-(3)."""
+    """Make the model of beta, gamma and psi with a course output, dakf-stability (1)-(3).
+
+    Inputs are delta_f and N_z, outputs gamma and the course psi + beta.
+
+    Args:
+        vehicle: The vehicle.
+        speed: Longitudinal speed (m/s), positive.
+
+    Returns:
+        The model.
+    """
     A, B = _make_lateral(vehicle, speed, 3)
     C = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
     return LinearModel(A, B, C, ("beta", "gamma", "psi"), ("delta_f", "N_z"), ("gamma", "course"))
@@ -176,9 +250,15 @@ def _compute_roll_ratios(vehicle: Vehicle) -> tuple[float, float, float]:
 
 
 def make_roll_model(vehicle: Vehicle) -> LinearModel:
-    """phi and phi_dot from the measured specific force a_y: double-layer-gps (3). Output: phi_dot.
+    """Make the model of phi and phi_dot from the measured specific force a_y, double-layer-gps (3).
 
-    The body's weight, M_s g h_s phi, is within a_y.
+    The body's weight, M_s g h_s phi, is within a_y. The output is phi_dot.
+
+    Args:
+        vehicle: The vehicle.
+
+    Returns:
+        The model.
     """
     A, B = np.zeros((2, 2)), np.zeros((2, 1))
     _write_roll(A, B, 0, 0, *_compute_roll_ratios(vehicle))
@@ -186,9 +266,16 @@ def make_roll_model(vehicle: Vehicle) -> LinearModel:
 
 
 def make_kinematic_model(gamma: float) -> LinearModel:
-    """v_x and v_y from both specific forces at a yaw rate in rad/s: double-layer-gps (4)-(5).
+    """Make the model of v_x and v_y from both specific forces, double-layer-gps (4)-(5).
 
-    Without roll or bank. Output: v_x, as of the wheels; at zero yaw rate v_y is unobservable.
+    It has no roll and no bank. The output is v_x, which wheels measure; at zero yaw rate v_y is
+    unobservable.
+
+    Args:
+        gamma: Yaw rate (rad/s).
+
+    Returns:
+        The model.
     """
     A, B = np.zeros((2, 2)), np.zeros((2, 2))
     _write_kinematic(A, B, gamma)
@@ -196,9 +283,17 @@ def make_kinematic_model(gamma: float) -> LinearModel:
 
 
 def make_velocity_roll_model(vehicle: Vehicle, gamma: float) -> LinearModel:
-    """v_x, v_y, phi and phi_dot from both specific forces: double-layer-gps (42), continuous.
+    """Make the model of v_x, v_y, phi and phi_dot from both specific forces, double-layer-gps (42).
 
-    Outputs: v_x and v_y, which the GPS and the first layer measure, and phi_dot.
+    It is continuous. Outputs are v_x and v_y, which the GPS and the first layer measure, and
+    phi_dot.
+
+    Args:
+        vehicle: The vehicle.
+        gamma: Yaw rate (rad/s).
+
+    Returns:
+        The model.
     """
     A, B, C = np.zeros((4, 4)), np.zeros((4, 2)), np.zeros((3, 4))
     _write_kinematic(A, B, gamma)

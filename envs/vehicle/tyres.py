@@ -28,7 +28,7 @@ class TyreInputs(NamedTuple):
 
 
 class TyreLoad(NamedTuple):
-    """Steering, drive forces and lateral capacities of the tyres under one instant's Inputs.
+    """Steering, drive forces and lateral capacities of the tyres under one instant's inputs.
 
     Computed once, used by several Runge-Kutta stages.
     """
@@ -52,24 +52,36 @@ class TyreLoad(NamedTuple):
 
 @inline
 def _compute_squared_capacity(limit: Any, drive: Any) -> Any:
-    """The square of the lateral capacity in N of a tyre that also drives: the friction circle, but
-    the capacity is never below 5 %."""
+    """Compute the squared lateral capacity (N2) of a tyre that also drives: the friction circle.
+
+    The capacity is never below 5 %.
+    """
     return maximum(limit * limit - drive * drive, 0.0025 * limit * limit)
 
 
 @jit
 def has_load_shift(small_angle: int, law: int, roll: int) -> int:
-    """1 where roll moves load from side to side: the tyres' limits are then those of the motion
-    and not of the inputs alone. Tyres without a limit feel nothing of it."""
+    """Check whether roll moves load from side to side; tyres without a limit feel nothing of it.
+
+    The tyres' limits then depend on the motion and not on the inputs alone.
+
+    Args:
+        small_angle: 1 for the small-angle plant, else 0.
+        law: Code of the tyre law, its place in `TYRE_LAWS`.
+        roll: 1 if the body rolls, else 0.
+
+    Returns:
+        1 if it does, else 0.
+    """
     return int(small_angle == 0 and law != LINEAR and roll == 1)
 
 
 @inline
 def _compute_axle_shift(F_l: Any, F_r: Any, rear_l: Any, rear_r: Any, weight: Any, car: Any) -> Any:
-    """N by which each rear wheel's load grows, and each front one's falls: F_x h / 2 l.
+    """Compute the force (N) by which each rear wheel's load grows and each front one's falls.
 
-    F_x is what the standing tyres let the motors bring to the road, so that it does not depend on
-    its own effect. Nine tenths of an axle's standing load is the most that moves.
+    It is F_x h / 2 l, where F_x is the drive force within the tyres' standing capacity, so that it
+    does not depend on its own effect. At most nine tenths of an axle's standing load move.
     """
     F_x = minimum(maximum(F_l, 0.0 - rear_l), rear_l) + minimum(maximum(F_r, 0.0 - rear_r), rear_r)
     shift = F_x * car.h_x * (0.5 / (car.l_f + car.l_r))
@@ -78,12 +90,21 @@ def _compute_axle_shift(F_l: Any, F_r: Any, rear_l: Any, rear_r: Any, weight: An
 
 @inline
 def compute_tyre_load(inputs: Any, car: Any, small_angle: int, load_shift: int = 0) -> Any:
-    """The Load of the Inputs of one instant.
+    """Compute the tyres' load under the inputs of one instant.
 
     The road may grip less on one side: each rear tyre has its own friction, which limits its
     motor's force; the front tyres share the mean. Drive force moves load between the axles, but
-    not on the small-angle plant. shifting: of `has_load_shift`; with 1 the rear tyres'
-    limits and slopes, drive force and moment are those of the inputs without any friction.
+    not on the small-angle plant.
+
+    Args:
+        inputs: `TyreInputs`.
+        car: `CarParams`.
+        small_angle: 1 for the small-angle plant, else 0.
+        load_shift: Result of `has_load_shift`; with 1 the rear tyres' limits and slopes, drive
+            force and moment are those of the inputs without any friction.
+
+    Returns:
+        The `TyreLoad`.
     """
     weight = car.m * GRAVITY / (2.0 * (car.l_f + car.l_r))
     front = 0.5 * (car.mu + car.mu_r) * weight * car.l_r
@@ -137,8 +158,10 @@ def _linear(tyre: Any, small_angle: int) -> Any:
 
 @jit
 def _fiala(tyre: Any) -> Any:
-    """z = clip(C t / 3 F_max, -1, 1), F_y = F_max z (3 - 3 |z| + z^2), which needs neither branch
-    nor arctangent (Pacejka, Tire and Vehicle Dynamics, 3)."""
+    """F_y = F_max z (3 - 3 |z| + z^2), z = clip(C t / 3 F_max, -1, 1): no branch, no arctangent.
+
+    Source: Pacejka, Tire and Vehicle Dynamics, 3.
+    """
     z = minimum(maximum(tyre.slope * tyre.tangent, -1.0), 1.0)
     return tyre.limit * z * (3.0 - 3.0 * absolute(z) + z * z)
 
@@ -158,9 +181,18 @@ def _dugoff(tyre: Any) -> Any:
 
 @inline
 def compute_lateral_forces(a: Any, b: Any, c: Any, d: Any, law: int, small_angle: int) -> Any:
-    """Lateral forces in N of the four Tyres, front left and right, rear left and right.
+    """Compute the lateral forces of the four tyres; the law is chosen once for all of them.
 
-    All at once: the law is chosen once for the four of them.
+    Args:
+        a: `Tyre` front left.
+        b: `Tyre` front right.
+        c: `Tyre` rear left.
+        d: `Tyre` rear right.
+        law: Code of the tyre law, its place in `TYRE_LAWS`.
+        small_angle: 1 for the small-angle plant, else 0.
+
+    Returns:
+        Four forces (N) in that order.
     """
     if law == LINEAR:
         s = small_angle
@@ -186,19 +218,37 @@ def _compute_slip_ratios(motion: Any, load: Any, car: Any, small_angle: int) -> 
 
 @jit
 def compute_slips(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
-    """Tangents of the front and rear slip angle (the small-angle plant's angles themselves)."""
+    """Compute the tangents of the front and rear slip angle.
+
+    Args:
+        motion: `Motion` or `Velocity` of the car.
+        load: `TyreLoad` of the inputs.
+        car: `CarParams`.
+        small_angle: 1 for the small-angle plant, which takes the angles themselves; else 0.
+
+    Returns:
+        (front, rear), positive where the force is to the left.
+    """
     across_f, along_f, across_r, along_r = _compute_slip_ratios(motion, load, car, small_angle)
     return across_f / along_f, across_r / along_r
 
 
 @inline
 def compute_load_transfer(motion: Any, car: Any, g_y: Any) -> Any:
-    """The share of its standing load by which the left wheels of (front, rear) are relieved.
+    """Compute the fraction of its standing load by which each axle's left wheel is relieved.
 
-    The right wheels get as much. The suspension passes K_x phi + C_x phi_dot on to the wheels; the
-    rest of the moment of the car's own height, (M h - M_s h_s) a_y, acts at once and is taken at
+    The right wheels get as much. The suspension passes K_x phi + C_x phi_dot on to the wheels. The
+    moment of the rest of the car's height, (M h - M_s h_s) a_y, acts at once and is taken at
     a_y = v_x gamma and gravity. Each axle bears it in proportion to its standing load. No
-    wheel leaves the ground: shares end at 0.9.
+    wheel leaves the ground: fractions end at 0.9.
+
+    Args:
+        motion: `Motion` or `Velocity` of the car.
+        car: `CarParams`.
+        g_y: Lateral gravity that the car feels on a banked road (m/s2).
+
+    Returns:
+        (front, rear), from -0.9 to 0.9.
     """
     direct = (car.m * car.h - car.S) * (motion.v_x * motion.gamma + g_y)
     moment = car.K_x * motion.phi + car.C_x * motion.phi_dot + direct
@@ -212,9 +262,19 @@ def compute_load_transfer(motion: Any, car: Any, g_y: Any) -> Any:
 def compute_tyre_forces(
     motion: Any, load: Any, car: Any, g_y: Any, small_angle: int, law: int, roll: int
 ) -> Any:
-    """(F_yf, F_yr, F_x, N_z): lateral forces of the axles, drive force, moment of the motors.
+    """Compute the forces of the axles and the moment of the motors.
 
-    The arguments are those of `compute_tyres`.
+    Args:
+        motion: `Motion` or `Velocity` of the car.
+        load: `TyreLoad` of the inputs.
+        car: `CarParams`.
+        g_y: Lateral gravity that the car feels on a banked road (m/s2).
+        small_angle: 1 for the small-angle plant, else 0.
+        law: Code of the tyre law, its place in `TYRE_LAWS`.
+        roll: 1 if the body rolls, else 0.
+
+    Returns:
+        (F_yf, F_yr, F_x, N_z): lateral forces of the axles, drive force (N), yaw moment (N m).
     """
     if has_load_shift(small_angle, law, roll):
         a, b, c, d, F_x, N_z = _compute_shifted_tyres(motion, load, car, g_y)
@@ -229,11 +289,22 @@ def compute_tyre_forces(
 def compute_tyres(
     motion: Any, load: Any, car: Any, g_y: Any, small_angle: int, law: int, roll: int
 ) -> Any:
-    """The four Tyres, front left and right, rear left and right; then the drive force in N and the
-    moment in N m of the motors.
+    """Compute the state of the four tyres, and the motors' drive force and yaw moment.
 
-    g_y: m/s2, the road's bank as the car feels it. Roll moves load from side to side, which
-    matters to tyres with a limit only, and is left out of the small-angle plant.
+    Roll moves load from side to side, which matters only to tyres with a limit, and is left out of
+    the small-angle plant.
+
+    Args:
+        motion: `Motion` or `Velocity` of the car.
+        load: `TyreLoad` of the inputs.
+        car: `CarParams`.
+        g_y: Lateral gravity that the car feels on a banked road (m/s2).
+        small_angle: 1 for the small-angle plant, else 0.
+        law: Code of the tyre law, its place in `TYRE_LAWS`.
+        roll: 1 if the body rolls, else 0.
+
+    Returns:
+        Four `Tyre` (front left and right, rear left and right), F_x (N) and N_z (N m).
     """
     if has_load_shift(small_angle, law, roll):
         return _compute_shifted_tyres(motion, load, car, g_y)

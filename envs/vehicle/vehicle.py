@@ -29,7 +29,7 @@ class Vehicle:
 
     Cornering stiffness is per tyre, as in the papers (an axle has 2 C). Letters of the papers
     stand in the descriptions: `Vehicle.__dataclass_fields__[name].metadata` has text and unit,
-    and the plausible range that `make_vehicle` and environments go by.
+    and the plausible range that `make_vehicle` and environments check.
 
     Raises ValueError on a value that is not finite or not positive (lags, motor_power and
     transfer_height may be zero, the antenna's place may be negative).
@@ -86,11 +86,26 @@ class Vehicle:
                 raise ValueError(f"Vehicle.{entry.name}: {got} is not {requirement}finite")
 
     def replace(self, **changes: Any) -> "Vehicle":
-        """A copy with some parameters changed; TypeError on an unknown name."""
+        """Copy the vehicle with some parameters changed; TypeError on an unknown name.
+
+        Args:
+            changes: New values by the names of fields.
+
+        Returns:
+            The copy.
+        """
         return dataclasses.replace(self, **changes)
 
     def scale_stiffness(self, front: float, rear: float | None = None) -> "Vehicle":
-        """A copy whose cornering stiffnesses are `front` and `rear` (or `front`) times ours."""
+        """Copy the vehicle with its cornering stiffnesses scaled.
+
+        Args:
+            front: Factor on the front stiffness.
+            rear: Factor on the rear stiffness; None for `front`.
+
+        Returns:
+            The copy.
+        """
         return self.replace(
             front_stiffness=self.front_stiffness * front,
             rear_stiffness=self.rear_stiffness * (front if rear is None else rear),
@@ -112,7 +127,11 @@ class Vehicle:
         return self.sprung_mass * self.roll_arm
 
     def check_roll(self) -> None:
-        """ValueError where this body would roll over, or its inertia is none, on its suspension."""
+        """Check that the suspension holds the body upright and the roll inertia suffices.
+
+        Raises:
+            ValueError: If the body would roll over, or its inertia is too small for its mass.
+        """
         lower_limit = self.roll_moment_arm * GRAVITY
         if self.roll_stiffness <= lower_limit:
             raise ValueError(
@@ -133,12 +152,19 @@ class Vehicle:
         return self.motor_torque * self.rear_track / self.wheel_radius
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON types only; `make_vehicle` reads it back."""
+        """Convert to JSON types, which `make_vehicle` reads back."""
         return dataclasses.asdict(self)
 
 
 def critical_speed(vehicle: Vehicle) -> float:
-    """The speed in m/s above which the linear vehicle is unstable; inf if it understeers."""
+    """Compute the speed above which the linear vehicle is unstable.
+
+    Args:
+        vehicle: The vehicle.
+
+    Returns:
+        The critical speed (m/s); inf if the vehicle understeers.
+    """
     excess = vehicle.front_stiffness * vehicle.front_arm - vehicle.rear_stiffness * vehicle.rear_arm
     if excess <= 0.0:
         return math.inf

@@ -23,19 +23,27 @@ _FIELDS = [entry.name for entry in dataclasses.fields(Vehicle)]
 
 
 def make_vehicle(source: VehicleSource, strict: bool = True) -> Vehicle:
-    """A vehicle from its name in `VEHICLES`, a TOML or JSON file, or a mapping of parameters.
+    """Make a vehicle from its name, a TOML or JSON file, or a mapping of parameters.
 
     Keys are those of `Vehicle`. A cornering stiffness is `front_stiffness_per_tyre` or
     `front_stiffness_axle` (both tyres together), and so for the rear; `front_stiffness` is per
     tyre in a mapping that has every parameter, as `Vehicle.to_dict` makes one, and else refused.
     What is left out is that of the vehicle under `base` (a name or another file); without one it is
-    the passenger car's, except for mass, inertia, arms and stiffnesses, which must be there. A file
-    without a `name` has that of the file. strict: whether implausible numbers of a file or a
-    mapping are refused.
+    the passenger car's, except for mass, inertia, arms and stiffnesses, which must be present. A
+    file without a `name` has that of the file. An unreadable file raises FileNotFoundError or
+    ValueError, a value out of place ValueError; messages name the file.
 
-    Raises FileNotFoundError; ValueError for an unknown name, a file that cannot be read, a missing
-    parameter, a stiffness of no convention or of two, and a value out of place; TypeError for an
-    unknown parameter, one that is no number, and another kind of source. Messages name the file.
+    Args:
+        source: Name in `VEHICLES`, path, mapping of parameters, or a `Vehicle`, returned as it is.
+        strict: Whether implausible numbers of a file or a mapping are refused.
+
+    Returns:
+        The vehicle.
+
+    Raises:
+        TypeError: For an unknown parameter, one that is no number, or another kind of source;
+            ValueError for an unknown name, a missing parameter, or a stiffness of no convention or
+            of two.
     """
     if isinstance(source, Vehicle):
         return source

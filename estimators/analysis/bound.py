@@ -30,17 +30,25 @@ _MODEL = ("car", "A", "B", "G", "GT", "H", "HT", "C_fast", "D_fast")
 
 
 class VehicleChange(NamedTuple):
-    """Another vehicle from a time on, in s since the first row."""
+    """Another vehicle from a time on.
+
+    Attributes:
+        time: Time since the first row (s).
+        vehicle: The later vehicle.
+    """
 
     time: float
     vehicle: Vehicle
 
 
 class Gust(NamedTuple):
-    """A side force that is constant from start to end (s since the first row), of unknown strength.
+    """A side force of unknown strength that is constant from start to end.
 
-    force_sd: N, the root of the mean square of what it can be. arm: m ahead of the centre of
-    gravity.
+    Attributes:
+        force_sd: Root mean square of the force (N).
+        arm: Distance ahead of the centre of gravity (m).
+        start: Time of its start since the first row (s).
+        end: Time of its end since the first row (s).
     """
 
     force_sd: float
@@ -60,15 +68,26 @@ def compute_error_bound(
     gust: Gust | None = None,
     **options: Any,
 ) -> Array:
-    """Standard deviation of the optimal estimate of beta at every row of a record, (K,) in rad.
+    """Compute the standard deviation of the optimal estimate of beta at every row of a record.
 
-    vehicle: the true one. sensors: all slow sensors that are there; the packets' captured and
-    arrived ticks are those of the record. speed: held, m/s. change: to the vehicle that it is
-    later. gust: one that the filter feels and does not know. options: those of `exact-kf` that say
-    the true noise, disturbances and latencies. The start is known exactly, as it is in the
-    environment. Raises ValueError for latencies where the model varies with time.
+    The lowest possible RMSE over a stretch of time is the root of the mean square of this. The
+    start is known exactly, as it is in the environment.
 
-    The lowest possible RMSE over a stretch of time is the root of the mean square of this.
+    Args:
+        vehicle: The true vehicle.
+        record: Record with the captured and arrived ticks of the packets.
+        sensors: All available slow sensors by name.
+        speed: Held speed (m/s).
+        dt: Tick (s).
+        change: Later vehicle, or None.
+        gust: Gust that the filter feels and does not know, or None.
+        **options: Options of `exact-kf` for the true noise, disturbances and latencies.
+
+    Returns:
+        Standard deviation (rad), shape (K,).
+
+    Raises:
+        ValueError: There are latencies, and the model varies with time.
     """
     late = any(options.get("latency", {}).values())
     if late and not (change is None and gust is None):
@@ -96,7 +115,7 @@ def compute_error_bound(
 
 
 def _set_gust_input(filter_: Any, arm: float) -> None:
-    """The state `bank` pushes as F_d does, and as N_d by an arm in m."""
+    """Let the state `bank` push as F_d does, and as N_d by an arm in m."""
     f, names = filter_.filters[0], filter_.names
     gust, force, moment = (names.index(name) for name in ("bank", "F_d", "N_d"))
     for matrix in (f.G, f.C_fast):
@@ -110,7 +129,7 @@ def _copy_model(filter_: Any, later: Any) -> None:
 
 
 def _reset_gust(filter_: Any, variance: float) -> None:
-    """What the gust is from now on has nothing to do with what was known before."""
+    """Reset the gust's state: from now on it is independent of what was known before."""
     f, index = filter_.filters[0], filter_.names.index("bank")
     f.P[index], f.P[:, index] = 0.0, 0.0
     f.P[index, index] = variance
@@ -119,7 +138,7 @@ def _reset_gust(filter_: Any, variance: float) -> None:
 def _run_events(
     filter_: Any, record: Record, events: Sequence[tuple[float, Callable[[], None]]]
 ) -> Array:
-    """The deviations of beta of a run that goes on; each event is behind the row at its time."""
+    """Compute the deviations of beta over the record; each event follows the row at its time."""
     fast, packets = np.ascontiguousarray(record.fast), np.ascontiguousarray(record.packets)
     X, S = (np.empty((len(fast), len(filter_.names))) for _ in range(2))
     ends = [min(round(time / record.dt) + 1, len(fast)) for time, _ in events]

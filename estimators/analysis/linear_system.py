@@ -36,24 +36,35 @@ _EMPTY, _NO_NIS = np.zeros((0, 0)), np.zeros(0)
 class DualRate:
     """A filter for x_{k+1} = A x_k + B u_k measured as y = C x once every `ratio` steps.
 
-    A (m, m), B (m, p), C (q, m); ratio: r >= 1. Q (m, m) or (m,): covariance of a step's process
-    noise. R (q, q) or (q,): of the measurement noise.
-    disturbed: rows of x that an extended state x_d pushes, dual-rate (4)-(5); None for no
-    disturbance accommodation. With d of them: leak, a_d of (7), a number, (d,) or (d, d); rate, u_d
-    of (7), a number or (d,); Q_d (d, d), (d,) or a number, covariance of w_d.
-    intersample: "pseudo" (14)-(32), "oh" (35), "hold" (Hara) or "predict" (34). gains: "constant",
-    "from-29" or "placed" with `poles` (m + d,) of the z-plane for one step: of (I - L C) A, (22),
-    for "pseudo" and "oh", of the single-rate filter, each to the power r, for the others.
-    start: x at k = 0, (m,). allow_unstable: accept a filter whose error grows.
+    Args:
+        A: Transition matrix, shape (m, m).
+        B: Input matrix, shape (m, p).
+        C: Measurement matrix, shape (q, m).
+        ratio: Steps between two samples, r >= 1.
+        Q: Covariance of a step's process noise, shape (m, m) or (m,).
+        R: Covariance of the measurement noise, shape (q, q) or (q,).
+        disturbed: Rows of x that d extended states x_d push, dual-rate (4)-(5); None for none.
+        leak: a_d of (7), a number, (d,) or (d, d).
+        rate: u_d of (7), a number or (d,).
+        Q_d: Covariance of w_d, a number, (d,) or (d, d).
+        intersample: "pseudo" (14)-(32), "oh" (35), "hold" (Hara) or "predict" (34).
+        gains: "constant", "from-29" or "placed".
+        poles: Poles in the z-plane for one step, shape (m + d,), for "placed": of (I - L C) A,
+            (22), for "pseudo" and "oh", of the single-rate filter, each to the power r, for the
+            others.
+        start: x at k = 0, shape (m,); None for zeros.
+        allow_unstable: Whether a filter whose error grows is accepted.
 
-    `x` (m + d,), `names` and `k` are those of now; `spectral_radius` of the error from
-    sample to sample; `find_unobservable`: directions that the measurement cannot see. `shares`
-    (r, m + d, q): L_{k+i} G_{k+i} of (14) and (19).
+    Attributes:
+        x: Present state with x_d, shape (m + d,); `names` has their names.
+        k: Present step.
+        spectral_radius: Spectral radius of the error from sample to sample.
+        unobservable: Directions that the measurement cannot see.
+        shares: L_{k+i} G_{k+i} of (14) and (19), shape (r, m + d, q).
 
-    Raises
-    ------
-    ValueError: a wrong shape, a Q or R that is no covariance, more states, inputs or outputs than
-        a filter can have, poles that cannot be placed, an error that grows.
+    Raises:
+        ValueError: A wrong shape, a Q or R that is no covariance, more states, inputs or outputs
+            than a filter can have, poles that cannot be placed, an error that grows.
     """
 
     def __init__(
@@ -105,7 +116,7 @@ class DualRate:
         self.reset()
 
     def _check_stability(self, F: Array, C: Array, allow_unstable: bool) -> None:
-        """Refuse an error that grows; name what the measurement cannot see."""
+        """Check that the error does not grow; warn of what the measurement cannot see."""
         M = frame_map(F, C, self.shares)
         self.spectral_radius = spectral_radius(M) if np.isfinite(M).all() else np.inf
         self.unobservable: tuple[str, ...] = ()
@@ -121,7 +132,7 @@ class DualRate:
             warnings.warn(text, UnobservableWarning, stacklevel=3)
 
     def reset(self) -> None:
-        """Back to k = 0, before the first sample."""
+        """Reset to k = 0, before the first sample."""
         self._reset_filter()
         self._take(np.zeros((1, FAST_WIDTH)), _NO_PACKETS)
 
@@ -134,15 +145,23 @@ class DualRate:
         advance(self._filters, self.gains, fast, len(fast), packets, count, 0, X, S, _NO_NIS)
 
     def step(self, u: npt.ArrayLike) -> None:
-        """From k to k+1 with the input u (p,) of the step: dual-rate (17), (19)."""
+        """Step from k to k+1: dual-rate (17), (19).
+
+        Args:
+            u: Input of the step, shape (p,).
+        """
         fast = np.zeros((1, FAST_WIDTH))
         fast[0, : self.inputs] = parse_vector("u", u, self.inputs)
         self._take(fast, _NO_PACKETS)
 
     def update(self, y: npt.ArrayLike) -> None:
-        """The sample y (q,) of this k, a multiple of r: dual-rate (13).
+        """Correct by the sample of this k, a multiple of r: dual-rate (13).
 
-        Raises ValueError at any other k, for a second one, and for a y that is not finite.
+        Args:
+            y: Sample, finite, shape (q,).
+
+        Raises:
+            ValueError: Another k, or a second sample.
         """
         f = self._filters[0]
         if f.tick % self.ratio:
@@ -160,10 +179,17 @@ class DualRate:
         return packet
 
     def run(self, U: npt.ArrayLike, Y: npt.ArrayLike) -> Estimates:
-        """Reset, then filter inputs U (K, p) and samples Y (K // r + 1, q) of k = 0, r, 2 r, ...
+        """Reset, then filter inputs and samples of k = 0, r, 2 r, ...
 
-        A row of Y that holds a NaN is a sample that never came. Returns estimates of k = 0 .. K,
-        time in steps. Raises ValueError for other shapes or an infinite number.
+        Args:
+            U: Inputs, shape (K, p).
+            Y: Samples, shape (K // r + 1, q); a row that holds a NaN is a sample that never came.
+
+        Returns:
+            Estimates of k = 0 .. K, time in steps.
+
+        Raises:
+            ValueError: Other shapes or an infinite number.
         """
         u, y = np.array(U, np.float64), np.array(Y, np.float64)
         q = int(self._filters[0].rows[_SENSOR])
@@ -187,17 +213,17 @@ class DualRate:
 
     @property
     def x(self) -> Array:
-        """x and x_d now, (m + d,)."""
+        """Present state with x_d, shape (m + d,)."""
         return np.array(self._filters[0].x[: len(self.names)])
 
     @property
     def k(self) -> int:
-        """k."""
+        """Present step k."""
         return int(self._filters[0].tick)
 
 
 def _parse_disturbed(rows: Sequence[int] | None, m: int) -> list[int]:
-    """The rows of x that a disturbance pushes; ValueError for one that is not there or twice."""
+    """Parse the rows of x that a disturbance pushes; ValueError for an unknown or repeated one."""
     chosen = [] if rows is None else [int(row) for row in rows]
     if len(set(chosen)) != len(chosen) or any(not 0 <= row < m for row in chosen):
         raise ValueError(f"disturbed holds different rows from 0 to {m - 1}, got {rows!r}")
@@ -205,7 +231,7 @@ def _parse_disturbed(rows: Sequence[int] | None, m: int) -> list[int]:
 
 
 def _check_sizes(A: Array, B: Array, C: Array, d: int) -> None:
-    """ValueError where shapes do not fit each other or a filter's memory."""
+    """Check that shapes fit each other and a filter's memory; else ValueError."""
     m = len(A)
     if A.shape != (m, m) or len(B) != m or C.shape[1] != m:
         raise ValueError(
@@ -220,7 +246,7 @@ def _check_sizes(A: Array, B: Array, C: Array, d: int) -> None:
 def _parse_poles(
     intersample: str, gains: str, poles: npt.ArrayLike | None, n: int
 ) -> npt.NDArray[np.complex128] | None:
-    """The poles to place, (n,); ValueError for an unknown rule or gain, or what does not fit it."""
+    """Parse the poles to place, (n,); ValueError for a contradiction or an unknown rule or gain."""
     for name, word, known in (("intersample", intersample, RULES), ("gains", gains, GAINS)):
         if word not in known:
             raise ValueError(f"{name} is one of {', '.join(known)}, got {word!r}")
@@ -237,7 +263,7 @@ def _parse_poles(
 
 
 def _make_record(F: Array, B: Array, drift: Array, C: Array, ratio: int) -> Any:
-    """The filter's memory: every state is dense, the slow sensor is the first."""
+    """Make the filter's memory: every state is dense, the slow sensor is the first."""
     filters = np.zeros(1, FILTER).view(np.recarray)
     f, n, q, p = filters[0], len(F), len(C), B.shape[1]
     f.kind, f.n, f.total, f.dense, f.step, f.relax = LINEAR, n, n, n, 1.0, 1.0

@@ -34,17 +34,26 @@ _RANK = 1e-14  # of a correlation matrix, what counts as nothing
 def smooth(
     estimator: Estimator | str, log: Log, lag_seconds: float = 1.0, **options: Any
 ) -> Estimates:
-    """Every state of a log given what was measured up to `lag_seconds` later, or longer.
+    """Compute every state of a log given what was measured up to `lag_seconds` later, or longer.
 
-    estimator: one with gains "covariance" that listens at every tick, whatever its rule for late
-    samples, or the name of one, to be built for the log's sensors with `options` as in
-    `make_estimator`. lag_seconds: whole ticks; a tick of block i (blocks of this length) knows what
-    was captured before block i + 2; `math.inf` for the whole log. Returns states and standard
-    deviations, and the NIS of each packet used at its capture.
+    Source: Rauch, Tung and Striebel, AIAA J. 3 (1965) 1445. ValueError also stands for what
+    `Estimator.run` refuses, and for a filter that is more, or less, than one Kalman filter: two
+    layers, precomputed gains, corrections between samples.
 
-    Raises ValueError as `run`, for a lag that is none, and for a filter that is more, or less, than
-    one Kalman filter: two layers, precomputed gains, corrections between samples.
-    Source: Rauch, Tung and Striebel, AIAA J. 3 (1965) 1445.
+    Args:
+        estimator: One with gains "covariance" that listens at every tick, whatever its rule for
+            late samples, or the name of one, to be built for the log's sensors.
+        log: Recorded drive.
+        lag_seconds: Lag (s), whole ticks; a tick of block i (blocks of this length) has what was
+            captured before block i + 2. `math.inf` takes the whole log.
+        **options: Options of `make_estimator` for a name.
+
+    Returns:
+        States, standard deviations, and the NIS of each packet used at its capture.
+
+    Raises:
+        TypeError: The estimator is built and has options, or has no `filters` to smooth.
+        ValueError: The lag is not positive.
     """
     if isinstance(estimator, str):
         defaults: dict[str, Any] = {"sensors": log.slow, "dt": log.record.dt, "gains": "covariance"}
@@ -78,7 +87,7 @@ def smooth(
 
 
 def _remove_delay(estimator: Estimator) -> Estimator:
-    """A copy of the filter for samples that are never late; ValueError where there is none."""
+    """Copy the filter for samples that are never late; ValueError where there is none."""
     f = estimator.filters[0]
     is_plain = f.between == NONE and f.periodic == 0 and f.delayed == 0 and f.pace == 1
     if len(estimator.filters) > 1 or not is_plain:
@@ -107,11 +116,11 @@ def _filter_forwards(
     x: Any,
     P: Any,
 ) -> int:
-    """Filter fast rows (K, FAST_WIDTH) and the packets (count, PACKET_WIDTH) from `position` on
-    that arrive by their end; returns the packets done.
+    """Filter fast rows (K, FAST_WIDTH) and the packets (count, PACKET_WIDTH) from `position` on.
 
-    nis (count,): of the packets used. F (K, n, n): each row's transition from the one before.
-    before (K, n): its prediction. x (K, n), P (K, n, n): after its samples.
+    Packets that arrive by the rows' end are taken; returns the packets done. nis (count,): of the
+    packets used. F (K, n, n): each row's transition from the one before. before (K, n): its
+    prediction. x (K, n), P (K, n, n): after its samples.
     """
     n, dense = f.n, f.dense
     for j in range(len(fast)):
@@ -138,7 +147,7 @@ def _filter_forwards(
 def _smooth_blocks(
     undelayed: Estimator, fast: Array, packets: Array, lag: int
 ) -> tuple[Array, Array, Array]:
-    """Smoothed states and standard deviations of all rows, and the packets' NIS."""
+    """Compute smoothed states and standard deviations of all rows, and the packets' NIS."""
     f, rows, n = undelayed.filters[0], len(fast), len(undelayed.names)
     Q = np.array(f.Q[:n, :n])
     X, S, nis = np.empty((rows, n)), np.empty((rows, n)), np.full(len(packets), np.nan)
@@ -168,7 +177,7 @@ def _smooth_blocks(
 
 
 def _smooth_backwards(Q: Array, F: Array, before: Array, x: Array, P: Array) -> tuple[Array, Array]:
-    """Rauch, Tung and Striebel: from the last filtered state to the first."""
+    """Smooth by Rauch, Tung and Striebel from the last filtered state to the first."""
     predicted = F[1:] @ P[:-1] @ F[1:].transpose(0, 2, 1) + Q
     sd = np.sqrt(np.einsum("kii->ki", predicted))
     sd[sd == 0.0] = 1.0

@@ -28,7 +28,16 @@ from .memory import N_CORE, N_TOTAL, FilterRecord, Vector
 
 @jit
 def dot(row: Vector, v: Vector, n: int) -> Any:
-    """The product of a row of C and a vector of states, n entries of each."""
+    """Compute the product of a row of C and a vector of states.
+
+    Args:
+        row: Row of C, shape (at least n,).
+        v: Vector, shape (at least n,).
+        n: Number of entries of each.
+
+    Returns:
+        The product.
+    """
     total = 0.0
     for k in range(n):
         total += row[k] * v[k]
@@ -37,7 +46,16 @@ def dot(row: Vector, v: Vector, n: int) -> Any:
 
 @jit
 def predict_measurement(f: FilterRecord, s: int, i: int) -> Any:
-    """What row i of sensor s would measure now: C x and, over the ground, the road's heading."""
+    """Predict a row of a slow sensor: C x and, over the ground, the road's heading.
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+        i: Index of its row.
+
+    Returns:
+        Value in the row's unit.
+    """
     value = dot(f.C[s, i], f.x, f.n)
     return value + f.road_turn if f.ground[s, i] == 1 else value
 
@@ -52,7 +70,22 @@ def _accumulate_rows(M: Vector, i: int, k: int, v: Any, a: Any, b: Any, c: Any, 
 def multiply_rows(
     M: Vector, i: int, V: Vector, n: int, j: int, a: Any, b: Any, c: Any, d: Any
 ) -> Any:
-    """a, b, c, d and rows i to i + 3 of M (., n) times V (n, .), eight columns from j on."""
+    """Add rows i to i + 3 of M times V to a, b, c and d, eight columns from j on.
+
+    Args:
+        M: Matrix, shape (., n).
+        i: First row of M.
+        V: Matrix, shape (n, .).
+        n: Number of columns of M.
+        j: First column of V.
+        a: Sum of row i.
+        b: Sum of row i + 1.
+        c: Sum of row i + 2.
+        d: Sum of row i + 3.
+
+    Returns:
+        The four sums.
+    """
     for k in range(n):
         a, b, c, d = _accumulate_rows(M, i, k, load8(V, k, j), a, b, c, d)
     return a, b, c, d
@@ -60,7 +93,7 @@ def multiply_rows(
 
 @inline
 def _multiply_symmetric(M: Vector, i: int, P: Vector, n: int, j: int) -> Any:
-    """The same from zero on for a symmetric matrix P."""
+    """Multiply rows i to i + 3 of M by a symmetric matrix P, see `multiply_rows`."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     for k in range(n):
         a, b, c, d = _accumulate_rows(M, i, k, load8_symmetric(P, k, j), a, b, c, d)
@@ -69,9 +102,12 @@ def _multiply_symmetric(M: Vector, i: int, P: Vector, n: int, j: int) -> Any:
 
 @jit
 def predict_covariance(f: FilterRecord) -> None:
-    """P <- F P F^T + Q with F = [[G, 0], [0, diag(decay)]] on the states, I on the clones.
+    """Predict P <- F P F^T + Q with F = [[G, 0], [0, diag(decay)]] on the states, I on the clones.
 
     The rows of the dense states are computed by fours, what stands above the diagonal counts.
+
+    Args:
+        f: Memory of the filter.
     """
     n, dense, N = f.n, f.dense, f.total
     P, Q, GT, keep, step = f.P, f.Q, f.GT, f.keep, vector_width(f.P)
@@ -113,10 +149,15 @@ def predict_covariance(f: FilterRecord) -> None:
 
 @jit
 def correct_scalar(f: FilterRecord, variance: Any, residual: Any) -> None:
-    """Use one residual of the given variance whose covariance with the state is `f.PC`.
+    """Correct by one residual whose covariance with the state is `f.PC`.
 
     P <- P - K s K^T, to which Joseph's form comes down for the optimal gain of a scalar. With
     products of two entries of P C^T it is symmetric to the last bit.
+
+    Args:
+        f: Memory of the filter.
+        variance: Variance of the residual, C P C^T + r.
+        residual: Measurement minus its prediction.
     """
     N, x, P, PC, gain, step = f.total, f.x, f.P, f.PC, f.gain, vector_width(f.P)
     inverse_variance = 1.0 / variance
@@ -135,14 +176,22 @@ def correct_scalar(f: FilterRecord, variance: Any, residual: Any) -> None:
 
 @jit
 def _update_weight(f: FilterRecord, variance: Any, residual: Any) -> None:
-    """What a residual of the given variance says of a member of a bank."""
+    """Update the weight of a bank's member by a residual of the given variance."""
     if f.members > 0:
         f.weight -= 0.5 * (residual * residual * (1.0 / variance) + log(variance))
 
 
 @jit
 def project(f: FilterRecord, row: Vector) -> Any:
-    """f.PC = P C^T of a measurement `row` (n,) of the states; returns C P C^T."""
+    """Compute f.PC = P C^T of a measurement of the states.
+
+    Args:
+        f: Memory of the filter.
+        row: Row of C, shape (n,).
+
+    Returns:
+        C P C^T.
+    """
     n, N, P, PC = f.n, f.total, f.P, f.PC
     for j in range(0, N, vector_width(P)):
         total = 0.0
@@ -161,7 +210,15 @@ def project(f: FilterRecord, row: Vector) -> Any:
 
 @jit
 def project_clone(f: FilterRecord, clone: int) -> Any:
-    """f.PC = P C^T of a measurement of one clone; returns C P C^T."""
+    """Compute f.PC = P C^T of a measurement of one clone.
+
+    Args:
+        f: Memory of the filter.
+        clone: Index of the clone in x.
+
+    Returns:
+        C P C^T.
+    """
     for i in range(f.total):
         f.PC[i] = f.P[clone, i]
     return f.PC[clone]
@@ -169,7 +226,14 @@ def project_clone(f: FilterRecord, clone: int) -> Any:
 
 @jit
 def update_with_states(f: FilterRecord, row: Vector, r: Any, residual: Any) -> None:
-    """Use the residual of a measurement `row` (n,) of the states with noise variance r."""
+    """Correct by the residual of a measurement of the states.
+
+    Args:
+        f: Memory of the filter.
+        row: Row of C, shape (n,).
+        r: Variance of its noise.
+        residual: Measurement minus its prediction.
+    """
     variance = project(f, row) + r
     _update_weight(f, variance, residual)
     correct_scalar(f, variance, residual)
@@ -177,7 +241,14 @@ def update_with_states(f: FilterRecord, row: Vector, r: Any, residual: Any) -> N
 
 @jit
 def update_with_clone(f: FilterRecord, clone: int, r: Any, residual: Any) -> None:
-    """Use the residual of a measurement of one clone with noise variance r."""
+    """Correct by the residual of a measurement of one clone.
+
+    Args:
+        f: Memory of the filter.
+        clone: Index of the clone in x.
+        r: Variance of the noise.
+        residual: Measurement minus its prediction.
+    """
     variance = project_clone(f, clone) + r
     _update_weight(f, variance, residual)
     correct_scalar(f, variance, residual)
@@ -185,7 +256,13 @@ def update_with_clone(f: FilterRecord, clone: int, r: Any, residual: Any) -> Non
 
 @jit
 def clone_covariance(f: FilterRecord, row: Vector, clone: int) -> None:
-    """Make a clone of the combination `row` of the states."""
+    """Write the covariance of a new clone of a combination of the states.
+
+    Args:
+        f: Memory of the filter.
+        row: The combination, shape (n,).
+        clone: Index of the clone in x.
+    """
     variance = project(f, row)
     N, P, PC = f.total, f.P, f.PC
     for i in range(N):

@@ -32,7 +32,7 @@ STORED_ONE = -3  # it is compared with what was stored at its capture
 
 @jit
 def get_direct() -> int:
-    """DIRECT, as a number: a literal argument would have every callee compiled once more."""
+    """Return DIRECT as a number: a literal argument would have every callee compiled once more."""
     return DIRECT
 
 
@@ -51,7 +51,7 @@ def _clone_states(f: FilterRecord, s: int, slot: int) -> None:
 
 @jit
 def _update_covariance(f: FilterRecord, s: int) -> None:
-    """Larsen's update at the capture: the covariance now, the states when the sample is here."""
+    """Update the covariance at the capture by Larsen's rule; the states follow at the arrival."""
     for i in range(f.rows[s]):
         row = f.C[s, i]
         f.larsen_expected[s, i] = predict_measurement(f, s, i)
@@ -64,7 +64,7 @@ def _update_covariance(f: FilterRecord, s: int) -> None:
 
 @jit
 def _propagate_gain(f: FilterRecord, s: int, i: int, row: Vector) -> None:
-    """Larsen's M_k K_s of row i after a measurement `row` (n,) with the gain f.gain."""
+    """Propagate Larsen's M_k K_s of row i past a measurement `row` (n,) with the gain f.gain."""
     projected = dot(row, f.larsen_gain[s, i], f.n)
     for k in range(f.n):
         f.larsen_gain[s, i, k] -= f.gain[k] * projected
@@ -72,7 +72,12 @@ def _propagate_gain(f: FilterRecord, s: int, i: int, row: Vector) -> None:
 
 @jit
 def propagate_larsen_gains(f: FilterRecord, row: Vector) -> None:
-    """`_propagate_gain` of every sample under way, past a measurement `row` (n,)."""
+    """Propagate Larsen's M_k K_s of every sample under way past a measurement.
+
+    Args:
+        f: Memory of the filter with its gain.
+        row: Row of C of that measurement, shape (n,).
+    """
     for s in range(N_SLOW):
         if f.stamp[s, 0] >= 0:
             for i in range(f.rows[s]):
@@ -81,7 +86,12 @@ def propagate_larsen_gains(f: FilterRecord, row: Vector) -> None:
 
 @jit
 def store_due_captures(f: FilterRecord, last: int) -> None:
-    """Store what every sensor measured that captured at the tick `last`; set its clock on."""
+    """Store what every sensor measured that captured at a tick, and advance its clock.
+
+    Args:
+        f: Memory of the filter.
+        last: The last tick.
+    """
     for s in range(N_SLOW):
         if f.period[s] > 0 and last >= f.next[s]:
             frame = (f.next[s] - f.phase[s]) // f.period[s]
@@ -101,7 +111,16 @@ def store_due_captures(f: FilterRecord, last: int) -> None:
 
 @jit
 def is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
-    """Whether a sample of a sensor on its clock came before or is refused; it is counted."""
+    """Return whether a sample of a sensor on its clock came before or is refused; it is counted.
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+        captured: Captured tick of the sample.
+
+    Returns:
+        True for a sample that must not be used.
+    """
     frame = (captured - f.phase[s]) // f.period[s]
     if f.phase[s] + frame * f.period[s] != captured:
         f.counts[COUNTERS.unknown] += 1
@@ -118,8 +137,17 @@ def is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
 
 @jit
 def find_clone(f: FilterRecord, s: int, captured: int) -> int:
-    """The first clone that a sample measures, DIRECT for the states, STORED_ONE for what else was
-    stored at its capture, or DROPPED (and counted)."""
+    """Find what a sample measures.
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+        captured: Captured tick of the sample.
+
+    Returns:
+        Index of its first clone, DIRECT for the states, STORED_ONE for what else was stored at its
+        capture, or DROPPED (and counted).
+    """
     if is_duplicate(f, s, captured):
         return DROPPED
     frame = (captured - f.phase[s]) // f.period[s]

@@ -28,7 +28,16 @@ from .tyres import linearise
 
 @jit
 def compute_signal(row: Vector, column: Vector, factor: Vector) -> Any:
-    """A signal of a fast row (FAST_WIDTH,): the sum of two of its columns times their factors."""
+    """Compute a signal of a fast row: the sum of two of its columns times their factors.
+
+    Args:
+        row: Fast row, shape (FAST_WIDTH,).
+        column: Indices of the columns, shape (2,).
+        factor: Their factors, shape (2,).
+
+    Returns:
+        The signal.
+    """
     return load_element(factor, 0) * load_element(row, load_element(column, 0)) + load_element(
         factor, 1
     ) * load_element(row, load_element(column, 1))
@@ -36,7 +45,7 @@ def compute_signal(row: Vector, column: Vector, factor: Vector) -> Any:
 
 @jit
 def _estimate_noise(f: FilterRecord, accel_y: float) -> None:
-    """The variance of a_y from its second differences, which a car's motion hardly has.
+    """Estimate the variance of a_y from its second differences, which motion hardly has.
 
     White noise of variance r gives them 6 r; what is far beyond counts as 9 times what is expected.
     """
@@ -50,8 +59,10 @@ def _estimate_noise(f: FilterRecord, accel_y: float) -> None:
 
 @jit
 def _write_scale_column(f: FilterRecord) -> None:
-    """The accelerometer's row has what it should measure now in the column of its scale's error;
-    at a standstill nothing of the scale is seen."""
+    """Write the accelerometer's prediction in the column of its scale's error.
+
+    At a standstill nothing of the scale is seen.
+    """
     row = f.C_fast[f.accel_row]
     row[f.scaled] = 0.0
     if f.speed <= MIN_SPEED:
@@ -64,7 +75,7 @@ def _write_scale_column(f: FilterRecord) -> None:
 
 @jit
 def _check_steering(f: FilterRecord) -> None:
-    """A steering angle (the first input) that jumps is none until the next row confirms it."""
+    """Skip a steering angle (the first input) that jumps until the next row confirms it."""
     steer = f.u_new[0]
     if absolute(steer - f.steer_before) > f.steer_jump:
         f.u_new[0] = np.nan
@@ -73,9 +84,14 @@ def _check_steering(f: FilterRecord) -> None:
 
 @jit
 def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
-    """Take a fast row (FAST_WIDTH,): its inputs (the last finite ones), measurements and speed.
+    """Read a fast row: its inputs (the last finite ones), measurements and speed.
 
-    wheel_speed: this sample of the speed, m/s. The model is built anew where it has to be.
+    The model is built anew where it has to be.
+
+    Args:
+        f: Memory of the filter.
+        row: Fast row, shape (FAST_WIDTH,).
+        wheel_speed: This sample of the speed (m/s).
     """
     is_sound = True
     for i in range(f.inputs):
@@ -112,7 +128,7 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
 
 @jit
 def _predict(f: FilterRecord, v: Vector) -> None:
-    """v <- F v on the states of a vector (n,) or longer."""
+    """Predict v <- F v on the states of a vector (n,) or longer."""
     n, new, step = f.n, allocate_scratch(f.P, 1, N_CORE), vector_width(f.P)
     for j in range(0, n, step):
         total = load8(f.keep, j) * load8(v, j)
@@ -125,7 +141,12 @@ def _predict(f: FilterRecord, v: Vector) -> None:
 
 @jit
 def propagate(f: FilterRecord, u: Vector) -> None:
-    """x <- F x + H u for the inputs u (INPUTS,), and P with it."""
+    """Predict x <- F x + H u, and P with it.
+
+    Args:
+        f: Memory of the filter, or a block of lanes.
+        u: Inputs, shape (N_INPUTS,).
+    """
     step = vector_width(f.P)
     _predict(f, f.x)
     for j in range(0, f.dense, step):
@@ -142,7 +163,7 @@ def propagate(f: FilterRecord, u: Vector) -> None:
 
 @jit
 def _scale_beta(f: FilterRecord) -> None:
-    """beta = v_y / V at the model's new speed V, since v_y is what stays."""
+    """Scale beta = v_y / V to the model's new speed V, since v_y is what stays."""
     f.x[BETA] *= f.stretch
     f.e[BETA] *= f.stretch
     if f.periodic == 0:
@@ -158,7 +179,12 @@ def _scale_beta(f: FilterRecord) -> None:
 
 @noinline
 def advance_state(f: FilterRecord, u: Vector) -> None:
-    """`propagate` with the model of now, and what else is carried along."""
+    """Predict by the present model, and what else is carried along.
+
+    Args:
+        f: Memory of the filter.
+        u: Inputs of the step, shape (N_INPUTS,).
+    """
     if f.stretch != 1.0:
         _scale_beta(f)
     if f.tyres > 0 and (f.tick % f.again == 0 or f.late == BUFFER):
@@ -178,7 +204,15 @@ def advance_state(f: FilterRecord, u: Vector) -> None:
 
 @jit
 def compute_residual(f: FilterRecord, i: int) -> Any:
-    """The residual of the fast measurement i."""
+    """Compute the residual of a fast measurement.
+
+    Args:
+        f: Memory of the filter, or a block of lanes.
+        i: Index of the measurement.
+
+    Returns:
+        Measurement minus its prediction.
+    """
     residual = load_element(f.y, i) - load_element(f.rest_fast, i)
     for k in range(f.n):
         residual = residual - load_element(f.C_fast, i, k) * load_element(f.x, k)
@@ -189,7 +223,7 @@ def compute_residual(f: FilterRecord, i: int) -> Any:
 
 @jit
 def _correct_joint(f: FilterRecord, gains: GainTables) -> None:
-    """x += K residuals with residuals that are all taken before, in f.eps."""
+    """Correct x += K residuals with residuals that are all taken before, in f.eps."""
     for i in range(f.fasts):
         K = gains[f.cell, locate_step_row(f) + i]
         for j in range(f.total):
@@ -198,7 +232,12 @@ def _correct_joint(f: FilterRecord, gains: GainTables) -> None:
 
 @noinline
 def correct_fast(f: FilterRecord, gains: GainTables) -> None:
-    """Correct by the fast measurements in f.y; what is not finite is counted and skipped."""
+    """Correct by the fast measurements in f.y; what is not finite is counted and skipped.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+    """
     for i in range(f.fasts):
         if not is_finite(f.y[i]):
             f.counts[COUNTERS.invalid] += 1

@@ -25,9 +25,17 @@ _MIN_SCALE, _MAX_SCALE = 0.05, 100.0  # of the scale of R
 
 @jit
 def interpolate_hdop(f: FilterRecord, s: int, packet: Vector) -> Any:
-    """The factor on sensor s's standard deviations at the HDOP of its packet (PACKET_WIDTH,).
+    """Interpolate the factor on a sensor's standard deviations at the HDOP of its packet.
 
     The filter's table, linear between its knots; 1 without a table or an HDOP.
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+        packet: Packet, shape (PACKET_WIDTH,).
+
+    Returns:
+        The factor.
     """
     if f.knots == 0 or f.hdop_column[s] == 0:
         return 1.0
@@ -45,7 +53,7 @@ def interpolate_hdop(f: FilterRecord, s: int, packet: Vector) -> Any:
 
 @jit
 def _find_capture_variance(f: FilterRecord, s: int, i: int, packet: Vector) -> Any:
-    """The variance of row i of a packet at the speed at which it was captured."""
+    """Find the variance of row i of a packet at the speed at which it was captured."""
     captured = int(packet[PACKET.captured])
     if f.late == CLONE and f.noise_over_speed[s, i] > 0.0 and captured < f.tick:
         slot = (captured - f.phase[s]) // f.period[s] % f.frames[s]
@@ -55,20 +63,40 @@ def _find_capture_variance(f: FilterRecord, s: int, i: int, packet: Vector) -> A
 
 @jit
 def compute_packet_variance(f: FilterRecord, s: int, i: int, packet: Vector) -> Any:
-    """The variance of row i of a packet (PACKET_WIDTH,) of sensor s."""
+    """Compute the variance of a packet's row.
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+        i: Index of its row.
+        packet: Packet, shape (PACKET_WIDTH,).
+
+    Returns:
+        Variance in the row's unit squared.
+    """
     factor = interpolate_hdop(f, s, packet)
     return _find_capture_variance(f, s, i, packet) * f.scale[s, i] * factor * factor
 
 
 @jit
 def project_row(f: FilterRecord, s: int, i: int, first: int) -> Any:
-    """f.PC = P C^T of row i, of the states (first < 0) or of a clone; returns C P C^T."""
+    """Compute f.PC = P C^T of a sensor's row.
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+        i: Index of its row.
+        first: Clone of its first row, negative where it measures the states.
+
+    Returns:
+        C P C^T.
+    """
     return project_clone(f, first + i) if first >= 0 else project(f, f.C[s, i])
 
 
 @jit
 def _compute_covariance(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
-    """f.S = C P C^T + R of the sample, its lower half."""
+    """Compute f.S = C P C^T + R of the sample, its lower half."""
     for i in range(f.rows[s]):
         projected = project_row(f, s, i, first)
         f.S[i, i] = projected + compute_packet_variance(f, s, i, packet)
@@ -78,9 +106,16 @@ def _compute_covariance(f: FilterRecord, s: int, first: int, packet: Vector) -> 
 
 @jit
 def test_innovation(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
-    """f.nis = residual^T S^-1 residual (f.residual); whether the gate lets the sample pass.
+    """Compute f.nis = residual^T S^-1 residual (f.residual) and compare it with the gate.
 
-    first: the clone of its first row, negative where it measures the states.
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+        first: Clone of its first row, negative where it measures the states.
+        packet: Packet, shape (PACKET_WIDTH,).
+
+    Returns:
+        Whether the gate lets the sample pass.
     """
     p, S = f.rows[s], f.S
     _compute_covariance(f, s, first, packet)
@@ -104,8 +139,10 @@ def test_innovation(f: FilterRecord, s: int, first: int, packet: Vector) -> bool
 
 @jit
 def _is_consistent(f: FilterRecord, s: int) -> bool:
-    """Whether every residual is the last gated one, within `_AGREEMENT_SD` deviations of a
-    difference."""
+    """Return whether every residual agrees with the last gated one.
+
+    They agree within `_AGREEMENT_SD` standard deviations of a difference.
+    """
     for i in range(f.rows[s]):
         difference, row_variance = f.residual[i] - f.doubt[s, i], 0.0
         if f.angle[s, i] == 1:
@@ -119,7 +156,7 @@ def _is_consistent(f: FilterRecord, s: int) -> bool:
 
 @jit
 def _is_observed_elsewhere(f: FilterRecord, s: int, state: int) -> bool:
-    """Whether another sensor that measures a state was believed since s was doubted."""
+    """Return whether another sensor that measures a state was believed since s was doubted."""
     for other in range(N_SLOW):
         if other != s and f.rows[other] > 0 and f.believed[other] >= f.doubted[s]:
             for i in range(f.rows[other]):
@@ -130,7 +167,13 @@ def _is_observed_elsewhere(f: FilterRecord, s: int, state: int) -> bool:
 
 @jit
 def inflate_covariance(f: FilterRecord, state: int, variance: Any) -> None:
-    """Add a variance to a state, now and in what was captured of it."""
+    """Add a variance to a state, now and in what was captured of it.
+
+    Args:
+        f: Memory of the filter.
+        state: Index of the state.
+        variance: Variance in the state's unit squared.
+    """
     v = f.PC
     for i in range(f.total):
         v[i] = 0.0
@@ -164,7 +207,17 @@ def _reset_sensor_states(f: FilterRecord, s: int) -> bool:
 
 @jit
 def check_sample(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
-    """Whether to use a sample: the gate lets it pass, or the filter begins anew with the sensor."""
+    """Return whether to use a sample: it passes the gate, or the filter re-starts with the sensor.
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+        first: Clone of its first row, negative where it measures the states.
+        packet: Packet, shape (PACKET_WIDTH,).
+
+    Returns:
+        True for a sample to use.
+    """
     passed = test_innovation(f, s, first, packet)
     if f.wary == 0:
         return passed
@@ -188,9 +241,15 @@ def check_sample(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
 def adapt_noise(
     f: FilterRecord, s: int, i: int, projected: float, residual: float, r: float
 ) -> None:
-    """Innovation-based R: the mean of residual^2 - C P C^T, as a multiple of the configured one.
+    """Adapt R to innovations: the mean of residual^2 - C P C^T, over the configured one.
 
-    projected: C P C^T of row i of sensor s. r: the sample's variance by the present scale.
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+        i: Index of its row.
+        projected: C P C^T of the row.
+        residual: Measurement minus its prediction.
+        r: The sample's variance by the present scale.
     """
     if r > 0.0:
         sample_scale = (residual * residual - projected) / r * f.scale[s, i]

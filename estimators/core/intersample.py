@@ -22,13 +22,18 @@ NONE, PSEUDO, DUAL_RATE = range(3)
 
 @jit
 def _apply_row(f: FilterRecord, s: int, i: int, v: Vector) -> Any:
-    """Row i of sensor s applied to a vector of states and clones (total,): its clone, if it has."""
+    """Apply row i of sensor s to a vector of states and clones (total,): its clone, if it has."""
     return v[f.first_clone[s] + i] if f.frames[s] > 0 else dot(f.C[s, i], v, f.n)
 
 
 @jit
 def predict_slow_rows(f: FilterRecord, s: int) -> None:
-    """What the slow rows are expected to be, and their pseudo-residuals: tie-vision (22)."""
+    """Predict the slow rows, and their pseudo-residuals: tie-vision (22).
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+    """
     for i in range(f.rows[s]):
         has_clones = f.frames[s] > 0
         f.expected[i] = f.x[f.first_clone[s] + i] if has_clones else predict_measurement(f, s, i)
@@ -39,8 +44,11 @@ def predict_slow_rows(f: FilterRecord, s: int) -> None:
 def correct_between(f: FilterRecord, gains: GainTables, s: int) -> None:
     """Correct x and e, both predicted, by the fast residuals in f.eps and the pseudo-residuals.
 
-    gains: in the present table, rows of K^T and then of the inverse's transpose stand behind those
-    of the steps and frames.
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns); rows of K^T and then of the inverse's
+            transpose stand behind those of the steps and frames.
+        s: Index of the slow sensor.
     """
     x, e, N, m = f.x, f.e, f.total, f.fasts
     first = locate_frame_row(f, s, f.pattern)
@@ -60,7 +68,13 @@ def correct_between(f: FilterRecord, gains: GainTables, s: int) -> None:
 
 @jit
 def correct_sample(f: FilterRecord, gains: GainTables, s: int) -> None:
-    """A sample has come in this tick: its residuals replace the pseudo ones, and e starts anew."""
+    """Correct by a sample of this tick: its residuals replace the pseudo ones, and e starts anew.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+        s: Index of the slow sensor.
+    """
     m, N, rows = f.fasts, f.total, f.rows[s]
     first = locate_frame_row(f, s, f.pattern)
     for i in range(rows):
@@ -78,7 +92,13 @@ def correct_sample(f: FilterRecord, gains: GainTables, s: int) -> None:
 
 @jit
 def update_error(f: FilterRecord, i: int, residual: float) -> None:
-    """A fast row's gain f.share[i] was used on x: the same for e."""
+    """Correct e by a fast row's gain f.share[i], which x has used.
+
+    Args:
+        f: Memory of the filter.
+        i: Index of the fast measurement.
+        residual: Its residual.
+    """
     projected = dot(f.C_fast[i], f.e, f.n)
     f.eps[i] = residual
     for j in range(f.total):
@@ -87,7 +107,12 @@ def update_error(f: FilterRecord, i: int, residual: float) -> None:
 
 @jit
 def apply_gain_shares(f: FilterRecord, s: int) -> None:
-    """Correct x and e by the pseudo-residuals with the share of the last sample's gain."""
+    """Correct x and e by the pseudo-residuals with the even fraction of the last sample's gain.
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+    """
     for i in range(f.fasts, f.fasts + f.rows[s]):
         for j in range(f.total):
             f.x[j] += f.share[i, j] * f.eps[i]
@@ -96,8 +121,16 @@ def apply_gain_shares(f: FilterRecord, s: int) -> None:
 
 @jit
 def split_sample_gain(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
-    """`correct_sample` with the covariance's gain of this packet (PACKET_WIDTH,), in even shares
-    over a period."""
+    """Correct by a sample as `correct_sample` does, with the covariance's gain of this packet.
+
+    The gain is split evenly over a period.
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+        first: What the sample measures, see `delay.find_clone`.
+        packet: Packet, shape (PACKET_WIDTH,).
+    """
     m, N, rows = f.fasts, f.total, f.rows[s]
     steps = f.period[s] // f.stride
     for i in range(rows):
@@ -126,7 +159,7 @@ def split_sample_gain(f: FilterRecord, s: int, first: int, packet: Vector) -> No
 
 @jit
 def _apply_share(f: FilterRecord, gains: GainTables, s: int) -> None:
-    """x += the share of the last innovation that is due now."""
+    """Add the fraction of the last innovation that is due now to x."""
     first = locate_frame_row(f, s, f.pattern) + f.since * f.rows[s]
     for i in range(f.rows[s]):
         K = gains[f.cell, first + i]
@@ -136,7 +169,13 @@ def _apply_share(f: FilterRecord, gains: GainTables, s: int) -> None:
 
 @jit
 def start_shares(f: FilterRecord, gains: GainTables, s: int) -> None:
-    """A sample has come: store its innovation and use its first share."""
+    """Store a sample's innovation and use its first fraction.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+        s: Index of the slow sensor.
+    """
     for i in range(f.rows[s]):
         f.innovation[i] = f.residual[i]
     f.since = 0
@@ -145,7 +184,13 @@ def start_shares(f: FilterRecord, gains: GainTables, s: int) -> None:
 
 @jit
 def apply_next_share(f: FilterRecord, gains: GainTables, s: int) -> None:
-    """The next share, as long as there is one."""
+    """Use the next fraction of the innovation, as long as there is one.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+        s: Index of the slow sensor.
+    """
     if f.since >= 0:
         f.since += 1
         if f.since < f.cycle:

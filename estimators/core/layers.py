@@ -43,12 +43,17 @@ CHANGE_RATE, SETTLE_RATE, TRUST_RATE = 0.1, 2.0, 0.3  # 1/s, of tyres: into CHAN
 def update_second_layer(
     first: FilterRecord, second: FilterRecord, gains: GainTables, packet: Vector
 ) -> None:
-    """Correct the second layer by a packet (PACKET_WIDTH,) that the first has used, as a velocity:
-    v_x = V cos(beta), v_y = V sin(beta).
+    """Correct the second layer by a packet as a velocity: v_x = V cos(beta), v_y = V sin(beta).
 
     double-layer-gps (8)-(9), with the first layer's sideslip angle as it was predicted for the
     captured tick. The noise along is the speed's, after the table of HDOP; the one across is that
     of the angle, (V sigma_beta)^2, and of the speed, (sigma_V sin(beta))^2.
+
+    Args:
+        first: Memory of the first layer.
+        second: Memory of the second layer.
+        gains: Tables of gains, shape (cells, rows, columns).
+        packet: Packet that the first layer has used, shape (PACKET_WIDTH,).
     """
     s, captured = int(packet[PACKET.sensor]), int(packet[PACKET.captured])
     beta = first.x[BETA]
@@ -72,13 +77,26 @@ def update_second_layer(
 
 @jit
 def first_member(layers: FilterRecords) -> int:
-    """The first layer that measures: 1 where there is a bank, else 0."""
+    """Return the first layer that measures.
+
+    Args:
+        layers: Memory of the estimator, shape (layers,).
+
+    Returns:
+        1 where there is a bank, else 0.
+    """
     return 1 if layers[0].members > 0 else 0
 
 
 @jit
 def process_packet_members(layers: FilterRecords, gains: GainTables, packet: Vector) -> None:
-    """`process_packet` a packet by every member behind the first one."""
+    """Process a packet by every member behind the first one.
+
+    Args:
+        layers: Memory of the bank, shape (layers,).
+        gains: Tables of gains, shape (cells, rows, columns).
+        packet: Packet, shape (PACKET_WIDTH,).
+    """
     for m in range(2, len(layers)):
         process_packet(layers[m], gains, packet)
 
@@ -94,7 +112,7 @@ def _find_likeliest(layers: FilterRecords) -> int:
 
 @jit
 def _set_level(f: FilterRecord, i: int, level: Any) -> None:
-    """Disturbance i comes with `level` of its configured variance."""
+    """Set the variance of disturbance i to `level` times the configured one."""
     index, ratio = f.dense + i, level / f.level[i]
     f.level[i] = level
     f.q_known[i] *= ratio
@@ -103,7 +121,11 @@ def _set_level(f: FilterRecord, i: int, level: Any) -> None:
 
 @noinline
 def replace_least_likely(layers: FilterRecords) -> None:
-    """The least likely member becomes the likeliest, but for tyres that may be others now."""
+    """Replace the least likely member by the likeliest with tyres that may have changed.
+
+    Args:
+        layers: Memory of the bank, shape (layers,).
+    """
     best = _find_likeliest(layers)
     max_weight, worst = layers[best].weight, 1
     for m in range(1, len(layers)):
@@ -129,7 +151,7 @@ def replace_least_likely(layers: FilterRecords) -> None:
 
 @jit
 def _copy_moments(source: FilterRecord, target: FilterRecord) -> None:
-    """Mean and covariance of states and clones."""
+    """Copy mean and covariance of states and clones."""
     for j in range(0, source.total, 8):
         store8(target.x, load8(source.x, j), j)
         for i in range(source.total):
@@ -138,7 +160,7 @@ def _copy_moments(source: FilterRecord, target: FilterRecord) -> None:
 
 @jit
 def _split_weight(source: FilterRecord, share: Any) -> Any:
-    """The probability (a member's `weight`, here) that leaves it."""
+    """Split off the probability (a member's `weight`, here) that leaves it, and return it."""
     moved = share * source.weight
     source.weight -= moved
     return moved
@@ -146,7 +168,7 @@ def _split_weight(source: FilterRecord, share: Any) -> Any:
 
 @jit
 def _merge(source: FilterRecord, probability: Any, target: FilterRecord) -> Any:
-    """Mean and covariance of a member with what comes from a source; the source's share."""
+    """Merge a source's mean and covariance into a member's; return the source's fraction."""
     target.weight += probability
     share = probability / target.weight
     product = share * (1.0 - share)
@@ -170,7 +192,7 @@ def _merge(source: FilterRecord, probability: Any, target: FilterRecord) -> Any:
 
 @jit
 def _remove_gust(f: FilterRecord) -> None:
-    """Force and moment are what they are without a gust, whatever they were."""
+    """Set force and moment to what they are without a gust, whatever they were."""
     for i in range(2):
         index = f.dense + i
         f.x[index] = 0.0
@@ -182,7 +204,11 @@ def _remove_gust(f: FilterRecord) -> None:
 
 @noinline
 def run_imm_step(layers: FilterRecords) -> None:
-    """The members' moments and weights after a step of the chain; layer 0 is its scratch."""
+    """Run a step of the Markov chain on the members' moments and weights; layer 0 is its scratch.
+
+    Args:
+        layers: Memory of the bank, shape (1 + 4,).
+    """
     best, calmed = _find_likeliest(layers), layers[0]
     calm, gusty, changed = layers[CALM], layers[GUSTY], layers[CHANGED]
     settling, max_weight, time = layers[SETTLING], layers[best].weight, calm.respawn * calm.step
@@ -208,7 +234,11 @@ def run_imm_step(layers: FilterRecords) -> None:
 
 @jit
 def update_bank(layers: FilterRecords) -> None:
-    """The bank's own step, now and then."""
+    """Run the bank's own step: interact, or replace a member.
+
+    Args:
+        layers: Memory of the bank, shape (layers,).
+    """
     if layers[0].burst[0] > 0.0:
         run_imm_step(layers)
     else:
@@ -222,7 +252,11 @@ def _compute_likelihood(layers: FilterRecords, m: int, best: int) -> Any:
 
 @noinline
 def compute_mixture(layers: FilterRecords) -> None:
-    """The mean and covariance of the mixture into layer 0."""
+    """Compute the mean and covariance of the mixture, in layer 0.
+
+    Args:
+        layers: Memory of the bank, shape (layers,).
+    """
     best = _find_likeliest(layers)
     likeliest, mixture = layers[best], layers[0]
     total, n = 0.0, likeliest.n

@@ -48,7 +48,7 @@ Vector = Any
 
 
 class SkipCounters(NamedTuple):
-    """What a filter skipped, by reason."""
+    """Counters of what a filter skipped, by reason."""
 
     refused: int = 0  # captured before the oldest state the filter still has
     duplicates: int = 1  # same sensor and captured tick as an earlier packet
@@ -61,8 +61,10 @@ class SkipCounters(NamedTuple):
 
 
 class CarIndex(NamedTuple):
-    """Places in the field `car`, in the order of `compute_bicycle_coefficients`; names of
-    `Vehicle`."""
+    """Places in the field `car`, in the order of `compute_bicycle_coefficients`.
+
+    Names are those of `Vehicle`.
+    """
 
     mass: int = 0  # kg
     yaw_inertia: int = 1  # kg m2
@@ -284,7 +286,7 @@ _FIELDS = _MODEL + _BANK + _FAST + _SLOW + _DELAY + _GAINS + _SPEED + _NOW + _BE
 
 
 def _count_numbers(field: Any) -> int:
-    """How many numbers it has."""
+    """Count the numbers of a field."""
     return math.prod(field[2]) if len(field) > 2 else 1
 
 

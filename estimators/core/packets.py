@@ -20,7 +20,17 @@ from .update import update_filter
 
 @jit
 def apply_packet(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -> bool:
-    """Use a sound packet of sensor s according to its age; whether it was used."""
+    """Correct by a sound packet according to its age.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+        s: Index of the slow sensor.
+        packet: Packet, shape (PACKET_WIDTH,).
+
+    Returns:
+        Whether it was used.
+    """
     if f.late == BUFFER:
         return rewind_update(f, gains, s, packet)
     first = find_clone(f, s, int(packet[PACKET.captured]))
@@ -35,7 +45,7 @@ def _is_whole(value: Any) -> Any:
 
 @jit
 def _is_timely(f: FilterRecord, captured: Any, arrived: Any) -> bool:
-    """Whether stamps are ticks from the first row to now, in their order; else counted."""
+    """Return whether stamps are ticks from the first row to now, in order; else count them."""
     if not (_is_whole(captured) and _is_whole(arrived)) or arrived < captured:
         f.counts[COUNTERS.unknown] += 1
     elif arrived > f.tick:
@@ -49,8 +59,11 @@ def _is_timely(f: FilterRecord, captured: Any, arrived: Any) -> bool:
 
 @jit
 def _is_frozen(f: FilterRecord, s: int, packet: Vector) -> bool:
-    """Whether two values or more, and all there are, are those of the sensor's last packet, and the
-    car moves: noise repeats no number, and a receiver's rounded course comes with a position."""
+    """Return whether a packet repeats the sensor's last one while the car moves.
+
+    Two values or more, and all there are, are equal: noise repeats no number, and a receiver's
+    rounded course comes with a position.
+    """
     last = f.last[s]
     if packet[PACKET.captured] == last[PACKET.captured]:  # a duplicate
         return False
@@ -66,9 +79,16 @@ def _is_frozen(f: FilterRecord, s: int, packet: Vector) -> bool:
 
 @jit
 def is_valid(f: FilterRecord, packet: Vector) -> bool:
-    """Whether a packet is one for this filter and fit for use; what is not is counted.
+    """Return whether a packet is one for this filter and fit for use; what is not is counted.
 
     Numbers are judged as floats, before any becomes an int.
+
+    Args:
+        f: Memory of the filter.
+        packet: Packet, shape (PACKET_WIDTH,).
+
+    Returns:
+        True for a packet to use.
     """
     for i in range(PACKET.value):
         if not is_finite(packet[i]):
@@ -117,7 +137,15 @@ def _store_waiting(f: FilterRecord, s: int, packet: Vector) -> bool:
 
 @jit
 def process_sample(f: FilterRecord, gains: GainTables) -> bool:
-    """`process_packet` the packet that lies in f.sample."""
+    """Process the packet in f.sample, see `process_packet`.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+
+    Returns:
+        False if it was dropped.
+    """
     f.nis = np.nan
     if not is_valid(f, f.sample):
         return False
@@ -129,15 +157,28 @@ def process_sample(f: FilterRecord, gains: GainTables) -> bool:
 
 @noinline
 def process_packet(f: FilterRecord, gains: GainTables, packet: Vector) -> bool:
-    """Use a packet that is here now, queue it for the next step, or drop and count it; False if it
-    was dropped."""
+    """Use a packet that has arrived, queue it for the next step, or drop and count it.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+        packet: Packet, shape (PACKET_WIDTH,).
+
+    Returns:
+        False if it was dropped.
+    """
     copy_into(packet, f.sample)
     return process_sample(f, gains)
 
 
 @jit
 def apply_waiting(f: FilterRecord, gains: GainTables) -> None:
-    """Use the packets that came since the last step that listened."""
+    """Correct by the packets that came since the last step that listened.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+    """
     for i in range(f.waits):
         copy_into(f.waiting[i], f.sample)
         apply_packet(f, gains, int(f.sample[PACKET.sensor]), f.sample)

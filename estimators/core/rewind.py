@@ -33,7 +33,7 @@ _NOW_SLOT = N_SNAPSHOTS  # the snapshot of now, while the past is filtered anew
 
 @jit
 def _find_slot(f: FilterRecord, tick: int) -> int:
-    """The snapshot after the fast row of a tick, before its samples."""
+    """Find the snapshot after the fast row of a tick, before its samples."""
     return int((tick - f.start) // SNAPSHOT_INTERVAL % N_SNAPSHOTS)
 
 
@@ -48,7 +48,7 @@ def _store_snapshot(f: FilterRecord, slot: int) -> None:
 
 @jit
 def _restore(f: FilterRecord, slot: int) -> None:
-    """The states and covariance of a snapshot."""
+    """Restore the states and covariance of a snapshot."""
     for i in range(f.n):
         f.x[i] = f.snapshot_x[slot, i]
         for j in range(f.n):
@@ -57,7 +57,11 @@ def _restore(f: FilterRecord, slot: int) -> None:
 
 @jit
 def store_history(f: FilterRecord) -> None:
-    """Store the inputs, fast measurements and model of the present tick."""
+    """Store the inputs, fast measurements and model of the present tick.
+
+    Args:
+        f: Memory of the filter.
+    """
     slot = f.tick % WINDOW
     copy_into(f.u, f.past_u[slot])
     copy_into(f.y, f.past_y[slot])
@@ -69,7 +73,7 @@ def store_history(f: FilterRecord) -> None:
 
 @jit
 def _restore_history(f: FilterRecord, tick: int) -> None:
-    """Inputs, fast measurements and model of a tick."""
+    """Restore inputs, fast measurements and model of a tick."""
     slot = tick % WINDOW
     copy_into(f.past_u[slot], f.u)
     copy_into(f.past_y[slot], f.y)
@@ -81,7 +85,7 @@ def _restore_history(f: FilterRecord, tick: int) -> None:
 
 @jit
 def _find_oldest(f: FilterRecord) -> int:
-    """The place to store a packet in: an empty one, or that of the earliest captured."""
+    """Find the place to store a packet in: an empty one, or that of the earliest captured."""
     place = 0
     for i in range(N_RECENT):
         if f.recent[i, PACKET.captured] < f.recent[place, PACKET.captured]:
@@ -99,7 +103,7 @@ def _store_packet(f: FilterRecord, s: int, packet: Vector, place: int) -> None:
 
 @jit
 def _is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
-    """Whether a sample is a duplicate of a stored one."""
+    """Return whether a sample is a duplicate of a stored one."""
     for i in range(N_RECENT):
         if f.recent[i, PACKET.captured] == captured and f.recent[i, PACKET.sensor] == s:
             return True
@@ -145,8 +149,10 @@ def _apply_tick_samples(
 
 @jit
 def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: int) -> bool:
-    """Filter anew from the snapshot at `first` to now; False, and back to now, if the gate refuses
-    the sample at the place `new_place`."""
+    """Filter anew from the snapshot at `first` to now, with a new sample.
+
+    Returns False, and all is as before, if the gate refuses the sample at the place `new_place`.
+    """
     now, invalid, count = f.tick, f.counts[COUNTERS.invalid], _collect_samples(f, first)
     _store_snapshot(f, _NOW_SLOT)
     _restore(f, _find_slot(f, first))
@@ -174,7 +180,17 @@ def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: in
 
 @noinline
 def rewind_update(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -> bool:
-    """Use a packet (PACKET_WIDTH,) of any age within the window; whether it was used."""
+    """Correct by a packet of any age within the window.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+        s: Index of the slow sensor.
+        packet: Packet, shape (PACKET_WIDTH,).
+
+    Returns:
+        Whether it was used.
+    """
     captured = int(packet[PACKET.captured])
     first = f.start + (captured - f.start) // SNAPSHOT_INTERVAL * SNAPSHOT_INTERVAL
     if _is_duplicate(f, s, captured):
@@ -192,7 +208,11 @@ def rewind_update(f: FilterRecord, gains: GainTables, s: int, packet: Vector) ->
 
 @jit
 def clear_history(f: FilterRecord) -> None:
-    """Empty the window."""
+    """Empty the window.
+
+    Args:
+        f: Memory of the filter.
+    """
     f.lost = _EMPTY_STAMP
     for i in range(N_RECENT):
         f.recent[i, PACKET.captured] = _EMPTY_STAMP

@@ -50,7 +50,12 @@ def _fill(vector: Vector, value: float) -> None:
 
 @noinline
 def reset_filter(f: FilterRecord, first: int) -> None:
-    """A fresh filter whose first row is the tick `first`."""
+    """Reset a filter to its start.
+
+    Args:
+        f: Memory of the filter.
+        first: Tick of its first fast row.
+    """
     f.start, f.tick, f.has_started, f.at = first, first - 1, 0, 0
     f.cell, f.wanted, f.cursor, f.waits, f.u_count = 0, -1, 0, 0, 0
     f.first_fix, f.since, f.nis, f.turning, f.road_turn = -1, -1, np.nan, 0.0, 0.0
@@ -102,7 +107,7 @@ def reset_filter(f: FilterRecord, first: int) -> None:
 
 @jit
 def _start(f: FilterRecord) -> None:
-    """The first step: nothing to predict from."""
+    """Start: the first step has nothing to predict from."""
     f.has_started = 1
     f.at = ((f.tick - f.origin) // f.stride) % f.cycle
     if f.speed_state >= 0:
@@ -111,14 +116,19 @@ def _start(f: FilterRecord) -> None:
 
 @jit
 def _update_road_turn(f: FilterRecord, u: Vector) -> None:
-    """The road turns beside the car, over a step with the inputs u (INPUTS,)."""
+    """Add the road's turn beside the car, over a step with the inputs u (INPUTS,)."""
     if f.kind == LATERAL and f.inputs > CURVATURE:
         f.road_turn += compute_road_turn(f.model_speed, u[CURVATURE], f.step)
 
 
 @jit
 def run_tick(f: FilterRecord, gains: GainTables) -> None:
-    """From the last tick to this one, whose fast row was read."""
+    """Step from the last tick to this one, whose fast row was read.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+    """
     f.tick += 1
     if f.stride > 1:
         for i in range(f.inputs):
@@ -157,7 +167,17 @@ def run_tick(f: FilterRecord, gains: GainTables) -> None:
 
 @jit
 def read_covariance(f: FilterRecord, gains: GainTables, i: int, j: int) -> Any:
-    """P[i, j] of two states, i <= j, now; with periodic gains that of the settled cycle."""
+    """Read the present covariance of two states; with periodic gains that of the settled cycle.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+        i: Index of a state.
+        j: Index of a state, i <= j.
+
+    Returns:
+        P[i, j].
+    """
     if f.periodic == 1:
         return gains[f.cell, locate_step_row(f), f.total + i * f.n - i * (i - 1) // 2 + j - i]
     return f.P[i, j]
@@ -165,13 +185,22 @@ def read_covariance(f: FilterRecord, gains: GainTables, i: int, j: int) -> Any:
 
 @jit
 def compute_deviation(f: FilterRecord, gains: GainTables, i: int) -> Any:
-    """The standard deviation of a state now."""
+    """Compute the present standard deviation of a state.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+        i: Index of the state.
+
+    Returns:
+        Standard deviation in the state's unit.
+    """
     return sqrt(maximum(read_covariance(f, gains, i, i), 0.0))
 
 
 @jit
 def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Any, S: Any) -> None:
-    """The states and standard deviations of all layers into row j of X and S (rows, n)."""
+    """Write the states and standard deviations of all layers in row j of X and S (rows, n)."""
     column = 0
     for layer in range(len(layers) if first_member(layers) == 0 else 1):
         f = layers[layer]
@@ -183,9 +212,16 @@ def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Any, S: Any)
 
 @jit
 def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Any) -> bool:
-    """Write the states of all layers into x (n,) and their covariance into zeros P (n, n) or none.
+    """Write the states of all layers and their covariance.
 
-    Returns False where P is to be read from gains that are missing.
+    Args:
+        layers: Memory of the estimator, shape (layers,).
+        gains: Tables of gains, shape (cells, rows, columns).
+        x: Output for the states, shape (n,).
+        P: Output for the covariance, zeros of shape (n, n), or (0, 0).
+
+    Returns:
+        False where P is to be read from gains that are missing.
     """
     offset, f = 0, layers[0]
     if len(P) > 0 and f.periodic == 1 and gains[f.cell, 0, 0] == 0.0:
@@ -214,14 +250,25 @@ def advance(
     S: Any,
     nis: Vector,
 ) -> int:
-    """Take the fast rows from `start` to `rows` and the first `count` packets.
+    """Process the fast rows from `start` to `rows` and the first `count` packets.
 
-    layers: (1,); (2,), of which the second measures what the first estimates; or a bank, the
-    mixture and its members. gains: of the first layer.
-    fast: (rows or more, FAST_WIDTH). packets: (count or more, PACKET_WIDTH). X, S: (rows, n) to be
-    filled with states and standard deviations, or empty. nis: (count,) to be filled with each
-    packet's normalised innovation squared, or empty. Returns the rows done: fewer than `rows` where
-    gains are missing, those of the cell `wanted` of the first layer; call again from there.
+    Args:
+        layers: Memory, shape (1,); (2,), of which the second measures what the first estimates; or
+            a bank, the mixture and its members.
+        gains: Tables of gains of the first layer, shape (cells, rows, columns).
+        fast: Fast rows, shape (rows or more, FAST_WIDTH).
+        rows: Number of fast rows.
+        packets: Packets, shape (count or more, PACKET_WIDTH).
+        count: Number of packets.
+        start: Number of rows that are done already.
+        X: Output for the states, shape (rows, n), or empty.
+        S: Output for the standard deviations, shape (rows, n), or empty.
+        nis: Output for each packet's normalised innovation squared, shape (count,), or empty.
+
+    Returns:
+        Number of rows done: fewer than `rows` where gains are missing, those of the cell `wanted`
+            of
+        the first layer; call again from there.
     """
     first = first_member(layers)
     f = layers[first]
@@ -259,7 +306,18 @@ def advance(
 
 @jit_nrt
 def step_all(layers: FilterRecords, gains: GainTables, fast: Any, packets: Any, count: int) -> int:
-    """`advance` over all rows with nothing to be filled: fewer arguments to hand over."""
+    """Call `advance` over all rows without outputs: fewer arguments to hand over.
+
+    Args:
+        layers: Memory of the estimator, shape (layers,).
+        gains: Tables of gains, shape (cells, rows, columns).
+        fast: Fast rows, shape (rows, FAST_WIDTH).
+        packets: Packets, shape (count or more, PACKET_WIDTH).
+        count: Number of packets.
+
+    Returns:
+        Number of rows done.
+    """
     empty = fast[:0]
     return advance(
         layers,
@@ -277,14 +335,25 @@ def step_all(layers: FilterRecords, gains: GainTables, fast: Any, packets: Any, 
 
 @jit
 def reset_filters(layers: FilterRecords, first: int) -> None:
-    """`reset_filter` for all layers of an estimator."""
+    """Reset all layers of an estimator.
+
+    Args:
+        layers: Memory of the estimator, shape (layers,).
+        first: Tick of the first fast row.
+    """
     for i in range(len(layers)):
         reset_filter(layers[i], first)
 
 
 @jit
 def process_packet_all(layers: FilterRecords, gains: GainTables, packet: Vector) -> None:
-    """`process_packet` a packet (PACKET_WIDTH,) by all layers of an estimator."""
+    """Process a packet by all layers of an estimator.
+
+    Args:
+        layers: Memory of the estimator, shape (layers,).
+        gains: Tables of gains, shape (cells, rows, columns).
+        packet: Packet, shape (PACKET_WIDTH,).
+    """
     if first_member(layers) > 0:
         process_packet(layers[1], gains, packet)
         process_packet_members(layers, gains, packet)

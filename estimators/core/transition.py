@@ -23,7 +23,7 @@ MIN_SPEED = 1.5  # m/s: below it the model stays that of this speed
 
 @jit
 def _build_lateral(f: FilterRecord, V: Any) -> None:
-    """tie-vision (8), dakf-stability (5)-(11), a body that rolls and what a_y feels of it."""
+    """Build tie-vision (8), dakf-stability (5)-(11), a body that rolls and what a_y feels of it."""
     A, B = f.A, f.B
     rolling = 2 if f.rolling > 0 else 0
     write_lateral(A, B, f.car, V, f.dense - f.delayed - rolling, f.inputs, f.preview)
@@ -41,7 +41,7 @@ def _build_lateral(f: FilterRecord, V: Any) -> None:
 
 @jit
 def _write_body(f: FilterRecord, V: Any) -> None:
-    """phi and phi_rate, and how they push beta: double-layer-gps (1), (3), solved for phi''."""
+    """Write phi, phi_rate and their effect on beta: double-layer-gps (1), (3), solved for phi''."""
     A, B, i = f.A, f.B, f.rolling
     share = 1.0 / (1.0 - f.roll_arm * f.sway)
     lift, lag = share * f.roll_arm, f.sway / V
@@ -57,7 +57,7 @@ def _write_body(f: FilterRecord, V: Any) -> None:
 
 @jit
 def _write_accel(f: FilterRecord, V: Any) -> None:
-    """The specific force a_y = V (beta' + gamma) + g phi, a row with feed-through of steering."""
+    """Write the specific force a_y = V (beta' + gamma) + g phi, with feed-through of steering."""
     row = f.C_fast[f.accel_row]
     for j in range(f.dense):
         row[j] = V * f.A[0, j]
@@ -71,7 +71,7 @@ def _write_accel(f: FilterRecord, V: Any) -> None:
 
 @jit
 def _compute_rates(f: FilterRecord, V: Any, front: Any, rear: Any) -> Any:
-    """(beta', gamma', phi_rate') by forces of the axles in N."""
+    """Compute (beta', gamma', phi_rate') by forces of the axles in N."""
     beta = (front + rear) / (f.car[CAR.mass] * V)
     gamma = (f.car[CAR.front_arm] * front - f.car[CAR.rear_arm] * rear) / f.car[CAR.yaw_inertia]
     if f.rolling == 0:
@@ -82,7 +82,7 @@ def _compute_rates(f: FilterRecord, V: Any, front: Any, rear: Any) -> Any:
 
 @jit
 def _write_tyres(f: FilterRecord, V: Any) -> None:
-    """What the estimated tyres do besides their slope by slip: columns of B, and f.push."""
+    """Write the estimated tyres' columns of B, besides their slope by slip, and f.push."""
     for j in range(3):  # both factors, then the grip
         if j < 2 or f.grip > 0:
             front = f.per_tyre[0, j // 2] if j != 1 else 0.0
@@ -103,7 +103,13 @@ def _write_tyres(f: FilterRecord, V: Any) -> None:
 
 @jit
 def build_continuous(f: FilterRecord, V: Any, turning: Any) -> None:
-    """f.A and f.B = [inputs, disturbances] at a speed V in m/s and a yaw rate in rad/s."""
+    """Build f.A and f.B = [inputs, disturbances].
+
+    Args:
+        f: Memory of the filter.
+        V: Speed (m/s).
+        turning: Yaw rate (rad/s).
+    """
     A, B = f.A, f.B
     for i in range(f.dense):
         for j in range(0, N_CORE, 8):
@@ -133,7 +139,7 @@ def build_continuous(f: FilterRecord, V: Any, turning: Any) -> None:
 
 @jit
 def _multiply(a: Vector, b: Vector, c: Vector, n: int, m: int) -> None:
-    """c = a b for a (n, n) and b (n, m), in the corners of larger arrays."""
+    """Multiply c = a b for a (n, n) and b (n, m), in the corners of larger arrays."""
     for j in range(0, m, 8):
         for i in range(0, n, 4):
             first, second, third, fourth = multiply_rows(a, i, b, n, j, 0.0, 0.0, 0.0, 0.0)
@@ -145,10 +151,13 @@ def _multiply(a: Vector, b: Vector, c: Vector, n: int, m: int) -> None:
 
 @jit
 def discretise(f: FilterRecord) -> None:
-    """f.G and f.H of tie-vision (9): exact for inputs and disturbances held over the step.
+    """Compute f.G and f.H of tie-vision (9): exact for inputs and disturbances held over the step.
 
     Phi = integral of e^(A t) over the step by its Taylor series, after halving the step until
     ||A h|| <= 1/2 and doubling back; G = I + A Phi. Accurate to rounding (relative 1e-14).
+
+    Args:
+        f: Memory of the filter with A, B and its step.
     """
     n, m = f.dense - f.delayed, N_INPUTS + f.n - f.dense
     E, Phi, T = (
@@ -205,7 +214,7 @@ def discretise(f: FilterRecord) -> None:
 
 @jit
 def _transpose(f: FilterRecord) -> None:
-    """f.GT and f.HT, by which states and covariance are predicted."""
+    """Write f.GT and f.HT, by which states and covariance are predicted."""
     for i in range(f.dense):
         for k in range(f.n):
             store_element(f.GT, load_element(f.G, i, k), k, i)
@@ -215,7 +224,7 @@ def _transpose(f: FilterRecord) -> None:
 
 @jit
 def _set_delayed_rows(f: FilterRecord) -> None:
-    """The delayed states follow what the camera sees: tie-vision (12), at every step."""
+    """Set the rows by which delayed states follow the camera's: tie-vision (12), at every step."""
     first = f.dense - f.delayed
     for i in range(f.delayed):
         for j in range(f.n):
@@ -226,20 +235,45 @@ def _set_delayed_rows(f: FilterRecord) -> None:
 
 @jit
 def compute_road_turn(V: Any, curvature: Any, step: Any) -> Any:
-    """The angle in rad by which a road of a curvature in 1/m turns within a step of so many s."""
+    """Compute the angle by which a road turns within a step.
+
+    Args:
+        V: Speed (m/s).
+        curvature: Curvature of the road (1/m).
+        step: Step (s).
+
+    Returns:
+        Angle (rad).
+    """
     return V * curvature * step
 
 
 @jit
 def compute_row_variance(f: FilterRecord, s: int, i: int, V: Any) -> Any:
-    """The variance of row i of sensor s at a speed of the model in m/s."""
+    """Compute the variance of a slow sensor's row at a speed.
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+        i: Index of its row.
+        V: Speed of the model (m/s).
+
+    Returns:
+        Variance in the row's unit squared.
+    """
     scaled = f.noise_over_speed[s, i]
     return scaled / (V * V) if scaled > 0.0 else f.r[s, i]
 
 
 @noinline
 def build_model(f: FilterRecord, speed: Any, turning: Any) -> None:
-    """The model at a speed in m/s and a yaw rate in rad/s, and the noise that goes with 1/V."""
+    """Build the model at a speed, and the noise that grows with 1/V.
+
+    Args:
+        f: Memory of the filter.
+        speed: Speed (m/s).
+        turning: Yaw rate (rad/s).
+    """
     V = maximum(speed, MIN_SPEED)
     if f.kind == LATERAL and f.model_speed > 0.0:
         f.stretch *= f.model_speed / V

@@ -20,10 +20,20 @@ _MIN_SLOPE = 0.02  # of a tyre's slope, where it slides
 
 @jit
 def compute_axle_force(stiffness: Any, load: Any, alpha: Any, factor: Any, grip: Any) -> Any:
-    """(F, dF/dalpha, dF/dfactor, dF/dgrip) of an axle: Fiala's law with friction 1/grip.
+    """Compute an axle's lateral force and its slopes: Fiala's law with friction 1/grip.
 
     F = C s alpha (1 - |z| + z^2 / 3), z = C s alpha grip / (3 F_z) within +-1; at grip 0 it is
-    linear. stiffness: N/rad of the axle, C. load: N, F_z. alpha: rad.
+    linear.
+
+    Args:
+        stiffness: Nominal cornering stiffness of the axle, C (N/rad).
+        load: Load of the axle, F_z (N).
+        alpha: Slip angle (rad).
+        factor: Factor on the stiffness, s.
+        grip: Reciprocal of friction.
+
+    Returns:
+        (F, dF/dalpha, dF/dfactor, dF/dgrip) in N, N/rad, N and N.
     """
     total_stiffness = stiffness * factor
     slip_ratio = total_stiffness * absolute(alpha) / (3.0 * load)
@@ -44,8 +54,10 @@ def compute_axle_force(stiffness: Any, load: Any, alpha: Any, factor: Any, grip:
 
 @jit
 def _set_random_walk(f: FilterRecord, moves: bool) -> None:
-    """Tyres walk while the car moves, and no further than they were unknown at the start; a new
-    member's walk more."""
+    """Set the tyres' random walk: while the car moves, up to their variance at the start.
+
+    A new member's walk more.
+    """
     for i in range(3 if f.grip > 0 else 2):
         index = f.tyres + i if i < 2 else f.grip
         walks = moves and f.P[index, index] < f.prior[index, index]
@@ -55,7 +67,12 @@ def _set_random_walk(f: FilterRecord, moves: bool) -> None:
 
 @jit
 def linearise(f: FilterRecord, steer: Any) -> None:
-    """Expand both axles' forces at the present state; steer: rad, of the front wheels."""
+    """Expand both axles' forces at the present state.
+
+    Args:
+        f: Memory of the filter.
+        steer: Steering angle of the front wheels (rad).
+    """
     x, V = f.x, maximum(f.model_speed, MIN_SPEED)
     for i in range(2):
         x[f.tyres + i] = minimum(maximum(x[f.tyres + i], FACTOR_LIMITS[0]), FACTOR_LIMITS[1])

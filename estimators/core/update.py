@@ -21,7 +21,7 @@ HEADING_TOLERANCE = 0.5  # rad: the first heading fix sets the heading where it 
 
 @jit
 def _predict_row(f: FilterRecord, s: int, i: int, first: int, captured: int) -> Any:
-    """What the filter expects row i of a sample to be."""
+    """Predict row i of a sample."""
     if first == STORED_ONE and f.late == LARSEN:
         return f.larsen_expected[s, i]
     if first == STORED_ONE:
@@ -52,7 +52,7 @@ def _align_heading(f: FilterRecord, s: int, turn: float) -> None:
 
 @jit
 def _compute_residuals(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
-    """f.residual of every row, wrapped where it is an angle; a heading fix may set psi."""
+    """Compute f.residual of every row, wrapped where it is an angle; a heading fix may set psi."""
     captured = int(packet[PACKET.captured])
     for i in range(f.rows[s]):
         residual = packet[PACKET.value + i] - _predict_row(f, s, i, first, captured)
@@ -66,7 +66,7 @@ def _compute_residuals(f: FilterRecord, s: int, first: int, packet: Vector) -> N
 
 @jit
 def _reduce_residuals(f: FilterRecord, s: int, first: int, i: int, K: Vector) -> None:
-    """What row i's correction by the gain K (total,) leaves of the residuals of the rows behind."""
+    """Subtract row i's correction by the gain K (total,) from the residuals of the rows behind."""
     for j in range(i + 1, f.rows[s]):
         correction = K[first + j] if first >= 0 else dot(f.C[s, j], K, f.n)
         f.residual[j] -= correction * f.residual[i]
@@ -76,7 +76,7 @@ def _reduce_residuals(f: FilterRecord, s: int, first: int, i: int, K: Vector) ->
 def _correct_periodic(
     f: FilterRecord, gains: GainTables, s: int, first: int, packet: Vector
 ) -> None:
-    """x += K residual with the gains of the table, one row after the other."""
+    """Correct x by the gains of the table, one row after the other."""
     captured = int(packet[PACKET.captured])
     first_row = locate_frame_row(f, s, (captured - f.phase[s]) // f.period[s] % f.pattern)
     for i in range(f.rows[s]):
@@ -88,7 +88,7 @@ def _correct_periodic(
 
 @jit
 def _correct(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
-    """The rows of a sample, one after the other, with the covariance."""
+    """Correct by the rows of a sample, one after the other, with the covariance."""
     for i in range(f.rows[s]):
         residual, r = f.residual[i], compute_packet_variance(f, s, i, packet)
         if f.adapt > 0.0:
@@ -104,7 +104,7 @@ def _correct(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
 
 @jit
 def _correct_states(f: FilterRecord, s: int) -> None:
-    """x <- x + M K residual, Larsen's correction at the arrival."""
+    """Correct x <- x + M K residual, Larsen's correction at the arrival."""
     for i in range(f.rows[s]):
         for k in range(f.n):
             f.x[k] += f.larsen_gain[s, i, k] * f.residual[i]
@@ -114,10 +114,19 @@ def _correct_states(f: FilterRecord, s: int) -> None:
 def update_filter(
     f: FilterRecord, gains: GainTables, s: int, first: int, packet: Vector, is_gated: bool
 ) -> bool:
-    """Correct by a packet (PACKET_WIDTH,) of sensor s whose values are sound; False if gated.
+    """Correct by a packet of a slow sensor whose values are sound.
 
-    first: of `delay.find`. judge: whether the gate judges it and its NIS is taken (not when it is
-    used again in a rewound window).
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+        s: Index of the slow sensor.
+        first: What the sample measures, see `delay.find_clone`.
+        packet: Packet, shape (PACKET_WIDTH,).
+        is_gated: Whether the gate judges it and its NIS is taken; not when it is used again in a
+            rewound window.
+
+    Returns:
+        False if the gate refuses it.
     """
     if is_gated:
         f.nis = np.nan

@@ -35,11 +35,19 @@ GUST = (8.0, 2.0)  # times the usual force and moment
 def assemble(
     config: FilterConfig, vehicle: Vehicle, dt: float, speed: float | None
 ) -> tuple[Any, tuple[Schedule, ...]]:
-    """The memory (layers,) of a filter and the schedules of its first slow sensor.
+    """Assemble the memory of a filter and the schedules of its first slow sensor.
 
-    vehicle: the filter's. dt: s of a tick. speed: m/s if it is held, None where it is measured.
-    Raises ValueError for a schedule that does not fit ticks, a sensor that can be later than the
-    filter's window, and for options that do not go together.
+    ValueError says that a schedule does not fit ticks, that a sensor can be later than the filter's
+    window, or that options do not go together.
+
+    Args:
+        config: Parsed options of the filter.
+        vehicle: The filter's vehicle.
+        dt: Tick (s).
+        speed: Speed (m/s) if it is held, None where it is measured.
+
+    Returns:
+        Memory, shape (layers,), and schedules.
     """
     layers, first = np.zeros(len(config.models), FILTER).view(np.recarray), 0
     for f, model in zip(layers, config.models, strict=True):
@@ -69,7 +77,7 @@ def assemble(
 
 
 def _scale_noise(config: FilterConfig, vehicle: Vehicle) -> dict[str, float]:
-    """Noise with the shares of the car's weight in it."""
+    """Compute the noise with the fractions of the car's weight in it."""
     noise, weight = dict(config.noise), vehicle.mass * GRAVITY
     arm = 0.5 * (vehicle.front_arm + vehicle.rear_arm)
     for name, share, size in zip(("force", "moment"), config.shares, (1.0, arm), strict=True):
@@ -79,7 +87,7 @@ def _scale_noise(config: FilterConfig, vehicle: Vehicle) -> dict[str, float]:
 
 
 def _build_bank(layers: Any, config: FilterConfig, dt: float) -> Any:
-    """The mixture and the members of a bank of the filter; the filter itself without one."""
+    """Build the mixture and the members of a bank of the filter; the filter itself without one."""
     if config.members < 2:
         return layers
     f = layers[0]
@@ -102,7 +110,7 @@ def _build_bank(layers: Any, config: FilterConfig, dt: float) -> Any:
 
 
 def _set_imm_members(bank: Any, dt: float) -> None:
-    """What the members that interact differ in."""
+    """Set what the interacting members differ in."""
     bank.respawn = round(IMM_TIME / dt)
     for f in bank:
         f.burst[:] = np.square(GUST) * f.q_known / f.q_share
@@ -112,12 +120,26 @@ def _set_imm_members(bank: Any, dt: float) -> None:
 
 
 def select_first_sensor(config: FilterConfig) -> FilterConfig:
-    """The same filter with its first slow sensor alone."""
+    """Reduce a filter to its first slow sensor.
+
+    Args:
+        config: Parsed options of the filter.
+
+    Returns:
+        Its options with that sensor alone.
+    """
     return replace(config, sensors=dict(list(config.sensors.items())[:1]))
 
 
 def remove_tyre_states(config: FilterConfig) -> FilterConfig:
-    """The same filter with nominal tyres and scale instead of states: that one is linear."""
+    """Reduce a filter to nominal tyres and scale instead of states: that one is linear.
+
+    Args:
+        config: Parsed options of the filter.
+
+    Returns:
+        Its options without these states.
+    """
     if not any(name in NONLINEAR for name in config.states):
         return config
     indices = [i for i, name in enumerate(config.states) if name not in NONLINEAR]
@@ -131,7 +153,7 @@ def remove_tyre_states(config: FilterConfig) -> FilterConfig:
 
 
 def _write_clocks(f: FilterRecord, config: FilterConfig, dt: float) -> None:
-    """Periods, the filter's own step, and by how much late states follow in it."""
+    """Write periods, the filter's own step, and by how much late states follow in it."""
     for name, sensor in config.sensors.items():
         label = f"{config.name}: the {name}'s period"
         f.period[SLOW_NAMES.index(name)] = count_ticks(sensor.period, dt, label)
@@ -145,7 +167,7 @@ def _write_clocks(f: FilterRecord, config: FilterConfig, dt: float) -> None:
 
 
 def _write_trust(f: FilterRecord, config: FilterConfig) -> None:
-    """What is known of a sample's noise, and which ones are skipped."""
+    """Write what is known of a sample's noise, and which ones are skipped."""
     f.least_satellites, f.adapt, f.robust = config.satellites, config.adapt, config.robust
     f.steer_jump = config.steer_rate * f.step
     f.model_error, f.r_told = config.model_error, config.noise["accel_y"] ** 2
@@ -163,7 +185,7 @@ def _write_trust(f: FilterRecord, config: FilterConfig) -> None:
 
 
 def _make_schedules(f: FilterRecord, config: FilterConfig, dt: float) -> tuple[Schedule, ...]:
-    """Of the first slow sensor: one, or two extremes where delays are random."""
+    """Make the schedules of the first slow sensor: one, or two extremes for random delays."""
     if not config.sensors:
         return (NO_SENSOR,)
     name, sensor = next(iter(config.sensors.items()))
@@ -179,7 +201,7 @@ def _make_schedules(f: FilterRecord, config: FilterConfig, dt: float) -> tuple[S
 
 
 def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule, ...]) -> None:
-    """The codes that choose what compiled code does; ValueError for what does not go together."""
+    """Write the codes that choose what compiled code does; ValueError for a contradiction."""
     f.cycle, f.pattern = planned[-1].cycle, max(1, len(planned[-1].lags))
     pseudo = config.intersample == "pseudo-residual"
     shared = config.row.intersample == "dual-rate"
@@ -210,7 +232,7 @@ def _is_covariance_needed(config: FilterConfig) -> bool:
 
 
 def _is_periodic(f: FilterRecord, config: FilterConfig, random: bool) -> bool:
-    """Whether the gains are precomputed; ValueError where that was asked for and cannot be.
+    """Return whether the gains are precomputed; ValueError where that is wanted and impossible.
 
     random: the first slow sensor's delay is.
     """

@@ -39,7 +39,7 @@ ASSUMED_DELAY = 0.033  # s
 
 @dataclass(frozen=True, kw_only=True)
 class FilterConfig:
-    """What is decided about a filter before it is designed: its name in `FILTERS` and its options.
+    """Decisions about a filter before its design: its name in `FILTERS` and its options.
 
     Options, as `make_estimator` takes them
     ---------------------------------------
@@ -149,11 +149,22 @@ class FilterConfig:
 def parse_config(
     name: str, row: FilterDefinition, sensors: Mapping[str, SlowSensor], options: Mapping[str, Any]
 ) -> FilterConfig:
-    """The config of a filter from its row, the slow sensors that are there, and options.
+    """Parse the options of a filter; each error names filter, option and value.
 
-    Raises TypeError for an unknown option or a value of the wrong type, ValueError for a sensor
-    that is absent, a value out of range and options that exclude each other; each names filter,
-    option and value.
+    TypeError says that an option is unknown or a value of the wrong type. ValueError says that a
+    sensor is absent, a value out of range, or that options exclude each other.
+
+    Args:
+        name: Name of the filter.
+        row: Its definition.
+        sensors: Available slow sensors by name.
+        options: Options of `make_estimator`.
+
+    Returns:
+        The complete options.
+
+    Raises:
+        reader.make_error: The ValueError for poles that are not one a state.
     """
     reader = OptionReader(name, dict(row.options) | dict(options))
     used = _select_slow_sensors(row, sensors, reader)
@@ -202,7 +213,7 @@ def parse_config(
 def _select_slow_sensors(
     row: FilterDefinition, available: Mapping[str, SlowSensor], reader: OptionReader
 ) -> tuple[str, ...]:
-    """The slow sensors to use, in the order of `SLOW_NAMES`."""
+    """Select the slow sensors to use, in the order of `SLOW_NAMES`."""
     slow = reader.read_value("slow", None)
     if not row.slow:
         if slow is not None:
@@ -229,7 +240,7 @@ def _select_slow_sensors(
 def _parse_rules(
     row: FilterDefinition, used: Sequence[str], reader: OptionReader
 ) -> dict[str, Any]:
-    """How gains are found, and what happens to late samples and between samples."""
+    """Parse how gains are computed, and what happens to late samples and between samples."""
     is_dual_rate, is_placed = row.intersample == "dual-rate", row.gains == "placed"
     intersample, between, assumed, poles = row.intersample, "hold", 0.0, row.poles
     if is_dual_rate:
@@ -272,7 +283,7 @@ def _parse_rules(
 def _parse_inertial(
     row: FilterDefinition, reader: OptionReader
 ) -> tuple[tuple[str, ...], dict[str, float]]:
-    """The fast sensors, and the standard deviations of their biases by state."""
+    """Parse the fast sensors, and the standard deviations of their biases by state."""
     if row.model != "bicycle" or row.gains != "covariance" or row.second:
         return row.fast, {}
     fast = reader.read_choices("fast", row.fast, INERTIAL)
@@ -300,7 +311,7 @@ def _make_models(
     biases: tuple[str, ...],
     reader: OptionReader,
 ) -> tuple[FilterModel, ...]:
-    """The model of each layer."""
+    """Make the model of each layer."""
     if row.model != "bicycle":
         return (MODELS[row.model],)
     disturbances = reader.read_choice("disturbances", row.disturbances, DISTURBANCES)
@@ -310,7 +321,7 @@ def _make_models(
 
 
 def _parse_gate(delay: str, reader: OptionReader) -> dict[str, Any]:
-    """`gate` and `wary` of a `FilterConfig`."""
+    """Parse `gate` and `wary` of a `FilterConfig`."""
     count = reader.read_number("wary", 0.0, "is a number of samples", lambda v: v in range(1000))
     wary = int(count) if delay in ("clone", "buffer") else 0
     gate = reader.read_value("gate", GATE_PROBABILITY if wary else None)

@@ -18,7 +18,18 @@ _CYCLES, _SETTLED = 400, 1e-12
 
 
 def compute_sampled_gain(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
-    """The Kalman gain (n, q) of a sample every `steps`, prediction alone in between: its limit."""
+    """Compute the limit of the Kalman gain of a sample every `steps`, prediction in between.
+
+    Args:
+        F: Transition matrix of a step, shape (n, n).
+        Q: Covariance of a step's process noise, shape (n, n).
+        C: Measurement matrix, shape (q, n).
+        R: Covariance of the measurement noise, shape (q, q).
+        steps: Number of steps between two samples.
+
+    Returns:
+        Gain, shape (n, q).
+    """
     n = len(F)
     power, noise = np.eye(n), np.zeros((n, n))
     for _ in range(steps):
@@ -33,10 +44,19 @@ def compute_sampled_gain(F: Array, Q: Array, C: Array, R: Array, steps: int) -> 
 
 
 def compute_hold_shares(F: Array, C: Array, K: Array, steps: int) -> Array:
-    """Hara: the innovation is held, B_i = L for all i; (steps, n, q).
+    """Compute Hara's B_i = L for all i: the innovation is held.
 
-    K (n, q): the gain of the single-rate filter with the low-rate measurement. L gives the error
-    from sample to sample its poles and its very map: F^r - sum_{i=1}^{r} F^i L C = F^r (I - K C).
+    L gives the error from sample to sample its poles and its very map:
+    F^r - sum_{i=1}^{r} F^i L C = F^r (I - K C).
+
+    Args:
+        F: Transition matrix of a step, shape (n, n).
+        C: Measurement matrix, shape (q, n).
+        K: Gain of the single-rate filter with the low-rate measurement, shape (n, q).
+        steps: Number of steps between two samples, r.
+
+    Returns:
+        B_i, shape (steps, n, q).
     """
     power, total = np.eye(len(F)), np.zeros_like(F)
     for _ in range(steps):
@@ -47,10 +67,19 @@ def compute_hold_shares(F: Array, C: Array, K: Array, steps: int) -> Array:
 
 
 def compute_pseudo_shares(F: Array, C: Array, L: Array, first: Array, steps: int) -> Array:
-    """B_i of the pseudo measurement with one gain L (n, q): dual-rate (31) and Oh's (35).
+    """Compute B_i of the pseudo measurement with one gain: dual-rate (31) and Oh's (35).
 
-    B_i = L C F [(I - L C) F]^(i-1) E, with E = `first` (n, q), the estimated error after the
-    sample over its innovation: C^+ - L. Returns (steps, n, q).
+    B_i = L C F [(I - L C) F]^(i-1) E.
+
+    Args:
+        F: Transition matrix of a step, shape (n, n).
+        C: Measurement matrix, shape (q, n).
+        L: Gain, shape (n, q).
+        first: E, the estimated error after the sample over its innovation, C^+ - L, shape (n, q).
+        steps: Number of steps between two samples.
+
+    Returns:
+        B_i, shape (steps, n, q).
     """
     shares, e = [L], first
     for _ in range(1, steps):
@@ -61,10 +90,20 @@ def compute_pseudo_shares(F: Array, C: Array, L: Array, first: Array, steps: int
 
 
 def compute_shares_29(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
-    """B_i = L_i G_i with G_i of (31) and L_i the Kalman gain for the pseudo noise of (29): limits.
+    """Compute the limits of B_i = L_i G_i, with G_i of (31) and the Kalman gain for (29).
 
     The covariance recursion is the paper's, which takes pseudo measurements for independent ones;
-    its error can grow (by 1.17 to 1.22 a sample for a course alone). Returns (steps, n, q).
+    its error can grow (by 1.17 to 1.22 a sample for a course alone).
+
+    Args:
+        F: Transition matrix of a step, shape (n, n).
+        Q: Covariance of a step's process noise, shape (n, n).
+        C: Measurement matrix, shape (q, n).
+        R: Covariance of the measurement noise, shape (q, q).
+        steps: Number of steps between two samples.
+
+    Returns:
+        B_i, shape (steps, n, q).
     """
     n, q = len(F), len(C)
     pinv = compute_inverse("moore-penrose", C, np.eye(n), R)
@@ -95,10 +134,22 @@ def compute_shares_29(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Arr
 def compute_shares(
     rule: str, gains: str, poles: Any, F: Array, Q: Array, C: Array, R: Array, steps: int
 ) -> Array:
-    """B_i (steps, n, q) of a rule of `RULES` with gains of `GAINS`.
+    """Compute B_i of a rule.
 
-    poles: (n,) of the z-plane for one step, for gains "placed": of the fast-rate filter (I - L C) F
-    where samples are made up in between, of the single-rate one (to the power of `steps`) else.
+    Args:
+        rule: Name of `RULES`.
+        gains: Name of `GAINS`.
+        poles: Poles in the z-plane for one step, shape (n,), for gains "placed": of the fast-rate
+            filter (I - L C) F for "oh" and "pseudo", of the single-rate one, to the power of
+            `steps`, for the others.
+        F: Transition matrix of a step, shape (n, n).
+        Q: Covariance of a step's process noise, shape (n, n).
+        C: Measurement matrix, shape (q, n).
+        R: Covariance of the measurement noise, shape (q, q).
+        steps: Number of steps between two samples.
+
+    Returns:
+        B_i, shape (steps, n, q).
     """
     is_single_rate = rule in ("predict", "hold")
     if gains == "from-29":
@@ -121,7 +172,16 @@ def compute_shares(
 
 
 def frame_map(F: Array, C: Array, shares: Array) -> Array:
-    """The error before a sample over that before the last one, (n, n)."""
+    """Compute the map from the error before a sample to that before the next one.
+
+    Args:
+        F: Transition matrix of a step, shape (n, n).
+        C: Measurement matrix, shape (q, n).
+        shares: B_i, shape (steps, n, q).
+
+    Returns:
+        Map, shape (n, n).
+    """
     M, eps = np.eye(len(F)), C
     for B in shares:
         M = F @ (M - B @ eps)
@@ -131,9 +191,17 @@ def frame_map(F: Array, C: Array, shares: Array) -> Array:
 def write_shares(
     F: Array, Q: Array, C: Array, R: Array, B: Array, table: Array, first: int, behind: int
 ) -> None:
-    """Shares B (steps, n, q), and the covariances they lead to, into a table of gains.
+    """Write B_i, and the covariances they lead to, into a table of gains.
 
-    first: the row at which shares start. behind: the column at which covariances do.
+    Args:
+        F: Transition matrix of a step, shape (n, n).
+        Q: Covariance of a step's process noise, shape (n, n).
+        C: Measurement matrix, shape (q, n).
+        R: Covariance of the measurement noise, shape (q, q).
+        B: B_i, shape (steps, n, q).
+        table: Output, shape (rows, columns).
+        first: Row at which B_i start.
+        behind: Column at which the covariances start.
     """
     steps, n, q = B.shape
     table[first : first + steps * q, :n] = B.transpose(0, 2, 1).reshape(steps * q, n)
@@ -143,7 +211,7 @@ def write_shares(
 def _write_covariances(
     F: Array, Q: Array, C: Array, R: Array, B: Array, table: Array, behind: int
 ) -> None:
-    """The covariance of the error after each step, from what is left of a long recursion."""
+    """Write the covariance of the error after each step, the limit of a long recursion."""
     n, q = F.shape[0], len(C)
     upper = np.triu_indices(n)
     P = np.zeros((n + q, n + q))  # of the error and the last innovation

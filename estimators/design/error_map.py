@@ -24,12 +24,27 @@ MARGINAL = 1e-9
 
 
 def spectral_radius(M: Array) -> float:
-    """The largest absolute eigenvalue."""
+    """Compute the spectral radius, the largest absolute eigenvalue.
+
+    Args:
+        M: Matrix, shape (n, n).
+
+    Returns:
+        The radius.
+    """
     return float(np.abs(np.linalg.eigvals(M)).max())
 
 
 def find_unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
-    """The directions in which an error stays for ever, each as "beta 1, psi -1, ..."."""
+    """Find the directions in which an error stays for ever.
+
+    Args:
+        M: Map of the error over a cycle, shape (size, size).
+        names: Names of the states, the first rows of M.
+
+    Returns:
+        Text of each, "beta 1, psi -1, ...".
+    """
     values, vectors = np.linalg.eig(M)
     directions = []
     for i in np.flatnonzero(np.abs(values) > 1.0 - MARGINAL):
@@ -45,7 +60,7 @@ def find_unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _DesignKey:
-    """What a table of gains depends on: key has all of it."""
+    """All that a table of gains depends on; `key` has all of it."""
 
     key: bytes
     f: FilterRecord = field(compare=False)
@@ -63,16 +78,34 @@ def _design_cached(task: _DesignKey) -> tuple[Array, Array]:
 def design_and_map(
     f: FilterRecord, schedule: Schedule, speed: float, config: FilterConfig
 ) -> tuple[Array, Array]:
-    """The table of gains and the map of the error at a speed in m/s, to be read alone."""
+    """Design the table of gains and the map of the error at a speed; both are read-only.
+
+    Args:
+        f: Memory of the filter, left as it is.
+        schedule: Schedule of its slow sensor.
+        speed: Speed (m/s).
+        config: Parsed options of the filter.
+
+    Returns:
+        Table, shape (rows, columns), and map, see `compute_error_map`.
+    """
     key = pickle.dumps((f.tobytes(), schedule, speed, config))
     return _design_cached(_DesignKey(key, f, schedule, speed, config))
 
 
 def compute_error_map(f: FilterRecord, table: Array, schedule: Schedule) -> Array:
-    """The error after one cycle over that before it, (size, size); what else a rule carries on
-    (the estimated error e, the last innovation, stored predictions) stands behind it.
+    """Compute the map from the error before one cycle to that after it.
 
-    table (rows, columns) and f: from `periodic.design_gains`, at one speed.
+    Behind the error of states and clones stands what else a rule carries on: the estimated error e,
+    the last innovation or stored predictions.
+
+    Args:
+        f: Memory from `periodic.design_gains`, at one speed.
+        table: Table of gains from there, shape (rows, columns).
+        schedule: Schedule of the slow sensor.
+
+    Returns:
+        Map, shape (size, size).
     """
     size, s = int(f.total), int(f.first_slow)
     F = np.eye(size)
@@ -104,7 +137,7 @@ def compute_error_map(f: FilterRecord, table: Array, schedule: Schedule) -> Arra
 
 
 def _build_clone_map(f: FilterRecord, schedule: Schedule, step: int) -> Array:
-    """Clones of what was captured in the step before."""
+    """Build the map that clones what was captured in the step before."""
     L, s = np.eye(int(f.total)), int(f.first_slow)
     frame, rest = divmod((step - 1) % schedule.cycle, schedule.period)
     if s >= 0 and f.late == CLONE and f.frames[s] > 0 and rest == 0:
@@ -118,7 +151,7 @@ def _build_clone_map(f: FilterRecord, schedule: Schedule, step: int) -> Array:
 def _build_residual_rows(
     f: FilterRecord, schedule: Schedule, frame: int, width: int, stored_at: int
 ) -> Array:
-    """What the residuals of a step see of the whole error, (m + p, width).
+    """Build the rows by which the residuals of a step depend on the whole error, (m + p, width).
 
     stored_at: where stored predictions start in the error; -1: there are none.
     """
@@ -137,7 +170,7 @@ def _build_residual_rows(
 def _build_correction(
     f: FilterRecord, table: Array, schedule: Schedule, step: int, width: int, stored_at: int
 ) -> Array:
-    """(I - K C) of the fast rows and of the frames that arrive in a step."""
+    """Build (I - K C) of the fast rows and of the frames that arrive in a step."""
     size, m = int(f.total), int(f.fasts)
     I = np.eye(width)  # noqa: E741
     M = I.copy()
@@ -172,7 +205,7 @@ def _build_correction(
 def _build_pseudo_correction(
     f: FilterRecord, table: Array, schedule: Schedule, step: int, width: int, stored_at: int
 ) -> Array:
-    """(error, e, ...) -> (error, e, ...): tie-vision (19)-(22)."""
+    """Build the map (error, e, ...) -> (error, e, ...) of tie-vision (19)-(22)."""
     size, m = int(f.total), int(f.fasts)
     C = build_measurement_rows(f, 0)
     first = 1 + schedule.cycle * max(m, 1) + (len(C) - m) * len(schedule.lags)
@@ -195,7 +228,7 @@ def _build_pseudo_correction(
 
 
 def _build_dual_rate_map(f: FilterRecord, table: Array, F: Array, schedule: Schedule) -> Array:
-    """From sample to sample, with the shares in the table."""
+    """Build the map from sample to sample, with the weights in the table."""
     n, s, r = int(f.n), int(f.first_slow), schedule.period
     q = int(f.rows[s])
     first = 1 + schedule.cycle + q * len(schedule.lags)

@@ -10,14 +10,22 @@ from .config import FilterConfig
 
 
 def _count_frames(sensor: SlowSensor, rule: str) -> int:
-    """Frames whose capture must be stored at once, by the sensor's longest delay."""
+    """Count the frames whose capture must be stored at once, by the sensor's longest delay."""
     if rule not in ("clone", "larsen"):
         return 0
     return math.ceil(sensor.longest_delay / sensor.period - 1e-9)
 
 
 def allocate_clones(f: FilterRecord, config: FilterConfig) -> None:
-    """Lay the clones of every sensor behind the states; ValueError if there are too many."""
+    """Lay the clones of every sensor behind the states.
+
+    Args:
+        f: Memory of the filter, written.
+        config: Parsed options of the filter.
+
+    Raises:
+        ValueError: There are more clones than the rule or the memory can hold.
+    """
     rule, label = config.delay, config.name
     f.late = IGNORE if rule in ("literal", "lag") else RULES.index(rule)  # their models are late
     f.total = f.n
@@ -43,8 +51,15 @@ def allocate_clones(f: FilterRecord, config: FilterConfig) -> None:
 
 
 def check_window(f: FilterRecord, config: FilterConfig) -> None:
-    """ValueError for a sensor that can be later than the filter's window, and for what a rule
-    cannot do."""
+    """Check that the filter's window holds the longest delay and that its rules go together.
+
+    Args:
+        f: Memory of the filter.
+        config: Parsed options of the filter.
+
+    Raises:
+        ValueError: A sensor can be later than the window, or the rule lacks what an option needs.
+    """
     dt, label, sensors = float(f.step / f.stride), config.name, config.sensors
     if f.late == CONSTANT and f.assumed >= WINDOW:
         raise ValueError(

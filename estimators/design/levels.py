@@ -1,4 +1,4 @@
-"""What a filter believes of noise: sensors, disturbances, Q, and deviations at the start."""
+"""A filter's noise levels: sensors, disturbances, Q, and deviations at the start."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,15 @@ DISTURBANCE = {"force_sd": 50.0, "moment_sd": 20.0, "disturbance_time": 0.3}  # 
 
 
 def parse_noise(forces: bool, reader: OptionReader) -> tuple[dict[str, float], dict[str, float]]:
-    """`FilterConfig.noise` and `noise_over_speed`; forces: whether its disturbances are."""
+    """Parse the standard deviations of sensors and disturbances.
+
+    Args:
+        forces: Whether the disturbances are a force and a moment.
+        reader: Options of the filter.
+
+    Returns:
+        `FilterConfig.noise` and `FilterConfig.noise_over_speed`.
+    """
     speed_dependent = [
         row.noise for row in _ROWS if row.over_speed and f"{row.noise}_noise" not in reader
     ]
@@ -47,7 +55,18 @@ def parse_noise(forces: bool, reader: OptionReader) -> tuple[dict[str, float], d
 def parse_hdop_table(
     row: FilterDefinition, reader: OptionReader
 ) -> tuple[tuple[float, float], ...]:
-    """Knots (HDOP, factor), or none."""
+    """Parse the factors on the GPS's noise.
+
+    Args:
+        row: Definition of the filter.
+        reader: Options of the filter.
+
+    Returns:
+        Knots (HDOP, factor), or none.
+
+    Raises:
+        reader.make_error: The ValueError for a table that is no such pairs.
+    """
     table = reader.read_value("hdop_table", row.hdop)
     if table is None or (isinstance(table, tuple) and not table):
         return ()
@@ -62,9 +81,19 @@ def parse_hdop_table(
 def parse_bank(
     states: Sequence[str], forces: bool, delay: str, reader: OptionReader
 ) -> dict[str, Any]:
-    """`members`, `levels` and `sudden` of a `FilterConfig`; forces: whether its disturbances are.
+    """Parse the options of a bank of filters.
 
-    delay: the rule for late samples.
+    Args:
+        states: Names of the filter's states.
+        forces: Whether the disturbances are a force and a moment.
+        delay: Rule for late samples.
+        reader: Options of the filter.
+
+    Returns:
+        `members`, `levels` and `sudden` of a `FilterConfig`.
+
+    Raises:
+        reader.make_error: The ValueError for a value out of range or without what it needs.
     """
     value = reader.read_value("levels", (1.0,))
     levels = reader.read_array("levels", value)
@@ -92,7 +121,19 @@ def parse_bank(
 def parse_process_noise(
     states: Sequence[str], tuning: Mapping[str, float], reader: OptionReader
 ) -> Array:
-    """Q (n, n) per second: the tuning's, the option's, single states' on its diagonal."""
+    """Parse Q: the tuning's or the option's, with single states' on its diagonal.
+
+    Args:
+        states: Names of the filter's states.
+        tuning: Process noise per second by state.
+        reader: Options of the filter.
+
+    Returns:
+        Q per second, shape (n, n).
+
+    Raises:
+        ValueError: Q has another shape; `check_covariance` refuses what is no covariance.
+    """
     n, matrix = len(states), reader.read_value("Q", None)
     tuned_diagonal = [tuning.get(state, 0.0) for state in states]
     Q = reader.read_array("Q", tuned_diagonal if matrix is None else matrix)
@@ -111,7 +152,22 @@ def parse_prior(
     biases: Mapping[str, float],
     reader: OptionReader,
 ) -> dict[str, float]:
-    """Standard deviations of all states at the start."""
+    """Parse the standard deviations of all states at the start.
+
+    Args:
+        states: Names of the filter's states.
+        noise: Standard deviations of sensors and disturbances.
+        biases: Standard deviations of the biases by state.
+        reader: Options of the filter.
+
+    Returns:
+        Standard deviation by state, in the state's unit.
+
+    Raises:
+        TypeError: The option is no mapping.
+        ValueError: A state is unknown.
+        reader.make_error: The ValueError for a value that is no standard deviation.
+    """
     deviations = {state: STATES[state].prior for state in states} | dict(biases)
     if "force" in noise:
         deviations |= {"F_d": noise["force"], "N_d": noise["moment"]}

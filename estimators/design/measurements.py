@@ -1,4 +1,4 @@
-"""What each slow sensor measures: its rows of C and their noise.
+"""Measurements of the slow sensors: their rows of C and their noise.
 
 A new slow sensor is an entry of `MEASUREMENTS`: options, states and compiled code follow it.
 """
@@ -16,10 +16,14 @@ COURSE_SPEED = 60.0 / 3.6  # m/s at which the receivers' course noise is quoted
 class MeasurementRow(NamedTuple):
     """One value of a packet as a measurement: a sum of states.
 
-    noise: its standard deviation is the option `<noise>_noise`. sd: that option's default, in the
-    unit of the value. angle: the innovation is wrapped. over_speed: the default holds at
-    `COURSE_SPEED` and grows as 1/V; the option holds at every speed. ground: it is a direction over
-    the ground, where psi is relative to the road.
+    Attributes:
+        states: Names of the states.
+        noise: Its standard deviation is the option `<noise>_noise`.
+        sd: That option's default, in the unit of the value.
+        angle: Whether the innovation is wrapped.
+        over_speed: Whether the default holds at `COURSE_SPEED` and grows as 1/V; the option holds
+            at every speed.
+        ground: Whether it is a direction over the ground, where psi is relative to the road.
     """
 
     states: tuple[str, ...]
@@ -34,8 +38,10 @@ class MeasurementRow(NamedTuple):
 class Measurement:
     """A slow sensor as a filter sees it.
 
-    rows: of a bicycle's states, for the packet's first values. velocities: in their place, of a
-    second layer. heading_fix: its first sample, where it is far off, sets psi.
+    Attributes:
+        rows: Sums of a bicycle's states, for the packet's first values.
+        velocities: Rows of a second layer, in their place.
+        heading_fix: Whether its first sample, where it is far off, sets psi.
     """
 
     rows: tuple[MeasurementRow, ...]
@@ -63,6 +69,14 @@ MEASUREMENTS: dict[str, Measurement] = {
 
 
 def find_packet_column(sensor: str, value: str) -> int:
-    """The column of a sensor's packets that holds a value; 0 where it sends none of that name."""
+    """Find the column of a sensor's packets that holds a value.
+
+    Args:
+        sensor: Name of the slow sensor.
+        value: Name of the value.
+
+    Returns:
+        Index of the column; 0 where the sensor sends none of that name.
+    """
     names = [field.name for field in SLOW[SLOW_NAMES.index(sensor)].values]
     return PACKET.value + names.index(value) if value in names else 0

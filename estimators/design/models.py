@@ -24,7 +24,13 @@ Array = npt.NDArray[np.float64]
 
 
 class StateInfo(NamedTuple):
-    """A state: unit, usual standard deviation at the start, and bound of estimates observed."""
+    """A state of a model.
+
+    Attributes:
+        unit: Its unit.
+        prior: Usual standard deviation at the start, in that unit.
+        bound: Bound of estimates in observations, in that unit.
+    """
 
     unit: str
     prior: float
@@ -67,10 +73,15 @@ FOREIGN_STATE = StateInfo("-", 0.0, 1e6)
 class FilterModel:
     """States by name, what drives them and what is measured.
 
-    kind: of `transition`. states: those that follow the model. disturbances: name of each state
-    behind them and the state that it pushes, or, for "forces", an Ornstein-Uhlenbeck force and
-    moment. late: the states that lag behind the camera's (tie-vision (12)). biases: the last
-    states, of `BIASES`. inputs, fast: names of `make_signals`.
+    Attributes:
+        kind: Code of `transition`.
+        states: Names of the states that follow the model.
+        inputs: Names of `make_signals`.
+        fast: Names of `make_signals` that are measured in every row.
+        disturbances: Name of each state behind them and of the state that it pushes.
+        forces: Whether the disturbances are an Ornstein-Uhlenbeck force and moment instead.
+        late: States that lag behind the camera's (tie-vision (12)).
+        biases: Last states, names of `BIASES`.
     """
 
     kind: int
@@ -131,7 +142,14 @@ Signal = tuple[tuple[int, float], tuple[int, float]]
 
 
 def make_signals(vehicle: Vehicle) -> dict[str, Signal]:
-    """Sums of two columns of a fast row, as (column, factor), by name."""
+    """Make the sums of two columns of a fast row.
+
+    Args:
+        vehicle: Vehicle with the wheels' radius and track.
+
+    Returns:
+        Two pairs (column, factor) by name.
+    """
     arm = vehicle.rear_track / (2.0 * vehicle.wheel_radius)  # N_z = arm (T_r - T_l)
     single = ("gyro", "accel_y", "accel_x", "roll_rate", "steer", "curvature")
     table: dict[str, Signal] = {
@@ -143,7 +161,14 @@ def make_signals(vehicle: Vehicle) -> dict[str, Signal]:
 
 
 def select_states(sensors: tuple[str, ...]) -> tuple[str, ...]:
-    """The fewest of a bicycle's states that these slow sensors measure: the first of `ORDER`."""
+    """Select the fewest of a bicycle's states that slow sensors measure: the first of `ORDER`.
+
+    Args:
+        sensors: Names of the slow sensors.
+
+    Returns:
+        Names of the states.
+    """
     rows = [row for sensor in sensors for row in MEASUREMENTS[sensor].rows]
     return ORDER[: max([2, *(1 + ORDER.index(state) for row in rows for state in row.states)])]
 
@@ -156,10 +181,18 @@ def make_bicycle_model(
     body: bool = False,
     biases: tuple[str, ...] = (),
 ) -> FilterModel:
-    """The bicycle with what these slow sensors need.
+    """Make the bicycle model with the states that slow sensors need.
 
-    disturbances: of `DISTURBANCES`; "walk" has d_1 and d_2, "walk-all" every state's. late: the
-    camera measures states that lag (tie-vision (12)-(13)). body: it rolls. biases: of `BIASES`.
+    Args:
+        sensors: Names of the slow sensors.
+        fast: Names of the fast sensors.
+        disturbances: Name of `DISTURBANCES`; "walk" has d_1 and d_2, "walk-all" every state's.
+        late: Whether the camera measures states that lag (tie-vision (12)-(13)).
+        body: Whether it rolls.
+        biases: Names of `BIASES`.
+
+    Returns:
+        The model.
     """
     walks = {"walk": WALK, "walk-all": WALK_ALL}.get(disturbances, ())
     states = select_states(sensors)
@@ -181,10 +214,16 @@ def write_model(
     noise_over_speed: Mapping[str, float],
     Q: Array,
 ) -> None:
-    """Write everything about the model and its measurements into a filter's memory.
+    """Write the model and its measurements into a filter's memory.
 
-    step: s. noise, noise_over_speed: of a `FilterConfig`. Q: (n, n), process noise per second on
-    top of the forces'.
+    Args:
+        f: Memory of the filter, written.
+        model: States, inputs and measurements.
+        vehicle: The filter's vehicle.
+        step: Step of the filter (s).
+        noise: `FilterConfig.noise`.
+        noise_over_speed: `FilterConfig.noise_over_speed`.
+        Q: Process noise per second on top of the forces', shape (n, n).
     """
     names, dense = model.names, len(model.states) + len(model.late)
     n = len(names)
@@ -216,7 +255,7 @@ def write_model(
 
 
 def _write_tyres(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> None:
-    """Where the tyres' states stand and start: at the nominal ones."""
+    """Write where the tyres' states stand and start: at the nominal ones."""
     names = model.names
     if TYRES[0] not in names:
         return
@@ -236,7 +275,7 @@ def _write_tyres(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> None:
 def _write_signals(
     f: FilterRecord, model: FilterModel, vehicle: Vehicle, noise: Mapping[str, float]
 ) -> None:
-    """Inputs and fast measurements; rows that depend on the speed are `transition.build`'s."""
+    """Write inputs and fast measurements; `build_model` writes rows that depend on speed."""
     table, names = make_signals(vehicle), model.names
     f.inputs, f.fasts = len(model.inputs), len(model.fast)
     for i, name in enumerate(model.inputs):
@@ -262,7 +301,7 @@ def _write_rows(
     noise: Mapping[str, float],
     noise_over_speed: Mapping[str, float],
 ) -> None:
-    """What the slow sensors that are used measure."""
+    """Write what the used slow sensors measure."""
     used = [s for s in range(len(SLOW_NAMES)) if f.period[s] > 0]
     f.first_slow = used[0] if used else -1
     for s in used:

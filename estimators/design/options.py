@@ -29,7 +29,12 @@ def _is_any_number(number: float) -> bool:
 
 
 class OptionReader:
-    """Keyword arguments of a filter by name; `check_unread` refuses those that nothing has read."""
+    """Keyword arguments of a filter; `check_unread` refuses those that were not read.
+
+    Args:
+        name: Name of the filter for messages.
+        options: Values by name.
+    """
 
     def __init__(self, name: str, options: Mapping[str, Any]) -> None:
         self.name, self._unread, self._known = name, dict(options), list[str]()
@@ -38,16 +43,45 @@ class OptionReader:
         return key in self._unread
 
     def read_value(self, key: str, default: Any) -> Any:
-        """The option as it came, or its default."""
+        """Read an option as it is.
+
+        Args:
+            key: Name of the option.
+            default: Value where it is not given.
+
+        Returns:
+            The value.
+        """
         self._known.append(key)
         return self._unread.pop(key, default)
 
     def make_error(self, key: str, expected: str, value: Any) -> ValueError:
-        """The error for a value that an option cannot have."""
+        """Make the error for a value that an option cannot have.
+
+        Args:
+            key: Name of the option.
+            expected: Predicate of the message, "is ...".
+            value: The value.
+
+        Returns:
+            The error, to be raised.
+        """
         return ValueError(f"{self.name}: {key} {expected}, got {value!r}")
 
     def read_choice(self, key: str, default: str, known: Sequence[str]) -> str:
-        """An option that is one of some words; ValueError for another."""
+        """Read an option that is one of some words.
+
+        Args:
+            key: Name of the option.
+            default: Value where it is not given.
+            known: Allowed words.
+
+        Returns:
+            The word.
+
+        Raises:
+            self.make_error: The ValueError for another word.
+        """
         value = self.read_value(key, default)
         if value not in known:
             raise self.make_error(key, f"is one of {', '.join(filter(None, known))}", value)
@@ -56,8 +90,19 @@ class OptionReader:
     def read_choices(
         self, key: str, default: Sequence[str], known: Sequence[str]
     ) -> tuple[str, ...]:
-        """An option that is the first of some words and any others, in their order; raises
-        ValueError for anything else."""
+        """Read an option that is the first of some words and any others.
+
+        Args:
+            key: Name of the option.
+            default: Value where it is not given.
+            known: Allowed words.
+
+        Returns:
+            The words in the order of `known`.
+
+        Raises:
+            self.make_error: The ValueError for anything else.
+        """
         value = self.read_value(key, default)
         words = list(value) if isinstance(value, list | tuple) else [value]
         chosen = tuple(word for word in known if word in words)
@@ -66,18 +111,45 @@ class OptionReader:
         return chosen
 
     def read_non_negative(self, key: str, unit: str, default: float = 0.0) -> float:
-        """A number that is 0 or more, in a unit."""
+        """Read a number that is 0 or more; errors as in `check_number`.
+
+        Args:
+            key: Name of the option.
+            unit: Unit for messages.
+            default: Value where it is not given.
+
+        Returns:
+            The number.
+        """
         expected = f"is in {unit} and not negative"
         return self.read_number(key, default, expected, lambda v: 0.0 <= v < np.inf)
 
     def read_number(
         self, key: str, default: float, expected: str = "", fits: Fits = _is_any_number
     ) -> float:
-        """An option that is a number; raises as `check_number`."""
+        """Read an option that is a number; errors as in `check_number`.
+
+        Args:
+            key: Name of the option.
+            default: Value where it is not given.
+            expected: Predicate of the message, "is ...".
+            fits: Whether a number is allowed.
+
+        Returns:
+            The number.
+        """
         return self.check_number(key, self.read_value(key, default), expected, fits)
 
     def read_positive(self, key: str, default: float) -> float:
-        """A number above zero; raises as `check_number`."""
+        """Read a number above zero; errors as in `check_number`.
+
+        Args:
+            key: Name of the option.
+            default: Value where it is not given.
+
+        Returns:
+            The number.
+        """
         return self.read_number(
             key, default, "must be positive and finite", lambda v: 0.0 < v < np.inf
         )
@@ -85,7 +157,21 @@ class OptionReader:
     def check_number(
         self, key: str, value: Any, expected: str = "", fits: Fits = _is_any_number
     ) -> float:
-        """An option's value as a number; TypeError if it is none, ValueError if it does not fit."""
+        """Convert an option's value to a number and check it.
+
+        Args:
+            key: Name of the option.
+            value: The value.
+            expected: Predicate of the message, "is ...".
+            fits: Whether a number is allowed.
+
+        Returns:
+            The number.
+
+        Raises:
+            TypeError: The value is no number.
+            self.make_error: The ValueError for a number that is not allowed.
+        """
         try:
             number = float(value)
         except (TypeError, ValueError):
@@ -95,28 +181,59 @@ class OptionReader:
         return number
 
     def read_array(self, key: str, value: Any) -> npt.NDArray[np.float64]:
-        """The value of an option as an array of its own; TypeError if it holds no numbers."""
+        """Convert the value of an option to an array of its own.
+
+        Args:
+            key: Name of the option.
+            value: Numbers of any shape.
+
+        Returns:
+            The array.
+
+        Raises:
+            TypeError: The value holds no numbers.
+        """
         try:
             return np.array(value, np.float64)
         except (TypeError, ValueError):
             raise TypeError(f"{self.name}: {key} holds numbers, got {value!r}") from None
 
     def check_unread(self) -> None:
-        """TypeError for options that nothing has read."""
+        """Check that every option was read.
+
+        Raises:
+            TypeError: An option is unknown.
+        """
         if self._unread:
             message = describe_unknown("option", sorted(self._unread), sorted(self._known))
             raise TypeError(f"{self.name}: {message}")
 
 
 def find_columns(channel: str) -> tuple[int, ...]:
-    """The columns of a fast row that a channel of `FAST_CHANNELS` has."""
+    """Find the columns of a fast row that a channel has.
+
+    Args:
+        channel: Name of `FAST_CHANNELS`.
+
+    Returns:
+        Their indices.
+    """
     return tuple(int(getattr(FAST, name)) for name in FAST_CHANNELS[channel])
 
 
 def parse_latency(reader: OptionReader, is_findable: bool) -> dict[str, float | str]:
-    """The option `latency` without zeros: s by channel, or `FIND` for one of them.
+    """Parse the option `latency`, without zeros.
 
-    is_findable: whether the filter has slow sensors, and tyres as states.
+    Args:
+        reader: Options of the filter.
+        is_findable: Whether the filter has slow sensors, and tyres as states.
+
+    Returns:
+        Latency (s) by channel, or `FIND` for one of them.
+
+    Raises:
+        TypeError: The option is no mapping.
+        reader.make_error: The ValueError for an unknown channel or a value out of range.
     """
     value: Any = reader.read_value("latency", {})
     if not isinstance(value, Mapping):

@@ -38,12 +38,19 @@ def iterate_gains(
     before: Any,
     gains: GainTables,
 ) -> int:
-    """Run a covariance filter over its schedule and write its gains; returns cycles used.
+    """Run a covariance filter over its schedule and write its gains.
 
-    filters (1,): in covariance mode, with ticks that are steps. s: its slow sensor, -1 for none.
-    lags: (pattern,) steps. table: (rows, columns), to be filled. before: (total, total), to be
-    filled with the covariance before the last frame. gains: what one with periodic gains would
-    read.
+    Args:
+        filters: Memory of the filter in covariance mode, with ticks that are steps, shape (1,).
+        s: Index of its slow sensor, -1 for none.
+        lags: Steps from capture to arrival of each frame, shape (pattern,).
+        cycles: Largest number of cycles.
+        table: Output, gains and covariances, shape (rows, columns).
+        before: Output, covariance before the last frame, shape (total, total).
+        gains: Tables that a filter with periodic gains would read.
+
+    Returns:
+        Number of cycles used.
     """
     f = filters[0]
     reset_filter(f, 0)
@@ -85,7 +92,7 @@ def iterate_gains(
 
 @jit
 def _copy_gain(source: Vector, target: Vector, size: int) -> Any:
-    """Copy `size` entries of a gain; returns the largest relative change."""
+    """Copy `size` entries of a gain; return the largest relative change."""
     change = 0.0
     for i in range(size):
         new = source[i]
@@ -95,7 +102,15 @@ def _copy_gain(source: Vector, target: Vector, size: int) -> Any:
 
 
 def compute_table_shape(f: FilterRecord, schedule: Schedule) -> tuple[int, int]:
-    """Rows and columns of a table of gains."""
+    """Compute the shape of a table of gains.
+
+    Args:
+        f: Memory of the filter.
+        schedule: Schedule of its slow sensor.
+
+    Returns:
+        Rows and columns.
+    """
     p, m = int(f.rows.max()), int(f.fasts)
     extra = {NONE: 0, PSEUDO: 2 * (m + p), DUAL_RATE: schedule.cycle * p}[int(f.between)]
     rows = 1 + schedule.cycle * max(m, 1) + p * len(schedule.lags) + extra
@@ -105,10 +120,16 @@ def compute_table_shape(f: FilterRecord, schedule: Schedule) -> tuple[int, int]:
 def design_gains(
     f: FilterRecord, schedule: Schedule, speed: float, config: FilterConfig
 ) -> tuple[Array, FilterRecord]:
-    """The table of gains (rows, columns) at a speed in m/s, and the filter's memory with the
-    transition G and the rows C_fast that it has there.
+    """Design the table of gains at a speed.
 
-    f: left as it is.
+    Args:
+        f: Memory of the filter, left as it is.
+        schedule: Schedule of its slow sensor.
+        speed: Speed (m/s).
+        config: Parsed options of the filter.
+
+    Returns:
+        Table, shape (rows, columns), and the memory with the G and the C_fast of this speed.
     """
     table, copy = _design_settled(f, schedule, speed, config)
     record: FilterRecord = np.array([f]).view(np.recarray)[0]
@@ -152,17 +173,27 @@ def _design_settled(
 
 
 def _add_bias_walk(f: FilterRecord) -> None:
-    """Let a constant bias walk by its prior in 10 s: what never moves has no settled gain, but
-    whether it is seen is the same. Only a filter with gains of its own has one."""
+    """Let a constant bias walk by its prior in 10 s, for a filter that has gains of its own.
+
+    What never moves has no settled gain, but whether it is seen is the same.
+    """
     for i in range(int(f.dense), int(f.n)):
         if f.pushed[i - f.dense] < 0:
             f.Q[i, i] += f.prior[i, i] * f.step / BIAS_WALK_TIME
 
 
 def build_measurement_rows(f: FilterRecord, frame: int, lag: int = 1) -> Array:
-    """C over states and clones, (m + p, size): the fast rows, then the slow rows of a frame.
+    """Build C over states and clones: the fast rows, then the slow rows of a frame.
 
     A frame without lag, or where there are no clones, measures the states.
+
+    Args:
+        f: Memory of the filter.
+        frame: Index of the frame in the pattern.
+        lag: Steps from its capture to its arrival.
+
+    Returns:
+        Measurement matrix, shape (m + p, total).
     """
     s, m = int(f.first_slow), int(f.fasts)
     p = int(f.rows[s]) if s >= 0 else 0
@@ -179,7 +210,7 @@ def build_measurement_rows(f: FilterRecord, frame: int, lag: int = 1) -> Array:
 def _write_shares(
     f: FilterRecord, G: Array, schedule: Schedule, config: FilterConfig, table: Array
 ) -> None:
-    """Append the shares of an innovation of the dual-rate rules."""
+    """Write the weights of an innovation of the dual-rate rules behind the gains."""
     n, s, total = int(f.n), int(f.first_slow), int(f.total)
     q = int(f.rows[s])
     F, C, Q, R = transition_matrix(f, G), f.C[s, :q, :n], f.Q[:n, :n], np.diag(f.r[s, :q])
@@ -205,7 +236,15 @@ def _write_pseudo_gains(f: FilterRecord, schedule: Schedule, table: Array, inver
 
 
 def combine_gains(K: Array, C: Array) -> Array:
-    """The gains (p, n) of rows that correct together from those of one after the other."""
+    """Combine gains of rows that correct one after the other to gains of a joint correction.
+
+    Args:
+        K: Gain of each row, shape (p, n).
+        C: Measurement matrix, shape (p, n).
+
+    Returns:
+        Joint gain of each row, shape (p, n).
+    """
     joint = np.zeros_like(K)
     for i in range(len(K)):
         joint[:i] -= np.outer(joint[:i] @ C[i], K[i])

@@ -8,7 +8,15 @@ from .kalman import Array
 
 
 def transition_matrix(f: FilterRecord, G: Array) -> Array:
-    """F (n, n) of a step: G (dense, n) on the dense states, the others decay."""
+    """Compute F of a step: G on the dense states, the others decay.
+
+    Args:
+        f: Memory of the filter.
+        G: Transition of the dense states, shape (dense, n).
+
+    Returns:
+        Transition matrix, shape (n, n).
+    """
     n, dense = int(f.n), len(G)
     F = np.zeros((n, n))
     F[:dense] = G
@@ -17,9 +25,18 @@ def transition_matrix(f: FilterRecord, G: Array) -> Array:
 
 
 def observer_gain(F: Array, C: Array, poles: Array) -> Array:
-    """K (n, p) that gives (I - K C) F the poles (n,) of the z-plane.
+    """Compute the gain K that gives (I - K C) F its poles.
 
-    Raises ValueError where that is impossible: not observable, or more equal poles than outputs.
+    Args:
+        F: Transition matrix, shape (n, n).
+        C: Measurement matrix, shape (p, n).
+        poles: Poles in the z-plane, shape (n,).
+
+    Returns:
+        Gain, shape (n, p).
+
+    Raises:
+        ValueError: It is not observable, or more poles are equal than there are outputs.
     """
     try:
         from scipy.signal import place_poles  # slow to load
@@ -36,8 +53,13 @@ def observer_gain(F: Array, C: Array, poles: Array) -> Array:
 def write_placed_gains(f: FilterRecord, G: Array, poles: tuple[float, ...], table: Array) -> None:
     """Write the gains of the fast rows and the error's covariance into a table of gains.
 
-    G: (dense, n). poles: (n,) in rad/s, negative real. table: (rows, columns), as in `periodic`.
-    Raises ValueError as `observer_gain`.
+    Errors are those of `observer_gain`.
+
+    Args:
+        f: Memory of the filter.
+        G: Transition of the dense states, shape (dense, n).
+        poles: Poles (rad/s), negative real, n of them.
+        table: Output, shape (rows, columns), see `periodic`.
     """
     n, m = int(f.n), int(f.fasts)
     F, C = transition_matrix(f, G), f.C_fast[:m, :n]

@@ -12,7 +12,18 @@ FILE = Path(__file__).with_name("tunings.toml")
 
 
 def read_tunings(path: str | Path = FILE) -> list[dict[str, Any]]:
-    """The entries of a tunings file; ValueError, with the path, for a file that is none."""
+    """Read the entries of a tunings file.
+
+    Args:
+        path: TOML file.
+
+    Returns:
+        Entries with `estimator`, `sensors` and `q`, process noise ((unit of the state)^2 / s) by
+            state.
+
+    Raises:
+        ValueError: It is no file of tunings; the message has the path.
+    """
     try:
         entries = tomllib.loads(Path(path).read_text(encoding="utf-8")).get("tuning", [])
         for entry in entries:

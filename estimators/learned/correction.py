@@ -31,8 +31,17 @@ class LearnedEstimator:
     the sum; the other states are the filter's. Where a number that it reads is not finite, beta is
     the filter's own.
 
-    base: the filter. `net`, `memory`: the correction as compiled code takes it. Raises ValueError
-    where the correction was made for another filter, other states or another tick.
+    Args:
+        base: The filter.
+        correction: Network and card.
+        vehicle: The filter's vehicle, whose mass the network reads.
+
+    Attributes:
+        net: The correction as compiled code takes it.
+        memory: Its memory, shape (memory_size,).
+
+    Raises:
+        ValueError: The correction was made for another filter, other states or another tick.
     """
 
     def __init__(self, base: Estimator, correction: Correction, vehicle: Vehicle) -> None:
@@ -52,25 +61,35 @@ class LearnedEstimator:
         self.reset(base.sensors, 0)
 
     def reset(self, sensors: Mapping[str, SlowSensor] | None, first: int) -> None:
-        """Forget everything; as `EstimatorLike.reset`, None for the clocks of the last time."""
+        """Reset as `EstimatorLike.reset` does.
+
+        Args:
+            sensors: Slow sensors of this episode by name; None keeps the clocks of the last one.
+            first: Tick of the first fast row.
+        """
         self.base.reset(sensors, first)
         reset_memory(self.memory, first)
 
     def step(self, rows: Array, packets: Array) -> None:
-        """Take fast rows and packets; as `EstimatorLike.step`."""
+        """Process fast rows and packets as `EstimatorLike.step` does.
+
+        Args:
+            rows: Fast rows, shape (k, FAST_WIDTH).
+            packets: Packets, shape (count, PACKET_WIDTH).
+        """
         record = rows, len(rows), packets.reshape(-1, PACKET_WIDTH), len(packets)
         _compile_step()(self.base.filters, self.base.gains, *record, self.memory, self.net)
 
     @property
     def x(self) -> Array:
-        """The states now, (n,)."""
+        """The present states, shape (n,)."""
         x = self.base.x
         x[self.net.beta] += self.memory[kernel.SHIFT]
         return x
 
     @property
     def P(self) -> Array:
-        """Their covariance now, (n, n)."""
+        """Their present covariance, shape (n, n)."""
         P, beta, deviation = self.base.P, self.net.beta, self.memory[kernel.DEVIATION]
         if deviation > 0.0:  # else there is no correction
             P[beta], P[:, beta], P[beta, beta] = 0.0, 0.0, deviation * deviation
@@ -79,7 +98,7 @@ class LearnedEstimator:
 
 @functools.cache
 def _compile_step() -> Any:
-    """`filter_and_correct` as a plain call."""
+    """Return `filter_and_correct` as a plain call."""
     record = np.zeros((1, 1)), 0, np.zeros((1, 1)), 0
     layers = np.zeros(1, FILTER), np.zeros((1, 1, 1))
     return compile_call(filter_and_correct, *layers, *record, np.zeros(1), EXAMPLE)
@@ -94,11 +113,20 @@ def learned(
     file: str | Path | Correction = "joint",
     **options: Any,
 ) -> LearnedEstimator:
-    """An `EstimatorFactory`: the filter that a correction was trained on, with that correction.
+    """Build the filter that a correction was trained on, with that correction.
 
-    file: a shipped correction's name, a file's path, or a `Correction`. The filter takes all slow
-    sensors, as in the training. options: of the filter, over those of the training. Raises what
-    `load_correction` and `make_estimator` raise.
+    It is an `EstimatorFactory`; errors are those of `load_correction` and `make_estimator`.
+
+    Args:
+        vehicle: The filter's vehicle.
+        sensors: Slow sensors by name; the filter takes all, as in the training.
+        dt: Tick (s).
+        speed: Speed (m/s) if it is held; None measures it.
+        file: Name of a shipped correction, path of a file, or a `Correction`.
+        **options: Options of the filter, over those of the training.
+
+    Returns:
+        The estimator.
     """
     correction = file if isinstance(file, Correction) else load_correction(file)
     settings = {"slow": list(sensors)} | correction.card.base_options | options

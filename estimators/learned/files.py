@@ -32,14 +32,23 @@ LAGS = (0, 1, 2, 4, 6, 9, 13, 17, 22, 27, 33, 40)
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectionCard:
-    """What a correction reads and how it was made; JSON types only.
+    """The inputs of a correction and how it was made; JSON types only.
 
-    base, base_options: the filter, a name of `FILTERS` with gains "covariance", and its options.
-    states: of the filter, which the network reads beside the standard deviation of its beta.
-    scenarios, seed, command, cpu_seconds, sideslip: of the training. temperature: the factor on the
-    deviation found on held-out seeds; evaluation: what was measured on others.
+    Attributes:
+        base: The filter, a name of `FILTERS` with gains "covariance".
+        states: States of the filter that the network reads beside the standard deviation of its
+            beta.
+        base_options: Options of the filter.
+        scenarios: Scenarios of the training.
+        seed: Seed of the training.
+        command: Command of the training.
+        cpu_seconds: CPU time of the training (s).
+        temperature: Factor on the deviation, from held-out seeds.
+        evaluation: What was measured on other seeds.
+        sideslip: Version of the package in the training.
 
-    Raises ValueError for another base, or states without beta.
+    Raises:
+        ValueError: Another base, or states without beta.
     """
 
     base: str
@@ -67,15 +76,28 @@ class CorrectionCard:
 
     @property
     def inputs(self) -> int:
-        """Numbers that the network takes, frames with: a_y / v - gyro, the fast inputs, states, the
-        deviation of beta, and the filter's mass."""
+        """Number of the network's inputs.
+
+        A frame has a_y / v - gyro, the fast inputs, states, the deviation of beta, and the filter's
+        mass.
+        """
         return (len(FAST_INPUTS) + len(self.states) + 3) * len(LAGS)
 
 
 @dataclass(frozen=True)
 class Correction:
-    """A network and its card. The network's two outputs are what is added to beta (rad) and the
-    logarithm of the standard deviation of the sum (rad); ValueError for another network."""
+    """A network and its card.
+
+    The network's two outputs are what is added to beta (rad) and the logarithm of the standard
+    deviation of the sum (rad).
+
+    Attributes:
+        card: What the network reads and how it was trained.
+        network: The network.
+
+    Raises:
+        ValueError: Another network.
+    """
 
     card: CorrectionCard
     network: Network
@@ -91,12 +113,20 @@ class Correction:
 
 
 def list_shipped() -> list[str]:
-    """The names of the corrections that come with the package: their filters'."""
+    """List the names of the corrections that come with the package: their filters'."""
     return sorted(path.stem for path in FOLDER.glob(f"*{SUFFIX}"))
 
 
 def save_correction(path: str | Path, correction: Correction) -> None:
-    """Write the whole file or none; ValueError for another ending than `.safetensors`."""
+    """Write the whole file of a correction or none.
+
+    Args:
+        path: File that ends in `.safetensors`.
+        correction: Network and card.
+
+    Raises:
+        ValueError: The file has another ending.
+    """
     if Path(path).suffix != SUFFIX:
         raise ValueError(f"a correction's file is NAME{SUFFIX}, got {path}")
     content = asdict(correction.card) | {"network": describe_network(correction.network)}
@@ -105,10 +135,18 @@ def save_correction(path: str | Path, correction: Correction) -> None:
 
 
 def load_correction(path: str | Path) -> Correction:
-    """A correction from its file, or a shipped one by its filter's name.
+    """Load a correction from its file, or a shipped one by its filter's name.
 
-    Raises FileNotFoundError where there is none; ValueError for a file that is no correction, is
-    cut short, has another format, or whose card and tensors do not fit together.
+    Args:
+        path: File, or name of `list_shipped`.
+
+    Returns:
+        Network and card.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is no correction, is cut short, has another format, or its card and
+            tensors do not fit together.
     """
     file = FOLDER / f"{path}{SUFFIX}" if str(path) in list_shipped() else Path(path)
     if not file.is_file():

@@ -24,10 +24,18 @@ _MAX_EXPONENT = 40.0  # where e^-x is nothing beside 1
 class PackedNetwork(NamedTuple):
     """A network as compiled code takes it.
 
-    mean, scale: of a frame, or of the stack. clip: infinite for none. inputs: of a frame. history:
-    frames. cells: (k, 4) the form of each. sizes: of the dense layers, inputs first. activation,
-    output: places in their tuples. numbers: of each cell and layer in turn; a layer's are weights
-    (inputs, outputs) row by row, then biases.
+    Attributes:
+        mean: Mean of a frame, or of the stack.
+        scale: Scale of a frame, or of the stack.
+        clip: Bound of normalised inputs, infinite for none.
+        inputs: Number of entries of a frame.
+        history: Number of frames.
+        cells: `form` of each cell, shape (k, 4).
+        sizes: Sizes of the dense layers, inputs first.
+        activation: Place in `ACTIVATIONS`.
+        output: Place in `OUTPUTS`.
+        numbers: Numbers of each cell and layer in turn; a layer's are weights (inputs, outputs) row
+            by row, then biases.
     """
 
     mean: Array
@@ -50,7 +58,19 @@ def pack_network(
     activation: str,
     output: str,
 ) -> PackedNetwork:
-    """scaling: mean, scale and clip. layers: weights (outputs, inputs) and biases of each."""
+    """Pack a network for compiled code.
+
+    Args:
+        scaling: Mean, scale and clip.
+        history: Number of frames.
+        cells: Cells before the dense layers.
+        layers: Weights (outputs, inputs) and biases (outputs,) of each dense layer.
+        activation: Name of `ACTIVATIONS`.
+        output: Name of `OUTPUTS`.
+
+    Returns:
+        The packed network.
+    """
     mean, scale, max_abs = scaling
     first_weights = cells[0].weight_in if cells else layers[0][0]
     numbers = [cell.numbers for cell in cells]
@@ -81,7 +101,7 @@ def _sigmoid(x: Any) -> Any:
 
 @jit
 def _apply_activation(x: Any, kind: int) -> Any:
-    """An activation with torch's default arguments."""
+    """Apply an activation with torch's default arguments."""
     if kind == TANH:
         return _tanh(x)
     if kind == RELU:
@@ -95,7 +115,7 @@ def _apply_activation(x: Any, kind: int) -> Any:
 
 @jit
 def _apply_dense(z: Any, numbers: Any, offset: int, out: Any) -> int:
-    """out = W z + b with the numbers at a place; the place behind them."""
+    """Write out = W z + b with the numbers at a place; return the place behind them."""
     n = len(out)
     bias = offset + len(z) * n
     for o in range(n):
@@ -109,7 +129,7 @@ def _apply_dense(z: Any, numbers: Any, offset: int, out: Any) -> int:
 
 @jit_nrt
 def _step_cell(z: Any, h: Any, gates: int, numbers: Any, offset: int) -> int:
-    """A step of torch's GRU (3 gates) or LSTM (4); h: its state, updated; the place behind."""
+    """Step torch's GRU (3 gates) or LSTM (4); h: its state, updated; return the place behind."""
     n = len(h) // (gates - 2)
     from_input, from_state = np.empty(gates * n), np.empty(gates * n)
     offset = _compute_gates(z, h[:n], numbers, offset, from_input, from_state)
@@ -135,7 +155,7 @@ def _step_cell(z: Any, h: Any, gates: int, numbers: Any, offset: int) -> int:
 def _compute_gates(
     z: Any, h: Any, numbers: Any, offset: int, from_input: Any, from_state: Any
 ) -> int:
-    """What a cell takes of its input and of its state, whose arrays stand as in `CELL_WEIGHTS`."""
+    """Compute a cell's sums of input and state, whose arrays stand as in `CELL_WEIGHTS`."""
     n, n_inputs = len(from_input), len(z) + len(h)
     for o in range(n):
         from_input[o] = numbers[offset + n_inputs * n + o]
@@ -153,7 +173,10 @@ def _compute_gates(
 
 @jit_nrt
 def _step_averages(z: Any, m: Any, form: Any, numbers: Any, offset: int) -> Any:
-    """(a step of `MovingAverages`, the place behind); m: steps so far and means, updated."""
+    """Step `MovingAverages`; return the output and the place behind.
+
+    m: steps so far and means, updated.
+    """
     units, times = form[1], form[3]
     out = np.empty(units * (1 + times))
     end = _apply_dense(z, numbers, offset + times, out[:units])
@@ -171,7 +194,14 @@ def _step_averages(z: Any, m: Any, form: Any, numbers: Any, offset: int) -> Any:
 
 @jit_nrt
 def forward(net: Any, x: Any, state: Any, out: Any) -> None:
-    """out (N, width) of observations x (N, inputs); state (N, memory) is updated."""
+    """Compute the network's outputs.
+
+    Args:
+        net: `PackedNetwork`.
+        x: Observations, shape (N, inputs).
+        state: Memory of each row, shape (N, memory), updated.
+        out: Output, shape (N, width).
+    """
     k, stacked, last = net.inputs, net.inputs * net.history, len(net.sizes) - 1
     framewise, frames = len(net.mean) == k, stacked - k
     for row in range(len(x)):

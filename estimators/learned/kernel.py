@@ -33,8 +33,14 @@ HISTORY = SLIP_RATE + 1 + len(COLUMNS)
 class CorrectionNet(NamedTuple):
     """A correction as compiled code takes it.
 
-    states: places of the filter's that are read, beta's among them. sizes: of the layers, inputs
-    first. numbers: each layer's weights, (inputs, outputs) row by row, then its biases.
+    Attributes:
+        states: Places of the filter's states that are read, beta's among them.
+        beta: Place of beta among the filter's states.
+        mean: Mean of the inputs, shape (inputs,).
+        scale: Scale of the inputs, shape (inputs,).
+        clip: Bound of normalised inputs.
+        sizes: Sizes of the layers, inputs first.
+        numbers: Each layer's weights, (inputs, outputs) row by row, then its biases.
     """
 
     states: Any
@@ -52,7 +58,15 @@ EXAMPLE = CorrectionNet(_INTEGERS, 0, _FLOATS, _FLOATS, 1.0, _INTEGERS, _FLOATS)
 
 
 def make_net(correction: Correction, states: tuple[str, ...]) -> CorrectionNet:
-    """The net for a filter with these states, all of the card's among them."""
+    """Make the net for a filter.
+
+    Args:
+        correction: Network and card.
+        states: Names of the filter's states, all of the card's among them.
+
+    Returns:
+        The net.
+    """
     network = correction.network
     layers = zip(network.weights, network.biases, strict=True)
     return CorrectionNet(
@@ -68,18 +82,38 @@ def make_net(correction: Correction, states: tuple[str, ...]) -> CorrectionNet:
 
 @jit
 def locate_stack(net: Any) -> Any:
-    """Where the stack of frames, which is the network's input, begins in a memory."""
+    """Locate the stack of frames, which is the network's input, in a memory.
+
+    Args:
+        net: `CorrectionNet`.
+
+    Returns:
+        Index of its first number.
+    """
     return HISTORY + net.sizes[0] // len(LAGS) * RING_FRAMES
 
 
 def compute_memory_size(net: CorrectionNet, states: int) -> int:
-    """Numbers of a car's memory, in whole cache lines; at its end a filter's, states + 1."""
+    """Compute the size of a car's memory, in whole cache lines.
+
+    Args:
+        net: The net.
+        states: Number of the filter's states; states + 1 of its numbers stand at the end.
+
+    Returns:
+        Number of numbers.
+    """
     return (int(locate_stack(net) + net.sizes.sum()) + states + 8) // 8 * 8
 
 
 @jit
 def reset_memory(m: Any, first: int) -> None:
-    """A fresh memory of the same car, whose first row is the tick `first`."""
+    """Reset a memory; the car's mass stays.
+
+    Args:
+        m: Memory of the correction, shape (memory_size,).
+        first: Tick of the first fast row.
+    """
     for i in range(len(m)):
         m[i] *= 1.0 if i == MASS else 0.0
     m[TICK] = first - 1.0
@@ -98,7 +132,7 @@ def _gather(m: Any, row: Any) -> None:
 
 @jit
 def _write_frame(f: Any, gains: Any, m: Any, net: Any, offset: int) -> int:
-    """Write the frame of this pace at a place; how many of its numbers are not finite."""
+    """Write the frame of this pace at a place; return how many of its numbers are not finite."""
     k, n = len(COLUMNS) + 1, len(net.states)
     for i in range(k):  # the slip rate stands before the columns
         m[offset + i] = m[SLIP_RATE + i] / m[COUNT]
@@ -114,7 +148,7 @@ def _write_frame(f: Any, gains: Any, m: Any, net: Any, offset: int) -> int:
 
 @jit
 def _run_layers(m: Any, net: Any, offset: int) -> int:
-    """Run the network on the stack at a place, which it normalises; where its outputs are."""
+    """Run the network on the stack at a place, which it normalises; return the outputs' place."""
     inputs, weight_offset = net.sizes[0], 0
     for i in range(inputs):
         m[offset + i] = clip((m[offset + i] - net.mean[i]) * net.scale[i], 0.0 - net.clip, net.clip)
@@ -140,7 +174,7 @@ def _run_layers(m: Any, net: Any, offset: int) -> int:
 
 @jit
 def _update_correction(f: Any, gains: Any, m: Any, net: Any) -> None:
-    """The correction of this pace."""
+    """Update the correction at this pace."""
     width, stack, newest = net.sizes[0] // len(LAGS), locate_stack(net), int(m[FRAMES])
     if _write_frame(f, gains, m, net, HISTORY + width * (newest % RING_FRAMES)) > 0:
         m[FRAMES], m[SHIFT], m[DEVIATION] = 0.0, 0.0, 0.0
@@ -158,9 +192,17 @@ def _update_correction(f: Any, gains: Any, m: Any, net: Any) -> None:
 def filter_and_correct(
     filters: Any, gains: Any, fast: Any, rows: int, packets: Any, count: int, m: Any, net: Any
 ) -> None:
-    """`advance` of a filter whose gains follow P, pace by pace, and its correction.
+    """Advance a filter whose gains follow P, pace by pace, and update its correction.
 
-    m: the memory, (memory_size(net, states),).
+    Args:
+        filters: Memory of the filter, dtype `FILTER`, shape (layers,).
+        gains: Tables of gains, shape (cells, rows, columns).
+        fast: Fast rows, shape (rows or more, FAST_WIDTH).
+        rows: Number of fast rows to take.
+        packets: Packets, shape (count or more, PACKET_WIDTH).
+        count: Number of packets to take.
+        m: Memory of the correction, shape (memory_size,).
+        net: `CorrectionNet`.
     """
     start, first_packet, empty, last = 0, 0, fast[:0], m[TICK] + rows
     for j in range(rows):
@@ -195,9 +237,14 @@ def filter_and_correct(
 
 @jit
 def apply_correction(f: Any, m: Any, net: Any) -> None:
-    """Put the correction into a filter's record, whose own numbers go to the memory's end.
+    """Add the correction to a filter's record, whose own numbers go to the memory's end.
 
     How the sum's error depends on those of the other states is not known: covariances are zero.
+
+    Args:
+        f: Memory of the filter.
+        m: Memory of the correction, shape (memory_size,).
+        net: `CorrectionNet`.
     """
     b, n, row = net.beta, f.n, m[len(m) - f.n - 1 :]
     copy_into(f.P[b, :n], row)
@@ -211,7 +258,13 @@ def apply_correction(f: Any, m: Any, net: Any) -> None:
 
 @jit
 def remove_correction(f: Any, m: Any, net: Any) -> None:
-    """Give a filter's record its own numbers back."""
+    """Restore a filter's own numbers in its record.
+
+    Args:
+        f: Memory of the filter.
+        m: Memory of the correction, shape (memory_size,).
+        net: `CorrectionNet`.
+    """
     b, n, row = net.beta, f.n, m[len(m) - f.n - 1 :]
     copy_into(row[:n], f.P[b])
     copy_into(row[:n], f.P[:, b])

@@ -1,4 +1,4 @@
-"""What a policy's network remembers with: torch's GRU and LSTM, and running means (traces)."""
+"""Memory of a policy's network: torch's GRU and LSTM, and running means (traces)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,10 +21,17 @@ CELL_WEIGHTS = ("weight_in", "weight_state", "bias_in", "bias_state")
 class RecurrentCell:
     """One layer of cells, whose state is all zero where an episode begins.
 
-    kind: of `GATES`. weight_in: (gates size, inputs), weight_state: (gates size, size), bias_in,
-    bias_state: (gates size,), the gates one below the other; all rounded to single precision.
+    Arrays are rounded to single precision, their gates one below the other.
 
-    Raises ValueError for another kind, or shapes that do not fit together.
+    Attributes:
+        kind: Name of `GATES`.
+        weight_in: Weights of the input, shape (gates size, inputs).
+        weight_state: Weights of the state, shape (gates size, size).
+        bias_in: Biases of the input, shape (gates size,).
+        bias_state: Biases of the state, shape (gates size,).
+
+    Raises:
+        ValueError: Another kind, or shapes that do not fit together.
     """
 
     parts: ClassVar[tuple[str, ...]] = CELL_WEIGHTS
@@ -47,12 +54,12 @@ class RecurrentCell:
 
     @property
     def size(self) -> int:
-        """Numbers of the output."""
+        """Number of outputs."""
         return len(self.weight_state[0])
 
     @property
     def memory(self) -> int:
-        """Numbers of the state: the output, and of an LSTM what the cells hold behind it."""
+        """Numbers of the state: the output, and behind it an LSTM's cell state."""
         return self.size * (2 if self.kind == "lstm" else 1)
 
     @property
@@ -62,23 +69,26 @@ class RecurrentCell:
 
     @property
     def numbers(self) -> Array:
-        """As compiled code takes them: each of `CELL_WEIGHTS`, weights (inputs, outputs) row by
-        row."""
+        """Arrays as compiled code takes them: each of `CELL_WEIGHTS`, transposed, row by row."""
         return np.concatenate([getattr(self, name).T.ravel() for name in CELL_WEIGHTS])
 
 
 @dataclass(frozen=True, eq=False)
 class MovingAverages:
-    """Units u = W z + b, of which the last ones are bent by SiLU, and running means of each.
+    """Units u = W z + b, of which the last ones pass SiLU, and running means of each.
 
     A mean is that of the episode so far, and from its time on a leaky one: a new u counts for
     max(1 / steps so far, 1 - exp(-1 / time)). No gate decides what is kept, so that minutes of a
-    small signal add up; what is to be averaged, products too, the bent units make.
+    small signal add up; what is to be averaged, products too, the SiLU units make.
 
-    weight_in: (units, inputs), bias_in: (units,), rounded to single precision. bent: how many are.
-    times: of the means, in steps.
+    Attributes:
+        weight_in: Weights, shape (units, inputs), rounded to single precision.
+        bias_in: Biases, shape (units,), rounded to single precision.
+        n_silu: Number of SiLU units.
+        times: Times of the means (steps).
 
-    Raises ValueError for shapes that do not fit together, or a number out of range.
+    Raises:
+        ValueError: Shapes that do not fit together, or a number out of range.
     """
 
     kind: ClassVar[str] = "traces"
@@ -108,7 +118,7 @@ class MovingAverages:
 
     @property
     def size(self) -> int:
-        """Numbers of the output: the units, then the means of all of them, time by time."""
+        """Number of outputs: the units, then the means of all of them, time by time."""
         return len(self.bias_in) * (1 + len(self.times))
 
     @property
@@ -118,13 +128,16 @@ class MovingAverages:
 
     @property
     def form(self) -> tuple[int, int, int, int]:
-        """No gates, units, how many are bent, and times."""
+        """No gates, units, SiLU units, and times."""
         return 0, len(self.bias_in), self.n_silu, len(self.times)
 
     @property
     def numbers(self) -> Array:
-        """As compiled code takes them: what a new number counts for in the end, of each time, then
-        weights (inputs, units) row by row, and biases."""
+        """Arrays as compiled code takes them.
+
+        They are the final weight of a new number, of each time, then weights (inputs, units) row by
+        row, and biases.
+        """
         shares = -np.expm1(-1.0 / np.array(self.times))
         return np.concatenate([shares, self.weight_in.T.ravel(), self.bias_in])
 
@@ -134,6 +147,15 @@ MemoryLayer = RecurrentCell | MovingAverages
 
 
 def compute_cell_shapes(kind: str, size: int, inputs: int) -> dict[str, tuple[int, ...]]:
-    """The shape of each of `CELL_WEIGHTS`."""
+    """Compute the shape of each of `CELL_WEIGHTS`.
+
+    Args:
+        kind: Name of `GATES`.
+        size: Number of outputs.
+        inputs: Number of inputs.
+
+    Returns:
+        Shape by name.
+    """
     rows = GATES[kind] * size
     return dict(zip(CELL_WEIGHTS, ((rows, inputs), (rows, size), (rows,), (rows,)), strict=True))

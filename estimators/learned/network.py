@@ -16,16 +16,25 @@ from .memory import Array, MemoryLayer
 class Network:
     """action = output(W_n ... activation(W_0 z + b_0) ... + b_n), z = clip((x - mean) scale).
 
-    mean, scale: (inputs,), of each frame before it is stacked, or (history inputs,), of the stack;
-    what has scale 0 is not read. clip: z lies within +-clip, None does not clip. weights:
-    (outputs, inputs) of each layer, biases: (outputs,), both rounded to single precision, in which
-    networks are trained; sums are in double precision, so that a row's result depends on the batch
-    around it by rounding of the sixteenth digit only. activation: a name of `ACTIVATIONS`, between
-    layers. output: of `OUTPUTS`, after the last one. history: so many frames, the newest included,
-    stand side by side in z, oldest first, those before the episode zero (the stack of
-    stable-baselines3's VecFrameStack). cells: between z and the first layer.
+    Weights and biases are rounded to single precision, in which networks are trained. Sums are in
+    double precision, so that a row's result depends on the batch around it by rounding of the
+    sixteenth digit only.
 
-    Raises ValueError for shapes that do not fit, a number that is not finite, an unknown name.
+    Attributes:
+        mean: Mean of each frame before it is stacked, shape (inputs,), or of the stack, (history
+            inputs,).
+        scale: Scale of the same shape; what has scale 0 is not read.
+        weights: Weights of each layer, shape (outputs, inputs).
+        biases: Biases of each layer, shape (outputs,).
+        activation: Name of `ACTIVATIONS`, between layers.
+        output: Name of `OUTPUTS`, after the last one.
+        clip: z lies within +-clip; None does not clip.
+        history: Number of frames side by side in z, oldest first, those before the episode zero
+            (the stack of stable-baselines3's VecFrameStack).
+        cells: Cells between z and the first layer.
+
+    Raises:
+        ValueError: Shapes that do not fit, a number that is not finite, an unknown name.
     """
 
     mean: Array
@@ -98,12 +107,12 @@ class Network:
 
     @property
     def _first(self) -> Array:
-        """The weights that take z."""
+        """Weights that take z."""
         return self.cells[0].weight_in if self.cells else self.weights[0]
 
     @property
     def inputs(self) -> int:
-        """Entries of an observation."""
+        """Number of entries of an observation."""
         return int(self._first.shape[-1]) // self.history
 
     @property
@@ -113,21 +122,28 @@ class Network:
 
     @property
     def width(self) -> int:
-        """Numbers of an action."""
+        """Number of entries of an action."""
         return len(self.biases[-1])
 
     @property
     def memory(self) -> int:
-        """Numbers that a row remembers: the older frames, then each cell's state."""
+        """Numbers of a row's memory: the older frames, then each cell's state."""
         return (self.history - 1) * self.inputs + sum(cell.memory for cell in self.cells)
 
     @property
     def reads(self) -> npt.NDArray[np.bool_]:
-        """(inputs,) the entries of an observation that are read in any frame."""
+        """Entries of an observation that are read in any frame, bool, shape (inputs,)."""
         return np.asarray((self.scale.reshape(-1, self.inputs) > 0.0).any(axis=0))
 
     def select_inputs(self, entries: npt.NDArray[np.bool_]) -> "Network":
-        """The same network of these entries alone, the others at their mean; entries: (inputs,)."""
+        """Restrict the network to some entries, the others at their mean.
+
+        Args:
+            entries: Entries of an observation that stay, bool, shape (inputs,).
+
+        Returns:
+            The smaller network.
+        """
         columns = np.tile(entries, self.history)
         selected = columns if len(self.mean) == len(columns) else entries
         cells, weights = list(self.cells), list(self.weights)
@@ -147,7 +163,7 @@ class Network:
 
     @property
     def dense(self) -> "Network":
-        """Behind cells the dense layers alone, as a network of what these give; else itself."""
+        """Dense layers behind cells as a network of what these give; without cells itself."""
         if not self.cells:
             return self
         width = self.weights[0].shape[1]
@@ -155,21 +171,42 @@ class Network:
         return replace(self, mean=scaling[0], scale=scaling[1], clip=None, history=1, cells=())
 
     def replace_dense(self, dense: "Network") -> "Network":
-        """The same network with other dense layers, those of a network of what they read."""
+        """Replace the dense layers.
+
+        Args:
+            dense: Network of what they read, with the new layers.
+
+        Returns:
+            The network with its layers, activation and output.
+        """
         layers = replace(self, weights=dense.weights, biases=dense.biases)
         return replace(layers, activation=dense.activation, output=dense.output)
 
     def compute_features(self, x: Array, state: Array) -> Array:
-        """(N, k) what the first dense layer reads, arguments as of a call."""
+        """Compute what the first dense layer reads.
+
+        Args:
+            x: Observations, shape (N, inputs).
+            state: Memory of each row, shape (N, memory), updated.
+
+        Returns:
+            Features, shape (N, k).
+        """
         memory_part = self._network_arrays._replace(sizes=self._network_arrays.sizes[:1])
         out = np.empty((len(x), int(memory_part.sizes[0])))
         forward(memory_part, x, state, out)
         return out
 
     def __call__(self, x: Array, state: Array | None = None) -> Array:
-        """(N, width) of observations (N, inputs).
+        """Compute the actions of observations.
 
-        state: (N, memory), updated in place; zero, or None, where an episode begins.
+        Args:
+            x: Observations, shape (N, inputs).
+            state: Memory, shape (N, memory), updated in place; zero, or None, where an episode
+                begins.
+
+        Returns:
+            Actions, shape (N, width).
         """
         if state is None:
             state = np.zeros((len(x), self.memory))

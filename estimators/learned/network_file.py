@@ -32,8 +32,18 @@ Tensors = dict[str, npt.NDArray[Any]]
 
 
 def read_tensors(path: Path, what: str) -> tuple[Tensors, dict[str, str]]:
-    """The tensors and the metadata of a file of `what`; ValueError where it is none, is cut short
-    or is larger than `MAX_BYTES`."""
+    """Read the tensors and the metadata of a safetensors file.
+
+    Args:
+        path: The file.
+        what: Kind of file for messages.
+
+    Returns:
+        Tensors and metadata by name.
+
+    Raises:
+        ValueError: It is no such file, is cut short or is larger than `MAX_BYTES`.
+    """
     size = path.stat().st_size
     if size > MAX_BYTES:
         raise ValueError(f"{path} has {size} bytes, a {what} has at most {MAX_BYTES}")
@@ -46,7 +56,17 @@ def read_tensors(path: Path, what: str) -> tuple[Tensors, dict[str, str]]:
 
 
 def parse_json_object(text: str) -> dict[str, Any]:
-    """A card's JSON object; ValueError for anything else."""
+    """Parse a card's JSON object.
+
+    Args:
+        text: JSON.
+
+    Returns:
+        Its fields.
+
+    Raises:
+        ValueError: It is no JSON object.
+    """
     try:
         fields = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -57,7 +77,14 @@ def parse_json_object(text: str) -> dict[str, Any]:
 
 
 def describe_network(network: Network) -> dict[str, Any]:
-    """What a card holds of a network."""
+    """Describe a network for its card.
+
+    Args:
+        network: The network.
+
+    Returns:
+        Sizes and kinds by name, JSON types only.
+    """
     return dict(
         hidden=list(network.hidden),
         activation=network.activation,
@@ -76,9 +103,18 @@ def _describe_cell(cell: MemoryLayer) -> list[Any]:
 
 
 def build_network(fields: Any, inputs: int, tensors: Tensors) -> Network:
-    """The network of so many inputs that a card describes, from tensors of the shapes it has.
+    """Build the network that a card describes.
 
-    Raises ValueError where they do not fit together.
+    Args:
+        fields: The card's description, see `describe_network`.
+        inputs: Number of entries of an observation.
+        tensors: Tensors by name, of the shapes that the card has.
+
+    Returns:
+        The network.
+
+    Raises:
+        ValueError: Card and tensors do not fit together.
     """
     if not isinstance(fields, dict) or set(fields) != {*_DENSE, *NO_MEMORY}:
         names = ", ".join((*_DENSE, *NO_MEMORY))
@@ -130,7 +166,7 @@ _Shapes = dict[str, tuple[tuple[int, ...], ...]]
 
 
 def _compute_shapes(inputs: int, history: int, cells: list[Any], sizes: list[int]) -> _Shapes:
-    """The shapes that each tensor may have."""
+    """Compute the shapes that each tensor may have."""
     width = inputs * history
     shapes: _Shapes = dict.fromkeys(("mean", "scale"), ((inputs,), (width,)))
     for i, (kind, size, *traces) in enumerate(cells):
@@ -147,7 +183,7 @@ def _compute_shapes(inputs: int, history: int, cells: list[Any], sizes: list[int
 
 
 def _check_tensors(tensors: Tensors, shapes: _Shapes) -> None:
-    """ValueError for tensors of other names, shapes or types."""
+    """Check the names, shapes and types of tensors; else ValueError."""
     if shapes.keys() != tensors.keys():
         missing, unexpected = shapes.keys() - tensors.keys(), tensors.keys() - shapes.keys()
         raise ValueError(
@@ -164,7 +200,14 @@ def _check_tensors(tensors: Tensors, shapes: _Shapes) -> None:
 
 
 def collect_tensors(network: Network) -> Tensors:
-    """What a file holds of a network."""
+    """Collect the tensors of a network for its file.
+
+    Args:
+        network: The network.
+
+    Returns:
+        Tensors by name.
+    """
     tensors: Tensors = {"mean": network.mean, "scale": network.scale}
     for i, cell in enumerate(network.cells):
         for part in cell.parts:

@@ -26,11 +26,19 @@ Sensors = Mapping[str, SlowSensor]
 class BatchEstimator:
     """N filters of one name in one compiled call; built by `make_batch`.
 
-    `batch[i]` is the `Estimator` at work in row i: it shares that row's memory. `filters`
-    (N, layers) are the records of all filters. `names`, `units`: of their states. Filters of equal
-    setups, but for the phases of clocks, share one table of gains.
+    `batch[i]` is the `Estimator` at work in row i: it shares that row's memory. Filters of equal
+    specs, but for the phases of clocks, share one table of gains. ValueError says that the filters
+    have different states.
 
-    Raises ValueError if the filters have different states.
+    Args:
+        name: Name of the filters.
+        specs: Vehicle, sensors and speed of each filter, N of them.
+        dt: Tick (s).
+        build: Function that builds one filter from its spec.
+
+    Attributes:
+        filters: Records of all filters, dtype `FILTER`, shape (N, layers).
+        names: Names of their states; `units` has their units.
     """
 
     def __init__(self, name: str, specs: Sequence[EstimatorSpec], dt: float, build: Build) -> None:
@@ -44,7 +52,7 @@ class BatchEstimator:
         self.configure(range(len(specs)), specs)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """A copy's records lie on cache lines, too, and its lanes are empty."""
+        """Restore a copy: its records lie on cache lines, too, and its lanes are empty."""
         self.__dict__.update(state)
         filters, self.filters = self.filters, allocate_aligned(self.filters.shape, FILTER)
         self.filters[:], self._lanes = filters, make_blocks(len(filters))
@@ -63,9 +71,13 @@ class BatchEstimator:
         return (self[i] for i in range(len(self)))
 
     def configure(self, rows: Iterable[int], specs: Iterable[EstimatorSpec]) -> None:
-        """Fit the filters of some rows to their setups; to be reset then.
+        """Fit the filters of some rows to their specs; a reset has to follow.
 
-        A filter whose setup differs in more than the phases of its clocks is built anew.
+        A filter whose spec differs in more than the phases of its clocks is built anew.
+
+        Args:
+            rows: Indices of the filters.
+            specs: Spec of each of these filters.
         """
         has_changed = False
         for i, spec in zip(rows, specs, strict=True):
@@ -92,9 +104,12 @@ class BatchEstimator:
         sensors: Sensors | Sequence[Sensors] | None = None,
         first: int = 0,
     ) -> None:
-        """Let the filters of a mask (N,) forget everything (None: all); see `Estimator.reset`.
+        """Reset the filters of a mask, see `Estimator.reset`.
 
-        sensors: slow sensors whose clocks have a new phase, of all filters or a list (N,).
+        Args:
+            mask: Filters to reset, bool, shape (N,); None resets all.
+            sensors: Slow sensors whose clocks have a new phase, of all filters or a list (N,).
+            first: Tick of the next fast row.
         """
         for i in _parse_mask(mask, len(self)):
             row_sensors = sensors if sensors is None or isinstance(sensors, Mapping) else sensors[i]
@@ -107,10 +122,15 @@ class BatchEstimator:
         counts: npt.ArrayLike | None = None,
         rows: npt.ArrayLike | None = None,
     ) -> None:
-        """Take each filter's fast rows (N, k, FAST_WIDTH) and packets (N, capacity, PACKET_WIDTH).
+        """Process each filter's fast rows and packets; a filter with none of either stands still.
 
-        counts, rows: (N,), how many of each filter's packets and rows are there (all if None; a
-        filter with none of either stands still). Raises ValueError for other shapes.
+        ValueError says that an array has another shape or a count is out of range.
+
+        Args:
+            fast: Fast rows, shape (N, k, FAST_WIDTH).
+            packets: Packets, shape (N, capacity, PACKET_WIDTH).
+            counts: Number of packets of each filter, shape (N,); None takes all.
+            rows: Number of fast rows of each filter, shape (N,); None takes all.
         """
         N = len(self)
         fast = np.ascontiguousarray(fast, np.float64)
@@ -128,7 +148,17 @@ class BatchEstimator:
         return make_empty_outputs(len(self))
 
     def run(self, sources: Sequence[Log | Record]) -> list[Estimates]:
-        """`Estimator.run` of each filter on a record of its own."""
+        """Run each filter on a record of its own, see `Estimator.run`.
+
+        Args:
+            sources: Records or logs, N of them.
+
+        Returns:
+            Estimates of each filter.
+
+        Raises:
+            ValueError: There are more or fewer records than filters.
+        """
         if len(sources) != len(self):
             raise ValueError(f"{self.name}: {len(self)} filters, got {len(sources)} records")
         return [self[i].run(source) for i, source in enumerate(sources)]
@@ -142,9 +172,15 @@ class BatchEstimator:
         counts: IntArray,
         *observed: Any,
     ) -> None:
-        """`step` of the filters of a mask without any checks of C-contiguous arrays.
+        """Process rows and packets as `step` does, without any checks of C-contiguous arrays.
 
-        observed: what `kernel.observe_batch` takes after `counts`.
+        Args:
+            mask: Filters at work, bool, shape (N,); None for all.
+            fast: Fast rows, shape (N, k, FAST_WIDTH).
+            rows: Number of fast rows of each filter, shape (N,).
+            packets: Packets, shape (N, capacity, PACKET_WIDTH).
+            counts: Number of packets of each filter, shape (N,).
+            *observed: Arguments of `kernel.observe_batch` after `counts`.
         """
         done = np.full(len(self), -1) if mask is None else np.where(mask, -1, rows)
         memory = self.filters, self._designs.pool, self._places, done, self._lanes
@@ -152,32 +188,36 @@ class BatchEstimator:
             self._design_missing(np.flatnonzero(done < rows))
 
     def _design_missing(self, rows: IntArray) -> None:
-        """Make the tables of gains that compiled code has just asked for, each once."""
+        """Compute the tables of gains that compiled code has just asked for, each once."""
         wanted = {(self._design_keys[i], int(self.filters[i, 0].wanted)): int(i) for i in rows}
         for i in wanted.values():
             self[i].design_missing()
 
     def get_state(self) -> Any:
-        """A snapshot that `set_state` continues from, bit for bit."""
+        """Return a snapshot, from which `set_state` restores every bit."""
         return self.filters.copy()
 
     def set_state(self, snapshot: Any) -> None:
-        """Go back to a snapshot of this batch or of one with the same setups."""
+        """Restore a snapshot of this batch or of one with the same specs.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         self.filters[:] = snapshot
 
     @property
     def x(self) -> Array:
-        """The states now, (N, n)."""
+        """The present states, shape (N, n)."""
         return np.array([estimator.x for estimator in self])
 
     @property
     def P(self) -> Array:
-        """Their covariances now, (N, n, n), as `Estimator.P`."""
+        """Their present covariances, shape (N, n, n), as `Estimator.P`."""
         return np.array([estimator.P for estimator in self])
 
     @property
     def counts(self) -> dict[str, IntArray]:
-        """All counters by name, each (N,)."""
+        """All counters by name, each of shape (N,)."""
         counts = [row.counts for row in self]
         return {name: np.array([row[name] for row in counts]) for name in SkipCounters._fields}
 

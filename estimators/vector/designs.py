@@ -16,13 +16,25 @@ Build = Callable[[EstimatorSpec], AnyEstimator]
 
 @jit_nrt
 def get_gains(pool: Any, place: Any) -> Any:
-    """The gains that lie in the pool at a place: (offset, then their shape)."""
+    """Return the table of gains at a place in the pool.
+
+    Args:
+        pool: Gains of all filters in one array, shape (total,).
+        place: Offset, cells, rows and columns, shape (4,).
+
+    Returns:
+        View of shape (cells, rows, columns).
+    """
     start, cells, height, width = place[0], place[1], place[2], place[3]
     return pool[start : start + cells * height * width].reshape((cells, height, width))
 
 
 class GainPool:
-    """Estimators of ours by the design of their setups, and the pool of their gains."""
+    """Estimators of the package by the design of their specs, and the pool of their gains.
+
+    Args:
+        build: Function that builds one estimator from its spec.
+    """
 
     def __init__(self, build: Build) -> None:
         self._build = build
@@ -34,9 +46,17 @@ class GainPool:
         return self._estimators[design]
 
     def get_estimator(self, spec: EstimatorSpec) -> Estimator:
-        """The estimator for this, built unless it is at hand.
+        """Return the estimator for a spec, built unless it is at hand.
 
-        Raises TypeError where a factory that built a filter of ours builds something else.
+        Args:
+            spec: Vehicle, sensors and speed.
+
+        Returns:
+            An estimator of the spec's design.
+
+        Raises:
+            TypeError: The factory builds an `Estimator` for other specs and something else for this
+                one.
         """
         design = spec.design
         if design not in self._estimators:
@@ -49,14 +69,25 @@ class GainPool:
         return self._estimators[design]
 
     def gains(self, design: Any) -> Array:
-        """The table of a design, to be read and written in the pool."""
+        """Return the table of a design, to be read and written in the pool.
+
+        Args:
+            design: `EstimatorSpec.design`.
+
+        Returns:
+            View of shape (cells, rows, columns).
+        """
         start, *shape = self._places[design]
         return self.pool[start : start + int(np.prod(shape))].reshape(shape)
 
     def place(self, used_keys: Sequence[Any]) -> npt.NDArray[np.int64]:
         """Lay the gains of the designs in use side by side in a new pool and drop the others.
 
-        Returns where each one's lie, (len(used), 4): offset and shape.
+        Args:
+            used_keys: Design of each row, N of them.
+
+        Returns:
+            Offset and shape of each row's table, shape (N, 4).
         """
         self._estimators = {design: self._estimators[design] for design in dict.fromkeys(used_keys)}
         tables = [

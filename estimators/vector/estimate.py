@@ -41,8 +41,7 @@ class EstimateObservation(
     `sideslip.estimators.EstimateObservation` of all rows, with the same arguments: every row gets
     the bits that the single wrapper would give it. It must be the innermost wrapper; others of its
     class may be stacked, each with its own `name`. It works on `SyncVectorEnv` and on a vector env
-    that offers what `records.BatchedEnv` lists. A factory is called once for each row, and again
-    where a row's car changes; one object cannot serve them all.
+    that offers what `records.BatchedEnv` lists.
 
     A row whose episode ended starts a new one with a fresh filter: in the next step, or within
     the step that ended it, where the old filter first takes the last record into `final_obs`. As
@@ -51,9 +50,23 @@ class EstimateObservation(
     `layout` describes a row; `estimator` is the `BatchEstimator` at work. `spec` names the single
     wrapper: `gym.make_vec(spec)` builds environments that are wrapped one by one.
 
-    Raises TypeError if it is not the innermost wrapper, the records are out of reach or the
-    estimator is an object; ValueError for an unknown output, where names would stand twice, or
-    without autoreset.
+    Args:
+        env: Vector environment of N rows.
+        estimator: Name, entry point or factory. A factory is called once for each row, and again
+            where a row's car changes. None for `choose_estimator` of the env's sensors.
+        outputs: States to append, each as `<state>_hat`.
+        std: Whether each one's standard deviation is appended as `<state>_std`.
+        replace: Whether the observation is these alone.
+        vehicle: Vehicle as the estimators believe it to be; None for each row's nominal, "truth"
+            for the true one.
+        options: Options of `make_estimator`.
+        name: Put before every name as `<name>_`.
+        **misplaced: Refused; the message names the nearest argument or option.
+
+    Raises:
+        TypeError: It is not the innermost wrapper, the records are out of reach or the estimator is
+            an object, which cannot serve all rows.
+        ValueError: An output is unknown, names would stand twice, or there is no autoreset.
     """
 
     def __init__(
@@ -100,13 +113,26 @@ class EstimateObservation(
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]  # as in VectorWrapper
-        """The env's with the single wrapper; JSON-able, None where the env has none."""
+        """The env's spec with the single wrapper; JSON-able, None where the env has none."""
         return make_vector_spec(self.env.spec, Single, self._saved_kwargs)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Reset the rows (those of options["reset_mask"]) and their estimators; take tick 0."""
+        """Reset the rows (those of options["reset_mask"]) and their estimators; take tick 0.
+
+        Args:
+            seed: Seed or seeds of the env.
+            options: Options of the env's reset.
+
+        Returns:
+            Observations, shape (N, width), and infos.
+
+        Raises:
+            ResetNeeded: A mask leaves out rows, and no step succeeded since the last whole reset.
+            TypeError: The env refuses the arguments.
+            ValueError: The env refuses the arguments.
+        """
         mask = None if options is None else options.get("reset_mask")
         rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
         ended_before, self._ended = self._ended, None
@@ -127,7 +153,18 @@ class EstimateObservation(
         return self._out.copy(), infos
 
     def step(self, actions: Any) -> Step:
-        """One step of all rows, whose records the estimators take before observations are made."""
+        """Step all rows; the estimators take their records before observations are made.
+
+        Args:
+            actions: Actions of the env, one a row.
+
+        Returns:
+            Observations (N, width), rewards, terminated and truncated, each (N,), and infos.
+
+        Raises:
+            ResetNeeded: It is called before `reset`, or after a step that failed.
+            ValueError: The env refuses the actions.
+        """
         ended_before, self._ended = self._ended, None  # an error on the way leaves rows apart
         if ended_before is None:
             raise ResetNeeded(
@@ -150,14 +187,14 @@ class EstimateObservation(
         return self._out.copy(), rewards, terminated, truncated, infos
 
     def _restore_ended(self, ended_before: Mask | None) -> None:
-        """After what the inner env refused: a `BatchedEnv` one does before it moves any row."""
+        """Restore the flags after an error: a `BatchedEnv` raises it before it moves any row."""
         if isinstance(self._records, BatchedRecords):
             self._ended = ended_before
 
     def get_state(self) -> dict[str, Any]:
-        """A snapshot of env and estimators that `set_state` continues from, bit for bit.
+        """Return a snapshot of env and estimators, from which `set_state` restores every bit.
 
-        Raises TypeError where the vector env makes none.
+        TypeError says that the vector env makes none.
         """
         return {
             "env": get_env_state(self.env),
@@ -167,7 +204,11 @@ class EstimateObservation(
         }
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Go back to a snapshot of this env or of one built with the same arguments."""
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         env: Any = self.env
         env.set_state(snapshot["env"])
         self._update_cars(range(self.num_envs))
@@ -176,7 +217,7 @@ class EstimateObservation(
         self._ended = None if ended is None else ended.copy()
 
     def _make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
-        """What the estimators of some rows are built for."""
+        """Make the specs of some rows' estimators."""
         specs = self._records.make_specs(rows)
         if self._arguments.truth:
             cars = get_true_vehicles(self.unwrapped, rows)
@@ -206,7 +247,7 @@ class EstimateObservation(
             self.estimator.reset(mask)
 
     def _finish(self, infos: dict[str, Any], ended: Mask) -> None:
-        """Take the last record of the rows that ended into their `final_obs` and `final_info`."""
+        """Process the last record of rows that ended into their `final_obs` and `final_info`."""
         inner, out = self._outputs.inner, np.zeros_like(self._out)
         obs = np.zeros((self.num_envs, inner), np.float32)
         if inner > 0:
@@ -223,7 +264,7 @@ class EstimateObservation(
         mask: Mask,
         out: Observations,
     ) -> None:
-        """Take the records of some rows; write their observations and their part of `infos`."""
+        """Process the records of some rows; write their observations and their part of `infos`."""
         outputs, N = self._outputs, self.num_envs
         beta, gamma = infos.get("beta"), infos.get("gamma")
         has_truth = beta is not None and gamma is not None
@@ -244,7 +285,7 @@ class EstimateObservation(
 
 
 def _find_records(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:
-    """The records; TypeError if anything that may hide ticks from the estimators is in between."""
+    """Find the records; TypeError if anything in between may hide ticks from the estimators."""
     if not isinstance(env, VectorEnv):
         raise TypeError(
             f"{type(env).__name__} is no vector environment; the wrapper of a single one is "

@@ -15,7 +15,13 @@ from .designs import Build
 class ForeignBatch(BatchEstimator):
     """N estimators of one factory, each an object of its row; none of them compiled.
 
-    first: row 0's, built already. Raises ValueError if they have different states.
+    ValueError says that they have different states.
+
+    Args:
+        first: Estimator of row 0.
+        specs: Vehicle, sensors and speed of each estimator, N of them.
+        dt: Tick (s).
+        build: Function that builds one estimator from its spec.
     """
 
     def __init__(
@@ -34,7 +40,12 @@ class ForeignBatch(BatchEstimator):
         return self._estimators[i]
 
     def configure(self, rows: Iterable[int], specs: Iterable[EstimatorSpec]) -> None:
-        """As `BatchEstimator.configure`."""
+        """Fit the estimators of some rows to their specs as `BatchEstimator.configure` does.
+
+        Args:
+            rows: Indices of the estimators.
+            specs: Spec of each of these estimators.
+        """
         for i, spec in zip(rows, specs, strict=True):
             if spec.design != self._design_keys[i]:
                 self._estimators[i], self._design_keys[i] = self._build(spec), spec.design
@@ -50,7 +61,16 @@ class ForeignBatch(BatchEstimator):
         counts: IntArray,
         *observed: Any,
     ) -> None:
-        """As `BatchEstimator.take`."""
+        """Process rows and packets as `BatchEstimator.take` does.
+
+        Args:
+            mask: Estimators at work, bool, shape (N,); None for all.
+            fast: Fast rows, shape (N, k, FAST_WIDTH).
+            rows: Number of fast rows of each estimator, shape (N,).
+            packets: Packets, shape (N, capacity, PACKET_WIDTH).
+            counts: Number of packets of each estimator, shape (N,).
+            *observed: Arguments of `kernel.observe_batch` after `counts`.
+        """
         obs, inner, plan, limits, *row_arrays = observed
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
         for i in chosen.tolist():
@@ -59,10 +79,14 @@ class ForeignBatch(BatchEstimator):
             write_outputs(estimator, obs[i], inner, plan, limits, beta, gamma, out, summary)
 
     def get_state(self) -> Any:
-        """As `BatchEstimator.get_state`: deep copies of the users' objects."""
+        """Return deep copies of the users' objects."""
         return [estimator.get_state() for estimator in self._estimators]
 
     def set_state(self, snapshot: Any) -> None:
-        """As `BatchEstimator.set_state`."""
+        """Restore a snapshot of this batch or of one with the same specs.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         for estimator, state in zip(self._estimators, snapshot, strict=True):
             estimator.set_state(state)

@@ -25,8 +25,7 @@ _MIN_LANES = 4  # filters that are computed alone in less time than in lanes
 
 @jit
 def _fetch(f: FilterRecord, template: FilterRecord) -> None:
-    """Have the caches fetch what a tick reads of a filter, whose states are as many as
-    `template`'s."""
+    """Have the caches fetch what a tick reads of a filter with as many states as `template`."""
     for i in range(0, X_OFFSET + template.total, 8):
         prefetch(f.padding, i)
     for i in range(0, N_SMALL, 8):
@@ -43,8 +42,10 @@ def _fetch(f: FilterRecord, template: FilterRecord) -> None:
 
 @jit
 def _select_lanes(b: LaneBlock, first: int, filters: Any, done: Any, rows: Any) -> int:
-    """Which filters from `first` on do their rows in the lanes of a block, equally many, into
-    b.here; returns how many rows."""
+    """Select the filters from `first` on that do their rows in the lanes of a block, into b.here.
+
+    All of them do equally many rows; returns how many.
+    """
     n_rows, count = 0, 0
     for lane in range(count_lanes()):
         i = first + lane
@@ -77,13 +78,31 @@ def observe_batch(
     out: Any,
     summary: Any,
 ) -> int:
-    """`observe` for every filter that has not done its rows; returns how many still have not.
-
-    filters: (N, L). places: (N, 4), see `get_gains`. done: (N,) rows done, -1 where a filter has
-    not started. lanes: of `lanes.make_blocks`. fast: (N, k, FAST_WIDTH). packets: (N, capacity,
-    PACKET_WIDTH). All others but inner, plan and limits have one row for each filter, too.
+    """Call `observe` for every filter that has not done its rows.
 
     Filters of one shape do their rows in lanes, others alone.
+
+    Args:
+        filters: Memories, dtype `FILTER`, shape (N, layers).
+        pool: Gains of all filters in one array, shape (total,).
+        places: Place of each filter's gains in the pool, shape (N, 4), see `get_gains`.
+        done: Number of rows done, shape (N,); -1 where a filter has not started. Updated.
+        lanes: Blocks of `lanes.make_blocks`.
+        fast: Fast rows, shape (N, k, FAST_WIDTH).
+        rows: Number of fast rows of each filter, shape (N,).
+        packets: Packets, shape (N, capacity, PACKET_WIDTH).
+        counts: Number of packets of each filter, shape (N,).
+        obs: Observations of the env, float32, shape (N, at least inner).
+        inner: Number of entries of each observation to copy.
+        plan: Shape (m, 3), see `observe`.
+        limits: Bounds of the outputs in their units, shape (m,).
+        beta: True sideslip angles (rad), shape (N,).
+        gamma: True yaw rates (rad/s), shape (N,).
+        out: Output, float32, shape (N, width), see `observe`.
+        summary: Output, shape (N, 3), see `observe`.
+
+    Returns:
+        Number of filters that still have not done their rows.
     """
     n_waiting = 0
     for first in range(0, len(filters), count_lanes()):  # without the compiler one by one
@@ -108,7 +127,14 @@ def observe_batch(
 
 
 def make_empty_outputs(count: int) -> tuple[Any, ...]:
-    """The arguments of `observe_batch` after `counts` for filters whose outputs nobody reads."""
+    """Make the arguments of `observe_batch` after `counts` for filters whose outputs are not read.
+
+    Args:
+        count: Number of filters N.
+
+    Returns:
+        The arguments in their order.
+    """
     empty, plan, truth = (
         np.zeros((count, 0), np.float32),
         np.zeros((0, 3), np.int64),
@@ -119,7 +145,7 @@ def make_empty_outputs(count: int) -> tuple[Any, ...]:
 
 @cache
 def compile_observe_batch() -> Any:
-    """`observe_batch` as a plain call."""
+    """Return `observe_batch` as a plain call."""
     filters, integers, cube = np.zeros((1, 1), FILTER), np.zeros(1, np.int64), np.zeros((1, 1, 1))
     memory = filters, np.zeros(1), np.zeros((1, 4), np.int64), integers, make_blocks(1)
     return compile_call(

@@ -62,8 +62,8 @@ _FLOATS = {
     "wild": (),  # 1: its residual is none
 }
 _INTS = ("shaped", "tick", "at", "cell", "cursor")
-"""Of a lane: 1 where its filter is known to have the block's shape, -1 where it has not, 0 where
-nobody looked; tick, step within the cycle, table of gains and packets done."""
+"""Of a lane: 1 where its filter is known to have the block's shape, -1 where it has not, 0 before
+the first look; tick, step within the cycle, table of gains and packets done."""
 _SHAPE = (
     *("n", "dense", "total", "inputs", "fasts", "kind", "periodic", "measured", "cycle"),
     *("store_predictions", "tyres", "robust"),
@@ -79,16 +79,32 @@ BLOCK = pad_to_cache_line(_FIELDS)
 
 
 def make_blocks(count: int) -> Any:
-    """Blocks for so many filters, nothing in them."""
+    """Allocate empty blocks.
+
+    Args:
+        count: Number of filters N.
+
+    Returns:
+        Records of the dtype `BLOCK`, enough for N lanes.
+    """
     return allocate_aligned((-(-count // LANES),), BLOCK)
 
 
 @jit
 def is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Any:
-    """Whether a filter's ticks are computed in its lane now; the first that does shapes the block.
+    """Return whether a filter's ticks are computed in its lane now.
 
-    Lanes compute models that change by speed alone, of which every tick predicts and corrects,
-    nothing is done between samples, and nothing of the past is stored but predictions.
+    The first filter that is shapes the block. Lanes compute models that change by speed alone, of
+    which every tick predicts and corrects. Nothing is done between samples, and nothing of the past
+    is stored but predictions.
+
+    Args:
+        b: Block of lanes.
+        lane: Index of the lane in the block.
+        f: Record of the lane's filter.
+
+    Returns:
+        True where the lane may compute them.
     """
     if b.shaped[lane] == 0:
         is_steady = f.tyres == 0 and f.kind != KINEMATIC and f.kind != VELOCITY_ROLL
@@ -118,7 +134,7 @@ def _is_same_shape(b: LaneBlock, f: FilterRecord) -> Any:
 
 @jit
 def _set_shape(b: LaneBlock, f: FilterRecord) -> None:
-    """What all filters of a block share."""
+    """Write into the block what all its filters share."""
     b.n, b.dense, b.total, b.inputs, b.fasts = f.n, f.dense, f.total, f.inputs, f.fasts
     b.kind, b.periodic, b.measured, b.cycle = f.kind, f.periodic, f.measured, f.cycle
     b.store_predictions, b.tyres, b.robust = f.store_predictions, f.tyres, f.robust
@@ -146,7 +162,7 @@ def _add_column(b: LaneBlock, column: int) -> None:
 
 @jit
 def _load_model(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """What a filter's ticks read and do not write."""
+    """Load what a filter's ticks read and do not write."""
     n, dense = f.n, f.dense
     for i in range(n):
         b.keep[i, lane], b.decay[i, lane], b.drift[i, lane] = f.keep[i], f.decay[i], f.drift[i]
@@ -175,7 +191,13 @@ def _load_model(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 @jit
 def load_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """A filter into its lane."""
+    """Load a filter's model, where its speed changed, and its state into its lane.
+
+    Args:
+        b: Block of lanes.
+        lane: Index of the lane in the block.
+        f: Record of the lane's filter.
+    """
     if b.model_speed[lane] != f.model_speed:
         _load_model(b, lane, f)
     _load_states(b, lane, f)
@@ -199,7 +221,7 @@ def _load_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 @jit
 def _load_clock(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """When the next capture is."""
+    """Load the tick of the next capture."""
     first = np.inf
     for s in range(N_SLOW):
         if f.period[s] > 0:
@@ -209,7 +231,13 @@ def _load_clock(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 @jit
 def store_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """The state of a lane into its filter's record."""
+    """Store the state of a lane in its filter's record.
+
+    Args:
+        b: Block of lanes.
+        lane: Index of the lane in the block.
+        f: Record of the lane's filter.
+    """
     _store_states(b, lane, f)
     for k in range(b.inputs):
         f.u[k] = b.u[k, lane]
@@ -232,7 +260,13 @@ def _store_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 @jit
 def store_captures(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store by its record what a lane's filter captured at its last tick; before the next one."""
+    """Store by its record what a lane's filter captured at its last tick; before the next one.
+
+    Args:
+        b: Block of lanes.
+        lane: Index of the lane in the block.
+        f: Record of the lane's filter.
+    """
     _store_states(b, lane, f)
     f.road_turn, f.speed_before = b.road_turn[lane], f.model_speed
     store_due_captures(f, b.tick[lane])
@@ -242,7 +276,13 @@ def store_captures(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 @jit
 def store_prediction(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store a lane's prediction of this tick, before its fast measurements."""
+    """Store a lane's prediction of this tick, before its fast measurements.
+
+    Args:
+        b: Block of lanes.
+        lane: Index of the lane in the block.
+        f: Record of the lane's filter.
+    """
     slot = b.tick[lane] % WINDOW
     f.past_road_turn[slot] = b.road_turn[lane]
     for i in range(b.n):

@@ -24,10 +24,16 @@ from .kernel import make_empty_outputs
 def correct_batch(
     filters: Any, pool: Any, places: Any, chosen: Any, record: Any, observed: Any, corrections: Any
 ) -> None:
-    """`observe_corrected` for the chosen filters.
+    """Call `observe_corrected` for the chosen filters.
 
-    record, observed: the arguments of `kernel.observe_batch` from `fast` to `counts` and behind.
-    corrections: memory (N, memory_size), net.
+    Args:
+        filters: Memories, dtype `FILTER`, shape (N, layers).
+        pool: Gains of all filters in one array, shape (total,).
+        places: Place of each filter's gains in the pool, shape (N, 4), see `get_gains`.
+        chosen: Indices of the filters.
+        record: Arguments of `kernel.observe_batch` from `fast` to `counts`.
+        observed: Arguments of `kernel.observe_batch` behind `counts`.
+        corrections: Memories of the corrections, shape (N, memory_size), and the network.
     """
     fast, rows, packets, counts = record
     obs, inner, plan, limits, beta, gamma, out, summary = observed
@@ -40,14 +46,21 @@ def correct_batch(
 
 
 def _build_base(build: Build, spec: EstimatorSpec) -> Any:
-    """The filter inside of a learned estimator, by a name that pickle finds."""
+    """Build the filter inside of a learned estimator, by a name that pickle finds."""
     return build(spec).inner.base  # type: ignore[union-attr]
 
 
 class LearnedBatch(BatchEstimator):
     """N learned estimators of one correction; `filters` are their filters' records.
 
-    first: row 0's, built already. `memory`: (N, memory_size), the corrections' own.
+    Args:
+        first: Estimator of row 0.
+        specs: Vehicle, sensors and speed of each estimator, N of them.
+        dt: Tick (s).
+        build: Function that builds one estimator from its spec.
+
+    Attributes:
+        memory: Memories of the corrections, shape (N, memory_size).
     """
 
     def __init__(
@@ -63,13 +76,23 @@ class LearnedBatch(BatchEstimator):
         return ForeignEstimator(estimator, self.name, self.dt, estimator.base.sensors)
 
     def configure(self, rows: Iterable[int], specs: Iterable[EstimatorSpec]) -> None:
-        """As `BatchEstimator.configure`."""
+        """Fit the filters of some rows to their specs as `BatchEstimator.configure` does.
+
+        Args:
+            rows: Indices of the filters.
+            specs: Spec of each of these filters.
+        """
         rows, specs = list(rows), list(specs)
         super().configure(rows, specs)
         self.memory[rows, MASS] = [spec.vehicle.mass for spec in specs]
 
     def take(self, mask: Any, *arguments: Any) -> None:
-        """As `BatchEstimator.take`."""
+        """Process rows and packets as `BatchEstimator.take` does.
+
+        Args:
+            mask: Filters at work, bool, shape (N,); None for all.
+            *arguments: Arguments of `kernel.observe_batch` from `fast` on.
+        """
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
         layers = self.filters, self._designs.pool, self._places, chosen
         _compile_correct_batch()(
@@ -77,17 +100,21 @@ class LearnedBatch(BatchEstimator):
         )
 
     def get_state(self) -> Any:
-        """The filters and their corrections."""
+        """Return copies of the filters and of their corrections."""
         return self.filters.copy(), self.memory.copy()
 
     def set_state(self, snapshot: Any) -> None:
-        """As `BatchEstimator.set_state`."""
+        """Restore a snapshot of this batch or of one with the same specs.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         self.filters[:], self.memory[:] = snapshot
 
 
 @functools.cache
 def _compile_correct_batch() -> Any:
-    """`correct_batch` as a plain call."""
+    """Return `correct_batch` as a plain call."""
     integers, cube = np.zeros(1, np.int64), np.zeros((1, 1, 1))
     layers = np.zeros((1, 1), FILTER), np.zeros(1), np.zeros((1, 4), np.int64), integers
     corrections = np.zeros((1, 1)), EXAMPLE

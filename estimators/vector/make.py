@@ -25,10 +25,19 @@ def build_batch(
     dt: float,
     options: Mapping[str, Any],
 ) -> BatchEstimator:
-    """An estimator for each setup: a compiled batch where they are ours and no channel is late,
-    else one of objects.
+    """Build an estimator for each spec; errors as in `make_estimator`.
 
-    source, options, errors: as in `make_estimator`.
+    The batch is compiled where all are the package's own and no channel is late. Else it has an
+    object for each row.
+
+    Args:
+        source: Name or factory.
+        specs: Vehicle, sensors and speed of each estimator.
+        dt: Tick (s).
+        options: Options of `make_estimator`.
+
+    Returns:
+        The batch.
     """
     build_one = functools.partial(build_estimator, source, dict(options), dt)
     if not (isinstance(source, str) and source in FILTERS) or options.get("latency"):
@@ -53,10 +62,22 @@ def make_batch(
     speed: float | Sequence[float | None] | None = None,
     **options: Any,
 ) -> BatchEstimator:
-    """Build `count` filters by name; the arguments are those of `make_estimator`.
+    """Build filters by name; the arguments and errors are those of `make_estimator`.
 
-    vehicle, sensors and speed may each be a list of `count`: one for each filter. Raises what
-    `make_estimator` raises, and ValueError for a list of another length.
+    Args:
+        name: Name or factory.
+        count: Number of filters N.
+        vehicle: Vehicle of all filters, or a list (N,).
+        sensors: Slow sensors by name of all filters, or a list (N,).
+        dt: Tick (s).
+        speed: Speed (m/s) of all filters where it is held, or a list (N,); None measures it.
+        **options: Options of `make_estimator`.
+
+    Returns:
+        The batch, reset to tick 0.
+
+    Raises:
+        ValueError: There is no filter, or a list has another length.
     """
     if count < 1:
         raise ValueError(f"{get_label(name)}: a batch has at least one filter, got {count}")

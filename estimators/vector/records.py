@@ -1,4 +1,4 @@
-"""Where a batch of estimators finds the records of a vector env's cars."""
+"""Records of a vector env's cars, as a batch of estimators reads them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -28,10 +28,21 @@ class RecordBatch(NamedTuple):
 
 
 class BatchedEnv(Protocol):
-    """What a vector env that steps all cars at once offers.
+    """The members of a vector env that steps all cars at once.
 
-    slow_sensors, nominal and held_speed: of each car, (N,). The final_... ones are a row's record
-    as it stood before its newest reset; they are read in the step that ended its episode.
+    The final_... ones are a row's record before its newest reset. They are read in the step that
+    ended its episode.
+
+    Attributes:
+        rows: Fast rows, shape (N, k, FAST_WIDTH).
+        ticks_done: Number of fast rows of each car, shape (N,).
+        packets: Packets, shape (N, capacity, PACKET_WIDTH).
+        delivered: Number of packets of each car, shape (N,).
+        slow_sensors: Slow sensors of each car by name.
+        nominal: Nominal vehicle of each car.
+        held_speed: Speed (m/s) of each car, None where it is not held.
+        layout: Entries of a row's observation.
+        dt: Tick (s).
     """
 
     rows: Array
@@ -50,7 +61,11 @@ class BatchedEnv(Protocol):
 
 
 class BatchedRecords:
-    """The records of a `BatchedEnv` env."""
+    """The records of a `BatchedEnv`.
+
+    Args:
+        env: The vector environment.
+    """
 
     def __init__(self, env: Any) -> None:
         self._env = env
@@ -58,30 +73,58 @@ class BatchedRecords:
         self.dt: float = env.dt
 
     def read_latest(self) -> RecordBatch:
-        """Of the newest step, or of tick 0 where a car was reset."""
+        """Return the records of the newest step, or of tick 0 where a car was reset."""
         env = self._env
         return _make_contiguous(env.rows, env.ticks_done, env.packets, env.delivered)
 
     def read_final(self, ended: npt.NDArray[np.bool_]) -> RecordBatch:
-        """Of the last step of the episodes that ended in this step."""
+        """Return the records of the last step of the episodes that ended in this step.
+
+        Args:
+            ended: Rows whose episode ended, shape (N,).
+
+        Returns:
+            Records of all rows, valid in those that ended.
+        """
         env = self._env
         return _make_contiguous(
             env.final_rows, env.final_ticks_done, env.final_packets, env.final_delivered
         )
 
     def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
-        """What the env offers to the estimators of some rows."""
+        """Make the specs of some rows' estimators.
+
+        Args:
+            rows: Indices of the rows.
+
+        Returns:
+            Nominal vehicle, slow sensors and held speed of each.
+        """
         env = self._env
         return [EstimatorSpec(env.nominal[i], env.slow_sensors[i], env.held_speed[i]) for i in rows]
 
     def annotate(self, label: str, beta: Array, std: Array, rows: npt.NDArray[np.bool_]) -> None:
-        """Estimates of some rows to draw beside the truth, by an env that draws."""
+        """Pass estimates of some rows to an env that draws, beside the truth.
+
+        Args:
+            label: Title of the estimates.
+            beta: Estimated sideslip angles (rad), shape (N,).
+            std: Their standard deviations (rad), shape (N,).
+            rows: Rows to draw, shape (N,).
+        """
         if hasattr(self._env, "annotate"):
             self._env.annotate(label, beta, std, rows)
 
 
 class SyncRecords:
-    """The records of the environments in a `SyncVectorEnv`, copied into one array each."""
+    """The records of the environments in a `SyncVectorEnv`, copied into one array each.
+
+    Args:
+        env: The vector environment.
+
+    Raises:
+        ValueError: Its environments have different layouts.
+    """
 
     def __init__(self, env: SyncVectorEnv[Any, Any]) -> None:
         self._bases = [find_base_env(sub_env) for sub_env in env.envs]
@@ -102,7 +145,7 @@ class SyncRecords:
         )
 
     def read_latest(self) -> RecordBatch:
-        """Of the newest step, or of tick 0 where a car was reset."""
+        """Return the records of the newest step, or of tick 0 where a car was reset."""
         fast, rows, packets, counts = self._records
         for i, base in enumerate(self._bases):
             n, m = base.ticks_done, base.delivered
@@ -111,7 +154,14 @@ class SyncRecords:
         return self._records
 
     def read_final(self, ended: npt.NDArray[np.bool_]) -> RecordBatch:
-        """Of the last step of the episodes that ended in this step."""
+        """Return the records of the last step of the episodes that ended in this step.
+
+        Args:
+            ended: Rows whose episode ended, shape (N,).
+
+        Returns:
+            Records of all rows, valid in those that ended.
+        """
         fast, rows, packets, counts = self._records
         for i in np.flatnonzero(ended):
             base = self._bases[i]
@@ -121,19 +171,41 @@ class SyncRecords:
         return self._records
 
     def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
-        """What the environments of some rows offer to their estimators."""
+        """Make the specs of some rows' estimators.
+
+        Args:
+            rows: Indices of the rows.
+
+        Returns:
+            Nominal vehicle, slow sensors and held speed of each.
+        """
         return [make_spec(self._bases[i]) for i in rows]
 
     def annotate(self, label: str, beta: Array, std: Array, rows: npt.NDArray[np.bool_]) -> None:
-        """Estimates of some rows to draw beside the truth."""
+        """Pass estimates of some rows to their envs, which draw them beside the truth.
+
+        Args:
+            label: Title of the estimates.
+            beta: Estimated sideslip angles (rad), shape (N,).
+            std: Their standard deviations (rad), shape (N,).
+            rows: Rows to draw, shape (N,).
+        """
         for i in np.flatnonzero(rows):
             self._bases[i].annotate(label, float(beta[i]), float(std[i]))
 
 
 def get_true_vehicles(base: Any, rows: Sequence[int]) -> list[Vehicle]:
-    """The true vehicles that some rows of a bare vector env drive in this episode.
+    """Return the true vehicles of some rows in this episode.
 
-    Raises TypeError where they are out of reach.
+    Args:
+        base: Vector environment without wrappers.
+        rows: Indices of the rows.
+
+    Returns:
+        Vehicle of each of these rows.
+
+    Raises:
+        TypeError: The vehicles are out of reach.
     """
     if isinstance(base, SyncVectorEnv):
         return [base.envs[i].unwrapped.vehicle for i in rows]  # type: ignore[attr-defined]
@@ -143,7 +215,17 @@ def get_true_vehicles(base: Any, rows: Sequence[int]) -> list[Vehicle]:
 
 
 def get_true_states(base: Any) -> Array:
-    """The `TrueState` of every row of a bare vector env now; TypeError where out of reach."""
+    """Return the present `TrueState` of every row.
+
+    Args:
+        base: Vector environment without wrappers.
+
+    Returns:
+        States in SI units, shape (N, len(TrueState)).
+
+    Raises:
+        TypeError: The states are out of reach.
+    """
     if isinstance(base, SyncVectorEnv):
         return np.array([env.unwrapped.true_state for env in base.envs])  # type: ignore[attr-defined]
     if not hasattr(base, "true_state"):
@@ -152,7 +234,7 @@ def get_true_states(base: Any) -> Array:
 
 
 def _make_contiguous(fast: Any, rows: Any, packets: Any, counts: Any) -> RecordBatch:
-    """Arrays as compiled code takes them, copied only where they are not."""
+    """Make arrays as compiled code takes them, copied only where they are not."""
     return RecordBatch(
         np.ascontiguousarray(fast, np.float64),
         np.ascontiguousarray(rows, np.int64),
@@ -162,9 +244,16 @@ def _make_contiguous(fast: Any, rows: Any, packets: Any, counts: Any) -> RecordB
 
 
 def make_record_source(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:
-    """The records of a bare vector env.
+    """Make the source of a vector env's records.
 
-    Raises TypeError for workers, whose records are out of reach, and where there are no records.
+    Args:
+        env: Vector environment without wrappers.
+
+    Returns:
+        Reader of the records.
+
+    Raises:
+        TypeError: The records are in worker processes, out of reach, or there are none.
     """
     if isinstance(env, AsyncVectorEnv):
         raise TypeError(
@@ -185,7 +274,17 @@ def make_record_source(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRe
 
 
 def get_env_state(env: Any) -> Any:
-    """The snapshot of a vector env, wrapped or not; TypeError where it makes none."""
+    """Return the snapshot of a vector env.
+
+    Args:
+        env: Vector environment, wrapped or not.
+
+    Returns:
+        The snapshot.
+
+    Raises:
+        TypeError: The vector env makes none.
+    """
     if not hasattr(env, "get_state"):
         raise TypeError(
             f"{type(env).__name__} makes no snapshots; the vector env that gym.make_vec builds "

@@ -1,4 +1,4 @@
-"""What a vector wrapper's spec names: the single wrapper around each environment."""
+"""The spec of a vector wrapper: it names the single wrapper around each environment."""
 
 import copy
 from collections.abc import Mapping
@@ -11,10 +11,18 @@ from gymnasium.vector import AutoresetMode
 def make_vector_spec(
     spec: EnvSpec | None, single: Any, kwargs: Mapping[str, Any]
 ) -> EnvSpec | None:
-    """The spec of a vector env whose rows wear the wrapper `single(**kwargs)`; None without one.
+    """Make the spec of a vector env whose rows wear the wrapper `single(**kwargs)`.
 
-    JSON-able. `gym.make_vec` of it makes environments that are wrapped one by one: it puts no
-    wrappers around an env that is a vector by itself.
+    `gym.make_vec` of it makes environments that are wrapped one by one: it puts no wrappers around
+    an env that is a vector by itself.
+
+    Args:
+        spec: Spec of the vector env, or None.
+        single: Class of the single wrapper.
+        kwargs: Keyword arguments of the wrapper.
+
+    Returns:
+        A JSON-able spec; None without one.
     """
     if spec is None:
         return None

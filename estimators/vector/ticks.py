@@ -26,8 +26,10 @@ from .lanes import LaneBlock, load_lane, store_captures, store_lane, store_predi
 
 @jit
 def _fetch_next(b: LaneBlock, first: int, filters: Any, fast: Any, j: int, rows: int) -> None:
-    """Have the caches fetch what the next block, of the filters from `first` on, reads at tick j,
-    and its share of their states."""
+    """Have the caches fetch what the next block reads at tick j, and a part of its states.
+
+    first: the first filter of that block.
+    """
     last = minimum(first + count_lanes(), len(filters))
     for i in range(first, last):
         for k in range(0, FAST_WIDTH, 5):  # a row lies on two cache lines or three
@@ -55,7 +57,7 @@ def _read_rows(b: LaneBlock, first: int, fast: Any, j: int) -> None:
 @jit
 def _read_signals(b: LaneBlock) -> Any:
     """Inputs into b.u_new, measurements into b.y; (speeds, whether a lane's tick stands apart)."""
-    is_outlier = load_element(b.here) != 1.0  # nowhere, as far as anybody looks at it
+    is_outlier = load_element(b.here) != 1.0  # lanes without a filter: masked below
     for i in range(b.inputs):
         store_element(b.u_new, compute_signal(b.row, b.u_column[i], b.u_factor[i]), i)
         is_outlier = is_outlier | (is_finite(load_element(b.u_new, i)) ^ True)
@@ -78,7 +80,7 @@ def _read_signals(b: LaneBlock) -> Any:
 
 @jit
 def _gather_gains(b: LaneBlock, first: int, pool: Vector, places: Any) -> None:
-    """The periodic gains of this tick into b.K."""
+    """Gather the periodic gains of this tick in b.K."""
     for lane in range(count_lanes()):
         if b.here[lane] == 1.0:
             place = places[first + lane]
@@ -90,7 +92,7 @@ def _gather_gains(b: LaneBlock, first: int, pool: Vector, places: Any) -> None:
 
 @jit
 def _correct(b: LaneBlock, first: int, filters: Any) -> None:
-    """The fast measurements of all lanes; a lane whose residual is not finite stays as it is."""
+    """Correct all lanes by their fast measurements; a residual that is not finite is skipped."""
     for i in range(b.fasts):
         residual = compute_residual(b, i)
         is_invalid = (
@@ -118,7 +120,7 @@ def _correct(b: LaneBlock, first: int, filters: Any) -> None:
 
 @jit
 def _store_captures(b: LaneBlock, first: int, filters: Any) -> None:
-    """What lanes that do this tick together captured at the last one."""
+    """Store what lanes that do this tick together captured at the last one."""
     if any_lane((load_element(b.now) > load_element(b.next)) & (load_element(b.here) == 1.0)):
         for lane in range(count_lanes()):
             is_due = b.now[lane] > b.next[lane]
@@ -130,7 +132,7 @@ def _store_captures(b: LaneBlock, first: int, filters: Any) -> None:
 def _step_lanes(
     b: LaneBlock, first: int, filters: Any, pool: Vector, places: Any, speed: Any
 ) -> None:
-    """A tick of all lanes."""
+    """Step all lanes by one tick."""
     store_element(b.speed_before, load_element(b.model_speed))
     store_element(b.speed, speed)
     for k in range(b.inputs):
@@ -162,8 +164,10 @@ def _average_wheel_speed(row: Vector) -> Any:
 def _store_outliers(
     b: LaneBlock, first: int, filters: Any, pool: Any, places: Any, fast: Any, j: int
 ) -> bool:
-    """Lanes whose tick stands apart into their records; False, and nothing is changed, where the
-    gains of one of them are missing."""
+    """Store lanes whose tick stands apart in their records.
+
+    Returns False, and nothing is changed, where the gains of one of them are missing.
+    """
     if b.periodic == 1:
         for lane in range(count_lanes()):
             if b.apart[lane] == 1.0:
@@ -181,7 +185,7 @@ def _store_outliers(
 
 @noinline
 def _step_filter(f: FilterRecord, gains: GainTables, row: Vector) -> None:
-    """A tick of a filter alone."""
+    """Step one filter by one tick."""
     read_fast_row(f, row, _average_wheel_speed(row))
     run_tick(f, gains)
 
@@ -190,7 +194,7 @@ def _step_filter(f: FilterRecord, gains: GainTables, row: Vector) -> None:
 def _step_outliers(
     b: LaneBlock, first: int, filters: Any, pool: Any, places: Any, fast: Any, j: int
 ) -> None:
-    """The tick of the lanes that stand apart, by their records, which the lanes take over."""
+    """Step the lanes that stand apart by their records, which the lanes take over."""
     for lane in range(count_lanes()):
         if b.apart[lane] == 1.0:
             i = first + lane
@@ -200,7 +204,7 @@ def _step_outliers(
 
 @jit
 def _set_next_due(b: LaneBlock, lane: int, packets: Any, count: int) -> None:
-    """When the lane's next packet is taken; one that no tick of this call waits for at the next."""
+    """Set when the lane's next packet is taken; one that no tick of this call waits for is next."""
     k, due_tick = b.cursor[lane], np.inf
     if k < count:
         arrived = packets[k, PACKET.arrived]
@@ -212,7 +216,7 @@ def _set_next_due(b: LaneBlock, lane: int, packets: Any, count: int) -> None:
 def _process_packets(
     b: LaneBlock, lane: int, f: FilterRecord, gains: GainTables, packets: Any, count: int
 ) -> None:
-    """The packets of a lane's filter that are here now, by its record."""
+    """Process the packets of a lane's filter that are here now, by its record."""
     k = b.cursor[lane]
     store_lane(b, lane, f)
     while k < count and not (f.tick < packets[k, PACKET.arrived] <= b.last[lane]):
@@ -235,11 +239,21 @@ def advance_block(
     packets: Any,
     counts: Any,
 ) -> int:
-    """`core.run.advance` from their first row on of the filters that are `here`.
+    """Advance the filters that are `here` from their first row on, as `core.run.advance` does.
 
-    first: the filter of the first lane. filters, places, fast, packets, counts: as in
-    `kernel.observe_batch`. Returns the rows done, of all alike: fewer than `rows` where one of them
-    has no gains.
+    Args:
+        b: Block of lanes.
+        first: Index of the filter in the first lane.
+        filters: Memories, dtype `FILTER`, shape (N, layers).
+        pool: Gains of all filters in one array, shape (total,).
+        places: Place of each filter's gains in the pool, shape (N, 4).
+        fast: Fast rows, shape (N, k, FAST_WIDTH).
+        rows: Number of fast rows, equal for these filters.
+        packets: Packets, shape (N, capacity, PACKET_WIDTH).
+        counts: Number of packets of each filter, shape (N,).
+
+    Returns:
+        Number of rows done by all alike: fewer than `rows` where one of them has no gains.
     """
     store_element(b.due, np.inf)
     for lane in range(count_lanes()):

@@ -29,9 +29,15 @@ class TruthObservation(
     `spec` names the single wrapper: `gym.make_vec(spec)` builds environments that are wrapped one
     by one.
 
-    Raises TypeError where the env has no layout or no vehicles, ValueError for an unknown name or
-    one that stands twice, and for states of rows that are reset within the step that ends their
-    episode, whose last ones are gone then.
+    Args:
+        env: Vector environment of N rows with a `layout`.
+        parameters: Names of `Vehicle`, appended as `true_<name>` in their units.
+        states: Names of `TrueState`, appended as `<name>_hat` as if by an estimator without error.
+
+    Raises:
+        TypeError: The env has no layout or no vehicles.
+        ValueError: A name is unknown or stands twice, or states are wanted of rows that are reset
+            within the step that ends their episode, whose last ones are gone then.
     """
 
     def __init__(
@@ -59,13 +65,21 @@ class TruthObservation(
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]  # as in VectorWrapper
-        """The env's with the single wrapper; JSON-able, None where the env has none."""
+        """The env's spec with the single wrapper; JSON-able, None where the env has none."""
         return make_vector_spec(self.env.spec, Single, self._saved_kwargs)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Reset the rows (those of options["reset_mask"]) and read their cars."""
+        """Reset the rows (those of options["reset_mask"]) and read their cars.
+
+        Args:
+            seed: Seed or seeds of the env.
+            options: Options of the env's reset.
+
+        Returns:
+            Observations, shape (N, width), and infos.
+        """
         mask = None if options is None else options.get("reset_mask")
         rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
         obs, infos = self.env.reset(seed=seed, options=options)
@@ -80,7 +94,14 @@ class TruthObservation(
         return np.hstack([obs, self._values, read_states(states, self._states)])
 
     def step(self, actions: Any) -> tuple[Observations, Any, Any, Any, dict[str, Any]]:
-        """One step of all rows."""
+        """Step all rows.
+
+        Args:
+            actions: Actions of the env, one a row.
+
+        Returns:
+            Observations (N, width), rewards, terminated and truncated, each (N,), and infos.
+        """
         obs, rewards, terminated, truncated, infos = self.env.step(actions)
         ended = np.logical_or(terminated, truncated)
         if self._same_step:
@@ -93,12 +114,16 @@ class TruthObservation(
         return self._append_truth(obs), rewards, terminated, truncated, infos
 
     def get_state(self) -> dict[str, Any]:
-        """A snapshot that `set_state` continues from; TypeError where the env makes none."""
+        """Return a snapshot for `set_state`; TypeError where the env makes none."""
         arrays = {"values": self._values.copy(), "ended": self._ended.copy()}
         return arrays | {"env": get_env_state(self.env)}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Go back to a snapshot of this env or of one built with the same arguments."""
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         env: Any = self.env
         env.set_state(snapshot["env"])
         self._values, self._ended = snapshot["values"].copy(), snapshot["ended"].copy()

@@ -21,8 +21,13 @@ _PARAMETERS = ("estimator", "outputs", "std", "replace", "vehicle", "options", "
 
 
 class EstimatorSpec(NamedTuple):
-    """What an estimator is built for: the vehicle as it believes it to be, the slow sensors, and
-    the speed in m/s where it is held."""
+    """Vehicle, sensors and speed for which an estimator is built.
+
+    Attributes:
+        vehicle: The vehicle as the estimator believes it to be.
+        sensors: Slow sensors by name.
+        speed: Speed (m/s) where it is held, else None.
+    """
 
     vehicle: Vehicle
     sensors: Mapping[str, SlowSensor]
@@ -30,20 +35,37 @@ class EstimatorSpec(NamedTuple):
 
     @property
     def design(self) -> Any:
-        """A key that is equal for setups that differ in the phases of their clocks alone."""
+        """A key that is equal for specs that differ in the phases of their clocks alone."""
         clocks = [(name, dataclasses.replace(s, phase=0.0)) for name, s in self.sensors.items()]
         return self.vehicle, tuple(sorted(clocks)), self.speed
 
 
 def make_spec(base: Any) -> EstimatorSpec:
-    """What a bare single env offers to estimators in its present episode."""
+    """Make the spec of a bare single env in its present episode.
+
+    Args:
+        base: Environment without wrappers.
+
+    Returns:
+        Nominal vehicle, slow sensors and held speed.
+    """
     return EstimatorSpec(base.nominal, base.slow_sensors, getattr(base, "held_speed", None))
 
 
 def build_estimator(
     source: str | EstimatorFactory, options: Mapping[str, Any], dt: float, spec: EstimatorSpec
 ) -> AnyEstimator:
-    """`make_estimator` of a name or a factory for a setup."""
+    """Build an estimator for a spec by `make_estimator`.
+
+    Args:
+        source: Name or factory.
+        options: Options of the estimator.
+        dt: Tick (s).
+        spec: Vehicle, sensors and speed.
+
+    Returns:
+        The estimator.
+    """
     vehicle, sensors, speed = spec
     return make_estimator(source, vehicle=vehicle, sensors=sensors, dt=dt, speed=speed, **options)
 
@@ -51,10 +73,25 @@ def build_estimator(
 class Arguments:
     """The checked arguments of a wrapper, and the estimators they stand for.
 
-    source: a name or a factory; None where `object` is the one estimator to use. vehicle: None for
-    the env's nominal one, or, if `truth`, the true one. recorded: what stands in the env's spec.
-    Raises ValueError for an object with a vehicle or options, which would not reach it, TypeError
-    for misplaced arguments, with the nearest name of the wrapper's or of the estimator's options.
+    Args:
+        estimator: Name, factory or object; None for `choose_estimator` of the sensors.
+        outputs: States to append.
+        std: Whether standard deviations are appended.
+        replace: Whether the inner observation is left out.
+        vehicle: Vehicle for the estimator, "truth" for the true one, None for the nominal one.
+        options: Options of the estimator.
+        name: Prefix of all names, or None.
+        slow_sensors: Slow sensors of the env by name.
+        misplaced: Keyword arguments that the wrapper does not have.
+
+    Attributes:
+        source: Name or factory; None where `object` is the one estimator to use.
+        recorded: Arguments for the env's spec.
+
+    Raises:
+        TypeError: An argument is misplaced; the message has the nearest name of the wrapper's or of
+            the estimator's options.
+        ValueError: An object has a vehicle or options, which would not reach it.
     """
 
     def __init__(
@@ -106,7 +143,18 @@ class Arguments:
         }
 
     def build(self, spec: EstimatorSpec, dt: float) -> AnyEstimator:
-        """An estimator for a setup and ticks of dt seconds; where one object is used, that one."""
+        """Build an estimator; where one object is used, return that one.
+
+        Args:
+            spec: Vehicle, sensors and speed.
+            dt: Tick (s).
+
+        Returns:
+            The estimator.
+
+        Raises:
+            ValueError: The object was built for another tick.
+        """
         if self.object is None:
             return build_estimator(self.source, self.options, dt, spec)
         if not isinstance(self.object, AnyEstimator):
@@ -120,7 +168,11 @@ class Arguments:
 
 
 class NotSerializable:
-    """In a spec in the place of an object: whoever builds from that spec gets the reason."""
+    """The place of an object in a spec: building from that spec raises the reason.
+
+    Args:
+        label: Name of the object for the message.
+    """
 
     def __init__(self, label: str) -> None:
         self._label = label
@@ -134,12 +186,19 @@ class NotSerializable:
 
 
 def choose_estimator(slow_sensors: Iterable[str]) -> str:
-    """The estimator where none is named: `dakf` where there is a GPS, else `exact-kf`."""
+    """Choose the estimator where none is named.
+
+    Args:
+        slow_sensors: Names of the slow sensors.
+
+    Returns:
+        "dakf" where there is a GPS, else "exact-kf".
+    """
     return "dakf" if "gps" in slow_sensors else "exact-kf"
 
 
 def _is_object(source: Any) -> bool:
-    """Whether this is an estimator, well made or not, rather than what builds one."""
+    """Return whether this is an estimator, well made or not, rather than what builds one."""
     if isinstance(source, str | type):
         return False
     return not callable(source) or hasattr(source, "step") or hasattr(source, "reset")

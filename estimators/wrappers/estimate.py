@@ -37,14 +37,6 @@ class EstimateObservation(
     class may be stacked, each with its own `name`; `TimeLimit` and stable-baselines3's `Monitor`
     may be inside.
 
-    estimator: a name of `make_estimator`, an entry point "package.module:Name", a factory (see
-    `EstimatorFactory`) or an object (see `EstimatorLike`), which is reset at every episode but
-    hears of no other car; None: `choose_estimator` of the env's sensors. outputs: states to append,
-    each as `<state>_hat`, then, if `std`, each one's standard deviation as `<state>_std`. replace:
-    the observation is these alone. vehicle: as the estimator believes it to be (a preset, a
-    mapping; default the env's nominal; "truth": the true car of each episode, as it is at the
-    reset). options: of `make_estimator`. name: put before every name as `<name>_`.
-
     `info` gains `beta_hat` and `beta_std` where the estimator has beta and, if beta or gamma is
     among the outputs, `nees`: their normalised estimation error squared, divided by their number.
     An estimate that is not finite is passed on, so that controllers and the env see the failure.
@@ -52,9 +44,9 @@ class EstimateObservation(
     estimator at work, around a user's own as a `ForeignEstimator`. In `spec` a factory that can be
     imported stands as its entry point; `spec.to_json()` refuses others and objects with TypeError.
 
-    Raises TypeError if it is not the innermost wrapper, the env has no record or the estimator is
-    none; ValueError for an unknown output, where names would stand twice, or for an object with a
-    vehicle or options.
+    TypeError says that it is not the innermost wrapper, that the env has no record or that the
+    estimator is none. ValueError says that an output is unknown, that names would stand twice, or
+    that an object has a vehicle or options.
 
     >>> import gymnasium as gym
     >>> env = EstimateObservation(gym.make("sideslip/YawVision-v0"), "multirate-kf")
@@ -63,6 +55,20 @@ class EstimateObservation(
 
     See also `make_estimator`, `sideslip.estimators.vector.EstimateObservation` for vector envs and
     `register_estimator`.
+
+    Args:
+        env: Environment, or wrappers that may be inside.
+        estimator: Name of `make_estimator`, entry point "package.module:Name", `EstimatorFactory`
+            or `EstimatorLike` object, which is reset at every episode but hears of no other car.
+            None for `choose_estimator` of the env's sensors.
+        outputs: States to append, each as `<state>_hat`.
+        std: Whether each one's standard deviation is appended as `<state>_std`.
+        replace: Whether the observation is these alone.
+        vehicle: Vehicle as the estimator believes it to be, a preset or a mapping; None for the
+            env's nominal. "truth" is the true car of each episode, as it is at the reset.
+        options: Options of `make_estimator`.
+        name: Put before every name as `<name>_`.
+        **misplaced: Refused; the message names the nearest argument or option.
     """
 
     def __init__(
@@ -95,7 +101,7 @@ class EstimateObservation(
         self._summary = np.zeros(3)
 
     def _update_estimator(self) -> AnyEstimator:
-        """The estimator for the env's present setup; the one at hand where nothing changed."""
+        """Return the estimator for the env's present spec; that at hand where nothing changed."""
         base, arguments, previous = self._base, self._arguments, self._estimator_spec
         spec = make_spec(base)
         if arguments.vehicle is not None:
@@ -116,30 +122,49 @@ class EstimateObservation(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Reset the env, then the estimator with this episode's clocks, and take tick 0."""
+        """Reset the env, then the estimator with this episode's clocks, and take tick 0.
+
+        Args:
+            seed: Seed of the env.
+            options: Options of the env's reset.
+
+        Returns:
+            Observation, shape (width,), and info.
+        """
         obs, info = self.env.reset(seed=seed, options=options)
         self._update_estimator().reset(self._base.slow_sensors)
         return self._append_estimates(obs, info), info
 
     def step(self, action: Any) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
-        """One env-step, whose record the estimator takes before the observation is made."""
+        """Step the env; the estimator takes its record before the observation is made.
+
+        Args:
+            action: Action of the env.
+
+        Returns:
+            Observation, shape (width,), reward, terminated, truncated and info.
+        """
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._append_estimates(obs, info), reward, terminated, truncated, info
 
     def get_state(self) -> dict[str, Any]:
-        """A snapshot of the env and the estimator that `set_state` continues from."""
+        """Return a snapshot of the env and the estimator for `set_state`."""
         inner = self.env.get_wrapper_attr("get_state")()
         return {"env": inner, "estimator": self.estimator.get_state()}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Go back to a snapshot of this env or of one built with the same arguments."""
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
         self._update_estimator().set_state(snapshot["estimator"])
 
     def _append_estimates(
         self, obs: npt.NDArray[np.float32], info: dict[str, Any]
     ) -> npt.NDArray[np.float32]:
-        """The estimator takes the newest step; the observation with its outputs, (width,)."""
+        """Process the newest step; return the observation with its outputs, (width,)."""
         base, outputs, summary = self._base, self.outputs, self._summary
         estimator: Any = self.estimator
         inner = None if self._is_native else getattr(estimator, "inner", None)
@@ -168,7 +193,17 @@ class EstimateObservation(
 
 
 def find_base_env(env: gym.Env[Any, Any]) -> Any:
-    """The base env; TypeError if anything that may hide ticks from the estimator is in between."""
+    """Find the base env, with no wrapper in between that may hide ticks from the estimator.
+
+    Args:
+        env: Environment, wrapped or not.
+
+    Returns:
+        The environment that has the record.
+
+    Raises:
+        TypeError: Another wrapper is inside, or the environment has no record.
+    """
     layer = env
     while isinstance(layer, gym.Wrapper):
         kind = type(layer)

@@ -1,4 +1,4 @@
-"""What an estimator adds to an observation, compiled: one call takes the step and writes it."""
+"""An estimator's part of an observation, compiled: one call takes the step and writes it."""
 
 from functools import cache
 from typing import Any
@@ -16,7 +16,7 @@ from ..learned.kernel import EXAMPLE, apply_correction, filter_and_correct, remo
 
 @jit
 def _clip_symmetric(value: Any, limit: Any) -> Any:
-    """The value within +-limit; NaN stays, so that a filter that failed is seen."""
+    """Clip the value to +-limit; NaN stays, so that a filter that failed is seen."""
     return value if value != value else minimum(maximum(value, 0.0 - limit), limit)
 
 
@@ -58,12 +58,28 @@ def observe(
     out: Any,
     summary: Any,
 ) -> int:
-    """`advance`, then the first `inner` entries of obs and the outputs into out.
+    """Advance the filter, then write the observation and the outputs.
 
-    plan: (m, 3), each output's state, counted through the layers, whether it is wrapped and which
-    truth it has (`outputs.TRUTHS`). limits: (m,). out: inner + m entries, or inner + 2 m with
-    standard deviations. summary: the first state, its standard deviation and the nees. Returns the
-    rows done, as `advance` does.
+    Args:
+        filters: Memory of the filter, dtype `FILTER`, shape (layers,).
+        gains: Tables of gains, shape (cells, rows, columns).
+        fast: Fast rows, shape (k, FAST_WIDTH).
+        rows: Number of fast rows to take.
+        packets: Packets, shape (capacity, PACKET_WIDTH).
+        count: Number of packets to take.
+        start: Number of rows that are done already.
+        obs: Observation of the env, float32, shape (at least inner,).
+        inner: Number of entries of `obs` to copy.
+        plan: Shape (m, 3): each output's state, counted through the layers, whether it is wrapped,
+            and its truth (`outputs.TRUTHS`).
+        limits: Bounds of the outputs in their units, shape (m,).
+        beta: True sideslip angle (rad).
+        gamma: True yaw rate (rad/s).
+        out: Output, float32, shape (inner + m,), or (inner + 2 m,) with standard deviations.
+        summary: Output, shape (3,): the first state, its standard deviation and the NEES.
+
+    Returns:
+        Number of rows done, as `advance` returns it.
     """
     X, nis = fast[:0], summary[:0]  # nothing to be filled
     done = advance(filters, gains, fast, rows, packets, count, start, X, X, nis)
@@ -98,9 +114,15 @@ def observe(
 def observe_corrected(
     filters: Any, gains: Any, record: Any, m: Any, net: Any, outputs: Any
 ) -> None:
-    """`filter_and_correct`, and what `observe` writes of the sums.
+    """Call `filter_and_correct`, and write the sums as `observe` does.
 
-    record, outputs: the arguments of `observe` before and behind `start`.
+    Args:
+        filters: Memory of the filter, dtype `FILTER`, shape (layers,).
+        gains: Tables of gains, shape (cells, rows, columns).
+        record: Arguments of `observe` from `fast` to `count`.
+        m: Memory of the correction, shape (memory_size,).
+        net: Network, as `learned.kernel.make_net` packs it.
+        outputs: Arguments of `observe` behind `start`.
     """
     fast, rows, packets, count = record
     filter_and_correct(filters, gains, fast, rows, packets, count, m, net)
@@ -111,7 +133,14 @@ def observe_corrected(
 
 @cache
 def compile_observe(corrected: bool = False) -> Any:
-    """`observe`, or `observe_corrected`, as a plain call."""
+    """Return `observe`, or `observe_corrected`, as a plain call.
+
+    Args:
+        corrected: Whether it is `observe_corrected`.
+
+    Returns:
+        A callable with the same positional arguments.
+    """
     small, wide, matrix = np.zeros(1, np.float32), np.zeros(1), np.zeros((1, 1))
     memory, record = (np.zeros(1, FILTER), np.zeros((1, 1, 1))), (matrix, 0, matrix, 0)
     outputs = small, 0, np.zeros((1, 3), np.int64), wide, 0.0, 0.0, small, wide

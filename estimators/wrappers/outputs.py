@@ -1,4 +1,4 @@
-"""What an estimator adds to an observation: states, under which names, within which bounds."""
+"""An estimator's part of an observation: states, under which names, within which bounds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,10 +25,14 @@ _wrap = as_python(wrap, ARRAYS)
 class Outputs:
     """The entries of a wrapped observation.
 
-    layout: all of them; the first `inner` are the inner observation's. plan, limits: as `observe`
-    takes them. keys: of `info`, each with its place in the summary that `observe` fills: beta and
-    its standard deviation where the filter estimates it, the nees where the truth of an output is
-    known.
+    Attributes:
+        layout: All entries; the first `inner` are the inner observation's.
+        inner: Number of inner entries.
+        plan: As `observe` takes it, shape (m, 3).
+        limits: Bounds of the outputs in their units, shape (m,).
+        keys: Keys of `info`, each with its place in the summary of `observe`. There are beta and
+            its standard deviation where the filter estimates it, and the NEES where an output's
+            truth is known.
     """
 
     layout: tuple[ObservationEntry, ...]
@@ -46,9 +50,21 @@ def make_outputs(
     name: str | None,
     inner: tuple[ObservationEntry, ...],
 ) -> Outputs:
-    """The outputs of an estimator with these states after the entries of an inner observation.
+    """Make the outputs of an estimator behind the entries of an inner observation.
 
-    Raises ValueError for an output that is no state, or where names would stand twice.
+    Args:
+        estimator: Name of the estimator for messages.
+        states: Names of its states.
+        outputs: States to append.
+        std: Whether standard deviations are appended.
+        name: Prefix of all names, or None.
+        inner: Entries of the inner observation.
+
+    Returns:
+        The entries, and how `observe` writes them.
+
+    Raises:
+        ValueError: An output is no state, or names would stand twice.
     """
     for output in outputs:
         if output not in states:
@@ -79,7 +95,15 @@ def make_outputs(
 
 
 def make_title(label: str, name: str | None) -> str:
-    """What a wrapper's estimates are called in pictures."""
+    """Make the title of a wrapper's estimates in pictures.
+
+    Args:
+        label: Name of the estimator.
+        name: Name of the wrapper, or None.
+
+    Returns:
+        The title.
+    """
     return label if name is None else f"{label} ({name})"
 
 
@@ -94,9 +118,20 @@ def write_outputs(
     out: npt.NDArray[np.float32],
     summary: Array,
 ) -> None:
-    """What `kernel.observe` writes of a filter of ours, of a user's; the arguments are the same.
+    """Write a user's estimates as `kernel.observe` writes those of a compiled filter.
 
-    Raises as `ForeignEstimator.x`.
+    Errors are those of `ForeignEstimator.x`.
+
+    Args:
+        estimator: The user's estimator.
+        obs: Observation of the env, shape (at least inner,).
+        inner: Number of entries of `obs` to copy.
+        plan: Shape (m, 3), see `kernel.observe`.
+        limits: Bounds of the outputs in their units, shape (m,).
+        beta: True sideslip angle (rad).
+        gamma: True yaw rate (rad/s).
+        out: Output, shape (inner + m,), or (inner + 2 m,) with standard deviations.
+        summary: Output, shape (3,): the first state, its standard deviation and the NEES.
     """
     x, P = np.asarray(estimator.x), np.asarray(estimator.P)
     std, states, m = compute_std(P), plan[:, 0], len(plan)

@@ -32,10 +32,18 @@ _STATES = {
 def make_truth_entries(
     parameters: Sequence[str], states: Sequence[str], inner: Sequence[ObservationEntry]
 ) -> tuple[ObservationEntry, ...]:
-    """`true_<parameter>` of each parameter of a `Vehicle` and `<state>_hat` of each state of a
-    `TrueState`, after the entries of an observation.
+    """Make the entries of true parameters and states behind those of an observation.
 
-    Raises ValueError for an unknown parameter or state, or where a name would stand twice.
+    Args:
+        parameters: Parameters of a `Vehicle`, each as `true_<parameter>`.
+        states: States of a `TrueState`, each as `<state>_hat`.
+        inner: Entries of the observation.
+
+    Returns:
+        All entries.
+
+    Raises:
+        ValueError: A parameter or state is unknown, or a name would stand twice.
     """
     fields = {field.name: field.metadata.get("unit") for field in dataclasses.fields(Vehicle)}
     entries = []
@@ -58,12 +66,28 @@ def make_truth_entries(
 
 
 def read_parameters(vehicle: Vehicle, parameters: Sequence[str]) -> npt.NDArray[np.float32]:
-    """The values of some parameters, (len(parameters),)."""
+    """Read parameters of a vehicle.
+
+    Args:
+        vehicle: The vehicle.
+        parameters: Names of `Vehicle`.
+
+    Returns:
+        Values in SI units, shape (len(parameters),).
+    """
     return np.array([getattr(vehicle, name) for name in parameters], np.float32)
 
 
 def read_states(true_state: Any, states: Sequence[str]) -> npt.NDArray[np.float32]:
-    """Some states of an array (..., len(TrueState)), within their bounds, (..., len(states))."""
+    """Read true states, clipped to their bounds.
+
+    Args:
+        true_state: States, shape (..., len(TrueState)).
+        states: Names of states.
+
+    Returns:
+        Values in SI units, shape (..., len(states)).
+    """
     limits = np.array([_STATES[name][1] for name in states])
     columns = [getattr(TRUE_STATE, name) for name in states]
     values: npt.NDArray[np.float32] = (
@@ -75,9 +99,17 @@ def read_states(true_state: Any, states: Sequence[str]) -> npt.NDArray[np.float3
 def choose_vehicle(
     estimator: Estimator | ForeignEstimator, built: Vehicle, vehicle: Vehicle
 ) -> Vehicle:
-    """The car to build an estimator for, so that the one at hand serves wherever it can.
+    """Choose the car to build an estimator for, so that the one at hand serves wherever it can.
 
-    Where gains follow P nothing is designed from the stiffnesses: `set_stiffness` will do.
+    Where gains follow P no gain is designed from the stiffnesses, and `set_stiffness` suffices.
+
+    Args:
+        estimator: The estimator at hand.
+        built: Vehicle for which it was built.
+        vehicle: True vehicle.
+
+    Returns:
+        `vehicle`, with the stiffnesses and the friction of `built` where these may stay.
     """
     if isinstance(estimator, ForeignEstimator) or estimator.filters[0].periodic:
         return vehicle
@@ -90,7 +122,12 @@ def choose_vehicle(
 
 
 def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> None:
-    """Give a filter a car's stiffnesses from its next reset on; one of a user's own has them."""
+    """Set a filter's cornering stiffnesses from its next reset on; a user's own estimator stays.
+
+    Args:
+        estimator: The estimator.
+        vehicle: Vehicle with the stiffnesses (N/rad).
+    """
     if isinstance(estimator, Estimator):
         for f in estimator.filters:
             f.car[4], f.car[5] = vehicle.front_stiffness, vehicle.rear_stiffness
@@ -99,14 +136,16 @@ def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> 
 class TruthObservation(
     gym.Wrapper[npt.NDArray[np.float32], Any, npt.NDArray[np.float32], Any], RecordConstructorArgs
 ):
-    """Appends parameters of the car that is driven, as they are at the reset, and true states.
+    """Appends parameters of the true car, as they are at the reset, and true states.
 
-    No sensor measures these: it makes the rungs with which others are compared (`agents.rungs`),
-    and stands outside of any `EstimateObservation`.
+    No sensor measures these: it makes the oracles with which others are compared (`agents.rungs`),
+    and stands outside of any `EstimateObservation`. `layout` describes the whole observation.
+    ValueError says that a name is unknown or stands twice.
 
-    parameters: names of `Vehicle`'s, appended as `true_<name>` in their units. states: names of
-    `TrueState`'s, appended as `<name>_hat` as if by an estimator without error. `layout` describes
-    the whole observation. Raises ValueError for an unknown name or one that stands twice.
+    Args:
+        env: Environment with a `layout`.
+        parameters: Names of `Vehicle`, appended as `true_<name>` in their units.
+        states: Names of `TrueState`, appended as `<name>_hat` as if by an estimator without error.
     """
 
     def __init__(
@@ -126,7 +165,15 @@ class TruthObservation(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Reset the env and read its car."""
+        """Reset the env and read its car.
+
+        Args:
+            seed: Seed of the env.
+            options: Options of the env's reset.
+
+        Returns:
+            Observation, shape (width,), and info.
+        """
         obs, info = self.env.reset(seed=seed, options=options)
         base: Any = self.unwrapped
         self._values = read_parameters(base.vehicle, self._parameters)
@@ -139,15 +186,26 @@ class TruthObservation(
         return np.concatenate([obs, self._values, read_states(base.true_state, self._states)])
 
     def step(self, action: Any) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
-        """One env-step."""
+        """Step the env.
+
+        Args:
+            action: Action of the env.
+
+        Returns:
+            Observation, shape (width,), reward, terminated, truncated and info.
+        """
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._append_truth(obs), reward, terminated, truncated, info
 
     def get_state(self) -> dict[str, Any]:
-        """A snapshot of the env and the parameters that `set_state` continues from."""
+        """Return a snapshot of the env and the parameters for `set_state`."""
         return {"env": self.env.get_wrapper_attr("get_state")(), "values": self._values.copy()}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Go back to a snapshot of this env or of one built with the same arguments."""
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
         self._values = snapshot["values"].copy()

@@ -1,8 +1,8 @@
-"""A memory learns from a teacher that filters, and acts.
+"""A memory learns to imitate a teacher with a filter.
 
-In a linear scenario what an action costs more than the best one is S_j (u - u*)^2, u* the action
-of the optimal filter's estimate: who imitates it where he himself drives minimises his cost, and
-what he lacks is memory, not exploration.
+In a linear scenario an action costs S_j (u - u*)^2 more than the optimum, with u* the action of
+the optimal filter's estimate. So imitation on the student's own drives minimises its cost, and the
+student needs memory, not exploration.
 """
 
 import itertools
@@ -33,9 +33,12 @@ import torch  # isort: skip  # after ours, which say which extra is missing
 
 
 class MemoryAgent:
-    """A memory that acts: stable-baselines3's `predict` on plain observations (N, k).
+    """A memory as an agent: stable-baselines3's `predict` on plain observations.
 
-    mean, scale: (k,) of the observations.
+    Args:
+        model: Network with memory.
+        mean: Means of the observation, shape (k,).
+        scale: Factors of the observation, shape (k,).
     """
 
     def __init__(self, model: MemoryNetwork, mean: Array, scale: Array) -> None:
@@ -48,7 +51,14 @@ class MemoryAgent:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Single, Any]:
-        """The actions (N, 1) and the next state; where an episode starts the state is zero."""
+        """Compute actions (N, 1) and the next state.
+
+        Args:
+            observation: Observations, shape (N, k).
+            state: State from the last call; None at the start.
+            episode_start: Rows whose state is cleared, shape (N,).
+            deterministic: Without effect.
+        """
         z = torch.from_numpy(normalise_inputs(observation, self.mean, self.scale))[:, None]
         if state is not None and episode_start is not None and np.any(episode_start):
             state = state.clone()
@@ -66,13 +76,19 @@ def train_memory(
     weight: float = 1.0,
     report: Callable[[RoundResult], None] = lambda _: None,
 ) -> MemoryAgent:
-    """A memory of `MEMORIES` that learned to act as a lesson's teacher, by DAgger.
+    """Train a memory to act as a task's teacher, by DAgger.
 
-    config: all but `cells` and `hidden`. late: steps that a packet is old when it arrives. weight:
-    S, what the square of an error costs. report: called after each round.
+    Args:
+        name: Key of `MEMORIES`.
+        task: Cars and teacher.
+        config: Configuration, of which `cells` and `hidden` have no effect.
+        delay_steps: Control periods between a packet's capture and its arrival.
+        weight: S, the cost of a squared error.
+        report: Function that is called after each round.
 
-    Raises ValueError for an unknown name, or a lesson whose observation does not say whether a
-    packet arrived; FloatingPointError, with the step, where the training diverges.
+    Raises:
+        ValueError: The name is unknown, or the observation does not say whether a packet arrived.
+        FloatingPointError: The training diverges; the message has the step.
     """
     cars = task.cars
     names = [entry.name for entry in cars.layout]

@@ -1,5 +1,4 @@
-"""What networks with memory read of a linear env: its observation without what says nothing, and
-with the camera's offset as a rate."""
+"""Compact observations of a linear env for networks with memory."""
 
 from typing import Any
 
@@ -21,10 +20,13 @@ MAX_AGE = 1.0  # s, from which on an age is no older
 class CompactObservation(VectorWrapper[Any, Any, Any, Any, Any]):
     """A vector env whose observations networks learn from more easily.
 
-    The lateral offset wanders over metres and is measured to a millimetre, so it becomes its mean
-    rate between the last two pictures, zero until there are two: with the pictures' ages the same
-    information, but for the first one's. Ages end at `MAX_AGE`; entries that begin as in `SILENT`
-    and the references are left out.
+    The lateral offset varies over metres and is measured to a millimetre. It becomes its mean rate
+    between the last two pictures, zero until there are two. With the pictures' ages that is the
+    same information, but for the first picture's. Ages end at `MAX_AGE`; entries that begin as in
+    `SILENT` and the references are left out.
+
+    Args:
+        env: Vector env of a linear scenario.
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
@@ -46,14 +48,26 @@ class CompactObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         self._last = np.full((3, env.num_envs), AGE_CAP)  # offset, its rate, age of the picture
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Single, dict[str, Any]]:
-        """The inner env's, of all rows; ValueError for some of them."""
+        """Reset all rows.
+
+        Args:
+            seed: Seeds of the inner env.
+            options: Options of the inner env, without `reset_mask`.
+
+        Raises:
+            ValueError: Only some rows are to be reset.
+        """
         if "reset_mask" in (options or {}):
             raise ValueError("rates of the lateral offset begin together: reset all rows at once")
         obs, infos = self.env.reset(seed=seed, options=options)
         return self._read(obs), infos
 
     def step(self, actions: Any) -> tuple[Single, Any, Any, Any, dict[str, Any]]:
-        """The inner env's."""
+        """Step the inner env and compute the observations.
+
+        Args:
+            actions: Actions, shape (N, width).
+        """
         obs, *rest = self.env.step(actions)
         return self._read(obs), *rest
 

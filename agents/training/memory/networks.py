@@ -1,8 +1,8 @@
-"""Kinds of memory as small networks, which learn all in the same way and are run the same way.
+"""Kinds of memory as small networks, which are all trained and run in the same way.
 
-Each reads normalised observations step by step and carries a state (B, ...), zero where an episode
-begins. What they do with the past is their difference: nothing, keep it, gate it (GRU), let it fade
-(linear), observe a linear car (Kalman), look back at it (transformer).
+Each reads normalised observations step by step and has a state (B, ...), zero where an episode
+begins. They differ in what the memory does: nothing, stack frames, gate (GRU), decay linearly,
+observe a linear car (Kalman), attend to the past (transformer).
 """
 
 import itertools
@@ -27,10 +27,12 @@ _FADE_STEPS = (2.0, 300.0)  # over which a linear memory fades to 1/e when it is
 
 
 class MemoryNetwork(nn.Module):
-    """What all have in common: inputs without correlation, a memory, layers that act.
+    """The base of memories: whitened inputs, a memory, and layers for the action.
 
-    inputs: entries of an observation. fresh: which of them says that a packet arrived. late:
-    control periods that a packet is old when it arrives.
+    Args:
+        inputs: Number of entries of an observation.
+        fresh_index: Entry that says whether a packet arrived.
+        delay_steps: Control periods between a packet's capture and its arrival.
     """
 
     rate: ClassVar[float] = 1e-2
@@ -45,30 +47,47 @@ class MemoryNetwork(nn.Module):
         self.head: nn.Module = make_dense_layers(self._build_memory() + inputs, *HIDDEN, 1)
 
     def _build_memory(self) -> int:
-        """Make the memory; the width of what `_update_memory` gives."""
+        """Build the memory, and return the width of the output of `_update_memory`."""
         return 0
 
     def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
-        """What is known after each step (B, T, m), and the next state, of inputs z (B, T, k);
-        arrived: (B, T, 1) whether a packet came."""
+        """Compute the memory after each step (B, T, m), and the next state.
+
+        z: inputs (B, T, k). arrived: whether a packet came, (B, T, 1).
+        """
         return z[..., :0], state
 
     def fit_whitening(self, drives: Sequence[Demonstrations], mean: Array, scale: Array) -> None:
-        """Mix the inputs so that their covariance on drives is one."""
+        """Fit the whitening of the inputs on drives.
+
+        Args:
+            drives: Demonstrations.
+            mean: Means of the observation, shape (k,).
+            scale: Factors of the observation, shape (k,).
+        """
         inputs = np.concatenate([normalise_inputs(demo.obs, mean, scale) for demo in drives])
         self.mix.copy_(
             torch.from_numpy(compute_whitening(inputs.reshape(-1, self.inputs), _MIN_STD**2))
         )
 
     def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
-        """(actions (B, T, 1), the next state) of normalised observations (B, T, k)."""
+        """Compute actions (B, T, 1) and the next state.
+
+        Args:
+            z: Normalised observations, shape (B, T, k).
+            state: State from the last call; None at the start.
+        """
         arrived, z = (z[..., self.fresh_index, None] > 0.0).to(z.dtype), z @ self.mix
         known, state = self._update_memory(z, arrived, state)
         return self.head(torch.cat([known, z], -1)), state
 
 
 def make_dense_layers(*sizes: int) -> nn.Sequential:
-    """Layers of these sizes with SiLU between them."""
+    """Make dense layers with SiLU between them.
+
+    Args:
+        sizes: Sizes of input, hidden layers and output.
+    """
     layers: list[nn.Module] = []
     for a, b in itertools.pairwise(sizes):
         layers += [nn.Linear(a, b), nn.SiLU()]
@@ -111,8 +130,10 @@ class Gru(MemoryNetwork):
 
 
 class LinearRnn(MemoryNetwork):
-    """32 complex numbers that turn and fade, each at its own rate, whatever arrives (the LRU of
-    Orvieto et al., ICML 2023)."""
+    """32 complex numbers that rotate and decay at their own rates.
+
+    Source: the LRU of Orvieto et al., ICML 2023.
+    """
 
     size = 32
 
@@ -125,12 +146,12 @@ class LinearRnn(MemoryNetwork):
         return 2 * self.size
 
     def _compute_powers(self, steps: int) -> Any:
-        """What 0 to steps - 1 steps leave of each number, (steps, n)."""
+        """Compute the factors of 0 to steps - 1 steps on each number, (steps, n)."""
         once = torch.complex(-torch.exp(self.fade), self.turn)
         return torch.exp(torch.arange(steps)[:, None] * once)
 
     def _project_inputs(self, z: Any) -> Any:
-        """What inputs add, (B, T, n), so scaled that white ones give states of one size."""
+        """Project inputs, (B, T, n), so that white ones give states of one size."""
         unit = torch.sqrt(1.0 - torch.exp(-2.0 * torch.exp(self.fade)))
         return torch.view_as_complex(self.read(z).unflatten(-1, (self.size, 2))) * unit
 
@@ -146,13 +167,17 @@ class LinearRnn(MemoryNetwork):
 
 
 class Kalman(LinearRnn):
-    """An observer of a linear car that is learned, for packets that come late.
+    """A learned observer of a linear car, for packets that come late.
 
-    It lives `late` steps ago, where the numbers of a linear memory turn and fade as the car's own
-    modes, and at a packet's arrival x+ = x + L (y - C x), y a mix of the inputs; L grows with the
-    time since the last packet, as a filter's gain does. What it knows now is that, led through the
-    inputs since then: what rewinding and filtering again comes to where gains are constant. The
-    action is linear in it.
+    Its state is `delay_steps` old and its numbers rotate and decay as the car's modes. At a
+    packet's arrival x+ = x + L (y - C x), with y a mix of the inputs; L grows with the time since
+    the last packet, as a filter's gain does. The present follows from the inputs since then: equal
+    to rewinding and filtering again where gains are constant. The action is linear in it.
+
+    Args:
+        inputs: Number of entries of an observation.
+        fresh_index: Entry that says whether a packet arrived.
+        delay_steps: Control periods between a packet's capture and its arrival.
     """
 
     size, outputs = 16, 4
@@ -246,8 +271,17 @@ MEMORIES: dict[str, type[MemoryNetwork]] = {
 
 
 def make_memory(name: str, inputs: int, fresh_index: int, delay_steps: int) -> MemoryNetwork:
-    """A new network of `MEMORIES`, arguments as of `Memory`; ValueError for an unknown name, or
-    numbers that are out of range."""
+    """Make a new network of `MEMORIES`.
+
+    Args:
+        name: Key of `MEMORIES`.
+        inputs: Number of entries of an observation.
+        fresh_index: Entry that says whether a packet arrived.
+        delay_steps: Control periods between a packet's capture and its arrival.
+
+    Raises:
+        ValueError: The name is unknown, or a number is out of range.
+    """
     check_choice("memory", name, MEMORIES)
     if not 0 <= fresh_index < inputs or delay_steps < 0:
         raise ValueError(

@@ -1,2 +1,1 @@
-"""Drives that students learn from, and running means that they remember with: by torch, and as
-observations of an env."""
+"""Demonstrations for students, and moving averages: by torch, and as observations of an env."""

@@ -1,5 +1,4 @@
-"""What a student learns from, drives, and what it makes of their observations: scaled, and without
-correlation."""
+"""Demonstrations that a student learns from, and the scaling and whitening of its inputs."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -15,15 +14,22 @@ Single = npt.NDArray[np.float32]
 
 CLIP = 8.0  # of an input, scaled
 UNREAD = ("gps_X", "gps_Y", "gps_satellites")
-"""Where the car is says nothing of how to hold it."""
+"""Entries without information for control, as they only locate the car."""
 _MIN_VARIANCE = 1e-3  # variance, of what varies by 1, that a mixture of inputs has at least
 _EARLY, _MEDIAN = 16.0, 50.0  # percentiles of an age
 
 
 class Demonstrations(NamedTuple):
-    """Episodes of a lesson, oldest step first: observations (N, T, k), the teacher's actions
-    (N, T, m), what it reads that is not in them (N, T, q), and the weights of the actions' errors
-    (N, T), zero where an episode was over. curvature: (m, m), of a lesson. costs: (N,)."""
+    """Episodes of a task, oldest step first.
+
+    Attributes:
+        obs: Observations, shape (N, T, k).
+        labels: The teacher's actions, shape (N, T, m).
+        privileged: The teacher's inputs that the observations lack, shape (N, T, q).
+        weights: Weights of the actions' errors, shape (N, T), zero after an episode's end.
+        curvature: Weight of an action's error, shape (m, m).
+        costs: Costs J, shape (N,).
+    """
 
     obs: Single
     labels: Single
@@ -34,16 +40,19 @@ class Demonstrations(NamedTuple):
 
     @property
     def zero_loss(self) -> float:
-        """The loss of a student that does nothing, all episodes together."""
+        """Loss of a student whose actions are zero, summed over episodes."""
         losses = np.einsum("nti,ij,ntj->nt", self.labels, self.curvature, self.labels)
         return float((losses * self.weights).sum())
 
 
 class Scaling(NamedTuple):
-    """What a student makes of an observation: clip((x - mean) scale) mixing.
+    """The scaling of a student's inputs: clip((x - mean) scale) mixing.
 
-    mean, scale: (k,), scale zero of what is not read. mixing: (k, k), symmetric; what varies
-    little while its parts vary much, as course less heading, then varies as much as they do.
+    Attributes:
+        mean: Means, shape (k,).
+        scale: Factors, shape (k,), zero for an entry that is not read.
+        mixing: Symmetric whitening, shape (k, k): it scales up what varies little while its parts
+            vary much, such as course less heading.
     """
 
     mean: Array
@@ -51,7 +60,11 @@ class Scaling(NamedTuple):
     mixing: Array
 
     def mix_inputs(self, obs: Single) -> Single:
-        """Inputs of a `Student`, of observations (..., k)."""
+        """Compute a `Student`'s inputs.
+
+        Args:
+            obs: Observations, shape (..., k).
+        """
         mixing = self.mixing.astype(np.float32)
         return normalise_inputs(obs, self.mean, self.scale) @ mixing
 
@@ -62,12 +75,17 @@ def compute_scaling(
     needs: Sequence[str],
     usual_ages: bool = True,
 ) -> Scaling:
-    """How a student sees what these drives see.
+    """Compute the scaling of a student's inputs from drives.
 
-    needs: what the teacher reads. A student that has all of it reads nothing else, of which it
-    would only learn noise; one that has less reads whatever varies, but for `UNREAD`. usual_ages:
-    an age is scaled as it varies while packets come, and lies at the clip before the first and long
-    after the last one; else by its deviation, as everything.
+    A student that has all of `needs` reads nothing else, which would only be noise to it. One that
+    has less reads all that varies, but for `UNREAD`.
+
+    Args:
+        drives: Demonstrations.
+        layout: Entries of the observation.
+        needs: Entries that the teacher reads.
+        usual_ages: Whether an age is scaled by its variation while packets come, and clipped before
+            the first and long after the last one; else by its deviation.
     """
     x = np.concatenate([demo.obs[demo.weights > 0.0] for demo in drives])
     names = [entry.name for entry in layout]
@@ -83,5 +101,11 @@ def compute_scaling(
 
 
 def normalise_inputs(obs: Single, mean: Array, scale: Array) -> Single:
-    """Observations (..., k) as a student reads them."""
+    """Normalise observations: clip((x - mean) scale).
+
+    Args:
+        obs: Observations, shape (..., k).
+        mean: Means, shape (k,).
+        scale: Factors, shape (k,).
+    """
     return np.clip((obs - mean.astype(np.float32)) * scale.astype(np.float32), -CLIP, CLIP)

@@ -1,4 +1,4 @@
-"""Running means by torch, for training: `MovingAverages` of the runtime, whole episodes at once."""
+"""Moving averages by torch, for training: `MovingAverages` of the runtime, by whole episodes."""
 
 import functools
 from collections.abc import Sequence
@@ -21,11 +21,15 @@ _MIN_SHARE = 1e-300  # instead of nothing: what a first step leaves of what was 
 
 
 class TraceLayer(nn.Module):
-    """The inputs and so many bent units, with the means of all.
+    """The inputs and SiLU units, with the moving averages of all.
 
-    inputs: as many units are plain: the inputs themselves. bent: units of a layer of SiLU. What is
-    plain and its means go on mixed, less `mean` times `mixing`: what tells most, as how a sensor
-    changes, is the small difference of two of them.
+    The inputs and their averages are whitened: `mean` is subtracted, and `mixing` multiplies. The
+    small difference of two of them often has most information, as of how a sensor changes.
+
+    Args:
+        inputs: Number of inputs.
+        n_silu: Number of SiLU units.
+        times: Steps of the moving averages.
     """
 
     def __init__(self, inputs: int, n_silu: int, times: Sequence[float] = TIMES) -> None:
@@ -40,13 +44,19 @@ class TraceLayer(nn.Module):
 
     @property
     def size(self) -> int:
-        """Numbers of the output: of the plain units and their means, then of the bent ones."""
+        """Size of the output: inputs and their averages, then SiLU units and theirs."""
         return (self.inputs + self.unit.out_features) * (1 + len(self.times))
 
     def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
-        """(units and means (B, T, size), the next state) of inputs (B, T, k), all of one age.
+        """Compute units and averages of inputs whose episodes began together.
 
-        state: (B, times, units + 1) means, and steps so far; None where episodes begin.
+        Args:
+            z: Inputs, shape (B, T, k).
+            state: Averages and number of steps so far, shape (B, times, units + 1); None at the
+                start.
+
+        Returns:
+            Units and averages (B, T, size), and the next state.
         """
         u = torch.cat([z, nn.functional.silu(self.unit(z))], -1)
         if state is None:
@@ -64,7 +74,11 @@ class TraceLayer(nn.Module):
         return torch.cat([mixed, silu], -1), torch.cat([means, age], -1)
 
     def fit_whitening(self, samples: Sequence[tuple[Any, Any]]) -> None:
-        """Mix by what the plain part is on inputs (B, T, k) where a mask (B, T) says so."""
+        """Fit the whitening of inputs and their averages.
+
+        Args:
+            samples: Inputs (B, T, k) and masks (B, T) of the steps that count.
+        """
         with torch.no_grad():
             outputs = [
                 self(torch.from_numpy(z))[0][..., : len(self.mean)][torch.from_numpy(mask)][
@@ -77,7 +91,11 @@ class TraceLayer(nn.Module):
         self.mixing.copy_(torch.from_numpy(compute_whitening(linear, MIN_VARIANCE)))
 
     def cell(self, mixing: Array) -> MovingAverages:
-        """The units of inputs that are mixed first, (k, k), by NumPy."""
+        """Make the runtime's layer for inputs that are mixed first.
+
+        Args:
+            mixing: Mixing of the inputs, shape (k, k).
+        """
         silu_weights = self.unit.weight.detach().numpy() @ mixing
         bias = np.concatenate([np.zeros(self.inputs), self.unit.bias.detach().numpy()])
         return MovingAverages(
@@ -85,8 +103,14 @@ class TraceLayer(nn.Module):
         )
 
     def convert_weights(self, weight: Array, bias: Array) -> tuple[Array, Array]:
-        """Weights (m, size) and biases (m,) of the next layer for what `cell` gives: time by time,
-        plain units before bent ones, not mixed."""
+        """Convert the next layer's weights for the output of `cell`.
+
+        That output is in the order of times, inputs before SiLU units, without whitening.
+
+        Args:
+            weight: Weights, shape (m, size).
+            bias: Biases, shape (m,).
+        """
         size, times = len(self.mean), 1 + len(self.times)
         linear = weight[:, :size] @ self.mixing.numpy().astype(np.float64).T
         bias = bias - linear @ self.mean.numpy()
@@ -96,8 +120,11 @@ class TraceLayer(nn.Module):
 
 @functools.cache
 def _compute_weights(times: tuple[float, ...], first: int, steps: int) -> tuple[Any, Any]:
-    """What each step of a block counts for in the means of each, (times, T, T), and what was
-    before, (times, T); first: steps before the block."""
+    """Compute the weights of a block's moving averages.
+
+    Returns each step's weight (times, T, T) and the past's (times, T). first: steps before the
+    block.
+    """
     ages = first + 1.0 + np.arange(steps)
     shares = np.maximum(1.0 / ages, -np.expm1(-1.0 / np.array(times))[:, None])
     left = np.log(np.maximum(1.0 - shares, _MIN_SHARE)).cumsum(-1)

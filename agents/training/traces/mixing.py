@@ -1,4 +1,4 @@
-"""Inputs without correlation."""
+"""Whitening: inputs without correlation."""
 
 from typing import Any
 
@@ -11,12 +11,21 @@ MIN_VARIANCE = 1e-4  # variance that a mixture of means has at least
 
 
 def compute_scale(spread: Any, minimum: float = 1e-9) -> Array:
-    """One over each standard deviation, zero of what does not vary."""
+    """Compute the inverse of each standard deviation, zero where nothing varies.
+
+    Args:
+        spread: Standard deviations, shape (k,).
+        minimum: Deviation below which an input counts as constant.
+    """
     return np.where(spread > minimum, 1.0 / np.maximum(spread, minimum), 0.0)
 
 
 def compute_whitening(z: Any, minimum: float) -> Array:
-    """(k, k) what makes the covariance of z (n, k) one; a smaller eigenvalue counts as
-    `minimum`."""
+    """Compute the symmetric matrix that makes a covariance one, shape (k, k).
+
+    Args:
+        z: Samples, shape (n, k).
+        minimum: Least eigenvalue of the covariance.
+    """
     sizes, axes = np.linalg.eigh(np.cov(z, rowvar=False))
     return np.asarray(axes / np.sqrt(np.maximum(sizes, minimum)) @ axes.T)

@@ -1,4 +1,4 @@
-"""What a policy remembers as an observation, so that whoever learns needs no memory."""
+"""A policy's memory as an observation, for algorithms without memory."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,20 +17,33 @@ PolicyFunction = Callable[[Any], Any]
 
 
 class Mixing(NamedTuple):
-    """What is remembered, x (k,), without correlation: (x - mean) mixing, which is symmetric."""
+    """The whitening of memory features x: (x - mean) mixing.
+
+    Attributes:
+        mean: Means, shape (k,).
+        mixing: Symmetric matrix, shape (k, k).
+    """
 
     mean: Array
     mixing: Array
 
     def adapt_to_mixed(self, network: Network) -> Network:
-        """A network of mixed x that gives what one of plain x does."""
+        """Adapt a network of plain x to mixed x.
+
+        Args:
+            network: Network of plain x.
+        """
         first = network.weights[0] @ np.linalg.inv(self.mixing)
         return _replace_first_layer(
             network, first, network.biases[0] + network.weights[0] @ self.mean
         )
 
     def adapt_to_plain(self, network: Network) -> Network:
-        """A network of plain x that gives what one of mixed x does."""
+        """Adapt a network of mixed x to plain x.
+
+        Args:
+            network: Network of mixed x.
+        """
         first = network.weights[0] @ self.mixing
         return _replace_first_layer(network, first, network.biases[0] - first @ self.mean)
 
@@ -41,10 +54,14 @@ def _replace_first_layer(network: Network, weights: Array, biases: Array) -> Net
 
 
 class MemoryObservation(VectorWrapper[Any, Any, Any, Any, Any]):
-    """A vector env whose observations (N, k) are what a network's dense layers read.
+    """A vector env whose observations (N, k) are the inputs of a network's dense layers.
 
-    env: resets a row in the step that ends it; its observation is the network's. What the network
-    remembers of a row begins anew with its episode. mixing: of the observations, None for none.
+    A row's memory starts anew with its episode.
+
+    Args:
+        env: Vector env that resets a row in the step that ends it, with the network's observation.
+        network: Network with memory.
+        mixing: Whitening of the observations, None for none.
     """
 
     def __init__(
@@ -62,7 +79,12 @@ class MemoryObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         self._last = np.zeros(self.observation_space.shape or (), np.float32)
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        """The inner env's; rows that a `reset_mask` leaves out go on, and are not read twice."""
+        """Reset the rows; those that a `reset_mask` leaves out keep their memory and observation.
+
+        Args:
+            seed: Seeds of the inner env.
+            options: Options of the inner env.
+        """
         mask = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_)))
         obs, infos = self.env.reset(seed=seed, options=options)
         new_state, updated = np.zeros_like(self._state[mask]), self._last.copy()
@@ -71,7 +93,11 @@ class MemoryObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         return updated.copy(), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """The inner env's; `final_obs` of its infos too."""
+        """Step the inner env and compute the observations, `final_obs` of the infos too.
+
+        Args:
+            actions: Actions, shape (N, width).
+        """
         obs, rewards, terminated, truncated, infos = self.env.step(actions)
         over = terminated | truncated
         if over.any():
@@ -87,7 +113,7 @@ class MemoryObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         return self._last.copy(), rewards, terminated, truncated, infos
 
     def _read(self, obs: Any, state: Any) -> Any:
-        """(N, k) float32; state (N, memory) is updated."""
+        """Compute observations (N, k), float32; the state (N, memory) is updated."""
         x = self._network.compute_features(obs.astype(np.float64), state)
         if self._mixing is None:
             return x.astype(np.float32)
@@ -97,9 +123,13 @@ class MemoryObservation(VectorWrapper[Any, Any, Any, Any, Any]):
 def measure_mixing(
     env: VectorEnv[Any, Any, Any], network: Network, drive: PolicyFunction, seed: int
 ) -> Mixing:
-    """By what a network remembers in its own drives: one episode of each row, from a seed on.
+    """Measure the whitening in a network's own drives, one episode of each row.
 
-    env: as of `MemoryObservation`. drive: gives actions of what its dense layers read.
+    Args:
+        env: Vector env, as for `MemoryObservation`.
+        network: Network with memory.
+        drive: Function from the inputs of its dense layers to actions.
+        seed: Seed of the first row.
     """
     wrapped, collected = MemoryObservation(env, network), []
     obs, _ = wrapped.reset(seed=seed)

@@ -26,23 +26,47 @@ class FieldOfView(NamedTuple):
 
 @jit
 def compute_lane_quality(motion: Any, field_of_view: Any) -> Any:
-    """The quality of a picture: 1, or 0 where the lane is out of view."""
+    """Compute the quality of a camera sample.
+
+    Args:
+        motion: `Motion` of the car.
+        field_of_view: `FieldOfView`.
+
+    Returns:
+        1, or 0 where the lane is out of view.
+    """
     is_turned = absolute(wrap(motion.psi - motion.theta)) > field_of_view.heading
     return select(is_turned | (absolute(motion.y) > field_of_view.offset), 0.0, 1.0)
 
 
 @inline
 def compute_preview_offset(y: Any, psi: Any, kappa: Any, l_pre: Any) -> Any:
-    """Lateral offset y_l in m at the preview point, positive to the left of the lane's centre line.
+    """Compute the lateral offset y_l at the preview point from the lane's centre line.
 
-    y: m, of the centre of gravity. psi: rad, relative to the lane. kappa: 1/m. l_pre: m.
+    Args:
+        y: Offset of the centre of gravity (m), left positive.
+        psi: Heading relative to the lane (rad).
+        kappa: Curvature of the lane (1/m).
+        l_pre: Preview distance (m).
+
+    Returns:
+        y_l (m), left positive.
     """
     return y + l_pre * psi - 0.5 * kappa * l_pre * l_pre  # tie-vision (4) with curvature
 
 
 @jit
 def compute_lane_offset(motion: Any, road: Any, l_pre: Any) -> Any:
-    """`compute_preview_offset` of a Motion on a road."""
+    """Compute `compute_preview_offset` of a Motion on a road.
+
+    Args:
+        motion: `Motion` of the car.
+        road: `RoadParams`.
+        l_pre: Preview distance (m).
+
+    Returns:
+        y_l (m), left positive.
+    """
     return compute_preview_offset(
         motion.y, motion.psi - motion.theta, compute_curvature(road, motion.s), l_pre
     )
@@ -50,6 +74,17 @@ def compute_lane_offset(motion: Any, road: Any, l_pre: Any) -> Any:
 
 @jit
 def sample_camera(motion: Any, road: Any, l_pre: Any, noise: Any, n: Any) -> Any:
-    """(psi, y_l): heading relative to the road, and `compute_lane_offset`."""
+    """Sample the camera's heading relative to the road and its lateral offset, with noise.
+
+    Args:
+        motion: `Motion` of the car.
+        road: `RoadParams`.
+        l_pre: Preview distance (m).
+        noise: `Noise`.
+        n: Standard normal numbers, at least two.
+
+    Returns:
+        psi (rad) and y_l (m).
+    """
     psi, y_l = motion.psi - motion.theta, compute_lane_offset(motion, road, l_pre)
     return wrap(psi + noise.camera_psi * n[0]), y_l + noise.camera_y * n[1]

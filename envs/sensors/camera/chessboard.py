@@ -15,10 +15,17 @@ MIN_BOARDS = 3  # boards
 def calibrate_camera(
     paths: Sequence[Path], corners: tuple[int, int] = (9, 6)
 ) -> tuple[Pinhole, float]:
-    """(camera, root mean square of the corners in pixels) from photographs that show a board with
-    so many inner corners; its tilt and height are the defaults.
+    """Compute a camera's intrinsics from photographs of a chessboard; tilt and height are defaults.
 
-    Raises ValueError where fewer than three of them show one, and for photographs of two sizes.
+    Args:
+        paths: Files of the photographs; those without a board are skipped.
+        corners: Inner corners of the board along its two sides.
+
+    Returns:
+        The camera, and the root mean square error of the corners (px).
+
+    Raises:
+        ValueError: If fewer than three show a board, or photographs have different sizes.
     """
     board = np.zeros((corners[0] * corners[1], 3), np.float32)
     board[:, :2] = np.mgrid[: corners[0], : corners[1]].T.reshape(-1, 2)

@@ -26,7 +26,7 @@ _SIDE = 0.15  # of a score, lost for every lane's width that the car would be of
 
 
 class LaneFit(NamedTuple):
-    """A lane's heading, offset and curvature, and what they rest on."""
+    """A lane's heading, offset and curvature, and the support of the fit."""
 
     psi: float  # rad, of the car against the lane
     y: float  # m, of the car to the left of its middle
@@ -37,20 +37,27 @@ class LaneFit(NamedTuple):
     error: Array  # (2,), standard errors of psi in rad and of y_l in m
 
     def compute_support(self, weight: Array) -> float:
-        """The weight of the points on both markings, the weaker one's above all."""
+        """Compute the weight of the points on both markings, dominated by the weaker one's.
+
+        Args:
+            weight: Weight of each point, shape (n,).
+
+        Returns:
+            The support.
+        """
         left, right = (float(np.sum(weight[self.side == side])) for side in (1, -1))
         return min(left, right) + 0.25 * (left + right)
 
 
 class FitStart(NamedTuple):
-    """Where a fit begins: psi, y, kappa, pitch and roll, and what speaks for it."""
+    """Start of a fit: its score, and psi, y, kappa, pitch and roll."""
 
     score: float
     values: Array  # (5,)
 
 
 class CameraMount(NamedTuple):
-    """Where a camera is, and what it looks for."""
+    """Place of a camera, and the lane that it looks for."""
 
     height: float  # m
     forward: float  # m
@@ -59,7 +66,14 @@ class CameraMount(NamedTuple):
 
 
 def compute_tolerance(x: Array) -> Array:
-    """How far in m from a marking a point belongs to it, X metres ahead."""
+    """Compute the distance from a marking within which a point belongs to it.
+
+    Args:
+        x: Distance ahead (m).
+
+    Returns:
+        Tolerance (m), in the shape of x.
+    """
     return 0.05 + 0.006 * x
 
 
@@ -78,8 +92,19 @@ def _draw_triples(x: Array, y: Array, weight: Array, rng: np.random.Generator) -
 
 
 def search_starts(x: Array, y: Array, weight: Array, mount: CameraMount) -> list[FitStart]:
-    """Starts for `fit_lane`: pairs of markings that hold many of the points, the best first; none
-    where no three points can be a marking. The draws are the same for as many points."""
+    """Search starts for `fit_lane`: pairs of markings that hold many of the points.
+
+    The random draws depend on the number of points alone.
+
+    Args:
+        x: Distance of the points ahead (m), shape (n,).
+        y: Distance of the points to the left (m), shape (n,).
+        weight: Weight of each point, shape (n,).
+        mount: Place of the camera.
+
+    Returns:
+        Starts, the best first; none where no three points can be a marking.
+    """
     if len(x) < 6:
         return []
     rng = np.random.Generator(np.random.SFC64(len(x)))
@@ -116,7 +141,18 @@ def search_starts(x: Array, y: Array, weight: Array, mount: CameraMount) -> list
 def correct_attitude(
     x: Array, y: Array, pitch: float, roll: float, mount: CameraMount
 ) -> tuple[Array, Array]:
-    """Points of the road from where they seem to be without pitch and roll."""
+    """Compute the places of points of the road from those seen without pitch and roll.
+
+    Args:
+        x: Apparent distance ahead (m), shape (n,).
+        y: Apparent distance to the left (m), shape (n,).
+        pitch: Pitch of the body (rad), nose down positive.
+        roll: Roll of the body (rad), left side up positive.
+        mount: Place of the camera.
+
+    Returns:
+        Distances ahead and to the left (m), shape (n,) each.
+    """
     (sp, cp), (sr, cr) = ((np.sin(angle), np.cos(angle)) for angle in (pitch, roll))
     x, up = x - mount.forward, -mount.height
     y, up = y * cr - up * sr, y * sr + up * cr
@@ -134,7 +170,18 @@ def correct_attitude(
 def project_to_lane(
     x: Array, y: Array, psi: float, offset: float, kappa: float
 ) -> tuple[Array, Array]:
-    """(along, across) in m of points against the middle of a lane of constant curvature."""
+    """Compute the coordinates of points against the middle of a lane of constant curvature.
+
+    Args:
+        x: Distance ahead (m), shape (n,).
+        y: Distance to the left (m), shape (n,).
+        psi: Heading of the car against the lane (rad).
+        offset: Offset of the car to the left of the lane's middle (m).
+        kappa: Curvature of the lane (1/m).
+
+    Returns:
+        Distances along and across (m), shape (n,) each.
+    """
     u = x * np.cos(psi) - y * np.sin(psi)
     v = offset + x * np.sin(psi) + y * np.cos(psi)
     w = 2.0 * v - kappa * (u * u + v * v)
@@ -144,8 +191,18 @@ def project_to_lane(
 def fit_lane(
     x: Array, y: Array, deviation: Array, start: Array, mount: CameraMount
 ) -> LaneFit | None:
-    """The least squares from a start (5,), by Gauss and Newton; None where the points do not hold
-    both markings. deviation: m, of each point across."""
+    """Fit a lane by least squares from a start, by Gauss and Newton.
+
+    Args:
+        x: Distance of the points ahead (m), shape (n,).
+        y: Distance of the points to the left (m), shape (n,).
+        deviation: Standard deviation of each point across (m), shape (n,).
+        start: psi, y, kappa, pitch and roll, shape (5,).
+        mount: Place of the camera.
+
+    Returns:
+        The fit; None where the points do not hold both markings.
+    """
     values, half = start, 0.5 * mount.width
     prior = np.array([0.0, 0.0, 0.0, PITCH_SD**-2, ROLL_SD**-2])
     inverse: Array = np.zeros((5, 5))

@@ -17,8 +17,7 @@ MAX_DELAY = 0.1  # s: a measured delay counts as no more
 
 @dataclass(frozen=True)
 class Detector:
-    """The time from a picture to its lane, shift + exp(normal), and the standard deviations of
-    what is found."""
+    """The lane finder's time, shift + exp(normal), and the standard deviations of its results."""
 
     shift: float  # s
     log_mean: float
@@ -28,14 +27,28 @@ class Detector:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "Detector":
-        """From what the file holds."""
+        """Make a detector from the content of its file.
+
+        Args:
+            values: Parsed JSON.
+
+        Returns:
+            The detector.
+        """
         times, errors = values["seconds"], values["errors"]
         noise = {"camera_psi": errors["psi_rad"], "camera_y": errors["y_l_m"]}
         shortest, longest = times["range"]
         return cls(times["shift"], times["log_mean"], times["log_sd"], (shortest, longest), noise)
 
     def compute_delay(self, share: float) -> float:
-        """Seconds, at a share in (0, 1) of the distribution."""
+        """Compute the delay at a quantile of its distribution.
+
+        Args:
+            share: Quantile, in (0, 1).
+
+        Returns:
+            Delay (s), within `range`.
+        """
         from statistics import NormalDist  # 2 ms that every import of the package would pay
 
         drawn = self.shift + math.exp(NormalDist(self.log_mean, self.log_sd).inv_cdf(share))
@@ -43,11 +56,18 @@ class Detector:
 
 
 def count_delay_ticks(seconds: float) -> int:
-    """Whole ticks after which what took so long arrives, one at least."""
+    """Count the whole ticks after which a result arrives.
+
+    Args:
+        seconds: Time that it takes (s).
+
+    Returns:
+        Ticks, at least one.
+    """
     return max(math.ceil(seconds / TICK - 1e-9), 1)
 
 
 @functools.cache
 def load_detector() -> Detector:
-    """The one on file."""
+    """Load the detector on file."""
     return Detector.from_dict(json.loads(FILE.read_text()))

@@ -14,9 +14,16 @@ PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 
 
 def read_picture(path: "str | os.PathLike[str]") -> Image:
-    """A picture, (height, width, 3) bytes in blue, green, red.
+    """Read a picture from a file; FileNotFoundError where it is missing.
 
-    Raises FileNotFoundError, and ValueError for a file that is no whole picture.
+    Args:
+        path: Path of the file.
+
+    Returns:
+        Bytes in blue, green, red, shape (height, width, 3).
+
+    Raises:
+        ValueError: For a file that is no whole picture.
     """
     _check_file(path)
     data = np.fromfile(path, np.uint8)
@@ -27,9 +34,16 @@ def read_picture(path: "str | os.PathLike[str]") -> Image:
 
 
 class Film:
-    """The frames of a film, as pictures; `frame_count` is how many its header promises.
+    """The frames of a film, as pictures.
 
-    Raises FileNotFoundError, and ValueError for a file without a first frame.
+    `frame_count` is the number that its header promises. A file that is missing raises
+    FileNotFoundError.
+
+    Args:
+        path: Path of the file.
+
+    Raises:
+        ValueError: For a file without a first frame.
     """
 
     def __init__(self, path: "str | os.PathLike[str]") -> None:
@@ -44,7 +58,14 @@ class Film:
         self._buffer = [np.asarray(first, np.uint8)]
 
     def read_head(self, count: int) -> list[Image]:
-        """The first frames, at most so many, which `iter` has again."""
+        """Read the first frames, which iteration returns again.
+
+        Args:
+            count: Largest number of frames.
+
+        Returns:
+            At most `count` pictures.
+        """
         while len(self._buffer) < count:
             has_frame, frame = self._reader.read()
             if not has_frame:
@@ -53,7 +74,7 @@ class Film:
         return list(self._buffer)
 
     def __iter__(self) -> Iterator[Image]:
-        """The frames, once; it ends where the file does, or what is whole of it."""
+        """Iterate over the frames, once, until the file or its undamaged part ends."""
         while self._buffer:
             yield self._buffer.pop(0)
         while True:
@@ -64,7 +85,16 @@ class Film:
 
 
 def draw_lane(picture: Image, finder: LaneFinder, lane: Lane) -> Image:
-    """A copy of a picture in colour with the markings that the finder found in it just now."""
+    """Draw the markings that a finder found in its newest picture onto a copy of it.
+
+    Args:
+        picture: Picture in grey or colour, shape (height, width) or (height, width, 3).
+        finder: Finder whose newest picture this is.
+        lane: Result of the finder.
+
+    Returns:
+        Picture in colour, shape (height, width, 3).
+    """
     shown = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) if picture.ndim == 2 else picture.copy()
     thick = max(shown.shape[1] // 400, 1)
     if finder.fit is not None:
@@ -89,7 +119,14 @@ def draw_lane(picture: Image, finder: LaneFinder, lane: Lane) -> Image:
 
 
 def describe_lane(lane: Lane) -> str:
-    """A line on a lane."""
+    """Describe a lane in one line.
+
+    Args:
+        lane: Result of a finder.
+
+    Returns:
+        The text.
+    """
     if lane.quality == 0.0:
         return "no lane"
     return (

@@ -38,7 +38,7 @@ _WORST = (0.02, 0.08)  # rad, m, standard errors beyond which it is lost
 
 
 class Lane(NamedTuple):
-    """What a picture shows; all 0 where no lane was found."""
+    """A lane in a picture; all 0 where none was found."""
 
     psi: float = 0.0  # rad, of the car against the lane, to the left positive
     y_l: float = 0.0  # m, at the preview point, left of the lane's middle: tie-vision (4)
@@ -53,8 +53,16 @@ LOST = Lane()
 class LaneFinder:
     """Finds the lane in a camera's pictures.
 
-    lane_width: m from marking to marking. near, far: m ahead of the car, where it looks; side: m,
-    how far to either side. view: beyond these limits the lane counts as lost (default: none).
+    Args:
+        camera: The camera.
+        lane_width: Distance from marking to marking (m).
+        near: Distance ahead of the car where the search begins (m).
+        far: Distance ahead where it ends (m).
+        side: Distance to either side that is searched (m).
+        view: Limits beyond which the lane counts as lost; None for no limits.
+
+    Raises:
+        ValueError: For distances out of order, or a camera that does not see this part of the road.
     """
 
     def __init__(
@@ -97,9 +105,16 @@ class LaneFinder:
         self.points: Array = np.zeros((0, 2))
 
     def find(self, picture: Image) -> Lane:
-        """The lane in a picture, (height, width) grey or (height, width, 3) blue, green, red.
+        """Find the lane in a picture.
 
-        Raises ValueError for a picture of another size than the camera's.
+        Args:
+            picture: Bytes, grey (height, width) or blue, green, red (height, width, 3).
+
+        Returns:
+            The lane, `LOST` where none was found.
+
+        Raises:
+            ValueError: For a picture of another size than the camera's.
         """
         if picture.shape[1::-1] != self.camera.size or picture.dtype != np.uint8:
             raise ValueError(
@@ -145,8 +160,10 @@ class LaneFinder:
         return self._x[row], self._y[column + 1] - CELL * shift, strength
 
     def _compute_quality(self, lane_fit: LaneFit, x: Array) -> float:
-        """The share of the rows in which each marking was found, of those in which it must be;
-        less for clipped light, few pixels and a fit that is not sure of itself."""
+        """Compute the fraction of the expected rows in which each marking was found.
+
+        It is less for clipped light, few pixels and an uncertain fit.
+        """
         uncertainty = float(np.max(lane_fit.error / _WORST))
         if uncertainty > 1.0:
             return 0.0
@@ -179,8 +196,15 @@ class LaneFinder:
         return np.asarray(is_inside & self._inner[np.arange(len(y)), inner_column])
 
     def locate_marking(self, lane_fit: LaneFit, side: int) -> Array:
-        """Y in m of a marking (side 1: the left one, -1: the right one) in every row, at
-        `rows_ahead`."""
+        """Compute the lateral place of a marking in every row, at `rows_ahead`.
+
+        Args:
+            lane_fit: The lane.
+            side: 1 for the left marking, -1 for the right one.
+
+        Returns:
+            Y to the left of the car (m), shape (rows,).
+        """
         offset = 0.5 * side * self._mount.width
         y = np.zeros_like(self._x)
         for _ in range(6):  # Newton, on the distance across the lane
@@ -191,5 +215,5 @@ class LaneFinder:
 
     @property
     def rows_ahead(self) -> Array:
-        """X in m of each row that is searched."""
+        """Distance ahead of each row that is searched (m)."""
         return self._x

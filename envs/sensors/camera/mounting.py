@@ -26,16 +26,32 @@ _STRAIGHT = 0.003, 0.01, 0.05  # 1/m, rad, rad: curvature, pitch and roll of the
 
 
 def make_default_camera(size: tuple[int, int]) -> Pinhole:
-    """A camera of which nothing is known: 58 degrees wide, without distortion, level."""
+    """Make a camera of unknown properties: 58 degrees wide, without distortion, level.
+
+    Args:
+        size: Width and height of its pictures (px).
+
+    Returns:
+        The camera.
+    """
     width, height = size
     K = ((0.9 * width, 0.0, width / 2), (0.0, 0.9 * width, height / 2), (0.0, 0.0, 1.0))
     return Pinhole(K=K, dist=(0.0,) * 5, size=size, tilt=0.0, ahead=0.0)
 
 
 def estimate_mounting(camera: Pinhole, picture: Image, lane_width: float) -> Pinhole:
-    """The camera with the tilt and the height that a picture of a straight lane shows.
+    """Estimate the tilt and the height of a camera from a picture of a straight lane.
 
-    Raises ValueError where two markings are not found in it, or no car sees them so.
+    Args:
+        camera: The camera, whose tilt and height are not used.
+        picture: Bytes, grey (height, width) or in colour (height, width, 3).
+        lane_width: Distance from marking to marking (m).
+
+    Returns:
+        The camera with both.
+
+    Raises:
+        ValueError: If two markings are not found, or tilt and height are no car's.
     """
     points, weight = _find_ridges(camera, picture)
     pair = _find_pair(points, weight)

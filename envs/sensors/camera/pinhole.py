@@ -25,10 +25,10 @@ _MEASURED = ("rms_px", "boards")  # a calibration file may hold them
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A camera's intrinsics and where it sits; the defaults are the papers' tilt and preview, and
-    a lens wide enough to see both markings throughout the analytic camera's field of view.
+    """A camera's intrinsics and mounting; a value out of place raises ValueError.
 
-    Raises ValueError for a value out of place.
+    The defaults are the papers' tilt and preview, and a lens wide enough to see both markings
+    throughout the analytic camera's field of view.
     """
 
     K: tuple[tuple[float, ...], ...] = _MATRIX  # px, the camera matrix
@@ -63,7 +63,17 @@ class Pinhole:
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> "Pinhole":
-        """A camera from names and values; ValueError for an unknown name and for none of K."""
+        """Make a camera from names and values.
+
+        Args:
+            values: Values by the names of fields.
+
+        Returns:
+            The camera.
+
+        Raises:
+            ValueError: For an unknown name or a value out of place.
+        """
         known = [field.name for field in dataclasses.fields(cls)]
         if unknown := [name for name in values if name not in (*known, *_MEASURED)]:
             raise ValueError(describe_unknown("camera field", unknown, known))
@@ -74,7 +84,17 @@ class Pinhole:
 
     @classmethod
     def read(cls, path: "str | os.PathLike[str]") -> "Pinhole":
-        """A camera from a TOML or JSON file with at least K, dist and size."""
+        """Read a camera from a TOML or JSON file.
+
+        Args:
+            path: Path of the file, which has at least K, dist and size.
+
+        Returns:
+            The camera.
+
+        Raises:
+            ValueError: For a missing field, an unknown name or a value out of place.
+        """
         values = read_document(path, "camera")
         if missing := {"K", "dist", "size"} - values.keys():
             raise ValueError(f"{path}: a camera needs {', '.join(sorted(missing))}")
@@ -84,11 +104,23 @@ class Pinhole:
             raise ValueError(f"{path}: {error}") from None
 
     def write(self, path: "str | os.PathLike[str]", **measured: float) -> None:
-        """Write a file that `read` reads back; measured: what else a calibration found."""
+        """Write a file that `read` reads back.
+
+        Args:
+            path: Path of the file, whose ending chooses the format.
+            measured: Further results of a calibration, by name.
+        """
         write_document(path, dataclasses.asdict(self) | measured)
 
     def undistort(self, pixels: Array) -> Array:
-        """Points on the plane one unit ahead of the lens, (..., 2), of pixels (..., 2)."""
+        """Undistort pixels to points on the plane one unit ahead of the lens.
+
+        Args:
+            pixels: Pixels, shape (..., 2).
+
+        Returns:
+            Points, shape (..., 2).
+        """
         points = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
         criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-9)
         undistorted = cv2.undistortPoints(
@@ -97,8 +129,15 @@ class Pinhole:
         return np.asarray(undistorted, float).reshape(np.shape(pixels))
 
     def project_points(self, x: Array, y: Array) -> Array:
-        """The pixels (..., 2) of points of the road, in m ahead and to the left of the car; NaN
-        where they lie outside the picture."""
+        """Project points of the road to pixels.
+
+        Args:
+            x: Distance ahead of the car (m).
+            y: Distance to the left of the car (m), in a shape that broadcasts with x.
+
+        Returns:
+            Pixels, shape (..., 2); NaN where they lie outside the picture.
+        """
         x, y = np.broadcast_arrays(np.asarray(x, float) - self.ahead, np.asarray(y, float))
         depth = x * cos(self.tilt) + self.height * sin(self.tilt)
         down = self.height * cos(self.tilt) - x * sin(self.tilt)
@@ -116,8 +155,15 @@ class Pinhole:
         return np.where((is_in_front & is_inside)[..., None], pixels, np.nan)
 
     def compute_rays(self, first: int, last: int) -> Array:
-        """Directions (rows, width, 3) of the pixels of the rows first to last - 1 in car axes, of
-        unit depth."""
+        """Compute the directions of the pixels of some rows in car axes, of unit depth.
+
+        Args:
+            first: First row.
+            last: Row behind the last one.
+
+        Returns:
+            Directions, shape (last - first, width, 3).
+        """
         grid = np.stack(np.meshgrid(np.arange(self.size[0]), np.arange(first, last)), -1)
         across, down = np.moveaxis(self.undistort(grid.astype(float)), -1, 0)
         s, c = sin(self.tilt), cos(self.tilt)
@@ -125,7 +171,14 @@ class Pinhole:
 
 
 def resample(picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Resample a picture to `WORKING_WIDTH`, in its proportions."""
+    """Resample a picture to `WORKING_WIDTH`, in its proportions.
+
+    Args:
+        picture: Bytes, shape (height, width) or (height, width, 3).
+
+    Returns:
+        The picture, WORKING_WIDTH wide.
+    """
     size = WORKING_WIDTH, round(picture.shape[0] * WORKING_WIDTH / picture.shape[1])
     method = cv2.INTER_AREA if picture.shape[1] > WORKING_WIDTH else cv2.INTER_CUBIC
     return np.asarray(cv2.resize(picture, size, interpolation=method), np.uint8)

@@ -27,7 +27,7 @@ _PATCH, _FLAKE = 0.25, 0.03  # m, along and across, of paint that wears off toge
 
 @dataclass(frozen=True)
 class Appearance:
-    """What the road and the picture look like. Raises ValueError for a value out of place."""
+    """Looks of the road and the picture; a value out of place raises ValueError."""
 
     noise: float = 2.0  # grey levels, standard deviation of a pixel
     blur: float = 0.5  # px, standard deviation of the lens
@@ -50,7 +50,7 @@ class Appearance:
 
 
 class RoadScene(NamedTuple):
-    """Where the car is against the road, and the road's bend."""
+    """Place of the car against the road, and the road's bend."""
 
     psi: float = 0.0  # rad, heading against the road, to the left positive
     y: float = 0.0  # m, left of the lane's middle
@@ -61,13 +61,26 @@ class RoadScene(NamedTuple):
 
     @classmethod
     def make_bend(cls, curvature: float, **places: float) -> "RoadScene":
-        """On a road of constant curvature in 1/m."""
+        """Make a scene on a road of constant curvature.
+
+        Args:
+            curvature: Curvature (1/m), left positive.
+            places: Other fields by name.
+
+        Returns:
+            The scene.
+        """
         return cls(road=RoadParams(curvature, -1e6, 1.0), **places)
 
 
 class RoadRenderer:
-    """Renders a camera's pictures; rows: the first and the last row that is painted, the rest stays
-    black (default: all)."""
+    """Renders a camera's pictures.
+
+    Args:
+        camera: The camera.
+        appearance: Looks of the road; None for the defaults.
+        rows: First row that is painted and the row behind the last, the rest is black; None: all.
+    """
 
     def __init__(
         self,
@@ -81,8 +94,16 @@ class RoadRenderer:
         self._rays = np.moveaxis(camera.compute_rays(first, last), -1, 0).astype(np.float32).copy()
 
     def render_picture(self, scene: RoadScene, seed: Any = 0) -> Image:
-        """The picture (height, width) in grey levels; seed: of `np.random.Philox`, a number or a
-        pair (key, tick), for the noise."""
+        """Render the picture of a scene.
+
+        Args:
+            scene: Place of the car on the road.
+            seed: Seed of the noise: a number, or (key, tick) for key and counter of
+                `np.random.Philox`.
+
+        Returns:
+            Grey levels, shape (height, width).
+        """
         camera, style = self.camera, self.appearance
         light = self._render_road(scene)
         if style.blur > 0.0:

@@ -78,7 +78,7 @@ def solved_by_ipopt(agent: Nmpc, found: Any, monkeypatch: pytest.MonkeyPatch) ->
     def put(target: dict[int, Any], value: Any, at: int) -> None:
         target[at] = value
 
-    monkeypatch.setitem(SYMBOLS, "at", lambda array, at: array[at])
+    monkeypatch.setitem(SYMBOLS, "load_element", lambda array, at: array[at])
     monkeypatch.setitem(SYMBOLS, "put", put)
     blocks = agent.design.blocks
     plan = ca.SX.sym("plan", agent.width * len(blocks))
