@@ -60,9 +60,11 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
         _draw_bars(
             axis, panel_rows, title, label, find_partial_entries(rows, panel_rows[0].scenario)
         )
-        bound_ratios = {r.estimator: r.value for r in rows
-                if r.metric == "rmse_over_bound"
-                and r.scenario == panel_rows[0].scenario}
+        bound_ratios = {
+            r.estimator: r.value
+            for r in rows
+            if r.metric == "rmse_over_bound" and r.scenario == panel_rows[0].scenario
+        }
         for row in panel_rows:
             if row.estimator in bound_ratios:
                 _draw_bound(axis, 1e3 * row.value / bound_ratios[row.estimator])

@@ -26,22 +26,25 @@ alone together
 """
 BANNED = frozenset(_BANNED.split())
 _VERBS = """
-accept add advance advertise align allocate annotate append apply ask assemble assert audit
-begin bind bound build calibrate call capture carry change check choose clip clone close collect
-combine compare compile complete compute concatenate condition configure convert copy correct
-count decode delay describe design detach detect discretise distil distill draw drive drop
-emulate encode end ensure equalise estimate evaluate execute expand explain export extend fail
-feed fetch fill filter find finish fit follow forget format gather generate get give group guard
-handle has hash identify import index inflate init initialise inline insert integrate invert is
-iterate join keep label latch launch learn lend linearise list load log look lower make map mask
-match measure merge mirror mix monitor move name note notice observe open optimise pack pad
-parse pass pick place plan plot predict prepare print process profile project propagate prune
-put raise read receive record reduce refuse register reject release remember remove render
-repeat replace replay report resample reset resolve restart restore return rewind rotate round
-run sample save scale score search select send serve set settle shift show shrink simulate skip
-smooth solve sort split square stack start step stop store subtract sum sweep symmetrise take
-teach test track train transform transpose trim trust try tune turn unify unpack unroll update
-upload use validate visit wait walk warm warn whiten wrap write
+accept accumulate adapt add advance advertise align allocate annotate append apply ask assemble
+assert audit average begin bind bound build calibrate call capture carry change check choose
+clear clip clone close collect combine compare compile complete compose compute concatenate
+condense condition configure convert copy correct count create decode delay derive describe
+design detach detect discretise distil distill download draw drive drop emulate encode end
+ensure equalise estimate evaluate execute expand explain export extend extract factor fail feed
+fetch fill filter find finish fit follow forget format from gather generate get give group guard
+handle has hash identify import index infer inflate init initialise inline insert integrate
+interpolate invert is iterate join keep label latch launch learn lend limit linearise list load
+locate log look lower make map mark mask match measure merge minimise mirror mix monitor move
+multiply name normalise note notice observe open optimise pack pad parse pass pick place plan
+plot precompute predict prepare print process profile project propagate prune push put raise
+rank read receive record reduce refuse register reject release remember remove render repeat
+replace replay report require resample reset resolve restart restore return rewind rotate round
+run sample save scale score search select send serve set settle shift show shrink shuffle
+simulate skip smooth solve sort split square stack start step stop store subtract sum summarise
+sweep symmetrise take teach test to track train transform transpose trim truncate trust try tune
+turn unify unpack unroll update upload use validate vary visit wait walk warm warn watch whiten
+wrap write
 """
 VERBS = frozenset(_VERBS.split())
 _ENDINGS = """

@@ -101,7 +101,7 @@ def collect_demonstrations(
             action, student_state = student.predict(obs, student_state, start)
         is_valid = running & np.isfinite(label).all(axis=1)
         steps.append((obs, np.nan_to_num(label), teacher_obs[:, privileged_columns], is_valid))
-        teacher.acted(teacher_state, action)
+        teacher.record_action(teacher_state, action)
         obs, rewards, terminated, truncated, _ = cars.step(action)
         teacher_obs, teacher_rewards, *_ = twins.step(action)
         if not np.array_equal(rewards[running], teacher_rewards[running]):

@@ -243,7 +243,9 @@ def measure_calibrated(
     **options: Any,
 ) -> Results:
     """The cells of calibrated contests on the clairvoyant's seeds; options: of `measure`."""
-    seeds = {task: [episode.seed for episode in record.episodes] for task, record in records.items()}
+    seeds = {
+        task: [episode.seed for episode in record.episodes] for task, record in records.items()
+    }
     task_entries = [
         control_entry
         for task in records

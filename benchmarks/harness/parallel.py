@@ -77,7 +77,9 @@ class Bar(progress.Progress):
             last_id, since, done = self._before
             if task.total is not None:
                 text = f"{task.completed:,.0f} of {task.total:,.0f} {task.fields['unit']}, "
-            if task.id != last_id or not done:  # what a stopped run has done took no time in this one
+            if (
+                task.id != last_id or not done
+            ):  # what a stopped run has done took no time in this one
                 self._before = task.id, passed, task.completed
             elif task.total is not None and task.completed > done:
                 pace = (passed - since) / (task.completed - done)

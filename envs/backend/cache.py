@@ -127,8 +127,11 @@ def _make_folder(folder: Path, sticky: bool = False) -> None:
     """
     if not folder.parent.exists():
         _make_folder(folder.parent)
-    with contextlib.suppress(FileExistsError):
+    try:
         folder.mkdir(mode=0o700)
+    except OSError:
+        if not folder.exists():
+            raise
     os.close(_open_if_trusted(folder, stat.S_ISDIR, sticky=sticky))
 
 

@@ -37,9 +37,7 @@ class Vehicle:
 
     name: str = "vehicle"
     mass: float = quantity("kg", 0.01, 1e5, "m")
-    yaw_inertia: float = quantity(
-        "kg m2", 0.1, 10, "I, about the vertical axis", per=_POINT_INERTIA
-    )
+    yaw_inertia: float = quantity("kg m2", 0.1, 10, "I about the vertical axis", per=_POINT_INERTIA)
     front_arm: float = quantity("m", 0.01, 10, "l_f, centre of gravity to front axle")
     rear_arm: float = quantity("m", 0.01, 10, "l_r, centre of gravity to rear axle")
     front_stiffness: float = quantity("N/rad", 3, 600, "C_f, one front tyre", per=("mass",))

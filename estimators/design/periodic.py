@@ -143,7 +143,7 @@ def _design_settled(
     filters: FilterRecords = np.array([f])
     copy = filters.view(np.recarray)[0]
     copy.periodic = copy.measured = copy.origin = copy.joint = copy.between = 0
-    copy.speed_profile = 1 if f.stride > 1 else f.pace
+    copy.pace = 1 if f.stride > 1 else f.pace
     copy.stride, copy.speed = 1, speed
     copy.late = CLONE if f.late == CLONE else IGNORE
     copy.cycle, copy.pattern = schedule.cycle, max(1, len(schedule.lags))

@@ -30,7 +30,7 @@ def traces(wide: int = WIDE, **change: Any) -> MovingAverages:
         "weight_in": rng.normal(size=(5, wide)),
         "bias_in": rng.normal(size=5),
     }
-    return MovingAverages(**numbers | {"bent": 2, "times": TIMES} | change)
+    return MovingAverages(**numbers | {"n_silu": 2, "times": TIMES} | change)
 
 
 def network(cell: MovingAverages) -> Network:
@@ -155,7 +155,7 @@ def test_a_file_holds_the_traces(tmp_path: Path) -> None:
 
 def test_a_file_of_no_units_cannot_ask_for_any_memory(tmp_path: Path) -> None:
     """Tensors of nothing would fit a card of any number of frames."""
-    none = traces(weight_in=np.zeros((0, WIDE)), bias_in=np.zeros(0), bent=0)
+    none = traces(weight_in=np.zeros((0, WIDE)), bias_in=np.zeros(0), n_silu=0)
     save_policy(tmp_path / "mine.safetensors", network(none), CARD)
     with pytest.raises(ValueError, match=r"traces with units.*\['traces', 0, 0, "):
         load_policy(tmp_path / "mine.safetensors")
@@ -166,8 +166,8 @@ def test_a_file_of_no_units_cannot_ask_for_any_memory(tmp_path: Path) -> None:
     [
         ({"weight_in": np.zeros(5)}, r"got \(\(5,\), \(5,\)\)"),
         ({"bias_in": np.zeros(4)}, r"weights \(units, inputs\) and biases \(units,\), got"),
-        ({"bent": 6}, "of 5 units 6 cannot be bent"),
-        ({"bent": -1}, "of 5 units -1"),
+        ({"n_silu": 6}, "of 5 units 6 cannot be bent"),
+        ({"n_silu": -1}, "of 5 units -1"),
         ({"times": ()}, "one time or more"),
         ({"times": (3.0, 0.0)}, "each above 0 steps"),
         ({"times": (float("nan"),)}, "each above 0 steps"),

@@ -177,9 +177,9 @@ class Watched:
         label[self.blind] = np.nan
         return label, memory
 
-    def acted(self, memory: Any, action: Any) -> None:
+    def record_action(self, memory: Any, action: Any) -> None:
         self.acts.append(action.copy())
-        self.teacher.acted(memory, action)
+        self.teacher.record_action(memory, action)
 
 
 def test_a_teacher_is_told_what_was_done_and_teaches_what_it_knows() -> None:

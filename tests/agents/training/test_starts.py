@@ -162,7 +162,7 @@ def test_what_a_training_drives_is_what_the_policy_drove(
             start = (start | truncated).numpy()
             rewards = rewards.numpy()
             paid, costs = paid - rewards * rates.now, costs - rewards
-            rates.ended(start)
+            rates.start_next_drives(start)
         else:
             obs, rewards, start, infos = cars.step(actions)
             paid -= rewards

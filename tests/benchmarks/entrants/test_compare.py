@@ -274,10 +274,10 @@ def test_a_users_agent_has_nominals_filter(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
-    "agent": ({"pairs": (UserEntry("lqrr"),)}, "unknown agent 'lqrr'"),
-    "estimator": ({"pairs": (UserEntry("lqr", "dakff"),)}, "unknown estimator 'dakff'"),
-    "zip": ({"pairs": (UserEntry("mine.zip"),)}, "mine.zip"),
-    "file": ({"pairs": (UserEntry("mine.py:A"),)}, "there is no file mine.py"),
+    "agent": ({"entries": (UserEntry("lqrr"),)}, "unknown agent 'lqrr'"),
+    "estimator": ({"entries": (UserEntry("lqr", "dakff"),)}, "unknown estimator 'dakff'"),
+    "zip": ({"entries": (UserEntry("mine.zip"),)}, "mine.zip"),
+    "file": ({"entries": (UserEntry("mine.py:A"),)}, "there is no file mine.py"),
     "id": ({"env_id": "YawFusion"}, "env"),
     "one episode": ({"episodes": 1}, "two episodes"),
     "no files": ({"fresh": True}, "there is none"),
@@ -293,7 +293,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 def test_a_challenge_that_cannot_be_driven_is_refused_before_it_is(case: str) -> None:
     options, message = WRONG[case]
     with pytest.raises((ValueError, TypeError, FileNotFoundError), match=message):
-        ComparisonRequest(**{"pairs": (UserEntry("esc"),)} | options)
+        ComparisonRequest(**{"entries": (UserEntry("esc"),)} | options)
 
 
 @pytest.mark.parametrize(

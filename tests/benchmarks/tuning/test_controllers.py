@@ -73,7 +73,7 @@ def test_an_adaptive_contestant_is_tuned_with_the_filter_it_follows(
 ) -> None:
     """Its numbers reach that filter, and nobody else's on the same one."""
     asked: list[ControlEntry] = []
-    monkeypatch.setattr(controllers, "run_chunk", lambda chunk: asked.append(chunk.cell))
+    monkeypatch.setattr(controllers, "run_chunk", lambda chunk: asked.append(chunk.entry))
     asked_of = controllers.make_controller_tuning("adaptive-nmpc", "car-yaw", (1,))
     options = asked_of.options(asked_of.start | {"force_sd": 77.0})
     run_contestant(asked_of.contests[0], asked_of.name, options, (1,))

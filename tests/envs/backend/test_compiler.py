@@ -75,10 +75,10 @@ def test_an_edit_in_a_callee_reaches_its_cached_callers(copy: Path, tmp_path: Pa
     variables = {"XDG_CACHE_HOME": str(cache)}
     exact = 0.25**2 * (3.0 - 2.0 * 0.25)
     assert float(run(SHIFT, copy, **variables)) == exact
-    kernels = sorted(cache.rglob("tracks.path_offset*.kernel"))
+    kernels = sorted(cache.rglob("tracks.compute_path_offset*.kernel"))
     assert len(kernels) == 1
     assert float(run(SHIFT, copy, **variables)) == exact
-    again = sorted(cache.rglob("tracks.path_offset*.kernel"))
+    again = sorted(cache.rglob("tracks.compute_path_offset*.kernel"))
     assert again == kernels  # the second run compiled nothing
     source = copy / "envs" / "backend" / "elementary.py"
     text = source.read_text()
@@ -138,7 +138,7 @@ def test_plain_replaces_every_callee_and_leaves_the_original_alone() -> None:
             assert not isinstance(callee, Dispatcher), f"{each.__name__} calls {name}"
             if hasattr(callee, "__code__") and callee.__name__ not in seen:
                 todo.append(callee)
-    assert {"kutta3", "rates", "slips", "sincos", "minimum", "floor"} <= seen
+    assert {"kutta3", "compute_rates", "compute_slips", "sincos", "minimum", "floor"} <= seen
     assert decorators.as_python(kutta3) is not function
 
 

@@ -91,7 +91,7 @@ WRITE = """
 import runpy, sys
 files = runpy.run_path(sys.argv[2])  # without the package, which takes most of a second to import
 print("before", flush=True)
-files["write_whole"](sys.argv[1], b"rows\\n")
+files["write_atomic"](sys.argv[1], b"rows\\n")
 print("after")
 """
 

@@ -186,7 +186,7 @@ def test_every_road_is_drawn() -> None:
     assert (
         scene(windy).wind != 0.0
         and scene(windy).field_of_view is None
-        and scene(bend).field_of_view.sees
+        and scene(bend).field_of_view.has_lane
     )
 
 
