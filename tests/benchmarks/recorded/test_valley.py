@@ -130,7 +130,7 @@ def test_a_car_that_cannot_be_is_not_identified(tmp_path: Path) -> None:
     as_table(log).to_csv(path, index=False)
     run = CliRunner().invoke(app, ["identify", str(path), "--out", str(out)])
     assert run.exit_code == 1 and not out.exists()
-    assert run.output.splitlines()[1].startswith("Not identified.")
+    assert any(line.startswith("Not identified.") for line in run.output.splitlines())
     again = ["replay", str(path), "--vehicle", "identify", "--estimator", "exact-kf"]
     run = CliRunner().invoke(app, again)
     assert run.exit_code == 0, run.output

@@ -10,7 +10,8 @@ import pytest
 SOURCE = Path(__file__).resolve().parents[3] / "src"
 USE = """
 from sideslip.envs.scenarios.tracks import TrackPath, compute_path_offset
-print(compute_path_offset(TrackPath(1.0, 0.3, 1.0, 0.7, 0.1, 1.0), 0.85).hex(), compute_path_offset.signatures != [])
+offset = compute_path_offset(TrackPath(1.0, 0.3, 1.0, 0.7, 0.1, 1.0), 0.85)
+print(offset.hex(), compute_path_offset.signatures != [])
 print("sideslip.envs.backend.kernels.compiler" in sys.modules)
 """
 
