@@ -100,6 +100,9 @@ class EnvView:
 
         Args:
             env: Vector env with its wrappers.
+
+        Returns:
+            View of the outermost layer.
         """
         spaces = env.single_observation_space, env.single_action_space
         return cls(env.num_envs, get_env_facts(env), list_plant_kinds(env), *spaces)
@@ -137,6 +140,9 @@ def make_env(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
         env_id: Id of a registered env.
         options: Arguments of `gym.make`.
 
+    Returns:
+        Env with its wrappers.
+
     Raises:
         TypeError: An argument is missing or unknown.
     """
@@ -155,6 +161,9 @@ def get_env_facts(env: AnyEnv | EnvView) -> EnvFacts:
 
     Args:
         env: Env of this package, wrapped or bare.
+
+    Returns:
+        Facts that hold for all rows.
 
     Raises:
         TypeError: `env` is no env of this package.
@@ -210,6 +219,9 @@ def list_plant_kinds(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
 
     Args:
         env: Env, vector env, `VecEnv` or `EnvView`.
+
+    Returns:
+        Kinds, each once.
     """
     if isinstance(env, EnvView):
         return env.plants
@@ -225,6 +237,9 @@ def list_configs(env: AnyEnv) -> Sequence[EnvConfig]:
 
     Args:
         env: Env, vector env or `VecEnv`.
+
+    Returns:
+        The configurations.
     """
     base: Any = env.unwrapped
     return [base.config] if hasattr(base, "config") else base.get_attr("config")
@@ -285,6 +300,9 @@ def get_layout(env: VectorEnv[Any, Any, Any]) -> tuple[ObservationEntry, ...]:
 
     Args:
         env: Vector env with its wrappers.
+
+    Returns:
+        Entries of the observation, in order.
 
     Raises:
         ValueError: `get_env_facts` refuses a wrapper, or the rows have different layouts.

@@ -105,6 +105,9 @@ class Optimum:
 
         Args:
             gains: L_j, shape (steps, n), or (n,) for all steps.
+
+        Returns:
+            Cost of an episode.
         """
         model, W = self.plant.model, self.plant.W
         L = np.broadcast_to(gains, self.gains.shape)
@@ -141,6 +144,9 @@ def make_linear_plant(env: AnyEnv) -> LinearPlant:
 
     Args:
         env: Env, single or vector.
+
+    Returns:
+        Plant in steps of the control period.
 
     Raises:
         ValueError: The scenario is not linear.
@@ -206,6 +212,9 @@ def make_true_options(env: AnyEnv) -> dict[str, Any]:
 
     Args:
         env: Env, single or vector.
+
+    Returns:
+        Options by name.
     """
     config = list_configs(env)[0]
     start = dict.fromkeys(select_states(tuple(config.slow)), 0.0)
@@ -223,6 +232,9 @@ def compute_optimum(env: gym.Env[Any, Any], schedules: int = 1) -> Optimum:
         env: Single env.
         schedules: Number of seeds from 0 whose arrivals are averaged; one is enough where nothing
             is lost or late by chance.
+
+    Returns:
+        Optimum with its gains and the errors of each schedule.
 
     Raises:
         ValueError: As `make_linear_plant`.
@@ -308,6 +320,9 @@ def wrap_optimal_estimate(env: Any) -> Any:
 
     Args:
         env: Env of a linear scenario.
+
+    Returns:
+        Wrapped env.
     """
     wrapper: Any = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation
     return wrapper(env, FILTER, outputs=OUTPUTS, std=False, options=make_true_options(env))

@@ -115,6 +115,9 @@ def evaluate_costs(
         env: Vector env of N rows.
         agent: Agent, as for `iterate_steps`.
         seeds: N seeds.
+
+    Returns:
+        Costs in the order of the seeds.
     """
     return evaluate_episodes(env, agent, seeds)[0]
 
@@ -127,6 +130,9 @@ def compute_cost_ratios(
     Args:
         costs: Costs J, shape (N,).
         others: Costs J to compare with, shape (N,).
+
+    Returns:
+        Ratios costs / others, shape (N,).
     """
     return np.asarray((costs + COST_FLOOR) / (others + COST_FLOOR))
 
@@ -278,6 +284,9 @@ def rollout(
         seed: Seed of the reset.
         options: Options of the reset.
 
+    Returns:
+        Columns by name, their units, and the log.
+
     Raises:
         TypeError: A vector env, or an env of another package.
     """
@@ -314,6 +323,9 @@ def get_motion(base: Any) -> dict[str, float]:
 
     Args:
         base: Unwrapped single env.
+
+    Returns:
+        Values by name, in SI units.
     """
     motion = base.motion
     return {

@@ -54,6 +54,9 @@ def make_noise_options(scenario: Scenario) -> dict[str, Any]:
 
     Args:
         scenario: Scenario whose noise the filter knows.
+
+    Returns:
+        Options by name.
     """
     noise = dict(scenario.noise)
     share = HDOP_LAWS[scenario.hdop_law]
@@ -78,6 +81,9 @@ def remove_biases(scenario: Scenario) -> Scenario:
 
     Args:
         scenario: Scenario with biases.
+
+    Returns:
+        Scenario without them.
     """
     noise = {key: value for key, value in scenario.noise.items() if not key.endswith("_bias")}
     return scenario.replace(noise=noise, gyro_bias=0.0, accel_y_bias=0.0)
@@ -89,6 +95,9 @@ def compute_range_rms(scenario: Scenario, name: str) -> float:
     Args:
         scenario: Scenario that holds the range.
         name: Name of the quantity, whose unit the result has.
+
+    Returns:
+        Root mean square, in the quantity's unit.
     """
     low, high = scenario.range(name)
     return math.sqrt((low * low + low * high + high * high) / 3.0)

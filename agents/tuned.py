@@ -23,6 +23,9 @@ def read_tuned(path: Path = FILE) -> dict[str, dict[str, Options]]:
     Args:
         path: TOML file.
 
+    Returns:
+        Options by class, entry and part.
+
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: The file holds something else; the message has the path.
@@ -45,6 +48,9 @@ def get_tuned_options(contest_class: str, name: str) -> Options:
     Args:
         contest_class: Class of tasks.
         name: Name of the entry.
+
+    Returns:
+        Options by part.
     """
     options = read_tuned().get(contest_class, {}).get(name, {})
     return {part: dict(options.get(part, {})) for part in PARTS}

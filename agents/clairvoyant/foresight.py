@@ -139,6 +139,9 @@ def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
         actions: Actions of a run, shape (K, width), to which a driver reacts who steers by the car;
             None: zeros.
 
+    Returns:
+        Forecast from tick 0 to the episode's end.
+
     Raises:
         ValueError: The env is not at the start of an episode.
     """
@@ -165,6 +168,9 @@ def read_plan_state(z: Array) -> PlanState:
 
     Args:
         z: Packed state of one car.
+
+    Returns:
+        State in SI units.
     """
     motion, drive = read(z, Z.motion), read(z, Z.drive)
     return PlanState._make(

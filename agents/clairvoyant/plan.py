@@ -75,6 +75,9 @@ def simulate_run(
         seed: Seed of the episode.
         actions: Actions, shape (K, width).
         feedback: States (K + 1, n) and gains (K, width, n) by which the actions are corrected.
+
+    Returns:
+        Trajectory, cost and number of control periods of the run.
     """
     env.reset(seed=seed)
     base: Any = env.unwrapped
@@ -102,6 +105,9 @@ def evaluate_actions(env: gym.Env[Any, Any], seed: int, actions: npt.ArrayLike) 
         env: Single env.
         seed: Seed of the episode.
         actions: Actions, shape (K, width).
+
+    Returns:
+        Cost J of the episode.
     """
     return simulate_run(env, seed, np.asarray(actions, np.float64)).cost
 
@@ -113,6 +119,9 @@ def solve_ilqr(env: gym.Env[Any, Any], seed: int, start: npt.ArrayLike | None = 
         env: Single env.
         seed: Seed of the episode.
         start: Actions, shape (K, width); None: zeros.
+
+    Returns:
+        Best actions in the env, their cost and the solver's status.
 
     Raises:
         ModuleNotFoundError: The extra `mpc` is not installed.
@@ -226,6 +235,9 @@ def compute_clairvoyant(
         env: Single env.
         seed: Seed of the episode.
         starts: Actions, shape (K, width), by method; without any the plan starts from zeros.
+
+    Returns:
+        Actions of the least cost, and the costs of all candidates.
     """
     start_time, base = time.process_time(), env.unwrapped
     env.reset(seed=seed)
@@ -256,6 +268,9 @@ def record_actions(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
         env: Single env.
         agent: Agent, as for `iterate_steps`.
         seed: Seed of the episode.
+
+    Returns:
+        Actions in fractions of full scale.
     """
     base: Any = env.unwrapped
     _, *steps = iterate_steps(env, agent, seed)

@@ -48,6 +48,9 @@ def list_active_states(fixed: PlanParams) -> tuple[str, ...]:
 
     Args:
         fixed: Parameters of the episode.
+
+    Returns:
+        Names of the states.
     """
     road = fixed.road
     active = {"v_x", "v_y", "gamma", *TORQUES}
@@ -69,6 +72,9 @@ def compute_node_errors(fixed: PlanParams, x: PlanState, known: PreviewStep) -> 
         fixed: Parameters of the episode.
         x: State at the step's start.
         known: Inputs of the step.
+
+    Returns:
+        Errors e_beta (rad) and e_gamma (rad/s).
     """
     kind = fixed.kind
     beta = _slip(x.v_x, x.v_y, kind.small_angle)
@@ -85,6 +91,9 @@ def compute_node_cost(fixed: PlanParams, errors: tuple[Any, Any], known: Preview
         fixed: Parameters of the episode.
         errors: e_beta (rad) and e_gamma (rad/s).
         known: Inputs of the step.
+
+    Returns:
+        Weighted cost.
     """
     return known.weight * _uncapped_cost_rate(*errors, 0.0, 0.0, fixed.kind.reference)
 
@@ -99,6 +108,9 @@ def advance(fixed: PlanParams, x: PlanState, action: Any, known: PreviewStep) ->
         x: State at the step's start.
         action: Fractions of full scale, shape (width,), as the env takes them.
         known: Inputs of the step.
+
+    Returns:
+        Next state, and what the step adds.
     """
     car = fixed.car._replace(C_f=known.C_f, C_r=known.C_r, mu=known.mu, mu_r=known.mu_r)
     task, kind, q = fixed.task, fixed.kind, fixed.ticks
@@ -161,6 +173,9 @@ def get_state_scales(fixed: PlanParams, names: tuple[str, ...]) -> list[float]:
     Args:
         fixed: Parameters of the episode.
         names: Names of states.
+
+    Returns:
+        Unit of each of `names`, in the state's own SI unit.
     """
     small = {"phi": 0.1, "phi_dot": 0.5, "slewing": 0.1, "added": 0.1}
     return [fixed.car.T_max if name in TORQUES else small.get(name, 1.0) for name in names]

@@ -100,6 +100,9 @@ def make_problem(fixed: PlanParams) -> IlqrProblem:
 
     Args:
         fixed: Parameters of the episode.
+
+    Returns:
+        Functions of the episode.
     """
     names = list_active_states(fixed)
     scale, size = np.array(get_state_scales(fixed, names)), len(names)
@@ -132,6 +135,9 @@ def linearise_run(problem: IlqrProblem, known: Array, run: Trajectory) -> Linear
         problem: Functions of the episode.
         known: Columns of `PreviewStep`, shape (len(PreviewStep), K + 1).
         run: States and actions.
+
+    Returns:
+        Derivatives along the run, in scaled states and fractions of full scale.
     """
     size, K, width = len(problem.names), problem.fixed.periods, problem.fixed.width
     points = np.zeros((size + width, K + 1))
@@ -155,6 +161,9 @@ def compute_limits(problem: IlqrProblem, forecast: Forecast, run: Trajectory) ->
         problem: Functions of the episode.
         forecast: Forecast with the driver's command.
         run: States and actions.
+
+    Returns:
+        Limits in fractions of full scale, shape (K, `N_INPUTS`), and those by the rate, (K,).
     """
     fixed, K = problem.fixed, problem.fixed.periods
     low, high, zero = np.zeros((K, N_INPUTS)), np.zeros((K, N_INPUTS)), np.zeros(K)

@@ -186,6 +186,9 @@ def list_entry_names(env: AnyEnv) -> set[str]:
 
     Args:
         env: Env, single or vector.
+
+    Returns:
+        Names, without order.
     """
     return {entry.name for entry in get_env_facts(env).layout}
 
@@ -196,6 +199,9 @@ def check_positive(name: str, value: float) -> float:
     Args:
         name: Name of the option, for the message.
         value: Number to check.
+
+    Returns:
+        The number as a float.
 
     Raises:
         ValueError: The number is not positive and finite.
@@ -211,6 +217,9 @@ def check_not_negative(name: str, value: float) -> float:
     Args:
         name: Name of the option, for the message.
         value: Number to check.
+
+    Returns:
+        The number as a float.
 
     Raises:
         ValueError: The number is negative or not finite.
@@ -229,6 +238,9 @@ def integrate_antiwindup(integral: Any, step: Any, unlimited: Any, limited: Any)
         step: Increment of the integral.
         unlimited: Output before its limits.
         limited: Output within its limits.
+
+    Returns:
+        Integral after the step.
     """
     if unlimited == limited or (unlimited > limited) != (step > 0.0):
         return integral + step

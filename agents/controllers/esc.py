@@ -47,6 +47,9 @@ def compute_yaw_gains(
         vehicle: Vehicle of the design.
         speed: Speed (m/s).
         bandwidth: Double pole of the closed loop (rad/s).
+
+    Returns:
+        Gains k_p and k_i.
     """
     I = vehicle.yaw_inertia  # noqa: E741
     a22 = compute_plant_python(make_nominal_car(vehicle), speed).a22
@@ -60,6 +63,9 @@ def apply_dead_zone(value: Any, band: Any) -> Any:
     Args:
         value: Value of any unit.
         band: Half width of the zone, in the same unit.
+
+    Returns:
+        Excess over the zone, 0 inside.
     """
     if value > band:
         return value - band

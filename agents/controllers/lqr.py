@@ -184,6 +184,9 @@ class Lqr(Controller):
             speed: Speed (m/s).
             front: Front cornering stiffness of a tyre (N/rad), where the gains are scheduled on it.
             rear: Rear cornering stiffness of a tyre (N/rad), likewise.
+
+        Returns:
+            Gains on the states of the design.
         """
         KS = np.empty(self.table.shape[3:])
         interpolate_gains(self.table, self.axes, float(speed), float(front), float(rear), KS)
@@ -197,6 +200,9 @@ class Lqr(Controller):
 
         Args:
             speed: Speed (m/s).
+
+        Returns:
+            The matrix S.
         """
         KS = np.empty(self.table.shape[3:])
         car, per = self.vehicle, np.array([1.0, self.authority])[: self.width]
@@ -256,6 +262,9 @@ def solve_box_qp(
         max_u: Limit of |u|.
         low: Lower limit of w.
         high: Upper limit of w.
+
+    Returns:
+        Coordinates u and w of the point.
     """
     if absolute(u) <= max_u and low <= w <= high:
         return u, w

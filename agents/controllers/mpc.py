@@ -111,6 +111,9 @@ class Mpc(Lqr):
 
         Args:
             speed: Speed (m/s).
+
+        Returns:
+            Program of that speed.
         """
         nearest = _find_nearest_speed(speed)
         return _make_program(self.nominal, nearest, self.prediction, self.horizon, self.authority)

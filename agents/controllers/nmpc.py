@@ -252,6 +252,9 @@ class Nmpc(Lqr):
 
         Args:
             state: Memory, shape (N, memory).
+
+        Returns:
+            Names, one for each row.
         """
         return [STATUSES[int(code)] for code in state[:, LAST.status]]
 

@@ -45,6 +45,9 @@ def compute_surface_slope(plant: Any, pole: Any) -> Any:
     Args:
         plant: `BicyclePlant` at the speed.
         pole: Decay rate of beta's error (rad/s).
+
+    Returns:
+        Slope xi (1/s).
     """
     return (plant.a11 + pole) / plant.a12
 

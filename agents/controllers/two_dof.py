@@ -71,6 +71,9 @@ def feedforward_gain(vehicle: Vehicle, speed: float) -> float:
     Args:
         vehicle: Vehicle of the design.
         speed: Speed (m/s).
+
+    Returns:
+        Gain C_FF (N m/rad).
     """
     return float(_compute_static_gain(make_nominal_car(vehicle), float(speed)))
 

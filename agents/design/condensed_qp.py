@@ -35,6 +35,9 @@ def condense_qp(model: DesignModel, horizon: int, limits: Array) -> QuadraticPro
         model: Design model.
         horizon: Number of steps.
         limits: Inputs at a fraction of 1, shape (m,).
+
+    Returns:
+        Program in the inputs over `limits`.
     """
     n, m = model.H.shape
     Sx, Su = np.zeros(((horizon + 1) * n, n)), np.zeros(((horizon + 1) * n, horizon * m))

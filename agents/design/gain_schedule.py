@@ -88,6 +88,9 @@ def make_gain_table(
         speeds: Speeds (m/s).
         fronts: Front stiffnesses (N/rad); empty: the vehicle's.
         rears: Rear stiffnesses (N/rad); empty: the vehicle's.
+
+    Returns:
+        Tables over speed, front and rear stiffness, in this order.
     """
     shape = len(speeds), max(len(fronts), 1), max(len(rears), 1)
     gains, terminal = [], []

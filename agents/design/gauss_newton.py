@@ -44,6 +44,9 @@ def make_plan_batch(variables: int, blocks: Any, count: int) -> PlanBatch:
         variables: Variables of a plan.
         blocks: Steps of each block, shape (blocks,).
         count: Number of plans.
+
+    Returns:
+        Batch with one column for each plan.
     """
     return PlanBatch(
         np.zeros((variables, count)),

@@ -41,6 +41,9 @@ def make_nominal_car(vehicle: Vehicle) -> Array:
 
     Args:
         vehicle: Nominal vehicle.
+
+    Returns:
+        Numbers in SI units.
     """
     return np.array(vehicle.lateral)
 
@@ -52,6 +55,9 @@ def compute_plant(car: Any, V: Any) -> Any:
     Args:
         car: Numbers at `CAR`, shape (6,).
         V: Speed (m/s).
+
+    Returns:
+        `BicyclePlant` of the car.
     """
     a11, a12, a21, a22, b11, b21, b22 = compute_bicycle_coefficients(
         car[CAR.m], car[CAR.I], car[CAR.l_f], car[CAR.l_r], car[CAR.C_f], car[CAR.C_r], V
@@ -71,6 +77,9 @@ def compute_drift(plant: Any, beta: Any, gamma: Any) -> Any:
         plant: `BicyclePlant` at the speed.
         beta: Sideslip angle (rad).
         gamma: Yaw rate (rad/s).
+
+    Returns:
+        Rates beta' (rad/s) and gamma' (rad/s^2).
     """
     return plant.a11 * beta + plant.a12 * gamma, plant.a21 * beta + plant.a22 * gamma
 
@@ -83,6 +92,9 @@ def compute_steady_yaw_rate(plant: Any, beta: Any, delta: Any) -> Any:
         plant: `BicyclePlant` at the speed.
         beta: Sideslip angle (rad).
         delta: Steering angle (rad).
+
+    Returns:
+        Yaw rate (rad/s).
     """
     return -(plant.a11 * beta + plant.b11 * delta) / plant.a12
 
@@ -97,6 +109,9 @@ def solve_inputs(plant: Any, first: Any, second: Any) -> Any:
         plant: `BicyclePlant` at the speed.
         first: Effect on beta' (rad/s).
         second: Effect on gamma' (rad/s^2).
+
+    Returns:
+        Steering angle (rad) and yaw moment (N m).
     """
     delta_f = first / plant.b11
     return delta_f, (second - plant.b21 * delta_f) / plant.b22

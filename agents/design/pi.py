@@ -41,6 +41,9 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str
             2 pole. "real": k k_p = pole (p_2 - pole) puts one of two real poles there, or both at
             p_2 / 2 where pole is beyond p_2.
 
+    Returns:
+        Gains k_p (N m/rad) and k_i (N m/(rad s)).
+
     Raises:
         ValueError: The placement is unknown, or the pole is not positive.
     """
@@ -85,6 +88,9 @@ def sample_pi(
         period: Sampling period T (s).
         pole: Radius or place of the closed-loop poles (rad/s).
         placement: "radius" or "real".
+
+    Returns:
+        Gains k_p (N m/rad) and k_i (N m/(rad s)).
 
     Raises:
         ValueError: As `design_pi`.

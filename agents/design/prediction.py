@@ -63,6 +63,9 @@ def clip_symmetric(value: Any, limit: Any) -> Any:
     Args:
         value: Value to clip.
         limit: Limit, in the same unit.
+
+    Returns:
+        Value within the limit.
     """
     return minimum(maximum(value, 0.0 - limit), limit)
 
@@ -75,6 +78,9 @@ def detect_limit(value: Any, low: Any, high: Any) -> Any:
         value: Value to test.
         low: Lower limit.
         high: Upper limit.
+
+    Returns:
+        1.0, -1.0 or 0.0.
     """
     close = 1e-9 * (high - low)
     return select(value >= high - close, 1.0, select(value <= low + close, -1.0, 0.0))
@@ -93,6 +99,9 @@ def multiply_row(
         driver: Driver's steering angle (rad).
         state: State of the prediction.
         beta: Sideslip angle (rad).
+
+    Returns:
+        Product of the row and the states.
     """
     share = 0.5 * model.car.d_r / model.car.r / model.full_scale * (state.T_r - state.T_l)
     lateral = M[row, 0] * beta + M[row, 1] * state.motion.gamma + M[row, 2] * share

@@ -79,6 +79,9 @@ def compute_lag_moments(time_constant: float, ticks: int) -> tuple[float, float]
     Args:
         time_constant: Time constant of the lag (s).
         ticks: Ticks of the step.
+
+    Returns:
+        Mean and standard deviation, as fractions of the deviation.
     """
     tick = make_lag(time_constant, TICK)
     left = tick.mean * tick.end ** np.arange(ticks)
@@ -110,6 +113,9 @@ def make_prediction_model(
         full_scale: Yaw moment at an action of 1 (N m).
         authority: Added steering at an action of 1 (rad).
         yaw_first: Whether the yaw moment comes before the drive torque.
+
+    Returns:
+        Numbers that all predictions share.
     """
     step = ticks * TICK
     motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
@@ -142,6 +148,9 @@ def make_blocks(steps: int, count: int) -> Array:
     Args:
         steps: Steps of the horizon.
         count: Maximum of blocks.
+
+    Returns:
+        Steps of each block, shape (blocks,).
     """
     ends = np.unique(np.rint(np.geomspace(1.0, steps, count)).astype(np.int64))
     return np.diff(ends, prepend=0)
@@ -156,6 +165,9 @@ def replace_tyres(car: Any, C_f: Any, C_r: Any, mu: Any) -> Any:
         C_f: Front cornering stiffness of a tyre (N/rad).
         C_r: Rear cornering stiffness of a tyre (N/rad).
         mu: Friction of the road, at both axles.
+
+    Returns:
+        `CarParams` with the new numbers.
     """
     tyres, road, other = (C_f, C_r), (mu,), (mu,)
     return CarParams(*(car[:4] + tyres + car[6:10] + road + car[11:19] + other + car[20:]))

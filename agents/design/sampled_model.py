@@ -99,6 +99,9 @@ def make_design_model(vehicle: Vehicle, speed: float, design_spec: DesignSpec) -
         speed: Speed (m/s).
         design_spec: Parameters of the design.
 
+    Returns:
+        Model in steps of `design_spec.period` ticks.
+
     Raises:
         ValueError: The speed is not positive.
     """
@@ -189,6 +192,9 @@ def compute_cost_weights(design_spec: DesignSpec) -> Sequence[float]:
 
     Args:
         design_spec: Parameters of the design.
+
+    Returns:
+        Weights of slip, yaw rate, yaw moment and added steering, in this order.
     """
     return (
         1.0 / BETA_SCALE**2,
@@ -219,6 +225,9 @@ def compute_input_cost(model: DesignModel, V: Array) -> Array:
     Args:
         model: Design model.
         V: Cost to go, shape (n, n).
+
+    Returns:
+        S = R + H' V H.
     """
     return model.R + model.H.T @ V @ model.H
 

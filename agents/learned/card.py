@@ -84,6 +84,9 @@ class Card:
             estimator: Estimator around the env, "" for none.
             estimator_options: Other arguments of `EstimateObservation`.
             rest: Other fields of the card.
+
+        Returns:
+            Card of the env.
         """
         options: JsonMap = {
             "env_id": env_id,
@@ -105,6 +108,9 @@ class Card:
         Args:
             env: Env, single or vector.
             rest: Other fields of the card.
+
+        Returns:
+            Card of the env.
         """
         facts = get_env_facts(env)
         entries = tuple((entry.name, entry.unit) for entry in facts.layout)
@@ -120,6 +126,9 @@ class Card:
 
         Args:
             extra: Further fields.
+
+        Returns:
+            Text of the object.
 
         Raises:
             ValueError: The card or a field has a value that JSON does not have.

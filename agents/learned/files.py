@@ -72,6 +72,9 @@ def is_policy(name: str) -> bool:
 
     Args:
         name: Name or path.
+
+    Returns:
+        True for either of them.
     """
     return name.endswith(SUFFIX) or name in list_shipped()
 
@@ -81,6 +84,9 @@ def hash_policy(name: str) -> str:
 
     Args:
         name: Shipped name or path.
+
+    Returns:
+        SHA-256 in hexadecimal digits.
     """
     path = FOLDER / f"{name}{SUFFIX}" if name in list_shipped() else Path(name)
     exists = is_policy(name) and path.is_file()
@@ -116,6 +122,9 @@ def load_policy(path: str | Path) -> Policy:
 
     Args:
         path: Path or shipped name.
+
+    Returns:
+        Policy with its network and card.
 
     Raises:
         FileNotFoundError: There is no such file.

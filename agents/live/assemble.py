@@ -87,6 +87,9 @@ class StreamSynchroniser:
 
         Args:
             batch: Datagrams in the order of their arrival.
+
+        Yields:
+            Ticks in order.
         """
         before, self.silent = self.silent, self.silent + 1
         self.accepted.clear()

@@ -108,6 +108,9 @@ def encode(
         stamp: Time stamp (us).
         values: Values of `FIELDS`, in SI units.
         names: Names of states, for estimates.
+
+    Returns:
+        Bytes of the datagram.
     """
     count = len(values)
     head = HEADER.pack(MAGIC, VERSION, kind, count, sequence & 0xFFFFFFFF, stamp)

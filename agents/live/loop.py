@@ -47,6 +47,9 @@ class Histogram:
 
         Args:
             share: Fraction of the times that do not exceed it.
+
+        Returns:
+            Upper edge of the quantile's bin, or the largest time (us).
         """
         left = math.ceil(share * self.number)
         for us, count in enumerate(self.counts):
@@ -259,6 +262,9 @@ class Loop:
 
         Args:
             name: Name of the estimator.
+
+        Returns:
+            Two lines, three where there were deadlines.
         """
         m, counts = self.statistics, self.assembler.counts
         ended = f"{name}: {m.ticks} ticks in {m.seconds:.1f} s, {self.ended}"

@@ -145,6 +145,9 @@ class OnboardController:
 
         Args:
             number: Number of the tick.
+
+        Returns:
+            Observation with the estimator's outputs, shape (k,).
         """
         done, outputs = self._count, self.outputs
         packets = np.concatenate(self._packets)

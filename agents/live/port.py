@@ -26,6 +26,9 @@ def parse_address(text: str, host: str = LOOPBACK) -> tuple[str, int]:
         text: Text of the address.
         host: Host of a text without one.
 
+    Returns:
+        Host as an IPv4 address, and port.
+
     Raises:
         ValueError: The text is no address, or the host is unknown.
     """
@@ -104,6 +107,9 @@ class Port:
 
         Args:
             batch: Datagrams so far, extended.
+
+        Returns:
+            The same batch.
         """
         while len(batch) < MAX_BATCH:
             try:
@@ -120,6 +126,9 @@ class Port:
 
         Args:
             seconds: Timeout (s).
+
+        Returns:
+            Datagrams in the order of their arrival.
         """
         select.select([self._socket], [], [], max(seconds, 0.0))
         return self.receive_available([])
@@ -129,6 +138,9 @@ class Port:
 
         Args:
             deadline: Time of `clock` (ns).
+
+        Returns:
+            Datagrams in the order of their arrival.
         """
         batch: list[Arrival] = []
         while (left := deadline - clock() - SPIN) > 0:

@@ -89,6 +89,9 @@ def update_digest(onboard: OnboardController, digest: int) -> int:
     Args:
         onboard: On-board controller after a tick.
         digest: Checksum of the estimates before.
+
+    Returns:
+        CRC-32 of all estimates.
     """
     return zlib.crc32(onboard.std.tobytes(), zlib.crc32(onboard.x.tobytes(), digest))
 
@@ -110,6 +113,9 @@ def read_setup(path: Path | str) -> dict[str, Any]:
 
     Args:
         path: File of the session.
+
+    Returns:
+        Setup as JSON types.
 
     Raises:
         ValueError: The file is no session, or its setup is incomplete.
@@ -190,6 +196,9 @@ def replay(path: Path | str, onboard: OnboardController, patience: int | None) -
         path: File of the session.
         onboard: On-board controller of the session's setup.
         patience: Patience of the `StreamSynchroniser`.
+
+    Returns:
+        Ticks, estimates and deviations, and whether they agree with the session's checksums.
     """
     assembler, digest, same = StreamSynchroniser(patience), 0, True
     ticks: list[int] = []

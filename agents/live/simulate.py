@@ -65,6 +65,9 @@ class WireAgent:
             state: Returned unchanged.
             episode_start: Without effect.
             deterministic: Without effect.
+
+        Returns:
+            Action in fractions of full scale, shape (width,), and `state`.
         """
         if not self.periods:
             self._action = np.zeros(self._facts.width, np.float32)

@@ -52,7 +52,6 @@ class ViewerProtocol(asyncio.DatagramProtocol):
 
         Args:
             data: Bytes of the datagram.
-            _: Address of the sender.
         """
         message = decode(data)
         if isinstance(message, RejectReason):
@@ -79,6 +78,9 @@ def get_unit(name: str) -> str:
 
     Args:
         name: Name of the state.
+
+    Returns:
+        Unit, with deg for rad.
     """
     return STATES.get(name, FOREIGN_STATE).unit.replace("rad", "deg")
 
@@ -89,6 +91,9 @@ def make_table(protocol: ViewerProtocol, title: str) -> Any:
     Args:
         protocol: Newest datagrams.
         title: Title of the table.
+
+    Returns:
+        Table of rich.
     """
     from rich.table import Table
     from rich.text import Text
@@ -162,6 +167,9 @@ def is_same_origin(host: str, origin: str | None) -> bool:
     Args:
         host: The request's Host, "name:port".
         origin: Its Origin, None where it has none.
+
+    Returns:
+        True if both hold.
     """
     name = host.rpartition(":")[0].strip("[]") or host
     with suppress(ValueError):

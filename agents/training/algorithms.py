@@ -74,6 +74,9 @@ class Algorithm:
     def load(self) -> Callable[..., BaseAlgorithm]:
         """Import the class.
 
+        Returns:
+            The class.
+
         Raises:
             ModuleNotFoundError: Its package is not installed.
         """
@@ -100,6 +103,9 @@ def get_algorithm(name: str) -> Algorithm:
     Args:
         name: Name in `ALGORITHMS`.
 
+    Returns:
+        Algorithm of that name.
+
     Raises:
         ValueError: The name is unknown.
     """
@@ -114,6 +120,9 @@ def read_settings(algo: str, env_id: str, file: str | Path | None = None) -> Set
         algo: Name of the algorithm.
         env_id: Id of the env.
         file: YAML file; None: the package's own.
+
+    Returns:
+        Values by name.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -179,6 +188,9 @@ def compute_action_std(settings: Settings) -> float:
 
     Args:
         settings: Settings of `read_settings`.
+
+    Returns:
+        Standard deviation, as a fraction of full scale.
     """
     return math.exp(settings.get("policy_kwargs", {}).get("log_std_init", UNIFORM_LOG_STD))
 
@@ -193,6 +205,9 @@ def make_model_options(algo: str, settings: Settings, seconds: float, num_envs: 
         settings: Settings of `read_settings`.
         seconds: Control period (s).
         num_envs: Number of environments.
+
+    Returns:
+        Arguments by name.
     """
     options = {name: value for name, value in settings.items() if name not in _TRAINING_SETTINGS}
     if "gamma" in options:
@@ -225,6 +240,9 @@ def make_model(
         scaling: Scaling of `Standardised`.
         seed: Seed of the model.
         rest: Further arguments of the class, such as its device.
+
+    Returns:
+        Model on the environments.
     """
     options = make_model_options(algo, settings, seconds, env.num_envs)
     options |= {name: _make_schedule(name, options[name]) for name in _SCHEDULED if name in options}

@@ -52,6 +52,9 @@ def read_state(path: Path) -> dict[str, Any]:
     Args:
         path: Checkpoint.
 
+    Returns:
+        State in JSON types.
+
     Raises:
         ValueError: The file is no checkpoint of this format, or is cut short.
     """

@@ -95,6 +95,9 @@ def collect_samples(
         drivers: Pairs of a key of `AGENTS` and slow sensors.
         seed: First seed.
         episodes: Seeds of each drive and driver.
+
+    Returns:
+        Samples of all drives, one after another.
     """
     seeds, collected = itertools.count(seed, episodes), list[Samples]()
     for (env_id, options), (driver, sensors) in itertools.product(drives, drivers):
@@ -139,6 +142,9 @@ def train_correction(
         episodes: Seeds of each drive and driver; an eighth as many are held out.
         epochs: Passes over all samples; the first network has half of them.
         report: Function that is called with the name of the next stage.
+
+    Returns:
+        Correction with its card's quality.
 
     Raises:
         ValueError: There are no drives, episodes or epochs; or as the filter and the envs.
@@ -216,6 +222,9 @@ def compute_errors(correction: Correction, data: Samples) -> tuple[Array, Array]
     Args:
         correction: Correction on which the samples were driven.
         data: Samples.
+
+    Returns:
+        Errors and standard deviations.
     """
     ones = np.ones(correction.card.inputs)
     plain = replace(correction.network, mean=0.0 * ones, scale=ones)
@@ -229,6 +238,9 @@ def compute_quality(correction: Correction, data: Samples) -> dict[str, float]:
     Args:
         correction: Correction on which the samples were driven.
         data: Samples.
+
+    Returns:
+        Numbers by name: "filter_rmse", "rmse", "coverage" and "nees".
     """
     errors, deviations = compute_errors(correction, data)
     squares = (errors / deviations) ** 2

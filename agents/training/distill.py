@@ -75,6 +75,9 @@ def collect_demonstrations(
         noise: Largest standard deviation of the teacher's noise.
         max_cost: Maximum of the cost that divides errors: failed or lost episodes teach most.
 
+    Returns:
+        Demonstrations with the teacher's actions, one row for each seed.
+
     Raises:
         ValueError: The teacher's cars differ from the student's.
     """
@@ -155,6 +158,9 @@ def distill(
         config: Configuration of the student and its training.
         path: Path that ends in `.safetensors`.
         report: Function that is called after each round.
+
+    Returns:
+        Policy of the last round, and the results of all rounds.
 
     Raises:
         ValueError: There is no task, `config.told` is set where the student sees all of the

@@ -24,6 +24,9 @@ def convert_sb3_policy(model: Any, normaliser: Any = None, history: int = 1) -> 
         normaliser: VecNormalize of the training, or None.
         history: Frames that a VecFrameStack stacked, inside or outside of the normaliser.
 
+    Returns:
+        Network of the actor.
+
     Raises:
         ValueError: The model is none of these, or has an observation of another width.
         ModuleNotFoundError: torch is not installed.
@@ -120,6 +123,9 @@ def find_actor_reader(kind: type) -> Callable[[Any], _Actor]:
     Args:
         kind: Class of the policy.
 
+    Returns:
+        Function of a policy.
+
     Raises:
         ValueError: The class is not in `ACTORS`.
     """
@@ -198,6 +204,9 @@ def read_normalisation(
         normaliser: VecNormalize or None.
         n_inputs: Entries that the network reads, of all frames together.
         history: Number of frames.
+
+    Returns:
+        Mean, factor (0: not read) and clip (None: none), by entry of all frames or of one.
     """
     if normaliser is None or not normaliser.norm_obs:
         return np.zeros(n_inputs), np.ones(n_inputs), None

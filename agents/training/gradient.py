@@ -49,6 +49,9 @@ def make_source(
         reward_scale: Factor of each car's reward.
         device: torch's device.
         compile: Whether to compile the step, as for `DeviceVectorEnv`.
+
+    Returns:
+        Environments with the seeds and reward factors of their rows.
     """
     options: dict[str, Any] = {
         "device": device,
@@ -105,6 +108,9 @@ class GruPolicy(BasePolicy):
         Args:
             observations: Observations, shape (N, k).
             state: State, shape (N, cells).
+
+        Returns:
+            Actions and next state.
         """
         z = self.features_extractor(observations)
         _, after = self.cell(z[None], state[None])
@@ -115,6 +121,9 @@ class GruPolicy(BasePolicy):
 
         Args:
             count: Number of cars.
+
+        Returns:
+            State on the policy's device.
         """
         return torch.zeros(count, self.cell.hidden_size, device=self.device)
 
@@ -132,6 +141,9 @@ class GruPolicy(BasePolicy):
             state: State from the last call; None at the start.
             episode_start: Rows whose state is cleared, shape (N,).
             deterministic: Without effect.
+
+        Returns:
+            Actions, shape (m,) or (N, m), and the next state for the next call.
         """
         obs_tensor, is_single = self.obs_to_tensor(observation)[0], np.ndim(observation) == 1
         before = self.begin(len(obs_tensor)) if state is None else torch.as_tensor(state[0])
@@ -240,6 +252,9 @@ class AnalyticPolicyGradient(BaseAlgorithm):
             tb_log_name: Name of the run in TensorBoard.
             reset_num_timesteps: Whether the steps count from 0.
             progress_bar: Whether to show a bar.
+
+        Returns:
+            The model itself.
 
         Raises:
             ValueError: There is no source.

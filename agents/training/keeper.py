@@ -59,6 +59,9 @@ def make_evaluation_seeds(episodes: int) -> list[int]:
 
     Args:
         episodes: Number of seeds.
+
+    Returns:
+        Seeds, as many as `episodes`.
     """
     return [_EVALUATION_SEEDS + i for i in range(episodes)]
 
@@ -212,6 +215,9 @@ class EvalCallback(BaseCallback):
             checkpoint: State of a checkpoint, None for a new training.
             trained_agent: Zip to start from, None for none.
             trust: Whether a pickle of VecNormalize beside the zip may be read.
+
+        Returns:
+            Model, ready to learn.
         """
         task, run_options = self.task, self.run_options
         start = None

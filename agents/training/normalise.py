@@ -78,6 +78,9 @@ class Standardised(FlattenExtractor):
 
         Args:
             observations: Observations, shape (N, k).
+
+        Returns:
+            Standardised and mixed observations, shape (N, k).
         """
         z = torch.clamp((observations - self.mean) * self.scale, -self.clip, self.clip)
         return z @ self.mixing
@@ -98,6 +101,9 @@ def measure_scaling(
         seed: Seed of actions and episodes.
         reads: Entries that the network reads; empty: all.
         mixed: Whether to whiten the entries under actions that are held for a while.
+
+    Returns:
+        Mean, factor (0: not read), clip and mixing (None: none).
 
     Raises:
         ValueError: The observation lacks an entry of `reads`, or none of them varies.

@@ -30,6 +30,9 @@ def compute_equal_weights(costs: Array) -> Array:
 
     Args:
         costs: Mean costs of the scenarios, shape (k,).
+
+    Returns:
+        Weights, shape (k,).
     """
     return np.asarray(costs.mean() / np.maximum(costs, _MIN_COST_SHARE * costs.mean()))
 
@@ -42,6 +45,9 @@ def compute_scenario_weights(task: TrainingTask, first: int) -> Array:
     Args:
         task: Task of the training.
         first: First seed of the uncontrolled drives.
+
+    Returns:
+        Weights in the order of the scenarios.
     """
     k = len(task.scenarios)
     if not k:
@@ -100,6 +106,9 @@ def measure_reward_scale(agent: Any, env: VecEnv, seed: int, steps: int) -> list
         env: Env that resets itself, whose scenarios do not depend on the agent.
         seed: Seed of row 0.
         steps: Steps of each row; further drives have the median of the row's factors.
+
+    Returns:
+        Factors of each row's drives, the last for all further ones.
     """
     scales: list[list[float]] = [[] for _ in range(env.num_envs)]
     costs, lengths = np.zeros(env.num_envs), np.zeros(env.num_envs)

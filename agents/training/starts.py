@@ -59,6 +59,9 @@ def read_warm_start(path: str | Path, width: int, trust: bool = False) -> WarmSt
         width: Entries of the observation.
         trust: Whether a pickle of VecNormalize beside the zip may be read.
 
+    Returns:
+        Tensors of the model, and its scaling.
+
     Raises:
         PermissionError: There is such a pickle and no trust.
         ValueError: The zip cannot be read, or as `check_zip`.
@@ -104,6 +107,9 @@ def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
         fields: Fields of `TrainingTask` that replace the card's. `env_options` add to the card's, a
             scenario there replaces its mixture, and another estimator drops the card's options.
 
+    Returns:
+        Task with the policy's observation and form.
+
     Raises:
         ValueError: The algorithm cannot start from a policy, or from one of this form.
     """
@@ -136,6 +142,9 @@ def resolve_settings(file: str | Path | None, algo: str, env_id: str, start: Any
         algo: Name of the algorithm.
         env_id: Id of the env.
         start: Policy to train further, or anything else for a new training.
+
+    Returns:
+        Values by name.
 
     Raises:
         ValueError: As `read_settings` and `make_finetune_task`.
@@ -190,6 +199,9 @@ def make_warm_start(
         policy: Policy to train further.
         task: Task of the training.
         layout: Entries of the task's observation.
+
+    Returns:
+        Tensors of the actor, and the policy's scaling.
 
     Raises:
         ValueError: The policy has another form than the settings, or another observation.
@@ -327,6 +339,9 @@ class PolicyWarmStart:
 
         Args:
             env: Vector env of the task.
+
+        Returns:
+            Wrapped env; `env` itself for a policy without memory.
         """
         return MemoryObservation(env, self._network, self._mixing) if self._mixing else env
 
@@ -335,6 +350,9 @@ class PolicyWarmStart:
 
         Args:
             network: Network of the model.
+
+        Returns:
+            Network of plain observations.
         """
         return (
             self._network.replace_dense(self._mixing.adapt_to_plain(network))

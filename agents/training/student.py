@@ -119,6 +119,9 @@ class Student(nn.Module):
         Args:
             z: Inputs, shape (B, T, k).
             state: State from the last call; None at the start.
+
+        Returns:
+            Outputs and next state.
         """
         memory = self.cell or self.traces
         if memory is not None:
@@ -150,6 +153,9 @@ class Student(nn.Module):
 
         Args:
             scaling: Scaling of the inputs.
+
+        Returns:
+            Network of the actions, without auxiliary outputs.
         """
         numbers = {name: value.detach().numpy().copy() for name, value in self.named_parameters()}
         names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
@@ -250,6 +256,9 @@ def fit_model(
         scaling: Scaling of the inputs.
         config: Configuration of the training.
         epochs: Passes over all drives.
+
+    Returns:
+        Mean loss of the last epoch.
 
     Raises:
         FloatingPointError: The loss is not finite.

@@ -83,6 +83,9 @@ class TrainingTask:
 
         Args:
             num_envs: Number of rows.
+
+        Returns:
+            Options by name; the rows take turns with the scenarios.
         """
         if not self.scenarios:
             return self.env_options
@@ -94,6 +97,9 @@ class TrainingTask:
 
         Args:
             num_envs: Number of rows.
+
+        Returns:
+            Vector env with the task's estimator.
         """
         options = self.options(num_envs)
         return make_native_env(self.env_id, num_envs, self.estimator_kwargs, options)
@@ -103,6 +109,9 @@ class TrainingTask:
 
         Args:
             logs: Folder of all trainings.
+
+        Returns:
+            Path of the folder.
 
         Raises:
             ValueError: The zoo does not have the algorithm.

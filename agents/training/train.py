@@ -92,6 +92,9 @@ def train(
             costs.
         trust: Whether a pickle of VecNormalize beside the zip may be read.
 
+    Returns:
+        Model and its evaluations.
+
     Raises:
         ValueError: The folder holds another training, or arguments contradict each other.
         FileNotFoundError: There is no checkpoint to resume from.
@@ -148,6 +151,9 @@ def load_initial_policy(folder: str | Path) -> Policy | None:
     Args:
         folder: Folder of the training.
 
+    Returns:
+        Policy under its own name.
+
     Raises:
         FileNotFoundError: The copy of the policy is missing.
         ValueError: As `read_task`.
@@ -176,6 +182,9 @@ def read_run_record(folder: str | Path) -> RunRecord:
 
     Args:
         folder: Folder of the training.
+
+    Returns:
+        The record.
 
     Raises:
         ValueError: As `read_task`.
@@ -233,6 +242,9 @@ def read_task(folder: str | Path, **arguments: Any) -> TrainingTask:
     Args:
         folder: Folder of the training.
         arguments: Fields of the task that must agree with it.
+
+    Returns:
+        The task.
 
     Raises:
         FileNotFoundError: There is no checkpoint.

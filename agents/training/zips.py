@@ -47,6 +47,9 @@ def policy_from_zip(
             the zip, if there is one.
         about: Fields of the policy's `Card`.
 
+    Returns:
+        Policy of the actor.
+
     Raises:
         FileNotFoundError: There is no such file.
         PermissionError: `trust` is False.
@@ -92,6 +95,9 @@ def export_zip(
         normalise: Pickle of VecNormalize, as for `policy_from_zip`.
         command: Command line, for the card.
 
+    Returns:
+        Policy as it is in the file.
+
     Raises:
         ValueError: The target has another ending; or as `policy_from_zip` and `save_policy`.
         PermissionError: `trust` is False.
@@ -116,6 +122,9 @@ def find_normaliser(path: Path, normalise: str | Path | None = None) -> Path | N
     Args:
         path: Path of the zip.
         normalise: Path of the pickle, None to look for it.
+
+    Returns:
+        Path of the pickle.
     """
     if normalise is not None:
         return Path(normalise)
@@ -222,6 +231,9 @@ def load_normaliser(file: Path) -> Any:
 
     Args:
         file: Path of the pickle.
+
+    Returns:
+        The VecNormalize.
 
     Raises:
         FileNotFoundError: There is no such file.

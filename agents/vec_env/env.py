@@ -147,6 +147,9 @@ class NativeVecEnv(VecEnv):
 
         Args:
             mode: Passed to stable-baselines3, which warns where it differs from `render_mode`.
+
+        Returns:
+            Frame, shape (height, width, 3).
         """
         return None if self.render_mode == "human" else super().render(mode)
 
@@ -160,6 +163,9 @@ class NativeVecEnv(VecEnv):
         Args:
             attr_name: Name of the attribute.
             indices: Rows, None for all.
+
+        Returns:
+            Values, one for each row.
 
         Raises:
             AttributeError: The rows do not have it.
@@ -191,6 +197,9 @@ class NativeVecEnv(VecEnv):
             indices: Rows, None for all.
             method_kwargs: Keyword arguments.
 
+        Returns:
+            Results, one for each row.
+
         Raises:
             AttributeError: `VecEnvRow` has no such method.
         """
@@ -205,6 +214,9 @@ class NativeVecEnv(VecEnv):
         Args:
             wrapper_class: Class of a wrapper.
             indices: Rows, None for all.
+
+        Returns:
+            True or False for each row.
         """
         return [row.is_wrapped(wrapper_class) for row in self._get_rows(indices)]
 
@@ -234,6 +246,9 @@ def make_vec_env(
         info_keywords: Keys of the last step's info that go into that file.
         wrapper_class: Called with the native vector env in its estimator; returns what is bridged.
 
+    Returns:
+        `VecEnv` that monitors episodes.
+
     Raises:
         ValueError: The id has no native vector env; or as `gym.make_vec` and `EstimateObservation`.
     """
@@ -257,6 +272,9 @@ def make_native_env(
         num_envs: Number of rows.
         estimator: Name of an estimator, or arguments of `EstimateObservation`.
         env_kwargs: Arguments of the environment.
+
+    Returns:
+        Vector env, wrapped if there is an estimator.
 
     Raises:
         ValueError: As `make_vec_env`.

@@ -57,6 +57,9 @@ class VecEnvRow:
         Args:
             name: Name of the attribute.
 
+        Returns:
+            Value of this row.
+
         Raises:
             AttributeError: No layer has it.
         """
@@ -81,6 +84,9 @@ class VecEnvRow:
 
         Args:
             name: Name of the attribute.
+
+        Returns:
+            True if it does.
         """
         try:
             self.get_wrapper_attr(name)
@@ -94,7 +100,6 @@ class VecEnvRow:
         Args:
             name: Name of the value.
             value: Value for `get_wrapper_attr`.
-            _: Without effect.
 
         Raises:
             AttributeError: The name is the env's.
@@ -130,6 +135,9 @@ class VecEnvRow:
 
         Args:
             wrapper_class: Class of a wrapper.
+
+        Returns:
+            True if one does.
         """
         wanted = _TWINS.get(wrapper_class, wrapper_class)
         return any(isinstance(layer, wanted) for layer in self._iterate_layers())

@@ -25,6 +25,9 @@ def make_file_name(env_id: str) -> str:
 
     Args:
         env_id: Id of an env.
+
+    Returns:
+        Name without a slash.
     """
     return env_id.replace("/", "-")
 
@@ -36,6 +39,9 @@ def find_next_folder(logs: Path, algo: str, env_id: str) -> Path:
         logs: Folder of all trainings.
         algo: Algorithm's name in the zoo.
         env_id: Id of the env.
+
+    Returns:
+        Path LOGS/ALGO/ID_N with N above all that exist.
     """
     numbered = re.compile(re.escape(make_file_name(env_id)) + r"_(\d+)")
     entries = (logs / algo).iterdir() if (logs / algo).is_dir() else ()

@@ -25,6 +25,9 @@ def compute_dissipation(params: Array, states: Array, switches: Any) -> Array:
         params: Packed parameters of the engine, one row for each car.
         states: Packed states of the engine, likewise.
         switches: Packed switches of the engine, likewise.
+
+    Returns:
+        Power of each car.
     """
     out = np.empty(len(params))
     _write(params, states, switches, out)

@@ -44,6 +44,9 @@ def call_quietly(make: Callable[..., T], *args: Any, **options: Any) -> T:
         make: Function to call.
         args: Positional arguments.
         options: Keyword arguments.
+
+    Returns:
+        What the maker returns.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnobservableWarning)
@@ -60,6 +63,9 @@ def make_env(
         estimator: Name of the estimator, "" for none.
         estimate: Other arguments of `EstimateObservation`.
         options: Arguments of the env.
+
+    Returns:
+        Env, wrapped if there is an estimator.
     """
     env: gym.Env[Any, Any] = gym.make(env_id, **{"on_bad_action": "fail", **options})
     return (

@@ -98,6 +98,9 @@ class Metric:
 
         Args:
             value: Value in the metric's unit.
+
+        Returns:
+            Number without its unit.
         """
         return f"{self.scale * value:.{self.digits}f}"
 

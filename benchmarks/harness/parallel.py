@@ -23,6 +23,9 @@ def split_seeds(seeds: int, size: int) -> list[tuple[int, ...]]:
     Args:
         seeds: Number of seeds.
         size: Maximum of seeds in a tuple.
+
+    Returns:
+        Tuples of consecutive seeds.
     """
     return [tuple(range(k, min(k + size, seeds))) for k in range(0, seeds, size)]
 
@@ -51,6 +54,9 @@ class Bar(progress.Progress):
         Args:
             args: Arguments of rich's `add_task`.
             options: Keyword arguments of rich's `add_task`, and the unit of its count, `unit`.
+
+        Returns:
+            Id of the task.
         """
         made = super().add_task(*args, **options)
         self._say()
@@ -102,6 +108,9 @@ def use_shared_bar(
         title: First title.
         unit: Unit of the count.
         total: Total of the count, None if unknown.
+
+    Yields:
+        The progress bar.
     """
     with Bar(console) as bar:
         bar.add_task(title, total=total, unit=unit)
@@ -129,6 +138,9 @@ def run_cases(
             has its own.
         console: Console of the progress bar, unless inside `use_shared_bar`; None: nothing is
             shown.
+
+    Returns:
+        Results, one for each case.
     """
     shared, results = _SHARED.get(), dict[int, Result]()
     with Bar(console) if shared is None else nullcontext(shared) as bar:

@@ -77,6 +77,9 @@ class ResultRow:
             metric: Name of the metric.
             number: Number and interval.
             columns: Other fields.
+
+        Returns:
+            Row of the metric.
         """
         return cls(metric=metric, value=number.value, low=number.low, high=number.high, **columns)
 
@@ -245,6 +248,9 @@ def read_json(path: str | Path) -> list[ResultRow]:
     Args:
         path: File to read.
 
+    Returns:
+        Rows in order.
+
     Raises:
         ValueError: The file holds others; the message has file, row and column.
     """
@@ -260,6 +266,9 @@ def read_objects(path: str | Path) -> list[dict[str, Any]]:
 
     Args:
         path: File to read.
+
+    Returns:
+        Objects in order.
 
     Raises:
         ValueError: The file holds something else; the message has the path.

@@ -43,6 +43,9 @@ class Estimate(NamedTuple):
         Args:
             scale: Factor of the numbers.
             digits: Format specification.
+
+        Returns:
+            Cells of the number and of the interval.
         """
         value, low, high = (f"{scale * number:{digits}}" for number in self)
         return value, f"{low} .. {high}" if math.isfinite(self.low) else ""
@@ -53,6 +56,9 @@ class Estimate(NamedTuple):
         Args:
             scale: Factor of the numbers.
             digits: Format specification.
+
+        Returns:
+            Text of both.
         """
         value, low, high = (f"{scale * number:{digits}}" for number in self)
         return f"{value} [{low}, {high}]" if math.isfinite(self.low) else value
@@ -64,6 +70,9 @@ def root_mean(squares: Array, axis: int = -1) -> Array:
     Args:
         squares: Mean squared errors.
         axis: Axis of the seeds.
+
+    Returns:
+        Roots, without the axis of the seeds.
     """
     return np.asarray(np.sqrt(np.mean(squares, axis=axis)))
 
@@ -74,6 +83,9 @@ def mean(values: Array, axis: int = -1) -> Array:
     Args:
         values: Numbers.
         axis: Axis of the seeds.
+
+    Returns:
+        Means, without the axis of the seeds.
     """
     return np.asarray(np.mean(values, axis=axis))
 
@@ -147,6 +159,9 @@ def mean_share(values: Array) -> Estimate:
 
     Args:
         values: Fractions, shape (n,).
+
+    Returns:
+        Mean and interval.
     """
     if not 0.0 < np.mean(values) < 1.0:
         return interval(values)
@@ -165,6 +180,9 @@ def ratio_of_roots(squares: Array, reference: Array, axis: int = -1) -> Array:
         squares: Mean squared errors.
         reference: Mean squared errors of the reference.
         axis: Axis of the seeds.
+
+    Returns:
+        Ratios, without the axis of the seeds.
     """
     return np.asarray(root_mean(squares, axis) / root_mean(reference, axis))
 
@@ -176,6 +194,9 @@ def ratio_of_means(values: Array, reference: Array, axis: int = -1) -> Array:
         values: Numbers.
         reference: Numbers of the reference.
         axis: Axis of the seeds.
+
+    Returns:
+        Ratios, without the axis of the seeds.
     """
     return np.asarray(mean(values, axis) / mean(reference, axis))
 
@@ -202,6 +223,9 @@ def geometric_mean(*strata: Array) -> Estimate:
 
     Args:
         strata: Logarithms of each stratum, shape (n_i,); strata have equal weight.
+
+    Returns:
+        Geometric mean and interval.
     """
     return Estimate(*(math.exp(log) for log in average(*strata)))
 
@@ -233,6 +257,9 @@ def compute_win_rate(costs: Array, others: Array) -> Estimate:
     Args:
         costs: Costs, shape (n,).
         others: The other's costs on the same seeds, shape (n,).
+
+    Returns:
+        Fraction and interval.
     """
     return share(np.where(costs == others, 0.5, np.less(costs, others)))
 
@@ -261,6 +288,9 @@ def compute_tail_mean(costs: Array) -> Estimate:
 
     Args:
         costs: Costs, shape (n,).
+
+    Returns:
+        Mean, NaN without costs, and interval.
     """
     if len(costs) == 0 or np.isnan(costs).any():
         return Estimate(math.nan)
@@ -303,6 +333,9 @@ def compute_p_value(logs: Array) -> float:
 
     Args:
         logs: Paired differences, shape (n,).
+
+    Returns:
+        p; 1 where the differences do not vary.
     """
     spread = float(np.std(logs, ddof=1)) if len(logs) > 1 else math.nan
     middle = float(np.mean(logs)) if len(logs) else math.nan

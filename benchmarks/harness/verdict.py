@@ -18,6 +18,9 @@ def format_verdict(*lines: str) -> str:
     Args:
         lines: Lines, of which at most LINES are not empty.
 
+    Returns:
+        Text of the lines.
+
     Raises:
         ValueError: There are more lines.
     """
@@ -37,6 +40,9 @@ def describe_leader(name: str, ratios: Mapping[str, Estimate], verb: str) -> str
         ratios: Its number over each rival's, the closest rival first.
         verb: Verb for what is better done little, such as "err".
 
+    Returns:
+        Clause without a full stop.
+
     >>> describe_leader("lqr", {"esc": Estimate(0.71, 0.65, 0.77)}, "cost")
     'lqr costs least, 71 % [65, 77] as much as esc'
     >>> describe_leader("lqr", {"esc": Estimate(0.98, 0.9, 1.05)}, "cost")
@@ -55,6 +61,9 @@ def format_percent(ratio: Estimate) -> str:
     Args:
         ratio: Ratio, 1 for 100 %.
 
+    Returns:
+        Text of both.
+
     >>> format_percent(Estimate(0.71, 0.65, 0.77)), format_percent(Estimate(0.5))
     ('71 % [65, 77]', '50 %')
     """
@@ -68,6 +77,9 @@ def summarise_names(names: Sequence[str], limit: int = _NAMES) -> str:
     Args:
         names: Names.
         limit: Maximum of names that are shown.
+
+    Returns:
+        Text of the names.
 
     >>> summarise_names(["a"]), summarise_names(["a", "b"]), summarise_names(["a", "b", "c", "d"])
     ('a', 'a and b', 'a, b and 2 more')

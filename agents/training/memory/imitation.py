@@ -58,6 +58,9 @@ class MemoryAgent:
             state: State from the last call; None at the start.
             episode_start: Rows whose state is cleared, shape (N,).
             deterministic: Without effect.
+
+        Returns:
+            Actions within [-1, 1], shape (N, 1), and the next state.
         """
         z = torch.from_numpy(normalise_inputs(observation, self.mean, self.scale))[:, None]
         if state is not None and episode_start is not None and np.any(episode_start):
@@ -85,6 +88,9 @@ def train_memory(
         delay_steps: Control periods between a packet's capture and its arrival.
         weight: S, the cost of a squared error.
         report: Function that is called after each round.
+
+    Returns:
+        Agent of the last round.
 
     Raises:
         ValueError: The name is unknown, or the observation does not say whether a packet arrived.

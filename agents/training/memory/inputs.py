@@ -54,6 +54,9 @@ class CompactObservation(VectorWrapper[Any, Any, Any, Any, Any]):
             seed: Seeds of the inner env.
             options: Options of the inner env, without `reset_mask`.
 
+        Returns:
+            Observations, shape (N, k), and infos.
+
         Raises:
             ValueError: Only some rows are to be reset.
         """
@@ -67,6 +70,9 @@ class CompactObservation(VectorWrapper[Any, Any, Any, Any, Any]):
 
         Args:
             actions: Actions, shape (N, width).
+
+        Returns:
+            Observations, shape (N, k), rewards, terminated, truncated and infos.
         """
         obs, *rest = self.env.step(actions)
         return self._read(obs), *rest

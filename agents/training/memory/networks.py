@@ -76,6 +76,9 @@ class MemoryNetwork(nn.Module):
         Args:
             z: Normalised observations, shape (B, T, k).
             state: State from the last call; None at the start.
+
+        Returns:
+            Actions and next state.
         """
         arrived, z = (z[..., self.fresh_index, None] > 0.0).to(z.dtype), z @ self.mix
         known, state = self._update_memory(z, arrived, state)
@@ -87,6 +90,9 @@ def make_dense_layers(*sizes: int) -> nn.Sequential:
 
     Args:
         sizes: Sizes of input, hidden layers and output.
+
+    Returns:
+        Layers in order, the last one linear.
     """
     layers: list[nn.Module] = []
     for a, b in itertools.pairwise(sizes):
@@ -278,6 +284,9 @@ def make_memory(name: str, inputs: int, fresh_index: int, delay_steps: int) -> M
         inputs: Number of entries of an observation.
         fresh_index: Entry that says whether a packet arrived.
         delay_steps: Control periods between a packet's capture and its arrival.
+
+    Returns:
+        Network with random weights.
 
     Raises:
         ValueError: The name is unknown, or a number is out of range.

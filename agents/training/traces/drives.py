@@ -64,6 +64,9 @@ class Scaling(NamedTuple):
 
         Args:
             obs: Observations, shape (..., k).
+
+        Returns:
+            Inputs, shape (..., k).
         """
         mixing = self.mixing.astype(np.float32)
         return normalise_inputs(obs, self.mean, self.scale) @ mixing
@@ -86,6 +89,9 @@ def compute_scaling(
         needs: Entries that the teacher reads.
         usual_ages: Whether an age is scaled by its variation while packets come, and clipped before
             the first and long after the last one; else by its deviation.
+
+    Returns:
+        Mean and factor, shape (k,), and mixing, shape (k, k).
     """
     x = np.concatenate([demo.obs[demo.weights > 0.0] for demo in drives])
     names = [entry.name for entry in layout]
@@ -107,5 +113,8 @@ def normalise_inputs(obs: Single, mean: Array, scale: Array) -> Single:
         obs: Observations, shape (..., k).
         mean: Means, shape (k,).
         scale: Factors, shape (k,).
+
+    Returns:
+        Normalised observations, shape (..., k).
     """
     return np.clip((obs - mean.astype(np.float32)) * scale.astype(np.float32), -CLIP, CLIP)

@@ -95,6 +95,9 @@ class TraceLayer(nn.Module):
 
         Args:
             mixing: Mixing of the inputs, shape (k, k).
+
+        Returns:
+            Layer of plain NumPy arrays.
         """
         silu_weights = self.unit.weight.detach().numpy() @ mixing
         bias = np.concatenate([np.zeros(self.inputs), self.unit.bias.detach().numpy()])
@@ -110,6 +113,9 @@ class TraceLayer(nn.Module):
         Args:
             weight: Weights, shape (m, size).
             bias: Biases, shape (m,).
+
+        Returns:
+            Weights and biases, shape (m,).
         """
         size, times = len(self.mean), 1 + len(self.times)
         linear = weight[:, :size] @ self.mixing.numpy().astype(np.float64).T

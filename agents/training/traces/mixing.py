@@ -16,6 +16,9 @@ def compute_scale(spread: Any, minimum: float = 1e-9) -> Array:
     Args:
         spread: Standard deviations, shape (k,).
         minimum: Deviation below which an input counts as constant.
+
+    Returns:
+        Factors, shape (k,).
     """
     return np.where(spread > minimum, 1.0 / np.maximum(spread, minimum), 0.0)
 
@@ -26,6 +29,9 @@ def compute_whitening(z: Any, minimum: float) -> Array:
     Args:
         z: Samples, shape (n, k).
         minimum: Least eigenvalue of the covariance.
+
+    Returns:
+        The matrix.
     """
     sizes, axes = np.linalg.eigh(np.cov(z, rowvar=False))
     return np.asarray(axes / np.sqrt(np.maximum(sizes, minimum)) @ axes.T)

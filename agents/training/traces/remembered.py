@@ -32,6 +32,9 @@ class Mixing(NamedTuple):
 
         Args:
             network: Network of plain x.
+
+        Returns:
+            Network of mixed x.
         """
         first = network.weights[0] @ np.linalg.inv(self.mixing)
         return _replace_first_layer(
@@ -43,6 +46,9 @@ class Mixing(NamedTuple):
 
         Args:
             network: Network of mixed x.
+
+        Returns:
+            Network of plain x.
         """
         first = network.weights[0] @ self.mixing
         return _replace_first_layer(network, first, network.biases[0] - first @ self.mean)
@@ -84,6 +90,9 @@ class MemoryObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         Args:
             seed: Seeds of the inner env.
             options: Options of the inner env.
+
+        Returns:
+            Observations of all rows, and infos.
         """
         mask = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_)))
         obs, infos = self.env.reset(seed=seed, options=options)
@@ -97,6 +106,9 @@ class MemoryObservation(VectorWrapper[Any, Any, Any, Any, Any]):
 
         Args:
             actions: Actions, shape (N, width).
+
+        Returns:
+            Observations, rewards, terminated, truncated and infos.
         """
         obs, rewards, terminated, truncated, infos = self.env.step(actions)
         over = terminated | truncated
@@ -130,6 +142,9 @@ def measure_mixing(
         network: Network with memory.
         drive: Function from the inputs of its dense layers to actions.
         seed: Seed of the first row.
+
+    Returns:
+        Mean and whitening of the dense layers' inputs.
     """
     wrapped, collected = MemoryObservation(env, network), []
     obs, _ = wrapped.reset(seed=seed)
