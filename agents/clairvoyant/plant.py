@@ -110,7 +110,7 @@ def advance(fixed: PlanParams, x: PlanState, action: Any, known: PreviewStep) ->
         known: Inputs of the step.
 
     Returns:
-        Next state, and what the step adds.
+        Next state, cost of the effort, and change of the added steering (rad).
     """
     car = fixed.car._replace(C_f=known.C_f, C_r=known.C_r, mu=known.mu, mu_r=known.mu_r)
     task, kind, q = fixed.task, fixed.kind, fixed.ticks

@@ -149,7 +149,7 @@ class NativeVecEnv(VecEnv):
             mode: Passed to stable-baselines3, which warns where it differs from `render_mode`.
 
         Returns:
-            Frame, shape (height, width, 3).
+            Frame, shape (height, width, 3), or None.
         """
         return None if self.render_mode == "human" else super().render(mode)
 
