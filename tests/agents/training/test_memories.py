@@ -150,7 +150,7 @@ def test_a_memory_comes_nearer_to_the_filter() -> None:
 
 
 def _still(model: Any) -> Any:
-    other = make_memory("mlp", model.inputs, model.fresh, model.late)
+    other = make_memory("mlp", model.inputs, model.fresh_index, model.delay_steps)
     for each in other.parameters():
         each.data.zero_()
     return other
