@@ -28,10 +28,8 @@ _TRANSPARENT = {
     "DictInfoToList HumanRendering ObstructView RecordEpisodeStatistics RecordVideo "
     "RenderCollection VectorizeTransformReward",
     "stable_baselines3": "Monitor VecCheckNan VecMonitor VecNormalize VecVideoRecorder",
-    __name__.partition(".")[
-        0
-    ]: "EstimateObservation OwnObservation CompactObservation RewardScaleWrapper MemoryObservation "
-    "TruthObservation",
+    __name__.partition(".")[0]: "CompactObservation EstimateObservation MemoryObservation "
+    "NativeObservation RewardScaleWrapper TruthObservation",
 }
 _CHANGES = {"reset", "step", "step_async", "step_wait", "observation", "observations", "action",
             "actions"}  # fmt: skip

@@ -296,7 +296,7 @@ def rollout(
     if not (isinstance(env, gym.Env) and env.has_wrapper_attr("layout")):
         raise TypeError(
             f"rollout runs one env of this package, got {short_repr(env)}; "
-            "agents.rollout.drives_of runs a vector env"
+            "agents.rollout.evaluate_episodes runs a vector env"
         )
     base: Any = env.unwrapped
     layout = env.get_wrapper_attr("layout")

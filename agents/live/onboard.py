@@ -50,7 +50,7 @@ class OnboardController:
 
     def __init__(self, env: gym.Env[Any, Any], agent: Any = None, seed: int | None = 0) -> None:
         if not isinstance(env, EstimateObservation):
-            raise TypeError(f"an Onboard reads an EstimateObservation, got {type(env).__name__}")
+            raise TypeError(f"it reads an EstimateObservation, got {type(env).__name__}")
         base: Any = env.unwrapped
         env.reset(seed=seed)
         self.base = base

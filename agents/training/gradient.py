@@ -261,7 +261,7 @@ class AnalyticPolicyGradient(BaseAlgorithm):
             FloatingPointError: The gradient is not finite; the message has the step.
         """
         if self.source is None:
-            raise ValueError("Gradient drives cars on tensors: it needs their source")
+            raise ValueError("AnalyticPolicyGradient drives cars on tensors: it needs their source")
         total, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )

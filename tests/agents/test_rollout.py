@@ -98,6 +98,6 @@ def test_a_rollout_of_many_cars_or_of_another_env_is_refused_in_one_line() -> No
     many = gym.make_vec("sideslip/YawVision-v0", num_envs=2)
     for env in (many, gym.make("CartPole-v1"), "CartPole-v1", 5):
         with pytest.raises(
-            TypeError, match=r"^rollout runs one env .*drives_of runs a vector env$"
+            TypeError, match=r"^rollout runs one env .*evaluate_episodes runs a vector env$"
         ):
             sideslip.rollout(env)  # type: ignore[arg-type]
