@@ -176,9 +176,9 @@ def test_a_kill_at_any_time_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> 
         "import sys\n"
         "from sideslip.agents.training import train\n"
         "options = {'scenario': 'sine-with-dwell'}\n"
-        "task = train.Task(num_envs=8, env_options=options, n_eval_envs=4)\n"
-        "means = train.Means(eval_freq=256)\n"
-        "train.train(task, 10**8, sys.argv[1], resume=len(sys.argv) > 2, means=means)\n"
+        "task = train.TrainingTask(num_envs=8, env_options=options, n_eval_envs=4)\n"
+        "run_options = train.RunOptions(eval_freq=256)\n"
+        "train.train(task, 10**8, sys.argv[1], len(sys.argv) > 2, run_options)\n"
     )
     path, reached = tmp_path / CHECKPOINT, [-1]
     for wait in np.random.default_rng(0).uniform(0.0, 0.5, 4):

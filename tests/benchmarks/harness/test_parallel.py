@@ -136,7 +136,7 @@ DRIVER = """
 import sys
 from pathlib import Path
 from sideslip.benchmarks.control.cells import ControlEntry
-from sideslip.benchmarks.control.list_scored_tasks import list_scored_tasks
+from sideslip.benchmarks.control.contests import list_scored_tasks
 from sideslip.benchmarks.control.run import CHUNK, measure
 from sideslip.benchmarks.harness.engines import use_engine
 
