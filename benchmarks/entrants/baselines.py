@@ -108,8 +108,8 @@ def find_baselines(
     again = measure(sample, make_task_seeds(salt, SAMPLE), title="baselines, a sample", **options)
     for entry, result in again.outcomes.items():
         same = np.isclose(result.costs, records[entry].costs[:SAMPLE], rtol=_SAME, atol=0.0)
-        # Another processor's roundings can lead a solver's iterations elsewhere in a drive. What
-        # changes the car or a controller changes them all.
+        # On another processor one drive of `oracle-state` costs 0.3 % more. What changes the car or
+        # a controller changes every drive.
         if result.error or not same.any():
             return None
     return salt, Results({entry: records[entry].drives(n) for entry in wanted})
