@@ -15,9 +15,10 @@ from .. import __version__
 from ..agents.learned.card import JsonMap
 from ..agents.learned.files import Policy, load_policy, save_policy
 from ..agents.rollout import compute_cost_ratios
+from ..envs.record import Array
 from .control.cells import ControlEntry
 from .control.contests import ControlTask
-from .control.episodes import Array, Chunk, DriveResult, run_chunk
+from .control.episodes import Chunk, DriveResult, run_chunk
 from .control.seeds import make_salted_seeds
 from .control.tables import make_spec
 from .harness.parallel import run_cases

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Log, Record
+from ..envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Array, Log, Record
 from ..envs.sensors.link import SlowSensor
 from ..envs.sensors.slow import SLOW_NAMES
 from .core.memory import FilterRecord, FilterRecords, SkipCounters
@@ -22,8 +22,6 @@ from .design.periodic import compute_table_shape
 from .design.schedule import Schedule, count_ticks
 from .entry import compile_advance, compile_estimate, compile_process_packet, compile_step
 from .estimates import Estimates, UnobservableWarning
-
-Array = npt.NDArray[np.float64]
 
 CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
 EMPTY = np.zeros((0, 0))

@@ -13,12 +13,9 @@ less likely by a factor of e^8, and so is the one in force.
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ..envs.record import PACKET, PACKET_WIDTH
+from ..envs.record import PACKET, PACKET_WIDTH, Array
 from .entry import compile_advance
-
-Array = npt.NDArray[np.float64]
 
 MAX_SEARCHED_LATENCY = 0.12  # s, of what is looked for
 LOOK_TIMES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)  # s from where a stretch begins

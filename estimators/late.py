@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from ..envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH
+from ..envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
 from ..envs.sensors.link import SlowSensor
 from .core.memory import FILTER
 from .design.config import FilterConfig
 from .design.options import FIND, find_columns
 from .design.schedule import Schedule, count_ticks
 from .entry import compile_advance, compile_process_packet
-from .estimator import EMPTY, NO_NIS, Array, Estimator
+from .estimator import EMPTY, NO_NIS, Estimator
 from .find_latency import LatencySearch, align_rows
 from .protocol import compute_std
 

@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from ..envs.record import Array
 
 
 def parse_matrix(name: str, value: npt.ArrayLike) -> Array:

@@ -7,12 +7,10 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from ..envs.record import PACKET, Log, Record
+from ..envs.record import PACKET, Array, Log, Record
 from ..envs.sensors.link import SlowSensor
 from .design.models import FOREIGN_STATE, STATES
 from .estimates import Estimates
-
-Array = npt.NDArray[np.float64]
 
 
 class EstimatorLike(Protocol):

@@ -13,6 +13,7 @@ from ...envs.engine.layout import ActuatorState, P, TaskParams, Z
 from ...envs.engine.step import make_step_variant, step_vehicle
 from ...envs.engine.tick import StepVariant
 from ...envs.engine.window import compute_profile_angle, make_window
+from ...envs.record import Array
 from ...envs.scenarios.roads import NOMINAL_PATH, NominalMotion, step_nominal_car
 from ...envs.scenarios.speed import (
     SpeedProfile,
@@ -25,8 +26,6 @@ from ...envs.task.reference import ReferenceParams
 from ...envs.ticks import FOREVER, TICK
 from ...envs.vehicle.actuators import Lag, apply_lag, make_lag
 from ...envs.vehicle.dynamics import CarParams, RoadParams
-
-Array = npt.NDArray[np.float64]
 
 
 class PreviewStep(NamedTuple):

@@ -16,13 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.engine.layout import P
+from ...envs.record import Array
 from ..controllers.base import Controller
 from ..rollout import iterate_steps
 from .foresight import Forecast, PlanState, make_forecast, read_plan_state
 from .slopes import N_INPUTS, IlqrProblem, Trajectory, compute_limits, linearise_run, make_problem
 from .sweep import run_backward_pass
 
-Array = npt.NDArray[np.float64]
 Actions = npt.NDArray[np.float32]
 
 STEP_LENGTHS = (1.0, 0.4, 0.1)  # of a step, tried in turn

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from ...envs.backend.decorators import as_python
 from ...envs.backend.primitives import ARRAYS
+from ...envs.record import Array
 from ...envs.vehicle.actuators import limit_angle
 from .foresight import Forecast, PlanParams, PlanState, PreviewStep
 from .plant import (
@@ -19,8 +19,6 @@ from .plant import (
     get_state_scales,
     list_active_states,
 )
-
-Array = npt.NDArray[np.float64]
 
 N_INPUTS = 2  # in a sweep: share of the moment and of the steering, which may be held at zero
 

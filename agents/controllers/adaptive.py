@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from ...envs.record import Array
 from ..env_facts import AnyEnv
-from .base import Array
 from .lqr import IN, Lqr
 from .nmpc import Nmpc
 

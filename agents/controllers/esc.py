@@ -8,6 +8,7 @@ import numpy as np
 
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute, maximum
+from ...envs.record import Array
 from ...envs.task.reference import LIMITED, compute_reference, make_reference_params
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import Vehicle
@@ -15,7 +16,6 @@ from ..design.gain_schedule import SPEEDS, find_cell
 from ..design.nominal_car import compute_plant_python, make_nominal_car
 from ..env_facts import AnyEnv
 from .base import (
-    Array,
     Controller,
     check_not_negative,
     check_positive,

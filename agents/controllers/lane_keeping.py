@@ -12,6 +12,7 @@ import numpy as np
 
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import maximum
+from ...envs.record import Array
 from ...envs.task.cost import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
 from ...envs.ticks import TICK
 from ...envs.vehicle.linear import LinearModel, make_vision_model
@@ -19,7 +20,7 @@ from ...envs.vehicle.vehicle import Vehicle
 from ..design.gain_schedule import SPEEDS, interpolate_gains
 from ..design.sampled_model import solve_lqr
 from ..env_facts import AnyEnv
-from .base import Array, Controller, check_positive
+from .base import Controller, check_positive
 
 Inputs = namedtuple(
     "Inputs",

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...envs.backend.decorators import copy_into, jit
 from ...envs.backend.primitives import absolute
+from ...envs.record import Array
 from ...envs.task.reference import REFERENCES
 from ...envs.ticks import TICK
 from ...envs.vehicle.tyres import MIN_SPEED
@@ -16,7 +17,7 @@ from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ..design.gain_schedule import SPEEDS, interpolate_gains, make_gain_table
 from ..design.sampled_model import DesignSpec
 from ..env_facts import AnyEnv
-from .base import Array, Controller, check_positive, list_entry_names
+from .base import Controller, check_positive, list_entry_names
 
 Inputs = namedtuple(
     "Inputs",

@@ -14,6 +14,7 @@ import numpy as np
 
 from ...envs.backend.decorators import as_python, jit
 from ...envs.backend.primitives import maximum
+from ...envs.record import Array
 from ...envs.task.reference import (
     LAGGED,
     REFERENCES,
@@ -32,7 +33,7 @@ from ..design.nominal_car import (
     solve_inputs,
 )
 from ..env_facts import AnyEnv
-from .base import Array, Controller, integrate_antiwindup, list_entry_names
+from .base import Controller, integrate_antiwindup, list_entry_names
 
 MIN_SPEED = 2.0  # m/s: below it the vehicle is taken as at this speed
 BANDWIDTH = (5.0, 5.0)  # rad/s, K_beta and K_gamma of dakf-stability V.D

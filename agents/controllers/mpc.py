@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csc_matrix
 
+from ...envs.record import Array
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import Vehicle
 from ..design.condensed_qp import QuadraticProgram, condense_qp
 from ..design.gain_schedule import SPEEDS
 from ..design.sampled_model import DesignSpec, make_design_model
 from ..env_facts import AnyEnv
-from .base import Array
 from .lqr import IN, Lqr, make_design_state
 
 MIN_STEP = 10  # ticks, the shortest of the prediction

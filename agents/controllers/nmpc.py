@@ -10,6 +10,7 @@ import numpy as np
 from ...envs.backend.decorators import jit
 from ...envs.backend.elementary import sincos
 from ...envs.engine.tick import StepVariant
+from ...envs.record import Array
 from ...envs.task.reference import LAGGED, ReferenceParams, compute_reference, make_reference_params
 from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import DisturbanceForces, Motion
@@ -25,7 +26,7 @@ from ..design.prediction_model import (
     replace_tyres,
 )
 from ..env_facts import AnyEnv, list_plant_kinds
-from .base import Array, check_positive
+from .base import check_positive
 from .lqr import IN, Lqr
 
 MIN_STEP = 10  # ticks, the shortest of the prediction

@@ -5,6 +5,7 @@ from typing import Any
 
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import maximum
+from ...envs.record import Array
 from ...envs.task.reference import (
     LAGGED,
     REFERENCES,
@@ -20,7 +21,7 @@ from ..design.nominal_car import (
     make_nominal_car,
 )
 from ..env_facts import AnyEnv
-from .base import Array, Controller, check_positive, list_entry_names
+from .base import Controller, check_positive, list_entry_names
 from .model_following import MIN_SPEED
 
 Inputs = namedtuple(

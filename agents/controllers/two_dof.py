@@ -12,12 +12,13 @@ import numpy as np
 
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute, maximum, select
+from ...envs.record import Array
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import Vehicle
 from ..design.nominal_car import CAR, compute_plant, make_nominal_car
 from ..design.pi import PLACEMENTS, POLE, design_pi, sample_pi
 from ..env_facts import AnyEnv
-from .base import Array, Controller, check_not_negative, integrate_antiwindup
+from .base import Controller, check_not_negative, integrate_antiwindup
 
 MIN_SPEED = 2.0  # m/s: gains below it are those of this speed
 SPEEDS = np.arange(MIN_SPEED, 61.0, 0.5)  # m/s

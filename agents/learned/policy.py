@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from ..controllers.base import Array, Controller
+from ...envs.record import Array
+from ..controllers.base import Controller
 from ..env_facts import AnyEnv, get_env_facts
 from .files import Policy, load_policy
 

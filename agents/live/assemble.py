@@ -12,13 +12,10 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH
+from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
 from ...envs.ticks import TICK
 from .datagrams import SENSORS, TICK_US, DatagramKind, Message, RejectReason, decode
-
-Array = npt.NDArray[np.float64]
 
 PATIENCE = 10  # ticks of silence, from which on the last row is held
 MAX_HELD = 1000  # ticks that are bridged; a longer gap begins anew

@@ -12,7 +12,7 @@ from ...envs.engine.arrays import EpisodeArrays
 from ...envs.engine.layout import FLAGS, STATE_WIDTH, P, Z
 from ...envs.engine.observe import observe
 from ...envs.engine.packets import update_newest
-from ...envs.record import FAST, FAST_WIDTH
+from ...envs.record import FAST, FAST_WIDTH, Array
 from ...envs.task.info import REPORT
 from ...envs.task.reference import compute_reference, filter_reference
 from ...envs.ticks import NEVER
@@ -25,7 +25,6 @@ from ..env_facts import get_env_facts
 from .assemble import NO_PACKETS, Tick
 
 _reference, _filter_reference = as_python(compute_reference), as_python(filter_reference)
-Array = npt.NDArray[np.float64]
 
 
 class OnboardController:

@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from ...estimators.learned.correction import Array, learned
+from ...envs.record import Array
+from ...estimators.learned.correction import learned
 from ...estimators.learned.files import Correction, CorrectionCard
 from ...estimators.learned.kernel import DEVIATION, MIN_LOG_DEVIATION, locate_stack
 from ...estimators.learned.network import Network

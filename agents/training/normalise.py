@@ -13,10 +13,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
 from ...envs.backend.extras import require_extra
+from ...envs.record import Array
 from ..env_facts import get_layout
 from .traces.mixing import compute_whitening
 
@@ -24,7 +24,6 @@ with require_extra("train", "training needs {}"):
     import torch
     from stable_baselines3.common.torch_layers import FlattenExtractor
 
-Array = npt.NDArray[np.float64]
 Scaling = tuple[list[float], list[float], float | None, list[list[float]] | None]
 """Mean, scale, clip and mixing of `Standardised`, in JSON types."""
 

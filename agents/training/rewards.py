@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.backend.extras import require_extra
+from ...envs.record import Array
 from ..rollout import COST_FLOOR, evaluate_episodes
 from ..vec_env.env import Observations, make_native_env
 from .task import TrainingTask
@@ -19,7 +20,6 @@ from .task import TrainingTask
 with require_extra("train", "training needs {}"):
     from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-Array = npt.NDArray[np.float64]
 
 _WEIGHT_DRIVES = 32  # uncontrolled drives by which a scenario is weighed
 _MIN_COST_SHARE = 0.05  # of the mean: a scenario that costs less uncontrolled weighs no more

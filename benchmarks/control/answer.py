@@ -5,6 +5,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from ...envs.record import Array
 from ..harness.stats import Estimate, geometric_mean
 from ..harness.verdict import describe_leader, format_verdict, summarise_names
 from .cells import (
@@ -17,7 +18,6 @@ from .cells import (
     ControlEntry,
 )
 from .contests import PARAMETERS, ControlTask
-from .episodes import Array
 from .ladder import DELAYS, DelayCost
 from .tables import Standing
 

@@ -20,11 +20,11 @@ from rich.console import Console
 
 from ... import __version__
 from ...envs.arguments import is_finite
+from ...envs.record import Array
 from ..harness.parallel import run_cases
 from ..harness.results import from_json, read_objects, write_text
 from .cells import ControlEntry
 from .contests import NOMINAL, STATE, ControlTask, find_oracle
-from .episodes import Array
 from .run import Results, hash_sources, measure
 from .scores import compute_log_ratios, survival_mask
 

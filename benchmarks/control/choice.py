@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ... import __version__
+from ...envs.record import Array
 from ..harness.stats import Estimate, geometric_mean
 from .cells import ControlEntry
 from .contests import (
@@ -27,7 +28,7 @@ from .contests import (
     list_candidates,
     write_tasks,
 )
-from .episodes import Array, DriveResult
+from .episodes import DriveResult
 from .run import Results, measure
 from .scores import ScoreScale, survival_mask
 from .seeds import make_tuning_seeds

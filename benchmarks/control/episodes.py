@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ...agents.rollout import EpisodeStep, iterate_steps
 from ...envs.arguments import parse_actions
-from ...envs.record import FAST
+from ...envs.record import FAST, Array
 from ...envs.task.failures import FAILURES
 from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import Motion
@@ -18,8 +17,6 @@ from ..harness.dissipation import compute_dissipation
 from ..harness.metrics import EPISODE, REDUCTIONS, StepSample
 from .build import make_cars
 from .cells import ControlEntry
-
-Array = npt.NDArray[np.float64]
 
 NUMBERS = tuple(metric.name for metric in EPISODE)
 _INFO = ("t", "beta", "gamma", "beta_ref", "gamma_ref", "yaw_moment", "steer", "psi")

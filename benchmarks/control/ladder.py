@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from ...envs.record import Array
 from ...envs.task.failures import FAILURES
 from ..harness.results import ResultTable
 from ..harness.stats import Estimate, average, compute_p_value, geometric_mean, holm
@@ -22,7 +23,6 @@ from .contests import (
     ControlTask,
     find_oracle,
 )
-from .episodes import Array
 from .run import Results, measure
 from .scores import MIN_GAP, ScoreScale, compute_log_ratios, survival_mask
 from .tables import Standing

@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ...agents.rollout import compute_cost_ratios
+from ...envs.record import Array
 from ..harness.stats import Estimate, ratio_of_sums
-from .episodes import Array, DriveResult
+from .episodes import DriveResult
 
 MIN_GAP = 0.05
 """A mean gap below which there is nothing to win."""

@@ -9,6 +9,7 @@ from rich.console import Console
 
 from ... import __version__
 from ...agents.learned.files import is_policy, load_policy
+from ...envs.record import Array
 from ..harness.results import ResultRow, ResultTable, Suite
 from .answer import compose_verdict
 from .build import measure_decision_time
@@ -22,7 +23,6 @@ from .calibration import (
 )
 from .cells import EPISODES, LEARNED, ControlEntry, make_entries, select_quick_tasks
 from .contests import STATE, TITLES, ControlTask, list_scored_tasks
-from .episodes import Array
 from .figures import add_figures
 from .ladder import (
     DELAY_TASK,

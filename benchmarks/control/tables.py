@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from ... import __version__
+from ...envs.record import Array
 from ..harness.metrics import EPISODE
 from ..harness.results import ResultRow, ResultTable
 from ..harness.stats import (
@@ -22,7 +23,7 @@ from ..harness.stats import (
 )
 from .cells import ControlEntry
 from .contests import ControlTask
-from .episodes import Array, DriveResult, get_control_period
+from .episodes import DriveResult, get_control_period
 from .scores import MIN_GAP, ScoreScale, score, survival_mask
 
 RATES = {"spin": "spin_rate", "off-road": "departure_rate"}

@@ -6,11 +6,11 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import numpy.typing as npt
 
 from ...agents import make_agent
 from ...agents.rollout import iterate_steps
 from ...envs.outside.plants import OUTSIDE_PLANTS, OutsideInputs, OutsidePlant
+from ...envs.record import Array
 from ...envs.scenarios.draws import Draws
 from ...envs.scenarios.scenario import Scenario
 from ...envs.scenarios.steering import (
@@ -24,7 +24,6 @@ from ...envs.vehicle.dynamics import Motion
 from ...envs.vehicle.vehicle import Vehicle
 from ..harness.drives import make_env
 
-Array = npt.NDArray[np.float64]
 Fields = Mapping[str, Any]
 
 CALM: dict[str, Any] = {

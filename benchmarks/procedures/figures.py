@@ -6,6 +6,7 @@ import numpy as np
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
+from ...envs.record import Array
 from ...envs.rendering.palette import GREY, INK, find_colour
 from ...envs.scenarios.tracks import Section
 from ..harness.results import Suite
@@ -13,7 +14,6 @@ from ..report.figures import draw_time_series, draw_track
 from . import fmvss126, iso3888, iso7401
 from .cases import CaseResults, ProcedureCase, SineDwellOutcome, Transient, select_cases
 from .contestants import CARS, ENTRIES
-from .drive import Array
 
 
 def add(suite: Suite, done: CaseResults) -> None:

@@ -24,8 +24,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...envs.record import Array
 from ...envs.vehicle.vehicle import GRAVITY
-from .drive import Array, DriveFunction, Fields, Series, TestCar
+from .drive import DriveFunction, Fields, Series, TestCar
 
 FREQUENCY, DWELL = 0.7, 0.5  # Hz, s
 ONSET = 0.5  # s, straight ahead before

@@ -16,8 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...envs.record import Array
 from ...envs.scenarios.tracks import Section, make_sections
-from .drive import Array, DriveFunction, Fields, Series, TestCar
+from .drive import DriveFunction, Fields, Series, TestCar
 
 TRACKS = ("iso-3888-1", "iso-3888-2")
 STANDARD_SPEED = 80.0 / 3.6  # m/s

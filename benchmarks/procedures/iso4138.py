@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...envs.record import Array
 from ...envs.task.reference import make_reference_params
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
-from .drive import Array, DriveFunction, Fields, Series, TestCar
+from .drive import DriveFunction, Fields, Series, TestCar
 
 SETTLE = 3.0  # s, at the first speed
 LINEAR_FROM, LINEAR_TO = 0.05 * GRAVITY, 0.25 * GRAVITY  # the range of the slope

@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.record import Array
 from ...envs.vehicle.linear import make_bicycle_model
 from ...envs.vehicle.vehicle import Vehicle
-from .drive import Array, DriveFunction, Fields, Series, TestCar
+from .drive import DriveFunction, Fields, Series, TestCar
 
 Complex = npt.NDArray[np.complex128]
 

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.backend.extras import require_extra
+from ...envs.record import Array
 from ...envs.rendering.palette import FACTS, GREY, INK, find_base, find_colour
 from ..harness.stats import Estimate
 from .colours import choose_line_styles
@@ -19,7 +20,6 @@ from .colours import choose_line_styles
 with require_extra("report", "figures need plotly"):
     from plotly import graph_objects as go
 
-Array = npt.NDArray[np.floating[Any]]
 
 _LOG = {"type": "log", "dtick": "D2", "tickformat": "~g"}  # 1, 2, 5, 10, ...
 POINTS = 1000

@@ -4,15 +4,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
+from ...envs.record import Array
 from ...envs.rendering.palette import INK
 from ..harness.results import ShareMap
 from .colours import SHARE_SCALE
-
-Array = npt.NDArray[np.float64]
 
 _GOOD_TO_BAD = [(1.0 - at, shade) for at, shade in SHARE_SCALE][::-1]
 

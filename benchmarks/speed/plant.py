@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-import numpy.typing as npt
 
 from ...envs.backend.arrays import make_offsets, read, write
 from ...envs.backend.decorators import inline, jit
 from ...envs.backend.simd import LANES
 from ...envs.engine.layout import P, Z
+from ...envs.record import Array
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import apply_lag
 from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams
@@ -24,8 +24,6 @@ from ..harness.results import Suite
 from .c_plant import load_c_plant
 from .contestants import WorkloadSet
 from .timing import Effort, Taken, Workload
-
-Array = npt.NDArray[np.float64]
 
 CARS, TICKS = 1024, 10  # cars at once; ticks a call
 PLANT = "plant"

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from ...envs.record import Array
 from ...estimators.design.tunings import TUNINGS
 from ..harness.drives import LoggedEpisode
 from ..harness.results import ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_roots, root_mean
-from .task import SAMPLERS, STORAGE, Array, EstimatorTuning, compute_squares, simulate
+from .task import SAMPLERS, STORAGE, EstimatorTuning, compute_squares, simulate
 
 _EDGE = 1.25  # times an end of its range or less: the number counts as being there
 

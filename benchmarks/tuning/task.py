@@ -10,12 +10,12 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 
 from ... import __version__
 from ...agents.rollout import rollout
 from ...envs.backend.cache import hash_sources
+from ...envs.record import Array
 from ...estimators.estimator import Estimator
 from ...estimators.filters import FILTERS
 from ...estimators.make import ESTIMATORS, make_estimator
@@ -24,7 +24,6 @@ from ..harness.drives import SETTLED, LoggedEpisode, call_quietly, make_filter_a
 from ..harness.parallel import run_cases
 from ..harness.stats import root_mean
 
-Array = npt.NDArray[np.float64]
 Range = tuple[float, float]
 
 PROCESS_RANGE = (1e-8, 1e2)  # (unit of the state)^2 / s

@@ -13,17 +13,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from ...envs.record import PACKET, Record
+from ...envs.record import PACKET, Array, Record
 from ...envs.sensors.link import SlowSensor
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import Vehicle
 from ..design.models import select_states
 from ..estimates import UnobservableWarning
 from ..make import make_estimator
-
-Array = npt.NDArray[np.float64]
 
 # of a filter's memory, at a held speed
 _MODEL = ("car", "A", "B", "G", "GT", "H", "HT", "C_fast", "D_fast")

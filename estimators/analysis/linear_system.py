@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH
+from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
 from ..core.delay import IGNORE
 from ..core.intersample import DUAL_RATE
 from ..core.memory import FILTER, N_CORE, N_INPUTS, N_ROWS
@@ -25,8 +25,6 @@ from ..design.error_map import MARGINAL, find_unobservable, spectral_radius
 from ..entry import compile_advance, compile_process_packet
 from ..estimates import Estimates, UnobservableWarning
 from ..matrices import parse_covariance, parse_matrix, parse_square, parse_vector
-
-Array = npt.NDArray[np.float64]
 
 _SENSOR = 0  # the place of the slow sensor in a filter's memory
 _NO_PACKETS = np.zeros((0, PACKET_WIDTH))

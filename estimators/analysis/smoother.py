@@ -10,10 +10,9 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ...envs.backend.decorators import jit
-from ...envs.record import FAST, PACKET, Log
+from ...envs.record import FAST, PACKET, Array, Log
 from ..core.delay import IGNORE
 from ..core.fast import read_fast_row
 from ..core.intersample import NONE
@@ -25,8 +24,6 @@ from ..design.schedule import count_ticks
 from ..estimates import Estimates
 from ..estimator import Estimator
 from ..make import make_estimator
-
-Array = npt.NDArray[np.float64]
 
 _RANK = 1e-14  # of a correlation matrix, what counts as nothing
 

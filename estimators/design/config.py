@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
 from ..core.delay import RULES
@@ -29,8 +29,6 @@ from .models import (
 )
 from .options import OptionReader, parse_latency
 from .tunings import TUNINGS
-
-Array = npt.NDArray[np.float64]
 
 GATE_PROBABILITY = 1.0 - 1e-9
 MIN_SATELLITES = 4.0  # double-layer-gps 4.3

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ...envs.record import Array
 from . import kalman
-from .kalman import Array, compute_inverse
+from .kalman import compute_inverse
 from .pole_placement import observer_gain
 
 RULES = ("predict", "hold", "oh", "pseudo")

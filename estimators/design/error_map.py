@@ -10,12 +10,12 @@ from functools import lru_cache
 
 import numpy as np
 
+from ...envs.record import Array
 from ..core.delay import CLONE, CONSTANT, STORED
 from ..core.intersample import DUAL_RATE, PSEUDO
 from ..core.memory import FilterRecord
 from .config import FilterConfig
 from .dual_rate import frame_map
-from .kalman import Array
 from .periodic import build_measurement_rows, design_gains
 from .pole_placement import transition_matrix
 from .schedule import Schedule

@@ -4,9 +4,8 @@ Shapes: P (n, n), C (p, n), R (p, p), y = C x + v (p,).
 """
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from ...envs.record import Array
 
 RIDGE = 1e-3  # lambda of Tikhonov's inverse, in SI units squared
 INVERSES = ("moore-penrose", "p-weighted", "tikhonov", "bayes")

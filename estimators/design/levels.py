@@ -5,16 +5,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...envs.record import Array
 from ..core.memory import N_KNOTS
 from ..filters import FilterDefinition
 from ..matrices import check_covariance
 from .measurements import COURSE_SPEED, MEASUREMENTS
 from .models import STATES, TYRES
 from .options import OptionReader
-
-Array = npt.NDArray[np.float64]
 
 _ROWS = [row for sensor in MEASUREMENTS.values() for row in sensor.rows]
 _VELOCITIES = [row for sensor in MEASUREMENTS.values() for row in sensor.velocities]

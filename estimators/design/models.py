@@ -10,17 +10,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from ...envs.record import FAST
+from ...envs.record import FAST, Array
 from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.vehicle.linear import make_roll_model
 from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from ..core.memory import CarIndex, FilterRecord
 from ..core.transition import FORCES, KINEMATIC, LATERAL, ROLL, VELOCITY_ROLL, YAW
 from .measurements import MEASUREMENTS, find_packet_column
-
-Array = npt.NDArray[np.float64]
 
 
 class StateInfo(NamedTuple):

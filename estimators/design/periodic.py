@@ -12,6 +12,7 @@ import numpy as np
 
 from ...envs.backend.decorators import jit
 from ...envs.backend.primitives import absolute, maximum
+from ...envs.record import Array
 from ..core.covariance import update_with_clone, update_with_states
 from ..core.delay import CLONE, DIRECT, DROPPED, IGNORE, find_clone
 from ..core.intersample import DUAL_RATE, NONE, PSEUDO
@@ -19,7 +20,7 @@ from ..core.memory import FilterRecord, FilterRecords, GainTables, Vector
 from ..core.run import reset_filter, reset_filters, run_tick
 from .config import FilterConfig
 from .dual_rate import compute_shares, write_shares
-from .kalman import Array, compute_inverse, constant_gain
+from .kalman import compute_inverse, constant_gain
 from .pole_placement import transition_matrix, write_placed_gains
 from .schedule import Schedule
 

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
+from ...envs.record import Array
 from ..core.memory import FilterRecord
-from .kalman import Array
 
 
 def transition_matrix(f: FilterRecord, G: Array) -> Array:

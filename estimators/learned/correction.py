@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ...envs.record import PACKET_WIDTH
+from ...envs.record import PACKET_WIDTH, Array
 from ...envs.sensors.link import SlowSensor
 from ...envs.ticks import TICK
 from ...envs.vehicle.vehicle import Vehicle
@@ -19,8 +18,6 @@ from ..make import make_estimator
 from . import kernel
 from .files import Correction, load_correction
 from .kernel import EXAMPLE, compute_memory_size, filter_and_correct, make_net, reset_memory
-
-Array = npt.NDArray[np.float64]
 
 
 class LearnedEstimator:

@@ -13,7 +13,8 @@ import numpy.typing as npt
 from ...envs.backend.decorators import jit, jit_nrt
 from ...envs.backend.elementary import clip, exp
 from ...envs.backend.primitives import maximum, minimum
-from .memory import Array, MemoryLayer
+from ...envs.record import Array
+from .memory import MemoryLayer
 
 ACTIVATIONS = ("tanh", "relu", "elu", "leaky-relu", "silu")
 OUTPUTS = ("tanh", "linear")

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from ...envs.record import Array
 
 GATES = {"gru": 3, "lstm": 4}
 """Gates of a kind of cell, in torch's order: reset, update, candidate; or input, forget,

@@ -7,9 +7,10 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.record import Array
 from .forward import ACTIVATIONS as ACTIVATIONS
 from .forward import OUTPUTS, PackedNetwork, forward, pack_network
-from .memory import Array, MemoryLayer
+from .memory import MemoryLayer
 
 
 @dataclass(frozen=True, eq=False)

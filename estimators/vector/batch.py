@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.backend.eights import allocate_aligned
-from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Log, Record
+from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Array, Log, Record
 from ...envs.sensors.link import SlowSensor
 from ..core.memory import FILTER, SkipCounters
 from ..estimates import Estimates
@@ -18,7 +18,6 @@ from .designs import Build, GainPool
 from .kernel import compile_observe_batch, make_empty_outputs
 from .lanes import make_blocks
 
-Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 Sensors = Mapping[str, SlowSensor]
 

@@ -7,10 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.backend.decorators import jit_nrt
+from ...envs.record import Array
 from ..estimator import Estimator
 from ..wrappers.arguments import AnyEstimator, EstimatorSpec
 
-Array = npt.NDArray[np.float64]
 Build = Callable[[EstimatorSpec], AnyEstimator]
 
 

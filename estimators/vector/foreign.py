@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.record import Array
 from ..wrappers.arguments import AnyEstimator, EstimatorSpec
 from ..wrappers.outputs import write_outputs
-from .batch import Array, BatchEstimator, IntArray
+from .batch import BatchEstimator, IntArray
 from .designs import Build
 
 

@@ -7,14 +7,13 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
 
-from ...envs.record import FAST_WIDTH, PACKET_WIDTH
+from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Array
 from ...envs.sensors.link import SlowSensor
 from ...envs.task.observation import ObservationEntry
 from ...envs.vehicle.vehicle import Vehicle
 from ..wrappers.arguments import EstimatorSpec, make_spec
 from ..wrappers.estimate import find_base_env
 
-Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 

@@ -9,11 +9,10 @@ import numpy.typing as npt
 from ...envs.backend.decorators import as_python
 from ...envs.backend.elementary import wrap
 from ...envs.backend.primitives import ARRAYS
+from ...envs.record import Array
 from ...envs.task.observation import ObservationEntry
 from ..design.models import FOREIGN_STATE, STATES
 from ..protocol import EstimatorLike, compute_std
-
-Array = npt.NDArray[np.float64]
 
 TRUTHS = {"beta": 1, "gamma": 2}  # states whose truth stands in the info
 BETA, STD, NEES = 0, 1, 2  # places in the summary of a step

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ....envs.record import Array
 from ..distill import (
     DISTILL_SEEDS,
     SEEDS_PER_TRAINING,
@@ -19,14 +20,7 @@ from ..distill import (
     collect_demonstrations,
 )
 from ..student import LAST_ROUND_FACTOR, DistillConfig, fit_model
-from ..traces.drives import (
-    Array,
-    Demonstrations,
-    Scaling,
-    Single,
-    compute_scaling,
-    normalise_inputs,
-)
+from ..traces.drives import Demonstrations, Scaling, Single, compute_scaling, normalise_inputs
 from .networks import MemoryNetwork, make_memory
 
 import torch  # isort: skip  # after ours, which say which extra is missing

@@ -14,7 +14,8 @@ import numpy as np
 
 from ....envs.arguments import check_choice
 from ....envs.backend.extras import require_extra
-from ..traces.drives import Array, Demonstrations, normalise_inputs
+from ....envs.record import Array
+from ..traces.drives import Demonstrations, normalise_inputs
 from ..traces.mixing import compute_whitening
 
 with require_extra("train", "memories need torch"):

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from ....envs.record import Array
 from ....envs.task.observation import ObservationEntry
 from .mixing import compute_scale, compute_whitening
 
-Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
 
 CLIP = 8.0  # of an input, scaled

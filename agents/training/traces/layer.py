@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from ....envs.backend.extras import require_extra
-from ....estimators.learned.memory import Array, MovingAverages
+from ....envs.record import Array
+from ....estimators.learned.memory import MovingAverages
 from .mixing import MIN_VARIANCE, SAMPLE_STRIDE, compute_whitening
 
 with require_extra("train", "training needs torch"):

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ....estimators.learned.memory import Array
+from ....envs.record import Array
 
 SAMPLE_STRIDE = 7  # steps, of those by which means are mixed
 MIN_VARIANCE = 1e-4  # variance that a mixture of means has at least

@@ -8,8 +8,8 @@ import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
+from ....envs.record import Array
 from ....envs.task.observation import ObservationEntry, make_space
-from ....estimators.learned.memory import Array
 from ....estimators.learned.network import Network
 from .mixing import MIN_VARIANCE, SAMPLE_STRIDE, compute_whitening
 

@@ -8,11 +8,12 @@ import numpy as np
 
 from ....agents import make_agent
 from ....agents.rollout import Rollout, rollout
+from ....envs.record import Array
 from ....envs.scenarios.manoeuvres import make_scenario
 from ...harness.drives import make_env
 from ...harness.parallel import split_seeds
 from . import tracking
-from .claim import Array, Example, SimulationResult
+from .claim import Example, SimulationResult
 from .simulations import FIRST, Numbers, collect_numbers, rms
 
 SIGNALS = ("beta", "gamma", "steer", "yaw_moment")

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from ....agents.rollout import rollout
-from ....envs.record import PACKET, Log
+from ....envs.record import PACKET, Array, Log
 from ....envs.scenarios.manoeuvres import make_scenario
 from ....estimators.analysis.bound import compute_error_bound
 from ....estimators.design.tunings import read_tunings
@@ -17,7 +17,7 @@ from ....estimators.estimator import Estimator
 from ....estimators.make import make_estimator
 from ...harness.drives import SETTLED, call_quietly, make_filter_arguments
 from ...harness.parallel import split_seeds
-from .claim import Array, Example, SimulationResult
+from .claim import Example, SimulationResult
 from .simulations import CHUNK, FIRST, Numbers, collect_numbers, rms
 
 _TUNED = {

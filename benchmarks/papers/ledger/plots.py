@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from ....envs.record import PACKET
-from .claim import Array, Example
+from ....envs.record import PACKET, Array
+from .claim import Example
 
 Draw = Callable[[Example], Any]
 

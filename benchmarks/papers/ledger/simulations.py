@@ -12,8 +12,9 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from ....envs.record import Array
 from ...harness.parallel import split_seeds
-from .claim import Array, SimulationResult
+from .claim import SimulationResult
 
 FIRST = 0  # the seed of the figures
 CHUNK = 5  # seeds of a case that is over in seconds

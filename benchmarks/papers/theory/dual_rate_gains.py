@@ -5,12 +5,13 @@ import math
 import numpy as np
 from scipy.linalg import expm
 
+from ....envs.record import Array
 from ....envs.scenarios.draws import KMH
 from ....envs.vehicle.linear import make_course_model
 from ....envs.vehicle.vehicle import COMS
 from ....estimators.design import dual_rate as dual_rate
 from ....estimators.design import kalman
-from ..ledger.claim import Array, Bound, SimulationResult, make_claim_factory, make_number_part
+from ..ledger.claim import Bound, SimulationResult, make_claim_factory, make_number_part
 from ..ledger.plots import PaperFigure
 from ..ledger.simulations import Analysis
 from . import error_maps

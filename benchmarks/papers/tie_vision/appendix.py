@@ -11,7 +11,8 @@ from functools import reduce
 
 import numpy as np
 
-from ..ledger.claim import Array, SimulationResult
+from ....envs.record import Array
+from ..ledger.claim import SimulationResult
 from ..ledger.simulations import Numbers, collect_numbers
 
 STEPS = 6

@@ -11,20 +11,14 @@ from functools import partial
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
+from ....envs.record import Array
 from ....envs.scenarios.draws import KMH
 from ....envs.sensors.slow import CAMERA_33_30
 from ....envs.vehicle.linear import make_vision_model
 from ....envs.vehicle.vehicle import COMS
 from ....estimators.design import kalman
 from ....estimators.make import make_estimator
-from ..ledger.claim import (
-    Array,
-    Bound,
-    Example,
-    SimulationResult,
-    make_claim_factory,
-    make_number_part,
-)
+from ..ledger.claim import Bound, Example, SimulationResult, make_claim_factory, make_number_part
 from ..ledger.plots import PaperFigure, make_curves
 from ..ledger.simulations import FIRST, Analysis
 from ..theory import error_maps

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.procedures import iso3888
-from sideslip.benchmarks.procedures.drive import Array, Fields, Series, TestCar
+from sideslip.benchmarks.procedures.drive import Fields, Series, TestCar
 from sideslip.envs import PASSENGER_CAR
+from sideslip.envs.record import Array
 from sideslip.envs.scenarios.tracks import Section
 
 CAR = TestCar(PASSENGER_CAR, 80.0 / 3.6, 16.0, 4.2, 0.8)
