@@ -4,21 +4,18 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Protocol, overload
 
-from ..envs.arguments import check_options
+from ..envs.validation import check_options
 from ..estimators.registry import Registry
-from .controllers.adaptive import AdaptiveLqr, AdaptiveNmpc
 from .controllers.base import Controller, NoControl
-from .controllers.esc import Esc
 from .controllers.lane_keeping import LaneKeeping
 from .controllers.lqr import Lqr
 from .controllers.model_following import ModelFollowing
 from .controllers.mpc import Mpc
-from .controllers.nmpc import Nmpc
-from .controllers.sliding_mode import SlidingMode
+from .controllers.nmpc import AdaptiveLqr, AdaptiveNmpc, Nmpc
 from .controllers.two_dof import Feedforward, TwoDof
-from .env_facts import AnyEnv
-from .learned.files import ZIP, is_policy, list_shipped
-from .learned.policy import PolicyController
+from .controllers.yaw_stability import Esc, SlidingMode
+from .env_info import AnyEnv
+from .learned.policy import ZIP, PolicyController, is_policy, list_shipped
 
 AGENTS = Registry(
     "agent",
@@ -105,7 +102,7 @@ def make_agent(
             options; or an `Agent`, which is returned.
         env: Env of this package.
         trust: Whether a zip may be read, which can run code of its author.
-        options: Arguments of the controller, or of `agents.training.zips.policy_from_zip`.
+        options: Arguments of the controller, or of `agents.training.export.policy_from_zip`.
 
     Returns:
         The agent.
@@ -127,7 +124,7 @@ def make_agent(
     agent: Any = name
     if isinstance(name, str):
         if name.endswith(ZIP):
-            zips = import_module(".training.zips", __name__)  # by name: a room above `learned`
+            zips = import_module(".training.export", __name__)  # by name: a room above `learned`
             return PolicyController(env, zips.policy_from_zip(name, env, trust=trust, **options))
         if name not in AGENTS and is_policy(name):
             return PolicyController(env, policy=name, **options)

@@ -17,16 +17,17 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ..envs.backend.decorators import as_python
 from ..envs.engine.config import EnvConfig
+from ..envs.numerics.jit import as_python
 from ..envs.record import PACKET_WIDTH, Array
 from ..envs.scenarios.steering import compute_wander_gains
-from ..envs.task.reference import REFERENCES
+from ..envs.task import REFERENCES
 from ..envs.ticks import TICK
 from ..estimators.design.models import select_states
 from ..estimators.make import make_estimator
 from ..estimators.vector import estimate as vector
 from ..estimators.wrappers.estimate import EstimateObservation
+from .baselines import FILTER, OUTPUTS, make_noise_options
 from .controllers.base import Controller
 from .design.sampled_model import (
     DesignModel,
@@ -35,8 +36,7 @@ from .design.sampled_model import (
     make_design_model,
     make_tick_model,
 )
-from .env_facts import AnyEnv, list_configs
-from .rungs import FILTER, OUTPUTS, make_noise_options
+from .env_info import AnyEnv, list_configs
 
 _REQUIRED = {
     "steering": "wander", "small_angle": True, "tyres": "linear", "roll": False,

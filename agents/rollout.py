@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import VectorEnv
 
-from ..envs.arguments import short_repr
-from ..envs.backend.extras import require_extra
-from ..envs.backend.files import atomic_file
+from ..envs.io import atomic_file
+from ..envs.numerics import require_extra
 from ..envs.record import Log, Record, concatenate
+from ..envs.validation import short_repr
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

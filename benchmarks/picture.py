@@ -4,14 +4,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..envs.backend.extras import require_extra
-from ..envs.backend.files import atomic_file
+from ..envs.io import atomic_file
+from ..envs.numerics import require_extra
 from ..envs.rendering.palette import INK, find_colour
-from .control.answer import is_default_filter, select_complete
-from .control.contests import TITLES, list_scored_tasks
+from .control.report import is_default_filter, select_complete
+from .control.tasks import TITLES, list_scored_tasks
 from .harness.metrics import METRICS
 from .harness.results import ResultRow, ShareMap, Suite
-from .report.colours import SHARE_SCALE
+from .report.figures import SHARE_SCALE
 
 _MAX_COLUMNS = 3  # panels
 

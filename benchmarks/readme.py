@@ -17,13 +17,20 @@ import typer
 from rich.console import Console
 
 from .. import __version__
-from .control.cells import LEARNED, REFERENCE_CONTROLLER, REFERENCE_FILTER, ControlEntry
-from .control.contests import NOMINAL, PARAMETERS, STATE, STEERING, list_scored_tasks
-from .control.ladder import make_score_scales
+from .control.baseline_gaps import make_score_scales
+from .control.entries import LEARNED, REFERENCE_CONTROLLER, REFERENCE_FILTER, ControlEntry
 from .control.run import measure
-from .control.seeds import make_salt, make_task_seeds
-from .control.tables import make_rows, rank_entries
-from .harness.errors import report_user_errors
+from .control.score import make_rows, rank_entries
+from .control.tasks import (
+    NOMINAL,
+    PARAMETERS,
+    STATE,
+    STEERING,
+    list_scored_tasks,
+    make_salt,
+    make_task_seeds,
+)
+from .harness.parallel import report_user_errors
 from .harness.results import ResultRow, read_json, write_json, write_text
 
 README, FIRST_ROWS = Path("README.md"), Path("docs/first.json")

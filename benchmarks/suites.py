@@ -45,10 +45,10 @@ def _run_seeds(suite: Any, r: Request) -> Any:
 
 
 def _run_control(suite: Any, r: Request) -> Any:
-    from .control.cells import EPISODES, QUICK_EPISODES
+    from .control.entries import EPISODES, QUICK_EPISODES
 
     if r.comparison is not None:
-        from .entrants.suite import run as run_comparison
+        from .entrants.score import run as run_comparison
 
         return run_comparison(r.comparison, r.jobs, r.console, r.keep)
     usual = QUICK_EPISODES if r.quick else EPISODES
@@ -71,19 +71,22 @@ def _run_highway(suite: Any, r: Request) -> Any:
 
 
 SUITES: dict[str, tuple[str, _Run]] = {
-    "estimation": (".estimation", _run_seeds),
-    "unknown": (".unknown.suite", _run_seeds),
+    "estimation": (".studies.estimation", _run_seeds),
+    "unknown": (".studies.unknown", _run_seeds),
     "control": (".control.suite", _run_control),
-    "learned": (".learned", _run_learned),
-    "learned-outside": (".learned_outside", _run_learned),
+    "learned": (".studies.learned", _run_learned),
+    "learned-outside": (".studies.learned_outside", _run_learned),
     "memory": (
-        ".memory.suite",
+        ".studies.recurrent",
         lambda suite, r: suite.run(r.quick, r.episodes, r.jobs, r.console, r.keep),
     ),
     "papers": (".papers.suite", _run_seeds),
-    "following": (".following", _run_following),
-    "highway": (".highway", _run_highway),
-    "recovery": (".recovery", lambda suite, r: suite.run(r.quick, r.jobs, r.console)),
+    "following": (".studies.coordinated_control", _run_following),
+    "highway": (".studies.traffic", _run_highway),
+    "recovery": (
+        ".studies.recovery_region",
+        lambda suite, r: suite.run(r.quick, r.jobs, r.console),
+    ),
     "procedures": (".procedures.suite", lambda suite, r: suite.run(r.quick, r.jobs, r.console)),
     "speed": (".speed.suite", lambda suite, r: suite.run(r.quick, r.console)),
 }
@@ -97,7 +100,7 @@ def check_salt(salt: str, names: Sequence[str]) -> None:
     if salt and not {*SALTED} & {*names}:
         raise ValueError(f"--salt goes with {', '.join(SALTED)}, got {', '.join(names)}")
     if salt:
-        from .control.seeds import make_salted_seeds
+        from .control.tasks import make_salted_seeds
 
         make_salted_seeds(salt, 1)
 

@@ -9,11 +9,9 @@ from .scenarios.manoeuvres import SCENARIOS, make_scenario
 from .scenarios.scenario import Scenario
 from .sensors.link import SlowSensor
 from .stability import StabilityEnv
-from .task.failures import FAILURES
-from .task.observation import ObservationEntry
+from .task import FAILURES, ObservationEntry
 from .vector import StabilityVectorEnv
-from .vehicle.vehicle import COMS, PASSENGER_CAR, Vehicle, critical_speed
-from .vehicle.vehicles import VEHICLES, make_vehicle
+from .vehicle.parameters import COMS, PASSENGER_CAR, VEHICLES, Vehicle, critical_speed, make_vehicle
 
 __all__ = [
     "COMS",

@@ -9,9 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
-from .arguments import parse_action, warn_once
-from .backend.decorators import compile_call
-from .engine.arrays import WorkspaceMixin
+from .camera_simulator import CameraMixin
 from .engine.config import EnvConfig
 from .engine.layout import PARAMS_WIDTH, Z
 from .engine.reset import reset_vehicle
@@ -23,19 +21,18 @@ from .engine.views import (
     get_vehicle,
     make_record,
 )
+from .engine.workspace import WorkspaceMixin
+from .numerics.jit import compile_call
 from .record import Array, Record
-from .rendering.drawn import PackedArrays, SingleRenderMixin
+from .rendering.renderer import PackedArrays, SingleRenderMixin
 from .scenarios.manoeuvres import ScenarioSource, make_scenario
 from .scenarios.scenario import Scenario
 from .sensors.link import SlowSensor
-from .task.failures import REFUSED, RUNNING, WILD
-from .task.info import make_info
-from .task.observation import ObservationEntry
+from .task import REFUSED, RUNNING, WILD, ObservationEntry, make_info
 from .ticks import TICK
+from .validation import parse_action, warn_once
 from .vehicle.dynamics import Motion
-from .vehicle.vehicle import Vehicle
-from .vehicle.vehicles import VehicleSource, make_vehicle
-from .vision import CameraMixin
+from .vehicle.parameters import Vehicle, VehicleSource, make_vehicle
 
 _COMPILED_STEP: list[
     Any

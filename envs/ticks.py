@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from .backend.decorators import as_python, jit
-from .backend.primitives import floor
+from .numerics.jit import as_python, jit
+from .numerics.primitives import floor
 
 TICK = 0.001
 """The base tick of the simulated car in seconds."""

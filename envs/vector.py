@@ -12,7 +12,15 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from .arguments import (
+from .engine.batch import step_rows
+from .engine.config import EnvConfig
+from .engine.episodes import EpisodeBatch
+from .engine.layout import Z
+from .record import Array
+from .rendering.renderer import PackedArrays, VectorRenderMixin
+from .stability import StabilityEnv
+from .task import REFUSED, WILD, make_infos
+from .validation import (
     check_int,
     expand_rows,
     format_rows,
@@ -22,15 +30,6 @@ from .arguments import (
     parse_seeds,
     warn_once,
 )
-from .engine.batch import step_rows
-from .engine.config import EnvConfig
-from .engine.episodes import EpisodeBatch
-from .engine.layout import Z
-from .record import Array
-from .rendering.drawn import PackedArrays, VectorRenderMixin
-from .stability import StabilityEnv
-from .task.failures import REFUSED, WILD
-from .task.info import make_infos
 
 Observations = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]

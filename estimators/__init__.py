@@ -15,11 +15,10 @@ May import `envs`; nothing of `agents` or `benchmarks`.
 from .analysis.linear_system import DualRate
 from .analysis.smoother import smooth
 from .design.config import FilterConfig
-from .estimates import Estimates, UnobservableWarning
 from .estimator import Estimator
 from .filters import FILTERS
 from .make import make_estimator, register_estimator
-from .protocol import EstimatorFactory, EstimatorLike
+from .protocol import Estimates, EstimatorFactory, EstimatorLike, UnobservableWarning
 from .wrappers.estimate import EstimateObservation
 
 __all__ = [

@@ -1,27 +1,80 @@
-"""The estimator object: a filter's compiled memory behind a small face."""
+"""Compiled functions as plain calls.
+
+The estimator object: a filter's compiled memory behind a small face.
+"""
 
 import itertools
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
+import numba
 import numpy as np
 import numpy.typing as npt
+from numba.extending import is_jitted
 
 from ..envs.record import FAST, FAST_WIDTH, PACKET_WIDTH, Array, Log, Record
 from ..envs.sensors.link import SlowSensor
 from ..envs.sensors.slow import SLOW_NAMES
-from .core.memory import FilterRecord, FilterRecords, SkipCounters
-from .core.run import reset_filters
-from .core.transition import KINEMATIC, LATERAL, VELOCITY_ROLL
+from .core.filter import advance, process_packet_all, reset_filters, step_all, write_estimate
+from .core.model import KINEMATIC, LATERAL, VELOCITY_ROLL
+from .core.record import FILTER, FilterRecord, FilterRecords, SkipCounters
 from .design.config import FilterConfig
-from .design.error_map import MARGINAL, design_and_map, find_unobservable, spectral_radius
 from .design.models import STATES
-from .design.periodic import compute_table_shape
-from .design.schedule import Schedule, count_ticks
-from .entry import compile_advance, compile_estimate, compile_process_packet, compile_step
-from .estimates import Estimates, UnobservableWarning
+from .design.periodic import Schedule, compute_table_shape, count_ticks
+from .design.stability import MARGINAL, design_and_map, find_unobservable, spectral_radius
+from .protocol import Estimates, UnobservableWarning
+
+
+def compile_call(function: Any, *example_args: Any) -> Any:
+    """Return the compiled call of a function for arguments of the example's types.
+
+    numba finds out the types of the arguments at every call, which costs more than a filter's
+    step. This is the call without it, so arguments must have exactly these types and layouts.
+
+    Args:
+        function: A jitted function; any other is returned as it is.
+        *example_args: Arguments whose types and layouts the call takes.
+
+    Returns:
+        A callable with the same positional arguments.
+    """
+    if not is_jitted(function):
+        return function
+    return function.compile(tuple(map(numba.typeof, example_args)))
+
+
+def _make_example() -> tuple[Any, Any]:
+    return np.zeros(1, FILTER), np.zeros((1, 1, 1))
+
+
+@cache
+def compile_advance() -> Any:
+    """Return `advance` as a plain call."""
+    matrix, vector = np.zeros((1, 1)), np.zeros(1)
+    return compile_call(advance, *_make_example(), matrix, 0, matrix, 0, 0, matrix, matrix, vector)
+
+
+@cache
+def compile_estimate() -> Any:
+    """Return `write_estimate` as a plain call."""
+    return compile_call(write_estimate, *_make_example(), np.zeros(1), np.zeros((1, 1)))
+
+
+@cache
+def compile_process_packet() -> Any:
+    """Return `process_packet_all` as a plain call."""
+    return compile_call(process_packet_all, *_make_example(), np.zeros(PACKET_WIDTH))
+
+
+@cache
+def compile_step() -> Any:
+    """Return `step_all` as a plain call."""
+    matrix = np.zeros((1, 1))
+    return compile_call(step_all, *_make_example(), matrix, matrix, 0)
+
 
 CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
 EMPTY = np.zeros((0, 0))

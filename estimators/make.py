@@ -7,13 +7,12 @@ from typing import Any, overload
 
 from ..envs.sensors.link import SlowSensor
 from ..envs.ticks import TICK
-from ..envs.vehicle.vehicle import COMS
-from ..envs.vehicle.vehicles import VehicleSource, make_vehicle
+from ..envs.vehicle.parameters import COMS, VehicleSource, make_vehicle
+from .delayed_channels import LateEstimator
 from .design.assemble import assemble, remove_tyre_states, select_first_sensor
 from .design.config import parse_config
 from .estimator import Estimator
 from .filters import FILTERS
-from .late import LateEstimator
 from .protocol import EstimatorFactory, ForeignEstimator, get_label
 from .registry import Registry
 

@@ -1,7 +1,11 @@
-"""The protocol of an estimator, and a user's own behind it, checked."""
+"""The estimates of a whole record, and the warning of what they cannot contain.
+
+The protocol of an estimator, and a user's own behind it, checked.
+"""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,7 +14,34 @@ import numpy.typing as npt
 from ..envs.record import PACKET, Array, Log, Record
 from ..envs.sensors.link import SlowSensor
 from .design.models import FOREIGN_STATE, STATES
-from .estimates import Estimates
+
+
+class UnobservableWarning(UserWarning):
+    """A filter has a direction that its sensors cannot see."""
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """A filter's states at every row of a record.
+
+    Attributes:
+        time: Time (s), shape (K,).
+        x: States, shape (K, n).
+        std: Their standard deviations, shape (K, n).
+        names: Names of the n states.
+        nis: Normalised innovation squared of each packet, shape (packets,); NaN where it is not
+            used.
+    """
+
+    time: Array
+    x: Array
+    std: Array
+    names: tuple[str, ...]
+    nis: Array
+
+    def __getitem__(self, name: str) -> Array:
+        """Return one state by name, shape (K,)."""
+        return self.x[:, self.names.index(name)]
 
 
 class EstimatorLike(Protocol):

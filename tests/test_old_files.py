@@ -18,27 +18,26 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 
-import sideslip.agents.learned.card
+import sideslip.agents.learned.policy
 import sideslip.benchmarks.control.calibration
 import sideslip.benchmarks.entrants.baselines
-import sideslip.estimators.learned.files
+import sideslip.estimators.learned.correction_file
 from sideslip.agents import make_agent
-from sideslip.agents.learned.files import list_shipped, load_policy
-from sideslip.agents.live import datagrams, session
+from sideslip.agents.baselines import read_tuned
+from sideslip.agents.learned.policy import list_shipped, load_policy
+from sideslip.agents.live import controller, messages
 from sideslip.agents.rollout import rollout
-from sideslip.agents.tuned import read_tuned
-from sideslip.benchmarks.control.contests import TaskMeasurement, read_tasks
+from sideslip.benchmarks.control.tasks import TaskMeasurement, read_tasks
 from sideslip.benchmarks.entrants.baselines import read_baselines
 from sideslip.benchmarks.harness.results import ResultRow, read_json
 from sideslip.benchmarks.recorded.wires import SignalCalibration, read_wires
-from sideslip.envs.recordings.columns import COLUMNS
+from sideslip.envs.recordings.tables import COLUMNS
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.envs.scenarios.scenario import Scenario
 from sideslip.envs.sensors.camera.pinhole import Pinhole
-from sideslip.envs.vehicle.vehicle import Vehicle
-from sideslip.envs.vehicle.vehicles import WIRE_TABLES, make_vehicle
+from sideslip.envs.vehicle.parameters import WIRE_TABLES, Vehicle, make_vehicle
 from sideslip.estimators import EstimateObservation
-from sideslip.estimators.learned.network_file import describe_network
+from sideslip.estimators.learned.network import describe_network
 from sideslip.estimators.wrappers.truth import TruthObservation
 
 OLD = Path(__file__).parent / "files/old"
@@ -64,9 +63,9 @@ def names_now() -> dict[str, list[str]]:
         info |= {*env.reset(seed=0)[1], *env.step(env.action_space.sample())[-1]}
     calibration = sideslip.benchmarks.control.calibration
     return {
-        "policy card": fields_of(sideslip.agents.learned.card.Card),
+        "policy card": fields_of(sideslip.agents.learned.policy.Card),
         "network": list(describe_network(load_policy(list_shipped()[0]).network)),
-        "correction card": fields_of(sideslip.estimators.learned.files.CorrectionCard),
+        "correction card": fields_of(sideslip.estimators.learned.correction_file.CorrectionCard),
         "scenario": fields_of(Scenario),
         "vehicle": fields_of(Vehicle),
         "wires": [*WIRE_TABLES, *fields_of(SignalCalibration)],
@@ -79,8 +78,8 @@ def names_now() -> dict[str, list[str]]:
             *fields_of(calibration.ClairvoyantEpisode),
         ],
         "baselines": fields_of(sideslip.benchmarks.entrants.baselines.BaselineRecord),
-        "session": list(session._SETUP),
-        "datagrams": [name for kind in datagrams.FIELDS.values() for name in kind],
+        "session": list(controller._SETUP),
+        "datagrams": [name for kind in messages.FIELDS.values() for name in kind],
         "info": sorted(info),
         "layout": sorted(layout),
         "drive": list(rollout(gym.make(YAW, scenario=SHORT), None, 0).columns),
@@ -120,11 +119,11 @@ def test_rows_and_a_session_are_read() -> None:
         "control", "tier 1", "cost_vs_nominal", 0.5, "", "none", 0.4, 0.6, 12, salt="ab12"
     )
     assert read_json(OLD / "rows.json") == [row]
-    assert session.read_setup(OLD / "session.slip")["estimator"] == "exact-kf"
-    (block,) = session.read_blocks(OLD / "session.slip")
-    found = [datagrams.decode(arrival.data) for batch in block.batches for arrival in batch]
+    assert controller.read_setup(OLD / "session.slip")["estimator"] == "exact-kf"
+    (block,) = controller.read_blocks(OLD / "session.slip")
+    found = [messages.decode(arrival.data) for batch in block.batches for arrival in batch]
     kinds = [getattr(each, "kind", each) for each in found]
-    assert kinds == [datagrams.DatagramKind.INERTIAL, datagrams.DatagramKind.END]
+    assert kinds == [messages.DatagramKind.INERTIAL, messages.DatagramKind.END]
 
 
 @pytest.mark.parametrize(
@@ -158,13 +157,13 @@ def test_a_training_goes_on_from_its_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("stable_baselines3")
-    from sideslip.agents.training import train
+    from sideslip.agents.training import trainer
     from sideslip.agents.training.checkpoint import read_state
 
     folder = shutil.copytree(OLD / "training", tmp_path / "training")
-    state = read_state(folder / train.CHECKPOINT)
-    monkeypatch.setattr(train, "__version__", state["sideslip"])
-    task = train.read_task(folder)
-    found = train.train(task, state["steps"], folder, resume=True)
+    state = read_state(folder / trainer.CHECKPOINT)
+    monkeypatch.setattr(trainer, "__version__", state["sideslip"])
+    task = trainer.read_task(folder)
+    found = trainer.train(task, state["steps"], folder, resume=True)
     assert [each.steps for each in found.evaluations] == [0, 16]
     assert found.model.num_timesteps == 16

@@ -174,8 +174,8 @@ def test_the_citation_is_of_this_version() -> None:
 
 
 def test_what_is_no_code_is_installed_too() -> None:
-    from sideslip.agents.learned.files import list_shipped, load_policy
-    from sideslip.benchmarks.speed.c_plant import read_source
+    from sideslip.agents.learned.policy import list_shipped, load_policy
+    from sideslip.benchmarks.speed.plant import read_source
 
     assert list_shipped() and all(load_policy(name).card.command for name in list_shipped())
     assert "plant" in read_source()

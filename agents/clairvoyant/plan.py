@@ -19,9 +19,16 @@ from ...envs.engine.layout import P
 from ...envs.record import Array
 from ..controllers.base import Controller
 from ..rollout import iterate_steps
-from .foresight import Forecast, PlanState, make_forecast, read_plan_state
-from .slopes import N_INPUTS, IlqrProblem, Trajectory, compute_limits, linearise_run, make_problem
-from .sweep import run_backward_pass
+from .preview import Forecast, PlanState, make_forecast, read_plan_state
+from .sweep import (
+    N_INPUTS,
+    IlqrProblem,
+    Trajectory,
+    compute_limits,
+    linearise_run,
+    make_problem,
+    run_backward_pass,
+)
 
 Actions = npt.NDArray[np.float32]
 

@@ -4,17 +4,15 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 
-from ...envs.backend.decorators import as_python
-from ...envs.backend.on_casadi import SYMBOLS, to_casadi
 from ...envs.engine.tick import compute_lagged_load, compute_motor_torques
-from ...envs.scenarios.roads import NOMINAL_PATH
-from ...envs.task.cost import compute_cost_rate
-from ...envs.task.reference import LAGGED, compute_reference
+from ...envs.numerics.casadi_backend import SYMBOLS, to_casadi
+from ...envs.numerics.jit import as_python
+from ...envs.scenarios.road import NOMINAL_PATH
+from ...envs.task import LAGGED, compute_cost_rate, compute_reference
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import apply_lag, compute_yaw_moment
-from ...envs.vehicle.dynamics import DisturbanceForces, Motion, compute_sideslip_angle
-from ...envs.vehicle.integration import rk4
-from .foresight import PlanParams, PlanState, PreviewStep
+from ...envs.vehicle.dynamics import DisturbanceForces, Motion, compute_sideslip_angle, rk4
+from .preview import PlanParams, PlanState, PreviewStep
 
 _rk4, _load_at, _torques = (
     to_casadi(rk4),

@@ -1,14 +1,187 @@
-"""The backward pass of differential dynamic programming within limits of the inputs.
+"""Linearisation of an episode along a run: the plant and the cost, for every control period.
+
+The backward pass of differential dynamic programming within limits of the inputs.
 
 Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
 """
 
+import functools
 import math
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
+import casadi as ca
 import numpy as np
 
-from ...envs.backend.decorators import jit
+from ...envs.numerics.jit import as_python, jit
+from ...envs.numerics.primitives import ARRAYS
+from ...envs.record import Array
+from ...envs.vehicle.actuators import limit_angle
+from .plant import (
+    advance,
+    compute_node_cost,
+    compute_node_errors,
+    get_state_scales,
+    list_active_states,
+)
+from .preview import Forecast, PlanParams, PlanState, PreviewStep
+
+N_INPUTS = 2  # in a sweep: share of the moment and of the steering, which may be held at zero
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A run of an episode.
+
+    Attributes:
+        states: `PlanState` at the start of every period and at the end, shape (K + 1, n).
+        actions: Fractions of full scale, shape (K, width).
+    """
+
+    states: Array
+    actions: Array
+
+
+class Linearisation(NamedTuple):
+    """The derivatives along a run, for n = size + N_INPUTS variables: scaled states, then inputs.
+
+    Attributes:
+        F: Derivative of the state after each period, shape (K, size, n).
+        g: Gradient of the cost, shape (K + 1, n); the last one is of the episode's end.
+        H: Gauss-Newton's Hessian of the cost, shape (K + 1, n, n), likewise.
+    """
+
+    F: Array
+    g: Array
+    H: Array
+
+
+class Limits(NamedTuple):
+    """The limits of the inputs in every period.
+
+    Attributes:
+        low: Lower limits, shape (K, N_INPUTS).
+        high: Upper limits, shape (K, N_INPUTS).
+        rate_low: Lower limit of the steering by its rate, shape (K,).
+        rate_high: Upper limit of the steering by its rate, shape (K,).
+        column: State that moves the rate's limits.
+        slope: Change of these limits per unit of that state.
+    """
+
+    low: Array
+    high: Array
+    rate_low: Array
+    rate_high: Array
+    column: int
+    slope: float
+
+
+@dataclass(frozen=True)
+class IlqrProblem:
+    """The functions that all episodes with the same `PlanParams` share.
+
+    Attributes:
+        fixed: Parameters of the episode.
+        names: Names of the active states.
+        scale: Unit of each active state, shape (size,).
+        slopes: CasADi's function of the derivatives, for all nodes at once.
+    """
+
+    fixed: PlanParams
+    names: tuple[str, ...]
+    scale: Array
+    slopes: Any  # of CasADi, for all nodes at once
+
+    @property
+    def state_indices(self) -> list[int]:
+        """Indices of the active states in a `PlanState`."""
+        return [PlanState._fields.index(name) for name in self.names]
+
+
+@functools.lru_cache(maxsize=8)
+def make_problem(fixed: PlanParams) -> IlqrProblem:
+    """Make the functions, cached for the newest few kinds of episode.
+
+    Args:
+        fixed: Parameters of the episode.
+
+    Returns:
+        Functions of the episode.
+    """
+    names = list_active_states(fixed)
+    scale, size = np.array(get_state_scales(fixed, names)), len(names)
+    w, known = ca.SX.sym("w", size + fixed.width), ca.SX.sym("known", len(PreviewStep._fields))
+    zero = PlanState(*(0.0,) * len(PlanState._fields))
+    x = zero._replace(**{name: scale[i] * w[i] for i, name in enumerate(names)})
+    step_inputs = PreviewStep(*ca.vertsplit(known))
+    step = advance(fixed, x, ca.vertsplit(w[size:]), step_inputs)
+    next_state = ca.vertcat(*(getattr(step.state, name) for name in names)) / scale
+    e, errors = ca.SX.sym("e", 2), ca.vertcat(*compute_node_errors(fixed, x, step_inputs))
+    error_hessian, error_gradient = ca.hessian(
+        compute_node_cost(fixed, (e[0], e[1]), step_inputs), e
+    )
+    error_jacobian = ca.jacobian(errors, w)
+    effort_hessian, effort_gradient = ca.hessian(
+        step.effort, w
+    )  # a sum of squares of nearly linear terms
+    gradient = error_jacobian.T @ ca.substitute(error_gradient, e, errors) + effort_gradient
+    hessian = error_jacobian.T @ error_hessian @ error_jacobian + effort_hessian
+    node = ca.Function(
+        "node", [w, known], [ca.jacobian(next_state, w), gradient, hessian], {"cse": True}
+    )
+    return IlqrProblem(fixed, names, scale, node.map(fixed.periods + 1))
+
+
+def linearise_run(problem: IlqrProblem, known: Array, run: Trajectory) -> Linearisation:
+    """Linearise every period of a run; an input that the action lacks has a unit Hessian alone.
+
+    Args:
+        problem: Functions of the episode.
+        known: Columns of `PreviewStep`, shape (len(PreviewStep), K + 1).
+        run: States and actions.
+
+    Returns:
+        Derivatives along the run, in scaled states and fractions of full scale.
+    """
+    size, K, width = len(problem.names), problem.fixed.periods, problem.fixed.width
+    points = np.zeros((size + width, K + 1))
+    points[:size] = (run.states[:, problem.state_indices] / problem.scale).T
+    points[size:, :K] = run.actions.T
+    n_used, n = size + width, size + N_INPUTS
+    F, g, H = (np.nan_to_num(value.full()) for value in problem.slopes(points, known))
+    result = Linearisation(
+        np.zeros((K, size, n)), np.zeros((K + 1, n)), np.tile(np.eye(n), (K + 1, 1, 1))
+    )
+    result.F[:, :, :n_used] = F.reshape(size, K + 1, n_used).transpose(1, 0, 2)[:K]
+    result.g[:, :n_used] = g.T
+    result.H[:, :n_used, :n_used] = H.reshape(n_used, K + 1, n_used).transpose(1, 0, 2)
+    return result
+
+
+def compute_limits(problem: IlqrProblem, forecast: Forecast, run: Trajectory) -> Limits:
+    """Compute limits by full scale, the wheels' stop, and the steering's rate from a run's angle.
+
+    Args:
+        problem: Functions of the episode.
+        forecast: Forecast with the driver's command.
+        run: States and actions.
+
+    Returns:
+        Limits in fractions of full scale, shape (K, `N_INPUTS`), and those by the rate, (K,).
+    """
+    fixed, K = problem.fixed, problem.fixed.periods
+    low, high, zero = np.zeros((K, N_INPUTS)), np.zeros((K, N_INPUTS)), np.zeros(K)
+    low[:, : fixed.width], high[:, : fixed.width] = -1.0, 1.0
+    if fixed.width < N_INPUTS:
+        return Limits(low, high, zero, zero, 0, 0.0)
+    task, column = fixed.task, problem.names.index("slewing")
+    clip_angle = as_python(limit_angle, ARRAYS)
+    low[:, 1] = clip_angle(-task.authority, forecast.driver, task.stop).max(axis=1) / task.authority
+    high[:, 1] = clip_angle(task.authority, forecast.driver, task.stop).min(axis=1) / task.authority
+    position = run.states[:K, PlanState._fields.index("slewing")] / task.authority
+    max_change = task.slew * fixed.ticks / task.authority
+    slope = problem.scale[column] / task.authority
+    return Limits(low, high, position - max_change, position + max_change, column, slope)
 
 
 @jit

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.decorators import as_python, jit
-from ...envs.backend.primitives import ARRAYS
-from ...envs.engine.packing import make_car
+from ...envs.engine.config import make_car
+from ...envs.numerics.jit import as_python, jit
+from ...envs.numerics.primitives import ARRAYS
 from ...envs.record import Array
 from ...envs.vehicle.actuators import compute_torque_limit
 from ...envs.vehicle.dynamics import CarParams
-from ...envs.vehicle.vehicle import GRAVITY, Vehicle
-from ..env_facts import AnyEnv, get_env_facts
+from ...envs.vehicle.parameters import GRAVITY, Vehicle
+from ..env_info import AnyEnv, get_env_facts
 
 _torque_limit = as_python(compute_torque_limit, ARRAYS)
 FRICTION = "true_friction"  # the entry whose friction a grip limit goes by, where it is there

@@ -10,16 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import jit
-from ...envs.backend.primitives import maximum
+from ...envs.numerics.jit import jit
+from ...envs.numerics.primitives import maximum
 from ...envs.record import Array
-from ...envs.task.cost import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
+from ...envs.task import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
 from ...envs.ticks import TICK
 from ...envs.vehicle.linear import LinearModel, make_vision_model
-from ...envs.vehicle.vehicle import Vehicle
-from ..design.gain_schedule import SPEEDS, interpolate_gains
-from ..design.sampled_model import solve_lqr
-from ..env_facts import AnyEnv
+from ...envs.vehicle.parameters import Vehicle
+from ..design.sampled_model import SPEEDS, interpolate_gains, solve_lqr
+from ..env_info import AnyEnv
 from .base import Controller, check_positive
 
 Inputs = namedtuple(

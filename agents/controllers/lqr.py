@@ -7,16 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import copy_into, jit
-from ...envs.backend.primitives import absolute
+from ...envs.numerics.jit import copy_into, jit
+from ...envs.numerics.primitives import absolute
 from ...envs.record import Array
-from ...envs.task.reference import REFERENCES
+from ...envs.task import REFERENCES
 from ...envs.ticks import TICK
+from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...envs.vehicle.tyres import MIN_SPEED
-from ...envs.vehicle.vehicle import GRAVITY, Vehicle
-from ..design.gain_schedule import SPEEDS, interpolate_gains, make_gain_table
-from ..design.sampled_model import DesignSpec
-from ..env_facts import AnyEnv
+from ..design.sampled_model import SPEEDS, DesignSpec, interpolate_gains, make_gain_table
+from ..env_info import AnyEnv
 from .base import Controller, check_positive, list_entry_names
 
 Inputs = namedtuple(

@@ -12,19 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import as_python, jit
-from ...envs.backend.primitives import maximum
+from ...envs.numerics.jit import as_python, jit
+from ...envs.numerics.primitives import maximum
 from ...envs.record import Array
-from ...envs.task.reference import (
-    LAGGED,
-    REFERENCES,
-    ZERO_SLIP,
-    compute_reference,
-    make_reference_params,
-)
+from ...envs.task import LAGGED, REFERENCES, ZERO_SLIP, compute_reference, make_reference_params
 from ...envs.ticks import TICK
-from ...envs.vehicle.vehicle import Vehicle
-from ..design.nominal_car import (
+from ...envs.vehicle.parameters import Vehicle
+from ..design.pi import (
     compute_drift,
     compute_plant,
     compute_plant_python,
@@ -32,7 +26,7 @@ from ..design.nominal_car import (
     make_nominal_car,
     solve_inputs,
 )
-from ..env_facts import AnyEnv
+from ..env_info import AnyEnv
 from .base import Controller, integrate_antiwindup, list_entry_names
 
 MIN_SPEED = 2.0  # m/s: below it the vehicle is taken as at this speed

@@ -1,4 +1,7 @@
-"""Nonlinear model predictive control: the plant's own text foreseen, a plan improved each time."""
+"""Nonlinear model predictive control: the plant's own text foreseen, a plan improved each time.
+
+Adaptive control: gains and predictions follow the tyres that a filter estimates on the way.
+"""
 
 import math
 from collections import namedtuple
@@ -7,25 +10,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...envs.backend.decorators import jit
-from ...envs.backend.elementary import sincos
 from ...envs.engine.tick import StepVariant
+from ...envs.numerics.functions import sincos
+from ...envs.numerics.jit import jit
 from ...envs.record import Array
-from ...envs.task.reference import LAGGED, ReferenceParams, compute_reference, make_reference_params
+from ...envs.task import LAGGED, ReferenceParams, compute_reference, make_reference_params
 from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import DisturbanceForces, Motion
+from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...envs.vehicle.tyres import MIN_SPEED, TYRE_LAWS, has_load_shift
-from ...envs.vehicle.vehicle import GRAVITY, Vehicle
-from ..design.gain_schedule import interpolate_gains
 from ..design.gauss_newton import MAX_VARIABLES, update_plan
-from ..design.prediction_model import (
+from ..design.prediction import (
     PredictionModel,
     PredictionStart,
     make_blocks,
     make_prediction_model,
     replace_tyres,
 )
-from ..env_facts import AnyEnv, list_plant_kinds
+from ..design.sampled_model import interpolate_gains
+from ..env_info import AnyEnv, list_plant_kinds
 from .base import check_positive
 from .lqr import IN, Lqr
 
@@ -281,3 +284,54 @@ def _read_plant_kind(env: AnyEnv, reference: int) -> tuple[StepVariant, bool, bo
         small, law, reference, roll, has_driver=0, lag=2, has_load_shift=shifting, road=0
     )
     return kind, plant.lags, plant.yaw_first
+
+
+TYRES = ("front_tyres_hat", "rear_tyres_hat")
+INVERSE_FRICTION = "inverse_friction_hat"
+MIN_FRICTION, MAX_FRICTION = 0.2, 1.2  # of the friction that is believed
+
+
+class AdaptiveLqr(Lqr):
+    """`Lqr` scheduled on the stiffness factors front_tyres_hat and rear_tyres_hat of `joint`.
+
+    Where the observation has inverse_friction_hat (`joint` with inverse_friction_sd), limits use
+    that friction, within 0.2 to 1.2.
+
+    Args:
+        env: Env of the controller, with both factors in its observation.
+        grip: Grip limit, as for `Controller`.
+        options: Other arguments of `Lqr`.
+
+    Raises:
+        ValueError: The tyres are not in the observation, or as `Lqr`.
+    """
+
+    def __init__(self, env: AnyEnv, grip: float | None = 0.7, **options: Any) -> None:
+        super().__init__(env, stiffness=TYRES, grip=grip, **options)
+
+    def _list_extra_entries(self, names: set[str]) -> tuple[str, ...]:
+        return (
+            *super()._list_extra_entries(names),
+            *((INVERSE_FRICTION,) if INVERSE_FRICTION in names else ()),
+        )
+
+    def _get_friction(self, inputs: Array) -> Array:
+        if INVERSE_FRICTION not in self.needs:
+            return super()._get_friction(inputs)
+        estimated = inputs[:, self.needs.index(INVERSE_FRICTION)]
+        return np.asarray(1.0 / np.clip(estimated, 1.0 / MAX_FRICTION, 1.0 / MIN_FRICTION))
+
+    def _law(self, inputs: Array, state: Array, action: Array) -> None:
+        inputs[:, IN.front_stiffness] *= self.vehicle.front_stiffness
+        inputs[:, IN.rear_stiffness] *= self.vehicle.rear_stiffness
+        super()._law(inputs, state, action)
+
+
+class AdaptiveNmpc(AdaptiveLqr, Nmpc):
+    """`Nmpc` that predicts with the tyres and the friction of `joint`, as `AdaptiveLqr` has them.
+
+    Args:
+        env: Env of the controller, with both factors in its observation.
+        grip: Grip limit, as for `Controller`.
+        options: Other arguments of `Nmpc`.
+    """

@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import jit
-from ...envs.backend.primitives import absolute, maximum, select
+from ...envs.numerics.jit import jit
+from ...envs.numerics.primitives import absolute, maximum, select
 from ...envs.record import Array
 from ...envs.ticks import TICK
-from ...envs.vehicle.vehicle import Vehicle
-from ..design.nominal_car import CAR, compute_plant, make_nominal_car
-from ..design.pi import PLACEMENTS, POLE, design_pi, sample_pi
-from ..env_facts import AnyEnv
+from ...envs.vehicle.parameters import Vehicle
+from ..design.pi import CAR, PLACEMENTS, POLE, compute_plant, design_pi, make_nominal_car, sample_pi
+from ..env_info import AnyEnv
 from .base import Controller, check_not_negative, integrate_antiwindup
 
 MIN_SPEED = 2.0  # m/s: gains below it are those of this speed

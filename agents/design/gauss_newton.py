@@ -5,10 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...envs.backend.arrays import count_lanes
-from ...envs.backend.decorators import jit
-from .prediction import N_RESIDUALS, N_TERMINAL, simulate_plans
-from .prediction_model import PredictionModel, PredictionStart
+from ...envs.numerics.jit import jit
+from ...envs.numerics.packed import count_lanes
+from .prediction import N_RESIDUALS, N_TERMINAL, PredictionModel, PredictionStart, simulate_plans
 
 N_CANDIDATES = 16  # that are tried at once
 MAX_VARIABLES = N_CANDIDATES - 1  # one is the plan itself

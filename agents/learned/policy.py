@@ -1,11 +1,349 @@
-"""A learned policy as one more controller: weights from a file, run by NumPy."""
+"""A policy's card: what it was trained on, how, and what it costs against others.
 
+A learned policy as one file: weights as safetensors, whose metadata hold the card.
+
+Reading it runs no code: safetensors are numbers, the card is JSON.
+
+A learned policy as one more controller: weights from a file, run by NumPy.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+from safetensors.numpy import save
+
+from ... import __version__
+from ...envs.io import check_types, from_json, write_atomic
 from ...envs.record import Array
+from ...envs.validation import describe_unknown
+from ...estimators.learned.network import (
+    NO_MEMORY,
+    Network,
+    build_network,
+    collect_tensors,
+    describe_network,
+    parse_json_object,
+    read_tensors,
+)
+from ...estimators.learned.network import SUFFIX as SUFFIX
+from ...estimators.registry import is_user_file
+from ...estimators.wrappers.estimate import EstimateObservation
 from ..controllers.base import Controller
-from ..env_facts import AnyEnv, get_env_facts
-from .files import Policy, load_policy
+from ..env_info import AnyEnv, get_env_facts, make_env
+
+JsonMap = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Card:
+    """The card of a policy: what it was trained on, how, and its evaluation; JSON types only.
+
+    Attributes:
+        env_id: Id of the env.
+        observation: (name, unit) of each entry that the network takes.
+        control_period: Ticks between two decisions.
+        reference: Name in `envs.task.REFERENCES`, by which the policy was judged.
+        env_options: Arguments of `gym.make`.
+        estimator: Estimator of `EstimateObservation` around the env, "" for none.
+        estimator_options: Other arguments of `EstimateObservation`.
+        algorithm: Name of the training's algorithm.
+        algorithm_options: Options of the training.
+        command: Command line of the training.
+        seeds: Seeds by purpose ("training", ...).
+        steps: Steps of the environment.
+        cpu_seconds: CPU time of the training (s).
+        sideslip: Version of the package.
+        evaluation: Result of `benchmarks.studies.policies.evaluation`: seeds, and mean costs on
+            them of the policy, of no control and of the best classical line.
+
+    Raises:
+        ValueError: A value has another type, or one that JSON does not have.
+    """
+
+    env_id: str
+    observation: tuple[tuple[str, str], ...]
+    control_period: int
+    reference: str
+    env_options: JsonMap = field(default_factory=dict)
+    estimator: str = ""
+    estimator_options: JsonMap = field(default_factory=dict)
+    algorithm: str = ""
+    algorithm_options: JsonMap = field(default_factory=dict)
+    command: str = ""
+    seeds: JsonMap = field(default_factory=dict)
+    steps: int = 0
+    cpu_seconds: float = 0.0
+    sideslip: str = __version__
+    evaluation: JsonMap = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        pairs = self.observation
+        if not isinstance(pairs, list | tuple) or not all(map(_is_entry, pairs)):
+            raise ValueError(f"observation is a list of (name, unit), got {pairs!r}")
+        object.__setattr__(self, "observation", tuple((name, unit) for name, unit in pairs))
+        if len({name for name, _ in pairs}) != len(pairs):
+            raise ValueError("observation names an entry twice")
+        check_types(Card, vars(self), "the card")
+        check_names_no_code(self.env_id, self.estimator, self.estimator_options)
+        self.to_json()
+
+    @classmethod
+    def from_env_id(
+        cls,
+        env_id: str,
+        env_options: Mapping[str, Any] | None = None,
+        estimator: str = "",
+        estimator_options: Mapping[str, Any] | None = None,
+        **rest: Any,
+    ) -> "Card":
+        """Make a card with the observation of an env and its estimator.
+
+        Args:
+            env_id: Id of the env.
+            env_options: Arguments of `gym.make`.
+            estimator: Estimator around the env, "" for none.
+            estimator_options: Other arguments of `EstimateObservation`.
+            rest: Other fields of the card.
+
+        Returns:
+            Card of the env.
+        """
+        options: JsonMap = {
+            "env_id": env_id,
+            "env_options": dict(env_options or {}),
+            "estimator": estimator,
+            "estimator_options": dict(estimator_options or {}),
+        }
+        env = make_env(env_id, options["env_options"])
+        if estimator:
+            env = EstimateObservation(env, estimator, **options["estimator_options"])
+        card = cls.from_env(env, **options, **rest)
+        env.close()
+        return card
+
+    @classmethod
+    def from_env(cls, env: AnyEnv, **rest: Any) -> "Card":
+        """Make a card with the observation, control period and reference of an env.
+
+        Args:
+            env: Env, single or vector.
+            rest: Other fields of the card.
+
+        Returns:
+            Card of the env.
+        """
+        facts = get_env_facts(env)
+        entries = tuple((entry.name, entry.unit) for entry in facts.layout)
+        return cls(
+            observation=entries,
+            control_period=int(facts.control_period),
+            reference=facts.reference,
+            **rest,
+        )
+
+    def to_json(self, **extra: Any) -> str:
+        """Convert the card to a JSON object.
+
+        Args:
+            extra: Further fields.
+
+        Returns:
+            Text of the object.
+
+        Raises:
+            ValueError: The card or a field has a value that JSON does not have.
+        """
+        try:
+            return json.dumps(asdict(self) | extra, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"the card holds what JSON has not: {error}") from None
+
+
+def check_names_no_code(env_id: str, estimator: str, estimator_options: JsonMap) -> None:
+    """Check that a foreign file names no code to import.
+
+    Args:
+        env_id: Id of a registered env.
+        estimator: Name of an estimator, or "".
+        estimator_options: Arguments of `EstimateObservation`, without an estimator.
+
+    Raises:
+        ValueError: The id or the estimator is an entry point or a file.
+    """
+    if "estimator" in estimator_options:
+        raise ValueError("estimator_options holds an estimator, which is none of its options")
+    if ":" in env_id:
+        raise ValueError(
+            f"env_id is that of a registered env, got {env_id!r}, which names a module: import it "
+            "first and give the id alone"
+        )
+    if ":" in estimator or is_user_file(estimator):
+        raise ValueError(
+            f"estimator is a name, got the entry point {estimator!r}: "
+            "sideslip.register_estimator gives it one"
+        )
+
+
+def _is_entry(pair: Any) -> bool:
+    return (
+        isinstance(pair, list | tuple)
+        and len(pair) == 2
+        and all(isinstance(word, str) for word in pair)
+    )
+
+
+FORMAT = 2
+"""Counts up when an older sideslip could not read, or would misread, a newer file: since 2 a
+network may have memory and more activations."""
+ZIP = ".zip"  # of stable-baselines3, which `agents.training.export` reads
+FOLDER = Path(__file__).resolve().with_name("policies")
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A network and its card.
+
+    Attributes:
+        name: Name of the file without its ending.
+        network: Network that computes the action.
+        card: Card of its training.
+    """
+
+    name: str
+    network: Network
+    card: Card
+
+    @property
+    def reads(self) -> npt.NDArray[np.bool_]:
+        """Whether the network reads each entry of the card's observation, shape (inputs,)."""
+        return self.network.reads
+
+    @property
+    def salt(self) -> str:
+        """Hexadecimal hash of the network, from which its test seeds are made."""
+        digest = hashlib.sha256()
+        for name, values in collect_tensors(self.network).items():
+            digest.update(name.encode() + values.tobytes())
+        return digest.hexdigest()[:16]
+
+
+def list_shipped() -> list[str]:
+    """List the names of the policies that come with the package."""
+    return sorted(path.stem for path in FOLDER.glob(f"*{SUFFIX}"))
+
+
+def is_policy(name: str) -> bool:
+    """Return whether a name is a shipped policy's, or a path with a policy's ending.
+
+    Args:
+        name: Name or path.
+
+    Returns:
+        True for either of them.
+    """
+    return name.endswith(SUFFIX) or name in list_shipped()
+
+
+def hash_policy(name: str) -> str:
+    """Compute the hash of a policy's file, "" for a name that is no policy's.
+
+    Args:
+        name: Shipped name or path.
+
+    Returns:
+        SHA-256 in hexadecimal digits.
+    """
+    path = FOLDER / f"{name}{SUFFIX}" if name in list_shipped() else Path(name)
+    exists = is_policy(name) and path.is_file()
+    return hashlib.sha256(path.read_bytes()).hexdigest() if exists else ""
+
+
+def save_policy(path: str | Path, network: Network, card: Card) -> None:
+    """Write a policy's file; a save that is stopped leaves an older file unchanged.
+
+    Args:
+        path: Path that ends in `.safetensors`.
+        network: Network to write.
+        card: Card of its training.
+
+    Raises:
+        ValueError: The ending is another, or the card's observation has another width than the
+            network's input.
+    """
+    target = Path(path)
+    if target.suffix != SUFFIX:
+        raise ValueError(f"a policy's file is NAME{SUFFIX}, got {target}")
+    if len(card.observation) != network.inputs:
+        raise ValueError(
+            f"the card's observation has {len(card.observation)} entries, "
+            f"the network takes {network.inputs}"
+        )
+    metadata = {"format": str(FORMAT), "card": card.to_json(network=describe_network(network))}
+    write_atomic(target, save(collect_tensors(network), metadata))
+
+
+def load_policy(path: str | Path) -> Policy:
+    """Load a policy from its file, or a shipped one by its name.
+
+    Args:
+        path: Path or shipped name.
+
+    Returns:
+        Policy with its network and card.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is no policy, is cut short, is larger than `MAX_BYTES` or has another
+            format, or its card and tensors do not fit together.
+    """
+    file = _find_file(path)
+    tensors, metadata = read_tensors(file, "policy")
+    try:
+        fields = _read_card_fields(metadata)
+        observation = fields.get("observation")
+        if not isinstance(observation, list):
+            raise ValueError(f"the card's observation is a list, got {observation!r}")
+        network = build_network(fields.pop("network", None), len(observation), tensors)
+        return Policy(file.stem, network, from_json(Card, fields, "the card"))
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+
+
+def _find_file(path: str | Path) -> Path:
+    name = str(path)
+    if name in list_shipped():
+        return FOLDER / f"{name}{SUFFIX}"
+    file = Path(path)
+    if not file.is_file():
+        if file.is_dir():
+            raise FileNotFoundError(f"policy {name} is a folder")
+        raise FileNotFoundError(
+            f"there is no such file and {describe_unknown('policy', [name], list_shipped())}"
+        )
+    return file
+
+
+def _read_card_fields(metadata: dict[str, str]) -> dict[str, Any]:
+    """The card's JSON object with the architecture, checked as far as the format goes."""
+    if not {"format", "card"} <= metadata.keys():
+        raise ValueError("safetensors without a card: this is not a policy of sideslip")
+    known = [str(version) for version in range(1, FORMAT + 1)]
+    if metadata["format"] not in known:
+        raise ValueError(
+            f"the card has format {metadata['format'][:20]}, this sideslip reads "
+            f"{' and '.join(known)}: another sideslip made it"
+        )
+    fields = parse_json_object(metadata["card"])
+    if metadata["format"] == "1" and isinstance(fields.get("network"), dict):
+        fields["network"] |= NO_MEMORY  # it has none
+    return fields
+
 
 DEFAULT = "ppo-yaw-vision"
 

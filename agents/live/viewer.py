@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from ...estimators.design.models import FOREIGN_STATE, STATES
-from .datagrams import DatagramKind, LoopStatus, Message, RejectReason, decode
-from .port import LOOPBACK, Port
+from .loop import LOOPBACK, Port
+from .messages import DatagramKind, LoopStatus, Message, RejectReason, decode
 
 PAGE = Path(__file__).with_name("page.html")
 SECONDS = 20.0  # of the strips

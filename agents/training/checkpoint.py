@@ -9,8 +9,8 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
-from ...envs.backend.extras import require_extra
-from ...envs.backend.files import write_atomic
+from ...envs.io import write_atomic
+from ...envs.numerics import require_extra
 
 with require_extra("train", "training needs {}"):
     import torch

@@ -18,15 +18,14 @@ import gymnasium as gym
 import numpy as np
 
 from ...envs.record import Array
-from ...estimators.learned.correction import learned
-from ...estimators.learned.files import Correction, CorrectionCard
-from ...estimators.learned.kernel import DEVIATION, MIN_LOG_DEVIATION, locate_stack
+from ...estimators.learned.correction import DEVIATION, MIN_LOG_DEVIATION, learned, locate_stack
+from ...estimators.learned.correction_file import Correction, CorrectionCard
 from ...estimators.learned.network import Network
 from ...estimators.vector.estimate import EstimateObservation
 from ..controllers.base import NoControl
 from ..controllers.lqr import Lqr
 from ..rollout import iterate_steps
-from .traces.mixing import compute_scale
+from .networks import compute_scale
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 

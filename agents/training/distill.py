@@ -16,13 +16,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..controllers.lqr import Lqr
-from ..learned.card import Card
-from ..learned.files import Policy, save_policy
-from ..learned.policy import PolicyController
+from ..learned.policy import Card, Policy, PolicyController, save_policy
 from ..rollout import COST_FLOOR
-from .student import LAST_ROUND_FACTOR, DistillConfig, Student, fit_model
-from .traces.drives import Demonstrations, Scaling, Single, compute_scaling, normalise_inputs
-from .traces.mixing import compute_scale
+from .networks import compute_scale
+from .student import (
+    LAST_ROUND_FACTOR,
+    Demonstrations,
+    DistillConfig,
+    Scaling,
+    Single,
+    Student,
+    compute_scaling,
+    fit_model,
+    normalise_inputs,
+)
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 

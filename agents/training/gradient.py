@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...envs.device.env import DeviceVectorEnv
+from ...envs.device.torch_env import DeviceVectorEnv
+from .config import TrainingTask
 from .normalise import Standardised
-from .rewards import RewardScale
-from .task import TrainingTask
+from .warm_start import RewardScale
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip

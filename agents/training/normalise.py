@@ -15,10 +15,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from ...envs.backend.extras import require_extra
+from ...envs.numerics import require_extra
 from ...envs.record import Array
-from ..env_facts import get_layout
-from .traces.mixing import compute_whitening
+from ..env_info import get_layout
+from .networks import compute_whitening
 
 with require_extra("train", "training needs {}"):
     import torch

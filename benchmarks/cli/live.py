@@ -16,16 +16,15 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from ...envs.arguments import check_choice
-from ...envs.backend.files import write_atomic
-from ..harness.verdict import format_verdict
-from .export import Trust
+from ...envs.io import write_atomic
+from ...envs.validation import check_choice
+from ..harness.study import format_verdict
+from .common import check_files, parse_options, print_written, show_episode
 from .names import check_env, complete
-from .options import parse_options
-from .output import check_files, print_written, show_episode
+from .policies import Trust
 
 if TYPE_CHECKING:
-    from ...agents.live.onboard import OnboardController
+    from ...agents.live.controller import OnboardController
 
 _Options = list[str] | None
 _Text = str | None
@@ -77,7 +76,7 @@ def live_command(
 
     With --simulate a simulated car is at the other end; without an ESTIMATOR it is alone.
     """
-    from ...agents.live.port import LOOPBACK, parse_address
+    from ...agents.live.loop import LOOPBACK, parse_address
 
     check_files(json=json)
     target = parse_address(to) if to else (LOOPBACK, port)
@@ -124,13 +123,13 @@ class _Connections:
 
 def _make_env_and_agent(setup: dict[str, Any], trust: bool) -> tuple[Any, Any]:
     names = setup["agent"], setup["agent_options"], setup["estimator"], setup["estimator_options"]
-    from .contestant import AgentSpec
+    from .common import AgentSpec
 
     return AgentSpec(*names, trust).build(setup["env"], setup["options"])
 
 
 def _make_controller(setup: dict[str, Any], trust: bool) -> "OnboardController":
-    from ...agents.live.onboard import OnboardController
+    from ...agents.live.controller import OnboardController
 
     return OnboardController(*_make_env_and_agent(setup, trust), setup["seed"])
 
@@ -151,12 +150,10 @@ def _run_live(
     json: Path | None,
 ) -> None:
     """The loop with all that is connected to it, and what it measured."""
-    from ...agents.live.assemble import PATIENCE, StreamSynchroniser
-    from ...agents.live.loop import Loop
-    from ...agents.live.port import Port
-    from ...agents.live.relay import Relay
-    from ...agents.live.session import Recorder
-    from ...agents.live.simulate import SimulatedCarProcess
+    from ...agents.live.controller import Recorder
+    from ...agents.live.loop import Loop, Port
+    from ...agents.live.messages import PATIENCE, StreamSynchroniser
+    from ...agents.live.simulate import Relay, SimulatedCarProcess
     from ...agents.live.viewer import Viewer
 
     patience = None if ends.step else round(PATIENCE / min(ends.speed, 1.0))
@@ -224,7 +221,7 @@ def _run_simulation(
     env_id: str, setup: dict[str, Any], target: Any, step: bool, speed: float
 ) -> None:
     """The simulated car alone."""
-    from ...agents.live.port import Port
+    from ...agents.live.loop import Port
     from ...agents.live.simulate import simulate
 
     check_env(env_id)
@@ -238,8 +235,8 @@ def _run_simulation(
 def _run_relay(
     source: str, target: Any, latency: float, speed: float, duration: float, json: Path | None
 ) -> None:
-    from ...agents.live.port import Port
-    from ...agents.live.relay import Relay
+    from ...agents.live.loop import Port
+    from ...agents.live.simulate import Relay
 
     signals, end = _watch_signals(), monotonic() + duration
     with Port() as port:
@@ -255,8 +252,8 @@ def _run_relay(
 
 def _replay(path: Path, requested: dict[str, Any], trust: bool, json: Path | None) -> None:
     from ...agents import AGENTS
-    from ...agents.learned.card import check_names_no_code
-    from ...agents.live.session import read_setup, replay
+    from ...agents.learned.policy import check_names_no_code
+    from ...agents.live.controller import read_setup, replay
     from ...estimators.filters import FILTERS
 
     setup = read_setup(path)

@@ -9,23 +9,40 @@ from rich.markup import escape
 from rich.table import Table
 
 from ... import __version__
-from ...envs.arguments import check_choice
-from ..harness.engines import PROCESSES, use_engine
-from ..harness.errors import report_user_errors
-from ..report.page import check_page, write_page
+from ...envs.validation import check_choice
+from ..harness.parallel import PROCESSES, report_user_errors, use_engine
+from ..report.html import check_page, write_page
 from ..suites import SUITES, Request, check_salt, run_suites
-from .calibrate import calibrate_command
-from .challenge import Agents, EnvId, Estimators, Fresh, Limit, Scenarios, make_request
-from .enjoy import enjoy_command
-from .export import Trust, export_command
-from .lane import lane_command
+from .common import (
+    Address,
+    Agents,
+    EngineName,
+    EnvId,
+    Estimators,
+    Fresh,
+    Limit,
+    Salt,
+    Scenarios,
+    check_files,
+    handle_interrupt,
+    make_request,
+    parse_options,
+    print_written,
+    show_episode,
+    write_output,
+)
+from .data import Mapping, identify_command, lane_command, replay_command
 from .live import live_command
 from .names import KINDS, complete
-from .options import Address, EngineName, Salt, parse_options
-from .output import check_files, handle_interrupt, print_written, show_episode, write_output
-from .recorded import Mapping, identify_command, replay_command
-from .train import distill_command, train_command, train_estimator_command
-from .tune import tune_app
+from .policies import (
+    Trust,
+    distill_command,
+    enjoy_command,
+    export_command,
+    train_command,
+    train_estimator_command,
+)
+from .search import calibrate_command, tune_app
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 app.add_typer(tune_app, name="tune")
@@ -150,7 +167,7 @@ def run(
     """Drive one episode, print its score, draw it."""
     from ...agents.rollout import rollout
     from ..report.film import FilmDriver, check_film, write_drive_film
-    from .contestant import AgentSpec
+    from .common import AgentSpec
 
     check_files(plot=plot, parquet=parquet, kml=kml)
     check_film(video)
@@ -229,7 +246,7 @@ def bench(
     check_page(page, names)
     done = []
     if log is not None:  # first: a log that cannot be read should not cost minutes
-        from ..recorded.replay_file import replay_file
+        from ..recorded.replay import replay_file
 
         done.append(replay_file(log, vehicle, mapping=mapping))
     request = Request(quick, jobs, console, episodes, keep, clairvoyant, challenge, salt)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from ...envs.arguments import check_choice
+from ...envs.validation import check_choice
 from ..suites import SUITES
 
 if TYPE_CHECKING:
@@ -81,8 +81,7 @@ def _format_range(ends: tuple[float, float], factor: float = 1.0) -> str:
 
 def list_vehicles() -> dict[str, str]:
     """Mass, wheelbase, and above which speed a car is unstable."""
-    from ...envs.vehicle.vehicle import critical_speed
-    from ...envs.vehicle.vehicles import VEHICLES
+    from ...envs.vehicle.parameters import VEHICLES, critical_speed
 
     lines = {}
     for name, car in VEHICLES.items():
@@ -115,7 +114,7 @@ def list_agents() -> dict[str, str]:
 
 def list_policies() -> dict[str, str]:
     """The algorithm and the environment of each policy that is shipped."""
-    from ...agents.learned.files import list_shipped, load_policy
+    from ...agents.learned.policy import list_shipped, load_policy
 
     cards = {name: load_policy(name).card for name in list_shipped()}
     return {

@@ -19,14 +19,15 @@ import numpy as np
 from rich.console import Console
 
 from ... import __version__
-from ...envs.arguments import is_finite
+from ...envs.io import from_json
 from ...envs.record import Array
+from ...envs.validation import is_finite
 from ..harness.parallel import run_cases
-from ..harness.results import from_json, read_objects, write_text
-from .cells import ControlEntry
-from .contests import NOMINAL, STATE, ControlTask, find_oracle
+from ..harness.results import read_objects, write_text
+from .entries import ControlEntry
 from .run import Results, hash_sources, measure
-from .scores import compute_log_ratios, survival_mask
+from .score import compute_log_ratios, survival_mask
+from .tasks import NOMINAL, STATE, ControlTask, find_oracle
 
 FILE = Path(__file__).with_name("clairvoyant.json")
 SEEDS = 64
@@ -98,8 +99,8 @@ def derive_seeds(task: ControlTask, count: int = SEEDS) -> list[int]:
 def solve(case: CalibrationCase) -> ClairvoyantEpisode:
     """The best of the plans from nominal's and the oracle's runs; from the folder of finished cases
     where it is there."""
+    from ...agents.baselines import make_oracle
     from ...agents.clairvoyant.plan import compute_clairvoyant, record_actions
-    from ...agents.rungs import make_oracle
 
     done = _read_finished(case)
     if done is not None:

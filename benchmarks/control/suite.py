@@ -8,23 +8,10 @@ import numpy as np
 from rich.console import Console
 
 from ... import __version__
-from ...agents.learned.files import is_policy, load_policy
+from ...agents.learned.policy import is_policy, load_policy
 from ...envs.record import Array
 from ..harness.results import ResultRow, ResultTable, Suite
-from .answer import compose_verdict
-from .build import measure_decision_time
-from .calibration import (
-    FILE,
-    CalibrationRecord,
-    check_current,
-    compute_regrets,
-    measure_calibrated,
-    read_calibration,
-)
-from .cells import EPISODES, LEARNED, ControlEntry, make_entries, select_quick_tasks
-from .contests import STATE, TITLES, ControlTask, list_scored_tasks
-from .figures import add_figures
-from .ladder import (
+from .baseline_gaps import (
     DELAY_TASK,
     DELAYS,
     DelayCost,
@@ -36,9 +23,25 @@ from .ladder import (
     make_score_scales,
     measure_delay_cost,
 )
+from .calibration import (
+    FILE,
+    CalibrationRecord,
+    check_current,
+    compute_regrets,
+    measure_calibrated,
+    read_calibration,
+)
+from .entries import (
+    EPISODES,
+    LEARNED,
+    ControlEntry,
+    make_entries,
+    measure_decision_time,
+    select_quick_tasks,
+)
+from .report import add_figures, compose_verdict
 from .run import Results, measure
-from .seeds import make_salt, make_task_seeds
-from .tables import (
+from .score import (
     Standing,
     make_main_table,
     make_motion_table,
@@ -46,6 +49,7 @@ from .tables import (
     make_task_table,
     rank_entries,
 )
+from .tasks import STATE, TITLES, ControlTask, list_scored_tasks, make_salt, make_task_seeds
 
 _TEXT = """\
 In a contest everybody drives the same salted seeds, and everything is paired by episode. \

@@ -14,18 +14,24 @@ import numpy as np
 from rich.console import Console
 
 from ... import __version__
-from ..control.cells import (
+from ...envs.io import from_json
+from ..control.entries import (
     REFERENCE_CONTROLLER,
     REFERENCE_FILTER,
     TRUTH,
     ControlEntry,
     select_quick_tasks,
 )
-from ..control.contests import NOMINAL, STATE, ControlTask, list_scored_tasks
-from ..control.episodes import NUMBERS, DriveResult
-from ..control.run import Results, measure
-from ..control.seeds import make_salt, make_task_seeds
-from ..harness.results import from_json, read_objects, write_text
+from ..control.run import NUMBERS, DriveResult, Results, measure
+from ..control.tasks import (
+    NOMINAL,
+    STATE,
+    ControlTask,
+    list_scored_tasks,
+    make_salt,
+    make_task_seeds,
+)
+from ..harness.results import read_objects, write_text
 from .challenge import EPISODES
 
 FILE = Path(__file__).with_name("baselines.json")

@@ -9,15 +9,15 @@ from typing import Any
 import gymnasium as gym
 
 from ...agents import AGENTS
-from ...agents.learned.files import ZIP, is_policy, list_shipped, load_policy
-from ...agents.training.zips import check_trusted
-from ...agents.tuned import get_tuned_options
-from ...envs.arguments import check_choice
+from ...agents.baselines import get_tuned_options
+from ...agents.learned.policy import ZIP, is_policy, list_shipped, load_policy
+from ...agents.training.export import check_trusted
 from ...envs.scenarios.manoeuvres import make_scenario
-from ...envs.vehicle.vehicles import make_vehicle
+from ...envs.validation import check_choice
+from ...envs.vehicle.parameters import make_vehicle
 from ...estimators.make import ESTIMATORS
-from ...estimators.user_files import find_class, is_user_file
-from ..control.cells import (
+from ...estimators.registry import find_class, is_user_file
+from ..control.entries import (
     REFERENCE_CONTROLLER,
     REFERENCE_FILTER,
     SETUPS,
@@ -25,8 +25,15 @@ from ..control.cells import (
     ControlEntry,
     select_quick_tasks,
 )
-from ..control.contests import NOMINAL, STEERING, TIERS, YAW, ControlTask, list_scored_tasks
-from ..control.seeds import make_salted_seeds
+from ..control.tasks import (
+    NOMINAL,
+    STEERING,
+    TIERS,
+    YAW,
+    ControlTask,
+    list_scored_tasks,
+    make_salted_seeds,
+)
 from .worker import LIMIT
 
 EPISODES = 64

@@ -23,12 +23,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...agents import make_agent
-from ...agents.env_facts import EnvView
-from ...envs.arguments import parse_actions
+from ...agents.env_info import EnvView
 from ...envs.sensors.link import SlowSensor
+from ...envs.validation import parse_actions
 from ...estimators.make import make_estimator
-from ...estimators.user_files import describe_error
-from ..control.build import CheckedAgent
+from ...estimators.registry import describe_error
+from ..control.entries import CheckedAgent
 
 MEMORY = 4 * 2**30
 """Bytes of address space of a contestant."""

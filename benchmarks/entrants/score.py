@@ -1,20 +1,257 @@
-"""`sideslip.score`: an entry's score as a Python object."""
+"""A user's contestants and the package's, on the same episodes.
 
+What a comparison says: a sentence a contestant, a table, and what it does not say.
+
+`sideslip.score`: an entry's score as a Python object.
+
+The open benchmark as a suite: verdict, tables, rows.
+"""
+
+import hashlib
+import math
 import os
+import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...envs.backend.extras import require_extra
-from ..control.cells import REFERENCE_FILTER
-from ..harness.stats import Estimate
+from rich.console import Console
+
+from ...envs.numerics import require_extra
+from ..control.baseline_gaps import list_failures, make_score_scales
+from ..control.entries import REFERENCE_CONTROLLER, REFERENCE_FILTER, ControlEntry
+from ..control.run import Chunk, Results, measure
+from ..control.score import Standing, make_rows, make_task_table, rank_entries
+from ..control.tasks import NOMINAL, ControlTask, make_salt, make_task_seeds, make_tuning_seeds
+from ..harness.parallel import run_cases
+from ..harness.results import ResultTable, Suite
+from ..harness.stats import Estimate, geometric_mean
+from ..harness.study import format_percent
+from .baselines import find_baselines, make_baseline_entries
 from .challenge import EPISODES, ComparisonRequest, UserEntry, choose_estimator
-from .compare import compare
-from .verdict import make_sentence
-from .worker import LIMIT
+from .worker import LIMIT, run_isolated_chunk, run_rehearsal, run_user_chunk
 
 if TYPE_CHECKING:
     import pandas as pd
+
+REHEARSED = 2  # episodes of a contest in which contestants show what they open
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The episodes of a challenge. salt: of the seeds, "" where the caller chose them. on_file:
+    whether the baselines are the file's."""
+
+    request: ComparisonRequest
+    salt: str
+    on_file: bool
+    results: Results
+
+    @cached_property
+    def overall(self) -> list[Standing]:
+        """Everybody over all contests, the best first."""
+        return self.standings(None)
+
+    def standings(self, tier: str | None) -> list[Standing]:
+        """Everybody in a tier, None: in all of them, the best first."""
+        return rank_entries(
+            self.results.outcomes, tier, make_score_scales(self.results, self.tasks)
+        )
+
+    @property
+    def tasks(self) -> list[ControlTask]:
+        """Those that were driven."""
+        return list(self.request.tasks)
+
+    def select(self, entry: UserEntry) -> Standing:
+        """A contestant over all contests."""
+        return next(standing for standing in self.overall if standing.label == entry.label)
+
+
+def compare(
+    request: ComparisonRequest,
+    jobs: int | None = None,
+    console: Console | None = None,
+    keep: Path | None = None,
+) -> Comparison:
+    """Drive a challenge. keep: a folder for the baselines' finished cases.
+
+    A contestant of names and files drives in processes of its own, objects in this one.
+    """
+    entries, tasks = request.entries, request.tasks
+    shared: dict[str, Any] = {"jobs": jobs, "console": console, "keep": keep}
+    controllers = any(entry.agent != REFERENCE_CONTROLLER for entry in entries)
+    filters = any(entry.agent == REFERENCE_CONTROLLER for entry in entries)
+    rivals = [
+        ControlEntry(
+            control_entry.task,
+            control_entry.estimator,
+            control_entry.controller,
+            tasks[control_entry.task],
+        )
+        for control_entry in make_baseline_entries(list(tasks), controllers, filters)
+    ]
+    user_entries = [
+        entry.make_entry(task, options) for task, options in tasks.items() for entry in entries
+    ]
+    isolated = [control_entry for control_entry in user_entries if not control_entry.objects]
+    baselines = (
+        find_baselines(rivals, request.episodes, **shared) if request.is_as_shipped else None
+    )
+    allowed: frozenset[str] | None = None
+    salt = baselines[0] if baselines else request.salt or make_salt()
+    if request.fresh:
+        allowed = _find_opened_files(request, isolated, jobs, console)
+        digests = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in sorted(allowed)]
+        salt = make_salt(*digests, secrets.token_hex(16))
+    seeds = request.seeds or make_task_seeds(salt, request.episodes)
+    results = baselines[1] if baselines else measure(rivals, seeds, title="baselines", **shared)
+    runner = partial(run_isolated_chunk, limit=request.limit, allowed=allowed)
+    remote = measure(isolated, seeds, jobs=jobs, console=console, title="entrants", runner=runner)
+    in_process = measure(
+        [control_entry for control_entry in user_entries if control_entry.objects],
+        seeds,
+        jobs=1,
+        runner=run_user_chunk,
+    )
+    all_results = Results(results.outcomes | remote.outcomes | in_process.outcomes)
+    return Comparison(request, "" if request.seeds else salt, bool(baselines), all_results)
+
+
+def _find_opened_files(
+    request: ComparisonRequest,
+    entries: Sequence[ControlEntry],
+    jobs: int | None,
+    console: Console | None,
+) -> frozenset[str]:
+    """Find the files that contestants open, theirs included, by a drive on tuning seeds."""
+    chunks = [Chunk(entry, tuple(make_tuning_seeds(REHEARSED))) for entry in entries]
+    runner = partial(run_rehearsal, limit=request.limit)
+    opened = [files for _, files in run_cases(runner, chunks, "rehearsal", jobs, console)]
+    return frozenset().union(*opened, (os.path.realpath(path) for path in request.files))
+
+
+_MAX_SENTENCES = 4  # contestants with a sentence
+
+
+def compose_verdict(comparison: Comparison) -> list[str]:
+    """At most five lines: the contestants, the best first, then how far to trust them."""
+    labels = {entry.label for entry in comparison.request.entries}
+    user_standings = [standing for standing in comparison.overall if standing.label in labels]
+    places = {standing.label: place for place, standing in enumerate(comparison.overall, 1)}
+    count = len(comparison.overall)
+    lines = [
+        f"Place {places[standing.label]} of {count}: {make_sentence(standing)}."
+        for standing in user_standings[:_MAX_SENTENCES]
+    ]
+    if len(user_standings) > _MAX_SENTENCES:
+        lines[-1] = f"{len(user_standings) - _MAX_SENTENCES + 1} more stand in the table."
+    return [*lines, _describe_trust(comparison)]
+
+
+def make_sentence(standing: Standing) -> str:
+    """Where a contestant stands."""
+    cost = standing.overall.get("cost_vs_nominal")
+    errors = [f"{c.name}: {r.error}" for c, r in standing.results.items() if r.error]
+    if cost is None or not math.isfinite(cost.value):
+        yards = "nominal and oracle-state leave no episode to compare"
+        return (
+            f"{standing.label}: not driven: {errors[0]}" if errors else f"{standing.label}: {yards}"
+        )
+    names = dict.fromkeys(task.tier for task in standing.pairs)
+    tiers = [f"tier {tier}: {100.0 * _compute_cost(standing, tier):.0f}" for tier in names if tier]
+    failed = standing.overall["failure_rate"]
+    nominal = [standing.scales[task].nominal for task in standing.drives if task in standing.scales]
+    nominal_failures = sum(float((run["failure"] != 0.0).sum()) for run in nominal)
+    episodes = sum(len(run.costs) for run in nominal)
+    parts = [
+        f"{format_percent(cost)} of nominal's cost"
+        + (f" ({', '.join(tiers)})" if tiers[1:] else ""),
+        f"wins {100.0 * standing.overall['share_won'].value:.0f} % of the episodes",
+        f"fails in {100.0 * failed.value:.1f} % (nominal "
+        f"{100.0 * nominal_failures / episodes:.1f} %)",
+        _describe_gap(standing.overall["score"]),
+    ]
+    text = f"{standing.label}: {', '.join(parts)}"
+    if errors:
+        text += f"; not driven in {len(errors)} of {len(standing.results)} contests: {errors[0]}"
+    return text
+
+
+def _compute_cost(standing: Standing, tier: str) -> float:
+    """Cost over nominal's in a tier."""
+    logs = [-r for task, (r, _) in standing.pairs.items() if task.tier == tier]
+    return geometric_mean(*logs).value
+
+
+def _describe_gap(score: Estimate) -> str:
+    """How much of the way from nominal to oracle-state."""
+    if not math.isfinite(score.value):
+        return "and nothing is to be won here"
+    if score.low > 0.0:
+        return f"closes {format_percent(score)} of the gap to oracle-state"
+    if score.high < 0.0:
+        return f"and is behind nominal (score {score.value:.2f}, oracle-state 1)"
+    return f"and is not told apart from nominal (score {score.value:.2f}, oracle-state 1)"
+
+
+def _describe_trust(comparison: Comparison) -> str:
+    """On what the numbers rest, and what they do not say."""
+    request = comparison.request
+    n = len(request.seeds or range(request.episodes))
+    count = len(comparison.tasks)
+    where = f"{count} contest{'s' if count > 1 else ''} x {n} episodes"
+    if request.fresh:
+        files = ", ".join(path.name for path in request.files)
+        return (
+            f"Publishable: {where} on seeds drawn after {files} were hashed; --salt "
+            f"{comparison.salt} "
+            "repeats them. Everybody driven anew. Not said: other cars, manoeuvres and sensors."
+        )
+    whose = "the given" if request.salt else "the package's own"
+    seeds = f"of {whose} salt {comparison.salt}" if comparison.salt else "of the caller's choice"
+    rows = "on file, a sample driven again" if comparison.on_file else "driven now"
+    return (
+        f"Not publishable: {where} on seeds {seeds}, which a contestant can be tuned on; --fresh "
+        f"draws new ones. Baselines {rows}. Not said: other cars, manoeuvres and sensors."
+    )
+
+
+def make_table(comparison: Comparison) -> ResultTable:
+    """Everybody over all contests, the best first; the user's own are marked."""
+    labels, cells = {entry.label for entry in comparison.request.entries}, []
+    for standing in comparison.overall:
+        numbers = [standing.overall.get(name) for name in ("cost_vs_nominal", "share_won", "score")]
+        cost, won, score = (Estimate(math.nan) if n is None else n for n in numbers)
+        cells.append(
+            [
+                f"> {standing.label}"
+                if standing.label in labels
+                else _label_baseline(standing.label),
+                _format_text(cost, 100.0, ".0f"),
+                _format_text(Estimate(won.value), 100.0, ".0f"),
+                _format_text(Estimate(standing.overall["failure_rate"].value), 100.0, ".1f"),
+                _format_text(score, 1.0, ".2f"),
+                str(standing.n),
+            ]
+        )
+    header = ("contestant", "cost, % [95 %]", "won, %", "fails, %", "score [95 %]", "episodes")
+    note = (
+        "> yours. Cost in percent of nominal's, the paired geometric mean of the episodes that "
+        "nominal and oracle-state survive. won: cheaper than nominal. score: 0 nominal, an LQG "
+        "that knows the nominal car, 1 oracle-state, which knows state and car."
+    )
+    return ResultTable("Your contestants and the package's", header, cells, note)
+
+
+def _label_baseline(label: str) -> str:
+    return f"{label} (lqr on {REFERENCE_FILTER})" if label == NOMINAL else label
+
+
+def _format_text(number: Estimate, scale: float, digits: str) -> str:
+    return number.inline(scale, digits) if math.isfinite(number.value) else ""
 
 
 @dataclass(frozen=True, repr=False)
@@ -135,3 +372,29 @@ def score(
         error=errors[0] if all(errors) else "",
         text=make_sentence(standing),
     )
+
+
+_TEXT = "Everybody drives the same episodes; an agent of yours on nominal's filter, or on yours."
+
+
+def run(
+    request: ComparisonRequest,
+    jobs: int | None = None,
+    console: Console | None = None,
+    keep: Path | None = None,
+) -> Suite:
+    """A challenge, driven. keep: a folder for the baselines' finished cases."""
+    comparison = compare(request, jobs, console, keep)
+    suite = Suite("control", "Your own beside the package's", _TEXT)
+    suite.verdict = "\n".join(compose_verdict(comparison))
+    suite.tables += [make_table(comparison)]
+    title = "Contest by contest"
+    suite.tables += [make_task_table(title, comparison.overall, comparison.tasks)]
+    lines = [line[1:] for line in list_failures(comparison.results)]
+    if lines:
+        header = ("contest", "contestant", "what happened")
+        suite.tables.append(ResultTable("Cells that went wrong", header, lines, keyed=False))
+    for tier in dict.fromkeys(task.tier for task in comparison.tasks):
+        for standing in comparison.standings(tier):
+            suite.rows += make_rows(standing, comparison.salt)
+    return suite

@@ -1,18 +1,113 @@
-"""A benchmark's work as a list of independent cases, run side by side with a progress bar."""
+"""The engines of independent cases: processes of this machine, or an existing Ray cluster.
 
+Every engine and every number of workers give the same results.
+
+A benchmark's work as a list of independent cases, run side by side with a progress bar.
+
+A user's error as one line; every other error keeps its traceback.
+"""
+
+import io
+import os
+import socket
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from threading import Event, Thread
 from typing import Any, TypeVar
 
+import joblib
+from gymnasium.error import Error as GymnasiumError
 from rich import progress
 from rich.console import Console
+from rich.markup import escape
 
-from .engines import execute_cases
+from ...envs.numerics import require_extra
+from ...envs.validation import check_choice
 
 Case = TypeVar("Case")
 Result = TypeVar("Result")
+
+PROCESSES, RAY = ENGINES = ("processes", "ray")
+RETRIES = 3
+"""Deaths of its worker or node that a case outlives on a cluster; a fourth may be its own doing."""
+_CLUSTER: ContextVar[Any] = ContextVar("cluster", default=None)
+
+
+def count_cores() -> int:
+    """Count the processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def use_engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
+    """Use an engine for the cases within.
+
+    Args:
+        name: Name in `ENGINES`.
+        address: Existing Ray cluster, "host:port"; "": the one on this machine. Its nodes need this
+            version of sideslip and a shared folder for finished cases.
+
+    Raises:
+        ValueError: The name is unknown, an address without Ray, or there is no such cluster.
+        ModuleNotFoundError: ray is not installed.
+    """
+    check_choice("engine", name, ENGINES)
+    if name == PROCESSES:
+        if address:
+            raise ValueError(f"an address is of a Ray cluster (engine {RAY!r}), got {address!r}")
+        yield
+        return
+    with require_extra("scale", "the engine 'ray' needs ray"):
+        import ray
+    quiet = {"env_vars": {"SIDESLIP_QUIET": "1", "OPENBLAS_NUM_THREADS": "1"}}
+    try:
+        if address:  # Ray itself asks for minutes, then ends the process
+            host, _, port = address.removeprefix("ray://").rpartition(":")
+            socket.create_connection((host, int(port)), timeout=5.0).close()
+        ray.init(address or "auto", runtime_env=quiet, log_to_driver=False, logging_level="error")
+    except (OSError, ValueError, RuntimeError) as error:
+        where = f"at {address}" if address else "on this machine (`ray start --head`)"
+        raise ValueError(f"there is no Ray cluster {where}: {error}") from None
+    token = _CLUSTER.set(ray)
+    try:
+        yield
+    finally:
+        _CLUSTER.reset(token)
+        ray.shutdown()
+
+
+def execute_cases(
+    function: Callable[[Case], Result], cases: Sequence[Case], jobs: int | None = None
+) -> Iterator[tuple[int, Result]]:
+    """Execute cases, and yield the index and result of each when it is done.
+
+    Args:
+        function: Function of a case, importable by workers.
+        cases: Cases.
+        jobs: Number of processes; None: one for each processor at most. A cluster has its own.
+    """
+    ray = _CLUSTER.get()
+    if ray is None:
+        # the number asked for is left alone: another one would end the processes of the last call
+        pool = joblib.Parallel(
+            jobs or max(min(count_cores(), len(cases)), 1), return_as="generator"
+        )
+        yield from enumerate(pool(joblib.delayed(function)(case) for case in cases))
+        return
+    remote = ray.remote(num_cpus=1, max_retries=RETRIES)(_call)  # a dead node's cases run again
+    function_ref, waiting = ray.put(function), {}
+    for place, case in enumerate(cases):
+        waiting[remote.remote(function_ref, case)] = place
+    while waiting:
+        (done,), _ = ray.wait(list(waiting), num_returns=1)
+        yield waiting.pop(done), ray.get(done)
+
+
+def _call(function: Callable[[Case], Result], case: Case) -> Result:
+    return function(case)
+
 
 _EVERY = 15.0  # s between two lines
 
@@ -151,3 +246,33 @@ def run_cases(
             results[place] = result
             bar.advance(task)
     return [results[place] for place in range(len(cases))]
+
+
+_USER_ERRORS = (
+    ValueError, TypeError, ModuleNotFoundError, OSError, RecursionError, GymnasiumError,
+    FloatingPointError,
+)  # fmt: skip
+
+_LONGEST = 1000  # letters of a message
+
+
+@contextmanager
+def report_user_errors() -> Iterator[None]:
+    """End the process with exit status 2 and the message of a user's error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a result is not lost for a letter
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        yield
+    except _USER_ERRORS as error:
+        Console(stderr=True, soft_wrap=True).print(
+            "[bold red]error:[/]", escape(_truncate_message(str(error))), highlight=False
+        )
+        sys.exit(2)
+
+
+def _truncate_message(text: str) -> str:
+    """Truncate a long message in its middle."""
+    if len(text) <= _LONGEST:
+        return text
+    return f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"

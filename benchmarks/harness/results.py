@@ -9,13 +9,13 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...envs.arguments import check_choice
-from ...envs.backend.files import atomic_file, write_atomic
-from ...envs.documents import from_json as from_json
+from ...envs.io import atomic_file, write_atomic
+from ...envs.io import from_json as from_json
 from ...envs.record import Array
-from .explorer import Explorer
+from ...envs.validation import check_choice
 from .metrics import METRICS
 from .stats import Estimate
+from .study import Explorer
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -2,12 +2,18 @@
 
 from functools import partial
 
-from .ledger.claim import Bound, ClaimPart, make_claim_factory, make_number_part, make_smaller_part
-from .ledger.controllers import FollowingSimulation
-from .ledger.filters import EstimationSimulation, PaperFilter
-from .ledger.plots import PaperFigure, make_course, make_curves
-from .ledger.simulations import Analysis
-from .theory.observability import compute_coms_ranks
+from .ledger import (
+    Analysis,
+    Bound,
+    ClaimPart,
+    EstimationSimulation,
+    PaperFilter,
+    make_claim_factory,
+    make_number_part,
+    make_smaller_part,
+)
+from .manoeuvres import FollowingSimulation, PaperFigure, make_course, make_curves
+from .theory import compute_coms_ranks
 
 PAPER = "dakf-stability"
 FIG6, FASTER, FIG8 = "dakf-fig6", "dakf-fig6-faster", "dakf-fig8"

@@ -5,9 +5,16 @@ from functools import partial
 import numpy as np
 
 from ...estimators.filters import FILTERS
-from .ledger.claim import Bound, ClaimPart, compare_others, make_claim_factory, make_smaller_part
-from .ledger.filters import EstimationSimulation, PaperFilter
-from .ledger.plots import PaperFigure, make_curves
+from .ledger import (
+    Bound,
+    ClaimPart,
+    EstimationSimulation,
+    PaperFilter,
+    compare_others,
+    make_claim_factory,
+    make_smaller_part,
+)
+from .manoeuvres import PaperFigure, make_curves
 
 PAPER = "double-layer-gps"
 FIG9, FASTER, PERIODS = "double-layer-fig9", "double-layer-fig9-fast", "double-layer-fig9-periods"

@@ -2,10 +2,15 @@
 
 from functools import partial
 
-from .ledger.claim import ClaimPart, make_claim_factory, make_smaller_part
-from .ledger.filters import EstimationSimulation, PaperFilter
-from .ledger.plots import PaperFigure, make_course, make_curves
-from .theory.dual_rate_gains import PAPER
+from .ledger import (
+    ClaimPart,
+    EstimationSimulation,
+    PaperFilter,
+    make_claim_factory,
+    make_smaller_part,
+)
+from .manoeuvres import PaperFigure, make_course, make_curves
+from .theory import PAPER
 
 FIG4, FIG5 = "dual-rate-fig4", "dual-rate-fig5"
 CONVENTIONAL, HOLDING, PSEUDO = "conventional", "innovation holding", "pseudo measurement"

@@ -1,5 +1,8 @@
-"""Question: which claims of the five papers hold? Every claim, what was measured, its verdict, and
-the papers' figures redrawn."""
+"""The papers' claims: one or two modules a paper, with its simulations, claims and figures.
+
+Question: which claims of the five papers hold? Every claim, what was measured, its verdict, and
+the papers' figures redrawn.
+"""
 
 from collections import Counter
 
@@ -9,18 +12,40 @@ from ... import __version__
 from ..harness.parallel import run_cases
 from ..harness.results import VERDICTS, ResultRow, ResultTable, Suite
 from ..harness.stats import Estimate
-from ..harness.verdict import format_verdict as format_verdict
-from ..harness.verdict import summarise_names
-from .claims import CLAIMS, FIGURES, SIMULATIONS
-from .ledger.claim import (
+from ..harness.study import format_verdict as format_verdict
+from ..harness.study import summarise_names
+from . import dakf_stability, double_layer, dual_rate, theory, tie_vision_control, uneven_delay
+from . import tie_vision_estimation as tie_vision
+from . import tie_vision_theory as tie_vision_convergence
+from .ledger import (
     Claim,
     MeasuredPart,
     Results,
+    Simulation,
     SimulationResult,
     evaluate_claim,
+    join_results,
     measure_parts,
 )
-from .ledger.simulations import join_results
+from .manoeuvres import PaperFigure
+
+_MODULES = (
+    tie_vision,
+    tie_vision_control,
+    tie_vision_convergence,
+    uneven_delay,
+    double_layer,
+    dual_rate,
+    theory,
+    dakf_stability,
+)
+
+SIMULATIONS: dict[str, Simulation] = {
+    simulation.name: simulation for module in _MODULES for simulation in module.SIMULATIONS
+}
+CLAIMS: tuple[Claim, ...] = tuple(claim for module in _MODULES for claim in module.CLAIMS)
+FIGURES: tuple[PaperFigure, ...] = tuple(f for module in _MODULES for f in module.FIGURES)
+
 
 SEEDS = 20
 QUICK_SEEDS = 4

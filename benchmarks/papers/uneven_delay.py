@@ -2,18 +2,19 @@
 
 from functools import partial
 
-from .ledger.claim import (
+from .ledger import (
+    Analysis,
     Bound,
     ClaimPart,
+    EstimationSimulation,
+    PaperFilter,
     make_claim_factory,
     make_number_part,
     make_smaller_part,
     select_ratio,
 )
-from .ledger.filters import EstimationSimulation, PaperFilter
-from .ledger.plots import PaperFigure, draw_delays, make_curves, make_offset
-from .ledger.simulations import Analysis
-from .theory.observability import compute_coms_ranks
+from .manoeuvres import PaperFigure, draw_delays, make_curves, make_offset
+from .theory import compute_coms_ranks
 
 PAPER = "uneven-delay"
 FIG5, NOISY, FIG7 = "uneven-delay-fig5", "uneven-delay-fig5-noisy", "uneven-delay-fig7"

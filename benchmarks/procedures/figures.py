@@ -8,12 +8,12 @@ from plotly.subplots import make_subplots
 
 from ...envs.record import Array
 from ...envs.rendering.palette import GREY, INK, find_colour
-from ...envs.scenarios.tracks import Section
+from ...envs.scenarios.road import Section
 from ..harness.results import Suite
 from ..report.figures import draw_time_series, draw_track
 from . import fmvss126, iso3888, iso7401
-from .cases import CaseResults, ProcedureCase, SineDwellOutcome, Transient, select_cases
-from .contestants import CARS, ENTRIES
+from .drive import CARS, ENTRIES
+from .tables import CaseResults, ProcedureCase, SineDwellOutcome, Transient, select_cases
 
 
 def add(suite: Suite, done: CaseResults) -> None:

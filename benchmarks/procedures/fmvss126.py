@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...envs.record import Array
-from ...envs.vehicle.vehicle import GRAVITY
+from ...envs.vehicle.parameters import GRAVITY
 from .drive import DriveFunction, Fields, Series, TestCar
 
 FREQUENCY, DWELL = 0.7, 0.5  # Hz, s

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...envs.record import Array
-from ...envs.scenarios.tracks import Section, make_sections
+from ...envs.scenarios.road import Section, make_sections
 from .drive import DriveFunction, Fields, Series, TestCar
 
 TRACKS = ("iso-3888-1", "iso-3888-2")

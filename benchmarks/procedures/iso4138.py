@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...envs.record import Array
-from ...envs.task.reference import make_reference_params
-from ...envs.vehicle.vehicle import GRAVITY, Vehicle
+from ...envs.task import make_reference_params
+from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from .drive import DriveFunction, Fields, Series, TestCar
 
 SETTLE = 3.0  # s, at the first speed

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from ...envs.record import Array
 from ...envs.vehicle.linear import make_bicycle_model
-from ...envs.vehicle.vehicle import Vehicle
+from ...envs.vehicle.parameters import Vehicle
 from .drive import DriveFunction, Fields, Series, TestCar
 
 Complex = npt.NDArray[np.complex128]

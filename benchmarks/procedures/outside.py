@@ -13,11 +13,10 @@ from ...agents import make_agent
 from ...agents.rollout import rollout
 from ...envs.outside.plants import make_outside_vehicle
 from ...envs.vehicle.dynamics import Motion
-from ...envs.vehicle.vehicle import GRAVITY
-from ..harness.drives import make_env
+from ...envs.vehicle.parameters import GRAVITY
+from ..harness.study import make_env
 from . import fmvss126
-from .contestants import OUTSIDE_ID, ProcedureEntry, make_outside_car
-from .drive import Law, make_plant_drive
+from .drive import OUTSIDE_ID, Law, ProcedureEntry, make_outside_car, make_plant_drive
 
 MODEL = "drift"
 LIMIT = 500.0  # N m

@@ -7,13 +7,13 @@ import numpy as np
 from rich.console import Console
 
 from ...envs.outside.plants import OUTSIDE_PLANTS
-from ...envs.vehicle.vehicle import GRAVITY
+from ...envs.vehicle.parameters import GRAVITY
 from ..harness.parallel import run_cases
 from ..harness.results import Suite
-from ..harness.verdict import format_verdict, summarise_names
+from ..harness.study import format_verdict, summarise_names
 from . import fmvss126, iso3888, iso4138, iso7401, outside, tables
-from .cases import NAME, CaseResults, ProcedureCase, SineDwellOutcome, Transient, select_cases
-from .contestants import CARS, ENTRIES
+from .drive import CARS, ENTRIES
+from .tables import NAME, CaseResults, ProcedureCase, SineDwellOutcome, Transient, select_cases
 
 SHOWN = 5.0  # of A: the sine with dwell in the figures
 QUICK_MULTIPLES = (1.5, 3.0, 5.0, 6.5)  # of A

@@ -1,17 +1,61 @@
-"""The suite's tables and rows, one of each for a procedure."""
+"""The suite's cases and their results.
 
+The suite's tables and rows, one of each for a procedure.
+"""
+
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ... import __version__
 from ...agents.rollout import compute_cost_ratios
-from ...envs.vehicle.vehicle import GRAVITY
+from ...envs.vehicle.parameters import GRAVITY
 from ..harness.results import ResultRow, ResultTable, Suite
 from ..harness.stats import geometric_mean, interval
 from . import fmvss126, iso3888, iso4138, iso7401, outside
-from .cases import NAME, CaseResults, ProcedureCase, SineDwellOutcome, Transient, select_cases
-from .contestants import ENTRIES
+from .drive import ENTRIES, Series
+
+NAME = "procedures"
+
+
+@dataclass(frozen=True)
+class ProcedureCase:
+    """A drive: a procedure, a car or outside model, a contestant's index, seeds."""
+
+    procedure: str
+    car: str
+    contestant: int = 0
+    seeds: tuple[int, ...] = ()
+    quick: bool = False
+
+
+@dataclass(frozen=True)
+class SineDwellOutcome:
+    """FMVSS 126 of a contestant, and one of its runs to look at."""
+
+    result: fmvss126.SineDwellResult
+    shown: Series
+
+
+@dataclass(frozen=True)
+class Transient:
+    """ISO 7401 of a car: by output, measured and of the linear model."""
+
+    step: dict[str, iso7401.StepResponse]
+    linear_step: dict[str, iso7401.StepResponse]
+    sweep: dict[str, iso7401.FrequencyResponse]
+    linear_sweep: dict[str, Any]
+
+
+CaseResults = dict[ProcedureCase, Any]
+"""The result of every case."""
+
+
+def select_cases(done: CaseResults, procedure: str) -> CaseResults:
+    """The cases of one procedure."""
+    return {case: result for case, result in done.items() if case.procedure == procedure}
+
 
 RIVAL = "lqr"
 """Against whom costs on outside plants are paired."""

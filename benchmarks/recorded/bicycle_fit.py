@@ -14,14 +14,20 @@ from scipy.ndimage import uniform_filter1d
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
-from ...envs.backend.decorators import jit
+from ...envs.numerics.jit import jit
 from ...envs.record import FAST, PACKET, Array, Log
-from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams, derivative
-from ...envs.vehicle.integration import rk4
+from ...envs.vehicle.dynamics import (
+    CarParams,
+    DisturbanceForces,
+    Motion,
+    RoadParams,
+    derivative,
+    rk4,
+)
+from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...envs.vehicle.tyres import LINEAR, TYRE_LAWS, TyreInputs, compute_tyre_load
-from ...envs.vehicle.vehicle import GRAVITY, Vehicle
 from .emulate import compute_ground_speed, compute_heading
-from .noises import estimate_noise_levels
+from .quality import estimate_noise_levels
 
 STEP, SMOOTH = 0.01, 0.03  # s: of the fit's grid, of the mean over a log's rows
 BURN, WINDOW, MARGIN = 1.0, 4.0, 0.3  # s: forgets the start, counts, lets channels be late

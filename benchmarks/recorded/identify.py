@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ...envs.record import Array, Log
-from ...envs.vehicle.vehicle import GRAVITY, Vehicle
+from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.make import make_estimator
 from ..harness.results import ResultTable, Suite
-from ..harness.verdict import format_verdict
+from ..harness.study import format_verdict
 from .bicycle_fit import (
     PRIOR,
     BicycleFit,
@@ -21,15 +21,18 @@ from .bicycle_fit import (
     fit,
     make_windows,
 )
-from .checks import (
+from .emulate import find_moving
+from .quality import (
+    LATE_WITHIN,
     MIN_CORRELATION,
+    WIDE,
+    Finding,
     estimate_steering_gain,
-    find_moving,
     find_saturated,
     find_swapped,
+    make_sensor_findings,
 )
-from .noises import LATE_WITHIN, WIDE, Finding, make_sensor_findings
-from .run import GYRO_ONLY
+from .suite import GYRO_ONLY
 from .wires import SignalCalibration, apply_wires
 
 TYRES = ("linear", "fiala")

@@ -7,14 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...envs.arguments import check_choice, is_finite, short_repr
-from ...envs.documents import is_document, read_document, write_document
+from ...envs.io import is_document, read_document, write_document
 from ...envs.record import FAST, PACKET, Log
 from ...envs.sensors.slow import SLOW_NAMES
-from ...envs.vehicle.vehicle import Vehicle
-from ...envs.vehicle.vehicles import WIRE_TABLES, VehicleSource
+from ...envs.validation import check_choice, is_finite, short_repr
+from ...envs.vehicle.parameters import WIRE_TABLES, Vehicle, VehicleSource
 from ...estimators.design.options import FAST_CHANNELS, find_columns
-from .noises import NOISES
+from .quality import NOISES
 
 CHANNELS = (*FAST_CHANNELS, *SLOW_NAMES)
 """What may be late."""

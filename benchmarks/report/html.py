@@ -1,4 +1,13 @@
-"""The report: what the suites found as one HTML file that needs nothing from the network.
+"""Tables of the report: sortable, their numbers to the right, the names in their colours.
+
+Tables of suites in a Markdown page, between the marks that ask for them.
+
+A page has `<!-- tables of SUITE -->` and `<!-- end -->`, each on a line of its own; what stands
+between them is the suite's, the rest its author's.
+
+Figures and texts made small for the page, which unpacks them: gzip in base64, lines as steps.
+
+The report: what the suites found as one HTML file that needs nothing from the network.
 
 The page is `page.html`, its looks `report.css`, what it does `report.js` and `explorer.js`, all
 beside this module and put together into one file. plotly.js and the figures lie in it packed. The
@@ -6,23 +15,216 @@ page's own policy lets no script run but ours, by its hash, and nothing be loade
 """
 
 import base64
+import gzip
 import hashlib
 import json
-from collections.abc import Mapping
+import math
+import re
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
+from functools import partial
 from html import escape
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
+import numpy.typing as npt
 
-from ...envs.rendering.palette import find_colour
-from ..harness.explorer import Explorer
-from ..harness.results import Suite, write_text
-from .pack import encode_figure, encode_steps, pack_text
-from .tables import format_table, inline
+from ...envs.rendering.palette import INK, find_base, find_colour
+from ..harness.results import ResultTable, Suite, write_text
+from ..harness.study import Explorer
+
+
+def parse_number(cell: str) -> float | None:
+    """The number a cell begins with, None for one that begins with none (or with NaN).
+
+    >>> parse_number("0.31 [0.29, 0.33]"), parse_number("-1,250 N m")
+    (0.31, -1250.0)
+    >>> parse_number("< 2e-3"), parse_number("2-dof")
+    (0.002, None)
+    """
+    match = _NUMBER.match(cell)
+    if not match:
+        return None
+    sign = -1.0 if match["sign"] in ("-", "\u2212") else 1.0
+    if match["inf"]:
+        return sign * math.inf
+    return sign * float(re.sub(r"[,\u00a0\u202f]", "", match["digits"]).replace("\u2212", "-"))
+
+
+_NUMBER = re.compile(
+    r"\s*[\[(<>≤≥~≈±]*\s*(?P<sign>[-+\u2212])?"
+    r"(?:(?P<inf>inf\b|∞)"
+    r"|(?P<digits>(?>\d+(?:[,\u00a0\u202f]\d{3})*(?:\.\d*)?|\.\d+)(?>e[-+\u2212]?\d+)?)(?!-\w))",
+    re.IGNORECASE,
+)
+_MAX_LETTERS = 40  # letters: a longer cell wraps
+_BLANK = {"", "-", "\u2013", "\u2014", "nan", "n/a"}
+
+
+def is_numeric(cells: Iterable[str]) -> bool:
+    """Whether a column is one of numbers: some, and nothing else but blanks."""
+    texts = [cell for cell in cells if cell.strip().lower() not in _BLANK]
+    return bool(texts) and all(parse_number(cell) is not None for cell in texts)
+
+
+def format_table(table: ResultTable) -> str:
+    """A table, folded; ValueError for a row that is not as long as the header."""
+    for row in table.cells:
+        if len(row) != len(table.header):
+            raise ValueError(
+                f"table {table.title!r}: {len(row)} cells under {len(table.header)} headers: {row}"
+            )
+    columns = list(zip(*table.cells, strict=True)) or [()] * len(table.header)
+    are_numbers = [is_numeric(column) for column in columns]
+    heads = "".join(
+        f'<th scope="col" aria-sort="none"{_format_class(is_number)}>'
+        f'<button type="button">{escape(name)}</button></th>'
+        for name, is_number in zip(table.header, are_numbers, strict=True)
+    )
+    body = "\n".join(
+        f"<tr>{_format_row(row, are_numbers, table.keyed)}</tr>" for row in table.cells
+    )
+    title = escape(table.title)
+    note = f'\n<p class="note">{inline(table.note)}</p>' if table.note else ""
+    return (
+        f"<details><summary>{title}</summary>\n"
+        f'<div class="scroll" role="region" tabindex="0" aria-label="{title}">\n'
+        f'<table class="sortable" aria-label="{title}">\n'
+        f"<thead><tr>{heads}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>{note}</details>"
+    )
+
+
+def _format_row(row: Sequence[str], numeric: Sequence[bool], keyed: bool) -> str:
+    cells = []
+    for i, (cell, is_number) in enumerate(zip(row, numeric, strict=True)):
+        value = parse_number(cell) if is_number else None
+        data = "" if value is None else f' data-value="{_format_number(value)}"'
+        tag, key = ('th scope="row"', _format_key(cell) if keyed else "") if i == 0 else ("td", "")
+        kind = ' class="long"' if len(cell) > _MAX_LETTERS else _format_class(is_number)
+        cells.append(f"<{tag}{kind}{data}>{key}{escape(cell)}</{tag[:2]}>")
+    return "".join(cells)
+
+
+def _format_class(is_number: bool) -> str:
+    return ' class="number"' if is_number else ""
+
+
+def _format_number(value: float) -> str:
+    """A number as JavaScript reads it."""
+    return repr(value) if math.isfinite(value) else "-Infinity" if value < 0 else "Infinity"
+
+
+def _format_key(cell: str) -> str:
+    """The colour of an estimator or controller in the figures, as a small square."""
+    if find_base(cell) is None:
+        return ""
+    shade = find_colour(cell)
+    return f'<i class="key" style="background:{"var(--ink)" if shade == INK else shade}"></i>'
+
+
+def inline(text: str) -> str:
+    """Escaped text; what stands in backticks becomes code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
+
+
+_FILL = partial(textwrap.fill, width=120, break_long_words=False, break_on_hyphens=False)
+_MARKED = r"(?<=^<!-- tables of {} -->\n).*?(?=^<!-- end -->$)"
+
+
+def format_page_table(table: ResultTable) -> str:
+    """A heading, the table, and its note in lines of 120."""
+    head, *rows = (
+        [text.replace("|", r"\|") for text in row] for row in (table.header, *table.cells)
+    )
+    lines = [f"| {' | '.join(row)} |" for row in (head, *rows)]
+    lines.insert(1, "|---" * len(head) + "|")
+    note = f"\n{_FILL(table.note)}\n" if table.note else ""
+    return "\n".join([f"## {table.title}", "", *lines, ""]) + note
+
+
+def check_page(path: Path | None, names: Sequence[str]) -> None:
+    """Before the work: the page has marks for a suite that is asked for; ValueError otherwise."""
+    if path is not None:
+        text = path.read_text(encoding="utf-8")
+        if not any(_compile_pattern(name).search(text) for name in names):
+            raise ValueError(
+                f"{path}: expected the lines <!-- tables of SUITE --> and <!-- end --> for one of "
+                f"{', '.join(names)}"
+            )
+
+
+def write_page(path: Path, suites: Sequence[Suite]) -> None:
+    """The page with each marked suite's tables anew; details, which only the report shows, are
+    left out."""
+    text = path.read_text(encoding="utf-8")
+    for suite in suites:
+        made = "\n".join(format_page_table(table) for table in suite.tables if not table.detail)
+        before, *marked = _compile_pattern(suite.name).split(text, maxsplit=1)
+        text = f"\n{made}\n".join((before, *marked))
+    write_text(path, text)
+
+
+def _compile_pattern(name: str) -> re.Pattern[str]:
+    return re.compile(_MARKED.format(re.escape(name)), re.MULTILINE | re.DOTALL)
+
+
+_MIN_PACKED = 40  # a shorter array is left as it is
+_LEVELS = {"x": 2**13, "y": 2**11}  # more than a screen has pixels
+
+
+def pack_text(text: str) -> str:
+    """A text as the page's `unpack` takes it; the same text gives the same letters."""
+    return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
+
+
+def encode_steps(values: npt.ArrayLike, levels: int = _LEVELS["y"]) -> dict[str, Any]:
+    """(n,) numbers as steps from one to the next in whole quanta, null for a gap.
+
+    levels: how many quanta the range has.
+
+    >>> encode_steps([1.0, 2.0, float("nan"), 3.0], levels=3)
+    {'from': 1.0, 'by': 1.0, 'steps': [0, 1, None, 1]}
+    """
+    v = np.asarray(values, float)
+    finite = np.isfinite(v)
+    low, high = (float(v[finite].min()), float(v[finite].max())) if finite.any() else (0.0, 0.0)
+    by = (high - low) / (levels - 1) or 1.0
+    quanta = np.round((v[finite] - low) / by).astype(int)
+    encoded: list[int | None] = [None] * len(v)
+    for i, step in zip(np.flatnonzero(finite), np.diff(quanta, prepend=0), strict=True):
+        encoded[i] = int(step)
+    return {"from": low, "by": by, "steps": encoded}
+
+
+def encode_figure(figure: Any) -> str:
+    """A plotly figure's data and layout as JSON, without the template and the title."""
+    from plotly.utils import PlotlyJSONEncoder
+
+    content = figure.to_plotly_json()
+    for name in ("template", "title"):
+        content["layout"].pop(name, None)
+    for trace, plain in zip(figure.data, content["data"], strict=True):
+        for axis, levels in _LEVELS.items():
+            values = getattr(trace, axis, None)
+            if _is_line(values):
+                plain[axis] = encode_steps(values, levels)
+    plain = {name: content[name] for name in ("data", "layout") if content.get(name)}
+    return json.dumps(plain, cls=PlotlyJSONEncoder, separators=(",", ":"))
+
+
+def _is_line(values: Any) -> TypeGuard[npt.NDArray[np.floating[Any]]]:
+    """Whether values are many enough, in a row, to be worth their steps."""
+    return (
+        isinstance(values, np.ndarray)
+        and values.dtype.kind == "f"
+        and values.ndim == 1
+        and len(values) > _MIN_PACKED
+    )
+
 
 POINTS = 250
 """Samples of a cell in a figure with menus."""

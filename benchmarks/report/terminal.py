@@ -9,7 +9,7 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from ..harness.results import ResultTable, Suite
-from .tables import is_numeric
+from .html import is_numeric
 
 _NAME = 32  # letters: a longer text in a table's first column is no name and may wrap
 _MIN_WIDTH = 22  # letters that a column of text has at least, and the first one on a narrow screen

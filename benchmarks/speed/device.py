@@ -15,10 +15,10 @@ from typing import Annotated, Any, NamedTuple
 import typer
 from rich.console import Console
 
-from ...envs.backend.on_torch import torch
-from ...envs.device.env import DeviceVectorEnv
+from ...envs.device.torch_env import DeviceVectorEnv
 from ...envs.engine.layout import PARAMS_WIDTH
-from ..harness.errors import report_user_errors
+from ...envs.numerics.torch_backend import torch
+from ..harness.parallel import report_user_errors
 from ..harness.results import check_writable, write_text
 
 COUNTS = (1024, 16384, 65536, 262144, 1048576)

@@ -13,13 +13,20 @@ import gymnasium as gym
 import numpy as np
 
 from ...estimators.filters import FILTERS
-from ...estimators.learned.files import list_shipped
+from ...estimators.learned.correction_file import list_shipped
 from ...estimators.make import make_estimator
 from ...estimators.vector.estimate import EstimateObservation as EstimateObservations
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..harness.results import ResultTable, Suite
-from .contestants import WorkloadSet, add_row, format_three_digits
-from .timing import Effort, Taken, Workload, measure_interleaved
+from .timing import (
+    Effort,
+    Taken,
+    Workload,
+    WorkloadSet,
+    add_row,
+    format_three_digits,
+    measure_interleaved,
+)
 
 COUNT, FEWER = 1024, 256  # environments at once, alone and with each filter
 EPISODE, CHUNK = 500, 50  # steps, the most; in one call

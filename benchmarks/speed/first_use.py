@@ -10,8 +10,7 @@ import sys
 from tempfile import TemporaryDirectory
 
 from ..harness.results import ResultTable, Suite
-from .contestants import AbsentError, add_row
-from .timing import Taken
+from .timing import AbsentError, Taken, add_row
 
 FIRST = "gym.make to the first step, kernels on disk"
 KERNEL = "cold compile of the dearest kernel"

@@ -11,8 +11,7 @@ from typing import Any
 
 from ...envs.ticks import TICK
 from ..harness.results import Suite
-from .contestants import WorkloadSet
-from .timing import Effort, Taken, Workload
+from .timing import Effort, Taken, Workload, WorkloadSet
 
 YAW, PENDULUM_ID = "sideslip/YawFusion-v0", "Pendulum-v1"
 PPO_YAW = "PPO, YawFusion-v0"
@@ -27,7 +26,7 @@ def _make_learner(name: str) -> Workload:
     from stable_baselines3 import PPO
     from stable_baselines3.common.env_util import make_vec_env
 
-    from ...agents.vec_env import env as bridge
+    from ...agents import vec_env as bridge
 
     make, env_id = (make_vec_env, PENDULUM_ID) if name == PENDULUM else (bridge.make_vec_env, YAW)
     model = PPO("MlpPolicy", make(env_id, COUNT, seed=0), seed=0, device="cpu", **_get_settings())
@@ -41,7 +40,7 @@ def _make_learner(name: str) -> Workload:
 
 def _get_settings() -> dict[str, Any]:
     """Those of `sideslip train`."""
-    from ...agents.training.algorithms import make_model_options, read_settings
+    from ...agents.training.config import make_model_options, read_settings
 
     options = make_model_options("ppo", read_settings("ppo", YAW), 10 * TICK, COUNT)
     return {name: options[name] for name in ("n_steps", "n_epochs", "batch_size", "gamma")}

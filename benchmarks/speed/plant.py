@@ -1,29 +1,84 @@
-"""Cost of a tick of the plant alone: ours, and the same in C.
+"""The plant in C, compiled on the spot: `plant.c` beside this module.
+
+Cost of a tick of the plant alone: ours, and the same in C.
 
 A tick is a millisecond of one car of `YawFusion-v0`: actuators that lag, the loads at the tick's
 middle and end, Fiala tyres, roll, and Kutta's three stages; no sensors, no driver.
 """
 
+import ctypes
+import os
+import shutil
+import subprocess
 from collections.abc import Callable
+from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
-from ...envs.backend.arrays import make_offsets, read, write
-from ...envs.backend.decorators import inline, jit
-from ...envs.backend.simd import LANES
 from ...envs.engine.layout import P, Z
+from ...envs.numerics.jit import inline, jit
+from ...envs.numerics.packed import make_offsets, read, write
+from ...envs.numerics.simd import LANES
 from ...envs.record import Array
 from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import apply_lag
-from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams
-from ...envs.vehicle.integration import kutta3, rk4
+from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams, kutta3, rk4
 from ...envs.vehicle.tyres import FIALA, TyreInputs, compute_tyre_load, has_load_shift
 from ..harness.results import Suite
-from .c_plant import load_c_plant
-from .contestants import WorkloadSet
-from .timing import Effort, Taken, Workload
+from .timing import AbsentError, Effort, Taken, Workload, WorkloadSet
+
+FLAGS = ("-O3", "-march=native", "-ffp-contract=off")
+VECTORS = (
+    "-fopenmp-simd",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fno-signed-zeros",
+    "-fschedule-insns",
+    "-fsched-pressure",
+)
+"""Flags with which gcc makes vectors of square roots, floor and choices: the fastest of those that
+were tried; no number changes."""
+
+
+def find_compiler() -> str:
+    """The C compiler: that of the variable CC, or the first one found.
+
+    Raises AbsentError where there is none.
+    """
+    for name in (os.environ.get("CC", ""), "gcc", "clang", "cc"):
+        if name and (path := shutil.which(name)):
+            return path
+    raise AbsentError("no C compiler")
+
+
+def read_source() -> str:
+    """The text of `plant.c`."""
+    return files(__package__).joinpath("plant.c").read_text(encoding="utf-8")
+
+
+def load_c_plant(block: int) -> Any:
+    """The function `plant` of `plant.c` for blocks of so many cars, loaded.
+
+    Raises AbsentError where there is no compiler, or none that can compile it.
+    """
+    with TemporaryDirectory() as folder:
+        library = Path(folder) / "plant.so"
+        flags = [*FLAGS, *VECTORS, f"-DBLOCK={block}", "-shared", "-fPIC"]
+        command = [find_compiler(), *flags, "-x", "c", "-", "-o", str(library)]
+        run = subprocess.run(command, input=read_source(), capture_output=True, text=True)
+        if run.returncode:
+            last = (run.stderr.strip().splitlines() or ["it gave no reason"])[-1]
+            raise AbsentError(f"{command[0]} does not compile it: {last}")
+        function = ctypes.CDLL(str(library)).plant  # stays when the file is gone
+    pointers = [ctypes.c_void_p] * 7
+    function.argtypes = [ctypes.c_long, ctypes.c_long, ctypes.c_double, *pointers]
+    function.restype = None
+    return function
+
 
 CARS, TICKS = 1024, 10  # cars at once; ticks a call
 PLANT = "plant"

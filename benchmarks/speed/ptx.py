@@ -15,8 +15,8 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from ...envs.cuda.kernel import make_constants
-from ...envs.cuda.ptx import count_opcodes, get_ptx
+from ...envs.device.cuda_kernel import make_constants
+from ...envs.device.cuda_launch import count_opcodes, get_ptx
 from ...envs.vector import StabilityVectorEnv
 from ..harness.results import check_writable, write_text
 

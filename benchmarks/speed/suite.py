@@ -1,14 +1,101 @@
-"""The suite speed: everything side by side in one run, and the targets."""
+"""What the engine is meant to reach, and what it does: ratios round by round.
+
+The suite speed: everything side by side in one run, and the targets.
+"""
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 from rich.console import Console
 
 from ..harness.results import ResultTable, Suite
-from ..harness.verdict import format_verdict, summarise_names
-from . import env_steps, first_use, learning, plant, targets
-from .contestants import format_three_digits
-from .timing import FULL, QUICK, Taken, compute_range
+from ..harness.study import format_verdict, summarise_names
+from . import env_steps, first_use, learning, plant
+from .timing import FULL, QUICK, Taken, add_row, compute_range, format_absences, format_three_digits
+
+
+class SpeedTarget(NamedTuple):
+    """A goal: the CPU time of `over` as a multiple of that of `workload` in the same round, or
+    where `over` is "" CPU seconds.
+
+    max_value: it is a price, at most this much; otherwise at least `min_value`.
+    """
+
+    name: str
+    over: str
+    workload: str
+    min_value: float = 0.0
+    max_value: float = float("inf")
+
+    @property
+    def text(self) -> str:
+        """ ">= 25 x", "<= 1.1 x" or "<= 5 CPU-s"."""
+        unit = "x" if self.over else "CPU-s"
+        return (
+            f">= {self.min_value:g} {unit}" if self.min_value else f"<= {self.max_value:g} {unit}"
+        )
+
+    def met(self, value: float) -> bool:
+        """Whether a value is where it should be."""
+        return self.min_value <= value <= self.max_value
+
+
+TARGETS = (
+    SpeedTarget("gym.make step, lane-keeping over ours", env_steps.LANE, env_steps.FUSION, 30.0),
+    SpeedTarget("gym.make step, CartPole over ours", env_steps.CARTPOLE, env_steps.FUSION, 1.4),
+    SpeedTarget("1024 at once, lane-keeping over ours", env_steps.LANE, env_steps.AT_ONCE, 200.0),
+    SpeedTarget("1024 at once, CartPole over ours", env_steps.CARTPOLES, env_steps.AT_ONCE, 0.1),
+    SpeedTarget("plant, C over ours", plant.C, plant.PLANT, 0.85),
+    SpeedTarget("delay at the tick over none", env_steps.LATE, env_steps.NONE_LATE, max_value=1.1),
+    SpeedTarget(
+        "full-covariance filter in the loop, 1024 at once, Pendulum over ours",
+        env_steps.PENDULUMS,
+        env_steps.FILTERED,
+        4.5,
+    ),
+    SpeedTarget("PPO, 256 at once, Pendulum over ours", learning.PENDULUM, learning.PPO_YAW, 1.7),
+    SpeedTarget(first_use.FIRST, "", first_use.FIRST, max_value=0.5),
+    SpeedTarget(first_use.KERNEL, "", first_use.KERNEL, max_value=5.0),
+)
+
+
+def add(
+    suite: Suite,
+    taken: Mapping[str, Taken],
+    seconds: Mapping[str, Taken],
+    absent: Mapping[str, str],
+) -> None:
+    """A row for each target that was measured, and the table, first of all, of all of them.
+
+    taken: of the contestants. seconds: measured CPU seconds of first use. absent: why others were
+    not measured.
+    """
+    cells, missing = [], dict[str, str]()
+    for target in TARGETS:
+        needed = [target.over, target.workload] if target.over else [target.workload]
+        absent_names = [name for name in needed if name not in {**taken, **seconds}]
+        cells.append([target.name, target.text, "", "", "not measured"])
+        if absent_names:
+            missing |= {name: absent.get(name, "not run") for name in absent_names}
+            continue
+        if target.over:
+            pairs = zip(taken[target.over], taken[target.workload], strict=True)
+            ratios = [reference_time / workload_time for reference_time, workload_time in pairs]
+            middle, *ends = add_row(suite, target.name, "ratio", ratios)
+        else:
+            middle, *ends = compute_range(seconds[target.workload])
+        met = "met" if target.met(middle) else "not met"
+        cells[-1][2:] = (
+            format_three_digits(middle),
+            " .. ".join(map(format_three_digits, ends)),
+            met,
+        )
+    header = ("figure", "target", "measured", "range", "")
+    note = "Ratios are taken round by round, in CPU time; the median counts." + format_absences(
+        missing
+    )
+    suite.tables.insert(0, ResultTable("Targets", header, cells, note, keyed=False))
+
 
 RIVALS = (env_steps.CARTPOLE, env_steps.LANE)
 RUNS, QUICK_RUNS = 5, 2  # fresh processes
@@ -33,7 +120,7 @@ def run(quick: bool = False, console: Console | None = None) -> Suite:
         taken |= more
         absent |= more_absent
     seconds, more_absent = first_use.add(suite, QUICK_RUNS if quick else RUNS, compiling=not quick)
-    targets.add(suite, taken, seconds, absent | more_absent)
+    add(suite, taken, seconds, absent | more_absent)
     suite.verdict = make_verdict(taken, suite.tables[0])
     return suite
 

@@ -7,20 +7,18 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import seeding
 
-from ..arguments import split_options
 from ..record import FAST_WIDTH, PACKET_WIDTH, Array, Record
 from ..scenarios.scenario import Scenario
 from ..sensors.link import SlowSensor
-from ..task.info import REPORT
+from ..task import REPORT
 from ..ticks import TICK
-from ..vehicle.vehicle import Vehicle
-from .arrays import BatchArrays, EpisodeStart, RecordArrays
-from .batch import reset_rows
-from .config import EnvConfig
-from .lanes import make_lane_buffers
+from ..validation import split_options
+from ..vehicle.parameters import Vehicle
+from .batch import make_lane_buffers, reset_rows
+from .config import EnvConfig, EpisodeConfig, pad_params
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, P, Z
-from .packing import EpisodeConfig, pad_params
 from .views import LazyRows, compute_true_states, get_slow_sensors, get_vehicle, make_record
+from .workspace import BatchArrays, EpisodeStart, RecordArrays
 
 IntArray = npt.NDArray[np.int64]
 T = TypeVar("T")

@@ -7,20 +7,17 @@ complete snapshot. `P` and `Z` are `EpisodeParams` and `EpisodeState` whose leav
 
 from typing import Annotated, Any, NamedTuple
 
-from ..backend.arrays import make_offsets
+from ..numerics.packed import make_offsets
 from ..record import PACKET_WIDTH
-from ..scenarios.driver import DriverParams
-from ..scenarios.roads import NominalMotion
-from ..scenarios.speed import SpeedProfile
+from ..scenarios.driver import DriverParams, SpeedProfile, Wind
+from ..scenarios.road import NominalMotion, TrackPath
 from ..scenarios.steering import STEERING_WIDTH
-from ..scenarios.tracks import TrackPath
-from ..scenarios.wind import Wind
 from ..sensors.camera import FieldOfView
 from ..sensors.gps import SatelliteGeometry
+from ..sensors.inertial import Noise
 from ..sensors.link import MAX_IN_FLIGHT, Link
-from ..sensors.noise import Noise
 from ..sensors.slow import SLOW, VALUES
-from ..task.reference import ReferenceParams
+from ..task import ReferenceParams
 from ..vehicle.actuators import Lag
 from ..vehicle.dynamics import CarParams, Motion, RoadParams
 from ..vehicle.linear import Bicycle

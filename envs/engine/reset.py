@@ -2,29 +2,26 @@
 
 from typing import Any
 
-from ..backend.arrays import read, write
-from ..backend.decorators import copy_into, jit, noinline
-from ..backend.elementary import sincos
-from ..backend.primitives import from_word, select
-from ..backend.random import CHANNELS, draw_normals
+from ..numerics.functions import CHANNELS, draw_normals, sincos
+from ..numerics.jit import copy_into, jit, noinline
+from ..numerics.packed import read, write
+from ..numerics.primitives import from_word, select
 from ..record import FAST
 from ..scenarios.draws import DRAWS, DRAWS_WIDTH, draw_stable
 from ..scenarios.driver import compute_target_angle
+from ..scenarios.road import transform_path
 from ..scenarios.steering import DRIVER, WANDER, write_steering
-from ..scenarios.tracks import transform_path
 from ..sensors.inertial import NormalDraws, compute_fast_row
 from ..sensors.link import draw_clock_phase
 from ..sensors.slow import GPS, draw_first_drift
-from ..task.info import REPORT
-from ..task.reference import compute_reference
+from ..task import REPORT, compute_reference
 from ..ticks import FOREVER, NEVER, round_to_ticks
 from ..vehicle.dynamics import compute_car_curvature, compute_gravity, compute_sideslip_angle
-from ..vehicle.vehicle import GRAVITY
-from .arrays import EpisodeArrays, EpisodeStart
+from ..vehicle.parameters import GRAVITY
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, P, Z
-from .observe import observe, write_report
-from .packets import NEVER_DUE, sample_slow_sensors
+from .outputs import NEVER_DUE, observe, sample_slow_sensors, write_report
 from .window import compute_profile_angle
+from .workspace import EpisodeArrays, EpisodeStart
 
 
 @jit

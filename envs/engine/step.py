@@ -11,20 +11,25 @@ sensors, the observation and the report.
 
 from typing import Any
 
-from ..backend.arrays import load_element, read, store_element, write
-from ..backend.decorators import copy_into, inline, jit, noinline
-from ..backend.elementary import clip
-from ..backend.primitives import any_lane, select
+from ..numerics.functions import clip
+from ..numerics.jit import copy_into, inline, jit, noinline
+from ..numerics.packed import load_element, read, store_element, write
+from ..numerics.primitives import any_lane, select
 from ..record import FAST
 from ..scenarios.steering import DRIVER
-from ..task.cost import compute_failure_cost
-from ..task.failures import BAD_ACTION, REFUSED, RUNNING, WILD, WILD_LIMIT, select_failure
-from ..task.info import REPORT
+from ..task import (
+    BAD_ACTION,
+    REFUSED,
+    REPORT,
+    RUNNING,
+    WILD,
+    WILD_LIMIT,
+    compute_failure_cost,
+    select_failure,
+)
 from ..vehicle.tyres import has_load_shift
-from .arrays import EpisodeArrays, EpisodeStart, split_workspace
 from .layout import FLAGS, P, Z
-from .observe import observe_fast, observe_slow, write_report
-from .packets import find_next_due, sample_slow_sensors
+from .outputs import find_next_due, observe_fast, observe_slow, sample_slow_sensors, write_report
 from .tick import (
     Measurements,
     StepParams,
@@ -35,6 +40,7 @@ from .tick import (
     integrate_tick,
 )
 from .window import TICK_COST, WINDOW, evaluate_cost, precompute_window, read_draws
+from .workspace import EpisodeArrays, EpisodeStart, split_workspace
 
 
 @jit

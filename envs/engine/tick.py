@@ -7,15 +7,18 @@ another's too.
 
 from typing import Any, NamedTuple
 
-from ..backend.decorators import inline
-from ..backend.primitives import any_lane, select
+from ..numerics.jit import inline
+from ..numerics.primitives import any_lane, select
 from ..record import FAST
-from ..scenarios.driver import compute_driver_angle
-from ..scenarios.roads import NOMINAL_PATH, NominalMotion, step_nominal_car
-from ..scenarios.speed import compute_acceleration_command, compute_speed_reference
-from ..scenarios.wind import compute_wind
+from ..scenarios.driver import (
+    compute_acceleration_command,
+    compute_driver_angle,
+    compute_speed_reference,
+    compute_wind,
+)
+from ..scenarios.road import NOMINAL_PATH, NominalMotion, step_nominal_car
 from ..sensors.inertial import NormalDraws, compute_fast_row, compute_specific_force
-from ..task.reference import compute_reference, filter_reference
+from ..task import compute_reference, filter_reference
 from ..ticks import TICK
 from ..vehicle.actuators import (
     allocate_torques,
@@ -25,8 +28,13 @@ from ..vehicle.actuators import (
     limit_angle,
     limit_rate,
 )
-from ..vehicle.dynamics import CarParams, DisturbanceForces, RoadParams, compute_car_curvature
-from ..vehicle.integration import kutta3
+from ..vehicle.dynamics import (
+    CarParams,
+    DisturbanceForces,
+    RoadParams,
+    compute_car_curvature,
+    kutta3,
+)
 from ..vehicle.tyres import TyreInputs, compute_tyre_load
 from .layout import ActuatorState
 from .window import CostInputs

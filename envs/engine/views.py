@@ -6,17 +6,17 @@ from typing import Any, NamedTuple, TypeVar, overload
 
 import numpy as np
 
-from ..backend.arrays import read
-from ..backend.decorators import jit
+from ..numerics.jit import jit
+from ..numerics.packed import read
 from ..record import Array, Record
-from ..scenarios.wind import compute_wind
+from ..scenarios.driver import compute_wind
 from ..sensors.link import SlowSensor
 from ..sensors.slow import SLOW_NAMES
 from ..ticks import TICK, count_ticks
 from ..vehicle.dynamics import Motion, compute_gravity, compute_sideslip_angle
-from ..vehicle.vehicle import Vehicle
+from ..vehicle.parameters import Vehicle
+from .config import EpisodeConfig
 from .layout import FLAGS, P, Z
-from .packing import EpisodeConfig
 
 T = TypeVar("T")
 

@@ -8,7 +8,9 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from ..backend.arrays import (
+from ..numerics.functions import CHANNELS, draw_normals
+from ..numerics.jit import inline, jit
+from ..numerics.packed import (
     count_lanes,
     iota,
     lane_width,
@@ -19,15 +21,13 @@ from ..backend.arrays import (
     store_element,
     write,
 )
-from ..backend.decorators import inline, jit
-from ..backend.primitives import absolute, any_lane, select, to_float, to_int, to_word
-from ..backend.random import CHANNELS, draw_normals
-from ..backend.simd import LANES
+from ..numerics.primitives import absolute, any_lane, select, to_float, to_int, to_word
+from ..numerics.simd import LANES
 from ..record import Array
+from ..scenarios.road import compute_path_offset
 from ..scenarios.steering import WANDER_START, compute_steering, interpolate_trace
-from ..scenarios.tracks import compute_path_offset
 from ..sensors.inertial import NormalDraws
-from ..task.cost import compute_cost_rate
+from ..task import compute_cost_rate
 from ..ticks import TICK
 from ..vehicle.dynamics import Motion, compute_sideslip_angle
 from .layout import PARAMS_WIDTH, P, Z

@@ -7,21 +7,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arguments import check_choice, check_int
-from ..backend.arrays import read
 from ..engine.layout import P, Z
 from ..engine.window import WINDOW
+from ..numerics.packed import read
 from ..rendering.trace import RenderState
 from ..scenarios.manoeuvres import ScenarioSource, make_scenario
 from ..scenarios.scenario import Scenario
 from ..stability import StabilityEnv
-from ..task.cost import compute_failure_cost
-from ..task.failures import COLLISION, DEPARTURE, RUNNING
-from ..task.info import REPORT
+from ..task import COLLISION, DEPARTURE, REPORT, RUNNING, compute_failure_cost
+from ..validation import check_choice, check_int
 from ..vehicle.dynamics import Motion
-from ..vehicle.vehicles import VehicleSource
-from .roads import ROADS
-from .traffic import PERIOD, Traffic, TrafficStart, parse_hazard
+from ..vehicle.parameters import VehicleSource
+from .traffic import PERIOD, ROADS, Traffic, TrafficStart, parse_hazard
 
 MAX_VEHICLES = 40  # vehicles: a step of the road looks at every pair
 _OWN_ROAD_FIELDS = ("road", "curvature", "path", "small_angle")

@@ -22,11 +22,11 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from ..backend.extras import require_extra
-from ..engine.packing import make_car
+from ..engine.config import make_car
+from ..numerics import require_extra
 from ..vehicle.actuators import compute_yaw_moment
 from ..vehicle.dynamics import Motion
-from ..vehicle.vehicle import GRAVITY, Vehicle
+from ..vehicle.parameters import GRAVITY, Vehicle
 
 Array = npt.NDArray[np.float64]
 

@@ -1,11 +1,22 @@
-"""The dialect of a text table: its encoding, separator, decimal mark, header and units."""
+"""The dialect of a text table: its encoding, separator, decimal mark, header and units.
+
+Which values of a table's columns are samples, and on which rows they stand.
+
+Metres east and north of a place on the earth, and back: the tangent plane of WGS 84.
+"""
 
 import csv
 import io
+import math
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from ..record import Array
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -153,3 +164,214 @@ def _split_line(line: str, separator: str) -> list[str]:
     else:
         line_fields = line.split() if separator == " " else line.split(separator)
     return [field.strip() for field in line_fields]
+
+
+Mask = npt.NDArray[np.bool_]
+SENSORS = {  # the values of a packet, as in `SLOW`; the first shows where a sample is
+    "camera": ("camera_psi", "camera_y_l"),
+    "gps": ("course", "gps_speed", "gps_x", "gps_y", "gps_hdop", "gps_satellites"),
+}
+SLOW_QUANTITIES = {*SENSORS["camera"], *SENSORS["gps"]}
+TRUTH = {"sideslip", "speed_y"}  # may be unknown in any row
+KINDS = ("fresh", "held", "interpolated")
+"""Values between a slow sensor's samples: samples too, the last one again, or a line."""
+LONGEST_GAP = 1.0  # s between values of a fast quantity that are joined by a line
+_COMPLETE = 0.75  # of the rows, above which a quantity is one of every row
+_SHUFFLED = 0.05  # of the rows, which step back in time
+_MIN_INTERVALS = 5  # between samples, from which their period is found
+
+
+def find_samples(
+    values: dict[str, Array], needed: Collection[str], kinds: Mapping[str, str], is_strict: bool
+) -> list[str]:
+    """Reduce a table to its samples, in the rows of the fastest needed quantity, in place.
+
+    Rows that are shuffled, or of which none has all needed quantities, are sorted by time. A slow
+    sensor's column that repeats or interpolates its samples keeps these alone: a held one was
+    captured in the first row of its run, linear interpolation shows them as the knots. Either is
+    believed only where they have one period. A fast quantity that comes at regular gaps is
+    interpolated, up to `LONGEST_GAP`; rows at the ends where it is unknown are left out. A slow
+    sample between the rows moves to the next: no estimator may have it before it was captured.
+
+    Args:
+        values: Quantities by name, (n,) each, angles in rad; NaN where unknown.
+        needed: The quantities without which there is no drive.
+        kinds: Of `KINDS`, by slow quantity, as far as they are known; others are recognised.
+        is_strict: Whether shuffled rows stay as they are.
+
+    Returns:
+        Sentences on what was done.
+    """
+    remarks = _sort_rows(values, needed, is_strict)
+    remarks += _keep_samples(values, kinds)
+    return remarks + _align_clocks(values, needed)
+
+
+def _sort_rows(values: dict[str, Array], needed: Collection[str], is_strict: bool) -> list[str]:
+    time = values["time"]
+    n_back = int(np.count_nonzero(np.diff(time) < 0.0))
+    is_merged = n_back and not np.isfinite([values[name] for name in needed]).all(0).any()
+    is_shuffled = n_back > _SHUFFLED * len(time) and len(np.unique(time)) > 0.99 * len(time)
+    if not (is_merged or (is_shuffled and not is_strict)):
+        return []
+    order = np.argsort(time, kind="stable")
+    values.update({name: column[order] for name, column in values.items()})
+    return [f"Time steps back in {n_back} of {len(time)} rows: they were sorted by it."]
+
+
+def _keep_samples(values: dict[str, Array], kinds: Mapping[str, str]) -> list[str]:
+    remarks = []
+    for first, *others in SENSORS.values():
+        if first not in values or kinds.get(first) == "fresh":
+            continue
+        columns = [values[name] for name in (first, *others) if name in values]
+        rows = np.flatnonzero(np.isfinite(columns[0]))
+        known = [column[rows] for column in columns if np.isfinite(column[rows]).all()]
+        for kind, places in (
+            ("held", np.flatnonzero(np.any(np.diff(known), axis=0)) + 1),
+            ("held", np.flatnonzero(np.diff(known[0])) + 1),
+            ("interpolated", _find_knots(known[0])),
+        ):
+            period, is_known = _find_period(np.diff(places)), kinds.get(first) == kind
+            if not is_known and (not period or first in kinds):
+                continue
+            if is_known or abs(places[0] - period) <= max(1.0, 0.2 * period):
+                places = np.append(0, places)  # the first run is as long as the others
+            for column in columns:
+                column[np.setdiff1d(np.arange(len(column)), rows[places])] = np.nan
+            remarks.append(
+                f"{first} is {kind} between its samples: {len(places)} of {len(rows)} values are "
+                f"kept (--map {first}_UNIT_fresh=COLUMN takes all)."
+            )
+            break
+    return remarks
+
+
+def _find_knots(values: Array) -> npt.NDArray[np.int64]:
+    """Find where an angle's slope changes by more than rounding; +-180 deg are one."""
+    gaps, scale = np.diff(np.unique(values)), float(np.abs(values).max())
+    resolution = gaps[gaps > 1e-12 * scale].min(initial=np.pi)
+    bends = np.abs(np.diff(np.unwrap(values), 2))
+    return np.flatnonzero(bends > 2.5 * resolution + 4e-7 * scale) + 1
+
+
+def _find_period(lengths: Array) -> float:
+    """Find the period of sampling in rows, 0.0 where there is none, from the rows between changes.
+
+    A lost or repeated sample makes a multiple, a coarse value in every row irregular distances.
+    """
+    if len(lengths) < _MIN_INTERVALS:
+        return 0.0
+    typical = float(np.quantile(lengths, 0.25, method="lower"))
+    period = float(np.mean(lengths[np.abs(lengths - typical) <= max(1.0, 0.1 * typical)]))
+    tolerance = 0.6 if period < 4.0 else max(1.0, 0.2 * period)
+    deviation = np.abs(lengths - period * np.maximum(np.rint(lengths / period), 1.0))
+    n_short, n_beside = (lengths < period - tolerance).sum(), (deviation > tolerance).sum()
+    is_regular = (
+        typical > 1.0 and n_short <= 0.05 * len(lengths) and n_beside <= 0.15 * len(lengths)
+    )
+    return period if is_regular else 0.0
+
+
+def _align_clocks(values: dict[str, Array], needed: Collection[str]) -> list[str]:
+    elapsed = np.append(0.0, np.cumsum(np.maximum(np.diff(values["time"]), 0.0)))
+    known = {name: np.isfinite(column) for name, column in values.items() if name != "time"}
+    base = max(known.keys() & needed, key=lambda name: (known[name].sum(), name))
+    is_base, joined, lines = known[base], {}, []
+    if is_base.sum() < 2:
+        return []
+    for name in sorted(known.keys() - SLOW_QUANTITIES):
+        base_mask, own_mask = is_base, known[name]
+        if (
+            own_mask[base_mask].mean() > _COMPLETE
+            or own_mask.sum() < 2
+            or (name in TRUTH and not own_mask[~base_mask].any())
+        ):
+            continue
+        t, interval = elapsed[own_mask], float(np.median(np.diff(elapsed[own_mask])))
+        after = np.clip(np.searchsorted(t, elapsed[base_mask]), 1, len(t) - 1)
+        is_near = t[after] - t[after - 1] <= min(1.9 * interval, 1.01 * LONGEST_GAP)
+        is_near = (
+            is_near & (elapsed[base_mask] >= t[0]) & (elapsed[base_mask] <= t[-1])
+        ) | own_mask[base_mask]
+        if is_near.sum() > own_mask[base_mask].sum():
+            joined[name] = np.where(
+                is_near, np.interp(elapsed[base_mask], t, values[name][own_mask]), np.nan
+            )
+            lines.append(f"{name} (every {interval:.3g} s)")
+    is_other = np.any(list(known.values()), axis=0)
+    is_other &= ~np.any([known[n] for n in known.keys() - SLOW_QUANTITIES - TRUTH], axis=0)
+    if not joined and not is_other.any():
+        return []
+    rows = np.flatnonzero(is_base if joined else ~is_other)
+    step = float(np.median(np.diff(elapsed[rows])))
+    places = np.searchsorted(elapsed[rows], elapsed - 0.01 * step)
+    for name, column in list(values.items()):
+        values[name] = joined[name] if name in joined else column[rows]
+        if name in SLOW_QUANTITIES:
+            moved_rows = np.flatnonzero(known[name] & (places < len(rows)))
+            values[name] = np.full(len(rows), np.nan)
+            values[name][places[moved_rows]] = column[moved_rows]
+    complete_rows = np.flatnonzero(
+        np.isfinite([*(joined[n] for n in joined.keys() - TRUTH), rows]).all(0)
+    )
+    if not len(complete_rows):
+        raise ValueError(f"{base}, {', '.join(joined)} are not known at the same time")
+    values.update(
+        {name: column[complete_rows[0] : complete_rows[-1] + 1] for name, column in values.items()}
+    )
+    remarks = [f"Interpolated in the rows of {base}: {', '.join(lines)}."] if joined else []
+    if n_ends := len(rows) - len(values["time"]):
+        remarks.append(f"{n_ends} rows at the ends, where these are unknown, were left out.")
+    return remarks
+
+
+EARTH = 6_378_137.0  # m, equatorial radius
+ECCENTRICITY_SQUARED = 6.694379990e-3
+
+
+def compute_radii(latitude: float) -> tuple[float, float]:
+    """Compute the radii of the parallel and of the meridian at a latitude.
+
+    Args:
+        latitude: Latitude (degrees north).
+
+    Returns:
+        Metres a radian (east, north).
+    """
+    phi = math.radians(latitude)
+    w = 1.0 - ECCENTRICITY_SQUARED * math.sin(phi) ** 2
+    return EARTH / math.sqrt(w) * math.cos(phi), EARTH * (1.0 - ECCENTRICITY_SQUARED) / w**1.5
+
+
+def to_metres(
+    latitude: Array, longitude: Array, origin: tuple[float, float]
+) -> tuple[Array, Array]:
+    """Convert places to metres east and north of an origin, the inverse of `to_degrees`.
+
+    Args:
+        latitude: Latitude (degrees north), shape (n,).
+        longitude: Longitude (degrees east), shape (n,).
+        origin: Origin (degrees north, degrees east).
+
+    Returns:
+        (east, north) (m), shape (n,) each.
+    """
+    east, north = compute_radii(origin[0])
+    delta = (longitude - origin[1] + 180.0) % 360.0 - 180.0  # over the date line
+    return east * np.radians(delta), north * np.radians(latitude - origin[0])
+
+
+def to_degrees(X: Array, Y: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
+    """Convert metres east and north of an origin to degrees, within 0.2 m up to 1 km.
+
+    Args:
+        X: Metres east (m), shape (n,).
+        Y: Metres north (m), shape (n,).
+        origin: Origin (degrees north, degrees east).
+
+    Returns:
+        (latitude, longitude) (degrees), shape (n,) each.
+    """
+    east, north = compute_radii(origin[0])
+    return origin[0] + np.degrees(Y / north), origin[1] + np.degrees(X / east)

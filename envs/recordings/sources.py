@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from ..arguments import short_repr
-from ..backend.extras import require_extra
+from ..numerics import require_extra
+from ..validation import short_repr
 
 if TYPE_CHECKING:
     from .nmea import Counts, Epoch

@@ -1,13 +1,20 @@
-"""Tables on disk, as they stand there: CSV, Parquet, MATLAB and MDF."""
+"""Tables on disk, as they stand there: CSV, Parquet, MATLAB and MDF.
 
-from collections.abc import Callable
+A table on disk as named quantities in SI units (needs the extra `report`).
+"""
+
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..backend.extras import require_extra
-from .dialect import find_unit, read_text
+from ..numerics import require_extra
+from ..record import Array
+from ..validation import join_names, short_repr
+from ..vehicle.parameters import GRAVITY
+from .dialect import KINDS, find_samples, find_unit, read_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -127,3 +134,279 @@ def _read_mdf(path: Path, is_wanted: Callable[[str], bool]) -> LogTable:
             units.append(find_unit(signal.unit))
     frame = pd.concat(columns, axis=1, sort=True) if columns else pd.DataFrame()
     return LogTable(frame.rename_axis("time_s").reset_index(), units, names, [])
+
+
+_LARGEST = 1e15  # in SI units
+_SPEED = {"mps": 1.0, "kmh": 1.0 / 3.6}
+_ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}
+_ANGLE_RATE = {"radps": 1.0, "degps": np.pi / 180.0}
+_ACCELERATION = {"mps2": 1.0, "g": GRAVITY}
+_LENGTH = {"m": 1.0}
+_TORQUE = {"nm": 1.0}
+_NUMBER = {"count": 1.0}
+_CURVATURE = {"radpm": 1.0}
+
+COLUMNS: dict[str, dict[str, float]] = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "speed_x": _SPEED,
+    "speed_y": _SPEED,
+    "yaw_rate": _ANGLE_RATE,
+    "accel_x": _ACCELERATION,
+    "accel_y": _ACCELERATION,
+    "roll_rate": _ANGLE_RATE,
+    "steer": _ANGLE,
+    "sideslip": _ANGLE,
+    "wheel_left": _SPEED,
+    "wheel_right": _SPEED,
+    "torque_left": _TORQUE,
+    "torque_right": _TORQUE,
+    "steer_command": _ANGLE,
+    "accel_command": _ACCELERATION,
+    "curvature": _CURVATURE,
+    "course": _ANGLE | {"degnorth": -np.pi / 180.0},
+    "gps_speed": _SPEED,
+    "gps_x": _LENGTH,
+    "gps_y": _LENGTH,
+    "gps_hdop": _NUMBER,
+    "gps_satellites": _NUMBER,
+    "camera_psi": _ANGLE,
+    "camera_y_l": _LENGTH,
+}
+"""What a log may hold and the units it may come in, with their factors to SI. A column is called
+quantity_unit (`yaw_rate_radps`). Axes are ISO 8855; angles, the course too, are positive to the
+left; `course_degnorth` alone counts from north, clockwise, as a compass does. The names of course
+and camera_psi may end on a kind of samples: `course_deg_held`."""
+_NORTH = np.pi / 2.0  # the course towards north, rad
+_NAMES = {
+    f"{quantity}_{unit}{kind}": (quantity, factor)
+    for quantity, units in COLUMNS.items()
+    for unit, factor in units.items()
+    for kind in ("", *(f"_{kind}" * (quantity in ("course", "camera_psi")) for kind in KINDS))
+}
+
+
+def make_column_name(quantity: str) -> str:
+    """Make the name of a quantity's column in SI units.
+
+    Args:
+        quantity: Name of the quantity, of `COLUMNS`.
+
+    Returns:
+        The name, such as "yaw_rate_radps".
+    """
+    return f"{quantity}_{next(iter(COLUMNS[quantity]))}"
+
+
+def parse_column_name(name: str) -> tuple[str, float]:
+    """Parse the name of a column.
+
+    Args:
+        name: Name in lower case, such as "yaw_rate_degps".
+
+    Returns:
+        Name of the quantity and the unit's factor to SI.
+
+    Raises:
+        ValueError: If it is none of ours.
+    """
+    if name in _NAMES:
+        return _NAMES[name]
+    quantity = name.rpartition("_")[0]
+    near = next((known for known in (name, quantity) if known in COLUMNS), None)
+    known = (
+        [make_column_name(q) for q in COLUMNS]
+        if near is None
+        else [f"{near}_{u}" for u in COLUMNS[near]]
+    )
+    raise ValueError(f"unknown column name {name!r}; expected one of {', '.join(known)}")
+
+
+def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
+    """Parse a mapping of column names: "yaw_rate_radps=MyColumn" to {"yaw_rate_radps": "MyColumn"}.
+
+    Args:
+        texts: Texts of the form NAME=COLUMN.
+
+    Returns:
+        Our column names to the log's.
+
+    Raises:
+        ValueError: For a text of another form, an unknown name and a name mapped twice.
+    """
+    mapping: dict[str, str] = {}
+    for text in texts:
+        name, _, column = (part.strip() for part in text.partition("="))
+        if not (name and column):
+            raise ValueError(f"expected NAME=COLUMN, such as steer_rad=Delta, got {text!r}")
+        if name in mapping:
+            raise ValueError(f"{name} is mapped twice, to {mapping[name]!r} and to {column!r}")
+        parse_column_name(name)
+        mapping[name] = column
+    return mapping
+
+
+def read_quantities(
+    path: Path, mapping: Mapping[str, str], needed: Sequence[str], gaps: Collection[str] | None
+) -> tuple[dict[str, Array], list[str]]:
+    """Read the file's known quantities in SI units, and describe how they were read.
+
+    An empty column counts as absent. A file that `read_table` refuses raises its errors. Rows in
+    messages count from 1 below the header.
+
+    Args:
+        path: Path of the table.
+        mapping: Our column names, unit included, to the file's; other columns are ignored.
+        needed: Quantities that must be present.
+        gaps: Quantities that may hold NaN, any other is complete; None: all but the time, and
+            shuffled rows are sorted.
+
+    Returns:
+        Quantities by name, shape (n,) each, and sentences on how they were read.
+
+    Raises:
+        ValueError: For a missing column, one given twice, a value that is no finite number, NaN,
+            and fewer than two rows.
+    """
+    wanted = {*COLUMNS, *map(str.casefold, mapping.values())}
+    table = read_table(
+        path, lambda name: name.casefold() in wanted or bool(_match_column(name, ""))
+    )
+    remarks = [*table.remarks]
+    try:
+        columns = _find_columns(table, mapping, remarks)
+        missing = [make_column_name(name) for name in needed if name not in columns]
+        if missing:
+            raise ValueError(
+                f"no column {' nor '.join(missing)}; {_list_columns(table)}; "
+                f"--map {missing[0]}=COLUMN names one"
+            )
+        if len(table.frame) < 2:
+            rows = "no rows" if table.frame.empty else "one row"
+            raise ValueError(f"the log has {rows}; a drive needs two or more")
+        values = {}
+        for quantity, (place, name) in columns.items():
+            column = _convert_column(table, place, name, remarks)
+            if quantity in needed or not np.isnan(column).all():
+                values[quantity] = column
+        _check_complete(values, ["time"])
+        kinds = {quantity: name.rpartition("_")[2] for quantity, (_, name) in columns.items()}
+        kinds = {quantity: kind for quantity, kind in kinds.items() if kind in KINDS}
+        remarks += find_samples(values, needed, kinds, gaps is not None)
+        if gaps is not None:
+            _check_complete(values, [name for name in values if name not in gaps])
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return values, remarks
+
+
+def _check_complete(values: Mapping[str, Array], quantities: Sequence[str]) -> None:
+    for quantity in quantities:
+        if (unknown := np.isnan(values[quantity])).any():
+            row = int(np.argmax(unknown)) + 1
+            raise ValueError(
+                f"column {make_column_name(quantity)!r} has no value (NaN) in row {row}"
+            )
+
+
+def _list_columns(table: LogTable) -> str:
+    return f"the log has {join_names(table.names)}"
+
+
+def _match_column(name: str, unit: str) -> str:
+    """Match a file's column to our name, in upper or lower case, "" where it is none of ours.
+
+    Its unit may be in the name, in brackets or beside it.
+    """
+    folded = name.casefold()
+    if folded not in _NAMES:
+        base, _, bracket = folded.rstrip("])").replace("(", "[").partition("[")
+        folded = f"{re.sub('[ -]+', '_', base.strip())}_{find_unit(bracket) or unit}"
+    return folded if folded in _NAMES else ""
+
+
+def _find_columns(
+    table: LogTable, mapping: Mapping[str, str], remarks: list[str]
+) -> dict[str, tuple[int, str]]:
+    """Find the place and our name of each quantity's column, and add to the remarks.
+
+    The mapping comes first, then our names, then names with units.
+    """
+    names, quantities = [str(name) for name in table.frame.columns], set()
+    for name, column in mapping.items():
+        if column.casefold() not in map(str.casefold, names):
+            raise ValueError(f"no column {column!r} for {name}; {_list_columns(table)}")
+        if parse_column_name(name)[0] in quantities:
+            raise ValueError(f"{parse_column_name(name)[0]} is mapped twice")
+        quantities.add(parse_column_name(name)[0])
+    best: dict[str, tuple[int, list[tuple[int, str]]]] = {}
+    for place, (label, unit) in enumerate(zip(names, table.units, strict=True)):
+        match = _match_column(label, unit)
+        options = [(name, 0) for name, c in mapping.items() if c.casefold() == label.casefold()]
+        for name, level in (*options, (match, 1 if match == label.casefold() else 2)):
+            quantity = parse_column_name(name)[0] if name else ""
+            if name and level < best.get(quantity, (3,))[0]:
+                best[quantity] = level, [(place, name)]
+            elif name and level == best[quantity][0]:
+                best[quantity][1].append((place, name))
+    columns = {}
+    for quantity, (level, ((place, name), *others)) in best.items():
+        label, unit = names[place], table.units[place]
+        name_unit = name.replace("degnorth", "deg").removeprefix(f"{quantity}_").split("_")[0]
+        if unit not in ("", "count", name_unit):
+            if level:
+                raise ValueError(
+                    f"{label} has the unit {unit} in the file; --map {quantity}_{unit}={label} or "
+                    f"--map {name}={label} says which it is"
+                )
+            remarks.append(f"{label} is read as {name}, though its unit in the file is {unit}.")
+        for other, alias in others:
+            if alias != name:
+                raise ValueError(f"{quantity} is given twice, as {name} and {alias}")
+            if not table.frame.iloc[:, place].equals(table.frame.iloc[:, other]):
+                raise ValueError(
+                    f"{label} is given twice, in columns {place + 1} and {other + 1}, with other "
+                    "values; rename or delete one"
+                )
+            remarks.append(f"{label} is given twice, with the same values.")
+        columns[quantity] = place, name
+    return columns
+
+
+def _convert_column(table: LogTable, place: int, name: str, remarks: list[str]) -> Array:
+    """Convert a column to SI units; ValueError names the first value that is no finite number.
+
+    A time that is far off in its unit, but not in another since 1970, is read in that, which is
+    remarked.
+    """
+    import pandas as pd
+
+    column, label = table.frame.iloc[:, place], str(table.frame.columns[place])
+    for kind in ("datetime64_any", "timedelta64", "bool"):
+        if getattr(pd.api.types, f"is_{kind}_dtype")(column.dtype):
+            raise ValueError(f"column {label!r} holds {column.dtype}; expected numbers")
+    numbers = column
+    if not pd.api.types.is_numeric_dtype(column.dtype):
+        try:
+            numbers = pd.to_numeric(column, errors="coerce")
+        except OverflowError as error:
+            raise ValueError(f"column {label!r}: expected numbers, got {error}") from None
+    values = np.array(numbers.to_numpy(np.float64, na_value=np.nan))
+    quantity, factor = parse_column_name(name)
+    if quantity == "time" and abs(values[0]) * factor > 1e11:
+        for unit, scale in COLUMNS["time"].items():
+            if 3e8 < values[0] * scale < 4e9:
+                factor = scale
+                remarks.append(f"{label} is read in {unit} since 1970; no other unit fits.")
+    values *= factor
+    if name.startswith("course_degnorth"):
+        values += _NORTH
+    is_none = np.isinf(values) | (np.isnan(values) & column.notna().to_numpy())
+    if (bad := is_none | (np.abs(values) > _LARGEST)).any():
+        row = int(np.argmax(bad))
+        text, expected = str(column.iloc[row]), f"a number up to {_LARGEST / abs(factor):g}"
+        if is_none[row]:
+            expected = "a number" + " with a decimal point alone" * ("," in text)
+        raise ValueError(
+            f"column {label!r}, row {row + 1}: expected {expected}, got {short_repr(text)}"
+        )
+    return values

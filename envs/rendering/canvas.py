@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..backend.extras import require_extra
+from ..numerics import require_extra
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
 with require_extra("render", "pictures need pygame"):

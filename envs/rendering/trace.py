@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..engine.config import EpisodeConfig
 from ..engine.layout import Z
-from ..engine.packing import EpisodeConfig
 from ..record import Array
-from ..task.info import REPORT
+from ..task import REPORT
 from ..vehicle.dynamics import Motion
 
 

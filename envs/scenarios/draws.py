@@ -2,10 +2,10 @@
 
 from typing import Any, NamedTuple
 
-from ..backend.arrays import make_offsets, read
-from ..backend.decorators import jit
-from ..backend.primitives import select
-from ..backend.random import CHANNELS, draw_uniforms
+from ..numerics.functions import CHANNELS, draw_uniforms
+from ..numerics.jit import jit
+from ..numerics.packed import make_offsets, read
+from ..numerics.primitives import select
 
 _ATTEMPTS = 64
 

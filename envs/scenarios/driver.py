@@ -5,17 +5,22 @@ is steered: the lateral acceleration that brings the car onto the path within th
 2 (y_path(t + T) - y - T y') / T^2. At gain 1 that closes the loop at 1.41/T rad/s with damping
 0.71. The steering angle is the one at which the nominal car turns so in the steady state; the arms
 follow as a first-order lag within a largest rate.
+
+The driver's longitudinal work: a speed held or followed, or an acceleration.
+
+Wind: a gust of side force with an arm, between two ticks.
 """
 
 from typing import Any, NamedTuple
 
-from ..backend.decorators import jit
-from ..backend.elementary import sincos
-from ..backend.primitives import maximum, minimum
+from ..numerics.functions import sincos
+from ..numerics.jit import inline, jit
+from ..numerics.primitives import any_lane, maximum, minimum, select
+from ..ticks import TICK
 from ..vehicle.actuators import apply_lag, limit_rate
 from ..vehicle.dynamics import compute_curvature
 from ..vehicle.tyres import MIN_SPEED
-from .tracks import compute_path_offset
+from .road import compute_path_offset
 
 MIN_PREVIEW = 1.0  # wheelbases: a driver looks no nearer
 
@@ -98,3 +103,91 @@ def compute_driver_angle(
     """
     target_angle = compute_target_angle(motion, path, road, target, driver, stop)
     return limit_rate(angle, apply_lag(target_angle, angle, driver.rest), driver.slew)
+
+
+class SpeedProfile(NamedTuple):
+    """The driver's longitudinal work: a speed held or followed by PI, or an acceleration."""
+
+    speed: Any  # m/s, at the start and to hold
+    hold: Any  # 1 hold the speed that `acceleration` and `surge` make of it; 0 apply them alone
+    acceleration: Any  # m/s2, from start to end
+    start: Any  # tick
+    end: Any
+    k_p: Any  # 1/s
+    k_i: Any  # 1/s2
+    surge: Any = 0.0  # m/s2, amplitude of a sine
+    surge_rate: Any = 1.0  # rad/s
+
+
+@inline
+def compute_speed_reference(tick: Any, profile: Any) -> Any:
+    """Compute the speed and the acceleration that the driver wants at a tick.
+
+    Args:
+        tick: Tick since the start of the episode.
+        profile: `SpeedProfile`.
+
+    Returns:
+        Speed (m/s) and acceleration (m/s2).
+    """
+    acceleration = select((tick >= profile.start) & (tick < profile.end), profile.acceleration, 0.0)
+    elapsed = (minimum(maximum(tick, profile.start), profile.end) - profile.start) * TICK
+    speed = profile.speed + profile.acceleration * elapsed
+    if any_lane(profile.surge != 0.0):
+        s, c = sincos(profile.surge_rate * (tick * TICK))
+        acceleration = acceleration + profile.surge * s
+        speed = speed + profile.surge / profile.surge_rate * (1.0 - c)
+    return speed, acceleration
+
+
+@inline
+def compute_acceleration_command(
+    tick: Any, v_x: Any, integral: Any, profile: Any, limit: Any
+) -> Any:
+    """Compute the driver's acceleration command: PI on the speed, its integral held at the limit.
+
+    The wanted speed starts at `profile.speed` and is the integral of the wanted acceleration, which
+    is fed forward.
+
+    Args:
+        tick: Tick since the start of the episode.
+        v_x: Measured speed (m/s).
+        integral: Integral part of the command (m/s2).
+        profile: `SpeedProfile`.
+        limit: Largest acceleration of the motors (m/s2).
+
+    Returns:
+        The command and the next integral (m/s2).
+    """
+    speed, feedforward = compute_speed_reference(tick, profile)
+    error = speed - v_x
+    command = profile.k_p * error + integral + profile.hold * feedforward
+    limited = minimum(maximum(command, 0.0 - limit), limit)
+    next_integral = integral + profile.k_i * error * TICK
+    integral = select(command == limited, next_integral, integral)
+    return profile.hold * limited + (1.0 - profile.hold) * feedforward, integral
+
+
+class Wind(NamedTuple):
+    """A side wind between two ticks."""
+
+    force: Any  # N, to the left
+    arm: Any  # m, ahead of the centre of gravity
+    start: Any
+    end: Any
+    height: Any = 0.0  # m, above the roll axis
+
+
+@jit
+def compute_wind(tick: Any, wind: Any) -> Any:
+    """Compute force and moments of the wind from this tick to the next.
+
+    Args:
+        tick: Tick since the start of the episode.
+        wind: `Wind`.
+
+    Returns:
+        Force (N), yaw moment and roll moment (N m).
+    """
+    force = select((tick >= wind.start) & (tick < wind.end), wind.force, 0.0)
+    return force, force * wind.arm, 0.0 - force * wind.height

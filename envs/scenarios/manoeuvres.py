@@ -1,4 +1,7 @@
-"""The manoeuvres by name: those drawn by the seed; the tiers' and the papers' own beside them."""
+"""A recorded steering trace as a scenario: what a log's driver did, driven again.
+
+The manoeuvres by name: those drawn by the seed; the tiers' and the papers' own beside them.
+"""
 
 import dataclasses
 import os
@@ -6,8 +9,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..arguments import check_choice, describe_unknown, short_repr
-from ..documents import has_suffix, is_document, read_document
+import numpy as np
+
+from ..io import has_suffix, is_document, read_document
+from ..recordings.log_file import find_clock
+from ..recordings.tables import read_quantities
+from ..validation import check_choice, describe_unknown, short_repr
 from .draws import KMH
 from .papers import ROAD_TESTS, SIMULATIONS
 from .scenario import Scenario
@@ -21,7 +28,48 @@ from .tiers import (
     WET_EVASION,
     make_random_steering,
 )
-from .traces import TABLE_SUFFIXES, read_trace
+
+TABLE_SUFFIXES = (".csv", ".parquet")
+
+
+def read_trace(path: str | os.PathLike[str], mapping: Mapping[str, str] | None = None) -> Scenario:
+    """Read a scenario that steers as a recorded drive, at its first speed, as long as it lasts.
+
+    Everything else is `Scenario`'s default; a mapping over it
+    (`{"base": "drive.csv", "friction": 0.4}`) changes that.
+
+    Args:
+        path: CSV or Parquet (needs the extra `report`) with the columns of `COLUMNS` for time and
+            steering angle (time_s, steer_rad or steer_deg) and optionally speed (speed_x_mps).
+        mapping: Our column names to the log's.
+
+    Returns:
+        The scenario.
+
+    Raises:
+        ValueError: For a clock that runs backward, stands still, jumps or is uneven, and for what
+            `read_log` refuses: a file that is no table, a missing column, NaN.
+    """
+    source = Path(path)
+    values, _ = read_quantities(source, mapping or {}, ("time", "steer"), {"speed_x"})
+    try:
+        _, step = find_clock(values["time"])
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
+    speed = values.get("speed_x", np.zeros(0))
+    known_speed = speed[np.isfinite(speed)]
+    trace = tuple(values["steer"].tolist())
+    scenario = Scenario(
+        name=source.stem,
+        steering="trace",
+        trace=trace,
+        trace_step=step,
+        duration=round((len(trace) - 1) * step, 9),
+    )
+    return (
+        scenario.replace(speed=max(float(known_speed[0]), 0.0)) if len(known_speed) else scenario
+    )  # noise at rest
+
 
 _DRAWN: dict[str, Any] = {
     "mirror": True,

@@ -8,7 +8,7 @@ wandering HDOP in the twins.
 
 from typing import Any
 
-from ..vehicle.vehicle import COMS
+from ..vehicle.parameters import COMS
 from .draws import KMH
 from .scenario import Scenario
 

@@ -2,10 +2,10 @@
 
 from typing import Any
 
-from ..backend.arrays import load_element
-from ..backend.decorators import jit
-from ..backend.elementary import PI, exp, sincos, smoothstep
-from ..backend.primitives import any_lane, floor, maximum, minimum, select, sqrt
+from ..numerics.functions import PI, exp, sincos, smoothstep
+from ..numerics.jit import jit
+from ..numerics.packed import load_element
+from ..numerics.primitives import any_lane, floor, maximum, minimum, select, sqrt
 from ..ticks import FOREVER, TICK, round_to_ticks
 
 (

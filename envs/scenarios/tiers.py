@@ -10,7 +10,7 @@ a reference to a scenario; the cars are the presets, which the env names.
 import math
 from typing import Any
 
-from ..vehicle.vehicle import COMS, PASSENGER_CAR
+from ..vehicle.parameters import COMS, PASSENGER_CAR
 from .draws import KMH
 from .scenario import Scenario
 

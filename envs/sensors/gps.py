@@ -2,13 +2,12 @@
 
 from typing import Any, NamedTuple
 
-from ..backend.decorators import jit
-from ..backend.elementary import PI, sincos, wrap
-from ..backend.primitives import floor, maximum, minimum, select, sqrt
-from ..backend.random import CHANNELS
+from ..numerics.functions import CHANNELS, PI, sincos, wrap
+from ..numerics.jit import jit
+from ..numerics.primitives import floor, maximum, minimum, select, sqrt
 from ..vehicle.dynamics import compute_sideslip_angle
 from ..vehicle.tyres import MIN_SPEED
-from .kind import Blocks, PacketValue, SlowKind
+from .link import Blocks, PacketValue, SlowKind
 
 GPS_KIND = SlowKind(
     "gps",

@@ -1,13 +1,16 @@
-"""A slow sensor's clock and link: when samples are captured, and when they arrive."""
+"""A slow sensor's clock and link: when samples are captured, and when they arrive.
+
+A kind of slow sensor: its name, the values of its packets, its random numbers.
+"""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from ..arguments import is_finite, short_repr
-from ..backend.decorators import jit
-from ..backend.primitives import any_lane, floor, select, to_int
-from ..backend.random import CHANNELS, draw_uniforms
+from ..numerics.functions import CHANNELS, draw_uniforms
+from ..numerics.jit import jit
+from ..numerics.primitives import any_lane, floor, select, to_int
 from ..ticks import NEVER, TICK, count_ticks
+from ..validation import is_finite, short_repr
 
 MAX_IN_FLIGHT = 8  # packets of one sensor under way at once, duplicates included
 
@@ -188,3 +191,30 @@ def draw_clock_phase(link: Any, key_low: int, key_high: int, sensor: int) -> Any
     """
     u = draw_uniforms(key_low, key_high, 0, CHANNELS.initial, 1 + sensor)
     return select(link.phase < 0.0, floor(u[0] * link.period), link.phase)
+
+
+class PacketValue(NamedTuple):
+    """One value of a slow sensor's packet."""
+
+    name: str
+    unit: str
+    bound: float  # the observation clips at +- this
+
+
+class Blocks(NamedTuple):
+    """A slow sensor's channels in `backend.random`: blocks of four random numbers a tick."""
+
+    noise: int  # normal numbers
+    link: int  # uniform ones: delay, loss, duplication, one unused
+    drift: int  # normal numbers: the drift's innovation, its start at reset, two unused
+
+
+class SlowKind(NamedTuple):
+    """A row of the table of slow sensors, `slow.SLOW`."""
+
+    name: str
+    values: tuple[PacketValue, ...]
+    blocks: Blocks | None = None  # None: of the sensor's place in the table
+    needs_quality: bool = (
+        False  # at quality 0 it saw nothing: the observation holds the sample before
+    )

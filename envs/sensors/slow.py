@@ -8,15 +8,13 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from ..arguments import check_mapping, describe_unknown
-from ..backend.decorators import jit
-from ..backend.elementary import exp
-from ..backend.primitives import to_int
-from ..backend.random import draw_normals
+from ..numerics.functions import draw_normals, exp
+from ..numerics.jit import jit
+from ..numerics.primitives import to_int
+from ..validation import check_mapping, describe_unknown
 from .camera import CAMERA_KIND, compute_lane_quality, sample_camera
 from .gps import GPS_KIND, compute_hdop_deviation, sample_gps
-from .kind import Blocks
-from .link import SlowSensor
+from .link import Blocks, SlowSensor
 
 SLOW = (CAMERA_KIND, GPS_KIND)
 CAMERA, GPS = range(len(SLOW))

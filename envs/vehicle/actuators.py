@@ -3,8 +3,8 @@
 import math
 from typing import Any, NamedTuple
 
-from ..backend.decorators import jit
-from ..backend.primitives import absolute, any_lane, maximum, minimum, select
+from ..numerics.jit import jit
+from ..numerics.primitives import absolute, any_lane, maximum, minimum, select
 from .tyres import MIN_SPEED
 
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..backend.decorators import as_python, jit
-from .vehicle import GRAVITY, Vehicle
+from ..numerics.jit import as_python, jit
+from .parameters import GRAVITY, Vehicle
 
 if TYPE_CHECKING:
     from control import StateSpace

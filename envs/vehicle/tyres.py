@@ -2,15 +2,15 @@
 
 Scalar functions over tuples, without branches on values, as in `dynamics`. A law of the lateral
 force has its name in `TYRE_LAWS` and its equation in `compute_lateral_forces`. A filter that needs
-slopes has Fiala's once more, in `estimators.core.tyres`; a test holds both equal.
+slopes has Fiala's once more, in `estimators.core.model`; a test holds both equal.
 """
 
 from typing import Any, NamedTuple
 
-from ..backend.decorators import inline, jit
-from ..backend.elementary import atan, sincos
-from ..backend.primitives import absolute, any_lane, maximum, minimum, sqrt
-from .vehicle import GRAVITY
+from ..numerics.functions import atan, sincos
+from ..numerics.jit import inline, jit
+from ..numerics.primitives import absolute, any_lane, maximum, minimum, sqrt
+from .parameters import GRAVITY
 
 TYRE_LAWS = ("linear", "fiala", "dugoff")
 """The laws by the names that `Scenario.tyres` takes; a law's code is its place."""

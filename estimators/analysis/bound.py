@@ -17,10 +17,10 @@ import numpy as np
 from ...envs.record import PACKET, Array, Record
 from ...envs.sensors.link import SlowSensor
 from ...envs.ticks import TICK
-from ...envs.vehicle.vehicle import Vehicle
+from ...envs.vehicle.parameters import Vehicle
 from ..design.models import select_states
-from ..estimates import UnobservableWarning
 from ..make import make_estimator
+from ..protocol import UnobservableWarning
 
 # of a filter's memory, at a held speed
 _MODEL = ("car", "A", "B", "G", "GT", "H", "HT", "C_fast", "D_fast")

@@ -15,16 +15,16 @@ import numpy as np
 import numpy.typing as npt
 
 from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
-from ..core.delay import IGNORE
-from ..core.intersample import DUAL_RATE
-from ..core.memory import FILTER, N_CORE, N_INPUTS, N_ROWS
-from ..core.run import reset_filters
-from ..core.transition import LINEAR
+from ..core.filter import reset_filters
+from ..core.innovation import IGNORE
+from ..core.model import LINEAR
+from ..core.record import FILTER, N_CORE, N_INPUTS, N_ROWS
+from ..core.update import DUAL_RATE
 from ..design.dual_rate import GAINS, RULES, compute_shares, frame_map, write_shares
-from ..design.error_map import MARGINAL, find_unobservable, spectral_radius
-from ..entry import compile_advance, compile_process_packet
-from ..estimates import Estimates, UnobservableWarning
-from ..matrices import parse_covariance, parse_matrix, parse_square, parse_vector
+from ..design.kalman import parse_covariance, parse_matrix, parse_square, parse_vector
+from ..design.stability import MARGINAL, find_unobservable, spectral_radius
+from ..estimator import compile_advance, compile_process_packet
+from ..protocol import Estimates, UnobservableWarning
 
 _SENSOR = 0  # the place of the slow sensor in a filter's memory
 _NO_PACKETS = np.zeros((0, PACKET_WIDTH))

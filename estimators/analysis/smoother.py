@@ -11,19 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import jit
+from ...envs.numerics.jit import jit
 from ...envs.record import FAST, PACKET, Array, Log
-from ..core.delay import IGNORE
-from ..core.fast import read_fast_row
-from ..core.intersample import NONE
-from ..core.memory import WINDOW, FilterRecord, GainTables, Vector
+from ..core.filter import run_tick
+from ..core.innovation import IGNORE
+from ..core.model import BETA, LATERAL
 from ..core.packets import process_packet
-from ..core.run import run_tick
-from ..core.transition import BETA, LATERAL
-from ..design.schedule import count_ticks
-from ..estimates import Estimates
+from ..core.predict import read_fast_row
+from ..core.record import WINDOW, FilterRecord, GainTables, Vector
+from ..core.update import NONE
+from ..design.periodic import count_ticks
 from ..estimator import Estimator
 from ..make import make_estimator
+from ..protocol import Estimates
 
 _RANK = 1e-14  # of a correlation matrix, what counts as nothing
 

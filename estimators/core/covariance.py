@@ -11,9 +11,10 @@ names (`vector.lanes`), whose columns come one by one.
 from math import log
 from typing import Any
 
-from ...envs.backend.arrays import load_element
-from ...envs.backend.decorators import inline, jit
-from ...envs.backend.eights import (
+from ...envs.numerics.jit import inline, jit
+from ...envs.numerics.packed import load_element
+from ...envs.numerics.primitives import absolute, any_lane, select, sqrt
+from ...envs.numerics.simd8 import (
     allocate_scratch,
     count_upper_rows,
     load8,
@@ -22,8 +23,7 @@ from ...envs.backend.eights import (
     store8,
     vector_width,
 )
-from ...envs.backend.primitives import absolute, any_lane, select, sqrt
-from .memory import N_CORE, N_TOTAL, FilterRecord, Vector
+from .record import N_CORE, N_TOTAL, FilterRecord, Vector
 
 
 @jit

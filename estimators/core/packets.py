@@ -1,4 +1,13 @@
-"""A packet that is here: sound or not, for now or for the next step.
+"""The rule "buffer": the window is filtered anew when a late sample comes.
+
+Every tick's inputs, fast measurements and speed are stored, and every few ticks the states and
+their covariance. A sample captured at c is put in its place: the newest snapshot not after c is
+restored, and the ticks up to now are filtered anew with all samples that are known by now. Exact
+for any delay, order and clock; a sample older than the window, or than a sample that had to go, is
+refused and counted. The gate judges a sample once, by what was known of the time before it; one
+that it refuses leaves everything as it was.
+
+A packet that is here: sound or not, for now or for the next step.
 
 A packet is a row (PACKET_WIDTH,), columns as in `envs.record.Packet`.
 """
@@ -7,15 +16,215 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import copy_into, jit, noinline
-from ...envs.backend.primitives import floor
+from ...envs.numerics.jit import copy_into, jit, noinline
+from ...envs.numerics.primitives import floor, maximum
 from ...envs.record import PACKET, PACKET_WIDTH
-from .delay import BUFFER, DROPPED, find_clone, is_duplicate
-from .memory import COUNTERS, N_SLOW, N_WAITING, FilterRecord, GainTables, Vector
-from .rewind import rewind_update
-from .speed import is_finite
-from .transition import MIN_SPEED
+from .innovation import BUFFER, DROPPED, find_clone, get_direct, is_duplicate
+from .model import MIN_SPEED, VELOCITY_ROLL, build_model, is_finite
+from .predict import advance_state, correct_fast
+from .record import (
+    COUNTERS,
+    N_RECENT,
+    N_SLOW,
+    N_SNAPSHOTS,
+    N_WAITING,
+    SNAPSHOT_INTERVAL,
+    WINDOW,
+    FilterRecord,
+    GainTables,
+    Vector,
+)
 from .update import update_filter
+
+_EMPTY_STAMP = -1  # the captured tick of a place that is empty
+_NOW_SLOT = N_SNAPSHOTS  # the snapshot of now, while the past is filtered anew
+
+
+@jit
+def _find_slot(f: FilterRecord, tick: int) -> int:
+    """Find the snapshot after the fast row of a tick, before its samples."""
+    return int((tick - f.start) // SNAPSHOT_INTERVAL % N_SNAPSHOTS)
+
+
+@jit
+def _store_snapshot(f: FilterRecord, slot: int) -> None:
+    """Store states and covariance in a snapshot."""
+    for i in range(f.n):
+        f.snapshot_x[slot, i] = f.x[i]
+        for j in range(f.n):
+            f.snapshot_P[slot, i, j] = f.P[i, j]
+
+
+@jit
+def _restore(f: FilterRecord, slot: int) -> None:
+    """Restore the states and covariance of a snapshot."""
+    for i in range(f.n):
+        f.x[i] = f.snapshot_x[slot, i]
+        for j in range(f.n):
+            f.P[i, j] = f.snapshot_P[slot, i, j]
+
+
+@jit
+def store_history(f: FilterRecord) -> None:
+    """Store the inputs, fast measurements and model of the present tick.
+
+    Args:
+        f: Memory of the filter.
+    """
+    slot = f.tick % WINDOW
+    copy_into(f.u, f.past_u[slot])
+    copy_into(f.y, f.past_y[slot])
+    f.past_speed[slot], f.past_turning[slot] = f.model_speed, f.turning
+    f.past_road_turn[slot] = f.road_turn
+    if (f.tick - f.start) % SNAPSHOT_INTERVAL == 0:
+        _store_snapshot(f, _find_slot(f, f.tick))
+
+
+@jit
+def _restore_history(f: FilterRecord, tick: int) -> None:
+    """Restore inputs, fast measurements and model of a tick."""
+    slot = tick % WINDOW
+    copy_into(f.past_u[slot], f.u)
+    copy_into(f.past_y[slot], f.y)
+    f.road_turn = f.past_road_turn[slot]
+    speed, turning = f.past_speed[slot], f.past_turning[slot]
+    if speed != f.model_speed or turning != f.turning:
+        build_model(f, speed, turning)
+
+
+@jit
+def _find_oldest(f: FilterRecord) -> int:
+    """Find the place to store a packet in: an empty one, or that of the earliest captured."""
+    place = 0
+    for i in range(N_RECENT):
+        if f.recent[i, PACKET.captured] < f.recent[place, PACKET.captured]:
+            place = i
+    return place
+
+
+@jit
+def _store_packet(f: FilterRecord, s: int, packet: Vector, place: int) -> None:
+    """Store a packet and its noise; what stood in its place is lost."""
+    f.lost = maximum(f.lost, int(f.recent[place, PACKET.captured]))
+    copy_into(packet, f.recent[place])
+    copy_into(f.r[s], f.recent_r[place])
+
+
+@jit
+def _is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
+    """Return whether a sample is a duplicate of a stored one."""
+    for i in range(N_RECENT):
+        if f.recent[i, PACKET.captured] == captured and f.recent[i, PACKET.sensor] == s:
+            return True
+    return False
+
+
+@jit
+def _collect_samples(f: FilterRecord, first: int) -> int:
+    """Collect in f.replay the good samples captured at `first` or later; returns how many."""
+    count = 0
+    for i in range(N_RECENT):
+        if f.recent[i, PACKET.captured] >= first and f.recent[i, PACKET.quality] > 0.0:
+            f.replay[count] = i
+            count += 1
+    return count
+
+
+@jit
+def _apply_stored(f: FilterRecord, gains: GainTables, s: int, place: int, is_new: bool) -> bool:
+    """Use a stored sample; False if it is new and the gate refuses it, now and for ever."""
+    if f.kind == VELOCITY_ROLL:  # its noise comes with each packet
+        copy_into(f.recent_r[place], f.r[s])
+    copy_into(f.recent[place], f.sample)
+    passed = update_filter(f, gains, s, get_direct(), f.sample, is_new)
+    if not passed:
+        f.recent[place, PACKET.quality] = 0.0
+    return passed
+
+
+@jit
+def _apply_tick_samples(
+    f: FilterRecord, gains: GainTables, tick: int, count: int, new_place: int
+) -> bool:
+    """Use the samples captured at a tick, one sensor after the other; False as `_apply_stored`."""
+    for s in range(N_SLOW):
+        for i in range(count):
+            place = f.replay[i]
+            due = f.recent[place, PACKET.captured] == tick and f.recent[place, PACKET.sensor] == s
+            if due and not _apply_stored(f, gains, s, place, place == new_place):
+                return False
+    return True
+
+
+@jit
+def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: int) -> bool:
+    """Filter anew from the snapshot at `first` to now, with a new sample.
+
+    Returns False, and all is as before, if the gate refuses the sample at the place `new_place`.
+    """
+    now, invalid, count = f.tick, f.counts[COUNTERS.invalid], _collect_samples(f, first)
+    _store_snapshot(f, _NOW_SLOT)
+    _restore(f, _find_slot(f, first))
+    passed = True
+    for tick in range(first, now + 1):
+        _restore_history(f, tick)
+        if tick > first:
+            advance_state(f, f.u)
+            correct_fast(f, gains)
+            if (tick - f.start) % SNAPSHOT_INTERVAL == 0:
+                _store_snapshot(f, _find_slot(f, tick))
+        f.stretch = 1.0  # what was restored is of this tick's speed
+        if not _apply_tick_samples(
+            f, gains, tick, count, new_place
+        ):  # no snapshot was changed before
+            passed = False
+            break
+    f.counts[COUNTERS.invalid] = invalid  # each row was counted when it came
+    if not passed:
+        _restore_history(f, now)
+        _restore(f, _NOW_SLOT)
+        f.stretch = 1.0
+    return passed
+
+
+@noinline
+def rewind_update(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -> bool:
+    """Correct by a packet of any age within the window.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+        s: Index of the slow sensor.
+        packet: Packet, shape (PACKET_WIDTH,).
+
+    Returns:
+        Whether it was used.
+    """
+    captured = int(packet[PACKET.captured])
+    first = f.start + (captured - f.start) // SNAPSHOT_INTERVAL * SNAPSHOT_INTERVAL
+    if _is_duplicate(f, s, captured):
+        f.counts[COUNTERS.duplicates] += 1
+        return False
+    place = _find_oldest(f)
+    if f.tick - first >= WINDOW or first <= maximum(f.lost, int(f.recent[place, PACKET.captured])):
+        f.counts[COUNTERS.refused] += 1
+        return False
+    _store_packet(f, s, packet, place)
+    if captured == f.tick:
+        return _apply_stored(f, gains, s, place, captured == f.tick)
+    return _replay_window(f, gains, first, place)
+
+
+@jit
+def clear_history(f: FilterRecord) -> None:
+    """Empty the window.
+
+    Args:
+        f: Memory of the filter.
+    """
+    f.lost = _EMPTY_STAMP
+    for i in range(N_RECENT):
+        f.recent[i, PACKET.captured] = _EMPTY_STAMP
 
 
 @jit

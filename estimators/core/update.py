@@ -1,20 +1,218 @@
-"""The correction by a sample of a slow sensor, whatever the filter's rules are."""
+"""Between slow samples: what stands in for the measurement that is not there.
+
+predict: nothing. pseudo-residual: tie-vision (19)-(22), which uneven-delay (20)-(22), double-layer
+(28)-(29), dual-rate (31) and Oh's (35) repeat: the propagated estimate of the error. The fast
+sensors' residuals are always the real ones. One constant gain K serves every tick, its columns in
+the order fast rows, slow rows; where gains are not precomputed, the share of the last sample's.
+dual-rate: that paper's rules, whose corrections after a sample are a table of shares of its
+innovation (`design.dual_rate`). single-rate: a filter that listens only at the sensor's rate.
+
+The correction by a sample of a slow sensor, whatever the filter's rules are.
+"""
 
 from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import jit, noinline
-from ...envs.backend.elementary import wrap
-from ...envs.backend.primitives import absolute, maximum
+from ...envs.numerics.functions import wrap
+from ...envs.numerics.jit import jit, noinline
+from ...envs.numerics.primitives import absolute, maximum
 from ...envs.record import PACKET
 from .covariance import dot, predict_measurement, update_with_clone, update_with_states
-from .delay import BUFFER, CONSTANT, LARSEN, STORED_ONE, propagate_larsen_gains
-from .innovation import adapt_noise, check_sample, compute_packet_variance, project_row
-from .intersample import NONE, PSEUDO, correct_sample, split_sample_gain, start_shares
-from .memory import COUNTERS, N_SNAPSHOTS, WINDOW, FilterRecord, GainTables, Vector
-from .speed import locate_frame_row
-from .transition import PSI
+from .innovation import (
+    BUFFER,
+    CONSTANT,
+    LARSEN,
+    STORED_ONE,
+    adapt_noise,
+    check_sample,
+    compute_packet_variance,
+    project_row,
+    propagate_larsen_gains,
+)
+from .model import PSI, locate_frame_row
+from .record import COUNTERS, N_SNAPSHOTS, WINDOW, FilterRecord, GainTables, Vector
+
+NONE, PSEUDO, DUAL_RATE = range(3)
+"""Codes of the field `between`."""
+
+
+@jit
+def _apply_row(f: FilterRecord, s: int, i: int, v: Vector) -> Any:
+    """Apply row i of sensor s to a vector of states and clones (total,): its clone, if it has."""
+    return v[f.first_clone[s] + i] if f.frames[s] > 0 else dot(f.C[s, i], v, f.n)
+
+
+@jit
+def predict_slow_rows(f: FilterRecord, s: int) -> None:
+    """Predict the slow rows, and their pseudo-residuals: tie-vision (22).
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+    """
+    for i in range(f.rows[s]):
+        has_clones = f.frames[s] > 0
+        f.expected[i] = f.x[f.first_clone[s] + i] if has_clones else predict_measurement(f, s, i)
+        f.eps[f.fasts + i] = _apply_row(f, s, i, f.e)  # C G e
+
+
+@jit
+def correct_between(f: FilterRecord, gains: GainTables, s: int) -> None:
+    """Correct x and e, both predicted, by the fast residuals in f.eps and the pseudo-residuals.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns); rows of K^T and then of the inverse's
+            transpose stand behind those of the steps and frames.
+        s: Index of the slow sensor.
+    """
+    x, e, N, m = f.x, f.e, f.total, f.fasts
+    first = locate_frame_row(f, s, f.pattern)
+    for i in range(m):
+        f.e_seen[i] = dot(f.C_fast[i], e, f.n)
+    for i in range(m):
+        K = gains[f.cell, first + i]
+        for j in range(N):
+            x[j] += K[j] * f.eps[i]
+            e[j] -= K[j] * f.e_seen[i]  # (21): (I - K C) G e
+    for i in range(m, m + f.rows[s]):
+        K = gains[f.cell, first + i]
+        for j in range(N):
+            x[j] += K[j] * f.eps[i]
+            e[j] -= K[j] * f.eps[i]
+
+
+@jit
+def correct_sample(f: FilterRecord, gains: GainTables, s: int) -> None:
+    """Correct by a sample of this tick: its residuals replace the pseudo ones, and e starts anew.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+        s: Index of the slow sensor.
+    """
+    m, N, rows = f.fasts, f.total, f.rows[s]
+    first = locate_frame_row(f, s, f.pattern)
+    for i in range(rows):
+        K, real = gains[f.cell, first + m + i], f.residual[i]  # tie-vision (19)
+        for j in range(N):
+            f.x[j] += K[j] * (real - f.eps[m + i])
+        f.eps[m + i] = real
+    for j in range(N):  # (20): e = (C^+ - K) eps
+        total = 0.0
+        for i in range(m + rows):
+            pinv, K = gains[f.cell, first + m + rows + i, j], gains[f.cell, first + i, j]
+            total += (pinv - K) * f.eps[i]
+        f.e[j] = total
+
+
+@jit
+def update_error(f: FilterRecord, i: int, residual: float) -> None:
+    """Correct e by a fast row's gain f.share[i], which x has used.
+
+    Args:
+        f: Memory of the filter.
+        i: Index of the fast measurement.
+        residual: Its residual.
+    """
+    projected = dot(f.C_fast[i], f.e, f.n)
+    f.eps[i] = residual
+    for j in range(f.total):
+        f.e[j] -= f.share[i, j] * projected
+
+
+@jit
+def apply_gain_shares(f: FilterRecord, s: int) -> None:
+    """Correct x and e by the pseudo-residuals with the even fraction of the last sample's gain.
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+    """
+    for i in range(f.fasts, f.fasts + f.rows[s]):
+        for j in range(f.total):
+            f.x[j] += f.share[i, j] * f.eps[i]
+            f.e[j] -= f.share[i, j] * f.eps[i]
+
+
+@jit
+def split_sample_gain(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
+    """Correct by a sample as `correct_sample` does, with the covariance's gain of this packet.
+
+    The gain is split evenly over a period.
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+        first: What the sample measures, see `delay.find_clone`.
+        packet: Packet, shape (PACKET_WIDTH,).
+    """
+    m, N, rows = f.fasts, f.total, f.rows[s]
+    steps = f.period[s] // f.stride
+    for i in range(rows):
+        for j in range(N):
+            f.x[j] -= f.share[m + i, j] * f.eps[m + i]
+    for i in range(rows):
+        r = compute_packet_variance(f, s, i, packet)
+        if first >= 0:
+            update_with_clone(f, first + i, r, 0.0)
+        else:
+            update_with_states(f, f.C[s, i], r, 0.0)
+        for k in range(i):  # the rows before it correct what it measures
+            correction = _apply_row(f, s, i, f.share[m + k])
+            for j in range(N):
+                f.share[m + k, j] -= f.gain[j] * correction
+        for j in range(N):
+            f.share[m + i, j] = f.gain[j] / steps
+        f.eps[m + i] = f.residual[i]
+    for j in range(N):
+        f.e[j] = 0.0
+        for i in range(m, m + rows):
+            f.x[j] += f.share[i, j] * f.eps[i]
+        for i in range(m + rows):
+            f.e[j] += (f.inverse[i, j] - f.share[i, j]) * f.eps[i]
+
+
+@jit
+def _apply_share(f: FilterRecord, gains: GainTables, s: int) -> None:
+    """Add the fraction of the last innovation that is due now to x."""
+    first = locate_frame_row(f, s, f.pattern) + f.since * f.rows[s]
+    for i in range(f.rows[s]):
+        K = gains[f.cell, first + i]
+        for j in range(f.total):
+            f.x[j] += K[j] * f.innovation[i]
+
+
+@jit
+def start_shares(f: FilterRecord, gains: GainTables, s: int) -> None:
+    """Store a sample's innovation and use its first fraction.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+        s: Index of the slow sensor.
+    """
+    for i in range(f.rows[s]):
+        f.innovation[i] = f.residual[i]
+    f.since = 0
+    _apply_share(f, gains, s)
+
+
+@jit
+def apply_next_share(f: FilterRecord, gains: GainTables, s: int) -> None:
+    """Use the next fraction of the innovation, as long as there is one.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+        s: Index of the slow sensor.
+    """
+    if f.since >= 0:
+        f.since += 1
+        if f.since < f.cycle:
+            _apply_share(f, gains, s)
+
 
 HEADING_TOLERANCE = 0.5  # rad: the first heading fix sets the heading where it is so far off
 

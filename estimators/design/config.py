@@ -10,11 +10,10 @@ import numpy as np
 from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
-from ..core.delay import RULES
+from ..core.innovation import RULES
 from ..filters import FilterDefinition
 from . import dual_rate
 from .kalman import INVERSES
-from .levels import parse_bank, parse_hdop_table, parse_noise, parse_prior, parse_process_noise
 from .models import (
     BIASES,
     DISTURBANCES,
@@ -27,8 +26,16 @@ from .models import (
     FilterModel,
     make_bicycle_model,
 )
-from .options import OptionReader, parse_latency
-from .tunings import TUNINGS
+from .options import (
+    TUNINGS,
+    OptionReader,
+    parse_bank,
+    parse_hdop_table,
+    parse_latency,
+    parse_noise,
+    parse_prior,
+    parse_process_noise,
+)
 
 GATE_PROBABILITY = 1.0 - 1e-9
 MIN_SATELLITES = 4.0  # double-layer-gps 4.3
@@ -46,8 +53,8 @@ class FilterConfig:
     gains: "periodic" (precomputed for a schedule that repeats) or "covariance"; of dual-rate
         "constant", "from-29" or "placed" (with poles).
     delay: "clone" or "buffer" (late samples used exactly), "larsen", "stored", "constant" (with
-        assumed_delay in s), "literal", "lag" or "ignore": `sideslip.estimators.core.delay` says
-        what they are.
+        assumed_delay in s), "literal", "lag" or "ignore":
+        `sideslip.estimators.core.innovation` says what they are.
     between: of single-rate-kf, "hold" (default) or "predict" between its steps.
     intersample: of double-layer "pseudo-residual" (default) or "predict"; of dual-rate "pseudo"
         (default), "predict", "hold" or "oh".

@@ -10,8 +10,7 @@ import numpy as np
 
 from ...envs.record import Array
 from . import kalman
-from .kalman import compute_inverse
-from .pole_placement import observer_gain
+from .kalman import compute_inverse, observer_gain
 
 RULES = ("predict", "hold", "oh", "pseudo")
 GAINS = ("constant", "from-29", "placed")

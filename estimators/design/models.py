@@ -1,4 +1,8 @@
-"""Which states a filter has, what drives them and what its sensors measure.
+"""Measurements of the slow sensors: their rows of C and their noise.
+
+A new slow sensor is an entry of `MEASUREMENTS`: options, states and compiled code follow it.
+
+Which states a filter has, what drives them and what its sensors measure.
 
 States stand in the order of `ORDER`, as many of them as the model has. The first ones follow the
 physical model ("dense"), the disturbances behind them decay by themselves.
@@ -11,13 +15,83 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...envs.record import FAST, Array
-from ...envs.sensors.slow import SLOW_NAMES
+from ...envs.record import FAST, PACKET, Array
+from ...envs.sensors.slow import SLOW, SLOW_NAMES
 from ...envs.vehicle.linear import make_roll_model
-from ...envs.vehicle.vehicle import GRAVITY, Vehicle
-from ..core.memory import CarIndex, FilterRecord
-from ..core.transition import FORCES, KINEMATIC, LATERAL, ROLL, VELOCITY_ROLL, YAW
-from .measurements import MEASUREMENTS, find_packet_column
+from ...envs.vehicle.parameters import GRAVITY, Vehicle
+from ..core.model import FORCES, KINEMATIC, LATERAL, ROLL, VELOCITY_ROLL, YAW
+from ..core.record import CarIndex, FilterRecord
+
+COURSE_SPEED = 60.0 / 3.6  # m/s at which the receivers' course noise is quoted
+
+
+class MeasurementRow(NamedTuple):
+    """One value of a packet as a measurement: a sum of states.
+
+    Attributes:
+        states: Names of the states.
+        noise: Its standard deviation is the option `<noise>_noise`.
+        sd: That option's default, in the unit of the value.
+        angle: Whether the innovation is wrapped.
+        over_speed: Whether the default holds at `COURSE_SPEED` and grows as 1/V; the option holds
+            at every speed.
+        ground: Whether it is a direction over the ground, where psi is relative to the road.
+    """
+
+    states: tuple[str, ...]
+    noise: str
+    sd: float
+    angle: bool = False
+    over_speed: bool = False
+    ground: bool = False
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A slow sensor as a filter sees it.
+
+    Attributes:
+        rows: Sums of a bicycle's states, for the packet's first values.
+        velocities: Rows of a second layer, in their place.
+        heading_fix: Whether its first sample, where it is far off, sets psi.
+    """
+
+    rows: tuple[MeasurementRow, ...]
+    velocities: tuple[MeasurementRow, ...] = ()
+    heading_fix: bool = False
+
+
+MEASUREMENTS: dict[str, Measurement] = {
+    "camera": Measurement(
+        (
+            MeasurementRow(("psi",), "psi", 3.5e-3, angle=True),
+            MeasurementRow(("y_l",), "y_l", 0.02),
+        ),
+    ),
+    "gps": Measurement(
+        (MeasurementRow(("beta", "psi"), "course", math.radians(0.14), True, True, ground=True),),
+        (
+            MeasurementRow(("v_x",), "gps_speed", 0.05),
+            MeasurementRow(("v_y",), "gps_speed", 0.05),
+        ),  # (41)
+        heading_fix=True,
+    ),
+}
+"""By the sensor's name. (41): double-layer-gps."""
+
+
+def find_packet_column(sensor: str, value: str) -> int:
+    """Find the column of a sensor's packets that holds a value.
+
+    Args:
+        sensor: Name of the slow sensor.
+        value: Name of the value.
+
+    Returns:
+        Index of the column; 0 where the sensor sends none of that name.
+    """
+    names = [field.name for field in SLOW[SLOW_NAMES.index(sensor)].values]
+    return PACKET.value + names.index(value) if value in names else 0
 
 
 class StateInfo(NamedTuple):

@@ -1,4 +1,6 @@
-"""Gains of a periodic schedule: the covariance filter is run over it until its gains repeat.
+"""The schedule of a slow sensor in steps of a filter: when frames are captured and arrive.
+
+Gains of a periodic schedule: the covariance filter is run over it until its gains repeat.
 
 A table of gains has a head row, then, for each step of the cycle, one row for every fast
 measurement (one where there is none), then one for each slow row at each frame of the pattern.
@@ -6,23 +8,112 @@ Pseudo-residuals add K^T and the transposed inverse, shared innovations a share 
 Behind the gains of a step stands the upper half of the states' covariance after that step.
 """
 
+import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import jit
-from ...envs.backend.primitives import absolute, maximum
+from ...envs.numerics.jit import jit
+from ...envs.numerics.primitives import absolute, maximum
 from ...envs.record import Array
+from ...envs.sensors.link import SlowSensor
 from ..core.covariance import update_with_clone, update_with_states
-from ..core.delay import CLONE, DIRECT, DROPPED, IGNORE, find_clone
-from ..core.intersample import DUAL_RATE, NONE, PSEUDO
-from ..core.memory import FilterRecord, FilterRecords, GainTables, Vector
-from ..core.run import reset_filter, reset_filters, run_tick
+from ..core.filter import reset_filter, reset_filters, run_tick
+from ..core.innovation import CLONE, DIRECT, DROPPED, IGNORE, find_clone
+from ..core.record import FilterRecord, FilterRecords, GainTables, Vector
+from ..core.update import DUAL_RATE, NONE, PSEUDO
 from .config import FilterConfig
 from .dual_rate import compute_shares, write_shares
-from .kalman import compute_inverse, constant_gain
-from .pole_placement import transition_matrix, write_placed_gains
-from .schedule import Schedule
+from .kalman import compute_inverse, constant_gain, transition_matrix, write_placed_gains
+
+
+def count_ticks(seconds: float, dt: float, label: str) -> int:
+    """Convert a time to a number of ticks.
+
+    Args:
+        seconds: Time (s).
+        dt: Tick (s).
+        label: Name of the time for messages.
+
+    Returns:
+        Number of ticks.
+
+    Raises:
+        ValueError: The time is no whole number of ticks.
+    """
+    count = round(seconds / dt)
+    if abs(seconds / dt - count) > 1e-6 * max(1.0, count):
+        raise ValueError(f"{label} of {seconds:g} s is no whole number of ticks of {dt:g} s")
+    return count
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Cycle of a slow sensor: frame i is captured at the step i `period`, arrives lags[i] later.
+
+    A schedule without frames has one step.
+
+    Attributes:
+        period: Steps between two captures.
+        lags: Steps from the capture of each frame of the cycle to its arrival.
+    """
+
+    period: int
+    lags: tuple[int, ...]
+
+    @property
+    def cycle(self) -> int:
+        """Steps after which everything repeats, the slots of the clones included."""
+        return self.period * max(1, len(self.lags))
+
+    def find_arriving(self, step: int) -> list[int]:
+        """Find the frames that arrive in a step of the cycle.
+
+        Args:
+            step: Step within the cycle.
+
+        Returns:
+            Indices of the frames.
+        """
+        arrival_steps = ((i * self.period + lag) % self.cycle for i, lag in enumerate(self.lags))
+        return [i for i, arrival_step in enumerate(arrival_steps) if arrival_step == step]
+
+
+NO_SENSOR = Schedule(1, ())
+
+
+def make_schedules(
+    label: str, sensor: SlowSensor, dt: float, stride: int, pace: int, frames: int
+) -> tuple[Schedule, ...]:
+    """Make the sensor's possible schedules: one where it repeats, else its two extremes.
+
+    Args:
+        label: Name of the sensor for messages.
+        sensor: Clock and delays of the sensor.
+        dt: Tick (s).
+        stride: Ticks of a filter's step.
+        pace: Ticks between steps that listen; a sample is used in the first of them at or after its
+            arrival.
+        frames: Number of stored captures, whose slots take turns; 0 for a filter that does not look
+            at the lag.
+
+    Returns:
+        One schedule, or those of the shortest and the longest delays.
+    """
+    period = count_ticks(sensor.period, dt, f"{label}'s period") // stride
+    late = [count_ticks(delay, dt, f"a delay: {label}'s") for delay in sensor.delays]
+    jitter = count_ticks(sensor.jitter, dt, f"{label}'s jitter")
+
+    def make_schedule(extra: int) -> Schedule:
+        lags = [math.ceil((lag + extra) / pace) * pace // stride for lag in late]
+        if len(set(lags)) == 1:
+            lags = lags[:1]
+        return Schedule(period, tuple(lags * (math.lcm(len(lags), max(1, frames)) // len(lags))))
+
+    shortest, longest = make_schedule(0), make_schedule(jitter)
+    return (longest,) if shortest == longest else (shortest, longest)
+
 
 GAIN_TOLERANCE = 1e-12
 MAX_RECURSION = 600.0  # s of the recursion

@@ -1,4 +1,7 @@
-"""Many filters of one kind at work side by side, each with its own memory and covariance."""
+"""Many filters of one kind at work side by side, each with its own memory and covariance.
+
+A batch of users' own estimators, or of late ones: an object a row, one after the other.
+"""
 
 import copy
 import functools
@@ -8,14 +11,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.eights import allocate_aligned
+from ...envs.numerics.simd8 import allocate_aligned
 from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Array, Log, Record
 from ...envs.sensors.link import SlowSensor
-from ..core.memory import FILTER, SkipCounters
-from ..estimates import Estimates
-from ..wrappers.arguments import EstimatorSpec
-from .designs import Build, GainPool
+from ..core.record import FILTER, SkipCounters
+from ..protocol import Estimates
+from ..wrappers.estimate import AnyEstimator, EstimatorSpec
+from ..wrappers.outputs import write_outputs
 from .kernel import compile_observe_batch, make_empty_outputs
+from .lane_ticks import Build, GainPool
 from .lanes import make_blocks
 
 IntArray = npt.NDArray[np.int64]
@@ -245,3 +249,83 @@ def _parse_counts(label: str, value: npt.ArrayLike, count: int, max_count: int) 
     if numbers.min() < 0 or numbers.max() > max_count:
         raise ValueError(f"{label} are 0 to {max_count}, got {numbers.min()} to {numbers.max()}")
     return numbers
+
+
+class ForeignBatch(BatchEstimator):
+    """N estimators of one factory, each an object of its row; none of them compiled.
+
+    ValueError says that they have different states.
+
+    Args:
+        first: Estimator of row 0.
+        specs: Vehicle, sensors and speed of each estimator, N of them.
+        dt: Tick (s).
+        build: Function that builds one estimator from its spec.
+    """
+
+    def __init__(
+        self, first: AnyEstimator, specs: Sequence[EstimatorSpec], dt: float, build: Build
+    ) -> None:
+        self.name, self.dt, self.names, self.units = first.name, dt, first.names, first.units
+        self._build = build
+        self._estimators: list[AnyEstimator] = [first, *(build(spec) for spec in specs[1:])]
+        self._design_keys = [spec.design for spec in specs]
+        self.configure(range(len(specs)), specs)
+
+    def __len__(self) -> int:
+        return len(self._estimators)
+
+    def __getitem__(self, i: int) -> AnyEstimator:
+        return self._estimators[i]
+
+    def configure(self, rows: Iterable[int], specs: Iterable[EstimatorSpec]) -> None:
+        """Fit the estimators of some rows to their specs as `BatchEstimator.configure` does.
+
+        Args:
+            rows: Indices of the estimators.
+            specs: Spec of each of these estimators.
+        """
+        for i, spec in zip(rows, specs, strict=True):
+            if spec.design != self._design_keys[i]:
+                self._estimators[i], self._design_keys[i] = self._build(spec), spec.design
+            self._check_states(i, self[i].names)
+            self[i].sensors = dict(spec.sensors)
+
+    def take(
+        self,
+        mask: npt.NDArray[np.bool_] | None,
+        fast: Array,
+        rows: IntArray,
+        packets: Array,
+        counts: IntArray,
+        *observed: Any,
+    ) -> None:
+        """Process rows and packets as `BatchEstimator.take` does.
+
+        Args:
+            mask: Estimators at work, bool, shape (N,); None for all.
+            fast: Fast rows, shape (N, k, FAST_WIDTH).
+            rows: Number of fast rows of each estimator, shape (N,).
+            packets: Packets, shape (N, capacity, PACKET_WIDTH).
+            counts: Number of packets of each estimator, shape (N,).
+            *observed: Arguments of `kernel.observe_batch` after `counts`.
+        """
+        obs, inner, plan, limits, *row_arrays = observed
+        chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
+        for i in chosen.tolist():
+            estimator, (beta, gamma, out, summary) = self[i], (array[i] for array in row_arrays)
+            estimator.step(fast[i, : rows[i]], packets[i, : counts[i]])
+            write_outputs(estimator, obs[i], inner, plan, limits, beta, gamma, out, summary)
+
+    def get_state(self) -> Any:
+        """Return deep copies of the users' objects."""
+        return [estimator.get_state() for estimator in self._estimators]
+
+    def set_state(self, snapshot: Any) -> None:
+        """Restore a snapshot of this batch or of one with the same specs.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
+        for estimator, state in zip(self._estimators, snapshot, strict=True):
+            estimator.set_state(state)

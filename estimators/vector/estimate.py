@@ -1,19 +1,23 @@
-"""EstimateObservation for vector environments: all rows' estimators in one compiled call."""
+"""The spec of a vector wrapper: it names the single wrapper around each environment.
 
+EstimateObservation for vector environments: all rows' estimators in one compiled call.
+"""
+
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs.registration import EnvSpec, VectorizeMode, WrapperSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ...envs.task.observation import ObservationEntry, make_space
-from ...envs.vehicle.vehicles import VehicleSource
-from ..wrappers.arguments import Arguments, EstimatorSource, EstimatorSpec
+from ...envs.task import ObservationEntry, make_space
+from ...envs.vehicle.parameters import VehicleSource
+from ..wrappers.estimate import Arguments, EstimatorSource, EstimatorSpec
 from ..wrappers.estimate import EstimateObservation as Single
 from ..wrappers.outputs import BETA, NEES, STD, make_outputs, make_title
 from ..wrappers.truth import choose_vehicle, set_stiffness
@@ -26,7 +30,41 @@ from .records import (
     get_true_vehicles,
     make_record_source,
 )
-from .spec import make_vector_spec
+
+
+def make_vector_spec(
+    spec: EnvSpec | None, single: Any, kwargs: Mapping[str, Any]
+) -> EnvSpec | None:
+    """Make the spec of a vector env whose rows wear the wrapper `single(**kwargs)`.
+
+    `gym.make_vec` of it makes environments that are wrapped one by one: it puts no wrappers around
+    an env that is a vector by itself.
+
+    Args:
+        spec: Spec of the vector env, or None.
+        single: Class of the single wrapper.
+        kwargs: Keyword arguments of the wrapper.
+
+    Returns:
+        A JSON-able spec; None without one.
+    """
+    if spec is None:
+        return None
+    spec = copy.deepcopy(spec)
+    entry = f"{single.__module__}:{single.__name__}"
+    wrapper = WrapperSpec(single.class_name(), entry, copy.deepcopy(dict(kwargs)))
+    spec.additional_wrappers += (wrapper,)
+    if spec.kwargs.get("vectorization_mode") == VectorizeMode.VECTOR_ENTRY_POINT.value:
+        spec.kwargs["vectorization_mode"] = VectorizeMode.SYNC.value
+        spec.kwargs.pop("info", None)
+        if "autoreset_mode" in spec.kwargs:
+            mode = spec.kwargs.pop("autoreset_mode")
+            spec.kwargs["vector_kwargs"] = {"autoreset_mode": mode}
+    vector_kwargs = spec.kwargs.get("vector_kwargs", {})
+    if isinstance(vector_kwargs.get("autoreset_mode"), AutoresetMode):
+        vector_kwargs["autoreset_mode"] = vector_kwargs["autoreset_mode"].value
+    return spec
+
 
 Observations = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]

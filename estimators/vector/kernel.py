@@ -8,17 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.arrays import count_lanes
-from ...envs.backend.decorators import jit, jit_nrt
-from ...envs.backend.eights import prefetch
-from ...envs.backend.primitives import maximum, minimum
-from ...envs.backend.simd import LANES
-from ..core.memory import FILTER, N_SMALL, N_TOTAL, X_OFFSET, FilterRecord
-from ..entry import compile_call
+from ...envs.numerics.jit import jit, jit_nrt
+from ...envs.numerics.packed import count_lanes
+from ...envs.numerics.primitives import maximum, minimum
+from ...envs.numerics.simd import LANES
+from ...envs.numerics.simd8 import prefetch
+from ..core.record import FILTER, N_SMALL, N_TOTAL, X_OFFSET, FilterRecord
+from ..estimator import compile_call
 from ..wrappers.kernel import observe
-from .designs import get_gains
+from .lane_ticks import advance_block, get_gains
 from .lanes import LaneBlock, is_lane_compatible, make_blocks
-from .ticks import advance_block
 
 _MIN_LANES = 4  # filters that are computed alone in less time than in lanes
 

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import jit
-from ...envs.backend.eights import allocate_aligned, pad_to_cache_line
-from ...envs.backend.simd import LANES
+from ...envs.numerics.jit import jit
+from ...envs.numerics.simd import LANES
+from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line
 from ...envs.record import FAST, FAST_WIDTH
-from ..core.delay import BUFFER, LARSEN, store_due_captures
-from ..core.intersample import NONE
-from ..core.memory import N_CORE, N_FAST, N_INPUTS, N_SLOW, WINDOW, FilterRecord
-from ..core.transition import KINEMATIC, VELOCITY_ROLL
+from ..core.innovation import BUFFER, LARSEN, store_due_captures
+from ..core.model import KINEMATIC, VELOCITY_ROLL
+from ..core.record import N_CORE, N_FAST, N_INPUTS, N_SLOW, WINDOW, FilterRecord
+from ..core.update import NONE
 
 LaneBlock = Any
 """One record of the dtype `BLOCK`; `b` in compiled code."""

@@ -9,10 +9,9 @@ from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
 
 from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Array
 from ...envs.sensors.link import SlowSensor
-from ...envs.task.observation import ObservationEntry
-from ...envs.vehicle.vehicle import Vehicle
-from ..wrappers.arguments import EstimatorSpec, make_spec
-from ..wrappers.estimate import find_base_env
+from ...envs.task import ObservationEntry
+from ...envs.vehicle.parameters import Vehicle
+from ..wrappers.estimate import EstimatorSpec, find_base_env, make_spec
 
 IntArray = npt.NDArray[np.int64]
 

@@ -10,11 +10,11 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from ...envs.task.observation import make_space
+from ...envs.task import make_space
 from ..wrappers.truth import STIFFNESSES, make_truth_entries, read_parameters, read_states
 from ..wrappers.truth import TruthObservation as Single
+from .estimate import make_vector_spec
 from .records import get_env_state, get_true_states, get_true_vehicles
-from .spec import make_vector_spec
 
 Observations = npt.NDArray[np.float32]
 

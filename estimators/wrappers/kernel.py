@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from ...envs.backend.decorators import jit, noinline
-from ...envs.backend.elementary import wrap
-from ...envs.backend.primitives import maximum, minimum
-from ..core.memory import FILTER
-from ..core.run import advance, compute_deviation, read_covariance
-from ..entry import compile_call
-from ..learned.kernel import EXAMPLE, apply_correction, filter_and_correct, remove_correction
+from ...envs.numerics.functions import wrap
+from ...envs.numerics.jit import jit, noinline
+from ...envs.numerics.primitives import maximum, minimum
+from ..core.filter import advance, compute_deviation, read_covariance
+from ..core.record import FILTER
+from ..estimator import compile_call
+from ..learned.correction import EXAMPLE, apply_correction, filter_and_correct, remove_correction
 
 
 @jit

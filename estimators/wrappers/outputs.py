@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...envs.backend.decorators import as_python
-from ...envs.backend.elementary import wrap
-from ...envs.backend.primitives import ARRAYS
+from ...envs.numerics.functions import wrap
+from ...envs.numerics.jit import as_python
+from ...envs.numerics.primitives import ARRAYS
 from ...envs.record import Array
-from ...envs.task.observation import ObservationEntry
+from ...envs.task import ObservationEntry
 from ..design.models import FOREIGN_STATE, STATES
 from ..protocol import EstimatorLike, compute_std
 

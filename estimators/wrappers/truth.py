@@ -11,8 +11,8 @@ import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
 
 from ...envs.engine.views import TRUE_STATE
-from ...envs.task.observation import ObservationEntry, make_space
-from ...envs.vehicle.vehicle import Vehicle
+from ...envs.task import ObservationEntry, make_space
+from ...envs.vehicle.parameters import Vehicle
 from ..estimator import Estimator
 from ..protocol import ForeignEstimator
 
@@ -138,8 +138,8 @@ class TruthObservation(
 ):
     """Appends parameters of the true car, as they are at the reset, and true states.
 
-    No sensor measures these: it makes the oracles with which others are compared (`agents.rungs`),
-    and stands outside of any `EstimateObservation`. `layout` describes the whole observation.
+    No sensor measures these: it makes the oracles with which others are compared
+    (`agents.baselines`), and stands outside of any `EstimateObservation`. `layout` describes the whole observation.
     ValueError says that a name is unknown or stands twice.
 
     Args:

@@ -14,7 +14,7 @@ from gymnasium.wrappers import vector
 
 import sideslip
 from sideslip.agents import make_agent
-from sideslip.agents.env_facts import get_env_facts, get_layout
+from sideslip.agents.env_info import get_env_facts, get_layout
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.vector import EstimateObservation as BatchEstimate
 from sideslip.estimators.vector.truth import TruthObservation as BatchTruth

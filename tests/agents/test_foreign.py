@@ -10,9 +10,8 @@ from typer.testing import CliRunner
 from sideslip.agents import AGENTS, Agent, Controller, make_agent, register_agent
 from sideslip.agents.rollout import evaluate_costs, rollout
 from sideslip.benchmarks.cli.main import app
-from sideslip.benchmarks.control.build import make_cars
-from sideslip.benchmarks.control.cells import ControlEntry
-from sideslip.benchmarks.control.contests import ControlTask
+from sideslip.benchmarks.control.entries import ControlEntry, make_cars
+from sideslip.benchmarks.control.tasks import ControlTask
 from sideslip.estimators import register_estimator
 from sideslip.estimators.make import ESTIMATORS
 from tests.envs.helpers import bits
@@ -135,7 +134,7 @@ def test_bad_arguments() -> None:
 
 def test_a_policys_card_names_no_code() -> None:
     """It comes with a file from elsewhere."""
-    from sideslip.agents.learned.card import Card
+    from sideslip.agents.learned.policy import Card
 
     for name in ("os:system", "evil.py", "folder/evil.py:Filter"):
         with pytest.raises(ValueError, match="estimator is a name, got the entry point"):

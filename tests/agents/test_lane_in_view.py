@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.agents.rungs import make_oracle
+from sideslip.agents.baselines import make_oracle
 from sideslip.envs import SCENARIOS
 from sideslip.envs.record import PACKET
 from sideslip.envs.scenarios.scenario import Scenario

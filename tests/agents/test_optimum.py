@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from sideslip.agents.baselines import OUTPUTS
 from sideslip.agents.optimum import (
     Lqg,
     Optimum,
@@ -14,7 +15,6 @@ from sideslip.agents.optimum import (
     make_linear_plant,
     wrap_optimal_estimate,
 )
-from sideslip.agents.rungs import OUTPUTS
 from sideslip.envs.record import FAST
 from sideslip.estimators.vector.truth import TruthObservation
 

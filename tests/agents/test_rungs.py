@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sideslip.agents.baselines import ORACLES, make_noise_options, make_oracle
 from sideslip.agents.controllers.base import Controller
 from sideslip.agents.controllers.lqr import Lqr
 from sideslip.agents.design.sampled_model import compute_regulator, make_design_model
-from sideslip.agents.rungs import ORACLES, make_noise_options, make_oracle
 from sideslip.envs import COMS
 from sideslip.envs.scenarios.manoeuvres import SCENARIOS
 from tests.envs.helpers import bits

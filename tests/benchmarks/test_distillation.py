@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 pytest.importorskip("torch")
-from sideslip.agents.learned.files import Policy, save_policy
-from sideslip.agents.training.task import TrainingTask
-from sideslip.benchmarks import distillation
-from sideslip.benchmarks.control.build import make_cars
-from sideslip.benchmarks.control.cells import ADAPTIVE, ControlEntry
-from sideslip.benchmarks.control.contests import list_scored_tasks, vary_scenario
-from sideslip.benchmarks.distillation import (
+from sideslip.agents.learned.policy import Policy, save_policy
+from sideslip.agents.training.config import TrainingTask
+from sideslip.benchmarks.control.entries import ADAPTIVE, ControlEntry, make_cars
+from sideslip.benchmarks.control.tasks import list_scored_tasks, vary_scenario
+from sideslip.benchmarks.studies import policies
+from sideslip.benchmarks.studies.policies import (
     FILTERS,
     VARIED,
     list_tasks,
@@ -23,7 +22,7 @@ from sideslip.benchmarks.distillation import (
     make_lessons,
     prepare_start,
 )
-from sideslip.envs.vehicle.vehicles import VEHICLES
+from sideslip.envs.vehicle.parameters import VEHICLES
 from sideslip.estimators.learned.network import Network
 from tests.benchmarks.conftest import Run
 
@@ -120,7 +119,7 @@ def test_gps_or_camera_of_a_varied_lesson_is_out_for_seconds() -> None:
 
 def test_the_wind_of_a_varied_lesson_blows_from_both_sides() -> None:
     contest = list_tasks("coms-zero-slip")[0]
-    _, drawn = distillation._draw_changes(1, np.random.default_rng(0))
+    _, drawn = policies._draw_changes(1, np.random.default_rng(0))
     change = {key: value for key, value in drawn.items() if not key.endswith("_outage")}
     change |= {"mirror": False}  # which would turn every other wind round by itself
     calm = {key: value for key, value in change.items() if not key.startswith("wind_")}
@@ -137,12 +136,12 @@ def test_the_wind_of_a_varied_lesson_blows_from_both_sides() -> None:
 
 
 def test_who_cannot_drive_a_contest_is_no_number_of_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(distillation, "load_policy", Mock())
-    monkeypatch.setattr(distillation, "make_salted_seeds", lambda *_: [0])
-    monkeypatch.setattr(distillation, "run_chunk", lambda _: Mock(error="no camera"))
+    monkeypatch.setattr(policies, "load_policy", Mock())
+    monkeypatch.setattr(policies, "make_salted_seeds", lambda *_: [0])
+    monkeypatch.setattr(policies, "run_chunk", lambda _: Mock(error="no camera"))
     contest = list_tasks("coms-model")[0]
     with pytest.raises(ValueError, match=f"policy cannot drive {contest.name}: no camera"):
-        distillation._evaluate_task(Path("mine"), contest, 1)
+        policies._evaluate_task(Path("mine"), contest, 1)
 
 
 def test_every_contest_is_in_one_class() -> None:
@@ -200,7 +199,7 @@ def test_where_it_is_said_contests_are_varied_too() -> None:
     assert {"gps_outage", "camera_outage"} < {key for each in varied for key in each}
     assert task(seed=0).scenarios == found != task(seed=1).scenarios
     rng = np.random.default_rng(0)
-    taught = [each for _ in names for each in distillation._draw_changes(2, rng) if each]
+    taught = [each for _ in names for each in policies._draw_changes(2, rng) if each]
     outages = [
         {each[key] for each in those for key in each if key.endswith("_outage")}
         for those in (varied, taught)

@@ -6,9 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.benchmarks import estimation
 from sideslip.benchmarks.harness.parallel import run_cases
-from sideslip.benchmarks.papers.ledger.filters import make_filters
+from sideslip.benchmarks.papers.ledger import make_filters
+from sideslip.benchmarks.studies import estimation
 
 
 def _ratio(squares: np.ndarray, of: int, to: int) -> float:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.following import (
+from sideslip.benchmarks.studies.coordinated_control import (
     BANDWIDTHS,
     LANE_CONTROLLERS,
     compute_loop_radius,

@@ -5,9 +5,9 @@ import importlib.util
 import numpy as np
 import pytest
 
-from sideslip.benchmarks import highway
-from sideslip.benchmarks.harness.verdict import LETTERS, LINES
-from sideslip.envs.task.failures import COLLISION, DEPARTURE, RUNNING, SPIN
+from sideslip.benchmarks.harness.study import LETTERS, LINES
+from sideslip.benchmarks.studies import traffic
+from sideslip.envs.task import COLLISION, DEPARTURE, RUNNING, SPIN
 
 pytest.importorskip("highway_env")
 
@@ -23,29 +23,29 @@ def test_an_episode_is_that_of_the_environment() -> None:
     """Everybody drives the same seeds; without control the first numbers are the env's own."""
     import gymnasium as gym
 
-    env = gym.make(highway.ID, on_bad_action="fail")
-    env.reset(seed=highway.FIRST_SEED)
+    env = gym.make(traffic.ID, on_bad_action="fail")
+    env.reset(seed=traffic.FIRST_SEED)
     cost, over = 0.0, False
     while not over:
         _, reward, terminated, truncated, info = env.step([0.0])
         cost, over = cost - float(reward), terminated or truncated
-    ((found, failure, slip),) = highway.simulate_swerve(("none", (0,)))
+    ((found, failure, slip),) = traffic.simulate_swerve(("none", (0,)))
     assert (found, failure) == (cost, info["failure"])
     assert 0.0 < slip < 0.6
 
 
-@pytest.mark.parametrize("who", highway.CONTROLLERS)
+@pytest.mark.parametrize("who", traffic.CONTROLLERS)
 def test_every_contestant_drives(who: str) -> None:
-    numbers = highway.simulate_swerve((who, (1,)))
+    numbers = traffic.simulate_swerve((who, (1,)))
     assert numbers.shape == (1, 3) and np.isfinite(numbers).all()
 
 
 def test_the_verdict_names_the_best_and_why_the_others_fail() -> None:
-    swerves = {who: made(SPIN, DEPARTURE) for who in highway.CONTROLLERS}
+    swerves = {who: made(SPIN, DEPARTURE) for who in traffic.CONTROLLERS}
     swerves["none"] = made(SPIN, SPIN, COLLISION, DEPARTURE)
-    swerves["lqr"], swerves[highway.ORACLE] = made(COLLISION), made()
-    lanes = {name: np.full((2, 5), 0.1 * (1 + i)) for i, name in enumerate(highway.READERS)}
-    text = highway.compose_verdict(swerves, lanes)
+    swerves["lqr"], swerves[traffic.ORACLE] = made(COLLISION), made()
+    lanes = {name: np.full((2, 5), 0.1 * (1 + i)) for i, name in enumerate(traffic.READERS)}
+    text = traffic.compose_verdict(swerves, lanes)
     lines = text.splitlines()
     assert len(lines) <= LINES and max(map(len, lines)) <= LETTERS
     assert "lqr 90 % [" in lines[1] and "none 60 % [" in lines[1]
@@ -54,15 +54,15 @@ def test_the_verdict_names_the_best_and_why_the_others_fail() -> None:
 
 
 def test_without_highway_env_the_suite_has_no_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(highway, "find_spec", lambda name: None)
-    suite = highway.run(1, 1, 1)
+    monkeypatch.setattr(traffic, "find_spec", lambda name: None)
+    suite = traffic.run(1, 1, 1)
     assert not suite.rows and "sideslip[highway]" in suite.verdict
     assert importlib.util.find_spec("highway_env") is not None
 
 
 @pytest.mark.long
 def test_the_suite_has_its_tables_and_rows() -> None:
-    suite = highway.run(2, 1, 1)
+    suite = traffic.run(2, 1, 1)
     assert len(suite.tables) == 2
-    assert [cells[0] for cells in suite.tables[0].cells] == list(highway.CONTROLLERS)
+    assert [cells[0] for cells in suite.tables[0].cells] == list(traffic.CONTROLLERS)
     assert {row.metric for row in suite.rows} >= {"success_rate", "collision_rate", "offset"}

@@ -6,14 +6,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents.learned.files import load_policy
-from sideslip.benchmarks import learned
-from sideslip.benchmarks.control.build import make_estimate_options
-from sideslip.benchmarks.control.cells import LEARNED, ControlEntry
-from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, list_scored_tasks
-from sideslip.benchmarks.control.episodes import NUMBERS, DriveResult
-from sideslip.benchmarks.distillation import VARIED, _draw_changes
-from sideslip.benchmarks.learned import (
+from sideslip.agents.learned.policy import load_policy
+from sideslip.benchmarks.control.entries import LEARNED, ControlEntry, make_estimate_options
+from sideslip.benchmarks.control.run import NUMBERS, DriveResult
+from sideslip.benchmarks.control.tasks import NOMINAL, PARAMETERS, list_scored_tasks
+from sideslip.benchmarks.studies import learned
+from sideslip.benchmarks.studies.learned import (
     CONDITIONS,
     LATELY_MET,
     NEVER_MET,
@@ -22,6 +20,7 @@ from sideslip.benchmarks.learned import (
     make_condition_scenario,
     select_tasks,
 )
+from sideslip.benchmarks.studies.policies import VARIED, _draw_changes
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 
 

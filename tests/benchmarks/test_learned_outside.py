@@ -11,15 +11,18 @@ import pytest
 pytest.importorskip("vehiclemodels")
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks import learned_outside as outside_suite
-from sideslip.benchmarks.control.build import make_estimate_options
-from sideslip.benchmarks.control.cells import ADAPTIVE, LEARNED, ControlEntry
-from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, list_scored_tasks
-from sideslip.benchmarks.control.episodes import NUMBERS, Chunk, DriveResult
-from sideslip.benchmarks.control.run import CachedDrive, measure
-from sideslip.benchmarks.harness.drives import make_env
-from sideslip.benchmarks.learned import TransferResult, list_entries
-from sideslip.benchmarks.learned_outside import (
+from sideslip.benchmarks.control.entries import (
+    ADAPTIVE,
+    LEARNED,
+    ControlEntry,
+    make_estimate_options,
+)
+from sideslip.benchmarks.control.run import NUMBERS, CachedDrive, Chunk, DriveResult, measure
+from sideslip.benchmarks.control.tasks import NOMINAL, PARAMETERS, list_scored_tasks
+from sideslip.benchmarks.harness.study import make_env
+from sideslip.benchmarks.studies import learned_outside as outside_suite
+from sideslip.benchmarks.studies.learned import TransferResult, list_entries
+from sideslip.benchmarks.studies.learned_outside import (
     KINDS,
     MANOEUVRE,
     OUTSIDE_ID,

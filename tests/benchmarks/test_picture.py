@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from sideslip.benchmarks.control.contests import list_scored_tasks
+from sideslip.benchmarks.control.tasks import list_scored_tasks
 from sideslip.benchmarks.harness.results import ResultRow, Suite
 from sideslip.benchmarks.picture import find_partial_entries, write_picture
 

@@ -10,17 +10,18 @@ import pytest
 
 import sideslip
 from sideslip.agents import make_agent
-from sideslip.agents.learned.card import Card
-from sideslip.agents.learned.files import list_shipped, load_policy, save_policy
-from sideslip.benchmarks.control import seeds
+from sideslip.agents.learned.policy import Card, list_shipped, load_policy, save_policy
 from sideslip.benchmarks.control import suite as control
-from sideslip.benchmarks.control.build import make_cars, make_estimate_options
-from sideslip.benchmarks.control.cells import LEARNED, ControlEntry
-from sideslip.benchmarks.control.contests import ControlTask
-from sideslip.benchmarks.control.episodes import Chunk
-from sideslip.benchmarks.control.run import CachedDrive
-from sideslip.benchmarks.control.seeds import make_salt, make_salted_seeds
-from sideslip.benchmarks.policies import (
+from sideslip.benchmarks.control import tasks
+from sideslip.benchmarks.control.entries import (
+    LEARNED,
+    ControlEntry,
+    make_cars,
+    make_estimate_options,
+)
+from sideslip.benchmarks.control.run import CachedDrive, Chunk
+from sideslip.benchmarks.control.tasks import ControlTask, make_salt, make_salted_seeds
+from sideslip.benchmarks.studies.policies import (
     evaluate_policy,
     make_suite,
     record_evaluation,
@@ -103,7 +104,7 @@ def test_the_suite_tells_it_in_rows_table_and_pictures(tmp_path: Path) -> None:
 def test_without_the_classical_line_the_rest_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sideslip.benchmarks.policies.FILTER", "nobody-kf")
+    monkeypatch.setattr("sideslip.benchmarks.studies.policies.FILTER", "nobody-kf")
     found = evaluate_policy(str(a_file(tmp_path)), 2)
     assert list(found.drives) == ["damper", "none"]
     assert "lqr on nobody-kf was not driven" in make_suite(found).tables[0].note
@@ -151,7 +152,7 @@ def test_seeds_and_cached_cases_are_of_these_weights(
     save_policy(path, other, policy.card)
     assert not np.array_equal(cached(Chunk(cell, (1, 2))).numbers, first.numbers)
     salt = make_salt()
-    monkeypatch.setattr(seeds, "_CONTESTANTS", {"estimators": (".py", ".toml"), "agents": (".py",)})
+    monkeypatch.setattr(tasks, "_CONTESTANTS", {"estimators": (".py", ".toml"), "agents": (".py",)})
     assert make_salt() != salt
 
 

@@ -9,12 +9,16 @@ import pytest
 
 from sideslip import __version__
 from sideslip.benchmarks import readme
-from sideslip.benchmarks.control.cells import ControlEntry
-from sideslip.benchmarks.control.contests import NOMINAL, STATE, TITLES, list_scored_tasks
-from sideslip.benchmarks.control.episodes import NUMBERS, Chunk, DriveResult, run_chunk
-from sideslip.benchmarks.control.run import Results
-from sideslip.benchmarks.control.scores import compute_log_ratios
-from sideslip.benchmarks.control.seeds import make_task_seeds
+from sideslip.benchmarks.control.entries import ControlEntry
+from sideslip.benchmarks.control.run import NUMBERS, Chunk, DriveResult, Results, run_chunk
+from sideslip.benchmarks.control.score import compute_log_ratios
+from sideslip.benchmarks.control.tasks import (
+    NOMINAL,
+    STATE,
+    TITLES,
+    list_scored_tasks,
+    make_task_seeds,
+)
 from sideslip.benchmarks.harness.results import ResultRow, read_json, write_json
 
 ROOT = Path(readme.__file__ or "").resolve().parents[1]

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks import recovery
 from sideslip.benchmarks.picture import write_picture
-from sideslip.benchmarks.recovery import (
+from sideslip.benchmarks.report.html import write_report
+from sideslip.benchmarks.studies import recovery_region
+from sideslip.benchmarks.studies.recovery_region import (
     CARS,
     CLAIRVOYANT,
     ORACLES,
@@ -18,7 +19,6 @@ from sideslip.benchmarks.recovery import (
     compute_recovery_mask,
     make_grid,
 )
-from sideslip.benchmarks.report.html import write_report
 
 CAR, COMS = CARS
 
@@ -81,20 +81,20 @@ def test_starts_are_what_the_axes_say(monkeypatch: pytest.MonkeyPatch) -> None:
         seen.extend([seeds, info["beta"], info["gamma"]])
         return iter(())
 
-    monkeypatch.setattr(recovery, "iterate_steps", steps)
+    monkeypatch.setattr(recovery_region, "iterate_steps", steps)
     compute_recovery_mask(RecoveryCase(COMS, "none", (3, 2), 2))
     seeds, beta, gamma = seen
-    assert seeds == [recovery.FIRST_SEED, recovery.FIRST_SEED + 1] * 6
+    assert seeds == [recovery_region.FIRST_SEED, recovery_region.FIRST_SEED + 1] * 6
     betas, gammas = make_grid((3, 2))
     np.testing.assert_allclose(beta.reshape(2, 3, 2)[1, :, 0], betas, atol=1e-9)
     np.testing.assert_allclose(gamma.reshape(2, 3, 2)[:, 1, 1], gammas, atol=1e-9)
 
 
 def test_table_rows_maps_and_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recovery, "QUICK_POINTS", (3, 3))
-    monkeypatch.setattr(recovery, "QUICK_SEEDS", 4)
-    monkeypatch.setattr(recovery, "CONTROLLERS", ("none", "lqr"))
-    suite = recovery.run(quick=True, jobs=1)
+    monkeypatch.setattr(recovery_region, "QUICK_POINTS", (3, 3))
+    monkeypatch.setattr(recovery_region, "QUICK_SEEDS", 4)
+    monkeypatch.setattr(recovery_region, "CONTROLLERS", ("none", "lqr"))
+    suite = recovery_region.run(quick=True, jobs=1)
     assert [table.title for table in suite.tables] == list(CARS)
     shares = {(row.scenario, row.controller): row for row in suite.rows}
     names = ("none", "lqr", CLAIRVOYANT)
@@ -105,7 +105,7 @@ def test_table_rows_maps_and_picture(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert sure and all(0.0 <= row.low <= row.value <= row.high <= 1.0 for row in sure)
     for each in suite.maps:
         assert "deg" in each.x_label and "deg/s" in each.y_label
-        assert each.x[-1] == pytest.approx(np.degrees(recovery.MAX_START[0]))
+        assert each.x[-1] == pytest.approx(np.degrees(recovery_region.MAX_START[0]))
         assert {share.shape for share in each.shares.values()} == {(3, 3)}
     pytest.importorskip("matplotlib")
     write_picture(tmp_path / "maps.png", [suite])
@@ -118,9 +118,9 @@ def test_table_rows_maps_and_picture(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_without_plotly_the_tables_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "plotly", None)
-    monkeypatch.delitem(sys.modules, "sideslip.benchmarks.report.heat_maps", raising=False)
-    monkeypatch.setattr(recovery, "QUICK_POINTS", (1, 1))
-    monkeypatch.setattr(recovery, "QUICK_SEEDS", 1)
-    monkeypatch.setattr(recovery, "CONTROLLERS", ("none",))
-    suite = recovery.run(quick=True, jobs=1)
+    monkeypatch.delitem(sys.modules, "sideslip.benchmarks.report.figures", raising=False)
+    monkeypatch.setattr(recovery_region, "QUICK_POINTS", (1, 1))
+    monkeypatch.setattr(recovery_region, "QUICK_SEEDS", 1)
+    monkeypatch.setattr(recovery_region, "CONTROLLERS", ("none",))
+    suite = recovery_region.run(quick=True, jobs=1)
     assert suite.figures == [] and len(suite.tables) == len(suite.maps) == 2

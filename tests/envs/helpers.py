@@ -8,7 +8,7 @@ import numpy as np
 
 import sideslip
 from sideslip.envs import Record, StabilityEnv
-from sideslip.envs.sensors.noise import Noise
+from sideslip.envs.sensors.inertial import Noise
 
 assert sideslip.__version__  # importing it registers the ids
 IDS = tuple(

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.arguments import join_names, short_repr
 from sideslip.envs.scenarios.scenario import Scenario
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.stability import StabilityEnv
-from sideslip.envs.vehicle.vehicle import Vehicle
-from sideslip.envs.vehicle.vehicles import make_vehicle
+from sideslip.envs.validation import join_names, short_repr
+from sideslip.envs.vehicle.parameters import Vehicle, make_vehicle
 
 HUGE = 10**400
 ODD: tuple[Any, ...] = (

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, PASSENGER_CAR, SCENARIOS, VEHICLES, StabilityEnv, make_vehicle
-from sideslip.envs.quantities import check_plausible
 from sideslip.envs.scenarios.scenario import Scenario
-from sideslip.envs.vehicle.vehicle import Vehicle
+from sideslip.envs.validation import check_plausible
+from sideslip.envs.vehicle.parameters import Vehicle
 
 CAR = {
     name.replace("stiffness", "stiffness_per_tyre"): getattr(PASSENGER_CAR, name)

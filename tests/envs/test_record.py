@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, Log, Record, SlowSensor, StabilityEnv
+from sideslip.envs.engine.config import make_car
 from sideslip.envs.engine.layout import Z
-from sideslip.envs.engine.packing import make_car
 from sideslip.envs.record import (
     FAST,
     FAST_UNITS,
@@ -19,8 +19,7 @@ from sideslip.envs.record import (
 )
 from sideslip.envs.sensors.slow import SLOW, VALUES
 from sideslip.envs.ticks import TICK
-from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams
-from sideslip.envs.vehicle.integration import kutta3
+from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, kutta3
 from sideslip.envs.vehicle.tyres import LINEAR as LINEAR_TYRES
 from sideslip.envs.vehicle.tyres import TyreInputs, compute_tyre_load
 

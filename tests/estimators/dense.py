@@ -14,7 +14,7 @@ from scipy.linalg import expm, solve_triangular
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Record
 from sideslip.envs.sensors.slow import SLOW_NAMES
 from sideslip.envs.vehicle.linear import make_vision_model
-from sideslip.envs.vehicle.vehicle import COMS
+from sideslip.envs.vehicle.parameters import COMS
 
 STATES = ("beta", "gamma", "psi", "y_l", "phi", "phi_rate")
 PUSHED = {"d1": 0, "d2": 1, "d3": 2}

@@ -11,7 +11,7 @@ import numpy as np
 from sideslip.envs import Log, SlowSensor, StabilityEnv
 from sideslip.envs.record import FAST, PACKET, Record, concatenate
 from sideslip.envs.scenarios.scenario import Scenario
-from sideslip.envs.sensors.noise import Noise
+from sideslip.envs.sensors.inertial import Noise
 from sideslip.envs.vehicle.linear import LinearModel, make_vision_model
 
 STATES = ("beta", "gamma", "psi", "y_l", "F_d", "N_d")

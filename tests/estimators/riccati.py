@@ -9,9 +9,9 @@ import numpy.typing as npt
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.linear import LinearModel, make_vision_model
-from sideslip.envs.vehicle.vehicle import Vehicle
+from sideslip.envs.vehicle.parameters import Vehicle
 from sideslip.estimators.design.kalman import joseph_form, kalman_gain
-from sideslip.estimators.design.levels import DISTURBANCE, NOISE
+from sideslip.estimators.design.options import DISTURBANCE, NOISE
 from tests.estimators.dense import MEASURED
 
 Array = npt.NDArray[np.float64]

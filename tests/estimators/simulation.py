@@ -14,7 +14,7 @@ from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Log, Re
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.sensors.slow import SLOW_NAMES
 from sideslip.envs.vehicle.linear import LinearModel, make_vision_model
-from sideslip.envs.vehicle.vehicle import COMS, GRAVITY, Vehicle
+from sideslip.envs.vehicle.parameters import COMS, GRAVITY, Vehicle
 
 KMH = 1.0 / 3.6
 CAMERA = SlowSensor(period=0.033, delays=(0.030,))

@@ -8,7 +8,7 @@ import pytest
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Log, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import FILTERS, make_estimator
-from sideslip.estimators.core.memory import COUNTERS
+from sideslip.estimators.core.record import COUNTERS
 from tests.estimators.simulation import CAMERA, FIG7, GPS, simulate
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")

@@ -8,7 +8,7 @@ import pytest
 
 from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH, Log, Record
 from sideslip.estimators import make_estimator
-from sideslip.estimators.find_latency import LatencySearch, align_rows
+from sideslip.estimators.delayed_channels import LatencySearch, align_rows
 from tests.estimators.simulation import CAMERA, FIG7, simulate
 from tests.estimators.test_late import later
 

@@ -10,7 +10,7 @@ from sideslip.envs.record import FAST, PACKET, Log, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import Estimator, make_estimator
 from sideslip.estimators.analysis.bound import VehicleChange, compute_error_bound
-from sideslip.estimators.late import LateEstimator
+from sideslip.estimators.delayed_channels import LateEstimator
 from sideslip.estimators.vector.make import make_batch
 from tests.estimators.core.test_conditioning import CASES, EXACT, differences
 from tests.estimators.simulation import CAMERA, FIG7, simulate

@@ -8,7 +8,7 @@ import pytest
 
 from sideslip.agents import make_agent, register_agent
 from sideslip.estimators import make_estimator
-from sideslip.estimators.user_files import describe_error, find_class, is_user_file, load_user_class
+from sideslip.estimators.registry import describe_error, find_class, is_user_file, load_user_class
 
 AGENT = """
 class Still:

@@ -2,12 +2,11 @@
 
 from typing import Any, NamedTuple
 
-from ...backend.decorators import inline, jit
-from ...backend.elementary import PI, wrap
-from ...backend.primitives import absolute, select
-from ...backend.random import CHANNELS
+from ...numerics.functions import CHANNELS, PI, wrap
+from ...numerics.jit import inline, jit
+from ...numerics.primitives import absolute, select
 from ...vehicle.dynamics import compute_curvature
-from ..kind import Blocks, PacketValue, SlowKind
+from ..link import Blocks, PacketValue, SlowKind
 
 CAMERA_KIND = SlowKind(
     "camera",

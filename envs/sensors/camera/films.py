@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from .finder import Lane, LaneFinder
-from .road_image import Image
+from .images import Image
+from .lane_finder import Lane, LaneFinder
 
 PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 

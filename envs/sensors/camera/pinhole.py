@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ...arguments import describe_unknown, is_finite, short_repr
-from ...documents import read_document, write_document
+from ...io import read_document, write_document
+from ...validation import describe_unknown, is_finite, short_repr
 
 Array = npt.NDArray[np.floating[Any]]
 _MATRIX = ((640.0, 0.0, 639.5), (0.0, 640.0, 359.5), (0.0, 0.0, 1.0))

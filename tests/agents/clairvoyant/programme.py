@@ -14,7 +14,6 @@ import numpy.typing as npt
 import osqp
 from scipy import sparse
 
-from sideslip.agents.clairvoyant.foresight import Forecast, PlanParams, PlanState, PreviewStep
 from sideslip.agents.clairvoyant.plant import (
     advance,
     compute_node_cost,
@@ -22,6 +21,7 @@ from sideslip.agents.clairvoyant.plant import (
     get_state_scales,
     list_active_states,
 )
+from sideslip.agents.clairvoyant.preview import Forecast, PlanParams, PlanState, PreviewStep
 
 Array = npt.NDArray[np.float64]
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import sideslip
-from sideslip.envs.backend.arrays import read
 from sideslip.envs.engine.layout import P, Z
-from sideslip.envs.scenarios.wind import Wind, compute_wind
+from sideslip.envs.numerics.packed import read
+from sideslip.envs.scenarios.driver import Wind, compute_wind
 from sideslip.envs.vehicle.actuators import allocate_torques
 from sideslip.estimators import EstimateObservation
 
@@ -17,7 +17,6 @@ ca = pytest.importorskip("casadi")
 pytest.importorskip("osqp")
 from sideslip.agents import make_agent  # noqa: E402
 from sideslip.agents.clairvoyant import plan as clairvoyant  # noqa: E402
-from sideslip.agents.clairvoyant.foresight import PlanState, PreviewStep, make_forecast  # noqa: E402
 from sideslip.agents.clairvoyant.plan import (  # noqa: E402
     PlanReplay,
     compute_clairvoyant,
@@ -27,8 +26,9 @@ from sideslip.agents.clairvoyant.plan import (  # noqa: E402
     solve_ilqr,
 )
 from sideslip.agents.clairvoyant.plant import advance  # noqa: E402
+from sideslip.agents.clairvoyant.preview import PlanState, PreviewStep, make_forecast  # noqa: E402
 from sideslip.agents.rollout import rollout  # noqa: E402
-from sideslip.envs.backend.on_casadi import to_casadi  # noqa: E402
+from sideslip.envs.numerics.casadi_backend import to_casadi  # noqa: E402
 
 assert sideslip.__version__
 ID = "sideslip/YawFusion-v0"

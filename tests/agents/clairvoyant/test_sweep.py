@@ -6,8 +6,12 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import lsq_linear
 
 pytest.importorskip("casadi")
-from sideslip.agents.clairvoyant.slopes import Limits, Linearisation
-from sideslip.agents.clairvoyant.sweep import run_backward_pass, solve_input_qp
+from sideslip.agents.clairvoyant.sweep import (
+    Limits,
+    Linearisation,
+    run_backward_pass,
+    solve_input_qp,
+)
 
 
 def test_the_cheapest_step_is_that_of_bounded_least_squares() -> None:

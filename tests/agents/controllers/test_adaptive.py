@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.adaptive import INVERSE_FRICTION, TYRES
+from sideslip.agents.baselines import make_noise_options
 from sideslip.agents.controllers.lqr import IN, make_design_state
-from sideslip.agents.rungs import make_noise_options
-from sideslip.benchmarks.control.cells import ControlEntry
-from sideslip.benchmarks.control.contests import STEERING, ControlTask
-from sideslip.benchmarks.control.episodes import Chunk, run_chunk
+from sideslip.agents.controllers.nmpc import INVERSE_FRICTION, TYRES
+from sideslip.benchmarks.control.entries import ControlEntry
+from sideslip.benchmarks.control.run import Chunk, run_chunk
+from sideslip.benchmarks.control.tasks import STEERING, ControlTask
 from sideslip.envs import make_scenario
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.vector import EstimateObservation as Vector

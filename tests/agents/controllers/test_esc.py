@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.esc import compute_yaw_gains
+from sideslip.agents.controllers.yaw_stability import compute_yaw_gains
 from sideslip.envs import COMS, PASSENGER_CAR, critical_speed
 from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation

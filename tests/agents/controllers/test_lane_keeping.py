@@ -9,8 +9,7 @@ import pytest
 
 from sideslip.agents import make_agent
 from sideslip.agents.controllers.lane_keeping import HASTE, MOVED, LaneKeeping, make_lane_model
-from sideslip.agents.design.gain_schedule import SPEEDS
-from sideslip.agents.design.sampled_model import solve_lqr
+from sideslip.agents.design.sampled_model import SPEEDS, solve_lqr
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from sideslip.agents import Lqr, make_agent
-from sideslip.agents.design.gain_schedule import SPEEDS
 from sideslip.agents.design.sampled_model import (
     DYNAMIC,
+    SPEEDS,
     DesignSpec,
     compute_regulator,
     make_design_model,
 )
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.task.reference import MODEL, ZERO_SLIP, compute_reference, make_reference_params
+from sideslip.envs.task import MODEL, ZERO_SLIP, compute_reference, make_reference_params
 from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation
 

@@ -12,7 +12,7 @@ import pytest
 from sideslip.agents import make_agent
 from sideslip.agents.controllers.lqr import Lqr
 from sideslip.agents.controllers.mpc import NOT_FINITE, Mpc
-from sideslip.agents.design.gain_schedule import SPEEDS
+from sideslip.agents.design.sampled_model import SPEEDS
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation
 from tests.envs.helpers import bits

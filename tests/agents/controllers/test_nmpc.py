@@ -9,6 +9,7 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 
 from sideslip.agents import Nmpc, make_agent
+from sideslip.agents.baselines import make_oracle
 from sideslip.agents.controllers.nmpc import _shift_plan, prepare_prediction
 from sideslip.agents.design.gauss_newton import (
     DIFFERENCE,
@@ -19,10 +20,8 @@ from sideslip.agents.design.gauss_newton import (
     solve_damped_step,
     update_plan,
 )
-from sideslip.agents.design.prediction import simulate_plans
-from sideslip.agents.design.prediction_model import make_blocks
-from sideslip.agents.rungs import make_oracle
-from sideslip.envs.backend.on_casadi import SYMBOLS, to_casadi
+from sideslip.agents.design.prediction import make_blocks, simulate_plans
+from sideslip.envs.numerics.casadi_backend import SYMBOLS, to_casadi
 from sideslip.estimators.wrappers.truth import TruthObservation
 
 YAW, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.sliding_mode import SlidingMode, compute_surface_slope
-from sideslip.agents.design.nominal_car import BicyclePlant
+from sideslip.agents.controllers.yaw_stability import SlidingMode, compute_surface_slope
+from sideslip.agents.design.pi import BicyclePlant
 from sideslip.envs import COMS, critical_speed
 from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation

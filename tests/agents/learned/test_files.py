@@ -16,8 +16,7 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-from sideslip.agents.learned.card import Card
-from sideslip.agents.learned.files import FORMAT, list_shipped, load_policy, save_policy
+from sideslip.agents.learned.policy import FORMAT, Card, list_shipped, load_policy, save_policy
 from sideslip.estimators.learned.network import Network
 
 pytestmark = pytest.mark.plain
@@ -106,7 +105,7 @@ def test_a_kill_during_a_save_keeps_the_old_file(file: Path) -> None:
     before = file.read_bytes()
     code = (
         "import os, signal, sys\n"
-        "from sideslip.agents.learned.files import load_policy, save_policy\n"
+        "from sideslip.agents.learned.policy import load_policy, save_policy\n"
         "policy = load_policy(sys.argv[1])\n"
         "os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)\n"
         "save_policy(sys.argv[1], policy.network.select_inputs(policy.reads), policy.card)\n"
@@ -236,7 +235,7 @@ def test_a_file_of_the_first_format_is_a_network_without_memory(file: Path) -> N
 
 
 def test_a_file_too_large_is_not_opened(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sideslip.estimators.learned.network_file.MAX_BYTES", 1000)
+    monkeypatch.setattr("sideslip.estimators.learned.network.MAX_BYTES", 1000)
     with pytest.raises(ValueError, match=r"bytes, a policy has at most 1000"):
         load_policy(file)
 

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from sideslip.agents import PolicyController
-from sideslip.agents.learned.card import Card
-from sideslip.agents.learned.files import Policy, load_policy, save_policy
-from sideslip.estimators.learned.memory import CELL_WEIGHTS, GATES, RecurrentCell
-from sideslip.estimators.learned.network import ACTIVATIONS, Network
+from sideslip.agents.learned.policy import Card, Policy, load_policy, save_policy
+from sideslip.estimators.learned.forward import ACTIVATIONS, CELL_WEIGHTS, GATES, RecurrentCell
+from sideslip.estimators.learned.network import Network
 
 torch = pytest.importorskip("torch")
 torch.set_num_threads(1)

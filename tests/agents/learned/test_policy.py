@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents import PolicyController, make_agent
-from sideslip.agents.learned.card import Card
-from sideslip.agents.learned.files import Policy, save_policy
+from sideslip.agents.learned.policy import Card, Policy, save_policy
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.learned.network import Network
 

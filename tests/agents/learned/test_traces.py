@@ -7,17 +7,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.agents.learned.card import Card
-from sideslip.agents.learned.files import load_policy, save_policy
-from sideslip.estimators.learned.memory import MovingAverages
+from sideslip.agents.learned.policy import Card, load_policy, save_policy
+from sideslip.estimators.learned.forward import MovingAverages
 from sideslip.estimators.learned.network import Network
 
 pytest.importorskip("torch")
 import torch
 
-from sideslip.agents.training.student import DistillConfig, Student, _EpisodeBatches
-from sideslip.agents.training.traces.drives import Demonstrations, Scaling
-from sideslip.agents.training.traces.layer import TraceLayer
+from sideslip.agents.training.networks import TraceLayer
+from sideslip.agents.training.student import (
+    Demonstrations,
+    DistillConfig,
+    Scaling,
+    Student,
+    _EpisodeBatches,
+)
 
 CARD = Card.from_env_id("sideslip/YawVision-v0")
 WIDE, RNG = len(CARD.observation), np.random.default_rng(0)

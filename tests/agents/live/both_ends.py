@@ -7,12 +7,18 @@ from typing import Any
 import gymnasium as gym
 
 from sideslip.agents import make_agent
-from sideslip.agents.live.assemble import PATIENCE, Arrival, StreamSynchroniser, Tick
-from sideslip.agents.live.datagrams import FIELDS, TICK_US, DatagramKind, encode
-from sideslip.agents.live.loop import Loop
-from sideslip.agents.live.onboard import OnboardController
-from sideslip.agents.live.port import Port
-from sideslip.agents.live.session import Recorder
+from sideslip.agents.live.controller import OnboardController, Recorder
+from sideslip.agents.live.loop import Loop, Port
+from sideslip.agents.live.messages import (
+    FIELDS,
+    PATIENCE,
+    TICK_US,
+    Arrival,
+    DatagramKind,
+    StreamSynchroniser,
+    Tick,
+    encode,
+)
 from sideslip.agents.live.simulate import WireAgent, simulate
 from sideslip.agents.rollout import Rollout
 from sideslip.estimators import EstimateObservation

@@ -5,8 +5,16 @@ import random
 import numpy as np
 import pytest
 
-from sideslip.agents.live.assemble import MAX_BEHIND, MAX_HELD, Arrival, StreamSynchroniser, Tick
-from sideslip.agents.live.datagrams import DatagramKind, RejectReason, encode
+from sideslip.agents.live.messages import (
+    MAX_BEHIND,
+    MAX_HELD,
+    Arrival,
+    DatagramKind,
+    RejectReason,
+    StreamSynchroniser,
+    Tick,
+    encode,
+)
 from sideslip.envs.record import FAST, PACKET
 from tests.agents.live.both_ends import camera, inertial
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sideslip.agents.live.datagrams import (
+from sideslip.agents.live.messages import (
     FIELDS,
     HEADER,
     LIMIT,

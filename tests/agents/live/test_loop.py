@@ -8,11 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.agents.live.assemble import Arrival, StreamSynchroniser
-from sideslip.agents.live.datagrams import FIELDS, TICK_US, DatagramKind, Message, decode
-from sideslip.agents.live.loop import PERIOD, Histogram, Loop
-from sideslip.agents.live.onboard import OnboardController
-from sideslip.agents.live.port import MAX_BATCH, Port, clock, parse_address
+from sideslip.agents.live.controller import OnboardController
+from sideslip.agents.live.loop import MAX_BATCH, PERIOD, Histogram, Loop, Port, clock, parse_address
+from sideslip.agents.live.messages import (
+    FIELDS,
+    TICK_US,
+    Arrival,
+    DatagramKind,
+    Message,
+    StreamSynchroniser,
+    decode,
+)
 from tests.agents.live.both_ends import SEED, VISION, camera, contestant, inertial
 
 ROW = [0.0, 0.0, 0.0, 0.0, 7.0, 7.0] + [0.0] * (len(FIELDS[DatagramKind.INERTIAL]) - 6)

@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.agents.live import session
-from sideslip.agents.live.assemble import PATIENCE
-from sideslip.agents.live.onboard import OnboardController
-from sideslip.agents.live.session import (
+from sideslip.agents.live import controller
+from sideslip.agents.live.controller import (
     _BLOCK,
     _ITEM,
     _MAGIC,
+    OnboardController,
     Recorder,
     read_blocks,
     read_setup,
     replay,
 )
+from sideslip.agents.live.messages import PATIENCE
 from tests.agents.live.both_ends import SEED, STEERING, contestant, drive
 
 SETUP: dict[str, Any] = {
@@ -123,7 +123,7 @@ def test_after_a_crash_all_but_the_last_block_is_there(tmp_path: Path) -> None:
     """Nothing waits in memory but the block at hand."""
     path = tmp_path / "a.session"
     recorder = Recorder(path, SETUP)
-    for i in range(3 * session.MAX_BATCHES + 7):
+    for i in range(3 * controller.MAX_BATCHES + 7):
         recorder.take([bytes([i % 256])])
     batches = [batch for block in read_blocks(path) for batch in block.batches]
     assert [batch[0].data[0] for batch in batches] == [i % 256 for i in range(300)]

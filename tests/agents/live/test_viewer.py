@@ -17,8 +17,8 @@ from rich.console import Console
 
 pytest.importorskip("aiohttp")
 
-from sideslip.agents.live.datagrams import DatagramKind, LoopStatus, encode
-from sideslip.agents.live.port import LOOPBACK, Port
+from sideslip.agents.live.loop import LOOPBACK, Port
+from sideslip.agents.live.messages import DatagramKind, LoopStatus, encode
 from sideslip.agents.live.viewer import Viewer, ViewerProtocol, make_event, make_table
 
 NAMES = ("beta", "gamma", "F_d")

@@ -7,8 +7,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents.live.onboard import OnboardController
-from sideslip.agents.live.port import Port
+from sideslip.agents.live.controller import OnboardController
+from sideslip.agents.live.loop import Port
 from sideslip.agents.live.simulate import MAX_TICKS, simulate
 from sideslip.agents.rollout import Rollout, rollout
 from sideslip.envs.record import FAST

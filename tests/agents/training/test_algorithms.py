@@ -13,27 +13,20 @@ pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 import torch
 
-from sideslip.agents.learned.files import load_policy
-from sideslip.agents.learned.policy import PolicyController
-from sideslip.agents.training import keeper, train
-from sideslip.agents.training.algorithms import (
+from sideslip.agents.learned.policy import PolicyController, load_policy
+from sideslip.agents.training import callbacks, trainer
+from sideslip.agents.training.callbacks import BEST, CHECKPOINT, POLICY, Progress, RunOptions
+from sideslip.agents.training.checkpoint import read_state
+from sideslip.agents.training.config import (
     ALGORITHMS,
     HYPERPARAMS,
     WARM_START_ENTRY,
     WARM_START_TRACES_ENTRY,
+    TrainingTask,
     check_settings,
     get_algorithm,
     make_model_options,
     read_settings,
-)
-from sideslip.agents.training.checkpoint import read_state
-from sideslip.agents.training.train import (
-    BEST,
-    CHECKPOINT,
-    POLICY,
-    Progress,
-    RunOptions,
-    TrainingTask,
 )
 
 SMALL: dict[str, Any] = {"n_steps": 16, "learning_starts": 64, "buffer_size": 4096}
@@ -43,7 +36,7 @@ EACH = RunOptions(eval_freq=ROLLOUT)
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(keeper, "_SCALING_ENVS", 8)
+    monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
     threads = torch.get_num_threads()
     yield
     torch.set_num_threads(threads)
@@ -77,20 +70,20 @@ def trained(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     """(task, folder, model) of two rollouts."""
     task, folder = tiny(request.param), tmp_path_factory.mktemp(request.param)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(keeper, "_SCALING_ENVS", 8)
-        model = train.train(task, 2 * ROLLOUT, folder, run_options=EACH).model
+        patch.setattr(callbacks, "_SCALING_ENVS", 8)
+        model = trainer.train(task, 2 * ROLLOUT, folder, run_options=EACH).model
     return task, folder, model
 
 
 def test_it_goes_on_where_the_checkpoint_is(trained: Any) -> None:
     task, folder, model = trained
-    again = train.train(task, 2 * ROLLOUT, folder, resume=True)  # there is nothing to do
+    again = trainer.train(task, 2 * ROLLOUT, folder, resume=True)  # there is nothing to do
     one, other = tensors(model), tensors(again.model)
     assert one.keys() == other.keys() and len(one) > 30
     assert all(torch.equal(one[name], other[name]) for name in one)
     assert any("log_ent_coef" in name for name in one) == (task.algo in ("sac", "tqc"))
     before = {name: value.clone() for name, value in other.items()}
-    more = train.train(task, 4 * ROLLOUT, folder, resume=True, run_options=EACH)
+    more = trainer.train(task, 4 * ROLLOUT, folder, resume=True, run_options=EACH)
     assert [each.steps // ROLLOUT for each in more.evaluations] == [0, 1, 2, 3, 4]
     moved = tensors(more.model)
     actor = [name for name in moved if "policy " in name and name.endswith(".weight")]
@@ -120,7 +113,7 @@ def test_numpys_policy_drives_as_torchs(trained: Any) -> None:
 
 def test_the_same_seed_trains_the_same(trained: Any, tmp_path: Path) -> None:
     task, _, model = trained
-    here = train.train(task, 2 * ROLLOUT, tmp_path, run_options=EACH)
+    here = trainer.train(task, 2 * ROLLOUT, tmp_path, run_options=EACH)
     one, other = tensors(model), tensors(here.model)
     assert all(torch.equal(one[name], other[name]) for name in one)
 
@@ -128,7 +121,7 @@ def test_the_same_seed_trains_the_same(trained: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_weights_of_nan_stop_it(algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the step; the checkpoint is that of the last evaluation."""
-    models, real = list[Any](), train.EvalCallback.build
+    models, real = list[Any](), trainer.EvalCallback.build
 
     def built(*arguments: Any) -> Any:
         models.append(real(*arguments))
@@ -139,10 +132,10 @@ def test_weights_of_nan_stop_it(algo: str, tmp_path: Path, monkeypatch: pytest.M
             with torch.no_grad():
                 next(models[0].policy.parameters()).fill_(float("nan"))
 
-    monkeypatch.setattr(train.EvalCallback, "build", built)
+    monkeypatch.setattr(trainer.EvalCallback, "build", built)
     means = RunOptions(eval_freq=ROLLOUT, report=spoil)
     with pytest.raises(FloatingPointError, match=f"after step {2 * ROLLOUT}; .*{CHECKPOINT}"):
-        train.train(tiny(algo), 4 * ROLLOUT, tmp_path, run_options=means)
+        trainer.train(tiny(algo), 4 * ROLLOUT, tmp_path, run_options=means)
     assert read_state(tmp_path / CHECKPOINT)["steps"] == ROLLOUT
 
 

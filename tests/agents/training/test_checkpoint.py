@@ -11,8 +11,10 @@ import torch
 from safetensors.torch import save
 
 from sideslip import __version__
+from sideslip.agents.training.callbacks import CHECKPOINT
 from sideslip.agents.training.checkpoint import FORMAT, STATE
-from sideslip.agents.training.train import CHECKPOINT, TrainingTask, read_run_record, read_task
+from sideslip.agents.training.config import TrainingTask
+from sideslip.agents.training.trainer import read_run_record, read_task
 
 WHOLE: dict[str, object] = dict.fromkeys(sorted(STATE), 0)
 WHOLE |= {"format": FORMAT, "task": dataclasses.asdict(TrainingTask()), "sideslip": __version__}

@@ -19,10 +19,9 @@ from sideslip.agents.training.corrections import (
     compute_quality,
     train_correction,
 )
-from sideslip.benchmarks.control.seeds import make_tuning_seeds
-from sideslip.estimators.learned.correction import learned
-from sideslip.estimators.learned.files import CorrectionCard
-from sideslip.estimators.learned.kernel import locate_stack
+from sideslip.benchmarks.control.tasks import make_tuning_seeds
+from sideslip.estimators.learned.correction import learned, locate_stack
+from sideslip.estimators.learned.correction_file import CorrectionCard
 from sideslip.estimators.vector.estimate import EstimateObservation
 from tests.estimators.learned.test_correction import READ, correction
 

@@ -11,21 +11,22 @@ import pytest
 pytest.importorskip("torch")
 import torch
 
-from sideslip.agents.learned.card import Card
-from sideslip.agents.learned.files import load_policy
+from sideslip.agents.baselines import make_oracle
+from sideslip.agents.learned.policy import Card, load_policy
 from sideslip.agents.rollout import COST_FLOOR
-from sideslip.agents.rungs import make_oracle
 from sideslip.agents.training import distill as training
 from sideslip.agents.training.distill import DistillTask, collect_demonstrations, distill
-from sideslip.agents.training.student import DistillConfig, Student, fit_model
-from sideslip.agents.training.traces.drives import (
+from sideslip.agents.training.student import (
     UNREAD,
     Demonstrations,
+    DistillConfig,
     Scaling,
+    Student,
     compute_scaling,
+    fit_model,
     normalise_inputs,
 )
-from sideslip.envs.task.observation import ObservationEntry
+from sideslip.envs.task import ObservationEntry
 
 ID, CARS = "sideslip/YawFusion-v0", 16
 SHORT = {"base": "coms-step", "duration": 1.2, "onset": 0.1}

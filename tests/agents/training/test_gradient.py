@@ -9,18 +9,17 @@ import pytest
 pytest.importorskip("stable_baselines3")
 import torch
 
-from sideslip.agents.learned.files import load_policy
-from sideslip.agents.learned.policy import PolicyController
+from sideslip.agents.learned.policy import PolicyController, load_policy
+from sideslip.agents.training.callbacks import EvalCallback, RunOptions
+from sideslip.agents.training.config import TrainingTask
 from sideslip.agents.training.gradient import (
     AnalyticPolicyGradient,
     GruPolicy,
     TrainingSource,
     unroll_window,
 )
-from sideslip.agents.training.keeper import EvalCallback, RunOptions
-from sideslip.agents.training.rewards import RewardScale
-from sideslip.agents.training.task import TrainingTask
-from sideslip.agents.vec_env.env import make_vec_env
+from sideslip.agents.training.warm_start import RewardScale
+from sideslip.agents.vec_env import make_vec_env
 from sideslip.envs.device import DeviceVectorEnv
 
 VISION, FUSION = "sideslip/YawVision-v0", "sideslip/YawFusion-v0"

@@ -11,11 +11,15 @@ import torch
 
 from sideslip.agents.optimum import Lqg, wrap_optimal_estimate
 from sideslip.agents.training.distill import DistillTask, collect_demonstrations
-from sideslip.agents.training.memory.imitation import MemoryAgent, train_memory
-from sideslip.agents.training.memory.inputs import MAX_AGE, RATE, CompactObservation
-from sideslip.agents.training.memory.networks import MEMORIES, Kalman, make_memory
-from sideslip.agents.training.student import DistillConfig
-from sideslip.agents.training.traces.drives import compute_scaling, normalise_inputs
+from sideslip.agents.training.networks import MAX_AGE, RATE, CompactObservation
+from sideslip.agents.training.recurrent import (
+    MEMORIES,
+    Kalman,
+    MemoryAgent,
+    make_memory,
+    train_memory,
+)
+from sideslip.agents.training.student import DistillConfig, compute_scaling, normalise_inputs
 
 ID, CARS, INPUTS, FRESH, STEPS = "sideslip/LinearYawVision-v0", 16, 5, 4, 90
 CAMERA = {"period": 0.04, "delays": [0.03], "loss": 0.3}

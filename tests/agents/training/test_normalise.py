@@ -6,8 +6,8 @@ import pytest
 pytest.importorskip("stable_baselines3")
 import torch
 
+from sideslip.agents.training.config import TrainingTask
 from sideslip.agents.training.normalise import CLIP, Standardised, measure_scaling
-from sideslip.agents.training.train import TrainingTask
 
 
 def test_observations_are_standardised_by_the_network() -> None:

@@ -10,21 +10,19 @@ import pytest
 pytest.importorskip("stable_baselines3")
 import torch
 
-from sideslip.agents.learned.card import Card
-from sideslip.agents.learned.files import Policy, load_policy
+from sideslip.agents.learned.policy import Card, Policy, load_policy
 from sideslip.agents.rollout import evaluate_costs
-from sideslip.agents.training.export import convert_sb3_policy
-from sideslip.agents.training.keeper import (
+from sideslip.agents.training.callbacks import (
     _SCALING_SEEDS,
     WARM_START_FILE,
     RunOptions,
     make_evaluation_seeds,
 )
-from sideslip.agents.training.starts import NetworkAgent, PolicyWarmStart, make_finetune_task
-from sideslip.agents.training.student import DistillConfig, Student
-from sideslip.agents.training.traces.drives import Scaling
-from sideslip.agents.training.traces.remembered import MemoryObservation, measure_mixing
-from sideslip.agents.training.train import train
+from sideslip.agents.training.export import convert_sb3_policy
+from sideslip.agents.training.networks import MemoryObservation, measure_mixing
+from sideslip.agents.training.student import DistillConfig, Scaling, Student
+from sideslip.agents.training.trainer import train
+from sideslip.agents.training.warm_start import NetworkAgent, PolicyWarmStart, make_finetune_task
 
 ID = "sideslip/YawFusion-v0"
 OPTIONS: dict[str, Any] = {"vehicle": "coms", "nominal": "coms", "reference": "zero-slip"}

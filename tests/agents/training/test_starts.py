@@ -12,11 +12,10 @@ pytest.importorskip("stable_baselines3")
 import torch
 from stable_baselines3.common.logger import configure
 
-from sideslip.agents.learned.files import Policy, load_policy
+from sideslip.agents.learned.policy import Policy, load_policy
 from sideslip.agents.rollout import COST_FLOOR, evaluate_costs
-from sideslip.agents.training import keeper
-from sideslip.agents.training.algorithms import HYPERPARAMS
-from sideslip.agents.training.keeper import (
+from sideslip.agents.training import callbacks
+from sideslip.agents.training.callbacks import (
     CHECKPOINT,
     WARM_START_FILE,
     EvalCallback,
@@ -24,11 +23,17 @@ from sideslip.agents.training.keeper import (
     RunOptions,
     make_evaluation_seeds,
 )
-from sideslip.agents.training.rewards import RewardScale, RewardScaleWrapper, measure_reward_scale
-from sideslip.agents.training.starts import NetworkAgent, make_finetune_task, resolve_settings
-from sideslip.agents.training.task import TrainingTask
-from sideslip.agents.training.train import load_initial_policy, read_task, train
-from sideslip.agents.vec_env.env import make_vec_env
+from sideslip.agents.training.config import HYPERPARAMS, TrainingTask
+from sideslip.agents.training.trainer import load_initial_policy, read_task, train
+from sideslip.agents.training.warm_start import (
+    NetworkAgent,
+    RewardScale,
+    RewardScaleWrapper,
+    make_finetune_task,
+    measure_reward_scale,
+    resolve_settings,
+)
+from sideslip.agents.vec_env import make_vec_env
 from sideslip.envs.device import DeviceVectorEnv
 
 POLICY = load_policy("distill-coms-yaw")
@@ -141,7 +146,7 @@ def test_what_a_training_drives_is_what_the_policy_drove(
     options = car | {"scenario": {"base": base, "duration": 0.3}}
     more: dict[str, Any] = {"num_envs": 4, "n_eval_envs": 4, "env_options": options}
     task = make_finetune_task(policy, algo=algo, **more)
-    monkeypatch.setattr(keeper, "load_parameters", lambda *_: None)
+    monkeypatch.setattr(callbacks, "load_parameters", lambda *_: None)
     network, saved = policy.network, None
     if steps:
         scaling = network.mean.tolist(), network.scale.tolist(), network.clip, None

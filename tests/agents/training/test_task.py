@@ -9,13 +9,13 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 from sideslip.agents.controllers.base import NoControl
-from sideslip.agents.learned.files import load_policy
-from sideslip.agents.learned.policy import PolicyController
+from sideslip.agents.learned.policy import PolicyController, load_policy
 from sideslip.agents.rollout import evaluate_costs
-from sideslip.agents.training import keeper, train
-from sideslip.agents.training.rewards import compute_equal_weights, compute_scenario_weights
-from sideslip.agents.training.task import TrainingTask
-from sideslip.agents.training.train import POLICY, RunOptions, read_task
+from sideslip.agents.training import callbacks, trainer
+from sideslip.agents.training.callbacks import POLICY, RunOptions
+from sideslip.agents.training.config import TrainingTask
+from sideslip.agents.training.trainer import read_task
+from sideslip.agents.training.warm_start import compute_equal_weights, compute_scenario_weights
 
 TINY, ROLLOUT = TrainingTask(num_envs=8, seed=3, n_eval_envs=4), 256  # steps of 8 environments
 MIXTURE: list[Any] = ["coms-slalom", {"base": "coms-step", "duration": 0.3}]
@@ -40,20 +40,20 @@ def test_a_mixture_may_be_of_roads_on_which_controllers_are_told_other_friction(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They would need a design for each kind of car; a network needs none."""
-    monkeypatch.setattr(keeper, "_SCALING_ENVS", 8)
+    monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
     options = {"vehicle": "passenger-car", "nominal": "passenger-car"}
     scenarios = ["car-step", "any-friction-step"]
     task = dataclasses.replace(TINY, env_options=options, scenarios=scenarios)
     cars: Any = task.vector_env(2).unwrapped
     assert cars.nominal[0] != cars.nominal[1]
-    train.train(task, ROLLOUT, tmp_path)
+    trainer.train(task, ROLLOUT, tmp_path)
     assert load_policy(tmp_path / POLICY).card.algorithm_options["scenarios"] == scenarios
 
 
 def test_a_policy_of_a_mixture_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(keeper, "_SCALING_ENVS", 8)
+    monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
     task = dataclasses.replace(TINY, scenarios=MIXTURE)
-    train.train(task, ROLLOUT, tmp_path)
+    trainer.train(task, ROLLOUT, tmp_path)
     card = load_policy(tmp_path / POLICY).card
     assert card.algorithm_options["scenarios"] == MIXTURE
     assert card.env_options == {"scenario": MIXTURE[0]}
@@ -65,14 +65,14 @@ def test_the_scenarios_of_a_mixture_weigh_alike(
 ) -> None:
     """In each second of driving, however long its episodes are; and a policy's share of the cost,
     however many drives each scenario has."""
-    monkeypatch.setattr(keeper, "_SCALING_ENVS", 8)
+    monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
     scenarios = ["coms-brake-in-turn", {"base": "coms-slalom", "duration": 3.0}]
     task = dataclasses.replace(TINY, scenarios=scenarios, n_eval_envs=7)
-    env, seeds = task.vector_env(7), keeper.make_evaluation_seeds(7)
+    env, seeds = task.vector_env(7), callbacks.make_evaluation_seeds(7)
     none = evaluate_costs(env, NoControl(env), seeds)
     assert none[::2].mean() > 3.0 * none[1::2].mean()  # else there is nothing to weigh
     wide = dataclasses.replace(task, num_envs=64)
-    cars: Any = keeper.EvalCallback(wide, tmp_path, None, RunOptions()).build(None).get_env()
+    cars: Any = callbacks.EvalCallback(wide, tmp_path, None, RunOptions()).build(None).get_env()
     cars.seed(2**63)
     cars.reset()
     returns, driven, running = np.zeros(64), np.zeros(64), np.ones(64)
@@ -82,7 +82,7 @@ def test_the_scenarios_of_a_mixture_weigh_alike(
         running *= ~dones
     rates = [returns[i::2].sum() / driven[i::2].sum() for i in range(2)]
     assert rates[0] == pytest.approx(rates[1], rel=0.01)
-    best = train.train(task, ROLLOUT, tmp_path).best
+    best = trainer.train(task, ROLLOUT, tmp_path).best
     costs = evaluate_costs(env, PolicyController(env, tmp_path / POLICY), seeds)
     shares = [costs[i::2].mean() / none[i::2].mean() for i in range(2)]
     means = [none[i::2].mean() for i in range(2)]
@@ -103,14 +103,14 @@ def test_where_the_uncontrolled_car_costs_nothing_there_is_nothing_to_learn(tmp_
     quiet = {"base": "straight", "duration": 0.3, "disturbance_force": 0.0}
     task = dataclasses.replace(TINY, env_options={"scenario": quiet | {"disturbance_moment": 0.0}})
     with pytest.raises(ValueError, match="costs nothing there: there is nothing to learn"):
-        train.train(task, ROLLOUT, tmp_path)
+        trainer.train(task, ROLLOUT, tmp_path)
 
 
 def test_a_policy_reads_what_its_task_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the other entries are, it acts the same; its card names those that count."""
-    monkeypatch.setattr(keeper, "_SCALING_ENVS", 8)
+    monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
     task = dataclasses.replace(TINY, reads=["gyro", "steer"])
-    train.train(task, ROLLOUT, tmp_path)
+    trainer.train(task, ROLLOUT, tmp_path)
     policy = load_policy(tmp_path / POLICY)
     assert policy.card.algorithm_options["reads"] == ["gyro", "steer"]
     names = [entry.name for entry in task.vector_env(1).unwrapped.layout]  # type: ignore[attr-defined]

@@ -8,8 +8,9 @@ from unittest.mock import Mock, call
 import pytest
 
 pytest.importorskip("stable_baselines3")
-from sideslip.agents.training import keeper, train
-from sideslip.agents.training.train import CURVE, RunOptions, TrainingTask
+from sideslip.agents.training import callbacks, trainer
+from sideslip.agents.training.callbacks import CURVE, RunOptions
+from sideslip.agents.training.config import TrainingTask
 
 TINY, ROLLOUT = TrainingTask(num_envs=8, seed=3, n_eval_envs=4), 256  # steps of 8 environments
 
@@ -18,10 +19,10 @@ def test_a_tracked_training_hands_over_what_is_logged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One run: named as the folder, told the task, given evaluations and losses, and ended."""
-    monkeypatch.setattr(keeper, "_SCALING_ENVS", 8)
+    monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
     run = Mock()
     monkeypatch.setitem(sys.modules, "wandb", Mock(init=run.init))
-    train.train(TINY, ROLLOUT, tmp_path / "mine", run_options=RunOptions(track="cars"))
+    trainer.train(TINY, ROLLOUT, tmp_path / "mine", run_options=RunOptions(track="cars"))
     assert run.init.call_args.kwargs["project"] == "cars"
     assert run.init.call_args.kwargs["name"] == "mine"
     assert run.init.call_args.kwargs["config"]["env_id"] == TINY.env_id
@@ -37,5 +38,5 @@ def test_a_tracked_training_hands_over_what_is_logged(
     assert own.method_calls[-1] == call.finish()  # a run that ended takes nothing
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(ModuleNotFoundError, match="tracking needs wandb: pip install wandb"):
-        train.train(TINY, ROLLOUT, tmp_path / "other", run_options=RunOptions(track="cars"))
+        trainer.train(TINY, ROLLOUT, tmp_path / "other", run_options=RunOptions(track="cars"))
     assert not (tmp_path / "other").exists()

@@ -24,21 +24,13 @@ from safetensors.torch import save
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sideslip.agents.training import keeper, train
-from sideslip.agents.training.algorithms import make_model_options
+from sideslip.agents.training import callbacks, trainer
+from sideslip.agents.training.callbacks import BEST, CHECKPOINT, CURVE, POLICY, Progress, RunOptions
 from sideslip.agents.training.checkpoint import read_state
+from sideslip.agents.training.config import TrainingTask, make_model_options
 from sideslip.agents.training.export import convert_sb3_policy
-from sideslip.agents.training.train import (
-    BEST,
-    CHECKPOINT,
-    CURVE,
-    POLICY,
-    Progress,
-    RunOptions,
-    TrainingTask,
-    read_task,
-)
-from sideslip.agents.vec_env.env import make_vec_env
+from sideslip.agents.training.trainer import read_task
+from sideslip.agents.vec_env import make_vec_env
 
 TINY = TrainingTask(num_envs=8, env_options={"scenario": "sine-with-dwell"}, seed=3, n_eval_envs=4)
 ROLLOUT = 256  # steps of 8 environments
@@ -47,7 +39,7 @@ EACH = RunOptions(eval_freq=ROLLOUT)
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(keeper, "_SCALING_ENVS", 8)
+    monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
     threads = torch.get_num_threads()
     yield
     torch.set_num_threads(threads)
@@ -58,8 +50,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Of a training of three rollouts."""
     path = tmp_path_factory.mktemp("trained")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(keeper, "_SCALING_ENVS", 8)
-        train.train(TINY, 3 * ROLLOUT, path, run_options=EACH)
+        patch.setattr(callbacks, "_SCALING_ENVS", 8)
+        trainer.train(TINY, 3 * ROLLOUT, path, run_options=EACH)
     yield path
 
 
@@ -81,7 +73,7 @@ def test_the_best_evaluation_is_kept(folder: Path) -> None:
     assert np.all(np.diff([line["cpu_seconds"] for line in lines]) > 0.0)
     model = PPO.load(folder / BEST, device="cpu")
     env = TINY.vector_env(4)
-    seeds = keeper.make_evaluation_seeds(4)
+    seeds = callbacks.make_evaluation_seeds(4)
     best = min(line["cost"] for line in lines)
     assert evaluate_costs(env, model, seeds).mean() == pytest.approx(best, rel=1e-6)
     policy = PolicyController(env, folder / POLICY)
@@ -98,13 +90,13 @@ def test_the_best_evaluation_is_kept(folder: Path) -> None:
 
 def test_training_goes_on_where_the_checkpoint_is(folder: Path, tmp_path: Path) -> None:
     """Weights, the optimiser's moments, the step size, the count, the evaluations."""
-    first = train.train(TINY, 2 * ROLLOUT, tmp_path, run_options=EACH)
-    again = train.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)  # there is nothing to do
+    first = trainer.train(TINY, 2 * ROLLOUT, tmp_path, run_options=EACH)
+    again = trainer.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)  # there is nothing to do
     assert again.evaluations == first.evaluations
     one, other = parameters(first.model), parameters(again.model)
     assert one.keys() == other.keys() and len(one) > 30
     assert all(torch.equal(one[name], other[name]) for name in one)
-    more = train.train(TINY, 5 * ROLLOUT, tmp_path, resume=True, run_options=EACH)
+    more = trainer.train(TINY, 5 * ROLLOUT, tmp_path, resume=True, run_options=EACH)
     assert more.model.num_timesteps == 5 * ROLLOUT
     assert more.evaluations[:3] == first.evaluations
     assert [each.steps // ROLLOUT for each in more.evaluations] == [0, 1, 2, 3, 4, 5]
@@ -118,7 +110,7 @@ def test_training_goes_on_where_the_checkpoint_is(folder: Path, tmp_path: Path) 
 
 
 def test_the_same_seed_trains_the_same(folder: Path, tmp_path: Path) -> None:
-    here = train.train(TINY, 3 * ROLLOUT, tmp_path, run_options=EACH)
+    here = trainer.train(TINY, 3 * ROLLOUT, tmp_path, run_options=EACH)
     assert [each.cost for each in here.evaluations] == [line["cost"] for line in curve(folder)]
 
 
@@ -134,9 +126,9 @@ def test_no_seed_serves_two_purposes(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return reset(self, seed=seed, options=options)
 
     monkeypatch.setattr(StabilityVectorEnv, "reset", watched)
-    train.train(TINY, ROLLOUT, tmp_path)
-    train.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)
-    tested = set(keeper.make_evaluation_seeds(4))
+    trainer.train(TINY, ROLLOUT, tmp_path)
+    trainer.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)
+    tested = set(callbacks.make_evaluation_seeds(4))
     others = [seed for seed in told if seed not in tested]
     assert len(others) == len(set(others)) == 8 + 8 + 8  # scaling, training, going on
     assert min(told) >= 2**63
@@ -145,7 +137,7 @@ def test_no_seed_serves_two_purposes(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_progress_is_told_after_every_rollout(tmp_path: Path) -> None:
     told: list[Progress] = []
     task = TrainingTask(num_envs=40, env_options=TINY.env_options, n_eval_envs=4)
-    train.train(task, 20 * 40 * 32, tmp_path, run_options=RunOptions(report=told.append))
+    trainer.train(task, 20 * 40 * 32, tmp_path, run_options=RunOptions(report=told.append))
     assert [each.steps for each in told] == [40 * 32 * i for i in range(1, 21)]
     assert told[0].cost is None and told[0].evaluations[0].steps == 0
     assert told[-1].cost is not None and told[-1].cost > 0.0  # 640 steps: episodes have 600
@@ -154,7 +146,7 @@ def test_progress_is_told_after_every_rollout(tmp_path: Path) -> None:
 def test_a_kill_in_the_middle_of_saving_leaves_the_older_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    train.train(TINY, ROLLOUT, tmp_path)
+    trainer.train(TINY, ROLLOUT, tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
     def killed(_: int) -> None:
@@ -163,11 +155,13 @@ def test_a_kill_in_the_middle_of_saving_leaves_the_older_checkpoint(
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", killed)
         with pytest.raises(KeyboardInterrupt):
-            train.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)
+            trainer.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)
     after = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     assert after.keys() == before.keys()
     assert after[CHECKPOINT] == before[CHECKPOINT] and after[CURVE] == before[CURVE]
-    assert train.train(TINY, 2 * ROLLOUT, tmp_path, resume=True).model.num_timesteps == 2 * ROLLOUT
+    assert (
+        trainer.train(TINY, 2 * ROLLOUT, tmp_path, resume=True).model.num_timesteps == 2 * ROLLOUT
+    )
 
 
 @pytest.mark.long
@@ -210,16 +204,16 @@ def test_a_checkpoint_of_another_training_is_refused(folder: Path, name: str, va
         read_task(folder, **{name: value})
     assert read_task(folder) == TINY
     with pytest.raises(ValueError, match="train that in another folder"):
-        train.train(dataclasses.replace(TINY, **{name: value}), 10, folder, resume=True)
+        trainer.train(dataclasses.replace(TINY, **{name: value}), 10, folder, resume=True)
 
 
 def test_a_folder_that_holds_a_training_is_not_overwritten(folder: Path, tmp_path: Path) -> None:
     before = (folder / CHECKPOINT).read_bytes()
     with pytest.raises(ValueError, match="holds a training already: go on with it"):
-        train.train(TINY, 10, folder)
+        trainer.train(TINY, 10, folder)
     assert (folder / CHECKPOINT).read_bytes() == before
     with pytest.raises(FileNotFoundError, match="holds no training to go on with"):
-        train.train(TINY, 10, tmp_path, resume=True)
+        trainer.train(TINY, 10, tmp_path, resume=True)
 
 
 def test_a_file_that_is_no_checkpoint_says_so(folder: Path, tmp_path: Path) -> None:
@@ -239,7 +233,7 @@ def test_what_cannot_be_trained_says_why_and_leaves_no_checkpoint(tmp_path: Path
     with pytest.raises(ValueError, match="seed is at least 0, got -1"):
         TrainingTask(seed=-1)
     with pytest.raises(ValueError, match="steps is at least 1, got 0"):
-        train.train(TINY, 0, tmp_path)
+        trainer.train(TINY, 0, tmp_path)
     for task, said in (
         (TrainingTask(estimator="dakf"), "dakf needs the slow sensor gps"),
         (TrainingTask(estimator="kf"), "kf"),
@@ -247,7 +241,7 @@ def test_what_cannot_be_trained_says_why_and_leaves_no_checkpoint(tmp_path: Path
         (TrainingTask("CartPole-v1"), "has no native vector env"),
     ):
         with pytest.raises(ValueError, match=said):
-            train.train(task, 10, tmp_path)
+            trainer.train(task, 10, tmp_path)
     assert not (tmp_path / CHECKPOINT).exists()
 
 
@@ -278,5 +272,5 @@ def test_batches_divide_a_rollout(num_envs: int) -> None:
 
 @pytest.mark.long
 def test_ppo_passes_a_quarter_of_none_within_a_minute(tmp_path: Path) -> None:
-    found = train.train(TrainingTask(), 250_000, tmp_path).best
+    found = trainer.train(TrainingTask(), 250_000, tmp_path).best
     assert found.of_none < 0.25

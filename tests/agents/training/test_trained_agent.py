@@ -12,10 +12,11 @@ import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sideslip.agents.training import keeper, train
+from sideslip.agents.training import callbacks, trainer
+from sideslip.agents.training.callbacks import BEST, RunOptions
+from sideslip.agents.training.config import TrainingTask
 from sideslip.agents.training.normalise import CLIP
-from sideslip.agents.training.train import BEST, RunOptions, TrainingTask
-from sideslip.agents.vec_env.env import make_vec_env
+from sideslip.agents.vec_env import make_vec_env
 
 SHORT: dict[str, Any] = {"scenario": {"base": "sine-with-dwell", "duration": 0.3}}
 TASK = TrainingTask(num_envs=4, env_options=SHORT, n_eval_envs=4)
@@ -23,7 +24,7 @@ TASK = TrainingTask(num_envs=4, env_options=SHORT, n_eval_envs=4)
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(keeper, "_SCALING_ENVS", 8)
+    monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
 
 
 def observations() -> Any:
@@ -36,7 +37,7 @@ def begun(tmp_path: Path, zipped: Path, trust: bool = False) -> Any:
     """The model before its first step."""
     place = tmp_path / "new"
     place.mkdir()
-    return train.EvalCallback(TASK, place, None, RunOptions()).build(None, zipped, trust)
+    return trainer.EvalCallback(TASK, place, None, RunOptions()).build(None, zipped, trust)
 
 
 def foreign(path: Path, normalised: bool, **options: Any) -> Any:
@@ -53,7 +54,7 @@ def foreign(path: Path, normalised: bool, **options: Any) -> Any:
 
 
 def test_our_zip_goes_on_as_it_was(tmp_path: Path) -> None:
-    first = train.train(TASK, 128, tmp_path / "first").model
+    first = trainer.train(TASK, 128, tmp_path / "first").model
     model = begun(tmp_path, tmp_path / "first" / BEST)
     assert model.num_timesteps == 0
     one, other = first.policy.state_dict(), model.policy.state_dict()
@@ -61,9 +62,9 @@ def test_our_zip_goes_on_as_it_was(tmp_path: Path) -> None:
     assert one.keys() == other.keys()
     assert all(torch.equal(best[name], other[name]) for name in best)
     assert float(other["features_extractor.clip"]) == CLIP
-    done = train.train(TASK, 128, tmp_path / "on", trained_agent=tmp_path / "first" / BEST)
+    done = trainer.train(TASK, 128, tmp_path / "on", trained_agent=tmp_path / "first" / BEST)
     assert done.model.num_timesteps == 128
-    again = train.train(TASK, 256, tmp_path / "on", resume=True)  # the scaling is the zip's still
+    again = trainer.train(TASK, 256, tmp_path / "on", resume=True)  # the scaling is the zip's still
     assert torch.equal(
         again.model.policy.state_dict()["features_extractor.mean"], other["features_extractor.mean"]
     )
@@ -92,17 +93,17 @@ def test_what_no_training_can_begin_with_is_refused(tmp_path: Path) -> None:
         ((tmp_path / "vecnormalize.pkl",), ValueError, "is no zip, or is cut short"),
     ):
         with pytest.raises(kind, match=said):
-            train.train(TASK, 128, tmp_path / "new", trained_agent=arguments[0])
-    assert not (tmp_path / "new" / train.CHECKPOINT).exists()
+            trainer.train(TASK, 128, tmp_path / "new", trained_agent=arguments[0])
+    assert not (tmp_path / "new" / trainer.CHECKPOINT).exists()
     with pytest.raises(ValueError, match="goes on from its checkpoint begins with nothing else"):
-        train.train(TASK, 128, tmp_path / "new", resume=True, trained_agent=zipped)
+        trainer.train(TASK, 128, tmp_path / "new", resume=True, trained_agent=zipped)
     reading = dataclasses.replace(TASK, reads=["gyro"])  # of which the zip's network knows nothing
     with pytest.raises(ValueError, match="give reads or a network"):
-        train.train(reading, 128, tmp_path / "new", trained_agent=zipped)
+        trainer.train(reading, 128, tmp_path / "new", trained_agent=zipped)
     (tmp_path / "vecnormalize.pkl").unlink()
     foreign(zipped, False, policy_kwargs={"net_arch": [8]})
     with pytest.raises(ValueError, match="holds other networks than this training's PPO"):
-        train.train(TASK, 128, tmp_path / "new", trained_agent=zipped)
+        trainer.train(TASK, 128, tmp_path / "new", trained_agent=zipped)
     SAC("MlpPolicy", make_vec_env(TASK.env_id, 1), buffer_size=10, device="cpu").save(zipped)
     with pytest.raises(ValueError, match="holds other networks than this training's PPO"):
-        train.train(TASK, 128, tmp_path / "new", trained_agent=zipped)
+        trainer.train(TASK, 128, tmp_path / "new", trained_agent=zipped)

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import sideslip
-from sideslip.agents.learned.files import load_policy
-from sideslip.agents.training.zips import export_zip
+from sideslip.agents.learned.policy import load_policy
+from sideslip.agents.training.export import export_zip
 
 sb3 = pytest.importorskip("stable_baselines3")
 contrib = pytest.importorskip("sb3_contrib")
@@ -24,7 +24,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy  # noqa: E402
 from stable_baselines3.common.torch_layers import FlattenExtractor  # noqa: E402
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize  # noqa: E402
 
-from sideslip.agents.vec_env.env import make_vec_env  # noqa: E402
+from sideslip.agents.vec_env import make_vec_env  # noqa: E402
 
 torch.set_num_threads(1)
 ID, GUST = "sideslip/YawVision-v0", {"base": "gust", "duration": 0.3}

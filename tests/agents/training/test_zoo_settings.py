@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("rl_zoo3")
-from sideslip.agents.learned.files import load_policy
+from sideslip.agents.learned.policy import load_policy
 from sideslip.agents.rollout import evaluate_costs
-from sideslip.agents.training.algorithms import ALGORITHMS, HYPERPARAMS
-from sideslip.agents.training.starts import NetworkAgent
-from sideslip.agents.training.train import POLICY, RunOptions, TrainingTask, train
+from sideslip.agents.training.callbacks import POLICY, RunOptions
+from sideslip.agents.training.config import ALGORITHMS, HYPERPARAMS, TrainingTask
+from sideslip.agents.training.trainer import train
+from sideslip.agents.training.warm_start import NetworkAgent
 
 THEIRS = [name for name, each in ALGORITHMS.items() if not each.on_tensors]
 FEW = {"n_envs": 4, "n_steps": 16, "batch_size": 32, "learning_starts": 32, "buffer_size": 1000}

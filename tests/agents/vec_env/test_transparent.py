@@ -21,8 +21,8 @@ from stable_baselines3.common.vec_env import (
     VecVideoRecorder,
 )
 
-from sideslip.agents.training.rewards import RewardScale, RewardScaleWrapper
-from sideslip.agents.vec_env.env import make_vec_env
+from sideslip.agents.training.warm_start import RewardScale, RewardScaleWrapper
+from sideslip.agents.vec_env import make_vec_env
 
 VISION = "sideslip/YawVision-v0"
 

@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sideslip.agents.vec_env.env import EMPTY_INFO, NativeVecEnv, make_vec_env
+from sideslip.agents.vec_env import EMPTY_INFO, NativeVecEnv, make_vec_env
 
 VISION, FUSION = "sideslip/YawVision-v0", "sideslip/AfsYawFusion-v0"
 SHORT: dict[str, Any] = {"base": "random-steering", "duration": 0.25}

@@ -12,11 +12,12 @@ import yaml
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
+from sideslip.agents import zoo
 from sideslip.agents.rollout import evaluate_costs
-from sideslip.agents.training import keeper
-from sideslip.agents.training.keeper import make_evaluation_seeds
-from sideslip.agents.training.train import RunOptions, TrainingTask, train
-from sideslip.agents.vec_env import zoo
+from sideslip.agents.training import callbacks
+from sideslip.agents.training.callbacks import RunOptions, make_evaluation_seeds
+from sideslip.agents.training.config import TrainingTask
+from sideslip.agents.training.trainer import train
 from tests.agents.vec_env.test_zoo import wrapper_of
 
 ENV = "sideslip/YawGps-v0"
@@ -36,7 +37,7 @@ TASK = TrainingTask(
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A training of two evaluations."""
     patch = pytest.MonkeyPatch()
-    patch.setattr(keeper, "_SCALING_ENVS", 8)
+    patch.setattr(callbacks, "_SCALING_ENVS", 8)
     place = TASK.find_zoo_folder(tmp_path_factory.mktemp("logs"))
     TASK.describe_for_zoo(place, 256, 128)
     train(TASK, 128, place, run_options=RunOptions(eval_freq=128))
@@ -113,7 +114,7 @@ def test_evaluations_are_as_eval_callback_has_them_and_go_on(folder: Path) -> No
 
 
 def test_another_folder_gets_none_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(keeper, "_SCALING_ENVS", 8)
+    monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
     train(TrainingTask(num_envs=4, n_eval_envs=2), 64, tmp_path / "plain")
     assert not list((tmp_path / "plain").glob("sideslip*"))
     assert not (tmp_path / "plain" / zoo.EVALUATIONS).exists()

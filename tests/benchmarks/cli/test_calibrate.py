@@ -13,7 +13,7 @@ from sideslip.benchmarks.control.calibration import (
     derive_seeds,
     read_calibration,
 )
-from sideslip.benchmarks.control.contests import list_scored_tasks
+from sideslip.benchmarks.control.tasks import list_scored_tasks
 from tests.benchmarks.conftest import Run
 
 FIRST = list_scored_tasks()[0]

@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 
 from sideslip.benchmarks.cli import main as cli
+from sideslip.benchmarks.cli.common import show_episode
 from sideslip.benchmarks.cli.names import KINDS, complete
-from sideslip.benchmarks.cli.output import show_episode
 from sideslip.benchmarks.suites import SUITES
 from tests.benchmarks.conftest import Run
 

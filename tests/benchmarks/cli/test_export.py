@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from sideslip.agents.learned.files import load_policy
-from sideslip.agents.vec_env.env import make_vec_env
+from sideslip.agents.learned.policy import load_policy
+from sideslip.agents.vec_env import make_vec_env
 from tests.benchmarks.conftest import Run
 
 sb3 = pytest.importorskip("stable_baselines3")

@@ -71,7 +71,7 @@ def test_ctrl_c_ends_with_the_summary_and_a_whole_session(run: Run, tmp_path: Pa
 def test_a_session_may_not_choose_code(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Any, said: str
 ) -> None:
-    from sideslip.agents.live.session import Recorder
+    from sideslip.agents.live.controller import Recorder
 
     session = tmp_path / "a.session"
     (tmp_path / "mine.py").write_text("raise SystemExit('it ran')\n")

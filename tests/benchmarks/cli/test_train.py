@@ -8,15 +8,14 @@ from typing import Any
 
 import pytest
 
-from sideslip.agents.learned.files import load_policy
+from sideslip.agents.learned.policy import load_policy
 
 pytest.importorskip("stable_baselines3")
-from sideslip.agents.training import keeper, train
-from sideslip.benchmarks import policies as enjoy
-from sideslip.benchmarks.cli import train as train_command
-from sideslip.benchmarks.cli.options import parse_options
-from sideslip.benchmarks.cli.output import choose_folder, make_command
-from sideslip.benchmarks.distillation import list_tasks
+from sideslip.agents.training import callbacks, trainer
+from sideslip.benchmarks.cli import policies as train_command
+from sideslip.benchmarks.cli.common import choose_folder, make_command, parse_options
+from sideslip.benchmarks.studies import policies as enjoy
+from sideslip.benchmarks.studies.policies import list_tasks
 from tests.benchmarks.conftest import Run
 
 TINY = ("--num-envs", 8, "--option", "scenario=sine-with-dwell", "--n-eval-envs", 4)
@@ -25,7 +24,7 @@ TINY = ("--num-envs", 8, "--option", "scenario=sine-with-dwell", "--n-eval-envs"
 @pytest.fixture
 def run(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     """Call `sideslip train` in an empty folder; gives (exit status, stdout, stderr)."""
-    monkeypatch.setattr(keeper, "_SCALING_ENVS", 8)
+    monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
     monkeypatch.setattr(train_command, "EPISODES", 4)
     monkeypatch.chdir(tmp_path)
     return partial(run, "train")
@@ -35,8 +34,8 @@ def run(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
 def test_the_policys_card_says_how_it_was_made_and_what_it_costs(run: Run) -> None:
     status, out, err = run(*TINY, "--steps", 256, "--out", "here")
     assert status == 0, err
-    assert "best" in out and f"here/{train.POLICY}" in out and "of none's" in out
-    card = load_policy(f"here/{train.POLICY}").card
+    assert "best" in out and f"here/{trainer.POLICY}" in out and "of none's" in out
+    card = load_policy(f"here/{trainer.POLICY}").card
     assert shlex.split(card.command)[1:] == [
         "train", "--algo", "ppo", "--env", "sideslip/YawVision-v0",
         "--option", "scenario=sine-with-dwell", "--steps", "256", "--seed", "0", "--num-envs", "8",
@@ -56,13 +55,13 @@ def test_it_goes_on_with_what_the_folder_holds(
     assert run(*TINY, "--steps", 256, "--eval-freq", 256)[0] == 0
     status, _, err = run("--resume", "--out", folder, "-n", 512, "-P")
     assert status == 0, err
-    assert len((tmp_path / folder / train.CURVE).read_text().splitlines()) == 3
+    assert len((tmp_path / folder / trainer.CURVE).read_text().splitlines()) == 3
     status, _, err = run("--resume", "--out", folder, "-n", 768, "--eval-freq", 512)
     assert status == 0, err
-    aim = train.read_run_record(folder)
+    aim = trainer.read_run_record(folder)
     assert (aim.steps, aim.eval_freq) == (768, 512) and aim.command.count("sideslip train") == 3
     assert run("--resume", "--out", folder)[0] == 0  # nothing is left to do
-    assert train.read_run_record(folder) == aim
+    assert trainer.read_run_record(folder) == aim
     status, _, err = run(*TINY, "--steps", 256)
     assert status == 2 and "holds a training already" in err
     settings = (tmp_path / "mine.yml", "sideslip/YawGps-v0:\n  n_envs: 8\n  policy: MlpPolicy\n")
@@ -115,13 +114,13 @@ def test_without_the_extra_the_command_names_it(
 ) -> None:
     for name in list(sys.modules):
         if name.split(".")[0] == missing or name in (
-            "sideslip.agents.training.train",
-            "sideslip.agents.training.algorithms",
-            "sideslip.agents.training.keeper",
-            "sideslip.agents.training.task",
+            "sideslip.agents.training.trainer",
+            "sideslip.agents.training.config",
+            "sideslip.agents.training.callbacks",
+            "sideslip.agents.training.config",
             "sideslip.agents.training.normalise",
             "sideslip.agents.training.checkpoint",
-            "sideslip.agents.vec_env.env",
+            "sideslip.agents.vec_env",
         ):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)
@@ -131,7 +130,7 @@ def test_without_the_extra_the_command_names_it(
 
 def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
     told = {"outputs": ["beta", "F_d"], "options": {"fast": ["gyro", "accel_y"]}}
-    task = train.TrainingTask(estimator="exact-kf", estimator_options=told)
+    task = trainer.TrainingTask(estimator="exact-kf", estimator_options=told)
     words = make_command(task, 10)
     found = [words[i + 1] for i, word in enumerate(words) if word == "--estimator-option"]
     assert parse_options(found) == told
@@ -140,7 +139,7 @@ def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
 
 
 def test_the_folder_is_named_by_what_is_trained() -> None:
-    task = train.TrainingTask("sideslip/YawGps-v0", "ppo", "dakf", {"scenario": "gust"}, 7)
+    task = trainer.TrainingTask("sideslip/YawGps-v0", "ppo", "dakf", {"scenario": "gust"}, 7)
     assert choose_folder(task, "", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-7")
     assert choose_folder(task, "mine", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-mine-7")
     assert choose_folder(task, "", Path("here"), None) == Path("here")
@@ -156,7 +155,7 @@ def test_a_log_folder_is_the_zoo_s_and_numbered(
     for number in (1, 2):
         status, out, err = run(*TINY, "--steps", 64, "-f", "logs")
         assert status == 0, err
-        assert f"logs/ppo/sideslip-YawVision-v0_{number}/{train.POLICY}" in out
+        assert f"logs/ppo/sideslip-YawVision-v0_{number}/{trainer.POLICY}" in out
     params = tmp_path / "logs/ppo/sideslip-YawVision-v0_2/sideslip-YawVision-v0"
     assert "scenario: sine-with-dwell" in (params / "args.yml").read_text()
     status, _, err = run(*TINY, "-f", "logs", "--out", "here")
@@ -187,11 +186,11 @@ def test_it_goes_on_from_a_distilled_policy_in_all_contests_of_its_class(
     status, out, err = run("-i", "distill-coms-yaw", *small)
     assert status == 0, err
     assert "of its start's" in out and " 1.000" in out and "judged" in out
-    assert asked == [(Path("on") / train.POLICY, "coms-zero-slip", 32)]
-    task = train.read_task("on")
+    assert asked == [(Path("on") / trainer.POLICY, "coms-zero-slip", 32)]
+    task = trainer.read_task("on")
     known = [each.scenario for each in list_tasks("coms-zero-slip")]
     assert (task.scenarios, task.estimator) == (known, "joint")
-    words = shlex.split(load_policy(f"on/{train.POLICY}").card.command)[2:]
+    words = shlex.split(load_policy(f"on/{trainer.POLICY}").card.command)[2:]
     assert words[-2:] == ["--trained-agent", "distill-coms-yaw"]
     status, _, err = run("-i", "distill-coms-yaw", "--algo", "sac", "--out", "off")
     assert status == 2 and "sac begins with a zip, not with policy distill-coms-yaw" in err

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("torch")
 from sideslip.envs.sensors.slow import SENSOR_SETS
 from sideslip.estimators import make_estimator
-from sideslip.estimators.learned.files import load_correction
+from sideslip.estimators.learned.correction_file import load_correction
 from tests.benchmarks.conftest import Run
 
 

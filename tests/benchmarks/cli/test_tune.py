@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from sideslip.benchmarks.tuning import file as tune_file
+from sideslip.benchmarks.tuning import estimator as tune_file
 from sideslip.benchmarks.tuning import study as tune_study
-from sideslip.estimators.design import tunings
+from sideslip.estimators.design import options
 from tests.benchmarks.conftest import Run
 
 SCENARIO = "tie-vision-fig8"
@@ -38,16 +38,16 @@ def test_the_command_prints_and_writes_what_it_found(run: Run, tmp_path: Path) -
     assert set(entry["q"]) == {"beta", "gamma"} and entry["note"] == "a remark"
     assert (tmp_path / "sideslip-tune.db").exists()
     run(*arguments)
-    assert tunings.read_tunings(tmp_path / "found.toml") == [entry]  # there was nothing left to do
+    assert options.read_tunings(tmp_path / "found.toml") == [entry]  # there was nothing left to do
 
 
 def test_write_changes_the_shipped_file(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tunings, "FILE", tmp_path / "shipped.toml")
-    tune_file.update(tunings.FILE, ENTRY)
+    monkeypatch.setattr(options, "FILE", tmp_path / "shipped.toml")
+    tune_file.update(options.FILE, ENTRY)
     assert run("bicycle-kf", "--scenario", SCENARIO, *FEW, "--write")[0] == 0
-    assert [e["estimator"] for e in tunings.read_tunings(tunings.FILE)] == ["dakf", "bicycle-kf"]
+    assert [e["estimator"] for e in options.read_tunings(options.FILE)] == ["dakf", "bicycle-kf"]
 
 
 FIG8 = ("bicycle-kf", "--scenario", SCENARIO)

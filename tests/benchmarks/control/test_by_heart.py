@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents.rollout import COST_FLOOR, evaluate_costs
-from sideslip.benchmarks.control.contests import YAW, ControlTask
-from sideslip.benchmarks.control.seeds import make_salt, make_task_seeds
+from sideslip.benchmarks.control.tasks import YAW, ControlTask, make_salt, make_task_seeds
 
 CONTEST = ControlTask("1", YAW, "coms", "zero-slip", "coms-random")
 PUBLIC = (0, 1, 2)

@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.agents.learned.files import SUFFIX
-from sideslip.benchmarks.control import episodes, run
-from sideslip.benchmarks.control.cells import ControlEntry
-from sideslip.benchmarks.control.contests import ControlTask
-from sideslip.benchmarks.control.episodes import Chunk, DriveResult
-from sideslip.benchmarks.control.run import CachedDrive
-from sideslip.envs.backend import cache
+from sideslip.benchmarks.control import run
+from sideslip.benchmarks.control.entries import ControlEntry
+from sideslip.benchmarks.control.run import CachedDrive, Chunk, DriveResult
+from sideslip.benchmarks.control.tasks import ControlTask
+from sideslip.envs.numerics import kernel_cache
+from sideslip.estimators.learned.network import SUFFIX
 
 SEEDS = (3, 4, 5)
-NUMBERS, SIGNALS = len(episodes.NUMBERS), 1 + len(episodes.SIGNALS)
+NUMBERS, SIGNALS = len(run.NUMBERS), 1 + len(run.SIGNALS)
 
 
 def _spoiled(path: Path, **changes: Any) -> None:
@@ -96,16 +95,16 @@ def test_other_options_of_an_id_and_another_car_s_file_are_another_case(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A scratch package: an id's options stand at its root, cars and cameras in files."""
-    monkeypatch.setattr(cache, "_PACKAGE", tmp_path)
+    monkeypatch.setattr(kernel_cache, "_PACKAGE", tmp_path)
     (tmp_path / "__init__.py").write_text("a")
-    seen = [cache.hash_experiment()]
+    seen = [kernel_cache.hash_experiment()]
     for path in ("__init__.py", "envs/vehicle/car.toml", "envs/camera.json", "envs/tick.py"):
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_text("b")
-        seen.append(cache.hash_experiment())
+        seen.append(kernel_cache.hash_experiment())
     assert len(set(seen)) == 5
     (tmp_path / "envs/notes.txt").write_text("b")
-    assert cache.hash_experiment() == seen[-1]
+    assert kernel_cache.hash_experiment() == seen[-1]
 
 
 def test_other_tuned_options_are_another_case(

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("casadi")
 pytest.importorskip("osqp")
-from sideslip.agents import rungs
+from sideslip.agents import baselines
 from sideslip.agents.clairvoyant import plan as clairvoyant
 from sideslip.agents.clairvoyant.plan import ClairvoyantResult
 from sideslip.benchmarks.control import calibration
@@ -26,9 +26,9 @@ from sideslip.benchmarks.control.calibration import (
     remove_cases,
     update,
 )
-from sideslip.benchmarks.control.cells import ControlEntry
-from sideslip.benchmarks.control.contests import NOMINAL, STATE, YAW, ControlTask
+from sideslip.benchmarks.control.entries import ControlEntry
 from sideslip.benchmarks.control.run import measure
+from sideslip.benchmarks.control.tasks import NOMINAL, STATE, YAW, ControlTask
 
 GUST = ControlTask("1", YAW, "coms", "zero-slip", "gust")
 SINE = ControlTask("1", YAW, "coms", "zero-slip", "sine")
@@ -50,7 +50,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     monkeypatch.setattr(clairvoyant, "compute_clairvoyant", stand_in)
     monkeypatch.setattr(clairvoyant, "record_actions", lambda *_: np.zeros((1, 1)))
-    monkeypatch.setattr(rungs, "make_oracle", lambda *_, **__: (None, None))
+    monkeypatch.setattr(baselines, "make_oracle", lambda *_, **__: (None, None))
     return seeds
 
 

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.control import contests as module
-from sideslip.benchmarks.control.cells import ControlEntry
-from sideslip.benchmarks.control.choice import make_oracle_entries, measure_task
-from sideslip.benchmarks.control.contests import (
+from sideslip.benchmarks.control import tasks as module
+from sideslip.benchmarks.control.baseline_gaps import make_oracle_entries, measure_task
+from sideslip.benchmarks.control.entries import ControlEntry
+from sideslip.benchmarks.control.run import NUMBERS, DriveResult, Results, measure
+from sideslip.benchmarks.control.score import ScoreScale
+from sideslip.benchmarks.control.tasks import (
     NOMINAL,
     ORACLES,
     PARAMETERS,
@@ -20,13 +22,10 @@ from sideslip.benchmarks.control.contests import (
     TaskMeasurement,
     list_candidates,
     list_scored_tasks,
+    make_salted_seeds,
     read_tasks,
     write_tasks,
 )
-from sideslip.benchmarks.control.episodes import NUMBERS, DriveResult
-from sideslip.benchmarks.control.run import Results, measure
-from sideslip.benchmarks.control.scores import ScoreScale
-from sideslip.benchmarks.control.seeds import make_salted_seeds
 from sideslip.benchmarks.harness.stats import average
 from sideslip.envs import FAILURES, SCENARIOS
 

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from sideslip.agents import Controller
-from sideslip.benchmarks.control.build import measure_decision_time
-from sideslip.benchmarks.control.cells import ControlEntry
-from sideslip.benchmarks.control.contests import ControlTask
-from sideslip.benchmarks.control.ladder import make_score_scales
+from sideslip.benchmarks.control.baseline_gaps import make_score_scales
+from sideslip.benchmarks.control.entries import ControlEntry, measure_decision_time
 from sideslip.benchmarks.control.run import measure
-from sideslip.benchmarks.control.tables import make_rows, rank_entries
+from sideslip.benchmarks.control.score import make_rows, rank_entries
+from sideslip.benchmarks.control.tasks import ControlTask
 
 MINE: dict[str, Any] = {
     "name": "my bend",

@@ -9,27 +9,26 @@ import pytest
 
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.control import build
-from sideslip.benchmarks.control import episodes as drive
+from sideslip.benchmarks.control import entries
+from sideslip.benchmarks.control import run as drive
 from sideslip.benchmarks.control import suite as control
-from sideslip.benchmarks.control.cells import (
+from sideslip.benchmarks.control.entries import (
     LEARNED,
     ORACLE_NAMES,
     REFERENCE_FILTER,
     ControlEntry,
     make_entries,
 )
-from sideslip.benchmarks.control.contests import (
+from sideslip.benchmarks.control.run import CachedDrive, Chunk, measure
+from sideslip.benchmarks.control.tasks import (
     PARAMETERS,
     STATE,
     YAW,
     ControlTask,
     find_oracle,
     list_scored_tasks,
+    make_salt,
 )
-from sideslip.benchmarks.control.episodes import Chunk
-from sideslip.benchmarks.control.run import CachedDrive, measure
-from sideslip.benchmarks.control.seeds import make_salt
 from sideslip.envs import COMS, FAILURES, SCENARIOS
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.estimators import EstimateObservation
@@ -46,8 +45,8 @@ PAIRS = (
 
 def test_a_correction_gives_controllers_what_its_filter_gives() -> None:
     for name, base in (("exact-kf", "exact-kf"), ("joint", "joint, friction")):
-        assert build.list_outputs(f"learned-{name}") == build.list_outputs(base)
-    assert build.list_outputs("joint")[-2:] == ("front_tyres", "rear_tyres")
+        assert entries.list_outputs(f"learned-{name}") == entries.list_outputs(base)
+    assert entries.list_outputs("joint")[-2:] == ("front_tyres", "rear_tyres")
 
 
 @pytest.mark.parametrize(("estimator", "controller"), PAIRS)
@@ -57,7 +56,7 @@ def test_a_cell_is_its_single_episodes(estimator: str, controller: str) -> None:
     assert driven.error == ""
     env: gym.Env[Any, Any] = gym.make(YAW, scenario=cell.task.scenario)
     if estimator:
-        outputs = build.list_outputs(estimator)
+        outputs = entries.list_outputs(estimator)
         env = EstimateObservation(env, estimator, outputs=outputs, std=False)
     agent = make_agent(controller, env)
     for i, seed in enumerate(SEEDS):
@@ -96,7 +95,7 @@ def test_a_filter_drives_a_car_that_does_not_roll(estimator: str) -> None:
     """Its levels are the scenario's, which has no accelerometer then."""
     contest = ControlTask(scenario="tie-vision-fig8")
     assert not make_scenario("tie-vision-fig8").roll
-    options = build.make_estimate_options(ControlEntry(contest, estimator, "lqr"))["options"]
+    options = entries.make_estimate_options(ControlEntry(contest, estimator, "lqr"))["options"]
     assert "fast" not in options and "accel_y_noise" not in options
     driven = drive.run_chunk(Chunk(ControlEntry(contest, estimator, "lqr"), (1,)))
     assert not driven.error and np.isfinite(driven.costs).all()
@@ -110,7 +109,7 @@ def test_who_is_not_tuned_takes_over_what_means_the_same(monkeypatch: pytest.Mon
     }
     nothing: dict[str, Any] = {"filter": {}, "controller": {}}
     monkeypatch.setattr(
-        "sideslip.benchmarks.control.cells.get_tuned_options",
+        "sideslip.agents.baselines.get_tuned_options",
         lambda _, name: found.get(name, nothing),
     )
     one = {find_oracle(each, PARAMETERS)[-4:]: each for each in list_scored_tasks()}
@@ -123,7 +122,7 @@ def test_who_is_not_tuned_takes_over_what_means_the_same(monkeypatch: pytest.Mon
 
 
 def test_truth_is_told_without_error() -> None:
-    env, _ = build.make_cars(ControlEntry(GUST, "truth", "two-dof"), 2)
+    env, _ = entries.make_cars(ControlEntry(GUST, "truth", "two-dof"), 2)
     obs, infos = env.reset(seed=[1, 2])  # type: ignore[arg-type]
     names = [entry.name for entry in env.layout]  # type: ignore[attr-defined]
     for _ in range(30):
@@ -147,7 +146,7 @@ class Broken:
 
 
 def broken(monkeypatch: pytest.MonkeyPatch, agent: Any) -> None:
-    make = build.make_cars
+    make = entries.make_cars
     monkeypatch.setattr(drive, "make_cars", lambda cell, n: (make(cell, n)[0], agent))
 
 

@@ -10,23 +10,25 @@ import numpy as np
 import pytest
 
 import sideslip
-from sideslip.agents.learned.files import SUFFIX
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks import readme, recovery
-from sideslip.benchmarks.control import calibration, ladder, run, seeds
-from sideslip.benchmarks.control.cells import ControlEntry
-from sideslip.benchmarks.control.contests import ControlTask, list_candidates, list_scored_tasks
-from sideslip.benchmarks.control.episodes import NUMBERS, DriveResult
-from sideslip.benchmarks.control.run import measure
-from sideslip.benchmarks.control.seeds import (
+from sideslip.benchmarks import readme
+from sideslip.benchmarks.control import baseline_gaps, calibration, run, tasks
+from sideslip.benchmarks.control.entries import ControlEntry
+from sideslip.benchmarks.control.run import NUMBERS, DriveResult, measure
+from sideslip.benchmarks.control.tasks import (
+    ControlTask,
+    list_candidates,
+    list_scored_tasks,
     make_salt,
     make_salted_seeds,
     make_task_seeds,
     make_tuning_seeds,
 )
-from sideslip.benchmarks.learned_outside import KINDS, make_outside_task
+from sideslip.benchmarks.studies import recovery_region
+from sideslip.benchmarks.studies.learned_outside import KINDS, make_outside_task
 from sideslip.benchmarks.suites import SALTED, SUITES, Request, run_suite
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS
+from sideslip.estimators.learned.network import SUFFIX
 
 ONE, OTHER = "0123456789abcdef", "fedcba9876543210"
 SHORT = {"base": "gust", "duration": 0.5}
@@ -93,8 +95,8 @@ def test_contests_share_no_car(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_price_of_delay_is_taken_on_the_salts_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
     cases = asked(monkeypatch)
-    ladder.measure_delay_cost(make_salted_seeds(OTHER, 4))
-    assert len(cases) == len(ladder.DELAYS) * len(ladder.CONTESTANTS)
+    baseline_gaps.measure_delay_cost(make_salted_seeds(OTHER, 4))
+    assert len(cases) == len(baseline_gaps.DELAYS) * len(baseline_gaps.CONTESTANTS)
     assert {chunk.seeds for _, chunk in cases} == {tuple(make_salted_seeds(OTHER, 4))}
 
 
@@ -137,7 +139,7 @@ def test_the_salt_follows_every_file_of_the_contestants(
     for name in contestants + others:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("one")
-    monkeypatch.setattr(seeds, "_PACKAGE", tmp_path)
+    monkeypatch.setattr(tasks, "_PACKAGE", tmp_path)
     salts = [make_salt()]
     for name in contestants:
         (tmp_path / name).write_text("two")
@@ -152,9 +154,9 @@ def test_the_salt_follows_every_file_of_the_contestants(
 
 def test_the_contestants_are_this_packages() -> None:
     """Where `seeds.py` lies must not decide it."""
-    assert Path(sideslip.__file__ or "").resolve().parent == seeds._PACKAGE
-    for folder in seeds._CONTESTANTS:
-        assert (seeds._PACKAGE / folder / "__init__.py").is_file()
+    assert Path(sideslip.__file__ or "").resolve().parent == tasks._PACKAGE
+    for folder in tasks._CONTESTANTS:
+        assert (tasks._PACKAGE / folder / "__init__.py").is_file()
 
 
 @pytest.mark.parametrize("salt", ["", "not a salt", "0xab", "AB", "-1"])
@@ -192,5 +194,5 @@ def test_tuning_seeds_are_nobody_elses() -> None:
     """Suites and users count theirs from 0: what they look at, nobody tuned on."""
     tuned = make_tuning_seeds(4096)
     assert tuned[:64] == make_tuning_seeds(64) and len(set(tuned)) == 4096
-    for first in (0, recovery.FIRST_SEED, calibration._FIRST):
+    for first in (0, recovery_region.FIRST_SEED, calibration._FIRST):
         assert set(tuned).isdisjoint(range(first, first + 2**20))

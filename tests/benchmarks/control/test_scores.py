@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.control.episodes import NUMBERS, DriveResult
-from sideslip.benchmarks.control.scores import ScoreScale, compute_log_ratios, score
+from sideslip.benchmarks.control.run import NUMBERS, DriveResult
+from sideslip.benchmarks.control.score import ScoreScale, compute_log_ratios, score
 from sideslip.envs import FAILURES
 
 Array = np.ndarray

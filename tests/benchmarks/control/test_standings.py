@@ -6,11 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.control.answer import compose_verdict, find_best_controller
-from sideslip.benchmarks.control.cells import REFERENCE_FILTER, ControlEntry
-from sideslip.benchmarks.control.contests import NOMINAL, PARAMETERS, STATE, ControlTask
-from sideslip.benchmarks.control.episodes import NUMBERS, DriveResult
-from sideslip.benchmarks.control.ladder import (
+from sideslip.benchmarks.control.baseline_gaps import (
     describe_findings,
     find_below_optimum,
     list_failures,
@@ -18,8 +14,10 @@ from sideslip.benchmarks.control.ladder import (
     make_oracle_table,
     make_score_scales,
 )
-from sideslip.benchmarks.control.run import Results
-from sideslip.benchmarks.control.tables import (
+from sideslip.benchmarks.control.entries import REFERENCE_FILTER, ControlEntry
+from sideslip.benchmarks.control.report import compose_verdict, find_best_controller
+from sideslip.benchmarks.control.run import NUMBERS, DriveResult, Results
+from sideslip.benchmarks.control.score import (
     Standing,
     make_main_table,
     make_motion_table,
@@ -27,6 +25,7 @@ from sideslip.benchmarks.control.tables import (
     make_task_table,
     rank_entries,
 )
+from sideslip.benchmarks.control.tasks import NOMINAL, PARAMETERS, STATE, ControlTask
 from sideslip.benchmarks.harness.metrics import EPISODE
 from sideslip.envs import FAILURES
 

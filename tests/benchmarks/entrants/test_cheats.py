@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from sideslip.benchmarks.control.cells import ControlEntry
-from sideslip.benchmarks.control.contests import ControlTask
-from sideslip.benchmarks.control.episodes import Chunk
+from sideslip.benchmarks.control.entries import ControlEntry
+from sideslip.benchmarks.control.run import Chunk
+from sideslip.benchmarks.control.tasks import ControlTask
 from sideslip.benchmarks.entrants.worker import run_isolated_chunk, run_rehearsal
 
 SEEDS = (918273645, 918273646)

@@ -10,26 +10,31 @@ import pandas as pd
 import pytest
 
 import sideslip
-from sideslip.benchmarks.control.build import make_agent_options
-from sideslip.benchmarks.control.cells import REFERENCE_FILTER, ControlEntry, select_quick_tasks
-from sideslip.benchmarks.control.contests import (
+from sideslip.benchmarks.control.entries import (
+    REFERENCE_FILTER,
+    ControlEntry,
+    make_agent_options,
+    select_quick_tasks,
+)
+from sideslip.benchmarks.control.run import NUMBERS, Chunk, DriveResult, Results, run_chunk
+from sideslip.benchmarks.control.tasks import (
     NOMINAL,
     STEERING,
     YAW,
     ControlTask,
+    Seeds,
     list_scored_tasks,
+    make_salt,
+    make_task_seeds,
 )
-from sideslip.benchmarks.control.episodes import NUMBERS, Chunk, DriveResult, run_chunk
-from sideslip.benchmarks.control.run import Results
-from sideslip.benchmarks.control.seeds import Seeds, make_salt, make_task_seeds
-from sideslip.benchmarks.entrants import baselines, compare
+from sideslip.benchmarks.entrants import baselines, score
 from sideslip.benchmarks.entrants.challenge import (
     EPISODES,
     ComparisonRequest,
     UserEntry,
     make_user_entries,
 )
-from sideslip.benchmarks.entrants.verdict import compose_verdict, make_sentence, make_table
+from sideslip.benchmarks.entrants.score import compose_verdict, make_sentence, make_table
 
 COST, FAILURE = NUMBERS.index("cost"), NUMBERS.index("failure")
 PD = """
@@ -92,7 +97,7 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> list[tuple[ControlEntry, tuple[in
         asked.extend(mine)
         return Results({cell: episodes(cell, len(each)) for cell, each in mine})
 
-    monkeypatch.setattr(compare, "measure", stand_in)
+    monkeypatch.setattr(score, "measure", stand_in)
     monkeypatch.setattr(baselines, "measure", stand_in)
     return asked
 
@@ -138,7 +143,7 @@ def test_committed_baselines_serve_where_a_sample_costs_the_same(
 ) -> None:
     on_file(tmp_path, monkeypatch)
     del driven[:]
-    found = compare.compare(challenge(tmp_path, episodes=8))
+    found = score.compare(challenge(tmp_path, episodes=8))
     assert found.on_file and found.salt == "abcd"
     mine = [(cell, seeds) for cell, seeds in driven if cell.is_users]
     assert mine and all(seeds == salted("abcd", 8, cell) for cell, seeds in mine)
@@ -165,7 +170,7 @@ def test_otherwise_they_drive_anew_on_everybodys_seeds(
     }
     options = changes.get(why, {})
     del driven[:]
-    found = compare.compare(challenge(tmp_path, **{"episodes": 8} | options))
+    found = score.compare(challenge(tmp_path, **{"episodes": 8} | options))
     assert not found.on_file
     everyone = {cell: seeds for cell, seeds in driven}  # the last time
     assert set(everyone) == set(found.results.outcomes)
@@ -192,10 +197,10 @@ def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
 ) -> None:
     """Other ones each time; with the bytes that the driver drew, others for another file."""
     rehearsed = frozenset({str((tmp_path / "pd.py").resolve())})
-    monkeypatch.setattr(compare, "_find_opened_files", lambda *_: rehearsed)
-    found = [compare.compare(challenge(tmp_path, fresh=True)) for _ in range(2)]
+    monkeypatch.setattr(score, "_find_opened_files", lambda *_: rehearsed)
+    found = [score.compare(challenge(tmp_path, fresh=True)) for _ in range(2)]
     assert found[0].salt != found[1].salt
-    again = compare.compare(challenge(tmp_path, salt=found[0].salt))
+    again = score.compare(challenge(tmp_path, salt=found[0].salt))
     assert again.salt == found[0].salt and "Not publishable" in compose_verdict(again)[-1]
     assert f"--salt {found[0].salt} repeats them" in compose_verdict(found[0])[-1]
     mine = [seeds for cell, seeds in driven if cell.is_users]
@@ -206,7 +211,7 @@ def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
     for text in (PD, PD + "# better\n"):
         (tmp_path / "pd.py").write_text(text)
         salts.add(
-            compare.compare(ComparisonRequest((UserEntry(f"{tmp_path}/pd.py"),), fresh=True)).salt
+            score.compare(ComparisonRequest((UserEntry(f"{tmp_path}/pd.py"),), fresh=True)).salt
         )
     assert len(salts) == 2
 
@@ -217,7 +222,7 @@ def test_the_verdict_has_a_sentence_for_each_and_five_lines_at_most(
     pairs = [UserEntry(f"{tmp_path}/{name}.py") for name in ("a", "broken", "c", "d", "e")]
     for pair in pairs:
         Path(pair.agent).write_text(PD)
-    found = compare.compare(ComparisonRequest(tuple(pairs), seeds=(1, 2, 3)))
+    found = score.compare(ComparisonRequest(tuple(pairs), seeds=(1, 2, 3)))
     lines = compose_verdict(found)
     assert len(lines) == 5 and "2 more stand in the table" in lines[3]
     mine = found.select(pairs[0])
@@ -264,7 +269,7 @@ def test_a_users_agent_has_nominals_filter(monkeypatch: pytest.MonkeyPatch) -> N
     """As it was tuned, and no tuned options of its own."""
     tuned = {NOMINAL: {"filter": {"force_sd": 7.0}, "controller": {"grip": 0.6}}}
     monkeypatch.setattr(
-        "sideslip.benchmarks.control.cells.get_tuned_options",
+        "sideslip.agents.baselines.get_tuned_options",
         lambda kind, name: tuned.get(name, {}),
     )
     mine = UserEntry("my.py:Pd").make_entry(ControlTask())

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.control.cells import ControlEntry
-from sideslip.benchmarks.control.contests import ControlTask
-from sideslip.benchmarks.control.episodes import Chunk
-from sideslip.benchmarks.entrants.process import find_place
-from sideslip.benchmarks.entrants.worker import run_isolated_chunk, run_user_chunk
+from sideslip.benchmarks.control.entries import ControlEntry
+from sideslip.benchmarks.control.run import Chunk
+from sideslip.benchmarks.control.tasks import ControlTask
+from sideslip.benchmarks.entrants.worker import find_place, run_isolated_chunk, run_user_chunk
 
 SHORT = {"scenario": {"base": "gust", "duration": 0.05}}
 HEAD = """

@@ -7,15 +7,15 @@ from zipfile import ZipFile
 import pytest
 
 import sideslip
-from sideslip.benchmarks.control.contests import YAW, ControlTask
+from sideslip.benchmarks.control.tasks import YAW, ControlTask
 from sideslip.benchmarks.entrants.challenge import ComparisonRequest, make_user_entries
 
 
 def test_a_zip_drives_as_its_export_does(tmp_path: Path) -> None:
     """On the observation that it was trained on."""
     sb3 = pytest.importorskip("stable_baselines3")
-    from sideslip.agents.training.zips import export_zip
-    from sideslip.agents.vec_env.env import make_vec_env
+    from sideslip.agents.training.export import export_zip
+    from sideslip.agents.vec_env import make_vec_env
 
     zipped, exported = tmp_path / "mine.zip", tmp_path / "mine.safetensors"
     sb3.A2C("MlpPolicy", make_vec_env(YAW, 1), policy_kwargs={"net_arch": [4]}).save(zipped)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import sideslip
-from sideslip.benchmarks.harness.dissipation import compute_dissipation
+from sideslip.benchmarks.harness.metrics import compute_dissipation
 
 assert sideslip.__version__
 COASTING = {

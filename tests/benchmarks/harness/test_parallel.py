@@ -16,10 +16,14 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from sideslip.benchmarks.estimation import run
-from sideslip.benchmarks.harness import engines, parallel
-from sideslip.benchmarks.harness.engines import execute_cases, use_engine
-from sideslip.benchmarks.harness.parallel import run_cases, use_shared_bar
+from sideslip.benchmarks.harness import parallel
+from sideslip.benchmarks.harness.parallel import (
+    execute_cases,
+    run_cases,
+    use_engine,
+    use_shared_bar,
+)
+from sideslip.benchmarks.studies.estimation import run
 
 CASES = [float(k) for k in range(12)]
 
@@ -81,14 +85,14 @@ class Deadly:
 
 
 def test_a_case_outlives_so_many_deaths_of_its_worker_and_no_more() -> None:
-    token = engines._CLUSTER.set(Deadly(engines.RETRIES))
+    token = parallel._CLUSTER.set(Deadly(parallel.RETRIES))
     try:
         assert dict(execute_cases(abs, [-1, -2, -3])) == {0: 1, 1: 2, 2: 3}
-        engines._CLUSTER.set(Deadly(engines.RETRIES + 1))
+        parallel._CLUSTER.set(Deadly(parallel.RETRIES + 1))
         with pytest.raises(ChildProcessError):
             list(execute_cases(abs, [-1]))
     finally:
-        engines._CLUSTER.reset(token)
+        parallel._CLUSTER.reset(token)
 
 
 @pytest.fixture
@@ -127,7 +131,7 @@ def test_a_case_that_ends_its_process_ends_the_work(
 ) -> None:
     from ray.exceptions import WorkerCrashedError
 
-    monkeypatch.setattr(engines, "RETRIES", 1)
+    monkeypatch.setattr(parallel, "RETRIES", 1)
     with pytest.raises(WorkerCrashedError), use_engine("ray", cluster[0].address):
         run_cases(os._exit, [1])
 
@@ -135,10 +139,10 @@ def test_a_case_that_ends_its_process_ends_the_work(
 DRIVER = """
 import sys
 from pathlib import Path
-from sideslip.benchmarks.control.cells import ControlEntry
-from sideslip.benchmarks.control.contests import list_scored_tasks
+from sideslip.benchmarks.control.entries import ControlEntry
+from sideslip.benchmarks.control.tasks import list_scored_tasks
 from sideslip.benchmarks.control.run import CHUNK, measure
-from sideslip.benchmarks.harness.engines import use_engine
+from sideslip.benchmarks.harness.parallel import use_engine
 
 with use_engine("ray", sys.argv[1]):
     cells = [ControlEntry(contest, "", "none") for contest in list_scored_tasks()[:6]]

@@ -5,21 +5,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks import estimation, following, recovery
 from sideslip.benchmarks.harness.results import ResultTable
 from sideslip.benchmarks.harness.stats import Estimate
-from sideslip.benchmarks.harness.verdict import LETTERS, LINES, describe_leader, format_verdict
+from sideslip.benchmarks.harness.study import LETTERS, LINES, describe_leader, format_verdict
 from sideslip.benchmarks.papers import suite as papers
-from sideslip.benchmarks.papers.ledger.claim import Bound, Claim, ClaimPart, MeasuredPart
+from sideslip.benchmarks.papers.ledger import Bound, Claim, ClaimPart, MeasuredPart
 from sideslip.benchmarks.procedures import iso3888
 from sideslip.benchmarks.procedures import suite as procedures
-from sideslip.benchmarks.procedures.cases import ProcedureCase, SineDwellOutcome
-from sideslip.benchmarks.procedures.contestants import CARS, ENTRIES
+from sideslip.benchmarks.procedures.drive import CARS, ENTRIES
 from sideslip.benchmarks.procedures.fmvss126 import SineDwellResult, SineDwellRun
+from sideslip.benchmarks.procedures.tables import ProcedureCase, SineDwellOutcome
 from sideslip.benchmarks.recorded import suite as recorded
-from sideslip.benchmarks.recorded.run import ReplayResult as Replayed
+from sideslip.benchmarks.recorded.suite import ReplayResult as Replayed
 from sideslip.benchmarks.speed import env_steps
 from sideslip.benchmarks.speed import suite as speed
+from sideslip.benchmarks.studies import coordinated_control, estimation, recovery_region
 
 RNG = np.random.default_rng(0)
 
@@ -78,16 +78,16 @@ def shares(level: float) -> Any:
 
 def test_recovery_names_who_saves_most_and_what_the_oracles_do() -> None:
     levels = {"none": 0.2, "two-dof": 0.3, "esc": 0.7, "lqr": 0.5}
-    levels |= dict(zip(recovery.ORACLES, (0.8, 0.9), strict=True))
+    levels |= dict(zip(recovery_region.ORACLES, (0.8, 0.9), strict=True))
     cars = {"a car": {name: shares(level) for name, level in levels.items()}}
-    cars["a car"][recovery.CLAIRVOYANT] = np.full((5, 5, 8), 0.95)
+    cars["a car"][recovery_region.CLAIRVOYANT] = np.full((5, 5, 8), 0.95)
     cars["another"] = cars["a car"] | {"lqr": cars["a car"]["esc"]}
-    _, first, second, why, _ = fits(recovery.compose_verdict(cars))
+    _, first, second, why, _ = fits(recovery_region.compose_verdict(cars))
     assert first == "a car: esc 70 %; lqr 50 %, none 20 %."
     assert second.startswith("another: esc and lqr 70 %; two-dof 30 %")
     assert "saves 90 % and 90 %, foresight too 95 % and 95 %" in why
     assert (
-        len(fits(recovery.compose_verdict({"a car": {"none": shares(0.1)}}))) == 2
+        len(fits(recovery_region.compose_verdict({"a car": {"none": shares(0.1)}}))) == 2
     )  # nothing driven
 
 
@@ -98,14 +98,14 @@ def test_following_takes_the_bandwidth_that_errs_least_and_never_fails() -> None
     found[..., 3] = 0.0
     found[6:, 0, 3] = 1.0  # K = 50 and 100: a run fails
     lanes = [np.full((30, 3), 5.0)]
-    for i in range(1, len(following.LANE_CONTROLLERS)):
+    for i in range(1, len(coordinated_control.LANE_CONTROLLERS)):
         lanes.append(np.column_stack([RNG.normal(1.0 if i != 4 else 0.5, 0.05, 30)] * 3))
-    _, follows, lane, why, _ = fits(following.compose_verdict(found, lanes))
+    _, follows, lane, why, _ = fits(coordinated_control.compose_verdict(found, lanes))
     assert "K = 20 rad/s errs least, 10 %" in follows and "fail at 50, 100" in follows
     assert lane.startswith("Lanes: both on multirate-residual-kf strays least, 5")
     assert "m by -4" in why and "5.0 m" in why
     found[..., 3] = 1.0
-    assert "every bandwidth" in following.compose_verdict(found, lanes)
+    assert "every bandwidth" in coordinated_control.compose_verdict(found, lanes)
 
 
 def claim(paper: str, stated: str, value: float) -> Any:

@@ -9,21 +9,21 @@ import pytest
 from sideslip.benchmarks.harness.metrics import METRICS
 from sideslip.benchmarks.harness.results import VERDICTS
 from sideslip.benchmarks.papers import suite as papers
-from sideslip.benchmarks.papers.claims import CLAIMS, FIGURES, SIMULATIONS
-from sideslip.benchmarks.papers.ledger.claim import (
+from sideslip.benchmarks.papers import theory
+from sideslip.benchmarks.papers.ledger import (
     Bound,
     Claim,
     ClaimPart,
     SimulationResult,
     compare_others,
     evaluate_claim,
+    join_results,
     measure_parts,
     select_number,
     select_ratio,
 )
-from sideslip.benchmarks.papers.ledger.simulations import join_results
-from sideslip.benchmarks.papers.theory import observability
-from sideslip.benchmarks.papers.tie_vision.appendix import compute_residuals
+from sideslip.benchmarks.papers.suite import CLAIMS, FIGURES, SIMULATIONS
+from sideslip.benchmarks.papers.tie_vision_theory import compute_residuals
 
 
 def judged(*parts: tuple[Any, Any]) -> str:
@@ -124,11 +124,11 @@ def test_joined_chunks_keep_the_order_of_the_seeds() -> None:
 
 def test_exact_ranks() -> None:
     """docs/PAPERS.md section 3: dakf 4 of 5, dual-rate 4 of 6, vision alone 4 of 4."""
-    numbers = observability.compute_coms_ranks(()).numbers
+    numbers = theory.compute_coms_ranks(()).numbers
     ranks = {name: float(value[0]) for (name, _), value in numbers.items()}
     assert ranks == {"dakf": 4.0, "dual-rate": 4.0, "vision": 4.0}
     singular = [[Fraction(1, 3), Fraction(2, 3)], [Fraction(1), Fraction(2)]]
-    assert observability.rank(singular) == 1
+    assert theory.rank(singular) == 1
 
 
 def test_the_appendix_holds_as_corrected_and_fails_as_printed() -> None:

@@ -6,7 +6,7 @@ import control
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.papers.tie_vision.margins import compute_gain_margin, find_crossings
+from sideslip.benchmarks.papers.tie_vision_theory import compute_gain_margin, find_crossings
 
 DT = 0.01
 

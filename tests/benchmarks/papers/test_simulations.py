@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.harness.drives import SETTLED, call_quietly, make_filter_arguments
 from sideslip.benchmarks.harness.parallel import split_seeds
-from sideslip.benchmarks.papers.ledger.controllers import FollowingSimulation, SlipSimulation
-from sideslip.benchmarks.papers.ledger.filters import (
+from sideslip.benchmarks.harness.study import SETTLED, call_quietly, make_filter_arguments
+from sideslip.benchmarks.papers.ledger import (
     EstimationSimulation,
     PaperFilter,
     get_paper_tuning,
     make_filters,
 )
+from sideslip.benchmarks.papers.manoeuvres import FollowingSimulation, SlipSimulation
 from sideslip.estimators import make_estimator
 
 VISION = "sideslip/YawVision-v0"

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents.design.pi import PLACEMENTS, POLE, design_pi
-from sideslip.benchmarks.papers.tie_vision.margins import compute_gain_margin
-from sideslip.benchmarks.papers.tie_vision.table_two import (
+from sideslip.benchmarks.papers.tie_vision_control import (
     INTEGRALS,
     PRINTED,
     SENSORS,
@@ -19,6 +18,7 @@ from sideslip.benchmarks.papers.tie_vision.table_two import (
     make_plain_loop,
     search,
 )
+from sideslip.benchmarks.papers.tie_vision_theory import compute_gain_margin
 from sideslip.envs import COMS
 from sideslip.envs.vehicle.linear import make_bicycle_model, make_vision_model
 from sideslip.estimators.design.kalman import joseph_form, kalman_gain

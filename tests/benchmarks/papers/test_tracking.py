@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.papers.ledger.tracking import measure_tracking, run_episode
+from sideslip.benchmarks.papers.manoeuvres import measure_tracking, run_episode
 
 FIG7: dict[str, Any] = {
     "base": "dakf-fig6",

@@ -17,7 +17,7 @@ from sideslip.benchmarks.procedures.drive import (
 )
 from sideslip.envs.outside.plants import Drift, make_outside_vehicle
 from sideslip.envs.vehicle.dynamics import Motion
-from sideslip.envs.vehicle.vehicle import GRAVITY
+from sideslip.envs.vehicle.parameters import GRAVITY
 
 V = 80.0 / 3.6
 BMW = TestCar(make_outside_vehicle(), V, 16.0, 4.508, 0.8)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.procedures import fmvss126, iso3888, iso4138, iso7401
-from sideslip.benchmarks.procedures.contestants import CARS, ENTRIES
 from sideslip.benchmarks.procedures.drive import (
     CALM,
+    CARS,
+    ENTRIES,
     DriveFunction,
     Series,
     make_env_drive,
@@ -17,7 +18,7 @@ from sideslip.benchmarks.procedures.drive import (
 from sideslip.envs import Scenario
 from sideslip.envs.scenarios.steering import compute_steering
 from sideslip.envs.ticks import TICK
-from sideslip.envs.vehicle.vehicle import GRAVITY
+from sideslip.envs.vehicle.parameters import GRAVITY
 
 EACH = pytest.mark.parametrize("name", CARS)
 LINEAR = {"small_angle": True, "tyres": "linear", "lags": False, "roll": False}

@@ -9,7 +9,7 @@ import pytest
 from sideslip.benchmarks.procedures import fmvss126
 from sideslip.benchmarks.procedures.drive import Fields, Series, TestCar
 from sideslip.envs import PASSENGER_CAR
-from sideslip.envs.vehicle.vehicle import GRAVITY
+from sideslip.envs.vehicle.parameters import GRAVITY
 
 CAR = TestCar(PASSENGER_CAR, 80.0 / 3.6, 16.0, 4.2, 0.8)
 A = math.radians(30.0)

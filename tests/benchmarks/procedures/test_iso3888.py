@@ -7,7 +7,7 @@ from sideslip.benchmarks.procedures import iso3888
 from sideslip.benchmarks.procedures.drive import Fields, Series, TestCar
 from sideslip.envs import PASSENGER_CAR
 from sideslip.envs.record import Array
-from sideslip.envs.scenarios.tracks import Section
+from sideslip.envs.scenarios.road import Section
 
 CAR = TestCar(PASSENGER_CAR, 80.0 / 3.6, 16.0, 4.2, 0.8)
 WIDTH = PASSENGER_CAR.width

@@ -9,7 +9,7 @@ import numpy as np
 import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.envs.record import FAST, PACKET, Array, Log
-from sideslip.envs.vehicle.vehicle import LATERAL_FIELDS, PASSENGER_CAR, Vehicle, critical_speed
+from sideslip.envs.vehicle.parameters import LATERAL_FIELDS, PASSENGER_CAR, Vehicle, critical_speed
 
 assert sideslip.__version__
 EVERY, STEP = 10, 0.01  # ticks to a row; s of a steering trace

@@ -11,7 +11,7 @@ import pandas as pd
 import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.envs.record import FAST, PACKET, Log
-from sideslip.envs.vehicle.vehicle import Vehicle
+from sideslip.envs.vehicle.parameters import Vehicle
 
 assert sideslip.__version__
 EVERY = 10  # ticks to a row

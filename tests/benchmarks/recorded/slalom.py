@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sideslip.envs.vehicle.linear import make_bicycle_model
-from sideslip.envs.vehicle.vehicle import PASSENGER_CAR
+from sideslip.envs.vehicle.parameters import PASSENGER_CAR
 
 Array = npt.NDArray[np.float64]
 

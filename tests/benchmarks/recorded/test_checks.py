@@ -15,7 +15,8 @@ from rich.console import Console
 
 import sideslip
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.recorded.checks import (
+from sideslip.benchmarks.recorded.emulate import compute_heading, find_backward
+from sideslip.benchmarks.recorded.quality import (
     COMPASS,
     TRUTH,
     estimate_resolution,
@@ -23,13 +24,12 @@ from sideslip.benchmarks.recorded.checks import (
     make_remarks,
     make_warnings,
 )
-from sideslip.benchmarks.recorded.emulate import compute_heading, find_backward
-from sideslip.benchmarks.recorded.replay_file import TRUTH_WARNING, replay_file
+from sideslip.benchmarks.recorded.replay import TRUTH_WARNING, replay_file
 from sideslip.benchmarks.report.html import write_report
 from sideslip.benchmarks.report.terminal import print_suite
 from sideslip.envs.record import FAST, PACKET, Array, Log
 from sideslip.envs.recordings.log_file import make_packet_rows
-from sideslip.envs.vehicle.vehicle import PASSENGER_CAR, Vehicle
+from sideslip.envs.vehicle.parameters import PASSENGER_CAR, Vehicle
 
 from .simulated import decimated
 from .slalom import VEHICLE, columns, saved

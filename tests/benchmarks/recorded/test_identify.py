@@ -9,12 +9,18 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.recorded.bicycle_fit import Theta, compute_errors, fit, make_windows
-from sideslip.benchmarks.recorded.checks import find_saturated, find_swapped, make_warnings
 from sideslip.benchmarks.recorded.identify import IdentificationResult, identify, make_suite
-from sideslip.benchmarks.recorded.noises import Finding, estimate_white_noise, jackknife
+from sideslip.benchmarks.recorded.quality import (
+    Finding,
+    estimate_white_noise,
+    find_saturated,
+    find_swapped,
+    jackknife,
+    make_warnings,
+)
 from sideslip.benchmarks.recorded.wires import SignalCalibration
 from sideslip.envs.record import FAST, Array, Log
-from sideslip.envs.vehicle.vehicle import PASSENGER_CAR
+from sideslip.envs.vehicle.parameters import PASSENGER_CAR
 
 from .simulated import drive
 

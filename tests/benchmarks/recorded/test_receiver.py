@@ -6,27 +6,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.verdict import LETTERS, LINES
+from sideslip.benchmarks.harness.study import LETTERS, LINES
 from sideslip.benchmarks.recorded.receiver import (
     SAME,
     Signal,
     Track,
     compare,
+    compose_verdict,
     compute_gain,
     compute_law_size,
+    draw,
+    make_receiver_suite,
     make_signals,
     make_track,
     predict_fixes,
-)
-from sideslip.benchmarks.recorded.receiver_suite import (
-    compose_verdict,
-    draw,
-    make_receiver_suite,
     replay_nmea,
     write_kml,
 )
-from sideslip.benchmarks.recorded.replay_file import replay_file
-from sideslip.envs.recordings.geodesy import to_degrees
+from sideslip.benchmarks.recorded.replay import replay_file
+from sideslip.envs.recordings.dialect import to_degrees
 from sideslip.envs.recordings.nmea import Epoch
 from tests.envs.recordings.receiver import ABSENT, REASON, RECORDINGS, sentence
 

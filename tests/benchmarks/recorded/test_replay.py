@@ -11,13 +11,11 @@ from pandas import read_csv
 
 from sideslip.benchmarks.harness.results import Suite, read_json, write_json
 from sideslip.benchmarks.recorded.emulate import Emulation, compute_heading
-from sideslip.benchmarks.recorded.replay_file import replay_file
-from sideslip.benchmarks.recorded.run import ESTIMATORS, GYRO_ONLY
-from sideslip.benchmarks.recorded.suite import corners, replay
+from sideslip.benchmarks.recorded.replay import replay_file
+from sideslip.benchmarks.recorded.suite import ESTIMATORS, GYRO_ONLY, corners, replay
 from sideslip.envs.record import Log
 from sideslip.envs.recordings.log_file import read_log
-from sideslip.envs.vehicle.vehicle import PASSENGER_CAR
-from sideslip.envs.vehicle.vehicles import make_vehicle
+from sideslip.envs.vehicle.parameters import PASSENGER_CAR, make_vehicle
 from sideslip.estimators import make_estimator
 
 from .slalom import ROWS, VEHICLE, columns, saved

@@ -13,13 +13,12 @@ from typer.testing import CliRunner
 
 from sideslip.benchmarks.cli.main import app
 from sideslip.benchmarks.recorded.bicycle_fit import BicycleFit, Theta, fit, make_windows
-from sideslip.benchmarks.recorded.checks import find_saturated
 from sideslip.benchmarks.recorded.identify import POSSIBLE, TYRES, identify
-from sideslip.benchmarks.recorded.noises import estimate_noise_levels
-from sideslip.benchmarks.recorded.run import Settings, run_estimators
+from sideslip.benchmarks.recorded.quality import estimate_noise_levels, find_saturated
+from sideslip.benchmarks.recorded.suite import Settings, run_estimators
 from sideslip.benchmarks.recorded.wires import SignalCalibration, apply_wires
 from sideslip.envs.record import FAST, Array, Log
-from sideslip.envs.vehicle.vehicle import PASSENGER_CAR, Vehicle
+from sideslip.envs.vehicle.parameters import PASSENGER_CAR, Vehicle
 
 from .drawn_cars import NOISE, drawn_car, scenario_of, simulate, steering_trace, without
 from .simulated import as_table

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from sideslip.benchmarks.cli.data import parse_estimator_options
 from sideslip.benchmarks.cli.main import app
-from sideslip.benchmarks.cli.recorded import parse_estimator_options
-from sideslip.benchmarks.recorded.replay_file import replay_file
+from sideslip.benchmarks.recorded.replay import replay_file
 from sideslip.benchmarks.recorded.wires import (
     SignalCalibration,
     apply_wires,
@@ -17,8 +17,7 @@ from sideslip.benchmarks.recorded.wires import (
     write_vehicle,
 )
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.vehicle.vehicle import PASSENGER_CAR
-from sideslip.envs.vehicle.vehicles import make_vehicle
+from sideslip.envs.vehicle.parameters import PASSENGER_CAR, make_vehicle
 
 from .simulated import as_table, drive
 from .slalom import columns, saved

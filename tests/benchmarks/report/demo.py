@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.explorer import Explorer, Panel
 from sideslip.benchmarks.harness.results import ResultTable, Suite
 from sideslip.benchmarks.harness.stats import Estimate
+from sideslip.benchmarks.harness.study import Explorer, Panel
 
 HOSTILE = "</script><b>1 & 2</b>"
 COMMAND = "sideslip bench --html report.html --json results.json"
@@ -112,7 +112,7 @@ def _place(t: Any) -> dict[str, Any]:
 def matrix() -> Suite:
     """What only the matrix has: a heat map, two cells side by side and in motion, a file."""
     figures = pytest.importorskip("sideslip.benchmarks.report.figures")
-    pictures = pytest.importorskip("sideslip.benchmarks.report.heat_maps")
+    pictures = pytest.importorskip("sideslip.benchmarks.report.figures")
     t = np.linspace(0.0, 8.0, 801)
     cells: dict[tuple[str, ...], dict[str, Any]] = {
         (manoeuvre, who): {"t": t, "beta": k * np.sin(t + k), **_place(t)}

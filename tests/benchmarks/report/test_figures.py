@@ -6,11 +6,11 @@ import sys
 import numpy as np
 import pytest
 
-from sideslip.agents import AGENTS, rungs
-from sideslip.benchmarks.control.cells import LEARNED
-from sideslip.benchmarks.control.cells import ORACLE_NAMES as MATRIX_RUNGS
+from sideslip.agents import AGENTS, baselines
+from sideslip.benchmarks.control.entries import LEARNED
+from sideslip.benchmarks.control.entries import ORACLE_NAMES as MATRIX_RUNGS
 from sideslip.benchmarks.harness.stats import Estimate
-from sideslip.benchmarks.report.colours import choose_line_styles
+from sideslip.benchmarks.report.figures import choose_line_styles
 from sideslip.envs.rendering.palette import (
     COLOURS,
     CONTROLLERS,
@@ -40,7 +40,7 @@ def test_every_filter_controller_and_rung_has_a_colour_of_its_own() -> None:
     """All names of the package, no two alike, none the strangers'; to be seen on white and dark."""
     assert set(FILTERS) == set(ESTIMATORS)
     assert {*CONTROLLERS} >= {*AGENTS, *(name for pairs in LEARNED.values() for _, name in pairs)}
-    assert {*ORACLES} >= {*MATRIX_RUNGS, *rungs.ORACLES}
+    assert {*ORACLES} >= {*MATRIX_RUNGS, *baselines.ORACLES}
     own = [*FILTERS.values(), *CONTROLLERS.values(), *ORACLES.values(), *OTHER_COLOURS, INK]
     assert len(set(own)) == len(own)
     for shade in own[:-1]:

@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.report.kml import ORIGIN, make_track_kml
+from sideslip.benchmarks.report.film import ORIGIN, make_track_kml
 
 NAMES = {"kml": "http://www.opengis.net/kml/2.2"}
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.report.pack import encode_figure, encode_steps, pack_text
+from sideslip.benchmarks.report.html import encode_figure, encode_steps, pack_text
 
 
 def values_of(entry: dict[str, Any]) -> np.ndarray:

@@ -16,8 +16,7 @@ import pytest
 
 from sideslip.benchmarks.harness.results import ResultTable, Suite
 from sideslip.benchmarks.report import html as report
-from sideslip.benchmarks.report.html import write_report
-from sideslip.benchmarks.report.tables import inline, parse_number
+from sideslip.benchmarks.report.html import inline, parse_number, write_report
 
 from .demo import COMMAND, HOSTILE, VERSIONS, answered, control, estimation, matrix
 

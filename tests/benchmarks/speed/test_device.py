@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from sideslip.benchmarks.speed import device as device_speed  # noqa: E402
-from sideslip.envs.device.env import DeviceVectorEnv  # noqa: E402
+from sideslip.envs.device.torch_env import DeviceVectorEnv  # noqa: E402
 
 ENV_ID = "sideslip/YawVision-v0"
 

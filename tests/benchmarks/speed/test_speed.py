@@ -8,18 +8,10 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.harness.results import Suite
-from sideslip.benchmarks.speed import c_plant as yardstick
-from sideslip.benchmarks.speed import contestants as field
-from sideslip.benchmarks.speed import (
-    env_steps,
-    first_use,
-    learning,
-    plant,
-    suite,
-    targets,
-    timing,
-)
-from sideslip.envs.backend.simd import LANES
+from sideslip.benchmarks.speed import env_steps, first_use, learning, plant, suite, timing
+from sideslip.benchmarks.speed import plant as yardstick
+from sideslip.benchmarks.speed import timing as field
+from sideslip.envs.numerics.simd import LANES
 from sideslip.estimators import FILTERS
 from sideslip.estimators.make import ESTIMATORS
 
@@ -137,7 +129,7 @@ def test_without_a_compiler_the_line_is_absent(monkeypatch: pytest.MonkeyPatch) 
 
 def test_learning_without_torch_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
     without(monkeypatch, "torch", "stable_baselines3")
-    monkeypatch.delitem(sys.modules, "sideslip.agents.vec_env.env", raising=False)
+    monkeypatch.delitem(sys.modules, "sideslip.agents.vec_env", raising=False)
     measured = Suite("speed", "", "")
     taken, absent = learning.add(measured, SHORT)
     assert taken == {} and measured.tables == []
@@ -146,7 +138,7 @@ def test_learning_without_torch_is_absent(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_compilation_is_counted_at_the_top_alone() -> None:
     code = """
-from sideslip.envs.backend.decorators import jit
+from sideslip.envs.numerics.jit import jit
 @jit
 def inner(x):
     return x + 1
@@ -174,13 +166,13 @@ def test_where_no_kernels_are_on_disk_the_first_step_is_absent(
 
 def test_ratios_are_taken_round_by_round() -> None:
     """Their median is not the ratio of the medians."""
-    target = targets.TARGETS[0]
+    target = suite.TARGETS[0]
     taken = {
         target.over: [20.0, 300.0, 80.0],
         target.workload: [1.0, 10.0, 2.0],
     }
     measured = Suite("speed", "", "")
-    targets.add(measured, taken, {}, {})
+    suite.add(measured, taken, {}, {})
     (row,) = measured.rows
     assert (row.scenario, row.metric) == (target.name, "ratio")
     assert (row.value, row.low, row.high, row.n) == (30.0, 20.0, 40.0, 3)
@@ -190,7 +182,7 @@ def test_ratios_are_taken_round_by_round() -> None:
 
 def test_every_target_stands_in_the_table() -> None:
     measured = Suite("speed", "", "")
-    targets.add(measured, {}, {first_use.FIRST: [0.6]}, {env_steps.LANE: "it rains"})
+    suite.add(measured, {}, {first_use.FIRST: [0.6]}, {env_steps.LANE: "it rains"})
     (table,) = measured.tables
     assert [(cells[0], cells[1]) for cells in table.cells] == [
         ("gym.make step, lane-keeping over ours", ">= 30 x"),
@@ -211,9 +203,9 @@ def test_every_target_stands_in_the_table() -> None:
 
 
 def test_a_price_is_met_from_below() -> None:
-    price = next(target for target in targets.TARGETS if target.max_value == 1.1)
+    price = next(target for target in suite.TARGETS if target.max_value == 1.1)
     assert price.met(1.05) and not price.met(1.15)
-    goal = targets.TARGETS[0]
+    goal = suite.TARGETS[0]
     assert goal.met(31.0) and not goal.met(29.0)
 
 
@@ -248,7 +240,7 @@ def test_targets_are_held_beside_all_parts(monkeypatch: pytest.MonkeyPatch) -> N
     for part in (env_steps, plant, learning, first_use):
         own = {part.__name__: (1.0,)}, {part.__name__: "not there"}
         monkeypatch.setattr(part, "add", lambda *_, own=own, **__: own)
-    monkeypatch.setattr(targets, "add", judge)
+    monkeypatch.setattr(suite, "add", judge)
     monkeypatch.setattr(suite, "make_verdict", lambda *_: "")
     suite.run(quick=True)
     taken, seconds, absent = held

@@ -11,22 +11,23 @@ import pytest
 
 pytest.importorskip("optuna")
 
-from sideslip.agents.tuned import FILE, get_tuned_options, read_tuned
-from sideslip.benchmarks.control.build import make_estimate_options
-from sideslip.benchmarks.control.cells import ControlEntry
-from sideslip.benchmarks.control.contests import ControlTask
-from sideslip.benchmarks.control.episodes import NUMBERS, DriveResult
-from sideslip.benchmarks.control.seeds import make_tuning_seeds
-from sideslip.benchmarks.tuning import controllers, spaces
+from sideslip.agents.baselines import FILE, get_tuned_options, read_tuned
+from sideslip.benchmarks.control.entries import ControlEntry, make_estimate_options
+from sideslip.benchmarks.control.run import NUMBERS, DriveResult
+from sideslip.benchmarks.control.tasks import ControlTask, make_tuning_seeds
+from sideslip.benchmarks.tuning import controllers
 from sideslip.benchmarks.tuning.controllers import (
+    KINDS,
+    SPACES,
     ControllerTuning,
+    SearchNumber,
     compute_objective,
     list_contests,
+    make_options,
     run_contestant,
     tune,
 )
-from sideslip.benchmarks.tuning.file import write_tuned
-from sideslip.benchmarks.tuning.spaces import KINDS, SPACES, SearchNumber, make_options
+from sideslip.benchmarks.tuning.estimator import write_tuned
 from tests.benchmarks.conftest import Run
 
 SHORT = ControlTask(scenario="sine-with-dwell")
@@ -153,10 +154,10 @@ def test_a_stopped_search_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 def test_every_class_has_contests_and_every_start_lies_within(kind: str) -> None:
     for name in SPACES:
         assert len(list_contests(name, kind)) >= 5
-        numbers = spaces.get_space(name, kind)
+        numbers = controllers.get_space(name, kind)
         assert all(0.0 < each.low <= each.start <= each.high for each in numbers)
         steers = any(each.steering for each in numbers)
-        assert not (steers and kind not in spaces.STEERING)
+        assert not (steers and kind not in controllers.STEERING)
 
 
 def test_numbers_become_options() -> None:

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.drives import LoggedEpisode
-from sideslip.benchmarks.tuning import file as tune_file
+from sideslip.benchmarks.harness.study import LoggedEpisode
+from sideslip.benchmarks.tuning import estimator as tune_file
+from sideslip.benchmarks.tuning import estimator as tune_task
+from sideslip.benchmarks.tuning import study as tune
 from sideslip.benchmarks.tuning import study as tune_study
-from sideslip.benchmarks.tuning import suite as tune
-from sideslip.benchmarks.tuning import task as tune_task
-from sideslip.benchmarks.tuning.task import EstimatorTuning
+from sideslip.benchmarks.tuning.estimator import EstimatorTuning
 from sideslip.estimators import make_estimator
-from sideslip.estimators.design import tunings
+from sideslip.estimators.design import options
 
 SCENARIO = "tie-vision-fig8"
 optuna = pytest.importorskip("optuna")
@@ -207,12 +207,12 @@ def test_an_entry_is_replaced_and_its_note_and_the_others_stay(tmp_path: Path) -
     by_hand.pop("command")
     tune_file.update(path, by_hand)
     tune_file.update(path, ENTRY)
-    assert tunings.read_tunings(path) == [ENTRY]
+    assert options.read_tunings(path) == [ENTRY]
     tune_file.update(path, ENTRY | {"note": "why: \\ \u00e4"})
     tune_file.update(path, ENTRY | {"sensors": "camera", "noise": {"psi_noise": 1.0}})
     path.write_text("# a remark\n" + path.read_text())
     tune_file.update(path, ENTRY | {"q": {"beta": 2.0}, "command": "again"})
-    first, second = tunings.read_tunings(path)
+    first, second = options.read_tunings(path)
     assert first == ENTRY | {"q": {"beta": 2.0}, "command": "again", "note": "why: \\ \u00e4"}
     assert second == ENTRY | {"sensors": "camera", "noise": {"psi_noise": 1.0}}
     assert path.read_text().startswith("# a remark\n")
@@ -237,15 +237,15 @@ def test_a_file_that_is_none_is_named(text: str, tmp_path: Path) -> None:
     path = tmp_path / "bad.toml"
     path.write_text(text)
     with pytest.raises(ValueError, match=r"bad\.toml is no file of tunings"):
-        tunings.read_tunings(path)
+        options.read_tunings(path)
 
 
 @pytest.mark.smoke
 @pytest.mark.parametrize(
-    "entry", tunings.read_tunings(), ids=lambda e: f"{e['estimator']} {e['sensors']}"
+    "entry", options.read_tunings(), ids=lambda e: f"{e['estimator']} {e['sensors']}"
 )
 def test_a_shipped_tuning_says_how_it_was_found(entry: dict[str, Any]) -> None:
-    assert tunings.TUNINGS[entry["estimator"], entry["sensors"]] == entry["q"]
+    assert options.TUNINGS[entry["estimator"], entry["sensors"]] == entry["q"]
     assert all(value >= 0.0 for value in entry["q"].values())
     if "command" not in entry:
         assert entry["note"]  # why there is none

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sideslip.envs import StabilityVectorEnv
-from sideslip.envs.device.env import DeviceVectorEnv
+from sideslip.envs.device.torch_env import DeviceVectorEnv
 from sideslip.envs.engine.layout import STATE_WIDTH, Z
 from sideslip.envs.record import PACKET, PACKET_WIDTH
 

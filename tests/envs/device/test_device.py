@@ -11,10 +11,10 @@ from ..helpers import FULL, IDS, unwrapped
 
 torch = pytest.importorskip("torch")
 
-from sideslip.envs.backend import random as noise  # noqa: E402
-from sideslip.envs.backend.on_torch import to_torch  # noqa: E402
-from sideslip.envs.device.env import DeviceVectorEnv  # noqa: E402
+from sideslip.envs.device.torch_env import DeviceVectorEnv  # noqa: E402
 from sideslip.envs.engine.layout import Z  # noqa: E402
+from sideslip.envs.numerics import functions as noise  # noqa: E402
+from sideslip.envs.numerics.torch_backend import to_torch  # noqa: E402
 from sideslip.envs.record import FAST  # noqa: E402
 from sideslip.envs.vehicle.dynamics import Motion  # noqa: E402
 

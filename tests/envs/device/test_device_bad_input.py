@@ -16,7 +16,7 @@ from ..helpers import bits
 
 torch = pytest.importorskip("torch")
 
-from sideslip.envs.device.env import DeviceVectorEnv  # noqa: E402
+from sideslip.envs.device.torch_env import DeviceVectorEnv  # noqa: E402
 
 pytestmark = pytest.mark.plain
 

@@ -4,7 +4,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from sideslip.envs.device.env import DeviceVectorEnv  # noqa: E402
+from sideslip.envs.device.torch_env import DeviceVectorEnv  # noqa: E402
 
 from .moments import FUSION, UNEVEN, agrees, episodes  # noqa: E402
 

@@ -7,8 +7,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from sideslip.envs.device.env import DeviceVectorEnv  # noqa: E402
-from sideslip.envs.device.gradient import GradientGate  # noqa: E402
+from sideslip.envs.device.gradients import GradientGate  # noqa: E402
+from sideslip.envs.device.torch_env import DeviceVectorEnv  # noqa: E402
 from sideslip.envs.record import PACKET  # noqa: E402
 
 from .moments import DRIVEN, FUSION  # noqa: E402

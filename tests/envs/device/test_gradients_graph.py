@@ -11,7 +11,7 @@ from ..helpers import FULL
 
 torch = pytest.importorskip("torch")
 
-from sideslip.envs.device.env import DeviceVectorEnv  # noqa: E402
+from sideslip.envs.device.torch_env import DeviceVectorEnv  # noqa: E402
 from sideslip.envs.engine.layout import P  # noqa: E402
 
 from ..batches import batch  # noqa: E402

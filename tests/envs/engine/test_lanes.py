@@ -6,11 +6,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.envs.backend import random as noise
-from sideslip.envs.backend.arrays import load_element, write
-from sideslip.envs.backend.decorators import jit
-from sideslip.envs.backend.elementary import atan, atan2, exp, sincos, smoothstep, wrap
-from sideslip.envs.backend.primitives import (
+from sideslip.envs.engine.layout import FLAGS
+from sideslip.envs.numerics import functions as noise
+from sideslip.envs.numerics.functions import (
+    atan,
+    atan2,
+    draw_normals,
+    draw_uniforms,
+    exp,
+    sincos,
+    smoothstep,
+    wrap,
+)
+from sideslip.envs.numerics.jit import jit
+from sideslip.envs.numerics.packed import load_element, write
+from sideslip.envs.numerics.primitives import (
     absolute,
     any_lane,
     floor,
@@ -22,9 +32,7 @@ from sideslip.envs.backend.primitives import (
     to_float,
     to_int,
 )
-from sideslip.envs.backend.random import draw_normals, draw_uniforms
-from sideslip.envs.backend.simd import LANES
-from sideslip.envs.engine.layout import FLAGS
+from sideslip.envs.numerics.simd import LANES
 
 from ..batches import SHORT, batch, drive, pair, same, same_cars
 from ..helpers import bits

@@ -6,8 +6,6 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import pytest
 
-from sideslip.envs.backend.arrays import make_offsets, read, write
-from sideslip.envs.backend.decorators import jit
 from sideslip.envs.engine.layout import (
     FLAGS,
     PARAMS_WIDTH,
@@ -17,6 +15,8 @@ from sideslip.envs.engine.layout import (
     P,
     Z,
 )
+from sideslip.envs.numerics.jit import jit
+from sideslip.envs.numerics.packed import make_offsets, read, write
 from sideslip.envs.record import PACKET_WIDTH
 from sideslip.envs.sensors.link import MAX_IN_FLIGHT
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from sideslip.envs import StabilityEnv
-from sideslip.envs.backend.decorators import as_python
-from sideslip.envs.engine.arrays import make_workspace, split_workspace
+from sideslip.envs.engine.workspace import make_workspace, split_workspace
+from sideslip.envs.numerics.jit import as_python
 
 from ..helpers import bits
 

@@ -14,9 +14,9 @@ from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
 from sideslip.envs import FAILURES
 from sideslip.envs.highway.env import MAX_VEHICLES, HighwayEnv
-from sideslip.envs.highway.roads import ANGLE, ENTRY, RADIUS
+from sideslip.envs.highway.traffic import ANGLE, ENTRY, RADIUS
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.task.failures import COLLISION, DEPARTURE
+from sideslip.envs.task import COLLISION, DEPARTURE
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.vector import EstimateObservation as VectorEstimateObservation
 

@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
-from sideslip.envs.highway.keeping import (
+from sideslip.envs.highway.lane_keeping_adapter import (
     KEEPING,
     STATES,
     KeepingEnv,

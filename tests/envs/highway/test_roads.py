@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from sideslip.envs.highway.roads import ROADS, LanePosition, locate_on_lane
+from sideslip.envs.highway.traffic import ROADS, LanePosition, locate_on_lane
 
 from highway_env.road.lane import PolyLane, SineLane, StraightLane  # isort: skip
 

@@ -11,11 +11,10 @@ from gymnasium.utils.env_checker import check_env
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
 from sideslip.envs import FAILURES
-from sideslip.envs.backend.arrays import read
 from sideslip.envs.engine.layout import Z
+from sideslip.envs.numerics.packed import read
 from sideslip.envs.sensors.inertial import compute_specific_force
-from sideslip.envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams
-from sideslip.envs.vehicle.integration import kutta3
+from sideslip.envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams, kutta3
 from sideslip.envs.vehicle.tyres import FIALA, TyreInputs, compute_tyre_load
 from sideslip.estimators import EstimateObservation
 
@@ -38,7 +37,7 @@ def test_the_environment_keeps_gymnasiums_contract(model: str) -> None:
 
 
 def test_an_outside_plant_is_drawn_without_tyre_forces() -> None:
-    from sideslip.envs.rendering.scene import make_car_scene
+    from sideslip.envs.rendering.road import make_car_scene
 
     env = outside("drift", scenario=STEP | {"duration": 0.3}, render_mode="rgb_array")
     env.reset(seed=0)

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sideslip.envs.recordings.columns import parse_mapping
 from sideslip.envs.recordings.log_file import read_log
+from sideslip.envs.recordings.tables import parse_mapping
 
 from .drives import drive, saved
 

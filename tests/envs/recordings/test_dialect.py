@@ -9,10 +9,9 @@ import pandas as pd
 import pytest
 
 from sideslip.envs.record import FAST, Log
-from sideslip.envs.recordings.columns import COLUMNS, read_quantities
 from sideslip.envs.recordings.dialect import _UNITS, find_unit
-from sideslip.envs.recordings.log_file import read_log
-from sideslip.envs.recordings.parts import read_parts
+from sideslip.envs.recordings.log_file import read_log, read_parts
+from sideslip.envs.recordings.tables import COLUMNS, read_quantities
 
 from .drives import drive, saved
 

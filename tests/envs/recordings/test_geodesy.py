@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sideslip.envs.recordings.geodesy import to_degrees, to_metres
+from sideslip.envs.recordings.dialect import to_degrees, to_metres
 
 
 def test_degrees_agree_with_the_earths_own_measures() -> None:

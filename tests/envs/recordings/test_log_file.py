@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.recordings.columns import COLUMNS, make_column_name, parse_mapping
 from sideslip.envs.recordings.log_file import read_log
+from sideslip.envs.recordings.tables import COLUMNS, make_column_name, parse_mapping
 from sideslip.envs.sensors.slow import GPS
 
 from .drives import drive, saved

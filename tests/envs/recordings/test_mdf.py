@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.recordings.log_file import read_log
-from sideslip.envs.recordings.parts import read_parts
+from sideslip.envs.recordings.log_file import read_log, read_parts
 
 from .drives import drive, saved
 

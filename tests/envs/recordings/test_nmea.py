@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sideslip.envs.recordings.nmea import DAY, LONGEST, Decoder, correct_dates
-from sideslip.envs.recordings.sentences import DECODED
+from sideslip.envs.recordings.nmea import DAY, DECODED, LONGEST, Decoder, correct_dates
 
 from .receiver import ABSENT, REASON, RECORDINGS, decoded, gga, rmc, sentence, zda
 

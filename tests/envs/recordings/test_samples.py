@@ -7,8 +7,7 @@ import pandas as pd
 import pytest
 
 from sideslip.envs.record import FAST, PACKET, Log
-from sideslip.envs.recordings.log_file import read_log
-from sideslip.envs.recordings.parts import read_parts
+from sideslip.envs.recordings.log_file import read_log, read_parts
 
 from .drives import drive, saved
 

@@ -9,9 +9,9 @@ import pytest
 pytest.importorskip("pygame")
 from sideslip.envs import StabilityEnv
 from sideslip.envs.rendering.canvas import Canvas
-from sideslip.envs.rendering.closeup import MAGNIFIED, draw_closeup
+from sideslip.envs.rendering.charts import MAGNIFIED, draw_closeup
 from sideslip.envs.rendering.palette import INK, PALETTE
-from sideslip.envs.rendering.scene import CarScene, make_car_scene
+from sideslip.envs.rendering.road import CarScene, make_car_scene
 
 BOX = (0.0, 0.0, 400.0, 300.0)
 WIND = PALETTE[3]

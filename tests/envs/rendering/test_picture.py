@@ -9,11 +9,9 @@ import pytest
 pytest.importorskip("pygame")
 from sideslip.envs import StabilityEnv
 from sideslip.envs.engine.step import make_step_variant
+from sideslip.envs.rendering.charts import _CLOSEUP, _ROAD, _STRIPS, MAX_SPAN, SIZE, draw_picture
 from sideslip.envs.rendering.palette import GREY, INK, find_colour, mix_colours
-from sideslip.envs.rendering.picture import _CLOSEUP, _ROAD, _STRIPS, SIZE, draw_picture
-from sideslip.envs.rendering.road import BLUE, ORANGE
-from sideslip.envs.rendering.scene import make_car_scene
-from sideslip.envs.rendering.strips import MAX_SPAN
+from sideslip.envs.rendering.road import BLUE, ORANGE, make_car_scene
 from sideslip.envs.rendering.trace import TRACE_POINT, EpisodeTrace
 from sideslip.estimators import EstimateObservation
 

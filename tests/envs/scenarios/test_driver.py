@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv
-from sideslip.envs.backend.arrays import read
-from sideslip.envs.backend.decorators import as_python
-from sideslip.envs.backend.primitives import ARRAYS
 from sideslip.envs.engine.layout import P
+from sideslip.envs.numerics.jit import as_python
+from sideslip.envs.numerics.packed import read
+from sideslip.envs.numerics.primitives import ARRAYS
 from sideslip.envs.scenarios.driver import DriverParams, compute_driver_angle, compute_target_angle
-from sideslip.envs.scenarios.tracks import (
+from sideslip.envs.scenarios.road import (
     compute_path_offset,
     make_path,
     make_sections,
     transform_path,
 )
-from sideslip.envs.task.reference import make_reference_params
+from sideslip.envs.task import make_reference_params
 from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 
 from ..helpers import FULL, LINEAR, Moment, bits, play

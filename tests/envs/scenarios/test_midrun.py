@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, StabilityEnv, stability
-from sideslip.envs.backend.decorators import as_python
 from sideslip.envs.engine import reset as restart
 from sideslip.envs.engine import step as kernel
+from sideslip.envs.engine.config import make_car
 from sideslip.envs.engine.layout import P
-from sideslip.envs.engine.packing import make_car
+from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.ticks import FOREVER
 from sideslip.envs.vehicle.tyres import TyreInputs, compute_tyre_load
 

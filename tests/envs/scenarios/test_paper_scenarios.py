@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, SCENARIOS, StabilityEnv
-from sideslip.envs.backend.arrays import read
 from sideslip.envs.engine.layout import P
+from sideslip.envs.numerics.packed import read
 from sideslip.envs.scenarios.papers import ROAD_TESTS, SIMULATIONS
 
 pytestmark = pytest.mark.plain

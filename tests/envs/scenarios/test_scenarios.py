@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from sideslip.envs import COMS, PASSENGER_CAR, SCENARIOS, Scenario, StabilityEnv, make_scenario
-from sideslip.envs.engine.packing import make_car
+from sideslip.envs.engine.config import make_car
 from sideslip.envs.scenarios.draws import DRAWS_WIDTH, Draws, draw_stable, is_stable
 
 from ..helpers import play

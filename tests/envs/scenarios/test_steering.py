@@ -8,17 +8,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv, critical_speed
-from sideslip.envs.engine.packing import make_car
+from sideslip.envs.engine.config import make_car
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.scenarios.draws import DRAWS_WIDTH, Draws, is_stable
-from sideslip.envs.scenarios.speed import SpeedProfile, compute_acceleration_command
+from sideslip.envs.scenarios.driver import (
+    SpeedProfile,
+    Wind,
+    compute_acceleration_command,
+    compute_wind,
+)
 from sideslip.envs.scenarios.steering import (
     STEERING_KINDS,
     STEERING_WIDTH,
     compute_steering,
     write_steering,
 )
-from sideslip.envs.scenarios.wind import Wind, compute_wind
 from sideslip.envs.ticks import FOREVER, TICK
 
 from ..helpers import FULL, LINEAR, fast_rows, packets, play

@@ -7,11 +7,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents.clairvoyant.foresight import make_forecast
+from sideslip.agents.clairvoyant.preview import make_forecast
 from sideslip.envs import StabilityEnv, make_scenario
-from sideslip.envs.device.env import DeviceVectorEnv
+from sideslip.envs.device.torch_env import DeviceVectorEnv
 from sideslip.envs.record import FAST
-from sideslip.envs.scenarios.traces import read_trace
+from sideslip.envs.scenarios.manoeuvres import read_trace
 
 from ..helpers import bits, drive_alike
 from ..recordings.drives import drive, saved

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sideslip.envs.backend.decorators import as_python
-from sideslip.envs.backend.primitives import ARRAYS
-from sideslip.envs.scenarios.tracks import (
+from sideslip.envs.numerics.jit import as_python
+from sideslip.envs.numerics.primitives import ARRAYS
+from sideslip.envs.scenarios.road import (
     PATHS,
     TrackPath,
     compute_path_offset,

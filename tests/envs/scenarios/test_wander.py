@@ -6,9 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.agents.clairvoyant.foresight import make_forecast
+from sideslip.agents.clairvoyant.preview import make_forecast
 from sideslip.envs import StabilityEnv
-from sideslip.envs.device.env import DeviceVectorEnv
+from sideslip.envs.device.torch_env import DeviceVectorEnv
 from sideslip.envs.record import FAST
 
 from ..helpers import bits, drive_alike

@@ -9,7 +9,7 @@ from scipy import stats
 
 from sideslip.envs import SlowSensor, StabilityEnv
 from sideslip.envs.record import PACKET
-from sideslip.envs.scenarios.checks import MIN_GPS_PERIOD
+from sideslip.envs.scenarios.scenario import MIN_GPS_PERIOD
 from sideslip.envs.sensors.link import MAX_IN_FLIGHT, make_link
 from sideslip.envs.sensors.slow import CAMERA, GPS, SENSOR_SETS
 

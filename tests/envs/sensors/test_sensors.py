@@ -11,7 +11,7 @@ from sideslip.envs import COMS, StabilityEnv
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.sensors.camera import sample_camera
 from sideslip.envs.sensors.gps import HDOP_LAWS, OUTAGE_JUMP, count_satellites, sample_gps
-from sideslip.envs.sensors.noise import Noise
+from sideslip.envs.sensors.inertial import Noise
 from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 
 from ..helpers import FULL, LINEAR, SILENT, fast_rows, packets, play

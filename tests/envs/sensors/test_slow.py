@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs import StabilityEnv
-from sideslip.envs.backend.random import CHANNELS, draw_uniforms
+from sideslip.envs.numerics.functions import CHANNELS, draw_uniforms
 from sideslip.envs.record import PACKET
 from sideslip.envs.sensors.slow import (
     BLOCKS,
@@ -15,7 +15,7 @@ from sideslip.envs.sensors.slow import (
     WIDTHS,
     make_blocks,
 )
-from sideslip.envs.task.observation import make_observation_layout
+from sideslip.envs.task import make_observation_layout
 
 pytestmark = pytest.mark.plain
 

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sideslip.envs.backend.decorators import as_python
+from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.record import PACKET, Record, concatenate
 from sideslip.envs.sensors.camera import (
     FieldOfView,
@@ -14,7 +14,7 @@ from sideslip.envs.sensors.camera import (
     compute_lane_quality,
     sample_camera,
 )
-from sideslip.envs.sensors.noise import Noise
+from sideslip.envs.sensors.inertial import Noise
 from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 from sideslip.estimators import make_estimator
 

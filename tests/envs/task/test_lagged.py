@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR, StabilityEnv
 from sideslip.envs.record import FAST
-from sideslip.envs.task.reference import (
+from sideslip.envs.task import (
     LAGGED,
     LIMITED,
     MODEL,

@@ -10,7 +10,7 @@ import pytest
 from sideslip.envs import Record, SlowSensor, StabilityEnv
 from sideslip.envs.record import FAST, PACKET, Fast
 from sideslip.envs.sensors.slow import SENSOR_SETS, SLOW, SLOW_NAMES
-from sideslip.envs.task.observation import AGE_CAP, N_SAMPLED
+from sideslip.envs.task import AGE_CAP, N_SAMPLED
 from sideslip.envs.ticks import TICK
 
 from ..helpers import FULL, IDS, LINEAR, play, unwrapped

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from sideslip.envs import COMS, FAILURES, StabilityEnv, Vehicle
 from sideslip.envs.record import FAST
-from sideslip.envs.task.cost import compute_cost_rate
-from sideslip.envs.task.reference import (
+from sideslip.envs.task import (
     LIMITED,
     MODEL,
     ZERO_SLIP,
+    compute_cost_rate,
     compute_reference,
     make_reference_params,
 )

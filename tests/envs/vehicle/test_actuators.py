@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR, StabilityEnv
-from sideslip.envs.engine.packing import make_car
+from sideslip.envs.engine.config import make_car
 from sideslip.envs.record import FAST
 from sideslip.envs.ticks import TICK
 from sideslip.envs.vehicle.actuators import (

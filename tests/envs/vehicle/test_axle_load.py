@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR, StabilityEnv
-from sideslip.envs.engine.packing import make_car
+from sideslip.envs.engine.config import make_car
 from sideslip.envs.vehicle.dynamics import CarParams, Motion
+from sideslip.envs.vehicle.parameters import GRAVITY
 from sideslip.envs.vehicle.tyres import (
     FIALA,
     TyreInputs,
@@ -17,7 +18,6 @@ from sideslip.envs.vehicle.tyres import (
     compute_tyre_load,
     has_load_shift,
 )
-from sideslip.envs.vehicle.vehicle import GRAVITY
 
 from ..helpers import FULL, bits, play
 

@@ -9,15 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.engine.packing import make_car
+from sideslip.envs.engine.config import make_car
 from sideslip.envs.vehicle.dynamics import (
     CarParams,
     DisturbanceForces,
     Motion,
     RoadParams,
     derivative,
+    kutta3,
+    rk4,
 )
-from sideslip.envs.vehicle.integration import kutta3, rk4
 from sideslip.envs.vehicle.tyres import (
     FIALA,
     LINEAR,

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, StabilityEnv, Vehicle
-from sideslip.envs.engine.packing import make_car
-from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, derivative
-from sideslip.envs.vehicle.integration import kutta3
+from sideslip.envs.engine.config import make_car
+from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, derivative, kutta3
 from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.envs.vehicle.tyres import LINEAR, TyreInputs, compute_tyre_load
 

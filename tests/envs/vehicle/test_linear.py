@@ -9,11 +9,11 @@ import pytest
 from scipy.signal import cont2discrete
 
 from sideslip.envs import COMS, PASSENGER_CAR, Vehicle, critical_speed
-from sideslip.envs.engine.packing import make_car
+from sideslip.envs.engine.config import make_car
 from sideslip.envs.sensors.camera import sample_camera
 from sideslip.envs.sensors.gps import sample_gps
-from sideslip.envs.sensors.noise import Noise
-from sideslip.envs.task.reference import make_reference_params
+from sideslip.envs.sensors.inertial import Noise
+from sideslip.envs.task import make_reference_params
 from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, derivative
 from sideslip.envs.vehicle.linear import (
     LinearModel,

@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, StabilityEnv
-from sideslip.envs.engine.packing import make_car
+from sideslip.envs.engine.config import make_car
 from sideslip.envs.engine.tick import compute_motor_torques
 from sideslip.envs.record import FAST
-from sideslip.envs.scenarios.speed import SpeedProfile
+from sideslip.envs.scenarios.driver import SpeedProfile
 from sideslip.envs.ticks import FOREVER
 from sideslip.envs.vehicle.actuators import compute_torque_limit, compute_yaw_moment
 

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR, StabilityEnv
-from sideslip.envs.backend.arrays import read
+from sideslip.envs.engine.config import make_car
 from sideslip.envs.engine.layout import P
-from sideslip.envs.engine.packing import make_car
+from sideslip.envs.numerics.packed import read
 from sideslip.envs.record import FAST
 from sideslip.envs.vehicle.dynamics import (
     CarParams,
@@ -20,8 +20,10 @@ from sideslip.envs.vehicle.dynamics import (
     RoadParams,
     compute_gravity,
     derivative,
+    kutta3,
+    rk4,
 )
-from sideslip.envs.vehicle.integration import kutta3, rk4
+from sideslip.envs.vehicle.parameters import GRAVITY
 from sideslip.envs.vehicle.tyres import (
     DUGOFF,
     FIALA,
@@ -32,7 +34,6 @@ from sideslip.envs.vehicle.tyres import (
     compute_tyre_forces,
     compute_tyre_load,
 )
-from sideslip.envs.vehicle.vehicle import GRAVITY
 
 from ..helpers import LINEAR as PAPER
 from ..helpers import fast_rows, play, unwrapped

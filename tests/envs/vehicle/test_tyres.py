@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.engine.packing import make_car
+from sideslip.envs.engine.config import make_car
 from sideslip.envs.vehicle.dynamics import CarParams, Motion, compute_sideslip_angle
+from sideslip.envs.vehicle.parameters import GRAVITY
 from sideslip.envs.vehicle.tyres import (
     DUGOFF,
     FIALA,
@@ -23,7 +24,6 @@ from sideslip.envs.vehicle.tyres import (
     compute_slips,
     compute_tyre_load,
 )
-from sideslip.envs.vehicle.vehicle import GRAVITY
 
 pytestmark = pytest.mark.plain
 

@@ -7,7 +7,7 @@ import gymnasium as gym
 import pytest
 
 from sideslip.envs import COMS, PASSENGER_CAR, VEHICLES, Vehicle, make_vehicle
-from sideslip.envs.documents import write_document
+from sideslip.envs.io import write_document
 
 pytestmark = pytest.mark.plain
 

@@ -13,7 +13,7 @@ from filterpy.kalman import KalmanFilter
 
 from sideslip.envs.record import FAST, PACKET, Array, Record
 from sideslip.envs.vehicle.linear import LinearModel, make_vision_model
-from sideslip.envs.vehicle.vehicle import Vehicle
+from sideslip.envs.vehicle.parameters import Vehicle
 
 Q = {"beta": 2e-3, "gamma": 2e-2, "psi": 1e-6, "y_l": 1e-4}  # per second
 NOISE = {"gyro_noise": 0.005, "psi_noise": 3.5e-3, "y_l_noise": 0.02}

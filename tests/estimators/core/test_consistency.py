@@ -16,9 +16,8 @@ from sideslip.envs import Log
 from sideslip.envs.record import PACKET
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.estimators import Estimator, make_estimator
-from sideslip.estimators.design.levels import DISTURBANCE, NOISE
-from sideslip.estimators.design.measurements import MEASUREMENTS
-from sideslip.estimators.design.models import select_states
+from sideslip.estimators.design.models import MEASUREMENTS, select_states
+from sideslip.estimators.design.options import DISTURBANCE, NOISE
 from tests.estimators.drives import Drives, told
 from tests.estimators.riccati import riccati
 

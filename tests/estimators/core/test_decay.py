@@ -15,7 +15,7 @@ from sideslip.envs.record import FAST_WIDTH, PACKET_WIDTH
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.sensors.slow import SLOW_NAMES
 from sideslip.estimators import FILTERS, Estimator, UnobservableWarning, make_estimator
-from sideslip.estimators.design.error_map import MARGINAL
+from sideslip.estimators.design.stability import MARGINAL
 from tests.estimators.simulation import CAMERA, GPS
 
 quietly = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")

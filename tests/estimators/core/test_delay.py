@@ -9,7 +9,7 @@ import pytest
 from sideslip.envs.record import FAST, PACKET, Record
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.linear import make_vision_model
-from sideslip.envs.vehicle.vehicle import COMS
+from sideslip.envs.vehicle.parameters import COMS
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.filters import FilterDefinition
 from tests.estimators.simulation import CAMERA, FIG7, Drive, simulate

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs import Log
-from sideslip.envs.vehicle.vehicle import Vehicle
+from sideslip.envs.vehicle.parameters import Vehicle
 from tests.estimators.golden.recording import (
     CASES,
     FOLDER,

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.estimators.core.layers import (
+from sideslip.estimators.core.multiple_model import (
     CALM,
     CHANGED,
     GUSTY,

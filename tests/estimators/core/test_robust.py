@@ -13,7 +13,7 @@ import sideslip
 from sideslip.agents.rollout import rollout
 from sideslip.envs import Log
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.vehicle.vehicle import GRAVITY
+from sideslip.envs.vehicle.parameters import GRAVITY
 from sideslip.estimators import Estimator, make_estimator
 
 assert sideslip.__version__

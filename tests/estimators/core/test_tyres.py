@@ -14,8 +14,8 @@ from sideslip.envs.record import PACKET
 from sideslip.envs.vehicle.tyres import FIALA, Tyre, compute_lateral_forces
 from sideslip.estimators import Estimator, make_estimator
 from sideslip.estimators.analysis.bound import compute_error_bound
-from sideslip.estimators.core.layers import replace_least_likely
-from sideslip.estimators.core.tyres import compute_axle_force
+from sideslip.estimators.core.model import compute_axle_force
+from sideslip.estimators.core.multiple_model import replace_least_likely
 from sideslip.estimators.design.assemble import HAZARD, REPLACE_TIME
 
 assert sideslip.__version__

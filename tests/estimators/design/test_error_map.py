@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.papers.ledger.filters import get_paper_tuning
+from sideslip.benchmarks.papers.ledger import get_paper_tuning
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET_WIDTH
 from sideslip.envs.sensors.link import SlowSensor
-from sideslip.envs.vehicle.vehicle import COMS
+from sideslip.envs.vehicle.parameters import COMS
 from sideslip.estimators import UnobservableWarning, make_estimator
-from sideslip.estimators.design.error_map import compute_error_map, spectral_radius
 from sideslip.estimators.design.periodic import design_gains
+from sideslip.estimators.design.stability import compute_error_map, spectral_radius
 from sideslip.estimators.estimator import CHECKED_SPEEDS
 from tests.estimators.simulation import CAMERA, FIG6, GPS, Drive, simulate
 

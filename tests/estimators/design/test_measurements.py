@@ -9,14 +9,14 @@ from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.sensors.slow import CAMERA, GPS, SLOW, SLOW_NAMES
 from sideslip.estimators import make_estimator
-from sideslip.estimators.design import measurements
-from sideslip.estimators.design.measurements import (
+from sideslip.estimators.design import models
+from sideslip.estimators.design.models import (
     MEASUREMENTS,
     Measurement,
     MeasurementRow,
     find_packet_column,
+    select_states,
 )
-from sideslip.estimators.design.models import select_states
 from tests.estimators.simulation import Drive, simulate
 
 LATE = SlowSensor(0.1, (0.050,))
@@ -47,7 +47,7 @@ def test_a_gps_in_the_cameras_place_gives_the_same_bits(
     expected = ours.run(log.record)
     assert expected["psi"][-1] > 1.5 and ours.poor > 0
     monkeypatch.setitem(MEASUREMENTS, "camera", MEASUREMENTS["gps"])
-    monkeypatch.setattr(measurements, "SLOW", SLOW[::-1])
+    monkeypatch.setattr(models, "SLOW", SLOW[::-1])
     log.record.packets[:, PACKET.sensor] = CAMERA
     moved = make_estimator("exact-kf", sensors={"camera": LATE}, **options)
     found = moved.run(log.record)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from sideslip.envs.backend.decorators import as_python
-from sideslip.envs.engine.packing import make_car
+from sideslip.envs.engine.config import make_car
+from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.record import FAST
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.actuators import compute_yaw_moment
@@ -17,9 +17,9 @@ from sideslip.envs.vehicle.linear import (
     make_velocity_roll_model,
     make_vision_model,
 )
-from sideslip.envs.vehicle.vehicle import COMS, PASSENGER_CAR
+from sideslip.envs.vehicle.parameters import COMS, PASSENGER_CAR
 from sideslip.estimators import make_estimator
-from sideslip.estimators.core.transition import build_model, discretise
+from sideslip.estimators.core.model import build_model, discretise
 from sideslip.estimators.design.models import make_signals
 from tests.estimators.simulation import CAMERA, GPS
 

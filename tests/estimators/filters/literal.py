@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.vehicle.vehicle import COMS
+from sideslip.envs.vehicle.parameters import COMS
 
 T = 0.001
 COURSE = np.radians(0.14) * 60.0 / 3.6  # rad m/s; its noise is this over the speed

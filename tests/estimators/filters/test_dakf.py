@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import place_poles
 
 from sideslip.envs.record import FAST, PACKET
-from sideslip.envs.vehicle.vehicle import COMS
+from sideslip.envs.vehicle.parameters import COMS
 from sideslip.estimators import make_estimator
 from tests.estimators.filters.literal import (
     COURSE,

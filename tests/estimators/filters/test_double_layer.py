@@ -7,10 +7,9 @@ import pytest
 
 from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH
 from sideslip.envs.sensors.link import SlowSensor
-from sideslip.envs.vehicle.vehicle import COMS, GRAVITY
+from sideslip.envs.vehicle.parameters import COMS, GRAVITY
 from sideslip.estimators import make_estimator
-from sideslip.estimators.design.periodic import design_gains
-from sideslip.estimators.design.schedule import NO_SENSOR
+from sideslip.estimators.design.periodic import NO_SENSOR, design_gains
 from tests.estimators.filters.literal import (
     COURSE,
     T,

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS, PASSENGER_CAR
-from sideslip.envs.engine.packing import make_car
+from sideslip.envs.engine.config import make_car
 from sideslip.envs.scenarios.manoeuvres import make_scenario
 from sideslip.envs.vehicle.dynamics import DisturbanceForces, Motion, RoadParams, derivative
+from sideslip.envs.vehicle.parameters import GRAVITY
 from sideslip.envs.vehicle.tyres import LINEAR, TyreInputs, compute_tyre_load
-from sideslip.envs.vehicle.vehicle import GRAVITY
 from sideslip.estimators import EstimateObservation, make_estimator, vector
 from tests.estimators.drives import Drives, told
 from tests.estimators.simulation import CAMERA, GPS

@@ -13,7 +13,7 @@ import numpy as np
 from sideslip.envs import Log, StabilityEnv
 from sideslip.envs.record import PACKET, Fast, concatenate
 from sideslip.envs.scenarios.manoeuvres import make_scenario
-from sideslip.envs.vehicle.vehicle import Vehicle
+from sideslip.envs.vehicle.parameters import Vehicle
 from sideslip.estimators import FILTERS, UnobservableWarning, make_estimator
 
 FOLDER = Path(__file__).parent

@@ -11,10 +11,15 @@ import pytest
 from sideslip.agents.rollout import rollout
 from sideslip.envs.record import FAST, Log
 from sideslip.envs.sensors.slow import SENSOR_SETS
-from sideslip.envs.vehicle.vehicle import COMS
+from sideslip.envs.vehicle.parameters import COMS
 from sideslip.estimators import EstimateObservation, make_estimator, vector
-from sideslip.estimators.learned.correction import LearnedEstimator, learned
-from sideslip.estimators.learned.files import (
+from sideslip.estimators.learned.correction import (
+    FRAME_TICKS,
+    RING_FRAMES,
+    LearnedEstimator,
+    learned,
+)
+from sideslip.estimators.learned.correction_file import (
     FAST_INPUTS,
     LAGS,
     Correction,
@@ -22,7 +27,6 @@ from sideslip.estimators.learned.files import (
     list_shipped,
     load_correction,
 )
-from sideslip.estimators.learned.kernel import FRAME_TICKS, RING_FRAMES
 from sideslip.estimators.learned.network import Network
 
 ID = "sideslip/YawFusion-v0"

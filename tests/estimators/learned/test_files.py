@@ -10,7 +10,7 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-from sideslip.estimators.learned.files import (
+from sideslip.estimators.learned.correction_file import (
     Correction,
     CorrectionCard,
     list_shipped,

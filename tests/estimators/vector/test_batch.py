@@ -13,7 +13,7 @@ from sideslip.envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
 from sideslip.estimators.vector.batch import BatchEstimator
 from sideslip.estimators.vector.make import make_batch
-from sideslip.estimators.wrappers.arguments import EstimatorSpec
+from sideslip.estimators.wrappers.estimate import EstimatorSpec
 from tests.estimators.simulation import CAMERA, FIG7, GPS, KMH, simulate
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from sideslip.envs import COMS
-from sideslip.envs.backend.eights import pad_to_cache_line
-from sideslip.envs.backend.simd import LANES
+from sideslip.envs.numerics.simd import LANES
+from sideslip.envs.numerics.simd8 import pad_to_cache_line
 from sideslip.envs.record import FAST, PACKET_WIDTH
 from sideslip.estimators import FILTERS, make_estimator
-from sideslip.estimators.core.memory import FILTER, N_SMALL, N_TOTAL, X_OFFSET
+from sideslip.estimators.core.record import FILTER, N_SMALL, N_TOTAL, X_OFFSET
 from sideslip.estimators.vector import kernel
 from sideslip.estimators.vector.lanes import BLOCK, make_blocks
 from sideslip.estimators.vector.make import make_batch

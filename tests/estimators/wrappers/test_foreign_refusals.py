@@ -8,12 +8,7 @@ import pytest
 
 from sideslip.agents.rollout import rollout
 from sideslip.envs import COMS
-from sideslip.estimators import (
-    EstimateObservation,
-    make_estimator,
-    smooth,
-    vector,
-)
+from sideslip.estimators import EstimateObservation, make_estimator, smooth, vector
 from sideslip.estimators.make import ESTIMATORS, register_estimator
 from tests.estimators.wrappers.constant import Constant
 

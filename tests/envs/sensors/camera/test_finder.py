@@ -11,12 +11,11 @@ import pytest
 pytest.importorskip("cv2")
 import cv2
 
-from sideslip.envs.backend.decorators import as_python
+from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.sensors.camera import FieldOfView, compute_lane_offset
-from sideslip.envs.sensors.camera.consensus import CameraMount, search_starts
-from sideslip.envs.sensors.camera.finder import Lane, LaneFinder
+from sideslip.envs.sensors.camera.images import Appearance, RoadRenderer, RoadScene
+from sideslip.envs.sensors.camera.lane_finder import CameraMount, Lane, LaneFinder, search_starts
 from sideslip.envs.sensors.camera.pinhole import Pinhole
-from sideslip.envs.sensors.camera.road_image import Appearance, RoadRenderer, RoadScene
 from sideslip.envs.vehicle.dynamics import Motion
 
 VIEW = FieldOfView(0.35, 4.0)  # of the scored scenarios

@@ -10,12 +10,15 @@ import pytest
 pytest.importorskip("cv2")
 import cv2
 
-from sideslip.envs.sensors.camera.chessboard import calibrate_camera
+from sideslip.envs.sensors.camera.calibration import (
+    calibrate_camera,
+    estimate_mounting,
+    make_default_camera,
+)
 from sideslip.envs.sensors.camera.films import read_picture
-from sideslip.envs.sensors.camera.finder import Lane, LaneFinder
-from sideslip.envs.sensors.camera.mounting import estimate_mounting, make_default_camera
+from sideslip.envs.sensors.camera.images import Image, RoadRenderer, RoadScene
+from sideslip.envs.sensors.camera.lane_finder import Lane, LaneFinder
 from sideslip.envs.sensors.camera.pinhole import Pinhole
-from sideslip.envs.sensors.camera.road_image import Image, RoadRenderer, RoadScene
 
 ROOT = Path(__file__).resolve().parents[4]
 PLACES = [folder / "shared" / "data" / "lane_images" for folder in (ROOT, ROOT.parent)]

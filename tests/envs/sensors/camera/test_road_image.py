@@ -8,13 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("cv2")
+from sideslip.envs.sensors.camera.images import Appearance, RoadRenderer, RoadScene, _make_rotation
 from sideslip.envs.sensors.camera.pinhole import Pinhole
-from sideslip.envs.sensors.camera.road_image import (
-    Appearance,
-    RoadRenderer,
-    RoadScene,
-    _make_rotation,
-)
 from sideslip.envs.vehicle.dynamics import RoadParams
 
 CAMERA = Pinhole()

@@ -1,0 +1,237 @@
+"""The oracles: reference controllers that know more and more of the truth.
+
+Every entry is scored between `nominal`, a well-designed LQG that knows the nominal car alone,
+and the better of the two that know state, disturbances and car: "Cost and score" of
+docs/ARCHITECTURE.md.
+
+Tuned options of the entries, by the class of tasks that they drive: `tuned.toml`.
+
+`sideslip tune controller` finds them. A class is a car with its disturbances and its reference,
+such as "coms-model" or "car-steering".
+"""
+
+import math
+import tomllib
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from ..envs.scenarios.scenario import Scenario
+from ..envs.sensors.gps import HDOP_LAWS
+from ..envs.validation import check_choice
+from ..estimators.vector import estimate as vector
+from ..estimators.vector.truth import TruthObservation as VectorTruthObservation
+from ..estimators.wrappers.estimate import EstimateObservation
+from ..estimators.wrappers.truth import STIFFNESSES, TRUTH, TruthObservation
+from .controllers.base import FRICTION, Controller
+from .controllers.lqr import Lqr
+from .controllers.nmpc import Nmpc
+
+NOMINAL = "nominal"
+PARAMETER_ORACLES = ("oracle-parameters-lqr", "oracle-parameters-nmpc")
+STATE_ORACLES = ("oracle-state-lqr", "oracle-state-nmpc")
+ORACLES = (NOMINAL, *PARAMETER_ORACLES, *STATE_ORACLES)
+"""Oracles by rising knowledge: `PARAMETER_ORACLES` know car, friction, noise and biases,
+`STATE_ORACLES` also the state and the disturbances; neither controller is always the better one."""
+
+FILTER = "exact-kf"
+TYRE_FILTER = "joint"
+TYRE_FILTER_OPTIONS = dict.fromkeys(("front_tyres_sd", "rear_tyres_sd", "inverse_friction_sd"), 0.1)
+"""Options of the filter for tyres with a limit: it knows them to a tenth, for its tyre law differs
+from the plant's. To a thousandth it is overconfident, and costs 1.1 to 4 times as much."""
+OUTPUTS = ("beta", "gamma", "F_d", "N_d")
+STATES = (*OUTPUTS, "phi", "phi_rate")
+GRIP = 0.7  # fraction of the rear tyres' grip for the yaw moment; 0.71 of it is left across
+STEER_WEIGHT = 100.0  # of added steering, which `lqr`'s design does not know the rate limit of
+_NOISE = {
+    "gyro": "gyro_noise",
+    "accel": "accel_y_noise",
+    "camera_psi": "psi_noise",
+    "camera_y": "y_l_noise",
+}
+
+
+def make_noise_options(scenario: Scenario) -> dict[str, Any]:
+    """Make options of `exact-kf` from the noise and the disturbances of a scenario.
+
+    The course's noise follows each packet's HDOP as far as the scenario's does. The accelerometer
+    is read where the body rolls, as the filter then assumes.
+
+    Args:
+        scenario: Scenario whose noise the filter knows.
+
+    Returns:
+        Options by name.
+    """
+    noise = dict(scenario.noise)
+    share = HDOP_LAWS[scenario.hdop_law]
+    options = {
+        "force_sd": scenario.disturbance_force,
+        "moment_sd": scenario.disturbance_moment,
+        "disturbance_time": scenario.disturbance_time,
+        "hdop_table": [(1.0, 1.0), (101.0, 1.0 + 100.0 * share)],
+    }
+    if scenario.roll:
+        options["fast"] = ["gyro", "accel_y"]
+        options["accel_bias_sd"] = compute_range_rms(scenario, "accel_y_bias")
+    options |= {
+        "bias_sd": compute_range_rms(scenario, "gyro_bias"),
+        "bank_sd": compute_range_rms(scenario, "bank"),
+    }
+    return options | {option: noise[key] for key, option in _NOISE.items() if key in noise}
+
+
+def remove_biases(scenario: Scenario) -> Scenario:
+    """Remove the sensors' biases from a scenario, for a filter that knows and subtracts them.
+
+    Args:
+        scenario: Scenario with biases.
+
+    Returns:
+        Scenario without them.
+    """
+    noise = {key: value for key, value in scenario.noise.items() if not key.endswith("_bias")}
+    return scenario.replace(noise=noise, gyro_bias=0.0, accel_y_bias=0.0)
+
+
+def compute_range_rms(scenario: Scenario, name: str) -> float:
+    """Compute the root mean square of a quantity that is uniform over its range.
+
+    Args:
+        scenario: Scenario that holds the range.
+        name: Name of the quantity, whose unit the result has.
+
+    Returns:
+        Root mean square, in the quantity's unit.
+    """
+    low, high = scenario.range(name)
+    return math.sqrt((low * low + low * high + high * high) / 3.0)
+
+
+def make_oracle(
+    name: str,
+    env_id: str,
+    num_envs: int | None = None,
+    vector_kwargs: Mapping[str, Any] | None = None,
+    options: Mapping[str, Mapping[str, Any]] | None = None,
+    **env_kwargs: Any,
+) -> tuple[Any, Controller]:
+    """Make an oracle and the env whose observation it needs.
+
+    Args:
+        name: Name in `ORACLES`.
+        env_id: Id of the env.
+        num_envs: Rows of a vector env; None: a single env.
+        vector_kwargs: Arguments of the vector env.
+        options: {"filter": of `exact-kf`, "controller": of the agent}, over the defaults: all slow
+            sensors of the id, `make_noise_options` of the scenario, a grip limit.
+        env_kwargs: Arguments of the env (scenario, vehicle, ...). Stiffness and friction of the
+            true car may differ between episodes; its other parameters are the env's.
+
+    Returns:
+        The env and the agent.
+
+    Raises:
+        ValueError: The name is unknown.
+        TypeError: The options have another key.
+    """
+    check_choice("rung", name, ORACLES)
+    chosen: dict[str, Mapping[str, Any]] = {"filter": {}, "controller": {}} | dict(options or {})
+    if len(chosen) != 2:
+        raise TypeError(f"options of a rung are 'filter' and 'controller', got {sorted(chosen)}")
+    single_env: Any = gym.make(env_id, **env_kwargs)
+    if name in PARAMETER_ORACLES:
+        unbiased = remove_biases(single_env.unwrapped.scenario)
+        env_kwargs |= {"scenario": unbiased.to_dict()}
+        single_env = gym.make(env_id, **env_kwargs)
+    base: Any = single_env.unwrapped
+    env = single_env
+    if num_envs is not None:
+        env = gym.make_vec(env_id, num_envs=num_envs, **dict(vector_kwargs or {}), **env_kwargs)
+    if name not in STATE_ORACLES:
+        env = _add_filter(env, base, name in PARAMETER_ORACLES, chosen["filter"])
+    if name != NOMINAL:
+        truth_wrapper = VectorTruthObservation if num_envs is not None else TruthObservation
+        states = () if name in PARAMETER_ORACLES else STATES
+        parameters = (*STIFFNESSES, FRICTION.removeprefix("true_"))
+        env = truth_wrapper(env, parameters, states)
+    settings: dict[str, Any] = {"disturbance_time": base.scenario.disturbance_time, "grip": GRIP}
+    plans = name in (PARAMETER_ORACLES[1], STATE_ORACLES[1])
+    if not plans:  # a plan foresees the steering's rate
+        settings["steer_weight"] = STEER_WEIGHT
+    if name != NOMINAL:
+        settings |= {
+            "vehicle": base.vehicle,
+            "stiffness": [f"true_{stiffness}" for stiffness in STIFFNESSES],
+        }
+    controller_class = Nmpc if plans else Lqr
+    return env, controller_class(env, **settings | dict(chosen["controller"]))
+
+
+def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, Any]) -> Any:
+    """Add a filter on all slow sensors, with the true tyres where it knows them."""
+    levels = make_noise_options(base.scenario) | {"slow": list(base.slow_sensors)}
+    if "gps" not in base.slow_sensors:
+        del levels["hdop_table"]
+    has_tyre_filter = knows_tyres and base.scenario.tyres == "fiala"
+    if has_tyre_filter:
+        levels |= TYRE_FILTER_OPTIONS
+    wrapper = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation
+    return wrapper(
+        env,
+        TYRE_FILTER if has_tyre_filter else FILTER,
+        outputs=OUTPUTS,
+        std=False,
+        vehicle=TRUTH if knows_tyres else None,
+        options=levels | dict(options),
+    )
+
+
+FILE = Path(__file__).with_name("tuned.toml")
+PARTS = ("filter", "controller")
+
+Options = dict[str, dict[str, Any]]
+"""Options of the filter and of the controller, by `PARTS`."""
+
+
+@cache
+def read_tuned(path: Path = FILE) -> dict[str, dict[str, Options]]:
+    """Read the options of a file, by class and entry.
+
+    Args:
+        path: TOML file.
+
+    Returns:
+        Options by class, entry and part.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file holds something else; the message has the path.
+    """
+    try:
+        classes: Any = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is no TOML: {error}") from None
+    for kind, names in classes.items():
+        for name, parts in names.items() if isinstance(names, dict) else [("", names)]:
+            is_valid = isinstance(parts, dict) and parts.keys() <= set(PARTS)
+            if not (is_valid and all(isinstance(options, dict) for options in parts.values())):
+                raise ValueError(f"{path}: {kind}.{name} is no table of {' and '.join(PARTS)}")
+    return dict(classes)
+
+
+def get_tuned_options(contest_class: str, name: str) -> Options:
+    """Get the tuned options of an entry by part, empty where none was tuned.
+
+    Args:
+        contest_class: Class of tasks.
+        name: Name of the entry.
+
+    Returns:
+        Options by part.
+    """
+    options = read_tuned().get(contest_class, {}).get(name, {})
+    return {part: dict(options.get(part, {})) for part in PARTS}

@@ -1,0 +1,320 @@
+"""The preview of an episode at its start: driver, wind and disturbances, step by step."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ...envs.engine.layout import ActuatorState, P, TaskParams, Z
+from ...envs.engine.step import make_step_variant, step_vehicle
+from ...envs.engine.tick import StepVariant
+from ...envs.engine.window import compute_profile_angle, make_window
+from ...envs.engine.workspace import EpisodeArrays
+from ...envs.numerics.jit import as_python
+from ...envs.numerics.packed import read
+from ...envs.record import Array
+from ...envs.scenarios.driver import (
+    SpeedProfile,
+    compute_acceleration_command,
+    compute_speed_reference,
+    compute_wind,
+)
+from ...envs.scenarios.road import NOMINAL_PATH, NominalMotion, step_nominal_car
+from ...envs.task import REPORT, ReferenceParams
+from ...envs.ticks import FOREVER, TICK
+from ...envs.vehicle.actuators import Lag, apply_lag, make_lag
+from ...envs.vehicle.dynamics import CarParams, RoadParams
+
+
+class PreviewStep(NamedTuple):
+    """Inputs and parameters of one step of the plan, which actions change hardly or not at all.
+
+    `beta_ref` and `gamma_ref` may change; `command` and `weight` are those of the step's start.
+    """
+
+    steer_start: Any  # rad, front steering angle without the added one
+    steer_middle: Any
+    steer_end: Any
+    command: Any  # rad, the driver's
+    F_d: Any  # N, mean over the step, with the wind's
+    N_d: Any  # N m
+    N_x: Any  # N m
+    C_f: Any  # N/rad
+    C_r: Any
+    mu: Any
+    mu_r: Any
+    speed: Any  # m/s, the driver's set point
+    acceleration: Any  # m/s2, the driver's acceleration, fed forward
+    turn: Any  # rad/s, of a road that is laid tick by tick
+    weight: Any  # s for which the cost rate at the start counts
+    beta_ref: Any  # rad, of a reference with a memory; of the step's start
+    gamma_ref: Any  # rad/s
+
+
+class PlanState(NamedTuple):
+    """States of a plan in SI units: motion, actuators, the driver's integral.
+
+    `slewing` is the commanded added steering, `added` the applied one (rad). T_l and T_r are the
+    motors' torques (N m).
+    """
+
+    v_x: Any
+    v_y: Any
+    gamma: Any
+    psi: Any
+    X: Any
+    Y: Any
+    s: Any
+    y: Any
+    theta: Any
+    phi: Any
+    phi_dot: Any
+    T_l: Any
+    T_r: Any
+    integral: Any
+    slewing: Any
+    added: Any
+
+
+class PlanParams(NamedTuple):
+    """Parameters that are constant within an episode; hashable, as the key of a solver.
+
+    Attributes:
+        car: Car, with zeros for the fields of `PreviewStep`.
+        road: Road.
+        speed_profile: Speed profile, with zeros for the fields of `PreviewStep`.
+        motor: Lag of the motors over a step.
+        steering: Lag of the steering over a step.
+        motor_tick: Lag of the motors over a tick.
+        steering_tick: Lag of the steering over a tick.
+        target: Reference of the task.
+        task: Parameters of the task.
+        kind: Variant of the plant.
+        width: Entries of an action.
+        ticks: Ticks of a step, the control period.
+        periods: Steps of the episode.
+    """
+
+    car: CarParams
+    road: RoadParams
+    speed_profile: SpeedProfile
+    motor: Lag
+    steering: Lag
+    motor_tick: Lag
+    steering_tick: Lag
+    target: ReferenceParams
+    task: TaskParams
+    kind: StepVariant
+    width: int
+    ticks: int
+    periods: int
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """An episode as a plan has it.
+
+    Attributes:
+        fixed: Parameters of the episode.
+        known: Columns of `PreviewStep`, shape (len(PreviewStep), periods + 1); the last one is of
+            the episode's end.
+        start: State at tick 0.
+        driver: Driver's steering command at every tick (rad), shape (periods, n).
+    """
+
+    fixed: PlanParams
+    known: Array
+    start: PlanState
+    driver: Array
+
+
+def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
+    """Make the forecast of an episode that was just reset.
+
+    Args:
+        base: Unwrapped env at tick 0.
+        actions: Actions of a run, shape (K, width), to which a driver reacts who steers by the car;
+            None: zeros.
+
+    Returns:
+        Forecast from tick 0 to the episode's end.
+
+    Raises:
+        ValueError: The env is not at the start of an episode.
+    """
+    n = base.control_period
+    snapshot = base.get_state()
+    p, z = snapshot["params"], snapshot["state"]
+    if z[Z.clock.tick] != 0.0:
+        raise ValueError("a forecast starts at an episode's start: call reset() first")
+    start = read_plan_state(z)
+    fixed = _make_plan_params(base, p, snapshot["config"].start.switches, n)
+    ticks = fixed.periods * n
+    if actions is None:
+        actions = np.zeros((fixed.periods, fixed.width))
+    drive, driver, refs = _simulate_actions(base, snapshot, actions, n)
+    command = driver
+    if not fixed.kind.has_driver and base.scenario.steering != "wander":
+        command = np.array([compute_profile_angle(p, float(k)) for k in range(ticks + 1)])
+    known = _compute_preview(p, fixed, drive, command, refs)
+    return Forecast(fixed, known, start, command[:-1].reshape(-1, n))
+
+
+def read_plan_state(z: Array) -> PlanState:
+    """Read the `PlanState` in a packed state of the env.
+
+    Args:
+        z: Packed state of one car.
+
+    Returns:
+        State in SI units.
+    """
+    motion, drive = read(z, Z.motion), read(z, Z.drive)
+    return PlanState._make(
+        (*motion, drive.T_l, drive.T_r, drive.integral, drive.slewing, drive.added)
+    )
+
+
+def _make_plan_params(base: Any, p: Array, switches: Any, ticks: int) -> PlanParams:
+    vehicle, lags = base.vehicle, base.scenario.lags
+    motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
+    task = read(p, P.task)
+    return PlanParams(
+        read(p, P.car)._replace(C_f=0.0, C_r=0.0, mu=0.0, mu_r=0.0),
+        read(p, P.road),
+        read(p, P.speed_profile)._replace(
+            speed=0.0, acceleration=0.0, start=0.0, end=FOREVER, surge=0.0
+        ),
+        make_lag(motor, ticks * TICK),
+        make_lag(steering, ticks * TICK),
+        make_lag(motor, TICK),
+        make_lag(steering, TICK),
+        read(p, P.target),
+        task,
+        as_python(make_step_variant)(p, switches),
+        base.action_space.shape[0],
+        ticks,
+        -int(-task.duration // ticks),
+    )
+
+
+def _simulate_actions(
+    base: Any, snapshot: Any, actions: Array, n: int
+) -> tuple[Array, Array, Array]:
+    """Simulate actions by the env's own ticks.
+
+    Returns actuator states (K n + 1, len(ActuatorState)), the driver's angle (K n + 1,) and the
+    references (K n + 1, 2). Disturbances, and a steering profile's front wheels without the added
+    angle, do not depend on the actions.
+    """
+    z, window = snapshot["state"], make_window(1)
+    bounds = np.array([[entry.low, entry.high] for entry in base.layout]).T.copy()
+    row = EpisodeArrays(
+        p=snapshot["params"],
+        z=z,
+        switches=snapshot["switches"],
+        obs=np.empty(len(base.layout), np.float32),
+        rows=snapshot["rows"],
+        packets=snapshot["packets"],
+        report=np.zeros(len(REPORT)),
+    )
+    held_actions = np.repeat(np.vstack([actions, actions[-1:]]).astype(np.float32), n, axis=0)
+    ticks = n * len(actions)
+    drive, driver = np.empty((ticks + 1, len(ActuatorState._fields))), np.empty(ticks + 1)
+    refs = np.empty((ticks + 1, 2))
+    for tick in range(ticks + 1):
+        drive[tick] = read(z, Z.drive)
+        driver[tick], refs[tick] = z[Z.driver], read(z, Z.refs)
+        step_vehicle(*row, held_actions[tick], 1, bounds, window)
+    # a car thrown about may leave the numbers
+    return np.nan_to_num(drive), np.nan_to_num(driver), np.nan_to_num(refs)
+
+
+def _compute_preview(
+    p: Array, fixed: PlanParams, drive: Array, command: Array, refs: Array
+) -> Array:
+    """Compute the columns of `PreviewStep`, shape (len(PreviewStep), periods + 1)."""
+    q, last = fixed.ticks, len(command) - 1
+    nodes = np.arange(0, last, q)
+    names = ActuatorState._fields
+    angle = drive[:, names.index("delta_f")] - drive[:, names.index("added")]
+
+    def compute_wheel_angle(ticks: Any, rest: float) -> Array:
+        """Compute the front wheels' angle without the added one, after a tick's lag."""
+        return np.asarray(as_python(apply_lag)(command[ticks], angle[ticks], rest))
+
+    lag, middle = fixed.steering_tick, nodes + q // 2
+    wind = read(p, P.wind)
+    wind_forces = np.array([compute_wind(float(tick), wind) for tick in range(last)])
+    forces = np.column_stack(
+        [drive[:last, names.index("F_d")], drive[:last, names.index("N_d")], np.zeros(last)]
+    )
+    mean_forces = (forces + wind_forces).reshape(-1, q, 3).mean(axis=1)
+    set_points = np.array(
+        [_compute_set_point(float(tick), read(p, P.speed_profile)) for tick in nodes]
+    )
+    car, change = read(p, P.car), read(p, P.tyre_change)
+    is_changed = nodes >= change.tick
+    tyres = [
+        np.where(is_changed, factor * stiffness, stiffness)
+        for factor, stiffness in ((change.front, car.C_f), (change.rear, car.C_r))
+    ]
+    table = (
+        compute_wheel_angle(nodes, lag.start),
+        compute_wheel_angle(middle, lag.middle if q % 2 else lag.start),
+        compute_wheel_angle(nodes + q - 1, lag.end),
+        command[nodes],
+        *mean_forces.T,
+        *tyres,
+        *(np.full(len(nodes), value) for value in (car.mu, car.mu_r)),
+        *set_points.T,
+        _compute_road_turns(p, fixed.kind, command[:last]).reshape(-1, q).mean(axis=1),
+        _compute_weights(nodes, fixed),
+        *refs[nodes].T,
+    )
+    known = np.array(PreviewStep._make(table))
+    end = known[:, -1:].copy()  # of the episode's end only command, references and weight count
+    end[PreviewStep._fields.index("command")] = command[last]
+    end[PreviewStep._fields.index("beta_ref") :, 0] = refs[last]
+    end[PreviewStep._fields.index("weight")] = (
+        0.5 * (q + 1) * TICK if last == fixed.task.duration else 0.0
+    )
+    return np.hstack([known, end])
+
+
+def _compute_road_turns(p: Array, kind: StepVariant, command: Array) -> Array:
+    """Compute by how much a nominal car's path turns in each tick (rad/s), shape (ticks,)."""
+    turns, path = np.zeros(len(command)), NominalMotion(0.0, 0.0)
+    if kind.road == NOMINAL_PATH:
+        speed_profile, nominal_car = read(p, P.speed_profile), read(p, P.nominal_car)
+        compute_motion, follow_path = (
+            as_python(compute_speed_reference),
+            as_python(step_nominal_car),
+        )
+        for tick, steer in enumerate(command):
+            turns[tick], path = follow_path(
+                path, steer, compute_motion(float(tick), speed_profile)[0], nominal_car
+            )
+    return turns
+
+
+def _compute_set_point(tick: float, speed_profile: SpeedProfile) -> tuple[float, float]:
+    """Compute the driver's speed (m/s) and feedforward acceleration (m/s^2) at a tick."""
+    feedforward_profile = speed_profile._replace(hold=1.0, k_p=0.0, k_i=0.0)
+    feedforward = compute_acceleration_command(tick, 0.0, 0.0, feedforward_profile, np.inf)[0]
+    total = compute_acceleration_command(
+        tick, 0.0, 0.0, feedforward_profile._replace(k_p=1.0), np.inf
+    )[0]
+    return total - feedforward, feedforward
+
+
+def _compute_weights(nodes: npt.NDArray[np.int_], fixed: PlanParams) -> Array:
+    """Compute the weight of each step's cost rate in the sum over ticks 1 .. T (s).
+
+    It sums over every q-th tick by the trapezoid rule, without the end; exact for q = 1.
+    """
+    q = fixed.ticks
+    weights = np.where(nodes < fixed.task.duration, q * TICK, 0.0)
+    weights[0] = 0.5 * (q - 1) * TICK
+    return np.asarray(weights)

@@ -1,0 +1,329 @@
+"""Facts of an environment, single or vector, that controllers are designed from."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
+
+from ..envs.engine.config import EnvConfig
+from ..envs.task import ObservationEntry, make_space
+from ..envs.validation import short_repr
+from ..envs.vehicle.parameters import Vehicle
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
+    AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any] | VecEnv
+else:
+    AnyEnv = Any  # stable-baselines3 comes with an extra, and needs a second to load
+
+# Not loaded here; vector twins have the same names. Ours describe what they change by `layout`.
+_TRANSPARENT = {
+    "gymnasium": "Wrapper VectorWrapper OrderEnforcing PassiveEnvChecker TimeLimit Autoreset "
+    "RewardWrapper VectorRewardWrapper ClipReward NormalizeReward TransformReward AddWhiteNoise "
+    "DictInfoToList HumanRendering ObstructView RecordEpisodeStatistics RecordVideo "
+    "RenderCollection VectorizeTransformReward",
+    "stable_baselines3": "Monitor VecCheckNan VecMonitor VecNormalize VecVideoRecorder",
+    __name__.partition(".")[0]: "CompactObservation EstimateObservation MemoryObservation "
+    "NativeObservation RewardScaleWrapper TruthObservation",
+}
+_CHANGES = {"reset", "step", "step_async", "step_wait", "observation", "observations", "action",
+            "actions"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class EnvFacts:
+    """The facts that controllers are designed from, the same for all rows of a vector env.
+
+    Attributes:
+        layout: Entries of an observation.
+        nominal: Vehicle as controllers know it.
+        full_scale: Yaw moment at an action of 1 (N m).
+        authority: Added steering angle at an action of 1 (rad).
+        control_period: Ticks between two decisions.
+        reference: Name in `envs.task.REFERENCES`.
+        width: Number of entries of an action.
+    """
+
+    layout: tuple[ObservationEntry, ...]
+    nominal: Vehicle
+    full_scale: float
+    authority: float
+    control_period: int
+    reference: str
+    width: int
+
+
+class PlantKind(NamedTuple):
+    """The variant of a plant, for the prediction of nonlinear MPC."""
+
+    tyres: str
+    """The tyre law, of `TYRE_LAWS`."""
+    small_angle: bool
+    roll: bool
+    lags: bool
+    """Whether the actuators lag."""
+    yaw_first: bool
+    """Whether the yaw moment comes before the drive torque."""
+
+
+@dataclass(frozen=True)
+class EnvView:
+    """The spaces and facts of a vector environment, from which an agent is built elsewhere.
+
+    `make_agent`, `get_env_facts` and the controllers accept it as an env. It has no `reset`, no
+    `step` and no seed: an agent built from it learns of the true car by observations alone.
+
+    Attributes:
+        num_envs: Number of rows, one car each.
+        facts: Observation layout, nominal car and limits of the actuators.
+        plants: Kinds of plant among the rows.
+        single_observation_space: Observation space of one row.
+        single_action_space: Action space of one row.
+    """
+
+    num_envs: int
+    facts: "EnvFacts"
+    plants: frozenset[PlantKind]
+    single_observation_space: gym.Space[Any]
+    single_action_space: gym.Space[Any]
+
+    @classmethod
+    def from_env(cls, env: VectorEnv[Any, Any, Any]) -> "EnvView":
+        """Make the view of a vector env.
+
+        Args:
+            env: Vector env with its wrappers.
+
+        Returns:
+            View of the outermost layer.
+        """
+        spaces = env.single_observation_space, env.single_action_space
+        return cls(env.num_envs, get_env_facts(env), list_plant_kinds(env), *spaces)
+
+    @property
+    def unwrapped(self) -> "EnvView":
+        """The view itself, which has no wrappers."""
+        return self
+
+    @property
+    def observation_space(self) -> gym.Space[Any]:
+        """Observation space of all rows."""
+        return batch_space(self.single_observation_space, self.num_envs)
+
+    @property
+    def action_space(self) -> gym.Space[Any]:
+        """Action space of all rows."""
+        return batch_space(self.single_action_space, self.num_envs)
+
+    @property
+    def layout(self) -> tuple[ObservationEntry, ...]:
+        """Entries of the observation: names, units and bounds."""
+        return self.facts.layout
+
+    @property
+    def nominal(self) -> Vehicle:
+        """The car as controllers know it."""
+        return self.facts.nominal
+
+
+def make_env(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
+    """Make the env of an id, with the env's own short message for a missing or unknown argument.
+
+    Args:
+        env_id: Id of a registered env.
+        options: Arguments of `gym.make`.
+
+    Returns:
+        Env with its wrappers.
+
+    Raises:
+        TypeError: An argument is missing or unknown.
+    """
+    try:
+        return gym.make(env_id, **options)
+    except TypeError as error:  # of which Gymnasium makes a longer one
+        raise TypeError(str(error).partition(" was raised from the environment")[0]) from None
+
+
+def get_env_facts(env: AnyEnv | EnvView) -> EnvFacts:
+    """Collect the facts of an env, a vector env, a stable-baselines3 `VecEnv` or an `EnvView`.
+
+    Every wrapper must be of a class that is known to keep observations and actions, or have
+    `transparent = True` on itself or its class. A subclass that overrides how it steps, resets,
+    observes or acts must set it anew.
+
+    Args:
+        env: Env of this package, wrapped or bare.
+
+    Returns:
+        Facts that hold for all rows.
+
+    Raises:
+        TypeError: `env` is no env of this package.
+        ValueError: Another wrapper, or rows with different nominal cars or limits.
+    """
+    try:
+        return _collect_facts(env)
+    except AttributeError as error:
+        made_by = "an agent is built for an env as of gym.make('sideslip/YawVision-v0')"
+        raise TypeError(f"{made_by}, got {short_repr(env)}") from error
+
+
+def _collect_facts(env: Any) -> EnvFacts:
+    nominals: Sequence[Any]
+    vehicles: Sequence[Any]
+    if isinstance(env, EnvView):
+        return env.facts
+    if isinstance(env, gym.Env):
+        base: Any = env.unwrapped
+        layout, width = env.get_wrapper_attr("layout"), base.action_space.shape[0]
+        _check_wrappers(env, layout)
+        nominals, vehicles = [base.nominal], [base.vehicle]
+        period, kind = base.control_period, base.reference
+    elif isinstance(env, VectorEnv):
+        base = env.unwrapped
+        layout, width = get_layout(env), base.single_action_space.shape[0]
+        nominals, vehicles = _get_row_values(base, "nominal"), _get_row_values(base, "vehicle")
+        period, kind = (
+            _get_common_value(base, "control_period"),
+            _get_common_value(base, "reference"),
+        )
+    else:
+        base = env.unwrapped
+        layout, width = _get_common_value(base, "layout"), base.action_space.shape[0]
+        _check_wrappers(env, layout)
+        nominals, vehicles = base.get_attr("nominal"), base.get_attr("vehicle")
+        period, kind = (
+            _get_common_value(base, "control_period"),
+            _get_common_value(base, "reference"),
+        )
+    limits = [(car.yaw_moment_limit, car.steering_authority) for car in vehicles]
+    for i, car in enumerate(zip(nominals, limits, strict=True)):
+        if car != (nominals[0], limits[0]):
+            raise ValueError(
+                f"the rows of a vector env share one design, but row {i} has another nominal "
+                "vehicle or other limits than row 0: make an agent for each kind of car"
+            )
+    return EnvFacts(layout, nominals[0], *limits[0], period, kind, width)
+
+
+def list_plant_kinds(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
+    """Collect the kinds of plant among the rows of an env.
+
+    Args:
+        env: Env, vector env, `VecEnv` or `EnvView`.
+
+    Returns:
+        Kinds, each once.
+    """
+    if isinstance(env, EnvView):
+        return env.plants
+    scenarios = ((config.scenario, config.yaw_first) for config in list_configs(env))
+    return frozenset(
+        PlantKind(scenario.tyres, scenario.small_angle, scenario.roll, scenario.lags, yaw_first)
+        for scenario, yaw_first in scenarios
+    )
+
+
+def list_configs(env: AnyEnv) -> Sequence[EnvConfig]:
+    """List the configurations of an env, one for all rows or one for each sub-environment.
+
+    Args:
+        env: Env, vector env or `VecEnv`.
+
+    Returns:
+        The configurations.
+    """
+    base: Any = env.unwrapped
+    return [base.config] if hasattr(base, "config") else base.get_attr("config")
+
+
+def _iterate_wrappers(env: Any) -> Iterator[Any]:
+    """The wrappers from the outermost in, and those of sub-environments in this process."""
+    inner = vars(env)
+    if isinstance(env, gym.Wrapper | VectorWrapper) or "venv" in inner:
+        yield env
+        yield from _iterate_wrappers(inner["venv"] if "venv" in inner else env.env)  # noqa: SIM401
+    for child in (*inner.get("envs", ()), *filter(None, [inner.get("vector_env")])):
+        yield from _iterate_wrappers(child)
+
+
+def _is_transparent(wrapper: Any) -> bool:
+    """Return whether a wrapper is known, or declared, to keep observations and actions."""
+    if "transparent" in vars(wrapper):
+        return wrapper.transparent is True
+    for base_class in type(wrapper).__mro__:
+        if "transparent" in vars(base_class):
+            return vars(base_class)["transparent"] is True
+        if (
+            base_class.__name__
+            in _TRANSPARENT.get(base_class.__module__.partition(".")[0], "").split()
+        ):
+            return not getattr(wrapper, "norm_obs", False)  # of VecNormalize
+        if not _CHANGES.isdisjoint(vars(base_class)):
+            return False
+    return False
+
+
+def _check_wrappers(env: Any, layout: tuple[ObservationEntry, ...]) -> None:
+    """ValueError for a wrapper that is not known to be transparent, with its name."""
+    wrong = [
+        type(wrapper).__name__ for wrapper in _iterate_wrappers(env) if not _is_transparent(wrapper)
+    ]
+    base = env.unwrapped
+    if {"layout", "envs", "vector_env"}.isdisjoint(dir(base)):  # elsewhere: spaces show wrappers
+        single = "single_" if isinstance(env, VectorEnv) else ""
+        observed, acted_on = (
+            getattr(base, f"{single}{role}_space") for role in ("observation", "action")
+        )
+        if observed != make_space(layout) or acted_on != gym.spaces.Box(
+            -1.0, 1.0, acted_on.shape, np.float32
+        ):
+            wrong.append(f"a wrapper within {type(base).__name__}")
+    if wrong:
+        raise ValueError(
+            f"{wrong[0]} may change observations or actions, which an agent reads and gives by "
+            "name and unit: build and drive the agent on the env inside of it; one that changes "
+            "neither says so by transparent = True, on it or in its class"
+        )
+
+
+def get_layout(env: VectorEnv[Any, Any, Any]) -> tuple[ObservationEntry, ...]:
+    """Read the layout of the outermost layer that has one, else that of the sub-environments.
+
+    Args:
+        env: Vector env with its wrappers.
+
+    Returns:
+        Entries of the observation, in order.
+
+    Raises:
+        ValueError: `get_env_facts` refuses a wrapper, or the rows have different layouts.
+    """
+    layer: Any = env
+    while "layout" not in vars(layer) and isinstance(layer, VectorWrapper):
+        layer = layer.env
+    layout = tuple(_get_common_value(layer, "layout"))
+    _check_wrappers(env, layout)
+    return layout
+
+
+def _get_row_values(base: Any, name: str) -> Sequence[Any]:
+    """An attribute of each row: the vector env's own sequence, or its sub-environments'."""
+    return list(getattr(base, name) if hasattr(base, name) else base.get_attr(name))
+
+
+def _get_common_value(base: Any, name: str) -> Any:
+    """An attribute that all rows share; ValueError where they do not."""
+    if hasattr(base, name):
+        return getattr(base, name)
+    rows = base.get_attr(name)
+    for i, row in enumerate(rows):
+        if row != rows[0]:
+            raise ValueError(f"row {i} of the vector env has another {name} than row 0")
+    return rows[0]

@@ -1,0 +1,384 @@
+"""The car's computer: estimates at every tick, an observation and an action per control period.
+
+A session on disk: every accepted datagram with its tick, and its replay bit for bit.
+
+A file is a head (MAGIC, the length of its JSON, the JSON) and blocks that are appended as they are
+full. A crash loses the last one at most, and a file that is cut is read up to there. A block has
+a checksum of itself and one of all estimates so far, by which a replay checks itself. Nothing in a
+file is run.
+"""
+
+import json
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from ...envs.engine.layout import FLAGS, STATE_WIDTH, P, Z
+from ...envs.engine.outputs import observe, update_newest
+from ...envs.engine.workspace import EpisodeArrays
+from ...envs.numerics.jit import as_python
+from ...envs.numerics.packed import read
+from ...envs.record import FAST, FAST_WIDTH, Array
+from ...envs.task import REPORT, compute_reference, filter_reference
+from ...envs.ticks import NEVER
+from ...estimators.estimator import Estimator
+from ...estimators.protocol import compute_std
+from ...estimators.wrappers.estimate import EstimateObservation
+from ...estimators.wrappers.kernel import compile_observe
+from ...estimators.wrappers.outputs import write_outputs
+from ..env_info import get_env_facts
+from .messages import NO_PACKETS, Arrival, StreamSynchroniser, Tick
+
+_reference, _filter_reference = as_python(compute_reference), as_python(filter_reference)
+
+
+class OnboardController:
+    """An estimator and an agent on the wires' data.
+
+    For equal ticks its results equal those in the env, bit for bit.
+
+    Args:
+        env: `EstimateObservation` with the sensors' clocks, the nominal car, the references and the
+            control period; it is not driven.
+        agent: Agent of `make_agent` for the env; None: without control.
+        seed: Seed of the env, whose reset draws the sensors' phases.
+
+    Attributes:
+        names: Names of the states.
+        action: Newest action, shape (width,), None before the first.
+        has_new_action: Whether the action is of this tick.
+
+    Raises:
+        TypeError: The env is another one.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], agent: Any = None, seed: int | None = 0) -> None:
+        if not isinstance(env, EstimateObservation):
+            raise TypeError(f"it reads an EstimateObservation, got {type(env).__name__}")
+        base: Any = env.unwrapped
+        env.reset(seed=seed)
+        self.base = base
+        self.facts, self.agent, self.outputs = get_env_facts(env), agent, env.outputs
+        self.estimator: Any = env.estimator
+        self.sensors, self.names = self.base.slow_sensors, env.estimator.names
+        self._is_native = isinstance(self.estimator, Estimator) and self.estimator.compiled
+        snapshot = self.base.get_state()
+        self._p, self._switches = snapshot["params"], snapshot["switches"]
+        self._kind, self._target = int(self._switches[FLAGS.reference]), read(self._p, P.target)
+        self._bounds = self.base.config.bounds
+        self._rows = np.zeros((self.facts.control_period, FAST_WIDTH))
+        self._X: Array = np.zeros((1, len(self.names)))
+        self._S = np.zeros_like(self._X)
+        self.begin(0)
+        self._warm_up()
+
+    @property
+    def x(self) -> Array:
+        """Estimated states, shape (n,)."""
+        estimate: Array = self._X[0]
+        return estimate
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations of the estimated states, shape (n,)."""
+        deviation: Array = self._S[0]
+        return deviation
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Counts of packets that the estimator did not use, for one of this package."""
+        return self.estimator.counts if self._is_native else {}
+
+    def begin(self, first: int) -> None:
+        """Clear all memory.
+
+        Args:
+            first: Number of the next tick.
+        """
+        self.estimator.reset(self.sensors, first)
+        self._z, self._refs = np.zeros(STATE_WIDTH), None
+        for sensor in Z.slow:
+            self._z[sensor.captured] = NEVER
+        self._count, self._packets = 0, [NO_PACKETS]
+        self._memory, self._start = None, np.ones(1, np.bool_)
+        self.action: npt.NDArray[np.float32] | None = None
+        self.has_new_action = False
+
+    def take(self, tick: Tick) -> None:
+        """Process a tick: the estimate and, at the end of a control period, the agent's action.
+
+        Args:
+            tick: Data of the tick.
+        """
+        if tick.begins:
+            self.begin(tick.number)
+        n, row = self.facts.control_period, tick.row
+        if self._is_native:
+            rows, packets = row.reshape(1, -1), tick.packets
+            self.estimator.take(rows, 1, packets, len(packets), self._X, self._S)
+        else:
+            self.estimator.step(row.reshape(1, -1), tick.packets)
+            self._X[0], self._S[0] = self.estimator.x, compute_std(self.estimator.P)
+        self._rows[self._count] = row
+        self._count += 1
+        if len(tick.packets):
+            self._packets.append(tick.packets)
+            for packet in tick.packets:
+                update_newest(self._z, packet, float(tick.number))
+        v = 0.5 * float(row[FAST.wheel_left] + row[FAST.wheel_right])
+        steady = _reference(tick.steer_next, v, self._target, self._kind)
+        before, target, kind = self._refs, self._target, self._kind
+        self._refs = steady if before is None else _filter_reference(before, steady, target, kind)
+        self.has_new_action = tick.number % n == 0
+        if self.has_new_action:
+            self._compute_action(tick.number)
+        elif self._count == n:  # begun within a period
+            self._count = 0
+
+    def _compute_action(self, number: int) -> None:
+        obs, start = self.make_observation(number), self._start
+        self._count, self._packets, self._start = 0, [NO_PACKETS], np.zeros(1, np.bool_)
+        if self.agent is None:
+            self.action = np.zeros(self.facts.width, np.float32)
+            return
+        prediction = self.agent.predict(obs, self._memory, start, deterministic=True)
+        self.action, self._memory = prediction
+
+    def make_observation(self, number: int) -> npt.NDArray[np.float32]:
+        """Make the observation that the env's agents would get.
+
+        Args:
+            number: Number of the tick.
+
+        Returns:
+            Observation with the estimator's outputs, shape (k,).
+        """
+        done, outputs = self._count, self.outputs
+        packets = np.concatenate(self._packets)
+        self._rows[done:] = self._rows[done - 1]
+        shown = len(self._rows) if self._switches[FLAGS.all_samples] else done
+        obs = np.empty(self._bounds.shape[1], np.float32)
+        self._z[Z.clock.tick] = number
+        row = EpisodeArrays(
+            self._p, self._z, self._switches, obs, self._rows, packets, np.zeros(len(REPORT))
+        )
+        observe(row, shown, len(packets), self._refs, self._bounds)
+        out, estimator = np.empty(len(outputs.layout), np.float32), self.estimator
+        last = outputs.inner, outputs.plan, outputs.limits, 0.0, 0.0, out, np.zeros(3)
+        if self._is_native:  # which takes no further row here
+            record = self._rows, 0, NO_PACKETS, 0, 0
+            compile_observe()(estimator.filters, estimator.gains, *record, obs, *last)
+        else:
+            write_outputs(estimator, obs, *last)
+        return out
+
+    def _warm_up(self) -> None:
+        """Compile the code of the first ticks."""
+        row, packet = self.base.record.fast[0], np.zeros((1, NO_PACKETS.shape[1]))
+        for number in range(self.facts.control_period + 1):
+            self.take(Tick(number, row, 0.0, packet, number == 0))
+        self.begin(0)
+
+
+MAGIC = b"SLIPSES1"
+MAX_BATCHES, MAX_BLOCK_BYTES = 100, 1 << 13  # of a block at most: a tenth of a second
+_LENGTH = struct.Struct("!I")
+_BLOCK = struct.Struct("!4sIIII")  # magic, batches, bytes, checksums of these and of estimates
+_ITEM = struct.Struct("!HH")  # which batch of the block, bytes of the datagram
+_MAGIC = b"BLOK"
+_SETUP: dict[str, Any] = {
+    **dict.fromkeys(("estimator", "agent", "env"), str),
+    **dict.fromkeys(("options", "agent_options", "estimator_options"), dict),
+    "seed": int,
+    "patience": (int, type(None)),
+}
+"""Types of a session's setup, by key."""
+
+
+class Recorder:
+    """Writes a session.
+
+    Args:
+        path: File to write.
+        setup: Setup of the replay, in JSON types.
+
+    Raises:
+        FileExistsError: The file exists; a session is never overwritten.
+    """
+
+    def __init__(self, path: Path | str, setup: Mapping[str, Any]) -> None:
+        self._file = open(path, "xb", buffering=0)  # noqa: SIM115, closed by `close`
+        text = json.dumps(dict(setup)).encode()
+        self._file.write(MAGIC + _LENGTH.pack(len(text)) + text)
+        self._items, self._batches, self._digest = bytearray(), 0, 0
+
+    def note(self, onboard: OnboardController) -> None:
+        """Add an estimate to the checksum.
+
+        Args:
+            onboard: On-board controller after a tick.
+        """
+        self._digest = update_digest(onboard, self._digest)
+
+    def take(self, accepted: list[bytes]) -> None:
+        """Record the accepted datagrams of a batch.
+
+        Args:
+            accepted: Datagrams of the batch.
+        """
+        for data in accepted:
+            self._items += _ITEM.pack(self._batches, len(data)) + data
+        self._batches += 1
+        if self._batches == MAX_BATCHES or len(self._items) > MAX_BLOCK_BYTES:
+            self._write()
+
+    def _write(self) -> None:
+        sizes = len(self._items), zlib.crc32(self._items), self._digest
+        self._file.write(_BLOCK.pack(_MAGIC, self._batches, *sizes) + self._items)
+        self._items, self._batches = bytearray(), 0
+
+    def close(self) -> None:
+        """Write the last block and close the file."""
+        if self._batches:
+            self._write()
+        self._file.close()
+
+
+def update_digest(onboard: OnboardController, digest: int) -> int:
+    """Update the checksum of all estimates by the newest one.
+
+    Args:
+        onboard: On-board controller after a tick.
+        digest: Checksum of the estimates before.
+
+    Returns:
+        CRC-32 of all estimates.
+    """
+    return zlib.crc32(onboard.std.tobytes(), zlib.crc32(onboard.x.tobytes(), digest))
+
+
+class SessionBlock(NamedTuple):
+    """A block of a session.
+
+    Attributes:
+        batches: Batches of datagrams.
+        digest: Checksum of all estimates after the block.
+    """
+
+    batches: list[list[Arrival]]
+    digest: int
+
+
+def read_setup(path: Path | str) -> dict[str, Any]:
+    """Read the setup of a session.
+
+    Args:
+        path: File of the session.
+
+    Returns:
+        Setup as JSON types.
+
+    Raises:
+        ValueError: The file is no session, or its setup is incomplete.
+    """
+    with open(path, "rb") as file:
+        setup = _read_header(path, file)
+    wrong = [name for name, kind in _SETUP.items() if not isinstance(setup.get(name, ...), kind)]
+    if wrong:
+        raise ValueError(f"{path}: its setup lacks {', '.join(wrong)}, or has it of another type")
+    return setup
+
+
+def _read_header(path: Path | str, file: Any) -> dict[str, Any]:
+    if file.read(len(MAGIC)) == MAGIC:
+        length = file.read(_LENGTH.size)
+        if len(length) == _LENGTH.size:
+            try:
+                setup = json.loads(file.read(*_LENGTH.unpack(length)))
+            except (ValueError, RecursionError):
+                setup = None
+            if isinstance(setup, dict):
+                return setup
+    raise ValueError(f"{path} is no session of `sideslip live --record`, or only its beginning")
+
+
+def read_blocks(path: Path | str) -> Iterator[SessionBlock]:
+    """Read the blocks of a session up to its end, or to where it was cut or damaged.
+
+    Args:
+        path: File of the session.
+    """
+    with open(path, "rb") as file:
+        _read_header(path, file)
+        while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
+            magic, count, size, check, digest = _BLOCK.unpack(head)
+            data = file.read(size) if magic == _MAGIC and count <= MAX_BATCHES else b""
+            if magic != _MAGIC or len(data) != size or zlib.crc32(data) != check:
+                return
+            batches = _parse_batches(data, count)
+            if batches is None:
+                return
+            yield SessionBlock(batches, digest)
+
+
+def _parse_batches(data: bytes, count: int) -> list[list[Arrival]] | None:
+    """Parse the datagrams of each batch; None for data that no recorder wrote."""
+    batches: list[list[Arrival]] = [[] for _ in range(count)]
+    offset = 0
+    while len(data) - offset >= _ITEM.size:
+        index, size = _ITEM.unpack_from(data, offset)
+        offset += _ITEM.size + size
+        if index >= count or offset > len(data):
+            return None
+        batches[index].append(Arrival(0, data[offset - size : offset]))
+    return batches if offset == len(data) else None
+
+
+class SessionReplay(NamedTuple):
+    """The result of a replay.
+
+    Attributes:
+        ticks: Numbers of the ticks, shape (T,).
+        x: Estimates, shape (T, n).
+        std: Standard deviations, shape (T, n).
+        same: Whether every block's checksum of the estimates is the session's.
+    """
+
+    ticks: npt.NDArray[np.int64]
+    x: npt.NDArray[np.float64]
+    std: npt.NDArray[np.float64]
+    same: bool
+
+
+def replay(path: Path | str, onboard: OnboardController, patience: int | None) -> SessionReplay:
+    """Replay a session.
+
+    Args:
+        path: File of the session.
+        onboard: On-board controller of the session's setup.
+        patience: Patience of the `StreamSynchroniser`.
+
+    Returns:
+        Ticks, estimates and deviations, and whether they agree with the session's checksums.
+    """
+    assembler, digest, same = StreamSynchroniser(patience), 0, True
+    ticks: list[int] = []
+    numbers: list[list[npt.NDArray[np.float64]]] = [[], []]
+    for block in read_blocks(path):
+        for batch in block.batches:
+            for tick in assembler.take(batch):
+                onboard.take(tick)
+                digest = update_digest(onboard, digest)
+                ticks.append(tick.number)
+                numbers[0].append(onboard.x.copy())
+                numbers[1].append(onboard.std.copy())
+        same = same and digest == block.digest
+    shape = len(ticks), len(onboard.names)
+    x, std = (np.array(values).reshape(shape) for values in numbers)
+    return SessionReplay(np.array(ticks, np.int64), x, std, same)

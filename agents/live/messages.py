@@ -1,0 +1,326 @@
+"""The datagrams on a car's wires: their format, and a decoder that nothing makes raise.
+
+Network byte order: a header of 20 bytes, `count` doubles and, behind the estimates, names.
+
+| bytes | header |
+|---|---|
+| 0-3 | "SLIP" |
+| 4 | VERSION |
+| 5 | kind, of `DatagramKind` |
+| 6-7 | count, the doubles that follow |
+| 8-11 | sequence number: of this sender's datagrams of this kind, modulo 2^32 |
+| 12-19 | stamp, us of the inertial sender's clock, int64, 0 to 2^53; 0: of another clock |
+
+FIELDS names the doubles of each kind, in SI units. A change of any of it is another VERSION.
+
+From datagrams to ticks: fast rows and packets as estimators take them, in any order of arrival.
+
+Time is that of the inertial stamps, so that two clocks may drift apart. A fast row ends its tick;
+packets of slow sensors belong to the next row. They were captured their age before their stamp,
+or before that row where the stamp is 0: their sender has another clock. Lost and late datagrams
+are counted and bridged by the last row, held. Equal batches give equal ticks, so that a session
+can be replayed.
+"""
+
+import math
+import struct
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from enum import IntEnum, StrEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...envs.record import FAST, FAST_WIDTH, PACKET, PACKET_WIDTH, Array
+from ...envs.sensors.slow import CAMERA, GPS, SLOW
+from ...envs.ticks import TICK
+
+MAGIC, VERSION = b"SLIP", 1
+HEADER = struct.Struct("!4sBBHIq")
+MAX_BYTES = 1400  # bytes: fits a frame of Ethernet
+LIMIT = 1e7  # the largest magnitude of any value, SI
+MAX_STAMP = 2**53  # us: 285 years, and a whole number as a double too
+MAX_AGE = 10.0  # s, of a slow sensor's sample
+TICK_US = 1000  # us a tick
+
+
+class DatagramKind(IntEnum):
+    """The kinds of datagrams."""
+
+    INERTIAL = 1  # a fast row: the tick is complete with it
+    CAMERA = 2
+    GPS = 3
+    ESTIMATE = 4  # states, their standard deviations, then their names
+    CONTROL = 5  # its stamp is that of the fast row it answers
+    STATUS = 6  # what the loop has counted
+    END = 7  # the drive is over
+
+
+class RejectReason(StrEnum):
+    """The reasons to ignore a datagram; each is counted."""
+
+    FOREIGN = "foreign"  # shorter than a header, or without the magic
+    VERSION = "version"
+    KIND = "kind"
+    LENGTH = "length"
+    OVERSIZED = "oversized"
+    NOT_FINITE = "not finite"
+    RANGE = "range"
+    DUPLICATE = "duplicate"  # the same sequence number as the newest
+    REORDERED = "reordered"  # an older one
+
+
+class LoopStatus(NamedTuple):
+    """The counts of a loop, as the doubles of a datagram; latencies and jitter in us."""
+
+    ticks: float = 0.0
+    misses: float = 0.0
+    held: float = 0.0
+    bad: float = 0.0
+    lost: float = 0.0
+    jitter: float = 0.0
+    latency: float = 0.0
+    time: float = 0.0  # us of the last tick's work
+
+
+def _list_slow_fields(place: int) -> tuple[str, ...]:
+    return *(value.name for value in SLOW[place].values), "age", "quality"
+
+
+SENSORS = {DatagramKind.CAMERA: CAMERA, DatagramKind.GPS: GPS}
+FIELDS: dict[int, tuple[str, ...]] = {
+    DatagramKind.INERTIAL: (*FAST._fields, "steer_next"),  # rad, the driver's command from now on
+    **{
+        kind: _list_slow_fields(place) for kind, place in SENSORS.items()
+    },  # age: s from capture to sending
+    DatagramKind.CONTROL: ("yaw_moment", "steering"),  # N m, rad, both added to the driver's
+    DatagramKind.STATUS: LoopStatus._fields,
+    DatagramKind.END: (),
+}
+
+
+class Message(NamedTuple):
+    """The content of a valid datagram."""
+
+    kind: int
+    sequence: int
+    stamp: int  # us
+    values: tuple[float, ...]
+    names: tuple[str, ...] = ()
+
+
+def encode(
+    kind: int, sequence: int, stamp: int, values: Sequence[float], names: Sequence[str] = ()
+) -> bytes:
+    """Encode a message.
+
+    Args:
+        kind: Kind of the datagram.
+        sequence: Sequence number, taken modulo 2^32.
+        stamp: Time stamp (us).
+        values: Values of `FIELDS`, in SI units.
+        names: Names of states, for estimates.
+
+    Returns:
+        Bytes of the datagram.
+    """
+    count = len(values)
+    head = HEADER.pack(MAGIC, VERSION, kind, count, sequence & 0xFFFFFFFF, stamp)
+    return head + struct.pack(f"!{count}d", *values) + ",".join(names).encode()
+
+
+def decode(data: bytes) -> Message | RejectReason:
+    """Decode a datagram; it raises nothing.
+
+    Args:
+        data: Bytes of the datagram.
+
+    Returns:
+        Message, or the reason to ignore it.
+    """
+    if len(data) > MAX_BYTES:
+        return RejectReason.OVERSIZED
+    if len(data) < HEADER.size or data[:4] != MAGIC:
+        return RejectReason.FOREIGN
+    _, version, kind, count, sequence, stamp = HEADER.unpack_from(data)
+    end = HEADER.size + 8 * count
+    names: tuple[str, ...] = ()
+    if version != VERSION:
+        return RejectReason.VERSION
+    if kind == DatagramKind.ESTIMATE:
+        names = tuple(data[end:].decode("ascii", "replace").split(","))
+        if end > len(data) or count != 2 * len(names):
+            return RejectReason.LENGTH
+    elif kind not in FIELDS:
+        return RejectReason.KIND
+    elif end != len(data) or count != len(FIELDS[kind]):
+        return RejectReason.LENGTH
+    values = struct.unpack_from(f"!{count}d", data, HEADER.size)
+    if not all(map(math.isfinite, values)):
+        return RejectReason.NOT_FINITE
+    is_large = kind != DatagramKind.STATUS and any(abs(value) > LIMIT for value in values)
+    if is_large or not 0 <= stamp <= MAX_STAMP:
+        return RejectReason.RANGE
+    if kind in SENSORS and not 0.0 <= values[-2] <= MAX_AGE:
+        return RejectReason.RANGE
+    return Message(kind, sequence, stamp, values, names)
+
+
+PATIENCE = 10  # ticks of silence, from which on the last row is held
+MAX_HELD = 1000  # ticks that are bridged; a longer gap begins anew
+MAX_BEHIND = 100  # rows from the past in succession: then the sender's clock was set back
+WINDOW = 1024  # sequence numbers; an older one is of a sender that began anew
+MAX_WAITING = 64  # packets of slow sensors before a fast row
+_INPUTS = (DatagramKind.INERTIAL, DatagramKind.END, *SENSORS)
+NO_PACKETS = np.zeros((0, PACKET_WIDTH))
+BRIDGED = ("lost", "restarted", "held", "late", "begun anew", "dropped")
+"""Counts beside `RejectReason`: sequence numbers that never came, senders that restarted, ticks
+without a row, rows behind their tick, gaps too long to be bridged, packets without a row."""
+
+
+class Arrival(NamedTuple):
+    """A datagram and its arrival.
+
+    Attributes:
+        at: Time of the monotonic clock (ns).
+        data: Bytes of the datagram.
+        sender: Address of its sender.
+    """
+
+    at: int
+    data: bytes
+    sender: Any = None
+
+
+class Tick(NamedTuple):
+    """The data of one tick."""
+
+    number: int
+    row: Array  # (FAST_WIDTH,)
+    steer_next: float  # rad, the driver's command from now on
+    packets: Array  # (count, PACKET_WIDTH)
+    begins: bool  # forget everything before
+
+
+class StreamSynchroniser:
+    """Makes ticks from datagrams.
+
+    Args:
+        patience: Calls of `take` without a fast row after which the last one is held; None: no
+            limit.
+
+    Attributes:
+        counts: Counts of ignored datagrams, by `RejectReason` and `BRIDGED`.
+        sender: Sender of the newest row.
+        accepted: Datagrams of the newest batch.
+        over: Whether the drive's end came.
+        silent: Calls since the last fast row.
+    """
+
+    def __init__(self, patience: int | None = PATIENCE) -> None:
+        self.patience = patience
+        self.counts: Counter[str] = Counter({name: 0 for name in (*RejectReason, *BRIDGED)})
+        self.sender: Any = None
+        self.accepted: list[bytes] = []
+        self.over, self.silent = False, 0
+        self._newest: dict[int, int] = {}  # sequence numbers by kind
+        self._waiting: list[tuple[int, Message]] = []
+        self._last: Tick | None = None
+        self._behind = 0
+
+    def take(self, batch: Sequence[Arrival]) -> Iterator[Tick]:
+        """Take a batch of datagrams and yield the ticks that it completes; called once a period.
+
+        Args:
+            batch: Datagrams in the order of their arrival.
+
+        Yields:
+            Ticks in order.
+        """
+        before, self.silent = self.silent, self.silent + 1
+        self.accepted.clear()
+        for arrival in batch:
+            message = decode(arrival.data)
+            if isinstance(message, RejectReason) or message.kind not in _INPUTS:
+                self.counts[
+                    message if isinstance(message, RejectReason) else RejectReason.KIND
+                ] += 1
+            elif self._check_order(message):
+                self.accepted.append(arrival.data)
+                if message.kind == DatagramKind.INERTIAL:
+                    self.sender, self.silent = arrival.sender, 0
+                    yield from self._process_row(message)
+                elif message.kind in SENSORS:
+                    self._waiting.append((SENSORS[DatagramKind(message.kind)], message))
+                    self._remove_oldest(MAX_WAITING)
+                elif message.kind == DatagramKind.END:
+                    self.over = True
+        last, patience = self._last, self.patience
+        if last is not None and self.silent and patience is not None and self.silent > patience:
+            missed = patience + 1 if before == patience else 1
+            for _ in range(missed):
+                self.counts["held"] += 1
+                last = last._replace(number=last.number + 1, begins=False)
+                yield self._finish_tick(last)
+
+    def _check_order(self, message: Message) -> bool:
+        """Return whether a message is the newest of its kind; count it otherwise."""
+        newest = self._newest.get(message.kind)
+        if newest is not None:
+            advance = (message.sequence - newest) & 0xFFFFFFFF
+            behind = 2**32 - advance
+            if advance == 0 or behind < WINDOW:
+                self.counts[RejectReason.REORDERED if advance else RejectReason.DUPLICATE] += 1
+                return False
+            if advance < 2**31:
+                self.counts["lost"] += advance - 1
+            else:
+                self.counts["restarted"] += 1
+                self._last = None if message.kind == DatagramKind.INERTIAL else self._last
+        self._newest[message.kind] = message.sequence
+        return True
+
+    def _process_row(self, message: Message) -> Iterator[Tick]:
+        """Yield the tick of a fast row, after those that are missing before it."""
+        row, number, last = message.values, round(message.stamp / TICK_US), self._last
+        begins = last is None
+        if last is not None:
+            missing = number - last.number - 1
+            if missing < 0:
+                self._behind += 1
+                if self._behind <= MAX_BEHIND:
+                    self.counts["late"] += 1
+                    return
+            begins = not 0 <= missing <= MAX_HELD
+            self.counts["begun anew"] += begins
+            for skipped in range(0 if begins else missing):
+                self.counts["held"] += 1
+                yield last._replace(
+                    number=last.number + 1 + skipped, packets=NO_PACKETS, begins=False
+                )
+        self._behind = 0
+        fast = np.array(row[:FAST_WIDTH])
+        yield self._finish_tick(Tick(number, fast, row[-1], NO_PACKETS, begins))
+
+    def _finish_tick(self, tick: Tick) -> Tick:
+        """Add the waiting packets to a tick."""
+        packets = NO_PACKETS
+        if self._waiting:
+            packets = np.zeros((len(self._waiting), PACKET_WIDTH))
+            for packet, (sensor, message) in zip(packets, self._waiting, strict=True):
+                *values, age, quality = message.values
+                sent = round(message.stamp / TICK_US) if message.stamp else tick.number
+                captured = sent - round(age / TICK)
+                head = sensor, captured, tick.number, quality, message.sequence
+                packet[: PACKET.value + len(values)] = *head, *values
+            order = np.lexsort((packets[:, PACKET.sensor], packets[:, PACKET.captured]))
+            packets = packets[order]
+            self._waiting.clear()
+        self._last = tick._replace(packets=packets)
+        return self._last
+
+    def _remove_oldest(self, limit: int) -> None:
+        """Remove the oldest packets where no row takes them."""
+        while len(self._waiting) > limit:
+            self.counts["dropped"] += 1
+            del self._waiting[0]

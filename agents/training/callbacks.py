@@ -1,0 +1,379 @@
+"""The callback of a training: evaluations on other seeds, the best policy, a checkpoint."""
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ... import __version__
+from ...envs.io import atomic_file, write_atomic
+from ...envs.record import Array
+from .. import zoo
+from ..learned.policy import Card, Policy, save_policy
+from ..rollout import compute_cost_ratios, evaluate_costs, evaluate_episodes
+from ..vec_env import make_vec_env
+from .checkpoint import load_parameters, save_checkpoint
+from .config import (
+    TrainingTask,
+    check_device,
+    compute_action_std,
+    get_algorithm,
+    make_model,
+    make_model_options,
+)
+from .export import convert_sb3_policy
+from .normalise import measure_scaling
+from .warm_start import (
+    PolicyWarmStart,
+    RewardScale,
+    RewardScaleWrapper,
+    compute_equal_weights,
+    compute_scenario_weights,
+    load_warm_start,
+    measure_reward_scale,
+    read_warm_start,
+)
+
+from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip  # after ours, which
+from stable_baselines3.common.callbacks import BaseCallback  # isort: skip  # name a missing extra
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # isort: skip
+from stable_baselines3.common.vec_env import VecEnv  # isort: skip
+
+CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
+POLICY, BEST, WARM_START_FILE = "policy.safetensors", "best_model.zip", "begun_with.safetensors"
+_SCALING_ENVS = 64  # environments whose observations make the scaling
+
+# Seeds of tests and of the calibration are below 2^63, those of `corrections` and `distill` beyond.
+_WEIGHT_SEEDS, _EVALUATION_SEEDS, _SCALING_SEEDS, _TRAINING_SEEDS = 2**63, 2**64, 2**65, 2**66
+_SEEDS_PER_TRAINING = (
+    2**40
+)  # seeds of a training: a start or resumption takes those from its steps on
+
+
+def make_evaluation_seeds(episodes: int) -> list[int]:
+    """Make the seeds of an evaluation.
+
+    Args:
+        episodes: Number of seeds.
+
+    Returns:
+        Seeds, as many as `episodes`.
+    """
+    return [_EVALUATION_SEEDS + i for i in range(episodes)]
+
+
+class Evaluation(NamedTuple):
+    """An evaluation of the deterministic policy.
+
+    For a mixture `of_none` is the mean over scenarios, and `cost` is that times their mean
+    uncontrolled cost.
+
+    Attributes:
+        steps: Steps of the training so far.
+        cpu_seconds: CPU time of the training so far, without evaluations (s).
+        cost: Mean cost J.
+        of_none: Cost as a fraction of the uncontrolled car's on these seeds.
+        of_start: Geometric mean of costs over those of the initial policy, None without one.
+    """
+
+    steps: int
+    cpu_seconds: float
+    cost: float
+    of_none: float
+    of_start: float | None = None
+
+    @property
+    def criterion(self) -> float:
+        """Number whose minimum chooses the best evaluation."""
+        return self.cost if self.of_start is None else self.of_start
+
+
+class Progress(NamedTuple):
+    """The progress of a training.
+
+    Attributes:
+        steps: Steps so far.
+        cost: Mean cost of the newest episodes with exploration; None before the first one's end.
+        evaluations: Evaluations so far.
+    """
+
+    steps: int
+    cost: float | None
+    evaluations: tuple[Evaluation, ...]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """The options of a run, which may change when a training resumes.
+
+    Attributes:
+        eval_freq: Steps between two evaluations.
+        device: torch's name of the device.
+        tensorboard_log: Folder for TensorBoard.
+        report: Function that is called after every rollout.
+        command: Command line, for the policy's card.
+        track: Project of Weights & Biases, "" for none.
+
+    Raises:
+        ValueError: `eval_freq` is below 1, or the device is none of torch's.
+    """
+
+    eval_freq: int = 250_000
+    device: str = "cpu"
+    tensorboard_log: str | None = None
+    report: Callable[[Progress], None] | None = None
+    command: str = ""
+    track: str = ""
+
+    def __post_init__(self) -> None:
+        if self.eval_freq < 1:
+            raise ValueError(f"eval_freq is at least 1, got {self.eval_freq}")
+        check_device(self.device)
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """The record of a run beside its task.
+
+    Attributes:
+        steps: Steps of the whole training.
+        eval_freq: Steps between two evaluations.
+        command: Command line, for the policy's card.
+        begun_with: Name of the initial policy, "" for none.
+    """
+
+    steps: int
+    eval_freq: int
+    command: str = ""
+    begun_with: str = ""
+
+
+class EvalCallback(BaseCallback):
+    """Build the model, evaluate it between rollouts, and save what a resumed training needs.
+
+    Args:
+        task: Task of the training.
+        folder: Folder of the training.
+        checkpoint: State of a checkpoint, None for a new training.
+        run_options: Options of this run.
+        steps: Steps of the whole training.
+        initial_policy: Policy that the training starts from; its costs weigh the drives.
+    """
+
+    def __init__(
+        self,
+        task: TrainingTask,
+        folder: Path,
+        checkpoint: Mapping[str, Any] | None,
+        run_options: RunOptions,
+        steps: int = 0,
+        initial_policy: Policy | None = None,
+    ) -> None:
+        super().__init__()
+        self.task, self.folder, self.run_options = task, folder, run_options
+        name = "" if initial_policy is None else initial_policy.name
+        self.run_record = RunRecord(steps, run_options.eval_freq, run_options.command, name)
+        self.seeds = make_evaluation_seeds(task.n_eval_envs)
+        self.eval_env = task.vector_env(task.n_eval_envs)
+        self.initial_policy, self.warm_start = initial_policy, None
+        if initial_policy is not None:
+            self.warm_start = PolicyWarmStart(
+                initial_policy, task, self.eval_env, _SCALING_SEEDS + task.seed
+            )
+            self.eval_env = self.warm_start.wrap_env(self.eval_env)
+        base: Any = self.eval_env.unwrapped
+        self.period: float = base.control_period * base.dt  # s
+        saved = {} if checkpoint is None else checkpoint
+        self.evaluations = [Evaluation(*row) for row in saved.get("evaluations", [])]
+        uncontrolled = self._average_scenarios(evaluate_costs(self.eval_env, None, self.seeds))
+        if uncontrolled.mean() == 0.0:
+            raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
+        self.equal_weights = compute_equal_weights(uncontrolled)
+        self.uncontrolled_cost = float(np.mean(uncontrolled * self.equal_weights))
+        self.weights = (
+            np.ones(1) if initial_policy else compute_scenario_weights(task, _WEIGHT_SEEDS)
+        )
+        driver = self.warm_start.driver if self.warm_start else None
+        self.initial_costs = evaluate_costs(self.eval_env, driver, self.seeds) if driver else None
+        self.scaling: Any = saved.get("scaling")
+        self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
+        self.since = time.process_time()
+
+    def build(
+        self,
+        checkpoint: Mapping[str, Any] | None,
+        trained_agent: str | Path | None = None,
+        trust: bool = False,
+    ) -> BaseAlgorithm:
+        """Build the model, new or of the checkpoint, a zip or a policy, with its environments.
+
+        Args:
+            checkpoint: State of a checkpoint, None for a new training.
+            trained_agent: Zip to start from, None for none.
+            trust: Whether a pickle of VecNormalize beside the zip may be read.
+
+        Returns:
+            Model, ready to learn.
+        """
+        task, run_options = self.task, self.run_options
+        start = None
+        if trained_agent is not None:
+            width = (self.eval_env.single_observation_space.shape or (0,))[0]
+            start = read_warm_start(trained_agent, width, trust)
+        elif checkpoint is None:
+            start = self.warm_start.start if self.warm_start else None
+        if start is not None:
+            self.scaling = start.scaling
+        if self.scaling is None:
+            spread, seed = compute_action_std(task.settings), _SCALING_SEEDS + task.seed
+            mixed = get_algorithm(task.algo).on_tensors
+            self.scaling = measure_scaling(
+                task.vector_env(_SCALING_ENVS), spread, seed, task.reads, mixed
+            )
+        env = make_vec_env(
+            task.env_id,
+            task.num_envs,
+            estimator=task.estimator_kwargs,
+            env_kwargs=task.options(task.num_envs),
+            wrapper_class=self.warm_start.wrap_env if self.warm_start else None,
+        )
+        steps = 0 if checkpoint is None else int(checkpoint["steps"])
+        seed = (task.seed + steps) % 2**32
+        first = _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING + steps
+        scaled_env = RewardScaleWrapper(env, self._make_reward_scale(env, first, steps))
+        further: dict[str, Any] = {
+            "device": run_options.device,
+            "tensorboard_log": run_options.tensorboard_log,
+        }
+        if get_algorithm(task.algo).on_tensors:
+            from .gradient import make_source
+
+            further["source"] = partial(make_source, task, first, scaled_env.reward_scale)
+        model = make_model(
+            task.algo, task.settings, scaled_env, self.period, self.scaling, seed, **further
+        )
+        if checkpoint is not None:
+            load_parameters(self.folder / CHECKPOINT, model)
+            if isinstance(model, OffPolicyAlgorithm):
+                model.learning_starts += steps  # its buffer begins empty
+        if start is not None:
+            load_warm_start(start, model)
+        model.num_timesteps = steps
+        env.seed(first)
+        self.init_callback(model)
+        return model
+
+    def _make_reward_scale(self, env: VecEnv, first: int, steps: int) -> RewardScale:
+        """Make the scale of the rewards, from this seed and step on."""
+        if self.warm_start is not None:
+            n_steps = -(-(self.run_record.steps - steps) // env.num_envs)
+            return RewardScale(measure_reward_scale(self.warm_start.driver, env, first, n_steps))
+        rate = np.resize(self.weights, env.num_envs) / self.period
+        return RewardScale(rate[:, None].tolist())
+
+    def _average_scenarios(self, costs: Array) -> Array:
+        """Average the costs of an evaluation by scenario, shape (k,)."""
+        k = max(len(self.task.scenarios), 1)
+        return np.array([costs[i::k].mean() for i in range(k)])
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        self.check()
+        last = self.evaluations[-1].steps if self.evaluations else -self.run_options.eval_freq
+        if self.model.num_timesteps - last >= self.run_options.eval_freq:
+            self.evaluate()
+
+    def _on_rollout_end(self) -> None:
+        if self.run_options.report is not None:
+            ended = self.model.ep_info_buffer
+            cost = -float(np.mean([episode["r"] for episode in ended])) if ended else None
+            progress = Progress(self.model.num_timesteps, cost, tuple(self.evaluations))
+            self.run_options.report(progress)
+
+    def check(self) -> None:
+        """Check that the weights are finite.
+
+        Raises:
+            FloatingPointError: A weight is not finite.
+        """
+        if not all(
+            bool(parameter.isfinite().all()) for parameter in self.model.policy.parameters()
+        ):
+            raise FloatingPointError(
+                f"the weights are not finite after step {self.model.num_timesteps}; "
+                f"{self.folder / CHECKPOINT} holds them as they were at the last evaluation"
+            )
+
+    def evaluate(self) -> None:
+        """Evaluate the policy, and write the checkpoint and the best policy so far."""
+        self.check()
+        self.spent += time.process_time() - self.since
+        costs, lengths = evaluate_episodes(self.eval_env, self.model, self.seeds)
+        cost, ratio = float(np.mean(self._average_scenarios(costs) * self.equal_weights)), None
+        if self.initial_costs is not None:
+            ratio = float(np.exp(np.log(compute_cost_ratios(costs, self.initial_costs)).mean()))
+        spent = round(self.spent, 3)
+        current = Evaluation(
+            self.model.num_timesteps, spent, cost, cost / self.uncontrolled_cost, ratio
+        )
+        if all(current.criterion < evaluation.criterion for evaluation in self.evaluations):
+            self._keep_best(current)
+        self.evaluations.append(current)
+        self.logger.record("eval/mean_reward", -cost)
+        self.logger.dump(self.model.num_timesteps)
+        checkpoint = {
+            "sideslip": __version__,
+            "task": asdict(self.task),
+            "steps": self.model.num_timesteps,
+            "aim": asdict(self.run_record),
+            "scaling": self.scaling,
+            "evaluations": self.evaluations,
+        }
+        save_checkpoint(self.folder / CHECKPOINT, self.model, checkpoint)
+        lines = "".join(json.dumps(evaluation._asdict()) + "\n" for evaluation in self.evaluations)
+        write_atomic(self.folder / CURVE, lines.encode())
+        zoo.write_evaluation(self.folder, self.task.env_id, self.model, costs, lengths)
+        self.since = time.process_time()
+
+    def _keep_best(self, current: Evaluation) -> None:
+        task = self.task
+        algorithm_options = make_model_options(task.algo, task.settings, self.period, task.num_envs)
+        algorithm_options |= {"num_envs": task.num_envs, "policy": task.settings["policy"]}
+        algorithm_options |= {"reads": task.reads} if task.reads else {}
+        if self.initial_policy is not None:
+            before = self.initial_policy.card.algorithm_options
+            algorithm_options |= {"begun_with": self.initial_policy.name}
+            algorithm_options |= (
+                {"class": before["class"]} if "class" in before and task.scenarios else {}
+            )
+        mixture: dict[str, Any] = {"scenarios": task.scenarios} if task.scenarios else {}
+        if task.scenarios and self.initial_policy is None:
+            mixture["weights"] = self.weights.round(3).tolist()
+        first = {"scenario": task.scenarios[0]} if task.scenarios else {}
+        card = Card.from_env_id(
+            task.env_id,
+            task.env_options | first,
+            task.estimator,
+            task.estimator_options,
+            algorithm=task.algo,
+            algorithm_options=algorithm_options | mixture,
+            command=self.run_options.command,
+            seeds={
+                "training": task.seed,
+                "from": _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING,
+            },
+            steps=current.steps,
+            cpu_seconds=current.cpu_seconds,
+        )
+        network = convert_sb3_policy(self.model)
+        network = self.warm_start.merge_network(network) if self.warm_start else network
+        save_policy(self.folder / POLICY, network, card)
+        with atomic_file(self.folder / BEST) as file:
+            self.model.save(file)

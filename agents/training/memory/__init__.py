@@ -1,1 +1,0 @@
-"""Kinds of memory in the linear environments, whose optimum is known."""

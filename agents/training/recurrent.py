@@ -1,0 +1,428 @@
+"""Kinds of memory in the linear environments, whose optimum is known.
+
+Kinds of memory as small networks, which are all trained and run in the same way.
+
+Each reads normalised observations step by step and has a state (B, ...), zero where an episode
+begins. They differ in what the memory does: nothing, stack frames, gate (GRU), decay linearly,
+observe a linear car (Kalman), attend to the past (transformer).
+
+A memory learns to imitate a teacher with a filter.
+
+In a linear scenario an action costs S_j (u - u*)^2 more than the optimum, with u* the action of
+the optimal filter's estimate. So imitation on the student's own drives minimises its cost, and the
+student needs memory, not exploration.
+"""
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ...envs.numerics import require_extra
+from ...envs.record import Array
+from ...envs.validation import check_choice
+from .distill import (
+    DISTILL_SEEDS,
+    SEEDS_PER_TRAINING,
+    DistillTask,
+    RoundResult,
+    collect_demonstrations,
+)
+from .networks import compute_whitening
+from .student import (
+    LAST_ROUND_FACTOR,
+    Demonstrations,
+    DistillConfig,
+    Scaling,
+    Single,
+    compute_scaling,
+    fit_model,
+    normalise_inputs,
+)
+
+with require_extra("train", "memories need torch"):
+    import torch
+    from torch import nn
+
+import torch  # isort: skip  # after ours, which say which extra is missing
+
+HIDDEN = (64, 64)  # of the layers behind a memory
+_MIN_STD = 1e-2  # deviation of a mix of inputs below which it is not scaled up further
+_FADE_STEPS = (2.0, 300.0)  # over which a linear memory fades to 1/e when it is new
+
+
+class MemoryNetwork(nn.Module):
+    """The base of memories: whitened inputs, a memory, and layers for the action.
+
+    Args:
+        inputs: Number of entries of an observation.
+        fresh_index: Entry that says whether a packet arrived.
+        delay_steps: Control periods between a packet's capture and its arrival.
+    """
+
+    rate: ClassVar[float] = 1e-2
+    """Of Adam: the best of 0.003, 0.005 and 0.01 in a first look at one condition."""
+    recurrent: ClassVar[bool] = True
+    mix: Any
+
+    def __init__(self, inputs: int, fresh_index: int, delay_steps: int) -> None:
+        super().__init__()
+        self.inputs, self.fresh_index, self.delay_steps = inputs, fresh_index, delay_steps
+        self.register_buffer("mix", torch.eye(inputs))
+        self.head: nn.Module = make_dense_layers(self._build_memory() + inputs, *HIDDEN, 1)
+
+    def _build_memory(self) -> int:
+        """Build the memory, and return the width of the output of `_update_memory`."""
+        return 0
+
+    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+        """Compute the memory after each step (B, T, m), and the next state.
+
+        z: inputs (B, T, k). arrived: whether a packet came, (B, T, 1).
+        """
+        return z[..., :0], state
+
+    def fit_whitening(self, drives: Sequence[Demonstrations], mean: Array, scale: Array) -> None:
+        """Fit the whitening of the inputs on drives.
+
+        Args:
+            drives: Demonstrations.
+            mean: Means of the observation, shape (k,).
+            scale: Factors of the observation, shape (k,).
+        """
+        inputs = np.concatenate([normalise_inputs(demo.obs, mean, scale) for demo in drives])
+        self.mix.copy_(
+            torch.from_numpy(compute_whitening(inputs.reshape(-1, self.inputs), _MIN_STD**2))
+        )
+
+    def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
+        """Compute actions (B, T, 1) and the next state.
+
+        Args:
+            z: Normalised observations, shape (B, T, k).
+            state: State from the last call; None at the start.
+
+        Returns:
+            Actions and next state.
+        """
+        arrived, z = (z[..., self.fresh_index, None] > 0.0).to(z.dtype), z @ self.mix
+        known, state = self._update_memory(z, arrived, state)
+        return self.head(torch.cat([known, z], -1)), state
+
+
+def make_dense_layers(*sizes: int) -> nn.Sequential:
+    """Make dense layers with SiLU between them.
+
+    Args:
+        sizes: Sizes of input, hidden layers and output.
+
+    Returns:
+        Layers in order, the last one linear.
+    """
+    layers: list[nn.Module] = []
+    for a, b in itertools.pairwise(sizes):
+        layers += [nn.Linear(a, b), nn.SiLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+class LastObservation(MemoryNetwork):
+    """No memory: layers on the last observation."""
+
+    recurrent = False
+
+
+class FrameStack(MemoryNetwork):
+    """The last 32 observations side by side."""
+
+    rate, count = 5e-3, 32
+
+    def _build_memory(self) -> int:
+        return (self.count - 1) * self.inputs
+
+    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+        before = z.new_zeros(len(z), self.count - 1, self.inputs) if state is None else state
+        frames = torch.cat([before, z], 1)
+        past = frames[:, :-1].unfold(1, self.count - 1, 1).flatten(2)
+        return past, frames[:, 1 - self.count :]
+
+
+class Gru(MemoryNetwork):
+    """A gated recurrent unit of 48 cells."""
+
+    size = 48
+
+    def _build_memory(self) -> int:
+        self.cell = nn.GRU(self.inputs, self.size, batch_first=True)
+        return self.size
+
+    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+        known, state = self.cell(z, None if state is None else state[None])
+        return known, state[0]
+
+
+class LinearRnn(MemoryNetwork):
+    """32 complex numbers that rotate and decay at their own rates.
+
+    Source: the LRU of Orvieto et al., ICML 2023.
+    """
+
+    size = 32
+
+    def _build_memory(self) -> int:
+        first, last = (math.log10(limit) for limit in _FADE_STEPS)
+        fades = torch.logspace(first, last, self.size)
+        self.fade = nn.Parameter(-torch.log(fades))
+        self.turn = nn.Parameter(0.3 * torch.rand(self.size))
+        self.read = nn.Linear(self.inputs, 2 * self.size, bias=False)
+        return 2 * self.size
+
+    def _compute_powers(self, steps: int) -> Any:
+        """Compute the factors of 0 to steps - 1 steps on each number, (steps, n)."""
+        once = torch.complex(-torch.exp(self.fade), self.turn)
+        return torch.exp(torch.arange(steps)[:, None] * once)
+
+    def _project_inputs(self, z: Any) -> Any:
+        """Project inputs, (B, T, n), so that white ones give states of one size."""
+        unit = torch.sqrt(1.0 - torch.exp(-2.0 * torch.exp(self.fade)))
+        return torch.view_as_complex(self.read(z).unflatten(-1, (self.size, 2))) * unit
+
+    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+        steps = z.shape[1]
+        powers, ages = self._compute_powers(steps + 1), torch.arange(steps)
+        past = ages[:, None] - ages
+        weights = torch.where(past[..., None] >= 0, powers[past.clamp(min=0)], 0.0)
+        known = torch.einsum("tsn,bsn->btn", weights, self._project_inputs(z))
+        if state is not None:
+            known = known + powers[1:] * state[:, None]
+        return torch.view_as_real(known).flatten(2), known[:, -1]
+
+
+class Kalman(LinearRnn):
+    """A learned observer of a linear car, for packets that come late.
+
+    Its state is `delay_steps` old and its numbers rotate and decay as the car's modes. At a
+    packet's arrival x+ = x + L (y - C x), with y a mix of the inputs; L grows with the time since
+    the last packet, as a filter's gain does. The present follows from the inputs since then: equal
+    to rewinding and filtering again where gains are constant. The action is linear in it.
+
+    Args:
+        inputs: Number of entries of an observation.
+        fresh_index: Entry that says whether a packet arrived.
+        delay_steps: Control periods between a packet's capture and its arrival.
+    """
+
+    size, outputs = 16, 4
+    gain_rise_steps = (
+        10.0  # steps without a packet in which the gains come half way to their last values
+    )
+
+    def __init__(self, inputs: int, fresh_index: int, delay_steps: int) -> None:
+        super().__init__(inputs, fresh_index, delay_steps)
+        self.head = nn.Linear(2 * self.size + inputs, 1)
+
+    def _build_memory(self) -> int:
+        width = super()._build_memory()
+        self.measure = nn.Linear(self.inputs, self.outputs)
+        self.expect = nn.Parameter(torch.zeros(width, self.outputs))
+        self.gains = nn.Parameter(0.1 * torch.randn(2, self.outputs, width))
+        return width
+
+    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+        n, delay_steps, steps = self.size, self.delay_steps, z.shape[1]
+        if state is None:
+            state = z.new_zeros(len(z), 2 + delay_steps, n, dtype=torch.complex64)
+        since, x, waiting = state[:, 0].real, state[:, 1], state[:, 2:]
+        pushes = torch.cat([waiting, self._project_inputs(z)], 1)
+        powers, measured = self._compute_powers(delay_steps + 2), self.measure(z)
+        has_packet, known = arrived.amax((0, 2)).tolist(), []
+        for t in range(steps):
+            x, since = powers[1] * x + pushes[:, t], since + 1.0
+            if has_packet[t]:
+                new = measured[:, t] - torch.view_as_real(x).flatten(1) @ self.expect
+                grown = (since / (since + self.gain_rise_steps))[:, :1]
+                correction = new @ self.gains[0] + grown * (new @ self.gains[1])
+                correction = torch.view_as_complex(correction.unflatten(1, (n, 2)))
+                x, since = x + arrived[:, t] * correction, since * (1.0 - arrived[:, t])
+            known.append(x)
+        now = torch.stack(known, 1) * powers[delay_steps]
+        if delay_steps:
+            inside = pushes[:, 1:].unfold(1, delay_steps, 1)  # (B, T, n, late), oldest first
+            now = now + torch.einsum("btnk,kn->btn", inside, powers[:delay_steps].flip(0))
+        state = torch.cat([torch.complex(since, 0.0 * since)[:, None], x[:, None]], 1)
+        state = torch.cat([state, pushes[:, steps:]], 1)
+        return torch.view_as_real(now).flatten(2), state
+
+
+class Transformer(MemoryNetwork):
+    """Two layers of causal attention over the last 64 steps, with a learned bias for each age."""
+
+    rate, window, layers, width, heads = 3e-3, 64, 2, 32, 2
+
+    def _build_memory(self) -> int:
+        width, layers = self.width, range(self.layers)
+        self.embed = nn.Linear(self.inputs, width)
+        self.attention_inputs = nn.ModuleList(nn.Linear(width, 3 * width) for _ in layers)
+        self.attention_outputs = nn.ModuleList(nn.Linear(width, width) for _ in layers)
+        self.feedforward = nn.ModuleList(make_dense_layers(width, 64, width) for _ in layers)
+        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(2 * self.layers))
+        self.bias = nn.Parameter(torch.zeros(self.layers, self.heads, self.window))
+        return width
+
+    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+        batch, steps, _ = z.shape
+        before, width = self.window - 1, self.width
+        if state is None:
+            state = z.new_zeros(batch, self.layers, before, 2 * width)
+        age = torch.arange(steps)[:, None] + before - torch.arange(steps + before)
+        visible = (age >= 0) & (age < self.window)
+        x, cached = self.embed(z), []
+        for i in range(self.layers):
+            projected: Any = self.attention_inputs[i](self.norms[2 * i](x))
+            query, pair = projected[..., :width], projected[..., width:]
+            pairs = torch.cat([state[:, i], pair], 1)
+            cached.append(pairs[:, -before:])
+            parts = (query, pairs[..., :width], pairs[..., width:])
+            q, k, v = (part.unflatten(-1, (self.heads, -1)).transpose(1, 2) for part in parts)
+            bias = torch.where(visible, self.bias[i][:, age.clamp(0, before)], -torch.inf)
+            scores = q @ k.mT * (width / self.heads) ** -0.5 + bias
+            attended = (scores.softmax(-1) @ v).transpose(1, 2).flatten(2)
+            x = x + self.attention_outputs[i](attended)
+            x = x + self.feedforward[i](self.norms[2 * i + 1](x))
+        return x, torch.stack(cached, 1)
+
+
+MEMORIES: dict[str, type[MemoryNetwork]] = {
+    "mlp": LastObservation,
+    "frames": FrameStack,
+    "gru": Gru,
+    "linear-rnn": LinearRnn,
+    "kalman": Kalman,
+    "transformer": Transformer,
+}
+
+
+def make_memory(name: str, inputs: int, fresh_index: int, delay_steps: int) -> MemoryNetwork:
+    """Make a new network of `MEMORIES`.
+
+    Args:
+        name: Key of `MEMORIES`.
+        inputs: Number of entries of an observation.
+        fresh_index: Entry that says whether a packet arrived.
+        delay_steps: Control periods between a packet's capture and its arrival.
+
+    Returns:
+        Network with random weights.
+
+    Raises:
+        ValueError: The name is unknown, or a number is out of range.
+    """
+    check_choice("memory", name, MEMORIES)
+    if not 0 <= fresh_index < inputs or delay_steps < 0:
+        raise ValueError(
+            f"fresh is one of {inputs} inputs and late at least 0, got fresh {fresh_index}, "
+            f"late {delay_steps}"
+        )
+    return MEMORIES[name](inputs, fresh_index, delay_steps)
+
+
+class MemoryAgent:
+    """A memory as an agent: stable-baselines3's `predict` on plain observations.
+
+    Args:
+        model: Network with memory.
+        mean: Means of the observation, shape (k,).
+        scale: Factors of the observation, shape (k,).
+    """
+
+    def __init__(self, model: MemoryNetwork, mean: Array, scale: Array) -> None:
+        self.model, self.mean, self.scale = model, mean, scale
+
+    def predict(
+        self,
+        observation: Single,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Single, Any]:
+        """Compute actions (N, 1) and the next state.
+
+        Args:
+            observation: Observations, shape (N, k).
+            state: State from the last call; None at the start.
+            episode_start: Rows whose state is cleared, shape (N,).
+            deterministic: Without effect.
+
+        Returns:
+            Actions within [-1, 1], shape (N, 1), and the next state.
+        """
+        z = torch.from_numpy(normalise_inputs(observation, self.mean, self.scale))[:, None]
+        if state is not None and episode_start is not None and np.any(episode_start):
+            state = state.clone()
+            state[torch.from_numpy(np.asarray(episode_start))] = 0.0
+        with torch.no_grad():
+            actions, state = self.model(z, state)
+        return actions[:, 0].clamp(-1.0, 1.0).numpy(), state
+
+
+def train_memory(
+    name: str,
+    task: DistillTask,
+    config: DistillConfig,
+    delay_steps: int,
+    weight: float = 1.0,
+    report: Callable[[RoundResult], None] = lambda _: None,
+) -> MemoryAgent:
+    """Train a memory to act as a task's teacher, by DAgger.
+
+    Args:
+        name: Key of `MEMORIES`.
+        task: Cars and teacher.
+        config: Configuration, of which `cells` and `hidden` have no effect.
+        delay_steps: Control periods between a packet's capture and its arrival.
+        weight: S, the cost of a squared error.
+        report: Function that is called after each round.
+
+    Returns:
+        Agent of the last round.
+
+    Raises:
+        ValueError: The name is unknown, or the observation does not say whether a packet arrived.
+        FloatingPointError: The training diverges; the message has the step.
+    """
+    cars = task.cars
+    names = [entry.name for entry in cars.layout]
+    fresh_columns = [i for i, label in enumerate(names) if label.endswith("_fresh")]
+    if len(fresh_columns) != 1:
+        raise ValueError(
+            f"a memory knows one sensor with packets, got {len(fresh_columns)} in {names}"
+        )
+    torch.set_num_threads(1)
+    torch.manual_seed(config.seed)
+    model = make_memory(name, len(names), fresh_columns[0], delay_steps)
+    seeds = itertools.count(DISTILL_SEEDS + config.seed * SEEDS_PER_TRAINING, cars.num_envs)
+    drives: list[Demonstrations] = []
+    agent, steps = None, 0
+    scaling: Scaling | None = None
+    for i in range(config.rounds):
+        first = next(seeds)
+        demo = collect_demonstrations(
+            task, agent, range(first, first + cars.num_envs), config.noise
+        )
+        drives.append(demo._replace(curvature=np.full((1, 1), weight, np.float32)))
+        steps += int((demo.weights > 0.0).sum())
+        if scaling is None:
+            mean, scale, _ = compute_scaling(
+                drives, cars.layout, task.teacher.needs, usual_ages=False
+            )
+            scaling = Scaling(mean, scale, np.eye(len(mean)))  # memories mix by themselves
+            model.fit_whitening(drives, mean, scale)
+        last = i == config.rounds - 1
+        loss = fit_model(
+            model, drives, scaling, config, config.epochs * (LAST_ROUND_FACTOR if last else 1)
+        )
+        agent = MemoryAgent(model, scaling.mean, scaling.scale)
+        report(RoundResult(steps, float(demo.costs.mean()), loss))
+    assert agent is not None
+    return agent

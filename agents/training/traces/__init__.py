@@ -1,1 +1,0 @@
-"""Demonstrations for students, and moving averages: by torch, and as observations of an env."""

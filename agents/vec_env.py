@@ -1,0 +1,453 @@
+"""One row of a native vector env, as far as it can be asked what a single environment is asked.
+
+The bridge to stable-baselines3: its `VecEnv` over the native vector env, a call for all rows.
+
+Stable-baselines3's kind of vector environment around the batch engine.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NoReturn
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium.envs.registration import load_env_creator
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+
+from ..envs.numerics import require_extra
+from ..envs.task import make_info
+from ..envs.vector import StabilityVectorEnv
+from ..envs.vehicle.dynamics import Motion
+from ..estimators.vector import estimate as vector
+from ..estimators.vector import truth as truth_vector
+from ..estimators.vector.estimate import EstimateObservation
+from ..estimators.wrappers import estimate as wrappers
+from ..estimators.wrappers import truth
+
+with require_extra("train", "training needs torch and stable-baselines3"):
+    from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+_ROW_ATTRIBUTES = (  # a sequence in the vector env, with an item for each row
+    "vehicle", "nominal", "scenario", "record", "held_speed", "slow_sensors", "motion",
+    "estimator", "np_random", "np_random_seed",
+)  # fmt: skip
+_SHARED_ATTRIBUTES = (
+    "layout", "control_period", "reference", "dt", "setting", "spec", "render_mode", "metadata",
+)  # fmt: skip
+_SPACES = ("observation_space", "action_space")
+_METHODS = ("reset", "get_wrapper_attr", "has_wrapper_attr", "set_wrapper_attr")
+_TWINS: dict[type, type] = {
+    wrappers.EstimateObservation: vector.EstimateObservation,
+    truth.TruthObservation: truth_vector.TruthObservation,
+}
+
+
+class VecEnvRow:
+    """One row of a vector env, with the attributes of the single env under the same names.
+
+    It has those of `_ROW_ATTRIBUTES`, `_SHARED_ATTRIBUTES` and `_SPACES`, the methods, and values
+    set here.
+
+    Args:
+        env: Vector env, wrapped or bare.
+        i: Index of the row.
+    """
+
+    def __init__(self, env: VectorEnv[Any, Any, Any], i: int) -> None:
+        self._env, self._i = env, i
+        self._set: dict[str, Any] = {}
+
+    def _iterate_layers(self) -> Iterator[VectorEnv[Any, Any, Any]]:
+        """Iterate from the outermost wrapper to the bare vector env."""
+        layer = self._env
+        while isinstance(layer, VectorWrapper):
+            yield layer
+            layer = layer.env
+        yield layer
+
+    def get_wrapper_attr(self, name: str) -> Any:
+        """Get an attribute of this row from the outermost layer that has it.
+
+        Args:
+            name: Name of the attribute.
+
+        Returns:
+            Value of this row.
+
+        Raises:
+            AttributeError: No layer has it.
+        """
+        if name in self._set:
+            return self._set[name]
+        if name in _METHODS:
+            return getattr(self, name)
+        attribute = f"single_{name}" if name in _SPACES else name
+        if name in (*_ROW_ATTRIBUTES, *_SHARED_ATTRIBUTES, *_SPACES):
+            for layer in self._iterate_layers():
+                if attribute in vars(layer) or hasattr(type(layer), attribute):
+                    value = getattr(layer, attribute)
+                    return self._get_row_value(name, value) if name in _ROW_ATTRIBUTES else value
+        known = (*_ROW_ATTRIBUTES, *_SHARED_ATTRIBUTES, *_SPACES, *_METHODS, *self._set)
+        raise AttributeError(f"a row of a vector env has {', '.join(known)}; not {name!r}")
+
+    def _get_row_value(self, name: str, value: Any) -> Any:
+        return Motion(*value[self._i].tolist()) if name == "motion" else value[self._i]
+
+    def has_wrapper_attr(self, name: str) -> bool:
+        """Return whether `get_wrapper_attr` finds an attribute.
+
+        Args:
+            name: Name of the attribute.
+
+        Returns:
+            True if it does.
+        """
+        try:
+            self.get_wrapper_attr(name)
+        except AttributeError:
+            return False
+        return True
+
+    def set_wrapper_attr(self, name: str, value: Any, **_: Any) -> None:
+        """Set a value beside the env, under a name that the env does not have.
+
+        Args:
+            name: Name of the value.
+            value: Value for `get_wrapper_attr`.
+
+        Raises:
+            AttributeError: The name is the env's.
+        """
+        if name not in self._set and self.has_wrapper_attr(name):
+            raise AttributeError(
+                f"{name!r} is the environment's and is not set from outside; options of reset "
+                "(`set_options`) change the scenario, vehicle, friction, state and duration"
+            )
+        self._set[name] = value
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start a new episode in this row alone.
+
+        Args:
+            seed: Seed of the row.
+            options: Options of the reset.
+
+        Returns:
+            Observation of shape (k,), and info.
+        """
+        mask = np.arange(self._env.num_envs) == self._i
+        seeds: Any = [seed if is_row else None for is_row in mask]
+        more = {name: [value] * len(mask) for name, value in (options or {}).items()}
+        obs, _ = self._env.reset(seed=seeds, options={**more, "reset_mask": mask})
+        base: Any = self._env.unwrapped
+        return obs[self._i], make_info(base.reports[self._i].tolist())
+
+    def is_wrapped(self, wrapper_class: type) -> bool:
+        """Return whether a layer has a class, or is the vector twin of a single wrapper.
+
+        Args:
+            wrapper_class: Class of a wrapper.
+
+        Returns:
+            True if one does.
+        """
+        wanted = _TWINS.get(wrapper_class, wrapper_class)
+        return any(isinstance(layer, wanted) for layer in self._iterate_layers())
+
+
+Observations = npt.NDArray[np.float32]
+Indices = int | Iterable[int] | None
+Wrapping = Callable[[VectorEnv[Any, Any, Any]], VectorEnv[Any, Any, Any]]
+
+
+class _EmptyInfo(dict[str, Any]):
+    """The info of a row where nothing ended: empty, one for all rows, and closed."""
+
+    def _refuse(self, *_: Any, **__: Any) -> NoReturn:
+        raise TypeError(
+            "the info of a row whose episode goes on is one empty dict that all rows share; put "
+            "another dict in its place in the list instead of writing into it"
+        )
+
+    __setitem__ = update = setdefault = __ior__ = _refuse
+
+    def __reduce__(self) -> tuple[Any, ...]:  # a copy is an ordinary dict
+        return dict, ()
+
+
+EMPTY_INFO = _EmptyInfo()
+
+
+class NativeVecEnv(VecEnv):
+    """stable-baselines3's `VecEnv` over a `StabilityVectorEnv`, wrapped or bare.
+
+    It equals stable-baselines3's `DummyVecEnv` around single environments with the same seeds, bit
+    for bit, but for one thing: where no episode ends, `infos` holds one empty dict that all rows
+    share (`EMPTY_INFO`; it refuses to be written into, `infos` itself is a fresh list). Where one
+    ends, its row has the whole info of the last step, `terminal_observation` and
+    `TimeLimit.truncated`. `reset_infos` are those of each row's newest reset.
+
+    `get_attr` reads what `VecEnvRow` has of each row; `set_attr` stores values for `get_attr`;
+    `env_method` calls methods of `VecEnvRow`. `set_options` takes the options of a single env's
+    `reset`, for all rows or a list of them.
+
+    Args:
+        vector_env: Vector env with autoreset in the same step; `make_vec_env` builds one.
+
+    Raises:
+        TypeError: The env is of another kind.
+        ValueError: The env has another autoreset mode.
+    """
+
+    def __init__(self, vector_env: VectorEnv[Any, Any, Any]) -> None:
+        base = vector_env.unwrapped
+        if not isinstance(base, StabilityVectorEnv):
+            raise TypeError(
+                f"{type(base).__name__} is no native vector env of this package; for single "
+                "environments there is stable_baselines3.common.env_util.make_vec_env"
+            )
+        mode = vector_env.metadata.get("autoreset_mode")
+        if mode != AutoresetMode.SAME_STEP:
+            raise ValueError(
+                "stable-baselines3 expects rows to be reset in the step that ends them: build the "
+                f"vector env with autoreset_mode='SameStep', not {mode}"
+            )
+        self.vector_env, self._base = vector_env, base
+        self._rows = [VecEnvRow(vector_env, i) for i in range(vector_env.num_envs)]
+        self._actions: Any = None
+        super().__init__(
+            vector_env.num_envs,
+            vector_env.single_observation_space,
+            vector_env.single_action_space,
+        )
+        self.metadata = dict(vector_env.metadata)
+
+    @property
+    def spec(self) -> Any:
+        """Spec of the vector env, wrappers included."""
+        return self.vector_env.spec
+
+    def reset(self) -> Observations:
+        """Start an episode in every row, with the seeds and options that were set for it."""
+        seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
+        obs, infos = self.vector_env.reset(seed=seeds, options=_merge_options(self._options))
+        self._reset_seeds()
+        self._reset_options()
+        self._store_infos(range(self.num_envs), infos)
+        return np.asarray(obs)
+
+    def step_async(self, actions: npt.NDArray[Any]) -> None:
+        """Store the actions for `step_wait`.
+
+        Args:
+            actions: Actions, shape (N, width).
+        """
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Apply each row's action for one control period.
+
+        Returns:
+            Observations (N, k) and rewards (N,) as float32, dones (N,) and N infos.
+
+        Raises:
+            ValueError: The actions have another shape or are not finite; then no row steps.
+        """
+        actions, self._actions = self._actions, None
+        obs, rewards, terminated, truncated, infos = self.vector_env.step(actions)
+        dones = terminated | truncated
+        row_infos: list[dict[str, Any]] = [EMPTY_INFO] * self.num_envs
+        if "final_obs" in infos:
+            ended = np.flatnonzero(dones).tolist()
+            finals = _split_infos(infos["final_info"], ended)
+            for i, info in zip(ended, finals, strict=True):
+                info["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
+                info["terminal_observation"] = infos["final_obs"][i]
+                row_infos[i] = info
+            self._store_infos(ended, infos)
+        return obs, rewards.astype(np.float32), dones, row_infos
+
+    def _store_infos(self, rows: Sequence[int], infos: Mapping[str, Any]) -> None:
+        """Store the infos that the resets of these rows returned."""
+        reset_infos = {key: value for key, value in infos.items() if "final_" not in key}
+        for i, info in zip(rows, _split_infos(reset_infos, rows), strict=True):
+            self.reset_infos[i] = make_info(self._base.reports[i].tolist()) | info
+
+    def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:
+        """Get a frame of each row, with render_mode="rgb_array"."""
+        frames: Any = self.vector_env.render()
+        return frames or ()
+
+    def render(self, mode: str | None = None) -> npt.NDArray[np.uint8] | None:
+        """Render all rows as one frame; None with render_mode="human", where `step` shows row 0.
+
+        Args:
+            mode: Passed to stable-baselines3, which warns where it differs from `render_mode`.
+
+        Returns:
+            Frame, shape (height, width, 3), or None.
+        """
+        return None if self.render_mode == "human" else super().render(mode)
+
+    def close(self) -> None:
+        """Close the vector env."""
+        self.vector_env.close()
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """Get an attribute of each row, as `VecEnvRow` has it.
+
+        Args:
+            attr_name: Name of the attribute.
+            indices: Rows, None for all.
+
+        Returns:
+            Values, one for each row.
+
+        Raises:
+            AttributeError: The rows do not have it.
+        """
+        return [row.get_wrapper_attr(attr_name) for row in self._get_rows(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Set a value beside each row, under a name that the env does not have.
+
+        Args:
+            attr_name: Name of the value.
+            value: Value for `get_attr`.
+            indices: Rows, None for all.
+
+        Raises:
+            AttributeError: The name is the env's.
+        """
+        for row in self._get_rows(indices):
+            row.set_wrapper_attr(attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of `VecEnvRow` for each row.
+
+        Args:
+            method_name: Name of the method.
+            method_args: Positional arguments.
+            indices: Rows, None for all.
+            method_kwargs: Keyword arguments.
+
+        Returns:
+            Results, one for each row.
+
+        Raises:
+            AttributeError: `VecEnvRow` has no such method.
+        """
+        chosen = [row.get_wrapper_attr(method_name) for row in self._get_rows(indices)]
+        return [method(*method_args, **method_kwargs) for method in chosen]
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Indices = None
+    ) -> list[bool]:
+        """Return for each row whether it has a wrapper or its vector twin.
+
+        Args:
+            wrapper_class: Class of a wrapper.
+            indices: Rows, None for all.
+
+        Returns:
+            True or False for each row.
+        """
+        return [row.is_wrapped(wrapper_class) for row in self._get_rows(indices)]
+
+    def _get_rows(self, indices: Indices) -> list[VecEnvRow]:
+        return [self._rows[i] for i in self._get_indices(indices)]
+
+
+def make_vec_env(
+    env_id: str,
+    num_envs: int = 1,
+    seed: int | None = None,
+    estimator: str | Mapping[str, Any] | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    monitor_file: str | None = None,
+    info_keywords: Sequence[str] = (),
+    wrapper_class: Wrapping | None = None,
+) -> VecMonitor:
+    """Make stable-baselines3's `VecEnv` on the native vector env, like its function of this name.
+
+    Args:
+        env_id: Id of an env with a native vector env.
+        num_envs: Number of rows.
+        seed: Seed of row 0; row i gets seed + i at the first reset.
+        estimator: Name of an estimator, or arguments of `EstimateObservation`.
+        env_kwargs: Arguments of the environment.
+        monitor_file: CSV file of episodes.
+        info_keywords: Keys of the last step's info that go into that file.
+        wrapper_class: Called with the native vector env in its estimator; returns what is bridged.
+
+    Returns:
+        `VecEnv` that monitors episodes.
+
+    Raises:
+        ValueError: The id has no native vector env; or as `gym.make_vec` and `EstimateObservation`.
+    """
+    env = make_native_env(env_id, num_envs, estimator, env_kwargs)
+    bridge = NativeVecEnv(env if wrapper_class is None else wrapper_class(env))
+    bridge.action_space.seed(seed)
+    bridge.seed(seed)
+    return VecMonitor(bridge, monitor_file, tuple(info_keywords))
+
+
+def make_native_env(
+    env_id: str,
+    num_envs: int,
+    estimator: str | Mapping[str, Any] | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+) -> VectorEnv[Any, Any, Any]:
+    """Make the vector env that `make_vec_env` bridges, with its estimator around it.
+
+    Args:
+        env_id: Id of an env with a native vector env.
+        num_envs: Number of rows.
+        estimator: Name of an estimator, or arguments of `EstimateObservation`.
+        env_kwargs: Arguments of the environment.
+
+    Returns:
+        Vector env, wrapped if there is an estimator.
+
+    Raises:
+        ValueError: As `make_vec_env`.
+    """
+    entry = gym.spec(env_id).vector_entry_point
+    kind = load_env_creator(entry) if isinstance(entry, str) else entry
+    if not (isinstance(kind, type) and issubclass(kind, StabilityVectorEnv)):
+        raise ValueError(
+            f"{env_id} has no native vector env of this package; for single environments there is "
+            "stable_baselines3.common.env_util.make_vec_env"
+        )
+    arguments: dict[str, Any] = {"autoreset_mode": "SameStep", "info": "ends", **(env_kwargs or {})}
+    env: VectorEnv[Any, Any, Any] = gym.make_vec(env_id, num_envs=num_envs, **arguments)
+    if estimator is None:
+        return env
+    estimator_options = (
+        dict(estimator) if isinstance(estimator, Mapping) else {"estimator": estimator}
+    )
+    return EstimateObservation(env, **estimator_options)
+
+
+def _split_infos(infos: Mapping[str, Any], rows: Sequence[int]) -> list[dict[str, Any]]:
+    """Split a vector env's infos of some rows into the single envs' infos."""
+    singles: list[dict[str, Any]] = [{} for _ in rows]
+    for key, column in infos.items():
+        if not key.startswith("_"):
+            values, is_present = column[rows].tolist(), infos[f"_{key}"][rows].tolist()
+            for info, value, is_set in zip(singles, values, is_present, strict=True):
+                if is_set:
+                    info[key] = value
+    return singles
+
+
+def _merge_options(options: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Merge the rows' options into those of the vector env, None where there are none."""
+    names = dict.fromkeys(name for row_options in options for name in row_options)
+    return {name: [row_options.get(name) for row_options in options] for name in names} or None

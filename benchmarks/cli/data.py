@@ -1,0 +1,402 @@
+"""`sideslip replay` and `sideslip identify`: recorded drives through estimators, and their car.
+
+`sideslip lane`: the lane in a picture or a film, and a camera's intrinsics from chessboards.
+"""
+
+import math
+import os
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from ...envs.io import atomic_file, read_document, write_atomic, write_document
+from ...envs.numerics import require_extra
+from ..harness.parallel import use_shared_bar
+from ..report.terminal import print_suite
+from .common import check_files, parse_option, parse_options, print_written, write_output
+from .names import complete
+
+if TYPE_CHECKING:
+    from ...envs.sensors.camera.images import Image
+    from ...envs.sensors.camera.lane_finder import Lane, LaneFinder
+    from ...envs.sensors.camera.pinhole import Pinhole
+
+Texts = list[str] | None
+Drive = Annotated[
+    Path, typer.Argument(help="A recorded drive: CSV, Parquet, MATLAB (.mat) or MDF (.mf4).")
+]
+Mapping = Annotated[
+    Texts, typer.Option("--map", help="NAME_UNIT=COLUMN of the log (yaw_rate_degps=r); repeatable.")
+]
+Ratio = Annotated[
+    float | None, typer.Option(help="Of the logged steering to the wheels' angle (15.2).")
+]
+Sign = Annotated[int | None, typer.Option(help="1 or -1, of the logged steering.")]
+Offset = Annotated[float | None, typer.Option(help="deg at the wheels, added to the steering.")]
+
+
+def _read_wires(vehicle: str | None, latency: Texts, **steering: float | None) -> Any:
+    """What the vehicle's file has of the wires, and over it what was asked for."""
+    from ..recorded.wires import read_wires
+
+    known = read_wires(vehicle)
+    overrides: dict[str, Any] = {
+        name: value for name, value in steering.items() if value is not None
+    }
+    late = {**known.latency, **parse_options(latency)}
+    return known._replace(latency=late, **overrides).check()
+
+
+def parse_estimator_options(texts: Texts) -> dict[str, dict[str, Any]]:
+    """{"joint": {"members": 4}} from texts such as "joint.members=4"; ValueError for others."""
+    options: dict[str, dict[str, Any]] = {}
+    for text in texts or ():
+        key, value = parse_option(text)
+        name, dot, option = key.partition(".")
+        if not (name and dot and option):
+            raise ValueError(f"an estimator's option is ESTIMATOR.NAME=VALUE, got {text!r}")
+        options.setdefault(name, {})[option] = value
+    return options
+
+
+def replay_command(
+    log: Annotated[
+        Path, typer.Argument(help="A recorded drive: CSV, Parquet, MATLAB, MDF or NMEA.")
+    ],
+    vehicle: Annotated[
+        str | None,
+        typer.Option(
+            help="A name, a TOML or JSON file, or `identify`: found in the log itself.",
+            autocompletion=complete("vehicles"),
+        ),
+    ] = None,
+    nominal: Annotated[
+        str, typer.Option(help="The car whose mass and arms `--vehicle identify` takes.")
+    ] = "passenger-car",
+    mapping: Mapping = None,
+    estimator: Annotated[
+        Texts, typer.Option(help="A name; repeatable; default: all that the log serves.")
+    ] = None,
+    estimator_option: Annotated[
+        Texts, typer.Option(help="ESTIMATOR.NAME=VALUE (joint.gate=0.99); repeatable.")
+    ] = None,
+    steering_ratio: Ratio = None,
+    steering_sign: Sign = None,
+    steering_offset: Offset = None,
+    latency: Annotated[
+        Texts, typer.Option(help="CHANNEL=S, by which a channel is late (gps=0.2); repeatable.")
+    ] = None,
+    until: Annotated[
+        float | None,
+        typer.Option(help="s of the log from which `identify` is; the rest is replayed."),
+    ] = None,
+    course_rate: Annotated[float, typer.Option(help="Hz of the emulated course.")] = 10.0,
+    course_noise: Annotated[float, typer.Option(help="deg, standard deviation.")] = 0.5,
+    course_delay: Annotated[float, typer.Option(help="s the course arrives late.")] = 0.0,
+    course_bias: Annotated[float, typer.Option(help="deg.")] = 0.0,
+    gyro_bias: Annotated[float, typer.Option(help="deg/s added to the gyro.")] = 0.0,
+    html: Annotated[
+        Path | None, typer.Option("--html", help="Write a self-contained report.")
+    ] = None,
+    json: Annotated[Path | None, typer.Option("--json", help="Write the rows as JSON.")] = None,
+    parquet: Annotated[
+        Path | None, typer.Option("--parquet", help="Write the rows as Parquet.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="Draw a receiver's track: PNG, PDF, SVG.")
+    ] = None,
+    kml: Annotated[Path | None, typer.Option(help="Write a receiver's track for a map.")] = None,
+) -> None:
+    """Run the estimators over a recorded drive and score them; over a receiver's log (NMEA), which
+    has no gyro, filter the fixes with noise that follows HDOP or does not."""
+    from ...envs.recordings.sources import is_nmea
+    from ..recorded.replay import replay_file
+
+    console = Console()
+    check_files(html=html, json=json, parquet=parquet, plot=plot, kml=kml)
+    if is_nmea(log):
+        from ..recorded.receiver import draw, make_receiver_suite, replay_nmea, write_kml
+
+        with use_shared_bar(console, f"replay {log}"):
+            received = replay_nmea(log, vehicle, mapping)
+        write_output(console, [make_receiver_suite(received)], html, json, parquet)
+        for path, write in ((plot, draw), (kml, write_kml)):
+            if path is not None:
+                write(path, received)
+                print_written(console, path)
+        return
+    if plot or kml:
+        raise ValueError(f"{log}: --plot and --kml are for a receiver's log (NMEA); see --html")
+    offset = None if steering_offset is None else math.radians(steering_offset)
+    wires = _read_wires(vehicle, latency, ratio=steering_ratio, sign=steering_sign, offset=offset)
+    with use_shared_bar(console, f"replay {log}"):
+        suite = replay_file(
+            log,
+            vehicle,
+            mapping=mapping,
+            wires=wires,
+            nominal=nominal,
+            until=until,
+            estimators=estimator,
+            options=parse_estimator_options(estimator_option),
+            course_rate=course_rate,
+            course_noise_deg=course_noise,
+            delay=course_delay,
+            bias_deg=course_bias,
+            gyro_bias_degps=gyro_bias,
+        )
+    write_output(console, [suite], html, json, parquet)
+
+
+def identify_command(
+    log: Drive,
+    vehicle: Annotated[
+        str,
+        typer.Option(
+            help="The car that is stated: its mass and arms stay, the search starts there.",
+            autocompletion=complete("vehicles"),
+        ),
+    ] = "passenger-car",
+    mapping: Mapping = None,
+    out: Annotated[Path | None, typer.Option(help="Write the car and its wires as TOML.")] = None,
+    until: Annotated[
+        float | None, typer.Option(help="s of the log that are used; the rest stays fresh.")
+    ] = None,
+    tyres: Annotated[
+        str | None,
+        typer.Option(
+            help="linear: as stiff as in this drive; fiala: as at small slips; default: "
+            "what predicts better."
+        ),
+    ] = None,
+    steering_ratio: Ratio = None,
+    steering_sign: Sign = None,
+    steering_offset: Offset = None,
+) -> None:
+    """Find a car's stiffness, inertia, steering, noise and latencies in a recorded drive, with
+    intervals, and which of them the log cannot tell; exit status 1, and no file, where nothing is
+    identified."""
+    from ..recorded.replay import identify_file
+    from ..recorded.wires import write_vehicle
+
+    console = Console()
+    check_files(toml=out)
+    offset = None if steering_offset is None else math.radians(steering_offset)
+    wires = _read_wires(vehicle, None, ratio=steering_ratio, sign=steering_sign, offset=offset)
+    with use_shared_bar(console, f"identify {log}"):
+        result, suite = identify_file(log, vehicle, mapping or (), wires, tyres, until)
+    print_suite(console, suite)
+    if result.reason:
+        raise typer.Exit(1)
+    if out is not None:
+        write_vehicle(out, result.car, result.wires)
+        print_written(console, out)
+
+
+TRIES = 60  # frames in which a lane is looked for that shows how the camera is mounted
+
+LARGEST = 2**26
+"""Pixels of a picture; a small file may hold many more."""
+
+
+def lane_command(
+    source: Annotated[
+        Path | None, typer.Argument(metavar="IMAGE|VIDEO", help="A picture or a film.")
+    ] = None,
+    intrinsics: Annotated[
+        Path | None,
+        typer.Option(help="The camera: TOML or JSON with K, dist, size, perhaps height and tilt."),
+    ] = None,
+    lane_width: Annotated[float, typer.Option(help="m, from marking to marking.")] = 3.7,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Write what was found on it.")
+    ] = None,
+    json: Annotated[Path | None, typer.Option("--json", help="Write the numbers.")] = None,
+    calibrate: Annotated[
+        Path | None, typer.Option(help="A folder of chessboards (9 x 6): find the intrinsics.")
+    ] = None,
+) -> None:
+    """Find the lane: heading, offset, curvature and a quality, drawn over the picture.
+
+    Without height and tilt among the intrinsics they are estimated from a picture, for a straight
+    lane of the width stated; without intrinsics a lens of usual width is assumed.
+    """
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(LARGEST))  # read where it is loaded
+    with require_extra("vision", "the lane finder needs {}"):
+        import cv2
+    from ...envs.sensors.camera.films import PICTURES, Film, read_picture
+
+    console = Console(soft_wrap=True)
+    check_files(json=json)
+    if (source is None) == (calibrate is None):
+        raise ValueError("expected a picture or a film, or --calibrate FOLDER")
+    if source is None:
+        assert calibrate is not None
+        _calibrate(calibrate, json or Path("intrinsics.json"), console)
+        return
+    if not 1.0 < lane_width < 10.0:
+        raise ValueError(f"--lane-width is 1 to 10 m, got {lane_width}")
+    cv2.setNumThreads(1)
+    still = source.suffix.lower() in PICTURES
+    check_files(**{"image" if still else "film": out})
+    if still:
+        try:
+            picture = read_picture(source)
+        except cv2.error:
+            raise ValueError(f"{source}: expected a picture of at most {LARGEST} pixels") from None
+        finder = _make_finder([picture], intrinsics, lane_width, source)
+        lanes, seconds = _process_picture(picture, finder, out)
+    else:
+        film = Film(source)
+        finder = _make_finder(film.read_head(TRIES), intrinsics, lane_width, source)
+        lanes, seconds = _process_film(film, finder, out, console)
+        if len(lanes) < film.frame_count:
+            console.print(
+                f"the film ends after {len(lanes)} of the {film.frame_count} frames it promises"
+            )
+    _report(console, source, finder.camera, lanes, seconds)
+    if json is not None:
+        frames = [lane._asdict() for lane in lanes]
+        write_document(json, {"source": str(source), "frames": frames})
+    for path in (out, json):
+        if path is not None:
+            print_written(console, path)
+
+
+def _calibrate(folder: Path, path: Path, console: Console) -> None:
+    """Write the intrinsics that a folder's chessboards give."""
+    from ...envs.sensors.camera.calibration import calibrate_camera
+    from ...envs.sensors.camera.films import PICTURES
+
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: there is no such folder")
+    check_files(json=path)
+    boards = sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURES)
+    camera, error = calibrate_camera(boards)
+    write_document(path, {"K": camera.K, "dist": camera.dist, "size": camera.size, "rms_px": error})
+    console.print(f"corners within {error:.2f} px rms in {len(boards)} pictures", highlight=False)
+    print_written(console, path)
+
+
+def _make_finder(
+    pictures: "list[Image]", intrinsics: Path | None, lane_width: float, source: Path
+) -> "LaneFinder":
+    """A finder for the camera of some pictures, the first of which that can shows its mounting.
+
+    Raises ValueError for intrinsics of another size, and where no picture shows a lane.
+    """
+    from ...envs.sensors.camera.analytic import FieldOfView
+    from ...envs.sensors.camera.calibration import (
+        FAR,
+        HEADING,
+        NEAR,
+        estimate_mounting,
+        make_default_camera,
+    )
+    from ...envs.sensors.camera.lane_finder import LaneFinder
+    from ...envs.sensors.camera.pinhole import Pinhole
+
+    height, width = pictures[0].shape[:2]
+    known: Any = {}
+    if intrinsics is None:
+        camera = make_default_camera((width, height))
+    else:
+        try:
+            camera, known = Pinhole.read(intrinsics), read_document(intrinsics, "camera")
+        except OverflowError as error:
+            raise ValueError(f"{intrinsics}: {error}") from None
+    if camera.size != (width, height):
+        raise ValueError(
+            f"{intrinsics}: the camera's pictures are {camera.size[0]} x {camera.size[1]} pixels, "
+            f"those of {source} {width} x {height}"
+        )
+    failed = None
+    for picture in pictures if not {"height", "tilt"} <= known.keys() else ():
+        try:
+            camera, failed = estimate_mounting(camera, picture, lane_width), None
+            break
+        except ValueError as error:
+            failed = error
+    if failed is not None:
+        raise ValueError(f"{source}: {failed}")
+    return LaneFinder(camera, lane_width, NEAR, FAR, view=FieldOfView(HEADING, 0.5 * lane_width))
+
+
+def _process_picture(
+    picture: "Image", finder: "LaneFinder", out: Path | None
+) -> tuple[list["Lane"], float]:
+    """(lanes, seconds a picture) of a picture, which is drawn; the fastest of some runs."""
+    import cv2
+
+    from ...envs.sensors.camera.films import draw_lane
+
+    lane, seconds = finder.find(picture), np.inf
+    for _ in range(10):
+        began = time.thread_time()
+        finder.find(picture)
+        seconds = min(seconds, time.thread_time() - began)
+    if out is not None:
+        _, data = cv2.imencode(out.suffix.lower(), draw_lane(picture, finder, lane))
+        write_atomic(out, data.tobytes())
+    return [lane], seconds
+
+
+def _process_film(
+    film: Any, finder: "LaneFinder", out: Path | None, console: Console
+) -> tuple[list["Lane"], float]:
+    """(lanes, seconds a picture, the median) of a film, which is drawn."""
+    import cv2
+
+    from ...envs.sensors.camera.films import draw_lane
+
+    lanes, times = [], []
+    with TemporaryDirectory() as folder, use_shared_bar(console, "lane", "pictures") as bar:
+        part = Path(folder, f"lane{out.suffix.lower() if out else '.avi'}")
+        writer = None
+        if out is not None:
+            code = cv2.VideoWriter.fourcc(*("mp4v" if part.suffix == ".mp4" else "MJPG"))
+            writer = cv2.VideoWriter(str(part), code, film.rate, finder.camera.size)
+        for picture in bar.track(film, film.frame_count or None, task_id=bar.task_ids[0]):
+            began = time.thread_time()
+            lanes.append(finder.find(picture))
+            times.append(time.thread_time() - began)
+            if writer is not None:
+                writer.write(draw_lane(picture, finder, lanes[-1]))
+        if writer is not None and out is not None:
+            writer.release()
+            with atomic_file(out) as file:
+                file.write(part.read_bytes())
+    return lanes, float(np.median(times))
+
+
+def _report(
+    console: Console, source: Path, camera: "Pinhole", lanes: list["Lane"], seconds: float
+) -> None:
+    """Print what was found."""
+    from ...envs.sensors.camera.films import describe_lane
+
+    detected = [lane for lane in lanes if lane.quality > 0.0]
+    if len(lanes) == 1:
+        lines = [f"{source.name}: {describe_lane(lanes[0])}"]
+    else:
+        lines = [f"{source.name}: a lane in {len(detected)} of {len(lanes)} frames"]
+        if detected:
+            psi, offset = (
+                np.array([getattr(lane, name) for lane in detected]) for name in ("psi", "y")
+            )
+            lines.append(
+                f"psi {np.degrees(psi.mean()):+.2f} deg (sd {np.degrees(psi.std()):.2f}), offset "
+                f"{offset.mean():+.2f} m (sd {offset.std():.2f}), quality "
+                f"{np.mean([lane.quality for lane in detected]):.2f}"
+            )
+    lines.append(
+        f"camera {camera.height:.2f} m high, tilted {np.degrees(camera.tilt):+.2f} deg; "
+        f"{1.0 / seconds:.0f} frames a second of one core"
+    )
+    for line in lines:
+        console.print(line, highlight=False, markup=False)

@@ -1,0 +1,387 @@
+"""The ladder of rungs: its yardsticks, whether it falls, what each step of knowledge costs, and
+what knowing late does: the price of delay.
+
+Which contests are scored: where the rungs of the ladder lie apart, on tuning seeds.
+
+`python -m sideslip.benchmarks.control.baseline_gaps --write` measures all candidates and writes
+the file.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from ... import __version__
+from ...envs.record import Array
+from ...envs.task import FAILURES
+from ..harness.results import ResultTable
+from ..harness.stats import Estimate, average, compute_p_value, geometric_mean, holm
+from .entries import ORACLE_NAMES, REFERENCE_CONTROLLER, REFERENCE_FILTER, ControlEntry
+from .run import DriveResult, Results, measure
+from .score import MIN_GAP, ScoreScale, Standing, compute_log_ratios, survival_mask
+from .tasks import (
+    LIMIT,
+    NOMINAL,
+    ORACLES,
+    PARAMETERS,
+    STATE,
+    TITLES,
+    YAW,
+    ControlTask,
+    TaskMeasurement,
+    find_oracle,
+    list_candidates,
+    make_tuning_seeds,
+    write_tasks,
+)
+
+_OF_THE_CAR = ("none", "spin", "off-road")
+CLAIRVOYANT = "clairvoyant"
+DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s, of camera and GPS alike, beside what the seed draws
+FRAME = 0.05  # s: so slow that a camera's frames 0.3 s late find room under way
+DELAY_TASK = ControlTask("1", YAW, "coms", "zero-slip", "coms-random")
+CONTESTANTS = (
+    *((NOMINAL, ""), (ORACLES[PARAMETERS][0], ""), (ORACLES[STATE][0], "")),
+    *(
+        (REFERENCE_CONTROLLER, filter_name)
+        for filter_name in (REFERENCE_FILTER, "multirate-kf", "bicycle-kf")
+    ),
+)
+
+
+def make_score_scales(
+    results: Results, tasks: Sequence[ControlTask]
+) -> dict[ControlTask, ScoreScale]:
+    """The yardstick of each contest in which both rungs were driven."""
+    scales = {}
+    for task in tasks:
+        nominal, oracle = (results.select(task, name) for name in (NOMINAL, STATE))
+        if not nominal.error and not oracle.error:
+            scales[task] = ScoreScale(nominal, oracle)
+    return scales
+
+
+def make_oracle_table(
+    results: Results, tasks: Sequence[ControlTask], foresight: Mapping[ControlTask, Array]
+) -> ResultTable:
+    """Every contest's rungs and whether they fall in cost.
+
+    foresight: (n,) log(J_oracle-state / J_clairvoyant) of the clairvoyant's own seeds, where it is
+    calibrated.
+    """
+    scales, cells = make_score_scales(results, tasks), []
+    for task in tasks:
+        if task not in scales:
+            errors = [results.select(task, oracle).error for oracle in (NOMINAL, STATE)]
+            cells.append([task.name, *[""] * 6, "; ".join(filter(None, errors))])
+            continue
+        scale = scales[task]
+        oracle_gains = scale.compute_paired_ratios(scale.oracle)[1]
+        gap, parameters = average(oracle_gains), results.select(task, PARAMETERS)
+        known = (
+            ""
+            if parameters.error
+            else f"{_compute_mean(scale.compute_paired_ratios(parameters)[0]):.2f}"
+        )
+        task_foresight = foresight.get(task)
+        cells.append(
+            [
+                task.name,
+                f"{100.0 * (1.0 - survival_mask(scale.nominal).mean()):.1f}",
+                find_oracle(task),
+                gap.inline(),
+                known,
+                "" if task_foresight is None else f"{task_foresight.mean():.2f}",
+                f"{len(oracle_gains)} of {len(scale.mark_compared(len(scale.oracle.costs)))}",
+                _describe_order(scale, oracle_gains, task_foresight),
+            ]
+        )
+    header = (
+        *("contest", "nominal fails / %", "oracle-state is", "its gap", "oracle-parameters"),
+        *("clairvoyant beyond", "episodes", "falls"),
+    )
+    note = "Mean of log(J_nominal / J), 0.69 for half the cost; the score's 1 is the gap."
+    if not foresight:
+        note += " The clairvoyant is not calibrated: its column is empty (`sideslip calibrate`)."
+    return ResultTable("The ladder", header, cells, note, keyed=False)
+
+
+def _compute_mean(values: Array) -> float:
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def _describe_order(scale: ScoreScale, oracle_gains: Array, foresight: Array | None) -> str:
+    """Whether each rung costs less than the one below it."""
+    if not len(oracle_gains):
+        return "no episode that nominal and oracle-state survive"
+    if scale.gap < MIN_GAP:
+        return "nothing to win here"
+    if foresight is not None and foresight.mean() <= 0.0:
+        return "clairvoyant does not"
+    return "yes" if average(oracle_gains).low > 0.0 else "not surely"
+
+
+def describe_findings(standings: Sequence[Standing]) -> list[str]:
+    """The contestants that cost less than oracle-state over their tier, Holm-corrected."""
+    others = [
+        item
+        for item in standings
+        if item.entry.controller not in ORACLE_NAMES
+        and "score" in item.overall
+        and np.isfinite(item.overall["score"].value)
+    ]
+    excess = [
+        np.concatenate([oracle_gain - r for r, oracle_gain in item.pairs.values()])
+        for item in others
+    ]  # below 0 where the contestant is better
+    sure = holm([compute_p_value(item) for item in excess])
+    return [
+        f"Finding: {item.label} costs less than oracle-state in tier {item.tier} "
+        f"(score {item.overall['score'].value:.2f})."
+        for item, is_sure in zip(others, sure, strict=True)
+        if is_sure
+    ]
+
+
+def find_below_optimum(names: Sequence[str], regrets: Sequence[Array]) -> list[str]:
+    """Of contestants with log(J / J_clairvoyant) (n,) on its seeds: who is surely below it."""
+    sure = holm([compute_p_value(logs) for logs in regrets])
+    return [name for name, is_sure in zip(names, sure, strict=True) if is_sure]
+
+
+def make_knowledge_table(results: Results, tiers: Mapping[str, Sequence[ControlTask]],
+                    foresight: Mapping[ControlTask, Array]) -> ResultTable:  # fmt: skip
+    """What not knowing costs, tier by tier: the ratio of the costs of neighbouring rungs."""
+    cells = []
+    for tier, tasks in tiers.items():
+        scales = make_score_scales(results, tasks)
+        steps: list[list[Array]] = [[], [], [c for k, c in foresight.items() if k in tasks]]
+        for task, scale in scales.items():
+            parameters = results.select(task, PARAMETERS)
+            if not parameters.error and scale.mark_compared(len(parameters.costs)).any():
+                r, oracle_gain = scale.compute_paired_ratios(parameters)
+                steps[0].append(r)
+                steps[1].append(oracle_gain - r)
+        texts = []
+        for logs in steps:
+            texts.append(geometric_mean(*logs).inline() if logs else "")
+        cells.append([f"{tier}: {TITLES[tier]}", *texts])
+    header = (
+        *("tier", "car, friction, biases (model)", "state and disturbances (sensing)"),
+        "what is ahead (foresight)",
+    )
+    note = (
+        "Cost without over cost with the knowledge: nominal / oracle-parameters, oracle-parameters "
+        "/ oracle-state, oracle-state / clairvoyant. Paired geometric means."
+    )
+    return ResultTable("What not knowing costs", header, cells, note, keyed=False)
+
+
+def list_failures(results: Results, late: float = 0.0) -> list[list[str]]:
+    """A line for every cell that could not be driven, or whose episodes ended by a failure that is
+    not the car's (a NaN, an action that is none): tier, contest, contestant, what happened.
+
+    late: s by which the sensors were, of the price of delay.
+    """
+    lines, more = [], f", sensors {1e3 * late:.0f} ms late" if late else ""
+    for entry, result in results.outcomes.items():
+        where = [entry.task.tier, entry.task.name + more, entry.label]
+        if result.error:
+            lines.append([*where, f"not driven: {result.error}"])
+            continue
+        codes = result["failure"].astype(int)
+        ended = [
+            f"{name} {100.0 * (codes == code).mean():.1f} %"
+            for code, name in enumerate(FAILURES)
+            if name not in _OF_THE_CAR and (codes == code).any()
+        ]
+        if ended:
+            lines.append([*where, ", ".join(ended)])
+        elif (codes != 0).all():
+            lines.append([*where, "every car fails"])
+    return lines
+
+
+@dataclass
+class DelayCost:
+    """A contestant's cost over that of nominal with sensors in time, at each delay."""
+
+    entry: ControlEntry
+    over: list[Estimate]
+
+
+def make_late_entries(delay: float) -> list[ControlEntry]:
+    """The contestants with camera (every FRAME) and GPS a delay (s) late."""
+    late = {"camera_delays": [delay], "camera_jitter": 0.0, "gps_delays": [delay]}
+    scenario = {"base": DELAY_TASK.scenario, **late}
+    options = {"scenario": scenario, "camera": {"period": FRAME}}
+    return [
+        ControlEntry(DELAY_TASK, estimator, controller, options)
+        for controller, estimator in CONTESTANTS
+    ]
+
+
+def measure_delay_cost(
+    seeds: Sequence[int],
+    *,
+    jobs: int | None = None,
+    console: Console | None = None,
+    keep: Path | None = None,
+) -> tuple[list[DelayCost], list[Results]]:
+    """Every contestant at each of DELAYS, all on the same seeds, and the results by delay."""
+    delay_results = [
+        measure(make_late_entries(d), seeds, jobs=jobs, console=console, keep=keep) for d in DELAYS
+    ]
+    in_time = delay_results[0].select(DELAY_TASK, NOMINAL)
+    prices = []
+    for controller, estimator in CONTESTANTS:
+        price = DelayCost(ControlEntry(DELAY_TASK, estimator, controller), [])
+        for results in delay_results:
+            result = results.select(DELAY_TASK, controller, estimator)
+            mask = survival_mask(in_time)[: len(result.costs)]
+            wrong = result.error or in_time.error
+            logs = (
+                np.empty(0)
+                if wrong
+                else -compute_log_ratios(in_time.costs[: len(mask)], result)[mask]
+            )
+            price.over.append(geometric_mean(logs))
+        prices.append(price)
+    return prices, delay_results
+
+
+def make_cost_lines(prices: Sequence[DelayCost]) -> Mapping[str, tuple[Array, Array, Array]]:
+    """name to (value, low, high) over the delays, of those that were driven at all of them."""
+    return {
+        price.entry.label: (*np.array(price.over).T,)
+        for price in prices
+        if np.isfinite(price.over).all()
+    }
+
+
+EPISODES = 64
+GAP, MIN_LOW, FAILING = 0.3, 0.2, 0.1
+"""A contest is scored whose gap is above the first, its lower limit above the second, and in which
+nominal fails in less than this share (at the limit in any, but never always)."""
+
+
+def make_oracle_entries(task: ControlTask) -> list[ControlEntry]:
+    """Nominal and the candidates for the oracles."""
+    return [
+        ControlEntry(task, "", name) for name in (NOMINAL, *ORACLES[PARAMETERS], *ORACLES[STATE])
+    ]
+
+
+def measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
+    """A candidate's numbers; the better oracle is that of fewer failures, then of the larger gap.
+
+    A rung that could not be computed, and cars that all fail, leave a gap of 0 and the reason.
+    """
+    nominal = results.select(task, NOMINAL)
+    errors = [f"{NOMINAL}: {nominal.error}"] if nominal.error else []
+    failing = 1.0 if nominal.error else float(np.mean(~survival_mask(nominal)))
+    knowing, _, _, _ = _select_oracle(results, task, PARAMETERS, nominal)
+    name, gap, n_compared, oracle_errors = _select_oracle(results, task, STATE, nominal)
+    errors += oracle_errors
+    return TaskMeasurement(
+        **asdict(task),
+        env_version=__version__,
+        oracle=name,
+        knowing=knowing,
+        gap=round(gap.value, 4),
+        low=round(gap.low, 4),
+        high=round(gap.high, 4),
+        failing=round(failing, 4),
+        judged=n_compared,
+        n=len(nominal.costs),
+        verdict="; ".join(errors)
+        if nominal.error or len(oracle_errors) == len(ORACLES[STATE])
+        else _describe_verdict(task, gap, failing, n_compared),
+    )
+
+
+def _select_oracle(
+    results: Results, task: ControlTask, oracle_kind: str, nominal: DriveResult
+) -> tuple[str, Estimate, int, list[str]]:
+    """(name, gap to nominal, episodes judged) of the better candidate, and what went wrong."""
+    options: list[tuple[bool, float, str, Estimate, int]] = []
+    errors = []
+    for name in ORACLES[oracle_kind]:
+        oracle = results.select(task, name)
+        if oracle.error:
+            errors.append(f"{name}: {oracle.error}")
+        elif not nominal.error:
+            log_ratios = ScoreScale(nominal, oracle).compute_paired_ratios(oracle)[1]
+            gap, failing = _compute_gap(log_ratios), float(np.mean(~survival_mask(oracle)))
+            options.append((failing > FAILING, -gap.value, name, gap, len(log_ratios)))
+    nothing = (True, 0.0, ORACLES[oracle_kind][0], Estimate(0.0, 0.0, 0.0), 0)
+    _, _, name, gap, n_compared = min(options) if options else nothing
+    return name, gap, n_compared, errors
+
+
+def _compute_gap(log_ratios: Array) -> Estimate:
+    """The mean of r with its interval, 0 where no episode or only one is left."""
+    if len(log_ratios) < 2:
+        return Estimate(0.0, 0.0, 0.0)
+    return Estimate(*(math.log(number) for number in geometric_mean(log_ratios)))
+
+
+def _describe_verdict(task: ControlTask, gap: Estimate, failing: float, n_compared: int) -> str:
+    if n_compared < 2:
+        return "no episode that nominal and oracle-state survive"
+    if failing >= FAILING and task.tier not in LIMIT:
+        return f"nominal fails in {100.0 * failing:.0f} %"
+    if not (gap.value > GAP and gap.low > MIN_LOW):
+        return f"too little to win: {gap.value:.2f} [{gap.low:.2f}, {gap.high:.2f}]"
+    return "scored"
+
+
+def choose_tasks(
+    among: Sequence[ControlTask] | None = None,
+    episodes: int = EPISODES,
+    jobs: int | None = None,
+    console: Console | None = None,
+) -> list[TaskMeasurement]:
+    """Measure candidates (default: all); one that cannot be driven is not scored, with why."""
+    among = list_candidates() if among is None else among
+    entries = [entry for task in among for entry in make_oracle_entries(task)]
+    results = measure(entries, make_tuning_seeds(episodes), jobs=jobs, console=console)
+    return [measure_task(results, task) for task in among]
+
+
+def main(
+    write: Annotated[bool, typer.Option(help="Replace the package's file.")] = False,
+    episodes: Annotated[int, typer.Option(min=2, help="Tuning seeds a contest.")] = EPISODES,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes.")] = None,
+) -> None:
+    """Which contests are scored: where the rungs of the ladder lie apart, on tuning seeds."""
+    console = Console()
+    measurements = choose_tasks(None, episodes, jobs, console)
+    columns = "tier", "contest", *ORACLES, "gap", "nominal fails / %", "verdict"
+    table = Table(*columns)
+    for measurement in measurements:
+        gap = f"{measurement.gap:.2f} [{measurement.low:.2f}, {measurement.high:.2f}]"
+        failing = f"{100.0 * measurement.failing:.1f}"
+        table.add_row(
+            measurement.tier,
+            measurement.task.name,
+            measurement.knowing,
+            measurement.oracle,
+            gap,
+            failing,
+            measurement.verdict,
+        )
+    console.print(table)
+    if write:
+        write_tasks(measurements)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,364 @@
+"""The matrix: contests, estimators, controllers, and the cells they make.
+
+A cell's cars: the vector env with its estimator, and the controller that drives them all.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import VectorEnv
+
+from ...agents import AGENTS, make_agent
+from ...agents.baselines import (
+    FILTER,
+    GRIP,
+    STEER_WEIGHT,
+    TYRE_FILTER,
+    Options,
+    get_tuned_options,
+    make_noise_options,
+    make_oracle,
+)
+from ...agents.learned.policy import is_policy, load_policy
+from ...agents.rollout import iterate_steps
+from ...envs.scenarios.manoeuvres import make_scenario
+from ...envs.sensors.slow import SENSOR_SETS
+from ...envs.task import OBSERVATION_OPTIONS
+from ...envs.validation import short_repr
+from ...estimators.design.models import TYRES
+from ...estimators.filters import FILTERS
+from ...estimators.learned.correction_file import load_correction
+from ...estimators.vector.estimate import EstimateObservation
+from ...estimators.vector.truth import TruthObservation
+from ..harness.study import call_quietly
+from .tasks import (
+    NOMINAL,
+    ORACLES,
+    PARAMETERS,
+    STATE,
+    STEERING,
+    TIERS,
+    YAW,
+    ControlTask,
+    find_oracle,
+)
+
+TRUTH, REFERENCE_CONTROLLER = "truth", "lqr"
+REFERENCE_FILTER = "exact-kf, all sensors"
+SETUPS: dict[str, tuple[str, dict[str, Any]]] = {
+    REFERENCE_FILTER: ("exact-kf", {"slow": ["camera", "gps"]}),
+    "exact-kf, no bias states": (
+        "exact-kf",
+        {"slow": ["camera", "gps"], "bias_sd": 0.0, "accel_bias_sd": 0.0},
+    ),
+    "exact-kf, no accelerometer": ("exact-kf", {"slow": ["camera", "gps"], "fast": ["gyro"]}),
+    "exact-kf, camera": ("exact-kf", {"slow": ["camera"]}),
+    "exact-kf, gps": ("exact-kf", {"slow": ["gps"]}),
+    "multirate-kf, camera and gps": ("multirate-kf", {"slow": ["camera", "gps"]}),
+    "joint": ("joint", {"slow": ["camera", "gps"]}),
+    "joint, friction": ("joint", {"slow": ["camera", "gps"], "inverse_friction_sd": 0.3}),
+    "learned-joint": ("learned-joint", {"slow": ["camera", "gps"]}),
+}
+"""Filters by what they are called in the tables: a name of `make_estimator` and its options, over
+the contestant's tuned ones where the filter is `exact-kf`."""
+ADAPTIVE = {"joint": "adaptive-lqr", "joint, friction": "adaptive-nmpc"}
+"""By the filter whose tyres they follow."""
+CORRECTED = ("learned-joint", "adaptive-nmpc")
+"""The same controller on that filter with a network behind it."""
+ESTIMATORS = (
+    *(name for name in SETUPS if name != CORRECTED[0]),
+    "single-rate-kf",
+    "uneven-delay-kf",
+    "dakf",
+    "bicycle-kf",
+    TRUTH,
+)
+CONTROLLERS: dict[str, tuple[str, ...]] = {
+    YAW: ("two-dof", "esc", "sliding-mode", "mpc", "nmpc"),
+    STEERING: ("two-dof", "esc", "model-following", "nmpc"),
+}
+"""Besides the reference controller, on the reference filter."""
+ORACLE_NAMES = (NOMINAL, PARAMETERS, STATE)
+_CANDIDATES = tuple(name for names in ORACLES.values() for name in names)
+LEARNED: dict[str, tuple[tuple[str, str], ...]] = {
+    "car-steering": (("joint", "distill-car-steering"), ("", "raw-car-steering")),
+    "car-yaw": (("joint", "distill-car-yaw"), ("", "raw-car-yaw")),
+    "coms-model": (
+        ("joint", "ppo-coms-steering"),
+        ("", "raw-coms-steering"),
+        ("joint", "distill-coms-steering"),
+    ),
+    "coms-zero-slip": (
+        ("joint", "ppo-coms-yaw"),
+        ("joint", "distill-coms-yaw"),
+        ("", "raw-coms-yaw"),
+    ),
+}
+"""(estimator, policy), first the one of which verdicts speak, by the class of contests that the
+policy was trained on, by its shipped name or path."""
+SHARED = {
+    ORACLES[PARAMETERS][0]: ("adaptive-lqr", {"grip", "steer_weight"}),
+    ORACLES[PARAMETERS][1]: ("adaptive-nmpc", {"horizon", "grip", "steer_weight"}),
+    ORACLES[STATE][1]: ("adaptive-nmpc", {"horizon", "steer_weight"}),
+}
+"""By who is not tuned: from whom, closest in what it knows, it takes over what of the controller;
+its filter's levels are the scenario's."""
+SLOW_CONTROLLERS = ("mpc", "nmpc", "adaptive-nmpc", ORACLES[STATE][1], ORACLES[PARAMETERS][1])
+
+EPISODES, QUICK_EPISODES, SLOW_EPISODES = 256, 8, 64
+QUICK_CONTESTS = 2
+"""Of each tier, in a quick run."""
+
+
+def select_quick_tasks(tasks: Sequence[ControlTask]) -> list[ControlTask]:
+    """`QUICK_CONTESTS` of each tier, from its first to its last."""
+    selected = []
+    for tier in dict.fromkeys(task.tier for task in tasks):
+        tier_tasks = [task for task in tasks if task.tier == tier]
+        step = max(len(tier_tasks) / QUICK_CONTESTS, 1.0)
+        selected += [tier_tasks[int(i * step)] for i in range(min(QUICK_CONTESTS, len(tier_tasks)))]
+    return selected
+
+
+@dataclass(frozen=True)
+class ControlEntry:
+    """One square of the matrix.
+
+    estimator: a name of `SETUPS` or of `make_estimator`, "truth", or "" where the controller reads
+    none or brings its own. controller: a name of `make_agent`, or a rung. options: of the env
+    beside the contest's, a scenario that has no name among them; tuned: options of filter and
+    controller instead of the best known; objects: a user's own instead of what the names mean, an
+    agent, or a factory of one, as "controller", a filter's factory as "estimator". Cells are equal
+    whatever these three are.
+    """
+
+    task: ControlTask
+    estimator: str
+    controller: str
+    options: dict[str, Any] = field(default_factory=dict, compare=False)
+    tuned: Options | None = field(default=None, compare=False)
+    objects: dict[str, Any] = field(default_factory=dict, compare=False)
+
+    @property
+    def is_users(self) -> bool:
+        """Whether its controller is a user's own."""
+        name = self.controller
+        known = name in AGENTS or name in (*ORACLE_NAMES, *_CANDIDATES) or is_policy(name)
+        return "controller" in self.objects or not known
+
+    @property
+    def best(self) -> Options:
+        """The options of its filter and its controller: `get_tuned_options`, or those of
+        `agents.get_tuned_options`, where the reference controller, `nominal`'s design on any
+        filter, has the rung's, a user's own the rung's filter, and one that was not tuned what it
+        shares with the rung."""
+        if self.tuned is not None:
+            return self.tuned
+        if self.is_users:
+            return get_tuned_options(self.task.kind, NOMINAL) | {"controller": {}}
+        kind, name = self.task.kind, self.oracle or self.controller
+        if name in SHARED and not any(get_tuned_options(kind, name).values()):
+            source, numbers = SHARED[name]
+            best = get_tuned_options(kind, source)["controller"]
+            return {"filter": {}, "controller": {key: best[key] for key in numbers & best.keys()}}
+        return get_tuned_options(kind, NOMINAL if name == REFERENCE_CONTROLLER else name)
+
+    @property
+    def label(self) -> str:
+        """Controller and estimator in words."""
+        return f"{self.controller} on {self.estimator}" if self.estimator else self.controller
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """Options of the env: an action that is none ends the episode, and a policy sees what its
+        training saw."""
+        card = load_policy(self.controller).card.env_options if is_policy(self.controller) else {}
+        observed = {name: card[name] for name in OBSERVATION_OPTIONS if name in card}
+        return self.task.env_options | {"on_bad_action": "fail"} | observed | self.options
+
+    @property
+    def oracle(self) -> str:
+        """The rung of the ladder that drives, "" where a contestant does."""
+        if self.is_users:
+            return ""
+        if self.controller in ORACLES:
+            return find_oracle(self.task, self.controller)
+        return self.controller if self.controller in (NOMINAL, *_CANDIDATES) else ""
+
+    @property
+    def slow(self) -> bool:
+        """Whether it takes so long to decide that it gets fewer episodes."""
+        return (self.oracle or self.controller) in SLOW_CONTROLLERS
+
+
+def make_entries(tasks: Sequence[ControlTask], quick: bool = False) -> Iterator[ControlEntry]:
+    """Every cell of the matrix, contest by contest; quick: without the slow contestants.
+
+    All estimators in the contests with the first of their tier's ids.
+    """
+    for task in tasks:
+        entries = [ControlEntry(task, "", oracle) for oracle in (*ORACLE_NAMES, "none")]
+        first = task.tier not in TIERS or task.env_id == TIERS[task.tier][0][0]
+        filters = ESTIMATORS if first else (REFERENCE_FILTER, TRUTH)
+        entries += [ControlEntry(task, name, REFERENCE_CONTROLLER) for name in filters]
+        entries += [
+            ControlEntry(task, REFERENCE_FILTER, controller)
+            for controller in CONTROLLERS[task.env_id]
+        ]
+        entries += [ControlEntry(task, *pair) for pair in (*ADAPTIVE.items(), CORRECTED)]
+        if task.tier:
+            entries += [ControlEntry(task, *pair) for pair in LEARNED.get(task.kind, ())]
+        yield from (entry for entry in entries if not (quick and entry.slow and not entry.oracle))
+
+
+STEPS = 200  # of a decision's time
+
+_PUSHES = ("force_sd", "moment_sd")
+_DISTURBANCES = {"forces": ("F_d", "N_d"), "walk": ("d1", "d2"), "walk-all": ("d1", "d2")}
+
+
+def list_outputs(estimator: str) -> tuple[str, ...]:
+    """The estimates that controllers read: beta, gamma, and disturbances if there are any."""
+    name = get_filter_name(estimator)
+    base = name.removeprefix("learned-")
+    row = FILTERS.get(base)  # a user's own has none
+    options = SETUPS.get(estimator, ("", {}))[1] | dict(row.options if row else ())
+    if row and base != name:
+        options |= load_correction(base).card.base_options
+    tyres = tuple(name for name in TYRES if f"{name}_sd" in options)
+    return ("beta", "gamma", *_DISTURBANCES.get(row.disturbances if row else "", ()), *tyres)
+
+
+def get_filter_name(estimator: str) -> str:
+    """The name of `make_estimator` of a cell's estimator."""
+    return SETUPS.get(estimator, (estimator, {}))[0]
+
+
+def make_estimate_options(entry: ControlEntry) -> dict[str, Any]:
+    """Options of `EstimateObservation` for a cell; a policy gets the estimate it was trained on."""
+    if is_policy(entry.controller):
+        card = load_policy(entry.controller).card
+        if card.estimator == entry.estimator:
+            return card.estimator_options
+    settings: dict[str, Any] = {"outputs": list_outputs(entry.estimator), "std": False}
+    if entry.estimator in SETUPS:
+        name, options = SETUPS[entry.estimator]
+        if entry.estimator == REFERENCE_FILTER:
+            options = options | {"slow": list_slow_sensors(entry.task.env_id)}
+        if name in (FILTER, TYRE_FILTER):
+            levels = make_noise_options(make_scenario(entry.env_options["scenario"]))
+            # where nothing pushes, the filter's own level
+            levels = {key: x for key, x in levels.items() if key not in _PUSHES or x > 0.0}
+            is_tuned = name == FILTER or entry.controller == ADAPTIVE.get(entry.estimator)
+            options = levels | (entry.best["filter"] if is_tuned else {}) | options
+            unused = set() if "gps" in options["slow"] else {"hdop_table"}
+            if "accel_y" not in options.get("fast", ()):
+                unused |= {"accel_y_noise", "accel_bias_sd"}
+            options = {key: value for key, value in options.items() if key not in unused}
+        settings["options"] = options
+    return settings
+
+
+def list_slow_sensors(env_id: str) -> list[str]:
+    """The names of an id's slow sensors."""
+    return list(SENSOR_SETS[gym.spec(env_id).kwargs["sensors"]])
+
+
+class CheckedAgent:
+    """A user's agent, whose `predict` is to return actions (rows, width) and a state.
+
+    Raises TypeError or ValueError with what came instead; NaN is the env's to judge.
+    """
+
+    def __init__(self, agent: Any, rows: int, width: int) -> None:
+        self.agent, self.shape = agent, (rows, width)
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Any, Any]:
+        """What the agent's returns."""
+        result = self.agent.predict(observation, state, episode_start, deterministic=deterministic)
+        if not (isinstance(result, tuple) and len(result) == 2):
+            raise TypeError(f"predict returns (action, state), got {short_repr(result)}")
+        shape = np.shape(result[0])
+        if shape != self.shape:
+            raise ValueError(
+                f"predict of observations {observation.shape} returns actions {self.shape}, a row "
+                f"a car, got shape {shape}"
+            )
+        return result
+
+
+def make_cars(entry: ControlEntry, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
+    """(vector env of `cars` rows with the cell's estimator, its agent), both as they are tuned."""
+    task, options = entry.task, entry.env_options
+    if entry.oracle:
+        return make_oracle(entry.oracle, task.env_id, cars, options=entry.best, **options)
+    env: Any = gym.make_vec(task.env_id, num_envs=cars, **options)
+    if entry.estimator == TRUTH:
+        env = TruthObservation(env, (), ("beta", "gamma"))
+    elif entry.estimator:
+        source = entry.objects.get("estimator", get_filter_name(entry.estimator))
+        env = call_quietly(EstimateObservation, env, source, **make_estimate_options(entry))
+    agent = make_agent(
+        entry.objects.get("controller", entry.controller), env, **make_agent_options(entry)
+    )
+    if entry.is_users:
+        return env, CheckedAgent(agent, cars, env.single_action_space.shape[0])
+    return env, agent
+
+
+def make_agent_options(entry: ControlEntry) -> dict[str, Any]:
+    """Options of `make_agent` for a cell."""
+    options: dict[str, Any] = {}
+    if entry.controller == "model-following":
+        options["rejection"] = entry.estimator == "dakf"
+    if entry.controller == REFERENCE_CONTROLLER:  # nominal's own design
+        options["grip"] = GRIP
+        if entry.task.env_id == STEERING:
+            options["steer_weight"] = STEER_WEIGHT
+    return options | entry.best["controller"]
+
+
+class _TimedFunction:
+    """A function that notes how long each of its calls takes, in s of wall time."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function, self.seconds = function, list[float]()
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        start_time = time.perf_counter()
+        result = self.function(*args, **kwargs)
+        self.seconds.append(time.perf_counter() - start_time)
+        return result
+
+
+def measure_decision_time(entry: ControlEntry) -> float:
+    """us (wall) a decision of one car: predict, and what the estimator adds to an env-step.
+
+    Medians over STEPS steps of an episode, the bare env stepped side by side.
+    """
+    cars: tuple[Any, Any] = make_cars(entry, 1)
+    env, agent = cars
+    bare: Any = gym.make_vec(entry.task.env_id, num_envs=1, **entry.env_options)
+    bare.reset(seed=0)
+    agent.predict, env.step, without = (
+        _TimedFunction(agent.predict),
+        _TimedFunction(env.step),
+        _TimedFunction(bare.step),
+    )
+    for step in islice(iterate_steps(env, agent, 0), 1, STEPS + 1):
+        without(np.zeros_like(step.action))
+    predict, with_estimator, without_estimator = (
+        np.median(f.seconds) for f in (agent.predict, env.step, without)
+    )
+    return 1e6 * float(predict + max(with_estimator - without_estimator, 0.0))

@@ -1,0 +1,415 @@
+"""The matrix's verdict: the best controller, the best estimator, and why.
+
+The matrix's figures: a picture for each question, heat maps, any two cells side by side.
+"""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ...agents import make_agent
+from ...agents.rollout import Rollout, rollout
+from ...envs.record import Array
+from ...envs.rendering.palette import find_colour
+from ...envs.vehicle.parameters import VEHICLES
+from ..harness.results import Suite
+from ..harness.stats import Estimate, geometric_mean
+from ..harness.study import (
+    Explorer,
+    Panel,
+    describe_leader,
+    format_verdict,
+    make_env,
+    summarise_names,
+)
+from ..report.film import make_track_kml
+from .baseline_gaps import DELAY_TASK, DELAYS, DelayCost, make_cost_lines
+from .entries import (
+    ADAPTIVE,
+    LEARNED,
+    ORACLE_NAMES,
+    REFERENCE_CONTROLLER,
+    REFERENCE_FILTER,
+    TRUTH,
+    ControlEntry,
+    get_filter_name,
+    make_agent_options,
+    make_estimate_options,
+)
+from .run import SIGNALS, Results
+from .score import Standing
+from .tasks import NOMINAL, PARAMETERS, TITLES, ControlTask
+
+_POLICIES = {pair for pairs in LEARNED.values() for pair in pairs}
+
+Gains = dict[ControlTask, Array]
+"""r of a contestant's episodes in the contests that count."""
+Driven = TypeVar("Driven", bound=Collection[Any])
+
+
+def compose_verdict(
+    by_tier: Mapping[str, Sequence[Standing]],
+    prices: Sequence[DelayCost] = (),
+    foresight: Mapping[ControlTask, Array] | None = None,
+) -> str:
+    """The verdict over all tiers: the best controller, the best estimator, and why.
+
+    foresight: (n,) log(J_oracle-state / J_clairvoyant) of calibrated contests.
+    """
+    filters, drivers = _group_estimators(by_tier), _group_controllers(by_tier)
+    others, none = select_complete(drivers), drivers.get("none", {})
+    best = find_best_controller(by_tier)
+    ratio = _compute_cost_ratio(others[best], none) if best not in ("", "none") and none else None
+    text = f", and {100.0 * ratio.value:.0f} % as much as no control" if ratio else ""
+    episodes = max((len(r) for gains in drivers.values() for r in gains.values()), default=0)
+    return format_verdict(
+        "Controllers drive on what estimators infer; cost: squared error of slip and yaw rate.",
+        f"Of the controllers {_describe_first(others)}{text}.",
+        f"Of the estimators, under one controller, {_describe_first(filters)}.",
+        _describe_reasons(by_tier, prices, foresight or {}),
+        f"{_describe_exceptions(by_tier)}Not covered: other cars and roads, and what "
+        f"{episodes} episodes a contest are too few to show.",
+    )
+
+
+def compute_relative_costs(standings: Mapping[str, Sequence[Standing]]) -> dict[str, Estimate]:
+    """The cost over nominal's in % of who drives everywhere, the best first."""
+    drivers = select_complete(_group_controllers(standings))
+    logs = {name: [-r for r in drivers[name].values()] for name in _rank_entries(drivers)}
+    return {
+        name: Estimate(*(100.0 * value for value in geometric_mean(*ratios)))
+        for name, ratios in logs.items()
+    }
+
+
+def is_default_filter(controller: str, estimator: str) -> bool:
+    """Whether that is the filter on which a controller is compared with others: the reference,
+    none, the one whose tyres it follows, or a policy's own."""
+    follows = ADAPTIVE.get(estimator) == controller
+    return estimator in ("", REFERENCE_FILTER) or follows or (estimator, controller) in _POLICIES
+
+
+def find_best_controller(by_tier: Mapping[str, Sequence[Standing]]) -> str:
+    """Who leads over all tiers of those who drive everywhere, "" where nobody has a score."""
+    return next(iter(_rank_entries(select_complete(_group_controllers(by_tier)))), "")
+
+
+def select_complete(by_name: Mapping[str, Driven]) -> dict[str, Driven]:
+    """Who drives every contest that anybody drives: who drives a part is not the best over all.
+
+    by_name: by name, the contests or what is known of each.
+    """
+    all_tasks = {task for tasks in by_name.values() for task in tasks}
+    return {name: tasks for name, tasks in by_name.items() if set(tasks) == all_tasks}
+
+
+def _group_estimators(by_tier: Mapping[str, Sequence[Standing]]) -> dict[str, Gains]:
+    """What each estimator under the reference controller gains, the truth left out."""
+    return _collect_gains(by_tier, "estimator", lambda entry: (
+        entry.controller == REFERENCE_CONTROLLER and entry.estimator != TRUTH))  # fmt: skip
+
+
+def _group_controllers(by_tier: Mapping[str, Sequence[Standing]]) -> dict[str, Gains]:
+    """What each controller gains on its own filter, the rungs left out."""
+    return _collect_gains(by_tier, "controller", lambda entry: (
+        entry.controller not in ORACLE_NAMES and is_default_filter(entry.controller,
+                                                                   entry.estimator)))  # fmt: skip
+
+
+def _collect_gains(
+    by_tier: Mapping[str, Sequence[Standing]], attribute: str, among: Callable[[ControlEntry], bool]
+) -> dict[str, Gains]:
+    by_name: dict[str, Gains] = {}
+    for item in (item for standings in by_tier.values() for item in standings if among(item.entry)):
+        name = getattr(item.entry, attribute).replace(", ", " with ")  # in a list of names
+        gains = by_name.setdefault(name, {})
+        gains |= {task: r for task, (r, _) in item.pairs.items()}
+    return {name: item for name, item in by_name.items() if item}
+
+
+def _compute_cost_ratio(one: Gains, other: Gains) -> Estimate:
+    """One's cost over the other's on the contests and seeds of both; NaN where there are none."""
+    both = [(r, other[task]) for task, r in one.items() if task in other]
+    return geometric_mean(*(b[: len(a)] - a[: len(b)] for a, b in both))
+
+
+def _rank_entries(by_name: Mapping[str, Gains]) -> dict[str, dict[str, Estimate]]:
+    """Each one's cost over its rivals', the best first: who costs more than the fewest, of these
+    who costs least of nominal's. Rivals that share no contest are left out, the closest first."""
+    ratios = {
+        name: {
+            other: _compute_cost_ratio(gains, rival_gains)
+            for other, rival_gains in by_name.items()
+            if other != name
+        }
+        for name, gains in by_name.items()
+    }
+    beaten = {name: sum(ratio.value > 1.0 for ratio in ratios[name].values()) for name in by_name}
+    gained = {name: np.mean([r.mean() for r in gains.values()]) for name, gains in by_name.items()}
+    order = sorted(by_name, key=lambda name: (beaten[name], -gained[name]))
+    return {
+        name: dict(sorted(
+            ((other, ratio) for other, ratio in ratios[name].items() if np.isfinite(ratio.value)),
+            key=lambda rival: -rival[1].value,
+        ))
+        for name in order
+    }  # fmt: skip
+
+
+def _describe_first(by_name: Mapping[str, Gains]) -> str:
+    """Who leads, and by how much."""
+    ranked = _rank_entries(by_name)
+    return describe_leader(*next(iter(ranked.items())), "cost") if ranked else "nobody has a score"
+
+
+def _describe_exceptions(by_tier: Mapping[str, Sequence[Standing]]) -> str:
+    """The tiers in which somebody else surely leads, and who does where he drives a part."""
+    parts = []
+    for tier, standings in by_tier.items():
+        for collect in (
+            _group_estimators,
+            lambda tiers: select_complete(_group_controllers(tiers)),
+        ):
+            overall, tier_ranking = (
+                _rank_entries(collect(by_tier)),
+                _rank_entries(collect({tier: standings})),
+            )
+            first, best = (next(iter(ranking), "") for ranking in (overall, tier_ranking))
+            if (
+                best != first
+                and first in tier_ranking.get(best, {})
+                and tier_ranking[best][first].high < 1.0
+            ):
+                parts.append(f"{best} in tier {tier}")
+    drivers, overall_best = _group_controllers(by_tier), find_best_controller(by_tier)
+    parted = drivers.keys() - select_complete(drivers).keys() if overall_best else ()
+    ratios = {name: _compute_cost_ratio(drivers[name], drivers[overall_best]) for name in parted}
+    cheaper = (name for name in ratios if ratios[name].high < 1.0)
+    ordered = sorted(cheaper, key=lambda label: ratios[label].value)
+    parts += [f"{name} on its own manoeuvres" for name in ordered]
+    return f"It costs less with {summarise_names(parts)}. " if parts else ""
+
+
+def _describe_reasons(
+    by_tier: Mapping[str, Sequence[Standing]],
+    prices: Sequence[DelayCost],
+    foresight: Mapping[ControlTask, Array],
+) -> str:
+    """What the rungs save: the price of the model, of sensing, of foresight and of delay."""
+    all_standings = [standing for standings in by_tier.values() for standing in standings]
+    parameter_pairs = [
+        r
+        for standing in all_standings
+        if standing.entry.controller == PARAMETERS
+        for r in standing.pairs.values()
+    ]
+    steps = (
+        ("the true car and road", [r for r, _ in parameter_pairs]),
+        ("its exact motion", [oracle_gain - r for r, oracle_gain in parameter_pairs]),
+        ("what is ahead", list(foresight.values())),
+    )
+    texts = [
+        f"{what} saves {100.0 * (1.0 - geometric_mean(*(-r for r in logs)).value):.0f} %"
+        for what, logs in steps
+        if logs
+    ]
+    late = [price.over for price in prices if price.entry.controller == REFERENCE_CONTROLLER]
+    delay = ""
+    if late and np.isfinite(late[0][-1].value):
+        grown = 100.0 * (late[0][-1].value / late[0][0].value - 1.0)
+        delay = f"; {DELAYS[-1]:g} s of delay costs {grown:.0f} %"
+    return f"Knowing {', then '.join(texts)} of the cost{delay}." if parameter_pairs else ""
+
+
+_PANELS = (
+    Panel("sideslip / mrad", (("beta", "true"), ("beta_ref", "reference"))),
+    Panel("yaw rate / (rad/s)", (("gamma", "true"), ("gamma_ref", "reference"))),
+    Panel("yaw moment / (N m)", (("yaw_moment", "delivered"),)),
+    Panel("front steering / mrad", (("steer", "delivered"),)),
+)
+_SCALES = {"beta": 1e3, "beta_ref": 1e3, "steer": 1e3}
+_BODY = (1.5, 1.15)  # of a car, over its wheelbase and its track
+_COST = "cost / nominal's, %: less is better"
+_CAPTION = "nominal: an LQG that knows the data sheet. Whiskers: 95 % intervals. Hollow: a variant."
+
+
+def add_figures(
+    suite: Suite,
+    by_tier: Mapping[str, Sequence[Standing]],
+    results: Results,
+    prices: Sequence[DelayCost],
+    foresight: Mapping[ControlTask, Array],
+) -> None:
+    """Add the figures to a suite that has its verdict; without plotly only the tracks.
+
+    foresight: (n,) log(J_oracle-state / J_clairvoyant) of calibrated contests.
+    """
+    series = {
+        entry: result.series
+        for entry, result in results.outcomes.items()
+        if result.series is not None
+    }
+    best = find_best_controller(by_tier)
+    suite.files += _make_tracks(series, best)
+    try:
+        from ..report.figures import draw_curves, draw_groups
+    except ModuleNotFoundError:
+        return
+    questions = (
+        ("Which controller holds the car?", {"All contests": compute_relative_costs(by_tier)}),
+        ("Which controller holds it in each tier?", _group_costs(by_tier, _controller)),
+        ("Which estimator does a controller drive best with?", _group_costs(by_tier, _estimator)),
+        ("What would knowing more save?", _group_oracles(by_tier, foresight)),
+    )
+    suite.answers += [
+        (title, draw_groups(groups, _COST, {100.0: "nominal"}), _CAPTION)
+        for title, groups in questions
+        if any(groups.values())
+    ]
+    shown = make_cost_lines(prices)
+    if shown:
+        ms, label = 1e3 * np.array(DELAYS), "cost / nominal's with sensors in time"
+        figure = draw_curves(ms, shown, "further delay of camera and GPS / ms", label)
+        text = (
+            f"{DELAY_TASK.name}: camera every 50 ms, GPS every 200 ms; each filter is designed "
+            "for its delay."
+        )
+        suite.answers.append(("What does late sensing cost?", figure, text))
+    suite.explorers.append(_make_explorer(series, best))
+    for tier, standings in by_tier.items():
+        suite.figures += _draw_maps(tier, standings)
+
+
+def _group_costs(
+    by_tier: Mapping[str, Sequence[Standing]], name: Any
+) -> dict[str, dict[str, Estimate]]:
+    """By tier, the cost over nominal's in %, the best first; name: of a cell, "" leaves it out."""
+    groups = {}
+    for tier, standings in by_tier.items():
+        costs = {
+            name(standing.entry): Estimate(
+                *(100.0 * n for n in standing.overall["cost_vs_nominal"])
+            )
+            for standing in standings
+            if name(standing.entry) and "cost_vs_nominal" in standing.overall
+        }
+        title = f"Tier {tier}: {TITLES[tier]}"
+        groups[title] = dict(sorted(costs.items(), key=lambda pair: pair[1].value))
+    return {title: costs for title, costs in groups.items() if costs}
+
+
+def _estimator(cell: ControlEntry) -> str:
+    return cell.estimator if cell.controller == REFERENCE_CONTROLLER else ""
+
+
+def _controller(cell: ControlEntry) -> str:
+    has_default = is_default_filter(cell.controller, cell.estimator) and cell.controller != NOMINAL
+    return cell.controller if has_default and cell.estimator != TRUTH else ""
+
+
+def _group_oracles(
+    by_tier: Mapping[str, Sequence[Standing]], foresight: Mapping[ControlTask, Array]
+) -> dict[str, dict[str, Estimate]]:
+    groups = _group_costs(
+        by_tier, lambda entry: entry.controller if entry.controller in ORACLE_NAMES else ""
+    )
+    for tier in by_tier:
+        title = f"Tier {tier}: {TITLES[tier]}"
+        logs = [value for task, value in foresight.items() if task.tier == tier]
+        if logs and "oracle-state" in groups.get(title, {}):
+            state = groups[title]["oracle-state"].value
+            ratio = geometric_mean(*(-value for value in logs))
+            groups[title]["clairvoyant"] = Estimate(*(state * value for value in ratio))
+    return groups
+
+
+def _draw_maps(tier: str, standings: Sequence[Standing]) -> list[tuple[str, Any, str]]:
+    from ..report.figures import draw_heat_map
+
+    names = [standing.label for standing in standings]
+    tasks = list(dict.fromkeys(c for standing in standings for c in standing.results))
+    figures = []
+    for metric, good, text in (
+        ("cost_vs_nominal", "low", "Over nominal's, the paired geometric mean; 1: nominal."),
+        ("failure_rate", "low", "The share of episodes in which the car spun or left the road."),
+    ):
+        values = np.full((len(standings), len(tasks)), np.nan)
+        for i, standing in enumerate(standings):
+            for j, task in enumerate(tasks):
+                if metric in standing.by_task.get(task, {}):
+                    values[i, j] = standing.by_task[task][metric].value
+        if np.isfinite(values).any():
+            title = f"Tier {tier}: {metric.replace('_', ' ')} in every contest"
+            columns = [task.name for task in tasks]
+            figures.append((title, draw_heat_map(names, columns, values, metric, good), text))
+    return figures
+
+
+def _make_tracks(series: Mapping[ControlEntry, Array], best: str) -> list[tuple[str, str, str]]:
+    """The tracks of the first and the last contest, for a map: no control and the best one."""
+    tasks = list(dict.fromkeys(entry.task for entry in series))
+    files = []
+    for task in dict.fromkeys(tasks[:1] + tasks[-1:]):
+        places = {
+            entry.label: (values[:, 1 + SIGNALS.index("X")], values[:, 1 + SIGNALS.index("Y")])
+            for entry, values in series.items()
+            if entry.task == task and entry.controller in ("none", best)
+            if is_default_filter(entry.controller, entry.estimator)
+        }
+        text = make_track_kml(task.name, places, {name: find_colour(name) for name in places})
+        name = f"{task.name.replace(', ', '-')}.kml"
+        files.append((name, "application/vnd.google-earth.kml+xml", text))
+    return files
+
+
+def _make_explorer(series: Mapping[ControlEntry, Array], best: str) -> Explorer:
+    """Every cell's first test seed; at first no control and the best controller."""
+    labels = (
+        c.label for c in series if c.controller == best and is_default_filter(best, c.estimator)
+    )
+    keyed: dict[tuple[str, ...], Array] = {
+        (c.task.tier, c.task.name, c.label): values for c, values in series.items()
+    }
+    bodies: dict[tuple[str, ...], tuple[float, float]] = {}
+    for entry in series:
+        car = VEHICLES[entry.task.vehicle or "coms"]
+        size = (_BODY[0] * car.wheelbase, _BODY[1] * car.front_track)
+        bodies[entry.task.tier, entry.task.name] = size
+    best = next(labels, "")
+    return make_time_explorer("Any two side by side", ("tier", "contest"), keyed, best, bodies)
+
+
+def make_time_explorer(
+    title: str,
+    menus: Sequence[str],
+    series: Mapping[tuple[str, ...], Array],
+    best: str = "",
+    bodies: Mapping[tuple[str, ...], tuple[float, float]] | None = None,
+) -> Explorer:
+    """Episodes of which two are shown beside each other, at first `none` and the best.
+
+    series: key (one name a menu, and the contestant) to what `Driven` keeps of one.
+    """
+    cells = {}
+    for key, values in series.items():
+        signals = dict(zip(("t", *SIGNALS), values.T, strict=True))
+        cells[key] = {name: _SCALES.get(name, 1.0) * signal for name, signal in signals.items()}
+    caption = (
+        "The same seed in both: line the contestant's, dashed the reference. The arrow is where "
+        "the car goes in a quarter of a second, its angle to the body the sideslip."
+    )
+    return Explorer(title, menus, cells, _PANELS, caption, ("none", best), bodies or {})
+
+
+def run_entry(entry: ControlEntry, seed: int) -> Rollout:
+    """One episode of a contestant in a single env."""
+    return rollout(*make_env_and_agent(entry), seed)
+
+
+def make_env_and_agent(entry: ControlEntry) -> tuple[Any, Any]:
+    """A single env with its filter, and the contestant that drives it."""
+    estimate = make_estimate_options(entry) if entry.estimator else None
+    name = get_filter_name(entry.estimator)
+    env = make_env(entry.task.env_id, name, estimate, **entry.env_options)
+    return env, make_agent(entry.controller, env, **make_agent_options(entry))

@@ -1,0 +1,255 @@
+"""A contest: a manoeuvre with its car, its actuators and the reference it is judged by.
+
+Those of a tier are chosen once, on tuning seeds, by what is to be won there (`choice.py`), and
+`contests.json` holds them with the measured gaps.
+
+Test seeds that nobody can have tuned on: they change with the contestants and the env.
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ... import __version__
+from ...agents import baselines
+from ...envs.io import from_json
+from ...envs.scenarios.manoeuvres import SCENARIOS, make_scenario
+from ...envs.validation import check_choice
+from ...envs.vehicle.parameters import VEHICLES
+from ...estimators.learned.network import SUFFIX
+from ..harness.results import read_objects, write_text
+
+YAW = "sideslip/YawFusion-v0"
+STEERING = "sideslip/AfsYawFusion-v0"
+FILE = Path(__file__).with_name("contests.json")
+COMMAND = "python -m sideslip.benchmarks.control.baseline_gaps --write"
+
+NOMINAL, PARAMETERS, STATE = "nominal", "oracle-parameters", "oracle-state"
+ORACLES = {PARAMETERS: baselines.PARAMETER_ORACLES, STATE: baselines.STATE_ORACLES}
+"""The rungs of which a contest's better one has the name."""
+
+TIERS: dict[str, tuple[tuple[str, str, str], ...]] = {
+    "1": ((STEERING, "coms", "model"), (YAW, "coms", "zero-slip")),
+    "2a": ((YAW, "passenger-car", "lagged"), (STEERING, "passenger-car", "lagged")),
+    "2b": ((YAW, "passenger-car", "lagged"), (STEERING, "passenger-car", "lagged")),
+    "2c": ((YAW, "passenger-car", "lagged"), (STEERING, "passenger-car", "lagged")),
+}
+"""The (env id, vehicle, reference) with which a tier's scenarios are driven."""
+TITLES = {
+    "1": "the COMS at 18 to 28 km/h",
+    "2a": "the passenger car at 60 to 80 km/h on a dry road",
+    "2b": "the passenger car on a road of unknown friction",
+    "2c": "the passenger car at the limit of its tyres",
+}
+LIMIT = ("2c",)
+"""Tiers in which nominal may fail as often as it does."""
+
+
+@dataclass(frozen=True)
+class ControlTask:
+    """A scenario in an environment; vehicle and reference: "" for the id's own. tier: "" where it
+    is none of a score's."""
+
+    tier: str = ""
+    env_id: str = YAW
+    vehicle: str = ""
+    reference: str = ""
+    scenario: str = "random-steering"
+
+    @property
+    def name(self) -> str:
+        """In tables: the scenario and what acts."""
+        return f"{self.scenario}, {'steering' if self.env_id == STEERING else 'yaw'}"
+
+    @property
+    def kind(self) -> str:
+        """The class of contests that share their tuned options."""
+        if self.vehicle in ("", "coms"):
+            return f"coms-{'zero-slip' if self.reference == 'zero-slip' else 'model'}"
+        return f"car-{'steering' if self.env_id == STEERING else 'yaw'}"
+
+    @property
+    def seed_text(self) -> str:
+        """JSON from which the seeds are drawn. Its keys stay when a field gets another name."""
+        parts = {
+            "tier": self.tier,
+            "env_id": self.env_id,
+            "vehicle": self.vehicle,
+            "reference": self.reference,
+            "scenario": self.scenario,
+        }
+        return json.dumps(parts)
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """Options of the env."""
+        car = {"vehicle": self.vehicle, "nominal": self.vehicle} if self.vehicle else {}
+        reference_options = {"reference": self.reference} if self.reference else {}
+        return {"scenario": self.scenario} | car | reference_options
+
+
+def vary_scenario(task: ControlTask, change: Mapping[str, Any]) -> dict[str, Any]:
+    """A contest's scenario, over its name, with some fields changed.
+
+    change: fields of `Scenario`; noise comes to the scenario's own, and "mass" is a factor on the
+    true car's, of which controllers and filters know nothing.
+    """
+    fields, base = dict(change), make_scenario(task.scenario)
+    if "noise" in fields:
+        fields["noise"] = dict(base.noise) | fields["noise"]
+    if "mass" in fields:
+        mass = fields.pop("mass") * VEHICLES[task.vehicle].mass
+        fields["vehicle"] = dict(base.vehicle) | {"mass": mass}
+    return {"base": task.scenario} | fields
+
+
+@dataclass(frozen=True)
+class TaskMeasurement:
+    """A candidate with what was measured on tuning seeds: an entry of the file.
+
+    oracle, knowing: the better of `ORACLES` for state and for parameters. gap: mean
+    log(J_nominal / J_oracle) of the episodes that both
+    survive, `judged` of n, with its 95 % interval; failing: the share in which nominal fails.
+    verdict: "scored", or why not.
+    """
+
+    tier: str
+    env_id: str
+    vehicle: str
+    reference: str
+    scenario: str
+    env_version: str
+    oracle: str
+    knowing: str
+    gap: float
+    low: float
+    high: float
+    failing: float
+    judged: int
+    n: int
+    verdict: str
+
+    @property
+    def task(self) -> ControlTask:
+        """Of which these are the numbers."""
+        return ControlTask(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
+
+
+def list_candidates() -> list[ControlTask]:
+    """Every scenario that has a tier, with each of the tier's ids and references."""
+    return [
+        ControlTask(tier, *variant, name)
+        for tier, variants in TIERS.items()
+        for variant in variants
+        for name, scenario in SCENARIOS.items()
+        if scenario.tier == tier
+    ]
+
+
+def read_tasks(path: Path = FILE) -> tuple[TaskMeasurement, ...]:
+    """All candidates of a file.
+
+    Raises FileNotFoundError, and ValueError, with the file and what to do, where it was measured
+    with another version, is cut short, or names what there is not.
+    """
+    measurements = []
+    for i, item in enumerate(read_objects(path), 1):
+        measurement, where = (
+            from_json(TaskMeasurement, item, f"{path}: entry {i}"),
+            f"{path}: entry {i}",
+        )
+        if measurement.env_version != __version__:
+            raise ValueError(
+                f"{where} was measured with version {measurement.env_version}, this is "
+                f"{__version__}; measure the contests anew: {COMMAND}"
+            )
+        check_choice(f"{where}: oracle", measurement.oracle, ORACLES[STATE])
+        check_choice(f"{where}: knowing", measurement.knowing, ORACLES[PARAMETERS])
+        if measurement.task not in list_candidates():
+            raise ValueError(
+                f"{where}: {measurement.task} is no contest of this version; {COMMAND}"
+            )
+        measurements.append(measurement)
+    return tuple(measurements)
+
+
+def write_tasks(entries: Sequence[TaskMeasurement], path: Path = FILE) -> None:
+    """Write a file that `read_tasks` reads."""
+    write_text(path, json.dumps([asdict(entry) for entry in entries], indent=1) + "\n")
+
+
+@cache
+def list_scored_tasks() -> tuple[ControlTask, ...]:
+    """The scored contests, tier by tier; raises as `read_tasks`."""
+    return tuple(
+        measurement.task for measurement in read_tasks() if measurement.verdict == "scored"
+    )
+
+
+@cache
+def _index_measurements() -> dict[ControlTask, TaskMeasurement]:
+    return {measurement.task: measurement for measurement in read_tasks()} if FILE.is_file() else {}
+
+
+def find_oracle(task: ControlTask, name: str = STATE) -> str:
+    """The better of `ORACLES` of a name in a contest; LQR where none was measured."""
+    measurement = _index_measurements().get(task)
+    if measurement is None:
+        return ORACLES[name][0]
+    return measurement.oracle if name == STATE else measurement.knowing
+
+
+Seeds = Sequence[int] | Callable[[ControlTask], Sequence[int]]
+"""The same in every contest, or of each."""
+
+_PACKAGE = Path(__file__).resolve().parents[2]
+_CONTESTANTS = dict.fromkeys(("estimators", "agents"), (".py", ".toml", SUFFIX))
+_LENGTH = 16
+_TUNING = 2**29  # the clairvoyant's are beyond 2^30
+
+
+def make_salt(*more: str) -> str:
+    """The salt: a hash of the contestants' files, weights included, the env's version and further
+    texts."""
+    digest = hashlib.sha256(__version__.encode())
+    for folder, endings in _CONTESTANTS.items():
+        for path in sorted((_PACKAGE / folder).rglob("*")):
+            if path.suffix in endings:
+                digest.update(str(path.relative_to(_PACKAGE)).encode() + path.read_bytes())
+    for text in more:
+        digest.update(text.encode())
+    return digest.hexdigest()[:_LENGTH]
+
+
+def make_salted_seeds(salt: str, n: int, more: str = "") -> list[int]:
+    """The first n test seeds of a salt (hexadecimal), each below 2^32; more seeds keep the first.
+
+    more: a text that makes them others. Raises ValueError for a salt that is not hexadecimal.
+    """
+    if not re.fullmatch("[0-9a-f]+", salt):
+        raise ValueError(f"a salt is hexadecimal digits, got {salt!r}")
+    words = [int(salt[i : i + 8], 16) for i in range(0, len(salt), 8)]
+    words += list(hashlib.sha256(more.encode()).digest()) if more else []
+    children = np.random.SeedSequence(words).spawn(n)
+    return [int(child.generate_state(1)[0]) for child in children]
+
+
+def make_task_seeds(salt: str, n: int) -> Callable[[ControlTask], list[int]]:
+    """The first n test seeds of each contest.
+
+    Other ones in each: a seed draws the car as well, and contests that share their cars would not
+    be independent strata of an interval.
+    """
+    return lambda task: make_salted_seeds(salt, n, task.seed_text)
+
+
+def make_tuning_seeds(n: int) -> list[int]:
+    """The first n seeds on which contests are chosen and controllers tuned: no test's."""
+    return list(range(_TUNING, _TUNING + n))

@@ -1,1 +1,0 @@
-"""The means to measure claims: simulations, filters, controllers, plots, the verdicts' rule."""

@@ -1,1 +1,0 @@
-"""Claims that need no simulation: observability, error maps between samples, dual-rate gains."""

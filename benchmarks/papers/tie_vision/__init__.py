@@ -1,1 +1,0 @@
-"""tie-vision's claims: estimation, control with Table II and its margins, convergence, appendix."""

@@ -1,0 +1,118 @@
+"""A file with a recorded drive, replayed: its parts, its wires, its car."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ...envs.recordings.log_file import WARNING_PREFIX, read_parts
+from ...envs.recordings.sources import is_nmea
+from ...envs.recordings.tables import parse_mapping
+from ...envs.vehicle.parameters import VehicleSource, make_vehicle
+from ..harness.results import Suite
+from ..harness.study import SETTLED
+from .identify import IdentificationResult, identify, make_suite
+from .quality import TRUTH, make_remarks, make_warnings
+from .suite import corners, replay
+from .wires import SignalCalibration, apply_wires
+
+FITTED, NOMINAL = "ferrari-250lm-fitted", "ferrari-250lm-nominal"
+FACTOR = 0.7  # of the fitted tyres, where no vehicle is named
+TRUTH_WARNING = "The truth of this log is in doubt, and with it all errors: see the warnings."
+
+
+def split_urgent(remarks: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Split a reader's remarks into warnings, without their mark, and the rest."""
+    urgent = [
+        text.removeprefix(WARNING_PREFIX).rstrip(".")
+        for text in remarks
+        if text.startswith(WARNING_PREFIX)
+    ]
+    return urgent, [text for text in remarks if not text.startswith(WARNING_PREFIX)]
+
+
+def identify_file(
+    log: str | Path,
+    vehicle: VehicleSource,
+    mapping: Sequence[str] = (),
+    wires: SignalCalibration | None = None,
+    tyres: str | None = None,
+    until: float | None = None,
+) -> tuple[IdentificationResult, Suite]:
+    """Read a drive and find its car: (what the log shows, its table).
+
+    until: s of the log that are used, None: all. Raises what `read_parts`, `make_vehicle` and
+    `identify` do.
+    """
+    logs, remarks = read_parts(log, parse_mapping(mapping), end=until)
+    car = make_vehicle(vehicle)
+    result = identify(logs, car, wires, tyres)
+    urgent, remarks = split_urgent(remarks)
+    result.remarks = [*remarks, *make_remarks(logs), *result.remarks]
+    suite = make_suite(result, logs[0].name)
+    suite.warnings = urgent + make_warnings(logs, car)
+    return result, suite
+
+
+def replay_file(
+    log: str | Path,
+    vehicle: VehicleSource | None = None,
+    *,
+    mapping: Sequence[str] | None = None,
+    wires: SignalCalibration | None = None,
+    nominal: VehicleSource = "passenger-car",
+    until: float | None = None,
+    **settings: Any,
+) -> Suite:
+    """Read a drive and its vehicle, replay it, each part of a log with holes by itself, and where
+    it has truth the vehicle's corners too; a receiver's log (NMEA) is replayed as `replay_nmea`
+    does.
+
+    vehicle: of `make_vehicle`; "identify": found in the log, or in its first `until` s, of which
+    the rest is then replayed, with the mass and arms of `nominal` and linear tyres, which
+    estimators have; None: the Ferrari 250 LM of the Stanford log, with the fitted tyres x 0.7, and
+    the corners of the nominal one. mapping: texts such as "steer_rad=Delta". wires: what is known
+    beside the car; identified ones stand behind it.
+    settings: of `replay`. Raises what `read_parts`, `make_vehicle`, `identify`, `replay` do.
+    """
+    if is_nmea(log):
+        from .receiver import make_receiver_suite, replay_nmea
+
+        return make_receiver_suite(replay_nmea(log, vehicle, mapping))
+    if until is not None and vehicle != "identify":
+        raise ValueError("--until is for --vehicle identify")
+    wires, tables, unknown = wires or SignalCalibration(), [], ""
+    if vehicle == "identify":
+        result, shown = identify_file(log, nominal, mapping or (), wires, "linear", until)
+        vehicle, tables, unknown = result.car, shown.tables, result.reason
+        latency = {**result.wires.latency, **wires.latency}
+        wires = result.wires._replace(latency=latency, noise={**result.wires.noise, **wires.noise})
+    logs, remarks = read_parts(log, parse_mapping(mapping or ()), start=until or 0.0)
+    logs = [apply_wires(part, wires) for part in logs]
+    if vehicle is None:
+        car, design = make_vehicle(NOMINAL), make_vehicle(FITTED)
+        settings = {"stiffness_factor": FACTOR} | settings
+        remarks.append(
+            "No vehicle was named, so the estimators assume the Ferrari 250 LM of the Stanford "
+            f"log, fitted tyres x {FACTOR}. For another car name its file: `--vehicle FILE`."
+        )
+    else:
+        car = design = make_vehicle(vehicle)
+    remarks += make_remarks(logs)
+    settings = {"noise": wires.noise} | settings
+    settings["emulated"] = not any(part.slow for part in logs)
+    parts = [part for part in logs if part.time[-1] - part.time[0] >= SETTLED] or logs[:1]
+    suite, *others = [replay(part, design, **settings) for part in parts]
+    others += [corners(part, car, **settings) for part in parts if "beta" in part.truth]
+    for other in others:
+        suite.rows += other.rows
+        suite.tables += other.tables
+        suite.figures += other.figures
+    suite.tables += tables
+    urgent, remarks = split_urgent(remarks)
+    suite.text = "\n\n".join([suite.text, *remarks])
+    suite.warnings = urgent + make_warnings(logs, design)
+    if unknown:
+        suite.warnings.append(f"the car is not identified, {unknown}: it stays as stated")
+    if any(text.startswith(TRUTH) for text in suite.warnings):
+        suite.verdict = "\n".join([TRUTH_WARNING, *suite.verdict.splitlines()[1:]])
+    return suite

@@ -1,0 +1,1 @@
+"""Suites about one question each: a file measures, tabulates and answers it."""

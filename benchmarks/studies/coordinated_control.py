@@ -1,0 +1,230 @@
+"""Question: what do steering and yaw moment do together? dakf-stability's bandwidth K, and lanes
+held on curved roads from camera and gyro, the aim of uneven-delay."""
+
+from collections.abc import Sequence
+from functools import partial
+from itertools import islice, product
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from rich.console import Console
+
+from ... import __version__
+from ...agents import make_agent
+from ...agents.controllers.model_following import compute_feedback_gains
+from ...agents.rollout import iterate_steps
+from ...envs.record import Array
+from ...envs.scenarios.manoeuvres import make_scenario
+from ...envs.ticks import TICK
+from ...envs.vehicle.dynamics import Motion
+from ...envs.vehicle.linear import LinearModel, make_bicycle_model
+from ...estimators.vector.estimate import EstimateObservation
+from ..harness.parallel import run_cases
+from ..harness.results import ResultRow, ResultTable, Suite
+from ..harness.stats import Estimate, interval, ratio_of_means, share
+from ..harness.study import call_quietly, describe_leader, format_verdict
+from ..papers.manoeuvres import measure_tracking, run_episode
+
+BANDWIDTHS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # rad/s, K_beta = K_gamma
+SEEDS, QUICK_SEEDS = 10, 2
+STEP = "dakf-fig7"
+ROAD, ROAD_ID = "curved-road", "sideslip/YawVisionUneven-v0"
+CARS, QUICK_CARS = 200, 20
+LANE_CONTROLLERS = (
+    ("none", "uneven-delay-kf", None),
+    ("steering alone", "uneven-delay-kf", False),
+    ("both", "uneven-delay-kf", True),
+    ("steering alone", "multirate-residual-kf", False),
+    ("both", "multirate-residual-kf", True),
+    ("steering alone", "exact-kf", False),
+    ("both", "exact-kf", True),
+)
+_TEXT = """\
+dakf-stability V.D has the bandwidth K limited by actuators and filter: its step by wire \
+(Fig. 7) with dakf in the loop, from K = 1 to 100 rad/s. The radius is that of the sampled loop of \
+the true car with its lags, without the filter: beyond 1 it is unstable.
+
+Lane keeping: bends of drawn curvature, 1 / 100 m to 1 / 33 m, a lane of 3.5 m, camera and gyro \
+with uneven delay; nobody steers but the controller."""
+_STATES = ("beta", "gamma", "psi", "y_l")
+
+
+def compute_loop_radius(scenario: str | dict[str, Any], bandwidth: float) -> float:
+    """Spectral radius of dakf-stability's loop as sampled every millisecond, without a filter.
+
+    The true car with its lags, the PI (31) designed for the nominal one and summed by forward
+    Euler: beyond 1 the loop is unstable.
+    """
+    parsed = make_scenario(scenario)
+    env: Any = gym.make("sideslip/AfsYawFusion-v0", scenario=parsed).unwrapped
+    env.reset(seed=0)
+    car, speed = env.vehicle, parsed.range("speed")[0]
+    plane = make_bicycle_model(car, speed)
+    lags = np.array([car.steering_lag, car.motor_lag]) * parsed.lags
+    slow = lags > 0.0
+    A, B = np.zeros((4, 4)), np.zeros((4, 2))
+    A[:2, :2] = plane.A
+    for i in range(2):
+        if slow[i]:
+            A[:2, 2 + i], A[2 + i, 2 + i], B[2 + i, i] = plane.B[:, i], -1 / lags[i], 1 / lags[i]
+        else:  # acts at once: its state is not there
+            B[:2, i], A[2 + i, 2 + i] = plane.B[:, i], -1.0 / TICK
+    G, H = LinearModel(A, B, np.eye(4), (), (), ()).discretise(TICK)
+    P, I = compute_feedback_gains(env.nominal, speed, (bandwidth, bandwidth))  # noqa: E741
+    fed = H @ P, -TICK * I, np.zeros((2, 2))
+    loop = np.block([[G - np.hstack([fed[0], np.zeros((4, 2))]), H], [fed[1], fed[2], np.eye(2)]])
+    return float(np.abs(np.linalg.eigvals(loop)).max())
+
+
+def track_reference(case: tuple[float, int]) -> Array:
+    """(rms_beta, rms_gamma, saturated, failed) of an episode of STEP with dakf in the loop.
+
+    case: the bandwidth (0: no control) and the seed.
+    """
+    K, seed = case
+    options: dict[str, Any] = {"bandwidth": (K, K)} if K > 0.0 else {"agent": "none"}
+    result = measure_tracking(run_episode(seed, STEP, **options))
+    return np.array([result.rms_beta, result.rms_gamma, result.saturated, result.failed], float)
+
+
+def keep_lane(index: int, cars: int) -> Array:
+    """(cars, 3): largest offset from the lane's centre in m, RMS slip in rad, left the road."""
+    _, estimator, moment = LANE_CONTROLLERS[index]
+    env: Any = gym.make_vec(ROAD_ID, num_envs=cars, scenario=ROAD, steering=True)
+    env = call_quietly(EstimateObservation, env, estimator, outputs=_STATES, std=False)
+    options = {} if moment is None else {"moment": moment}
+    agent = make_agent("none" if moment is None else "lane-keeping", env, **options)
+    base = env.unwrapped
+    max_offset, squares, steps, departed = np.zeros((4, cars))
+    y = Motion._fields.index("y")
+    for step in islice(iterate_steps(env, agent, 0), 1, None):
+        running = step.running
+        np.maximum(max_offset, np.abs(base.motion[:, y]), out=max_offset, where=running)
+        squares += running * step.info["beta"] ** 2
+        steps += running
+        departed[running & step.terminated] = 1.0
+    return np.stack([max_offset, np.sqrt(squares / steps), departed], axis=1)
+
+
+def run(
+    seeds: int = SEEDS, cars: int = CARS, jobs: int | None = None, console: Console | None = None
+) -> Suite:
+    """Both questions; seeds of the step, cars on the road."""
+    suite = Suite("following", "What steering and yaw moment do together", _TEXT)
+    cases = list(product((0.0, *BANDWIDTHS), range(seeds)))
+    errors = np.array(run_cases(track_reference, cases, "bandwidth", jobs, console))
+    errors = errors.reshape(len(BANDWIDTHS) + 1, seeds, -1)
+    _add_bandwidths(suite, errors)
+    run_lane = partial(keep_lane, cars=cars)
+    lanes = run_cases(run_lane, range(len(LANE_CONTROLLERS)), "lanes", jobs, console)
+    _add_lanes(suite, lanes)
+    suite.verdict = compose_verdict(errors, lanes)
+    return suite
+
+
+def compose_verdict(errors: Array, lanes: Sequence[Array]) -> str:
+    """The verdict. found: as `_add_bandwidths` has it; lanes: what `keep_lane` finds, of
+    `LANE_CONTROLLERS`."""
+    ratios = (errors[1:, :, :2].mean(axis=1) / errors[0, :, :2].mean(axis=0)).mean(axis=1)
+    stable = [i for i in range(len(BANDWIDTHS)) if not errors[1 + i, :, 3].any()]
+    best = min(stable, key=ratios.__getitem__, default=None)
+    follows = (
+        "Following: every bandwidth has runs that fail."
+        if best is None
+        else f"Following: bandwidth K = {BANDWIDTHS[best]:.0f} rad/s errs least, "
+        f"{100.0 * ratios[best]:.0f} % of no control's."
+    )
+    lost = [f"{K:.0f}" for i, K in enumerate(BANDWIDTHS) if i not in stable]
+    offset = {
+        _label_controller(i).replace(" alone", ""): numbers[:, 0]
+        for i, numbers in enumerate(lanes)
+        if LANE_CONTROLLERS[i][2] is not None
+    }
+    first, *others = sorted(offset, key=lambda name: offset[name].mean())
+    ratio = {name: interval(offset[first], ratio_of_means, offset[name]) for name in others}
+    reads = first.partition(" on ")[2]
+    both, steering_only = (
+        offset[f"{actuators} on {reads}"].mean() for actuators in ("both", "steering")
+    )
+    change = f"{100.0 * (both / steering_only - 1.0):+.0f} %"
+    return format_verdict(
+        "Steering and the motors' yaw moment, by one controller; bandwidth: how fast it corrects.",
+        follows + (f" Runs fail at {', '.join(lost)}." if lost and stable else ""),
+        f"Lanes: {describe_leader(first, ratio, 'stray')}.",
+        f"Why: yaw moment beside steering changes the {offset[first].mean():.2f} m by {change}; "
+        f"nobody steering: {lanes[0][:, 0].mean():.1f} m.",
+        "Not covered: sharper bends, faster cars, and drivers who steer themselves.",
+    )
+
+
+def _label_controller(i: int) -> str:
+    actuators, estimator, _ = LANE_CONTROLLERS[i]
+    return f"{actuators} on {estimator}" if actuators != "none" else actuators
+
+
+_COLUMNS = {  # what `track_reference` gives, and what the figure calls it
+    "error of beta / without control": "ratio",
+    "error of the yaw rate / without control": "ratio",
+    "share of time at the motors' limit": "saturation",
+    "share of runs that fail": "share",
+}
+
+
+def _add_bandwidths(suite: Suite, errors: Array) -> None:
+    """found: (none and every bandwidth, seeds, numbers of `track_reference`)."""
+    none, seeds = errors[0].mean(axis=0), errors.shape[1]
+    shares = errors[1:] / np.where([True, True, False, False], none, 1.0)
+    numbers = [[*map(interval, at_K.T[:-1]), share(at_K.T[-1])] for at_K in shares]
+    radius = np.array([compute_loop_radius(STEP, K) for K in BANDWIDTHS])
+    cells = []
+    for K, spread, r in zip(BANDWIDTHS, numbers, radius.tolist(), strict=True):
+        cells.append([f"{K:.0f}", *(f"{number.value:.3f}" for number in spread), f"{r:.5f}"])
+        scenario = f"{STEP}, K = {K:.0f} rad/s"
+        for metric, number in zip(_COLUMNS.values(), spread, strict=True):
+            suite.rows.append(_make_row(scenario, metric, number, seeds))
+        suite.rows.append(_make_row(scenario, "spectral_radius", Estimate(r, r, r), 1))
+    header = ("K / (rad/s)", "beta", "yaw rate", "saturated", "failed", "radius")
+    note = "Errors over those without control; shares of time and of runs."
+    suite.tables.append(ResultTable("The bandwidth K", header, cells, note, keyed=False))
+    try:
+        from ..report.figures import draw_curves
+    except ModuleNotFoundError:
+        return
+    columns = np.array(numbers).transpose(1, 2, 0)  # (column, value low high, K)
+    lines = {name: tuple(column) for name, column in zip(_COLUMNS, columns, strict=True)}
+    lines["spectral radius of the loop"] = (radius, radius, radius)
+    figure = draw_curves(np.array(BANDWIDTHS), lines, "K / (rad/s)", "ratio or share", "x")
+    caption = "Tracking, saturation and stability against the bandwidth; whiskers 95 % over seeds."
+    suite.figures.append(("dakf-stability V.D: the bandwidth K", figure, caption))
+
+
+def _add_lanes(suite: Suite, lanes: list[Array]) -> None:
+    cells = []
+    for i, numbers in enumerate(lanes):
+        actuators, estimator, _ = LANE_CONTROLLERS[i]
+        max_offset, slip, departures = *map(interval, numbers.T[:-1]), share(numbers.T[-1])
+        cells.append(
+            [
+                _label_controller(i),
+                *max_offset.text(),
+                f"{1e3 * slip.value:.1f}",
+                f"{100.0 * departures.value:.1f}",
+            ]
+        )
+        for metric, estimate in (
+            ("offset", max_offset),
+            ("rms_slip", slip),
+            ("departure_rate", departures),
+        ):
+            labels = {"estimator": estimator, "controller": actuators}
+            suite.rows.append(_make_row(ROAD, metric, estimate, len(numbers), **labels))
+    header = ("controller", "largest offset / m", "95 % interval", "RMS slip / mrad", "left / %")
+    note = "The largest offset of the centre of gravity from the lane's centre, mean over cars."
+    suite.tables.append(ResultTable("Keeping the lane on curved roads", header, cells, note))
+
+
+def _make_row(scenario: str, metric: str, number: Estimate, n: int, **labels: str) -> ResultRow:
+    labels = {"estimator": "dakf", "controller": "model-following"} | labels
+    common = {"suite": "following", "salt": "fixed", "env_version": __version__}
+    return ResultRow.from_estimate(metric, number, scenario=scenario, n=n, **labels, **common)

@@ -1,0 +1,206 @@
+"""Question: what do learned policies cost in a car whose equations are not ours?
+
+CommonRoad's models of a BMW 320i take the place of the passenger car, on a straight road and by our
+sensors and references. Controllers, filters and references are designed from that car, as far as
+our `Vehicle` describes it; the policies, trained on another one, learn nothing of it.
+"""
+
+import json
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from ...agents.rollout import iterate_steps
+from ...envs.outside.plants import OUTSIDE_PLANTS
+from ...envs.scenarios.manoeuvres import make_scenario
+from ...estimators.registry import describe_error
+from ..control.entries import ADAPTIVE, LEARNED, ControlEntry, make_cars
+from ..control.run import NUMBERS, Chunk, DriveResult, measure
+from ..control.score import compute_log_ratios, survival_mask
+from ..control.tasks import (
+    NOMINAL,
+    STEERING,
+    ControlTask,
+    list_scored_tasks,
+    make_salt,
+    make_task_seeds,
+    vary_scenario,
+)
+from ..harness.results import ResultTable, Suite
+from ..harness.stats import Estimate, geometric_mean, share
+from ..harness.study import format_verdict
+from .learned import EPISODES as EPISODES
+from .learned import QUICK_EPISODES as QUICK_EPISODES
+from .learned import TransferResult, add_figures, add_tables, collect_results, list_entries
+
+NAME = "learned-outside"
+OUTSIDE_ID = "sideslip/Outside-v0"
+KINDS = tuple(kind for kind in LEARNED if kind.startswith("car-"))
+"""Classes whose car is about as large and as fast as the BMW."""
+MANOEUVRE = "any-friction-sine-with-dwell"
+"""Which every class has, and after which a car heads as before: a straight road stays in sight."""
+_RIVALS = (NOMINAL, ADAPTIVE["joint, friction"])
+"""Over whose costs everybody's are: where there is no gap, there is no share."""
+_TEXT = (
+    "The passenger car's policies on CommonRoad's single-track, drift and multi-body models of a "
+    "BMW 320i, beside controllers on the same late sensors that are designed for it. No training "
+    "met it."
+)
+_NONE = " Left out: pip install 'sideslip[outside]'."
+
+
+@dataclass(frozen=True)
+class OutsideTask(ControlTask):
+    """A class's contest with an outside plant in place of its car and a straight road in place of
+    its bends. model: of `OutsideEnv`; like: the id whose actuators it has."""
+
+    model: str = "drift"
+    like: str = STEERING
+
+    @property
+    def kind(self) -> str:
+        """The class whose tuned options everybody has."""
+        return f"car-{'steering' if self.like == STEERING else 'yaw'}"
+
+    @property
+    def seed_text(self) -> str:
+        """That of a contest, with the model and the id whose actuators it has."""
+        return json.dumps(json.loads(super().seed_text) | {"model": self.model, "like": self.like})
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """Options of the env; of the contest's cars only the friction that a designer expects."""
+        friction = dict(make_scenario(self.scenario).nominal)["friction"]
+        flat = {"road": "straight", "bank": 0.0, "vehicle": {}, "nominal": {"friction": friction}}
+        return {
+            "model": self.model,
+            "scenario": vary_scenario(self, flat),
+            "reference": self.reference,
+            "steering": self.like == STEERING,
+        }
+
+
+def make_outside_task(kind: str, model: str) -> OutsideTask:
+    """A class's `MANOEUVRE` with a model as the car."""
+    like = next(
+        task for task in list_scored_tasks() if (task.kind, task.scenario) == (kind, MANOEUVRE)
+    )
+    return OutsideTask("", OUTSIDE_ID, "", like.reference, MANOEUVRE, model, like.env_id)
+
+
+def run_chunk(chunk: Chunk) -> DriveResult:
+    """`control.episodes.run_chunk` of cars that are stepped one by one: cost and failure of each
+    episode, the other numbers NaN."""
+    start_time, numbers = time.process_time(), np.full((len(chunk.seeds), len(NUMBERS)), np.nan)
+    try:
+        env, agent = make_cars(chunk.entry, len(chunk.seeds))
+        costs, failures = np.zeros((2, len(chunk.seeds)))
+        for step in iterate_steps(env, agent, list(chunk.seeds)):
+            costs -= np.where(step.running, step.reward, 0.0)
+            failures = np.where(step.running, step.info["failure"], failures)
+        env.close()
+    except Exception as error:
+        return DriveResult(numbers, np.nan, error=describe_error(error))
+    numbers[:, NUMBERS.index("cost")] = costs
+    numbers[:, NUMBERS.index("failure")] = failures
+    return DriveResult(numbers, time.process_time() - start_time)
+
+
+def run(
+    episodes: int = EPISODES,
+    jobs: int | None = None,
+    console: Console | None = None,
+    keep: Path | None = None,
+    quick: bool = False,
+    salt: str = "",
+) -> Suite:
+    """Every class of `KINDS` on every model.
+
+    episodes: of each. quick: the drift model alone. salt: of the seeds, "" for `make_salt`'s. The
+    rest is of `control.run.measure`. Raises ValueError with the reason where somebody cannot drive.
+    """
+    suite = Suite(NAME, "Learned policies in cars that are not ours", _TEXT)
+    if find_spec("vehiclemodels") is None:
+        suite.text += _NONE
+        return suite
+    models = ["drift"] if quick else list(OUTSIDE_PLANTS)
+    entries = [
+        ControlEntry(make_outside_task(kind, model), *pair)
+        for model in models
+        for kind in KINDS
+        for pair in list_entries(kind)
+    ]
+    salt = salt or make_salt()
+    seeds = make_task_seeds(salt, episodes)
+    results = measure(
+        entries, seeds, jobs=jobs, console=console, keep=keep, runner=run_chunk, title=NAME
+    )
+    transfers = [
+        TransferResult(
+            kind,
+            {
+                item: [collect_results(results, make_outside_task(kind, item), item)]
+                for item in models
+            },
+            salt,
+        )
+        for kind in KINDS
+    ]
+    note = "Other seeds on each model. No training met any."
+    for item in transfers:
+        title = f"{item.kind} in a BMW"
+        add_tables(suite, item, title, OUTSIDE_ID, f"{MANOEUVRE} on a straight road", note)
+        suite.tables.insert(-1, _make_ratio_table(item, title))
+    suite.verdict = compose_verdict(transfers)
+    add_figures(suite, transfers)
+    return suite
+
+
+def compose_verdict(transfers: Sequence[TransferResult]) -> str:
+    """The verdict: the policies of each class, by their cost over their rivals' on all models."""
+    lines = []
+    for transfer, policy in (
+        (one, controller) for one in transfers for _, controller in LEARNED[one.kind]
+    ):
+        costs = {
+            rival: _compute_cost_ratio(transfer, policy, rival, transfer.drives)
+            for rival in _RIVALS
+        }
+        said = ", ".join(f"{_format_percent(cost)} % of {rival}'s" for rival, cost in costs.items())
+        fails = 100.0 * share(transfer.mark_failures(policy)).value
+        lines.append(f"{policy} costs {said}; {fails:.0f} % fail.")
+    return format_verdict("On CommonRoad's BMW, designed for by all but the policies:", *lines)
+
+
+def _compute_cost_ratio(
+    transfer: TransferResult, controller: str, rival: str, models: Iterable[str]
+) -> Estimate:
+    """Geometric mean of the cost over a rival's, paired, where the rival survives."""
+    logs = []
+    for (results,) in (transfer.drives[model] for model in models):
+        mask = survival_mask(results[rival])
+        logs.append(-compute_log_ratios(results[rival].costs, results[controller])[mask])
+    return geometric_mean(*logs)
+
+
+def _make_ratio_table(transfer: TransferResult, title: str) -> ResultTable:
+    """What everybody costs on each model over `_RIVALS`."""
+    cells = [
+        [controller, *("" if controller == rival else _format_percent(_compute_cost_ratio(transfer,
+            controller, rival, [model]))
+                for model in transfer.drives for rival in _RIVALS)]
+        for _, controller in list_entries(transfer.kind)
+    ]  # fmt: skip
+    header = [f"{model}, % of {rival}" for model in transfer.drives for rival in _RIVALS]
+    note = "Geometric means, paired, where the one compared with survives; a failure counts 20."
+    return ResultTable(f"{title}: cost over others'", ("controller", *header), cells, note)
+
+
+def _format_percent(ratio: Estimate) -> str:
+    return ratio.inline(100.0, ".0f")

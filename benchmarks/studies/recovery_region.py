@@ -1,0 +1,221 @@
+"""Question: from which sideslip angle and yaw rate does a controller still save the car?
+
+Cars start straight ahead but sliding and turning, nobody steers, and the seed draws tyres and
+friction. A car is saved that does not fail and ends with a sideslip angle below `CAUGHT`.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from ... import __version__
+from ...agents.rollout import iterate_steps
+from ...envs.record import Array
+from ...envs.scenarios.draws import KMH
+from ..control.entries import REFERENCE_FILTER, ControlEntry, make_cars
+from ..control.run import get_control_period
+from ..control.tasks import YAW, ControlTask
+from ..harness.parallel import run_cases
+from ..harness.results import ResultRow, ResultTable, ShareMap, Suite
+from ..harness.stats import interval, mean_share
+from ..harness.study import format_verdict, summarise_names
+
+NAME = "recovery"
+READING = ("two-dof", "esc", "sliding-mode", "lqr")
+ORACLES = ("oracle-state-lqr", "oracle-state-nmpc")
+CONTROLLERS = ("none", *READING, "nominal", *ORACLES)
+CLAIRVOYANT = "clairvoyant"
+PULSES = tuple((side, 0.05 * 1.4**k) for side in (-1.0, 1.0) for k in range(10))
+"""Full yaw moment to the right or left, for how long (s), before an oracle goes on."""
+_TRIES = 5  # in a batch
+CAUGHT = 0.05  # rad
+SEEDS, QUICK_SEEDS = 16, 4
+POINTS, QUICK_POINTS = (13, 11), (5, 5)  # of the grid: sideslip angles, yaw rates
+MAX_START = (0.45, 1.0)  # rad and rad/s, where the grid ends
+FIRST_SEED = 2**28
+
+_SCENARIO = {"base": "recovery", "initial_beta": 0.0, "initial_gamma": 0.0, "half_width": 1e6}
+CARS: dict[str, tuple[ControlTask, dict[str, Any]]] = {
+    f"{car} at {kmh:g} km/h": (
+        ControlTask("", YAW, car, reference, "recovery"),
+        _SCENARIO | {"speed": kmh * KMH, "friction": friction},
+    )
+    for car, kmh, reference, friction in (
+        ("passenger-car", 80.0, "limited", (0.6, 0.9)),
+        ("coms", 40.0, "model", (0.7, 1.0)),
+    )
+}
+"""The contest of each car, whose class has the tuned options, and the scenario."""
+
+_TEXT = (
+    "The share of cars that are saved over the sideslip angle and yaw rate they start with: no "
+    f"failure within 5 s, and below {CAUGHT} rad at the end. Nobody steers; the yaw moment alone "
+    "acts. The seed draws tyres and friction. Filters start at zero, as after a cold start: they "
+    "have to find the slide first; the two oracles know it, and the car. clairvoyant: whatever any "
+    f"of them saves, or one of {len(PULSES)} tries with full moment to one side for 0.05 to "
+    "1 s and an oracle from then on: of such pieces the run that just saves a car is made "
+    "(Pontryagin), so that this is a lower bound of what can be saved, and probably near it."
+)
+
+
+@dataclass(frozen=True)
+class RecoveryCase:
+    """A controller on a car of `CARS`, over a grid of so many points, on so many seeds, after each
+    of some beginnings: share of the full yaw moment, and s."""
+
+    car: str
+    controller: str
+    points: tuple[int, int]
+    seeds: int
+    pulses: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+
+
+@dataclass
+class PulseThenAgent:
+    """An agent that takes over each row after a beginning: share of the full moment, decisions."""
+
+    agent: Any
+    share: Array
+    decisions: Array
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Any, Any]:
+        """The agent's action, the beginning's while that lasts."""
+        count, inner = state or (0, None)
+        action, inner = self.agent.predict(observation, inner, episode_start, deterministic)
+        combined = np.where(count < self.decisions, self.share, np.ravel(action))
+        return combined.reshape(np.shape(action)), (count + 1, inner)
+
+
+def make_grid(points: tuple[int, int]) -> tuple[Array, Array]:
+    """Sideslip angles (rad) and yaw rates (rad/s) of the starts."""
+    beta, gamma = (
+        np.linspace(-limit, limit, n) for limit, n in zip(MAX_START, points, strict=True)
+    )
+    return beta, gamma
+
+
+def compute_recovery_mask(case: RecoveryCase) -> Array:
+    """(yaw rates, sideslip angles, seeds) 1 where the car was saved, after any beginning."""
+    task, scenario = CARS[case.car]
+    beta, gamma = make_grid(case.points)
+    tries = len(case.pulses)
+    starts = [(g, b) for g in gamma for b in beta] * tries
+    v_x, indices = scenario["speed"], range(case.seeds)
+    states = [{"v_y": v_x * math.tan(b), "gamma": g} for g, b in starts for _ in indices]
+    seeds = [FIRST_SEED + i for i in indices] * len(starts)
+    reads = REFERENCE_FILTER if case.controller in READING else ""
+    entry = ControlEntry(task, reads, case.controller, {"scenario": scenario})
+    env, agent = make_cars(entry, len(states))
+    share, seconds = np.repeat(case.pulses, len(states) // tries, axis=0).T
+    agent = PulseThenAgent(agent, share, np.round(seconds / get_control_period(entry)))
+    lost, last = np.zeros(len(states), np.bool_), np.zeros(len(states))
+    for step in iterate_steps(env, agent, seeds, {"state": states}):
+        lost |= step.running & (step.info["failure"] != 0)
+        last = np.where(step.running, step.info["beta"], last)
+    env.close()
+    shape = (tries, len(gamma), len(beta), case.seeds)
+    caught = (~lost & (np.abs(last) < CAUGHT)).astype(float).reshape(shape)
+    return np.asarray(caught.max(axis=0))
+
+
+def run(quick: bool = False, jobs: int | None = None, console: Console | None = None) -> Suite:
+    """The maps of every controller on both cars; quick: a coarse grid and few seeds."""
+    points, seeds = (QUICK_POINTS, QUICK_SEEDS) if quick else (POINTS, SEEDS)
+    cases = [RecoveryCase(car, name, points, seeds) for car in CARS for name in CONTROLLERS]
+    starts = [PULSES[k : k + _TRIES] for k in range(0, len(PULSES), _TRIES)]
+    cases += [RecoveryCase(car, ORACLES[0], points, seeds, item) for car in CARS for item in starts]
+    results = dict(
+        zip(cases, run_cases(compute_recovery_mask, cases, NAME, jobs, console), strict=True)
+    )
+    suite = Suite(NAME, "From where the car is still saved", _TEXT)
+    beta, gamma = (np.degrees(axis) for axis in make_grid(points))
+    cars = {car: {name: results[RecoveryCase(car, name, points, seeds)] for name in CONTROLLERS}
+            for car in CARS}  # fmt: skip
+    for car, masks in cars.items():
+        car_masks = [item for case, item in results.items() if case.car == car]
+        masks[CLAIRVOYANT] = np.maximum.reduce(car_masks)
+    suite.verdict = compose_verdict(cars)
+    for car, masks in cars.items():
+        _add_table(suite, car, masks)
+        shares = {name: item.mean(axis=2) for name, item in masks.items()}
+        labels = ("sideslip angle / deg", "yaw rate / (deg/s)")
+        suite.maps.append(ShareMap(f"{car}: share of cars saved", beta, gamma, shares, *labels))
+    _draw_figures(suite)
+    return suite
+
+
+def _draw_figures(suite: Suite) -> None:
+    """The maps, those of the best first; nothing where plotly is not installed."""
+    try:
+        from ..report.figures import draw_share_maps
+    except ModuleNotFoundError:
+        return
+    text = "Colour: the share of seeds on which the car is saved; the line is at one half."
+    suite.figures = [
+        (share_map.title, draw_share_maps(share_map), text) for share_map in suite.maps
+    ]
+    first, best = suite.maps[0], suite.verdict.splitlines()[1:-2]
+    shown = ["none"]
+    for group in (READING, ORACLES, (CLAIRVOYANT,)):
+        names = [name for name in group if name in first.shares]
+        shown += sorted(names, key=lambda name: -float(first.shares[name].mean()))[:1]
+    selected = replace(first, shares={name: first.shares[name] for name in shown})
+    title = f"From where is a car still saved? ({first.title})"
+    suite.answers.append((title, draw_share_maps(selected), " ".join([*best[:1], text])))
+
+
+def compose_verdict(cars: Mapping[str, Mapping[str, Array]]) -> str:
+    """The verdict. cars: of each car, by controller what `compute_recovery_mask` finds."""
+    firsts, knowing, clairvoyant_shares = list[str](), list[str](), list[str]()
+    for car, masks in cars.items():
+        share = {name: values.mean(axis=(0, 1)) for name, values in masks.items()}  # (seeds,)
+        mean = {name: 100.0 * float(values.mean()) for name, values in share.items()}
+        rivals = sorted((name for name in READING if name in mean), key=lambda name: -mean[name])
+        even = [name for name in rivals if not interval(share[rivals[0]] - share[name]).low > 0.0]
+        best = " and ".join(even) if len(even) < 3 else f"{summarise_names(even, 1)}, a tie,"
+        rest = [name for name in rivals if name not in even][:1] + ["none"] * ("none" in mean)
+        others = ", ".join(f"{name} {mean[name]:.0f} %" for name in rest)
+        if rivals:
+            firsts.append(f"{car}: {best} {mean[rivals[0]]:.0f} %; {others}.")
+        known = [mean[name] for name in ORACLES if name in mean]
+        knowing += [f"{share:.0f} %" for share in sorted(known)[-1:]]
+        clairvoyant_shares += [f"{mean[name]:.0f} %" for name in (CLAIRVOYANT,) if name in mean]
+    return format_verdict(
+        "Cars start sliding and turning and nobody steers; saved: going straight again within 5 s.",
+        *firsts,
+        f"Why: knowing the exact motion saves {' and '.join(knowing)}, foresight too "
+        f"{' and '.join(clairvoyant_shares)}; filters must find it first."
+        if knowing
+        else "",
+        "Not covered: a driver who steers against the slide, and starts beyond the grid.",
+    )
+
+
+def _add_table(suite: Suite, car: str, masks: Mapping[str, Array]) -> None:
+    """A table and rows of a car; the seeds are what varies, the starts are the same for all."""
+    cells = []
+    shares = {name: mask.mean(axis=(0, 1)) for name, mask in masks.items()}
+    for name, share in shares.items():
+        number, difference = mean_share(share), interval(share - shares["none"])
+        cells.append([name, *number.text(1e2, ".1f"), *difference.text(1e2, ".1f")])
+        where = {"scenario": car, "controller": name, "n": len(share)}
+        common = {"suite": NAME, "salt": "fixed", "env_version": f"{YAW} {__version__}"}
+        suite.rows.append(ResultRow.from_estimate("saved_rate", number, **where, **common))
+    header = ("controller", "saved / %", "95 % interval", "above none / %", "95 % interval")
+    starts = next(iter(masks.values())).shape
+    note = (
+        f"Of {starts[0] * starts[1]} starts up to {np.degrees(MAX_START[0]):.0f} deg and "
+        f"{np.degrees(MAX_START[1]):.0f} deg/s, {starts[2]} seeds each; intervals over the seeds, "
+        "paired against none."
+    )
+    suite.tables.append(ResultTable(car, header, cells, note))

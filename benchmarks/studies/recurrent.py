@@ -1,0 +1,440 @@
+"""Kinds of memory by how much more they cost than the optimum: cases, measurements, the suite.
+
+Who is trained and judged in which condition, and what a training may use.
+
+A case: a memory is trained and judged by the optimum; finished ones stay in a folder.
+
+Question: how much of what memory is worth does each kind of network find?
+
+`sideslip/LinearYawVision-v0` with a picture every 40 ms, late or lost. All learn from the optimal
+filter's actions with as many steps; PPO learns from rewards. The gap is what a policy costs over
+the optimum, less one, from its actions' errors (`Optimum.excess`), which scatters little.
+"""
+
+import contextlib
+import hashlib
+import json
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from rich.console import Console
+
+from ... import __version__
+from ...agents.optimum import Lqg, Optimum, compute_optimum, wrap_optimal_estimate
+from ...envs.io import atomic_file
+from ...envs.numerics.kernel_cache import hash_experiment
+from ...envs.record import Array
+from ...envs.validation import check_choice
+from ..harness.parallel import run_cases
+from ..harness.results import ResultRow, ResultTable, Suite
+from ..harness.stats import Estimate, interval
+from ..harness.study import format_percent, format_verdict
+
+ID = "sideslip/LinearYawVision-v0"
+PERIOD, STEP = 0.04, 0.01  # s, of pictures and of control
+CONDITIONS: Mapping[str, Mapping[str, Any]] = {
+    "100 ms": {"delays": [0.1]},
+    "300 ms": {"delays": [0.3]},
+    "0 ms": {"delays": [0.0]},
+    "100 ms, half lost": {"delays": [0.1], "loss": 0.5},
+    "300 ms, half lost": {"delays": [0.3], "loss": 0.5},
+}
+"""How late pictures are, and which share never comes."""
+REPEATED, SEEDS = "100 ms", 3
+"""The condition in which everybody trains on so many seeds; elsewhere on one."""
+SCHEDULES = 8  # whose arrivals the optimum is averaged over, where pictures are lost
+FILTER, PPO, LQG_FACTOR = "lqg", "ppo", 8
+"""The optimum's own policy, as a check, on so many times the episodes; learning from rewards."""
+EPISODES, QUICK_EPISODES = 64, 16
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a training may use.
+
+    cars: side by side. rounds: of driving and learning. epochs: passes over all drives in a round.
+    ppo: steps of PPO, 0 for none. duration: s, of an episode.
+    """
+
+    cars: int = 64
+    rounds: int = 3
+    epochs: int = 1
+    ppo: int = 500_000
+    duration: float = 10.0
+
+
+QUICK = Budget(cars=32, rounds=2, epochs=1, ppo=0, duration=3.0)
+
+
+@dataclass(frozen=True)
+class MemoryCase:
+    """Who, in which condition, trained with which seed and budget; so many episodes judge it."""
+
+    learner: str
+    condition: str
+    seed: int
+    budget: Budget
+    episodes: int
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Of the env."""
+        spec = gym.spec(ID).kwargs
+        camera = {"period": PERIOD} | dict(CONDITIONS[self.condition])
+        return {"camera": camera, "scenario": spec["scenario"] | {"duration": self.budget.duration}}
+
+    @property
+    def delay_steps(self) -> int:
+        """Steps that a picture is old when it arrives."""
+        return round(float(CONDITIONS[self.condition]["delays"][0]) / STEP)
+
+    @property
+    def best(self) -> Optimum:
+        """The optimum."""
+        return _compute_best(self.condition, self.budget)
+
+
+@cache
+def _compute_best(condition: str, budget: Budget) -> Optimum:
+    options = MemoryCase("", condition, 0, budget, 1).options
+    return compute_optimum(gym.make(ID, **options), SCHEDULES if "loss" in options["camera"] else 1)
+
+
+def make_cases(
+    quick: bool,
+    episodes: int | None = None,
+    conditions: Sequence[str] = (),
+    seeds: int = SEEDS,
+) -> list[MemoryCase]:
+    """What a run trains, the repeated seeds last; arguments as of the suite's `run`."""
+    from ...agents.training.recurrent import MEMORIES
+
+    for item in conditions:
+        check_choice("condition", item, CONDITIONS)
+    budget, default = (QUICK, (REPEATED,)) if quick else (Budget(), tuple(CONDITIONS))
+    conditions = list(dict.fromkeys((REPEATED, *conditions))) if conditions else default
+    count = episodes or (QUICK_EPISODES if quick else EPISODES)
+    learners = (FILTER, *MEMORIES)
+    cases = [
+        MemoryCase(name, condition, 0, budget, count)
+        for condition in conditions
+        for name in learners
+    ]
+    if not quick:
+        cases.append(MemoryCase(PPO, REPEATED, 0, budget, count))
+        repeated = [
+            item for item in cases if item.condition == REPEATED and item.learner in MEMORIES
+        ]
+        cases += [replace(item, seed=seed) for seed in range(1, seeds) for item in repeated]
+    return cases
+
+
+FIRST_SEED = 2**30
+NOISE = 0.3  # of what shakes the teacher in the first round
+SOURCE_MODULES = ("measure", "cases")  # with the agents and the case all that its numbers depend on
+_LETTERS = 24  # of a kept case's name
+
+
+class MemoryResult(NamedTuple):
+    """Of each episode what the actions' errors cost and what all cost (n,); the optimum;
+    CPU-seconds and steps of the training."""
+
+    excess: Array
+    costs: Array
+    best: Array
+    seconds: Array
+    steps: Array
+
+    def gap(self) -> Estimate:
+        """From the actions' errors."""
+        return interval(self.excess / self.best)
+
+    def compute_paired_gap(self, reference: "MemoryResult") -> Estimate:
+        """From the costs, against the optimum's own policy on the same seeds."""
+        return interval((self.costs - reference.costs[: len(self.costs)]) / self.best)
+
+
+def evaluate_agent(
+    cars: Any, twins: Any, agent: Any, best: Optimum, seed: int
+) -> tuple[Array, Array]:
+    """(excess, costs), (N,) each, of an agent's episodes; twins: the same cars,
+    `wrap_optimal_estimate`."""
+    seeds = range(seed, seed + twins.num_envs)
+    names = [entry.name for entry in twins.layout]
+    columns = [names.index(name) for name in Lqg.needs]
+    obs, _ = cars.reset(seed=list(seeds))
+    twin_obs, _ = twins.reset(seed=list(seeds))
+    state, read, actions, costs = None, [], [], np.zeros(len(seeds))
+    for _ in range(best.plant.steps):
+        action, state = agent.predict(obs, state)
+        read.append(twin_obs[:, columns].astype(np.float64))
+        actions.append(action[:, 0].astype(np.float64))
+        twin_obs, rewards, *_ = twins.step(action)
+        obs = twin_obs if cars is twins else cars.step(action)[0]
+        costs -= rewards
+    return best.excess(np.stack(read, 1), np.stack(actions, 1)), costs
+
+
+def run_case(case: MemoryCase) -> MemoryResult:
+    """Train and judge."""
+    best, start_time = case.best, time.process_time()
+    count = case.episodes * (LQG_FACTOR if case.learner == FILTER else 1)
+    twins = wrap_optimal_estimate(_make_cars(case, count))
+    if case.learner == FILTER:
+        cars, agent, steps = twins, Lqg(twins), 0
+    elif case.learner == PPO:
+        cars = _make_cars(case, count)
+        agent, steps = _train_ppo(case, cars), case.budget.ppo
+    else:
+        agent, steps = _train_memory(case)
+        from ...agents.training.networks import CompactObservation
+
+        cars = CompactObservation(_make_cars(case, count))
+    seconds = time.process_time() - start_time if steps else 0.0
+    outcome = evaluate_agent(cars, twins, agent, best, FIRST_SEED)
+    return MemoryResult(*outcome, *(np.array(value) for value in (best.cost, seconds, steps)))
+
+
+def _make_cars(case: MemoryCase, count: int) -> Any:
+    return gym.make_vec(ID, count, **case.options)
+
+
+def _train_memory(case: MemoryCase) -> tuple[Any, int]:
+    """(a memory that acts, steps that it saw)."""
+    from ...agents.training.distill import DistillTask
+    from ...agents.training.networks import CompactObservation
+    from ...agents.training.recurrent import MEMORIES, train_memory
+    from ...agents.training.student import DistillConfig
+
+    budget = case.budget
+    twins = wrap_optimal_estimate(_make_cars(case, budget.cars))
+    task = DistillTask(CompactObservation(_make_cars(case, budget.cars)), twins, Lqg(twins))
+    config = DistillConfig(
+        rounds=budget.rounds,
+        epochs=budget.epochs,
+        learning_rate=MEMORIES[case.learner].rate,
+        noise=NOISE,
+        seed=case.seed,
+    )
+    weight, steps = float(case.best.weights[0]), list[int]()
+    agent = train_memory(
+        case.learner,
+        task,
+        config,
+        case.delay_steps,
+        weight,
+        lambda round_result: steps.append(round_result.steps),
+    )
+    return agent, steps[-1]
+
+
+def _train_ppo(case: MemoryCase, cars: Any) -> Any:
+    """PPO's policy, which sees the last observation alone, and the whole of it."""
+    from ...agents.learned.policy import PolicyController, load_policy
+    from ...agents.training.callbacks import POLICY
+    from ...agents.training.config import TrainingTask
+    from ...agents.training.trainer import train
+
+    task = TrainingTask(ID, env_options=case.options, seed=case.seed)
+    with tempfile.TemporaryDirectory() as folder:
+        train(task, case.budget.ppo, folder)
+        return PolicyController(cars, load_policy(Path(folder) / POLICY))
+
+
+@dataclass(frozen=True)
+class CaseCache:
+    """`measured` that looks in a folder first and leaves its result there; None keeps nothing."""
+
+    folder: Path | None
+
+    def __call__(self, case: MemoryCase) -> MemoryResult:
+        """The case's result."""
+        if self.folder is None:
+            return run_case(case)
+        sources = "".join(
+            (Path(__file__).parent / f"{name}.py").read_text() for name in SOURCE_MODULES
+        )
+        text = hash_experiment() + sources + json.dumps(asdict(case) | case.options)
+        path = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:_LETTERS]}.npz"
+        with contextlib.suppress(Exception), np.load(path, allow_pickle=False) as saved:
+            return MemoryResult(
+                *(saved[name] for name in MemoryResult._fields)
+            )  # damaged: measured anew
+        result = run_case(case)
+        with contextlib.suppress(OSError):  # a full disk loses the file, not the run
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_file(path) as file:
+                np.savez_compressed(file, **result._asdict())
+        return result
+
+
+NAME = "memory"
+_TEXT = (
+    "A linear car of known tyres whose sideslip angle a yaw moment keeps small, pictures every "
+    "40 ms: the best policy and its cost are computed. Each kind of memory imitates the optimal "
+    "filter's actions where it drives itself (DAgger), all with the same drives and passes; what "
+    "is left is the price of what it does not remember, or has not learned. Gap: cost over the "
+    "optimum, less one. An error of an action costs S (u - u*)^2, so the gap is their sum; beside "
+    "it stands the plain difference of the costs to the optimal policy on the same seeds."
+)
+
+Results = Mapping[str, Mapping[str, Sequence[MemoryResult]]]
+"""By who and condition, of each training seed."""
+
+
+def run(
+    quick: bool = False,
+    episodes: int | None = None,
+    jobs: int | None = None,
+    console: Console | None = None,
+    keep: Path | None = None,
+    conditions: Sequence[str] = (),
+    seeds: int = SEEDS,
+) -> Suite:
+    """Everybody in every condition; quick: in one, with little training and without PPO.
+
+    episodes: that judge a policy. keep: a folder in which finished cases stay. conditions: of
+    `CONDITIONS`, none for all. seeds: trainings of each memory in `REPEATED`, which is always
+    there.
+    """
+    suite = Suite(NAME, "Memory where the optimum is known", _TEXT)
+    if find_spec("torch") is None:
+        suite.verdict = 'Not trained: it needs torch, pip install "sideslip[train]".'
+        return suite
+    cases = make_cases(quick, episodes, conditions, seeds)
+    outcomes = run_cases(CaseCache(keep and keep.absolute()), cases, NAME, jobs, console)
+    results: dict[str, dict[str, list[MemoryResult]]] = {}
+    for case, outcome in zip(cases, outcomes, strict=True):
+        results.setdefault(case.learner, {}).setdefault(case.condition, []).append(outcome)
+    suite.verdict = make_verdict(results)
+    _add_tables(suite, results)
+    _draw(suite, results)
+    return suite
+
+
+def average_seeds(runs: Sequence[MemoryResult]) -> MemoryResult:
+    """The mean over training seeds, episode by episode."""
+    return MemoryResult(*(np.mean(arrays, axis=0) for arrays in zip(*runs, strict=True)))
+
+
+def make_verdict(results: Results) -> str:
+    """The verdict."""
+    learners = [learner for learner in results if learner not in (FILTER, PPO)]
+    gaps = {
+        learner: {
+            condition: average_seeds(item).gap() for condition, item in results[learner].items()
+        }
+        for learner in learners
+    }
+    mean = {
+        learner: float(np.mean([item.value for item in gaps[learner].values()]))
+        for learner in learners
+    }
+    first, *others = sorted(learners, key=lambda learner: mean[learner])
+    rest = ", ".join(f"{learner} {100.0 * mean[learner]:.0f} %" for learner in others)
+    hardest = max(gaps[first], key=lambda condition: gaps[first][condition].value)
+    check = "; ".join(
+        f"{condition} {format_percent(compute_lqg_gap(item[0]))}"
+        for condition, item in list(results[FILTER].items())[:2]
+    )
+    return format_verdict(
+        f"Over the optimum: {first} {100.0 * mean[first]:.0f} %, {rest}.",
+        f"Means of {len(gaps[first])} conditions; {first} is furthest from it at {hardest}: "
+        f"{format_percent(gaps[first][hardest])}.",
+        "By rewards alone ppo, without memory: "
+        f"{format_percent(average_seeds(results[PPO][REPEATED]).gap())} at {REPEATED}."
+        if PPO in results
+        else "",
+        f"Check, the optimal policy's own costs over it: {check}.",
+        "Not covered: longer training, larger networks, other sensors and cars.",
+    )
+
+
+def compute_lqg_gap(result: MemoryResult) -> Estimate:
+    """Of the optimum's own policy: its costs over the computed optimum, less one."""
+    return interval(result.costs / result.best - 1.0)
+
+
+def _format_gap(number: Estimate) -> str:
+    return number.inline(100.0, ".1f")
+
+
+def _add_tables(suite: Suite, results: Results) -> None:
+    conditions = list(results[FILTER])
+    reference = {condition: runs[0] for condition, runs in results[FILTER].items()}
+    gaps, trainings = [], []
+    for learner, learner_runs in results.items():
+        numbers = {
+            condition: compute_lqg_gap(runs[0]) if learner == FILTER else average_seeds(runs).gap()
+            for condition, runs in learner_runs.items()
+        }
+        gaps.append(
+            [learner, *(_format_gap(numbers[w]) if w in numbers else "" for w in conditions)]
+        )
+        for condition, number in numbers.items():
+            columns = {
+                "scenario": condition,
+                "controller": learner,
+                "n": len(learner_runs[condition][0].costs),
+            }
+            common = {"suite": NAME, "salt": "fixed", "env_version": f"{ID} {__version__}"}
+            suite.rows.append(ResultRow.from_estimate("gap", number, **columns, **common))
+        if learner != FILTER:
+            runs = learner_runs[REPEATED]
+            seeds = ", ".join(f"{100.0 * result.gap().value:.1f}" for result in runs)
+            plain = _format_gap(average_seeds(runs).compute_paired_gap(reference[REPEATED]))
+            spent = np.mean(
+                [result.seconds for run_list in learner_runs.values() for result in run_list]
+            )
+            trainings.append([learner, seeds, plain, f"{runs[0].steps:.0f}", f"{spent:.0f}"])
+    n = len(reference[REPEATED].costs) // LQG_FACTOR
+    optima = ", ".join(
+        f"{condition} {1e3 * runs.best:.1f}" for condition, runs in reference.items()
+    )
+    note = (
+        f"Percent over the optimum, with 95 % intervals over {n} episodes, the same for all; "
+        f"{FILTER}: the optimal policy's plain costs on {n * LQG_FACTOR}. "
+        f"The optimum in 10^-3: {optima}."
+    )
+    title = f"Trainings, at {REPEATED}"
+    header = ("memory", "gap of each seed / %", "plain costs / %", "steps", "CPU-s")
+    suite.tables += [
+        ResultTable("Cost over the optimum", ("memory", *conditions), gaps, note),
+        ResultTable(
+            title, header, trainings, "CPU-s: mean of all conditions. plain costs: over lqg's."
+        ),
+    ]
+
+
+def _draw(suite: Suite, results: Results) -> None:
+    """The gap over the delay; nothing where plotly is not installed or there is one delay only."""
+    delays = {
+        1e3 * camera["delays"][0]: condition
+        for condition, camera in CONDITIONS.items()
+        if "loss" not in camera and condition in results[FILTER]
+    }
+    delays = dict(sorted(delays.items()))
+    if find_spec("plotly") is None or len(delays) < 2:
+        return
+    from ..report.figures import draw_curves
+
+    series = {}
+    for learner in results:
+        if set(delays.values()) <= set(results[learner]) and learner != FILTER:
+            gaps = [
+                average_seeds(results[learner][condition]).gap() for condition in delays.values()
+            ]
+            value, low, high = 100.0 * np.array(gaps).T
+            series[learner] = value, low, high
+    labels = ("delay of the pictures / ms", "cost over the optimum / %")
+    figure = draw_curves(np.array(list(delays)), series, *labels, log="y")
+    question = "How much of the optimum does each memory find?"
+    suite.answers.append((question, figure, suite.verdict.splitlines()[0]))

@@ -1,0 +1,308 @@
+"""The task of a tuning: an estimator on drives of scenarios, its error, the numbers to be found.
+
+The file of tunings: entries are replaced whole, and the file whole or not at all.
+"""
+
+import dataclasses
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from rich.console import Console
+
+from ... import __version__
+from ...agents.baselines import Options, read_tuned
+from ...agents.rollout import rollout
+from ...envs.io import to_toml
+from ...envs.numerics.kernel_cache import hash_sources
+from ...envs.record import Array
+from ...estimators.design.options import read_tunings
+from ...estimators.estimator import Estimator
+from ...estimators.filters import FILTERS
+from ...estimators.make import ESTIMATORS, make_estimator
+from ..harness.parallel import run_cases
+from ..harness.results import write_text
+from ..harness.stats import root_mean
+from ..harness.study import SETTLED, LoggedEpisode, call_quietly, make_filter_arguments
+from ..studies.estimation import EXPERIMENTS
+
+Range = tuple[float, float]
+
+PROCESS_RANGE = (1e-8, 1e2)  # (unit of the state)^2 / s
+NOISE_RANGE = (1e-5, 1.0)  # unit of the sensor
+SAMPLERS = ("cma", "tpe")
+STORAGE = "sqlite:///sideslip-tune.db"
+FIRST_SEED = 1000  # of training; the test seeds count from 0
+
+
+@dataclass(frozen=True)
+class EstimatorTuning:
+    """A tuning: which options of an estimator are searched, on which drives, for what.
+
+    scenarios: which count alike, each with every seed. options: held. search: option to (low,
+    high), both positive. target: the state whose error counts, in `unit`. sensors: the slow ones
+    that the estimator uses, joined by commas.
+    """
+
+    estimator: str
+    scenarios: tuple[str, ...]
+    env_id: str
+    target: str
+    unit: str
+    sensors: str
+    options: dict[str, Any]
+    search: dict[str, Range]
+    seeds: tuple[int, ...]
+
+    @property
+    def subject(self) -> str:
+        """The scenarios' names."""
+        return ", ".join(self.scenarios)
+
+    @property
+    def study(self) -> str:
+        """The study's name: the same for the same question asked of the same sources."""
+        question = json.dumps(dataclasses.asdict(self), sort_keys=True, default=str)
+        stamp = f"{question} {hash_sources('estimators')} {__version__}"
+        digest = hashlib.sha256(stamp.encode()).hexdigest()[:12]
+        return f"{self.estimator} on {self.subject} {digest}"
+
+
+def make_estimator_tuning(
+    estimator: str,
+    scenarios: str | Sequence[str],
+    env_id: str | None = None,
+    target: str = "beta",
+    options: Mapping[str, Any] | None = None,
+    search: Mapping[str, Range | None] | None = None,
+    noises: Mapping[str, Range | None] | None = None,
+    seeds: int = 12,
+) -> EstimatorTuning:
+    """Check what a user asks for and fill in the rest.
+
+    scenarios: one's name or several.
+        env_id: default, the first environment in which every scenario has the sensors the estimator
+    needs. search: the
+    options to be found with their range (None: the default one); default, the process noise
+    `q_...` of every state that `options` does not hold. noises: searched as well.
+
+    Raises ValueError or TypeError for unknown names, a scenario without the sensors, an option
+    that the estimator does not have, a range that is none, no seeds.
+    """
+    if seeds < 1:
+        raise ValueError(f"seeds must be at least 1, got {seeds}")
+    scenarios = (scenarios,) if isinstance(scenarios, str) else tuple(scenarios)
+    if not scenarios or len(set(scenarios)) < len(scenarios):
+        raise ValueError(f"scenarios are one or more, each once, got {', '.join(scenarios)}")
+    held = dict(options or {})
+    ESTIMATORS.load(estimator)  # or ValueError
+    env_id, facts, filter_ = _find_env(estimator, scenarios, env_id, held)
+    states = filter_.names
+    if target not in states:
+        raise ValueError(f"{estimator} has no {target}; a target is one of {', '.join(states)}")
+    (drive,) = simulate_case((env_id, scenarios[0], (FIRST_SEED,)))
+    if target not in drive.log.truth:
+        known = ", ".join(state for state in states if state in drive.log.truth) or "none"
+        raise ValueError(f"the truth of {target} is not recorded; of its states: {known}")
+    if search is None:
+        search = {
+            f"q_{state}": None
+            for state in states
+            if f"q_{state}" not in held and _has_option(estimator, f"q_{state}", held, facts)
+        }
+    searched = {**search, **(noises or {})}
+    if not searched:
+        raise ValueError(f"{estimator} has no process noise to search; name the options to search")
+    for option in searched:
+        if option in held:
+            raise ValueError(f"the option {option} is both held and searched")
+        if not _has_option(estimator, option, held, facts):
+            build_estimator(estimator, facts, {**held, option: 1.0})  # raises with what it has
+    return EstimatorTuning(
+        estimator,
+        scenarios,
+        env_id,
+        target,
+        filter_.units[states.index(target)],
+        ",".join(filter_.sensors),
+        held,
+        {option: _check_range(option, limits) for option, limits in searched.items()},
+        tuple(range(FIRST_SEED, FIRST_SEED + seeds)),
+    )
+
+
+def _check_range(option: str, limits: Range | None) -> Range:
+    low, high = limits or (PROCESS_RANGE if option.startswith("q_") else NOISE_RANGE)
+    if not 0.0 < low < high < math.inf:
+        raise ValueError(f"the range of {option} is LOW:HIGH with 0 < LOW < HIGH, got {low}:{high}")
+    return float(low), float(high)
+
+
+def build_estimator(
+    estimator: str, facts: Mapping[str, Any], options: Mapping[str, Any]
+) -> Estimator:
+    """An estimator of an env's facts, without the warning of what it cannot see."""
+    return call_quietly(make_estimator, estimator, **facts, **options)
+
+
+def _make_unstable_option(estimator: str) -> dict[str, bool]:
+    """The option of ours to be built whatever their error does; a user's own has none."""
+    return {"allow_unstable": True} if estimator in FILTERS else {}
+
+
+def _has_option(
+    estimator: str, option: str, held: Mapping[str, Any], facts: Mapping[str, Any]
+) -> bool:
+    """Whether the estimator has an option; whether the number suits is another matter."""
+    try:
+        build_estimator(
+            estimator, facts, {**_make_unstable_option(estimator), **held, option: 1e-3}
+        )
+    except TypeError:
+        return False
+    except ValueError:
+        return True
+    return True
+
+
+def _find_env(
+    estimator: str, scenarios: Sequence[str], env_id: str | None, held: dict[str, Any]
+) -> tuple[str, dict[str, Any], Estimator]:
+    """The environment to use, and its facts and the estimator without tuning in the last
+    scenario."""
+    first = [experiment.env_id for experiment in EXPERIMENTS if experiment.scenario in scenarios]
+    others = [name for name in gym.registry if name.startswith("sideslip/Yaw")]
+    ids = list(dict.fromkeys([*first, *others])) if env_id is None else [env_id]
+    refused: dict[str, str] = {}
+    for name in ids:
+        try:
+            for scenario in scenarios:
+                env: gym.Env[Any, Any] = gym.make(name, scenario=scenario)
+                env.reset(seed=FIRST_SEED)
+                facts = make_filter_arguments(env.unwrapped)
+                filter_ = build_estimator(
+                    estimator, facts, {**_make_unstable_option(estimator), **held}
+                )
+        except ValueError as error:
+            refused.setdefault(str(error), name)
+        else:
+            return name, facts, filter_
+    reasons = "; ".join(f"{name}: {text}" for text, name in refused.items())
+    raise ValueError(f"no environment of {', '.join(scenarios)} suits {estimator}: {reasons}")
+
+
+def simulate_case(case: tuple[str, str, tuple[int, ...]]) -> list[LoggedEpisode]:
+    """The drives of (env id, scenario, seeds)."""
+    env_id, scenario, seeds = case
+    env: gym.Env[Any, Any] = gym.make(env_id, scenario=scenario, control_period=1)
+    return [
+        LoggedEpisode(rollout(env, seed=seed).log, make_filter_arguments(env.unwrapped))
+        for seed in seeds
+    ]
+
+
+def simulate(
+    task: EstimatorTuning,
+    seeds: Sequence[int],
+    title: str,
+    jobs: int | None,
+    console: Console | None,
+) -> list[LoggedEpisode]:
+    """The drives of some seeds in each scenario in turn, four a case, side by side."""
+    fours = [tuple(seeds[i : i + 4]) for i in range(0, len(seeds), 4)]
+    cases = [(task.env_id, scenario, four) for scenario in task.scenarios for four in fours]
+    done = run_cases(simulate_case, cases, title, jobs, console)
+    return [drive for drives in done for drive in drives]
+
+
+def compute_squares(
+    task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: Mapping[str, float]
+) -> Array:
+    """Mean squared error of the target from `SETTLED` s on: (scenarios, seeds).
+
+    Raises ValueError where the estimator cannot be built. An estimate that is not finite counts as
+    infinitely wrong.
+    """
+    options, turn = task.options | dict(values), 2.0 * math.pi
+    errors, filters = np.empty(len(drives)), dict[str, Estimator]()
+    for i, (log, facts) in enumerate((drive.log, drive.facts) for drive in drives):
+        clocks = [dataclasses.replace(sensor, phase=0.0) for sensor in facts["sensors"].values()]
+        key = repr(facts | {"sensors": clocks})  # a reset sets the clocks' phases
+        if key not in filters:
+            filters[key] = build_estimator(task.estimator, facts, options)
+        late = log.time >= SETTLED - 1e-9
+        with np.errstate(all="ignore"):
+            error = (filters[key].run(log)[task.target] - log.truth[task.target])[late]
+            if task.unit == "rad":
+                error = np.remainder(error + math.pi, turn) - math.pi
+            errors[i] = np.mean(error**2)
+    finite = np.where(np.isfinite(errors), errors, np.inf)
+    return finite.reshape(len(task.scenarios), -1)
+
+
+def compute_objective(errors: Array) -> float:
+    """What a search makes least: the geometric mean of the scenarios' RMSE, of `squares`."""
+    return float(np.exp(np.mean(np.log(root_mean(errors)))))
+
+
+_KEYS = ("estimator", "sensors", "command", "note", "q", "noise")
+_HEAD = """\
+# Tunings: process noise per second, (unit of the state)^2 / s, and measurement noise where it was
+# searched too. Each entry is the output of its command; `sensors` are the slow ones.
+"""
+
+
+def update(path: str | Path, entry: dict[str, Any]) -> None:
+    """Replace or add an entry of a tunings file, which is made if it is not there.
+
+    entry: estimator, sensors, q (by state), command, and noise (by option) and note where there is
+    a reason for one. The note of what a command found outlives the numbers unless a new one comes
+    with them; that of what was chosen by hand does not.
+    """
+    target = Path(path)
+    entries = {_make_key(old): old for old in read_tunings(target)} if target.exists() else {}
+    old = entries.get(_make_key(entry), {})
+    note = {"note": old["note"]} if {"note", "command"} <= old.keys() else {}
+    entries[_make_key(entry)] = note | entry
+    text = target.read_text(encoding="utf-8") if target.exists() else ""
+    head = text.partition("[[tuning]]")[0] or _HEAD + "\n"
+    write_text(target, head + "\n".join(map(_format_entry, entries.values())))
+
+
+def _make_key(entry: dict[str, Any]) -> tuple[str, str]:
+    return entry["estimator"], entry["sensors"]
+
+
+def _format_entry(entry: dict[str, Any]) -> str:
+    present = [key for key in _KEYS if entry.get(key) not in (None, {})]
+    lines = "".join(f"{key} = {to_toml(entry[key])}\n" for key in present)
+    return f"[[tuning]]\n{lines}"
+
+
+_TUNED = """\
+# Options of contestants as [class.name.part]; found by `sideslip tune controller NAME`.
+"""
+
+
+def write_tuned(path: str | Path, kind: str, name: str, options: Options) -> None:
+    """Replace or add a contestant's options in a file that `agents.baselines` reads."""
+    target = Path(path)
+    read_tuned.cache_clear()
+    classes = read_tuned(target) if target.exists() else {}
+    classes = classes | {kind: classes.get(kind, {}) | {name: options}}
+    tables = [
+        f"[{class_name}.{contestant}.{part}]\n"
+        + "".join(f"{option} = {json.dumps(value)}\n" for option, value in part_options.items())
+        for class_name, names in sorted(classes.items())
+        for contestant, parts in sorted(names.items())
+        for part, part_options in parts.items()
+        if part_options
+    ]
+    write_text(target, _TUNED + "\n" + "\n".join(tables))
+    read_tuned.cache_clear()

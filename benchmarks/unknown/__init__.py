@@ -1,1 +1,0 @@
-"""What it costs to know neither tyres nor noise: conditions, drives, curves, and the suite."""

@@ -1,0 +1,155 @@
+"""A camera that takes pictures: packets from what a lane finder sees of the rendered road.
+
+The engine captures and queues the camera's frames as ever. After a step its slow sensors are gone
+through once more from where they stood before it, and every frame's packet takes the finder's
+values, quality and delay before the next tick delivers anything.
+"""
+
+import math
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+
+from .engine.layout import P, Z
+from .engine.step import finish_outputs, sample_slow_ticks
+from .engine.window import WINDOW
+from .engine.workspace import EpisodeArrays
+from .numerics import require_extra
+from .numerics.functions import PI, draw_uniforms
+from .numerics.jit import as_python
+from .numerics.packed import read
+from .record import PACKET, PACKET_WIDTH, Array
+from .sensors.camera.analytic import compute_preview_offset
+from .sensors.camera.detector import MAX_DELAY, count_delay_ticks, load_detector
+from .sensors.slow import BLOCKS, CAMERA
+from .validation import check_mapping, describe_unknown
+from .vehicle.dynamics import Motion
+
+if TYPE_CHECKING:
+    from .sensors.camera.images import Image
+    from .sensors.camera.lane_finder import Lane
+
+_uniforms, _compute_preview_offset = as_python(draw_uniforms), as_python(compute_preview_offset)
+_SLOW_STATE = slice(Z.slow[0].frames, Z.driver)  # the slow sensors and the queue of packets
+
+
+class CameraSimulator:
+    """Takes the pictures of one car and finds the lane in them; needs the extra `vision`.
+
+    `picture` and `lane` are the newest ones. delay, appearance: as of `CameraMixin`.
+    """
+
+    def __init__(self, delay: str, appearance: Mapping[str, Any] | None) -> None:
+        with require_extra("vision", "vision='image' needs {}"):
+            from .sensors.camera.images import Appearance, RoadRenderer, RoadScene
+            from .sensors.camera.lane_finder import LaneFinder
+            from .sensors.camera.pinhole import Pinhole
+        fields = check_mapping("appearance", appearance or {})
+        if unknown := [name for name in fields if name not in Appearance.__dataclass_fields__]:
+            known = Appearance.__dataclass_fields__
+            raise TypeError(f"appearance: {describe_unknown('field', unknown, known)}")
+        style = Appearance(**fields)
+        self.delay, self._scene_class = delay, RoadScene
+        self.finder = LaneFinder(Pinhole(), style.lane_width)
+        self.renderer = RoadRenderer(self.finder.camera, style, self.finder.rows)
+        self.picture: Image | None = None
+        self.lane: Lane | None = None
+        self.metadata_flags = {"nondeterministic": True} if delay == "measured" else {}
+        self.finder.find(np.zeros(self.finder.camera.size[::-1], np.uint8))  # warm
+
+    def process_step(
+        self, before: Any, row: EpisodeArrays, done: int, bounds: Array, window: Array
+    ) -> None:
+        """Go through the slow sensors of a step of `done` ticks once more, with pictures.
+
+        before: the state ahead of the step. The others are as of `conclude`.
+        """
+        z = row.z
+        z[_SLOW_STATE] = before[_SLOW_STATE]
+        z[Z.under_way], z[Z.clock.next_due] = before[Z.under_way], before[Z.clock.next_due]
+        first, j, count = int(z[Z.clock.tick]) - done, 0, 0
+        while j < done:
+            frame = int(z[Z.slow[CAMERA].next_capture]) - first
+            stop = min(frame, done)
+            count = sample_slow_ticks(row, j, stop, count, done, window)
+            if frame <= done:
+                self.capture(row.p, z, read(window, WINDOW.track, stop - 1), first + stop)
+            j = stop
+        finish_outputs(row, len(row.rows), done, count, bounds)
+
+    def capture(self, p: Array, z: Array, motion: Motion, tick: int) -> None:
+        """Take a picture for the packets that were captured at a tick, if there are any.
+
+        p, z: the packed parameters and state, whose queue has the packets.
+        """
+        queue = z[Z.queue :][: int(z[Z.under_way]) * PACKET_WIDTH].reshape(-1, PACKET_WIDTH)
+        is_captured = (queue[:, PACKET.sensor] == CAMERA) & (queue[:, PACKET.captured] == tick)
+        if not is_captured.any():
+            return
+        key = int(z[Z.clock.key_low]), int(z[Z.clock.key_high])
+        heading = math.remainder(motion.psi - motion.theta, 2.0 * PI)
+        scene = self._scene_class(heading, motion.y, motion.s, motion.phi, 0.0, read(p, P.road))
+        self.picture = self.renderer.render_picture(scene, (key[0] | key[1] << 32, tick))
+        self.finder.view = read(p, P.field_of_view)
+        start = time.perf_counter()
+        self.lane = lane = self.finder.find(self.picture)
+        elapsed = time.perf_counter() - start
+        y_l = _compute_preview_offset(lane.y, lane.psi, lane.curvature, p[P.car.l_pre])
+        queue[is_captured, PACKET.quality] = lane.quality
+        queue[is_captured, PACKET.value], queue[is_captured, PACKET.value + 1] = lane.psi, y_l
+        if self.delay != "link":
+            share = _uniforms(*key, tick, BLOCKS[CAMERA].link)[0]
+            seconds = (
+                min(elapsed, MAX_DELAY)
+                if self.delay == "measured"
+                else load_detector().compute_delay(share)
+            )
+            arrival_tick = tick + count_delay_ticks(seconds)
+            queue[is_captured, PACKET.arrived] += (
+                arrival_tick - queue[is_captured, PACKET.arrived].min()
+            )
+            z[Z.clock.next_due] = queue[:, PACKET.arrived].min()
+
+
+class CameraMixin:
+    """An environment whose camera may take pictures.
+
+    vision: "analytic", the camera's numbers with noise, or "image": a picture of the road is
+    rendered at every frame and a lane finder reads it; `env.unwrapped.camera` has the newest.
+    delay, of pictures: "fitted" (default), drawn from the finder's times on file; "measured", what
+    the clock says, so that the environment is not deterministic, which `spec`, `metadata` and
+    `info` state; or "link", the camera's own. appearance: fields of `Appearance`, which replace the
+    clear road's.
+    """
+
+    camera: CameraSimulator | None = None
+    metadata: dict[str, Any]
+    _params: Array
+    _state: Array
+    _spec: EnvSpec | None = None
+
+    def _init_camera(self, vision: str, delay: str | None, appearance: Any) -> None:
+        if vision == "image":
+            self.camera = CameraSimulator(delay or "fitted", appearance)
+            self.metadata = {**self.metadata, **self.camera.metadata_flags}
+        elif appearance is not None:
+            raise ValueError("appearance is of pictures: vision='image'")
+
+    def _start_episode(self) -> None:
+        """What else begins with an episode whose tick 0 is packed."""
+        if self.camera is not None:
+            self.camera.capture(self._params, self._state, read(self._state, Z.motion), 0)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What `gym.make` builds this env from."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None and self.camera is not None and self.camera.metadata_flags:
+            spec.nondeterministic = True
+        self._spec = spec

@@ -1,0 +1,339 @@
+"""A row's generator on the device: NumPy's PCG64, which draws one 64-bit key a reset.
+
+Its 128-bit numbers are four words of 32 bits, the lowest first: first the state, then the
+increment. M. E. O'Neill, "PCG: A Family of Simple Fast Space-Efficient Statistically Good
+Algorithms for Random Number Generation", 2014.
+
+The fused kernel: one env-step of a row in each of CUDA's threads, resets included.
+
+Rows lie along the last axis of what a tick reads and writes, so that neighbouring threads touch
+neighbouring numbers.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import cuda, types
+from numba.cuda.np.numpy_support import carray
+
+from ..engine.batch import read_ends
+from ..engine.config import EnvConfig
+from ..engine.layout import FLAGS, STATE_WIDTH, Switches
+from ..engine.reset import reset_vehicle
+from ..engine.step import clip_action, finish_step, get_start_variant, integrate_step, reject_action
+from ..engine.tick import StepVariant
+from ..engine.window import make_window, precompute_window
+from ..engine.workspace import EpisodeArrays, EpisodeStart
+from ..numerics.jit import copy_into
+from ..record import FAST_WIDTH, PACKET_WIDTH, Array
+from ..scenarios.draws import DRAWS_WIDTH
+from ..task import REPORT
+from ..vehicle.dynamics import Motion
+from .cuda_text import SIMULATED, to_cuda
+
+WORDS = 8
+_MASK = 0xFFFFFFFF
+_M0, _M1, _M2, _M3 = 0x9FCCF645, 0x4385DF64, 0x1FC65DA4, 0x2360ED05
+
+
+def draw_key(words: Any) -> Any:
+    """The generator's next 64 bits as (low, high) of 32; its words (WORDS,) move on."""
+    a, b, c, d = int(words[0]), int(words[1]), int(words[2]), int(words[3])
+    aa, ab, ba = a * _M0, a * _M1, b * _M0
+    ac, bb, ca = a * _M2, b * _M1, c * _M0
+    low = (aa & _MASK) + int(words[4])
+    second = (low >> 32) + _extract_high(aa) + (ab & _MASK) + (ba & _MASK) + int(words[5])
+    third = (second >> 32) + _extract_high(ab) + _extract_high(ba) + int(words[6])
+    third = third + (ac & _MASK) + (bb & _MASK) + (ca & _MASK)
+    top = (third >> 32) + _extract_high(ac) + _extract_high(bb) + _extract_high(ca) + int(words[7])
+    top = top + a * _M3 + b * _M2 + c * _M1 + d * _M0  # what is above its 32 bits is lost
+    a, b, c, d = low & _MASK, second & _MASK, third & _MASK, top & _MASK
+    words[0], words[1], words[2], words[3] = a, b, c, d
+    low, high, turn = a ^ c, b ^ d, d >> 26  # the words' exclusive or, rotated by the leading bits
+    if turn >= 32:
+        low, high = high, low
+    turn = turn & 31
+    first = ((low >> turn) | (high << (32 - turn))) & _MASK
+    return first, ((high >> turn) | (low << (32 - turn))) & _MASK
+
+
+def _extract_high(product: int) -> int:
+    return (product >> 32) & _MASK
+
+
+def read_words(generators: Sequence[np.random.Generator]) -> npt.NDArray[np.int64]:
+    """The words (WORDS, N) of generators as they are now."""
+    words = np.empty((WORDS, len(generators)), np.int64)
+    for i, generator in enumerate(generators):
+        state: Any = generator.bit_generator.state["state"]
+        for k, number in enumerate((state["state"], state["inc"])):
+            words[4 * k : 4 * k + 4, i] = [number >> 32 * part & _MASK for part in range(4)]
+    return words
+
+
+# numba's own types say too little about itself:
+# mypy: disable-error-code="attr-defined,no-untyped-call,no-untyped-def"
+
+
+NAME = "sideslip_step"
+"""The kernel's name in its PTX."""
+
+RUNS, OVER, ASKED = range(3)  # of `Memory.over`; ASKED: it is to be reset
+MODES = ("Disabled", "NextStep", "SameStep")
+_, NEXT_STEP, SAME_STEP = range(3)
+DRAWN = DRAWS_WIDTH, DRAWS_WIDTH, len(Motion._fields)  # of a packed start, behind the parameters
+
+
+class KernelConstants(NamedTuple):
+    """What is the same for all rows and all steps: the compiler takes it for constants."""
+
+    mode: int  # when rows that ended are reset
+    n: int  # ticks of a control period
+    kind: StepVariant
+    switches: Switches
+    width: int  # of the packed parameters, a trace included
+    entries: int  # of an observation
+    inputs: int  # of an action
+    packets: int  # the most of a step
+    record: int  # whether records are written to the device's memory
+
+
+def make_constants(config: EnvConfig, mode: str, record: bool) -> KernelConstants:
+    """How an env's rows are stepped."""
+    base = config.base
+    return KernelConstants(
+        mode=MODES.index(mode),
+        n=int(config.control_period),
+        kind=get_start_variant(base.start),
+        switches=Switches(*base.start.switches.tolist()),
+        width=len(base.start.params),
+        entries=len(config.layout),
+        inputs=config.action_width,
+        packets=config.max_packets,
+        record=int(record),
+    )
+
+
+class DeviceArrays(NamedTuple):
+    """What lies on the device, N rows; `make_specification` has types and shapes."""
+
+    params: Any
+    states: Any
+    reports: Any
+    over: Any  # RUNS, OVER or ASKED
+    generators: Any  # `generator.draw_key`
+    which: Any  # of a row that is asked for, its place in starts
+    starts: Any  # packed one behind the other: parameters, low, high, motion; the first: no options
+    switches: Any  # of the starts
+    bounds: Any
+    actions: Any
+    obs: Any
+    rewards: Any
+    terminated: Any
+    truncated: Any
+    final_obs: Any  # of rows that end and are reset in the same step
+    final_reports: Any
+    rows: Any  # of the record
+    packets: Any
+    counts: Any  # of ticks and of packets
+
+
+class ThreadArrays(NamedTuple):
+    """A thread's own working arrays, or its part of the record."""
+
+    switches: Any
+    window: Any
+    rows: Any
+    packets: Any
+
+
+def make_specification(constants: KernelConstants, real: type, N: int, starts: int) -> DeviceArrays:
+    """(type, shape) of each array."""
+    width, byte, report = constants.width + sum(DRAWN), np.uint8, len(REPORT)
+    ends, n_record = N * (constants.mode == SAME_STEP), N * constants.record
+    return DeviceArrays(
+        params=(real, (constants.width, N)),
+        states=(real, (STATE_WIDTH, N)),
+        reports=(real, (report, N)),
+        over=(byte, (N,)),
+        generators=(np.int64, (WORDS, N)),
+        which=(np.int64, (N,)),
+        starts=(real, (starts, width)),
+        switches=(np.int64, (starts, len(FLAGS))),
+        bounds=(real, (2, constants.entries)),
+        actions=(np.float32, (N, constants.inputs)),
+        obs=(np.float32, (N, constants.entries)),
+        rewards=(real, (N,)),
+        terminated=(byte, (N,)),
+        truncated=(byte, (N,)),
+        final_obs=(np.float32, (ends, constants.entries)),
+        final_reports=(real, (report, ends)),
+        rows=(real, (constants.n, FAST_WIDTH, n_record)),
+        packets=(real, (constants.packets, PACKET_WIDTH, n_record)),
+        counts=(np.int64, (2, n_record)),
+    )
+
+
+def pack_starts(starts: Sequence[EpisodeStart]) -> tuple[Array, npt.NDArray[np.int64]]:
+    """`Memory.starts` and `Memory.switches`."""
+    packed = [
+        np.concatenate([start.params, start.low, start.high, start.motion]) for start in starts
+    ]
+    return np.stack(packed), np.stack([start.switches for start in starts])
+
+
+def step_row(
+    i: int, resets: bool, constants: KernelConstants, m: DeviceArrays, thread_arrays: ThreadArrays
+) -> None:
+    """One env-step of row i; or its reset, if `resets` and it is ASKED."""
+    row = EpisodeArrays(
+        m.params[:, i],
+        m.states[:, i],
+        thread_arrays.switches,
+        m.obs[i],
+        thread_arrays.rows,
+        thread_arrays.packets,
+        m.reports[:, i],
+    )
+    start_index, over = 0, int(m.over[i])
+    if resets:
+        if over != ASKED:
+            return
+        start_index = int(m.which[i])
+    elif over != RUNS:
+        m.rewards[i], m.terminated[i], m.truncated[i] = 0.0, 0, 0
+        if constants.mode != NEXT_STEP:
+            return
+    else:
+        copy_into(constants.switches, thread_arrays.switches)
+        done = _run_row(row, m.actions[i], constants, m.bounds, thread_arrays.window)
+        reward, terminated, truncated = read_ends(row.report)
+        m.rewards[i], m.terminated[i], m.truncated[i] = reward, int(terminated), int(truncated)
+        _count(i, constants, m, done, row.report)
+        if not (terminated or truncated):
+            return
+        if constants.mode != SAME_STEP:
+            m.over[i] = OVER
+            return
+        copy_into(row.obs, m.final_obs[i])
+        copy_into(row.report, m.final_reports[:, i])
+    _reset_row(start_index, row, m.generators[:, i], constants, m)
+    m.over[i] = RUNS
+    _count(i, constants, m, 1, row.report)
+
+
+def _run_row(row: Any, action: Any, constants: KernelConstants, bounds: Any, window: Any) -> int:
+    """An env-step of a row that runs; returns how many ticks it took."""
+    yaw_share, steer_share = clip_action(action)
+    if yaw_share != yaw_share:
+        reject_action(row)
+        for k in range(constants.entries):
+            row.obs[k] = 0.0
+        return 0
+    precompute_window(row.p, row.z, constants.n, constants.kind.has_driver, window)
+    done = integrate_step(
+        row.p,
+        row.z,
+        constants.kind,
+        yaw_share,
+        steer_share,
+        constants.n,
+        row.rows,
+        row.report,
+        window,
+        True,
+    )
+    finish_step(row, constants.n, done, bounds, window)
+    return int(done)
+
+
+def _reset_row(
+    start_index: int, row: Any, generator: Any, constants: KernelConstants, m: DeviceArrays
+) -> None:
+    """Start a row's next episode, with the next key of its generator."""
+    packed, low = m.starts[start_index], constants.width
+    high = low + DRAWN[0]
+    motion = high + DRAWN[1]
+    start = EpisodeStart(
+        packed[:low],
+        packed[low:high],
+        packed[high:motion],
+        m.switches[start_index],
+        packed[motion:],
+    )
+    key_low, key_high = draw_key(generator)
+    reset_vehicle(start, key_low, key_high, m.bounds, row)
+
+
+def _count(i: int, constants: KernelConstants, m: DeviceArrays, done: int, report: Any) -> None:
+    if constants.record:
+        m.counts[0, i], m.counts[1, i] = done, int(report[REPORT.packets])
+
+
+def make_kernel(constants: KernelConstants, real: type[np.floating[Any]]) -> Any:
+    """The kernel's function, for numba-cuda or its simulator; arguments are N, whether rows are
+    reset, and the pointers of `Memory`."""
+    step, make_array = to_cuda(step_row, real), _get_numbers if SIMULATED else carray
+    floats = types.float32 if real is np.float32 else types.float64
+    width, entries, inputs, report = (
+        constants.width,
+        constants.entries,
+        constants.inputs,
+        len(REPORT),
+    )
+    packed, flags, record = constants.width + sum(DRAWN), len(FLAGS), constants.record
+    window_shape = (len(make_window(1)), constants.n)
+    rows_shape, packets_shape = (constants.n, FAST_WIDTH), (constants.packets, PACKET_WIDTH)
+    n, ticks, max_packets, columns = constants.n, FAST_WIDTH, constants.packets, PACKET_WIDTH
+    thread_rows_shape, thread_packets_shape = (*rows_shape, 1), (*packets_shape, 1)
+
+    def step_kernel(
+        N, resets, params, states, reports, over, generators, which, starts, switches, bounds,
+        actions, obs, rewards, terminated, truncated, final_obs, final_reports, rows, packets,
+        counts,
+    ):  # fmt: skip
+        i = cuda.grid(1)
+        if i >= N:
+            return
+        memory = DeviceArrays(
+            make_array(params, (width, N)),
+            make_array(states, (STATE_WIDTH, N)),
+            make_array(reports, (report, N)),
+            make_array(over, (N,)),
+            make_array(generators, (WORDS, N)),
+            make_array(which, (N,)),
+            make_array(starts, (N, packed)),
+            make_array(switches, (N, flags)),
+            make_array(bounds, (2, entries)),
+            make_array(actions, (N, inputs)),
+            make_array(obs, (N, entries)),
+            make_array(rewards, (N,)),
+            make_array(terminated, (N,)),
+            make_array(truncated, (N,)),
+            make_array(final_obs, (N, entries)),
+            make_array(final_reports, (report, N)),
+            make_array(rows, (n, ticks, N)),
+            make_array(packets, (max_packets, columns, N)),
+            make_array(counts, (2, N)),
+        )
+        if record:
+            own_rows, own_packets = memory.rows[:, :, i], memory.packets[:, :, i]
+        else:  # laid out like a part of the record, for one type of both
+            own_rows = cuda.local.array(thread_rows_shape, floats)[:, :, 0]
+            own_packets = cuda.local.array(thread_packets_shape, floats)[:, :, 0]
+        thread_arrays = ThreadArrays(
+            cuda.local.array(flags, types.int64),
+            cuda.local.array(window_shape, floats),
+            own_rows,
+            own_packets,
+        )
+        step(i, resets, constants, memory, thread_arrays)
+
+    return step_kernel
+
+
+def _get_numbers(array: Any, shape: Any) -> Any:
+    """What a pointer stands for in the simulator."""
+    return array.numbers

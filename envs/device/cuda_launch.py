@@ -1,0 +1,187 @@
+"""The kernel as PTX, compiled without a GPU and kept on disk.
+
+In float64 a product and a sum are never contracted to one operation: numba-cuda's decorator has no
+switch for it, NVVM's call has.
+
+Launches of the kernel: by CUDA's driver on torch's current stream, or by numba's simulator.
+"""
+
+import contextlib
+import ctypes
+import hashlib
+import json
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from numba import cuda, types
+from numba.cuda import dispatcher
+from numba.cuda.compiler import compile_cuda, kernel_fixup
+from numba.cuda.cudadrv.nvvm import NVVM
+from numba.cuda.np.numpy_support import from_dtype
+
+from ..io import replace_file
+from ..numerics import kernel_cache
+from ..numerics.torch_backend import torch
+from .cuda_kernel import NAME, KernelConstants, make_kernel, make_specification
+from .cuda_text import SIMULATED
+
+# numba's own types say too little about itself:
+# mypy: disable-error-code="attr-defined,no-untyped-call"
+
+
+Capability = tuple[int, int]  # of a GPU: (9, 0) is an H200
+
+
+def get_ptx(
+    constants: KernelConstants, real: type[np.floating[Any]], capability: Capability
+) -> str:
+    """The PTX of a kernel for GPUs of a compute capability, from the disk where it is."""
+    folder = kernel_cache.find_kernel_folder("envs")
+    versions = version("numba-cuda"), version("numba"), NVVM().get_version()
+    key = json.dumps([constants, real.__name__, capability, versions])
+    path = folder / f"fused-{hashlib.sha256(key.encode()).hexdigest()[:16]}.ptx" if folder else None
+    if path and (data := kernel_cache.read_trusted(path)):
+        header, _, text = data.partition(b"\n")
+        if header == _make_header(key, text):  # else it is of another GPU, or not whole
+            return text.decode()
+    ptx = _compile_ptx(constants, real, capability)
+    if path:
+        text = ptx.encode()
+        with contextlib.suppress(OSError), replace_file(path) as file:
+            file.write(_make_header(key, text) + b"\n" + text)
+    return ptx
+
+
+def _make_header(key: str, text: bytes) -> bytes:
+    """The first line of a file: what it was compiled for, and its text's hash."""
+    return f"// {key} {hashlib.sha256(text).hexdigest()}".encode()
+
+
+def _compile_ptx(
+    constants: KernelConstants, real: type[np.floating[Any]], capability: Capability
+) -> str:
+    pointers = [
+        types.CPointer(from_dtype(np.dtype(dtype)))
+        for dtype, _ in make_specification(constants, real, 1, 1)
+    ]
+    with _set_capability(capability):
+        result = compile_cuda(
+            make_kernel(constants, real),
+            types.void,
+            (types.int64, types.boolean, *pointers),
+            nvvm_options={"opt": 3, "fma": real is np.float32},
+            cc=capability,
+        )
+        library = result.library
+        kernel = library.get_function(result.fndesc.llvm_func_name)
+        library._entry_name = kernel.name
+        kernel_fixup(kernel, False)
+        return str(library.get_asm_str(cc=capability)).replace(kernel.name, NAME)
+
+
+@contextlib.contextmanager
+def _set_capability(capability: Capability) -> Iterator[None]:
+    """numba-cuda asks the driver for which GPU a device function is: there may be none here."""
+
+    class Device:
+        compute_capability = capability
+
+    previous, dispatcher.get_current_device = dispatcher.get_current_device, lambda: Device
+    try:
+        yield
+    finally:
+        dispatcher.get_current_device = previous
+
+
+def count_opcodes(ptx: str) -> Counter[str]:
+    """How many of each instruction there are in a PTX text."""
+    return Counter(re.findall(r"^\t(?:@!?%\w+ )?([a-z][a-z0-9]*(?:\.[a-z0-9:]+)*)[\s;]", ptx, re.M))
+
+
+# the driver's types say too little about themselves:
+# mypy: disable-error-code="no-untyped-call"
+
+
+BLOCK = 128  # threads; 255 registers each leave a multiprocessor of an H200 two such blocks
+_SIMULATED_BLOCK = 4
+
+Tensor = torch.Tensor
+
+
+def make_context_current(device: torch.device) -> None:
+    """Make torch's context the current one."""
+    torch.empty(1, device=device)
+
+
+class DriverKernel:
+    """The kernel of a PTX text on a GPU; driver: `cuda.bindings.driver`.
+
+    Raises RuntimeError where the GPU refuses it, MemoryError where its memory does not suffice.
+    """
+
+    def __init__(self, ptx: str, device: torch.device, driver: Any) -> None:
+        self._driver, self._device = driver, device
+        self._text = ptx.encode() + b"\0"  # as long as the module is there
+        with torch.cuda.device(device):
+            make_context_current(device)
+            major, minor = torch.cuda.get_device_capability(device)
+            label = f"the kernel for sm_{major}{minor} on {device}"
+            self._module = self._check_result(driver.cuModuleLoadData(self._text), label)
+            function_result = driver.cuModuleGetFunction(self._module, NAME.encode())
+            self._function = self._check_result(function_result, label)
+
+    def __call__(self, count: int, resets: bool, arrays: Sequence[Tensor]) -> None:
+        """Step the rows, or reset those that are asked for; arrays as in `Memory`."""
+        values = (count, resets, *(array.data_ptr() for array in arrays))
+        kinds = (ctypes.c_int64, ctypes.c_bool, *[ctypes.c_void_p] * len(arrays))
+        grid, block = (-(-count // BLOCK), 1, 1), (BLOCK, 1, 1)
+        with torch.cuda.device(self._device):
+            stream = torch.cuda.current_stream(self._device).cuda_stream
+            launched = self._driver.cuLaunchKernel(
+                self._function, *grid, *block, 0, stream, (values, kinds), 0
+            )
+        self._check_result(launched, f"a step of {count} rows on {self._device}")
+
+    def _check_result(self, result: Any, label: str) -> Any:
+        """What the driver returned besides its code."""
+        code, *values = result
+        if code.value != 0:
+            out_of_memory = code == self._driver.CUresult.CUDA_ERROR_OUT_OF_MEMORY
+            raise (MemoryError if out_of_memory else RuntimeError)(f"{label}: {code.name}")
+        return values[0] if values else None
+
+
+class SimulatedPointer:
+    """A pointer of the simulator."""
+
+    def __init__(self, tensor: Tensor) -> None:
+        self.numbers = tensor.numpy()
+
+
+def load_kernel(
+    constants: KernelConstants, real: type[np.floating[Any]], device: torch.device
+) -> Any:
+    """The kernel, on a GPU or in the simulator."""
+    if SIMULATED:
+        return SimulatedKernel(constants, real)
+    from cuda.bindings import driver
+
+    return DriverKernel(
+        get_ptx(constants, real, torch.cuda.get_device_capability(device)), device, driver
+    )
+
+
+class SimulatedKernel:
+    """The kernel in numba's simulator: plain Python, a thread after the other."""
+
+    def __init__(self, constants: KernelConstants, real: type[np.floating[Any]]) -> None:
+        self._kernel: Any = cuda.jit(make_kernel(constants, real))
+
+    def __call__(self, count: int, resets: bool, arrays: Sequence[Tensor]) -> None:
+        """As `DriverKernel`."""
+        blocks = -(-count // _SIMULATED_BLOCK)
+        self._kernel[blocks, _SIMULATED_BLOCK](count, resets, *map(SimulatedPointer, arrays))

@@ -1,0 +1,154 @@
+# numba's own types say too little about itself:
+# mypy: disable-error-code="attr-defined,call-arg,misc,no-untyped-call,no-untyped-def"
+"""The engine's text as device functions: CUDA's table of primitives, and literals of one precision.
+
+numba-cuda compiles plain Python functions; those of the engine are rebuilt for it from the code
+objects that every other engine runs.
+"""
+
+from collections.abc import Callable
+from types import CodeType
+from typing import Any
+
+import numpy as np
+from numba import cuda, types
+
+from ..numerics import require_extra
+from ..numerics.jit import as_python
+from ..numerics.packed import load_element, read, store_element, write
+
+with require_extra("cuda", "the CUDA engine needs numba-cuda"):
+    import numba_cuda as numba_cuda  # numba's own `cuda` is another
+
+SIMULATED = bool(cuda.config.ENABLE_CUDASIM)
+"""Whether numba simulates CUDA in Python (NUMBA_ENABLE_CUDASIM=1)."""
+
+
+def to_cuda(function: Any, real: type[np.floating[Any]]) -> Any:
+    """The text of a function and its callees as device functions whose floats are of `real`.
+
+    In numba's simulator they stay plain Python.
+    """
+
+    def finish(rebuilt: Any) -> Any:
+        if real is not np.float64:
+            _set_precision(rebuilt, real)
+        return rebuilt if SIMULATED else _compile_device(rebuilt)
+
+    if not SIMULATED:
+        return as_python(function, _make_table(real), finish)
+    return as_python(function, _SINGLE if real is np.float32 else None, finish)
+
+
+_SINGLE: dict[str, Callable[..., Any]] = {
+    "to_word": lambda a: int(np.float32(a).view(np.uint32)),
+    "from_word": lambda a: np.uint32(a).view(np.float32),
+}
+"""Primitives of the simulator's float32: a word's 32 bits are those of a float."""
+
+
+def _set_precision(function: Any, real: Any) -> None:
+    """Give the function's literals and global numbers a precision: what meets a float64 becomes
+    one."""
+    names, code = function.__globals__, function.__code__
+    function.__code__ = code.replace(co_consts=_convert_literals(code.co_consts, real))
+    for name in code.co_names:
+        if name == "float" or isinstance(names.get(name), float | tuple):
+            names[name] = real if name == "float" else _convert_literals(names[name], real)
+
+
+def _convert_literals(value: Any, real: Any) -> Any:
+    if isinstance(value, float):
+        return real(value)
+    if isinstance(value, tuple) and not isinstance(value, CodeType):
+        make = getattr(value, "_make", tuple)
+        return make([_convert_literals(item, real) for item in value])
+    return value
+
+
+def _compile_device(function: Any) -> Any:
+    return cuda.jit(device=True, forceinline=True)(function)
+
+
+def _make_table(real: Any) -> dict[str, Callable[..., Any]]:
+    """The primitives that CUDA has its own text for, by the names that the equations use."""
+    from numba.cuda import libdevice
+
+    single = real is np.float32
+    fabs = libdevice.fabsf if single else libdevice.fabs
+    floor = libdevice.floorf if single else libdevice.floor
+    sqrt = libdevice.fsqrt_rn if single else libdevice.dsqrt_rn
+    frexp = libdevice.frexpf if single else libdevice.frexp
+    texts = {
+        "minimum": lambda a, b: a if a < b else b,
+        "maximum": lambda a, b: a if a > b else b,
+        "absolute": lambda a: fabs(a),
+        "floor": lambda a: floor(a),
+        "sqrt": lambda a: sqrt(a),
+        "select": lambda condition, a, b: a if condition else b,
+        "to_float": lambda a: real(a),
+        "frexp": lambda a: (frexp(a)[0], real(frexp(a)[1])),
+        "to_int": lambda a: int(a),
+        "to_word": lambda a: int(a),
+        "from_word": lambda a: real(a),
+        "any_lane": lambda condition: condition,
+        "lane_width": lambda array: 1,
+        "load_lanes": lambda array, where, first: read(array, where, first),
+        "count_lanes": lambda: 1,
+        "iota": lambda first: first,
+    }
+    if single:
+        texts["to_word"] = lambda a: int(libdevice.float_as_int(a))
+        texts["from_word"] = lambda a: libdevice.int_as_float(np.int32(a))
+    return {name: _compile_device(text) for name, text in texts.items()} | _register_access()
+
+
+def _register_access() -> dict[str, Callable[..., Any]]:
+    """How packed arrays are read and written, taught to numba-cuda once."""
+    if not _registered:
+        from numba.cuda.extending import overload
+
+        jit_options = {"forceinline": True}
+        for function, typing in (
+            (read, _read),
+            (write, _write),
+            (load_element, _load_element),
+            (store_element, _store_element),
+        ):
+            overload(function, jit_options=jit_options)(typing)
+            _registered[function.__name__] = function
+    return _registered
+
+
+_registered: dict[str, Callable[..., Any]] = {}
+
+
+def _format_column(j: Any) -> str:
+    return "" if j is None or isinstance(j, types.Omitted | types.NoneType) else ", j"
+
+
+def _build_function(text: str, **names: Any) -> Any:
+    exec(text, names)  # of our own words alone
+    return names["written"]
+
+
+def _read(array, where, j=None):
+    numbers = "".join(f"array[where[0] + {k}{_format_column(j)}], " for k in range(len(where)))
+    made = getattr(where, "instance_class", None)
+    body = f"made({numbers})" if made else f"({numbers})"
+    return _build_function(f"def written(array, where, j=None): return {body}", made=made)
+
+
+def _write(array, values, where, j=None):
+    lines = [f"    array[where[{k}]{_format_column(j)}] = values[{k}]\n" for k in range(len(where))]
+    return _build_function(f"def written(array, values, where, j=None):\n{''.join(lines)}")
+
+
+def _load_element(array, i, j=None):
+    return _build_function(f"def written(array, i, j=None): return array[i{_format_column(j)}]")
+
+
+def _store_element(array, value, i, j=None):
+    return _build_function(
+        f"def written(array, value, i, j=None): array[i{_format_column(j)}] = value"
+    )

@@ -1,0 +1,308 @@
+"""The slow sensors of an env-step on tensors: captures, packets under way, deliveries.
+
+A row's packets lie in the order of their arrival, (arrived, captured, sensor), those under way
+first and nothing behind them. An env-step puts the new ones to them, puts all in order, and takes
+off the front what has arrived.
+
+The observation and the report of an env-step, on tensors.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from ..engine.layout import SLOW_STATE, SLOW_WIDTH, P, Switches, Z
+from ..engine.outputs import NEVER_DUE, make_measurement_context
+from ..numerics.functions import clip
+from ..numerics.packed import read
+from ..numerics.primitives import select
+from ..numerics.torch_backend import to_torch, torch
+from ..record import FAST, PACKET, PACKET_WIDTH
+from ..sensors.link import Link, compute_arrivals, count_max_in_flight
+from ..sensors.slow import BLOCKS, NEEDS_QUALITY, VALUES, WIDTHS, sample_sensor
+from ..task import AGE_CAP, BAD_ACTION, N_SAMPLED, RUNNING, StepReport, compute_failure_cost
+from ..ticks import NEVER, TICK
+from ..vehicle.dynamics import Motion
+from .torch_ticks import InfoValues, TickState
+
+Tensor = torch.Tensor
+_NEVER_KEY = 1 << 62  # the place of what never arrives
+
+
+class SlowState(NamedTuple):
+    """The slow sensors' part of the rows' state."""
+
+    slow: Tensor  # (sensors, SLOW_WIDTH, N)
+    queue: Tensor  # (capacity, PACKET_WIDTH, N), by arrival
+
+
+class Delivered(NamedTuple):
+    """The packets that arrived in an env-step."""
+
+    packets: Tensor  # (most, PACKET_WIDTH, N)
+    number: Tensor  # (N,), how many of them are there
+
+
+class TickWindow(NamedTuple):
+    """The ticks of an env-step: after `first`, up to `last`, (N,) each."""
+
+    first: Tensor
+    last: Tensor
+    running: Tensor  # rows that were stepped
+    track: Tensor  # (n, len(Motion), N), where the car was at each tick
+
+
+class PacketCapacity(NamedTuple):
+    """The most packets of a sensor."""
+
+    frames: int  # captured in an env-step
+    under_way: int  # packets at once
+    copies: int  # of a packet
+
+
+def compute_capacity(links: Sequence[Link], n: int) -> PacketCapacity:
+    """The capacity for sensors with any of these links in an env-step of n ticks."""
+    return PacketCapacity(
+        max(-int(-n // link.period) for link in links),
+        max(count_max_in_flight(link) for link in links),
+        2 if any(link.duplicate > 0.0 for link in links) else 1,
+    )
+
+
+class SlowSensors:
+    """The slow sensors of a batch: those present, each with its capacity."""
+
+    def __init__(
+        self, capacities: dict[int, PacketCapacity], small_angle: int, dtype: torch.dtype
+    ) -> None:
+        self.capacities, self._small_angle = capacities, small_angle
+        (
+            self._sample_sensor,
+            self._make_measurement_context,
+            self._compute_arrivals,
+            self._read,
+            self._select,
+        ) = to_torch(dtype, sample_sensor, make_measurement_context, compute_arrivals, read, select)
+
+    def __call__(
+        self, p: Tensor, keys: Tensor, state: SlowState, window: TickWindow
+    ) -> tuple[SlowState, Delivered]:
+        """The slow sensors' state after an env-step, and what arrived in it."""
+        sensors = [list(sensor_state.unbind(0)) for sensor_state in state.slow.unbind(0)]
+        new_packets: list[Tensor] = []
+        for sensor, capacity in self.capacities.items():
+            for _ in range(capacity.frames):
+                sensors[sensor], packets = self._capture_frame(
+                    sensor, p, keys, sensors[sensor], window
+                )
+                new_packets += packets
+        queue = sort_packets(torch.cat([state.queue, torch.stack(new_packets)]))
+        arrived = queue[:, PACKET.arrived]
+        due = (arrived != NEVER) & (arrived <= window.last) & window.running
+        count = due.sum(0)
+        slow = self._update_newest(sensors, queue, due)
+        remaining = remove_first(queue, count)[: len(state.queue)]
+        return SlowState(slow, remaining), Delivered(queue, count)
+
+    def _capture_frame(
+        self, sensor: int, p: Tensor, keys: Tensor, slow: Sequence[Tensor], window: TickWindow
+    ) -> tuple[list[Tensor], list[Tensor]]:
+        """The next frame of a sensor where it falls into the window: (the sensor's state then, its
+        packets, of which those that are none never arrive)."""
+        pick = self._select
+        frame, tick = slow[SLOW_STATE.frames], slow[SLOW_STATE.next_capture]
+        active = window.running & (tick > window.first) & (tick <= window.last)
+        when = tick.to(torch.int64)
+        j = (when - window.first.to(torch.int64) - 1).clamp(0, len(window.track) - 1)
+        width = window.track.shape[1]
+        row_index = j.expand(1, width, -1)
+        motion = Motion(*window.track.gather(0, row_index)[0].unbind(0))
+        link = self._read(p, P.slow[sensor])
+        context = self._make_measurement_context(p, motion, self._small_angle, keys, tick)
+        values, quality, drift = self._sample_sensor(sensor, context, link, slow[SLOW_STATE.drift])
+        fields = [
+            number if isinstance(number, Tensor) else torch.full_like(tick, number)
+            for number in (quality, frame, *values)
+        ]
+        packets = []
+        arrival_ticks = self._compute_arrivals(
+            link, frame, tick, keys[0], keys[1], BLOCKS[sensor].link
+        )
+        for arrived in arrival_ticks[: self.capacities[sensor].copies]:
+            arrival_tick = pick(active, arrived, NEVER)
+            packets.append(
+                torch.stack((torch.full_like(tick, sensor), tick, arrival_tick, *fields))
+            )
+        next_state = list(slow)
+        next_state[SLOW_STATE.frames] = pick(active, frame + 1.0, frame)
+        next_state[SLOW_STATE.next_capture] = pick(active, tick + link.period, tick)
+        next_state[SLOW_STATE.drift] = pick(active, drift, slow[SLOW_STATE.drift])
+        return next_state, packets
+
+    def _update_newest(self, sensors: list[list[Tensor]], queue: Tensor, due: Tensor) -> Tensor:
+        """The sensors' state, as in `SlowState`, once the due packets were looked at in order."""
+        pick = self._select
+        for i in range(len(queue)):
+            packet = queue[i].unbind(0)
+            for sensor in self.capacities:
+                slow = sensors[sensor]
+                is_newer = due[i] & (packet[PACKET.sensor] == sensor)
+                is_newer = is_newer & (packet[PACKET.captured] > slow[SLOW_STATE.captured])
+                if NEEDS_QUALITY[sensor]:
+                    is_newer = is_newer & (packet[PACKET.quality] > 0.0)
+                newest = (
+                    packet[PACKET.captured],
+                    *packet[PACKET.value : PACKET.value + VALUES],
+                    packet[PACKET.arrived],
+                )
+                for k, value in enumerate(newest, SLOW_STATE.captured):
+                    slow[k] = pick(is_newer, value, slow[k])
+        return torch.stack([torch.stack(sensor_state) for sensor_state in sensors])
+
+
+def sort_packets(queue: Tensor) -> Tensor:
+    """Packets (count, PACKET_WIDTH, N) by (arrived, captured, sensor), those that never arrive
+    last."""
+    stamps = queue[:, :3].to(torch.int64)
+    arrived = stamps[:, PACKET.arrived]
+    key = (arrived << 32) + len(Z.slow) * stamps[:, PACKET.captured] + stamps[:, PACKET.sensor]
+    key = torch.where(queue[:, PACKET.arrived] == NEVER, _NEVER_KEY, key)
+    place = torch.arange(len(queue), device=queue.device)[:, None]
+    row_key, column_key = key[:, None], key[None]
+    is_before = (column_key < row_key) | ((column_key == row_key) & (place[None] < place[:, None]))
+    rank = is_before.sum(1)
+    order = torch.empty_like(rank).scatter_(0, rank, place.expand_as(rank))
+    return queue.gather(0, order[:, None].expand(-1, PACKET_WIDTH, -1))
+
+
+def remove_first(queue: Tensor, count: Tensor) -> Tensor:
+    """The rest of packets in order, (capacity, PACKET_WIDTH, N), without the first `count` (N,)."""
+    place = torch.arange(len(queue), device=queue.device)[:, None] + count
+    is_gone = place >= len(queue)
+    place = place.clamp(max=len(queue) - 1)
+    remaining = queue.gather(0, place[:, None].expand(-1, PACKET_WIDTH, -1))
+    before, after = remaining[:, : PACKET.arrived], remaining[:, PACKET.arrived + 1 :]
+    arrived = remaining[:, PACKET.arrived].masked_fill(is_gone, NEVER)
+    return torch.cat((before, arrived[:, None], after), 1)
+
+
+def read_packed(states: Tensor, capacity: int) -> SlowState:
+    """The slow sensors' part of packed states (STATE_WIDTH, N); ValueError where they hold more
+    than `capacity` packets."""
+    if bool((states[Z.under_way] > capacity).any()):
+        raise ValueError(f"a state has more than {capacity} packets under way")
+    slow = states[Z.slow[0].frames : Z.queue].reshape(len(Z.slow), SLOW_WIDTH, -1)
+    queue = states[Z.queue : Z.driver].reshape(-1, PACKET_WIDTH, states.shape[1])[:capacity].clone()
+    place = torch.arange(capacity, device=queue.device)[:, None]
+    queue[:, PACKET.arrived].masked_fill_(place >= states[Z.under_way], NEVER)
+    return SlowState(slow.clone(), sort_packets(queue))
+
+
+def write_packed(state: SlowState, states: Tensor) -> None:
+    """Write the slow sensors' part into packed states (STATE_WIDTH, N)."""
+    count = states.shape[1]
+    states[Z.slow[0].frames : Z.queue] = state.slow.reshape(-1, count)
+    states[Z.queue : Z.driver] = 0.0
+    flat = state.queue.reshape(-1, count)
+    states[Z.queue : Z.queue + len(flat)] = flat
+    arrived = state.queue[:, PACKET.arrived]
+    states[Z.under_way] = (arrived != NEVER).sum(0).to(states.dtype)
+    states[Z.clock.next_due] = torch.where(arrived[0] == NEVER, NEVER_DUE, arrived[0])
+
+
+class Observer:
+    """Observations and reports of a batch.
+
+    sensors: the slow ones present. bounds: (2, k), of the observation's entries. obs_dtype: of the
+    observations.
+    """
+
+    def __init__(
+        self,
+        sensors: tuple[int, ...],
+        switches: Switches,
+        bounds: Tensor,
+        dtype: torch.dtype,
+        obs_dtype: torch.dtype,
+    ) -> None:
+        self._obs_dtype = obs_dtype
+        self._sensors, self._switches = sensors, switches
+        self._bounds = bounds[:, :, None]
+        self._clip, self._select, self._compute_failure_cost = to_torch(
+            dtype, clip, select, compute_failure_cost
+        )
+
+    def observe(
+        self, rows: Tensor, done: Tensor, tick_state: TickState, slow: Tensor, delivered: Delivered
+    ) -> Tensor:
+        """The summary (N, k).
+
+        rows: (n, FAST_WIDTH, N), of which the first `done` (N,) count. slow: as in `Under`.
+        """
+        entries: list[Tensor] = []
+        sampled = rows[:, :N_SAMPLED]
+        if self._switches.all_samples:
+            entries += sampled.transpose(0, 1).flatten(0, 1).unbind(0)
+        else:
+            total: Any = 0.0
+            for j in range(len(rows)):
+                total = total + self._select(j < done, sampled[j], 0.0)
+            entries += torch.stack((sampled[-1], total / done), 1).flatten(0, 1).unbind(0)
+        entries += rows[-1, FAST.steer : FAST.steer + 4].unbind(0)
+        if self._switches.with_map:
+            entries.append(rows[-1, FAST.curvature])
+        for sensor in self._sensors:
+            entries += self._read_sensor(sensor, tick_state.tick, slow[sensor], delivered)
+        info_values = InfoValues(*tick_state.shown)
+        entries += [info_values.beta_ref, info_values.gamma_ref]
+        low, high = self._bounds.unbind(0)
+        clipped: Tensor = self._clip(torch.stack(entries), low, high)
+        return clipped.T.to(self._obs_dtype).contiguous()
+
+    def _read_sensor(
+        self, sensor: int, tick: Tensor, slow: Tensor, delivered: Delivered
+    ) -> list[Tensor]:
+        """Values, age and freshness of one sensor's newest sample."""
+        captured = slow[SLOW_STATE.captured]
+        age = self._select(captured != NEVER, (tick - captured) * TICK, AGE_CAP)
+        packets = delivered.packets
+        place = torch.arange(len(packets), device=tick.device)[:, None]
+        is_newest = (
+            packets[:, PACKET.arrived] == slow[SLOW_STATE.arrived]
+        )  # neither late nor a duplicate
+        is_fresh = (place < delivered.number) & (packets[:, PACKET.sensor] == sensor) & is_newest
+        values = [slow[i] for i in SLOW_STATE.values[: WIDTHS[sensor]]]
+        return [*values, age, is_fresh.any(0).to(tick.dtype)]
+
+    def report(self, tick_state: TickState, duration: Tensor, count: Tensor) -> Tensor:
+        """The reports (len(Report), N) of rows that were stepped."""
+        failure_cost = self._compute_failure_cost(duration, tick_state.tick)
+        cost = tick_state.cost + self._select(tick_state.failure != RUNNING, failure_cost, 0.0)
+        info_values = InfoValues(*tick_state.shown)
+        values = {
+            "t": tick_state.tick * TICK,
+            "beta": info_values.beta,
+            "gamma": tick_state.motion[2],
+            "psi": tick_state.motion[3],
+            "beta_ref": info_values.beta_ref,
+            "gamma_ref": info_values.gamma_ref,
+            "steer": info_values.steer,
+            "yaw_moment": info_values.moment,
+            "cost": cost,
+            "failure": tick_state.failure,
+            "packets": count.to(cost.dtype),
+            "reward": -cost,
+            "ended": (tick_state.tick >= duration).to(cost.dtype),
+        }
+        return torch.stack([values[name] for name in StepReport._fields])
+
+    def report_refusal(self, tick_state: TickState, duration: Tensor, before: Tensor) -> Tensor:
+        """The reports of rows that an action which is not finite fails; the rest stays."""
+        cost = self._compute_failure_cost(duration, tick_state.tick)
+        values = dict(zip(StepReport._fields, before.unbind(0), strict=True))
+        values |= {
+            "cost": cost,
+            "failure": torch.full_like(cost, BAD_ACTION),
+            "packets": torch.zeros_like(cost),
+            "reward": -cost,
+        }
+        return torch.stack([values[name] for name in StepReport._fields])

@@ -1,0 +1,213 @@
+"""The ticks of an env-step on tensors: the text of `integrate_tick` for all rows, each frozen where
+its episode ends.
+
+A row that fails or whose time is over stands still from then on while the others drive on: nothing
+branches on values, so the device never waits for the host.
+"""
+
+from typing import Any, NamedTuple
+
+from ..engine.layout import ActuatorState, P
+from ..engine.step import make_step_params
+from ..engine.tick import StepState, StepVariant, apply_tyre_change, integrate_tick
+from ..engine.window import compute_tick_cost
+from ..numerics.functions import CHANNELS, draw_normals
+from ..numerics.primitives import select
+from ..numerics.torch_backend import compile_method, to_torch, torch
+from ..record import FAST_WIDTH
+from ..scenarios.road import NominalMotion
+from ..scenarios.steering import compute_steering
+from ..sensors.inertial import NormalDraws
+from ..task import RUNNING, select_failure
+from ..ticks import TICK
+from ..vehicle.dynamics import Motion
+
+Tensor = torch.Tensor
+Numbers = tuple[Tensor, ...]
+
+
+class InfoValues(NamedTuple):
+    """Numbers of `info` from the last tick of a row; (N,) each."""
+
+    beta: Any
+    beta_ref: Any
+    gamma_ref: Any
+    steer: Any
+    moment: Any
+
+
+class TickState(NamedTuple):
+    """Where the rows are within an env-step; (N,) each, or tuples of such."""
+
+    alive: Tensor  # not frozen yet
+    motion: Numbers
+    drive: Numbers
+    driver: Tensor
+    refs: Numbers
+    nominal_motion: Numbers
+    tick: Tensor
+    failure: Tensor  # codes as floats
+    cost: Tensor
+    shown: Numbers
+    row: Numbers  # the newest fast row
+    track: Numbers  # the newest motion, fit for `info` or not
+
+
+class Ticks:
+    """The ticks of rows of one kind. compile: a tick, and the chances of all ticks, are one call of
+    `torch.compile` each."""
+
+    def __init__(self, kind: StepVariant, dtype: torch.dtype, compile: bool) -> None:
+        self.kind = kind
+        self._draw_normals, self._compute_steering = to_torch(dtype, draw_normals, compute_steering)
+        self._make_step_params, self._integrate_tick, self._apply_tyre_change = to_torch(
+            dtype, make_step_params, integrate_tick, apply_tyre_change
+        )
+        self._select_failure, self._select = to_torch(dtype, select_failure, select)
+        (self._compute_tick_cost,) = to_torch(dtype, compute_tick_cost)
+        self._dtype = dtype
+        self.tick: Any = compile_method(self._step_tick) if compile else self._step_tick
+        self.precompute_window: Any = (
+            compile_method(self._precompute_window) if compile else self._precompute_window
+        )
+
+    def _precompute_window(
+        self, p: Tensor, keys: Tensor, first: Tensor, n: int
+    ) -> tuple[Numbers, Any]:
+        """(eight normal numbers, the programme's steering) of n ticks from `first` on, (n, N)."""
+        ticks = first + torch.arange(n, device=first.device)[:, None]
+        tick_numbers = ticks.to(torch.int64)
+        inertial = self._draw_normals(keys[0], keys[1], tick_numbers, CHANNELS.inertial)
+        wheels = self._draw_normals(keys[0], keys[1], tick_numbers, CHANNELS.wheels)
+        if self.kind.has_driver:
+            return inertial + wheels, None
+        profile = p[P.steering_profile[0] :]
+        return inertial + wheels, self._compute_steering(ticks.to(self._dtype), profile)
+
+    def _step_tick(
+        self,
+        p: Tensor,
+        yaw_share: Tensor,
+        steer_share: Tensor,
+        tick_state: TickState,
+        draws: Numbers,
+        next_steer: Any,
+    ) -> TickState:
+        """One tick of the rows that are alive.
+
+        p: (PARAMS_WIDTH, N). share, turn: (N,), of the yaw moment and the added steering.
+        """
+        pick = self._select
+        params = self._make_step_params(p)
+        task = params.task
+        car = self._apply_tyre_change(
+            params.car, params.tyre_change, tick_state.tick > params.tyre_change.tick
+        )
+        # the load at the tick's start is computed anew where `anywhere` holds, and here it does
+        motion, drive, nominal_motion = (
+            Motion(*tick_state.motion),
+            ActuatorState(*tick_state.drive),
+            NominalMotion(*tick_state.nominal_motion),
+        )
+        state = StepState(
+            motion, drive, None, tick_state.driver, car, tick_state.refs, nominal_motion
+        )
+        next_state, measured = self._integrate_tick(
+            params,
+            yaw_share * task.yaw_scale,
+            steer_share * task.authority,
+            state,
+            tick_state.tick,
+            NormalDraws(draws[:4], draws[4:]),
+            next_steer,
+            self.kind,
+        )
+        alive, is_fit = tick_state.alive, tick_state.alive & ~measured.lost
+        tick = tick_state.tick + alive
+        tick_cost = self._compute_tick_cost(
+            next_state.motion, measured.cost_inputs, task, params.path, self.kind
+        )
+        failure = self._select_failure(measured.lost, tick_cost.spun, tick_cost.off)
+        refs = [pick(measured.lost, 0.0, ref) for ref in measured.refs]
+        info_values = (
+            pick(measured.lost, 0.0, tick_cost.beta),
+            *refs,
+            measured.steer,
+            measured.moment,
+        )
+
+        def select_rows(where: Tensor, new: Any, old: Any) -> Numbers:
+            return tuple(pick(where, a, b) for a, b in zip(new, old, strict=True))
+
+        return TickState(
+            alive & (failure == RUNNING) & (tick < task.duration),
+            select_rows(is_fit, next_state.motion, tick_state.motion),
+            select_rows(alive, next_state.drive, tick_state.drive),
+            pick(alive, next_state.driver, tick_state.driver),
+            select_rows(alive, refs, tick_state.refs),
+            select_rows(alive, next_state.nominal_motion, tick_state.nominal_motion),
+            tick,
+            pick(alive, failure, tick_state.failure),
+            tick_state.cost + pick(alive, tick_cost.cost * TICK, 0.0),
+            select_rows(alive, info_values, tick_state.shown),
+            select_rows(alive, measured.row, tick_state.row),
+            select_rows(alive, next_state.motion, tick_state.track),
+        )
+
+    def integrate_step(
+        self,
+        p: Tensor,
+        keys: Tensor,
+        start: TickState,
+        yaw_share: Tensor,
+        steer_share: Tensor,
+        n: int,
+    ) -> tuple[TickState, Tensor, Tensor]:
+        """n ticks, fewer for rows that fail or end: (where they are then, the fast rows, the
+        motions), of the latter (n, width, N); a row's last ones stand for those it does not have.
+        """
+        all_draws, steering = self.precompute_window(p, keys, start.tick + 1, n)
+        tick_state, rows, track = start, [], []
+        for j in range(n):
+            draws = tuple(normals_of[j] for normals_of in all_draws)
+            tick_state = self.tick(
+                p,
+                yaw_share,
+                steer_share,
+                tick_state,
+                draws,
+                None if steering is None else steering[j],
+            )
+            rows.append(torch.stack(tick_state.row))
+            track.append(torch.stack(tick_state.track))
+        return tick_state, torch.stack(rows), torch.stack(track)
+
+
+def make_tick_state(
+    motion: Tensor,
+    drive: Tensor,
+    driver: Tensor,
+    refs: Tensor,
+    nominal_motion: Tensor,
+    tick: Tensor,
+    alive: Tensor,
+) -> TickState:
+    """Where rows are at the start of an env-step."""
+    zeros = tick.new_zeros((2 + len(InfoValues._fields) + FAST_WIDTH, len(tick)))
+    failure, cost, *numbers = zeros.unbind(0)
+    info_values, row = numbers[: len(InfoValues._fields)], numbers[len(InfoValues._fields) :]
+    # no tensor stands twice: torch.compile would compile the first tick and the others apart
+    return TickState(
+        alive,
+        motion.unbind(0),
+        drive.unbind(0),
+        driver,
+        refs.unbind(0),
+        nominal_motion.unbind(0),
+        tick,
+        failure,
+        cost,
+        tuple(info_values),
+        tuple(row),
+        motion.unbind(0),
+    )

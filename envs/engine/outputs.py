@@ -1,0 +1,216 @@
+"""The queue of slow sensors' packets: capture at a tick, delivery at their arrival; compiled.
+
+Packets are delivered in the order (captured tick, sensor); what is under way lies in the state.
+
+The float32 observation of a step, and what `info` reads of the state; compiled.
+"""
+
+from typing import Any
+
+from ..numerics.functions import clip
+from ..numerics.jit import jit
+from ..numerics.packed import load_element, read, store_element
+from ..numerics.primitives import maximum, minimum, select, to_word
+from ..record import FAST, PACKET, PACKET_WIDTH
+from ..sensors.link import compute_arrivals
+from ..sensors.slow import BLOCKS, NEEDS_QUALITY, VALUES, WIDTHS, MeasurementContext, sample_sensor
+from ..task import AGE_CAP, N_SAMPLED, REPORT
+from ..ticks import NEVER, TICK
+from .layout import FLAGS, P, Z
+
+NEVER_DUE = 1e15
+
+
+@jit
+def _push_packet(
+    z: Any, sensor: int, captured: Any, due: Any, quality: Any, frame: Any, values: Any
+) -> None:
+    """Put a captured sample on its way; that the queue is long enough, `make_link` has checked."""
+    slot = int(z[Z.under_way])
+    packet = z[Z.queue + slot * PACKET_WIDTH :]
+    packet[PACKET.sensor] = sensor
+    packet[PACKET.captured] = captured
+    packet[PACKET.arrived] = due
+    packet[PACKET.quality] = quality
+    packet[PACKET.sequence] = frame
+    for i in range(VALUES):
+        packet[PACKET.value + i] = values[i]
+    z[Z.under_way] = slot + 1.0
+    z[Z.clock.next_due] = minimum(z[Z.clock.next_due], due)
+
+
+@jit
+def _send_frame(
+    z: Any, sensor: int, link: Any, tick: Any, key: Any, values: Any, quality: Any
+) -> None:
+    """A frame of a slow sensor: queue it for its arrivals and set the clock on."""
+    column = Z.slow[sensor]
+    frame = z[column.frames]
+    first, second = compute_arrivals(link, frame, tick, key[0], key[1], BLOCKS[sensor].link)
+    if first != NEVER:
+        _push_packet(z, sensor, tick, first, quality, frame, values)
+    if second != NEVER:
+        _push_packet(z, sensor, tick, second, quality, frame, values)
+    z[column.frames] = frame + 1.0
+    z[column.next_capture] = tick + link.period
+
+
+@jit
+def update_newest(z: Any, packet: Any, tick: Any) -> None:
+    """A packet (PACKET_WIDTH,) that is here becomes its sensor's newest sample, if it is newer."""
+    sensor = int(packet[PACKET.sensor])
+    newest = Z.slow[sensor]
+    is_empty = NEEDS_QUALITY[sensor] and packet[PACKET.quality] <= 0.0
+    if not is_empty and packet[PACKET.captured] > z[newest.captured]:
+        z[newest.captured] = packet[PACKET.captured]
+        for i in range(VALUES):
+            z[newest.values[0] + i] = packet[PACKET.value + i]
+        z[newest.arrived] = tick
+
+
+@jit
+def _move_due_packets(z: Any, tick: Any, packets: Any, count: int) -> int:
+    """Move the packets that arrive at this tick into `packets`; returns the new count."""
+    while True:
+        best, best_rank, due = -1, NEVER_DUE, NEVER_DUE
+        under_way = int(z[Z.under_way])
+        for slot in range(under_way):
+            offset = Z.queue + slot * PACKET_WIDTH
+            arrived = z[offset + PACKET.arrived]
+            if arrived == tick:
+                rank = len(Z.slow) * z[offset + PACKET.captured] + z[offset + PACKET.sensor]
+                if rank < best_rank:
+                    best, best_rank = offset, rank
+            else:
+                due = minimum(due, arrived)
+        if best < 0:
+            z[Z.clock.next_due] = due
+            return count
+        for i in range(PACKET_WIDTH):
+            packets[count, i] = z[best + i]
+        update_newest(z, packets[count], tick)
+        last = Z.queue + (under_way - 1) * PACKET_WIDTH  # it takes the free place
+        for i in range(PACKET_WIDTH):
+            z[best + i] = z[last + i]
+        z[Z.under_way] = under_way - 1.0
+        count += 1
+
+
+@jit
+def find_next_due(z: Any, tick: Any) -> Any:
+    """The first tick after this one at which a slow sensor captures or a packet arrives."""
+    due = maximum(z[Z.clock.next_due], tick + 1.0)
+    for sensor in range(len(Z.slow)):
+        capture = z[Z.slow[sensor].next_capture]
+        due = select(capture > tick, minimum(due, capture), due)
+    return due
+
+
+@jit
+def make_measurement_context(
+    p: Any, motion: Any, small_angle: int, key: Any, tick: Any
+) -> MeasurementContext:
+    """The scene that slow sensors see at a tick."""
+    road, car, noise = read(p, P.road), read(p, P.car), read(p, P.noise)
+    sky, field_of_view = read(p, P.sky), read(p, P.field_of_view)
+    return MeasurementContext(
+        motion, road, car, noise, sky, field_of_view, small_angle, key[0], key[1], tick
+    )
+
+
+@jit
+def sample_slow_sensors(row: Any, motion: Any, tick: Any, count: int) -> int:
+    """The slow sensors sample the motion at a tick, and due packets are delivered.
+
+    Returns how many packets there are then.
+    """
+    p, z, small_angle = row.p, row.z, row.switches[FLAGS.small_angle]
+    key = (to_word(z[Z.clock.key_low]), to_word(z[Z.clock.key_high]))
+    for sensor in range(len(Z.slow)):
+        column = Z.slow[sensor]
+        if tick == z[column.next_capture]:
+            link, context = (
+                read(p, P.slow[sensor]),
+                make_measurement_context(p, motion, small_angle, key, tick),
+            )
+            values, quality, z[column.drift] = sample_sensor(sensor, context, link, z[column.drift])
+            _send_frame(z, sensor, link, tick, key, values, quality)
+    if tick >= z[Z.clock.next_due]:
+        count = _move_due_packets(z, tick, row.packets, count)
+    return count
+
+
+@jit
+def observe(row: Any, n: int, count: int, refs: Any, bounds: Any) -> None:
+    """Write the float32 observation of a record of n ticks and `count` packets, every entry
+    clipped at its bounds (2, k); entries as in `make_observation_layout`."""
+    k = observe_fast(row.rows, n, refs, bounds, row.switches, row.obs)
+    observe_slow(row, k, count, bounds)
+
+
+@jit
+def observe_fast(rows: Any, n: int, refs: Any, bounds: Any, switches: Any, obs: Any) -> int:
+    """Write the entries of n fast rows, which come first, and of the references, which come last;
+    returns how many come first. rows, obs: of a vehicle, or with an axis more for those of a block.
+    """
+    k = 0
+    for column in range(N_SAMPLED):
+        if switches[FLAGS.all_samples]:
+            for j in range(n):
+                _store_clipped(obs, load_element(rows, j, column), bounds, k)
+                k += 1
+        else:
+            total = 0.0
+            for j in range(n):
+                total = total + load_element(rows, j, column)
+            _store_clipped(obs, load_element(rows, n - 1, column), bounds, k)
+            _store_clipped(obs, total / n, bounds, k + 1)
+            k += 2
+    for i in range(4):
+        _store_clipped(obs, load_element(rows, n - 1, FAST.steer + i), bounds, k)
+        k += 1
+    if switches[FLAGS.with_map]:
+        _store_clipped(obs, load_element(rows, n - 1, FAST.curvature), bounds, k)
+        k += 1
+    last = len(obs) - 2
+    _store_clipped(obs, refs[0], bounds, last)
+    _store_clipped(obs, refs[1], bounds, last + 1)
+    return k
+
+
+@jit
+def _store_clipped(obs: Any, value: Any, bounds: Any, k: int) -> None:
+    store_element(obs, clip(value, bounds[0, k], bounds[1, k]), k)
+
+
+@jit
+def observe_slow(row: Any, k: int, count: int, bounds: Any) -> None:
+    """Write the entries of the slow sensors, from k on, of a record of `count` packets."""
+    p, z, obs, packets = row.p, row.z, row.obs, row.packets
+    tick = z[Z.clock.tick]
+    for sensor in range(len(Z.slow)):
+        newest = Z.slow[sensor]
+        if p[P.slow[sensor].period] > 0.0:
+            for i in range(WIDTHS[sensor]):
+                obs[k] = clip(z[newest.values[0] + i], bounds[0, k], bounds[1, k])
+                k += 1
+            age = (tick - z[newest.captured]) * TICK
+            obs[k] = clip(select(z[newest.captured] != NEVER, age, AGE_CAP), 0.0, AGE_CAP)
+            is_fresh = 0.0
+            for i in range(count):
+                is_newest = (
+                    packets[i, PACKET.arrived] == z[newest.arrived]
+                )  # not late, no duplicate
+                if packets[i, PACKET.sensor] == sensor and is_newest:
+                    is_fresh = 1.0
+            obs[k + 1] = is_fresh
+            k += 2
+
+
+@jit
+def write_report(report: Any, z: Any) -> None:
+    """Write what `info` reads of the state; cost and references are the caller's."""
+    report[REPORT.t] = z[Z.clock.tick] * TICK
+    report[REPORT.gamma] = z[Z.motion.gamma]
+    report[REPORT.psi] = z[Z.motion.psi]
+    report[REPORT.failure] = z[Z.clock.failure]

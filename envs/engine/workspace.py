@@ -1,0 +1,185 @@
+"""The arrays of episodes: what kernels read and write of one, and of the N of a batch."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..numerics.jit import as_python, jit
+from ..numerics.packed import as_float32, as_int64, as_matrix, make_offsets, read
+from ..record import FAST_WIDTH, PACKET_WIDTH, Array
+from ..task import REPORT
+from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH
+from .window import WINDOW_HEIGHT, count_columns
+
+
+class EpisodeArrays(NamedTuple):
+    """One episode's arrays."""
+
+    # (PARAMS_WIDTH,), packed as in `EpisodeParams`; behind it a recorded trace, if there is one
+    p: Any
+    z: Any  # (STATE_WIDTH,), packed as in `State`
+    switches: Any  # (len(Switches),) int64
+    obs: Any  # (k,) float32
+    rows: Any  # (n, FAST_WIDTH), the fast rows of the newest record
+    packets: Any  # (most, PACKET_WIDTH), its packets
+    report: Any  # (len(Report),)
+
+
+class WorkspaceSizes(NamedTuple):
+    """What a workspace begins with."""
+
+    n: Any  # ticks a step
+    n_entries: Any  # of an observation
+    max_packets: Any  # packets of a step
+
+
+SIZES, _HEADER = make_offsets(WorkspaceSizes)
+
+
+def make_workspace(n: int, bounds: Array, max_packets: int, trace_width: int = 0) -> Array:
+    """The arrays of an episode, one behind the other in one vector: numba takes 0.04 us for every
+    array that it is handed. `split_workspace` finds them.
+
+    bounds: (2, k), of an observation's entries. trace: the numbers behind the parameters.
+    """
+    k = bounds.shape[1]
+    width = _HEADER + STATE_WIDTH + len(REPORT) + len(FLAGS) + 2 * k - (-k // 2)
+    width += n * FAST_WIDTH + max_packets * PACKET_WIDTH + WINDOW_HEIGHT * count_columns(n)
+    workspace = np.zeros(width + PARAMS_WIDTH + trace_width)
+    workspace[:_HEADER] = n, k, max_packets
+    _split_workspace(workspace)[1][:] = bounds
+    return workspace
+
+
+@jit
+def split_workspace(workspace: Any) -> Any:
+    """(the episode's Row, the bounds of its observation, its window) that lie in a workspace."""
+    sizes = read(workspace, SIZES)
+    n, k, max_packets = int(sizes.n), int(sizes.n_entries), int(sizes.max_packets)
+    report = _HEADER + STATE_WIDTH
+    flags = report + len(REPORT)
+    bounds = flags + len(FLAGS)
+    window = bounds + 2 * k
+    rows = window + WINDOW_HEIGHT * count_columns(n)
+    packets = rows + n * FAST_WIDTH
+    obs = packets + max_packets * PACKET_WIDTH
+    row = EpisodeArrays(
+        workspace[obs - (-k // 2) :],
+        workspace[_HEADER:report],
+        as_int64(workspace, flags, len(FLAGS)),
+        as_float32(workspace, obs, k),
+        as_matrix(workspace, rows, n, FAST_WIDTH),
+        as_matrix(workspace, packets, max_packets, PACKET_WIDTH),
+        workspace[report:flags],
+    )
+    return (
+        row,
+        as_matrix(workspace, bounds, 2, k),
+        as_matrix(workspace, window, WINDOW_HEIGHT, count_columns(n)),
+    )
+
+
+_split_workspace = as_python(split_workspace)
+_VIEW_NAMES = (
+    "_row", "_params", "_state", "_switches", "_obs", "rows", "packets", "_report", "_bounds",
+    "_window", "_read_report", "_copy_observation",
+)  # fmt: skip
+
+
+class WorkspaceMixin:
+    """An environment of one car, whose arrays are parts of `_workspace`.
+
+    `rows` and `packets` are the newest record's; `delivered` of the latter are there.
+    """
+
+    config: Any
+    control_period: int
+    _workspace: Array | None = None
+
+    def _allocate(self, width: int) -> None:
+        """A workspace for parameters and a trace behind them, `width` numbers, where they are not
+        as many as before."""
+        if self._workspace is None or len(self._params) != width:
+            config, trace = self.config, width - PARAMS_WIDTH
+            max_packets = config.max_packets
+            self._workspace = make_workspace(self.control_period, config.bounds, max_packets, trace)
+            self._bind_views()
+
+    def _bind_views(self) -> None:
+        """Name the parts, and the calls that read them in every step."""
+        self._row, self._bounds, self._window = _split_workspace(self._workspace)
+        self._params, self._state, self._switches, self._obs, *record = self._row
+        self.rows, self.packets, self._report = record
+        self._read_report, self._copy_observation = self._report.tolist, self._obs.copy
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name not in _VIEW_NAMES}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._bind_views()
+
+    @property
+    def delivered(self) -> int:
+        """How many packets the newest record has."""
+        return int(self._report[REPORT.packets])
+
+
+class BatchArrays(NamedTuple):
+    """The arrays of N episodes, a row for each."""
+
+    params: Any  # (N, ...), the rest as in `Row`
+    states: Any
+    switches: Any
+    obs: Any
+    rows: Any
+    packets: Any
+    reports: Any
+    ticks_done: Any  # (N,), how many of `rows` are there
+    delivered: Any  # (N,), how many of `packets` are there
+    over: Any  # (N,) of bool: the episode has ended and was not reset yet
+
+
+class RecordArrays(NamedTuple):
+    """The records of N episodes."""
+
+    rows: Any
+    packets: Any
+    ticks_done: Any
+    delivered: Any
+
+
+class EpisodeStart(NamedTuple):
+    """The packed start of an episode; of several, arrays have an axis more, the first."""
+
+    params: Any  # as in `Row`, with what the scenario does not draw
+    low: Any  # (len(Draws),), the ranges that it draws from
+    high: Any
+    switches: Any
+    motion: Any  # (len(Motion),), NaN: standing on the road at the drawn speed
+
+
+@jit
+def get_episode_arrays(batch: BatchArrays, i: int) -> EpisodeArrays:
+    """The arrays of an episode of several."""
+    return EpisodeArrays(
+        batch.params[i],
+        batch.states[i],
+        batch.switches[i],
+        batch.obs[i],
+        batch.rows[i],
+        batch.packets[i],
+        batch.reports[i],
+    )
+
+
+@jit
+def get_episode_start(starts: EpisodeStart, i: int) -> EpisodeStart:
+    """The start of one of several episodes."""
+    return EpisodeStart(
+        starts.params[i],
+        starts.low[i],
+        starts.high[i],
+        starts.switches[i],
+        starts.motion[i],
+    )

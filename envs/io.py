@@ -1,0 +1,254 @@
+"""Files that are there whole or not at all.
+
+Documents: what is written about a vehicle or a scenario, as TOML or JSON, and typed objects.
+"""
+
+import contextlib
+import io
+import json
+import math
+import os
+import stat
+import tomllib
+import uuid
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, get_origin
+
+from .validation import is_finite, join_names, short_repr
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+_OPEN = ("/dev/std", "/dev/fd/", "/proc/")  # what a process has open, by name
+
+
+@contextlib.contextmanager
+def atomic_file(path: Path | str) -> Iterator[io.BufferedWriter]:
+    """A binary file to write, which takes the place of `path` at the end, or none does on an error.
+
+    Whoever is killed meanwhile leaves an older file as it was. Links are followed, an older file's
+    mode and owner stay; a pipe, a device or an open file such as /dev/stdout is written as it is.
+    """
+    try:
+        old = os.stat(path)
+    except FileNotFoundError:
+        old = None
+    if old and (not stat.S_ISREG(old.st_mode) or os.path.abspath(path).startswith(_OPEN)):
+        with open(path, "ab") as file:
+            yield file
+        return
+    with replace_file(Path(os.path.realpath(path))) as file:
+        yield file
+        if old:
+            with contextlib.suppress(PermissionError):
+                os.fchown(file.fileno(), old.st_uid, old.st_gid)
+            os.fchmod(file.fileno(), stat.S_IMODE(old.st_mode))
+
+
+@contextlib.contextmanager
+def replace_file(path: Path, mode: int = 0o666) -> Iterator[io.BufferedWriter]:
+    """The same for a plain file or a link, which is replaced itself; `mode` as the umask has it."""
+    part = path.with_name(f".{path.name[:200]}.{uuid.uuid4().hex}.part")
+    try:
+        with open(part, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_atomic(path: Path | str, content: bytes) -> None:
+    """Write a file or nothing."""
+    with atomic_file(path) as file:
+        file.write(content)
+
+
+DataclassT = TypeVar("DataclassT", bound="DataclassInstance")
+SUFFIXES = (".toml", ".json")
+
+
+def has_suffix(source: object, suffixes: tuple[str, ...]) -> bool:
+    """Check whether a value is a text or a `Path` with one of these endings.
+
+    Args:
+        source: Any value.
+        suffixes: Endings in lower case, with the dot.
+
+    Returns:
+        True if it ends in one of them, in upper or lower case.
+    """
+    return isinstance(source, str | os.PathLike) and str(source).lower().endswith(suffixes)
+
+
+def is_document(source: object) -> bool:
+    """Check whether a value is a path: any `Path`, or a text with an ending, which no name has.
+
+    Args:
+        source: Any value.
+
+    Returns:
+        True for a path.
+    """
+    return isinstance(source, os.PathLike) or (isinstance(source, str) and "." in source[-8:])
+
+
+def read_document(source: "str | os.PathLike[str]", what: str) -> dict[str, Any]:
+    """Read the mapping in a TOML or JSON file; a file named under `base` is looked for beside it.
+
+    Raises FileNotFoundError, and ValueError for a folder, another ending, a `base` that leads back
+    to the file, and a file that is no TOML or JSON or holds no mapping.
+
+    Args:
+        source: Path of the file.
+        what: Kind of content, for messages.
+
+    Returns:
+        Names and values of the file.
+    """
+    path = Path(source)
+    values = _parse_file(path, what)
+    base = _find_base(path, values)
+    if base is not None:
+        _check_base_cycle(path, base, what)
+        values["base"] = str(base)
+    return values
+
+
+def _parse_file(path: Path, what: str) -> dict[str, Any]:
+    kind = path.suffix.lower()
+    if kind not in SUFFIXES:
+        raise ValueError(f"{path}: the file of a {what} ends in {' or '.join(SUFFIXES)}")
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such {what} file")
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a {what} file, found a folder")
+    name = kind[1:].upper()
+    try:
+        text = path.read_text(encoding="utf-8")
+        values: Any = tomllib.loads(text) if kind == ".toml" else json.loads(text)
+    except RecursionError:
+        raise ValueError(f"{path}: expected {name}, but it is nested too deeply") from None
+    except (ValueError, OSError) as error:  # of the decoder, of JSON or of TOML
+        raise ValueError(f"{path}: expected {name}, but {error}") from None
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: expected a mapping of names to values")
+    if not values:
+        raise ValueError(f"{path}: the file holds nothing")
+    return values
+
+
+def _find_base(path: Path, values: Mapping[str, Any]) -> Path | None:
+    """The file beside a file that it names under `base`."""
+    base = values.get("base")
+    with contextlib.suppress(OSError, ValueError):  # a text that can be no file's name
+        if isinstance(base, str) and (path.parent / base).is_file():
+            return path.parent / base
+    return None
+
+
+def _check_base_cycle(path: Path, base: Path | None, what: str) -> None:
+    """ValueError where a file's base, or the base of that, leads back to one of them."""
+    visited = {path.resolve()}
+    while base is not None:
+        if base.resolve() in visited:
+            raise ValueError(f"{path}: its base is the file itself, or leads back to it")
+        visited.add(base.resolve())
+        base = _find_base(base, _parse_file(base, what)) if has_suffix(base, SUFFIXES) else None
+
+
+def write_document(path: "str | os.PathLike[str]", values: Mapping[str, Any]) -> None:
+    """Write a mapping to a TOML or JSON file, which `read_document` reads back.
+
+    Args:
+        path: Path of the file, whose ending chooses the format.
+        values: Numbers, texts, lists and mappings of these by name.
+
+    Raises:
+        ValueError: For another ending.
+    """
+    kind = Path(path).suffix.lower()
+    if kind not in SUFFIXES:
+        raise ValueError(f"{path}: expected a file that ends in {' or '.join(SUFFIXES)}")
+    if kind == ".json":
+        text = json.dumps(values, indent=1)
+    else:
+        text = "\n".join(
+            f"{_format_key(name)} = {to_toml(value)}" for name, value in values.items()
+        )
+    write_atomic(os.fspath(path), (text + "\n").encode())
+
+
+def to_toml(value: Any) -> str:
+    """Format a value as TOML writes it behind a key.
+
+    Args:
+        value: Number, text, list or mapping.
+
+    Returns:
+        The text.
+    """
+    if isinstance(value, Mapping):
+        pairs = (f"{_format_key(name)} = {to_toml(item)}" for name, item in value.items())
+        return f"{{ {', '.join(pairs)} }}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(to_toml, value)) + "]"
+    if isinstance(value, float) and not math.isfinite(value):
+        return repr(value)  # inf, which JSON calls Infinity
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _format_key(name: str) -> str:
+    return name if name.isascii() and name.isidentifier() else to_toml(name)
+
+
+def from_json(kind: type[DataclassT], entry: Any, where: str) -> DataclassT:
+    """Make a dataclass's instance from a JSON object, whose lists may stand for tuples.
+
+    Args:
+        kind: The dataclass.
+        entry: The parsed JSON value.
+        where: Place of the value, for messages.
+
+    Returns:
+        The instance.
+
+    Raises:
+        ValueError: For an unknown or missing field and a value of another type.
+    """
+    if not isinstance(entry, dict):
+        raise ValueError(f"{where}: expected a JSON object, got {short_repr(entry)}")
+    known: dict[str, Any] = {spec.name: spec for spec in fields(kind)}
+    required = {name for name, spec in known.items() if spec.default is spec.default_factory}
+    for what, names in (("unknown", entry.keys() - known), ("missing", required - entry.keys())):
+        if names:
+            raise ValueError(f"{where}: {what} {join_names(sorted(names))}")
+    lists = {name: value for name, value in entry.items() if isinstance(value, list)}
+    tuples = {n: tuple(v) for n, v in lists.items() if get_origin(known[n].type) is tuple}
+    check_types(kind, entry | tuples, where)
+    try:
+        return kind(**entry | tuples)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def check_types(kind: "type[DataclassInstance]", values: Mapping[str, Any], where: str) -> None:
+    """Check that values have the types of a dataclass's fields.
+
+    Args:
+        kind: The dataclass.
+        values: Values by the names of fields.
+        where: Place of the values, for messages.
+
+    Raises:
+        ValueError: For a value of another type, with the place and the field.
+    """
+    types: dict[str, Any] = {spec.name: spec.type for spec in fields(kind)}
+    for name, value in values.items():
+        expected = get_origin(types[name]) or types[name]
+        fits = isinstance(value, expected) or (expected is float and is_finite(value))
+        if not fits or (isinstance(value, bool) and expected is not bool):
+            raise ValueError(f"{where}: {name} is {short_repr(value)}, not {expected.__name__}")

@@ -1,0 +1,355 @@
+"""How numba is made to compile kernels: its front end, each kernel's machine code, their files.
+
+numba's front end without what it does for nothing: its passes, and what it looks up again.
+
+How kernels are compiled: each function's text once, each kernel's machine code once.
+
+numba by itself runs LLVM's whole pipeline and emits machine code for every function a kernel calls,
+with everything below it, level by level. Here a function that another one calls is a
+`UnlinkedLibrary`: its LLVM text stays as numba lowered it. What Python calls links the parts below
+it, and is optimised and emitted then; that alone is cached on disk.
+
+All this uses numba's insides, which change: `decorators` does without where they are others.
+"""
+
+import contextlib
+import gc
+import hashlib
+import logging
+import time
+from collections.abc import Iterator
+from inspect import iscode
+from pathlib import Path
+from typing import Any
+
+from llvmlite import binding
+from numba.core import typed_passes, types, untyped_passes
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.compiler_machinery import PassManager
+from numba.core.dispatcher import _FunctionCompiler
+from numba.core.environment import lookup_environment
+from numba.core.funcdesc import default_mangler
+from numba.core.registry import CPUDispatcher
+from numba.core.sigutils import normalize_signature
+from numba.core.targetconfig import ConfigStack
+from numba.core.typing import make_concrete_template
+
+from . import kernel_cache
+from .kernel_cache import report_once
+
+# numba's own types say too little about itself:
+# mypy: disable-error-code="attr-defined,no-untyped-call,call-arg,misc,unused-ignore"
+
+
+_FUNCTION: Any = types.Function  # operators and numba's own functions
+_resolve = _FUNCTION.get_call_type
+_signatures: dict[Any, Any] = {}
+_UNTYPED = (
+    "TranslateByteCode FixupArgs IRProcessing RewriteSemanticConstants DeadBranchPrune "
+    "GenericRewrites RewriteDynamicRaises ReconstructSSA"
+)
+_TYPED = "NopythonTypeInference PreLowerStripPhis NativeLowering NoPythonBackend"
+_PASSES = [getattr(untyped_passes, name) for name in _UNTYPED.split()]
+_PASSES += [getattr(typed_passes, name) for name in _TYPED.split()]
+
+
+class _Passes(PassManager):
+    """Passes without numba's report of each, for which it writes out all types."""
+
+    def _runPass(self, index: int, step: Any, state: Any) -> None:
+        step.analysis = self._analysis
+        step.run_pass(state)
+
+
+def lean_passes() -> PassManager:
+    """Those that a function needs that neither counts references nor holds another one."""
+    passes = _Passes("part")
+    for pass_class in _PASSES:
+        passes.add_pass(pass_class, pass_class.__name__)
+    passes.finalize()
+    return passes
+
+
+def _resolved(function: Any, context: Any, args: Any, kws: Any) -> Any:
+    """What numba finds for an operator or a function of its own, by the types it is called with."""
+    if kws:
+        return _resolve(function, context, args, kws)
+    key = function, context, args, ConfigStack.top_or_none().nrt
+    if key not in _signatures:
+        _signatures[key] = _resolve(function, context, args, kws)
+    return _signatures[key]
+
+
+@contextlib.contextmanager
+def quickly() -> Iterator[None]:
+    """Nothing is looked up twice, and no cycles are sought among a compiler's millions of objects:
+    a fifth of its time each."""
+    enabled, resolve = gc.isenabled(), _FUNCTION.get_call_type
+    gc.disable()
+    _FUNCTION.get_call_type = _resolved
+    try:
+        yield
+    finally:
+        _FUNCTION.get_call_type = resolve
+        if enabled:
+            gc.enable()
+
+
+# numba's own types say too little about itself:
+# mypy: disable-error-code="attr-defined,no-untyped-call,call-arg,misc,unused-ignore"
+
+
+_logger = logging.getLogger("sideslip.compiler")
+_spent = [0.0]  # CPU-s on kernels so far, to tell a kernel's own from those it waited for
+
+
+class UnlinkedLibrary(JITCodeLibrary):
+    """The LLVM text of one function, neither optimised nor linked with those that it calls."""
+
+    def finalize(self) -> None:
+        """Note what cannot be cached on disk, and nothing else."""
+        self._raise_if_finalized()
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def get_own_module(self) -> Any:
+        """The LLVM module of this function alone, for linking."""
+        return super()._get_module_for_linking()
+
+    def _get_module_for_linking(self) -> Any:
+        """What a function that numba compiles by itself links: this one and all below it."""
+        module = self.get_own_module().clone()
+        for callee in _collect_callees(self)[1:]:
+            if not isinstance(callee, _ExternalLibrary):
+                callee_module = (
+                    callee.get_own_module()
+                    if isinstance(callee, UnlinkedLibrary)
+                    else callee._get_module_for_linking()
+                )
+                module.link_in(callee_module, preserve=True)
+        return module
+
+
+class Whole(JITCodeLibrary):
+    """A kernel's own library, into which all parts are linked."""
+
+    def _optimize_functions(self, module: Any) -> None:
+        """Nothing: parts are optimised, and what is around them is optimised with the whole."""
+
+    def _optimize_final_module(self) -> None:
+        """Once: numba's first run only prepares the counting of references."""
+        passes, options = self.codegen._module_pass_manager()
+        passes.run(self._final_module, options)
+
+
+class _BareLibrary:
+    """A part as a kernel of ours links it, which links each part itself."""
+
+    def __init__(self, part: UnlinkedLibrary) -> None:
+        self._part, self._reload_init = part, part._reload_init
+
+    def _ensure_finalized(self) -> None:
+        self._part._ensure_finalized()
+
+    def _get_module_for_linking(self) -> Any:
+        return self._part.get_own_module()
+
+
+class _ExternalLibrary:
+    """A kernel that callers find as machine code: nothing is linked into them."""
+
+    def __init__(self, path: Path | None) -> None:
+        self.path = path
+        self._reload_init: set[str] = set()
+
+    def _ensure_finalized(self) -> None:
+        """There is nothing to finalize: numba asks before it links."""
+
+    def _get_module_for_linking(self) -> Any:
+        """Nothing: the machine code is found by its name."""
+        return binding.parse_assembly("")
+
+
+class _UnlinkedPipeline(Compiler):
+    def define_pipelines(self) -> Any:
+        """numba's own, but only the passes that find something to do in a function that neither
+        counts references nor holds another one."""
+        if self.state.flags.nrt or any(map(iscode, self.state.func_id.code.co_consts)):
+            return super().define_pipelines()
+        return [lean_passes()]
+
+    def compile_extra(self, func: Any) -> Any:
+        self.state.library = UnlinkedLibrary(self.state.targetctx.codegen(), func.__qualname__)
+        return super().compile_extra(func)
+
+
+class _ExternalPipeline(_UnlinkedPipeline):
+    def compile_extra(self, func: Any) -> Any:
+        """Callers' files know the function by a name that is the same in every process: numba's
+        counts functions and types as they come."""
+
+        def mangler(name: str, types: Any, **_: Any) -> str:
+            digest = hashlib.sha256(str(tuple(types)).encode()).hexdigest()[:16]
+            return str(default_mangler(f"{name}_{digest}", ()))
+
+        self.state.targetctx = self.state.targetctx.subtarget(mangler=mangler)
+        return super().compile_extra(func)
+
+
+class _UnlinkedCompiler(_FunctionCompiler):
+    def _customize_flags(self, flags: Any) -> Any:
+        flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
+        return flags
+
+
+class Kernel(CPUDispatcher):
+    """A compiled function: a dispatcher of numba whose callees are parts.
+
+    folder: that of its files on disk, or None. apart: callers do not take its text in but call its
+    machine code; so must a function of a module be that several kernels call and that is long.
+    """
+
+    def __init__(
+        self,
+        py_func: Any,
+        locals: Any = None,
+        targetoptions: Any = None,
+        pipeline_class: Any = Compiler,
+        folder: Path | None = None,
+        apart: bool = False,
+    ) -> None:
+        super().__init__(py_func, locals, targetoptions, pipeline_class)
+        self.folder, self.apart = folder, apart
+        self.parts: dict[Any, Any] = {}
+        self._unlinked_compiler = _UnlinkedCompiler(
+            py_func,
+            self.targetdescr,
+            self.targetoptions,
+            self.locals,
+            _ExternalPipeline if apart else _UnlinkedPipeline,
+        )
+
+    def get_part(self, args: tuple[types.Type, ...]) -> Any:
+        """What callers link, for arguments of these types."""
+        with global_compiler_lock, self._compiling_counter:
+            if args not in self.parts:
+                if self.apart:
+                    self.compile(args)
+                    part = self.overloads[args]._replace(
+                        library=_ExternalLibrary(self._find_path(args))
+                    )
+                else:
+                    part = self._unlinked_compiler.compile(args, None)
+                part = part._replace(entry_point=part.library)  # the key of its code for callers
+                self.targetctx.insert_user_function(part.entry_point, part.fndesc, [part.library])
+                self.parts[args] = part
+            return self.parts[args]
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """What numba asks when it finds a call: the part's signature.
+
+        A literal is any number of its type: numba would compile the same text for 0, for 1 and for
+        an integer.
+        """
+        pysig, args = self._compiler.fold_argument_types(args, kws)
+        part = self.get_part(tuple(map(types.unliteral, args)))
+        name = self.py_func.__name__
+        return make_concrete_template(name, key=name, signatures=[part.signature]), pysig, args, {}
+
+    def get_overload(self, sig: Any) -> Any:
+        """What numba asks when it writes a call: the key of the part."""
+        return self.get_part(tuple(normalize_signature(sig)[0])).entry_point
+
+    def compile(self, sig: Any) -> Any:
+        """The call for arguments of these types, from the disk where it is kept."""
+        args = tuple(normalize_signature(sig)[0])
+        with global_compiler_lock:
+            if args not in self.overloads:
+                if not self._can_compile:
+                    raise RuntimeError("compilation disabled")
+                self.add_overload(self._load_or_build(args))
+            return self.overloads[args].entry_point
+
+    def _make_key(self, args: tuple[types.Type, ...]) -> str:
+        return kernel_cache.make_key(self.py_func, args, self.targetctx.codegen())
+
+    def _find_path(self, args: tuple[types.Type, ...]) -> Path | None:
+        if self.folder is None:
+            return None
+        return kernel_cache.make_path(self.folder, self.py_func, self._make_key(args))
+
+    def _load_or_build(self, args: tuple[types.Type, ...]) -> Any:
+        path, key = self._find_path(args), self._make_key(args)
+        if path is None:
+            return self._build(args)[0]
+        result = kernel_cache.load(path, key, self.py_func, args, self.targetctx)
+        if result is None:
+            result, environments, needs = self._build(args)
+            nameless = self.apart and str(result.signature.return_type) not in kernel_cache.RETURNS
+            if None not in needs and not nameless:
+                names = [(kernel_path.parent.name, kernel_path.name) for kernel_path in needs]
+                kernel_cache.save(path, key, result, environments, names)
+        return result
+
+    def _build(self, args: tuple[types.Type, ...]) -> tuple[Any, dict[str, Any], list[Any]]:
+        """What `_link_library` returns, compiled while the user waits."""
+        location = f"cached in {self.folder.parent}" if self.folder else "not cached"
+        report_once(
+            "compiling",
+            f"compiling kernels for this machine, 10 s to a minute ({location}) ...",
+            logging.INFO,
+        )
+        start, nested = time.process_time(), _spent[0]
+        with quickly():
+            result = _link_library(
+                self._unlinked_compiler.compile(args, None) if self.apart else self.get_part(args)
+            )
+        spent = time.process_time() - start
+        own_time, _spent[0] = spent - (_spent[0] - nested), nested + spent
+        _logger.info("compiled %s in %.1f CPU-s", self.py_func.__qualname__, own_time)
+        return result
+
+
+def _link_library(part: Any) -> tuple[Any, dict[str, Any], list[Path | None]]:
+    """A part with everything below it, optimised and emitted; all their environments; the files of
+    the kernels apart that it calls."""
+    target = part.target_context
+    library = Whole(target.codegen(), part.library.name)
+    library.enable_object_caching()
+    root, *callees = _collect_callees(part.library)
+    library.add_llvm_module(root._final_module.clone())  # where others find the function by name
+    library._reload_init.update(root._reload_init)
+    needs = [item.path for item in callees if isinstance(item, _ExternalLibrary)]
+    for item in callees:
+        if not isinstance(item, _ExternalLibrary):
+            library.add_linking_library(
+                _BareLibrary(item) if isinstance(item, UnlinkedLibrary) else item
+            )
+    target.create_cpython_wrapper(library, part.fndesc, part.environment, part.call_helper)
+    entry = target.get_executable(library, part.fndesc, part.environment)
+    all_environments = {
+        item: lookup_environment(item) for item in kernel_cache.list_environments(library)
+    }
+    environments = {name: item for name, item in all_environments.items() if item is not None}
+    kernel_cache.set_environments(library, environments)
+    return part._replace(library=library, entry_point=entry), environments, needs
+
+
+def _collect_callees(library: Any) -> list[Any]:
+    """A part and all it calls, directly or not, callers first.
+
+    LLVM's linker leaves out what nothing refers to yet.
+    """
+    visited: dict[Any, None] = {}
+
+    def visit(node: Any) -> None:
+        if isinstance(node, UnlinkedLibrary):
+            for callee in node._linking_libraries:
+                if callee not in visited:
+                    visit(callee)
+        visited[node] = None
+
+    visit(library)
+    return list(reversed(visited))

@@ -1,0 +1,241 @@
+"""Elementary functions as polynomials of our own: every backend gives the same bits.
+
+Library functions differ in the last bit between platforms, vector units and devices; these use
+only + - * / and correctly rounded square roots. Errors are stated at each function.
+
+Counter-based random numbers: each one is a pure function of (key, tick, channel).
+
+Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) gives four
+32-bit words for a counter and a key. Words live in signed 64-bit integers under masks, so that
+compiled code, Python, NumPy and torch compute the same words.
+"""
+
+from typing import Any, NamedTuple
+
+from .jit import jit
+from .primitives import absolute, floor, frexp, maximum, minimum, select, sqrt, to_float
+
+_TWO_OVER_PI = 0.6366197723675814
+_PI_2_HIGH = 1.5707963267341256  # the first 33 bits of pi/2, so that k * high is exact
+_PI_2_LOW = 6.077100506506192e-11
+PI = 3.141592653589793
+
+
+@jit
+def sin_kernel(r: Any) -> Any:
+    """sin r for |r| <= pi/4, error below 1e-16."""
+    z = r * r
+    p = 1.58969099521155010221e-10
+    p = p * z - 2.50507602534068634195e-08
+    p = p * z + 2.75573137070700676789e-06
+    p = p * z - 1.98412698298579493134e-04
+    p = p * z + 8.33333333332248946124e-03
+    p = p * z - 1.66666666666666324348e-01
+    return r + r * (z * p)
+
+
+@jit
+def cos_kernel(r: Any) -> Any:
+    """cos r for |r| <= pi/4, error below 2e-16."""
+    z = r * r
+    p = -1.13596475577881948265e-11
+    p = p * z + 2.08757232129817482790e-09
+    p = p * z - 2.75573143513906633035e-07
+    p = p * z + 2.48015872894767294178e-05
+    p = p * z - 1.38888888888741095749e-03
+    p = p * z + 4.16666666666666019037e-02
+    return 1.0 - 0.5 * z + z * (z * p)
+
+
+@jit
+def sincos(x: Any) -> Any:
+    """(sin x, cos x); error below 3e-16 + 1e-16 |x| for |x| < 1e6 rad."""
+    k = floor(x * _TWO_OVER_PI + 0.5)
+    r = (x - k * _PI_2_HIGH) - k * _PI_2_LOW
+    return quadrant(k - 4.0 * floor(0.25 * k), sin_kernel(r), cos_kernel(r))
+
+
+@jit
+def quadrant(q: Any, s: Any, c: Any) -> Any:
+    """(sin, cos) of an angle turned by q = 0, 1, 2 or 3 quarter turns."""
+    odd = (q == 1.0) | (q == 3.0)
+    sign_s = select(q > 1.5, -1.0, 1.0)
+    sign_c = select((q == 1.0) | (q == 2.0), -1.0, 1.0)
+    return sign_s * select(odd, c, s), sign_c * select(odd, s, c)
+
+
+@jit
+def _atan_kernel(t: Any) -> Any:
+    """arctan t for |t| < 0.1990, error below 1e-16: the series."""
+    z = t * t
+    p = 1.0 / 23.0
+    p = 1.0 / 21.0 - z * p
+    p = 1.0 / 19.0 - z * p
+    p = 1.0 / 17.0 - z * p
+    p = 1.0 / 15.0 - z * p
+    p = 1.0 / 13.0 - z * p
+    p = 1.0 / 11.0 - z * p
+    p = 1.0 / 9.0 - z * p
+    p = 1.0 / 7.0 - z * p
+    p = 1.0 / 5.0 - z * p
+    p = 1.0 / 3.0 - z * p
+    return t - t * (z * p)
+
+
+@jit
+def atan(x: Any) -> Any:
+    """arctan x, error below 5e-16: reciprocal above 1, two half-angle steps, then the series."""
+    steep = absolute(x) > 1.0
+    u = select(steep, -1.0, x) / select(steep, x, 1.0)
+    t = u / (1.0 + sqrt(1.0 + u * u))
+    t = t / (1.0 + sqrt(1.0 + t * t))
+    return 4.0 * _atan_kernel(t) + select(steep, select(x > 0.0, 0.5 * PI, -0.5 * PI), 0.0)
+
+
+@jit
+def atan2(y: Any, x: Any) -> Any:
+    """The angle of the vector (x, y) in [-pi, pi], error below 1e-15; 0 at the origin.
+
+    The half-angle steps of `atan` without their quotients: tan(a / 2) = y / (x + |(x, y)|).
+    """
+    wide, high = absolute(x), absolute(y)
+    steep = high > wide
+    far, near = maximum(wide, high), minimum(wide, high)
+    far = far + sqrt(far * far + near * near)
+    far = far + sqrt(far * far + near * near)
+    turn = 4.0 * _atan_kernel(near / maximum(far, 1e-300))
+    turn = select(steep, 0.5 * PI - turn, turn)
+    turn = select(x < 0.0, PI - turn, turn)
+    return select(y < 0.0, 0.0 - turn, turn)
+
+
+@jit
+def wrap(angle: Any) -> Any:
+    """The angle brought into [-pi, pi)."""
+    return angle - 2.0 * PI * floor(angle / (2.0 * PI) + 0.5)
+
+
+@jit
+def smoothstep(x: Any) -> Any:
+    """0 below 0, 1 above 1, the C1 cubic between."""
+    t = select(x < 0.0, 0.0, select(x > 1.0, 1.0, x))
+    return t * t * (3.0 - 2.0 * t)
+
+
+@jit
+def exp(x: Any) -> Any:
+    """e^x for |x| < 8, relative error below 5e-14: a polynomial at x / 64, squared six times."""
+    z = x * (1.0 / 64.0)
+    p = 1.0 / 362880.0
+    p = p * z + 1.0 / 40320.0
+    p = p * z + 1.0 / 5040.0
+    p = p * z + 1.0 / 720.0
+    p = p * z + 1.0 / 120.0
+    p = p * z + 1.0 / 24.0
+    p = p * z + 1.0 / 6.0
+    p = p * z + 0.5
+    p = p * z + 1.0
+    p = p * z + 1.0
+    for _ in range(6):
+        p = p * p
+    return p
+
+
+@jit
+def clip(value: Any, low: Any, high: Any) -> Any:
+    """The value kept within [low, high]."""
+    return minimum(maximum(value, low), high)
+
+
+_MASK = 0xFFFFFFFF
+_M0, _M1 = 0xD2511F53, 0xCD9E8D57
+_W0, _W1 = 0x9E3779B9, 0xBB67AE85
+_2_32 = 4294967296.0
+_LN2 = 0.6931471805599453
+_SQRT_HALF = 0.7071067811865476
+
+
+class Channels(NamedTuple):
+    """The table of channels: a block of four numbers for each use. New blocks go at the end."""
+
+    inertial: int = 0  # gyro, a_y, a_x, roll rate
+    wheels: int = 1  # left and right front wheel speed, disturbance force, disturbance moment
+    camera: int = 2  # psi, y_l, two unused
+    gps: int = 3  # course, speed, X, Y
+    camera_link: int = 4  # uniforms: delay, loss, duplication, one unused
+    gps_link: int = 5  # the same of the GPS
+    initial: int = 6  # disturbance force and moment at reset; clock phases
+    scenario: int = 7  # uniforms of the scenario's draws; the counter's tick is the attempt
+    sky: int = 8  # log HDOP's innovation, its start at reset, two unused
+    steering: int = 9  # of a driver who wanders; three unused
+
+
+CHANNELS = Channels()
+
+
+@jit
+def philox(key_low: int, key_high: int, a: int, b: int, c: int = 0, d: int = 0) -> Any:
+    """Four random 32-bit words (non-negative integers) for a counter (a, b, c, d)."""
+    k0, k1 = key_low & _MASK, key_high & _MASK  # tells compilers that products fit
+    a, b, c, d = a & _MASK, b & _MASK, c & _MASK, d & _MASK
+    for _ in range(10):
+        p0 = _M0 * a
+        p1 = _M1 * c
+        a, b, c, d = (
+            ((p1 >> 32) & _MASK) ^ b ^ k0,
+            p1 & _MASK,
+            ((p0 >> 32) & _MASK) ^ d ^ k1,
+            p0 & _MASK,
+        )
+        k0 = (k0 + _W0) & _MASK
+        k1 = (k1 + _W1) & _MASK
+    return a, b, c, d
+
+
+@jit
+def to_uniform(word: int) -> Any:
+    """A number in (0, 1) from a 32-bit word; never 0, never 1."""
+    return (to_float(word) + 0.5) / _2_32
+
+
+@jit
+def _log_uniform(word: int) -> Any:
+    """log((word + 0.5) / 2^32), error below 1e-13."""
+    m, exponent = frexp(to_float(2 * word + 1))  # of 2^33
+    z = (m - _SQRT_HALF) / (m + _SQRT_HALF)  # |z| < 0.1716
+    q = z * z
+    p = 1.0 / 15.0
+    p = p * q + 1.0 / 13.0
+    p = p * q + 1.0 / 11.0
+    p = p * q + 1.0 / 9.0
+    p = p * q + 1.0 / 7.0
+    p = p * q + 1.0 / 5.0
+    p = p * q + 1.0 / 3.0
+    return 2.0 * (z + z * (q * p)) - (33.0 - exponent + 0.5) * _LN2
+
+
+@jit
+def _draw_normal_pair(first: int, second: int) -> Any:
+    """Two standard normal numbers from two words (Box and Muller)."""
+    radius = sqrt(maximum(-2.0 * _log_uniform(first), 0.0))  # below 0 by rounding in float32 alone
+    turn = second + (1 << 29)  # the quarter turns are the two leading bits, exactly
+    q = turn >> 30
+    r = (to_float(turn - (q << 30)) - 536870912.0 + 0.5) * (2.0 * PI / _2_32)
+    s, c = quadrant(to_float(q & 3), sin_kernel(r), cos_kernel(r))
+    return radius * c, radius * s
+
+
+@jit
+def draw_normals(key_low: int, key_high: int, tick: int, block: int) -> Any:
+    """Four independent standard normal numbers of a block at a tick."""
+    a, b, c, d = philox(key_low, key_high, tick, block)
+    n0, n1 = _draw_normal_pair(a, b)
+    n2, n3 = _draw_normal_pair(c, d)
+    return n0, n1, n2, n3
+
+
+@jit
+def draw_uniforms(key_low: int, key_high: int, tick: int, block: int, index: int = 0) -> Any:
+    """Four independent numbers, uniform in (0, 1), of a block at a tick."""
+    a, b, c, d = philox(key_low, key_high, tick, block, index)
+    return to_uniform(a), to_uniform(b), to_uniform(c), to_uniform(d)

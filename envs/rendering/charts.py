@@ -1,0 +1,408 @@
+"""Strip charts over time: truth, references, estimates with their standard deviation.
+
+The car close up, its nose to the right: velocity and sideslip angle, tyre forces in their
+friction circles, motor torques, wind.
+
+A picture of one car: the road, the close-up, and the strip charts.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..engine.layout import FLAGS, P
+from ..record import Array
+from ..task import FAILURES, ZERO_SLIP
+from ..ticks import TICK
+from ..vehicle.parameters import GRAVITY
+from .canvas import Box, Canvas, pygame
+from .palette import GREY, INK, PALETTE, find_colour, mix_colours
+from .road import (
+    BLUE,
+    ORANGE,
+    SOFT,
+    CarScene,
+    CarTrack,
+    compute_body,
+    draw_road,
+    make_body_outline,
+    make_car_scene,
+    make_wheel_outline,
+)
+from .trace import TRACE_POINT, RenderState
+
+MAX_SPAN = 10.0  # s that are shown at most
+_DEGREES = math.degrees(1.0)
+_GRID, _ROW = "#E3E6E9", 20.0
+
+
+class ChartLine(NamedTuple):
+    """A line of a strip: values over time, an estimate's standard deviation around it."""
+
+    t: Array
+    values: Array
+    colour: str
+    dashed: bool = False
+    deviation: Array | None = None
+    width: float = 1.6
+
+
+class Strip(NamedTuple):
+    """A chart.
+
+    Attributes:
+        title: Title with a unit.
+        min_limit: Least that its axis reaches to either side, in that unit.
+        share: Weight of its height among all strips.
+        lines: Its lines.
+    """
+
+    title: str
+    min_limit: float
+    share: float
+    lines: list[ChartLine]
+
+
+def make_strips(
+    truth: Array,
+    estimates: dict[str, Array],
+    colours: dict[str, str],
+    ghosts: list[tuple[Array, str]],
+    max_moment: float,
+    has_yaw_reference: bool,
+) -> list[Strip]:
+    """Make the charts of a car's sideslip angle, yaw rate and yaw moment, with those of ghosts.
+
+    Args:
+        truth: Rows of `TracePoint`, shape (n, len(TracePoint)).
+        estimates: By label, estimates and standard deviations (rad), shape (n, 2).
+        colours: Colours by label.
+        ghosts: Rows of `TracePoint` and colour of each ghost.
+        max_moment: Full scale of the yaw moment (N m).
+        has_yaw_reference: Whether the yaw rate has a reference.
+
+    Returns:
+        The charts.
+    """
+
+    def make_lines(column: int, factor: float) -> list[ChartLine]:
+        others = [
+            ChartLine(g[:, TRACE_POINT.t], factor * g[:, column], shade) for g, shade in ghosts
+        ]
+        return [*others, ChartLine(t, factor * truth[:, column], INK, width=2.0)]
+
+    t = truth[:, TRACE_POINT.t]
+    estimate_lines = [
+        ChartLine(t, _DEGREES * hat, colours[name], deviation=_DEGREES * std)
+        for name, (hat, std) in ((name, columns.T) for name, columns in estimates.items())
+    ]
+    reference_lines = [
+        ChartLine(t, _DEGREES * truth[:, column], INK, True, width=1.0)
+        for column in (TRACE_POINT.beta_ref, TRACE_POINT.gamma_ref)
+    ]
+    return [
+        Strip(
+            "sideslip angle / deg",
+            1.0,
+            1.6,
+            [reference_lines[0], *make_lines(TRACE_POINT.beta, _DEGREES), *estimate_lines],
+        ),
+        Strip(
+            "yaw rate / (deg/s)",
+            10.0,
+            1.0,
+            [*reference_lines[1:][:has_yaw_reference], *make_lines(TRACE_POINT.gamma, _DEGREES)],
+        ),
+        Strip("yaw moment / (N m)", 0.2 * max_moment, 1.0, make_lines(TRACE_POINT.yaw_moment, 1.0)),
+    ]
+
+
+def draw_strips(canvas: Canvas, box: Box, strips: list[Strip], first: float, span: float) -> None:
+    """Draw strips below one another in a box.
+
+    Args:
+        canvas: The canvas.
+        box: The box.
+        strips: The charts.
+        first: Time at their left end (s).
+        span: Time that they show (s).
+    """
+    left, top, width, height = box
+    high = (height - _ROW) / sum(strip.share for strip in strips)
+    y = top
+    for strip in strips:
+        inside = left + 48.0, y + _ROW, width - 60.0, strip.share * high - _ROW - 4.0
+        _draw_strip(canvas, inside, strip, first, span)
+        y += strip.share * high
+    step = 1.0 if span <= 10.0 else 2.0
+    for t in np.arange(math.ceil(first / step) * step, first + span + 1e-6, step):
+        x = left + 48.0 + (width - 60.0) * (t - first) / span
+        canvas.draw_text((x, top + height - 10.0), f"{t:g}", SOFT, 11, 0.5)
+    canvas.draw_text((left, top + height - 10.0), "time / s", SOFT, 11)
+
+
+def _draw_strip(canvas: Canvas, box: Box, strip: Strip, first: float, span: float) -> None:
+    left, top, width, height = box
+    largest = max((_find_largest(line) for line in strip.lines), default=0.0)
+    limit = _find_nice_limit(max(strip.min_limit, 1.05 * largest))
+
+    def to_pixels(t: Array, values: Array) -> Array:
+        share = np.clip(values / limit, -1.1, 1.1)
+        return np.stack([left + width * (t - first) / span, top + 0.5 * height * (1.0 - share)], 1)
+
+    canvas.draw_box(box, "#FFFFFF")
+    for share in (-1.0, 0.0, 1.0):
+        y = top + 0.5 * height * (1.0 - share)
+        canvas.draw_line([(left, y), (left + width, y)], _GRID, 1.0)
+        canvas.draw_text((left - 6.0, y), f"{share * limit:g}", SOFT, 11, 1.0)
+    canvas.draw_text((left, top - 0.5 * _ROW + 2.0), strip.title, INK, 12)
+    canvas.set_clip(box)
+    for line in strip.lines:
+        if line.deviation is not None:
+            is_known = np.isfinite(line.values) & np.isfinite(line.deviation)
+            t, middle, std = line.t[is_known], line.values[is_known], line.deviation[is_known]
+            if len(t) > 1:
+                edges = to_pixels(t, middle + std), to_pixels(t, middle - std)[::-1]
+                canvas.draw_polygon(
+                    np.concatenate(edges), mix_colours(line.colour, "#FFFFFF", 0.25)
+                )
+    for line in strip.lines:
+        is_known = np.isfinite(line.values)
+        points = to_pixels(line.t[is_known], line.values[is_known])
+        if len(points) > 1:
+            draw_points = canvas.draw_dashes if line.dashed else canvas.draw_line
+            draw_points(points, line.colour, line.width)
+        if len(points) and not line.dashed:
+            canvas.draw_disc(points[-1], 2.6, line.colour)
+    canvas.set_clip(None)
+
+
+def _find_largest(line: ChartLine) -> float:
+    return float(np.max(np.abs(line.values), initial=0.0, where=np.isfinite(line.values)))
+
+
+def _find_nice_limit(limit: float) -> float:
+    """The next of 1, 2, 5, 10, ..., times a power of ten."""
+    power = 10.0 ** math.floor(math.log10(limit))
+    return next(
+        factor * power for factor in (1.0, 2.0, 3.0, 5.0, 10.0) if factor * power >= limit - 1e-9
+    )
+
+
+ToPixels = Callable[[Array], Array]  # from car axes to pixels
+GREEN = PALETTE[2]
+PAPER = "#F7F8F8"
+MAGNIFIED = 4.0  # times the sideslip angle is drawn
+_LENGTH, _CIRCLE = 190.0, 38.0  # pixels: the car, and the circle of 0.3 of its weight
+
+
+def draw_closeup(
+    canvas: Canvas,
+    box: Box,
+    scene: CarScene,
+    beta: float,
+    reference: float,
+    estimates: dict[str, tuple[float, str]],
+) -> None:
+    """Draw the close-up of a car in a box.
+
+    Args:
+        canvas: The canvas.
+        box: The box.
+        scene: The car.
+        beta: Sideslip angle (rad).
+        reference: Reference of the sideslip angle (rad).
+        estimates: By label, estimate of the sideslip angle (rad) and its colour.
+    """
+    front, rear, half = compute_body(scene.vehicle)
+    scale = _LENGTH / (front - rear)
+    x_0 = box[0] + 0.52 * box[2] - 0.5 * scale * (front + rear)
+    y_0 = box[1] + 0.5 * box[3]
+
+    def to_pixels(points: Array) -> Array:
+        x, y = np.asarray(points, float).T * scale
+        return np.stack([x_0 + x, y_0 - y], 1)
+
+    canvas.draw_polygon(to_pixels(make_body_outline(rear, front, half)), "#C9CED4")
+    inner = make_body_outline(rear + 0.02, front - 0.02, half - 1.5 / scale)
+    canvas.draw_polygon(to_pixels(inner), "#EDEFF1")
+    per_newton = _CIRCLE / (0.3 * scene.vehicle.mass * GRAVITY)
+    for wheel in scene.wheels:
+        centre = to_pixels(np.array([[wheel.x, wheel.y]]))[0]
+        if wheel.capacity > 0.0:
+            canvas.draw_disc(
+                centre, wheel.capacity * per_newton, mix_colours(PALETTE[5], PAPER, 0.16)
+            )
+            canvas.draw_ring(
+                centre, wheel.capacity * per_newton, mix_colours(PALETTE[5], PAPER, 0.7), 1.0
+            )
+    for wheel in scene.wheels:
+        canvas.draw_polygon(
+            to_pixels(make_wheel_outline(wheel.x, wheel.y, wheel.angle, scene.vehicle)), "#A9B0B7"
+        )
+    _draw_forces(canvas, scene, to_pixels, per_newton)
+    _draw_motors(canvas, box, scene, to_pixels)
+    _draw_directions(canvas, (x_0, y_0), beta, reference, estimates)
+    if scene.wind:
+        foot = np.array([x_0, y_0 + math.copysign(0.5 * box[3] - 34.0, scene.wind)])
+        canvas.draw_arrow(foot, foot - (0.0, math.copysign(34.0, scene.wind)), PALETTE[3], 4.0)
+        canvas.draw_text((foot[0] + 12.0, foot[1]), f"wind {abs(scene.wind):.0f} N", PALETTE[3], 12)
+    if any(wheel.capacity for wheel in scene.wheels):
+        words = "tyre forces in their friction circles"
+        canvas.draw_text((box[0] + 14.0, box[1] + 12.0), words, SOFT, 12)
+    degrees = round(math.degrees(beta), 1) + 0.0  # no -0.0
+    words = f"sideslip angle {degrees:+.1f} deg, drawn x {MAGNIFIED:.0f}"
+    canvas.draw_text((box[0] + 14.0, box[1] + box[3] - 12.0), words, INK, 12)
+
+
+def _draw_forces(canvas: Canvas, scene: CarScene, to_pixels: ToPixels, per_newton: float) -> None:
+    """Draw an arrow a tyre, from green to orange as it nears its limit, and the fraction in use."""
+    for wheel in scene.wheels:
+        cos, sin = math.cos(wheel.angle), math.sin(wheel.angle)
+        forward = cos * wheel.F_x - sin * wheel.F_y
+        left = sin * wheel.F_x + cos * wheel.F_y
+        start = to_pixels(np.array([[wheel.x, wheel.y]]))[0]
+        utilisation = math.hypot(forward, left) / wheel.capacity if wheel.capacity else 0.0
+        colour = mix_colours(ORANGE, GREEN, min(utilisation, 1.0) ** 3)
+        canvas.draw_arrow(start, start + per_newton * np.array([forward, -left]), colour, 3.0)
+        if wheel.capacity:
+            label_gap = math.copysign(wheel.capacity * per_newton + 10.0, wheel.y)
+            canvas.draw_text(
+                (start[0], start[1] - label_gap), f"{100.0 * utilisation:.0f} %", colour, 12, 0.5
+            )
+
+
+def _draw_motors(canvas: Canvas, box: Box, scene: CarScene, to_pixels: ToPixels) -> None:
+    """Each rear motor's torque as a bar, to the right where it drives."""
+    for wheel, torque in zip(scene.wheels[2:], scene.torques, strict=True):
+        _, y = to_pixels(np.array([[wheel.x, wheel.y]]))[0]
+        x = box[0] + 44.0
+        canvas.draw_box((x - 30.0, y + 4.0, 60.0, 7.0), "#E4E7EA", 3.5)
+        share = min(max(torque / scene.max_torque, -1.0), 1.0)
+        canvas.draw_box((x + min(30.0 * share, 0.0), y + 4.0, abs(30.0 * share), 7.0), PALETTE[0])
+        canvas.draw_line([(x, y + 2.0), (x, y + 13.0)], SOFT, 1.0)
+        canvas.draw_text((x, y - 6.0), f"{torque:+.0f} N m", INK, 12, 0.5)
+
+
+def _draw_directions(
+    canvas: Canvas,
+    centre: tuple[float, float],
+    beta: float,
+    reference: float,
+    estimates: dict[str, tuple[float, str]],
+) -> None:
+    """Draw the directions of the velocity, of its reference and of the estimates."""
+
+    foot = np.array(centre)
+
+    def find_tip(angle: float, length: float) -> Array:
+        drawn_angle = MAGNIFIED * angle
+        return foot + length * np.array([math.cos(drawn_angle), -math.sin(drawn_angle)])
+
+    canvas.draw_line(np.array([foot, find_tip(0.0, 138.0)]), "#C3C8CE", 1.0)
+    canvas.draw_dashes(np.array([foot, find_tip(reference, 138.0)]), INK, 1.0, 4.0, 3.0)
+    for angle, colour in estimates.values():
+        canvas.draw_line(np.array([foot, find_tip(angle, 132.0)]), colour, 2.0)
+    canvas.draw_arrow(foot, find_tip(beta, 122.0), INK, 3.0)
+    canvas.draw_disc(centre, 4.0, INK)
+    canvas.draw_disc(centre, 1.8, "#FFFFFF")
+
+
+SIZE = 960, 540
+_ROAD, _CLOSEUP, _STRIPS = (
+    (0.0, 40.0, 960.0, 216.0),
+    (0.0, 262.0, 336.0, 278.0),
+    (344.0, 284.0, 608.0, 252.0),
+)
+
+
+def draw_picture(
+    shot: RenderState, name: str = "true", ghosts: Sequence[tuple[str, RenderState]] = ()
+) -> pygame.Surface:
+    """Draw the picture of a car, with ghosts that drive beside it.
+
+    Args:
+        shot: State of the car.
+        name: Name of its driver.
+        ghosts: Name and state of each ghost.
+
+    Returns:
+        The picture.
+    """
+    p, _, switches, _, config, trace, _, draw_world = shot
+    now = trace.newest
+    span = min(max(float(p[P.task.duration]) * TICK, 2.0), MAX_SPAN)
+    first = max(now[TRACE_POINT.t] - span, 0.0)
+    truth, estimates = trace.select_since(first)
+    shades = _choose_shades(estimates)
+    scene = make_car_scene(shot)
+    ghost_cars = [
+        CarTrack(make_car_scene(item), item.trace.select_since(first)[0], GREY, ghost_name)
+        for ghost_name, item in ghosts
+    ]
+    canvas = Canvas(SIZE)
+    canvas.draw_box((0.0, 0.0, *SIZE), PAPER)
+    if draw_world is None:
+        draw_road(
+            canvas, _ROAD, [*ghost_cars, CarTrack(scene, truth, BLUE, name if ghosts else "")]
+        )
+    newest = {label: (float(item[-1, 0]), shades[label]) for label, item in estimates.items()}
+    finite_estimates = {label: item for label, item in newest.items() if math.isfinite(item[0])}
+    draw_closeup(
+        canvas, _CLOSEUP, scene, now[TRACE_POINT.beta], now[TRACE_POINT.beta_ref], finite_estimates
+    )
+    has_yaw_reference = int(switches[FLAGS.reference]) != ZERO_SLIP
+    others = [(item.truth, item.colour) for item in ghost_cars]
+    full_scale = float(p[P.task.yaw_scale])
+    strips = make_strips(truth, estimates, shades, others, full_scale, has_yaw_reference)
+    draw_strips(canvas, _STRIPS, strips, first, span)
+    _draw_legend(canvas, name, [item for item, _ in ghosts], shades)
+    failures = [("", scene.failure), *((item.name, item.scene.failure) for item in ghost_cars)]
+    _draw_heading(canvas, scene, config.scenario.name, now[TRACE_POINT.t], failures)
+    picture = canvas.finish()
+    if draw_world is not None:
+        size = int(_ROAD[2]), int(_ROAD[3])
+        picture.blit(draw_world(size, [item.scene.motion for item in ghost_cars]), _ROAD[:2])
+    return picture
+
+
+def _choose_shades(labels: Iterable[str]) -> dict[str, str]:
+    """Choose a colour for each estimator, its own where no other has it."""
+    shades: dict[str, str] = {}
+    for label in labels:
+        used_shades = shades.values()
+        choices = (find_colour(label), *PALETTE)
+        shades[label] = next(
+            (choice for choice in choices if choice not in used_shades), choices[0]
+        )
+    return shades
+
+
+def _draw_legend(canvas: Canvas, name: str, ghosts: Sequence[str], shades: dict[str, str]) -> None:
+    entries = [(name, INK, False), ("reference", INK, True)]
+    entries += [(ghost, GREY, False) for ghost in ghosts]
+    entries += [(f"{label} ± 1 std", shade, False) for label, shade in shades.items()]
+    x = _STRIPS[0] + 48.0
+    for words, shade, dashed in entries:
+        draw_sample = canvas.draw_dashes if dashed else canvas.draw_line
+        draw_sample([(x, 272.0), (x + 20.0, 272.0)], shade, 2.5 if not dashed else 1.5)
+        x += 26.0 + canvas.draw_text((x + 26.0, 272.0), words, INK, 12) + 18.0
+
+
+def _draw_heading(
+    canvas: Canvas, scene: CarScene, scenario: str, t: float, failures: list[tuple[str, int]]
+) -> None:
+    """Draw the names of scenario and car, the speed, and whose drive failed."""
+    x = 30.0 + canvas.draw_text((16.0, 20.0), scenario, INK, 17, bold=True)
+    speed = 3.6 * math.hypot(scene.motion.v_x, scene.motion.v_y)
+    car = f"{scene.vehicle.name}, {speed:.0f} km/h, friction {scene.friction:.2f}"
+    x += 16.0 + canvas.draw_text((x, 21.0), car, SOFT, 14)
+    for name, failure in failures:
+        if failure:
+            words = f"{name}: {FAILURES[failure]}" if name else FAILURES[failure]
+            width = canvas.draw_text((x + 10.0, 20.0), words, "#FFFFFF", 13)
+            canvas.draw_box((x, 9.0, width + 20.0, 22.0), ORANGE, 11.0)
+            x += width + 30.0
+    canvas.draw_text((SIZE[0] - 16.0, 20.0), f"{t:.2f} s", INK, 17, 1.0, True)

@@ -1,0 +1,210 @@
+"""Roads: straight ones with their bends, and those that follow a nominal car's path.
+
+Test tracks between cones, as lanes along a road and as the path a driver takes through them.
+
+ISO 3888-1 (double lane change) and ISO 3888-2 (obstacle avoidance) give fixed lengths and lane
+widths that grow with the vehicle's width, so a narrow car has narrow lanes and less far to go
+sideways. For the passenger car the lengths are the standards'. A car built for lower speeds drives
+them shortened in proportion to its speed (`scale`): the time in each section stays the same, and
+with it the lateral acceleration that the track asks for.
+
+ISO 3888-1's lane offset of 3.5 m is read as that between the right edges of the lanes; the last
+lane's right edge lies in line with the first one's in both.
+"""
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+from ..numerics.functions import smoothstep
+from ..numerics.jit import inline, jit
+from ..numerics.primitives import maximum
+from ..ticks import TICK
+from ..vehicle.linear import Bicycle, compute_bicycle_coefficients
+
+ROADS = ("straight", "nominal-path")
+STRAIGHT, NOMINAL_PATH = range(len(ROADS))
+_MIN_SPEED = 1.0  # m/s, of the nominal car
+
+
+class NominalMotion(NamedTuple):
+    """State of the nominal car whose path is the road."""
+
+    beta: Any  # rad
+    gamma: Any  # rad/s
+
+
+@inline
+def step_nominal_car(
+    nominal_motion: NominalMotion, steer: Any, speed: Any, car: Bicycle
+) -> tuple[Any, NominalMotion]:
+    """Step the nominal car, whose path is the road, over a tick by explicit Euler.
+
+    The direction of its path is psi + beta, so it turns by gamma + beta'. The road is a function of
+    time, and so of the seed alone: what the true car does has no effect on it.
+
+    Args:
+        nominal_motion: `NominalMotion` at the start of the tick.
+        steer: Steering angle held over the tick (rad).
+        speed: Speed (m/s), taken as at least 1.
+        car: `Bicycle` of the nominal vehicle.
+
+    Returns:
+        Turning rate of the road during the tick (rad/s), and the `NominalMotion` at its end.
+    """
+    V = maximum(speed, _MIN_SPEED)
+    a11, a12, a21, a22, b11, b21, _ = compute_bicycle_coefficients(
+        car.m, car.I, car.l_f, car.l_r, car.C_f, car.C_r, V
+    )
+    dbeta = a11 * nominal_motion.beta + a12 * nominal_motion.gamma + b11 * steer
+    dgamma = a21 * nominal_motion.beta + a22 * nominal_motion.gamma + b21 * steer
+    next_motion = NominalMotion(
+        nominal_motion.beta + TICK * dbeta, nominal_motion.gamma + TICK * dgamma
+    )
+    return nominal_motion.gamma + dbeta, next_motion
+
+
+TRANSITION_OVERLAP = (
+    0.15  # of a gap's length: how far the path's transition reaches into the lanes beside it
+)
+
+
+class Section(NamedTuple):
+    """A lane between cones."""
+
+    start: float  # m, along the road
+    length: float  # m
+    width: float  # m, between the cones
+    offset: float  # m, its centre line to the left of the road's
+
+
+class TrackPath(NamedTuple):
+    """A lateral offset from the road's centre line: two smooth transitions."""
+
+    shift_1: Any  # m, to the left
+    start_1: Any  # m, along the road
+    length_1: Any  # m
+    shift_2: Any
+    start_2: Any
+    length_2: Any
+
+
+def _make_iso_3888_1(width: float) -> tuple[Section, ...]:
+    first, side, last = 1.1 * width + 0.25, 1.2 * width + 0.25, 1.3 * width + 0.25
+    return (
+        Section(0.0, 15.0, first, 0.0),
+        Section(45.0, 25.0, side, 3.5 + 0.5 * (side - first)),
+        Section(95.0, 30.0, last, 0.5 * (last - first)),  # sections 5 and 6
+    )
+
+
+def _make_iso_3888_2(width: float) -> tuple[Section, ...]:
+    first, side, last = 1.1 * width + 0.25, width + 1.0, max(1.3 * width + 0.25, 3.0)
+    return (
+        Section(0.0, 12.0, first, 0.0),
+        Section(25.5, 11.0, side, 1.0 + 0.5 * (first + side)),  # 1 m from edge to edge
+        Section(49.0, 12.0, last, 0.5 * (last - first)),
+    )
+
+
+_TRACKS: dict[str, Callable[[float], tuple[Section, ...]]] = {
+    "iso-3888-1": _make_iso_3888_1,
+    "iso-3888-2": _make_iso_3888_2,
+}
+PATHS = ("road", *_TRACKS)
+
+
+def make_sections(
+    track: str, width: float, start: float = 0.0, scale: float = 1.0, side: float = 1.0
+) -> tuple[Section, ...]:
+    """Make the lanes of a track for a vehicle's width, in the order of driving.
+
+    Args:
+        track: Name of the track, of `PATHS`; "road" has no lanes.
+        width: Width of the vehicle (m).
+        start: Place along the road where the first lane begins (m).
+        scale: Factor on the lengths.
+        side: 1, or -1 to mirror the track.
+
+    Returns:
+        The lanes.
+
+    Raises:
+        ValueError: For an unknown track.
+    """
+    if track not in PATHS:
+        raise ValueError(f"unknown track {track!r}; known: {', '.join(PATHS)}")
+    lanes = _TRACKS[track](width) if track in _TRACKS else ()
+    return tuple(
+        Section(
+            start + scale * section.start,
+            scale * section.length,
+            section.width,
+            side * section.offset,
+        )
+        for section in lanes
+    )
+
+
+def make_path(track: str, width: float) -> TrackPath:
+    """Make the path through a track that begins at 0, in the standard's lengths.
+
+    It keeps to the centre of a lane but turns a little before its end and has not quite turned back
+    at its beginning (`TRANSITION_OVERLAP`), as far as the sides of the car stay between the cones.
+
+    Args:
+        track: Name of the track, of `PATHS`.
+        width: Width of the vehicle (m).
+
+    Returns:
+        The path.
+    """
+    shifts = []
+    lanes = make_sections(track, width)
+    for before, after in pairwise(lanes):
+        lane_end = before.start + before.length
+        gap = after.start - lane_end
+        shifts += [
+            after.offset - before.offset,
+            lane_end - TRANSITION_OVERLAP * gap,
+            (1.0 + 2.0 * TRANSITION_OVERLAP) * gap,
+        ]
+    return TrackPath(*(shifts or (0.0, 0.0, 1.0, 0.0, 0.0, 1.0)))
+
+
+@jit
+def transform_path(path: Any, start: Any, scale: Any, side: Any) -> Any:
+    """Shift, scale and mirror the path of a track.
+
+    Args:
+        path: `TrackPath` that begins at 0.
+        start: Place along the road where it begins (m).
+        scale: Factor on the lengths.
+        side: 1, or -1 to mirror it.
+
+    Returns:
+        The `TrackPath`.
+    """
+    return TrackPath(
+        side * path.shift_1,
+        start + scale * path.start_1,
+        scale * path.length_1,
+        side * path.shift_2,
+        start + scale * path.start_2,
+        scale * path.length_2,
+    )
+
+
+@jit
+def compute_path_offset(path: Any, s: Any) -> Any:
+    """Compute the path's lateral offset from the road's centre line; its slope is continuous.
+
+    Args:
+        path: `TrackPath`.
+        s: Distance along the road (m).
+
+    Returns:
+        Offset (m), to the left.
+    """
+    first = path.shift_1 * smoothstep((s - path.start_1) / path.length_1)
+    return first + path.shift_2 * smoothstep((s - path.start_2) / path.length_2)

@@ -1,0 +1,177 @@
+"""How a camera is mounted, from one picture of a lane: tilt and height.
+
+Straight markings meet in the vanishing point, whose row is the horizon's; how far they spread below
+it is the camera's height over a lane of known width. Needs the extra `vision`.
+
+A camera's intrinsics from photographs of a chessboard. Needs the extra `vision`.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from math import atan, cos
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from .analytic import FieldOfView
+from .images import Image
+from .lane_finder import Array, LaneFinder
+from .pinhole import WORKING_WIDTH, Pinhole, resample
+
+MAX_PAIRS, MIN_POINTS = 4000, 20  # pairs of points, and points
+_TOP, _BOTTOM = 0.55, 0.92  # of the picture's height: the road, without the bonnet
+_NEAR = 0.004  # of the focal length, from a line
+_SLOPES = 0.35, 4.0  # across over down, of a lane's own markings
+_TILTS, _HEIGHTS = (-0.14, 0.45), (0.8, 3.0)  # rad, m
+NEAR, FAR, HEADING = 6.0, 30.0, 0.12  # m, m, rad: beyond a bonnet, where markings are wide enough
+_STRAIGHT = 0.003, 0.01, 0.05  # 1/m, rad, rad: curvature, pitch and roll of the lane that shows it
+
+
+def make_default_camera(size: tuple[int, int]) -> Pinhole:
+    """Make a camera of unknown properties: 58 degrees wide, without distortion, level.
+
+    Args:
+        size: Width and height of its pictures (px).
+
+    Returns:
+        The camera.
+    """
+    width, height = size
+    K = ((0.9 * width, 0.0, width / 2), (0.0, 0.9 * width, height / 2), (0.0, 0.0, 1.0))
+    return Pinhole(K=K, dist=(0.0,) * 5, size=size, tilt=0.0, ahead=0.0)
+
+
+def estimate_mounting(camera: Pinhole, picture: Image, lane_width: float) -> Pinhole:
+    """Estimate the tilt and the height of a camera from a picture of a straight lane.
+
+    Args:
+        camera: The camera, whose tilt and height are not used.
+        picture: Bytes, grey (height, width) or in colour (height, width, 3).
+        lane_width: Distance from marking to marking (m).
+
+    Returns:
+        The camera with both.
+
+    Raises:
+        ValueError: If two markings are not found, or tilt and height are no car's.
+    """
+    points, weight = _find_ridges(camera, picture)
+    pair = _find_pair(points, weight)
+    if pair is None:
+        raise ValueError("no lane: no pair of markings was found: pass tilt and height")
+    (a, b), (c, d) = pair  # across = a + b down, left and right
+    down = (a - c) / (d - b)
+    tilt = atan(-down)
+    height = lane_width * cos(tilt) / (d - b)
+    mounted_camera = dataclasses.replace(camera, tilt=tilt, height=height)
+    finder = LaneFinder(
+        mounted_camera, lane_width, NEAR, FAR, view=FieldOfView(HEADING, 0.5 * lane_width)
+    )
+    finder.find(picture)
+    straight = finder.fit is not None and (np.abs(finder.fit[2:5]) < _STRAIGHT).all()
+    if not (straight and _HEIGHTS[0] < height < _HEIGHTS[1]):
+        what = f"for a camera {height:.2f} m high and tilted by {tilt:.3f} rad"
+        raise ValueError(f"no lane: the best markings are no straight one's {what}: pass both")
+    return mounted_camera
+
+
+def _find_ridges(camera: Pinhole, picture: Image) -> tuple[Array, Array]:
+    """(points (n, 2) on the plane one unit ahead, weight): bright ridges across the rows."""
+    grey = resample(picture if picture.ndim == 2 else picture.max(2))
+    rows = slice(int(_TOP * len(grey)), int(_BOTTOM * len(grey)))
+    smooth = cv2.GaussianBlur(grey[rows].astype(np.float32), (0, 0), 4.0)
+    light = -16.0 * cv2.Laplacian(smooth, cv2.CV_32F)
+    middle = light[:, 1:-1]
+    level = max(8.0, 4.0 * 1.4826 * float(np.median(np.abs(middle))))
+    is_ridge = (middle > level) & (middle >= light[:, :-2]) & (middle > light[:, 2:])
+    row, column = np.nonzero(is_ridge[::2])
+    pixels = np.stack([column + 1.5, 2.0 * row + rows.start + 0.5], 1)
+    pixels = pixels * camera.size[0] / WORKING_WIDTH - 0.5
+    weight = np.minimum(middle[::2][row, column], 40.0).astype(float)
+    return camera.undistort(pixels) if len(pixels) else pixels, weight
+
+
+def _find_pair(points: Array, weight: Array) -> tuple[Array, Array] | None:
+    """(left, right): each (2,), a and b of across = a + b down, by random consensus."""
+    if len(points) < MIN_POINTS:
+        return None
+    across, down = points.T
+    rng = np.random.Generator(np.random.SFC64(len(points)))
+    sums = np.cumsum(weight)
+    i, j = np.searchsorted(sums, rng.random((2, MAX_PAIRS)) * sums[-1]).clip(max=len(points) - 1)
+    with np.errstate(all="ignore"):
+        b = (across[j] - across[i]) / (down[j] - down[i])
+    is_marking = (
+        (np.abs(down[j] - down[i]) > 0.05) & (np.abs(b) > _SLOPES[0]) & (np.abs(b) < _SLOPES[1])
+    )
+    b = b[is_marking, None]
+    a = across[i[is_marking], None] - b * down[i[is_marking], None]
+    support = (np.abs(across - a - b * down) < _NEAR * (1.0 + np.abs(b))) @ weight
+    a, b = a[:, 0], b[:, 0]
+    left, right = np.flatnonzero(b < 0.0), np.flatnonzero(b > 0.0)
+    if not (len(left) and len(right)):
+        return None
+    spread = b[right] - b[left, None]  # a lane's: a wider pair holds another lane too
+    score = np.minimum(support[left, None], support[right]) + 0.25 * (
+        support[left, None] + support[right]
+    )
+    tilts = np.arctan((a[right] - a[left, None]) / spread)
+    score *= ((tilts > _TILTS[0]) & (tilts < _TILTS[1])) / (1.0 + 0.1 * spread)
+    best_left, best_right = np.unravel_index(np.argmax(score), score.shape)
+    lines = []
+    for k in (left[best_left], right[best_right]):
+        start, slope = a[k], b[k]
+        for _ in range(3):
+            near = np.abs(across - start - slope * down) < _NEAR * (1.0 + abs(slope))
+            slope, start = np.polyfit(down[near], across[near], 1, w=weight[near])
+        lines.append(np.array([start, slope]))
+    return lines[0], lines[1]
+
+
+MIN_BOARDS = 3  # boards
+
+
+def calibrate_camera(
+    paths: Sequence[Path], corners: tuple[int, int] = (9, 6)
+) -> tuple[Pinhole, float]:
+    """Compute a camera's intrinsics from photographs of a chessboard; tilt and height are defaults.
+
+    Args:
+        paths: Files of the photographs; those without a board are skipped.
+        corners: Inner corners of the board along its two sides.
+
+    Returns:
+        The camera, and the root mean square error of the corners (px).
+
+    Raises:
+        ValueError: If fewer than three show a board, or photographs have different sizes.
+    """
+    board = np.zeros((corners[0] * corners[1], 3), np.float32)
+    board[:, :2] = np.mgrid[: corners[0], : corners[1]].T.reshape(-1, 2)
+    corner_sets: list[Any] = []
+    sizes: dict[tuple[int, int], int] = {}
+    for path in paths:
+        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if grey is None:
+            continue
+        is_found, places = cv2.findChessboardCorners(grey, corners)
+        if is_found:
+            stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
+            corner_sets.append(cv2.cornerSubPix(grey, places, (8, 8), (-1, -1), stop))
+            size = grey.shape[1], grey.shape[0]
+            sizes[size] = sizes.get(size, 0) + 1
+    if len(corner_sets) < MIN_BOARDS:
+        raise ValueError(
+            f"{len(corner_sets)} of {len(paths)} files show a chessboard of {corners[0]} x "
+            f"{corners[1]} inner corners; expected {MIN_BOARDS} or more"
+        )
+    if len(sizes) > 1:
+        raise ValueError(f"the boards' photographs have different sizes: {sorted(sizes)}")
+    (size,) = sizes
+    start: Any = None
+    error, K, dist, *_ = cv2.calibrateCamera(
+        [board] * len(corner_sets), corner_sets, size, start, start
+    )
+    return Pinhole(K=tuple(map(tuple, K)), dist=tuple(dist.ravel()[:5]), size=size), float(error)

@@ -1,0 +1,193 @@
+"""The road as a camera sees it: markings, bends, roll and pitch, shadow, wear, blur and noise.
+
+Every pixel is followed to the road's plane, whose brightness there is averaged over the pixel's
+footprint. Needs the extra `vision`.
+"""
+
+from dataclasses import dataclass, fields
+from math import cos, sin
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ...validation import is_finite, short_repr
+from ...vehicle.dynamics import RoadParams
+from .pinhole import Pinhole
+
+Image = npt.NDArray[np.uint8]
+Flat = npt.NDArray[np.float32]
+
+ASPHALT, PAINT, GRASS, SKY = 85.0, 215.0, 60.0, 200.0  # grey levels
+VERGE = 1.6  # m, from a marking's middle to the grass
+_FAR = 80.0  # m, of the road that is drawn
+_PATCH, _FLAKE = 0.25, 0.03  # m, along and across, of paint that wears off together
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """Looks of the road and the picture; a value out of place raises ValueError."""
+
+    noise: float = 2.0  # grey levels, standard deviation of a pixel
+    blur: float = 0.5  # px, standard deviation of the lens
+    shadow: float = 0.0  # share of the light that bands of shadow across the road take
+    wear: float = 0.0  # share of the paint that has gone
+    lane_width: float = 3.5  # m, from marking to marking
+    marking_width: float = 0.12  # m
+    dash: float = 4.0  # m, length of the left marking's dashes; the right one is solid
+    gap: float = 5.0  # m
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (is_finite(value) and value >= 0.0):
+                raise ValueError(f"{field.name} is zero or more, got {short_repr(value)}")
+        if max(self.shadow, self.wear) > 1.0:
+            raise ValueError(f"shadow and wear are shares, got {self.shadow} and {self.wear}")
+        if not min(self.lane_width, self.marking_width, self.dash) > 0.0:
+            raise ValueError("lane_width, marking_width and dash are positive")
+
+
+class RoadScene(NamedTuple):
+    """Place of the car against the road, and the road's bend."""
+
+    psi: float = 0.0  # rad, heading against the road, to the left positive
+    y: float = 0.0  # m, left of the lane's middle
+    s: float = 0.0  # m, along the road
+    roll: float = 0.0  # rad, left side up positive, about the road below the car
+    pitch: float = 0.0  # rad, nose down positive
+    road: RoadParams = RoadParams(0.0, 0.0, 1.0)
+
+    @classmethod
+    def make_bend(cls, curvature: float, **places: float) -> "RoadScene":
+        """Make a scene on a road of constant curvature.
+
+        Args:
+            curvature: Curvature (1/m), left positive.
+            places: Other fields by name.
+
+        Returns:
+            The scene.
+        """
+        return cls(road=RoadParams(curvature, -1e6, 1.0), **places)
+
+
+class RoadRenderer:
+    """Renders a camera's pictures.
+
+    Args:
+        camera: The camera.
+        appearance: Looks of the road; None for the defaults.
+        rows: First row that is painted and the row behind the last, the rest is black; None: all.
+    """
+
+    def __init__(
+        self,
+        camera: Pinhole,
+        appearance: Appearance | None = None,
+        rows: tuple[int, int] | None = None,
+    ) -> None:
+        self.camera, self.appearance = camera, appearance or Appearance()
+        first, last = rows or (0, camera.size[1])
+        self.rows = slice(first, last)
+        self._rays = np.moveaxis(camera.compute_rays(first, last), -1, 0).astype(np.float32).copy()
+
+    def render_picture(self, scene: RoadScene, seed: Any = 0) -> Image:
+        """Render the picture of a scene.
+
+        Args:
+            scene: Place of the car on the road.
+            seed: Seed of the noise: a number, or (key, tick) for key and counter of
+                `np.random.Philox`.
+
+        Returns:
+            Grey levels, shape (height, width).
+        """
+        camera, style = self.camera, self.appearance
+        light = self._render_road(scene)
+        if style.blur > 0.0:
+            light = np.asarray(cv2.GaussianBlur(light, (0, 0), style.blur), np.float32)
+        if style.noise > 0.0:
+            key, tick = seed if isinstance(seed, tuple) else (int(seed), 0)
+            rng = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, tick]))
+            light += style.noise * rng.standard_normal(light.shape, np.float32)
+        image = np.zeros(camera.size[::-1], np.uint8)
+        image[self.rows] = np.clip(light + 0.5, 0.0, 255.0)
+        return image
+
+    def _render_road(self, scene: RoadScene) -> Flat:
+        """Brightness of the painted rows without blur and noise."""
+        camera, style = self.camera, self.appearance
+        rotation = _make_rotation(scene.roll, scene.pitch)
+        lens = rotation @ [camera.ahead, 0.0, camera.height]
+        forward, left, up = np.tensordot(rotation.astype(np.float32), self._rays, 1)
+        reach = np.float32(lens[2]) / np.maximum(-up, 1e-4)
+        X, Y = np.float32(lens[0]) + reach * forward, np.float32(lens[1]) + reach * left
+        is_road = (up < -1e-3) & (X < _FAR)
+        d, s = _compute_lane_coordinates(X, Y, scene)
+        pixel_width = reach / np.float32(camera.K[0][0])  # m of a pixel, across and along the view
+        pixel_length = pixel_width * np.maximum(X, 1.0) / np.float32(lens[2])
+        footprint_width = np.hypot(pixel_width, pixel_length * np.float32(sin(scene.psi)))
+        paint = _compute_coverage(
+            d + 0.5 * style.lane_width, style.marking_width, footprint_width
+        )  # right, solid
+        dashes = _compute_coverage(d - 0.5 * style.lane_width, style.marking_width, footprint_width)
+        period = style.dash + style.gap
+        place = np.mod(s + np.float32(scene.s % period) + 0.5 * style.gap, period)
+        paint += dashes * _compute_coverage(place - 0.5 * period, style.dash, pixel_length)
+        if style.wear > 0.0:
+            first = int(np.floor(scene.s / _PATCH))
+            patches = np.floor((s + np.float32(scene.s - first * _PATCH)) / _PATCH)
+            paint *= _hash_cells(patches.astype(np.int64) + first, d / _FLAKE) >= style.wear
+        light = ASPHALT + (PAINT - ASPHALT) * paint
+        if style.shadow > 0.0:
+            bands = np.mod(s + np.float32(scene.s % 11.0) + 0.7 * d, 11.0) < 4.5
+            light *= 1.0 - np.float32(style.shadow) * bands
+        verge = np.abs(d) > 0.5 * style.lane_width + VERGE
+        light = np.where(is_road, np.where(verge, np.float32(GRASS), light), np.float32(SKY))
+        return np.asarray(light, np.float32)
+
+
+def _make_rotation(roll: float, pitch: float) -> Any:
+    """From body axes to those of the road."""
+    roll_matrix = np.array([[1, 0, 0], [0, cos(roll), -sin(roll)], [0, sin(roll), cos(roll)]])
+    pitch_matrix = np.array([[cos(pitch), 0, sin(pitch)], [0, 1, 0], [-sin(pitch), 0, cos(pitch)]])
+    return pitch_matrix @ roll_matrix
+
+
+def _compute_lane_coordinates(X: Flat, Y: Flat, scene: RoadScene) -> tuple[Flat, Flat]:
+    """(d, s): m left of the lane's middle and along it from the car, of points in car axes.
+
+    Exact on the osculating circle; where the curvature changes ahead, to first order about it.
+    """
+    sine, cosine = np.float32(sin(scene.psi)), np.float32(cos(scene.psi))
+    u, v = X * cosine - Y * sine, np.float32(scene.y) + X * sine + Y * cosine
+    road = scene.road
+    from_ramp, slope = scene.s - road.start, road.curvature / road.ramp
+    kappa = slope * min(max(from_ramp, 0.0), road.ramp)
+    w = 2.0 * v - kappa * (u * u + v * v)
+    d = w / (1.0 + np.sqrt(np.maximum(1.0 - kappa * w, 0.0)))
+    s = u if abs(kappa) < 1e-9 else np.arctan2(kappa * u, 1.0 - kappa * v) / kappa
+    if slope and from_ramp < road.ramp:  # the curvature's double integral beyond the circle's
+        x, a, b = np.maximum(s, 0.0), from_ramp, from_ramp - road.ramp
+        cubes = np.maximum(x + a, 0.0) ** 3 - np.maximum(x + b, 0.0) ** 3
+        start, rise = max(a, 0.0), 0.5 * max(a, 0.0) ** 2
+        d = d - (slope * (cubes - start**3) / 6.0 - slope * rise * x - 0.5 * kappa * x * x)
+    return d.astype(np.float32), np.asarray(s, np.float32)
+
+
+def _compute_coverage(offset: Flat, width: float, footprint: Flat) -> Flat:
+    """The share of a footprint that a stripe covers."""
+    share = np.clip((0.5 * width - np.abs(offset)) / footprint + 0.5, 0.0, 1.0)
+    return np.asarray(np.minimum(share, width / footprint), np.float32)
+
+
+def _hash_cells(cells_s: npt.NDArray[np.int64], cells_d: Flat) -> Flat:
+    """A number in [0, 1) for each cell of the road."""
+    word = cells_s.astype(np.uint32) * np.uint32(0x9E3779B1)
+    word ^= np.floor(cells_d).astype(np.int64).astype(np.uint32) * np.uint32(0x85EBCA77)
+    word ^= word >> np.uint32(15)
+    word *= np.uint32(0x2C1B3C6D)
+    word ^= word >> np.uint32(13)
+    return np.asarray((word >> np.uint32(8)) / float(1 << 24), np.float32)

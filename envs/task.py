@@ -1,0 +1,342 @@
+"""The task: references, cost, failures, and what observation and info contain.
+
+References from the driver's command and the nominal vehicle.
+
+The cost rate, its scales, and what the rest of a failed episode costs.
+
+Failures of an episode, by code and name.
+
+What `info` contains: the report of a step and its names.
+
+What an observation contains: the name, unit and bounds of each entry.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from .numerics.jit import jit
+from .numerics.primitives import absolute, maximum, minimum, select
+from .record import FAST, FAST_UNITS, Array
+from .sensors.slow import SLOW
+from .ticks import TICK
+from .vehicle.actuators import apply_lag
+from .vehicle.parameters import GRAVITY, Vehicle
+
+REFERENCES = ("zero-slip", "model", "limited", "lagged")
+ZERO_SLIP, MODEL, LIMITED, LAGGED = range(len(REFERENCES))
+
+# The lagged reference's car has a characteristic speed of 35 m/s at most. The passenger car has
+# 36.5: at 80 km/h it is asked to turn 2 % less than it does by itself. A car that is neutral or
+# oversteers is asked to understeer. Its lag is about that of both presets, two over the trace of
+# their lateral dynamics: 0.08 s for the COMS at 22 km/h, 0.12 s for the passenger car at 70 km/h.
+CHARACTERISTIC_SPEED = 35.0  # m/s
+REFERENCE_LAG = 0.1  # s
+
+
+class ReferenceParams(NamedTuple):
+    """Coefficients of the steady-state responses of the nominal vehicle."""
+
+    b_0: Any  # l_r / l
+    b_1: Any  # M l_f / (2 l C_r l_r)
+    G: Any  # stability factor, dakf-stability (24)
+    per_l: Any  # 1 / l
+    mu_g: Any  # m/s2
+    G_lagged: Any  # stability factor of the lagged reference
+    rest: Any  # what a tick leaves of its deviation from the steady state
+
+
+def make_reference_params(nominal: Vehicle) -> ReferenceParams:
+    """Compute the coefficients of the references for a nominal vehicle.
+
+    Args:
+        nominal: The nominal vehicle.
+
+    Returns:
+        The coefficients.
+    """
+    l, M = nominal.wheelbase, nominal.mass  # noqa: E741
+    C_f, C_r = nominal.front_stiffness, nominal.rear_stiffness
+    l_f, l_r = nominal.front_arm, nominal.rear_arm
+    G = M / (2.0 * l * l) * (C_r * l_r - C_f * l_f) / (C_f * C_r)  # dakf-stability (24)
+    return ReferenceParams(
+        l_r / l,
+        M * l_f / (2.0 * l * C_r * l_r),
+        G,
+        1.0 / l,
+        nominal.friction * GRAVITY,
+        max(G, CHARACTERISTIC_SPEED**-2),
+        math.exp(-TICK / REFERENCE_LAG),
+    )
+
+
+@jit
+def compute_reference(steer: Any, v: Any, target: Any, reference_kind: int) -> Any:
+    """Compute the steady-state reference for a steering command at a measured speed.
+
+    zero-slip: (0, 0), the yaw rate is not judged. model: the nominal steady state, with
+    1 + G v^2 kept above 0.2. limited: the model within what friction can hold,
+    |gamma| <= 0.85 mu g / v and |beta| <= 0.02 mu g (Rajamani, Vehicle Dynamics and Control).
+    lagged: the steady state of `filter_reference`, limited in the same way, with the stability
+    factor of a car that understeers.
+
+    Args:
+        steer: The driver's steering command (rad).
+        v: Measured speed (m/s).
+        target: `ReferenceParams`.
+        reference_kind: Place of the reference in `REFERENCES`.
+
+    Returns:
+        beta_ref (rad) and gamma_ref (rad/s).
+    """
+    if reference_kind == ZERO_SLIP:
+        return 0.0 * steer, 0.0 * steer
+    G = target.G_lagged if reference_kind == LAGGED else target.G
+    gain = steer / maximum(1.0 + G * v * v, 0.2)
+    beta = (1.0 - target.b_1 * v * v) * target.b_0 * gain  # dakf-stability (23)
+    gamma = v * target.per_l * gain  # dakf-stability (23)
+    if reference_kind in (LIMITED, LAGGED):
+        max_beta = 0.02 * target.mu_g
+        max_gamma = 0.85 * target.mu_g / maximum(v, 1.0)
+        beta = minimum(maximum(beta, 0.0 - max_beta), max_beta)
+        gamma = minimum(maximum(gamma, 0.0 - max_gamma), max_gamma)
+    return beta, gamma
+
+
+@jit
+def filter_reference(before: Any, steady: Any, target: Any, reference_kind: int) -> Any:
+    """Filter the reference over a tick: the lagged one approaches the steady state, others jump.
+
+    Args:
+        before: (beta_ref, gamma_ref) of the tick before (rad, rad/s).
+        steady: Result of `compute_reference` (rad, rad/s).
+        target: `ReferenceParams`.
+        reference_kind: Place of the reference in `REFERENCES`.
+
+    Returns:
+        beta_ref (rad) and gamma_ref (rad/s).
+    """
+    if reference_kind == LAGGED:
+        return apply_lag(steady[0], before[0], target.rest), apply_lag(
+            steady[1], before[1], target.rest
+        )
+    return steady
+
+
+BETA_SCALE, GAMMA_SCALE, STEER_SCALE = 0.02, 0.1, 0.05
+EFFORT_WEIGHT, COST_CAP = 0.01, 100.0
+
+
+@jit
+def compute_cost_rate(
+    e_beta: Any, e_gamma: Any, moment_share: Any, steer_added: Any, reference_kind: int
+) -> Any:
+    """Compute the cost rate of a tick, capped at 100 per second.
+
+    c = (e_beta/0.02)^2 + (e_gamma/0.1)^2 + 0.01 (N_z/N_max)^2 + 0.01 (steer/0.05)^2
+
+    Args:
+        e_beta: Error of the sideslip angle (rad).
+        e_gamma: Error of the yaw rate (rad/s), not judged with "zero-slip".
+        moment_share: Yaw moment as a fraction of its full scale.
+        steer_added: Added steering angle (rad).
+        reference_kind: Place of the reference in `REFERENCES`.
+
+    Returns:
+        Cost rate (1/s).
+    """
+    b, s = e_beta * (1.0 / BETA_SCALE), steer_added * (1.0 / STEER_SCALE)
+    c = b * b + EFFORT_WEIGHT * (moment_share * moment_share) + EFFORT_WEIGHT * (s * s)
+    if reference_kind != ZERO_SLIP:
+        g = e_gamma * (1.0 / GAMMA_SCALE)
+        c = c + g * g
+    return minimum(absolute(c), COST_CAP)
+
+
+@jit
+def compute_failure_cost(duration: Any, tick: Any) -> Any:
+    """Compute the cost of the rest of a failed episode, so that failing never pays.
+
+    Args:
+        duration: Length of the episode (ticks).
+        tick: Tick at which it failed.
+
+    Returns:
+        The cost.
+    """
+    return COST_CAP * (duration - tick) * TICK
+
+
+RUNNING, SPIN, OFF_ROAD, NOT_FINITE, BAD_ACTION, COLLISION, DEPARTURE = range(7)
+FAILURES = ("none", "spin", "off-road", "not-finite", "bad-action", "collision", "departure")
+REFUSED = -1
+WILD = 1 << 30
+"""Added to what a step returns where an action was beyond `WILD_LIMIT`."""
+WILD_LIMIT = 10.0
+"""An action beyond it, a fraction of full scale, is a mistake, not a request for all of it."""
+
+
+@jit
+def select_failure(lost: Any, spun: Any, off: Any) -> Any:
+    """Select the failure's code.
+
+    Args:
+        lost: Whether the numbers are no longer finite.
+        spun: Whether the car spins.
+        off: Whether it has left the road.
+
+    Returns:
+        The code, as a float; the first that applies, in this order.
+    """
+    failure = select(spun, SPIN * 1.0, select(off, OFF_ROAD * 1.0, RUNNING * 1.0))
+    return select(lost, NOT_FINITE * 1.0, failure)
+
+
+class StepReport(NamedTuple):
+    """Columns of the report of a step, from which `info` is made."""
+
+    t: int = 0
+    beta: int = 1
+    gamma: int = 2
+    psi: int = 3
+    beta_ref: int = 4
+    gamma_ref: int = 5
+    steer: int = 6
+    yaw_moment: int = 7
+    cost: int = 8
+    failure: int = 9
+    packets: int = 10
+    reward: int = 11
+    ended: int = 12  # 1 the time is over
+
+
+REPORT = StepReport()
+
+_NUMBERS = REPORT._fields[: REPORT.failure]  # of `info`; `failure` and `is_success` follow
+_KEYS = (*_NUMBERS, "failure", "is_success")
+_RUNNING: dict[str, Any] = dict.fromkeys(_NUMBERS, 0.0) | {"failure": RUNNING, "is_success": False}
+_MASKS = tuple(f"_{key}" for key in _KEYS)
+
+
+def make_info(report: list[float]) -> dict[str, Any]:
+    """Make `info` of a step or a reset.
+
+    Args:
+        report: Report of the step, a number for each column of `StepReport`.
+
+    Returns:
+        The info.
+    """
+    info = _RUNNING.copy()  # a copy's keys need no sorting in
+    (
+        info["t"], info["beta"], info["gamma"], info["psi"], info["beta_ref"], info["gamma_ref"],
+        info["steer"], info["yaw_moment"], info["cost"], code, _, _, ended,
+    ) = report  # fmt: skip
+    if code != RUNNING:
+        info["failure"] = int(code)
+    elif ended == 1.0:
+        info["is_success"] = True
+    return info
+
+
+def make_infos(reports: Array, rows: npt.NDArray[np.bool_]) -> dict[str, Any]:
+    """Make the infos of some rows of a batch as Gymnasium's vector environments have them.
+
+    Args:
+        reports: Reports, shape (N, len(StepReport)).
+        rows: Rows that are reported, shape (N,); the others have zeros.
+
+    Returns:
+        An array (N,) for every key and, with an underscore before it, a mask.
+    """
+    if rows.all():
+        columns = reports.T.copy()
+    else:
+        columns = np.zeros(reports.shape[::-1])
+        columns[:, rows] = reports[rows].T
+    failure = columns[REPORT.failure].astype(np.int64)
+    success = (columns[REPORT.ended] == 1.0) & (failure == RUNNING)
+    values = (*columns[: len(_NUMBERS)], failure, success)
+    masks = np.empty((len(values), len(rows)), np.bool_)
+    masks[:] = rows
+    infos: dict[str, Any] = dict(zip(_KEYS, values, strict=True))
+    infos.update(zip(_MASKS, masks, strict=True))
+    return infos
+
+
+class ObservationEntry(NamedTuple):
+    """One number of an observation.
+
+    Attributes:
+        name: Name of the entry.
+        unit: Its unit.
+        low: Lower bound, finite.
+        high: Upper bound, finite.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+
+OBSERVATION_OPTIONS = ("fast", "with_map")
+"""The options of an environment that change what is observed, and nothing of a drive."""
+N_SAMPLED = 6  # the first columns of a fast row are sensors; the policy sees last and mean of each
+AGE_CAP = 10.0  # s
+
+_FAST_BOUNDS = (10.0, 50.0, 50.0, 10.0, 100.0, 100.0, 1.0, 2000.0, 2000.0, 1.0, 50.0, 1.0)
+_LAST_ONLY = ("steer", "torque_left", "torque_right", "steer_command")  # seen as they were last
+
+
+def make_space(layout: Sequence[ObservationEntry], frames: int = 1) -> "gym.spaces.Box[np.float32]":
+    """Make the space of an observation; of a stack of frames each bound is repeated in place.
+
+    Args:
+        layout: Entries of the observation.
+        frames: Number of frames in the stack.
+
+    Returns:
+        A box of shape (len(layout) * frames,).
+    """
+    low, high = np.array([entry[2:] for entry in layout]).T.astype(np.float32)
+    return gym.spaces.Box(np.repeat(low, frames), np.repeat(high, frames), dtype=np.float32)
+
+
+def make_observation_layout(
+    slow: tuple[str, ...], n: int, fast: str, with_map: bool = False
+) -> tuple[ObservationEntry, ...]:
+    """Make the entries of an observation.
+
+    Args:
+        slow: Names of the slow sensors present.
+        n: Ticks of a control period.
+        fast: "summary" (last sample and mean over the step) or "all" (every sample of the step).
+        with_map: Whether the road's curvature is an entry.
+
+    Returns:
+        The entries in their order.
+    """
+    entries = []
+    for column in range(N_SAMPLED):
+        name, unit, bound = FAST._fields[column], FAST_UNITS[column], _FAST_BOUNDS[column]
+        names = (name, f"{name}_mean") if fast == "summary" else [f"{name}_{j}" for j in range(n)]
+        entries += [ObservationEntry(entry_name, unit, -bound, bound) for entry_name in names]
+    for name in (*_LAST_ONLY, "curvature") if with_map else _LAST_ONLY:
+        column = getattr(FAST, name)
+        bound = _FAST_BOUNDS[column]
+        entries.append(ObservationEntry(name, FAST_UNITS[column], -bound, bound))
+    for kind in SLOW:
+        if kind.name in slow:
+            for value in kind.values:
+                name = f"{kind.name}_{value.name}"
+                entries.append(ObservationEntry(name, value.unit, -value.bound, value.bound))
+            entries.append(ObservationEntry(f"{kind.name}_age", "s", 0.0, AGE_CAP))
+            entries.append(ObservationEntry(f"{kind.name}_fresh", "-", 0.0, 1.0))
+    entries.append(ObservationEntry("beta_ref", "rad", -1.0, 1.0))
+    entries.append(ObservationEntry("gamma_ref", "rad/s", -10.0, 10.0))
+    return tuple(entries)

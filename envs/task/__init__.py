@@ -1,1 +1,0 @@
-"""The task: references, cost, failures, and what observation and info contain."""

@@ -1,0 +1,302 @@
+"""Arguments of environments, for one or for rows, checked; and how messages write them.
+
+Quantities: fields of a dataclass with a unit and the range that is plausible of a car.
+"""
+
+import dataclasses
+import difflib
+import inspect
+import math
+import operator
+import reprlib
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import logger
+from gymnasium.vector import AutoresetMode
+
+Mask = npt.NDArray[np.bool_]
+Actions = npt.NDArray[np.float32]
+MAX_LISTED_ROWS = 8  # rows that a message lists
+MAX_NUMBER = 1e12
+"""The largest number of a scenario or a vehicle: its ticks and its square are numbers still."""
+_CONVERSION_ERRORS = (TypeError, ValueError, OverflowError)  # what numpy raises where it finds none
+
+_FLOAT32 = np.dtype(np.float32)
+_REPR = reprlib.Repr()
+_REPR.maxstring = _REPR.maxother = 80
+
+
+def short_repr(value: object) -> str:
+    """A value in a message, short however long it is."""
+    try:
+        return _REPR.repr(value)
+    except Exception:  # what cannot be written: an integer of thousands of digits
+        return f"<{type(value).__name__}>"
+
+
+def join_names(names: Iterable[str]) -> str:
+    """Names in a message, the first of them where they are many."""
+    return textwrap.shorten(", ".join(names), 250, placeholder=" ...")
+
+
+def is_finite(value: Any) -> bool:
+    """Whether a value is a number, and no larger than LARGEST; True and False are none."""
+    number = isinstance(value, int | float | np.integer | np.floating)
+    return number and not isinstance(value, bool) and bool(abs(value) <= MAX_NUMBER)
+
+
+def check_number(name: str, value: Any) -> float:
+    """A finite number as a float; ValueError, with its name, for another value."""
+    if not is_finite(value):
+        raise ValueError(f"{name} {short_repr(value)} is no finite number")
+    return float(value)
+
+
+def check_mapping(name: str, value: Any) -> Mapping[str, Any]:
+    """A mapping; TypeError, with its name, for another value."""
+    if not isinstance(value, Mapping):
+        raise TypeError(f"{name} is a mapping, got {short_repr(value)}")
+    return value
+
+
+def describe_unknown(what: str, values: Iterable[Any], known: Iterable[str]) -> str:
+    """A message about names that are not known: what the first may have meant, or what there is."""
+    got, names = list(values), list(known)
+    close = difflib.get_close_matches(got[0][:80], names, 1) if isinstance(got[0], str) else []
+    hint = f"did you mean {close[0]!r}?" if close else f"known: {join_names(names)}"
+    return f"unknown {what} {join_names(map(short_repr, got))}; {hint}"
+
+
+def check_choice(what: str, value: Any, known: Iterable[str]) -> None:
+    """ValueError for a value that is none of the known names, with the nearest of them."""
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(describe_unknown(what, [value], known))
+
+
+def check_options(what: str, function: Callable[..., Any], options: Iterable[str]) -> None:
+    """TypeError for an option that a function does not take beside its first argument, with the
+    nearest of those that it does."""
+    parameters = list(inspect.signature(function).parameters.values())[1:]
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+        return
+    known = [parameter.name for parameter in parameters]
+    if unknown := [name for name in options if name not in known]:
+        raise TypeError(f"{what}: {describe_unknown('option', unknown, known)}")
+
+
+def check_int(
+    name: str, value: Any, what: str, minimum: int = 1, maximum: int | None = None
+) -> int:
+    """How many of `what`; TypeError for no whole number, ValueError out of least .. most."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"{name} is a number of {what}, got {short_repr(value)}")
+    if value < minimum or (maximum is not None and value > maximum):
+        limits = f"at least {minimum}" if maximum is None else f"{minimum} to {maximum} {what}"
+        raise ValueError(f"{name} is {limits}, got {short_repr(value)}")
+    return int(value)
+
+
+def expand_rows(name: str, value: Any, count: int) -> Sequence[Any]:
+    """An argument of each row: a list or tuple as it is, another value for all; ValueError for a
+    list of another length."""
+    if not isinstance(value, list | tuple):
+        return [value] * count
+    if len(value) != count:
+        raise ValueError(f"{name}: one or a list of {count}, one a row, got {len(value)}")
+    return value
+
+
+def parse_autoreset_mode(autoreset_mode: Any) -> AutoresetMode:
+    """The mode of its name or itself; ValueError for another."""
+    try:
+        return AutoresetMode(autoreset_mode)
+    except ValueError:
+        known = ", ".join(repr(mode.value) for mode in AutoresetMode)
+        got = short_repr(autoreset_mode)
+        raise ValueError(f"unknown autoreset_mode {got}; known: {known}") from None
+
+
+def format_rows(rows: npt.ArrayLike) -> str:
+    """ "row 3" or "rows 1, 5, ..." in a message."""
+    numbers = np.asarray(rows).tolist()
+    if len(numbers) == 1:
+        return f"row {numbers[0]}"
+    dots = ", ..." if len(numbers) > MAX_LISTED_ROWS else ""
+    return f"rows {', '.join(map(str, numbers[:MAX_LISTED_ROWS]))}{dots} ({len(numbers)} of them)"
+
+
+def parse_seeds(seed: Any, count: int) -> list[int | None]:
+    """A seed for each row: `seed + i` of a number, a list as it is.
+
+    Raises ValueError for a list of another length or a negative seed, TypeError for a seed that is
+    no whole number.
+    """
+    if seed is None:
+        return [None] * count
+    if isinstance(seed, int | np.integer):
+        seeds: list[int | None] = [int(seed) + i for i in range(count)]
+    else:
+        if not isinstance(seed, Sequence | np.ndarray):
+            raise TypeError(f"seed: an int or a list of {count}, got {short_repr(seed)}")
+        if len(seed) != count:
+            raise ValueError(f"seed: an int or a list of {count}, got {len(seed)}")
+        seeds = [None if entry is None else operator.index(entry) for entry in seed]
+    bad = [i for i, entry in enumerate(seeds) if entry is not None and entry < 0]
+    if bad:
+        raise ValueError(
+            f"seed: {format_rows(bad)} would get a negative seed, {short_repr(seeds[bad[0]])}"
+        )
+    return seeds
+
+
+def parse_reset_mask(mask: Any, count: int) -> Mask:
+    """The rows of options["reset_mask"], all without it; TypeError or ValueError for no mask."""
+    if mask is None:
+        return np.ones(count, np.bool_)
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+        what = mask.dtype if isinstance(mask, np.ndarray) else type(mask).__name__
+        raise TypeError(f"options['reset_mask'] is an array of bool, got {what}")
+    if mask.shape != (count,):
+        raise ValueError(f"options['reset_mask'] has shape ({count},), got {mask.shape}")
+    if not mask.any():
+        raise ValueError("options['reset_mask'] resets no row")
+    return mask.copy()
+
+
+def split_options(options: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
+    """The options of each row's reset: a list, tuple or array has one for each row, None for a row
+    without it."""
+    columns = {}
+    for name, value in options.items():
+        if isinstance(value, np.ndarray) and value.ndim > 0:
+            value = value.tolist()
+        if not isinstance(value, list | tuple):
+            value = [value] * count
+        elif len(value) != count:
+            raise ValueError(f"reset option {name}: one or a list of {count}, got {len(value)}")
+        columns[name] = value
+    return [
+        {name: value[i] for name, value in columns.items() if value[i] is not None}
+        for i in range(count)
+    ]
+
+
+def parse_action(action: Any, width: int, fail: bool) -> Actions:
+    """One action (width,) as float32; what has another shape or is no numbers raises ValueError,
+    with `fail` it is NaN."""
+    if type(action) is np.ndarray and action.dtype is _FLOAT32 and action.shape == (width,):
+        return action if action.flags.carray else action.copy()  # others are other types
+    try:
+        return _convert_action(action, width)
+    except ValueError as error:
+        if not fail:
+            raise ValueError(
+                f"an action has shape ({width},), got {error}; nothing was stepped"
+            ) from None
+    return np.full(width, np.nan, np.float32)
+
+
+def parse_actions(actions: Any, count: int, width: int, fail: bool) -> Actions:
+    """Actions (count, width) as float32.
+
+    What has another shape or is no numbers raises ValueError and names the rows; with `fail` these
+    rows are NaN.
+    """
+    try:
+        array = np.array(actions, np.float32)  # a copy: contiguous whatever came
+        if array.shape == (count, width):
+            return array
+    except _CONVERSION_ERRORS:  # rows of different lengths, or no numbers
+        pass
+    array, wrong = np.full((count, width), np.nan, np.float32), {}
+    try:
+        rows = list(actions)
+    except TypeError:  # no rows at all
+        rows = []
+    for i, row in enumerate(rows if len(rows) == count else ()):
+        try:
+            array[i] = _convert_action(row, width)
+        except ValueError as error:
+            wrong[i] = str(error)
+    if not fail and (wrong or len(rows) != count):
+        bad = list(wrong)
+        got = f"in {format_rows(bad)} {wrong[bad[0]]}" if bad else f"{len(rows)} rows"
+        raise ValueError(f"actions have shape ({count}, {width}), got {got}; nothing was stepped")
+    return array
+
+
+def warn_once(env: Any, actions: Actions) -> None:
+    """Warn, once an env, of actions far outside of -1 to 1."""
+    if not vars(env).get("_warned"):
+        largest = np.abs(actions[np.isfinite(actions)]).max()
+        logger.warn(
+            f"an action of {largest:g} is clipped to 1: actions are shares of full scale, "
+            "from -1 to 1, not N m or rad; the env says so once"
+        )
+    env._warned = True
+
+
+def _convert_action(action: Any, width: int) -> Actions:
+    """One action; ValueError says what came instead."""
+    try:
+        array = np.array(action, np.float32)
+    except _CONVERSION_ERRORS as error:
+        raise ValueError(f"{short_repr(action)}: {error}") from None
+    if array.shape != (width,):
+        raise ValueError(f"shape {array.shape}")
+    return array
+
+
+_CONFUSED_UNITS = {  # units in which a number may be instead, as shares of the right one
+    "m": {"mm": 1e-3, "cm": 1e-2},
+    "s": {"ms": 1e-3},
+    "m/s": {"km/h": 1.0 / 3.6},
+    "rad": {"deg": math.pi / 180.0},
+    "rad/s": {"deg/s": math.pi / 180.0},
+    "kg": {"t": 1e3},
+    "N/rad": {"kN/rad": 1e3, "N/deg": 180.0 / math.pi},
+    "-": {"%": 1e-2},
+}
+
+
+def quantity(
+    unit: str,
+    low: float,
+    high: float,
+    text: str = "",
+    default: Any = dataclasses.MISSING,
+    per: tuple[str, ...] = (),
+) -> Any:
+    """A field whose numbers are plausible from low to high, each times the fields `per`; where low
+    is above zero, they are positive at any rate."""
+    metadata = {"unit": unit, "text": text, "plausible": (low, high), "per": per}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def check_plausible(values: Any) -> None:
+    """Raise ValueError for a number of a dataclass outside its range, with the unit that it may be
+    in by mistake."""
+    entries = [spec for spec in dataclasses.fields(values) if "plausible" in spec.metadata]
+    for entry in sorted(
+        entries, key=lambda spec: len(spec.metadata["per"])
+    ):  # those last go by others
+        unit, _, (low, high), per = entry.metadata.values()
+        value, scale = getattr(values, entry.name), math.prod(getattr(values, n) for n in per)
+        low, high = scale * low, scale * high
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is None or low <= number <= high:
+                continue
+            per_text = f" for its {', '.join(per)}" if per else ""
+            units = _CONFUSED_UNITS.get(unit, {}).items()
+            candidates = " or ".join(name for name, size in units if low <= number * size <= high)
+            got = f"{type(values).__name__}.{entry.name}: {short_repr(number)} {unit}".removesuffix(
+                " -"
+            )
+            raise ValueError(
+                f"{got} is outside the plausible {low:.4g} to {high:.4g}{per_text}"
+                f"{f' (is it in {candidates}?)' if candidates else ''}; strict=False takes it"
+            )

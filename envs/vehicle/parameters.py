@@ -1,0 +1,333 @@
+"""The vehicle's parameters, a unit on each, and two presets.
+
+Vehicles by name, from files and from mappings: one reader for whatever takes a vehicle.
+"""
+
+import dataclasses
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..io import is_document, read_document
+from ..validation import (
+    MAX_NUMBER,
+    check_choice,
+    check_plausible,
+    describe_unknown,
+    is_finite,
+    quantity,
+    short_repr,
+)
+
+GRAVITY = 9.81
+LATERAL_FIELDS = (
+    "mass",
+    "yaw_inertia",
+    "front_arm",
+    "rear_arm",
+    "front_stiffness",
+    "rear_stiffness",
+)
+"""What a linear bicycle is made of, in the order of `linear.Bicycle`."""
+_POINT_INERTIA = ("mass", "front_arm", "rear_arm")  # as inertia, that of two points over the axles
+
+_MIN_NUMBER = 1.0 / MAX_NUMBER  # what is below is taken for zero: it is divided by
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vehicle:
+    """A car with two in-wheel motors at the rear axle.
+
+    Cornering stiffness is per tyre, as in the papers (an axle has 2 C). Letters of the papers
+    stand in the descriptions: `Vehicle.__dataclass_fields__[name].metadata` has text and unit,
+    and the plausible range that `make_vehicle` and environments check.
+
+    Raises ValueError on a value that is not finite or not positive (lags, motor_power and
+    transfer_height may be zero, the antenna's place may be negative).
+    """
+
+    name: str = "vehicle"
+    mass: float = quantity("kg", 0.01, 1e5, "m")
+    yaw_inertia: float = quantity("kg m2", 0.1, 10, "I about the vertical axis", per=_POINT_INERTIA)
+    front_arm: float = quantity("m", 0.01, 10, "l_f, centre of gravity to front axle")
+    rear_arm: float = quantity("m", 0.01, 10, "l_r, centre of gravity to rear axle")
+    front_stiffness: float = quantity("N/rad", 3, 600, "C_f, one front tyre", per=("mass",))
+    rear_stiffness: float = quantity("N/rad", 3, 600, "C_r, one rear tyre", per=("mass",))
+    front_track: float = quantity("m", 0.01, 5, "d_f, between the front wheels")
+    rear_track: float = quantity("m", 0.01, 5, "d_r, between the rear wheels")
+    wheel_radius: float = quantity("m", 0.005, 2, "r")
+    gravity_height: float = quantity("m", 0.005, 5, "h, height of the centre of gravity")
+    motor_torque: float = quantity("N m", 0.001, 5e4, "T_max, limit of one motor")
+    motor_lag: float = quantity("s", 0, 1, "time constant of the motors", 0.005)
+    steering_lag: float = quantity("s", 0, 1, "time constant of the steering actuator", 0.03)
+    steering_stop: float = quantity("rad", 0.01, 1.6, "largest angle that steering adds up to", 0.6)
+    steering_authority: float = quantity("rad", 0.001, 1.6, "largest added to the driver's", 0.1)
+    steering_rate: float = quantity("rad/s", 0.01, 30, "how fast the added angle may change", 0.8)
+    preview: float = quantity("m", 0.05, 200, "l_pre, the camera's preview distance", 5.135)
+    friction: float = quantity("-", 0.02, 2.5, "mu, tyre to road (a scenario has its own)", 0.9)
+    width: float = quantity("m", 0.01, 5, "over all; the lanes of test tracks go by it", 1.8)
+    sprung_mass: float = quantity("kg", 0.005, 1e5, "M_s, the part of the mass that rolls")
+    roll_arm: float = quantity("m", 0.001, 5, "h_s, centre of gravity above the roll axis")
+    roll_inertia: float = quantity("kg m2", 1e-7, 1e6, "I_x, about the roll axis")
+    roll_stiffness: float = quantity("N m/rad", 0.001, 1e8, "K_x, of the suspension")
+    roll_damping: float = quantity("N m s/rad", 1e-5, 1e7, "C_x, of the suspension")
+    antenna_ahead: float = quantity("m", -20, 20, "GPS antenna ahead of the centre of gravity", 0.0)
+    antenna_left: float = quantity("m", -20, 20, "GPS antenna left of the centre of gravity", 0.0)
+    motor_power: float = quantity("W", 0, 1e7, "limit of one motor, also braking; 0: none", 0.0)
+    transfer_height: float = quantity("m", 0, 5, "where drive force moves load between axles", 0.0)
+
+    def __post_init__(self) -> None:
+        for entry in dataclasses.fields(self):
+            value = getattr(self, entry.name)
+            if entry.name == "name":
+                if not isinstance(value, str):
+                    raise TypeError(f"Vehicle.name: expected a text, got {short_repr(value)}")
+                continue
+            if not isinstance(value, int | float) or isinstance(value, bool):
+                raise TypeError(f"Vehicle.{entry.name}: expected a number, got {short_repr(value)}")
+            requirement, is_low_ok = "positive and ", value > _MIN_NUMBER
+            if entry.metadata["plausible"][0] == 0:
+                requirement, is_low_ok = "zero or more and ", value > _MIN_NUMBER or value == 0.0
+            elif entry.metadata["plausible"][0] < 0:
+                requirement, is_low_ok = "", True
+            if not (is_finite(value) and is_low_ok):
+                got = f"{short_repr(value)} {entry.metadata['unit']}"
+                raise ValueError(f"Vehicle.{entry.name}: {got} is not {requirement}finite")
+
+    def replace(self, **changes: Any) -> "Vehicle":
+        """Copy the vehicle with some parameters changed; TypeError on an unknown name.
+
+        Args:
+            changes: New values by the names of fields.
+
+        Returns:
+            The copy.
+        """
+        return dataclasses.replace(self, **changes)
+
+    def scale_stiffness(self, front: float, rear: float | None = None) -> "Vehicle":
+        """Copy the vehicle with its cornering stiffnesses scaled.
+
+        Args:
+            front: Factor on the front stiffness.
+            rear: Factor on the rear stiffness; None for `front`.
+
+        Returns:
+            The copy.
+        """
+        return self.replace(
+            front_stiffness=self.front_stiffness * front,
+            rear_stiffness=self.rear_stiffness * (front if rear is None else rear),
+        )
+
+    @property
+    def lateral(self) -> tuple[float, ...]:
+        """The parameters of `LATERAL_FIELDS`."""
+        return tuple(getattr(self, name) for name in LATERAL_FIELDS)
+
+    @property
+    def wheelbase(self) -> float:
+        """l = l_f + l_r in m."""
+        return self.front_arm + self.rear_arm
+
+    @property
+    def roll_moment_arm(self) -> float:
+        """M_s h_s in kg m: the roll moment of 1 m/s2."""
+        return self.sprung_mass * self.roll_arm
+
+    def check_roll(self) -> None:
+        """Check that the suspension holds the body upright and the roll inertia suffices.
+
+        Raises:
+            ValueError: If the body would roll over, or its inertia is too small for its mass.
+        """
+        lower_limit = self.roll_moment_arm * GRAVITY
+        if self.roll_stiffness <= lower_limit:
+            raise ValueError(
+                f"Vehicle.roll_stiffness: {self.roll_stiffness!r} N m/rad does not hold the body "
+                f"upright; its weight takes M_s g h_s = {lower_limit:.6g}"
+            )
+        lower_limit = self.roll_moment_arm**2 / self.mass
+        if self.roll_inertia <= lower_limit:
+            raise ValueError(
+                f"Vehicle.roll_inertia: {self.roll_inertia!r} kg m2 about the roll axis; a sprung "
+                f"mass of {self.sprung_mass!r} kg at {self.roll_arm!r} m on a car of "
+                f"{self.mass!r} kg has more than {lower_limit:.6g}"
+            )
+
+    @property
+    def yaw_moment_limit(self) -> float:
+        """The largest yaw moment of the two motors in N m (372.7 for the COMS)."""
+        return self.motor_torque * self.rear_track / self.wheel_radius
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert to JSON types, which `make_vehicle` reads back."""
+        return dataclasses.asdict(self)
+
+
+def critical_speed(vehicle: Vehicle) -> float:
+    """Compute the speed above which the linear vehicle is unstable.
+
+    Args:
+        vehicle: The vehicle.
+
+    Returns:
+        The critical speed (m/s); inf if the vehicle understeers.
+    """
+    excess = vehicle.front_stiffness * vehicle.front_arm - vehicle.rear_stiffness * vehicle.rear_arm
+    if excess <= 0.0:
+        return math.inf
+    product = 2.0 * vehicle.front_stiffness * vehicle.rear_stiffness * vehicle.wheelbase**2
+    return math.sqrt(product / (vehicle.mass * excess))
+
+
+COMS = Vehicle(  # Table I of tie-vision; front track, height of the centre and roll are assumed
+    name="coms",
+    mass=380.0,
+    yaw_inertia=136.08,
+    front_arm=0.8,
+    rear_arm=0.6,
+    front_stiffness=6000.0,
+    rear_stiffness=6000.0,
+    front_track=0.84,
+    rear_track=0.82,
+    wheel_radius=0.22,
+    gravity_height=0.45,
+    motor_torque=100.0,
+    width=1.095,  # the maker's
+    sprung_mass=300.0,
+    roll_arm=0.35,
+    roll_inertia=60.0,
+    roll_stiffness=8000.0,
+    roll_damping=324.0,
+)
+
+PASSENGER_CAR = Vehicle(  # a compact electric car with two 700 N m in-wheel motors
+    name="passenger-car",
+    mass=1500.0,
+    yaw_inertia=2400.0,
+    front_arm=1.2,
+    rear_arm=1.5,
+    front_stiffness=55000.0,
+    rear_stiffness=60000.0,
+    front_track=1.55,
+    rear_track=1.55,
+    wheel_radius=0.31,
+    gravity_height=0.55,
+    motor_torque=700.0,
+    preview=12.0,
+    sprung_mass=1300.0,
+    roll_arm=0.45,
+    roll_inertia=760.0,
+    roll_stiffness=90000.0,  # 3.9 degrees of roll at 1 g
+    roll_damping=4000.0,  # a quarter of the critical damping
+)
+
+
+VehicleSource = str | os.PathLike[str] | Mapping[str, Any] | Vehicle
+"""What `make_vehicle` takes."""
+
+_STIFFNESS = ("front_stiffness", "rear_stiffness")
+WIRE_TABLES = ("steering", "latency", "noise")
+"""Tables that a vehicle's file may hold beside the car: what `sideslip identify` found of its
+wires, which `sideslip replay` applies and everybody else leaves alone."""
+_CONVENTIONS = {"_per_tyre": 1.0, "_axle": 0.5}  # tyres' share of the number
+_FIELDS = [entry.name for entry in dataclasses.fields(Vehicle)]
+
+
+def make_vehicle(source: VehicleSource, strict: bool = True) -> Vehicle:
+    """Make a vehicle from its name, a TOML or JSON file, or a mapping of parameters.
+
+    Keys are those of `Vehicle`. A cornering stiffness is `front_stiffness_per_tyre` or
+    `front_stiffness_axle` (both tyres together), and so for the rear; `front_stiffness` is per
+    tyre in a mapping that has every parameter, as `Vehicle.to_dict` makes one, and else refused.
+    What is left out is that of the vehicle under `base` (a name or another file); without one it is
+    the passenger car's, except for mass, inertia, arms and stiffnesses, which must be present. A
+    file without a `name` has that of the file. An unreadable file raises FileNotFoundError or
+    ValueError, a value out of place ValueError; messages name the file.
+
+    Args:
+        source: Name in `VEHICLES`, path, mapping of parameters, or a `Vehicle`, returned as it is.
+        strict: Whether implausible numbers of a file or a mapping are refused.
+
+    Returns:
+        The vehicle.
+
+    Raises:
+        TypeError: For an unknown parameter, one that is no number, or another kind of source;
+            ValueError for an unknown name, a missing parameter, or a stiffness of no convention or
+            of two.
+    """
+    if isinstance(source, Vehicle):
+        return source
+    if isinstance(source, Mapping):
+        return _parse_vehicle(
+            dict(source), strict, is_complete=all(name in source for name in _FIELDS)
+        )
+    if is_document(source):
+        return _read_vehicle(Path(source), strict)
+    if not isinstance(source, str):
+        raise TypeError(
+            "a vehicle is a name, the path of a TOML or JSON file or a mapping of parameters, "
+            f"got {short_repr(source)}"
+        )
+    check_choice("vehicle", source, VEHICLES)
+    return VEHICLES[source]
+
+
+def _read_vehicle(path: Path, strict: bool = True) -> Vehicle:
+    values = read_document(path, "vehicle")
+    values = {name: value for name, value in values.items() if name not in WIRE_TABLES}
+    try:
+        return _parse_vehicle({"name": path.stem} | values, strict)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{path}: {error}") from None
+
+
+def _format_key(name: str) -> str:
+    """A parameter's key, both where a stiffness has two."""
+    return " or ".join(map(name.__add__, _CONVENTIONS)) if name in _STIFFNESS else name
+
+
+def _parse_vehicle(values: dict[str, Any], strict: bool, is_complete: bool = False) -> Vehicle:
+    """A vehicle of a mapping, whose stiffnesses become those of a tyre, and are if it is whole."""
+    has_base = "base" in values
+    base = make_vehicle(values.pop("base", PASSENGER_CAR.replace(name="vehicle")), strict)
+    for name in _STIFFNESS:
+        present_keys = [key for key in (name, *map(name.__add__, _CONVENTIONS)) if key in values]
+        if len(present_keys) > 1:
+            raise ValueError(
+                f"{' and '.join(present_keys)} exclude each other: one convention an axle"
+            )
+        if name in present_keys and not is_complete:
+            raise ValueError(f"{name} must name its convention: {_format_key(name)}")
+        for convention, share in _CONVENTIONS.items():
+            if name + convention in values:
+                value = values.pop(name + convention)
+                values[name] = value * share if is_finite(value) else value  # refused by `Vehicle`
+    if unknown := [key for key in values if key not in _FIELDS]:
+        keys = [
+            *_FIELDS,
+            "base",
+            *(name + suffix for name in _STIFFNESS for suffix in _CONVENTIONS),
+        ]
+        raise TypeError(describe_unknown("vehicle parameter", unknown, keys))
+    missing = [name for name in LATERAL_FIELDS if name not in values]
+    if missing and not has_base:
+        raise ValueError(
+            f"missing {', '.join(map(_format_key, missing))} (or name a vehicle under 'base')"
+        )
+    vehicle = base.replace(**values)
+    if strict:
+        check_plausible(vehicle)
+    return vehicle
+
+
+VEHICLES: dict[str, Vehicle] = {"coms": COMS, "passenger-car": PASSENGER_CAR}
+"""Every vehicle that has a name: two presets, and those of recorded drives, from files."""
+
+for _path in sorted((Path(__file__).parent / "presets").glob("*.toml")):
+    VEHICLES[_path.stem] = _read_vehicle(_path)

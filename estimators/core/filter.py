@@ -1,0 +1,367 @@
+"""The filter itself, compiled: fast rows and packets in, states out.
+
+Order of a tick: what was captured at the last tick is held, prediction from the last tick to this
+one with the inputs of this row, the fast sensors, then the packets that arrive. A filter at the
+slow sensor's rate listens once every `pace` ticks, to the packets that came meanwhile; it holds its
+states in between (`stride`) or predicts them.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from ...envs.numerics.jit import copy_into, jit, jit_nrt, noinline
+from ...envs.numerics.primitives import maximum, sqrt
+from ...envs.record import FAST, PACKET
+from .innovation import BUFFER, store_due_captures
+from .model import (
+    CURVATURE,
+    LATERAL,
+    build_model,
+    compute_road_turn,
+    find_next_cell,
+    linearise,
+    locate_step_row,
+)
+from .multiple_model import (
+    compute_mixture,
+    first_member,
+    process_packet_members,
+    update_bank,
+    update_second_layer,
+)
+from .packets import apply_waiting, clear_history, process_packet, store_history
+from .predict import advance_state, correct_fast, read_fast_row
+from .record import (
+    COUNTERS,
+    N_CORE,
+    N_FRAMES,
+    N_SLOW,
+    N_STAMPS,
+    N_TOTAL,
+    WINDOW,
+    FilterRecord,
+    FilterRecords,
+    GainTables,
+    Vector,
+)
+
+
+@jit
+def _fill(vector: Vector, value: float) -> None:
+    for i in range(len(vector)):
+        vector[i] = value
+
+
+@noinline
+def reset_filter(f: FilterRecord, first: int) -> None:
+    """Reset a filter to its start.
+
+    Args:
+        f: Memory of the filter.
+        first: Tick of its first fast row.
+    """
+    f.start, f.tick, f.has_started, f.at = first, first - 1, 0, 0
+    f.cell, f.wanted, f.cursor, f.waits, f.u_count = 0, -1, 0, 0, 0
+    f.first_fix, f.since, f.nis, f.turning, f.road_turn = -1, -1, np.nan, 0.0, 0.0
+    _fill(f.x, 0.0)
+    copy_into(f.first, f.x)
+    _fill(f.e, 0.0)
+    _fill(f.gain, 0.0)
+    _fill(f.eps, 0.0)
+    _fill(f.innovation, 0.0)
+    _fill(f.u, 0.0)
+    _fill(f.u_sum, 0.0)
+    for i in range(len(f.share)):
+        _fill(f.share[i], 0.0)
+    for i in range(N_TOTAL):
+        _fill(f.P[i], 0.0)
+    for i in range(N_CORE):
+        copy_into(f.prior[i], f.P[i])
+    for s in range(N_SLOW):
+        _fill(f.scale[s], 1.0)
+        _fill(f.last[s], np.nan)
+        f.believed[s], f.doubts[s] = -1, 0
+        for i in range(N_FRAMES):
+            f.stamp[s, i] = -1
+        for i in range(N_STAMPS):
+            f.known_stamps[s, i] = -1
+        if f.period[s] > 0:
+            since_phase = maximum(first - f.phase[s], 0)
+            f.next[s] = f.phase[s] + (since_phase + f.period[s] - 1) // f.period[s] * f.period[s]
+    for i in range(len(f.counts)):
+        f.counts[i] = 0
+    clear_history(f)
+    for i in range(N_TOTAL):
+        f.keep[i] = 0.0 if i < f.dense else f.decay[i] if i < f.n else 1.0
+    f.weight, f.fresh = f.odds, 0.0
+    if f.r_share > 0.0:
+        f.r_fast[f.accel_row] = f.r_told
+        _fill(f.y_past, np.nan)
+    f.steer_before = np.nan
+    if f.scaled > 0:
+        f.C_fast[f.accel_row, f.scaled] = 0.0
+    if f.tyres > 0:
+        linearise(f, 0.0)
+    if f.measured == 1:
+        f.speed, f.model_speed = 0.0, 0.0
+    else:
+        build_model(f, f.speed, 0.0)
+    f.stretch = 1.0
+
+
+@jit
+def _start(f: FilterRecord) -> None:
+    """Start: the first step has nothing to predict from."""
+    f.has_started = 1
+    f.at = ((f.tick - f.origin) // f.stride) % f.cycle
+    if f.speed_state >= 0:
+        f.x[f.speed_state] = f.speed
+
+
+@jit
+def _update_road_turn(f: FilterRecord, u: Vector) -> None:
+    """Add the road's turn beside the car, over a step with the inputs u (INPUTS,)."""
+    if f.kind == LATERAL and f.inputs > CURVATURE:
+        f.road_turn += compute_road_turn(f.model_speed, u[CURVATURE], f.step)
+
+
+@jit
+def run_tick(f: FilterRecord, gains: GainTables) -> None:
+    """Step from the last tick to this one, whose fast row was read.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+    """
+    f.tick += 1
+    if f.stride > 1:
+        for i in range(f.inputs):
+            f.u_sum[i] += f.u[i]
+        f.u_count += 1
+    listens = f.pace == 1 or (f.tick >= f.origin and (f.tick - f.origin) % f.pace == 0)
+    if f.stride > 1 and not listens:
+        return
+    if f.has_started == 1:
+        store_due_captures(f, f.tick - f.stride)
+        if f.stride > 1:
+            for i in range(f.inputs):
+                f.u_sum[i] /= f.u_count
+            _update_road_turn(f, f.u_sum)
+            advance_state(f, f.u_sum)
+        else:
+            _update_road_turn(f, f.u)
+            advance_state(f, f.u)
+        f.at = f.at + 1 if f.at + 1 < f.cycle else 0
+    else:
+        _start(f)
+    if f.store_predictions == 1:
+        f.past_road_turn[f.tick % WINDOW] = f.road_turn
+        for i in range(f.n):
+            f.predicted[f.tick % WINDOW, i] = f.x[i]
+    if listens:
+        correct_fast(f, gains)
+    if f.late == BUFFER:
+        store_history(f)
+    for i in range(f.inputs):
+        f.u_sum[i] = 0.0
+    f.u_count = 0
+    if f.pace > 1 and listens:
+        apply_waiting(f, gains)
+
+
+@jit
+def read_covariance(f: FilterRecord, gains: GainTables, i: int, j: int) -> Any:
+    """Read the present covariance of two states; with periodic gains that of the settled cycle.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+        i: Index of a state.
+        j: Index of a state, i <= j.
+
+    Returns:
+        P[i, j].
+    """
+    if f.periodic == 1:
+        return gains[f.cell, locate_step_row(f), f.total + i * f.n - i * (i - 1) // 2 + j - i]
+    return f.P[i, j]
+
+
+@jit
+def compute_deviation(f: FilterRecord, gains: GainTables, i: int) -> Any:
+    """Compute the present standard deviation of a state.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+        i: Index of the state.
+
+    Returns:
+        Standard deviation in the state's unit.
+    """
+    return sqrt(maximum(read_covariance(f, gains, i, i), 0.0))
+
+
+@jit
+def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Any, S: Any) -> None:
+    """Write the states and standard deviations of all layers in row j of X and S (rows, n)."""
+    column = 0
+    for layer in range(len(layers) if first_member(layers) == 0 else 1):
+        f = layers[layer]
+        for i in range(f.n):
+            X[j, column] = f.x[i]
+            S[j, column] = compute_deviation(f, gains, i)
+            column += 1
+
+
+@jit
+def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Any) -> bool:
+    """Write the states of all layers and their covariance.
+
+    Args:
+        layers: Memory of the estimator, shape (layers,).
+        gains: Tables of gains, shape (cells, rows, columns).
+        x: Output for the states, shape (n,).
+        P: Output for the covariance, zeros of shape (n, n), or (0, 0).
+
+    Returns:
+        False where P is to be read from gains that are missing.
+    """
+    offset, f = 0, layers[0]
+    if len(P) > 0 and f.periodic == 1 and gains[f.cell, 0, 0] == 0.0:
+        return False
+    for layer in range(len(layers) if first_member(layers) == 0 else 1):
+        f = layers[layer]
+        for i in range(f.n):
+            x[offset + i] = f.x[i]
+            for j in range(f.n if len(P) > 0 else 0):  # a table holds one triangle
+                row, column = (j, i) if f.periodic == 1 and i > j else (i, j)
+                P[offset + i, offset + j] = read_covariance(f, gains, row, column)
+        offset += f.n
+    return True
+
+
+@noinline
+def advance(
+    layers: FilterRecords,
+    gains: GainTables,
+    fast: Any,
+    rows: int,
+    packets: Any,
+    count: int,
+    start: int,
+    X: Any,
+    S: Any,
+    nis: Vector,
+) -> int:
+    """Process the fast rows from `start` to `rows` and the first `count` packets.
+
+    Args:
+        layers: Memory, shape (1,); (2,), of which the second measures what the first estimates; or
+            a bank, the mixture and its members.
+        gains: Tables of gains of the first layer, shape (cells, rows, columns).
+        fast: Fast rows, shape (rows or more, FAST_WIDTH).
+        rows: Number of fast rows.
+        packets: Packets, shape (count or more, PACKET_WIDTH).
+        count: Number of packets.
+        start: Number of rows that are done already.
+        X: Output for the states, shape (rows, n), or empty.
+        S: Output for the standard deviations, shape (rows, n), or empty.
+        nis: Output for each packet's normalised innovation squared, shape (count,), or empty.
+
+    Returns:
+        Number of rows done: fewer than `rows` where gains are missing, those of the cell `wanted`
+            of
+        the first layer; call again from there.
+    """
+    first = first_member(layers)
+    f = layers[first]
+    position, last = 0 if start == 0 else f.cursor, f.tick + rows - start
+    for j in range(start, rows):
+        wheel_speed = 0.5 * (fast[j, FAST.wheel_left] + fast[j, FAST.wheel_right])
+        if f.periodic == 1:
+            cell = find_next_cell(f, wheel_speed)
+            if gains[cell, 0, 0] == 0.0:
+                f.wanted, f.cursor = cell, position
+                return j
+        for layer in range(first, len(layers)):
+            read_fast_row(layers[layer], fast[j], wheel_speed)
+            run_tick(layers[layer], gains)
+        while position < count and not (f.tick < packets[position, PACKET.arrived] <= last):
+            was_used = process_packet(
+                f, gains, packets[position]
+            )  # from beyond the last row: counted here
+            if len(nis) > 0:
+                nis[position] = f.nis
+            if first > 0:
+                process_packet_members(layers, gains, packets[position])
+            elif was_used and len(layers) > 1:
+                update_second_layer(f, layers[1], gains, packets[position])
+            position += 1
+        if first > 0 and f.tick % f.respawn == 0 and f.tick > f.start:
+            update_bank(layers)
+        if first > 0 and (len(X) > 0 or j == rows - 1):
+            compute_mixture(layers)
+        if len(X) > 0:
+            _write_row(layers, gains, j, X, S)
+    f.counts[COUNTERS.future] += count - position  # of a call without rows
+    return rows
+
+
+@jit_nrt
+def step_all(layers: FilterRecords, gains: GainTables, fast: Any, packets: Any, count: int) -> int:
+    """Call `advance` over all rows without outputs: fewer arguments to hand over.
+
+    Args:
+        layers: Memory of the estimator, shape (layers,).
+        gains: Tables of gains, shape (cells, rows, columns).
+        fast: Fast rows, shape (rows, FAST_WIDTH).
+        packets: Packets, shape (count or more, PACKET_WIDTH).
+        count: Number of packets.
+
+    Returns:
+        Number of rows done.
+    """
+    empty = fast[:0]
+    return advance(
+        layers,
+        gains,
+        fast,
+        len(fast),
+        packets,
+        count,
+        len(empty),
+        empty,
+        empty,
+        empty.reshape(0),
+    )
+
+
+@jit
+def reset_filters(layers: FilterRecords, first: int) -> None:
+    """Reset all layers of an estimator.
+
+    Args:
+        layers: Memory of the estimator, shape (layers,).
+        first: Tick of the first fast row.
+    """
+    for i in range(len(layers)):
+        reset_filter(layers[i], first)
+
+
+@jit
+def process_packet_all(layers: FilterRecords, gains: GainTables, packet: Vector) -> None:
+    """Process a packet by all layers of an estimator.
+
+    Args:
+        layers: Memory of the estimator, shape (layers,).
+        gains: Tables of gains, shape (cells, rows, columns).
+        packet: Packet, shape (PACKET_WIDTH,).
+    """
+    if first_member(layers) > 0:
+        process_packet(layers[1], gains, packet)
+        process_packet_members(layers, gains, packet)
+        compute_mixture(layers)
+    elif process_packet(layers[0], gains, packet) and len(layers) > 1:
+        update_second_layer(layers[0], layers[1], gains, packet)

@@ -1,0 +1,533 @@
+"""The model at a speed, compiled: A and B of each kind, discretised exactly.
+
+Tyres that a filter estimates while it drives: an extended Kalman filter on the bicycle.
+
+The factors of both axles' stiffness, and the reciprocal of friction where tyres have a limit, are
+states behind the dense ones. Every few ms each axle's force is expanded at the present state:
+its slope by slip stands in `car` and makes the bicycle's matrices, its slopes by the states are
+columns beside them, and the rest is a known push.
+
+The measured speed: when the model is built anew, and where its gains stand.
+
+There is a table of gains for each cell of speed. Its rows: a head, then, for each step of the
+cycle, one for every fast measurement (one where there is none), then, for each frame of the
+pattern, one for every row of the slow sensor, then those of the rule between samples.
+"""
+
+from typing import Any
+
+from ...envs.numerics.jit import jit, noinline
+from ...envs.numerics.packed import load_element, store_element
+from ...envs.numerics.primitives import absolute, maximum, minimum
+from ...envs.numerics.simd8 import allocate_scratch, load8, store8
+from ...envs.vehicle.linear import write_kinematic, write_lateral, write_roll
+from ...envs.vehicle.parameters import GRAVITY
+from .covariance import multiply_rows
+from .record import CAR, N_CORE, N_DRIVERS, N_INPUTS, N_SLOW, FilterRecord, Vector
+
+LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES, LINEAR = range(7)
+"""Kinds of models; LINEAR is any linear system, whose matrices are arguments."""
+BETA, GAMMA, PSI, Y_L = range(4)
+"""Places of a bicycle's states."""
+CURVATURE = 2
+"""Place of the road's curvature among a bicycle's inputs."""
+
+MIN_SPEED = 1.5  # m/s: below it the model stays that of this speed
+
+
+@jit
+def _build_lateral(f: FilterRecord, V: Any) -> None:
+    """Build tie-vision (8), dakf-stability (5)-(11), a body that rolls and what a_y feels of it."""
+    A, B = f.A, f.B
+    rolling = 2 if f.rolling > 0 else 0
+    write_lateral(A, B, f.car, V, f.dense - f.delayed - rolling, f.inputs, f.preview)
+    if f.forces == 1:
+        B[0, N_INPUTS], B[1, N_INPUTS + 1] = 1.0 / (f.car[CAR.mass] * V), B[1, 1]
+    if rolling > 0:
+        _write_body(f, V)
+    if f.accel_row > 0:
+        _write_accel(f, V)
+    if f.tyres > 0:
+        _write_tyres(f, V)
+    if f.banked >= 0:  # gravity, which an accelerometer does not feel and the body does not roll by
+        B[0, N_INPUTS + f.banked] = -GRAVITY / V
+
+
+@jit
+def _write_body(f: FilterRecord, V: Any) -> None:
+    """Write phi, phi_rate and their effect on beta: double-layer-gps (1), (3), solved for phi''."""
+    A, B, i = f.A, f.B, f.rolling
+    share = 1.0 / (1.0 - f.roll_arm * f.sway)
+    lift, lag = share * f.roll_arm, f.sway / V
+    stiffness = share * (f.roll_stiffness - f.roll_arm * GRAVITY)
+    write_roll(A, B, i, 0, stiffness, share * f.roll_damping, lift * V * B[0, 0])
+    A[i + 1, BETA], A[i + 1, GAMMA] = lift * V * A[0, BETA], lift * V * (A[0, GAMMA] + 1.0)
+    B[i + 1, N_INPUTS] = lift * V * B[0, N_INPUTS]  # the force that pushes beta
+    for j in range(f.dense):
+        A[0, j] += lag * A[i + 1, j]
+    B[0, 0] += lag * B[i + 1, 0]
+    B[0, N_INPUTS] += lag * B[i + 1, N_INPUTS]
+
+
+@jit
+def _write_accel(f: FilterRecord, V: Any) -> None:
+    """Write the specific force a_y = V (beta' + gamma) + g phi, with feed-through of steering."""
+    row = f.C_fast[f.accel_row]
+    for j in range(f.dense):
+        row[j] = V * f.A[0, j]
+    row[GAMMA] = V * (f.A[0, GAMMA] + 1.0)
+    if f.pushed[0] >= 0:  # what comes first behind is no bias
+        row[f.dense] = V * f.B[0, N_INPUTS]
+    if f.rolling > 0:
+        row[f.rolling] += GRAVITY
+    f.D_fast[f.accel_row, 0] = V * f.B[0, 0]
+
+
+@jit
+def _compute_rates(f: FilterRecord, V: Any, front: Any, rear: Any) -> Any:
+    """Compute (beta', gamma', phi_rate') by forces of the axles in N."""
+    beta = (front + rear) / (f.car[CAR.mass] * V)
+    gamma = (f.car[CAR.front_arm] * front - f.car[CAR.rear_arm] * rear) / f.car[CAR.yaw_inertia]
+    if f.rolling == 0:
+        return beta, gamma, 0.0
+    phi_rate = f.roll_arm / (1.0 - f.roll_arm * f.sway) * V * beta
+    return beta + f.sway / V * phi_rate, gamma, phi_rate
+
+
+@jit
+def _write_tyres(f: FilterRecord, V: Any) -> None:
+    """Write the estimated tyres' columns of B, besides their slope by slip, and f.push."""
+    for j in range(3):  # both factors, then the grip
+        if j < 2 or f.grip > 0:
+            front = f.per_tyre[0, j // 2] if j != 1 else 0.0
+            rear = f.per_tyre[1, j // 2] if j != 0 else 0.0
+            column = (f.tyres + j if j < 2 else f.grip) - f.dense
+            beta, gamma, phi_rate = _compute_rates(f, V, front, rear)
+            f.B[0, N_INPUTS + column], f.B[1, N_INPUTS + column] = beta, gamma
+            if f.rolling > 0:
+                f.B[f.rolling + 1, N_INPUTS + column] = phi_rate
+            if f.accel_row > 0:
+                f.C_fast[f.accel_row, f.dense + column] = V * beta
+    beta, gamma, phi_rate = _compute_rates(f, V, f.rest[0], f.rest[1])
+    f.push[0], f.push[1] = beta, gamma
+    if f.rolling > 0:
+        f.push[f.rolling + 1] = phi_rate
+    f.rest_fast[f.accel_row] = V * beta if f.accel_row > 0 else 0.0
+
+
+@jit
+def build_continuous(f: FilterRecord, V: Any, turning: Any) -> None:
+    """Build f.A and f.B = [inputs, disturbances].
+
+    Args:
+        f: Memory of the filter.
+        V: Speed (m/s).
+        turning: Yaw rate (rad/s).
+    """
+    A, B = f.A, f.B
+    for i in range(f.dense):
+        for j in range(0, N_CORE, 8):
+            store8(A, 0.0, i, j)
+        for j in range(0, N_DRIVERS, 8):
+            store8(B, 0.0, i, j)
+    if f.forces == 0:
+        for j in range(f.n - f.dense):
+            if f.pushed[j] >= 0:
+                B[f.pushed[j], N_INPUTS + j] = 1.0
+    if f.kind == LATERAL:
+        _build_lateral(f, V)
+    elif f.kind == ROLL or f.kind == VELOCITY_ROLL:
+        i = 0 if f.kind == ROLL else 2
+        write_roll(A, B, i, f.inputs - 1, f.roll_stiffness, f.roll_damping, f.roll_arm)
+    if f.kind == KINEMATIC or f.kind == VELOCITY_ROLL:
+        write_kinematic(A, B, turning)
+        if f.kind == VELOCITY_ROLL:
+            A[1, 2] = -GRAVITY  # double-layer-gps (5)
+    if f.kind == YAW or f.kind == FORCES:
+        I = f.car[CAR.yaw_inertia]  # noqa: E741  the papers' letter
+        B[0, 0] = 1.0 / I
+        B[0, N_INPUTS] = 1.0 / I
+        if f.kind == FORCES:
+            B[0, N_INPUTS], B[0, N_INPUTS + 1] = f.car[CAR.front_arm] / I, -f.car[CAR.rear_arm] / I
+
+
+@jit
+def _multiply(a: Vector, b: Vector, c: Vector, n: int, m: int) -> None:
+    """Multiply c = a b for a (n, n) and b (n, m), in the corners of larger arrays."""
+    for j in range(0, m, 8):
+        for i in range(0, n, 4):
+            first, second, third, fourth = multiply_rows(a, i, b, n, j, 0.0, 0.0, 0.0, 0.0)
+            store8(c, first, i, j)
+            store8(c, second, i + 1, j)
+            store8(c, third, i + 2, j)
+            store8(c, fourth, i + 3, j)
+
+
+@jit
+def discretise(f: FilterRecord) -> None:
+    """Compute f.G and f.H of tie-vision (9): exact for inputs and disturbances held over the step.
+
+    Phi = integral of e^(A t) over the step by its Taylor series, after halving the step until
+    ||A h|| <= 1/2 and doubling back; G = I + A Phi. Accurate to rounding (relative 1e-14).
+
+    Args:
+        f: Memory of the filter with A, B and its step.
+    """
+    n, m = f.dense - f.delayed, N_INPUTS + f.n - f.dense
+    E, Phi, T = (
+        allocate_scratch(f.A, N_CORE, N_DRIVERS),
+        allocate_scratch(f.A, N_CORE, N_DRIVERS),
+        allocate_scratch(f.A, N_CORE, N_DRIVERS),
+    )
+    one = allocate_scratch(f.A, N_CORE, N_CORE)  # h I
+    norm = 0.0
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += absolute(load_element(f.A, i, j))
+        norm = maximum(norm, total * f.step)
+    h, doublings = f.step, 0
+    while norm > 0.5:
+        norm *= 0.5
+        h *= 0.5
+        doublings += 1
+    for i in range(n):
+        for j in range(0, n, 8):
+            store8(one, 0.0, i, j)
+        store_element(one, h, i, i)
+        for j in range(0, n, 8):
+            store8(Phi, load8(one, i, j), i, j)
+    for order in range(15 if norm > 0.05 else 9, 1, -1):  # Horner: h (I + A h / 2 (I + ...))
+        _multiply(f.A, Phi, T, n, n)
+        share = h / order
+        for i in range(n):
+            for j in range(0, n, 8):
+                store8(Phi, load8(T, i, j) * share + load8(one, i, j), i, j)
+    for _ in range(doublings):  # the integral over 2 h is (I + e^(A h)) times that over h
+        _multiply(f.A, Phi, E, n, n)
+        for i in range(n):
+            store_element(E, load_element(E, i, i) + 2.0, i, i)
+        _multiply(E, Phi, T, n, n)
+        for i in range(n):
+            for j in range(0, n, 8):
+                store8(Phi, load8(T, i, j), i, j)
+    _multiply(f.A, Phi, E, n, n)
+    _multiply(Phi, f.B, T, n, m)
+    for i in range(n):
+        store_element(E, load_element(E, i, i) + 1.0, i, i)
+        drift = 0.0
+        for j in range(n):
+            store_element(f.G, load_element(E, i, j), i, j)
+            drift += load_element(Phi, i, j) * load_element(f.push, j)
+        store_element(f.drift, drift, i)
+        for j in range(f.inputs):
+            store_element(f.H, load_element(T, i, j), i, j)
+        for j in range(f.n - f.dense):
+            store_element(f.G, load_element(T, i, N_INPUTS + j), i, f.dense + j)
+
+
+@jit
+def _transpose(f: FilterRecord) -> None:
+    """Write f.GT and f.HT, by which states and covariance are predicted."""
+    for i in range(f.dense):
+        for k in range(f.n):
+            store_element(f.GT, load_element(f.G, i, k), k, i)
+        for k in range(f.inputs):
+            store_element(f.HT, load_element(f.H, i, k), k, i)
+
+
+@jit
+def _set_delayed_rows(f: FilterRecord) -> None:
+    """Set the rows by which delayed states follow the camera's: tie-vision (12), at every step."""
+    first = f.dense - f.delayed
+    for i in range(f.delayed):
+        for j in range(f.n):
+            f.G[first + i, j] = 0.0
+        f.G[first + i, PSI + i] = f.relax
+        f.G[first + i, first + i] = 1.0 - f.relax
+
+
+@jit
+def compute_road_turn(V: Any, curvature: Any, step: Any) -> Any:
+    """Compute the angle by which a road turns within a step.
+
+    Args:
+        V: Speed (m/s).
+        curvature: Curvature of the road (1/m).
+        step: Step (s).
+
+    Returns:
+        Angle (rad).
+    """
+    return V * curvature * step
+
+
+@jit
+def compute_row_variance(f: FilterRecord, s: int, i: int, V: Any) -> Any:
+    """Compute the variance of a slow sensor's row at a speed.
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+        i: Index of its row.
+        V: Speed of the model (m/s).
+
+    Returns:
+        Variance in the row's unit squared.
+    """
+    scaled = f.noise_over_speed[s, i]
+    return scaled / (V * V) if scaled > 0.0 else f.r[s, i]
+
+
+@noinline
+def build_model(f: FilterRecord, speed: Any, turning: Any) -> None:
+    """Build the model at a speed, and the noise that grows with 1/V.
+
+    Args:
+        f: Memory of the filter.
+        speed: Speed (m/s).
+        turning: Yaw rate (rad/s).
+    """
+    V = maximum(speed, MIN_SPEED)
+    if f.kind == LATERAL and f.model_speed > 0.0:
+        f.stretch *= f.model_speed / V
+    f.model_speed, f.turning = V, turning
+    if f.kind != LINEAR:
+        build_continuous(f, V, turning)
+        discretise(f)
+        _set_delayed_rows(f)
+    _transpose(f)
+    for s in range(N_SLOW):
+        for i in range(f.rows[s]):
+            f.r[s, i] = compute_row_variance(f, s, i, V)
+
+
+FACTOR_LIMITS = (0.2, 3.0)
+MAX_INVERSE_FRICTION = 4.0  # of the reciprocal of friction
+_MIN_SLOPE = 0.02  # of a tyre's slope, where it slides
+
+
+@jit
+def compute_axle_force(stiffness: Any, load: Any, alpha: Any, factor: Any, grip: Any) -> Any:
+    """Compute an axle's lateral force and its slopes: Fiala's law with friction 1/grip.
+
+    F = C s alpha (1 - |z| + z^2 / 3), z = C s alpha grip / (3 F_z) within +-1; at grip 0 it is
+    linear.
+
+    Args:
+        stiffness: Nominal cornering stiffness of the axle, C (N/rad).
+        load: Load of the axle, F_z (N).
+        alpha: Slip angle (rad).
+        factor: Factor on the stiffness, s.
+        grip: Reciprocal of friction.
+
+    Returns:
+        (F, dF/dalpha, dF/dfactor, dF/dgrip) in N, N/rad, N and N.
+    """
+    total_stiffness = stiffness * factor
+    slip_ratio = total_stiffness * absolute(alpha) / (3.0 * load)
+    z = minimum(slip_ratio * grip, 1.0)
+    share = 1.0 - z + z * z * (1.0 / 3.0)
+    if z >= 1.0:  # it slides: F_z / grip
+        force = load / grip if alpha > 0.0 else 0.0 - load / grip
+        return force, _MIN_SLOPE * total_stiffness, 0.0, 0.0 - force / grip
+    slope = (1.0 - z) * (1.0 - z)
+    grip_slope = total_stiffness * alpha * slip_ratio * (z * (2.0 / 3.0) - 1.0)
+    return (
+        total_stiffness * alpha * share,
+        maximum(slope, _MIN_SLOPE) * total_stiffness,
+        stiffness * alpha * slope,
+        grip_slope,
+    )
+
+
+@jit
+def _set_random_walk(f: FilterRecord, moves: bool) -> None:
+    """Set the tyres' random walk: while the car moves, up to their variance at the start.
+
+    A new member's walk more.
+    """
+    for i in range(3 if f.grip > 0 else 2):
+        index = f.tyres + i if i < 2 else f.grip
+        walks = moves and f.P[index, index] < f.prior[index, index]
+        extra = f.fresh if i < 2 else 0.0
+        f.Q[index, index] = f.q_tyres[i] + extra if walks else 0.0
+
+
+@jit
+def linearise(f: FilterRecord, steer: Any) -> None:
+    """Expand both axles' forces at the present state.
+
+    Args:
+        f: Memory of the filter.
+        steer: Steering angle of the front wheels (rad).
+    """
+    x, V = f.x, maximum(f.model_speed, MIN_SPEED)
+    for i in range(2):
+        x[f.tyres + i] = minimum(maximum(x[f.tyres + i], FACTOR_LIMITS[0]), FACTOR_LIMITS[1])
+    grip = 0.0
+    if f.grip > 0:
+        grip = minimum(maximum(x[f.grip], 0.0), MAX_INVERSE_FRICTION)
+        x[f.grip] = grip
+    beta, gamma = x[0], x[1]
+    push, moves = 0.0, f.speed > MIN_SPEED
+    _set_random_walk(f, moves)
+    for i in range(2):
+        arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
+        alpha = (steer if i == 0 else 0.0) - beta - arm * gamma / V
+        factor = x[f.tyres + i]
+        force, slope, per_factor, per_grip = compute_axle_force(
+            f.stiffness[i], f.load[i], alpha, factor, grip
+        )
+        f.car[CAR.front_stiffness + i] = 0.5 * slope
+        if not moves:  # nothing of the tyres is seen
+            per_factor, per_grip = 0.0, 0.0
+        f.per_tyre[i, 0], f.per_tyre[i, 1] = per_factor, per_grip
+        f.rest[i] = force - slope * alpha - per_factor * factor - per_grip * grip
+        push += absolute(force)
+    if f.model_error > 0.0:
+        force_error = f.model_error * push
+        moment_error = 0.5 * (f.car[CAR.front_arm] + f.car[CAR.rear_arm]) * force_error
+        f.Q[f.dense, f.dense] = f.q_known[0] + f.q_share * force_error * force_error
+        f.Q[f.dense + 1, f.dense + 1] = f.q_known[1] + f.q_share * moment_error * moment_error
+
+
+MAX_NUMBER = 1e15  # of a number that a filter takes: below it, whole floats are exact as int
+SPEED_TOLERANCE = 0.005  # the model is built anew where the speed moved by this share
+
+
+@jit
+def is_finite(value: float) -> Any:
+    """Return whether a number can be calculated with: not NaN, infinite or beyond `MAX_NUMBER`.
+
+    Args:
+        value: Any number.
+
+    Returns:
+        True for a usable number.
+    """
+    return absolute(value) < MAX_NUMBER
+
+
+@jit
+def smooth_speed(speed: Any, sample: Any, share: Any) -> Any:
+    """Low-pass the speed.
+
+    Args:
+        speed: Low-passed speed so far (m/s).
+        sample: New sample (m/s).
+        share: Weight of the sample, 0 to 1.
+
+    Returns:
+        Low-passed speed (m/s).
+    """
+    return speed + share * (sample - speed)
+
+
+@jit
+def is_speed_changed(speed: Any, model_speed: Any) -> Any:
+    """Return whether a speed is too far from the model's.
+
+    Args:
+        speed: Speed (m/s).
+        model_speed: Speed of the model (m/s).
+
+    Returns:
+        True beyond `SPEED_TOLERANCE`.
+    """
+    return absolute(maximum(speed, MIN_SPEED) - model_speed) > SPEED_TOLERANCE * model_speed
+
+
+@jit
+def filter_speed(f: FilterRecord, sample: float) -> Any:
+    """Compute the low-passed mean of the front wheels' speeds; a bad sample is skipped.
+
+    Args:
+        f: Memory of the filter.
+        sample: New sample of that mean (m/s).
+
+    Returns:
+        Low-passed speed (m/s).
+    """
+    if not is_finite(sample):
+        return f.speed
+    if f.model_speed == 0.0:
+        return sample
+    return smooth_speed(f.speed, sample, f.smoothing)
+
+
+@jit
+def is_model_outdated(f: FilterRecord, speed: float) -> Any:
+    """Return whether the model has to be built anew.
+
+    Args:
+        f: Memory of the filter.
+        speed: Speed (m/s).
+
+    Returns:
+        True where the speed is too far from the model's.
+    """
+    return is_speed_changed(speed, f.model_speed)
+
+
+@jit
+def find_cell(f: FilterRecord, speed: float) -> Any:
+    """Find the table of gains nearest to a speed.
+
+    Args:
+        f: Memory of the filter.
+        speed: Speed (m/s).
+
+    Returns:
+        Index of the cell.
+    """
+    if f.spacing == 0.0:
+        return 0
+    V = minimum(maximum(speed, f.low), f.high)
+    return int((V - f.low) / f.spacing + 0.5)
+
+
+@jit
+def find_next_cell(f: FilterRecord, sample: float) -> Any:
+    """Find the table of gains that the next row will use.
+
+    Args:
+        f: Memory of the filter.
+        sample: The row's sample of the speed (m/s).
+
+    Returns:
+        Index of the cell.
+    """
+    if f.measured == 1:
+        speed = filter_speed(f, sample)
+        if is_model_outdated(f, speed):
+            return find_cell(f, speed)
+    return f.cell
+
+
+@jit
+def locate_step_row(f: FilterRecord) -> Any:
+    """Locate the gain of the first fast measurement in this step.
+
+    Args:
+        f: Memory of the filter.
+
+    Returns:
+        Row of the table.
+    """
+    return 1 + f.at * maximum(f.fasts, 1)
+
+
+@jit
+def locate_frame_row(f: FilterRecord, s: int, frame: int) -> Any:
+    """Locate the gain of a slow sensor's first row for a frame.
+
+    Args:
+        f: Memory of the filter.
+        s: Index of the slow sensor.
+        frame: Frame of the pattern; the pattern's length for the rule between samples.
+
+    Returns:
+        Row of the table.
+    """
+    return 1 + f.cycle * maximum(f.fasts, 1) + frame * f.rows[s]

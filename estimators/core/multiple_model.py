@@ -1,0 +1,281 @@
+"""Estimators of several records: the second layer of double-layer-gps, or a bank and its mixture.
+
+The second layer has velocities and roll, measured by the GPS and the first layer.
+
+A bank: a filter that has settled on its tyres takes seconds to believe that they changed. Every
+half second the least likely member becomes a copy of the likeliest that has forgotten the tyres, at
+the odds of such a change, and whose tyres walk until the next one begins, since the change may come
+later; what is measured makes one or the other likelier. Members that would be twins of others at
+the start come with next to no weight, so that they begin anew first. Where members differ in the
+level of their disturbances, a place in the bank stays at its own. Layer 0 of an estimator
+with a bank is the mixture's mean and covariance, which nothing measures; its members follow.
+
+Or its four members interact, an interacting multiple model (Blom, Bar-Shalom 1988) of a Markov
+chain: nothing happens; a gust blows, whose force and moment walk; the tyres have just changed, and
+walk; they settle. Every fifth of a second each one is merged, mean and covariance, with what
+comes from the others at the chain's odds: a gust that begins adds its variance to the forces, one
+that ends leaves them as they are without it, tyres that change are forgotten. What a gust does is
+seen only after some tenths of a second: until then merging lets the hypothesis live.
+"""
+
+from math import exp, log
+from typing import Any
+
+from ...envs.numerics.functions import sincos
+from ...envs.numerics.jit import copy_into, jit, noinline
+from ...envs.numerics.primitives import maximum
+from ...envs.numerics.simd8 import load8, store8
+from ...envs.record import PACKET
+from .innovation import inflate_covariance, interpolate_hdop
+from .model import BETA, is_finite
+from .packets import process_packet, process_sample
+from .record import COUNTERS, WINDOW, FilterRecord, FilterRecords, GainTables, Vector
+
+MIN_LOG_WEIGHT = -60.0  # of a member's weight, below the likeliest
+CALM, GUSTY, CHANGED, SETTLING = range(1, 5)
+"""Layers of the members that interact."""
+GUST_RATE, LULL_RATE = 0.03, 0.3  # 1/s, of gusts that begin and end
+CHANGE_RATE, SETTLE_RATE, TRUST_RATE = 0.1, 2.0, 0.3  # 1/s, of tyres: into CHANGED, SETTLING, CALM
+
+
+@jit
+def update_second_layer(
+    first: FilterRecord, second: FilterRecord, gains: GainTables, packet: Vector
+) -> None:
+    """Correct the second layer by a packet as a velocity: v_x = V cos(beta), v_y = V sin(beta).
+
+    double-layer-gps (8)-(9), with the first layer's sideslip angle as it was predicted for the
+    captured tick. The noise along is the speed's, after the table of HDOP; the one across is that
+    of the angle, (V sigma_beta)^2, and of the speed, (sigma_V sin(beta))^2.
+
+    Args:
+        first: Memory of the first layer.
+        second: Memory of the second layer.
+        gains: Tables of gains, shape (cells, rows, columns).
+        packet: Packet that the first layer has used, shape (PACKET_WIDTH,).
+    """
+    s, captured = int(packet[PACKET.sensor]), int(packet[PACKET.captured])
+    beta = first.x[BETA]
+    if captured >= maximum(first.start, first.tick - WINDOW + 1) and captured < first.tick:
+        beta = first.predicted[captured % WINDOW, BETA]
+    sine, cosine = sincos(beta)
+    V = packet[first.speed_column[s]]
+    if not is_finite(V):
+        first.counts[COUNTERS.invalid] += 1
+        return
+    velocity = second.sample
+    copy_into(packet, velocity)
+    velocity[PACKET.value] = V * cosine
+    velocity[PACKET.value + 1] = V * sine
+    factor = interpolate_hdop(first, s, packet)
+    speed_variance = second.r_speed * factor * factor
+    second.r[s, 0] = speed_variance
+    second.r[s, 1] = V * V * first.P[BETA, BETA] + speed_variance * sine * sine
+    process_sample(second, gains)
+
+
+@jit
+def first_member(layers: FilterRecords) -> int:
+    """Return the first layer that measures.
+
+    Args:
+        layers: Memory of the estimator, shape (layers,).
+
+    Returns:
+        1 where there is a bank, else 0.
+    """
+    return 1 if layers[0].members > 0 else 0
+
+
+@jit
+def process_packet_members(layers: FilterRecords, gains: GainTables, packet: Vector) -> None:
+    """Process a packet by every member behind the first one.
+
+    Args:
+        layers: Memory of the bank, shape (layers,).
+        gains: Tables of gains, shape (cells, rows, columns).
+        packet: Packet, shape (PACKET_WIDTH,).
+    """
+    for m in range(2, len(layers)):
+        process_packet(layers[m], gains, packet)
+
+
+@jit
+def _find_likeliest(layers: FilterRecords) -> int:
+    best = 1
+    for m in range(2, len(layers)):
+        if layers[m].weight > layers[best].weight:
+            best = m
+    return best
+
+
+@jit
+def _set_level(f: FilterRecord, i: int, level: Any) -> None:
+    """Set the variance of disturbance i to `level` times the configured one."""
+    index, ratio = f.dense + i, level / f.level[i]
+    f.level[i] = level
+    f.q_known[i] *= ratio
+    f.Q[index, index] *= ratio
+
+
+@noinline
+def replace_least_likely(layers: FilterRecords) -> None:
+    """Replace the least likely member by the likeliest with tyres that may have changed.
+
+    Args:
+        layers: Memory of the bank, shape (layers,).
+    """
+    best = _find_likeliest(layers)
+    max_weight, worst = layers[best].weight, 1
+    for m in range(1, len(layers)):
+        layers[m].weight, layers[m].fresh = (
+            maximum(layers[m].weight - max_weight, MIN_LOG_WEIGHT),
+            0.0,
+        )
+        if layers[m].weight <= layers[worst].weight and m != best:
+            worst = m
+    f = layers[worst]
+    force, moment, odds, i = f.level[0], f.level[1], f.odds, f.dense
+    first = f.prior[i, i], f.prior[i + 1, i + 1]
+    layers[worst] = layers[best]
+    f.odds = odds  # with which the place, not the member, begins
+    if f.forces == 1:
+        _set_level(f, 0, force)
+        _set_level(f, 1, moment)
+        f.prior[i, i], f.prior[i + 1, i + 1] = first
+    for i in range(2):
+        inflate_covariance(f, f.tyres + i, f.spread)
+    f.weight, f.fresh = f.hazard, f.alert
+
+
+@jit
+def _copy_moments(source: FilterRecord, target: FilterRecord) -> None:
+    """Copy mean and covariance of states and clones."""
+    for j in range(0, source.total, 8):
+        store8(target.x, load8(source.x, j), j)
+        for i in range(source.total):
+            store8(target.P, load8(source.P, i, j), i, j)
+
+
+@jit
+def _split_weight(source: FilterRecord, share: Any) -> Any:
+    """Split off the probability (a member's `weight`, here) that leaves it, and return it."""
+    moved = share * source.weight
+    source.weight -= moved
+    return moved
+
+
+@jit
+def _merge(source: FilterRecord, probability: Any, target: FilterRecord) -> Any:
+    """Merge a source's mean and covariance into a member's; return the source's fraction."""
+    target.weight += probability
+    share = probability / target.weight
+    product = share * (1.0 - share)
+    for j in range(0, target.total, 8):
+        offset = load8(source.x, j) - load8(target.x, j)
+        for i in range(target.total):
+            target_entry, spread = (
+                load8(target.P, i, j),
+                (source.x[i] - target.x[i]) * offset * product,
+            )
+            store8(
+                target.P,
+                target_entry + (load8(source.P, i, j) - target_entry) * share + spread,
+                i,
+                j,
+            )
+    for i in range(target.total):
+        target.x[i] += share * (source.x[i] - target.x[i])
+    return share
+
+
+@jit
+def _remove_gust(f: FilterRecord) -> None:
+    """Set force and moment to what they are without a gust, whatever they were."""
+    for i in range(2):
+        index = f.dense + i
+        f.x[index] = 0.0
+        for j in range(f.total):
+            f.P[index, j] = 0.0
+            f.P[j, index] = 0.0
+        f.P[index, index] = f.q_known[i] / f.q_share
+
+
+@noinline
+def run_imm_step(layers: FilterRecords) -> None:
+    """Run a step of the Markov chain on the members' moments and weights; layer 0 is its scratch.
+
+    Args:
+        layers: Memory of the bank, shape (1 + 4,).
+    """
+    best, calmed = _find_likeliest(layers), layers[0]
+    calm, gusty, changed = layers[CALM], layers[GUSTY], layers[CHANGED]
+    settling, max_weight, time = layers[SETTLING], layers[best].weight, calm.respawn * calm.step
+    for m in range(1, len(layers)):
+        layers[m].weight = exp(maximum(layers[m].weight - max_weight, MIN_LOG_WEIGHT))
+    _copy_moments(gusty, calmed)
+    _remove_gust(calmed)
+    calm_probability = _split_weight(gusty, LULL_RATE * time)
+    share = _merge(calm, _split_weight(calm, GUST_RATE * time), gusty)
+    for i in range(2):
+        inflate_covariance(gusty, gusty.dense + i, share * gusty.burst[i])
+    _merge(calmed, calm_probability, calm)
+    _copy_moments(calm, calmed)
+    change_probability = _split_weight(calm, CHANGE_RATE * time)
+    _merge(settling, _split_weight(settling, TRUST_RATE * time), calm)
+    _merge(changed, _split_weight(changed, SETTLE_RATE * time), settling)
+    share = _merge(calmed, change_probability, changed)
+    for i in range(2):
+        inflate_covariance(changed, changed.tyres + i, share * changed.spread)
+    for m in range(1, len(layers)):
+        layers[m].weight = log(layers[m].weight)
+
+
+@jit
+def update_bank(layers: FilterRecords) -> None:
+    """Run the bank's own step: interact, or replace a member.
+
+    Args:
+        layers: Memory of the bank, shape (layers,).
+    """
+    if layers[0].burst[0] > 0.0:
+        run_imm_step(layers)
+    else:
+        replace_least_likely(layers)
+
+
+@jit
+def _compute_likelihood(layers: FilterRecords, m: int, best: int) -> Any:
+    return exp(maximum(layers[m].weight - layers[best].weight, MIN_LOG_WEIGHT))
+
+
+@noinline
+def compute_mixture(layers: FilterRecords) -> None:
+    """Compute the mean and covariance of the mixture, in layer 0.
+
+    Args:
+        layers: Memory of the bank, shape (layers,).
+    """
+    best = _find_likeliest(layers)
+    likeliest, mixture = layers[best], layers[0]
+    total, n = 0.0, likeliest.n
+    for m in range(1, len(layers)):
+        total += _compute_likelihood(layers, m, best)
+    for i in range(n):
+        mixture.x[i] = 0.0
+        for j in range(0, n, 8):
+            store8(mixture.P, 0.0, i, j)
+    for m in range(1, len(layers)):
+        share = _compute_likelihood(layers, m, best) / total
+        for i in range(n):
+            mixture.x[i] += share * layers[m].x[i]
+    for m in range(1, len(layers)):
+        share, f = _compute_likelihood(layers, m, best) / total, layers[m]
+        for j in range(0, n, 8):
+            offset = load8(f.x, j) - load8(mixture.x, j)
+            for i in range(n):
+                spread = load8(f.P, i, j) + (f.x[i] - mixture.x[i]) * offset
+                store8(mixture.P, load8(mixture.P, i, j) + share * spread, i, j)
+    mixture.tick, mixture.speed, mixture.nis = likeliest.tick, likeliest.speed, layers[1].nis
+    for i in range(len(mixture.counts)):
+        mixture.counts[i] = layers[1].counts[i]

@@ -1,0 +1,288 @@
+"""From one step to the next: a fast row read, the prediction, the correction by fast sensors."""
+
+from typing import Any
+
+import numpy as np
+
+from ...envs.numerics.jit import jit, noinline
+from ...envs.numerics.packed import load_element, store_element
+from ...envs.numerics.primitives import absolute, maximum, minimum
+from ...envs.numerics.simd8 import allocate_scratch, load8, store8, vector_width
+from ...envs.record import FAST
+from .covariance import predict_covariance, update_with_states
+from .innovation import BUFFER, LARSEN, propagate_larsen_gains
+from .model import (
+    BETA,
+    KINEMATIC,
+    LINEAR,
+    MIN_SPEED,
+    VELOCITY_ROLL,
+    build_model,
+    filter_speed,
+    find_cell,
+    is_finite,
+    is_model_outdated,
+    linearise,
+    locate_step_row,
+)
+from .record import COUNTERS, N_CORE, N_SLOW, FilterRecord, GainTables, Vector
+from .update import (
+    DUAL_RATE,
+    PSEUDO,
+    apply_gain_shares,
+    apply_next_share,
+    correct_between,
+    predict_slow_rows,
+    update_error,
+)
+
+
+@jit
+def compute_signal(row: Vector, column: Vector, factor: Vector) -> Any:
+    """Compute a signal of a fast row: the sum of two of its columns times their factors.
+
+    Args:
+        row: Fast row, shape (FAST_WIDTH,).
+        column: Indices of the columns, shape (2,).
+        factor: Their factors, shape (2,).
+
+    Returns:
+        The signal.
+    """
+    return load_element(factor, 0) * load_element(row, load_element(column, 0)) + load_element(
+        factor, 1
+    ) * load_element(row, load_element(column, 1))
+
+
+@jit
+def _estimate_noise(f: FilterRecord, accel_y: float) -> None:
+    """Estimate the variance of a_y from its second differences, which motion hardly has.
+
+    White noise of variance r gives them 6 r; what is far beyond counts as 9 times what is expected.
+    """
+    second_difference = accel_y - 2.0 * f.y_past[0] + f.y_past[1]
+    if is_finite(second_difference):
+        r = f.r_fast[f.accel_row]
+        sample_variance = minimum(second_difference * second_difference * (1.0 / 6.0), 9.0 * r)
+        f.r_fast[f.accel_row] = maximum(r + f.r_share * (sample_variance - r), f.r_told)
+    f.y_past[1], f.y_past[0] = f.y_past[0], accel_y
+
+
+@jit
+def _write_scale_column(f: FilterRecord) -> None:
+    """Write the accelerometer's prediction in the column of its scale's error.
+
+    At a standstill nothing of the scale is seen.
+    """
+    row = f.C_fast[f.accel_row]
+    row[f.scaled] = 0.0
+    if f.speed <= MIN_SPEED:
+        return
+    specific_force = f.rest_fast[f.accel_row] + f.D_fast[f.accel_row, 0] * f.u[0]
+    for k in range(f.n):
+        specific_force += row[k] * f.x[k]
+    row[f.scaled] = specific_force
+
+
+@jit
+def _check_steering(f: FilterRecord) -> None:
+    """Skip a steering angle (the first input) that jumps until the next row confirms it."""
+    steer = f.u_new[0]
+    if absolute(steer - f.steer_before) > f.steer_jump:
+        f.u_new[0] = np.nan
+    f.steer_before = steer
+
+
+@jit
+def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
+    """Read a fast row: its inputs (the last finite ones), measurements and speed.
+
+    The model is built anew where it has to be.
+
+    Args:
+        f: Memory of the filter.
+        row: Fast row, shape (FAST_WIDTH,).
+        wheel_speed: This sample of the speed (m/s).
+    """
+    is_sound = True
+    for i in range(f.inputs):
+        f.u_new[i] = compute_signal(row, f.u_column[i], f.u_factor[i])
+    if f.steer_jump > 0.0:
+        _check_steering(f)
+    for i in range(f.inputs):
+        is_sound = is_sound and is_finite(f.u_new[i])
+    if is_sound:
+        for i in range(f.inputs):
+            f.u[i] = f.u_new[i]
+    else:
+        f.counts[COUNTERS.invalid] += 1
+    for i in range(f.fasts):
+        f.y[i] = compute_signal(row, f.y_column[i], f.y_factor[i])
+    if f.r_share > 0.0:
+        _estimate_noise(f, f.y[f.accel_row])
+    turning, f.speed_before = f.turning, f.model_speed
+    if (f.kind == KINEMATIC or f.kind == VELOCITY_ROLL) and is_finite(row[FAST.gyro]):
+        turning = row[FAST.gyro]
+    is_outdated = turning != f.turning
+    if f.measured == 1:
+        f.speed = filter_speed(f, wheel_speed)
+        if is_model_outdated(f, f.speed):
+            is_outdated = True
+            f.cell = find_cell(f, f.speed)
+    if is_outdated:
+        build_model(
+            f,
+            f.speed if f.measured == 0 or is_model_outdated(f, f.speed) else f.model_speed,
+            turning,
+        )
+
+
+@jit
+def _predict(f: FilterRecord, v: Vector) -> None:
+    """Predict v <- F v on the states of a vector (n,) or longer."""
+    n, new, step = f.n, allocate_scratch(f.P, 1, N_CORE), vector_width(f.P)
+    for j in range(0, n, step):
+        total = load8(f.keep, j) * load8(v, j)
+        for k in range(n):
+            total = total + load_element(v, k) * load8(f.GT, k, j)
+        store8(new, total, 0, j)
+    for j in range(0, n, step):
+        store8(v, load8(new, 0, j), j)
+
+
+@jit
+def propagate(f: FilterRecord, u: Vector) -> None:
+    """Predict x <- F x + H u, and P with it.
+
+    Args:
+        f: Memory of the filter, or a block of lanes.
+        u: Inputs, shape (N_INPUTS,).
+    """
+    step = vector_width(f.P)
+    _predict(f, f.x)
+    for j in range(0, f.dense, step):
+        total = load8(f.x, j)
+        for k in range(f.inputs):
+            total = total + load_element(u, k) * load8(f.HT, k, j)
+        store8(f.x, total, j)
+    if f.kind == LINEAR or f.tyres > 0:
+        for j in range(0, f.n, step):
+            store8(f.x, load8(f.x, j) + load8(f.drift, j), j)
+    if f.periodic == 0:
+        predict_covariance(f)
+
+
+@jit
+def _scale_beta(f: FilterRecord) -> None:
+    """Scale beta = v_y / V to the model's new speed V, since v_y is what stays."""
+    f.x[BETA] *= f.stretch
+    f.e[BETA] *= f.stretch
+    if f.periodic == 0:
+        for i in range(f.total):
+            f.P[BETA, i] *= f.stretch
+        for i in range(f.total):
+            f.P[i, BETA] *= f.stretch
+        for s in range(N_SLOW):
+            for i in range(f.rows[s]):
+                f.larsen_gain[s, i, BETA] *= f.stretch
+    f.stretch = 1.0
+
+
+@noinline
+def advance_state(f: FilterRecord, u: Vector) -> None:
+    """Predict by the present model, and what else is carried along.
+
+    Args:
+        f: Memory of the filter.
+        u: Inputs of the step, shape (N_INPUTS,).
+    """
+    if f.stretch != 1.0:
+        _scale_beta(f)
+    if f.tyres > 0 and (f.tick % f.again == 0 or f.late == BUFFER):
+        linearise(f, u[0])
+        build_model(f, f.model_speed, f.turning)
+        if f.scaled > 0:
+            _write_scale_column(f)
+    propagate(f, u)
+    if f.between == PSEUDO:
+        _predict(f, f.e)
+    if f.periodic == 0 and f.late == LARSEN:
+        for s in range(N_SLOW):
+            if f.stamp[s, 0] >= 0:
+                for i in range(f.rows[s]):
+                    _predict(f, f.larsen_gain[s, i])
+
+
+@jit
+def compute_residual(f: FilterRecord, i: int) -> Any:
+    """Compute the residual of a fast measurement.
+
+    Args:
+        f: Memory of the filter, or a block of lanes.
+        i: Index of the measurement.
+
+    Returns:
+        Measurement minus its prediction.
+    """
+    residual = load_element(f.y, i) - load_element(f.rest_fast, i)
+    for k in range(f.n):
+        residual = residual - load_element(f.C_fast, i, k) * load_element(f.x, k)
+    for j in range(f.inputs):
+        residual = residual - load_element(f.D_fast, i, j) * load_element(f.u, j)
+    return residual
+
+
+@jit
+def _correct_joint(f: FilterRecord, gains: GainTables) -> None:
+    """Correct x += K residuals with residuals that are all taken before, in f.eps."""
+    for i in range(f.fasts):
+        K = gains[f.cell, locate_step_row(f) + i]
+        for j in range(f.total):
+            f.x[j] += K[j] * f.eps[i]
+
+
+@noinline
+def correct_fast(f: FilterRecord, gains: GainTables) -> None:
+    """Correct by the fast measurements in f.y; what is not finite is counted and skipped.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+    """
+    for i in range(f.fasts):
+        if not is_finite(f.y[i]):
+            f.counts[COUNTERS.invalid] += 1
+    if f.between == PSEUDO:
+        predict_slow_rows(f, f.first_slow)
+    if f.joint == 1:
+        for i in range(f.fasts):
+            residual = compute_residual(f, i)
+            f.eps[i] = residual if is_finite(residual) else 0.0
+        if f.between == PSEUDO:
+            correct_between(f, gains, f.first_slow)
+        else:
+            _correct_joint(f, gains)
+        return
+    for i in range(f.fasts):
+        residual = compute_residual(f, i)
+        if not is_finite(residual):
+            f.eps[i] = 0.0
+            continue
+        if f.periodic == 1:
+            step = locate_step_row(f) + i
+            for j in range(f.total):
+                store_element(
+                    f.x, load_element(f.x, j) + load_element(gains, f.cell, step, j) * residual, j
+                )
+            continue
+        update_with_states(f, f.C_fast[i], f.r_fast[i], residual)
+        for j in range(0, f.total, 8):  # the design of periodic gains reads them, too
+            store8(f.share, load8(f.gain, j), i, j)
+        if f.between == PSEUDO:
+            update_error(f, i, residual)
+        if f.late == LARSEN:
+            propagate_larsen_gains(f, f.C_fast[i])
+    if f.between == PSEUDO:
+        apply_gain_shares(f, f.first_slow)
+    elif f.between == DUAL_RATE:
+        apply_next_share(f, gains, f.first_slow)

@@ -1,0 +1,320 @@
+"""One filter's memory: a single record that compiled code reads and writes in place.
+
+A filter is its record, so a copy of the record is a complete snapshot and an array of records is
+a batch. Sizes are fixed so that every filter runs on the same compiled code; which fields a filter
+uses depends on four codes, and the comments name them:
+
+    kind     of model, `transition`                 between  slow samples, `intersample`
+    late     rule for late samples, `delay`         periodic 1: gains from a table, 0: from P
+
+`design.assemble` writes the blocks from the model to the gains once; `run.begin` sets the rest.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ...envs.numerics.simd8 import pad_to_cache_line
+from ...envs.record import PACKET_WIDTH
+from ...envs.sensors.slow import SLOW_NAMES
+
+N_CORE = 16  # states of a model; in whole eights, as `N_TOTAL`
+N_INPUTS = 4  # that drive it
+N_FAST = 3  # measurements of a fast row
+N_DRIVERS = N_CORE + 8  # columns of all that drives a state
+N_SLOW = len(SLOW_NAMES)  # sensors
+N_ROWS = 4  # of C, of one slow sensor
+N_FRAMES = 8  # of one slow sensor, captured and not here yet
+N_TOTAL = 32  # states and their clones
+N_STAMPS = 16  # frames whose stamps are stored, to know a duplicate
+N_WAITING = 8  # packets that wait for the next step of a single-rate filter
+N_KNOTS = 8  # of the table of HDOP
+WINDOW = 512  # ticks of history (rules "stored", "constant", "buffer")
+SNAPSHOT_INTERVAL = 16  # ticks between two snapshots of the rule "buffer"
+N_SNAPSHOTS = WINDOW // SNAPSHOT_INTERVAL
+N_RECENT = 64  # packets within the window
+
+FilterRecord = Any
+"""One record of the dtype `FILTER`; `f` in all compiled code."""
+FilterRecords = npt.NDArray[Any]
+"""(layers,) or (filters, layers) of the dtype `FILTER`."""
+GainTables = Any
+"""(cells, rows, columns): a table of gains for each cell of speed; `design.periodic` has its
+rows. Zeros where they are computed from P."""
+Vector = Any
+"""A vector of numbers, the shape said where it is taken."""
+
+
+class SkipCounters(NamedTuple):
+    """Counters of what a filter skipped, by reason."""
+
+    refused: int = 0  # captured before the oldest state the filter still has
+    duplicates: int = 1  # same sensor and captured tick as an earlier packet
+    future: int = 2  # captured or arriving after "now"
+    invalid: int = 3  # not finite or beyond all measure, in a packet or a fast row
+    poor: int = 4  # quality 0, or too few satellites
+    unknown: int = 5  # no sensor of ours, or a stamp that is no tick of the sensor's clock
+    gated: int = 6  # an innovation that chi-square calls impossible
+    stuck: int = 7  # every value as in the sensor's last packet, of an earlier tick, while it moves
+
+
+class CarIndex(NamedTuple):
+    """Places in the field `car`, in the order of `compute_bicycle_coefficients`.
+
+    Names are those of `Vehicle`.
+    """
+
+    mass: int = 0  # kg
+    yaw_inertia: int = 1  # kg m2
+    front_arm: int = 2  # m
+    rear_arm: int = 3
+    front_stiffness: int = 4  # N/rad, of a tyre
+    rear_stiffness: int = 5
+
+
+COUNTERS, CAR = SkipCounters(), CarIndex()
+
+_INT, _FLOAT = np.int64, np.float64
+
+_MODEL = [  # dx = A x + B u on the first `dense` states; those behind them decay by themselves
+    ("kind", _INT),
+    ("n", _INT),  # states
+    ("dense", _INT),
+    ("delayed", _INT),  # the last dense states that lag behind what the camera sees
+    ("total", _INT),  # states and clones
+    ("forces", _INT),  # 1: disturbances are a force and a moment; 0: they push states
+    ("pushed", _INT, (N_CORE,)),  # the state that each one behind pushes; -1: none
+    ("banked", _INT),  # which of those behind is the road's bank; -1: none
+    ("rolling", _INT),  # where a bicycle's phi and phi_rate stand; 0: it does not roll
+    ("car", _FLOAT, (len(CarIndex._fields),)),
+    ("roll_stiffness", _FLOAT),  # K_x / I_x
+    ("roll_damping", _FLOAT),  # C_x / I_x
+    ("roll_arm", _FLOAT),  # M_s h_s / I_x
+    ("sway", _FLOAT),  # m, M_s h_s / M
+    ("preview", _FLOAT),  # m
+    # tyres that are estimated: `car` has what they give more for more slip, at the present state
+    ("tyres", _INT),  # where the factors of front and rear stiffness stand; 0: they are known
+    ("grip", _INT),  # where the reciprocal of friction stands; 0: tyres without a limit
+    ("stiffness", _FLOAT, (2,)),  # N/rad, nominal, of the axles
+    ("load", _FLOAT, (2,)),  # N, on the axles
+    ("per_tyre", _FLOAT, (2, 2)),  # N, of each axle by its factor, by the grip's state
+    ("rest", _FLOAT, (2,)),  # N, of each axle where all that is linear is zero
+    ("again", _INT),  # ticks between two expansions
+    ("q_tyres", _FLOAT, (3,)),  # variances of a step of the factors and the grip, while it moves
+    ("model_error", _FLOAT),  # share of the axles' forces by which the tyres' law errs
+    ("q_known", _FLOAT, (2,)),  # variances of a step of F_d, N_d without it
+    ("q_share", _FLOAT),  # share of a disturbance's variance that comes in a step
+    ("step", _FLOAT),  # s, the filter's own step
+    ("relax", _FLOAT),  # share by which the delayed states follow in a step
+    ("A", _FLOAT, (N_CORE, N_CORE)),
+    ("B", _FLOAT, (N_CORE, N_DRIVERS)),  # inputs, then disturbances
+    ("push", _FLOAT, (N_CORE,)),  # what `rest` adds to dx
+    ("G", _FLOAT, (N_CORE, N_CORE)),  # tie-vision (9), rows of the dense states
+    ("H", _FLOAT, (N_CORE, N_INPUTS)),
+    ("drift", _FLOAT, (N_CORE,)),  # known part of a step, dual-rate (7) u_d, or of tyres
+    ("decay", _FLOAT, (N_CORE,)),  # share of a state that is left after a step
+    ("GT", _FLOAT, (N_CORE, N_CORE)),  # G and H transposed; zeros beyond the dense states
+    ("HT", _FLOAT, (N_INPUTS, N_CORE)),
+    ("keep", _FLOAT, (N_TOTAL,)),  # left after a step: 0 of dense states, 1 of clones
+    ("Q", _FLOAT, (N_CORE, N_CORE)),  # of one step
+    ("prior", _FLOAT, (N_CORE, N_CORE)),  # P at the start
+    ("first", _FLOAT, (N_CORE,)),  # x at the start
+    ("speed_state", _INT),  # the state that starts at the measured speed; -1: none
+]
+_BANK = [  # several filters beside each other, of which the first record is the mixture
+    ("members", _INT),  # records behind the mixture; 0: no bank
+    ("weight", _FLOAT),  # of a member: the logarithm of its likelihood
+    ("odds", _FLOAT),  # its weight at the start
+    ("respawn", _INT),  # ticks after which the least likely member begins anew
+    ("hazard", _FLOAT),  # log of the probability of a change within them
+    ("level", _FLOAT, (2,)),  # of a member: its force's and moment's variance over that configured
+    ("spread", _FLOAT),  # variance by which a new member forgets the tyres
+    ("fresh", _FLOAT),  # variance of a step of a new member's tyres, until the next one begins
+    ("alert", _FLOAT),  # what `fresh` is then
+    ("burst", _FLOAT, (2,)),  # variances of a gust's force, moment; 0: members do not interact
+]
+_FAST = [  # inputs and fast measurements: sums of two columns of the fast row
+    ("inputs", _INT),
+    ("u_column", _INT, (N_INPUTS, 2)),
+    ("u_factor", _FLOAT, (N_INPUTS, 2)),
+    ("steer_jump", _FLOAT),  # rad, a step of the first input that a row must confirm; 0: none
+    ("steer_before", _FLOAT),  # rad, of the row before, as it came
+    ("fasts", _INT),
+    ("y_column", _INT, (N_FAST, 2)),
+    ("y_factor", _FLOAT, (N_FAST, 2)),
+    ("C_fast", _FLOAT, (N_FAST, N_CORE)),
+    ("D_fast", _FLOAT, (N_FAST, N_INPUTS)),
+    ("accel_row", _INT),  # the fast measurement that is a bicycle's a_y; 0: none
+    ("scaled", _INT),  # where the error of its scale stands; 0: it has none
+    ("rest_fast", _FLOAT, (N_FAST,)),  # what is measured where states and inputs are zero
+    ("r_fast", _FLOAT, (N_FAST,)),  # variances
+    ("r_told", _FLOAT),  # (m/s2)^2, of a_y, as configured: the least
+    ("r_share", _FLOAT),  # of a new second difference in the variance of a_y; 0: as configured
+    ("y_past", _FLOAT, (2,)),  # a_y of the two rows before
+    ("robust", _FLOAT),  # standard deviations from which a residual counts less; 0: none does
+]
+_SLOW = [  # slow sensors: what each one measures, how noisy it is, when it captures
+    ("rows", _INT, (N_SLOW,)),  # of C
+    ("C", _FLOAT, (N_SLOW, N_ROWS, N_CORE)),
+    ("angle", _INT, (N_SLOW, N_ROWS)),  # 1: the residual is wrapped
+    ("ground", _INT, (N_SLOW, N_ROWS)),  # 1: a heading over the ground, where psi is the road's
+    ("r", _FLOAT, (N_SLOW, N_ROWS)),  # variances, at the present speed
+    ("noise_over_speed", _FLOAT, (N_SLOW, N_ROWS)),  # r is this / V^2; 0: r as it stands
+    ("heading_fix", _INT, (N_SLOW,)),  # 1: where the first sample is far off, it sets the heading
+    # columns of the sensor's packet; 0: it has none
+    ("hdop_column", _INT, (N_SLOW,)),
+    ("satellites_column", _INT, (N_SLOW,)),
+    ("speed_column", _INT, (N_SLOW,)),
+    ("r_speed", _FLOAT),  # (m/s)^2, of the speed over ground that a second layer takes
+    ("knots", _INT),  # of the table HDOP -> factor on a sensor's noise; 0: no table
+    ("hdop", _FLOAT, (N_KNOTS,)),
+    ("hdop_factor", _FLOAT, (N_KNOTS,)),
+    ("least_satellites", _FLOAT),  # packets with fewer are refused
+    ("gate", _FLOAT, (N_ROWS + 1,)),  # by dimension, the largest NIS; 0: no gate
+    ("wary", _INT),  # gated samples that agree until the sensor is believed again; 0: it never is
+    ("adapt", _FLOAT),  # share of a new innovation in the scale of R; 0: R as configured
+    ("first_slow", _INT),  # index of the first slow sensor that is used; -1: none
+    ("period", _INT, (N_SLOW,)),  # ticks; 0: not used
+    ("phase", _INT, (N_SLOW,)),
+    ("stride", _INT),  # ticks of one step of the filter
+    ("pace", _INT),  # ticks between two steps that listen to sensors
+    ("origin", _INT),  # phase of a single-rate filter's steps
+]
+_DELAY = [  # the rule for late samples
+    ("late", _INT),
+    ("frames", _INT, (N_SLOW,)),  # captured and not here yet, at most; CLONE, LARSEN
+    ("first_clone", _INT, (N_SLOW,)),  # where the sensor's clones start in x; CLONE
+    ("store_predictions", _INT),  # 1: `predicted` is filled; STORED, CONSTANT, below a second layer
+    ("assumed", _INT),  # ticks; CONSTANT
+]
+_GAINS = [
+    ("periodic", _INT),
+    ("joint", _INT),  # 1: the rows of a sensor correct together, not one after the other
+    ("between", _INT),
+    ("cycle", _INT),  # steps after which the schedule repeats
+    ("pattern", _INT),  # frames in it
+    ("low", _FLOAT),  # m/s, speed of the first table of gains
+    ("high", _FLOAT),  # of the last one
+    ("spacing", _FLOAT),  # m/s between tables; 0: one table
+    ("inverse", _FLOAT, (N_FAST + N_ROWS, N_TOTAL)),  # transposed, of (20); PSEUDO, not periodic
+]
+_SPEED = [
+    ("measured", _INT),  # 1: from the wheels, 0: fixed
+    ("smoothing", _FLOAT),  # share of a new sample in the low-pass
+    ("speed", _FLOAT),  # m/s, low-passed
+    ("model_speed", _FLOAT),  # the present model's
+    ("stretch", _FLOAT),  # of beta = v_y / V before the next step: old speed over new
+    ("speed_before", _FLOAT),  # the model's at the row before
+    ("turning", _FLOAT),  # rad/s, the present model's yaw rate; KINEMATIC, VELOCITY_ROLL
+    ("cell", _INT),  # the present table of gains
+    ("wanted", _INT),  # the table that is missing; -1: none
+]
+_NOW = [
+    ("start", _INT),  # tick of the first row
+    ("tick", _INT),  # of the last row
+    ("has_started", _INT),  # 1: there was a first step
+    ("road_turn", _FLOAT),  # rad, of the road since the first row
+    ("at", _INT),  # step within the schedule's cycle
+    ("x", _FLOAT, (N_TOTAL,)),  # states, then clones
+    ("P", _FLOAT, (N_TOTAL, N_TOTAL)),
+    ("u", _FLOAT, (N_INPUTS,)),  # the last finite inputs
+    ("u_sum", _FLOAT, (N_INPUTS,)),  # since the last step, over `u_count` ticks; stride > 1
+    ("u_count", _INT),
+    ("y", _FLOAT, (N_FAST,)),  # of this tick; NaN: none
+    ("cursor", _INT),  # packets of the present call that are done
+    ("counts", _INT, (len(SkipCounters._fields),)),
+    ("scale", _FLOAT, (N_SLOW, N_ROWS)),  # of R, where it adapts
+    ("nis", _FLOAT),  # of the last packet; NaN where it is not known
+    # `wary`: of each slow sensor
+    ("last", _FLOAT, (N_SLOW, PACKET_WIDTH)),  # packet
+    ("believed", _INT, (N_SLOW,)),  # tick of the last sample that was used; -1: none was
+    ("doubts", _INT, (N_SLOW,)),  # gated samples since then that agree with each other
+    ("doubted", _INT, (N_SLOW,)),  # tick of the first of them
+    ("doubt", _FLOAT, (N_SLOW, N_ROWS)),  # residual of the last of them
+    ("first_fix", _INT),  # captured tick of the first heading fix; -1: none yet
+    ("next", _INT, (N_SLOW,)),  # tick of the next capture
+    ("known_stamps", _INT, (N_SLOW, N_STAMPS)),  # captured ticks of frames that came
+    ("stamp", _INT, (N_SLOW, N_FRAMES)),  # captured tick of each frame that is due; -1: none
+    ("speed_captured", _FLOAT, (N_SLOW, N_FRAMES)),  # m/s, the model's at that tick; CLONE
+    ("waiting", _FLOAT, (N_WAITING, PACKET_WIDTH)),  # packets for the next step; pace > 1
+    ("waits", _INT),  # how many
+    ("sample", _FLOAT, (PACKET_WIDTH,)),  # the packet at hand
+    # LARSEN: what the residual of a frame that is due will do to the states, and its expectation
+    ("larsen_gain", _FLOAT, (N_SLOW, N_ROWS, N_CORE)),
+    ("larsen_expected", _FLOAT, (N_SLOW, N_ROWS)),
+]
+_BETWEEN = [  # corrections between slow samples
+    ("share", _FLOAT, (N_FAST + N_ROWS, N_TOTAL)),  # gains of a tick, fast, slow rows; not periodic
+    ("e", _FLOAT, (N_TOTAL,)),  # estimated error, tie-vision (18); PSEUDO
+    ("expected", _FLOAT, (N_ROWS,)),  # C x before this tick's corrections, slow rows; PSEUDO
+    ("eps", _FLOAT, (N_FAST + N_ROWS,)),  # residuals of this tick: fast, slow rows; joint, PSEUDO
+    ("innovation", _FLOAT, (N_ROWS,)),  # of the last sample; DUAL_RATE
+    ("since", _INT),  # steps since it; -1: there was none; DUAL_RATE
+]
+_SCRATCH = [
+    ("u_new", _FLOAT, (N_INPUTS,)),
+    ("PC", _FLOAT, (N_TOTAL,)),  # P C^T
+    ("gain", _FLOAT, (N_TOTAL,)),  # of the last measurement
+    ("residual", _FLOAT, (N_ROWS,)),  # of the sample at hand
+    ("S", _FLOAT, (N_ROWS, N_ROWS)),  # its covariance, then the Cholesky factor
+    ("white", _FLOAT, (N_ROWS,)),  # the residual by that factor
+    ("e_seen", _FLOAT, (N_FAST,)),  # C G e of the fast rows
+]
+_WINDOW = [  # history: of tick k in row k % WINDOW
+    ("predicted", _FLOAT, (WINDOW, N_CORE)),  # states; `store_predictions`
+    # the rest: BUFFER
+    ("past_u", _FLOAT, (WINDOW, N_INPUTS)),
+    ("past_y", _FLOAT, (WINDOW, N_FAST)),
+    ("past_speed", _FLOAT, (WINDOW,)),  # the model's
+    ("past_turning", _FLOAT, (WINDOW,)),
+    ("past_road_turn", _FLOAT, (WINDOW,)),  # and with `predicted`
+    (
+        "snapshot_x",
+        _FLOAT,
+        (N_SNAPSHOTS + 1, N_CORE),
+    ),  # the last is "now", while the past is redone
+    ("snapshot_P", _FLOAT, (N_SNAPSHOTS + 1, N_CORE, N_CORE)),
+    ("recent", _FLOAT, (N_RECENT, PACKET_WIDTH)),
+    ("recent_r", _FLOAT, (N_RECENT, N_ROWS)),  # r when each of them came
+    ("lost", _INT),  # captured tick of the newest packet that had to go
+    ("replay", _INT, (N_RECENT,)),  # scratch: those that are used again
+]
+
+_FIELDS = _MODEL + _BANK + _FAST + _SLOW + _DELAY + _GAINS + _SPEED + _NOW + _BETWEEN + _SCRATCH
+
+
+def _count_numbers(field: Any) -> int:
+    """Count the numbers of a field."""
+    return math.prod(field[2]) if len(field) > 2 else 1
+
+
+_LEADING = (  # what a tick in lanes reads or writes by the record, next to another
+    *("n", "total", "periodic", "members", "measured", "speed", "speed_before", "model_speed"),
+    *(
+        "tick",
+        "has_started",
+        "cell",
+        "at",
+        "cursor",
+        "road_turn",
+        "period",
+        "next",
+        "y",
+        "u",
+        "counts",
+    ),
+    *("x", "P"),
+)
+_RANK = dict(zip(_LEADING, range(len(_LEADING)), strict=True))
+_ORDER = sorted(
+    _FIELDS, key=lambda field: (_RANK.get(str(field[0]), len(_RANK)), _count_numbers(field))
+)
+_N_BEFORE_X = sum(_count_numbers(field) for field in _ORDER[: _RANK["x"]])
+_N_PADDING = 8 - _N_BEFORE_X % 8  # with it x and P begin on cache lines
+FILTER = pad_to_cache_line([("padding", _FLOAT, (_N_PADDING,)), *_ORDER, *_WINDOW])
+X_OFFSET = _N_PADDING + _N_BEFORE_X  # numbers before x
+N_SMALL = sum(
+    _count_numbers(field) for field in _ORDER[len(_LEADING) :] if _count_numbers(field) <= 64
+)  # behind P

@@ -1,0 +1,367 @@
+"""The latency of a fast channel, found while driving.
+
+A gyro that is late turns the predicted heading later than the camera or the GPS sees it turn: so
+the latency is the one with which the filter's packets surprise it least. The record is filtered
+with several latencies, each from where the stretch began, and a parabola through the sums of the
+packets' normalised innovations squared has the latency and its variance. The innovations of the
+gyro itself are left out: tyres that build up their force late look like a gyro that is late.
+
+A log that cannot tell is left alone: an estimate counts where every latency that is far from it is
+less likely by a factor of e^8, and so is the one in force.
+
+An estimator some of whose fast channels are late: by a known time, or by one that it finds.
+"""
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
+from ..envs.sensors.link import SlowSensor
+from .core.record import FILTER
+from .design.config import FilterConfig
+from .design.options import FIND, find_columns
+from .design.periodic import Schedule, count_ticks
+from .estimator import EMPTY, NO_NIS, Estimator, compile_advance, compile_process_packet
+from .protocol import compute_std
+
+MAX_SEARCHED_LATENCY = 0.12  # s, of what is looked for
+LOOK_TIMES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)  # s from where a stretch begins
+STEPS = (0.02, 0.01, 0.005)  # s between the latencies that are compared, ever closer
+MIN_LOG_RATIO = 8.0  # of a logarithm of a likelihood ratio
+
+
+def align_rows(rows: Array, lags: dict[int, int]) -> Array:
+    """Shift each late column of fast rows to the time when it was true.
+
+    Args:
+        rows: Fast rows, shape (k, FAST_WIDTH).
+        lags: Latency (ticks) by column.
+
+    Returns:
+        Aligned rows, shape (k, FAST_WIDTH); NaN where a value has not come yet.
+    """
+    result = rows.copy()
+    for column, lag in lags.items():
+        split = max(len(rows) - lag, 0)
+        result[:split, column], result[split:, column] = rows[lag:, column], np.nan
+    return result
+
+
+class LatencySearch:
+    """Search for the latency of some columns.
+
+    Args:
+        columns: Columns of the fast row that are late together.
+        dt: Tick (s).
+
+    Attributes:
+        lag: Latency in force (ticks).
+        sd: Its standard deviation (ticks), infinite before it is known.
+        done: Whether it needs no more looks.
+
+    Raises:
+        ValueError: The tick is too long to find a latency.
+    """
+
+    def __init__(self, columns: tuple[int, ...], dt: float) -> None:
+        self.columns, self.max_lag = columns, round(MAX_SEARCHED_LATENCY / dt)
+        if self.max_lag < 2:
+            raise ValueError(
+                f"a latency that is looked for is at most {MAX_SEARCHED_LATENCY:g} s, of "
+                f"which rows every {dt:g} s tell nothing: say the latency in s"
+            )
+        self._steps = [max(round(step / dt), 1) for step in STEPS]
+        self._looks = [round(look / dt) for look in LOOK_TIMES]
+        self.lag, self.sd, self.done = 0, np.inf, False
+
+    def begin(self, filters: Any, rows: Array, packets: Array) -> None:
+        """Begin a new stretch at a filter's memory.
+
+        Args:
+            filters: Memory of the filter, shape (layers,).
+            rows: Fast rows that it has not taken yet, shape (k, FAST_WIDTH).
+            packets: Packets that it has not taken yet, one a row.
+        """
+        self._start, self._rows, self._packets = filters.copy(), [rows], [packets]
+        self._count = len(rows)
+
+    def count_until_look(self) -> int:
+        """Return the number of rows until the next look."""
+        return min(look for look in self._looks if look > self._count) - self._count
+
+    def take(self, rows: Array, packets: Array) -> None:
+        """Store rows, no further than the next look, and packets, as the memory takes them.
+
+        Args:
+            rows: Fast rows, shape (k, FAST_WIDTH).
+            packets: Packets, one a row.
+        """
+        self._rows.append(rows)
+        self._packets.append(packets)
+        self._count += len(rows)
+
+    def look(self, delayed_filters: Any, rows: Array, packets: Array, gains: Any) -> Any:
+        """Compare latencies where a look is due.
+
+        Args:
+            delayed_filters: Memory of the filter, shape (layers,).
+            rows: Fast rows that it has not taken yet; a new stretch begins with them.
+            packets: Packets that it has not taken yet.
+            gains: Tables of gains, shape (cells, rows, columns).
+
+        Returns:
+            `delayed_filters`, or the memory for another latency that was found.
+        """
+        if self._count in self._looks:
+            delayed_filters = self._compare(delayed_filters, gains)
+        if self._count == self._looks[-1] and not self.done:
+            self.begin(delayed_filters, rows, packets)
+        return delayed_filters
+
+    def _compare(self, delayed_filters: Any, gains: Any) -> Any:
+        rows, results = np.concatenate(self._rows), dict[int, tuple[float, int, Any]]()
+
+        def sum_nis(lag: int) -> float:
+            if lag not in results:
+                results[lag] = self._filter_stretch(lag, rows, gains)
+            return results[lag][0]
+
+        lag, curvature, margin = self._minimise_nis(sum_nis)
+        min_nis, count, memory = results[lag]
+        scale = max(min_nis / max(count, 1), 1.0)
+        is_significant = margin > 2.0 * MIN_LOG_RATIO * scale and curvature > 0.0
+        self.done = is_significant and self._count == self._looks[-1]
+        if not is_significant:
+            return delayed_filters
+        self.sd = float(np.sqrt(2.0 * scale / curvature))
+        is_better = self.lag > 0 or sum_nis(self.lag) - min_nis > 2.0 * MIN_LOG_RATIO * scale
+        if lag == self.lag or not is_better:
+            return delayed_filters
+        self.lag = lag
+        return memory
+
+    def _minimise_nis(self, sum_nis: Any) -> tuple[int, float, float]:
+        """Find the lag of least NIS, the second derivative there (0: none), and its margin.
+
+        The margin is to the best lag that is far from it.
+        """
+        max_lag, (coarse, *finer) = self.max_lag, self._steps
+        grid = range(0, max_lag + 1, coarse)
+        best, step = min(grid, key=sum_nis), coarse
+        for step in finer:
+            candidates = [lag for lag in (best - step, best, best + step) if 0 <= lag <= max_lag]
+            best = min(candidates, key=sum_nis)
+        middle_lag = min(max(best, step), max_lag - step)
+        left, centre, right = (sum_nis(middle_lag + i * step) for i in (-1, 0, 1))
+        curvature = max((left - 2.0 * centre + right) / step**2, 0.0)
+        if curvature > 0.0:
+            best = round(middle_lag - (right - left) / (2.0 * step * curvature))
+            best = min(max(best, 0), max_lag)
+        distant_nis = min(sum_nis(lag) for lag in grid if abs(lag - best) >= coarse)
+        return best, curvature, distant_nis - sum_nis(best)
+
+    def _filter_stretch(self, lag: int, rows: Array, gains: Any) -> tuple[float, int, Any]:
+        """Filter the stretch with a lag: sum of its packets' NIS, count of numbers, memory."""
+        filters, count = self._start.copy(), len(rows) - self.max_lag
+        fast = align_rows(rows, dict.fromkeys(self.columns, lag))[:count]
+        packets = np.concatenate(self._packets)[:, :PACKET_WIDTH]
+        is_past = packets[:, PACKET.arrived] <= filters[0].tick + count
+        packets = np.ascontiguousarray(packets[is_past])
+        nis, empty = np.full(len(packets), np.nan), np.zeros((0, 0))
+        record = fast, count, packets, len(packets), 0, empty, empty, nis
+        compile_advance()(filters, gains, *record)
+        is_used = np.isfinite(nis)
+        sensors = packets[is_used, PACKET.sensor].astype(int)
+        return float(nis[is_used].sum()), int(filters[0].rows[sensors].sum()), filters
+
+
+_HISTORY_OFFSET: int = FILTER.fields["predicted"][1]  # type: ignore[index]  # where a memory's window begins, in bytes
+_INDEX_COLUMN = PACKET_WIDTH  # column behind a packet's: its place in the call
+
+
+class LateEstimator(Estimator):
+    """A filter with the option `latency`; built by `make_estimator`.
+
+    `delayed_filters`, a memory, is the filter at the time t - L of the latest channel, with every
+    channel at the time when it was true. The estimate at t is a copy, propagated to t with all that
+    has come: inputs, channels that are less late, packets. So it is the conditional mean of a
+    linear system, as without latencies. A step costs L / dt ticks more.
+
+    Args:
+        config: Parsed options of the filter, with a latency.
+        dt: Tick (s).
+        filters: Memory of the filter, shape (layers,).
+        schedules: Schedules of the samples.
+    """
+
+    compiled = False
+
+    def __init__(
+        self, config: FilterConfig, dt: float, filters: Any, schedules: tuple[Schedule, ...]
+    ) -> None:
+        self._fixed_lags, self._unknown_channel = dict[int, int](), ""
+        for channel, late in config.latency.items():
+            if late == FIND:
+                self._unknown_channel, late = channel, 0.0
+            lag = count_ticks(float(late), dt, f"{config.name}: a latency of {channel}")
+            self._fixed_lags |= dict.fromkeys(find_columns(channel), lag)
+        super().__init__(config, dt, filters, schedules)
+
+    def reset(self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0) -> None:
+        """Reset as `Estimator.reset` does; the search for a latency begins anew.
+
+        Args:
+            sensors: Slow sensors by name, whose clocks have a new phase; None keeps the phases.
+            first: Tick of the next fast row.
+        """
+        super().reset(sensors, first)
+        self.delayed_filters = self.filters.copy()
+        self._rows, self._waiting = np.zeros((0, FAST_WIDTH)), np.zeros((0, _INDEX_COLUMN + 1))
+        self._search = (
+            LatencySearch(find_columns(self._unknown_channel), self.dt)
+            if self._unknown_channel
+            else None
+        )
+        if self._search:
+            self._search.begin(self.delayed_filters, self._rows, self._waiting)
+
+    @property
+    def _lags(self) -> dict[int, int]:
+        """Ticks by column."""
+        search = self._search
+        return self._fixed_lags | (dict.fromkeys(search.columns, search.lag) if search else {})
+
+    @property
+    def _max_lag(self) -> int:
+        """Ticks by which `delayed_filters` is behind."""
+        search = self._search
+        return max(*self._lags.values(), search.max_lag if search and not search.done else 0)
+
+    def _receive(self, packet: Array) -> None:
+        self.take(np.zeros((0, FAST_WIDTH)), 0, packet[None], 1)
+
+    def _step(self, fast: Array, packets: Array, count: int) -> None:
+        self.take(fast, len(fast), packets, count)
+
+    def take(
+        self,
+        fast: Array,
+        rows: int,
+        packets: Array,
+        count: int,
+        X: Array = EMPTY,
+        S: Array = EMPTY,
+        nis: Array = NO_NIS,
+    ) -> None:
+        """Process rows and packets as `Estimator.take` does.
+
+        A packet that `delayed_filters` uses in a later call has no NIS.
+
+        Args:
+            fast: Fast rows, shape (k, FAST_WIDTH).
+            rows: Number of fast rows to take.
+            packets: Packets, shape (capacity, PACKET_WIDTH).
+            count: Number of packets to take.
+            X: Output for the states, shape (rows, n), or empty.
+            S: Output for the standard deviations, shape (rows, n), or empty.
+            nis: Output for each packet's normalised innovation squared, shape (count,), or empty.
+        """
+        remaining: Array = np.column_stack((packets[:count], np.arange(float(count))))
+        self._waiting[:, _INDEX_COLUMN] = -1.0
+        tick, start = self.tick, 0
+        while start < rows or len(remaining):
+            stop = min(start + 1, rows) if len(X) else rows
+            if self._search and not self._search.done:
+                stop = min(stop, start + self._search.count_until_look())
+            is_due = ~(remaining[:, PACKET.arrived] > tick + stop) | (stop == rows)
+            self._update_delayed(fast[start:stop], remaining[is_due], tick + stop, nis)
+            remaining = remaining[~is_due]
+            if len(X) and stop > start:
+                self._predict_current()
+                X[start] = self.x
+                S[start] = compute_std(self.P)
+            start = stop
+        if not len(X):
+            self._predict_current()
+        self.filters["counts"] = self.delayed_filters["counts"]
+
+    def _update_delayed(self, fast: Array, packets: Array, now: int, nis: Array) -> None:
+        """Process rows up to the tick `now`, and packets; `delayed_filters` takes what is due."""
+        rows = np.concatenate((self._rows, fast))
+        n_due = max(len(rows) - self._max_lag, 0)
+        pending = np.concatenate((self._waiting, packets))
+        arrived = pending[:, PACKET.arrived]
+        is_later = (arrived > now - len(rows) + n_due) & (
+            arrived <= now
+        )  # others are to be counted
+        self._rows, self._waiting = rows[n_due:], pending[is_later]
+        self._process_delayed(align_rows(rows, self._lags)[:n_due], pending[~is_later], nis)
+        if self._search and not self._search.done:
+            self._search.take(fast, packets)
+            self.delayed_filters[:] = self._search.look(
+                self.delayed_filters, self._rows, self._waiting, self.gains
+            )
+
+    def _process_delayed(self, fast: Array, pending: Array, nis: Array) -> None:
+        """Pass rows and packets to `delayed_filters`."""
+        packets, pending_nis = (
+            np.ascontiguousarray(pending[:, :_INDEX_COLUMN]),
+            np.full(len(pending), np.nan),
+        )
+        if len(fast):
+            record = fast, len(fast), packets, len(packets), 0, EMPTY, EMPTY, pending_nis
+            compile_advance()(self.delayed_filters, self.gains, *record)
+        else:
+            for packet in packets:
+                compile_process_packet()(self.delayed_filters, self.gains, packet)
+        if len(nis):
+            is_new = pending[:, _INDEX_COLUMN] >= 0.0
+            nis[pending[is_new, _INDEX_COLUMN].astype(int)] = pending_nis[is_new]
+
+    def _predict_current(self) -> None:
+        """Propagate a copy of `delayed_filters` to the present tick, with what has come."""
+        current, delayed = (
+            records.view(np.uint8).reshape(len(records), -1)
+            for records in (self.filters, self.delayed_filters)
+        )
+        skip_history = self.config.delay == "clone" and not self._f.store_predictions
+        end = _HISTORY_OFFSET if skip_history else None
+        current[:, :end] = delayed[:, :end]
+        if len(self._rows):
+            rows = align_rows(self._rows, self._lags)
+            packets = np.ascontiguousarray(self._waiting[:, :_INDEX_COLUMN])
+            record = rows, len(rows), packets, len(packets), 0, EMPTY, EMPTY, NO_NIS
+            compile_advance()(self.filters, self.gains, *record)
+
+    @property
+    def latency(self) -> dict[str, float]:
+        """Latency in force (s) by channel."""
+        return {
+            channel: self._lags[find_columns(channel)[0]] * self.dt
+            for channel in self.config.latency
+        }
+
+    @property
+    def latency_sd(self) -> float:
+        """Standard deviation (s) of the latency that is searched for.
+
+        It is infinite while the channel is taken as punctual, and 0 where all latencies are known.
+        """
+        return float(self._search.sd) * self.dt if self._search else 0.0
+
+    def get_state(self) -> Any:
+        """Return a snapshot as `Estimator.get_state` does."""
+        state = self.filters, self.delayed_filters, self._rows, self._waiting, self._search
+        return copy.deepcopy(state)
+
+    def set_state(self, snapshot: Any) -> None:
+        """Restore a snapshot as `Estimator.set_state` does.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
+        filters, delayed_filters, self._rows, self._waiting, self._search = copy.deepcopy(snapshot)
+        self.filters[:], self.delayed_filters[:] = filters, delayed_filters

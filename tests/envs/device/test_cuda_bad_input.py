@@ -1,0 +1,107 @@
+"""Without a driver, without memory, on another GPU: the CUDA engine says what is missing."""
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("numba_cuda")
+
+from sideslip.envs import StabilityVectorEnv  # noqa: E402
+from sideslip.envs.device import cuda_env, cuda_launch  # noqa: E402
+from sideslip.envs.device.cuda_env import CudaVectorEnv  # noqa: E402
+from sideslip.envs.device.cuda_kernel import make_constants, make_specification  # noqa: E402
+from sideslip.envs.device.cuda_text import SIMULATED  # noqa: E402
+
+pytestmark = pytest.mark.skipif(SIMULATED, reason="of real devices")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_without_a_driver_the_devices_that_are_there_are_named() -> None:
+    with pytest.raises(ValueError, match=r"'cuda' is not there: torch .* finds cpu: (no|built)"):
+        CudaVectorEnv(2)
+
+
+def test_it_is_no_engine_for_the_cpu() -> None:
+    with pytest.raises(ValueError, match="engine='cuda' runs on a CUDA device, got 'cpu'"):
+        CudaVectorEnv(2, device="cpu")
+
+
+def test_rows_that_do_not_fit_are_refused_with_how_many_would(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = StabilityVectorEnv(1).config
+    sizes = make_specification(
+        make_constants(config, "NextStep", record=False), np.float64, 1000, 1
+    )
+    needed = cuda_env.count_bytes(sizes)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (needed // 2, needed))
+    with pytest.raises(MemoryError, match=r"1000 rows of \d+ bytes .* on cuda:0.*at most 499 rows"):
+        cuda_env.check_memory(sizes, 1000, torch.device("cuda:0"))
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (needed, needed))
+    cuda_env.check_memory(sizes, 1000, torch.device("cuda:0"))
+
+
+@pytest.fixture
+def driver(monkeypatch: pytest.MonkeyPatch) -> Callable[..., SimpleNamespace]:
+    """A driver that notes its calls, and answers with a code where it is asked to."""
+    from cuda.bindings import driver as real
+
+    fine = real.CUresult.CUDA_SUCCESS
+    calls: dict[str, Any] = {}
+
+    def fake(**codes: str) -> SimpleNamespace:
+        def answers(name: str, *result: Any) -> Callable[..., Any]:
+            def called(*arguments: Any) -> Any:
+                calls[name] = arguments
+                return (getattr(real.CUresult, codes[name]) if name in codes else fine, *result)
+
+            return called
+
+        return SimpleNamespace(
+            CUresult=real.CUresult,
+            calls=calls,
+            cuModuleLoadData=answers("cuModuleLoadData", "module"),
+            cuModuleGetFunction=answers("cuModuleGetFunction", "function"),
+            cuLaunchKernel=answers("cuLaunchKernel"),
+        )
+
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, 0))
+    monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
+    stream = SimpleNamespace(cuda_stream=77)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
+    monkeypatch.setattr(cuda_launch, "make_context_current", lambda device: None)
+    return fake
+
+
+def test_a_launch_has_a_thread_for_each_row_and_one_address_for_each_array(driver: Any) -> None:
+    fake = driver()
+    loaded = cuda_launch.DriverKernel("// PTX", torch.device("cuda:0"), fake)
+    assert fake.calls["cuModuleLoadData"] == (b"// PTX\0",)
+    assert fake.calls["cuModuleGetFunction"] == ("module", b"sideslip_step")
+    arrays = [torch.zeros(3), torch.zeros(0)]
+    loaded(cuda_launch.BLOCK + 1, True, arrays)
+    function, *grid = fake.calls["cuLaunchKernel"]
+    assert function == "function"
+    assert grid[:8] == [2, 1, 1, cuda_launch.BLOCK, 1, 1, 0, 77]
+    values, kinds = grid[8]
+    assert values == (cuda_launch.BLOCK + 1, True, arrays[0].data_ptr(), arrays[1].data_ptr())
+    assert [kind.__name__ for kind in kinds] == ["c_long", "c_bool", "c_void_p", "c_void_p"]
+
+
+@pytest.mark.parametrize(
+    ("call", "code", "error"),
+    [
+        ("cuModuleLoadData", "CUDA_ERROR_NO_BINARY_FOR_GPU", RuntimeError),
+        ("cuModuleLoadData", "CUDA_ERROR_UNSUPPORTED_PTX_VERSION", RuntimeError),
+        ("cuLaunchKernel", "CUDA_ERROR_OUT_OF_MEMORY", MemoryError),
+    ],
+)
+def test_what_the_driver_refuses_is_said(driver: Any, call: str, code: str, error: Any) -> None:
+    fake = driver(**{call: code})
+    with pytest.raises(error, match=f"on cuda:0: {code}"):
+        cuda_launch.DriverKernel("// PTX", torch.device("cuda:0"), fake)(5, False, [])

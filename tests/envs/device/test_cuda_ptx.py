@@ -1,0 +1,93 @@
+"""The kernel compiles for an H200 without a GPU: what PTX it becomes, and where that is kept."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba_cuda")
+
+from sideslip.envs import StabilityVectorEnv
+from sideslip.envs.device import cuda_launch
+from sideslip.envs.device.cuda_kernel import NAME, DeviceArrays, KernelConstants, make_constants
+from sideslip.envs.numerics import kernel_cache
+
+H200 = (9, 0)
+ARITHMETIC = re.compile(r"^\t(?:@!?%\w+ )?(?:add|sub|mul|fma|div|rcp|sqrt)\S*\.(f32|f64)\s", re.M)
+
+
+def how() -> KernelConstants:
+    env = StabilityVectorEnv(1, sensors="fusion", reference="model", scenario="random-steering")
+    return make_constants(env.config, "NextStep", record=False)
+
+
+def test_float64_has_no_contraction_and_rounds_as_ieee_asks() -> None:
+    text = cuda_launch.get_ptx(how(), np.float64, H200)
+    found = cuda_launch.count_opcodes(text)
+    assert ".target sm_90" in text
+    head = text[text.index(f".visible .entry {NAME}(") :].partition(")")[0]
+    kinds = re.findall(r"\.param \.(\w+)", head)  # what `launch.DriverKernel` hands over
+    assert kinds == ["u64", "u8", *["u64"] * len(DeviceArrays._fields)]
+    assert not [each for each in found if each.startswith(("fma", "mad"))]
+    floats = [each for each in found if re.match(r"(add|sub|mul|div|rcp|sqrt)\S*\.f", each)]
+    assert len(floats) >= 6
+    for each in floats:  # without .rn the assembler may contract, with .approx it is another number
+        assert re.fullmatch(r"\w+\.rn\.f(64|32)", each), each
+    assert sum(found[each] for each in floats) < 8000
+    assert not re.search(r"\bcall\b", text)  # of a library's functions, whose bits are its own
+
+
+def test_float32_has_no_double_in_the_ticks() -> None:
+    text = cuda_launch.get_ptx(how(), np.float32, H200)
+    assert cuda_launch.count_opcodes(text)["fma.rn.f32"] > 500
+    kinds = ARITHMETIC.findall(text)
+    assert kinds.count("f64") < 0.02 * kinds.count("f32")
+    longest = max("".join("s" if each == "f32" else " " for each in kinds).split(), key=len)
+    assert len(longest) > 0.5 * len(kinds)  # the loop over the ticks, which lies in one piece
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache, and a compiler that counts."""
+    made: list[Any] = []
+    tmp_path.chmod(0o700)
+
+    def compiled(*arguments: Any) -> str:
+        made.append(arguments)
+        return f"text {len(made)}"
+
+    monkeypatch.setattr(cuda_launch, "_compile_ptx", compiled)
+    monkeypatch.setattr(kernel_cache, "find_kernel_folder", lambda layer: tmp_path)
+    return tmp_path
+
+
+def test_each_gpu_has_its_own_file(folder: Path) -> None:
+    assert cuda_launch.get_ptx(how(), np.float64, H200) == "text 1"
+    assert cuda_launch.get_ptx(how(), np.float64, H200) == "text 1"
+    assert cuda_launch.get_ptx(how(), np.float64, (8, 0)) == "text 2"
+    assert cuda_launch.get_ptx(how(), np.float32, H200) == "text 3"
+    assert len(list(folder.iterdir())) == 3
+
+
+@pytest.mark.parametrize(
+    "left",
+    [
+        lambda whole: b"",
+        lambda whole: whole[:4],
+        lambda whole: whole[:-1],
+        lambda whole: whole[:-6] + b"\xfftext1",
+        lambda whole: b"\xff",
+        lambda whole: b"// another key\nPTX of another GPU",
+    ],
+)
+def test_a_file_of_another_gpu_or_not_whole_is_compiled_anew(
+    folder: Path, left: Callable[[bytes], bytes]
+) -> None:
+    cuda_launch.get_ptx(how(), np.float64, H200)
+    (path,) = folder.iterdir()
+    path.write_bytes(left(path.read_bytes()))
+    assert cuda_launch.get_ptx(how(), np.float64, H200) == "text 2"
+    assert path.read_bytes().endswith(b"text 2")

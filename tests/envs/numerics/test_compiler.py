@@ -1,0 +1,169 @@
+"""The cache of compiled kernels follows the sources, and its absence is no trouble."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from numba.core.dispatcher import Dispatcher
+
+from sideslip.envs.numerics import jit, kernel_cache
+
+PACKAGE = kernel_cache._PACKAGE
+kernel_folder = kernel_cache.find_kernel_folder.__wrapped__  # asked anew each time
+FOLDERS = ("envs", "estimators", "agents", "benchmarks")
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """A copy of the package called `sideslip` in an empty folder."""
+    home = tmp_path / "copied" / "sideslip"
+    home.mkdir(parents=True)
+    for name in FOLDERS:
+        shutil.copytree(PACKAGE / name, home / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(PACKAGE / "__init__.py", home)
+    return home
+
+
+def run(code: str, home: Path, **variables: str) -> str:
+    """Run code on the package in `home` with every warning an error; returns what it prints."""
+    others = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("NUMBA_", "SIDESLIP_"))
+    }
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        env=others | {"PYTHONPATH": str(home.parent)} | variables,
+        cwd=home.parent,
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout
+
+
+@pytest.mark.smoke
+def test_stamp_is_that_of_the_sources(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stamp = kernel_cache.hash_sources()
+    monkeypatch.setattr(kernel_cache, "_PACKAGE", copy)
+    assert kernel_cache.hash_sources() == stamp
+    seen = {stamp}
+    # one more byte in any module of any folder
+    for module in (*(f"{folder}/__init__.py" for folder in FOLDERS), "benchmarks/speed/plant.py"):
+        with open(copy / module, "a") as source:
+            source.write("\n")
+        seen.add(kernel_cache.hash_sources())
+    room = copy / "envs" / "vehicle"
+    (room / "linear.py").rename(room / "linear_2.py")
+    seen.add(kernel_cache.hash_sources())
+    assert len(seen) == 7
+
+
+SHIFT = """
+from sideslip.envs.scenarios.road import TrackPath, compute_path_offset
+print(compute_path_offset(TrackPath(1.0, 0.0, 1.0, 0.0, 0.0, 1.0), 0.25))
+"""
+
+
+def test_an_edit_in_a_callee_reaches_its_cached_callers(copy: Path, tmp_path: Path) -> None:
+    """Numba alone would answer from the stale kernel: `compute_path_offset` itself did not
+    change."""
+    cache = tmp_path / "cache"
+    variables = {"XDG_CACHE_HOME": str(cache)}
+    exact = 0.25**2 * (3.0 - 2.0 * 0.25)
+    assert float(run(SHIFT, copy, **variables)) == exact
+    kernels = sorted(cache.rglob("tracks.compute_path_offset*.kernel"))
+    assert len(kernels) == 1
+    assert float(run(SHIFT, copy, **variables)) == exact
+    again = sorted(cache.rglob("tracks.compute_path_offset*.kernel"))
+    assert again == kernels  # the second run compiled nothing
+    source = copy / "envs" / "backend" / "elementary.py"
+    text = source.read_text()
+    changed = text.replace("return t * t * (3.0 - 2.0 * t)", "return t * t * (6.0 - 4.0 * t)")
+    assert changed != text
+    source.write_text(changed)
+    assert float(run(SHIFT, copy, **variables)) == 2.0 * exact
+
+
+@pytest.mark.parametrize("variable", ["XDG_CACHE_HOME", "NUMBA_CACHE_DIR"])
+def test_a_folder_that_cannot_be_written_costs_only_time(
+    variable: str, copy: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    printed = run(SHIFT, copy, **{variable: str(tmp_path / "file")})
+    assert float(printed) == 0.25**2 * (3.0 - 2.0 * 0.25)
+    assert (tmp_path / "file").read_text() == "not a folder"
+    assert not list(copy.rglob("*.nbc"))  # numba's own fallback would write beside the sources
+
+
+def test_old_versions_are_pruned_but_not_in_a_folder_of_the_users_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for variable in ("XDG_CACHE_HOME", "NUMBA_CACHE_DIR"):
+        monkeypatch.delenv(variable, raising=False)
+        base = tmp_path / variable
+        kernels = base / "sideslip" / "kernels" if variable == "XDG_CACHE_HOME" else base
+        for age in range(kernel_cache._MAX_VERSIONS + 3):
+            old = kernels / f"version-{age}"
+            old.mkdir(parents=True)
+            os.utime(old, (1e9 - age, 1e9 - age))
+        monkeypatch.setenv(variable, str(base))
+        assert kernel_folder() == kernels / kernel_cache.hash_sources()
+        left = {path.name for path in kernels.iterdir()} - {kernel_cache.hash_sources()}
+        # our own newest folder is one of those that stay
+        stay = kernel_cache._MAX_VERSIONS + (-1 if variable == "XDG_CACHE_HOME" else 3)
+        assert left == {f"version-{age}" for age in range(stay)}
+
+
+def test_compiling_leaves_numbas_own_settings_alone() -> None:
+    before = jit.config.CACHE_DIR
+    jit.jit(lambda x: x)
+    assert before == jit.config.CACHE_DIR
+
+
+def test_plain_replaces_every_callee_and_leaves_the_original_alone() -> None:
+    from sideslip.envs.vehicle.dynamics import kutta3
+
+    function = jit.as_python(kutta3)
+    seen: set[str] = set()
+    todo: list[Any] = [function]
+    while todo:
+        each = todo.pop()
+        seen.add(each.__name__)
+        for name in each.__code__.co_names:
+            callee = each.__globals__.get(name)
+            assert not isinstance(callee, Dispatcher), f"{each.__name__} calls {name}"
+            if hasattr(callee, "__code__") and callee.__name__ not in seen:
+                todo.append(callee)
+    assert {"kutta3", "compute_rates", "compute_slips", "sincos", "minimum", "floor"} <= seen
+    assert jit.as_python(kutta3) is not function
+
+
+def test_a_folder_that_can_only_be_read_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    folder = tmp_path / kernel_cache.hash_sources("envs")
+    assert kernel_folder("envs") == folder  # made
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError("read-only")
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    monkeypatch.setattr(os, "utime", refuse)
+    assert kernel_folder("envs") == folder
+    folder.rmdir()
+    assert kernel_folder("envs") is None
+
+
+def test_a_folder_that_another_process_prunes_meanwhile_is_no_trouble(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    gone = [tmp_path / "gone"]
+    monkeypatch.setattr(Path, "iterdir", lambda path: iter(gone))
+    assert kernel_folder("envs") is not None
