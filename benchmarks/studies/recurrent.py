@@ -139,7 +139,6 @@ def make_cases(
 
 FIRST_SEED = 2**30
 NOISE = 0.3  # of what shakes the teacher in the first round
-SOURCE_MODULES = ("measure", "cases")  # with the agents and the case all that its numbers depend on
 _LETTERS = 24  # of a kept case's name
 
 
@@ -259,9 +258,7 @@ class CaseCache:
         """The case's result."""
         if self.folder is None:
             return run_case(case)
-        sources = "".join(
-            (Path(__file__).parent / f"{name}.py").read_text() for name in SOURCE_MODULES
-        )
+        sources = Path(__file__).read_text()  # beside agents and case, all that numbers depend on
         text = hash_experiment() + sources + json.dumps(asdict(case) | case.options)
         path = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:_LETTERS]}.npz"
         with contextlib.suppress(Exception), np.load(path, allow_pickle=False) as saved:
