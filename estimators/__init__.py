@@ -5,8 +5,8 @@ namesake in `vector` around all rows of a vector env. Both take a user's own est
 `EstimatorLike` is what that needs, `register_estimator` gives it a name.
 
 Where to start reading: `filters` has the table of filters, one row each; `make` turns a row into an
-`Estimator`: `design.config` parses its options, `design.assemble` writes its compiled memory from
-models, noise and schedules. `core.memory` names every number of a filter, `core.run` is what
+`Estimator`: `design.config` parses its options, `design.assemble` writes its compiled record from
+models, noise and schedules. `core.record` names every number of a filter, `core.filter` is what
 happens at every tick. `wrappers` and `vector` put filters around environments; `protocol` and
 `registry` are for users' own. `analysis` has the error bound, the smoother and `DualRate`.
 May import `envs`; nothing of `agents` or `benchmarks`.

@@ -1,5 +1,5 @@
-"""The papers' claims: one module a paper, each claim with its verdict.
+"""The papers' claims: one or two modules a paper, each claim with its verdict.
 
-`ledger` holds what a claim is measured with, `theory` what needs no simulation, `tie_vision` that
-paper's own four modules.
+`ledger` holds what a claim is measured with, `manoeuvres` the drives and plots of the control
+papers, `theory` what needs no simulation.
 """

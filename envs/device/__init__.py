@@ -1,7 +1,8 @@
-"""The device engine: the environments of an id as tensors; it needs torch.
+"""The environments on torch tensors: `torch_env` with gradients, `cuda_env` as one CUDA kernel a step.
 
-The engine as one CUDA kernel a step: `text` makes device functions of it, `kernel` is the fused
-step, `ptx` its code without a GPU, `env` the environments.
+`base` is what both share. `torch_ticks`, `torch_outputs` and `torch_step` are the engine's step by
+torch, `gradients` its derivatives. `cuda_text` makes device functions of the engine's own text,
+`cuda_kernel` is the fused step, `cuda_launch` compiles it without a GPU and starts it.
 """
 
 from .torch_env import DeviceVectorEnv

@@ -1,10 +1,9 @@
 """The compiler and the kinds of numbers: one text for Python, SIMD lanes, NumPy, torch and CasADi.
 
-`jit` compiles a plain function, `as_python` rebuilds its text for another kind of numbers.
-`primitives` and `arrays` are what such texts may call; `elementary` and `random` are built from
-them. Nothing of sideslip is imported here, and every other room may import this one.
-
-Packages that come with an extra: what to say where one is missing.
+`jit` compiles a plain function and rebuilds its text for another kind of numbers. Such texts may
+call what `primitives`, `packed` and `functions` have. `simd` and `simd8` are lanes of 4 and 8,
+`torch_backend` and `casadi_backend` the other kinds. `compiler` and `kernel_cache` keep machine
+code on disk.
 """
 
 from collections.abc import Iterator

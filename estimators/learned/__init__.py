@@ -1,7 +1,6 @@
 """Networks by NumPy and in files, and a network's correction of a filter's sideslip angle.
 
-`network` and `memory` are dense layers, cells and traces, `network_file` their safetensors;
-policies are such files too. `files` has a correction with its card, `kernel` what happens at every
-tick, `correction` the estimator, "learned-exact-kf" by name; the shipped files lie in
-`corrections`.
+`forward` has dense layers, cells and moving averages, `network` a whole network and its safetensors
+file; policies are such files too. `correction` is the estimator "learned-exact-kf" and what it does
+at every tick, `correction_file` its file with a card; the shipped ones lie in `corrections`.
 """

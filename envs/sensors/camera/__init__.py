@@ -1,9 +1,9 @@
 """The camera: what it measures as numbers, and a lane finder on pictures in its place.
 
-`analytic` is the compiled sample of the engine. `pinhole` is the camera's geometry, `road_image`
-renders the road, `finder` and `consensus` find the lane in a picture, `mounting` finds tilt and
-height, `chessboard` the intrinsics, `films` reads files. Only `analytic` is loaded with the
-package; what works on pictures needs the extra of OpenCV.
+`analytic` is the compiled sample of the engine. `pinhole` is the camera's geometry, `images`
+renders the road, `lane_finder` finds the lane in a picture, `calibration` finds tilt, height and
+intrinsics, `films` reads files, `detector` has the measured noise of the lane finder. Only
+`analytic` is loaded with the package; what works on pictures needs the extra of OpenCV.
 """
 
 from .analytic import (
