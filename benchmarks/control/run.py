@@ -265,14 +265,7 @@ class CachedDrive:
 def hash_sources() -> str:
     """A hash of all files that an episode's numbers depend on, tuned options and weights too."""
     digest = hashlib.sha256((hash_experiment() + make_salt()).encode())
-    for name in (
-        "build.py",
-        "cells.py",
-        "contests.py",
-        "episodes.py",
-        "../harness/metrics.py",
-        "../harness/dissipation.py",
-    ):
+    for name in ("entries.py", "tasks.py", "run.py", "../harness/metrics.py"):
         digest.update((Path(__file__).parent / name).read_bytes())
     return digest.hexdigest()
 
