@@ -1,10 +1,8 @@
 """The compiler and the kinds of numbers: one text for Python, SIMD lanes, NumPy, torch and CasADi.
 
 `jit` compiles a plain function, `as_python` rebuilds its text for another kind of numbers.
-`primitives` and `arrays` are what such texts may call; `elementary` and `random` are built from
-them. Nothing of sideslip is imported here, and every other room may import this one.
-
-Packages that come with an extra: what to say where one is missing.
+`primitives` and `packed` are what such texts may call; `functions` is built from them. Every other
+room may import this one.
 """
 
 from collections.abc import Iterator
@@ -13,9 +11,14 @@ from contextlib import contextmanager
 
 @contextmanager
 def require_extra(name: str, needs: str) -> Iterator[None]:
-    """Around imports: ModuleNotFoundError for a missing package names the extra to install.
+    """Require an extra around imports: where a package is missing, the error names the extra.
 
-    needs: what needs what, "pictures need pygame"; {} stands for the missing module's name.
+    Args:
+        name: Name of the extra.
+        needs: Message, "pictures need pygame"; {} stands for the missing module's name.
+
+    Raises:
+        ModuleNotFoundError: For a missing package.
     """
     try:
         yield

@@ -1,5 +1,5 @@
 """The car: parameters, equations of motion, tyres, actuators and its linear models.
 
-`vehicle.Vehicle` is what users write; `dynamics`, `tyres` and `actuators` are the plant, functions
-of numbers alone. It imports `backend` and `ticks`.
+`parameters.Vehicle` is what users write; `dynamics`, `tyres` and `actuators` are the plant, scalar
+functions that are compiled; `linear` has the models for design.
 """

@@ -1,9 +1,9 @@
 """The camera: what it measures as numbers, and a lane finder on pictures in its place.
 
-`analytic` is the compiled sample of the engine. `pinhole` is the camera's geometry, `road_image`
-renders the road, `finder` and `consensus` find the lane in a picture, `mounting` finds tilt and
-height, `chessboard` the intrinsics, `films` reads files. Only `analytic` is loaded with the
-package; what works on pictures needs the extra of OpenCV.
+`analytic` is the compiled sample of the engine. `pinhole` is the camera's geometry, `images`
+renders the road, `lane_finder` finds the lane in a picture, `detector` has its measured times and
+errors, `calibration` estimates mounting and intrinsics, `films` reads files. What works on pictures
+needs the extra `vision`.
 """
 
 from .analytic import (
