@@ -53,10 +53,8 @@ class CameraSimulator:
             from .sensors.camera.images import Appearance, RoadRenderer, RoadScene
             from .sensors.camera.lane_finder import LaneFinder
             from .sensors.camera.pinhole import Pinhole
-        fields, known = (
-            check_mapping("appearance", appearance or {}),
-            Appearance.__dataclass_fields__,
-        )
+        fields = check_mapping("appearance", appearance or {})
+        known = Appearance.__dataclass_fields__
         if unknown := [name for name in fields if name not in known]:
             raise TypeError(f"appearance: {describe_unknown('field', unknown, known)}")
         style = Appearance(**fields)
@@ -149,7 +147,7 @@ class CameraMixin:
             raise ValueError("appearance is of pictures: vision='image'")
 
     def _start_episode(self) -> None:
-        """Take the picture of tick 0."""
+        """Begin an episode whose tick 0 is packed, with its picture."""
         if self.camera is not None:
             self.camera.capture(self._params, self._state, read(self._state, Z.motion), 0)
 

@@ -317,9 +317,8 @@ class StabilityEnv(
             ValueError: If it has another control period, other sensors or another observation.
         """
         if np.shape(snapshot["rows"]) != self.rows.shape:
-            raise ValueError(
-                f"the snapshot has {len(snapshot['rows'])} ticks a step, this env {len(self.rows)}"
-            )
+            ticks, own_ticks = len(snapshot["rows"]), len(self.rows)
+            raise ValueError(f"the snapshot has {ticks} ticks a step, this env {own_ticks}")
         if snapshot["layout"] != self.layout:
             raise ValueError("the snapshot is of an env with other sensors or another observation")
         self._allocate(len(snapshot["params"]))

@@ -141,9 +141,8 @@ def parse_seeds(seed: Any, count: int) -> list[int | None]:
         seeds = [None if entry is None else operator.index(entry) for entry in seed]
     bad = [i for i, entry in enumerate(seeds) if entry is not None and entry < 0]
     if bad:
-        raise ValueError(
-            f"seed: {format_rows(bad)} would get a negative seed, {short_repr(seeds[bad[0]])}"
-        )
+        got = short_repr(seeds[bad[0]])
+        raise ValueError(f"seed: {format_rows(bad)} would get a negative seed, {got}")
     return seeds
 
 
@@ -172,10 +171,8 @@ def split_options(options: Mapping[str, Any], count: int) -> list[dict[str, Any]
         elif len(value) != count:
             raise ValueError(f"reset option {name}: one or a list of {count}, got {len(value)}")
         columns[name] = value
-    return [
-        {name: value[i] for name, value in columns.items() if value[i] is not None}
-        for i in range(count)
-    ]
+    rows = range(count)
+    return [{n: v[i] for n, v in columns.items() if v[i] is not None} for i in rows]
 
 
 def parse_action(action: Any, width: int, fail: bool) -> Actions:
@@ -186,9 +183,8 @@ def parse_action(action: Any, width: int, fail: bool) -> Actions:
         return _convert_action(action, width)
     except ValueError as error:
         if not fail:
-            raise ValueError(
-                f"an action has shape ({width},), got {error}; nothing was stepped"
-            ) from None
+            text = f"an action has shape ({width},), got {error}; nothing was stepped"
+            raise ValueError(text) from None
     return np.full(width, np.nan, np.float32)
 
 

@@ -286,9 +286,8 @@ def _make_row_configs(
 ) -> tuple[StabilityEnv, list[EnvConfig]]:
     """The first row's env, and the config of each row; rows with the same values share one."""
     if arguments.get("vision") == "image":
-        raise ValueError(
-            "vision='image' sees for one car at a time: make_vec(..., vectorization_mode='sync')"
-        )
+        mode = "make_vec(..., vectorization_mode='sync')"
+        raise ValueError(f"vision='image' sees for one car at a time: {mode}")
     columns = {name: expand_rows(name, arguments.get(name), count) for name in _ROW_ARGUMENTS}
     envs: dict[tuple[int, ...], StabilityEnv] = {}
     rows = []

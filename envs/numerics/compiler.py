@@ -209,15 +209,14 @@ class Kernel(CPUDispatcher):
             _ExternalPipeline if apart else _UnlinkedPipeline,
         )
 
-    def get_part(self, args: tuple[types.Type, ...]) -> Any:
+    def _get_part(self, args: tuple[types.Type, ...]) -> Any:
         """Make the part that callers link, for arguments of these types."""
         with global_compiler_lock, self._compiling_counter:
             if args not in self.parts:
                 if self.apart:
                     self.compile(args)
-                    part = self.overloads[args]._replace(
-                        library=_ExternalLibrary(self._find_path(args))
-                    )
+                    library = _ExternalLibrary(self._find_path(args))
+                    part = self.overloads[args]._replace(library=library)
                 else:
                     part = self._unlinked_compiler.compile(args, None)
                 part = part._replace(entry_point=part.library)  # the key of its code for callers
@@ -228,13 +227,13 @@ class Kernel(CPUDispatcher):
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Get the part's signature, for numba at a call; a literal counts as any of its type."""
         pysig, args = self._compiler.fold_argument_types(args, kws)
-        part = self.get_part(tuple(map(types.unliteral, args)))
+        part = self._get_part(tuple(map(types.unliteral, args)))
         name = self.py_func.__name__
         return make_concrete_template(name, key=name, signatures=[part.signature]), pysig, args, {}
 
     def get_overload(self, sig: Any) -> Any:
         """Get the part's key, for numba when it lowers a call."""
-        return self.get_part(tuple(normalize_signature(sig)[0])).entry_point
+        return self._get_part(tuple(normalize_signature(sig)[0])).entry_point
 
     def compile(self, sig: Any) -> Any:
         """Compile for arguments of these types, or load the kernel from disk."""
@@ -270,16 +269,14 @@ class Kernel(CPUDispatcher):
     def _build(self, args: tuple[types.Type, ...]) -> tuple[Any, dict[str, Any], list[Any]]:
         """Compile and link while the user waits; returns the result of `_link_library`."""
         location = f"cached in {self.folder.parent}" if self.folder else "not cached"
-        report_once(
-            "compiling",
-            f"compiling kernels for this machine, 10 s to a minute ({location}) ...",
-            logging.INFO,
-        )
+        text = f"compiling kernels for this machine, 10 s to a minute ({location}) ..."
+        report_once("compiling", text, logging.INFO)
         start, nested = time.process_time(), _spent[0]
         with _remember_signatures():
-            result = _link_library(
-                self._unlinked_compiler.compile(args, None) if self.apart else self.get_part(args)
+            part = (
+                self._unlinked_compiler.compile(args, None) if self.apart else self._get_part(args)
             )
+            result = _link_library(part)
         spent = time.process_time() - start
         own_time, _spent[0] = spent - (_spent[0] - nested), nested + spent
         _logger.info("compiled %s in %.1f CPU-s", self.py_func.__qualname__, own_time)
@@ -297,9 +294,8 @@ def _link_library(part: Any) -> tuple[Any, dict[str, Any], list[Path | None]]:
     needs = [item.path for item in callees if isinstance(item, _ExternalLibrary)]
     for item in callees:
         if not isinstance(item, _ExternalLibrary):
-            library.add_linking_library(
-                _BareLibrary(item) if isinstance(item, _UnlinkedLibrary) else item
-            )
+            is_part = isinstance(item, _UnlinkedLibrary)
+            library.add_linking_library(_BareLibrary(item) if is_part else item)
     target.create_cpython_wrapper(library, part.fndesc, part.environment, part.call_helper)
     entry = target.get_executable(library, part.fndesc, part.environment)
     names = kernel_cache.list_environments(library)

@@ -153,9 +153,8 @@ def _write(context, builder, kind, array, index, value, value_type):
     elif value_type == FLOATS and kind.ndim == 2 and kind.layout == "C":
         builder.store(value, builder.bitcast(pointer, FLOATS.value.as_pointer()), align=8)
     else:
-        store_item(
-            context, builder, kind, context.cast(builder, value, value_type, kind.dtype), pointer
-        )
+        number = context.cast(builder, value, value_type, kind.dtype)
+        store_item(context, builder, kind, number, pointer)
 
 
 def _find_kind(array, indices):
@@ -236,9 +235,8 @@ def _register_view(primitive: Any, dtype: Any) -> None:
     def lower(context, builder, sig, args):
         size = context.get_constant(types.intp, dtype.bitwidth // 8)
         made = make_array(kind)(context, builder)
-        pointer = builder.bitcast(
-            locate_element(context, builder, sig.args[0], args[0], [args[1]]), made.data.type
-        )
+        first = locate_element(context, builder, sig.args[0], args[0], [args[1]])
+        pointer = builder.bitcast(first, made.data.type)
         strides = [builder.mul(size, size_of_axis) for size_of_axis in args[3:]] + [size]
         populate_array(made, pointer, args[2:], strides, size, None)
         return made._getvalue()

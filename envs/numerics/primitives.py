@@ -192,13 +192,11 @@ def _lower_frexp(context, builder, sig, args):
         return ir.Constant(ints, [value] * LANES if kind is FLOATS else value)
 
     bits = builder.bitcast(args[0], ints)
-    fraction = builder.or_(
-        builder.and_(bits, make_constant((1 << 52) - 1)), make_constant(1022 << 52)
-    )
+    digits = builder.and_(bits, make_constant((1 << 52) - 1))
+    fraction = builder.or_(digits, make_constant(1022 << 52))
     exponent = builder.sub(builder.lshr(bits, make_constant(52)), make_constant(1022))
-    return cgutils.pack_array(
-        builder, [builder.bitcast(fraction, operand_type), builder.sitofp(exponent, operand_type)]
-    )
+    m, e = builder.bitcast(fraction, operand_type), builder.sitofp(exponent, operand_type)
+    return cgutils.pack_array(builder, [m, e])
 
 
 def _lower_any_lane(context, builder, sig, args):

@@ -38,11 +38,11 @@ class LaneType(types.Type):
         super().__init__(name=f"lanes({kind})")
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Any:
-        """A number stands for equal lanes; integers become floats."""
+        """Convert a number to equal lanes; integers become floats."""
         return Conversion.safe if isinstance(other, self._taken) else None
 
     def unify(self, typingctx: Any, other: Any) -> Any:
-        """A variable that is a number on one way and lanes on the other is lanes."""
+        """Unify a variable that is a number on one branch and lanes on the other: lanes."""
         return self if isinstance(other, self._taken) else None
 
 
@@ -59,7 +59,7 @@ class _Model(models.PrimitiveModel):
 
 
 def splat(builder: Any, value: Any, lane_type: LaneType) -> Any:
-    """Lanes that are all equal to a machine value."""
+    """Make lanes that all equal a machine value."""
     undefined = ir.Constant(lane_type.value, ir.Undefined)
     one = builder.insert_element(undefined, value, ir.Constant(_LONG, 0))
     count = lane_type.value.count
@@ -77,7 +77,7 @@ def _from_number(context, builder, fromty, toty, value):
 
 
 def find_common_type(args: tuple[Any, ...]) -> Any:
-    """The kind that numbers and lanes meet in, single if none of them is lanes; None for others."""
+    """Find the type of a result of numbers and lanes, single without lanes; None for others."""
     if not all(isinstance(arg, LaneType | types.Number | types.Boolean) for arg in args):
         return None
     if FLOATS8 in args:
@@ -110,7 +110,7 @@ def register_primitive(
     _PrimitiveTyping.prefer_literal = prefer_literal
     infer_global(primitive)(_PrimitiveTyping)
     code = primitive.__code__
-    kinds = [types.Any] * code.co_argcount
+    kinds: list[Any] = [types.Any] * code.co_argcount
     if code.co_flags & inspect.CO_VARARGS:
         kinds.append(types.VarArg(types.Any))
     lower_builtin(primitive, *kinds)(lower)
@@ -138,7 +138,7 @@ def _register_operator(
 
 
 def compare(sign: str) -> dict[LaneType, Any]:
-    """The codes of a comparison; one with NaN is false, but `!=` is true."""
+    """Make the codes of a comparison; one with NaN is false, but `!=` is true."""
 
     def floats(builder, x, y):
         code = builder.fcmp_unordered if sign == "!=" else builder.fcmp_ordered

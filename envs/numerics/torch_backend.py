@@ -34,12 +34,10 @@ def _make_primitives(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
         if not isinstance(a, torch.Tensor):
             return math.frexp(a)[0], math.frexp(a)[1] * 1.0
         # by the bits, of a normal number: torch.frexp does not compile for AVX-512
-        integer, digits, bias = (
-            (torch.int64, 52, 1022) if a.dtype == torch.float64 else (torch.int32, 23, 126)
-        )
+        is_double = a.dtype == torch.float64
+        integer, digits, bias = (torch.int64, 52, 1022) if is_double else (torch.int32, 23, 126)
         bits, ones = a.view(integer), (1 << digits) - 1
-        mantissa_bits = (bits & ones) | (bias << digits)
-        m = mantissa_bits.view(a.dtype)
+        m = ((bits & ones) | (bias << digits)).view(a.dtype)
         return torch.where(a < 0.0, -m, m), to_float(((bits >> digits) & (2 * bias + 3)) - bias)
 
     def sqrt(a: Any) -> Any:

@@ -95,15 +95,17 @@ def make_link(sensor: SlowSensor | None, outage: tuple[float, float] | None = No
     if sensor is None:
         return Link._make([0.0] * len(Link._fields))
     delays = [count_ticks(delay) for delay in sensor.delays]
-    link = Link(
-        count_ticks(sensor.period),
-        -1.0 if sensor.phase is None else count_ticks(sensor.phase),
-        float(len(delays)),
-        *(delays + [0.0] * (4 - len(delays))),
-        count_ticks(sensor.jitter),
-        sensor.loss,
-        sensor.duplicate,
-        *map(count_ticks, outage or (0.0, 0.0)),
+    link = Link._make(
+        [
+            count_ticks(sensor.period),
+            -1.0 if sensor.phase is None else count_ticks(sensor.phase),
+            float(len(delays)),
+            *(delays + [0.0] * (4 - len(delays))),
+            count_ticks(sensor.jitter),
+            sensor.loss,
+            sensor.duplicate,
+            *map(count_ticks, outage or (0.0, 0.0)),
+        ]
     )
     max_in_flight = count_max_in_flight(link)
     if max_in_flight > MAX_IN_FLIGHT:

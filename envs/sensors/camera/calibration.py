@@ -65,9 +65,8 @@ def estimate_mounting(camera: Pinhole, picture: Image, lane_width: float) -> Pin
     tilt = atan(-down)
     height = lane_width * cos(tilt) / (d - b)
     mounted_camera = dataclasses.replace(camera, tilt=tilt, height=height)
-    finder = LaneFinder(
-        mounted_camera, lane_width, NEAR, FAR, view=FieldOfView(HEADING, 0.5 * lane_width)
-    )
+    view = FieldOfView(HEADING, 0.5 * lane_width)
+    finder = LaneFinder(mounted_camera, lane_width, NEAR, FAR, view=view)
     finder.find(picture)
     straight = finder.fit is not None and (np.abs(finder.fit[2:5]) < _STRAIGHT).all()
     if not (straight and _HEIGHTS[0] < height < _HEIGHTS[1]):
@@ -145,7 +144,7 @@ def calibrate_camera(
     board = np.zeros((corners[0] * corners[1], 3), np.float32)
     board[:, :2] = np.mgrid[: corners[0], : corners[1]].T.reshape(-1, 2)
     corner_sets: list[Any] = []
-    sizes: dict[tuple[int, int], int] = {}
+    sizes: set[tuple[int, int]] = set()
     for path in paths:
         grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if grey is None:
@@ -154,8 +153,7 @@ def calibrate_camera(
         if is_found:
             stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
             corner_sets.append(cv2.cornerSubPix(grey, places, (8, 8), (-1, -1), stop))
-            size = grey.shape[1], grey.shape[0]
-            sizes[size] = sizes.get(size, 0) + 1
+            sizes.add((grey.shape[1], grey.shape[0]))
     if len(corner_sets) < _MIN_BOARDS:
         raise ValueError(
             f"{len(corner_sets)} of {len(paths)} files show a chessboard of {corners[0]} x "

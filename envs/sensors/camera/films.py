@@ -97,10 +97,8 @@ def draw_lane(picture: Image, finder: LaneFinder, lane: Lane) -> Image:
     shown = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) if picture.ndim == 2 else picture.copy()
     thick = max(shown.shape[1] // 400, 1)
     if finder.fit is not None:
-        edges = [
-            finder.camera.project_points(finder.rows_ahead, finder.locate_marking(finder.fit, side))
-            for side in (1, -1)
-        ]
+        places = [finder.locate_marking(finder.fit, side) for side in (1, -1)]
+        edges = [finder.camera.project_points(finder.rows_ahead, y) for y in places]
         left, right = (np.round(edge[np.isfinite(edge[:, 0])]).astype(np.int32) for edge in edges)
         filled = shown.copy()
         cv2.fillPoly(filled, [np.concatenate([left, right[::-1]])], (80, 160, 0))

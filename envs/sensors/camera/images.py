@@ -59,19 +59,6 @@ class RoadScene(NamedTuple):
     pitch: float = 0.0  # rad, nose down positive
     road: RoadParams = RoadParams(0.0, 0.0, 1.0)
 
-    @classmethod
-    def make_bend(cls, curvature: float, **places: float) -> "RoadScene":
-        """Make a scene on a road of constant curvature.
-
-        Args:
-            curvature: Curvature (1/m), left positive.
-            places: Other fields by name.
-
-        Returns:
-            The scene.
-        """
-        return cls(road=RoadParams(curvature, -1e6, 1.0), **places)
-
 
 class RoadRenderer:
     """Renders a camera's pictures.

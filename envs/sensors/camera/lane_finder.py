@@ -146,13 +146,9 @@ def _correct_attitude(
     y, up = y * cr - up * sr, y * sr + up * cr
     x, up = x * cp + up * sp, up * cp - x * sp
     lens_height = mount.height * cr
-    lens = (
-        mount.forward * cp + lens_height * sp,
-        -mount.height * sr,
-        lens_height * cp - mount.forward * sp,
-    )
-    reach = lens[2] / np.maximum(-up, 1e-3)
-    return lens[0] + reach * x, lens[1] + reach * y
+    lens_x, lens_y = mount.forward * cp + lens_height * sp, -mount.height * sr
+    reach = (lens_height * cp - mount.forward * sp) / np.maximum(-up, 1e-3)
+    return lens_x + reach * x, lens_y + reach * y
 
 
 def _project_to_lane(
@@ -189,15 +185,15 @@ def _fit_lane(
         by_pitch = (project_points(pitch + step, roll)[1] - d) / step
         by_roll = (project_points(pitch, roll + step)[1] - d) / step
         rows = np.stack([u, np.ones_like(u), -0.5 * u * u, by_pitch, by_roll], 1)[is_inlier]
-        residual, bound, sd = (array[is_inlier] for array in (residual, bound, deviation))
-        normalised = residual / sd
+        r, limit, sd = (array[is_inlier] for array in (residual, bound, deviation))
+        normalised = r / sd
         scatter = max(1.0, float(np.mean(normalised * normalised)))  # of worn paint
-        weight = (1.0 - (residual / bound) ** 2) ** 2 / (sd**2 * scatter)  # Tukey
+        weight = (1.0 - (r / limit) ** 2) ** 2 / (sd**2 * scatter)  # Tukey
         try:
             inverse = np.linalg.inv(rows.T @ (weight[:, None] * rows) + np.diag(prior))
         except np.linalg.LinAlgError:
             return None
-        values = values - inverse @ (rows.T @ (weight * residual) + prior * values)
+        values = values - inverse @ (rows.T @ (weight * r) + prior * values)
     _, d = project_points(*values[3:])
     side = np.sign(d) * (np.abs(d - half * np.sign(d)) < 0.8 * _compute_tolerance(x))
     l_pre = mount.preview
@@ -217,9 +213,6 @@ class Lane(NamedTuple):
     y: float = 0.0  # m, of the car left of the lane's middle
 
 
-_LOST = Lane()
-
-
 class LaneFinder:
     """Finds the lane in a camera's pictures.
 
@@ -230,6 +223,9 @@ class LaneFinder:
         far: Distance ahead where it ends (m).
         side: Distance to either side that is searched (m).
         view: Limits beyond which the lane counts as lost; None for no limits.
+
+    Attributes:
+        rows_ahead: Distance ahead of each row that is searched (m), shape (rows,).
 
     Raises:
         ValueError: For distances out of order, or a camera that does not see this part of the road.
@@ -253,9 +249,9 @@ class LaneFinder:
         self._scale = scale = camera.size[0] / WORKING_WIDTH
         self._mount = CameraMount(camera.height, camera.ahead, camera.preview, lane_width)
         steps = camera.K[1][1] / scale * camera.height * (1.0 / near - 1.0 / far)  # picture's rows
-        self._x = 1.0 / np.linspace(1.0 / near, 1.0 / far, max(int(steps), 20))
+        self.rows_ahead = 1.0 / np.linspace(1.0 / near, 1.0 / far, max(int(steps), 20))
         self._y = np.arange(side, -side, -_CELL)
-        pixels = camera.project_points(self._x[:, None], self._y)
+        pixels = camera.project_points(self.rows_ahead[:, None], self._y)
         self._visible = np.isfinite(pixels[..., 0])
         if not self._visible.any():
             raise ValueError(f"the camera does not see the road {near} to {far} m ahead")
@@ -300,7 +296,7 @@ class LaneFinder:
         candidates = [fit for fit in fits if fit is not None]
         best = max(candidates, key=lambda fit: fit.compute_support(weight), default=None)
         if best is None or (quality := self._compute_quality(best, x)) == 0.0:
-            return _LOST
+            return Lane()
         self.fit = best
         y_l = _compute_preview_offset(best.y, best.psi, best.kappa, self.camera.preview)
         return Lane(best.psi, y_l, best.kappa, quality, best.y)
@@ -322,7 +318,7 @@ class LaneFinder:
             row, column, strength = row[strongest], column[strongest], strength[strongest]
         before, after = light[row, column].astype(float), light[row, column + 2].astype(float)
         shift = 0.5 * (before - after) / (before - 2.0 * strength + after)
-        return self._x[row], self._y[column + 1] - _CELL * shift, strength
+        return self.rows_ahead[row], self._y[column + 1] - _CELL * shift, strength
 
     def _compute_quality(self, lane_fit: _LaneFit, x: Array) -> float:
         """Fraction of the expected rows with a marking, less for bad light and uncertain fits."""
@@ -338,7 +334,7 @@ class LaneFinder:
         for side in (1, -1):
             expected = self._find_visible_rows(lane_fit, side)
             rows = len(np.unique(x[lane_fit.side == side]))
-            by_chance = float(np.sum(2.0 * _compute_tolerance(self._x[expected]) * density))
+            by_chance = float(np.sum(2.0 * _compute_tolerance(self.rows_ahead[expected]) * density))
             if rows < max(8.0, _MIN_SHARE * expected.sum(), by_chance + 6.0 * np.sqrt(by_chance)):
                 return 0.0
             shares.append(rows / max(expected.sum(), 1))
@@ -366,14 +362,11 @@ class LaneFinder:
             Y to the left of the car (m), shape (rows,).
         """
         offset = 0.5 * side * self._mount.width
-        y = np.zeros_like(self._x)
+        y = np.zeros_like(self.rows_ahead)
         for _ in range(6):  # Newton, on the distance across the lane
-            x, level = _correct_attitude(self._x, y, lane_fit.pitch, lane_fit.roll, self._mount)
+            x, level = _correct_attitude(
+                self.rows_ahead, y, lane_fit.pitch, lane_fit.roll, self._mount
+            )
             _, d = _project_to_lane(x, level, lane_fit.psi, lane_fit.y, lane_fit.kappa)
             y = y - (d - offset) / np.cos(lane_fit.psi - lane_fit.kappa * x)
         return y
-
-    @property
-    def rows_ahead(self) -> Array:
-        """Distance ahead of each row that is searched (m)."""
-        return self._x

@@ -123,9 +123,8 @@ class Pinhole:
         """
         points = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
         criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-9)
-        undistorted = cv2.undistortPoints(
-            points, np.array(self.K), np.array(self.dist), criteria=criteria
-        )
+        K, dist = np.array(self.K), np.array(self.dist)
+        undistorted = cv2.undistortPoints(points, K, dist, criteria=criteria)
         return np.asarray(undistorted, float).reshape(np.shape(pixels))
 
     def project_points(self, x: Array, y: Array) -> Array:
@@ -143,9 +142,8 @@ class Pinhole:
         down = self.height * cos(self.tilt) - x * sin(self.tilt)
         is_in_front = depth > 0.1
         points = np.stack([-y, down, np.where(is_in_front, depth, 1.0)], -1).reshape(-1, 1, 3)
-        pixels, _ = cv2.projectPoints(
-            points, np.zeros(3), np.zeros(3), np.array(self.K), np.array(self.dist)
-        )
+        K, dist = np.array(self.K), np.array(self.dist)
+        pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, dist)
         pixels = np.asarray(pixels, float).reshape(*x.shape, 2)
         width, height = self.size
         corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
