@@ -1,8 +1,8 @@
-"""A camera that takes pictures: packets from what a lane finder sees of the rendered road.
+"""The camera simulator: packets from a lane finder that reads pictures of the rendered road.
 
-The engine captures and queues the camera's frames as ever. After a step its slow sensors are gone
-through once more from where they stood before it, and every frame's packet takes the finder's
-values, quality and delay before the next tick delivers anything.
+The engine captures and queues the camera's frames as usual. After a step the slow sensors are
+replayed from their state before it, and each frame's packet gets the finder's values, quality and
+delay before the next tick delivers anything.
 """
 
 import math
@@ -37,9 +37,15 @@ _SLOW_STATE = slice(Z.slow[0].frames, Z.driver)  # the slow sensors and the queu
 
 
 class CameraSimulator:
-    """Takes the pictures of one car and finds the lane in them; needs the extra `vision`.
+    """Renders the pictures of one car and finds the lane in them; needs the extra `vision`.
 
-    `picture` and `lane` are the newest ones. delay, appearance: as of `CameraMixin`.
+    Args:
+        delay: "fitted", "measured" or "link", as in `StabilityEnv`.
+        appearance: Fields of `Appearance` that replace the defaults.
+
+    Attributes:
+        picture: Newest picture.
+        lane: Newest lane.
     """
 
     def __init__(self, delay: str, appearance: Mapping[str, Any] | None) -> None:
@@ -48,8 +54,8 @@ class CameraSimulator:
             from .sensors.camera.lane_finder import LaneFinder
             from .sensors.camera.pinhole import Pinhole
         fields = check_mapping("appearance", appearance or {})
-        if unknown := [name for name in fields if name not in Appearance.__dataclass_fields__]:
-            known = Appearance.__dataclass_fields__
+        known = Appearance.__dataclass_fields__
+        if unknown := [name for name in fields if name not in known]:
             raise TypeError(f"appearance: {describe_unknown('field', unknown, known)}")
         style = Appearance(**fields)
         self.delay, self._scene_class = delay, RoadScene
@@ -63,9 +69,14 @@ class CameraSimulator:
     def process_step(
         self, before: Any, row: EpisodeArrays, done: int, bounds: Array, window: Array
     ) -> None:
-        """Go through the slow sensors of a step of `done` ticks once more, with pictures.
+        """Replay the slow sensors of a step, with pictures.
 
-        before: the state ahead of the step. The others are as of `conclude`.
+        Args:
+            before: Packed state before the step.
+            row: Arrays of the episode.
+            done: Ticks of the step.
+            bounds: Bounds of the observation, shape (2, n).
+            window: Rows of the step's window.
         """
         z = row.z
         z[_SLOW_STATE] = before[_SLOW_STATE]
@@ -83,7 +94,11 @@ class CameraSimulator:
     def capture(self, p: Array, z: Array, motion: Motion, tick: int) -> None:
         """Take a picture for the packets that were captured at a tick, if there are any.
 
-        p, z: the packed parameters and state, whose queue has the packets.
+        Args:
+            p: Packed parameters.
+            z: Packed state, whose queue has the packets.
+            motion: `Motion` of the car.
+            tick: The tick.
         """
         queue = z[Z.queue :][: int(z[Z.under_way]) * PACKET_WIDTH].reshape(-1, PACKET_WIDTH)
         is_captured = (queue[:, PACKET.sensor] == CAMERA) & (queue[:, PACKET.captured] == tick)
@@ -101,28 +116,21 @@ class CameraSimulator:
         queue[is_captured, PACKET.quality] = lane.quality
         queue[is_captured, PACKET.value], queue[is_captured, PACKET.value + 1] = lane.psi, y_l
         if self.delay != "link":
-            share = _uniforms(*key, tick, BLOCKS[CAMERA].link)[0]
-            seconds = (
-                min(elapsed, MAX_DELAY)
-                if self.delay == "measured"
-                else load_detector().compute_delay(share)
-            )
-            arrival_tick = tick + count_delay_ticks(seconds)
-            queue[is_captured, PACKET.arrived] += (
-                arrival_tick - queue[is_captured, PACKET.arrived].min()
-            )
+            seconds = min(elapsed, MAX_DELAY)
+            if self.delay == "fitted":
+                share = _uniforms(*key, tick, BLOCKS[CAMERA].link)[0]
+                seconds = load_detector().compute_delay(share)
+            arrivals = queue[is_captured, PACKET.arrived]
+            arrivals += tick + count_delay_ticks(seconds) - arrivals.min()
+            queue[is_captured, PACKET.arrived] = arrivals
             z[Z.clock.next_due] = queue[:, PACKET.arrived].min()
 
 
 class CameraMixin:
-    """An environment whose camera may take pictures.
+    """An environment whose camera may take pictures; `env.unwrapped.camera` has the newest.
 
-    vision: "analytic", the camera's numbers with noise, or "image": a picture of the road is
-    rendered at every frame and a lane finder reads it; `env.unwrapped.camera` has the newest.
-    delay, of pictures: "fitted" (default), drawn from the finder's times on file; "measured", what
-    the clock says, so that the environment is not deterministic, which `spec`, `metadata` and
-    `info` state; or "link", the camera's own. appearance: fields of `Appearance`, which replace the
-    clear road's.
+    With `vision="image"` a picture of the road is rendered at every frame, and a lane finder reads
+    it. A "measured" delay is not deterministic, which `spec`, `metadata` and `info` state.
     """
 
     camera: CameraSimulator | None = None
@@ -139,13 +147,13 @@ class CameraMixin:
             raise ValueError("appearance is of pictures: vision='image'")
 
     def _start_episode(self) -> None:
-        """What else begins with an episode whose tick 0 is packed."""
+        """Begin an episode whose tick 0 is packed, with its picture."""
         if self.camera is not None:
             self.camera.capture(self._params, self._state, read(self._state, Z.motion), 0)
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What `gym.make` builds this env from."""
+        """The spec that `gym.make` builds this env from."""
         return self._spec
 
     @spec.setter

@@ -1,7 +1,4 @@
-"""Files that are there whole or not at all.
-
-Documents: what is written about a vehicle or a scenario, as TOML or JSON, and typed objects.
-"""
+"""Files that are written whole or not at all, and documents in TOML or JSON."""
 
 import contextlib
 import io
@@ -21,15 +18,23 @@ from .validation import is_finite, join_names, short_repr
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-_OPEN = ("/dev/std", "/dev/fd/", "/proc/")  # what a process has open, by name
+_DataclassT = TypeVar("_DataclassT", bound="DataclassInstance")
+_OPEN = ("/dev/std", "/dev/fd/", "/proc/")  # names of files that a process has open
+_SUFFIXES = (".toml", ".json")
 
 
 @contextlib.contextmanager
 def atomic_file(path: Path | str) -> Iterator[io.BufferedWriter]:
-    """A binary file to write, which takes the place of `path` at the end, or none does on an error.
+    """Open a binary file that replaces `path` at the end, and nothing on an error.
 
-    Whoever is killed meanwhile leaves an older file as it was. Links are followed, an older file's
-    mode and owner stay; a pipe, a device or an open file such as /dev/stdout is written as it is.
+    Links are followed, an older file's mode and owner stay; a pipe, a device or an open file such
+    as /dev/stdout is written directly.
+
+    Args:
+        path: Path of the file.
+
+    Yields:
+        The file to write.
     """
     try:
         old = os.stat(path)
@@ -49,7 +54,15 @@ def atomic_file(path: Path | str) -> Iterator[io.BufferedWriter]:
 
 @contextlib.contextmanager
 def replace_file(path: Path, mode: int = 0o666) -> Iterator[io.BufferedWriter]:
-    """The same for a plain file or a link, which is replaced itself; `mode` as the umask has it."""
+    """Open a binary file that replaces a plain file, or a link itself, at the end.
+
+    Args:
+        path: Path of the file.
+        mode: Permissions, less the umask.
+
+    Yields:
+        The file to write.
+    """
     part = path.with_name(f".{path.name[:200]}.{uuid.uuid4().hex}.part")
     try:
         with open(part, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
@@ -62,13 +75,14 @@ def replace_file(path: Path, mode: int = 0o666) -> Iterator[io.BufferedWriter]:
 
 
 def write_atomic(path: Path | str, content: bytes) -> None:
-    """Write a file or nothing."""
+    """Write a file, or nothing on an error.
+
+    Args:
+        path: Path of the file.
+        content: Its bytes.
+    """
     with atomic_file(path) as file:
         file.write(content)
-
-
-DataclassT = TypeVar("DataclassT", bound="DataclassInstance")
-SUFFIXES = (".toml", ".json")
 
 
 def has_suffix(source: object, suffixes: tuple[str, ...]) -> bool:
@@ -85,7 +99,7 @@ def has_suffix(source: object, suffixes: tuple[str, ...]) -> bool:
 
 
 def is_document(source: object) -> bool:
-    """Check whether a value is a path: any `Path`, or a text with an ending, which no name has.
+    """Check whether a value is a path: any `Path`, or a text with an ending.
 
     Args:
         source: Any value.
@@ -97,7 +111,7 @@ def is_document(source: object) -> bool:
 
 
 def read_document(source: "str | os.PathLike[str]", what: str) -> dict[str, Any]:
-    """Read the mapping in a TOML or JSON file; a file named under `base` is looked for beside it.
+    """Read the mapping in a TOML or JSON file; its `base` may name another file beside it.
 
     Raises FileNotFoundError, and ValueError for a folder, another ending, a `base` that leads back
     to the file, and a file that is no TOML or JSON or holds no mapping.
@@ -120,8 +134,8 @@ def read_document(source: "str | os.PathLike[str]", what: str) -> dict[str, Any]
 
 def _parse_file(path: Path, what: str) -> dict[str, Any]:
     kind = path.suffix.lower()
-    if kind not in SUFFIXES:
-        raise ValueError(f"{path}: the file of a {what} ends in {' or '.join(SUFFIXES)}")
+    if kind not in _SUFFIXES:
+        raise ValueError(f"{path}: the file of a {what} ends in {' or '.join(_SUFFIXES)}")
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such {what} file")
     if not path.is_file():
@@ -142,7 +156,7 @@ def _parse_file(path: Path, what: str) -> dict[str, Any]:
 
 
 def _find_base(path: Path, values: Mapping[str, Any]) -> Path | None:
-    """The file beside a file that it names under `base`."""
+    """Path of the file beside a file that it names under `base`; None without one."""
     base = values.get("base")
     with contextlib.suppress(OSError, ValueError):  # a text that can be no file's name
         if isinstance(base, str) and (path.parent / base).is_file():
@@ -151,13 +165,13 @@ def _find_base(path: Path, values: Mapping[str, Any]) -> Path | None:
 
 
 def _check_base_cycle(path: Path, base: Path | None, what: str) -> None:
-    """ValueError where a file's base, or the base of that, leads back to one of them."""
+    """Check that a file's base, or the base of that, does not lead back to one of them."""
     visited = {path.resolve()}
     while base is not None:
         if base.resolve() in visited:
             raise ValueError(f"{path}: its base is the file itself, or leads back to it")
         visited.add(base.resolve())
-        base = _find_base(base, _parse_file(base, what)) if has_suffix(base, SUFFIXES) else None
+        base = _find_base(base, _parse_file(base, what)) if has_suffix(base, _SUFFIXES) else None
 
 
 def write_document(path: "str | os.PathLike[str]", values: Mapping[str, Any]) -> None:
@@ -171,14 +185,13 @@ def write_document(path: "str | os.PathLike[str]", values: Mapping[str, Any]) ->
         ValueError: For another ending.
     """
     kind = Path(path).suffix.lower()
-    if kind not in SUFFIXES:
-        raise ValueError(f"{path}: expected a file that ends in {' or '.join(SUFFIXES)}")
+    if kind not in _SUFFIXES:
+        raise ValueError(f"{path}: expected a file that ends in {' or '.join(_SUFFIXES)}")
     if kind == ".json":
         text = json.dumps(values, indent=1)
     else:
-        text = "\n".join(
-            f"{_format_key(name)} = {to_toml(value)}" for name, value in values.items()
-        )
+        lines = [f"{_format_key(name)} = {to_toml(value)}" for name, value in values.items()]
+        text = "\n".join(lines)
     write_atomic(os.fspath(path), (text + "\n").encode())
 
 
@@ -205,7 +218,7 @@ def _format_key(name: str) -> str:
     return name if name.isascii() and name.isidentifier() else to_toml(name)
 
 
-def from_json(kind: type[DataclassT], entry: Any, where: str) -> DataclassT:
+def from_json(kind: type[_DataclassT], entry: Any, where: str) -> _DataclassT:
     """Make a dataclass's instance from a JSON object, whose lists may stand for tuples.
 
     Args:

@@ -1,4 +1,4 @@
-"""The record: what the car's wires carry. Estimators, replay and logs read only this."""
+"""The record of a drive: fast rows and packets, all that estimators, replay and logs read."""
 
 import dataclasses
 import itertools
@@ -29,7 +29,7 @@ class Fast(NamedTuple):
     torque_right: int = 8  # N m, applied
     steer_command: int = 9  # rad, the driver's
     accel_command: int = 10  # m/s2, the driver's
-    curvature: int = 11  # 1/m, the road's at the car, as a lane's polynomial or a map has it
+    curvature: int = 11  # 1/m, the road's at the car, from a lane's polynomial or a map
 
 
 class Packet(NamedTuple):
@@ -38,7 +38,7 @@ class Packet(NamedTuple):
     sensor: int = 0  # its place in `sensors.slow.SLOW`
     captured: int = 1  # tick
     arrived: int = 2  # tick
-    quality: int = 3  # 1 good; 0 not to be used: too slow for a course, no lane in view
+    quality: int = 3  # 1 good; 0 unusable: too slow for a course, no lane in view
     sequence: int = 4
     value: int = 5  # the first of VALUES
 
@@ -102,9 +102,10 @@ def concatenate(records: list[Record]) -> Record:
         ValueError: If ticks do not follow.
     """
     for before, after in itertools.pairwise(records):
-        if after.first != before.first + len(before.fast):
+        end = before.first + len(before.fast)
+        if after.first != end:
             raise ValueError(
-                f"a record that ends at tick {before.first + len(before.fast) - 1} "
+                f"a record that ends at tick {end - 1} "
                 f"is followed by one that starts at tick {after.first}"
             )
     return dataclasses.replace(

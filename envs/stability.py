@@ -34,9 +34,7 @@ from .validation import parse_action, warn_once
 from .vehicle.dynamics import Motion
 from .vehicle.parameters import Vehicle, VehicleSource, make_vehicle
 
-_COMPILED_STEP: list[
-    Any
-] = []  # `step_workspace` for the types of an env's arrays, once one has stepped
+_COMPILED_STEP: list[Any] = []  # `step_workspace` for an env's types, once one has stepped
 
 
 class StabilityEnv(
@@ -57,7 +55,7 @@ class StabilityEnv(
     episode as a failure.
 
     ## Observation
-    float32, as long for every control period. `layout` has name, unit and bounds of each entry:
+    float32, of one length for all control periods. `layout` has name, unit and bounds of each:
 
     | entries | unit | meaning |
     |---|---|---|
@@ -100,7 +98,7 @@ class StabilityEnv(
         scenario: Name, file, mapping or `Scenario`, as `make_scenario` reads it.
         vehicle: The true vehicle: name, file, mapping or `Vehicle`, as `make_vehicle` reads it.
         nominal: The vehicle of estimators and controllers; None for the true one.
-        control_period: Ticks of 1 ms between two decisions.
+        control_period: Ticks (1 ms) between two decisions.
         reference: "zero-slip", "model" (the nominal steady state), "limited" (that, by friction) or
             "lagged" (limited, never oversteering, with a lag of 0.1 s).
         fast: "summary" (last sample and mean) or "all" (every sample of the fast sensors).
@@ -230,7 +228,7 @@ class StabilityEnv(
         return self._copy_observation(), -info["cost"], terminated, truncated, info
 
     def _advance(self, command: npt.NDArray[np.float32]) -> int:
-        """One control period; what `step_vehicle` returns."""
+        """Advance one control period; returns the ticks done, or the code of a refusal."""
         if not _COMPILED_STEP:
             _COMPILED_STEP.append(compile_call(step_workspace, self._workspace, command))
         done: int = _COMPILED_STEP[0](self._workspace, command)
@@ -319,18 +317,13 @@ class StabilityEnv(
             ValueError: If it has another control period, other sensors or another observation.
         """
         if np.shape(snapshot["rows"]) != self.rows.shape:
-            raise ValueError(
-                f"the snapshot has {len(snapshot['rows'])} ticks a step, this env {len(self.rows)}"
-            )
+            ticks, own_ticks = len(snapshot["rows"]), len(self.rows)
+            raise ValueError(f"the snapshot has {ticks} ticks a step, this env {own_ticks}")
         if snapshot["layout"] != self.layout:
             raise ValueError("the snapshot is of an env with other sensors or another observation")
         self._allocate(len(snapshot["params"]))
-        self._params[:] = snapshot["params"]
-        self._state[:] = snapshot["state"]
-        self._switches[:] = snapshot["switches"]
+        for name in ("_params", "_state", "_switches", "rows", "packets", "_report"):
+            getattr(self, name)[:] = snapshot[name.strip("_")]
         self._episode = snapshot["config"]
-        self.rows[:] = snapshot["rows"]
-        self.packets[:] = snapshot["packets"]
-        self._report[:] = snapshot["report"]
         self.ticks_done, self._over = snapshot["progress"]
         self.np_random = copy.deepcopy(snapshot["rng"])

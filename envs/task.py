@@ -1,15 +1,4 @@
-"""The task: references, cost, failures, and what observation and info contain.
-
-References from the driver's command and the nominal vehicle.
-
-The cost rate, its scales, and what the rest of a failed episode costs.
-
-Failures of an episode, by code and name.
-
-What `info` contains: the report of a step and its names.
-
-What an observation contains: the name, unit and bounds of each entry.
-"""
+"""The task: references, cost rate, failures, and the contents of `info` and observations."""
 
 import math
 from collections.abc import Sequence
@@ -30,11 +19,10 @@ from .vehicle.parameters import GRAVITY, Vehicle
 REFERENCES = ("zero-slip", "model", "limited", "lagged")
 ZERO_SLIP, MODEL, LIMITED, LAGGED = range(len(REFERENCES))
 
-# The lagged reference's car has a characteristic speed of 35 m/s at most. The passenger car has
-# 36.5: at 80 km/h it is asked to turn 2 % less than it does by itself. A car that is neutral or
-# oversteers is asked to understeer. Its lag is about that of both presets, two over the trace of
-# their lateral dynamics: 0.08 s for the COMS at 22 km/h, 0.12 s for the passenger car at 70 km/h.
-CHARACTERISTIC_SPEED = 35.0  # m/s
+# The lagged reference understeers with a characteristic speed of at most 35 m/s (the passenger car
+# has 36.5). Its lag is about that of both presets, two over the trace of their lateral dynamics:
+# 0.08 s for the COMS at 22 km/h, 0.12 s for the passenger car at 70 km/h.
+_CHARACTERISTIC_SPEED = 35.0  # m/s
 REFERENCE_LAG = 0.1  # s
 
 
@@ -47,7 +35,7 @@ class ReferenceParams(NamedTuple):
     per_l: Any  # 1 / l
     mu_g: Any  # m/s2
     G_lagged: Any  # stability factor of the lagged reference
-    rest: Any  # what a tick leaves of its deviation from the steady state
+    rest: Any  # fraction of its deviation from the steady state that remains after a tick
 
 
 def make_reference_params(nominal: Vehicle) -> ReferenceParams:
@@ -69,7 +57,7 @@ def make_reference_params(nominal: Vehicle) -> ReferenceParams:
         G,
         1.0 / l,
         nominal.friction * GRAVITY,
-        max(G, CHARACTERISTIC_SPEED**-2),
+        max(G, _CHARACTERISTIC_SPEED**-2),
         math.exp(-TICK / REFERENCE_LAG),
     )
 
@@ -79,10 +67,9 @@ def compute_reference(steer: Any, v: Any, target: Any, reference_kind: int) -> A
     """Compute the steady-state reference for a steering command at a measured speed.
 
     zero-slip: (0, 0), the yaw rate is not judged. model: the nominal steady state, with
-    1 + G v^2 kept above 0.2. limited: the model within what friction can hold,
-    |gamma| <= 0.85 mu g / v and |beta| <= 0.02 mu g (Rajamani, Vehicle Dynamics and Control).
-    lagged: the steady state of `filter_reference`, limited in the same way, with the stability
-    factor of a car that understeers.
+    1 + G v^2 at least 0.2. limited: the model with |gamma| <= 0.85 mu g / v and
+    |beta| <= 0.02 mu g (Rajamani, Vehicle Dynamics and Control). lagged: limited, with the
+    stability factor of a car that understeers, for `filter_reference`.
 
     Args:
         steer: The driver's steering command (rad).
@@ -174,10 +161,8 @@ def compute_failure_cost(duration: Any, tick: Any) -> Any:
 RUNNING, SPIN, OFF_ROAD, NOT_FINITE, BAD_ACTION, COLLISION, DEPARTURE = range(7)
 FAILURES = ("none", "spin", "off-road", "not-finite", "bad-action", "collision", "departure")
 REFUSED = -1
-WILD = 1 << 30
-"""Added to what a step returns where an action was beyond `WILD_LIMIT`."""
-WILD_LIMIT = 10.0
-"""An action beyond it, a fraction of full scale, is a mistake, not a request for all of it."""
+WILD = 1 << 30  # added to the result of a step where an action was beyond `WILD_LIMIT`
+WILD_LIMIT = 10.0  # fraction of full scale beyond which an action is a mistake
 
 
 @jit
@@ -284,8 +269,7 @@ class ObservationEntry(NamedTuple):
     high: float
 
 
-OBSERVATION_OPTIONS = ("fast", "with_map")
-"""The options of an environment that change what is observed, and nothing of a drive."""
+OBSERVATION_OPTIONS = ("fast", "with_map")  # they change the observation, and nothing of a drive
 N_SAMPLED = 6  # the first columns of a fast row are sensors; the policy sees last and mean of each
 AGE_CAP = 10.0  # s
 
@@ -294,7 +278,7 @@ _LAST_ONLY = ("steer", "torque_left", "torque_right", "steer_command")  # seen a
 
 
 def make_space(layout: Sequence[ObservationEntry], frames: int = 1) -> "gym.spaces.Box[np.float32]":
-    """Make the space of an observation; of a stack of frames each bound is repeated in place.
+    """Make the space of an observation, or of a stack of frames, entry by entry.
 
     Args:
         layout: Entries of the observation.

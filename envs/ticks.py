@@ -1,4 +1,4 @@
-"""Time: the base tick, whole ticks of a time in seconds, never and for ever."""
+"""Time in ticks: the base tick, conversion from seconds, and the values of never and for ever."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ NEVER = -1.0
 
 @jit
 def round_to_ticks(seconds: Any) -> Any:
-    """Whole ticks of a time in seconds."""
+    """Round a time in seconds to whole ticks."""
     return floor(seconds / TICK + 0.5)
 
 
@@ -21,5 +21,5 @@ _round_to_ticks = as_python(round_to_ticks)
 
 
 def count_ticks(seconds: float) -> float:
-    """`round_to_ticks` without the compiler."""
+    """Round a time in seconds to whole ticks, without the compiler."""
     return float(_round_to_ticks(seconds))

@@ -1,7 +1,4 @@
-"""Arguments of environments, for one or for rows, checked; and how messages write them.
-
-Quantities: fields of a dataclass with a unit and the range that is plausible of a car.
-"""
+"""Checks of arguments, for one environment or rows of them, and the texts of their messages."""
 
 import dataclasses
 import difflib
@@ -20,10 +17,9 @@ from gymnasium.vector import AutoresetMode
 
 Mask = npt.NDArray[np.bool_]
 Actions = npt.NDArray[np.float32]
-MAX_LISTED_ROWS = 8  # rows that a message lists
-MAX_NUMBER = 1e12
-"""The largest number of a scenario or a vehicle: its ticks and its square are numbers still."""
-_CONVERSION_ERRORS = (TypeError, ValueError, OverflowError)  # what numpy raises where it finds none
+MAX_NUMBER = 1e12  # of a scenario or a vehicle: its ticks and its square stay finite
+_MAX_LISTED_ROWS = 8  # rows that a message lists
+_CONVERSION_ERRORS = (TypeError, ValueError, OverflowError)  # numpy's, for no numbers
 
 _FLOAT32 = np.dtype(np.float32)
 _REPR = reprlib.Repr()
@@ -31,40 +27,40 @@ _REPR.maxstring = _REPR.maxother = 80
 
 
 def short_repr(value: object) -> str:
-    """A value in a message, short however long it is."""
+    """Format a value for a message, shortened."""
     try:
         return _REPR.repr(value)
-    except Exception:  # what cannot be written: an integer of thousands of digits
+    except Exception:  # such as an integer of thousands of digits
         return f"<{type(value).__name__}>"
 
 
 def join_names(names: Iterable[str]) -> str:
-    """Names in a message, the first of them where they are many."""
+    """Format names for a message, the first of them where they are many."""
     return textwrap.shorten(", ".join(names), 250, placeholder=" ...")
 
 
 def is_finite(value: Any) -> bool:
-    """Whether a value is a number, and no larger than LARGEST; True and False are none."""
+    """Check whether a value is a number within +-MAX_NUMBER; True and False are none."""
     number = isinstance(value, int | float | np.integer | np.floating)
     return number and not isinstance(value, bool) and bool(abs(value) <= MAX_NUMBER)
 
 
 def check_number(name: str, value: Any) -> float:
-    """A finite number as a float; ValueError, with its name, for another value."""
+    """Check a number and convert it to float; ValueError, with its name, for another value."""
     if not is_finite(value):
         raise ValueError(f"{name} {short_repr(value)} is no finite number")
     return float(value)
 
 
 def check_mapping(name: str, value: Any) -> Mapping[str, Any]:
-    """A mapping; TypeError, with its name, for another value."""
+    """Check a mapping; TypeError, with its name, for another value."""
     if not isinstance(value, Mapping):
         raise TypeError(f"{name} is a mapping, got {short_repr(value)}")
     return value
 
 
 def describe_unknown(what: str, values: Iterable[Any], known: Iterable[str]) -> str:
-    """A message about names that are not known: what the first may have meant, or what there is."""
+    """Describe unknown names: the nearest known one of the first, or all that are known."""
     got, names = list(values), list(known)
     close = difflib.get_close_matches(got[0][:80], names, 1) if isinstance(got[0], str) else []
     hint = f"did you mean {close[0]!r}?" if close else f"known: {join_names(names)}"
@@ -72,14 +68,13 @@ def describe_unknown(what: str, values: Iterable[Any], known: Iterable[str]) -> 
 
 
 def check_choice(what: str, value: Any, known: Iterable[str]) -> None:
-    """ValueError for a value that is none of the known names, with the nearest of them."""
+    """Check that a value is a known name; ValueError, with the nearest one, for another."""
     if not isinstance(value, str) or value not in known:
         raise ValueError(describe_unknown(what, [value], known))
 
 
 def check_options(what: str, function: Callable[..., Any], options: Iterable[str]) -> None:
-    """TypeError for an option that a function does not take beside its first argument, with the
-    nearest of those that it does."""
+    """Check options of a function beside its first argument; TypeError for an unknown one."""
     parameters = list(inspect.signature(function).parameters.values())[1:]
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         return
@@ -91,7 +86,7 @@ def check_options(what: str, function: Callable[..., Any], options: Iterable[str
 def check_int(
     name: str, value: Any, what: str, minimum: int = 1, maximum: int | None = None
 ) -> int:
-    """How many of `what`; TypeError for no whole number, ValueError out of least .. most."""
+    """Check a number of `what`; TypeError for no integer, ValueError out of its limits."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name} is a number of {what}, got {short_repr(value)}")
     if value < minimum or (maximum is not None and value > maximum):
@@ -101,8 +96,7 @@ def check_int(
 
 
 def expand_rows(name: str, value: Any, count: int) -> Sequence[Any]:
-    """An argument of each row: a list or tuple as it is, another value for all; ValueError for a
-    list of another length."""
+    """Expand an argument to one for each row; ValueError for a list of another length."""
     if not isinstance(value, list | tuple):
         return [value] * count
     if len(value) != count:
@@ -111,7 +105,7 @@ def expand_rows(name: str, value: Any, count: int) -> Sequence[Any]:
 
 
 def parse_autoreset_mode(autoreset_mode: Any) -> AutoresetMode:
-    """The mode of its name or itself; ValueError for another."""
+    """Parse an autoreset mode or its name; ValueError for another."""
     try:
         return AutoresetMode(autoreset_mode)
     except ValueError:
@@ -121,16 +115,16 @@ def parse_autoreset_mode(autoreset_mode: Any) -> AutoresetMode:
 
 
 def format_rows(rows: npt.ArrayLike) -> str:
-    """ "row 3" or "rows 1, 5, ..." in a message."""
+    """Format rows for a message: "row 3" or "rows 1, 5, ..."."""
     numbers = np.asarray(rows).tolist()
     if len(numbers) == 1:
         return f"row {numbers[0]}"
-    dots = ", ..." if len(numbers) > MAX_LISTED_ROWS else ""
-    return f"rows {', '.join(map(str, numbers[:MAX_LISTED_ROWS]))}{dots} ({len(numbers)} of them)"
+    dots = ", ..." if len(numbers) > _MAX_LISTED_ROWS else ""
+    return f"rows {', '.join(map(str, numbers[:_MAX_LISTED_ROWS]))}{dots} ({len(numbers)} of them)"
 
 
 def parse_seeds(seed: Any, count: int) -> list[int | None]:
-    """A seed for each row: `seed + i` of a number, a list as it is.
+    """Make a seed for each row: `seed + i` of a number, a list as it is.
 
     Raises ValueError for a list of another length or a negative seed, TypeError for a seed that is
     no whole number.
@@ -147,14 +141,13 @@ def parse_seeds(seed: Any, count: int) -> list[int | None]:
         seeds = [None if entry is None else operator.index(entry) for entry in seed]
     bad = [i for i, entry in enumerate(seeds) if entry is not None and entry < 0]
     if bad:
-        raise ValueError(
-            f"seed: {format_rows(bad)} would get a negative seed, {short_repr(seeds[bad[0]])}"
-        )
+        got = short_repr(seeds[bad[0]])
+        raise ValueError(f"seed: {format_rows(bad)} would get a negative seed, {got}")
     return seeds
 
 
 def parse_reset_mask(mask: Any, count: int) -> Mask:
-    """The rows of options["reset_mask"], all without it; TypeError or ValueError for no mask."""
+    """Parse options["reset_mask"], all rows without it; TypeError or ValueError for no mask."""
     if mask is None:
         return np.ones(count, np.bool_)
     if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
@@ -168,8 +161,7 @@ def parse_reset_mask(mask: Any, count: int) -> Mask:
 
 
 def split_options(options: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
-    """The options of each row's reset: a list, tuple or array has one for each row, None for a row
-    without it."""
+    """Split options of reset by rows: a list, tuple or array has one, or None, for each row."""
     columns = {}
     for name, value in options.items():
         if isinstance(value, np.ndarray) and value.ndim > 0:
@@ -179,32 +171,27 @@ def split_options(options: Mapping[str, Any], count: int) -> list[dict[str, Any]
         elif len(value) != count:
             raise ValueError(f"reset option {name}: one or a list of {count}, got {len(value)}")
         columns[name] = value
-    return [
-        {name: value[i] for name, value in columns.items() if value[i] is not None}
-        for i in range(count)
-    ]
+    rows = range(count)
+    return [{n: v[i] for n, v in columns.items() if v[i] is not None} for i in rows]
 
 
 def parse_action(action: Any, width: int, fail: bool) -> Actions:
-    """One action (width,) as float32; what has another shape or is no numbers raises ValueError,
-    with `fail` it is NaN."""
+    """Parse an action (width,) to float32; a bad one raises ValueError, or is NaN with `fail`."""
     if type(action) is np.ndarray and action.dtype is _FLOAT32 and action.shape == (width,):
         return action if action.flags.carray else action.copy()  # others are other types
     try:
         return _convert_action(action, width)
     except ValueError as error:
         if not fail:
-            raise ValueError(
-                f"an action has shape ({width},), got {error}; nothing was stepped"
-            ) from None
+            text = f"an action has shape ({width},), got {error}; nothing was stepped"
+            raise ValueError(text) from None
     return np.full(width, np.nan, np.float32)
 
 
 def parse_actions(actions: Any, count: int, width: int, fail: bool) -> Actions:
-    """Actions (count, width) as float32.
+    """Parse actions (count, width) to float32.
 
-    What has another shape or is no numbers raises ValueError and names the rows; with `fail` these
-    rows are NaN.
+    A wrong shape or no numbers raises ValueError, which names the rows; with `fail` they are NaN.
     """
     try:
         array = np.array(actions, np.float32)  # a copy: contiguous whatever came
@@ -230,7 +217,7 @@ def parse_actions(actions: Any, count: int, width: int, fail: bool) -> Actions:
 
 
 def warn_once(env: Any, actions: Actions) -> None:
-    """Warn, once an env, of actions far outside of -1 to 1."""
+    """Warn, once per env, of actions far outside of -1 to 1."""
     if not vars(env).get("_warned"):
         largest = np.abs(actions[np.isfinite(actions)]).max()
         logger.warn(
@@ -241,7 +228,7 @@ def warn_once(env: Any, actions: Actions) -> None:
 
 
 def _convert_action(action: Any, width: int) -> Actions:
-    """One action; ValueError says what came instead."""
+    """Action (width,) as float32; ValueError with the value or shape of a bad one."""
     try:
         array = np.array(action, np.float32)
     except _CONVERSION_ERRORS as error:
@@ -251,7 +238,7 @@ def _convert_action(action: Any, width: int) -> Actions:
     return array
 
 
-_CONFUSED_UNITS = {  # units in which a number may be instead, as shares of the right one
+_CONFUSED_UNITS = {  # units in which a number may be by mistake, as fractions of the right one
     "m": {"mm": 1e-3, "cm": 1e-2},
     "s": {"ms": 1e-3},
     "m/s": {"km/h": 1.0 / 3.6},
@@ -271,19 +258,16 @@ def quantity(
     default: Any = dataclasses.MISSING,
     per: tuple[str, ...] = (),
 ) -> Any:
-    """A field whose numbers are plausible from low to high, each times the fields `per`; where low
-    is above zero, they are positive at any rate."""
+    """Make a dataclass's field whose numbers are plausible from low to high, times fields `per`."""
     metadata = {"unit": unit, "text": text, "plausible": (low, high), "per": per}
     return dataclasses.field(default=default, metadata=metadata)
 
 
 def check_plausible(values: Any) -> None:
-    """Raise ValueError for a number of a dataclass outside its range, with the unit that it may be
-    in by mistake."""
+    """Check a dataclass's numbers; ValueError outside of a range, with the unit by mistake."""
     entries = [spec for spec in dataclasses.fields(values) if "plausible" in spec.metadata]
-    for entry in sorted(
-        entries, key=lambda spec: len(spec.metadata["per"])
-    ):  # those last go by others
+    entries.sort(key=lambda spec: len(spec.metadata["per"]))  # ranges that depend on others last
+    for entry in entries:
         unit, _, (low, high), per = entry.metadata.values()
         value, scale = getattr(values, entry.name), math.prod(getattr(values, n) for n in per)
         low, high = scale * low, scale * high
@@ -293,9 +277,8 @@ def check_plausible(values: Any) -> None:
             per_text = f" for its {', '.join(per)}" if per else ""
             units = _CONFUSED_UNITS.get(unit, {}).items()
             candidates = " or ".join(name for name, size in units if low <= number * size <= high)
-            got = f"{type(values).__name__}.{entry.name}: {short_repr(number)} {unit}".removesuffix(
-                " -"
-            )
+            got = f"{type(values).__name__}.{entry.name}: {short_repr(number)} {unit}"
+            got = got.removesuffix(" -")
             raise ValueError(
                 f"{got} is outside the plausible {low:.4g} to {high:.4g}{per_text}"
                 f"{f' (is it in {candidates}?)' if candidates else ''}; strict=False takes it"

@@ -1,4 +1,4 @@
-"""StabilityVectorEnv: many cars in one compiled call a step, each with the bits of one alone."""
+"""StabilityVectorEnv: many cars in one compiled call a step, each with a single car's bits."""
 
 import copy
 from collections.abc import Mapping
@@ -119,13 +119,8 @@ class StabilityVectorEnv(
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        """Set the spec, its autoreset mode as JSON writes it.
-
-        Args:
-            spec: Gymnasium's spec of this env.
-        """
         if spec is not None and "autoreset_mode" in spec.kwargs:
-            spec.kwargs["autoreset_mode"] = self._mode.value
+            spec.kwargs["autoreset_mode"] = self._mode.value  # as JSON writes it
         self._spec = spec
 
     _spec: EnvSpec | None = None
@@ -151,11 +146,10 @@ class StabilityVectorEnv(
             raise ResetNeeded("reset all rows first: a reset_mask leaves out some of them")
         chosen = np.flatnonzero(mask)
         configs, config_index = self.apply_options(remaining, chosen.tolist())
-        new_generators = {
-            i: seeding.np_random(s) for i in chosen.tolist() if (s := seeds[i]) is not None
-        }
-        for i, (generator, used_seed) in new_generators.items():
-            self.generators[i], self.seeds[i] = generator, used_seed
+        rows = [i for i in chosen.tolist() if seeds[i] is not None]
+        new_generators = {i: seeding.np_random(seeds[i]) for i in rows}
+        for i, pair in new_generators.items():
+            self.generators[i], self.seeds[i] = pair
         self.reset_rows(chosen, configs, config_index)
         self.over[mask] = False
         self._n_over, self._started = int(self.over.sum()), True
@@ -187,16 +181,10 @@ class StabilityVectorEnv(
         config = self.config
         commands = parse_actions(actions, N, config.action_width, config.on_bad_action == "fail")
         over_rows = np.flatnonzero(self.over) if self._n_over else None
-        rewards, terminated, truncated = np.empty(N), np.empty(N, np.bool_), np.empty(N, np.bool_)
+        results = np.empty(N), np.empty(N, np.bool_), np.empty(N, np.bool_)
+        rewards, terminated, truncated = results
         n_ended = step_rows(
-            *self.arrays,
-            commands,
-            self.control_period,
-            config.bounds,
-            rewards,
-            terminated,
-            truncated,
-            self.lane_buffers,
+            *self.arrays, commands, self.control_period, config.bounds, *results, self.lane_buffers
         )
         if n_ended == REFUSED:
             bad = np.flatnonzero(~np.isfinite(commands).all(1) & ~self.over)
@@ -210,9 +198,8 @@ class StabilityVectorEnv(
         if over_rows is not None:
             self.reset_rows(over_rows)
         if self._max_steps is not None:
-            is_timed_out = (
-                self.states[:, Z.clock.tick] > (self._max_steps - 1) * self.control_period
-            )
+            last_tick = (self._max_steps - 1) * self.control_period
+            is_timed_out = self.states[:, Z.clock.tick] > last_tick
             truncated |= is_timed_out
             n_ended += int((is_timed_out & ~self.over).sum())
             self.over |= is_timed_out
@@ -229,7 +216,7 @@ class StabilityVectorEnv(
         return self.obs.copy(), rewards, terminated, truncated, infos
 
     def _reset_finished(self) -> Infos:
-        """Reset the rows that are over; returns what they reported last."""
+        """Reset the rows that are over; returns their last infos."""
         final_obs, rows = np.full(self.num_envs, None), np.flatnonzero(self.over)
         for i in rows:
             final_obs[i] = self.obs[i].copy()
@@ -299,20 +286,16 @@ def _make_row_configs(
 ) -> tuple[StabilityEnv, list[EnvConfig]]:
     """The first row's env, and the config of each row; rows with the same values share one."""
     if arguments.get("vision") == "image":
-        raise ValueError(
-            "vision='image' sees for one car at a time: make_vec(..., vectorization_mode='sync')"
-        )
+        mode = "make_vec(..., vectorization_mode='sync')"
+        raise ValueError(f"vision='image' sees for one car at a time: {mode}")
     columns = {name: expand_rows(name, arguments.get(name), count) for name in _ROW_ARGUMENTS}
     envs: dict[tuple[int, ...], StabilityEnv] = {}
     rows = []
     for values in zip(*columns.values(), strict=True):
         key = tuple(map(id, values))
         if key not in envs:
-            row_arguments = {
-                name: value
-                for name, value in zip(columns, values, strict=True)
-                if value is not None
-            }
-            envs[key] = StabilityEnv(**{**arguments, **row_arguments})
+            named = zip(columns, values, strict=True)
+            own_arguments = {name: value for name, value in named if value is not None}
+            envs[key] = StabilityEnv(**{**arguments, **own_arguments})
         rows.append(envs[key].config)
     return next(iter(envs.values())), rows

@@ -1,9 +1,15 @@
 """The compiler and the kinds of numbers: one text for Python, SIMD lanes, NumPy, torch and CasADi.
 
+<<<<<<< HEAD
 `jit` compiles a plain function and rebuilds its text for another kind of numbers. Such texts may
 call what `primitives`, `packed` and `functions` have. `simd` and `simd8` are lanes of 4 and 8,
 `torch_backend` and `casadi_backend` the other kinds. `compiler` and `kernel_cache` keep machine
 code on disk.
+=======
+`jit` compiles a plain function, `as_python` rebuilds its text for another kind of numbers.
+`primitives` and `packed` are what such texts may call; `functions` is built from them. Every other
+room may import this one.
+>>>>>>> shrink-A
 """
 
 from collections.abc import Iterator
@@ -12,9 +18,14 @@ from contextlib import contextmanager
 
 @contextmanager
 def require_extra(name: str, needs: str) -> Iterator[None]:
-    """Around imports: ModuleNotFoundError for a missing package names the extra to install.
+    """Require an extra around imports: where a package is missing, the error names the extra.
 
-    needs: what needs what, "pictures need pygame"; {} stands for the missing module's name.
+    Args:
+        name: Name of the extra.
+        needs: Message, "pictures need pygame"; {} stands for the missing module's name.
+
+    Raises:
+        ModuleNotFoundError: For a missing package.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""The plant's own text on CasADi's symbols: `envs.numerics.as_python` with CasADi's primitives."""
+"""The equations on CasADi's symbols: `as_python` with CasADi's primitives."""
 
 import types
 from collections.abc import Callable
@@ -22,23 +22,26 @@ SYMBOLS: dict[str, Callable[..., Any]] = {
     "to_float": lambda a: a * 1.0,
     "any_lane": lambda condition: isinstance(condition, ca.SX | ca.MX) or condition,
 }
-"""The primitives for CasADi's SX and MX, by the names the equations use."""
+"""The primitives for CasADi's SX and MX, by the names that the equations use."""
 
 _ELEMENTARY: dict[str, Callable[..., Any]] = {
     "sincos": lambda x: (ca.sin(x), ca.cos(x)),
     "atan": ca.atan,
     "atan2": ca.atan2,
 }
-"""CasADi's own in place of our polynomials: they agree to 1e-15 and have short derivatives."""
+"""CasADi's own functions, which agree to 1e-15 and have shorter derivatives than polynomials."""
 
 _PACKAGE = __name__.rpartition(".envs")[0]
 
 
 def to_casadi(function: F) -> F:
-    """The same text for CasADi expressions.
+    """Rebuild a function for CasADi expressions.
 
-    Conditions may be compared and selected, but not joined by `&` or `|`, which CasADi's
-    expressions lack; such a text raises TypeError when it is called.
+    Args:
+        function: Compiled function, without `&` and `|`, which raise TypeError on expressions.
+
+    Returns:
+        The rebuilt function.
     """
     rebuilt = as_python(function, SYMBOLS)
     _replace(rebuilt, set())
@@ -46,7 +49,7 @@ def to_casadi(function: F) -> F:
 
 
 def _replace(function: Any, done: set[int]) -> None:
-    """Put `_ELEMENTARY` into a rebuilt function and those it calls, which are its own copies."""
+    """Put `_ELEMENTARY` into a rebuilt function and its callees, which are copies of its own."""
     done.add(id(function))
     names = function.__globals__
     for name in function.__code__.co_names:

@@ -1,15 +1,9 @@
-"""How numba is made to compile kernels: its front end, each kernel's machine code, their files.
+"""The compiler of kernels: numba, with each function lowered once and each kernel emitted once.
 
-numba's front end without what it does for nothing: its passes, and what it looks up again.
-
-How kernels are compiled: each function's text once, each kernel's machine code once.
-
-numba by itself runs LLVM's whole pipeline and emits machine code for every function a kernel calls,
-with everything below it, level by level. Here a function that another one calls is a
-`UnlinkedLibrary`: its LLVM text stays as numba lowered it. What Python calls links the parts below
-it, and is optimised and emitted then; that alone is cached on disk.
-
-All this uses numba's insides, which change: `decorators` does without where they are others.
+numba by itself optimises and emits every function that a kernel calls, with everything below it,
+level by level. Here a function that another one calls is a part, whose LLVM text stays as lowered.
+What Python calls links the parts below it, and is optimised, emitted and cached on disk alone.
+All this uses numba's internals: `jit` falls back on plain numba where they differ.
 """
 
 import contextlib
@@ -42,7 +36,6 @@ from .kernel_cache import report_once
 # numba's own types say too little about itself:
 # mypy: disable-error-code="attr-defined,no-untyped-call,call-arg,misc,unused-ignore"
 
-
 _FUNCTION: Any = types.Function  # operators and numba's own functions
 _resolve = _FUNCTION.get_call_type
 _signatures: dict[Any, Any] = {}
@@ -63,17 +56,8 @@ class _Passes(PassManager):
         step.run_pass(state)
 
 
-def lean_passes() -> PassManager:
-    """Those that a function needs that neither counts references nor holds another one."""
-    passes = _Passes("part")
-    for pass_class in _PASSES:
-        passes.add_pass(pass_class, pass_class.__name__)
-    passes.finalize()
-    return passes
-
-
-def _resolved(function: Any, context: Any, args: Any, kws: Any) -> Any:
-    """What numba finds for an operator or a function of its own, by the types it is called with."""
+def _resolve_call(function: Any, context: Any, args: Any, kws: Any) -> Any:
+    """Signature of an operator or a function of numba's for argument types, looked up once."""
     if kws:
         return _resolve(function, context, args, kws)
     key = function, context, args, ConfigStack.top_or_none().nrt
@@ -83,12 +67,11 @@ def _resolved(function: Any, context: Any, args: Any, kws: Any) -> Any:
 
 
 @contextlib.contextmanager
-def quickly() -> Iterator[None]:
-    """Nothing is looked up twice, and no cycles are sought among a compiler's millions of objects:
-    a fifth of its time each."""
+def _remember_signatures() -> Iterator[None]:
+    """Look up no call twice, and collect no garbage: each saves a fifth of the compiler's time."""
     enabled, resolve = gc.isenabled(), _FUNCTION.get_call_type
     gc.disable()
-    _FUNCTION.get_call_type = _resolved
+    _FUNCTION.get_call_type = _resolve_call
     try:
         yield
     finally:
@@ -97,15 +80,11 @@ def quickly() -> Iterator[None]:
             gc.enable()
 
 
-# numba's own types say too little about itself:
-# mypy: disable-error-code="attr-defined,no-untyped-call,call-arg,misc,unused-ignore"
-
-
 _logger = logging.getLogger("sideslip.compiler")
 _spent = [0.0]  # CPU-s on kernels so far, to tell a kernel's own from those it waited for
 
 
-class UnlinkedLibrary(JITCodeLibrary):
+class _UnlinkedLibrary(JITCodeLibrary):
     """The LLVM text of one function, neither optimised nor linked with those that it calls."""
 
     def finalize(self) -> None:
@@ -114,81 +93,80 @@ class UnlinkedLibrary(JITCodeLibrary):
         self._finalize_dynamic_globals()
         self._finalized = True
 
-    def get_own_module(self) -> Any:
+    def _get_own_module(self) -> Any:
         """The LLVM module of this function alone, for linking."""
         return super()._get_module_for_linking()
 
     def _get_module_for_linking(self) -> Any:
-        """What a function that numba compiles by itself links: this one and all below it."""
-        module = self.get_own_module().clone()
+        """The module of this function and all below it, which numba's own functions link."""
+        module = self._get_own_module().clone()
         for callee in _collect_callees(self)[1:]:
-            if not isinstance(callee, _ExternalLibrary):
-                callee_module = (
-                    callee.get_own_module()
-                    if isinstance(callee, UnlinkedLibrary)
-                    else callee._get_module_for_linking()
-                )
-                module.link_in(callee_module, preserve=True)
+            if isinstance(callee, _UnlinkedLibrary):
+                module.link_in(callee._get_own_module(), preserve=True)
+            elif not isinstance(callee, _ExternalLibrary):
+                module.link_in(callee._get_module_for_linking(), preserve=True)
         return module
 
 
-class Whole(JITCodeLibrary):
+class _KernelLibrary(JITCodeLibrary):
     """A kernel's own library, into which all parts are linked."""
 
     def _optimize_functions(self, module: Any) -> None:
-        """Nothing: parts are optimised, and what is around them is optimised with the whole."""
+        """Leave the parts as they are: they are optimised with the whole."""
 
     def _optimize_final_module(self) -> None:
-        """Once: numba's first run only prepares the counting of references."""
+        """Optimise once: numba's first run only prepares the counting of references."""
         passes, options = self.codegen._module_pass_manager()
         passes.run(self._final_module, options)
 
 
 class _BareLibrary:
-    """A part as a kernel of ours links it, which links each part itself."""
+    """A part without those below it, which the kernel links itself."""
 
-    def __init__(self, part: UnlinkedLibrary) -> None:
+    def __init__(self, part: _UnlinkedLibrary) -> None:
         self._part, self._reload_init = part, part._reload_init
 
     def _ensure_finalized(self) -> None:
         self._part._ensure_finalized()
 
     def _get_module_for_linking(self) -> Any:
-        return self._part.get_own_module()
+        return self._part._get_own_module()
 
 
 class _ExternalLibrary:
-    """A kernel that callers find as machine code: nothing is linked into them."""
+    """A kernel that callers call as machine code: nothing is linked into them."""
 
     def __init__(self, path: Path | None) -> None:
         self.path = path
         self._reload_init: set[str] = set()
 
     def _ensure_finalized(self) -> None:
-        """There is nothing to finalize: numba asks before it links."""
+        """Do nothing: numba asks before it links."""
 
     def _get_module_for_linking(self) -> Any:
-        """Nothing: the machine code is found by its name."""
+        """An empty module: the machine code is found by its name."""
         return binding.parse_assembly("")
 
 
 class _UnlinkedPipeline(Compiler):
     def define_pipelines(self) -> Any:
-        """numba's own, but only the passes that find something to do in a function that neither
-        counts references nor holds another one."""
+        """numba's passes, but few for what neither counts references nor holds a function."""
         if self.state.flags.nrt or any(map(iscode, self.state.func_id.code.co_consts)):
             return super().define_pipelines()
-        return [lean_passes()]
+        passes = _Passes("part")
+        for pass_class in _PASSES:
+            passes.add_pass(pass_class, pass_class.__name__)
+        passes.finalize()
+        return [passes]
 
     def compile_extra(self, func: Any) -> Any:
-        self.state.library = UnlinkedLibrary(self.state.targetctx.codegen(), func.__qualname__)
+        self.state.library = _UnlinkedLibrary(self.state.targetctx.codegen(), func.__qualname__)
         return super().compile_extra(func)
 
 
 class _ExternalPipeline(_UnlinkedPipeline):
     def compile_extra(self, func: Any) -> Any:
-        """Callers' files know the function by a name that is the same in every process: numba's
-        counts functions and types as they come."""
+        """Compile under a name that is the same in every process, unlike numba's counter."""
 
         def mangler(name: str, types: Any, **_: Any) -> str:
             digest = hashlib.sha256(str(tuple(types)).encode()).hexdigest()[:16]
@@ -207,8 +185,8 @@ class _UnlinkedCompiler(_FunctionCompiler):
 class Kernel(CPUDispatcher):
     """A compiled function: a dispatcher of numba whose callees are parts.
 
-    folder: that of its files on disk, or None. apart: callers do not take its text in but call its
-    machine code; so must a function of a module be that several kernels call and that is long.
+    folder: folder of its files, or None. apart: whether callers call its machine code instead of
+    taking its text in, as suits what is long and called by several kernels.
     """
 
     def __init__(
@@ -231,15 +209,14 @@ class Kernel(CPUDispatcher):
             _ExternalPipeline if apart else _UnlinkedPipeline,
         )
 
-    def get_part(self, args: tuple[types.Type, ...]) -> Any:
-        """What callers link, for arguments of these types."""
+    def _get_part(self, args: tuple[types.Type, ...]) -> Any:
+        """Make the part that callers link, for arguments of these types."""
         with global_compiler_lock, self._compiling_counter:
             if args not in self.parts:
                 if self.apart:
                     self.compile(args)
-                    part = self.overloads[args]._replace(
-                        library=_ExternalLibrary(self._find_path(args))
-                    )
+                    library = _ExternalLibrary(self._find_path(args))
+                    part = self.overloads[args]._replace(library=library)
                 else:
                     part = self._unlinked_compiler.compile(args, None)
                 part = part._replace(entry_point=part.library)  # the key of its code for callers
@@ -248,22 +225,18 @@ class Kernel(CPUDispatcher):
             return self.parts[args]
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """What numba asks when it finds a call: the part's signature.
-
-        A literal is any number of its type: numba would compile the same text for 0, for 1 and for
-        an integer.
-        """
+        """Get the part's signature, for numba at a call; a literal counts as any of its type."""
         pysig, args = self._compiler.fold_argument_types(args, kws)
-        part = self.get_part(tuple(map(types.unliteral, args)))
+        part = self._get_part(tuple(map(types.unliteral, args)))
         name = self.py_func.__name__
         return make_concrete_template(name, key=name, signatures=[part.signature]), pysig, args, {}
 
     def get_overload(self, sig: Any) -> Any:
-        """What numba asks when it writes a call: the key of the part."""
-        return self.get_part(tuple(normalize_signature(sig)[0])).entry_point
+        """Get the part's key, for numba when it lowers a call."""
+        return self._get_part(tuple(normalize_signature(sig)[0])).entry_point
 
     def compile(self, sig: Any) -> Any:
-        """The call for arguments of these types, from the disk where it is kept."""
+        """Compile for arguments of these types, or load the kernel from disk."""
         args = tuple(normalize_signature(sig)[0])
         with global_compiler_lock:
             if args not in self.overloads:
@@ -294,18 +267,16 @@ class Kernel(CPUDispatcher):
         return result
 
     def _build(self, args: tuple[types.Type, ...]) -> tuple[Any, dict[str, Any], list[Any]]:
-        """What `_link_library` returns, compiled while the user waits."""
+        """Compile and link while the user waits; returns the result of `_link_library`."""
         location = f"cached in {self.folder.parent}" if self.folder else "not cached"
-        report_once(
-            "compiling",
-            f"compiling kernels for this machine, 10 s to a minute ({location}) ...",
-            logging.INFO,
-        )
+        text = f"compiling kernels for this machine, 10 s to a minute ({location}) ..."
+        report_once("compiling", text, logging.INFO)
         start, nested = time.process_time(), _spent[0]
-        with quickly():
-            result = _link_library(
-                self._unlinked_compiler.compile(args, None) if self.apart else self.get_part(args)
+        with _remember_signatures():
+            part = (
+                self._unlinked_compiler.compile(args, None) if self.apart else self._get_part(args)
             )
+            result = _link_library(part)
         spent = time.process_time() - start
         own_time, _spent[0] = spent - (_spent[0] - nested), nested + spent
         _logger.info("compiled %s in %.1f CPU-s", self.py_func.__qualname__, own_time)
@@ -313,10 +284,9 @@ class Kernel(CPUDispatcher):
 
 
 def _link_library(part: Any) -> tuple[Any, dict[str, Any], list[Path | None]]:
-    """A part with everything below it, optimised and emitted; all their environments; the files of
-    the kernels apart that it calls."""
+    """(a part with all below it, emitted; their environments; files of kernels that it calls)."""
     target = part.target_context
-    library = Whole(target.codegen(), part.library.name)
+    library = _KernelLibrary(target.codegen(), part.library.name)
     library.enable_object_caching()
     root, *callees = _collect_callees(part.library)
     library.add_llvm_module(root._final_module.clone())  # where others find the function by name
@@ -324,28 +294,22 @@ def _link_library(part: Any) -> tuple[Any, dict[str, Any], list[Path | None]]:
     needs = [item.path for item in callees if isinstance(item, _ExternalLibrary)]
     for item in callees:
         if not isinstance(item, _ExternalLibrary):
-            library.add_linking_library(
-                _BareLibrary(item) if isinstance(item, UnlinkedLibrary) else item
-            )
+            is_part = isinstance(item, _UnlinkedLibrary)
+            library.add_linking_library(_BareLibrary(item) if is_part else item)
     target.create_cpython_wrapper(library, part.fndesc, part.environment, part.call_helper)
     entry = target.get_executable(library, part.fndesc, part.environment)
-    all_environments = {
-        item: lookup_environment(item) for item in kernel_cache.list_environments(library)
-    }
-    environments = {name: item for name, item in all_environments.items() if item is not None}
+    names = kernel_cache.list_environments(library)
+    environments = {n: item for n in names if (item := lookup_environment(n)) is not None}
     kernel_cache.set_environments(library, environments)
     return part._replace(library=library, entry_point=entry), environments, needs
 
 
 def _collect_callees(library: Any) -> list[Any]:
-    """A part and all it calls, directly or not, callers first.
-
-    LLVM's linker leaves out what nothing refers to yet.
-    """
+    """A part and all it calls, callers first: LLVM's linker drops what nothing refers to yet."""
     visited: dict[Any, None] = {}
 
     def visit(node: Any) -> None:
-        if isinstance(node, UnlinkedLibrary):
+        if isinstance(node, _UnlinkedLibrary):
             for callee in node._linking_libraries:
                 if callee not in visited:
                     visit(callee)

@@ -1,13 +1,9 @@
-"""Elementary functions as polynomials of our own: every backend gives the same bits.
+"""Elementary functions and counter-based random numbers with the same bits on every backend.
 
-Library functions differ in the last bit between platforms, vector units and devices; these use
-only + - * / and correctly rounded square roots. Errors are stated at each function.
-
-Counter-based random numbers: each one is a pure function of (key, tick, channel).
-
-Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) gives four
-32-bit words for a counter and a key. Words live in signed 64-bit integers under masks, so that
-compiled code, Python, NumPy and torch compute the same words.
+Library functions differ in the last bit between platforms; these polynomials use only + - * / and
+correctly rounded square roots. A random number is a pure function of (key, tick, channel) by
+Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011), whose 32-bit
+words are signed 64-bit integers under masks.
 """
 
 from typing import Any, NamedTuple
@@ -23,7 +19,7 @@ PI = 3.141592653589793
 
 @jit
 def sin_kernel(r: Any) -> Any:
-    """sin r for |r| <= pi/4, error below 1e-16."""
+    """Compute sin r for |r| <= pi/4, error below 1e-16."""
     z = r * r
     p = 1.58969099521155010221e-10
     p = p * z - 2.50507602534068634195e-08
@@ -36,7 +32,7 @@ def sin_kernel(r: Any) -> Any:
 
 @jit
 def cos_kernel(r: Any) -> Any:
-    """cos r for |r| <= pi/4, error below 2e-16."""
+    """Compute cos r for |r| <= pi/4, error below 2e-16."""
     z = r * r
     p = -1.13596475577881948265e-11
     p = p * z + 2.08757232129817482790e-09
@@ -49,14 +45,14 @@ def cos_kernel(r: Any) -> Any:
 
 @jit
 def sincos(x: Any) -> Any:
-    """(sin x, cos x); error below 3e-16 + 1e-16 |x| for |x| < 1e6 rad."""
+    """Compute (sin x, cos x), error below 3e-16 + 1e-16 |x| for |x| < 1e6 rad."""
     k = floor(x * _TWO_OVER_PI + 0.5)
     r = (x - k * _PI_2_HIGH) - k * _PI_2_LOW
-    return quadrant(k - 4.0 * floor(0.25 * k), sin_kernel(r), cos_kernel(r))
+    return _quadrant(k - 4.0 * floor(0.25 * k), sin_kernel(r), cos_kernel(r))
 
 
 @jit
-def quadrant(q: Any, s: Any, c: Any) -> Any:
+def _quadrant(q: Any, s: Any, c: Any) -> Any:
     """(sin, cos) of an angle turned by q = 0, 1, 2 or 3 quarter turns."""
     odd = (q == 1.0) | (q == 3.0)
     sign_s = select(q > 1.5, -1.0, 1.0)
@@ -84,7 +80,7 @@ def _atan_kernel(t: Any) -> Any:
 
 @jit
 def atan(x: Any) -> Any:
-    """arctan x, error below 5e-16: reciprocal above 1, two half-angle steps, then the series."""
+    """Compute arctan x, error below 5e-16: reciprocal above 1, two half-angle steps, series."""
     steep = absolute(x) > 1.0
     u = select(steep, -1.0, x) / select(steep, x, 1.0)
     t = u / (1.0 + sqrt(1.0 + u * u))
@@ -94,7 +90,7 @@ def atan(x: Any) -> Any:
 
 @jit
 def atan2(y: Any, x: Any) -> Any:
-    """The angle of the vector (x, y) in [-pi, pi], error below 1e-15; 0 at the origin.
+    """Compute the angle of (x, y) in [-pi, pi], error below 1e-15; 0 at the origin.
 
     The half-angle steps of `atan` without their quotients: tan(a / 2) = y / (x + |(x, y)|).
     """
@@ -111,20 +107,20 @@ def atan2(y: Any, x: Any) -> Any:
 
 @jit
 def wrap(angle: Any) -> Any:
-    """The angle brought into [-pi, pi)."""
+    """Wrap an angle into [-pi, pi)."""
     return angle - 2.0 * PI * floor(angle / (2.0 * PI) + 0.5)
 
 
 @jit
 def smoothstep(x: Any) -> Any:
-    """0 below 0, 1 above 1, the C1 cubic between."""
+    """Compute the C1 step: 0 below 0, 1 above 1, a cubic between."""
     t = select(x < 0.0, 0.0, select(x > 1.0, 1.0, x))
     return t * t * (3.0 - 2.0 * t)
 
 
 @jit
 def exp(x: Any) -> Any:
-    """e^x for |x| < 8, relative error below 5e-14: a polynomial at x / 64, squared six times."""
+    """Compute e^x for |x| < 8, relative error below 5e-14: polynomial at x / 64, to the 64th."""
     z = x * (1.0 / 64.0)
     p = 1.0 / 362880.0
     p = p * z + 1.0 / 40320.0
@@ -143,7 +139,7 @@ def exp(x: Any) -> Any:
 
 @jit
 def clip(value: Any, low: Any, high: Any) -> Any:
-    """The value kept within [low, high]."""
+    """Clip a value to [low, high]."""
     return minimum(maximum(value, low), high)
 
 
@@ -156,7 +152,7 @@ _SQRT_HALF = 0.7071067811865476
 
 
 class Channels(NamedTuple):
-    """The table of channels: a block of four numbers for each use. New blocks go at the end."""
+    """Channels of random numbers, a block of four each; new ones go at the end."""
 
     inertial: int = 0  # gyro, a_y, a_x, roll rate
     wheels: int = 1  # left and right front wheel speed, disturbance force, disturbance moment
@@ -175,7 +171,7 @@ CHANNELS = Channels()
 
 @jit
 def philox(key_low: int, key_high: int, a: int, b: int, c: int = 0, d: int = 0) -> Any:
-    """Four random 32-bit words (non-negative integers) for a counter (a, b, c, d)."""
+    """Compute four random 32-bit words (non-negative integers) for a counter (a, b, c, d)."""
     k0, k1 = key_low & _MASK, key_high & _MASK  # tells compilers that products fit
     a, b, c, d = a & _MASK, b & _MASK, c & _MASK, d & _MASK
     for _ in range(10):
@@ -194,7 +190,7 @@ def philox(key_low: int, key_high: int, a: int, b: int, c: int = 0, d: int = 0) 
 
 @jit
 def to_uniform(word: int) -> Any:
-    """A number in (0, 1) from a 32-bit word; never 0, never 1."""
+    """Convert a 32-bit word to a number in (0, 1); never 0, never 1."""
     return (to_float(word) + 0.5) / _2_32
 
 
@@ -221,13 +217,13 @@ def _draw_normal_pair(first: int, second: int) -> Any:
     turn = second + (1 << 29)  # the quarter turns are the two leading bits, exactly
     q = turn >> 30
     r = (to_float(turn - (q << 30)) - 536870912.0 + 0.5) * (2.0 * PI / _2_32)
-    s, c = quadrant(to_float(q & 3), sin_kernel(r), cos_kernel(r))
+    s, c = _quadrant(to_float(q & 3), sin_kernel(r), cos_kernel(r))
     return radius * c, radius * s
 
 
 @jit
 def draw_normals(key_low: int, key_high: int, tick: int, block: int) -> Any:
-    """Four independent standard normal numbers of a block at a tick."""
+    """Draw four independent standard normal numbers of a block at a tick."""
     a, b, c, d = philox(key_low, key_high, tick, block)
     n0, n1 = _draw_normal_pair(a, b)
     n2, n3 = _draw_normal_pair(c, d)
@@ -236,6 +232,6 @@ def draw_normals(key_low: int, key_high: int, tick: int, block: int) -> Any:
 
 @jit
 def draw_uniforms(key_low: int, key_high: int, tick: int, block: int, index: int = 0) -> Any:
-    """Four independent numbers, uniform in (0, 1), of a block at a tick."""
+    """Draw four independent numbers, uniform in (0, 1), of a block at a tick."""
     a, b, c, d = philox(key_low, key_high, tick, block, index)
     return to_uniform(a), to_uniform(b), to_uniform(c), to_uniform(d)

@@ -1,7 +1,7 @@
-"""One text, several machines: the compiler's decorator and the table of primitives.
+"""The compiler's decorators, and the rebuilding of compiled functions for other numbers.
 
-The equations of sideslip are plain scalar functions over tuples. `jit` compiles them; `as_python`
-rebuilds the very same functions for Python floats, NumPy arrays or any other table of primitives.
+The equations are plain scalar functions over tuples. `jit` compiles them; `as_python` rebuilds the
+same code for Python floats, NumPy arrays or any other table of primitives.
 """
 
 import functools
@@ -17,9 +17,7 @@ from .kernel_cache import LAYERS, find_kernel_folder, report_once
 from .packed import read
 from .primitives import minimum
 
-STOCK = "SIDESLIP_STOCK_NUMBA"
-"""The environment variable with which numba compiles by itself."""
-
+_STOCK = "SIDESLIP_STOCK_NUMBA"  # environment variable with which plain numba compiles
 _PREFIX = __name__.removesuffix("envs.numerics.jit")
 _SUPPORTED = "0.68"  # numba's version whose insides `compiler` uses
 
@@ -33,37 +31,40 @@ def jit(function: F) -> F:
 
 
 def jit_nrt(function: F) -> F:
-    """The same for what allocates or reshapes arrays in `envs` or `estimators`, and its callers.
+    """Compile with reference counting: what allocates or reshapes arrays, and its callers.
 
-    All others there do without numba's counting of references, which costs two locked instructions
-    for every slice: a filter's tick twice as much.
+    All others in `envs` and `estimators` do without it, which halves the time of a filter's tick.
     """
     return _compile(function, _nrt=True)
 
 
 def inline(function: F) -> F:
-    """The same, and the text goes into its callers: what takes many numbers and is called often.
+    """Compile into the callers: what takes many numbers and is called often.
 
-    A call of a plant's function passes some sixty numbers through memory, which costs as much as
+    A call of a plant's function passes some sixty numbers through memory, which takes as long as
     the function itself.
     """
     return _compile(function, forceinline=True)
 
 
 def noinline(function: F) -> F:
-    """The same, with machine code of its own that callers call: what is long and called seldom.
-
-    It is made and cached once, not in each kernel that calls it.
-    """
+    """Compile once, to machine code that all callers call: what is long and called seldom."""
     return _compile(function, apart=True)
 
 
 def compile_call(function: F, *arguments: Any) -> F:
-    """A compiled function for arguments of these types and no others: numba looks at the types of
-    what it is called with, which takes as long as a hundred lines of what it compiled."""
-    compiled: Any = function
+    """Compile a function for the types of some arguments alone, which saves numba's dispatch.
+
+    Args:
+        function: Function compiled by `jit`.
+        arguments: Arguments of the types that it will be called with.
+
+    Returns:
+        The function for these types.
+    """
     if config.DISABLE_JIT:
         return function
+    compiled: Any = function
     return cast(F, compiled.compile(tuple(map(numba.typeof, arguments))))
 
 
@@ -75,10 +76,8 @@ def _compile(function: F, apart: bool = False, **options_more: bool) -> F:
         stock_jit: Any = numba.njit(error_model="numpy", forceinline="forceinline" in options_more)
         return cast(F, stock_jit(function))
     layer = function.__module__.removeprefix(_PREFIX).partition(".")[0]
-    is_package_layer = function.__module__.startswith(_PREFIX) and layer in LAYERS
-    folder = (
-        find_kernel_folder(layer) if is_package_layer else None
-    )  # the stamp knows of no other sources
+    is_hashed = function.__module__.startswith(_PREFIX) and layer in LAYERS
+    folder = find_kernel_folder(layer) if is_hashed else None
     options: dict[str, Any] = {"nopython": True, "boundscheck": None}
     options |= {"error_model": "numpy", "fastmath": False, "forceinline": False}
     options |= {"_nrt": layer not in ("envs", "estimators")} | options_more
@@ -87,12 +86,9 @@ def _compile(function: F, apart: bool = False, **options_more: bool) -> F:
 
 @functools.cache
 def _load_kernel_class() -> Any:
-    """The class of our compiler's functions, None where numba compiles by itself.
-
-    It does so on request, and where our compiler was not made for its version: the same numbers.
-    """
-    if os.environ.get(STOCK):
-        reason = f"{STOCK} is set"
+    """The class of our compiler's kernels; None for plain numba, on request or by its version."""
+    if os.environ.get(_STOCK):
+        reason = f"{_STOCK} is set"
     elif not numba.__version__.startswith(f"{_SUPPORTED}."):
         reason = f"our compiler is made for {_SUPPORTED}"
     else:
@@ -109,29 +105,29 @@ def _load_kernel_class() -> Any:
 
 @jit
 def copy_into(source: Any, target: Any) -> None:
-    """Copy a vector's numbers into another one; a slice's assignment would allocate."""
+    """Copy a vector's numbers into another one; assigning a slice would allocate."""
     for i in range(len(source)):
         target[i] = source[i]
 
 
+_PACKAGE = __name__.rpartition(".envs")[0]
 _PRIMITIVE_MODULES = {read.__module__, minimum.__module__}  # what a table may replace
-
-
-def _identity(function: Any) -> Any:
-    return function
 
 
 def as_python(
     function: F,
     table: Mapping[str, Callable[..., Any]] | None = None,
-    finish: Callable[[Any], Any] = _identity,
+    finish: Callable[[Any], Any] = lambda function: function,
 ) -> F:
-    """The same text without the compiler.
+    """Rebuild a function and its callees from the same code objects, without the compiler.
 
-    Parameters: `function`, compiled by `jit` or not; `table`, primitives by name that replace
-    ours (`ARRAYS` for NumPy arrays, None for Python floats); `finish`, what each rebuilt function
-    becomes (another compiler's).
-    Returns: a function built from the same code object, its callees replaced likewise.
+    Args:
+        function: Function, compiled by `jit` or not.
+        table: Primitives by name that replace ours: None for Python floats, `ARRAYS` for arrays.
+        finish: Decorator of each rebuilt function, such as another compiler's.
+
+    Returns:
+        The rebuilt function.
     """
     rebuilt: F = _rebuild(function, dict(table or {}), finish, {})
     return rebuilt
@@ -150,10 +146,8 @@ def _rebuild(
     rebuilt_functions[source] = finished = finish(rebuilt)
     for name in source.__code__.co_names:
         callee: Any = names.get(name)
-        is_package = isinstance(callee, types.FunctionType) and (
-            callee.__module__ or ""
-        ).startswith(__name__.rpartition(".envs")[0])
-        if is_jitted(callee) or is_package:
+        is_function = isinstance(callee, types.FunctionType)
+        if is_jitted(callee) or (is_function and (callee.__module__ or "").startswith(_PACKAGE)):
             names[name] = _rebuild(callee, table, finish, rebuilt_functions)
     del names["__name__"]  # by which torch.compile would look the names up in the module itself
     return finished

@@ -1,14 +1,9 @@
-"""Where compiled kernels lie on disk, and whether what lies there may be run.
+"""The cache of compiled kernels on disk: a line of JSON and the machine code in each file.
 
-Who can write a kernel's file can run anything. So a folder or a file counts only where it belongs
-to the user or to root and nobody else can write it, and its path is absolute; all else is compiled
-in memory, and said once.
-
-Compiled kernels as files: a line of JSON and the machine code, whole or not at all.
-
-Nothing is unpickled: a kernel's types are those that the process asks for. numba's own cache
-numbers its files in an index that two processes overwrite for each other, raises where the disk is
-full or a file is cut short, and stores every function below a kernel as well.
+Whoever can write such a file can run anything. So a folder or file is used only where its path is
+absolute, it belongs to the user or root and nobody else can write it; otherwise kernels are
+compiled in memory, with one warning. Nothing is unpickled. Unlike with numba's own cache, processes
+share no index, a full disk raises nothing, and callees are not stored.
 """
 
 import contextlib
@@ -38,9 +33,10 @@ from numba.core.typing import signature
 
 from ..io import replace_file
 
-QUIET = "SIDESLIP_QUIET"
-"""The environment variable that keeps `report_once` from writing to standard error."""
+# numba's own types say too little about itself:
+# mypy: disable-error-code="attr-defined,no-untyped-call,call-arg,misc,unused-ignore"
 
+_QUIET = "SIDESLIP_QUIET"  # environment variable that silences `report_once`
 _PACKAGE = Path(__file__).resolve().parents[2]
 LAYERS = ("envs", "estimators", "agents", "benchmarks")  # each calls only those before it
 _NOT_COMPILED = ("rendering", "highway")
@@ -51,17 +47,22 @@ _logger = logging.getLogger("sideslip.compiler")
 _reported: set[str] = set()
 
 
-class UntrustedError(Exception):
-    """What somebody else could have written."""
+class _UntrustedError(Exception):
+    """A file or folder that somebody else could have written."""
 
 
 def report_once(subject: str, text: str, level: int = logging.WARNING) -> None:
-    """Say something about a subject once in a process.
+    """Report on a subject once in a process.
 
-    A line on standard error; a record of the logger `sideslip.compiler` instead where the program
-    has set up logging; nothing in worker processes or with SIDESLIP_QUIET set.
+    It is a line on standard error, or a record of the logger `sideslip.compiler` where logging is
+    set up; nothing in worker processes or with SIDESLIP_QUIET set.
+
+    Args:
+        subject: Key of the report.
+        text: Message.
+        level: Level of the record.
     """
-    if subject in _reported or os.environ.get(QUIET):
+    if subject in _reported or os.environ.get(_QUIET):
         return
     _reported.add(subject)
     if _logger.hasHandlers():
@@ -71,11 +72,16 @@ def report_once(subject: str, text: str, level: int = logging.WARNING) -> None:
 
 
 def hash_sources(layer: str = LAYERS[-1]) -> str:
-    """The hash of all source files a layer's kernels may call, which names their folder.
+    """Hash all source files that a layer's kernels may call.
 
-    numba watches only the file of the function itself: an edit in a callee's module would
-    otherwise silently give the numbers of the old text. Calls point one way, so an edit in
-    `benchmarks` leaves the kernels of `envs` alone. What compiles nothing is left out.
+    numba watches only the file of the function itself; an edit in a callee's module would go
+    unnoticed. Calls point one way, so an edit in `benchmarks` leaves the kernels of `envs` alone.
+
+    Args:
+        layer: Name in `LAYERS`.
+
+    Returns:
+        16 hexadecimal digits.
     """
     digest = hashlib.sha256()
     for folder in LAYERS[: LAYERS.index(layer) + 1]:
@@ -87,8 +93,10 @@ def hash_sources(layer: str = LAYERS[-1]) -> str:
 
 
 def hash_experiment() -> str:
-    """The hash of all that a drive's numbers depend on but tuned options and weights: the sources
-    below the benchmarks, the ids with their options, and the cars and cameras in files."""
+    """Hash all that a drive's numbers depend on, except tuned options and weights.
+
+    That is the sources below the benchmarks, the ids and the files of cars and cameras.
+    """
     digest = hashlib.sha256(hash_sources("agents").encode())
     files = [path for path in (_PACKAGE / "envs").rglob("*.*") if path.suffix in _DATA_SUFFIXES]
     for path in [_PACKAGE / "__init__.py", *sorted(files)]:
@@ -98,14 +106,18 @@ def hash_experiment() -> str:
 
 @functools.cache
 def find_kernel_folder(layer: str = LAYERS[-1]) -> Path | None:
-    """The folder of a layer's kernels, made where it is missing; None where there can be none.
+    """Find or make the folder of a layer's kernels, and prune older versions.
 
-    One that can only be read is read. Older versions are pruned.
+    Args:
+        layer: Name in `LAYERS`.
+
+    Returns:
+        The folder, which may be read-only; None where there can be none.
     """
     try:
         folder = _find_cache_folder() / hash_sources(layer)
         _make_folder(folder)
-    except (UntrustedError, OSError) as error:
+    except (_UntrustedError, OSError) as error:
         report_once("cache", f"compiled kernels are not cached: {error}")
         return None
     with contextlib.suppress(OSError):
@@ -116,16 +128,12 @@ def find_kernel_folder(layer: str = LAYERS[-1]) -> Path | None:
 
 
 def _find_cache_folder() -> Path:
-    """The folder of all versions' folders, after the environment's variables.
-
-    Raises UntrustedError where it is not absolute: a folder that was downloaded and is worked in
-    could bring kernels.
-    """
+    """Folder of all versions, absolute: a downloaded working folder could bring kernels."""
     names = ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME")
     variable = next((name for name in names if os.environ.get(name)), names[-1])
     folder = Path(os.environ.get(variable, ""))
     if not folder.is_absolute():
-        raise UntrustedError(f"{variable} is no absolute path ({str(folder)!r})")
+        raise _UntrustedError(f"{variable} is no absolute path ({str(folder)!r})")
     if variable == "HOME":
         folder /= ".cache"
     if folder.is_symlink():  # of the user's own
@@ -140,11 +148,7 @@ def _find_cache_folder() -> Path:
 
 
 def _make_folder(folder: Path, sticky: bool = False) -> None:
-    """Make a folder for the user alone where it is missing, and its parents.
-
-    Raises UntrustedError where others could have made it, or can write in it; OSError where there
-    is none. sticky: one where all may write, but none can replace what is another's.
-    """
+    """Make a trusted folder and its parents; sticky: all may write but not replace in it."""
     if not folder.parent.exists():
         _make_folder(folder.parent)
     try:
@@ -163,7 +167,7 @@ def _prune(base: Path) -> None:
 
 
 def read_trusted(path: Path) -> bytes | None:
-    """A cached file's bytes; None where there is none, or one that others could have written."""
+    """Read a cached file; None where there is none, or one that others could have written."""
     try:
         folder = _open_if_trusted(path.parent, stat.S_ISDIR)
         try:
@@ -174,7 +178,7 @@ def read_trusted(path: Path) -> bytes | None:
             return file.read()
     except FileNotFoundError:
         return None
-    except (UntrustedError, OSError) as error:
+    except (_UntrustedError, OSError) as error:
         report_once("kernel", f"a cached kernel is compiled anew: {error}")
         return None
 
@@ -182,20 +186,17 @@ def read_trusted(path: Path) -> bytes | None:
 def _open_if_trusted(
     path: Path, kind: Callable[[int], bool], folder: int | None = None, sticky: bool = False
 ) -> int:
-    """The descriptor of a folder, or of a file in an open folder, that nobody else can write.
-
-    What is checked is what was opened. Raises UntrustedError, OSError.
-    """
+    """Descriptor of a folder, or of a file in an open folder; what was opened is checked."""
     flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
         descriptor = os.open(path if folder is None else path.name, flags, dir_fd=folder)
     except OSError as error:
         if error.errno == errno.ELOOP:
-            raise UntrustedError(f"{path} is a link") from None
+            raise _UntrustedError(f"{path} is a link") from None
         raise
     try:
         _check_owner(path, os.fstat(descriptor), kind, sticky)
-    except UntrustedError:
+    except _UntrustedError:
         os.close(descriptor)
         raise
     return descriptor
@@ -206,67 +207,55 @@ def _check_owner(
 ) -> None:
     mode, owner = status.st_mode, status.st_uid
     if not kind(mode):
-        raise UntrustedError(f"{path} is no plain file or folder")
+        raise _UntrustedError(f"{path} is no plain file or folder")
     if owner not in (0, os.geteuid()):
-        raise UntrustedError(f"{path} belongs to another user ({owner})")
+        raise _UntrustedError(f"{path} belongs to another user ({owner})")
     if mode & 0o022 and not stat.S_ISLNK(mode) and not (sticky and mode & stat.S_ISVTX):
-        raise UntrustedError(f"{path} can be written by others (mode {stat.S_IMODE(mode):o})")
-
-
-# numba's own types say too little about itself:
-# mypy: disable-error-code="attr-defined,no-untyped-call,call-arg,misc,unused-ignore"
+        raise _UntrustedError(f"{path} can be written by others (mode {stat.S_IMODE(mode):o})")
 
 
 RETURNS = {str(kind): kind for kind in (types.none, types.float64, types.int64, types.boolean)}
-"""What a function may return that callers find by name."""
+"""Return types of functions that callers find by name."""
 
 _ENVIRONMENTS = "_ZN08NumbaEnv"  # begins the names of the globals that point to environments
 _DIGEST = hashlib.sha256().digest_size
 _ENVIRONMENT = Environment({})  # of all kernels from files: those whose own are empty
-_libraries: dict[str, tuple["Header", Any]] = {}  # in this process's memory, by file
+_libraries: dict[str, tuple["_Header", Any]] = {}  # in this process's memory, by file
 
 
-class Header(NamedTuple):
-    """What a file says of its machine code."""
+class _Header(NamedTuple):
+    """First line of a kernel's file."""
 
-    kernel: str
-    """Of which function, argument types, machine and compiler it is."""
-    symbol: str
-    """The function's name in it."""
-    returns: str
-    environments: list[str]
-    """Names of the globals that point to environments; the function's own comes first."""
-    needs: list[tuple[str, str]]
-    """Folder and file of each kernel whose machine code it calls."""
+    kernel: str  # result of `make_key`
+    symbol: str  # the function's name in the machine code
+    returns: str  # key of RETURNS
+    environments: list[str]  # globals that point to environments, the function's own first
+    needs: list[tuple[str, str]]  # folder and file of each kernel whose machine code it calls
 
 
 def make_key(function: Any, args: Any, codegen: Any) -> str:
-    """What tells a kernel from all others: function, argument types, versions, machine."""
+    """Make a kernel's key: function, argument types, versions and machine."""
     versions = numba.__version__, llvmlite.__version__, sys.version, codegen.magic_tuple()
     return repr((function.__module__, function.__qualname__, str(args), versions))
 
 
 def make_path(folder: Path, function: Any, key: str) -> Path:
-    """The file of the kernel of this key."""
+    """Make the path of a kernel's file."""
     name = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}"
     return folder / f"{name}-{hashlib.sha256(key.encode()).hexdigest()[:16]}.kernel"
 
 
 def save(
-    path: Path,
-    key: str,
-    result: Any,
-    environments: dict[str, Any],
-    needs: list[tuple[str, str]],
+    path: Path, key: str, result: Any, environments: dict[str, Any], needs: list[tuple[str, str]]
 ) -> None:
-    """Write a kernel; one that cannot be written is compiled again next time."""
+    """Save a kernel; one that cannot be written is compiled again next time."""
     library, descriptor = result.library, result.fndesc
     constants = any(environment.consts for environment in environments.values())
     if constants or library.has_dynamic_globals or result.reload_init:
         return  # addresses and objects of this process
     own_name, returns = descriptor.env_name, str(result.signature.return_type)
     names = [own_name, *(name for name in list_environments(library) if name != own_name)]
-    header = Header(key, descriptor.mangled_name, returns, names, needs)
+    header = _Header(key, descriptor.mangled_name, returns, names, needs)
     data = json.dumps(header).encode() + b"\n" + library._get_compiled_object()
     _libraries[str(path)] = header, library
     with contextlib.suppress(OSError), replace_file(path, mode=0o600) as file:
@@ -274,7 +263,7 @@ def save(
 
 
 def load(path: Path, key: str, function: Any, args: Any, target: Any) -> Any:
-    """A kernel from its file; None where there is none, or only a damaged or foreign one."""
+    """Load a kernel from its file; None where there is none, or a damaged or foreign one."""
     rtsys.initialize(target)  # what arrays need, without all that a compiler needs
     linked = _load_library(path, target.codegen(), key)
     if linked is None:
@@ -310,8 +299,8 @@ def load(path: Path, key: str, function: Any, args: Any, target: Any) -> Any:
     )
 
 
-def _load_library(path: Path, codegen: Any, key: str | None = None) -> tuple[Header, Any] | None:
-    """A file's machine code, with that of the kernels it needs, in this process's memory."""
+def _load_library(path: Path, codegen: Any, key: str | None = None) -> tuple[_Header, Any] | None:
+    """(header, library) of a file and of the kernels it needs, in this process's memory."""
     if str(path) in _libraries:
         return _libraries[str(path)]
     data = read_trusted(path)
@@ -319,7 +308,7 @@ def _load_library(path: Path, codegen: Any, key: str | None = None) -> tuple[Hea
         return None
     header_line, _, code = data[_DIGEST:].partition(b"\n")
     try:
-        header = Header(*json.loads(header_line))
+        header = _Header(*json.loads(header_line))
         if key not in (None, header.kernel):
             raise ValueError("it is another kernel's")
         for folder, name in header.needs:
@@ -338,15 +327,12 @@ def _load_library(path: Path, codegen: Any, key: str | None = None) -> tuple[Hea
 
 
 def set_environments(library: Any, environments: dict[str, Any]) -> None:
-    """Tell emitted code where the environments of its functions are."""
+    """Set the addresses of the environments that emitted code refers to."""
     for name, environment in environments.items():
         library.codegen.set_env(name, environment)
 
 
 def list_environments(library: Any) -> list[str]:
-    """The names of the environments that a library's code refers to."""
-    return [
-        variable.name
-        for variable in library._final_module.global_variables
-        if variable.name.startswith(_ENVIRONMENTS)
-    ]
+    """List the names of the environments that a library's code refers to."""
+    names = [variable.name for variable in library._final_module.global_variables]
+    return [name for name in names if name.startswith(_ENVIRONMENTS)]

@@ -1,9 +1,9 @@
 # numba's own types say too little about itself:
 # mypy: disable-error-code="no-untyped-call,no-untyped-def,misc,untyped-decorator"
-"""The primitives: what the equations use beside + - * /, by name.
+"""The primitives: the functions that the equations use beside + - * /.
 
-Each kind of number has its own table of these. The functions here serve Python floats; the compiler
-is taught them for single numbers and for lanes alike, the same instructions for both.
+Each kind of number has a table of them by name. The functions here serve Python floats; compiled,
+single numbers and lanes take the same instructions.
 """
 
 import math
@@ -13,10 +13,18 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.core.imputils import lower_builtin
-from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.core.typing.templates import signature
 
-from .simd import BOOLS, FLOATS, INTS, LANES, LaneType, compare, find_common_type
+from .simd import (
+    BOOLS,
+    FLOATS,
+    INTS,
+    LANES,
+    LaneType,
+    compare,
+    find_common_type,
+    register_primitive,
+)
 
 
 def minimum(a: Any, b: Any) -> Any:
@@ -30,7 +38,7 @@ def maximum(a: Any, b: Any) -> Any:
 
 
 def absolute(a: Any) -> Any:
-    """|a|."""
+    """Compute |a|."""
     return math.fabs(a)
 
 
@@ -50,33 +58,33 @@ def select(condition: Any, a: Any, b: Any) -> Any:
 
 
 def to_float(a: Any) -> Any:
-    """An integer as a float."""
+    """Convert an integer to a float."""
     return a * 1.0
 
 
 def frexp(a: Any) -> Any:
-    """(m, e) of a positive number a = m 2^e with 0.5 <= m < 1, both floats."""
+    """Split a positive number into (m, e), a = m 2^e with 0.5 <= m < 1, both floats."""
     m, e = math.frexp(a)
     return m, e * 1.0
 
 
 def to_int(a: Any) -> Any:
-    """A whole number that is a float, as an integer."""
+    """Convert a float that is a whole number to an integer."""
     return int(a)
 
 
 def to_word(a: Any) -> Any:
-    """The 32-bit word that a float stands for: its value; where floats have 32 bits, its bits."""
+    """Convert a float to a 32-bit word: its value, or its bits where floats have 32 bits."""
     return int(a)
 
 
 def from_word(a: Any) -> Any:
-    """The float that stands for a 32-bit word."""
+    """Convert a 32-bit word to the float that stands for it."""
     return a * 1.0
 
 
 def any_lane(condition: Any) -> Any:
-    """Whether a condition holds for any of the cars that are computed together."""
+    """Check whether a condition holds for any of the cars in the lanes."""
     return condition
 
 
@@ -95,22 +103,6 @@ ARRAYS: dict[str, Callable[..., Any]] = {
 """The primitives for NumPy arrays, by the names the equations use."""
 
 _LANE_TYPES = {types.float64: FLOATS, types.int64: INTS, types.boolean: BOOLS}
-
-
-def _register_primitive(
-    primitive: Callable[..., Any], typing: Callable[..., Any], code: Callable[..., Any]
-) -> None:
-    """typing: from the arguments' types to a signature or None. code: of (builder, sig, args)."""
-
-    @infer_global(primitive)
-    class _PrimitiveTyping(AbstractTemplate):
-        def generic(self, args, kws):
-            return typing(*args)
-
-    def lower(context, builder, sig, args):
-        return code(builder, sig, args)
-
-    lower_builtin(primitive, *[types.Any] * primitive.__code__.co_argcount)(lower)
 
 
 def _infer_binary(a, b):
@@ -141,18 +133,17 @@ def _infer_select(condition, a, b):
 
 
 def _make_conversion(to: types.Type, to_lanes: LaneType) -> Callable[..., Any]:
-    def typing(a):
+    def infer(a):
         kind = find_common_type((a,))
-        lanes = isinstance(kind, LaneType)
-        return kind and signature(to_lanes if lanes else to, kind)
+        return kind and signature(to_lanes if isinstance(kind, LaneType) else to, kind)
 
-    return typing
+    return infer
 
 
 def _make_intrinsic(name: str) -> Callable[..., Any]:
-    """LLVM's own function of a float or of lanes of them."""
+    """Make the call of LLVM's function of a float or of lanes of them."""
 
-    def code(builder, sig, args):
+    def lower(context, builder, sig, args):
         operand_type = args[0].type
         suffix = f"v{LANES}f64" if isinstance(operand_type, ir.VectorType) else "f64"
         function = cgutils.get_or_insert_function(
@@ -160,36 +151,40 @@ def _make_intrinsic(name: str) -> Callable[..., Any]:
         )
         return builder.call(function, args)
 
-    return code
+    return lower
 
 
 def _make_selection(sign: str) -> Callable[..., Any]:
-    """The first of two where it stands so to the second, else the second."""
+    """Make the selection of a where `a sign b` holds, else b."""
     codes = compare(sign)
 
-    def code(builder, sig, args):
+    def lower(context, builder, sig, args):
         kind = FLOATS if sig.args[0] in (FLOATS, types.float64) else INTS
         return builder.select(codes[kind](builder, *args), *args)
 
-    return code
+    return lower
 
 
-def _lower_to_float(builder, sig, args):
+def _lower_select(context, builder, sig, args):
+    return builder.select(*args)
+
+
+def _lower_to_float(context, builder, sig, args):
     if sig.args[0] in (FLOATS, types.float64):
         return args[0]
     to = FLOATS.value if sig.return_type is FLOATS else ir.DoubleType()
     return builder.sitofp(args[0], to)
 
 
-def _lower_to_int(builder, sig, args):
+def _lower_to_int(context, builder, sig, args):
     if sig.args[0] in (INTS, types.int64):
         return args[0]
     to = INTS.value if sig.return_type is INTS else ir.IntType(64)
     return builder.fptosi(args[0], to)
 
 
-def _lower_frexp(builder, sig, args):
-    """The bits of a normal number's fraction under the exponent of 0.5, and its own as a float."""
+def _lower_frexp(context, builder, sig, args):
+    """(m, e) of a normal number: its fraction with the exponent of 0.5, and its exponent."""
     kind, operand_type = sig.args[0], args[0].type
     ints = INTS.value if kind is FLOATS else ir.IntType(64)
 
@@ -197,34 +192,32 @@ def _lower_frexp(builder, sig, args):
         return ir.Constant(ints, [value] * LANES if kind is FLOATS else value)
 
     bits = builder.bitcast(args[0], ints)
-    fraction = builder.or_(
-        builder.and_(bits, make_constant((1 << 52) - 1)), make_constant(1022 << 52)
-    )
+    digits = builder.and_(bits, make_constant((1 << 52) - 1))
+    fraction = builder.or_(digits, make_constant(1022 << 52))
     exponent = builder.sub(builder.lshr(bits, make_constant(52)), make_constant(1022))
-    return cgutils.pack_array(
-        builder, [builder.bitcast(fraction, operand_type), builder.sitofp(exponent, operand_type)]
-    )
+    m, e = builder.bitcast(fraction, operand_type), builder.sitofp(exponent, operand_type)
+    return cgutils.pack_array(builder, [m, e])
 
 
-def _lower_any_lane(builder, sig, args):
+def _lower_any_lane(context, builder, sig, args):
     if sig.args[0] is not BOOLS:
         return args[0]
     bits = builder.bitcast(args[0], ir.IntType(LANES))
     return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
 
-_register_primitive(minimum, _infer_binary, _make_selection("<"))
-_register_primitive(maximum, _infer_binary, _make_selection(">"))
-_register_primitive(absolute, _infer_float, _make_intrinsic("fabs"))
-_register_primitive(floor, _infer_float, _make_intrinsic("floor"))
-_register_primitive(sqrt, _infer_float, _make_intrinsic("sqrt"))
-_register_primitive(select, _infer_select, lambda builder, sig, args: builder.select(*args))
-_register_primitive(to_float, _make_conversion(types.float64, FLOATS), _lower_to_float)
-_register_primitive(frexp, _infer_frexp, _lower_frexp)
-_register_primitive(to_int, _make_conversion(types.int64, INTS), _lower_to_int)
-_register_primitive(to_word, _make_conversion(types.int64, INTS), _lower_to_int)
-_register_primitive(from_word, _make_conversion(types.float64, FLOATS), _lower_to_float)
-_register_primitive(
+register_primitive(minimum, _infer_binary, _make_selection("<"))
+register_primitive(maximum, _infer_binary, _make_selection(">"))
+register_primitive(absolute, _infer_float, _make_intrinsic("fabs"))
+register_primitive(floor, _infer_float, _make_intrinsic("floor"))
+register_primitive(sqrt, _infer_float, _make_intrinsic("sqrt"))
+register_primitive(select, _infer_select, _lower_select)
+register_primitive(to_float, _make_conversion(types.float64, FLOATS), _lower_to_float)
+register_primitive(frexp, _infer_frexp, _lower_frexp)
+register_primitive(to_int, _make_conversion(types.int64, INTS), _lower_to_int)
+register_primitive(to_word, _make_conversion(types.int64, INTS), _lower_to_int)
+register_primitive(from_word, _make_conversion(types.float64, FLOATS), _lower_to_float)
+register_primitive(
     any_lane,
     lambda a: signature(types.boolean, BOOLS if a is BOOLS else types.boolean),
     _lower_any_lane,

@@ -1,18 +1,14 @@
 # numba's own types say too little about itself:
 # mypy: disable-error-code="attr-defined,no-untyped-call,no-untyped-def,misc,untyped-decorator"
-"""Lanes: many numbers in one SIMD value, for which the compiler takes the equations unchanged.
+"""SIMD lanes: numba types whose machine value is LLVM's vector of doubles, integers or bools.
 
-A numba type whose machine value is LLVM's vector of doubles, with the integers and the truth values
-that go with it. Single numbers mix with lanes as they do with arrays. The arithmetic is that of
-single numbers, in the order written and without fused operations: a lane holds the very bits that
-the number alone would have, however many they are. With AVX-512 there are sixteen, two registers:
-while one waits for a result the other is computed, a third faster than eight. Elsewhere there are
-eight: sixteen would be four registers of sixteen, and most numbers would go through memory.
-
-Eight neighbours of a matrix's row are a type of their own, `FLOATS8`: with it the sums of one
-filter's small matrices are taken for eight columns at once, in the order of each column alone.
+The equations compile for them unchanged, in the order written and without fused operations: a lane
+has the bits that its number alone would have. Single numbers mix with lanes as with arrays. There
+are sixteen with AVX-512 (two registers, a third faster than one) and eight elsewhere. `FLOATS8`,
+eight neighbours of a matrix's row, serves the small matrices of a single filter.
 """
 
+import inspect
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -32,7 +28,7 @@ _DOUBLE, _LONG, _BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
 
 
 class LaneType(types.Type):
-    """As many of a kind: "float", "int" or "bool"."""
+    """The type of `count` numbers of one kind: "float", "int" or "bool"."""
 
     def __init__(
         self, kind: str, one: Any, single: Any, taken: tuple[Any, ...], count: int = LANES
@@ -42,11 +38,11 @@ class LaneType(types.Type):
         super().__init__(name=f"lanes({kind})")
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Any:
-        """A number stands for equal lanes; integers become floats."""
+        """Convert a number to equal lanes; integers become floats."""
         return Conversion.safe if isinstance(other, self._taken) else None
 
     def unify(self, typingctx: Any, other: Any) -> Any:
-        """A variable that is a number on one way and lanes on the other is lanes."""
+        """Unify a variable that is a number on one branch and lanes on the other: lanes."""
         return self if isinstance(other, self._taken) else None
 
 
@@ -63,12 +59,11 @@ class _Model(models.PrimitiveModel):
 
 
 def splat(builder: Any, value: Any, lane_type: LaneType) -> Any:
-    """Lanes that are all equal to a machine value."""
+    """Make lanes that all equal a machine value."""
     undefined = ir.Constant(lane_type.value, ir.Undefined)
     one = builder.insert_element(undefined, value, ir.Constant(_LONG, 0))
-    zeros = ir.Constant(
-        ir.VectorType(ir.IntType(32), lane_type.value.count), [0] * lane_type.value.count
-    )
+    count = lane_type.value.count
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), count), [0] * count)
     return builder.shuffle_vector(one, undefined, zeros)
 
 
@@ -82,7 +77,7 @@ def _from_number(context, builder, fromty, toty, value):
 
 
 def find_common_type(args: tuple[Any, ...]) -> Any:
-    """The kind that numbers and lanes meet in, single if none of them is lanes; None for others."""
+    """Find the type of a result of numbers and lanes, single without lanes; None for others."""
     if not all(isinstance(arg, LaneType | types.Number | types.Boolean) for arg in args):
         return None
     if FLOATS8 in args:
@@ -91,6 +86,34 @@ def find_common_type(args: tuple[Any, ...]) -> Any:
     ints = any(arg is INTS or isinstance(arg, types.Integer) for arg in args)
     kind = FLOATS if floats else INTS if ints else BOOLS
     return kind if any(isinstance(arg, LaneType) for arg in args) else kind.single
+
+
+def register_primitive(
+    primitive: Callable[..., Any],
+    infer: Callable[..., Any],
+    lower: Callable[..., Any],
+    prefer_literal: bool = False,
+) -> None:
+    """Teach the compiler a primitive.
+
+    Args:
+        primitive: The function, as Python runs it.
+        infer: From a call's argument types to its signature; None for types that it does not take.
+        lower: From (context, builder, signature, arguments) to the machine value.
+        prefer_literal: Whether the types of constants are literals.
+    """
+
+    class _PrimitiveTyping(AbstractTemplate):
+        def generic(self, args, kws):
+            return infer(*args)
+
+    _PrimitiveTyping.prefer_literal = prefer_literal
+    infer_global(primitive)(_PrimitiveTyping)
+    code = primitive.__code__
+    kinds: list[Any] = [types.Any] * code.co_argcount
+    if code.co_flags & inspect.CO_VARARGS:
+        kinds.append(types.VarArg(types.Any))
+    lower_builtin(primitive, *kinds)(lower)
 
 
 def _register_operator(
@@ -115,7 +138,7 @@ def _register_operator(
 
 
 def compare(sign: str) -> dict[LaneType, Any]:
-    """The codes of a comparison; one with NaN is false, but `!=` is true."""
+    """Make the codes of a comparison; one with NaN is false, but `!=` is true."""
 
     def floats(builder, x, y):
         code = builder.fcmp_unordered if sign == "!=" else builder.fcmp_ordered

@@ -1,7 +1,6 @@
-"""Tensors for the equations' text: torch's table of primitives.
+"""The equations on torch's tensors, with a vehicle in each place.
 
-`as_python(function, numbers(torch.float64))` is the plant's own text on tensors with a vehicle in
-each place. Both sides of a condition are computed, so nothing ever waits for the device.
+Both sides of a condition are computed, so nothing waits for the device.
 """
 
 import math
@@ -18,12 +17,8 @@ with require_extra("train", "the device engine needs torch"):
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
-def make_torch_primitives(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
-    """The primitives for tensors whose floats are of `dtype`, by the names the equations use.
-
-    Numbers that are no tensors are computed as Python's. What is not a number is treated as by the
-    compiled text: the smaller and the larger of NaN and b are b.
-    """
+def _make_primitives(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
+    """Primitives by name, for tensors and Python's numbers; of NaN and b either extreme is b."""
 
     def select(condition: Any, a: Any, b: Any) -> Any:
         if not isinstance(condition, torch.Tensor):
@@ -39,12 +34,10 @@ def make_torch_primitives(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
         if not isinstance(a, torch.Tensor):
             return math.frexp(a)[0], math.frexp(a)[1] * 1.0
         # by the bits, of a normal number: torch.frexp does not compile for AVX-512
-        integer, digits, bias = (
-            (torch.int64, 52, 1022) if a.dtype == torch.float64 else (torch.int32, 23, 126)
-        )
+        is_double = a.dtype == torch.float64
+        integer, digits, bias = (torch.int64, 52, 1022) if is_double else (torch.int32, 23, 126)
         bits, ones = a.view(integer), (1 << digits) - 1
-        mantissa_bits = (bits & ones) | (bias << digits)
-        m = mantissa_bits.view(a.dtype)
+        m = ((bits & ones) | (bias << digits)).view(a.dtype)
         return torch.where(a < 0.0, -m, m), to_float(((bits >> digits) & (2 * bias + 3)) - bias)
 
     def sqrt(a: Any) -> Any:
@@ -75,25 +68,34 @@ def make_torch_primitives(dtype: torch.dtype) -> dict[str, Callable[..., Any]]:
 
 
 def to_torch(dtype: torch.dtype, *functions: Callable[..., Any]) -> list[Any]:
-    """The functions' text on tensors whose floats are of `dtype`."""
-    table = make_torch_primitives(dtype)
+    """Rebuild functions for tensors.
+
+    Args:
+        dtype: Type of the tensors' floats.
+        functions: Compiled functions.
+
+    Returns:
+        The rebuilt functions, in the same order.
+    """
+    table = _make_primitives(dtype)
     return [as_python(function, table) for function in functions]
 
 
 def compile_method(function: Any) -> Any:
-    """The bound method by `torch.compile`, whole.
+    """Compile a bound method by `torch.compile`, as one graph.
 
-    torch inlines what is short wherever it is used, and so again in that; where each of a chain's
-    results is used several times, as in the logarithm's shifts, it would compile for an hour.
-    What torch has compiled it counts by code object, and refuses a ninth: each env has its own.
+    torch inlines short results wherever they are used: without the threshold a chain whose results
+    are used several times, as the logarithm's shifts, would compile for an hour. It refuses a ninth
+    compilation of a code object, so each method gets a copy.
+
+    Args:
+        function: Bound method.
+
+    Returns:
+        The compiled method.
     """
-    owner, source = function.__self__, function.__func__
-    function_copy = FunctionType(
-        source.__code__.replace(),
-        source.__globals__,
-        source.__name__,
-        source.__defaults__,
-        source.__closure__,
-    )
-    method_copy = MethodType(function_copy, owner)
-    return torch.compile(method_copy, fullgraph=True, options={"realize_opcount_threshold": 16})
+    source = function.__func__
+    code, names = source.__code__.replace(), source.__globals__
+    copy = FunctionType(code, names, source.__name__, source.__defaults__, source.__closure__)
+    method = MethodType(copy, function.__self__)
+    return torch.compile(method, fullgraph=True, options={"realize_opcount_threshold": 16})

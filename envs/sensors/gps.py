@@ -23,17 +23,16 @@ GPS_KIND = SlowKind(
 )
 COURSE_SPEED = 1.0  # m/s; below it a course has quality 0
 HDOP_LAWS = {"constant": 0.0, "half": 0.5, "table": 1.0}
-"""How much of the GPS's noise follows HDOP: its standard deviations are (1 + w (HDOP - 1)) times
-those of `Noise`, which are those at HDOP 1."""
-OUTAGE_JUMP = 3.0  # of the spread of log HDOP, upwards where an outage ends
+"""Weights w by law: the GPS's standard deviations are (1 + w (HDOP - 1)) times those of `Noise`."""
+OUTAGE_JUMP = 3.0  # spreads by which log HDOP rises where an outage ends
 
 
 class SatelliteGeometry(NamedTuple):
-    """The satellites over the GPS: log HDOP is an Ornstein-Uhlenbeck process."""
+    """Satellite geometry: log HDOP is an Ornstein-Uhlenbeck process."""
 
     median: Any  # log of the median HDOP
     spread: Any  # standard deviation of log HDOP
-    decay: Any  # what is left of a deviation after one period of the GPS
+    decay: Any  # fraction of a deviation that remains after one period of the GPS
     noise_gain: Any  # sqrt(1 - decay^2)
     weight: Any  # of HDOP in the noise, HDOP_LAWS
 
@@ -84,7 +83,7 @@ def sample_gps(
 ) -> Any:
     """Sample the GPS at its antenna, with noise.
 
-    course = psi + beta, dakf-stability (3), where beta, as all else, is the antenna's.
+    course = psi + beta, dakf-stability (3), with the antenna's beta.
 
     Args:
         motion: `Motion` of the car.

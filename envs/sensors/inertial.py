@@ -1,7 +1,4 @@
-"""The fast sensors: gyro, accelerometers, roll rate, wheel speeds, applied inputs.
-
-Noise levels and biases of all sensors.
-"""
+"""The fast sensors (gyro, accelerometers, roll rate, wheels), and the noise of all sensors."""
 
 from typing import Any, NamedTuple
 
@@ -15,7 +12,7 @@ from ..vehicle.parameters import GRAVITY
 
 
 class NormalDraws(NamedTuple):
-    """The random numbers of a tick, four standard normal ones each."""
+    """Random numbers of a tick, four standard normal ones each."""
 
     inertial: Any
     wheels: Any
@@ -23,7 +20,7 @@ class NormalDraws(NamedTuple):
 
 @inline
 def compute_specific_force(before: Any, after: Any, road: Any, small_angle: int, roll: int) -> Any:
-    """Compute the mean specific force over a tick: v', turning axes, gravity.
+    """Compute the mean specific force over a tick, from v', the turning axes and gravity.
 
     Args:
         before: `Motion` at the start of the tick.

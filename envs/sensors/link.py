@@ -1,7 +1,4 @@
-"""A slow sensor's clock and link: when samples are captured, and when they arrive.
-
-A kind of slow sensor: its name, the values of its packets, its random numbers.
-"""
+"""A slow sensor's kind, clock and link: what it sends, and when it captures and it arrives."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -98,21 +95,17 @@ def make_link(sensor: SlowSensor | None, outage: tuple[float, float] | None = No
     if sensor is None:
         return Link._make([0.0] * len(Link._fields))
     delays = [count_ticks(delay) for delay in sensor.delays]
-    start, end = outage if outage is not None else (0.0, 0.0)
-    d_0, d_1, d_2, d_3 = delays + [0.0] * (4 - len(delays))
-    link = Link(
-        count_ticks(sensor.period),
-        -1.0 if sensor.phase is None else count_ticks(sensor.phase),
-        float(len(delays)),
-        d_0,
-        d_1,
-        d_2,
-        d_3,
-        count_ticks(sensor.jitter),
-        sensor.loss,
-        sensor.duplicate,
-        count_ticks(start),
-        count_ticks(end),
+    link = Link._make(
+        [
+            count_ticks(sensor.period),
+            -1.0 if sensor.phase is None else count_ticks(sensor.phase),
+            float(len(delays)),
+            *(delays + [0.0] * (4 - len(delays))),
+            count_ticks(sensor.jitter),
+            sensor.loss,
+            sensor.duplicate,
+            *map(count_ticks, outage or (0.0, 0.0)),
+        ]
     )
     max_in_flight = count_max_in_flight(link)
     if max_in_flight > MAX_IN_FLIGHT:
@@ -154,12 +147,7 @@ def compute_arrivals(
     Returns:
         Ticks of the first and the second arrival; NEVER for none.
     """
-    jitter_share, loss_share, duplicate_share, second_share = (
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-    )  # what a link without chance makes nothing of
+    jitter_share, loss_share, duplicate_share, second_share = 0.0, 0.0, 0.0, 0.0
     if any_lane((link.jitter > 0.0) | (link.loss > 0.0) | (link.duplicate > 0.0)):
         jitter_share, loss_share, duplicate_share, second_share = draw_uniforms(
             key_low, key_high, to_int(tick), block
@@ -202,7 +190,7 @@ class PacketValue(NamedTuple):
 
 
 class Blocks(NamedTuple):
-    """A slow sensor's channels in `backend.random`: blocks of four random numbers a tick."""
+    """A slow sensor's channels: blocks of four random numbers a tick."""
 
     noise: int  # normal numbers
     link: int  # uniform ones: delay, loss, duplication, one unused
@@ -215,6 +203,4 @@ class SlowKind(NamedTuple):
     name: str
     values: tuple[PacketValue, ...]
     blocks: Blocks | None = None  # None: of the sensor's place in the table
-    needs_quality: bool = (
-        False  # at quality 0 it saw nothing: the observation holds the sample before
-    )
+    needs_quality: bool = False  # at quality 0 the observation holds the sample before

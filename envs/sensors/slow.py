@@ -1,4 +1,4 @@
-"""The slow sensors: the table of them, one sample of any of them, and which each id has.
+"""The slow sensors: their table, a sample of any of them, and the sensors of each id.
 
 A new one is a file beside `camera` and `gps`, a row of `SLOW` and a branch of `sample_sensor`:
 packets, observation, random numbers, reset and the device engine follow from the table.
@@ -21,9 +21,9 @@ CAMERA, GPS = range(len(SLOW))
 SLOW_NAMES = tuple(kind.name for kind in SLOW)
 WIDTHS = tuple(len(kind.values) for kind in SLOW)  # values of each one's packets
 NEEDS_QUALITY = tuple(kind.needs_quality for kind in SLOW)
-VALUES = max(WIDTHS)  # of any packet; those of a sensor with fewer are filled up with zeros
+VALUES = max(WIDTHS)  # of any packet, filled up with zeros
 
-_FIRST_BLOCK, _BLOCKS_PER_SENSOR = 1000, 10  # of random numbers, clear of `backend.random.CHANNELS`
+_FIRST_BLOCK, _BLOCKS_PER_SENSOR = 1000, 10  # of random numbers, clear of `CHANNELS`
 
 
 def make_blocks(place: int) -> Blocks:
@@ -60,7 +60,7 @@ class MeasurementContext(NamedTuple):
 class Sample(NamedTuple):
     """One measurement of a slow sensor."""
 
-    values: Any  # VALUES of them
+    values: Any  # VALUES numbers
     quality: Any
     drift: Any  # a number that the sensor carries from sample to sample
 
@@ -89,15 +89,9 @@ def sample_sensor(sensor: int, context: MeasurementContext, link: Any, drift: An
     drift = compute_hdop_deviation(drift, sky, link, context.tick, drift_noise)
     hdop = exp(sky.median + drift)
     course, speed, X, Y, hdop, satellites, quality = sample_gps(
-        context.motion,
-        car.forward,
-        car.left,
-        hdop,
-        sky.weight,
-        context.noise,
-        n,
+        context.motion, car.forward, car.left, hdop, sky.weight, context.noise, n,
         context.small_angle,
-    )
+    )  # fmt: skip
     return Sample((course, speed, X, Y, hdop, satellites), quality, drift)
 
 
@@ -120,12 +114,12 @@ def draw_first_drift(sensor: int, sky: Any, key_low: Any, key_high: Any) -> Any:
 
 
 CAMERA_33_30 = SlowSensor(period=0.033, delays=(0.030,))
-CAMERA_UNEVEN = SlowSensor(period=0.033, delays=(0.010,), jitter=0.020)
+_CAMERA_UNEVEN = SlowSensor(period=0.033, delays=(0.010,), jitter=0.020)
 GPS_5_HZ = SlowSensor(period=0.2)
 
 SENSOR_SETS: dict[str, dict[str, SlowSensor]] = {
     "vision": {"camera": CAMERA_33_30},
-    "vision-uneven": {"camera": CAMERA_UNEVEN},
+    "vision-uneven": {"camera": _CAMERA_UNEVEN},
     "gps": {"gps": GPS_5_HZ},
     "fusion": {"camera": CAMERA_33_30, "gps": GPS_5_HZ},
 }

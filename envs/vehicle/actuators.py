@@ -1,4 +1,4 @@
-"""Torque distribution, added steering, and first-order lags solved exactly."""
+"""The actuators: torque distribution, added steering, and first-order lags solved exactly."""
 
 import math
 from typing import Any, NamedTuple

@@ -1,20 +1,9 @@
-"""The plant's equations, written once.
+"""The plant: equations of motion of a single-track car whose body rolls, and their integration.
 
-A single-track model with two driven rear wheels and a body that rolls, in ISO 8855 axes (x
-forward, y left, z up; yaw to the left and roll with the left side up are positive), SI units.
-v_y is that of the roll axis below the centre of gravity. The functions are scalar, over tuples,
-without branches on values; `small_angle`, `law` (of the tyres) and `roll` are integers that choose
-the text, not the values.
-
-A turn to the left (a_y > 0) rolls the body to the right (phi > 0), whose centre of gravity then
-lags the roll axis: M (v_y' + v_x gamma) - M_s h_s phi'' = F_y. Accelerometers measure specific
-force, a_y = v_y' + v_x gamma + g phi, and a road banked by b adds g sin b.
-
-Steps through time of the plant's equations.
-
-Forces depend on the velocities and the roll alone, so only these go through the stages of a
-Runge-Kutta rule; place and heading follow once a step. Scalar functions over tuples, without
-branches on values, as in `dynamics`.
+ISO 8855 axes (x forward, y left, z up; yaw to the left and roll with the left side up positive), SI
+units. v_y is the roll axis's: M (v_y' + v_x gamma) - M_s h_s phi'' = F_y. Accelerometers measure
+a_y = v_y' + v_x gamma + g phi, and a road banked by b adds g sin b. The functions have no branches
+on values; the integers `small_angle`, `law` and `roll` choose the text that is compiled.
 """
 
 from typing import Any, NamedTuple
@@ -70,14 +59,14 @@ class Motion(NamedTuple):
 
 
 class RoadParams(NamedTuple):
-    """A road that is straight and flat up to `start`; what follows comes in over `ramp` metres."""
+    """A road that is straight and flat up to `start` and changes over `ramp` metres from there."""
 
     curvature: Any  # 1/m, left positive
     start: Any  # m
     ramp: Any  # m, positive
     lateral: Any = 0.0  # m/s2, g sin(bank), left side up positive
     longitudinal: Any = 0.0  # m/s2, g sin(grade), uphill positive
-    turn: Any = 0.0  # rad/s, of its direction beside the car: of a road laid tick by tick
+    turn: Any = 0.0  # rad/s, of its direction beside the car, where it is laid tick by tick
 
 
 @jit
@@ -101,7 +90,7 @@ def compute_curvature(road: Any, s: Any) -> Any:
 
 @jit
 def compute_car_curvature(motion: Any, road: Any) -> Any:
-    """Compute the curvature of the road at the car: by how much its direction turns in a metre.
+    """Compute the curvature of the road at the car, a turning road's direction included.
 
     Args:
         motion: `Motion` of the car.
@@ -117,20 +106,8 @@ def compute_car_curvature(motion: Any, road: Any) -> Any:
 
 
 @inline
-def rotate_gravity(road: Any, s: Any, sin_r: Any, cos_r: Any) -> Any:
-    """Compute the gravity that accelerometers feel in a car that does not roll.
-
-    The car itself is accelerated by as much the other way.
-
-    Args:
-        road: `RoadParams`.
-        s: Distance along the road (m).
-        sin_r: Sine of the heading relative to the road.
-        cos_r: Cosine of the heading relative to the road.
-
-    Returns:
-        (x, y) in the car's axes (m/s2).
-    """
+def _rotate_gravity(road: Any, s: Any, sin_r: Any, cos_r: Any) -> Any:
+    """(x, y) of the gravity that a car without roll measures (m/s2), by its heading on the road."""
     share = _compute_ramp(road, s)
     g_s, g_n = road.longitudinal * share, road.lateral * share
     return g_s * cos_r + g_n * sin_r, g_n * cos_r - g_s * sin_r
@@ -138,7 +115,7 @@ def rotate_gravity(road: Any, s: Any, sin_r: Any, cos_r: Any) -> Any:
 
 @jit
 def compute_gravity(motion: Any, road: Any, small_angle: int) -> Any:
-    """Compute `rotate_gravity` at a Motion; the small-angle car heads along the road.
+    """Compute the gravity that accelerometers measure in a car without roll.
 
     Args:
         motion: `Motion` of the car.
@@ -149,9 +126,9 @@ def compute_gravity(motion: Any, road: Any, small_angle: int) -> Any:
         (x, y) in the car's axes (m/s2).
     """
     if small_angle:
-        return rotate_gravity(road, motion.s, 0.0, 1.0)
+        return _rotate_gravity(road, motion.s, 0.0, 1.0)
     sin_r, cos_r = sincos(motion.psi - motion.theta)
-    return rotate_gravity(road, motion.s, sin_r, cos_r)
+    return _rotate_gravity(road, motion.s, sin_r, cos_r)
 
 
 class DisturbanceForces(NamedTuple):
@@ -174,10 +151,7 @@ class Velocity(NamedTuple):
 
 @inline
 def _compute_roll_acceleration(motion: Any, F_y: Any, N_x: Any, car: Any, per_m: Any) -> Any:
-    """phi'' from (1) and (3) of double-layer-gps, solved for it: a_y depends on phi''.
-
-    F_y: N, without gravity, whose pull on the body and on the whole car cancel in (3).
-    """
+    """phi'' (rad/s2) of double-layer-gps (1) and (3), in which gravity's pull cancels from F_y."""
     body_moment = N_x - car.C_x * motion.phi_dot - car.K_x * motion.phi
     lever = car.S * (F_y * per_m + GRAVITY * motion.phi)
     return (lever + body_moment) * (1.0 / (car.I_x - car.S * car.S * per_m))
@@ -201,7 +175,7 @@ def compute_rates(
         load: `TyreLoad` of the inputs.
         disturbance: `DisturbanceForces`.
         car: `CarParams`.
-        gravity: (x, y) of `rotate_gravity` (m/s2).
+        gravity: (x, y) of `compute_gravity` (m/s2).
         small_angle: 1 for the small-angle plant, else 0.
         law: Code of the tyre law, its place in `TYRE_LAWS`.
         roll: 1 if the body rolls, else 0.
@@ -231,19 +205,8 @@ def compute_rates(
 
 
 @inline
-def compute_course_rates(motion: Any, v_x: Any, v_y: Any, road: Any, small_angle: int) -> Any:
-    """Compute the time derivative of place and road direction at a Motion's place and heading.
-
-    Args:
-        motion: `Motion` of the car.
-        v_x: Longitudinal velocity (m/s).
-        v_y: Lateral velocity (m/s).
-        road: `RoadParams`.
-        small_angle: 1 for the small-angle plant, else 0.
-
-    Returns:
-        (dX, dY, ds, dy, dtheta)/dt (m/s, rad/s).
-    """
+def _compute_course_rates(motion: Any, v_x: Any, v_y: Any, road: Any, small_angle: int) -> Any:
+    """(dX, dY, ds, dy, dtheta)/dt (m/s, rad/s) at a Motion's place and heading."""
     kappa = compute_curvature(road, motion.s)
     if small_angle:
         dY = v_x * motion.psi + v_y  # tie-vision (5), V_x (psi + beta)
@@ -289,7 +252,9 @@ def derivative(
     """
     gravity = compute_gravity(motion, road, small_angle)
     rate = compute_rates(motion, load, disturbance, car, gravity, small_angle, law, roll)
-    dX, dY, ds, dy, dtheta = compute_course_rates(motion, motion.v_x, motion.v_y, road, small_angle)
+    dX, dY, ds, dy, dtheta = _compute_course_rates(
+        motion, motion.v_x, motion.v_y, road, small_angle
+    )
     return Motion(
         rate.v_x, rate.v_y, rate.gamma, motion.gamma, dX, dY, ds, dy, dtheta, rate.phi, rate.phi_dot
     )  # fmt: skip
@@ -315,7 +280,7 @@ def compute_sideslip_angle(v_x: Any, v_y: Any, small_angle: int) -> Any:
 
 @jit
 def _step_euler(start: Any, h: Any, rate: Any) -> Any:
-    """Compute start + h rate, written out so that it compiles for every number type."""
+    """Velocity start + h rate, written out so that it compiles for every number type."""
     return Velocity(
         start.v_x + h * rate.v_x,
         start.v_y + h * rate.v_y,
@@ -327,13 +292,13 @@ def _step_euler(start: Any, h: Any, rate: Any) -> Any:
 
 @jit
 def _average(first: Any, middle: Any, last: Any) -> Any:
-    """Simpson's rule."""
+    """Mean of a number by Simpson's rule."""
     return (first + 4.0 * middle + last) * (1.0 / 6.0)
 
 
 @jit
 def _average_velocities(a: Any, b: Any, c: Any) -> Any:
-    """Simpson's rule for each number of three Velocities."""
+    """Mean of three Velocities by Simpson's rule."""
     return Velocity(
         _average(a.v_x, b.v_x, c.v_x),
         _average(a.v_y, b.v_y, c.v_y),
@@ -345,7 +310,7 @@ def _average_velocities(a: Any, b: Any, c: Any) -> Any:
 
 @jit
 def _average_two(a: Any, b: Any) -> Any:
-    """The mean of two Velocities."""
+    """Mean of two Velocities."""
     return Velocity(
         0.5 * (a.v_x + b.v_x),
         0.5 * (a.v_y + b.v_y),
@@ -357,32 +322,26 @@ def _average_two(a: Any, b: Any) -> Any:
 
 @inline
 def _compute_mid_gravity(motion: Any, road: Any, h: Any, small_angle: int) -> Any:
-    """Compute `rotate_gravity` in the middle of a step of h seconds, for the whole step.
-
-    The car's place is extrapolated by its speed at the start; in the step it turns by h gamma.
-    """
+    """Measured gravity (m/s2) in the middle of a step of h seconds, extrapolated from its start."""
     s_mid = motion.s + 0.5 * h * motion.v_x
     if not any_lane((road.lateral != 0.0) | (road.longitudinal != 0.0)):
         return 0.0, 0.0
     if small_angle:
-        return rotate_gravity(road, s_mid, 0.0, 1.0)
+        return _rotate_gravity(road, s_mid, 0.0, 1.0)
     mid_turn_rate = motion.gamma - motion.v_x * compute_curvature(road, s_mid) - road.turn
     sin_r, cos_r = sincos(motion.psi - motion.theta + 0.5 * h * mid_turn_rate)
-    return rotate_gravity(road, s_mid, sin_r, cos_r)
+    return _rotate_gravity(road, s_mid, sin_r, cos_r)
 
 
 @inline
 def _integrate_motion(
     motion: Any, middle: Any, end: Any, mean: Any, road: Any, h: Any, small_angle: int
 ) -> Any:
-    """Compute the Motion after h seconds from its velocities halfway, at the end and in the mean.
-
-    No force within a step depends on place and heading, so these follow at once. The mean of the
-    turning velocity is the mean velocity in the mean direction, but for its length, 1 - r^2 / 24 of
-    it after a turn by r, and r / 12 of its change to the side: an error of h^5 a step. A road that
-    turns is taken where the car is halfway by the start's velocity: h^3 v^2 / 8 times its change of
-    curvature, below 1e-7 m a second at 1 ms.
-    """
+    """Motion after h seconds from the velocities halfway, at the end and in the mean."""
+    # Forces do not depend on place and heading, which follow here once a step. The mean of the
+    # turning velocity is the mean velocity in the mean direction, but for its length, 1 - r^2 / 24
+    # after a turn by r, and r / 12 of its change to the side: an error of h^5 a step. The road's
+    # direction is taken halfway by the start's velocity: below 1e-7 m a second at 1 ms.
     half, angle = 0.5 * h, h * mean.gamma
     shrink, side_gain = 1.0 - angle * angle * (1.0 / 24.0), angle * (1.0 / 12.0)
     v_x = shrink * mean.v_x - side_gain * (end.v_y - motion.v_y)
@@ -390,27 +349,18 @@ def _integrate_motion(
     psi = motion.psi + h * (motion.gamma + 2.0 * middle.gamma) * (1.0 / 6.0)  # in the mean
     s, y, theta = motion.s, motion.y, motion.theta
     if any_lane(road.curvature != 0.0) or any_lane(road.turn != 0.0):
-        _, _, ds, dy, dtheta = compute_course_rates(
+        _, _, ds, dy, dtheta = _compute_course_rates(
             motion, motion.v_x, motion.v_y, road, small_angle
         )
         s, y, theta = s + half * ds, y + half * dy, theta + half * dtheta
     mid_motion = Motion(
         v_x, v_y, mean.gamma, psi, motion.X, motion.Y, s, y, theta, end.phi, end.phi_dot
     )
-    dX, dY, ds, dy, dtheta = compute_course_rates(mid_motion, v_x, v_y, road, small_angle)
+    dX, dY, ds, dy, dtheta = _compute_course_rates(mid_motion, v_x, v_y, road, small_angle)
     return Motion(
-        end.v_x,
-        end.v_y,
-        end.gamma,
-        motion.psi + angle,
-        motion.X + h * dX,
-        motion.Y + h * dY,
-        motion.s + h * ds,
-        motion.y + h * dy,
-        motion.theta + h * dtheta,
-        end.phi,
-        end.phi_dot,
-    )
+        end.v_x, end.v_y, end.gamma, motion.psi + angle, motion.X + h * dX, motion.Y + h * dY,
+        motion.s + h * ds, motion.y + h * dy, motion.theta + h * dtheta, end.phi, end.phi_dot,
+    )  # fmt: skip
 
 
 @inline
@@ -425,10 +375,7 @@ def kutta3(
     law: int,
     roll: int = 0,
 ) -> Any:
-    """Integrate the plant over h seconds by Kutta's third-order rule.
-
-    Three stages at 1 ms err by less than what the plant's kinks cost any rule (docs/physics.md has
-    the table).
+    """Integrate the plant over h seconds by Kutta's third-order rule (errors: docs/physics.md).
 
     Args:
         motion: `Motion` at the start.
@@ -453,14 +400,9 @@ def kutta3(
     c = compute_rates(end, load[2], disturbance, car, gravity, small_angle, law, roll)
     mean = _average_velocities(start, middle, end)
     return _integrate_motion(
-        motion,
-        middle,
-        _step_euler(start, h, _average_velocities(a, b, c)),
-        mean,
-        road,
-        h,
+        motion, middle, _step_euler(start, h, _average_velocities(a, b, c)), mean, road, h,
         small_angle,
-    )
+    )  # fmt: skip
 
 
 @inline
@@ -475,9 +417,7 @@ def rk4(
     law: int,
     roll: int = 0,
 ) -> Any:
-    """Integrate the plant over h seconds by the classical Runge-Kutta method.
-
-    It serves plans, whose steps are longer than the plant's.
+    """Integrate the plant over h seconds, longer in plans, by the classical Runge-Kutta method.
 
     Args:
         motion: `Motion` at the start.

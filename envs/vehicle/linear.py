@@ -1,6 +1,6 @@
-"""Linear models of the vehicle (A, B, C), from which filters and controllers are designed.
+"""Linear models (A, B, C) of the vehicle, for the design of filters and controllers.
 
-The matrices are written into arrays by the functions below, here and in compiled filters alike.
+The compiled functions write the matrices, here and in the filters.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ Array = npt.NDArray[np.float64]
 
 
 class Bicycle(NamedTuple):
-    """A linear bicycle: the first arguments of `compute_bicycle_coefficients`, letters as there."""
+    """Parameters of the linear bicycle, as `compute_bicycle_coefficients` takes them."""
 
     m: Any
     I: Any  # noqa: E741  the papers' letter
@@ -163,28 +163,20 @@ class LinearModel:
         return exact[:n, :n], exact[:n, n:]
 
     def to_control(self) -> "StateSpace":
-        """A `control.StateSpace` with names (needs the extra `design`)."""
+        """Convert to a `control.StateSpace` with names (needs the extra `design`)."""
         import control
 
-        return control.StateSpace(
-            self.A,
-            self.B,
-            self.C,
-            np.zeros((len(self.outputs), len(self.inputs))),
-            states=list(self.states),
-            inputs=list(self.inputs),
-            outputs=list(self.outputs),
-        )
+        D = np.zeros((len(self.outputs), len(self.inputs)))
+        names = {name: list(getattr(self, name)) for name in ("states", "inputs", "outputs")}
+        return control.StateSpace(self.A, self.B, self.C, D, **names)
 
 
-def _make_lateral(
-    vehicle: Vehicle, speed: float, states: int, inputs: int = 2
-) -> tuple[Array, Array]:
-    """A (states, states) and B (states, inputs) of `write_lateral`."""
+def _make_lateral(vehicle: Vehicle, speed: float, n: int, m: int = 2) -> tuple[Array, Array]:
+    """Make A (n, n) and B (n, m) of `write_lateral`."""
     if not speed > 0.0:
         raise ValueError(f"a linear model needs a positive speed, got {speed!r} m/s")
-    A, B = np.zeros((states, states)), np.zeros((states, inputs))
-    _write_lateral(A, B, vehicle.lateral, float(speed), states, inputs, vehicle.preview)
+    A, B = np.zeros((n, n)), np.zeros((n, m))
+    _write_lateral(A, B, vehicle.lateral, float(speed), n, m, vehicle.preview)
     return A, B
 
 
@@ -201,9 +193,8 @@ def make_bicycle_model(vehicle: Vehicle, speed: float) -> LinearModel:
         The model.
     """
     A, B = _make_lateral(vehicle, speed, 2)
-    return LinearModel(
-        A, B, np.array([[0.0, 1.0]]), ("beta", "gamma"), ("delta_f", "N_z"), ("gamma",)
-    )
+    C = np.array([[0.0, 1.0]])
+    return LinearModel(A, B, C, ("beta", "gamma"), ("delta_f", "N_z"), ("gamma",))
 
 
 def make_vision_model(vehicle: Vehicle, speed: float) -> LinearModel:
@@ -285,8 +276,7 @@ def make_kinematic_model(gamma: float) -> LinearModel:
 def make_velocity_roll_model(vehicle: Vehicle, gamma: float) -> LinearModel:
     """Make the model of v_x, v_y, phi and phi_dot from both specific forces, double-layer-gps (42).
 
-    It is continuous. Outputs are v_x and v_y, which the GPS and the first layer measure, and
-    phi_dot.
+    Outputs are v_x and v_y, which the GPS and the first layer measure, and phi_dot.
 
     Args:
         vehicle: The vehicle.

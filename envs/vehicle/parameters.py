@@ -1,7 +1,4 @@
-"""The vehicle's parameters, a unit on each, and two presets.
-
-Vehicles by name, from files and from mappings: one reader for whatever takes a vehicle.
-"""
+"""The vehicle's parameters with units and plausible ranges; vehicles by name, file or mapping."""
 
 import dataclasses
 import math
@@ -24,17 +21,11 @@ from ..validation import (
 
 GRAVITY = 9.81
 LATERAL_FIELDS = (
-    "mass",
-    "yaw_inertia",
-    "front_arm",
-    "rear_arm",
-    "front_stiffness",
-    "rear_stiffness",
-)
-"""What a linear bicycle is made of, in the order of `linear.Bicycle`."""
-_POINT_INERTIA = ("mass", "front_arm", "rear_arm")  # as inertia, that of two points over the axles
-
-_MIN_NUMBER = 1.0 / MAX_NUMBER  # what is below is taken for zero: it is divided by
+    "mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness", "rear_stiffness",
+)  # fmt: skip
+"""Parameters of a linear bicycle, in the order of `linear.Bicycle`."""
+_POINT_INERTIA = ("mass", "front_arm", "rear_arm")  # inertia of two points over the axles
+_MIN_NUMBER = 1.0 / MAX_NUMBER  # a parameter below it counts as zero: it is divided by
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,7 +155,7 @@ class Vehicle:
         return self.motor_torque * self.rear_track / self.wheel_radius
 
     def to_dict(self) -> dict[str, Any]:
-        """Convert to JSON types, which `make_vehicle` reads back."""
+        """Convert to JSON types, which `make_vehicle` reads."""
         return dataclasses.asdict(self)
 
 
@@ -228,12 +219,11 @@ PASSENGER_CAR = Vehicle(  # a compact electric car with two 700 N m in-wheel mot
 
 
 VehicleSource = str | os.PathLike[str] | Mapping[str, Any] | Vehicle
-"""What `make_vehicle` takes."""
+"""A vehicle's name, file, parameters or itself, as `make_vehicle` takes it."""
 
 _STIFFNESS = ("front_stiffness", "rear_stiffness")
 WIRE_TABLES = ("steering", "latency", "noise")
-"""Tables that a vehicle's file may hold beside the car: what `sideslip identify` found of its
-wires, which `sideslip replay` applies and everybody else leaves alone."""
+"""Tables of a vehicle's file that `sideslip identify` writes and only `sideslip replay` reads."""
 _CONVENTIONS = {"_per_tyre": 1.0, "_axle": 0.5}  # tyres' share of the number
 _FIELDS = [entry.name for entry in dataclasses.fields(Vehicle)]
 
@@ -264,9 +254,8 @@ def make_vehicle(source: VehicleSource, strict: bool = True) -> Vehicle:
     if isinstance(source, Vehicle):
         return source
     if isinstance(source, Mapping):
-        return _parse_vehicle(
-            dict(source), strict, is_complete=all(name in source for name in _FIELDS)
-        )
+        is_complete = all(name in source for name in _FIELDS)
+        return _parse_vehicle(dict(source), strict, is_complete)
     if is_document(source):
         return _read_vehicle(Path(source), strict)
     if not isinstance(source, str):
@@ -288,38 +277,32 @@ def _read_vehicle(path: Path, strict: bool = True) -> Vehicle:
 
 
 def _format_key(name: str) -> str:
-    """A parameter's key, both where a stiffness has two."""
+    """Key of a parameter in a message, or both keys of a stiffness."""
     return " or ".join(map(name.__add__, _CONVENTIONS)) if name in _STIFFNESS else name
 
 
 def _parse_vehicle(values: dict[str, Any], strict: bool, is_complete: bool = False) -> Vehicle:
-    """A vehicle of a mapping, whose stiffnesses become those of a tyre, and are if it is whole."""
+    """Vehicle of a mapping; its stiffnesses name their convention unless it is complete."""
     has_base = "base" in values
     base = make_vehicle(values.pop("base", PASSENGER_CAR.replace(name="vehicle")), strict)
     for name in _STIFFNESS:
-        present_keys = [key for key in (name, *map(name.__add__, _CONVENTIONS)) if key in values]
-        if len(present_keys) > 1:
-            raise ValueError(
-                f"{' and '.join(present_keys)} exclude each other: one convention an axle"
-            )
-        if name in present_keys and not is_complete:
+        present = [key for key in (name, *map(name.__add__, _CONVENTIONS)) if key in values]
+        if len(present) > 1:
+            raise ValueError(f"{' and '.join(present)} exclude each other: one convention an axle")
+        if name in present and not is_complete:
             raise ValueError(f"{name} must name its convention: {_format_key(name)}")
         for convention, share in _CONVENTIONS.items():
             if name + convention in values:
                 value = values.pop(name + convention)
                 values[name] = value * share if is_finite(value) else value  # refused by `Vehicle`
     if unknown := [key for key in values if key not in _FIELDS]:
-        keys = [
-            *_FIELDS,
-            "base",
-            *(name + suffix for name in _STIFFNESS for suffix in _CONVENTIONS),
-        ]
-        raise TypeError(describe_unknown("vehicle parameter", unknown, keys))
+        suffixed = [name + suffix for name in _STIFFNESS for suffix in _CONVENTIONS]
+        known = [*_FIELDS, "base", *suffixed]
+        raise TypeError(describe_unknown("vehicle parameter", unknown, known))
     missing = [name for name in LATERAL_FIELDS if name not in values]
     if missing and not has_base:
-        raise ValueError(
-            f"missing {', '.join(map(_format_key, missing))} (or name a vehicle under 'base')"
-        )
+        names = ", ".join(map(_format_key, missing))
+        raise ValueError(f"missing {names} (or name a vehicle under 'base')")
     vehicle = base.replace(**values)
     if strict:
         check_plausible(vehicle)
@@ -327,7 +310,7 @@ def _parse_vehicle(values: dict[str, Any], strict: bool, is_complete: bool = Fal
 
 
 VEHICLES: dict[str, Vehicle] = {"coms": COMS, "passenger-car": PASSENGER_CAR}
-"""Every vehicle that has a name: two presets, and those of recorded drives, from files."""
+"""Vehicles by name: two presets, and those of recorded drives, from files."""
 
 for _path in sorted((Path(__file__).parent / "presets").glob("*.toml")):
     VEHICLES[_path.stem] = _read_vehicle(_path)

@@ -1,8 +1,8 @@
-"""Tyres: normal load, friction circle, slip and lateral force.
+"""The tyres: normal load, friction circle, slip and lateral force.
 
-Scalar functions over tuples, without branches on values, as in `dynamics`. A law of the lateral
-force has its name in `TYRE_LAWS` and its equation in `compute_lateral_forces`. A filter that needs
-slopes has Fiala's once more, in `estimators.core.model`; a test holds both equal.
+The functions have no branches on values, as in `dynamics`. A law of the lateral force has its name
+in `TYRE_LAWS` and its equation in `compute_lateral_forces`. `estimators.core.model` has Fiala's
+once more, with slopes; a test holds both equal.
 """
 
 from typing import Any, NamedTuple
@@ -28,10 +28,7 @@ class TyreInputs(NamedTuple):
 
 
 class TyreLoad(NamedTuple):
-    """Steering, drive forces and lateral capacities of the tyres under one instant's inputs.
-
-    Computed once, used by several Runge-Kutta stages.
-    """
+    """Steering, drive forces and lateral capacities under one instant's inputs."""
 
     sin_d: Any  # of the front steering angle
     cos_d: Any
@@ -52,18 +49,13 @@ class TyreLoad(NamedTuple):
 
 @inline
 def _compute_squared_capacity(limit: Any, drive: Any) -> Any:
-    """Compute the squared lateral capacity (N2) of a tyre that also drives: the friction circle.
-
-    The capacity is never below 5 %.
-    """
+    """Squared lateral capacity (N2) of a tyre that also drives: friction circle, at least 5 %."""
     return maximum(limit * limit - drive * drive, 0.0025 * limit * limit)
 
 
 @jit
 def has_load_shift(small_angle: int, law: int, roll: int) -> int:
-    """Check whether roll moves load from side to side; tyres without a limit feel nothing of it.
-
-    The tyres' limits then depend on the motion and not on the inputs alone.
+    """Check whether roll moves load from side to side, so that tyre limits depend on the motion.
 
     Args:
         small_angle: 1 for the small-angle plant, else 0.
@@ -78,11 +70,9 @@ def has_load_shift(small_angle: int, law: int, roll: int) -> int:
 
 @inline
 def _compute_axle_shift(F_l: Any, F_r: Any, rear_l: Any, rear_r: Any, weight: Any, car: Any) -> Any:
-    """Compute the force (N) by which each rear wheel's load grows and each front one's falls.
-
-    It is F_x h / 2 l, where F_x is the drive force within the tyres' standing capacity, so that it
-    does not depend on its own effect. At most nine tenths of an axle's standing load move.
-    """
+    """Force F_x h / 2 l (N) by which each rear wheel's load grows and each front one's falls."""
+    # F_x is within the tyres' standing capacity, so that it does not depend on its own effect.
+    # At most nine tenths of an axle's standing load move.
     F_x = minimum(maximum(F_l, 0.0 - rear_l), rear_l) + minimum(maximum(F_r, 0.0 - rear_r), rear_r)
     shift = F_x * car.h_x * (0.5 / (car.l_f + car.l_r))
     return minimum(maximum(shift, -0.9 * weight * car.l_f), 0.9 * weight * car.l_r)
@@ -92,9 +82,8 @@ def _compute_axle_shift(F_l: Any, F_r: Any, rear_l: Any, rear_r: Any, weight: An
 def compute_tyre_load(inputs: Any, car: Any, small_angle: int, load_shift: int = 0) -> Any:
     """Compute the tyres' load under the inputs of one instant.
 
-    The road may grip less on one side: each rear tyre has its own friction, which limits its
-    motor's force; the front tyres share the mean. Drive force moves load between the axles, but
-    not on the small-angle plant.
+    Each rear tyre's friction limits its motor's force; the front tyres have the mean of both sides.
+    Drive force moves load between the axles, but not on the small-angle plant.
 
     Args:
         inputs: `TyreInputs`.
@@ -123,22 +112,10 @@ def compute_tyre_load(inputs: Any, car: Any, small_angle: int, load_shift: int =
         left = sqrt(_compute_squared_capacity(rear_l, F_l))
         right = sqrt(_compute_squared_capacity(rear_r, F_r))
     return TyreLoad(
-        s,
-        c,
-        inputs.delta_f,
-        F_l + F_r,
-        0.5 * car.d_r * (F_r - F_l),
-        front,
-        left,
-        right,
-        car.C_f / (3.0 * front),
-        car.C_r / (3.0 * left),
-        car.C_r / (3.0 * right),
-        rear_l,
-        rear_r,
-        command_l,
-        command_r,
-    )
+        s, c, inputs.delta_f, F_l + F_r, 0.5 * car.d_r * (F_r - F_l), front, left, right,
+        car.C_f / (3.0 * front), car.C_r / (3.0 * left), car.C_r / (3.0 * right),
+        rear_l, rear_r, command_l, command_r,
+    )  # fmt: skip
 
 
 class Tyre(NamedTuple):
@@ -151,28 +128,24 @@ class Tyre(NamedTuple):
 
 @jit
 def _linear(tyre: Any, small_angle: int) -> Any:
-    """F_y = C atan t, without a limit."""
+    """Lateral force (N) F_y = C atan t, without a limit."""
     angle = tyre.tangent if small_angle else atan(tyre.tangent)
     return 3.0 * tyre.limit * (tyre.slope * angle)
 
 
 @jit
 def _fiala(tyre: Any) -> Any:
-    """F_y = F_max z (3 - 3 |z| + z^2), z = clip(C t / 3 F_max, -1, 1): no branch, no arctangent.
-
-    Source: Pacejka, Tire and Vehicle Dynamics, 3.
-    """
+    """Lateral force (N) F_max z (3 - 3 |z| + z^2), z = clip(C t / 3 F_max, -1, 1)."""
+    # Pacejka, Tire and Vehicle Dynamics, 3
     z = minimum(maximum(tyre.slope * tyre.tangent, -1.0), 1.0)
     return tyre.limit * z * (3.0 - 3.0 * absolute(z) + z * z)
 
 
 @jit
 def _dugoff(tyre: Any) -> Any:
-    """F_y = C t q (2 - q), q = min(1, F_max / 2 C |t|) (Dugoff, Fancher, Segel, SAE 700377, 1970).
-
-    With u = C t / F_max that is F_max u up to |u| = 1/2 and F_max (1 - 1 / 4 |u|) from there on,
-    which comes close to the limit and never passes it.
-    """
+    """Lateral force (N) C t q (2 - q), q = min(1, F_max / 2 C |t|)."""
+    # Dugoff, Fancher, Segel, SAE 700377, 1970. With u = C t / F_max it is F_max u up to |u| = 1/2
+    # and F_max (1 - 1 / 4 |u|) from there on, always below the limit.
     u = 3.0 * (tyre.slope * tyre.tangent)
     size = absolute(u)
     share = minimum(size, 0.5) + (0.5 - 0.25 / maximum(size, 0.5))
@@ -204,7 +177,7 @@ def compute_lateral_forces(a: Any, b: Any, c: Any, d: Any, law: int, small_angle
 
 @jit
 def _compute_slip_ratios(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
-    """Numerator and denominator of the tangent of the front slip angle, and of the rear one."""
+    """Numerator and denominator (m/s) of the tangents of the front and the rear slip angle."""
     front = motion.v_y + car.l_f * motion.gamma
     rear = motion.v_y - car.l_r * motion.gamma
     if small_angle:
@@ -235,12 +208,11 @@ def compute_slips(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
 
 @inline
 def compute_load_transfer(motion: Any, car: Any, g_y: Any) -> Any:
-    """Compute the fraction of its standing load by which each axle's left wheel is relieved.
+    """Compute the fraction of its standing load that each axle's left wheel gives to its right.
 
-    The right wheels get as much. The suspension passes K_x phi + C_x phi_dot on to the wheels. The
-    moment of the rest of the car's height, (M h - M_s h_s) a_y, acts at once and is taken at
-    a_y = v_x gamma and gravity. Each axle bears it in proportion to its standing load. No
-    wheel leaves the ground: fractions end at 0.9.
+    The suspension transmits K_x phi + C_x phi_dot; the moment of the rest of the car's height,
+    (M h - M_s h_s) a_y, acts at once, with a_y = v_x gamma and gravity. Each axle bears it in
+    proportion to its standing load.
 
     Args:
         motion: `Motion` or `Velocity` of the car.
@@ -291,9 +263,6 @@ def compute_tyres(
 ) -> Any:
     """Compute the state of the four tyres, and the motors' drive force and yaw moment.
 
-    Roll moves load from side to side, which matters only to tyres with a limit, and is left out of
-    the small-angle plant.
-
     Args:
         motion: `Motion` or `Velocity` of the car.
         load: `TyreLoad` of the inputs.
@@ -323,10 +292,7 @@ def _compute_static_tyres(motion: Any, load: Any, car: Any, small_angle: int) ->
 
 @inline
 def _compute_shifted_tyres(motion: Any, load: Any, car: Any, g_y: Any) -> Any:
-    """`compute_tyres` where roll moves load from side to side.
-
-    A quotient costs ten products: the slips' and the slopes' are all taken from one.
-    """
+    """`compute_tyres` where roll moves load from side to side; all quotients come from one."""
     across_f, along_f, across_r, along_r = _compute_slip_ratios(motion, load, car, 0)
     e_f, e_r = compute_load_transfer(motion, car, g_y)
     relieved, burdened = 1.0 - e_f, 1.0 + e_f
@@ -340,9 +306,7 @@ def _compute_shifted_tyres(motion: Any, load: Any, car: Any, g_y: Any) -> Any:
     left, right = sqrt(square_l), sqrt(square_r)
     sides, squares = relieved * burdened, square_l * square_r
     inv_product = 1.0 / (along_f * along_r * (sides * squares))
-    front = load.slope_f * (
-        along_r * squares * inv_product
-    )  # C_f / 3 F_max of the standing tyre, 1/along
+    front = load.slope_f * (along_r * squares * inv_product)  # C_f / 3 F_max of the standing tyre
     rear = car.C_r * (1.0 / 3.0) * (along_f * sides * inv_product)
     return (
         Tyre(across_f, load.limit_f * relieved, front * burdened),

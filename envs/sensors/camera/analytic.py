@@ -1,4 +1,4 @@
-"""The camera: heading relative to the road and lateral offset at the preview point."""
+"""The analytic camera: heading relative to the road, and lateral offset at the preview point."""
 
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ CAMERA_KIND = SlowKind(
 
 
 class FieldOfView(NamedTuple):
-    """The camera's field of view: beyond it there is no lane in the picture."""
+    """Field of view of the camera, beyond which no lane is in the picture."""
 
     heading: Any  # rad, relative to the road, either side
     offset: Any  # m, of the centre of gravity from the lane's centre, either side
@@ -56,7 +56,7 @@ def compute_preview_offset(y: Any, psi: Any, kappa: Any, l_pre: Any) -> Any:
 
 @jit
 def compute_lane_offset(motion: Any, road: Any, l_pre: Any) -> Any:
-    """Compute `compute_preview_offset` of a Motion on a road.
+    """Compute the lateral offset at the preview point of a car on a road.
 
     Args:
         motion: `Motion` of the car.

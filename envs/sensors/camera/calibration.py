@@ -1,9 +1,7 @@
-"""How a camera is mounted, from one picture of a lane: tilt and height.
+"""Calibration of a camera: mounting from a picture of a lane, intrinsics from a chessboard.
 
-Straight markings meet in the vanishing point, whose row is the horizon's; how far they spread below
-it is the camera's height over a lane of known width. Needs the extra `vision`.
-
-A camera's intrinsics from photographs of a chessboard. Needs the extra `vision`.
+The tilt follows from the vanishing point of straight markings, the height from how they spread
+below it over a lane of known width. Needs the extra `vision`.
 """
 
 import dataclasses
@@ -20,7 +18,8 @@ from .images import Image
 from .lane_finder import Array, LaneFinder
 from .pinhole import WORKING_WIDTH, Pinhole, resample
 
-MAX_PAIRS, MIN_POINTS = 4000, 20  # pairs of points, and points
+_MIN_BOARDS = 3
+_MAX_PAIRS, _MIN_POINTS = 4000, 20  # pairs of points, and points
 _TOP, _BOTTOM = 0.55, 0.92  # of the picture's height: the road, without the bonnet
 _NEAR = 0.004  # of the focal length, from a line
 _SLOPES = 0.35, 4.0  # across over down, of a lane's own markings
@@ -66,9 +65,8 @@ def estimate_mounting(camera: Pinhole, picture: Image, lane_width: float) -> Pin
     tilt = atan(-down)
     height = lane_width * cos(tilt) / (d - b)
     mounted_camera = dataclasses.replace(camera, tilt=tilt, height=height)
-    finder = LaneFinder(
-        mounted_camera, lane_width, NEAR, FAR, view=FieldOfView(HEADING, 0.5 * lane_width)
-    )
+    view = FieldOfView(HEADING, 0.5 * lane_width)
+    finder = LaneFinder(mounted_camera, lane_width, NEAR, FAR, view=view)
     finder.find(picture)
     straight = finder.fit is not None and (np.abs(finder.fit[2:5]) < _STRAIGHT).all()
     if not (straight and _HEIGHTS[0] < height < _HEIGHTS[1]):
@@ -78,7 +76,7 @@ def estimate_mounting(camera: Pinhole, picture: Image, lane_width: float) -> Pin
 
 
 def _find_ridges(camera: Pinhole, picture: Image) -> tuple[Array, Array]:
-    """(points (n, 2) on the plane one unit ahead, weight): bright ridges across the rows."""
+    """Bright ridges across the rows: points (n, 2) on the plane one unit ahead, weights (n,)."""
     grey = resample(picture if picture.ndim == 2 else picture.max(2))
     rows = slice(int(_TOP * len(grey)), int(_BOTTOM * len(grey)))
     smooth = cv2.GaussianBlur(grey[rows].astype(np.float32), (0, 0), 4.0)
@@ -94,18 +92,17 @@ def _find_ridges(camera: Pinhole, picture: Image) -> tuple[Array, Array]:
 
 
 def _find_pair(points: Array, weight: Array) -> tuple[Array, Array] | None:
-    """(left, right): each (2,), a and b of across = a + b down, by random consensus."""
-    if len(points) < MIN_POINTS:
+    """(left, right) markings by random consensus: each (2,), a and b of across = a + b down."""
+    if len(points) < _MIN_POINTS:
         return None
     across, down = points.T
     rng = np.random.Generator(np.random.SFC64(len(points)))
     sums = np.cumsum(weight)
-    i, j = np.searchsorted(sums, rng.random((2, MAX_PAIRS)) * sums[-1]).clip(max=len(points) - 1)
+    i, j = np.searchsorted(sums, rng.random((2, _MAX_PAIRS)) * sums[-1]).clip(max=len(points) - 1)
     with np.errstate(all="ignore"):
         b = (across[j] - across[i]) / (down[j] - down[i])
-    is_marking = (
-        (np.abs(down[j] - down[i]) > 0.05) & (np.abs(b) > _SLOPES[0]) & (np.abs(b) < _SLOPES[1])
-    )
+    is_marking = (np.abs(b) > _SLOPES[0]) & (np.abs(b) < _SLOPES[1])
+    is_marking &= np.abs(down[j] - down[i]) > 0.05
     b = b[is_marking, None]
     a = across[i[is_marking], None] - b * down[i[is_marking], None]
     support = (np.abs(across - a - b * down) < _NEAR * (1.0 + np.abs(b))) @ weight
@@ -114,9 +111,8 @@ def _find_pair(points: Array, weight: Array) -> tuple[Array, Array] | None:
     if not (len(left) and len(right)):
         return None
     spread = b[right] - b[left, None]  # a lane's: a wider pair holds another lane too
-    score = np.minimum(support[left, None], support[right]) + 0.25 * (
-        support[left, None] + support[right]
-    )
+    support_l, support_r = support[left, None], support[right]
+    score = np.minimum(support_l, support_r) + 0.25 * (support_l + support_r)
     tilts = np.arctan((a[right] - a[left, None]) / spread)
     score *= ((tilts > _TILTS[0]) & (tilts < _TILTS[1])) / (1.0 + 0.1 * spread)
     best_left, best_right = np.unravel_index(np.argmax(score), score.shape)
@@ -128,9 +124,6 @@ def _find_pair(points: Array, weight: Array) -> tuple[Array, Array] | None:
             slope, start = np.polyfit(down[near], across[near], 1, w=weight[near])
         lines.append(np.array([start, slope]))
     return lines[0], lines[1]
-
-
-MIN_BOARDS = 3  # boards
 
 
 def calibrate_camera(
@@ -151,7 +144,7 @@ def calibrate_camera(
     board = np.zeros((corners[0] * corners[1], 3), np.float32)
     board[:, :2] = np.mgrid[: corners[0], : corners[1]].T.reshape(-1, 2)
     corner_sets: list[Any] = []
-    sizes: dict[tuple[int, int], int] = {}
+    sizes: set[tuple[int, int]] = set()
     for path in paths:
         grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if grey is None:
@@ -160,12 +153,11 @@ def calibrate_camera(
         if is_found:
             stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
             corner_sets.append(cv2.cornerSubPix(grey, places, (8, 8), (-1, -1), stop))
-            size = grey.shape[1], grey.shape[0]
-            sizes[size] = sizes.get(size, 0) + 1
-    if len(corner_sets) < MIN_BOARDS:
+            sizes.add((grey.shape[1], grey.shape[0]))
+    if len(corner_sets) < _MIN_BOARDS:
         raise ValueError(
             f"{len(corner_sets)} of {len(paths)} files show a chessboard of {corners[0]} x "
-            f"{corners[1]} inner corners; expected {MIN_BOARDS} or more"
+            f"{corners[1]} inner corners; expected {_MIN_BOARDS} or more"
         )
     if len(sizes) > 1:
         raise ValueError(f"the boards' photographs have different sizes: {sorted(sizes)}")

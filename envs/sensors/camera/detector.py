@@ -1,4 +1,4 @@
-"""The lane finder as it was measured, in `detector.json`: its time and its errors in drives."""
+"""The measured times and errors of the lane finder, in `detector.json`."""
 
 import functools
 import json
@@ -9,7 +9,7 @@ from typing import Any
 
 from ...ticks import TICK
 
-FILE = Path(__file__).with_suffix(".json")
+_FILE = Path(__file__).with_suffix(".json")
 VISIONS = ("analytic", "image")
 DELAYS = ("fitted", "measured", "link")
 MAX_DELAY = 0.1  # s: a measured delay counts as no more
@@ -17,12 +17,12 @@ MAX_DELAY = 0.1  # s: a measured delay counts as no more
 
 @dataclass(frozen=True)
 class Detector:
-    """The lane finder's time, shift + exp(normal), and the standard deviations of its results."""
+    """Time of the lane finder, shift + exp(normal), and standard deviations of its results."""
 
     shift: float  # s
     log_mean: float
     log_sd: float
-    range: tuple[float, float]  # s, the least and the most that is drawn
+    range: tuple[float, float]  # s, limits of what is drawn
     noise: dict[str, float]  # by the names of `Noise`
 
     @classmethod
@@ -49,7 +49,7 @@ class Detector:
         Returns:
             Delay (s), within `range`.
         """
-        from statistics import NormalDist  # 2 ms that every import of the package would pay
+        from statistics import NormalDist  # 2 ms, which `import sideslip` does not need
 
         drawn = self.shift + math.exp(NormalDist(self.log_mean, self.log_sd).inv_cdf(share))
         return min(max(drawn, self.range[0]), self.range[1])
@@ -70,4 +70,4 @@ def count_delay_ticks(seconds: float) -> int:
 @functools.cache
 def load_detector() -> Detector:
     """Load the detector on file."""
-    return Detector.from_dict(json.loads(FILE.read_text()))
+    return Detector.from_dict(json.loads(_FILE.read_text()))

@@ -1,4 +1,4 @@
-"""Pictures and films from files, and what was found drawn on them. Needs the extra `vision`."""
+"""Pictures and films from files, and lanes drawn on them. Needs the extra `vision`."""
 
 import os
 from collections.abc import Iterator
@@ -34,13 +34,14 @@ def read_picture(path: "str | os.PathLike[str]") -> Image:
 
 
 class Film:
-    """The frames of a film, as pictures.
-
-    `frame_count` is the number that its header promises. A file that is missing raises
-    FileNotFoundError.
+    """The frames of a film, as pictures; FileNotFoundError where the file is missing.
 
     Args:
         path: Path of the file.
+
+    Attributes:
+        frame_count: Number of frames by the file's header.
+        rate: Frames per second.
 
     Raises:
         ValueError: For a file without a first frame.
@@ -48,14 +49,18 @@ class Film:
 
     def __init__(self, path: "str | os.PathLike[str]") -> None:
         _check_file(path)
-        self._path = str(path)
-        self._reader = cv2.VideoCapture(self._path)
+        self._reader = cv2.VideoCapture(str(path))
         self.frame_count = max(int(self._reader.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
         self.rate = float(self._reader.get(cv2.CAP_PROP_FPS)) or 30.0
-        has_frame, first = self._reader.read()
-        if not has_frame:
+        first = self._read_frame()
+        if first is None:
             raise ValueError(f"{path}: this is no film that can be read")
-        self._buffer = [np.asarray(first, np.uint8)]
+        self._buffer = [first]
+
+    def _read_frame(self) -> Image | None:
+        """The next frame of the file; None where it, or its undamaged part, ends."""
+        has_frame, frame = self._reader.read()
+        return np.asarray(frame, np.uint8) if has_frame else None
 
     def read_head(self, count: int) -> list[Image]:
         """Read the first frames, which iteration returns again.
@@ -66,22 +71,16 @@ class Film:
         Returns:
             At most `count` pictures.
         """
-        while len(self._buffer) < count:
-            has_frame, frame = self._reader.read()
-            if not has_frame:
-                break
-            self._buffer.append(np.asarray(frame, np.uint8))
+        while len(self._buffer) < count and (frame := self._read_frame()) is not None:
+            self._buffer.append(frame)
         return list(self._buffer)
 
     def __iter__(self) -> Iterator[Image]:
         """Iterate over the frames, once, until the file or its undamaged part ends."""
         while self._buffer:
             yield self._buffer.pop(0)
-        while True:
-            has_frame, frame = self._reader.read()
-            if not has_frame:
-                return
-            yield np.asarray(frame, np.uint8)
+        while (frame := self._read_frame()) is not None:
+            yield frame
 
 
 def draw_lane(picture: Image, finder: LaneFinder, lane: Lane) -> Image:
@@ -98,10 +97,8 @@ def draw_lane(picture: Image, finder: LaneFinder, lane: Lane) -> Image:
     shown = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) if picture.ndim == 2 else picture.copy()
     thick = max(shown.shape[1] // 400, 1)
     if finder.fit is not None:
-        edges = [
-            finder.camera.project_points(finder.rows_ahead, finder.locate_marking(finder.fit, side))
-            for side in (1, -1)
-        ]
+        places = [finder.locate_marking(finder.fit, side) for side in (1, -1)]
+        edges = [finder.camera.project_points(finder.rows_ahead, y) for y in places]
         left, right = (np.round(edge[np.isfinite(edge[:, 0])]).astype(np.int32) for edge in edges)
         filled = shown.copy()
         cv2.fillPoly(filled, [np.concatenate([left, right[::-1]])], (80, 160, 0))

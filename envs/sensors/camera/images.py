@@ -1,7 +1,7 @@
-"""The road as a camera sees it: markings, bends, roll and pitch, shadow, wear, blur and noise.
+"""Pictures of the road: markings, bends, roll and pitch, shadow, wear, blur and noise.
 
-Every pixel is followed to the road's plane, whose brightness there is averaged over the pixel's
-footprint. Needs the extra `vision`.
+Each pixel has the road's brightness, averaged over the pixel's footprint on the road's plane. Needs
+the extra `vision`.
 """
 
 from dataclasses import dataclass, fields
@@ -17,10 +17,10 @@ from ...vehicle.dynamics import RoadParams
 from .pinhole import Pinhole
 
 Image = npt.NDArray[np.uint8]
-Flat = npt.NDArray[np.float32]
+_Flat = npt.NDArray[np.float32]
 
-ASPHALT, PAINT, GRASS, SKY = 85.0, 215.0, 60.0, 200.0  # grey levels
-VERGE = 1.6  # m, from a marking's middle to the grass
+_ASPHALT, _PAINT, _GRASS, _SKY = 85.0, 215.0, 60.0, 200.0  # grey levels
+_VERGE = 1.6  # m, from a marking's middle to the grass
 _FAR = 80.0  # m, of the road that is drawn
 _PATCH, _FLAKE = 0.25, 0.03  # m, along and across, of paint that wears off together
 
@@ -31,8 +31,8 @@ class Appearance:
 
     noise: float = 2.0  # grey levels, standard deviation of a pixel
     blur: float = 0.5  # px, standard deviation of the lens
-    shadow: float = 0.0  # share of the light that bands of shadow across the road take
-    wear: float = 0.0  # share of the paint that has gone
+    shadow: float = 0.0  # fraction of the light that bands of shadow across the road take
+    wear: float = 0.0  # fraction of the paint that has gone
     lane_width: float = 3.5  # m, from marking to marking
     marking_width: float = 0.12  # m
     dash: float = 4.0  # m, length of the left marking's dashes; the right one is solid
@@ -58,19 +58,6 @@ class RoadScene(NamedTuple):
     roll: float = 0.0  # rad, left side up positive, about the road below the car
     pitch: float = 0.0  # rad, nose down positive
     road: RoadParams = RoadParams(0.0, 0.0, 1.0)
-
-    @classmethod
-    def make_bend(cls, curvature: float, **places: float) -> "RoadScene":
-        """Make a scene on a road of constant curvature.
-
-        Args:
-            curvature: Curvature (1/m), left positive.
-            places: Other fields by name.
-
-        Returns:
-            The scene.
-        """
-        return cls(road=RoadParams(curvature, -1e6, 1.0), **places)
 
 
 class RoadRenderer:
@@ -116,8 +103,8 @@ class RoadRenderer:
         image[self.rows] = np.clip(light + 0.5, 0.0, 255.0)
         return image
 
-    def _render_road(self, scene: RoadScene) -> Flat:
-        """Brightness of the painted rows without blur and noise."""
+    def _render_road(self, scene: RoadScene) -> _Flat:
+        """Brightness of the painted rows, without blur and noise, shape (rows, width)."""
         camera, style = self.camera, self.appearance
         rotation = _make_rotation(scene.roll, scene.pitch)
         lens = rotation @ [camera.ahead, 0.0, camera.height]
@@ -129,9 +116,7 @@ class RoadRenderer:
         pixel_width = reach / np.float32(camera.K[0][0])  # m of a pixel, across and along the view
         pixel_length = pixel_width * np.maximum(X, 1.0) / np.float32(lens[2])
         footprint_width = np.hypot(pixel_width, pixel_length * np.float32(sin(scene.psi)))
-        paint = _compute_coverage(
-            d + 0.5 * style.lane_width, style.marking_width, footprint_width
-        )  # right, solid
+        paint = _compute_coverage(d + 0.5 * style.lane_width, style.marking_width, footprint_width)
         dashes = _compute_coverage(d - 0.5 * style.lane_width, style.marking_width, footprint_width)
         period = style.dash + style.gap
         place = np.mod(s + np.float32(scene.s % period) + 0.5 * style.gap, period)
@@ -140,27 +125,25 @@ class RoadRenderer:
             first = int(np.floor(scene.s / _PATCH))
             patches = np.floor((s + np.float32(scene.s - first * _PATCH)) / _PATCH)
             paint *= _hash_cells(patches.astype(np.int64) + first, d / _FLAKE) >= style.wear
-        light = ASPHALT + (PAINT - ASPHALT) * paint
+        light = _ASPHALT + (_PAINT - _ASPHALT) * paint
         if style.shadow > 0.0:
             bands = np.mod(s + np.float32(scene.s % 11.0) + 0.7 * d, 11.0) < 4.5
             light *= 1.0 - np.float32(style.shadow) * bands
-        verge = np.abs(d) > 0.5 * style.lane_width + VERGE
-        light = np.where(is_road, np.where(verge, np.float32(GRASS), light), np.float32(SKY))
+        verge = np.abs(d) > 0.5 * style.lane_width + _VERGE
+        light = np.where(is_road, np.where(verge, np.float32(_GRASS), light), np.float32(_SKY))
         return np.asarray(light, np.float32)
 
 
 def _make_rotation(roll: float, pitch: float) -> Any:
-    """From body axes to those of the road."""
+    """Rotation matrix (3, 3) from body axes to the road's."""
     roll_matrix = np.array([[1, 0, 0], [0, cos(roll), -sin(roll)], [0, sin(roll), cos(roll)]])
     pitch_matrix = np.array([[cos(pitch), 0, sin(pitch)], [0, 1, 0], [-sin(pitch), 0, cos(pitch)]])
     return pitch_matrix @ roll_matrix
 
 
-def _compute_lane_coordinates(X: Flat, Y: Flat, scene: RoadScene) -> tuple[Flat, Flat]:
-    """(d, s): m left of the lane's middle and along it from the car, of points in car axes.
-
-    Exact on the osculating circle; where the curvature changes ahead, to first order about it.
-    """
+def _compute_lane_coordinates(X: _Flat, Y: _Flat, scene: RoadScene) -> tuple[_Flat, _Flat]:
+    """(d, s): distance left of the lane's middle and along it (m) of points in car axes."""
+    # Exact on the osculating circle; where the curvature changes ahead, to first order about it.
     sine, cosine = np.float32(sin(scene.psi)), np.float32(cos(scene.psi))
     u, v = X * cosine - Y * sine, np.float32(scene.y) + X * sine + Y * cosine
     road = scene.road
@@ -177,14 +160,14 @@ def _compute_lane_coordinates(X: Flat, Y: Flat, scene: RoadScene) -> tuple[Flat,
     return d.astype(np.float32), np.asarray(s, np.float32)
 
 
-def _compute_coverage(offset: Flat, width: float, footprint: Flat) -> Flat:
-    """The share of a footprint that a stripe covers."""
+def _compute_coverage(offset: _Flat, width: float, footprint: _Flat) -> _Flat:
+    """Fraction of a footprint that a stripe covers."""
     share = np.clip((0.5 * width - np.abs(offset)) / footprint + 0.5, 0.0, 1.0)
     return np.asarray(np.minimum(share, width / footprint), np.float32)
 
 
-def _hash_cells(cells_s: npt.NDArray[np.int64], cells_d: Flat) -> Flat:
-    """A number in [0, 1) for each cell of the road."""
+def _hash_cells(cells_s: npt.NDArray[np.int64], cells_d: _Flat) -> _Flat:
+    """Hash in [0, 1) of each cell of the road."""
     word = cells_s.astype(np.uint32) * np.uint32(0x9E3779B1)
     word ^= np.floor(cells_d).astype(np.int64).astype(np.uint32) * np.uint32(0x85EBCA77)
     word ^= word >> np.uint32(15)

@@ -1,4 +1,4 @@
-"""A pinhole camera on a car: from pixels to the road's plane and back.
+"""The pinhole camera on a car: projection of the road's plane to pixels, and back.
 
 Car axes: X forward, Y left, Z up, from the road below the centre of gravity. Needs `vision`.
 """
@@ -20,15 +20,15 @@ from ...validation import describe_unknown, is_finite, short_repr
 Array = npt.NDArray[np.floating[Any]]
 _MATRIX = ((640.0, 0.0, 639.5), (0.0, 640.0, 359.5), (0.0, 0.0, 1.0))
 WORKING_WIDTH = 1280  # px, of a picture in which a lane is looked for
-_MEASURED = ("rms_px", "boards")  # a calibration file may hold them
+_MEASURED = ("rms_px", "boards")  # further entries of a calibration file
 
 
 @dataclass(frozen=True)
 class Pinhole:
     """A camera's intrinsics and mounting; a value out of place raises ValueError.
 
-    The defaults are the papers' tilt and preview, and a lens wide enough to see both markings
-    throughout the analytic camera's field of view.
+    The defaults are the papers' tilt and preview, and a lens that sees both markings throughout the
+    analytic camera's field of view.
     """
 
     K: tuple[tuple[float, ...], ...] = _MATRIX  # px, the camera matrix
@@ -123,9 +123,8 @@ class Pinhole:
         """
         points = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
         criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 40, 1e-9)
-        undistorted = cv2.undistortPoints(
-            points, np.array(self.K), np.array(self.dist), criteria=criteria
-        )
+        K, dist = np.array(self.K), np.array(self.dist)
+        undistorted = cv2.undistortPoints(points, K, dist, criteria=criteria)
         return np.asarray(undistorted, float).reshape(np.shape(pixels))
 
     def project_points(self, x: Array, y: Array) -> Array:
@@ -143,9 +142,8 @@ class Pinhole:
         down = self.height * cos(self.tilt) - x * sin(self.tilt)
         is_in_front = depth > 0.1
         points = np.stack([-y, down, np.where(is_in_front, depth, 1.0)], -1).reshape(-1, 1, 3)
-        pixels, _ = cv2.projectPoints(
-            points, np.zeros(3), np.zeros(3), np.array(self.K), np.array(self.dist)
-        )
+        K, dist = np.array(self.K), np.array(self.dist)
+        pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, dist)
         pixels = np.asarray(pixels, float).reshape(*x.shape, 2)
         width, height = self.size
         corners = np.array([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])

@@ -16,7 +16,7 @@ from sideslip.envs.sensors.camera import FieldOfView, compute_lane_offset
 from sideslip.envs.sensors.camera.images import Appearance, RoadRenderer, RoadScene
 from sideslip.envs.sensors.camera.lane_finder import CameraMount, Lane, LaneFinder, search_starts
 from sideslip.envs.sensors.camera.pinhole import Pinhole
-from sideslip.envs.vehicle.dynamics import Motion
+from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 
 VIEW = FieldOfView(0.35, 4.0)  # of the scored scenarios
 CAMERA = Pinhole()
@@ -48,7 +48,7 @@ def draws(count: int, bend: float = 0.0, view: FieldOfView = VIEW) -> list[RoadS
     rng = np.random.default_rng(5)
     low = np.array([-view.heading, -view.offset, 0.0, -bend])
     return [
-        RoadScene.make_bend(kappa, psi=psi, y=y, s=s)
+        RoadScene(psi, y, s, road=RoadParams(kappa, -1e6, 1.0))
         for psi, y, s, kappa in rng.uniform(
             low, [view.heading, view.offset, 500.0, bend], (count, 4)
         )
@@ -151,7 +151,8 @@ def scaled(width: int) -> Pinhole:
 def test_one_working_scale_finds_the_same_lane_in_a_picture_of_any_size(width: int) -> None:
     finder = LaneFinder(scaled(width))
     way = cv2.INTER_AREA if width < 1280 else cv2.INTER_LINEAR
-    for scene in (RoadScene(psi=0.05, y=-0.4, s=3.0), RoadScene.make_bend(0.006, psi=-0.04, y=0.5)):
+    bend = RoadScene(-0.04, 0.5, road=RoadParams(0.006, -1e6, 1.0))
+    for scene in (RoadScene(psi=0.05, y=-0.4, s=3.0), bend):
         picture = CLEAR.render_picture(scene, 1)
         whole = FINDER.find(picture)
         other = cv2.resize(picture, finder.camera.size, interpolation=way)

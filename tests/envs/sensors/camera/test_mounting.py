@@ -19,6 +19,7 @@ from sideslip.envs.sensors.camera.films import read_picture
 from sideslip.envs.sensors.camera.images import Image, RoadRenderer, RoadScene
 from sideslip.envs.sensors.camera.lane_finder import Lane, LaneFinder
 from sideslip.envs.sensors.camera.pinhole import Pinhole
+from sideslip.envs.vehicle.dynamics import RoadParams
 
 ROOT = Path(__file__).resolve().parents[4]
 PLACES = [folder / "shared" / "data" / "lane_images" for folder in (ROOT, ROOT.parent)]
@@ -45,7 +46,7 @@ CAR = Pinhole(tilt=0.05, height=1.2)
     ("scene", "camera"),
     [
         (RoadScene(psi=0.16, y=0.2), CAR),  # no heading in a lane
-        (RoadScene.make_bend(0.008), CAR),  # not straight
+        (RoadScene(road=RoadParams(0.008, -1e6, 1.0)), CAR),  # not straight
         (RoadScene(y=0.2), replace(CAR, height=4.0)),
         (RoadScene(y=0.2), replace(CAR, height=0.6)),
         (RoadScene(y=0.2), replace(CAR, tilt=-0.18)),

@@ -35,7 +35,7 @@ def walked(scene: RoadScene, ahead: float, aside: float) -> tuple[float, float]:
     [
         RoadScene(psi=0.1, y=0.5),
         RoadScene(psi=-0.2, y=-1.0, s=7.3),
-        RoadScene.make_bend(0.02, psi=0.05, y=-0.4),
+        RoadScene(0.05, -0.4, road=RoadParams(0.02, -1e6, 1.0)),
         RoadScene(s=12.0, road=RoadParams(-0.03, 20.0, 20.0)),  # the ramp begins 8 m ahead
         RoadScene(s=27.0, psi=-0.1, road=RoadParams(0.02, 20.0, 20.0)),  # the car is on it
     ],
