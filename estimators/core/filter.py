@@ -325,16 +325,7 @@ def step_all(layers: FilterRecords, gains: GainTables, fast: Any, packets: Any, 
     """
     empty = fast[:0]
     return advance(
-        layers,
-        gains,
-        fast,
-        len(fast),
-        packets,
-        count,
-        len(empty),
-        empty,
-        empty,
-        empty.reshape(0),
+        layers, gains, fast, len(fast), packets, count, len(empty), empty, empty, empty.reshape(0)
     )
 
 

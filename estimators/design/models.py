@@ -63,10 +63,7 @@ class Measurement:
 
 MEASUREMENTS: dict[str, Measurement] = {
     "camera": Measurement(
-        (
-            MeasurementRow(("psi",), "psi", 3.5e-3, angle=True),
-            MeasurementRow(("y_l",), "y_l", 0.02),
-        ),
+        (MeasurementRow(("psi",), "psi", 3.5e-3, angle=True), MeasurementRow(("y_l",), "y_l", 0.02))
     ),
     "gps": Measurement(
         (MeasurementRow(("beta", "psi"), "course", math.radians(0.14), True, True, ground=True),),
