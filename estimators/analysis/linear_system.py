@@ -3,8 +3,7 @@
     x_{k+1} = a x_k + b u_k + x_d,k + w_k,    y_k = c x_k + v_k at k = 0, r, 2 r, ...
     x_d,k+1 = a_d x_d,k + u_d + w_d,k
 
-It runs on the compiled core of all filters, as its rule "dual-rate" with a model whose matrices are
-arguments. `make_estimator("dual-rate")` is its application to a car's course angle.
+It runs on the compiled core of all filters, as its rule "dual-rate" with matrices as arguments.
 """
 
 import warnings

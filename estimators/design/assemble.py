@@ -108,7 +108,7 @@ HAZARD = 0.2  # 1/s, of tyres that change
 _TYRE_VARIANCE = 0.06  # variance of their factors
 _TYRE_WALK = 0.02  # 1/s, of the factors of a new member until the next one: the change may be later
 _IMM_TIME = 0.2  # s between two steps of members that interact
-GUST = (8.0, 2.0)  # times the usual force and moment
+_GUST = (8.0, 2.0)  # times the usual force and moment
 
 
 def assemble(
@@ -191,7 +191,7 @@ def _set_imm_members(bank: Any, dt: float) -> None:
     """Set what the interacting members differ in."""
     bank.respawn = round(_IMM_TIME / dt)
     for f in bank:
-        f.burst[:] = np.square(GUST) * f.q_known / f.q_share
+        f.burst[:] = np.square(_GUST) * f.q_known / f.q_share
     gusty, changed = bank[GUSTY], bank[CHANGED]
     gusty.decay[gusty.dense : gusty.dense + 2] = 1.0
     changed.q_tyres[:2] += _TYRE_WALK * changed.step

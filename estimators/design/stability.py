@@ -51,9 +51,8 @@ def find_unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
         largest = np.abs(v).max()
         leading = v[0] if abs(v[0]) > 1e-6 * largest else v[np.argmax(np.abs(v))]
         parts = zip(names, v / leading, strict=True)
-        directions.append(
-            ", ".join(f"{name} {part:.4g}" for name, part in parts if abs(part) > 1e-6)
-        )
+        terms = (f"{name} {part:.4g}" for name, part in parts if abs(part) > 1e-6)
+        directions.append(", ".join(terms))
     return tuple(directions)
 
 
@@ -185,18 +184,16 @@ def _build_correction(
     M = (I - joint) @ M
     for frame in schedule.find_arriving(step):
         C = _build_residual_rows(f, schedule, frame, width, stored_at)[m:]
-        measured = build_measurement_rows(f, frame, 0 if stored_at >= 0 else schedule.lags[frame])[
-            m:
-        ]
+        lag = 0 if stored_at >= 0 else schedule.lags[frame]
+        measured = build_measurement_rows(f, frame, lag)[m:]
         first = 1 + schedule.cycle * max(m, 1) + frame * len(C)
         total, residual_map = np.zeros((width, len(C))), np.eye(len(C))
         for i in range(len(C)):  # row i's correction changes the residuals of those behind it
             K = np.zeros(width)
             K[:size] = table[first + i, :size]
             total += np.outer(K, residual_map[i])
-            residual_map -= (
-                np.outer(measured @ K[:size], residual_map[i]) * (np.arange(len(C)) > i)[:, None]
-            )
+            is_behind = (np.arange(len(C)) > i)[:, None]
+            residual_map -= np.outer(measured @ K[:size], residual_map[i]) * is_behind
         M = (I - total @ C) @ M
     return M
 
