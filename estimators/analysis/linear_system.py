@@ -15,10 +15,9 @@ import numpy.typing as npt
 
 from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
 from ..core.filter import reset_filters
-from ..core.innovation import IGNORE
+from ..core.innovation import DUAL_RATE, IGNORE
 from ..core.model import LINEAR
 from ..core.record import FILTER, N_CORE, N_INPUTS, N_ROWS
-from ..core.update import DUAL_RATE
 from ..design.dual_rate import GAINS, RULES, compute_shares, frame_map, write_shares
 from ..design.kalman import check_covariance
 from ..design.stability import MARGINAL, find_unobservable, spectral_radius

@@ -14,12 +14,11 @@ import numpy as np
 from ...envs.numerics.jit import jit
 from ...envs.record import FAST, PACKET, Array, Log
 from ..core.filter import run_tick
-from ..core.innovation import IGNORE
+from ..core.innovation import IGNORE, NONE
 from ..core.model import BETA, LATERAL
 from ..core.packets import process_packet
 from ..core.predict import read_fast_row
 from ..core.record import WINDOW, FilterRecord, GainTables, Vector
-from ..core.update import NONE
 from ..design.periodic import count_ticks
 from ..estimator import Estimator
 from ..make import make_estimator

@@ -1,11 +1,9 @@
 """The covariance and its gains in compiled code: `design.kalman`'s equations on a filter's memory.
 
 Only the first n of N = `total` states move; the others are clones. Rows are computed by eights of
-their columns: beyond N all is zero and stays so. Measurements come one scalar at
-a time, so that a gain is a division and not a matrix inverse.
-
-One filter's memory is a record of numbers; that of several filters in lanes has fields of the same
-names (`vector.lanes`), whose columns come one by one.
+their columns: beyond N all is zero and stays so. Measurements come one scalar at a time, so that
+a gain is a division. One filter's memory is a record of numbers; that of several filters in lanes
+(`vector.lanes`) has fields of the same names, whose columns come one by one.
 """
 
 from math import log

@@ -2,7 +2,7 @@
 
 Order of a tick: what was captured at the last tick is held, prediction from the last tick to this
 one with the inputs of this row, the fast sensors, then the packets that arrive. A filter at the
-slow sensor's rate listens once every `pace` ticks, to the packets that came meanwhile; it holds its
+slow sensor's rate listens every `pace` ticks, to the packets that came meanwhile; it holds its
 states in between (`stride`) or predicts them.
 """
 
@@ -20,8 +20,6 @@ from .model import (
     build_model,
     compute_road_turn,
     find_next_cell,
-    linearise,
-    locate_step_row,
 )
 from .multiple_model import (
     compute_mixture,
@@ -31,7 +29,7 @@ from .multiple_model import (
     update_second_layer,
 )
 from .packets import apply_waiting, clear_history, process_packet, store_history
-from .predict import advance_state, correct_fast, read_fast_row
+from .predict import advance_state, linearise, read_fast_row
 from .record import (
     COUNTERS,
     N_CORE,
@@ -45,6 +43,7 @@ from .record import (
     GainTables,
     Vector,
 )
+from .update import correct_fast, locate_step_row
 
 
 @jit
@@ -271,9 +270,7 @@ def advance(
         nis: Output for each packet's normalised innovation squared, shape (count,), or empty.
 
     Returns:
-        Number of rows done: fewer than `rows` where gains are missing, those of the cell `wanted`
-            of
-        the first layer; call again from there.
+        Rows done; fewer than `rows` where the table `wanted` is missing: call again from there.
     """
     first = first_member(layers)
     f = layers[first]
@@ -289,9 +286,8 @@ def advance(
             read_fast_row(layers[layer], fast[j], wheel_speed)
             run_tick(layers[layer], gains)
         while position < count and not (f.tick < packets[position, PACKET.arrived] <= last):
-            was_used = process_packet(
-                f, gains, packets[position]
-            )  # from beyond the last row: counted here
+            # from beyond the last row: counted here
+            was_used = process_packet(f, gains, packets[position])
             if len(nis) > 0:
                 nis[position] = f.nis
             if first > 0:

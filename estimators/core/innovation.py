@@ -1,27 +1,19 @@
-"""Late samples: what a filter stores of the moment of capture, and which sample it may still use.
+"""Late samples, and a sample's innovation: which one a filter uses, and how noisy it is.
 
-clone: at each capture the measured combinations of the states are cloned; a late sample is a
-measurement of its clones, so it is used exactly. The delayed states of tie-vision (12)-(13), held
-between the camera's triggers, are these clones: one algorithm under two names. The clones of frame
-i lie in slot i mod frames. They are made in the step *after* the capture, as (12) has it, when
-everything that is known at the captured tick has been used.
-buffer: the window is filtered anew from the capture on (`rewind`): exact for any clock. A sample
-that is older than what a rule stores (clone, larsen: its frames; buffer, stored: `WINDOW` ticks) is
-refused and counted; a sensor whose longest delay is that long is refused when the filter is built.
-larsen: the covariance takes the sample at its capture, the states when it arrives (Larsen 1998);
-exact where exactly one sample is under way and none is lost.
-stored: its residual is taken against the prediction stored at the capture and used as if it were
-fresh: uneven-delay (15)-(16). constant: the same, for an assumed delay instead of the stamp.
-literal, lag: the model has late states that follow at every step, by one step (tie-vision (12) read
-literally at 1 ms) or by a first-order lag of the delay. ignore: late samples are taken for fresh.
-
-A sample's innovation: its variance, whether it is possible at all, and what it tells of R.
+Rules for late samples, `RULES`: "clone": what is measured is cloned at each capture, so a late
+sample measures its clones, exactly; the delayed states of tie-vision (12)-(13) are these clones.
+They are made in the step after the capture, as (12) has it. Frame i is in slot i mod frames.
+"buffer": the window is filtered anew from the capture on (`packets`), exact for any clock.
+"larsen": the covariance takes the sample at its capture, the states when it arrives (Larsen 1998),
+exact where one sample is under way and none is lost. "stored": its residual against the prediction
+at the capture is used as if it were fresh, uneven-delay (15)-(16); "constant": the same, for an
+assumed delay. "literal", "lag": late states follow at every step, by one step (tie-vision (12) read
+literally at 1 ms) or by a first-order lag. "ignore": late samples are taken for fresh. What is
+older than a rule stores is refused and counted.
 
 A gate alone starves a filter that has lost itself. Gated samples in a row whose residuals agree
-show that it is the filter which is wrong, or that what is measured has jumped, as a heading does by
-the half turn of a flipped antenna: then the state that only this sensor measures is forgotten by as
-much as the residual, and the sensor is believed again. A state that another sensor measures, which
-was believed meanwhile, is not forgotten.
+show that the filter is wrong, or that what is measured has jumped, as a flipped antenna's heading:
+then the state that only this sensor measures is forgotten by as much as the residual.
 """
 
 from math import log
@@ -45,6 +37,8 @@ from .record import COUNTERS, N_SLOW, N_SNAPSHOTS, N_STAMPS, WINDOW, FilterRecor
 RULES = ("clone", "ignore", "stored", "constant", "larsen", "buffer", "literal", "lag")
 CLONE, IGNORE, STORED, CONSTANT, LARSEN, BUFFER = range(6)
 """Codes of the field `late`."""
+NONE, PSEUDO, DUAL_RATE = range(3)
+"""Codes of the field `between`, the rule between samples."""
 
 DIRECT = -1  # a sample measures the states as they are
 DROPPED = -2
@@ -276,18 +270,8 @@ def _compute_covariance(f: FilterRecord, s: int, first: int, packet: Vector) -> 
 
 
 @jit
-def test_innovation(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
-    """Compute f.nis = residual^T S^-1 residual (f.residual) and compare it with the gate.
-
-    Args:
-        f: Memory of the filter.
-        s: Index of the slow sensor.
-        first: Clone of its first row, negative where it measures the states.
-        packet: Packet, shape (PACKET_WIDTH,).
-
-    Returns:
-        Whether the gate lets the sample pass.
-    """
+def _test_innovation(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
+    """Compute f.nis = residual^T S^-1 residual (f.residual); return whether it passes the gate."""
     p, S = f.rows[s], f.S
     _compute_covariance(f, s, first, packet)
     nis = 0.0
@@ -389,7 +373,7 @@ def check_sample(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
     Returns:
         True for a sample to use.
     """
-    passed = test_innovation(f, s, first, packet)
+    passed = _test_innovation(f, s, first, packet)
     if f.wary == 0:
         return passed
     if not passed and f.believed[s] >= 0:

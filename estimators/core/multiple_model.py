@@ -1,21 +1,9 @@
 """Estimators of several records: the second layer of double-layer-gps, or a bank and its mixture.
 
-The second layer has velocities and roll, measured by the GPS and the first layer.
-
-A bank: a filter that has settled on its tyres takes seconds to believe that they changed. Every
-half second the least likely member becomes a copy of the likeliest that has forgotten the tyres, at
-the odds of such a change, and whose tyres walk until the next one begins, since the change may come
-later; what is measured makes one or the other likelier. Members that would be twins of others at
-the start come with next to no weight, so that they begin anew first. Where members differ in the
-level of their disturbances, a place in the bank stays at its own. Layer 0 of an estimator
-with a bank is the mixture's mean and covariance, which nothing measures; its members follow.
-
-Or its four members interact, an interacting multiple model (Blom, Bar-Shalom 1988) of a Markov
-chain: nothing happens; a gust blows, whose force and moment walk; the tyres have just changed, and
-walk; they settle. Every fifth of a second each one is merged, mean and covariance, with what
-comes from the others at the chain's odds: a gust that begins adds its variance to the forces, one
-that ends leaves them as they are without it, tyres that change are forgotten. What a gust does is
-seen only after some tenths of a second: until then merging lets the hypothesis live.
+The second layer has velocities and roll, measured by the GPS and the first layer. A bank's layer 0
+is the mixture's mean and covariance. Every half second its least likely member becomes a copy of
+the likeliest that forgets the tyres. Or four members interact (IMM, Blom and Bar-Shalom 1988):
+nothing happens, a gust blows, the tyres have just changed, they settle.
 """
 
 from math import exp, log
@@ -32,10 +20,11 @@ from .packets import process_packet, process_sample
 from .record import COUNTERS, WINDOW, FilterRecord, FilterRecords, GainTables, Vector
 
 MIN_LOG_WEIGHT = -60.0  # of a member's weight, below the likeliest
-CALM, GUSTY, CHANGED, SETTLING = range(1, 5)
+CALM, GUSTY, CHANGED, _SETTLING = range(1, 5)
 """Layers of the members that interact."""
-GUST_RATE, LULL_RATE = 0.03, 0.3  # 1/s, of gusts that begin and end
-CHANGE_RATE, SETTLE_RATE, TRUST_RATE = 0.1, 2.0, 0.3  # 1/s, of tyres: into CHANGED, SETTLING, CALM
+_GUST_RATE, _LULL_RATE = 0.03, 0.3  # 1/s, of gusts that begin and end
+# 1/s, of tyres: into CHANGED, SETTLING, CALM
+_CHANGE_RATE, _SETTLE_RATE, _TRUST_RATE = 0.1, 2.0, 0.3
 
 
 @jit
@@ -122,6 +111,9 @@ def _set_level(f: FilterRecord, i: int, level: Any) -> None:
 def replace_least_likely(layers: FilterRecords) -> None:
     """Replace the least likely member by the likeliest with tyres that may have changed.
 
+    Its tyres walk until the next one begins, since the change may come later. Where members differ
+    in the level of their disturbances, a place in the bank stays at its own.
+
     Args:
         layers: Memory of the bank, shape (layers,).
     """
@@ -205,25 +197,28 @@ def _remove_gust(f: FilterRecord) -> None:
 def run_imm_step(layers: FilterRecords) -> None:
     """Run a step of the Markov chain on the members' moments and weights; layer 0 is its scratch.
 
+    A gust that begins adds its variance to the forces, one that ends leaves them as they are
+    without it, tyres that change are forgotten.
+
     Args:
         layers: Memory of the bank, shape (1 + 4,).
     """
     best, calmed = _find_likeliest(layers), layers[0]
     calm, gusty, changed = layers[CALM], layers[GUSTY], layers[CHANGED]
-    settling, max_weight, time = layers[SETTLING], layers[best].weight, calm.respawn * calm.step
+    settling, max_weight, time = layers[_SETTLING], layers[best].weight, calm.respawn * calm.step
     for m in range(1, len(layers)):
         layers[m].weight = exp(maximum(layers[m].weight - max_weight, MIN_LOG_WEIGHT))
     _copy_moments(gusty, calmed)
     _remove_gust(calmed)
-    calm_probability = _split_weight(gusty, LULL_RATE * time)
-    share = _merge(calm, _split_weight(calm, GUST_RATE * time), gusty)
+    calm_probability = _split_weight(gusty, _LULL_RATE * time)
+    share = _merge(calm, _split_weight(calm, _GUST_RATE * time), gusty)
     for i in range(2):
         inflate_covariance(gusty, gusty.dense + i, share * gusty.burst[i])
     _merge(calmed, calm_probability, calm)
     _copy_moments(calm, calmed)
-    change_probability = _split_weight(calm, CHANGE_RATE * time)
-    _merge(settling, _split_weight(settling, TRUST_RATE * time), calm)
-    _merge(changed, _split_weight(changed, SETTLE_RATE * time), settling)
+    change_probability = _split_weight(calm, _CHANGE_RATE * time)
+    _merge(settling, _split_weight(settling, _TRUST_RATE * time), calm)
+    _merge(changed, _split_weight(changed, _SETTLE_RATE * time), settling)
     share = _merge(calmed, change_probability, changed)
     for i in range(2):
         inflate_covariance(changed, changed.tyres + i, share * changed.spread)

@@ -1,13 +1,9 @@
 """One filter's memory: a single record that compiled code reads and writes in place.
 
-A filter is its record, so a copy of the record is a complete snapshot and an array of records is
-a batch. Sizes are fixed so that every filter runs on the same compiled code; which fields a filter
-uses depends on four codes, and the comments name them:
-
-    kind     of model, `transition`                 between  slow samples, `intersample`
-    late     rule for late samples, `delay`         periodic 1: gains from a table, 0: from P
-
-`design.assemble` writes the blocks from the model to the gains once; `run.begin` sets the rest.
+A copy of the record is a complete snapshot and an array of records is a batch. Sizes are fixed,
+so every filter runs on the same compiled code. The codes `kind` (of model), `late` (rule for late
+samples), `between` (rule between samples) and `periodic` (1: gains from a table, 0: from P) say
+which fields are used. `design.assemble` writes all up to the gains, `filter.reset_filter` the rest.
 """
 
 import math
@@ -270,11 +266,8 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
     ("past_speed", _FLOAT, (WINDOW,)),  # the model's
     ("past_turning", _FLOAT, (WINDOW,)),
     ("past_road_turn", _FLOAT, (WINDOW,)),  # and with `predicted`
-    (
-        "snapshot_x",
-        _FLOAT,
-        (N_SNAPSHOTS + 1, N_CORE),
-    ),  # the last is "now", while the past is redone
+    # the last snapshot is "now", while the past is redone
+    ("snapshot_x", _FLOAT, (N_SNAPSHOTS + 1, N_CORE)),
     ("snapshot_P", _FLOAT, (N_SNAPSHOTS + 1, N_CORE, N_CORE)),
     ("recent", _FLOAT, (N_RECENT, PACKET_WIDTH)),
     ("recent_r", _FLOAT, (N_RECENT, N_ROWS)),  # r when each of them came
@@ -292,19 +285,8 @@ def _count_numbers(field: Any) -> int:
 
 _LEADING = (  # what a tick in lanes reads or writes by the record, next to another
     *("n", "total", "periodic", "members", "measured", "speed", "speed_before", "model_speed"),
-    *(
-        "tick",
-        "has_started",
-        "cell",
-        "at",
-        "cursor",
-        "road_turn",
-        "period",
-        "next",
-        "y",
-        "u",
-        "counts",
-    ),
+    *("tick", "has_started", "cell", "at", "cursor", "road_turn", "period", "next"),
+    *("y", "u", "counts"),
     *("x", "P"),
 )
 _RANK = dict(zip(_LEADING, range(len(_LEADING)), strict=True))

@@ -9,7 +9,17 @@ import numpy as np
 from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
-from ..core.innovation import BUFFER, CONSTANT, IGNORE, LARSEN, RULES, STORED
+from ..core.innovation import (
+    BUFFER,
+    CONSTANT,
+    DUAL_RATE,
+    IGNORE,
+    LARSEN,
+    NONE,
+    PSEUDO,
+    RULES,
+    STORED,
+)
 from ..core.model import KINEMATIC, MIN_SPEED, VELOCITY_ROLL
 from ..core.multiple_model import CHANGED, GUSTY, MIN_LOG_WEIGHT
 from ..core.record import (
@@ -22,7 +32,6 @@ from ..core.record import (
     WINDOW,
     FilterRecord,
 )
-from ..core.update import DUAL_RATE, NONE, PSEUDO
 from .config import FilterConfig
 from .kalman import kalman_gain
 from .models import NONLINEAR, write_model

@@ -11,9 +11,8 @@ from functools import lru_cache
 import numpy as np
 
 from ...envs.record import Array
-from ..core.innovation import CLONE, CONSTANT, STORED
+from ..core.innovation import CLONE, CONSTANT, DUAL_RATE, PSEUDO, STORED
 from ..core.record import FilterRecord
-from ..core.update import DUAL_RATE, PSEUDO
 from .config import FilterConfig
 from .dual_rate import frame_map
 from .kalman import transition_matrix

@@ -1,11 +1,9 @@
-"""A correction at every tick, compiled: frames are gathered, and at each pace the network runs.
+"""The learned estimator: a filter, and a network that corrects its sideslip angle at each pace.
 
 A car's memory is one vector: some numbers, sums of the fast columns since the last pace, a ring
-of frames, and what the layers work on. Paces are counted from tick 0 of the episode, so that
-the estimate of a tick is the same for every control period. A frame that is not finite is no
-frame: the correction is dropped, and its history begins anew.
-
-The learned estimator: a filter, and a network that corrects its sideslip angle.
+of frames, and what the layers work on. Paces are counted from tick 0 of the episode, so that the
+estimate of a tick is the same for every control period. A frame that is not finite drops the
+correction, whose history begins anew.
 """
 
 import functools
@@ -104,27 +102,14 @@ def locate_stack(net: Any) -> Any:
     return HISTORY + net.sizes[0] // len(LAGS) * RING_FRAMES
 
 
-def compute_memory_size(net: CorrectionNet, states: int) -> int:
-    """Compute the size of a car's memory, in whole cache lines.
-
-    Args:
-        net: The net.
-        states: Number of the filter's states; states + 1 of its numbers stand at the end.
-
-    Returns:
-        Number of numbers.
-    """
+def _compute_memory_size(net: CorrectionNet, states: int) -> int:
+    """Compute the size of a car's memory, in whole cache lines; states: number of the filter's."""
     return (int(locate_stack(net) + net.sizes.sum()) + states + 8) // 8 * 8
 
 
 @jit
-def reset_memory(m: Any, first: int) -> None:
-    """Reset a memory; the car's mass stays.
-
-    Args:
-        m: Memory of the correction, shape (memory_size,).
-        first: Tick of the first fast row.
-    """
+def _reset_memory(m: Any, first: int) -> None:
+    """Reset a memory to the tick before the first fast row; the car's mass stays."""
     for i in range(len(m)):
         m[i] *= 1.0 if i == MASS else 0.0
     m[TICK_PLACE] = first - 1.0
@@ -317,7 +302,7 @@ class LearnedEstimator:
             )
         self.base, self.names, self.correction = base, base.names, correction
         self.net = make_net(correction, base.names)
-        self.memory = np.zeros(compute_memory_size(self.net, len(base.names)))
+        self.memory = np.zeros(_compute_memory_size(self.net, len(base.names)))
         self.memory[MASS] = vehicle.mass
         self.reset(base.sensors, 0)
 
@@ -329,7 +314,7 @@ class LearnedEstimator:
             first: Tick of the first fast row.
         """
         self.base.reset(sensors, first)
-        reset_memory(self.memory, first)
+        _reset_memory(self.memory, first)
 
     def step(self, rows: Array, packets: Array) -> None:
         """Process fast rows and packets as `EstimatorLike.step` does.
