@@ -32,9 +32,9 @@ from ..core.record import (
     WINDOW,
     FilterRecord,
 )
-from .config import FilterConfig
 from .kalman import kalman_gain
 from .models import NONLINEAR, write_model
+from .options import FilterConfig
 from .periodic import NO_SENSOR, Schedule, build_measurement_rows, count_ticks
 
 

@@ -1,18 +1,16 @@
-"""The options of a filter: `FilterConfig` holds them, `parse_config` parses and checks them.
-
-Each error names filter, option and value.
-"""
+"""The options of a call, parsed to a `FilterConfig`; each error names filter, option and value."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
+from ...envs.validation import describe_unknown
 from ..core.innovation import RULES
 from ..core.record import N_KNOTS
 from ..filters import FilterDefinition
@@ -29,7 +27,6 @@ from .models import (
     STATES,
     TYRES,
     WANDER,
-    FilterModel,
     make_bicycle_model,
 )
 from .options import (
@@ -39,8 +36,8 @@ from .options import (
     FIND,
     NOISE,
     TUNINGS,
-    OptionReader,
 )
+from .options import FilterConfig as FilterConfig
 
 _GATE_PROBABILITY = 1.0 - 1e-9
 _MIN_SATELLITES = 4.0  # double-layer-gps 4.3
@@ -50,111 +47,90 @@ _MAX_MEMBERS = 8
 _N_IMM_MEMBERS = 4
 
 
-@dataclass(frozen=True, kw_only=True)
-class FilterConfig:
-    """Decisions about a filter before its design: its name in `FILTERS` and its options.
+_Fits = Callable[[float], bool]
 
-    Options, as `make_estimator` takes them
-    ---------------------------------------
-    slow: the slow sensor to use (default: the first of the row's that is there). A filter with
-        gains "covariance" also takes several.
-    gains: "periodic" (precomputed for a schedule that repeats) or "covariance"; of dual-rate
-        "constant", "from-29" or "placed" (with poles).
-    delay: the rule for late samples, see `sideslip.estimators.core.innovation`: "clone" or "buffer"
-        (exact), "larsen", "stored", "constant" (with assumed_delay, s), "literal", "lag", "ignore".
-    between: of single-rate-kf, "hold" (default) or "predict" between its steps.
-    intersample: of double-layer "pseudo-residual" (default) or "predict"; of dual-rate "pseudo"
-        (default), "predict", "hold" or "oh".
-    inverse: the generalised inverse of the pseudo-residual rule, "moore-penrose", "p-weighted",
-        "tikhonov" or "bayes".
-    poles: negative numbers in rad/s, one for each state, where gains are placed: of the filter's
-        error, of dual-rate as `sideslip.estimators.DualRate` says.
-    disturbances: of a bicycle, "none", "walk" (d1 and d2 push beta and gamma), "walk-all" (d3
-        pushes psi) or "forces" (an Ornstein-Uhlenbeck force and moment).
-    leak: 1/s, by which disturbances decay on top of that.
-    fast: of exact-kf, course-kf and dakf, what is measured in every row: "gyro" (default), and any
-        of "accel_y" and "roll_rate", with which the body rolls: states phi and phi_rate.
-    front_tyres_sd, rear_tyres_sd, inverse_friction_sd: of the same, above 0 (default of all but
-        joint) states: factors on both stiffnesses, and the reciprocal of friction, tyres having no
-        limit where it is known. The model is then expanded at the estimate (an EKF).
-    accel_scale_sd: of joint, above 0 (default) a state: the fraction by which the accelerometer
-        measures too much, as one does whose roll is not known.
-    bias_sd (rad/s), accel_bias_sd (m/s2), bank_sd (rad): of the same, above 0 (default) a state
-        `bias`, `accel_bias` or `bank`, a constant of this deviation that the sensor adds, or by
-        which the road leans, the left side up; with q_bias, ... it walks, with bias_time, ... (s)
-        above 0 it wanders about 0 with that deviation and forgets within that time.
-    q_beta, q_gamma, ...: process noise of a state per second, (unit)^2/s; or Q, (n, n) or (n,)
-        (default: of `tunings.toml`).
-    gyro_noise (rad/s), psi_noise (rad), y_l_noise (m), course_noise (rad at every speed; default
-        0.14 deg at 60 km/h growing as 1/V), accel_y_noise (m/s2), roll_rate_noise (rad/s),
-        wheel_noise, gps_speed_noise (m/s): standard deviations.
-    hdop_table: pairs (HDOP, factor on the GPS's noise), linear in between; None for one noise at
-        every HDOP (default: the factor is the HDOP for double-layer, None for the others).
-    satellites: the least that a GPS fix needs (default 4).
-    robust: standard deviations of an innovation from which it counts less (Huber); 0: none does.
-    steer_rate: rad/s; a steering angle that changes faster is skipped until the next row confirms
-        it; 0 (default of all but joint-robust): none is.
-    force_share, moment_share: fractions of the car's weight, and of that at half the wheelbase,
-        that are added to force_sd and moment_sd, as variances (default 0).
-    model_error: of joint, the fraction of the axles' forces by which its tyres err, added likewise.
-    accel_time: s; above 0 the accelerometer's noise is found while driving, over so long; then
-        `accel_y_noise` is the least.
-    members: of joint, the number of filters side by side, of which the least likely forgets the
-        tyres twice a second (default: one for each of `levels`).
-    levels: of joint, factors on force_sd and moment_sd, or pairs of one for each, which its members
-        take in turn; the likeliest counts most (default (1,)).
-    sudden: of joint, True runs four filters side by side that interact: nothing happens, a gust
-        blows, the tyres have just changed, they settle; then neither members nor levels.
-    gate: a probability; a sample whose innovation is less likely than 1 - gate is skipped.
-    wary: 0 is off (default; joint and joint-robust have 10). Above, with delay "clone" or "buffer":
-        a packet that repeats the last one while the car moves is skipped; the gate is 1 - 1e-9
-        where none is configured, a sensor's first sample passes it, and after so many gated samples
-        in a row that agree with each other the filter begins anew with the sensor.
-    adapt: fraction of a new innovation in an R that follows them (0: R as configured).
-    force_sd (N), moment_sd (N m), disturbance_time (s): of disturbances that are forces.
-    latency: s by which fast channels (steer, gyro, accel_x, accel_y, roll_rate, wheels) stand too
-        late in the record, {"gyro": 0.06}; "find" for one that joint finds while driving.
-    prior: standard deviations of states at the start, by state.
-    allow_unstable: build a filter whose error grows.
-    """
 
-    name: str
-    row: FilterDefinition
-    sensors: Mapping[str, SlowSensor]  # `slow`, in the order of SLOW_NAMES
-    models: tuple[FilterModel, ...]  # of each layer
-    gains: str  # "": the row's, where that can be
-    delay: str
-    assumed_delay: float
-    between: str
-    intersample: str
-    inverse: str
-    poles: tuple[float, ...]
-    leak: float
-    Q: Array  # (n, n) per second, of the states of all layers
-    noise: Mapping[str, float]  # standard deviations, names without "_noise"; force, moment, time
-    noise_over_speed: Mapping[str, float]  # of those that grow as 1/V, times V in m/s
-    hdop_table: tuple[tuple[float, float], ...]
-    satellites: float
-    gate: float | None
-    wary: int
-    members: int
-    levels: Array  # (count, 2), of force_sd, moment_sd
-    sudden: bool
-    robust: float
-    steer_rate: float
-    model_error: float
-    accel_time: float
-    shares: tuple[float, float]
-    times: Mapping[str, float]  # s, of biases
-    adapt: float
-    prior: Mapping[str, float]  # of all states
-    latency: Mapping[str, float | str]  # s, or "find", by channel; none that is punctual
-    allow_unstable: bool
+def _is_any_number(number: float) -> bool:
+    return True
 
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Names of the states of all layers."""
-        return tuple(self.prior)
+
+class _OptionReader:
+    """Keyword arguments of a filter by name; `check_unread` refuses those that were not read."""
+
+    def __init__(self, name: str, options: Mapping[str, Any]) -> None:
+        self.name, self._unread, self._known = name, dict(options), list[str]()
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._unread
+
+    def read_value(self, key: str, default: Any) -> Any:
+        """Read an option as it is."""
+        self._known.append(key)
+        return self._unread.pop(key, default)
+
+    def make_error(self, key: str, expected: str, value: Any) -> ValueError:
+        """Make the error for a value that an option cannot have; expected: "is ..."."""
+        return ValueError(f"{self.name}: {key} {expected}, got {value!r}")
+
+    def read_choice(self, key: str, default: str, known: Sequence[str]) -> str:
+        """Read an option that is one of some words; else ValueError."""
+        value = self.read_value(key, default)
+        if value not in known:
+            raise self.make_error(key, f"is one of {', '.join(filter(None, known))}", value)
+        return str(value)
+
+    def read_choices(
+        self, key: str, default: Sequence[str], known: Sequence[str]
+    ) -> tuple[str, ...]:
+        """Read the first of some words and any others, in the order of `known`; else ValueError."""
+        value = self.read_value(key, default)
+        words = list(value) if isinstance(value, list | tuple) else [value]
+        chosen = tuple(word for word in known if word in words)
+        if len(chosen) != len(words) or known[0] not in chosen:
+            raise self.make_error(key, f"is {known[0]!r} and any of {', '.join(known[1:])}", value)
+        return chosen
+
+    def read_non_negative(self, key: str, unit: str, default: float = 0.0) -> float:
+        """Read a number that is 0 or more."""
+        expected = f"is in {unit} and not negative"
+        return self.read_number(key, default, expected, lambda v: 0.0 <= v < np.inf)
+
+    def read_number(
+        self, key: str, default: float, expected: str = "", fits: _Fits = _is_any_number
+    ) -> float:
+        """Read an option that is a number; errors as in `check_number`."""
+        return self.check_number(key, self.read_value(key, default), expected, fits)
+
+    def read_positive(self, key: str, default: float) -> float:
+        """Read a number above zero."""
+        return self.read_number(
+            key, default, "must be positive and finite", lambda v: 0.0 < v < np.inf
+        )
+
+    def check_number(
+        self, key: str, value: Any, expected: str = "", fits: _Fits = _is_any_number
+    ) -> float:
+        """Convert to a number that fits; TypeError for no number, ValueError where it does not."""
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            raise TypeError(f"{self.name}: {key} is a number, got {value!r}") from None
+        if not fits(number):
+            raise self.make_error(key, expected, number)
+        return number
+
+    def read_array(self, key: str, value: Any) -> npt.NDArray[np.float64]:
+        """Convert an option's value to a new array of numbers; else TypeError."""
+        try:
+            return np.array(value, np.float64)
+        except (TypeError, ValueError):
+            raise TypeError(f"{self.name}: {key} holds numbers, got {value!r}") from None
+
+    def check_unread(self) -> None:
+        """Check that every option was read; else TypeError."""
+        if self._unread:
+            message = describe_unknown("option", sorted(self._unread), sorted(self._known))
+            raise TypeError(f"{self.name}: {message}")
 
 
 def parse_config(
@@ -177,7 +153,7 @@ def parse_config(
     Raises:
         reader.make_error: The ValueError for poles that are not one a state.
     """
-    reader = OptionReader(name, dict(row.options) | dict(options))
+    reader = _OptionReader(name, dict(row.options) | dict(options))
     used = _select_slow_sensors(row, sensors, reader)
     rules = _parse_rules(row, used, reader)
     fast, biases = _parse_inertial(row, reader)
@@ -228,7 +204,7 @@ def parse_config(
 
 
 def _select_slow_sensors(
-    row: FilterDefinition, available: Mapping[str, SlowSensor], reader: OptionReader
+    row: FilterDefinition, available: Mapping[str, SlowSensor], reader: _OptionReader
 ) -> tuple[str, ...]:
     """Select the slow sensors to use, in the order of `SLOW_NAMES`."""
     slow = reader.read_value("slow", None)
@@ -255,7 +231,7 @@ def _select_slow_sensors(
 
 
 def _parse_rules(
-    row: FilterDefinition, used: Sequence[str], reader: OptionReader
+    row: FilterDefinition, used: Sequence[str], reader: _OptionReader
 ) -> dict[str, Any]:
     """Parse how gains are computed, and what happens to late samples and between samples."""
     is_dual_rate, is_placed = row.intersample == "dual-rate", row.gains == "placed"
@@ -290,7 +266,7 @@ def _parse_rules(
 
 
 def _parse_inertial(
-    row: FilterDefinition, reader: OptionReader
+    row: FilterDefinition, reader: _OptionReader
 ) -> tuple[tuple[str, ...], dict[str, float]]:
     """Parse the fast sensors, and the standard deviations of their biases by state."""
     if row.model != "bicycle" or row.gains != "covariance" or row.second:
@@ -310,7 +286,7 @@ def _parse_inertial(
     return fast, {name: sd for name, sd in biases.items() if sd > 0.0}
 
 
-def _parse_gate(delay: str, reader: OptionReader) -> dict[str, Any]:
+def _parse_gate(delay: str, reader: _OptionReader) -> dict[str, Any]:
     """Parse `gate` and `wary` of a `FilterConfig`."""
     count = reader.read_number("wary", 0.0, "is a number of samples", lambda v: v in range(1000))
     wary = int(count) if delay in ("clone", "buffer") else 0
@@ -321,7 +297,7 @@ def _parse_gate(delay: str, reader: OptionReader) -> dict[str, Any]:
     return {"gate": gate, "wary": wary}
 
 
-def _parse_latency(reader: OptionReader, is_findable: bool) -> dict[str, float | str]:
+def _parse_latency(reader: _OptionReader, is_findable: bool) -> dict[str, float | str]:
     """Parse the latencies above zero (s, or `FIND` for one of them) by channel."""
     value: Any = reader.read_value("latency", {})
     if not isinstance(value, Mapping):
@@ -344,7 +320,7 @@ def _parse_latency(reader: OptionReader, is_findable: bool) -> dict[str, float |
     return latencies
 
 
-def _parse_noise(forces: bool, reader: OptionReader) -> tuple[dict[str, float], dict[str, float]]:
+def _parse_noise(forces: bool, reader: _OptionReader) -> tuple[dict[str, float], dict[str, float]]:
     """Parse `FilterConfig.noise` and `FilterConfig.noise_over_speed`."""
     rows = [row for sensor in MEASUREMENTS.values() for row in sensor.rows]
     speed_dependent = [
@@ -361,7 +337,7 @@ def _parse_noise(forces: bool, reader: OptionReader) -> tuple[dict[str, float], 
 
 
 def _parse_hdop_table(
-    row: FilterDefinition, reader: OptionReader
+    row: FilterDefinition, reader: _OptionReader
 ) -> tuple[tuple[float, float], ...]:
     """Parse the knots (HDOP, factor on the GPS's standard deviation), or none."""
     table = reader.read_value("hdop_table", row.hdop)
@@ -376,7 +352,7 @@ def _parse_hdop_table(
 
 
 def _parse_bank(
-    states: Sequence[str], forces: bool, delay: str, reader: OptionReader
+    states: Sequence[str], forces: bool, delay: str, reader: _OptionReader
 ) -> dict[str, Any]:
     """Parse `members`, `levels` and `sudden` of a `FilterConfig`."""
     value = reader.read_value("levels", (1.0,))
@@ -403,7 +379,7 @@ def _parse_bank(
 
 
 def _parse_process_noise(
-    states: Sequence[str], tuning: Mapping[str, float], reader: OptionReader
+    states: Sequence[str], tuning: Mapping[str, float], reader: _OptionReader
 ) -> Array:
     """Parse Q per second, shape (n, n): the tuning's or the option's, with each `q_STATE` in it."""
     n, matrix = len(states), reader.read_value("Q", None)
@@ -422,7 +398,7 @@ def _parse_prior(
     states: Sequence[str],
     noise: Mapping[str, float],
     biases: Mapping[str, float],
-    reader: OptionReader,
+    reader: _OptionReader,
 ) -> dict[str, float]:
     """Parse the standard deviation of every state at the start, in the state's unit."""
     deviations = {state: STATES[state].prior for state in states} | dict(biases)

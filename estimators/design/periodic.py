@@ -20,9 +20,9 @@ from ..core.covariance import update_with_clone, update_with_states
 from ..core.filter import reset_filter, reset_filters, run_tick
 from ..core.innovation import CLONE, DIRECT, DROPPED, DUAL_RATE, IGNORE, NONE, PSEUDO, find_clone
 from ..core.record import FilterRecord, FilterRecords, GainTables, Vector
-from .config import FilterConfig
 from .dual_rate import compute_shares, write_shares
 from .kalman import compute_inverse, observer_gain, transition_matrix
+from .options import FilterConfig
 
 
 def count_ticks(seconds: float, dt: float, label: str) -> int:

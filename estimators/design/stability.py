@@ -13,9 +13,9 @@ import numpy as np
 from ...envs.record import Array
 from ..core.innovation import CLONE, CONSTANT, DUAL_RATE, PSEUDO, STORED
 from ..core.record import FilterRecord
-from .config import FilterConfig
 from .dual_rate import frame_map
 from .kalman import transition_matrix
+from .options import FilterConfig
 from .periodic import Schedule, build_measurement_rows, design_gains
 
 MARGINAL = 1e-9
