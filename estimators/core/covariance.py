@@ -207,19 +207,27 @@ def project(f: FilterRecord, row: Vector) -> Any:
 
 
 @jit
-def project_clone(f: FilterRecord, clone: int) -> Any:
-    """Compute f.PC = P C^T of a measurement of one clone.
+def _project_clone(f: FilterRecord, clone: int) -> Any:
+    """Compute f.PC = P C^T of a measurement of one clone; return C P C^T."""
+    for i in range(f.total):
+        f.PC[i] = f.P[clone, i]
+    return f.PC[clone]
+
+
+@jit
+def project_row(f: FilterRecord, s: int, i: int, first: int) -> Any:
+    """Compute f.PC = P C^T of a sensor's row.
 
     Args:
         f: Memory of the filter.
-        clone: Index of the clone in x.
+        s: Index of the slow sensor.
+        i: Index of its row.
+        first: Clone of its first row, negative where it measures the states.
 
     Returns:
         C P C^T.
     """
-    for i in range(f.total):
-        f.PC[i] = f.P[clone, i]
-    return f.PC[clone]
+    return _project_clone(f, first + i) if first >= 0 else project(f, f.C[s, i])
 
 
 @jit
@@ -247,23 +255,6 @@ def update_with_clone(f: FilterRecord, clone: int, r: Any, residual: Any) -> Non
         r: Variance of the noise.
         residual: Measurement minus its prediction.
     """
-    variance = project_clone(f, clone) + r
+    variance = _project_clone(f, clone) + r
     _update_weight(f, variance, residual)
     correct_scalar(f, variance, residual)
-
-
-@jit
-def clone_covariance(f: FilterRecord, row: Vector, clone: int) -> None:
-    """Write the covariance of a new clone of a combination of the states.
-
-    Args:
-        f: Memory of the filter.
-        row: The combination, shape (n,).
-        clone: Index of the clone in x.
-    """
-    variance = project(f, row)
-    N, P, PC = f.total, f.P, f.PC
-    for i in range(N):
-        P[clone, i] = PC[i]
-        P[i, clone] = PC[i]
-    P[clone, clone] = variance

@@ -14,20 +14,8 @@ from ...envs.numerics.jit import copy_into, jit, jit_nrt, noinline
 from ...envs.numerics.primitives import maximum, sqrt
 from ...envs.record import FAST, PACKET
 from .innovation import BUFFER, store_due_captures
-from .model import (
-    CURVATURE,
-    LATERAL,
-    build_model,
-    compute_road_turn,
-    find_next_cell,
-)
-from .multiple_model import (
-    compute_mixture,
-    first_member,
-    process_packet_members,
-    update_bank,
-    update_second_layer,
-)
+from .model import CURVATURE, LATERAL, build_model, compute_road_turn, find_next_cell
+from .multiple_model import compute_mixture, replace_least_likely, run_imm_step, update_second_layer
 from .packets import apply_waiting, clear_history, process_packet, store_history
 from .predict import advance_state, linearise, read_fast_row
 from .record import (
@@ -203,10 +191,32 @@ def compute_deviation(f: FilterRecord, gains: GainTables, i: int) -> Any:
 
 
 @jit
+def _first_member(layers: FilterRecords) -> int:
+    """Return the first layer that measures: 1 where there is a bank, else 0."""
+    return 1 if layers[0].members > 0 else 0
+
+
+@jit
+def _process_packet_members(layers: FilterRecords, gains: GainTables, packet: Vector) -> None:
+    """Process a packet by every member behind the first one."""
+    for m in range(2, len(layers)):
+        process_packet(layers[m], gains, packet)
+
+
+@jit
+def _update_bank(layers: FilterRecords) -> None:
+    """Run the bank's own step: interact, or replace a member."""
+    if layers[0].burst[0] > 0.0:
+        run_imm_step(layers)
+    else:
+        replace_least_likely(layers)
+
+
+@jit
 def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Any, S: Any) -> None:
     """Write the states and standard deviations of all layers in row j of X and S (rows, n)."""
     column = 0
-    for layer in range(len(layers) if first_member(layers) == 0 else 1):
+    for layer in range(len(layers) if _first_member(layers) == 0 else 1):
         f = layers[layer]
         for i in range(f.n):
             X[j, column] = f.x[i]
@@ -230,7 +240,7 @@ def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Any) 
     offset, f = 0, layers[0]
     if len(P) > 0 and f.periodic == 1 and gains[f.cell, 0, 0] == 0.0:
         return False
-    for layer in range(len(layers) if first_member(layers) == 0 else 1):
+    for layer in range(len(layers) if _first_member(layers) == 0 else 1):
         f = layers[layer]
         for i in range(f.n):
             x[offset + i] = f.x[i]
@@ -272,7 +282,7 @@ def advance(
     Returns:
         Rows done; fewer than `rows` where the table `wanted` is missing: call again from there.
     """
-    first = first_member(layers)
+    first = _first_member(layers)
     f = layers[first]
     position, last = 0 if start == 0 else f.cursor, f.tick + rows - start
     for j in range(start, rows):
@@ -291,12 +301,12 @@ def advance(
             if len(nis) > 0:
                 nis[position] = f.nis
             if first > 0:
-                process_packet_members(layers, gains, packets[position])
+                _process_packet_members(layers, gains, packets[position])
             elif was_used and len(layers) > 1:
                 update_second_layer(f, layers[1], gains, packets[position])
             position += 1
         if first > 0 and f.tick % f.respawn == 0 and f.tick > f.start:
-            update_bank(layers)
+            _update_bank(layers)
         if first > 0 and (len(X) > 0 or j == rows - 1):
             compute_mixture(layers)
         if len(X) > 0:
@@ -346,9 +356,9 @@ def process_packet_all(layers: FilterRecords, gains: GainTables, packet: Vector)
         gains: Tables of gains, shape (cells, rows, columns).
         packet: Packet, shape (PACKET_WIDTH,).
     """
-    if first_member(layers) > 0:
+    if _first_member(layers) > 0:
         process_packet(layers[1], gains, packet)
-        process_packet_members(layers, gains, packet)
+        _process_packet_members(layers, gains, packet)
         compute_mixture(layers)
     elif process_packet(layers[0], gains, packet) and len(layers) > 1:
         update_second_layer(layers[0], layers[1], gains, packet)

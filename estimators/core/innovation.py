@@ -21,16 +21,9 @@ from typing import Any
 
 from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import jit
-from ...envs.numerics.primitives import maximum, minimum, sqrt
+from ...envs.numerics.primitives import sqrt
 from ...envs.record import PACKET
-from .covariance import (
-    clone_covariance,
-    dot,
-    predict_measurement,
-    project,
-    project_clone,
-    update_with_states,
-)
+from .covariance import dot, predict_measurement, project, project_row, update_with_states
 from .model import compute_row_variance
 from .record import COUNTERS, N_SLOW, N_SNAPSHOTS, N_STAMPS, WINDOW, FilterRecord, Vector
 
@@ -52,6 +45,17 @@ def get_direct() -> int:
 
 
 @jit
+def _clone_covariance(f: FilterRecord, row: Vector, clone: int) -> None:
+    """Write the covariance of a new clone of a combination (n,) of the states."""
+    variance = project(f, row)
+    N, P, PC = f.total, f.P, f.PC
+    for i in range(N):
+        P[clone, i] = PC[i]
+        P[i, clone] = PC[i]
+    P[clone, clone] = variance
+
+
+@jit
 def _clone_states(f: FilterRecord, s: int, slot: int) -> None:
     """Clone what sensor s captured at the last tick: tie-vision (12) at a trigger."""
     f.speed_captured[s, slot] = f.speed_before
@@ -61,7 +65,7 @@ def _clone_states(f: FilterRecord, s: int, slot: int) -> None:
         f.x[clone] = predict_measurement(f, s, i)
         f.e[clone] = dot(row, f.e, f.n)
         if f.periodic == 0:
-            clone_covariance(f, row, clone)
+            _clone_covariance(f, row, clone)
 
 
 @jit
@@ -185,7 +189,6 @@ def find_clone(f: FilterRecord, s: int, captured: int) -> int:
 
 
 _AGREEMENT_SD = 4.0  # standard deviations
-_MIN_SCALE, _MAX_SCALE = 0.05, 100.0  # of the scale of R
 
 
 @jit
@@ -241,22 +244,6 @@ def compute_packet_variance(f: FilterRecord, s: int, i: int, packet: Vector) -> 
     """
     factor = interpolate_hdop(f, s, packet)
     return _find_capture_variance(f, s, i, packet) * f.scale[s, i] * factor * factor
-
-
-@jit
-def project_row(f: FilterRecord, s: int, i: int, first: int) -> Any:
-    """Compute f.PC = P C^T of a sensor's row.
-
-    Args:
-        f: Memory of the filter.
-        s: Index of the slow sensor.
-        i: Index of its row.
-        first: Clone of its first row, negative where it measures the states.
-
-    Returns:
-        C P C^T.
-    """
-    return project_clone(f, first + i) if first >= 0 else project(f, f.C[s, i])
 
 
 @jit
@@ -390,23 +377,3 @@ def check_sample(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
             return False
     f.believed[s], f.doubts[s] = f.tick, 0
     return True
-
-
-@jit
-def adapt_noise(
-    f: FilterRecord, s: int, i: int, projected: float, residual: float, r: float
-) -> None:
-    """Adapt R to innovations: the mean of residual^2 - C P C^T, over the configured one.
-
-    Args:
-        f: Memory of the filter.
-        s: Index of the slow sensor.
-        i: Index of its row.
-        projected: C P C^T of the row.
-        residual: Measurement minus its prediction.
-        r: The sample's variance by the present scale.
-    """
-    if r > 0.0:
-        sample_scale = (residual * residual - projected) / r * f.scale[s, i]
-        scale = f.scale[s, i] + f.adapt * (sample_scale - f.scale[s, i])
-        f.scale[s, i] = minimum(maximum(scale, _MIN_SCALE), _MAX_SCALE)

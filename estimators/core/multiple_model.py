@@ -16,7 +16,7 @@ from ...envs.numerics.simd8 import load8, store8
 from ...envs.record import PACKET
 from .innovation import inflate_covariance, interpolate_hdop
 from .model import BETA, is_finite
-from .packets import process_packet, process_sample
+from .packets import process_sample
 from .record import COUNTERS, WINDOW, FilterRecord, FilterRecords, GainTables, Vector
 
 MIN_LOG_WEIGHT = -60.0  # of a member's weight, below the likeliest
@@ -64,32 +64,6 @@ def update_second_layer(
 
 
 @jit
-def first_member(layers: FilterRecords) -> int:
-    """Return the first layer that measures.
-
-    Args:
-        layers: Memory of the estimator, shape (layers,).
-
-    Returns:
-        1 where there is a bank, else 0.
-    """
-    return 1 if layers[0].members > 0 else 0
-
-
-@jit
-def process_packet_members(layers: FilterRecords, gains: GainTables, packet: Vector) -> None:
-    """Process a packet by every member behind the first one.
-
-    Args:
-        layers: Memory of the bank, shape (layers,).
-        gains: Tables of gains, shape (cells, rows, columns).
-        packet: Packet, shape (PACKET_WIDTH,).
-    """
-    for m in range(2, len(layers)):
-        process_packet(layers[m], gains, packet)
-
-
-@jit
 def _find_likeliest(layers: FilterRecords) -> int:
     best = 1
     for m in range(2, len(layers)):
@@ -118,12 +92,9 @@ def replace_least_likely(layers: FilterRecords) -> None:
         layers: Memory of the bank, shape (layers,).
     """
     best = _find_likeliest(layers)
-    max_weight, worst = layers[best].weight, 1
+    peak, worst = layers[best].weight, 1
     for m in range(1, len(layers)):
-        layers[m].weight, layers[m].fresh = (
-            maximum(layers[m].weight - max_weight, MIN_LOG_WEIGHT),
-            0.0,
-        )
+        layers[m].weight, layers[m].fresh = maximum(layers[m].weight - peak, MIN_LOG_WEIGHT), 0.0
         if layers[m].weight <= layers[worst].weight and m != best:
             worst = m
     f = layers[worst]
@@ -166,16 +137,8 @@ def _merge(source: FilterRecord, probability: Any, target: FilterRecord) -> Any:
     for j in range(0, target.total, 8):
         offset = load8(source.x, j) - load8(target.x, j)
         for i in range(target.total):
-            target_entry, spread = (
-                load8(target.P, i, j),
-                (source.x[i] - target.x[i]) * offset * product,
-            )
-            store8(
-                target.P,
-                target_entry + (load8(source.P, i, j) - target_entry) * share + spread,
-                i,
-                j,
-            )
+            entry, spread = load8(target.P, i, j), (source.x[i] - target.x[i]) * offset * product
+            store8(target.P, entry + (load8(source.P, i, j) - entry) * share + spread, i, j)
     for i in range(target.total):
         target.x[i] += share * (source.x[i] - target.x[i])
     return share
@@ -224,19 +187,6 @@ def run_imm_step(layers: FilterRecords) -> None:
         inflate_covariance(changed, changed.tyres + i, share * changed.spread)
     for m in range(1, len(layers)):
         layers[m].weight = log(layers[m].weight)
-
-
-@jit
-def update_bank(layers: FilterRecords) -> None:
-    """Run the bank's own step: interact, or replace a member.
-
-    Args:
-        layers: Memory of the bank, shape (layers,).
-    """
-    if layers[0].burst[0] > 0.0:
-        run_imm_step(layers)
-    else:
-        replace_least_likely(layers)
 
 
 @jit

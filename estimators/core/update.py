@@ -13,10 +13,10 @@ import numpy as np
 from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import jit, noinline
 from ...envs.numerics.packed import load_element, store_element
-from ...envs.numerics.primitives import absolute, maximum
+from ...envs.numerics.primitives import absolute, maximum, minimum
 from ...envs.numerics.simd8 import load8, store8
 from ...envs.record import PACKET
-from .covariance import dot, predict_measurement, update_with_clone, update_with_states
+from .covariance import dot, predict_measurement, project_row, update_with_clone, update_with_states
 from .innovation import (
     BUFFER,
     CONSTANT,
@@ -24,10 +24,8 @@ from .innovation import (
     LARSEN,
     PSEUDO,
     STORED_ONE,
-    adapt_noise,
     check_sample,
     compute_packet_variance,
-    project_row,
     propagate_larsen_gains,
 )
 from .innovation import NONE as NONE
@@ -188,6 +186,7 @@ def _apply_next_share(f: FilterRecord, gains: GainTables, s: int) -> None:
             _apply_share(f, gains, s)
 
 
+_MIN_SCALE, _MAX_SCALE = 0.05, 100.0  # of the scale of R
 _HEADING_TOLERANCE = 0.5  # rad: the first heading fix sets the heading where it is so far off
 
 
@@ -259,12 +258,23 @@ def _correct_periodic(
 
 
 @jit
+def _adapt_noise(
+    f: FilterRecord, s: int, i: int, projected: float, residual: float, r: float
+) -> None:
+    """Adapt R to innovations: the mean of residual^2 - C P C^T, over the configured one."""
+    if r > 0.0:
+        sample_scale = (residual * residual - projected) / r * f.scale[s, i]
+        scale = f.scale[s, i] + f.adapt * (sample_scale - f.scale[s, i])
+        f.scale[s, i] = minimum(maximum(scale, _MIN_SCALE), _MAX_SCALE)
+
+
+@jit
 def _correct(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
     """Correct by the rows of a sample, one after the other, with the covariance."""
     for i in range(f.rows[s]):
         residual, r = f.residual[i], compute_packet_variance(f, s, i, packet)
         if f.adapt > 0.0:
-            adapt_noise(f, s, i, project_row(f, s, i, first), residual, r)
+            _adapt_noise(f, s, i, project_row(f, s, i, first), residual, r)
         if first >= 0:
             update_with_clone(f, first + i, r, residual)
         else:

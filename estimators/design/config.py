@@ -29,14 +29,7 @@ from .models import (
     WANDER,
     make_bicycle_model,
 )
-from .options import (
-    DISTURBANCE,
-    EXTRA_NOISE,
-    FAST_CHANNELS,
-    FIND,
-    NOISE,
-    TUNINGS,
-)
+from .options import DISTURBANCE, EXTRA_NOISE, FAST_CHANNELS, FIND, NOISE, TUNINGS
 from .options import FilterConfig as FilterConfig
 
 _GATE_PROBABILITY = 1.0 - 1e-9
@@ -90,10 +83,10 @@ class _OptionReader:
             raise self.make_error(key, f"is {known[0]!r} and any of {', '.join(known[1:])}", value)
         return chosen
 
-    def read_non_negative(self, key: str, unit: str, default: float = 0.0) -> float:
+    def read_non_negative(self, key: str, unit: str) -> float:
         """Read a number that is 0 or more."""
         expected = f"is in {unit} and not negative"
-        return self.read_number(key, default, expected, lambda v: 0.0 <= v < np.inf)
+        return self.read_number(key, 0.0, expected, lambda v: 0.0 <= v < np.inf)
 
     def read_number(
         self, key: str, default: float, expected: str = "", fits: _Fits = _is_any_number
@@ -103,9 +96,8 @@ class _OptionReader:
 
     def read_positive(self, key: str, default: float) -> float:
         """Read a number above zero."""
-        return self.read_number(
-            key, default, "must be positive and finite", lambda v: 0.0 < v < np.inf
-        )
+        expected = "must be positive and finite"
+        return self.read_number(key, default, expected, lambda v: 0.0 < v < np.inf)
 
     def check_number(
         self, key: str, value: Any, expected: str = "", fits: _Fits = _is_any_number

@@ -185,15 +185,7 @@ def write_shares(
     """
     steps, n, q = B.shape
     table[first : first + steps * q, :n] = B.transpose(0, 2, 1).reshape(steps * q, n)
-    _write_covariances(F, Q, C, R, B, table, behind)
-
-
-def _write_covariances(
-    F: Array, Q: Array, C: Array, R: Array, B: Array, table: Array, behind: int
-) -> None:
-    """Write the covariance of the error after each step, the limit of a long recursion."""
-    n, q = F.shape[0], len(C)
-    upper = np.triu_indices(n)
+    upper = np.triu_indices(n)  # covariances after each step: the limit of a long recursion
     P = np.zeros((n + q, n + q))  # of the error and the last innovation
     predict_map = np.eye(n + q)
     predict_map[:n, :n] = F

@@ -89,17 +89,11 @@ def find_packet_column(sensor: str, value: str) -> int:
 
 
 class StateInfo(NamedTuple):
-    """A state of a model.
-
-    Attributes:
-        unit: Its unit.
-        prior: Usual standard deviation at the start, in that unit.
-        bound: Bound of estimates in observations, in that unit.
-    """
+    """A state of a model; numbers are in its unit."""
 
     unit: str
-    prior: float
-    bound: float
+    prior: float  # usual standard deviation at the start
+    bound: float  # of estimates in observations
 
 
 STATES = {

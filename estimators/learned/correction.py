@@ -39,34 +39,24 @@ is added to beta (rad), the deviation of the sum (rad, 0: there is no correction
 HISTORY = SLIP_RATE + 1 + len(COLUMNS)
 
 
-class CorrectionNet(NamedTuple):
-    """A correction as compiled code takes it.
+class _CorrectionNet(NamedTuple):
+    """A correction as compiled code takes it."""
 
-    Attributes:
-        states: Places of the filter's states that are read, beta's among them.
-        beta: Place of beta among the filter's states.
-        mean: Mean of the inputs, shape (inputs,).
-        scale: Scale of the inputs, shape (inputs,).
-        clip: Bound of normalised inputs.
-        sizes: Sizes of the layers, inputs first.
-        numbers: Each layer's weights, (inputs, outputs) row by row, then its biases.
-    """
-
-    states: Any
-    beta: int
-    mean: Any
+    states: Any  # places of the filter's states that are read, beta's among them
+    beta: int  # place of beta among the filter's states
+    mean: Any  # of the inputs, shape (inputs,)
     scale: Any
-    clip: float
-    sizes: Any
-    numbers: Any
+    clip: float  # bound of normalised inputs
+    sizes: Any  # of the layers, inputs first
+    numbers: Any  # each layer's weights, (inputs, outputs) row by row, then its biases
 
 
 _INTEGERS, _FLOATS = np.zeros(1, np.int64), np.zeros(1)
-EXAMPLE = CorrectionNet(_INTEGERS, 0, _FLOATS, _FLOATS, 1.0, _INTEGERS, _FLOATS)
+EXAMPLE = _CorrectionNet(_INTEGERS, 0, _FLOATS, _FLOATS, 1.0, _INTEGERS, _FLOATS)
 """For `entry`: all nets have these types."""
 
 
-def make_net(correction: Correction, states: tuple[str, ...]) -> CorrectionNet:
+def make_net(correction: Correction, states: tuple[str, ...]) -> _CorrectionNet:
     """Make the net for a filter.
 
     Args:
@@ -78,7 +68,7 @@ def make_net(correction: Correction, states: tuple[str, ...]) -> CorrectionNet:
     """
     network = correction.network
     layers = zip(network.weights, network.biases, strict=True)
-    return CorrectionNet(
+    return _CorrectionNet(
         np.array([states.index(name) for name in correction.card.states], np.int64),
         states.index("beta"),
         np.array(network.mean),
@@ -94,7 +84,7 @@ def locate_stack(net: Any) -> Any:
     """Locate the stack of frames, which is the network's input, in a memory.
 
     Args:
-        net: `CorrectionNet`.
+        net: `_CorrectionNet`.
 
     Returns:
         Index of its first number.
@@ -102,7 +92,7 @@ def locate_stack(net: Any) -> Any:
     return HISTORY + net.sizes[0] // len(LAGS) * RING_FRAMES
 
 
-def _compute_memory_size(net: CorrectionNet, states: int) -> int:
+def _compute_memory_size(net: _CorrectionNet, states: int) -> int:
     """Compute the size of a car's memory, in whole cache lines; states: number of the filter's."""
     return (int(locate_stack(net) + net.sizes.sum()) + states + 8) // 8 * 8
 
@@ -145,26 +135,22 @@ def _write_frame(f: Any, gains: Any, m: Any, net: Any, offset: int) -> int:
 @jit
 def _run_layers(m: Any, net: Any, offset: int) -> int:
     """Run the network on the stack at a place, which it normalises; return the outputs' place."""
-    inputs, weight_offset = net.sizes[0], 0
+    inputs, at = net.sizes[0], 0
     for i in range(inputs):
         m[offset + i] = clip((m[offset + i] - net.mean[i]) * net.scale[i], 0.0 - net.clip, net.clip)
     for layer in range(len(net.sizes) - 1):
         outputs = net.sizes[layer + 1]
         z, sums = m[offset : offset + inputs], m[offset + inputs : offset + inputs + outputs]
-        copy_into(net.numbers[weight_offset + inputs * outputs :][:outputs], sums)
+        copy_into(net.numbers[at + inputs * outputs :][:outputs], sums)
         for i in range(0, inputs, 4):  # four at once: sums are loaded and stored less often
             a, b, c, d = z[i], z[i + 1], z[i + 2], z[i + 3]
             if layer > 0:
                 a, b, c, d = maximum(a, 0.0), maximum(b, 0.0), maximum(c, 0.0), maximum(d, 0.0)
-            first = net.numbers[weight_offset + i * outputs :]
+            first = net.numbers[at + i * outputs :]
             second, third, fourth = first[outputs:], first[2 * outputs :], first[3 * outputs :]
             for o in range(outputs):
                 sums[o] = sums[o] + a * first[o] + b * second[o] + c * third[o] + d * fourth[o]
-        weight_offset, offset, inputs = (
-            weight_offset + (inputs + 1) * outputs,
-            offset + inputs,
-            outputs,
-        )
+        at, offset, inputs = at + (inputs + 1) * outputs, offset + inputs, outputs
     return offset
 
 
@@ -198,7 +184,7 @@ def filter_and_correct(
         packets: Packets, shape (count or more, PACKET_WIDTH).
         count: Number of packets to take.
         m: Memory of the correction, shape (memory_size,).
-        net: `CorrectionNet`.
+        net: `_CorrectionNet`.
     """
     start, first_packet, empty, last = 0, 0, fast[:0], m[TICK_PLACE] + rows
     for j in range(rows):
@@ -209,23 +195,8 @@ def filter_and_correct(
                 is_last or not m[TICK_PLACE] < packets[end, PACKET.arrived] <= last
             ):
                 end += 1
-            fast_rows, due_packets, n_due = (
-                fast[start : j + 1],
-                packets[first_packet:end],
-                end - first_packet,
-            )
-            advance(
-                filters,
-                gains,
-                fast_rows,
-                len(fast_rows),
-                due_packets,
-                n_due,
-                0,
-                empty,
-                empty,
-                m[:0],
-            )
+            chunk, due, n_due = fast[start : j + 1], packets[first_packet:end], end - first_packet
+            advance(filters, gains, chunk, len(chunk), due, n_due, 0, empty, empty, m[:0])
             start, first_packet = j + 1, end
         if is_due:
             _update_correction(filters[0], gains, m, net)
@@ -242,7 +213,7 @@ def apply_correction(f: Any, m: Any, net: Any) -> None:
     Args:
         f: Memory of the filter.
         m: Memory of the correction, shape (memory_size,).
-        net: `CorrectionNet`.
+        net: `_CorrectionNet`.
     """
     b, n, row = net.beta, f.n, m[len(m) - f.n - 1 :]
     copy_into(f.P[b, :n], row)
@@ -261,7 +232,7 @@ def remove_correction(f: Any, m: Any, net: Any) -> None:
     Args:
         f: Memory of the filter.
         m: Memory of the correction, shape (memory_size,).
-        net: `CorrectionNet`.
+        net: `_CorrectionNet`.
     """
     b, n, row = net.beta, f.n, m[len(m) - f.n - 1 :]
     copy_into(row[:n], f.P[b])

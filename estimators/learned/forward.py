@@ -175,32 +175,18 @@ _MAX_EXPONENT = 40.0  # where e^-x is nothing beside 1
 
 
 class PackedNetwork(NamedTuple):
-    """A network as compiled code takes it.
+    """A network as compiled code takes it."""
 
-    Attributes:
-        mean: Mean of a frame, or of the stack.
-        scale: Scale of a frame, or of the stack.
-        clip: Bound of normalised inputs, infinite for none.
-        inputs: Number of entries of a frame.
-        history: Number of frames.
-        cells: `form` of each cell, shape (k, 4).
-        sizes: Sizes of the dense layers, inputs first.
-        activation: Place in `ACTIVATIONS`.
-        output: Place in `OUTPUTS`.
-        numbers: Numbers of each cell and layer in turn; a layer's are weights (inputs, outputs) row
-            by row, then biases.
-    """
-
-    mean: Array
+    mean: Array  # of a frame, or of the stack
     scale: Array
-    clip: float
-    inputs: int
-    history: int
-    cells: npt.NDArray[np.int64]
-    sizes: npt.NDArray[np.int64]
-    activation: int
-    output: int
-    numbers: Array
+    clip: float  # bound of normalised inputs, infinite for none
+    inputs: int  # entries of a frame
+    history: int  # frames
+    cells: npt.NDArray[np.int64]  # `form` of each cell, shape (k, 4)
+    sizes: npt.NDArray[np.int64]  # of the dense layers, inputs first
+    activation: int  # place in `ACTIVATIONS`
+    output: int  # place in `OUTPUTS`
+    numbers: Array  # of each cell, then of each layer: weights (inputs, outputs), biases
 
 
 @jit
