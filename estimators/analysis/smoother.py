@@ -139,7 +139,7 @@ def _smooth_blocks(
     undelayed: Estimator, fast: Array, packets: Array, lag: int
 ) -> tuple[Array, Array, Array]:
     """Compute smoothed states and standard deviations of all rows, and the packets' NIS."""
-    f, rows, n = undelayed.filters[0], len(fast), len(undelayed.names)
+    f, gains, rows, n = undelayed.filters[0], undelayed.gains, len(fast), len(undelayed.names)
     Q = np.array(f.Q[:n, :n])
     X, S, nis = np.empty((rows, n)), np.empty((rows, n)), np.full(len(packets), np.nan)
     span = min(2 * lag, rows)
@@ -151,9 +151,7 @@ def _smooth_blocks(
             array[: span - lag] = array[lag:]
         first, end = done - start, min(start + span, rows)
         views = (array[first : end - start] for array in blocks)
-        position = _filter_forwards(
-            f, undelayed.gains, fast[done:end], packets, position, nis, *views
-        )
+        position = _filter_forwards(f, gains, fast[done:end], packets, position, nis, *views)
         done = end
         x, std = _smooth_backwards(Q, *(array[: end - start] for array in blocks))
         stop = min(start + lag, rows)

@@ -158,18 +158,16 @@ def correct_scalar(f: FilterRecord, variance: Any, residual: Any) -> None:
         residual: Measurement minus its prediction.
     """
     N, x, P, PC, gain, step = f.total, f.x, f.P, f.PC, f.gain, vector_width(f.P)
-    inverse_variance = 1.0 / variance
+    inverse = 1.0 / variance
     if f.robust > 0.0:  # Huber's: the noise is what makes it `robust` deviations
-        deviations = absolute(residual) * sqrt(inverse_variance)
-        inverse_variance = inverse_variance * select(
-            deviations > f.robust, f.robust / deviations, 1.0
-        )
+        deviations = absolute(residual) * sqrt(inverse)
+        inverse = inverse * select(deviations > f.robust, f.robust / deviations, 1.0)
     for j in range(0, N, step):
         pc = load8(PC, j)
-        store8(gain, pc * inverse_variance, j)
-        store8(x, load8(x, j) + pc * inverse_variance * residual, j)
+        store8(gain, pc * inverse, j)
+        store8(x, load8(x, j) + pc * inverse * residual, j)
         for i in range(count_upper_rows(P, N, j)):
-            store8(P, load8(P, i, j) - inverse_variance * (load_element(PC, i) * pc), i, j)
+            store8(P, load8(P, i, j) - inverse * (load_element(PC, i) * pc), i, j)
 
 
 @jit

@@ -10,13 +10,22 @@ from typing import Any
 
 import numpy as np
 
+from ...envs.numerics.functions import sincos
 from ...envs.numerics.jit import copy_into, jit, jit_nrt, noinline
 from ...envs.numerics.primitives import maximum, sqrt
 from ...envs.record import FAST, PACKET
-from .innovation import BUFFER, store_due_captures
-from .model import CURVATURE, LATERAL, build_model, compute_road_turn, find_next_cell
-from .multiple_model import compute_mixture, replace_least_likely, run_imm_step, update_second_layer
-from .packets import apply_waiting, clear_history, process_packet, store_history
+from .innovation import BUFFER, interpolate_hdop, store_due_captures
+from .model import (
+    BETA,
+    CURVATURE,
+    LATERAL,
+    build_model,
+    compute_road_turn,
+    find_next_cell,
+    is_finite,
+)
+from .multiple_model import compute_mixture, replace_least_likely, run_imm_step
+from .packets import apply_waiting, clear_history, process_packet, process_sample, store_history
 from .predict import advance_state, linearise, read_fast_row
 from .record import (
     COUNTERS,
@@ -191,6 +200,36 @@ def compute_deviation(f: FilterRecord, gains: GainTables, i: int) -> Any:
 
 
 @jit
+def _update_second_layer(
+    first: FilterRecord, second: FilterRecord, gains: GainTables, packet: Vector
+) -> None:
+    """Correct the second layer by a packet as a velocity: v_x = V cos(beta), v_y = V sin(beta).
+
+    double-layer-gps (8)-(9), with the first layer's sideslip angle as it was predicted for the
+    captured tick. The noise along is the speed's, after the table of HDOP; the one across is that
+    of the angle, (V sigma_beta)^2, and of the speed, (sigma_V sin(beta))^2.
+    """
+    s, captured = int(packet[PACKET.sensor]), int(packet[PACKET.captured])
+    beta = first.x[BETA]
+    if captured >= maximum(first.start, first.tick - WINDOW + 1) and captured < first.tick:
+        beta = first.predicted[captured % WINDOW, BETA]
+    sine, cosine = sincos(beta)
+    V = packet[first.speed_column[s]]
+    if not is_finite(V):
+        first.counts[COUNTERS.invalid] += 1
+        return
+    velocity = second.sample
+    copy_into(packet, velocity)
+    velocity[PACKET.value] = V * cosine
+    velocity[PACKET.value + 1] = V * sine
+    factor = interpolate_hdop(first, s, packet)
+    speed_variance = second.r_speed * factor * factor
+    second.r[s, 0] = speed_variance
+    second.r[s, 1] = V * V * first.P[BETA, BETA] + speed_variance * sine * sine
+    process_sample(second, gains)
+
+
+@jit
 def _first_member(layers: FilterRecords) -> int:
     """Return the first layer that measures: 1 where there is a bank, else 0."""
     return 1 if layers[0].members > 0 else 0
@@ -303,7 +342,7 @@ def advance(
             if first > 0:
                 _process_packet_members(layers, gains, packets[position])
             elif was_used and len(layers) > 1:
-                update_second_layer(f, layers[1], gains, packets[position])
+                _update_second_layer(f, layers[1], gains, packets[position])
             position += 1
         if first > 0 and f.tick % f.respawn == 0 and f.tick > f.start:
             _update_bank(layers)
@@ -361,4 +400,4 @@ def process_packet_all(layers: FilterRecords, gains: GainTables, packet: Vector)
         _process_packet_members(layers, gains, packet)
         compute_mixture(layers)
     elif process_packet(layers[0], gains, packet) and len(layers) > 1:
-        update_second_layer(layers[0], layers[1], gains, packet)
+        _update_second_layer(layers[0], layers[1], gains, packet)

@@ -1,23 +1,18 @@
-"""Estimators of several records: the second layer of double-layer-gps, or a bank and its mixture.
+"""A bank of filters side by side, and its mixture: the mean and covariance in layer 0.
 
-The second layer has velocities and roll, measured by the GPS and the first layer. A bank's layer 0
-is the mixture's mean and covariance. Every half second its least likely member becomes a copy of
-the likeliest that forgets the tyres. Or four members interact (IMM, Blom and Bar-Shalom 1988):
-nothing happens, a gust blows, the tyres have just changed, they settle.
+Every half second the least likely member becomes a copy of the likeliest that forgets the tyres.
+Or four members interact, an interacting multiple model (Blom, Bar-Shalom 1988): nothing happens,
+a gust blows, the tyres have just changed, they settle.
 """
 
 from math import exp, log
 from typing import Any
 
-from ...envs.numerics.functions import sincos
-from ...envs.numerics.jit import copy_into, jit, noinline
+from ...envs.numerics.jit import jit, noinline
 from ...envs.numerics.primitives import maximum
 from ...envs.numerics.simd8 import load8, store8
-from ...envs.record import PACKET
-from .innovation import inflate_covariance, interpolate_hdop
-from .model import BETA, is_finite
-from .packets import process_sample
-from .record import COUNTERS, WINDOW, FilterRecord, FilterRecords, GainTables, Vector
+from .innovation import inflate_covariance
+from .record import FilterRecord, FilterRecords
 
 MIN_LOG_WEIGHT = -60.0  # of a member's weight, below the likeliest
 CALM, GUSTY, CHANGED, _SETTLING = range(1, 5)
@@ -25,42 +20,6 @@ CALM, GUSTY, CHANGED, _SETTLING = range(1, 5)
 _GUST_RATE, _LULL_RATE = 0.03, 0.3  # 1/s, of gusts that begin and end
 # 1/s, of tyres: into CHANGED, SETTLING, CALM
 _CHANGE_RATE, _SETTLE_RATE, _TRUST_RATE = 0.1, 2.0, 0.3
-
-
-@jit
-def update_second_layer(
-    first: FilterRecord, second: FilterRecord, gains: GainTables, packet: Vector
-) -> None:
-    """Correct the second layer by a packet as a velocity: v_x = V cos(beta), v_y = V sin(beta).
-
-    double-layer-gps (8)-(9), with the first layer's sideslip angle as it was predicted for the
-    captured tick. The noise along is the speed's, after the table of HDOP; the one across is that
-    of the angle, (V sigma_beta)^2, and of the speed, (sigma_V sin(beta))^2.
-
-    Args:
-        first: Memory of the first layer.
-        second: Memory of the second layer.
-        gains: Tables of gains, shape (cells, rows, columns).
-        packet: Packet that the first layer has used, shape (PACKET_WIDTH,).
-    """
-    s, captured = int(packet[PACKET.sensor]), int(packet[PACKET.captured])
-    beta = first.x[BETA]
-    if captured >= maximum(first.start, first.tick - WINDOW + 1) and captured < first.tick:
-        beta = first.predicted[captured % WINDOW, BETA]
-    sine, cosine = sincos(beta)
-    V = packet[first.speed_column[s]]
-    if not is_finite(V):
-        first.counts[COUNTERS.invalid] += 1
-        return
-    velocity = second.sample
-    copy_into(packet, velocity)
-    velocity[PACKET.value] = V * cosine
-    velocity[PACKET.value + 1] = V * sine
-    factor = interpolate_hdop(first, s, packet)
-    speed_variance = second.r_speed * factor * factor
-    second.r[s, 0] = speed_variance
-    second.r[s, 1] = V * V * first.P[BETA, BETA] + speed_variance * sine * sine
-    process_sample(second, gains)
 
 
 @jit

@@ -278,9 +278,9 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
 _FIELDS = _MODEL + _BANK + _FAST + _SLOW + _DELAY + _GAINS + _SPEED + _NOW + _BETWEEN + _SCRATCH
 
 
-def _count_numbers(field: Any) -> int:
-    """Count the numbers of a field."""
-    return math.prod(field[2]) if len(field) > 2 else 1
+def _count_numbers(row: Any) -> int:
+    """Count the numbers of a row."""
+    return math.prod(row[2]) if len(row) > 2 else 1
 
 
 _LEADING = (  # what a tick in lanes reads or writes by the record, next to another
@@ -290,13 +290,11 @@ _LEADING = (  # what a tick in lanes reads or writes by the record, next to anot
     *("x", "P"),
 )
 _RANK = dict(zip(_LEADING, range(len(_LEADING)), strict=True))
-_ORDER = sorted(
-    _FIELDS, key=lambda field: (_RANK.get(str(field[0]), len(_RANK)), _count_numbers(field))
-)
-_N_BEFORE_X = sum(_count_numbers(field) for field in _ORDER[: _RANK["x"]])
+_ORDER = sorted(_FIELDS, key=lambda row: (_RANK.get(str(row[0]), len(_RANK)), _count_numbers(row)))
+_N_BEFORE_X = sum(_count_numbers(row) for row in _ORDER[: _RANK["x"]])
 _N_PADDING = 8 - _N_BEFORE_X % 8  # with it x and P begin on cache lines
 FILTER = pad_to_cache_line([("padding", _FLOAT, (_N_PADDING,)), *_ORDER, *_WINDOW])
 X_OFFSET = _N_PADDING + _N_BEFORE_X  # numbers before x
 N_SMALL = sum(
-    _count_numbers(field) for field in _ORDER[len(_LEADING) :] if _count_numbers(field) <= 64
+    _count_numbers(row) for row in _ORDER[len(_LEADING) :] if _count_numbers(row) <= 64
 )  # behind P

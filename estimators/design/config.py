@@ -215,10 +215,8 @@ def _select_slow_sensors(
         if slow is not None and sensor not in row.slow:
             raise ValueError(f"{reader.name} can use {' or '.join(row.slow)}, got slow={slow!r}")
         if sensor not in available:
-            present_names = ", ".join(available) or "none"
-            raise ValueError(
-                f"{reader.name} needs the slow sensor {sensor}; there is: {present_names}"
-            )
+            present = ", ".join(available) or "none"
+            raise ValueError(f"{reader.name} needs the slow sensor {sensor}; there is: {present}")
     return tuple(sensor for sensor in SLOW_NAMES if sensor in requested)
 
 
@@ -265,12 +263,10 @@ def _parse_inertial(
         return row.fast, {}
     fast = reader.read_choices("fast", row.fast, INERTIAL)
     biases = {name: reader.read_non_negative(f"{name}_sd", STATES[name].unit) for name in BIASES}
-    known_tyres = [name for name in TYRES if not biases[name] > 0.0]
-    if known_tyres not in (list(TYRES), list(TYRES[2:]), []):
-        raise ValueError(
-            f"{reader.name}: {known_tyres[0]}_sd is above 0 where another tyre's state is"
-        )
-    if biases[SCALE] > 0.0 and TYRES[0] in known_tyres:
+    known = [name for name in TYRES if not biases[name] > 0.0]
+    if known not in (list(TYRES), list(TYRES[2:]), []):
+        raise ValueError(f"{reader.name}: {known[0]}_sd is above 0 where another tyre's state is")
+    if biases[SCALE] > 0.0 and TYRES[0] in known:
         raise ValueError(f"{reader.name}: {SCALE}_sd needs tyres among the states: {TYRES[0]}_sd")
     for name, sd in biases.items():
         if sd > 0.0 and BIASES[name] not in (*fast, ""):
@@ -315,17 +311,13 @@ def _parse_latency(reader: _OptionReader, is_findable: bool) -> dict[str, float 
 def _parse_noise(forces: bool, reader: _OptionReader) -> tuple[dict[str, float], dict[str, float]]:
     """Parse `FilterConfig.noise` and `FilterConfig.noise_over_speed`."""
     rows = [row for sensor in MEASUREMENTS.values() for row in sensor.rows]
-    speed_dependent = [
-        row.noise for row in rows if row.over_speed and f"{row.noise}_noise" not in reader
-    ]
-    levels = NOISE | EXTRA_NOISE
-    noise = {
-        key.removesuffix("_noise"): reader.read_positive(key, sd) for key, sd in levels.items()
-    }
+    growing = [row.noise for row in rows if row.over_speed and f"{row.noise}_noise" not in reader]
+    sds = NOISE | EXTRA_NOISE
+    noise = {key.removesuffix("_noise"): reader.read_positive(key, sd) for key, sd in sds.items()}
     if forces:
         keys = zip(("force", "moment", "time"), DISTURBANCE.items(), strict=True)
         noise |= {short: reader.read_positive(key, default) for short, (key, default) in keys}
-    return noise, {name: noise[name] * COURSE_SPEED for name in speed_dependent}
+    return noise, {name: noise[name] * COURSE_SPEED for name in growing}
 
 
 def _parse_hdop_table(
@@ -352,9 +344,8 @@ def _parse_bank(
     pairs = levels.reshape(-1, 1).repeat(2, 1) if levels.ndim < 2 else levels
     fits = pairs.shape[1:] == (2,) and 1 <= len(pairs) <= _MAX_MEMBERS
     if not (fits and (pairs > 0.0).all() and np.isfinite(pairs).all()):
-        raise reader.make_error(
-            "levels", f"are 1 to {_MAX_MEMBERS} positive factors or pairs", value
-        )
+        expected = f"are 1 to {_MAX_MEMBERS} positive factors or pairs"
+        raise reader.make_error("levels", expected, value)
     expected = f"is a number of filters from 1 to {_MAX_MEMBERS}"
     count = reader.read_number(
         "members", len(pairs), expected, lambda v: v in range(1, _MAX_MEMBERS + 1)

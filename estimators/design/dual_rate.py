@@ -146,9 +146,8 @@ def compute_shares(
         return np.concatenate([L[None], np.zeros((steps - 1, *L.shape))])
     if gains == "constant":
         L = L / steps  # every step takes its even share
-    return compute_pseudo_shares(
-        F, C, L, compute_inverse("moore-penrose", C, np.eye(len(F)), R) - L, steps
-    )
+    inverse = compute_inverse("moore-penrose", C, np.eye(len(F)), R)
+    return compute_pseudo_shares(F, C, L, inverse - L, steps)
 
 
 def frame_map(F: Array, C: Array, shares: Array) -> Array:

@@ -24,13 +24,11 @@ def check_covariance(name: str, M: Array, definite: bool = False) -> None:
         raise ValueError(f"{name} is not finite")
     if not np.allclose(M, M.T, rtol=1e-9, atol=0.0):
         raise ValueError(f"{name} is not symmetric")
-    min_eigenvalue = np.linalg.eigvalsh(M).min(initial=np.inf)
-    if min_eigenvalue < -1e-12 * np.abs(M).max(initial=1e-300):
-        raise ValueError(f"{name} is indefinite: its least eigenvalue is {min_eigenvalue:.3g}")
-    if definite and not min_eigenvalue > 0.0:
-        raise ValueError(
-            f"{name} must be positive definite: its least eigenvalue is {min_eigenvalue:.3g}"
-        )
+    lowest = np.linalg.eigvalsh(M).min(initial=np.inf)
+    if lowest < -1e-12 * np.abs(M).max(initial=1e-300):
+        raise ValueError(f"{name} is indefinite: its least eigenvalue is {lowest:.3g}")
+    if definite and not lowest > 0.0:
+        raise ValueError(f"{name} must be positive definite: its least eigenvalue is {lowest:.3g}")
 
 
 _RIDGE = 1e-3  # lambda of Tikhonov's inverse, in SI units squared

@@ -103,16 +103,14 @@ def _iterate_gains(
     """
     f = filters[0]
     reset_filter(f, 0)
-    n, size, cycle, width = f.n, f.total, f.cycle, maximum(f.fasts, 1)
+    n, N, cycle, width = f.n, f.total, f.cycle, maximum(f.fasts, 1)
     for cycle_index in range(cycles):
         change = 0.0
         for step in range(cycle):
             run_tick(f, gains)
             if f.tick % f.pace == 0:
                 for i in range(f.fasts):
-                    change = maximum(
-                        change, _copy_gain(f.share[i], table[1 + step * width + i], size)
-                    )
+                    change = maximum(change, _copy_gain(f.share[i], table[1 + step * width + i], N))
             for frame in range(len(lags)):
                 captured = f.tick - lags[frame]
                 if (captured - frame * f.period[s]) % cycle != 0 or captured < 0:
@@ -120,16 +118,16 @@ def _iterate_gains(
                 first = find_clone(f, s, captured)
                 if first == DROPPED:
                     continue
-                for i in range(size):
-                    _copy_gain(f.P[i], before[i], size)
+                for i in range(N):
+                    _copy_gain(f.P[i], before[i], N)
                 for i in range(f.rows[s]):
                     if first == DIRECT:
                         update_with_states(f, f.C[s, i], f.r[s, i], 0.0)
                     else:
                         update_with_clone(f, first + i, f.r[s, i], 0.0)
                     to = table[1 + cycle * width + frame * f.rows[s] + i]
-                    change = maximum(change, _copy_gain(f.gain, to, size))
-            k = size
+                    change = maximum(change, _copy_gain(f.gain, to, N))
+            k = N
             for i in range(n):
                 for j in range(i, n):
                     table[1 + step * width, k] = f.P[i, j]
@@ -287,9 +285,8 @@ def _write_pseudo_gains(f: FilterRecord, schedule: Schedule, table: Array, inver
     cycle, frames, width = schedule.cycle, len(schedule.lags), max(int(f.fasts), 1)
     first = 1 + cycle * width + p * frames
     frame_gains = table[1 + cycle * width : first, :total].reshape(frames, p, total)
-    slow = np.mean(
-        [_combine_gains(gains, build_measurement_rows(f, 0)[m:]) for gains in frame_gains], axis=0
-    )
+    C = build_measurement_rows(f, 0)[m:]
+    slow = np.mean([_combine_gains(gains, C) for gains in frame_gains], axis=0)
     fast = table[1 : 1 + cycle * width, :total].reshape(cycle, width, total)[:, :m]
     # every step corrects by a pseudo-residual, so each takes its even fraction of the slow gain
     K = np.column_stack([fast.mean(0).T, slow.T / schedule.period])

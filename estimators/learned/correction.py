@@ -56,16 +56,8 @@ EXAMPLE = _CorrectionNet(_INTEGERS, 0, _FLOATS, _FLOATS, 1.0, _INTEGERS, _FLOATS
 """For `entry`: all nets have these types."""
 
 
-def make_net(correction: Correction, states: tuple[str, ...]) -> _CorrectionNet:
-    """Make the net for a filter.
-
-    Args:
-        correction: Network and card.
-        states: Names of the filter's states, all of the card's among them.
-
-    Returns:
-        The net.
-    """
+def _make_net(correction: Correction, states: tuple[str, ...]) -> _CorrectionNet:
+    """Make the net for a filter's states by name, all of the card's among them."""
     network = correction.network
     layers = zip(network.weights, network.biases, strict=True)
     return _CorrectionNet(
@@ -90,11 +82,6 @@ def locate_stack(net: Any) -> Any:
         Index of its first number.
     """
     return HISTORY + net.sizes[0] // len(LAGS) * RING_FRAMES
-
-
-def _compute_memory_size(net: _CorrectionNet, states: int) -> int:
-    """Compute the size of a car's memory, in whole cache lines; states: number of the filter's."""
-    return (int(locate_stack(net) + net.sizes.sum()) + states + 8) // 8 * 8
 
 
 @jit
@@ -272,8 +259,9 @@ class LearnedEstimator:
                 f"ticks of {base.dt:g} s"
             )
         self.base, self.names, self.correction = base, base.names, correction
-        self.net = make_net(correction, base.names)
-        self.memory = np.zeros(_compute_memory_size(self.net, len(base.names)))
+        self.net = _make_net(correction, base.names)
+        n_numbers = int(locate_stack(self.net) + self.net.sizes.sum()) + len(base.names) + 1
+        self.memory = np.zeros((n_numbers + 7) // 8 * 8)  # whole cache lines
         self.memory[MASS] = vehicle.mass
         self.reset(base.sensors, 0)
 

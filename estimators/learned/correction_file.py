@@ -67,11 +67,9 @@ class CorrectionCard:
             raise ValueError(f"a correction's base is {', '.join(allowed)}, got {self.base!r}")
         if not isinstance(self.states, list | tuple) or "beta" not in self.states:
             raise ValueError(f"a correction reads its filter's beta, got states {self.states!r}")
-        reserved = sorted({"vehicle", "sensors", "dt", "speed"} & self.base_options.keys())
-        if reserved:
-            raise ValueError(
-                f"base_options hold what the env tells a filter: {', '.join(reserved)}"
-            )
+        taken = sorted({"vehicle", "sensors", "dt", "speed"} & self.base_options.keys())
+        if taken:
+            raise ValueError(f"base_options hold what the env tells a filter: {', '.join(taken)}")
 
     @property
     def inputs(self) -> int:

@@ -112,10 +112,8 @@ class MovingAverages:
             object.__setattr__(self, name, single.astype(np.float64))
         object.__setattr__(self, "times", tuple(self.times))
         if self.weight_in.ndim != 2 or self.bias_in.shape != self.weight_in.shape[:1]:
-            shapes = self.weight_in.shape, self.bias_in.shape
-            raise ValueError(
-                f"traces have weights (units, inputs) and biases (units,), got {shapes}"
-            )
+            pair = self.weight_in.shape, self.bias_in.shape
+            raise ValueError(f"traces have weights (units, inputs) and biases (units,), got {pair}")
         if not 0 <= self.n_silu <= len(self.bias_in):
             raise ValueError(f"of {len(self.bias_in)} units {self.n_silu} cannot be bent")
         if not self.times or not all(0.0 < time <= _MAX_TIME for time in self.times):

@@ -407,10 +407,8 @@ def _compute_shapes(inputs: int, history: int, cells: list[Any], sizes: list[int
 def _check_tensors(tensors: Tensors, shapes: _Shapes) -> None:
     """Check the names, shapes and types of tensors; else ValueError."""
     if shapes.keys() != tensors.keys():
-        missing, unexpected = shapes.keys() - tensors.keys(), tensors.keys() - shapes.keys()
-        raise ValueError(
-            f"missing tensors: {sorted(missing)}; unexpected ones: {sorted(unexpected)}"
-        )
+        missing, extra = shapes.keys() - tensors.keys(), tensors.keys() - shapes.keys()
+        raise ValueError(f"missing tensors: {sorted(missing)}; unexpected ones: {sorted(extra)}")
     for name, allowed in shapes.items():
         kind = np.dtype(np.float64 if name in ("mean", "scale") else np.float32)
         tensor = tensors[name]
