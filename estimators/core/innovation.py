@@ -1,16 +1,5 @@
 """Late samples, and a sample's innovation: which one a filter uses, and how noisy it is.
 
-Rules for late samples, `RULES`: "clone": what is measured is cloned at each capture, so a late
-sample measures its clones, exactly; the delayed states of tie-vision (12)-(13) are these clones.
-They are made in the step after the capture, as (12) has it. Frame i is in slot i mod frames.
-"buffer": the window is filtered anew from the capture on (`packets`), exact for any clock.
-"larsen": the covariance takes the sample at its capture, the states when it arrives (Larsen 1998),
-exact where one sample is under way and none is lost. "stored": its residual against the prediction
-at the capture is used as if it were fresh, uneven-delay (15)-(16); "constant": the same, for an
-assumed delay. "literal", "lag": late states follow at every step, by one step (tie-vision (12) read
-literally at 1 ms) or by a first-order lag. "ignore": late samples are taken for fresh. What is
-older than a rule stores is refused and counted.
-
 A gate alone starves a filter that has lost itself. Gated samples in a row whose residuals agree
 show that the filter is wrong, or that what is measured has jumped, as a flipped antenna's heading:
 then the state that only this sensor measures is forgotten by as much as the residual.
@@ -28,6 +17,14 @@ from .model import compute_row_variance
 from .record import COUNTERS, N_SLOW, N_SNAPSHOTS, N_STAMPS, WINDOW, FilterRecord, Vector
 
 RULES = ("clone", "ignore", "stored", "constant", "larsen", "buffer", "literal", "lag")
+"""Rules for late samples; what is older than a rule stores is refused and counted.
+
+clone: what is measured is cloned in the step after each capture, so a late sample measures its
+clones, exactly (tie-vision (12)-(13)); frame i is in slot i mod frames. ignore: taken for fresh.
+stored: the residual against the prediction at the capture is used as if it were fresh, uneven-delay
+(15)-(16). constant: the same, for an assumed delay. larsen: the covariance takes it at its capture,
+the states when it arrives (Larsen 1998), exact for one under way and none lost. buffer: the window
+is filtered anew (`packets`), exact. literal, lag: late states follow by one step or a lag."""
 CLONE, IGNORE, STORED, CONSTANT, LARSEN, BUFFER = range(6)
 """Codes of the field `late`."""
 NONE, PSEUDO, DUAL_RATE = range(3)
@@ -281,10 +278,7 @@ def _test_innovation(f: FilterRecord, s: int, first: int, packet: Vector) -> boo
 
 @jit
 def _is_consistent(f: FilterRecord, s: int) -> bool:
-    """Return whether every residual agrees with the last gated one.
-
-    They agree within `_AGREEMENT_SD` standard deviations of a difference.
-    """
+    """Return whether every residual is within `_AGREEMENT_SD` deviations of the last gated one."""
     for i in range(f.rows[s]):
         difference, row_variance = f.residual[i] - f.doubt[s, i], 0.0
         if f.angle[s, i] == 1:

@@ -152,10 +152,7 @@ def _apply_tick_samples(
 
 @jit
 def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: int) -> bool:
-    """Filter anew from the snapshot at `first` to now, with a new sample.
-
-    Returns False, and all is as before, if the gate refuses the sample at the place `new_place`.
-    """
+    """Filter anew from `first` to now with a new sample; False, undone, if the gate refuses it."""
     now, invalid, count = f.tick, f.counts[COUNTERS.invalid], _collect_samples(f, first)
     _store_snapshot(f, _NOW_SLOT)
     _restore(f, _find_slot(f, first))
@@ -241,11 +238,7 @@ def _is_timely(f: FilterRecord, captured: Any, arrived: Any) -> bool:
 
 @jit
 def _is_frozen(f: FilterRecord, s: int, packet: Vector) -> bool:
-    """Return whether a packet repeats the sensor's last one while the car moves.
-
-    Two values or more, and all there are, are equal: noise repeats no number, and a receiver's
-    rounded course comes with a position.
-    """
+    """Return whether a packet of two values or more repeats the sensor's last while it moves."""
     last = f.last[s]
     if packet[PACKET.captured] == last[PACKET.captured]:  # a duplicate
         return False
@@ -261,10 +254,7 @@ def _is_frozen(f: FilterRecord, s: int, packet: Vector) -> bool:
 
 @jit
 def _is_valid(f: FilterRecord, packet: Vector) -> bool:
-    """Return whether a packet is for this filter and fit for use; what is not is counted.
-
-    Numbers are judged as floats, before any becomes an int.
-    """
+    """Return whether a packet is for this filter and fit for use; what is not is counted."""
     for i in range(PACKET.value):
         if not is_finite(packet[i]):
             f.counts[COUNTERS.invalid] += 1

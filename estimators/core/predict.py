@@ -49,12 +49,9 @@ def compute_signal(row: Vector, column: Vector, factor: Vector) -> Any:
 
 @jit
 def _estimate_noise(f: FilterRecord, accel_y: float) -> None:
-    """Estimate the variance of a_y from its second differences, which motion hardly has.
-
-    White noise of variance r gives them 6 r; what is far beyond counts as 9 times what is expected.
-    """
+    """Estimate the variance of a_y from its second differences, which motion hardly has."""
     second_difference = accel_y - 2.0 * f.y_past[0] + f.y_past[1]
-    if is_finite(second_difference):
+    if is_finite(second_difference):  # white noise gives it 6 r; far beyond counts as 9 r
         r = f.r_fast[f.accel_row]
         sample_variance = minimum(second_difference * second_difference * (1.0 / 6.0), 9.0 * r)
         f.r_fast[f.accel_row] = maximum(r + f.r_share * (sample_variance - r), f.r_told)
@@ -63,10 +60,7 @@ def _estimate_noise(f: FilterRecord, accel_y: float) -> None:
 
 @jit
 def _write_scale_column(f: FilterRecord) -> None:
-    """Write the accelerometer's prediction in the column of its scale's error.
-
-    At a standstill nothing of the scale is seen.
-    """
+    """Write the accelerometer's prediction in the column of its scale's error, 0 at standstill."""
     row = f.C_fast[f.accel_row]
     row[f.scaled] = 0.0
     if f.speed <= MIN_SPEED:

@@ -74,7 +74,8 @@ COUNTERS, CAR = SkipCounters(), CarIndex()
 
 _INT, _FLOAT = np.int64, np.float64
 
-_MODEL = [  # dx = A x + B u on the first `dense` states; those behind them decay by themselves
+_FIELDS = [
+    # model: dx = A x + B u on the first `dense` states; those behind them decay by themselves
     ("kind", _INT),
     ("n", _INT),  # states
     ("dense", _INT),
@@ -118,8 +119,7 @@ _MODEL = [  # dx = A x + B u on the first `dense` states; those behind them deca
     ("prior", _FLOAT, (N_CORE, N_CORE)),  # P at the start
     ("first", _FLOAT, (N_CORE,)),  # x at the start
     ("speed_state", _INT),  # the state that starts at the measured speed; -1: none
-]
-_BANK = [  # several filters beside each other, of which the first record is the mixture
+    # bank: several filters beside each other, of which the first record is the mixture
     ("members", _INT),  # records behind the mixture; 0: no bank
     ("weight", _FLOAT),  # of a member: the logarithm of its likelihood
     ("odds", _FLOAT),  # its weight at the start
@@ -130,8 +130,7 @@ _BANK = [  # several filters beside each other, of which the first record is the
     ("fresh", _FLOAT),  # variance of a step of a new member's tyres, until the next one begins
     ("alert", _FLOAT),  # what `fresh` is then
     ("burst", _FLOAT, (2,)),  # variances of a gust's force, moment; 0: members do not interact
-]
-_FAST = [  # inputs and fast measurements: sums of two columns of the fast row
+    # fast rows: inputs and fast measurements: sums of two columns of the fast row
     ("inputs", _INT),
     ("u_column", _INT, (N_INPUTS, 2)),
     ("u_factor", _FLOAT, (N_INPUTS, 2)),
@@ -150,8 +149,7 @@ _FAST = [  # inputs and fast measurements: sums of two columns of the fast row
     ("r_share", _FLOAT),  # of a new second difference in the variance of a_y; 0: as configured
     ("y_past", _FLOAT, (2,)),  # a_y of the two rows before
     ("robust", _FLOAT),  # standard deviations from which a residual counts less; 0: none does
-]
-_SLOW = [  # slow sensors: what each one measures, how noisy it is, when it captures
+    # slow sensors: what each one measures, how noisy it is, when it captures
     ("rows", _INT, (N_SLOW,)),  # of C
     ("C", _FLOAT, (N_SLOW, N_ROWS, N_CORE)),
     ("angle", _INT, (N_SLOW, N_ROWS)),  # 1: the residual is wrapped
@@ -177,15 +175,13 @@ _SLOW = [  # slow sensors: what each one measures, how noisy it is, when it capt
     ("stride", _INT),  # ticks of one step of the filter
     ("pace", _INT),  # ticks between two steps that listen to sensors
     ("origin", _INT),  # phase of a single-rate filter's steps
-]
-_DELAY = [  # the rule for late samples
+    # the rule for late samples
     ("late", _INT),
     ("frames", _INT, (N_SLOW,)),  # captured and not here yet, at most; CLONE, LARSEN
     ("first_clone", _INT, (N_SLOW,)),  # where the sensor's clones start in x; CLONE
     ("store_predictions", _INT),  # 1: `predicted` is filled; STORED, CONSTANT, below a second layer
     ("assumed", _INT),  # ticks; CONSTANT
-]
-_GAINS = [
+    # gains
     ("periodic", _INT),
     ("joint", _INT),  # 1: the rows of a sensor correct together, not one after the other
     ("between", _INT),
@@ -195,8 +191,7 @@ _GAINS = [
     ("high", _FLOAT),  # of the last one
     ("spacing", _FLOAT),  # m/s between tables; 0: one table
     ("inverse", _FLOAT, (N_FAST + N_ROWS, N_TOTAL)),  # transposed, of (20); PSEUDO, not periodic
-]
-_SPEED = [
+    # speed
     ("measured", _INT),  # 1: from the wheels, 0: fixed
     ("smoothing", _FLOAT),  # share of a new sample in the low-pass
     ("speed", _FLOAT),  # m/s, low-passed
@@ -206,8 +201,7 @@ _SPEED = [
     ("turning", _FLOAT),  # rad/s, the present model's yaw rate; KINEMATIC, VELOCITY_ROLL
     ("cell", _INT),  # the present table of gains
     ("wanted", _INT),  # the table that is missing; -1: none
-]
-_NOW = [
+    # state of the filter now
     ("start", _INT),  # tick of the first row
     ("tick", _INT),  # of the last row
     ("has_started", _INT),  # 1: there was a first step
@@ -240,16 +234,14 @@ _NOW = [
     # LARSEN: what the residual of a frame that is due will do to the states, and its expectation
     ("larsen_gain", _FLOAT, (N_SLOW, N_ROWS, N_CORE)),
     ("larsen_expected", _FLOAT, (N_SLOW, N_ROWS)),
-]
-_BETWEEN = [  # corrections between slow samples
+    # corrections between slow samples
     ("share", _FLOAT, (N_FAST + N_ROWS, N_TOTAL)),  # gains of a tick, fast, slow rows; not periodic
     ("e", _FLOAT, (N_TOTAL,)),  # estimated error, tie-vision (18); PSEUDO
     ("expected", _FLOAT, (N_ROWS,)),  # C x before this tick's corrections, slow rows; PSEUDO
     ("eps", _FLOAT, (N_FAST + N_ROWS,)),  # residuals of this tick: fast, slow rows; joint, PSEUDO
     ("innovation", _FLOAT, (N_ROWS,)),  # of the last sample; DUAL_RATE
     ("since", _INT),  # steps since it; -1: there was none; DUAL_RATE
-]
-_SCRATCH = [
+    # scratch
     ("u_new", _FLOAT, (N_INPUTS,)),
     ("PC", _FLOAT, (N_TOTAL,)),  # P C^T
     ("gain", _FLOAT, (N_TOTAL,)),  # of the last measurement
@@ -274,8 +266,6 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
     ("lost", _INT),  # captured tick of the newest packet that had to go
     ("replay", _INT, (N_RECENT,)),  # scratch: those that are used again
 ]
-
-_FIELDS = _MODEL + _BANK + _FAST + _SLOW + _DELAY + _GAINS + _SPEED + _NOW + _BETWEEN + _SCRATCH
 
 
 def _count_numbers(row: Any) -> int:

@@ -272,10 +272,7 @@ def _write_trust(f: FilterRecord, config: FilterConfig) -> None:
 
 
 def _make_schedules(f: FilterRecord, config: FilterConfig, dt: float) -> tuple[Schedule, ...]:
-    """Make the schedules of the first slow sensor: one, or two extremes for random delays.
-
-    A sample is used in the first step that listens at or after its arrival.
-    """
+    """Make the schedules of the first slow sensor: one, or two extremes for random delays."""
     if not config.sensors:
         return (NO_SENSOR,)
     name, sensor = next(iter(config.sensors.items()))
@@ -291,6 +288,7 @@ def _make_schedules(f: FilterRecord, config: FilterConfig, dt: float) -> tuple[S
     jitter = count_ticks(sensor.jitter, dt, f"{label}'s jitter")
 
     def make_schedule(extra: int) -> Schedule:
+        # a sample is used in the first step that listens at or after its arrival
         lags = [math.ceil((lag + extra) / pace) * pace // stride for lag in late]
         if len(set(lags)) == 1:
             lags = lags[:1]
@@ -331,10 +329,7 @@ def _is_covariance_needed(config: FilterConfig) -> bool:
 
 
 def _is_periodic(f: FilterRecord, config: FilterConfig, random: bool) -> bool:
-    """Return whether the gains are precomputed; ValueError where that is wanted and impossible.
-
-    random: the first slow sensor's delay is.
-    """
+    """Return whether gains are precomputed; `random`: whether the first sensor's delay is."""
 
     def refuse(reason: str) -> ValueError:
         return ValueError(f"{config.name}: no gains={config.gains!r}: {reason}")

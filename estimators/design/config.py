@@ -43,11 +43,7 @@ _N_IMM_MEMBERS = 4
 _Fits = Callable[[float], bool]
 
 
-def _is_any_number(number: float) -> bool:
-    return True
-
-
-class _OptionReader:
+class _Reader:
     """Keyword arguments of a filter by name; `check_unread` refuses those that were not read."""
 
     def __init__(self, name: str, options: Mapping[str, Any]) -> None:
@@ -89,7 +85,7 @@ class _OptionReader:
         return self.read_number(key, 0.0, expected, lambda v: 0.0 <= v < np.inf)
 
     def read_number(
-        self, key: str, default: float, expected: str = "", fits: _Fits = _is_any_number
+        self, key: str, default: float, expected: str = "", fits: _Fits = lambda _: True
     ) -> float:
         """Read an option that is a number; errors as in `check_number`."""
         return self.check_number(key, self.read_value(key, default), expected, fits)
@@ -100,7 +96,7 @@ class _OptionReader:
         return self.read_number(key, default, expected, lambda v: 0.0 < v < np.inf)
 
     def check_number(
-        self, key: str, value: Any, expected: str = "", fits: _Fits = _is_any_number
+        self, key: str, value: Any, expected: str = "", fits: _Fits = lambda _: True
     ) -> float:
         """Convert to a number that fits; TypeError for no number, ValueError where it does not."""
         try:
@@ -145,7 +141,7 @@ def parse_config(
     Raises:
         reader.make_error: The ValueError for poles that are not one a state.
     """
-    reader = _OptionReader(name, dict(row.options) | dict(options))
+    reader = _Reader(name, dict(row.options) | dict(options))
     used = _select_slow_sensors(row, sensors, reader)
     rules = _parse_rules(row, used, reader)
     fast, biases = _parse_inertial(row, reader)
@@ -196,7 +192,7 @@ def parse_config(
 
 
 def _select_slow_sensors(
-    row: FilterDefinition, available: Mapping[str, SlowSensor], reader: _OptionReader
+    row: FilterDefinition, available: Mapping[str, SlowSensor], reader: _Reader
 ) -> tuple[str, ...]:
     """Select the slow sensors to use, in the order of `SLOW_NAMES`."""
     slow = reader.read_value("slow", None)
@@ -220,9 +216,7 @@ def _select_slow_sensors(
     return tuple(sensor for sensor in SLOW_NAMES if sensor in requested)
 
 
-def _parse_rules(
-    row: FilterDefinition, used: Sequence[str], reader: _OptionReader
-) -> dict[str, Any]:
+def _parse_rules(row: FilterDefinition, used: Sequence[str], reader: _Reader) -> dict[str, Any]:
     """Parse how gains are computed, and what happens to late samples and between samples."""
     is_dual_rate, is_placed = row.intersample == "dual-rate", row.gains == "placed"
     intersample, between, assumed, poles = row.intersample, "hold", 0.0, row.poles
@@ -256,7 +250,7 @@ def _parse_rules(
 
 
 def _parse_inertial(
-    row: FilterDefinition, reader: _OptionReader
+    row: FilterDefinition, reader: _Reader
 ) -> tuple[tuple[str, ...], dict[str, float]]:
     """Parse the fast sensors, and the standard deviations of their biases by state."""
     if row.model != "bicycle" or row.gains != "covariance" or row.second:
@@ -274,7 +268,7 @@ def _parse_inertial(
     return fast, {name: sd for name, sd in biases.items() if sd > 0.0}
 
 
-def _parse_gate(delay: str, reader: _OptionReader) -> dict[str, Any]:
+def _parse_gate(delay: str, reader: _Reader) -> dict[str, Any]:
     """Parse `gate` and `wary` of a `FilterConfig`."""
     count = reader.read_number("wary", 0.0, "is a number of samples", lambda v: v in range(1000))
     wary = int(count) if delay in ("clone", "buffer") else 0
@@ -285,7 +279,7 @@ def _parse_gate(delay: str, reader: _OptionReader) -> dict[str, Any]:
     return {"gate": gate, "wary": wary}
 
 
-def _parse_latency(reader: _OptionReader, is_findable: bool) -> dict[str, float | str]:
+def _parse_latency(reader: _Reader, is_findable: bool) -> dict[str, float | str]:
     """Parse the latencies above zero (s, or `FIND` for one of them) by channel."""
     value: Any = reader.read_value("latency", {})
     if not isinstance(value, Mapping):
@@ -308,7 +302,7 @@ def _parse_latency(reader: _OptionReader, is_findable: bool) -> dict[str, float 
     return latencies
 
 
-def _parse_noise(forces: bool, reader: _OptionReader) -> tuple[dict[str, float], dict[str, float]]:
+def _parse_noise(forces: bool, reader: _Reader) -> tuple[dict[str, float], dict[str, float]]:
     """Parse `FilterConfig.noise` and `FilterConfig.noise_over_speed`."""
     rows = [row for sensor in MEASUREMENTS.values() for row in sensor.rows]
     growing = [row.noise for row in rows if row.over_speed and f"{row.noise}_noise" not in reader]
@@ -320,9 +314,7 @@ def _parse_noise(forces: bool, reader: _OptionReader) -> tuple[dict[str, float],
     return noise, {name: noise[name] * COURSE_SPEED for name in growing}
 
 
-def _parse_hdop_table(
-    row: FilterDefinition, reader: _OptionReader
-) -> tuple[tuple[float, float], ...]:
+def _parse_hdop_table(row: FilterDefinition, reader: _Reader) -> tuple[tuple[float, float], ...]:
     """Parse the knots (HDOP, factor on the GPS's standard deviation), or none."""
     table = reader.read_value("hdop_table", row.hdop)
     if table is None or (isinstance(table, tuple) and not table):
@@ -335,9 +327,7 @@ def _parse_hdop_table(
     return tuple((float(hdop), float(factor)) for hdop, factor in knots)
 
 
-def _parse_bank(
-    states: Sequence[str], forces: bool, delay: str, reader: _OptionReader
-) -> dict[str, Any]:
+def _parse_bank(states: Sequence[str], forces: bool, delay: str, reader: _Reader) -> dict[str, Any]:
     """Parse `members`, `levels` and `sudden` of a `FilterConfig`."""
     value = reader.read_value("levels", (1.0,))
     levels = reader.read_array("levels", value)
@@ -362,7 +352,7 @@ def _parse_bank(
 
 
 def _parse_process_noise(
-    states: Sequence[str], tuning: Mapping[str, float], reader: _OptionReader
+    states: Sequence[str], tuning: Mapping[str, float], reader: _Reader
 ) -> Array:
     """Parse Q per second, shape (n, n): the tuning's or the option's, with each `q_STATE` in it."""
     n, matrix = len(states), reader.read_value("Q", None)
@@ -381,7 +371,7 @@ def _parse_prior(
     states: Sequence[str],
     noise: Mapping[str, float],
     biases: Mapping[str, float],
-    reader: _OptionReader,
+    reader: _Reader,
 ) -> dict[str, float]:
     """Parse the standard deviation of every state at the start, in the state's unit."""
     deviations = {state: STATES[state].prior for state in states} | dict(biases)

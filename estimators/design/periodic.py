@@ -95,11 +95,10 @@ def _iterate_gains(
     before: Any,
     gains: GainTables,
 ) -> int:
-    """Run a covariance filter over its schedule, at most `cycles` times, and write its gains.
+    """Run a covariance filter over its schedule until its gains settle; return the cycles used.
 
-    Outputs: `table` (rows, columns), gains and covariances; `before` (total, total), the covariance
-    before the last frame. Ticks are steps. lags (pattern,): steps from capture to arrival of each
-    frame. s: the slow sensor, -1 for none. Returns the number of cycles used.
+    Outputs: `table` (rows, columns), and `before` (total, total), the covariance before the last
+    frame. lags (pattern,): steps from capture to arrival. s: the slow sensor, -1 for none.
     """
     f = filters[0]
     reset_filter(f, 0)
@@ -187,6 +186,7 @@ def design_gains(
 def _design_settled(
     f: FilterRecord, schedule: Schedule, speed: float, config: FilterConfig
 ) -> tuple[Array, FilterRecord]:
+    """Design the table of gains on a copy of the filter's memory, which is returned too."""
     filters: FilterRecords = np.array([f])
     copy = filters.view(np.recarray)[0]
     copy.periodic = copy.measured = copy.origin = copy.joint = copy.between = 0
@@ -196,7 +196,9 @@ def _design_settled(
     copy.cycle, copy.pattern = schedule.cycle, max(1, len(schedule.lags))
     copy.period[copy.period > 0] = schedule.period
     copy.phase[:] = 0
-    _add_bias_walk(copy)
+    for i in range(int(f.dense), int(f.n)):  # a bias that never moves has no settled gain
+        if f.pushed[i - f.dense] < 0:
+            copy.Q[i, i] += f.prior[i, i] * f.step / _BIAS_WALK_TIME
     s = int(f.first_slow)
     table = np.zeros(compute_table_shape(f, schedule))
     table[0, 0] = 1.0
@@ -217,16 +219,6 @@ def _design_settled(
         R = np.diag([*copy.r_fast[: copy.fasts], *copy.r[s, : copy.rows[s]]])
         _write_pseudo_gains(copy, schedule, table, compute_inverse(config.inverse, C, before, R))
     return table, copy
-
-
-def _add_bias_walk(f: FilterRecord) -> None:
-    """Let a constant bias walk by its prior in 10 s, for a filter that has gains of its own.
-
-    What never moves has no settled gain, but whether it is seen is the same.
-    """
-    for i in range(int(f.dense), int(f.n)):
-        if f.pushed[i - f.dense] < 0:
-            f.Q[i, i] += f.prior[i, i] * f.step / _BIAS_WALK_TIME
 
 
 def build_measurement_rows(f: FilterRecord, frame: int, lag: int = 1) -> Array:

@@ -148,10 +148,7 @@ def _build_clone_map(f: FilterRecord, schedule: Schedule, step: int) -> Array:
 def _build_residual_rows(
     f: FilterRecord, schedule: Schedule, frame: int, width: int, stored_at: int
 ) -> Array:
-    """Build the rows by which the residuals of a step depend on the whole error, (m + p, width).
-
-    stored_at: where stored predictions start in the error; -1: there are none.
-    """
+    """Build the residuals' rows (m + p, width) by the whole error; stored_at: -1 if none is."""
     lag = schedule.lags[frame] if schedule.lags else 0
     measured = build_measurement_rows(f, frame, lag)
     C = np.zeros((len(measured), width))

@@ -271,10 +271,7 @@ def _compute_gates(
 
 @jit_nrt
 def _step_averages(z: Any, m: Any, form: Any, numbers: Any, offset: int) -> Any:
-    """Step `MovingAverages`; return the output and the place behind.
-
-    m: steps so far and means, updated.
-    """
+    """Step `MovingAverages`, whose state m is updated; return the output and the place behind."""
     units, times = form[1], form[3]
     out = np.empty(units * (1 + times))
     end = _apply_dense(z, numbers, offset + times, out[:units])
