@@ -20,7 +20,7 @@ from .network import (
 )
 
 FORMAT = "1"
-"""Counts up where what a network reads (`kernel`) or its card changes."""
+"""Counts up where what a network reads (`correction`) or its card changes."""
 FOLDER = Path(__file__).resolve().with_name("corrections")
 FAST_INPUTS = (
     "gyro", "accel_y", "accel_x", "roll_rate", "wheel_left", "steer", "torque_left", "torque_right"
