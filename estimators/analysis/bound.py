@@ -1,11 +1,9 @@
 """The best that any estimator can do: the covariance of the optimal filter of the true model.
 
-Defined where the plant is linear (small-angle plant, linear tyres, speed held): then no estimator
-has a smaller mean squared error than the filter that knows the vehicle, the noise and the
-disturbances' statistics. Deterministic wind and biases do not change it: it knows them. Tyres that
-change on the way, and a gust whose strength it does not know, make the model vary with time: the
-filter then knows when, which no real one does. A gust's strength is not Gaussian: with it this is
-the least error of a linear estimator.
+Defined where the plant is linear (small-angle plant, linear tyres, speed held) and the filter
+knows the vehicle, the noise and the disturbances' statistics; deterministic wind and biases do
+not change it. Of tyres that change and of a gust the filter knows when. A gust's strength is not
+Gaussian: with it this is the least error of a linear estimator.
 """
 
 import warnings
@@ -22,7 +20,6 @@ from ..design.models import select_states
 from ..make import make_estimator
 from ..protocol import UnobservableWarning
 
-# of a filter's memory, at a held speed
 _MODEL = ("car", "A", "B", "G", "GT", "H", "HT", "C_fast", "D_fast")
 
 
@@ -121,6 +118,7 @@ def _set_gust_input(filter_: Any, arm: float) -> None:
 
 
 def _copy_model(filter_: Any, later: Any) -> None:
+    """Copy the model of a later filter at its held speed."""
     for name in _MODEL:
         filter_.filters[0][name] = later.filters[0][name]
 

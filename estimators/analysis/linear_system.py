@@ -3,8 +3,7 @@
     x_{k+1} = a x_k + b u_k + x_d,k + w_k,    y_k = c x_k + v_k at k = 0, r, 2 r, ...
     x_d,k+1 = a_d x_d,k + u_d + w_d,k
 
-It runs on the compiled core of all filters, as its rule "dual-rate" with a model whose matrices are
-arguments. `make_estimator("dual-rate")` is its application to a car's course angle.
+It runs on the compiled core of all filters, as its rule "dual-rate" with matrices as arguments.
 """
 
 import warnings
@@ -16,12 +15,11 @@ import numpy.typing as npt
 
 from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
 from ..core.filter import reset_filters
-from ..core.innovation import IGNORE
+from ..core.innovation import DUAL_RATE, IGNORE
 from ..core.model import LINEAR
 from ..core.record import FILTER, N_CORE, N_INPUTS, N_ROWS
-from ..core.update import DUAL_RATE
 from ..design.dual_rate import GAINS, RULES, compute_shares, frame_map, write_shares
-from ..design.kalman import parse_covariance, parse_matrix, parse_square, parse_vector
+from ..design.kalman import check_covariance
 from ..design.stability import MARGINAL, find_unobservable, spectral_radius
 from ..estimator import compile_advance, compile_process_packet
 from ..protocol import Estimates, UnobservableWarning
@@ -84,7 +82,7 @@ class DualRate:
         start: npt.ArrayLike | None = None,
         allow_unstable: bool = False,
     ) -> None:
-        a, b, c = (parse_matrix(name, M) for name, M in (("A", A), ("B", B), ("C", C)))
+        a, b, c = (_parse_matrix(name, M) for name, M in zip("ABC", (A, B, C), strict=True))
         m, rows = len(a), _parse_disturbed(disturbed, len(a))
         _check_sizes(a, b, c, len(rows))
         if not ratio >= 1 or int(ratio) != ratio:
@@ -93,12 +91,12 @@ class DualRate:
         F, drift = np.zeros((n, n)), np.zeros(n)
         F[:m, :m] = a
         F[rows, range(m, n)] = 1.0  # (5)
-        F[m:, m:] = parse_square("leak", leak, d)  # (11)
-        drift[m:] = parse_vector("rate", rate, d)
+        F[m:, m:] = _parse_square("leak", leak, d)  # (11)
+        drift[m:] = _parse_vector("rate", rate, d)
         noise = np.zeros((n, n))
-        noise[:m, :m] = parse_covariance("Q", Q, m)  # (12)
-        noise[m:, m:] = parse_covariance("Q_d", Q_d, d)
-        measured, r = np.hstack([c, np.zeros((q, d))]), parse_covariance("R", R, q, definite=True)
+        noise[:m, :m] = _parse_covariance("Q", Q, m)  # (12)
+        noise[m:, m:] = _parse_covariance("Q_d", Q_d, d)
+        measured, r = np.hstack([c, np.zeros((q, d))]), _parse_covariance("R", R, q, definite=True)
         placed = _parse_poles(intersample, gains, poles, n)
         with np.errstate(invalid="ignore", over="ignore"):
             shares = compute_shares(intersample, gains, placed, F, noise, measured, r, int(ratio))
@@ -109,7 +107,7 @@ class DualRate:
         self.gains[0, 0, 0] = 1.0
         write_shares(F, noise, measured, r, shares, self.gains[0], 1 + q + self.ratio, n)
         self._start = np.zeros(n)
-        self._start[:m] = parse_vector("start", 0.0 if start is None else start, m)
+        self._start[:m] = _parse_vector("start", 0.0 if start is None else start, m)
         self._filters = _make_record(F, b, drift, measured, self.ratio)
         self.reset()
 
@@ -149,7 +147,7 @@ class DualRate:
             u: Input of the step, shape (p,).
         """
         fast = np.zeros((1, FAST_WIDTH))
-        fast[0, : self.inputs] = parse_vector("u", u, self.inputs)
+        fast[0, : self.inputs] = _parse_vector("u", u, self.inputs)
         self._take(fast, _NO_PACKETS)
 
     def update(self, y: npt.ArrayLike) -> None:
@@ -166,15 +164,10 @@ class DualRate:
             raise ValueError(f"a sample comes every {self.ratio} steps, this is step {f.tick}")
         if f.since == 0:
             raise ValueError(f"step {f.tick} has had its sample")
-        compile_process_packet()(
-            self._filters, self.gains, self._make_packet(parse_vector("y", y, int(f.rows[_SENSOR])))
-        )
-
-    def _make_packet(self, y: Array) -> Array:
-        packet = np.zeros(PACKET_WIDTH)
+        packet, q = np.zeros(PACKET_WIDTH), int(f.rows[_SENSOR])
         packet[: PACKET.value] = _SENSOR, self.k, self.k, 1.0, 0.0
-        packet[PACKET.value : PACKET.value + len(y)] = y
-        return packet
+        packet[PACKET.value : PACKET.value + q] = _parse_vector("y", y, q)
+        compile_process_packet()(self._filters, self.gains, packet)
 
     def run(self, U: npt.ArrayLike, Y: npt.ArrayLike) -> Estimates:
         """Reset, then filter inputs and samples of k = 0, r, 2 r, ...
@@ -276,3 +269,36 @@ def _make_record(F: Array, B: Array, drift: Array, C: Array, ratio: int) -> Any:
     f.late, f.between, f.speed_state = IGNORE, DUAL_RATE, -1
     f.speed = 1.0  # no vehicle: any
     return filters
+
+
+def _parse_matrix(name: str, value: npt.ArrayLike) -> Array:
+    """Parse a finite matrix of any shape (k, m); ValueError for anything else."""
+    M = np.array(value, np.float64)
+    if M.ndim != 2 or not M.size or not np.isfinite(M).all():
+        raise ValueError(f"{name} is a finite matrix, got {value!r}")
+    return M
+
+
+def _parse_vector(name: str, value: npt.ArrayLike, n: int) -> Array:
+    """Parse a finite vector (n,), or a number that stands for n equal ones; else ValueError."""
+    v = np.array(value, np.float64)
+    v = np.full(n, v) if v.ndim == 0 else v
+    if v.shape != (n,) or not np.isfinite(v).all():
+        raise ValueError(f"{name} is finite and has shape ({n},), got {value!r}")
+    return v
+
+
+def _parse_square(name: str, value: npt.ArrayLike, n: int) -> Array:
+    """Parse a finite matrix (n, n), its diagonal (n,) or one number for it; else ValueError."""
+    M = np.array(value, np.float64)
+    M = np.diag(_parse_vector(name, M, n)) if M.ndim < 2 else M
+    if M.shape != (n, n) or not np.isfinite(M).all():
+        raise ValueError(f"{name} is finite and has shape ({n}, {n}) or ({n},), got {value!r}")
+    return M
+
+
+def _parse_covariance(name: str, value: npt.ArrayLike, n: int, definite: bool = False) -> Array:
+    """Parse a covariance (n, n), given as for `_parse_square`; else ValueError."""
+    M = _parse_square(name, value, n)
+    check_covariance(name, M, definite)
+    return M

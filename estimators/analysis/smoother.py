@@ -1,8 +1,8 @@
 """A fixed-lag smoother around any filter with a covariance: what a log tells afterwards.
 
-Offline every packet is there, so each is used at the tick at which it was captured. The filter goes
-forwards block by block; Rauch, Tung and Striebel's recursion then comes backwards from the end of
-the *next* block, so that every estimate knows at least one lag of its future, and at most two.
+Each packet is used at the tick at which it was captured. The filter goes forwards block by block;
+Rauch, Tung and Striebel's recursion then comes backwards from the end of the *next* block, so
+that every estimate knows at least one lag of its future, and at most two.
 """
 
 import copy
@@ -14,12 +14,11 @@ import numpy as np
 from ...envs.numerics.jit import jit
 from ...envs.record import FAST, PACKET, Array, Log
 from ..core.filter import run_tick
-from ..core.innovation import IGNORE
+from ..core.innovation import IGNORE, NONE
 from ..core.model import BETA, LATERAL
 from ..core.packets import process_packet
 from ..core.predict import read_fast_row
 from ..core.record import WINDOW, FilterRecord, GainTables, Vector
-from ..core.update import NONE
 from ..design.periodic import count_ticks
 from ..estimator import Estimator
 from ..make import make_estimator
@@ -65,18 +64,13 @@ def smooth(
         raise ValueError(f"the lag is in s and positive, got {lag_seconds!r}")
     undelayed = _remove_delay(estimator)
     record = undelayed.prepare_record(log)
-    rows = len(record.fast)
-    lag = rows
+    rows = lag = len(record.fast)
     if math.isfinite(lag_seconds):
         lag = min(rows, count_ticks(lag_seconds, undelayed.dt, "the lag"))
     packets = np.array(record.packets, np.float64)
     packets[:, PACKET.arrived] = packets[:, PACKET.captured]
-    sort_keys = (
-        record.packets[:, PACKET.arrived],
-        packets[:, PACKET.sensor],
-        packets[:, PACKET.captured],
-    )
-    order = np.lexsort(sort_keys)
+    by_capture = packets[:, PACKET.sensor], packets[:, PACKET.captured]
+    order = np.lexsort((record.packets[:, PACKET.arrived], *by_capture))
     x, std, nis = _smooth_blocks(undelayed, np.ascontiguousarray(record.fast), packets[order], lag)
     ordered_nis = np.empty_like(nis)
     ordered_nis[order] = nis
@@ -145,27 +139,19 @@ def _smooth_blocks(
     undelayed: Estimator, fast: Array, packets: Array, lag: int
 ) -> tuple[Array, Array, Array]:
     """Compute smoothed states and standard deviations of all rows, and the packets' NIS."""
-    f, rows, n = undelayed.filters[0], len(fast), len(undelayed.names)
+    f, gains, rows, n = undelayed.filters[0], undelayed.gains, len(fast), len(undelayed.names)
     Q = np.array(f.Q[:n, :n])
     X, S, nis = np.empty((rows, n)), np.empty((rows, n)), np.full(len(packets), np.nan)
     span = min(2 * lag, rows)
     # F, before, x, P of two blocks, as `_filter_forwards` fills them
-    blocks = (
-        np.empty((span, n, n)),
-        np.empty((span, n)),
-        np.empty((span, n)),
-        np.empty((span, n, n)),
-    )
+    blocks = [np.empty((span, n, *more)) for more in ((n,), (), (), (n,))]
     done = position = 0  # rows, packets
     for start in range(0, rows, lag):
         for array in blocks if start > 0 else ():  # what was the next block is the present one
             array[: span - lag] = array[lag:]
-        first = done - start
-        end = min(start + span, rows)
+        first, end = done - start, min(start + span, rows)
         views = (array[first : end - start] for array in blocks)
-        position = _filter_forwards(
-            f, undelayed.gains, fast[done:end], packets, position, nis, *views
-        )
+        position = _filter_forwards(f, gains, fast[done:end], packets, position, nis, *views)
         done = end
         x, std = _smooth_backwards(Q, *(array[: end - start] for array in blocks))
         stop = min(start + lag, rows)
@@ -179,9 +165,8 @@ def _smooth_backwards(Q: Array, F: Array, before: Array, x: Array, P: Array) -> 
     sd = np.sqrt(np.einsum("kii->ki", predicted))
     sd[sd == 0.0] = 1.0
     scaled = predicted / (sd[:, :, None] * sd[:, None, :])
-    inverse = np.linalg.pinv(
-        scaled, _RANK, hermitian=True
-    )  # singular where a state is known exactly
+    # singular where a state is known exactly
+    inverse = np.linalg.pinv(scaled, _RANK, hermitian=True)
     J = P[:-1] @ F[1:].transpose(0, 2, 1) / sd[:, None, :] @ inverse / sd[:, None, :]
     x, P = x.copy(), P.copy()
     for k in range(len(J) - 1, -1, -1):

@@ -1,11 +1,9 @@
 """The covariance and its gains in compiled code: `design.kalman`'s equations on a filter's memory.
 
 Only the first n of N = `total` states move; the others are clones. Rows are computed by eights of
-their columns: beyond N all is zero and stays so. Measurements come one scalar at
-a time, so that a gain is a division and not a matrix inverse.
-
-One filter's memory is a record of numbers; that of several filters in lanes has fields of the same
-names (`vector.lanes`), whose columns come one by one.
+their columns: beyond N all is zero and stays so. Measurements come one scalar at a time, so that
+a gain is a division. One filter's memory is a record of numbers; that of several filters in lanes
+(`vector.lanes`) has fields of the same names, whose columns come one by one.
 """
 
 from math import log
@@ -160,18 +158,16 @@ def correct_scalar(f: FilterRecord, variance: Any, residual: Any) -> None:
         residual: Measurement minus its prediction.
     """
     N, x, P, PC, gain, step = f.total, f.x, f.P, f.PC, f.gain, vector_width(f.P)
-    inverse_variance = 1.0 / variance
+    inverse = 1.0 / variance
     if f.robust > 0.0:  # Huber's: the noise is what makes it `robust` deviations
-        deviations = absolute(residual) * sqrt(inverse_variance)
-        inverse_variance = inverse_variance * select(
-            deviations > f.robust, f.robust / deviations, 1.0
-        )
+        deviations = absolute(residual) * sqrt(inverse)
+        inverse = inverse * select(deviations > f.robust, f.robust / deviations, 1.0)
     for j in range(0, N, step):
         pc = load8(PC, j)
-        store8(gain, pc * inverse_variance, j)
-        store8(x, load8(x, j) + pc * inverse_variance * residual, j)
+        store8(gain, pc * inverse, j)
+        store8(x, load8(x, j) + pc * inverse * residual, j)
         for i in range(count_upper_rows(P, N, j)):
-            store8(P, load8(P, i, j) - inverse_variance * (load_element(PC, i) * pc), i, j)
+            store8(P, load8(P, i, j) - inverse * (load_element(PC, i) * pc), i, j)
 
 
 @jit
@@ -209,19 +205,27 @@ def project(f: FilterRecord, row: Vector) -> Any:
 
 
 @jit
-def project_clone(f: FilterRecord, clone: int) -> Any:
-    """Compute f.PC = P C^T of a measurement of one clone.
+def _project_clone(f: FilterRecord, clone: int) -> Any:
+    """Compute f.PC = P C^T of a measurement of one clone; return C P C^T."""
+    for i in range(f.total):
+        f.PC[i] = f.P[clone, i]
+    return f.PC[clone]
+
+
+@jit
+def project_row(f: FilterRecord, s: int, i: int, first: int) -> Any:
+    """Compute f.PC = P C^T of a sensor's row.
 
     Args:
         f: Memory of the filter.
-        clone: Index of the clone in x.
+        s: Index of the slow sensor.
+        i: Index of its row.
+        first: Clone of its first row, negative where it measures the states.
 
     Returns:
         C P C^T.
     """
-    for i in range(f.total):
-        f.PC[i] = f.P[clone, i]
-    return f.PC[clone]
+    return _project_clone(f, first + i) if first >= 0 else project(f, f.C[s, i])
 
 
 @jit
@@ -249,23 +253,6 @@ def update_with_clone(f: FilterRecord, clone: int, r: Any, residual: Any) -> Non
         r: Variance of the noise.
         residual: Measurement minus its prediction.
     """
-    variance = project_clone(f, clone) + r
+    variance = _project_clone(f, clone) + r
     _update_weight(f, variance, residual)
     correct_scalar(f, variance, residual)
-
-
-@jit
-def clone_covariance(f: FilterRecord, row: Vector, clone: int) -> None:
-    """Write the covariance of a new clone of a combination of the states.
-
-    Args:
-        f: Memory of the filter.
-        row: The combination, shape (n,).
-        clone: Index of the clone in x.
-    """
-    variance = project(f, row)
-    N, P, PC = f.total, f.P, f.PC
-    for i in range(N):
-        P[clone, i] = PC[i]
-        P[i, clone] = PC[i]
-    P[clone, clone] = variance

@@ -2,7 +2,7 @@
 
 Order of a tick: what was captured at the last tick is held, prediction from the last tick to this
 one with the inputs of this row, the fast sensors, then the packets that arrive. A filter at the
-slow sensor's rate listens once every `pace` ticks, to the packets that came meanwhile; it holds its
+slow sensor's rate listens every `pace` ticks, to the packets that came meanwhile; it holds its
 states in between (`stride`) or predicts them.
 """
 
@@ -10,28 +10,23 @@ from typing import Any
 
 import numpy as np
 
+from ...envs.numerics.functions import sincos
 from ...envs.numerics.jit import copy_into, jit, jit_nrt, noinline
 from ...envs.numerics.primitives import maximum, sqrt
 from ...envs.record import FAST, PACKET
-from .innovation import BUFFER, store_due_captures
+from .innovation import BUFFER, interpolate_hdop, store_due_captures
 from .model import (
+    BETA,
     CURVATURE,
     LATERAL,
     build_model,
     compute_road_turn,
     find_next_cell,
-    linearise,
-    locate_step_row,
+    is_finite,
 )
-from .multiple_model import (
-    compute_mixture,
-    first_member,
-    process_packet_members,
-    update_bank,
-    update_second_layer,
-)
-from .packets import apply_waiting, clear_history, process_packet, store_history
-from .predict import advance_state, correct_fast, read_fast_row
+from .multiple_model import compute_mixture, replace_least_likely, run_imm_step
+from .packets import apply_waiting, clear_history, process_packet, process_sample, store_history
+from .predict import advance_state, linearise, read_fast_row
 from .record import (
     COUNTERS,
     N_CORE,
@@ -45,6 +40,7 @@ from .record import (
     GainTables,
     Vector,
 )
+from .update import correct_fast, locate_step_row
 
 
 @jit
@@ -204,10 +200,62 @@ def compute_deviation(f: FilterRecord, gains: GainTables, i: int) -> Any:
 
 
 @jit
+def _update_second_layer(
+    first: FilterRecord, second: FilterRecord, gains: GainTables, packet: Vector
+) -> None:
+    """Correct the second layer by a packet as a velocity: v_x = V cos(beta), v_y = V sin(beta).
+
+    double-layer-gps (8)-(9), with the first layer's sideslip angle as it was predicted for the
+    captured tick. The noise along is the speed's, after the table of HDOP; the one across is that
+    of the angle, (V sigma_beta)^2, and of the speed, (sigma_V sin(beta))^2.
+    """
+    s, captured = int(packet[PACKET.sensor]), int(packet[PACKET.captured])
+    beta = first.x[BETA]
+    if captured >= maximum(first.start, first.tick - WINDOW + 1) and captured < first.tick:
+        beta = first.predicted[captured % WINDOW, BETA]
+    sine, cosine = sincos(beta)
+    V = packet[first.speed_column[s]]
+    if not is_finite(V):
+        first.counts[COUNTERS.invalid] += 1
+        return
+    velocity = second.sample
+    copy_into(packet, velocity)
+    velocity[PACKET.value] = V * cosine
+    velocity[PACKET.value + 1] = V * sine
+    factor = interpolate_hdop(first, s, packet)
+    speed_variance = second.r_speed * factor * factor
+    second.r[s, 0] = speed_variance
+    second.r[s, 1] = V * V * first.P[BETA, BETA] + speed_variance * sine * sine
+    process_sample(second, gains)
+
+
+@jit
+def _first_member(layers: FilterRecords) -> int:
+    """Return the first layer that measures: 1 where there is a bank, else 0."""
+    return 1 if layers[0].members > 0 else 0
+
+
+@jit
+def _process_packet_members(layers: FilterRecords, gains: GainTables, packet: Vector) -> None:
+    """Process a packet by every member behind the first one."""
+    for m in range(2, len(layers)):
+        process_packet(layers[m], gains, packet)
+
+
+@jit
+def _update_bank(layers: FilterRecords) -> None:
+    """Run the bank's own step: interact, or replace a member."""
+    if layers[0].burst[0] > 0.0:
+        run_imm_step(layers)
+    else:
+        replace_least_likely(layers)
+
+
+@jit
 def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Any, S: Any) -> None:
     """Write the states and standard deviations of all layers in row j of X and S (rows, n)."""
     column = 0
-    for layer in range(len(layers) if first_member(layers) == 0 else 1):
+    for layer in range(len(layers) if _first_member(layers) == 0 else 1):
         f = layers[layer]
         for i in range(f.n):
             X[j, column] = f.x[i]
@@ -231,7 +279,7 @@ def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Any) 
     offset, f = 0, layers[0]
     if len(P) > 0 and f.periodic == 1 and gains[f.cell, 0, 0] == 0.0:
         return False
-    for layer in range(len(layers) if first_member(layers) == 0 else 1):
+    for layer in range(len(layers) if _first_member(layers) == 0 else 1):
         f = layers[layer]
         for i in range(f.n):
             x[offset + i] = f.x[i]
@@ -271,11 +319,9 @@ def advance(
         nis: Output for each packet's normalised innovation squared, shape (count,), or empty.
 
     Returns:
-        Number of rows done: fewer than `rows` where gains are missing, those of the cell `wanted`
-            of
-        the first layer; call again from there.
+        Rows done; fewer than `rows` where the table `wanted` is missing: call again from there.
     """
-    first = first_member(layers)
+    first = _first_member(layers)
     f = layers[first]
     position, last = 0 if start == 0 else f.cursor, f.tick + rows - start
     for j in range(start, rows):
@@ -289,18 +335,17 @@ def advance(
             read_fast_row(layers[layer], fast[j], wheel_speed)
             run_tick(layers[layer], gains)
         while position < count and not (f.tick < packets[position, PACKET.arrived] <= last):
-            was_used = process_packet(
-                f, gains, packets[position]
-            )  # from beyond the last row: counted here
+            # from beyond the last row: counted here
+            was_used = process_packet(f, gains, packets[position])
             if len(nis) > 0:
                 nis[position] = f.nis
             if first > 0:
-                process_packet_members(layers, gains, packets[position])
+                _process_packet_members(layers, gains, packets[position])
             elif was_used and len(layers) > 1:
-                update_second_layer(f, layers[1], gains, packets[position])
+                _update_second_layer(f, layers[1], gains, packets[position])
             position += 1
         if first > 0 and f.tick % f.respawn == 0 and f.tick > f.start:
-            update_bank(layers)
+            _update_bank(layers)
         if first > 0 and (len(X) > 0 or j == rows - 1):
             compute_mixture(layers)
         if len(X) > 0:
@@ -325,16 +370,7 @@ def step_all(layers: FilterRecords, gains: GainTables, fast: Any, packets: Any, 
     """
     empty = fast[:0]
     return advance(
-        layers,
-        gains,
-        fast,
-        len(fast),
-        packets,
-        count,
-        len(empty),
-        empty,
-        empty,
-        empty.reshape(0),
+        layers, gains, fast, len(fast), packets, count, len(empty), empty, empty, empty.reshape(0)
     )
 
 
@@ -359,9 +395,9 @@ def process_packet_all(layers: FilterRecords, gains: GainTables, packet: Vector)
         gains: Tables of gains, shape (cells, rows, columns).
         packet: Packet, shape (PACKET_WIDTH,).
     """
-    if first_member(layers) > 0:
+    if _first_member(layers) > 0:
         process_packet(layers[1], gains, packet)
-        process_packet_members(layers, gains, packet)
+        _process_packet_members(layers, gains, packet)
         compute_mixture(layers)
     elif process_packet(layers[0], gains, packet) and len(layers) > 1:
-        update_second_layer(layers[0], layers[1], gains, packet)
+        _update_second_layer(layers[0], layers[1], gains, packet)

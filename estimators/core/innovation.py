@@ -1,27 +1,8 @@
-"""Late samples: what a filter stores of the moment of capture, and which sample it may still use.
-
-clone: at each capture the measured combinations of the states are cloned; a late sample is a
-measurement of its clones, so it is used exactly. The delayed states of tie-vision (12)-(13), held
-between the camera's triggers, are these clones: one algorithm under two names. The clones of frame
-i lie in slot i mod frames. They are made in the step *after* the capture, as (12) has it, when
-everything that is known at the captured tick has been used.
-buffer: the window is filtered anew from the capture on (`rewind`): exact for any clock. A sample
-that is older than what a rule stores (clone, larsen: its frames; buffer, stored: `WINDOW` ticks) is
-refused and counted; a sensor whose longest delay is that long is refused when the filter is built.
-larsen: the covariance takes the sample at its capture, the states when it arrives (Larsen 1998);
-exact where exactly one sample is under way and none is lost.
-stored: its residual is taken against the prediction stored at the capture and used as if it were
-fresh: uneven-delay (15)-(16). constant: the same, for an assumed delay instead of the stamp.
-literal, lag: the model has late states that follow at every step, by one step (tie-vision (12) read
-literally at 1 ms) or by a first-order lag of the delay. ignore: late samples are taken for fresh.
-
-A sample's innovation: its variance, whether it is possible at all, and what it tells of R.
+"""Late samples, and a sample's innovation: which one a filter uses, and how noisy it is.
 
 A gate alone starves a filter that has lost itself. Gated samples in a row whose residuals agree
-show that it is the filter which is wrong, or that what is measured has jumped, as a heading does by
-the half turn of a flipped antenna: then the state that only this sensor measures is forgotten by as
-much as the residual, and the sensor is believed again. A state that another sensor measures, which
-was believed meanwhile, is not forgotten.
+show that the filter is wrong, or that what is measured has jumped, as a flipped antenna's heading:
+then the state that only this sensor measures is forgotten by as much as the residual.
 """
 
 from math import log
@@ -29,22 +10,25 @@ from typing import Any
 
 from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import jit
-from ...envs.numerics.primitives import maximum, minimum, sqrt
+from ...envs.numerics.primitives import sqrt
 from ...envs.record import PACKET
-from .covariance import (
-    clone_covariance,
-    dot,
-    predict_measurement,
-    project,
-    project_clone,
-    update_with_states,
-)
+from .covariance import dot, predict_measurement, project, project_row, update_with_states
 from .model import compute_row_variance
 from .record import COUNTERS, N_SLOW, N_SNAPSHOTS, N_STAMPS, WINDOW, FilterRecord, Vector
 
 RULES = ("clone", "ignore", "stored", "constant", "larsen", "buffer", "literal", "lag")
+"""Rules for late samples; what is older than a rule stores is refused and counted.
+
+clone: what is measured is cloned in the step after each capture, so a late sample measures its
+clones, exactly (tie-vision (12)-(13)); frame i is in slot i mod frames. ignore: taken for fresh.
+stored: the residual against the prediction at the capture is used as if it were fresh, uneven-delay
+(15)-(16). constant: the same, for an assumed delay. larsen: the covariance takes it at its capture,
+the states when it arrives (Larsen 1998), exact for one under way and none lost. buffer: the window
+is filtered anew (`packets`), exact. literal, lag: late states follow by one step or a lag."""
 CLONE, IGNORE, STORED, CONSTANT, LARSEN, BUFFER = range(6)
 """Codes of the field `late`."""
+NONE, PSEUDO, DUAL_RATE = range(3)
+"""Codes of the field `between`, the rule between samples."""
 
 DIRECT = -1  # a sample measures the states as they are
 DROPPED = -2
@@ -58,6 +42,17 @@ def get_direct() -> int:
 
 
 @jit
+def _clone_covariance(f: FilterRecord, row: Vector, clone: int) -> None:
+    """Write the covariance of a new clone of a combination (n,) of the states."""
+    variance = project(f, row)
+    N, P, PC = f.total, f.P, f.PC
+    for i in range(N):
+        P[clone, i] = PC[i]
+        P[i, clone] = PC[i]
+    P[clone, clone] = variance
+
+
+@jit
 def _clone_states(f: FilterRecord, s: int, slot: int) -> None:
     """Clone what sensor s captured at the last tick: tie-vision (12) at a trigger."""
     f.speed_captured[s, slot] = f.speed_before
@@ -67,7 +62,7 @@ def _clone_states(f: FilterRecord, s: int, slot: int) -> None:
         f.x[clone] = predict_measurement(f, s, i)
         f.e[clone] = dot(row, f.e, f.n)
         if f.periodic == 0:
-            clone_covariance(f, row, clone)
+            _clone_covariance(f, row, clone)
 
 
 @jit
@@ -191,7 +186,6 @@ def find_clone(f: FilterRecord, s: int, captured: int) -> int:
 
 
 _AGREEMENT_SD = 4.0  # standard deviations
-_MIN_SCALE, _MAX_SCALE = 0.05, 100.0  # of the scale of R
 
 
 @jit
@@ -250,22 +244,6 @@ def compute_packet_variance(f: FilterRecord, s: int, i: int, packet: Vector) -> 
 
 
 @jit
-def project_row(f: FilterRecord, s: int, i: int, first: int) -> Any:
-    """Compute f.PC = P C^T of a sensor's row.
-
-    Args:
-        f: Memory of the filter.
-        s: Index of the slow sensor.
-        i: Index of its row.
-        first: Clone of its first row, negative where it measures the states.
-
-    Returns:
-        C P C^T.
-    """
-    return project_clone(f, first + i) if first >= 0 else project(f, f.C[s, i])
-
-
-@jit
 def _compute_covariance(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
     """Compute f.S = C P C^T + R of the sample, its lower half."""
     for i in range(f.rows[s]):
@@ -276,18 +254,8 @@ def _compute_covariance(f: FilterRecord, s: int, first: int, packet: Vector) -> 
 
 
 @jit
-def test_innovation(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
-    """Compute f.nis = residual^T S^-1 residual (f.residual) and compare it with the gate.
-
-    Args:
-        f: Memory of the filter.
-        s: Index of the slow sensor.
-        first: Clone of its first row, negative where it measures the states.
-        packet: Packet, shape (PACKET_WIDTH,).
-
-    Returns:
-        Whether the gate lets the sample pass.
-    """
+def _test_innovation(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
+    """Compute f.nis = residual^T S^-1 residual (f.residual); return whether it passes the gate."""
     p, S = f.rows[s], f.S
     _compute_covariance(f, s, first, packet)
     nis = 0.0
@@ -310,10 +278,7 @@ def test_innovation(f: FilterRecord, s: int, first: int, packet: Vector) -> bool
 
 @jit
 def _is_consistent(f: FilterRecord, s: int) -> bool:
-    """Return whether every residual agrees with the last gated one.
-
-    They agree within `_AGREEMENT_SD` standard deviations of a difference.
-    """
+    """Return whether every residual is within `_AGREEMENT_SD` deviations of the last gated one."""
     for i in range(f.rows[s]):
         difference, row_variance = f.residual[i] - f.doubt[s, i], 0.0
         if f.angle[s, i] == 1:
@@ -389,7 +354,7 @@ def check_sample(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
     Returns:
         True for a sample to use.
     """
-    passed = test_innovation(f, s, first, packet)
+    passed = _test_innovation(f, s, first, packet)
     if f.wary == 0:
         return passed
     if not passed and f.believed[s] >= 0:
@@ -406,23 +371,3 @@ def check_sample(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
             return False
     f.believed[s], f.doubts[s] = f.tick, 0
     return True
-
-
-@jit
-def adapt_noise(
-    f: FilterRecord, s: int, i: int, projected: float, residual: float, r: float
-) -> None:
-    """Adapt R to innovations: the mean of residual^2 - C P C^T, over the configured one.
-
-    Args:
-        f: Memory of the filter.
-        s: Index of the slow sensor.
-        i: Index of its row.
-        projected: C P C^T of the row.
-        residual: Measurement minus its prediction.
-        r: The sample's variance by the present scale.
-    """
-    if r > 0.0:
-        sample_scale = (residual * residual - projected) / r * f.scale[s, i]
-        scale = f.scale[s, i] + f.adapt * (sample_scale - f.scale[s, i])
-        f.scale[s, i] = minimum(maximum(scale, _MIN_SCALE), _MAX_SCALE)

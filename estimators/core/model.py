@@ -1,17 +1,9 @@
-"""The model at a speed, compiled: A and B of each kind, discretised exactly.
+"""The linear model of a filter at the present speed: A, B, their exact discretisation, gains' rows.
 
-Tyres that a filter estimates while it drives: an extended Kalman filter on the bicycle.
-
-The factors of both axles' stiffness, and the reciprocal of friction where tyres have a limit, are
-states behind the dense ones. Every few ms each axle's force is expanded at the present state:
+Tyres that a filter estimates: factors on both axles' stiffness, and the reciprocal of friction,
+are states behind the dense ones. Every few ms each axle's force is expanded at the present state:
 its slope by slip stands in `car` and makes the bicycle's matrices, its slopes by the states are
-columns beside them, and the rest is a known push.
-
-The measured speed: when the model is built anew, and where its gains stand.
-
-There is a table of gains for each cell of speed. Its rows: a head, then, for each step of the
-cycle, one for every fast measurement (one where there is none), then, for each frame of the
-pattern, one for every row of the slow sensor, then those of the rule between samples.
+columns beside them, and the rest is a known push. `design.periodic` has the tables of gains.
 """
 
 from typing import Any
@@ -116,14 +108,8 @@ def _write_tyres(f: FilterRecord, V: Any) -> None:
 
 
 @jit
-def build_continuous(f: FilterRecord, V: Any, turning: Any) -> None:
-    """Build f.A and f.B = [inputs, disturbances].
-
-    Args:
-        f: Memory of the filter.
-        V: Speed (m/s).
-        turning: Yaw rate (rad/s).
-    """
+def _build_continuous(f: FilterRecord, V: Any, turning: Any) -> None:
+    """Build f.A and f.B = [inputs, disturbances] at a speed V (m/s) and yaw rate (rad/s)."""
     A, B = f.A, f.B
     for i in range(f.dense):
         for j in range(0, N_CORE, 8):
@@ -293,7 +279,7 @@ def build_model(f: FilterRecord, speed: Any, turning: Any) -> None:
         f.stretch *= f.model_speed / V
     f.model_speed, f.turning = V, turning
     if f.kind != LINEAR:
-        build_continuous(f, V, turning)
+        _build_continuous(f, V, turning)
         discretise(f)
         _set_delayed_rows(f)
     _transpose(f)
@@ -302,8 +288,6 @@ def build_model(f: FilterRecord, speed: Any, turning: Any) -> None:
             f.r[s, i] = compute_row_variance(f, s, i, V)
 
 
-FACTOR_LIMITS = (0.2, 3.0)
-MAX_INVERSE_FRICTION = 4.0  # of the reciprocal of friction
 _MIN_SLOPE = 0.02  # of a tyre's slope, where it slides
 
 
@@ -341,59 +325,8 @@ def compute_axle_force(stiffness: Any, load: Any, alpha: Any, factor: Any, grip:
     )
 
 
-@jit
-def _set_random_walk(f: FilterRecord, moves: bool) -> None:
-    """Set the tyres' random walk: while the car moves, up to their variance at the start.
-
-    A new member's walk more.
-    """
-    for i in range(3 if f.grip > 0 else 2):
-        index = f.tyres + i if i < 2 else f.grip
-        walks = moves and f.P[index, index] < f.prior[index, index]
-        extra = f.fresh if i < 2 else 0.0
-        f.Q[index, index] = f.q_tyres[i] + extra if walks else 0.0
-
-
-@jit
-def linearise(f: FilterRecord, steer: Any) -> None:
-    """Expand both axles' forces at the present state.
-
-    Args:
-        f: Memory of the filter.
-        steer: Steering angle of the front wheels (rad).
-    """
-    x, V = f.x, maximum(f.model_speed, MIN_SPEED)
-    for i in range(2):
-        x[f.tyres + i] = minimum(maximum(x[f.tyres + i], FACTOR_LIMITS[0]), FACTOR_LIMITS[1])
-    grip = 0.0
-    if f.grip > 0:
-        grip = minimum(maximum(x[f.grip], 0.0), MAX_INVERSE_FRICTION)
-        x[f.grip] = grip
-    beta, gamma = x[0], x[1]
-    push, moves = 0.0, f.speed > MIN_SPEED
-    _set_random_walk(f, moves)
-    for i in range(2):
-        arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
-        alpha = (steer if i == 0 else 0.0) - beta - arm * gamma / V
-        factor = x[f.tyres + i]
-        force, slope, per_factor, per_grip = compute_axle_force(
-            f.stiffness[i], f.load[i], alpha, factor, grip
-        )
-        f.car[CAR.front_stiffness + i] = 0.5 * slope
-        if not moves:  # nothing of the tyres is seen
-            per_factor, per_grip = 0.0, 0.0
-        f.per_tyre[i, 0], f.per_tyre[i, 1] = per_factor, per_grip
-        f.rest[i] = force - slope * alpha - per_factor * factor - per_grip * grip
-        push += absolute(force)
-    if f.model_error > 0.0:
-        force_error = f.model_error * push
-        moment_error = 0.5 * (f.car[CAR.front_arm] + f.car[CAR.rear_arm]) * force_error
-        f.Q[f.dense, f.dense] = f.q_known[0] + f.q_share * force_error * force_error
-        f.Q[f.dense + 1, f.dense + 1] = f.q_known[1] + f.q_share * moment_error * moment_error
-
-
 MAX_NUMBER = 1e15  # of a number that a filter takes: below it, whole floats are exact as int
-SPEED_TOLERANCE = 0.005  # the model is built anew where the speed moved by this share
+_SPEED_TOLERANCE = 0.005  # the model is built anew where the speed moved by this share
 
 
 @jit
@@ -433,9 +366,9 @@ def is_speed_changed(speed: Any, model_speed: Any) -> Any:
         model_speed: Speed of the model (m/s).
 
     Returns:
-        True beyond `SPEED_TOLERANCE`.
+        True beyond `_SPEED_TOLERANCE`.
     """
-    return absolute(maximum(speed, MIN_SPEED) - model_speed) > SPEED_TOLERANCE * model_speed
+    return absolute(maximum(speed, MIN_SPEED) - model_speed) > _SPEED_TOLERANCE * model_speed
 
 
 @jit
@@ -503,31 +436,3 @@ def find_next_cell(f: FilterRecord, sample: float) -> Any:
         if is_model_outdated(f, speed):
             return find_cell(f, speed)
     return f.cell
-
-
-@jit
-def locate_step_row(f: FilterRecord) -> Any:
-    """Locate the gain of the first fast measurement in this step.
-
-    Args:
-        f: Memory of the filter.
-
-    Returns:
-        Row of the table.
-    """
-    return 1 + f.at * maximum(f.fasts, 1)
-
-
-@jit
-def locate_frame_row(f: FilterRecord, s: int, frame: int) -> Any:
-    """Locate the gain of a slow sensor's first row for a frame.
-
-    Args:
-        f: Memory of the filter.
-        s: Index of the slow sensor.
-        frame: Frame of the pattern; the pattern's length for the rule between samples.
-
-    Returns:
-        Row of the table.
-    """
-    return 1 + f.cycle * maximum(f.fasts, 1) + frame * f.rows[s]

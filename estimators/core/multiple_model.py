@@ -1,103 +1,25 @@
-"""Estimators of several records: the second layer of double-layer-gps, or a bank and its mixture.
+"""A bank of filters side by side, and its mixture: the mean and covariance in layer 0.
 
-The second layer has velocities and roll, measured by the GPS and the first layer.
-
-A bank: a filter that has settled on its tyres takes seconds to believe that they changed. Every
-half second the least likely member becomes a copy of the likeliest that has forgotten the tyres, at
-the odds of such a change, and whose tyres walk until the next one begins, since the change may come
-later; what is measured makes one or the other likelier. Members that would be twins of others at
-the start come with next to no weight, so that they begin anew first. Where members differ in the
-level of their disturbances, a place in the bank stays at its own. Layer 0 of an estimator
-with a bank is the mixture's mean and covariance, which nothing measures; its members follow.
-
-Or its four members interact, an interacting multiple model (Blom, Bar-Shalom 1988) of a Markov
-chain: nothing happens; a gust blows, whose force and moment walk; the tyres have just changed, and
-walk; they settle. Every fifth of a second each one is merged, mean and covariance, with what
-comes from the others at the chain's odds: a gust that begins adds its variance to the forces, one
-that ends leaves them as they are without it, tyres that change are forgotten. What a gust does is
-seen only after some tenths of a second: until then merging lets the hypothesis live.
+Every half second the least likely member becomes a copy of the likeliest that forgets the tyres.
+Or four members interact, an interacting multiple model (Blom, Bar-Shalom 1988): nothing happens,
+a gust blows, the tyres have just changed, they settle.
 """
 
 from math import exp, log
 from typing import Any
 
-from ...envs.numerics.functions import sincos
-from ...envs.numerics.jit import copy_into, jit, noinline
+from ...envs.numerics.jit import jit, noinline
 from ...envs.numerics.primitives import maximum
 from ...envs.numerics.simd8 import load8, store8
-from ...envs.record import PACKET
-from .innovation import inflate_covariance, interpolate_hdop
-from .model import BETA, is_finite
-from .packets import process_packet, process_sample
-from .record import COUNTERS, WINDOW, FilterRecord, FilterRecords, GainTables, Vector
+from .innovation import inflate_covariance
+from .record import FilterRecord, FilterRecords
 
 MIN_LOG_WEIGHT = -60.0  # of a member's weight, below the likeliest
-CALM, GUSTY, CHANGED, SETTLING = range(1, 5)
+CALM, GUSTY, CHANGED, _SETTLING = range(1, 5)
 """Layers of the members that interact."""
-GUST_RATE, LULL_RATE = 0.03, 0.3  # 1/s, of gusts that begin and end
-CHANGE_RATE, SETTLE_RATE, TRUST_RATE = 0.1, 2.0, 0.3  # 1/s, of tyres: into CHANGED, SETTLING, CALM
-
-
-@jit
-def update_second_layer(
-    first: FilterRecord, second: FilterRecord, gains: GainTables, packet: Vector
-) -> None:
-    """Correct the second layer by a packet as a velocity: v_x = V cos(beta), v_y = V sin(beta).
-
-    double-layer-gps (8)-(9), with the first layer's sideslip angle as it was predicted for the
-    captured tick. The noise along is the speed's, after the table of HDOP; the one across is that
-    of the angle, (V sigma_beta)^2, and of the speed, (sigma_V sin(beta))^2.
-
-    Args:
-        first: Memory of the first layer.
-        second: Memory of the second layer.
-        gains: Tables of gains, shape (cells, rows, columns).
-        packet: Packet that the first layer has used, shape (PACKET_WIDTH,).
-    """
-    s, captured = int(packet[PACKET.sensor]), int(packet[PACKET.captured])
-    beta = first.x[BETA]
-    if captured >= maximum(first.start, first.tick - WINDOW + 1) and captured < first.tick:
-        beta = first.predicted[captured % WINDOW, BETA]
-    sine, cosine = sincos(beta)
-    V = packet[first.speed_column[s]]
-    if not is_finite(V):
-        first.counts[COUNTERS.invalid] += 1
-        return
-    velocity = second.sample
-    copy_into(packet, velocity)
-    velocity[PACKET.value] = V * cosine
-    velocity[PACKET.value + 1] = V * sine
-    factor = interpolate_hdop(first, s, packet)
-    speed_variance = second.r_speed * factor * factor
-    second.r[s, 0] = speed_variance
-    second.r[s, 1] = V * V * first.P[BETA, BETA] + speed_variance * sine * sine
-    process_sample(second, gains)
-
-
-@jit
-def first_member(layers: FilterRecords) -> int:
-    """Return the first layer that measures.
-
-    Args:
-        layers: Memory of the estimator, shape (layers,).
-
-    Returns:
-        1 where there is a bank, else 0.
-    """
-    return 1 if layers[0].members > 0 else 0
-
-
-@jit
-def process_packet_members(layers: FilterRecords, gains: GainTables, packet: Vector) -> None:
-    """Process a packet by every member behind the first one.
-
-    Args:
-        layers: Memory of the bank, shape (layers,).
-        gains: Tables of gains, shape (cells, rows, columns).
-        packet: Packet, shape (PACKET_WIDTH,).
-    """
-    for m in range(2, len(layers)):
-        process_packet(layers[m], gains, packet)
+_GUST_RATE, _LULL_RATE = 0.03, 0.3  # 1/s, of gusts that begin and end
+# 1/s, of tyres: into CHANGED, SETTLING, CALM
+_CHANGE_RATE, _SETTLE_RATE, _TRUST_RATE = 0.1, 2.0, 0.3
 
 
 @jit
@@ -122,16 +44,16 @@ def _set_level(f: FilterRecord, i: int, level: Any) -> None:
 def replace_least_likely(layers: FilterRecords) -> None:
     """Replace the least likely member by the likeliest with tyres that may have changed.
 
+    Its tyres walk until the next one begins, since the change may come later. Where members differ
+    in the level of their disturbances, a place in the bank stays at its own.
+
     Args:
         layers: Memory of the bank, shape (layers,).
     """
     best = _find_likeliest(layers)
-    max_weight, worst = layers[best].weight, 1
+    peak, worst = layers[best].weight, 1
     for m in range(1, len(layers)):
-        layers[m].weight, layers[m].fresh = (
-            maximum(layers[m].weight - max_weight, MIN_LOG_WEIGHT),
-            0.0,
-        )
+        layers[m].weight, layers[m].fresh = maximum(layers[m].weight - peak, MIN_LOG_WEIGHT), 0.0
         if layers[m].weight <= layers[worst].weight and m != best:
             worst = m
     f = layers[worst]
@@ -174,16 +96,8 @@ def _merge(source: FilterRecord, probability: Any, target: FilterRecord) -> Any:
     for j in range(0, target.total, 8):
         offset = load8(source.x, j) - load8(target.x, j)
         for i in range(target.total):
-            target_entry, spread = (
-                load8(target.P, i, j),
-                (source.x[i] - target.x[i]) * offset * product,
-            )
-            store8(
-                target.P,
-                target_entry + (load8(source.P, i, j) - target_entry) * share + spread,
-                i,
-                j,
-            )
+            entry, spread = load8(target.P, i, j), (source.x[i] - target.x[i]) * offset * product
+            store8(target.P, entry + (load8(source.P, i, j) - entry) * share + spread, i, j)
     for i in range(target.total):
         target.x[i] += share * (source.x[i] - target.x[i])
     return share
@@ -205,43 +119,33 @@ def _remove_gust(f: FilterRecord) -> None:
 def run_imm_step(layers: FilterRecords) -> None:
     """Run a step of the Markov chain on the members' moments and weights; layer 0 is its scratch.
 
+    A gust that begins adds its variance to the forces, one that ends leaves them as they are
+    without it, tyres that change are forgotten.
+
     Args:
         layers: Memory of the bank, shape (1 + 4,).
     """
     best, calmed = _find_likeliest(layers), layers[0]
     calm, gusty, changed = layers[CALM], layers[GUSTY], layers[CHANGED]
-    settling, max_weight, time = layers[SETTLING], layers[best].weight, calm.respawn * calm.step
+    settling, max_weight, time = layers[_SETTLING], layers[best].weight, calm.respawn * calm.step
     for m in range(1, len(layers)):
         layers[m].weight = exp(maximum(layers[m].weight - max_weight, MIN_LOG_WEIGHT))
     _copy_moments(gusty, calmed)
     _remove_gust(calmed)
-    calm_probability = _split_weight(gusty, LULL_RATE * time)
-    share = _merge(calm, _split_weight(calm, GUST_RATE * time), gusty)
+    calm_probability = _split_weight(gusty, _LULL_RATE * time)
+    share = _merge(calm, _split_weight(calm, _GUST_RATE * time), gusty)
     for i in range(2):
         inflate_covariance(gusty, gusty.dense + i, share * gusty.burst[i])
     _merge(calmed, calm_probability, calm)
     _copy_moments(calm, calmed)
-    change_probability = _split_weight(calm, CHANGE_RATE * time)
-    _merge(settling, _split_weight(settling, TRUST_RATE * time), calm)
-    _merge(changed, _split_weight(changed, SETTLE_RATE * time), settling)
+    change_probability = _split_weight(calm, _CHANGE_RATE * time)
+    _merge(settling, _split_weight(settling, _TRUST_RATE * time), calm)
+    _merge(changed, _split_weight(changed, _SETTLE_RATE * time), settling)
     share = _merge(calmed, change_probability, changed)
     for i in range(2):
         inflate_covariance(changed, changed.tyres + i, share * changed.spread)
     for m in range(1, len(layers)):
         layers[m].weight = log(layers[m].weight)
-
-
-@jit
-def update_bank(layers: FilterRecords) -> None:
-    """Run the bank's own step: interact, or replace a member.
-
-    Args:
-        layers: Memory of the bank, shape (layers,).
-    """
-    if layers[0].burst[0] > 0.0:
-        run_imm_step(layers)
-    else:
-        replace_least_likely(layers)
 
 
 @jit

@@ -1,15 +1,9 @@
-"""The rule "buffer": the window is filtered anew when a late sample comes.
+"""A packet that has arrived: whether it is sound, and the rule "buffer", which rewinds to it.
 
 Every tick's inputs, fast measurements and speed are stored, and every few ticks the states and
-their covariance. A sample captured at c is put in its place: the newest snapshot not after c is
-restored, and the ticks up to now are filtered anew with all samples that are known by now. Exact
-for any delay, order and clock; a sample older than the window, or than a sample that had to go, is
-refused and counted. The gate judges a sample once, by what was known of the time before it; one
-that it refuses leaves everything as it was.
-
-A packet that is here: sound or not, for now or for the next step.
-
-A packet is a row (PACKET_WIDTH,), columns as in `envs.record.Packet`.
+their covariance. For a late sample the newest snapshot not after its capture is restored, and the
+ticks up to now are filtered anew with all samples known by now: exact for any delay and order.
+The gate judges a sample once, by what was known before it; a refused one changes nothing.
 """
 
 from typing import Any
@@ -21,7 +15,7 @@ from ...envs.numerics.primitives import floor, maximum
 from ...envs.record import PACKET, PACKET_WIDTH
 from .innovation import BUFFER, DROPPED, find_clone, get_direct, is_duplicate
 from .model import MIN_SPEED, VELOCITY_ROLL, build_model, is_finite
-from .predict import advance_state, correct_fast
+from .predict import advance_state
 from .record import (
     COUNTERS,
     N_RECENT,
@@ -34,7 +28,7 @@ from .record import (
     GainTables,
     Vector,
 )
-from .update import update_filter
+from .update import correct_fast, update_filter
 
 _EMPTY_STAMP = -1  # the captured tick of a place that is empty
 _NOW_SLOT = N_SNAPSHOTS  # the snapshot of now, while the past is filtered anew
@@ -158,10 +152,7 @@ def _apply_tick_samples(
 
 @jit
 def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: int) -> bool:
-    """Filter anew from the snapshot at `first` to now, with a new sample.
-
-    Returns False, and all is as before, if the gate refuses the sample at the place `new_place`.
-    """
+    """Filter anew from `first` to now with a new sample; False, undone, if the gate refuses it."""
     now, invalid, count = f.tick, f.counts[COUNTERS.invalid], _collect_samples(f, first)
     _store_snapshot(f, _NOW_SLOT)
     _restore(f, _find_slot(f, first))
@@ -174,9 +165,8 @@ def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: in
             if (tick - f.start) % SNAPSHOT_INTERVAL == 0:
                 _store_snapshot(f, _find_slot(f, tick))
         f.stretch = 1.0  # what was restored is of this tick's speed
-        if not _apply_tick_samples(
-            f, gains, tick, count, new_place
-        ):  # no snapshot was changed before
+        # no snapshot was changed before
+        if not _apply_tick_samples(f, gains, tick, count, new_place):
             passed = False
             break
     f.counts[COUNTERS.invalid] = invalid  # each row was counted when it came
@@ -188,18 +178,8 @@ def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: in
 
 
 @noinline
-def rewind_update(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -> bool:
-    """Correct by a packet of any age within the window.
-
-    Args:
-        f: Memory of the filter.
-        gains: Tables of gains, shape (cells, rows, columns).
-        s: Index of the slow sensor.
-        packet: Packet, shape (PACKET_WIDTH,).
-
-    Returns:
-        Whether it was used.
-    """
+def _rewind_update(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -> bool:
+    """Correct by a packet of any age within the window; return whether it was used."""
     captured = int(packet[PACKET.captured])
     first = f.start + (captured - f.start) // SNAPSHOT_INTERVAL * SNAPSHOT_INTERVAL
     if _is_duplicate(f, s, captured):
@@ -228,20 +208,10 @@ def clear_history(f: FilterRecord) -> None:
 
 
 @jit
-def apply_packet(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -> bool:
-    """Correct by a sound packet according to its age.
-
-    Args:
-        f: Memory of the filter.
-        gains: Tables of gains, shape (cells, rows, columns).
-        s: Index of the slow sensor.
-        packet: Packet, shape (PACKET_WIDTH,).
-
-    Returns:
-        Whether it was used.
-    """
+def _apply_packet(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -> bool:
+    """Correct by a sound packet according to its age; return whether it was used."""
     if f.late == BUFFER:
-        return rewind_update(f, gains, s, packet)
+        return _rewind_update(f, gains, s, packet)
     first = find_clone(f, s, int(packet[PACKET.captured]))
     is_usable = first != DROPPED
     return is_usable and update_filter(f, gains, s, first, packet, is_usable)
@@ -268,11 +238,7 @@ def _is_timely(f: FilterRecord, captured: Any, arrived: Any) -> bool:
 
 @jit
 def _is_frozen(f: FilterRecord, s: int, packet: Vector) -> bool:
-    """Return whether a packet repeats the sensor's last one while the car moves.
-
-    Two values or more, and all there are, are equal: noise repeats no number, and a receiver's
-    rounded course comes with a position.
-    """
+    """Return whether a packet of two values or more repeats the sensor's last while it moves."""
     last = f.last[s]
     if packet[PACKET.captured] == last[PACKET.captured]:  # a duplicate
         return False
@@ -287,18 +253,8 @@ def _is_frozen(f: FilterRecord, s: int, packet: Vector) -> bool:
 
 
 @jit
-def is_valid(f: FilterRecord, packet: Vector) -> bool:
-    """Return whether a packet is one for this filter and fit for use; what is not is counted.
-
-    Numbers are judged as floats, before any becomes an int.
-
-    Args:
-        f: Memory of the filter.
-        packet: Packet, shape (PACKET_WIDTH,).
-
-    Returns:
-        True for a packet to use.
-    """
+def _is_valid(f: FilterRecord, packet: Vector) -> bool:
+    """Return whether a packet is for this filter and fit for use; what is not is counted."""
     for i in range(PACKET.value):
         if not is_finite(packet[i]):
             f.counts[COUNTERS.invalid] += 1
@@ -356,12 +312,12 @@ def process_sample(f: FilterRecord, gains: GainTables) -> bool:
         False if it was dropped.
     """
     f.nis = np.nan
-    if not is_valid(f, f.sample):
+    if not _is_valid(f, f.sample):
         return False
     s = int(f.sample[PACKET.sensor])
     if f.pace > 1 and not (f.has_started == 1 and (f.tick - f.origin) % f.pace == 0):
         return _store_waiting(f, s, f.sample)
-    return apply_packet(f, gains, s, f.sample)
+    return _apply_packet(f, gains, s, f.sample)
 
 
 @noinline
@@ -390,5 +346,5 @@ def apply_waiting(f: FilterRecord, gains: GainTables) -> None:
     """
     for i in range(f.waits):
         copy_into(f.waiting[i], f.sample)
-        apply_packet(f, gains, int(f.sample[PACKET.sensor]), f.sample)
+        _apply_packet(f, gains, int(f.sample[PACKET.sensor]), f.sample)
     f.waits = 0

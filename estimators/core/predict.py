@@ -1,16 +1,16 @@
-"""From one step to the next: a fast row read, the prediction, the correction by fast sensors."""
+"""From one step to the next: a fast row is read, and states and covariance are predicted."""
 
 from typing import Any
 
 import numpy as np
 
 from ...envs.numerics.jit import jit, noinline
-from ...envs.numerics.packed import load_element, store_element
+from ...envs.numerics.packed import load_element
 from ...envs.numerics.primitives import absolute, maximum, minimum
 from ...envs.numerics.simd8 import allocate_scratch, load8, store8, vector_width
 from ...envs.record import FAST
-from .covariance import predict_covariance, update_with_states
-from .innovation import BUFFER, LARSEN, propagate_larsen_gains
+from .covariance import predict_covariance
+from .innovation import BUFFER, LARSEN, PSEUDO
 from .model import (
     BETA,
     KINEMATIC,
@@ -18,23 +18,16 @@ from .model import (
     MIN_SPEED,
     VELOCITY_ROLL,
     build_model,
+    compute_axle_force,
     filter_speed,
     find_cell,
     is_finite,
     is_model_outdated,
-    linearise,
-    locate_step_row,
 )
-from .record import COUNTERS, N_CORE, N_SLOW, FilterRecord, GainTables, Vector
-from .update import (
-    DUAL_RATE,
-    PSEUDO,
-    apply_gain_shares,
-    apply_next_share,
-    correct_between,
-    predict_slow_rows,
-    update_error,
-)
+from .record import CAR, COUNTERS, N_CORE, N_SLOW, FilterRecord, Vector
+
+_FACTOR_LIMITS = (0.2, 3.0)
+_MAX_INVERSE_FRICTION = 4.0  # of the reciprocal of friction
 
 
 @jit
@@ -56,12 +49,9 @@ def compute_signal(row: Vector, column: Vector, factor: Vector) -> Any:
 
 @jit
 def _estimate_noise(f: FilterRecord, accel_y: float) -> None:
-    """Estimate the variance of a_y from its second differences, which motion hardly has.
-
-    White noise of variance r gives them 6 r; what is far beyond counts as 9 times what is expected.
-    """
+    """Estimate the variance of a_y from its second differences, which motion hardly has."""
     second_difference = accel_y - 2.0 * f.y_past[0] + f.y_past[1]
-    if is_finite(second_difference):
+    if is_finite(second_difference):  # white noise gives it 6 r; far beyond counts as 9 r
         r = f.r_fast[f.accel_row]
         sample_variance = minimum(second_difference * second_difference * (1.0 / 6.0), 9.0 * r)
         f.r_fast[f.accel_row] = maximum(r + f.r_share * (sample_variance - r), f.r_told)
@@ -70,10 +60,7 @@ def _estimate_noise(f: FilterRecord, accel_y: float) -> None:
 
 @jit
 def _write_scale_column(f: FilterRecord) -> None:
-    """Write the accelerometer's prediction in the column of its scale's error.
-
-    At a standstill nothing of the scale is seen.
-    """
+    """Write the accelerometer's prediction in the column of its scale's error, 0 at standstill."""
     row = f.C_fast[f.accel_row]
     row[f.scaled] = 0.0
     if f.speed <= MIN_SPEED:
@@ -135,6 +122,54 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
             f.speed if f.measured == 0 or is_model_outdated(f, f.speed) else f.model_speed,
             turning,
         )
+
+
+@jit
+def _set_random_walk(f: FilterRecord, moves: bool) -> None:
+    """Set the tyres' random walk, while the car moves; a new member's tyres walk more."""
+    for i in range(3 if f.grip > 0 else 2):
+        index = f.tyres + i if i < 2 else f.grip
+        walks = moves and f.P[index, index] < f.prior[index, index]
+        extra = f.fresh if i < 2 else 0.0
+        f.Q[index, index] = f.q_tyres[i] + extra if walks else 0.0
+
+
+@jit
+def linearise(f: FilterRecord, steer: Any) -> None:
+    """Expand both axles' forces at the present state.
+
+    Args:
+        f: Memory of the filter.
+        steer: Steering angle of the front wheels (rad).
+    """
+    x, V = f.x, maximum(f.model_speed, MIN_SPEED)
+    for i in range(2):
+        x[f.tyres + i] = minimum(maximum(x[f.tyres + i], _FACTOR_LIMITS[0]), _FACTOR_LIMITS[1])
+    grip = 0.0
+    if f.grip > 0:
+        grip = minimum(maximum(x[f.grip], 0.0), _MAX_INVERSE_FRICTION)
+        x[f.grip] = grip
+    beta, gamma = x[0], x[1]
+    push, moves = 0.0, f.speed > MIN_SPEED
+    _set_random_walk(f, moves)
+    for i in range(2):
+        arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
+        alpha = (steer if i == 0 else 0.0) - beta - arm * gamma / V
+        factor = x[f.tyres + i]
+        force, slope, per_factor, per_grip = compute_axle_force(
+            f.stiffness[i], f.load[i], alpha, factor, grip
+        )
+        f.car[CAR.front_stiffness + i] = 0.5 * slope
+        if not moves:  # nothing of the tyres is seen
+            per_factor, per_grip = 0.0, 0.0
+        f.per_tyre[i, 0], f.per_tyre[i, 1] = per_factor, per_grip
+        f.rest[i] = force - slope * alpha - per_factor * factor - per_grip * grip
+        push += absolute(force)
+    if f.model_error > 0.0:
+        force_error = f.model_error * push
+        moment_error = 0.5 * (f.car[CAR.front_arm] + f.car[CAR.rear_arm]) * force_error
+        f.Q[f.dense, f.dense] = f.q_known[0] + f.q_share * force_error * force_error
+        f.Q[f.dense + 1, f.dense + 1] = f.q_known[1] + f.q_share * moment_error * moment_error
 
 
 @jit
@@ -230,59 +265,3 @@ def compute_residual(f: FilterRecord, i: int) -> Any:
     for j in range(f.inputs):
         residual = residual - load_element(f.D_fast, i, j) * load_element(f.u, j)
     return residual
-
-
-@jit
-def _correct_joint(f: FilterRecord, gains: GainTables) -> None:
-    """Correct x += K residuals with residuals that are all taken before, in f.eps."""
-    for i in range(f.fasts):
-        K = gains[f.cell, locate_step_row(f) + i]
-        for j in range(f.total):
-            f.x[j] += K[j] * f.eps[i]
-
-
-@noinline
-def correct_fast(f: FilterRecord, gains: GainTables) -> None:
-    """Correct by the fast measurements in f.y; what is not finite is counted and skipped.
-
-    Args:
-        f: Memory of the filter.
-        gains: Tables of gains, shape (cells, rows, columns).
-    """
-    for i in range(f.fasts):
-        if not is_finite(f.y[i]):
-            f.counts[COUNTERS.invalid] += 1
-    if f.between == PSEUDO:
-        predict_slow_rows(f, f.first_slow)
-    if f.joint == 1:
-        for i in range(f.fasts):
-            residual = compute_residual(f, i)
-            f.eps[i] = residual if is_finite(residual) else 0.0
-        if f.between == PSEUDO:
-            correct_between(f, gains, f.first_slow)
-        else:
-            _correct_joint(f, gains)
-        return
-    for i in range(f.fasts):
-        residual = compute_residual(f, i)
-        if not is_finite(residual):
-            f.eps[i] = 0.0
-            continue
-        if f.periodic == 1:
-            step = locate_step_row(f) + i
-            for j in range(f.total):
-                store_element(
-                    f.x, load_element(f.x, j) + load_element(gains, f.cell, step, j) * residual, j
-                )
-            continue
-        update_with_states(f, f.C_fast[i], f.r_fast[i], residual)
-        for j in range(0, f.total, 8):  # the design of periodic gains reads them, too
-            store8(f.share, load8(f.gain, j), i, j)
-        if f.between == PSEUDO:
-            update_error(f, i, residual)
-        if f.late == LARSEN:
-            propagate_larsen_gains(f, f.C_fast[i])
-    if f.between == PSEUDO:
-        apply_gain_shares(f, f.first_slow)
-    elif f.between == DUAL_RATE:
-        apply_next_share(f, gains, f.first_slow)

@@ -1,13 +1,9 @@
 """One filter's memory: a single record that compiled code reads and writes in place.
 
-A filter is its record, so a copy of the record is a complete snapshot and an array of records is
-a batch. Sizes are fixed so that every filter runs on the same compiled code; which fields a filter
-uses depends on four codes, and the comments name them:
-
-    kind     of model, `transition`                 between  slow samples, `intersample`
-    late     rule for late samples, `delay`         periodic 1: gains from a table, 0: from P
-
-`design.assemble` writes the blocks from the model to the gains once; `run.begin` sets the rest.
+A copy of the record is a complete snapshot and an array of records is a batch. Sizes are fixed,
+so every filter runs on the same compiled code. The codes `kind` (of model), `late` (rule for late
+samples), `between` (rule between samples) and `periodic` (1: gains from a table, 0: from P) say
+which fields are used. `design.assemble` writes all up to the gains, `filter.reset_filter` the rest.
 """
 
 import math
@@ -78,7 +74,8 @@ COUNTERS, CAR = SkipCounters(), CarIndex()
 
 _INT, _FLOAT = np.int64, np.float64
 
-_MODEL = [  # dx = A x + B u on the first `dense` states; those behind them decay by themselves
+_FIELDS = [
+    # model: dx = A x + B u on the first `dense` states; those behind them decay by themselves
     ("kind", _INT),
     ("n", _INT),  # states
     ("dense", _INT),
@@ -122,8 +119,7 @@ _MODEL = [  # dx = A x + B u on the first `dense` states; those behind them deca
     ("prior", _FLOAT, (N_CORE, N_CORE)),  # P at the start
     ("first", _FLOAT, (N_CORE,)),  # x at the start
     ("speed_state", _INT),  # the state that starts at the measured speed; -1: none
-]
-_BANK = [  # several filters beside each other, of which the first record is the mixture
+    # bank: several filters beside each other, of which the first record is the mixture
     ("members", _INT),  # records behind the mixture; 0: no bank
     ("weight", _FLOAT),  # of a member: the logarithm of its likelihood
     ("odds", _FLOAT),  # its weight at the start
@@ -134,8 +130,7 @@ _BANK = [  # several filters beside each other, of which the first record is the
     ("fresh", _FLOAT),  # variance of a step of a new member's tyres, until the next one begins
     ("alert", _FLOAT),  # what `fresh` is then
     ("burst", _FLOAT, (2,)),  # variances of a gust's force, moment; 0: members do not interact
-]
-_FAST = [  # inputs and fast measurements: sums of two columns of the fast row
+    # fast rows: inputs and fast measurements: sums of two columns of the fast row
     ("inputs", _INT),
     ("u_column", _INT, (N_INPUTS, 2)),
     ("u_factor", _FLOAT, (N_INPUTS, 2)),
@@ -154,8 +149,7 @@ _FAST = [  # inputs and fast measurements: sums of two columns of the fast row
     ("r_share", _FLOAT),  # of a new second difference in the variance of a_y; 0: as configured
     ("y_past", _FLOAT, (2,)),  # a_y of the two rows before
     ("robust", _FLOAT),  # standard deviations from which a residual counts less; 0: none does
-]
-_SLOW = [  # slow sensors: what each one measures, how noisy it is, when it captures
+    # slow sensors: what each one measures, how noisy it is, when it captures
     ("rows", _INT, (N_SLOW,)),  # of C
     ("C", _FLOAT, (N_SLOW, N_ROWS, N_CORE)),
     ("angle", _INT, (N_SLOW, N_ROWS)),  # 1: the residual is wrapped
@@ -181,15 +175,13 @@ _SLOW = [  # slow sensors: what each one measures, how noisy it is, when it capt
     ("stride", _INT),  # ticks of one step of the filter
     ("pace", _INT),  # ticks between two steps that listen to sensors
     ("origin", _INT),  # phase of a single-rate filter's steps
-]
-_DELAY = [  # the rule for late samples
+    # the rule for late samples
     ("late", _INT),
     ("frames", _INT, (N_SLOW,)),  # captured and not here yet, at most; CLONE, LARSEN
     ("first_clone", _INT, (N_SLOW,)),  # where the sensor's clones start in x; CLONE
     ("store_predictions", _INT),  # 1: `predicted` is filled; STORED, CONSTANT, below a second layer
     ("assumed", _INT),  # ticks; CONSTANT
-]
-_GAINS = [
+    # gains
     ("periodic", _INT),
     ("joint", _INT),  # 1: the rows of a sensor correct together, not one after the other
     ("between", _INT),
@@ -199,8 +191,7 @@ _GAINS = [
     ("high", _FLOAT),  # of the last one
     ("spacing", _FLOAT),  # m/s between tables; 0: one table
     ("inverse", _FLOAT, (N_FAST + N_ROWS, N_TOTAL)),  # transposed, of (20); PSEUDO, not periodic
-]
-_SPEED = [
+    # speed
     ("measured", _INT),  # 1: from the wheels, 0: fixed
     ("smoothing", _FLOAT),  # share of a new sample in the low-pass
     ("speed", _FLOAT),  # m/s, low-passed
@@ -210,8 +201,7 @@ _SPEED = [
     ("turning", _FLOAT),  # rad/s, the present model's yaw rate; KINEMATIC, VELOCITY_ROLL
     ("cell", _INT),  # the present table of gains
     ("wanted", _INT),  # the table that is missing; -1: none
-]
-_NOW = [
+    # state of the filter now
     ("start", _INT),  # tick of the first row
     ("tick", _INT),  # of the last row
     ("has_started", _INT),  # 1: there was a first step
@@ -244,16 +234,14 @@ _NOW = [
     # LARSEN: what the residual of a frame that is due will do to the states, and its expectation
     ("larsen_gain", _FLOAT, (N_SLOW, N_ROWS, N_CORE)),
     ("larsen_expected", _FLOAT, (N_SLOW, N_ROWS)),
-]
-_BETWEEN = [  # corrections between slow samples
+    # corrections between slow samples
     ("share", _FLOAT, (N_FAST + N_ROWS, N_TOTAL)),  # gains of a tick, fast, slow rows; not periodic
     ("e", _FLOAT, (N_TOTAL,)),  # estimated error, tie-vision (18); PSEUDO
     ("expected", _FLOAT, (N_ROWS,)),  # C x before this tick's corrections, slow rows; PSEUDO
     ("eps", _FLOAT, (N_FAST + N_ROWS,)),  # residuals of this tick: fast, slow rows; joint, PSEUDO
     ("innovation", _FLOAT, (N_ROWS,)),  # of the last sample; DUAL_RATE
     ("since", _INT),  # steps since it; -1: there was none; DUAL_RATE
-]
-_SCRATCH = [
+    # scratch
     ("u_new", _FLOAT, (N_INPUTS,)),
     ("PC", _FLOAT, (N_TOTAL,)),  # P C^T
     ("gain", _FLOAT, (N_TOTAL,)),  # of the last measurement
@@ -270,11 +258,8 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
     ("past_speed", _FLOAT, (WINDOW,)),  # the model's
     ("past_turning", _FLOAT, (WINDOW,)),
     ("past_road_turn", _FLOAT, (WINDOW,)),  # and with `predicted`
-    (
-        "snapshot_x",
-        _FLOAT,
-        (N_SNAPSHOTS + 1, N_CORE),
-    ),  # the last is "now", while the past is redone
+    # the last snapshot is "now", while the past is redone
+    ("snapshot_x", _FLOAT, (N_SNAPSHOTS + 1, N_CORE)),
     ("snapshot_P", _FLOAT, (N_SNAPSHOTS + 1, N_CORE, N_CORE)),
     ("recent", _FLOAT, (N_RECENT, PACKET_WIDTH)),
     ("recent_r", _FLOAT, (N_RECENT, N_ROWS)),  # r when each of them came
@@ -282,39 +267,24 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
     ("replay", _INT, (N_RECENT,)),  # scratch: those that are used again
 ]
 
-_FIELDS = _MODEL + _BANK + _FAST + _SLOW + _DELAY + _GAINS + _SPEED + _NOW + _BETWEEN + _SCRATCH
 
-
-def _count_numbers(field: Any) -> int:
-    """Count the numbers of a field."""
-    return math.prod(field[2]) if len(field) > 2 else 1
+def _count_numbers(row: Any) -> int:
+    """Count the numbers of a row."""
+    return math.prod(row[2]) if len(row) > 2 else 1
 
 
 _LEADING = (  # what a tick in lanes reads or writes by the record, next to another
     *("n", "total", "periodic", "members", "measured", "speed", "speed_before", "model_speed"),
-    *(
-        "tick",
-        "has_started",
-        "cell",
-        "at",
-        "cursor",
-        "road_turn",
-        "period",
-        "next",
-        "y",
-        "u",
-        "counts",
-    ),
+    *("tick", "has_started", "cell", "at", "cursor", "road_turn", "period", "next"),
+    *("y", "u", "counts"),
     *("x", "P"),
 )
 _RANK = dict(zip(_LEADING, range(len(_LEADING)), strict=True))
-_ORDER = sorted(
-    _FIELDS, key=lambda field: (_RANK.get(str(field[0]), len(_RANK)), _count_numbers(field))
-)
-_N_BEFORE_X = sum(_count_numbers(field) for field in _ORDER[: _RANK["x"]])
+_ORDER = sorted(_FIELDS, key=lambda row: (_RANK.get(str(row[0]), len(_RANK)), _count_numbers(row)))
+_N_BEFORE_X = sum(_count_numbers(row) for row in _ORDER[: _RANK["x"]])
 _N_PADDING = 8 - _N_BEFORE_X % 8  # with it x and P begin on cache lines
 FILTER = pad_to_cache_line([("padding", _FLOAT, (_N_PADDING,)), *_ORDER, *_WINDOW])
 X_OFFSET = _N_PADDING + _N_BEFORE_X  # numbers before x
 N_SMALL = sum(
-    _count_numbers(field) for field in _ORDER[len(_LEADING) :] if _count_numbers(field) <= 64
+    _count_numbers(row) for row in _ORDER[len(_LEADING) :] if _count_numbers(row) <= 64
 )  # behind P

@@ -1,13 +1,9 @@
-"""Between slow samples: what stands in for the measurement that is not there.
+"""Corrections: by the fast sensors, by a sample, and between samples of a slow sensor.
 
-predict: nothing. pseudo-residual: tie-vision (19)-(22), which uneven-delay (20)-(22), double-layer
-(28)-(29), dual-rate (31) and Oh's (35) repeat: the propagated estimate of the error. The fast
-sensors' residuals are always the real ones. One constant gain K serves every tick, its columns in
-the order fast rows, slow rows; where gains are not precomputed, the share of the last sample's.
-dual-rate: that paper's rules, whose corrections after a sample are a table of shares of its
-innovation (`design.dual_rate`). single-rate: a filter that listens only at the sensor's rate.
-
-The correction by a sample of a slow sensor, whatever the filter's rules are.
+Rules between samples: predict: nothing. pseudo-residual: tie-vision (19)-(22), which uneven-delay
+(20)-(22), double-layer (28)-(29), dual-rate (31) and Oh's (35) repeat: the propagated estimate of
+the error, by one constant gain K, columns in the order fast rows, slow rows, or by the share of
+the last sample's gain. dual-rate: shares of the last innovation from a table.
 """
 
 from typing import Any
@@ -16,25 +12,26 @@ import numpy as np
 
 from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import jit, noinline
-from ...envs.numerics.primitives import absolute, maximum
+from ...envs.numerics.packed import load_element, store_element
+from ...envs.numerics.primitives import absolute, maximum, minimum
+from ...envs.numerics.simd8 import load8, store8
 from ...envs.record import PACKET
-from .covariance import dot, predict_measurement, update_with_clone, update_with_states
+from .covariance import dot, predict_measurement, project_row, update_with_clone, update_with_states
 from .innovation import (
     BUFFER,
     CONSTANT,
+    DUAL_RATE,
     LARSEN,
+    PSEUDO,
     STORED_ONE,
-    adapt_noise,
     check_sample,
     compute_packet_variance,
-    project_row,
     propagate_larsen_gains,
 )
-from .model import PSI, locate_frame_row
+from .innovation import NONE as NONE
+from .model import PSI, is_finite
+from .predict import compute_residual
 from .record import COUNTERS, N_SNAPSHOTS, WINDOW, FilterRecord, GainTables, Vector
-
-NONE, PSEUDO, DUAL_RATE = range(3)
-"""Codes of the field `between`."""
 
 
 @jit
@@ -44,13 +41,27 @@ def _apply_row(f: FilterRecord, s: int, i: int, v: Vector) -> Any:
 
 
 @jit
-def predict_slow_rows(f: FilterRecord, s: int) -> None:
-    """Predict the slow rows, and their pseudo-residuals: tie-vision (22).
+def locate_step_row(f: FilterRecord) -> Any:
+    """Locate the gain of the first fast measurement in this step.
 
     Args:
         f: Memory of the filter.
-        s: Index of the slow sensor.
+
+    Returns:
+        Row of the table.
     """
+    return 1 + f.at * maximum(f.fasts, 1)
+
+
+@jit
+def _locate_frame_row(f: FilterRecord, s: int, frame: int) -> Any:
+    """Locate the gain of sensor s's first row for a frame; `f.pattern`: of the rule between."""
+    return 1 + f.cycle * maximum(f.fasts, 1) + frame * f.rows[s]
+
+
+@jit
+def _predict_slow_rows(f: FilterRecord, s: int) -> None:
+    """Predict the slow rows of sensor s, and their pseudo-residuals: tie-vision (22)."""
     for i in range(f.rows[s]):
         has_clones = f.frames[s] > 0
         f.expected[i] = f.x[f.first_clone[s] + i] if has_clones else predict_measurement(f, s, i)
@@ -58,17 +69,13 @@ def predict_slow_rows(f: FilterRecord, s: int) -> None:
 
 
 @jit
-def correct_between(f: FilterRecord, gains: GainTables, s: int) -> None:
+def _correct_between(f: FilterRecord, gains: GainTables, s: int) -> None:
     """Correct x and e, both predicted, by the fast residuals in f.eps and the pseudo-residuals.
 
-    Args:
-        f: Memory of the filter.
-        gains: Tables of gains, shape (cells, rows, columns); rows of K^T and then of the inverse's
-            transpose stand behind those of the steps and frames.
-        s: Index of the slow sensor.
+    The rows of K^T, then of the inverse's transpose, stand behind those of the steps and frames.
     """
     x, e, N, m = f.x, f.e, f.total, f.fasts
-    first = locate_frame_row(f, s, f.pattern)
+    first = _locate_frame_row(f, s, f.pattern)
     for i in range(m):
         f.e_seen[i] = dot(f.C_fast[i], e, f.n)
     for i in range(m):
@@ -84,16 +91,10 @@ def correct_between(f: FilterRecord, gains: GainTables, s: int) -> None:
 
 
 @jit
-def correct_sample(f: FilterRecord, gains: GainTables, s: int) -> None:
-    """Correct by a sample of this tick: its residuals replace the pseudo ones, and e starts anew.
-
-    Args:
-        f: Memory of the filter.
-        gains: Tables of gains, shape (cells, rows, columns).
-        s: Index of the slow sensor.
-    """
+def _correct_sample(f: FilterRecord, gains: GainTables, s: int) -> None:
+    """Correct by a sample of this tick: its residuals replace the pseudo ones; e starts anew."""
     m, N, rows = f.fasts, f.total, f.rows[s]
-    first = locate_frame_row(f, s, f.pattern)
+    first = _locate_frame_row(f, s, f.pattern)
     for i in range(rows):
         K, real = gains[f.cell, first + m + i], f.residual[i]  # tie-vision (19)
         for j in range(N):
@@ -108,14 +109,8 @@ def correct_sample(f: FilterRecord, gains: GainTables, s: int) -> None:
 
 
 @jit
-def update_error(f: FilterRecord, i: int, residual: float) -> None:
-    """Correct e by a fast row's gain f.share[i], which x has used.
-
-    Args:
-        f: Memory of the filter.
-        i: Index of the fast measurement.
-        residual: Its residual.
-    """
+def _update_error(f: FilterRecord, i: int, residual: float) -> None:
+    """Correct e by a fast row's gain f.share[i], which x has used, and its residual."""
     projected = dot(f.C_fast[i], f.e, f.n)
     f.eps[i] = residual
     for j in range(f.total):
@@ -123,13 +118,8 @@ def update_error(f: FilterRecord, i: int, residual: float) -> None:
 
 
 @jit
-def apply_gain_shares(f: FilterRecord, s: int) -> None:
-    """Correct x and e by the pseudo-residuals with the even fraction of the last sample's gain.
-
-    Args:
-        f: Memory of the filter.
-        s: Index of the slow sensor.
-    """
+def _apply_gain_shares(f: FilterRecord, s: int) -> None:
+    """Correct x and e by the pseudo-residuals with the even fraction of the last sample's gain."""
     for i in range(f.fasts, f.fasts + f.rows[s]):
         for j in range(f.total):
             f.x[j] += f.share[i, j] * f.eps[i]
@@ -137,16 +127,10 @@ def apply_gain_shares(f: FilterRecord, s: int) -> None:
 
 
 @jit
-def split_sample_gain(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
-    """Correct by a sample as `correct_sample` does, with the covariance's gain of this packet.
+def _split_sample_gain(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
+    """Correct by a sample as `_correct_sample` does, with the covariance's gain of this packet.
 
-    The gain is split evenly over a period.
-
-    Args:
-        f: Memory of the filter.
-        s: Index of the slow sensor.
-        first: What the sample measures, see `delay.find_clone`.
-        packet: Packet, shape (PACKET_WIDTH,).
+    The gain is split evenly over a period. first: what the sample measures, see `find_clone`.
     """
     m, N, rows = f.fasts, f.total, f.rows[s]
     steps = f.period[s] // f.stride
@@ -177,7 +161,7 @@ def split_sample_gain(f: FilterRecord, s: int, first: int, packet: Vector) -> No
 @jit
 def _apply_share(f: FilterRecord, gains: GainTables, s: int) -> None:
     """Add the fraction of the last innovation that is due now to x."""
-    first = locate_frame_row(f, s, f.pattern) + f.since * f.rows[s]
+    first = _locate_frame_row(f, s, f.pattern) + f.since * f.rows[s]
     for i in range(f.rows[s]):
         K = gains[f.cell, first + i]
         for j in range(f.total):
@@ -185,14 +169,8 @@ def _apply_share(f: FilterRecord, gains: GainTables, s: int) -> None:
 
 
 @jit
-def start_shares(f: FilterRecord, gains: GainTables, s: int) -> None:
-    """Store a sample's innovation and use its first fraction.
-
-    Args:
-        f: Memory of the filter.
-        gains: Tables of gains, shape (cells, rows, columns).
-        s: Index of the slow sensor.
-    """
+def _start_shares(f: FilterRecord, gains: GainTables, s: int) -> None:
+    """Store a sample's innovation and use its first fraction."""
     for i in range(f.rows[s]):
         f.innovation[i] = f.residual[i]
     f.since = 0
@@ -200,21 +178,16 @@ def start_shares(f: FilterRecord, gains: GainTables, s: int) -> None:
 
 
 @jit
-def apply_next_share(f: FilterRecord, gains: GainTables, s: int) -> None:
-    """Use the next fraction of the innovation, as long as there is one.
-
-    Args:
-        f: Memory of the filter.
-        gains: Tables of gains, shape (cells, rows, columns).
-        s: Index of the slow sensor.
-    """
+def _apply_next_share(f: FilterRecord, gains: GainTables, s: int) -> None:
+    """Use the next fraction of the innovation, as long as there is one."""
     if f.since >= 0:
         f.since += 1
         if f.since < f.cycle:
             _apply_share(f, gains, s)
 
 
-HEADING_TOLERANCE = 0.5  # rad: the first heading fix sets the heading where it is so far off
+_MIN_SCALE, _MAX_SCALE = 0.05, 100.0  # of the scale of R
+_HEADING_TOLERANCE = 0.5  # rad: the first heading fix sets the heading where it is so far off
 
 
 @jit
@@ -257,7 +230,7 @@ def _compute_residuals(f: FilterRecord, s: int, first: int, packet: Vector) -> N
         f.residual[i] = wrap(residual) if f.angle[s, i] == 1 else residual
     if f.heading_fix[s] == 1 and f.first_fix < 0:
         f.first_fix = captured
-        if absolute(f.residual[0]) > HEADING_TOLERANCE:
+        if absolute(f.residual[0]) > _HEADING_TOLERANCE:
             _align_heading(f, s, f.residual[0])
             f.residual[0] = 0.0
 
@@ -276,7 +249,7 @@ def _correct_periodic(
 ) -> None:
     """Correct x by the gains of the table, one row after the other."""
     captured = int(packet[PACKET.captured])
-    first_row = locate_frame_row(f, s, (captured - f.phase[s]) // f.period[s] % f.pattern)
+    first_row = _locate_frame_row(f, s, (captured - f.phase[s]) // f.period[s] % f.pattern)
     for i in range(f.rows[s]):
         K, residual = gains[f.cell, first_row + i], f.residual[i]
         for j in range(f.total):
@@ -285,12 +258,23 @@ def _correct_periodic(
 
 
 @jit
+def _adapt_noise(
+    f: FilterRecord, s: int, i: int, projected: float, residual: float, r: float
+) -> None:
+    """Adapt R to innovations: the mean of residual^2 - C P C^T, over the configured one."""
+    if r > 0.0:
+        sample_scale = (residual * residual - projected) / r * f.scale[s, i]
+        scale = f.scale[s, i] + f.adapt * (sample_scale - f.scale[s, i])
+        f.scale[s, i] = minimum(maximum(scale, _MIN_SCALE), _MAX_SCALE)
+
+
+@jit
 def _correct(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
     """Correct by the rows of a sample, one after the other, with the covariance."""
     for i in range(f.rows[s]):
         residual, r = f.residual[i], compute_packet_variance(f, s, i, packet)
         if f.adapt > 0.0:
-            adapt_noise(f, s, i, project_row(f, s, i, first), residual, r)
+            _adapt_noise(f, s, i, project_row(f, s, i, first), residual, r)
         if first >= 0:
             update_with_clone(f, first + i, r, residual)
         else:
@@ -318,7 +302,7 @@ def update_filter(
         f: Memory of the filter.
         gains: Tables of gains, shape (cells, rows, columns).
         s: Index of the slow sensor.
-        first: What the sample measures, see `delay.find_clone`.
+        first: What the sample measures, see `find_clone`.
         packet: Packet, shape (PACKET_WIDTH,).
         is_gated: Whether the gate judges it and its NIS is taken; not when it is used again in a
             rewound window.
@@ -331,11 +315,11 @@ def update_filter(
     previous_fix = f.first_fix
     _compute_residuals(f, s, first, packet)
     if f.between == PSEUDO and f.periodic == 1:
-        correct_sample(f, gains, s)
+        _correct_sample(f, gains, s)
     elif f.between == PSEUDO:
-        split_sample_gain(f, s, first, packet)
+        _split_sample_gain(f, s, first, packet)
     elif f.between != NONE:
-        start_shares(f, gains, s)
+        _start_shares(f, gains, s)
     elif f.periodic == 1:
         _correct_periodic(f, gains, s, first, packet)
     elif first == STORED_ONE and f.late == LARSEN:
@@ -347,3 +331,59 @@ def update_filter(
             return False
         _correct(f, s, first, packet)
     return True
+
+
+@jit
+def _correct_joint(f: FilterRecord, gains: GainTables) -> None:
+    """Correct x += K residuals with residuals that are all taken before, in f.eps."""
+    for i in range(f.fasts):
+        K = gains[f.cell, locate_step_row(f) + i]
+        for j in range(f.total):
+            f.x[j] += K[j] * f.eps[i]
+
+
+@noinline
+def correct_fast(f: FilterRecord, gains: GainTables) -> None:
+    """Correct by the fast measurements in f.y; what is not finite is counted and skipped.
+
+    Args:
+        f: Memory of the filter.
+        gains: Tables of gains, shape (cells, rows, columns).
+    """
+    for i in range(f.fasts):
+        if not is_finite(f.y[i]):
+            f.counts[COUNTERS.invalid] += 1
+    if f.between == PSEUDO:
+        _predict_slow_rows(f, f.first_slow)
+    if f.joint == 1:
+        for i in range(f.fasts):
+            residual = compute_residual(f, i)
+            f.eps[i] = residual if is_finite(residual) else 0.0
+        if f.between == PSEUDO:
+            _correct_between(f, gains, f.first_slow)
+        else:
+            _correct_joint(f, gains)
+        return
+    for i in range(f.fasts):
+        residual = compute_residual(f, i)
+        if not is_finite(residual):
+            f.eps[i] = 0.0
+            continue
+        if f.periodic == 1:
+            step = locate_step_row(f) + i
+            for j in range(f.total):
+                store_element(
+                    f.x, load_element(f.x, j) + load_element(gains, f.cell, step, j) * residual, j
+                )
+            continue
+        update_with_states(f, f.C_fast[i], f.r_fast[i], residual)
+        for j in range(0, f.total, 8):  # the design of periodic gains reads them, too
+            store8(f.share, load8(f.gain, j), i, j)
+        if f.between == PSEUDO:
+            _update_error(f, i, residual)
+        if f.late == LARSEN:
+            propagate_larsen_gains(f, f.C_fast[i])
+    if f.between == PSEUDO:
+        _apply_gain_shares(f, f.first_slow)
+    elif f.between == DUAL_RATE:
+        _apply_next_share(f, gains, f.first_slow)

@@ -1,7 +1,4 @@
-"""Late samples before the first tick: the rule and its window, and how many clones it needs.
-
-From a filter's config to its compiled memory: one record a layer, and its schedules.
-"""
+"""From a filter's config to its compiled memory, one record a layer, and its schedules."""
 
 import math
 from dataclasses import replace
@@ -12,7 +9,17 @@ import numpy as np
 from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
-from ..core.innovation import BUFFER, CONSTANT, IGNORE, LARSEN, RULES, STORED
+from ..core.innovation import (
+    BUFFER,
+    CONSTANT,
+    DUAL_RATE,
+    IGNORE,
+    LARSEN,
+    NONE,
+    PSEUDO,
+    RULES,
+    STORED,
+)
 from ..core.model import KINEMATIC, MIN_SPEED, VELOCITY_ROLL
 from ..core.multiple_model import CHANGED, GUSTY, MIN_LOG_WEIGHT
 from ..core.record import (
@@ -25,11 +32,10 @@ from ..core.record import (
     WINDOW,
     FilterRecord,
 )
-from ..core.update import DUAL_RATE, NONE, PSEUDO
-from .config import FilterConfig
 from .kalman import kalman_gain
 from .models import NONLINEAR, write_model
-from .periodic import NO_SENSOR, Schedule, build_measurement_rows, count_ticks, make_schedules
+from .options import FilterConfig
+from .periodic import NO_SENSOR, Schedule, build_measurement_rows, count_ticks
 
 
 def _count_frames(sensor: SlowSensor, rule: str) -> int:
@@ -39,16 +45,8 @@ def _count_frames(sensor: SlowSensor, rule: str) -> int:
     return math.ceil(sensor.longest_delay / sensor.period - 1e-9)
 
 
-def allocate_clones(f: FilterRecord, config: FilterConfig) -> None:
-    """Lay the clones of every sensor behind the states.
-
-    Args:
-        f: Memory of the filter, written.
-        config: Parsed options of the filter.
-
-    Raises:
-        ValueError: There are more clones than the rule or the memory can hold.
-    """
+def _allocate_clones(f: FilterRecord, config: FilterConfig) -> None:
+    """Lay the clones of every sensor behind the states; ValueError where there are too many."""
     rule, label = config.delay, config.name
     f.late = IGNORE if rule in ("literal", "lag") else RULES.index(rule)  # their models are late
     f.total = f.n
@@ -73,16 +71,8 @@ def allocate_clones(f: FilterRecord, config: FilterConfig) -> None:
         )
 
 
-def check_window(f: FilterRecord, config: FilterConfig) -> None:
-    """Check that the filter's window holds the longest delay and that its rules go together.
-
-    Args:
-        f: Memory of the filter.
-        config: Parsed options of the filter.
-
-    Raises:
-        ValueError: A sensor can be later than the window, or the rule lacks what an option needs.
-    """
+def _check_window(f: FilterRecord, config: FilterConfig) -> None:
+    """Check that the window holds the longest delay and that rules go together; else ValueError."""
     dt, label, sensors = float(f.step / f.stride), config.name, config.sensors
     if f.late == CONSTANT and f.assumed >= WINDOW:
         raise ValueError(
@@ -119,15 +109,15 @@ def check_window(f: FilterRecord, config: FilterConfig) -> None:
         )
 
 
-SMOOTHING_TIME = 0.015  # s, of the measured speed
-MAX_SPEED = 80.0  # m/s, of the tables of gains
-SPACING = 0.5  # m/s between them
+_SMOOTHING_TIME = 0.015  # s, of the measured speed
+_MAX_SPEED = 80.0  # m/s, of the tables of gains
+_SPACING = 0.5  # m/s between them
 REPLACE_TIME = 0.5  # s between two members of a bank that begin anew
 HAZARD = 0.2  # 1/s, of tyres that change
-TYRE_VARIANCE = 0.06  # variance of their factors
-TYRE_WALK = 0.02  # 1/s, of the factors of a new member until the next one: the change may be later
-IMM_TIME = 0.2  # s between two steps of members that interact
-GUST = (8.0, 2.0)  # times the usual force and moment
+_TYRE_VARIANCE = 0.06  # variance of their factors
+_TYRE_WALK = 0.02  # 1/s, of the factors of a new member until the next one: the change may be later
+_IMM_TIME = 0.2  # s between two steps of members that interact
+_GUST = (8.0, 2.0)  # times the usual force and moment
 
 
 def assemble(
@@ -160,16 +150,16 @@ def assemble(
             if time > 0.0:
                 i, decay = model.names.index(state), math.exp(-step / time)
                 f.decay[i], f.Q[i, i] = decay, (1.0 - decay * decay) * f.prior[i, i]
-        allocate_clones(f, config)
+        _allocate_clones(f, config)
         f.measured, f.speed = int(speed is None), speed or 0.0
-        f.smoothing = 1.0 - math.exp(-dt / SMOOTHING_TIME)
+        f.smoothing = 1.0 - math.exp(-dt / _SMOOTHING_TIME)
         _write_trust(f, config)
         first += n
     planned = _make_schedules(layers[0], config, dt)
     for f in layers:
         f.assumed = layers[0].assumed
         _write_rules(f, config, planned)
-        check_window(f, config)
+        _check_window(f, config)
     layers[0].store_predictions |= len(layers) > 1
     return _build_bank(layers, config, dt), planned
 
@@ -189,13 +179,12 @@ def _build_bank(layers: Any, config: FilterConfig, dt: float) -> Any:
     if config.members < 2:
         return layers
     f = layers[0]
-    f.members, f.respawn, f.spread = config.members, round(REPLACE_TIME / dt), TYRE_VARIANCE
-    f.hazard, f.level[:], f.alert = math.log(HAZARD * REPLACE_TIME), 1.0, TYRE_WALK * f.step
+    f.members, f.respawn, f.spread = config.members, round(REPLACE_TIME / dt), _TYRE_VARIANCE
+    f.hazard, f.level[:], f.alert = math.log(HAZARD * REPLACE_TIME), 1.0, _TYRE_WALK * f.step
     bank = np.repeat(layers, 1 + config.members).view(np.recarray)
     for m, f in enumerate(bank[1:]):
-        f.odds = (
-            MIN_LOG_WEIGHT if m >= len(config.levels) else 0.0
-        )  # a twin of another begins anew first
+        # a twin of another begins anew first
+        f.odds = MIN_LOG_WEIGHT if m >= len(config.levels) else 0.0
         f.level[:] = np.square(config.levels[m % len(config.levels)])
         if f.forces:
             both = range(f.dense, f.dense + 2)
@@ -209,12 +198,12 @@ def _build_bank(layers: Any, config: FilterConfig, dt: float) -> Any:
 
 def _set_imm_members(bank: Any, dt: float) -> None:
     """Set what the interacting members differ in."""
-    bank.respawn = round(IMM_TIME / dt)
+    bank.respawn = round(_IMM_TIME / dt)
     for f in bank:
-        f.burst[:] = np.square(GUST) * f.q_known / f.q_share
+        f.burst[:] = np.square(_GUST) * f.q_known / f.q_share
     gusty, changed = bank[GUSTY], bank[CHANGED]
     gusty.decay[gusty.dense : gusty.dense + 2] = 1.0
-    changed.q_tyres[:2] += TYRE_WALK * changed.step
+    changed.q_tyres[:2] += _TYRE_WALK * changed.step
 
 
 def select_first_sensor(config: FilterConfig) -> FilterConfig:
@@ -292,10 +281,21 @@ def _make_schedules(f: FilterRecord, config: FilterConfig, dt: float) -> tuple[S
         sensor = SlowSensor(sensor.period, (config.assumed_delay,), sensor.phase)
     if config.row.intersample == "dual-rate":  # knows of no delay
         sensor = SlowSensor(sensor.period, (0.0,), sensor.phase)
-    label = f"{config.name}: the {name}"
-    return make_schedules(
-        label, sensor, dt, int(f.stride), int(f.pace), int(f.frames[f.first_slow])
-    )
+    label, stride, pace = f"{config.name}: the {name}", int(f.stride), int(f.pace)
+    slots = max(1, int(f.frames[f.first_slow]))  # of stored captures, which take turns
+    period = count_ticks(sensor.period, dt, f"{label}'s period") // stride
+    late = [count_ticks(delay, dt, f"a delay: {label}'s") for delay in sensor.delays]
+    jitter = count_ticks(sensor.jitter, dt, f"{label}'s jitter")
+
+    def make_schedule(extra: int) -> Schedule:
+        # a sample is used in the first step that listens at or after its arrival
+        lags = [math.ceil((lag + extra) / pace) * pace // stride for lag in late]
+        if len(set(lags)) == 1:
+            lags = lags[:1]
+        return Schedule(period, tuple(lags * (math.lcm(len(lags), slots) // len(lags))))
+
+    shortest, longest = make_schedule(0), make_schedule(jitter)
+    return (longest,) if shortest == longest else (shortest, longest)
 
 
 def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule, ...]) -> None:
@@ -308,12 +308,11 @@ def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule,
     f.joint = config.row.gains == "placed" or (pseudo and f.periodic)
     f.store_predictions = f.late in (STORED, CONSTANT)
     if f.measured and f.periodic:
-        f.low, f.high, f.spacing = MIN_SPEED, MAX_SPEED, SPACING
+        f.low, f.high, f.spacing = MIN_SPEED, _MAX_SPEED, _SPACING
     if pseudo:
         C = build_measurement_rows(f, 0)
-        f.inverse[: len(C), : f.total] = kalman_gain(
-            np.eye(f.total), C, np.zeros((len(C), len(C)))
-        ).T
+        zero = np.zeros((len(C), len(C)))
+        f.inverse[: len(C), : f.total] = kalman_gain(np.eye(f.total), C, zero).T
     if _is_covariance_needed(config) and (f.periodic or f.between != NONE):
         raise ValueError(
             f"{config.name}: gate, adapt, latency, delay='larsen' and delay='buffer' need "
@@ -330,17 +329,14 @@ def _is_covariance_needed(config: FilterConfig) -> bool:
 
 
 def _is_periodic(f: FilterRecord, config: FilterConfig, random: bool) -> bool:
-    """Return whether the gains are precomputed; ValueError where that is wanted and impossible.
-
-    random: the first slow sensor's delay is.
-    """
+    """Return whether gains are precomputed; `random`: whether the first sensor's delay is."""
 
     def refuse(reason: str) -> ValueError:
         return ValueError(f"{config.name}: no gains={config.gains!r}: {reason}")
 
     if f.between == DUAL_RATE or config.row.gains == "placed":
         return True
-    is_multi_sensor, ignores_lag = len(config.sensors) > 1, f.frames.max() == 0  # blind: to the lag
+    is_multi_sensor, ignores_lag = len(config.sensors) > 1, f.frames.max() == 0
     impossible = ""
     if f.kind in (KINEMATIC, VELOCITY_ROLL) or config.row.second:
         impossible = "its model changes with the yaw rate"

@@ -1,4 +1,4 @@
-"""dual-rate's corrections between slow samples, as shares of the last innovation.
+"""The corrections of dual-rate filters between slow samples, as shares of the last innovation.
 
 At fixed speed and ratio r, every rule of the paper is x_{k+i} = F x_{k+i-1} + H u + B_i eps_k for
 i = 0 .. r-1: B_i = L G_i with the gain L and the matrix G_i of the pseudo measurement (14).
@@ -17,19 +17,8 @@ GAINS = ("constant", "from-29", "placed")
 _CYCLES, _SETTLED = 400, 1e-12
 
 
-def compute_sampled_gain(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
-    """Compute the limit of the Kalman gain of a sample every `steps`, prediction in between.
-
-    Args:
-        F: Transition matrix of a step, shape (n, n).
-        Q: Covariance of a step's process noise, shape (n, n).
-        C: Measurement matrix, shape (q, n).
-        R: Covariance of the measurement noise, shape (q, q).
-        steps: Number of steps between two samples.
-
-    Returns:
-        Gain, shape (n, q).
-    """
+def _compute_sampled_gain(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
+    """Compute the limit of the Kalman gain (n, q) of a sample every `steps` steps."""
     n = len(F)
     power, noise = np.eye(n), np.zeros((n, n))
     for _ in range(steps):
@@ -43,20 +32,11 @@ def compute_sampled_gain(F: Array, Q: Array, C: Array, R: Array, steps: int) -> 
     return K
 
 
-def compute_hold_shares(F: Array, C: Array, K: Array, steps: int) -> Array:
-    """Compute Hara's B_i = L for all i: the innovation is held.
+def _compute_hold_shares(F: Array, C: Array, K: Array, steps: int) -> Array:
+    """Compute Hara's B_i = L for all i, shape (steps, n, q): the innovation is held.
 
     L gives the error from sample to sample its poles and its very map:
     F^r - sum_{i=1}^{r} F^i L C = F^r (I - K C).
-
-    Args:
-        F: Transition matrix of a step, shape (n, n).
-        C: Measurement matrix, shape (q, n).
-        K: Gain of the single-rate filter with the low-rate measurement, shape (n, q).
-        steps: Number of steps between two samples, r.
-
-    Returns:
-        B_i, shape (steps, n, q).
     """
     power, total = np.eye(len(F)), np.zeros_like(F)
     for _ in range(steps):
@@ -159,16 +139,15 @@ def compute_shares(
         exponent = steps if is_single_rate else 1
         L = observer_gain(np.linalg.matrix_power(F, exponent), C, poles**exponent)
     else:
-        L = compute_sampled_gain(F, Q, C, R, steps)
+        L = _compute_sampled_gain(F, Q, C, R, steps)
     if rule == "hold":
-        return compute_hold_shares(F, C, L, steps)
+        return _compute_hold_shares(F, C, L, steps)
     if rule == "predict":
         return np.concatenate([L[None], np.zeros((steps - 1, *L.shape))])
     if gains == "constant":
         L = L / steps  # every step takes its even share
-    return compute_pseudo_shares(
-        F, C, L, compute_inverse("moore-penrose", C, np.eye(len(F)), R) - L, steps
-    )
+    inverse = compute_inverse("moore-penrose", C, np.eye(len(F)), R)
+    return compute_pseudo_shares(F, C, L, inverse - L, steps)
 
 
 def frame_map(F: Array, C: Array, shares: Array) -> Array:
@@ -205,15 +184,7 @@ def write_shares(
     """
     steps, n, q = B.shape
     table[first : first + steps * q, :n] = B.transpose(0, 2, 1).reshape(steps * q, n)
-    _write_covariances(F, Q, C, R, B, table, behind)
-
-
-def _write_covariances(
-    F: Array, Q: Array, C: Array, R: Array, B: Array, table: Array, behind: int
-) -> None:
-    """Write the covariance of the error after each step, the limit of a long recursion."""
-    n, q = F.shape[0], len(C)
-    upper = np.triu_indices(n)
+    upper = np.triu_indices(n)  # covariances after each step: the limit of a long recursion
     P = np.zeros((n + q, n + q))  # of the error and the last innovation
     predict_map = np.eye(n + q)
     predict_map[:n, :n] = F

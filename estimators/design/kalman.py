@@ -1,79 +1,12 @@
-"""Vectors and matrices from the user: shape, finiteness, and covariances that are some.
-
-The Kalman filter in textbook letters, and the generalised inverses that pseudo-residuals need.
+"""The Kalman filter in textbook letters, generalised inverses and gains by pole placement.
 
 Shapes: P (n, n), C (p, n), R (p, p), y = C x + v (p,).
-
-Gains by pole placement: the observers that the papers compare with.
 """
 
 import numpy as np
-import numpy.typing as npt
-from scipy.linalg import solve_discrete_lyapunov
 
 from ...envs.record import Array
 from ..core.record import FilterRecord
-
-
-def parse_matrix(name: str, value: npt.ArrayLike) -> Array:
-    """Parse a finite matrix.
-
-    Args:
-        name: Name for messages.
-        value: Numbers of shape (k, m).
-
-    Returns:
-        Matrix, shape (k, m).
-
-    Raises:
-        ValueError: It is no finite matrix.
-    """
-    M = np.array(value, np.float64)
-    if M.ndim != 2 or not M.size or not np.isfinite(M).all():
-        raise ValueError(f"{name} is a finite matrix, got {value!r}")
-    return M
-
-
-def parse_vector(name: str, value: npt.ArrayLike, n: int) -> Array:
-    """Parse a finite vector.
-
-    Args:
-        name: Name for messages.
-        value: Numbers of shape (n,), or a number that stands for n equal ones.
-        n: Number of elements.
-
-    Returns:
-        Vector, shape (n,).
-
-    Raises:
-        ValueError: It is not finite or has another shape.
-    """
-    v = np.array(value, np.float64)
-    v = np.full(n, v) if v.ndim == 0 else v
-    if v.shape != (n,) or not np.isfinite(v).all():
-        raise ValueError(f"{name} is finite and has shape ({n},), got {value!r}")
-    return v
-
-
-def parse_square(name: str, value: npt.ArrayLike, n: int) -> Array:
-    """Parse a finite square matrix.
-
-    Args:
-        name: Name for messages.
-        value: Numbers of shape (n, n), a diagonal (n,) or one number for the diagonal.
-        n: Number of rows.
-
-    Returns:
-        Matrix, shape (n, n).
-
-    Raises:
-        ValueError: It is not finite or has another shape.
-    """
-    M = np.array(value, np.float64)
-    M = np.diag(parse_vector(name, M, n)) if M.ndim < 2 else M
-    if M.shape != (n, n) or not np.isfinite(M).all():
-        raise ValueError(f"{name} is finite and has shape ({n}, {n}) or ({n},), got {value!r}")
-    return M
 
 
 def check_covariance(name: str, M: Array, definite: bool = False) -> None:
@@ -91,33 +24,14 @@ def check_covariance(name: str, M: Array, definite: bool = False) -> None:
         raise ValueError(f"{name} is not finite")
     if not np.allclose(M, M.T, rtol=1e-9, atol=0.0):
         raise ValueError(f"{name} is not symmetric")
-    min_eigenvalue = np.linalg.eigvalsh(M).min(initial=np.inf)
-    if min_eigenvalue < -1e-12 * np.abs(M).max(initial=1e-300):
-        raise ValueError(f"{name} is indefinite: its least eigenvalue is {min_eigenvalue:.3g}")
-    if definite and not min_eigenvalue > 0.0:
-        raise ValueError(
-            f"{name} must be positive definite: its least eigenvalue is {min_eigenvalue:.3g}"
-        )
+    lowest = np.linalg.eigvalsh(M).min(initial=np.inf)
+    if lowest < -1e-12 * np.abs(M).max(initial=1e-300):
+        raise ValueError(f"{name} is indefinite: its least eigenvalue is {lowest:.3g}")
+    if definite and not lowest > 0.0:
+        raise ValueError(f"{name} must be positive definite: its least eigenvalue is {lowest:.3g}")
 
 
-def parse_covariance(name: str, value: npt.ArrayLike, n: int, definite: bool = False) -> Array:
-    """Parse a covariance; errors as in `parse_square` and `check_covariance`.
-
-    Args:
-        name: Name for messages.
-        value: Numbers of shape (n, n), a diagonal (n,) or one number for the diagonal.
-        n: Number of rows.
-        definite: Whether it must be positive definite.
-
-    Returns:
-        Covariance, shape (n, n).
-    """
-    M = parse_square(name, value, n)
-    check_covariance(name, M, definite)
-    return M
-
-
-RIDGE = 1e-3  # lambda of Tikhonov's inverse, in SI units squared
+_RIDGE = 1e-3  # lambda of Tikhonov's inverse, in SI units squared
 INVERSES = ("moore-penrose", "p-weighted", "tikhonov", "bayes")
 
 
@@ -166,7 +80,7 @@ def compute_inverse(kind: str, C: Array, P: Array, R: Array) -> Array:
     an optimal gain it leaves nothing to correct between the samples.
 
     Args:
-        kind: Name of `INVERSES`; "p-weighted" weighs by P, "tikhonov" is regularised by `RIDGE`.
+        kind: Name of `INVERSES`; "p-weighted" weighs by P, "tikhonov" is regularised by `_RIDGE`.
         C: Measurement matrix, shape (p, n).
         P: Covariance of the state, shape (n, n).
         R: Covariance of the measurement noise, shape (p, p).
@@ -181,24 +95,7 @@ def compute_inverse(kind: str, C: Array, P: Array, R: Array) -> Array:
         return kalman_gain(P, C, zero)
     if kind == "bayes":
         return kalman_gain(P, C, R)
-    return kalman_gain(I, C, RIDGE * np.eye(len(C)))
-
-
-def constant_gain(K_fast: Array, K_slow: Array, steps: int) -> Array:
-    """Compute one gain for every tick from the multirate filter's gains over a period.
-
-    Every tick of the frame corrects by a pseudo-residual, so each takes its even fraction of the
-    gain that the multirate filter applies at once.
-
-    Args:
-        K_fast: Gains of the fast rows, shape (steps, m, N).
-        K_slow: Joint gain of the slow rows at a sample, shape (p, N).
-        steps: Number of ticks between two samples.
-
-    Returns:
-        Gain, shape (N, m + p).
-    """
-    return np.column_stack([K_fast.mean(0).T, K_slow.T / steps])
+    return kalman_gain(I, C, _RIDGE * np.eye(len(C)))
 
 
 def transition_matrix(f: FilterRecord, G: Array) -> Array:
@@ -242,24 +139,3 @@ def observer_gain(F: Array, C: Array, poles: Array) -> Array:
     if np.abs(np.sort_complex(placed) - np.sort_complex(poles)).max() > 1e-6:
         raise ValueError(f"the poles {np.round(poles, 6)} cannot be placed: not observable")
     return K
-
-
-def write_placed_gains(f: FilterRecord, G: Array, poles: tuple[float, ...], table: Array) -> None:
-    """Write the gains of the fast rows and the error's covariance into a table of gains.
-
-    Errors are those of `observer_gain`.
-
-    Args:
-        f: Memory of the filter.
-        G: Transition of the dense states, shape (dense, n).
-        poles: Poles (rad/s), negative real, n of them.
-        table: Output, shape (rows, columns), see `periodic`.
-    """
-    n, m = int(f.n), int(f.fasts)
-    F, C = transition_matrix(f, G), f.C_fast[:m, :n]
-    K = observer_gain(F, C, np.exp(np.array(poles) * float(f.step)))
-    rest = np.eye(n) - K @ C
-    noise = rest @ f.Q[:n, :n] @ rest.T + K @ np.diag(f.r_fast[:m]) @ K.T
-    P = solve_discrete_lyapunov(rest @ F, noise)
-    table[1 : 1 + m, :n] = K.T
-    table[1, int(f.total) :] = P[np.triu_indices(n)]

@@ -1,10 +1,7 @@
-"""Measurements of the slow sensors: their rows of C and their noise.
+"""Which states a filter has, what drives them and what its sensors measure.
 
 A new slow sensor is an entry of `MEASUREMENTS`: options, states and compiled code follow it.
-
-Which states a filter has, what drives them and what its sensors measure.
-
-States stand in the order of `ORDER`, as many of them as the model has. The first ones follow the
+States stand in the order of `_ORDER`, as many of them as the model has. The first ones follow the
 physical model ("dense"), the disturbances behind them decay by themselves.
 """
 
@@ -63,10 +60,7 @@ class Measurement:
 
 MEASUREMENTS: dict[str, Measurement] = {
     "camera": Measurement(
-        (
-            MeasurementRow(("psi",), "psi", 3.5e-3, angle=True),
-            MeasurementRow(("y_l",), "y_l", 0.02),
-        ),
+        (MeasurementRow(("psi",), "psi", 3.5e-3, angle=True), MeasurementRow(("y_l",), "y_l", 0.02))
     ),
     "gps": Measurement(
         (MeasurementRow(("beta", "psi"), "course", math.radians(0.14), True, True, ground=True),),
@@ -95,17 +89,11 @@ def find_packet_column(sensor: str, value: str) -> int:
 
 
 class StateInfo(NamedTuple):
-    """A state of a model.
-
-    Attributes:
-        unit: Its unit.
-        prior: Usual standard deviation at the start, in that unit.
-        bound: Bound of estimates in observations, in that unit.
-    """
+    """A state of a model; numbers are in its unit."""
 
     unit: str
-    prior: float
-    bound: float
+    prior: float  # usual standard deviation at the start
+    bound: float  # of estimates in observations
 
 
 STATES = {
@@ -145,7 +133,7 @@ class FilterModel:
     """States by name, what drives them and what is measured.
 
     Attributes:
-        kind: Code of `transition`.
+        kind: Code of `core.model`.
         states: Names of the states that follow the model.
         inputs: Names of `make_signals`.
         fast: Names of `make_signals` that are measured in every row.
@@ -167,14 +155,12 @@ class FilterModel:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all states."""
-        disturbance_names = (
-            ("F_d", "N_d") if self.forces else tuple(name for name, _ in self.disturbances)
-        )
-        return self.states + self.late + disturbance_names + self.biases
+        pushes = ("F_d", "N_d") if self.forces else tuple(name for name, _ in self.disturbances)
+        return self.states + self.late + pushes + self.biases
 
 
-ORDER = ("beta", "gamma", "psi", "y_l")
-BODY = ("phi", "phi_rate")  # of a bicycle whose accelerometer or roll rate is measured
+_ORDER = ("beta", "gamma", "psi", "y_l")
+_BODY = ("phi", "phi_rate")  # of a bicycle whose accelerometer or roll rate is measured
 INERTIAL = ("gyro", "accel_y", "roll_rate")  # the fast sensors of a bicycle, in their order
 TYRES = ("front_tyres", "rear_tyres", "inverse_friction")
 WANDER = {"bias": "gyro", "accel_bias": "accel_y", "bank": ""}
@@ -184,8 +170,8 @@ BIASES = WANDER | {SCALE: "accel_y"} | dict.fromkeys(TYRES, "")
 accelerometer feels, the error of the accelerometer's scale, and the tyres: factors of stiffness,
 and the reciprocal of friction."""
 NONLINEAR = (*TYRES, SCALE)
-WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
-WALK_ALL = (*WALK, ("d3", "psi"))  # dual-rate (4): one for every state of (37)
+_WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
+_WALK_ALL = (*_WALK, ("d3", "psi"))  # dual-rate (4): one for every state of (37)
 DISTURBANCES = ("none", "walk", "walk-all", "forces")
 
 MODELS: dict[str, FilterModel] = {
@@ -205,7 +191,7 @@ MODELS: dict[str, FilterModel] = {
 }
 """Models other than the bicycle's, by name."""
 
-EXPANSION_TIME = 0.004  # s between two expansions of the tyres' forces
+_EXPANSION_TIME = 0.004  # s between two expansions of the tyres' forces
 
 _LATE = {"psi": "psi_late", "y_l": "y_l_late"}
 
@@ -232,7 +218,7 @@ def make_signals(vehicle: Vehicle) -> dict[str, Signal]:
 
 
 def select_states(sensors: tuple[str, ...]) -> tuple[str, ...]:
-    """Select the fewest of a bicycle's states that slow sensors measure: the first of `ORDER`.
+    """Select the fewest of a bicycle's states that slow sensors measure: the first of `_ORDER`.
 
     Args:
         sensors: Names of the slow sensors.
@@ -241,7 +227,7 @@ def select_states(sensors: tuple[str, ...]) -> tuple[str, ...]:
         Names of the states.
     """
     rows = [row for sensor in sensors for row in MEASUREMENTS[sensor].rows]
-    return ORDER[: max([2, *(1 + ORDER.index(state) for row in rows for state in row.states)])]
+    return _ORDER[: max([2, *(1 + _ORDER.index(state) for row in rows for state in row.states)])]
 
 
 def make_bicycle_model(
@@ -265,15 +251,13 @@ def make_bicycle_model(
     Returns:
         The model.
     """
-    walks = {"walk": WALK, "walk-all": WALK_ALL}.get(disturbances, ())
-    states = select_states(sensors)
-    late_states = (
-        tuple(_LATE[s] for s in states if s in _LATE) if late and "camera" in sensors else ()
-    )
-    walks = tuple((name, state) for name, state in walks if state in states)
+    states, walks = select_states(sensors), {"walk": _WALK, "walk-all": _WALK_ALL}
+    lags = late and "camera" in sensors
+    late_states = tuple(_LATE[state] for state in states if lags and state in _LATE)
+    walking = tuple(pair for pair in walks.get(disturbances, ()) if pair[1] in states)
     inputs = ("steer", "N_z", "curvature") if "psi" in states else ("steer", "N_z")
-    forces, states = disturbances == "forces", states + BODY * body
-    return FilterModel(LATERAL, states, inputs, fast, walks, forces, late_states, biases)
+    forces, states = disturbances == "forces", states + _BODY * body
+    return FilterModel(LATERAL, states, inputs, fast, walking, forces, late_states, biases)
 
 
 def write_model(
@@ -331,7 +315,7 @@ def _write_tyres(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> None:
     if TYRES[0] not in names:
         return
     f.tyres, f.grip = names.index(TYRES[0]), names.index(TYRES[2]) if TYRES[2] in names else 0
-    f.again = max(1, round(EXPANSION_TIME / f.step))
+    f.again = max(1, round(_EXPANSION_TIME / f.step))
     f.stiffness[:] = 2.0 * vehicle.front_stiffness, 2.0 * vehicle.rear_stiffness
     wheelbase = vehicle.front_arm + vehicle.rear_arm
     arms = np.array([vehicle.rear_arm, vehicle.front_arm])

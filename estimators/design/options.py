@@ -1,30 +1,19 @@
-"""The options of a call, each read once: what is wrong names filter, option and value.
+"""The options of a filter, the default noise levels and the tuned process noise.
 
-A filter's noise levels: sensors, disturbances, Q, and deviations at the start.
-
-Process noise of each filter with its slow sensors, as `sideslip tune estimator` found it.
-
-The numbers are data, in `tunings.toml`: per second, in (unit of the state)^2 / s, with the command
-that found them and what was held fixed on the way.
+The process noise of each filter with its slow sensors is in `tunings.toml`, as `sideslip tune
+estimator` found it: per second, in (unit of the state)^2 / s, with the command that found it.
 """
 
-import math
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from ...envs.record import FAST, Array
-from ...envs.validation import describe_unknown
-from ..core.record import N_KNOTS
+from ...envs.sensors.link import SlowSensor
 from ..filters import FilterDefinition
-from .kalman import check_covariance
-from .models import COURSE_SPEED, MEASUREMENTS, STATES, TYRES
-
-Fits = Callable[[float], bool]
+from .models import MEASUREMENTS, FilterModel
 
 FAST_CHANNELS = {
     "steer": ("steer",),
@@ -35,193 +24,7 @@ FAST_CHANNELS = {
     "wheels": ("wheel_left", "wheel_right"),
 }
 """The columns of `envs.record.Fast` that are late together."""
-MAX_LATENCY = 0.5  # s, of a latency that is known
 FIND = "find"
-
-
-def _is_any_number(number: float) -> bool:
-    return True
-
-
-class OptionReader:
-    """Keyword arguments of a filter; `check_unread` refuses those that were not read.
-
-    Args:
-        name: Name of the filter for messages.
-        options: Values by name.
-    """
-
-    def __init__(self, name: str, options: Mapping[str, Any]) -> None:
-        self.name, self._unread, self._known = name, dict(options), list[str]()
-
-    def __contains__(self, key: str) -> bool:
-        return key in self._unread
-
-    def read_value(self, key: str, default: Any) -> Any:
-        """Read an option as it is.
-
-        Args:
-            key: Name of the option.
-            default: Value where it is not given.
-
-        Returns:
-            The value.
-        """
-        self._known.append(key)
-        return self._unread.pop(key, default)
-
-    def make_error(self, key: str, expected: str, value: Any) -> ValueError:
-        """Make the error for a value that an option cannot have.
-
-        Args:
-            key: Name of the option.
-            expected: Predicate of the message, "is ...".
-            value: The value.
-
-        Returns:
-            The error, to be raised.
-        """
-        return ValueError(f"{self.name}: {key} {expected}, got {value!r}")
-
-    def read_choice(self, key: str, default: str, known: Sequence[str]) -> str:
-        """Read an option that is one of some words.
-
-        Args:
-            key: Name of the option.
-            default: Value where it is not given.
-            known: Allowed words.
-
-        Returns:
-            The word.
-
-        Raises:
-            self.make_error: The ValueError for another word.
-        """
-        value = self.read_value(key, default)
-        if value not in known:
-            raise self.make_error(key, f"is one of {', '.join(filter(None, known))}", value)
-        return str(value)
-
-    def read_choices(
-        self, key: str, default: Sequence[str], known: Sequence[str]
-    ) -> tuple[str, ...]:
-        """Read an option that is the first of some words and any others.
-
-        Args:
-            key: Name of the option.
-            default: Value where it is not given.
-            known: Allowed words.
-
-        Returns:
-            The words in the order of `known`.
-
-        Raises:
-            self.make_error: The ValueError for anything else.
-        """
-        value = self.read_value(key, default)
-        words = list(value) if isinstance(value, list | tuple) else [value]
-        chosen = tuple(word for word in known if word in words)
-        if len(chosen) != len(words) or known[0] not in chosen:
-            raise self.make_error(key, f"is {known[0]!r} and any of {', '.join(known[1:])}", value)
-        return chosen
-
-    def read_non_negative(self, key: str, unit: str, default: float = 0.0) -> float:
-        """Read a number that is 0 or more; errors as in `check_number`.
-
-        Args:
-            key: Name of the option.
-            unit: Unit for messages.
-            default: Value where it is not given.
-
-        Returns:
-            The number.
-        """
-        expected = f"is in {unit} and not negative"
-        return self.read_number(key, default, expected, lambda v: 0.0 <= v < np.inf)
-
-    def read_number(
-        self, key: str, default: float, expected: str = "", fits: Fits = _is_any_number
-    ) -> float:
-        """Read an option that is a number; errors as in `check_number`.
-
-        Args:
-            key: Name of the option.
-            default: Value where it is not given.
-            expected: Predicate of the message, "is ...".
-            fits: Whether a number is allowed.
-
-        Returns:
-            The number.
-        """
-        return self.check_number(key, self.read_value(key, default), expected, fits)
-
-    def read_positive(self, key: str, default: float) -> float:
-        """Read a number above zero; errors as in `check_number`.
-
-        Args:
-            key: Name of the option.
-            default: Value where it is not given.
-
-        Returns:
-            The number.
-        """
-        return self.read_number(
-            key, default, "must be positive and finite", lambda v: 0.0 < v < np.inf
-        )
-
-    def check_number(
-        self, key: str, value: Any, expected: str = "", fits: Fits = _is_any_number
-    ) -> float:
-        """Convert an option's value to a number and check it.
-
-        Args:
-            key: Name of the option.
-            value: The value.
-            expected: Predicate of the message, "is ...".
-            fits: Whether a number is allowed.
-
-        Returns:
-            The number.
-
-        Raises:
-            TypeError: The value is no number.
-            self.make_error: The ValueError for a number that is not allowed.
-        """
-        try:
-            number = float(value)
-        except (TypeError, ValueError):
-            raise TypeError(f"{self.name}: {key} is a number, got {value!r}") from None
-        if not fits(number):
-            raise self.make_error(key, expected, number)
-        return number
-
-    def read_array(self, key: str, value: Any) -> npt.NDArray[np.float64]:
-        """Convert the value of an option to an array of its own.
-
-        Args:
-            key: Name of the option.
-            value: Numbers of any shape.
-
-        Returns:
-            The array.
-
-        Raises:
-            TypeError: The value holds no numbers.
-        """
-        try:
-            return np.array(value, np.float64)
-        except (TypeError, ValueError):
-            raise TypeError(f"{self.name}: {key} holds numbers, got {value!r}") from None
-
-    def check_unread(self) -> None:
-        """Check that every option was read.
-
-        Raises:
-            TypeError: An option is unknown.
-        """
-        if self._unread:
-            message = describe_unknown("option", sorted(self._unread), sorted(self._known))
-            raise TypeError(f"{self.name}: {message}")
 
 
 def find_columns(channel: str) -> tuple[int, ...]:
@@ -236,210 +39,15 @@ def find_columns(channel: str) -> tuple[int, ...]:
     return tuple(int(getattr(FAST, name)) for name in FAST_CHANNELS[channel])
 
 
-def parse_latency(reader: OptionReader, is_findable: bool) -> dict[str, float | str]:
-    """Parse the option `latency`, without zeros.
-
-    Args:
-        reader: Options of the filter.
-        is_findable: Whether the filter has slow sensors, and tyres as states.
-
-    Returns:
-        Latency (s) by channel, or `FIND` for one of them.
-
-    Raises:
-        TypeError: The option is no mapping.
-        reader.make_error: The ValueError for an unknown channel or a value out of range.
-    """
-    value: Any = reader.read_value("latency", {})
-    if not isinstance(value, Mapping):
-        raise TypeError(f"{reader.name}: latency is seconds by channel, got {value!r}")
-    for channel in value:
-        if channel not in FAST_CHANNELS:
-            raise reader.make_error("latency", f"is of {', '.join(FAST_CHANNELS)}", dict(value))
-    latencies: dict[str, float | str] = {}
-    for channel, late in value.items():
-        expected = f"is 0 to {MAX_LATENCY} s or {FIND!r}"
-        if late == FIND:
-            latencies[channel] = FIND
-        elif reader.check_number(
-            f"latency of {channel}", late, expected, lambda s: 0 <= s <= MAX_LATENCY
-        ):
-            latencies[channel] = float(late)
-    if list(latencies.values()).count(FIND) > (1 if is_findable else 0):
-        expected = f"is {FIND!r} for one channel of a filter with tyres as states and slow sensors"
-        raise reader.make_error("latency", expected, dict(value))
-    return latencies
-
-
-_ROWS = [row for sensor in MEASUREMENTS.values() for row in sensor.rows]
-_VELOCITIES = [row for sensor in MEASUREMENTS.values() for row in sensor.velocities]
-NOISE = {"gyro_noise": 0.005} | {f"{row.noise}_noise": row.sd for row in _ROWS}  # gyro: rad/s
+NOISE = {"gyro_noise": 0.005} | {  # rad/s
+    f"{row.noise}_noise": row.sd for sensor in MEASUREMENTS.values() for row in sensor.rows
+}
 EXTRA_NOISE = {
     "accel_y_noise": 0.1,  # m/s2
     "roll_rate_noise": 0.005,  # rad/s
     "wheel_noise": 0.015,  # m/s, of the mean of both front wheels
-} | {f"{row.noise}_noise": row.sd for row in _VELOCITIES}
-MAX_MEMBERS = 8
-N_IMM_MEMBERS = 4  # members
+} | {f"{row.noise}_noise": row.sd for sensor in MEASUREMENTS.values() for row in sensor.velocities}
 DISTURBANCE = {"force_sd": 50.0, "moment_sd": 20.0, "disturbance_time": 0.3}  # N, N m, s
-
-
-def parse_noise(forces: bool, reader: OptionReader) -> tuple[dict[str, float], dict[str, float]]:
-    """Parse the standard deviations of sensors and disturbances.
-
-    Args:
-        forces: Whether the disturbances are a force and a moment.
-        reader: Options of the filter.
-
-    Returns:
-        `FilterConfig.noise` and `FilterConfig.noise_over_speed`.
-    """
-    speed_dependent = [
-        row.noise for row in _ROWS if row.over_speed and f"{row.noise}_noise" not in reader
-    ]
-    levels = NOISE | EXTRA_NOISE
-    noise = {
-        key.removesuffix("_noise"): reader.read_positive(key, sd) for key, sd in levels.items()
-    }
-    if forces:
-        keys = zip(("force", "moment", "time"), DISTURBANCE.items(), strict=True)
-        noise |= {short: reader.read_positive(key, default) for short, (key, default) in keys}
-    return noise, {name: noise[name] * COURSE_SPEED for name in speed_dependent}
-
-
-def parse_hdop_table(
-    row: FilterDefinition, reader: OptionReader
-) -> tuple[tuple[float, float], ...]:
-    """Parse the factors on the GPS's noise.
-
-    Args:
-        row: Definition of the filter.
-        reader: Options of the filter.
-
-    Returns:
-        Knots (HDOP, factor), or none.
-
-    Raises:
-        reader.make_error: The ValueError for a table that is no such pairs.
-    """
-    table = reader.read_value("hdop_table", row.hdop)
-    if table is None or (isinstance(table, tuple) and not table):
-        return ()
-    knots = reader.read_array("hdop_table", table)
-    is_valid = knots.ndim == 2 and knots.shape[1] == 2 and 2 <= len(knots) <= N_KNOTS
-    if not (is_valid and (np.diff(knots[:, 0]) > 0.0).all() and (knots[:, 1] > 0.0).all()):
-        expected = f"is 2 to {N_KNOTS} pairs (HDOP, factor) with rising HDOP and positive factors"
-        raise reader.make_error("hdop_table", expected, table)
-    return tuple((float(hdop), float(factor)) for hdop, factor in knots)
-
-
-def parse_bank(
-    states: Sequence[str], forces: bool, delay: str, reader: OptionReader
-) -> dict[str, Any]:
-    """Parse the options of a bank of filters.
-
-    Args:
-        states: Names of the filter's states.
-        forces: Whether the disturbances are a force and a moment.
-        delay: Rule for late samples.
-        reader: Options of the filter.
-
-    Returns:
-        `members`, `levels` and `sudden` of a `FilterConfig`.
-
-    Raises:
-        reader.make_error: The ValueError for a value out of range or without what it needs.
-    """
-    value = reader.read_value("levels", (1.0,))
-    levels = reader.read_array("levels", value)
-    pairs = levels.reshape(-1, 1).repeat(2, 1) if levels.ndim < 2 else levels
-    fits = pairs.shape[1:] == (2,) and 1 <= len(pairs) <= MAX_MEMBERS
-    if not (fits and (pairs > 0.0).all() and np.isfinite(pairs).all()):
-        raise reader.make_error(
-            "levels", f"are 1 to {MAX_MEMBERS} positive factors or pairs", value
-        )
-    expected = f"is a number of filters from 1 to {MAX_MEMBERS}"
-    count = reader.read_number(
-        "members", len(pairs), expected, lambda v: v in range(1, MAX_MEMBERS + 1)
-    )
-    if count > 1 and TYRES[0] not in states:
-        raise reader.make_error("members", "is 1 where tyres are known", count)
-    if (pairs != 1.0).any() and not (forces and 1 < count >= len(pairs)):
-        raise reader.make_error("levels", "need disturbances='forces' and a member each", value)
-    sudden = bool(reader.read_value("sudden", False))
-    if sudden and not (count == 1 and TYRES[0] in states and forces and delay == "clone"):
-        expected = "needs unknown tyres, disturbances='forces', delay='clone', no members or levels"
-        raise reader.make_error("sudden", expected, sudden)
-    return {"members": N_IMM_MEMBERS if sudden else int(count), "levels": pairs, "sudden": sudden}
-
-
-def parse_process_noise(
-    states: Sequence[str], tuning: Mapping[str, float], reader: OptionReader
-) -> Array:
-    """Parse Q: the tuning's or the option's, with single states' on its diagonal.
-
-    Args:
-        states: Names of the filter's states.
-        tuning: Process noise per second by state.
-        reader: Options of the filter.
-
-    Returns:
-        Q per second, shape (n, n).
-
-    Raises:
-        ValueError: Q has another shape; `check_covariance` refuses what is no covariance.
-    """
-    n, matrix = len(states), reader.read_value("Q", None)
-    tuned_diagonal = [tuning.get(state, 0.0) for state in states]
-    Q = reader.read_array("Q", tuned_diagonal if matrix is None else matrix)
-    if Q.shape not in ((n,), (n, n)):
-        raise ValueError(f"{reader.name}: Q has shape ({n}, {n}) or ({n},), got {Q.shape}")
-    Q = np.diag(Q) if Q.ndim == 1 else Q
-    for i, state in enumerate(states):
-        Q[i, i] = reader.read_number(f"q_{state}", float(Q[i, i]))
-    check_covariance(f"{reader.name}: Q", Q)
-    return Q
-
-
-def parse_prior(
-    states: Sequence[str],
-    noise: Mapping[str, float],
-    biases: Mapping[str, float],
-    reader: OptionReader,
-) -> dict[str, float]:
-    """Parse the standard deviations of all states at the start.
-
-    Args:
-        states: Names of the filter's states.
-        noise: Standard deviations of sensors and disturbances.
-        biases: Standard deviations of the biases by state.
-        reader: Options of the filter.
-
-    Returns:
-        Standard deviation by state, in the state's unit.
-
-    Raises:
-        TypeError: The option is no mapping.
-        ValueError: A state is unknown.
-        reader.make_error: The ValueError for a value that is no standard deviation.
-    """
-    deviations = {state: STATES[state].prior for state in states} | dict(biases)
-    if "force" in noise:
-        deviations |= {"F_d": noise["force"], "N_d": noise["moment"]}
-    prior = reader.read_value("prior", {})
-    if not isinstance(prior, Mapping):
-        raise TypeError(f"{reader.name}: prior is standard deviations by state, got {prior!r}")
-    for state, value in prior.items():
-        if state not in states:
-            known = ", ".join(states)
-            raise ValueError(
-                f"{reader.name} has no state {state!r}; it has: {known}; prior={prior}"
-            )
-        sd = reader.read_array(f"the prior of {state}", value)
-        if sd.ndim > 0 or not 0.0 <= sd < math.inf:
-            raise reader.make_error(f"the prior of {state}", "is a standard deviation", value)
-        deviations[state] = float(sd)
-    return deviations
 
 
 FILE = Path(__file__).with_name("tunings.toml")
@@ -452,8 +60,7 @@ def read_tunings(path: str | Path = FILE) -> list[dict[str, Any]]:
         path: TOML file.
 
     Returns:
-        Entries with `estimator`, `sensors` and `q`, process noise ((unit of the state)^2 / s) by
-            state.
+        Entries with `estimator`, `sensors` and `q`, process noise by state, (unit)^2 / s.
 
     Raises:
         ValueError: It is no file of tunings; the message has the path.
@@ -471,3 +78,110 @@ def read_tunings(path: str | Path = FILE) -> list[dict[str, Any]]:
 TUNINGS: dict[tuple[str, str], dict[str, float]] = {
     (entry["estimator"], entry["sensors"]): entry["q"] for entry in read_tunings()
 }
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterConfig:
+    """Decisions about a filter before its design: its name in `FILTERS` and its options.
+
+    Options, as `make_estimator` takes them
+    ---------------------------------------
+    slow: the slow sensor to use (default: the first of the row's that is there). A filter with
+        gains "covariance" also takes several.
+    gains: "periodic" (precomputed for a schedule that repeats) or "covariance"; of dual-rate
+        "constant", "from-29" or "placed" (with poles).
+    delay: the rule for late samples, see `sideslip.estimators.core.innovation`: "clone" or "buffer"
+        (exact), "larsen", "stored", "constant" (with assumed_delay, s), "literal", "lag", "ignore".
+    between: of single-rate-kf, "hold" (default) or "predict" between its steps.
+    intersample: of double-layer "pseudo-residual" (default) or "predict"; of dual-rate "pseudo"
+        (default), "predict", "hold" or "oh".
+    inverse: the generalised inverse of the pseudo-residual rule, "moore-penrose", "p-weighted",
+        "tikhonov" or "bayes".
+    poles: negative numbers in rad/s, one for each state, where gains are placed: of the filter's
+        error, of dual-rate as `sideslip.estimators.DualRate` says.
+    disturbances: of a bicycle, "none", "walk" (d1 and d2 push beta and gamma), "walk-all" (d3
+        pushes psi) or "forces" (an Ornstein-Uhlenbeck force and moment).
+    leak: 1/s, by which disturbances decay on top of that.
+    fast: of exact-kf, course-kf and dakf, what is measured in every row: "gyro" (default), and any
+        of "accel_y" and "roll_rate", with which the body rolls: states phi and phi_rate.
+    front_tyres_sd, rear_tyres_sd, inverse_friction_sd: of the same, above 0 (default of all but
+        joint) states: factors on both stiffnesses, and the reciprocal of friction, tyres having no
+        limit where it is known. The model is then expanded at the estimate (an EKF).
+    accel_scale_sd: of joint, above 0 (default) a state: the fraction by which the accelerometer
+        measures too much, as one does whose roll is not known.
+    bias_sd (rad/s), accel_bias_sd (m/s2), bank_sd (rad): of the same, above 0 (default) a state
+        `bias`, `accel_bias` or `bank`, a constant of this deviation that the sensor adds, or by
+        which the road leans, the left side up; with q_bias, ... it walks, with bias_time, ... (s)
+        above 0 it wanders about 0 with that deviation and forgets within that time.
+    q_beta, q_gamma, ...: process noise of a state per second, (unit)^2/s; or Q, (n, n) or (n,)
+        (default: of `tunings.toml`).
+    gyro_noise (rad/s), psi_noise (rad), y_l_noise (m), course_noise (rad at every speed; default
+        0.14 deg at 60 km/h growing as 1/V), accel_y_noise (m/s2), roll_rate_noise (rad/s),
+        wheel_noise, gps_speed_noise (m/s): standard deviations.
+    hdop_table: pairs (HDOP, factor on the GPS's noise), linear in between; None for one noise at
+        every HDOP (default: the factor is the HDOP for double-layer, None for the others).
+    satellites: the least that a GPS fix needs (default 4).
+    robust: standard deviations of an innovation from which it counts less (Huber); 0: none does.
+    steer_rate: rad/s; a steering angle that changes faster is skipped until the next row confirms
+        it; 0 (default of all but joint-robust): none is.
+    force_share, moment_share: fractions of the car's weight, and of that at half the wheelbase,
+        that are added to force_sd and moment_sd, as variances (default 0).
+    model_error: of joint, the fraction of the axles' forces by which its tyres err, added likewise.
+    accel_time: s; above 0 the accelerometer's noise is found while driving, over so long; then
+        `accel_y_noise` is the least.
+    members: of joint, the number of filters side by side, of which the least likely forgets the
+        tyres twice a second (default: one for each of `levels`).
+    levels: of joint, factors on force_sd and moment_sd, or pairs of one for each, which its members
+        take in turn; the likeliest counts most (default (1,)).
+    sudden: of joint, True runs four filters side by side that interact: nothing happens, a gust
+        blows, the tyres have just changed, they settle; then neither members nor levels.
+    gate: a probability; a sample whose innovation is less likely than 1 - gate is skipped.
+    wary: 0 is off (default; joint and joint-robust have 10). Above, with delay "clone" or "buffer":
+        a packet that repeats the last one while the car moves is skipped; the gate is 1 - 1e-9
+        where none is configured, a sensor's first sample passes it, and after so many gated samples
+        in a row that agree with each other the filter begins anew with the sensor.
+    adapt: fraction of a new innovation in an R that follows them (0: R as configured).
+    force_sd (N), moment_sd (N m), disturbance_time (s): of disturbances that are forces.
+    latency: s by which fast channels (steer, gyro, accel_x, accel_y, roll_rate, wheels) stand too
+        late in the record, {"gyro": 0.06}; "find" for one that joint finds while driving.
+    prior: standard deviations of states at the start, by state.
+    allow_unstable: build a filter whose error grows.
+    """
+
+    name: str
+    row: FilterDefinition
+    sensors: Mapping[str, SlowSensor]  # `slow`, in the order of SLOW_NAMES
+    models: tuple[FilterModel, ...]  # of each layer
+    gains: str  # "": the row's, where that can be
+    delay: str
+    assumed_delay: float
+    between: str
+    intersample: str
+    inverse: str
+    poles: tuple[float, ...]
+    leak: float
+    Q: Array  # (n, n) per second, of the states of all layers
+    noise: Mapping[str, float]  # standard deviations, names without "_noise"; force, moment, time
+    noise_over_speed: Mapping[str, float]  # of those that grow as 1/V, times V in m/s
+    hdop_table: tuple[tuple[float, float], ...]
+    satellites: float
+    gate: float | None
+    wary: int
+    members: int
+    levels: Array  # (count, 2), of force_sd, moment_sd
+    sudden: bool
+    robust: float
+    steer_rate: float
+    model_error: float
+    accel_time: float
+    shares: tuple[float, float]
+    times: Mapping[str, float]  # s, of biases
+    adapt: float
+    prior: Mapping[str, float]  # of all states
+    latency: Mapping[str, float | str]  # s, or "find", by channel; none that is punctual
+    allow_unstable: bool
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states of all layers."""
+        return tuple(self.prior)

@@ -1,31 +1,28 @@
-"""The schedule of a slow sensor in steps of a filter: when frames are captured and arrive.
+"""The schedule of a slow sensor, and the gains of a filter that repeat with it.
 
-Gains of a periodic schedule: the covariance filter is run over it until its gains repeat.
-
-A table of gains has a head row, then, for each step of the cycle, one row for every fast
-measurement (one where there is none), then one for each slow row at each frame of the pattern.
-Pseudo-residuals add K^T and the transposed inverse, shared innovations a share for each step.
-Behind the gains of a step stands the upper half of the states' covariance after that step.
+The covariance filter is run over the schedule until its gains repeat. A table of gains has a head
+row; for each step of the cycle a row for every fast measurement (one where there is none); for
+each frame of the pattern a row for every slow row. Pseudo-residuals add K^T and the transposed
+inverse, dual-rate rules a share for each step. Behind the gains of a step stands the upper half
+of the states' covariance after it.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
 
 from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import absolute, maximum
 from ...envs.record import Array
-from ...envs.sensors.link import SlowSensor
 from ..core.covariance import update_with_clone, update_with_states
 from ..core.filter import reset_filter, reset_filters, run_tick
-from ..core.innovation import CLONE, DIRECT, DROPPED, IGNORE, find_clone
+from ..core.innovation import CLONE, DIRECT, DROPPED, DUAL_RATE, IGNORE, NONE, PSEUDO, find_clone
 from ..core.record import FilterRecord, FilterRecords, GainTables, Vector
-from ..core.update import DUAL_RATE, NONE, PSEUDO
-from .config import FilterConfig
 from .dual_rate import compute_shares, write_shares
-from .kalman import compute_inverse, constant_gain, transition_matrix, write_placed_gains
+from .kalman import compute_inverse, observer_gain, transition_matrix
+from .options import FilterConfig
 
 
 def count_ticks(seconds: float, dt: float, label: str) -> int:
@@ -83,45 +80,13 @@ class Schedule:
 NO_SENSOR = Schedule(1, ())
 
 
-def make_schedules(
-    label: str, sensor: SlowSensor, dt: float, stride: int, pace: int, frames: int
-) -> tuple[Schedule, ...]:
-    """Make the sensor's possible schedules: one where it repeats, else its two extremes.
-
-    Args:
-        label: Name of the sensor for messages.
-        sensor: Clock and delays of the sensor.
-        dt: Tick (s).
-        stride: Ticks of a filter's step.
-        pace: Ticks between steps that listen; a sample is used in the first of them at or after its
-            arrival.
-        frames: Number of stored captures, whose slots take turns; 0 for a filter that does not look
-            at the lag.
-
-    Returns:
-        One schedule, or those of the shortest and the longest delays.
-    """
-    period = count_ticks(sensor.period, dt, f"{label}'s period") // stride
-    late = [count_ticks(delay, dt, f"a delay: {label}'s") for delay in sensor.delays]
-    jitter = count_ticks(sensor.jitter, dt, f"{label}'s jitter")
-
-    def make_schedule(extra: int) -> Schedule:
-        lags = [math.ceil((lag + extra) / pace) * pace // stride for lag in late]
-        if len(set(lags)) == 1:
-            lags = lags[:1]
-        return Schedule(period, tuple(lags * (math.lcm(len(lags), max(1, frames)) // len(lags))))
-
-    shortest, longest = make_schedule(0), make_schedule(jitter)
-    return (longest,) if shortest == longest else (shortest, longest)
-
-
-GAIN_TOLERANCE = 1e-12
-MAX_RECURSION = 600.0  # s of the recursion
-BIAS_WALK_TIME = 10.0  # s in which a bias walks by its prior where a filter is checked
+_GAIN_TOLERANCE = 1e-12
+_MAX_RECURSION = 600.0  # s of the recursion
+_BIAS_WALK_TIME = 10.0  # s in which a bias walks by its prior where a filter is checked
 
 
 @jit
-def iterate_gains(
+def _iterate_gains(
     filters: FilterRecords,
     s: int,
     lags: Any,
@@ -130,32 +95,21 @@ def iterate_gains(
     before: Any,
     gains: GainTables,
 ) -> int:
-    """Run a covariance filter over its schedule and write its gains.
+    """Run a covariance filter over its schedule until its gains settle; return the cycles used.
 
-    Args:
-        filters: Memory of the filter in covariance mode, with ticks that are steps, shape (1,).
-        s: Index of its slow sensor, -1 for none.
-        lags: Steps from capture to arrival of each frame, shape (pattern,).
-        cycles: Largest number of cycles.
-        table: Output, gains and covariances, shape (rows, columns).
-        before: Output, covariance before the last frame, shape (total, total).
-        gains: Tables that a filter with periodic gains would read.
-
-    Returns:
-        Number of cycles used.
+    Outputs: `table` (rows, columns), and `before` (total, total), the covariance before the last
+    frame. lags (pattern,): steps from capture to arrival. s: the slow sensor, -1 for none.
     """
     f = filters[0]
     reset_filter(f, 0)
-    n, size, cycle, width = f.n, f.total, f.cycle, maximum(f.fasts, 1)
+    n, N, cycle, width = f.n, f.total, f.cycle, maximum(f.fasts, 1)
     for cycle_index in range(cycles):
         change = 0.0
         for step in range(cycle):
             run_tick(f, gains)
             if f.tick % f.pace == 0:
                 for i in range(f.fasts):
-                    change = maximum(
-                        change, _copy_gain(f.share[i], table[1 + step * width + i], size)
-                    )
+                    change = maximum(change, _copy_gain(f.share[i], table[1 + step * width + i], N))
             for frame in range(len(lags)):
                 captured = f.tick - lags[frame]
                 if (captured - frame * f.period[s]) % cycle != 0 or captured < 0:
@@ -163,21 +117,21 @@ def iterate_gains(
                 first = find_clone(f, s, captured)
                 if first == DROPPED:
                     continue
-                for i in range(size):
-                    _copy_gain(f.P[i], before[i], size)
+                for i in range(N):
+                    _copy_gain(f.P[i], before[i], N)
                 for i in range(f.rows[s]):
                     if first == DIRECT:
                         update_with_states(f, f.C[s, i], f.r[s, i], 0.0)
                     else:
                         update_with_clone(f, first + i, f.r[s, i], 0.0)
                     to = table[1 + cycle * width + frame * f.rows[s] + i]
-                    change = maximum(change, _copy_gain(f.gain, to, size))
-            k = size
+                    change = maximum(change, _copy_gain(f.gain, to, N))
+            k = N
             for i in range(n):
                 for j in range(i, n):
                     table[1 + step * width, k] = f.P[i, j]
                     k += 1
-        if change < GAIN_TOLERANCE:
+        if change < _GAIN_TOLERANCE:
             return cycle_index + 1
     return cycles
 
@@ -232,6 +186,7 @@ def design_gains(
 def _design_settled(
     f: FilterRecord, schedule: Schedule, speed: float, config: FilterConfig
 ) -> tuple[Array, FilterRecord]:
+    """Design the table of gains on a copy of the filter's memory, which is returned too."""
     filters: FilterRecords = np.array([f])
     copy = filters.view(np.recarray)[0]
     copy.periodic = copy.measured = copy.origin = copy.joint = copy.between = 0
@@ -241,7 +196,9 @@ def _design_settled(
     copy.cycle, copy.pattern = schedule.cycle, max(1, len(schedule.lags))
     copy.period[copy.period > 0] = schedule.period
     copy.phase[:] = 0
-    _add_bias_walk(copy)
+    for i in range(int(f.dense), int(f.n)):  # a bias that never moves has no settled gain
+        if f.pushed[i - f.dense] < 0:
+            copy.Q[i, i] += f.prior[i, i] * f.step / _BIAS_WALK_TIME
     s = int(f.first_slow)
     table = np.zeros(compute_table_shape(f, schedule))
     table[0, 0] = 1.0
@@ -251,27 +208,17 @@ def _design_settled(
         if f.between == DUAL_RATE:
             _write_shares(copy, G, schedule, config, table)
         else:
-            write_placed_gains(copy, G, config.poles, table)
+            _write_placed_gains(copy, G, config.poles, table)
         return table, copy
     lags = np.array(schedule.lags, np.int64) * int(f.late == CLONE)
-    cycles = max(2, int(MAX_RECURSION / float(copy.step)) // schedule.cycle)
+    cycles = max(2, int(_MAX_RECURSION / float(copy.step)) // schedule.cycle)
     before = np.zeros((int(f.total), int(f.total)))
-    iterate_gains(filters, s, lags, cycles, table, before, np.zeros((1, 1, 1)))
+    _iterate_gains(filters, s, lags, cycles, table, before, np.zeros((1, 1, 1)))
     if f.between == PSEUDO:
         C = build_measurement_rows(f, 0)
         R = np.diag([*copy.r_fast[: copy.fasts], *copy.r[s, : copy.rows[s]]])
         _write_pseudo_gains(copy, schedule, table, compute_inverse(config.inverse, C, before, R))
     return table, copy
-
-
-def _add_bias_walk(f: FilterRecord) -> None:
-    """Let a constant bias walk by its prior in 10 s, for a filter that has gains of its own.
-
-    What never moves has no settled gain, but whether it is seen is the same.
-    """
-    for i in range(int(f.dense), int(f.n)):
-        if f.pushed[i - f.dense] < 0:
-            f.Q[i, i] += f.prior[i, i] * f.step / BIAS_WALK_TIME
 
 
 def build_measurement_rows(f: FilterRecord, frame: int, lag: int = 1) -> Array:
@@ -312,31 +259,35 @@ def _write_shares(
     write_shares(F, Q, C, R, B, table, first, total)
 
 
+def _write_placed_gains(f: FilterRecord, G: Array, poles: tuple[float, ...], table: Array) -> None:
+    """Write the gains of the fast rows for poles (rad/s), and the covariance, into a table."""
+    n, m = int(f.n), int(f.fasts)
+    F, C = transition_matrix(f, G), f.C_fast[:m, :n]
+    K = observer_gain(F, C, np.exp(np.array(poles) * float(f.step)))
+    rest = np.eye(n) - K @ C
+    noise = rest @ f.Q[:n, :n] @ rest.T + K @ np.diag(f.r_fast[:m]) @ K.T
+    P = solve_discrete_lyapunov(rest @ F, noise)
+    table[1 : 1 + m, :n] = K.T
+    table[1, int(f.total) :] = P[np.triu_indices(n)]
+
+
 def _write_pseudo_gains(f: FilterRecord, schedule: Schedule, table: Array, inverse: Array) -> None:
     """Append the constant gain and the generalised inverse of the pseudo-residual rule."""
     p, m, total = int(f.rows[f.first_slow]), int(f.fasts), int(f.total)
     cycle, frames, width = schedule.cycle, len(schedule.lags), max(int(f.fasts), 1)
     first = 1 + cycle * width + p * frames
     frame_gains = table[1 + cycle * width : first, :total].reshape(frames, p, total)
-    slow = np.mean(
-        [combine_gains(gains, build_measurement_rows(f, 0)[m:]) for gains in frame_gains], axis=0
-    )
+    C = build_measurement_rows(f, 0)[m:]
+    slow = np.mean([_combine_gains(gains, C) for gains in frame_gains], axis=0)
     fast = table[1 : 1 + cycle * width, :total].reshape(cycle, width, total)[:, :m]
-    K = constant_gain(fast, slow, schedule.period)
+    # every step corrects by a pseudo-residual, so each takes its even fraction of the slow gain
+    K = np.column_stack([fast.mean(0).T, slow.T / schedule.period])
     table[first : first + m + p, :total] = K.T
     table[first + m + p :, :total] = inverse.T
 
 
-def combine_gains(K: Array, C: Array) -> Array:
-    """Combine gains of rows that correct one after the other to gains of a joint correction.
-
-    Args:
-        K: Gain of each row, shape (p, n).
-        C: Measurement matrix, shape (p, n).
-
-    Returns:
-        Joint gain of each row, shape (p, n).
-    """
+def _combine_gains(K: Array, C: Array) -> Array:
+    """Combine gains (p, n) of rows that correct one after the other to joint ones; C: (p, n)."""
     joint = np.zeros_like(K)
     for i in range(len(K)):
         joint[:i] -= np.outer(joint[:i] @ C[i], K[i])

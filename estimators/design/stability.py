@@ -11,12 +11,11 @@ from functools import lru_cache
 import numpy as np
 
 from ...envs.record import Array
-from ..core.innovation import CLONE, CONSTANT, STORED
+from ..core.innovation import CLONE, CONSTANT, DUAL_RATE, PSEUDO, STORED
 from ..core.record import FilterRecord
-from ..core.update import DUAL_RATE, PSEUDO
-from .config import FilterConfig
 from .dual_rate import frame_map
 from .kalman import transition_matrix
+from .options import FilterConfig
 from .periodic import Schedule, build_measurement_rows, design_gains
 
 MARGINAL = 1e-9
@@ -51,9 +50,8 @@ def find_unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
         largest = np.abs(v).max()
         leading = v[0] if abs(v[0]) > 1e-6 * largest else v[np.argmax(np.abs(v))]
         parts = zip(names, v / leading, strict=True)
-        directions.append(
-            ", ".join(f"{name} {part:.4g}" for name, part in parts if abs(part) > 1e-6)
-        )
+        terms = (f"{name} {part:.4g}" for name, part in parts if abs(part) > 1e-6)
+        directions.append(", ".join(terms))
     return tuple(directions)
 
 
@@ -150,10 +148,7 @@ def _build_clone_map(f: FilterRecord, schedule: Schedule, step: int) -> Array:
 def _build_residual_rows(
     f: FilterRecord, schedule: Schedule, frame: int, width: int, stored_at: int
 ) -> Array:
-    """Build the rows by which the residuals of a step depend on the whole error, (m + p, width).
-
-    stored_at: where stored predictions start in the error; -1: there are none.
-    """
+    """Build the residuals' rows (m + p, width) by the whole error; stored_at: -1 if none is."""
     lag = schedule.lags[frame] if schedule.lags else 0
     measured = build_measurement_rows(f, frame, lag)
     C = np.zeros((len(measured), width))
@@ -185,18 +180,16 @@ def _build_correction(
     M = (I - joint) @ M
     for frame in schedule.find_arriving(step):
         C = _build_residual_rows(f, schedule, frame, width, stored_at)[m:]
-        measured = build_measurement_rows(f, frame, 0 if stored_at >= 0 else schedule.lags[frame])[
-            m:
-        ]
+        lag = 0 if stored_at >= 0 else schedule.lags[frame]
+        measured = build_measurement_rows(f, frame, lag)[m:]
         first = 1 + schedule.cycle * max(m, 1) + frame * len(C)
         total, residual_map = np.zeros((width, len(C))), np.eye(len(C))
         for i in range(len(C)):  # row i's correction changes the residuals of those behind it
             K = np.zeros(width)
             K[:size] = table[first + i, :size]
             total += np.outer(K, residual_map[i])
-            residual_map -= (
-                np.outer(measured @ K[:size], residual_map[i]) * (np.arange(len(C)) > i)[:, None]
-            )
+            is_behind = (np.arange(len(C)) > i)[:, None]
+            residual_map -= np.outer(measured @ K[:size], residual_map[i]) * is_behind
         M = (I - total @ C) @ M
     return M
 

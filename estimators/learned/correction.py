@@ -1,11 +1,9 @@
-"""A correction at every tick, compiled: frames are gathered, and at each pace the network runs.
+"""The learned estimator: a filter, and a network that corrects its sideslip angle at each pace.
 
 A car's memory is one vector: some numbers, sums of the fast columns since the last pace, a ring
-of frames, and what the layers work on. Paces are counted from tick 0 of the episode, so that
-the estimate of a tick is the same for every control period. A frame that is not finite is no
-frame: the correction is dropped, and its history begins anew.
-
-The learned estimator: a filter, and a network that corrects its sideslip angle.
+of frames, and what the layers work on. Paces are counted from tick 0 of the episode, so that the
+estimate of a tick is the same for every control period. A frame that is not finite drops the
+correction, whose history begins anew.
 """
 
 import functools
@@ -41,46 +39,28 @@ is added to beta (rad), the deviation of the sum (rad, 0: there is no correction
 HISTORY = SLIP_RATE + 1 + len(COLUMNS)
 
 
-class CorrectionNet(NamedTuple):
-    """A correction as compiled code takes it.
+class _CorrectionNet(NamedTuple):
+    """A correction as compiled code takes it."""
 
-    Attributes:
-        states: Places of the filter's states that are read, beta's among them.
-        beta: Place of beta among the filter's states.
-        mean: Mean of the inputs, shape (inputs,).
-        scale: Scale of the inputs, shape (inputs,).
-        clip: Bound of normalised inputs.
-        sizes: Sizes of the layers, inputs first.
-        numbers: Each layer's weights, (inputs, outputs) row by row, then its biases.
-    """
-
-    states: Any
-    beta: int
-    mean: Any
+    states: Any  # places of the filter's states that are read, beta's among them
+    beta: int  # place of beta among the filter's states
+    mean: Any  # of the inputs, shape (inputs,)
     scale: Any
-    clip: float
-    sizes: Any
-    numbers: Any
+    clip: float  # bound of normalised inputs
+    sizes: Any  # of the layers, inputs first
+    numbers: Any  # each layer's weights, (inputs, outputs) row by row, then its biases
 
 
 _INTEGERS, _FLOATS = np.zeros(1, np.int64), np.zeros(1)
-EXAMPLE = CorrectionNet(_INTEGERS, 0, _FLOATS, _FLOATS, 1.0, _INTEGERS, _FLOATS)
+EXAMPLE = _CorrectionNet(_INTEGERS, 0, _FLOATS, _FLOATS, 1.0, _INTEGERS, _FLOATS)
 """For `entry`: all nets have these types."""
 
 
-def make_net(correction: Correction, states: tuple[str, ...]) -> CorrectionNet:
-    """Make the net for a filter.
-
-    Args:
-        correction: Network and card.
-        states: Names of the filter's states, all of the card's among them.
-
-    Returns:
-        The net.
-    """
+def _make_net(correction: Correction, states: tuple[str, ...]) -> _CorrectionNet:
+    """Make the net for a filter's states by name, all of the card's among them."""
     network = correction.network
     layers = zip(network.weights, network.biases, strict=True)
-    return CorrectionNet(
+    return _CorrectionNet(
         np.array([states.index(name) for name in correction.card.states], np.int64),
         states.index("beta"),
         np.array(network.mean),
@@ -96,7 +76,7 @@ def locate_stack(net: Any) -> Any:
     """Locate the stack of frames, which is the network's input, in a memory.
 
     Args:
-        net: `CorrectionNet`.
+        net: `_CorrectionNet`.
 
     Returns:
         Index of its first number.
@@ -104,27 +84,9 @@ def locate_stack(net: Any) -> Any:
     return HISTORY + net.sizes[0] // len(LAGS) * RING_FRAMES
 
 
-def compute_memory_size(net: CorrectionNet, states: int) -> int:
-    """Compute the size of a car's memory, in whole cache lines.
-
-    Args:
-        net: The net.
-        states: Number of the filter's states; states + 1 of its numbers stand at the end.
-
-    Returns:
-        Number of numbers.
-    """
-    return (int(locate_stack(net) + net.sizes.sum()) + states + 8) // 8 * 8
-
-
 @jit
-def reset_memory(m: Any, first: int) -> None:
-    """Reset a memory; the car's mass stays.
-
-    Args:
-        m: Memory of the correction, shape (memory_size,).
-        first: Tick of the first fast row.
-    """
+def _reset_memory(m: Any, first: int) -> None:
+    """Reset a memory to the tick before the first fast row; the car's mass stays."""
     for i in range(len(m)):
         m[i] *= 1.0 if i == MASS else 0.0
     m[TICK_PLACE] = first - 1.0
@@ -160,26 +122,22 @@ def _write_frame(f: Any, gains: Any, m: Any, net: Any, offset: int) -> int:
 @jit
 def _run_layers(m: Any, net: Any, offset: int) -> int:
     """Run the network on the stack at a place, which it normalises; return the outputs' place."""
-    inputs, weight_offset = net.sizes[0], 0
+    inputs, at = net.sizes[0], 0
     for i in range(inputs):
         m[offset + i] = clip((m[offset + i] - net.mean[i]) * net.scale[i], 0.0 - net.clip, net.clip)
     for layer in range(len(net.sizes) - 1):
         outputs = net.sizes[layer + 1]
         z, sums = m[offset : offset + inputs], m[offset + inputs : offset + inputs + outputs]
-        copy_into(net.numbers[weight_offset + inputs * outputs :][:outputs], sums)
+        copy_into(net.numbers[at + inputs * outputs :][:outputs], sums)
         for i in range(0, inputs, 4):  # four at once: sums are loaded and stored less often
             a, b, c, d = z[i], z[i + 1], z[i + 2], z[i + 3]
             if layer > 0:
                 a, b, c, d = maximum(a, 0.0), maximum(b, 0.0), maximum(c, 0.0), maximum(d, 0.0)
-            first = net.numbers[weight_offset + i * outputs :]
+            first = net.numbers[at + i * outputs :]
             second, third, fourth = first[outputs:], first[2 * outputs :], first[3 * outputs :]
             for o in range(outputs):
                 sums[o] = sums[o] + a * first[o] + b * second[o] + c * third[o] + d * fourth[o]
-        weight_offset, offset, inputs = (
-            weight_offset + (inputs + 1) * outputs,
-            offset + inputs,
-            outputs,
-        )
+        at, offset, inputs = at + (inputs + 1) * outputs, offset + inputs, outputs
     return offset
 
 
@@ -213,7 +171,7 @@ def filter_and_correct(
         packets: Packets, shape (count or more, PACKET_WIDTH).
         count: Number of packets to take.
         m: Memory of the correction, shape (memory_size,).
-        net: `CorrectionNet`.
+        net: `_CorrectionNet`.
     """
     start, first_packet, empty, last = 0, 0, fast[:0], m[TICK_PLACE] + rows
     for j in range(rows):
@@ -224,23 +182,8 @@ def filter_and_correct(
                 is_last or not m[TICK_PLACE] < packets[end, PACKET.arrived] <= last
             ):
                 end += 1
-            fast_rows, due_packets, n_due = (
-                fast[start : j + 1],
-                packets[first_packet:end],
-                end - first_packet,
-            )
-            advance(
-                filters,
-                gains,
-                fast_rows,
-                len(fast_rows),
-                due_packets,
-                n_due,
-                0,
-                empty,
-                empty,
-                m[:0],
-            )
+            chunk, due, n_due = fast[start : j + 1], packets[first_packet:end], end - first_packet
+            advance(filters, gains, chunk, len(chunk), due, n_due, 0, empty, empty, m[:0])
             start, first_packet = j + 1, end
         if is_due:
             _update_correction(filters[0], gains, m, net)
@@ -257,7 +200,7 @@ def apply_correction(f: Any, m: Any, net: Any) -> None:
     Args:
         f: Memory of the filter.
         m: Memory of the correction, shape (memory_size,).
-        net: `CorrectionNet`.
+        net: `_CorrectionNet`.
     """
     b, n, row = net.beta, f.n, m[len(m) - f.n - 1 :]
     copy_into(f.P[b, :n], row)
@@ -276,7 +219,7 @@ def remove_correction(f: Any, m: Any, net: Any) -> None:
     Args:
         f: Memory of the filter.
         m: Memory of the correction, shape (memory_size,).
-        net: `CorrectionNet`.
+        net: `_CorrectionNet`.
     """
     b, n, row = net.beta, f.n, m[len(m) - f.n - 1 :]
     copy_into(row[:n], f.P[b])
@@ -316,8 +259,9 @@ class LearnedEstimator:
                 f"ticks of {base.dt:g} s"
             )
         self.base, self.names, self.correction = base, base.names, correction
-        self.net = make_net(correction, base.names)
-        self.memory = np.zeros(compute_memory_size(self.net, len(base.names)))
+        self.net = _make_net(correction, base.names)
+        n_numbers = int(locate_stack(self.net) + self.net.sizes.sum()) + len(base.names) + 1
+        self.memory = np.zeros((n_numbers + 7) // 8 * 8)  # whole cache lines
         self.memory[MASS] = vehicle.mass
         self.reset(base.sensors, 0)
 
@@ -329,7 +273,7 @@ class LearnedEstimator:
             first: Tick of the first fast row.
         """
         self.base.reset(sensors, first)
-        reset_memory(self.memory, first)
+        _reset_memory(self.memory, first)
 
     def step(self, rows: Array, packets: Array) -> None:
         """Process fast rows and packets as `EstimatorLike.step` does.

@@ -20,7 +20,7 @@ from .network import (
 )
 
 FORMAT = "1"
-"""Counts up where what a network reads (`kernel`) or its card changes."""
+"""Counts up where what a network reads (`correction`) or its card changes."""
 FOLDER = Path(__file__).resolve().with_name("corrections")
 FAST_INPUTS = (
     "gyro", "accel_y", "accel_x", "roll_rate", "wheel_left", "steer", "torque_left", "torque_right"
@@ -67,11 +67,9 @@ class CorrectionCard:
             raise ValueError(f"a correction's base is {', '.join(allowed)}, got {self.base!r}")
         if not isinstance(self.states, list | tuple) or "beta" not in self.states:
             raise ValueError(f"a correction reads its filter's beta, got states {self.states!r}")
-        reserved = sorted({"vehicle", "sensors", "dt", "speed"} & self.base_options.keys())
-        if reserved:
-            raise ValueError(
-                f"base_options hold what the env tells a filter: {', '.join(reserved)}"
-            )
+        taken = sorted({"vehicle", "sensors", "dt", "speed"} & self.base_options.keys())
+        if taken:
+            raise ValueError(f"base_options hold what the env tells a filter: {', '.join(taken)}")
 
     @property
     def inputs(self) -> int:

@@ -1,9 +1,8 @@
-"""Memory of a policy's network: torch's GRU and LSTM, and running means (traces).
+"""A policy's network at one observation after another, compiled: frames, cells, dense layers.
 
-A policy's network at one observation after another, compiled: frames, cells, dense layers.
-
-Its arrays lie one behind the other in one vector, weights transposed, so that a layer's sums grow
-input by input. Sums are in double precision and in one order, whatever the batch.
+Cells are torch's GRU and LSTM, or moving averages of several time scales. Arrays lie one behind
+the other in one vector, weights transposed, so that a layer's sums grow input by input. Sums are
+in double precision and in one order, whatever the batch.
 """
 
 from collections.abc import Sequence
@@ -21,7 +20,7 @@ from ...envs.record import Array
 GATES = {"gru": 3, "lstm": 4}
 """Gates of a kind of cell, in torch's order: reset, update, candidate; or input, forget,
 candidate, output."""
-MAX_TIME = 1e9  # steps of a mean: beyond any drive, and a number that arrays hold
+_MAX_TIME = 1e9  # steps of a mean: beyond any drive, and a number that arrays hold
 CELL_WEIGHTS = ("weight_in", "weight_state", "bias_in", "bias_state")
 """The arrays of a cell: torch's weight_ih, weight_hh, bias_ih and bias_hh."""
 
@@ -113,15 +112,13 @@ class MovingAverages:
             object.__setattr__(self, name, single.astype(np.float64))
         object.__setattr__(self, "times", tuple(self.times))
         if self.weight_in.ndim != 2 or self.bias_in.shape != self.weight_in.shape[:1]:
-            shapes = self.weight_in.shape, self.bias_in.shape
-            raise ValueError(
-                f"traces have weights (units, inputs) and biases (units,), got {shapes}"
-            )
+            pair = self.weight_in.shape, self.bias_in.shape
+            raise ValueError(f"traces have weights (units, inputs) and biases (units,), got {pair}")
         if not 0 <= self.n_silu <= len(self.bias_in):
             raise ValueError(f"of {len(self.bias_in)} units {self.n_silu} cannot be bent")
-        if not self.times or not all(0.0 < time <= MAX_TIME for time in self.times):
+        if not self.times or not all(0.0 < time <= _MAX_TIME for time in self.times):
             raise ValueError(
-                f"traces last one time or more, each above 0 steps and {MAX_TIME:g} at most, got "
+                f"traces last one time or more, each above 0 steps and {_MAX_TIME:g} at most, got "
                 f"{self.times}"
             )
 
@@ -144,8 +141,7 @@ class MovingAverages:
     def numbers(self) -> Array:
         """Arrays as compiled code takes them.
 
-        They are the final weight of a new number, of each time, then weights (inputs, units) row by
-        row, and biases.
+        Final weights of a new number by time, weights (inputs, units) row by row, biases.
         """
         shares = -np.expm1(-1.0 / np.array(self.times))
         return np.concatenate([shares, self.weight_in.T.ravel(), self.bias_in])
@@ -172,76 +168,23 @@ def compute_cell_shapes(kind: str, size: int, inputs: int) -> dict[str, tuple[in
 
 ACTIVATIONS = ("tanh", "relu", "elu", "leaky-relu", "silu")
 OUTPUTS = ("tanh", "linear")
-TANH, RELU, ELU, LEAKY, SILU = range(len(ACTIVATIONS))
+_TANH, _RELU, _ELU, _LEAKY, _SILU = range(len(ACTIVATIONS))
 _MAX_EXPONENT = 40.0  # where e^-x is nothing beside 1
 
 
 class PackedNetwork(NamedTuple):
-    """A network as compiled code takes it.
+    """A network as compiled code takes it."""
 
-    Attributes:
-        mean: Mean of a frame, or of the stack.
-        scale: Scale of a frame, or of the stack.
-        clip: Bound of normalised inputs, infinite for none.
-        inputs: Number of entries of a frame.
-        history: Number of frames.
-        cells: `form` of each cell, shape (k, 4).
-        sizes: Sizes of the dense layers, inputs first.
-        activation: Place in `ACTIVATIONS`.
-        output: Place in `OUTPUTS`.
-        numbers: Numbers of each cell and layer in turn; a layer's are weights (inputs, outputs) row
-            by row, then biases.
-    """
-
-    mean: Array
+    mean: Array  # of a frame, or of the stack
     scale: Array
-    clip: float
-    inputs: int
-    history: int
-    cells: npt.NDArray[np.int64]
-    sizes: npt.NDArray[np.int64]
-    activation: int
-    output: int
-    numbers: Array
-
-
-def pack_network(
-    scaling: tuple[Array, Array, float | None],
-    history: int,
-    cells: Sequence[MemoryLayer],
-    layers: Sequence[tuple[Array, Array]],
-    activation: str,
-    output: str,
-) -> PackedNetwork:
-    """Pack a network for compiled code.
-
-    Args:
-        scaling: Mean, scale and clip.
-        history: Number of frames.
-        cells: Cells before the dense layers.
-        layers: Weights (outputs, inputs) and biases (outputs,) of each dense layer.
-        activation: Name of `ACTIVATIONS`.
-        output: Name of `OUTPUTS`.
-
-    Returns:
-        The packed network.
-    """
-    mean, scale, max_abs = scaling
-    first_weights = cells[0].weight_in if cells else layers[0][0]
-    numbers = [cell.numbers for cell in cells]
-    numbers += [part.T.ravel() for layer in layers for part in layer]
-    return PackedNetwork(
-        mean,
-        scale,
-        np.inf if max_abs is None else float(max_abs),
-        first_weights.shape[1] // history,
-        history,
-        np.array([memory_layer.form for memory_layer in cells], np.int64).reshape(-1, 4),
-        np.array([layers[0][0].shape[1], *(len(b) for _, b in layers)], np.int64),
-        ACTIVATIONS.index(activation),
-        OUTPUTS.index(output),
-        np.concatenate(numbers),
-    )
+    clip: float  # bound of normalised inputs, infinite for none
+    inputs: int  # entries of a frame
+    history: int  # frames
+    cells: npt.NDArray[np.int64]  # `form` of each cell, shape (k, 4)
+    sizes: npt.NDArray[np.int64]  # of the dense layers, inputs first
+    activation: int  # place in `ACTIVATIONS`
+    output: int  # place in `OUTPUTS`
+    numbers: Array  # of each cell, then of each layer: weights (inputs, outputs), biases
 
 
 @jit
@@ -257,13 +200,13 @@ def _sigmoid(x: Any) -> Any:
 @jit
 def _apply_activation(x: Any, kind: int) -> Any:
     """Apply an activation with torch's default arguments."""
-    if kind == TANH:
+    if kind == _TANH:
         return _tanh(x)
-    if kind == RELU:
+    if kind == _RELU:
         return maximum(x, 0.0)
-    if kind == LEAKY:
+    if kind == _LEAKY:
         return maximum(x, 0.01 * x)
-    if kind == SILU:
+    if kind == _SILU:
         return x * _sigmoid(x)
     return x if x > 0.0 else exp(maximum(x, 0.0 - _MAX_EXPONENT)) - 1.0
 
@@ -328,15 +271,12 @@ def _compute_gates(
 
 @jit_nrt
 def _step_averages(z: Any, m: Any, form: Any, numbers: Any, offset: int) -> Any:
-    """Step `MovingAverages`; return the output and the place behind.
-
-    m: steps so far and means, updated.
-    """
+    """Step `MovingAverages`, whose state m is updated; return the output and the place behind."""
     units, times = form[1], form[3]
     out = np.empty(units * (1 + times))
     end = _apply_dense(z, numbers, offset + times, out[:units])
     for i in range(units - form[2], units):
-        out[i] = _apply_activation(out[i], SILU)
+        out[i] = _apply_activation(out[i], _SILU)
     m[0] += 1.0
     for j in range(times):
         share = maximum(numbers[offset + j], 1.0 / m[0])
@@ -390,7 +330,7 @@ def forward(net: Any, x: Any, state: Any, out: Any) -> None:
             y = np.empty(net.sizes[layer + 1])
             offset = _apply_dense(z, net.numbers, offset, y)
             kind = net.activation if layer < last - 1 else net.output
-            if layer < last - 1 or net.output == TANH:
+            if layer < last - 1 or net.output == _TANH:
                 for i in range(len(y)):
                     y[i] = _apply_activation(y[i], kind)
             z = y

@@ -1,9 +1,7 @@
-"""A policy's network: a normalised observation through cells and dense layers, without torch.
-
-Networks in safetensors files: tensors of the shapes that a card in the metadata has.
+"""A policy's network without torch, and its safetensors file: tensors, and a card in the metadata.
 
 Reading runs no code: safetensors are numbers, the card is JSON. Policies (`agents.learned.policy`)
-and corrections of estimators (`files`) are such files, each with a card of its own.
+and corrections of estimators (`correction_file`) are such files, each with a card of its own.
 """
 
 import json
@@ -29,7 +27,6 @@ from .forward import (
     RecurrentCell,
     compute_cell_shapes,
     forward,
-    pack_network,
 )
 
 
@@ -95,12 +92,11 @@ class Network:
         stacked = self._first.shape[-1]
         if stacked % self.history:
             raise ValueError(f"{stacked} inputs are not {self.history} frames of one width")
-        if self.mean.shape not in ((self.inputs,), (stacked,)) or self.scale.shape != (
-            self.mean.shape
-        ):
+        shape = self.mean.shape
+        if shape not in ((self.inputs,), (stacked,)) or self.scale.shape != shape:
             raise ValueError(
                 f"mean and scale are (inputs,) or (history inputs,) with {self.inputs} inputs, "
-                f"got {self.mean.shape} and {self.scale.shape}"
+                f"got {shape} and {self.scale.shape}"
             )
         width = stacked
         for i, cell in enumerate(self.cells):
@@ -178,18 +174,30 @@ class Network:
 
     @cached_property
     def _network_arrays(self) -> PackedNetwork:
-        scaling, kinds = (self.mean, self.scale, self.clip), (self.activation, self.output)
-        layers = list(zip(self.weights, self.biases, strict=True))
-        return pack_network(scaling, self.history, self.cells, layers, *kinds)
+        """The network as compiled code takes it."""
+        layers = zip(self.weights, self.biases, strict=True)
+        numbers = [cell.numbers for cell in self.cells]
+        numbers += [part.T.ravel() for layer in layers for part in layer]
+        return PackedNetwork(
+            self.mean,
+            self.scale,
+            np.inf if self.clip is None else float(self.clip),
+            self.inputs,
+            self.history,
+            np.array([cell.form for cell in self.cells], np.int64).reshape(-1, 4),
+            np.array([self.weights[0].shape[1], *map(len, self.biases)], np.int64),
+            ACTIVATIONS.index(self.activation),
+            OUTPUTS.index(self.output),
+            np.concatenate(numbers),
+        )
 
     @property
     def dense(self) -> "Network":
         """Dense layers behind cells as a network of what these give; without cells itself."""
         if not self.cells:
             return self
-        width = self.weights[0].shape[1]
-        scaling = np.zeros(width), np.ones(width)
-        return replace(self, mean=scaling[0], scale=scaling[1], clip=None, history=1, cells=())
+        mean = np.zeros(self.weights[0].shape[1])
+        return replace(self, mean=mean, scale=mean + 1.0, clip=None, history=1, cells=())
 
     def replace_dense(self, dense: "Network") -> "Network":
         """Replace the dense layers.
@@ -299,6 +307,12 @@ def describe_network(network: Network) -> dict[str, Any]:
     Returns:
         Sizes and kinds by name, JSON types only.
     """
+    cells: list[list[Any]] = [
+        [cell.kind, len(cell.bias_in), cell.n_silu, list(cell.times)]
+        if isinstance(cell, MovingAverages)
+        else [cell.kind, cell.size]
+        for cell in network.cells
+    ]
     return dict(
         hidden=list(network.hidden),
         activation=network.activation,
@@ -306,14 +320,8 @@ def describe_network(network: Network) -> dict[str, Any]:
         clip=network.clip,
         action_width=network.width,
         history=network.history,
-        cells=[_describe_cell(cell) for cell in network.cells],
+        cells=cells,
     )
-
-
-def _describe_cell(cell: MemoryLayer) -> list[Any]:
-    if isinstance(cell, MovingAverages):
-        return [cell.kind, len(cell.bias_in), cell.n_silu, list(cell.times)]
-    return [cell.kind, cell.size]
 
 
 def build_network(fields: Any, inputs: int, tensors: Tensors) -> Network:
@@ -399,10 +407,8 @@ def _compute_shapes(inputs: int, history: int, cells: list[Any], sizes: list[int
 def _check_tensors(tensors: Tensors, shapes: _Shapes) -> None:
     """Check the names, shapes and types of tensors; else ValueError."""
     if shapes.keys() != tensors.keys():
-        missing, unexpected = shapes.keys() - tensors.keys(), tensors.keys() - shapes.keys()
-        raise ValueError(
-            f"missing tensors: {sorted(missing)}; unexpected ones: {sorted(unexpected)}"
-        )
+        missing, extra = shapes.keys() - tensors.keys(), tensors.keys() - shapes.keys()
+        raise ValueError(f"missing tensors: {sorted(missing)}; unexpected ones: {sorted(extra)}")
     for name, allowed in shapes.items():
         kind = np.dtype(np.float64 if name in ("mean", "scale") else np.float32)
         tensor = tensors[name]
