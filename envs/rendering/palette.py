@@ -1,7 +1,7 @@
-"""One colour a name, in every picture, figure and table: each method has its own.
+"""One colour a name in every picture, figure and table: each method has its own.
 
-The colours were spread as far as possible in OKLab, for eyes without red or green cones too, those
-of names that meet in figures the furthest; every one stands out from white and from the dark page.
+The colours are spread as far as possible in OKLab, for eyes without red or green cones too, those
+of names that meet in figures the furthest. All stand out from white and from the dark page.
 """
 
 import zlib
@@ -118,11 +118,9 @@ def find_base(name: str) -> str | None:
         The name.
     """
     name = name.removeprefix(_DEFAULT_PREFIX).partition(" on ")[0]
-    return (
-        name
-        if name in COLOURS
-        else next((known for known in _LONGEST_FIRST if known in name), None)
-    )
+    if name in COLOURS:
+        return name
+    return next((known for known in _LONGEST_FIRST if known in name), None)
 
 
 def find_colour(name: str) -> str:
@@ -134,10 +132,9 @@ def find_colour(name: str) -> str:
     Returns:
         "#RRGGBB".
     """
-    known = find_base(name)
-    return (
-        COLOURS[known] if known else OTHER_COLOURS[zlib.crc32(name.encode()) % len(OTHER_COLOURS)]
-    )
+    if known := find_base(name):
+        return COLOURS[known]
+    return OTHER_COLOURS[zlib.crc32(name.encode()) % len(OTHER_COLOURS)]
 
 
 def mix_colours(shade: str, with_shade: str, share: float) -> str:
