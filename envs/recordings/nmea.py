@@ -64,9 +64,9 @@ def _read_sentence(text: bytes) -> _Sentence | None:
         fields = fields[: 3 + (len(fields) - 3) // 4 * 4]
     initial_values = {"numSV": sum(map(bool, fields[2:14]))} if kind == "GSA" else {}
     sentence = _Sentence(talker, kind, initial_values, [])
-    for (name, form), text in zip(_list_forms(kind), fields, strict=False):
-        if text:
-            value = _parse_value(name, form, text)
+    for (name, form), entry in zip(_list_forms(kind), fields, strict=False):
+        if entry:
+            value = _parse_value(name, form, entry)
             if value is None:
                 sentence.bad.append(name)
             else:
