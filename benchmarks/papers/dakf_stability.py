@@ -48,13 +48,10 @@ SIMULATIONS = (
 def _make_tracking_parts(
     scenario: str, beta: float | None, gamma: float | None
 ) -> tuple[ClaimPart, ...]:
+    slip, rate = "sideslip error, with / without", "yaw rate error, with / without"
     return (
-        make_smaller_part(
-            "sideslip error, with / without", scenario, WITH, WITHOUT, beta, "rms_beta"
-        ),
-        make_smaller_part(
-            "yaw rate error, with / without", scenario, WITH, WITHOUT, gamma, "rms_gamma"
-        ),
+        make_smaller_part(slip, scenario, WITH, WITHOUT, beta, "rms_beta"),
+        make_smaller_part(rate, scenario, WITH, WITHOUT, gamma, "rms_gamma"),
     )
 
 

@@ -64,9 +64,8 @@ def _draw_system(seed: int) -> _RandomSystem:
     G = [np.eye(STATES) + 0.2 * g for g in draw_arrays(STATES, STATES)]
     K = [0.2 * k for k in draw_arrays(STATES, OUTPUTS)]
     C = rng.normal(size=(OUTPUTS, STATES))
-    return _RandomSystem(
-        G, C, K, draw_arrays(STATES), draw_arrays(OUTPUTS), rng.normal(size=STATES)
-    )
+    w, v = draw_arrays(STATES), draw_arrays(OUTPUTS)
+    return _RandomSystem(G, C, K, w, v, rng.normal(size=STATES))
 
 
 def _compute_product(factors: list[Array]) -> Array:
@@ -321,11 +320,8 @@ def find_crossings(loop: "Loop") -> Array:
         for low, high, changes in zip(grid, grid[1:], signs[:-1] * signs[1:] < 0.0, strict=False)
         if changes
     ]
-    factors = [
-        (1.0 / abs(evaluate_loop(omega)), omega)
-        for omega in frequencies
-        if evaluate_loop(omega).real < 0.0
-    ]
+    values = [(evaluate_loop(omega), omega) for omega in frequencies]
+    factors = [(1.0 / abs(value), omega) for value, omega in values if value.real < 0.0]
     end = evaluate_loop(top).real
     return np.reshape([*factors, *([(-1.0 / end, top)] if end < 0.0 else [])], (-1, 2))
 

@@ -148,14 +148,13 @@ def make_plant_drive(
     def run_drive(fields: Fields) -> Series:
         scenario = Scenario(**(CALM | dict(fields)))
         profile = make_steering_profile(scenario)
-        return simulate_plant(
-            OUTSIDE_PLANTS[model](friction),
-            lambda t: float(compute_steering(t / TICK, profile)),
-            scenario.range("speed")[0],
-            scenario.duration,
-            scenario.acceleration is None,
-            law,
-        )
+
+        def steering(t: float) -> float:
+            return float(compute_steering(t / TICK, profile))
+
+        speed, hold = scenario.range("speed")[0], scenario.acceleration is None
+        plant = OUTSIDE_PLANTS[model](friction)
+        return simulate_plant(plant, steering, speed, scenario.duration, hold, law)
 
     return run_drive
 
@@ -258,6 +257,7 @@ _FRICTION = {
     "outputs": [*_TYRES["outputs"], "inverse_friction"],
     "options": {"inverse_friction_sd": 0.3},
 }
+_DISTILLED = {"coms": "distill-coms-yaw", "passenger-car": "distill-car-yaw"}
 ENTRIES = (
     ProcedureEntry("none"),
     ProcedureEntry("feedforward"),
@@ -266,7 +266,5 @@ ENTRIES = (
     ProcedureEntry("esc"),
     ProcedureEntry("adaptive-lqr", "joint", _TYRES),
     ProcedureEntry("adaptive-nmpc", "joint", _FRICTION, slow=True),
-    ProcedureEntry(
-        "distilled", policies={"coms": "distill-coms-yaw", "passenger-car": "distill-car-yaw"}
-    ),
+    ProcedureEntry("distilled", policies=_DISTILLED),
 )

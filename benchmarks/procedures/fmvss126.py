@@ -64,14 +64,12 @@ class SineDwellRun:
 def _make_slow_steer(car: TestCar, side: float, max_acceleration: float = 0.5 * GRAVITY) -> Fields:
     """Make the slowly rising steer, 2 s or more, until a linear car has an acceleration (m/s2)."""
     seconds = 30.0
+    amplitude = side * _RAMP_RATE / car.ratio * seconds
     return {
-        "steering": "ramp",
-        "onset": ONSET,
-        "amplitude": side * _RAMP_RATE / car.ratio * seconds,
-        "hold": seconds,
+        "steering": "ramp", "onset": ONSET, "amplitude": amplitude, "hold": seconds,
         "speed": car.speed,
         "duration": ONSET + seconds * min(1.0, max_acceleration / (2.0 * GRAVITY)),
-    }
+    }  # fmt: skip
 
 
 def fit_reference_angle(series: Series, ratio: float) -> float:
@@ -98,15 +96,10 @@ def list_amplitudes(A: float) -> Array:
 def make_sine_with_dwell(car: TestCar, amplitude: float) -> Fields:
     """Make a run of an amplitude (rad at the steering wheel), signed as its first half."""
     return {
-        "steering": "sine-with-dwell",
-        "onset": ONSET,
-        "amplitude": amplitude / car.ratio,
-        "frequency": FREQUENCY,
-        "hold": DWELL,
-        "speed": car.speed,
-        "acceleration": 0.0,
+        "steering": "sine-with-dwell", "onset": ONSET, "amplitude": amplitude / car.ratio,
+        "frequency": FREQUENCY, "hold": DWELL, "speed": car.speed, "acceleration": 0.0,
         "duration": COMPLETION + _AFTER,
-    }
+    }  # fmt: skip
 
 
 def evaluate_run(series: Series, amplitude: float, A: float) -> SineDwellRun:

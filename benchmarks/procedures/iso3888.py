@@ -35,9 +35,7 @@ class TrackRun:
     """One run through a track."""
 
     speed: float  # m/s
-    margins: tuple[
-        float, ...
-    ]  # m, smallest distance of the body to each lane's edge; < 0: a cone falls
+    margins: tuple[float, ...]  # m, by lane, to its edge; below 0 a cone falls, NaN: not driven
     series: Series
 
     @property

@@ -36,15 +36,10 @@ def compute_understeer_gradient(vehicle: Vehicle) -> float:
 def _make_circle(car: TestCar, steer: float, first: float, last: float, seconds: float) -> Fields:
     """Make a constant steering angle (rad) while the speed rises from first to last (m/s)."""
     return {
-        "steering": "held-step",
-        "amplitude": steer,
-        "onset": 0.0,
-        "speed": first,
-        "speed_change": last - first,
-        "change_start": _SETTLE,
-        "change_length": seconds,
+        "steering": "held-step", "amplitude": steer, "onset": 0.0, "speed": first,
+        "speed_change": last - first, "change_start": _SETTLE, "change_length": seconds,
         "duration": _SETTLE + seconds,
-    }
+    }  # fmt: skip
 
 
 def compute_handling(series: Series, vehicle: Vehicle) -> Handling:

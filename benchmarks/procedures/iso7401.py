@@ -61,15 +61,10 @@ def _make_sweep(car: TestCar, steer: float, seconds: float = 100.0) -> Fields:
     It has passed half a segment when it comes to the lowest frequency of the standard.
     """
     return {
-        "steering": "sweep",
-        "amplitude": steer,
-        "onset": ONSET,
-        "frequency": 0.25 * LOWEST,
-        "frequency_2": 1.25 * HIGHEST,
-        "hold": seconds,
-        "speed": car.speed,
+        "steering": "sweep", "amplitude": steer, "onset": ONSET, "frequency": 0.25 * LOWEST,
+        "frequency_2": 1.25 * HIGHEST, "hold": seconds, "speed": car.speed,
         "duration": ONSET + seconds + 2.0,
-    }
+    }  # fmt: skip
 
 
 def compute_step_response(t: Array, steer: Array, output: Array) -> StepResponse:

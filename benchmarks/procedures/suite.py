@@ -62,12 +62,10 @@ def _measure_transient(case: ProcedureCase) -> Transient:
     stepped = drive(iso7401.make_step(car, per * _STEP_AT))
     sweep = iso7401.run_sweep(drive, car, per * _SWEEP_AT)
     frequency = sweep[iso7401.OUTPUTS[0]].frequency
-    return Transient(
-        iso7401.compute_responses(stepped),
-        iso7401.compute_linear_step(car.vehicle, car.speed, stepped),
-        sweep,
-        iso7401.compute_linear_response(car.vehicle, car.speed, frequency),
-    )
+    step = iso7401.compute_responses(stepped)
+    linear_step = iso7401.compute_linear_step(car.vehicle, car.speed, stepped)
+    linear_sweep = iso7401.compute_linear_response(car.vehicle, car.speed, frequency)
+    return Transient(step, linear_step, sweep, linear_sweep)
 
 
 def make_cases(quick: bool) -> list[ProcedureCase]:

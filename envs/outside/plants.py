@@ -308,7 +308,5 @@ class MultiBody(OutsidePlant):
 
 
 OUTSIDE_PLANTS: dict[str, type[OutsidePlant]] = {
-    "single-track": SingleTrack,
-    "drift": Drift,
-    "multi-body": MultiBody,
-}
+    "single-track": SingleTrack, "drift": Drift, "multi-body": MultiBody
+}  # fmt: skip

@@ -111,17 +111,11 @@ def read_text(
     has_comma = any("," in x and not _THOUSANDS.fullmatch(x) for x in numbers)
     decimal = "," if has_comma and not any("." in x for x in numbers) else "."
     frame = pd.read_csv(
-        io.BytesIO(data),
-        sep=r"\s+" if separator == " " else separator,
-        decimal=decimal,
-        encoding=encoding,
-        header=0,
-        names=list(range(len(header))),
-        skiprows=[*range(header_line), *skipped] or None,
-        index_col=False,
-        skipinitialspace=True,
+        io.BytesIO(data), sep=r"\s+" if separator == " " else separator, decimal=decimal,
+        encoding=encoding, header=0, names=list(range(len(header))),
+        skiprows=[*range(header_line), *skipped] or None, index_col=False, skipinitialspace=True,
         low_memory=False,
-    )
+    )  # fmt: skip
     frame.columns = pd.Index(header)
     aspects = {
         f"{encoding.upper()} text": encoding != "utf-8-sig",

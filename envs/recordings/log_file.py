@@ -281,10 +281,8 @@ def _split_pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], lis
         piece = {name: column[rows] for name, column in values.items()}
         pieces.append(_resample_evenly(piece, typical))
     if dropped > len(time) / 2:
-        raise ValueError(
-            f"time stands still or steps back in {dropped} of {len(time)} rows: have its stamps "
-            "lost digits?"
-        )
+        rows_text = f"{dropped} of {len(time)} rows: have its stamps lost digits?"
+        raise ValueError(f"time stands still or steps back in {rows_text}")
     if not pieces:
         hole = f"a hole of {_MAX_HOLE:g} s"
         raise ValueError(f"no part of the log lasts {_MIN_PART:g} s without {hole}")

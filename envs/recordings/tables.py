@@ -122,30 +122,14 @@ _CURVATURE = {"radpm": 1.0}
 
 COLUMNS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-    "speed_x": _SPEED,
-    "speed_y": _SPEED,
-    "yaw_rate": _ANGLE_RATE,
-    "accel_x": _ACCELERATION,
-    "accel_y": _ACCELERATION,
-    "roll_rate": _ANGLE_RATE,
-    "steer": _ANGLE,
-    "sideslip": _ANGLE,
-    "wheel_left": _SPEED,
-    "wheel_right": _SPEED,
-    "torque_left": _TORQUE,
-    "torque_right": _TORQUE,
-    "steer_command": _ANGLE,
-    "accel_command": _ACCELERATION,
-    "curvature": _CURVATURE,
-    "course": _ANGLE | {"degnorth": -np.pi / 180.0},
-    "gps_speed": _SPEED,
-    "gps_x": _LENGTH,
-    "gps_y": _LENGTH,
-    "gps_hdop": _NUMBER,
-    "gps_satellites": _NUMBER,
-    "camera_psi": _ANGLE,
+    "speed_x": _SPEED, "speed_y": _SPEED, "yaw_rate": _ANGLE_RATE, "accel_x": _ACCELERATION,
+    "accel_y": _ACCELERATION, "roll_rate": _ANGLE_RATE, "steer": _ANGLE, "sideslip": _ANGLE,
+    "wheel_left": _SPEED, "wheel_right": _SPEED, "torque_left": _TORQUE, "torque_right": _TORQUE,
+    "steer_command": _ANGLE, "accel_command": _ACCELERATION, "curvature": _CURVATURE,
+    "course": _ANGLE | {"degnorth": -np.pi / 180.0}, "gps_speed": _SPEED, "gps_x": _LENGTH,
+    "gps_y": _LENGTH, "gps_hdop": _NUMBER, "gps_satellites": _NUMBER, "camera_psi": _ANGLE,
     "camera_y_l": _LENGTH,
-}
+}  # fmt: skip
 """What a log may hold and the units it may come in, with their factors to SI. A column is called
 quantity_unit (`yaw_rate_radps`). Axes are ISO 8855; angles, the course too, are positive to the
 left; `course_degnorth` alone counts from north, clockwise, as a compass does. The names of course
@@ -178,12 +162,9 @@ def _parse_column_name(name: str) -> tuple[str, float]:
     if name in _NAMES:
         return _NAMES[name]
     quantity = name.rpartition("_")[0]
-    near = next((known for known in (name, quantity) if known in COLUMNS), None)
-    known = (
-        [make_column_name(q) for q in COLUMNS]
-        if near is None
-        else [f"{near}_{u}" for u in COLUMNS[near]]
-    )
+    known = [make_column_name(q) for q in COLUMNS]
+    if near := next((text for text in (name, quantity) if text in COLUMNS), None):
+        known = [f"{near}_{u}" for u in COLUMNS[near]]
     raise ValueError(f"unknown column name {name!r}; expected one of {', '.join(known)}")
 
 
@@ -371,7 +352,6 @@ def _convert_column(table: _LogTable, place: int, name: str, remarks: list[str])
         text, expected = str(column.iloc[row]), f"a number up to {_LARGEST / abs(factor):g}"
         if is_none[row]:
             expected = "a number" + " with a decimal point alone" * ("," in text)
-        raise ValueError(
-            f"column {label!r}, row {row + 1}: expected {expected}, got {short_repr(text)}"
-        )
+        place_text = f"column {label!r}, row {row + 1}"
+        raise ValueError(f"{place_text}: expected {expected}, got {short_repr(text)}")
     return values

@@ -31,7 +31,8 @@ _NO_WINDOW = ("offscreen", "dummy")  # SDL's drivers that show nothing
 class Canvas:
     """A picture that shapes and text are drawn on.
 
-    Places and widths are in pixels of the result, x to the right and y down; colours are "#RRGGBB".
+    Places, widths and radii are in pixels of the result, x to the right and y down. Points have
+    shape (n, 2), centre, start and end shape (2,); colours are "#RRGGBB".
 
     Args:
         size: Width and height of the picture (px).
@@ -43,43 +44,22 @@ class Canvas:
         self._texts: list[tuple[pygame.Surface, tuple[float, float]]] = []
 
     def set_clip(self, box: Box | None) -> None:
-        """Limit the drawing of shapes to a box; text is drawn everywhere.
-
-        Args:
-            box: The box; None: the whole picture.
-        """
+        """Limit the drawing of shapes to a box; None: the whole picture. Text is never clipped."""
         self._large.set_clip(None if box is None else _scale_box(box))
 
     def draw_box(self, box: Box, colour: str, radius: float = 0.0) -> None:
-        """Draw a filled box with round corners.
-
-        Args:
-            box: The box.
-            colour: Its colour.
-            radius: Radius of its corners (px).
-        """
+        """Draw a filled box with round corners."""
         scaled = pygame.Rect(_scale_box(box))
         pygame.draw.rect(self._large, colour, scaled, border_radius=round(_OVERSAMPLING * radius))
 
     def draw_polygon(self, points: Points, colour: str) -> None:
-        """Draw a filled polygon.
-
-        Args:
-            points: Its corners (px), shape (n, 2).
-            colour: Its colour.
-        """
+        """Draw a filled polygon."""
         scaled = _scale_points(points)
         pygame.draw.polygon(self._large, colour, scaled)
         pygame.draw.aalines(self._large, colour, True, scaled)
 
     def draw_line(self, points: Points, colour: str, width: float = 1.0) -> None:
-        """Draw a line through at least two points.
-
-        Args:
-            points: Points (px), shape (n, 2).
-            colour: Its colour.
-            width: Its width (px).
-        """
+        """Draw a line through at least two points."""
         scaled, thick = _scale_points(points), max(round(_OVERSAMPLING * width), 1)
         pygame.draw.lines(self._large, colour, False, scaled, thick)
         if thick > 4:
@@ -89,15 +69,7 @@ class Canvas:
     def draw_dashes(
         self, points: Points, colour: str, width: float = 1.0, dash: float = 6.0, gap: float = 5.0
     ) -> None:
-        """Draw a dashed line.
-
-        Args:
-            points: Points (px), shape (n, 2).
-            colour: Its colour.
-            width: Its width (px).
-            dash: Length of a dash (px).
-            gap: Length between two dashes (px).
-        """
+        """Draw a dashed line; dash and gap are lengths (px)."""
         vertices = np.asarray(points, float)
         steps = np.hypot(*np.diff(vertices, axis=0).T)
         length = np.concatenate([[0.0], np.cumsum(steps)])
@@ -109,36 +81,16 @@ class Canvas:
             pygame.draw.line(self._large, colour, start, end, max(round(_OVERSAMPLING * width), 1))
 
     def draw_disc(self, centre: Any, radius: float, colour: str) -> None:
-        """Draw a filled circle.
-
-        Args:
-            centre: Its centre (px), shape (2,).
-            radius: Its radius (px).
-            colour: Its colour.
-        """
+        """Draw a filled circle."""
         pygame.draw.circle(self._large, colour, _scale_points([centre])[0], _OVERSAMPLING * radius)
 
     def draw_ring(self, centre: Any, radius: float, colour: str, width: float = 1.0) -> None:
-        """Draw a circle.
-
-        Args:
-            centre: Its centre (px), shape (2,).
-            radius: Radius to the middle of the line (px).
-            colour: Its colour.
-            width: Its width (px).
-        """
+        """Draw a circle, its radius to the middle of the line."""
         place, thick = _scale_points([centre])[0], max(round(_OVERSAMPLING * width), 1)
         pygame.draw.circle(self._large, colour, place, _OVERSAMPLING * radius + thick / 2, thick)
 
     def draw_arrow(self, start: Any, end: Any, colour: str, width: float = 2.0) -> None:
-        """Draw a line with a head at its end; the head shrinks with a short one.
-
-        Args:
-            start: Its start (px), shape (2,).
-            end: Its tip (px), shape (2,).
-            colour: Its colour.
-            width: Its width (px).
-        """
+        """Draw a line with a head at its end; the head shrinks with a short one."""
         a, b = np.asarray(start, float), np.asarray(end, float)
         length = float(np.hypot(*(b - a)))
         if length < 1.0:

@@ -86,12 +86,11 @@ def _make_strips(
         slip.append(_ChartLine(t, _DEGREES * hat, colours[name], deviation=_DEGREES * std))
     if has_yaw_reference:
         rate = [rate_reference, *rate]
+    moment = make_lines(TRACE_POINT.yaw_moment, 1.0)
     return [
         _Strip("sideslip angle / deg", 1.0, 1.6, slip),
         _Strip("yaw rate / (deg/s)", 10.0, 1.0, rate),
-        _Strip(
-            "yaw moment / (N m)", 0.2 * max_moment, 1.0, make_lines(TRACE_POINT.yaw_moment, 1.0)
-        ),
+        _Strip("yaw moment / (N m)", 0.2 * max_moment, 1.0, moment),
     ]
 
 
@@ -268,11 +267,8 @@ def _draw_directions(
 
 
 SIZE = 960, 540
-_ROAD, _CLOSEUP, _STRIPS = (
-    (0.0, 40.0, 960.0, 216.0),
-    (0.0, 262.0, 336.0, 278.0),
-    (344.0, 284.0, 608.0, 252.0),
-)
+_ROAD = (0.0, 40.0, 960.0, 216.0)
+_CLOSEUP, _STRIPS = (0.0, 262.0, 336.0, 278.0), (344.0, 284.0, 608.0, 252.0)
 
 
 def draw_picture(

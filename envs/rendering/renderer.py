@@ -85,9 +85,8 @@ class RenderMixin:
         """
         if not self._traces:
             self._traces = [EpisodeTrace() for _ in range(self._cars)]
-        render_state = RenderState(
-            *self._get_packed_arrays(row), self._traces[row], self._has_tyre_forces
-        )
+        arrays, trace = self._get_packed_arrays(row), self._traces[row]
+        render_state = RenderState(*arrays, trace, self._has_tyre_forces)
         if not render_state.params[P.car.m] > 0.0:
             raise ResetNeeded("there is nothing to draw yet: call reset() first")
         if render_state.trace.is_empty:
@@ -100,9 +99,8 @@ class RenderMixin:
             from .canvas import read_pixels
             from .charts import draw_picture
 
-            return tuple(
-                read_pixels(draw_picture(self.make_render_state(row))) for row in range(self._cars)
-            )
+            states = map(self.make_render_state, range(self._cars))
+            return tuple(read_pixels(draw_picture(state)) for state in states)
         if self.render_mode == "human":
             self._show()
         else:
