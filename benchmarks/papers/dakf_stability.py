@@ -21,7 +21,7 @@ FIG7, LARGER, FIG9 = "dakf-fig7", "dakf-fig7-larger", "dakf-fig9"
 BIAS, RANKS = "dakf-bias", "dakf-rank"
 DAKF, KF, LOB = "dakf", "course-kf", "lob"
 WITHOUT, WITH, FEEDBACK = "without control", "with control", "with control, no rejection"
-GYRO_BIAS = 8.7266e-4  # rad/s, 0.05 deg/s
+_GYRO_BIAS = 8.7266e-4  # rad/s, 0.05 deg/s
 
 _ENV = "sideslip/YawGps-v0"
 _FILTERS = tuple(PaperFilter(name, name) for name in (DAKF, KF, LOB))
@@ -31,7 +31,7 @@ _AGENTS = {WITHOUT: {"agent": "none"}, WITH: {}}
 SIMULATIONS = (
     FollowingSimulation(FIG7, FIG7, {**_AGENTS, FEEDBACK: {"rejection": False}}),
     FollowingSimulation(LARGER, {"base": FIG7, "name": LARGER, "amplitude": 0.1}, _AGENTS,
-                        share=0.25),
+        share=0.25),
     FollowingSimulation(FIG9, FIG9, _AGENTS, share=0.5),
     EstimationSimulation(FIG6, _ENV, FIG6, _FILTERS),
     EstimationSimulation(FASTER, _ENV, {"base": FIG6, "name": FASTER, "frequency": 0.4}, _FILTERS),
@@ -39,8 +39,7 @@ SIMULATIONS = (
     EstimationSimulation(BIAS, _ENV,
         {"base": FIG6, "name": BIAS, "steering": "straight", "duration": 120.0, "wind_force": 0.0,
             "gps_outage": None, "disturbance_force": 0.0, "disturbance_moment": 0.0,
-            "noise": {"gyro_bias": GYRO_BIAS}},
-        _FILTERS[:2], control_period=100),
+            "noise": {"gyro_bias": _GYRO_BIAS}}, _FILTERS[:2], control_period=100),
     Analysis(RANKS, compute_coms_ranks, random=False),
 )
 # fmt: on
@@ -49,13 +48,10 @@ SIMULATIONS = (
 def _make_tracking_parts(
     scenario: str, beta: float | None, gamma: float | None
 ) -> tuple[ClaimPart, ...]:
+    slip, rate = "sideslip error, with / without", "yaw rate error, with / without"
     return (
-        make_smaller_part(
-            "sideslip error, with / without", scenario, WITH, WITHOUT, beta, "rms_beta"
-        ),
-        make_smaller_part(
-            "yaw rate error, with / without", scenario, WITH, WITHOUT, gamma, "rms_gamma"
-        ),
+        make_smaller_part(slip, scenario, WITH, WITHOUT, beta, "rms_beta"),
+        make_smaller_part(rate, scenario, WITH, WITHOUT, gamma, "rms_gamma"),
     )
 
 
@@ -71,32 +67,30 @@ CLAIMS = (
     claim("Fig. 6", "the DAKF is better during the outage too",
         *(
             make_smaller_part(f"DAKF / {rival}, 4 to 6 s{text}", name, DAKF, filter_,
-                              metric="outage")
+                metric="outage")
             for name, text in ((FIG6, ""), (FASTER, " at 0.4 Hz"))
             for rival, filter_ in (("KF", KF), ("LOB", LOB))
         )),
     claim("Sec. IV.D", "slip and disturbances are observable",
         make_number_part("rank, of 5 states", RANKS, "dakf", "rank", Bound("=", 5.0),
-                         Bound("=", 4.0),
-            "rank"),
+            Bound("=", 4.0), "rank"),
         make_number_part("slip error after 120 s with 0.05 deg/s of gyro bias, DAKF", BIAS, DAKF,
-                         "last",
-            None, Bound(">=", 0.05), "drift"),
+            "last", None, Bound(">=", 0.05), "drift"),
         make_number_part("the same, three-state KF", BIAS, KF, "last", None, Bound("<=", 0.01),
-                         "drift"),
+            "drift"),
         note="A constant slip is the same to the sensors as a heading the other way with constant "
         "d1 and d2."),
     claim("Fig. 7", "with control sideslip angle and yaw rate track their references",
         *_make_tracking_parts(FIG7, 0.80, 0.50),
         make_smaller_part("peak of the slip, with / without", FIG7, WITH, WITHOUT,
-                          metric="peak_beta"),
+            metric="peak_beta"),
         make_number_part("share of time at the yaw moment's limit", FIG7, WITH, "saturated",
             metric="share"),
         make_number_part("the same, a step of 0.1 rad", LARGER, WITH, "saturated", metric="share")),
     claim("Sec. V.B", "disturbance rejection makes the car the nominal one",
         *(
             make_smaller_part(f"{text} error, with / without rejection", FIG7, WITH, FEEDBACK,
-                              metric=metric)
+                metric=metric)
             for text, metric in (("sideslip", "rms_beta"), ("yaw rate", "rms_gamma"))
         ),
         note="The feedback's integrals already take away what is constant."),
@@ -128,8 +122,8 @@ FIGURES = (
     *(
         figure(f"Fig. 7 {panel}", FIG7, draw, caption)
         for panel, draw, caption in (
-            ("(a): sideslip angle", make_curves("beta", _SLIP, ("reference", WITHOUT, WITH,
-                                                                FEEDBACK)),
+            ("(a): sideslip angle",
+                make_curves("beta", _SLIP, ("reference", WITHOUT, WITH, FEEDBACK)),
                 "A step of 0.06 rad at 1 s, wind from 4 to 8 s."),
             ("(b): yaw rate", make_curves("gamma", _RATE, ("reference", WITHOUT, WITH, FEEDBACK)),
                 "Tyres 7000 real, 10000 N/rad nominal."),

@@ -52,8 +52,8 @@ SIMULATIONS = (
     *(
         EstimationSimulation(name, _ENV,
             {"base": FIG9, "name": name, "hdop": hdop, "hdop_spread": spread, "hdop_law": law},
-            (*_FILTERS[:2], PaperFilter(WALKS + FIXED, PROPOSED, {**_PREDICTED,
-                                                                  "hdop_table": None}),
+            (*_FILTERS[:2],
+                PaperFilter(WALKS + FIXED, PROPOSED, {**_PREDICTED, "hdop_table": None}),
                 PaperFilter(PROPOSED + FIXED, PROPOSED, {"hdop_table": None})))
         for name, (hdop, spread), law, _ in _SKIES
     ),
@@ -82,8 +82,7 @@ CLAIMS = (
         ),
         *(
             make_smaller_part(f"jump at a course, double layer / three-state, {text}", name,
-                              PROPOSED, THREE,
-                metric="jump")
+                PROPOSED, THREE, metric="jump")
             for name, text in _SLALOMS
         ),
         note="The error over all milliseconds is that between courses: there are 200 to a course."),
@@ -95,9 +94,9 @@ CLAIMS = (
         note="30 % on inertia, damping and stiffness cancel except in the input gain."),
     claim("Fig. 9 (e)-(f)", "velocities better than a kinematic filter's",
         make_smaller_part("v_y, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED, 0.30,
-                          "v_y"),
+            "v_y"),
         make_smaller_part("v_x, double layer / kinematic KF", FIG9, PROPOSED, DESIGNED,
-                          metric="v_x"),
+            metric="v_x"),
         *(
             make_smaller_part(f"{state}, the same, tuned", FIG9, PROPOSED, KINEMATIC, metric=state)
             for state in ("v_y", "v_x")
@@ -123,9 +122,9 @@ CLAIMS = (
         make_smaller_part("slip, three-state / two-state", ROAD, THREE, LOB),
         make_smaller_part("roll, double layer / roll KF", ROAD, PROPOSED, ROLL, metric="phi"),
         make_smaller_part("v_y, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC,
-                          metric="v_y"),
+            metric="v_y"),
         make_smaller_part("v_x, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC,
-                          metric="v_x")),
+            metric="v_x")),
 )
 
 _SLIP, _SLIPS = "sideslip angle / rad", ("truth", LOB, THREE, PROPOSED)
@@ -135,7 +134,7 @@ FIGURES = tuple(
     for name, twin in ((FIG9, ""), (ROAD, " (twin)"))
     for panel, text, draw, caption in (
         ("a", "sideslip angle", make_curves("beta", _SLIP, _SLIPS),
-         "Tyres 7000 real, 10000 nominal."),
+            "Tyres 7000 real, 10000 nominal."),
         ("b", "sideslip angle between courses", make_curves("beta", _SLIP, _SLIPS, (9.0, 10.0)),
             "One second: five courses."),
         ("c", "yaw angle", make_curves("psi", "yaw angle / rad", ("truth", PROPOSED)),

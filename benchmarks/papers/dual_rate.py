@@ -1,4 +1,4 @@
-"""dual-rate: slip from the GPS's course alone; `dual_rate_gains` has the theory behind it."""
+"""dual-rate: the sideslip angle from the GPS's course alone; `theory` has its error dynamics."""
 
 from functools import partial
 
@@ -68,8 +68,7 @@ CLAIMS = (
         "about as good."),
     claim("Fig. 4 (c)", "the pseudo measurement is smoother",
         make_smaller_part("jump at a course, pseudo / conventional", FIG4, PSEUDO, CONVENTIONAL,
-                          0.15,
-            "jump")),
+            0.15, "jump")),
     claim("Fig. 5 (twin)", "the pseudo measurement is the most accurate on the road",
         *_make_order_parts(FIG5, None)),
 )

@@ -1,27 +1,9 @@
-"""The means to measure claims: simulations, filters, controllers, plots, the verdicts' rule.
+"""Claims of the papers: the simulations that measure them and the rule of their verdicts.
 
-A claim of a paper, and the rule that turns what was measured into a verdict.
-
-A claim has one or more parts. A part is one number a seed, what the paper states of that number
-(`stated`) and the threshold that an honest implementation meets (`threshold`, docs/PAPERS.md
-section 3); both are data. The rule:
-
-- a part *holds* where at least nine in ten seeds meet what the paper states, holds *in the median*
-  where at least the median over the seeds does, and *fails* otherwise;
-- a claim is `reproduced` if all its parts hold, `not reproduced` if all fail, `partly` otherwise;
-- a claim none of whose parts has a `stated` (the paper has no statement that could be false, or the
-  ledger only shows a number) is `report only`.
-
-A threshold is met if the median over the seeds meets it. It guards our implementation and has no
-part in the verdict.
-
-A simulation of the ledger: seeds in cases, and the numbers that they give.
-
-A simulation is data and gives the same `SimulationResult` whatever it is: filters over one drive
-(`filters`), controllers over the same manoeuvre (`controllers`), or a computation without a car
-(`Analysis`).
-
-Filters over the same uncontrolled drives, and how far off they are.
+A simulation gives one number a seed for each subject and metric. A part of a claim is such a
+number, what the paper states of it and the threshold that an honest implementation meets
+(docs/PAPERS.md section 3). The median over the seeds has to meet the threshold, which has no part
+in the verdict.
 """
 
 import math
@@ -47,32 +29,25 @@ from ..harness.study import SETTLED, call_quietly, make_filter_arguments
 
 @dataclass
 class Example:
-    """Signals of the first seed, for figures.
+    """Signals of the first seed, for figures."""
 
-    time: (K,) s. curves: by who ("truth", a filter, a controller, "reference") and signal, (K,).
-    packets: by slow sensor, (count, PACKET_WIDTH).
-    """
-
-    time: Array
-    curves: dict[str, dict[str, Array]]
-    packets: dict[str, Array] = field(default_factory=dict)
+    time: Array  # s, (K,)
+    curves: dict[str, dict[str, Array]]  # (K,) by subject (truth, reference, ...) and signal
+    packets: dict[str, Array] = field(default_factory=dict)  # (count, PACKET_WIDTH) by slow sensor
 
 
 @dataclass
 class SimulationResult:
-    """The result of a simulation or an analysis.
+    """The result of a simulation or an analysis."""
 
-    numbers: (seeds,) by who and metric. example: None but for the chunk with the first seed.
-    """
-
-    numbers: dict[tuple[str, str], Array]
-    example: Example | None = None
+    numbers: dict[tuple[str, str], Array]  # (seeds,) by subject and metric
+    example: Example | None = None  # of the chunk with the first seed
 
 
 Results = Mapping[str, SimulationResult]
 """Results by the name of the simulation or analysis."""
 
-MIN_AGREEMENT = 0.9  # of the seeds
+_MIN_AGREEMENT = 0.9  # of the seeds
 
 _RELATIONS: dict[str, Callable[[Array, float], npt.NDArray[np.bool_]]] = {
     "<": np.less,
@@ -85,10 +60,7 @@ _RELATIONS: dict[str, Callable[[Array, float], npt.NDArray[np.bool_]]] = {
 
 @dataclass(frozen=True)
 class Bound:
-    """A relation and a number, such as "<= 0.75".
-
-    Raises ValueError for an unknown relation or a number that is not finite.
-    """
+    """A relation and a number, such as "<= 0.75"; ValueError for an unknown or infinite one."""
 
     relation: str
     value: float
@@ -101,7 +73,7 @@ class Bound:
             )
 
     def is_met(self, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Which of the values meet it; NaN never does."""
+        """Tell which of the values meet it; NaN never does."""
         return np.asarray(_RELATIONS[self.relation](np.asarray(values, float), self.value))
 
     def __str__(self) -> str:
@@ -110,32 +82,25 @@ class Bound:
 
 @dataclass(frozen=True)
 class ClaimPart:
-    """One measured number of a claim.
+    """One measured number of a claim."""
 
-    label: who against whom. of: from the results to one number a seed. scenario: the name of the
-    simulation or analysis it comes from. metric: of `METRICS`.
-    """
-
-    label: str
-    scenario: str
-    compute: Callable[[Results], Array]
-    stated: Bound | None = None
-    threshold: Bound | None = None
-    metric: str = "ratio"
+    label: str  # what is compared with what
+    scenario: str  # name of the simulation or analysis
+    compute: Callable[[Results], Array]  # one number a seed, (seeds,)
+    stated: Bound | None = None  # by the paper
+    threshold: Bound | None = None  # of an honest implementation
+    metric: str = "ratio"  # of `METRICS`
 
 
 @dataclass(frozen=True)
 class Claim:
-    """paper: its short name. source: equation, figure or section. text: it in a line.
+    """A claim of a paper; ValueError without parts."""
 
-    note: what was found out about it, for the report. Raises ValueError for a claim without parts.
-    """
-
-    paper: str
-    source: str
+    paper: str  # its short name
+    source: str  # equation, figure or section
     text: str
     parts: tuple[ClaimPart, ...]
-    note: str = ""
+    note: str = ""  # on what was found, for the report
 
     def __post_init__(self) -> None:
         if not self.parts:
@@ -143,7 +108,7 @@ class Claim:
 
 
 def make_claim_factory(paper: str) -> Callable[..., Claim]:
-    """A maker of a paper's claims, from source, text, their parts and a note."""
+    """Make a function that makes a paper's claims from source, text, parts and a note."""
 
     def make_claim(source: str, text: str, *parts: ClaimPart, note: str = "") -> Claim:
         return Claim(paper, source, text, parts, note)
@@ -153,29 +118,29 @@ def make_claim_factory(paper: str) -> Callable[..., Claim]:
 
 @dataclass(frozen=True)
 class MeasuredPart:
-    """A part with its numbers, (seeds,)."""
+    """A part with its numbers, shape (seeds,)."""
 
     part: ClaimPart
     values: Array
 
     @property
     def median(self) -> float:
-        """Over the seeds."""
+        """The median over the seeds."""
         return float(np.median(self.values))
 
     @property
     def low(self) -> float:
-        """The least of the seeds."""
+        """The smallest number of the seeds."""
         return float(np.min(self.values))
 
     @property
     def high(self) -> float:
-        """The most of the seeds."""
+        """The largest number of the seeds."""
         return float(np.max(self.values))
 
     @property
     def agreement(self) -> float:
-        """The share of seeds that meet what the paper states; NaN where that is nothing."""
+        """The fraction of seeds that meet what the paper states; NaN where it states nothing."""
         stated = self.part.stated
         return math.nan if stated is None else float(np.mean(stated.is_met(self.values)))
 
@@ -192,7 +157,7 @@ class MeasuredPart:
 
 
 def measure_parts(claim: Claim, results: Results) -> tuple[MeasuredPart, ...]:
-    """Every part of a claim, measured. Raises ValueError for a part without numbers."""
+    """Measure every part of a claim; ValueError for a part without numbers."""
     parts = []
     for part in claim.parts:
         values = np.atleast_1d(np.asarray(part.compute(results), np.float64))
@@ -203,11 +168,15 @@ def measure_parts(claim: Claim, results: Results) -> tuple[MeasuredPart, ...]:
 
 
 def evaluate_claim(parts: Sequence[MeasuredPart]) -> str:
-    """The verdict on a claim: the rule of this module."""
+    """Evaluate a claim by the parts of which the paper states something.
+
+    "reproduced": all are as stated in at least nine of ten seeds; "not reproduced": none is, even
+    in the median over the seeds; "partly": anything between; "report only": no such part.
+    """
     stated_parts = [result for result in parts if result.part.stated is not None]
     if not stated_parts:
         return "report only"
-    if all(result.agreement >= MIN_AGREEMENT for result in stated_parts):
+    if all(result.agreement >= _MIN_AGREEMENT for result in stated_parts):
         return "reproduced"
     if any(result.holds_in_median for result in stated_parts):
         return "partly"
@@ -215,7 +184,7 @@ def evaluate_claim(parts: Sequence[MeasuredPart]) -> str:
 
 
 def select_number(scenario: str, subject: str, metric: str) -> Callable[[Results], Array]:
-    """A measured number as it stands."""
+    """Select a measured number as it stands."""
     return lambda results: results[scenario].numbers[subject, metric]
 
 
@@ -228,29 +197,27 @@ def make_number_part(
     threshold: Bound | None = None,
     metric: str = "ratio",
 ) -> ClaimPart:
-    """A measured number as a part of a claim."""
-    return ClaimPart(
-        label, scenario, select_number(scenario, subject, quantity), stated, threshold, metric
-    )
+    """Make a part of a claim of a measured number: a quantity of a subject in a scenario."""
+    number = select_number(scenario, subject, quantity)
+    return ClaimPart(label, scenario, number, stated, threshold, metric)
 
 
 def select_ratio(
     scenario: str, one: str, other: str, metric: str = "beta"
 ) -> Callable[[Results], Array]:
-    """One's number over the other's, seed by seed."""
+    """Select one's number over the other's, seed by seed."""
     return compare_others(scenario, one, (other,), np.min, metric)
 
 
 def compare_others(
     scenario: str, one: str, others: Sequence[str], pick: Callable[..., Array], metric: str = "beta"
 ) -> Callable[[Results], Array]:
-    """One's number over the best (pick: np.min) or the poorest (np.max) of the others'."""
+    """Select one's number over the best (pick: np.min) or the poorest (np.max) of others'."""
 
     def compute_ratio(results: Results) -> Array:
         numbers = results[scenario].numbers
-        return np.asarray(
-            numbers[one, metric] / pick([numbers[other, metric] for other in others], axis=0)
-        )
+        rival = pick([numbers[other, metric] for other in others], axis=0)
+        return np.asarray(numbers[one, metric] / rival)
 
     return compute_ratio
 
@@ -263,22 +230,21 @@ def make_smaller_part(
     max_ratio: float | None = None,
     metric: str = "beta",
 ) -> ClaimPart:
-    """The paper has one's number smaller than the other's; most: the ratio's threshold."""
+    """Make a part that states one's number smaller than the other's; max_ratio: threshold."""
     threshold = None if max_ratio is None else Bound("<=", max_ratio)
-    return ClaimPart(
-        label, scenario, select_ratio(scenario, one, other, metric), Bound("<", 1.0), threshold
-    )
+    ratio = select_ratio(scenario, one, other, metric)
+    return ClaimPart(label, scenario, ratio, Bound("<", 1.0), threshold)
 
 
 FIRST = 0  # the seed of the figures
-CHUNK = 5  # seeds of a case that is over in seconds
+_CHUNK = 5  # seeds of a case that is over in seconds
 
 Numbers = dict[tuple[str, str], float]
 """One seed's numbers, by who and metric."""
 
 
 class Simulation(Protocol):
-    """name: unique. chunks: the seeds of each case, of so many. measure: on a case's seeds."""
+    """A simulation with a unique name: the seeds of its cases, and numbers on those of a case."""
 
     @property
     def name(self) -> str: ...  # noqa: D102
@@ -290,42 +256,36 @@ class Simulation(Protocol):
 
 @dataclass(frozen=True)
 class Analysis:
-    """A computation without noise of sensors. function: importable, from seeds to
-    `SimulationResult`.
-
-    random: whether the seeds mean anything to it; else it is called once.
-    """
+    """A computation without noise of sensors."""
 
     name: str
-    function: Callable[[tuple[int, ...]], SimulationResult]
-    random: bool = True
+    function: Callable[[tuple[int, ...]], SimulationResult]  # of seeds, importable
+    random: bool = True  # whether the seeds mean anything to it; else it is called once
 
     def chunks(self, seeds: int) -> list[tuple[int, ...]]:
-        """The seeds of each case."""
-        return split_seeds(seeds if self.random else 1, CHUNK)
+        """Split the seeds into cases."""
+        return split_seeds(seeds if self.random else 1, _CHUNK)
 
     def measure(self, seeds: tuple[int, ...]) -> SimulationResult:
-        """The function's result."""
+        """Call the function."""
         return self.function(seeds)
 
 
 def rms(values: npt.ArrayLike) -> float:
-    """The root of the mean square."""
+    """Compute the root of the mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def collect_numbers(lines: list[Numbers]) -> dict[tuple[str, str], Array]:
-    """(seeds,) of each number, from the numbers of each seed."""
+    """Collect each number over the seeds, (seeds,), from the numbers of each seed."""
     return {name: np.array([line[name] for line in lines]) for name in lines[0]}
 
 
 def join_results(chunks: list[SimulationResult]) -> SimulationResult:
-    """The chunks of one simulation as one."""
+    """Join the chunks of one simulation."""
     names = chunks[0].numbers
     numbers = {name: np.concatenate([chunk.numbers[name] for chunk in chunks]) for name in names}
-    return SimulationResult(
-        numbers, next((c.example for c in chunks if c.example is not None), None)
-    )
+    return SimulationResult(numbers, next((c.example for c in chunks if c.example), None))
 
 
 _TUNED = {
@@ -335,24 +295,22 @@ _TUNED = {
 
 
 def get_paper_tuning(name: str) -> Mapping[str, float]:
-    """Options of `make_estimator` by which a filter is tuned for its paper's own simulation; none
-    for one whose default tuning is that."""
+    """Get the options by which a filter is tuned for its paper's simulation; {}: the default."""
     return _TUNED.get(name, {})
 
 
 @dataclass(frozen=True)
 class PaperFilter:
-    """label: its name in tables. name, options: of `make_estimator`. vehicle: the "nominal" one or
-    the "true" one, for which it is built."""
+    """A filter of a simulation."""
 
-    label: str
-    name: str
-    options: Mapping[str, Any] = field(default_factory=dict)
-    vehicle: str = "nominal"
+    label: str  # its name in tables
+    name: str  # of `make_estimator`
+    options: Mapping[str, Any] = field(default_factory=dict)  # of `make_estimator`
+    vehicle: str = "nominal"  # or "true", for which it is built
 
 
 def make_filters(filters: Sequence[PaperFilter], base: Any) -> dict[str, Estimator]:
-    """The filters by label, tuned for their papers and built for the running episode of an env."""
+    """Make filters by label, tuned for their papers, for the running episode of a base env."""
     cars, facts = {"nominal": base.nominal, "true": base.vehicle}, make_filter_arguments(base)
     by_label = {}
     for spec in filters:
@@ -369,10 +327,6 @@ class EstimationSimulation:
     Numbers of each filter: the RMSE of every state whose truth is known, from `SETTLED` on;
     "outage", that of beta while the GPS is out; "jump", the RMS change of beta in the milliseconds
     in which a packet arrives; "last", the mean of beta's error over the last second, its size.
-    bound: whether to add "bound", the RMS of the optimal standard deviation of beta. times: that
-    many times the seeds, where a ratio is close to its threshold. control_period: ticks between
-    rows of the truth; in between it is interpolated.
-
     Raises ValueError for the bound of a car whose tyres change on the way.
     """
 
@@ -380,23 +334,22 @@ class EstimationSimulation:
     env_id: str
     scenario: str | Mapping[str, Any]
     filters: tuple[PaperFilter, ...]
-    bound: bool = False
-    times: int = 1
-    control_period: int = 10
+    bound: bool = False  # whether to add "bound", the RMS of the optimal standard deviation of beta
+    times: int = 1  # that many times the seeds, where a ratio is close to its threshold
+    control_period: int = 10  # ticks between rows of the truth, interpolated in between
 
     def __post_init__(self) -> None:
         if self.bound and make_scenario(self.scenario).tyre_change_time is not None:
             raise ValueError(f"{self.name}: no bound is known where the tyres change on the way")
 
     def chunks(self, seeds: int) -> list[tuple[int, ...]]:
-        """The seeds of each case."""
-        return split_seeds(self.times * seeds, CHUNK)
+        """Split the seeds into cases."""
+        return split_seeds(self.times * seeds, _CHUNK)
 
     def measure(self, seeds: tuple[int, ...]) -> SimulationResult:
         """Drive each seed once and run every filter over its record."""
-        env: gym.Env[Any, Any] = gym.make(
-            self.env_id, scenario=self.scenario, control_period=self.control_period
-        )
+        options: dict[str, Any] = {"scenario": self.scenario, "control_period": self.control_period}
+        env: gym.Env[Any, Any] = gym.make(self.env_id, **options)
         base: Any = env.unwrapped
         estimators: dict[str, Estimator] = {}
         lines, example = [], None
@@ -413,10 +366,8 @@ class EstimationSimulation:
                 curves[label] = {name: estimates[name] for name in estimates.names}
                 numbers |= _compute_errors(label, curves[label], truth, drive.log, base.scenario)
             if self.bound:
-                std = compute_error_bound(
-                    record=drive.log.record,
-                    **make_filter_arguments(base) | {"vehicle": base.vehicle},
-                )
+                facts = make_filter_arguments(base) | {"vehicle": base.vehicle}
+                std = compute_error_bound(record=drive.log.record, **facts)
                 numbers["bound", "beta"] = _compute_settled_rms(std, drive.log)
             lines.append(numbers)
             if seed == FIRST:

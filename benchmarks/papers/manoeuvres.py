@@ -1,8 +1,7 @@
-"""dakf-stability Fig. 7: do steering and yaw moment make the car follow its reference model?
+"""Controllers over the papers' manoeuvres, and the papers' figures from an example's signals.
 
-Controllers over the same manoeuvre, and what they leave of the slip.
-
-The papers' figures from an example's signals: axes and curves as the papers have them.
+tie-vision's controllers are measured by the sideslip angle that they leave, dakf-stability's by how
+well the car follows its reference model.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -28,49 +27,51 @@ from .ledger import (
     rms,
 )
 
-Manoeuvre = str | Mapping[str, Any] | Scenario
+_Manoeuvre = str | Mapping[str, Any] | Scenario
 
-ENV_ID = "sideslip/AfsYawFusion-v0"
-STATES = ("beta", "gamma", "d1", "d2")
+_ENV_ID = "sideslip/AfsYawFusion-v0"
+_STATES = ("beta", "gamma", "d1", "d2")
 
 
 @dataclass(frozen=True)
 class Tracking:
-    """The errors of an episode from its reference.
+    """The errors of an episode from its reference, over all ticks."""
 
-    rms_beta (rad), rms_gamma (rad/s): of the error, over all ticks. peak_beta (rad): of the slip
-    itself. saturated: share of the ticks that ask for the whole yaw moment. steered: the largest
-    share of the steering's authority that was asked for.
-    """
-
-    rms_beta: float
-    rms_gamma: float
-    peak_beta: float
-    saturated: float
-    steered: float
+    rms_beta: float  # rad, of the error
+    rms_gamma: float  # rad/s, of the error
+    peak_beta: float  # rad, of the sideslip angle itself
+    saturated: float  # fraction of the ticks that command the whole yaw moment
+    steered: float  # largest fraction of the steering's authority that was commanded
     failed: bool
 
 
 def run_episode(
     seed: int,
-    scenario: Manoeuvre = "dakf-fig7",
+    scenario: _Manoeuvre = "dakf-fig7",
     agent: str = "model-following",
     estimator: str = "dakf",
     **options: Any,
 ) -> Rollout:
-    """An episode at 1 ms with GPS, gyro and camera on board; the estimator uses the GPS.
+    """Run an episode at 1 ms with GPS, gyro and camera on board; the estimator uses the GPS.
 
-    agent: "none" is the steer-by-wire car without control. options: of the agent (`bandwidth`,
-    `rejection`).
+    Args:
+        seed: Seed of the episode.
+        scenario: Scenario as `make_scenario` reads it.
+        agent: Controller; "none" is the steer-by-wire car without control.
+        estimator: Name of the estimator, tuned for its paper.
+        **options: Options of the controller (`bandwidth`, `rejection`).
+
+    Returns:
+        The episode.
     """
     tuned = dict(get_paper_tuning(estimator))
-    estimate = {"outputs": STATES, "options": {"slow": "gps"} | tuned}
-    env = make_env(ENV_ID, estimator, estimate, scenario=scenario, control_period=1)
+    estimate = {"outputs": _STATES, "options": {"slow": "gps"} | tuned}
+    env = make_env(_ENV_ID, estimator, estimate, scenario=scenario, control_period=1)
     return rollout(env, make_agent(agent, env, **options), seed)
 
 
 def measure_tracking(episode: Rollout) -> Tracking:
-    """The numbers of an episode of `run_episode`."""
+    """Measure how an episode of `run_episode` tracks its reference."""
     moment, steering = np.abs(episode["action_0"]), np.abs(episode["action_1"])
     return Tracking(
         rms_beta=rms(episode["beta"] - episode["beta_ref"]),
@@ -83,35 +84,32 @@ def measure_tracking(episode: Rollout) -> Tracking:
 
 
 SIGNALS = ("beta", "gamma", "steer", "yaw_moment")
-CONTESTANTS: dict[str, tuple[str, str, dict[str, Any]]] = {
+_CONTESTANTS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "none": ("none", "", {}),
     "feedforward": ("feedforward", "", {}),
     "single-rate": ("two-dof", "single-rate-kf", {"rate": "camera"}),
     "multirate": ("two-dof", "multirate-kf", {"rate": "control"}),
     "multirate-residual": ("two-dof", "multirate-residual-kf", {"rate": "control"}),
 }
-"""tie-vision Fig. 8: agent, the estimator it reads ("" for none) and its options, by label."""
+"""tie-vision Fig. 8, by label: agent, the estimator it reads ("" for none) and its options."""
 _NOISE = {"camera_psi": "psi_noise", "camera_y": "y_l_noise"}
 
 
 @dataclass(frozen=True)
 class SlipSimulation:
-    """tie-vision's controllers on the same seeds of a lane change, each with a filter that knows
-    the camera's noise.
+    """tie-vision's controllers on a lane change, each with a filter that knows the camera's noise.
 
-    contestants: of `CONTESTANTS`, or with a remark behind a comma. options: more options of the
-    agent, by contestant.
-    Numbers of each: RMS and peak of the slip, the largest change of the yaw moment in a
-    millisecond, the sum of all its changes and the share of time at its limit.
+    Numbers of each: RMS and peak of the slip, the largest change of the yaw moment in 1 ms, the sum
+    of all its changes and the fraction of time at its limit.
     """
 
     name: str
     scenario: str
-    contestants: tuple[str, ...]
-    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    contestants: tuple[str, ...]  # of `_CONTESTANTS`, or with a remark behind a comma
+    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # more ones of the agent
 
     def chunks(self, seeds: int) -> list[tuple[int, ...]]:
-        """The seeds of each case."""
+        """Split the seeds into cases."""
         return split_seeds(seeds, 2)
 
     def measure(self, seeds: tuple[int, ...]) -> SimulationResult:
@@ -119,7 +117,7 @@ class SlipSimulation:
         return _measure_agents(seeds, self.contestants, self._run_episode)
 
     def _run_episode(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
-        agent, estimator, options = CONTESTANTS[label.partition(",")[0]]
+        agent, estimator, options = _CONTESTANTS[label.partition(",")[0]]
         noise = make_scenario(self.scenario).noise
         known = {option: noise[name] for name, option in _NOISE.items() if name in noise}
         how: dict[str, Any] = {"scenario": self.scenario, "control_period": 1}
@@ -127,20 +125,15 @@ class SlipSimulation:
         more = self.options.get(label, {})
         drive = rollout(env, make_agent(agent, env, **{**options, **more}), seed)
         base: Any = env.unwrapped
-        return drive, _compute_effort(
-            drive["beta"], drive["yaw_moment"], base.vehicle.yaw_moment_limit
-        )
-
-
-def _compute_effort(slip: Array, moment: Array, limit: float) -> dict[str, float]:
-    change = np.abs(np.diff(moment))
-    return {
-        "rms_slip": rms(slip),
-        "peak_slip": float(np.max(np.abs(slip))),
-        "largest_step": float(np.max(change)),
-        "total_variation": float(np.sum(change)),
-        "saturation": float(np.mean(np.abs(moment) >= 0.999 * limit)),
-    }
+        slip, moment, limit = drive["beta"], drive["yaw_moment"], base.vehicle.yaw_moment_limit
+        change = np.abs(np.diff(moment))
+        return drive, {
+            "rms_slip": rms(slip),
+            "peak_slip": float(np.max(np.abs(slip))),
+            "largest_step": float(np.max(change)),
+            "total_variation": float(np.sum(change)),
+            "saturation": float(np.mean(np.abs(moment) >= 0.999 * limit)),
+        }
 
 
 def _measure_agents(
@@ -148,7 +141,7 @@ def _measure_agents(
     labels: Iterable[str],
     drive: Callable[[str, int], tuple[Rollout, dict[str, float]]],
 ) -> SimulationResult:
-    """The numbers of every contestant on each seed, and the signals of the first seed."""
+    """Measure every contestant on each seed, with the signals of the first seed."""
     lines, example = [], None
     for seed in seeds:
         numbers: Numbers = {}
@@ -168,19 +161,15 @@ def _measure_agents(
 
 @dataclass(frozen=True)
 class FollowingSimulation:
-    """dakf-stability's controller by wire, with and without parts of it.
-
-    agents: options of `tracking.drive` by label. share: of the seeds that are driven. Numbers of
-    each: those of `tracking.Tracking`.
-    """
+    """dakf-stability's controller by wire, with and without parts of it; numbers of `Tracking`."""
 
     name: str
     scenario: str | Mapping[str, Any]
-    agents: Mapping[str, Mapping[str, Any]]
-    share: float = 1.0
+    agents: Mapping[str, Mapping[str, Any]]  # options of `run_episode` by label
+    share: float = 1.0  # of the seeds that are driven
 
     def chunks(self, seeds: int) -> list[tuple[int, ...]]:
-        """The seeds of each case."""
+        """Split the seeds into cases."""
         return split_seeds(max(1, round(self.share * seeds)), 2)
 
     def measure(self, seeds: tuple[int, ...]) -> SimulationResult:
@@ -193,18 +182,18 @@ class FollowingSimulation:
         return drive, {name: float(value) for name, value in values.items()}
 
 
-Draw = Callable[[Example], Any]
+_Draw = Callable[[Example], Any]
 
 
 @dataclass(frozen=True)
 class PaperFigure:
-    """One figure of a paper, redrawn. scenario: of the simulation. caption: what to see."""
+    """One figure of a paper, redrawn."""
 
     paper: str
     title: str
-    scenario: str
-    draw: Draw
-    caption: str
+    scenario: str  # name of the simulation
+    draw: _Draw
+    caption: str  # what to see
 
 
 def _draw_lines(
@@ -214,7 +203,7 @@ def _draw_lines(
     window: tuple[float, float] | None = None,
     **more: Any,
 ) -> Any:
-    """Lines over time, in a window (s) of it; more: of `draw_time_series`."""
+    """_Draw lines over time, in a window (s) of it; more: of `draw_time_series`."""
     from ..report.figures import draw_time_series
 
     t = example.time
@@ -229,8 +218,8 @@ def make_curves(
     labels: Sequence[str] = (),
     window: tuple[float, float] | None = None,
     x_label: str = "time / s",
-) -> Draw:
-    """A signal of everybody (or of those named) over time. window: s, of the time axis."""
+) -> _Draw:
+    """Make a figure of a signal over time, of all subjects or the labels, in a window (s)."""
 
     def draw(example: Example) -> Any:
         signals = {name: example.curves.get(name, {}) for name in labels or example.curves}
@@ -240,8 +229,8 @@ def make_curves(
     return draw
 
 
-def make_loops(y_label: str) -> Draw:
-    """Open loops over frequency in Hz, on a logarithmic axis."""
+def make_loops(y_label: str) -> _Draw:
+    """Make a figure of open loops over frequency in Hz, on a logarithmic axis."""
 
     def draw(example: Example) -> Any:
         series = {name: signals["magnitude"] for name, signals in example.curves.items()}
@@ -253,21 +242,20 @@ def make_loops(y_label: str) -> Draw:
     return draw
 
 
-def make_course(y_label: str, labels: Sequence[str]) -> Draw:
-    """The course psi + beta: the truth, the receiver's samples and each filter's."""
+def make_course(y_label: str, labels: Sequence[str]) -> _Draw:
+    """Make a figure of the course psi + beta: truth, the receiver's samples, each filter's."""
 
     def draw(example: Example) -> Any:
-        series = {
-            name: example.curves[name]["psi"] + example.curves[name]["beta"] for name in labels
-        }
-        series["measured"] = extract_samples(example, "gps", 0, "arrived")
+        curves = {name: example.curves[name] for name in labels}
+        series = {name: curve["psi"] + curve["beta"] for name, curve in curves.items()}
+        series["measured"] = _extract_samples(example, "gps", 0, "arrived")
         return _draw_lines(example, series, y_label, dots=("measured",))
 
     return draw
 
 
-def extract_samples(example: Example, sensor: str, row: int, at: str) -> Array:
-    """A slow sensor's values at the ticks they were `captured` or `arrived`, NaN elsewhere."""
+def _extract_samples(example: Example, sensor: str, row: int, at: str) -> Array:
+    """Extract a slow sensor's values at the ticks `captured` or `arrived`, NaN elsewhere."""
     values = np.full(len(example.time), np.nan)
     ticks = example.packets[sensor][:, getattr(PACKET, at)].astype(int)
     in_range = ticks < len(values)
@@ -275,8 +263,8 @@ def extract_samples(example: Example, sensor: str, row: int, at: str) -> Array:
     return values
 
 
-def repeat_samples(values: Array) -> Array:
-    """Samples held until the next one, as a controller without an estimator sees them."""
+def _repeat_samples(values: Array) -> Array:
+    """Hold samples until the next one, as a controller without an estimator reads them."""
     known = np.flatnonzero(~np.isnan(values))
     last = np.searchsorted(known, np.arange(len(values)), side="right") - 1
     out = np.full(len(values), np.nan)
@@ -284,21 +272,23 @@ def repeat_samples(values: Array) -> Array:
     return out
 
 
-def make_offset(y_label: str, labels: Sequence[str], window: tuple[float, float]) -> Draw:
-    """The lateral offset: truth, the camera's held late samples, and each filter's."""
+def make_offset(y_label: str, labels: Sequence[str], window: tuple[float, float]) -> _Draw:
+    """Make a figure of the lateral offset: truth, the camera's held late samples, each filter's."""
 
     def draw(example: Example) -> Any:
         series = {name: example.curves[name]["y_l"] for name in labels}
-        series["measured, held"] = repeat_samples(extract_samples(example, "camera", 1, "arrived"))
+        series["measured, held"] = _repeat_samples(
+            _extract_samples(example, "camera", 1, "arrived")
+        )
         return _draw_lines(example, series, y_label, window)
 
     return draw
 
 
 def draw_delays(example: Example) -> Any:
-    """The delay of the newest frame over the time of its capture, for the first second."""
+    """_Draw the delay of the newest frame over the time of its capture, for the first second."""
     packets = example.packets["camera"]
     late = np.full(len(example.time), np.nan)
     ticks = packets[:, PACKET.captured].astype(int)
     late[ticks] = packets[:, PACKET.arrived] - packets[:, PACKET.captured]
-    return _draw_lines(example, {"camera": repeat_samples(late)}, "delay / ms", (0.0, 1.0))
+    return _draw_lines(example, {"camera": _repeat_samples(late)}, "delay / ms", (0.0, 1.0))

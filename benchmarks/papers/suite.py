@@ -1,7 +1,6 @@
-"""The papers' claims: one or two modules a paper, with its simulations, claims and figures.
+"""Which claims of the five papers hold? Each claim, what was measured and its verdict; the figures.
 
-Question: which claims of the five papers hold? Every claim, what was measured, its verdict, and
-the papers' figures redrawn.
+Each paper has one to three modules with its simulations, claims and figures, which are data.
 """
 
 from collections import Counter
@@ -30,15 +29,9 @@ from .ledger import (
 from .manoeuvres import PaperFigure
 
 _MODULES = (
-    tie_vision,
-    tie_vision_control,
-    tie_vision_convergence,
-    uneven_delay,
-    double_layer,
-    dual_rate,
-    theory,
-    dakf_stability,
-)
+    tie_vision, tie_vision_control, tie_vision_convergence, uneven_delay, double_layer, dual_rate,
+    theory, dakf_stability,
+)  # fmt: skip
 
 SIMULATIONS: dict[str, Simulation] = {
     simulation.name: simulation for module in _MODULES for simulation in module.SIMULATIONS
@@ -67,65 +60,61 @@ Ledger = list[tuple[Claim, tuple[MeasuredPart, ...]]]
 
 
 def measure(case: Case) -> SimulationResult:
-    """One simulation on a few of its seeds."""
+    """Measure one simulation on a few of its seeds."""
     name, seeds = case
     return SIMULATIONS[name].measure(seeds)
 
 
 def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = None) -> Suite:
-    """Every simulation once, then every claim on what it gave."""
-    results = simulate(seeds, jobs, console)
+    """Run every simulation once, then evaluate every claim.
+
+    Args:
+        seeds: Number of seeds.
+        jobs: Number of processes; None: one a core.
+        console: Console for the progress.
+
+    Returns:
+        The suite.
+    """
+    results = _simulate(seeds, jobs, console)
     ledger = [(claim, measure_parts(claim, results)) for claim in CLAIMS]
     suite = Suite(NAME, "Which claims of the papers hold", _TEXT)
     suite.verdict = compose_verdict(ledger)
     suite.tables = [_make_verdict_table(ledger), _make_note_table(ledger)]
-    suite.tables += [
-        _make_number_table(ledger, paper) for paper in dict.fromkeys(c.paper for c in CLAIMS)
-    ]
-    suite.rows = [
-        _make_row(claim, result, evaluate_claim(parts))
-        for claim, parts in ledger
-        for result in parts
-    ]
+    for paper in dict.fromkeys(claim.paper for claim in CLAIMS):
+        suite.tables.append(_make_number_table(ledger, paper))
+    for claim, parts in ledger:
+        suite.rows += [_make_row(claim, result, evaluate_claim(parts)) for result in parts]
     _draw_figures(suite, results)
     return suite
 
 
 def compose_verdict(ledger: Ledger) -> str:
-    """The verdict: how many claims hold, which do not."""
+    """Compose the verdict: how many claims hold, which do not."""
     verdicts = [(claim, evaluate_claim(parts)) for claim, parts in ledger]
     counted = Counter(item for _, item in verdicts)
     papers = dict.fromkeys(claim.paper for claim, _ in verdicts)
-    whole = {
-        paper: [item for claim, item in verdicts if claim.paper == paper and item != VERDICTS[-1]]
-        for paper in papers
-    }
-    held = [
-        f"{p} {paper_verdicts.count(VERDICTS[1])} of {len(paper_verdicts)}"
-        for p, paper_verdicts in whole.items()
-        if paper_verdicts
-    ]
+    held = []
+    for paper in papers:
+        items = [x for claim, x in verdicts if claim.paper == paper and x != VERDICTS[-1]]
+        if items:
+            held.append(f"{paper} {items.count(VERDICTS[1])} of {len(items)}")
     failed = [_format_source(claim) for claim, item in verdicts if item == "not reproduced"]
     missed = sum(item.meets_threshold is False for _, parts in ledger for item in parts)
     counts = ", ".join(f"{counted[name]} {name}" for name in VERDICTS if counted[name])
+    reasons = f"Not reproduced: {summarise_names(failed, 3)}. Reasons stand in the table Why."
     return format_verdict(
         f"{len(ledger)} claims of {len(papers)} papers: {counts}.",
         f"Reproduced: {'; '.join(held)}.",
-        f"Not reproduced: {summarise_names(failed, 3)}. Reasons stand in the table Why."
-        if failed
-        else "",
+        reasons if failed else "",
         f"{missed} of our own thresholds are missed." if missed else "All our thresholds are met.",
         "Not covered: the papers' own noise and tuning, which none of them prints.",
     )
 
 
-def simulate(seeds: int, jobs: int | None = None, console: Console | None = None) -> Results:
-    """The results of every simulation and analysis, by name."""
-    cases = [
-        (name, chunk)
-        for name, simulation in SIMULATIONS.items()
-        for chunk in simulation.chunks(seeds)
-    ]
+def _simulate(seeds: int, jobs: int | None = None, console: Console | None = None) -> Results:
+    """Run every simulation and analysis; return the results by name."""
+    cases = [(name, chunk) for name, x in SIMULATIONS.items() for chunk in x.chunks(seeds)]
     parts: dict[str, list[SimulationResult]] = {name: [] for name in SIMULATIONS}
     done = run_cases(measure, cases, NAME, jobs, console)
     for (name, _), measured in zip(cases, done, strict=True):
@@ -134,44 +123,35 @@ def simulate(seeds: int, jobs: int | None = None, console: Console | None = None
 
 
 def _make_verdict_table(ledger: Ledger) -> ResultTable:
-    """One line a claim."""
+    """Make the table of verdicts, one line a claim."""
     cells = [
         [_format_source(claim), claim.text, evaluate_claim(parts), _format_checks(parts)]
         for claim, parts in ledger
     ]
-    return ResultTable(
-        "The claims and what became of them",
-        ("paper", "claim", "verdict", "thresholds"),
-        cells,
-        keyed=False,
-    )
+    header = ("paper", "claim", "verdict", "thresholds")
+    return ResultTable("The claims and what became of them", header, cells, keyed=False)
 
 
 def _make_number_table(ledger: Ledger, paper: str) -> ResultTable:
-    """One line a part of a paper's claims."""
-    cells = [
-        [
-            f"{claim.source}: {result.part.label}",
-            _format_range(result),
-            _format_stated(result),
-            _format_check(result),
-        ]
-        for claim, parts in ledger
-        for result in parts
-        if claim.paper == paper
-    ]
-    return ResultTable(
-        f"{paper}: what was measured",
-        ("number", "median [range]", "paper states", "threshold"),
-        cells,
+    """Make the table of numbers, one line a part of a paper's claims."""
+    cells = []
+    for source, result in ((c.source, r) for c, parts in ledger if c.paper == paper for r in parts):
+        label, part = f"{source}: {result.part.label}", result.part
+        share = f" ({100.0 * result.agreement:.0f} %)"
+        stated = "" if part.stated is None else f"{part.stated}{share}"
+        met = "met" if result.meets_threshold else "MISSED"
+        check = "" if part.threshold is None else f"{part.threshold} {met}"
+        cells.append([label, _format_range(result), stated, check])
+    header = ("number", "median [range]", "paper states", "threshold")
+    note = (
         "The range is over seeds, tunings or speeds; behind what the paper states stands the share "
-        "of them in which it is so.",
-        keyed=False,
+        "of them in which it is so."
     )
+    return ResultTable(f"{paper}: what was measured", header, cells, note, keyed=False)
 
 
 def _make_note_table(ledger: Ledger) -> ResultTable:
-    """Remarks on some claims."""
+    """Make the table of remarks on claims."""
     cells = [[_format_source(claim), claim.note] for claim, _ in ledger if claim.note]
     return ResultTable("Why", ("paper", "what was found"), cells, keyed=False)
 
@@ -188,26 +168,12 @@ def _format_range(result: MeasuredPart) -> str:
 
 
 def _format_number(value: float) -> str:
-    """Three digits; of rounding errors the order of magnitude is enough."""
+    """Format three digits; of rounding errors the order of magnitude is enough."""
     return f"{value:.0e}" if 0.0 < abs(value) < 1e-6 else f"{value:.3g}"
 
 
-def _format_stated(result: MeasuredPart) -> str:
-    stated = result.part.stated
-    return "" if stated is None else f"{stated} ({100.0 * result.agreement:.0f} %)"
-
-
-def _format_check(result: MeasuredPart) -> str:
-    met = {True: "met", False: "MISSED"}
-    return (
-        ""
-        if result.meets_threshold is None
-        else f"{result.part.threshold} {met[result.meets_threshold]}"
-    )
-
-
 def _format_checks(parts: tuple[MeasuredPart, ...]) -> str:
-    """Whether a claim's thresholds are met, or how many are not."""
+    """Format whether a claim's thresholds are met, or how many are not."""
     checked = [result.meets_threshold for result in parts if result.meets_threshold is not None]
     if not checked:
         return ""
@@ -215,7 +181,7 @@ def _format_checks(parts: tuple[MeasuredPart, ...]) -> str:
 
 
 def _make_row(claim: Claim, result: MeasuredPart, judged: str) -> ResultRow:
-    """low and high are the range over the seeds."""
+    """Make a row of a part; low and high are the range over the seeds."""
     number = Estimate(result.median, result.low, result.high)
     where = {"suite": NAME, "scenario": result.part.scenario, "estimator": result.part.label}
     paper = f"{_format_source(claim)}: {claim.text}"
@@ -226,7 +192,7 @@ def _make_row(claim: Claim, result: MeasuredPart, judged: str) -> ResultRow:
 
 
 def _draw_figures(suite: Suite, results: Results) -> None:
-    """The papers' figures; nothing where plotly is not installed."""
+    """Draw the papers' figures; nothing where plotly is not installed."""
     try:
         from ..report import figures  # noqa: F401
     except ModuleNotFoundError:

@@ -1,13 +1,7 @@
-"""Claims that need no simulation: observability, error maps between samples, dual-rate gains.
+"""Claims that need no simulation: observability, error maps between samples, dual-rate's gains.
 
-Estimation errors between slow samples: maps from the error at the sample.
-
-dual-rate's letters: X~_{k+i|k+i} after i steps of 1 / r of the sampling period, from the prediction
-error X~_{k|k-1} at the sample, without noise.
-
-Ranks of observability matrices by exact arithmetic: no tolerance decides.
-
-dual-rate's theory: its error dynamics, the gains of its pseudo noise, its rank.
+Maps lead to X~_{k+i|k+i} after i steps of 1 / r of the sampling period (dual-rate's letters), from
+the prediction error X~_{k|k-1} at the sample, without noise. Ranks are exact: no tolerance decides.
 """
 
 import math
@@ -28,7 +22,7 @@ from .manoeuvres import PaperFigure
 
 
 def make_fast_maps(A: Array, C: Array, L: Array, r: int) -> list[Array]:
-    """Maps to X~_{k+i|k+i}, i = 0 .. r-1, with a measurement at every step: (22) repeated."""
+    """Make the maps, i = 0 .. r-1, with a measurement at every step: (22) repeated."""
     left = np.eye(len(A)) - L @ C
     maps = [left]
     for _ in range(1, r):
@@ -36,8 +30,8 @@ def make_fast_maps(A: Array, C: Array, L: Array, r: int) -> list[Array]:
     return maps
 
 
-def make_shared_maps(A: Array, C: Array, shares: Array) -> list[Array]:
-    """Maps to X~_{k+i|k+i} with corrections by shares (r, n, q) of the sample's innovation."""
+def _make_shared_maps(A: Array, C: Array, shares: Array) -> list[Array]:
+    """Make the maps with corrections by shares (r, n, q) of the sample's innovation."""
     error, maps = np.eye(len(A)), []
     for i, share in enumerate(shares):
         error = (A @ error if i > 0 else error) - share @ C
@@ -46,19 +40,18 @@ def make_shared_maps(A: Array, C: Array, shares: Array) -> list[Array]:
 
 
 def make_pseudo_maps(A: Array, C: Array, L: Array, r: int) -> list[Array]:
-    """Maps with pseudo measurements (14), G from (31)."""
-    return make_shared_maps(
-        A, C, dual_rate.compute_pseudo_shares(A, C, L, np.linalg.pinv(C) - L, r)
-    )
+    """Make the maps with pseudo measurements (14), G from (31)."""
+    shares = dual_rate.compute_pseudo_shares(A, C, L, np.linalg.pinv(C) - L, r)
+    return _make_shared_maps(A, C, shares)
 
 
 def make_predicted_maps(A: Array, C: Array, L: Array, r: int) -> list[Array]:
-    """Maps with no correction between samples: (34)."""
-    return make_shared_maps(A, C, np.concatenate([L[None], np.zeros((r - 1, *L.shape))]))
+    """Make the maps with no correction between samples: (34)."""
+    return _make_shared_maps(A, C, np.concatenate([L[None], np.zeros((r - 1, *L.shape))]))
 
 
 def compute_difference(maps: list[Array], others: list[Array]) -> float:
-    """The largest difference of two sequences of maps, over the largest of the others."""
+    """Compute the largest difference of two sequences of maps, over the largest of the others."""
     size = max(float(np.linalg.norm(matrix)) for matrix in others)
     return max(float(np.linalg.norm(a - b)) / size for a, b in zip(maps, others, strict=True))
 
@@ -67,7 +60,7 @@ Matrix = list[list[Fraction]]
 
 
 def rank(matrix: Sequence[Sequence[Fraction | int]]) -> int:
-    """The rank of a matrix of fractions, by elimination.
+    """Compute the rank of a matrix of fractions by elimination.
 
     >>> rank([[1, 2], [2, 4]]), rank([[Fraction(1, 3), 0], [0, 1]])
     (1, 2)
@@ -86,8 +79,8 @@ def rank(matrix: Sequence[Sequence[Fraction | int]]) -> int:
     return done
 
 
-def compute_observability_rank(A: Matrix, C: Sequence[Sequence[Fraction | int]]) -> int:
-    """The rank of [C; C A; ...; C A^(n-1)]: dakf-stability IV.D.
+def _compute_observability_rank(A: Matrix, C: Sequence[Sequence[Fraction | int]]) -> int:
+    """Compute the rank of [C; C A; ...; C A^(n-1)]: dakf-stability IV.D.
 
     For the continuous A; exact sampling cannot raise it, since e^(A T) keeps every A-invariant
     subspace, nor lower it but for special sampling times.
@@ -103,33 +96,29 @@ def compute_observability_rank(A: Matrix, C: Sequence[Sequence[Fraction | int]])
     return rank(stacked)
 
 
-def add_disturbances(A: Matrix, rows: int) -> Matrix:
-    """A with a constant disturbance behind each of its first rows: dakf-stability (15)-(17)."""
+def _add_disturbances(A: Matrix, rows: int) -> Matrix:
+    """Add a constant disturbance behind each of the first rows: dakf-stability (15)-(17)."""
     n = len(A)
     ends = [[Fraction(int(i == j)) for j in range(rows)] for i in range(n)]
-    return [a + e for a, e in zip(A, ends, strict=True)] + [
-        [Fraction(0)] * (n + rows) for _ in range(rows)
-    ]
+    zeros = [[Fraction(0)] * (n + rows) for _ in range(rows)]
+    return [a + e for a, e in zip(A, ends, strict=True)] + zeros
 
 
 def compute_coms_ranks(_: tuple[int, ...]) -> SimulationResult:
-    """Rank of each paper's observability matrix for the COMS at 25 km/h, taken as it is rounded."""
-    vision = [
-        [Fraction(entry) for entry in row] for row in linear.make_vision_model(COMS, 25.0 * KMH).A
-    ]
+    """Compute the rank of each paper's observability matrix for the COMS at 25 km/h, exactly."""
+    model = linear.make_vision_model(COMS, 25.0 * KMH)
+    vision = [[Fraction(entry) for entry in row] for row in model.A]
     course = [row[:3] for row in vision[:3]]
     models: dict[str, tuple[Matrix, list[list[int]]]] = {
-        "dakf": (add_disturbances(course, 2), [[0, 1, 0], [1, 0, 1]]),  # gyro and course
-        "dual-rate": (add_disturbances(course, 3), [[1, 0, 1]]),
+        "dakf": (_add_disturbances(course, 2), [[0, 1, 0], [1, 0, 1]]),  # gyro and course
+        "dual-rate": (_add_disturbances(course, 3), [[1, 0, 1]]),
         "vision": (vision, [[0, 0, 1, 0], [0, 0, 0, 1]]),
     }
     ranks = {
-        name: compute_observability_rank(A, [row + [0] * (len(A) - len(row)) for row in C])
+        name: _compute_observability_rank(A, [row + [0] * (len(A) - len(row)) for row in C])
         for name, (A, C) in models.items()
     }
-    return SimulationResult(
-        {(name, "rank"): np.array([float(value)]) for name, value in ranks.items()}
-    )
+    return SimulationResult({(name, "rank"): np.array([float(n)]) for name, n in ranks.items()})
 
 
 PAPER = "dual-rate"
@@ -139,21 +128,20 @@ SPEED = 25.0 * KMH
 COURSE_SD = math.radians(0.14) * (60.0 * KMH) / SPEED
 SQUARE, APPLICATION = "square C", "course only"
 STRONG, ANY = "strong disturbances", "any tuning"
-GROWS = 1.001  # the unobservable directions stay at 1, to the rounding of a double eigenvalue
+_GROWS = 1.001  # the unobservable directions stay at 1, to the rounding of a double eigenvalue
 
 
 def make_extended_model(stiffness: float = 9100.0) -> tuple[Array, Array]:
-    """A and C of (11) for the course model at 25 km/h and 1 ms, a random walk behind each state."""
-    model = make_course_model(
-        COMS.replace(front_stiffness=stiffness, rear_stiffness=stiffness), SPEED
-    )
+    """Make A and C of (11), the course model at 25 km/h and 1 ms with a random walk per state."""
+    car = COMS.replace(front_stiffness=stiffness, rear_stiffness=stiffness)
+    model = make_course_model(car, SPEED)
     A = np.zeros((6, 6))
     A[:3, :3], A[:3, 3:] = model.A, np.eye(3)
     return expm(A * 1e-3), np.array([[1.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
 
 
-def measure_maps(seeds: tuple[int, ...]) -> SimulationResult:
-    """Error dynamics with pseudo measurements against those with fast ones.
+def _measure_maps(seeds: tuple[int, ...]) -> SimulationResult:
+    """Compare the error dynamics with pseudo measurements to those with fast ones.
 
     Square: random systems of three states, all measured. Course only: the extended model with the
     Kalman gain that a random process noise has after 5 s of fast measurements.
@@ -175,16 +163,12 @@ def measure_maps(seeds: tuple[int, ...]) -> SimulationResult:
             P = A @ kalman.joseph_form(P, L, C, R) @ A.T + Q
         pseudo_maps = make_pseudo_maps(A, C, L, RATIO)
         application.append(compute_difference(pseudo_maps, make_fast_maps(A, C, L, RATIO)))
-    return SimulationResult(
-        {
-            (SQUARE, "difference"): np.array(square),
-            (APPLICATION, "difference"): np.array(application),
-        }
-    )
+    differences = {SQUARE: square, APPLICATION: application}
+    return SimulationResult({(name, "difference"): np.array(d) for name, d in differences.items()})
 
 
-def measure_gains(seeds: tuple[int, ...]) -> SimulationResult:
-    """Growth of the error from sample to sample with gains from the noise (29), a tuning a seed.
+def _measure_gains(seeds: tuple[int, ...]) -> SimulationResult:
+    """Measure the growth of the error from sample to sample with gains from the noise (29).
 
     Strong: process noise 1e-4 per second on the states and the same 5 to 50 on each of the three
     extended states, log-uniform. Any: 1e-6 to 1 on each state, 1e-3 to 100 on each extended one.
@@ -200,17 +184,16 @@ def measure_gains(seeds: tuple[int, ...]) -> SimulationResult:
             ANY: 10.0 ** rng.uniform([-6.0] * 3 + [-3.0] * 3, [0.0] * 3 + [2.0] * 3),
         }
         for name, q in tunings.items():
-            shares = dual_rate.compute_shares_29(
-                A, np.diag(np.asarray(q, np.float64)) * 1e-3, C, R, RATIO
-            )
+            Q = np.diag(np.asarray(q, np.float64)) * 1e-3
+            shares = dual_rate.compute_shares_29(A, Q, C, R, RATIO)
             growth = np.linalg.eigvals(dual_rate.frame_map(A, C, shares))
             radii[name].append(float(np.abs(growth).max()))
     return SimulationResult({(name, "spectral_radius"): np.array(r) for name, r in radii.items()})
 
 
 SIMULATIONS = (
-    Analysis(MAPS, measure_maps),
-    Analysis(GAINS, measure_gains),
+    Analysis(MAPS, _measure_maps),
+    Analysis(GAINS, _measure_gains),
     Analysis(RANKS, compute_coms_ranks, random=False),
 )
 
@@ -220,8 +203,7 @@ claim = make_claim_factory(PAPER)
 CLAIMS = (
     claim("(33)", "the error dynamics are those of fast measurements",
         make_number_part("difference of the maps, square C", MAPS, SQUARE, "difference",
-                         Bound("<=", 1e-9),
-            Bound("<=", 1e-9), "difference"),
+            Bound("<=", 1e-9), Bound("<=", 1e-9), "difference"),
         make_number_part("difference of the maps, course only", MAPS, APPLICATION, "difference",
             Bound("<=", 1e-9), Bound(">=", 0.2), "difference"),
         note="(30) has no exact solution unless C is invertible, and with disturbance "
@@ -229,7 +211,7 @@ CLAIMS = (
     claim("Sec. 3.3", "gains from the pseudo measurement's noise (29) make a filter",
         *(
             make_number_part(f"spectral radius, {tuning}", GAINS, tuning, "spectral_radius",
-                Bound("<=", GROWS), threshold, "spectral_radius")
+                Bound("<=", _GROWS), threshold, "spectral_radius")
             for tuning, threshold in ((STRONG, Bound(">=", 1.1)), (ANY, None))
         ),
         note="The pseudo measurements of a frame all repeat one innovation; taken for independent "
@@ -239,7 +221,7 @@ CLAIMS = (
         "tests)."),
     claim("Sec. 4.3", "the extended model's rank (the paper only checks that C C^T is invertible)",
         make_number_part("rank, of 6 states", RANKS, "dual-rate", "rank", None, Bound("=", 4.0),
-                         "rank")),
+            "rank")),
 )
 
 FIGURES: tuple[PaperFigure, ...] = ()

@@ -1,10 +1,9 @@
-"""Loops of a PI on the sideslip angle, opened at the plant's input: tie-vision's Table II.
+"""tie-vision's controller: feedforward, the loops of Table II, the lane changes of Fig. 8 and 10.
 
-The table gives two gain margins, 5.92 dB at 15.15 Hz (half of 1 / 33 ms) and 22.8 dB at 477.46 Hz
+Table II gives two gain margins, 5.92 dB at 15.15 Hz (half of 1 / 33 ms) and 22.8 dB at 477.46 Hz
 (3000 rad/s, probably where a frequency grid ended), for closed-loop poles "at -2 Hz", and nothing
-else: no speed, no Q and R, no discretisation. `search` tries what it leaves open.
-
-tie-vision's controller: feedforward, Table II, and the lane changes of Fig. 8 and 10.
+else: no speed, no Q and R, no discretisation. `search` tries what it leaves open, for loops of a PI
+on the sideslip angle, opened at the plant's input.
 """
 
 import itertools
@@ -53,30 +52,24 @@ INTEGRALS = {"forward-euler": 0.0, "tustin": 0.5, "backward-euler": 1.0}  # shar
 
 @dataclass(frozen=True)
 class LoopDesign:
-    """The choices that Table II leaves open.
+    """The choices that Table II leaves open."""
 
-    speed: m/s. placement, pole: of `design_pi`. integral: of `INTEGRALS`. sensors: what the Kalman
-    filter measures in every step: the yaw rate; with psi and y_l; these one step late, (12)-(13).
-    q_ratio: process variance of beta over that of gamma (and of psi and y_l, which have gamma's).
-    noise: variance of every measurement over gamma's process variance.
-    """
-
-    speed: float = 25.0 * KMH
-    placement: str = "real"
+    speed: float = 25.0 * KMH  # m/s
+    placement: str = "real"  # of `design_pi`, as the pole
     pole: float = POLE
-    integral: str = "forward-euler"
-    sensors: str = "gyro"
-    q_ratio: float = 25.75
-    noise: float = 1e-9
+    integral: str = "forward-euler"  # of `INTEGRALS`
+    sensors: str = "gyro"  # at every step: gyro; with psi and y_l; these a step late, (12)-(13)
+    q_ratio: float = 25.75  # process variance of beta over gamma's, which psi and y_l have too
+    noise: float = 1e-9  # variance of every measurement over gamma's process variance
 
 
 def _compute_direct_gain(pi: PI, dt: float, integral: str) -> float:
-    """The PI's direct gain; its sum grows by k_i dt error in all three forms."""
+    """Compute the PI's direct gain; its sum grows by k_i dt error in all three forms."""
     return pi.k_p + INTEGRALS[integral] * pi.k_i * dt
 
 
 def make_plain_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
-    """PI and plant with beta measured without delay; yaw moment held over dt seconds."""
+    """Make the loop of PI and plant with beta measured without delay; moment held over dt (s)."""
     import control
 
     pi = _pi(vehicle, design.speed, design.pole, design.placement)
@@ -89,8 +82,8 @@ def make_plain_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSp
 @lru_cache(maxsize=1024)
 def _make_filter(
     vehicle: Vehicle, speed: float, sensors: str, q_ratio: float, noise: float, dt: float
-) -> tuple[Array, Array, Array, Array]:
-    """(G, H, C, K): from the yaw moment to what the filter measures, and its steady gain."""
+) -> Parts:
+    """Make (G, H, C, K): from the yaw moment to what the filter measures, and its steady gain."""
     model = (make_bicycle_model if sensors == "gyro" else make_vision_model)(vehicle, speed)
     G, H = model.discretise(dt)
     H, C = H[:, 1:2], model.C
@@ -109,7 +102,7 @@ _pi = lru_cache(maxsize=256)(design_pi)
 
 
 def _split_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> tuple[Parts, Parts]:
-    """(A, B, C, D) of the plant and, with the sign of negative feedback, of filter and PI."""
+    """Make (A, B, C, D) of the plant and, with negative feedback, of filter and PI."""
     pi = _pi(vehicle, design.speed, design.pole, design.placement)
     G, H, C, K = _make_filter(
         vehicle, design.speed, design.sensors, design.q_ratio, design.noise, dt
@@ -119,16 +112,14 @@ def _split_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> tuple[Parts,
     one = np.ones((1, 1))
     A = np.block([[G @ F - direct * H @ beta_x, H], [-pi.k_i * dt * beta_x, one]])
     B = np.vstack([G @ K - direct * H @ beta_y, -pi.k_i * dt * beta_y])
-    return (
-        (G, H, C, np.zeros((len(C), 1))),
-        (A, B, np.hstack([direct * beta_x, -one]), direct * beta_y),
-    )
+    plant = (G, H, C, np.zeros((len(C), 1)))
+    return plant, (A, B, np.hstack([direct * beta_x, -one]), direct * beta_y)
 
 
 def make_estimator_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
-    """Plant, Kalman filter and PI, opened where the yaw moment enters the plant.
+    """Make the loop of plant, Kalman filter and PI, opened where the moment enters the plant.
 
-    The filter's input is the moment that the PI asks for: opened behind both, a filter with the
+    The filter's input is the moment that the PI commands: opened behind both, a filter with the
     right model would not show in the loop at all. It has its steady gain and the PI reads the
     estimate after the correction.
     """
@@ -139,23 +130,14 @@ def make_estimator_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "Sta
 
 
 def _evaluate_nyquist(parts: tuple[Parts, Parts]) -> float:
-    """The loop at z = -1, where it is real."""
+    """Evaluate the loop at z = -1, where it is real."""
     value = np.eye(1)
     for A, B, C, D in parts:
         value = (D - C @ np.linalg.solve(np.eye(len(A)) + A, B)) @ value
     return float(value[0, 0])
 
 
-def compute_margins(vehicle: Vehicle, design: LoopDesign) -> list[tuple[float, float]]:
-    """Gain margins (dB, rad/s) of the loop at the camera's 33 ms and at 1 ms, the same PI and
-    variances in both."""
-    return [
-        compute_gain_margin(make_estimator_loop(vehicle, design, dt))
-        for dt in (CAMERA_PERIOD, TICK)
-    ]
-
-
-GRID: dict[str, tuple[float | str, ...]] = {
+_GRID: dict[str, tuple[float | str, ...]] = {
     "speed": tuple(kmh * KMH for kmh in (10.0, 14.0, 20.0, 25.0, 30.0)),
     "placement": PLACEMENTS,
     "integral": tuple(INTEGRALS),
@@ -165,7 +147,7 @@ GRID: dict[str, tuple[float | str, ...]] = {
 
 
 @dataclass(frozen=True)
-class LoopMatch:
+class _LoopMatch:
     """A design and its two margins in dB, single-rate and multirate."""
 
     design: LoopDesign
@@ -173,23 +155,22 @@ class LoopMatch:
 
     @property
     def off(self) -> float:
-        """The larger difference to the printed margins, in dB."""
+        """The larger difference to the printed margins (dB)."""
         return max(abs(a - b) for a, b in zip(self.decibels, PRINTED, strict=True))
 
 
-def search(vehicle: Vehicle, within: float = 0.5) -> list[LoopMatch]:
-    """The designs of `GRID` whose margins both lie within some dB of Table II, the best first.
+def search(vehicle: Vehicle, within: float = 0.5) -> list[_LoopMatch]:
+    """Search the designs of the grid whose margins both lie within some dB of Table II, best first.
 
     Both crossovers are at half the sampling rate and the closed loops are stable, as in the paper.
     """
     hits = []
-    for values in itertools.product(*GRID.values()):
-        options: dict[str, Any] = dict(zip(GRID, values, strict=True))
+    for values in itertools.product(*_GRID.values()):
+        options: dict[str, Any] = dict(zip(_GRID, values, strict=True))
         design, margins = LoopDesign(**options), []
         for dt, printed in zip((CAMERA_PERIOD, TICK), PRINTED, strict=True):
-            end = _evaluate_nyquist(
-                _split_loop(vehicle, design, dt)
-            )  # a screen, before all crossings
+            # a screen, before all crossings
+            end = _evaluate_nyquist(_split_loop(vehicle, design, dt))
             if end >= 0.0 or abs(-20.0 * math.log10(-end) - printed) > within:
                 break
             loop = make_estimator_loop(vehicle, design, dt)
@@ -198,7 +179,7 @@ def search(vehicle: Vehicle, within: float = 0.5) -> list[LoopMatch]:
                 break
             margins.append(decibels)
         if len(margins) == len(PRINTED):
-            hits.append(LoopMatch(design, (margins[0], margins[1])))
+            hits.append(_LoopMatch(design, (margins[0], margins[1])))
     return sorted(hits, key=lambda hit: hit.off)
 
 
@@ -216,50 +197,38 @@ EQUAL = "multirate, gain margin of single-rate"
 HERTZ = (15.15, 477.46)  # Table II's crossovers
 
 
-def measure_static_slip(_: tuple[int, ...]) -> SimulationResult:
-    """The slip left after 10 s of steering by 0.001 rad with the feedforward (24), by speed."""
+def _measure_static_slip(_: tuple[int, ...]) -> SimulationResult:
+    """Measure the slip left after 10 s of steering by 0.001 rad with the feedforward (24)."""
     left = []
     for kmh in range(10, 46, 5):
         scenario = {
-            "base": FIG8,
-            "name": "static",
-            "steering": "step",
-            "onset": 0.0,
-            "amplitude": 0.001,
-            "hold": 60.0,
-            "duration": 10.0,
-            "speed": kmh * KMH,
-            "noise": {"wheel": 0.0},
-        }
+            "base": FIG8, "name": "static", "steering": "step", "onset": 0.0, "amplitude": 0.001,
+            "hold": 60.0, "duration": 10.0, "speed": kmh * KMH, "noise": {"wheel": 0.0},
+        }  # fmt: skip
         env = gym.make("sideslip/YawVision-v0", scenario=scenario)
         left.append(abs(rollout(env, make_agent("feedforward", env))["beta"][-1]))
     return SimulationResult({("feedforward", "static_slip"): np.array(left)})
 
 
-def compute_margin_gain(design: LoopDesign) -> float:
-    """By how many dB 1 ms raises the gain margin of 33 ms, the same PI on the true slip."""
-    slow, fast = (
-        compute_gain_margin(make_plain_loop(COMS, design, dt))[0] for dt in (CAMERA_PERIOD, TICK)
-    )
+def _compute_margin_gain(design: LoopDesign) -> float:
+    """Compute by how many dB 1 ms raises the gain margin of 33 ms, the same PI on the true slip."""
+    loops = [make_plain_loop(COMS, design, dt) for dt in (CAMERA_PERIOD, TICK)]
+    slow, fast = (compute_gain_margin(loop)[0] for loop in loops)
     return float(fast - slow)
 
 
-def measure_table_two(_: tuple[int, ...]) -> SimulationResult:
-    """The loops of the search that fit Table II, and the best one of 25 km/h over frequency."""
+def _measure_table_two(_: tuple[int, ...]) -> SimulationResult:
+    """Measure the loops of the search that fit Table II, and the best of 25 km/h over frequency."""
     matches = search(COMS)
     at_25 = [hit for hit in matches if math.isclose(hit.design.speed, 25.0 * KMH)]
+    raised = [_compute_margin_gain(LoopDesign(placement=name)) for name in ("real", "radius")]
     numbers = {
         ("loops", "count"): np.array([float(len(matches))]),
         ("loops", "off"): np.array([min(hit.off for hit in matches)] if matches else [np.inf]),
         ("25 km/h", "off"): np.array([at_25[0].off] if at_25 else [np.inf]),
-        ("same PI", "raised"): np.array(
-            [
-                compute_margin_gain(LoopDesign(placement=placement))
-                for placement in ("real", "radius")
-            ]
-        ),
+        ("same PI", "raised"): np.array(raised),
     }
-    shown = at_25[0] if at_25 else LoopMatch(LoopDesign(), PRINTED)
+    shown = at_25[0] if at_25 else _LoopMatch(LoopDesign(), PRINTED)
     example = _compute_magnitudes(shown.design)
     for label, dt in ((SINGLE, CAMERA_PERIOD), (MULTI, TICK)):
         decibels, omega = compute_gain_margin(make_estimator_loop(COMS, shown.design, dt))
@@ -269,27 +238,26 @@ def measure_table_two(_: tuple[int, ...]) -> SimulationResult:
 
 
 def _compute_magnitudes(design: LoopDesign) -> Example:
-    """The open loops in dB over Hz, each up to half its sampling rate."""
+    """Compute the open loops (dB) over Hz, each up to half its sampling rate."""
     hertz = np.geomspace(0.1, 0.5 / TICK, 600)
     lines = {}
     for label, dt in ((SINGLE, CAMERA_PERIOD), (MULTI, TICK)):
         below_nyquist = hertz <= 0.5 / dt
         loop = make_estimator_loop(COMS, design, dt)
         size = np.full(len(hertz), np.nan)
-        size[below_nyquist] = 20.0 * np.log10(
-            np.abs(loop(np.exp(2j * np.pi * hertz[below_nyquist] * dt)))
-        )
+        response = loop(np.exp(2j * np.pi * hertz[below_nyquist] * dt))
+        size[below_nyquist] = 20.0 * np.log10(np.abs(response))
         lines[label] = {"magnitude": size}
     return Example(hertz, lines)
 
 
 _CONTESTANTS = ("none", "feedforward", SINGLE, MULTI, PROPOSED)
 SIMULATIONS = (
-    Analysis(TABLE2, measure_table_two, random=False),
+    Analysis(TABLE2, _measure_table_two, random=False),
     SlipSimulation(FIG8, FIG8, (*_CONTESTANTS, EQUAL), {EQUAL: {"gain": 10.0 ** (28.8 / 20.0)}}),
     SlipSimulation(STIFF, STIFF, _CONTESTANTS),
     SlipSimulation(FIG10, FIG10, ("none", SINGLE, MULTI, PROPOSED)),
-    Analysis(STATIC, measure_static_slip, random=False),
+    Analysis(STATIC, _measure_static_slip, random=False),
 )
 
 _TYRES = {FIG8: "nominal", STIFF: "tyres x 1.2", FIG10: "twin"}
@@ -299,15 +267,12 @@ claim = make_claim_factory(PAPER)
 CLAIMS = (
     claim("(24)", "the feedforward brings the static slip to zero",
         make_number_part("slip left, 10 to 45 km/h", STATIC, "feedforward", "static_slip",
-                         Bound("<", 1e-9),
-            Bound("<", 1e-9), "static_slip")),
+            Bound("<", 1e-9), Bound("<", 1e-9), "static_slip")),
     claim("Table II", "gain margins of 5.92 dB at 15.15 Hz and 22.8 dB at 477.46 Hz",
         make_number_part("farther of both margins from the printed ones, best loop / dB", TABLE2,
-                         "loops",
-            "off", Bound("<=", 0.05), Bound("<=", 0.5), "decibels"),
+            "loops", "off", Bound("<=", 0.05), Bound("<=", 0.5), "decibels"),
         make_number_part("the same, best loop at 25 km/h / dB", TABLE2, "25 km/h", "off",
-                         Bound("<=", 0.05),
-            Bound("<=", 0.5), "decibels"),
+            Bound("<=", 0.05), Bound("<=", 0.5), "decibels"),
         *(
             make_number_part(f"crossover of the {label} loop / Hz", TABLE2, label, "crossover",
                 Bound("=", hertz), metric="hertz")
@@ -325,46 +290,42 @@ CLAIMS = (
     claim("Fig. 8", "the controller reduces the slip",
         *(
             make_smaller_part(f"{agent} / none, {_TYRES[name]}", name, agent, "none", max_ratio,
-                              "rms_slip")
+                "rms_slip")
             for name, max_ratio in ((FIG8, 0.40), (STIFF, 0.55))
             for agent in (SINGLE, MULTI)
         )),
     claim("Fig. 8 (a)", "the multirate controller keeps the slip smaller than the single-rate one",
         *(
             make_smaller_part(f"{agent} / single-rate, {_TYRES[name]}", name, agent, SINGLE,
-                              max_ratio, "rms_slip")
+                max_ratio, "rms_slip")
             for name, max_ratio in ((FIG8, 0.92), (STIFF, None))
             for agent in (MULTI, PROPOSED)
         )),
     claim("Fig. 8 (b)", "the multirate controller's input is smoother",
         make_smaller_part("largest 1 ms step, pseudo-residuals / single-rate", FIG8, PROPOSED,
-                          SINGLE, 0.4,
-            "largest_step"),
+            SINGLE, 0.4, "largest_step"),
         make_smaller_part("total variation, pseudo-residuals / single-rate", FIG8, PROPOSED, SINGLE,
             metric="total_variation")),
     claim("Fig. 8", "the gain margins of both control systems were set to be the same",
         make_number_part(
-            "share of time at the yaw moment's limit, multirate with single-rate's margin",
-            FIG8, EQUAL, "saturation", metric="share"),
+            "share of time at the yaw moment's limit, multirate with single-rate's margin", FIG8,
+            EQUAL, "saturation", metric="share"),
         ClaimPart("its slip / multirate with the same PI", FIG8,
-                  select_ratio(FIG8, EQUAL, MULTI, "rms_slip")),
+            select_ratio(FIG8, EQUAL, MULTI, "rms_slip")),
         note="Taken literally the multirate PI is 28.8 dB stronger and its yaw moment jumps from "
         "limit to limit with the noise."),
     claim("Fig. 10 (twin)", "on the road control reduces the slip, multirate more than single-rate",
         make_smaller_part("single-rate / none", FIG10, SINGLE, "none", metric="rms_slip"),
         make_smaller_part("pseudo-residuals / none", FIG10, PROPOSED, "none", metric="rms_slip"),
         make_smaller_part("pseudo-residuals / single-rate", FIG10, PROPOSED, SINGLE,
-                          metric="rms_slip")),
+            metric="rms_slip")),
 )
 
 _BETA, _MOMENT = "body slip angle / rad", "yaw moment / (N m)"
 _BEHIND = {
     FIG8: ("Fig. 8", "", "One lane change at 25 km/h, tyres as the controllers believe."),
-    STIFF: (
-        "Fig. 8",
-        " with tyres 1.2 times stiffer",
-        "The same lane change, when the controllers believe in too soft tyres.",
-    ),
+    STIFF: ("Fig. 8", " with tyres 1.2 times stiffer",
+        "The same lane change, when the controllers believe in too soft tyres."),
 }
 figure = partial(PaperFigure, PAPER)
 FIGURES = (

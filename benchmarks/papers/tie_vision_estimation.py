@@ -1,4 +1,4 @@
-"""tie-vision: body slip angle from a camera and a gyro; `control` has its controller."""
+"""tie-vision: the sideslip angle from a camera and a gyro."""
 
 from functools import partial
 
@@ -34,21 +34,16 @@ SIMULATIONS = (
     EstimationSimulation(FIG7, "sideslip/YawVision-v0", FIG7,
         (*_PAPERS_OWN, PaperFilter(NO_DELAY, MULTI, {"delay": "ignore"}),
             PaperFilter(RETUNED, MULTI, {"delay": "ignore", **_FOR_NO_DELAY}),
-            PaperFilter(EXACT, "exact-kf", vehicle="true")),
-        bound=True, times=5),
+            PaperFilter(EXACT, "exact-kf", vehicle="true")), bound=True, times=5),
     EstimationSimulation(FIG9, "sideslip/YawVision-v0", FIG9, _PAPERS_OWN),
 )
 # fmt: on
 
 
 def _make_poorest_part(scenario: str, threshold: Bound | None) -> ClaimPart:
-    return ClaimPart(
-        "bicycle / poorest vision filter",
-        scenario,
-        compare_others(scenario, BICYCLE, (SINGLE, MULTI, PROPOSED), np.max),
-        Bound(">", 1.0),
-        threshold,
-    )
+    ratio = compare_others(scenario, BICYCLE, (SINGLE, MULTI, PROPOSED), np.max)
+    label = "bicycle / poorest vision filter"
+    return ClaimPart(label, scenario, ratio, Bound(">", 1.0), threshold)
 
 
 def _make_best_parts(scenario: str, max_ratio: float | None) -> tuple[ClaimPart, ...]:
@@ -60,7 +55,7 @@ def _make_best_parts(scenario: str, max_ratio: float | None) -> tuple[ClaimPart,
 
 
 def _compute_pooled_ratio(measured: SimulationResult, one: str, other: str) -> np.ndarray:
-    """The ratio of RMS values over all seeds together, (1,)."""
+    """Compute the ratio of RMS values over all seeds together, (1,)."""
     squares = [np.mean(measured.numbers[label, "beta"] ** 2) for label in (one, other)]
     return np.array([np.sqrt(squares[0] / squares[1])])
 
@@ -80,10 +75,10 @@ CLAIMS = (
             lambda results: _compute_pooled_ratio(results[FIG7], EXACT, "bound"),
             threshold=Bound("<=", 1.03)),
         ClaimPart("multirate / bound: the stiffness error", FIG7,
-                  select_ratio(FIG7, MULTI, "bound")),
+            select_ratio(FIG7, MULTI, "bound")),
         ClaimPart("delay ignored / multirate", FIG7, select_ratio(FIG7, NO_DELAY, MULTI)),
         ClaimPart("delay ignored, tuned for it / multirate", FIG7,
-                  select_ratio(FIG7, RETUNED, MULTI)),
+            select_ratio(FIG7, RETUNED, MULTI)),
         note="docs/PAPERS.md has 2.7 for the stiffness error and 1.64 for the ignored delay. The "
         "exact filter reaches our bound, so that 2.7 belongs to another bound. What ignoring the "
         "delay costs is a matter of tuning: more than twice the error with the gains of the "

@@ -1,20 +1,10 @@
-"""tie-vision's claims: estimation, control with Table II and its margins, convergence, appendix.
+"""tie-vision's theory: the recursions of its appendix, its convergence, and gain margins of loops.
 
-tie-vision's appendix, checked term by term: its recursions against simulated errors.
-
-Random time-varying systems with noise are filtered with random gains; e is the true error. Each
-formula is written out as printed and as docs/PAPERS.md corrects it, and its residual is the largest
-difference from the simulated error over that error's size. The one-step lines of cases 1 and 2 are
-no equations between vectors as printed (K times w, H u times w) and cannot be checked.
-
-Does tie-vision's filter with pseudo-residuals converge, and with how many tunings?
-
-The paper leaves open which gain its (16), (21) use between samples. Two are tried with the same
-random process noise: the Kalman gain of (13) at 1 ms, every row corrected at every step, as the
-four steps (19)-(22) read; and the shipped filter's, which spreads the multirate filter's gain over
-the frame.
-
-Gain margins of a discrete-time loop, the crossing at half the sampling rate included.
+The appendix is checked term by term on random time-varying systems with random gains, as printed
+and as docs/PAPERS.md corrects it. The one-step lines of cases 1 and 2 are no equations between
+vectors as printed (K times w, H u times w) and cannot be checked. The gain that (16), (21) use
+between samples is left open: tried are the Kalman gain of (13) at 1 ms, every row corrected at
+every step, and the shipped filter's, which spreads the multirate filter's gain over the frame.
 """
 
 import math
@@ -53,7 +43,7 @@ STATES, OUTPUTS = 4, 3
 
 
 @dataclass
-class RandomSystem:
+class _RandomSystem:
     """Steps 0 .. n of a random system: G, w of the step to i+1; K, v of step i (0 unused)."""
 
     G: list[Array]
@@ -64,8 +54,8 @@ class RandomSystem:
     e: Array  # at step 0
 
 
-def draw_system(seed: int) -> RandomSystem:
-    """One system, with gains that make the error neither vanish nor explode."""
+def _draw_system(seed: int) -> _RandomSystem:
+    """Draw a system with gains that make the error neither vanish nor explode."""
     rng = np.random.default_rng(seed)
 
     def draw_arrays(*shape: int) -> list[Array]:
@@ -74,80 +64,81 @@ def draw_system(seed: int) -> RandomSystem:
     G = [np.eye(STATES) + 0.2 * g for g in draw_arrays(STATES, STATES)]
     K = [0.2 * k for k in draw_arrays(STATES, OUTPUTS)]
     C = rng.normal(size=(OUTPUTS, STATES))
-    return RandomSystem(G, C, K, draw_arrays(STATES), draw_arrays(OUTPUTS), rng.normal(size=STATES))
+    w, v = draw_arrays(STATES), draw_arrays(OUTPUTS)
+    return _RandomSystem(G, C, K, w, v, rng.normal(size=STATES))
 
 
-def compute_product(factors: list[Array]) -> Array:
-    """The product with the newest factor on the left, as the appendix has it."""
+def _compute_product(factors: list[Array]) -> Array:
+    """Multiply factors, the newest on the left, as the appendix has it."""
     return reduce(lambda total, factor: factor @ total, factors, np.eye(STATES))
 
 
-def compute_residual(formula: Array, simulated: Array) -> float:
-    """The largest difference over the largest entry."""
+def _compute_residual(formula: Array, simulated: Array) -> float:
+    """Compute a formula's largest difference from the simulated error over that one's size."""
     return float(np.abs(formula - simulated).max() / np.abs(simulated).max())
 
 
-def check_ideal(d: RandomSystem) -> dict[str, float]:
-    """Case 1: a measurement at every step."""
+def _check_ideal(d: _RandomSystem) -> dict[str, float]:
+    """Check case 1: a measurement at every step."""
     n, e = STEPS, d.e
     for i in range(1, n + 1):
         predicted = d.G[i - 1] @ e + d.w[i - 1]
         e = predicted - d.K[i] @ (d.C @ predicted + d.v[i])  # (17)-(18)
     M = [np.eye(STATES) - K @ d.C for K in d.K]
-    closed = compute_product([M[i] @ d.G[i - 1] for i in range(1, n + 1)]) @ d.e
+    closed = _compute_product([M[i] @ d.G[i - 1] for i in range(1, n + 1)]) @ d.e
     for p in range(n):
-        after = compute_product([M[i + 1] @ d.G[i] for i in range(p + 1, n)])
+        after = _compute_product([M[i + 1] @ d.G[i] for i in range(p + 1, n)])
         closed = closed + after @ M[p + 1] @ d.w[p]
     for p in range(1, n + 1):
-        after = compute_product([M[i] @ d.G[i - 1] for i in range(p + 1, n + 1)])
+        after = _compute_product([M[i] @ d.G[i - 1] for i in range(p + 1, n + 1)])
         closed = closed - after @ d.K[p] @ d.v[p]
-    return {"case 1": compute_residual(closed, e)}
+    return {"case 1": _compute_residual(closed, e)}
 
 
-def check_predicted(d: RandomSystem) -> dict[str, float]:
-    """Case 2: no correction between samples."""
+def _check_predicted(d: _RandomSystem) -> dict[str, float]:
+    """Check case 2: no correction between samples."""
     e = d.e
     for i in range(STEPS):
         e = d.G[i] @ e + d.w[i]
-    closed = compute_product(d.G[:STEPS]) @ d.e
+    closed = _compute_product(d.G[:STEPS]) @ d.e
     for p in range(STEPS):
-        closed = closed + compute_product(d.G[p + 1 : STEPS]) @ d.w[p]
-    return {"case 2": compute_residual(closed, e)}
+        closed = closed + _compute_product(d.G[p + 1 : STEPS]) @ d.w[p]
+    return {"case 2": _compute_residual(closed, e)}
 
 
-def check_compensated(d: RandomSystem) -> dict[str, float]:
-    """Case 3: any pseudo-residual; then the exact one, C G e."""
+def _check_compensated(d: _RandomSystem) -> dict[str, float]:
+    """Check case 3: any pseudo-residual; then the exact one, C G e."""
     n, e = STEPS, d.e
     for i in range(1, n + 1):  # v stands for any pseudo-residual: the first form is an identity
         e = d.G[i - 1] @ e + d.w[i - 1] - d.K[i] @ d.v[i]
     sums = {}
     for label, held in (("case 3 (a)", False), ("case 3 (a), printed", True)):
         G = [d.G[1] if held else g for g in d.G]
-        closed = compute_product(d.G[:n]) @ d.e
+        closed = _compute_product(d.G[:n]) @ d.e
         for p in range(n):
-            closed = closed + compute_product(G[p + 1 : n]) @ d.w[p]
+            closed = closed + _compute_product(G[p + 1 : n]) @ d.w[p]
         for p in range(1, n + 1):
-            closed = closed - compute_product(G[p:n]) @ d.K[p] @ d.v[p]
-        sums[label] = compute_residual(closed, e)
+            closed = closed - _compute_product(G[p:n]) @ d.K[p] @ d.v[p]
+        sums[label] = _compute_residual(closed, e)
     M = [np.eye(STATES) - K @ d.C for K in d.K]
     e = d.e
     for i in range(1, n + 1):
         e = M[i] @ d.G[i - 1] @ e + d.w[i - 1]  # with the exact residual C G e
-    start = compute_product([M[i] @ d.G[i - 1] for i in range(1, n + 1)]) @ d.e
+    start = _compute_product([M[i] @ d.G[i - 1] for i in range(1, n + 1)]) @ d.e
     for label, factor in (("case 3 (b)", False), ("case 3 (b), printed", True)):
         closed = start
         for p in range(n):
-            after = compute_product([M[i + 1] @ d.G[i] for i in range(p + 1, n)])
+            after = _compute_product([M[i + 1] @ d.G[i] for i in range(p + 1, n)])
             closed = closed + after @ (M[p + 1] @ d.w[p] if factor else d.w[p])
-        sums[label] = compute_residual(closed, e)
+        sums[label] = _compute_residual(closed, e)
     return sums
 
 
 def compute_residuals(seeds: tuple[int, ...]) -> SimulationResult:
-    """Every formula's residual on each seed's system."""
+    """Compute every formula's residual on each seed's system."""
     lines: list[Numbers] = []
-    for drive in map(draw_system, seeds):
-        by_case = check_ideal(drive) | check_predicted(drive) | check_compensated(drive)
+    for drive in map(_draw_system, seeds):
+        by_case = _check_ideal(drive) | _check_predicted(drive) | _check_compensated(drive)
         lines.append({(label, "residual"): value for label, value in by_case.items()})
     return SimulationResult(collect_numbers(lines))
 
@@ -163,8 +154,8 @@ C = np.zeros((3, 6))  # of (13): gamma and the delayed psi and y_l
 C[0, 1] = C[1, 4] = C[2, 5] = 1.0
 
 
-def make_transitions() -> tuple[Array, Array]:
-    """G of (13) at 1 ms: with the delayed states held, and in the step after a trigger (12)."""
+def _make_transitions() -> tuple[Array, Array]:
+    """Make G of (13) at 1 ms: with delayed states held, and in the step after a trigger (12)."""
     held = np.eye(6)
     held[:4, :4], _ = make_vision_model(COMS, SPEED).discretise(1e-3)
     latched = held.copy()
@@ -173,16 +164,16 @@ def make_transitions() -> tuple[Array, Array]:
     return held, latched
 
 
-def compute_literal_gain(Q: Array) -> Array:
-    """The Kalman gain of (13) at 1 ms with a measurement at every step, (6, 3)."""
-    _, latched = make_transitions()
+def _compute_literal_gain(Q: Array) -> Array:
+    """Compute the Kalman gain of (13) at 1 ms with a measurement at every step, (6, 3)."""
+    _, latched = _make_transitions()
     noise = np.diag([*Q, 0.0, 0.0]) * 1e-3
     return kalman.kalman_gain(solve_discrete_are(latched.T, C.T, noise, R), C, R)
 
 
-def compute_spectral_radius(K: Array) -> float:
-    """Growth of (error, estimated error e) over a frame: (19)-(22) with the gyro at 1 ms."""
-    held, latched = make_transitions()
+def _compute_spectral_radius(K: Array) -> float:
+    """Compute the growth of (error, estimated error e) over a frame: (19)-(22), gyro at 1 ms."""
+    held, latched = _make_transitions()
     I, zero = np.eye(6), np.zeros((6, 6))  # noqa: E741
     inverse = C.T @ np.linalg.inv(C @ C.T)
     sample = np.block([[I - K @ C, zero], [(inverse - K) @ C, zero]])  # (19)-(20)
@@ -195,8 +186,8 @@ def compute_spectral_radius(K: Array) -> float:
     return float(np.abs(np.linalg.eigvals(total)).max())
 
 
-def measure_tunings(seeds: tuple[int, ...], batch: int = 20) -> SimulationResult:
-    """The share of random tunings with which the error grows; a batch a seed.
+def _measure_tunings(seeds: tuple[int, ...], batch: int = 20) -> SimulationResult:
+    """Measure the fraction of random tunings with which the error grows; a batch a seed.
 
     Process noise of each state log-uniform over eight decades up to 1 (unit)^2/s.
     """
@@ -205,7 +196,7 @@ def measure_tunings(seeds: tuple[int, ...], batch: int = 20) -> SimulationResult
         rng = np.random.default_rng(seed)
         tunings = 10.0 ** rng.uniform(-8.0, 0.0, (batch, 4))
         radii = {
-            LITERAL: [compute_spectral_radius(compute_literal_gain(Q)) for Q in tunings],
+            LITERAL: [_compute_spectral_radius(_compute_literal_gain(Q)) for Q in tunings],
             SPREAD: [_compute_shipped_radius(Q) for Q in tunings],
         }
         for name, tuning_radii in radii.items():
@@ -214,18 +205,14 @@ def measure_tunings(seeds: tuple[int, ...], batch: int = 20) -> SimulationResult
 
 
 def _compute_shipped_radius(Q: Array) -> float:
+    camera = {"camera": CAMERA_33_30}
     return make_estimator(
-        "multirate-residual-kf",
-        vehicle=COMS,
-        sensors={"camera": CAMERA_33_30},
-        speed=SPEED,
-        Q=Q,
-        allow_unstable=True,
+        "multirate-residual-kf", vehicle=COMS, sensors=camera, speed=SPEED, Q=Q, allow_unstable=True
     ).spectral_radius
 
 
-def measure_maps(seeds: tuple[int, ...]) -> SimulationResult:
-    """The difference of the error dynamics with pseudo-residuals from those of a fast camera.
+def _measure_maps(seeds: tuple[int, ...]) -> SimulationResult:
+    """Compare the error dynamics with pseudo-residuals to those of a fast camera.
 
     The vision model at 1 ms, every row slow, a Kalman gain of random process noise a seed. The
     example has the size of the maps of the appendix's three cases, of the first seed.
@@ -243,20 +230,17 @@ def measure_maps(seeds: tuple[int, ...]) -> SimulationResult:
         }
         differences.append(theory.compute_difference(cases["pseudo-residuals"], cases["ideal"]))
         if seed == FIRST:
-            initial_size = np.linalg.norm(np.eye(len(G)))
-            sizes = {
-                name: {
-                    "error": np.array([np.linalg.norm(matrix) / initial_size for matrix in maps])
-                }
-                for name, maps in cases.items()
-            }
-            example = Example(np.arange(float(PERIOD)), sizes)
+            size, curves = np.linalg.norm(np.eye(len(G))), {}
+            for name, maps in cases.items():
+                sizes = np.array([np.linalg.norm(matrix) / size for matrix in maps])
+                curves[name] = {"error": sizes}
+            example = Example(np.arange(float(PERIOD)), curves)
     return SimulationResult({("pseudo-residuals", "difference"): np.array(differences)}, example)
 
 
 SIMULATIONS = (
-    Analysis(TUNINGS, measure_tunings),
-    Analysis(MAPS, measure_maps),
+    Analysis(TUNINGS, _measure_tunings),
+    Analysis(MAPS, _measure_maps),
     Analysis(APPENDIX, compute_residuals),
 )
 
@@ -271,8 +255,7 @@ CLAIMS = (
             "difference", Bound("<=", 1e-9), metric="difference"),
         *(
             make_number_part(f"share of random tunings that diverge, {gain}", TUNINGS, gain,
-                             "share",
-                Bound("=", 0.0), metric="share")
+                "share", Bound("=", 0.0), metric="share")
             for gain in (LITERAL, SPREAD)
         ),
         note="C has full row rank only: (20) cannot know the error that the sample does not see. "
@@ -281,7 +264,7 @@ CLAIMS = (
     claim("Appendix", "the error recursions of the three cases",
         *(
             make_number_part(f"{case}, residual", APPENDIX, case, "residual",
-                             None if corrected else _zero,
+                None if corrected else _zero,
                 _zero if corrected or not case.endswith("printed") else None, "residual")
             for case, corrected in (("case 1", False), ("case 2", False), ("case 3 (a)", True),
                 ("case 3 (a), printed", False), ("case 3 (b)", True),
@@ -310,7 +293,7 @@ _DECADES, _POINTS = 6, 4000  # of the frequency grid, below half the sampling ra
 
 
 def find_crossings(loop: "Loop") -> Array:
-    """(n, 2): factors on the loop that bring it to -1, and rad/s, in the order of frequency.
+    """Find the factors on the loop that bring it to -1, and rad/s, by frequency: (n, 2).
 
     L is real at z = -1: where it is negative there, half the sampling rate is a phase crossover.
     python-control's `stability_margins` finds crossings by a change of sign, and there is none at
@@ -322,9 +305,8 @@ def find_crossings(loop: "Loop") -> Array:
     if not loop.isdtime(strict=True) or loop.dt is True:
         raise ValueError(f"margins need a discrete-time loop with its period, got dt={loop.dt!r}")
     if not loop.issiso():
-        raise ValueError(
-            f"margins need one input and one output, got {loop.ninputs} x {loop.noutputs}"
-        )
+        sizes = f"{loop.ninputs} x {loop.noutputs}"
+        raise ValueError(f"margins need one input and one output, got {sizes}")
     dt = float(loop.dt)
     top = math.pi / dt
 
@@ -338,17 +320,14 @@ def find_crossings(loop: "Loop") -> Array:
         for low, high, changes in zip(grid, grid[1:], signs[:-1] * signs[1:] < 0.0, strict=False)
         if changes
     ]
-    factors = [
-        (1.0 / abs(evaluate_loop(omega)), omega)
-        for omega in frequencies
-        if evaluate_loop(omega).real < 0.0
-    ]
+    values = [(evaluate_loop(omega), omega) for omega in frequencies]
+    factors = [(1.0 / abs(value), omega) for value, omega in values if value.real < 0.0]
     end = evaluate_loop(top).real
     return np.reshape([*factors, *([(-1.0 / end, top)] if end < 0.0 else [])], (-1, 2))
 
 
 def compute_gain_margin(loop: "Loop") -> tuple[float, float]:
-    """(dB, rad/s) of the smallest gain above 1 that reaches -1; (inf, nan) where none does."""
+    """Compute (dB, rad/s) of the smallest gain above 1 that reaches -1; (inf, nan) if none does."""
     margins = find_crossings(loop)
     rising = margins[margins[:, 0] > 1.0]
     if not len(rising):
@@ -358,7 +337,7 @@ def compute_gain_margin(loop: "Loop") -> tuple[float, float]:
 
 
 def _compute_response(loop: "Loop", z: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
-    """The loop at the points z, (n,); python-control's own takes a state space point by point."""
+    """Compute the loop at the points z, (n,); python-control takes a state space point by point."""
     if not hasattr(loop, "A"):
         return np.asarray(loop(z))
     shifted = z[:, None, None] * np.eye(len(loop.A)) - loop.A

@@ -25,7 +25,7 @@ ROLLBACK_17 = "multirate-kf, constant 17 ms"
 
 
 def _make_filters(**noise: float) -> tuple[PaperFilter, ...]:
-    """The filters, with the camera's noise; the process noise is one for all of them."""
+    """Make the filters with the camera's noise; the process noise is one for all of them."""
     return (
         PaperFilter(PROPOSED, PROPOSED, noise),
         PaperFilter(EXACT, EXACT, noise),
@@ -51,16 +51,15 @@ claim = make_claim_factory(PAPER)
 CLAIMS = (
     claim("Sec. 1.3", "slip is observable from vision alone",
         make_number_part("rank, of 4 states", RANKS, "vision", "rank", Bound("=", 4.0),
-                         Bound("=", 4.0),
-            "rank"),
+            Bound("=", 4.0), "rank"),
         make_smaller_part("vision alone / the slip itself", FIG5, VISION, "truth")),
     claim("Fig. 5", "time stamps beat a constant delay, lateral offset",
         *(
             make_smaller_part(f"proposed / constant {delay}{text}", scenario, PROPOSED, rival,
-                              max_ratio, "y_l")
+                max_ratio, "y_l")
             for scenario, text in _NOISES
-            for delay, rival, max_ratio in (("33 ms", FRAME, 0.80), ("17 ms, near the mean", MEAN,
-                                                                     None))
+            for delay, rival, max_ratio in (("33 ms", FRAME, 0.80),
+                ("17 ms, near the mean", MEAN, None))
         ),
         note="Against one frame the time stamps win; against the true mean delay there is no "
         "gain. One process noise for all; with one tuned to the offset for each of them the order "

@@ -1,13 +1,12 @@
 """A drive: from a scenario's fields to the time series of what the car did.
 
-Cars and controllers under test, as drives.
+Cars and controllers under test are drives too: of an environment of ours or of an outside plant.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from ...agents import make_agent
@@ -41,22 +40,18 @@ CALM: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Series:
-    """The motion of a car, (n,) each, at even times, SI units.
-
-    steer: front wheels. v_x, v_y, gamma, psi, X, Y: of the centre of gravity. moment: the yaw
-    moment delivered, N m. failed: the episode ended by a failure.
-    """
+    """The motion of a car at even times, shape (n,) each, SI units."""
 
     t: Array
-    steer: Array
-    v_x: Array
+    steer: Array  # of the front wheels
+    v_x: Array  # of the centre of gravity, as all that follow
     v_y: Array
     gamma: Array
     psi: Array
     X: Array
     Y: Array
-    moment: Array
-    failed: bool = False
+    moment: Array  # N m, the yaw moment delivered
+    failed: bool = False  # the episode ended by a failure
 
     def __post_init__(self) -> None:
         for name, values in vars(self).items():
@@ -65,16 +60,16 @@ class Series:
 
     @property
     def beta(self) -> Array:
-        """The sideslip angle in rad."""
+        """The sideslip angle (rad)."""
         return np.arctan2(self.v_y, self.v_x)
 
     @property
     def a_y(self) -> Array:
-        """The lateral acceleration in m/s2, v_y' + v_x gamma."""
+        """The lateral acceleration (m/s2), v_y' + v_x gamma."""
         return np.gradient(self.v_y, self.t) + self.v_x * self.gamma
 
     def interpolate(self, name: str, time: float) -> float:
-        """A signal at a time in s, between two samples on the line; NaN after the end."""
+        """Interpolate a signal at a time (s) between two samples; NaN after the end."""
         values = np.asarray(getattr(self, name))
         return float(np.interp(time, self.t, values, right=np.nan))
 
@@ -85,7 +80,7 @@ DriveFunction = Callable[[Fields], Series]
 Law = Callable[[Motion, float], float]
 """A yaw moment in N m from the true motion and the steering angle."""
 
-SPEED_GAIN = 10.0  # 1/s, of the speed that an outside plant's driver holds
+_SPEED_GAIN = 10.0  # 1/s, of the speed that an outside plant's driver holds
 
 
 def make_env_drive(
@@ -97,27 +92,32 @@ def make_env_drive(
     agent_options: Fields | None = None,
     **options: Any,
 ) -> DriveFunction:
-    """Drives of an environment of ours with a controller and, if named, its estimator.
+    """Make drives of an environment of ours with a controller and, if named, its estimator.
 
-    estimate: options of the estimator's wrapper. options: of the environment (vehicle, nominal,
-    control_period, model of an outside plant).
+    Args:
+        env_id: Id of the environment.
+        agent: Name of the controller.
+        estimator: Name of the estimator that it reads, "" for none.
+        seed: Seed of every drive.
+        estimate: Options of the estimator's wrapper.
+        agent_options: Options of the controller.
+        **options: Options of the environment (vehicle, nominal, control_period, model).
+
+    Returns:
+        The function that drives.
     """
 
     def run_drive(fields: Fields) -> Series:
         env = make_env(env_id, estimator, estimate, scenario=CALM | dict(fields), **options)
-        return _run_episode(env, make_agent(agent, env, **(agent_options or {})), seed)
+        base: Any = env.unwrapped
+        rows = []
+        for step in iterate_steps(env, make_agent(agent, env, **(agent_options or {})), seed):
+            info = step.info
+            rows.append([info["t"], info["steer"], *_get_motion(base.motion), info["yaw_moment"]])
+        env.close()
+        return _make_series(rows, bool(info["failure"]))
 
     return run_drive
-
-
-def _run_episode(env: gym.Env[Any, Any], agent: Any, seed: int) -> Series:
-    base: Any = env.unwrapped
-    rows = []
-    for step in iterate_steps(env, agent, seed):
-        info = step.info
-        rows.append([info["t"], info["steer"], *_get_motion(base.motion), info["yaw_moment"]])
-    env.close()
-    return _make_series(rows, bool(info["failure"]))
 
 
 def _make_series(rows: list[list[float]], failed: bool) -> Series:
@@ -132,23 +132,29 @@ def _get_motion(m: Motion) -> tuple[float, ...]:
 def make_plant_drive(
     model: str, law: Law | None = None, friction: float | None = None
 ) -> DriveFunction:
-    """Drives of an outside plant alone, its steering angle prescribed and no actuator's lag.
+    """Make drives of an outside plant alone, its steering angle prescribed and no actuator's lag.
 
-    model: of `OUTSIDE_PLANTS`. law: a yaw moment every millisecond. friction: of its tyres. The
-    field `acceleration` None holds the speed, 0 lets the car coast.
+    The scenario's field `acceleration` None holds the speed, 0 lets the car coast.
+
+    Args:
+        model: Name of the plant, of `OUTSIDE_PLANTS`.
+        law: Law of the yaw moment, evaluated every millisecond; None: no moment.
+        friction: Peak lateral friction of its tyres; None: CommonRoad's.
+
+    Returns:
+        The function that drives.
     """
 
     def run_drive(fields: Fields) -> Series:
         scenario = Scenario(**(CALM | dict(fields)))
         profile = make_steering_profile(scenario)
-        return simulate_plant(
-            OUTSIDE_PLANTS[model](friction),
-            lambda t: float(compute_steering(t / TICK, profile)),
-            scenario.range("speed")[0],
-            scenario.duration,
-            scenario.acceleration is None,
-            law,
-        )
+
+        def steering(t: float) -> float:
+            return float(compute_steering(t / TICK, profile))
+
+        speed, hold = scenario.range("speed")[0], scenario.acceleration is None
+        plant = OUTSIDE_PLANTS[model](friction)
+        return simulate_plant(plant, steering, speed, scenario.duration, hold, law)
 
     return run_drive
 
@@ -161,7 +167,7 @@ def simulate_plant(
     hold: bool = False,
     law: Law | None = None,
 ) -> Series:
-    """An outside plant from straight ahead under a steering angle (rad) over time (s).
+    """Simulate an outside plant from straight ahead under a steering angle (rad) over time (s).
 
     hold: a force keeps the speed (m/s); otherwise the car coasts.
     """
@@ -170,7 +176,7 @@ def simulate_plant(
     for k in range(round(duration / TICK)):
         steer, motion = steering(k * TICK), plant.motion
         moment = 0.0 if law is None else law(motion, steer)
-        push = plant.p.m * plant.p.R_w * SPEED_GAIN * (speed - motion.v_x) if hold else 0.0
+        push = plant.p.m * plant.p.R_w * _SPEED_GAIN * (speed - motion.v_x) if hold else 0.0
         turn = plant.p.R_w / plant.p.T_r * moment
         plant.step(OutsideInputs(steer, 0.5 * push - turn, 0.5 * push + turn), TICK)
         if not plant.is_finite:
@@ -180,7 +186,7 @@ def simulate_plant(
 
 
 def make_steering_profile(scenario: Scenario) -> Array:
-    """The numbers that `compute_steering` reads, of a scenario that draws nothing.
+    """Make the numbers that `compute_steering` reads, of a scenario that draws nothing.
 
     Raises ValueError for a range: a procedure leaves nothing to the seed.
     """
@@ -194,54 +200,45 @@ def make_steering_profile(scenario: Scenario) -> Array:
 
 @dataclass(frozen=True)
 class TestCar:
-    """A car on the proving ground. speed: m/s of the procedures that prescribe one.
-
-    ratio: of the steering wheel's angle to the front wheels'. length, front_overhang: m, of its
-    body, the overhang from the front axle forward.
-    """
+    """A car on the proving ground."""
 
     vehicle: Vehicle
-    speed: float
-    ratio: float
-    length: float
-    front_overhang: float
+    speed: float  # m/s, of the procedures that prescribe one
+    ratio: float  # of the steering wheel's angle to the front wheels'
+    length: float  # m, of its body
+    front_overhang: float  # m, of its body, from the front axle forward
 
     __test__ = False  # pytest would take it for tests
 
 
 ENV_ID, OUTSIDE_ID = "sideslip/YawFusion-v0", "sideslip/Outside-v0"
-RATIO = 16.0  # steering wheel to front wheels, a usual rack's
+_RATIO = 16.0  # steering wheel to front wheels, a usual rack's
 
 # The standards' 80 km/h is the passenger car's. The COMS oversteers and is unstable above 63 km/h;
 # half of 80 km/h is to it what 80 km/h is to a car.
 CARS: dict[str, TestCar] = {
-    "coms": TestCar(COMS, 40.0 / 3.6, RATIO, 2.395, 0.5),
-    "passenger-car": TestCar(PASSENGER_CAR, 80.0 / 3.6, RATIO, 4.2, 0.8),
+    "coms": TestCar(COMS, 40.0 / 3.6, _RATIO, 2.395, 0.5),
+    "passenger-car": TestCar(PASSENGER_CAR, 80.0 / 3.6, _RATIO, 4.2, 0.8),
 }
 
 
 def make_outside_car() -> TestCar:
-    """CommonRoad's BMW 320i at 80 km/h (needs the extra `outside`)."""
-    return TestCar(make_outside_vehicle(), 80.0 / 3.6, RATIO, 4.508, 0.8)
+    """Make CommonRoad's BMW 320i at 80 km/h (needs the extra `outside`)."""
+    return TestCar(make_outside_vehicle(), 80.0 / 3.6, _RATIO, 4.508, 0.8)
 
 
 @dataclass(frozen=True)
 class ProcedureEntry:
-    """A controller with the estimator it reads ("" where it reads none).
-
-    estimate: options of the estimator's wrapper. slow: whether it plans, and is left out of a quick
-    run. policies: by car, where the controller is learned; each has
-    the estimator of its training.
-    """
+    """A controller with the estimator that it reads ("" for none)."""
 
     agent: str
     estimator: str = ""
-    estimate: Mapping[str, Any] = field(default_factory=dict)
-    slow: bool = False
-    policies: Mapping[str, str] = field(default_factory=dict)
+    estimate: Mapping[str, Any] = field(default_factory=dict)  # options of the estimator's wrapper
+    slow: bool = False  # it plans, and is left out of a quick run
+    policies: Mapping[str, str] = field(default_factory=dict)  # learned, with its estimator, by car
 
     def get_configuration(self, car: str) -> tuple[str, str, Mapping[str, Any]]:
-        """(agent, estimator, its options) on one of `CARS`; another car has the passenger car's."""
+        """Get agent, estimator and its options on a car; the passenger car's if not of `CARS`."""
         if not self.policies:
             return self.agent, self.estimator, self.estimate
         name = self.policies.get(car, self.policies["passenger-car"])
@@ -249,7 +246,7 @@ class ProcedureEntry:
         return name, card.estimator, card.estimator_options
 
     def drive(self, car: str, seed: int = 0) -> DriveFunction:
-        """Drives of one of `CARS`; references stay within what friction can hold."""
+        """Make the drives of one of `CARS`; references stay within what friction can hold."""
         options: dict[str, Any] = {"vehicle": CARS[car].vehicle.to_dict(), "reference": "limited"}
         agent, estimator, estimate = self.get_configuration(car)
         return make_env_drive(ENV_ID, agent, estimator, seed, estimate, **options)
@@ -260,6 +257,7 @@ _FRICTION = {
     "outputs": [*_TYRES["outputs"], "inverse_friction"],
     "options": {"inverse_friction_sd": 0.3},
 }
+_DISTILLED = {"coms": "distill-coms-yaw", "passenger-car": "distill-car-yaw"}
 ENTRIES = (
     ProcedureEntry("none"),
     ProcedureEntry("feedforward"),
@@ -268,7 +266,5 @@ ENTRIES = (
     ProcedureEntry("esc"),
     ProcedureEntry("adaptive-lqr", "joint", _TYRES),
     ProcedureEntry("adaptive-nmpc", "joint", _FRICTION, slow=True),
-    ProcedureEntry(
-        "distilled", policies={"coms": "distill-coms-yaw", "passenger-car": "distill-car-yaw"}
-    ),
+    ProcedureEntry("distilled", policies=_DISTILLED),
 )

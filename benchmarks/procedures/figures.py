@@ -12,12 +12,12 @@ from ...envs.scenarios.road import Section
 from ..harness.results import Suite
 from ..report.figures import draw_time_series, draw_track
 from . import fmvss126, iso3888, iso7401
-from .drive import CARS, ENTRIES
+from .drive import CARS
 from .tables import CaseResults, ProcedureCase, SineDwellOutcome, Transient, select_cases
 
 
 def add(suite: Suite, done: CaseResults) -> None:
-    """Every figure of what was found."""
+    """Add every figure of the results to a suite."""
     for car in CARS:
         car_results = {case: result for case, result in done.items() if case.car == car}
         title = f"FMVSS 126, {car}: yaw rate at 5 A over its own peak"
@@ -25,44 +25,39 @@ def add(suite: Suite, done: CaseResults) -> None:
             "Bars: at most 35 % and 20 % of the peak after the steer reversal may be left. A car "
             "that spins before completion of steer is left out."
         )
-        suite.figures.append((title, draw_yaw_rates(select_cases(car_results, "fmvss-126")), text))
+        suite.figures.append((title, _draw_yaw_rates(select_cases(car_results, "fmvss-126")), text))
         for name in iso3888.TRACKS:
-            runs = {
-                case: _choose_best(result)
-                for case, result in select_cases(car_results, name).items()
-            }
-            speeds = ", ".join(
-                f"{_get_label(k)} {3.6 * run.speed:.0f} km/h" for k, run in runs.items()
-            )
+            attempts = select_cases(car_results, name)
+            runs = {case: _choose_best(result) for case, result in attempts.items()}
+            speeds = ", ".join(f"{k.agent} {3.6 * run.speed:.0f} km/h" for k, run in runs.items())
             text = f"The fastest clean run, or the slowest where none is clean: {speeds}."
-            suite.figures.append((f"{name}, {car}: way and cones", draw_cones(runs), text))
+            suite.figures.append((f"{name}, {car}: way and cones", _draw_cones(runs), text))
         for result in select_cases(car_results, "iso-7401").values():
             text = "Dots: measured by a swept sine, no control. Line: the linear model."
             title = f"ISO 7401, {car}: frequency response to steering"
-            suite.figures.append((title, draw_bode(result), text))
+            suite.figures.append((title, _draw_bode(result), text))
 
 
-def draw_yaw_rates(done: dict[ProcedureCase, SineDwellOutcome]) -> Any:
-    """Yaw rate at 5 A as a share of its peak after the reversal, with the two limits."""
+def _draw_yaw_rates(done: dict[ProcedureCase, SineDwellOutcome]) -> Any:
+    """Draw the yaw rate at 5 A over its peak after the reversal, with the two limits."""
     t = max((result.shown.t for result in done.values()), key=len)
-    complete = {
-        k: result for k, result in done.items() if result.shown.t[-1] >= fmvss126.COMPLETION
+    series = {
+        case.agent: _compute_shares(result, t)
+        for case, result in done.items()
+        if result.shown.t[-1] >= fmvss126.COMPLETION
     }
-    series = {_get_label(case): _compute_shares(result, t) for case, result in complete.items()}
     figure = draw_time_series(t, series, "yaw rate / its peak after the reversal")
     for time, max_ratio in fmvss126.RATIOS:
         position = fmvss126.COMPLETION + time
         for level in (max_ratio, -max_ratio):
-            line = {"color": INK, "width": 3}
-            figure.add_shape(
-                type="line", x0=position - 0.1, x1=position + 0.1, y0=level, y1=level, line=line
-            )
+            ends = {"x0": position - 0.1, "x1": position + 0.1, "y0": level, "y1": level}
+            figure.add_shape(type="line", **ends, line={"color": INK, "width": 3})
     figure.update_yaxes(range=[-1.5, 1.5])
     return figure
 
 
 def _compute_shares(result: SineDwellOutcome, t: Array) -> Array:
-    """The yaw rate over its peak at the times t; NaN after the drive's end."""
+    """Compute the yaw rate over its peak at the times t; NaN after the drive's end."""
     shown = result.shown
     steered = (shown.t >= fmvss126.REVERSAL) & (shown.t <= fmvss126.COMPLETION)
     peak = np.max(-shown.gamma[steered], initial=1e-9)  # the first half steers to the left
@@ -70,18 +65,18 @@ def _compute_shares(result: SineDwellOutcome, t: Array) -> Array:
 
 
 def _choose_best(runs: list[iso3888.TrackRun]) -> iso3888.TrackRun:
-    """The fastest clean run, or the first of all."""
+    """Choose the fastest clean run, or the first of all."""
     return max((run for run in runs if run.passed), key=lambda run: run.speed, default=runs[0])
 
 
-def draw_cones(done: dict[ProcedureCase, iso3888.TrackRun]) -> Any:
-    """The ways of the centre of gravity, from where the first lane begins, and the cones."""
+def _draw_cones(done: dict[ProcedureCase, iso3888.TrackRun]) -> Any:
+    """Draw the paths of the centre of gravity, from where the first lane begins, and the cones."""
     paths: dict[str, tuple[Array, Array]] = {}
     lanes: tuple[Section, ...] = ()
     speed = 0.0
     for case, run in done.items():
         speed = run.speed
-        paths[_get_label(case)] = run.series.X - speed * iso3888.ONSET, run.series.Y
+        paths[case.agent] = run.series.X - speed * iso3888.ONSET, run.series.Y
         lanes = iso3888.make_lanes(CARS[case.car], case.procedure, speed)
     figure = draw_track(paths)
     places = [
@@ -98,15 +93,13 @@ def draw_cones(done: dict[ProcedureCase, iso3888.TrackRun]) -> Any:
     return figure
 
 
-def draw_bode(result: Transient) -> Any:
-    """Magnitude and phase of both outputs over the frequency."""
+def _draw_bode(result: Transient) -> Any:
+    """Draw magnitude and phase of both outputs over the frequency."""
     figure = make_subplots(rows=2, cols=2, shared_xaxes=True, vertical_spacing=0.06)
     for column, name in enumerate(iso7401.OUTPUTS, 1):
         measured, linear = result.sweep[name], result.linear_sweep[name]
-        for H, mode, label in (
-            (measured.H, "markers", "measured"),
-            (linear, "lines", "linear model"),
-        ):
+        kinds = (measured.H, "markers", "measured"), (linear, "lines", "linear model")
+        for H, mode, label in kinds:
             for row, values in ((1, np.abs(H)), (2, np.degrees(np.unwrap(np.angle(H))))):
                 legend = {"name": label, "legendgroup": label, "showlegend": row == column == 1}
                 pen = {"marker": {"color": find_colour("two-dof")}, "line": {"color": GREY}}
@@ -119,7 +112,3 @@ def draw_bode(result: Transient) -> Any:
     legend = {"orientation": "h", "x": 0, "xanchor": "left", "y": 1.02, "yanchor": "bottom"}
     figure.update_layout(height=520, legend=legend)
     return figure
-
-
-def _get_label(case: ProcedureCase) -> str:
-    return ENTRIES[case.contestant].agent

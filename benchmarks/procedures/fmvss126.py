@@ -11,11 +11,8 @@ A run passes where
 - from 5 A on, the centre of gravity has moved sideways by 1.83 m or more 1.07 s after the
   beginning of steer (S5.2.3).
 The peak is that of the yaw rate towards the reversed steering, between the reversal and the
-completion of steer: a car that spins has no later one. Magnitudes are compared.
-
-The standard's speed is 80 km/h. A car that does not go as fast is tested at its own top speed. The
-0.3 g and the 1.83 m stay: on the same road the same lateral accelerations are within reach, and the
-way that a lateral acceleration makes in a second does not depend on the speed.
+completion of steer: a car that spins has no later one. A car that does not reach the standard's
+80 km/h is tested at its top speed, with the same 0.3 g and 1.83 m.
 """
 
 import math
@@ -30,13 +27,13 @@ from .drive import DriveFunction, Fields, Series, TestCar
 
 FREQUENCY, DWELL = 0.7, 0.5  # Hz, s
 ONSET = 0.5  # s, straight ahead before
-AFTER = 2.0  # s, recorded after completion of steer
-RAMP_RATE = math.radians(13.5)  # rad/s at the steering wheel
+_AFTER = 2.0  # s, recorded after completion of steer
+_RAMP_RATE = math.radians(13.5)  # rad/s at the steering wheel
 A_AT, A_FROM, A_TO = 0.3 * GRAVITY, 0.1 * GRAVITY, 0.375 * GRAVITY
 FIRST, STEP, LAST = 1.5, 0.5, 6.5  # of A
 MIN_AMPLITUDE, MAX_AMPLITUDE = math.radians(270.0), math.radians(300.0)  # at the steering wheel
 RATIOS = ((1.0, 0.35), (1.75, 0.20))  # s after completion of steer, share of the peak
-RESPONSIVE = 5.0  # of A
+_RESPONSIVE = 5.0  # of A
 SIDEWAYS, SIDEWAYS_AT = 1.83, 1.07  # m, s after the beginning of steer
 
 REVERSAL = ONSET + 0.5 / FREQUENCY
@@ -45,50 +42,38 @@ COMPLETION = ONSET + 1.0 / FREQUENCY + DWELL
 
 @dataclass(frozen=True)
 class SineDwellRun:
-    """A sine with dwell: its amplitude at the steering wheel in rad, with its sign, and in A.
+    """A sine with dwell and its measures, which are NaN from where the car's drive ended."""
 
-    ratio_1, ratio_2: the yaw rate at the two times over its peak. sideways: m. All NaN from where
-    the car's drive ended.
-    """
-
-    amplitude: float
-    multiple: float
-    ratio_1: float
+    amplitude: float  # rad at the steering wheel, with its sign
+    multiple: float  # of A
+    ratio_1: float  # yaw rate over its peak at the first time of `RATIOS`
     ratio_2: float
-    sideways: float
+    sideways: float  # m
 
     @property
     def stable(self) -> bool:
-        """S5.2.1 and S5.2.2; NaN is not."""
+        """Whether S5.2.1 and S5.2.2 are met; NaN does not."""
         return self.ratio_1 <= RATIOS[0][1] and self.ratio_2 <= RATIOS[1][1]
 
     @property
-    def responsive(self) -> bool:
-        """S5.2.3, where it asks."""
-        return self.multiple < RESPONSIVE or self.sideways >= SIDEWAYS
-
-    @property
     def passed(self) -> bool:
-        """Both."""
-        return self.stable and self.responsive
+        """Whether S5.2.3 is met too, from 5 A on."""
+        return self.stable and (self.multiple < _RESPONSIVE or self.sideways >= SIDEWAYS)
 
 
-def make_slow_steer(car: TestCar, side: float, max_acceleration: float = 0.5 * GRAVITY) -> Fields:
-    """The slowly increasing steer: until a linear car reaches `max_acceleration` (m/s2), at
-    least 2 s long."""
+def _make_slow_steer(car: TestCar, side: float, max_acceleration: float = 0.5 * GRAVITY) -> Fields:
+    """Make the slowly rising steer, 2 s or more, until a linear car has an acceleration (m/s2)."""
     seconds = 30.0
+    amplitude = side * _RAMP_RATE / car.ratio * seconds
     return {
-        "steering": "ramp",
-        "onset": ONSET,
-        "amplitude": side * RAMP_RATE / car.ratio * seconds,
-        "hold": seconds,
+        "steering": "ramp", "onset": ONSET, "amplitude": amplitude, "hold": seconds,
         "speed": car.speed,
         "duration": ONSET + seconds * min(1.0, max_acceleration / (2.0 * GRAVITY)),
-    }
+    }  # fmt: skip
 
 
 def fit_reference_angle(series: Series, ratio: float) -> float:
-    """|A| in rad at the steering wheel: where the line through 0.1 to 0.375 g crosses 0.3 g.
+    """Fit |A| (rad at the steering wheel): where the line through 0.1 to 0.375 g crosses 0.3 g.
 
     Raises ValueError where the car never gets there.
     """
@@ -102,53 +87,42 @@ def fit_reference_angle(series: Series, ratio: float) -> float:
 
 
 def list_amplitudes(A: float) -> Array:
-    """Steering wheel angles in rad of a series, from 1.5 A on."""
+    """List the steering wheel angles (rad) of a series, from 1.5 A on."""
     last = MAX_AMPLITUDE if LAST * A > MAX_AMPLITUDE else max(LAST * A, MIN_AMPLITUDE)
     count = math.ceil(round((last / A - FIRST) / STEP, 9))
     return np.append(A * (FIRST + STEP * np.arange(count)), last)
 
 
 def make_sine_with_dwell(car: TestCar, amplitude: float) -> Fields:
-    """A run; amplitude: rad at the steering wheel, its sign the side of the first half."""
+    """Make a run of an amplitude (rad at the steering wheel), signed as its first half."""
     return {
-        "steering": "sine-with-dwell",
-        "onset": ONSET,
-        "amplitude": amplitude / car.ratio,
-        "frequency": FREQUENCY,
-        "hold": DWELL,
-        "speed": car.speed,
-        "acceleration": 0.0,
-        "duration": COMPLETION + AFTER,
-    }
+        "steering": "sine-with-dwell", "onset": ONSET, "amplitude": amplitude / car.ratio,
+        "frequency": FREQUENCY, "hold": DWELL, "speed": car.speed, "acceleration": 0.0,
+        "duration": COMPLETION + _AFTER,
+    }  # fmt: skip
 
 
 def evaluate_run(series: Series, amplitude: float, A: float) -> SineDwellRun:
-    """The result of a run; amplitude and A: rad at the steering wheel."""
+    """Evaluate a run; amplitude and A in rad at the steering wheel."""
     towards = -math.copysign(1.0, amplitude)
     steered = (series.t >= REVERSAL) & (series.t <= COMPLETION)
     peak = float(np.max(towards * series.gamma[steered], initial=0.0))
     later = [abs(series.interpolate("gamma", COMPLETION + time)) for time, _ in RATIOS]
     ratio_1, ratio_2 = (rate / peak if peak > 0.0 else math.nan for rate in later)
     multiple = round(abs(amplitude) / A, 6)  # 5 A is no less than 5 A
-    return SineDwellRun(amplitude, multiple, ratio_1, ratio_2, _compute_sideways(series))
-
-
-def _compute_sideways(series: Series) -> float:
-    """m across the heading at the beginning of steer."""
-    end = ONSET + SIDEWAYS_AT
-    dX, dY = (
-        series.interpolate(name, end) - series.interpolate(name, ONSET) for name in ("X", "Y")
-    )
-    psi = series.interpolate("psi", ONSET)
-    return abs(dY * math.cos(psi) - dX * math.sin(psi))
+    start = {name: series.interpolate(name, ONSET) for name in ("X", "Y", "psi")}
+    dX, dY = (series.interpolate(name, ONSET + SIDEWAYS_AT) - start[name] for name in ("X", "Y"))
+    # across the heading at the beginning of steer
+    sideways = abs(dY * math.cos(start["psi"]) - dX * math.sin(start["psi"]))
+    return SineDwellRun(amplitude, multiple, ratio_1, ratio_2, sideways)
 
 
 @dataclass(frozen=True)
 class SineDwellResult:
-    """A: rad at the steering wheel, the mean of both sides'. runs: as they were driven."""
+    """The runs of a car."""
 
-    A: float
-    runs: tuple[SineDwellRun, ...]
+    A: float  # rad at the steering wheel, the mean of both sides'
+    runs: tuple[SineDwellRun, ...]  # as they were driven
 
     @property
     def passed(self) -> bool:
@@ -163,11 +137,9 @@ class SineDwellResult:
 
 
 def measure_reference_angle(drive: DriveFunction, car: TestCar) -> float:
-    """A in rad at the steering wheel, the mean of a turn to the left and one to the right."""
-    angles = [
-        fit_reference_angle(drive(make_slow_steer(car, side)), car.ratio) for side in (1.0, -1.0)
-    ]
-    return float(np.mean(angles))
+    """Measure A (rad at the steering wheel), the mean of turns to the left and to the right."""
+    turns = [drive(_make_slow_steer(car, side)) for side in (1.0, -1.0)]
+    return float(np.mean([fit_reference_angle(turn, car.ratio) for turn in turns]))
 
 
 def run(
@@ -176,7 +148,17 @@ def run(
     A: float | None = None,
     multiples: Sequence[float] | None = None,
 ) -> SineDwellResult:
-    """The whole procedure. A: where it is known. multiples: of A, in place of the series."""
+    """Run the procedure.
+
+    Args:
+        drive: Drives of the car.
+        car: The car.
+        A: Reference angle (rad at the steering wheel); None: it is measured.
+        multiples: Amplitudes (of A); None: the standard's series.
+
+    Returns:
+        The runs, both sides of each amplitude.
+    """
     A = measure_reference_angle(drive, car) if A is None else A
     angles = list_amplitudes(A) if multiples is None else A * np.asarray(multiples)
     signed = [side * angle for angle in angles.tolist() for side in (1.0, -1.0)]

@@ -21,7 +21,7 @@ from ...envs.scenarios.road import Section, make_sections
 from .drive import DriveFunction, Fields, Series, TestCar
 
 TRACKS = ("iso-3888-1", "iso-3888-2")
-STANDARD_SPEED = 80.0 / 3.6  # m/s
+_STANDARD_SPEED = 80.0 / 3.6  # m/s
 ONSET = 1.0  # s, before the first lane
 RUN_OUT = 10.0  # m, after the last lane
 DRIVERS: tuple[Fields, ...] = tuple(
@@ -32,30 +32,26 @@ DRIVERS: tuple[Fields, ...] = tuple(
 
 @dataclass(frozen=True)
 class TrackRun:
-    """One run through a track. speed: m/s.
+    """One run through a track."""
 
-    margins: m, by lane the least distance between the body and the lane's edge, negative where
-    a cone falls; NaN of a lane that the car did not drive through.
-    """
-
-    speed: float
-    margins: tuple[float, ...]
+    speed: float  # m/s
+    margins: tuple[float, ...]  # m, by lane, to its edge; below 0 a cone falls, NaN: not driven
     series: Series
 
     @property
     def min_margin(self) -> float:
-        """The least margin in m; minus infinity where the track was not driven to its end."""
+        """The smallest margin (m); minus infinity where the track was not driven to its end."""
         is_complete = not self.series.failed and all(margin == margin for margin in self.margins)
         return min(self.margins) if is_complete else -math.inf
 
     @property
     def passed(self) -> bool:
-        """Without a cone, and not failed."""
+        """Whether no cone falls and the car does not fail."""
         return self.min_margin >= 0.0
 
 
 def compute_corners(series: Series, car: TestCar) -> Array:
-    """(n, 4, 2) of the body's corners on the ground in m, going round it."""
+    """Compute the body's corners on the ground (m), going round it: (n, 4, 2)."""
     front = car.vehicle.front_arm + car.front_overhang
     half = 0.5 * car.vehicle.width
     rear = front - car.length
@@ -67,7 +63,7 @@ def compute_corners(series: Series, car: TestCar) -> Array:
 
 
 def compute_margin(body: Array, lane: Section) -> float:
-    """The least distance in m between a body (n, 4, 2) and the edges of a lane that it crosses.
+    """Compute the smallest distance (m) of a body (n, 4, 2) to the edges of a lane that it crosses.
 
     The body's sides are cut where the lane begins and ends: a side may touch the first or the
     last cone with all corners outside. NaN where the body does not reach the lane's end.
@@ -91,23 +87,23 @@ def compute_margin(body: Array, lane: Section) -> float:
 
 
 def make_lanes(car: TestCar, track: str, speed: float) -> tuple[Section, ...]:
-    """The lanes where the car drives them at a speed in m/s."""
-    return make_sections(track, car.vehicle.width, speed * ONSET, compute_length_share(car))
+    """Make the lanes where the car drives them at a speed (m/s)."""
+    return make_sections(track, car.vehicle.width, speed * ONSET, _compute_length_share(car))
 
 
-def compute_length_share(car: TestCar) -> float:
-    """The share of the standards' lengths that the car drives."""
-    return min(1.0, car.speed / STANDARD_SPEED)
+def _compute_length_share(car: TestCar) -> float:
+    """Compute the fraction of the standards' lengths that the car drives."""
+    return min(1.0, car.speed / _STANDARD_SPEED)
 
 
-def make_lane_change(car: TestCar, track: str, speed: float) -> Fields:
-    """A run through a track at a speed in m/s."""
-    last = make_sections(track, car.vehicle.width, 0.0, compute_length_share(car))[-1]
+def _make_lane_change(car: TestCar, track: str, speed: float) -> Fields:
+    """Make a run through a track at a speed (m/s)."""
+    last = make_sections(track, car.vehicle.width, 0.0, _compute_length_share(car))[-1]
     way = last.start + last.length + RUN_OUT
     return {
         "steering": "driver",
         "path": track,
-        "path_speed": speed / compute_length_share(car),
+        "path_speed": speed / _compute_length_share(car),
         "onset": ONSET,
         "speed": speed,
         "acceleration": None if track == TRACKS[0] else 0.0,
@@ -116,32 +112,27 @@ def make_lane_change(car: TestCar, track: str, speed: float) -> Fields:
 
 
 def evaluate_run(series: Series, car: TestCar, track: str, speed: float) -> TrackRun:
-    """A run's margins."""
-    body = compute_corners(series, car)
-    lanes = make_lanes(car, track, speed)
+    """Evaluate a run's margins."""
+    body, lanes = compute_corners(series, car), make_lanes(car, track, speed)
     return TrackRun(speed, tuple(compute_margin(body, lane) for lane in lanes), series)
 
 
-def try_speed(drive: DriveFunction, car: TestCar, track: str, speed: float) -> TrackRun:
-    """The first clean run of a driver at a speed in m/s, or the one that came closest to it."""
-    best: TrackRun | None = None
+def _try_speed(drive: DriveFunction, car: TestCar, track: str, speed: float) -> TrackRun:
+    """Try a speed (m/s): the first clean run of a driver, or the one that came closest to it."""
+    runs = []
     for driver in DRIVERS:
-        candidate = evaluate_run(
-            drive({**make_lane_change(car, track, speed), **driver}), car, track, speed
-        )
-        if candidate.passed:
-            return candidate
-        if best is None or candidate.min_margin > best.min_margin:
-            best = candidate
-    assert best is not None
-    return best
+        series = drive({**_make_lane_change(car, track, speed), **driver})
+        runs.append(evaluate_run(series, car, track, speed))
+        if runs[-1].passed:
+            return runs[-1]
+    return max(runs, key=lambda track_run: track_run.min_margin)
 
 
 def run(drive: DriveFunction, car: TestCar, track: str, speeds: Sequence[float]) -> list[TrackRun]:
-    """One attempt at each of the speeds, m/s."""
-    return [try_speed(drive, car, track, speed) for speed in speeds]
+    """Drive one attempt at each of the speeds (m/s)."""
+    return [_try_speed(drive, car, track, speed) for speed in speeds]
 
 
 def find_highest_speed(runs: Sequence[TrackRun]) -> float:
-    """The highest speed in m/s of a clean run; 0 where there is none."""
+    """Find the highest speed (m/s) of a clean run; 0 where there is none."""
     return max((track_run.speed for track_run in runs if track_run.passed), default=0.0)

@@ -14,45 +14,40 @@ from ...envs.task import make_reference_params
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from .drive import DriveFunction, Fields, Series, TestCar
 
-SETTLE = 3.0  # s, at the first speed
+_SETTLE = 3.0  # s, at the first speed
 LINEAR_FROM, LINEAR_TO = 0.05 * GRAVITY, 0.25 * GRAVITY  # the range of the slope
 
 
 @dataclass(frozen=True)
 class Handling:
-    """The diagram, (n,) each: a_y in m/s2 and angle in rad; K in rad s2/m; theory: K's."""
+    """The handling diagram, shape (n,) each, and its slope."""
 
-    a_y: Array
-    angle: Array
-    K: float
-    theory: float
+    a_y: Array  # m/s2
+    angle: Array  # rad
+    K: float  # understeer gradient, rad s2/m
+    theory: float  # K of the linear model
 
 
 def compute_understeer_gradient(vehicle: Vehicle) -> float:
-    """K in rad s2/m of the linear model."""
+    """Compute K (rad s2/m) of the linear model."""
     return float(make_reference_params(vehicle).G) * vehicle.wheelbase
 
 
-def make_circle(car: TestCar, steer: float, first: float, last: float, seconds: float) -> Fields:
-    """A constant steering angle (rad) while the speed rises from the first to the last (m/s)."""
+def _make_circle(car: TestCar, steer: float, first: float, last: float, seconds: float) -> Fields:
+    """Make a constant steering angle (rad) while the speed rises from first to last (m/s)."""
     return {
-        "steering": "held-step",
-        "amplitude": steer,
-        "onset": 0.0,
-        "speed": first,
-        "speed_change": last - first,
-        "change_start": SETTLE,
-        "change_length": seconds,
-        "duration": SETTLE + seconds,
-    }
+        "steering": "held-step", "amplitude": steer, "onset": 0.0, "speed": first,
+        "speed_change": last - first, "change_start": _SETTLE, "change_length": seconds,
+        "duration": _SETTLE + seconds,
+    }  # fmt: skip
 
 
 def compute_handling(series: Series, vehicle: Vehicle) -> Handling:
-    """The handling diagram of a circle, and the slope in its linear range.
+    """Compute the handling diagram of a circle, and the slope in its linear range.
 
-    Raises ValueError where the car does not reach the linear range's end.
+    Raises ValueError where the car does not reach the end of that range.
     """
-    settled = series.t >= SETTLE
+    settled = series.t >= _SETTLE
     side = np.sign(np.mean(series.gamma[settled]))
     a_y = side * (series.v_x * series.gamma)[settled]  # quasi-steady: v_y' is left out
     path = vehicle.wheelbase * side * (series.gamma / series.v_x)[settled]
@@ -70,8 +65,17 @@ def run(
     max_acceleration: float = 0.5 * GRAVITY,
     seconds: float = 60.0,
 ) -> Handling:
-    """Drive a circle on which the linear car would reach `max_acceleration` (m/s2) at the car's
-    own speed."""
+    """Drive a circle on which the linear car would reach an acceleration at its full speed.
+
+    Args:
+        drive: Drives of the car.
+        car: The car.
+        max_acceleration: Lateral acceleration (m/s2).
+        seconds: Time in which the speed rises (s).
+
+    Returns:
+        The handling diagram.
+    """
     v, K = car.speed, compute_understeer_gradient(car.vehicle)
     steer = (car.vehicle.wheelbase / v**2 + K) * max_acceleration
-    return compute_handling(drive(make_circle(car, steer, 0.2 * v, v, seconds)), car.vehicle)
+    return compute_handling(drive(_make_circle(car, steer, 0.2 * v, v, seconds)), car.vehicle)

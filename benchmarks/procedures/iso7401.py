@@ -21,64 +21,54 @@ from ...envs.vehicle.linear import make_bicycle_model
 from ...envs.vehicle.parameters import Vehicle
 from .drive import DriveFunction, Fields, Series, TestCar
 
-Complex = npt.NDArray[np.complex128]
+_Complex = npt.NDArray[np.complex128]
 
 ONSET = 1.0  # s
 LOWEST, HIGHEST = 0.2, 2.0  # Hz
-SEGMENT = 10.0  # s, of the averaged periodograms
+_SEGMENT = 10.0  # s, of the averaged periodograms
 OUTPUTS = ("gamma", "a_y")
 
 
 @dataclass(frozen=True)
 class StepResponse:
-    """gain: steady state per rad of steering. response_time, peak_time: s. overshoot: a share."""
+    """The numbers of a step of the steering angle."""
 
-    gain: float
-    response_time: float
-    peak_time: float
-    overshoot: float
+    gain: float  # steady state per rad of steering
+    response_time: float  # s
+    peak_time: float  # s
+    overshoot: float  # fraction of the steady state
 
 
 @dataclass(frozen=True)
 class FrequencyResponse:
-    """(k,) each: frequency in Hz, H (per rad of steering), coherence, sd of H (one part of it)."""
+    """A frequency response, shape (k,) each."""
 
-    frequency: Array
-    H: Complex
+    frequency: Array  # Hz
+    H: _Complex  # per rad of steering
     coherence: Array
-    sd: Array
+    sd: Array  # of the real or the imaginary part of H
 
 
 def make_step(car: TestCar, steer: float, seconds: float = 4.0) -> Fields:
-    """A step of the steering angle (rad) that is held."""
-    return {
-        "steering": "held-step",
-        "amplitude": steer,
-        "onset": ONSET,
-        "speed": car.speed,
-        "duration": ONSET + seconds,
-    }
+    """Make a step of the steering angle (rad) that is held."""
+    steering = {"steering": "held-step", "amplitude": steer, "onset": ONSET}
+    return steering | {"speed": car.speed, "duration": ONSET + seconds}
 
 
-def make_sweep(car: TestCar, steer: float, seconds: float = 100.0) -> Fields:
-    """A sine of an amplitude (rad) whose frequency rises from 0.05 to 2.5 Hz.
+def _make_sweep(car: TestCar, steer: float, seconds: float = 100.0) -> Fields:
+    """Make a sine of an amplitude (rad) whose frequency rises from 0.05 to 2.5 Hz.
 
     It has passed half a segment when it comes to the lowest frequency of the standard.
     """
     return {
-        "steering": "sweep",
-        "amplitude": steer,
-        "onset": ONSET,
-        "frequency": 0.25 * LOWEST,
-        "frequency_2": 1.25 * HIGHEST,
-        "hold": seconds,
-        "speed": car.speed,
+        "steering": "sweep", "amplitude": steer, "onset": ONSET, "frequency": 0.25 * LOWEST,
+        "frequency_2": 1.25 * HIGHEST, "hold": seconds, "speed": car.speed,
         "duration": ONSET + seconds + 2.0,
-    }
+    }  # fmt: skip
 
 
 def compute_step_response(t: Array, steer: Array, output: Array) -> StepResponse:
-    """The standard's numbers of a step that is held to the end; t, steer, output: (n,).
+    """Compute the standard's numbers of a step that is held to the end; t, steer, output: (n,).
 
     The steady state is the mean of the last half second. Raises ValueError without a step.
     """
@@ -89,16 +79,12 @@ def compute_step_response(t: Array, steer: Array, output: Array) -> StepResponse
     share = output / steady
     start = _find_crossing(t, steer / end, 0.5)
     peak = int(np.argmax(share))
-    return StepResponse(
-        steady / end,
-        _find_crossing(t, share, 0.9) - start,
-        float(t[peak]) - start,
-        max(0.0, float(share[peak]) - 1.0),
-    )
+    response_time, peak_time = _find_crossing(t, share, 0.9) - start, float(t[peak]) - start
+    return StepResponse(steady / end, response_time, peak_time, max(0.0, float(share[peak]) - 1.0))
 
 
 def _find_crossing(t: Array, values: Array, level: float) -> float:
-    """When the values first pass the level, on the line between two samples."""
+    """Find when the values first pass the level, on the line between two samples."""
     k = int(np.argmax(values >= level))
     if k == 0:
         return float(t[0]) if values[0] >= level else math.nan
@@ -107,9 +93,9 @@ def _find_crossing(t: Array, values: Array, level: float) -> float:
 
 
 def estimate_frequency_response(
-    t: Array, steer: Array, output: Array, segment: float = SEGMENT
+    t: Array, steer: Array, output: Array, segment: float = _SEGMENT
 ) -> FrequencyResponse:
-    """The frequency response of output to steering between 0.2 and 2 Hz; t, steer, output: (n,)."""
+    """Estimate the frequency response of output to steering from 0.2 to 2 Hz; arrays: (n,)."""
     from scipy.signal import csd, welch
 
     rate = (len(t) - 1) / float(t[-1] - t[0])
@@ -128,8 +114,10 @@ def estimate_frequency_response(
     return FrequencyResponse(frequency[in_range], H, coherence, sd)
 
 
-def compute_linear_response(vehicle: Vehicle, speed: float, frequency: Array) -> dict[str, Complex]:
-    """(k,) of the linear model's yaw rate and lateral acceleration to steering, by output."""
+def compute_linear_response(
+    vehicle: Vehicle, speed: float, frequency: Array
+) -> dict[str, _Complex]:
+    """Compute the linear model's response to steering by output, shape (k,) each."""
     model = make_bicycle_model(vehicle, speed)
     B = model.B[:, 0]
     turned = [np.linalg.solve(2j * np.pi * f * np.eye(2) - model.A, B) for f in frequency]
@@ -139,32 +127,25 @@ def compute_linear_response(vehicle: Vehicle, speed: float, frequency: Array) ->
 
 
 def compute_linear_step(vehicle: Vehicle, speed: float, series: Series) -> dict[str, StepResponse]:
-    """The numbers of the linear model under the same steering, by output."""
+    """Compute the numbers of the linear model under the same steering, by output."""
     from scipy.signal import lsim
 
     model = make_bicycle_model(vehicle, speed)
     A, B = model.A, model.B[:, :1]
     C = np.vstack([[0.0, 1.0], speed * (A[0] + [0.0, 1.0])])
     D = np.array([[0.0], [speed * B[0, 0]]])
-    outputs = lsim((A, B, C, D), series.steer, series.t)[1]
-    return {
-        name: compute_step_response(series.t, series.steer, outputs[:, i])
-        for i, name in enumerate(OUTPUTS)
-    }
+    outputs = zip(OUTPUTS, lsim((A, B, C, D), series.steer, series.t)[1].T, strict=True)
+    return {name: compute_step_response(series.t, series.steer, y) for name, y in outputs}
 
 
 def compute_responses(series: Series) -> dict[str, StepResponse]:
-    """The numbers of yaw rate and lateral acceleration after a step."""
-    return {
-        name: compute_step_response(series.t, series.steer, getattr(series, name))
-        for name in OUTPUTS
-    }
+    """Compute the numbers of yaw rate and lateral acceleration after a step, by output."""
+    t, steer = series.t, series.steer
+    return {name: compute_step_response(t, steer, getattr(series, name)) for name in OUTPUTS}
 
 
 def run_sweep(drive: DriveFunction, car: TestCar, steer: float) -> dict[str, FrequencyResponse]:
-    """The frequency responses of yaw rate and lateral acceleration."""
-    series = drive(make_sweep(car, steer))
-    return {
-        name: estimate_frequency_response(series.t, series.steer, getattr(series, name))
-        for name in OUTPUTS
-    }
+    """Drive a sweep of an amplitude (rad); return the frequency responses by output."""
+    series = drive(_make_sweep(car, steer))
+    t, steered = series.t, series.steer
+    return {x: estimate_frequency_response(t, steered, getattr(series, x)) for x in OUTPUTS}

@@ -19,33 +19,25 @@ from . import fmvss126
 from .drive import OUTSIDE_ID, Law, ProcedureEntry, make_outside_car, make_plant_drive
 
 MODEL = "drift"
-LIMIT = 500.0  # N m
-GAIN = 2e4  # N m s/rad
+_LIMIT = 500.0  # N m
+_GAIN = 2e4  # N m s/rad
 FAILS_AT, PASSES_AT = 5.0, 6.5  # of A
 
-SCENARIO: dict[str, Any] = {
-    "name": "outside-lane-change",
-    "steering": "lane-change",
-    "duration": 5.0,
-    "mirror": True,
-    "onset": (0.5, 1.0),
-    "amplitude": (0.03, 0.08),
-    "frequency": (0.4, 0.7),
-    "speed": (60.0 / 3.6, 90.0 / 3.6),
-    "front_stiffness": (0.8, 1.2),
-    "rear_stiffness": (0.8, 1.2),
-    "friction": (0.7, 1.0),
-}
+_SCENARIO: dict[str, Any] = {
+    "name": "outside-lane-change", "steering": "lane-change", "duration": 5.0, "mirror": True,
+    "onset": (0.5, 1.0), "amplitude": (0.03, 0.08), "frequency": (0.4, 0.7),
+    "speed": (60.0 / 3.6, 90.0 / 3.6), "front_stiffness": (0.8, 1.2),
+    "rear_stiffness": (0.8, 1.2), "friction": (0.7, 1.0),
+}  # fmt: skip
 """A lane change within what the outside car was made for, drawn by the seed."""
 
 
-def compute_limited_moment(motion: Motion, steer: float) -> float:
-    """The check's yaw moment in N m."""
-    max_yaw_rate = 0.85 * GRAVITY * make_outside_vehicle().friction / motion.v_x
-    goal = min(
-        max(motion.v_x * steer / make_outside_vehicle().wheelbase, -max_yaw_rate), max_yaw_rate
-    )
-    return float(min(max(GAIN * (goal - motion.gamma), -LIMIT), LIMIT))
+def _compute_limited_moment(motion: Motion, steer: float) -> float:
+    """Compute the check's yaw moment (N m)."""
+    car = make_outside_vehicle()
+    max_yaw_rate = 0.85 * GRAVITY * car.friction / motion.v_x
+    goal = min(max(motion.v_x * steer / car.wheelbase, -max_yaw_rate), max_yaw_rate)
+    return float(min(max(_GAIN * (goal - motion.gamma), -_LIMIT), _LIMIT))
 
 
 @dataclass(frozen=True)
@@ -57,12 +49,12 @@ class OutsideCheck:
 
     @property
     def reproduced(self) -> bool:
-        """No control fails at 5 A, the law passes at 6.5 A."""
+        """Whether no control fails at 5 A and the law passes at 6.5 A."""
         return not any(run.passed for run in self.none.runs) and self.law.passed
 
 
 def run_check(model: str = MODEL) -> OutsideCheck:
-    """Drive it; A is the uncontrolled car's."""
+    """Drive the check; A is the uncontrolled car's."""
     car = make_outside_car()
     A = fmvss126.measure_reference_angle(make_plant_drive(model), car)
 
@@ -70,22 +62,22 @@ def run_check(model: str = MODEL) -> OutsideCheck:
         return fmvss126.run(make_plant_drive(model, law), car, A, [multiple])
 
     return OutsideCheck(
-        run_multiple(FAILS_AT, None), run_multiple(PASSES_AT, compute_limited_moment)
+        run_multiple(FAILS_AT, None), run_multiple(PASSES_AT, _compute_limited_moment)
     )
 
 
 @dataclass(frozen=True)
 class OutsideEpisode:
-    """One seed: the cost, whether it failed, the peak of the slip in rad."""
+    """An episode of one seed."""
 
     cost: float
     failed: bool
-    peak: float
+    peak: float  # rad, of the sideslip angle
 
 
 def run_episodes(model: str, entry: ProcedureEntry, seeds: Sequence[int]) -> list[OutsideEpisode]:
-    """A contestant on an outside plant."""
-    options: dict[str, Any] = {"model": model, "scenario": SCENARIO, "reference": "limited"}
+    """Run the episodes of a controller on an outside plant."""
+    options: dict[str, Any] = {"model": model, "scenario": _SCENARIO, "reference": "limited"}
     agent_name, estimator, estimate = entry.get_configuration(model)
     env = make_env(OUTSIDE_ID, estimator, estimate, **options)
     agent = make_agent(agent_name, env)

@@ -16,10 +16,10 @@ from .drive import CARS, ENTRIES
 from .tables import NAME, CaseResults, ProcedureCase, SineDwellOutcome, Transient, select_cases
 
 SHOWN = 5.0  # of A: the sine with dwell in the figures
-QUICK_MULTIPLES = (1.5, 3.0, 5.0, 6.5)  # of A
+_QUICK_MULTIPLES = (1.5, 3.0, 5.0, 6.5)  # of A
 EPISODES, QUICK_EPISODES = 20, 2
-STEP_AT = 0.2 * GRAVITY  # steady lateral acceleration of the step, in the linear range
-SWEEP_AT = 0.1 * GRAVITY  # of the sweep, where it is slow
+_STEP_AT = 0.2 * GRAVITY  # steady lateral acceleration of the step, in the linear range
+_SWEEP_AT = 0.1 * GRAVITY  # of the sweep, where it is slow
 
 _TEXT = (
     "Standard manoeuvres driven by the book. FMVSS 126: sine with dwell, amplitudes in units of A, "
@@ -37,7 +37,7 @@ _NONE_OUTSIDE = " Outside plants are left out: pip install 'sideslip[outside]'."
 
 
 def measure(case: ProcedureCase) -> Any:
-    """Drive a case: what its procedure gives."""
+    """Drive a case: the result of its procedure."""
     if case.procedure == "outside":
         return outside.run_episodes(case.car, ENTRIES[case.contestant], case.seeds)
     if case.procedure == "check":
@@ -45,7 +45,7 @@ def measure(case: ProcedureCase) -> Any:
     car, drive = CARS[case.car], ENTRIES[case.contestant].drive(case.car)
     if case.procedure == "fmvss-126":
         A = fmvss126.measure_reference_angle(ENTRIES[0].drive(case.car), car)
-        result = fmvss126.run(drive, car, A, QUICK_MULTIPLES if case.quick else None)
+        result = fmvss126.run(drive, car, A, _QUICK_MULTIPLES if case.quick else None)
         return SineDwellOutcome(result, drive(fmvss126.make_sine_with_dwell(car, SHOWN * A)))
     if case.procedure in iso3888.TRACKS:
         shares = np.arange(0.5, 1.25, 0.15 if case.quick else 0.05)
@@ -57,22 +57,19 @@ def measure(case: ProcedureCase) -> Any:
 
 def _measure_transient(case: ProcedureCase) -> Transient:
     car, drive = CARS[case.car], ENTRIES[case.contestant].drive(case.car)
-    per = car.vehicle.wheelbase / car.speed**2 + iso4138.compute_understeer_gradient(
-        car.vehicle
-    )  # rad s2/m
-    stepped = drive(iso7401.make_step(car, per * STEP_AT))
-    sweep = iso7401.run_sweep(drive, car, per * SWEEP_AT)
+    gradient = iso4138.compute_understeer_gradient(car.vehicle)
+    per = car.vehicle.wheelbase / car.speed**2 + gradient  # rad s2/m
+    stepped = drive(iso7401.make_step(car, per * _STEP_AT))
+    sweep = iso7401.run_sweep(drive, car, per * _SWEEP_AT)
     frequency = sweep[iso7401.OUTPUTS[0]].frequency
-    return Transient(
-        iso7401.compute_responses(stepped),
-        iso7401.compute_linear_step(car.vehicle, car.speed, stepped),
-        sweep,
-        iso7401.compute_linear_response(car.vehicle, car.speed, frequency),
-    )
+    step = iso7401.compute_responses(stepped)
+    linear_step = iso7401.compute_linear_step(car.vehicle, car.speed, stepped)
+    linear_sweep = iso7401.compute_linear_response(car.vehicle, car.speed, frequency)
+    return Transient(step, linear_step, sweep, linear_sweep)
 
 
 def make_cases(quick: bool) -> list[ProcedureCase]:
-    """Everything that is driven; outside plants only where their extra is installed."""
+    """Make the list of what is driven; outside plants only where their extra is installed."""
     indices = [k for k, entry in enumerate(ENTRIES) if not (quick and entry.slow)]
     driven = ("fmvss-126", *iso3888.TRACKS)
     cases = [ProcedureCase(p, car, k, (), quick) for p in driven for car in CARS for k in indices]
@@ -87,25 +84,19 @@ def make_cases(quick: bool) -> list[ProcedureCase]:
 
 
 def make_verdict(done: CaseResults) -> str:
-    """The verdict: on each car, who passes the sine with dwell, and how fast the lanes are."""
+    """Make the verdict: on each car, who passes the sine with dwell, and how fast the lanes are."""
     passed, lanes = [], []
     for car in CARS:
         car_results = {case: result for case, result in done.items() if case.car == car}
-        sines = {
-            get_controller_name(case): result.result
-            for case, result in select_cases(car_results, "fmvss-126").items()
-        }
+        outcomes = select_cases(car_results, "fmvss-126")
+        sines = {case.agent: outcome.result for case, outcome in outcomes.items()}
         passing = [name for name, item in sines.items() if item.passed]
         weakest = min(sines, key=lambda name: sines[name].highest)
-        failing = f"; {weakest} fails above {sines[weakest].highest:.3g} A" * (
-            weakest not in passing
-        )
+        failing = f"; {weakest} fails above {sines[weakest].highest:.3g} A"
+        failing *= weakest not in passing
         passed.append(f"{car}: {summarise_names(passing, 4)}{failing}.")
         runs = select_cases(car_results, next(iter(iso3888.TRACKS)))
-        speeds = {
-            get_controller_name(case): 3.6 * iso3888.find_highest_speed(item)
-            for case, item in runs.items()
-        }
+        speeds = {c.agent: 3.6 * iso3888.find_highest_speed(item) for c, item in runs.items()}
         max_speed = max(speeds.values())
         fast = summarise_names([name for name, speed in speeds.items() if speed == max_speed])
         lanes.append(f"{car} {max_speed:.0f} with {fast} (none {speeds['none']:.0f})")
@@ -117,19 +108,22 @@ def make_verdict(done: CaseResults) -> str:
     )
 
 
-def get_controller_name(case: ProcedureCase) -> str:
-    """The controller of a case."""
-    return ENTRIES[case.contestant].agent
-
-
 def run(quick: bool = False, jobs: int | None = None, console: Console | None = None) -> Suite:
-    """Every procedure for both cars and every contestant, and the outside plants."""
+    """Run every procedure for both cars and every controller, and the outside plants.
+
+    Args:
+        quick: Whether a few amplitudes, speeds and seeds do, and slow controllers are left out.
+        jobs: Number of processes; None: one a core.
+        console: Console for the progress.
+
+    Returns:
+        The suite.
+    """
     cases = make_cases(quick)
     done = dict(zip(cases, run_cases(measure, cases, NAME, jobs, console), strict=True))
     has_outside = any(case.procedure == "outside" for case in cases)
-    suite = Suite(
-        NAME, "Standard test procedures", _TEXT + (_OUTSIDE if has_outside else _NONE_OUTSIDE)
-    )
+    text = _TEXT + (_OUTSIDE if has_outside else _NONE_OUTSIDE)
+    suite = Suite(NAME, "Standard test procedures", text)
     tables.add(suite, done)
     suite.verdict = make_verdict(done)
     try:

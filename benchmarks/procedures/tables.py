@@ -1,7 +1,4 @@
-"""The suite's cases and their results.
-
-The suite's tables and rows, one of each for a procedure.
-"""
+"""The suite's cases and their results, its tables and rows, one of each for a procedure."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +18,7 @@ NAME = "procedures"
 
 @dataclass(frozen=True)
 class ProcedureCase:
-    """A drive: a procedure, a car or outside model, a contestant's index, seeds."""
+    """A case: a procedure, a car or outside model, a controller's index in `ENTRIES`, seeds."""
 
     procedure: str
     car: str
@@ -29,10 +26,15 @@ class ProcedureCase:
     seeds: tuple[int, ...] = ()
     quick: bool = False
 
+    @property
+    def agent(self) -> str:
+        """The controller."""
+        return ENTRIES[self.contestant].agent
+
 
 @dataclass(frozen=True)
 class SineDwellOutcome:
-    """FMVSS 126 of a contestant, and one of its runs to look at."""
+    """FMVSS 126 of a controller, and one of its runs to look at."""
 
     result: fmvss126.SineDwellResult
     shown: Series
@@ -53,7 +55,7 @@ CaseResults = dict[ProcedureCase, Any]
 
 
 def select_cases(done: CaseResults, procedure: str) -> CaseResults:
-    """The cases of one procedure."""
+    """Select the cases of one procedure."""
     return {case: result for case, result in done.items() if case.procedure == procedure}
 
 
@@ -62,7 +64,7 @@ RIVAL = "lqr"
 
 
 def add(suite: Suite, done: CaseResults) -> None:
-    """Every table of what was found."""
+    """Add every table of the results to a suite."""
     _add_sine(suite, select_cases(done, "fmvss-126"))
     _add_tracks(suite, {track: select_cases(done, track) for track in iso3888.TRACKS})
     _add_circle(suite, select_cases(done, "iso-4138"))
@@ -76,7 +78,7 @@ def add(suite: Suite, done: CaseResults) -> None:
 def _make_row(
     case: ProcedureCase, metric: str, value: float, output: str = "", **more: Any
 ) -> ResultRow:
-    """of: what is measured, if a case has several."""
+    """Make a row of a case; output: what is measured, if a case has several."""
     entry = ENTRIES[case.contestant]
     columns = {"estimator": entry.get_configuration(case.car)[1], "controller": entry.agent}
     columns["env_version"] = __version__
@@ -84,25 +86,19 @@ def _make_row(
     return ResultRow(NAME, scenario, metric, value, **columns | more)
 
 
-def _get_labels(case: ProcedureCase) -> list[str]:
-    return [ENTRIES[case.contestant].agent, case.car]
-
-
 def _add_sine(suite: Suite, done: dict[ProcedureCase, SineDwellOutcome]) -> None:
-    """FMVSS 126: up to which amplitude every run passes, and what the first failure is."""
+    """Add FMVSS 126: up to which amplitude every run passes, and what the first failure is."""
     cells = []
     for case, sine in done.items():
         result = sine.result
         suite.rows.append(_make_row(case, "amplitude", result.highest, n=len(result.runs)))
         failed = [run for run in result.runs if not run.passed]
         last = max(run.multiple for run in result.runs)
-        verdict = (
-            f"fails at {failed[0].multiple:.3g} A: {_describe_failure(failed[0])}"
-            if failed
-            else "passes"
-        )
+        verdict = "passes"
+        if failed:
+            verdict = f"fails at {failed[0].multiple:.3g} A: {_describe_failure(failed[0])}"
         amplitude, passed = f"{np.degrees(result.A):.1f}", f"{result.highest:.3g} of {last:.3g}"
-        cells.append([*_get_labels(case), amplitude, passed, verdict])
+        cells.append([case.agent, case.car, amplitude, passed, verdict])
     note = "Both sides; the last amplitude is the larger of 6.5 A and 270 deg, at most 300 deg."
     header = ("controller", "car", "A / deg", "passes up to / A", "result")
     suite.tables.append(ResultTable("FMVSS 126, sine with dwell", header, cells, note))
@@ -118,36 +114,35 @@ def _describe_failure(run: fmvss126.SineDwellRun) -> str:
 
 
 def _add_tracks(suite: Suite, done: dict[str, dict[ProcedureCase, list[iso3888.TrackRun]]]) -> None:
-    """ISO 3888: the highest clean speed of each contestant."""
+    """Add ISO 3888: the highest clean speed of each controller."""
     cells: dict[tuple[str, ...], list[str]] = {}
     for track_results in done.values():
         for case, runs in track_results.items():
             speed = iso3888.find_highest_speed(runs)
             suite.rows.append(_make_row(case, "speed", speed, n=len(runs)))
             text = f"{3.6 * speed:.0f}" if speed else "none clean"
-            cells.setdefault(tuple(_get_labels(case)), []).append(text)
+            cells.setdefault((case.agent, case.car), []).append(text)
     header = ("controller", "car", *(f"{track} / (km/h)" for track in done))
     lines = [[*labels, *texts] for labels, texts in cells.items()]
     note = "The highest speed without a cone; any of five drivers may do it."
-    suite.tables.append(
-        ResultTable("ISO 3888, lane change and obstacle avoidance", header, lines, note)
-    )
+    title = "ISO 3888, lane change and obstacle avoidance"
+    suite.tables.append(ResultTable(title, header, lines, note))
 
 
 def _add_circle(suite: Suite, done: dict[ProcedureCase, iso4138.Handling]) -> None:
-    """ISO 4138: the understeer gradient against the linear model's."""
+    """Add ISO 4138: the understeer gradient against the linear model's."""
     cells = []
     for case, handling in done.items():
         suite.rows.append(_make_row(case, "understeer_gradient", handling.K))
         per_g = np.degrees(GRAVITY * np.array([handling.K, handling.theory]))
-        cells.append([*_get_labels(case), f"{per_g[0]:+.3f}", f"{per_g[1]:+.3f}"])
+        cells.append([case.agent, case.car, f"{per_g[0]:+.3f}", f"{per_g[1]:+.3f}"])
     header = ("controller", "car", "measured / (deg/g)", "linear model / (deg/g)")
     note = "At the front wheels, between 0.05 and 0.25 g; negative: the car oversteers."
     suite.tables.append(ResultTable("ISO 4138, understeer gradient", header, cells, note))
 
 
 def _add_step(suite: Suite, done: dict[ProcedureCase, Transient]) -> None:
-    """ISO 7401: the step's numbers beside the linear model's."""
+    """Add ISO 7401: the step's numbers beside the linear model's."""
     cells = []
     for case, transient in done.items():
         for name in iso7401.OUTPUTS:
@@ -155,7 +150,7 @@ def _add_step(suite: Suite, done: dict[ProcedureCase, Transient]) -> None:
             suite.rows.append(_make_row(case, "response_time", one.response_time, name))
             suite.rows.append(_make_row(case, "overshoot", one.overshoot, name))
             pairs = [(a, vars(other)[key]) for key, a in vars(one).items()]
-            cells.append([*_get_labels(case), name, *(f"{a:.3g} ({b:.3g})" for a, b in pairs)])
+            cells.append([case.agent, case.car, name, *(f"{a:.3g} ({b:.3g})" for a, b in pairs)])
     header = ("output", "gain / (1/rad)", "90 % after / s", "peak after / s", "overshoot")
     note = "In brackets the linear model's under the same steering. No control."
     suite.tables.append(
@@ -164,15 +159,13 @@ def _add_step(suite: Suite, done: dict[ProcedureCase, Transient]) -> None:
 
 
 def _add_episodes(suite: Suite, done: dict[ProcedureCase, list[outside.OutsideEpisode]]) -> None:
-    """Outside plants: cost and spins of each contestant."""
+    """Add outside plants: cost and spins of each controller."""
     cells = []
-    costs = {
-        case: np.array([episode.cost for episode in episodes]) for case, episodes in done.items()
-    }
-    rivals = {case.car: costs[case] for case in done if _get_labels(case)[0] == RIVAL}
+    costs = {case: np.array([x.cost for x in episodes]) for case, episodes in done.items()}
+    rivals = {case.car: costs[case] for case in done if case.agent == RIVAL}
     for case, episodes in done.items():
         cost, paired = interval(costs[case]), ""
-        if case.car in rivals and _get_labels(case)[0] != RIVAL:
+        if case.car in rivals and case.agent != RIVAL:
             logs = np.log(compute_cost_ratios(costs[case], rivals[case.car]))
             paired = geometric_mean(logs).inline(100.0, ".0f")
         spins = float(np.mean([episode.failed for episode in episodes]))
@@ -180,15 +173,8 @@ def _add_episodes(suite: Suite, done: dict[ProcedureCase, list[outside.OutsideEp
         suite.rows.append(_make_row(case, "cost", cost.value, low=cost.low, high=cost.high, **more))
         suite.rows.append(_make_row(case, "share", spins, **more))
         peak = 1e3 * float(np.median([episode.peak for episode in episodes]))
-        cells.append(
-            [
-                *_get_labels(case),
-                cost.inline(1.0, ".3g"),
-                paired,
-                f"{100 * spins:.0f}",
-                f"{peak:.0f}",
-            ]
-        )
+        texts = cost.inline(1.0, ".3g"), paired, f"{100 * spins:.0f}", f"{peak:.0f}"
+        cells.append([case.agent, case.car, *texts])
     header = ("controller", "model", "cost", f"of {RIVAL}'s / %", "failed / %", "peak slip / mrad")
     note = (
         f"{len(episodes)} lane changes at 60 to 90 km/h; speed, steering, tyres and friction are "
@@ -198,7 +184,7 @@ def _add_episodes(suite: Suite, done: dict[ProcedureCase, list[outside.OutsideEp
 
 
 def _add_check(suite: Suite, check_result: outside.OutsideCheck) -> None:
-    """The claim on the drift model."""
+    """Add the claim on the drift model."""
     verdict = "reproduced" if check_result.reproduced else "not reproduced"
     text = "no control fails at 5 A, a yaw moment of 500 N m passes at 6.5 A"
     case = ProcedureCase("fmvss-126", f"outside {outside.MODEL}")

@@ -1,6 +1,7 @@
-"""Checks of a scenario and of reset options against what an outside plant can do.
+"""Environments around a plant that is not ours: our sensors, scenarios, references and cost.
 
-OutsideEnv: our sensors, scenarios, references and cost around a plant that is not ours.
+`PlantEnv` takes any plant of `PlantProtocol`, `OutsideEnv` one of CommonRoad's models, after checks
+that the model can follow scenario and reset options.
 """
 
 import dataclasses
@@ -32,34 +33,17 @@ from ..ticks import TICK
 from ..validation import check_choice, check_mapping, is_finite, short_repr, warn_once
 from .plants import OUTSIDE_PLANTS, OutsideInputs, OutsidePlant, PlantProtocol, make_outside_vehicle
 
-MIN_SPEED = (
-    1.0  # m/s: the multi-body model's least speed; below 0.1 it freezes while its wheels spin
-)
+_MIN_SPEED = 1.0  # m/s, of the multi-body model; below 0.1 it freezes while its wheels spin
 
 # Fields of a scenario that change our own plant or its road: only their defaults will do.
 _OWN_PLANT_FIELDS = (
-    "road",
-    "curvature",
-    "bank",
-    "grade",
-    "small_angle",
-    "tyres",
-    "vehicle",
-    "friction_right",
+    "road", "curvature", "bank", "grade", "small_angle", "tyres", "vehicle", "friction_right",
     "tyre_change_time",
-)
+)  # fmt: skip
 
 
-def check_scenario(scenario: Scenario, model: str) -> None:
-    """Check that a model can drive a scenario.
-
-    Args:
-        scenario: The scenario.
-        model: Name of the model, of `OUTSIDE_PLANTS`.
-
-    Raises:
-        ValueError: For a field that only our plant has, or that this model has not.
-    """
+def _check_scenario(scenario: Scenario, model: str) -> None:
+    """Raise ValueError for a scenario that a model of `OUTSIDE_PLANTS` cannot drive."""
     name = f"scenario {scenario.name!r}"
     defaults = {entry.name: entry.default for entry in dataclasses.fields(Scenario)}
     for field in _OWN_PLANT_FIELDS:
@@ -71,44 +55,22 @@ def check_scenario(scenario: Scenario, model: str) -> None:
             )
     if model != "multi-body":
         if scenario.wind_height:
-            raise ValueError(
-                f"{name}: wind_height {scenario.wind_height!r} rolls the body; the {model} model "
-                "has no roll"
-            )
+            wind = f"wind_height {scenario.wind_height!r} rolls the body"
+            raise ValueError(f"{name}: {wind}; the {model} model has no roll")
         return
     if not scenario.roll:
         raise ValueError(f"{name}: roll False; the multi-body model always rolls")
-    min_speed = find_min_speed(scenario)
-    if min_speed < MIN_SPEED:
+    change = scenario.speed_change + (scenario.acceleration or 0.0) * scenario.duration
+    min_speed = scenario.range("speed")[0] + min(change, 0.0)
+    if min_speed < _MIN_SPEED:
         raise ValueError(
             f"{name}: its speed comes down to {min_speed:.3g} m/s; the multi-body model needs "
-            f"{MIN_SPEED} m/s or more"
+            f"{_MIN_SPEED} m/s or more"
         )
 
 
-def find_min_speed(scenario: Scenario) -> float:
-    """Find the lowest speed that a scenario's own changes of speed lead to.
-
-    Args:
-        scenario: The scenario.
-
-    Returns:
-        Speed (m/s).
-    """
-    change = scenario.speed_change + (scenario.acceleration or 0.0) * scenario.duration
-    return scenario.range("speed")[0] + min(change, 0.0)
-
-
-def check_options(options: Mapping[str, Any], model: str) -> None:
-    """Check that a model can follow the options of reset.
-
-    Args:
-        options: Options of reset.
-        model: Name of the model, of `OUTSIDE_PLANTS`.
-
-    Raises:
-        ValueError: For an option that it cannot follow.
-    """
+def _check_options(options: Mapping[str, Any], model: str) -> None:
+    """Raise ValueError for an option of reset that a model of `OUTSIDE_PLANTS` cannot follow."""
     if "vehicle" in options:
         raise ValueError("reset option vehicle: an outside plant is its own vehicle")
     if "friction" in options and model == "single-track":
@@ -122,37 +84,30 @@ def check_options(options: Mapping[str, Any], model: str) -> None:
     if model != "multi-body":
         if state.get("phi") or state.get("phi_dot"):
             raise ValueError(f"reset option state: the {model} model has no roll")
-    elif (v_x := state.get("v_x")) is not None and not (is_finite(v_x) and v_x >= MIN_SPEED):
+    elif (v_x := state.get("v_x")) is not None and not (is_finite(v_x) and v_x >= _MIN_SPEED):
         raise ValueError(
             f"reset option state: v_x is {short_repr(v_x)} m/s; "
-            f"the multi-body model needs {MIN_SPEED} or more"
+            f"the multi-body model needs {_MIN_SPEED} or more"
         )
 
 
-_make_step_params, _make_step_variant, _write_final_state = (
-    as_python(make_step_params),
-    as_python(make_step_variant),
-    as_python(write_final_state),
-)
-_compute_inputs, _measure_tick, _compute_tick_cost = (
-    as_python(compute_inputs),
-    as_python(measure_tick),
-    as_python(compute_tick_cost),
-)
+_make_step_params = as_python(make_step_params)
+_make_step_variant = as_python(make_step_variant)
+_write_final_state = as_python(write_final_state)
+_compute_inputs = as_python(compute_inputs)
+_measure_tick = as_python(measure_tick)
+_compute_tick_cost = as_python(compute_tick_cost)
 _select_failure = as_python(select_failure)
 
 
 class PlantEnv(StabilityEnv):
-    """`StabilityEnv` whose true motion is that of `plant`, in a Python loop.
-
-    Sensors, references, cost and packets are ours.
-    """
+    """`StabilityEnv` whose true motion is that of `plant`, in a Python loop."""
 
     _has_tyre_forces = False
     plant: PlantProtocol
 
     def _advance(self, command: npt.NDArray[np.float32]) -> int:
-        """One control period of the outside plant: `step_vehicle` with another motion."""
+        """Drive one control period of the plant: `step_vehicle` with another motion."""
         yaw_share, steer_share = clip_action(command)
         if yaw_share != yaw_share:
             return super()._advance(command)  # refuses or fails before it moves anything
@@ -168,7 +123,7 @@ class PlantEnv(StabilityEnv):
     def _integrate_step(
         self, params: StepParams, variant: StepVariant, yaw_share: float, steer_share: float
     ) -> int:
-        """`step.integrate_step` whose motion is the outside plant's; returns the ticks done."""
+        """Integrate as `step.integrate_step`, with the plant's motion; return the ticks done."""
         z, plant, task = self._state, self.plant, params.task
         motion, drive, refs = read(z, Z.motion), read(z, Z.drive), read(z, Z.refs)
         nominal_motion = read(z, Z.nominal_motion)
@@ -181,9 +136,8 @@ class PlantEnv(StabilityEnv):
             applied = inputs.applied
             # a quotient, not the product of `command`: its last bit is that of all drives so far
             applied = applied._replace(effort=applied.moment / task.yaw_scale)
-            plant.step(
-                OutsideInputs(applied.steer, applied.T_l, applied.T_r, *inputs.disturbance), TICK
-            )
+            forces = (applied.steer, applied.T_l, applied.T_r, *inputs.disturbance)
+            plant.step(OutsideInputs(*forces), TICK)
             motion, force = state.motion, (0.0, 0.0)
             if plant.is_finite:
                 motion, force = plant.motion, plant.specific_force
@@ -202,17 +156,9 @@ class PlantEnv(StabilityEnv):
             failure = _select_failure(measured.lost, tick_cost.spun, tick_cost.off)
             is_over = failure != RUNNING or tick >= task.duration or done == self.control_period
         write(z, state.motion, Z.motion)
+        beta, refs, duration = tick_cost.beta, measured.refs, task.duration
         _write_final_state(
-            z,
-            self._report,
-            state,
-            measured,
-            failure,
-            tick_cost.beta,
-            measured.refs,
-            tick,
-            cost,
-            task.duration,
+            z, self._report, state, measured, failure, beta, refs, tick, cost, duration
         )
         return done
 
@@ -235,14 +181,14 @@ class OutsideEnv(PlantEnv):
         sensors: "vision", "vision-uneven", "gps" or "fusion".
         scenario: Scenario as `make_scenario` reads it.
         reference: "zero-slip", "model", "limited" or "lagged".
-        options: Further arguments of `StabilityEnv`; nominal is `make_outside_vehicle()` by
-            default.
+        options: Arguments of `StabilityEnv`; nominal is `make_outside_vehicle()` by default.
 
     Raises:
-        TypeError: For the argument vehicle; ValueError for an unknown model and for a scenario with
-            a road or a plant that the model has not (curvature, bank, grade, small_angle, tyres,
-            vehicle, friction_right, tyre_change_time; wind_height but for the multi-body model), or
-            that has the multi-body model below 1 m/s or without roll.
+        TypeError: For the argument vehicle.
+        ValueError: For an unknown model, and for a scenario with a road or a plant that it has not
+            (curvature, bank, grade, small_angle, tyres, vehicle, friction_right,
+            tyre_change_time; wind_height but for the multi-body model), or that has the multi-body
+            model below 1 m/s or without roll.
     """
 
     plant: OutsidePlant
@@ -259,7 +205,7 @@ class OutsideEnv(PlantEnv):
         if "vehicle" in options:
             raise TypeError("an outside plant is its own vehicle; only nominal can be given")
         self.model = model
-        check_scenario(make_scenario(scenario), model)
+        _check_scenario(make_scenario(scenario), model)
         super().__init__(sensors, scenario, make_outside_vehicle(), reference=reference, **options)
         self.plant = OUTSIDE_PLANTS[model]()
 
@@ -270,15 +216,14 @@ class OutsideEnv(PlantEnv):
 
         Args:
             seed: Seed of the env's generator; None continues it.
-            options: Options of reset of `StabilityEnv`, but no vehicle, and no s, y and theta in
-                state.
+            options: Those of `StabilityEnv`, but no vehicle, and no s, y and theta in state.
 
         Returns:
             The observation and the info at tick 0.
         """
         reset_options = dict(options or {})
-        check_options(reset_options, self.model)
-        check_scenario(self.config.apply_options(reset_options).scenario, self.model)
+        _check_options(reset_options, self.model)
+        _check_scenario(self.config.apply_options(reset_options).scenario, self.model)
         if "state" in reset_options:  # s and y are X and Y on the straight road of these plants
             state = reset_options["state"]
             reset_options["state"] = {**state, "s": state.get("X", 0.0), "y": state.get("Y", 0.0)}

@@ -20,20 +20,18 @@ from importlib import import_module
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from ..engine.config import make_car
 from ..numerics import require_extra
+from ..record import Array
 from ..vehicle.actuators import compute_yaw_moment
 from ..vehicle.dynamics import Motion
 from ..vehicle.parameters import GRAVITY, Vehicle
 
-Array = npt.NDArray[np.float64]
-
-BMW_320I = 2  # CommonRoad's number of the car
-MOTOR_TORQUE = 300.0  # N m of one in-wheel motor, which CommonRoad's car does not have: ours
-MIN_SPEED = 0.1  # m/s: below it the models switch to kinematics
-STABILITY_LIMIT = 1.5  # of the fastest eigenvalue times the step; Runge-Kutta's limit is 2.78
+_BMW_320I = 2  # CommonRoad's number of the car
+_MOTOR_TORQUE = 300.0  # N m of one in-wheel motor, which CommonRoad's car does not have: ours
+_MIN_SPEED = 0.1  # m/s: below it the models switch to kinematics
+_STABILITY_LIMIT = 1.5  # of the fastest eigenvalue times the step; Runge-Kutta's limit is 2.78
 
 
 class OutsideInputs(NamedTuple):
@@ -55,8 +53,8 @@ def _import_model(name: str) -> Any:
 
 @functools.cache
 def _load_parameters() -> Any:
-    """The BMW's parameters, with all drive and brake torque on the rear wheels."""
-    p = _import_model("vehicle_parameters").setup_vehicle_parameters(BMW_320I)
+    """Load the BMW's parameters, with all drive and brake torque on the rear wheels."""
+    p = _import_model("vehicle_parameters").setup_vehicle_parameters(_BMW_320I)
     return dataclasses.replace(p, T_sb=0.0, T_se=0.0)
 
 
@@ -84,7 +82,7 @@ def make_outside_vehicle() -> Vehicle:
         rear_track=p.T_r,
         wheel_radius=p.R_w,
         gravity_height=p.h_cg,
-        motor_torque=MOTOR_TORQUE,
+        motor_torque=_MOTOR_TORQUE,
         preview=12.0,
         width=p.w,
         friction=p.tire.p_dy1,
@@ -97,13 +95,9 @@ def make_outside_vehicle() -> Vehicle:
 
 
 class PlantProtocol(Protocol):
-    """A car that moves in place of our own plant.
+    """A car that moves in place of our own plant."""
 
-    Attributes:
-        specific_force: (a_x, a_y) at the end of the newest step (m/s2).
-    """
-
-    specific_force: tuple[float, float]
+    specific_force: tuple[float, float]  # (a_x, a_y) at the newest step's end, m/s2
 
     @property
     def motion(self) -> Motion:
@@ -144,10 +138,7 @@ class OutsidePlant(ABC):
         base = _load_parameters()
         tyre, scale = base.tire, 1.0 if friction is None else friction / base.tire.p_dy1
         tyre = dataclasses.replace(
-            tyre,
-            p_dy1=scale * tyre.p_dy1,
-            p_dx1=scale * tyre.p_dx1,
-            p_ky1=stiffness * tyre.p_ky1,
+            tyre, p_dy1=scale * tyre.p_dy1, p_dx1=scale * tyre.p_dx1, p_ky1=stiffness * tyre.p_ky1
         )
         self.p = dataclasses.replace(base, tire=tyre)
         self.car = make_car(make_outside_vehicle())
@@ -206,8 +197,8 @@ class OutsidePlant(ABC):
             inputs: Inputs, constant during the step.
             h: Length of the step (s).
         """
-        eigenvalue = self._slip_rate / max(abs(float(self.x[3])), MIN_SPEED)
-        parts = max(1, math.ceil(h * eigenvalue / STABILITY_LIMIT)) if self.is_finite else 1
+        eigenvalue = self._slip_rate / max(abs(float(self.x[3])), _MIN_SPEED)
+        parts = max(1, math.ceil(h * eigenvalue / _STABILITY_LIMIT)) if self.is_finite else 1
         try:
             with np.errstate(over="ignore", invalid="ignore"):
                 for _ in range(parts):
@@ -233,24 +224,12 @@ class SingleTrack(OutsidePlant):
     law = "vehicle_dynamics_st"
 
     def start(self, motion: Motion) -> None:
-        """Set the car to a Motion.
-
-        Args:
-            motion: Motion of the car.
-        """
+        """Set the car to a Motion, steering straight."""
         speed, slip = math.hypot(motion.v_x, motion.v_y), math.atan2(motion.v_y, motion.v_x)
         self.x = np.array([motion.X, motion.Y, 0.0, speed, motion.psi, motion.gamma, slip])
 
     def derivative(self, x: Array, inputs: OutsideInputs) -> Array:
-        """Compute dx/dt of a state.
-
-        Args:
-            x: State of the model.
-            inputs: Inputs of the plant.
-
-        Returns:
-            The derivative, in the shape of x.
-        """
+        """Compute dx/dt; the motors push along the path and turn the car by N_z / I_z."""
         state = x.tolist()
         state[2] = inputs.steer
         drive = (inputs.T_l + inputs.T_r) / (self.p.m * self.p.R_w)
@@ -258,7 +237,7 @@ class SingleTrack(OutsidePlant):
         lateral_acceleration, slip = inputs.F_y / self.p.m, state[6]
         rate[3] += lateral_acceleration * math.sin(slip)
         rate[5] += (compute_yaw_moment(inputs.T_l, inputs.T_r, self.car) + inputs.N_z) / self.p.I_z
-        rate[6] += lateral_acceleration * math.cos(slip) / max(state[3], MIN_SPEED)
+        rate[6] += lateral_acceleration * math.cos(slip) / max(state[3], _MIN_SPEED)
         return rate
 
     @property
@@ -267,20 +246,12 @@ class SingleTrack(OutsidePlant):
         return Motion(v * math.cos(slip), v * math.sin(slip), gamma, psi, X, Y, X, Y, 0.0)
 
     def compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:
-        """Compute the specific force of the state x.
-
-        Args:
-            inputs: Inputs of the plant.
-
-        Returns:
-            (a_x, a_y) (m/s2).
-        """
+        """Compute the specific force of the state x from the path's tangent and normal."""
         rate, slip = self.derivative(self.x, inputs), self.x[6]
         tangential, normal = rate[3], self.x[3] * (rate[6] + self.x[5])  # of the path
         sine, cosine = math.sin(slip), math.cos(slip)
-        return float(tangential * cosine - normal * sine), float(
-            tangential * sine + normal * cosine
-        )
+        a_x, a_y = tangential * cosine - normal * sine, tangential * sine + normal * cosine
+        return float(a_x), float(a_y)
 
 
 class Drift(SingleTrack):
@@ -291,11 +262,7 @@ class Drift(SingleTrack):
     wheel_load = 1.0
 
     def start(self, motion: Motion) -> None:
-        """Set the car to a Motion.
-
-        Args:
-            motion: Motion of the car.
-        """
+        """Set the car to a Motion, its wheels rolling."""
         super().start(motion)
         self.x = np.append(self.x, np.full(2, motion.v_x / self.p.R_w))
 
@@ -309,26 +276,14 @@ class MultiBody(OutsidePlant):
     velocity_columns = (3, 5, 10)
 
     def start(self, motion: Motion) -> None:
-        """Set the car to a Motion.
-
-        Args:
-            motion: Motion of the car.
-        """
+        """Set the car to a Motion, its roll included."""
         speed, slip = math.hypot(motion.v_x, motion.v_y), math.atan2(motion.v_y, motion.v_x)
         core = [motion.X, motion.Y, 0.0, speed, motion.psi, motion.gamma, slip]
         self.x = np.array(_import_model("init_mb").init_mb(core, self.p), float)
         self.x[6], self.x[7] = -motion.phi, -motion.phi_dot
 
     def derivative(self, x: Array, inputs: OutsideInputs) -> Array:
-        """Compute dx/dt of a state.
-
-        Args:
-            x: State of the model.
-            inputs: Inputs of the plant.
-
-        Returns:
-            The derivative, in the shape of x.
-        """
+        """Compute dx/dt; motor torques act on the rear wheels."""
         state = x.tolist()
         state[2] = inputs.steer
         rate = np.array(self._law(state, [0.0, 0.0], self.p))
@@ -345,14 +300,7 @@ class MultiBody(OutsidePlant):
         return Motion(x[3], x[10], x[5], x[4], x[0], x[1], x[0], x[1], 0.0, -x[6], -x[7])
 
     def compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:
-        """Compute the specific force of the state x.
-
-        Args:
-            inputs: Inputs of the plant.
-
-        Returns:
-            (a_x, a_y) (m/s2).
-        """
+        """Compute the specific force that the rolled body of the state x feels."""
         rate, x = self.derivative(self.x, inputs), self.x
         a_x = rate[3] - x[5] * x[10]
         a_y = rate[10] + x[5] * x[3] - GRAVITY * math.sin(x[6])  # felt by the rolled body
@@ -360,7 +308,5 @@ class MultiBody(OutsidePlant):
 
 
 OUTSIDE_PLANTS: dict[str, type[OutsidePlant]] = {
-    "single-track": SingleTrack,
-    "drift": Drift,
-    "multi-body": MultiBody,
-}
+    "single-track": SingleTrack, "drift": Drift, "multi-body": MultiBody
+}  # fmt: skip

@@ -1,8 +1,7 @@
-"""The dialect of a text table: its encoding, separator, decimal mark, header and units.
+"""The dialect of a text table, the samples among a table's values, and metres on the earth.
 
-Which values of a table's columns are samples, and on which rows they stand.
-
-Metres east and north of a place on the earth, and back: the tangent plane of WGS 84.
+A dialect is encoding, separator, decimal mark, header and units. A sensor's samples are found among
+held or interpolated values. Metres are those of the tangent plane of WGS 84.
 """
 
 import csv
@@ -112,17 +111,11 @@ def read_text(
     has_comma = any("," in x and not _THOUSANDS.fullmatch(x) for x in numbers)
     decimal = "," if has_comma and not any("." in x for x in numbers) else "."
     frame = pd.read_csv(
-        io.BytesIO(data),
-        sep=r"\s+" if separator == " " else separator,
-        decimal=decimal,
-        encoding=encoding,
-        header=0,
-        names=list(range(len(header))),
-        skiprows=[*range(header_line), *skipped] or None,
-        index_col=False,
-        skipinitialspace=True,
+        io.BytesIO(data), sep=r"\s+" if separator == " " else separator, decimal=decimal,
+        encoding=encoding, header=0, names=list(range(len(header))),
+        skiprows=[*range(header_line), *skipped] or None, index_col=False, skipinitialspace=True,
         low_memory=False,
-    )
+    )  # fmt: skip
     frame.columns = pd.Index(header)
     aspects = {
         f"{encoding.upper()} text": encoding != "utf-8-sig",
@@ -267,10 +260,8 @@ def _find_period(lengths: Array) -> float:
     tolerance = 0.6 if period < 4.0 else max(1.0, 0.2 * period)
     deviation = np.abs(lengths - period * np.maximum(np.rint(lengths / period), 1.0))
     n_short, n_beside = (lengths < period - tolerance).sum(), (deviation > tolerance).sum()
-    is_regular = (
-        typical > 1.0 and n_short <= 0.05 * len(lengths) and n_beside <= 0.15 * len(lengths)
-    )
-    return period if is_regular else 0.0
+    is_rare = n_short <= 0.05 * len(lengths) and n_beside <= 0.15 * len(lengths)
+    return period if typical > 1.0 and is_rare else 0.0
 
 
 def _align_clocks(values: dict[str, Array], needed: Collection[str]) -> list[str]:
@@ -281,23 +272,18 @@ def _align_clocks(values: dict[str, Array], needed: Collection[str]) -> list[str
     if is_base.sum() < 2:
         return []
     for name in sorted(known.keys() - SLOW_QUANTITIES):
-        base_mask, own_mask = is_base, known[name]
-        if (
-            own_mask[base_mask].mean() > _COMPLETE
-            or own_mask.sum() < 2
-            or (name in TRUTH and not own_mask[~base_mask].any())
-        ):
+        is_known, is_base_known = known[name], known[name][is_base]
+        is_scarce_truth = name in TRUTH and not is_known[~is_base].any()
+        if is_base_known.mean() > _COMPLETE or is_known.sum() < 2 or is_scarce_truth:
             continue
-        t, interval = elapsed[own_mask], float(np.median(np.diff(elapsed[own_mask])))
-        after = np.clip(np.searchsorted(t, elapsed[base_mask]), 1, len(t) - 1)
+        t, t_base = elapsed[is_known], elapsed[is_base]
+        interval = float(np.median(np.diff(t)))
+        after = np.clip(np.searchsorted(t, t_base), 1, len(t) - 1)
         is_near = t[after] - t[after - 1] <= min(1.9 * interval, 1.01 * LONGEST_GAP)
-        is_near = (
-            is_near & (elapsed[base_mask] >= t[0]) & (elapsed[base_mask] <= t[-1])
-        ) | own_mask[base_mask]
-        if is_near.sum() > own_mask[base_mask].sum():
-            joined[name] = np.where(
-                is_near, np.interp(elapsed[base_mask], t, values[name][own_mask]), np.nan
-            )
+        is_near = (is_near & (t_base >= t[0]) & (t_base <= t[-1])) | is_base_known
+        if is_near.sum() > is_base_known.sum():
+            line = np.interp(t_base, t, values[name][is_known])
+            joined[name] = np.where(is_near, line, np.nan)
             lines.append(f"{name} (every {interval:.3g} s)")
     is_other = np.any(list(known.values()), axis=0)
     is_other &= ~np.any([known[n] for n in known.keys() - SLOW_QUANTITIES - TRUTH], axis=0)
@@ -312,36 +298,27 @@ def _align_clocks(values: dict[str, Array], needed: Collection[str]) -> list[str
             moved_rows = np.flatnonzero(known[name] & (places < len(rows)))
             values[name] = np.full(len(rows), np.nan)
             values[name][places[moved_rows]] = column[moved_rows]
-    complete_rows = np.flatnonzero(
-        np.isfinite([*(joined[n] for n in joined.keys() - TRUTH), rows]).all(0)
-    )
+    needed_columns = [joined[n] for n in joined.keys() - TRUTH]
+    complete_rows = np.flatnonzero(np.isfinite([*needed_columns, rows]).all(0))
     if not len(complete_rows):
         raise ValueError(f"{base}, {', '.join(joined)} are not known at the same time")
-    values.update(
-        {name: column[complete_rows[0] : complete_rows[-1] + 1] for name, column in values.items()}
-    )
+    used = slice(complete_rows[0], complete_rows[-1] + 1)
+    values.update({name: column[used] for name, column in values.items()})
     remarks = [f"Interpolated in the rows of {base}: {', '.join(lines)}."] if joined else []
     if n_ends := len(rows) - len(values["time"]):
         remarks.append(f"{n_ends} rows at the ends, where these are unknown, were left out.")
     return remarks
 
 
-EARTH = 6_378_137.0  # m, equatorial radius
-ECCENTRICITY_SQUARED = 6.694379990e-3
+_EARTH = 6_378_137.0  # m, equatorial radius
+_ECCENTRICITY_SQUARED = 6.694379990e-3
 
 
-def compute_radii(latitude: float) -> tuple[float, float]:
-    """Compute the radii of the parallel and of the meridian at a latitude.
-
-    Args:
-        latitude: Latitude (degrees north).
-
-    Returns:
-        Metres a radian (east, north).
-    """
+def _compute_radii(latitude: float) -> tuple[float, float]:
+    """Compute the radii of parallel and meridian (m) at a latitude (degrees north)."""
     phi = math.radians(latitude)
-    w = 1.0 - ECCENTRICITY_SQUARED * math.sin(phi) ** 2
-    return EARTH / math.sqrt(w) * math.cos(phi), EARTH * (1.0 - ECCENTRICITY_SQUARED) / w**1.5
+    w = 1.0 - _ECCENTRICITY_SQUARED * math.sin(phi) ** 2
+    return _EARTH / math.sqrt(w) * math.cos(phi), _EARTH * (1.0 - _ECCENTRICITY_SQUARED) / w**1.5
 
 
 def to_metres(
@@ -357,7 +334,7 @@ def to_metres(
     Returns:
         (east, north) (m), shape (n,) each.
     """
-    east, north = compute_radii(origin[0])
+    east, north = _compute_radii(origin[0])
     delta = (longitude - origin[1] + 180.0) % 360.0 - 180.0  # over the date line
     return east * np.radians(delta), north * np.radians(latitude - origin[0])
 
@@ -373,5 +350,5 @@ def to_degrees(X: Array, Y: Array, origin: tuple[float, float]) -> tuple[Array, 
     Returns:
         (latitude, longitude) (degrees), shape (n,) each.
     """
-    east, north = compute_radii(origin[0])
+    east, north = _compute_radii(origin[0])
     return origin[0] + np.degrees(Y / north), origin[1] + np.degrees(X / east)

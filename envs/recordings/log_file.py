@@ -1,6 +1,6 @@
-"""A recorded drive from a file: the same record that the simulated car writes.
+"""Recorded drives from files: the same record that the simulated car writes.
 
-A recorded drive with holes as whole drives: short holes are filled, long ones divide it.
+`read_log` takes a drive as it is, `read_parts` fills short holes and divides it at long ones.
 """
 
 import dataclasses
@@ -16,23 +16,17 @@ from ..sensors.link import SlowSensor
 from ..sensors.slow import SLOW_NAMES
 from ..ticks import TICK
 from .dialect import LONGEST_GAP, SENSORS, SLOW_QUANTITIES, TRUTH
-from .tables import COLUMNS, make_column_name, parse_mapping, read_quantities
+from .tables import read_quantities
 
-__all__ = ["COLUMNS", "NEEDED", "make_column_name", "make_packet_rows", "parse_mapping", "read_log"]
-
-NEEDED = ("time", "speed_x", "yaw_rate", "steer")
+_NEEDED = ("time", "speed_x", "yaw_rate", "steer")
 """The quantities without which a log cannot be read."""
 
 _SAMPLED = {  # column of the record: quantity of the log
     "gyro": "yaw_rate",
-    "accel_y": "accel_y",
-    "accel_x": "accel_x",
-    "roll_rate": "roll_rate",
-    "wheel_left": "wheel_left",
-    "wheel_right": "wheel_right",
+    **{name: name for name in ("accel_y", "accel_x", "roll_rate", "wheel_left", "wheel_right")},
 }
 _INPUTS = ("steer", "torque_left", "torque_right", "steer_command", "accel_command", "curvature")
-GAPS = {*TRUTH, *SLOW_QUANTITIES}
+_GAPS = {*TRUTH, *SLOW_QUANTITIES}
 """Quantities that need not be known in every row."""
 _GAP = 1.5  # steps of time
 _STILL = 1e-3  # of a step of time
@@ -41,22 +35,21 @@ _STANDING = 0.5  # m/s; below it the sideslip angle is 0
 
 
 def read_log(path: str | Path, mapping: Mapping[str, str] | None = None) -> Log:
-    """Read a recorded drive from a table of `read_table` (needs the extra `report`).
+    """Read a recorded drive from a table: CSV, Parquet, MATLAB or MDF (needs the extra `report`).
 
     The record's dt is the mean step of time, its first tick that of the first row (0 where time
     starts below 0: ticks are never negative). A logged input (steering, torque, command) acts from
-    its own row to the next, so it stands one row later in the record. Without both wheel speeds
-    both wheels turn at speed_x. Slow sensors (course, camera_psi) are NaN between their samples; a
-    sample is captured and arrives in its row, and the sensor's period is the longest that has every
-    sample on its clock. truth["beta"] is the sideslip angle, or atan2(speed_y, speed_x) where only
-    that is logged; 0 at 0.5 m/s and below, NaN where unknown, left out where the log has neither.
-    The name is the file's with its folder's. ModuleNotFoundError is raised without the extra.
+    its row to the next, so it stands one row later in the record. Without both wheel speeds both
+    wheels turn at speed_x. Slow sensors (course, camera_psi) are NaN between their samples. One is
+    captured and arrives in its row, and the sensor's period is the longest that has every sample on
+    its clock. truth["beta"] is the sideslip angle, or atan2(speed_y, speed_x) where only that is
+    logged; 0 at 0.5 m/s and below, NaN where unknown, left out where the log has neither. The name
+    is the file's with its folder's.
 
     Args:
-        path: Table with columns named as in `COLUMNS`; those of `NEEDED` must be present, unknown
-            ones are ignored.
-        mapping: Our column names, unit included, to the log's ({"yaw_rate_degps": "GyroZ"});
-            `parse_mapping` makes it from texts.
+        path: Table with columns named as in `tables.COLUMNS`; unknown ones are ignored.
+        mapping: Our column names, unit included, to the log's ({"yaw_rate_degps": "GyroZ"}), as
+            `tables.parse_mapping` makes it.
 
     Returns:
         The log.
@@ -67,40 +60,26 @@ def read_log(path: str | Path, mapping: Mapping[str, str] | None = None) -> Log:
             messages count from 1 below the header.
     """
     source = Path(path)
-    values, _ = read_quantities(source, mapping or {}, NEEDED, GAPS)
+    values, _ = read_quantities(source, mapping or {}, _NEEDED, _GAPS)
     try:
-        return make_log(values, source)
+        return _make_log(values, source)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
 
 
-def make_log(values: dict[str, Array], source: Path, dt: float | None = None) -> Log:
-    """Make the log of quantities in SI units; ValueError for a bad clock.
-
-    Args:
-        values: Quantities by name, shape (n,) each.
-        source: Path of the file, for the log's name.
-        dt: Step of the clock (s); None finds it.
-
-    Returns:
-        The log.
-    """
+def _make_log(values: dict[str, Array], source: Path, dt: float | None = None) -> Log:
+    """Make the log of quantities in SI units, shape (n,); dt None finds the clock's step (s)."""
     dt = find_clock(values["time"])[1] if dt is None else dt
     first = max(round(float(values["time"][0]) / dt), 0)
     fast, present = _make_fast_rows(values)
     packets, slow = _make_packets(values, first, dt)
     record = Record(fast, packets, first, dt, present)
-    return Log(
-        record, slow, _compute_truth(values), f"{source.resolve().parent.name}/{source.stem}"
-    )
+    name = f"{source.resolve().parent.name}/{source.stem}"
+    return Log(record, slow, _compute_truth(values), name)
 
 
 def make_packet_rows(
-    sensor: str,
-    captured: Array,
-    arrived: Array,
-    values: Array,
-    quality: Array,
+    sensor: str, captured: Array, arrived: Array, values: Array, quality: Array
 ) -> Array:
     """Make the packets of one sensor in capture order.
 
@@ -146,24 +125,21 @@ def find_clock(time: Array) -> tuple[int, float]:
     ):
         if is_wrong.any():
             row = int(np.argmax(is_wrong)) + 1
-            raise ValueError(
-                f"time {what} at row {row + 1}: {time[row]:.12g} s after {time[row - 1]:.12g} s"
-            )
+            times = f"{time[row]:.12g} s after {time[row - 1]:.12g} s"
+            raise ValueError(f"time {what} at row {row + 1}: {times}")
     dt = round(float(time[-1] - time[0]) / len(steps), 12)
     deviation = np.abs(time - time[0] - dt * np.arange(len(time)))
     if deviation.max() > dt + _DRIFT * (time[-1] - time[0]):
         row = int(np.argmax(deviation)) + 1
-        raise ValueError(
-            f"time is uneven: row {row} is {deviation.max():.6g} s beside a clock of {dt:.6g} "
-            "s a row"
-        )
+        clock = f"{deviation.max():.6g} s beside a clock of {dt:.6g} s a row"
+        raise ValueError(f"time is uneven: row {row} is {clock}")
     if dt < TICK * (1.0 - 1e-6):
         raise ValueError(f"rows are {dt:.6g} s apart; the shortest step is {TICK} s")
     return max(round(float(time[0]) / dt), 0), dt
 
 
 def _make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
-    """The record's fast rows and the names of those of its columns that carry something."""
+    """Make the record's fast rows and the names of their columns that carry something."""
     fast = np.zeros((len(values["time"]), FAST_WIDTH))
     if not {"wheel_left", "wheel_right"} <= values.keys():
         values = values | {"wheel_left": values["speed_x"], "wheel_right": values["speed_x"]}
@@ -183,7 +159,7 @@ def _make_fast_rows(values: dict[str, Array]) -> tuple[Array, tuple[str, ...]]:
 def _make_packets(
     values: dict[str, Array], first: int, dt: float
 ) -> tuple[Array, dict[str, SlowSensor]]:
-    """The packets of all slow sensors and their clocks."""
+    """Make the packets of all slow sensors and their clocks."""
     packets, clocks = [np.zeros((0, PACKET_WIDTH))], {}
     for sensor, names in SENSORS.items():
         if not np.isfinite(values.get(names[0], np.nan)).any():
@@ -205,7 +181,7 @@ def _make_packets(
 
 
 def _compute_truth(values: dict[str, Array]) -> dict[str, Array]:
-    """The sideslip angle where the log knows it; 0 at a standstill."""
+    """Compute the sideslip angle (rad) where the log knows it; 0 at a standstill."""
     v_x, v_y = values["speed_x"], values.get("speed_y")
     if "sideslip" in values:
         beta = values["sideslip"]
@@ -218,8 +194,8 @@ def _compute_truth(values: dict[str, Array]) -> dict[str, Array]:
 
 
 WARNING_PREFIX = "WARNING: "  # begins a remark that concerns the result
-MAX_HOLE = 0.25  # s, the longest hole that is filled by interpolation
-MIN_PART = 2.0  # s, of a part
+_MAX_HOLE = 0.25  # s, the longest hole that is filled by interpolation
+_MIN_PART = 2.0  # s, of a part
 _SAME_STEP = 1e-3  # of a step, by which those of parts may differ
 
 
@@ -233,9 +209,9 @@ def read_parts(
 
     Shuffled rows are sorted. Rows without a value in a column that must be complete, and rows whose
     time is not after that of those before, are dropped; a file of which most rows lack a value at
-    irregular places is refused. Holes up to `MAX_HOLE` s are filled by interpolation on an even
+    irregular places is refused. Holes up to `_MAX_HOLE` s are filled by interpolation on an even
     clock; longer ones, and a clock that is set back by more, divide the log, and parts under
-    `MIN_PART` s are left out. All parts have the dt of the longest; one without a slow sensor's
+    `_MIN_PART` s are left out. All parts have the dt of the longest; one without a slow sensor's
     sample lacks the sensor.
 
     Args:
@@ -251,8 +227,8 @@ def read_parts(
         ValueError: If no part is left, and for all else that `read_log` refuses.
     """
     source = Path(path)
-    values, remarks = read_quantities(source, mapping or {}, NEEDED, None)
-    gaps = {name: np.isnan(v) for name, v in values.items() if name not in GAPS}
+    values, remarks = read_quantities(source, mapping or {}, _NEEDED, None)
+    gaps = {name: np.isnan(v) for name, v in values.items() if name not in _GAPS}
     known = ~np.any(list(gaps.values()), axis=0)
     elapsed = np.append(0.0, np.cumsum(np.maximum(np.diff(values["time"]), 0.0)))
     is_used = known & (elapsed >= start) & (elapsed < (math.inf if end is None else end))
@@ -265,10 +241,8 @@ def read_parts(
             if np.count_nonzero(known[1:] & known[:-1]) < np.count_nonzero(known) / 2:
                 regular = f"regular gaps up to {LONGEST_GAP:g} s could be filled"
                 raise ValueError(f"{count} {drop_reason}; {regular}")
-            remarks, count = (
-                [f"{WARNING_PREFIX}{count} {drop_reason} and were dropped.", *remarks],
-                0,
-            )
+            remarks = [f"{WARNING_PREFIX}{count} {drop_reason} and were dropped.", *remarks]
+            count = 0
         if np.count_nonzero(is_used) < 2:
             raise ValueError("fewer than two rows are complete, or are in the time asked for")
         pieces, done = _split_pieces({name: column[is_used] for name, column in values.items()})
@@ -276,7 +250,7 @@ def read_parts(
         if len(pieces) > 1:
             dt = find_clock(max((piece["time"] for piece in pieces), key=len))[1]
             pieces = [_resample_evenly(piece, dt, _SAME_STEP) for piece in pieces]
-        logs = [make_log(piece, source, dt) for piece in pieces]
+        logs = [_make_log(piece, source, dt) for piece in pieces]
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
     remarks += [f"{count} {text}." for count, text in [*done, (count, drop_reason)] if count]
@@ -294,37 +268,31 @@ def _split_pieces(values: dict[str, Array]) -> tuple[list[dict[str, Array]], lis
     if not (steps > 0.0).any():
         raise ValueError(f"time stands still at row 2: {time[1]:.12g} s after {time[0]:.12g} s")
     typical = float(np.median(steps[steps > 0.0]))
-    is_backward = steps < -MAX_HOLE
-    ends = np.flatnonzero(is_backward | (steps > MAX_HOLE + typical)) + 1
+    is_backward = steps < -_MAX_HOLE
+    ends = np.flatnonzero(is_backward | (steps > _MAX_HOLE + typical)) + 1
     for rows in np.split(np.arange(len(time)), ends):
         newest = np.maximum.accumulate(time[rows])
         is_later = np.append(True, time[rows][1:] > newest[:-1] + 1e-3 * typical)
         rows, dropped = rows[is_later], dropped + int(np.count_nonzero(~is_later))
-        if (len(ends) and time[rows[-1]] - time[rows[0]] < MIN_PART) or len(rows) < 2:
+        if (len(ends) and time[rows[-1]] - time[rows[0]] < _MIN_PART) or len(rows) < 2:
             short += 1
             continue
         holes += int(np.count_nonzero(np.diff(time[rows]) > 1.5 * typical))
-        pieces.append(
-            _resample_evenly({name: column[rows] for name, column in values.items()}, typical)
-        )
+        piece = {name: column[rows] for name, column in values.items()}
+        pieces.append(_resample_evenly(piece, typical))
     if dropped > len(time) / 2:
-        raise ValueError(
-            f"time stands still or steps back in {dropped} of {len(time)} rows: have its stamps "
-            "lost digits?"
-        )
+        rows_text = f"{dropped} of {len(time)} rows: have its stamps lost digits?"
+        raise ValueError(f"time stands still or steps back in {rows_text}")
     if not pieces:
-        raise ValueError(
-            f"no part of the log lasts {MIN_PART:g} s without a hole of {MAX_HOLE:g} s"
-        )
+        hole = f"a hole of {_MAX_HOLE:g} s"
+        raise ValueError(f"no part of the log lasts {_MIN_PART:g} s without {hole}")
+    n_backward = int(np.count_nonzero(is_backward))
     return pieces, [
         (dropped, "rows whose time steps back or stands still were dropped"),
-        (
-            int(np.count_nonzero(is_backward)),
-            "times the clock was set back: the log is divided there",
-        ),
-        (holes, f"holes up to {MAX_HOLE:g} s were filled by interpolation"),
+        (n_backward, "times the clock was set back: the log is divided there"),
+        (holes, f"holes up to {_MAX_HOLE:g} s were filled by interpolation"),
         (len(pieces) if len(pieces) > 1 else 0, "parts, between which rows are missing"),
-        (short, f"parts under {MIN_PART:g} s were left out"),
+        (short, f"parts under {_MIN_PART:g} s were left out"),
     ]
 
 
@@ -333,7 +301,7 @@ def _resample_evenly(
 ) -> dict[str, Array]:
     """Resample the quantities to an even clock: interpolated, slow samples in the nearest row.
 
-    Those whose clock is even already, and within this fraction of dt, stay as they are.
+    A clock that is even already, its step within the tolerance (a fraction) of dt, stays.
     """
     time = values["time"]
     try:
@@ -346,7 +314,6 @@ def _resample_evenly(
     for name in SLOW_QUANTITIES & values.keys():
         known = np.isfinite(values[name])
         resampled[name] = np.full(len(even), np.nan)
-        resampled[name][np.rint((time[known] - time[0]) / (even[1] - even[0])).astype(int)] = (
-            values[name][known]
-        )
+        rows = np.rint((time[known] - time[0]) / (even[1] - even[0])).astype(int)
+        resampled[name][rows] = values[name][known]
     return resampled

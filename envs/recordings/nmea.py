@@ -1,17 +1,8 @@
-"""NMEA 0183 sentences: bytes between "$" and the line's end, checked, and their fields as values.
+"""NMEA 0183, what satellite receivers send: bytes as they come, decoded into epochs.
 
-The forms of the fields and their conversion are pynmeagps's (needs the extra `wires`). Its parser
-of whole sentences is not used: it loses a sentence for one bad field ("0NaN" of a receiver in a
-tunnel), while here that field alone is left out.
-
-NMEA 0183, what satellite receivers send: bytes as they come, decoded into epochs.
-
-    decoder = Decoder()
-    for chunk in make_source("serial:/dev/ttyUSB0:4800"):
-        for epoch in decoder.decode_chunk(chunk):
-            ...
-
-Degrees from north, knots and times of day live here and in `sentences` alone.
+Fields have the forms and conversions of pynmeagps (needs the extra `wires`). Its parser of whole
+sentences is not used: it loses a sentence for one bad field ("0NaN" of a receiver in a tunnel),
+while here that field alone is left out. Degrees from north, knots and times of day stay here.
 """
 
 import math
@@ -36,7 +27,7 @@ with require_extra("wires", "decoding NMEA needs pynmeagps"):
 
 DECODED = ("GLL", "GSA", "VTG", "RMC", "GNS", "GGA", "GSV", "ZDA")  # later ones overrule
 _NO_FIX = "NEMS"  # modes of GNS: none, dead reckoning, typed in, simulated
-VENDOR, OTHER = "of vendors", "other"
+_VENDOR, _OTHER = "of vendors", "other"
 _RANGES = {
     "lat": (0.0, 90.0), "lon": (0.0, 180.0), "cog": (0.0, 360.0), "cogt": (0.0, 360.0),
     "spd": (0.0, 1e4), "sogn": (0.0, 1e4), "sogk": (0.0, 1e4), "HDOP": (0.0, 1e4),
@@ -46,30 +37,19 @@ _ANY = (-1e12, 1e12)
 _TIME = re.compile(r"(\d\d)(\d\d)(\d\d(?:\.\d*)?)", re.ASCII)
 
 
-class Sentence(NamedTuple):
+class _Sentence(NamedTuple):
     """A sentence with a right checksum."""
 
-    talker: str
-    """The system: GP, GL, GN, ..."""
-    kind: str
-    """One of `DECODED`, `VENDOR` or `OTHER`."""
-    values: dict[str, Any]
-    """The fields that hold something, by pynmeagps's names; empty for a kind not in `DECODED`."""
-    bad: list[str]
-    """The names of the fields that hold no value of theirs."""
+    talker: str  # the system: GP, GL, GN, ...
+    kind: str  # of `DECODED`, _VENDOR or _OTHER
+    values: dict[str, Any]  # fields that hold something, by pynmeagps's names
+    bad: list[str]  # the fields that hold no value of their range and form
 
 
-def read_sentence(text: bytes) -> Sentence | None:
-    """Read a sentence and check it.
+def _read_sentence(text: bytes) -> _Sentence | None:
+    """Read and check the bytes between "$" and the line's end; None for a wrong checksum.
 
-    Args:
-        text: Bytes between "$" and the line's end.
-
-    Returns:
-        The sentence; None for a wrong checksum.
-
-    Raises:
-        ValueError: For one without a checksum.
+    Raises ValueError for a sentence without a checksum.
     """
     try:
         content, talker, kind, fields, checksum = get_parts(text)
@@ -78,59 +58,33 @@ def read_sentence(text: bytes) -> Sentence | None:
     if calc_checksum(content) != checksum.strip().upper():
         return None
     if talker == "P" or kind not in DECODED:
-        return Sentence("", VENDOR if talker == "P" else OTHER, {}, [])
+        return _Sentence("", _VENDOR if talker == "P" else _OTHER, {}, [])
     talker = talker if talker in NMEA_TALKERS else ""
     if kind == "GSV":  # a number of the signal may follow the satellites
         fields = fields[: 3 + (len(fields) - 3) // 4 * 4]
     initial_values = {"numSV": sum(map(bool, fields[2:14]))} if kind == "GSA" else {}
-    sentence = Sentence(talker, kind, initial_values, [])
-    for (name, form), text in zip(_list_forms(kind), fields, strict=False):
-        if text:
-            value = _parse_value(name, form, text)
+    sentence = _Sentence(talker, kind, initial_values, [])
+    for (name, form), entry in zip(_list_forms(kind), fields, strict=False):
+        if entry:
+            value = _parse_value(name, form, entry)
             if value is None:
                 sentence.bad.append(name)
             else:
                 sentence.values[name] = value
     if kind == "GNS":
-        sentence.values["quality"] = int(
-            bool(set(sentence.values.get("posMode", "N")) - set(_NO_FIX))
-        )
+        modes = set(sentence.values.get("posMode", "N"))
+        sentence.values["quality"] = int(bool(modes - set(_NO_FIX)))
     if kind == "ZDA" and {"year", "month", "day"} <= sentence.values.keys():
         try:
-            sentence.values["date"] = date(
-                *(sentence.values[name] for name in ("year", "month", "day"))
-            )
+            day = [sentence.values[name] for name in ("year", "month", "day")]
+            sentence.values["date"] = date(*day)
         except ValueError:
             sentence.bad.append("day")
     return sentence
 
 
-def is_unchecked(text: bytes) -> bool:
-    """Check whether a sentence of `DECODED` lacks only its checksum; its last two fields are newer.
-
-    Args:
-        text: Bytes between "$" and the line's end.
-
-    Returns:
-        True if it does.
-    """
-    address, *fields = text.split(b",")
-    kind = address[2:].decode("ascii", "replace")
-    return b"*" not in text and kind in DECODED and len(fields) >= len(_list_forms(kind)) - 2
-
-
-def apply_sign(values: dict[str, Any], name: str, side: str, negative: str) -> float:
-    """Apply the sign of its side to a latitude or longitude.
-
-    Args:
-        values: Fields of an epoch.
-        name: Name of the field, "lat" or "lon" (degrees).
-        side: Name of the side's field, "NS" or "EW".
-        negative: Side that is negative, "S" or "W".
-
-    Returns:
-        Degrees; NaN where either field is missing.
-    """
+def _apply_sign(values: dict[str, Any], name: str, side: str, negative: str) -> float:
+    """Sign a latitude or longitude (degrees) by its side; NaN where either is missing."""
     if name not in values or side not in values:
         return math.nan
     return float(-values[name] if values[side] == negative else values[name])
@@ -138,7 +92,7 @@ def apply_sign(values: dict[str, Any], name: str, side: str, negative: str) -> f
 
 @cache
 def _list_forms(kind: str) -> tuple[tuple[str, str], ...]:
-    """(name, form) of each field of a kind, groups written out."""
+    """List (name, form) of each field of a kind, groups written out."""
 
     def iterate_fields(table: dict[str, Any]) -> Iterator[tuple[str, str]]:
         for name, form in table.items():
@@ -151,7 +105,7 @@ def _list_forms(kind: str) -> tuple[tuple[str, str], ...]:
 
 
 def _parse_value(name: str, form: str, text: str) -> Any:
-    """A field's value; None where the text is none."""
+    """Parse a field's value; None where the text is none."""
     try:
         value = _parse_time(text) if name == "time" else NMEAMessage.str2val(text, form)
     except ValueError:
@@ -162,7 +116,7 @@ def _parse_value(name: str, form: str, text: str) -> Any:
 
 
 def _parse_time(text: str) -> float:
-    """s of the day of hhmmss.ss; 23:59:60 is a leap second, which pynmeagps refuses."""
+    """Convert hhmmss.ss to s of the day; 23:59:60 is a leap second, which pynmeagps refuses."""
     match = _TIME.fullmatch(text)
     hour, minute, second = map(float, match.groups()) if match else (24.0, 0.0, 0.0)
     if not (hour < 24.0 and minute < 60.0 and second < 61.0):
@@ -171,11 +125,11 @@ def _parse_time(text: str) -> float:
 
 
 LONGEST = 1024  # bytes of a sentence; the standard has 82, some vendors' are longer
-KNOT = 1852.0 / 3600.0  # m/s
+_KNOT = 1852.0 / 3600.0  # m/s
 DAY = 86_400.0  # s
 HOUR = 3600.0  # s, from which a step forward is counted
-CONTINUOUS = 60.0  # s: a time of day within these is continuous, whatever its date
-ROLLOVER = 7 * 1024  # days, after which a receiver's count of weeks begins anew
+_CONTINUOUS = 60.0  # s: a time of day within these is continuous, whatever its date
+_ROLLOVER = 7 * 1024  # days, after which a receiver's count of weeks begins anew
 _EPOCH = date(1970, 1, 1).toordinal()
 _FIRST = DAY * (date(1980, 1, 6).toordinal() - _EPOCH)  # s: GPS has no earlier date
 _NOT_MEASURED = (0, 6, 7)  # GGA's quality: no fix, dead reckoning, typed in
@@ -183,11 +137,13 @@ _TIMED = ("GLL", "RMC", "GNS", "GGA")  # with a position
 
 
 class Epoch(NamedTuple):
-    """A receiver's measurements at one time; NaN is unknown."""
+    """A receiver's measurements at one time; NaN is unknown.
 
-    t: float
-    """UTC in s since 1970, since the first epoch's midnight where no date was sent. Leap seconds
-    that were sent are counted: differences are elapsed time."""
+    t is UTC in s since 1970, since the first epoch's midnight where no date was sent. Leap seconds
+    that were sent are counted: differences are elapsed time.
+    """
+
+    t: float  # s
     latitude: float  # degrees north, NaN without a fix
     longitude: float  # degrees east, NaN without a fix
     course: float  # rad counter-clockwise from east, in [-pi, pi]
@@ -206,41 +162,23 @@ class Epoch(NamedTuple):
 
 @dataclass
 class Counts:
-    """Counts of received sentences and epochs, and of their faults.
+    """Counts of received sentences and epochs, and of their faults."""
 
-    Attributes:
-        received: Bytes.
-        garbage: Bytes outside sentences, line ends apart.
-        sentences: Sentences by type, with a right checksum; those outside `DECODED` were skipped.
-        bad_checksum: Sentences with a wrong checksum.
-        truncated: Sentences cut short.
-        unchecked: Sentences without a checksum.
-        overlong: Sentences longer than `LONGEST`.
-        emptied: Bad fields, by type and name.
-        epochs: Epochs.
-        without_fix: Epochs without a fix.
-        without_time: Epochs without a time.
-        backward: Steps of time backward.
-        forward: Steps of time forward by an hour or more.
-        redated: Epochs dated by others.
-        repeated: Sentences repeated in an epoch.
-    """
-
-    received: int = 0
-    garbage: int = 0
-    sentences: Counter[str] = field(default_factory=Counter)
+    received: int = 0  # bytes
+    garbage: int = 0  # bytes outside sentences, line ends apart
+    sentences: Counter[str] = field(default_factory=Counter)  # by type, with a right checksum
     bad_checksum: int = 0
-    truncated: int = 0
-    unchecked: int = 0
-    overlong: int = 0
-    emptied: Counter[str] = field(default_factory=Counter)
+    truncated: int = 0  # sentences cut short
+    unchecked: int = 0  # sentences without a checksum
+    overlong: int = 0  # sentences longer than `LONGEST`
+    emptied: Counter[str] = field(default_factory=Counter)  # bad fields, by type and name
     epochs: int = 0
     without_fix: int = 0
     without_time: int = 0
-    backward: int = 0
-    forward: int = 0
-    redated: int = 0
-    repeated: int = 0
+    backward: int = 0  # steps of time
+    forward: int = 0  # steps of time by an hour or more
+    redated: int = 0  # epochs dated by others
+    repeated: int = 0  # sentences repeated in an epoch
 
     def rows(self) -> list[tuple[str, int]]:
         """List names and counts for a table."""
@@ -323,9 +261,12 @@ class Decoder:
 
     def _decode_sentence(self, text: bytes) -> list[Epoch]:
         try:
-            sentence = read_sentence(text)
-        except ValueError:
-            unchecked = is_unchecked(text)
+            sentence = _read_sentence(text)
+        except ValueError:  # a known sentence may lack its checksum and its last two, newer fields
+            address, *fields = text.split(b",")
+            kind = address[2:].decode("ascii", "replace")
+            is_known = b"*" not in text and kind in DECODED
+            unchecked = is_known and len(fields) >= len(_list_forms(kind)) - 2
             self.counts.unchecked += unchecked
             self.counts.truncated += not unchecked
             return []
@@ -336,7 +277,7 @@ class Decoder:
         self.counts.emptied.update(f"{sentence.kind} {name}" for name in sentence.bad)
         return self._add_sentence(sentence)
 
-    def _add_sentence(self, sentence: Sentence) -> list[Epoch]:
+    def _add_sentence(self, sentence: _Sentence) -> list[Epoch]:
         """Add a sentence to its epoch; those without a time belong to the one at hand."""
         talker, kind, values, _ = sentence
         done: list[Epoch] = []
@@ -364,19 +305,15 @@ class Decoder:
             return done
         self._parts[kind] = values
         self._time = self._time if time is None else time
-        present_kinds = self._parts.keys()
-        hdop = "GSA" in present_kinds or any("HDOP" in part for part in self._parts.values())
-        if (
-            present_kinds & {"RMC", "VTG"}
-            and present_kinds & {"GGA", "GNS"}
-            and hdop
-            and not self._sent
-        ):
+        kinds = self._parts.keys()
+        has_hdop = "GSA" in kinds or any("HDOP" in part for part in self._parts.values())
+        is_complete = kinds & {"RMC", "VTG"} and kinds & {"GGA", "GNS"} and has_hdop
+        if is_complete and not self._sent:
             done.append(self._make_epoch())
         return done
 
     def _close(self) -> list[Epoch]:
-        """End the epoch at hand: itself, if it was not handed out and is one."""
+        """End the epoch at hand; return it unless it was handed out or has no position."""
         is_unsent = not self._sent and not self._parts.keys().isdisjoint(_TIMED)
         done = [self._make_epoch()] if is_unsent else []
         self._parts, self._next, self._time, self._sent = self._next, {}, None, False
@@ -389,13 +326,11 @@ class Decoder:
         known = {k: v for kind in DECODED for k, v in self._parts.get(kind, {}).items()}
         flags = [known["status"] == "A"] if "status" in known else []
         flags += [known["quality"] not in _NOT_MEASURED] if "quality" in known else []
-        latitude, longitude = (
-            apply_sign(known, "lat", "NS", "S"),
-            apply_sign(known, "lon", "EW", "W"),
-        )
+        latitude = _apply_sign(known, "lat", "NS", "S")
+        longitude = _apply_sign(known, "lon", "EW", "W")
         has_fix = bool(flags) and all(flags) and math.isfinite(latitude + longitude)
         knots = known.get("spd", known.get("sogn", known.get("sogk", math.nan) / 1.852))
-        speed = KNOT * knots if has_fix else math.nan
+        speed = _KNOT * knots if has_fix else math.nan
         north = known.get("cog", known.get("cogt", math.nan)) if has_fix else math.nan
         hdop = known.get("HDOP", 0.0)
         self._fix = t if has_fix else self._fix
@@ -417,9 +352,8 @@ class Decoder:
 
     def _convert_time(self, time: float) -> float:
         day, newest_time = self._date
-        day += (time < newest_time - DAY / 2) - (
-            time > newest_time + DAY / 2
-        )  # midnight, without a date
+        # midnight, without a date
+        day += (time < newest_time - DAY / 2) - (time > newest_time + DAY / 2)
         self._date = day, time
         self._leaps += self._in_leap and time < DAY
         self._in_leap = time >= DAY
@@ -444,10 +378,10 @@ def correct_dates(epochs: list[Epoch]) -> list[Epoch]:
     step = np.diff(t[rows])
     jump = np.rint(step / DAY)
     dated = t[rows[:-1]] >= _FIRST
-    pause = dated & (jump != 0.0) & (np.abs(step - jump * DAY) > CONTINUOUS)
+    pause = dated & (jump != 0.0) & (np.abs(step - jump * DAY) > _CONTINUOUS)
     days = np.append(0.0, np.cumsum(np.where(pause, 0.0, jump)))
     for part in np.split(np.arange(len(rows)), np.flatnonzero(pause) + 1):
         later = days[part[-1:]] - days[part]
-        later += max(-later[later % ROLLOVER == 0.0], default=0.0)
+        later += max(-later[later % _ROLLOVER == 0.0], default=0.0)
         t[rows[part]] += later * DAY
     return [epoch._replace(t=float(new)) for epoch, new in zip(epochs, t, strict=True)]

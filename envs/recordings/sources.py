@@ -1,4 +1,4 @@
-"""Where a receiver's bytes come from: a file, a serial port, a TCP peer."""
+"""Sources of a receiver's bytes: a file, a serial port, a TCP peer."""
 
 import re
 import socket
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .nmea import Counts, Epoch
 
 BAUD = 4800  # of NMEA 0183
-PAUSE = 0.5  # s without a byte after which b"" is handed out
+_PAUSE = 0.5  # s without a byte after which b"" is handed out
 _CHUNK_SIZE = 65_536  # bytes of a chunk, and those that show what a file holds
 _LINE = re.compile(rb"\$(?:[A-Z]{2}(?:RMC|GGA|GNS|GLL),|[A-Z]{3,6},[^$*\r\n]*\*[0-9A-Fa-f]{2})")
 
@@ -24,8 +24,7 @@ class Connection(NamedTuple):
     """An open file, port or connection."""
 
     read: Callable[[], bytes]
-    """Some bytes, b"" after `PAUSE` without any; raises EOFError at a file's end, OSError where the
-    line is lost."""
+    """Some bytes, b"" after a pause; raises EOFError at a file's end, OSError on a lost line."""
     close: Callable[[], None]
 
 
@@ -35,20 +34,13 @@ class ByteSource:
 
     Iterating raises OSError where the line cannot be opened at first, ConnectionError where it was
     lost and does not come back; leaving the loop closes it.
-
-    Attributes:
-        name: Name of the source, for messages.
-        connect: Opens the line.
-        tries: Number of times that a lost line is opened again before a byte comes.
-        wait: Time before each (s).
-        losses: Number of times that it was lost.
     """
 
-    name: str
-    connect: Callable[[], Connection]
-    tries: int = 5
-    wait: float = 1.0
-    losses: int = 0
+    name: str  # for messages
+    connect: Callable[[], Connection]  # opens the line
+    tries: int = 5  # to open a lost line again before a byte comes
+    wait: float = 1.0  # s, before each
+    losses: int = 0  # of the line so far
 
     def __iter__(self) -> Iterator[bytes]:
         connection: Connection | None = self.connect()
@@ -103,9 +95,8 @@ def make_source(text: str, tries: int = 5, wait: float = 1.0) -> ByteSource:
     if kind == "tcp":
         if not (head and number.isdecimal() and 0 < int(number) < 65_536):
             raise ValueError(f"expected tcp:HOST:PORT, got {short_repr(text)}")
-        return ByteSource(
-            text, lambda: _make_tcp_connection(head.strip("[]"), int(number)), tries, wait
-        )
+        host = head.strip("[]")
+        return ByteSource(text, lambda: _make_tcp_connection(host, int(number)), tries, wait)
     path = Path(text)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
@@ -181,7 +172,7 @@ def _make_file_connection(path: Path) -> Connection:
 def _make_serial_connection(port: str, baud: int) -> Connection:
     with require_extra("wires", "a serial port needs pyserial"):
         import serial
-    device = serial.Serial(port, baud, timeout=PAUSE)
+    device = serial.Serial(port, baud, timeout=_PAUSE)
     return Connection(
         lambda: bytes(device.read(min(device.in_waiting or 1, _CHUNK_SIZE))), device.close
     )
@@ -189,7 +180,7 @@ def _make_serial_connection(port: str, baud: int) -> Connection:
 
 def _make_tcp_connection(host: str, port: int) -> Connection:
     peer = socket.create_connection((host, port), timeout=5.0)
-    peer.settimeout(PAUSE)
+    peer.settimeout(_PAUSE)
 
     def read() -> bytes:
         try:

@@ -1,6 +1,6 @@
-"""Tables on disk, as they stand there: CSV, Parquet, MATLAB and MDF.
+"""Tables on disk as named quantities in SI units (needs the extra `report`).
 
-A table on disk as named quantities in SI units (needs the extra `report`).
+CSV, Parquet, MATLAB and MDF are told apart by content. Columns have our names or mapped ones.
 """
 
 import re
@@ -20,39 +20,19 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-class LogTable(NamedTuple):
-    """A file's columns as they stand there.
+class _LogTable(NamedTuple):
+    """A file's columns as they stand there."""
 
-    Attributes:
-        frame: Values; names may repeat.
-        units: Unit of each column, "" for unknown.
-        names: Names of all columns; an MDF's frame has only the wanted ones.
-        remarks: Sentences on how the file was read.
-    """
-
-    frame: "pd.DataFrame"
-    units: list[str]
-    names: list[str]
-    remarks: list[str]
+    frame: "pd.DataFrame"  # names may repeat
+    units: list[str]  # "" for unknown
+    names: list[str]  # of all columns; an MDF's frame has only the wanted ones
+    remarks: list[str]  # sentences on how the file was read
 
 
-def read_table(path: Path, is_wanted: Callable[[str], bool]) -> LogTable:
+def _read_table(path: Path, is_wanted: Callable[[str], bool]) -> _LogTable:
     """Read a file's columns: text of any dialect, Parquet, MATLAB or MDF, recognised by content.
 
-    MDF needs `asammdf`.
-
-    Args:
-        path: Path of the file.
-        is_wanted: Whether a column's name is looked for.
-
-    Returns:
-        The table.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is no table.
-        ImportError: If an extra is missing.
-        MemoryError: If it does not fit into memory.
+    Raises FileNotFoundError, ValueError for a file that is no table, ImportError without an extra.
     """
     with require_extra("report", "reading a log needs pandas"):
         import pandas as pd
@@ -79,15 +59,14 @@ def read_table(path: Path, is_wanted: Callable[[str], bool]) -> LogTable:
     except Exception as error:  # of scipy and asammdf anything, where a file is damaged
         reason = " ".join(str(error).split()) or type(error).__name__
         reason = "it is not text" if isinstance(error, UnicodeDecodeError) else reason
-        raise ValueError(
-            f"{path}: expected CSV, Parquet, MATLAB or MDF, but {reason:.300}"
-        ) from None
+        message = f"{path}: expected CSV, Parquet, MATLAB or MDF, but {reason:.300}"
+        raise ValueError(message) from None
     names = [str(name).strip() for name in frame.columns]
-    return LogTable(frame.set_axis(names, axis=1), units or [""] * len(names), names, remarks)
+    return _LogTable(frame.set_axis(names, axis=1), units or [""] * len(names), names, remarks)
 
 
 def _read_matlab(path: Path, head: bytes) -> "pd.DataFrame":
-    """The numeric vectors of the length that most have; ValueError for a file of version 7.3."""
+    """Read the numeric vectors of the commonest length; ValueError for a file of version 7.3."""
     import pandas as pd
     from scipy.io import loadmat
 
@@ -100,13 +79,11 @@ def _read_matlab(path: Path, head: bytes) -> "pd.DataFrame":
     }
     lengths = [len(values) for values in columns.values()]
     common_length = max(set(lengths), key=lengths.count, default=0)
-    return pd.DataFrame(
-        {name: column for name, column in columns.items() if len(column) == common_length}
-    )
+    return pd.DataFrame({name: x for name, x in columns.items() if len(x) == common_length})
 
 
-def _read_mdf(path: Path, is_wanted: Callable[[str], bool]) -> LogTable:
-    """The wanted channels in rows at the stamps of all their groups, NaN where a group has none."""
+def _read_mdf(path: Path, is_wanted: Callable[[str], bool]) -> _LogTable:
+    """Read the wanted channels in rows at the stamps of all groups, NaN where one has none."""
     with require_extra("mdf", "reading MDF needs asammdf"):
         from asammdf import MDF
     import pandas as pd
@@ -121,11 +98,8 @@ def _read_mdf(path: Path, is_wanted: Callable[[str], bool]) -> LogTable:
             if not wanted and len(places) > 1 and is_wanted(name):
                 raise ValueError(f"channels share a name; --map one of {', '.join(labels)}")
             chosen.update(wanted)
-        signals = file.select(
-            [(None, *place) for place in chosen.values()],
-            ignore_value2text_conversions=True,
-            validate=True,
-        )
+        channels = [(None, *place) for place in chosen.values()]
+        signals = file.select(channels, ignore_value2text_conversions=True, validate=True)
         names = list(file.channels_db)
     for name, signal in zip(chosen, signals, strict=True):
         if signal.samples.ndim == 1 and signal.samples.dtype.kind in "fiub" and name != "time_s":
@@ -133,7 +107,7 @@ def _read_mdf(path: Path, is_wanted: Callable[[str], bool]) -> LogTable:
             columns[name] = column[~column.index.duplicated()]
             units.append(find_unit(signal.unit))
     frame = pd.concat(columns, axis=1, sort=True) if columns else pd.DataFrame()
-    return LogTable(frame.rename_axis("time_s").reset_index(), units, names, [])
+    return _LogTable(frame.rename_axis("time_s").reset_index(), units, names, [])
 
 
 _LARGEST = 1e15  # in SI units
@@ -148,35 +122,18 @@ _CURVATURE = {"radpm": 1.0}
 
 COLUMNS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-    "speed_x": _SPEED,
-    "speed_y": _SPEED,
-    "yaw_rate": _ANGLE_RATE,
-    "accel_x": _ACCELERATION,
-    "accel_y": _ACCELERATION,
-    "roll_rate": _ANGLE_RATE,
-    "steer": _ANGLE,
-    "sideslip": _ANGLE,
-    "wheel_left": _SPEED,
-    "wheel_right": _SPEED,
-    "torque_left": _TORQUE,
-    "torque_right": _TORQUE,
-    "steer_command": _ANGLE,
-    "accel_command": _ACCELERATION,
-    "curvature": _CURVATURE,
-    "course": _ANGLE | {"degnorth": -np.pi / 180.0},
-    "gps_speed": _SPEED,
-    "gps_x": _LENGTH,
-    "gps_y": _LENGTH,
-    "gps_hdop": _NUMBER,
-    "gps_satellites": _NUMBER,
-    "camera_psi": _ANGLE,
+    "speed_x": _SPEED, "speed_y": _SPEED, "yaw_rate": _ANGLE_RATE, "accel_x": _ACCELERATION,
+    "accel_y": _ACCELERATION, "roll_rate": _ANGLE_RATE, "steer": _ANGLE, "sideslip": _ANGLE,
+    "wheel_left": _SPEED, "wheel_right": _SPEED, "torque_left": _TORQUE, "torque_right": _TORQUE,
+    "steer_command": _ANGLE, "accel_command": _ACCELERATION, "curvature": _CURVATURE,
+    "course": _ANGLE | {"degnorth": -np.pi / 180.0}, "gps_speed": _SPEED, "gps_x": _LENGTH,
+    "gps_y": _LENGTH, "gps_hdop": _NUMBER, "gps_satellites": _NUMBER, "camera_psi": _ANGLE,
     "camera_y_l": _LENGTH,
-}
+}  # fmt: skip
 """What a log may hold and the units it may come in, with their factors to SI. A column is called
 quantity_unit (`yaw_rate_radps`). Axes are ISO 8855; angles, the course too, are positive to the
 left; `course_degnorth` alone counts from north, clockwise, as a compass does. The names of course
 and camera_psi may end on a kind of samples: `course_deg_held`."""
-_NORTH = np.pi / 2.0  # the course towards north, rad
 _NAMES = {
     f"{quantity}_{unit}{kind}": (quantity, factor)
     for quantity, units in COLUMNS.items()
@@ -197,27 +154,17 @@ def make_column_name(quantity: str) -> str:
     return f"{quantity}_{next(iter(COLUMNS[quantity]))}"
 
 
-def parse_column_name(name: str) -> tuple[str, float]:
-    """Parse the name of a column.
+def _parse_column_name(name: str) -> tuple[str, float]:
+    """Parse a column's name in lower case to its quantity and the unit's factor to SI.
 
-    Args:
-        name: Name in lower case, such as "yaw_rate_degps".
-
-    Returns:
-        Name of the quantity and the unit's factor to SI.
-
-    Raises:
-        ValueError: If it is none of ours.
+    Raises ValueError if it is none of ours.
     """
     if name in _NAMES:
         return _NAMES[name]
     quantity = name.rpartition("_")[0]
-    near = next((known for known in (name, quantity) if known in COLUMNS), None)
-    known = (
-        [make_column_name(q) for q in COLUMNS]
-        if near is None
-        else [f"{near}_{u}" for u in COLUMNS[near]]
-    )
+    known = [make_column_name(q) for q in COLUMNS]
+    if near := next((text for text in (name, quantity) if text in COLUMNS), None):
+        known = [f"{near}_{u}" for u in COLUMNS[near]]
     raise ValueError(f"unknown column name {name!r}; expected one of {', '.join(known)}")
 
 
@@ -240,7 +187,7 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
             raise ValueError(f"expected NAME=COLUMN, such as steer_rad=Delta, got {text!r}")
         if name in mapping:
             raise ValueError(f"{name} is mapped twice, to {mapping[name]!r} and to {column!r}")
-        parse_column_name(name)
+        _parse_column_name(name)
         mapping[name] = column
     return mapping
 
@@ -250,7 +197,7 @@ def read_quantities(
 ) -> tuple[dict[str, Array], list[str]]:
     """Read the file's known quantities in SI units, and describe how they were read.
 
-    An empty column counts as absent. A file that `read_table` refuses raises its errors. Rows in
+    An empty column counts as absent. A file that `_read_table` refuses raises its errors. Rows in
     messages count from 1 below the header.
 
     Args:
@@ -268,7 +215,7 @@ def read_quantities(
             and fewer than two rows.
     """
     wanted = {*COLUMNS, *map(str.casefold, mapping.values())}
-    table = read_table(
+    table = _read_table(
         path, lambda name: name.casefold() in wanted or bool(_match_column(name, ""))
     )
     remarks = [*table.remarks]
@@ -302,13 +249,11 @@ def read_quantities(
 def _check_complete(values: Mapping[str, Array], quantities: Sequence[str]) -> None:
     for quantity in quantities:
         if (unknown := np.isnan(values[quantity])).any():
-            row = int(np.argmax(unknown)) + 1
-            raise ValueError(
-                f"column {make_column_name(quantity)!r} has no value (NaN) in row {row}"
-            )
+            name, row = make_column_name(quantity), int(np.argmax(unknown)) + 1
+            raise ValueError(f"column {name!r} has no value (NaN) in row {row}")
 
 
-def _list_columns(table: LogTable) -> str:
+def _list_columns(table: _LogTable) -> str:
     return f"the log has {join_names(table.names)}"
 
 
@@ -325,7 +270,7 @@ def _match_column(name: str, unit: str) -> str:
 
 
 def _find_columns(
-    table: LogTable, mapping: Mapping[str, str], remarks: list[str]
+    table: _LogTable, mapping: Mapping[str, str], remarks: list[str]
 ) -> dict[str, tuple[int, str]]:
     """Find the place and our name of each quantity's column, and add to the remarks.
 
@@ -335,15 +280,16 @@ def _find_columns(
     for name, column in mapping.items():
         if column.casefold() not in map(str.casefold, names):
             raise ValueError(f"no column {column!r} for {name}; {_list_columns(table)}")
-        if parse_column_name(name)[0] in quantities:
-            raise ValueError(f"{parse_column_name(name)[0]} is mapped twice")
-        quantities.add(parse_column_name(name)[0])
+        quantity = _parse_column_name(name)[0]
+        if quantity in quantities:
+            raise ValueError(f"{quantity} is mapped twice")
+        quantities.add(quantity)
     best: dict[str, tuple[int, list[tuple[int, str]]]] = {}
     for place, (label, unit) in enumerate(zip(names, table.units, strict=True)):
         match = _match_column(label, unit)
         options = [(name, 0) for name, c in mapping.items() if c.casefold() == label.casefold()]
         for name, level in (*options, (match, 1 if match == label.casefold() else 2)):
-            quantity = parse_column_name(name)[0] if name else ""
+            quantity = _parse_column_name(name)[0] if name else ""
             if name and level < best.get(quantity, (3,))[0]:
                 best[quantity] = level, [(place, name)]
             elif name and level == best[quantity][0]:
@@ -372,7 +318,7 @@ def _find_columns(
     return columns
 
 
-def _convert_column(table: LogTable, place: int, name: str, remarks: list[str]) -> Array:
+def _convert_column(table: _LogTable, place: int, name: str, remarks: list[str]) -> Array:
     """Convert a column to SI units; ValueError names the first value that is no finite number.
 
     A time that is far off in its unit, but not in another since 1970, is read in that, which is
@@ -391,7 +337,7 @@ def _convert_column(table: LogTable, place: int, name: str, remarks: list[str]) 
         except OverflowError as error:
             raise ValueError(f"column {label!r}: expected numbers, got {error}") from None
     values = np.array(numbers.to_numpy(np.float64, na_value=np.nan))
-    quantity, factor = parse_column_name(name)
+    quantity, factor = _parse_column_name(name)
     if quantity == "time" and abs(values[0]) * factor > 1e11:
         for unit, scale in COLUMNS["time"].items():
             if 3e8 < values[0] * scale < 4e9:
@@ -399,14 +345,13 @@ def _convert_column(table: LogTable, place: int, name: str, remarks: list[str]) 
                 remarks.append(f"{label} is read in {unit} since 1970; no other unit fits.")
     values *= factor
     if name.startswith("course_degnorth"):
-        values += _NORTH
+        values += np.pi / 2.0  # the course towards north
     is_none = np.isinf(values) | (np.isnan(values) & column.notna().to_numpy())
     if (bad := is_none | (np.abs(values) > _LARGEST)).any():
         row = int(np.argmax(bad))
         text, expected = str(column.iloc[row]), f"a number up to {_LARGEST / abs(factor):g}"
         if is_none[row]:
             expected = "a number" + " with a decimal point alone" * ("," in text)
-        raise ValueError(
-            f"column {label!r}, row {row + 1}: expected {expected}, got {short_repr(text)}"
-        )
+        place_text = f"column {label!r}, row {row + 1}"
+        raise ValueError(f"{place_text}: expected {expected}, got {short_repr(text)}")
     return values

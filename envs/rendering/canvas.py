@@ -1,6 +1,6 @@
-"""A canvas: shapes are drawn at twice their size and shrunk, so that edges are smooth; text is not.
+"""A canvas with smooth edges, and the window that shows pictures: one a process.
 
-Nothing here needs a display.
+Shapes are drawn at twice their size and shrunk, text is not. Drawing needs no display.
 """
 
 import functools
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium import logger
 
 from ..numerics import require_extra
 
@@ -24,12 +25,14 @@ Box = tuple[float, float, float, float]
 
 _OVERSAMPLING = 2
 _FONTS = "dejavusans,notosans,liberationsans,arial,helveticaneue,segoeui"
+_NO_WINDOW = ("offscreen", "dummy")  # SDL's drivers that show nothing
 
 
 class Canvas:
     """A picture that shapes and text are drawn on.
 
-    Places and widths are in pixels of the result, x to the right and y down; colours are "#RRGGBB".
+    Places, widths and radii are in pixels of the result, x to the right and y down. Points have
+    shape (n, 2), centre, start and end shape (2,); colours are "#RRGGBB".
 
     Args:
         size: Width and height of the picture (px).
@@ -41,45 +44,22 @@ class Canvas:
         self._texts: list[tuple[pygame.Surface, tuple[float, float]]] = []
 
     def set_clip(self, box: Box | None) -> None:
-        """Limit the drawing of shapes to a box; text is drawn everywhere.
-
-        Args:
-            box: The box; None: the whole picture.
-        """
-        self._large.set_clip(
-            None if box is None else [round(_OVERSAMPLING * value) for value in box]
-        )
+        """Limit the drawing of shapes to a box; None: the whole picture. Text is never clipped."""
+        self._large.set_clip(None if box is None else _scale_box(box))
 
     def draw_box(self, box: Box, colour: str, radius: float = 0.0) -> None:
-        """Draw a filled box with round corners.
-
-        Args:
-            box: The box.
-            colour: Its colour.
-            radius: Radius of its corners (px).
-        """
-        scaled = pygame.Rect([round(_OVERSAMPLING * value) for value in box])
+        """Draw a filled box with round corners."""
+        scaled = pygame.Rect(_scale_box(box))
         pygame.draw.rect(self._large, colour, scaled, border_radius=round(_OVERSAMPLING * radius))
 
     def draw_polygon(self, points: Points, colour: str) -> None:
-        """Draw a filled polygon.
-
-        Args:
-            points: Its corners (px), shape (n, 2).
-            colour: Its colour.
-        """
+        """Draw a filled polygon."""
         scaled = _scale_points(points)
         pygame.draw.polygon(self._large, colour, scaled)
         pygame.draw.aalines(self._large, colour, True, scaled)
 
     def draw_line(self, points: Points, colour: str, width: float = 1.0) -> None:
-        """Draw a line through at least two points.
-
-        Args:
-            points: Points (px), shape (n, 2).
-            colour: Its colour.
-            width: Its width (px).
-        """
+        """Draw a line through at least two points."""
         scaled, thick = _scale_points(points), max(round(_OVERSAMPLING * width), 1)
         pygame.draw.lines(self._large, colour, False, scaled, thick)
         if thick > 4:
@@ -89,57 +69,28 @@ class Canvas:
     def draw_dashes(
         self, points: Points, colour: str, width: float = 1.0, dash: float = 6.0, gap: float = 5.0
     ) -> None:
-        """Draw a dashed line.
-
-        Args:
-            points: Points (px), shape (n, 2).
-            colour: Its colour.
-            width: Its width (px).
-            dash: Length of a dash (px).
-            gap: Length between two dashes (px).
-        """
+        """Draw a dashed line; dash and gap are lengths (px)."""
         vertices = np.asarray(points, float)
         steps = np.hypot(*np.diff(vertices, axis=0).T)
         length = np.concatenate([[0.0], np.cumsum(steps)])
         starts = np.arange(0.0, length[-1], dash + gap)
         ends = np.stack([starts, np.minimum(starts + dash, length[-1])], 1).ravel()
-        places = _scale_points(
-            np.stack([np.interp(ends, length, coordinate) for coordinate in vertices.T], 1)
-        )
-        for start, end in zip(places[::2], places[1::2], strict=True):
+        places = [np.interp(ends, length, coordinate) for coordinate in vertices.T]
+        scaled = _scale_points(np.stack(places, 1))
+        for start, end in zip(scaled[::2], scaled[1::2], strict=True):
             pygame.draw.line(self._large, colour, start, end, max(round(_OVERSAMPLING * width), 1))
 
     def draw_disc(self, centre: Any, radius: float, colour: str) -> None:
-        """Draw a filled circle.
-
-        Args:
-            centre: Its centre (px), shape (2,).
-            radius: Its radius (px).
-            colour: Its colour.
-        """
+        """Draw a filled circle."""
         pygame.draw.circle(self._large, colour, _scale_points([centre])[0], _OVERSAMPLING * radius)
 
     def draw_ring(self, centre: Any, radius: float, colour: str, width: float = 1.0) -> None:
-        """Draw a circle.
-
-        Args:
-            centre: Its centre (px), shape (2,).
-            radius: Radius to the middle of the line (px).
-            colour: Its colour.
-            width: Its width (px).
-        """
+        """Draw a circle, its radius to the middle of the line."""
         place, thick = _scale_points([centre])[0], max(round(_OVERSAMPLING * width), 1)
         pygame.draw.circle(self._large, colour, place, _OVERSAMPLING * radius + thick / 2, thick)
 
     def draw_arrow(self, start: Any, end: Any, colour: str, width: float = 2.0) -> None:
-        """Draw a line with a head at its end; the head shrinks with a short one.
-
-        Args:
-            start: Its start (px), shape (2,).
-            end: Its tip (px), shape (2,).
-            colour: Its colour.
-            width: Its width (px).
-        """
+        """Draw a line with a head at its end; the head shrinks with a short one."""
         a, b = np.asarray(start, float), np.asarray(end, float)
         length = float(np.hypot(*(b - a)))
         if length < 1.0:
@@ -200,12 +151,14 @@ def read_pixels(picture: pygame.Surface) -> npt.NDArray[np.uint8]:
     return flat.reshape(height, width, 3).copy()
 
 
+def _scale_box(box: Box) -> list[int]:
+    return [round(_OVERSAMPLING * value) for value in box]
+
+
 def _scale_points(points: Points) -> list[tuple[int, int]]:
     """Scale places to the large surface; what lies far outside is clipped at 4000 pixels."""
-    rounded = np.rint(np.clip(np.asarray(points, float), -4000.0, 4000.0) * _OVERSAMPLING).astype(
-        int
-    )
-    return [(x, y) for x, y in rounded.tolist()]
+    scaled = np.clip(np.asarray(points, float), -4000.0, 4000.0) * _OVERSAMPLING
+    return [(x, y) for x, y in np.rint(scaled).astype(int).tolist()]
 
 
 @functools.cache
@@ -223,3 +176,49 @@ def _render_words(words: str, colour: str, size: int, bold: bool) -> pygame.Surf
     except pygame.error:  # somebody's window called pygame.quit(), which ends all fonts
         _load_font.cache_clear()
         return _load_font(size, bold).render(words, True, colour)
+
+
+def show_picture(picture: pygame.Surface, rate: float) -> None:
+    """Show a picture in the window, no sooner than 1 / rate seconds after the last one.
+
+    Args:
+        picture: The picture.
+        rate: Pictures a second.
+    """
+    screen = pygame.display.get_surface() or _make_screen(picture.get_size())
+    screen.blit(picture, (0, 0))
+    pygame.event.pump()
+    pygame.display.flip()
+    _get_clock().tick(rate)
+
+
+def close_window() -> None:
+    """Close the window."""
+    pygame.display.quit()
+
+
+@functools.cache
+def _get_clock() -> pygame.time.Clock:
+    return pygame.time.Clock()
+
+
+def _make_screen(size: tuple[int, int]) -> pygame.Surface:
+    """Open the window; without a display warn, and go on with one that shows nothing."""
+    try:
+        pygame.display.init()
+        driver = pygame.display.get_driver()
+        if driver in _NO_WINDOW and os.environ.get("SDL_VIDEODRIVER") not in _NO_WINDOW:
+            raise pygame.error("SDL finds no screen")
+        screen = pygame.display.set_mode(size)
+    except pygame.error as error:
+        close_window()
+        if os.environ.get("SDL_VIDEODRIVER") in _NO_WINDOW:
+            raise
+        logger.warn(
+            f"there is no display ({error}): what render_mode='human' draws is not shown; "
+            "render_mode='rgb_array' returns frames"
+        )
+        os.environ["SDL_VIDEODRIVER"] = "dummy"
+        return _make_screen(size)
+    pygame.display.set_caption("sideslip")
+    return screen

@@ -1,9 +1,8 @@
-"""Strip charts over time: truth, references, estimates with their standard deviation.
+"""The picture of a car: the road, a close-up and strip charts over time.
 
-The car close up, its nose to the right: velocity and sideslip angle, tyre forces in their
-friction circles, motor torques, wind.
-
-A picture of one car: the road, the close-up, and the strip charts.
+The close-up has its nose to the right and shows velocity and sideslip angle, tyre forces in their
+friction circles, motor torques and wind. The charts show truth, references and estimates with their
+standard deviation.
 """
 
 import math
@@ -38,8 +37,8 @@ _DEGREES = math.degrees(1.0)
 _GRID, _ROW = "#E3E6E9", 20.0
 
 
-class ChartLine(NamedTuple):
-    """A line of a strip: values over time, an estimate's standard deviation around it."""
+class _ChartLine(NamedTuple):
+    """A line of a chart: values over time (s), an estimate's standard deviation around it."""
 
     t: Array
     values: Array
@@ -49,86 +48,54 @@ class ChartLine(NamedTuple):
     width: float = 1.6
 
 
-class Strip(NamedTuple):
-    """A chart.
+class _Strip(NamedTuple):
+    """A chart; `min_limit` is the smallest half range of its axis, `share` its weight in height."""
 
-    Attributes:
-        title: Title with a unit.
-        min_limit: Least that its axis reaches to either side, in that unit.
-        share: Weight of its height among all strips.
-        lines: Its lines.
-    """
-
-    title: str
+    title: str  # with the unit
     min_limit: float
     share: float
-    lines: list[ChartLine]
+    lines: list[_ChartLine]
 
 
-def make_strips(
+def _make_strips(
     truth: Array,
     estimates: dict[str, Array],
     colours: dict[str, str],
     ghosts: list[tuple[Array, str]],
     max_moment: float,
     has_yaw_reference: bool,
-) -> list[Strip]:
-    """Make the charts of a car's sideslip angle, yaw rate and yaw moment, with those of ghosts.
-
-    Args:
-        truth: Rows of `TracePoint`, shape (n, len(TracePoint)).
-        estimates: By label, estimates and standard deviations (rad), shape (n, 2).
-        colours: Colours by label.
-        ghosts: Rows of `TracePoint` and colour of each ghost.
-        max_moment: Full scale of the yaw moment (N m).
-        has_yaw_reference: Whether the yaw rate has a reference.
-
-    Returns:
-        The charts.
-    """
-
-    def make_lines(column: int, factor: float) -> list[ChartLine]:
-        others = [
-            ChartLine(g[:, TRACE_POINT.t], factor * g[:, column], shade) for g, shade in ghosts
-        ]
-        return [*others, ChartLine(t, factor * truth[:, column], INK, width=2.0)]
+) -> list[_Strip]:
+    """Make the charts of sideslip angle, yaw rate and yaw moment, with those of ghosts."""
 
     t = truth[:, TRACE_POINT.t]
-    estimate_lines = [
-        ChartLine(t, _DEGREES * hat, colours[name], deviation=_DEGREES * std)
-        for name, (hat, std) in ((name, columns.T) for name, columns in estimates.items())
-    ]
-    reference_lines = [
-        ChartLine(t, _DEGREES * truth[:, column], INK, True, width=1.0)
+
+    def make_lines(column: int, factor: float) -> list[_ChartLine]:
+        others = [
+            _ChartLine(g[:, TRACE_POINT.t], factor * g[:, column], shade) for g, shade in ghosts
+        ]
+        return [*others, _ChartLine(t, factor * truth[:, column], INK, width=2.0)]
+
+    slip, rate = make_lines(TRACE_POINT.beta, _DEGREES), make_lines(TRACE_POINT.gamma, _DEGREES)
+    slip_reference, rate_reference = (
+        _ChartLine(t, _DEGREES * truth[:, column], INK, True, width=1.0)
         for column in (TRACE_POINT.beta_ref, TRACE_POINT.gamma_ref)
-    ]
+    )
+    slip = [slip_reference, *slip]
+    for name, columns in estimates.items():
+        hat, std = columns.T
+        slip.append(_ChartLine(t, _DEGREES * hat, colours[name], deviation=_DEGREES * std))
+    if has_yaw_reference:
+        rate = [rate_reference, *rate]
+    moment = make_lines(TRACE_POINT.yaw_moment, 1.0)
     return [
-        Strip(
-            "sideslip angle / deg",
-            1.0,
-            1.6,
-            [reference_lines[0], *make_lines(TRACE_POINT.beta, _DEGREES), *estimate_lines],
-        ),
-        Strip(
-            "yaw rate / (deg/s)",
-            10.0,
-            1.0,
-            [*reference_lines[1:][:has_yaw_reference], *make_lines(TRACE_POINT.gamma, _DEGREES)],
-        ),
-        Strip("yaw moment / (N m)", 0.2 * max_moment, 1.0, make_lines(TRACE_POINT.yaw_moment, 1.0)),
+        _Strip("sideslip angle / deg", 1.0, 1.6, slip),
+        _Strip("yaw rate / (deg/s)", 10.0, 1.0, rate),
+        _Strip("yaw moment / (N m)", 0.2 * max_moment, 1.0, moment),
     ]
 
 
-def draw_strips(canvas: Canvas, box: Box, strips: list[Strip], first: float, span: float) -> None:
-    """Draw strips below one another in a box.
-
-    Args:
-        canvas: The canvas.
-        box: The box.
-        strips: The charts.
-        first: Time at their left end (s).
-        span: Time that they show (s).
-    """
+def _draw_strips(canvas: Canvas, box: Box, strips: list[_Strip], first: float, span: float) -> None:
+    """Draw charts below one another in a box, from the time `first` on for `span` seconds."""
     left, top, width, height = box
     high = (height - _ROW) / sum(strip.share for strip in strips)
     y = top
@@ -143,9 +110,10 @@ def draw_strips(canvas: Canvas, box: Box, strips: list[Strip], first: float, spa
     canvas.draw_text((left, top + height - 10.0), "time / s", SOFT, 11)
 
 
-def _draw_strip(canvas: Canvas, box: Box, strip: Strip, first: float, span: float) -> None:
+def _draw_strip(canvas: Canvas, box: Box, strip: _Strip, first: float, span: float) -> None:
     left, top, width, height = box
-    largest = max((_find_largest(line) for line in strip.lines), default=0.0)
+    values = [line.values for line in strip.lines]
+    largest = max(float(np.max(np.abs(y), initial=0.0, where=np.isfinite(y))) for y in values)
     limit = _find_nice_limit(max(strip.min_limit, 1.05 * largest))
 
     def to_pixels(t: Array, values: Array) -> Array:
@@ -165,9 +133,8 @@ def _draw_strip(canvas: Canvas, box: Box, strip: Strip, first: float, span: floa
             t, middle, std = line.t[is_known], line.values[is_known], line.deviation[is_known]
             if len(t) > 1:
                 edges = to_pixels(t, middle + std), to_pixels(t, middle - std)[::-1]
-                canvas.draw_polygon(
-                    np.concatenate(edges), mix_colours(line.colour, "#FFFFFF", 0.25)
-                )
+                band_colour = mix_colours(line.colour, "#FFFFFF", 0.25)
+                canvas.draw_polygon(np.concatenate(edges), band_colour)
     for line in strip.lines:
         is_known = np.isfinite(line.values)
         points = to_pixels(line.t[is_known], line.values[is_known])
@@ -179,21 +146,16 @@ def _draw_strip(canvas: Canvas, box: Box, strip: Strip, first: float, span: floa
     canvas.set_clip(None)
 
 
-def _find_largest(line: ChartLine) -> float:
-    return float(np.max(np.abs(line.values), initial=0.0, where=np.isfinite(line.values)))
-
-
 def _find_nice_limit(limit: float) -> float:
-    """The next of 1, 2, 5, 10, ..., times a power of ten."""
+    """Find the next of 1, 2, 3, 5, 10 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(limit))
-    return next(
-        factor * power for factor in (1.0, 2.0, 3.0, 5.0, 10.0) if factor * power >= limit - 1e-9
-    )
+    candidates = (factor * power for factor in (1.0, 2.0, 3.0, 5.0, 10.0))
+    return next(candidate for candidate in candidates if candidate >= limit - 1e-9)
 
 
-ToPixels = Callable[[Array], Array]  # from car axes to pixels
-GREEN = PALETTE[2]
-PAPER = "#F7F8F8"
+_ToPixels = Callable[[Array], Array]  # from car axes to pixels
+_GREEN = PALETTE[2]
+_PAPER = "#F7F8F8"
 MAGNIFIED = 4.0  # times the sideslip angle is drawn
 _LENGTH, _CIRCLE = 190.0, 38.0  # pixels: the car, and the circle of 0.3 of its weight
 
@@ -232,16 +194,12 @@ def draw_closeup(
     for wheel in scene.wheels:
         centre = to_pixels(np.array([[wheel.x, wheel.y]]))[0]
         if wheel.capacity > 0.0:
-            canvas.draw_disc(
-                centre, wheel.capacity * per_newton, mix_colours(PALETTE[5], PAPER, 0.16)
-            )
-            canvas.draw_ring(
-                centre, wheel.capacity * per_newton, mix_colours(PALETTE[5], PAPER, 0.7), 1.0
-            )
+            radius = wheel.capacity * per_newton
+            canvas.draw_disc(centre, radius, mix_colours(PALETTE[5], _PAPER, 0.16))
+            canvas.draw_ring(centre, radius, mix_colours(PALETTE[5], _PAPER, 0.7), 1.0)
     for wheel in scene.wheels:
-        canvas.draw_polygon(
-            to_pixels(make_wheel_outline(wheel.x, wheel.y, wheel.angle, scene.vehicle)), "#A9B0B7"
-        )
+        outline = make_wheel_outline(wheel.x, wheel.y, wheel.angle, scene.vehicle)
+        canvas.draw_polygon(to_pixels(outline), "#A9B0B7")
     _draw_forces(canvas, scene, to_pixels, per_newton)
     _draw_motors(canvas, box, scene, to_pixels)
     _draw_directions(canvas, (x_0, y_0), beta, reference, estimates)
@@ -257,7 +215,7 @@ def draw_closeup(
     canvas.draw_text((box[0] + 14.0, box[1] + box[3] - 12.0), words, INK, 12)
 
 
-def _draw_forces(canvas: Canvas, scene: CarScene, to_pixels: ToPixels, per_newton: float) -> None:
+def _draw_forces(canvas: Canvas, scene: CarScene, to_pixels: _ToPixels, per_newton: float) -> None:
     """Draw an arrow a tyre, from green to orange as it nears its limit, and the fraction in use."""
     for wheel in scene.wheels:
         cos, sin = math.cos(wheel.angle), math.sin(wheel.angle)
@@ -265,17 +223,16 @@ def _draw_forces(canvas: Canvas, scene: CarScene, to_pixels: ToPixels, per_newto
         left = sin * wheel.F_x + cos * wheel.F_y
         start = to_pixels(np.array([[wheel.x, wheel.y]]))[0]
         utilisation = math.hypot(forward, left) / wheel.capacity if wheel.capacity else 0.0
-        colour = mix_colours(ORANGE, GREEN, min(utilisation, 1.0) ** 3)
+        colour = mix_colours(ORANGE, _GREEN, min(utilisation, 1.0) ** 3)
         canvas.draw_arrow(start, start + per_newton * np.array([forward, -left]), colour, 3.0)
         if wheel.capacity:
-            label_gap = math.copysign(wheel.capacity * per_newton + 10.0, wheel.y)
-            canvas.draw_text(
-                (start[0], start[1] - label_gap), f"{100.0 * utilisation:.0f} %", colour, 12, 0.5
-            )
+            gap = math.copysign(wheel.capacity * per_newton + 10.0, wheel.y)
+            words = f"{100.0 * utilisation:.0f} %"
+            canvas.draw_text((start[0], start[1] - gap), words, colour, 12, 0.5)
 
 
-def _draw_motors(canvas: Canvas, box: Box, scene: CarScene, to_pixels: ToPixels) -> None:
-    """Each rear motor's torque as a bar, to the right where it drives."""
+def _draw_motors(canvas: Canvas, box: Box, scene: CarScene, to_pixels: _ToPixels) -> None:
+    """Draw each rear motor's torque as a bar, to the right where it drives."""
     for wheel, torque in zip(scene.wheels[2:], scene.torques, strict=True):
         _, y = to_pixels(np.array([[wheel.x, wheel.y]]))[0]
         x = box[0] + 44.0
@@ -294,12 +251,11 @@ def _draw_directions(
     estimates: dict[str, tuple[float, str]],
 ) -> None:
     """Draw the directions of the velocity, of its reference and of the estimates."""
-
     foot = np.array(centre)
 
     def find_tip(angle: float, length: float) -> Array:
-        drawn_angle = MAGNIFIED * angle
-        return foot + length * np.array([math.cos(drawn_angle), -math.sin(drawn_angle)])
+        magnified = MAGNIFIED * angle
+        return foot + length * np.array([math.cos(magnified), -math.sin(magnified)])
 
     canvas.draw_line(np.array([foot, find_tip(0.0, 138.0)]), "#C3C8CE", 1.0)
     canvas.draw_dashes(np.array([foot, find_tip(reference, 138.0)]), INK, 1.0, 4.0, 3.0)
@@ -311,11 +267,8 @@ def _draw_directions(
 
 
 SIZE = 960, 540
-_ROAD, _CLOSEUP, _STRIPS = (
-    (0.0, 40.0, 960.0, 216.0),
-    (0.0, 262.0, 336.0, 278.0),
-    (344.0, 284.0, 608.0, 252.0),
-)
+_ROAD = (0.0, 40.0, 960.0, 216.0)
+_CLOSEUP, _STRIPS = (0.0, 262.0, 336.0, 278.0), (344.0, 284.0, 608.0, 252.0)
 
 
 def draw_picture(
@@ -343,21 +296,19 @@ def draw_picture(
         for ghost_name, item in ghosts
     ]
     canvas = Canvas(SIZE)
-    canvas.draw_box((0.0, 0.0, *SIZE), PAPER)
+    canvas.draw_box((0.0, 0.0, *SIZE), _PAPER)
     if draw_world is None:
-        draw_road(
-            canvas, _ROAD, [*ghost_cars, CarTrack(scene, truth, BLUE, name if ghosts else "")]
-        )
+        driven_car = CarTrack(scene, truth, BLUE, name if ghosts else "")
+        draw_road(canvas, _ROAD, [*ghost_cars, driven_car])
     newest = {label: (float(item[-1, 0]), shades[label]) for label, item in estimates.items()}
-    finite_estimates = {label: item for label, item in newest.items() if math.isfinite(item[0])}
-    draw_closeup(
-        canvas, _CLOSEUP, scene, now[TRACE_POINT.beta], now[TRACE_POINT.beta_ref], finite_estimates
-    )
+    newest = {label: item for label, item in newest.items() if math.isfinite(item[0])}
+    beta, reference = now[TRACE_POINT.beta], now[TRACE_POINT.beta_ref]
+    draw_closeup(canvas, _CLOSEUP, scene, beta, reference, newest)
     has_yaw_reference = int(switches[FLAGS.reference]) != ZERO_SLIP
     others = [(item.truth, item.colour) for item in ghost_cars]
     full_scale = float(p[P.task.yaw_scale])
-    strips = make_strips(truth, estimates, shades, others, full_scale, has_yaw_reference)
-    draw_strips(canvas, _STRIPS, strips, first, span)
+    strips = _make_strips(truth, estimates, shades, others, full_scale, has_yaw_reference)
+    _draw_strips(canvas, _STRIPS, strips, first, span)
     _draw_legend(canvas, name, [item for item, _ in ghosts], shades)
     failures = [("", scene.failure), *((item.name, item.scene.failure) for item in ghost_cars)]
     _draw_heading(canvas, scene, config.scenario.name, now[TRACE_POINT.t], failures)
@@ -369,14 +320,12 @@ def draw_picture(
 
 
 def _choose_shades(labels: Iterable[str]) -> dict[str, str]:
-    """Choose a colour for each estimator, its own where no other has it."""
+    """Choose a colour for each estimator: its own unless another has it."""
     shades: dict[str, str] = {}
     for label in labels:
-        used_shades = shades.values()
-        choices = (find_colour(label), *PALETTE)
-        shades[label] = next(
-            (choice for choice in choices if choice not in used_shades), choices[0]
-        )
+        colour = find_colour(label)
+        free = (choice for choice in (colour, *PALETTE) if choice not in shades.values())
+        shades[label] = next(free, colour)
     return shades
 
 
@@ -387,7 +336,7 @@ def _draw_legend(canvas: Canvas, name: str, ghosts: Sequence[str], shades: dict[
     x = _STRIPS[0] + 48.0
     for words, shade, dashed in entries:
         draw_sample = canvas.draw_dashes if dashed else canvas.draw_line
-        draw_sample([(x, 272.0), (x + 20.0, 272.0)], shade, 2.5 if not dashed else 1.5)
+        draw_sample([(x, 272.0), (x + 20.0, 272.0)], shade, 1.5 if dashed else 2.5)
         x += 26.0 + canvas.draw_text((x + 26.0, 272.0), words, INK, 12) + 18.0
 
 

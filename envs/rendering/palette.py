@@ -1,7 +1,7 @@
-"""One colour a name, in every picture, figure and table: each method has its own.
+"""One colour a name in every picture, figure and table: each method has its own.
 
-The colours were spread as far as possible in OKLab, for eyes without red or green cones too, those
-of names that meet in figures the furthest; every one stands out from white and from the dark page.
+The colours are spread as far as possible in OKLab, for eyes without red or green cones too, those
+of names that meet in figures the furthest. All stand out from white and from the dark page.
 """
 
 import zlib
@@ -14,67 +14,30 @@ PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 OTHER_COLOURS = ("#AB1B99", "#907EFC", "#BD3F09", "#D87E12")
 """Of methods that are not ours, such as a user's own."""
 FILTERS = {
-    "bicycle-kf": "#EA75FC",
-    "single-rate-kf": "#995AFC",
-    "multirate-kf": "#00A275",
-    "multirate-residual-kf": "#BD247E",
-    "uneven-delay-kf": "#BD99B4",
-    "constant-delay-kf": "#90903F",
-    "vision-only-kf": "#E124A2",
-    "course-kf": "#FC5A48",
-    "dakf": "#994824",
-    "double-layer": "#096C5A",
-    "lob-2": "#7587C6",
-    "roll-kf": "#BD5A24",
-    "kinematic-velocity-kf": "#F35190",
-    "dual-rate": "#36B4CF",
-    "lob": "#633FE1",
-    "yaw-moment-observer": "#996C6C",
-    "lateral-force-observer": "#EA9048",
-    "exact-kf": "#0075B4",
-    "joint": "#1B9E1B",
-    "joint-robust": "#127F12",
-    "learned": "#7A9E1B",
-    "learned-exact-kf": "#3F9E90",
-    "learned-joint": "#9AA536",
-}
+    "bicycle-kf": "#EA75FC", "single-rate-kf": "#995AFC", "multirate-kf": "#00A275",
+    "multirate-residual-kf": "#BD247E", "uneven-delay-kf": "#BD99B4",
+    "constant-delay-kf": "#90903F", "vision-only-kf": "#E124A2", "course-kf": "#FC5A48",
+    "dakf": "#994824", "double-layer": "#096C5A", "lob-2": "#7587C6", "roll-kf": "#BD5A24",
+    "kinematic-velocity-kf": "#F35190", "dual-rate": "#36B4CF", "lob": "#633FE1",
+    "yaw-moment-observer": "#996C6C", "lateral-force-observer": "#EA9048", "exact-kf": "#0075B4",
+    "joint": "#1B9E1B", "joint-robust": "#127F12", "learned": "#7A9E1B",
+    "learned-exact-kf": "#3F9E90", "learned-joint": "#9AA536",
+}  # fmt: skip
 CONTROLLERS = {
-    "none": GREY,
-    "feedforward": "#C6A200",
-    "two-dof": "#CF75AB",
-    "model-following": "#1BBD75",
-    "esc": "#755A75",
-    "sliding-mode": "#C61248",
-    "lqr": "#D85A00",
-    "mpc": "#127EE1",
-    "nmpc": "#3F3FFC",
-    "adaptive-lqr": "#A84300",
-    "adaptive-nmpc": "#5A36FC",
-    "lane-keeping": "#486C3F",
-    "learned": "#D8636C",
-    "ppo-yaw-vision": "#AB6387",
-    "ppo-exact-kf": "#8A4FBF",
-    "ppo-coms-steering": "#C2571A",
-    "ppo-coms-yaw": "#7A5FD0",
-    "distill-coms-steering": "#8C6D1F",
-    "distill-coms-yaw": "#2E8B9E",
-    "distill-car-steering": "#B0603A",
-    "distill-car-yaw": "#5E8F2E",
-    "raw-car-steering": "#1F93C6",
-    "raw-car-yaw": "#2A8DBD",
-    "raw-coms-yaw": "#3D84B8",
-    "raw-coms-steering": "#15698F",
-}
+    "none": GREY, "feedforward": "#C6A200", "two-dof": "#CF75AB", "model-following": "#1BBD75",
+    "esc": "#755A75", "sliding-mode": "#C61248", "lqr": "#D85A00", "mpc": "#127EE1",
+    "nmpc": "#3F3FFC", "adaptive-lqr": "#A84300", "adaptive-nmpc": "#5A36FC",
+    "lane-keeping": "#486C3F", "learned": "#D8636C", "ppo-yaw-vision": "#AB6387",
+    "ppo-exact-kf": "#8A4FBF", "ppo-coms-steering": "#C2571A", "ppo-coms-yaw": "#7A5FD0",
+    "distill-coms-steering": "#8C6D1F", "distill-coms-yaw": "#2E8B9E",
+    "distill-car-steering": "#B0603A", "distill-car-yaw": "#5E8F2E", "raw-car-steering": "#1F93C6",
+    "raw-car-yaw": "#2A8DBD", "raw-coms-yaw": "#3D84B8", "raw-coms-steering": "#15698F",
+}  # fmt: skip
 ORACLES = {
-    "nominal": "#CF00B4",
-    "oracle-parameters": "#63905A",
-    "oracle-parameters-lqr": "#48905A",
-    "oracle-parameters-nmpc": "#6CA290",
-    "oracle-state": "#00ABFC",
-    "oracle-state-lqr": "#9090CF",
-    "oracle-state-nmpc": "#5A5ACF",
-    "clairvoyant": "#FC7E99",
-}
+    "nominal": "#CF00B4", "oracle-parameters": "#63905A", "oracle-parameters-lqr": "#48905A",
+    "oracle-parameters-nmpc": "#6CA290", "oracle-state": "#00ABFC", "oracle-state-lqr": "#9090CF",
+    "oracle-state-nmpc": "#5A5ACF", "clairvoyant": "#FC7E99",
+}  # fmt: skip
 
 # What the papers' figures call them.
 _ALIASES = {
@@ -118,11 +81,9 @@ def find_base(name: str) -> str | None:
         The name.
     """
     name = name.removeprefix(_DEFAULT_PREFIX).partition(" on ")[0]
-    return (
-        name
-        if name in COLOURS
-        else next((known for known in _LONGEST_FIRST if known in name), None)
-    )
+    if name in COLOURS:
+        return name
+    return next((known for known in _LONGEST_FIRST if known in name), None)
 
 
 def find_colour(name: str) -> str:
@@ -134,10 +95,9 @@ def find_colour(name: str) -> str:
     Returns:
         "#RRGGBB".
     """
-    known = find_base(name)
-    return (
-        COLOURS[known] if known else OTHER_COLOURS[zlib.crc32(name.encode()) % len(OTHER_COLOURS)]
-    )
+    if known := find_base(name):
+        return COLOURS[known]
+    return OTHER_COLOURS[zlib.crc32(name.encode()) % len(OTHER_COLOURS)]
 
 
 def mix_colours(shade: str, with_shade: str, share: float) -> str:

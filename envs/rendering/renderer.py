@@ -1,13 +1,7 @@
-"""What makes an environment one that can be drawn. Pygame is loaded with the first picture.
+"""Mixins that make an environment draw its cars; pygame is loaded with the first picture."""
 
-The window of render_mode "human": one a process, as pygame has it.
-"""
-
-import functools
-import os
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium import logger
@@ -18,51 +12,48 @@ from ..engine.layout import P, Z
 from ..record import Array
 from ..ticks import TICK
 from ..validation import check_choice
-from .canvas import pygame
 from .trace import EpisodeTrace, RenderState
 
 Frame = npt.NDArray[np.uint8]
 PackedArrays = tuple[Array, Array, Any, Array, EpisodeConfig]
 """The first fields of a `RenderState`."""
-MODES = ("human", "rgb_array")
+_MODES = ("human", "rgb_array")
 _TICKS_PER_FRAME = 20  # ticks of driving between two pictures in a window, or a control period
 
 
 class RenderMixin:
-    """An environment of one or more cars that draws them.
+    """An environment of one or more cars that draws them, from what the engine wrote.
 
     `render_mode` is None, "rgb_array" (`render` returns frames, (540, 960, 3) bytes) or "human" (a
-    window in which `reset` and `step` show the first car, in real time). The drawing reads what the
-    engine wrote and changes nothing of it. The strip charts begin at an episode's first picture.
-
-    An unknown mode raises ValueError; the first picture raises ModuleNotFoundError where pygame is
-    missing, ResetNeeded where there was no reset. Without a display a window warns once.
+    window in which `reset` and `step` show the first car, in real time). The strip charts begin at
+    an episode's first picture. An unknown mode raises ValueError; the first picture raises
+    ModuleNotFoundError without pygame, ResetNeeded before a reset. Without a display one warning
+    says that the window shows nothing.
     """
 
     _has_tyre_forces = True  # tyre forces can be drawn
     _has_shown = False  # a picture, in a window
     control_period: int
     render_mode: str | None
-    metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 100}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": list(_MODES), "render_fps": 100}  # noqa: RUF012
 
     def _init_rendering(self, mode: str | None) -> None:
         """Take the render mode; `render_fps` is that of real time."""
         if mode is not None:
-            check_choice("render_mode", mode, MODES)
+            check_choice("render_mode", mode, _MODES)
         self.render_mode = mode
         rate = max(round(1.0 / (self.control_period * TICK)), 1)
         self.metadata = {**self.metadata, "render_fps": rate}
         self._traces = [EpisodeTrace()] if mode == "human" else []
 
     def _get_packed_arrays(self, row: int) -> PackedArrays:
-        """A car's packed numbers: views, which change with the car."""
+        """Get a car's packed numbers: views, which change with the car."""
         raise NotImplementedError
 
     def _record_step(self) -> None:
         """Record what a reset or a step led to, and show it in the window if there is one.
 
-        Called where `_traces` has some. The window is an estimate behind: wrappers have not
-        estimated yet.
+        Called where `_traces` has some. The window is an estimate behind: wrappers estimate later.
         """
         for row, trace in enumerate(self._traces):
             _, state, _, report, _ = self._get_packed_arrays(row)
@@ -71,13 +62,14 @@ class RenderMixin:
             self._show()
 
     def _show(self) -> None:
-        from . import charts
+        from .canvas import show_picture
+        from .charts import draw_picture
 
         n, render_state = self.control_period, self.make_render_state(0)
         interval = n * max(-(-_TICKS_PER_FRAME // n), 1)
         if int(render_state.state[Z.clock.tick]) % interval == 0:
             self._has_shown = True
-            show(charts.draw_picture(render_state), 1.0 / (interval * TICK))
+            show_picture(draw_picture(render_state), 1.0 / (interval * TICK))
 
     def make_render_state(self, row: int = 0) -> RenderState:
         """Make what a car's picture is drawn from.
@@ -93,9 +85,8 @@ class RenderMixin:
         """
         if not self._traces:
             self._traces = [EpisodeTrace() for _ in range(self._cars)]
-        render_state = RenderState(
-            *self._get_packed_arrays(row), self._traces[row], self._has_tyre_forces
-        )
+        arrays, trace = self._get_packed_arrays(row), self._traces[row]
+        render_state = RenderState(*arrays, trace, self._has_tyre_forces)
         if not render_state.params[P.car.m] > 0.0:
             raise ResetNeeded("there is nothing to draw yet: call reset() first")
         if render_state.trace.is_empty:
@@ -103,14 +94,13 @@ class RenderMixin:
         return render_state
 
     def _render_frames(self) -> tuple[Frame, ...] | None:
-        """A frame of each car; None where a window shows them or no mode was asked for."""
+        """Draw a frame of each car; None in a window and without a render mode."""
         if self.render_mode == "rgb_array":
             from .canvas import read_pixels
             from .charts import draw_picture
 
-            return tuple(
-                read_pixels(draw_picture(self.make_render_state(row))) for row in range(self._cars)
-            )
+            states = map(self.make_render_state, range(self._cars))
+            return tuple(read_pixels(draw_picture(state)) for state in states)
         if self.render_mode == "human":
             self._show()
         else:
@@ -123,7 +113,9 @@ class RenderMixin:
 
     def _close_window(self) -> None:
         if self.render_mode == "human" and self._has_shown:
-            close()
+            from .canvas import close_window
+
+            close_window()
 
 
 class SingleRenderMixin(RenderMixin):
@@ -177,51 +169,3 @@ class VectorRenderMixin(RenderMixin):
     def close_extras(self, **_: Any) -> None:
         """Close the window, if there is one."""
         self._close_window()
-
-
-_NO_WINDOW = ("offscreen", "dummy")  # SDL's drivers that show nothing
-
-
-@functools.cache
-def _get_clock() -> pygame.time.Clock:
-    return pygame.time.Clock()
-
-
-def _make_screen(size: tuple[int, int]) -> pygame.Surface:
-    try:
-        pygame.display.init()
-        driver = pygame.display.get_driver()
-        if driver in _NO_WINDOW and os.environ.get("SDL_VIDEODRIVER") not in _NO_WINDOW:
-            raise pygame.error("SDL finds no screen")
-        screen = pygame.display.set_mode(size)
-    except pygame.error as error:
-        close()
-        if os.environ.get("SDL_VIDEODRIVER") in _NO_WINDOW:
-            raise
-        gym.logger.warn(
-            f"there is no display ({error}): what render_mode='human' draws is not shown; "
-            "render_mode='rgb_array' returns frames"
-        )
-        os.environ["SDL_VIDEODRIVER"] = "dummy"
-        return _make_screen(size)
-    pygame.display.set_caption("sideslip")
-    return screen
-
-
-def show(picture: pygame.Surface, rate: float) -> None:
-    """Show a picture, no sooner than 1 / rate seconds after the last one.
-
-    Args:
-        picture: The picture.
-        rate: Pictures a second.
-    """
-    screen = pygame.display.get_surface() or _make_screen(picture.get_size())
-    screen.blit(picture, (0, 0))
-    pygame.event.pump()
-    pygame.display.flip()
-    _get_clock().tick(rate)
-
-
-def close() -> None:
-    """Close the window."""
-    pygame.display.quit()

@@ -1,7 +1,7 @@
-"""What a picture shows of a car now, read from the packed numbers of its episode.
+"""The scene of a car and its road from above: lane or cones, trail, the camera's field of view.
 
-The road from above: the car in true proportion, its lane or cones, its trail, what its camera
-sees. The road's direction at the car is to the right, left of it is up.
+A scene is read from the packed numbers of an episode (`engine.layout`). The road's direction at the
+car is drawn to the right, its left is up; the car has its true proportions.
 """
 
 import math
@@ -36,34 +36,22 @@ from .canvas import Box, Canvas
 from .palette import INK, PALETTE, mix_colours
 from .trace import TRACE_POINT, RenderState
 
-_make_step_params, _make_step_variant, _compute_static_load = (
-    as_python(make_step_params),
-    as_python(make_step_variant),
-    as_python(compute_static_load),
-)
-_compute_tyres, _compute_lateral_forces, _apply_tyre_change = (
-    as_python(compute_tyres),
-    as_python(compute_lateral_forces),
-    as_python(apply_tyre_change),
-)
-_compute_gravity, _compute_torque_limit, _compute_wind = (
-    as_python(compute_gravity),
-    as_python(compute_torque_limit),
-    as_python(compute_wind),
-)
-_compute_lane_quality, _step_nominal_car = (
-    as_python(compute_lane_quality),
-    as_python(step_nominal_car),
-)
-_compute_curvature, _compute_path_offset = (
-    as_python(compute_curvature, ARRAYS),
-    as_python(compute_path_offset, ARRAYS),
-)
+_make_step_params = as_python(make_step_params)
+_make_step_variant = as_python(make_step_variant)
+_compute_static_load = as_python(compute_static_load)
+_compute_tyres = as_python(compute_tyres)
+_compute_lateral_forces = as_python(compute_lateral_forces)
+_apply_tyre_change = as_python(apply_tyre_change)
+_compute_gravity = as_python(compute_gravity)
+_compute_torque_limit = as_python(compute_torque_limit)
+_compute_wind = as_python(compute_wind)
+_compute_lane_quality = as_python(compute_lane_quality)
+_step_nominal_car = as_python(step_nominal_car)
+_compute_curvature = as_python(compute_curvature, ARRAYS)
+_compute_path_offset = as_python(compute_path_offset, ARRAYS)
 
-DRAWN_LENGTH = 45  # m of the road that are drawn
-DEFAULT_HALF_ANGLE = (
-    0.35  # rad to either side, drawn where the scenario's camera sees at any heading
-)
+_DRAWN_LENGTH = 45  # m of the road that are drawn
+_DEFAULT_HALF_ANGLE = 0.35  # rad to either side, where the scenario's camera sees at any heading
 
 
 class Wheel(NamedTuple):
@@ -77,7 +65,7 @@ class Wheel(NamedTuple):
     capacity: float  # N in all directions; 0: without a limit
 
 
-class CameraOverlay(NamedTuple):
+class _CameraOverlay(NamedTuple):
     """The camera's field of view, drawn over the road."""
 
     preview: float  # m, its preview distance
@@ -96,10 +84,10 @@ class CarScene(NamedTuple):
     wheels: tuple[Wheel, ...]  # front left and right, rear left and right
     friction: float  # of the road, the mean of both sides
     wind: float  # N, to the left
-    field_of_view: CameraOverlay | None  # None without a camera
+    field_of_view: _CameraOverlay | None  # None without a camera
     lanes: tuple[Section, ...]  # between cones
     path: Array  # the driver's, rows (s, y) in m; (0, 2) where it is the road's centre line
-    curvatures: Array  # 1/m, the road's curvature at each of the next DRAWN_LENGTH metres
+    curvatures: Array  # 1/m, the road's curvature at each of the next _DRAWN_LENGTH metres
     half_width: float  # m
     failure: int
 
@@ -132,9 +120,8 @@ def make_car_scene(shot: RenderState) -> CarScene:
     for place, F_wx, F_wy, tyre in zip(places, longitudinal, lateral, tyres, strict=True):
         # a tyre's limit is what its drive force leaves of the friction circle
         capacity = 0.0 if variant.law == LINEAR else math.hypot(tyre.limit, F_wx)
-        x, y, angle = place
         forces = (F_wx, F_wy, capacity) if has_tyre_forces else (0.0, 0.0, 0.0)
-        wheels.append(Wheel(x, y, angle, *forces))
+        wheels.append(Wheel(*place, *forces))
     lanes = _find_lanes(params.path, config)
     return CarScene(
         motion,
@@ -154,10 +141,10 @@ def make_car_scene(shot: RenderState) -> CarScene:
     )
 
 
-def _make_camera_overlay(p: Array, motion: Motion) -> CameraOverlay:
+def _make_camera_overlay(p: Array, motion: Motion) -> _CameraOverlay:
     view = read(p, P.field_of_view)
-    angle = float(view.heading) if math.isfinite(view.heading) else DEFAULT_HALF_ANGLE
-    return CameraOverlay(float(p[P.car.l_pre]), angle, bool(_compute_lane_quality(motion, view)))
+    angle = float(view.heading) if math.isfinite(view.heading) else _DEFAULT_HALF_ANGLE
+    return _CameraOverlay(float(p[P.car.l_pre]), angle, bool(_compute_lane_quality(motion, view)))
 
 
 def _find_lanes(path: TrackPath, config: EpisodeConfig) -> tuple[Section, ...]:
@@ -172,7 +159,7 @@ def _find_lanes(path: TrackPath, config: EpisodeConfig) -> tuple[Section, ...]:
 
 
 def _sample_path(path: TrackPath, s: float) -> Array:
-    distances = np.arange(s - DRAWN_LENGTH, s + DRAWN_LENGTH, 0.5)
+    distances = np.arange(s - _DRAWN_LENGTH, s + _DRAWN_LENGTH, 0.5)
     return np.stack([distances, _compute_path_offset(path, distances)], 1)
 
 
@@ -180,25 +167,20 @@ def _sample_curvatures(params: StepParams, z: Array, motion: Motion, road: int) 
     """Sample the curvature ahead; a nominal path is assumed to keep its present turning rate."""
     nominal_curvature = 0.0
     if road == NOMINAL_PATH:
-        turn_rate, _ = _step_nominal_car(
-            read(z, Z.nominal_motion), float(z[Z.driver]), motion.v_x, params.nominal_car
-        )
+        nominal_motion, driver = read(z, Z.nominal_motion), float(z[Z.driver])
+        turn_rate, _ = _step_nominal_car(nominal_motion, driver, motion.v_x, params.nominal_car)
         nominal_curvature = turn_rate / max(motion.v_x, 1.0)
-    curvatures: Array = nominal_curvature + _compute_curvature(
-        params.road, motion.s + np.arange(float(DRAWN_LENGTH))
-    )
+    distances = motion.s + np.arange(float(_DRAWN_LENGTH))
+    curvatures: Array = nominal_curvature + _compute_curvature(params.road, distances)
     return curvatures
 
 
 BLUE, ORANGE = PALETTE[0], PALETTE[1]
 ASPHALT, GRASS, PAINT, SOFT = "#D9DCE0", "#E2E9DA", "#FFFFFF", "#6B7177"
-TYRE = "#23272B"
-CAR_LENGTH, SCALES = (
-    96.0,
-    (22.0, 30.0),
-)  # pixels of a car's length, and of a metre at least and at most
-LANE = 1.75  # m to either side of the centre line, where the scenario sets no limit
-OVERHANG = 1.62  # length of a car in wheelbases
+_TYRE = "#23272B"
+_CAR_LENGTH, _SCALES = 96.0, (22.0, 30.0)  # pixels of a car; of a metre, at least and at most
+_LANE = 1.75  # m to either side of the centre line, where the scenario sets no limit
+_OVERHANG = 1.62  # length of a car in wheelbases
 
 
 class CarTrack(NamedTuple):
@@ -210,7 +192,7 @@ class CarTrack(NamedTuple):
     name: str = ""
 
 
-class GroundProjection(NamedTuple):
+class _GroundProjection(NamedTuple):
     """A projection from the ground to pixels."""
 
     x: float  # m, the place on the ground that is drawn at `centre`
@@ -221,26 +203,22 @@ class GroundProjection(NamedTuple):
     scale: float  # pixels a metre
 
     def __call__(self, points: Array) -> Array:
-        """Project places on the ground to pixels, shapes (n, 2)."""
+        """Project places on the ground to pixels, both of shape (n, 2)."""
         rel = np.asarray(points, float) - (self.x, self.y)
         right = rel[:, 0] * self.cos + rel[:, 1] * self.sin
         up = rel[:, 1] * self.cos - rel[:, 0] * self.sin
         return np.stack([self.centre[0] + self.scale * right, self.centre[1] - self.scale * up], 1)
 
 
-class CentreLine:
-    """The centre line of the road: as it was driven along, and its continuation.
-
-    Args:
-        scene: The car, with the curvatures ahead.
-        truth: Rows of `TracePoint`, shape (n, len(TracePoint)).
-    """
+class _CentreLine:
+    """The centre line of the road: as the car drove along it, and its continuation."""
 
     def __init__(self, scene: CarScene, truth: Array) -> None:
         s, y, theta = truth[:, TRACE_POINT.s], truth[:, TRACE_POINT.y], truth[:, TRACE_POINT.theta]
         X = truth[:, TRACE_POINT.X] + y * np.sin(theta)
         Y = truth[:, TRACE_POINT.Y] - y * np.cos(theta)
-        backward, forward = np.arange(-float(DRAWN_LENGTH), 0.0), np.arange(1.0, DRAWN_LENGTH + 1.0)
+        backward = np.arange(-float(_DRAWN_LENGTH), 0.0)
+        forward = np.arange(1.0, _DRAWN_LENGTH + 1.0)
         directions = theta[-1] + np.cumsum(scene.curvatures)
         middle = directions - 0.5 * scene.curvatures
         preview_xy = X[-1] + np.cumsum(np.cos(middle)), Y[-1] + np.cumsum(np.sin(middle))
@@ -250,15 +228,7 @@ class CentreLine:
         self._theta = np.concatenate([theta[0] + 0.0 * backward, theta, directions])
 
     def locate(self, s: Array, y: Array) -> Array:
-        """Compute the places on the ground of points of the road.
-
-        Args:
-            s: Distance along the road (m), shape (n,).
-            y: Distance to the left of the centre line (m), shape (n,).
-
-        Returns:
-            Places (m), shape (n, 2).
-        """
+        """Locate points of the road, s ahead and y to the left (m), on the ground: shape (n, 2)."""
         theta = np.interp(s, self._s, self._theta)
         X, Y = np.interp(s, self._s, self._X), np.interp(s, self._s, self._Y)
         return np.stack([X - y * np.sin(theta), Y + y * np.cos(theta)], 1)
@@ -273,19 +243,18 @@ def draw_road(canvas: Canvas, box: Box, cars: list[CarTrack]) -> None:
         cars: The cars, at least one.
     """
     scene, truth, *_ = cars[-1]
-    motion, road = scene.motion, CentreLine(scene, truth)
+    motion, road = scene.motion, _CentreLine(scene, truth)
     front, rear, _ = compute_body(scene.vehicle)
-    scale = min(max(CAR_LENGTH / (front - rear), SCALES[0]), SCALES[1])
+    scale = min(max(_CAR_LENGTH / (front - rear), _SCALES[0]), _SCALES[1])
     reach = box[3] / scale / 2.0 - 2.5  # the view follows a car that would leave it
     y = motion.y - min(max(motion.y, -reach), reach)
     x_0, y_0 = road.locate(np.array([motion.s]), np.array([y]))[0]
     centre = box[0] + 0.3 * box[2], box[1] + 0.5 * box[3]
-    view = GroundProjection(x_0, y_0, np.cos(motion.theta), np.sin(motion.theta), centre, scale)
+    view = _GroundProjection(x_0, y_0, np.cos(motion.theta), np.sin(motion.theta), centre, scale)
     s = np.arange(motion.s - 16.0, motion.s + 34.0, 1.0)
     canvas.set_clip(box)
     _draw_surface(canvas, box, view, road, scene, s)
-    if scene.field_of_view is not None:
-        _draw_camera_overlay(canvas, view, road, scene)
+    _draw_camera_overlay(canvas, view, road, scene)
     _draw_markings(canvas, box, view, road, scene, s)
     for car in cars:
         trail = view(car.truth[-400:, [TRACE_POINT.X, TRACE_POINT.Y]])
@@ -294,17 +263,17 @@ def draw_road(canvas: Canvas, box: Box, cars: list[CarTrack]) -> None:
     poses = [view(np.array([[car.scene.motion.X, car.scene.motion.Y]]))[0] for car in cars]
     for car, pose in zip(cars, poses, strict=True):
         heading = car.scene.motion.psi - motion.theta
-        draw_car(canvas, pose, heading, scale, car.scene, car.colour)
-    _names(canvas, box, cars, poses, scale)
+        _draw_car(canvas, pose, heading, scale, car.scene, car.colour)
+    _draw_names(canvas, box, cars, poses, scale)
     canvas.set_clip(None)
 
 
-def _names(
+def _draw_names(
     canvas: Canvas, box: Box, cars: list[CarTrack], poses: list[Array], scale: float
 ) -> None:
-    """Draw the names of cars in the box, each as near as it covers no car and no other name.
+    """Draw the cars' names, each as near as it covers no car and no other name.
 
-    A ghost's name is on its side of the last car, whose own is on the other.
+    A ghost's name is on its side of the last car, whose name is on the other.
     """
     taken = []  # the middle, the half width and the half height of what is not to be covered
     for car, (x, y) in zip(cars, poses, strict=True):
@@ -328,17 +297,17 @@ def _names(
 
 
 def _make_band(
-    road: CentreLine, view: GroundProjection, s: Array, right: float, left: float
+    road: _CentreLine, view: _GroundProjection, s: Array, right: float, left: float
 ) -> Array:
-    """The outline of a strip of the road between two offsets."""
+    """Make the outline (px) of a strip of the road between two lateral offsets (m)."""
     edges = road.locate(s, np.full_like(s, right)), road.locate(s[::-1], np.full_like(s, left))
     return view(np.concatenate(edges))
 
 
 def _draw_surface(
-    canvas: Canvas, box: Box, view: GroundProjection, road: CentreLine, scene: CarScene, s: Array
+    canvas: Canvas, box: Box, view: _GroundProjection, road: _CentreLine, scene: CarScene, s: Array
 ) -> None:
-    """Grass and asphalt, or a wide proving ground; the lanes between cones are lighter."""
+    """Draw grass and asphalt, or a wide proving ground; the lanes between cones are lighter."""
     wide = scene.half_width > 10.0
     canvas.draw_box(box, ASPHALT if wide or scene.lanes else GRASS)
     if not (wide or scene.lanes):
@@ -352,9 +321,9 @@ def _draw_surface(
 
 
 def _draw_markings(
-    canvas: Canvas, box: Box, view: GroundProjection, road: CentreLine, scene: CarScene, s: Array
+    canvas: Canvas, box: Box, view: _GroundProjection, road: _CentreLine, scene: CarScene, s: Array
 ) -> None:
-    """Lane markings, or cones with the driver's path; a thin line every ten metres."""
+    """Draw lane markings, or cones with the driver's path; a thin line every ten metres."""
     for place in np.arange(10.0 * np.ceil(s[0] / 10.0), s[-1], 10.0):
         cross_line = view(road.locate(np.full(2, place), np.array([-30.0, 30.0])))
         canvas.draw_line(cross_line, mix_colours(PAINT, ASPHALT, 0.35), 1.0)
@@ -364,7 +333,7 @@ def _draw_markings(
         path = scene.path[(scene.path[:, 0] > s[0]) & (scene.path[:, 0] < s[-1])]
         canvas.draw_dashes(view(road.locate(*path.T)), SOFT, 1.0, 2.0, 4.0)
     else:
-        edge = scene.half_width if scene.half_width <= 10.0 else LANE
+        edge = scene.half_width if scene.half_width <= 10.0 else _LANE
         for side in (-edge, edge):
             canvas.draw_line(view(road.locate(s, np.full_like(s, side))), PAINT, 2.0)
         for start in np.arange(9.0 * np.floor(s[0] / 9.0), s[-1], 9.0):
@@ -373,48 +342,38 @@ def _draw_markings(
     for lane in scene.lanes:
         count = max(round(lane.length / 3.0), 2)
         for place in np.linspace(lane.start, lane.start + lane.length, count + 1):
-            for side in (-0.5, 0.5):
-                cone_position = np.array([place]), np.array([lane.offset + side * lane.width])
-                if abs(place - s.mean()) < 30.0:
-                    cone = view(road.locate(*cone_position))[0]
+            if abs(place - s.mean()) < 30.0:
+                sides = lane.offset + np.array([-0.5, 0.5]) * lane.width
+                for cone in view(road.locate(np.full(2, place), sides)):
                     canvas.draw_disc(cone, 3.6, ORANGE)
                     canvas.draw_disc(cone, 1.4, PAINT)
 
 
 def _draw_camera_overlay(
-    canvas: Canvas, view: GroundProjection, road: CentreLine, scene: CarScene
+    canvas: Canvas, view: _GroundProjection, road: _CentreLine, scene: CarScene
 ) -> None:
-    """The camera's field of view to the preview point, and the offset there that it measures."""
+    """Draw the camera's field of view to the preview point, and the offset that it measures."""
     m, overlay = scene.motion, scene.field_of_view
-    assert overlay is not None
+    if overlay is None:
+        return
     colour = PALETTE[5] if overlay.has_lane else ORANGE
     angles = m.psi + np.linspace(-overlay.half_angle, overlay.half_angle, 9)
     reach = overlay.preview / np.cos(angles - m.psi)
     rim = np.stack([m.X + reach * np.cos(angles), m.Y + reach * np.sin(angles)], 1)
     wedge = np.concatenate([[[m.X, m.Y]], rim])
     canvas.draw_polygon(view(wedge), mix_colours(colour, ASPHALT, 0.2))
-    preview_point = np.array(
-        [[m.X + overlay.preview * np.cos(m.psi), m.Y + overlay.preview * np.sin(m.psi)]]
-    )
     if overlay.has_lane:
+        x, y = m.X + overlay.preview * np.cos(m.psi), m.Y + overlay.preview * np.sin(m.psi)
+        preview_point = np.array([[x, y]])
         lane = road.locate(np.array([m.s + overlay.preview]), np.array([0.0]))
         canvas.draw_line(view(np.concatenate([lane, preview_point])), colour, 2.5)
         canvas.draw_disc(view(lane)[0], 3.0, colour)
 
 
-def draw_car(
+def _draw_car(
     canvas: Canvas, place: Array, heading: float, scale: float, scene: CarScene, colour: str
 ) -> None:
-    """Draw a car.
-
-    Args:
-        canvas: The canvas.
-        place: Place of its centre of gravity (px), shape (2,).
-        heading: Heading from the picture's right (rad), left positive.
-        scale: Pixels of a metre.
-        scene: The car.
-        colour: Colour of its body.
-    """
+    """Draw a car at a place (px), its heading (rad) from the right, left positive."""
     cos, sin = np.cos(heading), np.sin(heading)
 
     def to_pixels(points: Array) -> Array:
@@ -424,14 +383,13 @@ def draw_car(
     front, rear, half = compute_body(scene.vehicle)
     for wheel in scene.wheels:  # further out than they are, to be seen
         outline = make_wheel_outline(wheel.x, np.sign(wheel.y) * half, wheel.angle, scene.vehicle)
-        canvas.draw_polygon(to_pixels(outline), TYRE)
+        canvas.draw_polygon(to_pixels(outline), _TYRE)
     canvas.draw_polygon(to_pixels(make_body_outline(rear, front, half)), colour)
     glass, length = mix_colours(INK, colour, 0.55), front - rear
     for rear_share, front_share, tip, foot in ((0.62, 0.74, 0.72, 0.86), (0.14, 0.21, 0.86, 0.74)):
         x, y = rear + np.array([rear_share, front_share]) * length, np.array([foot, tip]) * half
-        canvas.draw_polygon(
-            to_pixels(np.stack([x[[0, 1, 1, 0]], [y[0], y[1], -y[1], -y[0]]], 1)), glass
-        )
+        window = np.stack([x[[0, 1, 1, 0]], [y[0], y[1], -y[1], -y[0]]], 1)
+        canvas.draw_polygon(to_pixels(window), glass)
 
 
 def compute_body(vehicle: Vehicle) -> tuple[float, float, float]:
@@ -443,7 +401,7 @@ def compute_body(vehicle: Vehicle) -> tuple[float, float, float]:
     Returns:
         Front, rear (negative) and half width (m).
     """
-    over = 0.5 * (OVERHANG - 1.0) * vehicle.wheelbase
+    over = 0.5 * (_OVERHANG - 1.0) * vehicle.wheelbase
     return vehicle.front_arm + over, -vehicle.rear_arm - over, 0.5 * vehicle.width
 
 

@@ -1,4 +1,4 @@
-"""What an episode's pictures remember: the truth and the estimates of the steps so far."""
+"""The trace of an episode: truth and estimates of its steps so far, and the state of a picture."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -53,13 +53,9 @@ class EpisodeTrace:
             k, self._estimates = 0, {}
         if k == len(self._rows):
             self._rows = _extend_rows(self._rows)
-            self._estimates = {
-                name: _extend_rows(estimates) for name, estimates in self._estimates.items()
-            }
-        self._rows[k, : TRACE_POINT.X], self._rows[k, TRACE_POINT.X :] = (
-            report[_REPORT_COLUMNS],
-            state[_STATE_COLUMNS],
-        )
+            self._estimates = {name: _extend_rows(x) for name, x in self._estimates.items()}
+        self._rows[k, : TRACE_POINT.X] = report[_REPORT_COLUMNS]
+        self._rows[k, TRACE_POINT.X :] = state[_STATE_COLUMNS]
         self._count = k + 1
 
     def add_estimate(self, label: str, value: float, deviation: float) -> None:
@@ -99,12 +95,10 @@ class EpisodeTrace:
         first = int(np.searchsorted(self._rows[: self._count, TRACE_POINT.t], t))
         step = max((self._count - first) // max_points, 1)
         chosen = np.arange(self._count - 1, first - 1, -step)[::-1]
-        return self._rows[chosen], {
-            name: estimates[chosen] for name, estimates in self._estimates.items()
-        }
+        return self._rows[chosen], {name: x[chosen] for name, x in self._estimates.items()}
 
 
-RoadPainter = Callable[[tuple[int, int], list[Motion]], Any]
+_RoadPainter = Callable[[tuple[int, int], list[Motion]], Any]
 """Draws a road around a car, and others at their motions, on a surface of so many pixels."""
 
 
@@ -118,7 +112,7 @@ class RenderState(NamedTuple):
     config: EpisodeConfig
     trace: EpisodeTrace
     has_tyre_forces: bool = True  # its tyres are those of our plant
-    world: RoadPainter | None = None  # draws the road instead
+    world: _RoadPainter | None = None  # draws the road instead
 
 
 def _extend_rows(rows: Array) -> Array:
