@@ -1,15 +1,9 @@
 """The compiler and the kinds of numbers: one text for Python, SIMD lanes, NumPy, torch and CasADi.
 
-<<<<<<< HEAD
 `jit` compiles a plain function and rebuilds its text for another kind of numbers. Such texts may
 call what `primitives`, `packed` and `functions` have. `simd` and `simd8` are lanes of 4 and 8,
 `torch_backend` and `casadi_backend` the other kinds. `compiler` and `kernel_cache` keep machine
 code on disk.
-=======
-`jit` compiles a plain function, `as_python` rebuilds its text for another kind of numbers.
-`primitives` and `packed` are what such texts may call; `functions` is built from them. Every other
-room may import this one.
->>>>>>> shrink-A
 """
 
 from collections.abc import Iterator

@@ -1,15 +1,9 @@
 """The camera: what it measures as numbers, and a lane finder on pictures in its place.
 
 `analytic` is the compiled sample of the engine. `pinhole` is the camera's geometry, `images`
-<<<<<<< HEAD
 renders the road, `lane_finder` finds the lane in a picture, `calibration` finds tilt, height and
 intrinsics, `films` reads files, `detector` has the measured noise of the lane finder. Only
 `analytic` is loaded with the package; what works on pictures needs the extra of OpenCV.
-=======
-renders the road, `lane_finder` finds the lane in a picture, `detector` has its measured times and
-errors, `calibration` estimates mounting and intrinsics, `films` reads files. What works on pictures
-needs the extra `vision`.
->>>>>>> shrink-A
 """
 
 from .analytic import (
