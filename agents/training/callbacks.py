@@ -50,9 +50,7 @@ _SCALING_ENVS = 64  # environments whose observations make the scaling
 
 # Seeds of tests and of the calibration are below 2^63, those of `corrections` and `distill` beyond.
 _WEIGHT_SEEDS, _EVALUATION_SEEDS, _SCALING_SEEDS, _TRAINING_SEEDS = 2**63, 2**64, 2**65, 2**66
-_SEEDS_PER_TRAINING = (
-    2**40
-)  # seeds of a training: a start or resumption takes those from its steps on
+_SEEDS_PER_TRAINING = 2**40  # a start or resumption takes those from its steps on
 
 
 def make_evaluation_seeds(episodes: int) -> list[int]:
@@ -138,19 +136,12 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """The record of a run beside its task.
+    """The record of a run beside its task."""
 
-    Attributes:
-        steps: Steps of the whole training.
-        eval_freq: Steps between two evaluations.
-        command: Command line, for the policy's card.
-        begun_with: Name of the initial policy, "" for none.
-    """
-
-    steps: int
-    eval_freq: int
-    command: str = ""
-    begun_with: str = ""
+    steps: int  # of the whole training
+    eval_freq: int  # steps between two evaluations
+    command: str = ""  # command line, for the policy's card
+    begun_with: str = ""  # name of the initial policy, "" for none
 
 
 class EvalCallback(BaseCallback):
@@ -182,9 +173,8 @@ class EvalCallback(BaseCallback):
         self.eval_env = task.vector_env(task.n_eval_envs)
         self.initial_policy, self.warm_start = initial_policy, None
         if initial_policy is not None:
-            self.warm_start = PolicyWarmStart(
-                initial_policy, task, self.eval_env, _SCALING_SEEDS + task.seed
-            )
+            seed = _SCALING_SEEDS + task.seed
+            self.warm_start = PolicyWarmStart(initial_policy, task, self.eval_env, seed)
             self.eval_env = self.warm_start.wrap_env(self.eval_env)
         base: Any = self.eval_env.unwrapped
         self.period: float = base.control_period * base.dt  # s
@@ -195,9 +185,9 @@ class EvalCallback(BaseCallback):
             raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
         self.equal_weights = compute_equal_weights(uncontrolled)
         self.uncontrolled_cost = float(np.mean(uncontrolled * self.equal_weights))
-        self.weights = (
-            np.ones(1) if initial_policy else compute_scenario_weights(task, _WEIGHT_SEEDS)
-        )
+        self.weights = np.ones(1)
+        if not initial_policy:
+            self.weights = compute_scenario_weights(task, _WEIGHT_SEEDS)
         driver = self.warm_start.driver if self.warm_start else None
         self.initial_costs = evaluate_costs(self.eval_env, driver, self.seeds) if driver else None
         self.scaling: Any = saved.get("scaling")
@@ -232,9 +222,8 @@ class EvalCallback(BaseCallback):
         if self.scaling is None:
             spread, seed = compute_action_std(task.settings), _SCALING_SEEDS + task.seed
             mixed = get_algorithm(task.algo).on_tensors
-            self.scaling = measure_scaling(
-                task.vector_env(_SCALING_ENVS), spread, seed, task.reads, mixed
-            )
+            scaling_env = task.vector_env(_SCALING_ENVS)
+            self.scaling = measure_scaling(scaling_env, spread, seed, task.reads, mixed)
         env = make_vec_env(
             task.env_id,
             task.num_envs,
@@ -246,10 +235,8 @@ class EvalCallback(BaseCallback):
         seed = (task.seed + steps) % 2**32
         first = _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING + steps
         scaled_env = RewardScaleWrapper(env, self._make_reward_scale(env, first, steps))
-        further: dict[str, Any] = {
-            "device": run_options.device,
-            "tensorboard_log": run_options.tensorboard_log,
-        }
+        log, device = run_options.tensorboard_log, run_options.device
+        further = dict[str, Any](device=device, tensorboard_log=log)
         if get_algorithm(task.algo).on_tensors:
             from .gradient import make_source
 
@@ -298,14 +285,8 @@ class EvalCallback(BaseCallback):
             self.run_options.report(progress)
 
     def check(self) -> None:
-        """Check that the weights are finite.
-
-        Raises:
-            FloatingPointError: A weight is not finite.
-        """
-        if not all(
-            bool(parameter.isfinite().all()) for parameter in self.model.policy.parameters()
-        ):
+        """Check that the weights are finite; FloatingPointError otherwise."""
+        if not all(bool(weights.isfinite().all()) for weights in self.model.policy.parameters()):
             raise FloatingPointError(
                 f"the weights are not finite after step {self.model.num_timesteps}; "
                 f"{self.folder / CHECKPOINT} holds them as they were at the last evaluation"
@@ -319,10 +300,8 @@ class EvalCallback(BaseCallback):
         cost, ratio = float(np.mean(self._average_scenarios(costs) * self.equal_weights)), None
         if self.initial_costs is not None:
             ratio = float(np.exp(np.log(compute_cost_ratios(costs, self.initial_costs)).mean()))
-        spent = round(self.spent, 3)
-        current = Evaluation(
-            self.model.num_timesteps, spent, cost, cost / self.uncontrolled_cost, ratio
-        )
+        spent, of_none = round(self.spent, 3), cost / self.uncontrolled_cost
+        current = Evaluation(self.model.num_timesteps, spent, cost, of_none, ratio)
         if all(current.criterion < evaluation.criterion for evaluation in self.evaluations):
             self._keep_best(current)
         self.evaluations.append(current)
@@ -343,6 +322,7 @@ class EvalCallback(BaseCallback):
         self.since = time.process_time()
 
     def _keep_best(self, current: Evaluation) -> None:
+        """Write the policy's file with its card, and the model's zip."""
         task = self.task
         algorithm_options = make_model_options(task.algo, task.settings, self.period, task.num_envs)
         algorithm_options |= {"num_envs": task.num_envs, "policy": task.settings["policy"]}
@@ -350,13 +330,13 @@ class EvalCallback(BaseCallback):
         if self.initial_policy is not None:
             before = self.initial_policy.card.algorithm_options
             algorithm_options |= {"begun_with": self.initial_policy.name}
-            algorithm_options |= (
-                {"class": before["class"]} if "class" in before and task.scenarios else {}
-            )
+            if "class" in before and task.scenarios:
+                algorithm_options |= {"class": before["class"]}
         mixture: dict[str, Any] = {"scenarios": task.scenarios} if task.scenarios else {}
         if task.scenarios and self.initial_policy is None:
             mixture["weights"] = self.weights.round(3).tolist()
         first = {"scenario": task.scenarios[0]} if task.scenarios else {}
+        first_seed = _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING
         card = Card.from_env_id(
             task.env_id,
             task.env_options | first,
@@ -365,10 +345,7 @@ class EvalCallback(BaseCallback):
             algorithm=task.algo,
             algorithm_options=algorithm_options | mixture,
             command=self.run_options.command,
-            seeds={
-                "training": task.seed,
-                "from": _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING,
-            },
+            seeds={"training": task.seed, "from": first_seed},
             steps=current.steps,
             cpu_seconds=current.cpu_seconds,
         )

@@ -1,23 +1,7 @@
-"""The algorithms of `sideslip train`: stable-baselines3's and an own one, with their settings.
+"""The algorithms of `sideslip train`, their settings, and the task of a training.
 
 The settings stand in `hyperparams/`, in rl-baselines3-zoo's format, and were chosen on YawVision-v0
-with seed 0. PPO on its sensors alone (600,000 steps, about 20 CPU-s; mean cost over none's on 256
-drives): with a step size of 1e-3, rewards as they come and a horizon of 0.5 s 0.22, times ten 0.18,
-with 0.2 s 0.16, rewards per second (times a hundred) 0.13; a step size of 2e-3 0.125. Worse were a
-horizon of 0.1 s and 16 steps a rollout; running normalisation was no better.
-
-PPO behind `exact-kf` with accelerometer and disturbances (40 CPU-s; mean cost over nominal's on 64
-drives): a first deviation of 0.14 2.28, 0.37 1.10, 0.61 1.01, 1.0 1.09; with 0.37 a step size of
-4e-3 1.11; with 0.61 eight epochs instead of four 1.06. The same with seed 1 (2,400,000 steps, 1024
-drives): 1.05; a step size of 1e-3 1.04, batches of 4096 1.09, of 512 1.02, layers of 128 1.06 (both
-2,000,000 steps), a horizon of 0.4 s 1.08; reading only what LQR reads (`--reads`) 0.97.
-
-On sensors alone, over nominal's: PPO 5.8 after 40 CPU-s; SAC 7.3 after 40 where entropy's first
-weight is 1, 33 after 25 with a step size of 3e-4; three other settings diverged, for what reason
-was not looked into; recurrent PPO, 32 cells, 7.3 after 60. TQC has SAC's settings, not measured.
-One training each, beside other work on the machine: a first look.
-
-The task of a training, which stays the same when the training resumes.
+with seed 0. They discount as much in a second whatever the control period is.
 """
 
 import inspect
@@ -50,44 +34,25 @@ HYPERPARAMS = Path(__file__).parent / "hyperparams"
 PERIOD = 0.01  # s, of control: of the environments whose discount stands in the files
 WARM_START_ENTRY = "begun"  # the entry of training a policy further
 WARM_START_TRACES_ENTRY = "begun-traces"  # one with moving averages
-UNIFORM_LOG_STD = -0.55  # log of the deviation of actions drawn evenly
+_UNIFORM_LOG_STD = -0.55  # log of the deviation of actions drawn evenly
 
 _TRAINING_SETTINGS = ("n_timesteps", "n_envs", "policy", "normalize")
 _SCHEDULED = ("learning_rate", "clip_range")
 _MANAGED_ARGUMENTS = {
-    "env",
-    "seed",
-    "device",
-    "verbose",
-    "tensorboard_log",
-    "stats_window_size",
-    "source",
-}
+    "env", "seed", "device", "verbose", "tensorboard_log", "stats_window_size", "source",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Algorithm:
-    """An algorithm of `sideslip train`.
+    """An algorithm of `sideslip train`."""
 
-    Attributes:
-        kind: Class as "module:name".
-        zoo: Name in rl-baselines3-zoo.
-        on_tensors: Whether it follows gradients through cars on tensors.
-    """
-
-    kind: str
-    zoo: str
-    on_tensors: bool = False
+    kind: str  # class as "module:name"
+    zoo: str  # name in rl-baselines3-zoo
+    on_tensors: bool = False  # whether it follows gradients through cars on tensors
 
     def load(self) -> Callable[..., BaseAlgorithm]:
-        """Import the class.
-
-        Returns:
-            The class.
-
-        Raises:
-            ModuleNotFoundError: Its package is not installed.
-        """
+        """Import the class; ModuleNotFoundError where its package is not installed."""
         module, name = self.kind.split(":")
         with require_extra("train", "training needs {}"):
             algorithm_class: Callable[..., BaseAlgorithm] = getattr(import_module(module), name)
@@ -113,9 +78,6 @@ def get_algorithm(name: str) -> Algorithm:
 
     Returns:
         Algorithm of that name.
-
-    Raises:
-        ValueError: The name is unknown.
     """
     check_choice("algorithm", name, ALGORITHMS)
     return ALGORITHMS[name]
@@ -133,8 +95,8 @@ def read_settings(algo: str, env_id: str, file: str | Path | None = None) -> Set
         Values by name.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is no such YAML or has neither entry, or as `check_settings`.
+        ValueError: The file is no such YAML, has neither entry, or settings that the algorithm
+            lacks.
     """
     with require_extra("train", "settings need {}"):
         import yaml
@@ -200,7 +162,7 @@ def compute_action_std(settings: Settings) -> float:
     Returns:
         Standard deviation, as a fraction of full scale.
     """
-    return math.exp(settings.get("policy_kwargs", {}).get("log_std_init", UNIFORM_LOG_STD))
+    return math.exp(settings.get("policy_kwargs", {}).get("log_std_init", _UNIFORM_LOG_STD))
 
 
 def make_model_options(algo: str, settings: Settings, seconds: float, num_envs: int) -> Settings:
@@ -254,22 +216,19 @@ def make_model(
     """
     options = make_model_options(algo, settings, seconds, env.num_envs)
     options |= {name: _make_schedule(name, options[name]) for name in _SCHEDULED if name in options}
-    mean, scale, clip, mixing = scaling
     policy_kwargs = dict(options.get("policy_kwargs", {}))
     if "activation_fn" in policy_kwargs:
         policy_kwargs["activation_fn"] = list_activations()[policy_kwargs["activation_fn"]]
-    options["policy_kwargs"] = {
-        **policy_kwargs,
-        "features_extractor_class": Standardised,
-        "features_extractor_kwargs": {"mean": mean, "scale": scale, "clip": clip, "mixing": mixing},
-    }
+    policy_kwargs["features_extractor_class"] = Standardised
+    extractor_names = "mean", "scale", "clip", "mixing"
+    policy_kwargs["features_extractor_kwargs"] = dict(zip(extractor_names, scaling, strict=True))
+    options["policy_kwargs"], window = policy_kwargs, env.num_envs
     kind = get_algorithm(algo).load()
-    window = env.num_envs
     return kind(settings["policy"], env, stats_window_size=window, seed=seed, **options, **rest)
 
 
 def _make_schedule(name: str, value: Any) -> Any:
-    """Return a number, or for "lin_NUMBER" a schedule that falls to zero."""
+    """Make a schedule that falls to zero of "lin_NUMBER", and a float of a number."""
     word, _, number = str(value).rpartition("_")
     try:
         start = float(number)
@@ -364,13 +323,13 @@ class TrainingTask:
         return self.estimator_options | {"estimator": self.estimator} if self.estimator else None
 
     def options(self, num_envs: int) -> dict[str, Any]:
-        """Make the options of a vector env.
+        """Make the options of a vector env, whose rows take turns with the scenarios.
 
         Args:
             num_envs: Number of rows.
 
         Returns:
-            Options by name; the rows take turns with the scenarios.
+            Options by name.
         """
         if not self.scenarios:
             return self.env_options
@@ -378,13 +337,13 @@ class TrainingTask:
         return self.env_options | {"scenario": list(turns)}
 
     def vector_env(self, num_envs: int) -> VectorEnv[Any, Any, Any]:
-        """Make a vector env of the task, apart from the one of the training.
+        """Make a vector env of the task with its estimator, for other seeds than the training's.
 
         Args:
             num_envs: Number of rows.
 
         Returns:
-            Vector env with the task's estimator.
+            New vector env.
         """
         options = self.options(num_envs)
         return make_native_env(self.env_id, num_envs, self.estimator_kwargs, options)
@@ -424,6 +383,5 @@ class TrainingTask:
             "n_timesteps": steps,
             "seed": self.seed,
         }
-        zoo.describe(
-            folder, self.settings | {"n_envs": self.num_envs}, self.estimator_kwargs, arguments
-        )
+        settings = self.settings | {"n_envs": self.num_envs}
+        zoo.describe(folder, settings, self.estimator_kwargs, arguments)

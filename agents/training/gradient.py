@@ -2,8 +2,7 @@
 
 Many cars on tensors are driven for a window of control periods, and the mean cost rate is
 propagated back through all of it to the weights: truncated back-propagation through time. It is
-the short-horizon actor-critic (Xu et al., ICLR 2022) without its critic. The critic did not help
-in a first look, at other windows and step sizes than these (docs/training.md).
+the short-horizon actor-critic (Xu et al., ICLR 2022) without its critic.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,17 +24,11 @@ _MAX_GRADIENT_NORM = 1.0  # norm of a step's gradient
 
 
 class TrainingSource(NamedTuple):
-    """The cars of a training.
+    """The cars of a training."""
 
-    Attributes:
-        cars: `DeviceVectorEnv` with gradients that resets itself in the same step.
-        seeds: Seeds of the cars.
-        reward_scale: Factor of each car's reward.
-    """
-
-    cars: Any
-    seeds: list[int]
-    reward_scale: RewardScale
+    cars: Any  # `DeviceVectorEnv` with gradients that resets itself in the same step
+    seeds: list[int]  # seeds of the cars
+    reward_scale: RewardScale  # factor of each car's reward
 
 
 def make_source(
@@ -53,12 +46,7 @@ def make_source(
     Returns:
         Environments with the seeds and reward factors of their rows.
     """
-    options: dict[str, Any] = {
-        "device": device,
-        "dtype": "float32",
-        "grad": True,
-        "compile": compile,
-    }
+    options = dict[str, Any](device=device, dtype="float32", grad=True, compile=compile)
     options |= {"autoreset_mode": "SameStep", **task.options(task.num_envs)}
     cars = DeviceVectorEnv.make(task.env_id, task.num_envs, **options)
     return TrainingSource(cars, [first + i for i in range(task.num_envs)], reward_scale)
@@ -92,7 +80,7 @@ class GruPolicy(BasePolicy):
         self.features_extractor = self.make_features_extractor()
         inputs, last = self.features_extractor.features_dim, cells
         self.cell = nn.GRU(inputs, cells)
-        layers: list[nn.Module] = []
+        layers = list[nn.Module]()
         for size in net_arch:
             layers += [nn.Linear(last, size), nn.SiLU()]
             last = size

@@ -1,6 +1,4 @@
-"""Demonstrations that a student learns from, and the scaling and whitening of its inputs.
-
-The student of a distillation: its network, and one round of learning.
+"""The student of a distillation: demonstrations, scaled inputs, network, a round of learning.
 
 The loss is what an action's error adds to the cost of the rest of the drive, by the Riccati
 matrix of the teacher's design, over the cost of the episode: the score's logarithm, linearised.
@@ -28,31 +26,29 @@ with require_extra("train", "distillation needs torch"):
 
 Single = npt.NDArray[np.float32]
 
-CLIP = 8.0  # of an input, scaled
+_CLIP = 8.0  # of an input, scaled
 UNREAD = ("gps_X", "gps_Y", "gps_satellites")
 """Entries without information for control, as they only locate the car."""
 _MIN_VARIANCE = 1e-3  # variance, of what varies by 1, that a mixture of inputs has at least
 _EARLY, _MEDIAN = 16.0, 50.0  # percentiles of an age
+_WINDOW = 50  # steps through which the gradient goes back in time
+_SAMPLES = 512  # steps of a batch without memory
+LAST_ROUND_FACTOR = 3  # times as many epochs in the last round
+
+_Batch = tuple[Any, Any, Any, Any, Any, bool]
+"""Mixed observations (B, T, k), labels (B, T, m), privileged inputs (B, T, q), weights (B, T),
+curvatures (B, m, m), and whether it begins the episodes."""
 
 
 class Demonstrations(NamedTuple):
-    """Episodes of a task, oldest step first.
+    """Episodes of a task, oldest step first."""
 
-    Attributes:
-        obs: Observations, shape (N, T, k).
-        labels: The teacher's actions, shape (N, T, m).
-        privileged: The teacher's inputs that the observations lack, shape (N, T, q).
-        weights: Weights of the actions' errors, shape (N, T), zero after an episode's end.
-        curvature: Weight of an action's error, shape (m, m).
-        costs: Costs J, shape (N,).
-    """
-
-    obs: Single
-    labels: Single
-    privileged: Single
-    weights: Single
-    curvature: Single
-    costs: Array
+    obs: Single  # observations, shape (N, T, k)
+    labels: Single  # the teacher's actions, shape (N, T, m)
+    privileged: Single  # the teacher's inputs that the observations lack, shape (N, T, q)
+    weights: Single  # Weights of the actions' errors, shape (N, T), zero after an episode's end
+    curvature: Single  # weight of an action's error, shape (m, m)
+    costs: Array  # costs J, shape (N,)
 
     @property
     def zero_loss(self) -> float:
@@ -133,15 +129,7 @@ def normalise_inputs(obs: Single, mean: Array, scale: Array) -> Single:
     Returns:
         Normalised observations, shape (..., k).
     """
-    return np.clip((obs - mean.astype(np.float32)) * scale.astype(np.float32), -CLIP, CLIP)
-
-
-WINDOW = 50  # steps through which the gradient goes back in time
-SAMPLES = 512  # steps of a batch without memory
-LAST_ROUND_FACTOR = 3  # times as many epochs in the last round
-Batch = tuple[Any, Any, Any, Any, Any, bool]
-"""Mixed observations (B, T, k), labels (B, T, m), privileged inputs (B, T, q), weights (B, T),
-curvatures (B, m, m), and whether it begins the episodes."""
+    return np.clip((obs - mean.astype(np.float32)) * scale.astype(np.float32), -_CLIP, _CLIP)
 
 
 @dataclass(frozen=True)
@@ -199,7 +187,7 @@ class DistillConfig:
     @property
     def window(self) -> int:
         """Steps of truncated back-propagation; with traces all of them."""
-        return sys.maxsize if self.traces else WINDOW
+        return sys.maxsize if self.traces else _WINDOW
 
 
 class Student(nn.Module):
@@ -209,8 +197,8 @@ class Student(nn.Module):
         inputs: Number of inputs.
         width: Entries of an action.
         config: Configuration of the student.
-        n_privileged: Outputs of the auxiliary head, linear in the cells or, with moving averages,
-            in the last hidden layer; they serve in training alone.
+        n_privileged: Outputs of the auxiliary head, which serve in training alone; it is linear in
+            the cells or, with moving averages, in the last hidden layer.
     """
 
     def __init__(
@@ -222,9 +210,8 @@ class Student(nn.Module):
         memory_size = self.traces.size if self.traces else config.cells
         sizes = [memory_size or inputs, *config.hidden, width]
         self.dense = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
-        self.auxiliary_head = (
-            nn.Linear(config.cells or sizes[-2], n_privileged) if config.told else None
-        )
+        head_inputs = config.cells or sizes[-2]
+        self.auxiliary_head = nn.Linear(head_inputs, n_privileged) if config.told else None
         self.recurrent = bool(memory_size)
 
     def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
@@ -243,11 +230,9 @@ class Student(nn.Module):
         memory_output = z
         for layer in self.dense[:-1]:
             z = nn.functional.silu(layer(z))
-        auxiliary = (
-            []
-            if self.auxiliary_head is None
-            else [self.auxiliary_head(memory_output if self.cell else z)]
-        )
+        auxiliary = []
+        if self.auxiliary_head is not None:
+            auxiliary.append(self.auxiliary_head(memory_output if self.cell else z))
         return torch.cat([self.dense[-1](z), *auxiliary], dim=-1), state
 
     def fit_whitening(self, drives: Sequence[Demonstrations], scaling: Scaling) -> None:
@@ -258,18 +243,17 @@ class Student(nn.Module):
             scaling: Scaling of the inputs.
         """
         if self.traces is not None:
-            self.traces.fit_whitening(
-                [(scaling.mix_inputs(demo.obs), demo.weights > 0.0) for demo in drives]
-            )
+            samples = [(scaling.mix_inputs(demo.obs), demo.weights > 0.0) for demo in drives]
+            self.traces.fit_whitening(samples)
 
     def network(self, scaling: Scaling) -> Network:
-        """Convert the student to a network of plain observations, by NumPy.
+        """Convert the student to a network of plain observations without auxiliary outputs.
 
         Args:
             scaling: Scaling of the inputs.
 
         Returns:
-            Network of the actions, without auxiliary outputs.
+            Network of the actions, by NumPy.
         """
         numbers = {name: value.detach().numpy().copy() for name, value in self.named_parameters()}
         names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
@@ -283,16 +267,10 @@ class Student(nn.Module):
             numbers[first] = numbers[first] @ scaling.mixing
         if self.cell:
             cells.append(RecurrentCell("gru", *(numbers[f"cell.{name}"] for name in names)))
-        dense = range(len(self.dense))
-        return Network(
-            scaling.mean,
-            scaling.scale,
-            [numbers[f"dense.{i}.weight"] for i in dense],
-            [numbers[f"dense.{i}.bias"] for i in dense],
-            "silu",
-            clip=CLIP,
-            cells=cells,
-        )
+        weights = [numbers[f"dense.{i}.weight"] for i in range(len(self.dense))]
+        biases = [numbers[f"dense.{i}.bias"] for i in range(len(self.dense))]
+        mean, scale, _ = scaling
+        return Network(mean, scale, weights, biases, "silu", clip=_CLIP, cells=cells)
 
 
 def _concatenate(parts: Sequence[Single]) -> Any:
@@ -311,15 +289,13 @@ class _EpisodeBatches:
         longest = max(demo.weights.shape[1] for demo in drives)
         self.n_batches = -(-len(self.episodes) // self.batch) * -(-longest // self.window)
 
-    def __iter__(self) -> Iterator[Batch]:
+    def __iter__(self) -> Iterator[_Batch]:
         names = ("obs", "labels", "privileged", "weights")
         for chosen in torch.split(torch.randperm(len(self.episodes)), self.batch):
             rows = [self.episodes[int(i)] for i in chosen]
             longest = max(self.drives[i].weights.shape[1] for i, _ in rows)
-            arrays = [
-                np.zeros((len(rows), longest, *getattr(self.drives[0], name).shape[2:]), np.float32)
-                for name in names
-            ]
+            shapes = [getattr(self.drives[0], name).shape[2:] for name in names]
+            arrays = [np.zeros((len(rows), longest, *shape), np.float32) for shape in shapes]
             for row, (i, j) in enumerate(rows):
                 length = self.drives[i].weights.shape[1]
                 for array, name in zip(arrays, names, strict=True):
@@ -332,25 +308,24 @@ class _EpisodeBatches:
 
 
 class _StepBatches:
-    """Batches of `SAMPLES` single steps of all drives, each like an episode."""
+    """Batches of `_SAMPLES` single steps of all drives, each like an episode."""
 
     def __init__(
         self, drives: Sequence[Demonstrations], scaling: Scaling, _: DistillConfig
     ) -> None:
         valid = [demo.weights > 0.0 for demo in drives]
-        self.demo_index = torch.cat(
-            [torch.full((int(mask.sum()),), i) for i, mask in enumerate(valid)]
-        )
+        indices = [torch.full((int(mask.sum()),), i) for i, mask in enumerate(valid)]
+        self.demo_index = torch.cat(indices)
         self.curvatures = torch.from_numpy(np.stack([demo.curvature for demo in drives]))
         pairs = list(zip(drives, valid, strict=True))
         self.x = _concatenate([scaling.mix_inputs(demo.obs[mask]) for demo, mask in pairs])
         self.y = _concatenate([demo.labels[mask] for demo, mask in pairs])
         self.q = _concatenate([demo.privileged[mask] for demo, mask in pairs])
         self.w = _concatenate([demo.weights[mask] for demo, mask in pairs])
-        self.n_batches = -(-len(self.w) // SAMPLES)
+        self.n_batches = -(-len(self.w) // _SAMPLES)
 
-    def __iter__(self) -> Iterator[Batch]:
-        for i in torch.split(torch.randperm(len(self.w)), SAMPLES):
+    def __iter__(self) -> Iterator[_Batch]:
+        for i in torch.split(torch.randperm(len(self.w)), _SAMPLES):
             S = self.curvatures[self.demo_index[i]]
             yield *(array[i, None] for array in (self.x, self.y, self.q, self.w)), S, True
 
@@ -362,7 +337,7 @@ def fit_model(
     config: DistillConfig,
     epochs: int,
 ) -> float:
-    """Fit a model to drives, and return the loss of the last epoch.
+    """Fit a model to drives.
 
     Args:
         model: Network with the outputs of a `Student`; `recurrent` says whether it has memory.

@@ -96,8 +96,7 @@ def train(
 
     Raises:
         ValueError: The folder holds another training, or arguments contradict each other.
-        FileNotFoundError: There is no checkpoint to resume from.
-        FloatingPointError: Weights are not finite; the folder has those of the last evaluation.
+        ModuleNotFoundError: TensorBoard or Weights & Biases is not installed.
     """
     chosen_options = run_options or RunOptions()
     if steps < 1:
@@ -114,11 +113,9 @@ def train(
                 check_zip(Path(trained_agent))
     if chosen_options.tensorboard_log is not None and find_spec("tensorboard") is None:
         raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
-    tracker = (
-        _WandbCallback(chosen_options.track, Path(folder).name, asdict(task))
-        if chosen_options.track
-        else None
-    )
+    tracker = None
+    if chosen_options.track:
+        tracker = _WandbCallback(chosen_options.track, Path(folder).name, asdict(task))
     torch.set_num_threads(1)  # on small matrices threads only wait for each other
     folder_path = Path(folder)
     checkpoint = _prepare_folder(task, folder_path, resume)
@@ -129,11 +126,9 @@ def train(
     model = callback.build(checkpoint, zip_path, trust)
     done = model.num_timesteps
     if done < steps:
+        log = dict[str, Any](reset_num_timesteps=done == 0, tb_log_name=task.algo)
         try:
-            first = done == 0
-            model.learn(
-                steps - done, callback=callbacks, reset_num_timesteps=first, tb_log_name=task.algo
-            )
+            model.learn(steps - done, callback=callbacks, **log)
             callback.evaluate()
         except ValueError:  # torch's, of a distribution that is none, or the env's, of actions
             callback.check()
@@ -155,7 +150,6 @@ def load_initial_policy(folder: str | Path) -> Policy | None:
 
     Raises:
         FileNotFoundError: The copy of the policy is missing.
-        ValueError: As `read_task`.
     """
     name, file = read_run_record(folder).begun_with, Path(folder) / WARM_START_FILE
     if not name:
@@ -183,10 +177,7 @@ def read_run_record(folder: str | Path) -> RunRecord:
         folder: Folder of the training.
 
     Returns:
-        The record.
-
-    Raises:
-        ValueError: As `read_task`.
+        Record of the run.
     """
     read_task(folder)
     path = Path(folder) / CHECKPOINT
@@ -194,10 +185,7 @@ def read_run_record(folder: str | Path) -> RunRecord:
 
 
 class _WandbCallback(BaseCallback):
-    """Write the log of stable-baselines3 to a run of Weights & Biases.
-
-    project, name: of the run. config: its configuration. ModuleNotFoundError without wandb.
-    """
+    """Write the log of stable-baselines3 to a run of Weights & Biases."""
 
     def __init__(self, project: str, name: str, config: dict[str, Any]) -> None:
         super().__init__()
@@ -205,10 +193,8 @@ class _WandbCallback(BaseCallback):
             wandb: Any = import_module("wandb")
         except ImportError:
             raise ModuleNotFoundError("tracking needs wandb: pip install wandb") from None
-        self._wandb, self._run_arguments = (
-            wandb,
-            {"project": project, "name": name, "config": config},
-        )
+        self._wandb = wandb
+        self._run_arguments = {"project": project, "name": name, "config": config}
         self._run: Any = None
 
     def _on_training_start(self) -> None:
