@@ -78,55 +78,31 @@ class PlanState(NamedTuple):
 
 
 class PlanParams(NamedTuple):
-    """Parameters that are constant within an episode; hashable, as the key of a solver.
+    """Parameters that are constant within an episode; hashable, as the key of a solver."""
 
-    Attributes:
-        car: Car, with zeros for the fields of `PreviewStep`.
-        road: Road.
-        speed_profile: Speed profile, with zeros for the fields of `PreviewStep`.
-        motor: Lag of the motors over a step.
-        steering: Lag of the steering over a step.
-        motor_tick: Lag of the motors over a tick.
-        steering_tick: Lag of the steering over a tick.
-        target: Reference of the task.
-        task: Parameters of the task.
-        kind: Variant of the plant.
-        width: Entries of an action.
-        ticks: Ticks of a step, the control period.
-        periods: Steps of the episode.
-    """
-
-    car: CarParams
-    road: RoadParams
-    speed_profile: SpeedProfile
-    motor: Lag
-    steering: Lag
-    motor_tick: Lag
-    steering_tick: Lag
-    target: ReferenceParams
-    task: TaskParams
-    kind: StepVariant
-    width: int
-    ticks: int
-    periods: int
+    car: CarParams  # car, with zeros for the fields of `PreviewStep`
+    road: RoadParams  # road
+    speed_profile: SpeedProfile  # speed profile, with zeros for the fields of `PreviewStep`
+    motor: Lag  # lag of the motors over a step
+    steering: Lag  # lag of the steering over a step
+    motor_tick: Lag  # lag of the motors over a tick
+    steering_tick: Lag  # lag of the steering over a tick
+    target: ReferenceParams  # reference of the task
+    task: TaskParams  # parameters of the task
+    kind: StepVariant  # variant of the plant
+    width: int  # entries of an action
+    ticks: int  # ticks of a step, the control period
+    periods: int  # steps of the episode
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """An episode as a plan has it.
-
-    Attributes:
-        fixed: Parameters of the episode.
-        known: Columns of `PreviewStep`, shape (len(PreviewStep), periods + 1); the last one is of
-            the episode's end.
-        start: State at tick 0.
-        driver: Driver's steering command at every tick (rad), shape (periods, n).
-    """
+    """An episode as a plan has it."""
 
     fixed: PlanParams
-    known: Array
-    start: PlanState
-    driver: Array
+    known: Array  # columns of `PreviewStep` (its fields, periods + 1); the last: the episode's end
+    start: PlanState  # at tick 0
+    driver: Array  # the driver's steering command at every tick (rad), shape (periods, n)
 
 
 def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
@@ -153,6 +129,7 @@ def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
     ticks = fixed.periods * n
     if actions is None:
         actions = np.zeros((fixed.periods, fixed.width))
+    # disturbances, and a steering profile's front wheels, do not depend on the actions
     drive, driver, refs = _simulate_actions(base, snapshot, actions, n)
     command = driver
     if not fixed.kind.has_driver and base.scenario.steering != "wander":
@@ -171,12 +148,12 @@ def read_plan_state(z: Array) -> PlanState:
         State in SI units.
     """
     motion, drive = read(z, Z.motion), read(z, Z.drive)
-    return PlanState._make(
-        (*motion, drive.T_l, drive.T_r, drive.integral, drive.slewing, drive.added)
-    )
+    actuators = drive.T_l, drive.T_r, drive.integral, drive.slewing, drive.added
+    return PlanState(*motion, *actuators)
 
 
 def _make_plan_params(base: Any, p: Array, switches: Any, ticks: int) -> PlanParams:
+    """Make the parameters of an episode in steps of some ticks."""
     vehicle, lags = base.vehicle, base.scenario.lags
     motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
     task = read(p, P.task)
@@ -202,12 +179,7 @@ def _make_plan_params(base: Any, p: Array, switches: Any, ticks: int) -> PlanPar
 def _simulate_actions(
     base: Any, snapshot: Any, actions: Array, n: int
 ) -> tuple[Array, Array, Array]:
-    """Simulate actions by the env's own ticks.
-
-    Returns actuator states (K n + 1, len(ActuatorState)), the driver's angle (K n + 1,) and the
-    references (K n + 1, 2). Disturbances, and a steering profile's front wheels without the added
-    angle, do not depend on the actions.
-    """
+    """Simulate actuators, driver and references at every tick by the env, (K n + 1, ...) each."""
     z, window = snapshot["state"], make_window(1)
     bounds = np.array([[entry.low, entry.high] for entry in base.layout]).T.copy()
     row = EpisodeArrays(
@@ -251,9 +223,8 @@ def _compute_preview(
         [drive[:last, names.index("F_d")], drive[:last, names.index("N_d")], np.zeros(last)]
     )
     mean_forces = (forces + wind_forces).reshape(-1, q, 3).mean(axis=1)
-    set_points = np.array(
-        [_compute_set_point(float(tick), read(p, P.speed_profile)) for tick in nodes]
-    )
+    profile = read(p, P.speed_profile)
+    set_points = np.array([_compute_set_point(float(tick), profile) for tick in nodes])
     car, change = read(p, P.car), read(p, P.tyre_change)
     is_changed = nodes >= change.tick
     tyres = [
@@ -277,9 +248,8 @@ def _compute_preview(
     end = known[:, -1:].copy()  # of the episode's end only command, references and weight count
     end[PreviewStep._fields.index("command")] = command[last]
     end[PreviewStep._fields.index("beta_ref") :, 0] = refs[last]
-    end[PreviewStep._fields.index("weight")] = (
-        0.5 * (q + 1) * TICK if last == fixed.task.duration else 0.0
-    )
+    is_complete = last == fixed.task.duration
+    end[PreviewStep._fields.index("weight")] = 0.5 * (q + 1) * TICK if is_complete else 0.0
     return np.hstack([known, end])
 
 
@@ -288,33 +258,26 @@ def _compute_road_turns(p: Array, kind: StepVariant, command: Array) -> Array:
     turns, path = np.zeros(len(command)), NominalMotion(0.0, 0.0)
     if kind.road == NOMINAL_PATH:
         speed_profile, nominal_car = read(p, P.speed_profile), read(p, P.nominal_car)
-        compute_motion, follow_path = (
-            as_python(compute_speed_reference),
-            as_python(step_nominal_car),
-        )
+        compute_motion = as_python(compute_speed_reference)
+        follow_path = as_python(step_nominal_car)
         for tick, steer in enumerate(command):
-            turns[tick], path = follow_path(
-                path, steer, compute_motion(float(tick), speed_profile)[0], nominal_car
-            )
+            speed = compute_motion(float(tick), speed_profile)[0]
+            turns[tick], path = follow_path(path, steer, speed, nominal_car)
     return turns
 
 
 def _compute_set_point(tick: float, speed_profile: SpeedProfile) -> tuple[float, float]:
     """Compute the driver's speed (m/s) and feedforward acceleration (m/s^2) at a tick."""
-    feedforward_profile = speed_profile._replace(hold=1.0, k_p=0.0, k_i=0.0)
-    feedforward = compute_acceleration_command(tick, 0.0, 0.0, feedforward_profile, np.inf)[0]
-    total = compute_acceleration_command(
-        tick, 0.0, 0.0, feedforward_profile._replace(k_p=1.0), np.inf
-    )[0]
+    profile = speed_profile._replace(hold=1.0, k_p=0.0, k_i=0.0)
+    feedforward = compute_acceleration_command(tick, 0.0, 0.0, profile, np.inf)[0]
+    profile = profile._replace(k_p=1.0)
+    total = compute_acceleration_command(tick, 0.0, 0.0, profile, np.inf)[0]
     return total - feedforward, feedforward
 
 
 def _compute_weights(nodes: npt.NDArray[np.int_], fixed: PlanParams) -> Array:
-    """Compute the weight of each step's cost rate in the sum over ticks 1 .. T (s).
-
-    It sums over every q-th tick by the trapezoid rule, without the end; exact for q = 1.
-    """
-    q = fixed.ticks
+    """Compute the weight of each step's cost rate in the sum over ticks 1 .. T (s)."""
+    q = fixed.ticks  # the trapezoid rule over every q-th tick, without the end; exact for q = 1
     weights = np.where(nodes < fixed.task.duration, q * TICK, 0.0)
     weights[0] = 0.5 * (q - 1) * TICK
     return np.asarray(weights)

@@ -1,10 +1,7 @@
-"""A policy's card: what it was trained on, how, and what it costs against others.
+"""A learned policy: its card, its file, and the controller that runs its network by NumPy.
 
-A learned policy as one file: weights as safetensors, whose metadata hold the card.
-
-Reading it runs no code: safetensors are numbers, the card is JSON.
-
-A learned policy as one more controller: weights from a file, run by NumPy.
+The file holds weights as safetensors, whose metadata hold the card as JSON; reading it runs no
+code. The card says what the policy was trained on, how, and what it costs against others.
 """
 
 import hashlib
@@ -36,6 +33,11 @@ from ...estimators.registry import is_user_file
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..controllers.base import Controller
 from ..env_info import AnyEnv, get_env_facts, make_env
+
+FORMAT = 2  # rises when an older sideslip could not read, or would misread, a newer file
+ZIP = ".zip"  # of stable-baselines3, which `agents.training.export` reads
+FOLDER = Path(__file__).resolve().with_name("policies")
+_DEFAULT = "ppo-yaw-vision"
 
 JsonMap = dict[str, Any]
 
@@ -114,16 +116,13 @@ class Card:
         Returns:
             Card of the env.
         """
-        options: JsonMap = {
-            "env_id": env_id,
-            "env_options": dict(env_options or {}),
-            "estimator": estimator,
-            "estimator_options": dict(estimator_options or {}),
-        }
-        env = make_env(env_id, options["env_options"])
+        options, further = dict(env_options or {}), dict(estimator_options or {})
+        env = make_env(env_id, options)
         if estimator:
-            env = EstimateObservation(env, estimator, **options["estimator_options"])
-        card = cls.from_env(env, **options, **rest)
+            env = EstimateObservation(env, estimator, **further)
+        known = {"env_id": env_id, "env_options": options}
+        known |= {"estimator": estimator, "estimator_options": further}
+        card = cls.from_env(env, **known, **rest)
         env.close()
         return card
 
@@ -139,13 +138,8 @@ class Card:
             Card of the env.
         """
         facts = get_env_facts(env)
-        entries = tuple((entry.name, entry.unit) for entry in facts.layout)
-        return cls(
-            observation=entries,
-            control_period=int(facts.control_period),
-            reference=facts.reference,
-            **rest,
-        )
+        rest["observation"] = tuple((entry.name, entry.unit) for entry in facts.layout)
+        return cls(control_period=int(facts.control_period), reference=facts.reference, **rest)
 
     def to_json(self, **extra: Any) -> str:
         """Convert the card to a JSON object.
@@ -191,33 +185,17 @@ def check_names_no_code(env_id: str, estimator: str, estimator_options: JsonMap)
 
 
 def _is_entry(pair: Any) -> bool:
-    return (
-        isinstance(pair, list | tuple)
-        and len(pair) == 2
-        and all(isinstance(word, str) for word in pair)
-    )
-
-
-FORMAT = 2
-"""Counts up when an older sideslip could not read, or would misread, a newer file: since 2 a
-network may have memory and more activations."""
-ZIP = ".zip"  # of stable-baselines3, which `agents.training.export` reads
-FOLDER = Path(__file__).resolve().with_name("policies")
+    is_pair = isinstance(pair, list | tuple) and len(pair) == 2
+    return is_pair and all(isinstance(word, str) for word in pair)
 
 
 @dataclass(frozen=True)
 class Policy:
-    """A network and its card.
+    """A network and its card."""
 
-    Attributes:
-        name: Name of the file without its ending.
-        network: Network that computes the action.
-        card: Card of its training.
-    """
-
-    name: str
-    network: Network
-    card: Card
+    name: str  # name of the file without its ending
+    network: Network  # network that computes the action
+    card: Card  # card of its training
 
     @property
     def reads(self) -> npt.NDArray[np.bool_]:
@@ -316,21 +294,21 @@ def load_policy(path: str | Path) -> Policy:
 
 
 def _find_file(path: str | Path) -> Path:
+    """Find the file of a path or of a shipped policy's name."""
     name = str(path)
     if name in list_shipped():
         return FOLDER / f"{name}{SUFFIX}"
     file = Path(path)
+    if file.is_dir():
+        raise FileNotFoundError(f"policy {name} is a folder")
     if not file.is_file():
-        if file.is_dir():
-            raise FileNotFoundError(f"policy {name} is a folder")
-        raise FileNotFoundError(
-            f"there is no such file and {describe_unknown('policy', [name], list_shipped())}"
-        )
+        unknown = describe_unknown("policy", [name], list_shipped())
+        raise FileNotFoundError(f"there is no such file and {unknown}")
     return file
 
 
 def _read_card_fields(metadata: dict[str, str]) -> dict[str, Any]:
-    """The card's JSON object with the architecture, checked as far as the format goes."""
+    """Read the card's JSON object with the architecture, checked as far as the format goes."""
     if not {"format", "card"} <= metadata.keys():
         raise ValueError("safetensors without a card: this is not a policy of sideslip")
     known = [str(version) for version in range(1, FORMAT + 1)]
@@ -343,9 +321,6 @@ def _read_card_fields(metadata: dict[str, str]) -> dict[str, Any]:
     if metadata["format"] == "1" and isinstance(fields.get("network"), dict):
         fields["network"] |= NO_MEMORY  # it has none
     return fields
-
-
-DEFAULT = "ppo-yaw-vision"
 
 
 class PolicyController(Controller):
@@ -366,7 +341,7 @@ class PolicyController(Controller):
             another control period, or its action is narrower; or as `load_policy`.
     """
 
-    def __init__(self, env: AnyEnv, policy: str | Path | Policy = DEFAULT) -> None:
+    def __init__(self, env: AnyEnv, policy: str | Path | Policy = _DEFAULT) -> None:
         self.policy = policy if isinstance(policy, Policy) else load_policy(policy)
         name, card, facts = self.policy.name, self.policy.card, get_env_facts(env)
         reads = self.policy.reads

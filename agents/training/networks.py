@@ -170,7 +170,7 @@ class TraceLayer(nn.Module):
 
 @functools.cache
 def _compute_weights(times: tuple[float, ...], first: int, steps: int) -> tuple[Any, Any]:
-    """Compute the weights of a block's steps (times, T, T) and of the averages before (times, T)."""
+    """Compute the weights of a block's steps (times, T, T) and of earlier averages (times, T)."""
     ages = first + 1.0 + np.arange(steps)
     shares = np.maximum(1.0 / ages, -np.expm1(-1.0 / np.array(times))[:, None])
     left = np.log(np.maximum(1.0 - shares, _MIN_SHARE)).cumsum(-1)
