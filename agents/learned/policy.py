@@ -46,43 +46,28 @@ JsonMap = dict[str, Any]
 class Card:
     """The card of a policy: what it was trained on, how, and its evaluation; JSON types only.
 
-    Attributes:
-        env_id: Id of the env.
-        observation: (name, unit) of each entry that the network takes.
-        control_period: Ticks between two decisions.
-        reference: Name in `envs.task.REFERENCES`, by which the policy was judged.
-        env_options: Arguments of `gym.make`.
-        estimator: Estimator of `EstimateObservation` around the env, "" for none.
-        estimator_options: Other arguments of `EstimateObservation`.
-        algorithm: Name of the training's algorithm.
-        algorithm_options: Options of the training.
-        command: Command line of the training.
-        seeds: Seeds by purpose ("training", ...).
-        steps: Steps of the environment.
-        cpu_seconds: CPU time of the training (s).
-        sideslip: Version of the package.
-        evaluation: Result of `benchmarks.studies.policies.evaluation`: seeds, and mean costs on
-            them of the policy, of no control and of the best classical line.
+    The evaluation holds seeds and mean costs on them, of the policy, of no control and of the best
+    classical line.
 
     Raises:
         ValueError: A value has another type, or one that JSON does not have.
     """
 
-    env_id: str
-    observation: tuple[tuple[str, str], ...]
-    control_period: int
-    reference: str
-    env_options: JsonMap = field(default_factory=dict)
-    estimator: str = ""
-    estimator_options: JsonMap = field(default_factory=dict)
-    algorithm: str = ""
-    algorithm_options: JsonMap = field(default_factory=dict)
-    command: str = ""
-    seeds: JsonMap = field(default_factory=dict)
-    steps: int = 0
-    cpu_seconds: float = 0.0
-    sideslip: str = __version__
-    evaluation: JsonMap = field(default_factory=dict)
+    env_id: str  # id of the env
+    observation: tuple[tuple[str, str], ...]  # (name, unit) of each entry that the network takes
+    control_period: int  # ticks between two decisions
+    reference: str  # name in `envs.task.REFERENCES`, by which the policy was judged
+    env_options: JsonMap = field(default_factory=dict)  # of `gym.make`
+    estimator: str = ""  # of `EstimateObservation` around the env, "" for none
+    estimator_options: JsonMap = field(default_factory=dict)  # of `EstimateObservation`
+    algorithm: str = ""  # name of the training's algorithm
+    algorithm_options: JsonMap = field(default_factory=dict)  # of the training
+    command: str = ""  # line of the training
+    seeds: JsonMap = field(default_factory=dict)  # by purpose ("training", ...)
+    steps: int = 0  # of the environment
+    cpu_seconds: float = 0.0  # of the training
+    sideslip: str = __version__  # version of the package
+    evaluation: JsonMap = field(default_factory=dict)  # seeds, and mean costs on them
 
     def __post_init__(self) -> None:
         pairs = self.observation

@@ -73,10 +73,6 @@ class Port:
         host: Host to bind.
         port: Number to bind, 0 for any.
 
-    Attributes:
-        address: Bound host and port.
-        unsent: Datagrams that the network did not take.
-
     Raises:
         OSError: The port is in use, or the host is unknown.
     """
@@ -92,8 +88,8 @@ class Port:
             in_use = error.errno == errno.EADDRINUSE
             reason = "is in use" if in_use else f"is none: {error.strerror}"
             raise OSError(f"UDP port {port} of {host} {reason}") from None
-        self.address: tuple[str, int] = self._socket.getsockname()
-        self.unsent = 0
+        self.address: tuple[str, int] = self._socket.getsockname()  # bound host and port
+        self.unsent = 0  # datagrams that the network did not take
         self._sent: dict[int, int] = {}
 
     def send(
@@ -248,33 +244,19 @@ def _format_counts(counts: Mapping[str, int]) -> str:
 
 @dataclass
 class Loop:
-    """An on-board controller on a port.
+    """An on-board controller on a port."""
 
-    Attributes:
-        onboard: Estimator and agent.
-        assembler: Synchroniser of the datagrams.
-        port: Port that receives and sends.
-        targets: Addresses that get every estimate.
-        viewer: Address that gets every tenth estimate and the status.
-        step: Whether time is that of the stamps: each datagram is processed at its arrival.
-        recorder: Recorder of the session.
-        watch: Function that is called after each tick.
-        patience: Time without a fast row after which `run` ends (s).
-        statistics: Measurements of the loop.
-        ended: Reason of the end.
-    """
-
-    onboard: OnboardController
-    assembler: StreamSynchroniser
-    port: Port
-    targets: Sequence[Any] = ()
-    viewer: Any = None
-    step: bool = False
-    recorder: Recorder | None = None
-    watch: Callable[[Tick], None] | None = None
-    patience: float = 30.0
+    onboard: OnboardController  # estimator and agent
+    assembler: StreamSynchroniser  # synchroniser of the datagrams
+    port: Port  # receives and sends
+    targets: Sequence[Any] = ()  # addresses that get every estimate
+    viewer: Any = None  # address that gets every tenth estimate and the status
+    step: bool = False  # whether time is that of the stamps: datagrams are processed as they arrive
+    recorder: Recorder | None = None  # of the session
+    watch: Callable[[Tick], None] | None = None  # called after each tick
+    patience: float = 30.0  # s without a fast row after which `run` ends
     statistics: _Statistics = field(default_factory=_Statistics)
-    ended: str = ""
+    ended: str = ""  # reason of the end
 
     def run(self, stop: Callable[[], bool] = lambda: False, duration: float = math.inf) -> None:
         """Run until the drive is over, and set `ended`.

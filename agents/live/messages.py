@@ -196,21 +196,14 @@ class StreamSynchroniser:
     Args:
         patience: Calls of `take` without a fast row after which the last one is held; None: no
             limit.
-
-    Attributes:
-        counts: Counts of ignored datagrams, by `RejectReason` and `_BRIDGED`.
-        sender: Sender of the newest row.
-        accepted: Datagrams of the newest batch.
-        over: Whether the drive's end came.
-        silent: Calls since the last fast row.
     """
 
     def __init__(self, patience: int | None = PATIENCE) -> None:
         self.patience = patience
-        self.counts: Counter[str] = Counter({name: 0 for name in (*RejectReason, *_BRIDGED)})
-        self.sender: Any = None
-        self.accepted: list[bytes] = []
-        self.over, self.silent = False, 0
+        self.counts = Counter[str]({name: 0 for name in (*RejectReason, *_BRIDGED)})
+        self.sender: Any = None  # of the newest row
+        self.accepted: list[bytes] = []  # of the newest batch
+        self.over, self.silent = False, 0  # the drive's end came; calls since the last fast row
         self._newest: dict[int, int] = {}  # sequence numbers by kind
         self._waiting: list[tuple[int, Message]] = []
         self._last: Tick | None = None

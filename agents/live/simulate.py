@@ -36,24 +36,17 @@ _KINDS = {place: kind for kind, place in SENSORS.items()}
 class WireAgent:
     """An agent on the wires: it sends the env's record and returns the controls that arrive.
 
-    Attributes:
-        env: Bare `StabilityEnv`.
-        port: Port that sends.
-        to: Address of the receiver.
-        step: Lock-step, which waits for the control of every period. Otherwise a tick lasts a
-            millisecond over `speed`, and the last action holds where a control is late.
-        speed: Speed of the clock, 1 for real time.
-        late: Number of late controls.
-        periods: Number of control periods.
+    Without `step` a tick lasts a millisecond over `speed`, and the last action holds where a
+    control is late.
     """
 
-    env: gym.Env[Any, Any]
-    port: Port
-    to: Any
-    step: bool = False
-    speed: float = 1.0
-    late: int = 0
-    periods: int = 0
+    env: gym.Env[Any, Any]  # bare `StabilityEnv`
+    port: Port  # sends
+    to: Any  # address of the receiver
+    step: bool = False  # wait for the control of every period
+    speed: float = 1.0  # of the clock, 1 for real time
+    late: int = 0  # number of late controls
+    periods: int = 0  # number of control periods
     _start_time: int = 0  # ns, when tick 0 is due
     _newest: int = -1  # stamp of the newest control
     _action: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros(1, np.float32))
@@ -241,27 +234,16 @@ def _run_simulated_car(
 
 @dataclass
 class Relay:
-    """Sends the epochs of a source as datagrams; a lost line is opened again.
+    """Sends the epochs of a source as datagrams; a lost line is opened again."""
 
-    Attributes:
-        source: Source, as for `envs.recordings.sources.make_source`, whose errors it raises.
-        port: Port that sends.
-        to: Address of the receiver.
-        latency: Delay from an epoch to its sentences (s), added to the age.
-        speed: Speed of a file's clock, 1 for real time.
-        sent: Number of datagrams.
-        error: Reason of the end, "" at a file's end.
-        counts: Counts of the decoder.
-    """
-
-    source: str
-    port: Port
-    to: Any
-    latency: float = 0.0
-    speed: float = 1.0
-    sent: int = 0
-    error: str = ""
-    counts: Any = None
+    source: str  # as for `envs.recordings.sources.make_source`, whose errors it raises
+    port: Port  # sends
+    to: Any  # address of the receiver
+    latency: float = 0.0  # s from an epoch to its sentences, added to the age
+    speed: float = 1.0  # of a file's clock, 1 for real time
+    sent: int = 0  # number of datagrams
+    error: str = ""  # reason of the end, "" at a file's end
+    counts: Any = None  # of the decoder
     _origin: tuple[float, float] | None = field(default=None)
 
     def __post_init__(self) -> None:

@@ -31,19 +31,12 @@ _POLICY = (
 
 
 class ViewerProtocol(asyncio.DatagramProtocol):
-    """The newest datagrams of a loop.
-
-    Attributes:
-        names: Names of the states.
-        samples: Time (s), estimates and standard deviations, with angles in degrees.
-        status: Newest status of the loop.
-        count: Number of samples so far.
-        over: Event of the drive's end.
-    """
+    """The newest datagrams of a loop: its status, and estimates with angles in degrees."""
 
     def __init__(self) -> None:
-        self.names: tuple[str, ...] = ()
-        self.samples: deque[list[float]] = deque(maxlen=round(100 * _SECONDS))
+        self.names: tuple[str, ...] = ()  # of the states
+        # time (s), estimates and standard deviations
+        self.samples = deque[list[float]](maxlen=round(100 * _SECONDS))
         self.status, self.count, self.over = LoopStatus(), 0, asyncio.Event()
 
     def datagram_received(self, data: bytes, _: Any) -> None:

@@ -70,20 +70,13 @@ class Evaluation(NamedTuple):
 
     For a mixture `of_none` is the mean over scenarios, and `cost` is that times their mean
     uncontrolled cost.
-
-    Attributes:
-        steps: Steps of the training so far.
-        cpu_seconds: CPU time of the training so far, without evaluations (s).
-        cost: Mean cost J.
-        of_none: Cost as a fraction of the uncontrolled car's on these seeds.
-        of_start: Geometric mean of costs over those of the initial policy, None without one.
     """
 
-    steps: int
-    cpu_seconds: float
-    cost: float
-    of_none: float
-    of_start: float | None = None
+    steps: int  # of the training so far
+    cpu_seconds: float  # of the training so far, without evaluations
+    cost: float  # mean cost J
+    of_none: float  # as a fraction of the uncontrolled car's on these seeds
+    of_start: float | None = None  # geometric mean of costs over the initial policy's, if any
 
     @property
     def criterion(self) -> float:
@@ -92,41 +85,27 @@ class Evaluation(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """The progress of a training.
+    """The progress of a training."""
 
-    Attributes:
-        steps: Steps so far.
-        cost: Mean cost of the newest episodes with exploration; None before the first one's end.
-        evaluations: Evaluations so far.
-    """
-
-    steps: int
-    cost: float | None
-    evaluations: tuple[Evaluation, ...]
+    steps: int  # so far
+    cost: float | None  # mean of the newest episodes with exploration; None before one ends
+    evaluations: tuple[Evaluation, ...]  # so far
 
 
 @dataclass(frozen=True)
 class RunOptions:
     """The options of a run, which may change when a training resumes.
 
-    Attributes:
-        eval_freq: Steps between two evaluations.
-        device: torch's name of the device.
-        tensorboard_log: Folder for TensorBoard.
-        report: Function that is called after every rollout.
-        command: Command line, for the policy's card.
-        track: Project of Weights & Biases, "" for none.
-
     Raises:
         ValueError: `eval_freq` is below 1, or the device is none of torch's.
     """
 
-    eval_freq: int = 250_000
-    device: str = "cpu"
-    tensorboard_log: str | None = None
-    report: Callable[[Progress], None] | None = None
-    command: str = ""
-    track: str = ""
+    eval_freq: int = 250_000  # steps between two evaluations
+    device: str = "cpu"  # torch's name of the device
+    tensorboard_log: str | None = None  # folder for TensorBoard
+    report: Callable[[Progress], None] | None = None  # called after every rollout
+    command: str = ""  # command line, for the policy's card
+    track: str = ""  # project of Weights & Biases, "" for none
 
     def __post_init__(self) -> None:
         if self.eval_freq < 1:
@@ -224,13 +203,10 @@ class EvalCallback(BaseCallback):
             mixed = get_algorithm(task.algo).on_tensors
             scaling_env = task.vector_env(_SCALING_ENVS)
             self.scaling = measure_scaling(scaling_env, spread, seed, task.reads, mixed)
-        env = make_vec_env(
-            task.env_id,
-            task.num_envs,
-            estimator=task.estimator_kwargs,
-            env_kwargs=task.options(task.num_envs),
-            wrapper_class=self.warm_start.wrap_env if self.warm_start else None,
-        )
+        options = dict[str, Any](estimator=task.estimator_kwargs)
+        options["env_kwargs"] = task.options(task.num_envs)
+        options["wrapper_class"] = self.warm_start.wrap_env if self.warm_start else None
+        env = make_vec_env(task.env_id, task.num_envs, **options)
         steps = 0 if checkpoint is None else int(checkpoint["steps"])
         seed = (task.seed + steps) % 2**32
         first = _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING + steps
@@ -241,9 +217,8 @@ class EvalCallback(BaseCallback):
             from .gradient import make_source
 
             further["source"] = partial(make_source, task, first, scaled_env.reward_scale)
-        model = make_model(
-            task.algo, task.settings, scaled_env, self.period, self.scaling, seed, **further
-        )
+        made_of = scaled_env, self.period, self.scaling, seed
+        model = make_model(task.algo, task.settings, *made_of, **further)
         if checkpoint is not None:
             load_parameters(self.folder / CHECKPOINT, model)
             if isinstance(model, OffPolicyAlgorithm):

@@ -38,9 +38,8 @@ _UNIFORM_LOG_STD = -0.55  # log of the deviation of actions drawn evenly
 
 _TRAINING_SETTINGS = ("n_timesteps", "n_envs", "policy", "normalize")
 _SCHEDULED = ("learning_rate", "clip_range")
-_MANAGED_ARGUMENTS = {
-    "env", "seed", "device", "verbose", "tensorboard_log", "stats_window_size", "source",
-}  # fmt: skip
+_LOG_ARGUMENTS = {"verbose", "tensorboard_log", "stats_window_size"}
+_MANAGED_ARGUMENTS = {"env", "seed", "device", "source"} | _LOG_ARGUMENTS
 
 
 @dataclass(frozen=True)
@@ -64,9 +63,7 @@ ALGORITHMS = {
     "sac": Algorithm("stable_baselines3:SAC", "sac"),
     "tqc": Algorithm("sb3_contrib:TQC", "tqc"),
     "recurrent-ppo": Algorithm("sb3_contrib:RecurrentPPO", "ppo_lstm"),
-    "gradient": Algorithm(
-        f"{__package__}.gradient:AnalyticPolicyGradient", "gradient", on_tensors=True
-    ),
+    "gradient": Algorithm(f"{__package__}.gradient:AnalyticPolicyGradient", "gradient", True),
 }
 
 
@@ -261,35 +258,22 @@ def check_device(name: str) -> None:
 class TrainingTask:
     """The task of a training, which stays the same when the training resumes.
 
-    Attributes:
-        env_id: Id of a native vector env.
-        algo: Name in `ALGORITHMS`.
-        estimator: Estimator of `EstimateObservation`, "" for none.
-        env_options: Arguments of `gym.make`, in JSON types.
-        seed: Seed of the weights, the episodes and the exploration.
-        num_envs: Environments side by side; 0: the number in the settings.
-        scenarios: Mixture, of which each environment has one scenario for all its episodes.
-        estimator_options: Other arguments of `EstimateObservation`.
-        settings: Settings of `read_settings`; empty: the package's own.
-        n_eval_envs: Episodes of an evaluation, side by side.
-        reads: Entries of the observation that the network reads; empty: all.
-
     Raises:
         ValueError: An algorithm, setting or scenario is unknown, the seed is negative, there is no
             environment or fewer than scenarios, or an estimator is set with cars on tensors.
     """
 
-    env_id: str = "sideslip/YawVision-v0"
-    algo: str = "ppo"
-    estimator: str = ""
-    env_options: dict[str, Any] = field(default_factory=dict)
-    seed: int = 0
-    num_envs: int = 0
-    scenarios: list[Any] = field(default_factory=list)
-    estimator_options: dict[str, Any] = field(default_factory=dict)
-    settings: Settings = field(default_factory=dict)
-    n_eval_envs: int = 256
-    reads: list[str] = field(default_factory=list)
+    env_id: str = "sideslip/YawVision-v0"  # of a native vector env
+    algo: str = "ppo"  # name in `ALGORITHMS`
+    estimator: str = ""  # of `EstimateObservation`, "" for none
+    env_options: dict[str, Any] = field(default_factory=dict)  # of `gym.make`, in JSON types
+    seed: int = 0  # of the weights, the episodes and the exploration
+    num_envs: int = 0  # environments side by side; 0: the number in the settings
+    scenarios: list[Any] = field(default_factory=list)  # mixture: each environment has one
+    estimator_options: dict[str, Any] = field(default_factory=dict)  # of `EstimateObservation`
+    settings: Settings = field(default_factory=dict)  # empty: the package's own
+    n_eval_envs: int = 256  # episodes of an evaluation, side by side
+    reads: list[str] = field(default_factory=list)  # entries that the network reads; empty: all
 
     def __post_init__(self) -> None:
         settings = self.settings or read_settings(self.algo, self.env_id)
@@ -374,14 +358,8 @@ class TrainingTask:
             eval_freq: Steps between two evaluations.
         """
         first = {"scenario": self.scenarios[0]} if self.scenarios else {}
-        arguments = {
-            "algo": get_algorithm(self.algo).zoo,
-            "env": self.env_id,
-            "env_kwargs": self.env_options | first,
-            "eval_freq": eval_freq,
-            "n_eval_envs": self.n_eval_envs,
-            "n_timesteps": steps,
-            "seed": self.seed,
-        }
+        arguments = {"algo": get_algorithm(self.algo).zoo, "env": self.env_id}
+        arguments |= {"env_kwargs": self.env_options | first, "eval_freq": eval_freq}
+        arguments |= {"n_eval_envs": self.n_eval_envs, "n_timesteps": steps, "seed": self.seed}
         settings = self.settings | {"n_envs": self.num_envs}
         zoo.describe(folder, settings, self.estimator_kwargs, arguments)

@@ -140,12 +140,11 @@ def _convert_cells(module: Any) -> list[RecurrentCell]:
     if module.bidirectional or module.proj_size or module.batch_first or not module.bias:
         raise ValueError(f"recurrent layers with further arguments are not known: {module}")
     names = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
-    return [
-        RecurrentCell(
-            module.mode.lower(), *(_to_array(getattr(module, f"{name}_l{i}")) for name in names)
-        )
-        for i in range(module.num_layers)
-    ]
+    cells = []
+    for i in range(module.num_layers):
+        weights = (_to_array(getattr(module, f"{name}_l{i}")) for name in names)
+        cells.append(RecurrentCell(module.mode.lower(), *weights))
+    return cells
 
 
 def _to_array(parameter: Any) -> Any:
@@ -165,6 +164,7 @@ def _convert_dense(layers: list[Any]) -> tuple[list[Any], list[Any], list[str], 
     from torch import nn
 
     names = {kind: name for name, kind in list_activations().items()}
+    known = f"linear, {', '.join(names.values())}"
     weights, biases, layer_activations = list[Any](), list[Any](), list[str]()
     for layer in layers:
         if isinstance(layer, nn.Linear):
@@ -179,9 +179,7 @@ def _convert_dense(layers: list[Any]) -> tuple[list[Any], list[Any], list[str], 
         ):
             layer_activations.append(names[type(layer)])
         else:
-            raise ValueError(
-                f"layer {layer} is not known; known: linear, {', '.join(names.values())}"
-            )
+            raise ValueError(f"layer {layer} is not known; known: {known}")
     if len(layer_activations) == len(weights):  # the last one is the output's
         return weights, biases, layer_activations[:-1], layer_activations[-1]
     return weights, biases, layer_activations, "linear"
@@ -308,11 +306,8 @@ def find_normaliser(path: Path, normalise: str | Path | None = None) -> Path | N
     """
     if normalise is not None:
         return Path(normalise)
-    candidates = (
-        path.with_suffix(".pkl"),
-        path.with_name(_NORMALISER),
-        path.with_suffix("") / _NORMALISER,  # where rl-baselines3-zoo puts it
-    )
+    in_zoo = path.with_suffix("") / _NORMALISER  # where rl-baselines3-zoo puts it
+    candidates = path.with_suffix(".pkl"), path.with_name(_NORMALISER), in_zoo
     return next((file for file in candidates if file.is_file()), None)
 
 
@@ -353,10 +348,8 @@ def check_zip(file: Path) -> None:
     except BadZipFile as error:
         raise ValueError(f"{file} is no zip, or is cut short: {error}") from None
     if missing:
-        names = " and ".join(sorted(missing))
-        raise ValueError(
-            f"{file} is no zip of stable-baselines3, or is cut short: it holds no {names}"
-        )
+        lacks = f"it holds no {' and '.join(sorted(missing))}"
+        raise ValueError(f"{file} is no zip of stable-baselines3, or is cut short: {lacks}")
 
 
 def _read(file: Path) -> tuple[dict[str, Any], Any]:
@@ -399,9 +392,8 @@ def _build_policy(file: Path, content: dict[str, Any], weights: Any) -> Any:
         policy = kind(*spaces, lambda _: 0.0, **options)
         policy.load_state_dict(weights)
     except Exception as error:
-        raise ValueError(
-            f"{file}: its weights are not those of its {kind.__name__}: {error}"
-        ) from error
+        wrong = f"its weights are not those of its {kind.__name__}"
+        raise ValueError(f"{file}: {wrong}: {error}") from error
     return policy
 
 

@@ -262,9 +262,8 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         is_running, windows = True, 0
         while is_running and self.num_timesteps < total:
             callback.on_rollout_start()
-            mean_cost, obs, state = unroll_window(
-                policy, cars, obs, state, reward_scale, self.n_steps
-            )
+            window = reward_scale, self.n_steps
+            mean_cost, obs, state = unroll_window(policy, cars, obs, state, *window)
             self.num_timesteps += self.n_steps * cars.num_envs
             self._update_current_progress_remaining(self.num_timesteps, total)
             self._update_weights(mean_cost)
@@ -286,9 +285,8 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         mean_cost.backward()
         norm = nn.utils.clip_grad_norm_(self.policy.parameters(), _MAX_GRADIENT_NORM)
         if not norm.isfinite():
-            raise FloatingPointError(
-                f"the cost's slope is not finite after step {self.num_timesteps}"
-            )
+            step = self.num_timesteps
+            raise FloatingPointError(f"the cost's slope is not finite after step {step}")
         optimizer.step()
 
     def _excluded_save_params(self) -> list[str]:

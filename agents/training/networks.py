@@ -145,9 +145,8 @@ class TraceLayer(nn.Module):
         """
         silu_weights = self.unit.weight.detach().numpy() @ mixing
         bias = np.concatenate([np.zeros(self.inputs), self.unit.bias.detach().numpy()])
-        return MovingAverages(
-            np.concatenate([mixing, silu_weights]), bias, self.unit.out_features, self.times
-        )
+        weights = np.concatenate([mixing, silu_weights])
+        return MovingAverages(weights, bias, self.unit.out_features, self.times)
 
     def convert_weights(self, weight: Array, bias: Array) -> tuple[Array, Array]:
         """Convert the next layer's weights for the output of `cell`.

@@ -108,9 +108,8 @@ def measure_scaling(
     period = base.control_period * base.dt
     unknown = [name for name in reads if name not in names]
     if unknown:
-        raise ValueError(
-            f"the observation has no {', '.join(unknown)} to read; it has {', '.join(names)}"
-        )
+        lacking, available = ", ".join(unknown), ", ".join(names)
+        raise ValueError(f"the observation has no {lacking} to read; it has {available}")
     samples = _collect_observations(env, spread, seed, period, 0.0)
     deviation = samples.std(axis=0)
     varies = deviation > _CONSTANT

@@ -60,16 +60,12 @@ class Demonstrations(NamedTuple):
 class Scaling(NamedTuple):
     """The scaling of a student's inputs: clip((x - mean) scale) mixing.
 
-    Attributes:
-        mean: Means, shape (k,).
-        scale: Factors, shape (k,), zero for an entry that is not read.
-        mixing: Symmetric whitening, shape (k, k): it scales up what varies little while its parts
-            vary much, such as course less heading.
+    Mixing scales up what varies little while its parts vary much, such as course less heading.
     """
 
-    mean: Array
-    scale: Array
-    mixing: Array
+    mean: Array  # shape (k,)
+    scale: Array  # factors, shape (k,), zero for an entry that is not read
+    mixing: Array  # symmetric whitening, shape (k, k)
 
     def mix_inputs(self, obs: Single) -> Single:
         """Compute a `Student`'s inputs.
@@ -136,41 +132,29 @@ def normalise_inputs(obs: Single, mean: Array, scale: Array) -> Single:
 class DistillConfig:
     """The configuration of a student and its training.
 
-    Attributes:
-        rounds: Rounds of driving and learning; in the first one the teacher drives.
-        epochs: Passes over all drives in a round, `LAST_ROUND_FACTOR` times as many in the last
-            one.
-        cells: Cells of a GRU, 0 for none.
-        hidden: Sizes of the dense layers.
-        learning_rate: Learning rate of Adam, which falls to a fiftieth in each round.
-        noise: Largest standard deviation of the noise on the teacher's actions.
-        seed: Seed of weights and episodes.
-        batch: Episodes of a batch, for a student with memory.
-        told: Weight of the auxiliary loss: squared errors, in standard deviations, of the teacher's
-            inputs that a student with memory does not see. The loss of zero actions counts 1.
-        traces: SiLU units of `MovingAverages`, 0 for none.
+    The auxiliary loss is that of the teacher's inputs that a student with memory does not see:
+    squared errors in standard deviations, where the loss of zero actions counts 1.
 
     Raises:
         ValueError: A number is out of range, there are cells and traces, or `told` without memory.
     """
 
-    rounds: int = 7
-    epochs: int = 12
-    cells: int = 0
-    hidden: tuple[int, ...] = (64, 64)
-    learning_rate: float = 3e-3
-    noise: float = 0.02
-    seed: int = 0
-    batch: int = 16
-    told: float = 0.0
-    traces: int = 0
+    rounds: int = 7  # of driving and learning; in the first one the teacher drives
+    epochs: int = 12  # over all drives in a round; in the last one times `LAST_ROUND_FACTOR`
+    cells: int = 0  # of a GRU, 0 for none
+    hidden: tuple[int, ...] = (64, 64)  # sizes of the dense layers
+    learning_rate: float = 3e-3  # of Adam, which falls to a fiftieth in each round
+    noise: float = 0.02  # largest standard deviation of the noise on the teacher's actions
+    seed: int = 0  # of weights and episodes
+    batch: int = 16  # episodes of a batch, for a student with memory
+    told: float = 0.0  # weight of the auxiliary loss
+    traces: int = 0  # SiLU units of `MovingAverages`, 0 for none
 
     def __post_init__(self) -> None:
         sizes = self.rounds, self.epochs, self.batch, *self.hidden
         if min(sizes) < 1 or min(self.cells, self.traces, self.seed) < 0:
-            raise ValueError(
-                f"rounds, epochs and sizes are 1 at least, cells, traces and seed 0: {self}"
-            )
+            rule = "rounds, epochs and sizes are 1 at least, cells, traces and seed 0"
+            raise ValueError(f"{rule}: {self}")
         if not (self.learning_rate > 0.0 and self.noise >= 0.0 and self.told >= 0.0):
             raise ValueError(f"learning_rate is above zero, noise and told not below: {self}")
         if self.cells and self.traces:

@@ -37,18 +37,8 @@ from stable_baselines3.common.callbacks import BaseCallback  # isort: skip
 from stable_baselines3.common.logger import KVWriter  # isort: skip
 
 __all__ = [
-    "BEST",
-    "CHECKPOINT",
-    "CURVE",
-    "POLICY",
-    "EvalCallback",
-    "Progress",
-    "RunOptions",
-    "RunRecord",
-    "TrainResult",
-    "TrainingTask",
-    "read_task",
-    "train",
+    "BEST", "CHECKPOINT", "CURVE", "POLICY", "EvalCallback", "Progress", "RunOptions", "RunRecord",
+    "TrainResult", "TrainingTask", "read_task", "train",
 ]  # fmt: skip
 
 

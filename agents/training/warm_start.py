@@ -80,9 +80,8 @@ def read_warm_start(path: str | Path, width: int, trust: bool = False) -> WarmSt
         policy = parameters["policy"]
     except Exception as error:  # torch raises many for one that is cut short
         raise ValueError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
-    buffers = {
-        name.rpartition(".")[2]: x for name, x in policy.items() if "features_extractor." in name
-    }
+    inner = [name for name in policy if "features_extractor." in name]
+    buffers = {name.rpartition(".")[2]: policy[name] for name in inner}
     if buffers.keys() >= {"mean", "scale", "clip"}:  # every network of the policy has the same
         bound = float(buffers["clip"])
         mixing = buffers["mixing"].tolist() if "mixing" in buffers else None
@@ -171,10 +170,9 @@ def _get_policy_form(policy: Policy, algo: str) -> dict[str, Any]:
         )
     if on_tensors and network.activation != "silu":
         raise ValueError(f"{algo} goes on from layers of silu, not of {network.activation}")
-    further = (
-        {"cells": network.cells[0].size} if on_tensors else {"activation_fn": network.activation}
-    )
-    return {"net_arch": list(network.hidden), **further}
+    if on_tensors:
+        return {"net_arch": list(network.hidden), "cells": network.cells[0].size}
+    return {"net_arch": list(network.hidden), "activation_fn": network.activation}
 
 
 def _make_warm_start(
@@ -184,15 +182,13 @@ def _make_warm_start(
     network, policy_entries = policy.network, [name for name, _ in policy.card.observation]
     names = [entry.name for entry in layout]
     if policy_entries != names:
-        raise ValueError(
-            f"{policy.name} reads {', '.join(policy_entries)}; here there is {', '.join(names)}"
-        )
+        known, available = ", ".join(policy_entries), ", ".join(names)
+        raise ValueError(f"{policy.name} reads {known}; here there is {available}")
     form = _get_policy_form(policy, task.algo)
     policy_kwargs = task.settings.get("policy_kwargs", {})
     if policy_kwargs != policy_kwargs | form:
-        raise ValueError(
-            f"{policy.name} is a network of {form}, and the settings say {policy_kwargs}"
-        )
+        contrast = f"{form}, and the settings say {policy_kwargs}"
+        raise ValueError(f"{policy.name} is a network of {contrast}")
     on_tensors = get_algorithm(task.algo).on_tensors
     if on_tensors:
         cell = network.cells[0]
@@ -219,16 +215,13 @@ def load_warm_start(start: WarmStart, model: Any) -> None:
     Raises:
         ValueError: The tensors are of another network.
     """
-    unchanged = {
-        name: x
-        for name, x in model.get_parameters()["policy"].items()
-        if start.partial or "features_extractor." in name  # a zip from elsewhere has it outside
-    }
-    policy = unchanged | start.parameters["policy"]
+    policy = dict(model.get_parameters()["policy"])
+    if not start.partial:  # a zip from elsewhere has its features extractor outside
+        policy = {name: x for name, x in policy.items() if "features_extractor." in name}
+    policy |= start.parameters["policy"]
+    parameters = {**model.get_parameters(), **start.parameters, "policy": policy}
     try:
-        model.set_parameters(
-            {**model.get_parameters(), **start.parameters, "policy": policy}, device=model.device
-        )
+        model.set_parameters(parameters, device=model.device)
         for name, tensor in start.variables.items():
             getattr(model, name).data.copy_(tensor)
     except (AttributeError, KeyError, RuntimeError, ValueError) as error:
@@ -421,10 +414,9 @@ def measure_reward_scale(agent: Any, env: VecEnv, seed: int, steps: int) -> list
             scales[i].append(float(lengths[i] / (costs[i] + COST_FLOOR)))
             costs[i] = lengths[i] = 0.0
     open_scales = lengths / (costs + COST_FLOOR)
-    return [
-        [*row_scales, float(np.median(row_scales or [open_scales[i]]))]
-        for i, row_scales in enumerate(scales)
-    ]
+    for row_scales, open_scale in zip(scales, open_scales, strict=True):
+        row_scales.append(float(np.median(row_scales or [open_scale])))
+    return scales
 
 
 class RewardScaleWrapper(VecEnvWrapper):
