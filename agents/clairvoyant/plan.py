@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from ...envs.engine.layout import P
 from ...envs.record import Array
-from ..controllers.base import Controller
 from ..rollout import iterate_steps
 from .preview import Forecast, PlanState, make_forecast, read_plan_state
 from .sweep import (
@@ -254,29 +253,3 @@ def record_actions(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
 def _count_periods(base: Any) -> int:
     """Count the control periods of the episode that was last reset."""
     return -int(-base.get_state()["params"][P.task.duration] // base.control_period)
-
-
-class PlanReplay(Controller):
-    """A plan as an agent: the actions of one episode for every observation, then zeros.
-
-    Args:
-        env: Env of the controller.
-        actions: Fractions of full scale, shape (K, width).
-
-    Raises:
-        ValueError: The actions are not finite or have another shape.
-    """
-
-    memory = 1
-
-    def __init__(self, env: gym.Env[Any, Any], actions: npt.ArrayLike) -> None:
-        super().__init__(env)
-        planned, m = np.asarray(actions, np.float64), self.width
-        if planned.ndim != 2 or planned.shape[1] != m or not np.isfinite(planned).all():
-            raise ValueError(f"a plan is finite numbers (K, {m}), got shape {planned.shape}")
-        self._actions = np.vstack([planned, np.zeros((1, self.width))])
-
-    def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        step = state[:, 0].astype(int)
-        action[:] = self._actions[np.minimum(step, len(self._actions) - 1)]
-        state[:, 0] += 1.0

@@ -137,14 +137,10 @@ def advance(fixed: PlanParams, x: PlanState, action: Any, known: PreviewStep) ->
         added = _apply_lag(extra, x.added, right.mean * right.end**tick)
         share = share / task.yaw_scale
         effort += TICK * _uncapped_cost_rate(0.0, 0.0, share, added, kind.reference)
-    next_state = PlanState(
-        *motion,
-        _apply_lag(T_l, x.T_l, motor.end),
-        _apply_lag(T_r, x.T_r, motor.end),
-        x.integral + q * (integral - x.integral),
-        slewing,
-        _apply_lag(extra, x.added, steering.end),
-    )
+    torques = _apply_lag(T_l, x.T_l, motor.end), _apply_lag(T_r, x.T_r, motor.end)
+    new_integral = x.integral + q * (integral - x.integral)
+    new_added = _apply_lag(extra, x.added, steering.end)
+    next_state = PlanState._make((*motion, *torques, new_integral, slewing, new_added))
     return _PlanStep(next_state, effort, moved)
 
 

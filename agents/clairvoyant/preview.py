@@ -28,15 +28,12 @@ from ...envs.vehicle.dynamics import CarParams, RoadParams
 
 
 class PreviewStep(NamedTuple):
-    """Inputs and parameters of one step of the plan, which actions change hardly or not at all.
-
-    `beta_ref` and `gamma_ref` may change; `command` and `weight` are those of the step's start.
-    """
+    """Inputs and parameters of one step of the plan, which actions change hardly or not at all."""
 
     steer_start: Any  # rad, front steering angle without the added one
     steer_middle: Any
     steer_end: Any
-    command: Any  # rad, the driver's
+    command: Any  # rad, the driver's at the start
     F_d: Any  # N, mean over the step, with the wind's
     N_d: Any  # N m
     N_x: Any  # N m
@@ -53,11 +50,7 @@ class PreviewStep(NamedTuple):
 
 
 class PlanState(NamedTuple):
-    """States of a plan in SI units: motion, actuators, the driver's integral.
-
-    `slewing` is the commanded added steering, `added` the applied one (rad). T_l and T_r are the
-    motors' torques (N m).
-    """
+    """States of a plan in SI units: motion, actuators, the driver's integral."""
 
     v_x: Any
     v_y: Any
@@ -70,11 +63,11 @@ class PlanState(NamedTuple):
     theta: Any
     phi: Any
     phi_dot: Any
-    T_l: Any
+    T_l: Any  # torque of the left motor (N m)
     T_r: Any
     integral: Any
-    slewing: Any
-    added: Any
+    slewing: Any  # added steering that is commanded (rad)
+    added: Any  # added steering that is applied (rad)
 
 
 class PlanParams(NamedTuple):
@@ -110,8 +103,7 @@ def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
 
     Args:
         base: Unwrapped env at tick 0.
-        actions: Actions of a run, shape (K, width), to which a driver reacts who steers by the car;
-            None: zeros.
+        actions: Actions of a run, shape (K, width), to which a driver reacts; None: zeros.
 
     Returns:
         Forecast from tick 0 to the episode's end.
@@ -156,13 +148,12 @@ def _make_plan_params(base: Any, p: Array, switches: Any, ticks: int) -> PlanPar
     """Make the parameters of an episode in steps of some ticks."""
     vehicle, lags = base.vehicle, base.scenario.lags
     motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
-    task = read(p, P.task)
+    task, speed_profile = read(p, P.task), read(p, P.speed_profile)._replace(end=FOREVER)
+    speed_profile = speed_profile._replace(speed=0.0, acceleration=0.0, start=0.0, surge=0.0)
     return PlanParams(
         read(p, P.car)._replace(C_f=0.0, C_r=0.0, mu=0.0, mu_r=0.0),
         read(p, P.road),
-        read(p, P.speed_profile)._replace(
-            speed=0.0, acceleration=0.0, start=0.0, end=FOREVER, surge=0.0
-        ),
+        speed_profile,
         make_lag(motor, ticks * TICK),
         make_lag(steering, ticks * TICK),
         make_lag(motor, TICK),
@@ -182,15 +173,9 @@ def _simulate_actions(
     """Simulate actuators, driver and references at every tick by the env, (K n + 1, ...) each."""
     z, window = snapshot["state"], make_window(1)
     bounds = np.array([[entry.low, entry.high] for entry in base.layout]).T.copy()
-    row = EpisodeArrays(
-        p=snapshot["params"],
-        z=z,
-        switches=snapshot["switches"],
-        obs=np.empty(len(base.layout), np.float32),
-        rows=snapshot["rows"],
-        packets=snapshot["packets"],
-        report=np.zeros(len(REPORT)),
-    )
+    p, switches = snapshot["params"], snapshot["switches"]
+    obs, report = np.empty(len(base.layout), np.float32), np.zeros(len(REPORT))
+    row = EpisodeArrays(p, z, switches, obs, snapshot["rows"], snapshot["packets"], report)
     held_actions = np.repeat(np.vstack([actions, actions[-1:]]).astype(np.float32), n, axis=0)
     ticks = n * len(actions)
     drive, driver = np.empty((ticks + 1, len(ActuatorState._fields))), np.empty(ticks + 1)
@@ -219,9 +204,8 @@ def _compute_preview(
     lag, middle = fixed.steering_tick, nodes + q // 2
     wind = read(p, P.wind)
     wind_forces = np.array([compute_wind(float(tick), wind) for tick in range(last)])
-    forces = np.column_stack(
-        [drive[:last, names.index("F_d")], drive[:last, names.index("N_d")], np.zeros(last)]
-    )
+    F_d, N_d = (drive[:last, names.index(name)] for name in ("F_d", "N_d"))
+    forces = np.column_stack([F_d, N_d, np.zeros(last)])
     mean_forces = (forces + wind_forces).reshape(-1, q, 3).mean(axis=1)
     profile = read(p, P.speed_profile)
     set_points = np.array([_compute_set_point(float(tick), profile) for tick in nodes])

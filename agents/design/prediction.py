@@ -319,7 +319,7 @@ def simulate_plans(
     limits: Any,
     first: Any,
 ) -> None:
-    """Simulate plans: fill their residuals and their first commands.
+    """Simulate plans: fill their residuals, whose squares sum to J, and their first commands.
 
     The variables of a plan are, for every block, the fraction of the yaw moment and, where the car
     steers, that of the authority.
@@ -331,10 +331,8 @@ def simulate_plans(
         terminal: T of the terminal cost |T x|^2, shape (4, 9).
         blocks: Steps of each block, shape (blocks,).
         plans: Plans, shape (variables, lanes).
-        perturbations: Changes of the commands beyond their limits, shape (variables, lanes), for
-            gradients that a limit does not hide.
-        residuals: Residuals, shape (N_RESIDUALS steps + N_TERMINAL, lanes), filled; their squares
-            sum to J without its cap.
+        perturbations: Changes of the commands beyond their limits, shape (variables, lanes).
+        residuals: Residuals, shape (N_RESIDUALS steps + N_TERMINAL, lanes), filled.
         limits: 1 or -1 where a block starts at a limit, shape (variables, lanes), filled.
         first: First commands, shape (2, lanes), filled.
     """

@@ -236,8 +236,7 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
         card: Card of its training.
 
     Raises:
-        ValueError: The ending is another, or the card's observation has another width than the
-            network's input.
+        ValueError: The ending is another, or the network takes another width than the card's.
     """
     target = Path(path)
     if target.suffix != SUFFIX:
@@ -262,8 +261,7 @@ def load_policy(path: str | Path) -> Policy:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is no policy, is cut short, is larger than `MAX_BYTES` or has another
-            format, or its card and tensors do not fit together.
+        ValueError: The file is no policy of a known format, or card and tensors do not fit.
     """
     file = _find_file(path)
     tensors, metadata = read_tensors(file, "policy")
@@ -322,8 +320,7 @@ class PolicyController(Controller):
         policy: Shipped name, file's path, or `Policy`.
 
     Raises:
-        ValueError: The env lacks an entry that the policy reads or has another unit of it, has
-            another control period, or its action is narrower; or as `load_policy`.
+        ValueError: The env's entries, units, control period or action are not the policy's.
     """
 
     def __init__(self, env: AnyEnv, policy: str | Path | Policy = _DEFAULT) -> None:

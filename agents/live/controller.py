@@ -58,10 +58,7 @@ class OnboardController:
         agent: Agent of `make_agent` for the env; None: without control.
         seed: Seed of the env, whose reset draws the sensors' phases.
 
-    Attributes:
-        names: Names of the states.
-        action: Newest action, shape (width,), None before the first.
-        has_new_action: Whether the action is of this tick.
+
 
     Raises:
         TypeError: The env is another one.
@@ -70,8 +67,9 @@ class OnboardController:
     def __init__(self, env: gym.Env[Any, Any], agent: Any = None, seed: int | None = 0) -> None:
         if not isinstance(env, EstimateObservation):
             raise TypeError(f"it reads an EstimateObservation, got {type(env).__name__}")
+        base: Any = env.unwrapped
         env.reset(seed=seed)
-        self.base: Any = env.unwrapped
+        self.base = base
         self.facts, self.agent, self.outputs = get_env_facts(env), agent, env.outputs
         self.estimator: Any = env.estimator
         self.sensors, self.names = self.base.slow_sensors, env.estimator.names
@@ -115,8 +113,8 @@ class OnboardController:
             self._z[sensor.captured] = NEVER
         self._count, self._packets = 0, [NO_PACKETS]
         self._memory, self._start = None, np.ones(1, np.bool_)
-        self.action: npt.NDArray[np.float32] | None = None
-        self.has_new_action = False
+        self.action: npt.NDArray[np.float32] | None = None  # the newest
+        self.has_new_action = False  # of this tick
 
     def take(self, tick: Tick) -> None:
         """Process a tick: the estimate and, at the end of a control period, the agent's action.

@@ -194,8 +194,7 @@ class StreamSynchroniser:
     """Makes ticks from datagrams.
 
     Args:
-        patience: Calls of `take` without a fast row after which the last one is held; None: no
-            limit.
+        patience: Calls of `take` without a fast row before the last one is held; None: no limit.
     """
 
     def __init__(self, patience: int | None = PATIENCE) -> None:

@@ -180,9 +180,8 @@ class SimulatedCarProcess:
     def __init__(self, *arguments: Any) -> None:
         context = get_context("spawn")
         self._pipe, child_pipe = context.Pipe()
-        self._process = context.Process(
-            target=_run_simulated_car, args=(child_pipe, *arguments), daemon=True
-        )
+        arguments = (child_pipe, *arguments)
+        self._process = context.Process(target=_run_simulated_car, args=arguments, daemon=True)
         self._process.start()
         child_pipe.close()
         self._receive()

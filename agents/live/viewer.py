@@ -154,10 +154,8 @@ def _is_same_origin(host: str, origin: str | None) -> bool:
 
 
 async def _run_viewer(title: str, page: tuple[str, int] | None, screen: bool, pipe: Any) -> None:
-    loop, runner, address = asyncio.get_running_loop(), None, ""
-    transport, protocol = await loop.create_datagram_endpoint(
-        ViewerProtocol, local_addr=(LOOPBACK, 0)
-    )
+    loop, runner, address, local = asyncio.get_running_loop(), None, "", (LOOPBACK, 0)
+    transport, protocol = await loop.create_datagram_endpoint(ViewerProtocol, local_addr=local)
     if page is not None:
         from aiohttp import web
 
@@ -209,9 +207,7 @@ class Viewer:
         page: Host and port of the page, port 0 for any; None: no page.
         screen: Whether the terminal has a table.
 
-    Attributes:
-        address: Address that receives the loop's datagrams.
-        url: Address of the page.
+
 
     Raises:
         OSError: The port is in use.
@@ -233,7 +229,7 @@ class Viewer:
             raise OSError(f"the page of port {page[1] if page else 0}: {reply.strerror}")
         if isinstance(reply, str):
             raise ModuleNotFoundError(reply)
-        self.address, self.url = reply
+        self.address, self.url = reply  # of the loop's datagrams, of the page
 
     def __enter__(self) -> "Viewer":
         return self

@@ -42,7 +42,7 @@ from .warm_start import (
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip  # after ours, which
 from stable_baselines3.common.callbacks import BaseCallback  # isort: skip  # name a missing extra
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # isort: skip
-from stable_baselines3.common.vec_env import VecEnv  # isort: skip
+
 
 CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
 POLICY, BEST, WARM_START_FILE = "policy.safetensors", "best_model.zip", "begun_with.safetensors"
@@ -210,7 +210,12 @@ class EvalCallback(BaseCallback):
         steps = 0 if checkpoint is None else int(checkpoint["steps"])
         seed = (task.seed + steps) % 2**32
         first = _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING + steps
-        scaled_env = RewardScaleWrapper(env, self._make_reward_scale(env, first, steps))
+        if self.warm_start is not None:
+            n_steps = -(-(self.run_record.steps - steps) // env.num_envs)
+            scales = measure_reward_scale(self.warm_start.driver, env, first, n_steps)
+        else:
+            scales = (np.resize(self.weights, env.num_envs) / self.period)[:, None].tolist()
+        scaled_env = RewardScaleWrapper(env, RewardScale(scales))
         log, device = run_options.tensorboard_log, run_options.device
         further = dict[str, Any](device=device, tensorboard_log=log)
         if get_algorithm(task.algo).on_tensors:
@@ -229,14 +234,6 @@ class EvalCallback(BaseCallback):
         env.seed(first)
         self.init_callback(model)
         return model
-
-    def _make_reward_scale(self, env: VecEnv, first: int, steps: int) -> RewardScale:
-        """Make the scale of the rewards, from this seed and step on."""
-        if self.warm_start is not None:
-            n_steps = -(-(self.run_record.steps - steps) // env.num_envs)
-            return RewardScale(measure_reward_scale(self.warm_start.driver, env, first, n_steps))
-        rate = np.resize(self.weights, env.num_envs) / self.period
-        return RewardScale(rate[:, None].tolist())
 
     def _average_scenarios(self, costs: Array) -> Array:
         """Average the costs of an evaluation by scenario, shape (k,)."""

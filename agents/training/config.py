@@ -92,8 +92,7 @@ def read_settings(algo: str, env_id: str, file: str | Path | None = None) -> Set
         Values by name.
 
     Raises:
-        ValueError: The file is no such YAML, has neither entry, or settings that the algorithm
-            lacks.
+        ValueError: The file is no such YAML, or has neither entry.
     """
     with require_extra("train", "settings need {}"):
         import yaml
@@ -259,8 +258,7 @@ class TrainingTask:
     """The task of a training, which stays the same when the training resumes.
 
     Raises:
-        ValueError: An algorithm, setting or scenario is unknown, the seed is negative, there is no
-            environment or fewer than scenarios, or an estimator is set with cars on tensors.
+        ValueError: A name is unknown, a number out of range, or fields contradict each other.
     """
 
     env_id: str = "sideslip/YawVision-v0"  # of a native vector env
@@ -358,7 +356,7 @@ class TrainingTask:
             eval_freq: Steps between two evaluations.
         """
         first = {"scenario": self.scenarios[0]} if self.scenarios else {}
-        arguments = {"algo": get_algorithm(self.algo).zoo, "env": self.env_id}
+        arguments = dict[str, Any](algo=get_algorithm(self.algo).zoo, env=self.env_id)
         arguments |= {"env_kwargs": self.env_options | first, "eval_freq": eval_freq}
         arguments |= {"n_eval_envs": self.n_eval_envs, "n_timesteps": steps, "seed": self.seed}
         settings = self.settings | {"n_envs": self.num_envs}

@@ -137,8 +137,6 @@ def distill(
 ) -> _DistillResult:
     """Train a policy on all tasks and write it to a file after every round.
 
-    Equal arguments give equal bits.
-
     Args:
         card: Card of the student's cars, to which the training's numbers are added.
         tasks: Cars and teachers.
@@ -147,11 +145,10 @@ def distill(
         report: Function that is called after each round.
 
     Returns:
-        Policy of the last round, and the results of all rounds.
+        Policy of the last round, and all rounds' results: equal bits for equal arguments.
 
     Raises:
-        ValueError: There is no task, or `config.told` is set where the student sees all of the
-            teacher's inputs.
+        ValueError: There is no task, or `config.told` where the student sees all that matters.
     """
     if not tasks:
         raise ValueError("no lessons: there is nothing to learn from")

@@ -31,13 +31,10 @@ _PRIOR = 1e-4  # samples that a VecNormalize starts with, of mean 0 and variance
 
 
 def convert_sb3_policy(model: Any, normaliser: Any = None, history: int = 1) -> Network:
-    """Convert the deterministic actor of a model to a network.
-
-    Entries that never varied in training are not read: their scale is 0.
+    """Convert the deterministic actor of a model to a network; scale 0: an entry never varied.
 
     Args:
-        model: Model of stable-baselines3 or sb3-contrib, or its policy, of a class in `_ACTORS`,
-            with actions within [-1, 1] and at most `Standardised` before its layers.
+        model: Model or policy of a class in `_ACTORS`, with at most `Standardised` as extractor.
         normaliser: VecNormalize of the training, or None.
         history: Frames that a VecFrameStack stacked, inside or outside of the normaliser.
 
@@ -45,7 +42,7 @@ def convert_sb3_policy(model: Any, normaliser: Any = None, history: int = 1) -> 
         Network of the actor.
 
     Raises:
-        ValueError: The model is none of these, or has an observation of another width.
+        ValueError: The model is none of these, or has actions beyond [-1, 1].
     """
     with require_extra("train", "networks come from stable-baselines3"):
         from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -224,8 +221,7 @@ def policy_from_zip(
         path: Path of the zip.
         env: Env, single or vector, whose observation names the zip's numbered entries.
         trust: Whether code in the zip may run.
-        normalise: Pickle of the training's VecNormalize; None: NAME.pkl or vecnormalize.pkl beside
-            the zip, if there is one.
+        normalise: Pickle of VecNormalize; None: NAME.pkl or vecnormalize.pkl beside the zip.
         about: Fields of the policy's `Card`.
 
     Returns:
@@ -234,8 +230,7 @@ def policy_from_zip(
     Raises:
         FileNotFoundError: There is no such file.
         PermissionError: `trust` is False.
-        ValueError: The file is no such zip, or its policy has another observation or unknown
-            layers.
+        ValueError: The file is no such zip, or its policy has another observation.
         ModuleNotFoundError: stable-baselines3 is not installed.
     """
     file = Path(path)

@@ -148,11 +148,11 @@ class GruPolicy(BasePolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         layers = [layer.out_features for layer in self.layers if isinstance(layer, nn.Linear)]
-        sizes = {"cells": self.cell.hidden_size, "net_arch": layers[:-1]}
-        shared: dict[str, Any] = super()._get_constructor_parameters()
-        kind: dict[str, Any] = {"features_extractor_class": self.features_extractor_class}
-        kind |= {"features_extractor_kwargs": self.features_extractor_kwargs}
-        return shared | sizes | kind | {"lr_schedule": self._dummy_schedule}
+        parameters: dict[str, Any] = super()._get_constructor_parameters()
+        parameters |= {"cells": self.cell.hidden_size, "net_arch": layers[:-1]}
+        for name in ("features_extractor_class", "features_extractor_kwargs"):
+            parameters[name] = getattr(self, name)
+        return parameters | {"lr_schedule": self._dummy_schedule}
 
 
 class AnalyticPolicyGradient(BaseAlgorithm):
@@ -164,8 +164,7 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         learning_rate: Learning rate of Adam.
         n_steps: Control periods of a window.
         compile: Whether to compile the step, as for `DeviceVectorEnv`.
-        source: Function that makes the cars, called with `device` and `compile`; not needed to load
-            a zip.
+        source: Function of `device` and `compile` that makes the cars; None to load a zip.
         stats_window_size: As in stable-baselines3.
         tensorboard_log: As in stable-baselines3.
         policy_kwargs: Arguments of the policy.
@@ -198,19 +197,11 @@ class AnalyticPolicyGradient(BaseAlgorithm):
     ) -> None:
         if n_steps < 1:
             raise ValueError(f"n_steps is at least 1, got {n_steps}")
-        super().__init__(
-            policy,
-            env,
-            learning_rate,
-            policy_kwargs=policy_kwargs,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            device=device,
-            support_multi_env=True,
-            seed=seed,
-            supported_action_spaces=None,
+        further = dict[str, Any](
+            policy_kwargs=policy_kwargs, device=device, seed=seed, verbose=verbose
         )
+        further |= {"stats_window_size": stats_window_size, "tensorboard_log": tensorboard_log}
+        super().__init__(policy, env, learning_rate, support_multi_env=True, **further)
         self.n_steps, self.compile, self.source = n_steps, compile, source
         if _init_setup_model:
             self._setup_model()

@@ -98,8 +98,7 @@ class TraceLayer(nn.Module):
 
         Args:
             z: Inputs, shape (B, T, k).
-            state: Averages and number of steps so far, shape (B, times, units + 1); None at the
-                start.
+            state: Averages and number of steps, shape (B, times, units + 1); None at the start.
 
         Returns:
             Units and averages (B, T, size), and the next state.
@@ -219,8 +218,6 @@ def _replace_first_layer(network: Network, weights: Array, biases: Array) -> Net
 
 class MemoryObservation(VectorWrapper[Any, Any, Any, Any, Any]):
     """A vector env whose observations (N, k) are the inputs of a network's dense layers.
-
-    A row's memory starts anew with its episode.
 
     Args:
         env: Vector env that resets a row in the step that ends it, with the network's observation.

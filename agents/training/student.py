@@ -95,8 +95,7 @@ def compute_scaling(
         drives: Demonstrations.
         layout: Entries of the observation.
         needs: Entries that the teacher reads.
-        usual_ages: Whether an age is scaled by its variation while packets come, and clipped before
-            the first and long after the last one; else by its deviation.
+        usual_ages: Whether an age is scaled by its variation while packets come, not by all of it.
 
     Returns:
         Mean and factor, shape (k,), and mixing, shape (k, k).
@@ -181,8 +180,7 @@ class Student(nn.Module):
         inputs: Number of inputs.
         width: Entries of an action.
         config: Configuration of the student.
-        n_privileged: Outputs of the auxiliary head, which serve in training alone; it is linear in
-            the cells or, with moving averages, in the last hidden layer.
+        n_privileged: Outputs of the auxiliary head, which serve in training alone.
     """
 
     def __init__(

@@ -76,9 +76,7 @@ def train(
         resume: Whether to resume from the folder's checkpoint.
         run_options: Options of this run.
         trained_agent: Zip of stable-baselines3 with the first weights; or, for `ppo` and
-            `gradient`, a `Policy` or its name (`make_finetune_task` makes its task). A policy's
-            costs weigh the drives, and the best evaluation has the least geometric mean over these
-            costs.
+            `gradient`, a `Policy` or its name, whose costs weigh the drives.
         trust: Whether a pickle of VecNormalize beside the zip may be read.
 
     Returns:
@@ -96,11 +94,10 @@ def train(
             raise ValueError("a training that goes on from its checkpoint begins with nothing else")
         if task.reads:
             raise ValueError("a network reads what it was trained on: give reads or a network")
-        if not isinstance(trained_agent, Policy):
-            if is_policy(str(trained_agent)):
-                trained_agent = load_policy(trained_agent)
-            else:
-                check_zip(Path(trained_agent))
+        if not isinstance(trained_agent, Policy) and is_policy(str(trained_agent)):
+            trained_agent = load_policy(trained_agent)
+        elif not isinstance(trained_agent, Policy):
+            check_zip(Path(trained_agent))
     if chosen_options.tensorboard_log is not None and find_spec("tensorboard") is None:
         raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
     tracker = None

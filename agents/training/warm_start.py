@@ -274,9 +274,6 @@ class PolicyWarmStart:
         env: Vector env of the task, without moving averages.
         seed: Seed of the drives.
 
-    Attributes:
-        start: Warm start of the model.
-        driver: Agent that drives as the policy does.
     """
 
     def __init__(
@@ -284,7 +281,7 @@ class PolicyWarmStart:
     ) -> None:
         layout, self._network = get_layout(env), policy.network
         self.start = _make_warm_start(policy, task, layout)
-        self.driver = NetworkAgent(policy.network)
+        self.driver = NetworkAgent(policy.network)  # drives as the policy does
         self._mixing = None
         if policy.network.cells and not get_algorithm(task.algo).on_tensors:
             dense_agent = NetworkAgent(policy.network.dense)
@@ -356,16 +353,12 @@ class RewardScale:
     """The factors of the cars' rewards, which change from drive to drive.
 
     Args:
-        drive_scales: Factors of each car's drives in order; the last one serves for all further
-            ones.
-
-    Attributes:
-        now: Present factors, float32, shape (N,).
+        drive_scales: Factors of each car's drives in order; the last one serves for all later ones.
     """
 
     def __init__(self, drive_scales: Sequence[Sequence[float]]) -> None:
         self._drive_scales, self._drive = drive_scales, np.zeros(len(drive_scales), np.intp)
-        self.now = np.zeros(len(drive_scales), np.float32)
+        self.now = np.zeros(len(drive_scales), np.float32)  # present factors
         self.begin()
 
     def begin(self) -> None:
@@ -420,9 +413,7 @@ def measure_reward_scale(agent: Any, env: VecEnv, seed: int, steps: int) -> list
 
 
 class RewardScaleWrapper(VecEnvWrapper):
-    """Rewards times `RewardScale`: of the order of one for every control period.
-
-    It stands outside of the monitor, which counts costs.
+    """Rewards times `RewardScale`, outside of the monitor, which counts costs.
 
     Args:
         venv: Env of stable-baselines3.
