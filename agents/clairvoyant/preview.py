@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from ...envs.engine.layout import ActuatorState, P, TaskParams, Z
 from ...envs.engine.step import make_step_variant, step_vehicle
@@ -215,6 +214,9 @@ def _compute_preview(
         np.where(is_changed, factor * stiffness, stiffness)
         for factor, stiffness in ((change.front, car.C_f), (change.rear, car.C_r))
     ]
+    # s of each cost rate: the trapezoid rule over every q-th tick, without the end; exact for q = 1
+    weights = np.where(nodes < fixed.task.duration, q * TICK, 0.0)
+    weights[0] = 0.5 * (q - 1) * TICK
     table = (
         compute_wheel_angle(nodes, lag.start),
         compute_wheel_angle(middle, lag.middle if q % 2 else lag.start),
@@ -225,7 +227,7 @@ def _compute_preview(
         *(np.full(len(nodes), value) for value in (car.mu, car.mu_r)),
         *set_points.T,
         _compute_road_turns(p, fixed.kind, command[:last]).reshape(-1, q).mean(axis=1),
-        _compute_weights(nodes, fixed),
+        weights,
         *refs[nodes].T,
     )
     known = np.array(PreviewStep._make(table))
@@ -257,11 +259,3 @@ def _compute_set_point(tick: float, speed_profile: SpeedProfile) -> tuple[float,
     profile = profile._replace(k_p=1.0)
     total = compute_acceleration_command(tick, 0.0, 0.0, profile, np.inf)[0]
     return total - feedforward, feedforward
-
-
-def _compute_weights(nodes: npt.NDArray[np.int_], fixed: PlanParams) -> Array:
-    """Compute the weight of each step's cost rate in the sum over ticks 1 .. T (s)."""
-    q = fixed.ticks  # the trapezoid rule over every q-th tick, without the end; exact for q = 1
-    weights = np.where(nodes < fixed.task.duration, q * TICK, 0.0)
-    weights[0] = 0.5 * (q - 1) * TICK
-    return np.asarray(weights)

@@ -182,13 +182,11 @@ def compute_cost_weights(design_spec: DesignSpec) -> Sequence[float]:
 def compute_regulator(model: DesignModel) -> tuple[Array, Array]:
     """Compute the regulator u = -K x of least cost, and the cost of another input.
 
-    Another input for one period costs (u + K x)'S(u + K x) more.
-
     Args:
         model: Design model.
 
     Returns:
-        K (m, n) and S (m, m).
+        K (m, n) and S (m, m): another input costs (u + K x)'S(u + K x) more in one period.
     """
     K, V = compute_cost_to_go(model)
     return K, _compute_input_cost(model, V)
@@ -202,13 +200,11 @@ def _compute_input_cost(model: DesignModel, V: Array) -> Array:
 def compute_cost_to_go(model: DesignModel) -> tuple[Array, Array]:
     """Compute the regulator u = -K x of least cost, and its cost to go x'Vx.
 
-    The cost to go lacks a part that no input changes.
-
     Args:
         model: Design model.
 
     Returns:
-        K (m, n) and V (n, n).
+        K (m, n) and V (n, n), but for a part that no input changes.
     """
     return solve_lqr(model.G, model.H, model.Q, model.R, model.N, len(DYNAMIC))
 

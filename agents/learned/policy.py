@@ -46,9 +46,6 @@ JsonMap = dict[str, Any]
 class Card:
     """The card of a policy: what it was trained on, how, and its evaluation; JSON types only.
 
-    The evaluation holds seeds and mean costs on them, of the policy, of no control and of the best
-    classical line.
-
     Raises:
         ValueError: A value has another type, or one that JSON does not have.
     """
@@ -67,7 +64,7 @@ class Card:
     steps: int = 0  # of the environment
     cpu_seconds: float = 0.0  # of the training
     sideslip: str = __version__  # version of the package
-    evaluation: JsonMap = field(default_factory=dict)  # seeds, and mean costs on them
+    evaluation: JsonMap = field(default_factory=dict)  # seeds; costs of policy, none, classical
 
     def __post_init__(self) -> None:
         pairs = self.observation

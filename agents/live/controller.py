@@ -58,8 +58,6 @@ class OnboardController:
         agent: Agent of `make_agent` for the env; None: without control.
         seed: Seed of the env, whose reset draws the sensors' phases.
 
-
-
     Raises:
         TypeError: The env is another one.
     """
@@ -82,7 +80,10 @@ class OnboardController:
         self._X: Array = np.zeros((1, len(self.names)))
         self._S = np.zeros_like(self._X)
         self.begin(0)
-        self._warm_up()
+        row, packet = base.record.fast[0], np.zeros((1, NO_PACKETS.shape[1]))
+        for number in range(self.facts.control_period + 1):  # compiles the code of first ticks
+            self.take(Tick(number, row, 0.0, packet, number == 0))
+        self.begin(0)
 
     @property
     def x(self) -> Array:
@@ -175,13 +176,6 @@ class OnboardController:
         else:
             write_outputs(estimator, obs, *last)
         return out
-
-    def _warm_up(self) -> None:
-        """Compile the code of the first ticks."""
-        row, packet = self.base.record.fast[0], np.zeros((1, NO_PACKETS.shape[1]))
-        for number in range(self.facts.control_period + 1):
-            self.take(Tick(number, row, 0.0, packet, number == 0))
-        self.begin(0)
 
 
 class Recorder:

@@ -6,7 +6,8 @@ import math
 import select
 import socket
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -66,7 +67,7 @@ def wait_until(deadline: int) -> None:
         pass
 
 
-class Port:
+class Port(AbstractContextManager["Port"]):
     """A UDP port that listens on one of this machine's addresses, and numbers its datagrams.
 
     Args:
@@ -89,7 +90,7 @@ class Port:
             reason = "is in use" if in_use else f"is none: {error.strerror}"
             raise OSError(f"UDP port {port} of {host} {reason}") from None
         self.address: tuple[str, int] = self._socket.getsockname()  # bound host and port
-        self.unsent = 0  # datagrams that the network did not take
+
         self._sent: dict[int, int] = {}
 
     def send(
@@ -105,10 +106,8 @@ class Port:
             names: Names of states, for estimates.
         """
         number = self._sent[kind] = self._sent.get(kind, -1) + 1
-        try:
+        with suppress(OSError):  # the network takes no datagram now
             self._socket.sendto(encode(kind, number, stamp, values, names), to)
-        except OSError:
-            self.unsent += 1
 
     def _receive_available(self, batch: list[Arrival]) -> list[Arrival]:
         """Append the datagrams that have arrived to a batch, up to `MAX_BATCH`."""
@@ -157,9 +156,6 @@ class Port:
     def close(self) -> None:
         """Close the port."""
         self._socket.close()
-
-    def __enter__(self) -> "Port":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -236,10 +232,6 @@ class _Statistics:
     def per_million(self) -> float:
         """Misses per million deadlines."""
         return 1e6 * self.misses / max(self.deadlines, 1)
-
-
-def _format_counts(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in counts.items() if count)
 
 
 @dataclass
@@ -381,9 +373,9 @@ class Loop:
         Returns:
             Two lines, three where there were deadlines.
         """
-        m, counts = self.statistics, self.assembler.counts
+        m, tables = self.statistics, (self.assembler.counts, self.onboard.refused)
         ended = f"{name}: {m.ticks} ticks in {m.seconds:.1f} s, {self.ended}"
-        ignored, refused = map(_format_counts, (counts, self.onboard.refused))
+        ignored, refused = (", ".join(f"{n} {key}" for key, n in x.items() if n) for x in tables)
         by = f"; packets that the estimator refused: {refused}" if refused else ""
         lines = [f"{ended}.", f"Ignored or bridged: {ignored or 'nothing'}{by}."]
         if m.deadlines:

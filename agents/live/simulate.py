@@ -5,6 +5,7 @@ import math
 import signal
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from typing import Any
@@ -34,18 +35,14 @@ _KINDS = {place: kind for kind, place in SENSORS.items()}
 
 @dataclass
 class WireAgent:
-    """An agent on the wires: it sends the env's record and returns the controls that arrive.
-
-    Without `step` a tick lasts a millisecond over `speed`, and the last action holds where a
-    control is late.
-    """
+    """An agent on the wires: it sends the env's record and returns the controls that arrive."""
 
     env: gym.Env[Any, Any]  # bare `StabilityEnv`
     port: Port  # sends
     to: Any  # address of the receiver
     step: bool = False  # wait for the control of every period
     speed: float = 1.0  # of the clock, 1 for real time
-    late: int = 0  # number of late controls
+    late: int = 0  # late controls: the last action holds
     periods: int = 0  # number of control periods
     _start_time: int = 0  # ns, when tick 0 is due
     _newest: int = -1  # stamp of the newest control
@@ -170,7 +167,7 @@ def simulate(
     return drive, agent
 
 
-class SimulatedCarProcess:
+class SimulatedCarProcess(AbstractContextManager["SimulatedCarProcess"]):
     """The simulated car in a process of its own, ready before it starts.
 
     Args:
@@ -202,9 +199,6 @@ class SimulatedCarProcess:
         if isinstance(message, Exception):
             raise message
         return message
-
-    def __enter__(self) -> "SimulatedCarProcess":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._process.kill()

@@ -9,7 +9,7 @@ import os
 import secrets
 import signal
 from collections import deque
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 from html import escape
 from ipaddress import ip_address
@@ -199,15 +199,13 @@ def _run_process(title: str, page: tuple[str, int] | None, screen: bool, pipe: A
         pipe.send("the page needs aiohttp: pip install 'sideslip[wires]'" if missing else error)
 
 
-class Viewer:
+class Viewer(AbstractContextManager["Viewer"]):
     """The process that shows a loop's estimates.
 
     Args:
         title: Title above the estimates.
         page: Host and port of the page, port 0 for any; None: no page.
         screen: Whether the terminal has a table.
-
-
 
     Raises:
         OSError: The port is in use.
@@ -230,9 +228,6 @@ class Viewer:
         if isinstance(reply, str):
             raise ModuleNotFoundError(reply)
         self.address, self.url = reply  # of the loop's datagrams, of the page
-
-    def __enter__(self) -> "Viewer":
-        return self
 
     def __exit__(self, *_: object) -> None:
         with Port() as port:

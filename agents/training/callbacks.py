@@ -43,7 +43,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip  # 
 from stable_baselines3.common.callbacks import BaseCallback  # isort: skip  # name a missing extra
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # isort: skip
 
-
 CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
 POLICY, BEST, WARM_START_FILE = "policy.safetensors", "best_model.zip", "begun_with.safetensors"
 _SCALING_ENVS = 64  # environments whose observations make the scaling
@@ -66,15 +65,11 @@ def make_evaluation_seeds(episodes: int) -> list[int]:
 
 
 class Evaluation(NamedTuple):
-    """An evaluation of the deterministic policy.
-
-    For a mixture `of_none` is the mean over scenarios, and `cost` is that times their mean
-    uncontrolled cost.
-    """
+    """An evaluation of the deterministic policy; of a mixture `of_none` is a mean of scenarios."""
 
     steps: int  # of the training so far
     cpu_seconds: float  # of the training so far, without evaluations
-    cost: float  # mean cost J
+    cost: float  # mean cost J; of a mixture `of_none` times the scenarios' mean uncontrolled cost
     of_none: float  # as a fraction of the uncontrolled car's on these seeds
     of_start: float | None = None  # geometric mean of costs over the initial policy's, if any
 
@@ -222,8 +217,8 @@ class EvalCallback(BaseCallback):
             from .gradient import make_source
 
             further["source"] = partial(make_source, task, first, scaled_env.reward_scale)
-        made_of = scaled_env, self.period, self.scaling, seed
-        model = make_model(task.algo, task.settings, *made_of, **further)
+        setup = scaled_env, self.period, self.scaling, seed
+        model = make_model(task.algo, task.settings, *setup, **further)
         if checkpoint is not None:
             load_parameters(self.folder / CHECKPOINT, model)
             if isinstance(model, OffPolicyAlgorithm):

@@ -1,7 +1,7 @@
 """The algorithms of `sideslip train`, their settings, and the task of a training.
 
 The settings stand in `hyperparams/`, in rl-baselines3-zoo's format, and were chosen on YawVision-v0
-with seed 0. They discount as much in a second whatever the control period is.
+with seed 0.
 """
 
 import inspect

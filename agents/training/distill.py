@@ -24,7 +24,6 @@ from .student import (
     Demonstrations,
     DistillConfig,
     Scaling,
-    Single,
     Student,
     compute_scaling,
     fit_model,
@@ -102,23 +101,19 @@ def collect_demonstrations(
         start = np.logical_or(terminated, truncated)
         running = running & ~start
     x, y, privileged, w = (np.stack(columns, axis=1) for columns in zip(*steps, strict=True))
+    curvature = np.eye(teacher.width, dtype=np.float32)
+    if isinstance(teacher, Lqr):  # the Riccati matrix of its design at the mean speed
+        names = [entry.name for entry in cars.layout]
+        speed = float(x[..., names.index("wheel_left")].mean())
+        curvature = teacher.curvature(speed).astype(np.float32)
     weights = (w / (np.minimum(costs, max_cost)[:, None] + COST_FLOOR)).astype(np.float32)
-    return Demonstrations(x, y, privileged, weights, _compute_curvature(cars, teacher, x), costs)
+    return Demonstrations(x, y, privileged, weights, curvature, costs)
 
 
 def _list_privileged_columns(task: DistillTask) -> list[int]:
     """List the columns of the teacher's inputs that the student's observation lacks."""
     names, known = ([e.name for e in env.layout] for env in (task.teachers, task.cars))
     return [names.index(name) for name in task.teacher.needs if name not in known]
-
-
-def _compute_curvature(cars: Any, teacher: Any, obs: Single) -> Single:
-    """Compute the Riccati matrix of the teacher's design at the mean speed, else the identity."""
-    if not isinstance(teacher, Lqr):
-        return np.eye(teacher.width, dtype=np.float32)
-    names = [entry.name for entry in cars.layout]
-    speed = float(obs[..., names.index("wheel_left")].mean())
-    return teacher.curvature(speed).astype(np.float32)
 
 
 class _DistillResult(NamedTuple):

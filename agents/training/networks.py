@@ -35,7 +35,7 @@ _SILENT = ("accel_", "wheel_", "roll_rate", "gps_X", "gps_Y", "gps_speed", "gps_
 _OFFSET, RATE, _AGE = "camera_y_l", "camera_y_l_rate", "camera_age"
 MAX_AGE = 1.0  # s, from which on an age is no older
 
-_PolicyFunction = Callable[[Any], Any]
+
 _Single = npt.NDArray[np.float32]
 
 
@@ -284,7 +284,7 @@ class MemoryObservation(VectorWrapper[Any, Any, Any, Any, Any]):
 
 
 def measure_mixing(
-    env: VectorEnv[Any, Any, Any], network: Network, drive: _PolicyFunction, seed: int
+    env: VectorEnv[Any, Any, Any], network: Network, drive: Callable[[Any], Any], seed: int
 ) -> Mixing:
     """Measure the whitening in a network's own drives, one episode of each row.
 

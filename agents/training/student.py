@@ -58,14 +58,11 @@ class Demonstrations(NamedTuple):
 
 
 class Scaling(NamedTuple):
-    """The scaling of a student's inputs: clip((x - mean) scale) mixing.
-
-    Mixing scales up what varies little while its parts vary much, such as course less heading.
-    """
+    """The scaling of a student's inputs: clip((x - mean) scale) mixing."""
 
     mean: Array  # shape (k,)
     scale: Array  # factors, shape (k,), zero for an entry that is not read
-    mixing: Array  # symmetric whitening, shape (k, k)
+    mixing: Array  # symmetric whitening, shape (k, k): it scales up small differences
 
     def mix_inputs(self, obs: Single) -> Single:
         """Compute a `Student`'s inputs.
@@ -164,8 +161,7 @@ class DistillConfig:
     def describe(self) -> dict[str, Any]:
         """Collect all numbers but the seed, in JSON types."""
         numbers = asdict(self) | {"hidden": list(self.hidden)}
-        del numbers["seed"]
-        return numbers
+        return {name: value for name, value in numbers.items() if name != "seed"}
 
     @property
     def window(self) -> int:

@@ -51,9 +51,9 @@ class WarmStart(NamedTuple):
     """The tensors of a zip or policy for a new model."""
 
     name: str  # path of the zip or name of the policy
-    parameters: dict[str, Any]  # Weights and optimisers by their names in `get_parameters`
+    parameters: dict[str, Any]  # weights and optimisers by their names in `get_parameters`
     variables: dict[str, Any]  # further tensors of a zip
-    scaling: Scaling  # scaling of the observations
+    scaling: Scaling  # of the observations
     partial: bool = False  # whether the rest of the model stays unchanged
 
 
@@ -120,7 +120,7 @@ def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
     if fields.get("estimator", card.estimator) == card.estimator:
         task_fields["estimator"] = card.estimator
         task_fields["estimator_options"] = dict(card.estimator_options)
-    settings = fields.pop("settings", None) or read_settings(algo, _choose_entry(policy))
+    settings = fields.pop("settings", None) or resolve_settings(None, algo, card.env_id, policy)
     task_fields["settings"] = _add_policy_form(settings, policy, algo)
     return TrainingTask(**task_fields | fields)
 
@@ -139,13 +139,9 @@ def resolve_settings(file: str | Path | None, algo: str, env_id: str, start: Any
     """
     if not isinstance(start, Policy):
         return read_settings(algo, env_id, file)
-    return _add_policy_form(read_settings(algo, _choose_entry(start), file), start, algo)
-
-
-def _choose_entry(policy: Policy) -> str:
-    """Choose the settings' entry for training a policy further."""
-    has_averages = MovingAverages.kind in [cell.kind for cell in policy.network.cells]
-    return WARM_START_TRACES_ENTRY if has_averages else WARM_START_ENTRY
+    has_averages = MovingAverages.kind in [cell.kind for cell in start.network.cells]
+    entry = WARM_START_TRACES_ENTRY if has_averages else WARM_START_ENTRY
+    return _add_policy_form(read_settings(algo, entry, file), start, algo)
 
 
 def _add_policy_form(settings: Settings, policy: Policy, algo: str) -> Settings:
@@ -273,7 +269,6 @@ class PolicyWarmStart:
         task: Task of the training.
         env: Vector env of the task, without moving averages.
         seed: Seed of the drives.
-
     """
 
     def __init__(
