@@ -1,9 +1,8 @@
 """The clairvoyant oracle: the best actions for a known car, road and all future disturbances.
 
 Iterative LQR on the env itself: linearisation of the plant along a run, a backward pass within
-the limits, and runs of the env that try the new actions with the pass's gains. The result is a
-run and costs what the env computes, cap and failures included. It is a local optimum, sought from
-several starts.
+the limits, and runs of the env that try the new actions with the pass's gains. A result costs what
+the env computes, failures included. It is a local optimum, sought from several starts.
 """
 
 import time
@@ -17,7 +16,6 @@ import numpy.typing as npt
 
 from ...envs.engine.layout import P
 from ...envs.record import Array
-from ..controllers.base import Controller
 from ..rollout import iterate_steps
 from .preview import Forecast, PlanState, make_forecast, read_plan_state
 from .sweep import (
@@ -33,48 +31,35 @@ from .sweep import (
 Actions = npt.NDArray[np.float32]
 
 STEP_LENGTHS = (1.0, 0.4, 0.1)  # of a step, tried in turn
-FIRST_DAMPING = 1e-2  # of the first sweep
-DAMPING_LIMITS = (1e-8, 1e4)  # the least, and the one at which no step is left to try
-DAMPING_FACTOR = 4.0  # between dampings
+_FIRST_DAMPING = 1e-2  # of the first sweep
+_DAMPING_LIMITS = (1e-8, 1e4)  # the least, and the one at which no step is left to try
+_DAMPING_FACTOR = 4.0  # between dampings
 MAX_ITERATIONS = 60
-STALL_RULE = (1e-3, 3)  # so little gained, relative, in so many steps in a row: settled
+_STALL_RULE = (1e-3, 3)  # so little gained, relative, in so many steps in a row: settled
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Actions for an episode: the best run that a start led to.
+    """Actions for an episode: the best run that a start led to."""
 
-    Attributes:
-        actions: Actions, shape (K, width).
-        cost: Cost of the run in the env.
-        status: "settled", "stuck" (no step was cheaper) or "stopped" (after `MAX_ITERATIONS`).
-        seconds: CPU time (s).
-    """
-
-    actions: Actions
-    cost: float
-    status: str
-    seconds: float
+    actions: Actions  # actions, shape (K, width)
+    cost: float  # cost of the run in the env
+    status: str  # "settled", "stuck" (no step was cheaper) or "stopped" (after `MAX_ITERATIONS`)
+    seconds: float  # CPU time (s)
 
 
 @dataclass(frozen=True)
-class PlanRun:
-    """The env's run of actions.
+class _PlanRun:
+    """The env's run of actions."""
 
-    Attributes:
-        trajectory: States and applied actions.
-        cost: Cost J.
-        length: Periods until it ended.
-    """
-
-    trajectory: Trajectory
-    cost: float
-    length: int
+    trajectory: Trajectory  # states and applied actions
+    cost: float  # cost J
+    length: int  # periods until it ended
 
 
 def simulate_run(
     env: gym.Env[Any, Any], seed: int, actions: Array, feedback: tuple[Array, Array] | None = None
-) -> PlanRun:
+) -> _PlanRun:
     """Simulate one episode in the env.
 
     Args:
@@ -102,7 +87,7 @@ def simulate_run(
         length = k + 1
         if terminated or truncated:
             break
-    return PlanRun(Trajectory(states, applied.astype(np.float64)), cost, length)
+    return _PlanRun(Trajectory(states, applied.astype(np.float64)), cost, length)
 
 
 def evaluate_actions(env: gym.Env[Any, Any], seed: int, actions: npt.ArrayLike) -> float:
@@ -148,14 +133,10 @@ def solve_ilqr(env: gym.Env[Any, Any], seed: int, start: npt.ArrayLike | None = 
 
 def _search(
     env: gym.Env[Any, Any], seed: int, forecast: Forecast, actions: Array
-) -> tuple[PlanRun, str]:
+) -> tuple[_PlanRun, str]:
     """Search the best run that the steps from a start lead to, and return how they ended."""
-    problem, best, damping, n_stalled = (
-        make_problem(forecast.fixed),
-        simulate_run(env, seed, actions),
-        FIRST_DAMPING,
-        0,
-    )
+    problem, best = make_problem(forecast.fixed), simulate_run(env, seed, actions)
+    damping, n_stalled = _FIRST_DAMPING, 0
     for iteration in range(MAX_ITERATIONS):
         if forecast.fixed.kind.has_driver:  # the driver answers to the newest run
             env.reset(seed=seed)
@@ -164,8 +145,8 @@ def _search(
         best, damping = _run_line_search(env, seed, problem, forecast, best, damping)
         if best.cost >= previous_cost:
             return best, "settled" if iteration else "stuck"
-        n_stalled = n_stalled + 1 if best.cost > previous_cost * (1.0 - STALL_RULE[0]) else 0
-        if n_stalled == STALL_RULE[1]:
+        n_stalled = n_stalled + 1 if best.cost > previous_cost * (1.0 - _STALL_RULE[0]) else 0
+        if n_stalled == _STALL_RULE[1]:
             return best, "settled"
     return best, "stopped"
 
@@ -175,9 +156,9 @@ def _run_line_search(
     seed: int,
     problem: IlqrProblem,
     forecast: Forecast,
-    run: PlanRun,
+    run: _PlanRun,
     damping: float,
-) -> tuple[PlanRun, float]:
+) -> tuple[_PlanRun, float]:
     """Return the first cheaper run, else the run itself, and the damping for the next step."""
     fixed, size = problem.fixed, len(problem.names)
     nominal_run = _use_achieved_steering(problem, run.trajectory)
@@ -187,19 +168,18 @@ def _run_line_search(
     inputs[:, : fixed.width] = nominal_run.actions
     d, G = np.empty_like(inputs), np.empty((*inputs.shape, size))
     gains = np.zeros((fixed.periods, fixed.width, len(PlanState._fields)))
-    while damping < DAMPING_LIMITS[1]:
+    while damping < _DAMPING_LIMITS[1]:
         run_backward_pass(slopes, limits, inputs, run.length, damping, d, G)
         gains[:, :, problem.state_indices] = -G[:, : fixed.width] / problem.scale
         for length in STEP_LENGTHS:
             candidate = nominal_run.actions + length * d[:, : fixed.width]
             trial = simulate_run(env, seed, candidate, (nominal_run.states, gains))
             if trial.cost < run.cost:
-                factor = {
-                    STEP_LENGTHS[0]: 1.0 / DAMPING_FACTOR,
-                    STEP_LENGTHS[-1]: DAMPING_FACTOR,
-                }.get(length, 1.0)
-                return trial, max(damping * factor, DAMPING_LIMITS[0])
-        damping *= DAMPING_FACTOR
+                whole, short = STEP_LENGTHS[0], STEP_LENGTHS[-1]
+                factors = {whole: 1.0 / _DAMPING_FACTOR, short: _DAMPING_FACTOR}
+                factor = factors.get(length, 1.0)
+                return trial, max(damping * factor, _DAMPING_LIMITS[0])
+        damping *= _DAMPING_FACTOR
     return run, damping
 
 
@@ -214,23 +194,14 @@ def _use_achieved_steering(problem: IlqrProblem, run: Trajectory) -> Trajectory:
 
 @dataclass(frozen=True)
 class ClairvoyantResult:
-    """The best run of an episode.
+    """The best run of an episode."""
 
-    Attributes:
-        actions: Actions, shape (K, width).
-        cost: Cost of the run in the env.
-        winner: Label in `costs`.
-        costs: Costs of every start's own run ("two-dof") and of its plan ("from two-dof").
-        statuses: Statuses of the plans by start.
-        seconds: CPU time (s).
-    """
-
-    actions: Actions
-    cost: float
-    winner: str
-    costs: dict[str, float]
-    statuses: dict[str, str]
-    seconds: float
+    actions: Actions  # shape (K, width)
+    cost: float  # of the run in the env
+    winner: str  # label in `costs`
+    costs: dict[str, float]  # of each start's own run ("two-dof") and its plan ("from two-dof")
+    statuses: dict[str, str]  # of the plans by start
+    seconds: float  # CPU time
 
 
 def compute_clairvoyant(
@@ -250,26 +221,19 @@ def compute_clairvoyant(
     env.reset(seed=seed)
     shape = (_count_periods(base), *(base.action_space.shape or ()))
     candidates: dict[str, Actions] = {"none": np.zeros(shape, np.float32)}
-    candidates |= {
-        name: np.asarray(actions, np.float32) for name, actions in (starts or {}).items()
-    }
+    candidates |= {name: np.asarray(run, np.float32) for name, run in (starts or {}).items()}
     costs = {name: evaluate_actions(env, seed, actions) for name, actions in candidates.items()}
     plans = {name: solve_ilqr(env, seed, candidates[name]) for name in starts or candidates}
     for name, solved in plans.items():
         candidates[f"from {name}"], costs[f"from {name}"] = solved.actions, solved.cost
     winner = min(costs, key=lambda label: costs[label])
-    return ClairvoyantResult(
-        candidates[winner],
-        costs[winner],
-        winner,
-        costs,
-        {name: solved.status for name, solved in plans.items()},
-        time.process_time() - start_time,
-    )
+    statuses = {name: solved.status for name, solved in plans.items()}
+    actions, cost, seconds = candidates[winner], costs[winner], time.process_time() - start_time
+    return ClairvoyantResult(actions, cost, winner, costs, statuses, seconds)
 
 
 def record_actions(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
-    """Record an agent's actions in an episode, shape (K, width), zeros after a failure.
+    """Record an agent's actions in an episode.
 
     Args:
         env: Single env.
@@ -277,7 +241,7 @@ def record_actions(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
         seed: Seed of the episode.
 
     Returns:
-        Actions in fractions of full scale.
+        Actions in fractions of full scale, shape (K, width), zeros after a failure.
     """
     base: Any = env.unwrapped
     _, *steps = iterate_steps(env, agent, seed)
@@ -289,31 +253,3 @@ def record_actions(env: gym.Env[Any, Any], agent: Any, seed: int) -> Actions:
 def _count_periods(base: Any) -> int:
     """Count the control periods of the episode that was last reset."""
     return -int(-base.get_state()["params"][P.task.duration] // base.control_period)
-
-
-class PlanReplay(Controller):
-    """A plan as an agent: the actions of one episode for every observation, then zeros.
-
-    Args:
-        env: Env of the controller.
-        actions: Fractions of full scale, shape (K, width).
-
-    Raises:
-        ValueError: The actions are not finite or have another shape.
-    """
-
-    memory = 1
-
-    def __init__(self, env: gym.Env[Any, Any], actions: npt.ArrayLike) -> None:
-        super().__init__(env)
-        planned = np.asarray(actions, np.float64)
-        if planned.ndim != 2 or planned.shape[1] != self.width or not np.isfinite(planned).all():
-            raise ValueError(
-                f"a plan is finite numbers (K, {self.width}), got shape {planned.shape}"
-            )
-        self._actions = np.vstack([planned, np.zeros((1, self.width))])
-
-    def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        step = state[:, 0].astype(int)
-        action[:] = self._actions[np.minimum(step, len(self._actions) - 1)]
-        state[:, 0] += 1.0

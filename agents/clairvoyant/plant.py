@@ -14,26 +14,19 @@ from ...envs.vehicle.actuators import apply_lag, compute_yaw_moment
 from ...envs.vehicle.dynamics import DisturbanceForces, Motion, compute_sideslip_angle, rk4
 from .preview import PlanParams, PlanState, PreviewStep
 
-_rk4, _load_at, _torques = (
-    to_casadi(rk4),
-    to_casadi(compute_lagged_load),
-    to_casadi(compute_motor_torques),
-)
-_slip, _apply_lag, _yaw_moment = (
-    to_casadi(compute_sideslip_angle),
-    to_casadi(apply_lag),
-    to_casadi(compute_yaw_moment),
-)
+_rk4, _load_at = to_casadi(rk4), to_casadi(compute_lagged_load)
+_torques, _slip = to_casadi(compute_motor_torques), to_casadi(compute_sideslip_angle)
+_apply_lag, _yaw_moment = to_casadi(apply_lag), to_casadi(compute_yaw_moment)
 _reference = to_casadi(compute_reference)
 # a sum of squares: without its cap and, for the sake of its slope at zero, its sign's guard
 _uncapped_cost_rate = as_python(
     compute_cost_rate, SYMBOLS | {"minimum": lambda rate, cap: rate, "absolute": lambda rate: rate}
 )
 
-TORQUES = ("T_l", "T_r")
+_TORQUES = ("T_l", "T_r")
 
 
-class PlanStep(NamedTuple):
+class _PlanStep(NamedTuple):
     """The end of one step of the plan."""
 
     state: PlanState
@@ -51,7 +44,7 @@ def list_active_states(fixed: PlanParams) -> tuple[str, ...]:
         Names of the states.
     """
     road = fixed.road
-    active = {"v_x", "v_y", "gamma", *TORQUES}
+    active = {"v_x", "v_y", "gamma", *_TORQUES}
     if fixed.kind.roll:
         active |= {"phi", "phi_dot"}
     if fixed.speed_profile.hold and fixed.speed_profile.k_i:
@@ -96,7 +89,7 @@ def compute_node_cost(fixed: PlanParams, errors: tuple[Any, Any], known: Preview
     return known.weight * _uncapped_cost_rate(*errors, 0.0, 0.0, fixed.kind.reference)
 
 
-def advance(fixed: PlanParams, x: PlanState, action: Any, known: PreviewStep) -> PlanStep:
+def advance(fixed: PlanParams, x: PlanState, action: Any, known: PreviewStep) -> _PlanStep:
     """Advance a plan by one Runge-Kutta step of the env's own plant over `fixed.ticks` ticks.
 
     The driver's acceleration is that of the step's start; added steering acts by its mean.
@@ -113,10 +106,8 @@ def advance(fixed: PlanParams, x: PlanState, action: Any, known: PreviewStep) ->
     car = fixed.car._replace(C_f=known.C_f, C_r=known.C_r, mu=known.mu, mu_r=known.mu_r)
     task, kind, q = fixed.task, fixed.kind, fixed.ticks
     speed_profile = fixed.speed_profile._replace(speed=known.speed, acceleration=known.acceleration)
-    N_z = action[0] * task.yaw_scale
-    T_l, T_r, _, integral = _torques(
-        N_z, 0.0, x.v_x, x.integral, speed_profile, car, task.yaw_first
-    )
+    held = x.v_x, x.integral, speed_profile, car, task.yaw_first
+    T_l, T_r, _, integral = _torques(action[0] * task.yaw_scale, 0.0, *held)
     slewing = action[1] * task.authority if fixed.width > 1 else 0.0
     moved = slewing - x.slewing if fixed.width > 1 else 0.0
     # the angle moves at its full rate and then rests: its mean over the step
@@ -132,37 +123,25 @@ def advance(fixed: PlanParams, x: PlanState, action: Any, known: PreviewStep) ->
             (known.steer_end, steering.end, motor.end),
         )
     )
-    motion = _rk4(
+    start, forces = (
         Motion(*x[: len(Motion._fields)]),
-        loads,
         DisturbanceForces(known.F_d, known.N_d, known.N_x),
-        car,
-        road,
-        q * TICK,
-        kind.small_angle,
-        kind.law,
-        kind.roll,
     )
+    variant = kind.small_angle, kind.law, kind.roll
+    motion = _rk4(start, loads, forces, car, road, q * TICK, *variant)
     effort = 0.0
     for tick in range(q):
         left, right = fixed.motor_tick, fixed.steering_tick
         rest = left.mean * left.end**tick
         share = _yaw_moment(_apply_lag(T_l, x.T_l, rest), _apply_lag(T_r, x.T_r, rest), car)
         added = _apply_lag(extra, x.added, right.mean * right.end**tick)
-        effort += TICK * _uncapped_cost_rate(
-            0.0, 0.0, share / task.yaw_scale, added, kind.reference
-        )
-    next_state = PlanState._make(
-        (
-            *motion,
-            _apply_lag(T_l, x.T_l, motor.end),
-            _apply_lag(T_r, x.T_r, motor.end),
-            x.integral + q * (integral - x.integral),
-            slewing,
-            _apply_lag(extra, x.added, steering.end),
-        )
-    )
-    return PlanStep(next_state, effort, moved)
+        share = share / task.yaw_scale
+        effort += TICK * _uncapped_cost_rate(0.0, 0.0, share, added, kind.reference)
+    torques = _apply_lag(T_l, x.T_l, motor.end), _apply_lag(T_r, x.T_r, motor.end)
+    new_integral = x.integral + q * (integral - x.integral)
+    new_added = _apply_lag(extra, x.added, steering.end)
+    next_state = PlanState._make((*motion, *torques, new_integral, slewing, new_added))
+    return _PlanStep(next_state, effort, moved)
 
 
 def get_state_scales(fixed: PlanParams, names: tuple[str, ...]) -> list[float]:
@@ -176,4 +155,4 @@ def get_state_scales(fixed: PlanParams, names: tuple[str, ...]) -> list[float]:
         Unit of each of `names`, in the state's own SI unit.
     """
     small = {"phi": 0.1, "phi_dot": 0.5, "slewing": 0.1, "added": 0.1}
-    return [fixed.car.T_max if name in TORQUES else small.get(name, 1.0) for name in names]
+    return [fixed.car.T_max if name in _TORQUES else small.get(name, 1.0) for name in names]

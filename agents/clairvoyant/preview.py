@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from ...envs.engine.layout import ActuatorState, P, TaskParams, Z
 from ...envs.engine.step import make_step_variant, step_vehicle
@@ -28,15 +27,12 @@ from ...envs.vehicle.dynamics import CarParams, RoadParams
 
 
 class PreviewStep(NamedTuple):
-    """Inputs and parameters of one step of the plan, which actions change hardly or not at all.
-
-    `beta_ref` and `gamma_ref` may change; `command` and `weight` are those of the step's start.
-    """
+    """Inputs and parameters of one step of the plan, which actions change hardly or not at all."""
 
     steer_start: Any  # rad, front steering angle without the added one
     steer_middle: Any
     steer_end: Any
-    command: Any  # rad, the driver's
+    command: Any  # rad, the driver's at the start
     F_d: Any  # N, mean over the step, with the wind's
     N_d: Any  # N m
     N_x: Any  # N m
@@ -53,11 +49,7 @@ class PreviewStep(NamedTuple):
 
 
 class PlanState(NamedTuple):
-    """States of a plan in SI units: motion, actuators, the driver's integral.
-
-    `slewing` is the commanded added steering, `added` the applied one (rad). T_l and T_r are the
-    motors' torques (N m).
-    """
+    """States of a plan in SI units: motion, actuators, the driver's integral."""
 
     v_x: Any
     v_y: Any
@@ -70,63 +62,39 @@ class PlanState(NamedTuple):
     theta: Any
     phi: Any
     phi_dot: Any
-    T_l: Any
+    T_l: Any  # torque of the left motor (N m)
     T_r: Any
     integral: Any
-    slewing: Any
-    added: Any
+    slewing: Any  # added steering that is commanded (rad)
+    added: Any  # added steering that is applied (rad)
 
 
 class PlanParams(NamedTuple):
-    """Parameters that are constant within an episode; hashable, as the key of a solver.
+    """Parameters that are constant within an episode; hashable, as the key of a solver."""
 
-    Attributes:
-        car: Car, with zeros for the fields of `PreviewStep`.
-        road: Road.
-        speed_profile: Speed profile, with zeros for the fields of `PreviewStep`.
-        motor: Lag of the motors over a step.
-        steering: Lag of the steering over a step.
-        motor_tick: Lag of the motors over a tick.
-        steering_tick: Lag of the steering over a tick.
-        target: Reference of the task.
-        task: Parameters of the task.
-        kind: Variant of the plant.
-        width: Entries of an action.
-        ticks: Ticks of a step, the control period.
-        periods: Steps of the episode.
-    """
-
-    car: CarParams
-    road: RoadParams
-    speed_profile: SpeedProfile
-    motor: Lag
-    steering: Lag
-    motor_tick: Lag
-    steering_tick: Lag
-    target: ReferenceParams
-    task: TaskParams
-    kind: StepVariant
-    width: int
-    ticks: int
-    periods: int
+    car: CarParams  # car, with zeros for the fields of `PreviewStep`
+    road: RoadParams  # road
+    speed_profile: SpeedProfile  # speed profile, with zeros for the fields of `PreviewStep`
+    motor: Lag  # lag of the motors over a step
+    steering: Lag  # lag of the steering over a step
+    motor_tick: Lag  # lag of the motors over a tick
+    steering_tick: Lag  # lag of the steering over a tick
+    target: ReferenceParams  # reference of the task
+    task: TaskParams  # parameters of the task
+    kind: StepVariant  # variant of the plant
+    width: int  # entries of an action
+    ticks: int  # ticks of a step, the control period
+    periods: int  # steps of the episode
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """An episode as a plan has it.
-
-    Attributes:
-        fixed: Parameters of the episode.
-        known: Columns of `PreviewStep`, shape (len(PreviewStep), periods + 1); the last one is of
-            the episode's end.
-        start: State at tick 0.
-        driver: Driver's steering command at every tick (rad), shape (periods, n).
-    """
+    """An episode as a plan has it."""
 
     fixed: PlanParams
-    known: Array
-    start: PlanState
-    driver: Array
+    known: Array  # columns of `PreviewStep` (its fields, periods + 1); the last: the episode's end
+    start: PlanState  # at tick 0
+    driver: Array  # the driver's steering command at every tick (rad), shape (periods, n)
 
 
 def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
@@ -134,8 +102,7 @@ def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
 
     Args:
         base: Unwrapped env at tick 0.
-        actions: Actions of a run, shape (K, width), to which a driver reacts who steers by the car;
-            None: zeros.
+        actions: Actions of a run, shape (K, width), to which a driver reacts; None: zeros.
 
     Returns:
         Forecast from tick 0 to the episode's end.
@@ -153,6 +120,7 @@ def make_forecast(base: Any, actions: Array | None = None) -> Forecast:
     ticks = fixed.periods * n
     if actions is None:
         actions = np.zeros((fixed.periods, fixed.width))
+    # disturbances, and a steering profile's front wheels, do not depend on the actions
     drive, driver, refs = _simulate_actions(base, snapshot, actions, n)
     command = driver
     if not fixed.kind.has_driver and base.scenario.steering != "wander":
@@ -171,21 +139,20 @@ def read_plan_state(z: Array) -> PlanState:
         State in SI units.
     """
     motion, drive = read(z, Z.motion), read(z, Z.drive)
-    return PlanState._make(
-        (*motion, drive.T_l, drive.T_r, drive.integral, drive.slewing, drive.added)
-    )
+    actuators = drive.T_l, drive.T_r, drive.integral, drive.slewing, drive.added
+    return PlanState(*motion, *actuators)
 
 
 def _make_plan_params(base: Any, p: Array, switches: Any, ticks: int) -> PlanParams:
+    """Make the parameters of an episode in steps of some ticks."""
     vehicle, lags = base.vehicle, base.scenario.lags
     motor, steering = (vehicle.motor_lag, vehicle.steering_lag) if lags else (0.0, 0.0)
-    task = read(p, P.task)
+    task, speed_profile = read(p, P.task), read(p, P.speed_profile)._replace(end=FOREVER)
+    speed_profile = speed_profile._replace(speed=0.0, acceleration=0.0, start=0.0, surge=0.0)
     return PlanParams(
         read(p, P.car)._replace(C_f=0.0, C_r=0.0, mu=0.0, mu_r=0.0),
         read(p, P.road),
-        read(p, P.speed_profile)._replace(
-            speed=0.0, acceleration=0.0, start=0.0, end=FOREVER, surge=0.0
-        ),
+        speed_profile,
         make_lag(motor, ticks * TICK),
         make_lag(steering, ticks * TICK),
         make_lag(motor, TICK),
@@ -202,23 +169,12 @@ def _make_plan_params(base: Any, p: Array, switches: Any, ticks: int) -> PlanPar
 def _simulate_actions(
     base: Any, snapshot: Any, actions: Array, n: int
 ) -> tuple[Array, Array, Array]:
-    """Simulate actions by the env's own ticks.
-
-    Returns actuator states (K n + 1, len(ActuatorState)), the driver's angle (K n + 1,) and the
-    references (K n + 1, 2). Disturbances, and a steering profile's front wheels without the added
-    angle, do not depend on the actions.
-    """
+    """Simulate actuators, driver and references at every tick by the env, (K n + 1, ...) each."""
     z, window = snapshot["state"], make_window(1)
     bounds = np.array([[entry.low, entry.high] for entry in base.layout]).T.copy()
-    row = EpisodeArrays(
-        p=snapshot["params"],
-        z=z,
-        switches=snapshot["switches"],
-        obs=np.empty(len(base.layout), np.float32),
-        rows=snapshot["rows"],
-        packets=snapshot["packets"],
-        report=np.zeros(len(REPORT)),
-    )
+    p, switches = snapshot["params"], snapshot["switches"]
+    obs, report = np.empty(len(base.layout), np.float32), np.zeros(len(REPORT))
+    row = EpisodeArrays(p, z, switches, obs, snapshot["rows"], snapshot["packets"], report)
     held_actions = np.repeat(np.vstack([actions, actions[-1:]]).astype(np.float32), n, axis=0)
     ticks = n * len(actions)
     drive, driver = np.empty((ticks + 1, len(ActuatorState._fields))), np.empty(ticks + 1)
@@ -247,19 +203,20 @@ def _compute_preview(
     lag, middle = fixed.steering_tick, nodes + q // 2
     wind = read(p, P.wind)
     wind_forces = np.array([compute_wind(float(tick), wind) for tick in range(last)])
-    forces = np.column_stack(
-        [drive[:last, names.index("F_d")], drive[:last, names.index("N_d")], np.zeros(last)]
-    )
+    F_d, N_d = (drive[:last, names.index(name)] for name in ("F_d", "N_d"))
+    forces = np.column_stack([F_d, N_d, np.zeros(last)])
     mean_forces = (forces + wind_forces).reshape(-1, q, 3).mean(axis=1)
-    set_points = np.array(
-        [_compute_set_point(float(tick), read(p, P.speed_profile)) for tick in nodes]
-    )
+    profile = read(p, P.speed_profile)
+    set_points = np.array([_compute_set_point(float(tick), profile) for tick in nodes])
     car, change = read(p, P.car), read(p, P.tyre_change)
     is_changed = nodes >= change.tick
     tyres = [
         np.where(is_changed, factor * stiffness, stiffness)
         for factor, stiffness in ((change.front, car.C_f), (change.rear, car.C_r))
     ]
+    # s of each cost rate: the trapezoid rule over every q-th tick, without the end; exact for q = 1
+    weights = np.where(nodes < fixed.task.duration, q * TICK, 0.0)
+    weights[0] = 0.5 * (q - 1) * TICK
     table = (
         compute_wheel_angle(nodes, lag.start),
         compute_wheel_angle(middle, lag.middle if q % 2 else lag.start),
@@ -270,16 +227,15 @@ def _compute_preview(
         *(np.full(len(nodes), value) for value in (car.mu, car.mu_r)),
         *set_points.T,
         _compute_road_turns(p, fixed.kind, command[:last]).reshape(-1, q).mean(axis=1),
-        _compute_weights(nodes, fixed),
+        weights,
         *refs[nodes].T,
     )
     known = np.array(PreviewStep._make(table))
     end = known[:, -1:].copy()  # of the episode's end only command, references and weight count
     end[PreviewStep._fields.index("command")] = command[last]
     end[PreviewStep._fields.index("beta_ref") :, 0] = refs[last]
-    end[PreviewStep._fields.index("weight")] = (
-        0.5 * (q + 1) * TICK if last == fixed.task.duration else 0.0
-    )
+    is_complete = last == fixed.task.duration
+    end[PreviewStep._fields.index("weight")] = 0.5 * (q + 1) * TICK if is_complete else 0.0
     return np.hstack([known, end])
 
 
@@ -288,33 +244,18 @@ def _compute_road_turns(p: Array, kind: StepVariant, command: Array) -> Array:
     turns, path = np.zeros(len(command)), NominalMotion(0.0, 0.0)
     if kind.road == NOMINAL_PATH:
         speed_profile, nominal_car = read(p, P.speed_profile), read(p, P.nominal_car)
-        compute_motion, follow_path = (
-            as_python(compute_speed_reference),
-            as_python(step_nominal_car),
-        )
+        compute_motion = as_python(compute_speed_reference)
+        follow_path = as_python(step_nominal_car)
         for tick, steer in enumerate(command):
-            turns[tick], path = follow_path(
-                path, steer, compute_motion(float(tick), speed_profile)[0], nominal_car
-            )
+            speed = compute_motion(float(tick), speed_profile)[0]
+            turns[tick], path = follow_path(path, steer, speed, nominal_car)
     return turns
 
 
 def _compute_set_point(tick: float, speed_profile: SpeedProfile) -> tuple[float, float]:
     """Compute the driver's speed (m/s) and feedforward acceleration (m/s^2) at a tick."""
-    feedforward_profile = speed_profile._replace(hold=1.0, k_p=0.0, k_i=0.0)
-    feedforward = compute_acceleration_command(tick, 0.0, 0.0, feedforward_profile, np.inf)[0]
-    total = compute_acceleration_command(
-        tick, 0.0, 0.0, feedforward_profile._replace(k_p=1.0), np.inf
-    )[0]
+    profile = speed_profile._replace(hold=1.0, k_p=0.0, k_i=0.0)
+    feedforward = compute_acceleration_command(tick, 0.0, 0.0, profile, np.inf)[0]
+    profile = profile._replace(k_p=1.0)
+    total = compute_acceleration_command(tick, 0.0, 0.0, profile, np.inf)[0]
     return total - feedforward, feedforward
-
-
-def _compute_weights(nodes: npt.NDArray[np.int_], fixed: PlanParams) -> Array:
-    """Compute the weight of each step's cost rate in the sum over ticks 1 .. T (s).
-
-    It sums over every q-th tick by the trapezoid rule, without the end; exact for q = 1.
-    """
-    q = fixed.ticks
-    weights = np.where(nodes < fixed.task.duration, q * TICK, 0.0)
-    weights[0] = 0.5 * (q - 1) * TICK
-    return np.asarray(weights)

@@ -1,6 +1,4 @@
-"""Linearisation of an episode along a run: the plant and the cost, for every control period.
-
-The backward pass of differential dynamic programming within limits of the inputs.
+"""Linearisation of an episode along a run, and the backward pass within limits of the inputs.
 
 Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
 """
@@ -31,66 +29,39 @@ N_INPUTS = 2  # in a sweep: share of the moment and of the steering, which may b
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A run of an episode.
+    """A run of an episode."""
 
-    Attributes:
-        states: `PlanState` at the start of every period and at the end, shape (K + 1, n).
-        actions: Fractions of full scale, shape (K, width).
-    """
-
-    states: Array
-    actions: Array
+    states: Array  # `PlanState` at the start of every period and at the end, shape (K + 1, n)
+    actions: Array  # fractions of full scale, shape (K, width)
 
 
 class Linearisation(NamedTuple):
-    """The derivatives along a run, for n = size + N_INPUTS variables: scaled states, then inputs.
+    """The derivatives along a run by n = size + N_INPUTS variables: scaled states, then inputs."""
 
-    Attributes:
-        F: Derivative of the state after each period, shape (K, size, n).
-        g: Gradient of the cost, shape (K + 1, n); the last one is of the episode's end.
-        H: Gauss-Newton's Hessian of the cost, shape (K + 1, n, n), likewise.
-    """
-
-    F: Array
-    g: Array
-    H: Array
+    F: Array  # derivative of the state after each period, shape (K, size, n)
+    g: Array  # gradient of the cost, shape (K + 1, n); the last one is of the episode's end
+    H: Array  # Gauss-Newton's Hessian of the cost, shape (K + 1, n, n), likewise
 
 
 class Limits(NamedTuple):
-    """The limits of the inputs in every period.
+    """The limits of the inputs in every period."""
 
-    Attributes:
-        low: Lower limits, shape (K, N_INPUTS).
-        high: Upper limits, shape (K, N_INPUTS).
-        rate_low: Lower limit of the steering by its rate, shape (K,).
-        rate_high: Upper limit of the steering by its rate, shape (K,).
-        column: State that moves the rate's limits.
-        slope: Change of these limits per unit of that state.
-    """
-
-    low: Array
-    high: Array
-    rate_low: Array
-    rate_high: Array
-    column: int
-    slope: float
+    low: Array  # lower limits, shape (K, N_INPUTS)
+    high: Array  # upper limits, shape (K, N_INPUTS)
+    rate_low: Array  # lower limit of the steering by its rate, shape (K,)
+    rate_high: Array  # upper limit of the steering by its rate, shape (K,)
+    column: int  # state that moves the rate's limits
+    slope: float  # change of these limits per unit of that state
 
 
 @dataclass(frozen=True)
 class IlqrProblem:
-    """The functions that all episodes with the same `PlanParams` share.
-
-    Attributes:
-        fixed: Parameters of the episode.
-        names: Names of the active states.
-        scale: Unit of each active state, shape (size,).
-        slopes: CasADi's function of the derivatives, for all nodes at once.
-    """
+    """The functions that all episodes with the same `PlanParams` share."""
 
     fixed: PlanParams
-    names: tuple[str, ...]
-    scale: Array
-    slopes: Any  # of CasADi, for all nodes at once
+    names: tuple[str, ...]  # of the active states
+    scale: Array  # unit of each active state, shape (size,)
+    slopes: Any  # CasADi's function of the derivatives, for all nodes at once
 
     @property
     def state_indices(self) -> list[int]:
@@ -117,18 +88,15 @@ def make_problem(fixed: PlanParams) -> IlqrProblem:
     step = advance(fixed, x, ca.vertsplit(w[size:]), step_inputs)
     next_state = ca.vertcat(*(getattr(step.state, name) for name in names)) / scale
     e, errors = ca.SX.sym("e", 2), ca.vertcat(*compute_node_errors(fixed, x, step_inputs))
-    error_hessian, error_gradient = ca.hessian(
-        compute_node_cost(fixed, (e[0], e[1]), step_inputs), e
-    )
+    node_cost = compute_node_cost(fixed, (e[0], e[1]), step_inputs)
+    error_hessian, error_gradient = ca.hessian(node_cost, e)
     error_jacobian = ca.jacobian(errors, w)
-    effort_hessian, effort_gradient = ca.hessian(
-        step.effort, w
-    )  # a sum of squares of nearly linear terms
+    # the effort is a sum of squares of nearly linear terms
+    effort_hessian, effort_gradient = ca.hessian(step.effort, w)
     gradient = error_jacobian.T @ ca.substitute(error_gradient, e, errors) + effort_gradient
     hessian = error_jacobian.T @ error_hessian @ error_jacobian + effort_hessian
-    node = ca.Function(
-        "node", [w, known], [ca.jacobian(next_state, w), gradient, hessian], {"cse": True}
-    )
+    derivatives = [ca.jacobian(next_state, w), gradient, hessian]
+    node = ca.Function("node", [w, known], derivatives, {"cse": True})
     return IlqrProblem(fixed, names, scale, node.map(fixed.periods + 1))
 
 
@@ -149,9 +117,8 @@ def linearise_run(problem: IlqrProblem, known: Array, run: Trajectory) -> Linear
     points[size:, :K] = run.actions.T
     n_used, n = size + width, size + N_INPUTS
     F, g, H = (np.nan_to_num(value.full()) for value in problem.slopes(points, known))
-    result = Linearisation(
-        np.zeros((K, size, n)), np.zeros((K + 1, n)), np.tile(np.eye(n), (K + 1, 1, 1))
-    )
+    identities = np.tile(np.eye(n), (K + 1, 1, 1))
+    result = Linearisation(np.zeros((K, size, n)), np.zeros((K + 1, n)), identities)
     result.F[:, :, :n_used] = F.reshape(size, K + 1, n_used).transpose(1, 0, 2)[:K]
     result.g[:, :n_used] = g.T
     result.H[:, :n_used, :n_used] = H.reshape(n_used, K + 1, n_used).transpose(1, 0, 2)

@@ -9,34 +9,26 @@ from ...envs.numerics.jit import jit
 from ...envs.numerics.packed import count_lanes
 from .prediction import N_RESIDUALS, N_TERMINAL, PredictionModel, PredictionStart, simulate_plans
 
-N_CANDIDATES = 16  # that are tried at once
-MAX_VARIABLES = N_CANDIDATES - 1  # one is the plan itself
+_N_CANDIDATES = 16  # that are tried at once
+MAX_VARIABLES = _N_CANDIDATES - 1  # one is the plan itself
 LIMIT = 2.0  # of a variable: from one limit of an input to the other
 DIFFERENCE = 0.01  # of a variable, for slopes
-MIN_DAMPING = 1e-4  # Levenberg and Marquardt's, of the first of the steps that are tried
-STEP_LENGTHS = (1.0, 0.3)  # each step is tried whole and in part
+_MIN_DAMPING = 1e-4  # Levenberg and Marquardt's, of the first of the steps that are tried
+_STEP_LENGTHS = (1.0, 0.3)  # each step is tried whole and in part
 
 
-class PlanBatch(NamedTuple):
-    """Plans side by side and their results, one column for each.
+class _PlanBatch(NamedTuple):
+    """Plans side by side and their results, one column for each."""
 
-    Attributes:
-        plans: Variables, shape (variables, count).
-        perturbations: Changes beyond the limits, shape (variables, count).
-        limits: 1 or -1 where a block starts at a limit, shape (variables, count).
-        residuals: Residuals, whose squares sum to J, shape (residuals, count).
-        first: First yaw moment (fraction) and added steering (rad), shape (2, count).
-    """
-
-    plans: Any  # (variables, count)
-    perturbations: Any
-    limits: Any
-    residuals: Any
-    first: Any  # (2, count), share of the moment and rad of steering
+    plans: Any  # variables, shape (variables, count)
+    perturbations: Any  # changes beyond the limits, shape (variables, count)
+    limits: Any  # 1 or -1 where a block starts at a limit, shape (variables, count)
+    residuals: Any  # residuals, whose squares sum to J, shape (residuals, count)
+    first: Any  # first yaw moment (fraction) and added steering (rad), shape (2, count)
 
 
 @jit
-def make_plan_batch(variables: int, blocks: Any, count: int) -> PlanBatch:
+def make_plan_batch(variables: int, blocks: Any, count: int) -> _PlanBatch:
     """Make a batch of plans of zeros.
 
     Args:
@@ -47,7 +39,7 @@ def make_plan_batch(variables: int, blocks: Any, count: int) -> PlanBatch:
     Returns:
         Batch with one column for each plan.
     """
-    return PlanBatch(
+    return _PlanBatch(
         np.zeros((variables, count)),
         np.zeros((variables, count)),
         np.zeros((variables, count)),
@@ -63,9 +55,9 @@ def simulate_batch(
     K: Any,
     terminal: Any,
     blocks: Any,
-    batch: PlanBatch,
+    batch: _PlanBatch,
 ) -> None:
-    """Simulate any number of plans by `simulate_plans`, as many at a time as there are lanes.
+    """Simulate any number of plans, as many at a time as there are lanes.
 
     Args:
         model: Numbers that all predictions share.
@@ -104,11 +96,8 @@ def _sum_squares(residuals: Any, J: Any) -> None:
 
 
 @jit
-def _compute_normal_equations(batch: PlanBatch, A: Any, g: Any) -> None:
-    """Fill A = J'J and g = J'r; column i + 1 perturbs variable i of the plan in the first.
-
-    A variable that is at a limit, and would be cheaper beyond it, does not move.
-    """
+def _compute_normal_equations(batch: _PlanBatch, A: Any, g: Any) -> None:
+    """Fill A = J'J and g = J'r; column i + 1 perturbs variable i of the plan in the first."""
     n, residuals = len(g), batch.residuals
     slope = np.empty(n)
     A[:], g[:] = 0.0, 0.0
@@ -119,7 +108,7 @@ def _compute_normal_equations(batch: PlanBatch, A: Any, g: Any) -> None:
             g[i] += slope[i] * residuals[r, 0]
             for j in range(n):
                 A[i, j] += slope[i] * slope[j]
-    for i in range(n):
+    for i in range(n):  # a variable at a limit, cheaper beyond it, does not move
         if batch.limits[i, 0] * g[i] < 0.0:
             A[i, :], A[:, i], g[i] = 0.0, 0.0, 0.0
 
@@ -160,7 +149,7 @@ def solve_damped_step(A: Any, g: Any, damping: float, L: Any, d: Any) -> None:
 
 
 @jit
-def _fill_perturbations(plan: Any, batch: PlanBatch) -> None:
+def _fill_perturbations(plan: Any, batch: _PlanBatch) -> None:
     """Fill every column with the plan; a column perturbs one variable, the first none."""
     for i in range(len(plan)):
         batch.plans[i, :] = plan[i]
@@ -170,15 +159,15 @@ def _fill_perturbations(plan: Any, batch: PlanBatch) -> None:
 @jit
 def _fill_candidates(plan: Any, A: Any, g: Any, plans: Any) -> None:
     """Fill plans with the plan, the regulator's own (zeros), and steps of growing damping."""
-    n, damping = len(plan), MIN_DAMPING
+    n, damping = len(plan), _MIN_DAMPING
     L, d = np.empty((n, n)), np.empty(n)
     plans[:, 0], plans[:, 1] = plan, 0.0
-    for c in range(2, plans.shape[1], len(STEP_LENGTHS)):
+    for c in range(2, plans.shape[1], len(_STEP_LENGTHS)):
         solve_damped_step(A, g, damping, L, d)
         damping *= 10.0
-        for k in range(len(STEP_LENGTHS)):
+        for k in range(len(_STEP_LENGTHS)):
             for i in range(n):
-                plans[i, c + k] = min(max(plan[i] + STEP_LENGTHS[k] * d[i], -LIMIT), LIMIT)
+                plans[i, c + k] = min(max(plan[i] + _STEP_LENGTHS[k] * d[i], -LIMIT), LIMIT)
 
 
 @jit
@@ -210,10 +199,10 @@ def update_plan(
     """
     n = len(plan)
     batch, A, g, J = (
-        make_plan_batch(n, blocks, N_CANDIDATES),
+        make_plan_batch(n, blocks, _N_CANDIDATES),
         np.empty((n, n)),
         np.empty(n),
-        np.empty(N_CANDIDATES),
+        np.empty(_N_CANDIDATES),
     )
     min_cost, share, wheel = math.inf, 0.0, 0.0
     for _ in range(iterations):
@@ -225,7 +214,7 @@ def update_plan(
         simulate_batch(model, start, K, terminal, blocks, batch)
         _sum_squares(batch.residuals, J)
         best, min_cost = 0, math.inf
-        for c in range(N_CANDIDATES):
+        for c in range(_N_CANDIDATES):
             if J[c] < min_cost:
                 best, min_cost = c, J[c]
         if min_cost < math.inf:

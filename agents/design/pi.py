@@ -1,7 +1,4 @@
-"""The PI on the sideslip angle of tie-vision section V, by pole placement.
-
-The nominal car in compiled laws: its numbers by name, and its bicycle model at a speed.
-"""
+"""The nominal car in compiled laws, and the PI on its sideslip angle of tie-vision section V."""
 
 import math
 from dataclasses import dataclass
@@ -21,15 +18,10 @@ PLACEMENTS = ("radius", "real")
 
 @dataclass(frozen=True)
 class PI:
-    """Gains of the yaw moment on the slip error.
+    """Gains of the yaw moment on the slip error."""
 
-    Attributes:
-        k_p: Proportional gain (N m/rad).
-        k_i: Integral gain (N m/(rad s)).
-    """
-
-    k_p: float
-    k_i: float
+    k_p: float  # proportional gain (N m/rad)
+    k_i: float  # integral gain (N m/(rad s))
 
 
 def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str = "radius") -> PI:
@@ -98,9 +90,6 @@ def sample_pi(
 
     Returns:
         Gains k_p (N m/rad) and k_i (N m/(rad s)).
-
-    Raises:
-        ValueError: As `design_pi`.
     """
     _check(pole, placement)
     model = make_bicycle_model(vehicle, speed)
@@ -126,12 +115,9 @@ def sample_pi(
         from scipy.optimize import brentq  # slow to load
 
         factors = np.linspace(0.0, 4.0, 81)  # the first of them, before a pole leaves z > 0
-        upper_factor = next((f for f in factors[1:] if compute_excess(f) > 0.0), None)
-        k_p = continuous * (
-            4.0
-            if upper_factor is None
-            else brentq(compute_excess, upper_factor - 0.05, upper_factor)
-        )
+        upper = next((f for f in factors[1:] if compute_excess(f) > 0.0), None)
+        factor = 4.0 if upper is None else brentq(compute_excess, upper - 0.05, upper)
+        k_p = continuous * factor
     k_p = _limit_gain(vehicle, float(k_p))
     return PI(k_p, k_p * (1.0 - a_1) / period)
 
@@ -141,35 +127,25 @@ CAR, _ = make_offsets(Bicycle)
 
 
 class BicyclePlant(NamedTuple):
-    """A and B of tie-vision (8): beta and gamma, from the steering angle and the yaw moment.
+    """A and B of tie-vision (8): beta and gamma, from the steering angle and the yaw moment."""
 
-    Attributes:
-        a11: Effect of beta on beta' (1/s).
-        a12: Effect of gamma on beta'.
-        a21: Effect of beta on gamma' (1/s^2).
-        a22: Effect of gamma on gamma' (1/s).
-        b11: Effect of the steering angle on beta' (1/s).
-        b21: Effect of the steering angle on gamma' (1/s^2).
-        b22: Effect of the yaw moment on gamma' (1/(kg m^2)).
-    """
-
-    a11: Any
-    a12: Any
-    a21: Any
-    a22: Any
-    b11: Any
-    b21: Any
-    b22: Any
+    a11: Any  # effect of beta on beta' (1/s)
+    a12: Any  # effect of gamma on beta'
+    a21: Any  # effect of beta on gamma' (1/s^2)
+    a22: Any  # effect of gamma on gamma' (1/s)
+    b11: Any  # effect of the steering angle on beta' (1/s)
+    b21: Any  # effect of the steering angle on gamma' (1/s^2)
+    b22: Any  # effect of the yaw moment on gamma' (1/(kg m^2))
 
 
 def make_nominal_car(vehicle: Vehicle) -> Array:
-    """Make the array of the numbers at `CAR`, shape (6,).
+    """Make the numbers of a nominal car at `CAR` in SI units.
 
     Args:
         vehicle: Nominal vehicle.
 
     Returns:
-        Numbers in SI units.
+        Numbers, shape (6,).
     """
     return np.array(vehicle.lateral)
 
@@ -197,7 +173,7 @@ compute_plant_python = as_python(compute_plant)
 
 @jit
 def compute_drift(plant: Any, beta: Any, gamma: Any) -> Any:
-    """Compute A [beta, gamma], the rates without inputs (rad/s, rad/s^2).
+    """Compute A [beta, gamma], the rates without inputs.
 
     Args:
         plant: `BicyclePlant` at the speed.
@@ -212,7 +188,7 @@ def compute_drift(plant: Any, beta: Any, gamma: Any) -> Any:
 
 @jit
 def compute_steady_yaw_rate(plant: Any, beta: Any, delta: Any) -> Any:
-    """Compute the yaw rate (rad/s) that keeps a sideslip angle constant.
+    """Compute the yaw rate that keeps a sideslip angle constant.
 
     Args:
         plant: `BicyclePlant` at the speed.
@@ -227,9 +203,7 @@ def compute_steady_yaw_rate(plant: Any, beta: Any, delta: Any) -> Any:
 
 @jit
 def solve_inputs(plant: Any, first: Any, second: Any) -> Any:
-    """Solve B u = [first, second] for steering angle (rad) and yaw moment (N m).
-
-    Source: dakf-stability (26).
+    """Solve B u = [first, second] for the inputs: dakf-stability (26).
 
     Args:
         plant: `BicyclePlant` at the speed.

@@ -1,6 +1,4 @@
-"""The model of the car in nonlinear predictive control, and the start of a prediction.
-
-Predictions of nonlinear predictive control: the plant's own source, many plans at once.
+"""Predictions of nonlinear predictive control: the plant's own source, many plans at once.
 
 A plan is added to the linear regulator's action, constant in blocks of steps. The sum is limited
 as the plant limits it. So the plan of zeros is the regulator itself, which is optimal where the
@@ -65,47 +63,24 @@ class PredictionModel(NamedTuple):
 
 
 class PredictionStart(NamedTuple):
-    """The state and the held quantities at the start of a prediction.
+    """The state and the held quantities at the start of a prediction."""
 
-    Attributes:
-        car: `CarParams` of the car.
-        motion: Motion of the car.
-        T_l: Torque of the left motor (N m).
-        T_r: Torque of the right motor (N m).
-        delta_f: Applied steering angle (rad).
-        slewing: Added steering that was last commanded (rad).
-        driver: Driver's steering angle, held (rad).
-        a_x: Acceleration, held (m/s^2).
-        refs: beta_ref (rad) and gamma_ref (rad/s) now.
-        steady: Values that a lagged reference approaches.
-        push: Disturbance forces.
-        max_moment: Largest yaw moment as a fraction of full scale.
-    """
-
-    car: Any
-    motion: Any
-    T_l: Any
-    T_r: Any
-    delta_f: Any
-    slewing: Any  # rad, the added steering that was asked for last
-    driver: Any  # rad, held
-    a_x: Any  # m/s2, held
-    refs: Any  # (beta, gamma) now
-    steady: Any  # and where a lagged reference goes
-    push: Any
-    max_moment: Any  # share of full scale that the yaw moment may take
+    car: Any  # `CarParams` of the car
+    motion: Any  # motion of the car
+    T_l: Any  # torque of the left motor (N m)
+    T_r: Any  # torque of the right motor (N m)
+    delta_f: Any  # applied steering angle (rad)
+    slewing: Any  # added steering that was last commanded (rad)
+    driver: Any  # driver's steering angle, held (rad)
+    a_x: Any  # acceleration, held (m/s^2)
+    refs: Any  # beta_ref (rad) and gamma_ref (rad/s) now
+    steady: Any  # values that a lagged reference approaches
+    push: Any  # disturbance forces
+    max_moment: Any  # largest yaw moment as a fraction of full scale
 
 
-def compute_lag_moments(time_constant: float, ticks: int) -> tuple[float, float]:
-    """Compute mean and standard deviation, over a step's ticks, of a deviation's rest.
-
-    Args:
-        time_constant: Time constant of the lag (s).
-        ticks: Ticks of the step.
-
-    Returns:
-        Mean and standard deviation, as fractions of the deviation.
-    """
+def _compute_lag_moments(time_constant: float, ticks: int) -> tuple[float, float]:
+    """Compute mean and deviation, over a step's ticks, of what a lag leaves of a deviation."""
     tick = make_lag(time_constant, TICK)
     left = tick.mean * tick.end ** np.arange(ticks)
     return float(left.mean()), float(left.std())
@@ -148,8 +123,8 @@ def make_prediction_model(
         kind,
         make_lag(motor, step),
         make_lag(steering, step),
-        compute_lag_moments(motor, ticks),
-        compute_lag_moments(steering, ticks),
+        _compute_lag_moments(motor, ticks),
+        _compute_lag_moments(steering, ticks),
         step,
         full_scale,
         authority,
@@ -196,85 +171,42 @@ def replace_tyres(car: Any, C_f: Any, C_r: Any, mu: Any) -> Any:
     return CarParams(*(car[:4] + tyres + car[6:10] + road + car[11:19] + other + car[20:]))
 
 
-N_RESIDUALS = (
-    6  # of a step: slip, yaw rate, moment and steering with the spread of each in the step
-)
+N_RESIDUALS = 6  # of a step: slip, yaw rate, moment and steering with the spread of each in it
 N_TERMINAL = 4  # residuals behind the last step
 
 
-class PredictionState(NamedTuple):
-    """A prediction's state between steps.
+class _PredictionState(NamedTuple):
+    """A prediction's state between steps."""
 
-    Attributes:
-        motion: Motion of the car.
-        T_l: Torque of the left motor (N m).
-        T_r: Torque of the right motor (N m).
-        delta_f: Applied steering angle (rad).
-        slewing: Added steering that was last commanded (rad).
-        beta_ref: Reference of the sideslip angle (rad).
-        gamma_ref: Reference of the yaw rate (rad/s).
-        F_d: Disturbance force (N).
-        N_d: Disturbance moment (N m).
-    """
-
-    motion: Any
-    T_l: Any
-    T_r: Any
-    delta_f: Any
-    slewing: Any
-    beta_ref: Any
-    gamma_ref: Any
-    F_d: Any
-    N_d: Any
+    motion: Any  # motion of the car
+    T_l: Any  # torque of the left motor (N m)
+    T_r: Any  # torque of the right motor (N m)
+    delta_f: Any  # applied steering angle (rad)
+    slewing: Any  # added steering that was last commanded (rad)
+    beta_ref: Any  # reference of the sideslip angle (rad)
+    gamma_ref: Any  # reference of the yaw rate (rad/s)
+    F_d: Any  # disturbance force (N)
+    N_d: Any  # disturbance moment (N m)
 
 
 @inline
-def clip_symmetric(value: Any, limit: Any) -> Any:
-    """Clip a value to +-limit.
-
-    Args:
-        value: Value to clip.
-        limit: Limit, in the same unit.
-
-    Returns:
-        Value within the limit.
-    """
+def _clip_symmetric(value: Any, limit: Any) -> Any:
+    """Clip a value to +-limit."""
     return minimum(maximum(value, 0.0 - limit), limit)
 
 
 @inline
-def detect_limit(value: Any, low: Any, high: Any) -> Any:
-    """Detect a limit: 1 or -1 where the value is at the upper or the lower one, else 0.
-
-    Args:
-        value: Value to test.
-        low: Lower limit.
-        high: Upper limit.
-
-    Returns:
-        1.0, -1.0 or 0.0.
-    """
+def _detect_limit(value: Any, low: Any, high: Any) -> Any:
+    """Detect a limit: 1 or -1 where the value is at the upper or the lower one, else 0."""
     close = 1e-9 * (high - low)
     return select(value >= high - close, 1.0, select(value <= low + close, -1.0, 0.0))
 
 
 @inline
-def multiply_row(
-    M: Any, row: int, model: PredictionModel, driver: Any, state: PredictionState, beta: Any
+def _multiply_row(
+    M: Any, row: int, model: PredictionModel, driver: Any, state: _PredictionState, beta: Any
 ) -> Any:
-    """Multiply a row of a matrix by the states of the design model with forces.
-
-    Args:
-        M: Matrix, shape (rows, 9).
-        row: Index of the row.
-        model: Numbers that all predictions share.
-        driver: Driver's steering angle (rad).
-        state: State of the prediction.
-        beta: Sideslip angle (rad).
-
-    Returns:
-        Product of the row and the states.
-    """
+    """Multiply a row of M (rows, 9) by the states of the design model with forces."""
     share = 0.5 * model.car.d_r / model.car.r / model.full_scale * (state.T_r - state.T_l)
     lateral = M[row, 0] * beta + M[row, 1] * state.motion.gamma + M[row, 2] * share
     held = M[row, 3] * state.delta_f + M[row, 4] * driver + M[row, 5] * state.beta_ref
@@ -283,72 +215,46 @@ def multiply_row(
 
 
 @inline
-def compute_commands(
+def _compute_commands(
     model: PredictionModel,
     start: PredictionStart,
     K: Any,
-    state: PredictionState,
+    state: _PredictionState,
     beta: Any,
     added: Any,
     turn: Any,
 ) -> Any:
-    """Compute the commands of the regulator and a plan, within the limits.
-
-    Args:
-        model: Numbers that all predictions share.
-        start: Start of the prediction.
-        K: Gains of the regulator, shape (m, 9); one row where the car does not steer.
-        state: State of the prediction.
-        beta: Sideslip angle (rad).
-        added: Plan's yaw moment as a fraction of full scale.
-        turn: Plan's steering as a fraction of the authority, where the car steers.
-
-    Returns:
-        Yaw moment (fraction of full scale), added steering (rad), and for each 1 or -1 at a limit.
-    """
+    """Compute share of the yaw moment and steering (rad) within limits, and 1 or -1 at a limit."""
     max_moment = start.max_moment
     share = (
-        clip_symmetric(0.0 - multiply_row(K, 0, model, start.driver, state, beta), max_moment)
+        _clip_symmetric(0.0 - _multiply_row(K, 0, model, start.driver, state, beta), max_moment)
         + added
     )
     wheel, bound = 0.0 * share, 0.0 * share
     if len(K) > 1:
-        wheel = clip_symmetric(
-            0.0 - multiply_row(K, 1, model, start.driver, state, beta), model.authority
+        wheel = _clip_symmetric(
+            0.0 - _multiply_row(K, 1, model, start.driver, state, beta), model.authority
         )
-        wheel = clip_symmetric(wheel + model.authority * turn, model.authority)
+        wheel = _clip_symmetric(wheel + model.authority * turn, model.authority)
         wheel = limit_rate(state.slewing, wheel, model.slew)
         high = minimum(state.slewing + model.slew, model.authority)
         low = maximum(state.slewing - model.slew, 0.0 - model.authority)
-        bound = detect_limit(wheel, low, high)
-    share = clip_symmetric(share, max_moment)
-    return share, wheel, detect_limit(share, 0.0 - max_moment, max_moment), bound
+        bound = _detect_limit(wheel, low, high)
+    share = _clip_symmetric(share, max_moment)
+    return share, wheel, _detect_limit(share, 0.0 - max_moment, max_moment), bound
 
 
 @inline
-def predict_step(
+def _predict_step(
     model: PredictionModel,
     start: PredictionStart,
-    state: PredictionState,
+    state: _PredictionState,
     share: Any,
     wheel: Any,
     share_beyond: Any,
     steer_beyond: Any,
 ) -> Any:
-    """Predict one step with held commands.
-
-    Args:
-        model: Numbers that all predictions share.
-        start: Start of the prediction.
-        state: State before the step.
-        share: Yaw moment as a fraction of full scale.
-        wheel: Added steering (rad).
-        share_beyond: Further yaw moment that no limit applies to.
-        steer_beyond: Further steering (rad) that no limit applies to.
-
-    Returns:
-        State after the step, and the effort's four residuals.
-    """
+    """Predict one step with held commands: the state after it, and the effort's four residuals."""
     kind, motor, steering, h = model.kind, model.motor, model.steering, model.step
     car, driver = start.car, start.driver
     max_torque = compute_torque_limit(state.motion.v_x, car)
@@ -386,7 +292,7 @@ def predict_step(
         model.per_steer * apply_lag(extra, added, model.steering_work[0]),
         model.per_steer * model.steering_work[1] * (added - extra),
     )
-    next_state = PredictionState(
+    next_state = _PredictionState(
         motion,
         apply_lag(T_l, state.T_l, motor.end),
         apply_lag(T_r, state.T_r, motor.end),
@@ -413,7 +319,7 @@ def simulate_plans(
     limits: Any,
     first: Any,
 ) -> None:
-    """Simulate plans: fill their residuals and their first commands.
+    """Simulate plans: fill their residuals, whose squares sum to J, and their first commands.
 
     The variables of a plan are, for every block, the fraction of the yaw moment and, where the car
     steers, that of the authority.
@@ -425,10 +331,8 @@ def simulate_plans(
         terminal: T of the terminal cost |T x|^2, shape (4, 9).
         blocks: Steps of each block, shape (blocks,).
         plans: Plans, shape (variables, lanes).
-        perturbations: Changes of the commands beyond their limits, shape (variables, lanes), for
-            gradients that a limit does not hide.
-        residuals: Residuals, shape (N_RESIDUALS steps + N_TERMINAL, lanes), filled; their squares
-            sum to J without its cap.
+        perturbations: Changes of the commands beyond their limits, shape (variables, lanes).
+        residuals: Residuals, shape (N_RESIDUALS steps + N_TERMINAL, lanes), filled.
         limits: 1 or -1 where a block starts at a limit, shape (variables, lanes), filled.
         first: First commands, shape (2, lanes), filled.
     """
@@ -438,7 +342,7 @@ def simulate_plans(
         zero, zero, zero, zero,
         start_motion.phi + zero, start_motion.phi_dot + zero,
     )  # fmt: skip
-    state = PredictionState(
+    state = _PredictionState(
         motion,
         start.T_l + zero,
         start.T_r + zero,
@@ -464,7 +368,7 @@ def simulate_plans(
                 model.authority * load_element(perturbations, m * b + 1),
             )
         for k in range(blocks[b]):
-            share, wheel, ends, bound = compute_commands(model, start, K, state, beta, added, turn)
+            share, wheel, ends, bound = _compute_commands(model, start, K, state, beta, added, turn)
             if k == 0:
                 store_element(limits, ends, m * b)
                 if m > 1:
@@ -472,7 +376,7 @@ def simulate_plans(
             if row == 0:
                 store_element(first, share, 0)
                 store_element(first, wheel, 1)
-            state, efforts = predict_step(
+            state, efforts = _predict_step(
                 model, start, state, share, wheel, share_beyond, steer_beyond
             )
             beta = compute_sideslip_angle(
@@ -492,5 +396,5 @@ def simulate_plans(
             row += N_RESIDUALS
     for j in range(N_TERMINAL):
         store_element(
-            residuals, multiply_row(terminal, j, model, start.driver, state, beta), row + j
+            residuals, _multiply_row(terminal, j, model, start.driver, state, beta), row + j
         )

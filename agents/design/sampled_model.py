@@ -1,10 +1,8 @@
-"""The car as its controllers predict it: sampled at the control period, with the env's own cost.
+"""The car as its controllers predict it, sampled at the control period, and its regulators' gains.
 
-Every tick of a period counts in the cost, so both the motion and the cost are summed tick by tick:
-what is minimised is the episode's cost J itself, but for its cap, of the linear car at a held
-speed, with the driver's command and the references held as they are now.
-
-Gains over speed and cornering stiffness: designed on a grid, interpolated in compiled code.
+Motion and cost are summed tick by tick: what is minimised is the episode's cost J itself, but for
+its cap, of the linear car at a held speed, with driver's command and references held. Gains are
+designed on a grid of speeds and cornering stiffnesses, and interpolated in compiled code.
 """
 
 import itertools
@@ -25,13 +23,10 @@ from ...envs.vehicle.linear import LinearModel, make_bicycle_model
 from ...envs.vehicle.parameters import Vehicle
 
 DYNAMIC = ("beta", "gamma", "N_z", "delta_f")
-"""States that the inputs move: rad, rad/s, delivered yaw moment as a share of full scale, applied
-steering in rad."""
-
-HELD = ("driver", "beta_ref", "gamma_ref")
+"""States that the inputs move; N_z is the delivered fraction of full scale, angles are in rad."""
+_HELD = ("driver", "beta_ref", "gamma_ref")
 """Quantities held constant: the driver's steering in rad and the references."""
-
-DISTURBANCES: dict[str, tuple[str, ...]] = {
+_DISTURBANCES: dict[str, tuple[str, ...]] = {
     "none": (),
     "forces": ("F_d", "N_d"),
     "rates": ("d1", "d2"),
@@ -42,30 +37,20 @@ them, or d_1 and d_2 in rad/s and rad/s2, which stay: dakf-stability (8)-(9), (1
 
 @dataclass(frozen=True)
 class DesignSpec:
-    """The parameters of a design, but for the car and its speed.
+    """The parameters of a design, but for the car and its speed."""
 
-    Attributes:
-        period: Control period in ticks.
-        full_scale: Yaw moment at a first input of 1 (N m).
-        steers: Whether steering is the second input.
-        kind: Index in `REFERENCES`.
-        disturbances: Key of `DISTURBANCES`.
-        disturbance_time: Time in which forces decay (s).
-        steer_weight: Factor on the cost of added steering.
-    """
-
-    period: int
-    full_scale: float
-    steers: bool
-    kind: int
-    disturbances: str = "none"
-    disturbance_time: float = 0.3
-    steer_weight: float = 1.0
+    period: int  # control period in ticks
+    full_scale: float  # yaw moment at a first input of 1 (N m)
+    steers: bool  # whether steering is the second input
+    kind: int  # index in `REFERENCES`
+    disturbances: str = "none"  # key of `_DISTURBANCES`
+    disturbance_time: float = 0.3  # time in which forces decay (s)
+    steer_weight: float = 1.0  # factor on the cost of added steering
 
     @property
     def states(self) -> tuple[str, ...]:
         """Names of all states."""
-        return DYNAMIC + HELD + DISTURBANCES[self.disturbances]
+        return DYNAMIC + _HELD + _DISTURBANCES[self.disturbances]
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -78,22 +63,14 @@ class DesignModel:
     """The model x+ = G x + H u over a period, with the cost x'Qx + u'Ru + 2 x'Nu in units of J.
 
     The inputs move the first len(DYNAMIC) states; the others move by themselves alone.
-
-    Attributes:
-        G: Transition of the states, shape (n, n).
-        H: Effect of the inputs, shape (n, m).
-        Q: Weight of the states, shape (n, n).
-        R: Weight of the inputs, shape (m, m).
-        N: Cross weight, shape (n, m).
-        design_spec: Parameters that name states and inputs.
     """
 
-    G: Array
-    H: Array
-    Q: Array
-    R: Array
-    N: Array
-    design_spec: DesignSpec
+    G: Array  # transition of the states, shape (n, n)
+    H: Array  # effect of the inputs, shape (n, m)
+    Q: Array  # weight of the states, shape (n, n)
+    R: Array  # weight of the inputs, shape (m, m)
+    N: Array  # cross weight, shape (n, m)
+    design_spec: DesignSpec  # parameters that name states and inputs
 
 
 def make_design_model(vehicle: Vehicle, speed: float, design_spec: DesignSpec) -> DesignModel:
@@ -106,9 +83,6 @@ def make_design_model(vehicle: Vehicle, speed: float, design_spec: DesignSpec) -
 
     Returns:
         Model in steps of `design_spec.period` ticks.
-
-    Raises:
-        ValueError: The speed is not positive.
     """
     G1, H1, C, D = make_tick_model(vehicle, speed, design_spec)
     n, m = H1.shape
@@ -121,9 +95,8 @@ def make_design_model(vehicle: Vehicle, speed: float, design_spec: DesignSpec) -
         cost_matrix += cost_outputs.T @ W @ cost_outputs
         G, H = np.split(step @ transition, [n], axis=1)
     cost_matrix = 0.5 * (cost_matrix + cost_matrix.T)
-    return DesignModel(
-        G, H, cost_matrix[:n, :n], cost_matrix[n:, n:], cost_matrix[:n, n:], design_spec
-    )
+    Q, R, N = cost_matrix[:n, :n], cost_matrix[n:, n:], cost_matrix[:n, n:]
+    return DesignModel(G, H, Q, R, N, design_spec)
 
 
 def make_tick_model(
@@ -169,11 +142,8 @@ def make_tick_model(
 def _discretise_plane(
     vehicle: Vehicle, speed: float, design_spec: DesignSpec
 ) -> tuple[Array, Array]:
-    """Discretise beta and gamma over a tick.
-
-    Returns (2, 6), from themselves, both actuators and both commands, and (2, 2) from the
-    disturbances. An actuator without lag is its command.
-    """
+    """Discretise beta and gamma over a tick: from the plane (2, 6) and the disturbances (2, 2)."""
+    # an actuator without lag is its command; the plane: itself, both actuators, both commands
     model = make_bicycle_model(vehicle, speed)
     scale = np.array([design_spec.full_scale, 1.0])
     B = model.B[:, ::-1] * scale  # columns N_z, delta_f, as the inputs stand
@@ -193,7 +163,7 @@ def _discretise_plane(
 
 
 def compute_cost_weights(design_spec: DesignSpec) -> Sequence[float]:
-    """Compute the weights of the four outputs of the cost: docs/ARCHITECTURE.md, "Cost and score".
+    """Compute the weights of the cost's four outputs: docs/ARCHITECTURE.md, "Cost and score".
 
     Args:
         design_spec: Parameters of the design.
@@ -212,41 +182,29 @@ def compute_cost_weights(design_spec: DesignSpec) -> Sequence[float]:
 def compute_regulator(model: DesignModel) -> tuple[Array, Array]:
     """Compute the regulator u = -K x of least cost, and the cost of another input.
 
-    Another input for one period costs (u + K x)'S(u + K x) more. See `compute_cost_to_go`.
-
     Args:
         model: Design model.
 
     Returns:
-        K (m, n) and S (m, m).
+        K (m, n) and S (m, m): another input costs (u + K x)'S(u + K x) more in one period.
     """
     K, V = compute_cost_to_go(model)
-    return K, compute_input_cost(model, V)
+    return K, _compute_input_cost(model, V)
 
 
-def compute_input_cost(model: DesignModel, V: Array) -> Array:
-    """Compute S (m, m) of `compute_regulator`.
-
-    Args:
-        model: Design model.
-        V: Cost to go, shape (n, n).
-
-    Returns:
-        S = R + H' V H.
-    """
+def _compute_input_cost(model: DesignModel, V: Array) -> Array:
+    """Compute S = R + H'V H, shape (m, m), of `compute_regulator` by the cost to go V (n, n)."""
     return model.R + model.H.T @ V @ model.H
 
 
 def compute_cost_to_go(model: DesignModel) -> tuple[Array, Array]:
     """Compute the regulator u = -K x of least cost, and its cost to go x'Vx.
 
-    The cost to go lacks a part that no input changes. See `solve_lqr`.
-
     Args:
         model: Design model.
 
     Returns:
-        K (m, n) and V (n, n).
+        K (m, n) and V (n, n), but for a part that no input changes.
     """
     return solve_lqr(model.G, model.H, model.Q, model.R, model.N, len(DYNAMIC))
 
@@ -362,17 +320,15 @@ def make_gain_table(
     """
     shape = len(speeds), max(len(fronts), 1), max(len(rears), 1)
     gains, terminal = [], []
-    for speed, front, rear in itertools.product(
-        speeds, fronts or (vehicle.front_stiffness,), rears or (vehicle.rear_stiffness,)
-    ):
+    stiffnesses = fronts or (vehicle.front_stiffness,), rears or (vehicle.rear_stiffness,)
+    for speed, front, rear in itertools.product(speeds, *stiffnesses):
         car = vehicle.replace(front_stiffness=front, rear_stiffness=rear)
         model = make_design_model(car, speed, design_spec)
         K, V = compute_cost_to_go(model)
-        gains.append(np.hstack([K, compute_input_cost(model, V)]))
+        gains.append(np.hstack([K, _compute_input_cost(model, V)]))
         terminal.append(_factor_cost(V))
-    return GainTables(
-        *(np.array(parts).reshape(*shape, *parts[0].shape) for parts in (gains, terminal))
-    )
+    tables = (np.array(parts).reshape(*shape, *parts[0].shape) for parts in (gains, terminal))
+    return GainTables(*tables)
 
 
 def _factor_cost(V: Array) -> Array:

@@ -1,10 +1,7 @@
-"""A policy's card: what it was trained on, how, and what it costs against others.
+"""A learned policy: its card, its file, and the controller that runs its network by NumPy.
 
-A learned policy as one file: weights as safetensors, whose metadata hold the card.
-
-Reading it runs no code: safetensors are numbers, the card is JSON.
-
-A learned policy as one more controller: weights from a file, run by NumPy.
+The file holds weights as safetensors, whose metadata hold the card as JSON; reading it runs no
+code. The card says what the policy was trained on, how, and what it costs against others.
 """
 
 import hashlib
@@ -37,6 +34,11 @@ from ...estimators.wrappers.estimate import EstimateObservation
 from ..controllers.base import Controller
 from ..env_info import AnyEnv, get_env_facts, make_env
 
+FORMAT = 2  # rises when an older sideslip could not read, or would misread, a newer file
+ZIP = ".zip"  # of stable-baselines3, which `agents.training.export` reads
+FOLDER = Path(__file__).resolve().with_name("policies")
+_DEFAULT = "ppo-yaw-vision"
+
 JsonMap = dict[str, Any]
 
 
@@ -44,43 +46,25 @@ JsonMap = dict[str, Any]
 class Card:
     """The card of a policy: what it was trained on, how, and its evaluation; JSON types only.
 
-    Attributes:
-        env_id: Id of the env.
-        observation: (name, unit) of each entry that the network takes.
-        control_period: Ticks between two decisions.
-        reference: Name in `envs.task.REFERENCES`, by which the policy was judged.
-        env_options: Arguments of `gym.make`.
-        estimator: Estimator of `EstimateObservation` around the env, "" for none.
-        estimator_options: Other arguments of `EstimateObservation`.
-        algorithm: Name of the training's algorithm.
-        algorithm_options: Options of the training.
-        command: Command line of the training.
-        seeds: Seeds by purpose ("training", ...).
-        steps: Steps of the environment.
-        cpu_seconds: CPU time of the training (s).
-        sideslip: Version of the package.
-        evaluation: Result of `benchmarks.studies.policies.evaluation`: seeds, and mean costs on
-            them of the policy, of no control and of the best classical line.
-
     Raises:
         ValueError: A value has another type, or one that JSON does not have.
     """
 
-    env_id: str
-    observation: tuple[tuple[str, str], ...]
-    control_period: int
-    reference: str
-    env_options: JsonMap = field(default_factory=dict)
-    estimator: str = ""
-    estimator_options: JsonMap = field(default_factory=dict)
-    algorithm: str = ""
-    algorithm_options: JsonMap = field(default_factory=dict)
-    command: str = ""
-    seeds: JsonMap = field(default_factory=dict)
-    steps: int = 0
-    cpu_seconds: float = 0.0
-    sideslip: str = __version__
-    evaluation: JsonMap = field(default_factory=dict)
+    env_id: str  # id of the env
+    observation: tuple[tuple[str, str], ...]  # (name, unit) of each entry that the network takes
+    control_period: int  # ticks between two decisions
+    reference: str  # name in `envs.task.REFERENCES`, by which the policy was judged
+    env_options: JsonMap = field(default_factory=dict)  # of `gym.make`
+    estimator: str = ""  # of `EstimateObservation` around the env, "" for none
+    estimator_options: JsonMap = field(default_factory=dict)  # of `EstimateObservation`
+    algorithm: str = ""  # name of the training's algorithm
+    algorithm_options: JsonMap = field(default_factory=dict)  # of the training
+    command: str = ""  # line of the training
+    seeds: JsonMap = field(default_factory=dict)  # by purpose ("training", ...)
+    steps: int = 0  # of the environment
+    cpu_seconds: float = 0.0  # of the training
+    sideslip: str = __version__  # version of the package
+    evaluation: JsonMap = field(default_factory=dict)  # seeds; costs of policy, none, classical
 
     def __post_init__(self) -> None:
         pairs = self.observation
@@ -114,16 +98,13 @@ class Card:
         Returns:
             Card of the env.
         """
-        options: JsonMap = {
-            "env_id": env_id,
-            "env_options": dict(env_options or {}),
-            "estimator": estimator,
-            "estimator_options": dict(estimator_options or {}),
-        }
-        env = make_env(env_id, options["env_options"])
+        options, further = dict(env_options or {}), dict(estimator_options or {})
+        env = make_env(env_id, options)
         if estimator:
-            env = EstimateObservation(env, estimator, **options["estimator_options"])
-        card = cls.from_env(env, **options, **rest)
+            env = EstimateObservation(env, estimator, **further)
+        known = {"env_id": env_id, "env_options": options}
+        known |= {"estimator": estimator, "estimator_options": further}
+        card = cls.from_env(env, **known, **rest)
         env.close()
         return card
 
@@ -139,13 +120,8 @@ class Card:
             Card of the env.
         """
         facts = get_env_facts(env)
-        entries = tuple((entry.name, entry.unit) for entry in facts.layout)
-        return cls(
-            observation=entries,
-            control_period=int(facts.control_period),
-            reference=facts.reference,
-            **rest,
-        )
+        rest["observation"] = tuple((entry.name, entry.unit) for entry in facts.layout)
+        return cls(control_period=int(facts.control_period), reference=facts.reference, **rest)
 
     def to_json(self, **extra: Any) -> str:
         """Convert the card to a JSON object.
@@ -191,33 +167,17 @@ def check_names_no_code(env_id: str, estimator: str, estimator_options: JsonMap)
 
 
 def _is_entry(pair: Any) -> bool:
-    return (
-        isinstance(pair, list | tuple)
-        and len(pair) == 2
-        and all(isinstance(word, str) for word in pair)
-    )
-
-
-FORMAT = 2
-"""Counts up when an older sideslip could not read, or would misread, a newer file: since 2 a
-network may have memory and more activations."""
-ZIP = ".zip"  # of stable-baselines3, which `agents.training.export` reads
-FOLDER = Path(__file__).resolve().with_name("policies")
+    is_pair = isinstance(pair, list | tuple) and len(pair) == 2
+    return is_pair and all(isinstance(word, str) for word in pair)
 
 
 @dataclass(frozen=True)
 class Policy:
-    """A network and its card.
+    """A network and its card."""
 
-    Attributes:
-        name: Name of the file without its ending.
-        network: Network that computes the action.
-        card: Card of its training.
-    """
-
-    name: str
-    network: Network
-    card: Card
+    name: str  # name of the file without its ending
+    network: Network  # network that computes the action
+    card: Card  # card of its training
 
     @property
     def reads(self) -> npt.NDArray[np.bool_]:
@@ -273,8 +233,7 @@ def save_policy(path: str | Path, network: Network, card: Card) -> None:
         card: Card of its training.
 
     Raises:
-        ValueError: The ending is another, or the card's observation has another width than the
-            network's input.
+        ValueError: The ending is another, or the network takes another width than the card's.
     """
     target = Path(path)
     if target.suffix != SUFFIX:
@@ -299,8 +258,7 @@ def load_policy(path: str | Path) -> Policy:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file is no policy, is cut short, is larger than `MAX_BYTES` or has another
-            format, or its card and tensors do not fit together.
+        ValueError: The file is no policy of a known format, or card and tensors do not fit.
     """
     file = _find_file(path)
     tensors, metadata = read_tensors(file, "policy")
@@ -316,21 +274,21 @@ def load_policy(path: str | Path) -> Policy:
 
 
 def _find_file(path: str | Path) -> Path:
+    """Find the file of a path or of a shipped policy's name."""
     name = str(path)
     if name in list_shipped():
         return FOLDER / f"{name}{SUFFIX}"
     file = Path(path)
+    if file.is_dir():
+        raise FileNotFoundError(f"policy {name} is a folder")
     if not file.is_file():
-        if file.is_dir():
-            raise FileNotFoundError(f"policy {name} is a folder")
-        raise FileNotFoundError(
-            f"there is no such file and {describe_unknown('policy', [name], list_shipped())}"
-        )
+        unknown = describe_unknown("policy", [name], list_shipped())
+        raise FileNotFoundError(f"there is no such file and {unknown}")
     return file
 
 
 def _read_card_fields(metadata: dict[str, str]) -> dict[str, Any]:
-    """The card's JSON object with the architecture, checked as far as the format goes."""
+    """Read the card's JSON object with the architecture, checked as far as the format goes."""
     if not {"format", "card"} <= metadata.keys():
         raise ValueError("safetensors without a card: this is not a policy of sideslip")
     known = [str(version) for version in range(1, FORMAT + 1)]
@@ -343,9 +301,6 @@ def _read_card_fields(metadata: dict[str, str]) -> dict[str, Any]:
     if metadata["format"] == "1" and isinstance(fields.get("network"), dict):
         fields["network"] |= NO_MEMORY  # it has none
     return fields
-
-
-DEFAULT = "ppo-yaw-vision"
 
 
 class PolicyController(Controller):
@@ -362,11 +317,10 @@ class PolicyController(Controller):
         policy: Shipped name, file's path, or `Policy`.
 
     Raises:
-        ValueError: The env lacks an entry that the policy reads or has another unit of it, has
-            another control period, or its action is narrower; or as `load_policy`.
+        ValueError: The env's entries, units, control period or action are not the policy's.
     """
 
-    def __init__(self, env: AnyEnv, policy: str | Path | Policy = DEFAULT) -> None:
+    def __init__(self, env: AnyEnv, policy: str | Path | Policy = _DEFAULT) -> None:
         self.policy = policy if isinstance(policy, Policy) else load_policy(policy)
         name, card, facts = self.policy.name, self.policy.card, get_env_facts(env)
         reads = self.policy.reads

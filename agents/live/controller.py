@@ -1,11 +1,8 @@
-"""The car's computer: estimates at every tick, an observation and an action per control period.
+"""The car's computer: estimates at every tick, an action per control period, and sessions on disk.
 
-A session on disk: every accepted datagram with its tick, and its replay bit for bit.
-
-A file is a head (MAGIC, the length of its JSON, the JSON) and blocks that are appended as they are
-full. A crash loses the last one at most, and a file that is cut is read up to there. A block has
-a checksum of itself and one of all estimates so far, by which a replay checks itself. Nothing in a
-file is run.
+A session's file is a head (MAGIC, the length of its JSON, the JSON) and blocks that are appended
+as they are full; a file that is cut is read up to there. A block has a checksum of itself and one
+of all estimates so far, by which a replay checks itself bit for bit. Nothing in a file is run.
 """
 
 import json
@@ -35,24 +32,31 @@ from ...estimators.wrappers.outputs import write_outputs
 from ..env_info import get_env_facts
 from .messages import NO_PACKETS, Arrival, StreamSynchroniser, Tick
 
+MAGIC = b"SLIPSES1"
+MAX_BATCHES, _MAX_BLOCK_BYTES = 100, 1 << 13  # of a block at most: a tenth of a second
+_LENGTH = struct.Struct("!I")
+_BLOCK = struct.Struct("!4sIIII")  # magic, batches, bytes, checksums of these and of estimates
+_ITEM = struct.Struct("!HH")  # which batch of the block, bytes of the datagram
+_MAGIC = b"BLOK"
+_SETUP: dict[str, Any] = {
+    **dict.fromkeys(("estimator", "agent", "env"), str),
+    **dict.fromkeys(("options", "agent_options", "estimator_options"), dict),
+    "seed": int,
+    "patience": (int, type(None)),
+}
+"""Types of a session's setup, by key."""
+
 _reference, _filter_reference = as_python(compute_reference), as_python(filter_reference)
 
 
 class OnboardController:
-    """An estimator and an agent on the wires' data.
-
-    For equal ticks its results equal those in the env, bit for bit.
+    """An estimator and an agent on the wires' data, equal to those in the env bit for bit.
 
     Args:
         env: `EstimateObservation` with the sensors' clocks, the nominal car, the references and the
             control period; it is not driven.
         agent: Agent of `make_agent` for the env; None: without control.
         seed: Seed of the env, whose reset draws the sensors' phases.
-
-    Attributes:
-        names: Names of the states.
-        action: Newest action, shape (width,), None before the first.
-        has_new_action: Whether the action is of this tick.
 
     Raises:
         TypeError: The env is another one.
@@ -76,7 +80,10 @@ class OnboardController:
         self._X: Array = np.zeros((1, len(self.names)))
         self._S = np.zeros_like(self._X)
         self.begin(0)
-        self._warm_up()
+        row, packet = base.record.fast[0], np.zeros((1, NO_PACKETS.shape[1]))
+        for number in range(self.facts.control_period + 1):  # compiles the code of first ticks
+            self.take(Tick(number, row, 0.0, packet, number == 0))
+        self.begin(0)
 
     @property
     def x(self) -> Array:
@@ -107,8 +114,8 @@ class OnboardController:
             self._z[sensor.captured] = NEVER
         self._count, self._packets = 0, [NO_PACKETS]
         self._memory, self._start = None, np.ones(1, np.bool_)
-        self.action: npt.NDArray[np.float32] | None = None
-        self.has_new_action = False
+        self.action: npt.NDArray[np.float32] | None = None  # the newest
+        self.has_new_action = False  # of this tick
 
     def take(self, tick: Tick) -> None:
         """Process a tick: the estimate and, at the end of a control period, the agent's action.
@@ -142,32 +149,24 @@ class OnboardController:
             self._count = 0
 
     def _compute_action(self, number: int) -> None:
-        obs, start = self.make_observation(number), self._start
+        obs, start = self._make_observation(number), self._start
         self._count, self._packets, self._start = 0, [NO_PACKETS], np.zeros(1, np.bool_)
         if self.agent is None:
             self.action = np.zeros(self.facts.width, np.float32)
-            return
-        prediction = self.agent.predict(obs, self._memory, start, deterministic=True)
-        self.action, self._memory = prediction
+        else:
+            prediction = self.agent.predict(obs, self._memory, start, deterministic=True)
+            self.action, self._memory = prediction
 
-    def make_observation(self, number: int) -> npt.NDArray[np.float32]:
-        """Make the observation that the env's agents would get.
-
-        Args:
-            number: Number of the tick.
-
-        Returns:
-            Observation with the estimator's outputs, shape (k,).
-        """
+    def _make_observation(self, number: int) -> npt.NDArray[np.float32]:
+        """Make the observation (k,) that the env's agents would get at a tick."""
         done, outputs = self._count, self.outputs
         packets = np.concatenate(self._packets)
         self._rows[done:] = self._rows[done - 1]
         shown = len(self._rows) if self._switches[FLAGS.all_samples] else done
         obs = np.empty(self._bounds.shape[1], np.float32)
         self._z[Z.clock.tick] = number
-        row = EpisodeArrays(
-            self._p, self._z, self._switches, obs, self._rows, packets, np.zeros(len(REPORT))
-        )
+        switches, report = self._switches, np.zeros(len(REPORT))
+        row = EpisodeArrays(self._p, self._z, switches, obs, self._rows, packets, report)
         observe(row, shown, len(packets), self._refs, self._bounds)
         out, estimator = np.empty(len(outputs.layout), np.float32), self.estimator
         last = outputs.inner, outputs.plan, outputs.limits, 0.0, 0.0, out, np.zeros(3)
@@ -178,38 +177,13 @@ class OnboardController:
             write_outputs(estimator, obs, *last)
         return out
 
-    def _warm_up(self) -> None:
-        """Compile the code of the first ticks."""
-        row, packet = self.base.record.fast[0], np.zeros((1, NO_PACKETS.shape[1]))
-        for number in range(self.facts.control_period + 1):
-            self.take(Tick(number, row, 0.0, packet, number == 0))
-        self.begin(0)
-
-
-MAGIC = b"SLIPSES1"
-MAX_BATCHES, MAX_BLOCK_BYTES = 100, 1 << 13  # of a block at most: a tenth of a second
-_LENGTH = struct.Struct("!I")
-_BLOCK = struct.Struct("!4sIIII")  # magic, batches, bytes, checksums of these and of estimates
-_ITEM = struct.Struct("!HH")  # which batch of the block, bytes of the datagram
-_MAGIC = b"BLOK"
-_SETUP: dict[str, Any] = {
-    **dict.fromkeys(("estimator", "agent", "env"), str),
-    **dict.fromkeys(("options", "agent_options", "estimator_options"), dict),
-    "seed": int,
-    "patience": (int, type(None)),
-}
-"""Types of a session's setup, by key."""
-
 
 class Recorder:
-    """Writes a session.
+    """Writes a session; FileExistsError for a file that exists.
 
     Args:
         path: File to write.
         setup: Setup of the replay, in JSON types.
-
-    Raises:
-        FileExistsError: The file exists; a session is never overwritten.
     """
 
     def __init__(self, path: Path | str, setup: Mapping[str, Any]) -> None:
@@ -224,7 +198,7 @@ class Recorder:
         Args:
             onboard: On-board controller after a tick.
         """
-        self._digest = update_digest(onboard, self._digest)
+        self._digest = _update_digest(onboard, self._digest)
 
     def take(self, accepted: list[bytes]) -> None:
         """Record the accepted datagrams of a batch.
@@ -235,7 +209,7 @@ class Recorder:
         for data in accepted:
             self._items += _ITEM.pack(self._batches, len(data)) + data
         self._batches += 1
-        if self._batches == MAX_BATCHES or len(self._items) > MAX_BLOCK_BYTES:
+        if self._batches == MAX_BATCHES or len(self._items) > _MAX_BLOCK_BYTES:
             self._write()
 
     def _write(self) -> None:
@@ -250,26 +224,13 @@ class Recorder:
         self._file.close()
 
 
-def update_digest(onboard: OnboardController, digest: int) -> int:
-    """Update the checksum of all estimates by the newest one.
-
-    Args:
-        onboard: On-board controller after a tick.
-        digest: Checksum of the estimates before.
-
-    Returns:
-        CRC-32 of all estimates.
-    """
+def _update_digest(onboard: OnboardController, digest: int) -> int:
+    """Update the CRC-32 of all estimates by the newest one."""
     return zlib.crc32(onboard.std.tobytes(), zlib.crc32(onboard.x.tobytes(), digest))
 
 
-class SessionBlock(NamedTuple):
-    """A block of a session.
-
-    Attributes:
-        batches: Batches of datagrams.
-        digest: Checksum of all estimates after the block.
-    """
+class _SessionBlock(NamedTuple):
+    """Batches of datagrams, and the checksum of all estimates after them."""
 
     batches: list[list[Arrival]]
     digest: int
@@ -308,7 +269,7 @@ def _read_header(path: Path | str, file: Any) -> dict[str, Any]:
     raise ValueError(f"{path} is no session of `sideslip live --record`, or only its beginning")
 
 
-def read_blocks(path: Path | str) -> Iterator[SessionBlock]:
+def read_blocks(path: Path | str) -> Iterator[_SessionBlock]:
     """Read the blocks of a session up to its end, or to where it was cut or damaged.
 
     Args:
@@ -324,7 +285,7 @@ def read_blocks(path: Path | str) -> Iterator[SessionBlock]:
             batches = _parse_batches(data, count)
             if batches is None:
                 return
-            yield SessionBlock(batches, digest)
+            yield _SessionBlock(batches, digest)
 
 
 def _parse_batches(data: bytes, count: int) -> list[list[Arrival]] | None:
@@ -340,23 +301,16 @@ def _parse_batches(data: bytes, count: int) -> list[list[Arrival]] | None:
     return batches if offset == len(data) else None
 
 
-class SessionReplay(NamedTuple):
-    """The result of a replay.
+class _SessionReplay(NamedTuple):
+    """The result of a replay."""
 
-    Attributes:
-        ticks: Numbers of the ticks, shape (T,).
-        x: Estimates, shape (T, n).
-        std: Standard deviations, shape (T, n).
-        same: Whether every block's checksum of the estimates is the session's.
-    """
-
-    ticks: npt.NDArray[np.int64]
-    x: npt.NDArray[np.float64]
-    std: npt.NDArray[np.float64]
-    same: bool
+    ticks: npt.NDArray[np.int64]  # numbers of the ticks, shape (T,)
+    x: npt.NDArray[np.float64]  # estimates, shape (T, n)
+    std: npt.NDArray[np.float64]  # standard deviations, shape (T, n)
+    same: bool  # whether every block's checksum of the estimates is the session's
 
 
-def replay(path: Path | str, onboard: OnboardController, patience: int | None) -> SessionReplay:
+def replay(path: Path | str, onboard: OnboardController, patience: int | None) -> _SessionReplay:
     """Replay a session.
 
     Args:
@@ -374,11 +328,11 @@ def replay(path: Path | str, onboard: OnboardController, patience: int | None) -
         for batch in block.batches:
             for tick in assembler.take(batch):
                 onboard.take(tick)
-                digest = update_digest(onboard, digest)
+                digest = _update_digest(onboard, digest)
                 ticks.append(tick.number)
                 numbers[0].append(onboard.x.copy())
                 numbers[1].append(onboard.std.copy())
         same = same and digest == block.digest
     shape = len(ticks), len(onboard.names)
     x, std = (np.array(values).reshape(shape) for values in numbers)
-    return SessionReplay(np.array(ticks, np.int64), x, std, same)
+    return _SessionReplay(np.array(ticks, np.int64), x, std, same)

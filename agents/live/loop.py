@@ -1,7 +1,4 @@
-"""UDP ports, and waiting for a point in time with what arrives meanwhile.
-
-The loop: a tick every millisecond of the monotonic clock, and its missed deadlines.
-"""
+"""The loop of an on-board controller: UDP port, a tick every millisecond, missed deadlines."""
 
 import errno
 import gc
@@ -9,7 +6,8 @@ import math
 import select
 import socket
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,10 +24,10 @@ from .messages import (
     encode,
 )
 
-LOOPBACK, PORT = "127.0.0.1", 47001
-BUFFER = 1 << 22  # bytes of the kernel's, as far as it grants them
+LOOPBACK = "127.0.0.1"
+_BUFFER = 1 << 22  # bytes of the kernel's, as far as it grants them
 MAX_BATCH = 512  # datagrams of a batch: a flood of them does not stop the loop
-SPIN = 150_000  # ns before a point in time, which sleeping alone would miss
+_SPIN = 150_000  # ns before a point in time, which sleeping alone would miss
 
 clock = time.monotonic_ns
 """Time of the monotonic clock, which is never set (ns)."""
@@ -63,22 +61,18 @@ def wait_until(deadline: int) -> None:
     Args:
         deadline: Time of `clock` (ns).
     """
-    if (left := deadline - clock() - SPIN) > 0:
+    if (left := deadline - clock() - _SPIN) > 0:
         time.sleep(left * 1e-9)
     while clock() < deadline:
         pass
 
 
-class Port:
+class Port(AbstractContextManager["Port"]):
     """A UDP port that listens on one of this machine's addresses, and numbers its datagrams.
 
     Args:
         host: Host to bind.
         port: Number to bind, 0 for any.
-
-    Attributes:
-        address: Bound host and port.
-        unsent: Datagrams that the network did not take.
 
     Raises:
         OSError: The port is in use, or the host is unknown.
@@ -86,18 +80,17 @@ class Port:
 
     def __init__(self, host: str = LOOPBACK, port: int = 0) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
         self._socket.setblocking(False)
         try:
             self._socket.bind((host, port))
         except OSError as error:
             self._socket.close()
-            reason = (
-                "is in use" if error.errno == errno.EADDRINUSE else f"is none: {error.strerror}"
-            )
+            in_use = error.errno == errno.EADDRINUSE
+            reason = "is in use" if in_use else f"is none: {error.strerror}"
             raise OSError(f"UDP port {port} of {host} {reason}") from None
-        self.address: tuple[str, int] = self._socket.getsockname()
-        self.unsent = 0
+        self.address: tuple[str, int] = self._socket.getsockname()  # bound host and port
+
         self._sent: dict[int, int] = {}
 
     def send(
@@ -113,20 +106,11 @@ class Port:
             names: Names of states, for estimates.
         """
         number = self._sent[kind] = self._sent.get(kind, -1) + 1
-        try:
+        with suppress(OSError):  # the network takes no datagram now
             self._socket.sendto(encode(kind, number, stamp, values, names), to)
-        except OSError:
-            self.unsent += 1
 
-    def receive_available(self, batch: list[Arrival]) -> list[Arrival]:
-        """Append the datagrams that have arrived to a batch, up to `MAX_BATCH`.
-
-        Args:
-            batch: Datagrams so far, extended.
-
-        Returns:
-            The same batch.
-        """
+    def _receive_available(self, batch: list[Arrival]) -> list[Arrival]:
+        """Append the datagrams that have arrived to a batch, up to `MAX_BATCH`."""
         while len(batch) < MAX_BATCH:
             try:
                 data, sender = self._socket.recvfrom(MAX_BYTES + 1)
@@ -138,16 +122,16 @@ class Port:
         return batch
 
     def wait(self, seconds: float) -> list[Arrival]:
-        """Wait for the first datagrams, and return none after a timeout.
+        """Wait for the first datagrams.
 
         Args:
             seconds: Timeout (s).
 
         Returns:
-            Datagrams in the order of their arrival.
+            Datagrams in the order of their arrival, none after a timeout.
         """
         select.select([self._socket], [], [], max(seconds, 0.0))
-        return self.receive_available([])
+        return self._receive_available([])
 
     def receive_until(self, deadline: int) -> list[Arrival]:
         """Receive datagrams until a point in time, each with its time of arrival.
@@ -159,36 +143,30 @@ class Port:
             Datagrams in the order of their arrival.
         """
         batch: list[Arrival] = []
-        while (left := deadline - clock() - SPIN) > 0:
+        while (left := deadline - clock() - _SPIN) > 0:
             if len(batch) >= MAX_BATCH:
                 time.sleep(left * 1e-9)
                 break
             if select.select([self._socket], [], [], left * 1e-9)[0]:
-                self.receive_available(batch)
+                self._receive_available(batch)
         while clock() < deadline:
-            self.receive_available(batch)
-        return self.receive_available(batch)
+            self._receive_available(batch)
+        return self._receive_available(batch)
 
     def close(self) -> None:
         """Close the port."""
         self._socket.close()
 
-    def __enter__(self) -> "Port":
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
 
-PERIOD = 1_000_000  # ns
+PERIOD = 1_000_000  # ns, a tick of the loop
 LEAD = 100_000  # ns from a fast row's arrival to the deadline that follows it
-PHASE_GAIN, MAX_PHASE_STEP = (
-    0.02,
-    5_000,
-)  # of the distance from that, ns a tick: two clocks drift apart
-SUSPENDED = 1_000_000_000  # ns; who comes this late was not merely busy
-STATUS_EVERY = 100  # ticks
-IDLE = 0.1  # s
+PHASE_GAIN, MAX_PHASE_STEP = 0.02, 5_000  # of the distance, ns a tick: two clocks drift apart
+_SUSPENDED = 1_000_000_000  # ns; who comes this late was not merely busy
+_STATUS_EVERY = 100  # ticks
+_IDLE = 0.1  # s
 _TOP = 100_000  # us
 
 
@@ -232,35 +210,23 @@ class Histogram:
         return {"median": self.quantile(0.5), "p999": self.quantile(0.999), "max": self.largest}
 
 
-COUNTERS = ("ticks", "deadlines", "misses", "per_million", "suspensions", "actions", "seconds")
-TIMES = ("jitter", "latency", "work")
+_COUNTERS = ("ticks", "deadlines", "misses", "per_million", "suspensions", "actions", "seconds")
+_TIMES = ("jitter", "latency", "work")
 
 
 @dataclass
-class Statistics:
-    """The measurements of a loop.
+class _Statistics:
+    """The measurements of a loop."""
 
-    Attributes:
-        jitter: Times from a deadline to waking up (us).
-        latency: Times from a batch's oldest datagram to the estimates sent (us).
-        work: Times of a tick's work (us).
-        deadlines: Number of deadlines that were due.
-        misses: Deadlines that passed during the work of an earlier one.
-        suspensions: Number of misses of more than a second.
-        ticks: Ticks of the estimator.
-        actions: Number of controls sent.
-        seconds: Duration of the run (s).
-    """
-
-    jitter: Histogram = field(default_factory=Histogram)
-    latency: Histogram = field(default_factory=Histogram)
-    work: Histogram = field(default_factory=Histogram)
-    deadlines: int = 0
-    misses: int = 0
-    suspensions: int = 0
-    ticks: int = 0
-    actions: int = 0
-    seconds: float = 0.0
+    jitter: Histogram = field(default_factory=Histogram)  # times from a deadline to waking up (us)
+    latency: Histogram = field(default_factory=Histogram)  # oldest datagram to sending (us)
+    work: Histogram = field(default_factory=Histogram)  # times of a tick's work (us)
+    deadlines: int = 0  # number of deadlines that were due
+    misses: int = 0  # deadlines that passed during the work of an earlier one
+    suspensions: int = 0  # number of misses of more than a second
+    ticks: int = 0  # ticks of the estimator
+    actions: int = 0  # number of controls sent
+    seconds: float = 0.0  # duration of the run (s)
 
     @property
     def per_million(self) -> float:
@@ -268,39 +234,21 @@ class Statistics:
         return 1e6 * self.misses / max(self.deadlines, 1)
 
 
-def _format_counts(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-
-
 @dataclass
 class Loop:
-    """An on-board controller on a port.
+    """An on-board controller on a port."""
 
-    Attributes:
-        onboard: Estimator and agent.
-        assembler: Synchroniser of the datagrams.
-        port: Port that receives and sends.
-        targets: Addresses that get every estimate.
-        viewer: Address that gets every tenth estimate and the status.
-        step: Whether time is that of the stamps: each datagram is processed at its arrival.
-        recorder: Recorder of the session.
-        watch: Function that is called after each tick.
-        patience: Time without a fast row after which `run` ends (s).
-        statistics: Measurements of the loop.
-        ended: Reason of the end.
-    """
-
-    onboard: OnboardController
-    assembler: StreamSynchroniser
-    port: Port
-    targets: Sequence[Any] = ()
-    viewer: Any = None
-    step: bool = False
-    recorder: Recorder | None = None
-    watch: Callable[[Tick], None] | None = None
-    patience: float = 30.0
-    statistics: Statistics = field(default_factory=Statistics)
-    ended: str = ""
+    onboard: OnboardController  # estimator and agent
+    assembler: StreamSynchroniser  # synchroniser of the datagrams
+    port: Port  # receives and sends
+    targets: Sequence[Any] = ()  # addresses that get every estimate
+    viewer: Any = None  # address that gets every tenth estimate and the status
+    step: bool = False  # whether time is that of the stamps: datagrams are processed as they arrive
+    recorder: Recorder | None = None  # of the session
+    watch: Callable[[Tick], None] | None = None  # called after each tick
+    patience: float = 30.0  # s without a fast row after which `run` ends
+    statistics: _Statistics = field(default_factory=_Statistics)
+    ended: str = ""  # reason of the end
 
     def run(self, stop: Callable[[], bool] = lambda: False, duration: float = math.inf) -> None:
         """Run until the drive is over, and set `ended`.
@@ -308,9 +256,6 @@ class Loop:
         Args:
             stop: Function that returns whether to stop.
             duration: Longest duration (s).
-
-        Raises:
-            TimeoutError: No inertial data comes at all.
         """
         start_time = last_heard = time.monotonic()
         had_gc = gc.isenabled()
@@ -319,7 +264,7 @@ class Loop:
         try:
             while not self._check_end(stop, start_time + duration):
                 if deadline is None or self.step:
-                    batch = self.port.wait(IDLE)
+                    batch = self.port.wait(_IDLE)
                     if self._take(batch) and not self.step:
                         deadline = clock() + PERIOD
                 else:
@@ -344,12 +289,10 @@ class Loop:
         return bool(self.ended)
 
     def _handle_silence(self) -> None:
-        host, port = self.port.address
+        (host, port), limit = self.port.address, f"{self.patience:g} s"
         if not self.statistics.ticks:
-            raise TimeoutError(
-                f"no inertial datagram came to {host}:{port} within {self.patience:g} s"
-            )
-        self.ended = f"no inertial data for {self.patience:g} s"
+            raise TimeoutError(f"no inertial datagram came to {host}:{port} within {limit}")
+        self.ended = f"no inertial data for {limit}"
 
     def _run_tick(self, deadline: int) -> int:
         """Wait for a deadline, process the arrivals, and return the next deadline."""
@@ -370,7 +313,7 @@ class Loop:
             missed = (end_time - deadline) // PERIOD + 1
             statistics.misses += missed
             statistics.deadlines += missed
-            statistics.suspensions += missed * PERIOD > SUSPENDED
+            statistics.suspensions += missed * PERIOD > _SUSPENDED
             deadline += missed * PERIOD
         return deadline
 
@@ -392,21 +335,18 @@ class Loop:
 
     def _send(self, tick: Tick) -> None:
         onboard, stamp = self.onboard, tick.number * TICK_US
-        if (
-            onboard.has_new_action
-            and onboard.action is not None
-            and self.assembler.sender is not None
-        ):
+        sender, action = self.assembler.sender, onboard.action
+        if onboard.has_new_action and action is not None and sender is not None:
             self.statistics.actions += 1
-            moment = float(onboard.action[0]) * onboard.facts.full_scale
-            turn = float(onboard.action[1]) if len(onboard.action) > 1 else 0.0
+            moment = float(action[0]) * onboard.facts.full_scale
+            turn = float(action[1]) if len(action) > 1 else 0.0
             control = moment, turn * onboard.facts.authority
-            self.port.send(self.assembler.sender, DatagramKind.CONTROL, stamp, control)
+            self.port.send(sender, DatagramKind.CONTROL, stamp, control)
         receivers = [*self.targets, self.viewer] if tick.number % 10 == 0 else self.targets
         for target in filter(None, receivers):
             values = (*onboard.x.tolist(), *onboard.std.tolist())
             self.port.send(target, DatagramKind.ESTIMATE, stamp, values, onboard.names)
-        if self.viewer is not None and tick.number % STATUS_EVERY == 0:
+        if self.viewer is not None and tick.number % _STATUS_EVERY == 0:
             self.port.send(self.viewer, DatagramKind.STATUS, stamp, self.status())
 
     def status(self) -> LoopStatus:
@@ -420,9 +360,9 @@ class Loop:
     def numbers(self) -> dict[str, Any]:
         """Collect all measurements, in JSON types."""
         statistics = self.statistics
-        times = {f"{name}_us": getattr(statistics, name).summarise() for name in TIMES}
+        times = {f"{name}_us": getattr(statistics, name).summarise() for name in _TIMES}
         counts = {"counts": dict(self.assembler.counts), "refused": self.onboard.refused}
-        return {name: getattr(statistics, name) for name in COUNTERS} | times | counts
+        return {name: getattr(statistics, name) for name in _COUNTERS} | times | counts
 
     def lines(self, name: str) -> list[str]:
         """Format the first lines of a verdict on the loop.
@@ -433,9 +373,9 @@ class Loop:
         Returns:
             Two lines, three where there were deadlines.
         """
-        m, counts = self.statistics, self.assembler.counts
+        m, tables = self.statistics, (self.assembler.counts, self.onboard.refused)
         ended = f"{name}: {m.ticks} ticks in {m.seconds:.1f} s, {self.ended}"
-        ignored, refused = map(_format_counts, (counts, self.onboard.refused))
+        ignored, refused = (", ".join(f"{n} {key}" for key, n in x.items() if n) for x in tables)
         by = f"; packets that the estimator refused: {refused}" if refused else ""
         lines = [f"{ended}.", f"Ignored or bridged: {ignored or 'nothing'}{by}."]
         if m.deadlines:

@@ -1,4 +1,4 @@
-"""The datagrams on a car's wires: their format, and a decoder that nothing makes raise.
+"""The datagrams on a car's wires: their format, a decoder that raises nothing, and ticks of them.
 
 Network byte order: a header of 20 bytes, `count` doubles and, behind the estimates, names.
 
@@ -13,13 +13,10 @@ Network byte order: a header of 20 bytes, `count` doubles and, behind the estima
 
 FIELDS names the doubles of each kind, in SI units. A change of any of it is another VERSION.
 
-From datagrams to ticks: fast rows and packets as estimators take them, in any order of arrival.
-
-Time is that of the inertial stamps, so that two clocks may drift apart. A fast row ends its tick;
-packets of slow sensors belong to the next row. They were captured their age before their stamp,
-or before that row where the stamp is 0: their sender has another clock. Lost and late datagrams
-are counted and bridged by the last row, held. Equal batches give equal ticks, so that a session
-can be replayed.
+Time is that of the inertial stamps. A fast row ends its tick; packets of slow sensors belong to the
+next row. They were captured their age before their stamp, or before that row where the stamp is 0.
+Lost and late datagrams are counted and bridged by the last row, held. Equal batches give equal
+ticks, so that a session can be replayed.
 """
 
 import math
@@ -42,6 +39,11 @@ LIMIT = 1e7  # the largest magnitude of any value, SI
 MAX_STAMP = 2**53  # us: 285 years, and a whole number as a double too
 MAX_AGE = 10.0  # s, of a slow sensor's sample
 TICK_US = 1000  # us a tick
+PATIENCE = 10  # ticks of silence, from which on the last row is held
+MAX_HELD = 1000  # ticks that are bridged; a longer gap begins anew
+MAX_BEHIND = 100  # rows from the past in succession: then the sender's clock was set back
+_WINDOW = 1024  # sequence numbers; an older one is of a sender that began anew
+_MAX_WAITING = 64  # packets of slow sensors before a fast row
 
 
 class DatagramKind(IntEnum):
@@ -83,16 +85,13 @@ class LoopStatus(NamedTuple):
     time: float = 0.0  # us of the last tick's work
 
 
-def _list_slow_fields(place: int) -> tuple[str, ...]:
-    return *(value.name for value in SLOW[place].values), "age", "quality"
-
-
 SENSORS = {DatagramKind.CAMERA: CAMERA, DatagramKind.GPS: GPS}
 FIELDS: dict[int, tuple[str, ...]] = {
     DatagramKind.INERTIAL: (*FAST._fields, "steer_next"),  # rad, the driver's command from now on
-    **{
-        kind: _list_slow_fields(place) for kind, place in SENSORS.items()
-    },  # age: s from capture to sending
+    **{  # age: s from capture to sending
+        kind: (*(value.name for value in SLOW[place].values), "age", "quality")
+        for kind, place in SENSORS.items()
+    },
     DatagramKind.CONTROL: ("yaw_moment", "steering"),  # N m, rad, both added to the driver's
     DatagramKind.STATUS: LoopStatus._fields,
     DatagramKind.END: (),
@@ -166,30 +165,19 @@ def decode(data: bytes) -> Message | RejectReason:
     return Message(kind, sequence, stamp, values, names)
 
 
-PATIENCE = 10  # ticks of silence, from which on the last row is held
-MAX_HELD = 1000  # ticks that are bridged; a longer gap begins anew
-MAX_BEHIND = 100  # rows from the past in succession: then the sender's clock was set back
-WINDOW = 1024  # sequence numbers; an older one is of a sender that began anew
-MAX_WAITING = 64  # packets of slow sensors before a fast row
 _INPUTS = (DatagramKind.INERTIAL, DatagramKind.END, *SENSORS)
 NO_PACKETS = np.zeros((0, PACKET_WIDTH))
-BRIDGED = ("lost", "restarted", "held", "late", "begun anew", "dropped")
+_BRIDGED = ("lost", "restarted", "held", "late", "begun anew", "dropped")
 """Counts beside `RejectReason`: sequence numbers that never came, senders that restarted, ticks
 without a row, rows behind their tick, gaps too long to be bridged, packets without a row."""
 
 
 class Arrival(NamedTuple):
-    """A datagram and its arrival.
+    """A datagram and its arrival."""
 
-    Attributes:
-        at: Time of the monotonic clock (ns).
-        data: Bytes of the datagram.
-        sender: Address of its sender.
-    """
-
-    at: int
-    data: bytes
-    sender: Any = None
+    at: int  # time of the monotonic clock (ns)
+    data: bytes  # bytes of the datagram
+    sender: Any = None  # address of its sender
 
 
 class Tick(NamedTuple):
@@ -206,23 +194,15 @@ class StreamSynchroniser:
     """Makes ticks from datagrams.
 
     Args:
-        patience: Calls of `take` without a fast row after which the last one is held; None: no
-            limit.
-
-    Attributes:
-        counts: Counts of ignored datagrams, by `RejectReason` and `BRIDGED`.
-        sender: Sender of the newest row.
-        accepted: Datagrams of the newest batch.
-        over: Whether the drive's end came.
-        silent: Calls since the last fast row.
+        patience: Calls of `take` without a fast row before the last one is held; None: no limit.
     """
 
     def __init__(self, patience: int | None = PATIENCE) -> None:
         self.patience = patience
-        self.counts: Counter[str] = Counter({name: 0 for name in (*RejectReason, *BRIDGED)})
-        self.sender: Any = None
-        self.accepted: list[bytes] = []
-        self.over, self.silent = False, 0
+        self.counts = Counter[str]({name: 0 for name in (*RejectReason, *_BRIDGED)})
+        self.sender: Any = None  # of the newest row
+        self.accepted: list[bytes] = []  # of the newest batch
+        self.over, self.silent = False, 0  # the drive's end came; calls since the last fast row
         self._newest: dict[int, int] = {}  # sequence numbers by kind
         self._waiting: list[tuple[int, Message]] = []
         self._last: Tick | None = None
@@ -241,10 +221,10 @@ class StreamSynchroniser:
         self.accepted.clear()
         for arrival in batch:
             message = decode(arrival.data)
-            if isinstance(message, RejectReason) or message.kind not in _INPUTS:
-                self.counts[
-                    message if isinstance(message, RejectReason) else RejectReason.KIND
-                ] += 1
+            if isinstance(message, RejectReason):
+                self.counts[message] += 1
+            elif message.kind not in _INPUTS:
+                self.counts[RejectReason.KIND] += 1
             elif self._check_order(message):
                 self.accepted.append(arrival.data)
                 if message.kind == DatagramKind.INERTIAL:
@@ -252,7 +232,9 @@ class StreamSynchroniser:
                     yield from self._process_row(message)
                 elif message.kind in SENSORS:
                     self._waiting.append((SENSORS[DatagramKind(message.kind)], message))
-                    self._remove_oldest(MAX_WAITING)
+                    if len(self._waiting) > _MAX_WAITING:  # no row takes them
+                        self.counts["dropped"] += 1
+                        del self._waiting[0]
                 elif message.kind == DatagramKind.END:
                     self.over = True
         last, patience = self._last, self.patience
@@ -269,7 +251,7 @@ class StreamSynchroniser:
         if newest is not None:
             advance = (message.sequence - newest) & 0xFFFFFFFF
             behind = 2**32 - advance
-            if advance == 0 or behind < WINDOW:
+            if advance == 0 or behind < _WINDOW:
                 self.counts[RejectReason.REORDERED if advance else RejectReason.DUPLICATE] += 1
                 return False
             if advance < 2**31:
@@ -282,7 +264,7 @@ class StreamSynchroniser:
 
     def _process_row(self, message: Message) -> Iterator[Tick]:
         """Yield the tick of a fast row, after those that are missing before it."""
-        row, number, last = message.values, round(message.stamp / TICK_US), self._last
+        number, last = round(message.stamp / TICK_US), self._last
         begins = last is None
         if last is not None:
             missing = number - last.number - 1
@@ -295,12 +277,11 @@ class StreamSynchroniser:
             self.counts["begun anew"] += begins
             for skipped in range(0 if begins else missing):
                 self.counts["held"] += 1
-                yield last._replace(
-                    number=last.number + 1 + skipped, packets=NO_PACKETS, begins=False
-                )
+                held = last.number + 1 + skipped
+                yield last._replace(number=held, packets=NO_PACKETS, begins=False)
         self._behind = 0
-        fast = np.array(row[:FAST_WIDTH])
-        yield self._finish_tick(Tick(number, fast, row[-1], NO_PACKETS, begins))
+        fast, steer_next = np.array(message.values[:FAST_WIDTH]), message.values[-1]
+        yield self._finish_tick(Tick(number, fast, steer_next, NO_PACKETS, begins))
 
     def _finish_tick(self, tick: Tick) -> Tick:
         """Add the waiting packets to a tick."""
@@ -318,9 +299,3 @@ class StreamSynchroniser:
             self._waiting.clear()
         self._last = tick._replace(packets=packets)
         return self._last
-
-    def _remove_oldest(self, limit: int) -> None:
-        """Remove the oldest packets where no row takes them."""
-        while len(self._waiting) > limit:
-            self.counts["dropped"] += 1
-            del self._waiting[0]

@@ -1,13 +1,11 @@
-"""The other end: a simulated car that sends its measurements and takes controls.
-
-The relay: a receiver's NMEA, decoded, as datagrams of course, speed, HDOP and satellites.
-"""
+"""The other end of the wires: a simulated car that takes controls, and a relay of NMEA."""
 
 import gc
 import math
 import signal
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from typing import Any
@@ -25,36 +23,27 @@ from ...envs.ticks import TICK
 from ..env_info import get_env_facts
 from ..rollout import Rollout, rollout
 from .loop import Port, clock, wait_until
-from .messages import MAX_AGE, SENSORS, TICK_US, DatagramKind, Message, RejectReason, decode
+from .messages import MAX_AGE, SENSORS, TICK_US, DatagramKind, RejectReason, decode
 
 MAX_TICKS = 250  # of a control period in lock-step: so many rows the kernel holds
-SLACK = 150_000  # ns before the next row is due, at which a control is too late
+_SLACK = 150_000  # ns before the next row is due, at which a control is too late
 CONTROL_TIMEOUT = 60.0  # s that lock-step waits for a control
+MAX_HDOP = 99.0  # of a receiver without a fix
+_MAX_PAUSE = 10.0  # s between two epochs of a file
 _KINDS = {place: kind for kind, place in SENSORS.items()}
 
 
 @dataclass
 class WireAgent:
-    """An agent on the wires: it sends the env's record and returns the controls that arrive.
+    """An agent on the wires: it sends the env's record and returns the controls that arrive."""
 
-    Attributes:
-        env: Bare `StabilityEnv`.
-        port: Port that sends.
-        to: Address of the receiver.
-        step: Lock-step, which waits for the control of every period. Otherwise a tick lasts a
-            millisecond over `speed`, and the last action holds where a control is late.
-        speed: Speed of the clock, 1 for real time.
-        late: Number of late controls.
-        periods: Number of control periods.
-    """
-
-    env: gym.Env[Any, Any]
-    port: Port
-    to: Any
-    step: bool = False
-    speed: float = 1.0
-    late: int = 0
-    periods: int = 0
+    env: gym.Env[Any, Any]  # bare `StabilityEnv`
+    port: Port  # sends
+    to: Any  # address of the receiver
+    step: bool = False  # wait for the control of every period
+    speed: float = 1.0  # of the clock, 1 for real time
+    late: int = 0  # late controls: the last action holds
+    periods: int = 0  # number of control periods
     _start_time: int = 0  # ns, when tick 0 is due
     _newest: int = -1  # stamp of the newest control
     _action: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros(1, np.float32))
@@ -84,7 +73,7 @@ class WireAgent:
         if self.step:
             self._wait_for_control(tick * TICK_US)
         else:
-            end = self._get_due_time(tick + 1) - SLACK
+            end = self._get_due_time(tick + 1) - _SLACK
             while self._newest < tick * TICK_US and clock() < end:
                 self._read(self.port.wait((end - clock()) * 1e-9))
             self.late += self._newest < tick * TICK_US
@@ -101,11 +90,9 @@ class WireAgent:
                 wait_until(self._get_due_time(tick))
             for packet in record.packets[record.packets[:, PACKET.arrived] == tick]:
                 kind = _KINDS[int(packet[PACKET.sensor])]
-                age = (packet[PACKET.arrived] - packet[PACKET.captured]) * TICK
-                self.port.send(self.to, kind, tick * TICK_US, _make_values(kind, packet, age))
-            self.port.send(
-                self.to, DatagramKind.INERTIAL, tick * TICK_US, [*row.tolist(), float(steer)]
-            )
+                self.port.send(self.to, kind, tick * TICK_US, _make_values(kind, packet))
+            values = [*row.tolist(), float(steer)]
+            self.port.send(self.to, DatagramKind.INERTIAL, tick * TICK_US, values)
         return int(record.ticks[-1])
 
     def end(self) -> None:
@@ -121,8 +108,8 @@ class WireAgent:
             if time.monotonic() > end:
                 raise TimeoutError(
                     f"no control came within {CONTROL_TIMEOUT:g} s for the tick "
-                    f"{stamp // TICK_US}: does "
-                    f"`sideslip live` run with --step at {self.to[0]}:{self.to[1]}?"
+                    f"{stamp // TICK_US}: does `sideslip live` run with --step at "
+                    f"{self.to[0]}:{self.to[1]}?"
                 )
             self._read(self.port.wait(0.1))
 
@@ -132,17 +119,16 @@ class WireAgent:
             if isinstance(message, RejectReason) or message.kind != DatagramKind.CONTROL:
                 continue
             if message.stamp >= self._newest:
-                self._newest, self._action = message.stamp, self._decode_action(message)
-
-    def _decode_action(self, message: Message) -> npt.NDArray[np.float32]:
-        moment, turn = message.values
-        shares = moment / self._facts.full_scale, turn / self._facts.authority
-        return np.array(shares[: self._facts.width], np.float32)
+                moment, turn = message.values
+                shares = moment / self._facts.full_scale, turn / self._facts.authority
+                self._action = np.array(shares[: self._facts.width], np.float32)
+                self._newest = message.stamp
 
 
-def _make_values(kind: DatagramKind, packet: Any, age: float) -> list[float]:
-    width = WIDTHS[SENSORS[kind]]
-    values = packet[PACKET.value : PACKET.value + width].tolist()
+def _make_values(kind: DatagramKind, packet: Any) -> list[float]:
+    """Make a packet's doubles: its values, its age (s) and its quality."""
+    age = (packet[PACKET.arrived] - packet[PACKET.captured]) * TICK
+    values = packet[PACKET.value : PACKET.value + WIDTHS[SENSORS[kind]]].tolist()
     return [*values, float(age), float(packet[PACKET.quality])]
 
 
@@ -172,7 +158,6 @@ def simulate(
 
     Raises:
         ValueError: The control period is too long for lock-step.
-        TimeoutError: No control comes.
     """
     if step and get_env_facts(env).control_period > MAX_TICKS:
         raise ValueError(f"in lock-step a control period has at most {MAX_TICKS} ticks")
@@ -182,22 +167,18 @@ def simulate(
     return drive, agent
 
 
-class SimulatedCarProcess:
+class SimulatedCarProcess(AbstractContextManager["SimulatedCarProcess"]):
     """The simulated car in a process of its own, ready before it starts.
 
     Args:
         arguments: Id and options of the env, then `to`, `seed`, `step` and `speed` of `simulate`.
-
-    Raises:
-        Exception: As the env.
     """
 
     def __init__(self, *arguments: Any) -> None:
         context = get_context("spawn")
         self._pipe, child_pipe = context.Pipe()
-        self._process = context.Process(
-            target=_run_simulated_car, args=(child_pipe, *arguments), daemon=True
-        )
+        arguments = (child_pipe, *arguments)
+        self._process = context.Process(target=_run_simulated_car, args=arguments, daemon=True)
         self._process.start()
         child_pipe.close()
         self._receive()
@@ -219,9 +200,6 @@ class SimulatedCarProcess:
             raise message
         return message
 
-    def __enter__(self) -> "SimulatedCarProcess":
-        return self
-
     def __exit__(self, *_: object) -> None:
         self._process.kill()
         self._process.join()
@@ -236,9 +214,7 @@ def _run_simulated_car(
         env = gym.make(env_id, **options)
         with Port() as port:
             warm_up_agent = WireAgent(env, port, port.address, speed=10.0)
-            rollout(
-                env, warm_up_agent, seed, {"duration": 0.1}
-            )  # what is to be compiled is compiled now
+            rollout(env, warm_up_agent, seed, {"duration": 0.1})  # compiles before the drive
             gc.collect()
             gc.freeze()
             pipe.send("ready")
@@ -249,35 +225,18 @@ def _run_simulated_car(
         pipe.send(error)
 
 
-MAX_HDOP = 99.0  # of a receiver without a fix
-MAX_PAUSE = 10.0  # s between two epochs of a file
-
-
 @dataclass
 class Relay:
-    """Sends the epochs of a source as datagrams.
+    """Sends the epochs of a source as datagrams; a lost line is opened again."""
 
-    A lost line is opened again.
-
-    Attributes:
-        source: Source, as for `envs.recordings.sources.make_source`, whose errors it raises.
-        port: Port that sends.
-        to: Address of the receiver.
-        latency: Delay from an epoch to its sentences (s), added to the age.
-        speed: Speed of a file's clock, 1 for real time.
-        sent: Number of datagrams.
-        error: Reason of the end, "" at a file's end.
-        counts: Counts of the decoder.
-    """
-
-    source: str
-    port: Port
-    to: Any
-    latency: float = 0.0
-    speed: float = 1.0
-    sent: int = 0
-    error: str = ""
-    counts: Any = None
+    source: str  # as for `envs.recordings.sources.make_source`, whose errors it raises
+    port: Port  # sends
+    to: Any  # address of the receiver
+    latency: float = 0.0  # s from an epoch to its sentences, added to the age
+    speed: float = 1.0  # of a file's clock, 1 for real time
+    sent: int = 0  # number of datagrams
+    error: str = ""  # reason of the end, "" at a file's end
+    counts: Any = None  # of the decoder
     _origin: tuple[float, float] | None = field(default=None)
 
     def __post_init__(self) -> None:
@@ -294,7 +253,7 @@ class Relay:
         try:
             for epoch in self._iterate_epochs():
                 if epoch is not None and is_file and epoch.t > last_time:
-                    due += min(epoch.t - last_time, MAX_PAUSE) / self.speed
+                    due += min(epoch.t - last_time, _MAX_PAUSE) / self.speed
                 while not stop() and is_file and (left := due - time.monotonic()) > 0.0:
                     time.sleep(min(left, 0.1))
                 if stop():
@@ -319,16 +278,12 @@ class Relay:
 
     def _make_values(self, epoch: Any) -> list[float]:
         """Make the doubles of a datagram; an unknown number is 0, an unknown HDOP the worst."""
-        X, Y = self._compute_position(epoch) if epoch.has_fix else (0.0, 0.0)
+        X, Y = 0.0, 0.0  # m east and north of the first fix
+        if epoch.has_fix:
+            self._origin = self._origin or (epoch.latitude, epoch.longitude)
+            X, Y = map(float, to_metres(epoch.latitude, epoch.longitude, self._origin))
         hdop = epoch.hdop if math.isfinite(epoch.hdop) else MAX_HDOP
         course, speed = (value if math.isfinite(value) else 0.0 for value in epoch[3:5])
         age = epoch.age + self.latency
         age = min(max(age, 0.0), MAX_AGE) if math.isfinite(age) else MAX_AGE
         return [course, speed, X, Y, hdop, float(epoch.satellites), age, float(epoch.quality)]
-
-    def _compute_position(self, epoch: Any) -> tuple[float, float]:
-        """Compute the position east and north of the first fix (m)."""
-        if self._origin is None:
-            self._origin = epoch.latitude, epoch.longitude
-        east, north = to_metres(epoch.latitude, epoch.longitude, self._origin)
-        return float(east), float(north)

@@ -1,7 +1,6 @@
 """Views of a loop's estimates: a table in the terminal, a page in the browser.
 
-The viewer is a process of its own that receives datagrams: drawing would cost the loop its
-deadlines.
+They are a process of their own, as drawing would cost the loop its deadlines.
 """
 
 import asyncio
@@ -10,7 +9,7 @@ import os
 import secrets
 import signal
 from collections import deque
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 from html import escape
 from ipaddress import ip_address
@@ -22,8 +21,8 @@ from ...estimators.design.models import FOREIGN_STATE, STATES
 from .loop import LOOPBACK, Port
 from .messages import DatagramKind, LoopStatus, Message, RejectReason, decode
 
-PAGE = Path(__file__).with_name("page.html")
-SECONDS = 20.0  # of the strips
+_PAGE = Path(__file__).with_name("page.html")
+_SECONDS = 20.0  # of the strips
 _DEGREES = 57.29577951308232
 _POLICY = (
     "default-src 'none'; script-src 'nonce-{0}'; style-src 'nonce-{0}'; connect-src 'self'; "
@@ -32,19 +31,12 @@ _POLICY = (
 
 
 class ViewerProtocol(asyncio.DatagramProtocol):
-    """The newest datagrams of a loop.
-
-    Attributes:
-        names: Names of the states.
-        samples: Time (s), estimates and standard deviations, with angles in degrees.
-        status: Newest status of the loop.
-        count: Number of samples so far.
-        over: Event of the drive's end.
-    """
+    """The newest datagrams of a loop: its status, and estimates with angles in degrees."""
 
     def __init__(self) -> None:
-        self.names: tuple[str, ...] = ()
-        self.samples: deque[list[float]] = deque(maxlen=round(100 * SECONDS))
+        self.names: tuple[str, ...] = ()  # of the states
+        # time (s), estimates and standard deviations
+        self.samples = deque[list[float]](maxlen=round(100 * _SECONDS))
         self.status, self.count, self.over = LoopStatus(), 0, asyncio.Event()
 
     def datagram_received(self, data: bytes, _: Any) -> None:
@@ -67,21 +59,14 @@ class ViewerProtocol(asyncio.DatagramProtocol):
         if message.names != self.names:
             self.names = message.names
             self.samples.clear()
-        factors = [_DEGREES if get_unit(name)[0] == "d" else 1.0 for name in self.names] * 2
+        factors = [_DEGREES if _get_unit(name)[0] == "d" else 1.0 for name in self.names] * 2
         values = [a * b for a, b in zip(message.values, factors, strict=True)]
         self.samples.append([message.stamp * 1e-6, *values])
         self.count += 1
 
 
-def get_unit(name: str) -> str:
-    """Get the unit in which a state is shown.
-
-    Args:
-        name: Name of the state.
-
-    Returns:
-        Unit, with deg for rad.
-    """
+def _get_unit(name: str) -> str:
+    """Get the unit in which a state is shown, with deg for rad."""
     return STATES.get(name, FOREIGN_STATE).unit.replace("rad", "deg")
 
 
@@ -102,7 +87,7 @@ def make_table(protocol: ViewerProtocol, title: str) -> Any:
     n = len(protocol.names)
     newest = protocol.samples[-1] if protocol.samples else []
     for name, x, std in zip(protocol.names, newest[1 : 1 + n], newest[1 + n :], strict=False):
-        table.add_row(Text(name), f"{x:+.3f}", f"{std:.3f}", get_unit(name))
+        table.add_row(Text(name), f"{x:+.3f}", f"{std:.3f}", _get_unit(name))
     counts = protocol.status
     time = f"t {newest[0]:.1f} s; " if newest else "no inertial data yet; "
     table.caption = (
@@ -126,7 +111,7 @@ def make_event(protocol: ViewerProtocol, sent: int) -> tuple[str, int]:
     n_new = min(protocol.count - sent, len(protocol.samples))
     event = {
         "all": sent == 0,
-        "names": [[name, get_unit(name)] for name in protocol.names],
+        "names": [[name, _get_unit(name)] for name in protocol.names],
         "samples": list(protocol.samples)[len(protocol.samples) - n_new :],
         "status": protocol.status._asdict(),
     }
@@ -153,24 +138,15 @@ async def _render_page(title: str, protocol: ViewerProtocol, _: Any) -> Any:
 
     text, _ = make_event(protocol, 0)  # so that it is drawn as soon as it is loaded
     nonce = secrets.token_urlsafe(16)
-    page = PAGE.read_text(encoding="utf-8").replace("NONCE", nonce).replace("TITLE", escape(title))
+    page = _PAGE.read_text(encoding="utf-8").replace("NONCE", nonce).replace("TITLE", escape(title))
     text = page.replace("FIRST", text.replace("<", "\\u003c"))
     headers = {"Content-Security-Policy": _POLICY.format(nonce), "Cache-Control": "no-store"}
     return web.Response(text=text, content_type="text/html", headers=headers)
 
 
-def is_same_origin(host: str, origin: str | None) -> bool:
-    """Return whether a request is for this server and from its own page.
-
-    A foreign page whose name resolves to this address has that name as the host.
-
-    Args:
-        host: The request's Host, "name:port".
-        origin: Its Origin, None where it has none.
-
-    Returns:
-        True if both hold.
-    """
+def _is_same_origin(host: str, origin: str | None) -> bool:
+    """Return whether a request is for this server and from its own page."""
+    # a foreign page whose name resolves to this address has that name as the host
     name = host.rpartition(":")[0].strip("[]") or host
     with suppress(ValueError):
         name = "localhost" if ip_address(name) else name
@@ -178,16 +154,14 @@ def is_same_origin(host: str, origin: str | None) -> bool:
 
 
 async def _run_viewer(title: str, page: tuple[str, int] | None, screen: bool, pipe: Any) -> None:
-    loop, runner, address = asyncio.get_running_loop(), None, ""
-    transport, protocol = await loop.create_datagram_endpoint(
-        ViewerProtocol, local_addr=(LOOPBACK, 0)
-    )
+    loop, runner, address, local = asyncio.get_running_loop(), None, "", (LOOPBACK, 0)
+    transport, protocol = await loop.create_datagram_endpoint(ViewerProtocol, local_addr=local)
     if page is not None:
         from aiohttp import web
 
         @web.middleware
         async def check_origin(request: Any, handler: Any) -> Any:
-            if not is_same_origin(request.host, request.headers.get("Origin")):
+            if not _is_same_origin(request.host, request.headers.get("Origin")):
                 raise web.HTTPForbidden(text="this page is served by its address, to itself alone")
             return await handler(request)
 
@@ -225,17 +199,13 @@ def _run_process(title: str, page: tuple[str, int] | None, screen: bool, pipe: A
         pipe.send("the page needs aiohttp: pip install 'sideslip[wires]'" if missing else error)
 
 
-class Viewer:
+class Viewer(AbstractContextManager["Viewer"]):
     """The process that shows a loop's estimates.
 
     Args:
         title: Title above the estimates.
         page: Host and port of the page, port 0 for any; None: no page.
         screen: Whether the terminal has a table.
-
-    Attributes:
-        address: Address that receives the loop's datagrams.
-        url: Address of the page.
 
     Raises:
         OSError: The port is in use.
@@ -257,10 +227,7 @@ class Viewer:
             raise OSError(f"the page of port {page[1] if page else 0}: {reply.strerror}")
         if isinstance(reply, str):
             raise ModuleNotFoundError(reply)
-        self.address, self.url = reply
-
-    def __enter__(self) -> "Viewer":
-        return self
+        self.address, self.url = reply  # of the loop's datagrams, of the page
 
     def __exit__(self, *_: object) -> None:
         with Port() as port:

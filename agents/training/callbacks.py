@@ -42,7 +42,6 @@ from .warm_start import (
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip  # after ours, which
 from stable_baselines3.common.callbacks import BaseCallback  # isort: skip  # name a missing extra
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # isort: skip
-from stable_baselines3.common.vec_env import VecEnv  # isort: skip
 
 CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
 POLICY, BEST, WARM_START_FILE = "policy.safetensors", "best_model.zip", "begun_with.safetensors"
@@ -50,9 +49,7 @@ _SCALING_ENVS = 64  # environments whose observations make the scaling
 
 # Seeds of tests and of the calibration are below 2^63, those of `corrections` and `distill` beyond.
 _WEIGHT_SEEDS, _EVALUATION_SEEDS, _SCALING_SEEDS, _TRAINING_SEEDS = 2**63, 2**64, 2**65, 2**66
-_SEEDS_PER_TRAINING = (
-    2**40
-)  # seeds of a training: a start or resumption takes those from its steps on
+_SEEDS_PER_TRAINING = 2**40  # a start or resumption takes those from its steps on
 
 
 def make_evaluation_seeds(episodes: int) -> list[int]:
@@ -68,24 +65,13 @@ def make_evaluation_seeds(episodes: int) -> list[int]:
 
 
 class Evaluation(NamedTuple):
-    """An evaluation of the deterministic policy.
+    """An evaluation of the deterministic policy; of a mixture `of_none` is a mean of scenarios."""
 
-    For a mixture `of_none` is the mean over scenarios, and `cost` is that times their mean
-    uncontrolled cost.
-
-    Attributes:
-        steps: Steps of the training so far.
-        cpu_seconds: CPU time of the training so far, without evaluations (s).
-        cost: Mean cost J.
-        of_none: Cost as a fraction of the uncontrolled car's on these seeds.
-        of_start: Geometric mean of costs over those of the initial policy, None without one.
-    """
-
-    steps: int
-    cpu_seconds: float
-    cost: float
-    of_none: float
-    of_start: float | None = None
+    steps: int  # of the training so far
+    cpu_seconds: float  # of the training so far, without evaluations
+    cost: float  # mean cost J; of a mixture `of_none` times the scenarios' mean uncontrolled cost
+    of_none: float  # as a fraction of the uncontrolled car's on these seeds
+    of_start: float | None = None  # geometric mean of costs over the initial policy's, if any
 
     @property
     def criterion(self) -> float:
@@ -94,41 +80,27 @@ class Evaluation(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """The progress of a training.
+    """The progress of a training."""
 
-    Attributes:
-        steps: Steps so far.
-        cost: Mean cost of the newest episodes with exploration; None before the first one's end.
-        evaluations: Evaluations so far.
-    """
-
-    steps: int
-    cost: float | None
-    evaluations: tuple[Evaluation, ...]
+    steps: int  # so far
+    cost: float | None  # mean of the newest episodes with exploration; None before one ends
+    evaluations: tuple[Evaluation, ...]  # so far
 
 
 @dataclass(frozen=True)
 class RunOptions:
     """The options of a run, which may change when a training resumes.
 
-    Attributes:
-        eval_freq: Steps between two evaluations.
-        device: torch's name of the device.
-        tensorboard_log: Folder for TensorBoard.
-        report: Function that is called after every rollout.
-        command: Command line, for the policy's card.
-        track: Project of Weights & Biases, "" for none.
-
     Raises:
         ValueError: `eval_freq` is below 1, or the device is none of torch's.
     """
 
-    eval_freq: int = 250_000
-    device: str = "cpu"
-    tensorboard_log: str | None = None
-    report: Callable[[Progress], None] | None = None
-    command: str = ""
-    track: str = ""
+    eval_freq: int = 250_000  # steps between two evaluations
+    device: str = "cpu"  # torch's name of the device
+    tensorboard_log: str | None = None  # folder for TensorBoard
+    report: Callable[[Progress], None] | None = None  # called after every rollout
+    command: str = ""  # command line, for the policy's card
+    track: str = ""  # project of Weights & Biases, "" for none
 
     def __post_init__(self) -> None:
         if self.eval_freq < 1:
@@ -138,19 +110,12 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """The record of a run beside its task.
+    """The record of a run beside its task."""
 
-    Attributes:
-        steps: Steps of the whole training.
-        eval_freq: Steps between two evaluations.
-        command: Command line, for the policy's card.
-        begun_with: Name of the initial policy, "" for none.
-    """
-
-    steps: int
-    eval_freq: int
-    command: str = ""
-    begun_with: str = ""
+    steps: int  # of the whole training
+    eval_freq: int  # steps between two evaluations
+    command: str = ""  # command line, for the policy's card
+    begun_with: str = ""  # name of the initial policy, "" for none
 
 
 class EvalCallback(BaseCallback):
@@ -182,9 +147,8 @@ class EvalCallback(BaseCallback):
         self.eval_env = task.vector_env(task.n_eval_envs)
         self.initial_policy, self.warm_start = initial_policy, None
         if initial_policy is not None:
-            self.warm_start = PolicyWarmStart(
-                initial_policy, task, self.eval_env, _SCALING_SEEDS + task.seed
-            )
+            seed = _SCALING_SEEDS + task.seed
+            self.warm_start = PolicyWarmStart(initial_policy, task, self.eval_env, seed)
             self.eval_env = self.warm_start.wrap_env(self.eval_env)
         base: Any = self.eval_env.unwrapped
         self.period: float = base.control_period * base.dt  # s
@@ -195,9 +159,9 @@ class EvalCallback(BaseCallback):
             raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
         self.equal_weights = compute_equal_weights(uncontrolled)
         self.uncontrolled_cost = float(np.mean(uncontrolled * self.equal_weights))
-        self.weights = (
-            np.ones(1) if initial_policy else compute_scenario_weights(task, _WEIGHT_SEEDS)
-        )
+        self.weights = np.ones(1)
+        if not initial_policy:
+            self.weights = compute_scenario_weights(task, _WEIGHT_SEEDS)
         driver = self.warm_start.driver if self.warm_start else None
         self.initial_costs = evaluate_costs(self.eval_env, driver, self.seeds) if driver else None
         self.scaling: Any = saved.get("scaling")
@@ -232,31 +196,29 @@ class EvalCallback(BaseCallback):
         if self.scaling is None:
             spread, seed = compute_action_std(task.settings), _SCALING_SEEDS + task.seed
             mixed = get_algorithm(task.algo).on_tensors
-            self.scaling = measure_scaling(
-                task.vector_env(_SCALING_ENVS), spread, seed, task.reads, mixed
-            )
-        env = make_vec_env(
-            task.env_id,
-            task.num_envs,
-            estimator=task.estimator_kwargs,
-            env_kwargs=task.options(task.num_envs),
-            wrapper_class=self.warm_start.wrap_env if self.warm_start else None,
-        )
+            scaling_env = task.vector_env(_SCALING_ENVS)
+            self.scaling = measure_scaling(scaling_env, spread, seed, task.reads, mixed)
+        options = dict[str, Any](estimator=task.estimator_kwargs)
+        options["env_kwargs"] = task.options(task.num_envs)
+        options["wrapper_class"] = self.warm_start.wrap_env if self.warm_start else None
+        env = make_vec_env(task.env_id, task.num_envs, **options)
         steps = 0 if checkpoint is None else int(checkpoint["steps"])
         seed = (task.seed + steps) % 2**32
         first = _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING + steps
-        scaled_env = RewardScaleWrapper(env, self._make_reward_scale(env, first, steps))
-        further: dict[str, Any] = {
-            "device": run_options.device,
-            "tensorboard_log": run_options.tensorboard_log,
-        }
+        if self.warm_start is not None:
+            n_steps = -(-(self.run_record.steps - steps) // env.num_envs)
+            scales = measure_reward_scale(self.warm_start.driver, env, first, n_steps)
+        else:
+            scales = (np.resize(self.weights, env.num_envs) / self.period)[:, None].tolist()
+        scaled_env = RewardScaleWrapper(env, RewardScale(scales))
+        log, device = run_options.tensorboard_log, run_options.device
+        further = dict[str, Any](device=device, tensorboard_log=log)
         if get_algorithm(task.algo).on_tensors:
             from .gradient import make_source
 
             further["source"] = partial(make_source, task, first, scaled_env.reward_scale)
-        model = make_model(
-            task.algo, task.settings, scaled_env, self.period, self.scaling, seed, **further
-        )
+        setup = scaled_env, self.period, self.scaling, seed
+        model = make_model(task.algo, task.settings, *setup, **further)
         if checkpoint is not None:
             load_parameters(self.folder / CHECKPOINT, model)
             if isinstance(model, OffPolicyAlgorithm):
@@ -267,14 +229,6 @@ class EvalCallback(BaseCallback):
         env.seed(first)
         self.init_callback(model)
         return model
-
-    def _make_reward_scale(self, env: VecEnv, first: int, steps: int) -> RewardScale:
-        """Make the scale of the rewards, from this seed and step on."""
-        if self.warm_start is not None:
-            n_steps = -(-(self.run_record.steps - steps) // env.num_envs)
-            return RewardScale(measure_reward_scale(self.warm_start.driver, env, first, n_steps))
-        rate = np.resize(self.weights, env.num_envs) / self.period
-        return RewardScale(rate[:, None].tolist())
 
     def _average_scenarios(self, costs: Array) -> Array:
         """Average the costs of an evaluation by scenario, shape (k,)."""
@@ -298,14 +252,8 @@ class EvalCallback(BaseCallback):
             self.run_options.report(progress)
 
     def check(self) -> None:
-        """Check that the weights are finite.
-
-        Raises:
-            FloatingPointError: A weight is not finite.
-        """
-        if not all(
-            bool(parameter.isfinite().all()) for parameter in self.model.policy.parameters()
-        ):
+        """Check that the weights are finite; FloatingPointError otherwise."""
+        if not all(bool(weights.isfinite().all()) for weights in self.model.policy.parameters()):
             raise FloatingPointError(
                 f"the weights are not finite after step {self.model.num_timesteps}; "
                 f"{self.folder / CHECKPOINT} holds them as they were at the last evaluation"
@@ -319,10 +267,8 @@ class EvalCallback(BaseCallback):
         cost, ratio = float(np.mean(self._average_scenarios(costs) * self.equal_weights)), None
         if self.initial_costs is not None:
             ratio = float(np.exp(np.log(compute_cost_ratios(costs, self.initial_costs)).mean()))
-        spent = round(self.spent, 3)
-        current = Evaluation(
-            self.model.num_timesteps, spent, cost, cost / self.uncontrolled_cost, ratio
-        )
+        spent, of_none = round(self.spent, 3), cost / self.uncontrolled_cost
+        current = Evaluation(self.model.num_timesteps, spent, cost, of_none, ratio)
         if all(current.criterion < evaluation.criterion for evaluation in self.evaluations):
             self._keep_best(current)
         self.evaluations.append(current)
@@ -343,6 +289,7 @@ class EvalCallback(BaseCallback):
         self.since = time.process_time()
 
     def _keep_best(self, current: Evaluation) -> None:
+        """Write the policy's file with its card, and the model's zip."""
         task = self.task
         algorithm_options = make_model_options(task.algo, task.settings, self.period, task.num_envs)
         algorithm_options |= {"num_envs": task.num_envs, "policy": task.settings["policy"]}
@@ -350,13 +297,13 @@ class EvalCallback(BaseCallback):
         if self.initial_policy is not None:
             before = self.initial_policy.card.algorithm_options
             algorithm_options |= {"begun_with": self.initial_policy.name}
-            algorithm_options |= (
-                {"class": before["class"]} if "class" in before and task.scenarios else {}
-            )
+            if "class" in before and task.scenarios:
+                algorithm_options |= {"class": before["class"]}
         mixture: dict[str, Any] = {"scenarios": task.scenarios} if task.scenarios else {}
         if task.scenarios and self.initial_policy is None:
             mixture["weights"] = self.weights.round(3).tolist()
         first = {"scenario": task.scenarios[0]} if task.scenarios else {}
+        first_seed = _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING
         card = Card.from_env_id(
             task.env_id,
             task.env_options | first,
@@ -365,10 +312,7 @@ class EvalCallback(BaseCallback):
             algorithm=task.algo,
             algorithm_options=algorithm_options | mixture,
             command=self.run_options.command,
-            seeds={
-                "training": task.seed,
-                "from": _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING,
-            },
+            seeds={"training": task.seed, "from": first_seed},
             steps=current.steps,
             cpu_seconds=current.cpu_seconds,
         )

@@ -17,8 +17,7 @@ with require_extra("train", "training needs {}"):
     from safetensors.torch import save
 
 FORMAT = 3
-VARIABLES = "variables"
-"""Part of the tensors that belong to no module, such as the logarithm of an entropy's weight."""
+_VARIABLES = "variables"  # tensors of no module, such as the logarithm of an entropy's weight
 STATE = {"groups", "sideslip", "task", "steps", "aim", "scaling", "evaluations"}
 """Keys of a resumed training's state, besides the tensors."""
 
@@ -40,7 +39,7 @@ def save_checkpoint(path: Path, model: Any, rest: dict[str, Any]) -> None:
                 tensors |= {f"{part}/{i}/{key}": value for key, value in values.items()}
         else:
             tensors |= {f"{part}/{name}": value for name, value in state.items()}
-    tensors |= {f"{VARIABLES}/{name}": value for name, value in _get_variables(model).items()}
+    tensors |= {f"{_VARIABLES}/{name}": value for name, value in _get_variables(model).items()}
     plain = {name: value.detach().cpu().clone() for name, value in tensors.items()}
     content = json.dumps({"format": FORMAT, "groups": groups, **rest}, allow_nan=False)
     write_atomic(path, save(plain, {"checkpoint": content}))
@@ -95,7 +94,7 @@ def load_parameters(path: Path, model: Any) -> None:
     with safe_open(path, "pt") as file:
         for name in file.keys():  # noqa: SIM118  it is no mapping
             part, key = name.split("/", 1)
-            if part == VARIABLES:
+            if part == _VARIABLES:
                 variables[key].data.copy_(file.get_tensor(name))
             elif part in groups:
                 i, key = key.split("/", 1)

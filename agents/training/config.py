@@ -1,23 +1,7 @@
-"""The algorithms of `sideslip train`: stable-baselines3's and an own one, with their settings.
+"""The algorithms of `sideslip train`, their settings, and the task of a training.
 
 The settings stand in `hyperparams/`, in rl-baselines3-zoo's format, and were chosen on YawVision-v0
-with seed 0. PPO on its sensors alone (600,000 steps, about 20 CPU-s; mean cost over none's on 256
-drives): with a step size of 1e-3, rewards as they come and a horizon of 0.5 s 0.22, times ten 0.18,
-with 0.2 s 0.16, rewards per second (times a hundred) 0.13; a step size of 2e-3 0.125. Worse were a
-horizon of 0.1 s and 16 steps a rollout; running normalisation was no better.
-
-PPO behind `exact-kf` with accelerometer and disturbances (40 CPU-s; mean cost over nominal's on 64
-drives): a first deviation of 0.14 2.28, 0.37 1.10, 0.61 1.01, 1.0 1.09; with 0.37 a step size of
-4e-3 1.11; with 0.61 eight epochs instead of four 1.06. The same with seed 1 (2,400,000 steps, 1024
-drives): 1.05; a step size of 1e-3 1.04, batches of 4096 1.09, of 512 1.02, layers of 128 1.06 (both
-2,000,000 steps), a horizon of 0.4 s 1.08; reading only what LQR reads (`--reads`) 0.97.
-
-On sensors alone, over nominal's: PPO 5.8 after 40 CPU-s; SAC 7.3 after 40 where entropy's first
-weight is 1, 33 after 25 with a step size of 3e-4; three other settings diverged, for what reason
-was not looked into; recurrent PPO, 32 cells, 7.3 after 60. TQC has SAC's settings, not measured.
-One training each, beside other work on the machine: a first look.
-
-The task of a training, which stays the same when the training resumes.
+with seed 0.
 """
 
 import inspect
@@ -50,44 +34,24 @@ HYPERPARAMS = Path(__file__).parent / "hyperparams"
 PERIOD = 0.01  # s, of control: of the environments whose discount stands in the files
 WARM_START_ENTRY = "begun"  # the entry of training a policy further
 WARM_START_TRACES_ENTRY = "begun-traces"  # one with moving averages
-UNIFORM_LOG_STD = -0.55  # log of the deviation of actions drawn evenly
+_UNIFORM_LOG_STD = -0.55  # log of the deviation of actions drawn evenly
 
 _TRAINING_SETTINGS = ("n_timesteps", "n_envs", "policy", "normalize")
 _SCHEDULED = ("learning_rate", "clip_range")
-_MANAGED_ARGUMENTS = {
-    "env",
-    "seed",
-    "device",
-    "verbose",
-    "tensorboard_log",
-    "stats_window_size",
-    "source",
-}
+_LOG_ARGUMENTS = {"verbose", "tensorboard_log", "stats_window_size"}
+_MANAGED_ARGUMENTS = {"env", "seed", "device", "source"} | _LOG_ARGUMENTS
 
 
 @dataclass(frozen=True)
 class Algorithm:
-    """An algorithm of `sideslip train`.
+    """An algorithm of `sideslip train`."""
 
-    Attributes:
-        kind: Class as "module:name".
-        zoo: Name in rl-baselines3-zoo.
-        on_tensors: Whether it follows gradients through cars on tensors.
-    """
-
-    kind: str
-    zoo: str
-    on_tensors: bool = False
+    kind: str  # class as "module:name"
+    zoo: str  # name in rl-baselines3-zoo
+    on_tensors: bool = False  # whether it follows gradients through cars on tensors
 
     def load(self) -> Callable[..., BaseAlgorithm]:
-        """Import the class.
-
-        Returns:
-            The class.
-
-        Raises:
-            ModuleNotFoundError: Its package is not installed.
-        """
+        """Import the class; ModuleNotFoundError where its package is not installed."""
         module, name = self.kind.split(":")
         with require_extra("train", "training needs {}"):
             algorithm_class: Callable[..., BaseAlgorithm] = getattr(import_module(module), name)
@@ -99,9 +63,7 @@ ALGORITHMS = {
     "sac": Algorithm("stable_baselines3:SAC", "sac"),
     "tqc": Algorithm("sb3_contrib:TQC", "tqc"),
     "recurrent-ppo": Algorithm("sb3_contrib:RecurrentPPO", "ppo_lstm"),
-    "gradient": Algorithm(
-        f"{__package__}.gradient:AnalyticPolicyGradient", "gradient", on_tensors=True
-    ),
+    "gradient": Algorithm(f"{__package__}.gradient:AnalyticPolicyGradient", "gradient", True),
 }
 
 
@@ -113,9 +75,6 @@ def get_algorithm(name: str) -> Algorithm:
 
     Returns:
         Algorithm of that name.
-
-    Raises:
-        ValueError: The name is unknown.
     """
     check_choice("algorithm", name, ALGORITHMS)
     return ALGORITHMS[name]
@@ -133,8 +92,7 @@ def read_settings(algo: str, env_id: str, file: str | Path | None = None) -> Set
         Values by name.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is no such YAML or has neither entry, or as `check_settings`.
+        ValueError: The file is no such YAML, or has neither entry.
     """
     with require_extra("train", "settings need {}"):
         import yaml
@@ -200,7 +158,7 @@ def compute_action_std(settings: Settings) -> float:
     Returns:
         Standard deviation, as a fraction of full scale.
     """
-    return math.exp(settings.get("policy_kwargs", {}).get("log_std_init", UNIFORM_LOG_STD))
+    return math.exp(settings.get("policy_kwargs", {}).get("log_std_init", _UNIFORM_LOG_STD))
 
 
 def make_model_options(algo: str, settings: Settings, seconds: float, num_envs: int) -> Settings:
@@ -254,22 +212,19 @@ def make_model(
     """
     options = make_model_options(algo, settings, seconds, env.num_envs)
     options |= {name: _make_schedule(name, options[name]) for name in _SCHEDULED if name in options}
-    mean, scale, clip, mixing = scaling
     policy_kwargs = dict(options.get("policy_kwargs", {}))
     if "activation_fn" in policy_kwargs:
         policy_kwargs["activation_fn"] = list_activations()[policy_kwargs["activation_fn"]]
-    options["policy_kwargs"] = {
-        **policy_kwargs,
-        "features_extractor_class": Standardised,
-        "features_extractor_kwargs": {"mean": mean, "scale": scale, "clip": clip, "mixing": mixing},
-    }
+    policy_kwargs["features_extractor_class"] = Standardised
+    extractor_names = "mean", "scale", "clip", "mixing"
+    policy_kwargs["features_extractor_kwargs"] = dict(zip(extractor_names, scaling, strict=True))
+    options["policy_kwargs"], window = policy_kwargs, env.num_envs
     kind = get_algorithm(algo).load()
-    window = env.num_envs
     return kind(settings["policy"], env, stats_window_size=window, seed=seed, **options, **rest)
 
 
 def _make_schedule(name: str, value: Any) -> Any:
-    """Return a number, or for "lin_NUMBER" a schedule that falls to zero."""
+    """Make a schedule that falls to zero of "lin_NUMBER", and a float of a number."""
     word, _, number = str(value).rpartition("_")
     try:
         start = float(number)
@@ -302,35 +257,21 @@ def check_device(name: str) -> None:
 class TrainingTask:
     """The task of a training, which stays the same when the training resumes.
 
-    Attributes:
-        env_id: Id of a native vector env.
-        algo: Name in `ALGORITHMS`.
-        estimator: Estimator of `EstimateObservation`, "" for none.
-        env_options: Arguments of `gym.make`, in JSON types.
-        seed: Seed of the weights, the episodes and the exploration.
-        num_envs: Environments side by side; 0: the number in the settings.
-        scenarios: Mixture, of which each environment has one scenario for all its episodes.
-        estimator_options: Other arguments of `EstimateObservation`.
-        settings: Settings of `read_settings`; empty: the package's own.
-        n_eval_envs: Episodes of an evaluation, side by side.
-        reads: Entries of the observation that the network reads; empty: all.
-
     Raises:
-        ValueError: An algorithm, setting or scenario is unknown, the seed is negative, there is no
-            environment or fewer than scenarios, or an estimator is set with cars on tensors.
+        ValueError: A name is unknown, a number out of range, or fields contradict each other.
     """
 
-    env_id: str = "sideslip/YawVision-v0"
-    algo: str = "ppo"
-    estimator: str = ""
-    env_options: dict[str, Any] = field(default_factory=dict)
-    seed: int = 0
-    num_envs: int = 0
-    scenarios: list[Any] = field(default_factory=list)
-    estimator_options: dict[str, Any] = field(default_factory=dict)
-    settings: Settings = field(default_factory=dict)
-    n_eval_envs: int = 256
-    reads: list[str] = field(default_factory=list)
+    env_id: str = "sideslip/YawVision-v0"  # of a native vector env
+    algo: str = "ppo"  # name in `ALGORITHMS`
+    estimator: str = ""  # of `EstimateObservation`, "" for none
+    env_options: dict[str, Any] = field(default_factory=dict)  # of `gym.make`, in JSON types
+    seed: int = 0  # of the weights, the episodes and the exploration
+    num_envs: int = 0  # environments side by side; 0: the number in the settings
+    scenarios: list[Any] = field(default_factory=list)  # mixture: each environment has one
+    estimator_options: dict[str, Any] = field(default_factory=dict)  # of `EstimateObservation`
+    settings: Settings = field(default_factory=dict)  # empty: the package's own
+    n_eval_envs: int = 256  # episodes of an evaluation, side by side
+    reads: list[str] = field(default_factory=list)  # entries that the network reads; empty: all
 
     def __post_init__(self) -> None:
         settings = self.settings or read_settings(self.algo, self.env_id)
@@ -364,13 +305,13 @@ class TrainingTask:
         return self.estimator_options | {"estimator": self.estimator} if self.estimator else None
 
     def options(self, num_envs: int) -> dict[str, Any]:
-        """Make the options of a vector env.
+        """Make the options of a vector env, whose rows take turns with the scenarios.
 
         Args:
             num_envs: Number of rows.
 
         Returns:
-            Options by name; the rows take turns with the scenarios.
+            Options by name.
         """
         if not self.scenarios:
             return self.env_options
@@ -378,13 +319,13 @@ class TrainingTask:
         return self.env_options | {"scenario": list(turns)}
 
     def vector_env(self, num_envs: int) -> VectorEnv[Any, Any, Any]:
-        """Make a vector env of the task, apart from the one of the training.
+        """Make a vector env of the task with its estimator, for other seeds than the training's.
 
         Args:
             num_envs: Number of rows.
 
         Returns:
-            Vector env with the task's estimator.
+            New vector env.
         """
         options = self.options(num_envs)
         return make_native_env(self.env_id, num_envs, self.estimator_kwargs, options)
@@ -415,15 +356,8 @@ class TrainingTask:
             eval_freq: Steps between two evaluations.
         """
         first = {"scenario": self.scenarios[0]} if self.scenarios else {}
-        arguments = {
-            "algo": get_algorithm(self.algo).zoo,
-            "env": self.env_id,
-            "env_kwargs": self.env_options | first,
-            "eval_freq": eval_freq,
-            "n_eval_envs": self.n_eval_envs,
-            "n_timesteps": steps,
-            "seed": self.seed,
-        }
-        zoo.describe(
-            folder, self.settings | {"n_envs": self.num_envs}, self.estimator_kwargs, arguments
-        )
+        arguments = dict[str, Any](algo=get_algorithm(self.algo).zoo, env=self.env_id)
+        arguments |= {"env_kwargs": self.env_options | first, "eval_freq": eval_freq}
+        arguments |= {"n_eval_envs": self.n_eval_envs, "n_timesteps": steps, "seed": self.seed}
+        settings = self.settings | {"n_envs": self.num_envs}
+        zoo.describe(folder, settings, self.estimator_kwargs, arguments)

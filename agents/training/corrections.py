@@ -29,37 +29,32 @@ from .networks import compute_scale
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 
-OUTPUTS = ("beta", "gamma", "F_d", "N_d")  # what LQR reads
-READ = (*OUTPUTS, "bias", "front_tyres", "rear_tyres", "inverse_friction")
+_OUTPUTS = ("beta", "gamma", "F_d", "N_d")  # what LQR reads
+READ = (*_OUTPUTS, "bias", "front_tyres", "rear_tyres", "inverse_friction")
 """States that a network reads where the filter has them."""
 FIRST_ROUND = (("lqr", "fusion"), ("none", "fusion"), ("shaken", "fusion"), ("lqr", "vision"),
          ("shaken", "gps"))  # fmt: skip
-SECOND_ROUND = (("lqr", "fusion"), ("lqr", "vision"), ("lqr", "gps"))
+_SECOND_ROUND = (("lqr", "fusion"), ("lqr", "vision"), ("lqr", "gps"))
 """Who drives with which slow sensors, on the filter, then on the correction."""
 TRAINING, HELD_OUT = 2**67, 2**68  # seeds; `keeper` and `distill` have others
 _SEEDS = 2**40  # of a training
-EVERY = 10  # env-steps from one sample to the next
-MAX_SIDESLIP = 0.5  # rad: a car that slips more is lost, and nothing to learn from
+_EVERY = 10  # env-steps from one sample to the next
+_MAX_SIDESLIP = 0.5  # rad: a car that slips more is lost, and nothing to learn from
 _NOISE_STD, _MEMORY = 0.6, 0.95  # standard deviation of the added action, share left after a step
-HIDDEN = (64, 64)
-CLIP = 8.0  # standard deviations of an input
-BATCH, RATE = 1024, 2e-3  # of Adam; its steps fall to a fiftieth
-NORMAL_95 = 1.959964
+_HIDDEN = (64, 64)
+_CLIP = 8.0  # standard deviations of an input
+_BATCH, _RATE = 1024, 2e-3  # of Adam; its steps fall to a fiftieth
+_NORMAL_95 = 1.959964
 
-DriveSpec = tuple[str, dict[str, Any]]
+_DriveSpec = tuple[str, dict[str, Any]]
 """A scenario in an env: an id, and options of `gym.make`."""
 
 
 class Samples(NamedTuple):
-    """Samples of a filter's error.
+    """Samples of a filter's error."""
 
-    Attributes:
-        inputs: Inputs that the network normalises, float32, shape (k, inputs).
-        errors: Numbers to add to the filter's sideslip angle (rad), shape (k,).
-    """
-
-    inputs: Any
-    errors: Array
+    inputs: Any  # inputs that the network normalises, float32, shape (k, inputs)
+    errors: Array  # numbers to add to the filter's sideslip angle (rad), shape (k,)
 
 
 class _NoisyLqr(Lqr):
@@ -77,12 +72,12 @@ class _NoisyLqr(Lqr):
         return np.clip(action + self._noise, -1.0, 1.0).astype(np.float32), state
 
 
-AGENTS: dict[str, Any] = {"none": NoControl, "lqr": Lqr, "shaken": _NoisyLqr}
+_AGENTS: dict[str, Any] = {"none": NoControl, "lqr": Lqr, "shaken": _NoisyLqr}
 
 
 def collect_samples(
     correction: Correction,
-    drives: Sequence[DriveSpec],
+    drives: Sequence[_DriveSpec],
     drivers: Sequence[Any],
     seed: int,
     episodes: int,
@@ -92,7 +87,7 @@ def collect_samples(
     Args:
         correction: Correction behind the filter.
         drives: Scenarios, as ids and options of `gym.make`.
-        drivers: Pairs of a key of `AGENTS` and slow sensors.
+        drivers: Pairs of a key of `_AGENTS` and slow sensors.
         seed: First seed.
         episodes: Seeds of each drive and driver.
 
@@ -103,22 +98,22 @@ def collect_samples(
     for (env_id, options), (driver, sensors) in itertools.product(drives, drivers):
         options = {"sensors": sensors, "on_bad_action": "fail", **options}
         env: Any = gym.make_vec(env_id, num_envs=episodes, **options)
-        read = [name for name in OUTPUTS if name in correction.card.states]
+        read = [name for name in _OUTPUTS if name in correction.card.states]
         factory = functools.partial(learned, file=correction)
         env = EstimateObservation(env, factory, outputs=read, std=False)
-        collected += _iterate_samples(env, AGENTS[driver](env), next(seeds))
+        collected += _iterate_samples(env, _AGENTS[driver](env), next(seeds))
         env.close()
     return _concatenate(collected)
 
 
 def _iterate_samples(env: Any, agent: Any, seed: int) -> Iterator[Samples]:
-    """Iterate over samples of the first episodes' steps, one of `EVERY`."""
+    """Iterate over samples of the first episodes' steps, one of `_EVERY`."""
     batch, seeds = env.estimator, list(range(seed, seed + env.num_envs))
     net = batch.first.net
     stack = slice(locate_stack(net), locate_stack(net) + int(net.sizes[0]))
-    for step in itertools.islice(iterate_steps(env, agent, seeds), 0, None, EVERY):
+    for step in itertools.islice(iterate_steps(env, agent, seeds), 0, None, _EVERY):
         truth, memory = step.info["beta"], batch.memory
-        chosen = step.running & (np.abs(truth) < MAX_SIDESLIP) & (memory[:, DEVIATION] > 0.0)
+        chosen = step.running & (np.abs(truth) < _MAX_SIDESLIP) & (memory[:, DEVIATION] > 0.0)
         beta = batch.filters[chosen, 0].x[:, net.beta]
         yield Samples(memory[chosen, stack].astype(np.float32), truth[chosen] - beta)
 
@@ -129,7 +124,7 @@ def _concatenate(parts: Sequence[Samples]) -> Samples:
 
 def train_correction(
     card: CorrectionCard,
-    drives: Sequence[DriveSpec],
+    drives: Sequence[_DriveSpec],
     episodes: int = 32,
     epochs: int = 20,
     report: Callable[[str], None] = lambda _: None,
@@ -147,7 +142,7 @@ def train_correction(
         Correction with its card's quality.
 
     Raises:
-        ValueError: There are no drives, episodes or epochs; or as the filter and the envs.
+        ValueError: There are no drives, episodes or epochs.
     """
     if not drives or episodes < 1 or epochs < 1:
         raise ValueError(f"{len(drives)} drives, {episodes} episodes, {epochs} epochs: 1 at least")
@@ -156,32 +151,27 @@ def train_correction(
     plain, none = (np.zeros(card.inputs), np.ones(card.inputs)), np.zeros((2, card.inputs))
     blank = Correction(card, Network(*plain, [none], [np.zeros(2)], "relu", clip=np.inf))
     first_samples = collect_samples(blank, drives, FIRST_ROUND, TRAINING + first, episodes)
-    mean, spread = (
-        first_samples.inputs.mean(0, np.float64),
-        first_samples.inputs.std(0, dtype=np.float64),
-    )
+    inputs = first_samples.inputs  # normalised in place
+    mean, spread = inputs.mean(0, np.float64), inputs.std(0, dtype=np.float64)
     scale = compute_scale(spread)
-    np.subtract(first_samples.inputs, mean.astype(np.float32), out=first_samples.inputs)
-    np.clip(first_samples.inputs * scale.astype(np.float32), -CLIP, CLIP, out=first_samples.inputs)
+    np.subtract(inputs, mean.astype(np.float32), out=inputs)
+    np.clip(inputs * scale.astype(np.float32), -_CLIP, _CLIP, out=inputs)
     report("the first network")
     draft = Correction(card, _fit_network(first_samples, mean, scale, (epochs + 1) // 2, card.seed))
     report("drives on the first network")
-    second_samples = collect_samples(
-        draft, drives, SECOND_ROUND, TRAINING + first + _SEEDS // 2, episodes
-    )
+    second_seed = TRAINING + first + _SEEDS // 2
+    second_samples = collect_samples(draft, drives, _SECOND_ROUND, second_seed, episodes)
     report("the second network")
-    network = _fit_network(
-        _concatenate([first_samples, second_samples]), mean, scale, epochs, card.seed
-    )
+    all_samples = _concatenate([first_samples, second_samples])
+    network = _fit_network(all_samples, mean, scale, epochs, card.seed)
     report("calibration")
     last = Correction(card, network)
-    errors, deviations = compute_errors(
-        last, collect_samples(last, drives, SECOND_ROUND, HELD_OUT + first, n_test)
-    )
-    factor = float(np.quantile(np.abs(errors / deviations), 0.95)) / NORMAL_95
+    held_out = collect_samples(last, drives, _SECOND_ROUND, HELD_OUT + first, n_test)
+    errors, deviations = compute_errors(last, held_out)
+    factor = float(np.quantile(np.abs(errors / deviations), 0.95)) / _NORMAL_95
     biases = [*network.biases[:-1], network.biases[-1] + [0.0, np.log(factor)]]
     last = Correction(card, replace(network, biases=biases))
-    test = collect_samples(last, drives, SECOND_ROUND, HELD_OUT + first + _SEEDS // 2, n_test)
+    test = collect_samples(last, drives, _SECOND_ROUND, HELD_OUT + first + _SEEDS // 2, n_test)
     cpu_seconds = round(time.process_time() - start_time, 1)
     quality = compute_quality(last, test)
     card = replace(card, temperature=factor, cpu_seconds=cpu_seconds, evaluation=quality)
@@ -192,16 +182,16 @@ def _fit_network(data: Samples, mean: Array, scale: Array, epochs: int, seed: in
     """Fit a network to samples whose inputs are normalised by mean and scale."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
-    sizes = [data.inputs.shape[1], *HIDDEN, 2]
+    sizes = [data.inputs.shape[1], *_HIDDEN, 2]
     layers = [torch.nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
     between = itertools.chain(*((linear, torch.nn.ReLU()) for linear in layers[:-1]))
     model, unit = torch.nn.Sequential(*between, layers[-1]), float(data.errors.std()) or 1.0
     x, y = torch.from_numpy(data.inputs), torch.from_numpy((data.errors / unit).astype(np.float32))
-    optimiser = torch.optim.Adam(model.parameters(), RATE)
-    steps = epochs * -(-len(x) // BATCH)
+    optimiser = torch.optim.Adam(model.parameters(), _RATE)
+    steps = epochs * -(-len(x) // _BATCH)
     schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.02, steps)
     for _ in range(epochs):
-        for chosen in torch.split(torch.randperm(len(x)), BATCH):
+        for chosen in torch.split(torch.randperm(len(x)), _BATCH):
             middle, log_sd = model(x[chosen]).T
             log_sd = log_sd.clamp(MIN_LOG_DEVIATION - np.log(unit), 0.0 - np.log(unit))
             nll = 0.5 * ((y[chosen] - middle) * torch.exp(-log_sd)) ** 2 + log_sd
@@ -213,18 +203,18 @@ def _fit_network(data: Samples, mean: Array, scale: Array, epochs: int, seed: in
     biases = [layer.bias.detach().numpy().astype(np.float64) for layer in layers]
     weights[-1][0] *= unit
     biases[-1] = biases[-1] * [unit, 1.0] + [0.0, np.log(unit)]
-    return Network(mean, scale, weights, biases, "relu", clip=CLIP)
+    return Network(mean, scale, weights, biases, "relu", clip=_CLIP)
 
 
 def compute_errors(correction: Correction, data: Samples) -> tuple[Array, Array]:
-    """Compute the corrected errors and their deviations by NumPy (rad), shape (k,) each.
+    """Compute the corrected errors and their deviations.
 
     Args:
         correction: Correction on which the samples were driven.
         data: Samples.
 
     Returns:
-        Errors and standard deviations.
+        Errors and standard deviations (rad), shape (k,) each.
     """
     ones = np.ones(correction.card.inputs)
     plain = replace(correction.network, mean=0.0 * ones, scale=ones)
@@ -247,6 +237,6 @@ def compute_quality(correction: Correction, data: Samples) -> dict[str, float]:
     return {
         "filter_rmse": float(np.mean(data.errors**2) ** 0.5),
         "rmse": float(np.mean(errors**2) ** 0.5),
-        "coverage": float(np.mean(squares < NORMAL_95**2)),
+        "coverage": float(np.mean(squares < _NORMAL_95**2)),
         "nees": float(np.mean(squares)),
     }

@@ -24,7 +24,6 @@ from .student import (
     Demonstrations,
     DistillConfig,
     Scaling,
-    Single,
     Student,
     compute_scaling,
     fit_model,
@@ -39,39 +38,23 @@ _MEMORY = 0.95  # share of the noise left after a step
 
 
 class DistillTask(NamedTuple):
-    """Cars that a student drives, the same cars as the teacher sees them, and the teacher.
+    """Cars that a student drives, the same cars as the teacher sees them, and the teacher."""
 
-    Attributes:
-        cars: Vector env of the student, which resets itself.
-        teachers: Vector env of the teacher, of as many rows, which resets itself.
-        teacher: `Controller`.
-    """
-
-    cars: Any
-    teachers: Any
-    teacher: Any
+    cars: Any  # vector env of the student, which resets itself
+    teachers: Any  # vector env of the teacher, of as many rows, which resets itself
+    teacher: Any  # `Controller`
 
 
 class RoundResult(NamedTuple):
-    """The result of a round.
+    """The result of a round."""
 
-    Attributes:
-        steps: Steps of the student's envs so far.
-        cost: Mean cost of the round's episodes.
-        loss: Loss of the last epoch, relative to the episodes' cost.
-    """
-
-    steps: int
-    cost: float
-    loss: float
+    steps: int  # steps of the student's envs so far
+    cost: float  # mean cost of the round's episodes
+    loss: float  # loss of the last epoch, relative to the episodes' cost
 
 
 def collect_demonstrations(
-    task: DistillTask,
-    policy: Any,
-    seeds: Sequence[int],
-    noise: float,
-    max_cost: float = np.inf,
+    task: DistillTask, policy: Any, seeds: Sequence[int], noise: float, max_cost: float = np.inf
 ) -> Demonstrations:
     """Collect each seed's first episode, driven by a policy, or by the teacher with noise.
 
@@ -101,12 +84,10 @@ def collect_demonstrations(
     while running.any():
         label, teacher_state = teacher.predict(teacher_obs, teacher_state, start)
         if student is None:
-            coloured_noise = _MEMORY * coloured_noise + (
-                1.0 - _MEMORY**2
-            ) ** 0.5 * rng.standard_normal(label.shape)
-            action = np.clip(np.nan_to_num(label) + spread * coloured_noise, -1.0, 1.0).astype(
-                np.float32
-            )
+            white_noise = (1.0 - _MEMORY**2) ** 0.5 * rng.standard_normal(label.shape)
+            coloured_noise = _MEMORY * coloured_noise + white_noise
+            disturbed = np.nan_to_num(label) + spread * coloured_noise
+            action = np.clip(disturbed, -1.0, 1.0).astype(np.float32)
         else:
             action, student_state = student.predict(obs, student_state, start)
         is_valid = running & np.isfinite(label).all(axis=1)
@@ -120,10 +101,13 @@ def collect_demonstrations(
         start = np.logical_or(terminated, truncated)
         running = running & ~start
     x, y, privileged, w = (np.stack(columns, axis=1) for columns in zip(*steps, strict=True))
-    weights = w / (np.minimum(costs, max_cost)[:, None] + COST_FLOOR)
-    return Demonstrations(
-        x, y, privileged, weights.astype(np.float32), _compute_curvature(cars, teacher, x), costs
-    )
+    curvature = np.eye(teacher.width, dtype=np.float32)
+    if isinstance(teacher, Lqr):  # the Riccati matrix of its design at the mean speed
+        names = [entry.name for entry in cars.layout]
+        speed = float(x[..., names.index("wheel_left")].mean())
+        curvature = teacher.curvature(speed).astype(np.float32)
+    weights = (w / (np.minimum(costs, max_cost)[:, None] + COST_FLOOR)).astype(np.float32)
+    return Demonstrations(x, y, privileged, weights, curvature, costs)
 
 
 def _list_privileged_columns(task: DistillTask) -> list[int]:
@@ -132,16 +116,7 @@ def _list_privileged_columns(task: DistillTask) -> list[int]:
     return [names.index(name) for name in task.teacher.needs if name not in known]
 
 
-def _compute_curvature(cars: Any, teacher: Any, obs: Single) -> Single:
-    """Compute the Riccati matrix of the teacher's design at the mean speed, else the identity."""
-    if not isinstance(teacher, Lqr):
-        return np.eye(teacher.width, dtype=np.float32)
-    names = [entry.name for entry in cars.layout]
-    speed = float(obs[..., names.index("wheel_left")].mean())
-    return teacher.curvature(speed).astype(np.float32)
-
-
-class DistillResult(NamedTuple):
+class _DistillResult(NamedTuple):
     """The policy, and the result of each round."""
 
     policy: Policy
@@ -154,10 +129,8 @@ def distill(
     config: DistillConfig,
     path: str | Path,
     report: Callable[[RoundResult], None] = lambda _: None,
-) -> DistillResult:
+) -> _DistillResult:
     """Train a policy on all tasks and write it to a file after every round.
-
-    Equal arguments give equal bits.
 
     Args:
         card: Card of the student's cars, to which the training's numbers are added.
@@ -167,12 +140,10 @@ def distill(
         report: Function that is called after each round.
 
     Returns:
-        Policy of the last round, and the results of all rounds.
+        Policy of the last round, and all rounds' results: equal bits for equal arguments.
 
     Raises:
-        ValueError: There is no task, `config.told` is set where the student sees all of the
-            teacher's inputs, or the teacher's cars differ from the student's.
-        FloatingPointError: Loss or weights are not finite; the file has the round before.
+        ValueError: There is no task, or `config.told` where the student sees all that matters.
     """
     if not tasks:
         raise ValueError("no lessons: there is nothing to learn from")
@@ -188,8 +159,7 @@ def distill(
     model = Student(len(cars.layout), width, config, n_privileged)
     policy: Policy | None = None
     scaling: Scaling | None = None
-    drives: list[Demonstrations] = []
-    rounds: list[RoundResult] = []
+    drives, rounds = list[Demonstrations](), list[RoundResult]()
     max_costs = [np.inf] * len(tasks)
     for i in range(config.rounds):
         new_drives = []
@@ -202,23 +172,20 @@ def distill(
             scaling = compute_scaling(new_drives, cars.layout, tasks[0].teacher.needs)
             model.fit_whitening(new_drives, scaling)
             max_costs = [float(np.median(demo.costs)) for demo in new_drives]
-            privileged = np.concatenate(
-                [demo.privileged[demo.weights > 0.0] for demo in new_drives]
-            )
+            valid_parts = [demo.privileged[demo.weights > 0.0] for demo in new_drives]
+            privileged = np.concatenate(valid_parts)
             middle, scale = privileged.mean(0), compute_scale(privileged.std(0))
-        drives += [
-            demo._replace(privileged=normalise_inputs(demo.privileged, middle, scale))
-            for demo in new_drives
-        ]
+        for demo in new_drives:
+            standard = normalise_inputs(demo.privileged, middle, scale)
+            drives.append(demo._replace(privileged=standard))
         epochs = config.epochs * (LAST_ROUND_FACTOR if i == config.rounds - 1 else 1)
         loss = fit_model(model, drives, scaling, config, epochs)
-        rounds.append(
-            RoundResult(steps, float(np.mean([demo.costs.mean() for demo in new_drives])), loss)
-        )
+        mean_cost = float(np.mean([demo.costs.mean() for demo in new_drives]))
+        rounds.append(RoundResult(steps, mean_cost, loss))
         cpu_seconds = round(time.process_time() - start_time, 1)
         card = replace(card, steps=steps, cpu_seconds=cpu_seconds)
         policy = Policy(target.stem, model.network(scaling), card)
         save_policy(target, policy.network, card)
         report(rounds[-1])
     assert policy is not None
-    return DistillResult(policy, tuple(rounds))
+    return _DistillResult(policy, tuple(rounds))

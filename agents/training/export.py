@@ -1,6 +1,4 @@
-"""The deterministic actor of a stable-baselines3 model as a `Network`, which needs no torch.
-
-Zips of stable-baselines3 and sb3-contrib as policies; reading one can run code.
+"""Deterministic actors of stable-baselines3 models and zips as networks and policies without torch.
 
 A zip holds pickles, and unpickling runs the code in them. So nothing is read without `trust`, and
 `export_zip` writes a file that is read without it.
@@ -26,17 +24,17 @@ from ...estimators.wrappers.estimate import EstimateObservation
 from ..env_info import AnyEnv, get_env_facts
 from ..learned.policy import Card, Policy, save_policy
 
+_NEEDED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
+_MEMBERS = {"data", "policy.pth"}
+_NORMALISER = "vecnormalize.pkl"
 _PRIOR = 1e-4  # samples that a VecNormalize starts with, of mean 0 and variance 1
 
 
 def convert_sb3_policy(model: Any, normaliser: Any = None, history: int = 1) -> Network:
-    """Convert the deterministic actor of a model to a network.
-
-    Entries that never varied in training are not read: their scale is 0.
+    """Convert the deterministic actor of a model to a network; scale 0: an entry never varied.
 
     Args:
-        model: Model of stable-baselines3 or sb3-contrib, or its policy, of a class in `ACTORS`,
-            with actions within [-1, 1] and at most `Standardised` before its layers.
+        model: Model or policy of a class in `_ACTORS`, with at most `Standardised` as extractor.
         normaliser: VecNormalize of the training, or None.
         history: Frames that a VecFrameStack stacked, inside or outside of the normaliser.
 
@@ -44,22 +42,21 @@ def convert_sb3_policy(model: Any, normaliser: Any = None, history: int = 1) -> 
         Network of the actor.
 
     Raises:
-        ValueError: The model is none of these, or has an observation of another width.
-        ModuleNotFoundError: torch is not installed.
+        ValueError: The model is none of these, or has actions beyond [-1, 1].
     """
     with require_extra("train", "networks come from stable-baselines3"):
         from stable_baselines3.common.torch_layers import FlattenExtractor
 
         from .normalise import Standardised
     policy = getattr(model, "policy", model)
-    actor = find_actor_reader(type(policy))(policy)
+    actor = _find_actor_reader(type(policy))(policy)
     space = policy.action_space
-    bounds = getattr(space, "low", 0.0), getattr(space, "high", 0.0)
-    if not (np.all(bounds[0] == -1.0) and np.all(bounds[1] == 1.0)):
+    low, high = getattr(space, "low", 0.0), getattr(space, "high", 0.0)
+    if not (np.all(low == -1.0) and np.all(high == 1.0)):
         raise ValueError(f"an action lies within [-1, 1], got {space}")
-    if type(actor.extractor) not in (FlattenExtractor, Standardised):
-        name = type(actor.extractor).__name__
-        raise ValueError(f"the observation goes through {name}, not as it is")
+    extractor_class = type(actor.extractor)
+    if extractor_class not in (FlattenExtractor, Standardised):
+        raise ValueError(f"the observation goes through {extractor_class.__name__}, not as it is")
     weights, biases, activations, output = _convert_dense(actor.layers)
     if len(set(activations)) > 1:
         raise ValueError(f"one activation in all layers, got {', '.join(activations)}")
@@ -75,21 +72,13 @@ def convert_sb3_policy(model: Any, normaliser: Any = None, history: int = 1) -> 
             cells[0] = replace(cells[0], weight_in=cells[0].weight_in @ mixing)
         else:
             weights[0] = weights[0] @ mixing
-    return Network(
-        mean,
-        scale,
-        weights,
-        biases,
-        activations[0] if activations else "tanh",
-        "tanh" if actor.squashed else output,
-        clip,
-        history,
-        cells,
-    )
+    activation = activations[0] if activations else "tanh"
+    output = "tanh" if actor.squashed else output
+    return Network(mean, scale, weights, biases, activation, output, clip, history, cells)
 
 
 class _Actor(NamedTuple):
-    """The actor of a policy: layers, whether tanh follows, features extractor, recurrent layers."""
+    """The actor of a policy; `squashed`: whether tanh follows its layers."""
 
     layers: list[Any]
     squashed: bool
@@ -121,7 +110,7 @@ def _find_deterministic_actor(policy: Any) -> _Actor:
     return _Actor(list(policy.actor.mu), False, policy.actor.features_extractor)  # tanh is a layer
 
 
-ACTORS: dict[str, Callable[[Any], _Actor]] = {
+_ACTORS: dict[str, Callable[[Any], _Actor]] = {
     "stable_baselines3.common.policies.ActorCriticPolicy": _find_on_policy_actor,
     "stable_baselines3.sac.policies.SACPolicy": _find_gaussian_actor,
     "stable_baselines3.td3.policies.TD3Policy": _find_deterministic_actor,
@@ -129,27 +118,16 @@ ACTORS: dict[str, Callable[[Any], _Actor]] = {
     "sb3_contrib.common.recurrent.policies.RecurrentActorCriticPolicy": _find_recurrent_actor,
     f"{__package__}.gradient.GruPolicy": _find_gru_actor,
 }
-"""Readers of the known actors: "MlpPolicy" and "MlpLstmPolicy" of PPO, A2C, SAC, TD3, DDPG, TQC and
-RecurrentPPO, and `GruPolicy`. A subclass may compute anything and is none of them."""
+"""Readers of actors by the policy's class; a subclass may compute anything and is none of them."""
 
 
-def find_actor_reader(kind: type) -> Callable[[Any], _Actor]:
-    """Find the function that reads the actor of a class of policies.
-
-    Args:
-        kind: Class of the policy.
-
-    Returns:
-        Function of a policy.
-
-    Raises:
-        ValueError: The class is not in `ACTORS`.
-    """
+def _find_actor_reader(kind: type) -> Callable[[Any], _Actor]:
+    """Find the function that reads the actor of a class of policies."""
     name = f"{kind.__module__}.{kind.__qualname__}"
-    if name not in ACTORS:
-        known = ", ".join(path.rpartition(".")[2] for path in ACTORS)
+    if name not in _ACTORS:
+        known = ", ".join(path.rpartition(".")[2] for path in _ACTORS)
         raise ValueError(f"the actor of {name} is not known; known: {known}")
-    return ACTORS[name]
+    return _ACTORS[name]
 
 
 def _convert_cells(module: Any) -> list[RecurrentCell]:
@@ -159,12 +137,11 @@ def _convert_cells(module: Any) -> list[RecurrentCell]:
     if module.bidirectional or module.proj_size or module.batch_first or not module.bias:
         raise ValueError(f"recurrent layers with further arguments are not known: {module}")
     names = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
-    return [
-        RecurrentCell(
-            module.mode.lower(), *(_to_array(getattr(module, f"{name}_l{i}")) for name in names)
-        )
-        for i in range(module.num_layers)
-    ]
+    cells = []
+    for i in range(module.num_layers):
+        weights = (_to_array(getattr(module, f"{name}_l{i}")) for name in names)
+        cells.append(RecurrentCell(module.mode.lower(), *weights))
+    return cells
 
 
 def _to_array(parameter: Any) -> Any:
@@ -184,31 +161,25 @@ def _convert_dense(layers: list[Any]) -> tuple[list[Any], list[Any], list[str], 
     from torch import nn
 
     names = {kind: name for name, kind in list_activations().items()}
-    weights: list[Any] = []
-    biases: list[Any] = []
-    layer_activations: list[str] = []
+    known = f"linear, {', '.join(names.values())}"
+    weights, biases, layer_activations = list[Any](), list[Any](), list[str]()
     for layer in layers:
         if isinstance(layer, nn.Linear):
             if len(layer_activations) != len(weights):
                 raise ValueError("two linear layers without an activation between")
             weights.append(_to_array(layer.weight))
             biases.append(_to_array(layer.bias))
-        elif type(layer) in names and _has_default_arguments(layer):
+        elif (
+            type(layer) in names
+            and getattr(layer, "alpha", 1.0) == 1.0
+            and getattr(layer, "negative_slope", 0.01) == 0.01
+        ):
             layer_activations.append(names[type(layer)])
         else:
-            raise ValueError(
-                f"layer {layer} is not known; known: linear, {', '.join(names.values())}"
-            )
+            raise ValueError(f"layer {layer} is not known; known: {known}")
     if len(layer_activations) == len(weights):  # the last one is the output's
         return weights, biases, layer_activations[:-1], layer_activations[-1]
     return weights, biases, layer_activations, "linear"
-
-
-def _has_default_arguments(activation: Any) -> bool:
-    """Return whether an activation has torch's default arguments."""
-    return getattr(activation, "alpha", 1.0) == 1.0 and (
-        getattr(activation, "negative_slope", 0.01) == 0.01
-    )
 
 
 def read_normalisation(
@@ -234,11 +205,6 @@ def read_normalisation(
     return stats.mean, np.where(stats.var > 2.0 * prior, scale, 0.0), normaliser.clip_obs
 
 
-_NEEDED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
-_MEMBERS = {"data", "policy.pth"}
-_NORMALISER = "vecnormalize.pkl"
-
-
 def policy_from_zip(
     path: str | Path,
     env: AnyEnv,
@@ -255,8 +221,7 @@ def policy_from_zip(
         path: Path of the zip.
         env: Env, single or vector, whose observation names the zip's numbered entries.
         trust: Whether code in the zip may run.
-        normalise: Pickle of the training's VecNormalize; None: NAME.pkl or vecnormalize.pkl beside
-            the zip, if there is one.
+        normalise: Pickle of VecNormalize; None: NAME.pkl or vecnormalize.pkl beside the zip.
         about: Fields of the policy's `Card`.
 
     Returns:
@@ -265,8 +230,7 @@ def policy_from_zip(
     Raises:
         FileNotFoundError: There is no such file.
         PermissionError: `trust` is False.
-        ValueError: The file is no such zip, its policy has another observation, or
-            `convert_sb3_policy` refuses it.
+        ValueError: The file is no such zip, or its policy has another observation.
         ModuleNotFoundError: stable-baselines3 is not installed.
     """
     file = Path(path)
@@ -277,10 +241,8 @@ def policy_from_zip(
     normaliser_file = find_normaliser(file, normalise)
     normaliser = None if normaliser_file is None else load_normaliser(normaliser_file)
     network = convert_sb3_policy(policy, normaliser, frames)
-    described = {
-        "algorithm": f"stable-baselines3's {type(policy).__name__}",
-        "steps": int(content.get("num_timesteps", 0)),
-    }
+    algorithm = f"stable-baselines3's {type(policy).__name__}"
+    described = {"algorithm": algorithm, "steps": int(content.get("num_timesteps", 0))}
     return Policy(file.stem, network, Card.from_env(env, **{"env_id": "", **described, **about}))
 
 
@@ -311,8 +273,7 @@ def export_zip(
         Policy as it is in the file.
 
     Raises:
-        ValueError: The target has another ending; or as `policy_from_zip` and `save_policy`.
-        PermissionError: `trust` is False.
+        ValueError: The target has another ending.
     """
     check_trusted(Path(path), trust)
     if Path(target).suffix != SUFFIX:
@@ -329,27 +290,24 @@ def export_zip(
 
 
 def find_normaliser(path: Path, normalise: str | Path | None = None) -> Path | None:
-    """Find the pickle of a zip's VecNormalize: the argument, else one beside the zip, else None.
+    """Find the pickle of a zip's VecNormalize.
 
     Args:
         path: Path of the zip.
-        normalise: Path of the pickle, None to look for it.
+        normalise: Path of the pickle; None: one beside the zip, if there is one.
 
     Returns:
-        Path of the pickle.
+        Path of the pickle, None without one.
     """
     if normalise is not None:
         return Path(normalise)
-    candidates = (
-        path.with_suffix(".pkl"),
-        path.with_name(_NORMALISER),
-        path.with_suffix("") / _NORMALISER,  # where rl-baselines3-zoo puts it
-    )
+    in_zoo = path.with_suffix("") / _NORMALISER  # where rl-baselines3-zoo puts it
+    candidates = path.with_suffix(".pkl"), path.with_name(_NORMALISER), in_zoo
     return next((file for file in candidates if file.is_file()), None)
 
 
 def check_trusted(file: Path, trust: bool) -> None:
-    """Check that a zip may be unpickled.
+    """Check that a file is a zip of stable-baselines3, and that it may be unpickled.
 
     Args:
         file: Path of the zip.
@@ -357,7 +315,6 @@ def check_trusted(file: Path, trust: bool) -> None:
 
     Raises:
         PermissionError: `trust` is False.
-        ValueError: As `check_zip`.
     """
     check_zip(file)
     if not trust:
@@ -386,10 +343,8 @@ def check_zip(file: Path) -> None:
     except BadZipFile as error:
         raise ValueError(f"{file} is no zip, or is cut short: {error}") from None
     if missing:
-        names = " and ".join(sorted(missing))
-        raise ValueError(
-            f"{file} is no zip of stable-baselines3, or is cut short: it holds no {names}"
-        )
+        lacks = f"it holds no {' and '.join(sorted(missing))}"
+        raise ValueError(f"{file} is no zip of stable-baselines3, or is cut short: {lacks}")
 
 
 def _read(file: Path) -> tuple[dict[str, Any], Any]:
@@ -424,7 +379,7 @@ def _build_policy(file: Path, content: dict[str, Any], weights: Any) -> Any:
     options.pop("device", None)
     if not isinstance(kind, type):
         raise ValueError(f"{file}: its policy is of no class, but {kind!r}")
-    find_actor_reader(kind)
+    _find_actor_reader(kind)
     if issubclass(kind, ActorCriticPolicy):
         options.setdefault("use_sde", bool(content.get("use_sde", False)))
     spaces = content["observation_space"], content["action_space"]
@@ -432,9 +387,8 @@ def _build_policy(file: Path, content: dict[str, Any], weights: Any) -> Any:
         policy = kind(*spaces, lambda _: 0.0, **options)
         policy.load_state_dict(weights)
     except Exception as error:
-        raise ValueError(
-            f"{file}: its weights are not those of its {kind.__name__}: {error}"
-        ) from error
+        wrong = f"its weights are not those of its {kind.__name__}"
+        raise ValueError(f"{file}: {wrong}: {error}") from error
     return policy
 
 
@@ -445,7 +399,7 @@ def load_normaliser(file: Path) -> Any:
         file: Path of the pickle.
 
     Returns:
-        The VecNormalize.
+        VecNormalize of the training.
 
     Raises:
         FileNotFoundError: There is no such file.

@@ -2,8 +2,7 @@
 
 Many cars on tensors are driven for a window of control periods, and the mean cost rate is
 propagated back through all of it to the weights: truncated back-propagation through time. It is
-the short-horizon actor-critic (Xu et al., ICLR 2022) without its critic. The critic did not help
-in a first look, at other windows and step sizes than these (docs/training.md).
+the short-horizon actor-critic (Xu et al., ICLR 2022) without its critic.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,17 +24,11 @@ _MAX_GRADIENT_NORM = 1.0  # norm of a step's gradient
 
 
 class TrainingSource(NamedTuple):
-    """The cars of a training.
+    """The cars of a training."""
 
-    Attributes:
-        cars: `DeviceVectorEnv` with gradients that resets itself in the same step.
-        seeds: Seeds of the cars.
-        reward_scale: Factor of each car's reward.
-    """
-
-    cars: Any
-    seeds: list[int]
-    reward_scale: RewardScale
+    cars: Any  # `DeviceVectorEnv` with gradients that resets itself in the same step
+    seeds: list[int]  # seeds of the cars
+    reward_scale: RewardScale  # factor of each car's reward
 
 
 def make_source(
@@ -53,12 +46,7 @@ def make_source(
     Returns:
         Environments with the seeds and reward factors of their rows.
     """
-    options: dict[str, Any] = {
-        "device": device,
-        "dtype": "float32",
-        "grad": True,
-        "compile": compile,
-    }
+    options = dict[str, Any](device=device, dtype="float32", grad=True, compile=compile)
     options |= {"autoreset_mode": "SameStep", **task.options(task.num_envs)}
     cars = DeviceVectorEnv.make(task.env_id, task.num_envs, **options)
     return TrainingSource(cars, [first + i for i in range(task.num_envs)], reward_scale)
@@ -92,7 +80,7 @@ class GruPolicy(BasePolicy):
         self.features_extractor = self.make_features_extractor()
         inputs, last = self.features_extractor.features_dim, cells
         self.cell = nn.GRU(inputs, cells)
-        layers: list[nn.Module] = []
+        layers = list[nn.Module]()
         for size in net_arch:
             layers += [nn.Linear(last, size), nn.SiLU()]
             last = size
@@ -160,11 +148,11 @@ class GruPolicy(BasePolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         layers = [layer.out_features for layer in self.layers if isinstance(layer, nn.Linear)]
-        sizes = {"cells": self.cell.hidden_size, "net_arch": layers[:-1]}
-        shared: dict[str, Any] = super()._get_constructor_parameters()
-        kind: dict[str, Any] = {"features_extractor_class": self.features_extractor_class}
-        kind |= {"features_extractor_kwargs": self.features_extractor_kwargs}
-        return shared | sizes | kind | {"lr_schedule": self._dummy_schedule}
+        parameters: dict[str, Any] = super()._get_constructor_parameters()
+        parameters |= {"cells": self.cell.hidden_size, "net_arch": layers[:-1]}
+        for name in ("features_extractor_class", "features_extractor_kwargs"):
+            parameters[name] = getattr(self, name)
+        return parameters | {"lr_schedule": self._dummy_schedule}
 
 
 class AnalyticPolicyGradient(BaseAlgorithm):
@@ -176,8 +164,7 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         learning_rate: Learning rate of Adam.
         n_steps: Control periods of a window.
         compile: Whether to compile the step, as for `DeviceVectorEnv`.
-        source: Function that makes the cars, called with `device` and `compile`; not needed to load
-            a zip.
+        source: Function of `device` and `compile` that makes the cars; None to load a zip.
         stats_window_size: As in stable-baselines3.
         tensorboard_log: As in stable-baselines3.
         policy_kwargs: Arguments of the policy.
@@ -210,19 +197,11 @@ class AnalyticPolicyGradient(BaseAlgorithm):
     ) -> None:
         if n_steps < 1:
             raise ValueError(f"n_steps is at least 1, got {n_steps}")
-        super().__init__(
-            policy,
-            env,
-            learning_rate,
-            policy_kwargs=policy_kwargs,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            device=device,
-            support_multi_env=True,
-            seed=seed,
-            supported_action_spaces=None,
+        further = dict[str, Any](
+            policy_kwargs=policy_kwargs, device=device, seed=seed, verbose=verbose
         )
+        further |= {"stats_window_size": stats_window_size, "tensorboard_log": tensorboard_log}
+        super().__init__(policy, env, learning_rate, support_multi_env=True, **further)
         self.n_steps, self.compile, self.source = n_steps, compile, source
         if _init_setup_model:
             self._setup_model()
@@ -274,9 +253,8 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         is_running, windows = True, 0
         while is_running and self.num_timesteps < total:
             callback.on_rollout_start()
-            mean_cost, obs, state = unroll_window(
-                policy, cars, obs, state, reward_scale, self.n_steps
-            )
+            window = reward_scale, self.n_steps
+            mean_cost, obs, state = unroll_window(policy, cars, obs, state, *window)
             self.num_timesteps += self.n_steps * cars.num_envs
             self._update_current_progress_remaining(self.num_timesteps, total)
             self._update_weights(mean_cost)
@@ -298,9 +276,8 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         mean_cost.backward()
         norm = nn.utils.clip_grad_norm_(self.policy.parameters(), _MAX_GRADIENT_NORM)
         if not norm.isfinite():
-            raise FloatingPointError(
-                f"the cost's slope is not finite after step {self.num_timesteps}"
-            )
+            step = self.num_timesteps
+            raise FloatingPointError(f"the cost's slope is not finite after step {step}")
         optimizer.step()
 
     def _excluded_save_params(self) -> list[str]:

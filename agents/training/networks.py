@@ -1,12 +1,7 @@
-"""Demonstrations for students, and moving averages: by torch, and as observations of an env.
+"""Whitening of a network's inputs, moving averages by torch, and memory as an env's observation.
 
-Whitening: inputs without correlation.
-
-Moving averages by torch, for training: `MovingAverages` of the runtime, by whole episodes.
-
-A policy's memory as an observation, for algorithms without memory.
-
-Compact observations of a linear env for networks with memory.
+`TraceLayer` is the runtime's `MovingAverages` for training, by whole episodes. `MemoryObservation`
+serves algorithms without memory, `CompactObservation` networks with memory on a linear scenario.
 """
 
 import functools
@@ -29,8 +24,19 @@ with require_extra("train", "training needs torch"):
     import torch
     from torch import nn
 
-SAMPLE_STRIDE = 7  # steps, of those by which means are mixed
-MIN_VARIANCE = 1e-4  # variance that a mixture of means has at least
+_SAMPLE_STRIDE = 7  # steps, of those by which means are mixed
+_MIN_VARIANCE = 1e-4  # variance that a mixture of means has at least
+_TIMES = (3, 10, 30, 100, 300)
+"""Steps of the means: of control periods of 10 ms from the motors' lag to half a drive."""
+_BLOCK = 50  # steps whose means are one product of matrices
+_MIN_SHARE = 1e-300  # instead of nothing: what a first step leaves of what was before
+_SILENT = ("accel_", "wheel_", "roll_rate", "gps_X", "gps_Y", "gps_speed", "gps_satellites")
+"""Entries of sensors that the linear scenarios drown in noise, or that stand still there."""
+_OFFSET, RATE, _AGE = "camera_y_l", "camera_y_l_rate", "camera_age"
+MAX_AGE = 1.0  # s, from which on an age is no older
+
+
+_Single = npt.NDArray[np.float32]
 
 
 def compute_scale(spread: Any, minimum: float = 1e-9) -> Array:
@@ -47,23 +53,17 @@ def compute_scale(spread: Any, minimum: float = 1e-9) -> Array:
 
 
 def compute_whitening(z: Any, minimum: float) -> Array:
-    """Compute the symmetric matrix that makes a covariance one, shape (k, k).
+    """Compute the symmetric matrix that makes a covariance one.
 
     Args:
         z: Samples, shape (n, k).
-        minimum: Least eigenvalue of the covariance.
+        minimum: Minimum of the covariance's eigenvalues.
 
     Returns:
-        The matrix.
+        Matrix, shape (k, k).
     """
     sizes, axes = np.linalg.eigh(np.cov(z, rowvar=False))
     return np.asarray(axes / np.sqrt(np.maximum(sizes, minimum)) @ axes.T)
-
-
-TIMES = (3, 10, 30, 100, 300)
-"""Steps of the means: of control periods of 10 ms from the motors' lag to half a drive."""
-_BLOCK = 50  # steps whose means are one product of matrices
-_MIN_SHARE = 1e-300  # instead of nothing: what a first step leaves of what was before
 
 
 class TraceLayer(nn.Module):
@@ -78,7 +78,7 @@ class TraceLayer(nn.Module):
         times: Steps of the moving averages.
     """
 
-    def __init__(self, inputs: int, n_silu: int, times: Sequence[float] = TIMES) -> None:
+    def __init__(self, inputs: int, n_silu: int, times: Sequence[float] = _TIMES) -> None:
         super().__init__()
         self.inputs, self.times = inputs, tuple(times)
         self.unit = nn.Linear(inputs, n_silu)
@@ -98,8 +98,7 @@ class TraceLayer(nn.Module):
 
         Args:
             z: Inputs, shape (B, T, k).
-            state: Averages and number of steps so far, shape (B, times, units + 1); None at the
-                start.
+            state: Averages and number of steps, shape (B, times, units + 1); None at the start.
 
         Returns:
             Units and averages (B, T, size), and the next state.
@@ -125,16 +124,14 @@ class TraceLayer(nn.Module):
         Args:
             samples: Inputs (B, T, k) and masks (B, T) of the steps that count.
         """
+        outputs, size = [], len(self.mean)
         with torch.no_grad():
-            outputs = [
-                self(torch.from_numpy(z))[0][..., : len(self.mean)][torch.from_numpy(mask)][
-                    ::SAMPLE_STRIDE
-                ]
-                for z, mask in samples
-            ]
+            for z, mask in samples:
+                linear_part = self(torch.from_numpy(z))[0][..., :size]
+                outputs.append(linear_part[torch.from_numpy(mask)][::_SAMPLE_STRIDE])
         linear = torch.cat(outputs).numpy()
         self.mean.copy_(torch.from_numpy(linear.mean(0)))
-        self.mixing.copy_(torch.from_numpy(compute_whitening(linear, MIN_VARIANCE)))
+        self.mixing.copy_(torch.from_numpy(compute_whitening(linear, _MIN_VARIANCE)))
 
     def cell(self, mixing: Array) -> MovingAverages:
         """Make the runtime's layer for inputs that are mixed first.
@@ -147,9 +144,8 @@ class TraceLayer(nn.Module):
         """
         silu_weights = self.unit.weight.detach().numpy() @ mixing
         bias = np.concatenate([np.zeros(self.inputs), self.unit.bias.detach().numpy()])
-        return MovingAverages(
-            np.concatenate([mixing, silu_weights]), bias, self.unit.out_features, self.times
-        )
+        weights = np.concatenate([mixing, silu_weights])
+        return MovingAverages(weights, bias, self.unit.out_features, self.times)
 
     def convert_weights(self, weight: Array, bias: Array) -> tuple[Array, Array]:
         """Convert the next layer's weights for the output of `cell`.
@@ -172,35 +168,21 @@ class TraceLayer(nn.Module):
 
 @functools.cache
 def _compute_weights(times: tuple[float, ...], first: int, steps: int) -> tuple[Any, Any]:
-    """Compute the weights of a block's moving averages.
-
-    Returns each step's weight (times, T, T) and the past's (times, T). first: steps before the
-    block.
-    """
+    """Compute the weights of a block's steps (times, T, T) and of earlier averages (times, T)."""
     ages = first + 1.0 + np.arange(steps)
     shares = np.maximum(1.0 / ages, -np.expm1(-1.0 / np.array(times))[:, None])
     left = np.log(np.maximum(1.0 - shares, _MIN_SHARE)).cumsum(-1)
     since = left[:, :, None] - left[:, None, :]
     new = np.tril(np.exp(np.minimum(since, 0.0))) * shares[:, None, :]
-    return (
-        torch.from_numpy(new.astype(np.float32)),
-        torch.from_numpy(np.exp(left).astype(np.float32)),
-    )
-
-
-PolicyFunction = Callable[[Any], Any]
+    new, old = new.astype(np.float32), np.exp(left).astype(np.float32)
+    return torch.from_numpy(new), torch.from_numpy(old)
 
 
 class Mixing(NamedTuple):
-    """The whitening of memory features x: (x - mean) mixing.
+    """The whitening of memory features x: (x - mean) mixing."""
 
-    Attributes:
-        mean: Means, shape (k,).
-        mixing: Symmetric matrix, shape (k, k).
-    """
-
-    mean: Array
-    mixing: Array
+    mean: Array  # means, shape (k,)
+    mixing: Array  # symmetric matrix, shape (k, k)
 
     def adapt_to_mixed(self, network: Network) -> Network:
         """Adapt a network of plain x to mixed x.
@@ -212,9 +194,8 @@ class Mixing(NamedTuple):
             Network of mixed x.
         """
         first = network.weights[0] @ np.linalg.inv(self.mixing)
-        return _replace_first_layer(
-            network, first, network.biases[0] + network.weights[0] @ self.mean
-        )
+        bias = network.biases[0] + network.weights[0] @ self.mean
+        return _replace_first_layer(network, first, bias)
 
     def adapt_to_plain(self, network: Network) -> Network:
         """Adapt a network of mixed x to plain x.
@@ -230,14 +211,13 @@ class Mixing(NamedTuple):
 
 
 def _replace_first_layer(network: Network, weights: Array, biases: Array) -> Network:
-    rest = network.weights[1:], network.biases[1:]
-    return replace(network, weights=[weights, *rest[0]], biases=[biases, *rest[1]])
+    """Replace weights (m, k) and biases (m,) of a network's first dense layer."""
+    all_weights, all_biases = [weights, *network.weights[1:]], [biases, *network.biases[1:]]
+    return replace(network, weights=all_weights, biases=all_biases)
 
 
 class MemoryObservation(VectorWrapper[Any, Any, Any, Any, Any]):
     """A vector env whose observations (N, k) are the inputs of a network's dense layers.
-
-    A row's memory starts anew with its episode.
 
     Args:
         env: Vector env that resets a row in the step that ends it, with the network's observation.
@@ -249,10 +229,8 @@ class MemoryObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         self, env: VectorEnv[Any, Any, Any], network: Network, mixing: Mixing | None = None
     ) -> None:
         super().__init__(env)
-        width = network.dense.inputs
-        self.layout = tuple(
-            ObservationEntry(f"memory_{i}", "-", -np.inf, np.inf) for i in range(width)
-        )
+        names = [f"memory_{i}" for i in range(network.dense.inputs)]
+        self.layout = tuple(ObservationEntry(name, "-", -np.inf, np.inf) for name in names)
         self.single_observation_space = make_space(self.layout)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._network, self._state = network, np.zeros((env.num_envs, network.memory))
@@ -289,10 +267,8 @@ class MemoryObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         over = terminated | truncated
         if over.any():
             last = np.full(len(over), None)
-            final_obs = np.stack(infos["final_obs"][over])
-            for i, final in zip(
-                np.flatnonzero(over), self._read(final_obs, self._state[over]), strict=True
-            ):
+            final_obs = self._read(np.stack(infos["final_obs"][over]), self._state[over])
+            for i, final in zip(np.flatnonzero(over), final_obs, strict=True):
                 last[i] = final
             infos = infos | {"final_obs": last}
             self._state[over] = 0.0
@@ -308,7 +284,7 @@ class MemoryObservation(VectorWrapper[Any, Any, Any, Any, Any]):
 
 
 def measure_mixing(
-    env: VectorEnv[Any, Any, Any], network: Network, drive: PolicyFunction, seed: int
+    env: VectorEnv[Any, Any, Any], network: Network, drive: Callable[[Any], Any], seed: int
 ) -> Mixing:
     """Measure the whitening in a network's own drives, one episode of each row.
 
@@ -325,20 +301,12 @@ def measure_mixing(
     obs, _ = wrapped.reset(seed=seed)
     running, step = np.ones(env.num_envs, np.bool_), 0
     while running.any():
-        if step % SAMPLE_STRIDE == 0:
+        if step % _SAMPLE_STRIDE == 0:
             collected.append(obs[running])
         obs, _, terminated, truncated, _ = wrapped.step(drive(obs))
         running, step = running & ~(terminated | truncated), step + 1
     x = np.concatenate(collected).astype(np.float64)
-    return Mixing(x.mean(0), compute_whitening(x, MIN_VARIANCE))
-
-
-Single = npt.NDArray[np.float32]
-
-SILENT = ("accel_", "wheel_", "roll_rate", "gps_X", "gps_Y", "gps_speed", "gps_satellites")
-"""Entries of sensors that the linear scenarios drown in noise, or that stand still there."""
-OFFSET, RATE, AGE = "camera_y_l", "camera_y_l_rate", "camera_age"
-MAX_AGE = 1.0  # s, from which on an age is no older
+    return Mixing(x.mean(0), compute_whitening(x, _MIN_VARIANCE))
 
 
 class CompactObservation(VectorWrapper[Any, Any, Any, Any, Any]):
@@ -347,7 +315,7 @@ class CompactObservation(VectorWrapper[Any, Any, Any, Any, Any]):
     The lateral offset varies over metres and is measured to a millimetre. It becomes its mean rate
     between the last two pictures, zero until there are two. With the pictures' ages that is the
     same information, but for the first picture's. Ages end at `MAX_AGE`; entries that begin as in
-    `SILENT` and the references are left out.
+    `_SILENT` and the references are left out.
 
     Args:
         env: Vector env of a linear scenario.
@@ -358,20 +326,20 @@ class CompactObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         base: Any = env.unwrapped
         inner = base.layout
         self._period: float = base.control_period * base.dt
-        excluded = (*SILENT, "beta_ref", "gamma_ref")
+        excluded = (*_SILENT, "beta_ref", "gamma_ref")
         chosen = [i for i, entry in enumerate(inner) if not entry.name.startswith(excluded)]
         names = [inner[i].name for i in chosen]
         self._columns = np.array(chosen)
         self._ages = [i for i, name in enumerate(names) if name.endswith("_age")]
-        self._offset = names.index(OFFSET) if OFFSET in names else None
-        self._at = names.index(AGE) if AGE in names else None
+        self._offset = names.index(_OFFSET) if _OFFSET in names else None
+        self._at = names.index(_AGE) if _AGE in names else None
         rate = ObservationEntry(RATE, "m/s", -100.0, 100.0)
-        self.layout = tuple(rate if inner[i].name == OFFSET else inner[i] for i in chosen)
+        self.layout = tuple(rate if inner[i].name == _OFFSET else inner[i] for i in chosen)
         self.single_observation_space = make_space(self.layout)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._last = np.full((3, env.num_envs), AGE_CAP)  # offset, its rate, age of the picture
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Single, dict[str, Any]]:
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[_Single, dict[str, Any]]:
         """Reset all rows.
 
         Args:
@@ -389,7 +357,7 @@ class CompactObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         obs, infos = self.env.reset(seed=seed, options=options)
         return self._read(obs), infos
 
-    def step(self, actions: Any) -> tuple[Single, Any, Any, Any, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[_Single, Any, Any, Any, dict[str, Any]]:
         """Step the inner env and compute the observations.
 
         Args:
@@ -401,14 +369,16 @@ class CompactObservation(VectorWrapper[Any, Any, Any, Any, Any]):
         obs, *rest = self.env.step(actions)
         return self._read(obs), *rest
 
-    def _read(self, obs: Single) -> Single:
+    def _read(self, obs: _Single) -> _Single:
+        """Compute compact observations (N, k) of the inner env's."""
         x = obs[:, self._columns]
         if self._offset is not None and self._at is not None:
             x[:, self._offset] = self._compute_rate(x[:, self._offset], x[:, self._at])
         x[:, self._ages] = np.minimum(x[:, self._ages], MAX_AGE)
         return x
 
-    def _compute_rate(self, offset: Single, age: Single) -> Any:
+    def _compute_rate(self, offset: _Single, age: _Single) -> Any:
+        """Compute the offset's mean rate between the last two pictures (m/s), shape (N,)."""
         before, rate, aged = self._last
         between = aged + self._period - age  # from the last picture to this one
         new = between > 0.5 * self._period

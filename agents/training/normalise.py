@@ -1,10 +1,8 @@
-"""The input of a network instead of SI units: standardised observations.
+"""Standardised observations as the input of a network, instead of SI units.
 
-Scales and mixing are measured once, before the training, and are part of the network, which
-reads plain observations. Differences that vary little while their parts vary much, such as
-course less heading, matter to a policy; mixing scales them up. Algorithms that follow the cost's
-gradient need that. PPO behind a filter did no better with it (three seeds: 0.97, 1.05, 1.09 of
-the cost without).
+Scales and mixing are measured once, before the training, and are part of the network, which reads
+plain observations. Differences that vary little while their parts vary much, such as course less
+heading, matter to a policy; mixing scales them up, as algorithms need that follow the gradient.
 """
 
 import math
@@ -56,20 +54,18 @@ class Standardised(FlattenExtractor):
         super().__init__(observation_space)
         self.mean: torch.Tensor
         self.scale: torch.Tensor
-        self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32))
         self.clip: torch.Tensor
+        self.mixing: torch.Tensor
+        self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32))
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float32))
         self.register_buffer("clip", torch.tensor(math.inf if clip is None else clip))
-        self.mixing: torch.Tensor
         mixed = torch.eye(len(mean)) if mixing is None else torch.tensor(mixing)
         self.register_buffer("mixing", mixed.to(torch.float32))
 
     @property
     def numbers(self) -> tuple[Array, Array, float | None]:
         """Mean, scale and clip in use."""
-        mean, scale = (
-            tensor.cpu().numpy().astype(np.float64) for tensor in (self.mean, self.scale)
-        )
+        mean, scale = (x.cpu().numpy().astype(np.float64) for x in (self.mean, self.scale))
         return mean, scale, float(self.clip) if self.clip.isfinite() else None
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
@@ -112,9 +108,8 @@ def measure_scaling(
     period = base.control_period * base.dt
     unknown = [name for name in reads if name not in names]
     if unknown:
-        raise ValueError(
-            f"the observation has no {', '.join(unknown)} to read; it has {', '.join(names)}"
-        )
+        lacking, available = ", ".join(unknown), ", ".join(names)
+        raise ValueError(f"the observation has no {lacking} to read; it has {available}")
     samples = _collect_observations(env, spread, seed, period, 0.0)
     deviation = samples.std(axis=0)
     varies = deviation > _CONSTANT
@@ -125,9 +120,8 @@ def measure_scaling(
     scale = np.where(varies, 1.0 / np.where(varies, deviation, 1.0), 0.0)
     mean, mixing = samples.mean(axis=0), None
     if mixed:
-        held_samples = _collect_observations(
-            env, spread, seed, period, math.exp(-period / _CORRELATION_TIME)
-        )
+        decay = math.exp(-period / _CORRELATION_TIME)
+        held_samples = _collect_observations(env, spread, seed, period, decay)
         standard = np.clip((held_samples - mean) * scale, -CLIP, CLIP)
         mixing = compute_whitening(standard, _MIN_VARIANCE).tolist()
     return mean.tolist(), scale.tolist(), CLIP, mixing

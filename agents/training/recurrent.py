@@ -1,16 +1,9 @@
-"""Kinds of memory in the linear environments, whose optimum is known.
-
-Kinds of memory as small networks, which are all trained and run in the same way.
+"""Kinds of memory as small networks, which learn to imitate a teacher with a filter.
 
 Each reads normalised observations step by step and has a state (B, ...), zero where an episode
-begins. They differ in what the memory does: nothing, stack frames, gate (GRU), decay linearly,
-observe a linear car (Kalman), attend to the past (transformer).
-
-A memory learns to imitate a teacher with a filter.
-
-In a linear scenario an action costs S_j (u - u*)^2 more than the optimum, with u* the action of
-the optimal filter's estimate. So imitation on the student's own drives minimises its cost, and the
-student needs memory, not exploration.
+begins. In a linear scenario an action costs S_j (u - u*)^2 more than the optimum, with u* the
+action of the optimal filter's estimate. So imitation on the student's own drives minimises its
+cost, and the student needs memory, not exploration.
 """
 
 import itertools
@@ -46,24 +39,15 @@ with require_extra("train", "memories need torch"):
     import torch
     from torch import nn
 
-import torch  # isort: skip  # after ours, which say which extra is missing
-
-HIDDEN = (64, 64)  # of the layers behind a memory
+_HIDDEN = (64, 64)  # of the layers behind a memory
 _MIN_STD = 1e-2  # deviation of a mix of inputs below which it is not scaled up further
 _FADE_STEPS = (2.0, 300.0)  # over which a linear memory fades to 1/e when it is new
 
 
-class MemoryNetwork(nn.Module):
-    """The base of memories: whitened inputs, a memory, and layers for the action.
+class _MemoryNetwork(nn.Module):
+    """Whitened inputs, a memory and layers for the action; arguments as for `make_memory`."""
 
-    Args:
-        inputs: Number of entries of an observation.
-        fresh_index: Entry that says whether a packet arrived.
-        delay_steps: Control periods between a packet's capture and its arrival.
-    """
-
-    rate: ClassVar[float] = 1e-2
-    """Of Adam: the best of 0.003, 0.005 and 0.01 in a first look at one condition."""
+    rate: ClassVar[float] = 1e-2  # learning rate of Adam
     recurrent: ClassVar[bool] = True
     mix: Any
 
@@ -71,69 +55,44 @@ class MemoryNetwork(nn.Module):
         super().__init__()
         self.inputs, self.fresh_index, self.delay_steps = inputs, fresh_index, delay_steps
         self.register_buffer("mix", torch.eye(inputs))
-        self.head: nn.Module = make_dense_layers(self._build_memory() + inputs, *HIDDEN, 1)
+        self.head: nn.Module = _make_dense_layers(self._build_memory() + inputs, *_HIDDEN, 1)
 
     def _build_memory(self) -> int:
         """Build the memory, and return the width of the output of `_update_memory`."""
         return 0
 
     def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
-        """Compute the memory after each step (B, T, m), and the next state.
-
-        z: inputs (B, T, k). arrived: whether a packet came, (B, T, 1).
-        """
+        """Compute memory (B, T, m) and next state by inputs (B, T, k) and arrivals (B, T, 1)."""
         return z[..., :0], state
 
     def fit_whitening(self, drives: Sequence[Demonstrations], mean: Array, scale: Array) -> None:
-        """Fit the whitening of the inputs on drives.
-
-        Args:
-            drives: Demonstrations.
-            mean: Means of the observation, shape (k,).
-            scale: Factors of the observation, shape (k,).
-        """
+        """Fit the whitening of the inputs on drives, normalised by mean (k,) and scale (k,)."""
         inputs = np.concatenate([normalise_inputs(demo.obs, mean, scale) for demo in drives])
-        self.mix.copy_(
-            torch.from_numpy(compute_whitening(inputs.reshape(-1, self.inputs), _MIN_STD**2))
-        )
+        whitening = compute_whitening(inputs.reshape(-1, self.inputs), _MIN_STD**2)
+        self.mix.copy_(torch.from_numpy(whitening))
 
     def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
-        """Compute actions (B, T, 1) and the next state.
-
-        Args:
-            z: Normalised observations, shape (B, T, k).
-            state: State from the last call; None at the start.
-
-        Returns:
-            Actions and next state.
-        """
+        """Compute actions (B, T, 1) and the next state of normalised observations (B, T, k)."""
         arrived, z = (z[..., self.fresh_index, None] > 0.0).to(z.dtype), z @ self.mix
         known, state = self._update_memory(z, arrived, state)
         return self.head(torch.cat([known, z], -1)), state
 
 
-def make_dense_layers(*sizes: int) -> nn.Sequential:
-    """Make dense layers with SiLU between them.
-
-    Args:
-        sizes: Sizes of input, hidden layers and output.
-
-    Returns:
-        Layers in order, the last one linear.
-    """
+def _make_dense_layers(*sizes: int) -> nn.Sequential:
+    """Make dense layers of these sizes, the input's first, with SiLU between them."""
     layers: list[nn.Module] = []
     for a, b in itertools.pairwise(sizes):
         layers += [nn.Linear(a, b), nn.SiLU()]
     return nn.Sequential(*layers[:-1])
 
 
-class LastObservation(MemoryNetwork):
+class _LastObservation(_MemoryNetwork):
     """No memory: layers on the last observation."""
 
     recurrent = False
 
 
-class FrameStack(MemoryNetwork):
+class _FrameStack(_MemoryNetwork):
     """The last 32 observations side by side."""
 
     rate, count = 5e-3, 32
@@ -148,7 +107,7 @@ class FrameStack(MemoryNetwork):
         return past, frames[:, 1 - self.count :]
 
 
-class Gru(MemoryNetwork):
+class _Gru(_MemoryNetwork):
     """A gated recurrent unit of 48 cells."""
 
     size = 48
@@ -162,11 +121,8 @@ class Gru(MemoryNetwork):
         return known, state[0]
 
 
-class LinearRnn(MemoryNetwork):
-    """32 complex numbers that rotate and decay at their own rates.
-
-    Source: the LRU of Orvieto et al., ICML 2023.
-    """
+class _LinearRnn(_MemoryNetwork):
+    """32 complex numbers that rotate and decay: the LRU of Orvieto et al., ICML 2023."""
 
     size = 32
 
@@ -179,12 +135,12 @@ class LinearRnn(MemoryNetwork):
         return 2 * self.size
 
     def _compute_powers(self, steps: int) -> Any:
-        """Compute the factors of 0 to steps - 1 steps on each number, (steps, n)."""
+        """Compute the factors of 0 to steps - 1 steps on each number, shape (steps, n)."""
         once = torch.complex(-torch.exp(self.fade), self.turn)
         return torch.exp(torch.arange(steps)[:, None] * once)
 
     def _project_inputs(self, z: Any) -> Any:
-        """Project inputs, (B, T, n), so that white ones give states of one size."""
+        """Project inputs to (B, T, n), so that white ones give states of one size."""
         unit = torch.sqrt(1.0 - torch.exp(-2.0 * torch.exp(self.fade)))
         return torch.view_as_complex(self.read(z).unflatten(-1, (self.size, 2))) * unit
 
@@ -199,7 +155,7 @@ class LinearRnn(MemoryNetwork):
         return torch.view_as_real(known).flatten(2), known[:, -1]
 
 
-class Kalman(LinearRnn):
+class Kalman(_LinearRnn):
     """A learned observer of a linear car, for packets that come late.
 
     Its state is `delay_steps` old and its numbers rotate and decay as the car's modes. At a
@@ -214,9 +170,7 @@ class Kalman(LinearRnn):
     """
 
     size, outputs = 16, 4
-    gain_rise_steps = (
-        10.0  # steps without a packet in which the gains come half way to their last values
-    )
+    gain_rise_steps = 10.0  # without a packet, in which gains come half way to their last values
 
     def __init__(self, inputs: int, fresh_index: int, delay_steps: int) -> None:
         super().__init__(inputs, fresh_index, delay_steps)
@@ -255,7 +209,7 @@ class Kalman(LinearRnn):
         return torch.view_as_real(now).flatten(2), state
 
 
-class Transformer(MemoryNetwork):
+class _Transformer(_MemoryNetwork):
     """Two layers of causal attention over the last 64 steps, with a learned bias for each age."""
 
     rate, window, layers, width, heads = 3e-3, 64, 2, 32, 2
@@ -265,7 +219,7 @@ class Transformer(MemoryNetwork):
         self.embed = nn.Linear(self.inputs, width)
         self.attention_inputs = nn.ModuleList(nn.Linear(width, 3 * width) for _ in layers)
         self.attention_outputs = nn.ModuleList(nn.Linear(width, width) for _ in layers)
-        self.feedforward = nn.ModuleList(make_dense_layers(width, 64, width) for _ in layers)
+        self.feedforward = nn.ModuleList(_make_dense_layers(width, 64, width) for _ in layers)
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(2 * self.layers))
         self.bias = nn.Parameter(torch.zeros(self.layers, self.heads, self.window))
         return width
@@ -293,17 +247,17 @@ class Transformer(MemoryNetwork):
         return x, torch.stack(cached, 1)
 
 
-MEMORIES: dict[str, type[MemoryNetwork]] = {
-    "mlp": LastObservation,
-    "frames": FrameStack,
-    "gru": Gru,
-    "linear-rnn": LinearRnn,
+MEMORIES: dict[str, type[_MemoryNetwork]] = {
+    "mlp": _LastObservation,
+    "frames": _FrameStack,
+    "gru": _Gru,
+    "linear-rnn": _LinearRnn,
     "kalman": Kalman,
-    "transformer": Transformer,
+    "transformer": _Transformer,
 }
 
 
-def make_memory(name: str, inputs: int, fresh_index: int, delay_steps: int) -> MemoryNetwork:
+def make_memory(name: str, inputs: int, fresh_index: int, delay_steps: int) -> _MemoryNetwork:
     """Make a new network of `MEMORIES`.
 
     Args:
@@ -328,7 +282,7 @@ def make_memory(name: str, inputs: int, fresh_index: int, delay_steps: int) -> M
 
 
 class MemoryAgent:
-    """A memory as an agent: stable-baselines3's `predict` on plain observations.
+    """A memory as an agent on plain observations.
 
     Args:
         model: Network with memory.
@@ -336,7 +290,7 @@ class MemoryAgent:
         scale: Factors of the observation, shape (k,).
     """
 
-    def __init__(self, model: MemoryNetwork, mean: Array, scale: Array) -> None:
+    def __init__(self, model: _MemoryNetwork, mean: Array, scale: Array) -> None:
         self.model, self.mean, self.scale = model, mean, scale
 
     def predict(
@@ -346,7 +300,7 @@ class MemoryAgent:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Single, Any]:
-        """Compute actions (N, 1) and the next state.
+        """Compute actions and the next state, with the signature of stable-baselines3.
 
         Args:
             observation: Observations, shape (N, k).
@@ -388,16 +342,14 @@ def train_memory(
         Agent of the last round.
 
     Raises:
-        ValueError: The name is unknown, or the observation does not say whether a packet arrived.
-        FloatingPointError: The training diverges; the message has the step.
+        ValueError: The observation does not say whether a packet arrived, or the name is unknown.
     """
     cars = task.cars
     names = [entry.name for entry in cars.layout]
     fresh_columns = [i for i, label in enumerate(names) if label.endswith("_fresh")]
-    if len(fresh_columns) != 1:
-        raise ValueError(
-            f"a memory knows one sensor with packets, got {len(fresh_columns)} in {names}"
-        )
+    count = len(fresh_columns)
+    if count != 1:
+        raise ValueError(f"a memory knows one sensor with packets, got {count} in {names}")
     torch.set_num_threads(1)
     torch.manual_seed(config.seed)
     model = make_memory(name, len(names), fresh_columns[0], delay_steps)
@@ -407,21 +359,17 @@ def train_memory(
     scaling: Scaling | None = None
     for i in range(config.rounds):
         first = next(seeds)
-        demo = collect_demonstrations(
-            task, agent, range(first, first + cars.num_envs), config.noise
-        )
+        row_seeds = range(first, first + cars.num_envs)
+        demo = collect_demonstrations(task, agent, row_seeds, config.noise)
         drives.append(demo._replace(curvature=np.full((1, 1), weight, np.float32)))
         steps += int((demo.weights > 0.0).sum())
         if scaling is None:
-            mean, scale, _ = compute_scaling(
-                drives, cars.layout, task.teacher.needs, usual_ages=False
-            )
+            needs = task.teacher.needs
+            mean, scale, _ = compute_scaling(drives, cars.layout, needs, usual_ages=False)
             scaling = Scaling(mean, scale, np.eye(len(mean)))  # memories mix by themselves
             model.fit_whitening(drives, mean, scale)
-        last = i == config.rounds - 1
-        loss = fit_model(
-            model, drives, scaling, config, config.epochs * (LAST_ROUND_FACTOR if last else 1)
-        )
+        epochs = config.epochs * (LAST_ROUND_FACTOR if i == config.rounds - 1 else 1)
+        loss = fit_model(model, drives, scaling, config, epochs)
         agent = MemoryAgent(model, scaling.mean, scaling.scale)
         report(RoundResult(steps, float(demo.costs.mean()), loss))
     assert agent is not None

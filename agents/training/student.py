@@ -1,6 +1,4 @@
-"""Demonstrations that a student learns from, and the scaling and whitening of its inputs.
-
-The student of a distillation: its network, and one round of learning.
+"""The student of a distillation: demonstrations, scaled inputs, network, a round of learning.
 
 The loss is what an action's error adds to the cost of the rest of the drive, by the Riccati
 matrix of the teacher's design, over the cost of the episode: the score's logarithm, linearised.
@@ -28,31 +26,29 @@ with require_extra("train", "distillation needs torch"):
 
 Single = npt.NDArray[np.float32]
 
-CLIP = 8.0  # of an input, scaled
+_CLIP = 8.0  # of an input, scaled
 UNREAD = ("gps_X", "gps_Y", "gps_satellites")
 """Entries without information for control, as they only locate the car."""
 _MIN_VARIANCE = 1e-3  # variance, of what varies by 1, that a mixture of inputs has at least
 _EARLY, _MEDIAN = 16.0, 50.0  # percentiles of an age
+_WINDOW = 50  # steps through which the gradient goes back in time
+_SAMPLES = 512  # steps of a batch without memory
+LAST_ROUND_FACTOR = 3  # times as many epochs in the last round
+
+_Batch = tuple[Any, Any, Any, Any, Any, bool]
+"""Mixed observations (B, T, k), labels (B, T, m), privileged inputs (B, T, q), weights (B, T),
+curvatures (B, m, m), and whether it begins the episodes."""
 
 
 class Demonstrations(NamedTuple):
-    """Episodes of a task, oldest step first.
+    """Episodes of a task, oldest step first."""
 
-    Attributes:
-        obs: Observations, shape (N, T, k).
-        labels: The teacher's actions, shape (N, T, m).
-        privileged: The teacher's inputs that the observations lack, shape (N, T, q).
-        weights: Weights of the actions' errors, shape (N, T), zero after an episode's end.
-        curvature: Weight of an action's error, shape (m, m).
-        costs: Costs J, shape (N,).
-    """
-
-    obs: Single
-    labels: Single
-    privileged: Single
-    weights: Single
-    curvature: Single
-    costs: Array
+    obs: Single  # observations, shape (N, T, k)
+    labels: Single  # the teacher's actions, shape (N, T, m)
+    privileged: Single  # the teacher's inputs that the observations lack, shape (N, T, q)
+    weights: Single  # Weights of the actions' errors, shape (N, T), zero after an episode's end
+    curvature: Single  # weight of an action's error, shape (m, m)
+    costs: Array  # costs J, shape (N,)
 
     @property
     def zero_loss(self) -> float:
@@ -62,18 +58,11 @@ class Demonstrations(NamedTuple):
 
 
 class Scaling(NamedTuple):
-    """The scaling of a student's inputs: clip((x - mean) scale) mixing.
+    """The scaling of a student's inputs: clip((x - mean) scale) mixing."""
 
-    Attributes:
-        mean: Means, shape (k,).
-        scale: Factors, shape (k,), zero for an entry that is not read.
-        mixing: Symmetric whitening, shape (k, k): it scales up what varies little while its parts
-            vary much, such as course less heading.
-    """
-
-    mean: Array
-    scale: Array
-    mixing: Array
+    mean: Array  # shape (k,)
+    scale: Array  # factors, shape (k,), zero for an entry that is not read
+    mixing: Array  # symmetric whitening, shape (k, k): it scales up small differences
 
     def mix_inputs(self, obs: Single) -> Single:
         """Compute a `Student`'s inputs.
@@ -103,8 +92,7 @@ def compute_scaling(
         drives: Demonstrations.
         layout: Entries of the observation.
         needs: Entries that the teacher reads.
-        usual_ages: Whether an age is scaled by its variation while packets come, and clipped before
-            the first and long after the last one; else by its deviation.
+        usual_ages: Whether an age is scaled by its variation while packets come, not by all of it.
 
     Returns:
         Mean and factor, shape (k,), and mixing, shape (k, k).
@@ -133,56 +121,36 @@ def normalise_inputs(obs: Single, mean: Array, scale: Array) -> Single:
     Returns:
         Normalised observations, shape (..., k).
     """
-    return np.clip((obs - mean.astype(np.float32)) * scale.astype(np.float32), -CLIP, CLIP)
-
-
-WINDOW = 50  # steps through which the gradient goes back in time
-SAMPLES = 512  # steps of a batch without memory
-LAST_ROUND_FACTOR = 3  # times as many epochs in the last round
-Batch = tuple[Any, Any, Any, Any, Any, bool]
-"""Mixed observations (B, T, k), labels (B, T, m), privileged inputs (B, T, q), weights (B, T),
-curvatures (B, m, m), and whether it begins the episodes."""
+    return np.clip((obs - mean.astype(np.float32)) * scale.astype(np.float32), -_CLIP, _CLIP)
 
 
 @dataclass(frozen=True)
 class DistillConfig:
     """The configuration of a student and its training.
 
-    Attributes:
-        rounds: Rounds of driving and learning; in the first one the teacher drives.
-        epochs: Passes over all drives in a round, `LAST_ROUND_FACTOR` times as many in the last
-            one.
-        cells: Cells of a GRU, 0 for none.
-        hidden: Sizes of the dense layers.
-        learning_rate: Learning rate of Adam, which falls to a fiftieth in each round.
-        noise: Largest standard deviation of the noise on the teacher's actions.
-        seed: Seed of weights and episodes.
-        batch: Episodes of a batch, for a student with memory.
-        told: Weight of the auxiliary loss: squared errors, in standard deviations, of the teacher's
-            inputs that a student with memory does not see. The loss of zero actions counts 1.
-        traces: SiLU units of `MovingAverages`, 0 for none.
+    The auxiliary loss is that of the teacher's inputs that a student with memory does not see:
+    squared errors in standard deviations, where the loss of zero actions counts 1.
 
     Raises:
         ValueError: A number is out of range, there are cells and traces, or `told` without memory.
     """
 
-    rounds: int = 7
-    epochs: int = 12
-    cells: int = 0
-    hidden: tuple[int, ...] = (64, 64)
-    learning_rate: float = 3e-3
-    noise: float = 0.02
-    seed: int = 0
-    batch: int = 16
-    told: float = 0.0
-    traces: int = 0
+    rounds: int = 7  # of driving and learning; in the first one the teacher drives
+    epochs: int = 12  # over all drives in a round; in the last one times `LAST_ROUND_FACTOR`
+    cells: int = 0  # of a GRU, 0 for none
+    hidden: tuple[int, ...] = (64, 64)  # sizes of the dense layers
+    learning_rate: float = 3e-3  # of Adam, which falls to a fiftieth in each round
+    noise: float = 0.02  # largest standard deviation of the noise on the teacher's actions
+    seed: int = 0  # of weights and episodes
+    batch: int = 16  # episodes of a batch, for a student with memory
+    told: float = 0.0  # weight of the auxiliary loss
+    traces: int = 0  # SiLU units of `MovingAverages`, 0 for none
 
     def __post_init__(self) -> None:
         sizes = self.rounds, self.epochs, self.batch, *self.hidden
         if min(sizes) < 1 or min(self.cells, self.traces, self.seed) < 0:
-            raise ValueError(
-                f"rounds, epochs and sizes are 1 at least, cells, traces and seed 0: {self}"
-            )
+            rule = "rounds, epochs and sizes are 1 at least, cells, traces and seed 0"
+            raise ValueError(f"{rule}: {self}")
         if not (self.learning_rate > 0.0 and self.noise >= 0.0 and self.told >= 0.0):
             raise ValueError(f"learning_rate is above zero, noise and told not below: {self}")
         if self.cells and self.traces:
@@ -193,13 +161,12 @@ class DistillConfig:
     def describe(self) -> dict[str, Any]:
         """Collect all numbers but the seed, in JSON types."""
         numbers = asdict(self) | {"hidden": list(self.hidden)}
-        del numbers["seed"]
-        return numbers
+        return {name: value for name, value in numbers.items() if name != "seed"}
 
     @property
     def window(self) -> int:
         """Steps of truncated back-propagation; with traces all of them."""
-        return sys.maxsize if self.traces else WINDOW
+        return sys.maxsize if self.traces else _WINDOW
 
 
 class Student(nn.Module):
@@ -209,8 +176,7 @@ class Student(nn.Module):
         inputs: Number of inputs.
         width: Entries of an action.
         config: Configuration of the student.
-        n_privileged: Outputs of the auxiliary head, linear in the cells or, with moving averages,
-            in the last hidden layer; they serve in training alone.
+        n_privileged: Outputs of the auxiliary head, which serve in training alone.
     """
 
     def __init__(
@@ -222,9 +188,8 @@ class Student(nn.Module):
         memory_size = self.traces.size if self.traces else config.cells
         sizes = [memory_size or inputs, *config.hidden, width]
         self.dense = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
-        self.auxiliary_head = (
-            nn.Linear(config.cells or sizes[-2], n_privileged) if config.told else None
-        )
+        head_inputs = config.cells or sizes[-2]
+        self.auxiliary_head = nn.Linear(head_inputs, n_privileged) if config.told else None
         self.recurrent = bool(memory_size)
 
     def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
@@ -243,11 +208,9 @@ class Student(nn.Module):
         memory_output = z
         for layer in self.dense[:-1]:
             z = nn.functional.silu(layer(z))
-        auxiliary = (
-            []
-            if self.auxiliary_head is None
-            else [self.auxiliary_head(memory_output if self.cell else z)]
-        )
+        auxiliary = []
+        if self.auxiliary_head is not None:
+            auxiliary.append(self.auxiliary_head(memory_output if self.cell else z))
         return torch.cat([self.dense[-1](z), *auxiliary], dim=-1), state
 
     def fit_whitening(self, drives: Sequence[Demonstrations], scaling: Scaling) -> None:
@@ -258,18 +221,17 @@ class Student(nn.Module):
             scaling: Scaling of the inputs.
         """
         if self.traces is not None:
-            self.traces.fit_whitening(
-                [(scaling.mix_inputs(demo.obs), demo.weights > 0.0) for demo in drives]
-            )
+            samples = [(scaling.mix_inputs(demo.obs), demo.weights > 0.0) for demo in drives]
+            self.traces.fit_whitening(samples)
 
     def network(self, scaling: Scaling) -> Network:
-        """Convert the student to a network of plain observations, by NumPy.
+        """Convert the student to a network of plain observations without auxiliary outputs.
 
         Args:
             scaling: Scaling of the inputs.
 
         Returns:
-            Network of the actions, without auxiliary outputs.
+            Network of the actions, by NumPy.
         """
         numbers = {name: value.detach().numpy().copy() for name, value in self.named_parameters()}
         names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
@@ -283,16 +245,10 @@ class Student(nn.Module):
             numbers[first] = numbers[first] @ scaling.mixing
         if self.cell:
             cells.append(RecurrentCell("gru", *(numbers[f"cell.{name}"] for name in names)))
-        dense = range(len(self.dense))
-        return Network(
-            scaling.mean,
-            scaling.scale,
-            [numbers[f"dense.{i}.weight"] for i in dense],
-            [numbers[f"dense.{i}.bias"] for i in dense],
-            "silu",
-            clip=CLIP,
-            cells=cells,
-        )
+        weights = [numbers[f"dense.{i}.weight"] for i in range(len(self.dense))]
+        biases = [numbers[f"dense.{i}.bias"] for i in range(len(self.dense))]
+        mean, scale, _ = scaling
+        return Network(mean, scale, weights, biases, "silu", clip=_CLIP, cells=cells)
 
 
 def _concatenate(parts: Sequence[Single]) -> Any:
@@ -311,15 +267,13 @@ class _EpisodeBatches:
         longest = max(demo.weights.shape[1] for demo in drives)
         self.n_batches = -(-len(self.episodes) // self.batch) * -(-longest // self.window)
 
-    def __iter__(self) -> Iterator[Batch]:
+    def __iter__(self) -> Iterator[_Batch]:
         names = ("obs", "labels", "privileged", "weights")
         for chosen in torch.split(torch.randperm(len(self.episodes)), self.batch):
             rows = [self.episodes[int(i)] for i in chosen]
             longest = max(self.drives[i].weights.shape[1] for i, _ in rows)
-            arrays = [
-                np.zeros((len(rows), longest, *getattr(self.drives[0], name).shape[2:]), np.float32)
-                for name in names
-            ]
+            shapes = [getattr(self.drives[0], name).shape[2:] for name in names]
+            arrays = [np.zeros((len(rows), longest, *shape), np.float32) for shape in shapes]
             for row, (i, j) in enumerate(rows):
                 length = self.drives[i].weights.shape[1]
                 for array, name in zip(arrays, names, strict=True):
@@ -332,25 +286,24 @@ class _EpisodeBatches:
 
 
 class _StepBatches:
-    """Batches of `SAMPLES` single steps of all drives, each like an episode."""
+    """Batches of `_SAMPLES` single steps of all drives, each like an episode."""
 
     def __init__(
         self, drives: Sequence[Demonstrations], scaling: Scaling, _: DistillConfig
     ) -> None:
         valid = [demo.weights > 0.0 for demo in drives]
-        self.demo_index = torch.cat(
-            [torch.full((int(mask.sum()),), i) for i, mask in enumerate(valid)]
-        )
+        indices = [torch.full((int(mask.sum()),), i) for i, mask in enumerate(valid)]
+        self.demo_index = torch.cat(indices)
         self.curvatures = torch.from_numpy(np.stack([demo.curvature for demo in drives]))
         pairs = list(zip(drives, valid, strict=True))
         self.x = _concatenate([scaling.mix_inputs(demo.obs[mask]) for demo, mask in pairs])
         self.y = _concatenate([demo.labels[mask] for demo, mask in pairs])
         self.q = _concatenate([demo.privileged[mask] for demo, mask in pairs])
         self.w = _concatenate([demo.weights[mask] for demo, mask in pairs])
-        self.n_batches = -(-len(self.w) // SAMPLES)
+        self.n_batches = -(-len(self.w) // _SAMPLES)
 
-    def __iter__(self) -> Iterator[Batch]:
-        for i in torch.split(torch.randperm(len(self.w)), SAMPLES):
+    def __iter__(self) -> Iterator[_Batch]:
+        for i in torch.split(torch.randperm(len(self.w)), _SAMPLES):
             S = self.curvatures[self.demo_index[i]]
             yield *(array[i, None] for array in (self.x, self.y, self.q, self.w)), S, True
 
@@ -362,7 +315,7 @@ def fit_model(
     config: DistillConfig,
     epochs: int,
 ) -> float:
-    """Fit a model to drives, and return the loss of the last epoch.
+    """Fit a model to drives.
 
     Args:
         model: Network with the outputs of a `Student`; `recurrent` says whether it has memory.

@@ -37,18 +37,8 @@ from stable_baselines3.common.callbacks import BaseCallback  # isort: skip
 from stable_baselines3.common.logger import KVWriter  # isort: skip
 
 __all__ = [
-    "BEST",
-    "CHECKPOINT",
-    "CURVE",
-    "POLICY",
-    "EvalCallback",
-    "Progress",
-    "RunOptions",
-    "RunRecord",
-    "TrainResult",
-    "TrainingTask",
-    "read_task",
-    "train",
+    "BEST", "CHECKPOINT", "CURVE", "POLICY", "EvalCallback", "Progress", "RunOptions", "RunRecord",
+    "TrainResult", "TrainingTask", "read_task", "train",
 ]  # fmt: skip
 
 
@@ -86,9 +76,7 @@ def train(
         resume: Whether to resume from the folder's checkpoint.
         run_options: Options of this run.
         trained_agent: Zip of stable-baselines3 with the first weights; or, for `ppo` and
-            `gradient`, a `Policy` or its name (`make_finetune_task` makes its task). A policy's
-            costs weigh the drives, and the best evaluation has the least geometric mean over these
-            costs.
+            `gradient`, a `Policy` or its name, whose costs weigh the drives.
         trust: Whether a pickle of VecNormalize beside the zip may be read.
 
     Returns:
@@ -96,8 +84,7 @@ def train(
 
     Raises:
         ValueError: The folder holds another training, or arguments contradict each other.
-        FileNotFoundError: There is no checkpoint to resume from.
-        FloatingPointError: Weights are not finite; the folder has those of the last evaluation.
+        ModuleNotFoundError: TensorBoard or Weights & Biases is not installed.
     """
     chosen_options = run_options or RunOptions()
     if steps < 1:
@@ -107,18 +94,15 @@ def train(
             raise ValueError("a training that goes on from its checkpoint begins with nothing else")
         if task.reads:
             raise ValueError("a network reads what it was trained on: give reads or a network")
-        if not isinstance(trained_agent, Policy):
-            if is_policy(str(trained_agent)):
-                trained_agent = load_policy(trained_agent)
-            else:
-                check_zip(Path(trained_agent))
+        if not isinstance(trained_agent, Policy) and is_policy(str(trained_agent)):
+            trained_agent = load_policy(trained_agent)
+        elif not isinstance(trained_agent, Policy):
+            check_zip(Path(trained_agent))
     if chosen_options.tensorboard_log is not None and find_spec("tensorboard") is None:
         raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
-    tracker = (
-        _WandbCallback(chosen_options.track, Path(folder).name, asdict(task))
-        if chosen_options.track
-        else None
-    )
+    tracker = None
+    if chosen_options.track:
+        tracker = _WandbCallback(chosen_options.track, Path(folder).name, asdict(task))
     torch.set_num_threads(1)  # on small matrices threads only wait for each other
     folder_path = Path(folder)
     checkpoint = _prepare_folder(task, folder_path, resume)
@@ -129,11 +113,9 @@ def train(
     model = callback.build(checkpoint, zip_path, trust)
     done = model.num_timesteps
     if done < steps:
+        log = dict[str, Any](reset_num_timesteps=done == 0, tb_log_name=task.algo)
         try:
-            first = done == 0
-            model.learn(
-                steps - done, callback=callbacks, reset_num_timesteps=first, tb_log_name=task.algo
-            )
+            model.learn(steps - done, callback=callbacks, **log)
             callback.evaluate()
         except ValueError:  # torch's, of a distribution that is none, or the env's, of actions
             callback.check()
@@ -155,7 +137,6 @@ def load_initial_policy(folder: str | Path) -> Policy | None:
 
     Raises:
         FileNotFoundError: The copy of the policy is missing.
-        ValueError: As `read_task`.
     """
     name, file = read_run_record(folder).begun_with, Path(folder) / WARM_START_FILE
     if not name:
@@ -183,10 +164,7 @@ def read_run_record(folder: str | Path) -> RunRecord:
         folder: Folder of the training.
 
     Returns:
-        The record.
-
-    Raises:
-        ValueError: As `read_task`.
+        Record of the run.
     """
     read_task(folder)
     path = Path(folder) / CHECKPOINT
@@ -194,10 +172,7 @@ def read_run_record(folder: str | Path) -> RunRecord:
 
 
 class _WandbCallback(BaseCallback):
-    """Write the log of stable-baselines3 to a run of Weights & Biases.
-
-    project, name: of the run. config: its configuration. ModuleNotFoundError without wandb.
-    """
+    """Write the log of stable-baselines3 to a run of Weights & Biases."""
 
     def __init__(self, project: str, name: str, config: dict[str, Any]) -> None:
         super().__init__()
@@ -205,10 +180,8 @@ class _WandbCallback(BaseCallback):
             wandb: Any = import_module("wandb")
         except ImportError:
             raise ModuleNotFoundError("tracking needs wandb: pip install wandb") from None
-        self._wandb, self._run_arguments = (
-            wandb,
-            {"project": project, "name": name, "config": config},
-        )
+        self._wandb = wandb
+        self._run_arguments = {"project": project, "name": name, "config": config}
         self._run: Any = None
 
     def _on_training_start(self) -> None:

@@ -1,6 +1,4 @@
-"""The warm start of a training: a zip of stable-baselines3, or a policy's file.
-
-The reward of a policy: its cost rate, weighted so that drives count as they do in a score.
+"""Start of a training from a zip of stable-baselines3 or a policy, and the scale of its rewards.
 
 The score compares logarithms of costs, whose derivative is that of the cost over the cost. So the
 scenarios of a mixture are weighted by the uncontrolled car's cost. Where a training starts from a
@@ -44,25 +42,19 @@ with require_extra("train", "training needs {}"):
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.save_util import load_from_zip_file  # isort: skip
 
+_WEIGHT_DRIVES = 32  # uncontrolled drives by which a scenario is weighed
+_MIN_COST_SHARE = 0.05  # of the mean: a scenario that costs less uncontrolled weighs no more
 _GRU = [f"cell.{part}_l0" for part in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
 
 
 class WarmStart(NamedTuple):
-    """The tensors of a zip or policy for a new model.
+    """The tensors of a zip or policy for a new model."""
 
-    Attributes:
-        name: Path of the zip or name of the policy.
-        parameters: Weights and optimisers by their names in `get_parameters`.
-        variables: Further tensors of a zip.
-        scaling: Scaling of the observations.
-        partial: Whether the rest of the model stays unchanged.
-    """
-
-    name: str
-    parameters: dict[str, Any]
-    variables: dict[str, Any]
-    scaling: Scaling
-    partial: bool = False
+    name: str  # path of the zip or name of the policy
+    parameters: dict[str, Any]  # weights and optimisers by their names in `get_parameters`
+    variables: dict[str, Any]  # further tensors of a zip
+    scaling: Scaling  # of the observations
+    partial: bool = False  # whether the rest of the model stays unchanged
 
 
 def read_warm_start(path: str | Path, width: int, trust: bool = False) -> WarmStart:
@@ -88,29 +80,23 @@ def read_warm_start(path: str | Path, width: int, trust: bool = False) -> WarmSt
         policy = parameters["policy"]
     except Exception as error:  # torch raises many for one that is cut short
         raise ValueError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
-    buffers = {
-        name.rpartition(".")[2]: x for name, x in policy.items() if "features_extractor." in name
-    }
+    inner = [name for name in policy if "features_extractor." in name]
+    buffers = {name.rpartition(".")[2]: policy[name] for name in inner}
     if buffers.keys() >= {"mean", "scale", "clip"}:  # every network of the policy has the same
         bound = float(buffers["clip"])
         mixing = buffers["mixing"].tolist() if "mixing" in buffers else None
-        numbers = (
-            buffers["mean"].tolist(),
-            buffers["scale"].tolist(),
-            bound if bound < math.inf else None,
-        )
-        return WarmStart(str(file), parameters, variables or {}, (*numbers, mixing))
+        mean_scale = buffers["mean"].tolist(), buffers["scale"].tolist()
+        inner_scaling = (*mean_scale, bound if bound < math.inf else None, mixing)
+        return WarmStart(str(file), parameters, variables or {}, inner_scaling)
     normaliser_file = find_normaliser(file)
     if normaliser_file is not None and not trust:
         raise PermissionError(
             f"{normaliser_file} is a pickle, which may run code: say --trust to read it"
         )
-    mean, scale, clip = read_normalisation(
-        load_normaliser(normaliser_file) if normaliser_file else None, width, 1
-    )
-    return WarmStart(
-        str(file), parameters, variables or {}, (mean.tolist(), scale.tolist(), clip, None)
-    )
+    normaliser = load_normaliser(normaliser_file) if normaliser_file else None
+    mean, scale, clip = read_normalisation(normaliser, width, 1)
+    scaling = mean.tolist(), scale.tolist(), clip, None
+    return WarmStart(str(file), parameters, variables or {}, scaling)
 
 
 def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
@@ -123,9 +109,6 @@ def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
 
     Returns:
         Task with the policy's observation and form.
-
-    Raises:
-        ValueError: The algorithm cannot start from a policy, or from one of this form.
     """
     card, algo = policy.card, fields.get("algo", "ppo")
     options = dict(card.env_options) | fields.pop("env_options", {})
@@ -133,17 +116,11 @@ def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
     scenarios = fields.pop("scenarios", mixture)
     if scenarios:
         options.pop("scenario", None)
-    task_fields: dict[str, Any] = {
-        "env_id": card.env_id,
-        "env_options": options,
-        "scenarios": scenarios,
-    }
+    task_fields = dict[str, Any](env_id=card.env_id, env_options=options, scenarios=scenarios)
     if fields.get("estimator", card.estimator) == card.estimator:
-        task_fields |= {
-            "estimator": card.estimator,
-            "estimator_options": dict(card.estimator_options),
-        }
-    settings = fields.pop("settings", None) or read_settings(algo, _choose_entry(policy))
+        task_fields["estimator"] = card.estimator
+        task_fields["estimator_options"] = dict(card.estimator_options)
+    settings = fields.pop("settings", None) or resolve_settings(None, algo, card.env_id, policy)
     task_fields["settings"] = _add_policy_form(settings, policy, algo)
     return TrainingTask(**task_fields | fields)
 
@@ -159,25 +136,16 @@ def resolve_settings(file: str | Path | None, algo: str, env_id: str, start: Any
 
     Returns:
         Values by name.
-
-    Raises:
-        ValueError: As `read_settings` and `make_finetune_task`.
     """
     if not isinstance(start, Policy):
         return read_settings(algo, env_id, file)
-    return _add_policy_form(read_settings(algo, _choose_entry(start), file), start, algo)
-
-
-def _choose_entry(policy: Policy) -> str:
-    """Choose the settings' entry for training a policy further."""
-    return (
-        WARM_START_TRACES_ENTRY
-        if MovingAverages.kind in [cell.kind for cell in policy.network.cells]
-        else WARM_START_ENTRY
-    )
+    has_averages = MovingAverages.kind in [cell.kind for cell in start.network.cells]
+    entry = WARM_START_TRACES_ENTRY if has_averages else WARM_START_ENTRY
+    return _add_policy_form(read_settings(algo, entry, file), start, algo)
 
 
 def _add_policy_form(settings: Settings, policy: Policy, algo: str) -> Settings:
+    """Replace the policy's arguments in settings by those of a policy to train further."""
     form = _get_policy_form(policy, algo)
     return settings | {"policy_kwargs": settings.get("policy_kwargs", {}) | form}
 
@@ -198,42 +166,25 @@ def _get_policy_form(policy: Policy, algo: str) -> dict[str, Any]:
         )
     if on_tensors and network.activation != "silu":
         raise ValueError(f"{algo} goes on from layers of silu, not of {network.activation}")
-    sizes = {"net_arch": list(network.hidden)}
-    return sizes | (
-        {"cells": network.cells[0].size} if on_tensors else {"activation_fn": network.activation}
-    )
+    if on_tensors:
+        return {"net_arch": list(network.hidden), "cells": network.cells[0].size}
+    return {"net_arch": list(network.hidden), "activation_fn": network.activation}
 
 
-def make_warm_start(
+def _make_warm_start(
     policy: Policy, task: TrainingTask, layout: Sequence[ObservationEntry]
 ) -> WarmStart:
-    """Make the warm start of a task's actor from a policy; a critic stays unchanged.
-
-    Args:
-        policy: Policy to train further.
-        task: Task of the training.
-        layout: Entries of the task's observation.
-
-    Returns:
-        Tensors of the actor, and the policy's scaling.
-
-    Raises:
-        ValueError: The policy has another form than the settings, or another observation.
-    """
+    """Make the warm start of a task's actor from a policy; a critic stays unchanged."""
     network, policy_entries = policy.network, [name for name, _ in policy.card.observation]
     names = [entry.name for entry in layout]
     if policy_entries != names:
-        raise ValueError(
-            f"{policy.name} reads {', '.join(policy_entries)}; here there is {', '.join(names)}"
-        )
-    form, policy_kwargs = (
-        _get_policy_form(policy, task.algo),
-        task.settings.get("policy_kwargs", {}),
-    )
+        known, available = ", ".join(policy_entries), ", ".join(names)
+        raise ValueError(f"{policy.name} reads {known}; here there is {available}")
+    form = _get_policy_form(policy, task.algo)
+    policy_kwargs = task.settings.get("policy_kwargs", {})
     if policy_kwargs != policy_kwargs | form:
-        raise ValueError(
-            f"{policy.name} is a network of {form}, and the settings say {policy_kwargs}"
-        )
+        contrast = f"{form}, and the settings say {policy_kwargs}"
+        raise ValueError(f"{policy.name} is a network of {contrast}")
     on_tensors = get_algorithm(task.algo).on_tensors
     if on_tensors:
         cell = network.cells[0]
@@ -260,16 +211,13 @@ def load_warm_start(start: WarmStart, model: Any) -> None:
     Raises:
         ValueError: The tensors are of another network.
     """
-    unchanged = {
-        name: x
-        for name, x in model.get_parameters()["policy"].items()
-        if start.partial or "features_extractor." in name  # a zip from elsewhere has it outside
-    }
-    policy = unchanged | start.parameters["policy"]
+    policy = dict(model.get_parameters()["policy"])
+    if not start.partial:  # a zip from elsewhere has its features extractor outside
+        policy = {name: x for name, x in policy.items() if "features_extractor." in name}
+    policy |= start.parameters["policy"]
+    parameters = {**model.get_parameters(), **start.parameters, "policy": policy}
     try:
-        model.set_parameters(
-            {**model.get_parameters(), **start.parameters, "policy": policy}, device=model.device
-        )
+        model.set_parameters(parameters, device=model.device)
         for name, tensor in start.variables.items():
             getattr(model, name).data.copy_(tensor)
     except (AttributeError, KeyError, RuntimeError, ValueError) as error:
@@ -280,7 +228,7 @@ def load_warm_start(start: WarmStart, model: Any) -> None:
 
 
 class NetworkAgent:
-    """A network as an agent on its plain observation; rows may be of any cars.
+    """A network as an agent on plain observations; rows may be of any cars.
 
     Args:
         network: Network that computes the action.
@@ -321,23 +269,14 @@ class PolicyWarmStart:
         task: Task of the training.
         env: Vector env of the task, without moving averages.
         seed: Seed of the drives.
-
-    Attributes:
-        start: Warm start of the model.
-        driver: Agent that drives as the policy does.
-
-    Raises:
-        ValueError: As `make_warm_start`.
     """
 
     def __init__(
         self, policy: Policy, task: TrainingTask, env: VectorEnv[Any, Any, Any], seed: int
     ) -> None:
         layout, self._network = get_layout(env), policy.network
-        self.start, self.driver = (
-            make_warm_start(policy, task, layout),
-            NetworkAgent(policy.network),
-        )
+        self.start = _make_warm_start(policy, task, layout)
+        self.driver = NetworkAgent(policy.network)  # drives as the policy does
         self._mixing = None
         if policy.network.cells and not get_algorithm(task.algo).on_tensors:
             dense_agent = NetworkAgent(policy.network.dense)
@@ -345,7 +284,7 @@ class PolicyWarmStart:
                 env, policy.network, lambda obs: dense_agent.predict(obs)[0], seed
             )
             mixed = self._mixing.adapt_to_mixed(policy.network)
-            self.start = make_warm_start(replace(policy, network=mixed), task, layout)
+            self.start = _make_warm_start(replace(policy, network=mixed), task, layout)
             self.driver = NetworkAgent(mixed.dense)
 
     def wrap_env(self, env: VectorEnv[Any, Any, Any]) -> VectorEnv[Any, Any, Any]:
@@ -368,15 +307,9 @@ class PolicyWarmStart:
         Returns:
             Network of plain observations.
         """
-        return (
-            self._network.replace_dense(self._mixing.adapt_to_plain(network))
-            if self._mixing
-            else network
-        )
-
-
-_WEIGHT_DRIVES = 32  # uncontrolled drives by which a scenario is weighed
-_MIN_COST_SHARE = 0.05  # of the mean: a scenario that costs less uncontrolled weighs no more
+        if not self._mixing:
+            return network
+        return self._network.replace_dense(self._mixing.adapt_to_plain(network))
 
 
 def compute_equal_weights(costs: Array) -> Array:
@@ -392,16 +325,14 @@ def compute_equal_weights(costs: Array) -> Array:
 
 
 def compute_scenario_weights(task: TrainingTask, first: int) -> Array:
-    """Compute each scenario's weight by the uncontrolled cost of a control period, shape (k,).
-
-    It is 1 for a task without a mixture.
+    """Compute each scenario's weight by the uncontrolled cost of a control period.
 
     Args:
         task: Task of the training.
         first: First seed of the uncontrolled drives.
 
     Returns:
-        Weights in the order of the scenarios.
+        Weights of the scenarios, shape (k,); 1 for a task without a mixture.
     """
     k = len(task.scenarios)
     if not k:
@@ -409,25 +340,20 @@ def compute_scenario_weights(task: TrainingTask, first: int) -> Array:
     rows = _WEIGHT_DRIVES * k
     env = make_native_env(task.env_id, rows, None, task.options(rows))
     costs, steps = evaluate_episodes(env, None, range(first, first + rows))
-    return compute_equal_weights(
-        np.array([costs[i::k].sum() / steps[i::k].sum() for i in range(k)])
-    )
+    rates = [costs[i::k].sum() / steps[i::k].sum() for i in range(k)]
+    return compute_equal_weights(np.array(rates))
 
 
 class RewardScale:
     """The factors of the cars' rewards, which change from drive to drive.
 
     Args:
-        drive_scales: Factors of each car's first, second, ... drive; the last one serves for all
-            further drives.
-
-    Attributes:
-        now: Present factors, float32, shape (N,).
+        drive_scales: Factors of each car's drives in order; the last one serves for all later ones.
     """
 
     def __init__(self, drive_scales: Sequence[Sequence[float]]) -> None:
         self._drive_scales, self._drive = drive_scales, np.zeros(len(drive_scales), np.intp)
-        self.now = np.zeros(len(drive_scales), np.float32)
+        self.now = np.zeros(len(drive_scales), np.float32)  # present factors
         self.begin()
 
     def begin(self) -> None:
@@ -441,10 +367,9 @@ class RewardScale:
         Args:
             rows: Whether a car starts its next drive, shape (N,).
         """
-        if rows.any():
-            chosen = np.flatnonzero(rows).tolist()
-            self._drive[chosen] += 1
-            self._update_scale(chosen)
+        chosen = np.flatnonzero(rows).tolist()
+        self._drive[chosen] += 1
+        self._update_scale(chosen)
 
     def _update_scale(self, rows: Sequence[int]) -> None:
         for i in rows:
@@ -459,10 +384,10 @@ def measure_reward_scale(agent: Any, env: VecEnv, seed: int, steps: int) -> list
         agent: Agent, as for `iterate_steps`.
         env: Env that resets itself, whose scenarios do not depend on the agent.
         seed: Seed of row 0.
-        steps: Steps of each row; further drives have the median of the row's factors.
+        steps: Steps of each row.
 
     Returns:
-        Factors of each row's drives, the last for all further ones.
+        Factors of each row's drives, then their median for all further drives.
     """
     scales: list[list[float]] = [[] for _ in range(env.num_envs)]
     costs, lengths = np.zeros(env.num_envs), np.zeros(env.num_envs)
@@ -477,16 +402,13 @@ def measure_reward_scale(agent: Any, env: VecEnv, seed: int, steps: int) -> list
             scales[i].append(float(lengths[i] / (costs[i] + COST_FLOOR)))
             costs[i] = lengths[i] = 0.0
     open_scales = lengths / (costs + COST_FLOOR)
-    return [
-        [*row_scales, float(np.median(row_scales or [open_scales[i]]))]
-        for i, row_scales in enumerate(scales)
-    ]
+    for row_scales, open_scale in zip(scales, open_scales, strict=True):
+        row_scales.append(float(np.median(row_scales or [open_scale])))
+    return scales
 
 
 class RewardScaleWrapper(VecEnvWrapper):
-    """Rewards times `RewardScale`: of the order of one for every control period.
-
-    It stands outside of the monitor, which counts costs.
+    """Rewards times `RewardScale`, outside of the monitor, which counts costs.
 
     Args:
         venv: Env of stable-baselines3.

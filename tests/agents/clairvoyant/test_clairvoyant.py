@@ -18,7 +18,6 @@ pytest.importorskip("osqp")
 from sideslip.agents import make_agent  # noqa: E402
 from sideslip.agents.clairvoyant import plan as clairvoyant  # noqa: E402
 from sideslip.agents.clairvoyant.plan import (  # noqa: E402
-    PlanReplay,
     compute_clairvoyant,
     evaluate_actions,
     record_actions,
@@ -27,7 +26,6 @@ from sideslip.agents.clairvoyant.plan import (  # noqa: E402
 )
 from sideslip.agents.clairvoyant.plant import advance  # noqa: E402
 from sideslip.agents.clairvoyant.preview import PlanState, PreviewStep, make_forecast  # noqa: E402
-from sideslip.agents.rollout import rollout  # noqa: E402
 from sideslip.envs.numerics.casadi_backend import to_casadi  # noqa: E402
 
 assert sideslip.__version__
@@ -190,20 +188,6 @@ def test_steering_too() -> None:
     assert beyond.mean() < 0.1  # hardly any action asks for more than the rate gives
 
 
-def test_a_plan_is_an_agent() -> None:
-    env = make("sine", 0.5)
-    actions = np.random.default_rng(3).uniform(-1.0, 1.0, (50, 1)).astype(np.float32)
-    agent = PlanReplay(env, actions)
-    assert rollout(env, agent, 4).cost == pytest.approx(
-        evaluate_actions(env, 4, actions), rel=1e-12
-    )
-    np.testing.assert_array_equal(record_actions(env, agent, 4), actions)
-    obs = np.zeros((3, len(env.get_wrapper_attr("layout"))), np.float32)
-    taken, state = agent.predict(obs, np.array([[0.0], [7.0], [50.0]]))
-    np.testing.assert_array_equal(taken[:, 0], [actions[0, 0], actions[7, 0], 0.0])
-    np.testing.assert_array_equal(state[:, 0], [1.0, 8.0, 51.0])
-
-
 def test_an_unfinished_plan_has_its_status_and_the_better_run_stands(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -224,9 +208,7 @@ def test_bad_input() -> None:
     env.step(np.zeros(1, np.float32))
     with pytest.raises(ValueError, match="call reset"):
         make_forecast(env.unwrapped)
-    for wrong in (np.zeros(5), np.zeros((5, 2)), np.full((5, 1), np.nan)):
-        with pytest.raises(ValueError, match="a plan is finite numbers"):
-            PlanReplay(env, wrong)
+
     joined = to_casadi(compute_wind)
     with pytest.raises(TypeError, match="&"):
         joined(ca.SX.sym("tick"), Wind(1.0, 0.0, 0.0, 1.0))
