@@ -1,6 +1,6 @@
-"""`sideslip replay` and `sideslip identify`: recorded drives through estimators, and their car.
+"""`sideslip replay` and `identify`, of recorded drives, and `lane`, of pictures and films.
 
-`sideslip lane`: the lane in a picture or a film, and a camera's intrinsics from chessboards.
+cv2 is imported when a command needs it, after the limit on a picture's pixels is set.
 """
 
 import math
@@ -11,49 +11,52 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import typer
 from rich.console import Console
+from typer import Argument, Exit, Option
 
 from ...envs.io import atomic_file, read_document, write_atomic, write_document
 from ...envs.numerics import require_extra
 from ..harness.parallel import use_shared_bar
 from ..report.terminal import print_suite
 from .common import check_files, parse_option, parse_options, print_written, write_output
-from .names import complete
+from .names import File, Html, Json, Parquet, Text, Texts, complete
 
 if TYPE_CHECKING:
     from ...envs.sensors.camera.images import Image
     from ...envs.sensors.camera.lane_finder import Lane, LaneFinder
     from ...envs.sensors.camera.pinhole import Pinhole
 
-Texts = list[str] | None
-Drive = Annotated[
-    Path, typer.Argument(help="A recorded drive: CSV, Parquet, MATLAB (.mat) or MDF (.mf4).")
-]
 Mapping = Annotated[
-    Texts, typer.Option("--map", help="NAME_UNIT=COLUMN of the log (yaw_rate_degps=r); repeatable.")
+    Texts, Option("--map", help="NAME_UNIT=COLUMN of the log (yaw_rate_degps=r); repeatable.")
 ]
-Ratio = Annotated[
-    float | None, typer.Option(help="Of the logged steering to the wheels' angle (15.2).")
-]
-Sign = Annotated[int | None, typer.Option(help="1 or -1, of the logged steering.")]
-Offset = Annotated[float | None, typer.Option(help="deg at the wheels, added to the steering.")]
+Ratio = Annotated[float | None, Option(help="Of the logged steering to the wheels' angle (15.2).")]
+Sign = Annotated[int | None, Option(help="1 or -1, of the logged steering.")]
+Offset = Annotated[float | None, Option(help="deg at the wheels, added to the steering.")]
+
+_MAX_TRIES = 60  # frames in which a lane is looked for that shows how the camera is mounted
+_MAX_PIXELS = 2**26  # of a picture; a small file may hold many more
 
 
-def _read_wires(vehicle: str | None, latency: Texts, **steering: float | None) -> Any:
-    """What the vehicle's file has of the wires, and over it what was asked for."""
+def _read_wires(
+    vehicle: str | None,
+    latency: Texts,
+    ratio: float | None,
+    sign: int | None,
+    offset_deg: float | None,
+) -> Any:
+    """Read the calibration of signals from the vehicle's file, and replace what is given."""
     from ..recorded.wires import read_wires
 
     known = read_wires(vehicle)
-    overrides: dict[str, Any] = {
-        name: value for name, value in steering.items() if value is not None
-    }
+    offset = None if offset_deg is None else math.radians(offset_deg)
+    steering = {"ratio": ratio, "sign": sign, "offset": offset}
+    overrides: dict[str, Any] = {k: value for k, value in steering.items() if value is not None}
     late = {**known.latency, **parse_options(latency)}
     return known._replace(latency=late, **overrides).check()
 
 
 def parse_estimator_options(texts: Texts) -> dict[str, dict[str, Any]]:
-    """{"joint": {"members": 4}} from texts such as "joint.members=4"; ValueError for others."""
+    """Parse texts such as "joint.members=4" to options by estimator, {"joint": {"members": 4}}."""
     options: dict[str, dict[str, Any]] = {}
     for text in texts or ():
         key, value = parse_option(text)
@@ -65,52 +68,43 @@ def parse_estimator_options(texts: Texts) -> dict[str, dict[str, Any]]:
 
 
 def replay_command(
-    log: Annotated[
-        Path, typer.Argument(help="A recorded drive: CSV, Parquet, MATLAB, MDF or NMEA.")
-    ],
+    log: Annotated[Path, Argument(help="A recorded drive: CSV, Parquet, MATLAB, MDF or NMEA.")],
     vehicle: Annotated[
-        str | None,
-        typer.Option(
+        Text,
+        Option(
             help="A name, a TOML or JSON file, or `identify`: found in the log itself.",
             autocompletion=complete("vehicles"),
         ),
     ] = None,
     nominal: Annotated[
-        str, typer.Option(help="The car whose mass and arms `--vehicle identify` takes.")
+        str, Option(help="The car whose mass and arms `--vehicle identify` takes.")
     ] = "passenger-car",
     mapping: Mapping = None,
     estimator: Annotated[
-        Texts, typer.Option(help="A name; repeatable; default: all that the log serves.")
+        Texts, Option(help="A name; repeatable; default: all that the log serves.")
     ] = None,
     estimator_option: Annotated[
-        Texts, typer.Option(help="ESTIMATOR.NAME=VALUE (joint.gate=0.99); repeatable.")
+        Texts, Option(help="ESTIMATOR.NAME=VALUE (joint.gate=0.99); repeatable.")
     ] = None,
     steering_ratio: Ratio = None,
     steering_sign: Sign = None,
     steering_offset: Offset = None,
     latency: Annotated[
-        Texts, typer.Option(help="CHANNEL=S, by which a channel is late (gps=0.2); repeatable.")
+        Texts, Option(help="CHANNEL=S, by which a channel is late (gps=0.2); repeatable.")
     ] = None,
     until: Annotated[
-        float | None,
-        typer.Option(help="s of the log from which `identify` is; the rest is replayed."),
+        float | None, Option(help="s of the log from which `identify` is; the rest is replayed.")
     ] = None,
-    course_rate: Annotated[float, typer.Option(help="Hz of the emulated course.")] = 10.0,
-    course_noise: Annotated[float, typer.Option(help="deg, standard deviation.")] = 0.5,
-    course_delay: Annotated[float, typer.Option(help="s the course arrives late.")] = 0.0,
-    course_bias: Annotated[float, typer.Option(help="deg.")] = 0.0,
-    gyro_bias: Annotated[float, typer.Option(help="deg/s added to the gyro.")] = 0.0,
-    html: Annotated[
-        Path | None, typer.Option("--html", help="Write a self-contained report.")
-    ] = None,
-    json: Annotated[Path | None, typer.Option("--json", help="Write the rows as JSON.")] = None,
-    parquet: Annotated[
-        Path | None, typer.Option("--parquet", help="Write the rows as Parquet.")
-    ] = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="Draw a receiver's track: PNG, PDF, SVG.")
-    ] = None,
-    kml: Annotated[Path | None, typer.Option(help="Write a receiver's track for a map.")] = None,
+    course_rate: Annotated[float, Option(help="Hz of the emulated course.")] = 10.0,
+    course_noise: Annotated[float, Option(help="deg, standard deviation.")] = 0.5,
+    course_delay: Annotated[float, Option(help="s the course arrives late.")] = 0.0,
+    course_bias: Annotated[float, Option(help="deg.")] = 0.0,
+    gyro_bias: Annotated[float, Option(help="deg/s added to the gyro.")] = 0.0,
+    html: Html = None,
+    json: Json = None,
+    parquet: Parquet = None,
+    plot: Annotated[File, Option(help="Draw a receiver's track: PNG, PDF, SVG.")] = None,
+    kml: Annotated[File, Option(help="Write a receiver's track for a map.")] = None,
 ) -> None:
     """Run the estimators over a recorded drive and score them; over a receiver's log (NMEA), which
     has no gyro, filter the fixes with noise that follows HDOP or does not."""
@@ -132,8 +126,7 @@ def replay_command(
         return
     if plot or kml:
         raise ValueError(f"{log}: --plot and --kml are for a receiver's log (NMEA); see --html")
-    offset = None if steering_offset is None else math.radians(steering_offset)
-    wires = _read_wires(vehicle, latency, ratio=steering_ratio, sign=steering_sign, offset=offset)
+    wires = _read_wires(vehicle, latency, steering_ratio, steering_sign, steering_offset)
     with use_shared_bar(console, f"replay {log}"):
         suite = replay_file(
             log,
@@ -154,22 +147,24 @@ def replay_command(
 
 
 def identify_command(
-    log: Drive,
+    log: Annotated[
+        Path, Argument(help="A recorded drive: CSV, Parquet, MATLAB (.mat) or MDF (.mf4).")
+    ],
     vehicle: Annotated[
         str,
-        typer.Option(
+        Option(
             help="The car that is stated: its mass and arms stay, the search starts there.",
             autocompletion=complete("vehicles"),
         ),
     ] = "passenger-car",
     mapping: Mapping = None,
-    out: Annotated[Path | None, typer.Option(help="Write the car and its wires as TOML.")] = None,
+    out: Annotated[File, Option(help="Write the car and its wires as TOML.")] = None,
     until: Annotated[
-        float | None, typer.Option(help="s of the log that are used; the rest stays fresh.")
+        float | None, Option(help="s of the log that are used; the rest stays fresh.")
     ] = None,
     tyres: Annotated[
-        str | None,
-        typer.Option(
+        Text,
+        Option(
             help="linear: as stiff as in this drive; fiala: as at small slips; default: "
             "what predicts better."
         ),
@@ -186,39 +181,27 @@ def identify_command(
 
     console = Console()
     check_files(toml=out)
-    offset = None if steering_offset is None else math.radians(steering_offset)
-    wires = _read_wires(vehicle, None, ratio=steering_ratio, sign=steering_sign, offset=offset)
+    wires = _read_wires(vehicle, None, steering_ratio, steering_sign, steering_offset)
     with use_shared_bar(console, f"identify {log}"):
         result, suite = identify_file(log, vehicle, mapping or (), wires, tyres, until)
     print_suite(console, suite)
     if result.reason:
-        raise typer.Exit(1)
+        raise Exit(1)
     if out is not None:
         write_vehicle(out, result.car, result.wires)
         print_written(console, out)
 
 
-TRIES = 60  # frames in which a lane is looked for that shows how the camera is mounted
-
-LARGEST = 2**26
-"""Pixels of a picture; a small file may hold many more."""
-
-
 def lane_command(
-    source: Annotated[
-        Path | None, typer.Argument(metavar="IMAGE|VIDEO", help="A picture or a film.")
-    ] = None,
+    source: Annotated[File, Argument(metavar="IMAGE|VIDEO", help="A picture or a film.")] = None,
     intrinsics: Annotated[
-        Path | None,
-        typer.Option(help="The camera: TOML or JSON with K, dist, size, perhaps height and tilt."),
+        File, Option(help="The camera: TOML or JSON with K, dist, size, perhaps height and tilt.")
     ] = None,
-    lane_width: Annotated[float, typer.Option(help="m, from marking to marking.")] = 3.7,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Write what was found on it.")
-    ] = None,
-    json: Annotated[Path | None, typer.Option("--json", help="Write the numbers.")] = None,
+    lane_width: Annotated[float, Option(help="m, from marking to marking.")] = 3.7,
+    out: Annotated[File, Option("--out", "-o", help="Write what was found on it.")] = None,
+    json: Annotated[File, Option("--json", help="Write the numbers.")] = None,
     calibrate: Annotated[
-        Path | None, typer.Option(help="A folder of chessboards (9 x 6): find the intrinsics.")
+        File, Option(help="A folder of chessboards (9 x 6): find the intrinsics.")
     ] = None,
 ) -> None:
     """Find the lane: heading, offset, curvature and a quality, drawn over the picture.
@@ -226,7 +209,7 @@ def lane_command(
     Without height and tilt among the intrinsics they are estimated from a picture, for a straight
     lane of the width stated; without intrinsics a lens of usual width is assumed.
     """
-    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(LARGEST))  # read where it is loaded
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(_MAX_PIXELS))  # read where it is loaded
     with require_extra("vision", "the lane finder needs {}"):
         import cv2
     from ...envs.sensors.camera.films import PICTURES, Film, read_picture
@@ -248,12 +231,14 @@ def lane_command(
         try:
             picture = read_picture(source)
         except cv2.error:
-            raise ValueError(f"{source}: expected a picture of at most {LARGEST} pixels") from None
+            raise ValueError(
+                f"{source}: expected a picture of at most {_MAX_PIXELS} pixels"
+            ) from None
         finder = _make_finder([picture], intrinsics, lane_width, source)
         lanes, seconds = _process_picture(picture, finder, out)
     else:
         film = Film(source)
-        finder = _make_finder(film.read_head(TRIES), intrinsics, lane_width, source)
+        finder = _make_finder(film.read_head(_MAX_TRIES), intrinsics, lane_width, source)
         lanes, seconds = _process_film(film, finder, out, console)
         if len(lanes) < film.frame_count:
             console.print(
@@ -269,7 +254,7 @@ def lane_command(
 
 
 def _calibrate(folder: Path, path: Path, console: Console) -> None:
-    """Write the intrinsics that a folder's chessboards give."""
+    """Write the intrinsics that the chessboards of a folder's pictures give."""
     from ...envs.sensors.camera.calibration import calibrate_camera
     from ...envs.sensors.camera.films import PICTURES
 
@@ -286,10 +271,7 @@ def _calibrate(folder: Path, path: Path, console: Console) -> None:
 def _make_finder(
     pictures: "list[Image]", intrinsics: Path | None, lane_width: float, source: Path
 ) -> "LaneFinder":
-    """A finder for the camera of some pictures, the first of which that can shows its mounting.
-
-    Raises ValueError for intrinsics of another size, and where no picture shows a lane.
-    """
+    """Make a finder; height and tilt, if not in a file, are those of the first fit picture."""
     from ...envs.sensors.camera.analytic import FieldOfView
     from ...envs.sensors.camera.calibration import (
         FAR,
@@ -330,7 +312,7 @@ def _make_finder(
 def _process_picture(
     picture: "Image", finder: "LaneFinder", out: Path | None
 ) -> tuple[list["Lane"], float]:
-    """(lanes, seconds a picture) of a picture, which is drawn; the fastest of some runs."""
+    """Find the lane of a picture, draw it, and return it with the CPU seconds that it took."""
     import cv2
 
     from ...envs.sensors.camera.films import draw_lane
@@ -349,7 +331,7 @@ def _process_picture(
 def _process_film(
     film: Any, finder: "LaneFinder", out: Path | None, console: Console
 ) -> tuple[list["Lane"], float]:
-    """(lanes, seconds a picture, the median) of a film, which is drawn."""
+    """Find a film's lanes, draw them, and return them with the median CPU seconds of a frame."""
     import cv2
 
     from ...envs.sensors.camera.films import draw_lane
@@ -377,7 +359,7 @@ def _process_film(
 def _report(
     console: Console, source: Path, camera: "Pinhole", lanes: list["Lane"], seconds: float
 ) -> None:
-    """Print what was found."""
+    """Print the lanes, the camera's mounting and the frames per second."""
     from ...envs.sensors.camera.films import describe_lane
 
     detected = [lane for lane in lanes if lane.quality > 0.0]
@@ -386,9 +368,8 @@ def _report(
     else:
         lines = [f"{source.name}: a lane in {len(detected)} of {len(lanes)} frames"]
         if detected:
-            psi, offset = (
-                np.array([getattr(lane, name) for lane in detected]) for name in ("psi", "y")
-            )
+            psi = np.array([lane.psi for lane in detected])
+            offset = np.array([lane.y for lane in detected])
             lines.append(
                 f"psi {np.degrees(psi.mean()):+.2f} deg (sd {np.degrees(psi.std()):.2f}), offset "
                 f"{offset.mean():+.2f} m (sd {offset.std():.2f}), quality "

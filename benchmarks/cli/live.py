@@ -1,6 +1,6 @@
-"""`sideslip live`: an estimator on datagrams in real time, the simulated car, the relay, replay."""
+"""`sideslip live`: an estimator on UDP datagrams in real time, the simulated car, relay, replay."""
 
-import json as writer
+import json as writer  # a command's option is called json
 import os
 import signal
 from contextlib import ExitStack
@@ -12,64 +12,58 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import gymnasium as gym
 import numpy as np
-import typer
 from rich.console import Console
 from rich.markup import escape
+from typer import Argument, Option
 
 from ...envs.io import write_atomic
 from ...envs.validation import check_choice
 from ..harness.study import format_verdict
-from .common import check_files, parse_options, print_written, show_episode
-from .names import check_env, complete
+from .common import AgentSpec, check_files, parse_options, print_written, show_episode
+from .names import File, Text, Texts, check_env, complete
 from .policies import Trust
 
 if TYPE_CHECKING:
     from ...agents.live.controller import OnboardController
 
-_Options = list[str] | None
-_Text = str | None
 console = Console(soft_wrap=True, highlight=False)
 
 
 def live_command(
     estimator: Annotated[
-        _Text,
-        typer.Argument(
+        Text,
+        Argument(
             help="A name, FILE.py:Class or module:Name.", autocompletion=complete("estimators")
         ),
     ] = None,
-    agent: Annotated[str, typer.Option(help="What answers with controls.")] = "none",
+    agent: Annotated[str, Option(help="What answers with controls.")] = "none",
     env: Annotated[
-        _Text, typer.Option(help="The id whose sensors the car has; default: one that fits.")
+        Text, Option(help="The id whose sensors the car has; default: one that fits.")
     ] = None,
-    vehicle: Annotated[_Text, typer.Option(help="The car: a name or a file.")] = None,
-    scenario: Annotated[_Text, typer.Option(help="Of --simulate: a name or a file.")] = None,
-    option: Annotated[_Options, typer.Option(help="NAME=VALUE of the id; repeatable.")] = None,
-    agent_option: Annotated[_Options, typer.Option(help="NAME=VALUE; repeatable.")] = None,
-    estimator_option: Annotated[_Options, typer.Option(help="NAME=VALUE; repeatable.")] = None,
-    seed: Annotated[int, typer.Option(help="Of --simulate, and of drawn sensor phases.")] = 0,
-    control_period: Annotated[int, typer.Option(help="Ticks of 1 ms.")] = 10,
-    host: Annotated[str, typer.Option(help="Where port and page are bound.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="UDP port of what comes in.")] = 47001,
+    vehicle: Annotated[Text, Option(help="The car: a name or a file.")] = None,
+    scenario: Annotated[Text, Option(help="Of --simulate: a name or a file.")] = None,
+    option: Annotated[Texts, Option(help="NAME=VALUE of the id; repeatable.")] = None,
+    agent_option: Annotated[Texts, Option(help="NAME=VALUE; repeatable.")] = None,
+    estimator_option: Annotated[Texts, Option(help="NAME=VALUE; repeatable.")] = None,
+    seed: Annotated[int, Option(help="Of --simulate, and of drawn sensor phases.")] = 0,
+    control_period: Annotated[int, Option(help="Ticks of 1 ms.")] = 10,
+    host: Annotated[str, Option(help="Where port and page are bound.")] = "127.0.0.1",
+    port: Annotated[int, Option(help="UDP port of what comes in.")] = 47001,
     publish: Annotated[
-        _Options, typer.Option(help="HOST:PORT that gets every estimate; repeatable.")
+        Texts, Option(help="HOST:PORT that gets every estimate; repeatable.")
     ] = None,
-    gps: Annotated[
-        _Text, typer.Option(help="NMEA: a file, serial:PORT[:BAUD] or tcp:HOST:PORT.")
-    ] = None,
-    latency: Annotated[float, typer.Option(help="s that the receiver is late.")] = 0.0,
-    page: Annotated[int | None, typer.Option(help="Port of a live page; 0: any.")] = None,
-    simulate: Annotated[
-        bool, typer.Option("--simulate", help="The other end: a simulated car.")
-    ] = False,
-    relay: Annotated[_Text, typer.Option(help="Only relay this NMEA by UDP; as --gps.")] = None,
-    to: Annotated[_Text, typer.Option(help="HOST:PORT for --relay, --simulate alone.")] = None,
-    step: Annotated[bool, typer.Option("--step", help="Lock-step, as fast as it goes.")] = False,
-    speed: Annotated[float, typer.Option(min=0.001, help="Of --simulate and of a file.")] = 1.0,
-    duration: Annotated[float, typer.Option(help="s, after which it ends.")] = float("inf"),
-    record: Annotated[Path | None, typer.Option(help="Write the session to a new file.")] = None,
-    replay: Annotated[Path | None, typer.Option(help="Take a session again.")] = None,
-    json: Annotated[Path | None, typer.Option("--json", help="Write what was measured.")] = None,
+    gps: Annotated[Text, Option(help="NMEA: a file, serial:PORT[:BAUD] or tcp:HOST:PORT.")] = None,
+    latency: Annotated[float, Option(help="s that the receiver is late.")] = 0.0,
+    page: Annotated[int | None, Option(help="Port of a live page; 0: any.")] = None,
+    simulate: Annotated[bool, Option("--simulate", help="The other end: a simulated car.")] = False,
+    relay: Annotated[Text, Option(help="Only relay this NMEA by UDP; as --gps.")] = None,
+    to: Annotated[Text, Option(help="HOST:PORT for --relay, --simulate alone.")] = None,
+    step: Annotated[bool, Option("--step", help="Lock-step, as fast as it goes.")] = False,
+    speed: Annotated[float, Option(min=0.001, help="Of --simulate and of a file.")] = 1.0,
+    duration: Annotated[float, Option(help="s, after which it ends.")] = float("inf"),
+    record: Annotated[File, Option(help="Write the session to a new file.")] = None,
+    replay: Annotated[File, Option(help="Take a session again.")] = None,
+    json: Annotated[File, Option("--json", help="Write what was measured.")] = None,
     trust: Trust = False,
 ) -> None:
     """Run an estimator in real time on datagrams of a car's sensors, and an agent if asked to.
@@ -109,7 +103,7 @@ def live_command(
 
 @dataclass
 class _Connections:
-    """What the loop is connected to. bound, page: (host, port). receiver: (source, latency)."""
+    """Ends of the loop. bound, page: host and port; receiver: its source and latency (s)."""
 
     bound: tuple[str, int]
     publish: list[Any]
@@ -123,8 +117,6 @@ class _Connections:
 
 def _make_env_and_agent(setup: dict[str, Any], trust: bool) -> tuple[Any, Any]:
     names = setup["agent"], setup["agent_options"], setup["estimator"], setup["estimator_options"]
-    from .common import AgentSpec
-
     return AgentSpec(*names, trust).build(setup["env"], setup["options"])
 
 
@@ -135,7 +127,7 @@ def _make_controller(setup: dict[str, Any], trust: bool) -> "OnboardController":
 
 
 def _watch_signals() -> list[int]:
-    """A list that a signal to end fills."""
+    """Make a list that fills when the process is asked to end."""
     signals: list[int] = []
     for signal_number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signal_number, lambda number, _: signals.append(number))
@@ -149,7 +141,7 @@ def _run_live(
     record: Path | None,
     json: Path | None,
 ) -> None:
-    """The loop with all that is connected to it, and what it measured."""
+    """Run the loop with its connections, and print and write what it measured."""
     from ...agents.live.controller import Recorder
     from ...agents.live.loop import Loop, Port
     from ...agents.live.messages import PATIENCE, StreamSynchroniser
@@ -200,7 +192,7 @@ def _run_live(
 def _compare_offline(
     drive: tuple[Any, int, int], setup: dict[str, Any], trust: bool, numbers: dict[str, Any]
 ) -> str:
-    """How far the drive over the wires is from the one without them."""
+    """Compare the drive with the same one without datagrams; a sentence, and new `numbers`."""
     from ...agents.rollout import rollout
 
     columns, late, periods = drive
@@ -220,7 +212,7 @@ def _compare_offline(
 def _run_simulation(
     env_id: str, setup: dict[str, Any], target: Any, step: bool, speed: float
 ) -> None:
-    """The simulated car alone."""
+    """Run the simulated car alone and print its episode."""
     from ...agents.live.loop import Port
     from ...agents.live.simulate import simulate
 

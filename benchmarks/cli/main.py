@@ -1,12 +1,12 @@
-"""The command line: all commands, and `list`, `run` and `bench` themselves."""
+"""The command line `sideslip`: all commands, with `list`, `run` and `bench` themselves."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from typer import Argument, Option
 
 from ... import __version__
 from ...envs.validation import check_choice
@@ -14,18 +14,8 @@ from ..harness.parallel import PROCESSES, report_user_errors, use_engine
 from ..report.html import check_page, write_page
 from ..suites import SUITES, Request, check_salt, run_suites
 from .common import (
-    Address,
-    Agents,
-    EngineName,
-    EnvId,
-    Estimators,
-    Fresh,
-    Limit,
-    Salt,
-    Scenarios,
     check_files,
     handle_interrupt,
-    make_request,
     parse_options,
     print_written,
     show_episode,
@@ -33,7 +23,19 @@ from .common import (
 )
 from .data import Mapping, identify_command, lane_command, replay_command
 from .live import live_command
-from .names import KINDS, complete
+from .names import (
+    KINDS,
+    Address,
+    EngineName,
+    File,
+    Html,
+    Jobs,
+    Json,
+    Parquet,
+    Text,
+    Texts,
+    complete,
+)
 from .policies import (
     Trust,
     distill_command,
@@ -61,22 +63,14 @@ for _name, _command, _line in (
     app.command(_name, short_help=_line)(_command)
 console = Console()
 
-Quick = Annotated[bool, typer.Option("--quick", help="Few seeds: a first look in minutes.")]
-Json = Annotated[Path | None, typer.Option("--json", help="Write the rows as JSON.")]
-Parquet = Annotated[Path | None, typer.Option("--parquet", help="Write the rows as Parquet.")]
-Html = Annotated[Path | None, typer.Option("--html", help="Write a self-contained report.")]
 Vehicle = Annotated[
-    str | None,
-    typer.Option(
-        help="The car: a name or a TOML or JSON file.", autocompletion=complete("vehicles")
-    ),
+    Text,
+    Option(help="The car: a name or a TOML or JSON file.", autocompletion=complete("vehicles")),
 ]
-Options = list[str] | None
-Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")]
 
 
 def main() -> None:
-    """Entry point of `sideslip`; a user's error is one line and exit status 2."""
+    """Run the command line; a user's error is one line and exit status 2."""
     with report_user_errors():
         app()
 
@@ -90,7 +84,7 @@ def _print_version(shown: bool) -> None:
 @app.callback()
 def describe_app(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print it.")
+        bool, Option("--version", callback=_print_version, is_eager=True, help="Print it.")
     ] = False,
 ) -> None:
     """Lateral stability of electric vehicles: environments, estimators, controllers."""
@@ -99,8 +93,7 @@ def describe_app(
 @app.command("list", short_help="List everything that has a name.")
 def list_names(
     kinds: Annotated[
-        list[str] | None,
-        typer.Argument(help=f"{', '.join(KINDS)}; default: all.", autocompletion=lambda: [*KINDS]),
+        Texts, Argument(help=f"{', '.join(KINDS)}; default: all.", autocompletion=lambda: [*KINDS])
     ] = None,
 ) -> None:
     """Everything that has a name, with a line on each."""
@@ -119,49 +112,47 @@ def list_names(
 @app.command(short_help="Drive one episode and draw it.")
 def run(
     env_id: Annotated[
-        str | None,
-        typer.Argument(
+        Text,
+        Argument(
             help="An environment's id; default: the first of YawVision and AfsYawFusion that fits.",
             autocompletion=complete("environments"),
         ),
     ] = None,
     agent: Annotated[
         str,
-        typer.Option(
+        Option(
             help="A name, a policy's path, FILE.py:Class or module:Name.",
             autocompletion=complete("agents", "policies"),
         ),
     ] = "none",
     estimator: Annotated[
-        str | None,
-        typer.Option(
-            help="A name, FILE.py:Class or module:Name.", autocompletion=complete("estimators")
-        ),
+        Text,
+        Option(help="A name, FILE.py:Class or module:Name.", autocompletion=complete("estimators")),
     ] = None,
     vehicle: Vehicle = None,
     scenario: Annotated[
-        str | None,
-        typer.Option(
+        Text,
+        Option(
             help="A name, a TOML or JSON file, or a recorded drive (CSV, Parquet) to steer as.",
             autocompletion=complete("scenarios"),
         ),
     ] = None,
     option: Annotated[
-        Options, typer.Option(help="NAME=VALUE of the environment (reference=model); repeatable.")
+        Texts, Option(help="NAME=VALUE of the environment (reference=model); repeatable.")
     ] = None,
     agent_option: Annotated[
-        Options, typer.Option(help="NAME=VALUE of the agent (grip=0.6); repeatable.")
+        Texts, Option(help="NAME=VALUE of the agent (grip=0.6); repeatable.")
     ] = None,
     estimator_option: Annotated[
-        Options, typer.Option(help="NAME=VALUE of the estimator (q_beta=1e-4); repeatable.")
+        Texts, Option(help="NAME=VALUE of the estimator (q_beta=1e-4); repeatable.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
-    control_period: Annotated[int, typer.Option(help="Ticks of 1 ms.")] = 10,
-    plot: Annotated[Path | None, typer.Option(help="Write a PNG, PDF or SVG.")] = None,
-    parquet: Annotated[Path | None, typer.Option(help="Write every signal.")] = None,
-    kml: Annotated[Path | None, typer.Option(help="Write the track for a map.")] = None,
-    video: Annotated[Path | None, typer.Option(help="Write a film, .mp4 or .gif.")] = None,
-    beside: Annotated[str | None, typer.Option(help="Another agent, a ghost in the film.")] = None,
+    seed: Annotated[int, Option(help="Seed of the episode.")] = 0,
+    control_period: Annotated[int, Option(help="Ticks of 1 ms.")] = 10,
+    plot: Annotated[File, Option(help="Write a PNG, PDF or SVG.")] = None,
+    parquet: Annotated[File, Option(help="Write every signal.")] = None,
+    kml: Annotated[File, Option(help="Write the track for a map.")] = None,
+    video: Annotated[File, Option(help="Write a film, .mp4 or .gif.")] = None,
+    beside: Annotated[Text, Option(help="Another agent, a ghost in the film.")] = None,
     trust: Trust = False,
 ) -> None:
     """Drive one episode, print its score, draw it."""
@@ -187,58 +178,69 @@ def run(
 @app.command(short_help="Compare estimators and controllers.")
 def bench(
     suites: Annotated[
-        list[str] | None,
-        typer.Argument(help="Suites; default: all.", autocompletion=complete("suites")),
+        Texts, Argument(help="Suites; default: all.", autocompletion=complete("suites"))
     ] = None,
-    quick: Quick = False,
-    log: Annotated[Path | None, typer.Option(help="Replay this recorded drive too.")] = None,
+    quick: Annotated[bool, Option("--quick", help="Few seeds: a first look in minutes.")] = False,
+    log: Annotated[File, Option(help="Replay this recorded drive too.")] = None,
     vehicle: Vehicle = None,
     mapping: Mapping = None,
     html: Html = None,
     json: Json = None,
     parquet: Parquet = None,
-    picture: Annotated[Path | None, typer.Option(help="The summary: PNG, PDF or SVG.")] = None,
-    page: Annotated[
-        Path | None, typer.Option(help="Put the tables between this Markdown page's marks.")
-    ] = None,
+    picture: Annotated[File, Option(help="The summary: PNG, PDF or SVG.")] = None,
+    page: Annotated[File, Option(help="Put the tables between this Markdown page's marks.")] = None,
     jobs: Jobs = None,
     episodes: Annotated[
-        int | None, typer.Option(min=4, help="A cell of control (256), or seeds of other suites.")
+        int | None, Option(min=4, help="A cell of control (256), or seeds of other suites.")
     ] = None,
     keep: Annotated[
-        Path | None, typer.Option(help="A folder for finished cases: a stopped run goes on.")
+        File, Option(help="A folder for finished cases: a stopped run goes on.")
     ] = None,
     clairvoyant: Annotated[
-        Path | None, typer.Option(help="A file of `sideslip calibrate`; default: the package's.")
+        File, Option(help="A file of `sideslip calibrate`; default: the package's.")
     ] = None,
-    agent: Agents = None,
-    estimator: Estimators = None,
-    scenario: Scenarios = None,
-    env_id: EnvId = "",
-    fresh: Fresh = False,
-    salt: Salt = "",
-    limit: Limit = 600.0,
+    agent: Annotated[
+        Texts,
+        Option(
+            help="Your own: FILE.py:Class, a policy's path, a name; repeatable.",
+            autocompletion=complete("agents", "policies"),
+        ),
+    ] = None,
+    estimator: Annotated[Texts, Option(help="FILE.py:Class, a name, none; repeatable.")] = None,
+    scenario: Annotated[Texts, Option(help="A name or a file; repeatable.")] = None,
+    env_id: Annotated[str, Option("--env", help="The contests of this id alone.")] = "",
+    fresh: Annotated[
+        bool, Option("--fresh", help="Seeds drawn after your files are hashed: publishable.")
+    ] = False,
+    salt: Annotated[
+        str, Option(help="Of the test seeds, hexadecimal; default: of the contestants' sources.")
+    ] = "",
+    limit: Annotated[float, Option(help="s of wall time for a contestant in a contest.")] = 600.0,
     trust: Trust = False,
     engine_name: EngineName = PROCESSES,
     address: Address = "",
 ) -> None:
     """Compare estimators and controllers, and a recorded drive with --log; with --agent and
     --estimator your own beside some of the package's."""
-    challenge = make_request(
-        suites or [],
-        agent or [],
-        estimator or [],
-        None if log else vehicle,
-        scenario or [],
-        env_id,
-        fresh,
-        salt,
-        limit,
-        episodes,
-        quick,
-        trust,
-    )
-    names = suites or (["control"] if challenge else list(SUITES))
+    comparison = None
+    if agent or estimator:
+        from ..control.entries import QUICK_EPISODES
+        from ..entrants.challenge import EPISODES, ComparisonRequest, make_user_entries
+
+        if list(suites or []) not in ([], ["control"]):
+            raise ValueError("--agent and --estimator go with the suite control alone")
+        estimators = ["" if name == "none" else name for name in estimator or []]
+        entries = tuple(make_user_entries(agent or [], estimators, trust))
+        if not entries:
+            raise ValueError("--estimator none goes with --agent")
+        car, scenarios = None if log else vehicle, tuple(scenario or [])
+        n_episodes = episodes or (QUICK_EPISODES if quick else EPISODES)
+        comparison = ComparisonRequest(
+            entries, car, scenarios, env_id, n_episodes, None, fresh, salt, limit
+        )
+    elif scenario or env_id or fresh:
+        raise ValueError("--scenario, --env and --fresh go with --agent or --estimator")
+    names = suites or (["control"] if comparison else list(SUITES))
     for name in names:
         check_choice("suite", name, SUITES)
     check_salt(salt, names)
@@ -249,7 +251,7 @@ def bench(
         from ..recorded.replay import replay_file
 
         done.append(replay_file(log, vehicle, mapping=mapping))
-    request = Request(quick, jobs, console, episodes, keep, clairvoyant, challenge, salt)
+    request = Request(quick, jobs, console, episodes, keep, clairvoyant, comparison, salt)
     how = "the same command" if keep else "add --keep FOLDER, which keeps finished cases"
     with use_engine(engine_name, address), handle_interrupt(how):
         done += run_suites(names, request)

@@ -1,16 +1,29 @@
-"""Names on the command line: a line on each for `sideslip list`, their completion in a shell."""
+"""Names and options that commands share: a line on each name, completion in shells."""
 
 import ast
 import math
 from collections.abc import Callable, Iterable
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium as gym
+from typer import Option
 
 from ...envs.validation import check_choice
 from ..suites import SUITES
 
-if TYPE_CHECKING:
-    from ...envs.scenarios.scenario import Scenario
+Text = str | None
+Texts = list[str] | None
+File = Path | None
+EngineName = Annotated[
+    str, Option("--engine", help="What runs the cases: processes, or ray, a cluster.")
+]
+Address = Annotated[str, Option(help="HOST:PORT of the cluster; default: this machine's.")]
+Jobs = Annotated[int | None, Option("--jobs", "-j", min=1, help="Processes.")]
+Html = Annotated[File, Option("--html", help="Write a self-contained report.")]
+Json = Annotated[File, Option("--json", help="Write the rows as JSON.")]
+Parquet = Annotated[File, Option("--parquet", help="Write the rows as Parquet.")]
 
 _ENVIRONMENTS = {
     "YawVision": "camera every 33 ms, 30 ms late",
@@ -25,24 +38,20 @@ _ENVIRONMENTS = {
 }
 
 
-def list_environments() -> dict[str, str]:
-    """The package's ids with their slow sensors."""
-    import gymnasium as gym
-
+def _list_environments() -> dict[str, str]:
+    """List the package's ids with their slow sensors."""
     ids = [name for name in gym.registry if name.startswith("sideslip/")]
     return {name: _ENVIRONMENTS[name.rpartition("/")[2].partition("-v")[0]] for name in ids}
 
 
 def check_env(env_id: str) -> None:
-    """ValueError for an id that nobody registered; one with a colon imports its module first."""
-    import gymnasium as gym
-
+    """Raise ValueError for an id that is not registered and, without a colon, has no module."""
     if env_id not in gym.registry and ":" not in env_id:
-        check_choice("environment", env_id, list_environments())
+        check_choice("environment", env_id, _list_environments())
 
 
-def list_scenarios() -> dict[str, str]:
-    """What a driver does in each, how fast and on what; a range is drawn by the seed."""
+def _list_scenarios() -> dict[str, str]:
+    """List the scenarios with steering, path, speed, friction, duration and particulars."""
     from ...envs.scenarios.manoeuvres import SCENARIOS
 
     lines = {}
@@ -54,24 +63,19 @@ def list_scenarios() -> dict[str, str]:
             f"friction {_format_range(scenario.range('friction'))}",
             f"{scenario.duration:g} s",
         ]
-        words += [f"tier {scenario.tier}"] if scenario.tier else []
-        lines[name] = ", ".join(
-            [*words, *(text for text, is_set in _list_marks(scenario) if is_set)]
-        )
+        particulars = {
+            f"tier {scenario.tier}": scenario.tier,
+            "side wind": any(scenario.range("wind_force")),
+            "braking": scenario.speed_change < 0.0,
+            "bend": any(scenario.range("curvature")),
+            "another friction on the right": scenario.friction_right,
+            "tyres that change": scenario.tyre_change_time,
+            "outages": scenario.camera_outage or scenario.gps_outage,
+            "starts sliding": any(scenario.range("initial_beta")),
+        }
+        words += [text for text, is_present in particulars.items() if is_present]
+        lines[name] = ", ".join(words)
     return lines
-
-
-def _list_marks(scenario: "Scenario") -> list[tuple[str, Any]]:
-    """What sets a scenario apart, and whether it does."""
-    return [
-        ("side wind", any(scenario.range("wind_force"))),
-        ("braking", scenario.speed_change < 0.0),
-        ("bend", any(scenario.range("curvature"))),
-        ("another friction on the right", scenario.friction_right),
-        ("tyres that change", scenario.tyre_change_time),
-        ("outages", scenario.camera_outage or scenario.gps_outage),
-        ("starts sliding", any(scenario.range("initial_beta"))),
-    ]
 
 
 def _format_range(ends: tuple[float, float], factor: float = 1.0) -> str:
@@ -79,8 +83,8 @@ def _format_range(ends: tuple[float, float], factor: float = 1.0) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def list_vehicles() -> dict[str, str]:
-    """Mass, wheelbase, and above which speed a car is unstable."""
+def _list_vehicles() -> dict[str, str]:
+    """List the cars with mass, wheelbase and critical speed."""
     from ...envs.vehicle.parameters import VEHICLES, critical_speed
 
     lines = {}
@@ -91,46 +95,45 @@ def list_vehicles() -> dict[str, str]:
     return lines
 
 
-def list_estimators() -> dict[str, str]:
-    """The slow sensors that a filter takes, and where it comes from."""
+def _list_estimators() -> dict[str, str]:
+    """List the estimators with their slow sensors and source."""
     from ...estimators.filters import FILTERS
     from ...estimators.make import ESTIMATORS
 
-    lines = {name: "registered" for name in ESTIMATORS}
     behind = "a network behind the filter of its file, which corrects the sideslip angle"
-    lines |= {name: behind for name in lines if name.startswith("learned")}
+    lines = {name: behind if name.startswith("learned") else "registered" for name in ESTIMATORS}
     for name, filter_ in FILTERS.items():
         slow = " or ".join(filter_.slow) if len(filter_.slow) < 2 else "camera, GPS or both"
         lines[name] = f"{slow.replace('gps', 'GPS') or 'fast sensors alone'}; {filter_.source}"
     return lines
 
 
-def list_agents() -> dict[str, str]:
-    """The first sentence of each controller's docstring."""
+def _list_agents() -> dict[str, str]:
+    """List the agents with the first sentence of their docstrings."""
     from ...agents import AGENTS
 
     return {name: _extract_sentence(AGENTS.load(name).__doc__) for name in AGENTS}
 
 
-def list_policies() -> dict[str, str]:
-    """The algorithm and the environment of each policy that is shipped."""
+def _list_policies() -> dict[str, str]:
+    """List the shipped policies with algorithm and environment."""
     from ...agents.learned.policy import list_shipped, load_policy
 
-    cards = {name: load_policy(name).card for name in list_shipped()}
-    return {
-        name: f"{card.algorithm} on {card.env_id}, estimator {card.estimator or 'none'}"
-        for name, card in cards.items()
-    }
+    lines = {}
+    for name in list_shipped():
+        card = load_policy(name).card
+        lines[name] = f"{card.algorithm} on {card.env_id}, estimator {card.estimator or 'none'}"
+    return lines
 
 
-def list_suites() -> dict[str, str]:
-    """The first sentence of each suite's module, which is not imported for it."""
+def _list_suites() -> dict[str, str]:
+    """List the suites with the first sentence of their modules, which are not imported."""
     lines = {}
     for name, (module, _) in SUITES.items():
         spec = find_spec(module, __package__.rpartition(".")[0])
         assert spec is not None and spec.origin is not None
-        with open(spec.origin, encoding="utf-8") as file:
-            lines[name] = _extract_sentence(ast.get_docstring(ast.parse(file.read())))
+        module_text = Path(spec.origin).read_text(encoding="utf-8")
+        lines[name] = _extract_sentence(ast.get_docstring(ast.parse(module_text)))
     return lines
 
 
@@ -141,19 +144,19 @@ def _extract_sentence(text: str | None) -> str:
 
 
 KINDS: dict[str, Callable[[], dict[str, str]]] = {
-    "environments": list_environments,
-    "scenarios": list_scenarios,
-    "vehicles": list_vehicles,
-    "estimators": list_estimators,
-    "agents": list_agents,
-    "policies": list_policies,
-    "suites": list_suites,
+    "environments": _list_environments,
+    "scenarios": _list_scenarios,
+    "vehicles": _list_vehicles,
+    "estimators": _list_estimators,
+    "agents": _list_agents,
+    "policies": _list_policies,
+    "suites": _list_suites,
 }
-"""What has a name, and a line on each."""
+"""Functions that list the names of a kind with a line on each."""
 
 
 def complete(*kinds: str) -> Callable[[str], Iterable[Any]]:
-    """A completion of names of these kinds, with the line on each."""
+    """Make a shell completion of the names of some `KINDS`, with the line on each."""
 
     def list_matches(incomplete: str) -> list[tuple[str, str]]:
         pairs = [pair for kind in kinds for pair in KINDS[kind]().items()]

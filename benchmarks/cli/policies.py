@@ -1,11 +1,4 @@
-"""`sideslip export`: a stable-baselines3 zip as a policy's file, which cannot run code.
-
-`sideslip enjoy`: a learned policy at work, and what it costs against others.
-
-`sideslip train`: a policy learns, with a progress bar; a stopped training goes on.
-`sideslip distill`: one learns from a teacher that sees more, over a class of contests.
-`sideslip train-estimator`: a network learns to correct a filter's sideslip angle.
-"""
+"""Commands of learned policies and corrections: export, enjoy, train, distill, train-estimator."""
 
 import shlex
 import shutil
@@ -18,11 +11,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
 from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from typer import Argument, Option
 
 from ... import __version__
 from ..harness.parallel import use_shared_bar
@@ -38,7 +31,7 @@ from .common import (
     show_training,
     write_output,
 )
-from .names import check_env, complete
+from .names import File, Html, Json, Parquet, Text, Texts, check_env, complete
 
 if TYPE_CHECKING:
     from ...agents.learned.policy import Policy
@@ -46,24 +39,20 @@ if TYPE_CHECKING:
     from ...estimators.learned.network import Network
 
 ENV = "sideslip/YawVision-v0"
+EPISODES, _TASK_EPISODES = 256, 32  # of the policy's test, and of each contest of its class
 Trust = Annotated[
-    bool, typer.Option("--trust", help="Read policies' zips, which may run code of their makers.")
+    bool, Option("--trust", help="Read policies' zips, which may run code of their makers.")
 ]
 
 
 def export_command(
-    zipped: Annotated[Path, typer.Argument(metavar="ZIP", help="Of stable-baselines3.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Default: NAME.safetensors beside it.")
-    ] = None,
-    env: Annotated[str, typer.Option(help="The id that it was trained on.")] = ENV,
-    estimator: Annotated[str, typer.Option(help="The estimator around it.")] = "",
-    option: Annotated[
-        list[str] | None, typer.Option(help="NAME=VALUE of the environment; repeatable.")
-    ] = None,
+    zipped: Annotated[Path, Argument(metavar="ZIP", help="Of stable-baselines3.")],
+    out: Annotated[File, Option("--out", "-o", help="Default: NAME.safetensors beside it.")] = None,
+    env: Annotated[str, Option(help="The id that it was trained on.")] = ENV,
+    estimator: Annotated[str, Option(help="The estimator around it.")] = "",
+    option: Annotated[Texts, Option(help="NAME=VALUE of the environment; repeatable.")] = None,
     normalise: Annotated[
-        Path | None,
-        typer.Option(help="VecNormalize's pickle; default: NAME.pkl or vecnormalize.pkl beside."),
+        File, Option(help="VecNormalize's pickle; default: NAME.pkl or vecnormalize.pkl beside.")
     ] = None,
     trust: Trust = False,
 ) -> None:
@@ -78,17 +67,14 @@ def export_command(
         trust=trust, normalise=normalise, command=get_command_line(),
     )  # fmt: skip
     console, scaled = Console(soft_wrap=True), find_normaliser(zipped, normalise)
-    console.print(
-        f"network: {describe_sizes(policy.network)}; observations normalised by: "
-        f"{scaled or 'nothing'}",
-        markup=False,
-        highlight=False,
-    )
+    sizes = f"network: {_describe_sizes(policy.network)}"
+    text = f"{sizes}; observations normalised by: {scaled or 'nothing'}"
+    console.print(text, markup=False, highlight=False)
     print_written(console, target)
 
 
-def describe_sizes(network: "Network") -> str:
-    """What an observation goes through, as "22 x 3 frames x 16 lstm x 64 x 1"."""
+def _describe_sizes(network: "Network") -> str:
+    """Describe the sizes of a network's layers, as "22 x 3 frames x 16 lstm x 64 x 1"."""
     frames = [f"{network.history} frames"] if network.history > 1 else []
     cells = [f"{cell.size} {cell.kind}" for cell in network.cells]
     layers = map(str, (*network.hidden, network.width))
@@ -96,8 +82,8 @@ def describe_sizes(network: "Network") -> str:
 
 
 @contextmanager
-def export_policy(name: str, env: str | None, trust: bool) -> Iterator[str]:
-    """A policy's name or path as it is; a zip as the path of its export, for the time being."""
+def _export_policy(name: str, env: Text, trust: bool) -> Iterator[str]:
+    """Yield a policy's name or path; for a zip the path of its export in a temporary folder."""
     if not name.endswith(".zip"):
         yield name
         return
@@ -110,24 +96,21 @@ def export_policy(name: str, env: str | None, trust: bool) -> Iterator[str]:
 
 
 def enjoy_command(
-    policy: Annotated[
-        str, typer.Argument(help="A shipped policy's name, or a file's or zip's path.")
-    ],
-    env: Annotated[str | None, typer.Option(help="Another id than the policy's own.")] = None,
-    episodes: Annotated[int, typer.Option(min=1, help="How many.")] = 256,
-    scenario: Annotated[str | None, typer.Option(help="A scenario's name.")] = None,
+    policy: Annotated[str, Argument(help="A shipped policy's name, or a file's or zip's path.")],
+    env: Annotated[Text, Option(help="Another id than the policy's own.")] = None,
+    episodes: Annotated[int, Option(min=1, help="How many.")] = 256,
+    scenario: Annotated[Text, Option(help="A scenario's name.")] = None,
     seed: Annotated[
-        int | None,
-        typer.Option(help="Of the first episode; default: test seeds made from the weights."),
+        int | None, Option(help="Of the first episode; default: test seeds made from the weights.")
     ] = None,
-    html: Annotated[Path | None, typer.Option("--html", help="Write a report.")] = None,
-    json: Annotated[Path | None, typer.Option("--json", help="Write the rows.")] = None,
-    parquet: Annotated[Path | None, typer.Option("--parquet", help="Write the rows.")] = None,
-    plot: Annotated[Path | None, typer.Option(help="Write the first episode as a PNG.")] = None,
+    html: Html = None,
+    json: Json = None,
+    parquet: Parquet = None,
+    plot: Annotated[File, Option(help="Write the first episode as a PNG.")] = None,
     video: Annotated[
-        Path | None, typer.Option(help="Write it as a film, .mp4 or .gif, no control beside it.")
+        File, Option(help="Write it as a film, .mp4 or .gif, no control beside it.")
     ] = None,
-    card: Annotated[bool, typer.Option("--card", help="Show the policy's card, no more.")] = False,
+    card: Annotated[bool, Option("--card", help="Show the policy's card, no more.")] = False,
     trust: Trust = False,
 ) -> None:
     """Drive a learned policy: its cost against no control and the best classical line.
@@ -142,7 +125,7 @@ def enjoy_command(
     console = Console()
     check_files(html=html, json=json, parquet=parquet, plot=plot)
     check_film(video)
-    with export_policy(policy, env, trust) as path:
+    with _export_policy(policy, env, trust) as path:
         if card:
             _show_card(console, load_policy(path))
             return
@@ -153,24 +136,20 @@ def enjoy_command(
         show_episode(console, run_entry(first, evaluation.seeds[0]), evaluation.policy.name, plot)
         if video is not None:
             cars = (evaluation.policy.name, first), ("no control", evaluation.entries["none"])
-            write_film(
-                video,
-                [FilmDriver(name, *make_env_and_agent(entry)) for name, entry in cars],
-                evaluation.seeds[0],
-                console,
-            )
+            drivers = [FilmDriver(name, *make_env_and_agent(entry)) for name, entry in cars]
+            write_film(video, drivers, evaluation.seeds[0], console)
             print_written(console, video)
 
 
 def _show_card(console: Console, policy: "Policy") -> None:
-    """A line a field of the card, and the size of the network."""
+    """Print a policy's card and the sizes of its network."""
     network = policy.network
     unread = [name for (name, _), read in zip(policy.card.observation, policy.reads, strict=True)
               if not read]  # fmt: skip
     fields = asdict(policy.card) | {
         "observation": ", ".join(f"{name} / {unit}" for name, unit in policy.card.observation),
         "not read": ", ".join(unread) or "none",
-        "network": f"{describe_sizes(network)}, {network.activation}, {network.output} output",
+        "network": f"{_describe_sizes(network)}, {network.activation}, {network.output} output",
         "observation clipped at": network.clip,
     }
     table = Table("field", "value", box=box.SIMPLE_HEAD, title=policy.name, title_justify="left")
@@ -180,93 +159,68 @@ def _show_card(console: Console, policy: "Policy") -> None:
 
 
 def make_task_table(file: Path, kind: str, episodes: int) -> Table:
-    """What a policy costs in each contest of its class; its card has it too."""
+    """Make a table of a policy's costs on the tasks of its class, written into its card too."""
     from ..studies.policies import evaluate_card
 
     table = Table("contest", "in % of nominal", "adaptive-nmpc", "better", "fails")
     with use_shared_bar(Console(), f"judge {file}"):
         written = evaluate_card(file, kind, episodes)
     for task, record in written["cost in % of nominal"].items():
-        policy_cost, rival_cost = record["policy"], record["adaptive-nmpc"]
+        cost, low, high = record["policy"]
         better, fails = record["better than adaptive-nmpc"][0], record["fails"]
-        numbers = (
-            f"{policy_cost[0]:.0f} [{policy_cost[1]:.0f}, {policy_cost[2]:.0f}]",
-            f"{rival_cost[0]:.0f}",
-        )
+        numbers = f"{cost:.0f} [{low:.0f}, {high:.0f}]", f"{record['adaptive-nmpc'][0]:.0f}"
         table.add_row(task, *numbers, f"{100.0 * better:.0f} %", f"{100.0 * fails:.0f} %")
     return table
 
 
-EPISODES, CONTESTS = 256, 32  # of the policy's test, and of each contest of its class
-_Text = str | None
-
-
 def train_command(
-    algo: Annotated[
-        _Text, typer.Option(help="ppo, sac, tqc, recurrent-ppo, gradient (ppo).")
-    ] = None,
-    env: Annotated[_Text, typer.Option(help="An environment's id (sideslip/YawVision-v0).")] = None,
-    estimator: Annotated[_Text, typer.Option(help="An estimator's name (none).")] = None,
+    algo: Annotated[Text, Option(help="ppo, sac, tqc, recurrent-ppo, gradient (ppo).")] = None,
+    env: Annotated[Text, Option(help="An environment's id (sideslip/YawVision-v0).")] = None,
+    estimator: Annotated[Text, Option(help="An estimator's name (none).")] = None,
     estimator_option: Annotated[
-        list[str] | None,
-        typer.Option(help='NAME=VALUE of EstimateObservation, as outputs=["beta","F_d"].'),
+        Texts, Option(help='NAME=VALUE of EstimateObservation, as outputs=["beta","F_d"].')
     ] = None,
     option: Annotated[
-        list[str] | None,
-        typer.Option(help="NAME=VALUE of the environment, as scenario=gust; repeatable."),
+        Texts, Option(help="NAME=VALUE of the environment, as scenario=gust; repeatable.")
     ] = None,
-    scenarios: Annotated[
-        list[str] | None, typer.Option(help="Of a mixture: a name or a file; repeatable.")
-    ] = None,
+    scenarios: Annotated[Texts, Option(help="Of a mixture: a name or a file; repeatable.")] = None,
     reads: Annotated[
-        list[str] | None,
-        typer.Option(help="An entry of the observation that the network reads (all); repeatable."),
+        Texts, Option(help="An entry of the observation that the network reads (all); repeatable.")
     ] = None,
     steps: Annotated[
-        int | None,
-        typer.Option("--steps", "--n-timesteps", "-n", help="Control periods, all in all."),
+        int | None, Option("--steps", "--n-timesteps", "-n", help="Control periods, all in all.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Of weights and episodes (0).")] = None,
+    seed: Annotated[int | None, Option(help="Of weights and episodes (0).")] = None,
     num_envs: Annotated[
-        int | None, typer.Option(min=1, help="Side by side; default: of the settings.")
+        int | None, Option(min=1, help="Side by side; default: of the settings.")
     ] = None,
     conf_file: Annotated[
-        Path | None,
-        typer.Option("--conf-file", "-conf", help="YAML of settings; default: the package's own."),
+        File, Option("--conf-file", "-conf", help="YAML of settings; default: the package's own.")
     ] = None,
-    eval_freq: Annotated[
-        int | None, typer.Option(help="Steps between two evaluations (250000).")
-    ] = None,
+    eval_freq: Annotated[int | None, Option(help="Steps between two evaluations (250000).")] = None,
     n_eval_envs: Annotated[
-        int | None, typer.Option(min=1, help="Episodes of an evaluation (256).")
+        int | None, Option(min=1, help="Episodes of an evaluation (256).")
     ] = None,
     tensorboard_log: Annotated[
-        _Text, typer.Option("--tensorboard-log", "-tb", help="A folder for TensorBoard.")
+        Text, Option("--tensorboard-log", "-tb", help="A folder for TensorBoard.")
     ] = None,
-    track: Annotated[bool, typer.Option("--track", help="Log to Weights & Biases.")] = False,
-    wandb_project_name: Annotated[str, typer.Option(help="With --track.")] = "sideslip",
-    device: Annotated[str, typer.Option(help="Of the networks, as torch calls it.")] = "cpu",
-    progress: Annotated[
-        bool, typer.Option("--progress/--no-progress", "-P", help="Show a bar.")
-    ] = True,
+    track: Annotated[bool, Option("--track", help="Log to Weights & Biases.")] = False,
+    wandb_project_name: Annotated[str, Option(help="With --track.")] = "sideslip",
+    device: Annotated[str, Option(help="Of the networks, as torch calls it.")] = "cpu",
+    progress: Annotated[bool, Option("--progress/--no-progress", "-P", help="Show a bar.")] = True,
     trained_agent: Annotated[
-        Path | None,
-        typer.Option("--trained-agent", "-i", help="Begin with an sb3 zip or a policy."),
+        File, Option("--trained-agent", "-i", help="Begin with an sb3 zip or a policy.")
     ] = None,
     varied: Annotated[
-        int,
-        typer.Option(min=0, help="With a policy: each contest so often, varied as in `distill`."),
+        int, Option(min=0, help="With a policy: each contest so often, varied as in `distill`.")
     ] = 0,
     trust: Trust = False,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder; default: train-ENV-ALGO...-SEED here.")
-    ] = None,
+    out: Annotated[File, Option(help="Folder; default: train-ENV-ALGO...-SEED here.")] = None,
     log_folder: Annotated[
-        Path | None,
-        typer.Option("--log-folder", "-f", help="Instead of --out, as the zoo: FOLDER/ALGO/ENV_N."),
+        File, Option("--log-folder", "-f", help="Instead of --out, as the zoo: FOLDER/ALGO/ENV_N.")
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the training in the folder.")
+        bool, Option("--resume", help="Go on with the training in the folder.")
     ] = False,
 ) -> None:
     """Train a policy; the best one of the evaluations is saved, the last one can be gone on with.
@@ -335,7 +289,7 @@ def train_command(
     console.print(_make_table(trained))
     kind = load_policy(folder / POLICY).card.algorithm_options.get("class")
     if kind is not None:
-        console.print(make_task_table(folder / POLICY, kind, CONTESTS))
+        console.print(make_task_table(folder / POLICY, kind, _TASK_EPISODES))
     else:
         costs = summarise_evaluation(record_evaluation(folder / POLICY, EPISODES))["cost"]
         shown = ", ".join(f"{name} {cost['mean']:.4g}" for name, cost in costs.items())
@@ -356,45 +310,41 @@ def _make_table(trained: "TrainResult") -> Table:
 
 
 def distill_command(
-    name: Annotated[str, typer.Argument(help="Of the file NAME.safetensors.")],
-    kind: Annotated[str, typer.Option("--class", help="Of contests, as coms-model.")],
+    name: Annotated[str, Argument(help="Of the file NAME.safetensors.")],
+    kind: Annotated[str, Option("--class", help="Of contests, as coms-model.")],
     teacher: Annotated[
-        str, typer.Option(help="A rung, a controller of the matrix, or a policy.")
+        str, Option(help="A rung, a controller of the matrix, or a policy.")
     ] = "adaptive-nmpc",
     estimator: Annotated[
-        str, typer.Option(help="What the policy reads: joint, or nothing but the sensors.")
+        str, Option(help="What the policy reads: joint, or nothing but the sensors.")
     ] = "joint",
     cars: Annotated[
-        int,
-        typer.Option(help="Of each contest and round; its varied lessons share as many.", min=1),
+        int, Option(help="Of each contest and round; its varied lessons share as many.", min=1)
     ] = 6,
     varied: Annotated[
         int,
-        typer.Option(
+        Option(
             min=0, help="Lessons of each contest with another car, late camera, wind and outages."
         ),
     ] = 0,
-    rounds: Annotated[int, typer.Option(help="Of driving and learning.")] = 7,
-    epochs: Annotated[int, typer.Option(help="Passes over all drives in a round.")] = 12,
-    cells: Annotated[int, typer.Option(help="Of its GRU; 0: no memory.")] = 0,
-    hidden: Annotated[
-        list[int] | None, typer.Option(help="Size of a dense layer (64, 64).")
-    ] = None,
-    batch: Annotated[int, typer.Option(help="Episodes, with a GRU or traces.")] = 16,
-    noise: Annotated[float, typer.Option(help="That shakes the teacher, at most.")] = 0.02,
+    rounds: Annotated[int, Option(help="Of driving and learning.")] = 7,
+    epochs: Annotated[int, Option(help="Passes over all drives in a round.")] = 12,
+    cells: Annotated[int, Option(help="Of its GRU; 0: no memory.")] = 0,
+    hidden: Annotated[list[int] | None, Option(help="Size of a dense layer (64, 64).")] = None,
+    batch: Annotated[int, Option(help="Episodes, with a GRU or traces.")] = 16,
+    noise: Annotated[float, Option(help="That shakes the teacher, at most.")] = 0.02,
     traces: Annotated[
-        int, typer.Option(min=0, help="Bent units whose running means it reads, instead of a GRU.")
+        int, Option(min=0, help="Bent units whose running means it reads, instead of a GRU.")
     ] = 0,
     told: Annotated[
-        float, typer.Option(help="Weight of what the teacher reads, as its GRU or traces tell it.")
+        float, Option(help="Weight of what the teacher reads, as its GRU or traces tell it.")
     ] = 0.0,
     option: Annotated[
-        list[str] | None,
-        typer.Option(help="NAME=VALUE of what is observed: with_map, fast; repeatable."),
+        Texts, Option(help="NAME=VALUE of what is observed: with_map, fast; repeatable.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of weights and episodes.")] = 0,
-    episodes: Annotated[int, typer.Option(help="Of each contest's test.", min=2)] = 32,
-    out: Annotated[Path | None, typer.Option(help="The file; default: NAME here.")] = None,
+    seed: Annotated[int, Option(help="Of weights and episodes.")] = 0,
+    episodes: Annotated[int, Option(help="Of each contest's test.", min=2)] = 32,
+    out: Annotated[File, Option(help="The file; default: NAME here.")] = None,
 ) -> None:
     """Distil a policy by DAgger; its card says what it costs in each contest, on unseen seeds."""
     from ...agents.training.distill import RoundResult, distill
@@ -428,23 +378,20 @@ def distill_command(
 
 
 def train_estimator_command(
-    name: Annotated[str, typer.Argument(help="Of the file NAME.safetensors.")],
+    name: Annotated[str, Argument(help="Of the file NAME.safetensors.")],
     base: Annotated[
-        str, typer.Option(help="The filter.", autocompletion=complete("estimators"))
+        str, Option(help="The filter.", autocompletion=complete("estimators"))
     ] = "exact-kf",
-    scenarios: Annotated[
-        list[str] | None, typer.Option(help="Repeatable; default: of all scored contests.")
-    ] = None,
-    option: Annotated[
-        list[str] | None, typer.Option(help="NAME=VALUE of the filter; repeatable.")
-    ] = None,
-    episodes: Annotated[int, typer.Option(help="Of each contest, driver and sensor set.")] = 32,
-    epochs: Annotated[int, typer.Option(help="Passes over all samples.")] = 20,
-    seed: Annotated[int, typer.Option(help="Of weights and episodes.", min=0)] = 0,
-    out: Annotated[Path | None, typer.Option(help="The file; default: NAME here.")] = None,
+    scenarios: Annotated[Texts, Option(help="Repeatable; default: of all scored contests.")] = None,
+    option: Annotated[Texts, Option(help="NAME=VALUE of the filter; repeatable.")] = None,
+    episodes: Annotated[int, Option(help="Of each contest, driver and sensor set.")] = 32,
+    epochs: Annotated[int, Option(help="Passes over all samples.")] = 20,
+    seed: Annotated[int, Option(help="Of weights and episodes.", min=0)] = 0,
+    out: Annotated[File, Option(help="The file; default: NAME here.")] = None,
 ) -> None:
     """Train a correction of a filter; `learned` with `file=FILE` estimates with it."""
     from ...agents.training.corrections import READ, train_correction
+    from ...envs.sensors.slow import SENSOR_SETS
     from ...estimators.learned.correction_file import CorrectionCard, save_correction
     from ...estimators.make import make_estimator
     from ..control.tasks import YAW, list_scored_tasks
@@ -455,8 +402,6 @@ def train_estimator_command(
     wanted = dict.fromkeys(scenarios or known)
     drives = [(c.env_id, c.env_options) for c in list_scored_tasks() if c.scenario in wanted]
     drives += [(YAW, {"scenario": item}) for item in wanted if item not in known]
-    from ...envs.sensors.slow import SENSOR_SETS
-
     both, options = SENSOR_SETS["fusion"], parse_options(option)
     states = make_estimator(base, sensors=both, slow=list(both), **options).names
     card = CorrectionCard(

@@ -1,7 +1,4 @@
-"""`sideslip tune`: what a user types, turned into a tuning's task; what it found, into a file.
-
-`sideslip calibrate`: what the clairvoyant costs, into a file beside the user.
-"""
+"""`sideslip tune`, of estimators and controllers, and `calibrate`, of the clairvoyant's costs."""
 
 import shlex
 from collections.abc import Sequence
@@ -9,31 +6,20 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 from rich.console import Console
 from rich.table import Table
+from typer import Argument, Option, Typer
 
 from ...envs.validation import check_choice
 from ..harness.parallel import PROCESSES, use_engine
 from ..harness.results import check_writable
 from ..report.terminal import print_suite
-from .common import (
-    Address,
-    EngineName,
-    check_files,
-    get_command_line,
-    handle_interrupt,
-    parse_options,
-    print_written,
-)
+from .common import check_files, get_command_line, handle_interrupt, parse_options, print_written
+from .names import Address, EngineName, File, Jobs, Text, Texts
 
-tune_app = typer.Typer(no_args_is_help=True)
-Texts = list[str] | None
-Storage = Annotated[
-    str | None, typer.Option(help="RDB URL or SQLite file; default: sideslip-tune.db here.")
-]
-Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")]
-Seed = Annotated[int, typer.Option(help="Of the sampler; another on each machine of a study.")]
+tune_app = Typer(no_args_is_help=True)
+Storage = Annotated[Text, Option(help="RDB URL or SQLite file; default: sideslip-tune.db here.")]
+Seed = Annotated[int, Option(help="Of the sampler; another on each machine of a study.")]
 
 
 @tune_app.callback()
@@ -42,7 +28,7 @@ def describe_tune() -> None:
 
 
 def _parse_range(text: str) -> tuple[str, tuple[float, float] | None]:
-    """NAME or NAME=LOW:HIGH."""
+    """Parse NAME or NAME=LOW:HIGH to the name and its range, None without one."""
     name, equals, limits = text.partition("=")
     if not equals:
         return name, None
@@ -55,30 +41,29 @@ def _parse_range(text: str) -> tuple[str, tuple[float, float] | None]:
 
 @tune_app.command("estimator")
 def tune_estimator(
-    name: Annotated[str, typer.Argument(help="An estimator's name.")],
+    name: Annotated[str, Argument(help="An estimator's name.")],
     scenario: Annotated[
-        list[str], typer.Option(help="A scenario's name; repeatable: each counts alike.")
+        list[str], Option(help="A scenario's name; repeatable: each counts alike.")
     ],
-    env: Annotated[str, typer.Option(help="An environment's id; default: one that fits.")] = "",
-    target: Annotated[str, typer.Option(help="The state whose error counts.")] = "beta",
-    option: Annotated[Texts, typer.Option(help="NAME=VALUE, held; repeatable.")] = None,
+    env: Annotated[str, Option(help="An environment's id; default: one that fits.")] = "",
+    target: Annotated[str, Option(help="The state whose error counts.")] = "beta",
+    option: Annotated[Texts, Option(help="NAME=VALUE, held; repeatable.")] = None,
     search: Annotated[
-        Texts,
-        typer.Option(help="NAME or NAME=LOW:HIGH; default: every q_STATE not held; repeatable."),
+        Texts, Option(help="NAME or NAME=LOW:HIGH; default: every q_STATE not held; repeatable.")
     ] = None,
     noise: Annotated[
-        Texts, typer.Option(help="psi_noise or psi_noise=LOW:HIGH, searched too; repeatable.")
+        Texts, Option(help="psi_noise or psi_noise=LOW:HIGH, searched too; repeatable.")
     ] = None,
-    trials: Annotated[int, typer.Option(help="Of the study, the finished ones included.")] = 200,
-    seeds: Annotated[int, typer.Option(help="Training drives.")] = 12,
-    test_seeds: Annotated[int, typer.Option(help="Test drives.")] = 20,
-    sampler: Annotated[str, typer.Option(help="cma (CMA-ES) or tpe.")] = "cma",
+    trials: Annotated[int, Option(help="Of the study, the finished ones included.")] = 200,
+    seeds: Annotated[int, Option(help="Training drives.")] = 12,
+    test_seeds: Annotated[int, Option(help="Test drives.")] = 20,
+    sampler: Annotated[str, Option(help="cma (CMA-ES) or tpe.")] = "cma",
     seed: Seed = 0,
     storage: Storage = None,
     jobs: Jobs = None,
-    out: Annotated[Path | None, typer.Option(help="Write the entry to a tunings file.")] = None,
-    write: Annotated[bool, typer.Option("--write", help="Make it the shipped tuning.")] = False,
-    note: Annotated[str, typer.Option(help="A note for the entry.")] = "",
+    out: Annotated[File, Option(help="Write the entry to a tunings file.")] = None,
+    write: Annotated[bool, Option("--write", help="Make it the shipped tuning.")] = False,
+    note: Annotated[str, Option(help="A note for the entry.")] = "",
 ) -> None:
     """Find an estimator's Q, and R if asked to, on training seeds; report on test seeds.
 
@@ -91,34 +76,27 @@ def tune_estimator(
     files = [*([out] if out else []), *([options.FILE] if write else [])]
     check_files(toml=out)
     check_writable(*files)
-    task = make_estimator_tuning(
-        name,
-        scenario,
-        env or None,
-        target,
-        parse_options(option),
-        dict(map(_parse_range, search)) if search else None,
-        dict(map(_parse_range, noise or [])),
-        seeds,
-    )
+    held, ranges = parse_options(option), dict(map(_parse_range, search)) if search else None
+    noises = dict(map(_parse_range, noise or []))
+    task = make_estimator_tuning(name, scenario, env or None, target, held, ranges, noises, seeds)
     if write and not all(key.startswith("q_") for key in task.search):
         raise ValueError("shipped tunings hold process noise alone: --out writes the others")
     console = Console()
     suite, result = run(task, trials, test_seeds, storage or STORAGE, sampler, seed, jobs, console)
     print_suite(console, suite)
-    flags: list[tuple[str, Sequence[Any]]] = [
-        ("--scenario", scenario),
-        ("--env", [env] if env else []),
-        ("--target", [target] if target != "beta" else []),
-        ("--option", option or []),
-        ("--search", search or []),
-        ("--noise", noise or []),
-        ("--sampler", [sampler] if sampler != "cma" else []),
-        ("--trials", [trials]),
-        ("--seeds", [seeds]),
-        ("--seed", [seed] if seed else []),
-    ]
-    words = [str(word) for flag, values in flags for value in values for word in (flag, value)]
+    flags: dict[str, Sequence[Any]] = {
+        "--scenario": scenario,
+        "--env": [env] if env else [],
+        "--target": [target] if target != "beta" else [],
+        "--option": option or [],
+        "--search": search or [],
+        "--noise": noise or [],
+        "--sampler": [sampler] if sampler != "cma" else [],
+        "--trials": [trials],
+        "--seeds": [seeds],
+        "--seed": [seed] if seed else [],
+    }
+    words = [str(word) for flag in flags for value in flags[flag] for word in (flag, value)]
     command = shlex.join(["sideslip", "tune", "estimator", name, *words])
     made = make_entry(task, result, command, note)
     for path in files:
@@ -128,18 +106,16 @@ def tune_estimator(
 
 @tune_app.command("controller")
 def tune_controller(
-    name: Annotated[str, typer.Argument(help="A contestant of the matrix, or a rung.")],
-    kind: Annotated[
-        list[str] | None, typer.Option("--class", help="Of contests; default: all. Repeatable.")
-    ] = None,
-    trials: Annotated[int, typer.Option(help="Of a study, the finished ones included.")] = 60,
-    seeds: Annotated[int, typer.Option(help="Tuning seeds a contest.")] = 16,
+    name: Annotated[str, Argument(help="A contestant of the matrix, or a rung.")],
+    kind: Annotated[Texts, Option("--class", help="Of contests; default: all. Repeatable.")] = None,
+    trials: Annotated[int, Option(help="Of a study, the finished ones included.")] = 60,
+    seeds: Annotated[int, Option(help="Tuning seeds a contest.")] = 16,
     seed: Seed = 0,
     storage: Storage = None,
     jobs: Jobs = None,
-    out: Annotated[Path | None, typer.Option(help="Write the options to this TOML file.")] = None,
-    log: Annotated[Path | None, typer.Option(help="A folder for every study's log.")] = None,
-    write: Annotated[bool, typer.Option("--write", help="Into the package: both.")] = False,
+    out: Annotated[File, Option(help="Write the options to this TOML file.")] = None,
+    log: Annotated[File, Option(help="A folder for every study's log.")] = None,
+    write: Annotated[bool, Option("--write", help="Into the package: both.")] = False,
     engine_name: EngineName = PROCESSES,
     address: Address = "",
 ) -> None:
@@ -166,9 +142,8 @@ def tune_controller(
         except ValueError as error:
             if kind:
                 raise
-            console.print(
-                f"{name} in {class_name} was left out: {error}", markup=False, highlight=False
-            )
+            text = f"{name} in {class_name} was left out: {error}"
+            console.print(text, markup=False, highlight=False)
             continue
         print_suite(console, controllers.make_suite(task, result))
         for path in filter(None, tables):
@@ -179,13 +154,13 @@ def tune_controller(
 
 
 def calibrate_command(
-    out: Annotated[Path, typer.Argument(help="The file to write.")] = Path("clairvoyant.json"),
+    out: Annotated[Path, Argument(help="The file to write.")] = Path("clairvoyant.json"),
     contest: Annotated[
-        list[str] | None, typer.Option(help="Its name in the tables; default: all. Repeatable.")
+        Texts, Option(help="Its name in the tables; default: all. Repeatable.")
     ] = None,
-    seeds: Annotated[int, typer.Option(help="Seeds a contest.")] = 64,
-    write: Annotated[bool, typer.Option("--write", help="Into the package instead.")] = False,
-    jobs: Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes.")] = None,
+    seeds: Annotated[int, Option(help="Seeds a contest.")] = 64,
+    write: Annotated[bool, Option("--write", help="Into the package instead.")] = False,
+    jobs: Jobs = None,
     engine_name: EngineName = PROCESSES,
     address: Address = "",
 ) -> None:
@@ -208,10 +183,8 @@ def calibrate_command(
     n_episodes = len(tasks) * seeds
     text = f"{remaining} of {n_episodes} episodes are left; the same command goes on if stopped."
     console.print(text, highlight=False)
-    with (
-        use_engine(engine_name, address),
-        handle_interrupt("run the same command in the same folder"),
-    ):
+    how = "run the same command in the same folder"
+    with use_engine(engine_name, address), handle_interrupt(how):
         records = calibrate(tasks, folder, seeds, get_command_line(), jobs, console)
     update(path, records)
     remove_cases(make_cases(tasks, folder, seeds))

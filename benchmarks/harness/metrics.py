@@ -1,8 +1,6 @@
-"""The vocabulary of metrics with their units, and the metrics of an episode, step by step.
+"""Metrics with their units, those of an episode step by step, and the tyres' dissipated power.
 
-A new metric of the matrix is one entry of `EPISODE`: its rows, its column and its unit follow.
-
-The power that tyres dissipate by sliding sideways.
+A new metric of an episode is one entry of `EPISODE`: its rows, its column and its unit follow.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,47 +19,29 @@ from ...envs.record import Array
 from ...envs.vehicle.dynamics import compute_gravity
 from ...envs.vehicle.tyres import compute_tyre_forces
 
-FULL = 0.999  # of an input's range: saturated
+_FULL = 0.999  # of an input's range: saturated
 
 
 class StepSample(NamedTuple):
-    """An env-step of N cars.
+    """An env-step of N cars."""
 
-    Attributes:
-        command: Fractions of yaw moment and added steering, shape (N, 2).
-        last_command: Those of the last step, shape (N, 2).
-        reward: Rewards, shape (N,).
-        info: Info of the env after the step.
-        last: Info of the env before the step.
-        full_scale: Yaw moment (N m) and added steering (rad) at a fraction of 1, shape (2,).
-        dt: Control period (s).
-        lateral_deviation: Distance from the path of the reference (m), shape (N,).
-        power: Power of the motors (W), shape (N,).
-        tyre_dissipation: Power that the tyres dissipate (W), shape (N,).
-    """
-
-    command: Array
-    last_command: Array
-    reward: Array
-    info: Mapping[str, Any]
-    last: Mapping[str, Any]
-    full_scale: Array
-    dt: float
-    lateral_deviation: Array
-    power: Array
-    tyre_dissipation: Array
+    command: Array  # fractions of yaw moment and added steering, shape (N, 2)
+    last_command: Array  # those of the last step, shape (N, 2)
+    reward: Array  # rewards, shape (N,)
+    info: Mapping[str, Any]  # info of the env after the step
+    last: Mapping[str, Any]  # info of the env before the step
+    full_scale: Array  # yaw moment (N m) and added steering (rad) at a fraction of 1, shape (2,)
+    dt: float  # control period (s)
+    lateral_deviation: Array  # distance from the path of the reference (m), shape (N,)
+    power: Array  # power of the motors (W), shape (N,)
+    tyre_dissipation: Array  # power that the tyres dissipate (W), shape (N,)
 
 
-class Reduction(NamedTuple):
-    """A reduction of the values of an episode's steps to one number, which starts at 0.
+class _Reduction(NamedTuple):
+    """Reduction of the values of an episode's steps to one number, which starts at 0."""
 
-    Attributes:
-        add: Function of the number so far and a step's value.
-        finish: Function of the last number and the count of steps.
-    """
-
-    add: Callable[[Array, Array], Array]
-    finish: Callable[[Array, Array], Array]
+    add: Callable[[Array, Array], Array]  # of the number so far and a step's value
+    finish: Callable[[Array, Array], Array]  # of the last number and the count of steps
 
 
 def _keep_total(total: Array, _: Array) -> Array:
@@ -69,49 +49,29 @@ def _keep_total(total: Array, _: Array) -> Array:
 
 
 REDUCTIONS = {
-    "sum": Reduction(np.add, _keep_total),
-    "mean": Reduction(np.add, np.divide),
-    "rms": Reduction(
-        lambda total, value: total + value * value, lambda t, steps: np.sqrt(t / steps)
-    ),
-    "max": Reduction(np.maximum, _keep_total),
-    "last": Reduction(lambda _, value: value, _keep_total),
+    "sum": _Reduction(np.add, _keep_total),
+    "mean": _Reduction(np.add, np.divide),
+    "rms": _Reduction(lambda total, x: total + x * x, lambda total, n: np.sqrt(total / n)),
+    "max": _Reduction(np.maximum, _keep_total),
+    "last": _Reduction(lambda _, x: x, _keep_total),
 }
 
 
 @dataclass(frozen=True)
 class Metric:
-    """A number of an episode.
-
-    Attributes:
-        name: Name of the metric.
-        unit: Unit of the number.
-        compute: Function from a `StepSample` to values, shape (N,).
-        reduction: Key of `REDUCTIONS`.
-        heading: Heading of its column in the matrix's table of motion, "" for none.
-        scale: Factor of a number there.
-        digits: Decimal places of a number there.
-        turning: Whether it is meaningful only where the reference has a yaw rate.
-    """
+    """A number of an episode."""
 
     name: str
     unit: str
-    compute: Callable[[StepSample], Array]
-    reduction: str
-    heading: str = ""
-    scale: float = 1.0
-    digits: int = 1
-    turning: bool = False
+    compute: Callable[[StepSample], Array]  # function from a `StepSample` to values, shape (N,)
+    reduction: str  # key of `REDUCTIONS`
+    heading: str = ""  # heading of its column in the matrix's table of motion, "" for none
+    scale: float = 1.0  # factor of a number there
+    digits: int = 1  # decimal places of a number there
+    turning: bool = False  # whether it is meaningful only where the reference has a yaw rate
 
     def text(self, value: float) -> str:
-        """Format a value for its column.
-
-        Args:
-            value: Value in the metric's unit.
-
-        Returns:
-            Number without its unit.
-        """
+        """Format a value in the metric's unit for its column."""
         return f"{self.scale * value:.{self.digits}f}"
 
 
@@ -128,78 +88,37 @@ _DEGREES = 180.0 / np.pi
 EPISODE = (
     Metric("cost", "-", lambda m: -m.reward, "sum"),
     Metric("rms_slip", "rad", lambda m: m.info["beta"], "rms"),
-    Metric(
-        "peak_slip", "rad", lambda m: np.abs(m.info["beta"]), "max", "peak slip / deg", _DEGREES, 2
-    ),
+    Metric("peak_slip", "rad", lambda m: np.abs(m.info["beta"]), "max",
+           "peak slip / deg", _DEGREES, 2),
     Metric("rms_slip_error", "rad", _make_error("beta"), "rms", "slip error / deg", _DEGREES, 2),
-    Metric(
-        *(
-            "rms_yaw_error",
-            "rad/s",
-            _make_error("gamma"),
-            "rms",
-            "yaw error / (deg/s)",
-            _DEGREES,
-            2,
-        ),
-        turning=True,
-    ),
-    Metric(
-        *(
-            "path_error",
-            "m",
-            lambda m: np.abs(m.lateral_deviation),
-            "max",
-            "off the path / m",
-            1.0,
-            2,
-        ),
-        turning=True,
-    ),
+    Metric("rms_yaw_error", "rad/s", _make_error("gamma"), "rms",
+           "yaw error / (deg/s)", _DEGREES, 2, turning=True),
+    # largest distance from the path of the reference's yaw rate and slip
+    Metric("path_error", "m", lambda m: np.abs(m.lateral_deviation), "max",
+           "off the path / m", 1.0, 2, turning=True),
+    # mechanical work of both motors, without regard to its sign
     Metric("motor_energy", "J", lambda m: m.power * m.dt, "sum", "motors / kJ", 1e-3),
-    Metric(
-        "tyre_dissipation", "J", lambda m: m.tyre_dissipation * m.dt, "sum", "tyres / kJ", 1e-3, 2
-    ),
-    Metric(
-        "effort",
-        "-",
-        lambda m: (m.info["yaw_moment"] / m.full_scale[0]) ** 2,
-        "mean",
-        "effort",
-        1,
-        3,
-    ),
-    Metric(
-        "moment_rate",
-        "N m/s",
-        lambda m: np.abs(m.info["yaw_moment"] - m.last["yaw_moment"]) / m.dt,
-        "mean",
-        "moment rate / (N m/s)",
-        digits=0,
-    ),
+    # energy of sliding sideways, both axles
+    Metric("tyre_dissipation", "J", lambda m: m.tyre_dissipation * m.dt, "sum",
+           "tyres / kJ", 1e-3, 2),
+    # delivered yaw moment as a fraction
+    Metric("effort", "-", lambda m: (m.info["yaw_moment"] / m.full_scale[0]) ** 2, "mean",
+           "effort", 1, 3),
+    Metric("moment_rate", "N m/s",
+           lambda m: np.abs(m.info["yaw_moment"] - m.last["yaw_moment"]) / m.dt, "mean",
+           "moment rate / (N m/s)", digits=0),
     Metric("largest_step", "N m", _make_change(0), "max", "step / (N m)", digits=0),
+    # added steering command as a fraction
     Metric("steer_effort", "-", lambda m: m.command[:, 1] ** 2, "mean"),
     Metric("largest_steer_step", "rad", _make_change(1), "max", "steer step / mrad", 1e3),
-    Metric(
-        "saturation",
-        "-",
-        lambda m: (np.abs(m.command).max(axis=1) >= FULL).astype(np.float64),
-        "mean",
-        "saturated / %",
-        1e2,
-    ),
+    # fraction of the decisions with an input at its limit
+    Metric("saturation", "-",
+           lambda m: (np.abs(m.command).max(axis=1) >= _FULL).astype(np.float64), "mean",
+           "saturated / %", 1e2),
+    # a code of `FAILURES`
     Metric("failure", "code", lambda m: m.info["failure"], "last"),
-)
-"""The metrics of an episode.
-
-path_error: largest distance from the path that the reference's yaw rate and slip would drive from
-the same start. motor_energy: mechanical work of both motors, without regard to its sign.
-tyre_dissipation: energy of sliding sideways, both axles. effort: mean square of the delivered yaw
-moment as a fraction. moment_rate: mean rate of the delivered yaw moment. steer_effort: mean square
-of the added steering command as a fraction. largest_step, largest_steer_step: between two
-decisions. saturation: fraction of the decisions with an input at its limit. failure: a code of
-`FAILURES`.
-"""
+)  # fmt: skip
+"""Metrics of an episode."""
 
 _OTHERS = {
     "rad": "rmse static_slip drift course_prediction_error",
@@ -219,14 +138,13 @@ _OTHERS = {
 METRICS = {metric.name: metric.unit for metric in EPISODE} | {
     name: unit for unit, names in _OTHERS.items() for name in names.split()
 }
-"""Every metric that a row may have, with its unit; a new one is added here first."""
+"""Unit of every metric that a row may have."""
 
 
 def compute_dissipation(params: Array, states: Array, switches: Any) -> Array:
-    """Compute the power that N cars' tyres dissipate (W), shape (N,).
+    """Compute the power that N cars' tyres dissipate: force times speed across, both axles.
 
-    It is the lateral force times the speed across the wheel, at both axles. Drive slip is not
-    modelled.
+    Drive slip is not modelled.
 
     Args:
         params: Packed parameters of the engine, one row for each car.
@@ -234,7 +152,7 @@ def compute_dissipation(params: Array, states: Array, switches: Any) -> Array:
         switches: Packed switches of the engine, likewise.
 
     Returns:
-        Power of each car.
+        Power of each car (W), shape (N,).
     """
     out = np.empty(len(params))
     _write(params, states, switches, out)

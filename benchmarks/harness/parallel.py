@@ -1,10 +1,7 @@
-"""The engines of independent cases: processes of this machine, or an existing Ray cluster.
+"""Independent cases side by side, in processes or on a Ray cluster, with a progress bar.
 
-Every engine and every number of workers give the same results.
-
-A benchmark's work as a list of independent cases, run side by side with a progress bar.
-
-A user's error as one line; every other error keeps its traceback.
+Every engine and every number of workers give the same results. A user's error is one line; every
+other error keeps its traceback.
 """
 
 import io
@@ -29,9 +26,8 @@ from ...envs.validation import check_choice
 Case = TypeVar("Case")
 Result = TypeVar("Result")
 
-PROCESSES, RAY = ENGINES = ("processes", "ray")
-RETRIES = 3
-"""Deaths of its worker or node that a case outlives on a cluster; a fourth may be its own doing."""
+PROCESSES, _RAY = _ENGINES = ("processes", "ray")
+RETRIES = 3  # deaths of its worker or node that a case outlives on a cluster
 _CLUSTER: ContextVar[Any] = ContextVar("cluster", default=None)
 
 
@@ -45,18 +41,17 @@ def use_engine(name: str = PROCESSES, address: str = "") -> Iterator[None]:
     """Use an engine for the cases within.
 
     Args:
-        name: Name in `ENGINES`.
-        address: Existing Ray cluster, "host:port"; "": the one on this machine. Its nodes need this
-            version of sideslip and a shared folder for finished cases.
+        name: Name, `PROCESSES` or "ray".
+        address: Existing Ray cluster, "host:port", "" for this machine's; it has this version.
 
     Raises:
         ValueError: The name is unknown, an address without Ray, or there is no such cluster.
         ModuleNotFoundError: ray is not installed.
     """
-    check_choice("engine", name, ENGINES)
+    check_choice("engine", name, _ENGINES)
     if name == PROCESSES:
         if address:
-            raise ValueError(f"an address is of a Ray cluster (engine {RAY!r}), got {address!r}")
+            raise ValueError(f"an address is of a Ray cluster (engine {_RAY!r}), got {address!r}")
         yield
         return
     with require_extra("scale", "the engine 'ray' needs ray"):
@@ -86,20 +81,18 @@ def execute_cases(
     Args:
         function: Function of a case, importable by workers.
         cases: Cases.
-        jobs: Number of processes; None: one for each processor at most. A cluster has its own.
+        jobs: Number of processes, None for one a processor at most; a cluster has its own.
     """
     ray = _CLUSTER.get()
     if ray is None:
         # the number asked for is left alone: another one would end the processes of the last call
-        pool = joblib.Parallel(
-            jobs or max(min(count_cores(), len(cases)), 1), return_as="generator"
-        )
+        n_jobs = jobs or max(min(count_cores(), len(cases)), 1)
+        pool = joblib.Parallel(n_jobs, return_as="generator")
         yield from enumerate(pool(joblib.delayed(function)(case) for case in cases))
         return
     remote = ray.remote(num_cpus=1, max_retries=RETRIES)(_call)  # a dead node's cases run again
-    function_ref, waiting = ray.put(function), {}
-    for place, case in enumerate(cases):
-        waiting[remote.remote(function_ref, case)] = place
+    function_ref = ray.put(function)
+    waiting = {remote.remote(function_ref, case): place for place, case in enumerate(cases)}
     while waiting:
         (done,), _ = ray.wait(list(waiting), num_returns=1)
         yield waiting.pop(done), ray.get(done)
@@ -113,22 +106,12 @@ _EVERY = 15.0  # s between two lines
 
 
 def split_seeds(seeds: int, size: int) -> list[tuple[int, ...]]:
-    """Split the seeds 0 .. seeds-1 into tuples.
-
-    Args:
-        seeds: Number of seeds.
-        size: Maximum of seeds in a tuple.
-
-    Returns:
-        Tuples of consecutive seeds.
-    """
+    """Split the seeds 0 .. seeds-1 into tuples of at most `size` consecutive ones."""
     return [tuple(range(k, min(k + size, seeds))) for k in range(0, seeds, size)]
 
 
 class Bar(progress.Progress):
-    """A progress bar, or lines on standard error where no bar can be drawn.
-
-    There is a line for each task and every 15 s, with the remaining time at the task's rate so far.
+    """A progress bar, or where none can be drawn a line on standard error every 15 s.
 
     Args:
         console: Console of the bar; None: nothing is shown.
@@ -144,15 +127,7 @@ class Bar(progress.Progress):
         self._before = progress.TaskID(-1), 0.0, 0.0  # the newest task as it was first seen
 
     def add_task(self, *args: Any, **options: Any) -> progress.TaskID:
-        """Add a task, which lines then report.
-
-        Args:
-            args: Arguments of rich's `add_task`.
-            options: Keyword arguments of rich's `add_task`, and the unit of its count, `unit`.
-
-        Returns:
-            Id of the task.
-        """
+        """Add a task as rich does, with the `unit` of its count, and report it in a line."""
         made = super().add_task(*args, **options)
         self._say()
         return made
@@ -178,9 +153,7 @@ class Bar(progress.Progress):
             last_id, since, done = self._before
             if task.total is not None:
                 text = f"{task.completed:,.0f} of {task.total:,.0f} {task.fields['unit']}, "
-            if (
-                task.id != last_id or not done
-            ):  # what a stopped run has done took no time in this one
+            if task.id != last_id or not done:  # what a stopped run has done took no time in this
                 self._before = task.id, passed, task.completed
             elif task.total is not None and task.completed > done:
                 pace = (passed - since) / (task.completed - done)
@@ -229,10 +202,8 @@ def run_cases(
         function: Function of a case, importable by workers.
         cases: Cases.
         title: Title of the progress bar.
-        jobs: Number of processes, None for the available processors, 1 for this process; a cluster
-            has its own.
-        console: Console of the progress bar, unless inside `use_shared_bar`; None: nothing is
-            shown.
+        jobs: Number of processes, None for one a processor, 1 for this process.
+        console: Console of the progress bar outside of `use_shared_bar`; None: nothing is shown.
 
     Returns:
         Results, one for each case.
@@ -253,7 +224,7 @@ _USER_ERRORS = (
     FloatingPointError,
 )  # fmt: skip
 
-_LONGEST = 1000  # letters of a message
+_MAX_LETTERS = 1000  # of a message
 
 
 @contextmanager
@@ -265,14 +236,8 @@ def report_user_errors() -> Iterator[None]:
     try:
         yield
     except _USER_ERRORS as error:
-        Console(stderr=True, soft_wrap=True).print(
-            "[bold red]error:[/]", escape(_truncate_message(str(error))), highlight=False
-        )
+        text, half = str(error), _MAX_LETTERS // 2
+        text = text if len(text) <= _MAX_LETTERS else f"{text[:half]} ... {text[-half:]}"
+        console = Console(stderr=True, soft_wrap=True)
+        console.print("[bold red]error:[/]", escape(text), highlight=False)
         sys.exit(2)
-
-
-def _truncate_message(text: str) -> str:
-    """Truncate a long message in its middle."""
-    if len(text) <= _LONGEST:
-        return text
-    return f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"

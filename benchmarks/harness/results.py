@@ -1,4 +1,4 @@
-"""The row: one measured number with everything needed to reproduce it."""
+"""Results of suites: rows for machines, tables and maps for people, and the files of rows."""
 
 import json
 import math
@@ -9,8 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...envs.io import atomic_file, write_atomic
-from ...envs.io import from_json as from_json
+from ...envs.io import atomic_file, from_json, write_atomic
 from ...envs.record import Array
 from ...envs.validation import check_choice
 from .metrics import METRICS
@@ -27,24 +26,7 @@ VERDICTS = ("", "reproduced", "partly", "not reproduced", "report only")
 class ResultRow:
     """One number of a benchmark.
 
-    For a claim, which has a verdict, and a replay, value and bounds are median and range over n
-    seeds.
-
-    Attributes:
-        suite: Name of the suite.
-        scenario: Name of the scenario.
-        metric: Name of the metric, in `METRICS`.
-        value: Number in the metric's unit.
-        estimator: Name of the estimator.
-        controller: Name of the controller.
-        low: Lower bound of the 95 % interval, NaN without one.
-        high: Upper bound of the 95 % interval, NaN without one.
-        n: Number of runs.
-        salt: Salt of the seeds.
-        env_version: Version of the env.
-        spec: JSON of the env, "" where no env was run.
-        verdict: Verdict on a claim, in `VERDICTS`.
-        paper: Paper of a claim.
+    Value and bounds of a claim, which has a verdict, and of a replay are median and range.
 
     Raises:
         ValueError: The metric or verdict is outside of the vocabulary.
@@ -52,17 +34,17 @@ class ResultRow:
 
     suite: str
     scenario: str
-    metric: str
-    value: float
+    metric: str  # name of the metric, in `METRICS`
+    value: float  # number in the metric's unit
     estimator: str = ""
     controller: str = ""
-    low: float = math.nan
-    high: float = math.nan
-    n: int = 1
+    low: float = math.nan  # lower bound of the 95 % interval, NaN without one
+    high: float = math.nan  # upper bound of the 95 % interval, NaN without one
+    n: int = 1  # number of runs
     salt: str = ""
     env_version: str = ""
-    spec: str = ""
-    verdict: str = ""
+    spec: str = ""  # JSON of the env, "" where no env was run
+    verdict: str = ""  # verdict on a claim, in `VERDICTS`
     paper: str = ""
 
     def __post_init__(self) -> None:
@@ -71,38 +53,20 @@ class ResultRow:
 
     @classmethod
     def from_estimate(cls, metric: str, number: Estimate, **columns: Any) -> "ResultRow":
-        """Make a row of a number with its interval.
-
-        Args:
-            metric: Name of the metric.
-            number: Number and interval.
-            columns: Other fields.
-
-        Returns:
-            Row of the metric.
-        """
+        """Make a row of a metric from a number with its interval, and other columns."""
         return cls(metric=metric, value=number.value, low=number.low, high=number.high, **columns)
 
 
 @dataclass
 class ResultTable:
-    """A table for the screen and the report.
-
-    Attributes:
-        title: Title of the table.
-        header: Headings of the columns.
-        cells: Texts, row by row.
-        note: Meaning of the columns.
-        keyed: Whether the first column names estimators or controllers, which have their colour.
-        detail: Whether it stands in the report alone, too long for a screen.
-    """
+    """A table for the screen and the report."""
 
     title: str
-    header: Sequence[str]
+    header: Sequence[str]  # headings of the columns
     cells: Sequence[Sequence[str]]
-    note: str = ""
-    keyed: bool = True
-    detail: bool = False
+    note: str = ""  # meaning of the columns
+    keyed: bool = True  # the first column names estimators or controllers, shown in colour
+    detail: bool = False  # it stands in the report alone, too long for a screen
 
     def to_pandas(self) -> "DataFrame":
         """Convert the texts to a pandas table (needs the extra `report`)."""
@@ -118,45 +82,21 @@ class ResultTable:
 
 @dataclass(frozen=True)
 class ShareMap:
-    """Fractions between 0 and 1 over two axes.
-
-    Attributes:
-        title: Title of the map.
-        x: Values of the horizontal axis.
-        y: Values of the vertical axis.
-        shares: Fractions by name, each of shape (y, x).
-        x_label: Label of the horizontal axis.
-        y_label: Label of the vertical axis.
-    """
+    """Fractions between 0 and 1 over two axes."""
 
     title: str
-    x: Array
-    y: Array
-    shares: Mapping[str, Array]
-    x_label: str
-    y_label: str
+    x: Array  # values of the horizontal axis
+    y: Array  # values of the vertical axis
+    shares: Mapping[str, Array]  # fractions by name, each of shape (y, x)
+    x_label: str  # label of the horizontal axis
+    y_label: str  # label of the vertical axis
 
 
 @dataclass
 class Suite:
-    """The result of a benchmark module: rows for machines, tables and figures for people.
+    """The result of a benchmark: rows for machines, tables and figures for people.
 
-    `answers` and `figures` are empty without the extra `report` or where pictures were not
-    requested.
-
-    Attributes:
-        name: Name of the suite.
-        title: Title of the suite.
-        text: Text of the report.
-        rows: Rows of all numbers.
-        tables: Tables of the report.
-        figures: Title, plotly figure, and what to see in it.
-        explorers: Figures with menus.
-        maps: Maps for the summary's PNG.
-        files: Files that the report offers: name, media type, text.
-        verdict: Answer in plain words, at most five lines (`harness.verdict`).
-        warnings: Warnings about the input, which stand above the verdict.
-        answers: Question, plotly figure, and the answer in a sentence.
+    `answers` and `figures` are empty without the extra `report`, and where no pictures are wanted.
     """
 
     name: str
@@ -164,13 +104,13 @@ class Suite:
     text: str
     rows: list[ResultRow] = field(default_factory=list)
     tables: list[ResultTable] = field(default_factory=list)
-    figures: list[tuple[str, Any, str]] = field(default_factory=list)
-    explorers: list[Explorer] = field(default_factory=list)
-    maps: list[ShareMap] = field(default_factory=list)
-    files: list[tuple[str, str, str]] = field(default_factory=list)
-    verdict: str = ""
-    warnings: list[str] = field(default_factory=list)
-    answers: list[tuple[str, Any, str]] = field(default_factory=list)
+    figures: list[tuple[str, Any, str]] = field(default_factory=list)  # title, plotly, caption
+    explorers: list[Explorer] = field(default_factory=list)  # figures with menus
+    maps: list[ShareMap] = field(default_factory=list)  # maps for the summary's PNG
+    files: list[tuple[str, str, str]] = field(default_factory=list)  # name, media type, text
+    verdict: str = ""  # answer in plain words, at most five lines
+    warnings: list[str] = field(default_factory=list)  # about the input, above the verdict
+    answers: list[tuple[str, Any, str]] = field(default_factory=list)  # question, plotly, text
 
     @property
     def headlines(self) -> list[str]:
@@ -187,20 +127,12 @@ class Suite:
     def _repr_html_(self) -> str:
         """Format the verdict and the first table for a notebook."""
         lines = "".join(f"<p>{escape(line)}</p>" for line in self.headlines)
-        return f"<h3>{escape(self.title)}</h3>{lines}" + "".join(
-            table._repr_html_() for table in self.tables[:1]
-        )
+        first = "".join(table._repr_html_() for table in self.tables[:1])
+        return f"<h3>{escape(self.title)}</h3>{lines}{first}"
 
 
 def check_writable(*paths: Path | None) -> None:
-    """Check that results can be written, before the work.
-
-    Args:
-        paths: Files to write; None is skipped.
-
-    Raises:
-        OSError: A file cannot be written.
-    """
+    """Check before the work that files can be written, None aside; OSError otherwise."""
     for path in paths:
         if path is None:
             continue
@@ -216,22 +148,12 @@ def check_writable(*paths: Path | None) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file or nothing.
-
-    Args:
-        path: File to write.
-        text: Content of the file.
-    """
+    """Write a text file, whole or not at all."""
     write_atomic(path, text.encode())
 
 
 def write_json(path: str | Path, rows: Sequence[ResultRow]) -> None:
-    """Write rows as a JSON list of objects; NaN becomes null.
-
-    Args:
-        path: File to write.
-        rows: Rows.
-    """
+    """Write rows as a JSON list of objects; NaN becomes null."""
     plain = [
         {
             key: None if isinstance(value, float) and not math.isfinite(value) else value
@@ -243,17 +165,7 @@ def write_json(path: str | Path, rows: Sequence[ResultRow]) -> None:
 
 
 def read_json(path: str | Path) -> list[ResultRow]:
-    """Read rows that `write_json` wrote.
-
-    Args:
-        path: File to read.
-
-    Returns:
-        Rows in order.
-
-    Raises:
-        ValueError: The file holds others; the message has file, row and column.
-    """
+    """Read rows of `write_json`; ValueError with file, row and column for others."""
     rows = []
     for i, entry in enumerate(read_objects(path), 1):
         numbers = {name: math.nan if value is None else value for name, value in entry.items()}
@@ -262,17 +174,7 @@ def read_json(path: str | Path) -> list[ResultRow]:
 
 
 def read_objects(path: str | Path) -> list[dict[str, Any]]:
-    """Read a JSON list of objects.
-
-    Args:
-        path: File to read.
-
-    Returns:
-        Objects in order.
-
-    Raises:
-        ValueError: The file holds something else; the message has the path.
-    """
+    """Read a JSON list of objects; ValueError with the path for something else."""
     try:
         entries = json.loads(Path(path).read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
@@ -283,12 +185,7 @@ def read_objects(path: str | Path) -> list[dict[str, Any]]:
 
 
 def write_parquet(path: str | Path, rows: Sequence[ResultRow]) -> None:
-    """Write rows as a Parquet table (needs the extra `report`).
-
-    Args:
-        path: File to write.
-        rows: Rows.
-    """
+    """Write rows as a Parquet table (needs the extra `report`)."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

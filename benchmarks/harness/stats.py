@@ -1,9 +1,8 @@
-"""Intervals over seeds, 95 %, paired where two columns share their seeds.
+"""Statistics over seeds with 95 % intervals, paired where two columns share their seeds.
 
-All but fractions have Student's, from each episode's contribution to the estimate's error
-(`margin_of_error`); of positive numbers on a logarithmic scale. Simulations test their coverage
-on skewed costs and in small strata. No interval of a mean holds for rare failures that did not
-occur: failures are counted, and `share` bounds their rate.
+Intervals are Student's, from each episode's contribution to the error (`margin_of_error`), on a
+logarithmic scale for positive numbers; those of fractions are Wilson's. No interval of a mean holds
+for rare failures that did not occur: failures are counted, and `share` bounds their rate.
 """
 
 import math
@@ -15,14 +14,11 @@ import numpy.typing as npt
 
 from ...envs.record import Array
 
-LEVEL = 0.95
-WORST = 0.05
-"""The share of the episodes that `compute_tail_mean` takes the mean of."""
-_TAIL = 0.5 * (1.0 - LEVEL)
-_FEWEST = 4  # seeds, with fewer an interval spans orders of magnitude
-_MIN_TAIL = (
-    25  # episodes in the tail, with fewer the interval of `compute_tail_mean` covers too rarely
-)
+_LEVEL = 0.95
+_TAIL = 0.5 * (1.0 - _LEVEL)
+_MIN_SEEDS = 4  # with fewer an interval spans orders of magnitude
+_WORST = 0.05  # fraction of the episodes that `compute_tail_mean` takes the mean of
+_MIN_TAIL = 25  # episodes in the tail, with fewer its interval covers too rarely
 
 
 class Estimate(NamedTuple):
@@ -32,70 +28,32 @@ class Estimate(NamedTuple):
     low: float = math.nan
     high: float = math.nan
 
-    @property
-    def half_width(self) -> float:
-        """Half the width of the interval."""
-        return 0.5 * (self.high - self.low)
-
     def text(self, scale: float = 1.0, digits: str = ".3f") -> tuple[str, str]:
-        """Format the number and its interval, if there is one, as two cells of a table.
-
-        Args:
-            scale: Factor of the numbers.
-            digits: Format specification.
-
-        Returns:
-            Cells of the number and of the interval.
-        """
+        """Format scaled number and interval, "" without one, as two cells of a table."""
         value, low, high = (f"{scale * number:{digits}}" for number in self)
         return value, f"{low} .. {high}" if math.isfinite(self.low) else ""
 
     def inline(self, scale: float = 1.0, digits: str = ".2f") -> str:
-        """Format the number and, in brackets, its interval if there is one.
-
-        Args:
-            scale: Factor of the numbers.
-            digits: Format specification.
-
-        Returns:
-            Text of both.
-        """
+        """Format the scaled number and, in brackets, its interval if there is one."""
         value, low, high = (f"{scale * number:{digits}}" for number in self)
         return f"{value} [{low}, {high}]" if math.isfinite(self.low) else value
 
 
 def root_mean(squares: Array, axis: int = -1) -> Array:
-    """Compute the square root of the mean: RMSE from each seed's mean squared error.
-
-    Args:
-        squares: Mean squared errors.
-        axis: Axis of the seeds.
-
-    Returns:
-        Roots, without the axis of the seeds.
-    """
+    """Compute the square root of the mean over the seeds' axis: RMSE from squared errors."""
     return np.asarray(np.sqrt(np.mean(squares, axis=axis)))
 
 
 def mean(values: Array, axis: int = -1) -> Array:
-    """Compute the mean, a statistic of `interval`.
-
-    Args:
-        values: Numbers.
-        axis: Axis of the seeds.
-
-    Returns:
-        Means, without the axis of the seeds.
-    """
+    """Compute the mean over the seeds' axis, a statistic of `interval`."""
     return np.asarray(np.mean(values, axis=axis))
 
 
 def margin_of_error(*strata: Array) -> float:
     """Compute half of the 95 % interval of the sum of independent means, by Student's t.
 
-    The variances add up with the degrees of freedom of Welch and Satterthwaite. A variance that few
-    numbers carry has fewer of them, by its kurtosis (O'Neill 2014, Some useful moment results in
-    sampling problems).
+    The variances add up with the degrees of freedom of Welch and Satterthwaite, fewer where the
+    kurtosis is large (O'Neill 2014, Some useful moment results in sampling problems).
 
     Args:
         strata: Numbers of each mean, shape (n_i,).
@@ -135,13 +93,11 @@ def interval(
         paired: Numbers of the same seeds, shape (n,), left out together with `values`.
 
     Returns:
-        The statistic and its interval; no interval for fewer than four seeds, and where the
-            statistic
-        of the others is not finite.
+        Statistic and interval, without bounds for fewer than four seeds or an infinite statistic.
     """
     data = (values,) if paired is None else (values, paired)
     estimate, n = float(statistic(*data, axis=-1)), len(values)
-    if n < _FEWEST:
+    if n < _MIN_SEEDS:
         return Estimate(estimate)
     with np.errstate(divide="ignore"):
         rest = [statistic(*(np.delete(column, i) for column in data), axis=-1) for i in range(n)]
@@ -155,14 +111,7 @@ def interval(
 
 
 def mean_share(values: Array) -> Estimate:
-    """Compute the mean of fractions that are not only 0 and 1; its interval is that of the odds.
-
-    Args:
-        values: Fractions, shape (n,).
-
-    Returns:
-        Mean and interval.
-    """
+    """Compute the mean of fractions (n,); its interval is that of the odds, if they vary."""
     if not 0.0 < np.mean(values) < 1.0:
         return interval(values)
     return Estimate(*(odds / (1.0 + odds) for odds in interval(values, _odds)))
@@ -174,42 +123,17 @@ def _odds(values: Array, axis: int = -1) -> Array:
 
 
 def ratio_of_roots(squares: Array, reference: Array, axis: int = -1) -> Array:
-    """Compute the RMSE over the RMSE of a reference on the same seeds.
-
-    Args:
-        squares: Mean squared errors.
-        reference: Mean squared errors of the reference.
-        axis: Axis of the seeds.
-
-    Returns:
-        Ratios, without the axis of the seeds.
-    """
+    """Compute the RMSE over that of a reference on the same seeds, from squared errors."""
     return np.asarray(root_mean(squares, axis) / root_mean(reference, axis))
 
 
 def ratio_of_means(values: Array, reference: Array, axis: int = -1) -> Array:
-    """Compute the mean over the mean of a reference on the same seeds.
-
-    Args:
-        values: Numbers.
-        reference: Numbers of the reference.
-        axis: Axis of the seeds.
-
-    Returns:
-        Ratios, without the axis of the seeds.
-    """
+    """Compute the mean over that of a reference on the same seeds, along their axis."""
     return np.asarray(mean(values, axis) / mean(reference, axis))
 
 
 def average(*strata: Array) -> Estimate:
-    """Average the means of strata, such as those of clipped logarithms.
-
-    Args:
-        strata: Numbers of each stratum, shape (n_i,).
-
-    Returns:
-        Mean and interval; NaN without strata, and where a number is NaN.
-    """
+    """Average the means of strata (n_i,); NaN without strata, and where a number is NaN."""
     filled = [stratum for stratum in strata if len(stratum)]
     if not filled:
         return Estimate(math.nan)
@@ -219,26 +143,12 @@ def average(*strata: Array) -> Estimate:
 
 
 def geometric_mean(*strata: Array) -> Estimate:
-    """Compute the geometric mean: exp of the `average` of logarithms of paired ratios.
-
-    Args:
-        strata: Logarithms of each stratum, shape (n_i,); strata have equal weight.
-
-    Returns:
-        Geometric mean and interval.
-    """
+    """Compute exp of the `average` of strata of logarithms (n_i,), of equal weight."""
     return Estimate(*(math.exp(log) for log in average(*strata)))
 
 
 def share(hits: npt.ArrayLike) -> Estimate:
-    """Compute the mean of numbers that are 0 or 1, a tie one half, with Wilson's interval.
-
-    Args:
-        hits: Numbers, shape (n,).
-
-    Returns:
-        Mean and interval; NaN without numbers, and where one is NaN.
-    """
+    """Compute the mean of numbers (n,) that are 0 or 1, a tie 0.5, with Wilson's interval."""
     from scipy.stats import norm
 
     values, z = np.asarray(hits, np.float64), float(norm.isf(_TAIL))
@@ -252,15 +162,7 @@ def share(hits: npt.ArrayLike) -> Estimate:
 
 
 def compute_win_rate(costs: Array, others: Array) -> Estimate:
-    """Compute the fraction of episodes that cost less than the other's, a tie one half.
-
-    Args:
-        costs: Costs, shape (n,).
-        others: The other's costs on the same seeds, shape (n,).
-
-    Returns:
-        Fraction and interval.
-    """
+    """Compute the fraction of episodes that cost less than the other's on the same seeds."""
     return share(np.where(costs == others, 0.5, np.less(costs, others)))
 
 
@@ -281,10 +183,9 @@ def compute_profile(values: Array, levels: Array) -> tuple[Array, Array, Array]:
 
 
 def compute_tail_mean(costs: Array) -> Estimate:
-    """Compute the mean of the largest `WORST` of positive numbers: the conditional value at risk.
+    """Compute the mean of the largest 5 % of positive numbers: the conditional value at risk.
 
-    Its interval is that of the logarithm, from each number's influence on the tail's mean; there is
-    none where the tail has fewer than 25.
+    Its interval is the logarithm's, by influences on the tail's mean; none for a tail below 25.
 
     Args:
         costs: Costs, shape (n,).
@@ -294,7 +195,7 @@ def compute_tail_mean(costs: Array) -> Estimate:
     """
     if len(costs) == 0 or np.isnan(costs).any():
         return Estimate(math.nan)
-    count = max(1, round(WORST * len(costs)))
+    count = max(1, round(_WORST * len(costs)))
     ordered = np.sort(costs)
     value = float(ordered[-count:].mean())
     if count < _MIN_TAIL or value <= 0.0:
@@ -307,8 +208,7 @@ def compute_tail_mean(costs: Array) -> Estimate:
 def ratio_of_sums(tops: Sequence[Array], bottoms: Sequence[Array]) -> Estimate:
     """Compute the sum over strata of the mean top over that of the mean bottom.
 
-    The interval is that of the mean residual top - ratio x bottom, in which an episode's top and
-    bottom stay together.
+    The interval is that of the mean residual top - ratio x bottom of each episode.
 
     Args:
         tops: Numerators of each stratum, shape (n_i,).
@@ -329,14 +229,7 @@ def ratio_of_sums(tops: Sequence[Array], bottoms: Sequence[Array]) -> Estimate:
 
 
 def compute_p_value(logs: Array) -> float:
-    """Compute the one-sided p of Student's test that a mean is not below 0.
-
-    Args:
-        logs: Paired differences, shape (n,).
-
-    Returns:
-        p; 1 where the differences do not vary.
-    """
+    """Compute p of Student's test that paired differences (n,) have a mean not below 0."""
     spread = float(np.std(logs, ddof=1)) if len(logs) > 1 else math.nan
     middle = float(np.mean(logs)) if len(logs) else math.nan
     if not spread > 0.0:
@@ -346,19 +239,11 @@ def compute_p_value(logs: Array) -> float:
     return float(student.cdf(middle * math.sqrt(len(logs)) / spread, len(logs) - 1))
 
 
-def holm(chances: Sequence[float], level: float = 1.0 - LEVEL) -> list[bool]:
-    """Test several p values at a family-wise level, by Holm's step-down.
-
-    Args:
-        chances: p values.
-        level: Family-wise level.
-
-    Returns:
-        Whether each is significant.
-    """
-    significant, order = [False] * len(chances), np.argsort(chances)
-    for rank, i in enumerate(order):
-        if not chances[i] <= level / (len(chances) - rank):
+def holm(chances: Sequence[float]) -> list[bool]:
+    """Test p values at a family-wise level of 5 %, by Holm's step-down: which are significant."""
+    significant = [False] * len(chances)
+    for rank, i in enumerate(np.argsort(chances)):
+        if not chances[i] <= (1.0 - _LEVEL) / (len(chances) - rank):
             break
         significant[i] = True
     return significant

@@ -1,12 +1,8 @@
-"""The lines of figures: no two alike, a name's colour that of `envs.rendering.palette`.
+"""Figures as plotly figures: time series, errors, curves, tracks, bars, groups, heat maps.
 
-The figures of the report, as plotly figures: time series, errors, tracks, bars.
-
-Every axis carries its unit, every name has its colour (`colours`). Lines longer than `POINTS` are
-thinned so that no peak is lost, and numbers are stored in single precision.
+Every axis carries its unit, every name has its colour (`envs.rendering.palette`). Lines longer than
+`POINTS` are thinned so that no peak is lost, and numbers are stored in single precision.
 Importing this module needs plotly, the extra `report`.
-
-The matrix as a heat map, and shares over two axes. Needs plotly.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -14,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from plotly import graph_objects as go
-from plotly.subplots import make_subplots
 
 from ...envs.numerics import require_extra
 from ...envs.record import Array
@@ -25,16 +19,19 @@ from ..harness.stats import Estimate
 
 with require_extra("report", "figures need plotly"):
     from plotly import graph_objects as go
+    from plotly.subplots import make_subplots
 
 SHARE_SCALE = ((0.0, "#D55E00"), (0.5, "#F0E442"), (1.0, "#0072B2"))
-"""From bad to good, safe for the colour-blind."""
-
+"""Colours from bad to good, safe for the colour-blind."""
+POINTS = 1000
+"""Maximum of points of a line: a figure is no wider in pixels."""
 _DASHES = {"reference": "dash", "bound": "dot"}
-_ORDER = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot")
+_DASH_ORDER = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot")
+_LOG = {"type": "log", "dtick": "D2", "tickformat": "~g"}  # 1, 2, 5, 10, ...
 
 
 def choose_line_styles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """(colour, dash) of each line of a figure: no two alike, a variant of a known name dashed.
+    """Choose (colour, dash) of each line: no two alike, a variant of a known name dashed.
 
     >>> [dash for _, dash in choose_line_styles(["exact-kf", "exact-kf, true model"]).values()]
     ['solid', 'dash']
@@ -43,32 +40,21 @@ def choose_line_styles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
     for name in names:
         known = find_base(name)
         first = _DASHES.get(known or "", "solid" if known in (name, None) else "dash")
-        choices = [(find_colour(name), dash) for dash in (first, *_ORDER)]
+        choices = [(find_colour(name), dash) for dash in (first, *_DASH_ORDER)]
         taken = styles.values()
         styles[name] = next((style for style in choices if style not in taken), choices[0])
     return styles
 
 
-_LOG = {"type": "log", "dtick": "D2", "tickformat": "~g"}  # 1, 2, 5, 10, ...
-POINTS = 1000
-"""The most points a line is drawn with: a figure is no wider in pixels."""
-
-
-def find_peaks(y: Array, limit: int = POINTS) -> npt.NDArray[np.intp]:
-    """Indices of at most `limit` samples of y (n,) that draw the same line: the smallest and
-    largest of each of limit/2 - 1 stretches, and both ends. A stretch of NaN stays a gap.
-
-    >>> find_peaks(np.array([0.0, 9.0, 0.0, 1.0, 1.0, -9.0, 0.0, 1.0]), limit=6)
-    array([0, 1, 4, 5, 7])
-    """
+def _find_peaks(y: Array) -> npt.NDArray[np.intp]:
+    """Find at most POINTS indices of y (n,) that draw the same line: extremes of stretches."""
     n = len(y)
-    if n <= limit:
+    if n <= POINTS:
         return np.arange(n)
-    size = -(-n // (limit // 2 - 1))
+    size = -(-n // (POINTS // 2 - 1))
     starts = np.arange(0, n, size)
-    padded = np.full(len(starts) * size, np.nan)
-    padded[:n] = y
-    table = padded.reshape(len(starts), size)
+    padding = np.full(len(starts) * size - n, np.nan)
+    table = np.append(y, padding).reshape(len(starts), size)
     low = np.where(np.isnan(table), np.inf, table).argmin(axis=1)
     high = np.where(np.isnan(table), -np.inf, table).argmax(axis=1)
     return np.unique(np.concatenate([starts + low, starts + high, [0, n - 1]]))
@@ -81,12 +67,10 @@ def draw_time_series(
     x_label: str = "time / s",
     dots: Collection[str] = (),
 ) -> Any:
-    """Lines over time, all on one axis.
+    """Draw series (n,) by name over times t (n,) on one axis, "truth" on top and thicker.
 
-    t: (n,). series: name to (n,); "truth" is drawn last, on top of the others, and thicker.
-    unit_label: quantity and unit, "sideslip angle / mrad". dots: names drawn as dots, for packets
-    (NaN between them).
-    Raises ValueError for a series that is not as long as t.
+    unit_label: Quantity and unit, as "sideslip angle / mrad". dots: Names that are drawn as dots,
+    for packets with NaN between them. Raises ValueError for a series that is not as long as t.
     """
     t = np.asarray(t, float)
     figure = go.Figure()
@@ -96,7 +80,7 @@ def draw_time_series(
             raise ValueError(f"series {name!r} has shape {y.shape}, its time {t.shape}")
         present = ~np.isnan(y) if name in dots else np.ones(len(y), bool)
         x, y = t[present], y[present]
-        shown = find_peaks(y)
+        shown = _find_peaks(y)
         trace = _make_line(name, x[shown], y[shown], *colour_and_dash, name in dots)
         if len(y) > 4 * POINTS and name not in (*dots, *FACTS):
             trace.line.width = 1.0  # a dense line is noisy: leave room to see the others
@@ -106,7 +90,7 @@ def draw_time_series(
 
 
 def draw_error_series(t: Array, errors: Mapping[str, Array], unit_label: str) -> Any:
-    """Estimate minus truth over time, around a line at zero; arguments as of `draw_time_series`."""
+    """Draw estimate minus truth over time, as `draw_time_series`, with a line at zero."""
     figure = draw_time_series(t, errors, unit_label)
     figure.add_hline(y=0.0, line={"color": GREY, "width": 1}, layer="below")
     return figure
@@ -119,10 +103,9 @@ def draw_curves(
     y_label: str,
     log: str = "",
 ) -> Any:
-    """Lines with dots; series: name to values (n,), or to (value, low, high) for whiskers.
+    """Draw lines with dots; series: values (n,) by name, or (value, low, high) for whiskers.
 
-    log: which axes are logarithmic, of "x", "y" and "xy". Raises ValueError for a series that is
-    not as long as x.
+    log: Logarithmic axes, of "x", "y" and "xy". Raises ValueError for a series not as long as x.
     """
     figure = go.Figure()
     for name, pen in choose_line_styles(series).items():
@@ -142,10 +125,7 @@ def draw_curves(
 
 
 def draw_track(paths: Mapping[str, tuple[Array, Array]]) -> Any:
-    """Paths seen from above, a metre as long in x as in y.
-
-    paths: name to (x, y), (n,) each. Raises ValueError for unequal lengths.
-    """
+    """Draw paths (x, y) in m by name, seen from above; ValueError for unequal lengths."""
     figure = go.Figure()
     for name, colour_and_dash in choose_line_styles(paths).items():
         x, y = (np.asarray(values, float) for values in paths[name])
@@ -164,23 +144,21 @@ def draw_bars(
     lows: Sequence[float],
     highs: Sequence[float],
     unit: str,
-    log: bool = False,
 ) -> Any:
-    """One bar a label, the first on top, with the interval [low, high] as whiskers.
+    """Draw a bar for each label, the first on top, with its interval as whiskers.
 
-    unit: quantity and unit, "RMSE / mrad". log: a logarithmic axis, with dots instead of bars (a
-    bar's length would mean nothing). No whiskers where a bound is NaN or both equal the value.
+    unit: Quantity and unit, "RMSE / mrad". No whiskers for NaN, or bounds that equal the value.
     """
     if not len(labels) == len(values) == len(lows) == len(highs):
         raise ValueError("labels, values, lows and highs differ in length")
     value = np.asarray(values, float)
     above, below = np.asarray(highs, float) - value, value - np.asarray(lows, float)
     none = ~(np.isfinite(above) & np.isfinite(below)) | ((above == 0) & (below == 0))
+    ends = {"array": np.where(none, np.nan, above), "arrayminus": np.where(none, np.nan, below)}
     whiskers = {
         "type": "data",
         "symmetric": False,
-        "array": np.where(none, np.nan, above),
-        "arrayminus": np.where(none, np.nan, below),
+        **ends,
         "color": INK,
         "thickness": 1.5,
         "width": 5,
@@ -189,32 +167,31 @@ def draw_bars(
         f"{v:.3g}" if off else f"{v:.3g} [{v - b:.3g}, {v + a:.3g}]"
         for v, a, b, off in zip(value, above, below, none, strict=True)
     ]
-    common: dict[str, Any] = {
-        "x": value,
-        "y": list(labels),
-        "error_x": whiskers,
-        "showlegend": False,
-        "customdata": text,
-        "hovertemplate": "%{y}: %{customdata}<extra></extra>",
-    }
-    colours = [find_colour(label) for label in labels]
-    if log:
-        trace = go.Scatter(mode="markers", marker={"color": colours, "size": 12}, **common)
-    else:
-        trace = go.Bar(orientation="h", marker={"color": colours}, width=0.6, **common)
-    figure = go.Figure(trace)
-    figure.update_xaxes(type="log" if log else "linear")
-    figure.update_yaxes(type="category", autorange="reversed", ticks="", showgrid=log)
+    figure = go.Figure(
+        go.Bar(
+            orientation="h",
+            marker={"color": [find_colour(label) for label in labels]},
+            width=0.6,
+            x=value,
+            y=list(labels),
+            error_x=whiskers,
+            showlegend=False,
+            customdata=text,
+            hovertemplate="%{y}: %{customdata}<extra></extra>",
+        )
+    )
+    figure.update_xaxes(type="linear")
+    figure.update_yaxes(type="category", autorange="reversed", ticks="", showgrid=False)
     return _finish(figure, unit, "", 100 + 34 * len(labels), hovermode="closest")
 
 
 def draw_groups(
     groups: Mapping[str, Mapping[str, Estimate]], unit: str, lines: Mapping[float, str]
 ) -> Any:
-    """Dots with intervals on a logarithmic axis, group below group, each under its title.
+    """Draw dots with intervals on a logarithmic axis, group below group, each under its title.
 
-    groups: by title, the numbers by name, drawn in this order. unit: quantity and unit. lines:
-    what certain values mean. A name that is a variant of a known one has a hollow dot.
+    groups: Numbers by name, by title. unit: Quantity and unit. lines: Meanings of certain values.
+    A name that is a variant of a known one has a hollow dot.
     """
     figure, ticks, row = go.Figure(), dict[int, str](), 0
     for title, numbers in groups.items():
@@ -224,14 +201,11 @@ def draw_groups(
             row += 1
             ticks[row] = name
             ends = {"array": [high - value], "arrayminus": [value - low], "symmetric": False}
-            marker = {
-                "color": find_colour(name),
-                "size": 10,
-                "line": {"width": 2, "color": find_colour(name)},
-            }
+            colour = find_colour(name)
+            marker = {"color": colour, "size": 10, "line": {"width": 2, "color": colour}}
             marker["symbol"] = "circle" if find_base(name) in (name, None) else "circle-open"
             hover = f"{name}: {value:.3g} [{low:.3g}, {high:.3g}]<extra></extra>"
-            pen = {"type": "data", "color": find_colour(name), "thickness": 1.6, "width": 4}
+            pen = {"type": "data", "color": colour, "thickness": 1.6, "width": 4}
             figure.add_trace(
                 go.Scatter(x=[value], y=[row], error_x=pen | ends, marker=marker,
                            mode="markers", name=name, hovertemplate=hover, showlegend=False)
@@ -242,14 +216,8 @@ def draw_groups(
         figure.add_shape(type="line", x0=value, x1=value, y0=0, y1=1, yref="paper", **look)
         place = {"x": np.log10(value), "y": 1, "yref": "paper", "yanchor": "bottom"}
         figure.add_annotation(text=meaning, showarrow=False, font={"size": 11}, **place)
-    _finish(
-        figure,
-        unit,
-        "",
-        110 + 21 * row,
-        hovermode="closest",
-        margin={"t": 28, "b": 12, "l": 12, "r": 12},
-    )
+    margin = {"t": 28, "b": 12, "l": 12, "r": 12}
+    _finish(figure, unit, "", 110 + 21 * row, hovermode="closest", margin=margin)
     figure.update_layout(showlegend=False)
     figure.update_xaxes(**_LOG)
     names = {"tickvals": list(ticks), "ticktext": list(ticks.values())}
@@ -266,7 +234,7 @@ def _make_line(name: str, x: Array, y: Array, colour: str, dash: str, dots: bool
 
 
 def _reduce_precision(values: Array) -> Array:
-    """Single precision where nobody can see it, not for a small range far from zero."""
+    """Reduce to single precision, but for a small range far from zero."""
     finite = values[np.isfinite(values)]
     lost = np.abs(finite - finite.astype(np.float32))
     far = len(finite) > 0 and lost.max() > 1e-4 * np.ptp(finite)
@@ -274,17 +242,17 @@ def _reduce_precision(values: Array) -> Array:
 
 
 def _compute_slimness(figure: Any) -> float:
-    """Height over width of all paths together."""
+    """Compute the height over the width of all paths."""
     spans = []
-    for values in ([trace.y for trace in figure.data], [trace.x for trace in figure.data]):
-        finite = np.concatenate([*values, np.zeros(0)])
-        finite = finite[np.isfinite(finite)]
+    for axis in ("y", "x"):
+        values = np.concatenate([*(trace[axis] for trace in figure.data), np.zeros(0)])
+        finite = values[np.isfinite(values)]
         spans.append(float(np.ptp(finite)) if len(finite) else 0.0)
     return spans[0] / max(spans[1], 1e-9)
 
 
 def _sort_facts(figure: Any) -> Any:
-    """Truth on top of the estimates; the legend names it first."""
+    """Sort the truth above the estimates; the legend names it first."""
     figure.data = sorted(figure.data, key=lambda trace: trace.name in FACTS)
     figure.update_traces(legendrank=1, selector=lambda trace: trace.name in FACTS)
     return figure
@@ -298,19 +266,15 @@ def _finish(figure: Any, x: str, y: str, height: int, **layout: Any) -> Any:
     return figure
 
 
-_GOOD_TO_BAD = [(1.0 - at, shade) for at, shade in SHARE_SCALE][::-1]
-
-
 def draw_heat_map(
     names: Sequence[str], columns: Sequence[str], values: Array, unit: str, good: str = "high"
 ) -> Any:
-    """Names down, columns across, the number in each field; NaN stays empty.
+    """Draw names down, columns across, the number in each field; NaN stays empty.
 
-    values: (names, columns). good: "high" or "low" values are the good ones (blue).
+    values: Shape (names, columns). good: "high" or "low" values are the good ones (blue).
     """
-    scale = [list(stop) for stop in _GOOD_TO_BAD]
-    if good == "high":
-        scale = [[at, shade] for (at, _), (_, shade) in zip(scale, scale[::-1], strict=True)]
+    flipped = [(1.0 - at, shade) for at, shade in SHARE_SCALE[::-1]]
+    scale = [list(stop) for stop in (SHARE_SCALE if good == "high" else flipped)]
     text = [[f"{v:.2f}" if np.isfinite(v) else "" for v in row] for row in values]
     low, high = np.nanpercentile(values, [5.0, 95.0])  # one outlier shall not bleach the rest
     trace = go.Heatmap(
@@ -338,7 +302,7 @@ def draw_heat_map(
 
 
 def draw_share_maps(share_map: ShareMap) -> Any:
-    """Shares over two axes, a panel a name, with the line at one half."""
+    """Draw fractions over two axes, a panel for each name, with the line at one half."""
     n_columns = min(3, len(share_map.shares))
     n_rows = -(-len(share_map.shares) // n_columns)
     names = list(share_map.shares)
@@ -350,10 +314,8 @@ def draw_share_maps(share_map: ShareMap) -> Any:
         axes: dict[str, Any] = {"x": share_map.x, "y": share_map.y, "z": share}
         figure.add_trace(go.Heatmap(**axes, coloraxis="coloraxis", hovertemplate=hover), **place)
         half = {"start": 0.5, "end": 0.5, "size": 1.0, "coloring": "none"}
-        line = {"color": INK, "width": 1.5}
-        figure.add_trace(
-            go.Contour(**axes, contours=half, line=line, showscale=False, hoverinfo="skip"), **place
-        )
+        pen = {"contours": half, "line": {"color": INK, "width": 1.5}}
+        figure.add_trace(go.Contour(**axes, **pen, showscale=False, hoverinfo="skip"), **place)
         figure.update_xaxes(title_text=share_map.x_label, **place)
         if place["col"] == 1:
             figure.update_yaxes(title_text=share_map.y_label, **place)

@@ -1,7 +1,4 @@
-"""Films of drives: a car, and others as ghosts on the same road, as MP4 or GIF.
-
-A drive's track for map programs: KML, its metres laid on the earth around an origin.
-"""
+"""Films of drives, with other cars as ghosts, as MP4 or GIF; and tracks for map programs (KML)."""
 
 import copy
 import tempfile
@@ -30,7 +27,7 @@ _COLOURS = 128  # of a GIF
 
 
 class FilmDriver(NamedTuple):
-    """Who drives which environment, and what the film calls it."""
+    """Agent of a drive in an env, and its name in the film."""
 
     name: str
     env: Any  # a Gymnasium environment of this package, wrapped or not
@@ -38,11 +35,7 @@ class FilmDriver(NamedTuple):
 
 
 def check_film(path: Path | None) -> None:
-    """Refuse before the work what cannot be filmed.
-
-    Raises ValueError for another ending than those of `RATES`, ModuleNotFoundError without the
-    extra `render`, OSError where nothing can be written.
-    """
+    """Check before the work that a film can be written; ValueError for another ending."""
     if path is None:
         return
     if path.suffix.lower() not in RATES:
@@ -56,9 +49,10 @@ def check_film(path: Path | None) -> None:
 def write_drive_film(
     path: Path | None, driver: FilmDriver, beside: str | None, seed: int | None, console: Console
 ) -> None:
-    """The film of a drive, where there is a path for it; beside: an agent's name, for a ghost that
-    drives in an env of the same kind. Raises as `film` and `make_agent`, ValueError for a ghost
-    without a film."""
+    """Write the film of a drive, where there is a path, with an agent `beside` it as a ghost.
+
+    Raises ValueError for a ghost without a film, and as `write_film` and `make_agent`.
+    """
     if path is None:
         if beside is not None:
             raise ValueError(f"{beside!r} can only drive beside in a film: --video names its file")
@@ -75,10 +69,10 @@ def write_drive_film(
 def write_film(
     path: Path, drivers: Sequence[FilmDriver], seed: int | None = 0, console: Console | None = None
 ) -> None:
-    """Drive an episode and write its film, whole or not at all; a console shows the progress.
+    """Drive an episode and write its film, whole or not at all, with progress on a console.
 
     The first driver's car is filmed until its episode ends; the others' drive on the same road.
-    Raises as `check_film` and, for an env of another package, AttributeError.
+    Raises as `check_film`.
     """
     check_film(path)
     base = drivers[0].env.unwrapped
@@ -98,7 +92,7 @@ def write_film(
 
 
 def render_frames(drivers: Sequence[FilmDriver], seed: int | None, every: int) -> Iterator[Frame]:
-    """A frame of every so many steps of the first driver's episode, and of its last one."""
+    """Render every `every`-th step of the first driver's episode, and its last one."""
     from ...envs.rendering.canvas import read_pixels
     from ...envs.rendering.charts import draw_picture
 
@@ -131,13 +125,12 @@ def _write_mp4(path: Path, frames: Iterable[Frame], rate: float) -> None:
 
 
 def _write_gif(path: Path, frames: Iterable[Frame], rate: float) -> None:
-    """One palette for all frames, without dither: what does not change costs nothing."""
+    """Write frames with one palette, without dither: what does not change costs nothing."""
     from PIL import Image
 
     pictures = [Image.fromarray(frame) for frame in frames]
-    sample = np.concatenate(
-        [np.asarray(picture)[::2, ::2] for picture in pictures[:: len(pictures) // 6 or 1]]
-    )
+    chosen = pictures[:: len(pictures) // 6 or 1]
+    sample = np.concatenate([np.asarray(picture)[::2, ::2] for picture in chosen])
     palette = Image.fromarray(sample).quantize(_COLOURS, Image.Quantize.MEDIANCUT)
     indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     durations = [round(1000.0 / rate)] * len(indexed)
@@ -146,8 +139,7 @@ def _write_gif(path: Path, frames: Iterable[Frame], rate: float) -> None:
 
 
 ORIGIN = (35.9015, 139.9378)  # deg north and east: a campus of the papers' authors, our choice
-_MAX_POINTS = 2000  # points
-
+_MAX_POINTS = 2000
 _DOCUMENT = """\
 <?xml version="1.0" encoding="UTF-8"?>
 <kml xmlns="http://www.opengis.net/kml/2.2">
@@ -173,10 +165,9 @@ def make_track_kml(
     colours: dict[str, str] | None = None,
     origin: tuple[float, float] = ORIGIN,
 ) -> str:
-    """A KML document of tracks, name to (X east, Y north) in m.
+    """Make a KML document of tracks, (X east, Y north) in m by name, around an origin.
 
-    colours: name to "#RRGGBB". Raises ValueError for no track or one whose X and Y differ in
-    length or are not finite.
+    colours: "#RRGGBB" by name. Raises ValueError for no track, or an unequal or infinite one.
     """
     if not tracks:
         raise ValueError("a KML document needs at least one track")

@@ -1,17 +1,8 @@
-"""Tables of the report: sortable, their numbers to the right, the names in their colours.
+"""The report as one HTML file that needs no network, and tables in Markdown pages.
 
-Tables of suites in a Markdown page, between the marks that ask for them.
-
-A page has `<!-- tables of SUITE -->` and `<!-- end -->`, each on a line of its own; what stands
-between them is the suite's, the rest its author's.
-
-Figures and texts made small for the page, which unpacks them: gzip in base64, lines as steps.
-
-The report: what the suites found as one HTML file that needs nothing from the network.
-
-The page is `page.html`, its looks `report.css`, what it does `report.js` and `explorer.js`, all
-beside this module and put together into one file. plotly.js and the figures lie in it packed. The
-page's own policy lets no script run but ours, by its hash, and nothing be loaded.
+The page is `page.html` with `report.css`, `report.js` and `explorer.js` beside this module. plotly
+and the figures lie in it as gzip in base64, lines as steps. Its policy lets no script run but ours,
+by its hash. A Markdown page has `<!-- tables of SUITE -->` and `<!-- end -->` around its tables.
 """
 
 import base64
@@ -23,7 +14,6 @@ import re
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
-from functools import partial
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -39,7 +29,7 @@ from ..harness.study import Explorer
 
 
 def parse_number(cell: str) -> float | None:
-    """The number a cell begins with, None for one that begins with none (or with NaN).
+    """Parse the number that a cell begins with, None for one that begins with none or with NaN.
 
     >>> parse_number("0.31 [0.29, 0.33]"), parse_number("-1,250 N m")
     (0.31, -1250.0)
@@ -66,13 +56,13 @@ _BLANK = {"", "-", "\u2013", "\u2014", "nan", "n/a"}
 
 
 def is_numeric(cells: Iterable[str]) -> bool:
-    """Whether a column is one of numbers: some, and nothing else but blanks."""
+    """Check whether a column has numbers, and nothing else but blanks."""
     texts = [cell for cell in cells if cell.strip().lower() not in _BLANK]
     return bool(texts) and all(parse_number(cell) is not None for cell in texts)
 
 
-def format_table(table: ResultTable) -> str:
-    """A table, folded; ValueError for a row that is not as long as the header."""
+def _format_table(table: ResultTable) -> str:
+    """Format a folded table; ValueError for a row that is not as long as the header."""
     for row in table.cells:
         if len(row) != len(table.header):
             raise ValueError(
@@ -102,7 +92,7 @@ def _format_row(row: Sequence[str], numeric: Sequence[bool], keyed: bool) -> str
     cells = []
     for i, (cell, is_number) in enumerate(zip(row, numeric, strict=True)):
         value = parse_number(cell) if is_number else None
-        data = "" if value is None else f' data-value="{_format_number(value)}"'
+        data = "" if value is None else f' data-value="{value!r}"'.replace("inf", "Infinity")
         tag, key = ('th scope="row"', _format_key(cell) if keyed else "") if i == 0 else ("td", "")
         kind = ' class="long"' if len(cell) > _MAX_LETTERS else _format_class(is_number)
         cells.append(f"<{tag}{kind}{data}>{key}{escape(cell)}</{tag[:2]}>")
@@ -113,13 +103,8 @@ def _format_class(is_number: bool) -> str:
     return ' class="number"' if is_number else ""
 
 
-def _format_number(value: float) -> str:
-    """A number as JavaScript reads it."""
-    return repr(value) if math.isfinite(value) else "-Infinity" if value < 0 else "Infinity"
-
-
 def _format_key(cell: str) -> str:
-    """The colour of an estimator or controller in the figures, as a small square."""
+    """Format the colour of an estimator or controller as a small square."""
     if find_base(cell) is None:
         return ""
     shade = find_colour(cell)
@@ -127,27 +112,27 @@ def _format_key(cell: str) -> str:
 
 
 def inline(text: str) -> str:
-    """Escaped text; what stands in backticks becomes code."""
+    """Escape a text; what stands in backticks becomes code."""
     return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
 
 
-_FILL = partial(textwrap.fill, width=120, break_long_words=False, break_on_hyphens=False)
 _MARKED = r"(?<=^<!-- tables of {} -->\n).*?(?=^<!-- end -->$)"
 
 
 def format_page_table(table: ResultTable) -> str:
-    """A heading, the table, and its note in lines of 120."""
+    """Format a heading, the table, and its note in lines of 120."""
     head, *rows = (
         [text.replace("|", r"\|") for text in row] for row in (table.header, *table.cells)
     )
     lines = [f"| {' | '.join(row)} |" for row in (head, *rows)]
     lines.insert(1, "|---" * len(head) + "|")
-    note = f"\n{_FILL(table.note)}\n" if table.note else ""
+    note = textwrap.fill(table.note, 120, break_long_words=False, break_on_hyphens=False)
+    note = f"\n{note}\n" if table.note else ""
     return "\n".join([f"## {table.title}", "", *lines, ""]) + note
 
 
 def check_page(path: Path | None, names: Sequence[str]) -> None:
-    """Before the work: the page has marks for a suite that is asked for; ValueError otherwise."""
+    """Check that a page has marks for a suite that is asked for; ValueError otherwise."""
     if path is not None:
         text = path.read_text(encoding="utf-8")
         if not any(_compile_pattern(name).search(text) for name in names):
@@ -158,8 +143,7 @@ def check_page(path: Path | None, names: Sequence[str]) -> None:
 
 
 def write_page(path: Path, suites: Sequence[Suite]) -> None:
-    """The page with each marked suite's tables anew; details, which only the report shows, are
-    left out."""
+    """Write a page with new tables of its marked suites, but for details."""
     text = path.read_text(encoding="utf-8")
     for suite in suites:
         made = "\n".join(format_page_table(table) for table in suite.tables if not table.detail)
@@ -177,14 +161,12 @@ _LEVELS = {"x": 2**13, "y": 2**11}  # more than a screen has pixels
 
 
 def pack_text(text: str) -> str:
-    """A text as the page's `unpack` takes it; the same text gives the same letters."""
+    """Pack a text for the page's `unpack`; the same text gives the same letters."""
     return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
 
 
 def encode_steps(values: npt.ArrayLike, levels: int = _LEVELS["y"]) -> dict[str, Any]:
-    """(n,) numbers as steps from one to the next in whole quanta, null for a gap.
-
-    levels: how many quanta the range has.
+    """Encode numbers (n,) as steps in quanta, `levels` of them in the range; null for a gap.
 
     >>> encode_steps([1.0, 2.0, float("nan"), 3.0], levels=3)
     {'from': 1.0, 'by': 1.0, 'steps': [0, 1, None, 1]}
@@ -201,7 +183,7 @@ def encode_steps(values: npt.ArrayLike, levels: int = _LEVELS["y"]) -> dict[str,
 
 
 def encode_figure(figure: Any) -> str:
-    """A plotly figure's data and layout as JSON, without the template and the title."""
+    """Encode a plotly figure's data and layout as JSON, without template and title."""
     from plotly.utils import PlotlyJSONEncoder
 
     content = figure.to_plotly_json()
@@ -217,7 +199,7 @@ def encode_figure(figure: Any) -> str:
 
 
 def _is_line(values: Any) -> TypeGuard[npt.NDArray[np.floating[Any]]]:
-    """Whether values are many enough, in a row, to be worth their steps."""
+    """Check whether values are many enough, in a row, to be worth their steps."""
     return (
         isinstance(values, np.ndarray)
         and values.dtype.kind == "f"
@@ -226,28 +208,28 @@ def _is_line(values: Any) -> TypeGuard[npt.NDArray[np.floating[Any]]]:
     )
 
 
-POINTS = 250
-"""Samples of a cell in a figure with menus."""
+POINTS = 250  # samples of a cell in a figure with menus
 _FEW = 4  # figures of a suite; more are folded
 
 
 def write_report(
     path: str | Path, suites: list[Suite], command: str, environment: Mapping[str, str]
 ) -> None:
-    """Write one self-contained HTML file: an answer with a picture, the matrix's where it was run,
-    then every suite's verdict, pictures, text and tables.
+    """Write one self-contained HTML file: an answer, then every suite's verdict, pictures, tables.
 
-    command: the command line that made it. environment: versions by name. A figure's own title
-    and template are left out: the page has its title above it and draws it light or dark.
-    Raises ValueError for no suite or a table whose rows are not as long as its header,
-    ModuleNotFoundError for figures without plotly. Nothing is left half-written.
+    command: Command line that made the suites. environment: Versions by name. The file is written
+    whole or not at all. Raises ValueError for no suite or a row not as long as its header.
     """
     if not suites:
         raise ValueError("a report needs at least one suite")
     facts = {"made": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"), **environment}
     drawn = any(suite.answers or suite.figures or suite.explorers for suite in suites)
     script = _read_asset("report.js") + "\n\n" + _read_asset("explorer.js")
-    plotly = _read_plotly() if drawn else ""
+    plotly = ""
+    if drawn:
+        from plotly.offline import get_plotlyjs
+
+        plotly = str(get_plotlyjs()).replace("\r\n", "\n")
     lead = next((suite for suite in suites if suite.name == "control"), suites[0])
     linked = [(f"suite-{i}", suite) for i, suite in enumerate(suites, 1)]
     page = Template(_read_asset("page.html") + "\n").substitute(
@@ -269,7 +251,7 @@ def write_report(
 
 
 def _format_section(link: str, suite: Suite, opened: int) -> str:
-    """All of a suite; opened: how many of its answers' pictures the page opens with."""
+    """Format a suite; opened: how many of its answers' pictures the page opens with."""
     blocks = [f"<h2>{escape(suite.title)}</h2>"]
     if suite.headlines:
         lines = "\n".join(f"<li>{inline(line)}</li>" for line in suite.headlines)
@@ -285,13 +267,13 @@ def _format_section(link: str, suite: Suite, opened: int) -> str:
         inside = "\n".join(figures)
         figures = [f"<details><summary>{len(figures)} figures</summary>\n{inside}\n</details>"]
     blocks += figures
-    blocks += [format_table(table) for table in suite.tables]
+    blocks += [_format_table(table) for table in suite.tables]
     blocks += [_download(*file) for file in suite.files]
     return f'<section id="{link}">\n' + "\n".join(blocks) + "\n</section>"
 
 
 def _format_figure(title: str, figure: Any, caption: str) -> str:
-    """A figure; its layout's meta: "wide" or "scroll", one that keeps its width on a phone."""
+    """Format a figure; its layout's meta is "wide", or "scroll" to keep its width on phones."""
     kind = figure.layout.meta or ""
     return (
         f'<figure class="{kind}">\n<h3>{escape(title)}</h3>\n<div class="frame">'
@@ -302,7 +284,7 @@ def _format_figure(title: str, figure: Any, caption: str) -> str:
 
 
 def _format_explorer(explorer: Explorer) -> str:
-    """Two cells side by side; `explorer.js` makes the menus and draws."""
+    """Format two cells side by side; `explorer.js` makes the menus and draws."""
     content = {
         "menus": list(explorer.menus),
         "pair": list(explorer.pair),
@@ -325,18 +307,18 @@ def _format_explorer(explorer: Explorer) -> str:
 
 
 def _select_samples(values: Any) -> Any:
-    """At most POINTS samples, of every signal of a cell at the same places."""
+    """Select at most POINTS samples, of every signal of a cell at the same places."""
     n = len(values)
     return values[np.unique(np.linspace(0, n - 1, min(n, POINTS)).astype(int))]
 
 
 def _format_data(name: str, text: str) -> str:
-    """A packed text, which no browser runs."""
+    """Format a packed text, which no browser runs."""
     return f'<script type="application/gzip" data-name="{name}">{pack_text(text)}</script>'
 
 
 def _hash(script: str) -> str:
-    """A script as the page's policy names it."""
+    """Hash a script as the page's policy names it."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
 
 
@@ -346,12 +328,6 @@ def _download(name: str, media: str, text: str) -> str:
         f'<p class="file"><a download="{escape(name)}" href="data:{media};base64,{data}">'
         f"{escape(name)}</a></p>"
     )
-
-
-def _read_plotly() -> str:
-    from plotly.offline import get_plotlyjs
-
-    return str(get_plotlyjs()).replace("\r\n", "\n")
 
 
 def _read_asset(name: str) -> str:

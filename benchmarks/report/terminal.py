@@ -1,7 +1,8 @@
-"""A suite on the screen: its verdict first, and tables that fit whatever the width."""
+"""Suites on the screen: the verdict first, and tables that fit its width."""
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from rich import box
 from rich.console import Console
@@ -18,24 +19,22 @@ _FEW, _ROWS = 2, 20  # suites of a run whose tables are printed, and the rows of
 
 
 def print_run(console: Console, suites: Sequence[Suite], reported: bool) -> None:
-    """Print what a run found in about 60 lines: verdicts, a table each, and where the rest is.
+    """Print a run in about 60 lines: verdicts, a table each, and where the rest is.
 
     Args:
         console: The screen.
-        suites: What was found. Of many a line of the verdict alone is printed.
+        suites: Results; of many one line of each verdict alone.
         reported: Whether a report has the rest.
     """
     is_short = len(suites) <= _FEW
     for suite in suites:
         _print_title(console, suite)
-        headlines = suite.headlines
-        lines = (
-            headlines if is_short else headlines[1:2] or headlines
-        )  # a verdict's second line is the answer
+        lines = suite.headlines
+        if not is_short:
+            lines = lines[1:2] or lines  # a verdict's second line is the answer
         console.print(f"[bold]{escape(chr(10).join(lines))}[/]\n", highlight=False)
-        for table in [candidate for candidate in suite.tables if not candidate.detail][
-            : int(is_short)
-        ]:
+        shown = [table for table in suite.tables if not table.detail]
+        for table in shown[: int(is_short)]:
             max_rows = _ROWS // len(suites)
             left = len(table.cells) - max_rows
             cut = replace(table, cells=table.cells[:max_rows]) if left > 0 else table
@@ -55,26 +54,24 @@ def _print_title(console: Console, suite: Suite) -> None:
 
 
 def print_suite(console: Console, suite: Suite) -> None:
-    """The title, the verdict, the text, and each table with its note, but for details."""
+    """Print title, verdict, text, and each table with its note, but for details."""
     _print_title(console, suite)
     if suite.verdict:
         console.print(f"[bold]{escape(chr(10).join(suite.headlines))}[/]\n", highlight=False)
     console.print(f"{escape(suite.text)}\n", highlight=False)
-    for table in suite.tables:
-        if table.detail:
-            continue
+    shown = [table for table in suite.tables if not table.detail]
+    for table in shown:
         for part in _split_table(table, console.width):
             console.print(_make_rich_table(part, console.width))
         if table.note:
             console.print(f"[dim]{escape(table.note)}[/]\n", highlight=False)
-    if more := [table.title for table in suite.tables if table.detail]:
-        count = f"{len(more)} tables more are" if len(more) > 1 else "1 table more is"
+    if more := len(suite.tables) - len(shown):
+        count = f"{more} tables more are" if more > 1 else "1 table more is"
         console.print(f"{count} in the report (--html).\n", highlight=False)
 
 
 def _split_table(table: ResultTable, width: int) -> list[ResultTable]:
-    """The table as it fits into so many columns of text: some columns each, the first in all;
-    texts wrap."""
+    """Split a table into parts of as many columns as the width takes, the first in all."""
     columns = list(zip(table.header, *table.cells, strict=True))
     lengths = [max(map(len, column)) for column in columns]
     widths = [
@@ -89,27 +86,24 @@ def _split_table(table: ResultTable, width: int) -> list[ResultTable]:
             used = first
         groups[-1].append(i)
         used += widths[i]
-    return [
-        replace(
-            table,
-            title=table.title if not k else f"{table.title} (continued)",
-            header=[table.header[i] for i in group],
-            cells=[[row[i] for i in group] for row in table.cells],
-        )
-        for k, group in enumerate(groups)
-    ]
+    parts = list[ResultTable]()
+    for group in groups:
+        header = [table.header[i] for i in group]
+        cells = [[row[i] for i in group] for row in table.cells]
+        title = f"{table.title} (continued)" if parts else table.title
+        parts.append(replace(table, title=title, header=header, cells=cells))
+    return parts
 
 
 def _choose_width(width: int) -> int:
-    """Letters that the first column has, if it needs them, on a screen of so many columns."""
+    """Choose the maximum of letters in the first column, on a screen of so many."""
     return _NAME if width >= _NARROW else _MIN_WIDTH
 
 
 def _make_rich_table(table: ResultTable, width: int) -> RichTable:
-    """Columns of numbers to the right and whole, those of text to the left, wrapped if long."""
-    shown = RichTable(
-        title=table.title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
-    )
+    """Make a table with numbers to the right and whole, texts to the left and wrapped."""
+    style: Any = {"title_justify": "left", "box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0)}
+    shown = RichTable(title=table.title, **style)
     columns = zip(*table.cells, strict=True) if table.cells else [()] * len(table.header)
     for i, (name, column) in enumerate(zip(table.header, columns, strict=True)):
         right = i > 0 and is_numeric(column)

@@ -1,4 +1,4 @@
-"""Question: how many env-steps a second does the device engine take, and what bounds it?
+"""Env-steps a second of the device engine against the size of the batch, and what bounds them.
 
 `python -m sideslip.benchmarks.speed.device --device cuda --out table.md`
 """
@@ -21,17 +21,17 @@ from ...envs.numerics.torch_backend import torch
 from ..harness.parallel import report_user_errors
 from ..harness.results import check_writable, write_text
 
-COUNTS = (1024, 16384, 65536, 262144, 1048576)
-ROUNDS = 5
+_COUNTS = (1024, 16384, 65536, 262144, 1048576)
+_ROUNDS = 5
 _COPIED = 1 << 28  # bytes, beyond every cache
 
 
-class DeviceTiming(NamedTuple):
-    """What a batch of `size` rows did."""
+class _DeviceTiming(NamedTuple):
+    """Speed of a batch of `size` rows."""
 
     size: int
     dtype: str
-    rate: float  # env-steps a second of wall time: median, least and largest of the rounds
+    rate: float  # env-steps a second of wall time: median, smallest and largest of the rounds
     min_rate: float
     max_rate: float
     bytes_a_step: float  # of one row, each number moved once
@@ -46,25 +46,24 @@ def _measure_seconds(work: Callable[[], object], device: torch.device) -> float:
     return time.perf_counter() - start
 
 
-def measure_bandwidth(device: torch.device) -> float:
-    """Bytes a second, read and written, of a copy within the device."""
+def _measure_bandwidth(device: torch.device) -> float:
+    """Measure the bandwidth of a copy within the device (bytes/s, read and written)."""
     one = torch.ones(_COPIED, dtype=torch.uint8, device=device)
     other = torch.empty_like(one)
     taken = [_measure_seconds(lambda: other.copy_(one), device) for _ in range(4)]
     return 2.0 * _COPIED / min(taken[1:])
 
 
-def count_bytes(env: Any) -> float:
-    """The least that a step of one row moves: its parameters and its state are read, the state,
-    the observation and the record are written."""
+def _count_bytes(env: Any) -> float:
+    """Count the bytes a row's step has to move: it reads parameters and state, writes the rest."""
     held, brought = env.tensors()
     read = sum(tensor.nbytes for tensor in held) + env.num_envs * PARAMS_WIDTH * env.dtype.itemsize
     written = sum(tensor.nbytes for tensor in (*held, *brought))
     return float((read + written) / env.num_envs)
 
 
-def measure(env: Any, copied: float, rounds: int, steps: int) -> DeviceTiming:
-    """Rounds of `steps` steps each, after one that does not count."""
+def measure(env: Any, copied: float, rounds: int, steps: int) -> _DeviceTiming:
+    """Measure a batch in rounds of `steps`, after a first one; copied: a copy's bytes a second."""
     env.reset(seed=0)
     actions = torch.zeros(env.action_space.shape or (), device=env.device)
 
@@ -75,13 +74,13 @@ def measure(env: Any, copied: float, rounds: int, steps: int) -> DeviceTiming:
     taken = [_measure_seconds(run_steps, env.device) for _ in range(rounds + 1)][1:]
     rates = [env.num_envs * steps / seconds for seconds in taken]
     middle, dtype = statistics.median(rates), str(env.dtype).removeprefix("torch.")
-    return DeviceTiming(
-        env.num_envs, dtype, middle, min(rates), max(rates), count_bytes(env), copied
+    return _DeviceTiming(
+        env.num_envs, dtype, middle, min(rates), max(rates), _count_bytes(env), copied
     )
 
 
-def format_table(timings: Sequence[DeviceTiming]) -> str:
-    """The measurements as Markdown."""
+def _format_table(timings: Sequence[_DeviceTiming]) -> str:
+    """Format the measurements as a Markdown table."""
     lines = [
         "| N | floats | env-steps/s | range | us a step of all | bytes a row, at least "
         "| of a copy's bandwidth |",
@@ -98,13 +97,6 @@ def format_table(timings: Sequence[DeviceTiming]) -> str:
     return "\n".join(lines)
 
 
-def get_device_name(device: torch.device) -> str:
-    """The device in words."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    return f"CPU, {torch.get_num_threads()} threads of torch"
-
-
 def main(
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1, ...")] = "cpu",
     dtype: Annotated[list[str] | None, typer.Option(help="float32, float64; both.")] = None,
@@ -113,7 +105,7 @@ def main(
     engine: Annotated[str, typer.Option(help="cuda, or torch: on a GPU, else torch.")] = "",
     compiled: Annotated[bool, typer.Option("--compile", help="By torch.compile.")] = False,
     steps: Annotated[int, typer.Option(min=1, help="Steps of a round.")] = 20,
-    rounds: Annotated[int, typer.Option(min=1, help="Rounds that count.")] = ROUNDS,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds that count.")] = _ROUNDS,
     out: Annotated[Path | None, typer.Option(help="Write the table as Markdown.")] = None,
 ) -> None:
     """Measure env-steps per second against the size of the batch; ValueError without the device.
@@ -121,25 +113,26 @@ def main(
     Episodes end and start anew where the steps are many enough; the resets are then part of it.
     """
     check_writable(out)
-    console, timings = Console(), []
-    copied = 0.0
+    console, timings, copied = Console(), [], 0.0
     engine = engine or ("cuda" if device.startswith("cuda") else "torch")
     options: dict[str, Any] = {"engine": engine} | ({"compile": True} if compiled else {})
-    for kind, size in itertools.product(dtype or ("float32", "float64"), count or COUNTS):
+    for kind, size in itertools.product(dtype or ("float32", "float64"), count or _COUNTS):
         batch = DeviceVectorEnv.make(
             env, size, device=device, dtype=kind, on_bad_action="fail", **options
         )
-        copied = copied or measure_bandwidth(batch.device)
+        copied = copied or _measure_bandwidth(batch.device)
         timings.append(measure(batch, copied, rounds, steps))
         console.print(f"{size}, {kind}: {timings[-1].rate:.3g} env-steps/s", highlight=False)
         del batch
+    hardware = f"CPU, {torch.get_num_threads()} threads of torch"
+    if device.startswith("cuda"):
+        hardware = torch.cuda.get_device_name(torch.device(device))
     text = (
         f"`{shlex.join(['python', '-m', 'sideslip.benchmarks.speed.device', *sys.argv[1:]])}`\n\n"
-        f"{get_device_name(torch.device(device))}, torch {torch.__version__}; {env}, engine "
-        f"{engine}, "
+        f"{hardware}, torch {torch.__version__}; {env}, engine {engine}, "
         f"{'compiled' if compiled else 'not compiled'}. Median and range of {rounds} rounds of "
         f"{steps} steps, wall time. A copy on the device moves {copied / 1e9:.3g} GB/s.\n\n"
-        f"{format_table(timings)}\n"
+        f"{_format_table(timings)}\n"
     )
     console.print(text, highlight=False, markup=False, soft_wrap=True)
     if out is not None:

@@ -1,7 +1,7 @@
-"""What an env-step costs: ours with full sensors, single and in batches, beside others'.
+"""CPU time of an env-step: ours with full sensors, single and in batches, beside other packages'.
 
-Ours is 10 ms of driving, ten ticks of plant and sensors, infos included. Singles are of `gym.make`,
-reset after at most 500 steps; batches run on, and reset their rows themselves.
+Ours is 10 ms of driving: ten ticks of plant and sensors, infos included. Single ones are reset
+after at most 500 steps; batches run on, and reset their rows themselves.
 """
 
 import warnings
@@ -18,24 +18,16 @@ from ...estimators.make import make_estimator
 from ...estimators.vector.estimate import EstimateObservation as EstimateObservations
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..harness.results import ResultTable, Suite
-from .timing import (
-    Effort,
-    Taken,
-    Workload,
-    WorkloadSet,
-    add_row,
-    format_three_digits,
-    measure_interleaved,
-)
+from .timing import Effort, Taken, Workload, WorkloadSet, add_row, format_range, measure_interleaved
 
 COUNT, FEWER = 1024, 256  # environments at once, alone and with each filter
-EPISODE, CHUNK = 500, 50  # steps, the most; in one call
-STEPS, FRAMES = 10, 33  # of a batch, in one call; until camera frames fall on steps as before
+EPISODE, _CHUNK = 500, 50  # steps, the most; in one call
+_STEPS, _FRAMES = 10, 33  # of a batch, in one call; until camera frames fall on steps as before
 
-FUSION_ID, VISION_ID = "sideslip/YawFusion-v0", "sideslip/YawVision-v0"
+_FUSION_ID, _VISION_ID = "sideslip/YawFusion-v0", "sideslip/YawVision-v0"
 FUSION, VISION = "YawFusion-v0", "YawVision-v0"
-PROMPT: dict[str, Any] = {"camera": {"delays": [0.0]}}
-FILTER: dict[str, Any] = {"estimator": "exact-kf", "options": {"gains": "covariance"}}
+_PROMPT: dict[str, Any] = {"camera": {"delays": [0.0]}}
+_FILTER: dict[str, Any] = {"estimator": "exact-kf", "options": {"gains": "covariance"}}
 AT_ONCE = f"{FUSION} x {COUNT}"
 FILTERED = f"{AT_ONCE} + exact-kf, full P"
 LATE, NONE_LATE = f"{VISION} x {COUNT}", f"{VISION} x {COUNT}, no delay"
@@ -43,20 +35,14 @@ CARTPOLE, LANE = "CartPole-v1", "lane-keeping-v0 (highway-env)"
 CARTPOLES, PENDULUMS = f"{CARTPOLE} x {COUNT}", f"Pendulum-v1 x {COUNT}"
 ENVPOOL = f"{PENDULUMS} (EnvPool)"
 
-Policy = Callable[[Any], Any]
-
 
 def choose_upright_action(obs: Any) -> Any:
-    """Keeps a cart's pole up, so that its episodes are long."""
+    """Choose the action that keeps a cart's pole up, so that episodes are long."""
     return (obs[..., 2] + 0.3 * obs[..., 3] > 0.0).astype(int)
 
 
-def make_episode(env: gym.Env[Any, Any], policy: Policy | None = None) -> Workload:
-    """`CHUNK` steps a call of an episode of at most `EPISODE`, always the same one.
-
-    policy: what acts (None: action 0, or the one that does nothing); it runs once, its actions are
-    replayed.
-    """
+def _make_episode(env: gym.Env[Any, Any], policy: Callable[[Any], Any] | None = None) -> Workload:
+    """Make calls of `_CHUNK` steps of one episode, in which a policy acts, or nothing is done."""
     idle = env.action_space.sample() * 0
     obs, _ = env.reset(seed=0)
     actions, over = list[Any](), False
@@ -65,7 +51,7 @@ def make_episode(env: gym.Env[Any, Any], policy: Policy | None = None) -> Worklo
         obs, _, terminated, truncated, _ = env.step(actions[-1])
         over = terminated or truncated
 
-    chunk = min(CHUNK, len(actions))
+    chunk = min(_CHUNK, len(actions))
     end = position = len(actions) // chunk * chunk
 
     def run_chunk() -> None:
@@ -80,20 +66,20 @@ def make_episode(env: gym.Env[Any, Any], policy: Policy | None = None) -> Worklo
     return Workload(run_chunk, chunk)
 
 
-def make_batch(env: Any, steps: int = STEPS) -> Workload:
-    """Steps of a batch in which nothing is done."""
+def _make_batch(env: Any, steps: int = _STEPS) -> Workload:
+    """Make calls of some steps of a batch in which nothing is done."""
     env.reset(seed=0)
     idle = np.zeros(env.action_space.shape, env.action_space.dtype)
+    return Workload(lambda: _repeat_step(env, idle, steps), steps * env.num_envs)
 
-    def run_steps() -> None:
-        for _ in range(steps):
-            env.step(idle)
 
-    return Workload(run_steps, steps * env.num_envs)
+def _repeat_step(env: Any, action: Any, steps: int) -> None:
+    for _ in range(steps):
+        env.step(action)
 
 
 def _make_cartpoles() -> Workload:
-    """Gymnasium's own batch of carts, each call from a reset on, with poles kept up."""
+    """Make calls of Gymnasium's own batch of carts, from a reset on, with poles kept up."""
     env: Any = gym.make_vec(CARTPOLE, COUNT, vectorization_mode="vector_entry_point")
     obs, _ = env.reset(seed=0)
     actions = []
@@ -109,69 +95,57 @@ def _make_cartpoles() -> Workload:
     return Workload(run_steps, len(actions) * COUNT)
 
 
-def _make_pendulums() -> Workload:
-    """Gymnasium's own batch; Pendulum has none of arrays."""
-    return make_batch(gym.make_vec("Pendulum-v1", COUNT, vectorization_mode="sync"), 1)
-
-
 def _make_envpool() -> Workload:
     import envpool
 
     env: Any = envpool.make("Pendulum-v1", env_type="gymnasium", num_envs=COUNT, num_threads=1)
     env.reset()
     idle = np.zeros((COUNT, 1), np.float32)
-
-    def run_steps() -> None:
-        for _ in range(STEPS):
-            env.step(idle)
-
-    return Workload(run_steps, STEPS * COUNT)
+    return Workload(lambda: _repeat_step(env, idle, _STEPS), _STEPS * COUNT)
 
 
 def _make_lane_keeping() -> Workload:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return make_episode(gym.make("highway_env:lane-keeping-v0"))
+        return _make_episode(gym.make("highway_env:lane-keeping-v0"))
 
 
-def _make_vector_env(env_id: str, **arguments: Any) -> Any:
-    return gym.make_vec(env_id, COUNT, **arguments)
-
-
-def make_workloads() -> WorkloadSet:
-    """All environments; those of packages that are not installed are absent."""
+def _make_workloads() -> WorkloadSet:
+    """Make all workloads but those of packages that are not installed."""
     field = WorkloadSet()
-    field.add(FUSION, lambda: make_episode(gym.make(FUSION_ID)))
-    field.add(AT_ONCE, lambda: make_batch(_make_vector_env(FUSION_ID)))
+    make = gym.make_vec
+    field.add(FUSION, lambda: _make_episode(gym.make(_FUSION_ID)))
+    field.add(AT_ONCE, lambda: _make_batch(make(_FUSION_ID, COUNT)))
     field.add(
-        FILTERED, lambda: make_batch(EstimateObservations(_make_vector_env(FUSION_ID), **FILTER))
+        FILTERED, lambda: _make_batch(EstimateObservations(make(_FUSION_ID, COUNT), **_FILTER))
     )
-    field.add(LATE, lambda: make_batch(_make_vector_env(VISION_ID), FRAMES))
-    field.add(NONE_LATE, lambda: make_batch(_make_vector_env(VISION_ID, **PROMPT), FRAMES))
-    field.add(CARTPOLE, lambda: make_episode(gym.make(CARTPOLE), choose_upright_action))
+    field.add(LATE, lambda: _make_batch(make(_VISION_ID, COUNT), _FRAMES))
+    field.add(NONE_LATE, lambda: _make_batch(make(_VISION_ID, COUNT, **_PROMPT), _FRAMES))
+    field.add(CARTPOLE, lambda: _make_episode(gym.make(CARTPOLE), choose_upright_action))
     field.add(LANE, _make_lane_keeping, "highway-env")
     field.add(CARTPOLES, _make_cartpoles)
-    field.add(PENDULUMS, _make_pendulums)
+    # Pendulum has no batch of arrays
+    field.add(PENDULUMS, lambda: _make_batch(make("Pendulum-v1", COUNT, "sync"), 1))
     field.add(ENVPOOL, _make_envpool, "envpool")
     return field
 
 
 def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
-    """Rows and a table; what each contestant took, and why others are absent."""
+    """Add rows and a table to a suite; CPU us a step by name, and why others are absent."""
     note = (
         "Ours: 10 ms of driving, ten ticks of plant and sensors, with infos. Singles through "
         f"gym.make, in episodes of at most {EPISODE} steps; x {COUNT}: a step of one environment "
         "of a batch. Filters with full P compute the covariance of six states at every tick; a "
         "filter's own cost is the difference to the line without."
     )
-    return make_workloads().measure(suite, "Cost of an env-step", "step", effort, note)
+    return _make_workloads().measure(suite, "Cost of an env-step", "step", effort, note)
 
 
 def add_filters(suite: Suite, effort: Effort) -> None:
-    """Add rows and a table of what each filter adds to a step, in a third of the rounds each."""
+    """Add rows and a table of the CPU us that each filter adds, in a third of the rounds."""
     envs = {
-        "one": make_episode(gym.make(FUSION_ID)),
-        "many": make_batch(gym.make_vec(FUSION_ID, FEWER)),
+        "one": _make_episode(gym.make(_FUSION_ID)),
+        "many": _make_batch(gym.make_vec(_FUSION_ID, FEWER)),
     }
     header = ("", "one", "range", f"of {FEWER}", "range")
     fewer, cells = replace(effort, rounds=max(1, effort.rounds // 3)), []
@@ -180,8 +154,8 @@ def add_filters(suite: Suite, effort: Effort) -> None:
         bare, bare_many, one, many = (np.array(values) for values in taken.values())
         cells.append([name])
         for env, added in ((FUSION, one - bare), (f"{FUSION} x {FEWER}", many - bare_many)):
-            middle, *ends = add_row(suite, f"{env} + {name}", "us_added", added.tolist())
-            cells[-1] += format_three_digits(middle), " .. ".join(map(format_three_digits, ends))
+            row = add_row(suite, f"{env} + {name}", "us_added", added.tolist())
+            cells[-1] += format_range(*row)
     note = (
         f"CPU us that a filter adds to an env-step of {FUSION}, its first two states and their "
         "deviations in the observation: differences round by round."
@@ -190,12 +164,12 @@ def add_filters(suite: Suite, effort: Effort) -> None:
 
 
 def _make_filtered(name: str) -> dict[str, Workload]:
-    """One environment and a batch with a filter."""
-    env, many = gym.make(FUSION_ID), gym.make_vec(FUSION_ID, FEWER)
+    """Make calls of one environment and of a batch with a filter."""
+    env, many = gym.make(_FUSION_ID), gym.make_vec(_FUSION_ID, FEWER)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what it cannot see
         outputs = make_estimator(name, sensors=env.get_wrapper_attr("slow_sensors")).names[:2]
         return {
-            "one filtered": make_episode(EstimateObservation(env, name, outputs)),
-            "many filtered": make_batch(EstimateObservations(many, name, outputs)),
+            "one filtered": _make_episode(EstimateObservation(env, name, outputs)),
+            "many filtered": _make_batch(EstimateObservations(many, name, outputs)),
         }

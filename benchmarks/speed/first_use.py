@@ -1,4 +1,4 @@
-"""What the first use costs, by processes of their own: imports, the first step, compilation.
+"""CPU time of the first use, in fresh processes: imports, the first step, compilation.
 
 Kernels are compiled once and cached on disk; a cold one is compiled in a temporary folder.
 """
@@ -66,11 +66,8 @@ run(EstimateObservations(gym.make_vec(id, num_envs=8), **how), (8, 1))
 """
 
 
-def measure_first_step() -> dict[str, float]:
-    """CPU seconds of each thing a fresh process does up to its first step.
-
-    Raises AbsentError where that takes minutes, because no kernels are cached on disk.
-    """
+def _measure_first_step() -> dict[str, float]:
+    """Measure the CPU seconds of what a process does up to its first step; kernels are cached."""
     try:
         marks: list[tuple[str, float]] = json.loads(_run_python(_WARM, limit=LIMIT))
     except subprocess.TimeoutExpired:
@@ -80,8 +77,7 @@ def measure_first_step() -> dict[str, float]:
 
 
 def measure_compilation(code: str = _COLD) -> list[tuple[str, float]]:
-    """(name, CPU seconds) of each kernel that some code has compiled with nothing on disk, without
-    those of kernels that it calls as they stand."""
+    """Measure the CPU seconds of each kernel that code compiles with nothing on disk."""
     with TemporaryDirectory() as folder:
         environment = {"XDG_CACHE_HOME": folder, "NUMBA_CACHE_DIR": ""}
         printed = _run_python(f"{_WATCH}\n{code}\nprint(json.dumps(taken))", environment)
@@ -91,7 +87,7 @@ def measure_compilation(code: str = _COLD) -> list[tuple[str, float]]:
 def _run_python(
     code: str, variables: dict[str, str] | None = None, limit: float | None = None
 ) -> str:
-    """What code prints in an interpreter of its own that finds the same packages."""
+    """Run code in a fresh interpreter that finds the same packages; the last line it prints."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)} | (variables or {})
     command = [sys.executable, "-c", code]
     run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=limit)
@@ -101,14 +97,10 @@ def _run_python(
 
 
 def add(suite: Suite, runs: int, compiling: bool) -> tuple[dict[str, Taken], dict[str, str]]:
-    """Rows and a table; the targets' CPU seconds, and why others are absent.
-
-    runs: processes whose first one does not count. compiling: also everything cold, which takes
-    minutes.
-    """
+    """Add rows and a table; CPU s of the targets, reasons of absence. compiling: cold, minutes."""
     columns, absent = dict[str, Taken](), dict[str, str]()
     try:
-        taken = [measure_first_step() for _ in range(runs + 1)][1:]
+        taken = [_measure_first_step() for _ in range(runs + 1)][1:]
         columns = {f"first use: {name}": [run[name] for run in taken] for name in taken[0]}
         counted = ("import numba", "gym.make", "first reset", "first step")
         columns[FIRST] = [sum(run[name] for name in counted) for run in taken]
@@ -128,7 +120,6 @@ def add(suite: Suite, runs: int, compiling: bool) -> tuple[dict[str, Taken], dic
         "Fresh processes; the first gym.make imports numba, which is shown apart and counted. "
         "Cold: environment and exact-kf, single and batch, with nothing on disk."
     )
-    suite.tables.append(
-        ResultTable("Cost of the first use", ("", "CPU-s", "range"), cells, note, False)
-    )
+    header = ("", "CPU-s", "range")
+    suite.tables.append(ResultTable("Cost of the first use", header, cells, note, False))
     return {name: columns[name] for name in (FIRST, KERNEL) if name in columns}, absent

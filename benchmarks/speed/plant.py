@@ -1,6 +1,4 @@
-"""The plant in C, compiled on the spot: `plant.c` beside this module.
-
-Cost of a tick of the plant alone: ours, and the same in C.
+"""CPU time of a tick of the plant alone: ours, and the same in C (`plant.c`, compiled on the spot).
 
 A tick is a millisecond of one car of `YawFusion-v0`: actuators that lag, the loads at the tick's
 middle and end, Fiala tyres, roll, and Kutta's three stages; no sensors, no driver.
@@ -31,24 +29,20 @@ from ...envs.vehicle.tyres import FIALA, TyreInputs, compute_tyre_load, has_load
 from ..harness.results import Suite
 from .timing import AbsentError, Effort, Taken, Workload, WorkloadSet
 
-FLAGS = ("-O3", "-march=native", "-ffp-contract=off")
-VECTORS = (
-    "-fopenmp-simd",
-    "-fno-math-errno",
-    "-fno-trapping-math",
-    "-fno-signed-zeros",
-    "-fschedule-insns",
-    "-fsched-pressure",
+_FLAGS = ("-O3", "-march=native", "-ffp-contract=off")
+_VECTOR_FLAGS = """
+-fopenmp-simd -fno-math-errno -fno-trapping-math -fno-signed-zeros -fschedule-insns -fsched-pressure
+"""  # gcc makes vectors of square roots, floor and choices; no number changes
+CARS, _TICKS = 1024, 10  # cars at once; ticks a call
+PLANT, C = "plant", "plant in C"
+
+_CAR, _ROAD, _MOTION, _PUSH, _INPUTS = (
+    make_offsets(kind)[0] for kind in (CarParams, RoadParams, Motion, DisturbanceForces, TyreInputs)
 )
-"""Flags with which gcc makes vectors of square roots, floor and choices: the fastest of those that
-were tried; no number changes."""
 
 
-def find_compiler() -> str:
-    """The C compiler: that of the variable CC, or the first one found.
-
-    Raises AbsentError where there is none.
-    """
+def _find_compiler() -> str:
+    """Find the C compiler: that of the variable CC, or the first one on the path."""
     for name in (os.environ.get("CC", ""), "gcc", "clang", "cc"):
         if name and (path := shutil.which(name)):
             return path
@@ -56,19 +50,16 @@ def find_compiler() -> str:
 
 
 def read_source() -> str:
-    """The text of `plant.c`."""
+    """Read the text of `plant.c`."""
     return files(__package__).joinpath("plant.c").read_text(encoding="utf-8")
 
 
-def load_c_plant(block: int) -> Any:
-    """The function `plant` of `plant.c` for blocks of so many cars, loaded.
-
-    Raises AbsentError where there is no compiler, or none that can compile it.
-    """
+def _load_c_plant(block: int) -> Any:
+    """Compile and load the function `plant` of `plant.c` for blocks of so many cars."""
     with TemporaryDirectory() as folder:
         library = Path(folder) / "plant.so"
-        flags = [*FLAGS, *VECTORS, f"-DBLOCK={block}", "-shared", "-fPIC"]
-        command = [find_compiler(), *flags, "-x", "c", "-", "-o", str(library)]
+        flags = [*_FLAGS, *_VECTOR_FLAGS.split(), f"-DBLOCK={block}", "-shared", "-fPIC"]
+        command = [_find_compiler(), *flags, "-x", "c", "-", "-o", str(library)]
         run = subprocess.run(command, input=read_source(), capture_output=True, text=True)
         if run.returncode:
             last = (run.stderr.strip().splitlines() or ["it gave no reason"])[-1]
@@ -80,24 +71,10 @@ def load_c_plant(block: int) -> Any:
     return function
 
 
-CARS, TICKS = 1024, 10  # cars at once; ticks a call
-PLANT = "plant"
-C = "plant in C"
-
-_CAR, _ROAD, _MOTION, _PUSH, _INPUTS = (
-    make_offsets(kind)[0] for kind in (CarParams, RoadParams, Motion, DisturbanceForces, TyreInputs)
-)
-
-
 class Cars(NamedTuple):
-    """Cars in the middle of a drive; arrays (blocks, fields, LANES), fields as in the plant's
-    tuples.
+    """Cars in the middle of a drive, arrays (blocks, fields, LANES) as in the plant's tuples."""
 
-    left: (4,) the share left of an actuator's deviation from its command, of steering at the middle
-    and the end of a tick, then of the motors.
-    """
-
-    left: Array
+    left: Array  # (4,): fraction left of an actuator's deviation: steering, motors; middle, end
     cars: Array
     roads: Array
     pushes: Array
@@ -106,19 +83,16 @@ class Cars(NamedTuple):
     acting: Array
 
     def clone(self) -> "Cars":
-        """The same cars, for another contestant."""
+        """Copy the cars, for another workload."""
         return Cars(*(array.copy() for array in self))
 
 
-Advance = Callable[[Cars, int], object]
+_Advance = Callable[[Cars, int], object]
 """Moves cars on by some ticks, in place."""
 
 
 def make_cars(count: int, seed: int = 0) -> Cars:
-    """Cars that the seeds of `YawFusion-v0` draw, with commands of their own.
-
-    count: a multiple of LANES.
-    """
+    """Make cars as the seeds of `YawFusion-v0` draw; count: a multiple of LANES."""
     env: Any = gym.make_vec("sideslip/YawFusion-v0", num_envs=count)
     env.reset(seed=seed)
     p, z, rng = env.params, env.states, np.random.default_rng(seed)
@@ -150,8 +124,7 @@ def integrate_tick(
     left: Any,
     stages: int,
 ) -> Any:
-    """(last, motion, acting) after a tick by the rule of so many stages; first and last: the Load
-    at its start and end."""
+    """Integrate a tick by 3 or 4 stages; loads at its start and end are `first` and `last`."""
     between = TyreInputs(
         apply_lag(command.delta_f, acting.delta_f, left[0]),
         apply_lag(command.T_l, acting.T_l, left[2]),
@@ -185,7 +158,7 @@ def advance(
     ticks: int,
     stages: int,
 ) -> None:
-    """Ticks of every car, a block at a time; the arrays of `Cars`."""
+    """Move all cars by some ticks, a block at a time, in the arrays of `Cars`."""
     for b in range(len(cars)):
         car, road = read(cars[b], _CAR), read(roads[b], _ROAD)
         push, command = read(pushes[b], _PUSH), read(commands[b], _INPUTS)
@@ -200,16 +173,13 @@ def advance(
 
 
 def advance_in_lanes(cars: Cars, ticks: int) -> None:
-    """The plant as the batch engine moves it, in lanes."""
+    """Move cars by some ticks as the batch engine does, in lanes."""
     advance(*cars, ticks, 3)
 
 
-def make_c_advance() -> Advance:
-    """The same plant in C, once its numbers agree with ours.
-
-    Raises AbsentError without a compiler, RuntimeError where the numbers differ.
-    """
-    function = load_c_plant(LANES)
+def make_c_advance() -> _Advance:
+    """Make the function that moves cars in C; RuntimeError where its numbers are not ours."""
+    function = _load_c_plant(LANES)
 
     def advance_in_c(cars: Cars, ticks: int) -> None:
         function(len(cars.cars), ticks, TICK, *(array.ctypes.data for array in cars))
@@ -224,18 +194,18 @@ def make_c_advance() -> Advance:
     return advance_in_c
 
 
-def _make_workload(advance: Advance, cars: Cars) -> Workload:
-    """Cars from the middle of their drives on, in every round the same ones."""
+def _make_workload(advance: _Advance, cars: Cars) -> Workload:
+    """Make calls that move cars by `_TICKS`, in every round from the same state on."""
     running = cars.clone()
 
     def reset_cars() -> None:
         running.motions[:], running.acting[:] = cars.motions, cars.acting
 
-    return Workload(lambda: advance(running, TICKS), CARS * TICKS, reset_cars)
+    return Workload(lambda: advance(running, _TICKS), CARS * _TICKS, reset_cars)
 
 
 def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
-    """Rows and a table; each contestant's time, and why others are absent."""
+    """Add rows and a table to a suite; CPU us a tick by name, and why others are absent."""
     cars, field = make_cars(CARS), WorkloadSet()
     field.add(PLANT, lambda: _make_workload(advance_in_lanes, cars))
     field.add(C, lambda: _make_workload(make_c_advance(), cars))

@@ -1,4 +1,4 @@
-"""Question: what does the fused CUDA kernel compile to, without a GPU?
+"""Instructions and registers of the fused CUDA kernel, counted without a GPU.
 
 `python -m sideslip.benchmarks.speed.ptx --out table.md`
 """
@@ -20,28 +20,27 @@ from ...envs.device.cuda_launch import count_opcodes, get_ptx
 from ...envs.vector import StabilityVectorEnv
 from ..harness.results import check_writable, write_text
 
-_ARITHMETIC = ("add", "sub", "mul", "fma", "div", "rcp", "sqrt")
+_ARITHMETIC = "add|sub|mul|fma|div|rcp|sqrt"
 
 
 def count_by_kind(text: str) -> dict[str, Any]:
-    """What of a PTX text is counted, by name."""
+    """Count the instructions of a PTX text by kind."""
     totals = count_opcodes(text)
 
     def count_matching(pattern: str) -> int:
         return sum(count for name, count in totals.items() if re.match(pattern, name))
 
-    arithmetic = "|".join(_ARITHMETIC)
     return {
         "instructions": totals.total(),
-        "on float64": count_matching(rf"({arithmetic})\S*\.f64"),
-        "on float32": count_matching(rf"({arithmetic})\S*\.f32"),
+        "on float64": count_matching(rf"({_ARITHMETIC})\S*\.f64"),
+        "on float32": count_matching(rf"({_ARITHMETIC})\S*\.f32"),
         "fused": count_matching("fma|mad"),
         "divisions, roots": count_matching(r"(div|rcp|sqrt)\S*\.f"),
     }
 
 
 def assemble_kernel(text: str, capability: tuple[int, int]) -> dict[str, Any]:
-    """Registers and bytes spilled of a thread, by `ptxas` where it is on the path."""
+    """Count a thread's registers and spilled bytes with `ptxas`; {} without it on the path."""
     if shutil.which("ptxas") is None:
         return {}
     with tempfile.TemporaryDirectory() as folder:

@@ -1,7 +1,4 @@
-"""What the engine is meant to reach, and what it does: ratios round by round.
-
-The suite speed: everything side by side in one run, and the targets.
-"""
+"""CPU time of steps, ticks, learning and first use, and whether it meets the engine's targets."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -11,51 +8,54 @@ from rich.console import Console
 from ..harness.results import ResultTable, Suite
 from ..harness.study import format_verdict, summarise_names
 from . import env_steps, first_use, learning, plant
-from .timing import FULL, QUICK, Taken, add_row, compute_range, format_absences, format_three_digits
+from .timing import (
+    FULL,
+    QUICK,
+    Taken,
+    add_row,
+    compute_range,
+    format_absences,
+    format_range,
+    format_three_digits,
+)
 
 
-class SpeedTarget(NamedTuple):
-    """A goal: the CPU time of `over` as a multiple of that of `workload` in the same round, or
-    where `over` is "" CPU seconds.
-
-    max_value: it is a price, at most this much; otherwise at least `min_value`.
-    """
+class _SpeedTarget(NamedTuple):
+    """A limit for the ratio of CPU times, over / workload, of a round, or for CPU seconds."""
 
     name: str
-    over: str
+    over: str  # "": CPU seconds of the workload
     workload: str
     min_value: float = 0.0
     max_value: float = float("inf")
 
     @property
     def text(self) -> str:
-        """ ">= 25 x", "<= 1.1 x" or "<= 5 CPU-s"."""
-        unit = "x" if self.over else "CPU-s"
-        return (
-            f">= {self.min_value:g} {unit}" if self.min_value else f"<= {self.max_value:g} {unit}"
-        )
+        """Limit with its unit, as ">= 25 x" or "<= 5 CPU-s"."""
+        limit = f">= {self.min_value:g}" if self.min_value else f"<= {self.max_value:g}"
+        return f"{limit} {'x' if self.over else 'CPU-s'}"
 
     def met(self, value: float) -> bool:
-        """Whether a value is where it should be."""
+        """Check whether a value meets the target."""
         return self.min_value <= value <= self.max_value
 
 
 TARGETS = (
-    SpeedTarget("gym.make step, lane-keeping over ours", env_steps.LANE, env_steps.FUSION, 30.0),
-    SpeedTarget("gym.make step, CartPole over ours", env_steps.CARTPOLE, env_steps.FUSION, 1.4),
-    SpeedTarget("1024 at once, lane-keeping over ours", env_steps.LANE, env_steps.AT_ONCE, 200.0),
-    SpeedTarget("1024 at once, CartPole over ours", env_steps.CARTPOLES, env_steps.AT_ONCE, 0.1),
-    SpeedTarget("plant, C over ours", plant.C, plant.PLANT, 0.85),
-    SpeedTarget("delay at the tick over none", env_steps.LATE, env_steps.NONE_LATE, max_value=1.1),
-    SpeedTarget(
+    _SpeedTarget("gym.make step, lane-keeping over ours", env_steps.LANE, env_steps.FUSION, 30.0),
+    _SpeedTarget("gym.make step, CartPole over ours", env_steps.CARTPOLE, env_steps.FUSION, 1.4),
+    _SpeedTarget("1024 at once, lane-keeping over ours", env_steps.LANE, env_steps.AT_ONCE, 200.0),
+    _SpeedTarget("1024 at once, CartPole over ours", env_steps.CARTPOLES, env_steps.AT_ONCE, 0.1),
+    _SpeedTarget("plant, C over ours", plant.C, plant.PLANT, 0.85),
+    _SpeedTarget("delay at the tick over none", env_steps.LATE, env_steps.NONE_LATE, max_value=1.1),
+    _SpeedTarget(
         "full-covariance filter in the loop, 1024 at once, Pendulum over ours",
         env_steps.PENDULUMS,
         env_steps.FILTERED,
         4.5,
     ),
-    SpeedTarget("PPO, 256 at once, Pendulum over ours", learning.PENDULUM, learning.PPO_YAW, 1.7),
-    SpeedTarget(first_use.FIRST, "", first_use.FIRST, max_value=0.5),
-    SpeedTarget(first_use.KERNEL, "", first_use.KERNEL, max_value=5.0),
+    _SpeedTarget("PPO, 256 at once, Pendulum over ours", learning.PENDULUM, learning.PPO_YAW, 1.7),
+    _SpeedTarget(first_use.FIRST, "", first_use.FIRST, max_value=0.5),
+    _SpeedTarget(first_use.KERNEL, "", first_use.KERNEL, max_value=5.0),
 )
 
 
@@ -65,11 +65,7 @@ def add(
     seconds: Mapping[str, Taken],
     absent: Mapping[str, str],
 ) -> None:
-    """A row for each target that was measured, and the table, first of all, of all of them.
-
-    taken: of the contestants. seconds: measured CPU seconds of first use. absent: why others were
-    not measured.
-    """
+    """Add rows of measured targets, and first of all the table of all; absent: reasons."""
     cells, missing = [], dict[str, str]()
     for target in TARGETS:
         needed = [target.over, target.workload] if target.over else [target.workload]
@@ -81,31 +77,23 @@ def add(
         if target.over:
             pairs = zip(taken[target.over], taken[target.workload], strict=True)
             ratios = [reference_time / workload_time for reference_time, workload_time in pairs]
-            middle, *ends = add_row(suite, target.name, "ratio", ratios)
+            measured = add_row(suite, target.name, "ratio", ratios)
         else:
-            middle, *ends = compute_range(seconds[target.workload])
-        met = "met" if target.met(middle) else "not met"
-        cells[-1][2:] = (
-            format_three_digits(middle),
-            " .. ".join(map(format_three_digits, ends)),
-            met,
-        )
+            measured = compute_range(seconds[target.workload])
+        met = "met" if target.met(measured[0]) else "not met"
+        cells[-1][2:] = *format_range(*measured), met
     header = ("figure", "target", "measured", "range", "")
-    note = "Ratios are taken round by round, in CPU time; the median counts." + format_absences(
-        missing
-    )
+    note = "Ratios are taken round by round, in CPU time; the median counts."
+    note += format_absences(missing)
     suite.tables.insert(0, ResultTable("Targets", header, cells, note, keyed=False))
 
 
-RIVALS = (env_steps.CARTPOLE, env_steps.LANE)
-RUNS, QUICK_RUNS = 5, 2  # fresh processes
+_RIVALS = (env_steps.CARTPOLE, env_steps.LANE)
+_RUNS, _QUICK_RUNS = 5, 2  # fresh processes
 
 
 def run(quick: bool = False, console: Console | None = None) -> Suite:
-    """CPU time of steps, ticks, learning and first use: median of rounds, and range.
-
-    quick: few rounds, nothing compiled anew.
-    """
+    """Measure the CPU times of steps, ticks, learning and first use; quick: nothing cold."""
     suite = Suite(
         "speed",
         "What a step costs",
@@ -119,18 +107,20 @@ def run(quick: bool = False, console: Console | None = None) -> Suite:
         more, more_absent = part.add(suite, effort)
         taken |= more
         absent |= more_absent
-    seconds, more_absent = first_use.add(suite, QUICK_RUNS if quick else RUNS, compiling=not quick)
+    seconds, more_absent = first_use.add(
+        suite, _QUICK_RUNS if quick else _RUNS, compiling=not quick
+    )
     add(suite, taken, seconds, absent | more_absent)
     suite.verdict = make_verdict(taken, suite.tables[0])
     return suite
 
 
 def make_verdict(taken: Mapping[str, Taken], goals: ResultTable) -> str:
-    """The verdict. taken: CPU us of the contestants; goals: the table of targets."""
+    """Make the verdict from the CPU us of the workloads and the table of targets, `goals`."""
     us = {name: compute_range(times)[0] for name, times in taken.items()}
     step_time = us[env_steps.FUSION]
     over = [
-        f"{format_three_digits(us[name] / step_time)} for {name}" for name in RIVALS if name in us
+        f"{format_three_digits(us[name] / step_time)} for {name}" for name in _RIVALS if name in us
     ]
     met = [line[0] for line in goals.cells if line[-1] == "met"]
     missed = [f"{name} ({measured} of {goal})" for name, goal, measured, _, outcome in goals.cells

@@ -1,7 +1,4 @@
-"""CPU time of contestants side by side: interleaved rounds in one process, on one thread.
-
-The contestants of one comparison, those that could not come, and the table of their costs.
-"""
+"""CPU times of workloads that take turns in one process, on one thread, and the table of them."""
 
 import statistics
 import time
@@ -14,20 +11,16 @@ from ..harness.results import ResultRow, ResultTable, Suite
 
 @dataclass(frozen=True)
 class Workload:
-    """Some work and the number of units (steps, ticks, ...) that one call of it consists of.
-
-    start: called before each round, not timed.
-    """
+    """Work whose call consists of some units (steps, ticks, ...)."""
 
     work: Callable[[], object]
     units: int
-    start: Callable[[], object] = lambda: None
+    start: Callable[[], object] = lambda: None  # before each round, not timed
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How long to measure: rounds that count, and the CPU seconds that a contestant works at least
-    in each of them, by whole calls of its work."""
+    """Rounds that count, and the CPU time (s) of each workload in one, by whole calls, at least."""
 
     rounds: int
     seconds: float
@@ -35,14 +28,14 @@ class Effort:
 
 QUICK = Effort(9, 0.01)
 FULL = Effort(25, 0.04)
-"""Many short rounds: what the machine does meanwhile falls on all contestants of one round."""
+"""Many short rounds: what the machine does meanwhile falls on all workloads of one round."""
 
 Taken = list[float]
 """CPU microseconds a unit, round by round."""
 
 
 def measure_interleaved(workloads: Mapping[str, Workload], effort: Effort) -> dict[str, Taken]:
-    """Each contestant's time in every round, after one that does not count."""
+    """Measure the CPU us a unit of workloads, round by round, after a first round."""
     with limit_threads():
         calls = {
             name: _count_calls(workload, effort.seconds) for name, workload in workloads.items()
@@ -55,7 +48,7 @@ def measure_interleaved(workloads: Mapping[str, Workload], effort: Effort) -> di
 
 
 def _measure_calls(workload: Workload, calls: int) -> float:
-    """CPU microseconds a unit of some calls of the work."""
+    """Measure the CPU microseconds a unit of some calls."""
     workload.start()
     start = time.process_time()
     for _ in range(calls):
@@ -64,7 +57,7 @@ def _measure_calls(workload: Workload, calls: int) -> float:
 
 
 def _count_calls(workload: Workload, seconds: float) -> int:
-    """How many calls take so many seconds, by the second call: the first may compile."""
+    """Count the calls that take so many seconds, by the second one: the first may compile."""
     _measure_calls(workload, 1)
     once = _measure_calls(workload, 1) * workload.units * 1e-6
     return max(1, round(seconds / max(once, 1e-9)))
@@ -72,7 +65,7 @@ def _count_calls(workload: Workload, seconds: float) -> int:
 
 @contextmanager
 def limit_threads() -> Iterator[None]:
-    """Linear algebra and torch on one thread, where threadpoolctl is installed."""
+    """Limit linear algebra and torch to one thread, where threadpoolctl is installed."""
     try:
         from threadpoolctl import threadpool_limits
     except ModuleNotFoundError:
@@ -83,23 +76,23 @@ def limit_threads() -> Iterator[None]:
 
 
 def compute_range(values: Taken) -> tuple[float, float, float]:
-    """(median, least, largest)."""
+    """Compute the median, minimum and maximum of some values."""
     return statistics.median(values), min(values), max(values)
 
 
 class AbsentError(Exception):
-    """A contestant that cannot come; the message says why."""
+    """A workload cannot be made; the message says why."""
 
 
 @dataclass
 class WorkloadSet:
-    """Contestants by name; `absent`: why others are not among them."""
+    """Workloads by name, and the reasons why others are absent."""
 
     workloads: dict[str, Workload] = field(default_factory=dict)
     absent: dict[str, str] = field(default_factory=dict)
 
     def add(self, name: str, make: Callable[[], Workload], package: str | None = None) -> None:
-        """Make a contestant; without the optional package that it comes from it is absent."""
+        """Add a workload, or why it is absent: the optional package it needs is not installed."""
         try:
             self.workloads[name] = make()
         except AbsentError as error:
@@ -112,21 +105,11 @@ class WorkloadSet:
     def measure(
         self, suite: Suite, title: str, unit: str, effort: Effort, note: str
     ) -> tuple[dict[str, Taken], dict[str, str]]:
-        """Time the contestants, add rows and a table; (times by name, why others are absent).
-
-        unit: "step" or "tick".
-        """
+        """Measure all; add rows and a table in us per "step" or "tick"; times, reasons by name."""
         taken, cells = measure_interleaved(self.workloads, effort), []
         for name, values in taken.items():
-            middle, *ends = add_row(suite, name, f"us_per_{unit}", values)
-            cells.append(
-                [
-                    name,
-                    format_three_digits(middle),
-                    " .. ".join(map(format_three_digits, ends)),
-                    format_rate(middle),
-                ]
-            )
+            middle, *bounds = add_row(suite, name, f"us_per_{unit}", values)
+            cells.append([name, *format_range(middle, *bounds), _format_rate(middle)])
         if cells:
             header = ("", f"us per {unit}", "range", "per CPU-s")
             text = note + format_absences(self.absent)
@@ -135,23 +118,27 @@ class WorkloadSet:
 
 
 def add_row(suite: Suite, name: str, metric: str, values: Taken) -> tuple[float, float, float]:
-    """Add a row of a suite; its (median, least, largest)."""
+    """Add the median and range of rounds as a row of a suite, and return them."""
     middle, low, high = compute_range(values)
-    suite.rows.append(
-        ResultRow(suite.name, name, metric, middle, low=low, high=high, n=len(values))
-    )
+    row = ResultRow(suite.name, name, metric, middle, low=low, high=high, n=len(values))
+    suite.rows.append(row)
     return middle, low, high
 
 
 def format_absences(absent: Mapping[str, str]) -> str:
-    """A sentence on those that could not come, or nothing."""
+    """Format a sentence on the absent workloads, with reasons by name; "" without any."""
     if not absent:
         return ""
     return f" Not measured: {'; '.join(f'{name} ({reason})' for name, reason in absent.items())}."
 
 
+def format_range(middle: float, low: float, high: float) -> tuple[str, str]:
+    """Format a median and its range, to three digits, as two cells of a table."""
+    return format_three_digits(middle), " .. ".join(map(format_three_digits, (low, high)))
+
+
 def format_three_digits(value: float) -> str:
-    """A number to three digits, without an exponent.
+    """Format a number to three digits, without an exponent.
 
     >>> format_three_digits(0.04431), format_three_digits(7.2), format_three_digits(1004.0)
     ('0.0443', '7.2', '1000')
@@ -159,10 +146,6 @@ def format_three_digits(value: float) -> str:
     return f"{float(f'{value:.3g}'):g}"
 
 
-def format_rate(microseconds: float) -> str:
-    """How many in a second, to three digits.
-
-    >>> format_rate(0.0443), format_rate(7.25), format_rate(1210.0)
-    ('22,600,000', '138,000', '826')
-    """
+def _format_rate(microseconds: float) -> str:
+    """Format the number of units in a second of CPU time, to three digits."""
     return f"{float(f'{1e6 / microseconds:.3g}'):,.0f}"

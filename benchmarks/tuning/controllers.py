@@ -1,10 +1,8 @@
-"""What is searched of each contestant of the matrix, with its range: one table.
+"""Search of the options that make a controller cheapest over the tasks of a class.
 
-Question: which options make a contestant of the matrix cheapest, over a class's contests?
-
-Every contestant gets the same number of trials on the same tuning seeds. What is made small is
-minus the mean of `scores.gains` over contests and seeds: log(J / J_nominal), J_nominal that of the
-untuned `nominal`, clipped to +-3, where a failure counts log 20.
+Every controller gets the same number of trials on the same tuning seeds. The objective is minus the
+mean of `compute_log_ratios` over tasks and seeds: log(J / J_nominal), J_nominal that of the untuned
+`nominal`, clipped to +-3, where a failure counts log 20.
 """
 
 import hashlib
@@ -36,26 +34,20 @@ from .estimator import STORAGE
 from .study import make_result_table
 
 KINDS = ("coms-model", "coms-zero-slip", "car-yaw", "car-steering")
-"""The classes of contests."""
-STEERING = ("coms-model", "car-steering")
-"""Those in which the action steers too."""
+"""Classes of tasks."""
+STEERING = ("coms-model", "car-steering")  # the action steers too
 
 
 class SearchNumber(NamedTuple):
-    """A number that is searched between low and high, on a logarithmic scale, from `start` on.
+    """A number that is searched between low and high, on a logarithmic scale, from `start` on."""
 
-    name: of the option, behind a dot the place in a list. of: whose option it is, of
-    `CELL_WEIGHTS`.
-    is_integer: it is an integer. steering: it means something only where the action steers.
-    """
-
-    name: str
+    name: str  # of the option, behind a dot the place in a list
     start: float
     low: float
     high: float
-    of: tuple[str, ...] = ("controller",)
+    of: tuple[str, ...] = ("controller",)  # whose option it is: controller, filter or both
     is_integer: bool = False
-    steering: bool = False
+    steering: bool = False  # it means something only where the action steers
 
 
 _TIME = SearchNumber("disturbance_time", 0.3, 0.03, 3.0, ("filter",))  # s
@@ -69,14 +61,12 @@ _LEVELS = (
 )
 _GRIP = SearchNumber("grip", 0.7, 0.3, 1.0)
 _FILTER = (*_LEVELS, _TIME, _GRIP)
-_LQG = (
-    *_LEVELS,
-    _TIME._replace(of=("filter", "controller")),
-    _GRIP,
-    SearchNumber("steer_weight", 100.0, 0.3, 1e3, steering=True),
-)
-_MPC = (*_LEVELS, _TIME._replace(of=("filter", "controller")), _GRIP)
-_ADAPTIVE = (*_LEVELS[:2], _LEVELS[-1], _TIME._replace(of=("filter", "controller")), _GRIP)
+_STEER = SearchNumber("steer_weight", 100.0, 0.3, 1e3, steering=True)
+_BOTH_TIMES = _TIME._replace(of=("filter", "controller"))
+_MPC = (*_LEVELS, _BOTH_TIMES, _GRIP)
+_LQG = (*_MPC, _STEER)
+_NMPC = (SearchNumber("horizon", 0.5, 0.2, 1.0), _STEER._replace(start=10.0))  # s
+_ADAPTIVE = (*_LEVELS[:2], _LEVELS[-1], _BOTH_TIMES, _GRIP)
 
 SPACES: dict[str, tuple[SearchNumber, ...]] = {
     "two-dof": (
@@ -103,38 +93,32 @@ SPACES: dict[str, tuple[SearchNumber, ...]] = {
     ),
     "lqr": _LQG,
     "mpc": (SearchNumber("horizon", 30, 10, 60, is_integer=True), *_MPC),
-    "nmpc": (
-        SearchNumber("horizon", 0.5, 0.2, 1.0),  # s
-        SearchNumber("steer_weight", 10.0, 0.3, 1e3, steering=True),
-        *_MPC,
-    ),
-    "adaptive-lqr": (SearchNumber("steer_weight", 100.0, 0.3, 1e3, steering=True), *_ADAPTIVE),
-    "adaptive-nmpc": (
-        SearchNumber("horizon", 0.5, 0.2, 1.0),  # s
-        SearchNumber("steer_weight", 10.0, 0.3, 1e3, steering=True),
-        *_ADAPTIVE,
-    ),
+    "nmpc": (*_NMPC, *_MPC),
+    "adaptive-lqr": (_STEER, *_ADAPTIVE),
+    "adaptive-nmpc": (*_NMPC, *_ADAPTIVE),
     "nominal": _LQG,
-    "oracle-parameters-lqr": tuple(
-        entry for entry in _LQG if entry.name != "bias_sd"
-    ),  # it knows it
+    # it knows the gyro's bias
+    "oracle-parameters-lqr": tuple(number for number in _LQG if number.name != "bias_sd"),
 }
-"""By contestant; all but the rungs, which bring their own, drive on `exact-kf` with all sensors,
-the adaptive ones on the filter whose tyres they follow. In the matrix `lqr` has what was found for
-`nominal`, which is the same design."""
-SLOW = ("mpc", "nmpc", "adaptive-nmpc", "oracle-parameters-lqr")
-"""Contestants whose worse trials end after a few seeds."""
+"""Numbers by controller. All but the oracles drive on `exact-kf` with all sensors, adaptive ones on
+the filter whose tyres they follow; `lqr` has what is found for `nominal`, the same design."""
+_SLOW = ("mpc", "nmpc", "adaptive-nmpc", "oracle-parameters-lqr")
+_STAGES = (2, 4, 8)  # seeds after which the better half of a slow controller's trials goes on
+_TRIALS = 60
+LOGS = Path(__file__).with_name("logs")
+"""Studies whose options the package ships."""
+_UNTUNED: Options = {"filter": {}, "controller": {}}
 
 
 def get_space(name: str, kind: str) -> tuple[SearchNumber, ...]:
-    """What is searched of a contestant in a class; ValueError for another name or class."""
+    """Get the numbers of a controller in a class of tasks; ValueError for unknown names."""
     check_choice("controller", name, SPACES)
     check_choice("class", kind, KINDS)
     return tuple(number for number in SPACES[name] if kind in STEERING or not number.steering)
 
 
 def make_options(numbers: tuple[SearchNumber, ...], values: Mapping[str, float]) -> Options:
-    """The options of filter and controller with the numbers that were found, by name."""
+    """Make the options of filter and controller from the values of numbers by name."""
     options: dict[str, dict[str, Any]] = {"filter": {}, "controller": {}}
     for number in numbers:
         name, _, index = number.name.partition(".")
@@ -147,17 +131,9 @@ def make_options(numbers: tuple[SearchNumber, ...], values: Mapping[str, float])
     return options
 
 
-TRIALS = 60
-LOGS = Path(__file__).with_name("logs")
-"""The studies whose options the package ships."""
-STAGES = (2, 4, 8)
-"""Seeds after which the better half of a slow contestant's trials goes on."""
-_UNTUNED: Options = {"filter": {}, "controller": {}}
-
-
 @dataclass(frozen=True)
 class ControllerTuning:
-    """What is searched: a contestant's numbers, over a class's contests, on tuning seeds."""
+    """A search of a controller's numbers over the tasks of a class, on tuning seeds."""
 
     name: str
     kind: str
@@ -167,28 +143,28 @@ class ControllerTuning:
 
     @property
     def study(self) -> str:
-        """The study's name: the same for the same question asked of the same sources."""
+        """Name of the study: one for the same question, asked of the same sources."""
         stamp = f"{json.dumps(asdict(self), default=str)} {hash_experiment()} {__version__}"
         digest = hashlib.sha256(stamp.encode()).hexdigest()[:12]
         return f"{self.name} in {self.kind} {digest}"
 
     @property
     def search(self) -> dict[str, tuple[float, float]]:
-        """(low, high) by name."""
+        """Range (low, high) of each number by name."""
         return {number.name: (number.low, number.high) for number in self.numbers}
 
     @property
     def start(self) -> dict[str, float]:
-        """Where the search starts."""
+        """Value of each number at which the search starts."""
         return {number.name: number.start for number in self.numbers}
 
     def options(self, values: dict[str, float]) -> Options:
-        """The options with some numbers, which have three digits."""
+        """Make the options from values of the numbers, rounded to three digits."""
         return make_options(self.numbers, {name: float(f"{v:.3g}") for name, v in values.items()})
 
 
 def make_controller_tuning(name: str, kind: str, seeds: Sequence[int]) -> ControllerTuning:
-    """The question; ValueError for an unknown name or class, no contests and no seeds."""
+    """Make the search; ValueError for an unknown name or class, no tasks and no seeds."""
     numbers, matching = get_space(name, kind), list_contests(name, kind)
     if not matching or not seeds:
         raise ValueError(f"{kind}: {len(matching)} contests, {len(seeds)} seeds; both are needed")
@@ -196,18 +172,15 @@ def make_controller_tuning(name: str, kind: str, seeds: Sequence[int]) -> Contro
 
 
 def list_contests(name: str, kind: str) -> list[ControlTask]:
-    """The scored contests of a class; of a rung, by which those are chosen, all candidates."""
-    return [
-        contest
-        for contest in (list_candidates() if name in ORACLES else list_scored_tasks())
-        if contest.kind == kind
-    ]
+    """List the scored tasks of a class; for an oracle all candidates, chosen by its costs."""
+    tasks = list_candidates() if name in ORACLES else list_scored_tasks()
+    return [task for task in tasks if task.kind == kind]
 
 
 def run_contestant(
     contest: ControlTask, name: str, options: Options, seeds: tuple[int, ...]
 ) -> DriveResult:
-    """A contestant's episodes with some options."""
+    """Run a controller on a task with some options, an episode for each seed."""
     follows = {controller: estimator for estimator, controller in ADAPTIVE.items()}
     estimator = "" if name in ORACLES else follows.get(name, REFERENCE_FILTER)
     return run_chunk(Chunk(ControlEntry(contest, estimator, name, tuned=options), seeds))
@@ -221,7 +194,7 @@ def _compute_nominal_costs(contest: ControlTask, seeds: tuple[int, ...]) -> Arra
 def compute_objective(
     task: ControllerTuning, seeds: tuple[int, ...], values: dict[str, float]
 ) -> float:
-    """The mean over contests and some seeds, infinite where nothing can be designed."""
+    """Compute the mean over tasks and some seeds; infinite where the design fails."""
     options, log_ratios = task.options(values), []
     for contest in task.contests:
         result = run_contestant(contest, task.name, options, seeds)
@@ -232,21 +205,19 @@ def compute_objective(
     return value if math.isfinite(value) else math.inf
 
 
-def evaluate_trials(
+def _evaluate_trials(
     task: ControllerTuning, jobs: int, batch: Sequence[dict[str, float]]
 ) -> list[tuple[float, int]]:
-    """(objective, seeds driven) of each of a batch's trials.
+    """Evaluate a batch of trials, each to its objective and the number of seeds that it drove.
 
-    Of a slow contestant's the worse half is left after each of `STAGES` (successive halving); the
-    others go on with the seeds that they have not driven.
+    The worse half of a slow controller's trials ends after each of `_STAGES` (successive halving).
     """
-    stages = [stage for stage in STAGES if task.name in SLOW and stage < len(task.seeds)]
+    stages = [stage for stage in _STAGES if task.name in _SLOW and stage < len(task.seeds)]
     results, remaining, done = [(0.0, 0)] * len(batch), list(range(len(batch))), 0
     for count in (*stages, len(task.seeds)):
         new = task.seeds[done:count]
-        values = run_cases(
-            partial(compute_objective, task, new), [batch[i] for i in remaining], jobs=jobs
-        )
+        trials = [batch[i] for i in remaining]
+        values = run_cases(partial(compute_objective, task, new), trials, jobs=jobs)
         for i, value in zip(remaining, values, strict=True):
             results[i] = (results[i][0] * done + value * len(new)) / count, count
         done = count
@@ -256,43 +227,35 @@ def evaluate_trials(
 
 def tune(
     task: ControllerTuning,
-    trials: int = TRIALS,
+    trials: int = _TRIALS,
     storage: str = STORAGE,
     seed: int = 0,
     jobs: int | None = None,
     console: Console | None = None,
 ) -> dict[str, Any]:
-    """Search; the study as a mapping of JSON types: every trial and the best of those that drove
-    all seeds.
+    """Search for the best options; a search that was stopped goes on.
 
-    A stopped search goes on where it was. Raises ValueError for a contestant that cannot drive the
-    contests, no trials, a storage that fails, and where no trial is finite.
+    Returns the study's log as JSON types. Raises ValueError for a controller that cannot drive a
+    task, no trials, a storage that fails, and where no trial that drove all seeds is finite.
     """
     from .study import create_study, run_search
 
     if trials < 1:
         raise ValueError(f"trials must be at least 1, got {trials}")
+    options = task.options(task.start)
     for contest in task.contests:  # what cannot be driven at all; kernels are compiled once
-        if error := run_contestant(
-            contest, task.name, task.options(task.start), task.seeds[:1]
-        ).error:
+        if error := run_contestant(contest, task.name, options, task.seeds[:1]).error:
             raise ValueError(f"{task.name} in {contest.name}: {error}")
     study = create_study(task, storage, "tpe", seed)
     if not study.trials:
         study.enqueue_trial(task.start)
-    run_search(
-        study,
-        task,
-        trials,
-        partial(evaluate_trials, task, jobs or count_cores()),
-        len(task.seeds),
-        console,
-    )
-    return make_log(task, study.trials)
+    evaluate = partial(_evaluate_trials, task, jobs or count_cores())
+    run_search(study, task, trials, evaluate, len(task.seeds), console)
+    return _make_log(task, study.trials)
 
 
-def make_log(task: ControllerTuning, trials: Sequence[Any]) -> dict[str, Any]:
-    """The log of a study; trials: Optuna's."""
+def _make_log(task: ControllerTuning, trials: Sequence[Any]) -> dict[str, Any]:
+    """Make the log of a study from Optuna's trials."""
     rows: list[dict[str, Any]] = []
     for item in trials:
         if "seeds" in item.user_attrs:  # the others were stopped
@@ -318,14 +281,14 @@ def make_log(task: ControllerTuning, trials: Sequence[Any]) -> dict[str, Any]:
 
 
 def write_log(path: Path, log: dict[str, Any]) -> None:
-    """A log as JSON, a trial a line."""
+    """Write a log as JSON, a trial a line."""
     lines = ",\n  ".join(json.dumps(trial) for trial in log["trials"])
     head = json.dumps({key: value for key, value in log.items() if key != "trials"}, indent=1)
     write_text(path, f'{head[:-2]},\n "trials": [\n  {lines}\n ]\n}}\n')
 
 
 def make_suite(task: ControllerTuning, log: dict[str, Any]) -> Suite:
-    """What a study found, as a table."""
+    """Make a suite with the numbers that a study found."""
     best = log["best"]
     start = math.inf if log["start"] is None else math.exp(log["start"])
     text = (

@@ -1,7 +1,4 @@
-"""The task of a tuning: an estimator on drives of scenarios, its error, the numbers to be found.
-
-The file of tunings: entries are replaced whole, and the file whole or not at all.
-"""
+"""Tuning of an estimator: its options and ranges, its error on drives, and the files of tunings."""
 
 import dataclasses
 import hashlib
@@ -34,8 +31,8 @@ from ..studies.estimation import EXPERIMENTS
 
 Range = tuple[float, float]
 
-PROCESS_RANGE = (1e-8, 1e2)  # (unit of the state)^2 / s
-NOISE_RANGE = (1e-5, 1.0)  # unit of the sensor
+_PROCESS_RANGE = (1e-8, 1e2)  # (unit of the state)^2 / s
+_NOISE_RANGE = (1e-5, 1.0)  # unit of the sensor
 SAMPLERS = ("cma", "tpe")
 STORAGE = "sqlite:///sideslip-tune.db"
 FIRST_SEED = 1000  # of training; the test seeds count from 0
@@ -43,31 +40,26 @@ FIRST_SEED = 1000  # of training; the test seeds count from 0
 
 @dataclass(frozen=True)
 class EstimatorTuning:
-    """A tuning: which options of an estimator are searched, on which drives, for what.
-
-    scenarios: which count alike, each with every seed. options: held. search: option to (low,
-    high), both positive. target: the state whose error counts, in `unit`. sensors: the slow ones
-    that the estimator uses, joined by commas.
-    """
+    """A search of an estimator's options that are most accurate on drives of scenarios."""
 
     estimator: str
-    scenarios: tuple[str, ...]
+    scenarios: tuple[str, ...]  # they count alike, each with every seed
     env_id: str
-    target: str
+    target: str  # the state whose error counts, in `unit`
     unit: str
-    sensors: str
-    options: dict[str, Any]
-    search: dict[str, Range]
+    sensors: str  # the slow ones that the estimator uses, joined by commas
+    options: dict[str, Any]  # held
+    search: dict[str, Range]  # (low, high) by option, both positive
     seeds: tuple[int, ...]
 
     @property
     def subject(self) -> str:
-        """The scenarios' names."""
+        """Names of the scenarios."""
         return ", ".join(self.scenarios)
 
     @property
     def study(self) -> str:
-        """The study's name: the same for the same question asked of the same sources."""
+        """Name of the study: one for the same question, asked of the same sources."""
         question = json.dumps(dataclasses.asdict(self), sort_keys=True, default=str)
         stamp = f"{question} {hash_sources('estimators')} {__version__}"
         digest = hashlib.sha256(stamp.encode()).hexdigest()[:12]
@@ -84,16 +76,24 @@ def make_estimator_tuning(
     noises: Mapping[str, Range | None] | None = None,
     seeds: int = 12,
 ) -> EstimatorTuning:
-    """Check what a user asks for and fill in the rest.
+    """Make a tuning of what a user asks for: check it, and fill in the rest.
 
-    scenarios: one's name or several.
-        env_id: default, the first environment in which every scenario has the sensors the estimator
-    needs. search: the
-    options to be found with their range (None: the default one); default, the process noise
-    `q_...` of every state that `options` does not hold. noises: searched as well.
+    Args:
+        estimator: Name of the estimator.
+        scenarios: Name of a scenario, or several.
+        env_id: Id of the env; default: the first whose scenarios have the estimator's sensors.
+        target: State whose error counts.
+        options: Options that are held.
+        search: Options to be found, with their range or None for the default one; default: process
+            noise `q_...` of every state that `options` does not hold.
+        noises: Measurement noises, searched as well.
+        seeds: Number of training drives in each scenario.
 
-    Raises ValueError or TypeError for unknown names, a scenario without the sensors, an option
-    that the estimator does not have, a range that is none, no seeds.
+    Returns:
+        Tuning.
+
+    Raises:
+        ValueError: A name is unknown, a scenario lacks the sensors, or a range or seeds are none.
     """
     if seeds < 1:
         raise ValueError(f"seeds must be at least 1, got {seeds}")
@@ -106,7 +106,7 @@ def make_estimator_tuning(
     states = filter_.names
     if target not in states:
         raise ValueError(f"{estimator} has no {target}; a target is one of {', '.join(states)}")
-    (drive,) = simulate_case((env_id, scenarios[0], (FIRST_SEED,)))
+    (drive,) = _simulate_case((env_id, scenarios[0], (FIRST_SEED,)))
     if target not in drive.log.truth:
         known = ", ".join(state for state in states if state in drive.log.truth) or "none"
         raise ValueError(f"the truth of {target} is not recorded; of its states: {known}")
@@ -124,21 +124,16 @@ def make_estimator_tuning(
             raise ValueError(f"the option {option} is both held and searched")
         if not _has_option(estimator, option, held, facts):
             build_estimator(estimator, facts, {**held, option: 1.0})  # raises with what it has
+    unit, sensors = filter_.units[states.index(target)], ",".join(filter_.sensors)
+    ranges = {option: _check_range(option, limits) for option, limits in searched.items()}
+    numbers = tuple(range(FIRST_SEED, FIRST_SEED + seeds))
     return EstimatorTuning(
-        estimator,
-        scenarios,
-        env_id,
-        target,
-        filter_.units[states.index(target)],
-        ",".join(filter_.sensors),
-        held,
-        {option: _check_range(option, limits) for option, limits in searched.items()},
-        tuple(range(FIRST_SEED, FIRST_SEED + seeds)),
+        estimator, scenarios, env_id, target, unit, sensors, held, ranges, numbers
     )
 
 
 def _check_range(option: str, limits: Range | None) -> Range:
-    low, high = limits or (PROCESS_RANGE if option.startswith("q_") else NOISE_RANGE)
+    low, high = limits or (_PROCESS_RANGE if option.startswith("q_") else _NOISE_RANGE)
     if not 0.0 < low < high < math.inf:
         raise ValueError(f"the range of {option} is LOW:HIGH with 0 < LOW < HIGH, got {low}:{high}")
     return float(low), float(high)
@@ -147,23 +142,22 @@ def _check_range(option: str, limits: Range | None) -> Range:
 def build_estimator(
     estimator: str, facts: Mapping[str, Any], options: Mapping[str, Any]
 ) -> Estimator:
-    """An estimator of an env's facts, without the warning of what it cannot see."""
+    """Build an estimator for an env's facts, without `UnobservableWarning`."""
     return call_quietly(make_estimator, estimator, **facts, **options)
 
 
 def _make_unstable_option(estimator: str) -> dict[str, bool]:
-    """The option of ours to be built whatever their error does; a user's own has none."""
+    """Make the option that lets our filters be built though their error grows."""
     return {"allow_unstable": True} if estimator in FILTERS else {}
 
 
 def _has_option(
     estimator: str, option: str, held: Mapping[str, Any], facts: Mapping[str, Any]
 ) -> bool:
-    """Whether the estimator has an option; whether the number suits is another matter."""
+    """Check whether the estimator has an option, whatever number suits it."""
     try:
-        build_estimator(
-            estimator, facts, {**_make_unstable_option(estimator), **held, option: 1e-3}
-        )
+        options = {**_make_unstable_option(estimator), **held, option: 1e-3}
+        build_estimator(estimator, facts, options)
     except TypeError:
         return False
     except ValueError:
@@ -174,8 +168,7 @@ def _has_option(
 def _find_env(
     estimator: str, scenarios: Sequence[str], env_id: str | None, held: dict[str, Any]
 ) -> tuple[str, dict[str, Any], Estimator]:
-    """The environment to use, and its facts and the estimator without tuning in the last
-    scenario."""
+    """Find an env that suits; its id, its facts, and the untuned estimator."""
     first = [experiment.env_id for experiment in EXPERIMENTS if experiment.scenario in scenarios]
     others = [name for name in gym.registry if name.startswith("sideslip/Yaw")]
     ids = list(dict.fromkeys([*first, *others])) if env_id is None else [env_id]
@@ -186,9 +179,8 @@ def _find_env(
                 env: gym.Env[Any, Any] = gym.make(name, scenario=scenario)
                 env.reset(seed=FIRST_SEED)
                 facts = make_filter_arguments(env.unwrapped)
-                filter_ = build_estimator(
-                    estimator, facts, {**_make_unstable_option(estimator), **held}
-                )
+                options = {**_make_unstable_option(estimator), **held}
+                filter_ = build_estimator(estimator, facts, options)
         except ValueError as error:
             refused.setdefault(str(error), name)
         else:
@@ -197,8 +189,8 @@ def _find_env(
     raise ValueError(f"no environment of {', '.join(scenarios)} suits {estimator}: {reasons}")
 
 
-def simulate_case(case: tuple[str, str, tuple[int, ...]]) -> list[LoggedEpisode]:
-    """The drives of (env id, scenario, seeds)."""
+def _simulate_case(case: tuple[str, str, tuple[int, ...]]) -> list[LoggedEpisode]:
+    """Simulate the drives of an env id, a scenario and seeds."""
     env_id, scenario, seeds = case
     env: gym.Env[Any, Any] = gym.make(env_id, scenario=scenario, control_period=1)
     return [
@@ -214,20 +206,19 @@ def simulate(
     jobs: int | None,
     console: Console | None,
 ) -> list[LoggedEpisode]:
-    """The drives of some seeds in each scenario in turn, four a case, side by side."""
+    """Simulate the drives of some seeds in each scenario in turn, four a case."""
     fours = [tuple(seeds[i : i + 4]) for i in range(0, len(seeds), 4)]
     cases = [(task.env_id, scenario, four) for scenario in task.scenarios for four in fours]
-    done = run_cases(simulate_case, cases, title, jobs, console)
+    done = run_cases(_simulate_case, cases, title, jobs, console)
     return [drive for drives in done for drive in drives]
 
 
 def compute_squares(
     task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: Mapping[str, float]
 ) -> Array:
-    """Mean squared error of the target from `SETTLED` s on: (scenarios, seeds).
+    """Compute the target's mean squared error from `SETTLED` s on, shape (scenarios, seeds).
 
-    Raises ValueError where the estimator cannot be built. An estimate that is not finite counts as
-    infinitely wrong.
+    It is infinite where an estimate is not finite. Raises ValueError where the estimator fails.
     """
     options, turn = task.options | dict(values), 2.0 * math.pi
     errors, filters = np.empty(len(drives)), dict[str, Estimator]()
@@ -247,11 +238,14 @@ def compute_squares(
 
 
 def compute_objective(errors: Array) -> float:
-    """What a search makes least: the geometric mean of the scenarios' RMSE, of `squares`."""
+    """Compute the geometric mean of the scenarios' RMSE from squared errors."""
     return float(np.exp(np.mean(np.log(root_mean(errors)))))
 
 
 _KEYS = ("estimator", "sensors", "command", "note", "q", "noise")
+_TUNED = """\
+# Options of contestants as [class.name.part]; found by `sideslip tune controller NAME`.
+"""
 _HEAD = """\
 # Tunings: process noise per second, (unit of the state)^2 / s, and measurement noise where it was
 # searched too. Each entry is the output of its command; `sensors` are the slow ones.
@@ -259,11 +253,11 @@ _HEAD = """\
 
 
 def update(path: str | Path, entry: dict[str, Any]) -> None:
-    """Replace or add an entry of a tunings file, which is made if it is not there.
+    """Replace or add an entry of a tunings file, which is made if it does not exist.
 
-    entry: estimator, sensors, q (by state), command, and noise (by option) and note where there is
-    a reason for one. The note of what a command found outlives the numbers unless a new one comes
-    with them; that of what was chosen by hand does not.
+    An old entry's note stays where that entry has a command and the new one has no note.
+
+    entry: Estimator, sensors, command, q by state, and perhaps noise by option and a note.
     """
     target = Path(path)
     entries = {_make_key(old): old for old in read_tunings(target)} if target.exists() else {}
@@ -281,17 +275,11 @@ def _make_key(entry: dict[str, Any]) -> tuple[str, str]:
 
 def _format_entry(entry: dict[str, Any]) -> str:
     present = [key for key in _KEYS if entry.get(key) not in (None, {})]
-    lines = "".join(f"{key} = {to_toml(entry[key])}\n" for key in present)
-    return f"[[tuning]]\n{lines}"
-
-
-_TUNED = """\
-# Options of contestants as [class.name.part]; found by `sideslip tune controller NAME`.
-"""
+    return "[[tuning]]\n" + "".join(f"{key} = {to_toml(entry[key])}\n" for key in present)
 
 
 def write_tuned(path: str | Path, kind: str, name: str, options: Options) -> None:
-    """Replace or add a contestant's options in a file that `agents.baselines` reads."""
+    """Replace or add a controller's options, class by class, in a file of `read_tuned`."""
     target = Path(path)
     read_tuned.cache_clear()
     classes = read_tuned(target) if target.exists() else {}

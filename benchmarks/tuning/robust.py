@@ -1,9 +1,8 @@
-"""Question: which levels make `joint-robust` most accurate on cars that nobody has measured?
+"""Search of the levels that make `joint-robust` most accurate on cars with unknown parameters.
 
-`python -m sideslip.benchmarks.tuning.robust` searches them on simulated drives up to the limit of
-grip: our passenger car and CommonRoad's drift and multi-body models, logged at 100 Hz, with a
-noise, a bias, a wandering error of the accelerometer, a steering offset and loose contacts drawn
-for each, and a filter that is configured with other tyres, friction and roll stiffness.
+`python -m sideslip.benchmarks.tuning.robust` simulates drives up to the limit of grip, of our car
+and of CommonRoad's drift and multi-body models, logged at 100 Hz with random sensor errors. The
+filter is configured with other tyres, friction and roll stiffness.
 """
 
 import dataclasses
@@ -30,12 +29,11 @@ from ..recorded.emulate import Emulation
 from .estimator import FIRST_SEED, STORAGE, Range
 from .study import create_study, run_search
 
-PLANTS = ("", "drift", "multi-body")
-"""Of a drive: ours, then CommonRoad's."""
-EVERY = 10  # ticks between two rows of a log
+_PLANTS = ("", "drift", "multi-body")  # of a drive: ours, then CommonRoad's
+_EVERY = 10  # ticks between two rows of a log
 DURATION = 30.0  # s
-LATE_COURSE = Emulation(delay=0.2)
-SPACE: dict[str, Range] = {
+_LATE_COURSE = Emulation(delay=0.2)
+_SPACE: dict[str, Range] = {
     "inverse_friction_sd": (0.02, 0.6),
     "q_front_tyres": (1e-4, 0.2),
     "force_share": (3e-3, 0.3),
@@ -47,11 +45,11 @@ SPACE: dict[str, Range] = {
     "accel_scale_sd": (0.003, 0.1),
     "gyro_noise": (1e-3, 0.03),
 }
-"""What is searched; the rear tyres' have the front tyres'."""
+"""Ranges of the levels; the rear tyres have those of the front tyres."""
 
 
 def _make_scenario(draw: np.random.Generator, outside: bool) -> dict[str, Any]:
-    """Random steering whose lateral acceleration reaches a share of the grip."""
+    """Draw a random steering whose lateral acceleration reaches a fraction of the grip."""
     speed, friction = draw.uniform(12.0, 32.0), draw.uniform(0.6, 1.1)
     peak = draw.uniform(0.35, 0.9) * friction * GRAVITY
     steer = 0.25 * peak * (2.6 / speed**2 + 0.0025)
@@ -63,31 +61,29 @@ def _make_scenario(draw: np.random.Generator, outside: bool) -> dict[str, Any]:
 
 
 def simulate_drive(seed: int) -> LoggedEpisode | None:
-    """A log at 100 Hz and what a filter is configured with; None where the car spins."""
+    """Simulate a log at 100 Hz with what a filter is configured with; None for a spin."""
     draw = np.random.default_rng(seed)
-    plant = PLANTS[seed % len(PLANTS)]
+    plant = _PLANTS[seed % len(_PLANTS)]
     native_env: dict[str, Any] = {"id": "sideslip/YawGps-v0", "vehicle": "passenger-car"}
     outside_env: dict[str, Any] = {"id": "sideslip/Outside-v0", "model": plant, "sensors": "gps"}
     scenario = _make_scenario(draw, bool(plant))
-    env: Any = gym.make(
-        **(outside_env if plant else native_env), scenario=scenario, control_period=EVERY
-    )
+    made = outside_env if plant else native_env
+    env: Any = gym.make(**made, scenario=scenario, control_period=_EVERY)
     done = rollout(env, seed=seed)
     log, base = done.log, env.unwrapped
     if log.time[-1] < DURATION - 1.0:
         return None
-    n, dt = -(-len(log.record.fast) // EVERY), EVERY * log.record.dt
+    n, dt = -(-len(log.record.fast) // _EVERY), _EVERY * log.record.dt
     truth = np.interp(np.arange(n) * dt, log.time - log.time[0], log.truth["beta"])
-    rows = dataclasses.replace(log.record, fast=log.record.fast[::EVERY].copy(), first=0, dt=dt)
-    noisy_log = LATE_COURSE.add_course(Log(rows, {}, {"beta": truth}, f"drive {seed}"), seed)
-    add_sensor_errors(noisy_log.record.fast, dt, draw)
-    return LoggedEpisode(
-        noisy_log, {"vehicle": vary_vehicle(base.nominal, scenario["friction"], draw), "dt": dt}
-    )
+    rows = dataclasses.replace(log.record, fast=log.record.fast[::_EVERY].copy(), first=0, dt=dt)
+    noisy_log = _LATE_COURSE.add_course(Log(rows, {}, {"beta": truth}, f"drive {seed}"), seed)
+    _add_sensor_errors(noisy_log.record.fast, dt, draw)
+    vehicle = _vary_vehicle(base.nominal, scenario["friction"], draw)
+    return LoggedEpisode(noisy_log, {"vehicle": vehicle, "dt": dt})
 
 
-def vary_vehicle(car: Vehicle, friction: float, draw: np.random.Generator) -> Vehicle:
-    """The car as its data sheet has it: stiffness, friction, roll, weight and balance differ."""
+def _vary_vehicle(car: Vehicle, friction: float, draw: np.random.Generator) -> Vehicle:
+    """Draw the car of a data sheet: stiffness, friction, roll, weight and balance differ."""
     car, moved = car.scale_stiffness(*draw.uniform(0.7, 1.3, 2)), draw.uniform(-0.08, 0.08)
     return dataclasses.replace(
         car,
@@ -100,8 +96,8 @@ def vary_vehicle(car: Vehicle, friction: float, draw: np.random.Generator) -> Ve
     )
 
 
-def add_sensor_errors(fast: Array, dt: float, draw: np.random.Generator) -> None:
-    """Put the errors of somebody else's sensors on fast rows."""
+def _add_sensor_errors(fast: Array, dt: float, draw: np.random.Generator) -> None:
+    """Add drawn noise, biases, scale errors and dropouts to fast rows, in place."""
     n = len(fast)
     wander = _draw_ou_path(draw, n, dt / draw.uniform(3.0, 30.0)) * draw.uniform(0.0, 0.4)
     fast[:, FAST.accel_y] *= 1.0 + draw.uniform(-0.03, 0.03)
@@ -109,9 +105,8 @@ def add_sensor_errors(fast: Array, dt: float, draw: np.random.Generator) -> None
     noise = np.radians(draw.uniform(0.0, 0.4)) * draw.standard_normal(n)
     fast[:, FAST.gyro] += np.radians(draw.uniform(-0.3, 0.3)) + noise
     turning = np.gradient(fast[:, FAST.gyro], dt)
-    fast[:, FAST.accel_y] += draw.uniform(-0.3, 0.3) * np.convolve(
-        turning, np.ones(20) / 20, "same"
-    )
+    smooth = np.convolve(turning, np.ones(20) / 20, "same")
+    fast[:, FAST.accel_y] += draw.uniform(-0.3, 0.3) * smooth
     fast[:, [FAST.wheel_left, FAST.wheel_right]] *= draw.uniform(0.98, 1.02)
     fast[:, FAST.steer] *= draw.uniform(0.94, 1.06)
     fast[:, FAST.steer] += np.radians(draw.uniform(-0.1, 0.1))
@@ -119,7 +114,7 @@ def add_sensor_errors(fast: Array, dt: float, draw: np.random.Generator) -> None
 
 
 def _draw_ou_path(draw: np.random.Generator, n: int, share: float) -> Array:
-    """An Ornstein-Uhlenbeck path (n,) of deviation 1; share: of a step in its time."""
+    """Draw an Ornstein-Uhlenbeck path (n,) of deviation 1; share: step over time constant."""
     left, path = math.exp(-share), np.empty(n)
     path[0] = draw.standard_normal()
     for i in range(1, n):
@@ -128,13 +123,13 @@ def _draw_ou_path(draw: np.random.Generator, n: int, share: float) -> Array:
 
 
 def make_options(values: Mapping[str, float]) -> dict[str, float]:
-    """Options of `joint-robust`: both axles alike."""
+    """Make the options of `joint-robust` from levels, both axles alike."""
     both = {name.replace("front", "rear"): value for name, value in values.items()}
     return both | dict(values)
 
 
 def compute_errors(options: Mapping[str, Any], drives: Sequence[LoggedEpisode]) -> Array:
-    """(drives, 2, 2): RMSE of beta in rad and NEES; without and with a late course."""
+    """Compute RMSE of beta (rad) and NEES, without and with late course: (drives, 2, 2)."""
     results = np.empty((len(drives), 2, 2))
     for i, sample in enumerate(drives):
         for j, slow in enumerate(({}, sample.log.slow)):
@@ -142,7 +137,7 @@ def compute_errors(options: Mapping[str, Any], drives: Sequence[LoggedEpisode]) 
             if not slow:
                 log.record = dataclasses.replace(log.record, packets=log.record.packets[:0])
             facts = sample.facts | {"sensors": slow, "slow": list(slow)}
-            facts |= {"course_noise": math.radians(LATE_COURSE.course_noise_deg)} if slow else {}
+            facts |= {"course_noise": math.radians(_LATE_COURSE.course_noise_deg)} if slow else {}
             estimates = call_quietly(make_estimator, "joint-robust", **facts, **options).run(log)
             settled = log.time >= SETTLED
             off = (estimates["beta"] - log.truth["beta"])[settled]
@@ -152,18 +147,17 @@ def compute_errors(options: Mapping[str, Any], drives: Sequence[LoggedEpisode]) 
 
 
 def compute_objective(results: Array) -> float:
-    """What the search makes least, of `errors`: the mean logarithm of the RMSE, and a tenth of how
-    far the NEES is from 1 on that scale, so that deviations stay honest."""
+    """Compute the mean logarithm of the RMSE, and a tenth of the NEES' distance from 1."""
     rmse, nees = np.log(results[..., 0]), np.log(results[..., 1])
     return float(np.mean(rmse + 0.1 * np.abs(nees)))
 
 
 @dataclasses.dataclass(frozen=True)
-class Levels:
-    """The question of a study: `SPACE`."""
+class _Levels:
+    """Question of the study."""
 
     study: str
-    search: Mapping[str, Range] = dataclasses.field(default_factory=lambda: SPACE)
+    search: Mapping[str, Range] = dataclasses.field(default_factory=lambda: _SPACE)
 
 
 def _evaluate_levels(path: str, values: dict[str, float]) -> float:
@@ -180,13 +174,10 @@ def main(
     """Search the levels; print them, and what they give on drives not seen."""
     console = Console()
     seeds = range(FIRST_SEED, FIRST_SEED + 2 * drives)
-    all_drives = [
-        sample
-        for sample in run_cases(simulate_drive, seeds, "drives", jobs, console)
-        if sample is not None
-    ]
+    simulated = run_cases(simulate_drive, seeds, "drives", jobs, console)
+    all_drives = [drive for drive in simulated if drive is not None]
     training, test = all_drives[0::2], all_drives[1::2]
-    study = create_study(Levels(f"joint-robust {hash_sources('estimators')}"), storage)
+    study = create_study(_Levels(f"joint-robust {hash_sources('estimators')}"), storage)
     with tempfile.TemporaryDirectory() as folder:
         path = f"{folder}/drives"
         joblib.dump(training, path)
@@ -195,7 +186,7 @@ def main(
             values = run_cases(functools.partial(_evaluate_levels, path), batch, jobs=jobs)
             return [(value, len(training)) for value in values]
 
-        run_search(study, Levels(study.study_name), trials, evaluate_batch, len(training), console)
+        run_search(study, _Levels(study.study_name), trials, evaluate_batch, len(training), console)
     best = {name: float(f"{value:.2g}") for name, value in study.best_params.items()}
     for name, value in make_options(best).items():
         console.print(f"{name} = {value}")

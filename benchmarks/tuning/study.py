@@ -1,12 +1,7 @@
-"""The search of a tuning with Optuna: the logarithms of the numbers, on the training drives.
+"""Search with Optuna over the logarithms of numbers, and its result for estimators as a suite.
 
 A study lives in a database, so that a search that was stopped goes on and several machines can
-share one. Importing this module needs optuna, the extra `tune`.
-
-Question: which process and measurement noise makes an estimator most accurate?
-
-Searched on training seeds, judged on test seeds. `task` has what is searched and what counts as
-error, `study` searches, `file` stores what was found.
+share one. It is searched on training seeds and judged on test seeds. Needs the extra `tune`.
 """
 
 import contextlib
@@ -46,17 +41,16 @@ with require_extra("tune", "tuning needs optuna"):
     from sqlalchemy.exc import SQLAlchemyError
 
 BATCH = 8  # trials asked for before any result is in: the same search for every number of jobs
-DIGITS = 3  # of what is found
 
 
-class Question(Protocol):
-    """What a study is about: its name, and the (low, high) of each number by name."""
-
-    @property
-    def study(self) -> str: ...  # noqa: D102
+class _Question(Protocol):
+    """Name of a study, and the (low, high) of each number by name."""
 
     @property
-    def search(self) -> Mapping[str, tuple[float, float]]: ...  # noqa: D102
+    def study(self) -> str: ...
+
+    @property
+    def search(self) -> Mapping[str, tuple[float, float]]: ...
 
 
 @functools.lru_cache(maxsize=1)
@@ -65,7 +59,7 @@ def _load_drives(path: str) -> Any:
 
 
 def evaluate_trial(path: str, task: EstimatorTuning, values: dict[str, float]) -> float:
-    """`objective` with some numbers, on the drives in a file; infinite if unstable."""
+    """Evaluate the objective of some numbers on the drives in a file; infinite if unstable."""
     try:
         return compute_objective(compute_squares(task, _load_drives(path), values))
     except ValueError:  # a filter that diverges, a covariance that is none
@@ -73,13 +67,12 @@ def evaluate_trial(path: str, task: EstimatorTuning, values: dict[str, float]) -
 
 
 def create_study(
-    task: Question, storage: str = STORAGE, sampler: str = SAMPLERS[0], seed: int = 0
+    task: _Question, storage: str = STORAGE, sampler: str = SAMPLERS[0], seed: int = 0
 ) -> "optuna.Study":
-    """The task's study, made if it is not there.
+    """Create or load a task's study in a storage: an RDB URL, or the path of an SQLite file.
 
-    storage: an RDB URL, or the path of an SQLite file. Machines that share one take different
-    seeds. Raises ValueError for an unknown sampler, a storage that cannot be used, and a study that
-    holds something else.
+    Machines that share one take different seeds. Raises ValueError for an unknown sampler, a
+    storage that cannot be used, and a study that holds something else.
     """
     url = storage if "://" in storage else f"sqlite:///{storage}"
     wait = {"connect_args": {"timeout": 60.0}} if url.startswith("sqlite") else {}
@@ -104,7 +97,7 @@ def search(
     jobs: int | None = None,
     console: Console | None = None,
 ) -> dict[str, float]:
-    """The best numbers after so many trials of the task's study, those it holds included.
+    """Search on training drives until the study has so many trials; the best numbers, 3 digits.
 
     Raises ValueError for a storage that fails and where no trial gave a stable filter.
     """
@@ -123,21 +116,21 @@ def search(
     if best.value is None or not math.isfinite(best.value):
         compute_squares(task, drives, best.params)  # the estimator's own words, if it has any
         raise ValueError(f"none of {trials} trials of {task.estimator} gave finite estimates")
-    return {name: float(f"{v:.{DIGITS}g}") for name, v in best.params.items()}
+    return {name: float(f"{v:.3g}") for name, v in best.params.items()}
 
 
 def run_search(
     study: "optuna.Study",
-    task: Question,
+    task: _Question,
     trials: int,
     evaluate: Callable[[Sequence[dict[str, float]]], Sequence[tuple[float, int]]],
     n_drives: int,
     console: Console | None = None,
 ) -> None:
-    """Ask for batches until the study has so many trials, those it holds included.
+    """Run batches of trials until the study has so many, those it holds included.
 
-    evaluate: from the numbers of a batch to (value, drives it is the mean of) of each. A trial that
-    drove fewer than `n_drives` counts as pruned; its user attributes have both.
+    `evaluate` maps the numbers of a batch to (value, drives it is the mean of) of each. A trial of
+    fewer drives than `n_drives` counts as pruned; its user attributes have both.
     """
     space: dict[str, optuna.distributions.BaseDistribution] = {
         name: optuna.distributions.FloatDistribution(*limits, log=True)
@@ -161,7 +154,7 @@ def run_search(
             bar.update(shown, completed=len(done), description=_format_best(study))
 
 
-def _list_finished(study: "optuna.Study", task: Question) -> list[FrozenTrial]:
+def _list_finished(study: "optuna.Study", task: _Question) -> list[FrozenTrial]:
     states = (TrialState.COMPLETE, TrialState.PRUNED)
     done = study.get_trials(deepcopy=False, states=states)
     if len(study.directions) != 1 or any(set(t.params) != set(task.search) for t in done):
@@ -170,7 +163,7 @@ def _list_finished(study: "optuna.Study", task: Question) -> list[FrozenTrial]:
 
 
 def _make_sampler(name: str, seed: int, size: int) -> "optuna.samplers.BaseSampler":
-    """CMA-ES has no use for a single number."""
+    """Make a sampler; TPE for a single number, which CMA-ES cannot search."""
     if name not in SAMPLERS:
         raise ValueError(f"unknown sampler {name!r}; known: {', '.join(SAMPLERS)}")
     if name == "tpe" or size == 1:
@@ -180,7 +173,7 @@ def _make_sampler(name: str, seed: int, size: int) -> "optuna.samplers.BaseSampl
 
 @contextlib.contextmanager
 def _silence_optuna() -> Iterator[None]:
-    """Without Optuna's log and its warnings of what is experimental."""
+    """Mute Optuna's log and its warnings about experimental parts."""
     before = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     try:
@@ -193,7 +186,7 @@ def _silence_optuna() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _convert_storage_errors(storage: str, *others: type[Exception]) -> Iterator[None]:
-    """ValueError, without the password, for what databases and Optuna raise."""
+    """Convert errors of databases and Optuna to ValueError, without the password."""
     kinds: tuple[type[Exception], ...] = (SQLAlchemyError, optuna.exceptions.OptunaError, *others)
     try:
         yield
@@ -231,7 +224,6 @@ def run(
 
     Raises ValueError for no trials or test seeds, and as `create_study` and `search`.
     """
-
     if trials < 1:
         raise ValueError(f"trials must be at least 1, got {trials}")
     if not 1 <= test_seeds <= task.seeds[0]:
@@ -261,7 +253,7 @@ def _make_comparisons(
     test: Sequence[LoggedEpisode],
     numbers: dict[str, float],
 ) -> list[ResultTable]:
-    """A table a scenario."""
+    """Make a table of errors before and after for each scenario."""
     default = [_compute_squares(task, drives, {}) for drives in (training, test)]
     tuned = [_compute_squares(task, drives, numbers) for drives in (training, test)]
     tables = []
@@ -286,7 +278,7 @@ def _make_comparisons(
 def _compute_squares(
     task: EstimatorTuning, drives: Sequence[LoggedEpisode], numbers: dict[str, float]
 ) -> Array:
-    """`squares`, infinite where the estimator diverges."""
+    """Compute the squared errors, infinite where the estimator diverges."""
     try:
         return compute_squares(task, drives, numbers)
     except ValueError:
@@ -302,7 +294,7 @@ def _format_spread(errors: Array) -> str:
 def make_result_table(
     numbers: Mapping[str, float], search: Mapping[str, tuple[float, float]]
 ) -> ResultTable:
-    """The numbers that were found; one at the end of its range is marked."""
+    """Make a table of the numbers that were found, marked at the end of their ranges."""
     cells = []
     for name, (low, high) in search.items():
         value = numbers[name]
@@ -315,7 +307,7 @@ def make_result_table(
 def make_entry(
     task: EstimatorTuning, numbers: dict[str, float], command: str, note: str = ""
 ) -> dict[str, Any]:
-    """The tuning that was found, as an entry of a tunings file."""
+    """Make the entry of a tunings file from the numbers that a command found."""
     used = task.options | numbers
     q = {key.removeprefix("q_"): value for key, value in used.items() if key.startswith("q_")}
     q = TUNINGS.get((task.estimator, task.sensors), {}) | q

@@ -90,7 +90,6 @@ def drawn() -> list[tuple[str, Any, str]]:
     course = {"truth": beta, "camera": seen} | lines
     return [
         ("Error of each estimator", figures.draw_bars(names, *bars), "Shorter is better."),
-        ("The same on a log axis", figures.draw_bars(names, *bars, log=True), ""),
         (
             "The sideslip angle",
             figures.draw_time_series(t, course, label, dots=["camera"]),
