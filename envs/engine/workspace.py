@@ -177,9 +177,5 @@ def get_episode_arrays(batch: BatchArrays, i: int) -> EpisodeArrays:
 def get_episode_start(starts: EpisodeStart, i: int) -> EpisodeStart:
     """The start of one of several episodes."""
     return EpisodeStart(
-        starts.params[i],
-        starts.low[i],
-        starts.high[i],
-        starts.switches[i],
-        starts.motion[i],
+        starts.params[i], starts.low[i], starts.high[i], starts.switches[i], starts.motion[i]
     )

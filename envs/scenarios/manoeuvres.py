@@ -118,11 +118,7 @@ _MANOEUVRES = (
         **_HARSH,
     ),
     Scenario(
-        name="sensor-outage",
-        camera_outage=(3.0, 6.0),
-        gps_outage=(3.0, 6.0),
-        **_SLALOM,
-        **_HARSH,
+        name="sensor-outage", camera_outage=(3.0, 6.0), gps_outage=(3.0, 6.0), **_SLALOM, **_HARSH
     ),
     Scenario(
         name="uneven-delay",

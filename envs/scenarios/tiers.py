@@ -41,11 +41,7 @@ _COMS = _DRAWN | {
     "vehicle": _COMS_PLANT,
     "nominal": _COMS_PLANT,
 }
-_CAR = _DRAWN | {
-    "speed": (60.0 * KMH, 80.0 * KMH),
-    "vehicle": _CAR_PLANT,
-    "nominal": _CAR_PLANT,
-}
+_CAR = _DRAWN | {"speed": (60.0 * KMH, 80.0 * KMH), "vehicle": _CAR_PLANT, "nominal": _CAR_PLANT}
 
 RANDOM: dict[str, Any] = {
     "steering": "random",
@@ -168,11 +164,7 @@ _TWO_C = _make_scenarios(
 
 # Not scored, but mapped over where it starts: the driver does not steer, the car is caught or lost.
 _RECOVERY = Scenario(
-    name="recovery",
-    duration=5.0,
-    initial_beta=(0.05, 0.25),
-    initial_gamma=(-0.5, 0.5),
-    **_COMS,
+    name="recovery", duration=5.0, initial_beta=(0.05, 0.25), initial_gamma=(-0.5, 0.5), **_COMS
 )
 
 # Not scored either: what is drawn where a driver swerves around others, on `sideslip/Highway-v0`.
