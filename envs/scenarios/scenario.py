@@ -1,7 +1,4 @@
-"""What a scenario's fields may be; a value out of place is refused by its field's name.
-
-A manoeuvre is data: named, frozen, JSON-able.
-"""
+"""`Scenario`: a manoeuvre as a frozen dataclass, with the checks of its fields."""
 
 import dataclasses
 import math
@@ -25,49 +22,31 @@ from .road import PATHS, ROADS
 from .steering import STEERING_KINDS
 
 Fields = Mapping[str, Any]
-
-MAX_SLIP = 1.5  # rad: a start beyond it has no speed along the car
+_MAX_SLIP = 1.5  # rad: a start beyond it has no speed along the car
 MIN_GPS_PERIOD = 0.05  # s; an env keeps room for its packets
-MAX_SAMPLES = 1_000_000  # of a trace
-SIDES = ("side", "wind_side")  # drawn, but no fields
-
-TIER_NAMES = ("", "1", "2a", "2b", "2c")
-
+_MAX_SAMPLES = 1_000_000  # of a trace
+_SIDES = ("side", "wind_side")  # drawn, but no fields
+_TIER_NAMES = ("", "1", "2a", "2b", "2c")
 _CHOICES = {
-    "steering": STEERING_KINDS,
-    "path": PATHS,
-    "road": ROADS,
-    "hdop_law": HDOP_LAWS,
-    "tyres": TYRE_LAWS,
-    "tier": TIER_NAMES,
-}
+    "steering": STEERING_KINDS, "path": PATHS, "road": ROADS, "hdop_law": HDOP_LAWS,
+    "tyres": TYRE_LAWS, "tier": _TIER_NAMES,
+}  # fmt: skip
 _PARAMETERS = [entry.name for entry in dataclasses.fields(Vehicle)]
 _FLAGS = ("mirror", "small_angle", "lags", "roll")
 _NUMBERS_OR_NONE = ("acceleration", "gps_period")
 _DRAWS_OR_NONE = ("path_speed", "friction_right", "tyre_change_time")
 _MAY_BE_INFINITE = ("half_width", "camera_heading", "camera_offset")
 _TIMES_OR_NONE = {  # how many
-    "camera_delays": (1, 2, 3, 4),
-    "gps_delays": (1, 2, 3, 4),
-    "camera_outage": (2,),
-    "gps_outage": (2,),
-}
+    "camera_delays": (1, 2, 3, 4), "gps_delays": (1, 2, 3, 4),
+    "camera_outage": (2,), "gps_outage": (2,),
+}  # fmt: skip
 
 
-def check_fields(fields: Fields, entries: Sequence[dataclasses.Field[Any]]) -> None:
-    """Check the fields of a scenario; messages have its name and the field's.
-
-    What is plausible above zero alone must be positive.
-
-    Args:
-        fields: Values by the names of fields.
-        entries: Fields of the dataclass; those of type float are one number, neither drawn nor
-            None.
-
-    Raises:
-        type: ValueError for a field out of place, TypeError for an unknown vehicle parameter.
-    """
+def _check_fields(fields: Fields, entries: Sequence[dataclasses.Field[Any]]) -> None:
+    """Check a scenario's values by field; errors name scenario and field."""
+    # a field of type float is one number, neither drawn nor None
     numbers = [spec.name for spec in entries if spec.type is float]
+    # what is plausible above zero alone must be positive
     positive = {spec.name for spec in entries if spec.metadata.get("plausible", (0,))[0] > 0}
     try:
         _check_names(fields)
@@ -82,6 +61,7 @@ def check_fields(fields: Fields, entries: Sequence[dataclasses.Field[Any]]) -> N
 
 
 def _check_names(fields: Fields) -> None:
+    """Check names, choices, flags, and that steering, path and road fit."""
     if not isinstance(fields["name"], str):
         raise ValueError("name is no text")
     for what, known in _CHOICES.items():
@@ -89,25 +69,25 @@ def _check_names(fields: Fields) -> None:
     for name in _FLAGS:
         if not isinstance(fields[name], bool):
             raise ValueError(f"{name} is True or False, got {short_repr(fields[name])}")
-    if fields["path"] != "road" and fields["steering"] != "driver":
-        raise ValueError(
-            f"path {fields['path']!r} needs the steering 'driver', got {fields['steering']!r}"
-        )
-    if fields["road"] == "nominal-path" and fields["steering"] == "driver":
+    path, road, steering = fields["path"], fields["road"], fields["steering"]
+    if path != "road" and steering != "driver":
+        raise ValueError(f"path {path!r} needs the steering 'driver', got {steering!r}")
+    if road == "nominal-path" and steering == "driver":
         raise ValueError("road 'nominal-path' follows a programme's steering, not a driver's")
-    if fields["road"] == "nominal-path" and get_range(fields["curvature"]) != (0.0, 0.0):
+    if road == "nominal-path" and get_range(fields["curvature"]) != (0.0, 0.0):
         raise ValueError(f"road 'nominal-path' has no curvature, got {fields['curvature']!r}")
-    if fields["path_speed"] is not None and fields["path"] == "road":
+    if fields["path_speed"] is not None and path == "road":
         raise ValueError("path_speed needs a track as path; a road has no lengths to scale")
 
 
 def _check_trace(fields: Fields) -> None:
+    """Check the recorded steering angles."""
     trace, steering = fields["trace"], fields["steering"]
     if not isinstance(trace, tuple) or not all(map(is_finite, trace)):
         raise ValueError(f"trace is angles in rad, finite ones, got {short_repr(trace)}")
-    if (len(trace) > 1) != (steering == "trace") or len(trace) > MAX_SAMPLES:
+    if (len(trace) > 1) != (steering == "trace") or len(trace) > _MAX_SAMPLES:
         raise ValueError(
-            f"trace has 2 to {MAX_SAMPLES} angles where the steering is 'trace', else none; got "
+            f"trace has 2 to {_MAX_SAMPLES} angles where the steering is 'trace', else none; got "
             f"{len(trace)} with {steering!r}"
         )
     if fields["trace_step"] < TICK:
@@ -115,6 +95,7 @@ def _check_trace(fields: Fields) -> None:
 
 
 def _check_mappings(fields: Fields) -> None:
+    """Check replaced vehicle parameters and noise."""
     for name in ("vehicle", "nominal", "noise"):
         values = fields[name]
         if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
@@ -134,12 +115,13 @@ def _check_number(name: str, value: Any) -> None:
 
 
 def _check_numbers(fields: Fields, numbers: Iterable[str], positive: Container[str]) -> None:
+    """Check that undrawn numbers are finite and in range."""
     for name in numbers:
         if name not in _MAY_BE_INFINITE:
             _check_number(name, fields[name])
     for name in _NUMBERS_OR_NONE:
         _check_number(name, 0.0 if fields[name] is None else fields[name])
-    width = fields["half_width"]  # only compared with: it may be as wide as a float can be
+    width = fields["half_width"]  # only compared with: any finite float will do
     if not (is_finite(width) or (isinstance(width, float) and math.isfinite(width))):
         raise ValueError(f"half_width {short_repr(width)} is not finite")
     for name in ("camera_heading", "camera_offset"):
@@ -155,8 +137,9 @@ def _check_numbers(fields: Fields, numbers: Iterable[str], positive: Container[s
 
 
 def _check_draws(fields: Fields, positive: Container[str]) -> None:
+    """Check that numbers and ranges that are drawn from are in range."""
     for name in Draws._fields:
-        if name in SIDES or (name in _DRAWS_OR_NONE and fields[name] is None):
+        if name in _SIDES or (name in _DRAWS_OR_NONE and fields[name] is None):
             continue
         value = fields[name]
         ends = value if isinstance(value, tuple) else (value, value)
@@ -166,10 +149,9 @@ def _check_draws(fields: Fields, positive: Container[str]) -> None:
             none_text = " or None" if name in _DRAWS_OR_NONE else ""
             raise ValueError(f"{name} must be positive{none_text}, got {value!r}")
     for name in ("front_change", "rear_change"):
-        if fields["tyre_change_time"] is None and get_range(fields[name]) != (1.0, 1.0):
-            raise ValueError(
-                f"{name} {fields[name]!r} needs a tyre_change_time, from which it acts"
-            )
+        value = fields[name]
+        if fields["tyre_change_time"] is None and get_range(value) != (1.0, 1.0):
+            raise ValueError(f"{name} {value!r} needs a tyre_change_time, from which it acts")
     steering, hold = fields["steering"], fields["hold"]
     if steering in ("ramp", "sweep", "wander") and get_range(hold)[0] < TICK:
         raise ValueError(f"hold of a {steering} is 1 ms or more, got {hold!r}")
@@ -178,6 +160,7 @@ def _check_draws(fields: Fields, positive: Container[str]) -> None:
 
 
 def _check_motion(fields: Fields) -> None:
+    """Check speed, road slope and start."""
     min_speed = get_range(fields["speed"])[0]
     if min_speed < 0.0 or min_speed + fields["speed_change"] < 0.0:
         raise ValueError("speed must not be negative, with speed_change or without")
@@ -191,28 +174,27 @@ def _check_motion(fields: Fields) -> None:
     if max(map(abs, (*get_range(bank), grade))) > 0.5:
         raise ValueError(f"bank and grade are up to 0.5 rad, got {bank!r}, {grade!r}")
     beta = fields["initial_beta"]
-    if max(map(abs, get_range(beta))) > MAX_SLIP:
-        raise ValueError(f"initial_beta is up to {MAX_SLIP} rad, got {beta!r}")
+    if max(map(abs, get_range(beta))) > _MAX_SLIP:
+        raise ValueError(f"initial_beta is up to {_MAX_SLIP} rad, got {beta!r}")
 
 
 def _check_sensors(fields: Fields) -> None:
+    """Check clocks, delays and losses of the slow sensors."""
     if not 0.0 <= fields["hdop_spread"] <= 1.0:
         raise ValueError(f"hdop_spread is 0 to 1, got {fields['hdop_spread']!r}")
     for name, counts in _TIMES_OR_NONE.items():
         value = fields[name]
         fits = isinstance(value, tuple) and len(value) in counts and all(map(is_finite, value))
         if value is not None and not (fits and min(value) >= 0.0):
-            count_text = " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))
-            raise ValueError(
-                f"{name} is {count_text} times in s, zero or more, got {short_repr(value)}"
-            )
+            number = " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))
+            got = short_repr(value)
+            raise ValueError(f"{name} is {number} times in s, zero or more, got {got}")
     period = fields["gps_period"]
     if period is not None and not period >= MIN_GPS_PERIOD:
         raise ValueError(f"gps_period is {MIN_GPS_PERIOD} s or more, got {period!r}")
-    if get_range(fields["gps_latency"])[0] < 0.0:
-        raise ValueError(f"gps_latency is zero or more, got {fields['gps_latency']!r}")
-    if fields["camera_jitter"] < 0.0:
-        raise ValueError(f"camera_jitter is zero or more, got {fields['camera_jitter']!r}")
+    for name in ("gps_latency", "camera_jitter"):
+        if get_range(fields[name])[0] < 0.0:
+            raise ValueError(f"{name} is zero or more, got {fields[name]!r}")
     if not 0.0 <= fields["camera_loss"] < 1.0:
         raise ValueError(f"camera_loss is a probability below 1, got {fields['camera_loss']!r}")
     if fields["camera_jitter"] and fields["camera_delays"] is None:
@@ -312,7 +294,7 @@ class Scenario:
         tyres: Tyre law, of `TYRE_LAWS`.
         lags: Whether motors and steering have lags.
         roll: Whether the body rolls.
-        tier: Tier in whose score the scenario may stand, of `TIER_NAMES`; "" for none.
+        tier: Tier in whose score the scenario may stand, of `_TIER_NAMES`; "" for none.
         vehicle: Parameters that replace those of the env's vehicle.
         nominal: Parameters that replace those of the env's nominal vehicle.
         noise: Numbers that replace the default `Noise`.
@@ -399,7 +381,7 @@ class Scenario:
             value = getattr(self, entry.name)
             if isinstance(value, list):
                 object.__setattr__(self, entry.name, tuple(value))
-        check_fields(vars(self), dataclasses.fields(self))
+        _check_fields(vars(self), dataclasses.fields(self))
 
     def range(self, name: str) -> tuple[float, float]:
         """Get the ends of a drawn quantity; zeros where it is None.
@@ -420,7 +402,7 @@ class Scenario:
         """
         low, high = np.empty(DRAWS_WIDTH), np.empty(DRAWS_WIDTH)
         for i, name in enumerate(Draws._fields):
-            if name in SIDES:
+            if name in _SIDES:
                 low[i], high[i] = (0.0, 1.0) if self.mirror else (1.0, 1.0)
             else:
                 low[i], high[i] = self.range(name)
@@ -459,9 +441,8 @@ class Scenario:
         for entry in dataclasses.fields(self):
             value = getattr(self, entry.name)
             default = {} if entry.name in ("vehicle", "nominal", "noise") else entry.default
-            if value != default:
-                mapping = isinstance(value, Mapping)
-                values[entry.name] = (
-                    dict(value) if mapping else list(value) if isinstance(value, tuple) else value
-                )
+            if isinstance(value, Mapping | tuple) and value != default:
+                values[entry.name] = dict(value) if isinstance(value, Mapping) else list(value)
+            elif value != default:
+                values[entry.name] = value
         return values
