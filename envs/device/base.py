@@ -49,14 +49,9 @@ def is_compile_used(is_wanted: bool, device: torch.device) -> bool:
 
 
 def parse_device_actions(
-    actions: Any,
-    count: int,
-    width: int,
-    fail: bool,
-    device: torch.device,
-    dtype: torch.dtype,
+    actions: Any, count: int, width: int, fail: bool, device: torch.device, dtype: torch.dtype,
     grad: bool,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Actions (count, width) rounded to float32 as the other engines take them; with `grad` a
     tensor's are not rounded, and have their graph.
 
@@ -84,13 +79,9 @@ def parse_device_actions(
 
 
 def read_states(
-    states: Array,
-    over: npt.NDArray[np.bool_],
-    reports: Array,
-    capacity: int,
-    device: torch.device,
+    states: Array, over: npt.NDArray[np.bool_], reports: Array, capacity: int, device: torch.device,
     dtype: torch.dtype,
-) -> tuple[TorchState, Tensor]:
+) -> tuple[TorchState, Tensor]:  # fmt: skip
     """The state on the device, and the keys (2, N), of packed states (N, STATE_WIDTH)."""
     packed = torch.as_tensor(states.T.copy())
     slow_state = read_packed(packed, capacity)
@@ -177,13 +168,9 @@ class DeviceRows:
     """
 
     def __init__(
-        self,
-        episodes: EpisodeBatch,
-        capacities: dict[int, PacketCapacity],
-        device: torch.device,
-        dtype: torch.dtype,
-        start: TorchReset | None = None,
-    ) -> None:
+        self, episodes: EpisodeBatch, capacities: dict[int, PacketCapacity], device: torch.device,
+        dtype: torch.dtype, start: TorchReset | None = None,
+    ) -> None:  # fmt: skip
         self.capacities, self._device, self._dtype = capacities, device, dtype
         self._start, self._attached = start, AttachedParameters()
         self._obs_dtype = dtype if start else torch.float32
@@ -256,26 +243,18 @@ class DeviceRows:
             return torch.as_tensor(array.transpose(*axes).copy()).to(device, dtype)
 
         state, keys = read_states(
-            episodes.states[rows],
-            episodes.over[rows],
-            episodes.reports[rows],
-            self._capacity,
-            device,
-            dtype,
-        )
+            episodes.states[rows], episodes.over[rows], episodes.reports[rows], self._capacity,
+            device, dtype,
+        )  # fmt: skip
         packets = np.zeros((len(rows), self._packets, PACKET_WIDTH))
         width = min(self._packets, episodes.packets.shape[1])
         packets[:, :width] = episodes.packets[rows, :width]
         no_rows = torch.zeros(len(rows), dtype=torch.bool, device=device)
         outcome = StepOutcome(
             torch.as_tensor(episodes.obs[rows]).to(device, self._obs_dtype),
-            torch.zeros(len(rows), dtype=dtype, device=device),
-            no_rows,
-            no_rows,
-            no_rows,
-            to_device(episodes.rows[rows], 1, 2, 0),
-            to_device(packets, 1, 2, 0),
+            torch.zeros(len(rows), dtype=dtype, device=device), no_rows, no_rows, no_rows,
+            to_device(episodes.rows[rows], 1, 2, 0), to_device(packets, 1, 2, 0),
             torch.as_tensor(episodes.ticks_done[rows]).to(device),
             torch.as_tensor(episodes.delivered[rows]).to(device),
-        )
+        )  # fmt: skip
         return to_device(episodes.params[rows], 1, 0), keys, state, outcome

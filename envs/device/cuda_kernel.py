@@ -104,16 +104,11 @@ def make_constants(config: EnvConfig, mode: str, record: bool) -> KernelConstant
     """How an env's rows are stepped."""
     base = config.base
     return KernelConstants(
-        mode=MODES.index(mode),
-        n=int(config.control_period),
-        kind=get_start_variant(base.start),
-        switches=Switches(*base.start.switches.tolist()),
-        width=len(base.start.params),
-        entries=len(config.layout),
-        inputs=config.action_width,
-        packets=config.max_packets,
+        mode=MODES.index(mode), n=int(config.control_period), kind=get_start_variant(base.start),
+        switches=Switches(*base.start.switches.tolist()), width=len(base.start.params),
+        entries=len(config.layout), inputs=config.action_width, packets=config.max_packets,
         record=int(record),
-    )
+    )  # fmt: skip
 
 
 class DeviceArrays(NamedTuple):
@@ -189,14 +184,9 @@ def step_row(
 ) -> None:
     """One env-step of row i; or its reset, if `resets` and it is ASKED."""
     row = EpisodeArrays(
-        m.params[:, i],
-        m.states[:, i],
-        thread_arrays.switches,
-        m.obs[i],
-        thread_arrays.rows,
-        thread_arrays.packets,
-        m.reports[:, i],
-    )
+        m.params[:, i], m.states[:, i], thread_arrays.switches, m.obs[i], thread_arrays.rows,
+        thread_arrays.packets, m.reports[:, i],
+    )  # fmt: skip
     start_index, over = 0, int(m.over[i])
     if resets:
         if over != ASKED:
@@ -234,17 +224,9 @@ def _run_row(row: Any, action: Any, constants: KernelConstants, bounds: Any, win
         return 0
     precompute_window(row.p, row.z, constants.n, constants.kind.has_driver, window)
     done = integrate_step(
-        row.p,
-        row.z,
-        constants.kind,
-        yaw_share,
-        steer_share,
-        constants.n,
-        row.rows,
-        row.report,
-        window,
-        True,
-    )
+        row.p, row.z, constants.kind, yaw_share, steer_share, constants.n, row.rows, row.report,
+        window, True,
+    )  # fmt: skip
     finish_step(row, constants.n, done, bounds, window)
     return int(done)
 

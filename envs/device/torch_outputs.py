@@ -217,13 +217,9 @@ class Observer:
     """
 
     def __init__(
-        self,
-        sensors: tuple[int, ...],
-        switches: Switches,
-        bounds: Tensor,
-        dtype: torch.dtype,
+        self, sensors: tuple[int, ...], switches: Switches, bounds: Tensor, dtype: torch.dtype,
         obs_dtype: torch.dtype,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._obs_dtype = obs_dtype
         self._sensors, self._switches = sensors, switches
         self._bounds = bounds[:, :, None]

@@ -71,17 +71,10 @@ class TorchStep:
     """
 
     def __init__(
-        self,
-        kind: StepVariant,
-        n: int,
-        capacities: dict[int, PacketCapacity],
-        switches: Switches,
-        bounds: Array,
-        dtype: torch.dtype,
-        obs_dtype: torch.dtype,
-        device: torch.device,
+        self, kind: StepVariant, n: int, capacities: dict[int, PacketCapacity], switches: Switches,
+        bounds: Array, dtype: torch.dtype, obs_dtype: torch.dtype, device: torch.device,
         compile: bool,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.kind, self.n, self.dtype = kind, n, dtype
         self._ticks = Ticks(kind, dtype, compile)
         self._slow = SlowSensors(capacities, kind.small_angle, dtype)
@@ -106,13 +99,8 @@ class TorchStep:
         steer_share = steer_shares[0] if steer_shares else torch.zeros_like(state.tick)
         running = is_finite & ~state.over
         start_fields = (
-            state.motion,
-            state.drive,
-            state.driver,
-            state.refs,
-            state.nominal_motion,
-            state.tick,
-        )
+            state.motion, state.drive, state.driver, state.refs, state.nominal_motion, state.tick,
+        )  # fmt: skip
         start = make_tick_state(*start_fields, running)
         tick_state, rows, track = self._ticks.integrate_step(
             p, keys, start, yaw_share, steer_share, self.n
@@ -126,16 +114,9 @@ class TorchStep:
         return next_state, outcome
 
     def _finish_step(
-        self,
-        p: Tensor,
-        keys: Tensor,
-        state: TorchState,
-        tick_state: TickState,
-        rows: Tensor,
-        track: Tensor,
-        running: Tensor,
-        refused: Tensor,
-    ) -> tuple[TorchState, StepOutcome]:
+        self, p: Tensor, keys: Tensor, state: TorchState, tick_state: TickState, rows: Tensor,
+        track: Tensor, running: Tensor, refused: Tensor,
+    ) -> tuple[TorchState, StepOutcome]:  # fmt: skip
         done, duration = tick_state.tick - state.tick, p[P.task.duration]
         window = TickWindow(state.tick, tick_state.tick, running, track)
         slow_state, delivered = self._slow(p, keys, state.slow_state, window)
@@ -151,29 +132,15 @@ class TorchStep:
         terminated = stepped & (failure != RUNNING)
         truncated = running & (report[REPORT.ended] == 1.0) & ~terminated
         next_state = TorchState(
-            torch.stack(tick_state.motion),
-            torch.stack(tick_state.drive),
-            tick_state.driver,
-            torch.stack(tick_state.refs),
-            torch.stack(tick_state.nominal_motion),
-            tick_state.tick,
-            failure,
-            *slow_state,
-            terminated | truncated,
-            report,
-        )
+            torch.stack(tick_state.motion), torch.stack(tick_state.drive), tick_state.driver,
+            torch.stack(tick_state.refs), torch.stack(tick_state.nominal_motion), tick_state.tick,
+            failure, *slow_state, terminated | truncated, report,
+        )  # fmt: skip
         rewards = torch.where(stepped, -report[REPORT.cost], 0.0)
         return next_state, StepOutcome(
-            obs,
-            rewards,
-            terminated,
-            truncated,
-            refused,
-            rows,
-            delivered.packets,
-            done.to(torch.int64),
-            delivered.number,
-        )
+            obs, rewards, terminated, truncated, refused, rows, delivered.packets,
+            done.to(torch.int64), delivered.number,
+        )  # fmt: skip
 
 
 class TorchReset:
@@ -220,14 +187,9 @@ class TorchReset:
             self._draw_normals(keys[0], keys[1], 0, c) for c in (CHANNELS.inertial, CHANNELS.wheels)
         ]
         row = self._compute_first_row(
-            motion,
-            steer,
-            params.road,
-            params.car.d_f,
-            params.noise,
-            NormalDraws(*n),
+            motion, steer, params.road, params.car.d_f, params.noise, NormalDraws(*n),
             kind.small_angle,
-        )
+        )  # fmt: skip
         row = [zero + number for number in row]
         v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
         refs = torch.stack(self._compute_reference(steer, v, params.target, kind.reference))

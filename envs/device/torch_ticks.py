@@ -85,14 +85,9 @@ class Ticks:
         return inertial + wheels, self._compute_steering(ticks.to(self._dtype), profile)
 
     def _step_tick(
-        self,
-        p: Tensor,
-        yaw_share: Tensor,
-        steer_share: Tensor,
-        tick_state: TickState,
-        draws: Numbers,
-        next_steer: Any,
-    ) -> TickState:
+        self, p: Tensor, yaw_share: Tensor, steer_share: Tensor, tick_state: TickState,
+        draws: Numbers, next_steer: Any,
+    ) -> TickState:  # fmt: skip
         """One tick of the rows that are alive.
 
         p: (PARAMS_WIDTH, N). share, turn: (N,), of the yaw moment and the added steering.
@@ -113,15 +108,9 @@ class Ticks:
             motion, drive, None, tick_state.driver, car, tick_state.refs, nominal_motion
         )
         next_state, measured = self._integrate_tick(
-            params,
-            yaw_share * task.yaw_scale,
-            steer_share * task.authority,
-            state,
-            tick_state.tick,
-            NormalDraws(draws[:4], draws[4:]),
-            next_steer,
-            self.kind,
-        )
+            params, yaw_share * task.yaw_scale, steer_share * task.authority, state,
+            tick_state.tick, NormalDraws(draws[:4], draws[4:]), next_steer, self.kind,
+        )  # fmt: skip
         alive, is_fit = tick_state.alive, tick_state.alive & ~measured.lost
         tick = tick_state.tick + alive
         tick_cost = self._compute_tick_cost(
@@ -155,14 +144,9 @@ class Ticks:
         )
 
     def integrate_step(
-        self,
-        p: Tensor,
-        keys: Tensor,
-        start: TickState,
-        yaw_share: Tensor,
-        steer_share: Tensor,
+        self, p: Tensor, keys: Tensor, start: TickState, yaw_share: Tensor, steer_share: Tensor,
         n: int,
-    ) -> tuple[TickState, Tensor, Tensor]:
+    ) -> tuple[TickState, Tensor, Tensor]:  # fmt: skip
         """n ticks, fewer for rows that fail or end: (where they are then, the fast rows, the
         motions), of the latter (n, width, N); a row's last ones stand for those it does not have.
         """
@@ -171,43 +155,24 @@ class Ticks:
         for j in range(n):
             draws = tuple(normals_of[j] for normals_of in all_draws)
             tick_state = self.tick(
-                p,
-                yaw_share,
-                steer_share,
-                tick_state,
-                draws,
+                p, yaw_share, steer_share, tick_state, draws,
                 None if steering is None else steering[j],
-            )
+            )  # fmt: skip
             rows.append(torch.stack(tick_state.row))
             track.append(torch.stack(tick_state.track))
         return tick_state, torch.stack(rows), torch.stack(track)
 
 
 def make_tick_state(
-    motion: Tensor,
-    drive: Tensor,
-    driver: Tensor,
-    refs: Tensor,
-    nominal_motion: Tensor,
-    tick: Tensor,
-    alive: Tensor,
-) -> TickState:
+    motion: Tensor, drive: Tensor, driver: Tensor, refs: Tensor, nominal_motion: Tensor,
+    tick: Tensor, alive: Tensor,
+) -> TickState:  # fmt: skip
     """Where rows are at the start of an env-step."""
     zeros = tick.new_zeros((2 + len(InfoValues._fields) + FAST_WIDTH, len(tick)))
     failure, cost, *numbers = zeros.unbind(0)
     info_values, row = numbers[: len(InfoValues._fields)], numbers[len(InfoValues._fields) :]
     # no tensor stands twice: torch.compile would compile the first tick and the others apart
     return TickState(
-        alive,
-        motion.unbind(0),
-        drive.unbind(0),
-        driver,
-        refs.unbind(0),
-        nominal_motion.unbind(0),
-        tick,
-        failure,
-        cost,
-        tuple(info_values),
-        tuple(row),
-        motion.unbind(0),
-    )
+        alive, motion.unbind(0), drive.unbind(0), driver, refs.unbind(0), nominal_motion.unbind(0),
+        tick, failure, cost, tuple(info_values), tuple(row), motion.unbind(0),
+    )  # fmt: skip
