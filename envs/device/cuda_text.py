@@ -1,9 +1,8 @@
 # numba's own types say too little about itself:
 # mypy: disable-error-code="attr-defined,call-arg,misc,no-untyped-call,no-untyped-def"
-"""The engine's text as device functions: CUDA's table of primitives, and literals of one precision.
+"""The engine's functions as CUDA device functions, rebuilt from the code of the other engines.
 
-numba-cuda compiles plain Python functions; those of the engine are rebuilt for it from the code
-objects that every other engine runs.
+CUDA has its own primitives, and literals are of one precision.
 """
 
 from collections.abc import Callable
@@ -25,9 +24,14 @@ SIMULATED = bool(cuda.config.ENABLE_CUDASIM)
 
 
 def to_cuda(function: Any, real: type[np.floating[Any]]) -> Any:
-    """The text of a function and its callees as device functions whose floats are of `real`.
+    """Rebuild a function and its callees as device functions; plain Python in the simulator.
 
-    In numba's simulator they stay plain Python.
+    Args:
+        function: Function of the engine.
+        real: Type of all floats.
+
+    Returns:
+        The function.
     """
 
     def finish(rebuilt: Any) -> Any:
@@ -48,8 +52,7 @@ _SINGLE: dict[str, Callable[..., Any]] = {
 
 
 def _set_precision(function: Any, real: Any) -> None:
-    """Give the function's literals and global numbers a precision: what meets a float64 becomes
-    one."""
+    """Give the function's literals and global numbers a precision, so that no float64 enters."""
     names, code = function.__globals__, function.__code__
     function.__code__ = code.replace(co_consts=_convert_literals(code.co_consts, real))
     for name in code.co_names:
@@ -58,10 +61,11 @@ def _set_precision(function: Any, real: Any) -> None:
 
 
 def _convert_literals(value: Any, real: Any) -> Any:
+    """Convert the floats of a value and of nested tuples."""
     if isinstance(value, float):
         return real(value)
     if isinstance(value, tuple) and not isinstance(value, CodeType):
-        make = getattr(value, "_make", tuple)
+        make = getattr(value, "_make", tuple)  # of a named tuple
         return make([_convert_literals(item, real) for item in value])
     return value
 
@@ -71,7 +75,7 @@ def _compile_device(function: Any) -> Any:
 
 
 def _make_table(real: Any) -> dict[str, Callable[..., Any]]:
-    """The primitives that CUDA has its own text for, by the names that the equations use."""
+    """Make CUDA's own primitives by the names that the equations use."""
     from numba.cuda import libdevice
 
     single = real is np.float32
@@ -104,7 +108,7 @@ def _make_table(real: Any) -> dict[str, Callable[..., Any]]:
 
 
 def _register_access() -> dict[str, Callable[..., Any]]:
-    """How packed arrays are read and written, taught to numba-cuda once."""
+    """Register numba-cuda's versions of reading and writing packed arrays, once."""
     if not _registered:
         from numba.cuda.extending import overload
 
@@ -128,7 +132,7 @@ def _format_column(j: Any) -> str:
 
 
 def _build_function(text: str, **names: Any) -> Any:
-    exec(text, names)  # of our own words alone
+    exec(text, names)  # the text is made here alone
     return names["written"]
 
 

@@ -1,8 +1,6 @@
-"""The ticks of an env-step on tensors: the text of `integrate_tick` for all rows, each frozen where
-its episode ends.
+"""The ticks of an env-step on tensors: `integrate_tick` for all rows, each frozen at its end.
 
-A row that fails or whose time is over stands still from then on while the others drive on: nothing
-branches on values, so the device never waits for the host.
+Nothing branches on values, so the device never waits for the host.
 """
 
 from typing import Any, NamedTuple
@@ -37,7 +35,7 @@ class InfoValues(NamedTuple):
 
 
 class TickState(NamedTuple):
-    """Where the rows are within an env-step; (N,) each, or tuples of such."""
+    """State of the rows within an env-step; (N,) each, or tuples of such."""
 
     alive: Tensor  # not frozen yet
     motion: Numbers
@@ -54,8 +52,13 @@ class TickState(NamedTuple):
 
 
 class Ticks:
-    """The ticks of rows of one kind. compile: a tick, and the chances of all ticks, are one call of
-    `torch.compile` each."""
+    """Ticks of rows of one variant.
+
+    Args:
+        kind: Variant of the ticks.
+        dtype: Type of floats.
+        compile: Whether a tick, and the window of all ticks, go through `torch.compile`.
+    """
 
     def __init__(self, kind: StepVariant, dtype: torch.dtype, compile: bool) -> None:
         self.kind = kind
@@ -74,7 +77,7 @@ class Ticks:
     def _precompute_window(
         self, p: Tensor, keys: Tensor, first: Tensor, n: int
     ) -> tuple[Numbers, Any]:
-        """(eight normal numbers, the programme's steering) of n ticks from `first` on, (n, N)."""
+        """Compute (eight normal numbers, profile's steering) of n ticks from `first` on, (n, N)."""
         ticks = first + torch.arange(n, device=first.device)[:, None]
         tick_numbers = ticks.to(torch.int64)
         inertial = self._draw_normals(keys[0], keys[1], tick_numbers, CHANNELS.inertial)
@@ -88,22 +91,16 @@ class Ticks:
         self, p: Tensor, yaw_share: Tensor, steer_share: Tensor, tick_state: TickState,
         draws: Numbers, next_steer: Any,
     ) -> TickState:  # fmt: skip
-        """One tick of the rows that are alive.
-
-        p: (PARAMS_WIDTH, N). share, turn: (N,), of the yaw moment and the added steering.
-        """
+        """Step the rows that are alive by a tick; p is (PARAMS_WIDTH, N), the shares (N,)."""
         pick = self._select
         params = self._make_step_params(p)
         task = params.task
         car = self._apply_tyre_change(
             params.car, params.tyre_change, tick_state.tick > params.tyre_change.tick
         )
-        # the load at the tick's start is computed anew where `anywhere` holds, and here it does
-        motion, drive, nominal_motion = (
-            Motion(*tick_state.motion),
-            ActuatorState(*tick_state.drive),
-            NominalMotion(*tick_state.nominal_motion),
-        )
+        motion, drive = Motion(*tick_state.motion), ActuatorState(*tick_state.drive)
+        nominal_motion = NominalMotion(*tick_state.nominal_motion)
+        # the load at the tick's start is None: on tensors `any_lane` holds, and it is computed anew
         state = StepState(
             motion, drive, None, tick_state.driver, car, tick_state.refs, nominal_motion
         )
@@ -118,12 +115,8 @@ class Ticks:
         )
         failure = self._select_failure(measured.lost, tick_cost.spun, tick_cost.off)
         refs = [pick(measured.lost, 0.0, ref) for ref in measured.refs]
-        info_values = (
-            pick(measured.lost, 0.0, tick_cost.beta),
-            *refs,
-            measured.steer,
-            measured.moment,
-        )
+        beta = pick(measured.lost, 0.0, tick_cost.beta)
+        info_values = (beta, *refs, measured.steer, measured.moment)
 
         def select_rows(where: Tensor, new: Any, old: Any) -> Numbers:
             return tuple(pick(where, a, b) for a, b in zip(new, old, strict=True))
@@ -147,17 +140,25 @@ class Ticks:
         self, p: Tensor, keys: Tensor, start: TickState, yaw_share: Tensor, steer_share: Tensor,
         n: int,
     ) -> tuple[TickState, Tensor, Tensor]:  # fmt: skip
-        """n ticks, fewer for rows that fail or end: (where they are then, the fast rows, the
-        motions), of the latter (n, width, N); a row's last ones stand for those it does not have.
+        """Integrate n ticks, fewer for rows that fail or end.
+
+        Args:
+            p: Packed parameters, shape (PARAMS_WIDTH, N).
+            keys: Keys of the episodes, shape (2, N).
+            start: State at the start.
+            yaw_share: Yaw moment as a fraction of full scale, shape (N,).
+            steer_share: Added steering as a fraction of full scale, shape (N,).
+            n: Number of ticks.
+
+        Returns:
+            State, fast rows and motions (n, width, N); a row's last ones are repeated.
         """
         all_draws, steering = self.precompute_window(p, keys, start.tick + 1, n)
         tick_state, rows, track = start, [], []
         for j in range(n):
             draws = tuple(normals_of[j] for normals_of in all_draws)
-            tick_state = self.tick(
-                p, yaw_share, steer_share, tick_state, draws,
-                None if steering is None else steering[j],
-            )  # fmt: skip
+            angle = None if steering is None else steering[j]
+            tick_state = self.tick(p, yaw_share, steer_share, tick_state, draws, angle)
             rows.append(torch.stack(tick_state.row))
             track.append(torch.stack(tick_state.track))
         return tick_state, torch.stack(rows), torch.stack(track)
@@ -167,7 +168,7 @@ def make_tick_state(
     motion: Tensor, drive: Tensor, driver: Tensor, refs: Tensor, nominal_motion: Tensor,
     tick: Tensor, alive: Tensor,
 ) -> TickState:  # fmt: skip
-    """Where rows are at the start of an env-step."""
+    """Make the state of rows at the start of an env-step, from tensors (..., N)."""
     zeros = tick.new_zeros((2 + len(InfoValues._fields) + FAST_WIDTH, len(tick)))
     failure, cost, *numbers = zeros.unbind(0)
     info_values, row = numbers[: len(InfoValues._fields)], numbers[len(InfoValues._fields) :]
