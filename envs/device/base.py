@@ -66,15 +66,13 @@ def parse_device_actions(
         rounded: Tensor = torch.as_tensor(parse_actions(actions, count, width, fail))
         return rounded.to(device, dtype)
     if actions.device != device:
-        raise ValueError(
-            f"actions are on {actions.device}, the env on {device}; nothing was stepped"
-        )
+        places = f"on {actions.device}, the env on {device}"
+        raise ValueError(f"actions are {places}; nothing was stepped")
     if actions.shape != (count, width):
         if not fail:
-            raise ValueError(
-                f"actions have shape ({count}, {width}), got {tuple(actions.shape)}; "
-                "nothing was stepped"
-            )
+            got = tuple(actions.shape)
+            rule = f"actions have shape ({count}, {width})"
+            raise ValueError(f"{rule}, got {got}; nothing was stepped")
         actions = torch.full((count, width), torch.nan, device=device)
     if not grad:
         actions = actions.detach().to(torch.float32)
@@ -192,13 +190,7 @@ class DeviceRows:
     def upload(
         self, episodes: EpisodeBatch, rows: IntArray, inputs: ResetTensors = NO_TENSORS
     ) -> None:
-        """Copy rows that were reset to the device.
-
-        Args:
-            episodes: Episodes on the host.
-            rows: Indices of the rows, shape (M,).
-            inputs: The reset's tensors.
-        """
+        """Copy rows (M,) that were reset to the device, with the reset's tensors."""
         params, keys, state, outcome = self._read_rows(episodes, rows)
         row_index = torch.as_tensor(rows, device=self._device)
         if self._start is None:

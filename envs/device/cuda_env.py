@@ -186,10 +186,8 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
             raise ResetNeeded("no episode was started: call reset() first")
         memory = self._memory
         if self._mode == AutoresetMode.DISABLED and (memory.over != RUNS).any():
-            raise ResetNeeded(
-                f"the episode is over in {format_rows(memory.over.nonzero()[:, 0].tolist())}: "
-                "call reset() with a reset_mask"
-            )
+            over = format_rows(memory.over.nonzero()[:, 0].tolist())
+            raise ResetNeeded(f"the episode is over in {over}: call reset() with a reset_mask")
         sizes = make_specification(self._constants, self._real, self.num_envs, 1)
         new_arrays = {name: self._allocate(*getattr(sizes, name)) for name in _NEW_ARRAYS[1:]}
         self._memory = memory = memory._replace(actions=self._parse_actions(actions), **new_arrays)
@@ -260,8 +258,7 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
     def set_state(self, snapshot: Snapshot) -> None:
         """Restore a snapshot of this env, or of one built with the same arguments.
 
-        Args:
-            snapshot: Return value of `get_state`; ValueError for one of other rows, plant or dtype.
+        Raises ValueError for one of other rows, another dtype, plant, sensors or records.
         """
         if not isinstance(snapshot, Snapshot):
             raise ValueError(f"a snapshot of this engine is a Snapshot, got {short_repr(snapshot)}")

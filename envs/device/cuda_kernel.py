@@ -96,16 +96,7 @@ class KernelConstants(NamedTuple):
 
 
 def make_constants(config: EnvConfig, mode: str, record: bool) -> KernelConstants:
-    """Make the kernel's constants from an env's config.
-
-    Args:
-        config: Config of the env.
-        mode: Autoreset mode, of `MODES`.
-        record: Whether records are written.
-
-    Returns:
-        The constants.
-    """
+    """Make the kernel's constants from an env's config, autoreset mode and whether it records."""
     base = config.base
     return KernelConstants(
         mode=MODES.index(mode), n=int(config.control_period), kind=get_start_variant(base.start),
@@ -153,26 +144,17 @@ def make_specification(constants: KernelConstants, real: type, N: int, starts: i
     width, byte, report = constants.width + sum(_DRAWN), np.uint8, len(REPORT)
     ends, n_record = N * (constants.mode == SAME_STEP), N * constants.record
     return DeviceArrays(
-        params=(real, (constants.width, N)),
-        states=(real, (STATE_WIDTH, N)),
-        reports=(real, (report, N)),
-        over=(byte, (N,)),
-        generators=(np.int64, (WORDS, N)),
-        which=(np.int64, (N,)),
-        starts=(real, (starts, width)),
-        switches=(np.int64, (starts, len(FLAGS))),
-        bounds=(real, (2, constants.entries)),
-        actions=(np.float32, (N, constants.inputs)),
-        obs=(np.float32, (N, constants.entries)),
-        rewards=(real, (N,)),
-        terminated=(byte, (N,)),
-        truncated=(byte, (N,)),
-        final_obs=(np.float32, (ends, constants.entries)),
-        final_reports=(real, (report, ends)),
+        params=(real, (constants.width, N)), states=(real, (STATE_WIDTH, N)),
+        reports=(real, (report, N)), over=(byte, (N,)), generators=(np.int64, (WORDS, N)),
+        which=(np.int64, (N,)), starts=(real, (starts, width)),
+        switches=(np.int64, (starts, len(FLAGS))), bounds=(real, (2, constants.entries)),
+        actions=(np.float32, (N, constants.inputs)), obs=(np.float32, (N, constants.entries)),
+        rewards=(real, (N,)), terminated=(byte, (N,)), truncated=(byte, (N,)),
+        final_obs=(np.float32, (ends, constants.entries)), final_reports=(real, (report, ends)),
         rows=(real, (constants.n, FAST_WIDTH, n_record)),
         packets=(real, (constants.packets, PACKET_WIDTH, n_record)),
         counts=(np.int64, (2, n_record)),
-    )
+    )  # fmt: skip
 
 
 def pack_starts(starts: Sequence[EpisodeStart]) -> tuple[Array, npt.NDArray[np.int64]]:
@@ -276,26 +258,16 @@ def make_kernel(constants: KernelConstants, real: type[np.floating[Any]]) -> Any
         if i >= N:
             return
         memory = DeviceArrays(
-            make_array(params, (width, N)),
-            make_array(states, (STATE_WIDTH, N)),
-            make_array(reports, (report, N)),
-            make_array(over, (N,)),
-            make_array(generators, (WORDS, N)),
-            make_array(which, (N,)),
-            make_array(starts, (N, packed)),
-            make_array(switches, (N, flags)),
-            make_array(bounds, (2, entries)),
-            make_array(actions, (N, inputs)),
-            make_array(obs, (N, entries)),
-            make_array(rewards, (N,)),
-            make_array(terminated, (N,)),
-            make_array(truncated, (N,)),
-            make_array(final_obs, (N, entries)),
-            make_array(final_reports, (report, N)),
-            make_array(rows, (n, FAST_WIDTH, N)),
-            make_array(packets, (max_packets, PACKET_WIDTH, N)),
-            make_array(counts, (2, N)),
-        )
+            make_array(params, (width, N)), make_array(states, (STATE_WIDTH, N)),
+            make_array(reports, (report, N)), make_array(over, (N,)),
+            make_array(generators, (WORDS, N)), make_array(which, (N,)),
+            make_array(starts, (N, packed)), make_array(switches, (N, flags)),
+            make_array(bounds, (2, entries)), make_array(actions, (N, inputs)),
+            make_array(obs, (N, entries)), make_array(rewards, (N,)), make_array(terminated, (N,)),
+            make_array(truncated, (N,)), make_array(final_obs, (N, entries)),
+            make_array(final_reports, (report, N)), make_array(rows, (n, FAST_WIDTH, N)),
+            make_array(packets, (max_packets, PACKET_WIDTH, N)), make_array(counts, (2, N)),
+        )  # fmt: skip
         if record:
             own_rows, own_packets = memory.rows[:, :, i], memory.packets[:, :, i]
         else:  # laid out like a part of the record, for one type of both

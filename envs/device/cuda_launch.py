@@ -14,6 +14,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from importlib.metadata import version
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -38,16 +39,7 @@ _Capability = tuple[int, int]  # of a GPU: (9, 0) is an H200
 def get_ptx(
     constants: KernelConstants, real: type[np.floating[Any]], capability: _Capability
 ) -> str:
-    """Get the PTX of a kernel, from the disk or compiled.
-
-    Args:
-        constants: Constants of the kernel.
-        real: Type of floats.
-        capability: Compute capability of the GPU.
-
-    Returns:
-        The text.
-    """
+    """Get a kernel's PTX for GPUs of a compute capability, from the disk or compiled."""
     folder = kernel_cache.find_kernel_folder("envs")
     versions = version("numba-cuda"), version("numba"), NVVM().get_version()
     key = json.dumps([constants, real.__name__, capability, versions])
@@ -157,13 +149,6 @@ class DriverKernel:
         return values[0] if values else None
 
 
-class _SimulatedPointer:
-    """A pointer of the simulator."""
-
-    def __init__(self, tensor: Tensor) -> None:
-        self.numbers = tensor.numpy()
-
-
 def load_kernel(
     constants: KernelConstants, real: type[np.floating[Any]], device: torch.device
 ) -> Any:
@@ -185,4 +170,5 @@ class _SimulatedKernel:
     def __call__(self, count: int, resets: bool, arrays: Sequence[Tensor]) -> None:
         """Step or reset rows as `DriverKernel` does."""
         blocks = -(-count // _SIMULATED_BLOCK)
-        self._kernel[blocks, _SIMULATED_BLOCK](count, resets, *map(_SimulatedPointer, arrays))
+        pointers = [SimpleNamespace(numbers=array.numpy()) for array in arrays]
+        self._kernel[blocks, _SIMULATED_BLOCK](count, resets, *pointers)

@@ -24,15 +24,7 @@ SIMULATED = bool(cuda.config.ENABLE_CUDASIM)
 
 
 def to_cuda(function: Any, real: type[np.floating[Any]]) -> Any:
-    """Rebuild a function and its callees as device functions; plain Python in the simulator.
-
-    Args:
-        function: Function of the engine.
-        real: Type of all floats.
-
-    Returns:
-        The function.
-    """
+    """Rebuild a function and its callees with floats of `real`, plain Python in the simulator."""
 
     def finish(rebuilt: Any) -> Any:
         if real is not np.float64:
@@ -113,12 +105,9 @@ def _register_access() -> dict[str, Callable[..., Any]]:
         from numba.cuda.extending import overload
 
         jit_options = {"forceinline": True}
-        for function, typing in (
-            (read, _read),
-            (write, _write),
-            (load_element, _load_element),
-            (store_element, _store_element),
-        ):
+        functions: list[Callable[..., Any]] = [read, write, load_element, store_element]
+        typings: list[Callable[..., Any]] = [_read, _write, _load_element, _store_element]
+        for function, typing in zip(functions, typings, strict=True):
             overload(function, jit_options=jit_options)(typing)
             _registered[function.__name__] = function
     return _registered

@@ -138,10 +138,7 @@ class AttachedParameters:
         """Put parameters (N,) of these rows (M,) in place of those that they had."""
         selected = torch.zeros(len(configs), dtype=torch.bool, device=rows.device)
         selected[rows] = True
-        remaining = [
-            (mask & ~selected, old_configs, parameters_held)
-            for mask, old_configs, parameters_held in self._held
-        ]
+        remaining = [(mask & ~selected, old, values) for mask, old, values in self._held]
         self._held = [entry for entry in remaining if entry[0].any()]
         if parameters:
             self._held.append((selected, list(configs), parameters))

@@ -133,16 +133,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
 
     @classmethod
     def make(cls, env_id: str, num_envs: int = 1, **arguments: Any) -> "DeviceVectorEnv":
-        """Make the environments of an id.
-
-        Args:
-            env_id: Registered id.
-            num_envs: Number of environments.
-            arguments: Arguments that replace the id's.
-
-        Returns:
-            The environments.
-        """
+        """Make `num_envs` environments of a registered `env_id`; `arguments` replace its own."""
         spec = gym.spec(env_id)
         if spec.vector_entry_point != "sideslip.envs.vector:StabilityVectorEnv":
             raise ValueError(f"{env_id} has no environment on the device")
@@ -214,10 +205,8 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         if not self._started:
             raise ResetNeeded("no episode was started: call reset() first")
         if self._has_over and self._mode == AutoresetMode.DISABLED:
-            over = self._rows.state.over.nonzero()[:, 0].tolist()
-            raise ResetNeeded(
-                f"the episode is over in {format_rows(over)}: call reset() with a reset_mask"
-            )
+            over = format_rows(self._rows.state.over.nonzero()[:, 0].tolist())
+            raise ResetNeeded(f"the episode is over in {over}: call reset() with a reset_mask")
         config, rows = self._host.config, self._rows
         fail = config.on_bad_action == "fail"
         commands = parse_device_actions(
@@ -300,9 +289,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
         """Restore a snapshot of this env, or of a `StabilityVectorEnv` with the same arguments.
 
-        Args:
-            snapshot: Return value of `get_state`; ValueError for one of other rows or sizes, or of
-                another kind of plant.
+        Raises ValueError for one of other rows or sizes, or of another kind of plant.
         """
         if not isinstance(snapshot, Mapping):
             raise ValueError(f"a snapshot of this engine is a mapping, got {short_repr(snapshot)}")

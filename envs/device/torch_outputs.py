@@ -66,13 +66,7 @@ def compute_capacity(links: Sequence[Link], n: int) -> PacketCapacity:
 
 
 class SlowSensors:
-    """Slow sensors of a batch.
-
-    Args:
-        capacities: Capacity of each slow sensor present, by index.
-        small_angle: 1 for the plant of small angles.
-        dtype: Type of floats.
-    """
+    """Slow sensors of a batch: those present, by index, each with its capacity."""
 
     def __init__(
         self, capacities: dict[int, PacketCapacity], small_angle: int, dtype: torch.dtype
@@ -180,15 +174,7 @@ def _remove_first(queue: Tensor, count: Tensor) -> Tensor:
 
 
 def read_packed(states: Tensor, capacity: int) -> SlowState:
-    """Read the slow sensors' part of packed states.
-
-    Args:
-        states: Packed states, shape (STATE_WIDTH, N).
-        capacity: Capacity of the queue; ValueError for a state with more packets.
-
-    Returns:
-        The part.
-    """
+    """Read the slow sensors' part of states (STATE_WIDTH, N) with at most `capacity` packets."""
     if bool((states[Z.under_way] > capacity).any()):
         raise ValueError(f"a state has more than {capacity} packets under way")
     slow = states[Z.slow[0].frames : Z.queue].reshape(len(Z.slow), SLOW_WIDTH, -1)
@@ -235,18 +221,7 @@ class Observer:
     def observe(
         self, rows: Tensor, done: Tensor, tick_state: TickState, slow: Tensor, delivered: Delivered
     ) -> Tensor:
-        """Compute the observation (N, k).
-
-        Args:
-            rows: Fast rows, shape (n, FAST_WIDTH, N).
-            done: Number of rows that count, shape (N,).
-            tick_state: State at the end.
-            slow: Slow sensors' state, as in `SlowState`.
-            delivered: Packets of the step.
-
-        Returns:
-            The observation.
-        """
+        """Compute the observation (N, k) from the first `done` (N,) of rows (n, FAST_WIDTH, N)."""
         entries: list[Tensor] = []
         sampled = rows[:, :N_SAMPLED]
         if self._switches.all_samples:
@@ -287,20 +262,13 @@ class Observer:
         cost = tick_state.cost + self._select(tick_state.failure != RUNNING, failure_cost, 0.0)
         info_values = InfoValues(*tick_state.shown)
         values = {
-            "t": tick_state.tick * TICK,
-            "beta": info_values.beta,
-            "gamma": tick_state.motion[2],
-            "psi": tick_state.motion[3],
-            "beta_ref": info_values.beta_ref,
-            "gamma_ref": info_values.gamma_ref,
-            "steer": info_values.steer,
-            "yaw_moment": info_values.moment,
-            "cost": cost,
-            "failure": tick_state.failure,
-            "packets": count.to(cost.dtype),
-            "reward": -cost,
+            "t": tick_state.tick * TICK, "beta": info_values.beta, "gamma": tick_state.motion[2],
+            "psi": tick_state.motion[3], "beta_ref": info_values.beta_ref,
+            "gamma_ref": info_values.gamma_ref, "steer": info_values.steer,
+            "yaw_moment": info_values.moment, "cost": cost, "failure": tick_state.failure,
+            "packets": count.to(cost.dtype), "reward": -cost,
             "ended": (tick_state.tick >= duration).to(cost.dtype),
-        }
+        }  # fmt: skip
         return torch.stack([values[name] for name in StepReport._fields])
 
     def report_refusal(self, tick_state: TickState, duration: Tensor, before: Tensor) -> Tensor:

@@ -147,11 +147,7 @@ class TorchStep:
 class TorchReset:
     """Tick 0 on tensors as `reset_vehicle` makes it, with gradients to motion and parameters.
 
-    A path that a driver follows stays where the reset put it.
-
-    Args:
-        step: Env-steps of the rows.
-        sensors: Slow sensors present, by index.
+    A path that a driver follows stays where the reset put it. `sensors` are those present.
     """
 
     def __init__(self, step: TorchStep, sensors: tuple[int, ...]) -> None:

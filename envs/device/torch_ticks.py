@@ -52,13 +52,7 @@ class TickState(NamedTuple):
 
 
 class Ticks:
-    """Ticks of rows of one variant.
-
-    Args:
-        kind: Variant of the ticks.
-        dtype: Type of floats.
-        compile: Whether a tick, and the window of all ticks, go through `torch.compile`.
-    """
+    """Ticks of rows of one variant; `compile`: a tick and the window go through `torch.compile`."""
 
     def __init__(self, kind: StepVariant, dtype: torch.dtype, compile: bool) -> None:
         self.kind = kind
@@ -140,18 +134,9 @@ class Ticks:
         self, p: Tensor, keys: Tensor, start: TickState, yaw_share: Tensor, steer_share: Tensor,
         n: int,
     ) -> tuple[TickState, Tensor, Tensor]:  # fmt: skip
-        """Integrate n ticks, fewer for rows that fail or end.
+        """Integrate n ticks, fewer for rows that fail or end, whose last values are repeated.
 
-        Args:
-            p: Packed parameters, shape (PARAMS_WIDTH, N).
-            keys: Keys of the episodes, shape (2, N).
-            start: State at the start.
-            yaw_share: Yaw moment as a fraction of full scale, shape (N,).
-            steer_share: Added steering as a fraction of full scale, shape (N,).
-            n: Number of ticks.
-
-        Returns:
-            State, fast rows and motions (n, width, N); a row's last ones are repeated.
+        Returns the state, and the fast rows and motions of all ticks, (n, width, N) each.
         """
         all_draws, steering = self.precompute_window(p, keys, start.tick + 1, n)
         tick_state, rows, track = start, [], []

@@ -50,16 +50,7 @@ class _LaneBuffers(NamedTuple):
 
 
 def make_lane_buffers(count: int, n: int, entries: int) -> _LaneBuffers:
-    """Make the working arrays of an env.
-
-    Args:
-        count: Number of rows.
-        n: Ticks of an env-step.
-        entries: Number of entries of an observation.
-
-    Returns:
-        The arrays.
-    """
+    """Make the working arrays of an env of `count` rows, n ticks a step and `entries` observed."""
     return _LaneBuffers(
         np.arange(count), np.zeros(LANES, np.int64), np.zeros((PARAMS_WIDTH, LANES)),
         np.zeros((STATE_WIDTH, LANES)), np.zeros((2, LANES)), np.zeros((n, FAST_WIDTH, LANES)),
@@ -215,16 +206,9 @@ def reset_rows(
     chosen: Any, start_index: Any, starts: EpisodeStart, keys: Any, bounds: Any, batch: BatchArrays,
     final: RecordArrays,
 ) -> None:  # fmt: skip
-    """Reset rows, whose records are first copied into `final`.
+    """Reset the chosen rows (M,), whose records are first copied into `final`.
 
-    Args:
-        chosen: Rows to reset, shape (M,).
-        start_index: Index of each one's start in `starts`, shape (M,).
-        starts: Starts, with one axis more than one's own.
-        keys: Keys of the episodes, two words of 32 bits each, shape (M, 2).
-        bounds: Bounds of the observation's entries, shape (2, k).
-        batch: Arrays of all rows.
-        final: Records before the reset.
+    `start_index` (M,) is each one's index in `starts`; keys (M, 2) are two words of 32 bits.
     """
     for m in range(len(chosen)):
         i, t = chosen[m], start_index[m]

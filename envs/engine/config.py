@@ -71,16 +71,7 @@ def make_car(vehicle: Vehicle) -> CarParams:
 
 
 def make_task_params(vehicle: Vehicle, scenario: Scenario, yaw_first: bool) -> TaskParams:
-    """Make the episode's length and limits.
-
-    Args:
-        vehicle: Vehicle.
-        scenario: Scenario.
-        yaw_first: Whether the yaw moment comes before the acceleration.
-
-    Returns:
-        The parameters.
-    """
+    """Make the episode's length and limits; yaw_first: the yaw moment comes before acceleration."""
     return TaskParams(
         duration=count_ticks(scenario.duration), half_width=scenario.half_width,
         yaw_scale=vehicle.yaw_moment_limit, yaw_first=float(yaw_first), spin=_SPIN_ANGLE,
@@ -111,16 +102,10 @@ def _make_link(scenario: Scenario, name: str, sensor: SlowSensor | None) -> Link
         raise ValueError(f"scenario {short_repr(scenario.name)}: {name}: {error}") from None
 
 
-def _make_satellite_geometry(scenario: Scenario, link: Link) -> SatelliteGeometry:
-    """Make a scenario's satellite geometry, at the GPS's own period."""
-    decay = math.exp(-link.period * TICK / scenario.hdop_time)
-    return SatelliteGeometry(
-        median=math.log(scenario.hdop),
-        spread=scenario.hdop_spread,
-        decay=decay,
-        noise_gain=math.sqrt(1.0 - decay * decay),
-        weight=HDOP_LAWS[scenario.hdop_law],
-    )
+def _compute_gains(exponent: float) -> tuple[float, float]:
+    """Compute (decay, noise gain) of an Ornstein-Uhlenbeck process over a step."""
+    decay = math.exp(exponent)
+    return decay, math.sqrt(1.0 - decay * decay)
 
 
 def _list_numbers(part: Any) -> list[float]:
@@ -131,15 +116,7 @@ def _list_numbers(part: Any) -> list[float]:
 
 
 def pad_params(params: Array, width: int) -> Array:
-    """Pad packed parameters to the width of a longer trace: the last angle is repeated.
-
-    Args:
-        params: Packed parameters, shape (n,).
-        width: Number of parameters and angles.
-
-    Returns:
-        Padded parameters, shape (width,); zeros are appended without a trace.
-    """
+    """Pad packed parameters to (width,): a trace repeats its last angle, others append zeros."""
     has_trace = len(params) > PARAMS_WIDTH
     return np.pad(params, (0, width - len(params)), "edge" if has_trace else "constant")
 
@@ -154,16 +131,13 @@ def _make_episode_config(
     nominal = config.nominal.replace(**scenario.nominal)
     if scenario.roll:
         vehicle.check_roll()
-    decay = math.exp(-TICK / scenario.disturbance_time)
     links = {name: _make_link(scenario, name, slow.get(name)) for name in SLOW_NAMES}
+    hdop_gains = _compute_gains(-links["gps"].period * TICK / scenario.hdop_time)
+    gains = _compute_gains(-TICK / scenario.disturbance_time)
     params = EpisodeParams(
         car=make_car(vehicle),
-        road=RoadParams(
-            curvature=0.0,  # drawn, like the bank
-            start=scenario.curve_start,
-            ramp=scenario.curve_ramp,
-            lateral=0.0,
-            longitudinal=GRAVITY * math.sin(scenario.grade),
+        road=RoadParams(  # curvature and bank are drawn
+            0.0, scenario.curve_start, scenario.curve_ramp, 0.0, GRAVITY * math.sin(scenario.grade)
         ),
         motor=make_lag(vehicle.motor_lag if scenario.lags else 0.0, TICK),
         steering=make_lag(vehicle.steering_lag if scenario.lags else 0.0, TICK),
@@ -172,15 +146,12 @@ def _make_episode_config(
         noise=Noise()._replace(**scenario.noise),
         slow=tuple(links.values()),
         target=make_reference_params(nominal),
-        disturbance=Disturbance(
-            force=scenario.disturbance_force,
-            moment=scenario.disturbance_moment,
-            decay=decay,
-            noise_gain=math.sqrt(1.0 - decay * decay),
-        ),
+        disturbance=Disturbance(scenario.disturbance_force, scenario.disturbance_moment, *gains),
         task=make_task_params(vehicle, scenario, config.yaw_first),
         steering_profile=(0.0,) * STEERING_WIDTH,  # drawn
-        sky=_make_satellite_geometry(scenario, links["gps"]),
+        sky=SatelliteGeometry(
+            math.log(scenario.hdop), scenario.hdop_spread, *hdop_gains, HDOP_LAWS[scenario.hdop_law]
+        ),
         driver=DriverParams(
             preview=scenario.driver_preview,
             gain=scenario.driver_gain,
@@ -202,15 +173,11 @@ def _make_episode_config(
     low, high = scenario.get_draw_ranges()
     angles = scenario.trace  # as `steering.interpolate_trace` reads them
     trace = [scenario.trace_step / TICK, *angles, angles[-1]] if angles else []
-    start = EpisodeStart(
-        params=np.array(_list_numbers(params) + trace, np.float64),
-        low=low,
-        high=high,
-        switches=np.array(switches, np.int64),
-        motion=np.full(len(Motion._fields), np.nan) if motion is None else motion,
-    )
+    packed = np.array(_list_numbers(params) + trace, np.float64)
+    motion = np.full(len(Motion._fields), np.nan) if motion is None else motion
+    start = EpisodeStart(packed, low, high, np.array(switches, np.int64), motion)
     assert len(start.params) == PARAMS_WIDTH or scenario.trace
-    held_speed = scenario.held_speed if np.isnan(start.motion[0]) else None
+    held_speed = scenario.held_speed if np.isnan(motion[0]) else None
     return EpisodeConfig(start, vehicle, nominal, scenario, slow, held_speed)
 
 
@@ -338,16 +305,7 @@ class EnvConfig:
     def make_episode(
         self, scenario: Scenario, vehicle: Vehicle, motion: Array | None = None
     ) -> EpisodeConfig:
-        """Make an episode of a scenario.
-
-        Args:
-            scenario: Scenario.
-            vehicle: True vehicle.
-            motion: `Motion` at the start, NaN or None for the default, shape (len(Motion),).
-
-        Returns:
-            The episode's config.
-        """
+        """Make an episode with a true vehicle; motion (len(Motion),) is NaN where it is default."""
         if self.strict:
             cars = vehicle.replace(**scenario.vehicle), self.nominal.replace(**scenario.nominal)
             for part in (scenario, *cars):

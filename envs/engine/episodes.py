@@ -53,12 +53,9 @@ class EpisodeBatch:
         )  # fmt: skip
         self.params, self.states, self.switches, self.obs, *record, self.over = self.arrays
         self.rows, self.packets, self.reports, self.ticks_done, self.delivered = record
-        self.final_rows, self.final_packets = self.rows.copy(), self.packets.copy()
-        self.final_ticks_done = self.ticks_done.copy()
-        self.final_delivered = self.delivered.copy()
-        self._final = RecordArrays(
-            self.final_rows, self.final_packets, self.final_ticks_done, self.final_delivered
-        )
+        records = self.rows, self.packets, self.ticks_done, self.delivered
+        self._final = final = RecordArrays(*(array.copy() for array in records))
+        self.final_rows, self.final_packets, self.final_ticks_done, self.final_delivered = final
         self.lane_buffers = make_lane_buffers(N, self.control_period, len(self.layout))
         self.configs: list[EpisodeConfig] = [row_config.base for row_config in rows]
         self.generators: list[np.random.Generator | None] = [None] * N
@@ -67,15 +64,7 @@ class EpisodeBatch:
     def apply_options(
         self, options: Mapping[str, Any], chosen: Sequence[int]
     ) -> tuple[list[EpisodeConfig], IntArray]:
-        """Make the configs of rows with options of reset.
-
-        Args:
-            options: Options of reset, for all rows or a list with a value for each.
-            chosen: Indices of the rows, shape (M,).
-
-        Returns:
-            Configs, and the index of each row's among them, shape (M,).
-        """
+        """Make configs with options of reset, and find the index (M,) of each chosen row's."""
         row_options, places = split_options(options, self._count), []
         configs: list[EpisodeConfig] = []
         known: dict[tuple[Any, ...], int] = {}  # rows with the same objects as options share one
@@ -93,12 +82,9 @@ class EpisodeBatch:
         configs: Sequence[EpisodeConfig] | None = None,
         config_index: IntArray | None = None,
     ) -> None:
-        """Reset rows with the next keys of their generators.
+        """Reset the chosen rows (M,) with the next keys of their generators.
 
-        Args:
-            chosen: Indices of the rows, shape (M,).
-            configs: Configs; None for those without options.
-            config_index: Index of each row's config in `configs`, shape (M,).
+        `config_index` (M,) is each one's index in `configs`; None for those without options.
         """
         if configs is None or config_index is None:
             places, config_index = np.unique(self._config_index[chosen], return_inverse=True)

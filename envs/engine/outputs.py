@@ -136,15 +136,7 @@ def sample_slow_sensors(row: Any, motion: Any, tick: Any, count: int) -> int:
 
 @jit
 def observe(row: Any, n: int, count: int, refs: Any, bounds: Any) -> None:
-    """Write the float32 observation of a record, entries as in `make_observation_layout`.
-
-    Args:
-        row: `EpisodeArrays`.
-        n: Number of fast rows.
-        count: Number of packets.
-        refs: References of sideslip angle (rad) and yaw rate (rad/s).
-        bounds: Bounds at which entries are clipped, shape (2, k).
-    """
+    """Write the float32 observation of n fast rows and `count` packets, clipped at its bounds."""
     k = observe_fast(row.rows, n, refs, bounds, row.switches, row.obs)
     observe_slow(row, k, count, bounds)
 
@@ -153,8 +145,7 @@ def observe(row: Any, n: int, count: int, refs: Any, bounds: Any) -> None:
 def observe_fast(rows: Any, n: int, refs: Any, bounds: Any, switches: Any, obs: Any) -> int:
     """Write the observation's first entries, of n fast rows, and its last two, the references.
 
-    `rows` and `obs` are a vehicle's, or have an axis more for those of a block. Returns the number
-    of first entries.
+    Returns the number of first entries. For a block `rows` and `obs` have an axis more.
     """
     k = 0
     for column in range(N_SAMPLED):

@@ -84,15 +84,7 @@ def compute_first_row(
 def reset_vehicle(
     start: EpisodeStart, key_low: int, key_high: int, bounds: Any, row: EpisodeArrays
 ) -> None:
-    """Draw the episode from a key and deliver tick 0.
-
-    Args:
-        start: Packed start of the episode.
-        key_low: Lower 32 bits of the key.
-        key_high: Upper 32 bits of the key.
-        bounds: Bounds of the observation's entries, shape (2, k).
-        row: Arrays of the episode.
-    """
+    """Draw the episode from a key, two words of 32 bits, and deliver tick 0."""
     p, z, rows, report = row.p, row.z, row.rows, row.report
     copy_into(start.params, p)
     copy_into(start.switches, row.switches)

@@ -253,8 +253,7 @@ def measure_tick(
 ) -> tuple[Any, Measurements]:  # fmt: skip
     """Compute the driver's command (rad) and the measurements at the end of a tick.
 
-    `motion` is that at the end, `accel` the specific forces (a_x, a_y) in m/s2, `refs_before` the
-    references at the tick's start. The others are as in `integrate_tick`.
+    `accel` is (a_x, a_y), specific forces in m/s2; `refs_before` are the references at the start.
     """
     task = params.task
     row = compute_fast_row(motion, accel, applied, params.car.d_f, params.noise, draws)

@@ -22,16 +22,7 @@ T = TypeVar("T")
 
 
 def get_vehicle(config: EpisodeConfig, params: Array, state: Array) -> Vehicle:
-    """Get the true vehicle now, with the seed's draws; friction is the mean of both sides.
-
-    Args:
-        config: Config of the episode.
-        params: Packed parameters.
-        state: Packed state.
-
-    Returns:
-        The vehicle; the config's before a reset.
-    """
+    """Get the true vehicle now, with the seed's draws; friction is the mean of both sides."""
     car, change = read(params, P.car), read(params, P.tyre_change)
     if not car.m > 0.0:  # not reset yet
         return config.vehicle
@@ -44,15 +35,7 @@ def get_vehicle(config: EpisodeConfig, params: Array, state: Array) -> Vehicle:
 
 
 def get_slow_sensors(config: EpisodeConfig, state: Array) -> dict[str, SlowSensor]:
-    """Get the slow sensors by name, with the clock phases that the episode drew.
-
-    Args:
-        config: Config of the episode.
-        state: Packed state.
-
-    Returns:
-        The sensors.
-    """
+    """Get the slow sensors by name, with the clock phases that the episode drew."""
     sensors = {}
     for name, sensor in config.slow.items():
         if sensor.phase is None:
@@ -83,16 +66,7 @@ TRUE_STATE = TrueState()
 
 
 def compute_true_states(params: Array, states: Array, switches: Any) -> Array:
-    """Compute the `TrueState` of N episodes now.
-
-    Args:
-        params: Packed parameters, shape (N, ...).
-        states: Packed states, shape (N, STATE_WIDTH).
-        switches: Switches, shape (N, len(Switches)).
-
-    Returns:
-        True states, shape (N, len(TrueState)).
-    """
+    """Compute the `TrueState` of N episodes now, shape (N, len(TrueState))."""
     out = np.empty((len(params), len(TRUE_STATE)))
     _write_true_states(params, states, switches, out)
     return out
@@ -119,12 +93,7 @@ def make_record(state: Array, rows: Array, packets: Array) -> Record:
 
 
 class LazyRows(Sequence[T]):
-    """Items of a batch's rows, each made when it is read.
-
-    Args:
-        count: Number of rows.
-        make_item: Makes the item of a row.
-    """
+    """Items of a batch's `count` rows, each made by `make_item` when it is read."""
 
     def __init__(self, count: int, make_item: Callable[[int], T]) -> None:
         self._rows, self._make_item = range(count), make_item

@@ -79,15 +79,7 @@ def make_window(n: int, *lanes: int) -> Array:
 
 @jit
 def compute_profile_angle(p: Any, tick: Any) -> Any:
-    """Compute the steering angle (rad) of a profile, or of the trace behind `EpisodeParams`.
-
-    Args:
-        p: Packed parameters of one vehicle.
-        tick: Tick since the start of the episode.
-
-    Returns:
-        Angle at the wheels (rad).
-    """
+    """Compute the steering angle (rad) of a profile, or of the trace behind `EpisodeParams`."""
     if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
         return interpolate_trace(tick, p[PARAMS_WIDTH:])
     return compute_steering(tick, p[P.steering_profile[0] :])
@@ -119,15 +111,7 @@ def has_overwrite(p: Any, width: int) -> bool:
 
 @jit
 def precompute_window(p: Any, z: Any, n: int, has_driver: int, window: Any) -> None:
-    """Write noise and steering of the next n ticks of one vehicle into its window.
-
-    Args:
-        p: Packed parameters.
-        z: Packed state.
-        n: Number of ticks.
-        has_driver: 1 where the driver reacts to the car, and no profile steers.
-        window: Window to write to.
-    """
+    """Write noise and steering of one vehicle's next n ticks; with has_driver no profile steers."""
     clock = read(z, Z.clock)
     key_low, key_high, first = to_word(clock.key_low), to_word(clock.key_high), int(clock.tick) + 1
     profile = p[P.steering_profile[0] :]
@@ -190,19 +174,9 @@ def compute_tick_cost(
 def evaluate_cost(
     window: Any, n: int, cost: Any, params: Any, variant: Any
 ) -> tuple[Any, int, bool]:
-    """Evaluate a step's n ticks, up to one at which a car spins or has left the road.
+    """Evaluate a step's n ticks up to a failure: (cost, number of ticks, whether the last fails).
 
-    Cost and failures overwrite the cost inputs in the window.
-
-    Args:
-        window: Window of one car or of a block.
-        n: Number of ticks.
-        cost: 0, of one car or of those of a block.
-        params: `StepParams`.
-        variant: `StepVariant`.
-
-    Returns:
-        Cost, number of ticks, and whether the last of them is a failure.
+    Cost and failures overwrite the cost inputs in the window. `cost` is 0, of one car or a block.
     """
     for j in range(0, n, lane_width(window)):
         motion = load_lanes(window, WINDOW.track, j)

@@ -37,16 +37,9 @@ SIZES, _HEADER = make_offsets(_WorkspaceSizes)
 
 
 def make_workspace(n: int, bounds: Array, max_packets: int, trace_width: int = 0) -> Array:
-    """Make a workspace: one vector, since numba takes 0.04 us for every array in a call.
+    """Make a workspace of n ticks: one vector, since numba takes 0.04 us for every array passed.
 
-    Args:
-        n: Ticks of an env-step.
-        bounds: Bounds of the observation's entries, shape (2, k).
-        max_packets: Largest number of packets in a step.
-        trace_width: Number of values of a trace behind the parameters.
-
-    Returns:
-        The workspace, which `split_workspace` splits.
+    `bounds` are (2, k); `trace_width` values of a trace follow the parameters.
     """
     k = bounds.shape[1]
     width = _HEADER + STATE_WIDTH + len(REPORT) + len(FLAGS) + 2 * k - (-k // 2)

@@ -157,14 +157,7 @@ class HighwayEnv(StabilityEnv):
         report[REPORT.reward] = -report[REPORT.cost]
 
     def make_render_state(self, row: int = 0) -> RenderState:
-        """Make the state that a picture shows, its road by highway-env's own graphics.
-
-        Args:
-            row: Number of the car, 0.
-
-        Returns:
-            The state.
-        """
+        """Make the state that a picture of car `row` shows, its road by highway-env's graphics."""
         return super().make_render_state(row)._replace(world=self._draw_world)
 
     def _draw_world(self, size: tuple[int, int], others: list[Motion]) -> Any:

@@ -68,11 +68,7 @@ class KeepingPlant:
         self.s = 0.0
 
     def start(self, seed: int) -> None:
-        """Begin an episode.
-
-        Args:
-            seed: Seed of highway-env's environment.
-        """
+        """Begin an episode with a seed of highway-env's environment."""
         self.last_observation, _ = self.env.reset(seed=seed)
         self.s = 0.0
         self.project()
@@ -168,12 +164,9 @@ class KeepingEnv(PlantEnv):
     ) -> None:
         self.plant: KeepingPlant = KeepingPlant(render_mode)
         fixed: dict[str, Any] = {"steering": True, "reference": "zero-slip"}
+        vehicle = make_keeping_vehicle()
         super().__init__(
-            sensors,
-            KEEPING,
-            make_keeping_vehicle(),
-            control_period=control_period,
-            **fixed | options,
+            sensors, KEEPING, vehicle, control_period=control_period, **fixed | options
         )
 
     def reset(
@@ -220,11 +213,7 @@ class KeepingEnv(PlantEnv):
         raise TypeError("highway-env's lane-keeping-v0 makes no snapshots")
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Refuse: TypeError, since highway-env makes no snapshots.
-
-        Args:
-            snapshot: Not used.
-        """
+        """Refuse any snapshot: TypeError, since highway-env makes none."""
         self.get_state()
 
 
@@ -246,14 +235,7 @@ class NativeObservation(gym.ObservationWrapper[Any, Any, Any]):
         self.observation_space = make_space(self.layout)
 
     def observation(self, observation: Any) -> Any:
-        """Append highway-env's `STATES` to an observation.
-
-        Args:
-            observation: Observation of the `KeepingEnv`.
-
-        Returns:
-            Both, float32.
-        """
+        """Append highway-env's `STATES` to an observation of the `KeepingEnv`, in float32."""
         base: Any = self.env.unwrapped
         plant = base.plant
         native = plant.last_observation if self._returned else plant.env.observation_type.observe()

@@ -31,11 +31,8 @@ from highway_env.vehicle.objects import Obstacle  # isort: skip
 
 assert canvas  # which keeps pygame from greeting
 WIDTH = StraightLane.DEFAULT_WIDTH  # m
-ENTRY, _BEHIND, _BEYOND = (
-    60.0,
-    -300.0,
-    3000.0,
-)  # m: straight to begin with, where roads begin and end
+# m: length of the first straight, where roads begin, where they end
+ENTRY, _BEHIND, _BEYOND = 60.0, -300.0, 3000.0
 RADIUS, ANGLE = 400.0, math.radians(60.0)  # of either bend
 _LINE, _DASHES, _NONE = LineType.CONTINUOUS_LINE, LineType.STRIPED, LineType.NONE
 _FAST = 60.0  # m/s, no limit
@@ -110,10 +107,8 @@ def _make_merging(side: int) -> _RoadLayout:
 
 
 ROADS: dict[str, Callable[[int], _RoadLayout]] = {
-    "straight": _make_straight,
-    "curved": _make_curved,
-    "merging": _make_merging,
-}
+    "straight": _make_straight, "curved": _make_curved, "merging": _make_merging,
+}  # fmt: skip
 """The function that makes each road, for the side of the free lane."""
 
 
@@ -300,21 +295,13 @@ class BrakingVehicle(IDMVehicle):  # type: ignore[misc]
         self.speed: float = speed
 
     def act(self, action: Any = None) -> None:
-        """Follow the road; brake from the onset on.
-
-        Args:
-            action: Action of highway-env's, or None.
-        """
+        """Follow the road; brake from the onset on."""
         super().act(action)
         if self.time_left <= 0.0 and not self.crashed:
             self.action["acceleration"] = -self.rate
 
     def step(self, dt: float) -> None:
-        """Step the vehicle, which never goes backwards.
-
-        Args:
-            dt: Length of the step (s).
-        """
+        """Step the vehicle by dt (s); it never goes backwards."""
         self.time_left -= dt
         super().step(dt)
         self.speed = max(self.speed, 0.0)
@@ -385,11 +372,7 @@ class Traffic:
             self.road.objects.append(Obstacle(self.road, end.position(end.length, 0.0)))
 
     def step_road(self, motion: Motion) -> None:
-        """Step the road, at whose end our car is at a Motion.
-
-        Args:
-            motion: Motion of our car.
-        """
+        """Step the road by `PERIOD` ticks; `motion` is our car's at the end."""
         self.ego.set_motion(motion)
         self.road.act()
         self.road.step(_STEP)
@@ -406,14 +389,7 @@ class Traffic:
         return not bool(ego.lane.on_lane(ego.position, margin=0.5 * ego.WIDTH))
 
     def locate(self, motion: Motion) -> LanePosition:
-        """Locate our car on the lanes that it follows.
-
-        Args:
-            motion: Motion of our car.
-
-        Returns:
-            The position.
-        """
+        """Locate our car with a `Motion` on the lanes that it follows."""
         route = self.course.route
         position = locate_on_lane(route[self._lane], motion.X, motion.Y, motion.psi)
         while position.longitudinal > route[self._lane].length and self._lane + 1 < len(route):

@@ -15,21 +15,12 @@ from ..io import has_suffix, is_document, read_document
 from ..recordings.log_file import find_clock
 from ..recordings.tables import read_quantities
 from ..validation import check_choice, describe_unknown, short_repr
+from . import tiers
 from .draws import KMH
 from .papers import ROAD_TESTS, SIMULATIONS
 from .scenario import Scenario
-from .tiers import (
-    BRAKE_IN_TURN,
-    DOUBLE_LANE_CHANGE,
-    SINE_WITH_DWELL,
-    SLALOM,
-    STEP,
-    TIERS,
-    WET_EVASION,
-    make_random_steering,
-)
 
-TABLE_SUFFIXES = (".csv", ".parquet")
+_TABLE_SUFFIXES = (".csv", ".parquet")
 
 
 def read_trace(path: str | os.PathLike[str], mapping: Mapping[str, str] | None = None) -> Scenario:
@@ -73,22 +64,22 @@ _DRAWN: dict[str, Any] = {
 # Above 28 km/h so many of the drawn cars are close to their critical speed that those which spin
 # would decide the mean cost of a harsh manoeuvre.
 _HARSH = _DRAWN | {"speed": (18.0 * KMH, 28.0 * KMH)}
-_RANDOM = make_random_steering(0.005, 0.015)
-_SLALOM = SLALOM | {"amplitude": (0.04, 0.1)}
+_RANDOM = tiers.make_random_steering(0.005, 0.015)
+_SLALOM = tiers.SLALOM | {"amplitude": (0.04, 0.1)}
 _LANE: dict[str, Any] = {"steering": "driver", "half_width": 1.75}
 _BEND: dict[str, Any] = {"curvature": (0.01, 0.03), "curve_start": 15.0, "curve_ramp": 10.0}
 
 _MANOEUVRES = (
     Scenario(name="random-steering", **_RANDOM, **_HARSH),
-    Scenario(name="sine-with-dwell", amplitude=(0.05, 0.12), **SINE_WITH_DWELL, **_HARSH),
-    Scenario(name="double-lane-change", **DOUBLE_LANE_CHANGE, **_HARSH),
-    Scenario(name="step-steer", amplitude=(0.03, 0.1), **STEP, **_HARSH),
+    Scenario(name="sine-with-dwell", amplitude=(0.05, 0.12), **tiers.SINE_WITH_DWELL, **_HARSH),
+    Scenario(name="double-lane-change", **tiers.DOUBLE_LANE_CHANGE, **_HARSH),
+    Scenario(name="step-steer", amplitude=(0.03, 0.1), **tiers.STEP, **_HARSH),
     Scenario(name="gust", wind_force=(300.0, 500.0), wind_arm=(-0.1, 0.3),
              wind_start=(1.0, 3.0), wind_length=(1.0, 4.0), **_HARSH),
     Scenario(name="low-friction", duration=6.0, steering="lane-change", onset=(0.5, 1.5),
              amplitude=(0.02, 0.045), frequency=(0.3, 0.6),
              **(_HARSH | {"friction": (0.27, 0.35)})),
-    Scenario(name="brake-in-turn", amplitude=(0.04, 0.1), **BRAKE_IN_TURN, **_HARSH),
+    Scenario(name="brake-in-turn", amplitude=(0.04, 0.1), **tiers.BRAKE_IN_TURN, **_HARSH),
     Scenario(name="stiffness-step", tyre_change_time=(3.0, 6.0), front_change=(0.7, 1.3),
              rear_change=(0.7, 1.3), **_RANDOM, **_HARSH),
     Scenario(name="sensor-outage", camera_outage=(3.0, 6.0), gps_outage=(3.0, 6.0),
@@ -116,12 +107,12 @@ _ROADS = (
     # only the controller steers
     Scenario(name="curved-road", half_width=1.75, **_BEND, **_HARSH),
     Scenario(name="curved-road-driver", **_LANE, **_BEND, **_HARSH),
-    WET_EVASION,
+    tiers.WET_EVASION,
 )  # fmt: skip
 
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
-    for scenario in (*_MANOEUVRES, *_EASY, *_ROADS, *TIERS, *SIMULATIONS, *ROAD_TESTS)
+    for scenario in (*_MANOEUVRES, *_EASY, *_ROADS, *tiers.TIERS, *SIMULATIONS, *ROAD_TESTS)
 }
 
 
@@ -151,7 +142,7 @@ def make_scenario(source: ScenarioSource) -> Scenario:
         return source
     if isinstance(source, Mapping):
         return _parse_scenario(dict(source))
-    if has_suffix(source, TABLE_SUFFIXES):
+    if has_suffix(source, _TABLE_SUFFIXES):
         return read_trace(source)
     if is_document(source):
         values = read_document(source, "scenario")

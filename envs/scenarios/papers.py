@@ -13,18 +13,14 @@ from .scenario import Scenario
 
 
 def _make_stiffness(stiffness: float) -> dict[str, float]:
+    """Make the same stiffness (N/rad) of all tyres."""
     return {"front_stiffness": stiffness, "rear_stiffness": stiffness}
 
 
 _SIMULATED: dict[str, Any] = {  # the plant of the papers' own equations
-    "small_angle": True,
-    "tyres": "linear",
-    "lags": False,
-    "roll": False,
-    "hdop": 1.0,
-    "hdop_spread": 0.0,
-    "hdop_law": "constant",
-}
+    "small_angle": True, "tyres": "linear", "lags": False, "roll": False,
+    "hdop": 1.0, "hdop_spread": 0.0, "hdop_law": "constant",
+}  # fmt: skip
 _ON_THE_ROAD: dict[str, Any] = {"half_width": 200.0}  # all that the plant has
 _QUIET: dict[str, Any] = {"disturbance_force": 0.0, "disturbance_moment": 0.0}
 _WIND: dict[str, Any] = {"wind_force": 200.0, "wind_start": 4.0, "wind_length": 4.0}
@@ -77,8 +73,7 @@ _DOUBLE = Scenario(
 )  # fmt: skip
 
 SIMULATIONS = (
-    _FIG7,
-    _FIG8,
+    _FIG7, _FIG8,
     _FIG8.replace(name="tie-vision-fig8-stiff", vehicle=_make_stiffness(7200.0)),
     _UNEVEN,
     _UNEVEN.replace(name="uneven-delay-fig5-noisy", noise={"camera_psi": 0.003, "camera_y": 0.03}),
@@ -86,10 +81,8 @@ SIMULATIONS = (
     _DOUBLE.replace(name="double-layer-fig9-fast", frequency=0.4),
     _DOUBLE.replace(name="double-layer-fig9-periods", steering="double-lane-change", hold=9.0),
     _DOUBLE.replace(name="double-layer-fig9-calm", wind_force=0.0),
-    _DUAL,
-    _DAKF,
-    _DAKF_STEP,
-)
+    _DUAL, _DAKF, _DAKF_STEP,
+)  # fmt: skip
 
 # given: a sine by the driver, 0 to 30 km/h, the filter's tyres are not the real ones
 _DRIVER = Scenario(
@@ -127,12 +120,8 @@ _DAKF_CORNER = _DAKF_DRIVER.replace(
 )  # fmt: skip
 
 ROAD_TESTS = (
-    _DRIVER,
-    _MOTOR,
+    _DRIVER, _MOTOR,
     # given besides: 9 to 18 ms of image processing
     _DRIVER.replace(name="uneven-delay-fig7", camera_delays=(0.009,), camera_jitter=0.009),
-    _DOUBLE_ROAD,
-    _DUAL_ROAD,
-    _DAKF_DRIVER,
-    _DAKF_CORNER,
-)
+    _DOUBLE_ROAD, _DUAL_ROAD, _DAKF_DRIVER, _DAKF_CORNER,
+)  # fmt: skip

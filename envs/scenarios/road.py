@@ -171,13 +171,9 @@ def transform_path(path: Any, start: Any, scale: Any, side: Any) -> Any:
         The `TrackPath`.
     """
     return TrackPath(
-        side * path.shift_1,
-        start + scale * path.start_1,
-        scale * path.length_1,
-        side * path.shift_2,
-        start + scale * path.start_2,
-        scale * path.length_2,
-    )
+        side * path.shift_1, start + scale * path.start_1, scale * path.length_1,
+        side * path.shift_2, start + scale * path.start_2, scale * path.length_2,
+    )  # fmt: skip
 
 
 @jit

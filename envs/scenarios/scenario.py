@@ -86,10 +86,8 @@ def _check_trace(fields: Fields) -> None:
     if not isinstance(trace, tuple) or not all(map(is_finite, trace)):
         raise ValueError(f"trace is angles in rad, finite ones, got {short_repr(trace)}")
     if (len(trace) > 1) != (steering == "trace") or len(trace) > _MAX_SAMPLES:
-        raise ValueError(
-            f"trace has 2 to {_MAX_SAMPLES} angles where the steering is 'trace', else none; got "
-            f"{len(trace)} with {steering!r}"
-        )
+        rule = f"2 to {_MAX_SAMPLES} angles where the steering is 'trace', else none"
+        raise ValueError(f"trace has {rule}; got {len(trace)} with {steering!r}")
     if fields["trace_step"] < TICK:
         raise ValueError(f"trace_step is {TICK} s or more, got {fields['trace_step']!r}")
 
@@ -212,22 +210,18 @@ class Scenario:
     (0.02, 0.05)
 
     Attributes:
-        name: Name of the scenario.
-        duration: Length of the episode (s).
-        steering: Kind of the steering programme, of `STEERING_KINDS`. "random" is two pairs of
-            sines, of amplitude and amplitude_2. "driver" keeps to `path` by preview. "wander" is a
+        name, duration: Name, and length of the episode (s).
+        steering: Kind of the steering profile, of `STEERING_KINDS`. "random" is two pairs of sines,
+            of amplitude and amplitude_2. "driver" keeps to `path` by preview. "wander" is a
             zero-mean Ornstein-Uhlenbeck process of standard deviation amplitude and corner
             frequency `frequency`, held for `hold` from one angle to the next.
-        trace: Recorded angles at the wheels (rad) for "trace": straight between them, the last
-            stays.
-        trace_step: Time between the trace's samples (s).
-        onset: Time at which steering begins (s).
-        amplitude: Amplitude at the wheels (rad).
+        trace, trace_step: Angles at the wheels (rad) for "trace", interpolated linearly, the last
+            of which stays, and the time between them (s).
+        onset, amplitude: Time at which steering begins (s), and amplitude at the wheels (rad).
         amplitude_2: Amplitude of the second pair of a random steering (rad).
         frequency: Frequency (Hz).
         frequency_2: Second frequency of a random steering, or the end of a sweep (Hz).
-        frequency_3: Third frequency of a random steering (Hz).
-        frequency_4: Fourth frequency of a random steering (Hz).
+        frequency_3, frequency_4: Further frequencies of a random steering (Hz).
         hold: Time of a step, dwell, ramp or sweep, or from one lane change to the next (s).
         mirror: Whether the seed draws the side of steering, track, bend, bank, friction_right and
             start, and that of the wind.
@@ -235,68 +229,53 @@ class Scenario:
             width that begins where the car is at the onset at the speed it starts with.
         path_speed: Speed (m/s) at which a track has its standard's lengths, which grow with the
             speed drawn; None: these lengths at every speed.
-        driver_preview: Preview time of the driver (s).
-        driver_gain: Gain of the driver.
-        driver_lag: Time constant of the driver's arms (s).
-        driver_rate: Largest rate of the driver's angle at the wheels (rad/s).
-        initial_beta: Sideslip angle at the start (rad).
-        initial_gamma: Yaw rate at the start (rad/s).
-        speed: Speed at the start (m/s).
-        acceleration: Acceleration (m/s2); None holds the speed.
+        driver_preview, driver_gain: Preview time (s) and gain of the driver.
+        driver_lag, driver_rate: Time constant of the driver's arms (s), and largest rate of the
+            driver's angle at the wheels (rad/s).
+        initial_beta, initial_gamma: Sideslip angle (rad) and yaw rate (rad/s) at the start.
+        speed, acceleration: Speed at the start (m/s); acceleration (m/s2), None holds the speed.
         speed_change: Change of the held speed at an even rate (m/s).
-        change_start: Time at which that change begins (s).
-        change_length: Time that it takes (s).
-        surge: Amplitude of a sine of the driver's acceleration, which the held speed follows
-            (m/s2).
-        surge_frequency: Frequency of that sine (Hz).
+        change_start, change_length: Time at which that change begins, and that it takes (s).
+        surge, surge_frequency: Amplitude (m/s2) and frequency (Hz) of a sine of the driver's
+            acceleration, which the held speed follows.
         friction: Friction of the road, which replaces the vehicle's.
         friction_right: Friction under the right wheels; None: as on the left.
-        front_stiffness: Factor on the front stiffness; draws of an unstable car are drawn again.
-        rear_stiffness: Factor on the rear stiffness.
+        front_stiffness, rear_stiffness: Factors on the tyres' stiffness; draws of an unstable car
+            are drawn again.
         tyre_change_time: Time at which the tyres change (s); None: never.
-        front_change: Further factor on the front stiffness from then on.
-        rear_change: Further factor on the rear stiffness from then on.
-        wind_force: Force of a side wind (N).
-        wind_arm: Its arm ahead of the centre of gravity (m).
-        wind_start: Time at which it begins (s).
-        wind_length: Time that it lasts (s).
-        wind_height: Its height above the roll axis (m).
-        disturbance_force: Standard deviation of an Ornstein-Uhlenbeck force (N).
-        disturbance_moment: Standard deviation of an Ornstein-Uhlenbeck moment (N m).
-        disturbance_time: Time constant of both (s).
+        front_change, rear_change: Further factors on the stiffness from then on.
+        wind_force, wind_arm, wind_height: Force of a side wind (N), its arm ahead of the centre of
+            gravity, and its height above the roll axis (m).
+        wind_start, wind_length: Time at which it begins, and that it lasts (s).
+        disturbance_force, disturbance_moment, disturbance_time: Standard deviations of an
+            Ornstein-Uhlenbeck force (N) and moment (N m), and their time constant (s).
         road: "straight", or "nominal-path", which bends as the nominal linear car would drive the
-            programme's steering at the wanted speed; its camera reports y_l without that bend.
+            steering profile at the wanted speed; its camera reports y_l without that bend.
         curvature: Curvature of the bend (1/m), left positive.
-        curve_start: Place where curvature, bank and grade begin (m); negative: from the beginning.
-        curve_ramp: Length over which they come in (m).
-        bank: Bank of the road (rad), left side up.
-        grade: Grade of the road (rad), uphill.
-        half_width: Distance from the driver's path, else from the road's centre line, that ends the
-            episode (m).
-        camera_delays: Repeating pattern of delays that replaces the id's, and its jitter (s).
-        camera_jitter: Jitter of these delays (s).
+        curve_start, curve_ramp: Place where curvature, bank and grade begin (m; negative: from the
+            beginning), and length over which they come in (m).
+        bank, grade: Bank (rad), left side up, and grade (rad), uphill, of the road.
+        half_width: Distance (m) from the driver's path, else from the road's centre line, that ends
+            the episode.
+        camera_delays, camera_jitter: Repeating pattern of delays and their jitter (s), which
+            replace the id's.
         camera_loss: Probability that a frame is lost; 0: the id's.
-        camera_heading: Heading against the road (rad) beyond which no lane is in view (quality 0).
-        camera_offset: Offset from the lane's centre (m) beyond which no lane is in view.
-        camera_outage: (from, to) without packets (s).
-        gps_period: Period that replaces the id's (s).
-        gps_delays: Repeating pattern of delays that replaces the id's (s).
-        gps_outage: (from, to) without packets (s).
+        camera_heading, camera_offset: Heading against the road (rad) and offset from the lane's
+            centre (m) beyond which no lane is in view (quality 0).
+        camera_outage, gps_outage: (from, to) without packets (s).
+        gps_period, gps_delays: Period, and repeating pattern of delays, that replace the id's (s).
         gps_latency: Further delay of all GPS packets of the episode, whose stamps are true (s);
             `slow_sensors` describes its range as a delay and a jitter.
-        gyro_bias: Addition to the noise's bias of the gyro (rad/s).
-        accel_y_bias: Addition to the noise's bias of the lateral accelerometer (m/s2).
-        hdop: Median of the GPS's HDOP.
-        hdop_spread: Standard deviation of its logarithm.
-        hdop_time: Correlation time of its logarithm (s).
+        gyro_bias, accel_y_bias: Additions to the noise's biases of gyro (rad/s) and lateral
+            accelerometer (m/s2).
+        hdop, hdop_spread, hdop_time: Median of the GPS's HDOP, and standard deviation and
+            correlation time (s) of its logarithm.
         hdop_law: How much of the GPS's noise follows HDOP, of `HDOP_LAWS`.
         small_angle: Whether the plant is that of the papers' small angles.
         tyres: Tyre law, of `TYRE_LAWS`.
-        lags: Whether motors and steering have lags.
-        roll: Whether the body rolls.
-        tier: Tier in whose score the scenario may stand, of `_TIER_NAMES`; "" for none.
-        vehicle: Parameters that replace those of the env's vehicle.
-        nominal: Parameters that replace those of the env's nominal vehicle.
+        lags, roll: Whether motors and steering have lags, and whether the body rolls.
+        tier: Tier in whose score the scenario may stand: "1", "2a", "2b", "2c", or "" for none.
+        vehicle, nominal: Parameters that replace those of the env's vehicle and nominal vehicle.
         noise: Numbers that replace the default `Noise`.
     """
 
