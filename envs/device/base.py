@@ -70,9 +70,8 @@ def parse_device_actions(
         raise ValueError(f"actions are {places}; nothing was stepped")
     if actions.shape != (count, width):
         if not fail:
-            got = tuple(actions.shape)
-            rule = f"actions have shape ({count}, {width})"
-            raise ValueError(f"{rule}, got {got}; nothing was stepped")
+            shapes = f"({count}, {width}), got {tuple(actions.shape)}"
+            raise ValueError(f"actions have shape {shapes}; nothing was stepped")
         actions = torch.full((count, width), torch.nan, device=device)
     if not grad:
         actions = actions.detach().to(torch.float32)

@@ -19,6 +19,7 @@ from ..numerics.packed import load_element, read, store_element, write
 with require_extra("cuda", "the CUDA engine needs numba-cuda"):
     import numba_cuda as numba_cuda  # numba's own `cuda` is another
 
+_Function = Callable[..., Any]
 SIMULATED = bool(cuda.config.ENABLE_CUDASIM)
 """Whether numba simulates CUDA in Python (NUMBA_ENABLE_CUDASIM=1)."""
 
@@ -36,7 +37,7 @@ def to_cuda(function: Any, real: type[np.floating[Any]]) -> Any:
     return as_python(function, _SINGLE if real is np.float32 else None, finish)
 
 
-_SINGLE: dict[str, Callable[..., Any]] = {
+_SINGLE: dict[str, _Function] = {
     "to_word": lambda a: int(np.float32(a).view(np.uint32)),
     "from_word": lambda a: np.uint32(a).view(np.float32),
 }
@@ -66,7 +67,7 @@ def _compile_device(function: Any) -> Any:
     return cuda.jit(device=True, forceinline=True)(function)
 
 
-def _make_table(real: Any) -> dict[str, Callable[..., Any]]:
+def _make_table(real: Any) -> dict[str, _Function]:
     """Make CUDA's own primitives by the names that the equations use."""
     from numba.cuda import libdevice
 
@@ -99,21 +100,21 @@ def _make_table(real: Any) -> dict[str, Callable[..., Any]]:
     return {name: _compile_device(text) for name, text in texts.items()} | _register_access()
 
 
-def _register_access() -> dict[str, Callable[..., Any]]:
+def _register_access() -> dict[str, _Function]:
     """Register numba-cuda's versions of reading and writing packed arrays, once."""
     if not _registered:
         from numba.cuda.extending import overload
 
         jit_options = {"forceinline": True}
-        functions: list[Callable[..., Any]] = [read, write, load_element, store_element]
-        typings: list[Callable[..., Any]] = [_read, _write, _load_element, _store_element]
+        functions: list[_Function] = [read, write, load_element, store_element]
+        typings: list[_Function] = [_read, _write, _load_element, _store_element]
         for function, typing in zip(functions, typings, strict=True):
             overload(function, jit_options=jit_options)(typing)
             _registered[function.__name__] = function
     return _registered
 
 
-_registered: dict[str, Callable[..., Any]] = {}
+_registered: dict[str, _Function] = {}
 
 
 def _format_column(j: Any) -> str:

@@ -353,8 +353,8 @@ class Traffic:
     def _add_vehicles(self, others: int, start: TrafficStart) -> None:
         """Add IDM vehicles ahead and behind in both lanes, and on the ramp if there is one."""
         random, course = self.road.np_random, self.course
-        own, free = course.own_lane, course.free_lane
-        slots = [(free, 80.0), (own, -35.0), (own, 120.0), (free, -45.0)]  # lane, m ahead
+        ego, free = course.own_lane, course.free_lane
+        slots = [(free, 80.0), (ego, -35.0), (ego, 120.0), (free, -45.0)]  # lane, m ahead
         for i in range(others):
             speed = start.speed * random.uniform(0.95, 1.05)
             if course.ramp is not None and i == 0:
@@ -363,7 +363,7 @@ class Traffic:
             else:
                 index, offset = slots[i % len(slots)]
                 far = offset + math.copysign(45.0 * (i // len(slots)), offset)
-                lateral = 0.0 if index == own else WIDTH * (index - own)
+                lateral = 0.0 if index == ego else WIDTH * (index - ego)
                 position = np.array([far + random.uniform(-8.0, 8.0), lateral])
             vehicle = IDMVehicle(self.road, position, speed=speed, target_speed=speed)
             self.road.vehicles.append(vehicle)

@@ -271,8 +271,7 @@ class Scenario:
         hdop, hdop_spread, hdop_time: Median of the GPS's HDOP, and standard deviation and
             correlation time (s) of its logarithm.
         hdop_law: How much of the GPS's noise follows HDOP, of `HDOP_LAWS`.
-        small_angle: Whether the plant is that of the papers' small angles.
-        tyres: Tyre law, of `TYRE_LAWS`.
+        small_angle, tyres: Whether the plant is of small angles; tyre law, of `TYRE_LAWS`.
         lags, roll: Whether motors and steering have lags, and whether the body rolls.
         tier: Tier in whose score the scenario may stand: "1", "2a", "2b", "2c", or "" for none.
         vehicle, nominal: Parameters that replace those of the env's vehicle and nominal vehicle.
