@@ -27,7 +27,7 @@ _MOTION, _DRIVE, _REFS, _LEAD = (
     slice(part[0], part[-1] + 1) for part in (Z.motion, Z.drive, Z.refs, Z.nominal_motion)
 )
 _PACKED = _MOTION, _DRIVE, Z.driver, _REFS, _LEAD, Z.clock.tick, Z.clock.failure
-"""Where the first fields of a `TorchState` lie in the packed state."""
+"""Places of the first fields of a `TorchState` in the packed state."""
 
 
 def is_compile_used(is_wanted: bool, device: torch.device) -> bool:

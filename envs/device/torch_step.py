@@ -54,7 +54,7 @@ class StepOutcome(NamedTuple):
     truncated: Tensor
     refused: Tensor  # (N,), the action is not finite and counts
     rows: Tensor  # (n, FAST_WIDTH, N)
-    packets: Tensor  # (most, PACKET_WIDTH, N)
+    packets: Tensor  # (max, PACKET_WIDTH, N)
     done: Tensor  # (N,), how many ticks and packets there are, int64
     delivered: Tensor
 

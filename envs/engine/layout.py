@@ -138,7 +138,7 @@ class Switches(NamedTuple):
     small_angle: int
     law: int
     reference: int
-    steering: int  # kind of steering programme, used at reset
+    steering: int  # kind of steering profile, used at reset
     all_samples: int  # the observation holds every fast sample
     with_map: int  # and the road's curvature
     fail_bad: int  # a non-finite action ends the episode instead of being refused

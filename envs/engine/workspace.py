@@ -21,7 +21,7 @@ class EpisodeArrays(NamedTuple):
     switches: Any  # (len(Switches),) int64
     obs: Any  # (k,) float32
     rows: Any  # (n, FAST_WIDTH), the fast rows of the newest record
-    packets: Any  # (most, PACKET_WIDTH), its packets
+    packets: Any  # (max, PACKET_WIDTH), its packets
     report: Any  # (len(Report),)
 
 

@@ -117,7 +117,7 @@ SCENARIOS: dict[str, Scenario] = {
 
 
 ScenarioSource = str | os.PathLike[str] | Mapping[str, Any] | Scenario
-"""What `make_scenario` takes."""
+"""Source of a scenario, which `make_scenario` reads."""
 
 
 def make_scenario(source: ScenarioSource) -> Scenario:
