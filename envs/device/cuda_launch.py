@@ -19,16 +19,18 @@ from typing import Any
 
 import numpy as np
 from numba import cuda, types
-from numba.cuda import dispatcher
-from numba.cuda.compiler import compile_cuda, kernel_fixup
-from numba.cuda.cudadrv.nvvm import NVVM
-from numba.cuda.np.numpy_support import from_dtype
 
 from ..io import replace_file
 from ..numerics import kernel_cache
 from ..numerics.torch_backend import torch
 from .cuda_kernel import NAME, KernelConstants, make_kernel, make_specification
 from .cuda_text import SIMULATED
+
+if not SIMULATED:  # the simulator has no compiler
+    from numba.cuda import dispatcher
+    from numba.cuda.compiler import compile_cuda, kernel_fixup
+    from numba.cuda.cudadrv.nvvm import NVVM
+    from numba.cuda.np.numpy_support import from_dtype
 
 Tensor = torch.Tensor
 BLOCK = 128  # threads; 255 registers each leave a multiprocessor of an H200 two such blocks

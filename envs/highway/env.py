@@ -34,9 +34,8 @@ class HighwayEnv(StabilityEnv):
     camera, driver and the record's curvature refer to the lane that our car follows, which begins
     as its own and stays so while the driver swerves. Needs the extra `highway`.
 
-    The seed draws on which side the free lane is, the hazard and the traffic from the episode's
-    key, and highway-env's own random numbers come from there too. The road is stepped every 50 ms
-    at the ticks' places of our car, whatever the control period.
+    The episode's key draws the side of the free lane, the hazard, the traffic and highway-env's own
+    random numbers. The road is stepped every 50 ms, whatever the control period.
 
     Raises ModuleNotFoundError without highway-env, ValueError for an unknown road, a number of
     vehicles out of place, a scenario with a road of its own or of small angles, one without a

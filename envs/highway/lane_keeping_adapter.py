@@ -83,8 +83,7 @@ class KeepingPlant:
     def step(self, inputs: OutsideInputs, h: float) -> None:
         """Step the car over a tick, and integrate its place on the lane.
 
-        The first tick of a control period is one of highway-env's `step`, which also takes the next
-        lane and observes; the others only move the car.
+        A control period's first tick is highway-env's own `step`; the others only move the car.
 
         Args:
             inputs: Inputs, of which the steering angle acts.
