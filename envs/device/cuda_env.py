@@ -1,4 +1,4 @@
-"""CudaVectorEnv: many cars in one CUDA kernel a step; state, resets and results on the device."""
+"""`CudaVectorEnv`: many cars in one CUDA kernel a step, with state and resets on the device."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,6 @@ from ..numerics.torch_backend import torch
 from ..validation import (
     check_int,
     format_rows,
-    parse_actions,
     parse_autoreset_mode,
     parse_reset_mask,
     parse_seeds,
@@ -25,7 +24,14 @@ from ..validation import (
     split_options,
 )
 from ..vector import StabilityVectorEnv
-from .base import check_arguments, parse_device, parse_dtype, read_infos
+from .base import (
+    check_arguments,
+    parse_device,
+    parse_device_actions,
+    parse_dtype,
+    read_infos,
+    refuse_actions,
+)
 from .cuda_kernel import (
     ASKED,
     RUNS,
@@ -44,12 +50,12 @@ Tensor = torch.Tensor
 Infos = dict[str, Any]
 
 _NEW_ARRAYS = ("actions", "rewards", "terminated", "truncated", "final_obs", "final_reports")
-"""What is new in every step; all else stays where it is."""
+"""Arrays that are new in every step; the others stay at their place."""
 _TORCH = {np.uint8: torch.uint8, np.int64: torch.int64, np.float32: torch.float32}
 
 
 class Snapshot(NamedTuple):
-    """All that the rows of a `CudaVectorEnv` go on from."""
+    """Snapshot of all rows of a `CudaVectorEnv`."""
 
     num_envs: int
     constants: KernelConstants
@@ -59,31 +65,29 @@ class Snapshot(NamedTuple):
 
 
 class CudaVectorEnv(VectorEnv[Any, Any, Any]):
-    """`num_envs` environments on a GPU: the text, the noise and the episodes of
-    `StabilityVectorEnv`, seed by seed, one CUDA thread a row and one kernel a step.
+    """`num_envs` environments on a GPU, one CUDA thread a row and one kernel a step.
 
-    The kernel takes the ticks, sensors, packets, observation, cost and resets; keys of new episodes
-    come from each row's PCG64 on the device. Nothing waits for the host, but with
-    `on_bad_action="raise"` a step asks whether an action is bad, and with "Disabled" whether an
-    episode is over. It launches on torch's current stream. Needs torch and numba-cuda, of the
-    extras `train` and `cuda`; the first env of a kind compiles for half a minute, then PTX is on
-    disk.
+    Equations, noise and episodes are those of `StabilityVectorEnv`, seed by seed. The kernel takes
+    the ticks, sensors, packets, observation, cost and resets; keys of new episodes come from each
+    row's PCG64 on the device. The host waits only to learn whether an action is bad
+    (`on_bad_action="raise"`) or an episode is over ("Disabled"). Needs torch and numba-cuda, of the
+    extras `train` and `cuda`; the first env of a kind compiles for half a minute.
 
-    ## Arguments
-    arguments: those of `StabilityEnv`. device: "cuda", "cuda:1", ...; "cpu" in numba's simulator
-    (NUMBA_ENABLE_CUDASIM=1), a few rows for tests. dtype: "float64", which contracts no product
-    with a sum and has the bits of `StabilityVectorEnv`; or "float32". autoreset_mode: as of
-    `StabilityVectorEnv`. record: whether `rows` and `packets` are written.
-
-    ## Tensors
-    As of `DeviceVectorEnv`: observations (N, k) float32, rewards (N,), `terminated`, `truncated`
-    (N,) of bool, infos (N,), new ones each time and on the device. With "SameStep" infos have
-    `final_obs` and `final_info`, zeros in rows that did not end.
-
-    Options of reset are those of `StabilityVectorEnv`; all rows have a plant of one kind.
+    Tensors are as of `DeviceVectorEnv`, new ones each time. With "SameStep" infos have `final_obs`
+    and `final_info`, zeros in rows that did not end. Options of reset are those of
+    `StabilityVectorEnv`; all rows have a plant of one kind.
 
     Raises TypeError or ValueError for an argument out of place and a device that is not there,
     MemoryError where the rows do not fit.
+
+    Args:
+        num_envs: Number of environments N.
+        device: "cuda", "cuda:1", ...; "cpu" in numba's simulator (NUMBA_ENABLE_CUDASIM=1), a few
+            rows for tests.
+        dtype: "float64", which has the bits of `StabilityVectorEnv`, or "float32".
+        autoreset_mode: "NextStep", "SameStep" or "Disabled".
+        record: Whether `rows` and `packets` are written.
+        arguments: Arguments of `StabilityEnv`.
     """
 
     def __init__(
@@ -125,6 +129,7 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
         self._started = False
 
     def _allocate(self, kind: Any, shape: tuple[int, ...]) -> Tensor:
+        """Allocate zeros of a NumPy type on the device."""
         return torch.zeros(shape, dtype=_TORCH.get(kind, self.dtype), device=self.device)
 
     def reset(
@@ -155,10 +160,7 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
     def _make_configs(
         self, options: Mapping[str, Any], mask: Any
     ) -> tuple[Sequence[EpisodeConfig], Any]:
-        """The starts' configs, that without options first, and the place of each row's.
-
-        Raises ValueError for a plant of another kind.
-        """
+        """Make the starts' configs, that without options first, and each row's index among them."""
         configs, start_index = [self._config.base], np.zeros(self.num_envs, np.int64)
         known: dict[tuple[Any, ...], int] = {}
         for i, row_options in enumerate(split_options(options, self.num_envs) if options else ()):
@@ -184,10 +186,8 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
             raise ResetNeeded("no episode was started: call reset() first")
         memory = self._memory
         if self._mode == AutoresetMode.DISABLED and (memory.over != RUNS).any():
-            raise ResetNeeded(
-                f"the episode is over in {format_rows(memory.over.nonzero()[:, 0].tolist())}: "
-                "call reset() with a reset_mask"
-            )
+            over = format_rows(memory.over.nonzero()[:, 0].tolist())
+            raise ResetNeeded(f"the episode is over in {over}: call reset() with a reset_mask")
         sizes = make_specification(self._constants, self._real, self.num_envs, 1)
         new_arrays = {name: self._allocate(*getattr(sizes, name)) for name in _NEW_ARRAYS[1:]}
         self._memory = memory = memory._replace(actions=self._parse_actions(actions), **new_arrays)
@@ -200,76 +200,63 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
         return memory.obs.clone(), memory.rewards, *ends, infos
 
     def _parse_actions(self, actions: Any) -> Tensor:
-        """Actions (N, width) as float32 on the device, checked."""
-        N, width, fail = self.num_envs, self._constants.inputs, self._config.on_bad_action == "fail"
-        if not isinstance(actions, torch.Tensor):
-            actions = torch.as_tensor(parse_actions(actions, N, width, fail)).to(self.device)
-        if actions.device != self.device:
-            raise ValueError(
-                f"actions are on {actions.device}, the env on {self.device}; nothing was stepped"
-            )
-        if actions.shape != (N, width):
-            if not fail:
-                raise ValueError(
-                    f"actions have shape ({N}, {width}), got {tuple(actions.shape)}; "
-                    "nothing was stepped"
-                )
-            actions = torch.full((N, width), torch.nan, device=self.device)
-        commands: Tensor = actions.detach().to(torch.float32).contiguous()
+        """Parse actions (N, width) as float32 on the device."""
+        fail = self._config.on_bad_action == "fail"
+        actions = parse_device_actions(
+            actions, self.num_envs, self._constants.inputs, fail, self.device, torch.float32, False
+        )
+        commands: Tensor = actions.contiguous()
         if not fail:
             bad = ~torch.isfinite(commands).all(1) & (self._memory.over == RUNS)
             if bad.any():  # here the host waits
-                rows = bad.nonzero()[:, 0].tolist()
-                raise ValueError(
-                    f"the action of {format_rows(rows)} is not finite, "
-                    f"{commands[rows[0]].tolist()}; nothing was stepped"
-                )
+                refuse_actions(commands, bad)
         return commands
 
     @property
     def rows(self) -> Tensor:
-        """The fast rows of the newest record, (N, n, FAST_WIDTH); ValueError without `record`."""
+        """Fast rows of the newest record, (N, n, FAST_WIDTH); ValueError without `record`."""
         return self._get_record(self._memory.rows).permute(2, 0, 1)
 
     @property
     def packets(self) -> Tensor:
-        """The packets of the newest record, (N, most, PACKET_WIDTH)."""
+        """Packets of the newest record, (N, max, PACKET_WIDTH)."""
         return self._get_record(self._memory.packets).permute(2, 0, 1)
 
     @property
     def ticks_done(self) -> Tensor:
-        """How many of `rows` are there, (N,)."""
+        """Number of `rows` of the newest record, (N,)."""
         return self._get_record(self._memory.counts)[0]
 
     @property
     def delivered(self) -> Tensor:
-        """How many of `packets` are there, (N,)."""
+        """Number of `packets` of the newest record, (N,)."""
         return self._get_record(self._memory.counts)[1]
 
     def _get_record(self, part: Tensor) -> Tensor:
+        """Get a part of the record; ValueError without `record`."""
         if not self._constants.record:
             raise ValueError("there is no record: build the env with record=True")
         return part
 
     @property
     def motion(self) -> Tensor:
-        """The true `Motion` of each row now, (N, len(Motion)), in SI units."""
+        """True `Motion` of each row now, (N, len(Motion)), in SI units."""
         states: Tensor = self._memory.states
         return states[Z.motion[0] : Z.motion[-1] + 1].T.clone()
 
     def tensors(self) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-        """The state of the rows on the device and the newest step's outcome; the env's own."""
+        """Get the state of the rows and the newest step's outcome, the env's own tensors."""
         m = self._memory
         results = m.obs, m.rewards, m.terminated, m.truncated, m.rows, m.packets
         return (m.states, m.reports, m.over), results
 
     def get_state(self) -> Snapshot:
-        """A snapshot of all rows, on the device."""
+        """Copy the state of all rows, on the device."""
         memory = DeviceArrays(*(array.clone() for array in self._memory))
         return Snapshot(self.num_envs, self._constants, self.dtype, self._started, memory)
 
     def set_state(self, snapshot: Snapshot) -> None:
-        """Go back to a snapshot of this env, or of one built with the same arguments.
+        """Restore a snapshot of this env, or of one built with the same arguments.
 
         Raises ValueError for one of other rows, another dtype, plant, sensors or records.
         """
@@ -278,14 +265,13 @@ class CudaVectorEnv(VectorEnv[Any, Any, Any]):
         snapshot_facts, own_facts = snapshot[:3], (self.num_envs, self._constants, self.dtype)
         if snapshot_facts != own_facts:
             raise ValueError(f"the snapshot is of other rows, {snapshot_facts}, not {own_facts}")
-        self._memory = DeviceArrays(
-            *(array.to(self.device, copy=True) for array in snapshot.memory)
-        )
+        copies = (array.to(self.device, copy=True) for array in snapshot.memory)
+        self._memory = DeviceArrays(*copies)
         self._started = snapshot.started
 
 
 def count_bytes(sizes: DeviceArrays) -> int:
-    """What an env needs of the device's memory: its own, and the results of three steps."""
+    """Count the bytes that an env needs: its arrays, and the results of three steps."""
     return sum(
         math.prod(shape) * np.dtype(kind).itemsize * (3 if name in (*_NEW_ARRAYS, "obs") else 1)
         for name, (kind, shape) in sizes._asdict().items()
@@ -293,7 +279,7 @@ def count_bytes(sizes: DeviceArrays) -> int:
 
 
 def check_memory(sizes: DeviceArrays, count: int, device: torch.device) -> None:
-    """MemoryError where these rows do not fit on the device."""
+    """Check that arrays of these sizes, of `count` rows, fit on the device; else MemoryError."""
     needed, free = count_bytes(sizes), torch.cuda.mem_get_info(device)[0]
     if needed > free:
         row = -(-needed // count)

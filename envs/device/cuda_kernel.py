@@ -1,13 +1,11 @@
-"""A row's generator on the device: NumPy's PCG64, which draws one 64-bit key a reset.
-
-Its 128-bit numbers are four words of 32 bits, the lowest first: first the state, then the
-increment. M. E. O'Neill, "PCG: A Family of Simple Fast Space-Efficient Statistically Good
-Algorithms for Random Number Generation", 2014.
-
-The fused kernel: one env-step of a row in each of CUDA's threads, resets included.
+# numba's own types say too little about itself:
+# mypy: disable-error-code="attr-defined,no-untyped-call,no-untyped-def"
+"""The fused CUDA kernel: an env-step of a row in each thread, with resets and PCG64 generators.
 
 Rows lie along the last axis of what a tick reads and writes, so that neighbouring threads touch
-neighbouring numbers.
+neighbouring numbers. A generator is NumPy's PCG64 (M. E. O'Neill, "PCG: A Family of Simple Fast
+Space-Efficient Statistically Good Algorithms for Random Number Generation", 2014): state, then
+increment, each of four words of 32 bits, the lowest first.
 """
 
 from collections.abc import Sequence
@@ -39,7 +37,7 @@ _M0, _M1, _M2, _M3 = 0x9FCCF645, 0x4385DF64, 0x1FC65DA4, 0x2360ED05
 
 
 def draw_key(words: Any) -> Any:
-    """The generator's next 64 bits as (low, high) of 32; its words (WORDS,) move on."""
+    """Draw the generator's next 64 bits as (low, high) of 32; its words (WORDS,) advance."""
     a, b, c, d = int(words[0]), int(words[1]), int(words[2]), int(words[3])
     aa, ab, ba = a * _M0, a * _M1, b * _M0
     ac, bb, ca = a * _M2, b * _M1, c * _M0
@@ -60,11 +58,12 @@ def draw_key(words: Any) -> Any:
 
 
 def _extract_high(product: int) -> int:
+    """Extract the upper 32 of 64 bits."""
     return (product >> 32) & _MASK
 
 
 def read_words(generators: Sequence[np.random.Generator]) -> npt.NDArray[np.int64]:
-    """The words (WORDS, N) of generators as they are now."""
+    """Read the words (WORDS, N) of generators."""
     words = np.empty((WORDS, len(generators)), np.int64)
     for i, generator in enumerate(generators):
         state: Any = generator.bit_generator.state["state"]
@@ -73,21 +72,17 @@ def read_words(generators: Sequence[np.random.Generator]) -> npt.NDArray[np.int6
     return words
 
 
-# numba's own types say too little about itself:
-# mypy: disable-error-code="attr-defined,no-untyped-call,no-untyped-def"
-
-
 NAME = "sideslip_step"
 """The kernel's name in its PTX."""
 
-RUNS, OVER, ASKED = range(3)  # of `Memory.over`; ASKED: it is to be reset
+RUNS, _OVER, ASKED = range(3)  # of `DeviceArrays.over`; ASKED: it is to be reset
 MODES = ("Disabled", "NextStep", "SameStep")
 _, NEXT_STEP, SAME_STEP = range(3)
-DRAWN = DRAWS_WIDTH, DRAWS_WIDTH, len(Motion._fields)  # of a packed start, behind the parameters
+_DRAWN = DRAWS_WIDTH, DRAWS_WIDTH, len(Motion._fields)  # of a packed start, behind the parameters
 
 
 class KernelConstants(NamedTuple):
-    """What is the same for all rows and all steps: the compiler takes it for constants."""
+    """Constants of the compiled kernel, the same for all rows and steps."""
 
     mode: int  # when rows that ended are reset
     n: int  # ticks of a control period
@@ -96,35 +91,30 @@ class KernelConstants(NamedTuple):
     width: int  # of the packed parameters, a trace included
     entries: int  # of an observation
     inputs: int  # of an action
-    packets: int  # the most of a step
+    packets: int  # largest number in a step
     record: int  # whether records are written to the device's memory
 
 
 def make_constants(config: EnvConfig, mode: str, record: bool) -> KernelConstants:
-    """How an env's rows are stepped."""
+    """Make the kernel's constants from an env's config, autoreset mode and whether it records."""
     base = config.base
     return KernelConstants(
-        mode=MODES.index(mode),
-        n=int(config.control_period),
-        kind=get_start_variant(base.start),
-        switches=Switches(*base.start.switches.tolist()),
-        width=len(base.start.params),
-        entries=len(config.layout),
-        inputs=config.action_width,
-        packets=config.max_packets,
+        mode=MODES.index(mode), n=int(config.control_period), kind=get_start_variant(base.start),
+        switches=Switches(*base.start.switches.tolist()), width=len(base.start.params),
+        entries=len(config.layout), inputs=config.action_width, packets=config.max_packets,
         record=int(record),
-    )
+    )  # fmt: skip
 
 
 class DeviceArrays(NamedTuple):
-    """What lies on the device, N rows; `make_specification` has types and shapes."""
+    """Arrays on the device, of N rows; `make_specification` has types and shapes."""
 
     params: Any
     states: Any
     reports: Any
-    over: Any  # RUNS, OVER or ASKED
-    generators: Any  # `generator.draw_key`
-    which: Any  # of a row that is asked for, its place in starts
+    over: Any  # RUNS, _OVER or ASKED
+    generators: Any  # as `draw_key` reads them
+    which: Any  # index in starts of a row that is asked for
     starts: Any  # packed one behind the other: parameters, low, high, motion; the first: no options
     switches: Any  # of the starts
     bounds: Any
@@ -140,7 +130,7 @@ class DeviceArrays(NamedTuple):
     counts: Any  # of ticks and of packets
 
 
-class ThreadArrays(NamedTuple):
+class _ThreadArrays(NamedTuple):
     """A thread's own working arrays, or its part of the record."""
 
     switches: Any
@@ -150,53 +140,37 @@ class ThreadArrays(NamedTuple):
 
 
 def make_specification(constants: KernelConstants, real: type, N: int, starts: int) -> DeviceArrays:
-    """(type, shape) of each array."""
-    width, byte, report = constants.width + sum(DRAWN), np.uint8, len(REPORT)
+    """Make (type, shape) of each array, for N rows and a number of starts."""
+    width, byte, report = constants.width + sum(_DRAWN), np.uint8, len(REPORT)
     ends, n_record = N * (constants.mode == SAME_STEP), N * constants.record
     return DeviceArrays(
-        params=(real, (constants.width, N)),
-        states=(real, (STATE_WIDTH, N)),
-        reports=(real, (report, N)),
-        over=(byte, (N,)),
-        generators=(np.int64, (WORDS, N)),
-        which=(np.int64, (N,)),
-        starts=(real, (starts, width)),
-        switches=(np.int64, (starts, len(FLAGS))),
-        bounds=(real, (2, constants.entries)),
-        actions=(np.float32, (N, constants.inputs)),
-        obs=(np.float32, (N, constants.entries)),
-        rewards=(real, (N,)),
-        terminated=(byte, (N,)),
-        truncated=(byte, (N,)),
-        final_obs=(np.float32, (ends, constants.entries)),
-        final_reports=(real, (report, ends)),
+        params=(real, (constants.width, N)), states=(real, (STATE_WIDTH, N)),
+        reports=(real, (report, N)), over=(byte, (N,)), generators=(np.int64, (WORDS, N)),
+        which=(np.int64, (N,)), starts=(real, (starts, width)),
+        switches=(np.int64, (starts, len(FLAGS))), bounds=(real, (2, constants.entries)),
+        actions=(np.float32, (N, constants.inputs)), obs=(np.float32, (N, constants.entries)),
+        rewards=(real, (N,)), terminated=(byte, (N,)), truncated=(byte, (N,)),
+        final_obs=(np.float32, (ends, constants.entries)), final_reports=(real, (report, ends)),
         rows=(real, (constants.n, FAST_WIDTH, n_record)),
         packets=(real, (constants.packets, PACKET_WIDTH, n_record)),
         counts=(np.int64, (2, n_record)),
-    )
+    )  # fmt: skip
 
 
 def pack_starts(starts: Sequence[EpisodeStart]) -> tuple[Array, npt.NDArray[np.int64]]:
-    """`Memory.starts` and `Memory.switches`."""
-    packed = [
-        np.concatenate([start.params, start.low, start.high, start.motion]) for start in starts
-    ]
+    """Pack starts as `DeviceArrays.starts` and `DeviceArrays.switches`."""
+    packed = [np.concatenate([x.params, x.low, x.high, x.motion]) for x in starts]
     return np.stack(packed), np.stack([start.switches for start in starts])
 
 
-def step_row(
-    i: int, resets: bool, constants: KernelConstants, m: DeviceArrays, thread_arrays: ThreadArrays
+def _step_row(
+    i: int, resets: bool, constants: KernelConstants, m: DeviceArrays, thread_arrays: _ThreadArrays
 ) -> None:
-    """One env-step of row i; or its reset, if `resets` and it is ASKED."""
+    """Step row i by one env-step; or reset it, if `resets` and it is ASKED."""
     row = EpisodeArrays(
-        m.params[:, i],
-        m.states[:, i],
-        thread_arrays.switches,
-        m.obs[i],
-        thread_arrays.rows,
-        thread_arrays.packets,
-        m.reports[:, i],
-    )
+        m.params[:, i], m.states[:, i], thread_arrays.switches, m.obs[i], thread_arrays.rows,
+        thread_arrays.packets, m.reports[:, i],
+    )  # fmt: skip
     start_index, over = 0, int(m.over[i])
     if resets:
         if over != ASKED:
@@ -215,7 +189,7 @@ def step_row(
         if not (terminated or truncated):
             return
         if constants.mode != SAME_STEP:
-            m.over[i] = OVER
+            m.over[i] = _OVER
             return
         copy_into(row.obs, m.final_obs[i])
         copy_into(row.report, m.final_reports[:, i])
@@ -225,7 +199,7 @@ def step_row(
 
 
 def _run_row(row: Any, action: Any, constants: KernelConstants, bounds: Any, window: Any) -> int:
-    """An env-step of a row that runs; returns how many ticks it took."""
+    """Step a row that runs by one env-step; return the ticks done."""
     yaw_share, steer_share = clip_action(action)
     if yaw_share != yaw_share:
         reject_action(row)
@@ -234,17 +208,9 @@ def _run_row(row: Any, action: Any, constants: KernelConstants, bounds: Any, win
         return 0
     precompute_window(row.p, row.z, constants.n, constants.kind.has_driver, window)
     done = integrate_step(
-        row.p,
-        row.z,
-        constants.kind,
-        yaw_share,
-        steer_share,
-        constants.n,
-        row.rows,
-        row.report,
-        window,
-        True,
-    )
+        row.p, row.z, constants.kind, yaw_share, steer_share, constants.n, row.rows, row.report,
+        window, True,
+    )  # fmt: skip
     finish_step(row, constants.n, done, bounds, window)
     return int(done)
 
@@ -254,40 +220,34 @@ def _reset_row(
 ) -> None:
     """Start a row's next episode, with the next key of its generator."""
     packed, low = m.starts[start_index], constants.width
-    high = low + DRAWN[0]
-    motion = high + DRAWN[1]
+    high = low + _DRAWN[0]
+    motion = high + _DRAWN[1]
     start = EpisodeStart(
-        packed[:low],
-        packed[low:high],
-        packed[high:motion],
-        m.switches[start_index],
+        packed[:low], packed[low:high], packed[high:motion], m.switches[start_index],
         packed[motion:],
-    )
+    )  # fmt: skip
     key_low, key_high = draw_key(generator)
     reset_vehicle(start, key_low, key_high, m.bounds, row)
 
 
 def _count(i: int, constants: KernelConstants, m: DeviceArrays, done: int, report: Any) -> None:
+    """Write the numbers of ticks and packets of row i's record."""
     if constants.record:
         m.counts[0, i], m.counts[1, i] = done, int(report[REPORT.packets])
 
 
 def make_kernel(constants: KernelConstants, real: type[np.floating[Any]]) -> Any:
-    """The kernel's function, for numba-cuda or its simulator; arguments are N, whether rows are
-    reset, and the pointers of `Memory`."""
-    step, make_array = to_cuda(step_row, real), _get_numbers if SIMULATED else carray
+    """Make the kernel for numba-cuda or its simulator.
+
+    Its arguments are N, whether rows are reset, and pointers to `DeviceArrays`, of floats `real`.
+    """
+    step, make_array = to_cuda(_step_row, real), _get_numbers if SIMULATED else carray
     floats = types.float32 if real is np.float32 else types.float64
-    width, entries, inputs, report = (
-        constants.width,
-        constants.entries,
-        constants.inputs,
-        len(REPORT),
-    )
-    packed, flags, record = constants.width + sum(DRAWN), len(FLAGS), constants.record
-    window_shape = (len(make_window(1)), constants.n)
-    rows_shape, packets_shape = (constants.n, FAST_WIDTH), (constants.packets, PACKET_WIDTH)
-    n, ticks, max_packets, columns = constants.n, FAST_WIDTH, constants.packets, PACKET_WIDTH
-    thread_rows_shape, thread_packets_shape = (*rows_shape, 1), (*packets_shape, 1)
+    width, entries, inputs = constants.width, constants.entries, constants.inputs
+    packed, flags, record = width + sum(_DRAWN), len(FLAGS), constants.record
+    n, max_packets, report = constants.n, constants.packets, len(REPORT)
+    window_shape = (len(make_window(1)), n)
+    rows_shape, packets_shape = (n, FAST_WIDTH, 1), (max_packets, PACKET_WIDTH, 1)
 
     def step_kernel(
         N, resets, params, states, reports, over, generators, which, starts, switches, bounds,
@@ -298,42 +258,29 @@ def make_kernel(constants: KernelConstants, real: type[np.floating[Any]]) -> Any
         if i >= N:
             return
         memory = DeviceArrays(
-            make_array(params, (width, N)),
-            make_array(states, (STATE_WIDTH, N)),
-            make_array(reports, (report, N)),
-            make_array(over, (N,)),
-            make_array(generators, (WORDS, N)),
-            make_array(which, (N,)),
-            make_array(starts, (N, packed)),
-            make_array(switches, (N, flags)),
-            make_array(bounds, (2, entries)),
-            make_array(actions, (N, inputs)),
-            make_array(obs, (N, entries)),
-            make_array(rewards, (N,)),
-            make_array(terminated, (N,)),
-            make_array(truncated, (N,)),
-            make_array(final_obs, (N, entries)),
-            make_array(final_reports, (report, N)),
-            make_array(rows, (n, ticks, N)),
-            make_array(packets, (max_packets, columns, N)),
-            make_array(counts, (2, N)),
-        )
+            make_array(params, (width, N)), make_array(states, (STATE_WIDTH, N)),
+            make_array(reports, (report, N)), make_array(over, (N,)),
+            make_array(generators, (WORDS, N)), make_array(which, (N,)),
+            make_array(starts, (N, packed)), make_array(switches, (N, flags)),
+            make_array(bounds, (2, entries)), make_array(actions, (N, inputs)),
+            make_array(obs, (N, entries)), make_array(rewards, (N,)), make_array(terminated, (N,)),
+            make_array(truncated, (N,)), make_array(final_obs, (N, entries)),
+            make_array(final_reports, (report, N)), make_array(rows, (n, FAST_WIDTH, N)),
+            make_array(packets, (max_packets, PACKET_WIDTH, N)), make_array(counts, (2, N)),
+        )  # fmt: skip
         if record:
             own_rows, own_packets = memory.rows[:, :, i], memory.packets[:, :, i]
         else:  # laid out like a part of the record, for one type of both
-            own_rows = cuda.local.array(thread_rows_shape, floats)[:, :, 0]
-            own_packets = cuda.local.array(thread_packets_shape, floats)[:, :, 0]
-        thread_arrays = ThreadArrays(
-            cuda.local.array(flags, types.int64),
-            cuda.local.array(window_shape, floats),
-            own_rows,
-            own_packets,
-        )
+            own_rows = cuda.local.array(rows_shape, floats)[:, :, 0]
+            own_packets = cuda.local.array(packets_shape, floats)[:, :, 0]
+        own_flags = cuda.local.array(flags, types.int64)
+        own_window = cuda.local.array(window_shape, floats)
+        thread_arrays = _ThreadArrays(own_flags, own_window, own_rows, own_packets)
         step(i, resets, constants, memory, thread_arrays)
 
     return step_kernel
 
 
 def _get_numbers(array: Any, shape: Any) -> Any:
-    """What a pointer stands for in the simulator."""
+    """Get the array of a simulated pointer."""
     return array.numbers

@@ -1,9 +1,9 @@
-"""The kernel as PTX, compiled without a GPU and kept on disk.
+# numba's and the driver's own types say too little about themselves:
+# mypy: disable-error-code="attr-defined,no-untyped-call"
+"""The kernel's PTX, cached on disk, and its launch by CUDA's driver or in numba's simulator.
 
-In float64 a product and a sum are never contracted to one operation: numba-cuda's decorator has no
-switch for it, NVVM's call has.
-
-Launches of the kernel: by CUDA's driver on torch's current stream, or by numba's simulator.
+PTX is compiled without a GPU. In float64 a product and a sum are never contracted to one operation,
+for which NVVM's call has a switch and numba-cuda's decorator has none.
 """
 
 import contextlib
@@ -14,14 +14,11 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from importlib.metadata import version
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numba import cuda, types
-from numba.cuda import dispatcher
-from numba.cuda.compiler import compile_cuda, kernel_fixup
-from numba.cuda.cudadrv.nvvm import NVVM
-from numba.cuda.np.numpy_support import from_dtype
 
 from ..io import replace_file
 from ..numerics import kernel_cache
@@ -29,17 +26,22 @@ from ..numerics.torch_backend import torch
 from .cuda_kernel import NAME, KernelConstants, make_kernel, make_specification
 from .cuda_text import SIMULATED
 
-# numba's own types say too little about itself:
-# mypy: disable-error-code="attr-defined,no-untyped-call"
+if not SIMULATED:  # the simulator has no compiler
+    from numba.cuda import dispatcher
+    from numba.cuda.compiler import compile_cuda, kernel_fixup
+    from numba.cuda.cudadrv.nvvm import NVVM
+    from numba.cuda.np.numpy_support import from_dtype
 
-
-Capability = tuple[int, int]  # of a GPU: (9, 0) is an H200
+Tensor = torch.Tensor
+BLOCK = 128  # threads; 255 registers each leave a multiprocessor of an H200 two such blocks
+_SIMULATED_BLOCK = 4
+_Capability = tuple[int, int]  # of a GPU: (9, 0) is an H200
 
 
 def get_ptx(
-    constants: KernelConstants, real: type[np.floating[Any]], capability: Capability
+    constants: KernelConstants, real: type[np.floating[Any]], capability: _Capability
 ) -> str:
-    """The PTX of a kernel for GPUs of a compute capability, from the disk where it is."""
+    """Get a kernel's PTX for GPUs of a compute capability, from the disk or compiled."""
     folder = kernel_cache.find_kernel_folder("envs")
     versions = version("numba-cuda"), version("numba"), NVVM().get_version()
     key = json.dumps([constants, real.__name__, capability, versions])
@@ -57,17 +59,16 @@ def get_ptx(
 
 
 def _make_header(key: str, text: bytes) -> bytes:
-    """The first line of a file: what it was compiled for, and its text's hash."""
+    """Make the first line of a file: the key of its compilation, and its text's hash."""
     return f"// {key} {hashlib.sha256(text).hexdigest()}".encode()
 
 
 def _compile_ptx(
-    constants: KernelConstants, real: type[np.floating[Any]], capability: Capability
+    constants: KernelConstants, real: type[np.floating[Any]], capability: _Capability
 ) -> str:
-    pointers = [
-        types.CPointer(from_dtype(np.dtype(dtype)))
-        for dtype, _ in make_specification(constants, real, 1, 1)
-    ]
+    """Compile the kernel's PTX."""
+    specification = make_specification(constants, real, 1, 1)
+    pointers = [types.CPointer(from_dtype(np.dtype(dtype))) for dtype, _ in specification]
     with _set_capability(capability):
         result = compile_cuda(
             make_kernel(constants, real),
@@ -84,8 +85,8 @@ def _compile_ptx(
 
 
 @contextlib.contextmanager
-def _set_capability(capability: Capability) -> Iterator[None]:
-    """numba-cuda asks the driver for which GPU a device function is: there may be none here."""
+def _set_capability(capability: _Capability) -> Iterator[None]:
+    """Set the compute capability, which numba-cuda asks a driver for that may be missing."""
 
     class Device:
         compute_capability = capability
@@ -98,29 +99,24 @@ def _set_capability(capability: Capability) -> Iterator[None]:
 
 
 def count_opcodes(ptx: str) -> Counter[str]:
-    """How many of each instruction there are in a PTX text."""
+    """Count the instructions of a PTX text by name."""
     return Counter(re.findall(r"^\t(?:@!?%\w+ )?([a-z][a-z0-9]*(?:\.[a-z0-9:]+)*)[\s;]", ptx, re.M))
 
 
-# the driver's types say too little about themselves:
-# mypy: disable-error-code="no-untyped-call"
-
-
-BLOCK = 128  # threads; 255 registers each leave a multiprocessor of an H200 two such blocks
-_SIMULATED_BLOCK = 4
-
-Tensor = torch.Tensor
-
-
 def make_context_current(device: torch.device) -> None:
-    """Make torch's context the current one."""
+    """Make torch's context on the device the current one."""
     torch.empty(1, device=device)
 
 
 class DriverKernel:
-    """The kernel of a PTX text on a GPU; driver: `cuda.bindings.driver`.
+    """The kernel of a PTX text on a GPU.
 
     Raises RuntimeError where the GPU refuses it, MemoryError where its memory does not suffice.
+
+    Args:
+        ptx: PTX text.
+        device: GPU.
+        driver: Module `cuda.bindings.driver`.
     """
 
     def __init__(self, ptx: str, device: torch.device, driver: Any) -> None:
@@ -135,7 +131,7 @@ class DriverKernel:
             self._function = self._check_result(function_result, label)
 
     def __call__(self, count: int, resets: bool, arrays: Sequence[Tensor]) -> None:
-        """Step the rows, or reset those that are asked for; arrays as in `Memory`."""
+        """Step `count` rows, or reset those that are asked for; arrays as in `DeviceArrays`."""
         values = (count, resets, *(array.data_ptr() for array in arrays))
         kinds = (ctypes.c_int64, ctypes.c_bool, *[ctypes.c_void_p] * len(arrays))
         grid, block = (-(-count // BLOCK), 1, 1), (BLOCK, 1, 1)
@@ -147,7 +143,7 @@ class DriverKernel:
         self._check_result(launched, f"a step of {count} rows on {self._device}")
 
     def _check_result(self, result: Any, label: str) -> Any:
-        """What the driver returned besides its code."""
+        """Get the driver's result besides its code, of which a failure raises."""
         code, *values = result
         if code.value != 0:
             out_of_memory = code == self._driver.CUresult.CUDA_ERROR_OUT_OF_MEMORY
@@ -155,33 +151,26 @@ class DriverKernel:
         return values[0] if values else None
 
 
-class SimulatedPointer:
-    """A pointer of the simulator."""
-
-    def __init__(self, tensor: Tensor) -> None:
-        self.numbers = tensor.numpy()
-
-
 def load_kernel(
     constants: KernelConstants, real: type[np.floating[Any]], device: torch.device
 ) -> Any:
-    """The kernel, on a GPU or in the simulator."""
+    """Load the kernel of floats `real` on a GPU or in the simulator."""
     if SIMULATED:
-        return SimulatedKernel(constants, real)
+        return _SimulatedKernel(constants, real)
     from cuda.bindings import driver
 
-    return DriverKernel(
-        get_ptx(constants, real, torch.cuda.get_device_capability(device)), device, driver
-    )
+    ptx = get_ptx(constants, real, torch.cuda.get_device_capability(device))
+    return DriverKernel(ptx, device, driver)
 
 
-class SimulatedKernel:
+class _SimulatedKernel:
     """The kernel in numba's simulator: plain Python, a thread after the other."""
 
     def __init__(self, constants: KernelConstants, real: type[np.floating[Any]]) -> None:
         self._kernel: Any = cuda.jit(make_kernel(constants, real))
 
     def __call__(self, count: int, resets: bool, arrays: Sequence[Tensor]) -> None:
-        """As `DriverKernel`."""
+        """Step or reset rows as `DriverKernel` does."""
         blocks = -(-count // _SIMULATED_BLOCK)
-        self._kernel[blocks, _SIMULATED_BLOCK](count, resets, *map(SimulatedPointer, arrays))
+        pointers = [SimpleNamespace(numbers=array.numpy()) for array in arrays]
+        self._kernel[blocks, _SIMULATED_BLOCK](count, resets, *pointers)

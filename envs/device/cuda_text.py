@@ -1,9 +1,8 @@
 # numba's own types say too little about itself:
 # mypy: disable-error-code="attr-defined,call-arg,misc,no-untyped-call,no-untyped-def"
-"""The engine's text as device functions: CUDA's table of primitives, and literals of one precision.
+"""The engine's functions as CUDA device functions, rebuilt from the code of the other engines.
 
-numba-cuda compiles plain Python functions; those of the engine are rebuilt for it from the code
-objects that every other engine runs.
+CUDA has its own primitives, and literals are of one precision.
 """
 
 from collections.abc import Callable
@@ -20,15 +19,13 @@ from ..numerics.packed import load_element, read, store_element, write
 with require_extra("cuda", "the CUDA engine needs numba-cuda"):
     import numba_cuda as numba_cuda  # numba's own `cuda` is another
 
+_Function = Callable[..., Any]
 SIMULATED = bool(cuda.config.ENABLE_CUDASIM)
 """Whether numba simulates CUDA in Python (NUMBA_ENABLE_CUDASIM=1)."""
 
 
 def to_cuda(function: Any, real: type[np.floating[Any]]) -> Any:
-    """The text of a function and its callees as device functions whose floats are of `real`.
-
-    In numba's simulator they stay plain Python.
-    """
+    """Rebuild a function and its callees with floats of `real`, plain Python in the simulator."""
 
     def finish(rebuilt: Any) -> Any:
         if real is not np.float64:
@@ -40,7 +37,7 @@ def to_cuda(function: Any, real: type[np.floating[Any]]) -> Any:
     return as_python(function, _SINGLE if real is np.float32 else None, finish)
 
 
-_SINGLE: dict[str, Callable[..., Any]] = {
+_SINGLE: dict[str, _Function] = {
     "to_word": lambda a: int(np.float32(a).view(np.uint32)),
     "from_word": lambda a: np.uint32(a).view(np.float32),
 }
@@ -48,8 +45,7 @@ _SINGLE: dict[str, Callable[..., Any]] = {
 
 
 def _set_precision(function: Any, real: Any) -> None:
-    """Give the function's literals and global numbers a precision: what meets a float64 becomes
-    one."""
+    """Give the function's literals and global numbers a precision, so that no float64 enters."""
     names, code = function.__globals__, function.__code__
     function.__code__ = code.replace(co_consts=_convert_literals(code.co_consts, real))
     for name in code.co_names:
@@ -58,10 +54,11 @@ def _set_precision(function: Any, real: Any) -> None:
 
 
 def _convert_literals(value: Any, real: Any) -> Any:
+    """Convert the floats of a value and of nested tuples."""
     if isinstance(value, float):
         return real(value)
     if isinstance(value, tuple) and not isinstance(value, CodeType):
-        make = getattr(value, "_make", tuple)
+        make = getattr(value, "_make", tuple)  # of a named tuple
         return make([_convert_literals(item, real) for item in value])
     return value
 
@@ -70,8 +67,8 @@ def _compile_device(function: Any) -> Any:
     return cuda.jit(device=True, forceinline=True)(function)
 
 
-def _make_table(real: Any) -> dict[str, Callable[..., Any]]:
-    """The primitives that CUDA has its own text for, by the names that the equations use."""
+def _make_table(real: Any) -> dict[str, _Function]:
+    """Make CUDA's own primitives by the names that the equations use."""
     from numba.cuda import libdevice
 
     single = real is np.float32
@@ -103,24 +100,21 @@ def _make_table(real: Any) -> dict[str, Callable[..., Any]]:
     return {name: _compile_device(text) for name, text in texts.items()} | _register_access()
 
 
-def _register_access() -> dict[str, Callable[..., Any]]:
-    """How packed arrays are read and written, taught to numba-cuda once."""
+def _register_access() -> dict[str, _Function]:
+    """Register numba-cuda's versions of reading and writing packed arrays, once."""
     if not _registered:
         from numba.cuda.extending import overload
 
         jit_options = {"forceinline": True}
-        for function, typing in (
-            (read, _read),
-            (write, _write),
-            (load_element, _load_element),
-            (store_element, _store_element),
-        ):
+        functions: list[_Function] = [read, write, load_element, store_element]
+        typings: list[_Function] = [_read, _write, _load_element, _store_element]
+        for function, typing in zip(functions, typings, strict=True):
             overload(function, jit_options=jit_options)(typing)
             _registered[function.__name__] = function
     return _registered
 
 
-_registered: dict[str, Callable[..., Any]] = {}
+_registered: dict[str, _Function] = {}
 
 
 def _format_column(j: Any) -> str:
@@ -128,7 +122,7 @@ def _format_column(j: Any) -> str:
 
 
 def _build_function(text: str, **names: Any) -> Any:
-    exec(text, names)  # of our own words alone
+    exec(text, names)  # the text is made here alone
     return names["written"]
 
 

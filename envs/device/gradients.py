@@ -1,4 +1,4 @@
-"""A user's tensors in the place of packed numbers, with their graph; what must not flow back."""
+"""Gradients on tensors: a user's tensors in place of packed numbers, and a gate for gradients."""
 
 import copy
 import dataclasses
@@ -20,16 +20,12 @@ _FIELDS = [field.name for field in dataclasses.fields(Vehicle) if field.name != 
 
 
 class GradientGate:
-    """Lets gradients through to the rows that are `open` (N,), zero to the others.
-
-    Where numbers overflow a slope is no number, and stays none when it is multiplied by zero; so
-    do slopes that overflow while the numbers do not yet.
-    """
+    """Gate of gradients: they pass to rows that are `open` (N,), finite ones alone, else zeros."""
 
     open: Tensor
 
     def __call__(self, value: Tensor) -> Tensor:
-        """The value (..., N); `open` may be set until the gradients come."""
+        """Gate a value (..., N); `open` may be set until the gradients come."""
         if not (torch.is_grad_enabled() and value.requires_grad):
             return value
         gated = value.view_as(value)
@@ -41,7 +37,7 @@ class GradientGate:
 
 
 class ResetTensors(NamedTuple):
-    """Tensors that a reset has in the place of numbers, by name."""
+    """Tensors in a reset's options in place of numbers, by name."""
 
     parameters: dict[str, Any]  # of `Vehicle`, as they came: they may change
     state: dict[str, Tensor]  # (N,), of `Motion`
@@ -53,10 +49,17 @@ NO_TENSORS = ResetTensors({}, {})
 def split_inputs(
     options: Mapping[str, Any], base: EpisodeConfig, count: int, template: Tensor
 ) -> tuple[dict[str, Any], ResetTensors]:
-    """(options of reset without tensors, those tensors) for `count` rows.
+    """Split options of reset into those without tensors, and the tensors.
 
-    template: has the device and the dtype. Raises ValueError for a parameter that the plant does
-    not take from a vehicle by itself, a value that no vehicle has, another shape or another device.
+    Args:
+        options: Options of reset.
+        base: Config of an episode without options.
+        count: Number of rows.
+        template: Tensor with the device and the type of floats.
+
+    Returns:
+        Options without tensors, and the tensors; ValueError for a parameter that the plant does not
+        take from a vehicle, an impossible value, another shape or another device.
     """
     remaining = dict(options)
     parameters = dict(check_mapping("reset option parameters", remaining.pop("parameters", {})))
@@ -67,18 +70,15 @@ def split_inputs(
         low, high = _expand_rows(name, value, count, template).detach().aminmax()
         base.vehicle.replace(**{name: low.item()}).replace(**{name: high.item()})
     if parameters and base.scenario.roll:  # which they make together
-        columns = [
-            _expand_rows(k, tensor, count, template).detach() for k, tensor in parameters.items()
-        ]
-        for row in set(zip(*(tensor.tolist() for tensor in columns), strict=True)):
+        expanded = (_expand_rows(k, value, count, template) for k, value in parameters.items())
+        for row in set(zip(*(tensor.detach().tolist() for tensor in expanded), strict=True)):
             base.vehicle.replace(**dict(zip(parameters, row, strict=True))).check_roll()
     state = remaining.get("state")
     state_values = dict(state) if isinstance(state, Mapping) else {}
-    state_tensors = {
-        name: tensor for name, tensor in state_values.items() if isinstance(tensor, torch.Tensor)
-    }
     tensors = {
-        name: _expand_rows(name, tensor, count, template) for name, tensor in state_tensors.items()
+        name: _expand_rows(name, value, count, template)
+        for name, value in state_values.items()
+        if isinstance(value, torch.Tensor)
     }
     if tensors:
         rows = torch.stack(list(tensors.values())).detach().T.tolist()
@@ -87,7 +87,7 @@ def split_inputs(
 
 
 def _expand_rows(name: str, value: Any, count: int, template: Tensor) -> Tensor:
-    """A tensor () or (count,), or a number, as (count,)."""
+    """Expand a tensor () or (count,), or a number, to (count,)."""
     if not isinstance(value, torch.Tensor):
         value = template.new_tensor(check_number(name, value))
     if value.shape not in ((), (count,)):
@@ -99,37 +99,35 @@ def _expand_rows(name: str, value: Any, count: int, template: Tensor) -> Tensor:
 
 
 def _pack_vehicle(vehicle: Vehicle, config: EpisodeConfig) -> dict[int, Any]:
-    """The packed parameters that follow from a vehicle, by place."""
+    """Pack the parameters that follow from a vehicle, by place."""
     task = make_task_params(vehicle, config.scenario, True)
     return dict(zip((*P.car, *P.task), (*make_car(vehicle), *task), strict=True))
 
 
 def _replace_values(vehicle: Vehicle, values: Mapping[str, Any]) -> Vehicle:
-    """A copy of the vehicle with these values, which are not looked at."""
+    """Copy the vehicle with these values, unchecked."""
     changed = copy.copy(vehicle)
     vars(changed).update(values)
     return changed
 
 
 def _find_places(names: Iterable[str], config: EpisodeConfig) -> list[int]:
-    """Where the packed parameters lie that these of a vehicle make: without them they are NaN.
-
-    The friction under the right wheels is the vehicle's where the scenario has none of its own.
-    """
+    """Find the places of the packed parameters that depend on these of a vehicle."""
     changed = _replace_values(config.vehicle, dict.fromkeys(names, np.nan))
+    # the friction under the right wheels is the vehicle's where the scenario has none of its own
     excluded = () if config.scenario.friction_right is None else (P.car.mu_r,)
     packed = _pack_vehicle(changed, config).items()
     return [place for place, value in packed if value != value and place not in excluded]
 
 
 def replace_motion(motion: Tensor, state: Mapping[str, Tensor], rows: Tensor) -> Tensor:
-    """The motion (len(Motion), M) of some rows with the tensors (N,) of a reset."""
+    """Replace the motion (len(Motion), M) of some rows by a reset's tensors (N,)."""
     numbers = dict(zip(Motion._fields, motion.unbind(0), strict=True))
     return torch.stack([state[name][rows] if name in state else numbers[name] for name in numbers])
 
 
 class AttachedParameters:
-    """The tensors that stand in the packed parameters of some rows."""
+    """Tensors in the packed parameters of some rows."""
 
     def __init__(self) -> None:
         self._held: list[tuple[Tensor, list[EpisodeConfig], dict[str, Any]]] = []
@@ -137,35 +135,31 @@ class AttachedParameters:
     def put(
         self, rows: Tensor, configs: Sequence[EpisodeConfig], parameters: dict[str, Any]
     ) -> None:
-        """Parameters (N,) of these rows (M,) from now on, in the place of those that they had."""
+        """Put parameters (N,) of these rows (M,) in place of those that they had."""
         selected = torch.zeros(len(configs), dtype=torch.bool, device=rows.device)
         selected[rows] = True
-        remaining = [
-            (mask & ~selected, old_configs, parameters_held)
-            for mask, old_configs, parameters_held in self._held
-        ]
+        remaining = [(mask & ~selected, old, values) for mask, old, values in self._held]
         self._held = [entry for entry in remaining if entry[0].any()]
         if parameters:
             self._held.append((selected, list(configs), parameters))
 
     def insert_tensors(self, params: Tensor) -> Tensor:
-        """The packed parameters (PARAMS_WIDTH, N) with them."""
+        """Insert the tensors into the packed parameters (PARAMS_WIDTH, N)."""
         columns, count = list(params.unbind(0)), params.shape[1]
         for mask, configs, parameters in self._held:
             values = {
                 name: params.new_tensor([getattr(config.vehicle, name) for config in configs])
                 for name in _FIELDS
             }
-            values |= {
-                k: _expand_rows(k, tensor, count, params) for k, tensor in parameters.items()
-            }
+            for name, tensor in parameters.items():
+                values[name] = _expand_rows(name, tensor, count, params)
             packed = _pack_vehicle(_replace_values(configs[0].vehicle, values), configs[0])
             for place in _find_places(parameters, configs[0]):
                 columns[place] = torch.where(mask, packed[place], columns[place])
         return torch.stack(columns) if self._held else params
 
     def write(self, params: Tensor, packed: Array) -> None:
-        """Their numbers from params (PARAMS_WIDTH, N) into packed ones (N, PARAMS_WIDTH)."""
+        """Write the tensors' numbers in params (PARAMS_WIDTH, N) to packed (N, PARAMS_WIDTH)."""
         for mask, configs, parameters in self._held:
             places = _find_places(parameters, configs[0])
             where = np.ix_(mask.cpu().numpy(), np.array(places))

@@ -1,4 +1,4 @@
-"""DeviceVectorEnv: many cars on torch tensors; observations and rewards stay on the device."""
+"""`DeviceVectorEnv`: many cars on torch tensors, whose results stay on the device."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -32,6 +32,7 @@ from .base import (
     parse_device_actions,
     parse_dtype,
     read_infos,
+    refuse_actions,
 )
 from .gradients import NO_TENSORS, split_inputs
 from .torch_outputs import PacketCapacity, compute_capacity
@@ -43,8 +44,7 @@ _Links = dict[int, set[Link]]  # by the sensor's place
 
 
 class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
-    """`num_envs` environments on a device: the equations, the noise and the episodes of
-    `StabilityVectorEnv`, seed by seed, in tensors.
+    """`num_envs` environments on a device, `StabilityVectorEnv` in tensors, seed by seed.
 
     In float64 an env-step agrees with the other engines' from the same state to 1e-9, and so does a
     second of stable driving. In float32 a step of 10 ms is within 1e-5 m/s, 1e-6 rad/s and 1e-4 m
@@ -52,42 +52,43 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
     `DeviceVectorEnv.make(id, num_envs=N, device="cuda")` builds that of an id. Needs torch, of the
     extra `train`.
 
-    ## Arguments
-    arguments: those of `StabilityEnv`. device: "cpu", "cuda", "cuda:1", ... dtype: "float64" or
-    "float32". autoreset_mode: "NextStep", "SameStep" or "Disabled", as of `StabilityVectorEnv`.
-    compile: a tick and what follows the ticks go through `torch.compile`, which takes minutes
-    once, and on the CPU needs a C++ compiler (without one it warns and does not). engine: "torch",
-    or "cuda", which makes a `CudaVectorEnv`: one kernel a step. grad: what a step returns has
-    gradients, below.
-
     ## Tensors
-    Observations are (N, k) float32, rewards (N,), `terminated` and `truncated` (N,) of bool.
-    Infos are tensors (N,), of every row. All are new ones each time. After a step `rows`
-    (N, n, FAST_WIDTH), of which `ticks_done` (N,) are there, and `packets` (N, most, PACKET_WIDTH),
-    of which `delivered` (N,) are, make the record.
-
-    Actions are tensors (N, width) on the device. A bad one does what it does in the vector env. A
-    step waits for the device once, to learn whether one was bad and whether an episode ended.
+    Observations are (N, k) float32, rewards (N,), `terminated` and `truncated` (N,) of bool, infos
+    (N,) of every row; all are new ones each time. The first `ticks_done` (N,) of `rows`
+    (N, n, FAST_WIDTH) and `delivered` (N,) of `packets` (N, max, PACKET_WIDTH) make the record.
+    Actions are tensors (N, width) on the device, a bad one as in the vector env. A step waits for
+    the device once, to learn whether one was bad and whether an episode ended.
 
     ## Reset
-    By the compiled engine, on the host, from each row's own generator; what it drew is copied over.
+    The compiled engine resets on the host, from each row's own generator; its draws are copied.
     Options are those of `StabilityVectorEnv`, but all rows have a plant of one kind: tyres, roll,
     lags, small angles and whether a driver reacts to the car are those of the env's own scenario.
 
     ## Gradients
-    With `grad=True` observations (then of `dtype`, and actions are not rounded), rewards, infos,
-    `rows`, `packets` and `motion` have gradients to actions and to tensors () or (N,) in `reset`'s
-    options: `state`, by the names of a `Motion`, and `parameters`, by those of a `Vehicle`, true
-    ones in the place of what the seed drew. A row that is reset starts a graph of its own. At a
-    limit (actuators, grip, actions, the cost's cap) they are those of one side; they know nothing
-    of when something happens: failures, ends, arrivals. An env-step in which a row's numbers
+    With `grad=True` observations, rewards, infos, `rows`, `packets` and `motion` have gradients to
+    actions and to tensors () or (N,) in `reset`'s options: `state`, by the names of a `Motion`, and
+    `parameters`, by those of a `Vehicle`, true ones in place of the seed's draws. Observations are
+    then of `dtype`, and actions are not rounded. A row that is reset starts a graph of its own. At
+    a limit (actuators, grip, actions, the cost's cap) the gradients are those of one side; they do
+    not contain the times of failures, ends and arrivals. An env-step in which a row's numbers
     overflow has none.
 
     Raises TypeError or ValueError for an argument out of place and a device that is not there.
+
+    Args:
+        num_envs: Number of environments N.
+        device: "cpu", "cuda", "cuda:1", ...
+        dtype: "float64" or "float32".
+        autoreset_mode: "NextStep", "SameStep" or "Disabled", as of `StabilityVectorEnv`.
+        compile: Whether a tick and the step's end go through `torch.compile`, which takes minutes
+            once, and on the CPU needs a C++ compiler (without one it warns and does not).
+        engine: "torch", or "cuda", which makes a `CudaVectorEnv`: one kernel a step.
+        grad: Whether results have gradients.
+        arguments: Arguments of `StabilityEnv`.
     """
 
     def __new__(cls, *arguments: Any, engine: str = "torch", **named: Any) -> Any:
-        """The environments of another engine where it is chosen."""
+        """Make the environments of the chosen engine."""
         check_choice("engine", engine, ("torch", "cuda"))
         if engine == "torch":
             return super().__new__(cls)
@@ -132,7 +133,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
 
     @classmethod
     def make(cls, env_id: str, num_envs: int = 1, **arguments: Any) -> "DeviceVectorEnv":
-        """The environments of an id; `arguments` replace its own."""
+        """Make `num_envs` environments of a registered `env_id`; `arguments` replace its own."""
         spec = gym.spec(env_id)
         if spec.vector_entry_point != "sideslip.envs.vector:StabilityVectorEnv":
             raise ValueError(f"{env_id} has no environment on the device")
@@ -141,8 +142,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
     def _collect_links(
         self, configs: Iterable[EpisodeConfig]
     ) -> tuple[_Links, dict[int, PacketCapacity]]:
-        """The slow sensors' links in these configs and those before, and the room that they take;
-        ValueError for a config of another kind of plant."""
+        """Collect the slow sensors' links, these configs' and those before, and their capacity."""
         configs = list({id(config): config for config in configs}.values())
         for config in configs:
             if config.scenario.steering in ("trace", "wander"):
@@ -157,13 +157,10 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
             for sensor, previous in self._links.items()
         }
         n = self.control_period
-        return links, {
-            sensor: compute_capacity(list(sensor_links), n)
-            for sensor, sensor_links in links.items()
-        }
+        return links, {i: compute_capacity(list(known), n) for i, known in links.items()}
 
     def _build(self, capacities: dict[int, PacketCapacity]) -> None:
-        """The step with these capacities, and all rows on the device."""
+        """Build the step with these capacities, and copy all rows to the device."""
         host = self._host
         switches = read(host.config.base.start.switches, FLAGS)
         obs_dtype = self.dtype if self._grad else torch.float32
@@ -184,13 +181,9 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         chosen = np.flatnonzero(parse_reset_mask(mask, self.num_envs))
         inputs = NO_TENSORS
         if self._grad:
-            template = self._rows.params
-            reset_options, inputs = split_inputs(
-                reset_options, host.config.base, self.num_envs, template
-            )
-        episode_options = {
-            name: value for name, value in reset_options.items() if name != "reset_mask"
-        }
+            place = host.config.base, self.num_envs, self._rows.params
+            reset_options, inputs = split_inputs(reset_options, *place)
+        episode_options = {k: value for k, value in reset_options.items() if k != "reset_mask"}
         configs, _ = host.apply_options(episode_options, chosen.tolist())
         links, capacities = self._collect_links(configs)
         needs_rebuild = capacities != self._rows.capacities
@@ -212,10 +205,8 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         if not self._started:
             raise ResetNeeded("no episode was started: call reset() first")
         if self._has_over and self._mode == AutoresetMode.DISABLED:
-            over = self._rows.state.over.nonzero()[:, 0].tolist()
-            raise ResetNeeded(
-                f"the episode is over in {format_rows(over)}: call reset() with a reset_mask"
-            )
+            over = format_rows(self._rows.state.over.nonzero()[:, 0].tolist())
+            raise ResetNeeded(f"the episode is over in {over}: call reset() with a reset_mask")
         config, rows = self._host.config, self._rows
         fail = config.on_bad_action == "fail"
         commands = parse_device_actions(
@@ -226,11 +217,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         flags = torch.stack((outcome.refused.any(), state.over.any()))
         refused, ended = flags.tolist()  # the one time the device is waited for
         if refused and not fail:
-            bad_rows = outcome.refused.nonzero()[:, 0].tolist()
-            raise ValueError(
-                f"the action of {format_rows(bad_rows)} is not finite, "
-                f"{commands[bad_rows[0]].tolist()}; nothing was stepped"
-            )
+            refuse_actions(commands, outcome.refused)
         over_rows = rows.state.over if self._has_over else None
         rows.state, rows.outcome, self._has_over = state, outcome, ended
         infos: Infos = {}
@@ -246,10 +233,7 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         return rows.outcome.obs.clone(), outcome.rewards, *ends, infos
 
     def detach(self) -> None:
-        """Cut the graph at the state: what follows has no gradients to actions and states before.
-
-        Parameters stay attached, by a graph of their own and with the values that they have now.
-        """
+        """Cut the graph at the state, from earlier actions and states; parameters stay attached."""
         self._rows.detach()
 
     def _reset_rows(self, over: Tensor) -> None:
@@ -260,36 +244,36 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         self._rows.upload(self._host, chosen)
 
     def _make_infos(self) -> Infos:
-        """The numbers of `info` of every row, (N,) each."""
+        """Make the numbers of `info` of every row, (N,) each."""
         return read_infos(self._rows.state.report.clone())
 
     @property
     def rows(self) -> Tensor:
-        """The fast rows of the newest record, (N, n, FAST_WIDTH)."""
+        """Fast rows of the newest record, (N, n, FAST_WIDTH)."""
         return self._rows.outcome.rows.permute(2, 0, 1)
 
     @property
     def packets(self) -> Tensor:
-        """The packets of the newest record, (N, most, PACKET_WIDTH)."""
+        """Packets of the newest record, (N, max, PACKET_WIDTH)."""
         return self._rows.outcome.packets.permute(2, 0, 1)
 
     @property
     def ticks_done(self) -> Tensor:
-        """How many of `rows` are there, (N,)."""
+        """Number of `rows` of the newest record, (N,)."""
         return self._rows.outcome.done
 
     @property
     def delivered(self) -> Tensor:
-        """How many of `packets` are there, (N,)."""
+        """Number of `packets` of the newest record, (N,)."""
         return self._rows.outcome.delivered
 
     @property
     def motion(self) -> Tensor:
-        """The true `Motion` of each row now, (N, len(Motion)), in SI units."""
+        """True `Motion` of each row now, (N, len(Motion)), in SI units."""
         return self._rows.state.motion.T.clone()
 
     def tensors(self) -> tuple[TorchState, StepOutcome]:
-        """The state of the rows on the device and the newest step's outcome; the env's own."""
+        """Get the state of the rows and the newest step's outcome, the env's own tensors."""
         return self._rows.state, self._rows.outcome
 
     @property  # type: ignore[misc]  # without a setter, as in the vector env
@@ -298,16 +282,14 @@ class DeviceVectorEnv(VectorEnv[Any, Any, Any]):
         return self._host.np_random
 
     def get_state(self) -> dict[str, Any]:
-        """A snapshot of all rows, which `StabilityVectorEnv.set_state` takes too."""
+        """Copy the state of all rows, which `StabilityVectorEnv.set_state` takes too."""
         self._rows.download(self._host)
         return self._host.get_state()
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Go back to a snapshot of this env, or of a `StabilityVectorEnv` built with the same
-        arguments.
+        """Restore a snapshot of this env, or of a `StabilityVectorEnv` with the same arguments.
 
-        Raises ValueError for one of another number of rows, control period or observation, and one
-        whose rows have another kind of plant.
+        Raises ValueError for one of other rows or sizes, or of another kind of plant.
         """
         if not isinstance(snapshot, Mapping):
             raise ValueError(f"a snapshot of this engine is a mapping, got {short_repr(snapshot)}")

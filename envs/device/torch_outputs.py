@@ -1,10 +1,7 @@
-"""The slow sensors of an env-step on tensors: captures, packets under way, deliveries.
+"""Outputs of an env-step on tensors: slow sensors with their packets, observation and report.
 
-A row's packets lie in the order of their arrival, (arrived, captured, sensor), those under way
-first and nothing behind them. An env-step puts the new ones to them, puts all in order, and takes
-off the front what has arrived.
-
-The observation and the report of an env-step, on tensors.
+A row's packets are sorted by (arrived, captured, sensor). An env-step appends the new ones, sorts
+all, and removes those that have arrived from the front.
 """
 
 from collections.abc import Sequence
@@ -25,7 +22,7 @@ from ..vehicle.dynamics import Motion
 from .torch_ticks import InfoValues, TickState
 
 Tensor = torch.Tensor
-_NEVER_KEY = 1 << 62  # the place of what never arrives
+_NEVER_KEY = 1 << 62  # sorts packets that never arrive behind all others
 
 
 class SlowState(NamedTuple):
@@ -36,23 +33,23 @@ class SlowState(NamedTuple):
 
 
 class Delivered(NamedTuple):
-    """The packets that arrived in an env-step."""
+    """Packets that arrived in an env-step."""
 
-    packets: Tensor  # (most, PACKET_WIDTH, N)
-    number: Tensor  # (N,), how many of them are there
+    packets: Tensor  # (max, PACKET_WIDTH, N)
+    number: Tensor  # (N,), how many of them count
 
 
 class TickWindow(NamedTuple):
-    """The ticks of an env-step: after `first`, up to `last`, (N,) each."""
+    """Ticks of an env-step: after `first`, up to `last`, (N,) each."""
 
     first: Tensor
     last: Tensor
     running: Tensor  # rows that were stepped
-    track: Tensor  # (n, len(Motion), N), where the car was at each tick
+    track: Tensor  # (n, len(Motion), N), motion at each tick
 
 
 class PacketCapacity(NamedTuple):
-    """The most packets of a sensor."""
+    """Largest numbers of packets of a sensor."""
 
     frames: int  # captured in an env-step
     under_way: int  # packets at once
@@ -60,7 +57,7 @@ class PacketCapacity(NamedTuple):
 
 
 def compute_capacity(links: Sequence[Link], n: int) -> PacketCapacity:
-    """The capacity for sensors with any of these links in an env-step of n ticks."""
+    """Compute the capacity for sensors with any of these links in an env-step of n ticks."""
     return PacketCapacity(
         max(-int(-n // link.period) for link in links),
         max(count_max_in_flight(link) for link in links),
@@ -69,24 +66,23 @@ def compute_capacity(links: Sequence[Link], n: int) -> PacketCapacity:
 
 
 class SlowSensors:
-    """The slow sensors of a batch: those present, each with its capacity."""
+    """Slow sensors of a batch: those present, by index, each with its capacity."""
 
     def __init__(
         self, capacities: dict[int, PacketCapacity], small_angle: int, dtype: torch.dtype
     ) -> None:
         self.capacities, self._small_angle = capacities, small_angle
         (
-            self._sample_sensor,
-            self._make_measurement_context,
-            self._compute_arrivals,
-            self._read,
+            self._sample_sensor, self._make_measurement_context, self._compute_arrivals, self._read,
             self._select,
-        ) = to_torch(dtype, sample_sensor, make_measurement_context, compute_arrivals, read, select)
+        ) = to_torch(
+            dtype, sample_sensor, make_measurement_context, compute_arrivals, read, select
+        )  # fmt: skip
 
     def __call__(
         self, p: Tensor, keys: Tensor, state: SlowState, window: TickWindow
     ) -> tuple[SlowState, Delivered]:
-        """The slow sensors' state after an env-step, and what arrived in it."""
+        """Compute the slow sensors' state after an env-step, and the packets that arrived in it."""
         sensors = [list(sensor_state.unbind(0)) for sensor_state in state.slow.unbind(0)]
         new_packets: list[Tensor] = []
         for sensor, capacity in self.capacities.items():
@@ -95,26 +91,24 @@ class SlowSensors:
                     sensor, p, keys, sensors[sensor], window
                 )
                 new_packets += packets
-        queue = sort_packets(torch.cat([state.queue, torch.stack(new_packets)]))
+        queue = _sort_packets(torch.cat([state.queue, torch.stack(new_packets)]))
         arrived = queue[:, PACKET.arrived]
         due = (arrived != NEVER) & (arrived <= window.last) & window.running
         count = due.sum(0)
         slow = self._update_newest(sensors, queue, due)
-        remaining = remove_first(queue, count)[: len(state.queue)]
+        remaining = _remove_first(queue, count)[: len(state.queue)]
         return SlowState(slow, remaining), Delivered(queue, count)
 
     def _capture_frame(
         self, sensor: int, p: Tensor, keys: Tensor, slow: Sequence[Tensor], window: TickWindow
     ) -> tuple[list[Tensor], list[Tensor]]:
-        """The next frame of a sensor where it falls into the window: (the sensor's state then, its
-        packets, of which those that are none never arrive)."""
+        """Capture a sensor's next frame if it is in the window: (sensor's state, its packets)."""
         pick = self._select
         frame, tick = slow[SLOW_STATE.frames], slow[SLOW_STATE.next_capture]
         active = window.running & (tick > window.first) & (tick <= window.last)
         when = tick.to(torch.int64)
         j = (when - window.first.to(torch.int64) - 1).clamp(0, len(window.track) - 1)
-        width = window.track.shape[1]
-        row_index = j.expand(1, width, -1)
+        row_index = j.expand(1, window.track.shape[1], -1)
         motion = Motion(*window.track.gather(0, row_index)[0].unbind(0))
         link = self._read(p, P.slow[sensor])
         context = self._make_measurement_context(p, motion, self._small_angle, keys, tick)
@@ -124,14 +118,12 @@ class SlowSensors:
             for number in (quality, frame, *values)
         ]
         packets = []
-        arrival_ticks = self._compute_arrivals(
-            link, frame, tick, keys[0], keys[1], BLOCKS[sensor].link
-        )
+        block = BLOCKS[sensor].link
+        arrival_ticks = self._compute_arrivals(link, frame, tick, keys[0], keys[1], block)
         for arrived in arrival_ticks[: self.capacities[sensor].copies]:
-            arrival_tick = pick(active, arrived, NEVER)
-            packets.append(
-                torch.stack((torch.full_like(tick, sensor), tick, arrival_tick, *fields))
-            )
+            arrival_tick = pick(active, arrived, NEVER)  # outside the window it never arrives
+            head = torch.full_like(tick, sensor), tick, arrival_tick
+            packets.append(torch.stack((*head, *fields)))
         next_state = list(slow)
         next_state[SLOW_STATE.frames] = pick(active, frame + 1.0, frame)
         next_state[SLOW_STATE.next_capture] = pick(active, tick + link.period, tick)
@@ -139,7 +131,7 @@ class SlowSensors:
         return next_state, packets
 
     def _update_newest(self, sensors: list[list[Tensor]], queue: Tensor, due: Tensor) -> Tensor:
-        """The sensors' state, as in `SlowState`, once the due packets were looked at in order."""
+        """Update the sensors' newest samples by the due packets; return their `SlowState.slow`."""
         pick = self._select
         for i in range(len(queue)):
             packet = queue[i].unbind(0)
@@ -149,19 +141,15 @@ class SlowSensors:
                 is_newer = is_newer & (packet[PACKET.captured] > slow[SLOW_STATE.captured])
                 if NEEDS_QUALITY[sensor]:
                     is_newer = is_newer & (packet[PACKET.quality] > 0.0)
-                newest = (
-                    packet[PACKET.captured],
-                    *packet[PACKET.value : PACKET.value + VALUES],
-                    packet[PACKET.arrived],
-                )
+                values = packet[PACKET.value : PACKET.value + VALUES]
+                newest = (packet[PACKET.captured], *values, packet[PACKET.arrived])
                 for k, value in enumerate(newest, SLOW_STATE.captured):
                     slow[k] = pick(is_newer, value, slow[k])
         return torch.stack([torch.stack(sensor_state) for sensor_state in sensors])
 
 
-def sort_packets(queue: Tensor) -> Tensor:
-    """Packets (count, PACKET_WIDTH, N) by (arrived, captured, sensor), those that never arrive
-    last."""
+def _sort_packets(queue: Tensor) -> Tensor:
+    """Sort packets (count, PACKET_WIDTH, N); those that never arrive come last."""
     stamps = queue[:, :3].to(torch.int64)
     arrived = stamps[:, PACKET.arrived]
     key = (arrived << 32) + len(Z.slow) * stamps[:, PACKET.captured] + stamps[:, PACKET.sensor]
@@ -174,8 +162,8 @@ def sort_packets(queue: Tensor) -> Tensor:
     return queue.gather(0, order[:, None].expand(-1, PACKET_WIDTH, -1))
 
 
-def remove_first(queue: Tensor, count: Tensor) -> Tensor:
-    """The rest of packets in order, (capacity, PACKET_WIDTH, N), without the first `count` (N,)."""
+def _remove_first(queue: Tensor, count: Tensor) -> Tensor:
+    """Remove the first `count` (N,) of sorted packets (capacity, PACKET_WIDTH, N)."""
     place = torch.arange(len(queue), device=queue.device)[:, None] + count
     is_gone = place >= len(queue)
     place = place.clamp(max=len(queue) - 1)
@@ -186,15 +174,14 @@ def remove_first(queue: Tensor, count: Tensor) -> Tensor:
 
 
 def read_packed(states: Tensor, capacity: int) -> SlowState:
-    """The slow sensors' part of packed states (STATE_WIDTH, N); ValueError where they hold more
-    than `capacity` packets."""
+    """Read the slow sensors' part of states (STATE_WIDTH, N) with at most `capacity` packets."""
     if bool((states[Z.under_way] > capacity).any()):
         raise ValueError(f"a state has more than {capacity} packets under way")
     slow = states[Z.slow[0].frames : Z.queue].reshape(len(Z.slow), SLOW_WIDTH, -1)
     queue = states[Z.queue : Z.driver].reshape(-1, PACKET_WIDTH, states.shape[1])[:capacity].clone()
     place = torch.arange(capacity, device=queue.device)[:, None]
     queue[:, PACKET.arrived].masked_fill_(place >= states[Z.under_way], NEVER)
-    return SlowState(slow.clone(), sort_packets(queue))
+    return SlowState(slow.clone(), _sort_packets(queue))
 
 
 def write_packed(state: SlowState, states: Tensor) -> None:
@@ -212,18 +199,18 @@ def write_packed(state: SlowState, states: Tensor) -> None:
 class Observer:
     """Observations and reports of a batch.
 
-    sensors: the slow ones present. bounds: (2, k), of the observation's entries. obs_dtype: of the
-    observations.
+    Args:
+        sensors: Slow sensors present, by index.
+        switches: Switches of the plant and the task.
+        bounds: Bounds of the observation's entries, shape (2, k).
+        dtype: Type of floats.
+        obs_dtype: Type of observations.
     """
 
     def __init__(
-        self,
-        sensors: tuple[int, ...],
-        switches: Switches,
-        bounds: Tensor,
-        dtype: torch.dtype,
+        self, sensors: tuple[int, ...], switches: Switches, bounds: Tensor, dtype: torch.dtype,
         obs_dtype: torch.dtype,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._obs_dtype = obs_dtype
         self._sensors, self._switches = sensors, switches
         self._bounds = bounds[:, :, None]
@@ -234,10 +221,7 @@ class Observer:
     def observe(
         self, rows: Tensor, done: Tensor, tick_state: TickState, slow: Tensor, delivered: Delivered
     ) -> Tensor:
-        """The summary (N, k).
-
-        rows: (n, FAST_WIDTH, N), of which the first `done` (N,) count. slow: as in `Under`.
-        """
+        """Compute the observation (N, k) from the first `done` (N,) of rows (n, FAST_WIDTH, N)."""
         entries: list[Tensor] = []
         sampled = rows[:, :N_SAMPLED]
         if self._switches.all_samples:
@@ -261,48 +245,36 @@ class Observer:
     def _read_sensor(
         self, sensor: int, tick: Tensor, slow: Tensor, delivered: Delivered
     ) -> list[Tensor]:
-        """Values, age and freshness of one sensor's newest sample."""
+        """Read values, age and freshness of one sensor's newest sample."""
         captured = slow[SLOW_STATE.captured]
         age = self._select(captured != NEVER, (tick - captured) * TICK, AGE_CAP)
         packets = delivered.packets
         place = torch.arange(len(packets), device=tick.device)[:, None]
-        is_newest = (
-            packets[:, PACKET.arrived] == slow[SLOW_STATE.arrived]
-        )  # neither late nor a duplicate
+        # neither late nor a duplicate
+        is_newest = packets[:, PACKET.arrived] == slow[SLOW_STATE.arrived]
         is_fresh = (place < delivered.number) & (packets[:, PACKET.sensor] == sensor) & is_newest
         values = [slow[i] for i in SLOW_STATE.values[: WIDTHS[sensor]]]
         return [*values, age, is_fresh.any(0).to(tick.dtype)]
 
     def report(self, tick_state: TickState, duration: Tensor, count: Tensor) -> Tensor:
-        """The reports (len(Report), N) of rows that were stepped."""
+        """Compute the reports (len(StepReport), N) of rows that were stepped."""
         failure_cost = self._compute_failure_cost(duration, tick_state.tick)
         cost = tick_state.cost + self._select(tick_state.failure != RUNNING, failure_cost, 0.0)
         info_values = InfoValues(*tick_state.shown)
         values = {
-            "t": tick_state.tick * TICK,
-            "beta": info_values.beta,
-            "gamma": tick_state.motion[2],
-            "psi": tick_state.motion[3],
-            "beta_ref": info_values.beta_ref,
-            "gamma_ref": info_values.gamma_ref,
-            "steer": info_values.steer,
-            "yaw_moment": info_values.moment,
-            "cost": cost,
-            "failure": tick_state.failure,
-            "packets": count.to(cost.dtype),
-            "reward": -cost,
+            "t": tick_state.tick * TICK, "beta": info_values.beta, "gamma": tick_state.motion[2],
+            "psi": tick_state.motion[3], "beta_ref": info_values.beta_ref,
+            "gamma_ref": info_values.gamma_ref, "steer": info_values.steer,
+            "yaw_moment": info_values.moment, "cost": cost, "failure": tick_state.failure,
+            "packets": count.to(cost.dtype), "reward": -cost,
             "ended": (tick_state.tick >= duration).to(cost.dtype),
-        }
+        }  # fmt: skip
         return torch.stack([values[name] for name in StepReport._fields])
 
     def report_refusal(self, tick_state: TickState, duration: Tensor, before: Tensor) -> Tensor:
-        """The reports of rows that an action which is not finite fails; the rest stays."""
+        """Compute the reports of rows that fail by a non-finite action, from those before."""
         cost = self._compute_failure_cost(duration, tick_state.tick)
         values = dict(zip(StepReport._fields, before.unbind(0), strict=True))
-        values |= {
-            "cost": cost,
-            "failure": torch.full_like(cost, BAD_ACTION),
-            "packets": torch.zeros_like(cost),
-            "reward": -cost,
-        }
+        values |= {"cost": cost, "reward": -cost, "packets": torch.zeros_like(cost)}
+        values["failure"] = torch.full_like(cost, BAD_ACTION)
         return torch.stack([values[name] for name in StepReport._fields])

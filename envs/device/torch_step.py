@@ -1,8 +1,4 @@
-"""One env-step of all rows on tensors, from state to state, observation and report: a pure function
-that never waits for the device.
-
-Tick 0 on tensors: what `reset_vehicle` delivers, computed from where the cars start.
-"""
+"""Env-steps of all rows on tensors, pure functions that never wait for the device; and tick 0."""
 
 from typing import Any, NamedTuple
 
@@ -29,19 +25,19 @@ Tensor = torch.Tensor
 
 
 class TorchState(NamedTuple):
-    """The state of the rows that an env-step changes; the rows are the last axis."""
+    """State of the rows that an env-step changes; the rows are the last axis."""
 
     motion: Tensor  # (len(Motion), N)
-    drive: Tensor  # (len(Drive), N)
+    drive: Tensor  # (len(ActuatorState), N)
     driver: Tensor  # (N,)
     refs: Tensor  # (2, N)
-    nominal_motion: Tensor  # (len(Lead), N)
+    nominal_motion: Tensor  # (len(NominalMotion), N)
     tick: Tensor
     failure: Tensor
     slow: Tensor  # the fields of `SlowState`
     queue: Tensor
     over: Tensor  # (N,) of bool
-    report: Tensor  # (len(Report), N)
+    report: Tensor  # (len(StepReport), N)
 
     @property
     def slow_state(self) -> SlowState:
@@ -50,7 +46,7 @@ class TorchState(NamedTuple):
 
 
 class StepOutcome(NamedTuple):
-    """The outcome of an env-step."""
+    """Outcome of an env-step."""
 
     obs: Tensor  # (N, k); zeros where the row had no tick
     rewards: Tensor  # (N,)
@@ -58,30 +54,31 @@ class StepOutcome(NamedTuple):
     truncated: Tensor
     refused: Tensor  # (N,), the action is not finite and counts
     rows: Tensor  # (n, FAST_WIDTH, N)
-    packets: Tensor  # (most, PACKET_WIDTH, N)
+    packets: Tensor  # (max, PACKET_WIDTH, N)
     done: Tensor  # (N,), how many ticks and packets there are, int64
     delivered: Tensor
 
 
 class TorchStep:
-    """The env-steps of rows of one kind.
+    """Env-steps of rows of one variant.
 
-    kind: what chooses the plant's text. most: the slow sensors present, each with its
-    capacity. obs_dtype: of the observations. compile: through `torch.compile`.
+    Args:
+        kind: Variant of the ticks.
+        n: Ticks of an env-step.
+        capacities: Capacity of each slow sensor present, by index.
+        switches: Switches of the plant and the task.
+        bounds: Bounds of the observation's entries, shape (2, k).
+        dtype: Type of floats.
+        obs_dtype: Type of observations.
+        device: Device.
+        compile: Whether `torch.compile` is used.
     """
 
     def __init__(
-        self,
-        kind: StepVariant,
-        n: int,
-        capacities: dict[int, PacketCapacity],
-        switches: Switches,
-        bounds: Array,
-        dtype: torch.dtype,
-        obs_dtype: torch.dtype,
-        device: torch.device,
+        self, kind: StepVariant, n: int, capacities: dict[int, PacketCapacity], switches: Switches,
+        bounds: Array, dtype: torch.dtype, obs_dtype: torch.dtype, device: torch.device,
         compile: bool,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.kind, self.n, self.dtype = kind, n, dtype
         self._ticks = Ticks(kind, dtype, compile)
         self._slow = SlowSensors(capacities, kind.small_angle, dtype)
@@ -93,10 +90,9 @@ class TorchStep:
     def __call__(
         self, p: Tensor, keys: Tensor, state: TorchState, actions: Tensor
     ) -> tuple[TorchState, StepOutcome]:
-        """(the state after one env-step, its outcome).
+        """Step all rows; those that are over stand still, those with a non-finite action fail.
 
-        p: (PARAMS_WIDTH, N). keys: (2, N), int64. actions: (N, width), of the floats of p; rows
-        whose action is not finite fail. Rows that are over stand still.
+        p is (PARAMS_WIDTH, N), keys (2, N) int64, actions (N, width) of the floats of p.
         """
         is_finite = torch.isfinite(actions).all(1)
         gate = GradientGate()
@@ -105,15 +101,7 @@ class TorchStep:
         yaw_share, *steer_shares = map(gate, shares.unbind(1))
         steer_share = steer_shares[0] if steer_shares else torch.zeros_like(state.tick)
         running = is_finite & ~state.over
-        start_fields = (
-            state.motion,
-            state.drive,
-            state.driver,
-            state.refs,
-            state.nominal_motion,
-            state.tick,
-        )
-        start = make_tick_state(*start_fields, running)
+        start = make_tick_state(*state[:6], running)  # motion to tick
         tick_state, rows, track = self._ticks.integrate_step(
             p, keys, start, yaw_share, steer_share, self.n
         )
@@ -126,16 +114,10 @@ class TorchStep:
         return next_state, outcome
 
     def _finish_step(
-        self,
-        p: Tensor,
-        keys: Tensor,
-        state: TorchState,
-        tick_state: TickState,
-        rows: Tensor,
-        track: Tensor,
-        running: Tensor,
-        refused: Tensor,
-    ) -> tuple[TorchState, StepOutcome]:
+        self, p: Tensor, keys: Tensor, state: TorchState, tick_state: TickState, rows: Tensor,
+        track: Tensor, running: Tensor, refused: Tensor,
+    ) -> tuple[TorchState, StepOutcome]:  # fmt: skip
+        """Do slow sensors, observation and report of a step whose ticks are integrated."""
         done, duration = tick_state.tick - state.tick, p[P.task.duration]
         window = TickWindow(state.tick, tick_state.tick, running, track)
         slow_state, delivered = self._slow(p, keys, state.slow_state, window)
@@ -151,35 +133,21 @@ class TorchStep:
         terminated = stepped & (failure != RUNNING)
         truncated = running & (report[REPORT.ended] == 1.0) & ~terminated
         next_state = TorchState(
-            torch.stack(tick_state.motion),
-            torch.stack(tick_state.drive),
-            tick_state.driver,
-            torch.stack(tick_state.refs),
-            torch.stack(tick_state.nominal_motion),
-            tick_state.tick,
-            failure,
-            *slow_state,
-            terminated | truncated,
-            report,
-        )
+            torch.stack(tick_state.motion), torch.stack(tick_state.drive), tick_state.driver,
+            torch.stack(tick_state.refs), torch.stack(tick_state.nominal_motion), tick_state.tick,
+            failure, *slow_state, terminated | truncated, report,
+        )  # fmt: skip
         rewards = torch.where(stepped, -report[REPORT.cost], 0.0)
         return next_state, StepOutcome(
-            obs,
-            rewards,
-            terminated,
-            truncated,
-            refused,
-            rows,
-            delivered.packets,
-            done.to(torch.int64),
-            delivered.number,
-        )
+            obs, rewards, terminated, truncated, refused, rows, delivered.packets,
+            done.to(torch.int64), delivered.number,
+        )  # fmt: skip
 
 
 class TorchReset:
-    """Tick 0 of the rows of a step, so that its gradients reach motion and parameters.
+    """Tick 0 on tensors as `reset_vehicle` makes it, with gradients to motion and parameters.
 
-    sensors: the slow ones present. Where a driver follows a path, it stays where the reset laid it.
+    A path that a driver follows stays where the reset put it. `sensors` are those present.
     """
 
     def __init__(self, step: TorchStep, sensors: tuple[int, ...]) -> None:
@@ -188,27 +156,19 @@ class TorchReset:
             step.dtype, make_step_params, read, draw_normals, draw_first_drift
         )
         (
-            self._compute_target_angle,
-            self._compute_first_row,
-            self._compute_reference,
+            self._compute_target_angle, self._compute_first_row, self._compute_reference,
             self._compute_sideslip_angle,
         ) = to_torch(
-            step.dtype,
-            compute_target_angle,
-            compute_first_row,
-            compute_reference,
+            step.dtype, compute_target_angle, compute_first_row, compute_reference,
             compute_sideslip_angle,
-        )
+        )  # fmt: skip
 
     def __call__(
         self, p: Tensor, keys: Tensor, state: TorchState
     ) -> tuple[TorchState, StepOutcome]:
-        """(the state, its outcome) from a state that a reset left; arguments as in `TorchStep`."""
-        kind, params, zero = (
-            self._step.kind,
-            self._make_step_params(p),
-            torch.zeros_like(state.tick),
-        )
+        """Compute (state, outcome) at tick 0 from the state that a reset left."""
+        kind, params = self._step.kind, self._make_step_params(p)
+        zero = torch.zeros_like(state.tick)
         motion, steer = Motion(*state.motion.unbind(0)), state.driver
         if kind.has_driver:
             road, target, stop = params.road, params.target, params.task.stop
@@ -220,14 +180,9 @@ class TorchReset:
             self._draw_normals(keys[0], keys[1], 0, c) for c in (CHANNELS.inertial, CHANNELS.wheels)
         ]
         row = self._compute_first_row(
-            motion,
-            steer,
-            params.road,
-            params.car.d_f,
-            params.noise,
-            NormalDraws(*n),
+            motion, steer, params.road, params.car.d_f, params.noise, NormalDraws(*n),
             kind.small_angle,
-        )
+        )  # fmt: skip
         row = [zero + number for number in row]
         v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
         refs = torch.stack(self._compute_reference(steer, v, params.target, kind.reference))
@@ -249,7 +204,7 @@ class TorchReset:
         return result
 
     def _rewind_sensors(self, p: Tensor, keys: Tensor, slow: Tensor) -> Tensor:
-        """The slow sensors before tick 0, from how they are after it."""
+        """Compute the slow sensors' state before tick 0 from that after it."""
         sensors = list(slow.unbind(0))
         for i in self._sensors:
             after, sky = sensors[i], self._read(p, P.sky)

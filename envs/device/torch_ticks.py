@@ -1,8 +1,6 @@
-"""The ticks of an env-step on tensors: the text of `integrate_tick` for all rows, each frozen where
-its episode ends.
+"""The ticks of an env-step on tensors: `integrate_tick` for all rows, each frozen at its end.
 
-A row that fails or whose time is over stands still from then on while the others drive on: nothing
-branches on values, so the device never waits for the host.
+Nothing branches on values, so the device never waits for the host.
 """
 
 from typing import Any, NamedTuple
@@ -37,7 +35,7 @@ class InfoValues(NamedTuple):
 
 
 class TickState(NamedTuple):
-    """Where the rows are within an env-step; (N,) each, or tuples of such."""
+    """State of the rows within an env-step; (N,) each, or tuples of such."""
 
     alive: Tensor  # not frozen yet
     motion: Numbers
@@ -54,8 +52,7 @@ class TickState(NamedTuple):
 
 
 class Ticks:
-    """The ticks of rows of one kind. compile: a tick, and the chances of all ticks, are one call of
-    `torch.compile` each."""
+    """Ticks of rows of one variant; `compile`: a tick and the window go through `torch.compile`."""
 
     def __init__(self, kind: StepVariant, dtype: torch.dtype, compile: bool) -> None:
         self.kind = kind
@@ -74,7 +71,7 @@ class Ticks:
     def _precompute_window(
         self, p: Tensor, keys: Tensor, first: Tensor, n: int
     ) -> tuple[Numbers, Any]:
-        """(eight normal numbers, the programme's steering) of n ticks from `first` on, (n, N)."""
+        """Compute (eight normal numbers, profile's steering) of n ticks from `first` on, (n, N)."""
         ticks = first + torch.arange(n, device=first.device)[:, None]
         tick_numbers = ticks.to(torch.int64)
         inertial = self._draw_normals(keys[0], keys[1], tick_numbers, CHANNELS.inertial)
@@ -85,43 +82,26 @@ class Ticks:
         return inertial + wheels, self._compute_steering(ticks.to(self._dtype), profile)
 
     def _step_tick(
-        self,
-        p: Tensor,
-        yaw_share: Tensor,
-        steer_share: Tensor,
-        tick_state: TickState,
-        draws: Numbers,
-        next_steer: Any,
-    ) -> TickState:
-        """One tick of the rows that are alive.
-
-        p: (PARAMS_WIDTH, N). share, turn: (N,), of the yaw moment and the added steering.
-        """
+        self, p: Tensor, yaw_share: Tensor, steer_share: Tensor, tick_state: TickState,
+        draws: Numbers, next_steer: Any,
+    ) -> TickState:  # fmt: skip
+        """Step the rows that are alive by a tick; p is (PARAMS_WIDTH, N), the shares (N,)."""
         pick = self._select
         params = self._make_step_params(p)
         task = params.task
         car = self._apply_tyre_change(
             params.car, params.tyre_change, tick_state.tick > params.tyre_change.tick
         )
-        # the load at the tick's start is computed anew where `anywhere` holds, and here it does
-        motion, drive, nominal_motion = (
-            Motion(*tick_state.motion),
-            ActuatorState(*tick_state.drive),
-            NominalMotion(*tick_state.nominal_motion),
-        )
+        motion, drive = Motion(*tick_state.motion), ActuatorState(*tick_state.drive)
+        nominal_motion = NominalMotion(*tick_state.nominal_motion)
+        # the load at the tick's start is None: on tensors `any_lane` holds, and it is computed anew
         state = StepState(
             motion, drive, None, tick_state.driver, car, tick_state.refs, nominal_motion
         )
         next_state, measured = self._integrate_tick(
-            params,
-            yaw_share * task.yaw_scale,
-            steer_share * task.authority,
-            state,
-            tick_state.tick,
-            NormalDraws(draws[:4], draws[4:]),
-            next_steer,
-            self.kind,
-        )
+            params, yaw_share * task.yaw_scale, steer_share * task.authority, state,
+            tick_state.tick, NormalDraws(draws[:4], draws[4:]), next_steer, self.kind,
+        )  # fmt: skip
         alive, is_fit = tick_state.alive, tick_state.alive & ~measured.lost
         tick = tick_state.tick + alive
         tick_cost = self._compute_tick_cost(
@@ -129,12 +109,8 @@ class Ticks:
         )
         failure = self._select_failure(measured.lost, tick_cost.spun, tick_cost.off)
         refs = [pick(measured.lost, 0.0, ref) for ref in measured.refs]
-        info_values = (
-            pick(measured.lost, 0.0, tick_cost.beta),
-            *refs,
-            measured.steer,
-            measured.moment,
-        )
+        beta = pick(measured.lost, 0.0, tick_cost.beta)
+        info_values = (beta, *refs, measured.steer, measured.moment)
 
         def select_rows(where: Tensor, new: Any, old: Any) -> Numbers:
             return tuple(pick(where, a, b) for a, b in zip(new, old, strict=True))
@@ -155,59 +131,34 @@ class Ticks:
         )
 
     def integrate_step(
-        self,
-        p: Tensor,
-        keys: Tensor,
-        start: TickState,
-        yaw_share: Tensor,
-        steer_share: Tensor,
+        self, p: Tensor, keys: Tensor, start: TickState, yaw_share: Tensor, steer_share: Tensor,
         n: int,
-    ) -> tuple[TickState, Tensor, Tensor]:
-        """n ticks, fewer for rows that fail or end: (where they are then, the fast rows, the
-        motions), of the latter (n, width, N); a row's last ones stand for those it does not have.
+    ) -> tuple[TickState, Tensor, Tensor]:  # fmt: skip
+        """Integrate n ticks, fewer for rows that fail or end, whose last values are repeated.
+
+        Returns the state, and the fast rows and motions of all ticks, (n, width, N) each.
         """
         all_draws, steering = self.precompute_window(p, keys, start.tick + 1, n)
         tick_state, rows, track = start, [], []
         for j in range(n):
             draws = tuple(normals_of[j] for normals_of in all_draws)
-            tick_state = self.tick(
-                p,
-                yaw_share,
-                steer_share,
-                tick_state,
-                draws,
-                None if steering is None else steering[j],
-            )
+            angle = None if steering is None else steering[j]
+            tick_state = self.tick(p, yaw_share, steer_share, tick_state, draws, angle)
             rows.append(torch.stack(tick_state.row))
             track.append(torch.stack(tick_state.track))
         return tick_state, torch.stack(rows), torch.stack(track)
 
 
 def make_tick_state(
-    motion: Tensor,
-    drive: Tensor,
-    driver: Tensor,
-    refs: Tensor,
-    nominal_motion: Tensor,
-    tick: Tensor,
-    alive: Tensor,
-) -> TickState:
-    """Where rows are at the start of an env-step."""
+    motion: Tensor, drive: Tensor, driver: Tensor, refs: Tensor, nominal_motion: Tensor,
+    tick: Tensor, alive: Tensor,
+) -> TickState:  # fmt: skip
+    """Make the state of rows at the start of an env-step, from tensors (..., N)."""
     zeros = tick.new_zeros((2 + len(InfoValues._fields) + FAST_WIDTH, len(tick)))
     failure, cost, *numbers = zeros.unbind(0)
     info_values, row = numbers[: len(InfoValues._fields)], numbers[len(InfoValues._fields) :]
     # no tensor stands twice: torch.compile would compile the first tick and the others apart
     return TickState(
-        alive,
-        motion.unbind(0),
-        drive.unbind(0),
-        driver,
-        refs.unbind(0),
-        nominal_motion.unbind(0),
-        tick,
-        failure,
-        cost,
-        tuple(info_values),
-        tuple(row),
-        motion.unbind(0),
-    )
+        alive, motion.unbind(0), drive.unbind(0), driver, refs.unbind(0), nominal_motion.unbind(0),
+        tick, failure, cost, tuple(info_values), tuple(row), motion.unbind(0),
+    )  # fmt: skip

@@ -1,7 +1,4 @@
-"""One env-step of several vehicles of one kind in SIMD lanes; compiled.
-
-Rows of vehicles: the loops around `step_vehicle` and `reset_vehicle`; compiled.
-"""
+"""Env-steps and resets of a batch, its vehicles of one variant in SIMD lanes; compiled."""
 
 from typing import Any, NamedTuple
 
@@ -34,15 +31,13 @@ from .workspace import (
 )
 
 _REPORT, _REFS = len(REPORT), (REPORT.beta_ref, REPORT.gamma_ref)
-_DYNAMIC_WIDTH = Z.slow[
-    0
-].frames  # what a tick changes comes first in a state, but for the driver's angle
+_DYNAMIC_WIDTH = Z.slow[0].frames  # a tick changes the first numbers, and the driver's angle
 
 
-class LaneBuffers(NamedTuple):
-    """Working arrays of a batch step; the last axis of those of a block is the lanes'."""
+class _LaneBuffers(NamedTuple):
+    """Working arrays of a batch step; the last axis of a block's arrays is the lanes'."""
 
-    order: npt.NDArray[np.int64]  # (N,), all rows, those of one kind next to each other
+    order: npt.NDArray[np.int64]  # (N,), all rows, those of one variant next to each other
     members: npt.NDArray[np.int64]  # (lanes,), the rows in the lanes now
     params: Array
     states: Array
@@ -50,32 +45,25 @@ class LaneBuffers(NamedTuple):
     rows: Array
     reports: Array
     obs: Array  # but for the entries of slow sensors
-    window: Array  # `window.make_window` the block
-    single_window: Array  # and of a row that is stepped by itself
+    window: Array  # of the block
+    single_window: Array  # of a row that is stepped by itself
 
 
-def make_lane_buffers(count: int, n: int, entries: int) -> LaneBuffers:
-    """The block of an env of `count` rows, n ticks a step and `entries` of an observation."""
-    return LaneBuffers(
-        np.arange(count),
-        np.zeros(LANES, np.int64),
-        np.zeros((PARAMS_WIDTH, LANES)),
-        np.zeros((STATE_WIDTH, LANES)),
-        np.zeros((2, LANES)),
-        np.zeros((n, FAST_WIDTH, LANES)),
-        np.zeros((_REPORT, LANES)),
-        np.zeros((entries, LANES)),
-        make_window(n, LANES),
+def make_lane_buffers(count: int, n: int, entries: int) -> _LaneBuffers:
+    """Make the working arrays of an env of `count` rows, n ticks a step and `entries` observed."""
+    return _LaneBuffers(
+        np.arange(count), np.zeros(LANES, np.int64), np.zeros((PARAMS_WIDTH, LANES)),
+        np.zeros((STATE_WIDTH, LANES)), np.zeros((2, LANES)), np.zeros((n, FAST_WIDTH, LANES)),
+        np.zeros((_REPORT, LANES)), np.zeros((entries, LANES)), make_window(n, LANES),
         make_window(n),
-    )
+    )  # fmt: skip
 
 
 @noinline
-def step_lanes(
-    count: int, batch: BatchArrays, actions: Any, n: int, bounds: Any, buffers: LaneBuffers
+def _step_lanes(
+    count: int, batch: BatchArrays, actions: Any, n: int, bounds: Any, buffers: _LaneBuffers
 ) -> bool:
-    """One env-step of the first `count` of the block's members, of one kind, whose actions are
-    finite; False, and nothing is changed, where not all of them come to the step's end."""
+    """Step the block's first `count` members; False, and nothing changes, where one ends early."""
     params, states = batch.params, batch.states
     for lane in range(count_lanes()):
         i = buffers.members[lane if lane < count else 0]  # spare lanes repeat the first
@@ -93,17 +81,9 @@ def step_lanes(
             i = buffers.members[lane if lane < count else 0]
             overwrite_steering(params[i], states[i], n, buffers.window[:, :, lane])
     done = integrate_step(
-        buffers.params,
-        buffers.states,
-        variant,
-        load_element(buffers.shares, 0),
-        load_element(buffers.shares, 1),
-        n,
-        buffers.rows,
-        buffers.reports,
-        buffers.window,
-        False,
-    )
+        buffers.params, buffers.states, variant, load_element(buffers.shares, 0),
+        load_element(buffers.shares, 1), n, buffers.rows, buffers.reports, buffers.window, False,
+    )  # fmt: skip
     if done == 0:
         return False
     refs, last = read(buffers.reports, _REFS), len(bounds[0]) - 2
@@ -133,30 +113,16 @@ _MAX_SCALAR = 2  # up to so many vehicles are stepped one by one
 
 @jit
 def step_rows(
-    params: Any,
-    states: Any,
-    switches: Any,
-    obs: Any,
-    rows: Any,
-    packets: Any,
-    reports: Any,
-    ticks_done: Any,
-    delivered: Any,
-    over: Any,
-    actions: Any,
-    n: int,
-    bounds: Any,
-    rewards: Any,
-    terminated: Any,
-    truncated: Any,
-    buffers: LaneBuffers,
-) -> int:
-    """One env-step of every row, and how many episodes ended.
+    params: Any, states: Any, switches: Any, obs: Any, rows: Any, packets: Any, reports: Any,
+    ticks_done: Any, delivered: Any, over: Any, actions: Any, n: int, bounds: Any, rewards: Any,
+    terminated: Any, truncated: Any, buffers: _LaneBuffers,
+) -> int:  # fmt: skip
+    """Step every row by one env-step, and count the episodes that ended.
 
-    The first ten are `BatchArrays`, one by one as in `step_vehicle`. Rows whose episode is `over`
-    stand still, with reward 0, and do not end again; then those that ended in this step are. Adds
-    WILD for an action that is. Returns REFUSED, and steps nothing, where an action that is not to
-    fail its row is not finite.
+    The first ten arguments are `BatchArrays`, one by one as in `step_vehicle`. Rows whose episode
+    is `over` stand still with reward 0; then `over` is set for those that ended in this step. WILD
+    is added for an action beyond its limit. REFUSED is returned, and nothing stepped, where an
+    action that does not fail its row is not finite.
     """
     n_ended = 0
     batch = BatchArrays(
@@ -185,7 +151,7 @@ def step_rows(
         ):
             is_vectorised = False
             if n_pending > _MAX_SCALAR:
-                is_vectorised = step_lanes(n_pending, batch, actions, n, bounds, buffers)
+                is_vectorised = _step_lanes(n_pending, batch, actions, n, bounds, buffers)
             for lane in range(n_pending):
                 i = buffers.members[lane]
                 done = n if is_vectorised else _step_single(i, batch, actions, n, bounds, buffers)
@@ -206,14 +172,14 @@ def step_rows(
 
 @jit
 def read_ends(report: Any) -> tuple[float, bool, bool]:
-    """(reward, terminated, truncated) of a step's report."""
+    """Read (reward, terminated, truncated) from a step's report (len(Report),)."""
     terminated = report[REPORT.failure] != RUNNING
     return -report[REPORT.cost], terminated, report[REPORT.ended] == 1.0 and not terminated
 
 
 @jit
-def _has_variant_change(m: int, batch: BatchArrays, buffers: LaneBuffers) -> bool:
-    """Whether the next row in order has another text than this one."""
+def _has_variant_change(m: int, batch: BatchArrays, buffers: _LaneBuffers) -> bool:
+    """Whether the next row in order has another `StepVariant` than row m."""
     i, j = buffers.order[m], buffers.order[m + 1]
     flags, next_flags = batch.switches[i], batch.switches[j]
     return bool(
@@ -223,39 +189,26 @@ def _has_variant_change(m: int, batch: BatchArrays, buffers: LaneBuffers) -> boo
 
 @jit
 def _step_single(
-    i: int, batch: BatchArrays, actions: Any, n: int, bounds: Any, buffers: LaneBuffers
+    i: int, batch: BatchArrays, actions: Any, n: int, bounds: Any, buffers: _LaneBuffers
 ) -> int:
+    """Step row i by itself; return the ticks done."""
     row = get_episode_arrays(batch, i)
     return int(
         step_vehicle(
-            row.p,
-            row.z,
-            row.switches,
-            row.obs,
-            row.rows,
-            row.packets,
-            row.report,
-            actions[i],
-            n,
-            bounds,
-            buffers.single_window,
+            row.p, row.z, row.switches, row.obs, row.rows, row.packets, row.report, actions[i], n,
+            bounds, buffers.single_window,
         )
-    )
+    )  # fmt: skip
 
 
 @jit
 def reset_rows(
-    chosen: Any,
-    start_index: Any,
-    starts: EpisodeStart,
-    keys: Any,
-    bounds: Any,
-    batch: BatchArrays,
+    chosen: Any, start_index: Any, starts: EpisodeStart, keys: Any, bounds: Any, batch: BatchArrays,
     final: RecordArrays,
-) -> None:
-    """Reset the chosen rows (M,), whose records go into `final` before.
+) -> None:  # fmt: skip
+    """Reset the chosen rows (M,), whose records are first copied into `final`.
 
-    start_index: (M,), each one's place in `starts`. keys: (M, 2), two words of 32 bits.
+    `start_index` (M,) is each one's index in `starts`; keys (M, 2) are two words of 32 bits.
     """
     for m in range(len(chosen)):
         i, t = chosen[m], start_index[m]

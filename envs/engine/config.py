@@ -1,7 +1,4 @@
-"""From the public description (vehicle, scenario, sensors) to the kernel's packed numbers.
-
-The environment's configuration, checked, and that of an episode with its options.
-"""
+"""Configuration of an environment, checked, and of an episode, packed for the kernels."""
 
 import dataclasses
 import math
@@ -45,159 +42,103 @@ from ..vehicle.tyres import TYRE_LAWS
 from .layout import PARAMS_WIDTH, Disturbance, EpisodeParams, Switches, TaskParams, TyreChange
 from .workspace import EpisodeStart
 
-SPIN_ANGLE = 0.5  # rad of sideslip: the car has spun
+_SPIN_ANGLE = 0.5  # rad of sideslip: the car has spun
 
 
 @dataclass(frozen=True)
 class EpisodeConfig:
-    """An episode before its draws.
-
-    start: what a reset starts from, packed. vehicle, nominal: with the scenario's replacements.
-    held_speed: m/s, where it is one number and held exactly.
-    """
+    """An episode before its draws."""
 
     start: EpisodeStart
-    vehicle: Vehicle
-    nominal: Vehicle
+    vehicle: Vehicle  # with the scenario's replacements
+    nominal: Vehicle  # likewise
     scenario: Scenario
     slow: dict[str, SlowSensor]
-    held_speed: float | None
+    held_speed: float | None  # m/s, where it is one number and held exactly
 
 
 def make_car(vehicle: Vehicle) -> CarParams:
-    """The plant's parameters of a vehicle."""
+    """Make the plant's parameters of a vehicle."""
     return CarParams(
-        m=vehicle.mass,
-        I=vehicle.yaw_inertia,
-        l_f=vehicle.front_arm,
-        l_r=vehicle.rear_arm,
-        C_f=vehicle.front_stiffness,
-        C_r=vehicle.rear_stiffness,
-        d_f=vehicle.front_track,
-        d_r=vehicle.rear_track,
-        r=vehicle.wheel_radius,
-        T_max=vehicle.motor_torque,
-        mu=vehicle.friction,
-        l_pre=vehicle.preview,
-        S=vehicle.roll_moment_arm,
-        I_x=vehicle.roll_inertia,
-        K_x=vehicle.roll_stiffness,
-        C_x=vehicle.roll_damping,
-        h=vehicle.gravity_height,
-        forward=vehicle.antenna_ahead,
-        left=vehicle.antenna_left,
-        mu_r=vehicle.friction,
-        P=vehicle.motor_power,
-        h_x=vehicle.transfer_height,
-    )
+        m=vehicle.mass, I=vehicle.yaw_inertia, l_f=vehicle.front_arm, l_r=vehicle.rear_arm,
+        C_f=vehicle.front_stiffness, C_r=vehicle.rear_stiffness, d_f=vehicle.front_track,
+        d_r=vehicle.rear_track, r=vehicle.wheel_radius, T_max=vehicle.motor_torque,
+        mu=vehicle.friction, l_pre=vehicle.preview, S=vehicle.roll_moment_arm,
+        I_x=vehicle.roll_inertia, K_x=vehicle.roll_stiffness, C_x=vehicle.roll_damping,
+        h=vehicle.gravity_height, forward=vehicle.antenna_ahead, left=vehicle.antenna_left,
+        mu_r=vehicle.friction, P=vehicle.motor_power, h_x=vehicle.transfer_height,
+    )  # fmt: skip
 
 
 def make_task_params(vehicle: Vehicle, scenario: Scenario, yaw_first: bool) -> TaskParams:
-    """The episode's length and limits."""
+    """Make the episode's length and limits; yaw_first: the yaw moment comes before acceleration."""
     return TaskParams(
-        duration=count_ticks(scenario.duration),
-        half_width=scenario.half_width,
-        yaw_scale=vehicle.yaw_moment_limit,
-        yaw_first=float(yaw_first),
-        spin=SPIN_ANGLE,
-        authority=vehicle.steering_authority,
-        slew=vehicle.steering_rate * TICK,
+        duration=count_ticks(scenario.duration), half_width=scenario.half_width,
+        yaw_scale=vehicle.yaw_moment_limit, yaw_first=float(yaw_first), spin=_SPIN_ANGLE,
+        authority=vehicle.steering_authority, slew=vehicle.steering_rate * TICK,
         stop=vehicle.steering_stop,
-    )
+    )  # fmt: skip
 
 
 def _make_speed_profile(scenario: Scenario) -> SpeedProfile:
-    """The driver's work along the road; the speed itself is drawn."""
+    """Make the driver's speed profile; the speed itself is drawn."""
     profile = SpeedProfile(
         speed=0.0, hold=1.0, acceleration=0.0, start=0.0, end=FOREVER, k_p=2.0, k_i=0.5
     )
     if scenario.acceleration is not None:
         return profile._replace(hold=0.0, acceleration=scenario.acceleration)
     if scenario.speed_change:
-        start = count_ticks(scenario.change_start)
-        profile = profile._replace(
-            acceleration=scenario.speed_change / scenario.change_length,
-            start=start,
-            end=start + count_ticks(scenario.change_length),
-        )
+        start, length = scenario.change_start, scenario.change_length
+        rate, tick = scenario.speed_change / length, count_ticks(start)
+        profile = profile._replace(acceleration=rate, start=tick, end=tick + count_ticks(length))
     return profile._replace(surge=scenario.surge, surge_rate=math.tau * scenario.surge_frequency)
 
 
 def _make_link(scenario: Scenario, name: str, sensor: SlowSensor | None) -> Link:
+    """Make a slow sensor's link with the scenario's outage."""
     try:
         return make_link(sensor, getattr(scenario, f"{name}_outage", None))
     except ValueError as error:
         raise ValueError(f"scenario {short_repr(scenario.name)}: {name}: {error}") from None
 
 
-def _make_road(scenario: Scenario) -> RoadParams:
-    """The road but for its curvature and bank, which are drawn."""
-    return RoadParams(
-        curvature=0.0,
-        start=scenario.curve_start,
-        ramp=scenario.curve_ramp,
-        lateral=0.0,
-        longitudinal=GRAVITY * math.sin(scenario.grade),
-    )
-
-
-def _make_satellite_geometry(scenario: Scenario, link: Link) -> SatelliteGeometry:
-    """The satellites of a scenario, at the GPS's own period."""
-    decay = math.exp(-link.period * TICK / scenario.hdop_time)
-    return SatelliteGeometry(
-        median=math.log(scenario.hdop),
-        spread=scenario.hdop_spread,
-        decay=decay,
-        noise_gain=math.sqrt(1.0 - decay * decay),
-        weight=HDOP_LAWS[scenario.hdop_law],
-    )
+def _compute_gains(exponent: float) -> tuple[float, float]:
+    """Compute (decay, noise gain) of an Ornstein-Uhlenbeck process over a step."""
+    decay = math.exp(exponent)
+    return decay, math.sqrt(1.0 - decay * decay)
 
 
 def _list_numbers(part: Any) -> list[float]:
-    """The numbers of nested tuples, in order."""
+    """List the numbers of nested tuples, in order."""
     if not isinstance(part, tuple):
         return [part]
     return [number for item in part for number in _list_numbers(item)]
 
 
-def _make_trace(scenario: Scenario) -> list[float]:
-    """What `steering.interpolate_trace` reads, behind the packed parameters."""
-    trace = scenario.trace
-    return [scenario.trace_step / TICK, *trace, trace[-1]] if trace else []
-
-
 def pad_params(params: Array, width: int) -> Array:
-    """Packed parameters as long as with a longer trace: the last angle stays, none stays none."""
+    """Pad packed parameters to (width,): a trace repeats its last angle, others append zeros."""
     has_trace = len(params) > PARAMS_WIDTH
     return np.pad(params, (0, width - len(params)), "edge" if has_trace else "constant")
 
 
-def make_episode_config(
-    scenario: Scenario,
-    vehicle: Vehicle,
-    nominal: Vehicle,
-    slow: dict[str, SlowSensor],
-    reference: str,
-    motion: Array | None = None,
-    all_samples: bool = False,
-    with_map: bool = False,
-    yaw_first: bool = True,
-    fail_bad: bool = False,
-) -> EpisodeConfig:
-    """Pack everything that a reset does not draw; ValueError where something is out of place.
-
-    motion: (len(Motion),), where the car starts, NaN for the default (None: of all).
-    """
-    check_choice("reference", reference, REFERENCES)
+def _make_episode_config(
+    config: "EnvConfig", scenario: Scenario, vehicle: Vehicle, slow: dict[str, SlowSensor],
+    motion: Array | None,
+) -> EpisodeConfig:  # fmt: skip
+    """Pack everything that a reset does not draw; motion (len(Motion),) is NaN by default."""
+    check_choice("reference", config.reference, REFERENCES)
     vehicle = vehicle.replace(**scenario.vehicle)
-    nominal = nominal.replace(**scenario.nominal)
+    nominal = config.nominal.replace(**scenario.nominal)
     if scenario.roll:
         vehicle.check_roll()
-    decay = math.exp(-TICK / scenario.disturbance_time)
     links = {name: _make_link(scenario, name, slow.get(name)) for name in SLOW_NAMES}
+    hdop_gains = _compute_gains(-links["gps"].period * TICK / scenario.hdop_time)
+    gains = _compute_gains(-TICK / scenario.disturbance_time)
     params = EpisodeParams(
         car=make_car(vehicle),
-        road=_make_road(scenario),
+        road=RoadParams(  # curvature and bank are drawn
+            0.0, scenario.curve_start, scenario.curve_ramp, 0.0, GRAVITY * math.sin(scenario.grade)
+        ),
         motor=make_lag(vehicle.motor_lag if scenario.lags else 0.0, TICK),
         steering=make_lag(vehicle.steering_lag if scenario.lags else 0.0, TICK),
         wind=Wind(0.0, 0.0, 0.0, 0.0, scenario.wind_height),  # the rest is drawn
@@ -205,15 +146,12 @@ def make_episode_config(
         noise=Noise()._replace(**scenario.noise),
         slow=tuple(links.values()),
         target=make_reference_params(nominal),
-        disturbance=Disturbance(
-            force=scenario.disturbance_force,
-            moment=scenario.disturbance_moment,
-            decay=decay,
-            noise_gain=math.sqrt(1.0 - decay * decay),
-        ),
-        task=make_task_params(vehicle, scenario, yaw_first),
+        disturbance=Disturbance(scenario.disturbance_force, scenario.disturbance_moment, *gains),
+        task=make_task_params(vehicle, scenario, config.yaw_first),
         steering_profile=(0.0,) * STEERING_WIDTH,  # drawn
-        sky=_make_satellite_geometry(scenario, links["gps"]),
+        sky=SatelliteGeometry(
+            math.log(scenario.hdop), scenario.hdop_spread, *hdop_gains, HDOP_LAWS[scenario.hdop_law]
+        ),
         driver=DriverParams(
             preview=scenario.driver_preview,
             gain=scenario.driver_gain,
@@ -226,38 +164,27 @@ def make_episode_config(
         nominal_car=Bicycle(*nominal.lateral),
     )
     switches = Switches(
-        small_angle=int(scenario.small_angle),
-        law=TYRE_LAWS.index(scenario.tyres),
-        reference=REFERENCES.index(reference),
-        steering=STEERING_KINDS.index(scenario.steering),
-        all_samples=int(all_samples),
-        with_map=int(with_map),
-        fail_bad=int(fail_bad),
-        roll=int(scenario.roll),
-        road=ROADS.index(scenario.road),
-    )
+        small_angle=int(scenario.small_angle), law=TYRE_LAWS.index(scenario.tyres),
+        reference=REFERENCES.index(config.reference),
+        steering=STEERING_KINDS.index(scenario.steering), all_samples=int(config.fast == "all"),
+        with_map=int(config.with_map), fail_bad=int(config.on_bad_action == "fail"),
+        roll=int(scenario.roll), road=ROADS.index(scenario.road),
+    )  # fmt: skip
     low, high = scenario.get_draw_ranges()
-    start = EpisodeStart(
-        params=np.array(_list_numbers(params) + _make_trace(scenario), np.float64),
-        low=low,
-        high=high,
-        switches=np.array(switches, np.int64),
-        motion=np.full(len(Motion._fields), np.nan) if motion is None else motion,
-    )
+    angles = scenario.trace  # as `steering.interpolate_trace` reads them
+    trace = [scenario.trace_step / TICK, *angles, angles[-1]] if angles else []
+    packed = np.array(_list_numbers(params) + trace, np.float64)
+    motion = np.full(len(Motion._fields), np.nan) if motion is None else motion
+    start = EpisodeStart(packed, low, high, np.array(switches, np.int64), motion)
     assert len(start.params) == PARAMS_WIDTH or scenario.trace
-    held_speed = (
-        scenario.held_speed if np.isnan(start.motion[0]) else None
-    )  # or it starts at another
+    held_speed = scenario.held_speed if np.isnan(motion[0]) else None
     return EpisodeConfig(start, vehicle, nominal, scenario, slow, held_speed)
 
 
-def apply_scenario_clocks(
+def _apply_scenario_clocks(
     sensors: dict[str, SlowSensor], scenario: Scenario
 ) -> dict[str, SlowSensor]:
-    """The sensors with the clocks and delays of a scenario: its fields `<sensor>_period`,
-    `<sensor>_delays` and, with these, `<sensor>_jitter`, and `<sensor>_loss`, where it has them. A
-    drawn `<sensor>_latency` is described by the worst case: the least of it as a delay, the rest
-    as jitter."""
+    """Replace clocks and delays of the sensors by the fields `<sensor>_...` of a scenario."""
     changed = {}
     for name, sensor in sensors.items():
         period, delays = (getattr(scenario, f"{name}_{key}", None) for key in ("period", "delays"))
@@ -268,30 +195,23 @@ def apply_scenario_clocks(
             sensor = dataclasses.replace(sensor, delays=delays, jitter=jitter)
         if loss := getattr(scenario, f"{name}_loss", 0.0):
             sensor = dataclasses.replace(sensor, loss=loss)
-        low, high = (
-            count_ticks(end) for end in get_range(getattr(scenario, f"{name}_latency", 0.0))
-        )
-        if high > 0.0:
-            sensor = dataclasses.replace(
-                sensor,
-                delays=tuple(delay + low * TICK for delay in sensor.delays),
-                jitter=sensor.jitter + (high - low) * TICK,
-            )
+        low, high = map(count_ticks, get_range(getattr(scenario, f"{name}_latency", 0.0)))
+        if high > 0.0:  # the worst case: the smallest latency as a delay, the rest as jitter
+            delays = tuple(delay + low * TICK for delay in sensor.delays)
+            jitter = sensor.jitter + (high - low) * TICK
+            sensor = dataclasses.replace(sensor, delays=delays, jitter=jitter)
         changed[name] = sensor
     return changed
 
 
-def count_max_packets(sensor: SlowSensor, n: int) -> int:
-    """The worst case: all frames of a step, doubled, and all that were under way."""
+def _count_max_packets(sensor: SlowSensor, n: int) -> int:
+    """Count the most packets of a step: all its frames, doubled, and those under way before."""
     period = min(sensor.period, MIN_GPS_PERIOD)  # of any scenario
     return 2 * (n // int(count_ticks(period)) + 1) + MAX_IN_FLIGHT
 
 
-def apply_detector_clock(camera: SlowSensor, delay: str | None) -> SlowSensor:
-    """The camera whose pictures a detector looks at: its delay is described by its range.
-
-    Raises ValueError where a picture would arrive as it is taken.
-    """
+def _apply_detector_clock(camera: SlowSensor, delay: str | None) -> SlowSensor:
+    """Describe the delay of a camera with a detector by its range; it is a tick at least."""
     if delay == "link":
         if count_ticks(min(camera.delays)) < 1:
             raise ValueError("a picture takes a tick at least: camera delays of 0.001 s or more")
@@ -301,16 +221,12 @@ def apply_detector_clock(camera: SlowSensor, delay: str | None) -> SlowSensor:
     return dataclasses.replace(camera, delays=(first * TICK,), jitter=(last - first) * TICK)
 
 
-RESET_OPTIONS = ("scenario", "vehicle", "friction", "state", "duration")
+_RESET_OPTIONS = ("scenario", "vehicle", "friction", "state", "duration")
 
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """The arguments of an environment, common to its episodes but for options of reset;
-    `StabilityEnv` describes them.
-
-    Raises TypeError or ValueError for an argument out of place.
-    """
+    """Arguments of an environment, as `StabilityEnv` describes them; errors name the argument."""
 
     sensors: str
     scenario: Scenario
@@ -356,29 +272,29 @@ class EnvConfig:
 
     @property
     def slow(self) -> dict[str, SlowSensor]:
-        """The slow sensors, with what replaces the set's."""
+        """The slow sensors by name, with the changes to the sensor set's."""
         return apply_changes(SENSOR_SETS[self.sensors], self.slow_changes)
 
     @cached_property
     def layout(self) -> tuple[ObservationEntry, ...]:
         """The entries of an observation."""
-        n, fast = int(self.control_period), self.fast
-        return make_observation_layout(tuple(self.slow), n, fast, self.with_map)
+        n = int(self.control_period)
+        return make_observation_layout(tuple(self.slow), n, self.fast, self.with_map)
 
     @cached_property
     def bounds(self) -> Array:
-        """Their bounds, (2, len(layout))."""
+        """Bounds of the observation's entries, shape (2, len(layout))."""
         return np.array([[entry.low, entry.high] for entry in self.layout]).T.copy()
 
     @property
     def max_packets(self) -> int:
-        """The most packets of a step."""
+        """Largest number of packets in a step."""
         n = int(self.control_period)
-        return sum(count_max_packets(sensor, n) for sensor in self.slow.values())
+        return sum(_count_max_packets(sensor, n) for sensor in self.slow.values())
 
     @property
     def action_width(self) -> int:
-        """The numbers of an action."""
+        """Width of an action."""
         return 2 if self.steering else 1
 
     @cached_property
@@ -389,38 +305,25 @@ class EnvConfig:
     def make_episode(
         self, scenario: Scenario, vehicle: Vehicle, motion: Array | None = None
     ) -> EpisodeConfig:
-        """An episode of a scenario with a true vehicle and a start, as of
-        `parse_initial_motion`."""
+        """Make an episode with a true vehicle; motion (len(Motion),) is NaN where it is default."""
         if self.strict:
             cars = vehicle.replace(**scenario.vehicle), self.nominal.replace(**scenario.nominal)
             for part in (scenario, *cars):
                 check_plausible(part)
-        slow = apply_scenario_clocks(self.slow, scenario)
+        slow = _apply_scenario_clocks(self.slow, scenario)
         if self.vision == "image":
-            slow["camera"] = apply_detector_clock(slow["camera"], self.delay)
+            slow["camera"] = _apply_detector_clock(slow["camera"], self.delay)
             scenario = scenario.replace(noise={**scenario.noise, **load_detector().noise})
-        return make_episode_config(
-            scenario,
-            vehicle,
-            self.nominal,
-            slow,
-            self.reference,
-            motion,
-            self.fast == "all",
-            self.with_map,
-            self.yaw_first,
-            self.on_bad_action == "fail",
-        )
+        return _make_episode_config(self, scenario, vehicle, slow, motion)
 
     def apply_options(self, options: Mapping[str, Any]) -> EpisodeConfig:
-        """An episode with options of reset; ValueError for an unknown option or state."""
+        """Make an episode with options of reset; ValueError for an unknown option or state."""
         if not options:
             return self.base
-        unknown = sorted(map(str, set(options) - set(RESET_OPTIONS)))
+        unknown = sorted(map(str, set(options) - set(_RESET_OPTIONS)))
         if unknown:
-            raise ValueError(
-                f"unknown reset option {', '.join(unknown)}; known: {', '.join(RESET_OPTIONS)}"
-            )
+            known = ", ".join(_RESET_OPTIONS)
+            raise ValueError(f"unknown reset option {', '.join(unknown)}; known: {known}")
         scenario = make_scenario(options.get("scenario", self.scenario))
         vehicle = make_vehicle(options.get("vehicle", self.vehicle), self.strict)
         if "friction" in options:
@@ -429,14 +332,12 @@ class EnvConfig:
         if "duration" in options:
             duration = check_number("reset option duration", options["duration"])
             scenario = scenario.replace(duration=duration)
-        return self.make_episode(
-            scenario, vehicle, parse_initial_motion(options.get("state", {}), scenario)
-        )
+        motion = _parse_initial_motion(options.get("state", {}), scenario)
+        return self.make_episode(scenario, vehicle, motion)
 
 
-def parse_initial_motion(state: Mapping[str, Any], scenario: Scenario) -> Array:
-    """A Motion's numbers (len(Motion),), NaN where the mapping has none; ValueError for a name
-    that is no state's, a value that is no number, and roll where the scenario has none."""
+def _parse_initial_motion(state: Mapping[str, Any], scenario: Scenario) -> Array:
+    """Parse a start `Motion` (len(Motion),) from a mapping, NaN where it has no value."""
     remaining = dict(check_mapping("reset option state", state))
     start = np.full(len(Motion._fields), np.nan)
     for i, name in enumerate(Motion._fields):
@@ -446,10 +347,8 @@ def parse_initial_motion(state: Mapping[str, Any], scenario: Scenario) -> Array:
             raise ValueError(f"reset option state: {name} is {got}, not a number up to 1e6")
         start[i] = np.nan if value is None else value
         if name.startswith("phi") and value and not scenario.roll:
-            raise ValueError(
-                f"reset option state: {name} is {value!r}, but scenario {scenario.name!r} "
-                "has no roll"
-            )
+            reason = f"but scenario {scenario.name!r} has no roll"
+            raise ValueError(f"reset option state: {name} is {value!r}, {reason}")
     if remaining:
         known = ", ".join(Motion._fields)
         raise ValueError(f"unknown state {join_names(map(str, remaining))}; known: {known}")

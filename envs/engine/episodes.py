@@ -1,4 +1,4 @@
-"""Episodes: the batch state, arrays with a row for each of N episodes."""
+"""`EpisodeBatch`: the state of N episodes, arrays with a row for each."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
@@ -25,13 +25,13 @@ T = TypeVar("T")
 
 
 class EpisodeBatch:
-    """N episodes of an `EnvConfig` each: arrays with a row for each, and each one's generator.
+    """N episodes: arrays with a row for each, and each one's generator.
 
-    rows: of each row, which differ in scenario and vehicles alone; `config` is that of the first.
+    The first `ticks_done` (N,) of `rows` (N, n, FAST_WIDTH) and `delivered` (N,) of `packets`
+    (N, max, PACKET_WIDTH) make the records; `final_...` are those before a row's newest reset.
 
-    `rows` (N, n, FAST_WIDTH) of which `ticks_done` (N,) are there and `packets` (N, most,
-    PACKET_WIDTH) of which `delivered` (N,) are make the records; `final_...` are those before a
-    row's newest reset. What is no array is a sequence of N whose items are made when asked for.
+    Args:
+        rows: Config of each row, which differ in scenario and vehicles alone.
     """
 
     def __init__(self, rows: Sequence[EnvConfig]) -> None:
@@ -43,25 +43,19 @@ class EpisodeBatch:
         self.control_period = int(config.control_period)
         self.layout = config.layout
         self.arrays = BatchArrays(
-            params=np.zeros((N, PARAMS_WIDTH)),
-            states=np.zeros((N, STATE_WIDTH)),
+            params=np.zeros((N, PARAMS_WIDTH)), states=np.zeros((N, STATE_WIDTH)),
             switches=np.zeros((N, len(FLAGS)), np.int64),
             obs=np.zeros((N, len(self.layout)), np.float32),
             rows=np.zeros((N, self.control_period, FAST_WIDTH)),
             packets=np.zeros((N, config.max_packets, PACKET_WIDTH)),
-            reports=np.zeros((N, len(REPORT))),
-            ticks_done=np.zeros(N, np.int64),
-            delivered=np.zeros(N, np.int64),
-            over=np.zeros(N, np.bool_),
-        )
+            reports=np.zeros((N, len(REPORT))), ticks_done=np.zeros(N, np.int64),
+            delivered=np.zeros(N, np.int64), over=np.zeros(N, np.bool_),
+        )  # fmt: skip
         self.params, self.states, self.switches, self.obs, *record, self.over = self.arrays
         self.rows, self.packets, self.reports, self.ticks_done, self.delivered = record
-        self.final_rows, self.final_packets = self.rows.copy(), self.packets.copy()
-        self.final_ticks_done = self.ticks_done.copy()
-        self.final_delivered = self.delivered.copy()
-        self._final = RecordArrays(
-            self.final_rows, self.final_packets, self.final_ticks_done, self.final_delivered
-        )
+        records = self.rows, self.packets, self.ticks_done, self.delivered
+        self._final = final = RecordArrays(*(array.copy() for array in records))
+        self.final_rows, self.final_packets, self.final_ticks_done, self.final_delivered = final
         self.lane_buffers = make_lane_buffers(N, self.control_period, len(self.layout))
         self.configs: list[EpisodeConfig] = [row_config.base for row_config in rows]
         self.generators: list[np.random.Generator | None] = [None] * N
@@ -70,10 +64,7 @@ class EpisodeBatch:
     def apply_options(
         self, options: Mapping[str, Any], chosen: Sequence[int]
     ) -> tuple[list[EpisodeConfig], IntArray]:
-        """The configs that options of reset give the chosen rows, and which of them each one has.
-
-        Raises what `EnvConfig.apply_options` raises, and ValueError for a list of another length.
-        """
+        """Make configs with options of reset, and find the index (M,) of each chosen row's."""
         row_options, places = split_options(options, self._count), []
         configs: list[EpisodeConfig] = []
         known: dict[tuple[Any, ...], int] = {}  # rows with the same objects as options share one
@@ -91,8 +82,10 @@ class EpisodeBatch:
         configs: Sequence[EpisodeConfig] | None = None,
         config_index: IntArray | None = None,
     ) -> None:
-        """Reset the chosen rows (M,) with the next keys of their generators, each with the config
-        of its place `config_index` in `configs` (None: without options)."""
+        """Reset the chosen rows (M,) with the next keys of their generators.
+
+        `config_index` (M,) is each one's index in `configs`; None for those without options.
+        """
         if configs is None or config_index is None:
             places, config_index = np.unique(self._config_index[chosen], return_inverse=True)
             configs = [self._distinct_configs[place].base for place in places]
@@ -112,19 +105,19 @@ class EpisodeBatch:
         self.group_by_variant()
 
     def set_params(self, params: Array) -> None:
-        """Take these packed parameters, (N, width)."""
+        """Replace the packed parameters by others, shape (N, width)."""
         self.params = params
         self.arrays = self.arrays._replace(params=params)
 
     def group_by_variant(self) -> None:
-        """Put rows whose ticks have the same text next to each other in the block's order."""
+        """Sort rows of the same variant next to each other in the block's order."""
         lags = self.params[:, [P.motor.start, P.steering.start]] > 0.0
         variants = np.hstack([self.switches, lags])
         is_mixed = (variants != variants[0]).any()
         self.lane_buffers.order[:] = np.lexsort(variants.T) if is_mixed else np.arange(self._count)
 
     def get_generator(self, i: int) -> np.random.Generator:
-        """A row's, which draws one 64-bit key a reset; seeded by chance if it never was."""
+        """Get row i's generator, which draws one 64-bit key a reset; seeded randomly at first."""
         generator = self.generators[i]
         if generator is None:
             generator, self.seeds[i] = seeding.np_random()
@@ -138,24 +131,23 @@ class EpisodeBatch:
 
     @property
     def motion(self) -> Array:
-        """The true `Motion` of each row now, (N, len(Motion)), in SI units."""
+        """True `Motion` of each row now, in SI units, shape (N, len(Motion))."""
         return np.array(self.states[:, Z.motion[0] : Z.motion[-1] + 1])
 
     @property
     def true_state(self) -> Array:
-        """The `TrueState` of each row now, (N, len(TrueState)); no sensor tells these."""
+        """`TrueState` of each row now, which no sensor has, shape (N, len(TrueState))."""
         return compute_true_states(self.params, self.states, self.switches)
 
     @property
     def record(self) -> Sequence[Record]:
         """Each row's `StabilityEnv.record`."""
-        return self._map_rows(
-            lambda i: make_record(
-                self.states[i],
-                self.rows[i, : self.ticks_done[i]],
-                self.packets[i, : self.delivered[i]],
-            )
-        )
+
+        def make(i: int) -> Record:
+            rows, packets = self.rows[i, : self.ticks_done[i]], self.packets[i, : self.delivered[i]]
+            return make_record(self.states[i], rows, packets)
+
+        return self._map_rows(make)
 
     @property
     def scenario(self) -> Sequence[Scenario]:

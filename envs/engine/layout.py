@@ -1,8 +1,7 @@
-"""State by name: where the numbers of an episode lie in its two packed vectors.
+"""Layout of an episode's two packed vectors, parameters and state; a copy of both is a snapshot.
 
-`params` is constant within an episode, `state` is everything that changes: a copy of both is a
-complete snapshot. `P` and `Z` are `EpisodeParams` and `EpisodeState` whose leaves are indices:
-`p[P.car.mu]` and `z[Z.clock.tick]` are numbers, `read(z, Z.motion)` is a Motion.
+`P` and `Z` are `EpisodeParams` and `_EpisodeState` whose leaves are indices: `p[P.car.mu]` and
+`z[Z.clock.tick]` are numbers, `read(z, Z.motion)` is a `Motion`.
 """
 
 from typing import Annotated, Any, NamedTuple
@@ -29,7 +28,7 @@ class Disturbance(NamedTuple):
     force: Any  # N, standard deviation
     moment: Any  # N m
     decay: Any  # what is left after a tick
-    noise_gain: Any  # sqrt(1 - keep^2)
+    noise_gain: Any  # sqrt(1 - decay^2)
 
 
 class TaskParams(NamedTuple):
@@ -62,7 +61,7 @@ class ActuatorState(NamedTuple):
     integral: Any
     F_d: Any
     N_d: Any
-    slewing: Any  # rad, the added steering that is asked for, within its rate
+    slewing: Any  # rad, the command of added steering within its rate
     added: Any  # rad, the added steering that acts
 
 
@@ -77,8 +76,8 @@ class Clock(NamedTuple):
     next_due: Any  # arrival tick of the next packet
 
 
-class SlowSensorState(NamedTuple):
-    """Where one slow sensor stands, and its newest sample."""
+class _SlowSensorState(NamedTuple):
+    """State of a slow sensor, and its newest sample."""
 
     frames: Any  # captured so far
     next_capture: Any
@@ -88,7 +87,7 @@ class SlowSensorState(NamedTuple):
     drift: Any  # what the sensor carries from sample to sample
 
 
-SLOW_STATE, SLOW_WIDTH = make_offsets(SlowSensorState)
+SLOW_STATE, SLOW_WIDTH = make_offsets(_SlowSensorState)
 
 
 class EpisodeParams(NamedTuple):
@@ -114,39 +113,37 @@ class EpisodeParams(NamedTuple):
     nominal_car: Bicycle  # nominal, which lays the road
 
 
-class EpisodeState(NamedTuple):
-    """The state, which changes from tick to tick. A new part goes at the end or, where a tick of
-    the plant changes it, before `slow`."""
+class _EpisodeState(NamedTuple):
+    """The state. New parts go at the end, or before `slow` where a plant tick changes them."""
 
     motion: Motion
     drive: ActuatorState
     clock: Clock
     refs: Annotated[tuple[Any, ...], 2]  # rad, rad/s, the references of beta and gamma
     nominal_motion: NominalMotion  # the nominal car where it lays the road
-    slow: Annotated[tuple[SlowSensorState, ...], len(SLOW)]
-    queue: Annotated[
-        Any, len(SLOW) * MAX_IN_FLIGHT * PACKET_WIDTH
-    ]  # packets, columns as in `Packet`
+    slow: Annotated[tuple[_SlowSensorState, ...], len(SLOW)]
+    # packets, columns as in `Packet`
+    queue: Annotated[Any, len(SLOW) * MAX_IN_FLIGHT * PACKET_WIDTH]
     driver: Any  # rad, the driver's steering command
     under_way: Any  # how many packets are in the queue
 
 
 P, PARAMS_WIDTH = make_offsets(EpisodeParams)
-Z, STATE_WIDTH = make_offsets(EpisodeState)
+Z, STATE_WIDTH = make_offsets(_EpisodeState)
 
 
 class Switches(NamedTuple):
-    """Integers that choose the text of the plant and the task, the same for a whole batch."""
+    """Integers that choose variants of the plant and the task, the same for a whole batch."""
 
     small_angle: int
     law: int
     reference: int
-    steering: int  # kind of steering programme, used at reset
+    steering: int  # kind of steering profile, used at reset
     all_samples: int  # the observation holds every fast sample
     with_map: int  # and the road's curvature
     fail_bad: int  # a non-finite action ends the episode instead of being refused
     roll: int  # the body rolls
-    road: int  # of `scenarios.roads.ROADS`
+    road: int  # of `scenarios.road.ROADS`
 
 
 FLAGS, _ = make_offsets(Switches)

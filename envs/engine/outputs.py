@@ -1,8 +1,7 @@
-"""The queue of slow sensors' packets: capture at a tick, delivery at their arrival; compiled.
+"""Outputs of an env-step: packets of the slow sensors, float32 observation, report; compiled.
 
-Packets are delivered in the order (captured tick, sensor); what is under way lies in the state.
-
-The float32 observation of a step, and what `info` reads of the state; compiled.
+Packets are captured at a tick and delivered at their arrival in the order (captured tick, sensor);
+those under way lie in the state.
 """
 
 from typing import Any
@@ -25,7 +24,7 @@ NEVER_DUE = 1e15
 def _push_packet(
     z: Any, sensor: int, captured: Any, due: Any, quality: Any, frame: Any, values: Any
 ) -> None:
-    """Put a captured sample on its way; that the queue is long enough, `make_link` has checked."""
+    """Queue a captured sample; `make_link` has checked that the queue is long enough."""
     slot = int(z[Z.under_way])
     packet = z[Z.queue + slot * PACKET_WIDTH :]
     packet[PACKET.sensor] = sensor
@@ -43,7 +42,7 @@ def _push_packet(
 def _send_frame(
     z: Any, sensor: int, link: Any, tick: Any, key: Any, values: Any, quality: Any
 ) -> None:
-    """A frame of a slow sensor: queue it for its arrivals and set the clock on."""
+    """Queue a slow sensor's frame for its arrivals, and set the sensor's clock on."""
     column = Z.slow[sensor]
     frame = z[column.frames]
     first, second = compute_arrivals(link, frame, tick, key[0], key[1], BLOCKS[sensor].link)
@@ -57,7 +56,7 @@ def _send_frame(
 
 @jit
 def update_newest(z: Any, packet: Any, tick: Any) -> None:
-    """A packet (PACKET_WIDTH,) that is here becomes its sensor's newest sample, if it is newer."""
+    """Take a delivered packet (PACKET_WIDTH,) as its sensor's newest sample, if it is newer."""
     sensor = int(packet[PACKET.sensor])
     newest = Z.slow[sensor]
     is_empty = NEEDS_QUALITY[sensor] and packet[PACKET.quality] <= 0.0
@@ -70,7 +69,7 @@ def update_newest(z: Any, packet: Any, tick: Any) -> None:
 
 @jit
 def _move_due_packets(z: Any, tick: Any, packets: Any, count: int) -> int:
-    """Move the packets that arrive at this tick into `packets`; returns the new count."""
+    """Move the packets that arrive at this tick into `packets`; return the new count."""
     while True:
         best, best_rank, due = -1, NEVER_DUE, NEVER_DUE
         under_way = int(z[Z.under_way])
@@ -98,7 +97,7 @@ def _move_due_packets(z: Any, tick: Any, packets: Any, count: int) -> int:
 
 @jit
 def find_next_due(z: Any, tick: Any) -> Any:
-    """The first tick after this one at which a slow sensor captures or a packet arrives."""
+    """Find the first tick after this one at which a slow sensor captures or a packet arrives."""
     due = maximum(z[Z.clock.next_due], tick + 1.0)
     for sensor in range(len(Z.slow)):
         capture = z[Z.slow[sensor].next_capture]
@@ -110,7 +109,7 @@ def find_next_due(z: Any, tick: Any) -> Any:
 def make_measurement_context(
     p: Any, motion: Any, small_angle: int, key: Any, tick: Any
 ) -> MeasurementContext:
-    """The scene that slow sensors see at a tick."""
+    """Make the inputs of the slow sensors' measurements at a tick."""
     road, car, noise = read(p, P.road), read(p, P.car), read(p, P.noise)
     sky, field_of_view = read(p, P.sky), read(p, P.field_of_view)
     return MeasurementContext(
@@ -120,19 +119,14 @@ def make_measurement_context(
 
 @jit
 def sample_slow_sensors(row: Any, motion: Any, tick: Any, count: int) -> int:
-    """The slow sensors sample the motion at a tick, and due packets are delivered.
-
-    Returns how many packets there are then.
-    """
+    """Sample the slow sensors at a tick and deliver due packets; return the new packet count."""
     p, z, small_angle = row.p, row.z, row.switches[FLAGS.small_angle]
     key = (to_word(z[Z.clock.key_low]), to_word(z[Z.clock.key_high]))
     for sensor in range(len(Z.slow)):
         column = Z.slow[sensor]
         if tick == z[column.next_capture]:
-            link, context = (
-                read(p, P.slow[sensor]),
-                make_measurement_context(p, motion, small_angle, key, tick),
-            )
+            link = read(p, P.slow[sensor])
+            context = make_measurement_context(p, motion, small_angle, key, tick)
             values, quality, z[column.drift] = sample_sensor(sensor, context, link, z[column.drift])
             _send_frame(z, sensor, link, tick, key, values, quality)
     if tick >= z[Z.clock.next_due]:
@@ -142,16 +136,16 @@ def sample_slow_sensors(row: Any, motion: Any, tick: Any, count: int) -> int:
 
 @jit
 def observe(row: Any, n: int, count: int, refs: Any, bounds: Any) -> None:
-    """Write the float32 observation of a record of n ticks and `count` packets, every entry
-    clipped at its bounds (2, k); entries as in `make_observation_layout`."""
+    """Write the float32 observation of n fast rows and `count` packets, clipped at its bounds."""
     k = observe_fast(row.rows, n, refs, bounds, row.switches, row.obs)
     observe_slow(row, k, count, bounds)
 
 
 @jit
 def observe_fast(rows: Any, n: int, refs: Any, bounds: Any, switches: Any, obs: Any) -> int:
-    """Write the entries of n fast rows, which come first, and of the references, which come last;
-    returns how many come first. rows, obs: of a vehicle, or with an axis more for those of a block.
+    """Write the observation's first entries, of n fast rows, and its last two, the references.
+
+    Returns the number of first entries. For a block `rows` and `obs` have an axis more.
     """
     k = 0
     for column in range(N_SAMPLED):
@@ -180,6 +174,7 @@ def observe_fast(rows: Any, n: int, refs: Any, bounds: Any, switches: Any, obs: 
 
 @jit
 def _store_clipped(obs: Any, value: Any, bounds: Any, k: int) -> None:
+    """Store entry k of an observation, clipped at its bounds (2, k)."""
     store_element(obs, clip(value, bounds[0, k], bounds[1, k]), k)
 
 
@@ -198,9 +193,8 @@ def observe_slow(row: Any, k: int, count: int, bounds: Any) -> None:
             obs[k] = clip(select(z[newest.captured] != NEVER, age, AGE_CAP), 0.0, AGE_CAP)
             is_fresh = 0.0
             for i in range(count):
-                is_newest = (
-                    packets[i, PACKET.arrived] == z[newest.arrived]
-                )  # not late, no duplicate
+                # not late, no duplicate
+                is_newest = packets[i, PACKET.arrived] == z[newest.arrived]
                 if packets[i, PACKET.sensor] == sensor and is_newest:
                     is_fresh = 1.0
             obs[k + 1] = is_fresh
@@ -209,7 +203,7 @@ def observe_slow(row: Any, k: int, count: int, bounds: Any) -> None:
 
 @jit
 def write_report(report: Any, z: Any) -> None:
-    """Write what `info` reads of the state; cost and references are the caller's."""
+    """Write time, yaw rate, heading and failure of the state into the report."""
     report[REPORT.t] = z[Z.clock.tick] * TICK
     report[REPORT.gamma] = z[Z.motion.gamma]
     report[REPORT.psi] = z[Z.motion.psi]

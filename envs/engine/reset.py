@@ -1,4 +1,4 @@
-"""Reset: draw an episode from a key and deliver tick 0; compiled."""
+"""Reset of an episode: its draws from a key, and tick 0; compiled."""
 
 from typing import Any
 
@@ -26,10 +26,7 @@ from .workspace import EpisodeArrays, EpisodeStart
 
 @jit
 def _write_surroundings(p: Any, d: Any, s: Any, v_x: Any) -> None:
-    """Friction, wind, the road and the path from what was drawn, for a car that starts at s, v_x.
-
-    The path begins where the car is at the onset; a mirrored bend leans to the other side.
-    """
+    """Write drawn friction, wind, road and path, for a start at s (m) with v_x (m/s)."""
     mirrored = d.side < 0.5
     right = select(d.friction_right > 0.0, d.friction_right, d.friction)
     p[P.car.mu] = select(mirrored, right, d.friction)
@@ -41,7 +38,7 @@ def _write_surroundings(p: Any, d: Any, s: Any, v_x: Any) -> None:
     p[P.road.curvature] = select(mirrored, 0.0 - d.curvature, d.curvature)
     bank_gravity = GRAVITY * sincos(d.bank)[0]
     p[P.road.lateral] = select(mirrored, 0.0 - bank_gravity, bank_gravity)
-    scaled = d.path_speed > 0.0
+    scaled = d.path_speed > 0.0  # the path begins where the car is at the onset
     scale = select(scaled, d.speed, 1.0) / select(scaled, d.path_speed, 1.0)
     path = transform_path(read(p, P.path), s + d.onset * v_x, scale, select(mirrored, -1.0, 1.0))
     write(p, path, P.path)
@@ -49,7 +46,7 @@ def _write_surroundings(p: Any, d: Any, s: Any, v_x: Any) -> None:
 
 @jit
 def _write_sensors(p: Any, d: Any, low: Any, high: Any) -> None:
-    """Biases, and the GPS's latency, which was packed as the worst case of low and high."""
+    """Write drawn biases and GPS latency, which was packed as the worst case of low and high."""
     p[P.noise.gyro_bias] = p[P.noise.gyro_bias] + d.gyro_bias
     p[P.noise.accel_y_bias] = p[P.noise.accel_y_bias] + d.accel_y_bias
     link, min_latency = P.slow[GPS], round_to_ticks(low[DRAWS.gps_latency])
@@ -61,7 +58,7 @@ def _write_sensors(p: Any, d: Any, low: Any, high: Any) -> None:
 
 @jit
 def _write_motion(z: Any, d: Any, start: Any, small_angle: int) -> None:
-    """The motion at the start: as drawn, but for the numbers that are there in `start`."""
+    """Write the drawn motion, or the numbers of `start` (len(Motion),) that are not NaN."""
     mirrored = d.side < 0.5
     beta = select(mirrored, 0.0 - d.initial_beta, d.initial_beta)
     sine, cosine = sincos(beta)
@@ -77,7 +74,7 @@ def _write_motion(z: Any, d: Any, start: Any, small_angle: int) -> None:
 def compute_first_row(
     motion: Any, steer: Any, road: Any, d_f: Any, noise: Any, draws: Any, small_angle: int
 ) -> Any:
-    """The fast sensors at tick 0, columns as in `Fast`: nothing has acted yet but the steering."""
+    """Compute the fast sensors (FAST_WIDTH) at tick 0, when only the steering has acted."""
     applied = (steer, 0.0, 0.0, steer, 0.0, compute_car_curvature(motion, road))
     g_x, g_y = compute_gravity(motion, road, small_angle)
     return compute_fast_row(motion, (g_x, g_y + GRAVITY * motion.phi), applied, d_f, noise, draws)

@@ -1,12 +1,9 @@
-"""One env-step of one vehicle: n plant ticks, sensors, delivery, cost, observation; compiled.
+"""Env-step of one vehicle: n plant ticks, sensors, packets, cost and observation; compiled.
 
 Order of tick k: sensors sample the state at k; packets with arrival k are delivered, ordered by
-(captured tick, sensor). The control of tick k acts until k+1. A step from tick k returns the
-ticks k+1 .. k+n; a reset returns tick 0 alone.
-
-An env-step is three parts. `precompute_window` writes the numbers that do not depend on the car
-into a window array, `integrate_step` moves the car tick by tick, `finish_step` handles the slow
-sensors, the observation and the report.
+(captured tick, sensor). The control of tick k acts until k+1. A step from tick k returns the ticks
+k+1 to k+n; a reset returns tick 0 alone. `precompute_window` writes what does not depend on the
+car, `integrate_step` moves the car, `finish_step` does slow sensors, observation and report.
 """
 
 from typing import Any
@@ -45,68 +42,55 @@ from .workspace import EpisodeArrays, EpisodeStart, split_workspace
 
 @jit
 def make_step_params(p: Any) -> StepParams:
-    """Parameters that are constant within an env-step."""
+    """Make the parameters that are constant within an env-step from packed ones."""
     return StepParams(
-        car=read(p, P.car),
-        road=read(p, P.road),
-        motor=read(p, P.motor),
-        steering=read(p, P.steering),
-        wind=read(p, P.wind),
-        speed_profile=read(p, P.speed_profile),
-        target=read(p, P.target),
-        disturbance=read(p, P.disturbance),
-        task=read(p, P.task),
-        noise=read(p, P.noise),
-        driver=read(p, P.driver),
-        path=read(p, P.path),
-        tyre_change=read(p, P.tyre_change),
-        nominal_car=read(p, P.nominal_car),
-    )
+        car=read(p, P.car), road=read(p, P.road), motor=read(p, P.motor),
+        steering=read(p, P.steering), wind=read(p, P.wind), speed_profile=read(p, P.speed_profile),
+        target=read(p, P.target), disturbance=read(p, P.disturbance), task=read(p, P.task),
+        noise=read(p, P.noise), driver=read(p, P.driver), path=read(p, P.path),
+        tyre_change=read(p, P.tyre_change), nominal_car=read(p, P.nominal_car),
+    )  # fmt: skip
 
 
 @jit
 def make_step_variant(p: Any, switches: Any) -> StepVariant:
-    """Integers that choose the text of one vehicle's ticks."""
+    """Make the variant of a vehicle's ticks from packed parameters p and switches."""
     flags = read(switches, FLAGS)
     lag = int(p[P.motor.start] > 0.0) + int(p[P.steering.start] > 0.0)
     has_driver = int(flags.steering == DRIVER)
     load_shift = has_load_shift(flags.small_angle, flags.law, flags.roll)
     return StepVariant(
-        flags.small_angle,
-        flags.law,
-        flags.reference,
-        flags.roll,
-        has_driver,
-        lag,
-        load_shift,
+        flags.small_angle, flags.law, flags.reference, flags.roll, has_driver, lag, load_shift,
         flags.road,
-    )
+    )  # fmt: skip
 
 
 def get_start_variant(start: EpisodeStart) -> StepVariant:
-    """The same of an episode's start."""
+    """Get the variant of an episode's ticks from its packed start."""
     return StepVariant(*map(int, make_step_variant(start.params, start.switches)))
 
 
 @jit
 def integrate_step(
-    p: Any,
-    z: Any,
-    variant: StepVariant,
-    yaw_share: Any,
-    steer_share: Any,
-    n: int,
-    rows: Any,
-    report: Any,
-    window: Any,
-    is_single: bool,
-) -> int:
-    """The plant and the fast sensors for n ticks, fewer where the episode ends; returns how many.
+    p: Any, z: Any, variant: StepVariant, yaw_share: Any, steer_share: Any, n: int, rows: Any,
+    report: Any, window: Any, is_single: bool,
+) -> int:  # fmt: skip
+    """Integrate plant and fast sensors over n ticks, fewer where the episode ends.
 
-    yaw_share, steer_share: of the yaw moment and the added steering, within +-1. rows: filled with
-    the fast sensors. p, z, report: vectors, or matrices with a column for each vehicle of a block;
-    rows and window have one axis more then. alone: whether it is one vehicle; where one of several
-    fails or ends before the others, 0 is returned and z and report are as they were.
+    Args:
+        p: Packed parameters; of a block of vehicles p, z and report have a column for each.
+        z: Packed state.
+        variant: Variant of the ticks.
+        yaw_share: Yaw moment as a fraction of full scale, within +-1.
+        steer_share: Added steering as a fraction of full scale, within +-1.
+        n: Number of ticks.
+        rows: Array for the fast sensors; of a block rows and window have one axis more.
+        report: Array for the report.
+        window: Window, with noise and steering of the ticks.
+        is_single: Whether it is one vehicle.
+
+    Returns:
+        Number of ticks done; 0 where one of a block ends early, z and report then unchanged.
     """
     params = make_step_params(p)
     task = params.task
@@ -115,11 +99,8 @@ def integrate_step(
     while True:
         motion, drive, tick = read(z, Z.motion), read(z, Z.drive), load_element(z, Z.clock.tick)
         car = apply_tyre_change(params.car, params.tyre_change, tick > params.tyre_change.tick)
-        tyre_load, refs, nominal_motion = (
-            compute_static_load(drive, car, variant),
-            read(z, Z.refs),
-            read(z, Z.nominal_motion),
-        )
+        tyre_load = compute_static_load(drive, car, variant)
+        refs, nominal_motion = read(z, Z.refs), read(z, Z.nominal_motion)
         state = StepState(
             motion, drive, tyre_load, load_element(z, Z.driver), car, refs, nominal_motion
         )
@@ -155,17 +136,9 @@ def integrate_step(
 
 @inline
 def write_final_state(
-    z: Any,
-    report: Any,
-    state: StepState,
-    measured: Measurements,
-    failure: Any,
-    beta: Any,
-    refs: Any,
-    tick: Any,
-    cost: Any,
-    duration: Any,
-) -> None:
+    z: Any, report: Any, state: StepState, measured: Measurements, failure: Any, beta: Any,
+    refs: Any, tick: Any, cost: Any, duration: Any,
+) -> None:  # fmt: skip
     """Write the end of an env-step into z, but for the motion, and into its report."""
     write(z, state.drive, Z.drive)
     store_element(z, state.driver, Z.driver)
@@ -185,13 +158,13 @@ def write_final_state(
 
 @jit
 def finish_step(row: EpisodeArrays, n: int, done: int, bounds: Any, window: Any) -> None:
-    """The slow sensors along `done` ticks of one vehicle, its observation and its report."""
-    finish_slow_sensors(row, done, observe_step(row, n, done, bounds), bounds, window)
+    """Do slow sensors, observation and report of one vehicle's step of `done` ticks of n."""
+    finish_slow_sensors(row, done, _observe_step(row, n, done, bounds), bounds, window)
 
 
 @noinline
 def finish_slow_sensors(row: EpisodeArrays, done: int, k: int, bounds: Any, window: Any) -> None:
-    """The same where all but the slow sensors is in the observation; their entries begin at k."""
+    """Do slow sensors and report of a step of `done` ticks; their entries begin at k."""
     _finish_report(row, k, sample_slow_ticks(row, 0, done, 0, done, window), bounds)
 
 
@@ -199,8 +172,10 @@ def finish_slow_sensors(row: EpisodeArrays, done: int, k: int, bounds: Any, wind
 def sample_slow_ticks(
     row: EpisodeArrays, first: int, last: int, count: int, done: int, window: Any
 ) -> int:
-    """The slow sensors at the ticks first to last - 1 of the `done` of a step; returns how many
-    packets there are then, of `count` before."""
+    """Sample the slow sensors at ticks first to last - 1 of a step's `done`.
+
+    `count` is the number of packets before; returns the number then.
+    """
     z = row.z
     before = z[Z.clock.tick] - done
     tick = find_next_due(z, before + first)
@@ -212,9 +187,8 @@ def sample_slow_ticks(
 
 
 @jit
-def observe_step(row: EpisodeArrays, n: int, done: int, bounds: Any) -> int:
-    """The observation of a step of `done` ticks but for the slow sensors, whose entries begin where
-    it returns."""
+def _observe_step(row: EpisodeArrays, n: int, done: int, bounds: Any) -> int:
+    """Write the observation but for the slow sensors, whose first entry's index is returned."""
     report, rows = row.report, row.rows
     refs = (report[REPORT.beta_ref], report[REPORT.gamma_ref])
     n_rows = done
@@ -227,12 +201,13 @@ def observe_step(row: EpisodeArrays, n: int, done: int, bounds: Any) -> int:
 
 @jit
 def finish_outputs(row: EpisodeArrays, n: int, done: int, count: int, bounds: Any) -> None:
-    """The observation and the report of a step of `done` ticks and `count` packets."""
-    _finish_report(row, observe_step(row, n, done, bounds), count, bounds)
+    """Write observation and report of a step of `done` ticks of n with `count` packets."""
+    _finish_report(row, _observe_step(row, n, done, bounds), count, bounds)
 
 
 @jit
 def _finish_report(row: EpisodeArrays, k: int, count: int, bounds: Any) -> None:
+    """Write the report, and the observation of the slow sensors from entry k on."""
     report = row.report
     observe_slow(row, k, count, bounds)
     write_report(report, row.z)
@@ -242,8 +217,7 @@ def _finish_report(row: EpisodeArrays, k: int, count: int, bounds: Any) -> None:
 
 @jit
 def clip_action(action: Any) -> tuple[float, float]:
-    """(yaw moment, added steering) of an action as they are taken, within +-1; NaN where the
-    action is not finite."""
+    """Clip (yaw moment, added steering) of an action to +-1; NaN where it is not finite."""
     share = float(action[0])  # in plain Python a float32 would make float32 of all that follows
     turn = float(action[1]) if len(action) > 1 else 0.0
     total = share + turn
@@ -254,7 +228,7 @@ def clip_action(action: Any) -> tuple[float, float]:
 
 @jit
 def check_action_range(action: Any) -> int:
-    """WILD where a number of an action is finite and beyond FAR, else 0."""
+    """Check an action: WILD where a number is finite and beyond WILD_LIMIT, else 0."""
     for share in action:
         if (share > WILD_LIMIT or share < -WILD_LIMIT) and share - share == 0.0:
             return WILD
@@ -277,24 +251,14 @@ def reject_action(row: EpisodeArrays) -> int:
 
 @noinline
 def step_vehicle(
-    p: Any,
-    z: Any,
-    switches: Any,
-    obs: Any,
-    rows: Any,
-    packets: Any,
-    report: Any,
-    action: Any,
-    n: int,
-    bounds: Any,
-    window: Any,
-) -> int:
-    """n ticks of one vehicle, fewer where the episode ends; returns how many.
+    p: Any, z: Any, switches: Any, obs: Any, rows: Any, packets: Any, report: Any, action: Any,
+    n: int, bounds: Any, window: Any,
+) -> int:  # fmt: skip
+    """Step one vehicle by n ticks, fewer where the episode ends; return the ticks done.
 
-    The first seven are a `Row`: from Python they come one by one, since numba takes 0.2 us for
-    every array within a tuple. action: the share of the yaw moment and, if there are two, that of
-    the added steering; one that is not finite does nothing and returns REFUSED, or fails the
-    episode (`fail_bad`). window: what `make_window` gives.
+    The first seven arguments are `EpisodeArrays`, one by one: numba takes 0.2 us for every array
+    within a tuple. The action holds fractions of the yaw moment and, if there are two, of the added
+    steering; one that is not finite returns REFUSED, or fails the episode (`fail_bad`).
     """
     row = EpisodeArrays(p, z, switches, obs, rows, packets, report)
     yaw_share, steer_share = clip_action(action)
@@ -309,7 +273,7 @@ def step_vehicle(
 
 @jit
 def step_workspace(workspace: Any, action: Any) -> int:
-    """`step_vehicle` of the episode whose arrays lie in a workspace, and WILD."""
+    """Step the vehicle of a workspace as `step_vehicle` does, and add WILD where it applies."""
     row, bounds, window = split_workspace(workspace)
     n = len(row.rows)
     done = int(

@@ -1,8 +1,7 @@
-"""One tick of the car: commands, actuators, plant, fast sensors, cost and failures.
+"""One tick of the car: commands, actuators, plant and fast sensors; for numbers, lanes and tensors.
 
-The text is the same for one car, for cars in lanes, and for tensors of them. `integrate_tick` is a
-tick of our plant; `command` and `measure_tick`, before and after the motion, serve a plant of
-another's too.
+`integrate_tick` is a tick of our plant; `compute_inputs` before the motion and `measure_tick` after
+it serve outside plants too.
 """
 
 from typing import Any, NamedTuple
@@ -39,11 +38,11 @@ from ..vehicle.tyres import TyreInputs, compute_tyre_load
 from .layout import ActuatorState
 from .window import CostInputs
 
-NO_LAG, ONE_LAG = range(2)  # 2: both lag
+_NO_LAG, _ONE_LAG = range(2)  # 2: both lag
 
 
 class StepVariant(NamedTuple):
-    """Integers that choose a tick's text: the same for all cars that are computed together."""
+    """Integers that choose a tick's code, the same for all cars computed together."""
 
     small_angle: int
     law: int
@@ -51,8 +50,8 @@ class StepVariant(NamedTuple):
     roll: int
     has_driver: int  # the driver reacts to the car
     lag: int  # how many of motors and steering lag
-    has_load_shift: int  # `tyres.shifts`
-    road: int  # of `scenarios.roads.ROADS`
+    has_load_shift: int  # 1 where the lateral acceleration shifts load between the wheels
+    road: int  # of `scenarios.road.ROADS`
 
 
 class StepParams(NamedTuple):
@@ -79,15 +78,15 @@ class StepState(NamedTuple):
 
     motion: Any
     drive: Any
-    start: Any  # the Load at the tick's start
+    start: Any  # `TyreLoad` at the tick's start
     driver: Any  # rad, the driver's steering command
-    car: Any  # with its tyres as they are now
+    car: Any  # with the present tyres
     refs: Any  # rad, rad/s, the references of beta and gamma
     nominal_motion: Any  # the nominal car that lays the road
 
 
 class AppliedInputs(NamedTuple):
-    """What acts during a tick, means; the first six are columns of `Fast`, from `steer` on."""
+    """Mean inputs over a tick; the first six are columns of `Fast`, from `steer` on."""
 
     steer: Any  # rad, front wheels
     T_l: Any  # N m
@@ -97,10 +96,10 @@ class AppliedInputs(NamedTuple):
     curvature: Any  # 1/m, the road's at the car
     added: Any  # rad, the part of steer that was added to the driver's
     moment: Any  # N m, yaw moment of both motors
-    effort: Any  # its share of full scale
+    effort: Any  # its fraction of full scale
 
 
-class PlantInputs(NamedTuple):
+class _PlantInputs(NamedTuple):
     """Inputs of the plant during a tick."""
 
     steer: Any  # rad, command to the front wheels
@@ -118,13 +117,13 @@ class Measurements(NamedTuple):
     refs: Any
     steer: Any  # rad, N m: of `AppliedInputs`
     moment: Any
-    lost: Any  # whether the numbers are no longer finite
+    lost: Any  # whether a number is not finite
     cost_inputs: CostInputs
 
 
 @inline
 def apply_tyre_change(car: Any, change: Any, is_changed: Any) -> Any:
-    """The car, its tyres changed where `is_changed` holds."""
+    """Change the car's tyres where `is_changed` holds."""
     C_f = select(is_changed, car.C_f * change.front, car.C_f)
     C_r = select(is_changed, car.C_r * change.rear, car.C_r)
     new_stiffness = (C_f, C_r)
@@ -133,7 +132,7 @@ def apply_tyre_change(car: Any, change: Any, is_changed: Any) -> Any:
 
 @inline
 def compute_static_load(drive: Any, car: Any, variant: StepVariant) -> Any:
-    """The Load of the actuators as they are now."""
+    """Compute the tyres' load at the actuators' present state."""
     inputs = TyreInputs(drive.delta_f, drive.T_l, drive.T_r)
     return compute_tyre_load(inputs, car, variant.small_angle, variant.has_load_shift)
 
@@ -142,7 +141,7 @@ def compute_static_load(drive: Any, car: Any, variant: StepVariant) -> Any:
 def compute_lagged_load(
     steer: Any, T_l: Any, T_r: Any, drive: Any, rest: Any, car: Any, variant: StepVariant
 ) -> Any:
-    """The Load at a front angle, `rest` of the motors' deviation from T_l and T_r being left."""
+    """Compute the tyres' load; `rest` of the motors' deviation from T_l and T_r (N m) is left."""
     inputs = TyreInputs(steer, apply_lag(T_l, drive.T_l, rest), apply_lag(T_r, drive.T_r, rest))
     return compute_tyre_load(inputs, car, variant.small_angle, variant.has_load_shift)
 
@@ -151,7 +150,7 @@ def compute_lagged_load(
 def compute_motor_torques(
     N_z: Any, tick: Any, v_x: Any, integral: Any, profile: Any, car: Any, yaw_first: Any
 ) -> Any:
-    """(T_l, T_r, a_x, integral): torques in N m for a yaw moment and the driver's acceleration."""
+    """Compute (T_l, T_r, a_x, integral): torques (N m) for yaw moment and driver's acceleration."""
     max_torque = compute_torque_limit(v_x, car)
     limit = 2.0 * max_torque / (car.m * car.r)
     a_x, integral = compute_acceleration_command(tick, v_x, integral, profile, limit)
@@ -163,7 +162,7 @@ def compute_motor_torques(
 def _apply_due_change(
     params: StepParams, state: StepState, tick: Any, variant: StepVariant
 ) -> StepState:
-    """The state once the tyres have changed, if they do so at this tick."""
+    """Change the tyres if they are due to change at this tick."""
     is_due, car, start = tick == params.tyre_change.tick, state.car, state.start
     if any_lane(is_due):
         car = apply_tyre_change(car, params.tyre_change, is_due)
@@ -177,7 +176,7 @@ def _apply_due_change(
 def _follow_nominal_path(
     params: StepParams, state: StepState, tick: Any
 ) -> tuple[StepParams, NominalMotion]:
-    """(the parameters with the road as it turns during the tick, the nominal car at its end)."""
+    """Compute (parameters with the road's turning rate, nominal car at the tick's end)."""
     speed, _ = compute_speed_reference(tick, params.speed_profile)
     turn_rate, nominal_motion = step_nominal_car(
         state.nominal_motion, state.driver, speed, params.nominal_car
@@ -189,15 +188,10 @@ def _follow_nominal_path(
 
 @inline
 def compute_inputs(
-    params: StepParams,
-    N_z: Any,
-    steer_command: Any,
-    state: StepState,
-    tick: Any,
+    params: StepParams, N_z: Any, steer_command: Any, state: StepState, tick: Any,
     draws: NormalDraws,
-) -> PlantInputs:
-    """The plant's inputs during the tick that starts at `tick`; arguments as in
-    `integrate_tick`."""
+) -> _PlantInputs:  # fmt: skip
+    """Compute the plant's inputs during a tick; arguments as in `integrate_tick`."""
     motor, steering, task, ou = params.motor, params.steering, params.task, params.disturbance
     drive, driver, car = state.drive, state.driver, state.car
     slewing = limit_rate(drive.slewing, steer_command, task.slew)
@@ -210,56 +204,39 @@ def compute_inputs(
     left, right = apply_lag(T_l, drive.T_l, motor.mean), apply_lag(T_r, drive.T_r, motor.mean)
     moment = compute_yaw_moment(left, right, car)
     applied = AppliedInputs(
-        apply_lag(steer, drive.delta_f, steering.mean),
-        left,
-        right,
-        driver,
-        a_x,
+        apply_lag(steer, drive.delta_f, steering.mean), left, right, driver, a_x,
         compute_car_curvature(state.motion, params.road),
-        apply_lag(limited_steer, drive.added, steering.mean),
-        moment,
+        apply_lag(limited_steer, drive.added, steering.mean), moment,
         moment * (1.0 / task.yaw_scale),
-    )
+    )  # fmt: skip
     next_drive = ActuatorState(
-        apply_lag(T_l, drive.T_l, motor.end),
-        apply_lag(T_r, drive.T_r, motor.end),
-        apply_lag(steer, drive.delta_f, steering.end),
-        integral,
+        apply_lag(T_l, drive.T_l, motor.end), apply_lag(T_r, drive.T_r, motor.end),
+        apply_lag(steer, drive.delta_f, steering.end), integral,
         ou.decay * drive.F_d + ou.noise_gain * ou.force * draws.wheels[2],
-        ou.decay * drive.N_d + ou.noise_gain * ou.moment * draws.wheels[3],
-        slewing,
+        ou.decay * drive.N_d + ou.noise_gain * ou.moment * draws.wheels[3], slewing,
         apply_lag(limited_steer, drive.added, steering.end),
-    )
-    return PlantInputs(
-        steer,
-        T_l,
-        T_r,
-        DisturbanceForces(drive.F_d + F_w, drive.N_d + N_w, N_x),
-        applied,
+    )  # fmt: skip
+    return _PlantInputs(
+        steer, T_l, T_r, DisturbanceForces(drive.F_d + F_w, drive.N_d + N_w, N_x), applied,
         next_drive,
-    )
+    )  # fmt: skip
 
 
 @inline
 def _compute_loads(
-    params: StepParams, inputs: PlantInputs, state: StepState, variant: StepVariant
+    params: StepParams, inputs: _PlantInputs, state: StepState, variant: StepVariant
 ) -> Any:
-    """The Load at the start, the middle and the end of a tick."""
-    motor, steering, drive, car, start = (
-        params.motor,
-        params.steering,
-        state.drive,
-        state.car,
-        state.start,
-    )
+    """Compute the tyres' load at the start, the middle and the end of a tick."""
+    motor, steering = params.motor, params.steering
+    drive, car, start = state.drive, state.car, state.start
     steer, T_l, T_r = inputs.steer, inputs.T_l, inputs.T_r
-    if variant.lag == NO_LAG:
+    if variant.lag == _NO_LAG:
         start = compute_tyre_load(
             TyreInputs(steer, T_l, T_r), car, variant.small_angle, variant.has_load_shift
         )
         middle, end = start, start
     else:  # actuators that lag move continuously: a tick starts where the last one ended
-        if variant.lag == ONE_LAG:  # the other one jumps
+        if variant.lag == _ONE_LAG:  # the other one jumps
             angle = apply_lag(steer, drive.delta_f, steering.start)
             start = compute_lagged_load(angle, T_l, T_r, drive, motor.start, car, variant)
         angle = apply_lag(steer, drive.delta_f, steering.middle)
@@ -271,19 +248,12 @@ def _compute_loads(
 
 @inline
 def measure_tick(
-    params: StepParams,
-    motion: Any,
-    accel: Any,
-    applied: AppliedInputs,
-    refs_before: Any,
-    next_steer: Any,
-    draws: NormalDraws,
-    variant: StepVariant,
-) -> tuple[Any, Measurements]:
-    """(the driver's command, what is Seen) at the end of a tick that led to a motion.
+    params: StepParams, motion: Any, accel: Any, applied: AppliedInputs, refs_before: Any,
+    next_steer: Any, draws: NormalDraws, variant: StepVariant,
+) -> tuple[Any, Measurements]:  # fmt: skip
+    """Compute the driver's command (rad) and the measurements at the end of a tick.
 
-    accel: (a_x, a_y) in m/s2, specific forces. before: the references at the tick's start. The
-    others are as in `integrate_tick`.
+    `accel` is (a_x, a_y), specific forces in m/s2; `refs_before` are the references at the start.
     """
     task = params.task
     row = compute_fast_row(motion, accel, applied, params.car.d_f, params.noise, draws)
@@ -291,45 +261,39 @@ def measure_tick(
     driver = next_steer
     if variant.has_driver:
         driver = compute_driver_angle(
-            applied.driver,
-            motion,
-            params.path,
-            params.road,
-            params.target,
-            params.driver,
+            applied.driver, motion, params.path, params.road, params.target, params.driver,
             task.stop,
-        )
+        )  # fmt: skip
     steady = compute_reference(driver, v, params.target, variant.reference)
     refs = filter_reference(refs_before, steady, params.target, variant.reference)
     size = motion.v_x * motion.v_x + motion.v_y * motion.v_y + motion.gamma * motion.gamma
     finite = size + motion.psi + motion.Y + motion.phi  # squares: the references take them too
     measured = Measurements(
-        row,
-        refs,
-        applied.steer,
-        applied.moment,
-        finite - finite != 0.0,
+        row, refs, applied.steer, applied.moment, finite - finite != 0.0,
         CostInputs(refs[0], refs[1], applied.effort, applied.added),
-    )
+    )  # fmt: skip
     return driver, measured
 
 
 @inline
 def integrate_tick(
-    params: StepParams,
-    N_z: Any,
-    steer_command: Any,
-    state: StepState,
-    tick: Any,
-    draws: NormalDraws,
-    next_steer: Any,
-    variant: StepVariant,
-) -> tuple[StepState, Measurements]:
-    """(the state, what is Seen) at the end of the tick that starts at `tick`.
+    params: StepParams, N_z: Any, steer_command: Any, state: StepState, tick: Any,
+    draws: NormalDraws, next_steer: Any, variant: StepVariant,
+) -> tuple[StepState, Measurements]:  # fmt: skip
+    """Integrate one tick of the plant.
 
-    N_z: N m and turn: rad, the commanded yaw moment and added steering. chance: the numbers of the
-    next tick. ahead: rad, the programme's steering at the next tick, which counts where no driver
-    reacts to the car.
+    Args:
+        params: Parameters.
+        N_z: Commanded yaw moment (N m).
+        steer_command: Commanded added steering (rad).
+        state: State at the start.
+        tick: Tick at which it starts.
+        draws: Random numbers of the tick's end.
+        next_steer: Profile's steering (rad) at the end, used where no driver reacts to the car.
+        variant: Variant of the tick.
+
+    Returns:
+        State and measurements at the end.
     """
     small_angle, law, roll = variant.small_angle, variant.law, variant.roll
     state, nominal_motion = _apply_due_change(params, state, tick, variant), state.nominal_motion

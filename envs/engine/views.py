@@ -1,4 +1,4 @@
-"""Views of an episode's packed numbers: its car, its sensors' clocks, its motion, its record."""
+"""Views of an episode's packed numbers: vehicle, slow sensors, motion, true state and record."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 def get_vehicle(config: EpisodeConfig, params: Array, state: Array) -> Vehicle:
-    """The true vehicle now, with what the seed drew; friction is the mean of both sides'."""
+    """Get the true vehicle now, with the seed's draws; friction is the mean of both sides."""
     car, change = read(params, P.car), read(params, P.tyre_change)
     if not car.m > 0.0:  # not reset yet
         return config.vehicle
@@ -35,7 +35,7 @@ def get_vehicle(config: EpisodeConfig, params: Array, state: Array) -> Vehicle:
 
 
 def get_slow_sensors(config: EpisodeConfig, state: Array) -> dict[str, SlowSensor]:
-    """The slow sensors by name, with the clock phase that the episode drew."""
+    """Get the slow sensors by name, with the clock phases that the episode drew."""
     sensors = {}
     for name, sensor in config.slow.items():
         if sensor.phase is None:
@@ -47,16 +47,16 @@ def get_slow_sensors(config: EpisodeConfig, state: Array) -> dict[str, SlowSenso
 
 
 def get_motion(state: Array) -> Motion:
-    """The true velocities, heading, place and roll now, in SI units."""
+    """Get the true `Motion` now, in SI units."""
     return read(state, Z.motion)
 
 
 class TrueState(NamedTuple):
-    """What an estimator of every state would tell, without its error: columns of an array."""
+    """True values of the states that estimators may have: columns of an array."""
 
     beta: int = 0  # rad
     gamma: int = 1  # rad/s
-    F_d: int = 2  # N, all that pushes to the side: wind and the slope of a banked road too
+    F_d: int = 2  # N, the whole lateral disturbance, with wind and bank
     N_d: int = 3  # N m, with the wind's
     phi: int = 4  # rad
     phi_rate: int = 5  # rad/s
@@ -66,7 +66,7 @@ TRUE_STATE = TrueState()
 
 
 def compute_true_states(params: Array, states: Array, switches: Any) -> Array:
-    """The `TrueState` of N episodes now, (N, len(TrueState))."""
+    """Compute the `TrueState` of N episodes now, shape (N, len(TrueState))."""
     out = np.empty((len(params), len(TRUE_STATE)))
     _write_true_states(params, states, switches, out)
     return out
@@ -74,6 +74,7 @@ def compute_true_states(params: Array, states: Array, switches: Any) -> Array:
 
 @jit
 def _write_true_states(params: Any, states: Any, switches: Any, out: Any) -> None:
+    """Write the `TrueState` of N episodes into out (N, len(TrueState))."""
     for i in range(len(params)):
         p, z = params[i], states[i]
         motion, small_angle = read(z, Z.motion), switches[i, FLAGS.small_angle]
@@ -87,12 +88,12 @@ def _write_true_states(params: Any, states: Any, switches: Any, out: Any) -> Non
 
 
 def make_record(state: Array, rows: Array, packets: Array) -> Record:
-    """The record whose fast rows end now (copies)."""
+    """Make a record from copies of fast rows that end now, and of packets."""
     return Record(rows.copy(), packets.copy(), int(state[Z.clock.tick]) - len(rows) + 1)
 
 
 class LazyRows(Sequence[T]):
-    """Something of every row of a batch, made when it is asked for."""
+    """Items of a batch's `count` rows, each made by `make_item` when it is read."""
 
     def __init__(self, count: int, make_item: Callable[[int], T]) -> None:
         self._rows, self._make_item = range(count), make_item

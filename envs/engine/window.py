@@ -1,7 +1,6 @@
-"""The look-ahead window of an env-step: noise and steering programme of its ticks, which do not
-depend on the car, computed ahead; and where the car went.
+"""The window of an env-step: noise and steering of its ticks, computed ahead, and motion and cost.
 
-Its columns are the ticks of the step. That of a block of vehicles has a third axis, their lanes.
+Its columns are the ticks of the step. A block of vehicles has a third axis, their lanes.
 """
 
 from typing import Annotated, Any, NamedTuple
@@ -34,7 +33,7 @@ from .layout import PARAMS_WIDTH, P, Z
 
 
 class CostInputs(NamedTuple):
-    """What is judged of a tick besides the motion that it led to."""
+    """Inputs of a tick's cost besides the motion at its end."""
 
     beta_ref: Any
     gamma_ref: Any
@@ -42,7 +41,7 @@ class CostInputs(NamedTuple):
     added: Any
 
 
-class TickCost(NamedTuple):
+class _TickCost(NamedTuple):
     """Cost and failures of a tick."""
 
     cost: Any  # per second
@@ -51,9 +50,8 @@ class TickCost(NamedTuple):
     off: Any  # or has left the road
 
 
-class StepWindow(NamedTuple):
-    """Rows of the array: normal numbers, the programme's angle in rad, Motion at the tick's end and
-    what is to be judged of it."""
+class _StepWindow(NamedTuple):
+    """Rows of the window: normal numbers, steering angle (rad), motion and cost inputs."""
 
     inertial: Annotated[tuple[Any, ...], 4]
     wheels: Annotated[tuple[Any, ...], 4]
@@ -62,27 +60,26 @@ class StepWindow(NamedTuple):
     cost_inputs: CostInputs
 
 
-WINDOW, WINDOW_HEIGHT = make_offsets(StepWindow)
-TICK_COST = TickCost(*WINDOW.cost_inputs)
-"""The rows in which a tick's Verdict stands once there is one, flags as 0 and 1."""
+WINDOW, WINDOW_HEIGHT = make_offsets(_StepWindow)
+TICK_COST = _TickCost(*WINDOW.cost_inputs)
+"""The rows that hold a tick's cost once it is evaluated, flags as 0 and 1."""
 _DECAY, _NOISE_GAIN, _HOLD = P.steering_profile[WANDER_START : WANDER_START + 3]
 
 
 @jit
 def count_columns(n: int) -> int:
-    """The columns for n ticks a step: whole lanes."""
+    """Count the columns for n ticks a step: whole lanes."""
     return -(-n // LANES) * LANES
 
 
 def make_window(n: int, *lanes: int) -> Array:
-    """The array for n ticks a step."""
+    """Make a window (WINDOW_HEIGHT, columns, *lanes) for n ticks a step."""
     return np.zeros((WINDOW_HEIGHT, count_columns(n), *lanes))
 
 
 @jit
 def compute_profile_angle(p: Any, tick: Any) -> Any:
-    """The angle in rad at a tick of one vehicle's programme, or of the trace behind
-    `EpisodeParams`."""
+    """Compute the steering angle (rad) of a profile, or of the trace behind `EpisodeParams`."""
     if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
         return interpolate_trace(tick, p[PARAMS_WIDTH:])
     return compute_steering(tick, p[P.steering_profile[0] :])
@@ -90,17 +87,14 @@ def compute_profile_angle(p: Any, tick: Any) -> Any:
 
 @jit
 def overwrite_steering(p: Any, z: Any, n: int, window: Any) -> None:
-    """Write the angles of a trace, or of a driver who wanders, over those of the programme."""
+    """Write the angles of a trace, or of a wandering driver, over those of the profile."""
     if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
         for j in range(n):
             window[WINDOW.steer, j] = interpolate_trace(z[Z.clock.tick] + (j + 1), p[PARAMS_WIDTH:])
     hold = p[_HOLD]
     if hold > 0.0:
-        angle, key_low, key_high = (
-            z[Z.driver],
-            to_word(z[Z.clock.key_low]),
-            to_word(z[Z.clock.key_high]),
-        )
+        angle = z[Z.driver]
+        key_low, key_high = to_word(z[Z.clock.key_low]), to_word(z[Z.clock.key_high])
         for j in range(n):
             tick = int(z[Z.clock.tick]) + (j + 1)
             if tick % int(hold) == 0:
@@ -111,17 +105,13 @@ def overwrite_steering(p: Any, z: Any, n: int, window: Any) -> None:
 
 @jit
 def has_overwrite(p: Any, width: int) -> bool:
-    """Whether `overwrite_steering` has something to write for one of a block's vehicles at least; p
-    has a column for each, `width` is that of their parameters."""
+    """Whether `overwrite_steering` has something to write for a block: p with `width` rows."""
     return width > PARAMS_WIDTH or bool(any_lane(load_element(p, _HOLD) > 0.0))
 
 
 @jit
 def precompute_window(p: Any, z: Any, n: int, has_driver: int, window: Any) -> None:
-    """The random numbers and the programme's steering of the next n ticks of one vehicle.
-
-    has_driver: 1 where the driver reacts to the car, and no programme steers.
-    """
+    """Write noise and steering of one vehicle's next n ticks; with has_driver no profile steers."""
     clock = read(z, Z.clock)
     key_low, key_high, first = to_word(clock.key_low), to_word(clock.key_high), int(clock.tick) + 1
     profile = p[P.steering_profile[0] :]
@@ -138,7 +128,7 @@ def precompute_window(p: Any, z: Any, n: int, has_driver: int, window: Any) -> N
 
 @jit
 def precompute_lane_window(p: Any, z: Any, n: int, has_driver: int, window: Any) -> None:
-    """The same of a block of vehicles: p, z with a column for each."""
+    """Write noise and steering of a block: `precompute_window` of p, z with a column a vehicle."""
     clock = read(z, Z.clock)
     key_low, key_high = to_word(clock.key_low), to_word(clock.key_high)
     profile = p[P.steering_profile[0] :]
@@ -154,24 +144,23 @@ def precompute_lane_window(p: Any, z: Any, n: int, has_driver: int, window: Any)
 
 @jit
 def read_draws(window: Any, j: int) -> NormalDraws:
-    """The random numbers of a tick of the step."""
+    """Read the random numbers of tick j of the step."""
     return NormalDraws(read(window, WINDOW.inertial, j), read(window, WINDOW.wheels, j))
 
 
 @inline
 def compute_tick_cost(
     motion: Any, cost_inputs: CostInputs, task: Any, path: Any, variant: Any
-) -> TickCost:
-    """The Verdict on a tick that led to a motion.
+) -> _TickCost:
+    """Compute cost and failures of a tick from the motion at its end.
 
-    No tick of the plant waits for it: that of all of a step's follows at once.
+    No tick of the plant waits for it: a step's ticks are evaluated together.
     """
     beta = compute_sideslip_angle(motion.v_x, motion.v_y, variant.small_angle)
     e_beta, e_gamma = beta - cost_inputs.beta_ref, motion.gamma - cost_inputs.gamma_ref
-    lateral_deviation = motion.y - (
-        compute_path_offset(path, motion.s) if variant.has_driver else 0.0
-    )
-    return TickCost(
+    path_offset = compute_path_offset(path, motion.s) if variant.has_driver else 0.0
+    lateral_deviation = motion.y - path_offset
+    return _TickCost(
         compute_cost_rate(
             e_beta, e_gamma, cost_inputs.effort, cost_inputs.added, variant.reference
         ),
@@ -185,16 +174,13 @@ def compute_tick_cost(
 def evaluate_cost(
     window: Any, n: int, cost: Any, params: Any, variant: Any
 ) -> tuple[Any, int, bool]:
-    """(cost, ticks, whether the last of them is a failure) of a step's n ticks, up to one at which
-    a car spins or has left the road. cost: 0, of one car or of those of a block.
+    """Evaluate a step's n ticks up to a failure: (cost, number of ticks, whether the last fails).
 
-    Verdicts take the place of what they are on.
+    Cost and failures overwrite the cost inputs in the window. `cost` is 0, of one car or a block.
     """
     for j in range(0, n, lane_width(window)):
-        motion, cost_inputs = (
-            load_lanes(window, WINDOW.track, j),
-            load_lanes(window, WINDOW.cost_inputs, j),
-        )
+        motion = load_lanes(window, WINDOW.track, j)
+        cost_inputs = load_lanes(window, WINDOW.cost_inputs, j)
         tick_cost = compute_tick_cost(motion, cost_inputs, params.task, params.path, variant)
         spun, off = select(tick_cost.spun, 1.0, 0.0), select(tick_cost.off, 1.0, 0.0)
         write(window, (tick_cost.cost, tick_cost.beta, spun, off), WINDOW.cost_inputs, j)

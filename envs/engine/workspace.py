@@ -1,4 +1,4 @@
-"""The arrays of episodes: what kernels read and write of one, and of the N of a batch."""
+"""Arrays of an episode and of a batch of N; an episode's workspace, one vector that holds them."""
 
 from typing import Any, NamedTuple
 
@@ -17,30 +17,29 @@ class EpisodeArrays(NamedTuple):
 
     # (PARAMS_WIDTH,), packed as in `EpisodeParams`; behind it a recorded trace, if there is one
     p: Any
-    z: Any  # (STATE_WIDTH,), packed as in `State`
+    z: Any  # (STATE_WIDTH,), packed as in `EpisodeState`
     switches: Any  # (len(Switches),) int64
     obs: Any  # (k,) float32
     rows: Any  # (n, FAST_WIDTH), the fast rows of the newest record
-    packets: Any  # (most, PACKET_WIDTH), its packets
+    packets: Any  # (max, PACKET_WIDTH), its packets
     report: Any  # (len(Report),)
 
 
-class WorkspaceSizes(NamedTuple):
-    """What a workspace begins with."""
+class _WorkspaceSizes(NamedTuple):
+    """Sizes at the beginning of a workspace."""
 
     n: Any  # ticks a step
     n_entries: Any  # of an observation
     max_packets: Any  # packets of a step
 
 
-SIZES, _HEADER = make_offsets(WorkspaceSizes)
+SIZES, _HEADER = make_offsets(_WorkspaceSizes)
 
 
 def make_workspace(n: int, bounds: Array, max_packets: int, trace_width: int = 0) -> Array:
-    """The arrays of an episode, one behind the other in one vector: numba takes 0.04 us for every
-    array that it is handed. `split_workspace` finds them.
+    """Make a workspace of n ticks: one vector, since numba takes 0.04 us for every array passed.
 
-    bounds: (2, k), of an observation's entries. trace: the numbers behind the parameters.
+    `bounds` are (2, k); `trace_width` values of a trace follow the parameters.
     """
     k = bounds.shape[1]
     width = _HEADER + STATE_WIDTH + len(REPORT) + len(FLAGS) + 2 * k - (-k // 2)
@@ -53,7 +52,7 @@ def make_workspace(n: int, bounds: Array, max_packets: int, trace_width: int = 0
 
 @jit
 def split_workspace(workspace: Any) -> Any:
-    """(the episode's Row, the bounds of its observation, its window) that lie in a workspace."""
+    """Split a workspace into (`EpisodeArrays`, bounds of the observation, window)."""
     sizes = read(workspace, SIZES)
     n, k, max_packets = int(sizes.n), int(sizes.n_entries), int(sizes.max_packets)
     report = _HEADER + STATE_WIDTH
@@ -64,14 +63,11 @@ def split_workspace(workspace: Any) -> Any:
     packets = rows + n * FAST_WIDTH
     obs = packets + max_packets * PACKET_WIDTH
     row = EpisodeArrays(
-        workspace[obs - (-k // 2) :],
-        workspace[_HEADER:report],
-        as_int64(workspace, flags, len(FLAGS)),
-        as_float32(workspace, obs, k),
+        workspace[obs - (-k // 2) :], workspace[_HEADER:report],
+        as_int64(workspace, flags, len(FLAGS)), as_float32(workspace, obs, k),
         as_matrix(workspace, rows, n, FAST_WIDTH),
-        as_matrix(workspace, packets, max_packets, PACKET_WIDTH),
-        workspace[report:flags],
-    )
+        as_matrix(workspace, packets, max_packets, PACKET_WIDTH), workspace[report:flags],
+    )  # fmt: skip
     return (
         row,
         as_matrix(workspace, bounds, 2, k),
@@ -97,16 +93,15 @@ class WorkspaceMixin:
     _workspace: Array | None = None
 
     def _allocate(self, width: int) -> None:
-        """A workspace for parameters and a trace behind them, `width` numbers, where they are not
-        as many as before."""
+        """Allocate a workspace for `width` parameters with a trace, if that is another number."""
         if self._workspace is None or len(self._params) != width:
-            config, trace = self.config, width - PARAMS_WIDTH
-            max_packets = config.max_packets
-            self._workspace = make_workspace(self.control_period, config.bounds, max_packets, trace)
+            config, n = self.config, self.control_period
+            sizes = config.max_packets, width - PARAMS_WIDTH
+            self._workspace = make_workspace(n, config.bounds, *sizes)
             self._bind_views()
 
     def _bind_views(self) -> None:
-        """Name the parts, and the calls that read them in every step."""
+        """Bind the workspace's parts, and the calls that read them in every step."""
         self._row, self._bounds, self._window = _split_workspace(self._workspace)
         self._params, self._state, self._switches, self._obs, *record = self._row
         self.rows, self.packets, self._report = record
@@ -121,14 +116,14 @@ class WorkspaceMixin:
 
     @property
     def delivered(self) -> int:
-        """How many packets the newest record has."""
+        """Number of packets of the newest record."""
         return int(self._report[REPORT.packets])
 
 
 class BatchArrays(NamedTuple):
     """The arrays of N episodes, a row for each."""
 
-    params: Any  # (N, ...), the rest as in `Row`
+    params: Any  # (N, ...), the rest as in `EpisodeArrays`
     states: Any
     switches: Any
     obs: Any
@@ -152,7 +147,7 @@ class RecordArrays(NamedTuple):
 class EpisodeStart(NamedTuple):
     """The packed start of an episode; of several, arrays have an axis more, the first."""
 
-    params: Any  # as in `Row`, with what the scenario does not draw
+    params: Any  # as in `EpisodeArrays`, but for the draws
     low: Any  # (len(Draws),), the ranges that it draws from
     high: Any
     switches: Any
@@ -161,25 +156,16 @@ class EpisodeStart(NamedTuple):
 
 @jit
 def get_episode_arrays(batch: BatchArrays, i: int) -> EpisodeArrays:
-    """The arrays of an episode of several."""
+    """Get the arrays of episode i of a batch."""
     return EpisodeArrays(
-        batch.params[i],
-        batch.states[i],
-        batch.switches[i],
-        batch.obs[i],
-        batch.rows[i],
-        batch.packets[i],
-        batch.reports[i],
-    )
+        batch.params[i], batch.states[i], batch.switches[i], batch.obs[i], batch.rows[i],
+        batch.packets[i], batch.reports[i],
+    )  # fmt: skip
 
 
 @jit
 def get_episode_start(starts: EpisodeStart, i: int) -> EpisodeStart:
     """The start of one of several episodes."""
     return EpisodeStart(
-        starts.params[i],
-        starts.low[i],
-        starts.high[i],
-        starts.switches[i],
-        starts.motion[i],
+        starts.params[i], starts.low[i], starts.high[i], starts.switches[i], starts.motion[i]
     )

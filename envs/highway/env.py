@@ -1,4 +1,4 @@
-"""HighwayEnv: our car and its sensors on highway-env's roads, among its vehicles."""
+"""`HighwayEnv`: our car and its sensors on highway-env's roads, among its vehicles."""
 
 import copy
 from collections.abc import Mapping
@@ -34,9 +34,8 @@ class HighwayEnv(StabilityEnv):
     camera, driver and the record's curvature refer to the lane that our car follows, which begins
     as its own and stays so while the driver swerves. Needs the extra `highway`.
 
-    The seed draws on which side the free lane is, the hazard and the traffic from the episode's
-    key, and highway-env's own random numbers come from there too. The road is stepped every 50 ms
-    at the ticks' places of our car, whatever the control period.
+    The episode's key draws the side of the free lane, the hazard, the traffic and highway-env's own
+    random numbers. The road is stepped every 50 ms, whatever the control period.
 
     Raises ModuleNotFoundError without highway-env, ValueError for an unknown road, a number of
     vehicles out of place, a scenario with a road of its own or of small angles, one without a
@@ -109,26 +108,23 @@ class HighwayEnv(StabilityEnv):
         """
         reset_options = dict(options or {})
         if "scenario" in reset_options:
-            reset_options["scenario"] = self._adapt_scenario(
-                make_scenario(reset_options["scenario"])
-            )
+            scenario = make_scenario(reset_options["scenario"])
+            reset_options["scenario"] = self._adapt_scenario(scenario)
         state = reset_options.get("state", {})
         if isinstance(state, Mapping):
             if fixed_names := [name for name in _FIXED_STATE if name in state]:
-                raise ValueError(
-                    f"reset option state: {fixed_names[0]} is where the road begins; y may be"
-                )
+                reason = f"{fixed_names[0]} is where the road begins; y may be"
+                raise ValueError(f"reset option state: {reason}")
             if "y" in state:
                 reset_options["state"] = {**state, "Y": state["y"]}
         return super().reset(seed=seed, options=reset_options)
 
     def _start_episode(self) -> None:
-        """The road, the vehicles on it, and the driver's path around the one that brakes."""
+        """Make the road, its vehicles, and the driver's path around the one that brakes."""
         p, z = self._params, self._state
         friction = 0.5 * float(p[P.car.mu] + p[P.car.mu_r])
-        start = TrafficStart(
-            self._episode.vehicle, self.motion, float(p[P.speed_profile.speed]), friction
-        )
+        speed = float(p[P.speed_profile.speed])
+        start = TrafficStart(self._episode.vehicle, self.motion, speed, friction)
         key = int(z[Z.clock.key_low]) | int(z[Z.clock.key_high]) << 32
         self._traffic = Traffic(self.road, start, self.hazard, self.traffic, key)
         if self._traffic.path is not None:
@@ -136,7 +132,7 @@ class HighwayEnv(StabilityEnv):
         super()._start_episode()
 
     def _advance(self, command: npt.NDArray[np.float32]) -> int:
-        """One control period of our car on the lane as it is here, then the road's steps in it."""
+        """Drive a control period on the lane as it is here, then take the road's steps in it."""
         traffic, p, z = self._traffic, self._params, self._state
         assert traffic is not None
         position = traffic.locate(self.motion)
@@ -153,25 +149,18 @@ class HighwayEnv(StabilityEnv):
         return done
 
     def _write_failure(self, failure: int) -> None:
-        """End the episode, the rest of it charged."""
+        """End the episode with a failure code; the rest of it is charged."""
         z, report = self._state, self._report
         z[Z.clock.failure] = report[REPORT.failure] = failure
         report[REPORT.cost] += compute_failure_cost(self._params[P.task.duration], z[Z.clock.tick])
         report[REPORT.reward] = -report[REPORT.cost]
 
     def make_render_state(self, row: int = 0) -> RenderState:
-        """Make what a picture is drawn from, its road by highway-env's own graphics.
-
-        Args:
-            row: Number of the car, 0.
-
-        Returns:
-            The state.
-        """
+        """Make the state that a picture of car `row` shows, its road by highway-env's graphics."""
         return super().make_render_state(row)._replace(world=self._draw_world)
 
     def _draw_world(self, size: tuple[int, int], others: list[Motion]) -> Any:
-        """The road around our car as highway-env draws it, and others of ours as shadows on it."""
+        """Draw the road around our car by highway-env, with others of ours as shadows on it."""
         import pygame
         from highway_env.road.graphics import RoadGraphics, WorldSurface
         from highway_env.vehicle.graphics import VehicleGraphics

@@ -1,12 +1,9 @@
-"""highway-env's own `lane-keeping-v0` behind our record: our sensors and filters there.
+"""Adapter of highway-env's own `lane-keeping-v0`, for our sensors and estimators.
 
-Its car is a linear bicycle whose steering alone acts, at a constant speed. Faults of its version
-1.12.1 are worked around here, and `tests/envs/highway/test_keeping.py` has each:
-
-- it takes no argument `render_mode` (set here on the built environment);
-- its `step` returns the observation from before the step (`NativeObservation` takes either);
-- its Runge-Kutta steps of 0.1 s are unstable below 5.5 m/s (here a step is a tick of 1 ms);
-- its linear model, half as strong in steering as the car, is not used.
+Its car is a linear bicycle at constant speed, and its steering alone acts. Faults of version 1.12.1
+are worked around: `render_mode` is set on the built environment, which takes no such argument;
+`step` returns the observation from before the step (`NativeObservation` takes either); steps of
+0.1 s are unstable below 5.5 m/s, so a step is a tick; its too weak linear model is not used.
 """
 
 import math
@@ -29,20 +26,15 @@ from ..vehicle.dynamics import Motion
 from ..vehicle.parameters import Vehicle
 from .traffic import locate_on_lane
 
-from highway_env.envs.lane_keeping_env import LaneKeepingEnv  # isort: skip  # after `roads`
+from highway_env.envs.lane_keeping_env import LaneKeepingEnv  # isort: skip  # after `traffic`
 from highway_env.vehicle.dynamics import BicycleVehicle  # isort: skip
 
 _compute_preview_offset = as_python(compute_preview_offset)
 _MASS = 1000.0  # kg; theirs is 1 kg, and only ratios to it count
 KEEPING = Scenario(
-    name="lane-keeping-v0",
-    duration=16.0,
-    speed=8.3,
-    tyres="linear",
-    roll=False,
-    disturbance_force=0.0,
-    disturbance_moment=0.0,
-)
+    name="lane-keeping-v0", duration=16.0, speed=8.3, tyres="linear", roll=False,
+    disturbance_force=0.0, disturbance_moment=0.0,
+)  # fmt: skip
 """Only the controller steers; the car and its lane are highway-env's."""
 STATES = ("beta", "gamma", "psi", "y_l")
 
@@ -51,26 +43,14 @@ def make_keeping_vehicle() -> Vehicle:
     """Make highway-env's bicycle as our `Vehicle`; the motors, roll and height are assumed."""
     car = BicycleVehicle
     return Vehicle(
-        name="highway-env's bicycle",
-        mass=_MASS,
-        yaw_inertia=_MASS * car.INERTIA_Z / car.MASS,
-        front_arm=car.LENGTH_A,
-        rear_arm=car.LENGTH_B,
+        name="highway-env's bicycle", mass=_MASS, yaw_inertia=_MASS * car.INERTIA_Z / car.MASS,
+        front_arm=car.LENGTH_A, rear_arm=car.LENGTH_B,
         front_stiffness=_MASS * car.FRICTION_FRONT / car.MASS,  # per tyre, as their 2 C_f has it
-        rear_stiffness=_MASS * car.FRICTION_REAR / car.MASS,
-        front_track=1.6,
-        rear_track=1.6,
-        wheel_radius=0.3,
-        gravity_height=0.5,
-        motor_torque=100.0,
-        steering_authority=0.5,
-        width=car.WIDTH,
-        sprung_mass=0.9 * _MASS,
-        roll_arm=0.3,
-        roll_inertia=500.0,
-        roll_stiffness=5e4,
-        roll_damping=3e3,
-    )
+        rear_stiffness=_MASS * car.FRICTION_REAR / car.MASS, front_track=1.6, rear_track=1.6,
+        wheel_radius=0.3, gravity_height=0.5, motor_torque=100.0, steering_authority=0.5,
+        width=car.WIDTH, sprung_mass=0.9 * _MASS, roll_arm=0.3, roll_inertia=500.0,
+        roll_stiffness=5e4, roll_damping=3e3,
+    )  # fmt: skip
 
 
 class KeepingPlant:
@@ -88,30 +68,22 @@ class KeepingPlant:
         self.s = 0.0
 
     def start(self, seed: int) -> None:
-        """Begin an episode.
-
-        Args:
-            seed: Seed of highway-env's environment.
-        """
+        """Begin an episode with a seed of highway-env's environment."""
         self.last_observation, _ = self.env.reset(seed=seed)
         self.s = 0.0
         self.project()
 
     def project(self) -> None:
-        """Project the car onto the lane that highway-env has it keep.
-
-        The next tick is a step of highway-env's own `step`.
-        """
+        """Project the car onto highway-env's lane; the next tick is one of its own `step`."""
         self._is_full_step = True
         x, y, heading = self.env.vehicle.state[:3, 0].tolist()
         position = locate_on_lane(self.env.lane, x, -y, -heading)
         self.y, self.theta, self.curvature = position.y, position.theta, position.curvature
 
     def step(self, inputs: OutsideInputs, h: float) -> None:
-        """Step the car over a tick; its place on the lane is integrated until projected again.
+        """Step the car over a tick, and integrate its place on the lane.
 
-        The first tick of a control period is one of highway-env's `step`, which also takes the next
-        lane and observes; the others are what it does to the car.
+        A control period's first tick is highway-env's own `step`; the others only move the car.
 
         Args:
             inputs: Inputs, of which the steering angle acts.
@@ -125,12 +97,8 @@ class KeepingPlant:
             self.env.action_type.act(action)
             self.env.road.step(h)
         self._is_full_step, after = False, self.motion
-        distance, sideways = (
-            0.5 * h * (a + b)
-            for a, b in zip(
-                _compute_road_velocity(before), _compute_road_velocity(after), strict=True
-            )
-        )
+        ends = zip(_compute_road_velocity(before), _compute_road_velocity(after), strict=True)
+        distance, sideways = (0.5 * h * (a + b) for a, b in ends)
         ds = distance / (1.0 - self.curvature * self.y)
         self.s, self.theta = self.s + ds, self.theta + self.curvature * ds
         self.y += sideways
@@ -166,7 +134,7 @@ class KeepingPlant:
 
 
 def _compute_road_velocity(motion: Motion) -> tuple[float, float]:
-    """(along, across) in m/s, the velocity in the road's axes."""
+    """Compute the velocity (along, across) in the road's axes (m/s)."""
     angle = motion.psi - motion.theta
     cos, sin = math.cos(angle), math.sin(angle)
     return motion.v_x * cos - motion.v_y * sin, motion.v_x * sin + motion.v_y * cos
@@ -195,12 +163,9 @@ class KeepingEnv(PlantEnv):
     ) -> None:
         self.plant: KeepingPlant = KeepingPlant(render_mode)
         fixed: dict[str, Any] = {"steering": True, "reference": "zero-slip"}
+        vehicle = make_keeping_vehicle()
         super().__init__(
-            sensors,
-            KEEPING,
-            make_keeping_vehicle(),
-            control_period=control_period,
-            **fixed | options,
+            sensors, KEEPING, vehicle, control_period=control_period, **fixed | options
         )
 
     def reset(
@@ -227,7 +192,7 @@ class KeepingEnv(PlantEnv):
         self.plant.start(int(self._state[Z.clock.key_low]))
 
     def _advance(self, command: npt.NDArray[np.float32]) -> int:
-        """A control period on the lane as it is here, which camera and record then see."""
+        """Drive a control period on the lane as it is here, which camera and record then have."""
         plant, z = self.plant, self._state
         plant.project()
         self._params[P.road.curvature] = plant.curvature
@@ -247,11 +212,7 @@ class KeepingEnv(PlantEnv):
         raise TypeError("highway-env's lane-keeping-v0 makes no snapshots")
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Refuse: TypeError, since highway-env makes no snapshots.
-
-        Args:
-            snapshot: Not used.
-        """
+        """Refuse any snapshot: TypeError, since highway-env makes none."""
         self.get_state()
 
 
@@ -267,24 +228,13 @@ class NativeObservation(gym.ObservationWrapper[Any, Any, Any]):
     def __init__(self, env: gym.Env[Any, Any], returned: bool) -> None:
         super().__init__(env)
         self._returned = returned
-        units = ("rad", "rad/s", "rad", "m")
-        names = [f"{name}_hat" for name in STATES]
-        entries = [
-            ObservationEntry(name, unit, -200.0, 200.0)
-            for name, unit in zip(names, units, strict=True)
-        ]
+        units = zip(STATES, ("rad", "rad/s", "rad", "m"), strict=True)
+        entries = [ObservationEntry(f"{name}_hat", unit, -200.0, 200.0) for name, unit in units]
         self.layout = (*env.get_wrapper_attr("layout"), *entries)
         self.observation_space = make_space(self.layout)
 
     def observation(self, observation: Any) -> Any:
-        """Append highway-env's `STATES` to an observation.
-
-        Args:
-            observation: Observation of the `KeepingEnv`.
-
-        Returns:
-            Both, float32.
-        """
+        """Append highway-env's `STATES` to an observation of the `KeepingEnv`, in float32."""
         base: Any = self.env.unwrapped
         plant = base.plant
         native = plant.last_observation if self._returned else plant.env.observation_type.observe()

@@ -1,9 +1,7 @@
-"""Road networks of highway-env with the lanes that our car follows, and a place on these lanes.
+"""highway-env's road networks and vehicles, one of which brakes, with our car among them.
 
 Our car begins at the origin, along x, at the centre of its own lane; the free lane beside it is to
 its left (side 1) or to its right (-1). Every road begins straight.
-
-The vehicles on a road: highway-env's own, one of which brakes, and our car among them.
 """
 
 import dataclasses
@@ -33,28 +31,21 @@ from highway_env.vehicle.objects import Obstacle  # isort: skip
 
 assert canvas  # which keeps pygame from greeting
 WIDTH = StraightLane.DEFAULT_WIDTH  # m
-ENTRY, BEHIND, BEYOND = 60.0, -300.0, 3000.0  # m: straight to begin with, where roads begin and end
+# m: length of the first straight, where roads begin, where they end
+ENTRY, _BEHIND, _BEYOND = 60.0, -300.0, 3000.0
 RADIUS, ANGLE = 400.0, math.radians(60.0)  # of either bend
 _LINE, _DASHES, _NONE = LineType.CONTINUOUS_LINE, LineType.STRIPED, LineType.NONE
 _FAST = 60.0  # m/s, no limit
 _DIFFERENCE = 0.05  # m, of differences along a lane
 
 
-class RoadLayout(NamedTuple):
-    """A network and the lanes that our car follows in it.
-
-    Attributes:
-        network: highway-env's network.
-        route: Our lanes, one after the other.
-        own_lane: Index of our lane among those of each road.
-        free_lane: Index of the lane beside it.
-        ramp: Index of the lane from which others merge; None without a ramp.
-    """
+class _RoadLayout(NamedTuple):
+    """A network and the lanes that our car follows in it."""
 
     network: Any
-    route: tuple[Any, ...]
-    own_lane: int
-    free_lane: int
+    route: tuple[Any, ...]  # our lanes, one after the other
+    own_lane: int  # index of our lane among those of each road
+    free_lane: int  # of the lane beside it
     ramp: tuple[str, str, int] | None = None  # where others merge from
 
 
@@ -67,32 +58,18 @@ class LanePosition(NamedTuple):
     curvature: float  # 1/m, left positive
 
 
-def make_straight(side: int) -> RoadLayout:
-    """Make two lanes straight ahead.
-
-    Args:
-        side: Side of the free lane, 1 left or -1 right.
-
-    Returns:
-        The layout.
-    """
+def _make_straight(side: int) -> _RoadLayout:
+    """Make two lanes straight ahead."""
     network = RoadNetwork()
-    _add_straight(network, "start", "a", side, BEHIND, 0.0)
-    route = _add_straight(network, "a", "b", side, 0.0, BEYOND)
-    return RoadLayout(network, tuple(route), *_get_lane_indices(side))
+    _add_straight(network, "start", "a", side, _BEHIND, 0.0)
+    route = _add_straight(network, "a", "b", side, 0.0, _BEYOND)
+    return _RoadLayout(network, tuple(route), *_get_lane_indices(side))
 
 
-def make_curved(side: int) -> RoadLayout:
-    """Make two lanes through a bend to the left and one to the right, with circular arcs.
-
-    Args:
-        side: Side of the free lane, 1 left or -1 right.
-
-    Returns:
-        The layout.
-    """
+def _make_curved(side: int) -> _RoadLayout:
+    """Make two lanes through a bend to the left and one to the right, with circular arcs."""
     network, route = RoadNetwork(), []
-    _add_straight(network, "start", "a", side, BEHIND, 0.0)
+    _add_straight(network, "start", "a", side, _BEHIND, 0.0)
     route += _add_straight(network, "a", "b", side, 0.0, ENTRY)
     position, heading = np.array([ENTRY, 0.0]), 0.0
     for first, last, turn in (("b", "c", 1.0), ("c", "d", -1.0)):
@@ -105,62 +82,51 @@ def make_curved(side: int) -> RoadLayout:
             network.add_lane(first, last, lane)
             route += [lane] * (offset == 0.0)
         position, heading = route[-1].position(route[-1].length, 0.0), heading - turn * ANGLE
-    route += _add_straight(network, "d", "e", side, position[0], position[0] + BEYOND, position[1])
-    return RoadLayout(network, tuple(route), *_get_lane_indices(side))
+    route += _add_straight(network, "d", "e", side, position[0], position[0] + _BEYOND, position[1])
+    return _RoadLayout(network, tuple(route), *_get_lane_indices(side))
 
 
-def make_merging(side: int) -> RoadLayout:
-    """Make two lanes straight ahead that others join from a ramp on the right, as on `merge-v0`.
-
-    Args:
-        side: Side of the free lane, 1 left or -1 right.
-
-    Returns:
-        The layout.
-    """
+def _make_merging(side: int) -> _RoadLayout:
+    """Make two lanes straight ahead that others join from a ramp on the right, as on `merge-v0`."""
     network, route = RoadNetwork(), []
-    _add_straight(network, "start", "a", side, BEHIND, 0.0)
+    _add_straight(network, "start", "a", side, _BEHIND, 0.0)
     for first, last, start, end in (("a", "b", 0.0, 200.0), ("b", "c", 200.0, 350.0)):
         route += _add_straight(network, first, last, side, start, end)
-    route += _add_straight(network, "c", "d", side, 350.0, BEYOND)
+    route += _add_straight(network, "c", "d", side, 350.0, _BEYOND)
     edge, sway, lines = max(offset for offset, _ in _list_lanes(side)) + WIDTH, 3.25, (_LINE, _LINE)
-    far, lane_options = (
-        edge + 2.0 * sway,
-        {"line_types": lines, "forbidden": True, "speed_limit": _FAST},
-    )
-    ramp = StraightLane([BEHIND, far], [120.0, far], **lane_options)
+    far = edge + 2.0 * sway
+    style = {"line_types": lines, "forbidden": True, "speed_limit": _FAST}
+    ramp = StraightLane([_BEHIND, far], [120.0, far], **style)
     ends = [120.0, far - sway], [200.0, far - sway]
-    bend = SineLane(*ends, sway, math.pi / 80.0, 0.5 * math.pi, **lane_options)
-    last = StraightLane(
-        [200.0, edge], [350.0, edge], **lane_options | {"line_types": (_NONE, _LINE)}
-    )
+    bend = SineLane(*ends, sway, math.pi / 80.0, 0.5 * math.pi, **style)
+    style["line_types"] = _NONE, _LINE
+    last = StraightLane([200.0, edge], [350.0, edge], **style)
     for first, end_node, lane in (("j", "k", ramp), ("k", "b", bend), ("b", "c", last)):
         network.add_lane(first, end_node, lane)
-    return RoadLayout(network, tuple(route), *_get_lane_indices(side), ("j", "k", 0))
+    return _RoadLayout(network, tuple(route), *_get_lane_indices(side), ("j", "k", 0))
 
 
-ROADS: dict[str, Callable[[int], RoadLayout]] = {
-    "straight": make_straight,
-    "curved": make_curved,
-    "merging": make_merging,
-}
-"""What lays each road, for the side of the free lane."""
+ROADS: dict[str, Callable[[int], _RoadLayout]] = {
+    "straight": _make_straight, "curved": _make_curved, "merging": _make_merging,
+}  # fmt: skip
+"""The function that makes each road, for the side of the free lane."""
 
 
 def _list_lanes(side: int) -> list[tuple[float, tuple[int, int]]]:
-    """(offset in m to the right of ours, its lines) of both lanes, from left to right."""
+    """List both lanes from left to right: (offset in m to the right of ours, its lines)."""
     left = -WIDTH if side > 0 else 0.0
     return [(left, (_LINE, _DASHES)), (left + WIDTH, (_NONE, _LINE))]
 
 
 def _get_lane_indices(side: int) -> tuple[int, int]:
+    """Get the indices of (our lane, the free lane)."""
     return (1, 0) if side > 0 else (0, 1)
 
 
 def _add_straight(
     network: Any, first: str, last: str, side: int, start: float, end: float, y: float = 0.0
 ) -> list[Any]:
-    """Lay both lanes of a straight stretch from x = start to end, ours at y; returns ours."""
+    """Add both lanes of a straight stretch from x = start to end, ours at y; return ours."""
     for offset, lines in _list_lanes(side):
         ends = [start, y + offset], [end, y + offset]
         network.add_lane(first, last, StraightLane(*ends, WIDTH, lines, speed_limit=_FAST))
@@ -190,15 +156,13 @@ def locate_on_lane(lane: Any, X: float, Y: float, psi: float) -> LanePosition:
         bend = 0.0
     else:
         for _ in range(4):
-            direction = np.array(
-                [math.cos(lane.heading_at(longitudinal)), math.sin(lane.heading_at(longitudinal))]
-            )
+            heading = lane.heading_at(longitudinal)
+            direction = np.array([math.cos(heading), math.sin(heading)])
             offset = point - lane.position(longitudinal, 0.0)
             longitudinal += float(direction @ offset) / _compute_scale(lane, longitudinal)
             right = float(direction[0] * offset[1] - direction[1] * offset[0])
-        heading_change = lane.heading_at(longitudinal + _DIFFERENCE) - lane.heading_at(
-            longitudinal - _DIFFERENCE
-        )
+        before, after = longitudinal - _DIFFERENCE, longitudinal + _DIFFERENCE
+        heading_change = lane.heading_at(after) - lane.heading_at(before)
         bend = -heading_change / (2.0 * _DIFFERENCE * _compute_scale(lane, longitudinal))
     lane_direction = -lane.heading_at(longitudinal)
     theta = lane_direction + 2.0 * math.pi * round((psi - lane_direction) / (2.0 * math.pi))
@@ -207,9 +171,8 @@ def locate_on_lane(lane: Any, X: float, Y: float, psi: float) -> LanePosition:
 
 def _compute_scale(lane: Any, longitudinal: float) -> float:
     """Compute the metres of a unit of a lane's own coordinate."""
-    chord = lane.position(longitudinal + _DIFFERENCE, 0.0) - lane.position(
-        longitudinal - _DIFFERENCE, 0.0
-    )
+    before, after = longitudinal - _DIFFERENCE, longitudinal + _DIFFERENCE
+    chord = lane.position(after, 0.0) - lane.position(before, 0.0)
     return float(np.hypot(*chord)) / (2.0 * _DIFFERENCE)
 
 
@@ -244,9 +207,8 @@ class Hazard:
         for name, value in vars(self).items():
             ends = list(value) if isinstance(value, list | tuple) else [value, value]
             if len(ends) != 2 or not all(map(is_finite, ends)) or not 0.0 <= ends[0] <= ends[1]:
-                raise ValueError(
-                    f"hazard: {name} is a number or (low, high) from 0 on, got {value}"
-                )
+                rule = "is a number or (low, high) from 0 on"
+                raise ValueError(f"hazard: {name} {rule}, got {value}")
             object.__setattr__(self, name, tuple(map(float, ends)))
 
 
@@ -280,13 +242,8 @@ class TrafficStart(NamedTuple):
     friction: float
 
 
-class EgoVehicle(HighwayVehicle):  # type: ignore[misc]
-    """Our car as the others see it: it is where it was put, and a vehicle like any other.
-
-    Args:
-        road: highway-env's road.
-        start: Drawn start of the episode.
-    """
+class _EgoVehicle(HighwayVehicle):  # type: ignore[misc]
+    """Our car among highway-env's vehicles, which its own simulation moves."""
 
     color = (50, 200, 0)  # highway-env's own for the car that is driven
 
@@ -299,39 +256,24 @@ class EgoVehicle(HighwayVehicle):  # type: ignore[misc]
         self.on_state_update()
 
     def set_motion(self, motion: Motion) -> None:
-        """Move to a Motion of ours; the body's centre is not the centre of gravity.
-
-        Args:
-            motion: Motion of our car.
-        """
+        """Move to a `Motion` of our car; the body's centre is not the centre of gravity."""
         direction = np.array([math.cos(motion.psi), -math.sin(motion.psi)])
         self.position = np.array([motion.X, -motion.Y]) + self._centre * direction
         self.heading: float = -motion.psi
         self.speed: float = motion.v_x
-        self._velocity = motion.v_x * direction + motion.v_y * np.array(
-            [direction[1], -direction[0]]
-        )
+        leftward = np.array([direction[1], -direction[0]])
+        self._velocity = motion.v_x * direction + motion.v_y * leftward
 
     @property
     def velocity(self) -> Any:
-        """Velocity with the sideslip that other vehicles do not have."""
+        """Velocity (m/s), shape (2,), with the sideslip that other vehicles do not have."""
         return self._velocity
 
     def act(self, action: Any = None) -> None:
-        """Do nothing: its driver is ours.
-
-        Args:
-            action: Not used.
-        """
+        """Do nothing: its driver is ours."""
 
     def step(self, dt: float) -> None:
-        """Take part in a step of the road.
-
-        An impact foreseen in the last step is a crash, as it is to highway-env's own vehicles.
-
-        Args:
-            dt: Length of the step (s).
-        """
+        """Crash where the last step foresaw an impact, as highway-env's own vehicles do."""
         self.crashed |= self.impact is not None
         self.on_state_update()
 
@@ -353,21 +295,13 @@ class BrakingVehicle(IDMVehicle):  # type: ignore[misc]
         self.speed: float = speed
 
     def act(self, action: Any = None) -> None:
-        """Follow the road; brake from the onset on.
-
-        Args:
-            action: Action of highway-env's, or None.
-        """
+        """Follow the road; brake from the onset on."""
         super().act(action)
         if self.time_left <= 0.0 and not self.crashed:
             self.action["acceleration"] = -self.rate
 
     def step(self, dt: float) -> None:
-        """Step the vehicle, which never goes backwards.
-
-        Args:
-            dt: Length of the step (s).
-        """
+        """Step the vehicle by dt (s); it never goes backwards."""
         self.time_left -= dt
         super().step(dt)
         self.speed = max(self.speed, 0.0)
@@ -388,16 +322,13 @@ class Traffic:
         self, road: str, start: TrafficStart, hazard: Hazard | None, others: int, key: int
     ) -> None:
         random = np.random.Generator(np.random.Philox(key=[key, 0]))
-        self.course: RoadLayout = ROADS[road](1 if random.random() < 0.5 else -1)
-        self.road = Road(
-            self.course.network, np_random=random, neighbour_vehicles_connected_lanes=True
-        )
-        self.ego = EgoVehicle(self.road, start)
+        self.course = ROADS[road](1 if random.random() < 0.5 else -1)
+        options = {"np_random": random, "neighbour_vehicles_connected_lanes": True}
+        self.road = Road(self.course.network, **options)
+        self.ego = _EgoVehicle(self.road, start)
         self.road.vehicles.append(self.ego)
         self._lane = 0
-        self.path: TrackPath | None = None
-        if hazard is not None:
-            self.path = self._add_hazard(hazard, start)
+        self.path = None if hazard is None else self._add_hazard(hazard, start)
         self._add_vehicles(others, start)
 
     def _add_hazard(self, hazard: Hazard, start: TrafficStart) -> TrackPath:
@@ -410,7 +341,7 @@ class Traffic:
         position = np.array([self.ego.position[0] + distance, 0.0])
         self.road.vehicles.append(BrakingVehicle(self.road, position, v, draw["onset"], rate))
         meeting = math.sqrt(2.0 * gap / rate)  # s after the onset, while it still moves
-        if meeting > v / rate:
+        if meeting > v / rate:  # it already stands
             meeting = gap / v + 0.5 * v / rate
         begin = v * (draw["onset"] + draw["reaction"])
         length = v * max(draw["haste"] * (meeting - draw["reaction"]), _SHORTEST)
@@ -420,14 +351,10 @@ class Traffic:
         return TrackPath(shift, begin, length, -shift, back, length)
 
     def _add_vehicles(self, others: int, start: TrafficStart) -> None:
-        """IDM vehicles ahead and behind in both lanes, and on the ramp if there is one."""
+        """Add IDM vehicles ahead and behind in both lanes, and on the ramp if there is one."""
         random, course = self.road.np_random, self.course
-        slots = [
-            (course.free_lane, 80.0),
-            (course.own_lane, -35.0),
-            (course.own_lane, 120.0),
-            (course.free_lane, -45.0),
-        ]
+        ego, free = course.own_lane, course.free_lane
+        slots = [(free, 80.0), (ego, -35.0), (ego, 120.0), (free, -45.0)]  # lane, m ahead
         for i in range(others):
             speed = start.speed * random.uniform(0.95, 1.05)
             if course.ramp is not None and i == 0:
@@ -436,21 +363,16 @@ class Traffic:
             else:
                 index, offset = slots[i % len(slots)]
                 far = offset + math.copysign(45.0 * (i // len(slots)), offset)
-                lateral = 0.0 if index == course.own_lane else WIDTH * (index - course.own_lane)
+                lateral = 0.0 if index == ego else WIDTH * (index - ego)
                 position = np.array([far + random.uniform(-8.0, 8.0), lateral])
-            self.road.vehicles.append(
-                IDMVehicle(self.road, position, speed=speed, target_speed=speed)
-            )
+            vehicle = IDMVehicle(self.road, position, speed=speed, target_speed=speed)
+            self.road.vehicles.append(vehicle)
         if course.ramp is not None:
             end = course.network.graph["b"]["c"][-1]
             self.road.objects.append(Obstacle(self.road, end.position(end.length, 0.0)))
 
     def step_road(self, motion: Motion) -> None:
-        """Step the road, at whose end our car is at a Motion.
-
-        Args:
-            motion: Motion of our car.
-        """
+        """Step the road by `PERIOD` ticks; `motion` is our car's at the end."""
         self.ego.set_motion(motion)
         self.road.act()
         self.road.step(_STEP)
@@ -467,14 +389,7 @@ class Traffic:
         return not bool(ego.lane.on_lane(ego.position, margin=0.5 * ego.WIDTH))
 
     def locate(self, motion: Motion) -> LanePosition:
-        """Locate our car on the lanes that it follows.
-
-        Args:
-            motion: Motion of our car.
-
-        Returns:
-            The position.
-        """
+        """Locate our car with a `Motion` on the lanes that it follows."""
         route = self.course.route
         position = locate_on_lane(route[self._lane], motion.X, motion.Y, motion.psi)
         while position.longitudinal > route[self._lane].length and self._lane + 1 < len(route):

@@ -1,4 +1,4 @@
-"""Random draws of an episode: ranges, the numbers drawn from them, and unstable cars redrawn."""
+"""Random draws of an episode: ranges, numbers drawn from them, and redraws of unstable cars."""
 
 from typing import Any, NamedTuple
 
@@ -49,17 +49,8 @@ DRAWS, DRAWS_WIDTH = make_offsets(Draws)
 
 
 @jit
-def draw_numbers(low: Any, high: Any, key_low: int, key_high: int, attempt: int, out: Any) -> None:
-    """Draw uniform numbers in [low, high]; where both are equal they keep their bits.
-
-    Args:
-        low: Lower ends, shape (len(Draws),).
-        high: Upper ends, shape (len(Draws),).
-        key_low: Lower 32 bits of the episode's key.
-        key_high: Upper 32 bits of the episode's key.
-        attempt: Number of the attempt, from 0.
-        out: Array for the draws, shape (len(Draws),).
-    """
+def _draw_numbers(low: Any, high: Any, key_low: int, key_high: int, attempt: int, out: Any) -> None:
+    """Draw uniform numbers in [low, high] into out (len(Draws),); equal ends keep their bits."""
     u = draw_uniforms(key_low, key_high, attempt, CHANNELS.scenario, 0)
     for i in range(len(out)):
         if i % 4 == 0:
@@ -69,12 +60,10 @@ def draw_numbers(low: Any, high: Any, key_low: int, key_high: int, attempt: int,
 
 @jit
 def is_stable(d: Any, car: Any) -> Any:
-    """Check whether the drawn linear vehicle is stable at the drawn speed, with 5 % to spare.
-
-    It must be before its tyres change and after.
+    """Check whether the drawn linear vehicle is stable at 1.05 times the drawn speed.
 
     Args:
-        d: `Draws`.
+        d: `Draws`, whose tyres must give stability before they change and after.
         car: `CarParams`, to whose stiffness the drawn factors apply.
 
     Returns:
@@ -91,6 +80,7 @@ def is_stable(d: Any, car: Any) -> Any:
 
 @jit
 def _is_below_critical(C_f: Any, C_r: Any, speed: Any, car: Any) -> Any:
+    """Check whether 1.05 times a speed (m/s) is below the critical speed of linear tyres."""
     excess = C_f * car.l_f - C_r * car.l_r
     l, v = car.l_f + car.l_r, 1.05 * speed  # noqa: E741
     return car.m * v * v * excess < 2.0 * C_f * C_r * l * l
@@ -112,10 +102,10 @@ def draw_stable(low: Any, high: Any, key_low: int, key_high: int, car: Any, out:
         The `Draws`, and the number of draws that were rejected.
     """
     attempt = 0
-    draw_numbers(low, high, key_low, key_high, attempt, out)
+    _draw_numbers(low, high, key_low, key_high, attempt, out)
     while attempt + 1 < _ATTEMPTS and not is_stable(read(out, DRAWS), car):
         attempt += 1
-        draw_numbers(low, high, key_low, key_high, attempt, out)
+        _draw_numbers(low, high, key_low, key_high, attempt, out)
     return read(out, DRAWS), attempt
 
 

@@ -1,14 +1,9 @@
-"""A driver who keeps to a path by preview.
+"""The driver, who steers by preview and controls the speed, and the side wind; compiled.
 
-MacAdam's optimal preview control (1981) for a single preview point and a car that goes where it
-is steered: the lateral acceleration that brings the car onto the path within the preview time T,
-2 (y_path(t + T) - y - T y') / T^2. At gain 1 that closes the loop at 1.41/T rad/s with damping
-0.71. The steering angle is the one at which the nominal car turns so in the steady state; the arms
-follow as a first-order lag within a largest rate.
-
-The driver's longitudinal work: a speed held or followed, or an acceleration.
-
-Wind: a gust of side force with an arm, between two ticks.
+Steering is MacAdam's optimal preview control (1981) with one preview point: the lateral
+acceleration that brings the car onto the path within the preview time T,
+2 (y_path(t + T) - y - T y') / T^2; at gain 1 the loop has 1.41/T rad/s and damping 0.71. The angle
+is the nominal car's for it in the steady state, behind a first-order lag and a rate limit.
 """
 
 from typing import Any, NamedTuple
@@ -22,7 +17,7 @@ from ..vehicle.dynamics import compute_curvature
 from ..vehicle.tyres import MIN_SPEED
 from .road import compute_path_offset
 
-MIN_PREVIEW = 1.0  # wheelbases: a driver looks no nearer
+_MIN_PREVIEW = 1.0  # wheelbases: a driver looks no nearer
 
 
 class DriverParams(NamedTuple):
@@ -35,22 +30,11 @@ class DriverParams(NamedTuple):
 
 
 @jit
-def compute_lateral_error(motion: Any, path: Any, road: Any, preview: Any) -> Any:
-    """Compute how far the previewed path lies to the left of the car's course.
-
-    The road's own bend is the double integral of its curvature, exact on a clothoid too.
-
-    Args:
-        motion: `Motion` of the car.
-        path: `TrackPath`.
-        road: `RoadParams`.
-        preview: Preview distance (m).
-
-    Returns:
-        Lateral error (m).
-    """
+def _compute_lateral_error(motion: Any, path: Any, road: Any, preview: Any) -> Any:
+    """Compute how far the path lies to the left of the car's course at a preview distance (m)."""
     sin_r, cos_r = sincos(motion.psi - motion.theta)
     slope = (motion.v_x * sin_r + motion.v_y * cos_r) / maximum(motion.v_x, MIN_SPEED)
+    # the double integral of the curvature, exact on a clothoid too
     bend = 0.5 * preview * preview * compute_curvature(road, motion.s + preview * (1.0 / 3.0))
     return compute_path_offset(path, motion.s + preview) + bend - motion.y - preview * slope
 
@@ -65,7 +49,7 @@ def compute_target_angle(
         motion: `Motion` of the car.
         path: `TrackPath`.
         road: `RoadParams`.
-        target: `ReferenceParams`, what the driver knows of the car.
+        target: `ReferenceParams` of the nominal car, which the driver knows.
         driver: `DriverParams`.
         stop: Largest angle (rad).
 
@@ -73,8 +57,8 @@ def compute_target_angle(
         Angle at the wheels (rad), within +-stop.
     """
     v = motion.v_x
-    preview = maximum(driver.preview * v, MIN_PREVIEW / target.per_l)
-    error = compute_lateral_error(motion, path, road, preview)
+    preview = maximum(driver.preview * v, _MIN_PREVIEW / target.per_l)
+    error = _compute_lateral_error(motion, path, road, preview)
     curvature = driver.gain * 2.0 * error / (preview * preview)
     angle = curvature * maximum(1.0 + target.G * v * v, 0.2) / target.per_l  # dakf-stability (23)
     return minimum(maximum(angle, 0.0 - stop), stop)
@@ -84,7 +68,7 @@ def compute_target_angle(
 def compute_driver_angle(
     angle: Any, motion: Any, path: Any, road: Any, target: Any, driver: Any, stop: Any
 ) -> Any:
-    """Compute the driver's steering angle a tick later, at a Motion.
+    """Compute the driver's steering angle a tick later.
 
     Source: MacAdam, "Application of an optimal preview control for simulation of closed-loop
     automobile driving", IEEE Trans. SMC 11 (1981).
@@ -94,7 +78,7 @@ def compute_driver_angle(
         motion: `Motion` of the car.
         path: `TrackPath`.
         road: `RoadParams`.
-        target: `ReferenceParams`, what the driver knows of the car.
+        target: `ReferenceParams` of the nominal car, which the driver knows.
         driver: `DriverParams`.
         stop: Largest angle (rad).
 
@@ -106,7 +90,7 @@ def compute_driver_angle(
 
 
 class SpeedProfile(NamedTuple):
-    """The driver's longitudinal work: a speed held or followed by PI, or an acceleration."""
+    """The driver's speed, held or followed by PI control, or an acceleration."""
 
     speed: Any  # m/s, at the start and to hold
     hold: Any  # 1 hold the speed that `acceleration` and `surge` make of it; 0 apply them alone
@@ -144,10 +128,9 @@ def compute_speed_reference(tick: Any, profile: Any) -> Any:
 def compute_acceleration_command(
     tick: Any, v_x: Any, integral: Any, profile: Any, limit: Any
 ) -> Any:
-    """Compute the driver's acceleration command: PI on the speed, its integral held at the limit.
+    """Compute the driver's acceleration command: PI on the speed with feedforward.
 
-    The wanted speed starts at `profile.speed` and is the integral of the wanted acceleration, which
-    is fed forward.
+    The wanted acceleration is fed forward; the integral part is held at the limit.
 
     Args:
         tick: Tick since the start of the episode.

@@ -1,6 +1,6 @@
-"""A recorded steering trace as a scenario: what a log's driver did, driven again.
+"""The scenarios by name, and a recorded drive's steering trace as a scenario.
 
-The manoeuvres by name: those drawn by the seed; the tiers' and the papers' own beside them.
+`SCENARIOS` holds the manoeuvres below, the scored tiers' and the papers'.
 """
 
 import dataclasses
@@ -15,21 +15,12 @@ from ..io import has_suffix, is_document, read_document
 from ..recordings.log_file import find_clock
 from ..recordings.tables import read_quantities
 from ..validation import check_choice, describe_unknown, short_repr
+from . import tiers
 from .draws import KMH
 from .papers import ROAD_TESTS, SIMULATIONS
 from .scenario import Scenario
-from .tiers import (
-    BRAKE_IN_TURN,
-    DOUBLE_LANE_CHANGE,
-    SINE_WITH_DWELL,
-    SLALOM,
-    STEP,
-    TIERS,
-    WET_EVASION,
-    make_random_steering,
-)
 
-TABLE_SUFFIXES = (".csv", ".parquet")
+_TABLE_SUFFIXES = (".csv", ".parquet")
 
 
 def read_trace(path: str | os.PathLike[str], mapping: Mapping[str, str] | None = None) -> Scenario:
@@ -56,142 +47,86 @@ def read_trace(path: str | os.PathLike[str], mapping: Mapping[str, str] | None =
         _, step = find_clock(values["time"])
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
+    trace = tuple(values["steer"].tolist())
+    length = round((len(trace) - 1) * step, 9)
+    fields: dict[str, Any] = {"trace": trace, "trace_step": step, "duration": length}
     speed = values.get("speed_x", np.zeros(0))
     known_speed = speed[np.isfinite(speed)]
-    trace = tuple(values["steer"].tolist())
-    scenario = Scenario(
-        name=source.stem,
-        steering="trace",
-        trace=trace,
-        trace_step=step,
-        duration=round((len(trace) - 1) * step, 9),
-    )
-    return (
-        scenario.replace(speed=max(float(known_speed[0]), 0.0)) if len(known_speed) else scenario
-    )  # noise at rest
+    if len(known_speed):
+        fields["speed"] = max(float(known_speed[0]), 0.0)  # noise at rest
+    return Scenario(name=source.stem, steering="trace", **fields)
 
 
 _DRAWN: dict[str, Any] = {
-    "mirror": True,
-    "speed": (18.0 * KMH, 36.0 * KMH),
-    "front_stiffness": (0.6, 1.4),
-    "rear_stiffness": (0.6, 1.4),
-    "friction": (0.7, 1.0),
-}
+    "mirror": True, "speed": (18.0 * KMH, 36.0 * KMH), "front_stiffness": (0.6, 1.4),
+    "rear_stiffness": (0.6, 1.4), "friction": (0.7, 1.0),
+}  # fmt: skip
 # Above 28 km/h so many of the drawn cars are close to their critical speed that those which spin
 # would decide the mean cost of a harsh manoeuvre.
 _HARSH = _DRAWN | {"speed": (18.0 * KMH, 28.0 * KMH)}
-_RANDOM = make_random_steering(0.005, 0.015)
-_SLALOM = SLALOM | {"amplitude": (0.04, 0.1)}
+_RANDOM = tiers.make_random_steering(0.005, 0.015)
+_SLALOM = tiers.SLALOM | {"amplitude": (0.04, 0.1)}
 _LANE: dict[str, Any] = {"steering": "driver", "half_width": 1.75}
 _BEND: dict[str, Any] = {"curvature": (0.01, 0.03), "curve_start": 15.0, "curve_ramp": 10.0}
 
 _MANOEUVRES = (
     Scenario(name="random-steering", **_RANDOM, **_HARSH),
-    Scenario(name="sine-with-dwell", amplitude=(0.05, 0.12), **SINE_WITH_DWELL, **_HARSH),
-    Scenario(name="double-lane-change", **DOUBLE_LANE_CHANGE, **_HARSH),
-    Scenario(name="step-steer", amplitude=(0.03, 0.1), **STEP, **_HARSH),
-    Scenario(
-        name="gust",
-        wind_force=(300.0, 500.0),
-        wind_arm=(-0.1, 0.3),
-        wind_start=(1.0, 3.0),
-        wind_length=(1.0, 4.0),
-        **_HARSH,
-    ),
-    Scenario(
-        name="low-friction",
-        duration=6.0,
-        steering="lane-change",
-        onset=(0.5, 1.5),
-        amplitude=(0.02, 0.045),
-        frequency=(0.3, 0.6),
-        **(_HARSH | {"friction": (0.27, 0.35)}),
-    ),
-    Scenario(name="brake-in-turn", amplitude=(0.04, 0.1), **BRAKE_IN_TURN, **_HARSH),
-    Scenario(
-        name="stiffness-step",
-        tyre_change_time=(3.0, 6.0),
-        front_change=(0.7, 1.3),
-        rear_change=(0.7, 1.3),
-        **_RANDOM,
-        **_HARSH,
-    ),
-    Scenario(
-        name="sensor-outage",
-        camera_outage=(3.0, 6.0),
-        gps_outage=(3.0, 6.0),
-        **_SLALOM,
-        **_HARSH,
-    ),
-    Scenario(
-        name="uneven-delay",
-        camera_delays=(0.020, 0.015, 0.010, 0.025),  # uneven-delay, Fig. 5
-        **_RANDOM,
-        **_HARSH,
-    ),
-)
+    Scenario(name="sine-with-dwell", amplitude=(0.05, 0.12), **tiers.SINE_WITH_DWELL, **_HARSH),
+    Scenario(name="double-lane-change", **tiers.DOUBLE_LANE_CHANGE, **_HARSH),
+    Scenario(name="step-steer", amplitude=(0.03, 0.1), **tiers.STEP, **_HARSH),
+    Scenario(name="gust", wind_force=(300.0, 500.0), wind_arm=(-0.1, 0.3),
+             wind_start=(1.0, 3.0), wind_length=(1.0, 4.0), **_HARSH),
+    Scenario(name="low-friction", duration=6.0, steering="lane-change", onset=(0.5, 1.5),
+             amplitude=(0.02, 0.045), frequency=(0.3, 0.6),
+             **(_HARSH | {"friction": (0.27, 0.35)})),
+    Scenario(name="brake-in-turn", amplitude=(0.04, 0.1), **tiers.BRAKE_IN_TURN, **_HARSH),
+    Scenario(name="stiffness-step", tyre_change_time=(3.0, 6.0), front_change=(0.7, 1.3),
+             rear_change=(0.7, 1.3), **_RANDOM, **_HARSH),
+    Scenario(name="sensor-outage", camera_outage=(3.0, 6.0), gps_outage=(3.0, 6.0),
+             **_SLALOM, **_HARSH),
+    Scenario(name="uneven-delay", camera_delays=(0.020, 0.015, 0.010, 0.025),
+             **_RANDOM, **_HARSH),  # uneven-delay, Fig. 5
+)  # fmt: skip
 
 # Easier ones, to begin with.
 _EASY = (
     Scenario(name="straight", **_DRAWN),
-    Scenario(
-        name="sine",
-        steering="sine",
-        onset=(0.5, 1.5),
-        amplitude=(0.02, 0.06),
-        frequency=(0.3, 0.8),
-        **_DRAWN,
-    ),
+    Scenario(name="sine", steering="sine", onset=(0.5, 1.5), amplitude=(0.02, 0.06),
+             frequency=(0.3, 0.8), **_DRAWN),
     Scenario(name="slalom", **_SLALOM, **_DRAWN),
-    Scenario(
-        name="lane-change",
-        duration=6.0,
-        steering="lane-change",
-        onset=(0.5, 1.5),
-        amplitude=(0.05, 0.14),
-        frequency=(0.3, 0.6),
-        **_DRAWN,
-    ),
-)
+    Scenario(name="lane-change", duration=6.0, steering="lane-change", onset=(0.5, 1.5),
+             amplitude=(0.05, 0.14), frequency=(0.3, 0.6), **_DRAWN),
+)  # fmt: skip
 
-# What these ask for is a place on the road, which the cost does not judge.
+# The task of these is the car's place on the road, which the cost does not contain.
 _ROADS = (
-    Scenario(  # braking as hard as the motors can: the right wheel slips
-        name="split-friction",
-        duration=6.0,
-        speed_change=-18.0 * KMH,
-        change_start=2.0,
-        change_length=2.0,
-        friction_right=(0.2, 0.3),
-        **_LANE,
-        **(_HARSH | {"speed": (22.0 * KMH, 30.0 * KMH)}),
-    ),
-    Scenario(  # only the controller steers
-        name="curved-road", half_width=1.75, **_BEND, **_HARSH
-    ),
+    # braking as hard as the motors can: the right wheel slips
+    Scenario(name="split-friction", duration=6.0, speed_change=-18.0 * KMH, change_start=2.0,
+             change_length=2.0, friction_right=(0.2, 0.3), **_LANE,
+             **(_HARSH | {"speed": (22.0 * KMH, 30.0 * KMH)})),
+    # only the controller steers
+    Scenario(name="curved-road", half_width=1.75, **_BEND, **_HARSH),
     Scenario(name="curved-road-driver", **_LANE, **_BEND, **_HARSH),
-    WET_EVASION,
-)
+    tiers.WET_EVASION,
+)  # fmt: skip
 
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
-    for scenario in (*_MANOEUVRES, *_EASY, *_ROADS, *TIERS, *SIMULATIONS, *ROAD_TESTS)
+    for scenario in (*_MANOEUVRES, *_EASY, *_ROADS, *tiers.TIERS, *SIMULATIONS, *ROAD_TESTS)
 }
 
 
 ScenarioSource = str | os.PathLike[str] | Mapping[str, Any] | Scenario
-"""What `make_scenario` takes."""
+"""Source of a scenario, which `make_scenario` reads."""
 
 
 def make_scenario(source: ScenarioSource) -> Scenario:
     """Make a scenario from its name, a file, a mapping of fields, or a scenario itself.
 
-    A TOML or JSON file holds such a mapping, `Scenario.write` makes one; a CSV or Parquet file is a
-    recorded drive, whose steering is driven again (`read_trace`). A mapping may start from another
-    scenario, a name or a file, under `base`. A file without a `name` has that of the file. A file
-    that is missing raises FileNotFoundError, an unknown name and a value out of place ValueError;
-    messages name the file.
+    A TOML or JSON file holds such a mapping, as `Scenario.write` makes one; a CSV or Parquet file
+    is a recorded drive, whose steering is driven again (`read_trace`). A mapping may start from
+    another scenario, a name or a file, under `base`. Without a `name` a file's stem is the name. A
+    missing file raises FileNotFoundError, an unknown name and a value out of place ValueError.
 
     Args:
         source: Name in `SCENARIOS`, path, mapping of fields, or a `Scenario`, returned as it is.
@@ -207,7 +142,7 @@ def make_scenario(source: ScenarioSource) -> Scenario:
         return source
     if isinstance(source, Mapping):
         return _parse_scenario(dict(source))
-    if has_suffix(source, TABLE_SUFFIXES):
+    if has_suffix(source, _TABLE_SUFFIXES):
         return read_trace(source)
     if is_document(source):
         values = read_document(source, "scenario")
@@ -225,7 +160,7 @@ def make_scenario(source: ScenarioSource) -> Scenario:
 
 
 def _parse_scenario(values: dict[str, Any]) -> Scenario:
-    """A scenario of a mapping."""
+    """Make a scenario from a mapping, which may have a `base`."""
     base = values.pop("base", None)
     known = [entry.name for entry in dataclasses.fields(Scenario)]
     if unknown := [key for key in values if key not in known]:

@@ -1,15 +1,9 @@
-"""Roads: straight ones with their bends, and those that follow a nominal car's path.
+"""Roads along a nominal car's path, and test tracks between cones with the driver's path on them.
 
-Test tracks between cones, as lanes along a road and as the path a driver takes through them.
-
-ISO 3888-1 (double lane change) and ISO 3888-2 (obstacle avoidance) give fixed lengths and lane
-widths that grow with the vehicle's width, so a narrow car has narrow lanes and less far to go
-sideways. For the passenger car the lengths are the standards'. A car built for lower speeds drives
-them shortened in proportion to its speed (`scale`): the time in each section stays the same, and
-with it the lateral acceleration that the track asks for.
-
-ISO 3888-1's lane offset of 3.5 m is read as that between the right edges of the lanes; the last
-lane's right edge lies in line with the first one's in both.
+ISO 3888-1 (double lane change) and ISO 3888-2 (obstacle avoidance) fix the lengths; the lanes'
+widths grow with the vehicle's. A slower car drives the lengths scaled by its speed: times and
+lateral acceleration stay. ISO 3888-1's offset of 3.5 m is taken between the right edges of the
+lanes; the last lane's right edge is in line with the first's in both.
 """
 
 from collections.abc import Callable
@@ -23,7 +17,7 @@ from ..ticks import TICK
 from ..vehicle.linear import Bicycle, compute_bicycle_coefficients
 
 ROADS = ("straight", "nominal-path")
-STRAIGHT, NOMINAL_PATH = range(len(ROADS))
+NOMINAL_PATH = ROADS.index("nominal-path")
 _MIN_SPEED = 1.0  # m/s, of the nominal car
 
 
@@ -40,8 +34,8 @@ def step_nominal_car(
 ) -> tuple[Any, NominalMotion]:
     """Step the nominal car, whose path is the road, over a tick by explicit Euler.
 
-    The direction of its path is psi + beta, so it turns by gamma + beta'. The road is a function of
-    time, and so of the seed alone: what the true car does has no effect on it.
+    Its path has the direction psi + beta and turns by gamma + beta'. The road is a function of time
+    and the seed alone: the true car has no effect on it.
 
     Args:
         nominal_motion: `NominalMotion` at the start of the tick.
@@ -64,9 +58,7 @@ def step_nominal_car(
     return nominal_motion.gamma + dbeta, next_motion
 
 
-TRANSITION_OVERLAP = (
-    0.15  # of a gap's length: how far the path's transition reaches into the lanes beside it
-)
+_TRANSITION_OVERLAP = 0.15  # of a gap's length: the path's transition reaches so far into the lanes
 
 
 class Section(NamedTuple):
@@ -90,6 +82,7 @@ class TrackPath(NamedTuple):
 
 
 def _make_iso_3888_1(width: float) -> tuple[Section, ...]:
+    """Make the lanes of a double lane change for a vehicle's width (m)."""
     first, side, last = 1.1 * width + 0.25, 1.2 * width + 0.25, 1.3 * width + 0.25
     return (
         Section(0.0, 15.0, first, 0.0),
@@ -99,6 +92,7 @@ def _make_iso_3888_1(width: float) -> tuple[Section, ...]:
 
 
 def _make_iso_3888_2(width: float) -> tuple[Section, ...]:
+    """Make the lanes of an obstacle avoidance for a vehicle's width (m)."""
     first, side, last = 1.1 * width + 0.25, width + 1.0, max(1.3 * width + 0.25, 3.0)
     return (
         Section(0.0, 12.0, first, 0.0),
@@ -136,21 +130,16 @@ def make_sections(
         raise ValueError(f"unknown track {track!r}; known: {', '.join(PATHS)}")
     lanes = _TRACKS[track](width) if track in _TRACKS else ()
     return tuple(
-        Section(
-            start + scale * section.start,
-            scale * section.length,
-            section.width,
-            side * section.offset,
-        )
-        for section in lanes
+        Section(start + scale * lane.start, scale * lane.length, lane.width, side * lane.offset)
+        for lane in lanes
     )
 
 
 def make_path(track: str, width: float) -> TrackPath:
     """Make the path through a track that begins at 0, in the standard's lengths.
 
-    It keeps to the centre of a lane but turns a little before its end and has not quite turned back
-    at its beginning (`TRANSITION_OVERLAP`), as far as the sides of the car stay between the cones.
+    It keeps to a lane's centre but for `_TRANSITION_OVERLAP` at the ends, where the sides of the
+    car stay between the cones.
 
     Args:
         track: Name of the track, of `PATHS`.
@@ -160,15 +149,11 @@ def make_path(track: str, width: float) -> TrackPath:
         The path.
     """
     shifts = []
-    lanes = make_sections(track, width)
-    for before, after in pairwise(lanes):
+    for before, after in pairwise(make_sections(track, width)):
         lane_end = before.start + before.length
         gap = after.start - lane_end
-        shifts += [
-            after.offset - before.offset,
-            lane_end - TRANSITION_OVERLAP * gap,
-            (1.0 + 2.0 * TRANSITION_OVERLAP) * gap,
-        ]
+        shifts += [after.offset - before.offset, lane_end - _TRANSITION_OVERLAP * gap]
+        shifts.append((1.0 + 2.0 * _TRANSITION_OVERLAP) * gap)
     return TrackPath(*(shifts or (0.0, 0.0, 1.0, 0.0, 0.0, 1.0)))
 
 
@@ -186,13 +171,9 @@ def transform_path(path: Any, start: Any, scale: Any, side: Any) -> Any:
         The `TrackPath`.
     """
     return TrackPath(
-        side * path.shift_1,
-        start + scale * path.start_1,
-        scale * path.length_1,
-        side * path.shift_2,
-        start + scale * path.start_2,
-        scale * path.length_2,
-    )
+        side * path.shift_1, start + scale * path.start_1, scale * path.length_1,
+        side * path.shift_2, start + scale * path.start_2, scale * path.length_2,
+    )  # fmt: skip
 
 
 @jit

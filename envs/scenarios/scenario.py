@@ -1,7 +1,4 @@
-"""What a scenario's fields may be; a value out of place is refused by its field's name.
-
-A manoeuvre is data: named, frozen, JSON-able.
-"""
+"""`Scenario`: a manoeuvre as a frozen dataclass, with the checks of its fields."""
 
 import dataclasses
 import math
@@ -25,49 +22,31 @@ from .road import PATHS, ROADS
 from .steering import STEERING_KINDS
 
 Fields = Mapping[str, Any]
-
-MAX_SLIP = 1.5  # rad: a start beyond it has no speed along the car
+_MAX_SLIP = 1.5  # rad: a start beyond it has no speed along the car
 MIN_GPS_PERIOD = 0.05  # s; an env keeps room for its packets
-MAX_SAMPLES = 1_000_000  # of a trace
-SIDES = ("side", "wind_side")  # drawn, but no fields
-
-TIER_NAMES = ("", "1", "2a", "2b", "2c")
-
+_MAX_SAMPLES = 1_000_000  # of a trace
+_SIDES = ("side", "wind_side")  # drawn, but no fields
+_TIER_NAMES = ("", "1", "2a", "2b", "2c")
 _CHOICES = {
-    "steering": STEERING_KINDS,
-    "path": PATHS,
-    "road": ROADS,
-    "hdop_law": HDOP_LAWS,
-    "tyres": TYRE_LAWS,
-    "tier": TIER_NAMES,
-}
+    "steering": STEERING_KINDS, "path": PATHS, "road": ROADS, "hdop_law": HDOP_LAWS,
+    "tyres": TYRE_LAWS, "tier": _TIER_NAMES,
+}  # fmt: skip
 _PARAMETERS = [entry.name for entry in dataclasses.fields(Vehicle)]
 _FLAGS = ("mirror", "small_angle", "lags", "roll")
 _NUMBERS_OR_NONE = ("acceleration", "gps_period")
 _DRAWS_OR_NONE = ("path_speed", "friction_right", "tyre_change_time")
 _MAY_BE_INFINITE = ("half_width", "camera_heading", "camera_offset")
 _TIMES_OR_NONE = {  # how many
-    "camera_delays": (1, 2, 3, 4),
-    "gps_delays": (1, 2, 3, 4),
-    "camera_outage": (2,),
-    "gps_outage": (2,),
-}
+    "camera_delays": (1, 2, 3, 4), "gps_delays": (1, 2, 3, 4),
+    "camera_outage": (2,), "gps_outage": (2,),
+}  # fmt: skip
 
 
-def check_fields(fields: Fields, entries: Sequence[dataclasses.Field[Any]]) -> None:
-    """Check the fields of a scenario; messages have its name and the field's.
-
-    What is plausible above zero alone must be positive.
-
-    Args:
-        fields: Values by the names of fields.
-        entries: Fields of the dataclass; those of type float are one number, neither drawn nor
-            None.
-
-    Raises:
-        type: ValueError for a field out of place, TypeError for an unknown vehicle parameter.
-    """
+def _check_fields(fields: Fields, entries: Sequence[dataclasses.Field[Any]]) -> None:
+    """Check a scenario's values by field; errors name scenario and field."""
+    # a field of type float is one number, neither drawn nor None
     numbers = [spec.name for spec in entries if spec.type is float]
+    # what is plausible above zero alone must be positive
     positive = {spec.name for spec in entries if spec.metadata.get("plausible", (0,))[0] > 0}
     try:
         _check_names(fields)
@@ -82,6 +61,7 @@ def check_fields(fields: Fields, entries: Sequence[dataclasses.Field[Any]]) -> N
 
 
 def _check_names(fields: Fields) -> None:
+    """Check names, choices, flags, and that steering, path and road fit."""
     if not isinstance(fields["name"], str):
         raise ValueError("name is no text")
     for what, known in _CHOICES.items():
@@ -89,32 +69,31 @@ def _check_names(fields: Fields) -> None:
     for name in _FLAGS:
         if not isinstance(fields[name], bool):
             raise ValueError(f"{name} is True or False, got {short_repr(fields[name])}")
-    if fields["path"] != "road" and fields["steering"] != "driver":
-        raise ValueError(
-            f"path {fields['path']!r} needs the steering 'driver', got {fields['steering']!r}"
-        )
-    if fields["road"] == "nominal-path" and fields["steering"] == "driver":
+    path, road, steering = fields["path"], fields["road"], fields["steering"]
+    if path != "road" and steering != "driver":
+        raise ValueError(f"path {path!r} needs the steering 'driver', got {steering!r}")
+    if road == "nominal-path" and steering == "driver":
         raise ValueError("road 'nominal-path' follows a programme's steering, not a driver's")
-    if fields["road"] == "nominal-path" and get_range(fields["curvature"]) != (0.0, 0.0):
+    if road == "nominal-path" and get_range(fields["curvature"]) != (0.0, 0.0):
         raise ValueError(f"road 'nominal-path' has no curvature, got {fields['curvature']!r}")
-    if fields["path_speed"] is not None and fields["path"] == "road":
+    if fields["path_speed"] is not None and path == "road":
         raise ValueError("path_speed needs a track as path; a road has no lengths to scale")
 
 
 def _check_trace(fields: Fields) -> None:
+    """Check the recorded steering angles."""
     trace, steering = fields["trace"], fields["steering"]
     if not isinstance(trace, tuple) or not all(map(is_finite, trace)):
         raise ValueError(f"trace is angles in rad, finite ones, got {short_repr(trace)}")
-    if (len(trace) > 1) != (steering == "trace") or len(trace) > MAX_SAMPLES:
-        raise ValueError(
-            f"trace has 2 to {MAX_SAMPLES} angles where the steering is 'trace', else none; got "
-            f"{len(trace)} with {steering!r}"
-        )
+    if (len(trace) > 1) != (steering == "trace") or len(trace) > _MAX_SAMPLES:
+        rule = f"2 to {_MAX_SAMPLES} angles where the steering is 'trace', else none"
+        raise ValueError(f"trace has {rule}; got {len(trace)} with {steering!r}")
     if fields["trace_step"] < TICK:
         raise ValueError(f"trace_step is {TICK} s or more, got {fields['trace_step']!r}")
 
 
 def _check_mappings(fields: Fields) -> None:
+    """Check replaced vehicle parameters and noise."""
     for name in ("vehicle", "nominal", "noise"):
         values = fields[name]
         if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
@@ -134,12 +113,13 @@ def _check_number(name: str, value: Any) -> None:
 
 
 def _check_numbers(fields: Fields, numbers: Iterable[str], positive: Container[str]) -> None:
+    """Check that undrawn numbers are finite and in range."""
     for name in numbers:
         if name not in _MAY_BE_INFINITE:
             _check_number(name, fields[name])
     for name in _NUMBERS_OR_NONE:
         _check_number(name, 0.0 if fields[name] is None else fields[name])
-    width = fields["half_width"]  # only compared with: it may be as wide as a float can be
+    width = fields["half_width"]  # only compared with: any finite float will do
     if not (is_finite(width) or (isinstance(width, float) and math.isfinite(width))):
         raise ValueError(f"half_width {short_repr(width)} is not finite")
     for name in ("camera_heading", "camera_offset"):
@@ -155,8 +135,9 @@ def _check_numbers(fields: Fields, numbers: Iterable[str], positive: Container[s
 
 
 def _check_draws(fields: Fields, positive: Container[str]) -> None:
+    """Check that numbers and ranges that are drawn from are in range."""
     for name in Draws._fields:
-        if name in SIDES or (name in _DRAWS_OR_NONE and fields[name] is None):
+        if name in _SIDES or (name in _DRAWS_OR_NONE and fields[name] is None):
             continue
         value = fields[name]
         ends = value if isinstance(value, tuple) else (value, value)
@@ -166,10 +147,9 @@ def _check_draws(fields: Fields, positive: Container[str]) -> None:
             none_text = " or None" if name in _DRAWS_OR_NONE else ""
             raise ValueError(f"{name} must be positive{none_text}, got {value!r}")
     for name in ("front_change", "rear_change"):
-        if fields["tyre_change_time"] is None and get_range(fields[name]) != (1.0, 1.0):
-            raise ValueError(
-                f"{name} {fields[name]!r} needs a tyre_change_time, from which it acts"
-            )
+        value = fields[name]
+        if fields["tyre_change_time"] is None and get_range(value) != (1.0, 1.0):
+            raise ValueError(f"{name} {value!r} needs a tyre_change_time, from which it acts")
     steering, hold = fields["steering"], fields["hold"]
     if steering in ("ramp", "sweep", "wander") and get_range(hold)[0] < TICK:
         raise ValueError(f"hold of a {steering} is 1 ms or more, got {hold!r}")
@@ -178,6 +158,7 @@ def _check_draws(fields: Fields, positive: Container[str]) -> None:
 
 
 def _check_motion(fields: Fields) -> None:
+    """Check speed, road slope and start."""
     min_speed = get_range(fields["speed"])[0]
     if min_speed < 0.0 or min_speed + fields["speed_change"] < 0.0:
         raise ValueError("speed must not be negative, with speed_change or without")
@@ -191,28 +172,27 @@ def _check_motion(fields: Fields) -> None:
     if max(map(abs, (*get_range(bank), grade))) > 0.5:
         raise ValueError(f"bank and grade are up to 0.5 rad, got {bank!r}, {grade!r}")
     beta = fields["initial_beta"]
-    if max(map(abs, get_range(beta))) > MAX_SLIP:
-        raise ValueError(f"initial_beta is up to {MAX_SLIP} rad, got {beta!r}")
+    if max(map(abs, get_range(beta))) > _MAX_SLIP:
+        raise ValueError(f"initial_beta is up to {_MAX_SLIP} rad, got {beta!r}")
 
 
 def _check_sensors(fields: Fields) -> None:
+    """Check clocks, delays and losses of the slow sensors."""
     if not 0.0 <= fields["hdop_spread"] <= 1.0:
         raise ValueError(f"hdop_spread is 0 to 1, got {fields['hdop_spread']!r}")
     for name, counts in _TIMES_OR_NONE.items():
         value = fields[name]
         fits = isinstance(value, tuple) and len(value) in counts and all(map(is_finite, value))
         if value is not None and not (fits and min(value) >= 0.0):
-            count_text = " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))
-            raise ValueError(
-                f"{name} is {count_text} times in s, zero or more, got {short_repr(value)}"
-            )
+            number = " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))
+            got = short_repr(value)
+            raise ValueError(f"{name} is {number} times in s, zero or more, got {got}")
     period = fields["gps_period"]
     if period is not None and not period >= MIN_GPS_PERIOD:
         raise ValueError(f"gps_period is {MIN_GPS_PERIOD} s or more, got {period!r}")
-    if get_range(fields["gps_latency"])[0] < 0.0:
-        raise ValueError(f"gps_latency is zero or more, got {fields['gps_latency']!r}")
-    if fields["camera_jitter"] < 0.0:
-        raise ValueError(f"camera_jitter is zero or more, got {fields['camera_jitter']!r}")
+    for name in ("gps_latency", "camera_jitter"):
+        if get_range(fields[name])[0] < 0.0:
+            raise ValueError(f"{name} is zero or more, got {fields[name]!r}")
     if not 0.0 <= fields["camera_loss"] < 1.0:
         raise ValueError(f"camera_loss is a probability below 1, got {fields['camera_loss']!r}")
     if fields["camera_jitter"] and fields["camera_delays"] is None:
@@ -230,22 +210,18 @@ class Scenario:
     (0.02, 0.05)
 
     Attributes:
-        name: Name of the scenario.
-        duration: Length of the episode (s).
-        steering: Kind of the steering programme, of `STEERING_KINDS`. "random" is two pairs of
-            sines, of amplitude and amplitude_2. "driver" keeps to `path` by preview. "wander" is a
+        name, duration: Name, and length of the episode (s).
+        steering: Kind of the steering profile, of `STEERING_KINDS`. "random" is two pairs of sines,
+            of amplitude and amplitude_2. "driver" keeps to `path` by preview. "wander" is a
             zero-mean Ornstein-Uhlenbeck process of standard deviation amplitude and corner
             frequency `frequency`, held for `hold` from one angle to the next.
-        trace: Recorded angles at the wheels (rad) for "trace": straight between them, the last
-            stays.
-        trace_step: Time between the trace's samples (s).
-        onset: Time at which steering begins (s).
-        amplitude: Amplitude at the wheels (rad).
+        trace, trace_step: Angles at the wheels (rad) for "trace", interpolated linearly, the last
+            of which stays, and the time between them (s).
+        onset, amplitude: Time at which steering begins (s), and amplitude at the wheels (rad).
         amplitude_2: Amplitude of the second pair of a random steering (rad).
         frequency: Frequency (Hz).
         frequency_2: Second frequency of a random steering, or the end of a sweep (Hz).
-        frequency_3: Third frequency of a random steering (Hz).
-        frequency_4: Fourth frequency of a random steering (Hz).
+        frequency_3, frequency_4: Further frequencies of a random steering (Hz).
         hold: Time of a step, dwell, ramp or sweep, or from one lane change to the next (s).
         mirror: Whether the seed draws the side of steering, track, bend, bank, friction_right and
             start, and that of the wind.
@@ -253,68 +229,52 @@ class Scenario:
             width that begins where the car is at the onset at the speed it starts with.
         path_speed: Speed (m/s) at which a track has its standard's lengths, which grow with the
             speed drawn; None: these lengths at every speed.
-        driver_preview: Preview time of the driver (s).
-        driver_gain: Gain of the driver.
-        driver_lag: Time constant of the driver's arms (s).
-        driver_rate: Largest rate of the driver's angle at the wheels (rad/s).
-        initial_beta: Sideslip angle at the start (rad).
-        initial_gamma: Yaw rate at the start (rad/s).
-        speed: Speed at the start (m/s).
-        acceleration: Acceleration (m/s2); None holds the speed.
+        driver_preview, driver_gain: Preview time (s) and gain of the driver.
+        driver_lag, driver_rate: Time constant of the driver's arms (s), and largest rate of the
+            driver's angle at the wheels (rad/s).
+        initial_beta, initial_gamma: Sideslip angle (rad) and yaw rate (rad/s) at the start.
+        speed, acceleration: Speed at the start (m/s); acceleration (m/s2), None holds the speed.
         speed_change: Change of the held speed at an even rate (m/s).
-        change_start: Time at which that change begins (s).
-        change_length: Time that it takes (s).
-        surge: Amplitude of a sine of the driver's acceleration, which the held speed follows
-            (m/s2).
-        surge_frequency: Frequency of that sine (Hz).
+        change_start, change_length: Time at which that change begins, and that it takes (s).
+        surge, surge_frequency: Amplitude (m/s2) and frequency (Hz) of a sine of the driver's
+            acceleration, which the held speed follows.
         friction: Friction of the road, which replaces the vehicle's.
         friction_right: Friction under the right wheels; None: as on the left.
-        front_stiffness: Factor on the front stiffness; draws of an unstable car are drawn again.
-        rear_stiffness: Factor on the rear stiffness.
+        front_stiffness, rear_stiffness: Factors on the tyres' stiffness; draws of an unstable car
+            are drawn again.
         tyre_change_time: Time at which the tyres change (s); None: never.
-        front_change: Further factor on the front stiffness from then on.
-        rear_change: Further factor on the rear stiffness from then on.
-        wind_force: Force of a side wind (N).
-        wind_arm: Its arm ahead of the centre of gravity (m).
-        wind_start: Time at which it begins (s).
-        wind_length: Time that it lasts (s).
-        wind_height: Its height above the roll axis (m).
-        disturbance_force: Standard deviation of an Ornstein-Uhlenbeck force (N).
-        disturbance_moment: Standard deviation of an Ornstein-Uhlenbeck moment (N m).
-        disturbance_time: Time constant of both (s).
+        front_change, rear_change: Further factors on the stiffness from then on.
+        wind_force, wind_arm, wind_height: Force of a side wind (N), its arm ahead of the centre of
+            gravity, and its height above the roll axis (m).
+        wind_start, wind_length: Time at which it begins, and that it lasts (s).
+        disturbance_force, disturbance_moment, disturbance_time: Standard deviations of an
+            Ornstein-Uhlenbeck force (N) and moment (N m), and their time constant (s).
         road: "straight", or "nominal-path", which bends as the nominal linear car would drive the
-            programme's steering at the wanted speed; its camera reports y_l without that bend.
+            steering profile at the wanted speed; its camera reports y_l without that bend.
         curvature: Curvature of the bend (1/m), left positive.
-        curve_start: Place where curvature, bank and grade begin (m); negative: from the beginning.
-        curve_ramp: Length over which they come in (m).
-        bank: Bank of the road (rad), left side up.
-        grade: Grade of the road (rad), uphill.
-        half_width: Distance from the driver's path, else from the road's centre line, that ends the
-            episode (m).
-        camera_delays: Repeating pattern of delays that replaces the id's, and its jitter (s).
-        camera_jitter: Jitter of these delays (s).
+        curve_start, curve_ramp: Place where curvature, bank and grade begin (m; negative: from the
+            beginning), and length over which they come in (m).
+        bank, grade: Bank (rad), left side up, and grade (rad), uphill, of the road.
+        half_width: Distance (m) from the driver's path, else from the road's centre line, that ends
+            the episode.
+        camera_delays, camera_jitter: Repeating pattern of delays and their jitter (s), which
+            replace the id's.
         camera_loss: Probability that a frame is lost; 0: the id's.
-        camera_heading: Heading against the road (rad) beyond which no lane is in view (quality 0).
-        camera_offset: Offset from the lane's centre (m) beyond which no lane is in view.
-        camera_outage: (from, to) without packets (s).
-        gps_period: Period that replaces the id's (s).
-        gps_delays: Repeating pattern of delays that replaces the id's (s).
-        gps_outage: (from, to) without packets (s).
+        camera_heading, camera_offset: Heading against the road (rad) and offset from the lane's
+            centre (m) beyond which no lane is in view (quality 0).
+        camera_outage, gps_outage: (from, to) without packets (s).
+        gps_period, gps_delays: Period, and repeating pattern of delays, that replace the id's (s).
         gps_latency: Further delay of all GPS packets of the episode, whose stamps are true (s);
             `slow_sensors` describes its range as a delay and a jitter.
-        gyro_bias: Addition to the noise's bias of the gyro (rad/s).
-        accel_y_bias: Addition to the noise's bias of the lateral accelerometer (m/s2).
-        hdop: Median of the GPS's HDOP.
-        hdop_spread: Standard deviation of its logarithm.
-        hdop_time: Correlation time of its logarithm (s).
+        gyro_bias, accel_y_bias: Additions to the noise's biases of gyro (rad/s) and lateral
+            accelerometer (m/s2).
+        hdop, hdop_spread, hdop_time: Median of the GPS's HDOP, and standard deviation and
+            correlation time (s) of its logarithm.
         hdop_law: How much of the GPS's noise follows HDOP, of `HDOP_LAWS`.
-        small_angle: Whether the plant is that of the papers' small angles.
-        tyres: Tyre law, of `TYRE_LAWS`.
-        lags: Whether motors and steering have lags.
-        roll: Whether the body rolls.
-        tier: Tier in whose score the scenario may stand, of `TIER_NAMES`; "" for none.
-        vehicle: Parameters that replace those of the env's vehicle.
-        nominal: Parameters that replace those of the env's nominal vehicle.
+        small_angle, tyres: Whether the plant is of small angles; tyre law, of `TYRE_LAWS`.
+        lags, roll: Whether motors and steering have lags, and whether the body rolls.
+        tier: Tier in whose score the scenario may stand: "1", "2a", "2b", "2c", or "" for none.
+        vehicle, nominal: Parameters that replace those of the env's vehicle and nominal vehicle.
         noise: Numbers that replace the default `Noise`.
     """
 
@@ -399,7 +359,7 @@ class Scenario:
             value = getattr(self, entry.name)
             if isinstance(value, list):
                 object.__setattr__(self, entry.name, tuple(value))
-        check_fields(vars(self), dataclasses.fields(self))
+        _check_fields(vars(self), dataclasses.fields(self))
 
     def range(self, name: str) -> tuple[float, float]:
         """Get the ends of a drawn quantity; zeros where it is None.
@@ -420,7 +380,7 @@ class Scenario:
         """
         low, high = np.empty(DRAWS_WIDTH), np.empty(DRAWS_WIDTH)
         for i, name in enumerate(Draws._fields):
-            if name in SIDES:
+            if name in _SIDES:
                 low[i], high[i] = (0.0, 1.0) if self.mirror else (1.0, 1.0)
             else:
                 low[i], high[i] = self.range(name)
@@ -459,9 +419,8 @@ class Scenario:
         for entry in dataclasses.fields(self):
             value = getattr(self, entry.name)
             default = {} if entry.name in ("vehicle", "nominal", "noise") else entry.default
-            if value != default:
-                mapping = isinstance(value, Mapping)
-                values[entry.name] = (
-                    dict(value) if mapping else list(value) if isinstance(value, tuple) else value
-                )
+            if isinstance(value, Mapping | tuple) and value != default:
+                values[entry.name] = dict(value) if isinstance(value, Mapping) else list(value)
+            elif value != default:
+                values[entry.name] = value
         return values

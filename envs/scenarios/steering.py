@@ -1,4 +1,4 @@
-"""The steering programmes: the driver's angle at a time, from numbers that were drawn."""
+"""Steering profiles: the driver's angle at a tick, from numbers drawn at reset; compiled."""
 
 from typing import Any
 
@@ -14,23 +14,21 @@ from ..ticks import FOREVER, TICK, round_to_ticks
 ) = range(14)  # fmt: skip
 STEERING_KINDS = (
     "straight", "sine", "slalom", "lane-change", "step", "random", "double-lane-change",
-    "sine-with-dwell", "ramp", "sweep", "held-step", "driver", "trace",
-    "wander",
+    "sine-with-dwell", "ramp", "sweep", "held-step", "driver", "trace", "wander",
 )  # fmt: skip
 SINES, STEPS = 4, 3
 _RAMP_START = 5 * SINES + 3 * STEPS
 _SWEEP_START = _RAMP_START + 3
 WANDER_START = _SWEEP_START + 5
 STEERING_WIDTH = WANDER_START + 3
-RISE = 0.2  # s, of a step
+_RISE = 0.2  # s, of a step
 
 
 @jit
 def compute_steering(tick: Any, profile: Any) -> Any:
     """Compute the driver's steering command at a tick.
 
-    The programme is an array, since a tuple would go through memory at every call, and a loop's
-    index into it is a jump table.
+    The profile is an array: a tuple goes through memory in every call.
 
     Args:
         tick: Tick since the start of the episode.
@@ -78,7 +76,7 @@ def interpolate_trace(tick: Any, trace: Any) -> Any:
 
     Args:
         tick: Tick since the start of the episode.
-        trace: Ticks from sample to sample, the samples (rad), and the last one again, which stays.
+        trace: Ticks from sample to sample, the samples (rad), and the last one again.
 
     Returns:
         Angle at the wheels (rad).
@@ -108,6 +106,7 @@ def compute_wander_gains(amplitude: Any, hertz: Any, hold: Any) -> Any:
 
 @jit
 def _write_sine(profile: Any, i: int, amplitude: Any, hertz: Any, start: Any, end: Any) -> None:
+    """Write sine i (rad) between two ticks, with phase 0 at its start."""
     profile[5 * i] = amplitude
     profile[5 * i + 1] = 2.0 * PI * hertz
     profile[5 * i + 2] = 0.0
@@ -117,13 +116,14 @@ def _write_sine(profile: Any, i: int, amplitude: Any, hertz: Any, start: Any, en
 
 @jit
 def _write_step(profile: Any, i: int, amplitude: Any, start: Any, rise: Any) -> None:
+    """Write smooth step i (rad), which rises for some ticks from its start."""
     k = 5 * SINES + 3 * i
     profile[k], profile[k + 1], profile[k + 2] = amplitude, start, rise
 
 
 @jit
 def _write_dwell(profile: Any, a: Any, hertz: Any, start: Any, dwell: Any) -> None:
-    """Three quarters of a sine, its peak held, and the last quarter."""
+    """Write three quarters of a sine, its peak held for some ticks, and the last quarter."""
     peak, last = start + round_to_ticks(0.75 / hertz), start + round_to_ticks(1.0 / hertz)
     _write_sine(profile, 0, a, hertz, start, peak)
     _write_sine(profile, 1, -a, 0.0, peak, peak + dwell)
@@ -134,22 +134,19 @@ def _write_dwell(profile: Any, a: Any, hertz: Any, start: Any, dwell: Any) -> No
 
 @jit
 def write_steering(kind: int, d: Any, profile: Any) -> None:
-    """Write the steering programme of a kind from drawn numbers.
+    """Write the steering profile of a kind from drawn numbers.
 
-    A driver's and a trace's programme is empty; a wandering driver's has the numbers of
-    `compute_wander_gains`.
-
-    The slalom, the lane changes, the step and the random steering leave the car on its old
-    heading: the slalom starts with a half wave of half the amplitude, the step is followed by its
-    mirror image and by straight on, and the sines of a random steering come in pairs whose heading
-    angles cancel. The sine with dwell stays at its second peak for `hold` (FMVSS 126). The ramp
-    reaches its amplitude after `hold`, the held step after 0.2 s, and both stay there. The sweep
-    goes from `frequency` to `frequency_2` within `hold`, evenly in Hz, and stays at that.
+    A driver's and a trace's is empty; a wandering driver's has `compute_wander_gains`. The slalom,
+    lane changes, step and random steering keep the heading: the slalom starts with half a wave of
+    half the amplitude, the step is followed by its mirror image, and random sines come in pairs
+    whose heading angles cancel. The sine with dwell stays at its second peak for `hold`
+    (FMVSS 126). The ramp rises within `hold`, the held step within 0.2 s, and both stay. The sweep
+    goes from `frequency` to `frequency_2` within `hold`, evenly in Hz, and stays there.
 
     Args:
-        kind: Place of the kind in `STEERING_KINDS`.
+        kind: Index of the kind in `STEERING_KINDS`.
         d: `Draws`.
-        profile: Array for the programme, at least STEERING_WIDTH long.
+        profile: Array for the profile, at least STEERING_WIDTH long.
     """
     for i in range(SINES):
         _write_sine(profile, i, 0.0, 0.0, 0.0, 0.0)
@@ -172,7 +169,7 @@ def write_steering(kind: int, d: Any, profile: Any) -> None:
         _write_sine(profile, 0, 0.5 * a, d.frequency, start, half)
         _write_sine(profile, 1, -a, d.frequency, half, FOREVER)
     elif kind == STEP:
-        length, rise = round_to_ticks(d.hold), round_to_ticks(RISE)
+        length, rise = round_to_ticks(d.hold), round_to_ticks(_RISE)
         _write_step(profile, 0, a, start, rise)
         _write_step(profile, 1, -2.0 * a, start + length, rise)
         _write_step(profile, 2, a, start + 2.0 * length, rise)
@@ -195,7 +192,7 @@ def write_steering(kind: int, d: Any, profile: Any) -> None:
         profile[k + 2] = 2.0 * PI * (d.frequency_2 - d.frequency)
         profile[k + 3], profile[k + 4] = start, d.hold
     elif kind == HELD_STEP:
-        _write_step(profile, 0, a, start, round_to_ticks(RISE))
+        _write_step(profile, 0, a, start, round_to_ticks(_RISE))
     elif kind == WANDER:
         decay, noise_gain = compute_wander_gains(d.amplitude, d.frequency, d.hold)
         k = WANDER_START

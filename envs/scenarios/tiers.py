@@ -1,10 +1,8 @@
-"""The manoeuvres of the two scored tiers: everything that decides is drawn by the seed.
-
-So is what real sensors do: biases, a GPS that is late, an uneven camera that may lose the lane.
+"""Scenarios of the two scored tiers: the seed draws cars, manoeuvres and sensor faults.
 
 Tier 1 is the COMS at 18 to 28 km/h. Tier 2 is the passenger car at 60 to 80 km/h: on a dry road
-(2a), on a road of any friction (2b), and at the limit of its tyres (2c). A contest adds an id and
-a reference to a scenario; the cars are the presets, which the env names.
+(2a), on a road of any friction (2b), and at the limit of its tyres (2c). Sensors have biases, a
+late GPS, and an uneven camera that may lose the lane. The env names the car, a task the reference.
 """
 
 import math
@@ -14,84 +12,50 @@ from ..vehicle.parameters import COMS, PASSENGER_CAR
 from .draws import KMH
 from .scenario import Scenario
 
-DEGREE = math.radians(1.0)
+_DEGREE = math.radians(1.0)
 
 _DRAWN: dict[str, Any] = {
-    "mirror": True,
-    "front_stiffness": (0.6, 1.4),
-    "rear_stiffness": (0.6, 1.4),
-    "camera_delays": (0.030,),
-    "camera_jitter": 0.010,
-    "camera_loss": 0.05,
-    "camera_heading": 0.35,
-    "camera_offset": 4.0,
-    "gps_latency": (0.1, 0.3),
-    "gyro_bias": (-0.5 * DEGREE, 0.5 * DEGREE),
+    "mirror": True, "front_stiffness": (0.6, 1.4), "rear_stiffness": (0.6, 1.4),
+    "camera_delays": (0.030,), "camera_jitter": 0.010, "camera_loss": 0.05, "camera_heading": 0.35,
+    "camera_offset": 4.0, "gps_latency": (0.1, 0.3), "gyro_bias": (-0.5 * _DEGREE, 0.5 * _DEGREE),
     "accel_y_bias": (-0.2, 0.2),
-    "bank": (-0.02, 0.02),  # the crossfall of a road that sheds water,
+    "bank": (-0.02, 0.02),  # the crossfall of a road that sheds water
     "curve_start": -100.0,  # there from the beginning
-}
+}  # fmt: skip
 # 2 kW a wheel is assumed: the papers give the COMS's torque alone. The passenger car's 700 N m take
 # 50 kW a wheel at 80 km/h, which is assumed to be there.
 _COMS_PLANT = {"motor_power": 2000.0, "transfer_height": COMS.gravity_height}
 _CAR_PLANT = {"transfer_height": PASSENGER_CAR.gravity_height}
 _COMS = _DRAWN | {
-    "speed": (18.0 * KMH, 28.0 * KMH),
-    "friction": (0.7, 1.0),
-    "vehicle": _COMS_PLANT,
+    "speed": (18.0 * KMH, 28.0 * KMH), "friction": (0.7, 1.0), "vehicle": _COMS_PLANT,
     "nominal": _COMS_PLANT,
-}
-_CAR = _DRAWN | {
-    "speed": (60.0 * KMH, 80.0 * KMH),
-    "vehicle": _CAR_PLANT,
-    "nominal": _CAR_PLANT,
-}
+}  # fmt: skip
+_CAR = _DRAWN | {"speed": (60.0 * KMH, 80.0 * KMH), "vehicle": _CAR_PLANT, "nominal": _CAR_PLANT}
 
 RANDOM: dict[str, Any] = {
-    "steering": "random",
-    "onset": (0.0, 1.0),
-    "frequency": (0.3, 0.4),
-    "frequency_2": (0.4, 0.8),
-    "frequency_3": (0.2, 0.3),
-    "frequency_4": (0.4, 0.6),
-}
+    "steering": "random", "onset": (0.0, 1.0), "frequency": (0.3, 0.4), "frequency_2": (0.4, 0.8),
+    "frequency_3": (0.2, 0.3), "frequency_4": (0.4, 0.6),
+}  # fmt: skip
 SLALOM: dict[str, Any] = {"steering": "slalom", "onset": (0.5, 1.5), "frequency": (0.2, 0.6)}
 STEP: dict[str, Any] = {
-    "duration": 8.0,
-    "steering": "step",
-    "onset": (0.5, 1.5),
-    "hold": (1.0, 2.0),
-}
+    "duration": 8.0, "steering": "step", "onset": (0.5, 1.5), "hold": (1.0, 2.0),
+}  # fmt: skip
 SINE_WITH_DWELL: dict[str, Any] = {  # FMVSS 126: 0.7 Hz, and half a second at the second peak
-    "duration": 6.0,
-    "steering": "sine-with-dwell",
-    "onset": (0.5, 1.0),
-    "frequency": (0.6, 0.8),
+    "duration": 6.0, "steering": "sine-with-dwell", "onset": (0.5, 1.0), "frequency": (0.6, 0.8),
     "hold": 0.5,
-}
+}  # fmt: skip
 BRAKE_IN_TURN: dict[str, Any] = {  # the motors brake; they share their torque with the yaw moment
-    "duration": 6.0,
-    "steering": "held-step",
-    "onset": (0.5, 1.0),
-    "speed_change": -12.0 * KMH,
-    "change_start": 2.0,
-    "change_length": 2.0,
-}
+    "duration": 6.0, "steering": "held-step", "onset": (0.5, 1.0), "speed_change": -12.0 * KMH,
+    "change_start": 2.0, "change_length": 2.0,
+}  # fmt: skip
 DOUBLE_LANE_CHANGE: dict[str, Any] = {  # a section takes the time it takes at 25 to 32 km/h
-    "duration": 6.0,
-    "steering": "driver",
-    "path": "iso-3888-2",
-    "path_speed": (7.0, 9.0),
-    "onset": (0.5, 1.0),
-    "half_width": 2.0,
-}
+    "duration": 6.0, "steering": "driver", "path": "iso-3888-2", "path_speed": (7.0, 9.0),
+    "onset": (0.5, 1.0), "half_width": 2.0,
+}  # fmt: skip
 _ISO_3888_1: dict[str, Any] = {
-    "duration": 9.0,
-    "steering": "driver",
-    "path": "iso-3888-1",
-    "onset": (0.5, 1.0),
+    "duration": 9.0, "steering": "driver", "path": "iso-3888-1", "onset": (0.5, 1.0),
     "half_width": 5.0,
-}
+}  # fmt: skip
 
 
 def make_random_steering(low: float, high: float) -> dict[str, Any]:
@@ -108,16 +72,15 @@ def make_random_steering(low: float, high: float) -> dict[str, Any]:
 
 
 def _set_amplitude(shape: dict[str, Any], low: float, high: float) -> dict[str, Any]:
+    """Set the range of a manoeuvre's steering amplitude (rad)."""
     return shape | {"amplitude": (low, high)}
 
 
 def _make_scenarios(tier: str, common: dict[str, Any], **shapes: dict[str, Any]) -> list[Scenario]:
-    """Make the scenarios of a tier by their names, written with underscores.
-
-    Without a driver on a track the road follows the nominal car, so that the camera sees a lane.
-    """
+    """Make a tier's scenarios from their fields by name, written with underscores."""
     scenarios = []
     for name, shape in shapes.items():
+        # without a driver on a track the road follows the nominal car: the camera sees a lane
         road = "straight" if shape["steering"] == "driver" else "nominal-path"
         fields: dict[str, Any] = {"road": road} | common | shape
         scenarios.append(Scenario(name=name.replace("_", "-"), tier=tier, **fields))
@@ -168,26 +131,14 @@ _TWO_C = _make_scenarios(
 
 # Not scored, but mapped over where it starts: the driver does not steer, the car is caught or lost.
 _RECOVERY = Scenario(
-    name="recovery",
-    duration=5.0,
-    initial_beta=(0.05, 0.25),
-    initial_gamma=(-0.5, 0.5),
-    **_COMS,
+    name="recovery", duration=5.0, initial_beta=(0.05, 0.25), initial_gamma=(-0.5, 0.5), **_COMS
 )
 
-# Not scored either: what is drawn where a driver swerves around others, on `sideslip/Highway-v0`.
-WET_EVASION = Scenario(
-    name="wet-evasion",
-    duration=6.0,
-    steering="driver",
-    **_CAR
-    | {
-        "speed": (75.0 * KMH, 100.0 * KMH),
-        "driver_gain": 2.0,  # startled
-        "friction": (0.4, 0.7),
-        "nominal": _CAR_PLANT | {"friction": 0.55},
-        "camera_offset": 6.0,
-    },
-)
+# Not scored either: drawn where a driver swerves around others, on `sideslip/Highway-v0`.
+_WET_ROAD = _CAR | {
+    "speed": (75.0 * KMH, 100.0 * KMH), "friction": (0.4, 0.7), "camera_offset": 6.0,
+    "nominal": _CAR_PLANT | {"friction": 0.55}, "driver_gain": 2.0,  # startled
+}  # fmt: skip
+WET_EVASION = Scenario(name="wet-evasion", duration=6.0, steering="driver", **_WET_ROAD)
 
 TIERS: tuple[Scenario, ...] = (*_ONE, *_TWO_A, *_TWO_B, *_TWO_C, _RECOVERY)
