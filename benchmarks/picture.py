@@ -59,7 +59,10 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
         ratios = {r.estimator: r.value for r in over_bound}
         bounded = [row for row in panel_rows if row.estimator in ratios]
         for row in bounded[:1]:  # the bound is the same for all
-            _draw_bound(axis, 1e3 * row.value / ratios[row.estimator])
+            value = 1e3 * row.value / ratios[row.estimator]
+            axis.axvline(value, color=INK, linewidth=1.5)
+            box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0}
+            axis.text(value, -0.4, " the bound", color=INK, fontsize=8, va="center", bbox=box)
     with atomic_file(path) as file:
         figure.savefig(file, format=Path(path).suffix[1:] or "png", dpi=110)
 
@@ -70,7 +73,7 @@ def _is_shown(row: ResultRow) -> bool:
 
 
 def find_partial_entries(rows: Sequence[ResultRow], tier: str) -> set[str]:
-    """Controllers that drive a part of a tier's contests, so that theirs is another's score."""
+    """Find the controllers that drive a part of a tier's tasks, so that theirs is another score."""
     of_tier = {task.name for task in list_scored_tasks() if f"tier {task.tier}" == tier}
     driven: dict[str, set[str]] = {}
     for row in rows:
@@ -95,12 +98,6 @@ def _draw_maps(strip: Any, share_map: ShareMap) -> None:
         axis.tick_params(labelsize=7)
     axes[0].set_ylabel(share_map.y_label, fontsize=7)
     strip.colorbar(image, ax=axes).ax.tick_params(labelsize=7)
-
-
-def _draw_bound(axis: Any, value: float) -> None:
-    axis.axvline(value, color=INK, linewidth=1.5)
-    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0}
-    axis.text(value, -0.4, " the bound", color=INK, fontsize=8, va="center", bbox=box)
 
 
 def _draw_bars(

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -44,12 +44,10 @@ _OF_THE_CAR = ("none", "spin", "off-road")
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s, of camera and GPS alike, beside what the seed draws
 _FRAME = 0.05  # s: so slow that a camera's frames 0.3 s late find room under way
 DELAY_TASK = ControlTask("1", YAW, "coms", "zero-slip", "coms-random")
+_FILTERS = (REFERENCE_FILTER, "multirate-kf", "bicycle-kf")
 CONTESTANTS = (
     *((NOMINAL, ""), (ORACLES[PARAMETERS][0], ""), (ORACLES[STATE][0], "")),
-    *(
-        (REFERENCE_CONTROLLER, filter_name)
-        for filter_name in (REFERENCE_FILTER, "multirate-kf", "bicycle-kf")
-    ),
+    *((REFERENCE_CONTROLLER, filter_name) for filter_name in _FILTERS),
 )
 
 
@@ -125,11 +123,11 @@ def describe_findings(standings: Sequence[Standing]) -> list[str]:
         for item in others
     ]  # below 0 where the contestant is better
     sure = holm([compute_p_value(item) for item in excess])
+    better = [item for item, is_sure in zip(others, sure, strict=True) if is_sure]
     return [
         f"Finding: {item.label} costs less than oracle-state in tier {item.tier} "
         f"(score {item.overall['score'].value:.2f})."
-        for item, is_sure in zip(others, sure, strict=True)
-        if is_sure
+        for item in better
     ]
 
 
@@ -154,10 +152,8 @@ def make_knowledge_table(results: Results, tiers: Mapping[str, Sequence[ControlT
                 steps[1].append(oracle_gain - r)
         texts = (geometric_mean(*logs).inline() if logs else "" for logs in steps)
         cells.append([f"{tier}: {TITLES[tier]}", *texts])
-    header = (
-        *("tier", "car, friction, biases (model)", "state and disturbances (sensing)"),
-        "what is ahead (foresight)",
-    )
+    knowledge = ("car, friction, biases (model)", "state and disturbances (sensing)")
+    header = ("tier", *knowledge, "what is ahead (foresight)")
     note = (
         "Cost without over cost with the knowledge: nominal / oracle-parameters, oracle-parameters "
         "/ oracle-state, oracle-state / clairvoyant. Paired geometric means."
@@ -264,19 +260,11 @@ def measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
     errors += oracle_errors
     is_unknown = bool(nominal.error) or len(oracle_errors) == len(ORACLES[STATE])
     verdict = _describe_verdict(task, gap, failing, n_compared)
-    return TaskMeasurement(
-        **asdict(task),
-        env_version=__version__,
-        oracle=name,
-        knowing=knowing,
-        gap=round(gap.value, 4),
-        low=round(gap.low, 4),
-        high=round(gap.high, 4),
-        failing=round(failing, 4),
-        judged=n_compared,
-        n=len(nominal.costs),
-        verdict="; ".join(errors) if is_unknown else verdict,
-    )
+    facts: dict[str, Any] = asdict(task) | {"env_version": __version__}
+    facts |= {"oracle": name, "knowing": knowing, "judged": n_compared, "n": len(nominal.costs)}
+    numbers = zip(("gap", "low", "high", "failing"), (*gap, failing), strict=True)
+    facts |= {key: round(number, 4) for key, number in numbers}
+    return TaskMeasurement(**facts, verdict="; ".join(errors) if is_unknown else verdict)
 
 
 def _select_oracle(

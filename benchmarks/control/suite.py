@@ -12,7 +12,7 @@ from rich.console import Console
 
 from ... import __version__
 from ...agents.learned.policy import is_policy, load_policy
-from ...envs.record import Array
+
 from ..harness.results import ResultRow, ResultTable, Suite
 from .baseline_gaps import (
     DELAY_TASK,
@@ -97,7 +97,9 @@ def run(
     suite = Suite("control", "Which controller and estimator hold the car", "")
     names = {task.tier for task in tasks}
     tiers = {tier: [c for c in tasks if c.tier == tier] for tier in TITLES if tier in names}
-    by_tier, foresight, detail_tables = {}, _compute_foresight(records, calibrated), []
+    regrets = compute_regrets(records, calibrated).items()
+    foresight = {entry.task: regret for entry, regret in regrets if entry.controller == STATE}
+    by_tier, detail_tables = dict[str, list[Standing]](), list[ResultTable]()
     for tier, tier_tasks in tiers.items():
         by_tier[tier] = rank_entries(results.outcomes, tier, make_score_scales(results, tier_tasks))
         for item in by_tier[tier]:
@@ -152,14 +154,6 @@ def _read_calibrated(
     records = {task: record for task, record in read_calibration(path).items() if task in tasks}
     check_current(records, path)
     return records
-
-
-def _compute_foresight(
-    records: Mapping[ControlTask, CalibrationRecord], calibrated: Results
-) -> dict[ControlTask, Array]:
-    """log(J_oracle-state / J_clairvoyant) of each calibrated task, shape (n,)."""
-    regrets = compute_regrets(records, calibrated).items()
-    return {entry.task: regret for entry, regret in regrets if entry.controller == STATE}
 
 
 def _describe_beaten(records: Mapping[ControlTask, CalibrationRecord], calibrated: Results) -> str:

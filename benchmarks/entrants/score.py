@@ -138,8 +138,10 @@ def make_sentence(standing: Standing) -> str:
     if cost is None or not math.isfinite(cost.value):
         reason = "nominal and oracle-state leave no episode to compare"
         return f"{standing.label}: {f'not driven: {errors[0]}' if errors else reason}"
-    names = dict.fromkeys(task.tier for task in standing.pairs)
-    tiers = [f"tier {tier}: {100.0 * _compute_cost(standing, tier):.0f}" for tier in names if tier]
+    tiers = []
+    for tier in dict.fromkeys(task.tier for task in standing.pairs if task.tier):
+        logs = [-r for task, (r, _) in standing.pairs.items() if task.tier == tier]
+        tiers.append(f"tier {tier}: {100.0 * geometric_mean(*logs).value:.0f}")
     failed = standing.overall["failure_rate"]
     nominal = [standing.scales[task].nominal for task in standing.drives if task in standing.scales]
     nominal_failures = sum(float((run["failure"] != 0.0).sum()) for run in nominal)
@@ -156,12 +158,6 @@ def make_sentence(standing: Standing) -> str:
     if errors:
         text += f"; not driven in {len(errors)} of {len(standing.results)} contests: {errors[0]}"
     return text
-
-
-def _compute_cost(standing: Standing, tier: str) -> float:
-    """Cost over nominal's in a tier."""
-    logs = [-r for task, (r, _) in standing.pairs.items() if task.tier == tier]
-    return geometric_mean(*logs).value
 
 
 def _describe_gap(score: Estimate) -> str:
@@ -325,15 +321,9 @@ def score(
         rows.append(row | {"n": len(pairs[0]) if pairs else 0, "error": result.error})
     overall = {name: standing.overall.get(metric, _NONE) for name, metric in _COLUMNS.items()}
     errors = [row["error"] for row in rows]
-    return Score(
-        standing.entry.controller,
-        standing.entry.estimator,
-        **overall,
-        n=standing.n,
-        contests=tuple(rows),
-        error=errors[0] if all(errors) else "",
-        text=make_sentence(standing),
-    )
+    names = (standing.entry.controller, standing.entry.estimator)
+    error, text = errors[0] if all(errors) else "", make_sentence(standing)
+    return Score(*names, **overall, n=standing.n, contests=tuple(rows), error=error, text=text)
 
 
 _TEXT = "Everybody drives the same episodes; an agent of yours on nominal's filter, or on yours."

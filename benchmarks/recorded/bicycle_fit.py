@@ -294,8 +294,11 @@ def fit(
 
     x = np.clip(np.array(start)[at], low, high)
     for max_evaluations in (60,) if scale is not None else (10, 10, 60):
-        residual = compute_residual(car, make_theta(x), w)
-        now = estimate_noise_levels(residual, w.dt) if scale is None else scale
+        now = (
+            estimate_noise_levels(compute_residual(car, make_theta(x), w), w.dt)
+            if scale is None
+            else scale
+        )
         solution = least_squares(
             compute_weighted, x, jacobian, (low, high), x_scale=10.0 * steps, args=(now,),
             max_nfev=max_evaluations,

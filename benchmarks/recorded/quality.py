@@ -318,11 +318,6 @@ def jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float
     return statistic(total), margin_of_error((count - 1.0) * without)
 
 
-def _compute_root_mean(sums: Array) -> float:
-    """Root of the mean from the sum of squares and the count."""
-    return math.sqrt(float(sums[0]) / max(float(sums[1]), 1.0))
-
-
 def estimate_white_noise(parts: Sequence[Array]) -> tuple[float, float]:
     """Estimate standard deviation and half interval of a channel's white noise.
 
@@ -333,7 +328,8 @@ def estimate_white_noise(parts: Sequence[Array]) -> tuple[float, float]:
         new = np.concatenate([[True], np.diff(values) != 0.0])
         third = np.diff(values if new.mean() > 0.7 else values[new], 3) / math.sqrt(20.0)
         blocks += [np.array([block @ block, len(block)]) for block in np.array_split(third, BLOCKS)]
-    return jackknife(np.array(blocks), _compute_root_mean)
+    # each block: sum of squares and count
+    return jackknife(np.array(blocks), lambda x: math.sqrt(float(x[0]) / max(float(x[1]), 1.0)))
 
 
 def estimate_noise_levels(left: Array, dt: float) -> Array:

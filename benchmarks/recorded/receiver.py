@@ -301,11 +301,9 @@ def compose_verdict(replay: ReceiverReplay) -> str:
 
 
 def _describe_gain(name: str, results: Mapping[str, _NoiseLawResult]) -> str:
-    number, what = (
-        compute_gain(results[_TUNED], results[_FIXED]),
-        f"Tuning the noise of {name} by HDOP",
-    )
-    value, low, high = number
+    """Sentence on whether noise that follows HDOP predicts a signal better."""
+    number = compute_gain(results[_TUNED], results[_FIXED])
+    what, (value, low, high) = f"Tuning the noise of {name} by HDOP", number
     if max(abs(low), abs(high)) < _NEGLIGIBLE:
         return f"{what} changes nothing: log-likelihood {value:+.3f}."
     how = "pays" if low > 0.0 else "costs" if high < 0.0 else "is not seen to pay"

@@ -232,20 +232,21 @@ def add_tables(
     shares, totals = [], []
     for controller in names:
         scores = {name: transfer.score_condition(controller, name) for name in transfer.drives}
-        shares.append([controller, *map(_format_share, scores.values())])
+        texts = (x.inline() if np.isfinite(x.value) else "-" for x in scores.values())
+        shares.append([controller, *texts])
         costs = transfer.costs(controller)
         ratio = compute_tail_mean(compute_cost_ratios(costs, transfer.costs(NOMINAL))).value
         won = {rival: compute_win_rate(costs, transfer.costs(rival)).value for rival in rivals}
         beaten = ["" if x == controller else f"{100.0 * rate:.0f} %" for x, rate in won.items()]
         fails = share(transfer.mark_failures(controller)).value
         totals.append([controller, *beaten, f"{100.0 * fails:.1f} %", f"{ratio:.2f}"])
-        labels = {"controller": controller, "n": episodes, "salt": transfer.salt}
+        labels: dict[str, Any] = {"suite": suite.name, "controller": controller, "n": episodes}
+        labels |= {"salt": transfer.salt, "env_version": f"{env_id} {__version__}"}
         for condition, item in scores.items():
-            if not np.isfinite(item.value):
-                continue  # there is no gap
-            where = {"suite": suite.name, "scenario": f"{transfer.kind}, {condition}"}
-            version = {"env_version": f"{env_id} {__version__}"}
-            suite.rows.append(ResultRow.from_estimate("score", item, **where, **labels, **version))
+            if np.isfinite(item.value):  # else there is no gap
+                scenario = f"{transfer.kind}, {condition}"
+                row = ResultRow.from_estimate("score", item, scenario=scenario, **labels)
+                suite.rows.append(row)
     count = episodes // len(transfer.drives)
     note = f"{scenarios}; {count} episodes a condition, the same for everybody. {remark}"
     if any("-" in row for row in shares):
@@ -256,11 +257,6 @@ def add_tables(
         ResultTable(f"{title}: share of the gap", ("controller", *transfer.drives), shares, note),
         ResultTable(f"{title}: all conditions together", header, totals, text),
     ]
-
-
-def _format_share(share: Estimate) -> str:
-    """A share, or "-" where there is no gap."""
-    return share.inline() if np.isfinite(share.value) else "-"
 
 
 def add_figures(suite: Suite, transfers: Sequence[TransferResult]) -> None:

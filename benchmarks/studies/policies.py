@@ -172,11 +172,10 @@ def make_suite(result: PolicyEvaluation) -> Suite:
     suite = Suite("enjoy", title, text, _make_rows(result), [_make_table(result)])
     from ..control.report import make_time_explorer
 
-    series: dict[tuple[str, ...], Array] = {
-        (label,): outcome.series
-        for label, outcome in result.drives.items()
-        if outcome.series is not None
-    }
+    series: dict[tuple[str, ...], Array] = {}
+    for label, outcome in result.drives.items():
+        if outcome.series is not None:
+            series[label,] = outcome.series
     suite.explorers.append(make_time_explorer("The first seed, side by side", (), series, name))
     suite.verdict = _compose_verdict(result)
     return suite

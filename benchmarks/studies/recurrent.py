@@ -373,15 +373,11 @@ def _add_tables(suite: Suite, results: Results) -> None:
         f"{FILTER}: the optimal policy's plain costs on {n * LQG_FACTOR}. "
         f"The optimum in 10^-3: {optima}."
     )
-    title, text = (
-        f"Trainings, at {REPEATED}",
-        "CPU-s: mean of all conditions. plain costs: over lqg's.",
-    )
+    suite.tables.append(ResultTable("Cost over the optimum", ("memory", *conditions), gaps, note))
     header = ("memory", "gap of each seed / %", "plain costs / %", "steps", "CPU-s")
-    suite.tables += [
-        ResultTable("Cost over the optimum", ("memory", *conditions), gaps, note),
-        ResultTable(title, header, trainings, text),
-    ]
+    title, text = f"Trainings, at {REPEATED}", "CPU-s: mean of all conditions. "
+    text += "plain costs: over lqg's."
+    suite.tables.append(ResultTable(title, header, trainings, text))
 
 
 def _draw(suite: Suite, results: Results) -> None:
