@@ -37,8 +37,10 @@ README, FIRST_ROWS = Path("README.md"), Path("docs/first.json")
 PAGE, ROWS = Path("docs/benchmark.md"), Path("docs/control.json")
 METRICS = ("cost_vs_nominal", "failure_rate")
 HEADS = {"1": "COMS, 18-28 km/h", "2a": "car, dry", "2b": "any friction", "2c": "limit"}
-_ON_JOINT = ("distill-car-steering", "distill-car-yaw", "ppo-coms-yaw", "ppo-coms-steering")
-_ON_JOINT += ("distill-coms-yaw", "distill-coms-steering")
+_ON_JOINT = (
+    *("distill-car-steering", "distill-car-yaw", "ppo-coms-yaw", "ppo-coms-steering"),
+    *("distill-coms-yaw", "distill-coms-steering"),
+)
 _UNFILTERED = ("raw-car-steering", "raw-car-yaw", "raw-coms-yaw", "raw-coms-steering")
 _SHOWN: Mapping[str, tuple[str, str]] = {
     "`oracle-state`: knows state and car": (STATE, ""),

@@ -12,7 +12,6 @@ from rich.console import Console
 
 from ... import __version__
 from ...agents.learned.policy import is_policy, load_policy
-
 from ..harness.results import ResultRow, ResultTable, Suite
 from .baseline_gaps import (
     DELAY_TASK,

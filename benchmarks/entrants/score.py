@@ -321,9 +321,9 @@ def score(
         rows.append(row | {"n": len(pairs[0]) if pairs else 0, "error": result.error})
     overall = {name: standing.overall.get(metric, _NONE) for name, metric in _COLUMNS.items()}
     errors = [row["error"] for row in rows]
-    names = (standing.entry.controller, standing.entry.estimator)
     error, text = errors[0] if all(errors) else "", make_sentence(standing)
-    return Score(*names, **overall, n=standing.n, contests=tuple(rows), error=error, text=text)
+    facts: dict[str, Any] = {"n": standing.n, "contests": tuple(rows), "error": error, "text": text}
+    return Score(standing.entry.controller, standing.entry.estimator, **overall, **facts)
 
 
 _TEXT = "Everybody drives the same episodes; an agent of yours on nominal's filter, or on yours."

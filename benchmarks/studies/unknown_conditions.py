@@ -177,32 +177,9 @@ class Curve:
         return [self.make_condition(value) for value in self.values]
 
 
-def _vary_stiffness(factor: float) -> Condition:
-    same = dict.fromkeys(_STIFF, factor)
-    return Condition(f"both axles {factor:g} of nominal", CAMERA, MIX | same)
-
-
 def _vary_steering(degrees: float) -> Condition:
     size = {"amplitude": np.radians(degrees), "amplitude_2": 0.6 * np.radians(degrees)}
     return Condition(f"steering of {degrees:g} deg", CAMERA, size)
-
-
-def _vary_delay(ms: float) -> Condition:
-    late = {"camera_delays": (1e-3 * ms,)}
-    return Condition(f"camera {ms:g} ms late", CAMERA, MIX | late)
-
-
-def _vary_period(period: float) -> Condition:
-    return Condition(f"GPS every {period:g} s", GPS, MIX | {"gps_period": period})
-
-
-def _vary_outage(seconds: float) -> Condition:
-    out = {"gps_outage": (3.0, 3.0 + seconds)} if seconds else {}
-    return Condition(f"no GPS for {seconds:g} s", GPS, MIX | out)
-
-
-def _vary_bias(degrees: float) -> Condition:
-    return Condition(f"gyro {degrees:g} deg/s off", CAMERA, _make_gyro_bias(degrees), _BIASED)
 
 
 def _vary_noise(factor: float) -> Condition:
@@ -226,17 +203,22 @@ def _vary_disturbances(factor: float) -> Condition:
 
 CURVES = (
     Curve("What do other tyres cost?", "stiffness of both axles / nominal",
-          (0.6, 0.8, 1.0, 1.2, 1.4), _vary_stiffness),
+          (0.6, 0.8, 1.0, 1.2, 1.4), lambda factor: Condition(
+              f"both axles {factor:g} of nominal", CAMERA, MIX | dict.fromkeys(_STIFF, factor))),
     Curve("How much steering do the tyres need?", "steering amplitude / deg",
           (0.125, 0.25, 0.5, 1.0, 2.0, 4.0), _vary_steering, "xy"),
     Curve("What does a late camera cost?", "delay of the camera / ms",
-          (0.0, 30.0, 60.0, 100.0, 150.0, 200.0), _vary_delay),
+          (0.0, 30.0, 60.0, 100.0, 150.0, 200.0), lambda ms: Condition(
+              f"camera {ms:g} ms late", CAMERA, MIX | {"camera_delays": (1e-3 * ms,)})),
     Curve("What does a slow GPS cost?", "period of the GPS / s",
-          (0.05, 0.1, 0.2, 0.5, 1.0, 2.0), _vary_period, "xy"),
+          (0.05, 0.1, 0.2, 0.5, 1.0, 2.0), lambda period: Condition(
+              f"GPS every {period:g} s", GPS, MIX | {"gps_period": period}), "xy"),
     Curve("What does a GPS that is out cost?", "length of the outage / s",
-          (0.0, 1.0, 2.0, 3.0, 4.0, 6.0), _vary_outage),
+          (0.0, 1.0, 2.0, 3.0, 4.0, 6.0), lambda s: Condition(
+              f"no GPS for {s:g} s", GPS, MIX | ({"gps_outage": (3.0, 3.0 + s)} if s else {}))),
     Curve("What does a gyro's bias cost?", "bias of the gyro / (deg/s)",
-          (0.0, 0.1, 0.2, 0.5, 1.0, 2.0), _vary_bias),
+          (0.0, 0.1, 0.2, 0.5, 1.0, 2.0), lambda degrees: Condition(
+              f"gyro {degrees:g} deg/s off", CAMERA, _make_gyro_bias(degrees), _BIASED)),
     Curve("What does another noise of the accelerometer cost?",
           "accelerometer noise / data sheet's", (0.25, 0.5, 1.0, 2.0, 4.0), _vary_noise, "xy"),
     Curve("What do other disturbances cost?", "disturbances / those assumed",
