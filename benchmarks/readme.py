@@ -65,7 +65,7 @@ _SHOWN: Mapping[str, tuple[str, str]] = {
     "`lqr` on `uneven-delay-kf`": (REFERENCE_CONTROLLER, "uneven-delay-kf"),
     "`lqr` on `dakf`": (REFERENCE_CONTROLLER, "dakf"),
 }
-"""(controller, estimator) of each line, by what it is called."""
+"""Controller and estimator of each line of the table by its label."""
 FIRST: Mapping[str, Sequence[tuple[str, str]]] = {
     "a controller given the true state and car": [(STATE, "")],
     "policy on `joint`": [("distill-car-steering", "joint"), ("ppo-coms-steering", "joint")],

@@ -303,7 +303,7 @@ def main(
     episodes: Annotated[int, typer.Option(min=2, help="Tuning seeds a contest.")] = EPISODES,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes.")] = None,
 ) -> None:
-    """Which contests are scored: where the rungs of the ladder lie apart, on tuning seeds."""
+    """Measure which tasks are scored: where the baselines lie apart, on tuning seeds."""
     console = Console()
     candidates = list_candidates()
     entries = [entry for task in candidates for entry in make_oracle_entries(task)]

@@ -64,9 +64,8 @@ SETUPS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 """Filters by name in the tables: a name of `make_estimator`, and options over the tuned ones."""
 ADAPTIVE = {"joint": "adaptive-lqr", "joint, friction": "adaptive-nmpc"}
-"""By the filter whose tyres they follow."""
-_CORRECTED = ("learned-joint", "adaptive-nmpc")
-"""The same controller on that filter with a network behind it."""
+"""Adaptive controllers by the filter whose tyres they follow."""
+_CORRECTED = ("learned-joint", "adaptive-nmpc")  # on a filter with a network behind it
 ESTIMATORS = (
     *(name for name in SETUPS if name != _CORRECTED[0]),
     *("single-rate-kf", "uneven-delay-kf", "dakf", "bicycle-kf", TRUTH),
@@ -92,19 +91,18 @@ LEARNED: dict[str, tuple[tuple[str, str], ...]] = {
         ("", "raw-coms-yaw"),
     ),
 }
-"""(estimator, policy) by the class of tasks that it was trained on; verdicts speak of the first."""
+"""Pairs of estimator and policy by the class of its tasks; verdicts speak of the first."""
 _SHARED = {
     ORACLES[PARAMETERS][0]: ("adaptive-lqr", {"grip", "steer_weight"}),
     ORACLES[PARAMETERS][1]: ("adaptive-nmpc", {"horizon", "grip", "steer_weight"}),
     ORACLES[STATE][1]: ("adaptive-nmpc", {"horizon", "steer_weight"}),
 }
-"""By a controller that is not tuned: from which, closest in what it knows, it takes what options;
-its filter's levels are the scenario's."""
+"""Untuned controllers: the one, closest in knowledge, from which they take which options; their
+filters' levels are the scenario's."""
 _SLOW_CONTROLLERS = ("mpc", "nmpc", "adaptive-nmpc", ORACLES[STATE][1], ORACLES[PARAMETERS][1])
 
 EPISODES, QUICK_EPISODES, SLOW_EPISODES = 256, 8, 64
-_QUICK_TASKS = 2
-"""Of each tier, in a quick run."""
+_QUICK_TASKS = 2  # of each tier, in a quick run
 
 
 def select_quick_tasks(tasks: Sequence[ControlTask]) -> list[ControlTask]:
@@ -171,8 +169,7 @@ class ControlEntry:
 
     @property
     def env_options(self) -> dict[str, Any]:
-        """Options of the env: an action that is none ends the episode, and a policy sees what its
-        training saw."""
+        """Options of the env; a bad action ends the episode, a policy sees what its training saw."""
         card = load_policy(self.controller).card.env_options if is_policy(self.controller) else {}
         observed = {name: card[name] for name in OBSERVATION_OPTIONS if name in card}
         return self.task.env_options | {"on_bad_action": "fail"} | observed | self.options
@@ -268,12 +265,9 @@ class CheckedAgent:
         self.agent, self.shape = agent, (rows, width)
 
     def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
+        self, observation: Any, state: Any = None, episode_start: Any = None,
         deterministic: bool = True,
-    ) -> tuple[Any, Any]:
+    ) -> tuple[Any, Any]:  # fmt: skip
         """Return what the agent does, checked."""
         result = self.agent.predict(observation, state, episode_start, deterministic=deterministic)
         if not (isinstance(result, tuple) and len(result) == 2):

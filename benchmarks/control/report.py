@@ -132,10 +132,7 @@ def _compute_cost_ratio(one: _Gains, other: _Gains) -> Estimate:
 
 
 def _rank_entries(by_name: Mapping[str, _Gains]) -> dict[str, dict[str, Estimate]]:
-    """Cost ratios over the rivals that share a task, the closest first, of each; the best first.
-
-    The best costs more than the fewest rivals, and of these the smallest fraction of nominal's.
-    """
+    """Cost ratios over rivals by name; the best, with the fewest cheaper rivals, is first."""
     ratios = {
         name: {rival: _compute_cost_ratio(x, by_name[rival]) for rival in by_name if rival != name}
         for name, x in by_name.items()
@@ -153,7 +150,7 @@ def _rank_entries(by_name: Mapping[str, _Gains]) -> dict[str, dict[str, Estimate
 
 
 def _describe_first(by_name: Mapping[str, _Gains]) -> str:
-    """Who leads, and by how much."""
+    """Clause on who leads, and by how much."""
     ranked = _rank_entries(by_name)
     return describe_leader(*next(iter(ranked.items())), "cost") if ranked else "nobody has a score"
 
@@ -182,7 +179,7 @@ def _describe_reasons(
     prices: Sequence[DelayCost],
     foresight: Mapping[ControlTask, Array],
 ) -> str:
-    """What the baselines save by knowing the model, the motion and what is ahead; cost of delay."""
+    """Sentence on what the baselines save by their knowledge, and on the cost of delay."""
     all_standings = [standing for standings in by_tier.values() for standing in standings]
     knowing = [item for item in all_standings if item.entry.controller == PARAMETERS]
     parameter_pairs = [pair for item in knowing for pair in item.pairs.values()]

@@ -55,7 +55,7 @@ def compute_log_ratios(nominal: Array, result: DriveResult) -> Array:
 
 @dataclass(frozen=True)
 class ScoreScale:
-    """What 0 and 1 are in a task: the episodes of `nominal` and `oracle-state`.
+    """The scale of scores in a task: the episodes of `nominal`, 0, and of `oracle-state`, 1.
 
     Raises ValueError with the reason where one of them was not driven.
     """
@@ -122,7 +122,7 @@ class Standing:
 
     @property
     def label(self) -> str:
-        """As in tables and figures."""
+        """Name in tables and figures."""
         return self.entry.label
 
     @cached_property

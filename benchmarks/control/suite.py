@@ -156,7 +156,7 @@ def _read_calibrated(
 
 
 def _describe_beaten(records: Mapping[ControlTask, CalibrationRecord], calibrated: Results) -> str:
-    """Who costs less than the clairvoyant on its own seeds."""
+    """Sentence on who costs less than the clairvoyant on its seeds."""
     if not records:
         return ""
     regrets = compute_regrets(records, calibrated)

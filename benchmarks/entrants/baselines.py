@@ -38,7 +38,7 @@ COMMAND = f"python -m {__name__}"
 _BASELINE_PAIRS = (("", NOMINAL), ("", STATE), ("", "none"))
 CONTROLLERS = ((REFERENCE_FILTER, "esc"),)
 ESTIMATORS = (("multirate-kf, camera and gps", REFERENCE_CONTROLLER), (TRUTH, REFERENCE_CONTROLLER))
-"""(estimator, controller) of everybody's baselines, an agent's rivals and an estimator's."""
+"""Estimator and controller of all baselines, of an agent's rivals and of an estimator's."""
 _SAMPLE = 2  # episodes of a baseline that are driven again
 _SAME = 1e-6  # of a cost
 

@@ -209,7 +209,7 @@ class ComparisonRequest:
         return tasks
 
     def _select_tasks(self, tasks: Sequence[ControlTask]) -> list[ControlTask]:
-        """Those of the id; another than the tiers' takes the place of the one without steering."""
+        """Tasks of the id; one that no tier has takes the place of the id without steering."""
         if self.env_id in ("", YAW, STEERING):
             return [task for task in tasks if self.env_id in ("", task.env_id)]
         return [replace(task, env_id=self.env_id) for task in tasks if task.env_id == YAW]

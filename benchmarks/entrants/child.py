@@ -41,7 +41,7 @@ _OPENS = {"open": 0, "ctypes.dlopen": 0, "import": 1}  # audit events, the argum
 
 
 class ChildSettings(NamedTuple):
-    """What the process is told before any code of the contestant runs.
+    """Settings that the process gets before any code of the entry runs.
 
     Args:
         scratch: The one folder in which it may write.

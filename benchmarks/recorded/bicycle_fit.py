@@ -36,7 +36,7 @@ _STRETCHES = 40  # at most, of the log, which the intervals take for independent
 
 
 class Theta(NamedTuple):
-    """What is fitted; the first three are logarithms of factors on the stated car."""
+    """Fitted parameters; the first three are logarithms of factors on the stated car."""
 
     front: float = 0.0
     rear: float = 0.0
@@ -158,8 +158,7 @@ def _compute_load(rows: Any, i: Any, place: Any, theta: Any, car: Any) -> Any:
 def _simulate_windows(
     rows: Any, starts: Any, theta: Any, fixed: Any, law: int, roll: int, h: float, out: Any
 ) -> None:
-    """Fill out (3, windows, rows) with yaw rate, lateral specific force and sideslip angle at the
-    GPS's antenna by the plant."""
+    """Fill out (3, windows, rows): yaw rate, lateral specific force, sideslip angle of the GPS."""
     m, l_f, l_r, mu = fixed[0], fixed[2], fixed[3], fixed[9]
     car = CarParams(
         m, fixed[1] * np.exp(theta[2]), l_f, l_r, fixed[4] * np.exp(theta[0]),

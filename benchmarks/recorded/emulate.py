@@ -19,7 +19,7 @@ _NOT_NEGATIVE = ("course_noise_deg", "delay")
 
 @dataclass(frozen=True, kw_only=True)
 class Emulation:
-    """What is put on top of a recorded drive.
+    """A GPS course and a gyro bias put on top of a recorded drive.
 
     Attributes:
         course_rate: Rate of the course (Hz), a sample every so many whole rows of the log.

@@ -59,7 +59,7 @@ _NOTE = (
 
 @dataclass
 class IdentificationResult:
-    """What a log has shown.
+    """The car and calibration that a log shows.
 
     Attributes:
         car: The stated car with the identified numbers.

@@ -77,10 +77,7 @@ def _find_jumps(log: Log, name: str) -> npt.NDArray[np.bool_]:
 
 
 def _smooth_columns(logs: Sequence[Log], *names: str) -> list[Array]:
-    """Smoothed columns where the car moves and nothing jumps, all parts one behind the other.
-
-    "turning" is speed x yaw rate, "slipping" the change of speed x truth, both in m/s2.
-    """
+    """Smoothed columns of undisturbed rows; also speed x yaw rate, change of speed x truth."""
     columns: list[list[Array]] = [[] for _ in names]
     for log in logs:
         dt, raw = log.record.dt, _get_columns(log)
@@ -122,10 +119,7 @@ def _describe_contradiction(
 
 
 def _fit_steering(logs: Sequence[Log], car: Vehicle, steady: bool, tyres: float = 1.0) -> Any:
-    """Line of the steering that the linear car needs for its yaw rate over the logged one.
-
-    steady: Not in hard turns, nor where accel_y is not speed x yaw rate. tyres: 0: neutral car.
-    """
+    """Line of the linear car's steering for its yaw rate over the logged one; tyres 0: neutral."""
     speed, gyro, steer, accel_y = _smooth_columns(logs, "speed", "gyro", "steer", "accel_y")
     bend = car.rear_arm / car.front_stiffness - car.front_arm / car.rear_stiffness
     under = tyres * max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
@@ -192,7 +186,7 @@ def _describe_zeros(logs: Sequence[Log], name: str) -> list[str]:
 
 
 def _describe_fixes(logs: Sequence[Log]) -> list[str]:
-    """What a course cannot be: held while the gyro turns, and elsewhere for a fix or two."""
+    """Sentences on a course that is held while the gyro turns, or jumps for a fix or two."""
     before, after, change, turned, _ = compute_course_steps(logs, 0.0)
     runs, _ = label(change == 0.0)
     held = (runs > 0) & (np.bincount(runs, np.abs(turned), 1) > 0.1)[runs]
@@ -210,7 +204,7 @@ def _describe_fixes(logs: Sequence[Log]) -> list[str]:
 
 
 def _describe_steering(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[str]:
-    """What is wrong with the steering, by steady turns and all rows, by these and other tyres."""
+    """Sentences on the steering, by steady turns and all rows, by these and other tyres."""
     line, *lines = (_fit_steering(logs, car, *how) for how in ((steady,), (False,), (False, 0.0)))
     sentences = _describe_contradiction(line, "steering", "yaw rate")
     if not all(_describe_contradiction(candidate, "", "") for candidate in lines):
@@ -228,7 +222,7 @@ def _describe_steering(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[
 
 
 def _describe_course(line: Any, turned: Array) -> list[str]:
-    """What is wrong with the course, by its change over the integral of the gyro."""
+    """Sentences on the course, by its change over the integral of the gyro."""
     if len(turned) < _FEW or turned.std() < 0.02:
         return []
     related = line.rvalue if line else 0.0
@@ -348,11 +342,8 @@ def estimate_noise_levels(left: Array, dt: float) -> Array:
 
 
 def _collect_fixes(log: Log, value: int, signal: Array, part: Array, times: Array) -> list[Array]:
-    """Blocks of sums of d^2, d p, p^2 and 1, shape (4, times) each.
-
-    d: Differences of two fixes' values less the signal's so much earlier. p: Those of `part`, whose
-    size is not known.
-    """
+    """Blocks of sums of d^2, d p, p^2 and 1, shape (4, times) each."""
+    # d: differences of two fixes' values less the signal's so much earlier; p: those of `part`
     packets = log.record.select_packets("gps")
     packets = packets[packets[:, PACKET.quality] > 0.0]
     rows, place = packets[:, PACKET.captured] - log.record.first, np.arange(float(len(signal)))

@@ -78,7 +78,7 @@ def make_track(epochs: Sequence[Epoch]) -> Track:
 
 
 class Signal(NamedTuple):
-    """What is filtered.
+    """A filtered quantity of a receiver's fixes.
 
     Attributes:
         name: Name of the signal.

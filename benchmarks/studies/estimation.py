@@ -78,19 +78,12 @@ class SeedChunk:
 
 @dataclass
 class _EstimationResult:
-    """Errors and cost of an experiment's filters.
+    """Errors and cost of an experiment's filters, and the drive of seed 0 with its estimates."""
 
-    Attributes:
-        squares: Mean squared errors (rad2), shape (seeds, filters).
-        bound: Mean squares of the bound (rad2), shape (seeds,).
-        cost: CPU time per tick (us), shape (seeds, filters).
-        example: The drive of seed 0 and each filter's estimate of beta (rad).
-    """
-
-    squares: Array
-    bound: Array
-    cost: Array
-    example: tuple[Rollout, dict[str, Array]] | None
+    squares: Array  # mean squared errors (rad2), shape (seeds, filters)
+    bound: Array  # mean squares of the bound (rad2), shape (seeds,)
+    cost: Array  # CPU time per tick (us), shape (seeds, filters)
+    example: tuple[Rollout, dict[str, Array]] | None  # estimates of beta (rad)
 
 
 def _make_env(experiment: Experiment) -> gym.Env[Any, Any]:

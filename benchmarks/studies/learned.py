@@ -71,11 +71,11 @@ CONDITIONS: Mapping[str, Mapping[str, Any]] = {
     "400 N from the side": {"wind_force": 400.0, "wind_start": 2.0, "wind_length": 3.0},
     "half the pictures lost": {"camera_loss": 0.5},
 }
-"""What each one changes of a task's scenario, as `vary_scenario` takes it."""
+"""Changes of a task's scenario by condition, as for `vary_scenario`."""
 NEVER_MET = ("gyro 0.5 deg/s off", "half the pictures lost")
-"""Those that no training varied (`distillation.VARIED` has the others)."""
+"""Conditions that no training varied (`policies.VARIED` has the others)."""
 LATELY_MET = ("no camera from 2 to 7 s", "400 N from the side")
-"""Those that the trainings of `raw-coms-steering` and `raw-coms-yaw` varied, and no older one."""
+"""Conditions that only the trainings of `raw-coms-steering` and `raw-coms-yaw` varied."""
 _QUICK_CONDITIONS = (TRAINED, "tyres 1.4 to 1.8", "no GPS from 2 to 7 s", "400 N from the side")
 
 

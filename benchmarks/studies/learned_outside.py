@@ -45,7 +45,7 @@ OUTSIDE_ID = "sideslip/Outside-v0"
 KINDS = tuple(kind for kind in LEARNED if kind.startswith("car-"))
 """Classes whose car is about as large and as fast as the BMW."""
 MANOEUVRE = "any-friction-sine-with-dwell"
-"""Which every class has, and after which a car heads as before: a straight road stays in sight."""
+"""The scenario of every class after which a car heads as before, along a straight road."""
 _RIVALS = (NOMINAL, ADAPTIVE["joint, friction"])
 """Over whose costs everybody's are: where there is no gap, there is no share."""
 _TEXT = (

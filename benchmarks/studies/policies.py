@@ -1,4 +1,4 @@
-"""What a learned policy costs against no control, the classical line, a class's baselines.
+"""Costs of a learned policy beside no control, the classical line and a class's baselines.
 
 All drive the same seeds, made from the policy's weights. Lessons of `sideslip distill` and starts
 of `sideslip train -i` are made here: the tasks of a class with their teacher, some of them varied.
@@ -182,7 +182,7 @@ def make_suite(result: PolicyEvaluation) -> Suite:
 
 
 def _compose_verdict(result: PolicyEvaluation) -> str:
-    """What the policy costs over each of the others, and how often it fails."""
+    """Costs of the policy over the others', and how often it fails."""
     name = result.policy.name
     others = [label for label in result.drives if label != name]
     fails = 100.0 * np.mean(result.drives[name]["failure"] != 0.0)
@@ -236,7 +236,7 @@ def _make_rows(result: PolicyEvaluation) -> list[ResultRow]:
 _JOINT, _RIVAL = "joint, friction", "adaptive-nmpc"
 _OUTPUTS = ("beta", "gamma", "phi", "phi_rate", "F_d", "N_d", "bias", "front_tyres", "rear_tyres",
            "inverse_friction")  # fmt: skip
-"""What a student on `joint` reads of it, with standard deviations."""
+"""States that a student on `joint` reads, with standard deviations."""
 VARIED = {"tyres": (0.4, 2.0), "wind": (-500.0, 500.0), "mass": (0.8, 1.3)}
 VARIED |= {"camera": (0.01, 0.12), "out": (2.0, 6.0)}
 """Of lessons that are varied: factors on each axle's tyres and the wind's force from the side, in

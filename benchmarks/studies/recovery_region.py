@@ -85,12 +85,9 @@ class PulseThenAgent:
     decisions: Array
 
     def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
+        self, observation: Any, state: Any = None, episode_start: Any = None,
         deterministic: bool = True,
-    ) -> tuple[Any, Any]:
+    ) -> tuple[Any, Any]:  # fmt: skip
         """Return the agent's action, the pulse's while that lasts."""
         count, inner = state or (0, None)
         action, inner = self.agent.predict(observation, inner, episode_start, deterministic)

@@ -53,7 +53,7 @@ EPISODES, QUICK_EPISODES = 64, 16
 
 @dataclass(frozen=True)
 class Budget:
-    """What a training may use.
+    """The budget of a training.
 
     Attributes:
         cars: Cars side by side.
@@ -262,7 +262,7 @@ _TEXT = (
 )
 
 Results = Mapping[str, Mapping[str, Sequence[MemoryResult]]]
-"""By learner and condition, of each training seed."""
+"""Results of each training seed, by learner and condition."""
 
 
 def run(

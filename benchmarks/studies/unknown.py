@@ -102,11 +102,9 @@ def _describe_range(
 
 
 def _add_reliability(suite: Suite, results: Sequence[ConditionResult]) -> None:
-    """Rows and a figure of the fraction of errors within intervals, where `joint` models all.
-
-    Conditions share their seeds, so each seed's share is its mean over them; of conditions with the
-    same drives the first one counts. results: Of all `CONDITIONS`.
-    """
+    """Rows and a figure of the fraction of errors within intervals, where `joint` models all."""
+    # Conditions share their seeds, so each seed's share is its mean over them; of conditions with
+    # the same drives the first one counts.
     shares = dict[str, list[Estimate]]()
     drives = {
         (condition.env_id, repr(condition.scenario)): condition
