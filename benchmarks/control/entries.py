@@ -169,7 +169,7 @@ class ControlEntry:
 
     @property
     def env_options(self) -> dict[str, Any]:
-        """Options of the env; a bad action ends the episode, a policy sees what its training saw."""
+        """Options of the env; bad actions end the episode, a policy sees what its training saw."""
         card = load_policy(self.controller).card.env_options if is_policy(self.controller) else {}
         observed = {name: card[name] for name in OBSERVATION_OPTIONS if name in card}
         return self.task.env_options | {"on_bad_action": "fail"} | observed | self.options

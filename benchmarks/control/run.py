@@ -51,19 +51,12 @@ class Chunk:
 
 @dataclass
 class DriveResult:
-    """Episodes of an entry in the order of their seeds.
+    """Episodes of an entry in the order of their seeds."""
 
-    Attributes:
-        numbers: Metrics, shape (seeds, NUMBERS); NaN where the entry was not driven.
-        seconds: CPU time (s).
-        series: Time and SIGNALS of the first seed, shape (k, 1 + SIGNALS).
-        error: Why the entry could not be driven.
-    """
-
-    numbers: Array
-    seconds: float
-    series: Array | None = None
-    error: str = ""
+    numbers: Array  # metrics, shape (seeds, NUMBERS); NaN where the entry was not driven
+    seconds: float  # CPU time (s)
+    series: Array | None = None  # time and SIGNALS of the first seed, shape (k, 1 + SIGNALS)
+    error: str = ""  # why the entry could not be driven
 
     def __getitem__(self, name: str) -> Array:
         """One of NUMBERS, shape (seeds,)."""

@@ -104,21 +104,13 @@ _ScoreScales = Mapping[ControlTask, ScoreScale]
 
 @dataclass
 class Standing:
-    """An entry over the tasks of a tier.
+    """An entry over the tasks of a tier."""
 
-    Attributes:
-        tier: Tier, "" for all.
-        entry: Its entry in one of the tasks.
-        results: Results of all tasks that it was to drive, errors among them.
-        scales: Scales of the tier's tasks.
-        us: Time of a decision (us).
-    """
-
-    tier: str
-    entry: ControlEntry
-    results: dict[ControlTask, DriveResult]
-    scales: _ScoreScales
-    us: float = float("nan")
+    tier: str  # tier, "" for all
+    entry: ControlEntry  # its entry in one of the tasks
+    results: dict[ControlTask, DriveResult]  # of all its tasks, errors too
+    scales: _ScoreScales  # scales of the tier's tasks
+    us: float = float("nan")  # time of a decision (us)
 
     @property
     def label(self) -> str:

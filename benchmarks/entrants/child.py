@@ -41,15 +41,10 @@ _OPENS = {"open": 0, "ctypes.dlopen": 0, "import": 1}  # audit events, the argum
 
 
 class ChildSettings(NamedTuple):
-    """Settings that the process gets before any code of the entry runs.
+    """Settings that the process gets before any code of the entry runs."""
 
-    Args:
-        scratch: The one folder in which it may write.
-        allowed: Files that it may open beside the installation; None notes what it opens.
-    """
-
-    scratch: str
-    allowed: frozenset[str] | None
+    scratch: str  # the one folder in which it may write
+    allowed: frozenset[str] | None  # files it may open; None: notes them
 
 
 class _EntryServer:

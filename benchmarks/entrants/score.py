@@ -323,7 +323,8 @@ def score(
     errors = [row["error"] for row in rows]
     error, text = errors[0] if all(errors) else "", make_sentence(standing)
     facts: dict[str, Any] = {"n": standing.n, "contests": tuple(rows), "error": error, "text": text}
-    return Score(standing.entry.controller, standing.entry.estimator, **overall, **facts)
+    facts |= overall
+    return Score(standing.entry.controller, standing.entry.estimator, **facts)
 
 
 _TEXT = "Everybody drives the same episodes; an agent of yours on nominal's filter, or on yours."

@@ -64,29 +64,20 @@ inertia, one of I/(m l_f l_r), is narrow: with both stiffnesses it leaves the ya
 class Windows:
     """Drives on the fit's grid and where windows start on it.
 
-    Attributes:
-        rows: Smoothed gyro, accel_y, speed, steering, left and right torque, of which the last
-            three acted until their row; the integral of the gyro, and the GPS's course less that,
-            NaN in rows without a fix; shape (8, n).
-        starts: First row of each window, shape (count,).
-        stretch: Stretch of the log of each window, shape (count,).
-        dt: Step (s).
-        accel: Whether the acceleration was logged.
-        course: Whether a window has fixes.
-        tyres: Law in `TYRE_LAWS`; the body rolls where they are not linear.
-        centre: Means of the priors.
-        spread: Standard deviations of the priors.
+    Rows are smoothed gyro, accel_y, speed, steering, left and right torque, of which the last three
+    acted until their row; the integral of the gyro, and the GPS's course less that, NaN without a
+    fix.
     """
 
-    rows: Array
-    starts: npt.NDArray[np.int64]
-    stretch: npt.NDArray[np.int64]
-    dt: float
-    accel: bool
-    course: bool
-    tyres: str = "linear"
-    centre: Theta = _STATED
-    spread: Theta = PRIOR
+    rows: Array  # channels, shape (8, n)
+    starts: npt.NDArray[np.int64]  # first row of each window, shape (count,)
+    stretch: npt.NDArray[np.int64]  # stretch of the log of each window, shape (count,)
+    dt: float  # step (s)
+    accel: bool  # whether the acceleration was logged
+    course: bool  # whether a window has fixes
+    tyres: str = "linear"  # law in `TYRE_LAWS`; the body rolls where they are not linear
+    centre: Theta = _STATED  # means of the priors
+    spread: Theta = PRIOR  # standard deviations of the priors
 
     @property
     def scored_rows(self) -> npt.NDArray[np.int64]:
@@ -235,25 +226,15 @@ def compute_errors(car: Vehicle, theta: Theta, w: Windows) -> Array:
 
 @dataclass(frozen=True)
 class BicycleFit:
-    """A fitted `Theta`, its n free parameters, and every stretch's normal equations there.
+    """A fitted `Theta`, its n free parameters, and every stretch's normal equations there."""
 
-    Attributes:
-        theta: Fitted parameters.
-        free: Names of the free ones.
-        scale: Standard deviations of the channels' residuals, by which the fit is weighted.
-        H: Curvature of each stretch's squares, shape (stretches, n, n).
-        g: Slope of each stretch's squares, shape (stretches, n).
-        prior: Curvature of the priors, which belong to no stretch, shape (n,).
-        pull: Slope of the priors, shape (n,).
-    """
-
-    theta: Theta
-    free: tuple[str, ...]
-    scale: Array
-    H: Array
-    g: Array
-    prior: Array
-    pull: Array
+    theta: Theta  # fitted parameters
+    free: tuple[str, ...]  # names of the free ones
+    scale: Array  # standard deviations of the channels' residuals, by which the fit is weighted
+    H: Array  # curvature of each stretch's squares, shape (stretches, n, n)
+    g: Array  # slope of each stretch's squares, shape (stretches, n)
+    prior: Array  # curvature of the priors, which belong to no stretch, shape (n,)
+    pull: Array  # slope of the priors, shape (n,)
 
     def estimate_shift(self, left_out: npt.NDArray[np.bool_]) -> Array:
         """Estimate how the free ones move when stretches are left out, to first order, (n,)."""

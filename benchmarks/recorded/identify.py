@@ -59,25 +59,14 @@ _NOTE = (
 
 @dataclass
 class IdentificationResult:
-    """The car and calibration that a log shows.
-
-    Attributes:
-        car: The stated car with the identified numbers.
-        wires: The stated calibration with the identified numbers.
-        findings: Rows of the table.
-        rates: RMS of the yaw rate's residual over 4 s (rad/s): of the stated car, the identified
-            one, and that on stretches which its fit had not seen.
-        slips: RMS beside the log's own sideslip (rad), stated and identified.
-        reason: Why nothing is known of the car, "" otherwise.
-        remarks: Remarks for people.
-    """
+    """The car and calibration that a log shows: the stated ones with the identified numbers."""
 
     car: Vehicle
     wires: SignalCalibration
     findings: list[Finding] = field(default_factory=list)
-    rates: tuple[float, ...] = ()
-    slips: tuple[float, ...] = ()
-    reason: str = ""
+    rates: tuple[float, ...] = ()  # RMS of yaw rate's residual (rad/s): stated, fitted, held out
+    slips: tuple[float, ...] = ()  # RMS beside the log's sideslip (rad): stated, fitted
+    reason: str = ""  # why nothing is known of the car
     remarks: list[str] = field(default_factory=list)
 
 

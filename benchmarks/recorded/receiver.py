@@ -78,29 +78,17 @@ def make_track(epochs: Sequence[Epoch]) -> Track:
 
 
 class Signal(NamedTuple):
-    """A filtered quantity of a receiver's fixes.
+    """A filtered quantity of a receiver's fixes."""
 
-    Attributes:
-        name: Name of the signal.
-        unit: Unit of the values.
-        axes: Number of axes; two are real and imaginary part.
-        z: Values, shape (n,).
-        base_size: Size of the noise beside HDOP, shape (n,).
-        spread: Standard deviation of the rate at the start.
-        track: Fixes.
-        scored: Mask of the fixes that are scored.
-        half: Row at which half of these lie behind.
-    """
-
-    name: str
-    unit: str
-    axes: int
-    z: npt.NDArray[np.complex128]
-    base_size: Array
-    spread: float
-    track: Track
-    scored: Mask
-    half: int = 0
+    name: str  # name of the signal
+    unit: str  # unit of the values
+    axes: int  # number of axes; two are real and imaginary part
+    z: npt.NDArray[np.complex128]  # values, shape (n,)
+    base_size: Array  # size of the noise beside HDOP, shape (n,)
+    spread: float  # standard deviation of the rate at the start
+    track: Track  # fixes
+    scored: Mask  # mask of the fixes that are scored
+    half: int = 0  # row at which half of these lie behind
 
 
 class _NoiseLawResult(NamedTuple):

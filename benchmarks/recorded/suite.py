@@ -100,17 +100,13 @@ class Settings(Emulation):
 class ReplayResult:
     """Errors of one vehicle's estimators on one drive, by estimator.
 
-    Attributes:
-        squares: Mean squared error of each seed (rad2); empty without truth.
-        cost: CPU time per row (us).
-        traces: Sideslip angle of the first seed (rad), shape (rows,).
-        outcomes: States that are no motion at the end: name, value, standard deviation.
-        remarks: Why it was left out or what it cannot see.
+    outcomes: States that are no motion at the end: name, value, standard deviation. remarks: Why an
+    estimator was left out, or what it cannot see.
     """
 
-    squares: dict[str, Array] = field(default_factory=dict)
-    cost: dict[str, float] = field(default_factory=dict)
-    traces: dict[str, Array] = field(default_factory=dict)
+    squares: dict[str, Array] = field(default_factory=dict)  # by seed (rad2); empty without truth
+    cost: dict[str, float] = field(default_factory=dict)  # CPU time per row (us)
+    traces: dict[str, Array] = field(default_factory=dict)  # sideslip of the first seed (rad)
     outcomes: dict[str, list[tuple[str, float, float]]] = field(default_factory=dict)
     remarks: dict[str, str] = field(default_factory=dict)
 

@@ -20,21 +20,13 @@ _MAX_LATENCY = 5.0  # s
 
 
 class SignalCalibration(NamedTuple):
-    """Calibration of a log's signals; the road-wheel angle is sign x logged / ratio + offset.
+    """Calibration of a log's signals; the road-wheel angle is sign x logged / ratio + offset."""
 
-    Attributes:
-        ratio: Steering ratio.
-        sign: 1 or -1.
-        offset: Angle at the wheels (rad).
-        latency: Latency by channel (s).
-        noise: Standard deviations by the estimators' options.
-    """
-
-    ratio: float = 1.0
-    sign: int = 1
-    offset: float = 0.0
-    latency: Mapping[str, float] = {}
-    noise: Mapping[str, float] = {}
+    ratio: float = 1.0  # steering ratio
+    sign: int = 1  # 1 or -1
+    offset: float = 0.0  # angle at the wheels (rad)
+    latency: Mapping[str, float] = {}  # latency by channel (s)
+    noise: Mapping[str, float] = {}  # standard deviations by the estimators' options
 
     @property
     def gain(self) -> float:

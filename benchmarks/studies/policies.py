@@ -54,25 +54,15 @@ _CLASSICAL, FILTER = "lqr", "exact-kf"
 
 @dataclass
 class PolicyEvaluation:
-    """Episodes on the same seeds by entry, the policy's first.
+    """Episodes on the same seeds by entry, the policy's first."""
 
-    Attributes:
-        policy: The policy.
-        salt: Salt of the seeds, "" where the caller chose them.
-        seeds: Seeds of the episodes.
-        reference: Reference of the env.
-        entries: Entries by name.
-        drives: Episodes by name.
-        left_out: Why an entry is not among them, by name.
-    """
-
-    policy: Policy
-    salt: str
-    seeds: list[int]
-    reference: str
-    entries: dict[str, ControlEntry]
-    drives: dict[str, DriveResult]
-    left_out: dict[str, str]
+    policy: Policy  # the policy
+    salt: str  # salt of the seeds, "" where the caller chose them
+    seeds: list[int]  # seeds of the episodes
+    reference: str  # reference of the env
+    entries: dict[str, ControlEntry]  # entries by name
+    drives: dict[str, DriveResult]  # episodes by name
+    left_out: dict[str, str]  # why an entry is not among them, by name
 
     def costs(self, name: str) -> Array:
         """Return the costs of an entry, shape (seeds,)."""

@@ -53,21 +53,13 @@ EPISODES, QUICK_EPISODES = 64, 16
 
 @dataclass(frozen=True)
 class Budget:
-    """The budget of a training.
+    """The budget of a training."""
 
-    Attributes:
-        cars: Cars side by side.
-        rounds: Rounds of driving and learning.
-        epochs: Passes over all drives in a round.
-        ppo: Steps of PPO, 0 for none.
-        duration: Duration of an episode (s).
-    """
-
-    cars: int = 64
-    rounds: int = 3
-    epochs: int = 1
-    ppo: int = 500_000
-    duration: float = 10.0
+    cars: int = 64  # cars side by side
+    rounds: int = 3  # rounds of driving and learning
+    epochs: int = 1  # passes over all drives in a round
+    ppo: int = 500_000  # steps of PPO, 0 for none
+    duration: float = 10.0  # duration of an episode (s)
 
 
 QUICK = Budget(cars=32, rounds=2, epochs=1, ppo=0, duration=3.0)

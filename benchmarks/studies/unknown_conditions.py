@@ -40,31 +40,18 @@ Filters = Mapping[str, tuple[str, Mapping[str, Any]]]
 
 @dataclass(frozen=True)
 class Condition:
-    """A kind of drive.
+    """A kind of drive."""
 
-    Attributes:
-        name: Name in the tables.
-        env_id: Id of the env.
-        scenario: Fields over `LINEAR`.
-        options: Options of `joint`.
-        since: Time from which errors count (s).
-        bounded: Whether the bound is one: for a linear car that does not roll.
-        modelled: Whether `joint` has a state or a level for all that happens.
-        filters: Further filters or others of a name, as (estimator, options) by label.
-        vehicle: Vehicle of the env.
-        gyro_late: Delay of the gyro (s), which the bound knows.
-    """
-
-    name: str
-    env_id: str = CAMERA
-    scenario: Mapping[str, Any] = field(default_factory=dict)
-    options: Mapping[str, Any] = field(default_factory=dict)
-    since: float = SETTLED
-    bounded: bool = True
-    modelled: bool = True
-    filters: Filters = field(default_factory=dict)
-    vehicle: str = "coms"
-    gyro_late: float = 0.0
+    name: str  # name in the tables
+    env_id: str = CAMERA  # id of the env
+    scenario: Mapping[str, Any] = field(default_factory=dict)  # fields over `LINEAR`
+    options: Mapping[str, Any] = field(default_factory=dict)  # options of `joint`
+    since: float = SETTLED  # time from which errors count (s)
+    bounded: bool = True  # whether the bound is one: for a linear car that does not roll
+    modelled: bool = True  # whether `joint` has a state or a level for all that happens
+    filters: Filters = field(default_factory=dict)  # others: (estimator, options) by label
+    vehicle: str = "coms"  # vehicle of the env
+    gyro_late: float = 0.0  # delay of the gyro (s), which the bound knows
 
     @property
     def all_filters(self) -> Filters:
@@ -257,27 +244,16 @@ _CHUNK = 16
 
 @dataclass
 class ConditionResult:
-    """Results of the seeds whose episodes did not end early.
+    """Results of the seeds whose episodes did not end early."""
 
-    Attributes:
-        labels: Labels of the filters.
-        seeds: Seeds of the episodes.
-        squares: Mean squared errors (rad2), shape (seeds, filters).
-        best: Mean squares of the bound (rad2), NaN where there is none, shape (seeds,).
-        nees: Normalised squared errors, shape (seeds, filters).
-        inside: Fractions of the errors within `LEVELS`, shape (seeds, filters, levels).
-        variances: The filters' own variances (rad2), shape (seeds, filters).
-        left_out: Number of episodes that ended early.
-    """
-
-    labels: tuple[str, ...]
-    seeds: tuple[int, ...]
-    squares: Array
-    best: Array
-    nees: Array
-    inside: Array
-    variances: Array
-    left_out: int
+    labels: tuple[str, ...]  # labels of the filters
+    seeds: tuple[int, ...]  # seeds of the episodes
+    squares: Array  # mean squared errors (rad2), shape (seeds, filters)
+    best: Array  # mean squares of the bound (rad2), NaN where there is none, shape (seeds,)
+    nees: Array  # normalised squared errors, shape (seeds, filters)
+    inside: Array  # fractions of the errors within `LEVELS`, shape (seeds, filters, levels)
+    variances: Array  # the filters' own variances (rad2), shape (seeds, filters)
+    left_out: int  # number of episodes that ended early
 
     def select(self, label: str) -> tuple[Array, Array, Array]:
         """Return squares (seeds,), NEES (seeds,) and fractions (seeds, levels) of a filter."""
