@@ -26,23 +26,19 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
     rows = [row for suite in suites for row in suite.rows]
     error = "error of sideslip / mrad"
     score = "score (0: nominal, 1: oracle-state)\nhatched: of a part of the contests"
-    panels = [
-        (title, [r for r in rows if (r.scenario, r.metric) == key and _is_shown(r)], label)
-        for title, key, label in (
-            ("Estimating with a late camera", ("tie-vision-fig7", "rmse"), error),
-            ("Estimating with GPS, wind, outage", ("dakf-fig6", "rmse"), error),
-            *(
-                (f"Tier {tier}\n{text}", (f"tier {tier}", "score"), score)
-                for tier, text in TITLES.items()
-            ),
-        )
+    candidates = [
+        ("Estimating with a late camera", ("tie-vision-fig7", "rmse"), error),
+        ("Estimating with GPS, wind, outage", ("dakf-fig6", "rmse"), error),
+        *((f"Tier {x}\n{text}", (f"tier {x}", "score"), score) for x, text in TITLES.items()),
     ]
-    panels = [panel for panel in panels if panel[1]]
+    panels = []
+    for title, key, label in candidates:
+        if shown := [r for r in rows if (r.scenario, r.metric) == key and _is_shown(r)]:
+            panels.append((title, shown, label))
     maps = [share_map for suite in suites for share_map in suite.maps]
     if not (panels or maps):
-        raise ValueError(
-            "nothing to draw: the picture needs the suites estimation, control or recovery"
-        )
+        needed = "the suites estimation, control or recovery"
+        raise ValueError(f"nothing to draw: the picture needs {needed}")
     n_columns = min(len(panels), _MAX_COLUMNS)
     n_rows = -(-len(panels) // max(n_columns, 1))
     heights = [n_rows] * bool(panels) + [1] * len(maps)
@@ -57,18 +53,16 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
     for axis in axes[len(panels) :]:
         axis.set_axis_off()
     for axis, (title, panel_rows, label) in zip(axes, panels, strict=False):
-        _draw_bars(
-            axis, panel_rows, title, label, find_partial_entries(rows, panel_rows[0].scenario)
-        )
-        bound_ratios = {
-            r.estimator: r.value
-            for r in rows
-            if r.metric == "rmse_over_bound" and r.scenario == panel_rows[0].scenario
-        }
-        for row in panel_rows:
-            if row.estimator in bound_ratios:
-                _draw_bound(axis, 1e3 * row.value / bound_ratios[row.estimator])
-                break
+        scenario = panel_rows[0].scenario
+        _draw_bars(axis, panel_rows, title, label, find_partial_entries(rows, scenario))
+        over_bound = [r for r in rows if (r.scenario, r.metric) == (scenario, "rmse_over_bound")]
+        ratios = {r.estimator: r.value for r in over_bound}
+        bounded = [row for row in panel_rows if row.estimator in ratios]
+        for row in bounded[:1]:  # the bound is the same for all
+            value = 1e3 * row.value / ratios[row.estimator]
+            axis.axvline(value, color=INK, linewidth=1.5)
+            box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0}
+            axis.text(value, -0.4, " the bound", color=INK, fontsize=8, va="center", bbox=box)
     with atomic_file(path) as file:
         figure.savefig(file, format=Path(path).suffix[1:] or "png", dpi=110)
 
@@ -79,7 +73,7 @@ def _is_shown(row: ResultRow) -> bool:
 
 
 def find_partial_entries(rows: Sequence[ResultRow], tier: str) -> set[str]:
-    """Controllers that drive a part of a tier's contests, so that theirs is another's score."""
+    """Find the controllers that drive a part of a tier's tasks, so that theirs is another score."""
     of_tier = {task.name for task in list_scored_tasks() if f"tier {task.tier}" == tier}
     driven: dict[str, set[str]] = {}
     for row in rows:
@@ -106,12 +100,6 @@ def _draw_maps(strip: Any, share_map: ShareMap) -> None:
     strip.colorbar(image, ax=axes).ax.tick_params(labelsize=7)
 
 
-def _draw_bound(axis: Any, value: float) -> None:
-    axis.axvline(value, color=INK, linewidth=1.5)
-    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0}
-    axis.text(value, -0.4, " the bound", color=INK, fontsize=8, va="center", bbox=box)
-
-
 def _draw_bars(
     axis: Any, rows: Sequence[ResultRow], title: str, label: str, parted: set[str]
 ) -> None:
@@ -122,10 +110,8 @@ def _draw_bars(
     scale = 1e3 if METRICS[rows[0].metric] == "rad" else 1.0
     values = [scale * row.value for row in ordered]
     colours = [find_colour(name) for name in names]
-    errors = [
-        [scale * (row.value - row.low) for row in ordered],
-        [scale * (row.high - row.value) for row in ordered],
-    ]
+    ends = [[row.value - row.low for row in ordered], [row.high - row.value for row in ordered]]
+    errors = [[scale * length for length in side] for side in ends]
     bars = axis.barh(names, values, color=colours, xerr=errors, ecolor="0.3", capsize=2)
     for bar, name in zip(bars, names, strict=True):
         if "," in name or name in parted:  # a variant of a known name wears its colour, hatched

@@ -1,10 +1,9 @@
 """The tables of results in README.md and docs/benchmark.md, made from the rows of runs.
 
-`sideslip bench control --json rows.json`, then `python -m sideslip.benchmarks.readme
-rows.json` writes the tiers' rows to docs/control.json and the table of docs/benchmark.md. A policy
-that came after the run drives its seeds with `python -m sideslip.benchmarks.readme
-docs/control.json --add NAME`. `python -m sideslip.benchmarks.readme --first` drives README's few
-entries in the contests with steering, writes docs/first.json and README's table.
+`sideslip bench control --json rows.json`, then `python -m sideslip.benchmarks.readme rows.json`
+writes the tiers' rows to docs/control.json and the table of docs/benchmark.md. With --add NAME, a
+policy that came after the run drives its seeds. With --first, README's few entries drive the
+contests with steering; their rows go to docs/first.json and make README's table.
 """
 
 import math
@@ -19,13 +18,14 @@ from rich.console import Console
 from .. import __version__
 from .control.baseline_gaps import make_score_scales
 from .control.entries import LEARNED, REFERENCE_CONTROLLER, REFERENCE_FILTER, ControlEntry
-from .control.run import measure
+from .control.run import Results, measure
 from .control.score import make_rows, rank_entries
 from .control.tasks import (
     NOMINAL,
     PARAMETERS,
     STATE,
     STEERING,
+    ControlTask,
     list_scored_tasks,
     make_salt,
     make_task_seeds,
@@ -37,7 +37,12 @@ README, FIRST_ROWS = Path("README.md"), Path("docs/first.json")
 PAGE, ROWS = Path("docs/benchmark.md"), Path("docs/control.json")
 METRICS = ("cost_vs_nominal", "failure_rate")
 HEADS = {"1": "COMS, 18-28 km/h", "2a": "car, dry", "2b": "any friction", "2c": "limit"}
-SHOWN: Mapping[str, tuple[str, str]] = {
+_ON_JOINT = (
+    *("distill-car-steering", "distill-car-yaw", "ppo-coms-yaw", "ppo-coms-steering"),
+    *("distill-coms-yaw", "distill-coms-steering"),
+)
+_UNFILTERED = ("raw-car-steering", "raw-car-yaw", "raw-coms-yaw", "raw-coms-steering")
+_SHOWN: Mapping[str, tuple[str, str]] = {
     "`oracle-state`: knows state and car": (STATE, ""),
     "`oracle-parameters`: knows car and biases": (PARAMETERS, ""),
     "`adaptive-nmpc` on `joint` with friction": ("adaptive-nmpc", "joint, friction"),
@@ -47,16 +52,8 @@ SHOWN: Mapping[str, tuple[str, str]] = {
     "`nominal`: `lqr` on `exact-kf`": (NOMINAL, ""),
     "`mpc` on `exact-kf`": ("mpc", REFERENCE_FILTER),
     "`sliding-mode` on `exact-kf`": ("sliding-mode", REFERENCE_FILTER),
-    "policy `distill-car-steering` on `joint`": ("distill-car-steering", "joint"),
-    "policy `distill-car-yaw` on `joint`": ("distill-car-yaw", "joint"),
-    "policy `ppo-coms-yaw` on `joint`": ("ppo-coms-yaw", "joint"),
-    "policy `ppo-coms-steering` on `joint`": ("ppo-coms-steering", "joint"),
-    "policy `distill-coms-yaw` on `joint`": ("distill-coms-yaw", "joint"),
-    "policy `distill-coms-steering` on `joint`": ("distill-coms-steering", "joint"),
-    "policy `raw-car-steering`, no filter": ("raw-car-steering", ""),
-    "policy `raw-car-yaw`, no filter": ("raw-car-yaw", ""),
-    "policy `raw-coms-yaw`, no filter": ("raw-coms-yaw", ""),
-    "policy `raw-coms-steering`, no filter": ("raw-coms-steering", ""),
+    **{f"policy `{name}` on `joint`": (name, "joint") for name in _ON_JOINT},
+    **{f"policy `{name}`, no filter": (name, "") for name in _UNFILTERED},
     "`model-following` on `exact-kf`": ("model-following", REFERENCE_FILTER),
     "`two-dof` on `exact-kf`": ("two-dof", REFERENCE_FILTER),
     "`esc` on `exact-kf`": ("esc", REFERENCE_FILTER),
@@ -68,7 +65,7 @@ SHOWN: Mapping[str, tuple[str, str]] = {
     "`lqr` on `uneven-delay-kf`": (REFERENCE_CONTROLLER, "uneven-delay-kf"),
     "`lqr` on `dakf`": (REFERENCE_CONTROLLER, "dakf"),
 }
-"""(controller, estimator) of each line, by what it is called."""
+"""Controller and estimator of each line of the table by its label."""
 FIRST: Mapping[str, Sequence[tuple[str, str]]] = {
     "a controller given the true state and car": [(STATE, "")],
     "policy on `joint`": [("distill-car-steering", "joint"), ("ppo-coms-steering", "joint")],
@@ -92,7 +89,7 @@ def measure_first(
     Args:
         jobs: Processes, None for all processors.
         console: Where progress is shown.
-        salt: Of the seeds, "" for the one of the contestants' sources.
+        salt: Salt of the seeds, "" for the one of the contestants' sources.
 
     Returns:
         Cost and failures of each entry in each tier.
@@ -112,15 +109,28 @@ def measure_first(
     salt = salt or make_salt()
     seeds = make_task_seeds(salt, EPISODES)
     results = measure(requests, seeds, jobs=jobs, console=console, title="README")
-    rows: list[ResultRow] = []
+    _check_driven(results)
+    return _make_tier_rows(results, tasks, salt)
+
+
+def _check_driven(results: Results) -> None:
+    """Raise ValueError for an entry that could not drive."""
     for entry, result in results.outcomes.items():
         if result.error:
             raise ValueError(f"{entry.label} in {entry.task.name}: {result.error}")
+
+
+def _make_tier_rows(
+    results: Results, tasks: Sequence[ControlTask], salt: str, controller: str = ""
+) -> list[ResultRow]:
+    """Cost and failures in each tier of a controller's entries, "" for all."""
+    rows: list[ResultRow] = []
     for tier in HEADS:
         scales = make_score_scales(results, [task for task in tasks if task.tier == tier])
-        for item in rank_entries(results.outcomes, tier, scales):
-            metric_rows = (row for row in make_rows(item, salt) if row.metric in METRICS)
-            rows += [row for row in metric_rows if row.scenario == f"tier {tier}"]
+        for standing in rank_entries(results.outcomes, tier, scales):
+            if controller in ("", standing.entry.controller):
+                metric_rows = (r for r in make_rows(standing, salt) if r.metric in METRICS)
+                rows += [row for row in metric_rows if row.scenario == f"tier {tier}"]
     return rows
 
 
@@ -133,38 +143,38 @@ def read_tier_rows(path: str | Path) -> list[ResultRow]:
 def make_table(rows: Sequence[ResultRow]) -> str:
     """Cost in % of nominal's with its interval, and in brackets failures in %, as Markdown."""
     by_key = {(row.scenario, row.controller, row.estimator, row.metric): row for row in rows}
-    lines = ["| | " + " | ".join(f"{tier}: {text}" for tier, text in HEADS.items()) + " |"]
-    lines.append("|---" * (1 + len(HEADS)) + "|")
-    for name, key in SHOWN.items():
+    lines = []
+    for name, key in _SHOWN.items():
         cells = []
         for tier in HEADS:
             cost, failing = (by_key.get((f"tier {tier}", *key, metric)) for metric in METRICS)
-            spread = "" if cost is None or key[0] == NOMINAL else _format_interval(cost)
             if cost is None or failing is None:
                 cells.append("")
-            else:
-                cells.append(f"{100.0 * cost.value:.0f}{spread} ({100.0 * failing.value:.0f})")
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+                continue
+            interval = f" [{100.0 * cost.low:.0f}, {100.0 * cost.high:.0f}]"
+            text = f"{100.0 * cost.value:.0f}{'' if key[0] == NOMINAL else interval}"
+            cells.append(f"{text} ({100.0 * failing.value:.0f})")
+        lines.append([name, *cells])
+    return _format_table(lines)
+
+
+def _format_table(lines: Sequence[Sequence[str]]) -> str:
+    """A table with a column for each tier, as Markdown."""
+    heads = " | ".join(f"{tier}: {text}" for tier, text in HEADS.items())
+    body = (f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join([f"| | {heads} |", "|---" * (1 + len(HEADS)) + "|", *body])
 
 
 def make_first_table(rows: Sequence[ResultRow]) -> str:
     """Make README's table: cost in % of nominal's, the best of the first tier's columns first."""
-    by_key = {
-        (row.scenario, row.controller, row.estimator): row.value
-        for row in rows
-        if row.metric == METRICS[0]
-    }
-    lines = ["| | " + " | ".join(f"{tier}: {text}" for tier, text in HEADS.items()) + " |"]
-    lines.append("|---" * (1 + len(HEADS)) + "|")
+    cost_rows = [row for row in rows if row.metric == METRICS[0]]
+    by_key = {(row.scenario, row.controller, row.estimator): row.value for row in cost_rows}
+    lines = []
     for name, entries in FIRST.items():
         costs = [[by_key.get((f"tier {tier}", *pair)) for pair in entries] for tier in HEADS]
-        cells = [
-            next((f"{100.0 * x:.0f}" for x in tier_costs if x is not None), "")
-            for tier_costs in costs
-        ]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        first = (next((x for x in tier_costs if x is not None), None) for tier_costs in costs)
+        lines.append([name, *("" if x is None else f"{100.0 * x:.0f}" for x in first)])
+    return _format_table(lines)
 
 
 def make_headlines(root: Path) -> list[str]:
@@ -174,36 +184,21 @@ def make_headlines(root: Path) -> list[str]:
     docs/speed.json` write the files.
     """
     rows = read_json(root / "docs/estimation.json")
-    ratios = {
-        row.estimator: row
-        for row in rows
-        if (row.scenario, row.metric) == ("tie-vision-fig7", "rmse_over_bound")
-    }
+    key = ("tie-vision-fig7", "rmse_over_bound")
+    ratios = {row.estimator: row for row in rows if (row.scenario, row.metric) == key}
     joint, multirate = ratios["joint"], ratios["multirate-residual-kf"]
-    (step,) = (
-        row.value
-        for row in read_json(root / "docs/speed.json")
-        if (row.scenario, row.metric) == ("YawFusion-v0 x 1024", "us_per_step")
-    )
+    key, speeds = ("YawFusion-v0 x 1024", "us_per_step"), read_json(root / "docs/speed.json")
+    (step,) = (row.value for row in speeds if (row.scenario, row.metric) == key)
     first = [row for row in read_json(root / FIRST_ROWS) if row.metric == METRICS[0]]
-    wide = [
-        max(
-            math.ceil(100.0 * (row.high / row.value - 1.0))
-            for row in first
-            if matches(row.scenario)
-        )
-        for matches in ("tier 2c".__ne__, "tier 2c".__eq__)
-    ]
+    above = [(row.scenario, math.ceil(100.0 * (row.high / row.value - 1.0))) for row in first]
+    limit = max(percent for tier, percent in above if tier == "tier 2c")
+    usual = max(percent for tier, percent in above if tier != "tier 2c")
     return [
-        f"Their 95 % intervals reach up to {wide[0]} % above them, {wide[1]} % at the limit",
+        f"Their 95 % intervals reach up to {usual} % above them, {limit} % at the limit",
         f"`joint` errs {joint.value:.2f} times as much as the best possible filter, the "
         f"paper's own filter {multirate.value:.1f} times ({joint.n} seeds).",
         f"A 10 ms step takes {step:.1f} us of CPU time a car in a batch of 1,024.",
     ]
-
-
-def _format_interval(row: ResultRow) -> str:
-    return f" [{100.0 * row.low:.0f}, {100.0 * row.high:.0f}]"
 
 
 def replace_table(text: str, new_table: str) -> str:
@@ -240,17 +235,9 @@ def add_policy(
     requests += [ControlEntry(task, estimators[task.kind], name) for task in tasks]
     seeds = make_task_seeds(tier_1[0].salt, episodes)
     results = measure(requests, seeds, jobs=jobs, console=console, title=name)
-    for entry, result in results.outcomes.items():
-        if result.error:
-            raise ValueError(f"{entry.label} in {entry.task.name}: {result.error}")
+    _check_driven(results)
     merged = [row for row in rows if row.controller != name]
-    for tier in HEADS:
-        scales = make_score_scales(results, [task for task in tasks if task.tier == tier])
-        for standing in rank_entries(results.outcomes, tier, scales):
-            if standing.entry.controller == name:
-                new = (row for row in make_rows(standing, tier_1[0].salt) if row.metric in METRICS)
-                merged += [row for row in new if row.scenario == f"tier {tier}"]
-    return merged
+    return merged + _make_tier_rows(results, tasks, tier_1[0].salt, name)
 
 
 def main(

@@ -19,11 +19,15 @@ if TYPE_CHECKING:
 class Request:
     """The options of a run.
 
-    quick: few seeds. jobs: processes, None for all processors. episodes: of a cell of the matrix,
-    or seeds of estimation, unknown and papers; None for the suite's own number. keep: a folder for
-    finished cases. clairvoyant: a file of `sideslip calibrate`, None for the package's. challenge:
-    a user's contestants, who drive instead of the matrix. salt: of the seeds of `SALTED`, "" for
-    the one of the contestants' sources.
+    Attributes:
+        quick: Whether few seeds are run.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+        episodes: Episodes of a cell of the matrix, or seeds; None for the suite's number.
+        keep: Folder of finished cases.
+        clairvoyant: File of `sideslip calibrate`, None for the package's.
+        comparison: A user's entries, which drive instead of the matrix.
+        salt: Salt of the seeds of `SALTED`, "" for the one of the contestants' sources.
     """
 
     quick: bool = False
@@ -70,6 +74,10 @@ def _run_highway(suite: Any, r: Request) -> Any:
     return suite.run(*numbers, r.jobs, r.console)
 
 
+def _run_quick(suite: Any, r: Request) -> Any:
+    return suite.run(r.quick, r.jobs, r.console)
+
+
 SUITES: dict[str, tuple[str, _Run]] = {
     "estimation": (".studies.estimation", _run_seeds),
     "unknown": (".studies.unknown", _run_seeds),
@@ -83,11 +91,8 @@ SUITES: dict[str, tuple[str, _Run]] = {
     "papers": (".papers.suite", _run_seeds),
     "following": (".studies.coordinated_control", _run_following),
     "highway": (".studies.traffic", _run_highway),
-    "recovery": (
-        ".studies.recovery_region",
-        lambda suite, r: suite.run(r.quick, r.jobs, r.console),
-    ),
-    "procedures": (".procedures.suite", lambda suite, r: suite.run(r.quick, r.jobs, r.console)),
+    "recovery": (".studies.recovery_region", _run_quick),
+    "procedures": (".procedures.suite", _run_quick),
     "speed": (".speed.suite", lambda suite, r: suite.run(r.quick, r.console)),
 }
 """The module of each suite, and how a request runs it."""

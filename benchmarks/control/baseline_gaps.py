@@ -1,17 +1,15 @@
-"""The ladder of rungs: its yardsticks, whether it falls, what each step of knowledge costs, and
-what knowing late does: the price of delay.
+"""The gaps between the baselines: nominal, oracle-parameters, oracle-state and clairvoyant.
 
-Which contests are scored: where the rungs of the ladder lie apart, on tuning seeds.
-
-`python -m sideslip.benchmarks.control.baseline_gaps --write` measures all candidates and writes
-the file.
+Scales of scores, what each step of knowledge and delay costs, and which tasks are scored: those
+where the baselines lie apart on tuning seeds. `python -m
+sideslip.benchmarks.control.baseline_gaps --write` measures all candidates and writes the file.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -43,23 +41,20 @@ from .tasks import (
 )
 
 _OF_THE_CAR = ("none", "spin", "off-road")
-CLAIRVOYANT = "clairvoyant"
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s, of camera and GPS alike, beside what the seed draws
-FRAME = 0.05  # s: so slow that a camera's frames 0.3 s late find room under way
+_FRAME = 0.05  # s: so slow that a camera's frames 0.3 s late find room under way
 DELAY_TASK = ControlTask("1", YAW, "coms", "zero-slip", "coms-random")
+_FILTERS = (REFERENCE_FILTER, "multirate-kf", "bicycle-kf")
 CONTESTANTS = (
     *((NOMINAL, ""), (ORACLES[PARAMETERS][0], ""), (ORACLES[STATE][0], "")),
-    *(
-        (REFERENCE_CONTROLLER, filter_name)
-        for filter_name in (REFERENCE_FILTER, "multirate-kf", "bicycle-kf")
-    ),
+    *((REFERENCE_CONTROLLER, filter_name) for filter_name in _FILTERS),
 )
 
 
 def make_score_scales(
     results: Results, tasks: Sequence[ControlTask]
 ) -> dict[ControlTask, ScoreScale]:
-    """The yardstick of each contest in which both rungs were driven."""
+    """Make the scale of scores of each task in which both baselines were driven."""
     scales = {}
     for task in tasks:
         nominal, oracle = (results.select(task, name) for name in (NOMINAL, STATE))
@@ -71,10 +66,9 @@ def make_score_scales(
 def make_oracle_table(
     results: Results, tasks: Sequence[ControlTask], foresight: Mapping[ControlTask, Array]
 ) -> ResultTable:
-    """Every contest's rungs and whether they fall in cost.
+    """Make the table of every task's baselines, and of whether they fall in cost.
 
-    foresight: (n,) log(J_oracle-state / J_clairvoyant) of the clairvoyant's own seeds, where it is
-    calibrated.
+    foresight: log(J_oracle-state / J_clairvoyant) of the calibrated tasks, shape (n,) each.
     """
     scales, cells = make_score_scales(results, tasks), []
     for task in tasks:
@@ -84,25 +78,17 @@ def make_oracle_table(
             continue
         scale = scales[task]
         oracle_gains = scale.compute_paired_ratios(scale.oracle)[1]
-        gap, parameters = average(oracle_gains), results.select(task, PARAMETERS)
-        known = (
-            ""
-            if parameters.error
-            else f"{_compute_mean(scale.compute_paired_ratios(parameters)[0]):.2f}"
-        )
-        task_foresight = foresight.get(task)
-        cells.append(
-            [
-                task.name,
-                f"{100.0 * (1.0 - survival_mask(scale.nominal).mean()):.1f}",
-                find_oracle(task),
-                gap.inline(),
-                known,
-                "" if task_foresight is None else f"{task_foresight.mean():.2f}",
-                f"{len(oracle_gains)} of {len(scale.mark_compared(len(scale.oracle.costs)))}",
-                _describe_order(scale, oracle_gains, task_foresight),
-            ]
-        )
+        parameters, known = results.select(task, PARAMETERS), ""
+        if not parameters.error:
+            gains = scale.compute_paired_ratios(parameters)[0]
+            known = f"{gains.mean() if len(gains) else math.nan:.2f}"
+        ahead = foresight.get(task)
+        fails = 100.0 * (1.0 - survival_mask(scale.nominal).mean())
+        beyond = "" if ahead is None else f"{ahead.mean():.2f}"
+        counted = f"{len(oracle_gains)} of {len(scale.mark_compared(len(scale.oracle.costs)))}"
+        falls = _describe_order(scale, oracle_gains, ahead)
+        texts = (find_oracle(task), average(oracle_gains).inline(), known, beyond, counted, falls)
+        cells.append([task.name, f"{fails:.1f}", *texts])
     header = (
         *("contest", "nominal fails / %", "oracle-state is", "its gap", "oracle-parameters"),
         *("clairvoyant beyond", "episodes", "falls"),
@@ -111,10 +97,6 @@ def make_oracle_table(
     if not foresight:
         note += " The clairvoyant is not calibrated: its column is empty (`sideslip calibrate`)."
     return ResultTable("The ladder", header, cells, note, keyed=False)
-
-
-def _compute_mean(values: Array) -> float:
-    return float(values.mean()) if len(values) else float("nan")
 
 
 def _describe_order(scale: ScoreScale, oracle_gains: Array, foresight: Array | None) -> str:
@@ -129,36 +111,35 @@ def _describe_order(scale: ScoreScale, oracle_gains: Array, foresight: Array | N
 
 
 def describe_findings(standings: Sequence[Standing]) -> list[str]:
-    """The contestants that cost less than oracle-state over their tier, Holm-corrected."""
+    """Describe the entries that cost less than oracle-state over their tier, Holm-corrected."""
     others = [
         item
         for item in standings
         if item.entry.controller not in ORACLE_NAMES
-        and "score" in item.overall
-        and np.isfinite(item.overall["score"].value)
+        and np.isfinite(item.overall.get("score", Estimate(math.nan)).value)
     ]
     excess = [
         np.concatenate([oracle_gain - r for r, oracle_gain in item.pairs.values()])
         for item in others
     ]  # below 0 where the contestant is better
     sure = holm([compute_p_value(item) for item in excess])
+    better = [item for item, is_sure in zip(others, sure, strict=True) if is_sure]
     return [
         f"Finding: {item.label} costs less than oracle-state in tier {item.tier} "
         f"(score {item.overall['score'].value:.2f})."
-        for item, is_sure in zip(others, sure, strict=True)
-        if is_sure
+        for item in better
     ]
 
 
 def find_below_optimum(names: Sequence[str], regrets: Sequence[Array]) -> list[str]:
-    """Of contestants with log(J / J_clairvoyant) (n,) on its seeds: who is surely below it."""
+    """Find who is surely below the clairvoyant, from log(J / J_clairvoyant), shape (n,) each."""
     sure = holm([compute_p_value(logs) for logs in regrets])
     return [name for name, is_sure in zip(names, sure, strict=True) if is_sure]
 
 
 def make_knowledge_table(results: Results, tiers: Mapping[str, Sequence[ControlTask]],
                     foresight: Mapping[ControlTask, Array]) -> ResultTable:  # fmt: skip
-    """What not knowing costs, tier by tier: the ratio of the costs of neighbouring rungs."""
+    """Make the table of what not knowing costs in each tier: ratios of neighbouring baselines."""
     cells = []
     for tier, tasks in tiers.items():
         scales = make_score_scales(results, tasks)
@@ -169,14 +150,10 @@ def make_knowledge_table(results: Results, tiers: Mapping[str, Sequence[ControlT
                 r, oracle_gain = scale.compute_paired_ratios(parameters)
                 steps[0].append(r)
                 steps[1].append(oracle_gain - r)
-        texts = []
-        for logs in steps:
-            texts.append(geometric_mean(*logs).inline() if logs else "")
+        texts = (geometric_mean(*logs).inline() if logs else "" for logs in steps)
         cells.append([f"{tier}: {TITLES[tier]}", *texts])
-    header = (
-        *("tier", "car, friction, biases (model)", "state and disturbances (sensing)"),
-        "what is ahead (foresight)",
-    )
+    knowledge = ("car, friction, biases (model)", "state and disturbances (sensing)")
+    header = ("tier", *knowledge, "what is ahead (foresight)")
     note = (
         "Cost without over cost with the knowledge: nominal / oracle-parameters, oracle-parameters "
         "/ oracle-state, oracle-state / clairvoyant. Paired geometric means."
@@ -185,10 +162,9 @@ def make_knowledge_table(results: Results, tiers: Mapping[str, Sequence[ControlT
 
 
 def list_failures(results: Results, late: float = 0.0) -> list[list[str]]:
-    """A line for every cell that could not be driven, or whose episodes ended by a failure that is
-    not the car's (a NaN, an action that is none): tier, contest, contestant, what happened.
+    """List (tier, task, entry, what happened) where the failure is not the car's, such as a NaN.
 
-    late: s by which the sensors were, of the price of delay.
+    late: Delay of the sensors (s), of the cost of delay.
     """
     lines, more = [], f", sensors {1e3 * late:.0f} ms late" if late else ""
     for entry, result in results.outcomes.items():
@@ -217,11 +193,11 @@ class DelayCost:
     over: list[Estimate]
 
 
-def make_late_entries(delay: float) -> list[ControlEntry]:
-    """The contestants with camera (every FRAME) and GPS a delay (s) late."""
+def _make_late_entries(delay: float) -> list[ControlEntry]:
+    """The contestants with camera (every _FRAME) and GPS a delay (s) late."""
     late = {"camera_delays": [delay], "camera_jitter": 0.0, "gps_delays": [delay]}
     scenario = {"base": DELAY_TASK.scenario, **late}
-    options = {"scenario": scenario, "camera": {"period": FRAME}}
+    options = {"scenario": scenario, "camera": {"period": _FRAME}}
     return [
         ControlEntry(DELAY_TASK, estimator, controller, options)
         for controller, estimator in CONTESTANTS
@@ -235,54 +211,46 @@ def measure_delay_cost(
     console: Console | None = None,
     keep: Path | None = None,
 ) -> tuple[list[DelayCost], list[Results]]:
-    """Every contestant at each of DELAYS, all on the same seeds, and the results by delay."""
+    """Drive every contestant at each of DELAYS, all on the same seeds; the results by delay too."""
     delay_results = [
-        measure(make_late_entries(d), seeds, jobs=jobs, console=console, keep=keep) for d in DELAYS
+        measure(_make_late_entries(d), seeds, jobs=jobs, console=console, keep=keep) for d in DELAYS
     ]
     in_time = delay_results[0].select(DELAY_TASK, NOMINAL)
     prices = []
     for controller, estimator in CONTESTANTS:
         price = DelayCost(ControlEntry(DELAY_TASK, estimator, controller), [])
         for results in delay_results:
-            result = results.select(DELAY_TASK, controller, estimator)
-            mask = survival_mask(in_time)[: len(result.costs)]
-            wrong = result.error or in_time.error
-            logs = (
-                np.empty(0)
-                if wrong
-                else -compute_log_ratios(in_time.costs[: len(mask)], result)[mask]
-            )
+            result, logs = results.select(DELAY_TASK, controller, estimator), np.empty(0)
+            if not (result.error or in_time.error):
+                mask = survival_mask(in_time)[: len(result.costs)]
+                logs = -compute_log_ratios(in_time.costs[: len(mask)], result)[mask]
             price.over.append(geometric_mean(logs))
         prices.append(price)
     return prices, delay_results
 
 
 def make_cost_lines(prices: Sequence[DelayCost]) -> Mapping[str, tuple[Array, Array, Array]]:
-    """name to (value, low, high) over the delays, of those that were driven at all of them."""
-    return {
-        price.entry.label: (*np.array(price.over).T,)
-        for price in prices
-        if np.isfinite(price.over).all()
-    }
+    """Make (value, low, high) over the delays by name, of those that drove at all of them."""
+    complete = [price for price in prices if np.isfinite(price.over).all()]
+    return {price.entry.label: (*np.array(price.over).T,) for price in complete}
 
 
 EPISODES = 64
-GAP, MIN_LOW, FAILING = 0.3, 0.2, 0.1
-"""A contest is scored whose gap is above the first, its lower limit above the second, and in which
-nominal fails in less than this share (at the limit in any, but never always)."""
+# A task is scored whose gap is above the first and its lower limit above the second, and in which
+# nominal fails in less than this fraction (at the limit in any, but never always).
+_GAP, _MIN_LOW, _FAILING = 0.3, 0.2, 0.1
 
 
 def make_oracle_entries(task: ControlTask) -> list[ControlEntry]:
-    """Nominal and the candidates for the oracles."""
-    return [
-        ControlEntry(task, "", name) for name in (NOMINAL, *ORACLES[PARAMETERS], *ORACLES[STATE])
-    ]
+    """Make the entries of nominal and of the candidates for the oracles."""
+    names = (NOMINAL, *ORACLES[PARAMETERS], *ORACLES[STATE])
+    return [ControlEntry(task, "", name) for name in names]
 
 
 def measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
-    """A candidate's numbers; the better oracle is that of fewer failures, then of the larger gap.
+    """Measure a candidate; the better oracle is that of fewer failures, then of the larger gap.
 
-    A rung that could not be computed, and cars that all fail, leave a gap of 0 and the reason.
+    A baseline that could not be computed, and cars that all fail, leave a gap of 0 and the reason.
     """
     nominal = results.select(task, NOMINAL)
     errors = [f"{NOMINAL}: {nominal.error}"] if nominal.error else []
@@ -290,27 +258,19 @@ def measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
     knowing, _, _, _ = _select_oracle(results, task, PARAMETERS, nominal)
     name, gap, n_compared, oracle_errors = _select_oracle(results, task, STATE, nominal)
     errors += oracle_errors
-    return TaskMeasurement(
-        **asdict(task),
-        env_version=__version__,
-        oracle=name,
-        knowing=knowing,
-        gap=round(gap.value, 4),
-        low=round(gap.low, 4),
-        high=round(gap.high, 4),
-        failing=round(failing, 4),
-        judged=n_compared,
-        n=len(nominal.costs),
-        verdict="; ".join(errors)
-        if nominal.error or len(oracle_errors) == len(ORACLES[STATE])
-        else _describe_verdict(task, gap, failing, n_compared),
-    )
+    is_unknown = bool(nominal.error) or len(oracle_errors) == len(ORACLES[STATE])
+    verdict = _describe_verdict(task, gap, failing, n_compared)
+    facts: dict[str, Any] = asdict(task) | {"env_version": __version__}
+    facts |= {"oracle": name, "knowing": knowing, "judged": n_compared, "n": len(nominal.costs)}
+    numbers = zip(("gap", "low", "high", "failing"), (*gap, failing), strict=True)
+    facts |= {key: round(number, 4) for key, number in numbers}
+    return TaskMeasurement(**facts, verdict="; ".join(errors) if is_unknown else verdict)
 
 
 def _select_oracle(
     results: Results, task: ControlTask, oracle_kind: str, nominal: DriveResult
 ) -> tuple[str, Estimate, int, list[str]]:
-    """(name, gap to nominal, episodes judged) of the better candidate, and what went wrong."""
+    """Name, gap to nominal and compared episodes of the better candidate, and what went wrong."""
     options: list[tuple[bool, float, str, Estimate, int]] = []
     errors = []
     for name in ORACLES[oracle_kind]:
@@ -319,41 +279,23 @@ def _select_oracle(
             errors.append(f"{name}: {oracle.error}")
         elif not nominal.error:
             log_ratios = ScoreScale(nominal, oracle).compute_paired_ratios(oracle)[1]
-            gap, failing = _compute_gap(log_ratios), float(np.mean(~survival_mask(oracle)))
-            options.append((failing > FAILING, -gap.value, name, gap, len(log_ratios)))
+            gap, failing = Estimate(0.0, 0.0, 0.0), float(np.mean(~survival_mask(oracle)))
+            if len(log_ratios) > 1:
+                gap = Estimate(*(math.log(number) for number in geometric_mean(log_ratios)))
+            options.append((failing > _FAILING, -gap.value, name, gap, len(log_ratios)))
     nothing = (True, 0.0, ORACLES[oracle_kind][0], Estimate(0.0, 0.0, 0.0), 0)
     _, _, name, gap, n_compared = min(options) if options else nothing
     return name, gap, n_compared, errors
 
 
-def _compute_gap(log_ratios: Array) -> Estimate:
-    """The mean of r with its interval, 0 where no episode or only one is left."""
-    if len(log_ratios) < 2:
-        return Estimate(0.0, 0.0, 0.0)
-    return Estimate(*(math.log(number) for number in geometric_mean(log_ratios)))
-
-
 def _describe_verdict(task: ControlTask, gap: Estimate, failing: float, n_compared: int) -> str:
     if n_compared < 2:
         return "no episode that nominal and oracle-state survive"
-    if failing >= FAILING and task.tier not in LIMIT:
+    if failing >= _FAILING and task.tier not in LIMIT:
         return f"nominal fails in {100.0 * failing:.0f} %"
-    if not (gap.value > GAP and gap.low > MIN_LOW):
+    if not (gap.value > _GAP and gap.low > _MIN_LOW):
         return f"too little to win: {gap.value:.2f} [{gap.low:.2f}, {gap.high:.2f}]"
     return "scored"
-
-
-def choose_tasks(
-    among: Sequence[ControlTask] | None = None,
-    episodes: int = EPISODES,
-    jobs: int | None = None,
-    console: Console | None = None,
-) -> list[TaskMeasurement]:
-    """Measure candidates (default: all); one that cannot be driven is not scored, with why."""
-    among = list_candidates() if among is None else among
-    entries = [entry for task in among for entry in make_oracle_entries(task)]
-    results = measure(entries, make_tuning_seeds(episodes), jobs=jobs, console=console)
-    return [measure_task(results, task) for task in among]
 
 
 def main(
@@ -361,23 +303,18 @@ def main(
     episodes: Annotated[int, typer.Option(min=2, help="Tuning seeds a contest.")] = EPISODES,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes.")] = None,
 ) -> None:
-    """Which contests are scored: where the rungs of the ladder lie apart, on tuning seeds."""
+    """Measure which tasks are scored: where the baselines lie apart, on tuning seeds."""
     console = Console()
-    measurements = choose_tasks(None, episodes, jobs, console)
+    candidates = list_candidates()
+    entries = [entry for task in candidates for entry in make_oracle_entries(task)]
+    results = measure(entries, make_tuning_seeds(episodes), jobs=jobs, console=console)
+    measurements = [measure_task(results, task) for task in candidates]
     columns = "tier", "contest", *ORACLES, "gap", "nominal fails / %", "verdict"
     table = Table(*columns)
-    for measurement in measurements:
-        gap = f"{measurement.gap:.2f} [{measurement.low:.2f}, {measurement.high:.2f}]"
-        failing = f"{100.0 * measurement.failing:.1f}"
-        table.add_row(
-            measurement.tier,
-            measurement.task.name,
-            measurement.knowing,
-            measurement.oracle,
-            gap,
-            failing,
-            measurement.verdict,
-        )
+    for m in measurements:
+        gap = f"{m.gap:.2f} [{m.low:.2f}, {m.high:.2f}]"
+        failing = f"{100.0 * m.failing:.1f}"
+        table.add_row(m.tier, m.task.name, m.knowing, m.oracle, gap, failing, m.verdict)
     console.print(table)
     if write:
         write_tasks(measurements)

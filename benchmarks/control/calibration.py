@@ -1,9 +1,8 @@
-"""The clairvoyant's costs, contest by contest, on seeds of their own that only the version salts.
+"""The clairvoyant's costs of each task, on seeds of their own that only the version salts.
 
-Solving for it takes ten seconds an episode, so it is done once, by `sideslip calibrate`, and lies
-in a file. The rungs of the ladder drive the same seeds when a table is made. An entry that no
-longer fits, by its version, its contest, or what the uncontrolled car costs on its seeds, is
-refused.
+An episode takes ten seconds to solve, so `sideslip calibrate` solves all once, into a file. The
+baselines drive the same seeds when a table is made. An entry is refused that no longer fits: by
+its version, its task, or what the uncontrolled car costs on its seeds.
 """
 
 import hashlib
@@ -20,6 +19,7 @@ from rich.console import Console
 
 from ... import __version__
 from ...envs.io import from_json
+from ...envs.numerics import require_extra
 from ...envs.record import Array
 from ...envs.validation import is_finite
 from ..harness.parallel import run_cases
@@ -54,8 +54,7 @@ class CalibrationCase:
 
 @dataclass(frozen=True)
 class ClairvoyantEpisode:
-    """What was found of one seed; the fields of `agents.clairvoyant.ClairvoyantResult` without
-    actions."""
+    """The result of one seed: the fields of `agents.clairvoyant.ClairvoyantResult`, no actions."""
 
     seed: int
     cost: float
@@ -80,25 +79,24 @@ class CalibrationRecord:
 
     @property
     def task(self) -> ControlTask:
-        """Of which these are the costs."""
+        """The task of the costs."""
         return ControlTask(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
 
     @property
     def costs(self) -> Array:
-        """(n,) the clairvoyant's."""
+        """Costs of the clairvoyant, shape (n,)."""
         return np.array([episode.cost for episode in self.episodes])
 
 
 def derive_seeds(task: ControlTask, count: int = SEEDS) -> list[int]:
-    """The first `count` seeds of a contest's calibration; more seeds begin with the same ones."""
+    """Derive the first `count` seeds of a task's calibration; more begin with the same ones."""
     texts = [f"clairvoyant {__version__} {task.seed_text} {i}" for i in range(count)]
     digests = [hashlib.sha256(text.encode()).digest() for text in texts]
     return [_FIRST + int.from_bytes(digest[:4]) % _FIRST for digest in digests]
 
 
 def solve(case: CalibrationCase) -> ClairvoyantEpisode:
-    """The best of the plans from nominal's and the oracle's runs; from the folder of finished cases
-    where it is there."""
+    """Solve from nominal's and the oracle's runs, or read the folder of finished cases."""
     from ...agents.baselines import make_oracle
     from ...agents.clairvoyant.plan import compute_clairvoyant, record_actions
 
@@ -111,10 +109,8 @@ def solve(case: CalibrationCase) -> ClairvoyantEpisode:
         starts[name] = record_actions(*driver, case.seed)
     env: gym.Env[Any, Any] = gym.make(task.env_id, **task.env_options)
     result = compute_clairvoyant(env, case.seed, starts)
-    seconds = round(result.seconds, 1)
-    episode = ClairvoyantEpisode(
-        case.seed, result.cost, result.winner, result.costs, result.statuses, seconds
-    )
+    plan = (result.cost, result.winner, result.costs, result.statuses, round(result.seconds, 1))
+    episode = ClairvoyantEpisode(case.seed, *plan)
     write_text(case.path, json.dumps(asdict(episode)))
     return episode
 
@@ -138,36 +134,28 @@ def calibrate(
     jobs: int | None = None,
     console: Console | None = None,
 ) -> list[CalibrationRecord]:
-    """One entry a contest; folder: of finished cases, from which a stopped run goes on.
+    """Calibrate each task; a stopped run goes on from the folder of finished cases.
 
-    Raises ValueError for fewer than two seeds (no interval), ModuleNotFoundError, with what to
+    Raises ValueError for fewer than two seeds (no interval), and ModuleNotFoundError, with what to
     install, before the work rather than in a worker.
     """
     if seeds < 2:
         raise ValueError(f"an interval needs two seeds or more, got {seeds}")
-    try:
+    with require_extra("mpc", "the clairvoyant needs CasADi and OSQP"):
         import casadi  # noqa: F401
         import osqp  # noqa: F401
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "the clairvoyant needs CasADi and OSQP: pip install 'sideslip[mpc]'"
-        ) from None
     folder.mkdir(parents=True, exist_ok=True)
     cases = make_cases(tasks, folder, seeds)
     episodes = run_cases(solve, cases, "calibration", jobs, console)
+    parts = (tuple(episodes[i * seeds : (i + 1) * seeds]) for i in range(len(tasks)))
     return [
-        CalibrationRecord(
-            **asdict(task),
-            env_version=__version__,
-            command=command,
-            episodes=tuple(episodes[i * seeds : (i + 1) * seeds]),
-        )
-        for i, task in enumerate(tasks)
+        CalibrationRecord(**asdict(task), env_version=__version__, command=command, episodes=part)
+        for task, part in zip(tasks, parts, strict=True)
     ]
 
 
 def make_cases(tasks: Sequence[ControlTask], folder: Path, seeds: int) -> list[CalibrationCase]:
-    """Every episode, contest by contest."""
+    """Make the case of every episode, task by task."""
     return [CalibrationCase(c, seed, str(folder)) for c in tasks for seed in derive_seeds(c, seeds)]
 
 
@@ -183,8 +171,7 @@ def remove_cases(cases: Sequence[CalibrationCase]) -> None:
 def read_calibration(
     path: str | Path = FILE, stale: bool = False
 ) -> dict[ControlTask, CalibrationRecord]:
-    """The entries of a file by contest. stale: those of another version or of other seeds are left
-    out instead of refused.
+    """Read the entries of a file by task; stale: leave out what does not fit, refuse nothing.
 
     Raises FileNotFoundError where there is none, ValueError, with file, entry and field, for one
     that is cut short or lacks something, of another version or of other seeds.
@@ -213,7 +200,7 @@ def read_calibration(
 
 
 def update(path: str | Path, new_records: Sequence[CalibrationRecord]) -> None:
-    """Replace or add entries of a file, which is made if it is not there; its stale ones go."""
+    """Replace or add entries of a file, which is made if needed; its stale ones go."""
     records = read_calibration(path, stale=True) if Path(path).exists() else {}
     records |= {record.task: record for record in new_records}
     ordered = sorted(records.values(), key=lambda record: record.task.name)
@@ -223,13 +210,10 @@ def update(path: str | Path, new_records: Sequence[CalibrationRecord]) -> None:
 def check_current(
     records: Mapping[ControlTask, CalibrationRecord], path: str | Path = FILE
 ) -> None:
-    """ValueError, with the contest, where the uncontrolled car no longer costs what it did."""
+    """Raise ValueError for a task in which the uncontrolled car no longer costs what it did."""
     for task, record in records.items():
-        control_entry, seeds = (
-            ControlEntry(task, "", "none"),
-            [episode.seed for episode in record.episodes],
-        )
-        now = measure([control_entry], seeds, jobs=1).outcomes[control_entry]
+        entry, seeds = ControlEntry(task, "", "none"), [one.seed for one in record.episodes]
+        now = measure([entry], seeds, jobs=1).outcomes[entry]
         then = np.array([episode.costs["none"] for episode in record.episodes])
         if now.error or not np.allclose(now.costs, then, rtol=_SAME, atol=0.0):
             raise ValueError(
@@ -243,25 +227,17 @@ def measure_calibrated(
     control_entries: Sequence[ControlEntry],
     **options: Any,
 ) -> Results:
-    """The cells of calibrated contests on the clairvoyant's seeds; options: of `measure`."""
-    seeds = {
-        task: [episode.seed for episode in record.episodes] for task, record in records.items()
-    }
-    task_entries = [
-        control_entry
-        for task in records
-        for control_entry in control_entries
-        if control_entry.task == task
-    ]
-    return measure(
-        task_entries, seeds.__getitem__, title="control, the clairvoyant's seeds", **options
-    )
+    """Drive the entries of calibrated tasks on the clairvoyant's seeds; options: of `measure`."""
+    seeds = {task: [one.seed for one in record.episodes] for task, record in records.items()}
+    selected = [entry for task in records for entry in control_entries if entry.task == task]
+    title = "control, the clairvoyant's seeds"
+    return measure(selected, seeds.__getitem__, title=title, **options)
 
 
 def compute_regrets(
     records: Mapping[ControlTask, CalibrationRecord], results: Results
 ) -> dict[ControlEntry, Array]:
-    """(n,) log(J / J_clairvoyant) of each cell on the seeds that it survives."""
+    """Compute log(J / J_clairvoyant), shape (n,), of each entry on the seeds that it survives."""
     regrets = {}
     for entry, result in results.outcomes.items():
         if not result.error and survival_mask(result).any():

@@ -1,6 +1,6 @@
-"""The matrix: contests, estimators, controllers, and the cells they make.
+"""Entries of the control benchmark: a task, an estimator and a controller with their options.
 
-A cell's cars: the vector env with its estimator, and the controller that drives them all.
+They make the vector env with its estimator, the agent that drives it, and time a decision.
 """
 
 import time
@@ -50,33 +50,25 @@ from .tasks import (
 
 TRUTH, REFERENCE_CONTROLLER = "truth", "lqr"
 REFERENCE_FILTER = "exact-kf, all sensors"
+_BOTH: dict[str, Any] = {"slow": ["camera", "gps"]}
 SETUPS: dict[str, tuple[str, dict[str, Any]]] = {
-    REFERENCE_FILTER: ("exact-kf", {"slow": ["camera", "gps"]}),
-    "exact-kf, no bias states": (
-        "exact-kf",
-        {"slow": ["camera", "gps"], "bias_sd": 0.0, "accel_bias_sd": 0.0},
-    ),
-    "exact-kf, no accelerometer": ("exact-kf", {"slow": ["camera", "gps"], "fast": ["gyro"]}),
+    REFERENCE_FILTER: ("exact-kf", _BOTH),
+    "exact-kf, no bias states": ("exact-kf", _BOTH | {"bias_sd": 0.0, "accel_bias_sd": 0.0}),
+    "exact-kf, no accelerometer": ("exact-kf", _BOTH | {"fast": ["gyro"]}),
     "exact-kf, camera": ("exact-kf", {"slow": ["camera"]}),
     "exact-kf, gps": ("exact-kf", {"slow": ["gps"]}),
-    "multirate-kf, camera and gps": ("multirate-kf", {"slow": ["camera", "gps"]}),
-    "joint": ("joint", {"slow": ["camera", "gps"]}),
-    "joint, friction": ("joint", {"slow": ["camera", "gps"], "inverse_friction_sd": 0.3}),
-    "learned-joint": ("learned-joint", {"slow": ["camera", "gps"]}),
+    "multirate-kf, camera and gps": ("multirate-kf", _BOTH),
+    "joint": ("joint", _BOTH),
+    "joint, friction": ("joint", _BOTH | {"inverse_friction_sd": 0.3}),
+    "learned-joint": ("learned-joint", _BOTH),
 }
-"""Filters by what they are called in the tables: a name of `make_estimator` and its options, over
-the contestant's tuned ones where the filter is `exact-kf`."""
+"""Filters by name in the tables: a name of `make_estimator`, and options over the tuned ones."""
 ADAPTIVE = {"joint": "adaptive-lqr", "joint, friction": "adaptive-nmpc"}
-"""By the filter whose tyres they follow."""
-CORRECTED = ("learned-joint", "adaptive-nmpc")
-"""The same controller on that filter with a network behind it."""
+"""Adaptive controllers by the filter whose tyres they follow."""
+_CORRECTED = ("learned-joint", "adaptive-nmpc")  # on a filter with a network behind it
 ESTIMATORS = (
-    *(name for name in SETUPS if name != CORRECTED[0]),
-    "single-rate-kf",
-    "uneven-delay-kf",
-    "dakf",
-    "bicycle-kf",
-    TRUTH,
+    *(name for name in SETUPS if name != _CORRECTED[0]),
+    *("single-rate-kf", "uneven-delay-kf", "dakf", "bicycle-kf", TRUTH),
 )
 CONTROLLERS: dict[str, tuple[str, ...]] = {
     YAW: ("two-dof", "esc", "sliding-mode", "mpc", "nmpc"),
@@ -99,42 +91,43 @@ LEARNED: dict[str, tuple[tuple[str, str], ...]] = {
         ("", "raw-coms-yaw"),
     ),
 }
-"""(estimator, policy), first the one of which verdicts speak, by the class of contests that the
-policy was trained on, by its shipped name or path."""
-SHARED = {
+"""Pairs of estimator and policy by the class of its tasks; verdicts speak of the first."""
+_SHARED = {
     ORACLES[PARAMETERS][0]: ("adaptive-lqr", {"grip", "steer_weight"}),
     ORACLES[PARAMETERS][1]: ("adaptive-nmpc", {"horizon", "grip", "steer_weight"}),
     ORACLES[STATE][1]: ("adaptive-nmpc", {"horizon", "steer_weight"}),
 }
-"""By who is not tuned: from whom, closest in what it knows, it takes over what of the controller;
-its filter's levels are the scenario's."""
-SLOW_CONTROLLERS = ("mpc", "nmpc", "adaptive-nmpc", ORACLES[STATE][1], ORACLES[PARAMETERS][1])
+"""Untuned controllers: the one, closest in knowledge, from which they take which options; their
+filters' levels are the scenario's."""
+_SLOW_CONTROLLERS = ("mpc", "nmpc", "adaptive-nmpc", ORACLES[STATE][1], ORACLES[PARAMETERS][1])
 
 EPISODES, QUICK_EPISODES, SLOW_EPISODES = 256, 8, 64
-QUICK_CONTESTS = 2
-"""Of each tier, in a quick run."""
+_QUICK_TASKS = 2  # of each tier, in a quick run
 
 
 def select_quick_tasks(tasks: Sequence[ControlTask]) -> list[ControlTask]:
-    """`QUICK_CONTESTS` of each tier, from its first to its last."""
+    """`_QUICK_TASKS` of each tier, from its first to its last."""
     selected = []
     for tier in dict.fromkeys(task.tier for task in tasks):
         tier_tasks = [task for task in tasks if task.tier == tier]
-        step = max(len(tier_tasks) / QUICK_CONTESTS, 1.0)
-        selected += [tier_tasks[int(i * step)] for i in range(min(QUICK_CONTESTS, len(tier_tasks)))]
+        step = max(len(tier_tasks) / _QUICK_TASKS, 1.0)
+        selected += [tier_tasks[int(i * step)] for i in range(min(_QUICK_TASKS, len(tier_tasks)))]
     return selected
 
 
 @dataclass(frozen=True)
 class ControlEntry:
-    """One square of the matrix.
+    """An estimator and a controller in a task. Entries are equal whatever the last three are.
 
-    estimator: a name of `SETUPS` or of `make_estimator`, "truth", or "" where the controller reads
-    none or brings its own. controller: a name of `make_agent`, or a rung. options: of the env
-    beside the contest's, a scenario that has no name among them; tuned: options of filter and
-    controller instead of the best known; objects: a user's own instead of what the names mean, an
-    agent, or a factory of one, as "controller", a filter's factory as "estimator". Cells are equal
-    whatever these three are.
+    Attributes:
+        task: Task to drive.
+        estimator: Name in `SETUPS` or of `make_estimator`, "truth", or "" where the controller
+            reads none or brings its own.
+        controller: Name of `make_agent`, or a baseline.
+        options: Options of the env beside the task's, with a scenario that has no name.
+        tuned: Options of filter and controller instead of the best known.
+        objects: A user's objects instead of what the names mean: an agent or its factory as
+            "controller", a filter's factory as "estimator".
     """
 
     task: ControlTask
@@ -153,17 +146,18 @@ class ControlEntry:
 
     @property
     def best(self) -> Options:
-        """The options of its filter and its controller: `get_tuned_options`, or those of
-        `agents.get_tuned_options`, where the reference controller, `nominal`'s design on any
-        filter, has the rung's, a user's own the rung's filter, and one that was not tuned what it
-        shares with the rung."""
+        """Options of filter and controller: `tuned`, or those of `agents.get_tuned_options`.
+
+        The reference controller has nominal's, a user's own nominal's filter, and one that was not
+        tuned what it shares with a baseline.
+        """
         if self.tuned is not None:
             return self.tuned
         if self.is_users:
             return get_tuned_options(self.task.kind, NOMINAL) | {"controller": {}}
         kind, name = self.task.kind, self.oracle or self.controller
-        if name in SHARED and not any(get_tuned_options(kind, name).values()):
-            source, numbers = SHARED[name]
+        if name in _SHARED and not any(get_tuned_options(kind, name).values()):
+            source, numbers = _SHARED[name]
             best = get_tuned_options(kind, source)["controller"]
             return {"filter": {}, "controller": {key: best[key] for key in numbers & best.keys()}}
         return get_tuned_options(kind, NOMINAL if name == REFERENCE_CONTROLLER else name)
@@ -175,15 +169,14 @@ class ControlEntry:
 
     @property
     def env_options(self) -> dict[str, Any]:
-        """Options of the env: an action that is none ends the episode, and a policy sees what its
-        training saw."""
+        """Options of the env; bad actions end the episode, a policy sees what its training saw."""
         card = load_policy(self.controller).card.env_options if is_policy(self.controller) else {}
         observed = {name: card[name] for name in OBSERVATION_OPTIONS if name in card}
         return self.task.env_options | {"on_bad_action": "fail"} | observed | self.options
 
     @property
     def oracle(self) -> str:
-        """The rung of the ladder that drives, "" where a contestant does."""
+        """The baseline that drives, "" where a contestant does."""
         if self.is_users:
             return ""
         if self.controller in ORACLES:
@@ -193,37 +186,34 @@ class ControlEntry:
     @property
     def slow(self) -> bool:
         """Whether it takes so long to decide that it gets fewer episodes."""
-        return (self.oracle or self.controller) in SLOW_CONTROLLERS
+        return (self.oracle or self.controller) in _SLOW_CONTROLLERS
 
 
 def make_entries(tasks: Sequence[ControlTask], quick: bool = False) -> Iterator[ControlEntry]:
-    """Every cell of the matrix, contest by contest; quick: without the slow contestants.
+    """Make every entry, task by task; quick: without the slow contestants.
 
-    All estimators in the contests with the first of their tier's ids.
+    All estimators drive in the tasks with the first of their tier's ids.
     """
     for task in tasks:
         entries = [ControlEntry(task, "", oracle) for oracle in (*ORACLE_NAMES, "none")]
         first = task.tier not in TIERS or task.env_id == TIERS[task.tier][0][0]
         filters = ESTIMATORS if first else (REFERENCE_FILTER, TRUTH)
         entries += [ControlEntry(task, name, REFERENCE_CONTROLLER) for name in filters]
-        entries += [
-            ControlEntry(task, REFERENCE_FILTER, controller)
-            for controller in CONTROLLERS[task.env_id]
-        ]
-        entries += [ControlEntry(task, *pair) for pair in (*ADAPTIVE.items(), CORRECTED)]
+        entries += [ControlEntry(task, REFERENCE_FILTER, name) for name in CONTROLLERS[task.env_id]]
+        entries += [ControlEntry(task, *pair) for pair in (*ADAPTIVE.items(), _CORRECTED)]
         if task.tier:
             entries += [ControlEntry(task, *pair) for pair in LEARNED.get(task.kind, ())]
         yield from (entry for entry in entries if not (quick and entry.slow and not entry.oracle))
 
 
-STEPS = 200  # of a decision's time
+_STEPS = 200  # of a decision's time
 
 _PUSHES = ("force_sd", "moment_sd")
 _DISTURBANCES = {"forces": ("F_d", "N_d"), "walk": ("d1", "d2"), "walk-all": ("d1", "d2")}
 
 
 def list_outputs(estimator: str) -> tuple[str, ...]:
-    """The estimates that controllers read: beta, gamma, and disturbances if there are any."""
+    """List the estimates that controllers read: beta, gamma, and disturbances if there are any."""
     name = get_filter_name(estimator)
     base = name.removeprefix("learned-")
     row = FILTERS.get(base)  # a user's own has none
@@ -235,12 +225,12 @@ def list_outputs(estimator: str) -> tuple[str, ...]:
 
 
 def get_filter_name(estimator: str) -> str:
-    """The name of `make_estimator` of a cell's estimator."""
+    """Return the name of `make_estimator` of an entry's estimator."""
     return SETUPS.get(estimator, (estimator, {}))[0]
 
 
 def make_estimate_options(entry: ControlEntry) -> dict[str, Any]:
-    """Options of `EstimateObservation` for a cell; a policy gets the estimate it was trained on."""
+    """Make options of `EstimateObservation`; a policy gets the estimate it was trained on."""
     if is_policy(entry.controller):
         card = load_policy(entry.controller).card
         if card.estimator == entry.estimator:
@@ -249,7 +239,8 @@ def make_estimate_options(entry: ControlEntry) -> dict[str, Any]:
     if entry.estimator in SETUPS:
         name, options = SETUPS[entry.estimator]
         if entry.estimator == REFERENCE_FILTER:
-            options = options | {"slow": list_slow_sensors(entry.task.env_id)}
+            sensors = gym.spec(entry.task.env_id).kwargs["sensors"]
+            options = options | {"slow": list(SENSOR_SETS[sensors])}
         if name in (FILTER, TYRE_FILTER):
             levels = make_noise_options(make_scenario(entry.env_options["scenario"]))
             # where nothing pushes, the filter's own level
@@ -264,13 +255,8 @@ def make_estimate_options(entry: ControlEntry) -> dict[str, Any]:
     return settings
 
 
-def list_slow_sensors(env_id: str) -> list[str]:
-    """The names of an id's slow sensors."""
-    return list(SENSOR_SETS[gym.spec(env_id).kwargs["sensors"]])
-
-
 class CheckedAgent:
-    """A user's agent, whose `predict` is to return actions (rows, width) and a state.
+    """A user's agent, whose `predict` is to return actions, shape (rows, width), and a state.
 
     Raises TypeError or ValueError with what came instead; NaN is the env's to judge.
     """
@@ -279,13 +265,10 @@ class CheckedAgent:
         self.agent, self.shape = agent, (rows, width)
 
     def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
+        self, observation: Any, state: Any = None, episode_start: Any = None,
         deterministic: bool = True,
-    ) -> tuple[Any, Any]:
-        """What the agent's returns."""
+    ) -> tuple[Any, Any]:  # fmt: skip
+        """Return what the agent does, checked."""
         result = self.agent.predict(observation, state, episode_start, deterministic=deterministic)
         if not (isinstance(result, tuple) and len(result) == 2):
             raise TypeError(f"predict returns (action, state), got {short_repr(result)}")
@@ -299,7 +282,7 @@ class CheckedAgent:
 
 
 def make_cars(entry: ControlEntry, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
-    """(vector env of `cars` rows with the cell's estimator, its agent), both as they are tuned."""
+    """Make the vector env of `cars` rows with the entry's estimator, and its agent, both tuned."""
     task, options = entry.task, entry.env_options
     if entry.oracle:
         return make_oracle(entry.oracle, task.env_id, cars, options=entry.best, **options)
@@ -309,16 +292,15 @@ def make_cars(entry: ControlEntry, cars: int) -> tuple[VectorEnv[Any, Any, Any],
     elif entry.estimator:
         source = entry.objects.get("estimator", get_filter_name(entry.estimator))
         env = call_quietly(EstimateObservation, env, source, **make_estimate_options(entry))
-    agent = make_agent(
-        entry.objects.get("controller", entry.controller), env, **make_agent_options(entry)
-    )
+    controller = entry.objects.get("controller", entry.controller)
+    agent = make_agent(controller, env, **make_agent_options(entry))
     if entry.is_users:
         return env, CheckedAgent(agent, cars, env.single_action_space.shape[0])
     return env, agent
 
 
 def make_agent_options(entry: ControlEntry) -> dict[str, Any]:
-    """Options of `make_agent` for a cell."""
+    """Make the options of `make_agent` for an entry."""
     options: dict[str, Any] = {}
     if entry.controller == "model-following":
         options["rejection"] = entry.estimator == "dakf"
@@ -343,22 +325,18 @@ class _TimedFunction:
 
 
 def measure_decision_time(entry: ControlEntry) -> float:
-    """us (wall) a decision of one car: predict, and what the estimator adds to an env-step.
+    """Measure the wall time of a decision of one car (us): predict, and the estimator's part.
 
-    Medians over STEPS steps of an episode, the bare env stepped side by side.
+    Medians over _STEPS steps of an episode, the bare env stepped side by side.
     """
     cars: tuple[Any, Any] = make_cars(entry, 1)
     env, agent = cars
     bare: Any = gym.make_vec(entry.task.env_id, num_envs=1, **entry.env_options)
     bare.reset(seed=0)
-    agent.predict, env.step, without = (
-        _TimedFunction(agent.predict),
-        _TimedFunction(env.step),
-        _TimedFunction(bare.step),
-    )
-    for step in islice(iterate_steps(env, agent, 0), 1, STEPS + 1):
+    agent.predict, env.step = _TimedFunction(agent.predict), _TimedFunction(env.step)
+    without = _TimedFunction(bare.step)
+    for step in islice(iterate_steps(env, agent, 0), 1, _STEPS + 1):
         without(np.zeros_like(step.action))
-    predict, with_estimator, without_estimator = (
-        np.median(f.seconds) for f in (agent.predict, env.step, without)
-    )
+    timers = (agent.predict, env.step, without)
+    predict, with_estimator, without_estimator = (np.median(f.seconds) for f in timers)
     return 1e6 * float(predict + max(with_estimator - without_estimator, 0.0))

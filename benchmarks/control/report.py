@@ -1,9 +1,11 @@
-"""The matrix's verdict: the best controller, the best estimator, and why.
+"""The verdict of the control benchmark, and its figures, tracks and side-by-side views.
 
-The matrix's figures: a picture for each question, heat maps, any two cells side by side.
+`_Gains` are log ratios of nominal's cost over an entry's, by task; `foresight` everywhere is
+log(J_oracle-state / J_clairvoyant) of the calibrated tasks, shape (n,) each.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import product
 from typing import Any, TypeVar
 
 import numpy as np
@@ -43,8 +45,7 @@ from .tasks import NOMINAL, PARAMETERS, TITLES, ControlTask
 
 _POLICIES = {pair for pairs in LEARNED.values() for pair in pairs}
 
-Gains = dict[ControlTask, Array]
-"""r of a contestant's episodes in the contests that count."""
+_Gains = dict[ControlTask, Array]
 Driven = TypeVar("Driven", bound=Collection[Any])
 
 
@@ -53,10 +54,7 @@ def compose_verdict(
     prices: Sequence[DelayCost] = (),
     foresight: Mapping[ControlTask, Array] | None = None,
 ) -> str:
-    """The verdict over all tiers: the best controller, the best estimator, and why.
-
-    foresight: (n,) log(J_oracle-state / J_clairvoyant) of calibrated contests.
-    """
+    """Compose the verdict over all tiers: the best controller, the best estimator, and why."""
     filters, drivers = _group_estimators(by_tier), _group_controllers(by_tier)
     others, none = select_complete(drivers), drivers.get("none", {})
     best = find_best_controller(by_tier)
@@ -73,8 +71,8 @@ def compose_verdict(
     )
 
 
-def compute_relative_costs(standings: Mapping[str, Sequence[Standing]]) -> dict[str, Estimate]:
-    """The cost over nominal's in % of who drives everywhere, the best first."""
+def _compute_relative_costs(standings: Mapping[str, Sequence[Standing]]) -> dict[str, Estimate]:
+    """Cost over nominal's (%) of who drives everywhere, the best first."""
     drivers = select_complete(_group_controllers(standings))
     logs = {name: [-r for r in drivers[name].values()] for name in _rank_entries(drivers)}
     return {
@@ -84,34 +82,33 @@ def compute_relative_costs(standings: Mapping[str, Sequence[Standing]]) -> dict[
 
 
 def is_default_filter(controller: str, estimator: str) -> bool:
-    """Whether that is the filter on which a controller is compared with others: the reference,
-    none, the one whose tyres it follows, or a policy's own."""
+    """Whether a controller is compared on it: the reference, none, or its own filter."""
     follows = ADAPTIVE.get(estimator) == controller
     return estimator in ("", REFERENCE_FILTER) or follows or (estimator, controller) in _POLICIES
 
 
 def find_best_controller(by_tier: Mapping[str, Sequence[Standing]]) -> str:
-    """Who leads over all tiers of those who drive everywhere, "" where nobody has a score."""
+    """Find who leads over all tiers of those who drive everywhere; "" where nobody has a score."""
     return next(iter(_rank_entries(select_complete(_group_controllers(by_tier)))), "")
 
 
 def select_complete(by_name: Mapping[str, Driven]) -> dict[str, Driven]:
-    """Who drives every contest that anybody drives: who drives a part is not the best over all.
+    """Select who drives every task that anybody drives: only they can be the best over all.
 
-    by_name: by name, the contests or what is known of each.
+    by_name: Tasks, or a mapping of them, by name.
     """
     all_tasks = {task for tasks in by_name.values() for task in tasks}
     return {name: tasks for name, tasks in by_name.items() if set(tasks) == all_tasks}
 
 
-def _group_estimators(by_tier: Mapping[str, Sequence[Standing]]) -> dict[str, Gains]:
-    """What each estimator under the reference controller gains, the truth left out."""
+def _group_estimators(by_tier: Mapping[str, Sequence[Standing]]) -> dict[str, _Gains]:
+    """_Gains of each estimator under the reference controller, the truth left out."""
     return _collect_gains(by_tier, "estimator", lambda entry: (
         entry.controller == REFERENCE_CONTROLLER and entry.estimator != TRUTH))  # fmt: skip
 
 
-def _group_controllers(by_tier: Mapping[str, Sequence[Standing]]) -> dict[str, Gains]:
-    """What each controller gains on its own filter, the rungs left out."""
+def _group_controllers(by_tier: Mapping[str, Sequence[Standing]]) -> dict[str, _Gains]:
+    """_Gains of each controller on its own filter, the baselines left out."""
     return _collect_gains(by_tier, "controller", lambda entry: (
         entry.controller not in ORACLE_NAMES and is_default_filter(entry.controller,
                                                                    entry.estimator)))  # fmt: skip
@@ -119,8 +116,8 @@ def _group_controllers(by_tier: Mapping[str, Sequence[Standing]]) -> dict[str, G
 
 def _collect_gains(
     by_tier: Mapping[str, Sequence[Standing]], attribute: str, among: Callable[[ControlEntry], bool]
-) -> dict[str, Gains]:
-    by_name: dict[str, Gains] = {}
+) -> dict[str, _Gains]:
+    by_name: dict[str, _Gains] = {}
     for item in (item for standings in by_tier.values() for item in standings if among(item.entry)):
         name = getattr(item.entry, attribute).replace(", ", " with ")  # in a list of names
         gains = by_name.setdefault(name, {})
@@ -128,22 +125,17 @@ def _collect_gains(
     return {name: item for name, item in by_name.items() if item}
 
 
-def _compute_cost_ratio(one: Gains, other: Gains) -> Estimate:
-    """One's cost over the other's on the contests and seeds of both; NaN where there are none."""
+def _compute_cost_ratio(one: _Gains, other: _Gains) -> Estimate:
+    """Cost ratio of two on the tasks and seeds of both; NaN where there are none."""
     both = [(r, other[task]) for task, r in one.items() if task in other]
     return geometric_mean(*(b[: len(a)] - a[: len(b)] for a, b in both))
 
 
-def _rank_entries(by_name: Mapping[str, Gains]) -> dict[str, dict[str, Estimate]]:
-    """Each one's cost over its rivals', the best first: who costs more than the fewest, of these
-    who costs least of nominal's. Rivals that share no contest are left out, the closest first."""
+def _rank_entries(by_name: Mapping[str, _Gains]) -> dict[str, dict[str, Estimate]]:
+    """Cost ratios over rivals by name; the best, with the fewest cheaper rivals, is first."""
     ratios = {
-        name: {
-            other: _compute_cost_ratio(gains, rival_gains)
-            for other, rival_gains in by_name.items()
-            if other != name
-        }
-        for name, gains in by_name.items()
+        name: {rival: _compute_cost_ratio(x, by_name[rival]) for rival in by_name if rival != name}
+        for name, x in by_name.items()
     }
     beaten = {name: sum(ratio.value > 1.0 for ratio in ratios[name].values()) for name in by_name}
     gained = {name: np.mean([r.mean() for r in gains.values()]) for name, gains in by_name.items()}
@@ -157,30 +149,21 @@ def _rank_entries(by_name: Mapping[str, Gains]) -> dict[str, dict[str, Estimate]
     }  # fmt: skip
 
 
-def _describe_first(by_name: Mapping[str, Gains]) -> str:
-    """Who leads, and by how much."""
+def _describe_first(by_name: Mapping[str, _Gains]) -> str:
+    """Clause on who leads, and by how much."""
     ranked = _rank_entries(by_name)
     return describe_leader(*next(iter(ranked.items())), "cost") if ranked else "nobody has a score"
 
 
 def _describe_exceptions(by_tier: Mapping[str, Sequence[Standing]]) -> str:
-    """The tiers in which somebody else surely leads, and who does where he drives a part."""
+    """The tiers in which another surely leads, and who does so on a part of the tasks."""
     parts = []
     for tier, standings in by_tier.items():
-        for collect in (
-            _group_estimators,
-            lambda tiers: select_complete(_group_controllers(tiers)),
-        ):
-            overall, tier_ranking = (
-                _rank_entries(collect(by_tier)),
-                _rank_entries(collect({tier: standings})),
-            )
-            first, best = (next(iter(ranking), "") for ranking in (overall, tier_ranking))
-            if (
-                best != first
-                and first in tier_ranking.get(best, {})
-                and tier_ranking[best][first].high < 1.0
-            ):
+        for collect in (_group_estimators, lambda by: select_complete(_group_controllers(by))):
+            overall, in_tier = (_rank_entries(collect(x)) for x in (by_tier, {tier: standings}))
+            first, best = next(iter(overall), ""), next(iter(in_tier), "")
+            rivals = in_tier.get(best, {})
+            if best != first and first in rivals and rivals[first].high < 1.0:
                 parts.append(f"{best} in tier {tier}")
     drivers, overall_best = _group_controllers(by_tier), find_best_controller(by_tier)
     parted = drivers.keys() - select_complete(drivers).keys() if overall_best else ()
@@ -196,14 +179,10 @@ def _describe_reasons(
     prices: Sequence[DelayCost],
     foresight: Mapping[ControlTask, Array],
 ) -> str:
-    """What the rungs save: the price of the model, of sensing, of foresight and of delay."""
+    """Sentence on what the baselines save by their knowledge, and on the cost of delay."""
     all_standings = [standing for standings in by_tier.values() for standing in standings]
-    parameter_pairs = [
-        r
-        for standing in all_standings
-        if standing.entry.controller == PARAMETERS
-        for r in standing.pairs.values()
-    ]
+    knowing = [item for item in all_standings if item.entry.controller == PARAMETERS]
+    parameter_pairs = [pair for item in knowing for pair in item.pairs.values()]
     steps = (
         ("the true car and road", [r for r, _ in parameter_pairs]),
         ("its exact motion", [oracle_gain - r for r, oracle_gain in parameter_pairs]),
@@ -241,15 +220,9 @@ def add_figures(
     prices: Sequence[DelayCost],
     foresight: Mapping[ControlTask, Array],
 ) -> None:
-    """Add the figures to a suite that has its verdict; without plotly only the tracks.
-
-    foresight: (n,) log(J_oracle-state / J_clairvoyant) of calibrated contests.
-    """
-    series = {
-        entry: result.series
-        for entry, result in results.outcomes.items()
-        if result.series is not None
-    }
+    """Add the figures to a suite that has its verdict; without plotly only the tracks."""
+    outcomes = results.outcomes.items()
+    series = {entry: drive.series for entry, drive in outcomes if drive.series is not None}
     best = find_best_controller(by_tier)
     suite.files += _make_tracks(series, best)
     try:
@@ -257,7 +230,7 @@ def add_figures(
     except ModuleNotFoundError:
         return
     questions = (
-        ("Which controller holds the car?", {"All contests": compute_relative_costs(by_tier)}),
+        ("Which controller holds the car?", {"All contests": _compute_relative_costs(by_tier)}),
         ("Which controller holds it in each tier?", _group_costs(by_tier, _controller)),
         ("Which estimator does a controller drive best with?", _group_costs(by_tier, _estimator)),
         ("What would knowing more save?", _group_oracles(by_tier, foresight)),
@@ -271,10 +244,8 @@ def add_figures(
     if shown:
         ms, label = 1e3 * np.array(DELAYS), "cost / nominal's with sensors in time"
         figure = draw_curves(ms, shown, "further delay of camera and GPS / ms", label)
-        text = (
-            f"{DELAY_TASK.name}: camera every 50 ms, GPS every 200 ms; each filter is designed "
-            "for its delay."
-        )
+        text = f"{DELAY_TASK.name}: camera every 50 ms, GPS every 200 ms; "
+        text += "each filter is designed for its delay."
         suite.answers.append(("What does late sensing cost?", figure, text))
     suite.explorers.append(_make_explorer(series, best))
     for tier, standings in by_tier.items():
@@ -284,15 +255,14 @@ def add_figures(
 def _group_costs(
     by_tier: Mapping[str, Sequence[Standing]], name: Any
 ) -> dict[str, dict[str, Estimate]]:
-    """By tier, the cost over nominal's in %, the best first; name: of a cell, "" leaves it out."""
+    """Cost over nominal's (%) by tier, the best first; name: of an entry, "" leaves it out."""
     groups = {}
     for tier, standings in by_tier.items():
+        shown = [item for item in standings if "cost_vs_nominal" in item.overall]
         costs = {
-            name(standing.entry): Estimate(
-                *(100.0 * n for n in standing.overall["cost_vs_nominal"])
-            )
-            for standing in standings
-            if name(standing.entry) and "cost_vs_nominal" in standing.overall
+            name(item.entry): Estimate(*(100.0 * n for n in item.overall["cost_vs_nominal"]))
+            for item in shown
+            if name(item.entry)
         }
         title = f"Tier {tier}: {TITLES[tier]}"
         groups[title] = dict(sorted(costs.items(), key=lambda pair: pair[1].value))
@@ -311,9 +281,9 @@ def _controller(cell: ControlEntry) -> str:
 def _group_oracles(
     by_tier: Mapping[str, Sequence[Standing]], foresight: Mapping[ControlTask, Array]
 ) -> dict[str, dict[str, Estimate]]:
-    groups = _group_costs(
-        by_tier, lambda entry: entry.controller if entry.controller in ORACLE_NAMES else ""
-    )
+    """Cost over nominal's (%) of the baselines by tier, the clairvoyant's from oracle-state's."""
+    names = ORACLE_NAMES
+    groups = _group_costs(by_tier, lambda x: x.controller if x.controller in names else "")
     for tier in by_tier:
         title = f"Tier {tier}: {TITLES[tier]}"
         logs = [value for task, value in foresight.items() if task.tier == tier]
@@ -335,10 +305,9 @@ def _draw_maps(tier: str, standings: Sequence[Standing]) -> list[tuple[str, Any,
         ("failure_rate", "low", "The share of episodes in which the car spun or left the road."),
     ):
         values = np.full((len(standings), len(tasks)), np.nan)
-        for i, standing in enumerate(standings):
-            for j, task in enumerate(tasks):
-                if metric in standing.by_task.get(task, {}):
-                    values[i, j] = standing.by_task[task][metric].value
+        for (i, standing), (j, task) in product(enumerate(standings), enumerate(tasks)):
+            if metric in standing.by_task.get(task, {}):
+                values[i, j] = standing.by_task[task][metric].value
         if np.isfinite(values).any():
             title = f"Tier {tier}: {metric.replace('_', ' ')} in every contest"
             columns = [task.name for task in tasks]
@@ -347,7 +316,7 @@ def _draw_maps(tier: str, standings: Sequence[Standing]) -> list[tuple[str, Any,
 
 
 def _make_tracks(series: Mapping[ControlEntry, Array], best: str) -> list[tuple[str, str, str]]:
-    """The tracks of the first and the last contest, for a map: no control and the best one."""
+    """Tracks of the first and the last task for a map (KML): no control and the best controller."""
     tasks = list(dict.fromkeys(entry.task for entry in series))
     files = []
     for task in dict.fromkeys(tasks[:1] + tasks[-1:]):
@@ -364,7 +333,7 @@ def _make_tracks(series: Mapping[ControlEntry, Array], best: str) -> list[tuple[
 
 
 def _make_explorer(series: Mapping[ControlEntry, Array], best: str) -> Explorer:
-    """Every cell's first test seed; at first no control and the best controller."""
+    """Every entry's first test seed; at first no control and the best controller."""
     labels = (
         c.label for c in series if c.controller == best and is_default_filter(best, c.estimator)
     )
@@ -387,9 +356,17 @@ def make_time_explorer(
     best: str = "",
     bodies: Mapping[tuple[str, ...], tuple[float, float]] | None = None,
 ) -> Explorer:
-    """Episodes of which two are shown beside each other, at first `none` and the best.
+    """Make a view of two episodes beside each other, at first `none` and the best.
 
-    series: key (one name a menu, and the contestant) to what `Driven` keeps of one.
+    Args:
+        title: Title of the figure.
+        menus: Label of each part of a key but the entry's name.
+        series: Time and SIGNALS, shape (k, 1 + SIGNALS), by key.
+        best: Name of the entry beside `none`.
+        bodies: Length and width of the car (m) by the key without the entry's name.
+
+    Returns:
+        Figure with menus.
     """
     cells = {}
     for key, values in series.items():
@@ -403,12 +380,12 @@ def make_time_explorer(
 
 
 def run_entry(entry: ControlEntry, seed: int) -> Rollout:
-    """One episode of a contestant in a single env."""
+    """Run one episode of an entry in a single env."""
     return rollout(*make_env_and_agent(entry), seed)
 
 
 def make_env_and_agent(entry: ControlEntry) -> tuple[Any, Any]:
-    """A single env with its filter, and the contestant that drives it."""
+    """Make a single env with its filter, and the agent that drives it."""
     estimate = make_estimate_options(entry) if entry.estimator else None
     name = get_filter_name(entry.estimator)
     env = make_env(entry.task.env_id, name, estimate, **entry.env_options)

@@ -1,6 +1,7 @@
-"""The episodes of a cell: all seeds at once, reduced to a few numbers an episode.
+"""Episodes of the control benchmark: driven, reduced to metrics, and kept as finished cases.
 
-All cells driven: the episodes of each, and finished cases on disk.
+A chunk drives all its seeds at once in a vector env. A folder keeps finished chunks, by a hash of
+everything that their numbers depend on.
 """
 
 import contextlib
@@ -41,7 +42,7 @@ SIGNALS = (*_INFO[1:], *_PLACE)
 
 @dataclass(frozen=True)
 class Chunk:
-    """A case: some seeds of a cell. keep: whether it returns the first seed's time series."""
+    """Some seeds of an entry; keep: whether the first seed's time series is returned."""
 
     entry: ControlEntry
     seeds: tuple[int, ...]
@@ -50,28 +51,24 @@ class Chunk:
 
 @dataclass
 class DriveResult:
-    """Episodes of a cell in the order of their seeds.
+    """Episodes of an entry in the order of their seeds."""
 
-    numbers: (seeds, NUMBERS). seconds: of CPU time. series: (k, 1 + SIGNALS) with the time first,
-    of the first seed. error: why the cell could not be driven; its numbers are NaN.
-    """
-
-    numbers: Array
-    seconds: float
-    series: Array | None = None
-    error: str = ""
+    numbers: Array  # metrics, shape (seeds, NUMBERS); NaN where the entry was not driven
+    seconds: float  # CPU time (s)
+    series: Array | None = None  # time and SIGNALS of the first seed, shape (k, 1 + SIGNALS)
+    error: str = ""  # why the entry could not be driven
 
     def __getitem__(self, name: str) -> Array:
-        """(seeds,) one of NUMBERS."""
+        """One of NUMBERS, shape (seeds,)."""
         return self.numbers[:, NUMBERS.index(name)]
 
     @property
     def costs(self) -> Array:
-        """(seeds,)."""
+        """Cost of each episode, shape (seeds,)."""
         return self["cost"]
 
     def mark_failures(self, cause: str) -> Array:
-        """(seeds,) 1 where an episode ended by this failure, NaN where none was driven."""
+        """Mark episodes that ended by this failure with 1, undriven ones with NaN; (seeds,)."""
         return np.where(np.isnan(self["failure"]), np.nan, self["failure"] == FAILURES.index(cause))
 
 
@@ -97,22 +94,11 @@ class _MetricAccumulator:
         self.lateral_deviation += speed * (self.turned + info["beta"] - info["beta_ref"]) * self.dt
         torques = self.base.rows[:, -1, [FAST.torque_left, FAST.torque_right]]
         power = np.abs(torques).sum(axis=1) * speed / self.radius
-        tyre_dissipation = compute_dissipation(
-            self.base.params, self.base.states, self.base.switches
-        )
-        moment = StepSample(
-            *(
-                command,
-                self.last_command,
-                step.reward,
-                info,
-                self.last,
-                self.full_scale,
-                self.dt,
-                self.lateral_deviation,
-            ),
-            *(power, tyre_dissipation),
-        )
+        base, commands = self.base, (command, self.last_command)
+        infos, scales = (info, self.last), (self.full_scale, self.dt)
+        dissipation = compute_dissipation(base.params, base.states, base.switches)
+        moves = (self.lateral_deviation, power, dissipation)
+        moment = StepSample(*commands, step.reward, *infos, *scales, *moves)
         for metric, total in zip(EPISODE, self.totals, strict=True):
             added = REDUCTIONS[metric.reduction].add(total, metric.compute(moment))
             np.copyto(total, added, where=step.running)
@@ -120,14 +106,14 @@ class _MetricAccumulator:
         self.last, self.last_command = step.info, command
 
     def numbers(self) -> Array:
-        """(cars, NUMBERS)."""
+        """Metrics of all episodes, shape (cars, NUMBERS)."""
         folds = [REDUCTIONS[metric.reduction] for metric in EPISODE]
         done = [f.finish(t, self.steps) for f, t in zip(folds, self.totals, strict=True)]
         return np.stack(done, axis=1)
 
 
 def run_chunk(chunk: Chunk) -> DriveResult:
-    """Drive one episode a seed; the reason why a cell cannot be built or driven is its `error`."""
+    """Drive one episode a seed; why an entry cannot be built or driven is its `error`."""
     try:
         return _run_chunk(chunk)
     except Exception as error:
@@ -151,14 +137,14 @@ def _run_chunk(chunk: Chunk) -> DriveResult:
 
 
 def _read_signals(env: Any, step: EpisodeStep) -> list[float]:
-    """The time and SIGNALS of the first car."""
+    """Time and SIGNALS of the first car."""
     motion = env.unwrapped.motion[0]
     place = [float(motion[Motion._fields.index(name)]) for name in _PLACE]
     return [float(step.info[name][0]) for name in _INFO] + place
 
 
 def get_control_period(entry: ControlEntry) -> float:
-    """Seconds between two decisions of a cell."""
+    """Return the time between two decisions of an entry (s)."""
     return int(entry.options.get("control_period", 10)) * TICK
 
 
@@ -169,12 +155,12 @@ _LENGTH = 24
 
 @dataclass
 class Results:
-    """Every cell's episodes."""
+    """Episodes by entry."""
 
     outcomes: dict[ControlEntry, DriveResult] = field(default_factory=dict)
 
     def select(self, task: ControlTask, controller: str, estimator: str = "") -> DriveResult:
-        """One cell; KeyError if it was not asked for."""
+        """Return one entry's episodes; KeyError if it was not asked for."""
         return self.outcomes[ControlEntry(task, estimator, controller)]
 
 
@@ -188,18 +174,26 @@ def measure(
     runner: Callable[[Chunk], DriveResult] | None = None,
     title: str = "control",
 ) -> Results:
-    """Drive every cell on its contest's seeds, slow ones on the first of them.
+    """Drive every entry on its task's seeds, slow ones on the first of them.
 
-    keep: a folder in which finished cases stay, so that a run that was stopped goes on. by: what
-    drives a chunk instead of `run_chunk`. title: of the progress bar.
+    Args:
+        entries: Entries to drive.
+        seeds: Seeds of all tasks, or a function of the task.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+        keep: Folder in which finished cases stay, so that a run that was stopped goes on.
+        runner: Function that drives a chunk instead of `run_chunk`.
+        title: Title of the progress bar.
+
+    Returns:
+        Episodes of all entries.
     """
     if not entries:
         return Results()
-    seeds_by_entry = {entry: seeds(entry.task) if callable(seeds) else seeds for entry in entries}
-    seeds_by_entry = {
-        entry: item[:SLOW_EPISODES] if entry.slow else item
-        for entry, item in seeds_by_entry.items()
-    }
+    seeds_by_entry: dict[ControlEntry, Sequence[int]] = {}
+    for entry in entries:
+        task_seeds = seeds(entry.task) if callable(seeds) else seeds
+        seeds_by_entry[entry] = task_seeds[:SLOW_EPISODES] if entry.slow else task_seeds
     chunks = [  # the first of every cell before the second of any: a stopped run has them all
         Chunk(entry, tuple(entry_seeds[first : first + CHUNK]), keep=first == 0)
         for first in range(0, max(map(len, seeds_by_entry.values())), CHUNK)
@@ -225,26 +219,26 @@ def _join_results(parts: list[DriveResult]) -> DriveResult:
 
 @dataclass(frozen=True)
 class CachedDrive:
-    """`run_chunk` that looks in a folder first and leaves its result there; None caches nothing.
+    """`run_chunk`, or another runner, behind a folder of results; None caches nothing.
 
-    runner: what drives instead. Results of other sources, plant and matrix included, or of a
-    policy's other weights, are not taken for ours.
+    Results of other sources, plant and matrix included, or of a policy's other weights, are not
+    taken.
     """
 
     folder: Path | None
     runner: Callable[[Chunk], DriveResult] | None = None
 
     def __call__(self, chunk: Chunk) -> DriveResult:
-        """The chunk's result, from the folder if it is there."""
+        """Return the chunk's result, from the folder if it is there."""
         if self.folder is None:
             return self._run_chunk(chunk)
         path = self._make_path(chunk)
-        cached = read_case(path, chunk, entire=self.runner is None)
+        cached = _read_case(path, chunk, entire=self.runner is None)
         if cached is not None:
             return cached
         result = self._run_chunk(chunk)
         if not result.error:  # an error is worth another try
-            write_case(path, result)
+            _write_case(path, result)
         return result
 
     def _run_chunk(self, chunk: Chunk) -> DriveResult:
@@ -254,29 +248,24 @@ class CachedDrive:
         assert self.folder is not None
         weights = hash_policy(chunk.entry.controller)
         source_text = "" if self.runner is None else Path(inspect.getfile(self.runner)).read_text()
-        text = json.dumps(
-            [hash_sources(), source_text, weights, chunk.entry.oracle, asdict(chunk)],
-            sort_keys=True,
-        )
+        key = [hash_sources(), source_text, weights, chunk.entry.oracle, asdict(chunk)]
+        text = json.dumps(key, sort_keys=True)
         return self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:_LENGTH]}.npz"
 
 
 @cache
 def hash_sources() -> str:
-    """A hash of all files that an episode's numbers depend on, tuned options and weights too."""
+    """Hash all files that an episode's numbers depend on, tuned options and weights too."""
     digest = hashlib.sha256((hash_experiment() + make_salt()).encode())
     for name in ("entries.py", "tasks.py", "run.py", "../harness/metrics.py"):
         digest.update((Path(__file__).parent / name).read_bytes())
     return digest.hexdigest()
 
 
-def read_case(path: Path, chunk: Chunk, entire: bool = True) -> DriveResult | None:
-    """The chunk's result; None where the file is absent, damaged or another chunk's. entire: with
-    all numbers, and the series that the chunk keeps."""
-    shapes: dict[str, tuple[int, ...]] = {
-        "numbers": (len(chunk.seeds), len(NUMBERS)),
-        "seconds": (),
-    }
+def _read_case(path: Path, chunk: Chunk, entire: bool = True) -> DriveResult | None:
+    """Read the chunk's result; None where the file is absent, damaged or another chunk's."""
+    shapes: dict[str, tuple[int, ...]] = {"numbers": (len(chunk.seeds), len(NUMBERS))}
+    shapes["seconds"] = ()
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = dict(archive)
@@ -290,12 +279,13 @@ def read_case(path: Path, chunk: Chunk, entire: bool = True) -> DriveResult | No
 
 
 def _has_shape(array: npt.NDArray[Any], shape: tuple[int, ...], entire: bool) -> bool:
+    """Whether an array has a shape and finite numbers: all if it is to be entire, else any."""
     finite = np.isfinite(array)
     is_valid = finite.all() if entire else finite.any()
     return array.dtype == np.float64 and array.shape == shape and bool(is_valid)
 
 
-def write_case(path: Path, result: DriveResult) -> None:
+def _write_case(path: Path, result: DriveResult) -> None:
     """Write a file of `read_case`; a full disk loses the file, not the run."""
     arrays: dict[str, Any] = {"numbers": result.numbers, "seconds": np.array(result.seconds)}
     if result.series is not None:

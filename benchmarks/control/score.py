@@ -1,10 +1,9 @@
 """From episode costs to scores: 0 is `nominal`, 1 is `oracle-state`, everything paired by episode.
 
-r = log((J_nominal + 0.001) / (J + 0.001)), clipped to +-3, over the episodes that both rungs
-survive; a contestant's failure there counts log(1 / 20). The score is the sum over contests of the
-mean r over that of the oracle's: a ratio of sums, so that no small gap decides.
-
-The matrix as rows for machines and tables for people.
+r = log((J_nominal + 0.001) / (J + 0.001)), clipped to +-3, over the episodes that both baselines
+survive; a failure there counts log(1 / 20). The score is the sum over tasks of the mean r over
+that of the oracle's: a ratio of sums, so that no small gap decides. Standings become rows and
+tables here.
 """
 
 import math
@@ -36,19 +35,18 @@ from .entries import ControlEntry
 from .run import DriveResult, get_control_period
 from .tasks import ControlTask
 
-MIN_GAP = 0.05
-"""A mean gap below which there is nothing to win."""
+MIN_GAP = 0.05  # mean r of the oracle, below which there is nothing to win
 _CLIP = 3.0
 FAILURE_RATIO = 20.0  # times nominal's cost, of an episode that ends by a failure
 
 
 def survival_mask(result: DriveResult) -> npt.NDArray[np.bool_]:
-    """(seeds,) whether an episode ended by no failure."""
+    """Whether each episode ended by no failure, shape (seeds,)."""
     return np.asarray(result["failure"] == 0.0)
 
 
 def compute_log_ratios(nominal: Array, result: DriveResult) -> Array:
-    """(n,) r of the first n episodes; nominal: (n,) costs of the same seeds."""
+    """Compute r of the first n episodes from nominal's costs of the same seeds, shape (n,) each."""
     n = len(nominal)
     with np.errstate(invalid="ignore"):
         r = np.log(compute_cost_ratios(nominal, result.costs[:n]))
@@ -57,7 +55,7 @@ def compute_log_ratios(nominal: Array, result: DriveResult) -> Array:
 
 @dataclass(frozen=True)
 class ScoreScale:
-    """What 0 and 1 are in a contest: the episodes of `nominal` and `oracle-state`.
+    """The scale of scores in a task: the episodes of `nominal`, 0, and of `oracle-state`, 1.
 
     Raises ValueError with the reason where one of them was not driven.
     """
@@ -71,17 +69,16 @@ class ScoreScale:
                 raise ValueError(f"{name}: {oracle.error}")
 
     def mark_compared(self, n: int) -> npt.NDArray[np.bool_]:
-        """(m,) of at most n episodes: which of them both survive."""
+        """Mark which of at most n episodes both survive, shape (m,)."""
         n = min(n, len(self.nominal.costs), len(self.oracle.costs))
         return survival_mask(self.nominal)[:n] & survival_mask(self.oracle)[:n]
 
     def compute_paired_ratios(self, result: DriveResult) -> tuple[Array, Array]:
-        """(r of a contestant, r of the oracle) on the same episodes, those that count."""
+        """Compute r of an entry and r of the oracle on the episodes that count, shape (n,) each."""
         compared = self.mark_compared(len(result.costs))
         nominal = self.nominal.costs[: len(compared)]
-        return compute_log_ratios(nominal, result)[compared], compute_log_ratios(
-            nominal, self.oracle
-        )[compared]
+        r, oracle_ratios = (compute_log_ratios(nominal, x)[compared] for x in (result, self.oracle))
+        return r, oracle_ratios
 
     @property
     def gap(self) -> float:
@@ -91,62 +88,55 @@ class ScoreScale:
 
 
 def score(pairs: Sequence[tuple[Array, Array]]) -> Estimate:
-    """The score over contests from each one's `ScoreScale.paired`, those that have no episode left
-    out; NaN where nothing is to be won."""
+    """Compute the score from each task's `compute_paired_ratios`; NaN without a gap to be won."""
     filled = [pair for pair in pairs if len(pair[0])]
     if not filled or np.mean([oracle_ratios.mean() for _, oracle_ratios in filled]) < MIN_GAP:
         return Estimate(math.nan)
     return ratio_of_sums([r for r, _ in filled], [oracle_ratios for _, oracle_ratios in filled])
 
 
-RATES = {"spin": "spin_rate", "off-road": "departure_rate"}
-_FAILED = {"not-finite": "not_finite_rate", "bad-action": "bad_action_rate"}
+_RATES = {"spin": "spin_rate", "off-road": "departure_rate", "not-finite": "not_finite_rate"}
+_RATES |= {"bad-action": "bad_action_rate"}
 _OFTEN = 0.1  # nominal's failure rate above which failures rank
 
-ScoreScales = Mapping[ControlTask, ScoreScale]
+_ScoreScales = Mapping[ControlTask, ScoreScale]
 
 
 @dataclass
 class Standing:
-    """A contestant over the contests of a tier.
+    """An entry over the tasks of a tier."""
 
-    results: of all contests that it was to drive, errors among them. yards: of the tier.
-    """
-
-    tier: str
-    entry: ControlEntry
-    results: dict[ControlTask, DriveResult]
-    scales: ScoreScales
-    us: float = float("nan")
+    tier: str  # tier, "" for all
+    entry: ControlEntry  # its entry in one of the tasks
+    results: dict[ControlTask, DriveResult]  # of all its tasks, errors too
+    scales: _ScoreScales  # scales of the tier's tasks
+    us: float = float("nan")  # time of a decision (us)
 
     @property
     def label(self) -> str:
-        """As in tables and figures."""
+        """Name in tables and figures."""
         return self.entry.label
 
     @cached_property
     def drives(self) -> dict[ControlTask, DriveResult]:
-        """The contests without an error."""
+        """Results of the tasks without an error."""
         return {task: result for task, result in self.results.items() if not result.error}
 
     @cached_property
     def pairs(self) -> dict[ControlTask, tuple[Array, Array]]:
-        """r of the contestant and of the oracle on the episodes that count, where any do."""
-        paired = {
-            c: self.scales[c].compute_paired_ratios(result)
-            for c, result in self.drives.items()
-            if c in self.scales
-        }
+        """r of the entry and of the oracle on the episodes that count, where any do."""
+        scaled = [(task, run) for task, run in self.drives.items() if task in self.scales]
+        paired = {task: self.scales[task].compute_paired_ratios(run) for task, run in scaled}
         return {task: pair for task, pair in paired.items() if len(pair[0])}
 
     @cached_property
     def by_task(self) -> dict[ControlTask, dict[str, Estimate]]:
-        """Every metric of every contest that was driven."""
+        """Every metric of every task that was driven."""
         return {task: self._metrics(task) for task in self.drives}
 
     @cached_property
     def overall(self) -> dict[str, Estimate]:
-        """Over all contests; failures of all episodes, NaN where none was driven."""
+        """Metrics over all tasks; failures of all episodes, NaN where none was driven."""
         all_failed = [~survival_mask(result) for result in self.drives.values()]
         failed = np.concatenate(all_failed) if all_failed else np.empty(0)
         metrics = {"failure_rate": share(failed)}
@@ -155,9 +145,8 @@ class Standing:
             metrics["score"] = score(list(self.pairs.values()))
             compared = zip(*map(self._select_compared, self.pairs), strict=True)
             metrics["share_won"] = compute_win_rate(*map(np.concatenate, compared))
-            metrics["worst_cost"] = compute_tail_mean(
-                np.concatenate([self.drives[c].costs for c in self.pairs])
-            )
+            costs = np.concatenate([self.drives[task].costs for task in self.pairs])
+            metrics["worst_cost"] = compute_tail_mean(costs)
         return metrics
 
     @property
@@ -169,9 +158,8 @@ class Standing:
     @property
     def excluded(self) -> int:
         """Episodes of the compared ones that nominal or the oracle did not survive."""
-        everything = sum(
-            len(self.scales[c].mark_compared(len(self.drives[c].costs))) for c in self.pairs
-        )
+        marks = (self.scales[c].mark_compared(len(self.drives[c].costs)) for c in self.pairs)
+        everything = sum(map(len, marks))
         return everything - self.n
 
     @property
@@ -180,27 +168,23 @@ class Standing:
         return sum(len(r) for r, _ in self.pairs.values())
 
     def mean(self, name: str) -> float:
-        """A number of `EPISODE` over all contests in which it means something."""
+        """Average a number of `EPISODE` over all tasks in which it means something."""
         turning = next(metric.turning for metric in EPISODE if metric.name == name)
-        means = [
-            result[name].mean()
-            for task, result in self.drives.items()
-            if not (turning and task.reference == "zero-slip")
-        ]
+        runs = self.drives.items()
+        counted = [run for task, run in runs if not (turning and task.reference == "zero-slip")]
+        means = [run[name].mean() for run in counted]
         return float(np.mean(means)) if means else float("nan")
 
     def _select_compared(self, task: ControlTask) -> tuple[Array, Array]:
-        """(its costs, nominal's) of the episodes that count."""
+        """Costs of the entry and of nominal on the episodes that count, shape (n,) each."""
         costs, scale = self.drives[task].costs, self.scales[task]
         mask = scale.mark_compared(len(costs))
         return costs[: len(mask)][mask], scale.nominal.costs[: len(mask)][mask]
 
     def _metrics(self, task: ControlTask) -> dict[str, Estimate]:
         result = self.drives[task]
-        metrics = {
-            "failure_rate": share(~survival_mask(result)),
-            "worst_cost": compute_tail_mean(result.costs),
-        }
+        metrics = {"failure_rate": share(~survival_mask(result))}
+        metrics["worst_cost"] = compute_tail_mean(result.costs)
         if task in self.pairs:
             r, oracle_ratios = self.pairs[task]
             metrics["cost_vs_nominal"] = geometric_mean(-r)
@@ -210,48 +194,38 @@ class Standing:
         for metric in EPISODE:
             if metric.name != "failure":
                 metrics[metric.name] = interval(result[metric.name])
-        for failure, name in (RATES | _FAILED).items():
+        for failure, name in _RATES.items():
             metrics[name] = share(result.mark_failures(failure))
         return metrics
 
 
 def rank_entries(
-    results: Mapping[ControlEntry, DriveResult], tier: str | None, scales: ScoreScales
+    results: Mapping[ControlEntry, DriveResult], tier: str | None, scales: _ScoreScales
 ) -> list[Standing]:
-    """Every contestant of a tier, None: of all together, the best first: by failures where nominal
-    fails in more than 10 %, else by score."""
+    """Rank the entries of a tier, None: of all; the best is first, by failures or by score."""
     by_pair: dict[tuple[str, str], list[ControlEntry]] = {}
     for entry in results:
         if tier in (None, entry.task.tier):
             by_pair.setdefault((entry.controller, entry.estimator), []).append(entry)
     ranked = [
-        Standing(
-            tier or "",
-            pair_entries[0],
-            {entry.task: results[entry] for entry in pair_entries},
-            scales,
-        )
-        for pair_entries in by_pair.values()
+        Standing(tier or "", entries[0], {entry.task: results[entry] for entry in entries}, scales)
+        for entries in by_pair.values()
     ]
     return sorted(ranked, key=_rank)
 
 
 def _rank(standing: Standing) -> tuple[float, float]:
-    """Smaller is better; what has no number comes last."""
+    """Key of the order: smaller is better; what has no number comes last."""
     value = standing.overall.get("score", Estimate(float("nan"))).value
     failed = standing.overall["failure_rate"].value if standing.by_failures else 0.0
     return tuple(np.nan_to_num([failed, -value], nan=np.inf).tolist())
 
 
 def make_rows(standing: Standing, salt: str) -> list[ResultRow]:
-    """One row a metric and contest, and the aggregates of the tier."""
+    """Make a row for each metric and task, and those of the tier."""
     entry = standing.entry
-    common: dict[str, Any] = {
-        "suite": "control",
-        "estimator": entry.estimator,
-        "controller": entry.controller,
-        "salt": salt,
-    }
+    common: dict[str, Any] = {"suite": "control", "salt": salt}
+    common |= {"estimator": entry.estimator, "controller": entry.controller}
     rows = []
     for task, metrics in standing.by_task.items():
         version = f"{task.env_id} {__version__}"
@@ -274,13 +248,13 @@ def make_rows(standing: Standing, salt: str) -> list[ResultRow]:
 
 
 def make_spec(entry: ControlEntry) -> str:
-    """The env as JSON: what `gym.make` needs to build it again."""
+    """Make the JSON of the env from which `gym.make` builds it again."""
     env = gym.make(gym.spec(entry.task.env_id), **entry.env_options)
     return env.spec.to_json() if env.spec is not None else ""
 
 
 def make_main_table(title: str, ranked: Sequence[Standing], note: str = "") -> ResultTable:
-    """The contestants, the best first."""
+    """Make the table of the entries, the best first."""
     header = (
         *("controller and estimator", "fails / %", "95 %", "cost / nominal's, %", "95 % "),
         *("score", "95 %  ", "won / %", "worst 5 %", "contests", "episodes", "left out"),
@@ -289,25 +263,14 @@ def make_main_table(title: str, ranked: Sequence[Standing], note: str = "") -> R
     cells = []
     for standing in ranked:
         texts: list[str] = []
-        for name, scale, digits in (
-            ("failure_rate", 100.0, ".1f"),
-            ("cost_vs_nominal", 100.0, ".1f"),
-            ("score", 1.0, ".2f"),
-        ):
+        columns = (("failure_rate", 100.0, ".1f"), ("cost_vs_nominal", 100.0, ".1f"))
+        for name, scale, digits in (*columns, ("score", 1.0, ".2f")):
             texts += _format_texts(standing.overall.get(name), scale, digits)
         share_won, tail = (standing.overall.get(name) for name in ("share_won", "worst_cost"))
-        cells.append(
-            [
-                standing.label,
-                *texts,
-                _format_texts(share_won, 100.0, ".0f")[0],
-                _format_texts(tail, 1.0, ".3g")[0],
-                f"{len(standing.pairs)} of {len(standing.results)}",
-                str(standing.n),
-                str(standing.excluded),
-                f"{standing.us:.0f}" if np.isfinite(standing.us) else "",
-            ]
-        )
+        texts += [_format_texts(share_won, 100.0, ".0f")[0], _format_texts(tail, 1.0, ".3g")[0]]
+        texts += [f"{len(standing.pairs)} of {len(standing.results)}", str(standing.n)]
+        texts += [str(standing.excluded), f"{standing.us:.0f}" if np.isfinite(standing.us) else ""]
+        cells.append([standing.label, *texts])
     return ResultTable(title, header, cells, note)
 
 
@@ -321,17 +284,15 @@ def _format_texts(number: Estimate | None, scale: float, digits: str) -> tuple[s
 def make_task_table(
     title: str, ranked: Sequence[Standing], tasks: Sequence[ControlTask]
 ) -> ResultTable:
-    """Cost against nominal in %, every contestant in every contest."""
-    cells = []
-    for standing in ranked:
-        cells.append([standing.label, *(_format_cell(standing, task) for task in tasks)])
+    """Make the table of the cost over nominal's (%), every entry in every task."""
+    cells = [[item.label, *(_format_cell(item, task) for task in tasks)] for item in ranked]
     note = "Percent of nominal's cost, the paired geometric mean; in brackets failures in percent."
     header = ("controller and estimator", *(c.name for c in tasks))
     return ResultTable(title, header, cells, note, detail=True)
 
 
 def _format_cell(standing: Standing, task: ControlTask) -> str:
-    """What stands in a square: the number, or why there is none."""
+    """Text of a cell: the number, or why there is none."""
     if task not in standing.results:
         return ""
     if standing.results[task].error:
@@ -348,19 +309,15 @@ def _format_cell(standing: Standing, task: ControlTask) -> str:
 
 
 def make_motion_table(title: str, ranked: Sequence[Standing]) -> ResultTable:
-    """The motion under each contestant, in the same order: means over all contests."""
+    """Make the table of the motion, the entries in the same order: means over all tasks."""
     shown = [metric for metric in EPISODE if metric.heading]
     header = ["controller and estimator", *(m.heading for m in shown), "of the period / %"]
     cells = []
     for standing in ranked:
-        share_ = (
-            f"{1e-4 * standing.us / get_control_period(standing.entry):.2f}"
-            if np.isfinite(standing.us)
-            else ""
-        )
+        used = 1e-4 * standing.us / get_control_period(standing.entry)
         values = [(metric, standing.mean(metric.name)) for metric in shown]
         texts = [metric.text(value) if np.isfinite(value) else "" for metric, value in values]
-        cells.append([standing.label, *texts, share_])
+        cells.append([standing.label, *texts, f"{used:.2f}" if np.isfinite(used) else ""])
     note = (
         "Yaw error and path where the reference turns. motors: mechanical work of both. effort: "
         "mean square share of the full yaw moment. Steps: the largest of what is asked between "

@@ -1,15 +1,17 @@
-"""Question: which estimator and which controller keeps the car where it should be, and how far is
-that from knowing its state? The matrix of both on the scored contests of four tiers."""
+"""The suite `control`: which estimator and controller hold the car, and how far from the oracles?
+
+All pairs of both drive the scored tasks of four tiers on salted seeds.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 
 from ... import __version__
 from ...agents.learned.policy import is_policy, load_policy
-from ...envs.record import Array
 from ..harness.results import ResultRow, ResultTable, Suite
 from .baseline_gaps import (
     DELAY_TASK,
@@ -70,12 +72,19 @@ def run(
     clairvoyant: Path | None = None,
     salt: str = "",
 ) -> Suite:
-    """All tiers, the ladder, the price of delay, and pictures.
+    """Run all tiers, the baselines, the cost of delay, and the pictures.
 
-    episodes: a cell (slow controllers have at most 64). keep: a folder in which finished cases
-    stay, so that a run that was stopped goes on. quick: a few contests, without the slow
-    contestants and the price of delay. clairvoyant: a file of `sideslip calibrate`, None: the
-    package's, if there is one. salt: of the seeds, "" for `make_salt`'s.
+    Args:
+        episodes: Episodes of an entry (slow controllers have at most 64).
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+        keep: Folder in which finished cases stay, so that a run that was stopped goes on.
+        quick: Whether few tasks are driven, without the slow controllers and the cost of delay.
+        clairvoyant: File of `sideslip calibrate`, None for the package's, if there is one.
+        salt: Salt of the seeds, "" for `make_salt`'s.
+
+    Returns:
+        Suite with verdict, tables and figures.
     """
     salt = salt or make_salt()
     tasks = select_quick_tasks(list_scored_tasks()) if quick else list(list_scored_tasks())
@@ -85,30 +94,23 @@ def run(
     results = measure(requested, seeds, jobs=jobs, console=console, keep=keep)
     calibrated = measure_calibrated(records, requested, jobs=jobs, console=console, keep=keep)
     suite = Suite("control", "Which controller and estimator hold the car", "")
-    tiers = {tier: [c for c in tasks if c.tier == tier] for tier in TITLES}
-    tiers = {tier: tier_tasks for tier, tier_tasks in tiers.items() if tier_tasks}
-    by_tier, foresight, detail_tables = {}, _compute_foresight(records, calibrated), []
+    names = {task.tier for task in tasks}
+    tiers = {tier: [c for c in tasks if c.tier == tier] for tier in TITLES if tier in names}
+    regrets = compute_regrets(records, calibrated).items()
+    foresight = {entry.task: regret for entry, regret in regrets if entry.controller == STATE}
+    by_tier, detail_tables = dict[str, list[Standing]](), list[ResultTable]()
     for tier, tier_tasks in tiers.items():
         by_tier[tier] = rank_entries(results.outcomes, tier, make_score_scales(results, tier_tasks))
         for item in by_tier[tier]:
             if item.drives:
-                item.us = measure_decision_time(
-                    next(entry for entry in requested if _is_driven_entry(entry, item))
-                )
+                item.us = measure_decision_time(_find_driven_entry(requested, item))
             suite.rows += make_rows(item, salt)
-        title = f"Tier {tier}: {TITLES[tier]}"
-        note = " ".join(
-            [
-                _NOTE,
-                *describe_findings(by_tier[tier]),
-                *(_describe_policies() if tier == "1" else ()),
-            ]
-        )
-        suite.tables.append(make_main_table(title, by_tier[tier], note))
-        detail_tables += [
-            make_task_table(f"{title}, contest by contest", by_tier[tier], tier_tasks)
-        ]
-        detail_tables += [make_motion_table(f"{title}: the motion", by_tier[tier])]
+        title, ranked = f"Tier {tier}: {TITLES[tier]}", by_tier[tier]
+        trainings = _describe_policies() if tier == "1" else []
+        note = " ".join([_NOTE, *describe_findings(ranked), *trainings])
+        suite.tables.append(make_main_table(title, ranked, note))
+        detail_tables += [make_task_table(f"{title}, contest by contest", ranked, tier_tasks)]
+        detail_tables += [make_motion_table(f"{title}: the motion", ranked)]
     suite.tables.append(make_knowledge_table(results, tiers, foresight))
     ladder = make_oracle_table(results, tasks, foresight)
     ladder.note += _describe_beaten(records, calibrated)
@@ -121,9 +123,8 @@ def run(
     suite.tables += _make_failure_tables(results, late)
     suite.verdict = compose_verdict(by_tier, prices, foresight)
     add_figures(suite, by_tier, results, prices, foresight)
-    spent = np.nansum(
-        [c.seconds for item in (results, calibrated, *late) for c in item.outcomes.values()]
-    )
+    outcomes = [drive for x in (results, calibrated, *late) for drive in x.outcomes.values()]
+    spent = np.nansum([drive.seconds for drive in outcomes])
     suite.text = f"{_TEXT} Driven in {spent / 60.0:.1f} CPU-minutes."
     return suite
 
@@ -135,41 +136,27 @@ _NOTE = (
 )
 
 
-def _is_driven_entry(entry: ControlEntry, standing: Standing) -> bool:
-    """Whether it is a cell that the contestant drove without an error."""
-    same = (entry.controller, entry.estimator) == (
-        standing.entry.controller,
-        standing.entry.estimator,
-    )
-    return same and entry.task in standing.drives
+def _find_driven_entry(entries: Sequence[ControlEntry], standing: Standing) -> ControlEntry:
+    """The first entry that the contestant drove without an error."""
+    pair = (standing.entry.controller, standing.entry.estimator)
+    driven = (entry for entry in entries if (entry.controller, entry.estimator) == pair)
+    return next(entry for entry in driven if entry.task in standing.drives)
 
 
 def _read_calibrated(
     path: Path | None, tasks: Sequence[ControlTask]
 ) -> dict[ControlTask, CalibrationRecord]:
-    """The clairvoyant's entries of contests; ValueError where one is stale."""
+    """The clairvoyant's records of tasks; ValueError where one is stale."""
     path = FILE if path is None and FILE.is_file() else path
     if path is None:
         return {}
-    read = read_calibration(path)
-    records = {task: record for task, record in read.items() if task in tasks}
+    records = {task: record for task, record in read_calibration(path).items() if task in tasks}
     check_current(records, path)
     return records
 
 
-def _compute_foresight(
-    records: Mapping[ControlTask, CalibrationRecord], calibrated: Results
-) -> dict[ControlTask, Array]:
-    """(n,) log(J_oracle-state / J_clairvoyant) of each calibrated contest."""
-    return {
-        c.task: regret
-        for c, regret in compute_regrets(records, calibrated).items()
-        if c.controller == STATE
-    }
-
-
 def _describe_beaten(records: Mapping[ControlTask, CalibrationRecord], calibrated: Results) -> str:
-    """Who costs less than the clairvoyant on its own seeds."""
+    """Sentence on who costs less than the clairvoyant on its seeds."""
     if not records:
         return ""
     regrets = compute_regrets(records, calibrated)
@@ -191,6 +178,7 @@ def _describe_policies() -> list[str]:
 
 
 def _make_failure_tables(results: Results, late: Sequence[Results]) -> list[ResultTable]:
+    """Table of the entries that went wrong, also with late sensors; none without such."""
     lines = list_failures(results)
     for delay, delayed in zip(DELAYS, late, strict=False):
         lines += list_failures(delayed, delay)
@@ -204,20 +192,14 @@ def _make_failure_tables(results: Results, late: Sequence[Results]) -> list[Resu
 
 
 def _make_delay_rows(prices: Sequence[DelayCost], n: int, salt: str) -> list[ResultRow]:
-    """Rows of the price of delay; the scenario has the delay."""
-    return [
-        ResultRow.from_estimate(
-            "cost_vs_nominal",
-            ratio,
-            suite="control",
-            scenario=f"{DELAY_TASK.name}, sensors {1e3 * delay:.0f} ms late",
-            estimator=price.entry.estimator,
-            controller=price.entry.controller,
-            n=n,
-            salt=salt,
-            env_version=f"{DELAY_TASK.env_id} {__version__}",
-        )
-        for price in prices
-        for delay, ratio in zip(DELAYS[: len(price.over)], price.over, strict=True)
-        if np.isfinite(ratio.value)
-    ]
+    """Rows of the cost of delay; the scenario has the delay."""
+    version, rows = f"{DELAY_TASK.env_id} {__version__}", []
+    common: Any = {"suite": "control", "n": n, "salt": salt, "env_version": version}
+    for price in prices:
+        labels = {"estimator": price.entry.estimator, "controller": price.entry.controller}
+        for delay, ratio in zip(DELAYS[: len(price.over)], price.over, strict=True):
+            scenario = f"{DELAY_TASK.name}, sensors {1e3 * delay:.0f} ms late"
+            if np.isfinite(ratio.value):
+                columns = {"scenario": scenario, **labels, **common}
+                rows.append(ResultRow.from_estimate("cost_vs_nominal", ratio, **columns))
+    return rows

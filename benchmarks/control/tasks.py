@@ -1,9 +1,8 @@
-"""A contest: a manoeuvre with its car, its actuators and the reference it is judged by.
+"""Tasks of the control benchmark: a manoeuvre with its car, actuators and reference.
 
-Those of a tier are chosen once, on tuning seeds, by what is to be won there (`choice.py`), and
-`contests.json` holds them with the measured gaps.
-
-Test seeds that nobody can have tuned on: they change with the contestants and the env.
+Those of a tier are chosen once, on tuning seeds, by the gap between the baselines
+(`baseline_gaps.py`); `contests.json` holds them with the measured gaps. Test seeds follow a salt, a
+hash of the contestants' sources and the env's version, so that nobody can have tuned on them.
 """
 
 import hashlib
@@ -33,7 +32,7 @@ COMMAND = "python -m sideslip.benchmarks.control.baseline_gaps --write"
 
 NOMINAL, PARAMETERS, STATE = "nominal", "oracle-parameters", "oracle-state"
 ORACLES = {PARAMETERS: baselines.PARAMETER_ORACLES, STATE: baselines.STATE_ORACLES}
-"""The rungs of which a contest's better one has the name."""
+"""The candidates for a baseline's name, of which a task has the better one."""
 
 TIERS: dict[str, tuple[tuple[str, str, str], ...]] = {
     "1": ((STEERING, "coms", "model"), (YAW, "coms", "zero-slip")),
@@ -48,14 +47,12 @@ TITLES = {
     "2b": "the passenger car on a road of unknown friction",
     "2c": "the passenger car at the limit of its tyres",
 }
-LIMIT = ("2c",)
-"""Tiers in which nominal may fail as often as it does."""
+LIMIT = ("2c",)  # tiers in which nominal may fail as often as it does
 
 
 @dataclass(frozen=True)
 class ControlTask:
-    """A scenario in an environment; vehicle and reference: "" for the id's own. tier: "" where it
-    is none of a score's."""
+    """A scenario in an environment; vehicle, reference: "" for the id's; tier: "" if unscored."""
 
     tier: str = ""
     env_id: str = YAW
@@ -65,12 +62,12 @@ class ControlTask:
 
     @property
     def name(self) -> str:
-        """In tables: the scenario and what acts."""
+        """Name in tables: the scenario and what acts."""
         return f"{self.scenario}, {'steering' if self.env_id == STEERING else 'yaw'}"
 
     @property
     def kind(self) -> str:
-        """The class of contests that share their tuned options."""
+        """Class of the tasks that share their tuned options."""
         if self.vehicle in ("", "coms"):
             return f"coms-{'zero-slip' if self.reference == 'zero-slip' else 'model'}"
         return f"car-{'steering' if self.env_id == STEERING else 'yaw'}"
@@ -78,14 +75,8 @@ class ControlTask:
     @property
     def seed_text(self) -> str:
         """JSON from which the seeds are drawn. Its keys stay when a field gets another name."""
-        parts = {
-            "tier": self.tier,
-            "env_id": self.env_id,
-            "vehicle": self.vehicle,
-            "reference": self.reference,
-            "scenario": self.scenario,
-        }
-        return json.dumps(parts)
+        names = ("tier", "env_id", "vehicle", "reference", "scenario")
+        return json.dumps({name: getattr(self, name) for name in names})
 
     @property
     def env_options(self) -> dict[str, Any]:
@@ -96,10 +87,10 @@ class ControlTask:
 
 
 def vary_scenario(task: ControlTask, change: Mapping[str, Any]) -> dict[str, Any]:
-    """A contest's scenario, over its name, with some fields changed.
+    """Make a task's scenario, over its name, with some fields of `Scenario` changed.
 
-    change: fields of `Scenario`; noise comes to the scenario's own, and "mass" is a factor on the
-    true car's, of which controllers and filters know nothing.
+    Noise comes to the scenario's own; "mass" is a factor on the true car's, of which controllers
+    and filters know nothing.
     """
     fields, base = dict(change), make_scenario(task.scenario)
     if "noise" in fields:
@@ -114,10 +105,9 @@ def vary_scenario(task: ControlTask, change: Mapping[str, Any]) -> dict[str, Any
 class TaskMeasurement:
     """A candidate with what was measured on tuning seeds: an entry of the file.
 
-    oracle, knowing: the better of `ORACLES` for state and for parameters. gap: mean
-    log(J_nominal / J_oracle) of the episodes that both
-    survive, `judged` of n, with its 95 % interval; failing: the share in which nominal fails.
-    verdict: "scored", or why not.
+    oracle, knowing: The better of `ORACLES` for state and for parameters. gap: Mean of
+    log(J_nominal / J_oracle) of the episodes that both survive, `judged` of n, with its 95 %
+    interval. failing: Fraction in which nominal fails. verdict: "scored", or why not.
     """
 
     tier: str
@@ -138,12 +128,12 @@ class TaskMeasurement:
 
     @property
     def task(self) -> ControlTask:
-        """Of which these are the numbers."""
+        """The task of these numbers."""
         return ControlTask(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
 
 
 def list_candidates() -> list[ControlTask]:
-    """Every scenario that has a tier, with each of the tier's ids and references."""
+    """List every scenario that has a tier, with each of the tier's ids and references."""
     return [
         ControlTask(tier, *variant, name)
         for tier, variants in TIERS.items()
@@ -154,17 +144,15 @@ def list_candidates() -> list[ControlTask]:
 
 
 def read_tasks(path: Path = FILE) -> tuple[TaskMeasurement, ...]:
-    """All candidates of a file.
+    """Read all candidates of a file.
 
     Raises FileNotFoundError, and ValueError, with the file and what to do, where it was measured
     with another version, is cut short, or names what there is not.
     """
     measurements = []
     for i, item in enumerate(read_objects(path), 1):
-        measurement, where = (
-            from_json(TaskMeasurement, item, f"{path}: entry {i}"),
-            f"{path}: entry {i}",
-        )
+        where = f"{path}: entry {i}"
+        measurement = from_json(TaskMeasurement, item, where)
         if measurement.env_version != __version__:
             raise ValueError(
                 f"{where} was measured with version {measurement.env_version}, this is "
@@ -187,10 +175,8 @@ def write_tasks(entries: Sequence[TaskMeasurement], path: Path = FILE) -> None:
 
 @cache
 def list_scored_tasks() -> tuple[ControlTask, ...]:
-    """The scored contests, tier by tier; raises as `read_tasks`."""
-    return tuple(
-        measurement.task for measurement in read_tasks() if measurement.verdict == "scored"
-    )
+    """List the scored tasks, tier by tier; raises as `read_tasks`."""
+    return tuple(entry.task for entry in read_tasks() if entry.verdict == "scored")
 
 
 @cache
@@ -199,15 +185,14 @@ def _index_measurements() -> dict[ControlTask, TaskMeasurement]:
 
 
 def find_oracle(task: ControlTask, name: str = STATE) -> str:
-    """The better of `ORACLES` of a name in a contest; LQR where none was measured."""
+    """Find the better of `ORACLES` of a name in a task; LQR where none was measured."""
     measurement = _index_measurements().get(task)
     if measurement is None:
         return ORACLES[name][0]
     return measurement.oracle if name == STATE else measurement.knowing
 
 
-Seeds = Sequence[int] | Callable[[ControlTask], Sequence[int]]
-"""The same in every contest, or of each."""
+Seeds = Sequence[int] | Callable[[ControlTask], Sequence[int]]  # of all tasks, or by task
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 _CONTESTANTS = dict.fromkeys(("estimators", "agents"), (".py", ".toml", SUFFIX))
@@ -216,8 +201,7 @@ _TUNING = 2**29  # the clairvoyant's are beyond 2^30
 
 
 def make_salt(*more: str) -> str:
-    """The salt: a hash of the contestants' files, weights included, the env's version and further
-    texts."""
+    """Make the salt: a hash of the contestants' files, weights, the env's version and texts."""
     digest = hashlib.sha256(__version__.encode())
     for folder, endings in _CONTESTANTS.items():
         for path in sorted((_PACKAGE / folder).rglob("*")):
@@ -229,9 +213,9 @@ def make_salt(*more: str) -> str:
 
 
 def make_salted_seeds(salt: str, n: int, more: str = "") -> list[int]:
-    """The first n test seeds of a salt (hexadecimal), each below 2^32; more seeds keep the first.
+    """Make the first n test seeds of a salt, below 2^32; more seeds keep the first.
 
-    more: a text that makes them others. Raises ValueError for a salt that is not hexadecimal.
+    more: A text that makes them others. Raises ValueError for a salt that is not hexadecimal.
     """
     if not re.fullmatch("[0-9a-f]+", salt):
         raise ValueError(f"a salt is hexadecimal digits, got {salt!r}")
@@ -242,14 +226,14 @@ def make_salted_seeds(salt: str, n: int, more: str = "") -> list[int]:
 
 
 def make_task_seeds(salt: str, n: int) -> Callable[[ControlTask], list[int]]:
-    """The first n test seeds of each contest.
+    """Make the function from a task to its first n test seeds.
 
-    Other ones in each: a seed draws the car as well, and contests that share their cars would not
-    be independent strata of an interval.
+    They differ between tasks: a seed draws the car as well, and tasks that share their cars would
+    not be independent strata of an interval.
     """
     return lambda task: make_salted_seeds(salt, n, task.seed_text)
 
 
 def make_tuning_seeds(n: int) -> list[int]:
-    """The first n seeds on which contests are chosen and controllers tuned: no test's."""
+    """Make the first n seeds on which tasks are chosen and controllers tuned: no test's."""
     return list(range(_TUNING, _TUNING + n))

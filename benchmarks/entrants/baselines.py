@@ -1,5 +1,4 @@
-"""The package's own contestants of the open benchmark: on file, where their episodes still cost
-what they did.
+"""The package's own entries of the open benchmark: on file, while their episodes cost the same.
 
 `python -m sideslip.benchmarks.entrants.baselines` drives them all and writes the file.
 """
@@ -36,18 +35,17 @@ from .challenge import EPISODES
 
 FILE = Path(__file__).with_name("baselines.json")
 COMMAND = f"python -m {__name__}"
-BASELINE_PAIRS = (("", NOMINAL), ("", STATE), ("", "none"))
+_BASELINE_PAIRS = (("", NOMINAL), ("", STATE), ("", "none"))
 CONTROLLERS = ((REFERENCE_FILTER, "esc"),)
 ESTIMATORS = (("multirate-kf, camera and gps", REFERENCE_CONTROLLER), (TRUTH, REFERENCE_CONTROLLER))
-"""(estimator, controller) of everybody's baselines, an agent's rivals and an estimator's."""
-SAMPLE = 2  # episodes of a baseline that are driven again
+"""Estimator and controller of all baselines, of an agent's rivals and of an estimator's."""
+_SAMPLE = 2  # episodes of a baseline that are driven again
 _SAME = 1e-6  # of a cost
 
 
 @dataclass(frozen=True)
 class BaselineRecord:
-    """A baseline's episodes in a contest: an entry of the file. salt: of the seeds. failures:
-    codes."""
+    """A baseline's episodes in a task: an entry of the file; failures: codes of `FAILURES`."""
 
     tier: str
     env_id: str
@@ -63,12 +61,12 @@ class BaselineRecord:
 
     @property
     def entry(self) -> ControlEntry:
-        """Of which these are the episodes."""
+        """The entry of these episodes."""
         task = ControlTask(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
         return ControlEntry(task, self.estimator, self.controller)
 
     def drives(self, n: int) -> DriveResult:
-        """The first n episodes; what is not on file is NaN."""
+        """Return the first n episodes; what is not on file is NaN."""
         numbers = np.full((n, len(NUMBERS)), np.nan)
         numbers[:, NUMBERS.index("cost")] = self.costs[:n]
         numbers[:, NUMBERS.index("failure")] = self.failures[:n]
@@ -78,42 +76,38 @@ class BaselineRecord:
 def make_baseline_entries(
     tasks: Sequence[ControlTask], agents: bool = True, estimators: bool = True
 ) -> list[ControlEntry]:
-    """The baselines in these contests. agents, estimators: whether such are among the rivals."""
-    pairs = BASELINE_PAIRS + (CONTROLLERS if agents else ()) + (ESTIMATORS if estimators else ())
+    """Make the baselines' entries; agents, estimators: whether such are among the rivals."""
+    pairs = _BASELINE_PAIRS + (CONTROLLERS if agents else ()) + (ESTIMATORS if estimators else ())
     return [ControlEntry(task, *pair) for task in tasks for pair in pairs]
 
 
 def read_baselines(path: Path = FILE) -> dict[ControlEntry, BaselineRecord]:
-    """The entries of a file; none of another version's. Raises ValueError for another file."""
-    records = (
-        from_json(BaselineRecord, x, f"{path}: entry {i}")
-        for i, x in enumerate(read_objects(path), 1)
-    )
+    """Read the entries of a file of this version; raises ValueError for another kind of file."""
+    items = enumerate(read_objects(path), 1)
+    records = (from_json(BaselineRecord, item, f"{path}: entry {i}") for i, item in items)
     return {record.entry: record for record in records if record.env_version == __version__}
 
 
 def find_baselines(
     wanted: Sequence[ControlEntry], n: int, **options: Any
 ) -> tuple[str, Results] | None:
-    """Find (salt, first n episodes) of baselines that are all on file with so many episodes.
+    """Find salt and first n episodes of baselines that are all on file with so many; else None.
 
-    Of each a sample is driven again, and a drive of it costs the same; else None.
-
-    The sample: `SAMPLE` episodes of each, of the slow ones in one contest. options: of `measure`.
+    None, too, where of a baseline no episode of a sample costs the same again: `_SAMPLE` episodes
+    of each, of the slow ones in one task. options: of `measure`.
     """
     records = read_baselines(FILE) if FILE.is_file() else {}
-    matches = [
-        records[entry] for entry in wanted if entry in records and len(records[entry].costs) >= n
-    ]
+    known = (records[entry] for entry in wanted if entry in records)
+    matches = [record for record in known if len(record.costs) >= n]
     salts = {record.salt for record in matches}
     if len(matches) < len(wanted) or len(salts) != 1:
         return None
     (salt,) = salts
     slow = [entry for entry in wanted if entry.slow]
     sample = [entry for entry in wanted if entry not in slow[1:]]
-    again = measure(sample, make_task_seeds(salt, SAMPLE), title="baselines, a sample", **options)
+    again = measure(sample, make_task_seeds(salt, _SAMPLE), title="baselines, a sample", **options)
     for entry, result in again.outcomes.items():
-        same = np.isclose(result.costs, records[entry].costs[:SAMPLE], rtol=_SAME, atol=0.0)
+        same = np.isclose(result.costs, records[entry].costs[:_SAMPLE], rtol=_SAME, atol=0.0)
         # On another processor one drive of `oracle-state` costs 0.3 % more. What changes the car or
         # a controller changes every drive.
         if result.error or not same.any():
@@ -122,25 +116,17 @@ def find_baselines(
 
 
 def write_baselines(path: Path = FILE, jobs: int | None = None) -> None:
-    """Drive all baselines of the usual contests, and write the file; ValueError where one fails."""
-    salt = make_salt()
-    control_entries = make_baseline_entries(select_quick_tasks(list_scored_tasks()))
-    results = measure(
-        control_entries, make_task_seeds(salt, EPISODES), jobs=jobs, console=Console()
-    ).outcomes
-    lines = []
-    for control_entry, result in results.items():
+    """Drive all baselines of the usual tasks, and write the file; ValueError where one fails."""
+    salt, lines = make_salt(), []
+    entries = make_baseline_entries(select_quick_tasks(list_scored_tasks()))
+    seeds = make_task_seeds(salt, EPISODES)
+    for entry, result in measure(entries, seeds, jobs=jobs, console=Console()).outcomes.items():
         if result.error:
-            raise ValueError(f"{control_entry.task.name}, {control_entry.label}: {result.error}")
-        costs, failures = result.costs.tolist(), result["failure"].astype(int).tolist()
-        names = asdict(control_entry.task) | {
-            "estimator": control_entry.estimator,
-            "controller": control_entry.controller,
-        }
-        record = BaselineRecord(
-            **names, salt=salt, env_version=__version__, costs=costs, failures=failures
-        )
-        lines.append(json.dumps(asdict(record)))
+            raise ValueError(f"{entry.task.name}, {entry.label}: {result.error}")
+        record = asdict(entry.task) | {"estimator": entry.estimator, "controller": entry.controller}
+        record |= {"salt": salt, "env_version": __version__, "costs": result.costs.tolist()}
+        record |= {"failures": result["failure"].astype(int).tolist()}
+        lines.append(json.dumps(record))
     write_text(path, "[\n" + ",\n".join(lines) + "\n]\n")
 
 

@@ -1,4 +1,4 @@
-"""What is compared: a user's contestants, and the contests in which they meet the package's own."""
+"""The request of an open benchmark: a user's entries, and the tasks in which they drive."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -45,9 +45,13 @@ _COMS, _CAR = "1", "2a"  # tiers, of which a scenario without one has car and re
 
 @dataclass(frozen=True)
 class UserEntry:
-    """A contestant. agent: a name, a file's class or a path, of `make_agent`, or an object or
-    factory; estimator: the same of `make_estimator`, or a name of the matrix, "" for none. trust:
-    of `make_agent`, for a zip."""
+    """A user's agent and estimator.
+
+    Attributes:
+        agent: Name, file's class or path of `make_agent`, or an object or factory.
+        estimator: The same of `make_estimator`, or a name in `SETUPS`, "" for none.
+        trust: Whether a zip may be read.
+    """
 
     agent: Any
     estimator: Any = REFERENCE_FILTER
@@ -55,21 +59,19 @@ class UserEntry:
 
     @property
     def label(self) -> str:
-        """As `ControlEntry.label`."""
+        """Agent and estimator in words, as of a `ControlEntry`."""
         return self.make_entry(ControlTask()).label
 
     def make_entry(
         self, task: ControlTask, options: Mapping[str, Any] | None = None
     ) -> ControlEntry:
-        """The cell of a contest. options: of the env, beside the contest's."""
+        """Make the entry of a task; options: of the env, beside the task's."""
         parts = {"controller": self.agent, "estimator": self.estimator}
         objects = {part: value for part, value in parts.items() if not isinstance(value, str)}
         estimator, agent = _label(self.estimator), _label(self.agent)
-        best = (
-            get_tuned_options(task.kind, NOMINAL) | {"controller": {"trust": True}}
-            if self.trust
-            else None
-        )
+        best = None
+        if self.trust:
+            best = get_tuned_options(task.kind, NOMINAL) | {"controller": {"trust": True}}
         return ControlEntry(task, estimator, agent, dict(options or {}), best, objects)
 
     @property
@@ -80,8 +82,7 @@ class UserEntry:
         return [path for path in paths if path.is_file()]
 
     def check(self) -> None:
-        """FileNotFoundError or ValueError for a name, file or class that there is not,
-        PermissionError for a zip without trust."""
+        """Raise FileNotFoundError or ValueError for what is unknown, PermissionError for a zip."""
         for source, known in ((self.agent, AGENTS), (self.estimator, ESTIMATORS)):
             if not isinstance(source, str):
                 continue
@@ -103,8 +104,7 @@ def _label(source: Any) -> str:
 def make_user_entries(
     agents: Sequence[str], estimators: Sequence[str], trust: bool = False
 ) -> list[UserEntry]:
-    """Every agent on every estimator, or on the usual one, and the reference controller on every
-    estimator. trust: of zips."""
+    """Make every agent on every or its usual estimator, and the reference controller on each."""
     entries = [
         UserEntry(agent, estimator, trust and agent.endswith(ZIP))
         for agent in agents
@@ -115,7 +115,7 @@ def make_user_entries(
 
 
 def choose_estimator(agent: str) -> str:
-    """The estimator for an agent: a policy's own, none for what saw an env alone."""
+    """Choose the estimator of an agent: a policy's own, none for what saw an env alone."""
     if is_policy(agent):
         return load_policy(agent).card.estimator or ""
     return "" if agent.endswith(ZIP) else REFERENCE_FILTER
@@ -123,18 +123,25 @@ def choose_estimator(agent: str) -> str:
 
 @dataclass(frozen=True)
 class ComparisonRequest:
-    """A user's contestants and where they drive.
+    """A user's entries and where they drive.
 
-    vehicle: as `make_vehicle` takes it, instead of the contests' cars, true and nominal. scenarios:
-    as `make_scenario` takes them; none: some contests of every tier. A scenario's name that is
-    scored means its contests; another one is driven in both ids with a yaw moment on camera and
-    GPS, by the COMS, or by `vehicle` with the references of the passenger car. env_id: the
-    contests of one id alone. episodes: a contest. seeds: instead of salted ones. fresh: the seeds
-    are drawn after the user's files are hashed, and everybody drives anew. salt: of a fresh
-    challenge that is repeated. limit: s of wall time a cell.
+    A scenario's name that is scored means its tasks; another one is driven in both ids with a yaw
+    moment on camera and GPS, by the COMS, or by `vehicle` with the passenger car's references.
 
-    Raises ValueError for an unknown id, less than two episodes, a fresh challenge without files, or
-    a salt beside other seeds, and what `UserEntry.check`, `make_vehicle` and `make_scenario` raise.
+    Attributes:
+        entries: The user's entries.
+        vehicle: Vehicle as for `make_vehicle`, instead of the tasks' cars, true and nominal.
+        scenarios: Scenarios as for `make_scenario`; empty: some tasks of every tier.
+        env_id: Id whose tasks alone are driven.
+        episodes: Episodes of a task.
+        seeds: Seeds instead of salted ones.
+        fresh: Whether seeds are drawn after the user's files are hashed, and all drive anew.
+        salt: Salt of a fresh request that is repeated.
+        limit: Wall time of an entry in a task (s).
+
+    Raises:
+        ValueError: An unknown id, less than two episodes, a fresh request without files, a salt
+            beside other seeds; and what the makers above raise.
     """
 
     entries: tuple[UserEntry, ...]
@@ -166,43 +173,43 @@ class ComparisonRequest:
 
     @property
     def files(self) -> list[Path]:
-        """The user's files, once each."""
+        """The user's files without repetition."""
         return list(dict.fromkeys(path for entry in self.entries for path in entry.files))
 
     @property
     def is_as_shipped(self) -> bool:
-        """Whether all contests are the package's own, on its seeds."""
+        """Whether all tasks are the package's own, on its seeds."""
         return not (self.fresh or self.salt or self.seeds or any(self.tasks.values()))
 
     @cached_property
     def tasks(self) -> dict[ControlTask, dict[str, Any]]:
-        """Every contest with the env's options beside its own, a vehicle and a scenario as data."""
+        """The env's options beside its own by task, a vehicle and a scenario as data."""
         car = {} if self.vehicle is None else make_vehicle(self.vehicle).to_dict()
         options = {"vehicle": car, "nominal": car} if car else {}
         if not self.scenarios:
-            return {
-                task: options
-                for task in self._select_tasks(select_quick_tasks(list_scored_tasks()))
-            }
+            usual = select_quick_tasks(list_scored_tasks())
+            return dict.fromkeys(self._select_tasks(usual), options)
         tasks: dict[ControlTask, dict[str, Any]] = {}
         for source in self.scenarios:
             scored = [task for task in list_scored_tasks() if task.scenario == source]
             if scored:
-                tasks |= {task: options for task in self._select_tasks(scored)}
+                tasks |= dict.fromkeys(self._select_tasks(scored), options)
                 continue
             scenario = make_scenario(source)
             data = options | {"scenario": scenario.to_dict()}
-            tier = _CAR if car else _COMS
-            variants = [ControlTask("", *variant, scenario.name) for variant in TIERS[tier]]
-            if any(tasks.get(task, data) != data for task in self._select_tasks(variants)):
-                raise ValueError(
-                    f"two scenarios are called {scenario.name!r}: give each a name of its own"
-                )
-            tasks |= {task: data for task in self._select_tasks(variants)}
+            variants = [
+                ControlTask("", *variant, scenario.name)
+                for variant in TIERS[_CAR if car else _COMS]
+            ]
+            selected = self._select_tasks(variants)
+            if any(tasks.get(task, data) != data for task in selected):
+                name = scenario.name
+                raise ValueError(f"two scenarios are called {name!r}: give each a name of its own")
+            tasks |= dict.fromkeys(selected, data)
         return tasks
 
     def _select_tasks(self, tasks: Sequence[ControlTask]) -> list[ControlTask]:
-        """Those of the id; another than the tiers' takes the place of the one without steering."""
+        """Tasks of the id; one that no tier has takes the place of the id without steering."""
         if self.env_id in ("", YAW, STEERING):
             return [task for task in tasks if self.env_id in ("", task.env_id)]
         return [replace(task, env_id=self.env_id) for task in tasks if task.env_id == YAW]

@@ -1,7 +1,7 @@
-"""The process of a contestant: it gets observations, or records, and returns actions or estimates.
+"""The process of a user's entry: it gets observations or records, returns actions or estimates.
 
-The environment, its seeds and the results stay with the driver. What is asked comes pickled; the
-answers are bytes of which nothing is unpickled.
+The env, its seeds and the results stay with the driver. Requests come pickled; the answers are
+bytes of which nothing is unpickled.
 """
 
 import ctypes
@@ -30,11 +30,9 @@ from ...estimators.make import make_estimator
 from ...estimators.registry import describe_error
 from ..control.entries import CheckedAgent
 
-MEMORY = 4 * 2**30
-"""Bytes of address space of a contestant."""
-WRITTEN = 2**26
-"""Bytes of the longest file that it may write, in its scratch folder."""
-DONE, FAILED = b"d", b"f"
+_MEMORY = 4 * 2**30  # bytes of address space
+_WRITTEN = 2**26  # bytes of the longest file that it may write, in its scratch folder
+DONE, _FAILED = b"d", b"f"
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 _INSTALLED = {*site.getsitepackages(), sys.prefix, sys.base_prefix, str(_PACKAGE)}
@@ -43,18 +41,13 @@ _OPENS = {"open": 0, "ctypes.dlopen": 0, "import": 1}  # audit events, the argum
 
 
 class ChildSettings(NamedTuple):
-    """What the process is told before any code of the contestant runs.
+    """Settings that the process gets before any code of the entry runs."""
 
-    Args:
-        scratch: The one folder in which it may write.
-        allowed: Files that it may open beside the installation; None notes what it opens.
-    """
-
-    scratch: str
-    allowed: frozenset[str] | None
+    scratch: str  # the one folder in which it may write
+    allowed: frozenset[str] | None  # files it may open; None: notes them
 
 
-class EntryServer:
+class _EntryServer:
     """The agent, or the estimators of all rows, of one process."""
 
     def __init__(self) -> None:
@@ -103,26 +96,24 @@ def main() -> None:
     opened: set[str] = set()
 
     def refuse(text: str) -> None:
-        driver.send_bytes(FAILED + text.encode())
+        driver.send_bytes(_FAILED + text.encode())
         os._exit(1)
 
-    limit_process(Path(start.scratch))
+    _limit_process(Path(start.scratch))
     sys.addaudithook(_make_audit_hook(opened, start, refuse))
     driver.send_bytes(DONE + json.dumps(time.process_time()).encode())
-    server = EntryServer()
+    server = _EntryServer()
     with suppress(EOFError):
         while True:
             name, *arguments = driver.recv()
             try:
-                answer = (
-                    json.dumps(sorted(opened)).encode()
-                    if name == "opened"
-                    else getattr(server, name)(*arguments)
-                )
+                if name == "opened":
+                    answer = json.dumps(sorted(opened)).encode()
+                else:
+                    answer = getattr(server, name)(*arguments)
             except MemoryError as error:
-                refuse(
-                    f"{describe_error(error)}; a contestant has {MEMORY / 2**30:g} GiB of memory"
-                )
+                memory = f"a contestant has {_MEMORY / 2**30:g} GiB of memory"
+                refuse(f"{describe_error(error)}; {memory}")
             except Exception as error:
                 refuse(describe_error(error))
             driver.send_bytes(DONE + answer)
@@ -132,9 +123,8 @@ def _make_audit_hook(
     opened: set[str], start: ChildSettings, refuse: Callable[[str], None]
 ) -> Callable[[str, tuple[Any, ...]], None]:
     """Make the audit hook that notes what is opened outside the installation, or ends there."""
-    skipped = tuple(
-        f"{os.path.realpath(folder)}/" for folder in {*_INSTALLED, *_SYSTEM, start.scratch}
-    )
+    folders = {*_INSTALLED, *_SYSTEM, start.scratch}
+    skipped = tuple(f"{os.path.realpath(folder)}/" for folder in folders)
 
     def hook(event: str, arguments: tuple[Any, ...]) -> None:
         place = _OPENS.get(event)
@@ -153,14 +143,11 @@ def _make_audit_hook(
     return hook
 
 
-def limit_process(scratch: Path) -> None:
+def _limit_process(scratch: Path) -> None:
     """Limit this process for good: its memory, and where it may write."""
-    for kind, limit in (
-        (resource.RLIMIT_AS, MEMORY),
-        (resource.RLIMIT_FSIZE, WRITTEN),
-        (resource.RLIMIT_CORE, 0),
-    ):
-        resource.setrlimit(kind, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (_WRITTEN, _WRITTEN))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     if sys.platform == "linux":
         libc = ctypes.CDLL(None, use_errno=True)
         libc.prctl(1, 9, 0, 0, 0)  # PR_SET_PDEATHSIG: killed with the driver
@@ -177,10 +164,7 @@ _SIGNALS = 0b11  # sockets and signals to processes outside
 
 
 def _apply_landlock(libc: Any, rights: Mapping[Path, int]) -> None:
-    """Deny this process to change files, but for some below these paths, and to reach others.
-
-    Nothing happens where the kernel has no Landlock.
-    """
+    """Deny this process to change files but below these paths, and to reach others, if it can."""
     version = libc.syscall(_CREATE, None, 0, 1)
     if version < 1:
         return

@@ -1,10 +1,7 @@
-"""A user's contestants and the package's, on the same episodes.
+"""The open benchmark: a user's entries and the package's on the same episodes, and their scores.
 
-What a comparison says: a sentence a contestant, a table, and what it does not say.
-
-`sideslip.score`: an entry's score as a Python object.
-
-The open benchmark as a suite: verdict, tables, rows.
+`sideslip.score` gives an entry's score as a Python object; `run` makes the suite with verdict,
+tables and rows.
 """
 
 import hashlib
@@ -36,13 +33,12 @@ from .worker import LIMIT, run_isolated_chunk, run_rehearsal, run_user_chunk
 if TYPE_CHECKING:
     import pandas as pd
 
-REHEARSED = 2  # episodes of a contest in which contestants show what they open
+_REHEARSED = 2  # episodes of a task in which entries show what they open
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The episodes of a challenge. salt: of the seeds, "" where the caller chose them. on_file:
-    whether the baselines are the file's."""
+    """The episodes of a request; salt: "" for the caller's seeds; on_file: the baselines are."""
 
     request: ComparisonRequest
     salt: str
@@ -51,22 +47,21 @@ class Comparison:
 
     @cached_property
     def overall(self) -> list[Standing]:
-        """Everybody over all contests, the best first."""
+        """Standings over all tasks, the best first."""
         return self.standings(None)
 
     def standings(self, tier: str | None) -> list[Standing]:
-        """Everybody in a tier, None: in all of them, the best first."""
-        return rank_entries(
-            self.results.outcomes, tier, make_score_scales(self.results, self.tasks)
-        )
+        """Rank everybody in a tier, None: in all of them, the best first."""
+        scales = make_score_scales(self.results, self.tasks)
+        return rank_entries(self.results.outcomes, tier, scales)
 
     @property
     def tasks(self) -> list[ControlTask]:
-        """Those that were driven."""
+        """Tasks that were driven."""
         return list(self.request.tasks)
 
     def select(self, entry: UserEntry) -> Standing:
-        """A contestant over all contests."""
+        """Return an entry's standing over all tasks."""
         return next(standing for standing in self.overall if standing.label == entry.label)
 
 
@@ -76,48 +71,37 @@ def compare(
     console: Console | None = None,
     keep: Path | None = None,
 ) -> Comparison:
-    """Drive a challenge. keep: a folder for the baselines' finished cases.
+    """Drive a request; keep: folder of the baselines' finished cases.
 
-    A contestant of names and files drives in processes of its own, objects in this one.
+    An entry of names and files drives in processes of its own, objects in this one.
     """
     entries, tasks = request.entries, request.tasks
     shared: dict[str, Any] = {"jobs": jobs, "console": console, "keep": keep}
     controllers = any(entry.agent != REFERENCE_CONTROLLER for entry in entries)
     filters = any(entry.agent == REFERENCE_CONTROLLER for entry in entries)
     rivals = [
-        ControlEntry(
-            control_entry.task,
-            control_entry.estimator,
-            control_entry.controller,
-            tasks[control_entry.task],
-        )
-        for control_entry in make_baseline_entries(list(tasks), controllers, filters)
+        ControlEntry(entry.task, entry.estimator, entry.controller, tasks[entry.task])
+        for entry in make_baseline_entries(list(tasks), controllers, filters)
     ]
     user_entries = [
-        entry.make_entry(task, options) for task, options in tasks.items() for entry in entries
+        user.make_entry(task, options) for task, options in tasks.items() for user in entries
     ]
-    isolated = [control_entry for control_entry in user_entries if not control_entry.objects]
-    baselines = (
-        find_baselines(rivals, request.episodes, **shared) if request.is_as_shipped else None
-    )
+    isolated = [entry for entry in user_entries if not entry.objects]
+    objects = [entry for entry in user_entries if entry.objects]
+    known = find_baselines(rivals, request.episodes, **shared) if request.is_as_shipped else None
     allowed: frozenset[str] | None = None
-    salt = baselines[0] if baselines else request.salt or make_salt()
+    salt = known[0] if known else request.salt or make_salt()
     if request.fresh:
         allowed = _find_opened_files(request, isolated, jobs, console)
         digests = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in sorted(allowed)]
         salt = make_salt(*digests, secrets.token_hex(16))
     seeds = request.seeds or make_task_seeds(salt, request.episodes)
-    results = baselines[1] if baselines else measure(rivals, seeds, title="baselines", **shared)
+    results = known[1] if known else measure(rivals, seeds, title="baselines", **shared)
     runner = partial(run_isolated_chunk, limit=request.limit, allowed=allowed)
     remote = measure(isolated, seeds, jobs=jobs, console=console, title="entrants", runner=runner)
-    in_process = measure(
-        [control_entry for control_entry in user_entries if control_entry.objects],
-        seeds,
-        jobs=1,
-        runner=run_user_chunk,
-    )
+    in_process = measure(objects, seeds, jobs=1, runner=run_user_chunk)
     all_results = Results(results.outcomes | remote.outcomes | in_process.outcomes)
-    return Comparison(request, "" if request.seeds else salt, bool(baselines), all_results)
+    return Comparison(request, "" if request.seeds else salt, bool(known), all_results)
 
 
 def _find_opened_files(
@@ -126,8 +110,8 @@ def _find_opened_files(
     jobs: int | None,
     console: Console | None,
 ) -> frozenset[str]:
-    """Find the files that contestants open, theirs included, by a drive on tuning seeds."""
-    chunks = [Chunk(entry, tuple(make_tuning_seeds(REHEARSED))) for entry in entries]
+    """Find the files that entries open, theirs included, by a drive on tuning seeds."""
+    chunks = [Chunk(entry, tuple(make_tuning_seeds(_REHEARSED))) for entry in entries]
     runner = partial(run_rehearsal, limit=request.limit)
     opened = [files for _, files in run_cases(runner, chunks, "rehearsal", jobs, console)]
     return frozenset().union(*opened, (os.path.realpath(path) for path in request.files))
@@ -137,53 +121,43 @@ _MAX_SENTENCES = 4  # contestants with a sentence
 
 
 def compose_verdict(comparison: Comparison) -> list[str]:
-    """At most five lines: the contestants, the best first, then how far to trust them."""
+    """Compose at most five lines: the user's entries, the best first, and how far to trust them."""
     labels = {entry.label for entry in comparison.request.entries}
-    user_standings = [standing for standing in comparison.overall if standing.label in labels]
-    places = {standing.label: place for place, standing in enumerate(comparison.overall, 1)}
-    count = len(comparison.overall)
-    lines = [
-        f"Place {places[standing.label]} of {count}: {make_sentence(standing)}."
-        for standing in user_standings[:_MAX_SENTENCES]
-    ]
-    if len(user_standings) > _MAX_SENTENCES:
-        lines[-1] = f"{len(user_standings) - _MAX_SENTENCES + 1} more stand in the table."
+    placed = [(i, x) for i, x in enumerate(comparison.overall, 1) if x.label in labels]
+    count, more = len(comparison.overall), len(placed) - _MAX_SENTENCES
+    lines = [f"Place {i} of {count}: {make_sentence(x)}." for i, x in placed[:_MAX_SENTENCES]]
+    if more > 0:
+        lines[-1] = f"{more + 1} more stand in the table."
     return [*lines, _describe_trust(comparison)]
 
 
 def make_sentence(standing: Standing) -> str:
-    """Where a contestant stands."""
+    """Make the sentence that says where an entry stands."""
     cost = standing.overall.get("cost_vs_nominal")
     errors = [f"{c.name}: {r.error}" for c, r in standing.results.items() if r.error]
     if cost is None or not math.isfinite(cost.value):
-        yards = "nominal and oracle-state leave no episode to compare"
-        return (
-            f"{standing.label}: not driven: {errors[0]}" if errors else f"{standing.label}: {yards}"
-        )
-    names = dict.fromkeys(task.tier for task in standing.pairs)
-    tiers = [f"tier {tier}: {100.0 * _compute_cost(standing, tier):.0f}" for tier in names if tier]
+        reason = "nominal and oracle-state leave no episode to compare"
+        return f"{standing.label}: {f'not driven: {errors[0]}' if errors else reason}"
+    tiers = []
+    for tier in dict.fromkeys(task.tier for task in standing.pairs if task.tier):
+        logs = [-r for task, (r, _) in standing.pairs.items() if task.tier == tier]
+        tiers.append(f"tier {tier}: {100.0 * geometric_mean(*logs).value:.0f}")
     failed = standing.overall["failure_rate"]
     nominal = [standing.scales[task].nominal for task in standing.drives if task in standing.scales]
     nominal_failures = sum(float((run["failure"] != 0.0).sum()) for run in nominal)
     episodes = sum(len(run.costs) for run in nominal)
+    won, failing = standing.overall["share_won"].value, 100.0 * failed.value
     parts = [
         f"{format_percent(cost)} of nominal's cost"
         + (f" ({', '.join(tiers)})" if tiers[1:] else ""),
-        f"wins {100.0 * standing.overall['share_won'].value:.0f} % of the episodes",
-        f"fails in {100.0 * failed.value:.1f} % (nominal "
-        f"{100.0 * nominal_failures / episodes:.1f} %)",
+        f"wins {100.0 * won:.0f} % of the episodes",
+        f"fails in {failing:.1f} % (nominal {100.0 * nominal_failures / episodes:.1f} %)",
         _describe_gap(standing.overall["score"]),
     ]
     text = f"{standing.label}: {', '.join(parts)}"
     if errors:
         text += f"; not driven in {len(errors)} of {len(standing.results)} contests: {errors[0]}"
     return text
-
-
-def _compute_cost(standing: Standing, tier: str) -> float:
-    """Cost over nominal's in a tier."""
-    logs = [-r for task, (r, _) in standing.pairs.items() if task.tier == tier]
-    return geometric_mean(*logs).value
 
 
 def _describe_gap(score: Estimate) -> str:
@@ -198,7 +172,7 @@ def _describe_gap(score: Estimate) -> str:
 
 
 def _describe_trust(comparison: Comparison) -> str:
-    """On what the numbers rest, and what they do not say."""
+    """Sentence on what the numbers rest, and what they do not say."""
     request = comparison.request
     n = len(request.seeds or range(request.episodes))
     count = len(comparison.tasks)
@@ -207,8 +181,8 @@ def _describe_trust(comparison: Comparison) -> str:
         files = ", ".join(path.name for path in request.files)
         return (
             f"Publishable: {where} on seeds drawn after {files} were hashed; --salt "
-            f"{comparison.salt} "
-            "repeats them. Everybody driven anew. Not said: other cars, manoeuvres and sensors."
+            f"{comparison.salt} repeats them. Everybody driven anew. "
+            "Not said: other cars, manoeuvres and sensors."
         )
     whose = "the given" if request.salt else "the package's own"
     seeds = f"of {whose} salt {comparison.salt}" if comparison.salt else "of the caller's choice"
@@ -220,23 +194,17 @@ def _describe_trust(comparison: Comparison) -> str:
 
 
 def make_table(comparison: Comparison) -> ResultTable:
-    """Everybody over all contests, the best first; the user's own are marked."""
+    """Make the table of everybody over all tasks, the best first; the user's own are marked."""
     labels, cells = {entry.label for entry in comparison.request.entries}, []
     for standing in comparison.overall:
         numbers = [standing.overall.get(name) for name in ("cost_vs_nominal", "share_won", "score")]
         cost, won, score = (Estimate(math.nan) if n is None else n for n in numbers)
-        cells.append(
-            [
-                f"> {standing.label}"
-                if standing.label in labels
-                else _label_baseline(standing.label),
-                _format_text(cost, 100.0, ".0f"),
-                _format_text(Estimate(won.value), 100.0, ".0f"),
-                _format_text(Estimate(standing.overall["failure_rate"].value), 100.0, ".1f"),
-                _format_text(score, 1.0, ".2f"),
-                str(standing.n),
-            ]
-        )
+        label = standing.label
+        baseline = f"{label} (lqr on {REFERENCE_FILTER})" if label == NOMINAL else label
+        failed = Estimate(standing.overall["failure_rate"].value)
+        texts = [_format_text(cost, 100.0, ".0f"), _format_text(Estimate(won.value), 100.0, ".0f")]
+        texts += [_format_text(failed, 100.0, ".1f"), _format_text(score, 1.0, ".2f")]
+        cells.append([f"> {label}" if label in labels else baseline, *texts, str(standing.n)])
     header = ("contestant", "cost, % [95 %]", "won, %", "fails, %", "score [95 %]", "episodes")
     note = (
         "> yours. Cost in percent of nominal's, the paired geometric mean of the episodes that "
@@ -244,10 +212,6 @@ def make_table(comparison: Comparison) -> ResultTable:
         "that knows the nominal car, 1 oracle-state, which knows state and car."
     )
     return ResultTable("Your contestants and the package's", header, cells, note)
-
-
-def _label_baseline(label: str) -> str:
-    return f"{label} (lqr on {REFERENCE_FILTER})" if label == NOMINAL else label
 
 
 def _format_text(number: Estimate, scale: float, digits: str) -> str:
@@ -293,13 +257,9 @@ class Score:
         return pd.DataFrame(list(self.contests))
 
 
-_NONE = Estimate(float("nan"))
-_COLUMNS = {
-    "score": "score",
-    "cost": "cost_vs_nominal",
-    "won": "share_won",
-    "failures": "failure_rate",
-}
+_NONE = Estimate(math.nan)
+_COLUMNS = {"score": "score", "cost": "cost_vs_nominal"}
+_COLUMNS |= {"won": "share_won", "failures": "failure_rate"}
 
 
 def score(
@@ -353,9 +313,7 @@ def score(
     rows = []
     for task, result in standing.results.items():
         numbers = standing.by_task.get(task, {})
-        row: dict[str, Any] = {
-            "tier": task.tier, "env_id": task.env_id, "scenario": task.scenario
-        }  # fmt: skip
+        row: dict[str, Any] = {key: getattr(task, key) for key in ("tier", "env_id", "scenario")}
         for name, metric in _COLUMNS.items():
             number = numbers.get(metric, _NONE)
             row |= {name: number.value, f"{name}_low": number.low, f"{name}_high": number.high}
@@ -363,15 +321,10 @@ def score(
         rows.append(row | {"n": len(pairs[0]) if pairs else 0, "error": result.error})
     overall = {name: standing.overall.get(metric, _NONE) for name, metric in _COLUMNS.items()}
     errors = [row["error"] for row in rows]
-    return Score(
-        standing.entry.controller,
-        standing.entry.estimator,
-        **overall,
-        n=standing.n,
-        contests=tuple(rows),
-        error=errors[0] if all(errors) else "",
-        text=make_sentence(standing),
-    )
+    error, text = errors[0] if all(errors) else "", make_sentence(standing)
+    facts: dict[str, Any] = {"n": standing.n, "contests": tuple(rows), "error": error, "text": text}
+    facts |= overall
+    return Score(standing.entry.controller, standing.entry.estimator, **facts)
 
 
 _TEXT = "Everybody drives the same episodes; an agent of yours on nominal's filter, or on yours."
@@ -383,7 +336,7 @@ def run(
     console: Console | None = None,
     keep: Path | None = None,
 ) -> Suite:
-    """A challenge, driven. keep: a folder for the baselines' finished cases."""
+    """Drive a request and make its suite; keep: folder of the baselines' finished cases."""
     comparison = compare(request, jobs, console, keep)
     suite = Suite("control", "Your own beside the package's", _TEXT)
     suite.verdict = "\n".join(compose_verdict(comparison))

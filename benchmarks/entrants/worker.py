@@ -1,6 +1,6 @@
-"""The process of a contestant as its driver sees it: asked, watched, ended.
+"""A user's agent or estimators in a process of their own, as their driver asks, watches, ends it.
 
-A user's contestant in a process of its own, which never holds the env, its seeds or a result.
+The process never holds the env, its seeds or a result.
 """
 
 import json
@@ -39,18 +39,12 @@ _LONGEST = 2**16  # bytes of an answer beside its numbers
 _START = f"from {__package__}.child import main; main()"
 
 
-class ContestantError(Exception):
-    """Why a contestant gave no answer."""
+class _ContestantError(Exception):
+    """Why an entry gave no answer."""
 
 
-class ChildProcess:
-    """The process of a contestant, and the one way to ask it.
-
-    Args:
-        texts: What it is made of; its stack is searched for these files.
-        limit: Seconds of wall time that all its answers may take.
-        allowed: Of `ChildSettings`.
-    """
+class _ChildProcess:
+    """The process of texts that make an entry; `limit`: wall time (s) that all answers may take."""
 
     def __init__(
         self, texts: Sequence[str], limit: float, allowed: Iterable[str] | None = None
@@ -59,8 +53,8 @@ class ChildProcess:
         self._folder = TemporaryDirectory(prefix="sideslip-")
         self._log = TemporaryFile()  # noqa: SIM115  # closed with the process
         scratch = self._folder.name
-        variables = {"OPENBLAS_NUM_THREADS": "1", **os.environ}
-        variables |= {"PYTHONPATH": os.pathsep.join(sys.path), "SIDESLIP_QUIET": "1"}
+        variables = {"OPENBLAS_NUM_THREADS": "1", **os.environ, "SIDESLIP_QUIET": "1"}
+        variables |= {"PYTHONPATH": os.pathsep.join(sys.path)}
         variables |= {"XDG_CACHE_HOME": scratch, "TMPDIR": scratch}
         variables.pop("NUMBA_CACHE_DIR", None)
         for layer in LAYERS:  # kernels of its own: it may read ours, and write none of them
@@ -89,20 +83,12 @@ class ChildProcess:
         self._left = self._limit = limit
 
     def call(self, *message: Any, length: int | None = None) -> bytes:
-        """Send a message and return the answer.
+        """Ask for a method of `_EntryServer` by name; the answer's bytes, of a known length.
 
-        Args:
-            message: A method of `Contestant` by name, and its arguments.
-            length: Bytes of the answer, where they are known.
-
-        Returns:
-            The answer's bytes.
-
-        Raises:
-            ContestantError: The contestant failed, ended, was too slow or sent something else.
+        Raises _ContestantError where it failed, ended, was too slow or sent something else.
         """
         if self.reason:
-            raise ContestantError(self.reason)
+            raise _ContestantError(self.reason)
         start_time, late = time.monotonic(), False
         try:
             self._pipe.send(message)
@@ -119,10 +105,10 @@ class ChildProcess:
         elif length is not None and len(content) != length:
             self.reason = f"its process sent {len(content)} bytes where {length} are right"
         if self.reason:
-            raise ContestantError(self.reason)
+            raise _ContestantError(self.reason)
         return content
 
-    def __deepcopy__(self, memo: Any) -> "ChildProcess":
+    def __deepcopy__(self, memo: Any) -> "_ChildProcess":
         return self  # in a copy of a wrapper's recorded arguments, too, there is one process
 
     def _stop(self) -> None:
@@ -144,9 +130,8 @@ class ChildProcess:
         self._stop()
         status = self._process.wait()
         self._log.seek(max(self._log.seek(0, os.SEEK_END) - _LONGEST, 0))
-        text, _, stack = (
-            self._log.read().decode(errors="replace").partition("(most recent call first)")
-        )
+        log = self._log.read().decode(errors="replace")
+        text, _, stack = log.partition("(most recent call first)")
         if late:
             return f"no end within {self._limit:g} s{find_place(self._texts, stack)}"
         last = (text.strip().splitlines() or [""])[-1]
@@ -176,16 +161,10 @@ def find_place(texts: Sequence[str], stack: str) -> str:
 LIMIT = 600.0  # s of wall time a cell
 
 
-class RemoteAgent:
-    """The agent of a child, as `make_agent` takes a factory and an agent.
+class _RemoteAgent:
+    """The agent that a child makes of a text, as `make_agent` takes a factory."""
 
-    Args:
-        child: Where it is built and asked.
-        source: The text of which the child makes it.
-        trust: Whether the child may read a zip.
-    """
-
-    def __init__(self, child: ChildProcess, source: str, trust: bool = False) -> None:
+    def __init__(self, child: _ChildProcess, source: str, trust: bool) -> None:
         self._child, self._source, self._trust = child, source, trust
 
     def __call__(self, env: Any, **options: Any) -> "_RemotePolicy":
@@ -196,28 +175,23 @@ class RemoteAgent:
 
 
 class _RemotePolicy:
-    def __init__(self, child: ChildProcess, shape: tuple[int, int]) -> None:
+    def __init__(self, child: _ChildProcess, shape: tuple[int, int]) -> None:
         self._child, self._shape = child, shape
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Any, Any]:  # fmt: skip
-        """The child's actions, float32 (rows, width); its memory stays there."""
+        """Return the child's actions, float32 (rows, width); its memory stays there."""
         length = 4 * self._shape[0] * self._shape[1]
         answer = self._child.call("predict", observation, episode_start, length=length)
         return np.frombuffer(answer, np.float32).reshape(self._shape), None
 
 
-class RemoteEstimators:
-    """The estimators of a child, as `make_estimator` takes a factory.
+class _RemoteEstimators:
+    """The estimators that a child makes of a text, as `make_estimator` takes a factory."""
 
-    Args:
-        child: Where they are built and asked.
-        source: The text of which the child makes them.
-    """
-
-    def __init__(self, child: ChildProcess, source: str) -> None:
+    def __init__(self, child: _ChildProcess, source: str) -> None:
         self._child, self.name, self._rows = child, source, 0
 
     def __call__(self, **arguments: Any) -> "_RemoteRow":
@@ -226,13 +200,13 @@ class RemoteEstimators:
         return _RemoteRow(self._child, self.name, row, arguments)
 
 
-class RemoteBatch(ForeignBatch):
+class _RemoteBatch(ForeignBatch):
     """The estimators of a child, all rows in one message."""
 
     def take(
         self, mask: Any, fast: Any, rows: Any, packets: Any, counts: Any, *observed: Any
     ) -> None:
-        """As `BatchEstimator.take`."""
+        """Process some rows, as `BatchEstimator.take`."""
         obs, inner, plan, limits, *others = observed
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
         remote: list[Any] = [self[i].inner for i in chosen.tolist()]
@@ -249,23 +223,23 @@ class RemoteBatch(ForeignBatch):
 class _RemoteRow:
     """One estimator of a child, as an `EstimatorLike`."""
 
-    batch = RemoteBatch
+    batch = _RemoteBatch
     x: Any = None
     P: Any = None
 
     def __init__(
-        self, child: ChildProcess, source: str, row: int, arguments: dict[str, Any]
+        self, child: _ChildProcess, source: str, row: int, arguments: dict[str, Any]
     ) -> None:
         self.child, self.row = child, row
         names = json.loads(child.call("estimator", row, source, arguments))
         self.names = tuple(names) if isinstance(names, list) else ()
 
     def reset(self, sensors: Mapping[str, SlowSensor], first: int) -> None:
-        """As `EstimatorLike.reset`."""
+        """Start anew, as `EstimatorLike.reset`."""
         self.child.call("reset", self.row, dict(sensors), first)
 
     def step(self, rows: Any, packets: Any) -> None:
-        """As `EstimatorLike.step`."""
+        """Process records, as `EstimatorLike.step`."""
         self.take([self], [(self.row, rows, packets)])
 
     @staticmethod
@@ -279,7 +253,7 @@ class _RemoteRow:
             row.x, row.P = values[:n], values[n:].reshape(n, n)
 
 
-def is_foreign(source: Any) -> bool:
+def _is_foreign(source: Any) -> bool:
     """Whether a text names code that is not the package's."""
     return isinstance(source, str) and (
         is_user_file(source) or source.endswith(ZIP) or ":" in source
@@ -287,28 +261,24 @@ def is_foreign(source: Any) -> bool:
 
 
 def run_user_chunk(chunk: Chunk) -> DriveResult:
-    """`run_chunk`; a cell of which every episode ends by an action that is none was not driven."""
-    result = run_chunk(chunk)
-    if not result.error and result.mark_failures("bad-action").all():
-        return _make_failed_result(
-            chunk, "every action is NaN, or infinite, before an episode is over"
-        )
-    return result
+    """Run a chunk; an entry whose every episode ends by an action that is none was not driven."""
+    result, wrong = run_chunk(chunk), "every action is NaN, or infinite, before an episode is over"
+    failed = not result.error and result.mark_failures("bad-action").all()
+    return _make_failed_result(chunk, wrong) if failed else result
 
 
 def run_isolated_chunk(
     chunk: Chunk, limit: float = LIMIT, allowed: Iterable[str] | None = None
 ) -> DriveResult:
-    """`run_user_chunk`, but what is not the package's code runs in a child of its own, agent and
-    estimator apart.
+    """Run a chunk as `run_user_chunk`, but agent and estimator of a user in a child of their own.
 
     Args:
-        chunk: Whose contestants are names and files.
-        limit: Seconds of wall time.
-        allowed: Files that a child may open, of `Start`.
+        chunk: Chunk whose entry has names and files.
+        limit: Wall time (s).
+        allowed: Files that a child may open, of `ChildSettings`.
 
     Returns:
-        The episodes.
+        Episodes.
     """
     return _run_isolated_chunk(chunk, limit, allowed)[0]
 
@@ -321,25 +291,26 @@ def run_rehearsal(chunk: Chunk, limit: float = LIMIT) -> tuple[DriveResult, set[
 def _run_isolated_chunk(
     chunk: Chunk, limit: float, allowed: Iterable[str] | None
 ) -> tuple[DriveResult, set[str]]:
-    entry, children, opened = chunk.entry, list[ChildProcess](), set[str]()
+    """Episodes of a chunk, and the files that its children opened."""
+    entry, children, opened = chunk.entry, list[_ChildProcess](), set[str]()
     objects = dict(entry.objects)
     try:
         for part in ("controller", "estimator"):
             source = getattr(entry, part)
-            if part in objects or not is_foreign(source):
+            if part in objects or not _is_foreign(source):
                 continue
-            child = ChildProcess((entry.controller, entry.estimator), limit, allowed)
+            child = _ChildProcess((entry.controller, entry.estimator), limit, allowed)
             children.append(child)
             trust = bool(entry.best["controller"].get("trust"))
-            agent = part == "controller"
+            is_agent = part == "controller"
             objects[part] = (
-                RemoteAgent(child, source, trust) if agent else RemoteEstimators(child, source)
+                _RemoteAgent(child, source, trust) if is_agent else _RemoteEstimators(child, source)
             )
         result = run_user_chunk(replace(chunk, entry=replace(entry, objects=objects)))
         for child in children:
             if not child.reason:
                 opened.update(json.loads(child.call("opened")))
-    except ContestantError as error:
+    except _ContestantError as error:
         result = _make_failed_result(chunk, str(error))
     finally:
         spent = sum(child.close() for child in children)

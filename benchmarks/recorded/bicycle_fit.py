@@ -29,14 +29,14 @@ from ...envs.vehicle.tyres import LINEAR, TYRE_LAWS, TyreInputs, compute_tyre_lo
 from .emulate import compute_ground_speed, compute_heading
 from .quality import estimate_noise_levels
 
-STEP, SMOOTH = 0.01, 0.03  # s: of the fit's grid, of the mean over a log's rows
-BURN, WINDOW, MARGIN = 1.0, 4.0, 0.3  # s: forgets the start, counts, lets channels be late
-MIN_SPEED = 4.0  # m/s, in a window
-STRETCHES = 40  # at most, of the log, which the intervals take for independent
+_STEP, _SMOOTH = 0.01, 0.03  # s: of the fit's grid, of the mean over a log's rows
+_BURN, _WINDOW, _MARGIN = 1.0, 4.0, 0.3  # s: forgets the start, counts, lets channels be late
+_MIN_SPEED = 4.0  # m/s, in a window
+_STRETCHES = 40  # at most, of the log, which the intervals take for independent
 
 
 class Theta(NamedTuple):
-    """What is fitted; the first three are logarithms of factors on the stated car."""
+    """Fitted parameters; the first three are logarithms of factors on the stated car."""
 
     front: float = 0.0
     rear: float = 0.0
@@ -52,53 +52,49 @@ class Theta(NamedTuple):
 
 
 _STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-3, 1e-3, 4e-3, 4e-3, 4e-3])  # of slopes
-_LOW = np.array([-2.0, -2.0, -2.0, -np.inf, -0.5, -0.5, -5.0, 0.3, -MARGIN, -MARGIN, -MARGIN])
-_HIGH = np.array([2.0, 2.0, 2.0, np.inf, 0.5, 0.5, 5.0, 3.0, MARGIN, MARGIN, BURN])
-STATED = Theta()
+_LOW = np.array([-2.0, -2.0, -2.0, -np.inf, -0.5, -0.5, -5.0, 0.3, -_MARGIN, -_MARGIN, -_MARGIN])
+_HIGH = np.array([2.0, 2.0, 2.0, np.inf, 0.5, 0.5, 5.0, 3.0, _MARGIN, _MARGIN, _BURN])
+_STATED = Theta()
 PRIOR = Theta(0.4, 0.4, 0.2, 0.05, 0.01, 0.01, 0.5, 0.1, 0.1, 0.1, 0.3)
-"""Standard deviations of the priors, whose centres are stated; of the gain its share. Both
-stiffnesses and the inertia scaled together leave the yaw rate nearly as it is, so that of the
-inertia, which is one of I/(m l_f l_r), is narrow."""
+"""Standard deviations of the priors around the stated values; of the gain a fraction. That of the
+inertia, one of I/(m l_f l_r), is narrow: with both stiffnesses it leaves the yaw rate as it is."""
 
 
 @dataclass(frozen=True)
 class Windows:
     """Drives on the fit's grid and where windows start on it.
 
-    rows: (8, n), smoothed gyro, accel_y, speed, steering, left and right torque, of which the last
-    three acted until their row; the integral of the gyro, and the GPS's course less that, NaN in
-    rows without a fix. starts: (count,). stretch: (count,), of which stretch of the log each
-    window is. dt: s. accel: whether the acceleration was logged. course: whether a window has
-    fixes. tyres: of `TYRE_LAWS`; the body rolls where they are not linear. centre, spread: means
-    and standard deviations of the priors.
+    Rows are smoothed gyro, accel_y, speed, steering, left and right torque, of which the last three
+    acted until their row; the integral of the gyro, and the GPS's course less that, NaN without a
+    fix.
     """
 
-    rows: Array
-    starts: npt.NDArray[np.int64]
-    stretch: npt.NDArray[np.int64]
-    dt: float
-    accel: bool
-    course: bool
-    tyres: str = "linear"
-    centre: Theta = STATED
-    spread: Theta = PRIOR
+    rows: Array  # channels, shape (8, n)
+    starts: npt.NDArray[np.int64]  # first row of each window, shape (count,)
+    stretch: npt.NDArray[np.int64]  # stretch of the log of each window, shape (count,)
+    dt: float  # step (s)
+    accel: bool  # whether the acceleration was logged
+    course: bool  # whether a window has fixes
+    tyres: str = "linear"  # law in `TYRE_LAWS`; the body rolls where they are not linear
+    centre: Theta = _STATED  # means of the priors
+    spread: Theta = PRIOR  # standard deviations of the priors
 
     @property
     def scored_rows(self) -> npt.NDArray[np.int64]:
-        """(count, rows): places of the rows that count."""
-        first, count = round(BURN / self.dt), round(WINDOW / self.dt)
+        """Places of the rows that count, shape (count, rows)."""
+        first, count = round(_BURN / self.dt), round(_WINDOW / self.dt)
         return self.starts[:, None] + np.arange(first + 1, first + count + 1)
 
     def select(self, wanted: npt.NDArray[np.bool_]) -> "Windows":
-        """Those of a mask."""
+        """Select the windows of a mask."""
         return replace(self, starts=self.starts[wanted], stretch=self.stretch[wanted])
 
 
 def make_windows(logs: Sequence[Log], left_out: Sequence[npt.NDArray[np.bool_]]) -> Windows:
-    """Windows of drives of one dt; left_out: of each drive, the rows that are not to be used."""
+    """Make windows of drives of one dt; left_out: mask of each drive's rows that are not used."""
     dt, first = logs[0].record.dt, 0
-    every, width = max(round(STEP / dt), 1), max(round(SMOOTH / dt), 1)
-    before, after = (round(s / (every * dt)) for s in (MARGIN, BURN + WINDOW + 2.0 * MARGIN))
+    every, width = max(round(_STEP / dt), 1), max(round(_SMOOTH / dt), 1)
+    before, after = (round(s / (every * dt)) for s in (_MARGIN, _BURN + _WINDOW + 2.0 * _MARGIN))
     pieces, starts = [], []
     for log, out in zip(logs, left_out, strict=True):
         fast = log.record.fast.T
@@ -113,14 +109,14 @@ def make_windows(logs: Sequence[Log], left_out: Sequence[npt.NDArray[np.bool_]])
         bad = np.maximum.reduceat(out, np.arange(0, len(out), every))
         rows = rows[:, ::every]
         rows[7] = _compute_courses(log, every, rows.shape[1])
-        for start in range(before, rows.shape[1] - after, round(WINDOW / (every * dt))):
+        for start in range(before, rows.shape[1] - after, round(_WINDOW / (every * dt))):
             piece = slice(start, start + after)
-            if not bad[piece].any() and rows[2, piece].min() >= MIN_SPEED:
+            if not bad[piece].any() and rows[2, piece].min() >= _MIN_SPEED:
                 starts.append(first + start)
         first += rows.shape[1]
         pieces.append(rows)
     count = len(starts)
-    stretch = np.arange(count) * min(STRETCHES, count) // max(count, 1)
+    stretch = np.arange(count) * min(_STRETCHES, count) // max(count, 1)
     accel = all("accel_y" in log.record.present for log in logs)
     rows = np.ascontiguousarray(np.concatenate(pieces, axis=1))
     windows = Windows(rows, np.array(starts, np.int64), stretch, every * dt, accel, False)
@@ -128,8 +124,7 @@ def make_windows(logs: Sequence[Log], left_out: Sequence[npt.NDArray[np.bool_]])
 
 
 def _compute_courses(log: Log, every: int, count: int) -> Array:
-    """(count,): the GPS's course less the gyro's integral, in every so-manieth row of the log, NaN
-    in those without a fix."""
+    """The GPS's course less the gyro's integral (rad), NaN in rows without a fix, (count,)."""
     courses = np.full(count, np.nan)
     packets = log.record.select_packets("gps")
     fixes = packets[(packets[:, PACKET.quality] > 0.0) & np.isfinite(packets[:, PACKET.value])]
@@ -154,8 +149,7 @@ def _compute_load(rows: Any, i: Any, place: Any, theta: Any, car: Any) -> Any:
 def _simulate_windows(
     rows: Any, starts: Any, theta: Any, fixed: Any, law: int, roll: int, h: float, out: Any
 ) -> None:
-    """Fill out (3, windows, rows) with yaw rate, lateral specific force and sideslip angle at the
-    GPS's antenna by the plant."""
+    """Fill out (3, windows, rows): yaw rate, lateral specific force, sideslip angle of the GPS."""
     m, l_f, l_r, mu = fixed[0], fixed[2], fixed[3], fixed[9]
     car = CarParams(
         m, fixed[1] * np.exp(theta[2]), l_f, l_r, fixed[4] * np.exp(theta[0]),
@@ -185,10 +179,13 @@ def _simulate_windows(
 
 
 def compute_residual(car: Vehicle, theta: Theta, w: Windows) -> Array:
-    """(windows, channels, rows): measured less predicted yaw rate and, if logged, acceleration and
-    course, which begins anew in each window and is 0 in rows without a fix."""
-    first, count = round(BURN / w.dt), round(WINDOW / w.dt)
-    out = np.empty((3, len(w.starts), first + count + round(MARGIN / w.dt)))
+    """Compute measured less predicted channels, shape (windows, channels, rows).
+
+    Yaw rate (rad/s) and, if logged, acceleration (m/s2) and course (rad), which begins anew in each
+    window and is 0 in rows without a fix.
+    """
+    first, count = round(_BURN / w.dt), round(_WINDOW / w.dt)
+    out = np.empty((3, len(w.starts), first + count + round(_MARGIN / w.dt)))
     fixed = np.array([
         car.mass, car.yaw_inertia, car.front_arm, car.rear_arm, car.front_stiffness,
         car.rear_stiffness, car.front_track, car.rear_track, car.wheel_radius, car.friction,
@@ -201,9 +198,8 @@ def compute_residual(car: Vehicle, theta: Theta, w: Windows) -> Array:
     def interpolate_late(values: Array, delay: float) -> Array:
         places = np.arange(first, first + count) - delay / w.dt
         below = np.clip(places.astype(np.int64), 0, out.shape[2] - 2)
-        return np.asarray(
-            values[:, below] + (places - below) * (values[:, below + 1] - values[:, below])
-        )
+        step = values[:, below + 1] - values[:, below]
+        return np.asarray(values[:, below] + (places - below) * step)
 
     rate = w.rows[0][w.scored_rows] - out[0, :, first : first + count] - theta.gyro_bias
     channels = [rate]
@@ -213,11 +209,8 @@ def compute_residual(car: Vehicle, theta: Theta, w: Windows) -> Array:
     if w.course:
         turned = w.rows[6][w.starts[:, None] + np.arange(1, out.shape[2] + 1)]
         moved = out[2] + turned - theta.gyro_bias * w.dt * np.arange(out.shape[2])
-        course = (
-            w.rows[7][w.scored_rows]
-            + w.rows[6][w.scored_rows]
-            - interpolate_late(moved, theta.gps_delay)
-        )
+        course = w.rows[7][w.scored_rows] + w.rows[6][w.scored_rows]
+        course = course - interpolate_late(moved, theta.gps_delay)
         fixes = np.isfinite(course)
         course = np.where(fixes, course, 0.0)
         middle = course.sum(axis=1) / np.maximum(fixes.sum(axis=1), 1)
@@ -226,37 +219,30 @@ def compute_residual(car: Vehicle, theta: Theta, w: Windows) -> Array:
 
 
 def compute_errors(car: Vehicle, theta: Theta, w: Windows) -> Array:
-    """RMS of the residual of yaw rate and, if logged, acceleration, in rad/s and m/s2."""
-    return np.asarray(np.sqrt(np.mean(compute_residual(car, theta, w) ** 2, axis=(0, 2))))[
-        : 1 + w.accel
-    ]
+    """Compute the RMS of the residual of yaw rate (rad/s) and, if logged, acceleration (m/s2)."""
+    squares = np.mean(compute_residual(car, theta, w) ** 2, axis=(0, 2))
+    return np.asarray(np.sqrt(squares))[: 1 + w.accel]
 
 
 @dataclass(frozen=True)
 class BicycleFit:
-    """A fitted `Theta`, its free ones, and every stretch's normal equations there.
+    """A fitted `Theta`, its n free parameters, and every stretch's normal equations there."""
 
-    scale: of the channels' residuals, by which the fit is weighted. H (stretches, n, n), g
-    (stretches, n): curvature and slope of each stretch's squares by the n free ones. prior, pull
-    (n,): those of the priors, which belong to no stretch.
-    """
-
-    theta: Theta
-    free: tuple[str, ...]
-    scale: Array
-    H: Array
-    g: Array
-    prior: Array
-    pull: Array
+    theta: Theta  # fitted parameters
+    free: tuple[str, ...]  # names of the free ones
+    scale: Array  # standard deviations of the channels' residuals, by which the fit is weighted
+    H: Array  # curvature of each stretch's squares, shape (stretches, n, n)
+    g: Array  # slope of each stretch's squares, shape (stretches, n)
+    prior: Array  # curvature of the priors, which belong to no stretch, shape (n,)
+    pull: Array  # slope of the priors, shape (n,)
 
     def estimate_shift(self, left_out: npt.NDArray[np.bool_]) -> Array:
-        """(n,) by how much the free ones move, to first order, when stretches are left out."""
+        """Estimate how the free ones move when stretches are left out, to first order, (n,)."""
         rest = self.H[~left_out].sum(axis=0) + np.diag(self.prior)
         return np.asarray(-np.linalg.solve(rest, self.g[~left_out].sum(axis=0) + self.pull))
 
     def half(self, name: str) -> float:
-        """Half of the 95 % interval; infinite if it is not free: a jackknife over stretches, and
-        that the truth may lie beside the priors."""
+        """Half of the 95 % interval: a jackknife, and the priors' part; infinite if not free."""
         count = len(self.g)
         if name not in self.free or count < 2:
             return float("inf")
@@ -270,7 +256,7 @@ class BicycleFit:
 def fit(
     car: Vehicle, w: Windows, start: Theta, free: Sequence[str], scale: Array | None = None
 ) -> BicycleFit:
-    """Least squares of the `free` ones of `start`; scale: of the channels, None: found here."""
+    """Fit the `free` parameters by least squares; scale: of the channels, None: estimated."""
     at = [Theta._fields.index(name) for name in free]
     low, high, centre, sd = _LOW[at], _HIGH[at], np.array(w.centre)[at], np.array(w.spread)[at]
     steps = (_STEPS * (1, 1, 1, abs(start.gain), *7 * (1,)))[at]
@@ -299,10 +285,8 @@ def fit(
             xtol=1e-6, ftol=1e-7,
         )  # fmt: skip
         x = solution.x
-    J, r = (
-        part[: -len(at)].reshape(len(w.starts), -1, *part.shape[1:])
-        for part in (solution.jac, solution.fun)
-    )
+    flat = (part[: -len(at)] for part in (solution.jac, solution.fun))  # without the priors' rows
+    J, r = (part.reshape(len(w.starts), -1, *part.shape[1:]) for part in flat)
     membership = (w.stretch[:, None] == np.unique(w.stretch)).astype(float)  # (windows, stretches)
     H = np.einsum("ws,wki,wkj->sij", membership, J, J, optimize=True)
     g = np.einsum("ws,wki,wk->si", membership, J, r, optimize=True)

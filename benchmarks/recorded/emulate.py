@@ -1,4 +1,4 @@
-"""The course of a recorded drive, and one made of sideslip truth and gyro where it has none."""
+"""Course, speed and path of a recorded drive, and a GPS course made of its truth and gyro."""
 
 import dataclasses
 import math
@@ -13,21 +13,24 @@ from ...envs.recordings.log_file import make_packet_rows
 from ...envs.sensors.gps import COURSE_SPEED
 from ...envs.sensors.link import SlowSensor
 
-FAST_ENOUGH = 4.0  # m/s, below which nothing of a drive is judged
+_MIN_SPEED = 4.0  # m/s, below which nothing of a drive is judged
 _NOT_NEGATIVE = ("course_noise_deg", "delay")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Emulation:
-    """What is put on top of a recorded drive.
+    """A GPS course and a gyro bias put on top of a recorded drive.
 
-    course_rate: Hz; one sample every so many whole rows of the log. course_noise_deg: standard
-    deviation in deg. delay: s the course arrives late. bias_deg: constant error of the course in
-    deg. gyro_bias_degps: added to the gyro that estimators see, in deg/s; the emulated heading
-    goes without it.
+    Attributes:
+        course_rate: Rate of the course (Hz), a sample every so many whole rows of the log.
+        course_noise_deg: Standard deviation of the course (deg).
+        delay: Delay of the course (s).
+        bias_deg: Constant error of the course (deg).
+        gyro_bias_degps: Bias of the gyro that estimators see (deg/s), not of the emulated heading.
 
-    Raises ValueError for values that are not finite, a rate that is not positive, a negative noise
-    or delay.
+    Raises:
+        ValueError: A value that is not finite, a rate that is not positive, a negative noise or
+            delay.
     """
 
     course_rate: float = 10.0
@@ -56,17 +59,17 @@ class Emulation:
         return round(1.0 / (self.course_rate * dt))
 
     def add_gyro_bias(self, log: Log) -> Log:
-        """The log with the gyro's bias added."""
+        """Return the log with the gyro's bias added."""
         fast = log.record.fast.copy()
         fast[:, FAST.gyro] += math.radians(self.gyro_bias_degps)
         return dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
 
     def add_course(self, log: Log, seed: int) -> Log:
-        """The log with the gyro's bias and a GPS that measures the course, and nothing else.
+        """Return the log with the gyro's bias and a GPS that measures the course, nothing else.
 
         course = sideslip truth + integral of the logged yaw rate + bias + noise. Samples stand on
-        ticks that are whole periods; there is none where the truth is unknown, quality is 0 below
-        1 m/s, and values other than the course are NaN. Raises ValueError without truth.
+        ticks that are whole periods, none where the truth is unknown; quality is 0 below 1 m/s.
+        Raises ValueError without truth.
         """
         if "beta" not in log.truth:
             raise ValueError(f"{log.name}: a course cannot be emulated without sideslip truth")
@@ -89,31 +92,31 @@ class Emulation:
 
 
 def compute_heading(log: Log) -> Array:
-    """The integral of the logged yaw rate in rad, 0 at the first row; (rows,)."""
+    """Integrate the logged yaw rate to a heading (rad), 0 at the first row, shape (rows,)."""
     gamma = log.record.fast[:, FAST.gyro]
     steps = 0.5 * (gamma[1:] + gamma[:-1]) * log.record.dt
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def compute_ground_speed(log: Log) -> Array:
-    """The mean speed of the front wheels in m/s; (rows,)."""
+    """Compute the mean speed of the front wheels (m/s), shape (rows,)."""
     fast = log.record.fast
     return np.asarray(0.5 * (fast[:, FAST.wheel_left] + fast[:, FAST.wheel_right]))
 
 
 def find_moving(log: Log) -> npt.NDArray[np.bool_]:
-    """The rows that are fast enough to judge."""
-    return np.asarray(compute_ground_speed(log) > FAST_ENOUGH)
+    """Mark the rows that are fast enough to judge."""
+    return np.asarray(compute_ground_speed(log) > _MIN_SPEED)
 
 
 def find_backward(log: Log) -> npt.NDArray[np.bool_]:
-    """The rows that are driven backward: at a negative speed, or with a truth about half a turn."""
+    """Mark the rows driven backward: at a negative speed, or with a truth about half a turn."""
     turn = np.abs(np.nan_to_num(log.truth.get("beta", np.zeros(len(log.time))))) / math.pi
     return np.asarray((compute_ground_speed(log) < 0.0) | ((turn > 0.75) & (turn < 1.01)))
 
 
 def compute_path(log: Log, beta: Array) -> tuple[Array, Array]:
-    """Dead reckoning: (x, y) in m from speed, heading and a sideslip angle; (rows,) each."""
+    """Compute x and y (m) by dead reckoning with a sideslip angle (rad), shape (rows,) each."""
     psi = compute_heading(log)
     v_x = compute_ground_speed(log)
     v_y = v_x * np.tan(np.nan_to_num(beta))
@@ -123,15 +126,15 @@ def compute_path(log: Log, beta: Array) -> tuple[Array, Array]:
 
 
 def compute_course_steps(logs: Sequence[Log], lag: float) -> Array:
-    """(5, steps) between fixes at least `lag` s apart, in rad: the course before and after, and the
-    change of course, integral of the gyro and sideslip, by the truth or else by accel_y."""
+    """Compute steps between fixes at least `lag` (s) apart, in rad, shape (5, steps).
+
+    The course before and after; the changes of course, of the integral of the gyro, and of
+    sideslip, by the truth or else by accel_y.
+    """
     parts = [np.zeros((5, 0))]
     for log in (log for log in logs if "gps" in log.slow):
-        fixes, speed, dt = (
-            log.record.select_packets("gps"),
-            compute_ground_speed(log),
-            log.record.dt,
-        )
+        fixes = log.record.select_packets("gps")
+        speed, dt = compute_ground_speed(log), log.record.dt
         place = fixes[:, PACKET.captured].astype(int) - log.record.first
         good = (fixes[:, PACKET.quality] > 0.0) & (place >= 0) & (place < len(log.time))
         good[good] &= (find_moving(log) & ~find_backward(log))[place[good]]
@@ -140,7 +143,7 @@ def compute_course_steps(logs: Sequence[Log], lag: float) -> Array:
             continue
         usual = max(float(np.median(np.diff(place))), 1.0)
         n = max(math.ceil(lag / (usual * dt) - 1e-9), 1)
-        turned = np.cumsum(log.record.fast[:, FAST.accel_y] / np.maximum(speed, FAST_ENOUGH)) * dt
+        turned = np.cumsum(log.record.fast[:, FAST.accel_y] / np.maximum(speed, _MIN_SPEED)) * dt
         slip = (turned - compute_heading(log)) * ("accel_y" in log.record.present)
         slip = log.truth.get("beta", slip)
         columns = np.stack([np.unwrap(course), compute_heading(log)[place], slip[place]])

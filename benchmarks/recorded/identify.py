@@ -36,16 +36,16 @@ from .suite import GYRO_ONLY
 from .wires import SignalCalibration, apply_wires
 
 TYRES = ("linear", "fiala")
-MIN_WINDOWS = 6
-MIN_TURNING = 0.3  # m/s2, RMS of speed x yaw rate
-MILD = 5.0  # m/s2; beyond, a saturating axle looks like another steering ratio
-MAX_FRICTION_SHARE = 0.8  # of the stated friction's acceleration, beyond which that is in doubt
-MAX_RATIO_FACTOR = 2.5  # within this factor of the stated ratio, that one may be right
-MAX_ERROR_RATIO = 0.98  # of the error on held-out stretches, at most, where a latency is applied
-FOLDS = 4
+_MIN_WINDOWS = 6
+_MIN_TURNING = 0.3  # m/s2, RMS of speed x yaw rate
+_MILD = 5.0  # m/s2; beyond, a saturating axle looks like another steering ratio
+_MAX_FRICTION_SHARE = 0.8  # of the stated friction's acceleration, beyond which that is in doubt
+_MAX_RATIO_FACTOR = 2.5  # within this factor of the stated ratio, that one may be right
+_MAX_ERROR_RATIO = 0.98  # of the error on held-out stretches, at most, where a latency is applied
+_FOLDS = 4
 POSSIBLE = (0.6, 1.3)  # I/(m l_f l_r) of cars
-MAX_INTERVAL_SHARE = 0.5  # of the prior's interval, the widest one with which a number is told
-UNKNOWN_GAIN = 0.3  # standard deviation of its share, where no stated ratio is near
+_MAX_INTERVAL_SHARE = 0.5  # of the prior's interval, the widest one with which a number is told
+_UNKNOWN_GAIN = 0.3  # standard deviation of its share, where no stated ratio is near
 _DELAYS = {"steer_delay": "steer", "accel_delay": "accel_y"}
 _OF_ACCEL = ("accel_bias", "accel_gain")
 _OF_CAR = {"front": "front_stiffness", "rear": "rear_stiffness", "inertia": "yaw_inertia"}
@@ -59,20 +59,14 @@ _NOTE = (
 
 @dataclass
 class IdentificationResult:
-    """What a log has shown.
-
-    car, wires: the stated ones with the numbers that were found. rates: RMS in rad/s of what the
-    stated car, the found one, and the found one on stretches that its fit had not seen, leave of
-    the yaw rate over 4 s. slips: RMS beside the log's own sideslip in rad, stated and found.
-    reason: why nothing was found of the car, "" otherwise.
-    """
+    """The car and calibration that a log shows: the stated ones with the identified numbers."""
 
     car: Vehicle
     wires: SignalCalibration
     findings: list[Finding] = field(default_factory=list)
-    rates: tuple[float, ...] = ()
-    slips: tuple[float, ...] = ()
-    reason: str = ""
+    rates: tuple[float, ...] = ()  # RMS of yaw rate's residual (rad/s): stated, fitted, held out
+    slips: tuple[float, ...] = ()  # RMS beside the log's sideslip (rad): stated, fitted
+    reason: str = ""  # why nothing is known of the car
     remarks: list[str] = field(default_factory=list)
 
 
@@ -84,10 +78,19 @@ def identify(
 ) -> IdentificationResult:
     """Fit the car to the parts of a log, and the noise of its sensors.
 
-    car, wires: the stated ones, where the search starts. tyres: "linear", as stiff as the log's
-    accelerations have them, without roll, or "fiala", as stiff as at small slips, with the stated
-    friction and roll; None: what errs less on held-out stretches. Raises ValueError for swapped
-    columns.
+    Args:
+        logs: Parts of the log.
+        car: Stated car, where the search starts.
+        wires: Stated calibration, where the search starts.
+        tyres: "linear", as stiff as the log's accelerations have them, without roll, or "fiala", as
+            stiff as at small slips, with the stated friction and roll; None: what errs less on
+            held-out stretches.
+
+    Returns:
+        Car, calibration and findings.
+
+    Raises:
+        ValueError: Swapped columns, or an unknown law of tyres.
     """
     if tyres not in (None, *TYRES):
         raise ValueError(f"tyres are {' or '.join(TYRES)}, got {tyres!r}")
@@ -105,9 +108,9 @@ def identify(
             for _, label, value, unit in _list_parameters(car, stated)
         ]
     else:
-        near = 1.0 / MAX_RATIO_FACTOR < gain / stated.gain < MAX_RATIO_FACTOR
+        near = 1.0 / _MAX_RATIO_FACTOR < gain / stated.gain < _MAX_RATIO_FACTOR
         start = Theta(gain=stated.gain if near else gain, offset=stated.offset)
-        sd = abs(start.gain) * (PRIOR.gain if near else UNKNOWN_GAIN)
+        sd = abs(start.gain) * (PRIOR.gain if near else _UNKNOWN_GAIN)
         w = replace(w, centre=start, spread=PRIOR._replace(gain=sd))
         _fit_car(result, w, near, TYRES if tyres is None else (tyres,))
     slips = _estimate_slips(logs, result.car, result.wires)
@@ -120,11 +123,11 @@ def identify(
 
 
 def _find_reason(w: Windows, related: float) -> str:
-    """Why a log shows nothing of a car, "" if it may."""
-    if len(w.starts) < MIN_WINDOWS:
-        return f"{len(w.starts)} of {MIN_WINDOWS} windows of 5 s are fast enough and whole"
+    """Why a log shows nothing of a car, "" if it may; related: steering to yaw rate."""
+    if len(w.starts) < _MIN_WINDOWS:
+        return f"{len(w.starts)} of {_MIN_WINDOWS} windows of 5 s are fast enough and whole"
     turns = w.rows[2][w.scored_rows] * w.rows[0][w.scored_rows]
-    if np.std(turns) < MIN_TURNING:
+    if np.std(turns) < _MIN_TURNING:
         return f"no excitation, speed x yaw rate has {np.std(turns):.2g} m/s2 RMS"
     if abs(related) < MIN_CORRELATION:
         return f"steering and yaw rate are unrelated (correlation {related:.2f})"
@@ -132,7 +135,7 @@ def _find_reason(w: Windows, related: float) -> str:
 
 
 def _list_parameters(car: Vehicle, wires: SignalCalibration) -> list[tuple[str, str, float, str]]:
-    """(name in `Theta`, label, stated value, unit) of what the car's fit tells."""
+    """Name in `Theta`, label, stated value and unit of what the car's fit tells."""
     return [
         ("front", "front_stiffness_axle", 2.0 * car.front_stiffness, "N/rad"),
         ("rear", "rear_stiffness_axle", 2.0 * car.rear_stiffness, "N/rad"),
@@ -149,21 +152,19 @@ def _fit_car(result: IdentificationResult, w: Windows, near: bool, laws: Sequenc
     """Fill in all that the car's motion tells. near: whether the stated ratio may be right."""
     car, stated = result.car, result.wires
     peak_accel = float(np.percentile(np.abs(w.rows[2] * w.rows[0])[w.scored_rows], 95))
-    held = ["gain"] if near and peak_accel > MILD else []
+    held = ["gain"] if near and peak_accel > _MILD else []
     without = (*held, *(() if w.accel else _OF_ACCEL), *(() if w.course else ("gps_delay",)))
     free = [name for name in (*Theta._fields[:8], "gps_delay") if name not in without]
-    if len(laws) > 1 and peak_accel > MAX_FRICTION_SHARE * car.friction * GRAVITY:
+    if len(laws) > 1 and peak_accel > _MAX_FRICTION_SHARE * car.friction * GRAVITY:
         laws = TYRES[:1]  # the stated friction is not this log's, and Fiala's law lives by it
-    fits = [
-        (replace(w, tyres=law), fit(car, replace(w, tyres=law), w.centre, free)) for law in laws
-    ]
+    by_law = [replace(w, tyres=law) for law in laws]
+    fits = [(windows, fit(car, windows, w.centre, free)) for windows in by_law]
     scale = fits[0][1].scale  # one for all laws
     w, base = min(fits, key=lambda pair: np.linalg.norm(_evaluate_folds(car, *pair) / scale))
     rows, best, free_too = _fit_latencies(car, w, base)
     theta, gain = best.theta, best.theta.gain
-    values = {
-        key: getattr(car, key) * math.exp(getattr(theta, name)) for name, key in _OF_CAR.items()
-    }
+    factors = {key: math.exp(getattr(theta, name)) for name, key in _OF_CAR.items()}
+    values = {key: getattr(car, key) * factor for key, factor in factors.items()}
     fitted = car.replace(**values, name=f"{car.name}-identified")
     result.findings = _make_car_findings(car, stated, w, (best, free_too), held, peak_accel) + rows
     share = fitted.yaw_inertia / (car.mass * car.front_arm * car.rear_arm)
@@ -196,8 +197,7 @@ def _fit_car(result: IdentificationResult, w: Windows, near: bool, laws: Sequenc
 def _fit_latencies(
     car: Vehicle, w: Windows, base: BicycleFit
 ) -> tuple[list[Finding], BicycleFit, BicycleFit]:
-    """Findings of the latencies of steering and accelerometer, the fit with those that pay, and
-    the one in which all are free."""
+    """Findings of both latencies, the fit with those that pay, and the one with all free."""
     names = tuple(_DELAYS)[: 2 if w.accel else 1]
     usual, pays, rows = np.linalg.norm(_evaluate_folds(car, w, base) / base.scale), [], []
     free = fit(car, w, base.theta, (*base.free, *names), base.scale)
@@ -207,26 +207,24 @@ def _fit_latencies(
         if is_determined and abs(value) > half:
             single_fit = fit(car, w, base.theta, (*base.free, name), base.scale)
             share = np.linalg.norm(_evaluate_folds(car, w, single_fit) / base.scale) / usual
-            pays += [name] if share < MAX_ERROR_RATIO else []
+            pays += [name] if share < _MAX_ERROR_RATIO else []
             remark = f"{'' if name in pays else 'not '}applied: error held out x {share:.3f}"
         label = f"latency of {_DELAYS[name]}"
-        rows.append(
-            Finding(label, 0.0, value, half, "s", is_determined, remark if is_determined else WIDE)
-        )
+        text = remark if is_determined else WIDE
+        rows.append(Finding(label, 0.0, value, half, "s", is_determined, text))
     best = fit(car, w, base.theta, (*base.free, *pays), base.scale) if pays else base
     return rows, best, free
 
 
 def _evaluate_folds(car: Vehicle, w: Windows, best: BicycleFit) -> Array:
-    """`errors` on each fold of stretches, of the fit to others."""
+    """RMS of the residual of each channel, on each fold of stretches by the fit to the others."""
     squares, labels = [], np.unique(w.stretch)
-    for fold in range(FOLDS):
-        moves = best.estimate_shift(labels % FOLDS == fold)
+    for fold in range(_FOLDS):
+        moves = best.estimate_shift(labels % _FOLDS == fold)
         moved = {n: getattr(best.theta, n) + m for n, m in zip(best.free, moves, strict=True)}
-        fold_windows = w.select(w.stretch % FOLDS == fold)
-        squares.append(
-            np.mean(compute_residual(car, best.theta._replace(**moved), fold_windows) ** 2, axis=2)
-        )
+        fold_windows = w.select(w.stretch % _FOLDS == fold)
+        theta = best.theta._replace(**moved)
+        squares.append(np.mean(compute_residual(car, theta, fold_windows) ** 2, axis=2))
     return np.asarray(np.sqrt(np.mean(np.concatenate(squares), axis=0)))
 
 
@@ -238,13 +236,12 @@ def _make_car_findings(
     held: Sequence[str],
     peak_accel: float,
 ) -> list[Finding]:
-    """The rows of `_list_parameters` with what was found. An interval also has by how much its
-    number moves where the latencies are free, in the second fit."""
+    """Findings of `_list_parameters`; intervals with the shift by free latencies in fit 2."""
     findings, (best, free) = [], fits
     for name, label, value, unit in _list_parameters(car, stated):
         at = float(getattr(best.theta, name))
         half = math.hypot(best.half(name), float(getattr(free.theta, name)) - at)
-        is_determined = half <= MAX_INTERVAL_SHARE * 1.96 * getattr(w.spread, name)
+        is_determined = half <= _MAX_INTERVAL_SHARE * 1.96 * getattr(w.spread, name)
         remark = "" if is_determined else WIDE
         if name in _OF_CAR:
             at, half = value * math.exp(at), value * math.exp(at) * half
@@ -261,7 +258,7 @@ def _make_car_findings(
 
 
 def _estimate_slips(logs: Sequence[Log], car: Vehicle, wires: SignalCalibration) -> list[Array]:
-    """The sideslip angle of each log by the gyro alone, rad."""
+    """Sideslip angle (rad) of each log by the gyro alone."""
     dt = logs[0].record.dt
     estimator = make_estimator(GYRO_ONLY, vehicle=car, dt=dt, q_beta=1e-3, q_gamma=0.1)
     steered = wires._replace(latency={})
@@ -269,7 +266,7 @@ def _estimate_slips(logs: Sequence[Log], car: Vehicle, wires: SignalCalibration)
 
 
 def _compute_truth_error(logs: Sequence[Log], slips: Sequence[Array]) -> float:
-    """RMS of sideslip beside the logs' own, in rad; NaN where they have none."""
+    """RMS of the sideslip's error (rad) where logs have the truth; NaN where none has."""
     errors = [np.zeros(0)]
     for log, slip in zip(logs, slips, strict=True):
         if "beta" in log.truth:
@@ -280,14 +277,12 @@ def _compute_truth_error(logs: Sequence[Log], slips: Sequence[Array]) -> float:
 
 
 def make_suite(result: IdentificationResult, name: str) -> Suite:
-    """The findings as a table with a verdict."""
+    """Make a suite of the findings: a table with a verdict."""
     suite = Suite("identify", f"The car of a recorded drive: {name}", "; ".join(result.remarks))
     missing = [finding.name for finding in result.findings if not finding.is_determined]
     if result.reason:
-        answer = (
-            f"Not identified. This log shows nothing of the car: {result.reason}. "
-            "It stays as stated."
-        )
+        answer = f"Not identified. This log shows nothing of the car: {result.reason}. "
+        answer += "It stays as stated."
     else:
         rates = "{:.2f} deg/s of the yaw rate, the found one {:.2f} ({:.2f} held out)".format(
             *map(math.degrees, result.rates)
@@ -305,12 +300,13 @@ def make_suite(result: IdentificationResult, name: str) -> Suite:
         "Not covered: the mass, which scales all; drives beside the part that was used.",
     )
     header = ("number", "stated", "found", "95 %", "unit", "told by this log?")
-    cells = [_format_cells(finding) for finding in result.findings]
+    cells = list(map(_format_cells, result.findings))
     suite.tables = [ResultTable("What the log shows", header, cells, _NOTE, keyed=False)]
     return suite
 
 
 def _format_cells(row: Finding) -> list[str]:
+    """Texts of a finding's cells."""
     stated, value = (f"{x:.4g}" if math.isfinite(x) else "-" for x in (row.stated, row.value))
     ends = "-"
     if math.isfinite(row.half):

@@ -1,6 +1,6 @@
-"""What is wrong with a recorded drive: columns that contradict one another, a gyro at its limit.
+"""Quality of a recorded drive: columns that contradict one another, noise, and a late GPS.
 
-Noise of each sensor of a recorded drive, and how late its GPS is, with jackknife intervals.
+Intervals are jackknives over blocks of the log.
 """
 
 import math
@@ -51,7 +51,7 @@ _GUESSES = {  # a ratio of steering angles, and what it looks like from there on
 
 
 def _get_columns(log: Log) -> dict[str, Array]:
-    """The columns that a log has, by name, (rows,) each."""
+    """Columns of a log by name, shape (rows,) each."""
     names = {"gyro", "accel_y", "accel_x", "steer"} & set(log.record.present)
     columns = {name: log.record.fast[:, getattr(FAST, name)] for name in names}
     columns |= {TRUTH: log.truth["beta"]} if "beta" in log.truth else {}
@@ -59,7 +59,7 @@ def _get_columns(log: Log) -> dict[str, Array]:
 
 
 def _find_jumps(log: Log, name: str) -> npt.NDArray[np.bool_]:
-    """The rows of a column beside a jump that no car makes, or between two."""
+    """Mask of a column's rows beside a jump that no car makes, or between two."""
     x = _get_columns(log)[name]
     known = np.isfinite(x) & (find_moving(log) | (name == "speed")) & ~find_backward(log)
     if known.sum() < _FEW:
@@ -77,8 +77,7 @@ def _find_jumps(log: Log, name: str) -> npt.NDArray[np.bool_]:
 
 
 def _smooth_columns(logs: Sequence[Log], *names: str) -> list[Array]:
-    """Smoothed columns where the car moves and nothing jumps, in all parts; "turning" is speed x
-    yaw rate, "slipping" the change of speed x truth."""
+    """Smoothed columns of undisturbed rows; also speed x yaw rate, change of speed x truth."""
     columns: list[list[Array]] = [[] for _ in names]
     for log in logs:
         dt, raw = log.record.dt, _get_columns(log)
@@ -96,7 +95,7 @@ def _smooth_columns(logs: Sequence[Log], *names: str) -> list[Array]:
 
 
 def _fit_line(y: Array, x: Array, *beside: Array) -> Any:
-    """SciPy's line of y over x, after what others explain of both; None where one is constant."""
+    """SciPy's line of y over x, less what others explain of both; None where one is constant."""
     others = np.column_stack([*beside, np.ones(len(y))])
     if len(y) < _FEW:
         return None
@@ -120,8 +119,7 @@ def _describe_contradiction(
 
 
 def _fit_steering(logs: Sequence[Log], car: Vehicle, steady: bool, tyres: float = 1.0) -> Any:
-    """The steering that the linear car needs for its yaw rate over the logged one. steady: not in
-    hard turns, nor where accel_y is not speed x yaw rate. tyres: 0 for a neutral car."""
+    """Line of the linear car's steering for its yaw rate over the logged one; tyres 0: neutral."""
     speed, gyro, steer, accel_y = _smooth_columns(logs, "speed", "gyro", "steer", "accel_y")
     bend = car.rear_arm / car.front_stiffness - car.front_arm / car.rear_stiffness
     under = tyres * max(car.mass * bend / (2.0 * car.wheelbase), 0.0)
@@ -132,14 +130,13 @@ def _fit_steering(logs: Sequence[Log], car: Vehicle, steady: bool, tyres: float 
 
 
 def estimate_steering_gain(logs: Sequence[Log], car: Vehicle) -> tuple[float, float]:
-    """(gain, correlation): by how much the logged steering is to be multiplied to turn the car as
-    its gyro shows, from steady turns of the linear car."""
+    """Estimate gain and correlation of the logged steering, from the linear car's yaw rate."""
     line = _fit_steering(logs, car, steady=False)
     return (float(line.slope), float(line.rvalue)) if line else (1.0, 0.0)
 
 
 def estimate_resolution(log: Log) -> float:
-    """The step between the values of the gyro in rad/s, 0 for one too fine to be seen."""
+    """Estimate the step between the values of the gyro (rad/s), 0 for one too fine to be seen."""
     steps = np.diff(np.unique(log.record.fast[:, FAST.gyro]))
     step = float(np.median(steps)) if 2 <= len(steps) < len(log.time) / 3 else math.inf
     even = np.abs(steps / step - np.rint(steps / step)).max(initial=0.0) < 0.1
@@ -147,8 +144,7 @@ def estimate_resolution(log: Log) -> float:
 
 
 def find_saturated(log: Log) -> npt.NDArray[np.bool_]:
-    """The rows in which the gyro stays at its largest value, of either sign: much longer than at
-    others, and many steps of its resolution from 0."""
+    """Mark rows in which the gyro stays at its limit: long, and many steps of its resolution."""
     gyro = log.record.fast[:, FAST.gyro]
     runs = np.cumsum(np.diff(gyro, prepend=gyro[0]) != 0.0)
     length = np.bincount(runs)
@@ -158,7 +154,7 @@ def find_saturated(log: Log) -> npt.NDArray[np.bool_]:
 
 
 def find_swapped(logs: Sequence[Log]) -> str:
-    """What columns seem to be swapped, "" for none that can be seen."""
+    """Find what columns seem to be swapped, "" for none that can be seen."""
     present = set.intersection(*(set(log.record.present) for log in logs))
     names = ("speed", "turning", "accel_y", "accel_x", "steer")
     speed, turning, accel_y, accel_x, steer = _smooth_columns(logs, *names)
@@ -190,7 +186,7 @@ def _describe_zeros(logs: Sequence[Log], name: str) -> list[str]:
 
 
 def _describe_fixes(logs: Sequence[Log]) -> list[str]:
-    """What a course cannot be: held while the gyro turns, and elsewhere for a fix or two."""
+    """Sentences on a course that is held while the gyro turns, or jumps for a fix or two."""
     before, after, change, turned, _ = compute_course_steps(logs, 0.0)
     runs, _ = label(change == 0.0)
     held = (runs > 0) & (np.bincount(runs, np.abs(turned), 1) > 0.1)[runs]
@@ -208,7 +204,7 @@ def _describe_fixes(logs: Sequence[Log]) -> list[str]:
 
 
 def _describe_steering(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[str]:
-    """What is wrong with the steering, by steady turns and all rows, by these and other tyres."""
+    """Sentences on the steering, by steady turns and all rows, by these and other tyres."""
     line, *lines = (_fit_steering(logs, car, *how) for how in ((steady,), (False,), (False, 0.0)))
     sentences = _describe_contradiction(line, "steering", "yaw rate")
     if not all(_describe_contradiction(candidate, "", "") for candidate in lines):
@@ -226,7 +222,7 @@ def _describe_steering(logs: Sequence[Log], car: Vehicle, steady: bool) -> list[
 
 
 def _describe_course(line: Any, turned: Array) -> list[str]:
-    """What is wrong with the course, by its change over the integral of the gyro."""
+    """Sentences on the course, by its change over the integral of the gyro."""
     if len(turned) < _FEW or turned.std() < 0.02:
         return []
     related = line.rvalue if line else 0.0
@@ -238,13 +234,13 @@ def _describe_course(line: Any, turned: Array) -> list[str]:
 
 
 def make_remarks(logs: Sequence[Log]) -> list[str]:
-    """What is no fault of a drive, but good to know: a gyro of coarse steps."""
+    """Make remarks on what is no fault of a drive, but good to know: a gyro of coarse steps."""
     step = math.degrees(max(map(estimate_resolution, logs)))
     return [f"The gyro's resolution is {step:.3g} deg/s."] if step > 0.1 else []
 
 
 def make_warnings(logs: Sequence[Log], car: Vehicle) -> list[str]:
-    """What does not fit together in a drive, a sentence each."""
+    """Make warnings of what does not fit together in a drive, a sentence each."""
     sentences = [f"columns seem to be swapped, {what}"] if (what := find_swapped(logs)) else []
     if count := sum(find_saturated(log).sum() for log in logs):
         sentences.append(f"the gyro is at its limit in {count} rows")
@@ -255,9 +251,8 @@ def make_warnings(logs: Sequence[Log], car: Vehicle) -> list[str]:
     turning, accel_y, slipping = _smooth_columns(judged, "turning", "accel_y", "slipping")
     if len(turning) < _FEW or max(np.std(turning), np.std(accel_y)) < _TURNING:
         return sentences
-    sentences += [
-        text for name in _ZEROS for text in _describe_zeros(logs, name)
-    ] + _describe_fixes(logs)
+    zeros = [text for name in _ZEROS for text in _describe_zeros(logs, name)]
+    sentences += zeros + _describe_fixes(logs)
     used = slipping.any() | (np.abs(turning) < _MILD)
     accel = _fit_line(accel_y[used], turning[used], slipping[used])
     if np.std(turning) < _TURNING and not (accel and abs(accel.rvalue) > 0.8):
@@ -265,9 +260,8 @@ def make_warnings(logs: Sequence[Log], car: Vehicle) -> list[str]:
     _, _, change, turned, slipped = compute_course_steps(logs, 1.0)
     course, wrong, unit = _fit_line(change, turned, slipped), [], accel.slope if accel else 1.0
     if accel and course and 0.67 < accel.slope / course.slope < 1.5:
-        wrong = _describe_contradiction(
-            accel, "the yaw rate", "what accel_y and course imply", True
-        )
+        implied = "what accel_y and course imply"
+        wrong = _describe_contradiction(accel, "the yaw rate", implied, True)
         unit = 1.0 if wrong else unit
     if not wrong:
         factor = FACTOR if slipping.any() else 3.0  # the faster the turns, the more they differ
@@ -276,14 +270,13 @@ def make_warnings(logs: Sequence[Log], car: Vehicle) -> list[str]:
     sentences += wrong
     if not slipping.any():
         return sentences
-    in_course, by = _fit_line(change, slipped, turned), "what gyro, accel_y and speed imply"
+    in_course = _fit_line(change, slipped, turned)
     if not accel or abs(accel.rvalue) < MIN_CORRELATION:
-        return sentences + _describe_contradiction(
-            in_course, TRUTH, "what gyro and course imply", True
-        )
-    sentences += _describe_contradiction(
-        _fit_line(accel_y / unit, slipping, turning), TRUTH, by, True
-    )
+        implied = "what gyro and course imply"
+        return sentences + _describe_contradiction(in_course, TRUTH, implied, True)
+    line = _fit_line(accel_y / unit, slipping, turning)
+    implied = "what gyro, accel_y and speed imply"
+    sentences += _describe_contradiction(line, TRUTH, implied, True)
     if course and in_course and in_course.slope < 1.0 / FACTOR - _SURE * in_course.stderr:
         sentences += [] if sentences else ["the course shows no sideslip: is it the heading?"]
     return sentences
@@ -291,7 +284,7 @@ def make_warnings(logs: Sequence[Log], car: Vehicle) -> list[str]:
 
 WIDE = "its interval is too wide"
 BLOCKS = 20  # of a log, which the intervals take for independent
-ALIKE = (0.0, 0.1, 0.25, 0.5, 1.0)  # s, for which rows of a residual may be alike
+_ALIKE = (0.0, 0.1, 0.25, 0.5, 1.0)  # s, for which rows of a residual may be alike
 LATE = (-0.2, 1.2)  # s, of the GPS
 _COURSE, _SPEED = range(2)  # places in its values
 LATE_WITHIN = 0.05  # s, half of the widest interval of a latency
@@ -301,7 +294,7 @@ NOISES = {name: f"{name.removesuffix('_left')}_noise" for name in (*_FAST, "cour
 
 
 class Finding(NamedTuple):
-    """A number with half of its 95 % interval; told: whether the log determines it."""
+    """A number with half of its 95 % interval, and whether the log determines it."""
 
     name: str
     stated: float
@@ -313,33 +306,34 @@ class Finding(NamedTuple):
 
 
 def jackknife(blocks: Array, statistic: Callable[[Array], float]) -> tuple[float, float]:
-    """(value, half of the 95 % interval) of a statistic of the sum of blocks, (count, ...)."""
+    """Compute a statistic of the sum of blocks, (count, ...), and half of its 95 % interval."""
     total, count = blocks.sum(axis=0), len(blocks)
     without = np.array([statistic(total - block) for block in blocks])
     return statistic(total), margin_of_error((count - 1.0) * without)
 
 
-def _compute_root_mean(sums: Array) -> float:
-    return math.sqrt(float(sums[0]) / max(float(sums[1]), 1.0))
-
-
 def estimate_white_noise(parts: Sequence[Array]) -> tuple[float, float]:
-    """(standard deviation, half) of a channel's white noise: third differences of samples that are
-    new (a slower sensor repeats its last one)."""
+    """Estimate standard deviation and half interval of a channel's white noise.
+
+    From third differences of new samples: a slower sensor repeats its last one.
+    """
     blocks = []
     for values in parts:
         new = np.concatenate([[True], np.diff(values) != 0.0])
         third = np.diff(values if new.mean() > 0.7 else values[new], 3) / math.sqrt(20.0)
         blocks += [np.array([block @ block, len(block)]) for block in np.array_split(third, BLOCKS)]
-    return jackknife(np.array(blocks), _compute_root_mean)
+    # each block: sum of squares and count
+    return jackknife(np.array(blocks), lambda x: math.sqrt(float(x[0]) / max(float(x[1]), 1.0)))
 
 
 def estimate_noise_levels(left: Array, dt: float) -> Array:
-    """(channels,): standard deviations of independent rows that would tell as little as those of a
-    residual, which are alike for a while: of means over up to 1 s, by the root of their rows."""
+    """Estimate deviations of independent rows that tell as much as a residual's, (channels,).
+
+    Rows of a residual are alike for a while: means over up to 1 s, by the root of their rows.
+    """
     levels = [np.full(left.shape[1], 1e-9)]
     shown = np.maximum(np.mean(left != 0.0, axis=(0, 2)), 1e-9)
-    for seconds in ALIKE:
+    for seconds in _ALIKE:
         rows = max(round(seconds / dt), 1)
         trimmed = left[:, :, : left.shape[2] // rows * rows]
         means = trimmed.reshape(*left.shape[:2], -1, rows).mean(axis=3)
@@ -348,8 +342,8 @@ def estimate_noise_levels(left: Array, dt: float) -> Array:
 
 
 def _collect_fixes(log: Log, value: int, signal: Array, part: Array, times: Array) -> list[Array]:
-    """Blocks of sums over the differences d of two fixes' values less the signal's so much earlier,
-    and p of `part`, whose size is not known: d^2, d p, p^2 and 1, each (times,)."""
+    """Blocks of sums of d^2, d p, p^2 and 1, shape (4, times) each."""
+    # d: differences of two fixes' values less the signal's so much earlier; p: those of `part`
     packets = log.record.select_packets("gps")
     packets = packets[packets[:, PACKET.quality] > 0.0]
     rows, place = packets[:, PACKET.captured] - log.record.first, np.arange(float(len(signal)))
@@ -369,14 +363,14 @@ def _collect_fixes(log: Log, value: int, signal: Array, part: Array, times: Arra
 
 
 def _compute_remainder(sums: Array, share: float | None = None) -> Array:
-    """(times,): the mean of squares that a share of the part leaves; None: the best one."""
+    """Mean squares that a fraction of the part leaves, None: the best one; shape (times,)."""
     square, product, part_square, count = sums
     shares = product / np.maximum(part_square, 1e-12) if share is None else share
     return np.asarray((square - 2.0 * shares * product + shares**2 * part_square) / count)
 
 
 def _find_minimum(times: Array, sums: Array, share: float | None = None) -> float:
-    """The time of the least that is left, between the samples by a parabola."""
+    """Time of the smallest remainder (s), between the samples by a parabola."""
     lefts = _compute_remainder(sums, share)
     i = int(np.clip(np.argmin(lefts), 1, len(times) - 2))
     left, middle, right = lefts[i - 1 : i + 2]
@@ -388,41 +382,33 @@ def _find_minimum(times: Array, sums: Array, share: float | None = None) -> floa
 def make_sensor_findings(
     logs: Sequence[Log], slips: Sequence[Array]
 ) -> tuple[list[Finding], dict[str, float], dict[str, float]]:
-    """Findings of the sensors, noise by the estimators' options, and latency by sensor.
+    """Make findings of the sensors, noise by the estimators' options, and latency by sensor (s).
 
-    slips: of each log, a sideslip angle in rad, (rows,), by which the course is predicted.
+    slips: Sideslip angle (rad) of each log, shape (rows,), by which the course is predicted.
     """
     findings: list[Finding] = []
     noise: dict[str, float] = {}
     for channel, unit in _FAST.items():
         if all(channel in log.record.present for log in logs):
-            sd, half = estimate_white_noise(
-                [log.record.fast[:, getattr(FAST, channel)] for log in logs]
-            )
+            column = getattr(FAST, channel)
+            sd, half = estimate_white_noise([log.record.fast[:, column] for log in logs])
             is_determined = half < 0.3 * sd
             remark = "" if is_determined else WIDE if sd > 0.0 else "none is seen"
-            findings.append(
-                Finding(f"noise of {channel}", math.nan, sd, half, unit, is_determined, remark)
-            )
+            row = Finding(f"noise of {channel}", math.nan, sd, half, unit, is_determined, remark)
+            findings.append(row)
             noise |= {NOISES[channel]: sd} if is_determined else {}
     times = np.arange(*LATE, max(logs[0].record.dt, 0.01))
     pairs = [pair for pair in zip(logs, slips, strict=True) if "gps" in pair[0].slow]
-    courses = [
-        b
-        for log, slip in pairs
-        for b in _collect_fixes(log, _COURSE, compute_heading(log), slip, times)
-    ]
-    speeds = [
-        b
-        for log, _ in pairs
-        for b in _collect_fixes(log, _SPEED, compute_ground_speed(log), 0.0 * log.time, times)
-    ]
+    courses, speeds = list[Array](), list[Array]()
+    for log, slip in pairs:
+        courses += _collect_fixes(log, _COURSE, compute_heading(log), slip, times)
+        speed, none = compute_ground_speed(log), 0.0 * log.time
+        speeds += _collect_fixes(log, _SPEED, speed, none, times)
     if not courses:
         return findings, noise, {}
     late, half = jackknife(np.array(courses), lambda sums: _find_minimum(times, sums))
-    half = math.hypot(
-        half, late - _find_minimum(times, np.sum(courses, axis=0), 1.0)
-    )  # had the slip its size
+    with_slip = _find_minimum(times, np.sum(courses, axis=0), 1.0)  # had the slip its size
+    half = math.hypot(half, late - with_slip)
     is_determined = half < LATE_WITHIN
     pays = is_determined and late > half
     remark = ("applied" if pays else "within its interval of 0") if is_determined else WIDE

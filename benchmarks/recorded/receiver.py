@@ -1,10 +1,8 @@
-"""Does noise that follows HDOP filter a receiver's fixes better than one noise for all?
+"""Receivers' logs (NMEA): does noise that follows HDOP filter fixes better than one for all?
 
 The filter has a constant rate between fixes, disturbed by white noise of density q, on each axis:
 of position (east and north) and, where the car moves, of course. A log without a gyro bears no more
 at 0.5 to 1 Hz.
-
-Question: do a receiver's fixes filter better with noise that follows HDOP? (NMEA logs)
 """
 
 import itertools
@@ -20,6 +18,7 @@ from scipy.stats import spearmanr
 
 from ... import __version__
 from ...envs.io import atomic_file
+from ...envs.numerics import require_extra
 from ...envs.record import Array
 from ...envs.recordings.dialect import to_metres
 from ...envs.recordings.nmea import HOUR, Counts, Epoch
@@ -33,17 +32,17 @@ from ..harness.study import format_verdict
 from ..report.film import make_track_kml
 
 SAME = "constant, same information"
-GAP = 10.0  # s without a fix, or back, after which the filter starts anew
+_GAP = 10.0  # s without a fix, or back, after which the filter starts anew
 SETTLED = 3  # fixes after a start that are not scored
-MIN_FIXES = 120  # scored fixes
-BLOCK = 30  # fixes, whose mean is one number of an interval
-MIN_NOISE = 1e-3  # in m or rad: r of a log that shows none
-_LIMITS = math.log(MIN_NOISE), math.log(1e4)  # of q and r
+_MIN_FIXES = 120  # scored fixes
+_BLOCK = 30  # fixes, whose mean is one number of an interval
+_MIN_NOISE = 1e-3  # in m or rad: r of a log that shows none
+_LIMITS = math.log(_MIN_NOISE), math.log(1e4)  # of q and r
 _GRID, _STEP = np.linspace(*_LIMITS, 8), 1.0
 
 
 class Track(NamedTuple):
-    """A receiver's fixes with an HDOP, (n,) each, in rising time; angles in rad."""
+    """A receiver's fixes with an HDOP, shape (n,) each, in rising time; SI units, angles in rad."""
 
     origin: tuple[float, float]  # degrees north and east
     t: Array
@@ -55,18 +54,18 @@ class Track(NamedTuple):
     satellites: Array
 
     def select(self, shown: Mask) -> "Track":
-        """Some of the fixes."""
+        """Select some of the fixes."""
         return Track(self.origin, *(column[shown] for column in self[1:]))
 
 
 def make_track(epochs: Sequence[Epoch]) -> Track:
-    """The fixes around the first one; those without HDOP or out of order are left out.
+    """Make the track of fixes around the first one, without those that lack HDOP or are late.
 
-    A step back beyond `GAP` is a clock that was set, and stays.
+    A step back beyond `_GAP` is a clock that was set, and stays.
     """
     shown, last = [], -math.inf
     for epoch in epochs:
-        late = epoch.t > last or epoch.t < last - GAP
+        late = epoch.t > last or epoch.t < last - _GAP
         if epoch.has_fix and late and math.isfinite(epoch.hdop):
             shown.append(epoch)
             last = epoch.t
@@ -74,29 +73,26 @@ def make_track(epochs: Sequence[Epoch]) -> Track:
     now = dict(zip(Epoch._fields, columns, strict=True))
     origin = (float(now["latitude"][0]), float(now["longitude"][0])) if shown else (0.0, 0.0)
     east, north = to_metres(now["latitude"], now["longitude"], origin)
-    same = {name: now[name] for name in ("t", "course", "speed", "hdop", "satellites")}
-    return Track(east=east, north=north, origin=origin, **same)
+    course, *others = (now[name] for name in ("course", "speed", "hdop", "satellites"))
+    return Track(origin, now["t"], east, north, course, *others)
 
 
 class Signal(NamedTuple):
-    """What is filtered: name, unit, axes (two: real and imaginary part), values (n,), the noise's
-    own size (n,), the standard deviation of a rate at the start, which fixes are scored, and the
-    row at which half of these lie behind."""
+    """A filtered quantity of a receiver's fixes."""
 
-    name: str
-    unit: str
-    axes: int
-    z: npt.NDArray[np.complex128]
-    base_size: Array
-    spread: float
-    track: Track
-    scored: Mask
-    half: int = 0
+    name: str  # name of the signal
+    unit: str  # unit of the values
+    axes: int  # number of axes; two are real and imaginary part
+    z: npt.NDArray[np.complex128]  # values, shape (n,)
+    base_size: Array  # size of the noise beside HDOP, shape (n,)
+    spread: float  # standard deviation of the rate at the start
+    track: Track  # fixes
+    scored: Mask  # mask of the fixes that are scored
+    half: int = 0  # row at which half of these lie behind
 
 
-class NoiseLawResult(NamedTuple):
-    """A law's filter: r, the noise at HDOP 1; q; and per scored fix of the second half the
-    prediction's error, its log-likelihood and normalised square."""
+class _NoiseLawResult(NamedTuple):
+    """A law's noise r at HDOP 1, density q, and numbers of each scored fix of the second half."""
 
     r: float
     q: float
@@ -107,10 +103,9 @@ class NoiseLawResult(NamedTuple):
 
 
 def make_signals(track: Track) -> list[Signal]:
-    """Position, scored where the car moves, and course, which has a meaning there alone; those
-    with `MIN_FIXES` fixes to score.
+    """Make position and course, scored where the car moves, if they have enough fixes.
 
-    Raises ValueError where position has fewer.
+    Raises ValueError where position has fewer than `_MIN_FIXES`.
     """
     moving: Mask = ~(track.speed < COURSE_SPEED)  # an unknown speed may be one
     positions = np.asarray(track.east + 1j * track.north, np.complex128)
@@ -123,22 +118,19 @@ def make_signals(track: Track) -> list[Signal]:
     for signal in (position, course):
         known = signal.scored & np.isfinite(predict_fixes(signal, signal.base_size**2, 1.0)[0])
         rows = np.flatnonzero(known)
-        if len(rows) >= MIN_FIXES:
+        if len(rows) >= _MIN_FIXES:
             scored.append(signal._replace(scored=known, half=int(rows[len(rows) // 2])))
         elif signal is position:
-            raise ValueError(
-                f"{len(rows)} fixes to score, where the car moves; {MIN_FIXES} are needed"
-            )
+            text = f"{len(rows)} fixes to score, where the car moves"
+            raise ValueError(f"{text}; {_MIN_FIXES} are needed")
     return scored
 
 
-def compare(signal: Signal) -> dict[str, NoiseLawResult]:
-    """Each law of the noise, q and r at their maximum likelihood on the first half; and one noise
-    for all with the average information of the law `table`."""
+def compare(signal: Signal) -> dict[str, _NoiseLawResult]:
+    """Fit each law of the noise on the first half, and one noise as informative as `table`'s."""
     half = signal.half
-    sizes = {
-        name: compute_law_size(signal.track.hdop, weight) for name, weight in HDOP_LAWS.items()
-    }
+    hdop = signal.track.hdop
+    sizes = {name: compute_law_size(hdop, weight) for name, weight in HDOP_LAWS.items()}
     results = {name: _fit_law(signal, size) for name, size in sizes.items()}
     table = (sizes["table"] * signal.base_size)[:half]
     base = signal.base_size[:half]
@@ -148,20 +140,20 @@ def compare(signal: Signal) -> dict[str, NoiseLawResult]:
 
 
 def compute_law_size(hdop: Array, weight: float) -> Array:
-    """The noise's size by HDOP, of the table of double-layer: 1 + weight (table - 1)."""
+    """Compute the noise's size by HDOP, of the table of double-layer: 1 + weight (table - 1)."""
     knots, factors = zip(*FILTERS["double-layer"].hdop, strict=True)
     return np.asarray(1.0 + weight * (np.interp(hdop, knots, factors) - 1.0))
 
 
-def compute_gain(result: NoiseLawResult, other: NoiseLawResult) -> Estimate:
-    """The mean log-likelihood less that of another law on the same fixes, by blocks of fixes."""
+def compute_gain(result: _NoiseLawResult, other: _NoiseLawResult) -> Estimate:
+    """Compute the mean log-likelihood less that of another law, by blocks of the same fixes."""
     difference = result.likelihood - other.likelihood
-    blocks = np.array_split(difference, max(len(difference) // BLOCK, 1))
+    blocks = np.array_split(difference, max(len(difference) // _BLOCK, 1))
     return interval(np.array([block.mean() for block in blocks]))
 
 
-def _fit_law(signal: Signal, size: Array, r: float | None = None) -> NoiseLawResult:
-    """The filter at its maximum likelihood on the first half: the best of a grid, then refined."""
+def _fit_law(signal: Signal, size: Array, r: float | None = None) -> _NoiseLawResult:
+    """Filter at its maximum likelihood on the first half: the best of a grid, then refined."""
     half = signal.half
 
     def compute_scores(p: Array, count: int) -> tuple[Array, Array, Array]:
@@ -183,20 +175,20 @@ def _fit_law(signal: Signal, size: Array, r: float | None = None) -> NoiseLawRes
     late = signal.scored & (np.arange(len(signal.z)) >= half)
     q, noise = np.exp(p)
     hdop = signal.track.hdop
-    return NoiseLawResult(noise, q, error[late], likelihood[late], square[late], hdop[late])
+    return _NoiseLawResult(noise, q, error[late], likelihood[late], square[late], hdop[late])
 
 
 def predict_fixes(signal: Signal, R: Array, q: float) -> tuple[Array, Array]:
-    """(size of the error of predicting each fix from those before, its variance on an axis).
+    """Predict each fix from those before: size of the error, its variance on an axis, (n,) each.
 
-    R: (n,) variances. NaN while the filter settles.
+    R: Variances, shape (n,). NaN while the filter settles.
     """
     error, variance = np.full((2, len(R)), np.nan)
     t, z, noise = signal.track.t.tolist(), signal.z.tolist(), R.tolist()
     since = SETTLED
     for k, now in enumerate(t[: len(noise)]):
         dt = now - t[k - 1] if k else math.inf
-        if not 0.0 < dt <= GAP:
+        if not 0.0 < dt <= _GAP:
             x, v, a, b, c = z[k], 0.0, noise[k], 0.0, signal.spread**2
             since = 0
             continue
@@ -216,9 +208,9 @@ def predict_fixes(signal: Signal, R: Array, q: float) -> tuple[Array, Array]:
     return error, variance
 
 
-DEGREES = 180.0 / math.pi
-TUNED, FIXED = "table", "constant"
-CLASSES = {"HDOP below 2": (0.0, 2.0), "2 to 5": (2.0, 5.0), "5 and more": (5.0, math.inf)}
+_DEGREES = 180.0 / math.pi
+_TUNED, _FIXED = "table", "constant"
+_CLASSES = {"HDOP below 2": (0.0, 2.0), "2 to 5": (2.0, 5.0), "5 and more": (5.0, math.inf)}
 _NEGLIGIBLE = 0.01  # of log-likelihood a fix: nobody would notice
 _WEAK_CORRELATION = 0.3  # a rank correlation that explains little
 _ROWS = {"position": "prediction_error", "course": "course_prediction_error"}
@@ -230,14 +222,14 @@ class ReceiverReplay(NamedTuple):
 
     name: str
     track: Track
-    outcomes: list[tuple[Signal, dict[str, NoiseLawResult]]]
+    outcomes: list[tuple[Signal, dict[str, _NoiseLawResult]]]
     counts: Counts
 
 
 def replay_nmea(log: str | Path, *no_drive: object) -> ReceiverReplay:
     """Read a receiver's log and compare the laws of its noise on it (needs the extra `wires`).
 
-    no_drive: what only a drive with a gyro has, a vehicle and a mapping: None or empty. Raises what
+    no_drive: What only a drive with a gyro has, a vehicle and a mapping: None or empty. Raises what
     `read_nmea` does, and ValueError, with the path, for a log too short to compare.
     """
     path = Path(log)
@@ -255,7 +247,7 @@ def replay_nmea(log: str | Path, *no_drive: object) -> ReceiverReplay:
 
 
 def make_receiver_suite(replay: ReceiverReplay) -> Suite:
-    """The answer, the counts, the numbers of each law, the track."""
+    """Make a suite of the verdict, the counts, the numbers of each law, and the track."""
     track = replay.track
     low, middle, high = np.percentile(track.hdop, (5, 50, 95))
     step = np.diff(track.t)
@@ -275,21 +267,18 @@ def make_receiver_suite(replay: ReceiverReplay) -> Suite:
     ]
     suite.tables = [_make_table(signal, results) for signal, results in replay.outcomes]
     counts = [[what, str(n)] for what, n in replay.counts.rows()]
-    suite.tables.append(
-        ResultTable("What came from the receiver", ("what", "count"), counts, keyed=False)
-    )
+    title = "What came from the receiver"
+    suite.tables.append(ResultTable(title, ("what", "count"), counts, keyed=False))
     suite.figures = _draw_figures(replay)
     return suite
 
 
 def compose_verdict(replay: ReceiverReplay) -> str:
-    """The verdict."""
-    tuned, fixed = (replay.outcomes[0][1][law] for law in (TUNED, FIXED))
+    """Compose the verdict."""
+    tuned, fixed = (replay.outcomes[0][1][law] for law in (_TUNED, _FIXED))
     rank = float(spearmanr(fixed.hdop, fixed.error).statistic)
-    errors = [
-        f"{np.median(result.error):.2f} m ({np.percentile(result.error, 95):.1f} m)"
-        for result in (tuned, fixed)
-    ]
+    pairs = [(np.median(x.error), np.percentile(x.error, 95)) for x in (tuned, fixed)]
+    errors = [f"{middle:.2f} m ({high:.1f} m)" for middle, high in pairs]
     why = "." if abs(rank) > _WEAK_CORRELATION else ", as of a receiver that smooths its fixes."
     return format_verdict(
         *(_describe_gain(signal.name, results) for signal, results in replay.outcomes),
@@ -299,10 +288,10 @@ def compose_verdict(replay: ReceiverReplay) -> str:
     )
 
 
-def _describe_gain(name: str, results: Mapping[str, NoiseLawResult]) -> str:
-    number = compute_gain(results[TUNED], results[FIXED])
-    value, low, high = number
-    what = f"Tuning the noise of {name} by HDOP"
+def _describe_gain(name: str, results: Mapping[str, _NoiseLawResult]) -> str:
+    """Sentence on whether noise that follows HDOP predicts a signal better."""
+    number = compute_gain(results[_TUNED], results[_FIXED])
+    what, (value, low, high) = f"Tuning the noise of {name} by HDOP", number
     if max(abs(low), abs(high)) < _NEGLIGIBLE:
         return f"{what} changes nothing: log-likelihood {value:+.3f}."
     how = "pays" if low > 0.0 else "costs" if high < 0.0 else "is not seen to pay"
@@ -310,7 +299,7 @@ def _describe_gain(name: str, results: Mapping[str, NoiseLawResult]) -> str:
 
 
 def _make_rows(
-    replay: ReceiverReplay, signal: Signal, results: Mapping[str, NoiseLawResult]
+    replay: ReceiverReplay, signal: Signal, results: Mapping[str, _NoiseLawResult]
 ) -> list[ResultRow]:
     rows = []
     for law, result in results.items():
@@ -319,31 +308,26 @@ def _make_rows(
             "n": len(result.error), "env_version": f"replay {__version__}",
         }  # fmt: skip
         rms = Estimate(float(np.sqrt(np.mean(result.error**2))))
-        rows.append(ResultRow.from_estimate(_ROWS[signal.name], rms, **where))
+        numbers = {_ROWS[signal.name]: rms}
         for column, metric in _ALL.items():
-            rows.append(
-                ResultRow.from_estimate(
-                    metric, Estimate(float(getattr(result, column).mean())), **where
-                )
-            )
-        if law != FIXED:
-            rows.append(
-                ResultRow.from_estimate("difference", compute_gain(result, results[FIXED]), **where)
-            )
+            numbers[metric] = Estimate(float(getattr(result, column).mean()))
+        if law != _FIXED:
+            numbers["difference"] = compute_gain(result, results[_FIXED])
+        rows += [ResultRow.from_estimate(metric, x, **where) for metric, x in numbers.items()]
     return rows
 
 
-def _make_table(signal: Signal, results: Mapping[str, NoiseLawResult]) -> ResultTable:
-    scale, unit = (DEGREES, "deg") if signal.axes == 1 else (1.0, signal.unit)
+def _make_table(signal: Signal, results: Mapping[str, _NoiseLawResult]) -> ResultTable:
+    scale, unit = (_DEGREES, "deg") if signal.axes == 1 else (1.0, signal.unit)
     cells = []
     for law, result in results.items():
         error = scale * result.error
         more = "-"
-        if law != FIXED:
-            more = compute_gain(result, results[FIXED]).inline(digits="+.3f")
+        if law != _FIXED:
+            more = compute_gain(result, results[_FIXED]).inline(digits="+.3f")
         numbers = [np.median(error), np.sqrt(np.mean(error**2)), np.percentile(error, 95)]
         numbers += [result.likelihood.mean(), result.square.mean()]
-        noise = f"{scale * result.r:.3g}" if result.r > 1.5 * MIN_NOISE else "none seen"
+        noise = f"{scale * result.r:.3g}" if result.r > 1.5 * _MIN_NOISE else "none seen"
         cells.append([law, noise, *(f"{number:.2f}" for number in numbers), more])
     header = ("noise", f"at HDOP 1 / {unit}", "median", "rms", "95 %", "log-likelihood", "NIS",
               "against constant")  # fmt: skip
@@ -358,7 +342,7 @@ def _make_table(signal: Signal, results: Mapping[str, NoiseLawResult]) -> Result
 
 
 def write_kml(path: Path, replay: ReceiverReplay) -> None:
-    """The fixes as a track for a map."""
+    """Write the fixes as a track for a map."""
     track = replay.track
     fixes = {"fixes": (track.east, track.north)}
     write_text(path, make_track_kml(replay.name, fixes, origin=track.origin))
@@ -370,36 +354,21 @@ def _draw_figures(replay: ReceiverReplay) -> list[tuple[str, Any, str]]:
         from ..report.figures import draw_time_series, draw_track
     except ModuleNotFoundError:
         return []
-    now = replay.track
-    shown = {
-        name: (_select_values(now, ends, now.east), now.north) for name, ends in CLASSES.items()
-    }
-    time = now.t - now.t[0]
-    return [
-        (
-            f"{replay.name}: the track",
-            draw_track(shown),
-            "East and north of the first fix, by HDOP.",
-        ),
-        (f"{replay.name}: HDOP", draw_time_series(time, {"HDOP": now.hdop}, "HDOP"), ""),
-    ]
-
-
-def _select_values(track: Track, ends: tuple[float, float], values: Array) -> Array:
-    """The values where HDOP lies within the ends, else NaN."""
-    return np.where((track.hdop >= ends[0]) & (track.hdop < ends[1]), values, np.nan)
+    now, name, caption = replay.track, replay.name, "East and north of the first fix, by HDOP."
+    shown = {}
+    for label, (low, high) in _CLASSES.items():
+        within = (now.hdop >= low) & (now.hdop < high)
+        shown[label] = np.where(within, now.east, np.nan), now.north
+    over_time = draw_time_series(now.t - now.t[0], {"HDOP": now.hdop}, "HDOP")
+    return [(f"{name}: the track", draw_track(shown), caption), (f"{name}: HDOP", over_time, "")]
 
 
 def draw(path: Path, replay: ReceiverReplay) -> None:
-    """The track and the errors of the next fix by HDOP, as a picture; needs the extra `report`."""
-    try:
+    """Draw the track and the errors of the next fix by HDOP as a picture (extra `report`)."""
+    with require_extra("report", "pictures need matplotlib"):
         from matplotlib.colors import LogNorm
         from matplotlib.figure import Figure
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "pictures need matplotlib: pip install 'sideslip[report]'"
-        ) from None
-    track, result = replay.track, replay.outcomes[0][1][FIXED]
+    track, result = replay.track, replay.outcomes[0][1][_FIXED]
     figure = Figure(figsize=(10, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(4, 3))
     look = {"c": track.hdop, "norm": LogNorm(1.0, 20.0), "cmap": "cividis_r", "s": 5}

@@ -1,4 +1,4 @@
-"""A file with a recorded drive, replayed: its parts, its wires, its car."""
+"""A file with a recorded drive, replayed or identified: its parts, its wires, its car."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,19 +15,16 @@ from .quality import TRUTH, make_remarks, make_warnings
 from .suite import corners, replay
 from .wires import SignalCalibration, apply_wires
 
-FITTED, NOMINAL = "ferrari-250lm-fitted", "ferrari-250lm-nominal"
-FACTOR = 0.7  # of the fitted tyres, where no vehicle is named
+_FITTED, _NOMINAL = "ferrari-250lm-fitted", "ferrari-250lm-nominal"
+_FACTOR = 0.7  # of the fitted tyres, where no vehicle is named
 TRUTH_WARNING = "The truth of this log is in doubt, and with it all errors: see the warnings."
 
 
-def split_urgent(remarks: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split a reader's remarks into warnings, without their mark, and the rest."""
-    urgent = [
-        text.removeprefix(WARNING_PREFIX).rstrip(".")
-        for text in remarks
-        if text.startswith(WARNING_PREFIX)
-    ]
-    return urgent, [text for text in remarks if not text.startswith(WARNING_PREFIX)]
+def _split_urgent(remarks: Sequence[str]) -> tuple[list[str], list[str]]:
+    """A reader's warnings, without their mark, and its other remarks."""
+    urgent = [text for text in remarks if text.startswith(WARNING_PREFIX)]
+    others = [text for text in remarks if not text.startswith(WARNING_PREFIX)]
+    return [text.removeprefix(WARNING_PREFIX).rstrip(".") for text in urgent], others
 
 
 def identify_file(
@@ -38,15 +35,23 @@ def identify_file(
     tyres: str | None = None,
     until: float | None = None,
 ) -> tuple[IdentificationResult, Suite]:
-    """Read a drive and find its car: (what the log shows, its table).
+    """Read a drive and identify its car.
 
-    until: s of the log that are used, None: all. Raises what `read_parts`, `make_vehicle` and
-    `identify` do.
+    Args:
+        log: File of the drive.
+        vehicle: Stated vehicle as for `make_vehicle`.
+        mapping: Texts such as "steer_rad=Delta".
+        wires: Stated calibration.
+        tyres: Law of the tyres, as for `identify`.
+        until: End of the part that is used (s), None for all.
+
+    Returns:
+        What the log shows, and its suite.
     """
     logs, remarks = read_parts(log, parse_mapping(mapping), end=until)
     car = make_vehicle(vehicle)
     result = identify(logs, car, wires, tyres)
-    urgent, remarks = split_urgent(remarks)
+    urgent, remarks = _split_urgent(remarks)
     result.remarks = [*remarks, *make_remarks(logs), *result.remarks]
     suite = make_suite(result, logs[0].name)
     suite.warnings = urgent + make_warnings(logs, car)
@@ -63,16 +68,25 @@ def replay_file(
     until: float | None = None,
     **settings: Any,
 ) -> Suite:
-    """Read a drive and its vehicle, replay it, each part of a log with holes by itself, and where
-    it has truth the vehicle's corners too; a receiver's log (NMEA) is replayed as `replay_nmea`
-    does.
+    """Read a drive and replay it, each part of a log with holes by itself; with truth, corners too.
 
-    vehicle: of `make_vehicle`; "identify": found in the log, or in its first `until` s, of which
-    the rest is then replayed, with the mass and arms of `nominal` and linear tyres, which
-    estimators have; None: the Ferrari 250 LM of the Stanford log, with the fitted tyres x 0.7, and
-    the corners of the nominal one. mapping: texts such as "steer_rad=Delta". wires: what is known
-    beside the car; identified ones stand behind it.
-    settings: of `replay`. Raises what `read_parts`, `make_vehicle`, `identify`, `replay` do.
+    Args:
+        log: File of the drive; a receiver's log (NMEA) is replayed as by `replay_nmea`.
+        vehicle: Vehicle as for `make_vehicle`; "identify": found in the log, or in its first
+            `until` s, of which the rest is replayed, with the mass and arms of `nominal` and linear
+            tyres; None: the Ferrari 250 LM of the Stanford log, the fitted tyres x 0.7, and the
+            corners of the nominal one.
+        mapping: Texts such as "steer_rad=Delta".
+        wires: Calibration beside the car, over an identified one.
+        nominal: Stated vehicle of the identification.
+        until: End of the part that identifies the car (s).
+        settings: Fields of `Settings`.
+
+    Returns:
+        Suite of all parts and corners.
+
+    Raises:
+        ValueError: `until` without "identify"; and what the readers and `replay` raise.
     """
     if is_nmea(log):
         from .receiver import make_receiver_suite, replay_nmea
@@ -89,11 +103,11 @@ def replay_file(
     logs, remarks = read_parts(log, parse_mapping(mapping or ()), start=until or 0.0)
     logs = [apply_wires(part, wires) for part in logs]
     if vehicle is None:
-        car, design = make_vehicle(NOMINAL), make_vehicle(FITTED)
-        settings = {"stiffness_factor": FACTOR} | settings
+        car, design = make_vehicle(_NOMINAL), make_vehicle(_FITTED)
+        settings = {"stiffness_factor": _FACTOR} | settings
         remarks.append(
             "No vehicle was named, so the estimators assume the Ferrari 250 LM of the Stanford "
-            f"log, fitted tyres x {FACTOR}. For another car name its file: `--vehicle FILE`."
+            f"log, fitted tyres x {_FACTOR}. For another car name its file: `--vehicle FILE`."
         )
     else:
         car = design = make_vehicle(vehicle)
@@ -108,7 +122,7 @@ def replay_file(
         suite.tables += other.tables
         suite.figures += other.figures
     suite.tables += tables
-    urgent, remarks = split_urgent(remarks)
+    urgent, remarks = _split_urgent(remarks)
     suite.text = "\n\n".join([suite.text, *remarks])
     suite.warnings = urgent + make_warnings(logs, design)
     if unknown:

@@ -1,7 +1,4 @@
-"""Estimators over one recorded drive: their settings, and how far they are from the truth.
-
-Question: which estimator comes closest to the sideslip angle of a real, recorded drive?
-"""
+"""The suite `replay`: estimators over one recorded drive, and how far they are from the truth."""
 
 import dataclasses
 import json
@@ -37,24 +34,31 @@ ESTIMATORS: dict[str, tuple[str, ...]] = {
 }
 """The estimators of a replay and the slow sensors that serve them, the better one first."""
 
-OWN_NOISE = "joint-robust"  # brings its levels along and finds the accelerometer's as it drives
-MIN_COURSE_NOISE = 0.01  # deg, of the course, the least that estimators assume
-MIN_GYRO_NOISE = 0.002  # rad/s; below, what the model lacks weighs more than the sensor's noise
+_OWN_NOISE = "joint-robust"  # brings its levels along and finds the accelerometer's as it drives
+_MIN_COURSE_NOISE = 0.01  # deg, of the course, the least that estimators assume
+_MIN_GYRO_NOISE = 0.002  # rad/s; below, what the model lacks weighs more than the sensor's noise
 _MOTION = ("beta", "gamma", "psi", "y_l", "course", "phi", "phi_rate", "F_d", "N_d")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings(Emulation):
-    """How a drive is replayed, on top of `Emulation`.
+    """How a drive is replayed, on top of `Emulation`; its course noise is what estimators assume.
 
-    estimators: names in `ESTIMATORS`; None: all. The gyro-only one always runs along.
-    q_beta, q_gamma, q_psi: process noise of every estimator in rad2/s, (rad/s)2/s, rad2/s; the
-    course noise they assume is `course_noise_deg`. seeds: how many noises of the emulated course,
-    from `seed` on. options: more options of estimators, by name. noise: standard deviations by
-    option, which estimators assume. stiffness_factor: of both tyre stiffnesses of the estimators.
-    figures: whether to draw. emulated: whether a log with truth and no slow sensor gets a course.
+    Attributes:
+        estimators: Names in `ESTIMATORS`, None for all. The gyro-only one always runs along.
+        q_beta: Process noise of sideslip (rad2/s).
+        q_gamma: Process noise of the yaw rate ((rad/s)2/s).
+        q_psi: Process noise of the heading (rad2/s).
+        seeds: Number of noises of the emulated course.
+        seed: The first of their seeds.
+        stiffness_factor: Factor of both tyre stiffnesses of the estimators.
+        figures: Whether to draw.
+        emulated: Whether a log with truth and no slow sensor gets a course.
+        options: More options of estimators by name.
+        noise: Standard deviations that estimators assume by option.
 
-    Raises ValueError for a value out of range and an unknown estimator.
+    Raises:
+        ValueError: A value out of range, or an unknown estimator.
     """
 
     estimators: Sequence[str] | None = None
@@ -85,7 +89,7 @@ class Settings(Emulation):
                 raise ValueError(f"{name} must be finite and not negative, got {value}")
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON types: everything that moves a number."""
+        """Return everything that moves a number, as JSON types."""
         plain = dataclasses.asdict(self)
         del plain["figures"], plain["emulated"]
         plain["estimators"] = list(self.estimators or ESTIMATORS)
@@ -94,26 +98,24 @@ class Settings(Emulation):
 
 @dataclass
 class ReplayResult:
-    """Errors of one vehicle's estimators on one drive.
+    """Errors of one vehicle's estimators on one drive, by estimator.
 
-    squares: by estimator, mean squared error in rad2 of each seed (empty without truth). cost: CPU
-    us per row. traces: sideslip of the first seed in rad, (rows,). found: by estimator, its states
-    that are no motion at the end: (name, value, standard deviation). remarks: by estimator, why it
-    was left out or what it cannot see.
+    outcomes: States that are no motion at the end: name, value, standard deviation. remarks: Why an
+    estimator was left out, or what it cannot see.
     """
 
-    squares: dict[str, Array] = field(default_factory=dict)
-    cost: dict[str, float] = field(default_factory=dict)
-    traces: dict[str, Array] = field(default_factory=dict)
+    squares: dict[str, Array] = field(default_factory=dict)  # by seed (rad2); empty without truth
+    cost: dict[str, float] = field(default_factory=dict)  # CPU time per row (us)
+    traces: dict[str, Array] = field(default_factory=dict)  # sideslip of the first seed (rad)
     outcomes: dict[str, list[tuple[str, float, float]]] = field(default_factory=dict)
     remarks: dict[str, str] = field(default_factory=dict)
 
     def rmse(self, name: str) -> tuple[float, float, float]:
-        """Median, least and most over the seeds, in rad."""
+        """Return the RMS error (rad): median, smallest and largest over the seeds."""
         return _summarise_range(np.sqrt(self.squares[name]))
 
     def ratio(self, name: str, other: str = GYRO_ONLY) -> tuple[float, float, float]:
-        """RMSE over another's, seed by seed: median, least and most."""
+        """Return the RMS error over another's, seed by seed: median, smallest and largest."""
         return _summarise_range(np.sqrt(self.squares[name] / self.squares[other]))
 
 
@@ -121,11 +123,8 @@ def _summarise_range(values: Array) -> tuple[float, float, float]:
     return float(np.median(values)), float(np.min(values)), float(np.max(values))
 
 
-def make_drives(log: Log, settings: Settings) -> list[Log]:
-    """What the estimators see: a drive for each noise of the course, or the one that was logged.
-
-    Raises ValueError for a log that is over before errors count.
-    """
+def _make_drives(log: Log, settings: Settings) -> list[Log]:
+    """A drive for each noise of the course, or the logged one; ValueError if it is too short."""
     duration = log.time[-1] - log.time[0]
     if duration < SETTLED:
         raise ValueError(
@@ -137,7 +136,7 @@ def make_drives(log: Log, settings: Settings) -> list[Log]:
 
 
 def run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings) -> ReplayResult:
-    """Every wanted estimator that the drives' slow sensors serve, over every drive."""
+    """Run every wanted estimator that the drives' slow sensors serve over every drive."""
     log, result = drives[0], ReplayResult()
     counts = (log.time >= log.time[0] + SETTLED - 1e-9) & ~find_backward(log)
     truth = log.truth.get("beta")
@@ -149,7 +148,7 @@ def run_estimators(drives: Sequence[Log], vehicle: Vehicle, settings: Settings) 
         if settings.estimators is not None and name not in (GYRO_ONLY, *settings.estimators):
             continue
         slow = next((sensor for sensor in serves if sensor in log.slow), None)
-        if serves and slow is None and name != OWN_NOISE:  # which inertial sensors serve too
+        if serves and slow is None and name != _OWN_NOISE:  # which inertial sensors serve too
             result.remarks[name] = f"left out: needs {' or '.join(serves)}"
             continue
         try:
@@ -191,43 +190,43 @@ def _make_estimator(
     options: dict[str, Any] = {"q_beta": settings.q_beta, "q_gamma": settings.q_gamma}
     if slow is not None:
         options |= {"slow": slow, "q_psi": settings.q_psi}
-    if name == OWN_NOISE:
+    if name == _OWN_NOISE:
         options = {"slow": slow} if slow is not None else {}
     if slow == "gps":
-        options["course_noise"] = math.radians(max(settings.course_noise_deg, MIN_COURSE_NOISE))
+        options["course_noise"] = math.radians(max(settings.course_noise_deg, _MIN_COURSE_NOISE))
         options |= {key: settings.noise[key] for key in ("course_noise",) if key in settings.noise}
-    if "gyro_noise" in settings.noise and name != OWN_NOISE:
-        options["gyro_noise"] = max(settings.noise["gyro_noise"], MIN_GYRO_NOISE)
+    if "gyro_noise" in settings.noise and name != _OWN_NOISE:
+        options["gyro_noise"] = max(settings.noise["gyro_noise"], _MIN_GYRO_NOISE)
     options |= settings.options.get(name, {})
     facts = {"vehicle": vehicle, "sensors": sensors, "dt": log.record.dt}
     return call_quietly(make_estimator, name, **facts, **options)  # the result names what is unseen
 
 
-__all__ = ["Settings", "corners", "replay"]
-
-CORNERS = ((0.7, 0.7), (0.7, 1.3), (1.3, 0.7), (1.3, 1.3))
+_CORNERS = ((0.7, 0.7), (0.7, 1.3), (1.3, 0.7), (1.3, 1.3))
 DEGREES = 180.0 / math.pi
-WINDOW = 10.0  # s to either side of the largest sideslip
-HIDDEN = "Names that are pale in the legend are hidden; a click shows them."
+_WINDOW = 10.0  # s to either side of the largest sideslip
+_HIDDEN = "Names that are pale in the legend are hidden; a click shows them."
 
 
 def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
     """Run the estimators over a recorded drive, designed from this vehicle, and score them.
 
-    settings: of `Settings` (course_rate, course_noise_deg, delay, bias_deg, gyro_bias_degps,
-    estimators, options, noise, q_beta, q_gamma, q_psi, seeds, seed, stiffness_factor, figures). A
-    log that carries slow sensors is replayed with those; else a GPS course is emulated where the
-    log knows the true sideslip; else estimators that need one are left out, and noted. Without
-    truth nothing is scored, but drawn.
+    A log with slow sensors is replayed with those; else a GPS course is emulated where the log
+    knows the true sideslip; else estimators that need one are left out. Without truth nothing is
+    scored, but drawn. Of rmse (rad, from 2 s on), ratio (over gyro-only) and us_per_tick, value is
+    the median, low and high are the smallest and largest over the noises.
 
-    Rows: rmse (rad, from 2 s on), ratio (over gyro-only) and us_per_tick; value is the median, low
-    and high are the least and most over the noises.
+    Args:
+        log: Recorded drive.
+        vehicle: Vehicle from which the estimators are designed.
+        settings: Fields of `Settings`; TypeError for an unknown, ValueError for a bad one.
 
-    Raises TypeError for an unknown setting, ValueError for a bad one and for a drive under 2 s.
+    Returns:
+        Suite with verdict, tables and figures.
     """
     how = Settings(**settings)
     car = vehicle.scale_stiffness(how.stiffness_factor)
-    drives = make_drives(log, how)
+    drives = _make_drives(log, how)
     result = run_estimators(drives, car, how)
     suite = Suite("replay", f"A recorded drive: {log.name}", _make_text(log, drives, car, how))
     suite.rows = _make_rows(result, log.name, car, how)
@@ -245,7 +244,7 @@ def replay(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
 
 
 def compose_verdict(result: ReplayResult, emulated: bool) -> str:
-    """The verdict. emulated: whether the GPS course is made from the truth."""
+    """Compose the verdict; emulated: whether the GPS course is made from the truth."""
     if not result.squares:
         return format_verdict(
             f"Nobody wins: without the true sideslip angle {len(result.traces)} estimators are "
@@ -267,33 +266,32 @@ def compose_verdict(result: ReplayResult, emulated: bool) -> str:
 
 
 def corners(log: Log, vehicle: Vehicle, **settings: Any) -> Suite:
-    """`replay` with the four corners of a vehicle: front and rear stiffness x 0.7 and x 1.3.
+    """Replay with the four corners of a vehicle: front and rear stiffness x 0.7 and x 1.3.
 
-    settings: of `replay`. One table, the rows of every corner, no figures. Raises what `replay`
-    does, and ValueError for a log without truth.
+    settings: Those of `replay`. One table, the rows of every corner, no figures. Raises what
+    `replay` does, and ValueError for a log without truth.
     """
     how = Settings(**settings)
     if "beta" not in log.truth:
         raise ValueError(f"{log.name}: corners are scored against sideslip truth; there is none")
-    drives = make_drives(log, how)
+    drives = _make_drives(log, how)
     suite = Suite("replay", f"A recorded drive: {log.name}", "")
     results = {}
-    for front, rear in CORNERS:
+    for front, rear in _CORNERS:
         car = vehicle.scale_stiffness(how.stiffness_factor).scale_stiffness(front, rear)
         result = results[f"{front} / {rear}"] = run_estimators(drives, car, how)
         scenario = f"{log.name}: {vehicle.name}, front x {front}, rear x {rear}"
         suite.rows += _make_rows(result, scenario, car, how)
     names = [name for name in ESTIMATORS if any(name in r.squares for r in results.values())]
     title = f"{log.name}, {vehicle.name} with front / rear stiffness x ...: RMSE / deg"
-    cells = [
-        [name, *(_format_error(result, name) for result in results.values())] for name in names
-    ]
+    cells = [[name, *(_format_error(x, name) for x in results.values())] for name in names]
     note = "The same process noise in all corners; medians over the noises."
     suite.tables = [ResultTable(title, ("estimator", *results), cells, note)]
     return suite
 
 
 def _make_text(log: Log, drives: Sequence[Log], car: Vehicle, settings: Settings) -> str:
+    """Text of the report: the drive, the design of the estimators, and what was emulated."""
     duration, rate = log.time[-1] - log.time[0], 1.0 / log.record.dt
     text = [f"{duration:.0f} s at {rate:.4g} Hz. The estimators are designed from {car.name!r}"]
     if settings.stiffness_factor != 1.0:
@@ -327,7 +325,7 @@ def _make_text(log: Log, drives: Sequence[Log], car: Vehicle, settings: Settings
 def _make_rows(
     result: ReplayResult, scenario: str, car: Vehicle, settings: Settings
 ) -> list[ResultRow]:
-    """Every number of a result."""
+    """Rows of every number of a result."""
     spec = json.dumps({"vehicle": car.to_dict(), "settings": settings.as_dict()})
     common = {"salt": f"seed {settings.seed}", "env_version": f"replay {__version__}", "spec": spec}
     rows = []
@@ -338,26 +336,23 @@ def _make_rows(
             errors = {"rmse": Estimate(*result.rmse(name)), "ratio": Estimate(*result.ratio(name))}
             measured = errors | measured
         where = {"suite": "replay", "scenario": scenario, "estimator": name, "n": n}
-        rows += [
-            ResultRow.from_estimate(metric, number, **where, **common)
-            for metric, number in measured.items()
-        ]
+        for metric, number in measured.items():
+            rows.append(ResultRow.from_estimate(metric, number, **where, **common))
     return rows
 
 
 def _format_error(result: ReplayResult, name: str) -> str:
+    """Median RMS error (deg), "-" for an estimator that was left out."""
     return f"{DEGREES * result.rmse(name)[0]:.2f}" if name in result.squares else "-"
 
 
 def _make_table(result: ReplayResult, name: str, car: Vehicle, noises: int) -> ResultTable:
-    """The estimators, best first; remarks in the note."""
+    """Table of the estimators, best first; remarks in the note."""
     note = "; ".join(f"`{label}` {remark}" for label, remark in result.remarks.items())
     if not result.squares:
         cells = [[label, f"{cost:.3f}"] for label, cost in result.cost.items()]
-        header: tuple[str, ...] = ("estimator", "us per tick")
-        return ResultTable(
-            f"{name}, designed from {car.name}: no truth, no score", header, cells, note
-        )
+        title = f"{name}, designed from {car.name}: no truth, no score"
+        return ResultTable(title, ("estimator", "us per tick"), cells, note)
     header = ("estimator", "RMSE / deg", "least .. most", "of gyro only", "us per tick")
     cells = []
     for label in sorted(result.squares, key=lambda label: result.rmse(label)[0]):
@@ -370,7 +365,7 @@ def _make_table(result: ReplayResult, name: str, car: Vehicle, noises: int) -> R
 
 
 def _make_parameter_table(result: ReplayResult, name: str) -> ResultTable:
-    """What estimators found of the car and its sensors, at the end of the drive."""
+    """Table of the car's and sensors' states that estimators have at the end of the drive."""
     cells = [
         [label, state, f"{value:.4g}", f"{sd:.2g}"]
         for label, states in result.outcomes.items()
@@ -392,24 +387,23 @@ def _draw_figures(result: ReplayResult, log: Log) -> list[tuple[str, Any, str]]:
     slips = {name: DEGREES * beta for name, beta in traces.items()}
     label = "sideslip angle / deg"
     peak_time = log.time[np.nanargmax(np.abs(next(iter(slips.values()))))]
-    near = np.abs(log.time - peak_time) <= WINDOW
+    near = np.abs(log.time - peak_time) <= _WINDOW
     close = {name: beta[near] for name, beta in slips.items()}
     paths = {name: compute_path(log, beta) for name, beta in traces.items()}
     overview = _select_traces(draw_time_series(log.time, slips, label), result)
     shown = [
-        ("the sideslip angle and its estimates", overview, HIDDEN),
+        ("the sideslip angle and its estimates", overview, _HIDDEN),
         ("where the car slips most", draw_time_series(log.time[near], close, label),
-            f"The {2 * WINDOW:g} s around the largest sideslip angle, all estimators."),
+            f"The {2 * _WINDOW:g} s around the largest sideslip angle, all estimators."),
         ("the track", _select_traces(draw_track(paths), result),
             "Dead reckoning from wheel speed, the integral of the logged yaw rate and each "
-            f"sideslip angle: what a degree of sideslip is worth on the road. {HIDDEN}"),
+            f"sideslip angle: what a degree of sideslip is worth on the road. {_HIDDEN}"),
     ]  # fmt: skip
     if truth is not None:
         errors = {name: DEGREES * (beta - truth) for name, beta in result.traces.items()}
-        figure = _select_traces(
-            draw_error_series(log.time, errors, f"error of the {label}"), result
-        )
-        shown.insert(2, ("errors", figure, f"Estimate minus truth. {HIDDEN}"))
+        over_time = draw_error_series(log.time, errors, f"error of the {label}")
+        figure = _select_traces(over_time, result)
+        shown.insert(2, ("errors", figure, f"Estimate minus truth. {_HIDDEN}"))
         value, low, high = (DEGREES * np.array([result.rmse(name) for name in result.squares])).T
         bars = draw_bars(list(result.squares), value, low, high, f"RMSE of the {label}")
         text = f"Median over the noises; whiskers: least and most. {GYRO_ONLY} has no slow sensor."

@@ -1,4 +1,4 @@
-"""What is known of a log's wires, steering, latencies and noise: from a vehicle's file, applied."""
+"""Calibration of a log's signals from a vehicle's file: steering, latencies and noise, applied."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -15,60 +15,53 @@ from ...envs.vehicle.parameters import WIRE_TABLES, Vehicle, VehicleSource
 from ...estimators.design.options import FAST_CHANNELS, find_columns
 from .quality import NOISES
 
-CHANNELS = (*FAST_CHANNELS, *SLOW_NAMES)
-"""What may be late."""
-MAX_LATENCY = 5.0  # s
+_CHANNELS = (*FAST_CHANNELS, *SLOW_NAMES)  # that may be late
+_MAX_LATENCY = 5.0  # s
 
 
 class SignalCalibration(NamedTuple):
-    """Road-wheel angle = sign x logged / ratio + offset (rad); s by which each channel is late;
-    standard deviations of the noise by the estimators' options."""
+    """Calibration of a log's signals; the road-wheel angle is sign x logged / ratio + offset."""
 
-    ratio: float = 1.0
-    sign: int = 1
-    offset: float = 0.0
-    latency: Mapping[str, float] = {}
-    noise: Mapping[str, float] = {}
+    ratio: float = 1.0  # steering ratio
+    sign: int = 1  # 1 or -1
+    offset: float = 0.0  # angle at the wheels (rad)
+    latency: Mapping[str, float] = {}  # latency by channel (s)
+    noise: Mapping[str, float] = {}  # standard deviations by the estimators' options
 
     @property
     def gain(self) -> float:
-        """Sign / ratio."""
+        """Gain of the logged steering, sign / ratio."""
         return self.sign / self.ratio
 
     def check(self) -> "SignalCalibration":
-        """Itself; ValueError for numbers that cannot be and for an unknown channel."""
+        """Return itself; ValueError for numbers that cannot be and for an unknown channel."""
         if not (0.0 < self.ratio < 1e4 and self.sign in (-1, 1) and abs(self.offset) < 0.5):
             raise ValueError(
                 "steering has a ratio above 0, a sign of 1 or -1 and an offset below 28 deg, got "
                 f"{self.ratio:g}, {self.sign}, {np.degrees(self.offset):g} deg"
             )
         for channel, late in self.latency.items():
-            min_latency = 0.0 if channel in SLOW_NAMES else -MAX_LATENCY
-            if channel not in CHANNELS or not (
-                is_finite(late) and min_latency <= late <= MAX_LATENCY
-            ):
+            low = 0.0 if channel in SLOW_NAMES else -_MAX_LATENCY
+            is_possible = is_finite(late) and low <= late <= _MAX_LATENCY
+            if channel not in _CHANNELS or not is_possible:
                 raise ValueError(
-                    f"a latency is CHANNEL=S, {min_latency:g} to {MAX_LATENCY:g} s, of "
-                    f"{', '.join(CHANNELS)}; got {channel}={late}"
+                    f"a latency is CHANNEL=S, {low:g} to {_MAX_LATENCY:g} s, of "
+                    f"{', '.join(_CHANNELS)}; got {channel}={late}"
                 )
         for name, value in self.noise.items():
             check_choice("noise", name, NOISES.values())
             if not (is_finite(value) and value >= 0.0):
-                raise ValueError(
-                    f"noise {name} is a number of zero or more, got {short_repr(value)}"
-                )
+                wanted = f"noise {name} is a number of zero or more"
+                raise ValueError(f"{wanted}, got {short_repr(value)}")
         return self
 
 
 def read_wires(source: VehicleSource | None) -> SignalCalibration:
-    """The wires in a vehicle's file, with its errors; nothing is known of another source's."""
+    """Read the calibration in a vehicle's file, with its errors; that of others is unknown."""
     if source is None or source == "identify" or not is_document(source):
         return SignalCalibration()
     path = Path(str(source))
-    tables: dict[str, Any] = {
-        **{name: {} for name in WIRE_TABLES},
-        **read_document(path, "vehicle"),
-    }
+    tables: dict[str, Any] = {name: {} for name in WIRE_TABLES} | read_document(path, "vehicle")
     try:
         steering, latency, noise = (dict(tables[name]) for name in WIRE_TABLES)
         return SignalCalibration(**steering, latency=latency, noise=noise).check()
@@ -77,7 +70,7 @@ def read_wires(source: VehicleSource | None) -> SignalCalibration:
 
 
 def write_vehicle(path: Path, car: Vehicle, wires: SignalCalibration) -> None:
-    """A file that `make_vehicle` reads, with the wires in tables of their own."""
+    """Write a file that `make_vehicle` reads, with the calibration in separate tables."""
     values = car.to_dict()
     for axle in ("front", "rear"):
         values[f"{axle}_stiffness_axle"] = 2.0 * values.pop(f"{axle}_stiffness")
@@ -87,8 +80,7 @@ def write_vehicle(path: Path, car: Vehicle, wires: SignalCalibration) -> None:
 
 
 def apply_wires(log: Log, wires: SignalCalibration) -> Log:
-    """The log with angles of the wheels, fast channels moved to when they were true, and packets
-    stamped with when they were captured; the arrival stays."""
+    """Return the log with calibrated steering, fast channels and captures at the true time."""
     record, slow = log.record, dict(log.slow)
     fast, place = record.fast.copy(), np.arange(len(record.fast), dtype=float)
     fast[:, FAST.steer] = wires.gain * fast[:, FAST.steer] + wires.offset

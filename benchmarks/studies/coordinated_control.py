@@ -1,5 +1,7 @@
-"""Question: what do steering and yaw moment do together? dakf-stability's bandwidth K, and lanes
-held on curved roads from camera and gyro, the aim of uneven-delay."""
+"""The suite `following`: what steering and yaw moment do together.
+
+dakf-stability's bandwidth K, and lanes held on curved roads from camera and gyro with uneven delay.
+"""
 
 from collections.abc import Sequence
 from functools import partial
@@ -28,8 +30,8 @@ from ..papers.manoeuvres import measure_tracking, run_episode
 
 BANDWIDTHS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # rad/s, K_beta = K_gamma
 SEEDS, QUICK_SEEDS = 10, 2
-STEP = "dakf-fig7"
-ROAD, ROAD_ID = "curved-road", "sideslip/YawVisionUneven-v0"
+_STEP = "dakf-fig7"
+_ROAD, _ROAD_ID = "curved-road", "sideslip/YawVisionUneven-v0"
 CARS, QUICK_CARS = 200, 20
 LANE_CONTROLLERS = (
     ("none", "uneven-delay-kf", None),
@@ -51,7 +53,7 @@ _STATES = ("beta", "gamma", "psi", "y_l")
 
 
 def compute_loop_radius(scenario: str | dict[str, Any], bandwidth: float) -> float:
-    """Spectral radius of dakf-stability's loop as sampled every millisecond, without a filter.
+    """Compute the spectral radius of dakf-stability's loop, sampled every millisecond, unfiltered.
 
     The true car with its lags, the PI (31) designed for the nominal one and summed by forward
     Euler: beyond 1 the loop is unstable.
@@ -72,26 +74,26 @@ def compute_loop_radius(scenario: str | dict[str, Any], bandwidth: float) -> flo
             B[:2, i], A[2 + i, 2 + i] = plane.B[:, i], -1.0 / TICK
     G, H = LinearModel(A, B, np.eye(4), (), (), ()).discretise(TICK)
     P, I = compute_feedback_gains(env.nominal, speed, (bandwidth, bandwidth))  # noqa: E741
-    fed = H @ P, -TICK * I, np.zeros((2, 2))
-    loop = np.block([[G - np.hstack([fed[0], np.zeros((4, 2))]), H], [fed[1], fed[2], np.eye(2)]])
+    closed = G - np.hstack([H @ P, np.zeros((4, 2))])
+    loop = np.block([[closed, H], [-TICK * I, np.zeros((2, 2)), np.eye(2)]])
     return float(np.abs(np.linalg.eigvals(loop)).max())
 
 
 def track_reference(case: tuple[float, int]) -> Array:
-    """(rms_beta, rms_gamma, saturated, failed) of an episode of STEP with dakf in the loop.
+    """Run the step with dakf in the loop: rms_beta (rad), rms_gamma (rad/s), saturated, failed.
 
-    case: the bandwidth (0: no control) and the seed.
+    case: Bandwidth (rad/s; 0: no control) and seed.
     """
     K, seed = case
     options: dict[str, Any] = {"bandwidth": (K, K)} if K > 0.0 else {"agent": "none"}
-    result = measure_tracking(run_episode(seed, STEP, **options))
+    result = measure_tracking(run_episode(seed, _STEP, **options))
     return np.array([result.rms_beta, result.rms_gamma, result.saturated, result.failed], float)
 
 
 def keep_lane(index: int, cars: int) -> Array:
-    """(cars, 3): largest offset from the lane's centre in m, RMS slip in rad, left the road."""
+    """Drive the road: largest offset from the lane (m), RMS slip (rad), departed; (cars, 3)."""
     _, estimator, moment = LANE_CONTROLLERS[index]
-    env: Any = gym.make_vec(ROAD_ID, num_envs=cars, scenario=ROAD, steering=True)
+    env: Any = gym.make_vec(_ROAD_ID, num_envs=cars, scenario=_ROAD, steering=True)
     env = call_quietly(EstimateObservation, env, estimator, outputs=_STATES, std=False)
     options = {} if moment is None else {"moment": moment}
     agent = make_agent("none" if moment is None else "lane-keeping", env, **options)
@@ -110,7 +112,7 @@ def keep_lane(index: int, cars: int) -> Array:
 def run(
     seeds: int = SEEDS, cars: int = CARS, jobs: int | None = None, console: Console | None = None
 ) -> Suite:
-    """Both questions; seeds of the step, cars on the road."""
+    """Answer both questions; seeds of the step, cars on the road."""
     suite = Suite("following", "What steering and yaw moment do together", _TEXT)
     cases = list(product((0.0, *BANDWIDTHS), range(seeds)))
     errors = np.array(run_cases(track_reference, cases, "bandwidth", jobs, console))
@@ -124,8 +126,7 @@ def run(
 
 
 def compose_verdict(errors: Array, lanes: Sequence[Array]) -> str:
-    """The verdict. found: as `_add_bandwidths` has it; lanes: what `keep_lane` finds, of
-    `LANE_CONTROLLERS`."""
+    """Compose the verdict from the errors of `_add_bandwidths` and of `keep_lane` by controller."""
     ratios = (errors[1:, :, :2].mean(axis=1) / errors[0, :, :2].mean(axis=0)).mean(axis=1)
     stable = [i for i in range(len(BANDWIDTHS)) if not errors[1 + i, :, 3].any()]
     best = min(stable, key=ratios.__getitem__, default=None)
@@ -144,9 +145,8 @@ def compose_verdict(errors: Array, lanes: Sequence[Array]) -> str:
     first, *others = sorted(offset, key=lambda name: offset[name].mean())
     ratio = {name: interval(offset[first], ratio_of_means, offset[name]) for name in others}
     reads = first.partition(" on ")[2]
-    both, steering_only = (
-        offset[f"{actuators} on {reads}"].mean() for actuators in ("both", "steering")
-    )
+    pair = (f"{actuators} on {reads}" for actuators in ("both", "steering"))
+    both, steering_only = (offset[name].mean() for name in pair)
     change = f"{100.0 * (both / steering_only - 1.0):+.0f} %"
     return format_verdict(
         "Steering and the motors' yaw moment, by one controller; bandwidth: how fast it corrects.",
@@ -172,15 +172,15 @@ _COLUMNS = {  # what `track_reference` gives, and what the figure calls it
 
 
 def _add_bandwidths(suite: Suite, errors: Array) -> None:
-    """found: (none and every bandwidth, seeds, numbers of `track_reference`)."""
+    """Add table, rows and figure; errors: (none and every bandwidth, seeds, `track_reference`)."""
     none, seeds = errors[0].mean(axis=0), errors.shape[1]
     shares = errors[1:] / np.where([True, True, False, False], none, 1.0)
     numbers = [[*map(interval, at_K.T[:-1]), share(at_K.T[-1])] for at_K in shares]
-    radius = np.array([compute_loop_radius(STEP, K) for K in BANDWIDTHS])
+    radius = np.array([compute_loop_radius(_STEP, K) for K in BANDWIDTHS])
     cells = []
     for K, spread, r in zip(BANDWIDTHS, numbers, radius.tolist(), strict=True):
         cells.append([f"{K:.0f}", *(f"{number.value:.3f}" for number in spread), f"{r:.5f}"])
-        scenario = f"{STEP}, K = {K:.0f} rad/s"
+        scenario = f"{_STEP}, K = {K:.0f} rad/s"
         for metric, number in zip(_COLUMNS.values(), spread, strict=True):
             suite.rows.append(_make_row(scenario, metric, number, seeds))
         suite.rows.append(_make_row(scenario, "spectral_radius", Estimate(r, r, r), 1))
@@ -204,21 +204,12 @@ def _add_lanes(suite: Suite, lanes: list[Array]) -> None:
     for i, numbers in enumerate(lanes):
         actuators, estimator, _ = LANE_CONTROLLERS[i]
         max_offset, slip, departures = *map(interval, numbers.T[:-1]), share(numbers.T[-1])
-        cells.append(
-            [
-                _label_controller(i),
-                *max_offset.text(),
-                f"{1e3 * slip.value:.1f}",
-                f"{100.0 * departures.value:.1f}",
-            ]
-        )
-        for metric, estimate in (
-            ("offset", max_offset),
-            ("rms_slip", slip),
-            ("departure_rate", departures),
-        ):
-            labels = {"estimator": estimator, "controller": actuators}
-            suite.rows.append(_make_row(ROAD, metric, estimate, len(numbers), **labels))
+        texts = (*max_offset.text(), f"{1e3 * slip.value:.1f}", f"{100.0 * departures.value:.1f}")
+        cells.append([_label_controller(i), *texts])
+        labels = {"estimator": estimator, "controller": actuators}
+        metrics = {"offset": max_offset, "rms_slip": slip, "departure_rate": departures}
+        for metric, number in metrics.items():
+            suite.rows.append(_make_row(_ROAD, metric, number, len(numbers), **labels))
     header = ("controller", "largest offset / m", "95 % interval", "RMS slip / mrad", "left / %")
     note = "The largest offset of the centre of gravity from the lane's centre, mean over cars."
     suite.tables.append(ResultTable("Keeping the lane on curved roads", header, cells, note))

@@ -1,5 +1,7 @@
-"""Question: which estimator comes closest to the sideslip angle, and how far is that from the
-best possible? On the papers' simulations tie-vision-fig7 and dakf-fig6."""
+"""The suite `estimation`: which estimator comes closest to the sideslip angle, and to the bound?
+
+On the papers' simulations tie-vision-fig7 and dakf-fig6.
+"""
 
 import time
 from collections.abc import Sequence
@@ -24,16 +26,12 @@ SEEDS = 100
 QUICK_SEEDS = 10
 _CHUNK = 5
 TRUE_MODEL = "exact-kf, true model"
-UNAIDED = "bicycle-kf"
-"""The filter without a slow sensor."""
+_UNAIDED = "bicycle-kf"  # without a slow sensor
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A paper's simulation, the env that runs it and the filters that have their sensors.
-
-    brief: what is hard about it, in a word or two.
-    """
+    """A paper's simulation, its env and filters; brief: what is hard about it, in a few words."""
 
     brief: str
     scenario: str
@@ -72,30 +70,27 @@ EXPERIMENTS = (
 
 @dataclass(frozen=True)
 class SeedChunk:
-    """One case: a handful of seeds of an experiment."""
+    """A case: some seeds of an experiment, by its place in EXPERIMENTS."""
 
     experiment: int
     seeds: tuple[int, ...]
 
 
 @dataclass
-class EstimationResult:
-    """Mean squared errors (seeds, filters), of the bound (seeds,), CPU us per tick.
+class _EstimationResult:
+    """Errors and cost of an experiment's filters, and the drive of seed 0 with its estimates."""
 
-    example: the drive of seed 0 and each filter's estimate of beta.
-    """
-
-    squares: Array
-    bound: Array
-    cost: Array
-    example: tuple[Rollout, dict[str, Array]] | None
+    squares: Array  # mean squared errors (rad2), shape (seeds, filters)
+    bound: Array  # mean squares of the bound (rad2), shape (seeds,)
+    cost: Array  # CPU time per tick (us), shape (seeds, filters)
+    example: tuple[Rollout, dict[str, Array]] | None  # estimates of beta (rad)
 
 
 def _make_env(experiment: Experiment) -> gym.Env[Any, Any]:
     return gym.make(experiment.env_id, scenario=experiment.scenario, control_period=1)
 
 
-def measure(case: SeedChunk) -> EstimationResult:
+def measure(case: SeedChunk) -> _EstimationResult:
     """Drive the seeds of a case once and run every filter over the same records."""
     experiment = EXPERIMENTS[case.experiment]
     env = _make_env(experiment)
@@ -114,17 +109,16 @@ def measure(case: SeedChunk) -> EstimationResult:
             cost[i, j] = (time.process_time() - start) / len(settled) * 1e6
             traces[label] = estimates["beta"]
             squares[i, j] = np.mean((traces[label] - drive.log.truth["beta"])[settled] ** 2)
-        std = compute_error_bound(
-            record=drive.log.record, **make_filter_arguments(base) | {"vehicle": base.vehicle}
-        )
+        facts = make_filter_arguments(base) | {"vehicle": base.vehicle}
+        std = compute_error_bound(record=drive.log.record, **facts)
         best[i] = np.mean(std[settled] ** 2)
         if seed == 0:
             example = (drive, traces)
-    return EstimationResult(squares, best, cost, example)
+    return _EstimationResult(squares, best, cost, example)
 
 
 def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = None) -> Suite:
-    """Every estimator of both experiments on the seeds 0 .. seeds-1."""
+    """Run every estimator of both experiments on the seeds 0 .. seeds-1."""
     chunks = split_seeds(seeds, _CHUNK)
     cases = [SeedChunk(e, chunk) for e in range(len(EXPERIMENTS)) for chunk in chunks]
     results = run_cases(measure, cases, "estimation", jobs, console)
@@ -143,40 +137,36 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
     )
     errors, examples = list[tuple[Array, Array]](), list[tuple[Rollout, dict[str, Array]]]()
     for e, experiment in enumerate(EXPERIMENTS):
-        experiment_results = [
-            r for case, r in zip(cases, results, strict=True) if case.experiment == e
-        ]
-        squares = np.concatenate([m.squares for m in experiment_results])
-        best = np.concatenate([m.bound for m in experiment_results])
-        cost = np.median(np.concatenate([m.cost for m in experiment_results]), axis=0)
+        pairs = zip(cases, results, strict=True)
+        chunked = [result for case, result in pairs if case.experiment == e]
+        squares, best, costs = (
+            np.concatenate([getattr(m, name) for m in chunked])
+            for name in ("squares", "bound", "cost")
+        )
+        cost = np.median(costs, axis=0)
         errors.append((squares, best))
         _add_rows(suite, experiment, squares, best, cost)
-        examples += [m.example for m in experiment_results if m.example is not None]
+        examples += [m.example for m in chunked if m.example is not None]
     suite.verdict = compose_verdict(errors)
     _draw_figures(suite, errors, examples)
     return suite
 
 
 def compose_verdict(errors: Sequence[tuple[Array, Array]]) -> str:
-    """The verdict. found: mean squared errors (seeds, filters) and of the bound (seeds,), of each
-    experiment."""
+    """Compose the verdict from each experiment's squares, (seeds, filters), and bound, (seeds,)."""
     firsts, unaided, known = [], [], []
     for experiment, (squares, best) in zip(EXPERIMENTS, errors, strict=True):
-        by_label = dict(
-            zip((filter_.label for filter_ in experiment.filters), squares.T, strict=True)
-        )
-        rivals = sorted(
-            (n for n in by_label if n != TRUE_MODEL), key=lambda name: by_label[name].mean()
-        )
-        ratios = {
-            other: interval(by_label[rivals[0]], ratio_of_roots, by_label[other])
-            for other in rivals[1:]
-        }
-        over_bound = float(ratio_of_roots(by_label[rivals[0]], best))
-        first = describe_leader(rivals[0], ratios, "err")
+        labels = [filter_.label for filter_ in experiment.filters]
+        by_label = dict(zip(labels, squares.T, strict=True))
+        known_labels = [label for label in labels if label != TRUE_MODEL]
+        leader, *rivals = sorted(known_labels, key=lambda name: by_label[name].mean())
+        least = by_label[leader]
+        ratios = {name: interval(least, ratio_of_roots, by_label[name]) for name in rivals}
+        over_bound = float(ratio_of_roots(least, best))
+        first = describe_leader(leader, ratios, "err")
         firsts.append(f"{experiment.brief}: {first}, {over_bound:.2f} times the least possible.")
-        unaided.append(f"{ratio_of_roots(by_label[UNAIDED], by_label[rivals[0]]):.1f}")
-        known.append(f"{ratio_of_roots(by_label[TRUE_MODEL], by_label[rivals[0]]):.2f}")
+        unaided.append(f"{ratio_of_roots(by_label[_UNAIDED], least):.1f}")
+        known.append(f"{ratio_of_roots(by_label[TRUE_MODEL], least):.2f}")
     return format_verdict(
         "An estimator infers the sideslip angle: between where the car points and where it goes.",
         *firsts,
@@ -192,38 +182,25 @@ def _add_rows(
     """Rows and a table of one experiment, best estimator first."""
     env = _make_env(experiment)
     spec = env.spec.to_json() if env.spec is not None else ""
-    common: dict[str, Any] = {
-        "suite": suite.name,
-        "scenario": experiment.scenario,
-        "n": len(squares),
-        "salt": "fixed",
-        "env_version": f"{experiment.env_id} {__version__}",
-        "spec": spec,
-        "paper": experiment.paper,
-    }
+    common: dict[str, Any] = {"suite": suite.name, "scenario": experiment.scenario, "spec": spec}
+    common |= {"n": len(squares), "salt": "fixed", "paper": experiment.paper}
+    common |= {"env_version": f"{experiment.env_id} {__version__}"}
     lines = [(float(root_mean(best)), ["the bound", f"{1e3 * root_mean(best):.2f}", "", "1", ""])]
     for j, filter_ in enumerate(experiment.filters):
         error = interval(squares[:, j], root_mean)
         ratio = interval(squares[:, j], ratio_of_roots, best)
         us = float(cost[j])
+        numbers = {"rmse": error, "rmse_over_bound": ratio, "us_per_tick": Estimate(us)}
         suite.rows += [
             ResultRow.from_estimate(metric, number, estimator=filter_.label, **common)
-            for metric, number in (
-                ("rmse", error),
-                ("rmse_over_bound", ratio),
-                ("us_per_tick", Estimate(us)),
-            )
+            for metric, number in numbers.items()
         ]
         texts = error.text(1e3, ".2f")
         lines.append((error.value, [filter_.label, *texts, f"{ratio.value:.2f}", f"{us:.3f}"]))
-    suite.tables.append(
-        ResultTable(
-            f"{experiment.paper}: error of the sideslip angle ({len(squares)} seeds)",
-            ("estimator", "RMSE / mrad", "95 % interval", "over the bound", "us per tick"),
-            [cells for _, cells in sorted(lines, key=lambda line: line[0])],
-            experiment.text,
-        )
-    )
+    title = f"{experiment.paper}: error of the sideslip angle ({len(squares)} seeds)"
+    header = ("estimator", "RMSE / mrad", "95 % interval", "over the bound", "us per tick")
+    cells = [texts for _, texts in sorted(lines, key=lambda line: line[0])]
+    suite.tables.append(ResultTable(title, header, cells, experiment.text))
 
 
 def _draw_figures(
@@ -238,10 +215,9 @@ def _draw_figures(
         return
     groups, angle = {}, "sideslip angle / mrad"
     for experiment, (squares, best) in zip(EXPERIMENTS, errors, strict=True):
-        ratios = {
-            item.label: Estimate(*interval(column, ratio_of_roots, best))
-            for item, column in zip(experiment.filters, squares.T, strict=True)
-        }
+        labels = [filter_.label for filter_ in experiment.filters]
+        numbers = (Estimate(*interval(column, ratio_of_roots, best)) for column in squares.T)
+        ratios = dict(zip(labels, numbers, strict=True))
         title = f"{experiment.brief} ({experiment.paper})"
         groups[title] = dict(sorted(ratios.items(), key=lambda pair: pair[1].value))
     ratio = "error / the least possible: less is better"
@@ -261,6 +237,5 @@ def _draw_figures(
             title = f"{experiment.paper}: the sideslip angle and its estimates (seed 0)"
             suite.figures.append((title, over_time, experiment.text))
         figure = draw_error_series(t, missed, f"error of the {angle}")
-        suite.figures.append(
-            (f"{experiment.paper}: errors (seed 0)", figure, "Estimate minus truth.")
-        )
+        title, caption = f"{experiment.paper}: errors (seed 0)", "Estimate minus truth."
+        suite.figures.append((title, figure, caption))

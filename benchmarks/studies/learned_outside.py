@@ -1,8 +1,8 @@
-"""Question: what do learned policies cost in a car whose equations are not ours?
+"""The suite `learned-outside`: what learned policies cost in a car whose equations are not ours.
 
-CommonRoad's models of a BMW 320i take the place of the passenger car, on a straight road and by our
+CommonRoad's models of a BMW 320i take the place of the passenger car, on a straight road, with our
 sensors and references. Controllers, filters and references are designed from that car, as far as
-our `Vehicle` describes it; the policies, trained on another one, learn nothing of it.
+our `Vehicle` describes it; the policies were trained on another one.
 """
 
 import json
@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -33,18 +34,18 @@ from ..control.tasks import (
     vary_scenario,
 )
 from ..harness.results import ResultTable, Suite
-from ..harness.stats import Estimate, geometric_mean, share
+from ..harness.stats import geometric_mean, share
 from ..harness.study import format_verdict
 from .learned import EPISODES as EPISODES
 from .learned import QUICK_EPISODES as QUICK_EPISODES
 from .learned import TransferResult, add_figures, add_tables, collect_results, list_entries
 
-NAME = "learned-outside"
+_NAME = "learned-outside"
 OUTSIDE_ID = "sideslip/Outside-v0"
 KINDS = tuple(kind for kind in LEARNED if kind.startswith("car-"))
 """Classes whose car is about as large and as fast as the BMW."""
 MANOEUVRE = "any-friction-sine-with-dwell"
-"""Which every class has, and after which a car heads as before: a straight road stays in sight."""
+"""The scenario of every class after which a car heads as before, along a straight road."""
 _RIVALS = (NOMINAL, ADAPTIVE["joint, friction"])
 """Over whose costs everybody's are: where there is no gap, there is no share."""
 _TEXT = (
@@ -56,26 +57,25 @@ _NONE = " Left out: pip install 'sideslip[outside]'."
 
 
 @dataclass(frozen=True)
-class OutsideTask(ControlTask):
-    """A class's contest with an outside plant in place of its car and a straight road in place of
-    its bends. model: of `OutsideEnv`; like: the id whose actuators it has."""
+class _OutsideTask(ControlTask):
+    """A class's task with a model of `OutsideEnv` on a straight road; like: id of the actuators."""
 
     model: str = "drift"
     like: str = STEERING
 
     @property
     def kind(self) -> str:
-        """The class whose tuned options everybody has."""
+        """Class of the tuned options."""
         return f"car-{'steering' if self.like == STEERING else 'yaw'}"
 
     @property
     def seed_text(self) -> str:
-        """That of a contest, with the model and the id whose actuators it has."""
+        """JSON of the seeds: a task's, with the model and the id whose actuators it has."""
         return json.dumps(json.loads(super().seed_text) | {"model": self.model, "like": self.like})
 
     @property
     def env_options(self) -> dict[str, Any]:
-        """Options of the env; of the contest's cars only the friction that a designer expects."""
+        """Options of the env; of the task's cars only the friction that a designer expects."""
         friction = dict(make_scenario(self.scenario).nominal)["friction"]
         flat = {"road": "straight", "bank": 0.0, "vehicle": {}, "nominal": {"friction": friction}}
         return {
@@ -86,17 +86,15 @@ class OutsideTask(ControlTask):
         }
 
 
-def make_outside_task(kind: str, model: str) -> OutsideTask:
-    """A class's `MANOEUVRE` with a model as the car."""
-    like = next(
-        task for task in list_scored_tasks() if (task.kind, task.scenario) == (kind, MANOEUVRE)
-    )
-    return OutsideTask("", OUTSIDE_ID, "", like.reference, MANOEUVRE, model, like.env_id)
+def make_outside_task(kind: str, model: str) -> _OutsideTask:
+    """Make a class's task of `MANOEUVRE` with a model as the car."""
+    tasks = (task for task in list_scored_tasks() if task.scenario == MANOEUVRE)
+    like = next(task for task in tasks if task.kind == kind)
+    return _OutsideTask("", OUTSIDE_ID, "", like.reference, MANOEUVRE, model, like.env_id)
 
 
 def run_chunk(chunk: Chunk) -> DriveResult:
-    """`control.episodes.run_chunk` of cars that are stepped one by one: cost and failure of each
-    episode, the other numbers NaN."""
+    """Drive cars that are stepped one by one; all metrics but cost and failure are NaN."""
     start_time, numbers = time.process_time(), np.full((len(chunk.seeds), len(NUMBERS)), np.nan)
     try:
         env, agent = make_cars(chunk.entry, len(chunk.seeds))
@@ -120,12 +118,11 @@ def run(
     quick: bool = False,
     salt: str = "",
 ) -> Suite:
-    """Every class of `KINDS` on every model.
+    """Run every class of `KINDS` on every model; arguments as of `learned.run`.
 
-    episodes: of each. quick: the drift model alone. salt: of the seeds, "" for `make_salt`'s. The
-    rest is of `control.run.measure`. Raises ValueError with the reason where somebody cannot drive.
+    quick: The drift model alone. Raises ValueError with the reason where an entry cannot drive.
     """
-    suite = Suite(NAME, "Learned policies in cars that are not ours", _TEXT)
+    suite = Suite(_NAME, "Learned policies in cars that are not ours", _TEXT)
     if find_spec("vehiclemodels") is None:
         suite.text += _NONE
         return suite
@@ -139,19 +136,12 @@ def run(
     salt = salt or make_salt()
     seeds = make_task_seeds(salt, episodes)
     results = measure(
-        entries, seeds, jobs=jobs, console=console, keep=keep, runner=run_chunk, title=NAME
+        entries, seeds, jobs=jobs, console=console, keep=keep, runner=run_chunk, title=_NAME
     )
-    transfers = [
-        TransferResult(
-            kind,
-            {
-                item: [collect_results(results, make_outside_task(kind, item), item)]
-                for item in models
-            },
-            salt,
-        )
-        for kind in KINDS
-    ]
+    transfers = [TransferResult(kind, salt=salt) for kind in KINDS]
+    for item, model in product(transfers, models):
+        task = make_outside_task(item.kind, model)
+        item.drives[model] = [collect_results(results, task, model)]
     note = "Other seeds on each model. No training met any."
     for item in transfers:
         title = f"{item.kind} in a BMW"
@@ -163,44 +153,35 @@ def run(
 
 
 def compose_verdict(transfers: Sequence[TransferResult]) -> str:
-    """The verdict: the policies of each class, by their cost over their rivals' on all models."""
+    """Compose the verdict: the cost of each class's policies over their rivals' on all models."""
     lines = []
-    for transfer, policy in (
-        (one, controller) for one in transfers for _, controller in LEARNED[one.kind]
-    ):
-        costs = {
-            rival: _compute_cost_ratio(transfer, policy, rival, transfer.drives)
-            for rival in _RIVALS
-        }
-        said = ", ".join(f"{_format_percent(cost)} % of {rival}'s" for rival, cost in costs.items())
-        fails = 100.0 * share(transfer.mark_failures(policy)).value
-        lines.append(f"{policy} costs {said}; {fails:.0f} % fail.")
+    for transfer in transfers:
+        for _, policy in LEARNED[transfer.kind]:
+            models = transfer.drives
+            ratios = {x: _format_cost_ratio(transfer, policy, x, models) for x in _RIVALS}
+            costs = ", ".join(f"{ratio} % of {rival}'s" for rival, ratio in ratios.items())
+            fails = 100.0 * share(transfer.mark_failures(policy)).value
+            lines.append(f"{policy} costs {costs}; {fails:.0f} % fail.")
     return format_verdict("On CommonRoad's BMW, designed for by all but the policies:", *lines)
 
 
-def _compute_cost_ratio(
+def _format_cost_ratio(
     transfer: TransferResult, controller: str, rival: str, models: Iterable[str]
-) -> Estimate:
-    """Geometric mean of the cost over a rival's, paired, where the rival survives."""
+) -> str:
+    """Geometric mean (%) of the cost over a rival's, paired, where the rival survives."""
     logs = []
     for (results,) in (transfer.drives[model] for model in models):
         mask = survival_mask(results[rival])
         logs.append(-compute_log_ratios(results[rival].costs, results[controller])[mask])
-    return geometric_mean(*logs)
+    return geometric_mean(*logs).inline(100.0, ".0f")
 
 
 def _make_ratio_table(transfer: TransferResult, title: str) -> ResultTable:
-    """What everybody costs on each model over `_RIVALS`."""
-    cells = [
-        [controller, *("" if controller == rival else _format_percent(_compute_cost_ratio(transfer,
-            controller, rival, [model]))
-                for model in transfer.drives for rival in _RIVALS)]
-        for _, controller in list_entries(transfer.kind)
-    ]  # fmt: skip
-    header = [f"{model}, % of {rival}" for model in transfer.drives for rival in _RIVALS]
+    """Table of what everybody costs on each model over `_RIVALS`."""
+    pairs, cells = list(product(transfer.drives, _RIVALS)), []
+    for _, name in list_entries(transfer.kind):
+        ratios = (name != x and _format_cost_ratio(transfer, name, x, [m]) for m, x in pairs)
+        cells.append([name, *(ratio or "" for ratio in ratios)])
+    header = [f"{model}, % of {rival}" for model, rival in pairs]
     note = "Geometric means, paired, where the one compared with survives; a failure counts 20."
     return ResultTable(f"{title}: cost over others'", ("controller", *header), cells, note)
-
-
-def _format_percent(ratio: Estimate) -> str:
-    return ratio.inline(100.0, ".0f")

@@ -1,10 +1,7 @@
-"""Question: what does a learned policy cost, against no control and the best classical line?
+"""Costs of a learned policy beside no control, the classical line and a class's baselines.
 
-All drive the same seeds in the env that the policy was trained on, which are made from its weights:
-nobody can have trained on them.
-
-What `sideslip distill` learns from, the contests of a class with their teacher, what goes on
-from it, and what came of it in each of them.
+All drive the same seeds, made from the policy's weights. Lessons of `sideslip distill` and starts
+of `sideslip train -i` are made here: the tasks of a class with their teacher, some of them varied.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -52,27 +49,23 @@ if TYPE_CHECKING:
     from ...agents.training.config import TrainingTask
     from ...agents.training.distill import DistillTask
 
-CLASSICAL, FILTER = "lqr", "exact-kf"
+_CLASSICAL, FILTER = "lqr", "exact-kf"
 
 
 @dataclass
 class PolicyEvaluation:
-    """The contestants' episodes on the same seeds: the policy's first.
+    """Episodes on the same seeds by entry, the policy's first."""
 
-    salt: of the seeds, "" where the caller chose them. reference: of the env. driven: by
-    contestant. left_out: why a contestant is not among them.
-    """
-
-    policy: Policy
-    salt: str
-    seeds: list[int]
-    reference: str
-    entries: dict[str, ControlEntry]
-    drives: dict[str, DriveResult]
-    left_out: dict[str, str]
+    policy: Policy  # the policy
+    salt: str  # salt of the seeds, "" where the caller chose them
+    seeds: list[int]  # seeds of the episodes
+    reference: str  # reference of the env
+    entries: dict[str, ControlEntry]  # entries by name
+    drives: dict[str, DriveResult]  # episodes by name
+    left_out: dict[str, str]  # why an entry is not among them, by name
 
     def costs(self, name: str) -> Array:
-        """(seeds,) of a contestant."""
+        """Return the costs of an entry, shape (seeds,)."""
         return self.drives[name].costs
 
 
@@ -86,11 +79,18 @@ def evaluate_policy(
 ) -> PolicyEvaluation:
     """Drive a policy, the uncontrolled car, and the classical line.
 
-    policy: a shipped name or a path. env_id: another env than the policy's own, with that id's
-    options. scenario: a name, instead of the env's own. seed: of the first episode, the next ones
-    count up; default: seeds made from the weights.
+    Args:
+        policy: Shipped name or path.
+        episodes: Episodes of each entry.
+        env_id: Another env than the policy's own, with that id's options.
+        scenario: Name instead of the env's own.
+        seed: Seed of the first episode, the next ones count up; None: made from the weights.
 
-    Raises ValueError where the policy cannot drive the env, and what `load_policy` raises.
+    Returns:
+        Episodes of all entries.
+
+    Raises:
+        ValueError: The policy cannot drive the env.
     """
     loaded = load_policy(policy)
     home, shown, reference, options = _describe_task(loaded, env_id, scenario)
@@ -98,7 +98,7 @@ def evaluate_policy(
     seeds = (
         make_salted_seeds(salt, episodes) if seed is None else list(range(seed, seed + episodes))
     )
-    rivals = {f"{CLASSICAL} on {FILTER}": (FILTER, CLASSICAL), "none": ("", "none")}
+    rivals = {f"{_CLASSICAL} on {FILTER}": (FILTER, _CLASSICAL), "none": ("", "none")}
     if loaded.name in rivals:
         raise ValueError(f"the policy's file is called {loaded.name!r}, as what it is held against")
     contestants = {loaded.name: (loaded.card.estimator, policy)} | rivals
@@ -119,7 +119,7 @@ def evaluate_policy(
 def _describe_task(
     policy: Policy, env_id: str | None, scenario: str | None
 ) -> tuple[str, str, str, JsonMap]:
-    """(env's id, what its scenario is called, its reference, its options)."""
+    """Id of the env, the name of its scenario, its reference, its options."""
     card = policy.card
     options = dict(card.env_options) if env_id in (None, card.env_id) else {}
     if scenario is not None:
@@ -130,7 +130,7 @@ def _describe_task(
 
 
 def summarise_evaluation(result: PolicyEvaluation) -> dict[str, Any]:
-    """For a card: the seeds' salt, and each contestant's mean cost with its 95 % interval."""
+    """Summarise for a card: the salt, and each entry's mean cost with its 95 % interval."""
     costs = {}
     for name in result.drives:
         mean, low, high = (round(number, 6) for number in interval(result.costs(name)))
@@ -147,7 +147,7 @@ def record_evaluation(path: str | Path, episodes: int = 256) -> PolicyEvaluation
 
 
 def make_suite(result: PolicyEvaluation) -> Suite:
-    """Table and rows; the first episode over time and in motion."""
+    """Make a suite of table and rows, and of the first episode over time and in motion."""
     name, card = result.policy.name, result.policy.card
     entry = result.entries[name]
     text = (
@@ -158,58 +158,46 @@ def make_suite(result: PolicyEvaluation) -> Suite:
     reference = result.reference
     if reference != card.reference:
         text += f" Here it is judged by another reference, {reference}: by another cost."
-    suite = Suite(
-        "enjoy", f"{name} on {entry.task.env_id}", text, _make_rows(result), [_make_table(result)]
-    )
+    title = f"{name} on {entry.task.env_id}"
+    suite = Suite("enjoy", title, text, _make_rows(result), [_make_table(result)])
     from ..control.report import make_time_explorer
 
-    series: dict[tuple[str, ...], Array] = {
-        (label,): outcome.series
-        for label, outcome in result.drives.items()
-        if outcome.series is not None
-    }
+    series: dict[tuple[str, ...], Array] = {}
+    for label, outcome in result.drives.items():
+        if outcome.series is not None:
+            series[label,] = outcome.series
     suite.explorers.append(make_time_explorer("The first seed, side by side", (), series, name))
     suite.verdict = _compose_verdict(result)
     return suite
 
 
 def _compose_verdict(result: PolicyEvaluation) -> str:
-    """What the policy costs over each of the others, and how often it fails."""
-    name, others = (
-        result.policy.name,
-        [label for label in result.drives if label != result.policy.name],
-    )
+    """Costs of the policy over the others', and how often it fails."""
+    name = result.policy.name
+    others = [label for label in result.drives if label != name]
     fails = 100.0 * np.mean(result.drives[name]["failure"] != 0.0)
     lines = []
     for other in others:
         logs = np.log(compute_cost_ratios(result.costs(name), result.costs(other)))
-        lines.append(
-            f"{name} costs {format_percent(geometric_mean(logs))} of {other}, seed by seed."
-        )
+        ratio = format_percent(geometric_mean(logs))
+        lines.append(f"{name} costs {ratio} of {other}, seed by seed.")
     limits = f"Not said: other cars, scenarios and seeds than these {len(result.seeds)}."
     return format_verdict(*lines, f"It fails in {fails:.0f} % of the episodes. {limits}")
 
 
 def _make_table(result: PolicyEvaluation) -> ResultTable:
+    """Table of what the policy costs over each other's, and of everybody's motion."""
     first = result.policy.name
     costs, cells = result.costs(first), []
     for name, outcome in result.drives.items():
-        rival = name != first
-        ratio = (
-            format_percent(geometric_mean(np.log(compute_cost_ratios(costs, outcome.costs))))
-            if rival
-            else ""
-        )
-        cells.append(
-            [
-                name,
-                ratio,
-                f"{100.0 * compute_win_rate(costs, outcome.costs).value:.0f} %" if rival else "",
-                f"{1e3 * outcome['rms_slip'].mean():.2f}",
-                f"{outcome['largest_step'].mean():.0f}",
-                f"{100.0 * np.mean(outcome['failure'] != 0.0):.1f} %",
-            ]
-        )
+        ratio = better = ""
+        if name != first:
+            logs = np.log(compute_cost_ratios(costs, outcome.costs))
+            ratio = format_percent(geometric_mean(logs))
+            better = f"{100.0 * compute_win_rate(costs, outcome.costs).value:.0f} %"
+        slip, step = 1e3 * outcome["rms_slip"].mean(), outcome["largest_step"].mean()
+        fails = 100.0 * np.mean(outcome["failure"] != 0.0)
+        cells.append([name, ratio, better, f"{slip:.2f}", f"{step:.0f}", f"{fails:.1f} %"])
     header = (f"{first} costs, of it", "better", "RMS slip", "step", "fails")
     note = (
         f"{first}'s cost over each other's: paired geometric means with 95 % intervals. "
@@ -221,18 +209,13 @@ def _make_table(result: PolicyEvaluation) -> ResultTable:
 
 
 def _make_rows(result: PolicyEvaluation) -> list[ResultRow]:
+    """Rows of every entry: cost, slip, effort and steps."""
     rows = []
     for name, outcome in result.drives.items():
         entry, is_policy = result.entries[name], name == result.policy.name
-        labels = {
-            "estimator": entry.estimator,
-            "controller": name if is_policy else entry.controller,
-        }
-        seeds: dict[str, Any] = {
-            "n": len(result.seeds),
-            "salt": result.salt,
-            "spec": make_spec(entry),
-        }
+        controller = name if is_policy else entry.controller
+        labels: dict[str, Any] = {"estimator": entry.estimator, "controller": controller}
+        seeds = {"n": len(result.seeds), "salt": result.salt, "spec": make_spec(entry)}
         common = {"suite": "enjoy", "env_version": f"{entry.task.env_id} {__version__}"}
         for metric in ("cost", "rms_slip", "peak_slip", "effort", "largest_step"):
             columns = {"scenario": entry.task.scenario, **common, **labels, **seeds}
@@ -240,17 +223,12 @@ def _make_rows(result: PolicyEvaluation) -> list[ResultRow]:
     return rows
 
 
-JOINT, RIVAL = "joint, friction", "adaptive-nmpc"
-OUTPUTS = ("beta", "gamma", "phi", "phi_rate", "F_d", "N_d", "bias", "front_tyres", "rear_tyres",
+_JOINT, _RIVAL = "joint, friction", "adaptive-nmpc"
+_OUTPUTS = ("beta", "gamma", "phi", "phi_rate", "F_d", "N_d", "bias", "front_tyres", "rear_tyres",
            "inverse_friction")  # fmt: skip
-"""What a student on `joint` reads of it, with standard deviations."""
-VARIED = {
-    "tyres": (0.4, 2.0),
-    "wind": (-500.0, 500.0),
-    "mass": (0.8, 1.3),
-    "camera": (0.01, 0.12),
-    "out": (2.0, 6.0),
-}
+"""States that a student on `joint` reads, with standard deviations."""
+VARIED = {"tyres": (0.4, 2.0), "wind": (-500.0, 500.0), "mass": (0.8, 1.3)}
+VARIED |= {"camera": (0.01, 0.12), "out": (2.0, 6.0)}
 """Of lessons that are varied: factors on each axle's tyres and the wind's force from the side, in
 N, in every episode, and, of a lesson, on the true car's mass; how late its camera is, and how long
 its GPS or its camera is out, in s."""
@@ -259,54 +237,42 @@ FILTERS = ("", "joint")
 
 
 def list_tasks(kind: str) -> list[ControlTask]:
-    """The scored contests of a class; ValueError for an unknown one."""
-    check_choice(
-        "class of contests", kind, list(dict.fromkeys(task.kind for task in list_scored_tasks()))
-    )
+    """List the scored tasks of a class; ValueError for an unknown one."""
+    kinds = list(dict.fromkeys(task.kind for task in list_scored_tasks()))
+    check_choice("class of contests", kind, kinds)
     return [task for task in list_scored_tasks() if task.kind == kind]
 
 
 def make_card(
     kind: str,
     estimator: str = "",
-    teacher: str = RIVAL,
+    teacher: str = _RIVAL,
     observation_options: Mapping[str, Any] | None = None,
     **rest: Any,
 ) -> Card:
-    """The card of a policy for a class of contests, in the first one's env with options
-    `observation_options` of what is observed; rest: other fields."""
+    """Make the card of a policy for a class of tasks in the first one's env."""
     check_choice("estimator", estimator, FILTERS)
     for name in observation_options or {}:
         check_choice("option", name, OBSERVATION_OPTIONS)
     first = list_tasks(kind)[0]
     options = _make_estimate_options(first, teacher) if estimator else {}
-    return Card.from_env_id(
-        first.env_id,
-        first.env_options | dict(observation_options or {}),
-        estimator,
-        options,
-        **rest,
-    )
+    env_options = first.env_options | dict(observation_options or {})
+    return Card.from_env_id(first.env_id, env_options, estimator, options, **rest)
 
 
 def _make_estimate_options(task: ControlTask, teacher: str) -> JsonMap:
-    """The filter of a teacher that reads `joint`, else of the rival, which is the same in all
-    contests of a class, and more of its states."""
+    """The filter of a teacher on `joint`, else of the rival's, with more of its states."""
     filters = {controller: name for name, controller in ADAPTIVE.items()}
-    controller = teacher if teacher in filters else RIVAL
-    filter_options = make_estimate_options(ControlEntry(task, filters[controller], controller))[
-        "options"
-    ]
-    known = [
-        output
-        for output in OUTPUTS
-        if output != "inverse_friction" or f"{output}_sd" in filter_options
-    ]
-    return {"outputs": known, "std": True, "options": filter_options}
+    controller = teacher if teacher in filters else _RIVAL
+    entry = ControlEntry(task, filters[controller], controller)
+    options = make_estimate_options(entry)["options"]
+    has_friction = "inverse_friction_sd" in options
+    known = [name for name in _OUTPUTS if name != "inverse_friction" or has_friction]
+    return {"outputs": known, "std": True, "options": options}
 
 
 def _draw_changes(varied: int, rng: np.random.Generator) -> Iterator[JsonMap]:
-    """What lessons change of their contest's scenario: nothing, then `VARIED` so many times."""
+    """Draw what lessons change of their task's scenario: nothing, then `VARIED` so many times."""
     yield {}
     for _ in range(varied):
         start, length = rng.uniform(0.0, 4.0), rng.uniform(*VARIED["out"])
@@ -331,29 +297,37 @@ def make_lessons(
     seed: int = 0,
     observation_options: Mapping[str, Any] | None = None,
 ) -> "list[DistillTask]":
-    """A lesson for each contest of a class, and more of each where what the contest keeps varies.
+    """Make a lesson for each task of a class, and more of each in which the scenario varies.
 
-    teacher: a rung, a controller of the matrix, which reads its filter there, or a policy, which
-    reads the one of its card. cars: of each contest's lesson. varied: so many more, as `VARIED`
-    says, share as many cars, rounded up; no filter and no teacher learns of it. seed: of what is
-    drawn for them. seen: options of what the student observes. Raises ValueError for another name,
-    or where that observation lacks what the teacher needs.
+    Args:
+        kind: Class of tasks.
+        teacher: Baseline, controller with its filter of the benchmark, or policy with its card's.
+        estimator: Estimator of the student.
+        cars: Cars of each task's lesson.
+        varied: Further lessons by `VARIED`, which share as many cars, rounded up; no filter and no
+            teacher knows of the changes.
+        seed: Seed of what is drawn for them.
+        observation_options: Options of what the student observes.
+
+    Returns:
+        Lessons of all tasks.
+
+    Raises:
+        ValueError: An unknown name, or an observation that lacks what the teacher needs.
     """
     from ...agents.training.distill import DistillTask
 
     rng = np.random.default_rng(seed)
-    reads = {controller: name for name, controller in ADAPTIVE.items()} | dict.fromkeys(
-        _WITHOUT_FILTER, ""
-    )
+    reads = {controller: name for name, controller in ADAPTIVE.items()}
+    reads |= dict.fromkeys(_WITHOUT_FILTER, "")
     if is_policy(teacher):
         reads[teacher] = load_policy(teacher).card.estimator
     lessons = []
     for task in list_tasks(kind):
         for change in _draw_changes(varied, rng):
             scenario_options = {"scenario": vary_scenario(task, change)} if change else {}
-            entry = ControlEntry(
-                task, reads.get(teacher, REFERENCE_FILTER), teacher, scenario_options
-            )
+            name = reads.get(teacher, REFERENCE_FILTER)
+            entry = ControlEntry(task, name, teacher, scenario_options)
             count = -(-cars // varied) if change else cars
             twins, agent = make_cars(entry, count)
             options = task.env_options | scenario_options | dict(observation_options or {})
@@ -367,12 +341,12 @@ def make_lessons(
 def prepare_start(
     agent: Path | None, varied: int = 0
 ) -> "tuple[Path | Policy | None, Callable[..., TrainingTask]]":
-    """What `sideslip train -i` begins with, and what makes its task of the fields that were said.
+    """Prepare what `sideslip train -i` begins with, and the function that makes its task.
 
-    agent: a zip's path stays what it is; a distilled policy goes on in all contests of its class,
-    but for those with a driver where cars are driven on tensors: rows are of one kind there.
-    varied: so many times in each of them as `VARIED` says, too, drawn by the training's seed and
-    not as `make_lessons` draws. Raises ValueError for them without contests of a class.
+    A zip's path stays what it is; a distilled policy goes on in all tasks of its class, but for
+    those with a driver where cars are driven on tensors: rows are of one kind there. varied: so
+    many times in each of them as `VARIED` says, drawn by the training's seed. Raises ValueError for
+    them without tasks of a class.
     """
     from ...agents.training.config import TrainingTask, get_algorithm
     from ...agents.training.warm_start import make_finetune_task
@@ -403,13 +377,10 @@ def prepare_start(
 
 
 def evaluate_card(path: Path, kind: str, episodes: int) -> JsonMap:
-    """Drive a policy, `nominal`, the rival and oracle-parameters on seeds made from its weights,
-    and write into its card what it costs; what is written."""
+    """Drive a policy and its class's baselines, write what it costs into its card; return that."""
     policy, policy_evaluation = load_policy(path), evaluate_policy(str(path), episodes)
-    tasks = list_tasks(kind)
-    task_costs = run_cases(
-        partial(_evaluate_task, path, episodes=episodes), tasks, "contests", jobs=1
-    )
+    tasks, evaluate = list_tasks(kind), partial(_evaluate_task, path, episodes=episodes)
+    task_costs = run_cases(evaluate, tasks, "contests", jobs=1)
     costs = dict(zip((task.scenario for task in tasks), task_costs, strict=True))
     record = summarise_evaluation(policy_evaluation) | {"cost in % of nominal": costs}
     save_policy(path, policy.network, replace(policy.card, evaluation=record))
@@ -417,12 +388,13 @@ def evaluate_card(path: Path, kind: str, episodes: int) -> JsonMap:
 
 
 def _evaluate_task(path: Path, task: ControlTask, episodes: int) -> JsonMap:
+    """Cost in % of nominal's and win rates, with intervals, and the fraction of failures."""
     policy = load_policy(path)
     seeds = tuple(make_salted_seeds(policy.salt, episodes, task.seed_text))
     entries = {
         "policy": ControlEntry(task, policy.card.estimator, str(path)),
         NOMINAL: ControlEntry(task, "", NOMINAL),
-        RIVAL: ControlEntry(task, JOINT, RIVAL),
+        _RIVAL: ControlEntry(task, _JOINT, _RIVAL),
         PARAMETERS: ControlEntry(task, "", PARAMETERS),
     }
     results = {name: run_chunk(Chunk(entry, seeds)) for name, entry in entries.items()}
@@ -435,10 +407,8 @@ def _evaluate_task(path: Path, task: ControlTask, episodes: int) -> JsonMap:
         for name, result in results.items()
         if name != NOMINAL
     }
-    beaten = {
-        name: compute_win_rate(results["policy"].costs, results[name].costs)
-        for name in (NOMINAL, RIVAL)
-    }
+    policy_costs, rivals = results["policy"].costs, (NOMINAL, _RIVAL)
+    beaten = {name: compute_win_rate(policy_costs, results[name].costs) for name in rivals}
     fails = float((results["policy"]["failure"] != 0.0).mean())
     better = {f"better than {name}": _list_rounded(result, 1.0) for name, result in beaten.items()}
     return shown | better | {"fails": fails}

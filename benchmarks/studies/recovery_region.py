@@ -1,7 +1,7 @@
-"""Question: from which sideslip angle and yaw rate does a controller still save the car?
+"""The suite `recovery`: from which sideslip angle and yaw rate a controller still saves the car.
 
 Cars start straight ahead but sliding and turning, nobody steers, and the seed draws tyres and
-friction. A car is saved that does not fail and ends with a sideslip angle below `CAUGHT`.
+friction. A car is saved that does not fail and ends with a sideslip angle below 0.05 rad.
 """
 
 import math
@@ -25,16 +25,16 @@ from ..harness.stats import interval, mean_share
 from ..harness.study import format_verdict, summarise_names
 
 NAME = "recovery"
-READING = ("two-dof", "esc", "sliding-mode", "lqr")
+_READING = ("two-dof", "esc", "sliding-mode", "lqr")
 ORACLES = ("oracle-state-lqr", "oracle-state-nmpc")
-CONTROLLERS = ("none", *READING, "nominal", *ORACLES)
+CONTROLLERS = ("none", *_READING, "nominal", *ORACLES)
 CLAIRVOYANT = "clairvoyant"
-PULSES = tuple((side, 0.05 * 1.4**k) for side in (-1.0, 1.0) for k in range(10))
+_PULSES = tuple((side, 0.05 * 1.4**k) for side in (-1.0, 1.0) for k in range(10))
 """Full yaw moment to the right or left, for how long (s), before an oracle goes on."""
 _TRIES = 5  # in a batch
-CAUGHT = 0.05  # rad
+_CAUGHT = 0.05  # rad
 SEEDS, QUICK_SEEDS = 16, 4
-POINTS, QUICK_POINTS = (13, 11), (5, 5)  # of the grid: sideslip angles, yaw rates
+_POINTS, QUICK_POINTS = (13, 11), (5, 5)  # of the grid: sideslip angles, yaw rates
 MAX_START = (0.45, 1.0)  # rad and rad/s, where the grid ends
 FIRST_SEED = 2**28
 
@@ -49,14 +49,14 @@ CARS: dict[str, tuple[ControlTask, dict[str, Any]]] = {
         ("coms", 40.0, "model", (0.7, 1.0)),
     )
 }
-"""The contest of each car, whose class has the tuned options, and the scenario."""
+"""The task of each car, whose class has the tuned options, and the scenario."""
 
 _TEXT = (
     "The share of cars that are saved over the sideslip angle and yaw rate they start with: no "
-    f"failure within 5 s, and below {CAUGHT} rad at the end. Nobody steers; the yaw moment alone "
+    f"failure within 5 s, and below {_CAUGHT} rad at the end. Nobody steers; the yaw moment alone "
     "acts. The seed draws tyres and friction. Filters start at zero, as after a cold start: they "
     "have to find the slide first; the two oracles know it, and the car. clairvoyant: whatever any "
-    f"of them saves, or one of {len(PULSES)} tries with full moment to one side for 0.05 to "
+    f"of them saves, or one of {len(_PULSES)} tries with full moment to one side for 0.05 to "
     "1 s and an oracle from then on: of such pieces the run that just saves a car is made "
     "(Pontryagin), so that this is a lower bound of what can be saved, and probably near it."
 )
@@ -64,8 +64,10 @@ _TEXT = (
 
 @dataclass(frozen=True)
 class RecoveryCase:
-    """A controller on a car of `CARS`, over a grid of so many points, on so many seeds, after each
-    of some beginnings: share of the full yaw moment, and s."""
+    """A controller on a car of `CARS`, over a grid of starts, after each of some pulses.
+
+    pulses: Fraction of the full yaw moment, and duration (s).
+    """
 
     car: str
     controller: str
@@ -76,20 +78,17 @@ class RecoveryCase:
 
 @dataclass
 class PulseThenAgent:
-    """An agent that takes over each row after a beginning: share of the full moment, decisions."""
+    """An agent that takes over each row after a pulse: fraction of the full moment, decisions."""
 
     agent: Any
     share: Array
     decisions: Array
 
     def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
+        self, observation: Any, state: Any = None, episode_start: Any = None,
         deterministic: bool = True,
-    ) -> tuple[Any, Any]:
-        """The agent's action, the beginning's while that lasts."""
+    ) -> tuple[Any, Any]:  # fmt: skip
+        """Return the agent's action, the pulse's while that lasts."""
         count, inner = state or (0, None)
         action, inner = self.agent.predict(observation, inner, episode_start, deterministic)
         combined = np.where(count < self.decisions, self.share, np.ravel(action))
@@ -97,15 +96,14 @@ class PulseThenAgent:
 
 
 def make_grid(points: tuple[int, int]) -> tuple[Array, Array]:
-    """Sideslip angles (rad) and yaw rates (rad/s) of the starts."""
-    beta, gamma = (
-        np.linspace(-limit, limit, n) for limit, n in zip(MAX_START, points, strict=True)
-    )
+    """Make the sideslip angles (rad) and yaw rates (rad/s) of the starts."""
+    axes = zip(MAX_START, points, strict=True)
+    beta, gamma = (np.linspace(-limit, limit, n) for limit, n in axes)
     return beta, gamma
 
 
 def compute_recovery_mask(case: RecoveryCase) -> Array:
-    """(yaw rates, sideslip angles, seeds) 1 where the car was saved, after any beginning."""
+    """Mark with 1 where a pulse lets the car be saved, shape (yaw rates, slip angles, seeds)."""
     task, scenario = CARS[case.car]
     beta, gamma = make_grid(case.points)
     tries = len(case.pulses)
@@ -113,7 +111,7 @@ def compute_recovery_mask(case: RecoveryCase) -> Array:
     v_x, indices = scenario["speed"], range(case.seeds)
     states = [{"v_y": v_x * math.tan(b), "gamma": g} for g, b in starts for _ in indices]
     seeds = [FIRST_SEED + i for i in indices] * len(starts)
-    reads = REFERENCE_FILTER if case.controller in READING else ""
+    reads = REFERENCE_FILTER if case.controller in _READING else ""
     entry = ControlEntry(task, reads, case.controller, {"scenario": scenario})
     env, agent = make_cars(entry, len(states))
     share, seconds = np.repeat(case.pulses, len(states) // tries, axis=0).T
@@ -124,19 +122,18 @@ def compute_recovery_mask(case: RecoveryCase) -> Array:
         last = np.where(step.running, step.info["beta"], last)
     env.close()
     shape = (tries, len(gamma), len(beta), case.seeds)
-    caught = (~lost & (np.abs(last) < CAUGHT)).astype(float).reshape(shape)
+    caught = (~lost & (np.abs(last) < _CAUGHT)).astype(float).reshape(shape)
     return np.asarray(caught.max(axis=0))
 
 
 def run(quick: bool = False, jobs: int | None = None, console: Console | None = None) -> Suite:
-    """The maps of every controller on both cars; quick: a coarse grid and few seeds."""
-    points, seeds = (QUICK_POINTS, QUICK_SEEDS) if quick else (POINTS, SEEDS)
+    """Run the maps of every controller on both cars; quick: a coarse grid and few seeds."""
+    points, seeds = (QUICK_POINTS, QUICK_SEEDS) if quick else (_POINTS, SEEDS)
     cases = [RecoveryCase(car, name, points, seeds) for car in CARS for name in CONTROLLERS]
-    starts = [PULSES[k : k + _TRIES] for k in range(0, len(PULSES), _TRIES)]
+    starts = [_PULSES[k : k + _TRIES] for k in range(0, len(_PULSES), _TRIES)]
     cases += [RecoveryCase(car, ORACLES[0], points, seeds, item) for car in CARS for item in starts]
-    results = dict(
-        zip(cases, run_cases(compute_recovery_mask, cases, NAME, jobs, console), strict=True)
-    )
+    masks_by_case = run_cases(compute_recovery_mask, cases, NAME, jobs, console)
+    results = dict(zip(cases, masks_by_case, strict=True))
     suite = Suite(NAME, "From where the car is still saved", _TEXT)
     beta, gamma = (np.degrees(axis) for axis in make_grid(points))
     cars = {car: {name: results[RecoveryCase(car, name, points, seeds)] for name in CONTROLLERS}
@@ -161,12 +158,10 @@ def _draw_figures(suite: Suite) -> None:
     except ModuleNotFoundError:
         return
     text = "Colour: the share of seeds on which the car is saved; the line is at one half."
-    suite.figures = [
-        (share_map.title, draw_share_maps(share_map), text) for share_map in suite.maps
-    ]
+    suite.figures = [(item.title, draw_share_maps(item), text) for item in suite.maps]
     first, best = suite.maps[0], suite.verdict.splitlines()[1:-2]
     shown = ["none"]
-    for group in (READING, ORACLES, (CLAIRVOYANT,)):
+    for group in (_READING, ORACLES, (CLAIRVOYANT,)):
         names = [name for name in group if name in first.shares]
         shown += sorted(names, key=lambda name: -float(first.shares[name].mean()))[:1]
     selected = replace(first, shares={name: first.shares[name] for name in shown})
@@ -175,12 +170,12 @@ def _draw_figures(suite: Suite) -> None:
 
 
 def compose_verdict(cars: Mapping[str, Mapping[str, Array]]) -> str:
-    """The verdict. cars: of each car, by controller what `compute_recovery_mask` finds."""
+    """Compose the verdict from each car's masks of `compute_recovery_mask` by controller."""
     firsts, knowing, clairvoyant_shares = list[str](), list[str](), list[str]()
     for car, masks in cars.items():
         share = {name: values.mean(axis=(0, 1)) for name, values in masks.items()}  # (seeds,)
         mean = {name: 100.0 * float(values.mean()) for name, values in share.items()}
-        rivals = sorted((name for name in READING if name in mean), key=lambda name: -mean[name])
+        rivals = sorted((name for name in _READING if name in mean), key=lambda name: -mean[name])
         even = [name for name in rivals if not interval(share[rivals[0]] - share[name]).low > 0.0]
         best = " and ".join(even) if len(even) < 3 else f"{summarise_names(even, 1)}, a tie,"
         rest = [name for name in rivals if name not in even][:1] + ["none"] * ("none" in mean)
@@ -190,13 +185,12 @@ def compose_verdict(cars: Mapping[str, Mapping[str, Array]]) -> str:
         known = [mean[name] for name in ORACLES if name in mean]
         knowing += [f"{share:.0f} %" for share in sorted(known)[-1:]]
         clairvoyant_shares += [f"{mean[name]:.0f} %" for name in (CLAIRVOYANT,) if name in mean]
+    why = f"Why: knowing the exact motion saves {' and '.join(knowing)}, foresight too "
+    why += f"{' and '.join(clairvoyant_shares)}; filters must find it first."
     return format_verdict(
         "Cars start sliding and turning and nobody steers; saved: going straight again within 5 s.",
         *firsts,
-        f"Why: knowing the exact motion saves {' and '.join(knowing)}, foresight too "
-        f"{' and '.join(clairvoyant_shares)}; filters must find it first."
-        if knowing
-        else "",
+        why if knowing else "",
         "Not covered: a driver who steers against the slide, and starts beyond the grid.",
     )
 

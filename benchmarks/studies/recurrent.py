@@ -1,10 +1,4 @@
-"""Kinds of memory by how much more they cost than the optimum: cases, measurements, the suite.
-
-Who is trained and judged in which condition, and what a training may use.
-
-A case: a memory is trained and judged by the optimum; finished ones stay in a folder.
-
-Question: how much of what memory is worth does each kind of network find?
+"""The suite `memory`: how much more each kind of recurrent network costs than the optimum.
 
 `sideslip/LinearYawVision-v0` with a picture every 40 ms, late or lost. All learn from the optimal
 filter's actions with as many steps; PPO learns from rewards. The gap is what a policy costs over
@@ -20,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,7 +34,7 @@ from ..harness.stats import Estimate, interval
 from ..harness.study import format_percent, format_verdict
 
 ID = "sideslip/LinearYawVision-v0"
-PERIOD, STEP = 0.04, 0.01  # s, of pictures and of control
+PERIOD, _STEP = 0.04, 0.01  # s, of pictures and of control
 CONDITIONS: Mapping[str, Mapping[str, Any]] = {
     "100 ms": {"delays": [0.1]},
     "300 ms": {"delays": [0.3]},
@@ -50,7 +45,7 @@ CONDITIONS: Mapping[str, Mapping[str, Any]] = {
 """How late pictures are, and which share never comes."""
 REPEATED, SEEDS = "100 ms", 3
 """The condition in which everybody trains on so many seeds; elsewhere on one."""
-SCHEDULES = 8  # whose arrivals the optimum is averaged over, where pictures are lost
+_SCHEDULES = 8  # whose arrivals the optimum is averaged over, where pictures are lost
 FILTER, PPO, LQG_FACTOR = "lqg", "ppo", 8
 """The optimum's own policy, as a check, on so many times the episodes; learning from rewards."""
 EPISODES, QUICK_EPISODES = 64, 16
@@ -58,17 +53,13 @@ EPISODES, QUICK_EPISODES = 64, 16
 
 @dataclass(frozen=True)
 class Budget:
-    """What a training may use.
+    """The budget of a training."""
 
-    cars: side by side. rounds: of driving and learning. epochs: passes over all drives in a round.
-    ppo: steps of PPO, 0 for none. duration: s, of an episode.
-    """
-
-    cars: int = 64
-    rounds: int = 3
-    epochs: int = 1
-    ppo: int = 500_000
-    duration: float = 10.0
+    cars: int = 64  # cars side by side
+    rounds: int = 3  # rounds of driving and learning
+    epochs: int = 1  # passes over all drives in a round
+    ppo: int = 500_000  # steps of PPO, 0 for none
+    duration: float = 10.0  # duration of an episode (s)
 
 
 QUICK = Budget(cars=32, rounds=2, epochs=1, ppo=0, duration=3.0)
@@ -76,7 +67,7 @@ QUICK = Budget(cars=32, rounds=2, epochs=1, ppo=0, duration=3.0)
 
 @dataclass(frozen=True)
 class MemoryCase:
-    """Who, in which condition, trained with which seed and budget; so many episodes judge it."""
+    """A learner in a condition, its training's seed and budget, and the episodes that judge it."""
 
     learner: str
     condition: str
@@ -86,15 +77,15 @@ class MemoryCase:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Of the env."""
+        """Options of the env."""
         spec = gym.spec(ID).kwargs
         camera = {"period": PERIOD} | dict(CONDITIONS[self.condition])
         return {"camera": camera, "scenario": spec["scenario"] | {"duration": self.budget.duration}}
 
     @property
     def delay_steps(self) -> int:
-        """Steps that a picture is old when it arrives."""
-        return round(float(CONDITIONS[self.condition]["delays"][0]) / STEP)
+        """Age of a picture when it arrives (control steps)."""
+        return round(float(CONDITIONS[self.condition]["delays"][0]) / _STEP)
 
     @property
     def best(self) -> Optimum:
@@ -105,16 +96,14 @@ class MemoryCase:
 @cache
 def _compute_best(condition: str, budget: Budget) -> Optimum:
     options = MemoryCase("", condition, 0, budget, 1).options
-    return compute_optimum(gym.make(ID, **options), SCHEDULES if "loss" in options["camera"] else 1)
+    n = _SCHEDULES if "loss" in options["camera"] else 1
+    return compute_optimum(gym.make(ID, **options), n)
 
 
 def make_cases(
-    quick: bool,
-    episodes: int | None = None,
-    conditions: Sequence[str] = (),
-    seeds: int = SEEDS,
+    quick: bool, episodes: int | None = None, conditions: Sequence[str] = (), seeds: int = SEEDS
 ) -> list[MemoryCase]:
-    """What a run trains, the repeated seeds last; arguments as of the suite's `run`."""
+    """Make the cases of a run, the repeated seeds last; arguments as of `run`."""
     from ...agents.training.recurrent import MEMORIES
 
     for item in conditions:
@@ -122,29 +111,23 @@ def make_cases(
     budget, default = (QUICK, (REPEATED,)) if quick else (Budget(), tuple(CONDITIONS))
     conditions = list(dict.fromkeys((REPEATED, *conditions))) if conditions else default
     count = episodes or (QUICK_EPISODES if quick else EPISODES)
-    learners = (FILTER, *MEMORIES)
-    cases = [
-        MemoryCase(name, condition, 0, budget, count)
-        for condition in conditions
-        for name in learners
-    ]
+    pairs = product(conditions, (FILTER, *MEMORIES))
+    cases = [MemoryCase(name, condition, 0, budget, count) for condition, name in pairs]
     if not quick:
         cases.append(MemoryCase(PPO, REPEATED, 0, budget, count))
-        repeated = [
-            item for item in cases if item.condition == REPEATED and item.learner in MEMORIES
-        ]
+        memories = [case for case in cases if case.learner in MEMORIES]
+        repeated = [case for case in memories if case.condition == REPEATED]
         cases += [replace(item, seed=seed) for seed in range(1, seeds) for item in repeated]
     return cases
 
 
-FIRST_SEED = 2**30
-NOISE = 0.3  # of what shakes the teacher in the first round
+_FIRST_SEED = 2**30
+_NOISE = 0.3  # of what shakes the teacher in the first round
 _LETTERS = 24  # of a kept case's name
 
 
 class MemoryResult(NamedTuple):
-    """Of each episode what the actions' errors cost and what all cost (n,); the optimum;
-    CPU-seconds and steps of the training."""
+    """Costs by the actions' errors and in all, (n,); the optimum; the training's CPU-s, steps."""
 
     excess: Array
     costs: Array
@@ -153,19 +136,18 @@ class MemoryResult(NamedTuple):
     steps: Array
 
     def gap(self) -> Estimate:
-        """From the actions' errors."""
+        """Compute the gap from the actions' errors."""
         return interval(self.excess / self.best)
 
     def compute_paired_gap(self, reference: "MemoryResult") -> Estimate:
-        """From the costs, against the optimum's own policy on the same seeds."""
+        """Compute the gap from the costs, over the optimum's own policy on the same seeds."""
         return interval((self.costs - reference.costs[: len(self.costs)]) / self.best)
 
 
-def evaluate_agent(
+def _evaluate_agent(
     cars: Any, twins: Any, agent: Any, best: Optimum, seed: int
 ) -> tuple[Array, Array]:
-    """(excess, costs), (N,) each, of an agent's episodes; twins: the same cars,
-    `wrap_optimal_estimate`."""
+    """Excess and costs of an agent's episodes, (N,) each; twins: the cars with the optimum."""
     seeds = range(seed, seed + twins.num_envs)
     names = [entry.name for entry in twins.layout]
     columns = [names.index(name) for name in Lqg.needs]
@@ -183,7 +165,7 @@ def evaluate_agent(
 
 
 def run_case(case: MemoryCase) -> MemoryResult:
-    """Train and judge."""
+    """Train and judge a case."""
     best, start_time = case.best, time.process_time()
     count = case.episodes * (LQG_FACTOR if case.learner == FILTER else 1)
     twins = wrap_optimal_estimate(_make_cars(case, count))
@@ -198,7 +180,7 @@ def run_case(case: MemoryCase) -> MemoryResult:
 
         cars = CompactObservation(_make_cars(case, count))
     seconds = time.process_time() - start_time if steps else 0.0
-    outcome = evaluate_agent(cars, twins, agent, best, FIRST_SEED)
+    outcome = _evaluate_agent(cars, twins, agent, best, _FIRST_SEED)
     return MemoryResult(*outcome, *(np.array(value) for value in (best.cost, seconds, steps)))
 
 
@@ -207,7 +189,7 @@ def _make_cars(case: MemoryCase, count: int) -> Any:
 
 
 def _train_memory(case: MemoryCase) -> tuple[Any, int]:
-    """(a memory that acts, steps that it saw)."""
+    """A memory that acts, and the steps that it saw."""
     from ...agents.training.distill import DistillTask
     from ...agents.training.networks import CompactObservation
     from ...agents.training.recurrent import MEMORIES, train_memory
@@ -216,22 +198,11 @@ def _train_memory(case: MemoryCase) -> tuple[Any, int]:
     budget = case.budget
     twins = wrap_optimal_estimate(_make_cars(case, budget.cars))
     task = DistillTask(CompactObservation(_make_cars(case, budget.cars)), twins, Lqg(twins))
-    config = DistillConfig(
-        rounds=budget.rounds,
-        epochs=budget.epochs,
-        learning_rate=MEMORIES[case.learner].rate,
-        noise=NOISE,
-        seed=case.seed,
-    )
+    training: Any = {"rounds": budget.rounds, "epochs": budget.epochs, "seed": case.seed}
+    config = DistillConfig(learning_rate=MEMORIES[case.learner].rate, noise=_NOISE, **training)
     weight, steps = float(case.best.weights[0]), list[int]()
-    agent = train_memory(
-        case.learner,
-        task,
-        config,
-        case.delay_steps,
-        weight,
-        lambda round_result: steps.append(round_result.steps),
-    )
+    arguments = (case.learner, task, config, case.delay_steps, weight)
+    agent = train_memory(*arguments, lambda round_result: steps.append(round_result.steps))
     return agent, steps[-1]
 
 
@@ -250,21 +221,20 @@ def _train_ppo(case: MemoryCase, cars: Any) -> Any:
 
 @dataclass(frozen=True)
 class CaseCache:
-    """`measured` that looks in a folder first and leaves its result there; None keeps nothing."""
+    """`run_case` behind a folder of results; None keeps nothing."""
 
     folder: Path | None
 
     def __call__(self, case: MemoryCase) -> MemoryResult:
-        """The case's result."""
+        """Return the case's result, from the folder if it is there."""
         if self.folder is None:
             return run_case(case)
         sources = Path(__file__).read_text()  # beside agents and case, all that numbers depend on
         text = hash_experiment() + sources + json.dumps(asdict(case) | case.options)
         path = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:_LETTERS]}.npz"
+        # a damaged file is measured anew
         with contextlib.suppress(Exception), np.load(path, allow_pickle=False) as saved:
-            return MemoryResult(
-                *(saved[name] for name in MemoryResult._fields)
-            )  # damaged: measured anew
+            return MemoryResult(*(saved[name] for name in MemoryResult._fields))
         result = run_case(case)
         with contextlib.suppress(OSError):  # a full disk loses the file, not the run
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -284,7 +254,7 @@ _TEXT = (
 )
 
 Results = Mapping[str, Mapping[str, Sequence[MemoryResult]]]
-"""By who and condition, of each training seed."""
+"""Results of each training seed, by learner and condition."""
 
 
 def run(
@@ -296,11 +266,19 @@ def run(
     conditions: Sequence[str] = (),
     seeds: int = SEEDS,
 ) -> Suite:
-    """Everybody in every condition; quick: in one, with little training and without PPO.
+    """Train and judge all in every condition; quick: in one, little, and without PPO.
 
-    episodes: that judge a policy. keep: a folder in which finished cases stay. conditions: of
-    `CONDITIONS`, none for all. seeds: trainings of each memory in `REPEATED`, which is always
-    there.
+    Args:
+        quick: Whether the run is quick.
+        episodes: Episodes that judge a policy.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+        keep: Folder in which finished cases stay.
+        conditions: Names in `CONDITIONS`, none for all; `REPEATED` is always among them.
+        seeds: Trainings of each memory in `REPEATED`.
+
+    Returns:
+        Suite with verdict, tables and a figure.
     """
     suite = Suite(NAME, "Memory where the optimum is known", _TEXT)
     if find_spec("torch") is None:
@@ -317,46 +295,39 @@ def run(
     return suite
 
 
-def average_seeds(runs: Sequence[MemoryResult]) -> MemoryResult:
+def _average_seeds(runs: Sequence[MemoryResult]) -> MemoryResult:
     """The mean over training seeds, episode by episode."""
     return MemoryResult(*(np.mean(arrays, axis=0) for arrays in zip(*runs, strict=True)))
 
 
 def make_verdict(results: Results) -> str:
-    """The verdict."""
-    learners = [learner for learner in results if learner not in (FILTER, PPO)]
-    gaps = {
-        learner: {
-            condition: average_seeds(item).gap() for condition, item in results[learner].items()
-        }
-        for learner in learners
-    }
-    mean = {
-        learner: float(np.mean([item.value for item in gaps[learner].values()]))
-        for learner in learners
-    }
-    first, *others = sorted(learners, key=lambda learner: mean[learner])
+    """Compose the verdict."""
+    gaps, mean = dict[str, dict[str, Estimate]](), dict[str, float]()
+    for learner in (name for name in results if name not in (FILTER, PPO)):
+        runs = results[learner].items()
+        gaps[learner] = {condition: _average_seeds(item).gap() for condition, item in runs}
+        mean[learner] = float(np.mean([item.value for item in gaps[learner].values()]))
+    first, *others = sorted(mean, key=lambda learner: mean[learner])
     rest = ", ".join(f"{learner} {100.0 * mean[learner]:.0f} %" for learner in others)
     hardest = max(gaps[first], key=lambda condition: gaps[first][condition].value)
-    check = "; ".join(
-        f"{condition} {format_percent(compute_lqg_gap(item[0]))}"
-        for condition, item in list(results[FILTER].items())[:2]
-    )
+    optima = list(results[FILTER].items())[:2]
+    checks = [f"{name} {format_percent(_compute_lqg_gap(item[0]))}" for name, item in optima]
+    rewards = ""
+    if PPO in results:
+        gap = format_percent(_average_seeds(results[PPO][REPEATED]).gap())
+        rewards = f"By rewards alone ppo, without memory: {gap} at {REPEATED}."
     return format_verdict(
         f"Over the optimum: {first} {100.0 * mean[first]:.0f} %, {rest}.",
         f"Means of {len(gaps[first])} conditions; {first} is furthest from it at {hardest}: "
         f"{format_percent(gaps[first][hardest])}.",
-        "By rewards alone ppo, without memory: "
-        f"{format_percent(average_seeds(results[PPO][REPEATED]).gap())} at {REPEATED}."
-        if PPO in results
-        else "",
-        f"Check, the optimal policy's own costs over it: {check}.",
+        rewards,
+        f"Check, the optimal policy's own costs over it: {'; '.join(checks)}.",
         "Not covered: longer training, larger networks, other sensors and cars.",
     )
 
 
-def compute_lqg_gap(result: MemoryResult) -> Estimate:
-    """Of the optimum's own policy: its costs over the computed optimum, less one."""
+def _compute_lqg_gap(result: MemoryResult) -> Estimate:
+    """Costs of the optimum's own policy over the computed optimum, less one."""
     return interval(result.costs / result.best - 1.0)
 
 
@@ -365,60 +336,47 @@ def _format_gap(number: Estimate) -> str:
 
 
 def _add_tables(suite: Suite, results: Results) -> None:
+    """Add rows and the tables of gaps and of trainings."""
     conditions = list(results[FILTER])
     reference = {condition: runs[0] for condition, runs in results[FILTER].items()}
     gaps, trainings = [], []
     for learner, learner_runs in results.items():
         numbers = {
-            condition: compute_lqg_gap(runs[0]) if learner == FILTER else average_seeds(runs).gap()
-            for condition, runs in learner_runs.items()
+            name: _compute_lqg_gap(runs[0]) if learner == FILTER else _average_seeds(runs).gap()
+            for name, runs in learner_runs.items()
         }
-        gaps.append(
-            [learner, *(_format_gap(numbers[w]) if w in numbers else "" for w in conditions)]
-        )
+        texts = [_format_gap(numbers[name]) if name in numbers else "" for name in conditions]
+        gaps.append([learner, *texts])
         for condition, number in numbers.items():
-            columns = {
-                "scenario": condition,
-                "controller": learner,
-                "n": len(learner_runs[condition][0].costs),
-            }
+            n = len(learner_runs[condition][0].costs)
+            columns: dict[str, Any] = {"scenario": condition, "controller": learner, "n": n}
             common = {"suite": NAME, "salt": "fixed", "env_version": f"{ID} {__version__}"}
             suite.rows.append(ResultRow.from_estimate("gap", number, **columns, **common))
         if learner != FILTER:
             runs = learner_runs[REPEATED]
             seeds = ", ".join(f"{100.0 * result.gap().value:.1f}" for result in runs)
-            plain = _format_gap(average_seeds(runs).compute_paired_gap(reference[REPEATED]))
-            spent = np.mean(
-                [result.seconds for run_list in learner_runs.values() for result in run_list]
-            )
+            plain = _format_gap(_average_seeds(runs).compute_paired_gap(reference[REPEATED]))
+            spent = np.mean([run.seconds for item in learner_runs.values() for run in item])
             trainings.append([learner, seeds, plain, f"{runs[0].steps:.0f}", f"{spent:.0f}"])
     n = len(reference[REPEATED].costs) // LQG_FACTOR
-    optima = ", ".join(
-        f"{condition} {1e3 * runs.best:.1f}" for condition, runs in reference.items()
-    )
+    optima = ", ".join(f"{name} {1e3 * run.best:.1f}" for name, run in reference.items())
     note = (
         f"Percent over the optimum, with 95 % intervals over {n} episodes, the same for all; "
         f"{FILTER}: the optimal policy's plain costs on {n * LQG_FACTOR}. "
         f"The optimum in 10^-3: {optima}."
     )
-    title = f"Trainings, at {REPEATED}"
+    suite.tables.append(ResultTable("Cost over the optimum", ("memory", *conditions), gaps, note))
     header = ("memory", "gap of each seed / %", "plain costs / %", "steps", "CPU-s")
-    suite.tables += [
-        ResultTable("Cost over the optimum", ("memory", *conditions), gaps, note),
-        ResultTable(
-            title, header, trainings, "CPU-s: mean of all conditions. plain costs: over lqg's."
-        ),
-    ]
+    title, text = f"Trainings, at {REPEATED}", "CPU-s: mean of all conditions. "
+    text += "plain costs: over lqg's."
+    suite.tables.append(ResultTable(title, header, trainings, text))
 
 
 def _draw(suite: Suite, results: Results) -> None:
     """The gap over the delay; nothing where plotly is not installed or there is one delay only."""
-    delays = {
-        1e3 * camera["delays"][0]: condition
-        for condition, camera in CONDITIONS.items()
-        if "loss" not in camera and condition in results[FILTER]
-    }
-    delays = dict(sorted(delays.items()))
+    late = {name: camera for name, camera in CONDITIONS.items() if "loss" not in camera}
+    measured = [(1e3 * late[name]["delays"][0], name) for name in late if name in results[FILTER]]
+    delays = dict(sorted(measured))
     if find_spec("plotly") is None or len(delays) < 2:
         return
     from ..report.figures import draw_curves
@@ -426,9 +384,7 @@ def _draw(suite: Suite, results: Results) -> None:
     series = {}
     for learner in results:
         if set(delays.values()) <= set(results[learner]) and learner != FILTER:
-            gaps = [
-                average_seeds(results[learner][condition]).gap() for condition in delays.values()
-            ]
+            gaps = [_average_seeds(results[learner][name]).gap() for name in delays.values()]
             value, low, high = 100.0 * np.array(gaps).T
             series[learner] = value, low, high
     labels = ("delay of the pictures / ms", "cost over the optimum / %")

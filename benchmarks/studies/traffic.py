@@ -1,6 +1,6 @@
-"""Question: does stability control save a late driver's swerve on a wet road among other vehicles?
+"""The suite `highway`: does stability control save a late driver's swerve among other vehicles?
 
-`sideslip/Highway-v0` as it is by default, the same seeds for everybody; and highway-env's own
+`sideslip/Highway-v0` on a wet road, the same seeds for everybody; and highway-env's own
 `lane-keeping-v0`, driven by `lane-keeping` on our filters and on highway-env's observation.
 """
 
@@ -31,18 +31,18 @@ from ..harness.results import ResultRow, ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_means, root_mean, share
 from ..harness.study import call_quietly, format_percent, format_verdict, make_env
 
-NAME, ID = "highway", "sideslip/Highway-v0"
-CONTEST = ControlTask("", ID, "passenger-car", "lagged", "wet-evasion")
+_NAME, ID = "highway", "sideslip/Highway-v0"
+_TASK = ControlTask("", ID, "passenger-car", "lagged", "wet-evasion")
 ORACLE = ORACLES[STATE][0]
-READS = {"none": "", "ppo-yaw-vision": "", ORACLE: ""}
+_READS = {"none": "", "ppo-yaw-vision": "", ORACLE: ""}
 CONTROLLERS = ("none", "ppo-yaw-vision", "two-dof", "lqr", "nmpc", ORACLE)
-SEEDS, QUICK_SEEDS, CHUNK = 64, 16, 8
+SEEDS, QUICK_SEEDS, _CHUNK = 64, 16, 8
 FIRST_SEED = 2**29
-ENDS = ("spin", "collision", "departure")
+_ENDS = ("spin", "collision", "departure")
 
 KEEPING = "lane-keeping-v0"
-RETURNED, NEWEST = "its observation, as step returns it", "its observation, after the step"
-READERS = ("multirate-residual-kf", "exact-kf", RETURNED, NEWEST)
+_RETURNED, _NEWEST = "its observation, as step returns it", "its observation, after the step"
+READERS = ("multirate-residual-kf", "exact-kf", _RETURNED, _NEWEST)
 DRIVES, QUICK_DRIVES = 4, 1
 _TEXT = """\
 A vehicle ahead brakes hard on a wet road (friction 0.4 to 0.7), and a startled driver swerves \
@@ -54,9 +54,9 @@ filters and `lane-keeping` on it, beside the noisy state that highway-env observ
 
 
 def simulate_swerve(case: tuple[str, tuple[int, ...]]) -> Array:
-    """(seeds, 3): cost, failure and largest slip in rad of a controller on some seeds."""
+    """Run a controller on some seeds: cost, failure and largest slip (rad), shape (seeds, 3)."""
     controller, seeds = case
-    entry = ControlEntry(CONTEST, READS.get(controller, REFERENCE_FILTER), controller)
+    entry = ControlEntry(_TASK, _READS.get(controller, REFERENCE_FILTER), controller)
     if entry.oracle:
         env, agent = make_oracle(entry.oracle, ID, options=entry.best, **entry.env_options)
     else:
@@ -74,15 +74,18 @@ def simulate_swerve(case: tuple[str, tuple[int, ...]]) -> Array:
 
 
 def keep_lane(case: tuple[str, int]) -> Array:
-    """(5,): RMS errors of slip, yaw rate, heading and offset at the preview point, and the RMS
-    offset in m from the lane's centre, in the second half of a drive."""
+    """Drive with a reader and a seed: RMS of five numbers in the second half, shape (5,).
+
+    Errors of slip, yaw rate, heading (rad, rad/s) and the preview point's offset (m); the car's
+    offset from the lane's centre (m).
+    """
     from ...envs.highway.lane_keeping_adapter import STATES, KeepingEnv, NativeObservation
 
     reader, seed = case
     base: Any = KeepingEnv()
     env: Any
-    if reader in (RETURNED, NEWEST):
-        env = NativeObservation(base, reader == RETURNED)
+    if reader in (_RETURNED, _NEWEST):
+        env = NativeObservation(base, reader == _RETURNED)
     else:
         env = call_quietly(EstimateObservation, base, reader, outputs=STATES, std=False)
     agent = make_agent("lane-keeping", env, moment=False)
@@ -90,8 +93,7 @@ def keep_lane(case: tuple[str, int]) -> Array:
     columns = [names.index(f"{name}_hat") for name in STATES]
     rows = []
     for step in iterate_steps(env, agent, seed):
-        error = step.obs[columns] - base.truth
-        rows.append([*error, base.motion.y])
+        rows.append([*(step.obs[columns] - base.truth), base.motion.y])
     return root_mean(np.square(rows[len(rows) // 2 :]), axis=0)
 
 
@@ -101,57 +103,38 @@ def run(
     jobs: int | None = None,
     console: Console | None = None,
 ) -> Suite:
-    """Both questions; seeds of the swerve, drives of the lane keeping."""
-    suite = Suite(NAME, "Swerving among other vehicles, on highway-env's roads", _TEXT)
+    """Answer both questions; seeds of the swerve, drives of the lane keeping."""
+    suite = Suite(_NAME, "Swerving among other vehicles, on highway-env's roads", _TEXT)
     if find_spec("highway_env") is None:
         suite.verdict = 'Not driven: it needs highway-env, pip install "sideslip[highway]".'
         return suite
-    cases = list(product(CONTROLLERS, split_seeds(seeds, CHUNK)))
-    parts = run_cases(simulate_swerve, cases, NAME, jobs, console)
-    swerves = {
-        controller: np.concatenate(
-            [part for (item, _), part in zip(cases, parts, strict=True) if item == controller]
-        )
-        for controller in CONTROLLERS
-    }
-    lane_cases = list(product(READERS, range(drives)))
-    results = run_cases(keep_lane, lane_cases, KEEPING, jobs, console)
-    lanes = {
-        reader: np.array(
-            [item for (name, _), item in zip(lane_cases, results, strict=True) if name == reader]
-        )
-        for reader in READERS
-    }
+    chunks = split_seeds(seeds, _CHUNK)
+    cases, lane_cases = list(product(CONTROLLERS, chunks)), list(product(READERS, range(drives)))
+    parts = iter(run_cases(simulate_swerve, cases, _NAME, jobs, console))
+    swerves = {name: np.concatenate([next(parts) for _ in chunks]) for name in CONTROLLERS}
+    rows = iter(run_cases(keep_lane, lane_cases, KEEPING, jobs, console))
+    lanes = {reader: np.array([next(rows) for _ in range(drives)]) for reader in READERS}
     _add_swerves(suite, swerves)
     _add_lanes(suite, lanes)
     suite.verdict = compose_verdict(swerves, lanes)
     return suite
 
 
-def compute_end_rate(numbers: Array, cause: str) -> Estimate:
-    """The share of episodes that ended by a failure, "none" for success, with Wilson's interval."""
+def _compute_end_rate(numbers: Array, cause: str) -> Estimate:
+    """Fraction of episodes that ended by a failure, "none" for success."""
     return share(numbers[:, 1] == FAILURES.index(cause))
 
 
 def compose_verdict(swerves: Mapping[str, Array], lanes: Mapping[str, Array]) -> str:
-    """The verdict; arguments as `simulate_swerve` and `keep_lane` have them, by controller and
-    reader."""
-    success = {
-        controller: compute_end_rate(numbers, "none") for controller, numbers in swerves.items()
-    }
-    rivals = sorted(
-        (controller for controller in success if controller not in ("none", ORACLE)),
-        key=lambda controller: -success[controller].value,
-    )
-    free = swerves["none"]
-    ends = ", ".join(
-        f"{cause} {100.0 * compute_end_rate(free, cause).value:.0f} %" for cause in ENDS
-    )
+    """Compose the verdict from `simulate_swerve` by controller and `keep_lane` by reader."""
+    success = {name: _compute_end_rate(numbers, "none") for name, numbers in swerves.items()}
+    names = [name for name in success if name not in ("none", ORACLE)]
+    rivals = sorted(names, key=lambda name: -success[name].value)
+    rates = {cause: 100.0 * _compute_end_rate(swerves["none"], cause).value for cause in _ENDS}
+    ends = ", ".join(f"{cause} {rate:.0f} %" for cause, rate in rates.items())
     offset = {reader: float(numbers[:, -1].mean()) for reader, numbers in lanes.items()}
-    filter_best, observation_best = (
-        min((offset[r], r) for r in READERS[:2]),
-        min((offset[r], r) for r in READERS[2:]),
-    )
+    filter_best = min((offset[r], r) for r in READERS[:2])
+    observation_best = min((offset[r], r) for r in READERS[2:])
     return format_verdict(
         "A late driver swerves around a braking vehicle on a wet road; control has the yaw moment.",
         f"Success: {rivals[0]} {format_percent(success[rivals[0]])}, then {rivals[1]} "
@@ -167,34 +150,25 @@ def compose_verdict(swerves: Mapping[str, Array], lanes: Mapping[str, Array]) ->
 def _add_swerves(suite: Suite, swerves: Mapping[str, Array]) -> None:
     cells, free = [], swerves["none"]
     for controller, numbers in swerves.items():
-        success = compute_end_rate(numbers, "none")
+        success = _compute_end_rate(numbers, "none")
         cost = interval(numbers[:, 0], ratio_of_means, free[:, 0])
         slip = interval(numbers[:, 2])
-        ends = {cause: compute_end_rate(numbers, cause) for cause in ENDS}
-        cells.append(
-            [
-                controller,
-                *success.text(1e2, ".1f"),
-                *(f"{100.0 * rate.value:.1f}" for rate in ends.values()),
-                *cost.text(1e2, ".0f"),
-                f"{np.degrees(slip.value):.2f}",
-            ]
-        )
+        ends = {cause: _compute_end_rate(numbers, cause) for cause in _ENDS}
+        rates = (f"{100.0 * rate.value:.1f}" for rate in ends.values())
+        texts = (*success.text(1e2, ".1f"), *rates, *cost.text(1e2, ".0f"))
+        cells.append([controller, *texts, f"{np.degrees(slip.value):.2f}"])
         metrics = {"success_rate": success, "ratio": cost, "peak_slip": slip}
         metrics |= {f"{cause}_rate": rate for cause, rate in ends.items()}
-        reads = READS.get(controller, REFERENCE_FILTER)
-        _add_rows(
-            suite, CONTEST.scenario, metrics, len(numbers), controller=controller, estimator=reads
-        )
-    header = ("controller", "success / %", "95 % interval", *(f"{cause} / %" for cause in ENDS))
+        labels = {"controller": controller, "estimator": _READS.get(controller, REFERENCE_FILTER)}
+        _add_rows(suite, _TASK.scenario, metrics, len(numbers), **labels)
+    header = ("controller", "success / %", "95 % interval", *(f"{cause} / %" for cause in _ENDS))
     more = ("cost / none's / %", "95 % interval", "peak slip / deg")
     note = (
         f"The same {len(free)} seeds for all; Wilson's intervals; costs are means with failures "
         "charged to the end, paired."
     )
-    suite.tables.append(
-        ResultTable("An evasive lane change on a wet road", (*header, *more), cells, note)
-    )
+    title = "An evasive lane change on a wet road"
+    suite.tables.append(ResultTable(title, (*header, *more), cells, note))
 
 
 def _add_lanes(suite: Suite, lanes: Mapping[str, Array]) -> None:
@@ -202,9 +176,8 @@ def _add_lanes(suite: Suite, lanes: Mapping[str, Array]) -> None:
     for reader, numbers in lanes.items():
         slip, rate, heading, preview_offset, offset = (interval(column) for column in numbers.T)
         shown = [f"{1e3 * error.value:.1f}" for error in (slip, rate, heading)]
-        cells.append(
-            [reader, *shown, f"{100.0 * preview_offset.value:.1f}", *offset.text(1.0, ".2f")]
-        )
+        texts = (f"{100.0 * preview_offset.value:.1f}", *offset.text(1.0, ".2f"))
+        cells.append([reader, *shown, *texts])
         labels = {"controller": "lane-keeping", "estimator": reader}
         _add_rows(suite, KEEPING, {"rmse": slip, "offset": offset}, len(numbers), **labels)
     header = ("reads", "slip / mrad", "yaw rate / (mrad/s)", "heading / mrad", "y_l / cm")
@@ -216,7 +189,7 @@ def _add_lanes(suite: Suite, lanes: Mapping[str, Array]) -> None:
 def _add_rows(
     suite: Suite, scenario: str, metrics: Mapping[str, Estimate], n: int, **labels: str
 ) -> None:
-    common = {"suite": NAME, "salt": "fixed", "env_version": f"{ID} {__version__}"}
+    common = {"suite": _NAME, "salt": "fixed", "env_version": f"{ID} {__version__}"}
     suite.rows += [
         ResultRow.from_estimate(metric, number, scenario=scenario, n=n, **labels, **common)
         for metric, number in metrics.items()

@@ -1,24 +1,19 @@
-"""What it costs to know neither tyres nor noise: conditions, drives, curves, and the suite.
+"""The suite `unknown`: what does it cost to know neither tyres nor noise?
 
-One figure a question: error against a quantity, and whether intervals hold what they promise.
-
-Question: what does it cost to know neither tyres nor noise? `joint` on cars whose front and rear
-stiffness are drawn from 0.6 to 1.4 of what filters assume, over the bound that knows them.
-
-FilterPy's extended Kalman filter of the car with unknown tyres, beside `joint`: error and time.
-
-Written as its users would: eight states, two scalar updates for a camera frame, which is used as it
-arrives. So it is the same filter as `joint` where the camera is at once, and another where it is
-late.
+`joint` on cars whose front and rear stiffness are drawn from 0.6 to 1.4 of what filters assume,
+over the bound that knows them; curves over one quantity each; whether intervals hold what they
+promise; and, beside `joint`, FilterPy's extended Kalman filter, written as its users would: eight
+states, and a camera's frame is used as it arrives, so that late frames make it another filter.
 """
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from importlib.util import find_spec
+from itertools import product
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 from rich.console import Console
 
 from ... import __version__
@@ -49,47 +44,36 @@ from .unknown_conditions import (
 BOUND = "the bound"
 
 
-def make_columns(condition: Condition, result: ConditionResult) -> dict[str, Any]:
+def _make_columns(condition: Condition, result: ConditionResult) -> dict[str, Any]:
     """The columns that the rows of a condition share."""
+    common = {"suite": NAME, "scenario": condition.name, "salt": "fixed"}
     version = f"{condition.env_id} {__version__}"
-    common = {
-        "suite": "unknown",
-        "scenario": condition.name,
-        "salt": "fixed",
-        "env_version": version,
-    }
-    return common | {"n": len(result.best)}
+    return common | {"env_version": version, "n": len(result.best)}
 
 
-def _make_rows(condition: Condition, result: ConditionResult, label: str) -> list[ResultRow]:
-    """A filter's error and NEES, and its error over the bound where there is one."""
-    squares, nees, _ = result.select(label)
-    numbers = {"rmse": interval(squares, root_mean), "nees": interval(nees, mean)}
-    if condition.bounded:
-        numbers["rmse_over_bound"] = interval(squares, ratio_of_roots, result.best)
-    columns = make_columns(condition, result)
-    return [
+def _add_rows(suite: Suite, numbers: Mapping[str, Estimate], label: str, columns: Any) -> None:
+    """Rows of an estimator's numbers by metric."""
+    suite.rows += [
         ResultRow.from_estimate(metric, number, estimator=label, **columns)
         for metric, number in numbers.items()
     ]
 
 
-def add_curve(suite: Suite, curve: Curve, results: Sequence[ConditionResult]) -> None:
+def _add_curve(suite: Suite, curve: Curve, results: Sequence[ConditionResult]) -> None:
     """Rows and a figure of a curve; no figure where plotly is not installed."""
-    conditions = curve.conditions()
-    labels = list(results[0].labels)
     lines = dict[str, list[Estimate]]()
-    for condition, result in zip(conditions, results, strict=True):
-        for label in labels:
-            suite.rows += _make_rows(condition, result, label)
-            lines.setdefault(label, []).append(interval(result.select(label)[0], root_mean))
+    for condition, result in zip(curve.conditions(), results, strict=True):
+        columns = _make_columns(condition, result)
+        for label in results[0].labels:
+            squares, nees, _ = result.select(label)
+            numbers = {"rmse": interval(squares, root_mean), "nees": interval(nees, mean)}
+            if condition.bounded:
+                numbers["rmse_over_bound"] = interval(squares, ratio_of_roots, result.best)
+            _add_rows(suite, numbers, label, columns)
+            lines.setdefault(label, []).append(numbers["rmse"])
         if condition.bounded:
             best = interval(result.best, root_mean)
-            suite.rows.append(
-                ResultRow.from_estimate(
-                    "rmse", best, estimator=BOUND, **make_columns(condition, result)
-                )
-            )
+            _add_rows(suite, {"rmse": best}, BOUND, columns)
             lines.setdefault(BOUND, []).append(best)
     try:
         from ..report.figures import draw_curves
@@ -110,22 +94,17 @@ def _split_line(line: Sequence[Estimate], scale: float) -> tuple[Array, Array, A
 def _describe_range(
     lines: Mapping[str, Sequence[Estimate]], results: Sequence[ConditionResult]
 ) -> str:
-    """From the first point to the last."""
+    """Errors (mrad) from the first point to the last."""
     n = min(len(result.best) for result in results)
-    spans = [
-        f"{label} {1e3 * values[0].value:.2g} to {1e3 * values[-1].value:.2g}"
-        for label, values in lines.items()
-    ]
+    ends = {label: (values[0].value, values[-1].value) for label, values in lines.items()}
+    spans = [f"{label} {1e3 * a:.2g} to {1e3 * b:.2g}" for label, (a, b) in ends.items()]
     return f"From left to right, mrad: {', '.join(spans)}; at least {n} drives a point."
 
 
-def add_reliability(suite: Suite, results: Sequence[ConditionResult]) -> None:
-    """Rows and a figure of the share of errors within an interval against its confidence, where
-    nothing happens that `joint` cannot foresee.
-
-    Conditions share their seeds, so each seed's share is its mean over them; of conditions with the
-    same drives the first one counts. found: of all `CONDITIONS`.
-    """
+def _add_reliability(suite: Suite, results: Sequence[ConditionResult]) -> None:
+    """Rows and a figure of the fraction of errors within intervals, where `joint` models all."""
+    # Conditions share their seeds, so each seed's share is its mean over them; of conditions with
+    # the same drives the first one counts.
     shares = dict[str, list[Estimate]]()
     drives = {
         (condition.env_id, repr(condition.scenario)): condition
@@ -149,16 +128,11 @@ def add_reliability(suite: Suite, results: Sequence[ConditionResult]) -> None:
             inside = np.array([np.mean(item, axis=0) for item in by_seed.values()])
             line = [mean_share(column) for column in inside.T]
             shares[f"{label}, {kind}"] = line
-            columns = make_columns(*selected[0]) | {
-                "scenario": f"all with {kind}",
-                "n": len(inside),
-            }
-            suite.rows += [
-                ResultRow.from_estimate(
-                    f"covered_{100.0 * level:.0f}", share, estimator=label, **columns
-                )
-                for level, share in zip(LEVELS, line, strict=True)
-            ]
+            columns = _make_columns(*selected[0])
+            columns |= {"scenario": f"all with {kind}", "n": len(inside)}
+            pairs = zip(LEVELS, line, strict=True)
+            numbers = {f"covered_{100.0 * level:.0f}": covered for level, covered in pairs}
+            _add_rows(suite, numbers, label, columns)
     try:
         from ..report.figures import draw_curves
     except ModuleNotFoundError:
@@ -174,51 +148,38 @@ def add_reliability(suite: Suite, results: Sequence[ConditionResult]) -> None:
     suite.answers.append((question, draw_curves(percent, series, *labels), text))
 
 
-def make_parts_table(suite: Suite, results: Sequence[ConditionResult]) -> ResultTable:
-    """Rows and a table of the filter's error without each of its parts, over that with all.
-
-    results: of all `PARTS`.
-    """
+def _make_parts_table(suite: Suite, results: Sequence[ConditionResult]) -> ResultTable:
+    """Rows and a table of the filter's error without each of its `PARTS`, over that with all."""
     cells = [[label] for label in WITHOUT]
     for condition, result in zip(PARTS, results, strict=True):
         complete_squares = result.select(next(iter(WITHOUT)))[0]
-        columns = make_columns(condition, result)
+        columns = _make_columns(condition, result)
         for line, label in zip(cells, WITHOUT, strict=True):
             squares = result.select(label)[0]
-            error, ratio = (
-                interval(squares, root_mean),
-                interval(squares, ratio_of_roots, complete_squares),
-            )
-            suite.rows += [
-                ResultRow.from_estimate(metric, number, estimator=label, **columns)
-                for metric, number in (("rmse", error), ("ratio", ratio))
-            ]
+            error = interval(squares, root_mean)
+            ratio = interval(squares, ratio_of_roots, complete_squares)
+            _add_rows(suite, {"rmse": error, "ratio": ratio}, label, columns)
             line.append(f"{1e3 * error.value:.2f} ({ratio.value:.2f})")
-    return ResultTable(
-        f"What each part of joint saves: RMSE / mrad, and over the complete one's "
-        f"({len(results[0].best)} seeds)",
-        ("filter", *(condition.name for condition in PARTS)),
-        cells,
+    title = "What each part of joint saves: RMSE / mrad, and over the complete one's "
+    note = (
         "complete: accelerometer, both stiffnesses, friction, biases of gyro and accelerometer, a "
-        "force and a moment. Below 1 the part costs more than it saves there.",
+        "force and a moment. Below 1 the part costs more than it saves there."
     )
-
-
-def list_conditions() -> list[Condition]:
-    """The conditions of all curves, one after the other."""
-    return [condition for curve in CURVES for condition in curve.conditions()]
+    header = ("filter", *(condition.name for condition in PARTS))
+    return ResultTable(f"{title}({len(results[0].best)} seeds)", header, cells, note)
 
 
 SEEDS, QUICK_SEEDS = 256, 8
 NAME = "unknown"
-COVERED = (0.5, 0.8, 0.95)
+_COVERED = (0.5, 0.8, 0.95)
 
 
 def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = None) -> Suite:
-    """Every condition on the seeds 0 .. seeds-1; curves and parts on the first quarter of many."""
+    """Run all conditions on the seeds 0 .. seeds-1; curves, parts on the first quarter of many."""
     few = min(seeds, max(seeds // 4, QUICK_SEEDS))
     results = measure_all(CONDITIONS, seeds, NAME, jobs, console)
-    points = measure_all(list_conditions(), few, f"{NAME}: curves", jobs, console)
+    curve_conditions = [condition for curve in CURVES for condition in curve.conditions()]
+    points = measure_all(curve_conditions, few, f"{NAME}: curves", jobs, console)
     parts = measure_all(PARTS, few, f"{NAME}: parts", jobs, console)
     suite = Suite(
         NAME,
@@ -233,10 +194,8 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
     )
     ratios, against, lines = dict[str, dict[str, Estimate]](), dict[str, Estimate](), []
     for condition, item in zip(CONDITIONS, results, strict=True):
-        (joint_squares, nees, inside), exact_squares = (
-            item.select("joint"),
-            item.select("exact-kf")[0],
-        )
+        (joint_squares, nees, inside), labels = item.select("joint"), item.labels
+        exact_squares, own = item.select("exact-kf")[0], item.variances[:, labels.index("joint")]
         saved, honest = interval(joint_squares, ratio_of_roots, exact_squares), interval(nees, mean)
         against[condition.name], known = saved, None
         covered = inside.mean(axis=0)
@@ -246,40 +205,34 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
             known = numbers["rmse_over_bound"] = interval(joint_squares, ratio_of_roots, item.best)
             best = interval(exact_squares, ratio_of_roots, item.best)
             ratios[condition.name] = {"joint": known, "exact-kf": best}
-        theory = interval(
-            joint_squares, ratio_of_roots, item.variances[:, item.labels.index("joint")]
-        )
-        numbers["rmse_over_own"] = theory
-        columns = make_columns(condition, item)
-        suite.rows += [
-            ResultRow.from_estimate(k, v, estimator="joint", **columns) for k, v in numbers.items()
-        ]
+        theory = numbers["rmse_over_own"] = interval(joint_squares, ratio_of_roots, own)
+        _add_rows(suite, numbers, "joint", _make_columns(condition, item))
         lines.append([
             condition.name, str(len(nees)), str(item.left_out), _format_ratio(known),
             _format_ratio(saved),
             f"{honest.value:.2f}", f"{theory.value:.2f}",
-            *(f"{100.0 * covered[LEVELS.index(level)]:.0f}" for level in COVERED),
+            *(f"{100.0 * covered[LEVELS.index(level)]:.0f}" for level in _COVERED),
         ])  # fmt: skip
     head = ("condition", "n", "left out", "over the bound", "over exact-kf", "NEES", "over its own")
     suite.tables = [
         ResultTable(
             "joint, which assumes nominal tyres",
-            (*head, *(f"in {100.0 * item:.0f} %" for item in COVERED)),
+            (*head, *(f"in {100.0 * item:.0f} %" for item in _COVERED)),
             lines,
             "left out: episodes that end early, in which tyres that saturate let the car "
             "spin. over its own: error over the deviation that joint gives, where NEES is 1 the "
             "limit of filters that do not know the tyres. in 50 %: share of the errors within the "
             "interval of that confidence.",
         ),
-        make_parts_table(suite, parts),
+        _make_parts_table(suite, parts),
         *_make_race_table(suite, max(few // 8, 2), jobs, console),
     ]
     suite.verdict = _compose_verdict(ratios, against)
     _draw_figures(suite, ratios)
-    add_reliability(suite, results)
+    _add_reliability(suite, results)
     rest = iter(points)
     for curve in CURVES:
-        add_curve(suite, curve, [next(rest) for _ in curve.values])
+        _add_curve(suite, curve, [next(rest) for _ in curve.values])
     return suite
 
 
@@ -287,37 +240,23 @@ def _make_race_table(
     suite: Suite, seeds: int, jobs: int | None, console: Console | None
 ) -> list[ResultTable]:
     """Rows and a table of joint beside FilterPy's filter; none where FilterPy is not installed."""
-    try:
-        pass
-    except ModuleNotFoundError:
+    if find_spec("filterpy") is None:
         return []
-    cases = [(delay, seed) for delay in DELAYS.values() for seed in range(seeds)]
-    errors = np.reshape(
-        run_cases(compare_filters, cases, f"{NAME}: FilterPy", jobs, console), (-1, seeds, 3, 2)
-    )
+    cases = list(product(DELAYS.values(), range(seeds)))
+    results = run_cases(compare_filters, cases, f"{NAME}: FilterPy", jobs, console)
+    errors = np.reshape(results, (-1, seeds, 3, 2))
     cells = []
     for name, values in zip(DELAYS, errors, strict=True):
         for i, label in enumerate(("joint", "FilterPy")):
             error = interval(values[:, i, 0], ratio_of_roots, values[:, 2, 0])
             us = Estimate(float(np.median(values[:, i, 1])))
-            columns = {
-                "suite": NAME,
-                "scenario": name,
-                "salt": "fixed",
-                "n": seeds,
-                "estimator": label,
-            }
+            columns = {"suite": NAME, "scenario": name, "salt": "fixed", "n": seeds}
             columns["env_version"] = f"{CAMERA} {__version__}"
-            numbers = {"rmse_over_bound": error, "us_per_tick": us}
-            suite.rows += [
-                ResultRow.from_estimate(metric, number, **columns)
-                for metric, number in numbers.items()
-            ]
+            _add_rows(suite, {"rmse_over_bound": error, "us_per_tick": us}, label, columns)
             cells.append([name, label, _format_ratio(error), f"{us.value:.3g}"])
     head = ("camera", "filter", "over the bound", "CPU us a tick")
-    text = (
-        "The same eight states; FilterPy's takes a frame as it arrives. One core, in one process."
-    )
+    text = "The same eight states; FilterPy's takes a frame as it arrives. "
+    text += "One core, in one process."
     return [ResultTable("Beside FilterPy's extended Kalman filter", head, cells, text)]
 
 
@@ -331,9 +270,8 @@ def _compose_verdict(
     joint = [item["joint"].value for item in ratios.values()]
     exact = [item["exact-kf"].value for item in ratios.values()]
     worst = max(ratios, key=lambda name: ratios[name]["joint"].value)
-    four, one = (
-        against[f"from the change on, {item}"].value for item in ("four members", "one filter")
-    )
+    names = (f"from the change on, {item}" for item in ("four members", "one filter"))
+    four, one = (against[name].value for name in names)
     return format_verdict(
         "A filter believes in the tyres of a data sheet; a real car's are up to 40 % off.",
         f"joint, which estimates them, has {min(joint):.2f} to {max(joint):.2f} times the least "
@@ -350,11 +288,9 @@ def _draw_figures(suite: Suite, ratios: Mapping[str, Mapping[str, Estimate]]) ->
         from ..report.figures import draw_groups
     except ModuleNotFoundError:
         return
-    bars = draw_groups(
-        {k: dict(v) for k, v in ratios.items()},
-        "error / that of a filter that knows the tyres: less is better",
-        {1.0: "knows the tyres"},
-    )
+    label = "error / that of a filter that knows the tyres: less is better"
+    groups = {name: dict(numbers) for name, numbers in ratios.items()}
+    bars = draw_groups(groups, label, {1.0: "knows the tyres"})
     text = suite.verdict.splitlines()[1]
     suite.answers.append(("What does it cost not to know the tyres?", bars, text))
 
@@ -363,11 +299,13 @@ DELAYS = {"camera at once": 0.0, "camera 30 ms late": 0.03}
 STATES = 8  # beta, gamma, psi, y_l, F_d, N_d, and both axles' factors
 
 
-class FilterPyEkf:
-    """ekf: FilterPy's filter. dt: s of a tick. speed: m/s, held."""
+class _FilterPyEkf:
+    """FilterPy's filter `ekf` of a car with unknown tyres at a speed (m/s), ticks of dt (s)."""
 
     def __init__(self, vehicle: Vehicle, speed: float, dt: float) -> None:
         self.car, self.V, self.dt = vehicle, speed, dt
+        from filterpy.kalman import ExtendedKalmanFilter  # an extra that few have
+
         self.ekf: Any = ExtendedKalmanFilter(dim_x=STATES, dim_z=1)
         force, moment, time_constant = DISTURBANCE.values()
         self.ekf.x = np.array([0.0] * 6 + [1.0, 1.0])
@@ -415,7 +353,7 @@ class FilterPyEkf:
         self.ekf.update(np.array([value]), lambda x: row, lambda x: row @ x, R=r)
 
     def run(self, log: Log) -> Array:
-        """beta at every row."""
+        """Return beta (rad) at every row."""
         record, slips, came = log.record, np.empty(len(log.record.fast)), 0
         for k, row in enumerate(record.fast):
             if k > 0:
@@ -432,15 +370,17 @@ class FilterPyEkf:
 
 
 def compare_filters(case: tuple[float, int]) -> Array:
-    """(filters, 2) mean squared error of beta and CPU us a tick, of joint and of FilterPy's, and
-    the bound's mean square behind; case: the camera's delay in s, and a seed."""
+    """Compare mean squared error of beta and CPU time per tick (us): joint, FilterPy's, the bound.
+
+    case: The camera's delay (s) and a seed. Shape (3, 2), without a time of the bound.
+    """
     delay, seed = case
     env: Any = gym.make(CAMERA, scenario=LINEAR | MIX | {"camera_delays": (delay,)})
     log, std = run_with_bound(env, seed)
     facts = make_filter_arguments(env.unwrapped)
     joint = call_quietly(make_estimator, "joint", **facts)
     joint.run(log)  # compiled, and its memory warm
-    rival = FilterPyEkf(facts["vehicle"], facts["speed"], facts["dt"])
+    rival = _FilterPyEkf(facts["vehicle"], facts["speed"], facts["dt"])
     settled, results = log.time >= SETTLED - 1e-9, []
     runs: list[Callable[[], Array]] = [lambda: joint.run(log)["beta"], lambda: rival.run(log)]
     for run in runs:

@@ -1,11 +1,12 @@
-"""Which drives: conditions, curves of one quantity each, and what a filter can do without.
+"""Conditions of the suite `unknown`: drives, curves of one quantity, and what a filter can lack.
 
-Drives of a condition, every filter over the same records, and what the bound is there.
+A condition's drives are recorded once; every filter runs over the same records, beside the bound.
 """
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any
 
 import gymnasium as gym
@@ -22,16 +23,16 @@ from ...estimators.make import make_estimator
 from ..harness.parallel import run_cases, split_seeds
 from ..harness.study import SETTLED, call_quietly, make_filter_arguments
 
-CAMERA, GPS, FUSION = (f"sideslip/Yaw{sensors}-v0" for sensors in ("Vision", "Gps", "Fusion"))
-KMH = 1.0 / 3.6
-STIFF = {"front_stiffness": (0.6, 1.4), "rear_stiffness": (0.6, 1.4)}
+CAMERA, GPS, _FUSION = (f"sideslip/Yaw{sensors}-v0" for sensors in ("Vision", "Gps", "Fusion"))
+_KMH = 1.0 / 3.6
+_STIFF = {"front_stiffness": (0.6, 1.4), "rear_stiffness": (0.6, 1.4)}
 LINEAR = {"base": "random-steering", "small_angle": True, "tyres": "linear", "roll": False}
-LINEAR |= {"lags": False, "speed": 25.0 * KMH, "hdop_law": "constant"} | STIFF
+LINEAR |= {"lags": False, "speed": 25.0 * _KMH, "hdop_law": "constant"} | _STIFF
 MIX = {"amplitude": (0.03, 0.08), "amplitude_2": (0.02, 0.05)}
-CHANGED = 5.0  # s
-CHANGE = {"tyre_change_time": CHANGED, "front_change": (0.7, 1.3), "rear_change": (0.7, 1.3)}
-GUST = {"wind_force": (300.0, 500.0), "wind_arm": 0.1, "wind_start": 4.0, "wind_length": 3.0}
-TRUE = "exact-kf, true model"
+_CHANGED = 5.0  # s
+_CHANGE = {"tyre_change_time": _CHANGED, "front_change": (0.7, 1.3), "rear_change": (0.7, 1.3)}
+_GUST = {"wind_force": (300.0, 500.0), "wind_arm": 0.1, "wind_start": 4.0, "wind_length": 3.0}
+_TRUE = "exact-kf, true model"
 """The label of a filter that knows the true car and noise."""
 
 Filters = Mapping[str, tuple[str, Mapping[str, Any]]]
@@ -39,54 +40,49 @@ Filters = Mapping[str, tuple[str, Mapping[str, Any]]]
 
 @dataclass(frozen=True)
 class Condition:
-    """A kind of drive. scenario: over `LINEAR`. options: of `joint`. since: s, from which errors
-    count. bounded: whether the bound is one there: a linear car that does not roll. foreseen:
-    whether `joint` has a state or a level for all that happens. filters: more of them, or others of
-    a name, as (estimator, options) by label. vehicle: of the env. gyro_late: s by which the gyro
-    comes later than measured, which the bound knows.
-    """
+    """A kind of drive."""
 
-    name: str
-    env_id: str = CAMERA
-    scenario: Mapping[str, Any] = field(default_factory=dict)
-    options: Mapping[str, Any] = field(default_factory=dict)
-    since: float = SETTLED
-    bounded: bool = True
-    modelled: bool = True
-    filters: Filters = field(default_factory=dict)
-    vehicle: str = "coms"
-    gyro_late: float = 0.0
+    name: str  # name in the tables
+    env_id: str = CAMERA  # id of the env
+    scenario: Mapping[str, Any] = field(default_factory=dict)  # fields over `LINEAR`
+    options: Mapping[str, Any] = field(default_factory=dict)  # options of `joint`
+    since: float = SETTLED  # time from which errors count (s)
+    bounded: bool = True  # whether the bound is one: for a linear car that does not roll
+    modelled: bool = True  # whether `joint` has a state or a level for all that happens
+    filters: Filters = field(default_factory=dict)  # others: (estimator, options) by label
+    vehicle: str = "coms"  # vehicle of the env
+    gyro_late: float = 0.0  # delay of the gyro (s), which the bound knows
 
     @property
     def all_filters(self) -> Filters:
-        """Every filter that drives along."""
+        """Every filter that runs over the drives."""
         return {"joint": ("joint", self.options), "exact-kf": ("exact-kf", {})} | dict(self.filters)
 
 
 LATE = 0.06  # s
-FIND = {"latency": {"gyro": "find"}}
-FOUR = {"members": 4}
-SUDDEN = {"sudden": True}
-THREE = {"levels": (0.5, 1.0, 2.0)}
-LIMITED = {"inverse_friction_sd": 0.5}
-BIASED = {"bias_sd": 0.01}
-INERTIAL = {"fast": ["gyro", "accel_y"]}
-GUSTY = {"levels": ((1.0, 1.0), (8.0, 2.0)), "disturbance_time": 1.0}
-"""One member expects a force that is eight times as strong; both, one that lasts."""
+_FIND = {"latency": {"gyro": "find"}}
+_FOUR = {"members": 4}
+_SUDDEN = {"sudden": True}
+_THREE = {"levels": (0.5, 1.0, 2.0)}
+_LIMITED = {"inverse_friction_sd": 0.5}
+_BIASED = {"bias_sd": 0.01}
+_INERTIAL = {"fast": ["gyro", "accel_y"]}
+_GUSTY = {"levels": ((1.0, 1.0), (8.0, 2.0)), "disturbance_time": 1.0}
+"""One model expects a force that is eight times as strong; both, one that lasts."""
 
 
-def scale_disturbances(factor: float) -> dict[str, Any]:
+def _scale_disturbances(factor: float) -> dict[str, Any]:
     """Disturbances of a factor times the levels that filters assume."""
     return MIX | {"disturbance_force": 50.0 * factor, "disturbance_moment": 20.0 * factor}
 
 
-def make_gyro_bias(degrees: float) -> dict[str, Any]:
-    """A gyro that is off by so many deg/s."""
+def _make_gyro_bias(degrees: float) -> dict[str, Any]:
+    """A gyro with a bias (deg/s)."""
     return MIX | {"noise": {"gyro_bias": np.radians(degrees)}}
 
 
-def make_rolling(
-    name: str, options: Mapping[str, Any], gust: Mapping[str, Any] = GUST
+def _make_rolling(
+    name: str, options: Mapping[str, Any], gust: Mapping[str, Any] = _GUST
 ) -> Condition:
     """A car whose accelerometer feels that it rolls; there is no bound."""
     scenario = MIX | {"roll": True} | dict(gust)
@@ -94,73 +90,68 @@ def make_rolling(
 
 
 FIALA = {"tyres": "fiala", "friction": 0.9}
-SLALOM = {"base": "slalom", "tyres": "fiala", "friction": 0.5}
-LATER = {"tyre_change_time": 5.37}  # s: between two steps of a bank, as the gust's start
-LATER_GUST = GUST | {"wind_start": 4.13}
-CAR = {"speed": 80.0 * KMH, "disturbance_force": 200.0, "disturbance_moment": 350.0}
-CAR_LEVELS = {"force_sd": 200.0, "moment_sd": 350.0}
-CAR_FILTERS: Filters = {"exact-kf": ("exact-kf", CAR_LEVELS)}
+_SLALOM = {"base": "slalom", "tyres": "fiala", "friction": 0.5}
+_LATER = {"tyre_change_time": 5.37}  # s: between two steps of a bank, as the gust's start
+_LATER_GUST = _GUST | {"wind_start": 4.13}
+CAR = {"speed": 80.0 * _KMH, "disturbance_force": 200.0, "disturbance_moment": 350.0}
+_CAR_LEVELS = {"force_sd": 200.0, "moment_sd": 350.0}
+_CAR_FILTERS: Filters = {"exact-kf": ("exact-kf", _CAR_LEVELS)}
 """The disturbances accelerate the passenger car as those of `LINEAR` do the COMS."""
-UNEVEN = {"camera_delays": (0.02, 0.015, 0.01, 0.025)}
+_UNEVEN = {"camera_delays": (0.02, 0.015, 0.01, 0.025)}
+_ON_CAR: dict[str, Any] = {"filters": _CAR_FILTERS, "vehicle": "passenger-car"}
+_HALF, _TWICE = _scale_disturbances(0.5), _scale_disturbances(2.0)
 CONDITIONS = (
     Condition("camera", CAMERA, MIX),
     Condition("GPS", GPS, MIX),
-    Condition("camera and GPS", FUSION, MIX),
+    Condition("camera and GPS", _FUSION, MIX),
     Condition("camera, gentle steering", CAMERA),
     Condition("GPS, gentle steering", GPS),
-    Condition("camera, 10 km/h", CAMERA, MIX | {"speed": 10.0 * KMH}),
-    Condition("camera, 40 km/h, gentle", CAMERA, {"speed": 40.0 * KMH}),
-    Condition(
-        "camera, passenger car, 80 km/h",
-        CAMERA,
-        CAR,
-        CAR_LEVELS,
-        filters=CAR_FILTERS,
-        vehicle="passenger-car",
-    ),
+    Condition("camera, 10 km/h", CAMERA, MIX | {"speed": 10.0 * _KMH}),
+    Condition("camera, 40 km/h, gentle", CAMERA, {"speed": 40.0 * _KMH}),
+    Condition("camera, passenger car, 80 km/h", CAMERA, CAR, _CAR_LEVELS, **_ON_CAR),
     Condition("camera, gyro 60 ms late", CAMERA, MIX, modelled=False, gyro_late=LATE),
     Condition("the same, configured", CAMERA, MIX, {"latency": {"gyro": LATE}}, gyro_late=LATE),
-    Condition("the same, found", CAMERA, MIX, FIND, gyro_late=LATE),
-    Condition("GPS, gyro 60 ms late, found", GPS, MIX, FIND, gyro_late=LATE),
-    Condition("camera, a punctual gyro's found", CAMERA, MIX, FIND),
-    Condition("camera, gyro 0.5 deg/s off", CAMERA, make_gyro_bias(0.5), BIASED),
-    Condition("GPS, gyro 0.5 deg/s off", GPS, make_gyro_bias(0.5), BIASED),
-    Condition("camera 20, 15, 10, 25 ms late", CAMERA, MIX | UNEVEN),
+    Condition("the same, found", CAMERA, MIX, _FIND, gyro_late=LATE),
+    Condition("GPS, gyro 60 ms late, found", GPS, MIX, _FIND, gyro_late=LATE),
+    Condition("camera, a punctual gyro's found", CAMERA, MIX, _FIND),
+    Condition("camera, gyro 0.5 deg/s off", CAMERA, _make_gyro_bias(0.5), _BIASED),
+    Condition("GPS, gyro 0.5 deg/s off", GPS, _make_gyro_bias(0.5), _BIASED),
+    Condition("camera 20, 15, 10, 25 ms late", CAMERA, MIX | _UNEVEN),
     Condition("GPS out for 5 s", GPS, MIX | {"gps_outage": (3.0, 8.0)}),
-    Condition("half the disturbances it was told", CAMERA, scale_disturbances(0.5), modelled=False),
+    Condition("half the disturbances it was told", CAMERA, _HALF, modelled=False),
+    Condition("twice the disturbances it was told", CAMERA, _TWICE, modelled=False),
+    Condition("half the disturbances, three levels", CAMERA, _HALF, _THREE),
+    Condition("twice the disturbances, three levels", CAMERA, _TWICE, _THREE),
+    Condition("a gust of unknown strength", CAMERA, MIX | _GUST, modelled=False),
+    Condition("the same gust, for a gust", CAMERA, MIX | _GUST, _GUSTY, modelled=False),
+    Condition("the same gust, sudden", CAMERA, MIX | _GUST, _SUDDEN, modelled=False),
+    Condition("a gust at 4.13 s, sudden", CAMERA, MIX | _LATER_GUST, _SUDDEN, modelled=False),
+    _make_rolling("the gust, car that rolls", {}),
+    _make_rolling("the same, accelerometer", _INERTIAL),
+    _make_rolling("the same, accelerometer, for a gust", _INERTIAL | _GUSTY),
+    _make_rolling("no gust, accelerometer, for a gust", _INERTIAL | _GUSTY, {}),
+    Condition("camera, four members", CAMERA, MIX, _FOUR),
+    Condition("camera, three levels", CAMERA, MIX, _THREE),
+    Condition("camera, sudden", CAMERA, MIX, _SUDDEN),
+    Condition("tyres change at 5 s, four members", CAMERA, MIX | _CHANGE, _FOUR),
+    Condition("the same, sudden", CAMERA, MIX | _CHANGE, _SUDDEN),
+    Condition("the same, three levels", CAMERA, MIX | _CHANGE, _THREE),
+    Condition("the same, one filter", CAMERA, MIX | _CHANGE, modelled=False),
+    Condition("from the change on, four members", CAMERA, MIX | _CHANGE, _FOUR, _CHANGED),
+    Condition("from the change on, three levels", CAMERA, MIX | _CHANGE, _THREE, _CHANGED),
     Condition(
-        "twice the disturbances it was told", CAMERA, scale_disturbances(2.0), modelled=False
+        "from the change on, one filter", CAMERA, MIX | _CHANGE, {}, _CHANGED, modelled=False
     ),
-    Condition("half the disturbances, three levels", CAMERA, scale_disturbances(0.5), THREE),
-    Condition("twice the disturbances, three levels", CAMERA, scale_disturbances(2.0), THREE),
-    Condition("a gust of unknown strength", CAMERA, MIX | GUST, modelled=False),
-    Condition("the same gust, for a gust", CAMERA, MIX | GUST, GUSTY, modelled=False),
-    Condition("the same gust, sudden", CAMERA, MIX | GUST, SUDDEN, modelled=False),
-    Condition("a gust at 4.13 s, sudden", CAMERA, MIX | LATER_GUST, SUDDEN, modelled=False),
-    make_rolling("the gust, car that rolls", {}),
-    make_rolling("the same, accelerometer", INERTIAL),
-    make_rolling("the same, accelerometer, for a gust", INERTIAL | GUSTY),
-    make_rolling("no gust, accelerometer, for a gust", INERTIAL | GUSTY, {}),
-    Condition("camera, four members", CAMERA, MIX, FOUR),
-    Condition("camera, three levels", CAMERA, MIX, THREE),
-    Condition("camera, sudden", CAMERA, MIX, SUDDEN),
-    Condition("tyres change at 5 s, four members", CAMERA, MIX | CHANGE, FOUR),
-    Condition("the same, sudden", CAMERA, MIX | CHANGE, SUDDEN),
-    Condition("the same, three levels", CAMERA, MIX | CHANGE, THREE),
-    Condition("the same, one filter", CAMERA, MIX | CHANGE, modelled=False),
-    Condition("from the change on, four members", CAMERA, MIX | CHANGE, FOUR, CHANGED),
-    Condition("from the change on, three levels", CAMERA, MIX | CHANGE, THREE, CHANGED),
-    Condition("from the change on, one filter", CAMERA, MIX | CHANGE, {}, CHANGED, modelled=False),
-    Condition("tyres change at 5.37 s, four members", CAMERA, MIX | CHANGE | LATER, FOUR),
-    Condition("tyres change at 5.37 s, sudden", CAMERA, MIX | CHANGE | LATER, SUDDEN),
-    Condition("Fiala tyres, friction 0.9", CAMERA, MIX | FIALA, LIMITED, bounded=False),
-    Condition("slalom, Fiala tyres, friction 0.5", CAMERA, SLALOM, LIMITED, bounded=False),
+    Condition("tyres change at 5.37 s, four members", CAMERA, MIX | _CHANGE | _LATER, _FOUR),
+    Condition("tyres change at 5.37 s, sudden", CAMERA, MIX | _CHANGE | _LATER, _SUDDEN),
+    Condition("Fiala tyres, friction 0.9", CAMERA, MIX | FIALA, _LIMITED, bounded=False),
+    Condition("slalom, Fiala tyres, friction 0.5", CAMERA, _SLALOM, _LIMITED, bounded=False),
 )
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A quantity that grows from left to right. at: the condition at a value. log: of `curves`."""
+    """A quantity over which conditions vary; log: axes of `draw_curves` with a logarithm."""
 
     question: str
     label: str
@@ -169,13 +160,8 @@ class Curve:
     log: str = "y"
 
     def conditions(self) -> list[Condition]:
-        """The condition at every value."""
+        """Make the condition at every value."""
         return [self.make_condition(value) for value in self.values]
-
-
-def _vary_stiffness(factor: float) -> Condition:
-    same = dict.fromkeys(STIFF, factor)
-    return Condition(f"both axles {factor:g} of nominal", CAMERA, MIX | same)
 
 
 def _vary_steering(degrees: float) -> Condition:
@@ -183,64 +169,50 @@ def _vary_steering(degrees: float) -> Condition:
     return Condition(f"steering of {degrees:g} deg", CAMERA, size)
 
 
-def _vary_delay(ms: float) -> Condition:
-    late = {"camera_delays": (1e-3 * ms,)}
-    return Condition(f"camera {ms:g} ms late", CAMERA, MIX | late)
-
-
-def _vary_period(period: float) -> Condition:
-    return Condition(f"GPS every {period:g} s", GPS, MIX | {"gps_period": period})
-
-
-def _vary_outage(seconds: float) -> Condition:
-    out = {"gps_outage": (3.0, 3.0 + seconds)} if seconds else {}
-    return Condition(f"no GPS for {seconds:g} s", GPS, MIX | out)
-
-
-def _vary_bias(degrees: float) -> Condition:
-    return Condition(f"gyro {degrees:g} deg/s off", CAMERA, make_gyro_bias(degrees), BIASED)
-
-
 def _vary_noise(factor: float) -> Condition:
     """A car that rolls, since its accelerometer feels that: there is no bound."""
     noise = {"roll": True, "noise": {"accel": 0.1 * factor}}
-    options = INERTIAL | {"accel_time": 2.0}
+    options = _INERTIAL | {"accel_time": 2.0}
     filters: Filters = {
         "joint, finds the noise": ("joint", options),
-        "exact-kf": ("exact-kf", INERTIAL),
-        TRUE: ("exact-kf", INERTIAL | {"accel_y_noise": 0.1 * factor}),
+        "exact-kf": ("exact-kf", _INERTIAL),
+        _TRUE: ("exact-kf", _INERTIAL | {"accel_y_noise": 0.1 * factor}),
     }
     name = f"accelerometer noise x {factor:g}"
-    return Condition(name, CAMERA, MIX | noise, INERTIAL, bounded=False, filters=filters)
+    return Condition(name, CAMERA, MIX | noise, _INERTIAL, bounded=False, filters=filters)
 
 
 def _vary_disturbances(factor: float) -> Condition:
-    filters = {"joint, three levels": ("joint", THREE)}
-    return Condition(
-        f"disturbances x {factor:g}", CAMERA, scale_disturbances(factor), filters=filters
-    )
+    filters = {"joint, three levels": ("joint", _THREE)}
+    name, scenario = f"disturbances x {factor:g}", _scale_disturbances(factor)
+    return Condition(name, CAMERA, scenario, filters=filters)
 
 
 CURVES = (
     Curve("What do other tyres cost?", "stiffness of both axles / nominal",
-          (0.6, 0.8, 1.0, 1.2, 1.4), _vary_stiffness),
+          (0.6, 0.8, 1.0, 1.2, 1.4), lambda factor: Condition(
+              f"both axles {factor:g} of nominal", CAMERA, MIX | dict.fromkeys(_STIFF, factor))),
     Curve("How much steering do the tyres need?", "steering amplitude / deg",
           (0.125, 0.25, 0.5, 1.0, 2.0, 4.0), _vary_steering, "xy"),
     Curve("What does a late camera cost?", "delay of the camera / ms",
-          (0.0, 30.0, 60.0, 100.0, 150.0, 200.0), _vary_delay),
+          (0.0, 30.0, 60.0, 100.0, 150.0, 200.0), lambda ms: Condition(
+              f"camera {ms:g} ms late", CAMERA, MIX | {"camera_delays": (1e-3 * ms,)})),
     Curve("What does a slow GPS cost?", "period of the GPS / s",
-          (0.05, 0.1, 0.2, 0.5, 1.0, 2.0), _vary_period, "xy"),
+          (0.05, 0.1, 0.2, 0.5, 1.0, 2.0), lambda period: Condition(
+              f"GPS every {period:g} s", GPS, MIX | {"gps_period": period}), "xy"),
     Curve("What does a GPS that is out cost?", "length of the outage / s",
-          (0.0, 1.0, 2.0, 3.0, 4.0, 6.0), _vary_outage),
+          (0.0, 1.0, 2.0, 3.0, 4.0, 6.0), lambda s: Condition(
+              f"no GPS for {s:g} s", GPS, MIX | ({"gps_outage": (3.0, 3.0 + s)} if s else {}))),
     Curve("What does a gyro's bias cost?", "bias of the gyro / (deg/s)",
-          (0.0, 0.1, 0.2, 0.5, 1.0, 2.0), _vary_bias),
+          (0.0, 0.1, 0.2, 0.5, 1.0, 2.0), lambda degrees: Condition(
+              f"gyro {degrees:g} deg/s off", CAMERA, _make_gyro_bias(degrees), _BIASED)),
     Curve("What does another noise of the accelerometer cost?",
           "accelerometer noise / data sheet's", (0.25, 0.5, 1.0, 2.0, 4.0), _vary_noise, "xy"),
     Curve("What do other disturbances cost?", "disturbances / those assumed",
           (0.5, 0.7, 1.0, 1.4, 2.0), _vary_disturbances, "xy"),
 )  # fmt: skip
 
-COMPLETE = INERTIAL | LIMITED | BIASED | {"accel_bias_sd": 0.3}
+_COMPLETE = _INERTIAL | _LIMITED | _BIASED | {"accel_bias_sd": 0.3}
 WITHOUT: dict[str, dict[str, Any]] = {
     "joint, complete": {},
     "without accelerometer": {"fast": ["gyro"], "accel_bias_sd": 0.0},
@@ -249,46 +221,42 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "without disturbances": {"force_sd": 1.0, "moment_sd": 1.0},
     "without biases": {"bias_sd": 0.0, "accel_bias_sd": 0.0},
 }
-"""Options over `COMPLETE`: a state is left out or known at the start."""
+"""Options over `_COMPLETE`: a state is left out or known at the start."""
 
 
 def _make_ablation(name: str, env_id: str, scenario: Mapping[str, Any]) -> Condition:
-    filters = {label: ("joint", COMPLETE | left) for label, left in WITHOUT.items()}
+    filters = {label: ("joint", _COMPLETE | left) for label, left in WITHOUT.items()}
     return Condition(name, env_id, {"roll": True} | dict(scenario), bounded=False, filters=filters)
 
 
 PARTS = (
     _make_ablation("camera, car that rolls", CAMERA, MIX),
     _make_ablation("GPS, car that rolls", GPS, MIX),
-    _make_ablation("gyro 0.5 deg/s off, car that rolls", CAMERA, make_gyro_bias(0.5)),
+    _make_ablation("gyro 0.5 deg/s off, car that rolls", CAMERA, _make_gyro_bias(0.5)),
     _make_ablation("Fiala tyres, car that rolls", CAMERA, MIX | FIALA),
 )
 
 
-LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
-"""Confidences of the intervals that are counted."""
+LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)  # confidences of counted intervals
 _Z = norm.ppf(0.5 + 0.5 * np.array(LEVELS))
 _CHUNK = 16
 
 
 @dataclass
 class ConditionResult:
-    """Of some seeds: mean squared errors, NEES and filters' own variances (seeds, filters), mean
-    squares of the bound (seeds,), NaN where there is none, and shares of the errors within `LEVELS`
-    (seeds, filters, levels). Episodes that ended early are left out, `seeds` are the others'.
-    """
+    """Results of the seeds whose episodes did not end early."""
 
-    labels: tuple[str, ...]
-    seeds: tuple[int, ...]
-    squares: Array
-    best: Array
-    nees: Array
-    inside: Array
-    variances: Array
-    left_out: int
+    labels: tuple[str, ...]  # labels of the filters
+    seeds: tuple[int, ...]  # seeds of the episodes
+    squares: Array  # mean squared errors (rad2), shape (seeds, filters)
+    best: Array  # mean squares of the bound (rad2), NaN where there is none, shape (seeds,)
+    nees: Array  # normalised squared errors, shape (seeds, filters)
+    inside: Array  # fractions of the errors within `LEVELS`, shape (seeds, filters, levels)
+    variances: Array  # the filters' own variances (rad2), shape (seeds, filters)
+    left_out: int  # number of episodes that ended early
 
     def select(self, label: str) -> tuple[Array, Array, Array]:
-        """Squares (seeds,), NEES (seeds,) and shares (seeds, levels) of a filter."""
+        """Return squares (seeds,), NEES (seeds,) and fractions (seeds, levels) of a filter."""
         at = self.labels.index(label)
         return self.squares[:, at], self.nees[:, at], self.inside[:, at]
 
@@ -300,8 +268,8 @@ def measure_all(
     jobs: int | None = None,
     console: Console | None = None,
 ) -> list[ConditionResult]:
-    """Every condition on the seeds 0 .. seeds-1."""
-    cases = [(condition, chunk) for condition in conditions for chunk in split_seeds(seeds, _CHUNK)]
+    """Measure every condition on the seeds 0 .. seeds-1."""
+    cases = list(product(conditions, split_seeds(seeds, _CHUNK)))
     results = iter(run_cases(measure, cases, title, jobs, console))
     return [_join_results([next(results) for _ in split_seeds(seeds, _CHUNK)]) for _ in conditions]
 
@@ -317,12 +285,11 @@ def _join_results(parts: Sequence[ConditionResult]) -> ConditionResult:
 
 
 def measure(case: tuple[Condition, Iterable[int]]) -> ConditionResult:
-    """Drive some seeds of a condition."""
+    """Drive some seeds of a condition, and run its filters over the records."""
     condition, seeds = case
     scenario = LINEAR | dict(condition.scenario)
-    env: Any = gym.make(
-        condition.env_id, scenario=scenario, control_period=10, vehicle=condition.vehicle
-    )
+    options: Any = {"scenario": scenario, "vehicle": condition.vehicle}
+    env: Any = gym.make(condition.env_id, control_period=10, **options)
     filters, left_out = dict[str, Any](), 0
     labels = tuple(condition.all_filters)
     squares, nees, inside, best, variances, driven_seeds = (list[Any]() for _ in range(6))
@@ -334,7 +301,7 @@ def measure(case: tuple[Condition, Iterable[int]]) -> ConditionResult:
         log, cars = episode
         driven_seeds.append(seed)
         settled = log.time >= condition.since - 1e-9
-        if not filters or TRUE in filters:  # else only clocks differ, and the log has them
+        if not filters or _TRUE in filters:  # else only clocks differ, and the log has them
             filters = _make_filters(condition, env.unwrapped, log)
         felt, errors, sds = _delay_gyro(log, condition.gyro_late), [], []
         for filter_ in filters.values():
@@ -346,28 +313,20 @@ def measure(case: tuple[Condition, Iterable[int]]) -> ConditionResult:
         nees.append(np.mean(sizes**2, axis=1))
         variances.append(np.mean(np.square(sds), axis=1))
         inside.append(np.mean(sizes[:, :, None] < _Z, axis=1))
-        best.append(
-            np.mean(_compute_bound(env.unwrapped, log, cars, condition.gyro_late)[settled] ** 2)
-            if condition.bounded
-            else np.nan
-        )
+        if condition.bounded:
+            bound = _compute_bound(env.unwrapped, log, cars, condition.gyro_late)
+            best.append(np.mean(bound[settled] ** 2))
+        else:
+            best.append(np.nan)
     n = len(labels)
-    tables = [np.reshape(values, (-1, n)) for values in (squares, nees, variances)]
-    shares = np.reshape(inside, (-1, n, len(LEVELS)))
-    return ConditionResult(
-        labels,
-        tuple(driven_seeds),
-        tables[0],
-        np.array(best),
-        tables[1],
-        shares,
-        tables[2],
-        left_out,
-    )
+    square, normalised, variance = (np.reshape(x, (-1, n)) for x in (squares, nees, variances))
+    shares, driven = np.reshape(inside, (-1, n, len(LEVELS))), tuple(driven_seeds)
+    tables = (square, np.array(best), normalised, shares, variance)
+    return ConditionResult(labels, driven, *tables, left_out)
 
 
 def run_with_bound(env: Any, seed: int) -> tuple[Log, Array]:
-    """An episode's record, and the least deviation at every row; RuntimeError if it ends early."""
+    """Return an episode's record, the bound (rad) at every row; RuntimeError if it ends early."""
     episode = _run_episode(env, seed)
     if episode is None:
         raise RuntimeError(f"the episode of seed {seed} ends early")
@@ -375,7 +334,7 @@ def run_with_bound(env: Any, seed: int) -> tuple[Log, Array]:
 
 
 def _delay_gyro(log: Log, late: float) -> Log:
-    """A log whose gyro is read so many seconds after it measured; the first value until then."""
+    """A log whose gyro is read late (s); the first value until then."""
     if late == 0.0:
         return log
     fast, rows = log.record.fast.copy(), round(late / log.record.dt)
@@ -384,8 +343,7 @@ def _delay_gyro(log: Log, late: float) -> Log:
 
 
 def _run_episode(env: Any, seed: int) -> tuple[Log, tuple[Vehicle, Vehicle]] | None:
-    """The record of an episode with its true sideslip angle, and the car at its start and its end;
-    None where it ended early."""
+    """Record with the true sideslip angle, car at start and end; None where it ended early."""
     base, records, times, slips = env.unwrapped, list[Record](), [], []
     for step in iterate_steps(env, None, seed):
         if not records:
@@ -402,18 +360,14 @@ def _run_episode(env: Any, seed: int) -> tuple[Log, tuple[Vehicle, Vehicle]] | N
 
 def _get_levels(scenario: Any) -> dict[str, Any]:
     """The true levels of disturbances, as options of a filter."""
-    return {
-        "force_sd": scenario.disturbance_force,
-        "moment_sd": scenario.disturbance_moment,
-    }
+    return {"force_sd": scenario.disturbance_force, "moment_sd": scenario.disturbance_moment}
 
 
 def _make_filters(condition: Condition, base: Any, log: Log) -> dict[str, Any]:
     facts, filters = make_filter_arguments(base) | {"slow": list(log.slow)}, {}
+    true = facts | {"vehicle": base.vehicle} | _get_levels(base.scenario)
     for label, (name, options) in condition.all_filters.items():
-        known = facts | (
-            {"vehicle": base.vehicle} | _get_levels(base.scenario) if label == TRUE else {}
-        )
+        known = true if label == _TRUE else facts
         filters[label] = call_quietly(make_estimator, name, **known, **options)
     return filters
 
@@ -421,19 +375,13 @@ def _make_filters(condition: Condition, base: Any, log: Log) -> dict[str, Any]:
 def _compute_bound(
     base: Any, log: Log, cars: tuple[Vehicle, Vehicle], gyro_late: float = 0.0
 ) -> Array:
-    """The least deviation at every row; tyres that change, a gust and by how many s the gyro is
-    late are known but for what no filter can know: the strength of a gust."""
+    """The bound (rad) at every row, which knows all but the strength of a gust."""
     scene, passing = base.scenario, dict[str, Any]()
     if scene.tyre_change_time is not None:
         passing["change"] = VehicleChange(scene.tyre_change_time, cars[1])
     if scene.wind_force != 0.0:
-        end = scene.wind_start + scene.wind_length
-        passing["gust"] = Gust(
-            compute_range_rms(scene, "wind_force"), scene.wind_arm, scene.wind_start, end
-        )
-    facts = (
-        make_filter_arguments(base)
-        | {"vehicle": cars[0], "latency": {"gyro": gyro_late}}
-        | _get_levels(scene)
-    )
+        strength, end = compute_range_rms(scene, "wind_force"), scene.wind_start + scene.wind_length
+        passing["gust"] = Gust(strength, scene.wind_arm, scene.wind_start, end)
+    facts = make_filter_arguments(base) | _get_levels(scene)
+    facts |= {"vehicle": cars[0], "latency": {"gyro": gyro_late}}
     return compute_error_bound(record=log.record, **facts, **passing)

@@ -139,7 +139,8 @@ class TruthObservation(
     """Appends parameters of the true car, as they are at the reset, and true states.
 
     No sensor measures these: it makes the oracles with which others are compared
-    (`agents.baselines`), and stands outside of any `EstimateObservation`. `layout` describes the whole observation.
+    (`agents.baselines`), and stands outside of any `EstimateObservation`. `layout` describes the
+    whole observation.
     ValueError says that a name is unknown or stands twice.
 
     Args:
