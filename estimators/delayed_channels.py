@@ -1,15 +1,8 @@
-"""The latency of a fast channel, found while driving.
+"""Filters of late fast channels: by a known latency, or by one identified while driving.
 
-A gyro that is late turns the predicted heading later than the camera or the GPS sees it turn: so
-the latency is the one with which the filter's packets surprise it least. The record is filtered
-with several latencies, each from where the stretch began, and a parabola through the sums of the
-packets' normalised innovations squared has the latency and its variance. The innovations of the
-gyro itself are left out: tyres that build up their force late look like a gyro that is late.
-
-A log that cannot tell is left alone: an estimate counts where every latency that is far from it is
-less likely by a factor of e^8, and so is the one in force.
-
-An estimator some of whose fast channels are late: by a known time, or by one that it finds.
+A gyro that is late turns the predicted heading later than the camera or the GPS sees it turn. So
+its latency is the one at which the slow packets' normalised innovations squared (NIS) are least.
+The gyro's own innovations are left out: tyres that build up their force late look like a late gyro.
 """
 
 import copy
@@ -27,10 +20,10 @@ from .design.periodic import Schedule, count_ticks
 from .estimator import EMPTY, NO_NIS, Estimator, compile_advance, compile_process_packet
 from .protocol import compute_std
 
-MAX_SEARCHED_LATENCY = 0.12  # s, of what is looked for
-LOOK_TIMES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)  # s from where a stretch begins
-STEPS = (0.02, 0.01, 0.005)  # s between the latencies that are compared, ever closer
-MIN_LOG_RATIO = 8.0  # of a logarithm of a likelihood ratio
+_MAX_SEARCHED_LATENCY = 0.12  # s
+_LOOK_TIMES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)  # s from where a stretch begins
+_STEPS = (0.02, 0.01, 0.005)  # s between the latencies that are compared, ever closer
+_MIN_LOG_RATIO = 8.0  # by which the logarithm of an accepted latency's likelihood is greater
 
 
 def align_rows(rows: Array, lags: dict[int, int]) -> Array:
@@ -51,7 +44,7 @@ def align_rows(rows: Array, lags: dict[int, int]) -> Array:
 
 
 class LatencySearch:
-    """Search for the latency of some columns.
+    """Search for the latency of some columns: least NIS, with a variance by a parabola.
 
     Args:
         columns: Columns of the fast row that are late together.
@@ -67,14 +60,14 @@ class LatencySearch:
     """
 
     def __init__(self, columns: tuple[int, ...], dt: float) -> None:
-        self.columns, self.max_lag = columns, round(MAX_SEARCHED_LATENCY / dt)
+        self.columns, self.max_lag = columns, round(_MAX_SEARCHED_LATENCY / dt)
         if self.max_lag < 2:
             raise ValueError(
-                f"a latency that is looked for is at most {MAX_SEARCHED_LATENCY:g} s, of "
+                f"a latency that is looked for is at most {_MAX_SEARCHED_LATENCY:g} s, of "
                 f"which rows every {dt:g} s tell nothing: say the latency in s"
             )
-        self._steps = [max(round(step / dt), 1) for step in STEPS]
-        self._looks = [round(look / dt) for look in LOOK_TIMES]
+        self._steps = [max(round(step / dt), 1) for step in _STEPS]
+        self._looks = [round(look / dt) for look in _LOOK_TIMES]
         self.lag, self.sd, self.done = 0, np.inf, False
 
     def begin(self, filters: Any, rows: Array, packets: Array) -> None:
@@ -132,22 +125,19 @@ class LatencySearch:
         lag, curvature, margin = self._minimise_nis(sum_nis)
         min_nis, count, memory = results[lag]
         scale = max(min_nis / max(count, 1), 1.0)
-        is_significant = margin > 2.0 * MIN_LOG_RATIO * scale and curvature > 0.0
+        is_significant = margin > 2.0 * _MIN_LOG_RATIO * scale and curvature > 0.0
         self.done = is_significant and self._count == self._looks[-1]
         if not is_significant:
             return delayed_filters
         self.sd = float(np.sqrt(2.0 * scale / curvature))
-        is_better = self.lag > 0 or sum_nis(self.lag) - min_nis > 2.0 * MIN_LOG_RATIO * scale
+        is_better = self.lag > 0 or sum_nis(self.lag) - min_nis > 2.0 * _MIN_LOG_RATIO * scale
         if lag == self.lag or not is_better:
             return delayed_filters
         self.lag = lag
         return memory
 
     def _minimise_nis(self, sum_nis: Any) -> tuple[int, float, float]:
-        """Find the lag of least NIS, the second derivative there (0: none), and its margin.
-
-        The margin is to the best lag that is far from it.
-        """
+        """Find the lag of least NIS, the second derivative there and the margin to distant lags."""
         max_lag, (coarse, *finer) = self.max_lag, self._steps
         grid = range(0, max_lag + 1, coarse)
         best, step = min(grid, key=sum_nis), coarse
@@ -185,10 +175,9 @@ _INDEX_COLUMN = PACKET_WIDTH  # column behind a packet's: its place in the call
 class LateEstimator(Estimator):
     """A filter with the option `latency`; built by `make_estimator`.
 
-    `delayed_filters`, a memory, is the filter at the time t - L of the latest channel, with every
-    channel at the time when it was true. The estimate at t is a copy, propagated to t with all that
-    has come: inputs, channels that are less late, packets. So it is the conditional mean of a
-    linear system, as without latencies. A step costs L / dt ticks more.
+    `delayed_filters` is the filter at the time t - L of the latest channel, with every channel at
+    the time when it was true. The estimate at t is a copy, propagated to t with all that has come.
+    So it is the conditional mean of a linear system. A step costs L / dt ticks more.
 
     Args:
         config: Parsed options of the filter, with a latency.
@@ -211,21 +200,13 @@ class LateEstimator(Estimator):
         super().__init__(config, dt, filters, schedules)
 
     def reset(self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0) -> None:
-        """Reset as `Estimator.reset` does; the search for a latency begins anew.
-
-        Args:
-            sensors: Slow sensors by name, whose clocks have a new phase; None keeps the phases.
-            first: Tick of the next fast row.
-        """
+        """Reset as `Estimator.reset` does; the search for a latency begins anew."""
         super().reset(sensors, first)
         self.delayed_filters = self.filters.copy()
         self._rows, self._waiting = np.zeros((0, FAST_WIDTH)), np.zeros((0, _INDEX_COLUMN + 1))
-        self._search = (
-            LatencySearch(find_columns(self._unknown_channel), self.dt)
-            if self._unknown_channel
-            else None
-        )
-        if self._search:
+        self._search: LatencySearch | None = None
+        if self._unknown_channel:
+            self._search = LatencySearch(find_columns(self._unknown_channel), self.dt)
             self._search.begin(self.delayed_filters, self._rows, self._waiting)
 
     @property
@@ -259,15 +240,6 @@ class LateEstimator(Estimator):
         """Process rows and packets as `Estimator.take` does.
 
         A packet that `delayed_filters` uses in a later call has no NIS.
-
-        Args:
-            fast: Fast rows, shape (k, FAST_WIDTH).
-            rows: Number of fast rows to take.
-            packets: Packets, shape (capacity, PACKET_WIDTH).
-            count: Number of packets to take.
-            X: Output for the states, shape (rows, n), or empty.
-            S: Output for the standard deviations, shape (rows, n), or empty.
-            nis: Output for each packet's normalised innovation squared, shape (count,), or empty.
         """
         remaining: Array = np.column_stack((packets[:count], np.arange(float(count))))
         self._waiting[:, _INDEX_COLUMN] = -1.0
@@ -294,9 +266,8 @@ class LateEstimator(Estimator):
         n_due = max(len(rows) - self._max_lag, 0)
         pending = np.concatenate((self._waiting, packets))
         arrived = pending[:, PACKET.arrived]
-        is_later = (arrived > now - len(rows) + n_due) & (
-            arrived <= now
-        )  # others are to be counted
+        # others are to be counted
+        is_later = (arrived > now - len(rows) + n_due) & (arrived <= now)
         self._rows, self._waiting = rows[n_due:], pending[is_later]
         self._process_delayed(align_rows(rows, self._lags)[:n_due], pending[~is_later], nis)
         if self._search and not self._search.done:
@@ -307,10 +278,8 @@ class LateEstimator(Estimator):
 
     def _process_delayed(self, fast: Array, pending: Array, nis: Array) -> None:
         """Pass rows and packets to `delayed_filters`."""
-        packets, pending_nis = (
-            np.ascontiguousarray(pending[:, :_INDEX_COLUMN]),
-            np.full(len(pending), np.nan),
-        )
+        packets = np.ascontiguousarray(pending[:, :_INDEX_COLUMN])
+        pending_nis = np.full(len(pending), np.nan)
         if len(fast):
             record = fast, len(fast), packets, len(packets), 0, EMPTY, EMPTY, pending_nis
             compile_advance()(self.delayed_filters, self.gains, *record)
@@ -339,17 +308,12 @@ class LateEstimator(Estimator):
     @property
     def latency(self) -> dict[str, float]:
         """Latency in force (s) by channel."""
-        return {
-            channel: self._lags[find_columns(channel)[0]] * self.dt
-            for channel in self.config.latency
-        }
+        channels = self.config.latency
+        return {channel: self._lags[find_columns(channel)[0]] * self.dt for channel in channels}
 
     @property
     def latency_sd(self) -> float:
-        """Standard deviation (s) of the latency that is searched for.
-
-        It is infinite while the channel is taken as punctual, and 0 where all latencies are known.
-        """
+        """Standard deviation (s) of the unknown latency: infinite until found, 0 if none is."""
         return float(self._search.sd) * self.dt if self._search else 0.0
 
     def get_state(self) -> Any:
@@ -358,10 +322,6 @@ class LateEstimator(Estimator):
         return copy.deepcopy(state)
 
     def set_state(self, snapshot: Any) -> None:
-        """Restore a snapshot as `Estimator.set_state` does.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Restore a snapshot as `Estimator.set_state` does."""
         filters, delayed_filters, self._rows, self._waiting, self._search = copy.deepcopy(snapshot)
         self.filters[:], self.delayed_filters[:] = filters, delayed_filters

@@ -1,7 +1,4 @@
-"""Classes in files of a user's own, by "FILE.py:Name": names of agents and estimators.
-
-Factories by name: those of the package, and those that users register as with Gymnasium.
-"""
+"""Factories of agents and estimators by name: built in, registered, or in a user's own file."""
 
 import ast
 import hashlib
@@ -17,7 +14,7 @@ from typing import Any
 from ..envs.validation import describe_unknown
 
 SUFFIX = ".py"
-_PREFIX = "sideslip_user_file_"  # of the modules' names
+_PREFIX = "sideslip_user_file_"  # of the modules that users' files become
 
 
 def is_user_file(text: str) -> bool:
@@ -57,7 +54,7 @@ def find_class(text: str) -> tuple[Path, str]:
     except ValueError as error:  # a null byte
         raise ValueError(f"{path} is no Python: {error}") from None
     classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
-    classes = [class_name for class_name in classes if not class_name.startswith("_")]
+    classes = [word for word in classes if not word.startswith("_")]
     definitions = f"it defines {', '.join(classes) or 'no class'}"
     if name and name not in set(_iterate_bindings(tree)):
         raise ValueError(f"{path} has no {name!r}; {definitions}")
@@ -78,9 +75,9 @@ def _iterate_bindings(tree: ast.Module) -> Iterator[str]:
 
 
 def load_user_class(text: str) -> Callable[..., Any]:
-    """Load the class, or another factory, of a user's file.
+    """Load the class, or another factory, of a user's file, which is run once a process.
 
-    The file is run once a process as long as its content stays. It may import its neighbours.
+    The file may import its neighbours. It is run again when its content changes.
 
     Args:
         text: "FILE.py:Name", or "FILE.py" for its only class.
@@ -137,7 +134,7 @@ def describe_error(error: BaseException) -> str:
     return text + location
 
 
-Factory = Callable[..., Any]
+_Factory = Callable[..., Any]
 
 
 class Registry:
@@ -148,11 +145,11 @@ class Registry:
         builtin: The package's own factories or entry points by name.
     """
 
-    def __init__(self, kind: str, builtin: Mapping[str, Factory | str]) -> None:
+    def __init__(self, kind: str, builtin: Mapping[str, _Factory | str]) -> None:
         self._kind = kind
-        self._factories: dict[str, Factory | str] = dict(builtin)
+        self._factories: dict[str, _Factory | str] = dict(builtin)
 
-    def register(self, name: str, factory: Factory | str) -> None:
+    def register(self, name: str, factory: _Factory | str) -> None:
         """Register a name; the same factory once more changes nothing.
 
         Args:
@@ -162,8 +159,8 @@ class Registry:
 
         Raises:
             TypeError: The name is no str, or the factory neither a callable nor a str.
-            ValueError: The name is empty, has a colon or belongs to another factory, or the string
-                is no entry point.
+            ValueError: The name is invalid or belongs to another factory, or a str is no entry
+                point.
         """
         if not isinstance(name, str):
             raise TypeError(f"the name of an {self._kind} is a str, got {name!r}")
@@ -181,7 +178,7 @@ class Registry:
         if known != factory:
             raise ValueError(f"the {self._kind} {name!r} is registered already, as {known!r}")
 
-    def load(self, name: str, others: Iterable[str] = ()) -> Factory:
+    def load(self, name: str, others: Iterable[str] = ()) -> _Factory:
         """Load the factory of a name or an entry point; errors as in `import_entry_point`.
 
         Args:
@@ -220,7 +217,7 @@ def _split_entry_point(entry_point: str) -> tuple[str, str]:
     return module, name
 
 
-def import_entry_point(entry_point: str) -> Factory:
+def import_entry_point(entry_point: str) -> _Factory:
     """Import the factory at an entry point.
 
     Args:
@@ -250,7 +247,7 @@ def import_entry_point(entry_point: str) -> Factory:
     return factory  # type: ignore[no-any-return]
 
 
-def find_entry_point(factory: Factory) -> str | None:
+def find_entry_point(factory: _Factory) -> str | None:
     """Find the entry point of a factory.
 
     Args:
@@ -261,10 +258,7 @@ def find_entry_point(factory: Factory) -> str | None:
     """
     text = f"{getattr(factory, '__module__', '')}:{getattr(factory, '__qualname__', '')}"
     try:
-        return (
-            text
-            if not text.startswith("__main__:") and import_entry_point(text) is factory
-            else None
-        )
+        is_found = not text.startswith("__main__:") and import_entry_point(text) is factory
     except (TypeError, ValueError):
         return None
+    return text if is_found else None

@@ -1,4 +1,4 @@
-"""The base of every classical controller: named inputs, batches, memory outside the object."""
+"""The base of all classical controllers: named inputs, batches, memory outside the object."""
 
 import math
 from abc import ABC, abstractmethod
@@ -56,8 +56,8 @@ class Controller(ABC):
         facts = get_env_facts(env)
         names = [entry.name for entry in facts.layout]
         self.grip = None if grip is None else check_positive("grip", grip)
-        limits = grip is not None or self.knows_friction
-        self._true_friction = limits and FRICTION in names
+        reads_friction = grip is not None or self.knows_friction
+        self._true_friction = reads_friction and FRICTION in names
         if self._true_friction:
             self.needs = (*self.needs, FRICTION)
         missing = [name for name in self.needs if name not in names]
@@ -90,12 +90,9 @@ class Controller(ABC):
         return inputs[:, -1] if self._true_friction else np.full(len(inputs), self.nominal.friction)
 
     def _compute_max_moment(self, inputs: Array) -> Array:
-        """Compute the largest yaw moment as a fraction of full scale, shape (N,).
-
-        The motors' power at the measured speed (columns 0 and 1, the front wheels) and `grip` limit
-        it.
-        """
+        """Compute the largest yaw moment as a fraction of full scale, shape (N,)."""
         car, max_moment = self.vehicle, np.ones(len(inputs))
+        # the motors' power limits it at the measured speed (columns 0 and 1, the front wheels)
         if car.motor_power > 0.0:
             max_moment = _torque_limit(inputs[:, :2].mean(axis=1), self._car) / car.motor_torque
         if self.grip is None:

@@ -24,8 +24,6 @@ Inputs = namedtuple(
     "beta_hat gamma_hat disturbance_1 disturbance_2 front_stiffness rear_stiffness",
 )
 """Columns of the law's inputs; `Lqr` puts in beta_ref for those that it does without."""
-
-
 IN = Inputs(*range(14))
 
 
@@ -35,8 +33,7 @@ def make_design_state(x: Any, share: Any, z: Any) -> None:
 
     Args:
         x: Row of `Inputs`.
-        share: Yaw moment per difference of the motors' torques, as a fraction of full scale (1/N
-            m).
+        share: Yaw moment, as a fraction of full scale, per difference of motor torques (1/N m).
         z: States of the design model, shape (n,), filled.
     """
     z[0], z[1] = x[IN.beta_hat], x[IN.gamma_hat]
@@ -60,12 +57,8 @@ def _lqr_law(
     slew: Any,
     front_arm: Any,
 ) -> None:
-    """Compute the actions of LQR within the limits.
-
-    x: `Inputs`. state: steering last added (rad), where the car steers. max_moment: yaw moment as a
-    fraction of full scale, shape (N,). sliding_slip: slip at which the front tyres slide (rad),
-    (N,).
-    """
+    """Compute the actions of LQR within the limits; state: steering last added (rad)."""
+    # sliding_slip: slip at which the front tyres slide (rad), max_moment: of full scale, both (N,)
     m, n = table.shape[3], table.shape[4] - table.shape[3]
     KS, z = np.empty((m, n + m)), np.empty(n)
     for row in range(len(x)):
@@ -212,12 +205,7 @@ class Lqr(Controller):
         return np.asarray(KS[:, len(self.design_spec.states) :] * np.outer(per, per))
 
     def record_action(self, state: Array, action: Any) -> None:
-        """Note the added steering, from which the rate limit counts.
-
-        Args:
-            state: Memory, shape (N, memory), updated.
-            action: Action that the env gets, shape (N, width).
-        """
+        """Note the added steering, from which the rate limit counts."""
         if self.width == 2:
             state[:, 0] = action[:, 1] * self.authority
 
@@ -226,11 +214,8 @@ class Lqr(Controller):
         _lqr_law(inputs, state, action, *limits, *self._design)
 
     def _compute_sliding_slip(self, inputs: Array) -> Array:
-        """Compute the slip at which the front tyres' force stops growing (Fiala), rad, shape (N,).
-
-        It is infinite without a grip limit.
-        """
-        if self.grip is None:
+        """Compute the slip at which the front tyres slide (Fiala), rad, shape (N,)."""
+        if self.grip is None:  # no limit
             return np.full(len(inputs), np.inf)
         car = self.vehicle
         stiffness = inputs[:, IN.front_stiffness] if self.scheduled else car.front_stiffness

@@ -21,15 +21,13 @@ from .base import Controller, check_not_negative, integrate_antiwindup
 
 MIN_SPEED = 2.0  # m/s: gains below it are those of this speed
 SPEEDS = np.arange(MIN_SPEED, 61.0, 0.5)  # m/s
-CAMERA_PERIOD = 0.033  # s
+_CAMERA_PERIOD = 0.033  # s
 FEEDFORWARDS = ("reference", "zero-slip")
-
 
 Inputs = namedtuple("Inputs", "wheel_left wheel_right steer_command beta_hat beta_ref")
 """Columns of the laws' inputs; the feedforward reads the first three alone."""
 Memory = namedtuple("Memory", "integral wait share")
 """The integral (N m), decisions until the next update, and the fraction held until then."""
-
 
 IN = Inputs(*range(5))
 LAST = Memory(*range(3))
@@ -119,7 +117,7 @@ def _two_dof_law(
     wait: int,
     dt: float,
 ) -> None:
-    """x: `Inputs`. state: `Memory`."""
+    """Compute the actions from `Inputs` x and update the `Memory` state."""
     for n in range(len(x)):
         if state[n, LAST.wait] > 0.0:
             state[n, LAST.wait] -= 1.0
@@ -197,7 +195,7 @@ class TwoDof(Controller):
         if rate not in ("control", "camera"):
             raise ValueError(f"rate is 'control' or 'camera', got {rate!r}")
         period = self.control_period * TICK
-        wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
+        wait = 1 if rate == "control" else max(1, math.ceil(_CAMERA_PERIOD / period - 1e-9))
         dt = wait * period
         table = _make_pi_table(
             self.nominal, check_not_negative("gain", gain), pole, placement, dt if sampled else None

@@ -1,7 +1,4 @@
-"""ESC as cars have it: the yaw rate is held near what driver and friction ask for, slip bounded.
-
-Sliding mode: the yaw moment keeps errors of yaw rate and sideslip angle on one line.
-"""
+"""ESC as cars have it and sliding mode: yaw rate and sideslip angle are held by the yaw moment."""
 
 import math
 from collections import namedtuple
@@ -41,13 +38,10 @@ from .base import (
 from .model_following import MIN_SPEED
 
 BANDWIDTH = 16.0  # rad/s
-RELEASE = 0.5  # s, in which the integral is let go within the dead band
-
+_RELEASE = 0.5  # s, in which the integral is let go within the dead band
 
 EscInputs = namedtuple("EscInputs", "wheel_left wheel_right steer_command gyro beta_hat")
 """Columns of the law's inputs; the last one only where the slip is bounded."""
-
-
 ESC_IN = EscInputs(*range(5))
 
 
@@ -107,7 +101,7 @@ def _esc_law(
     full_scale: float,
     dt: float,
 ) -> None:
-    """x: `Inputs`. state: the integral in N m."""
+    """Compute the actions from `EscInputs` x; the state is the integral (N m)."""
     for n in range(len(x)):
         v = maximum(0.5 * (x[n, ESC_IN.wheel_left] + x[n, ESC_IN.wheel_right]), speeds[0])
         i, share = find_cell(speeds, v)
@@ -122,7 +116,7 @@ def _esc_law(
         N_z = min(max(unlimited, -limit), limit)
         state[n, 0] = integrate_antiwindup(state[n, 0], k_i * error * dt, unlimited, N_z)
         if absolute(error) == 0.0:
-            state[n, 0] -= state[n, 0] * dt / RELEASE
+            state[n, 0] -= state[n, 0] * dt / _RELEASE
         action[n, 0] = N_z / full_scale
 
 
@@ -189,7 +183,6 @@ SlidingModeInputs = namedtuple(
 Memory = namedtuple("Memory", "beta_ref gamma_ref known")
 """The references of the last decision, for their derivatives, and whether there was one."""
 
-
 SLIDING_IN = SlidingModeInputs(*range(8))
 LAST = Memory(*range(3))
 
@@ -213,12 +206,8 @@ def compute_surface_slope(plant: Any, pole: Any) -> Any:
 
 @jit
 def _compute_reference(x: Any, v: Any, plant: Any, target: Any, kind: int) -> Any:
-    """Compute (beta_ref, gamma_ref) of a row.
-
-    A lagged reference is the observation's. Where the yaw rate is free, it is the one that keeps
-    beta_ref.
-    """
-    if kind == LAGGED:
+    """Compute (beta_ref, gamma_ref) of a row; a free yaw rate is that which keeps beta_ref."""
+    if kind == LAGGED:  # then the observation has it
         return x[SLIDING_IN.beta_ref], x[SLIDING_IN.gamma_ref]
     beta, gamma = compute_reference(x[SLIDING_IN.steer_command], v, target, kind)
     if kind == ZERO_SLIP:
@@ -241,7 +230,7 @@ def _sliding_mode_law(
     full_scale: float,
     dt: float,
 ) -> None:
-    """x: `Inputs`. state: `Memory`."""
+    """Compute the actions from `SlidingModeInputs` x and update the `Memory` state."""
     for n in range(len(x)):
         v = maximum(0.5 * (x[n, SLIDING_IN.wheel_left] + x[n, SLIDING_IN.wheel_right]), MIN_SPEED)
         plant = compute_plant(car, v)
@@ -259,9 +248,8 @@ def _sliding_mode_law(
         s = gamma - gamma_ref + xi * (beta - beta_ref)
         drift_rates = compute_drift(plant, beta, gamma)
         s_rate = drift_rates[1] + plant.b21 * delta - gamma_ref_rate
-        s_rate += xi * (
-            drift_rates[0] + plant.b11 * delta - beta_ref_rate
-        )  # s' without the yaw moment
+        # s' without the yaw moment
+        s_rate += xi * (drift_rates[0] + plant.b11 * delta - beta_ref_rate)
         reach = rate * layer * min(max(s / layer, -1.0), 1.0)
         N_z = -(s_rate + reach) / plant.b22  # Rajamani 8.3: equivalent control and boundary layer
         state[n, LAST.beta_ref], state[n, LAST.gamma_ref] = beta_ref, gamma_ref

@@ -1,4 +1,4 @@
-"""Many filters in one compiled call: the loop around `observe`.
+"""The batch's part of an observation, compiled: every filter's ticks, in lanes or alone.
 
 The tables of gains of all filters lie in one flat array, the pool, since their shapes differ.
 """
@@ -41,10 +41,7 @@ def _fetch(f: FilterRecord, template: FilterRecord) -> None:
 
 @jit
 def _select_lanes(b: LaneBlock, first: int, filters: Any, done: Any, rows: Any) -> int:
-    """Select the filters from `first` on that do their rows in the lanes of a block, into b.here.
-
-    All of them do equally many rows; returns how many.
-    """
+    """Select the filters that do their rows in lanes into b.here; return how many rows all do."""
     n_rows, count = 0, 0
     for lane in range(count_lanes()):
         i = first + lane
@@ -134,11 +131,8 @@ def make_empty_outputs(count: int) -> tuple[Any, ...]:
     Returns:
         The arguments in their order.
     """
-    empty, plan, truth = (
-        np.zeros((count, 0), np.float32),
-        np.zeros((0, 3), np.int64),
-        np.zeros(count),
-    )
+    empty, plan = np.zeros((count, 0), np.float32), np.zeros((0, 3), np.int64)
+    truth = np.zeros(count)
     return empty, 0, plan, np.zeros(0), truth, truth, empty, np.zeros((count, 3))
 
 

@@ -1,9 +1,9 @@
 """Filters of one shape in SIMD lanes: what their ticks read and write, side by side.
 
-The filters' records stay what they are; a block has fields of the same names whose numbers are
-lanes, so the equations of `core` are compiled for it unchanged. Filter i of a batch has lane
-i mod LANES of block i // LANES. Its model stays there from call to call and is loaded anew where
-its speed is another one; its state is loaded and stored in every call.
+A block has a record's fields of the same names, whose numbers are lanes, so the equations of `core`
+are compiled for it unchanged. Filter i of a batch has lane i mod LANES of block i // LANES. Its
+model stays there and is loaded anew where its speed changed; its state is loaded and stored in
+every call.
 """
 
 from typing import Any
@@ -61,9 +61,9 @@ _FLOATS = {
     "apart": (),  # 1: the tick is computed by the record
     "wild": (),  # 1: its residual is none
 }
+# of a lane: whether its filter has the block's shape (1, -1; 0 before the first look), tick, step
+# within the cycle, table of gains, packets done
 _INTS = ("shaped", "tick", "at", "cell", "cursor")
-"""Of a lane: 1 where its filter is known to have the block's shape, -1 where it has not, 0 before
-the first look; tick, step within the cycle, table of gains and packets done."""
 _SHAPE = (
     *("n", "dense", "total", "inputs", "fasts", "kind", "periodic", "measured", "cycle"),
     *("store_predictions", "tyres", "robust"),
@@ -92,11 +92,10 @@ def make_blocks(count: int) -> Any:
 
 @jit
 def is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Any:
-    """Return whether a filter's ticks are computed in its lane now.
+    """Return whether a filter's ticks are computed in its lane now; the first shapes the block.
 
-    The first filter that is shapes the block. Lanes compute models that change by speed alone, of
-    which every tick predicts and corrects. Nothing is done between samples, and nothing of the past
-    is stored but predictions.
+    Lanes compute models that change by speed alone, of which every tick predicts and corrects.
+    Nothing is done between samples, and nothing of the past is stored but predictions.
 
     Args:
         b: Block of lanes.

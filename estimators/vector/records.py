@@ -30,32 +30,21 @@ class BatchedEnv(Protocol):
 
     The final_... ones are a row's record before its newest reset. They are read in the step that
     ended its episode.
-
-    Attributes:
-        rows: Fast rows, shape (N, k, FAST_WIDTH).
-        ticks_done: Number of fast rows of each car, shape (N,).
-        packets: Packets, shape (N, capacity, PACKET_WIDTH).
-        delivered: Number of packets of each car, shape (N,).
-        slow_sensors: Slow sensors of each car by name.
-        nominal: Nominal vehicle of each car.
-        held_speed: Speed (m/s) of each car, None where it is not held.
-        layout: Entries of a row's observation.
-        dt: Tick (s).
     """
 
-    rows: Array
-    ticks_done: IntArray
-    packets: Array
-    delivered: IntArray
+    rows: Array  # fast rows, (N, k, FAST_WIDTH)
+    ticks_done: IntArray  # number of fast rows of each car, (N,)
+    packets: Array  # (N, capacity, PACKET_WIDTH)
+    delivered: IntArray  # number of packets of each car, (N,)
     final_rows: Array
     final_ticks_done: IntArray
     final_packets: Array
     final_delivered: IntArray
-    slow_sensors: Sequence[Mapping[str, SlowSensor]]
-    nominal: Sequence[Vehicle]
-    held_speed: Sequence[float | None]
-    layout: tuple[ObservationEntry, ...]
-    dt: float
+    slow_sensors: Sequence[Mapping[str, SlowSensor]]  # of each car, by name
+    nominal: Sequence[Vehicle]  # of each car
+    held_speed: Sequence[float | None]  # m/s, of each car where it is held
+    layout: tuple[ObservationEntry, ...]  # of a row's observation
+    dt: float  # tick (s)
 
 
 class BatchedRecords:
@@ -133,33 +122,18 @@ class SyncRecords:
         self.layout: tuple[ObservationEntry, ...] = layouts[0]
         self.dt: float = self._bases[0].dt
         N = len(self._bases)
-        ticks = max(len(base.rows) for base in self._bases)
-        capacity = max(len(base.packets) for base in self._bases)
-        self._records = RecordBatch(
-            np.zeros((N, ticks, FAST_WIDTH)),
-            np.zeros(N, np.int64),
-            np.zeros((N, capacity, PACKET_WIDTH)),
-            np.zeros(N, np.int64),
-        )
+        fast = np.zeros((N, max(len(base.rows) for base in self._bases), FAST_WIDTH))
+        packets = np.zeros((N, max(len(base.packets) for base in self._bases), PACKET_WIDTH))
+        self._records = RecordBatch(fast, np.zeros(N, np.int64), packets, np.zeros(N, np.int64))
 
     def read_latest(self) -> RecordBatch:
-        """Return the records of the newest step, or of tick 0 where a car was reset."""
-        fast, rows, packets, counts = self._records
+        """Return the records of the newest step as `BatchedRecords.read_latest` does."""
         for i, base in enumerate(self._bases):
-            n, m = base.ticks_done, base.delivered
-            fast[i, :n], packets[i, :m] = base.rows[:n], base.packets[:m]
-            rows[i], counts[i] = n, m
+            self._store(i, base.rows, base.ticks_done, base.packets, base.delivered)
         return self._records
 
     def read_final(self, ended: npt.NDArray[np.bool_]) -> RecordBatch:
-        """Return the records of the last step of the episodes that ended in this step.
-
-        Args:
-            ended: Rows whose episode ended, shape (N,).
-
-        Returns:
-            Records of all rows, valid in those that ended.
-        """
+        """Return the last records of ended episodes as `BatchedRecords.read_final` does."""
         fast, rows, packets, counts = self._records
         for i in np.flatnonzero(ended):
             base = self._bases[i]
@@ -169,25 +143,11 @@ class SyncRecords:
         return self._records
 
     def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
-        """Make the specs of some rows' estimators.
-
-        Args:
-            rows: Indices of the rows.
-
-        Returns:
-            Nominal vehicle, slow sensors and held speed of each.
-        """
+        """Make the specs of some rows' estimators as `BatchedRecords.make_specs` does."""
         return [make_spec(self._bases[i]) for i in rows]
 
     def annotate(self, label: str, beta: Array, std: Array, rows: npt.NDArray[np.bool_]) -> None:
-        """Pass estimates of some rows to their envs, which draw them beside the truth.
-
-        Args:
-            label: Title of the estimates.
-            beta: Estimated sideslip angles (rad), shape (N,).
-            std: Their standard deviations (rad), shape (N,).
-            rows: Rows to draw, shape (N,).
-        """
+        """Pass estimates to the envs that draw as `BatchedRecords.annotate` does."""
         for i in np.flatnonzero(rows):
             self._bases[i].annotate(label, float(beta[i]), float(std[i]))
 
@@ -233,12 +193,9 @@ def get_true_states(base: Any) -> Array:
 
 def _make_contiguous(fast: Any, rows: Any, packets: Any, counts: Any) -> RecordBatch:
     """Make arrays as compiled code takes them, copied only where they are not."""
-    return RecordBatch(
-        np.ascontiguousarray(fast, np.float64),
-        np.ascontiguousarray(rows, np.int64),
-        np.ascontiguousarray(packets, np.float64),
-        np.ascontiguousarray(counts, np.int64),
-    )
+    fast, packets = (np.ascontiguousarray(a, np.float64) for a in (fast, packets))
+    rows, counts = (np.ascontiguousarray(a, np.int64) for a in (rows, counts))
+    return RecordBatch(fast, rows, packets, counts)
 
 
 def make_record_source(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:

@@ -16,11 +16,11 @@ from ..wrappers.truth import TruthObservation as Single
 from .estimate import make_vector_spec
 from .records import get_env_state, get_true_states, get_true_vehicles
 
-Observations = npt.NDArray[np.float32]
+_Observations = npt.NDArray[np.float32]
 
 
 class TruthObservation(
-    VectorWrapper[Observations, Any, Observations, Any, Any], RecordConstructorArgs
+    VectorWrapper[_Observations, Any, _Observations, Any, Any], RecordConstructorArgs
 ):
     """`sideslip.estimators.wrappers.truth.TruthObservation` of all rows, with the same bits.
 
@@ -70,16 +70,8 @@ class TruthObservation(
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, Any]]:
-        """Reset the rows (those of options["reset_mask"]) and read their cars.
-
-        Args:
-            seed: Seed or seeds of the env.
-            options: Options of the env's reset.
-
-        Returns:
-            Observations, shape (N, width), and infos.
-        """
+    ) -> tuple[_Observations, dict[str, Any]]:
+        """Reset the rows (those of options["reset_mask"]) and read their cars."""
         mask = None if options is None else options.get("reset_mask")
         rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
         obs, infos = self.env.reset(seed=seed, options=options)
@@ -87,21 +79,14 @@ class TruthObservation(
         self._ended &= ~rows
         return self._append_truth(obs), infos
 
-    def _append_truth(self, obs: Observations) -> Observations:
-        if not self._states:
-            return np.hstack([obs, self._values])
-        states = get_true_states(self.unwrapped)
-        return np.hstack([obs, self._values, read_states(states, self._states)])
+    def _append_truth(self, obs: _Observations) -> _Observations:
+        parts = [obs, self._values]
+        if self._states:
+            parts.append(read_states(get_true_states(self.unwrapped), self._states))
+        return np.hstack(parts)
 
-    def step(self, actions: Any) -> tuple[Observations, Any, Any, Any, dict[str, Any]]:
-        """Step all rows.
-
-        Args:
-            actions: Actions of the env, one a row.
-
-        Returns:
-            Observations (N, width), rewards, terminated and truncated, each (N,), and infos.
-        """
+    def step(self, actions: Any) -> tuple[_Observations, Any, Any, Any, dict[str, Any]]:
+        """Step all rows; `final_obs` gets the parameters of the old cars."""
         obs, rewards, terminated, truncated, infos = self.env.step(actions)
         ended = np.logical_or(terminated, truncated)
         if self._same_step:
@@ -119,11 +104,7 @@ class TruthObservation(
         return arrays | {"env": get_env_state(self.env)}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Restore a snapshot of this env or of one built with the same arguments."""
         env: Any = self.env
         env.set_state(snapshot["env"])
         self._values, self._ended = snapshot["values"].copy(), snapshot["ended"].copy()

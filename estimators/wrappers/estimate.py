@@ -1,7 +1,4 @@
-"""The arguments of `EstimateObservation`, single and vector: an estimator, and its car.
-
-EstimateObservation: an estimator's states beside, or instead of, the raw observation.
-"""
+"""EstimateObservation: an estimator's states beside, or instead of, the raw observation."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
@@ -33,17 +30,11 @@ _PARAMETERS = ("estimator", "outputs", "std", "replace", "vehicle", "options", "
 
 
 class EstimatorSpec(NamedTuple):
-    """Vehicle, sensors and speed for which an estimator is built.
+    """Vehicle, sensors and speed for which an estimator is built."""
 
-    Attributes:
-        vehicle: The vehicle as the estimator believes it to be.
-        sensors: Slow sensors by name.
-        speed: Speed (m/s) where it is held, else None.
-    """
-
-    vehicle: Vehicle
-    sensors: Mapping[str, SlowSensor]
-    speed: float | None = None
+    vehicle: Vehicle  # as the estimator believes it to be
+    sensors: Mapping[str, SlowSensor]  # slow ones by name
+    speed: float | None = None  # m/s where it is held
 
     @property
     def design(self) -> Any:
@@ -101,8 +92,8 @@ class Arguments:
         recorded: Arguments for the env's spec.
 
     Raises:
-        TypeError: An argument is misplaced; the message has the nearest name of the wrapper's or of
-            the estimator's options.
+        TypeError: An argument is misplaced; the message has the nearest name of an argument or
+            option.
         ValueError: An object has a vehicle or options, which would not reach it.
     """
 
@@ -119,30 +110,28 @@ class Arguments:
         misplaced: Mapping[str, Any],
     ) -> None:
         source: Any = choose_estimator(slow_sensors) if estimator is None else estimator
-        recorded = source
         if misplaced:
             wrong = describe_unknown("argument of EstimateObservation", misplaced, _PARAMETERS)
             if isinstance(source, str) and "did you mean" not in wrong:
-                make_estimator(
-                    source, sensors=slow_sensors, **misplaced
-                )  # names the nearest option
-                wrong = (
-                    f"options of an estimator are passed as options={short_repr(dict(misplaced))}"
-                )
+                # this names the nearest option
+                make_estimator(source, sensors=slow_sensors, **misplaced)
+                passed = short_repr(dict(misplaced))
+                wrong = f"options of an estimator are passed as options={passed}"
             raise TypeError(wrong)
         self.options = dict(options or {})
         self.truth = isinstance(vehicle, str) and vehicle == TRUTH
         self.vehicle = None if vehicle is None or self.truth else make_vehicle(vehicle)
         self.source, self.object, self.label = source, None, get_label(source)
-        if not _is_object(source):
-            recorded = source if isinstance(source, str) else find_entry_point(source) or source
-        else:
+        recorded = source
+        if _is_object(source):
             if vehicle is not None or self.options:
                 raise ValueError(
                     f"{self.label} is built already: a vehicle and options go to a name or a "
                     "factory"
                 )
-            self.source, self.object, recorded = None, source, NotSerializable(self.label)
+            self.source, self.object, recorded = None, source, _NotSerializable(self.label)
+        elif not isinstance(source, str):
+            recorded = find_entry_point(source) or source
         car = vehicle.to_dict() if isinstance(vehicle, Vehicle) else vehicle
         self.recorded = {
             "estimator": recorded,
@@ -179,12 +168,8 @@ class Arguments:
         return estimator
 
 
-class NotSerializable:
-    """The place of an object in a spec: building from that spec raises the reason.
-
-    Args:
-        label: Name of the object for the message.
-    """
+class _NotSerializable:
+    """The place of an object in a spec: building from that spec raises the reason."""
 
     def __init__(self, label: str) -> None:
         self._label = label
@@ -306,10 +291,9 @@ class EstimateObservation(
             spec = spec._replace(vehicle=arguments.vehicle)
         elif arguments.truth:
             car = base.vehicle
-            vehicle = (
-                car if previous is None else choose_vehicle(self.estimator, previous.vehicle, car)
-            )
-            spec = spec._replace(vehicle=vehicle)
+            if previous is not None:
+                car = choose_vehicle(self.estimator, previous.vehicle, car)
+            spec = spec._replace(vehicle=car)
         if previous is None or spec.design != previous.design:
             self.estimator, self._estimator_spec = arguments.build(spec, base.dt), spec
             self._is_native = isinstance(self.estimator, Estimator) and self.estimator.compiled
@@ -320,28 +304,13 @@ class EstimateObservation(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Reset the env, then the estimator with this episode's clocks, and take tick 0.
-
-        Args:
-            seed: Seed of the env.
-            options: Options of the env's reset.
-
-        Returns:
-            Observation, shape (width,), and info.
-        """
+        """Reset the env, then the estimator with this episode's clocks, and take tick 0."""
         obs, info = self.env.reset(seed=seed, options=options)
         self._update_estimator().reset(self._base.slow_sensors)
         return self._append_estimates(obs, info), info
 
     def step(self, action: Any) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
-        """Step the env; the estimator takes its record before the observation is made.
-
-        Args:
-            action: Action of the env.
-
-        Returns:
-            Observation, shape (width,), reward, terminated, truncated and info.
-        """
+        """Step the env; the estimator takes its record before the observation is made."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._append_estimates(obs, info), reward, terminated, truncated, info
 
@@ -351,11 +320,7 @@ class EstimateObservation(
         return {"env": inner, "estimator": self.estimator.get_state()}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Restore a snapshot of this env or of one built with the same arguments."""
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
         self._update_estimator().set_state(snapshot["estimator"])
 
