@@ -145,8 +145,7 @@ def register_agent(name: str, factory: Callable[..., Agent] | str) -> None:
     """Give a user's agent a name that works wherever an agent's name does.
 
     Args:
-        name: New name, known in this process alone; worker processes and the command line take the
-            entry point itself.
+        name: New name, in this process alone; workers and the command line take the entry point.
         factory: Called with the env and options, as the classes of `AGENTS` are; or
             "package.module:Name", which is imported at its first use.
 

@@ -44,12 +44,9 @@ OUTPUTS = ("beta", "gamma", "F_d", "N_d")
 STATES = (*OUTPUTS, "phi", "phi_rate")
 GRIP = 0.7  # fraction of the rear tyres' grip for the yaw moment; 0.71 of it is left across
 STEER_WEIGHT = 100.0  # of added steering, which `lqr`'s design does not know the rate limit of
-_NOISE = {
-    "gyro": "gyro_noise",
-    "accel": "accel_y_noise",
-    "camera_psi": "psi_noise",
-    "camera_y": "y_l_noise",
-}
+_NOISE = dict(
+    gyro="gyro_noise", accel="accel_y_noise", camera_psi="psi_noise", camera_y="y_l_noise"
+)
 
 
 def make_noise_options(scenario: Scenario) -> dict[str, Any]:

@@ -64,18 +64,11 @@ class EnvView:
 
     `make_agent`, `get_env_facts` and the controllers accept it as an env. It has no `reset`, no
     `step` and no seed: an agent built from it learns of the true car by observations alone.
-
-    Attributes:
-        num_envs: Number of rows, one car each.
-        facts: Observation layout, nominal car and limits of the actuators.
-        plants: Kinds of plant among the rows.
-        single_observation_space: Observation space of one row.
-        single_action_space: Action space of one row.
     """
 
-    num_envs: int
-    facts: "EnvFacts"
-    plants: frozenset[PlantKind]
+    num_envs: int  # rows, one car each
+    facts: EnvFacts
+    plants: frozenset[PlantKind]  # among the rows
     single_observation_space: gym.Space[Any]
     single_action_space: gym.Space[Any]
 

@@ -127,18 +127,8 @@ class Optimum:
         return np.asarray(wrong**2 @ self.weights)
 
 
-def make_linear_plant(env: AnyEnv) -> LinearPlant:
-    """Make the linear plant of an env.
-
-    Args:
-        env: Env, single or vector.
-
-    Returns:
-        Plant in steps of the control period.
-
-    Raises:
-        ValueError: The scenario is not linear.
-    """
+def _make_linear_plant(env: AnyEnv) -> LinearPlant:
+    """Make the linear plant of an env; ValueError where its scenario is not linear."""
     config = list_configs(env)[0]
     scenario, n = config.scenario, int(config.control_period)
     _check(config)
@@ -207,16 +197,15 @@ def compute_optimum(env: gym.Env[Any, Any], schedules: int = 1) -> Optimum:
 
     Args:
         env: Single env.
-        schedules: Number of seeds from 0 whose arrivals are averaged; one is enough where nothing
-            is lost or late by chance.
+        schedules: Number of seeds from 0 whose arrivals are averaged; 1 where none are random.
 
     Returns:
         Optimum with its gains and the errors of each schedule.
 
     Raises:
-        ValueError: As `make_linear_plant`.
+        ValueError: The scenario is not linear.
     """
-    plant = make_linear_plant(env)
+    plant = _make_linear_plant(env)
     gains, weights, cost = _solve_regulator(plant)
     errors = np.array([_compute_error_covariances(env, plant, seed) for seed in range(schedules)])
     blind = np.einsum("j,ji,kjil,jl->", weights, gains, errors, gains) / schedules
@@ -283,7 +272,7 @@ class Lqg(Controller):
 
     def __init__(self, env: AnyEnv, gains: Array | None = None) -> None:
         super().__init__(env)
-        plant = make_linear_plant(env)
+        plant = _make_linear_plant(env)
         self.gains = _solve_regulator(plant)[0][0] if gains is None else gains
         self._answer = _select_gains(plant, self.gains)
 

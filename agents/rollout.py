@@ -145,16 +145,13 @@ TRUTH = ("beta", "gamma", "psi", "v_x", "v_y", "phi", "y_l")
 class Rollout:
     """An episode: row 0 is the reset, row k the state after the k-th step.
 
-    Attributes:
-        columns: Arrays of one value for each row: numbers of `info`, true motion, entries of the
-            observation (`obs_...`), the action that led to the row, and its reward.
-        units: Units by column.
-        log: Record of every tick, with the truth at the ticks of the rows.
+    A column is a number of `info`, of the true motion or of the observation (`obs_...`), the action
+    that led to the row, or its reward.
     """
 
-    columns: dict[str, npt.NDArray[np.float64]]
-    units: dict[str, str]
-    log: Log
+    columns: dict[str, npt.NDArray[np.float64]]  # a value for each row
+    units: dict[str, str]  # by column
+    log: Log  # record of every tick, with the truth at the ticks of the rows
 
     def __getitem__(self, name: str) -> npt.NDArray[np.float64]:
         if name not in self.columns:
@@ -293,7 +290,7 @@ def rollout(
     layout = env.get_wrapper_attr("layout")
     rows, records = [], []
     for step in iterate_steps(env, agent, seed, options):
-        info = step.info | get_motion(base)
+        info = step.info | _get_motion(base)
         info.pop("is_success", None)
         rows.append([*map(float, (*info.values(), step.reward, *step.action, *step.obs))])
         records.append(base.record)
@@ -310,15 +307,8 @@ def rollout(
     return Rollout(columns, units, Log(record, base.slow_sensors, truth, base.scenario.name))
 
 
-def get_motion(base: Any) -> dict[str, float]:
-    """Read the motion that `info` lacks: v_x, v_y (m/s), phi (rad), y_l and place X, Y (m).
-
-    Args:
-        base: Unwrapped single env.
-
-    Returns:
-        Values by name, in SI units.
-    """
+def _get_motion(base: Any) -> dict[str, float]:
+    """Read the motion that `info` lacks: v_x, v_y (m/s), phi (rad), y_l and place X, Y (m)."""
     motion = base.motion
     return {
         "v_x": motion.v_x,

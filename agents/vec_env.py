@@ -176,7 +176,9 @@ class NativeVecEnv(VecEnv):
     def reset(self) -> Observations:
         """Start an episode in every row, with the seeds and options that were set for it."""
         seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
-        obs, infos = self.vector_env.reset(seed=seeds, options=_merge_options(self._options))
+        names = dict.fromkeys(name for row_options in self._options for name in row_options)
+        options = {name: [row.get(name) for row in self._options] for name in names} or None
+        obs, infos = self.vector_env.reset(seed=seeds, options=options)
         self._reset_seeds()
         self._reset_options()
         self._store_infos(range(self.num_envs), infos)
@@ -334,9 +336,3 @@ def _split_infos(infos: Mapping[str, Any], rows: Sequence[int]) -> list[dict[str
                 if is_set:
                     info[key] = value
     return singles
-
-
-def _merge_options(options: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Merge the rows' options into those of the vector env, None where there are none."""
-    names = dict.fromkeys(name for row_options in options for name in row_options)
-    return {name: [row_options.get(name) for row_options in options] for name in names} or None

@@ -49,8 +49,7 @@ def describe(
 
     Args:
         folder: Folder to make.
-        settings: Settings in the zoo's format, in JSON types; `normalize` becomes False, for the
-            model has its own scales.
+        settings: Settings in the zoo's format; `normalize` becomes False: the model has scales.
         estimator_kwargs: Arguments of `EstimateObservation`, or None.
         arguments: Arguments of the command line, "env" and "env_kwargs" among them.
     """

@@ -26,16 +26,8 @@ _STEPS = (0.02, 0.01, 0.005)  # s between the latencies that are compared, ever 
 _MIN_LOG_RATIO = 8.0  # by which the logarithm of an accepted latency's likelihood is greater
 
 
-def align_rows(rows: Array, lags: dict[int, int]) -> Array:
-    """Shift each late column of fast rows to the time when it was true.
-
-    Args:
-        rows: Fast rows, shape (k, FAST_WIDTH).
-        lags: Latency (ticks) by column.
-
-    Returns:
-        Aligned rows, shape (k, FAST_WIDTH); NaN where a value has not come yet.
-    """
+def _align_rows(rows: Array, lags: dict[int, int]) -> Array:
+    """Shift late columns of fast rows to when they were true, by lags (ticks); NaN at the end."""
     result = rows.copy()
     for column, lag in lags.items():
         split = max(len(rows) - lag, 0)
@@ -43,21 +35,8 @@ def align_rows(rows: Array, lags: dict[int, int]) -> Array:
     return result
 
 
-class LatencySearch:
-    """Search for the latency of some columns: least NIS, with a variance by a parabola.
-
-    Args:
-        columns: Columns of the fast row that are late together.
-        dt: Tick (s).
-
-    Attributes:
-        lag: Latency in force (ticks).
-        sd: Its standard deviation (ticks), infinite before it is known.
-        done: Whether it needs no more looks.
-
-    Raises:
-        ValueError: The tick is too long to find a latency.
-    """
+class _LatencySearch:
+    """Search for the latency of `columns` of a fast row: least NIS, its variance by a parabola."""
 
     def __init__(self, columns: tuple[int, ...], dt: float) -> None:
         self.columns, self.max_lag = columns, round(_MAX_SEARCHED_LATENCY / dt)
@@ -68,16 +47,11 @@ class LatencySearch:
             )
         self._steps = [max(round(step / dt), 1) for step in _STEPS]
         self._looks = [round(look / dt) for look in _LOOK_TIMES]
+        # latency in force and its standard deviation (ticks), whether no more looks are needed
         self.lag, self.sd, self.done = 0, np.inf, False
 
     def begin(self, filters: Any, rows: Array, packets: Array) -> None:
-        """Begin a new stretch at a filter's memory.
-
-        Args:
-            filters: Memory of the filter, shape (layers,).
-            rows: Fast rows that it has not taken yet, shape (k, FAST_WIDTH).
-            packets: Packets that it has not taken yet, one a row.
-        """
+        """Begin a new stretch at a filter's memory, with what that has not taken yet."""
         self._start, self._rows, self._packets = filters.copy(), [rows], [packets]
         self._count = len(rows)
 
@@ -86,28 +60,13 @@ class LatencySearch:
         return min(look for look in self._looks if look > self._count) - self._count
 
     def take(self, rows: Array, packets: Array) -> None:
-        """Store rows, no further than the next look, and packets, as the memory takes them.
-
-        Args:
-            rows: Fast rows, shape (k, FAST_WIDTH).
-            packets: Packets, one a row.
-        """
+        """Store rows, no further than the next look, and packets, as the memory takes them."""
         self._rows.append(rows)
         self._packets.append(packets)
         self._count += len(rows)
 
     def look(self, delayed_filters: Any, rows: Array, packets: Array, gains: Any) -> Any:
-        """Compare latencies where a look is due.
-
-        Args:
-            delayed_filters: Memory of the filter, shape (layers,).
-            rows: Fast rows that it has not taken yet; a new stretch begins with them.
-            packets: Packets that it has not taken yet.
-            gains: Tables of gains, shape (cells, rows, columns).
-
-        Returns:
-            `delayed_filters`, or the memory for another latency that was found.
-        """
+        """Compare latencies where a look is due; return the memory for the latency in force."""
         if self._count in self._looks:
             delayed_filters = self._compare(delayed_filters, gains)
         if self._count == self._looks[-1] and not self.done:
@@ -156,7 +115,7 @@ class LatencySearch:
     def _filter_stretch(self, lag: int, rows: Array, gains: Any) -> tuple[float, int, Any]:
         """Filter the stretch with a lag: sum of its packets' NIS, count of numbers, memory."""
         filters, count = self._start.copy(), len(rows) - self.max_lag
-        fast = align_rows(rows, dict.fromkeys(self.columns, lag))[:count]
+        fast = _align_rows(rows, dict.fromkeys(self.columns, lag))[:count]
         packets = np.concatenate(self._packets)[:, :PACKET_WIDTH]
         is_past = packets[:, PACKET.arrived] <= filters[0].tick + count
         packets = np.ascontiguousarray(packets[is_past])
@@ -173,17 +132,11 @@ _INDEX_COLUMN = PACKET_WIDTH  # column behind a packet's: its place in the call
 
 
 class LateEstimator(Estimator):
-    """A filter with the option `latency`; built by `make_estimator`.
+    """A filter with the option `latency`; arguments are those of `Estimator`.
 
     `delayed_filters` is the filter at the time t - L of the latest channel, with every channel at
     the time when it was true. The estimate at t is a copy, propagated to t with all that has come.
     So it is the conditional mean of a linear system. A step costs L / dt ticks more.
-
-    Args:
-        config: Parsed options of the filter, with a latency.
-        dt: Tick (s).
-        filters: Memory of the filter, shape (layers,).
-        schedules: Schedules of the samples.
     """
 
     compiled = False
@@ -204,9 +157,9 @@ class LateEstimator(Estimator):
         super().reset(sensors, first)
         self.delayed_filters = self.filters.copy()
         self._rows, self._waiting = np.zeros((0, FAST_WIDTH)), np.zeros((0, _INDEX_COLUMN + 1))
-        self._search: LatencySearch | None = None
+        self._search: _LatencySearch | None = None
         if self._unknown_channel:
-            self._search = LatencySearch(find_columns(self._unknown_channel), self.dt)
+            self._search = _LatencySearch(find_columns(self._unknown_channel), self.dt)
             self._search.begin(self.delayed_filters, self._rows, self._waiting)
 
     @property
@@ -214,12 +167,6 @@ class LateEstimator(Estimator):
         """Ticks by column."""
         search = self._search
         return self._fixed_lags | (dict.fromkeys(search.columns, search.lag) if search else {})
-
-    @property
-    def _max_lag(self) -> int:
-        """Ticks by which `delayed_filters` is behind."""
-        search = self._search
-        return max(*self._lags.values(), search.max_lag if search and not search.done else 0)
 
     def _receive(self, packet: Array) -> None:
         self.take(np.zeros((0, FAST_WIDTH)), 0, packet[None], 1)
@@ -263,18 +210,19 @@ class LateEstimator(Estimator):
     def _update_delayed(self, fast: Array, packets: Array, now: int, nis: Array) -> None:
         """Process rows up to the tick `now`, and packets; `delayed_filters` takes what is due."""
         rows = np.concatenate((self._rows, fast))
-        n_due = max(len(rows) - self._max_lag, 0)
+        search = self._search if self._search and not self._search.done else None
+        max_lag = max(*self._lags.values(), search.max_lag if search else 0)
+        n_due = max(len(rows) - max_lag, 0)
         pending = np.concatenate((self._waiting, packets))
         arrived = pending[:, PACKET.arrived]
         # others are to be counted
         is_later = (arrived > now - len(rows) + n_due) & (arrived <= now)
         self._rows, self._waiting = rows[n_due:], pending[is_later]
-        self._process_delayed(align_rows(rows, self._lags)[:n_due], pending[~is_later], nis)
-        if self._search and not self._search.done:
-            self._search.take(fast, packets)
-            self.delayed_filters[:] = self._search.look(
-                self.delayed_filters, self._rows, self._waiting, self.gains
-            )
+        self._process_delayed(_align_rows(rows, self._lags)[:n_due], pending[~is_later], nis)
+        if search:
+            search.take(fast, packets)
+            record = self.delayed_filters, self._rows, self._waiting, self.gains
+            self.delayed_filters[:] = search.look(*record)
 
     def _process_delayed(self, fast: Array, pending: Array, nis: Array) -> None:
         """Pass rows and packets to `delayed_filters`."""
@@ -292,15 +240,13 @@ class LateEstimator(Estimator):
 
     def _predict_current(self) -> None:
         """Propagate a copy of `delayed_filters` to the present tick, with what has come."""
-        current, delayed = (
-            records.view(np.uint8).reshape(len(records), -1)
-            for records in (self.filters, self.delayed_filters)
-        )
+        layers = self.filters, self.delayed_filters
+        current, delayed = (f.view(np.uint8).reshape(len(f), -1) for f in layers)
         skip_history = self.config.delay == "clone" and not self._f.store_predictions
         end = _HISTORY_OFFSET if skip_history else None
         current[:, :end] = delayed[:, :end]
         if len(self._rows):
-            rows = align_rows(self._rows, self._lags)
+            rows = _align_rows(self._rows, self._lags)
             packets = np.ascontiguousarray(self._waiting[:, :_INDEX_COLUMN])
             record = rows, len(rows), packets, len(packets), 0, EMPTY, EMPTY, NO_NIS
             compile_advance()(self.filters, self.gains, *record)

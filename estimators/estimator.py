@@ -24,6 +24,10 @@ from .design.periodic import Schedule, compute_table_shape, count_ticks
 from .design.stability import MARGINAL, design_and_map, find_unobservable, spectral_radius
 from .protocol import Estimates, UnobservableWarning
 
+CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
+EMPTY = np.zeros((0, 0))
+NO_NIS = np.zeros(0)
+
 
 def compile_call(function: Any, *example_args: Any) -> Any:
     """Return the compiled call of a function for arguments of the example's types.
@@ -71,12 +75,6 @@ def _compile_step() -> Any:
     """Return `step_all` as a plain call."""
     matrix = np.zeros((1, 1))
     return compile_call(step_all, *_make_example(), matrix, matrix, 0)
-
-
-CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
-EMPTY = np.zeros((0, 0))
-NO_NIS = np.zeros(0)
-_NO_PACKETS = np.zeros((0, PACKET_WIDTH))
 
 
 class Estimator:
@@ -276,7 +274,7 @@ class Estimator:
         Args:
             fast_row: Fast row of this tick, shape (FAST_WIDTH,).
         """
-        self.step(np.atleast_2d(np.asarray(fast_row, np.float64)), _NO_PACKETS)
+        self.step(np.atleast_2d(np.asarray(fast_row, np.float64)), np.zeros((0, PACKET_WIDTH)))
 
     def update(self, packet: npt.ArrayLike) -> None:
         """Process one packet that has arrived, after the fast row of this tick.

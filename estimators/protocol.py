@@ -26,8 +26,7 @@ class Estimates:
         x: States, shape (K, n).
         std: Their standard deviations, shape (K, n).
         names: Names of the n states.
-        nis: Normalised innovation squared of each packet, shape (packets,); NaN where it is not
-            used.
+        nis: Normalised innovation squared of each packet, shape (packets,); NaN without use.
     """
 
     time: Array
@@ -157,16 +156,9 @@ class ForeignEstimator:
         return value
 
     def run(self, source: Log | Record) -> Estimates:
-        """Reset, then filter a whole record tick by tick.
+        """Reset, then filter a whole record tick by tick, as `Estimator.run` does; NIS is NaN.
 
-        Args:
-            source: Record, or a log that has one.
-
-        Returns:
-            States and standard deviations of the record; NIS is NaN.
-
-        Raises:
-            ValueError: The record is empty or has another tick than `dt`.
+        ValueError says that the record is empty or has another tick than `dt`.
         """
         record = source.record if isinstance(source, Log) else source
         if len(record.fast) == 0 or abs(record.dt - self.dt) > 1e-9:

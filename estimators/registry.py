@@ -40,8 +40,7 @@ def find_class(text: str) -> tuple[Path, str]:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: With file and line: it is no Python, has no such name, or defines no class or
-            several and none is named.
+        ValueError: With file and line: it is no Python, or has no such name or no single class.
     """
     file, _, name = (text, "", "") if text.endswith(SUFFIX) else text.rpartition(":")
     path = Path(file)
@@ -74,21 +73,8 @@ def _iterate_bindings(tree: ast.Module) -> Iterator[str]:
             yield node.id
 
 
-def load_user_class(text: str) -> Callable[..., Any]:
-    """Load the class, or another factory, of a user's file, which is run once a process.
-
-    The file may import its neighbours. It is run again when its content changes.
-
-    Args:
-        text: "FILE.py:Name", or "FILE.py" for its only class.
-
-    Returns:
-        The factory.
-
-    Raises:
-        ValueError: As `find_class`, or the file raises; the message has the line.
-        TypeError: The name is not callable.
-    """
+def _load_user_class(text: str) -> Callable[..., Any]:
+    """Load a factory of a user's file as `find_class` finds it; the file is run once."""
     path, name = find_class(text)
     try:
         factory = getattr(_load_module(path.resolve()), name)
@@ -154,13 +140,11 @@ class Registry:
 
         Args:
             name: New name, without a colon.
-            factory: A callable, or "package.module:Name" or "FILE.py:Name", loaded at its first
-                use.
+            factory: A callable, "package.module:Name" or "FILE.py:Name", loaded at its first use.
 
         Raises:
             TypeError: The name is no str, or the factory neither a callable nor a str.
-            ValueError: The name is invalid or belongs to another factory, or a str is no entry
-                point.
+            ValueError: The name is invalid or another factory's, or a str is no entry point.
         """
         if not isinstance(name, str):
             raise TypeError(f"the name of an {self._kind} is a str, got {name!r}")
@@ -179,25 +163,30 @@ class Registry:
             raise ValueError(f"the {self._kind} {name!r} is registered already, as {known!r}")
 
     def load(self, name: str, others: Iterable[str] = ()) -> _Factory:
-        """Load the factory of a name or an entry point; errors as in `import_entry_point`.
+        """Load the factory of a name or an entry point.
+
+        A user's file is run once a process, as long as its content stays; it may import its
+        neighbours.
 
         Args:
-            name: Registered name, "package.module:Name" or "FILE.py:Name" (see `load_user_class`).
+            name: Registered name, "package.module:Name" or "FILE.py:Name".
             others: Further names that may have been meant, for messages.
 
         Returns:
             The factory.
 
         Raises:
-            ValueError: The name is not registered.
+            ValueError: The name is not registered, or there is no such file, module or name.
+            TypeError: It is not callable.
+            ModuleNotFoundError: The module needs another one that is missing.
         """
         factory = self._factories.get(name, name)
         if not isinstance(factory, str):
             return factory
         if is_user_file(factory):
-            return load_user_class(factory)
+            return _load_user_class(factory)
         if ":" in factory:
-            return import_entry_point(factory)
+            return _import_entry_point(factory)
         raise ValueError(describe_unknown(self._kind, [name], [*self._factories, *others]))
 
     def __contains__(self, name: object) -> bool:
@@ -217,20 +206,8 @@ def _split_entry_point(entry_point: str) -> tuple[str, str]:
     return module, name
 
 
-def import_entry_point(entry_point: str) -> _Factory:
-    """Import the factory at an entry point.
-
-    Args:
-        entry_point: "package.module:Name".
-
-    Returns:
-        The factory.
-
-    Raises:
-        ModuleNotFoundError: The module needs another one that is missing.
-        TypeError: The object is not callable.
-        ValueError: There is no such module or name.
-    """
+def _import_entry_point(entry_point: str) -> _Factory:
+    """Import the factory at an entry point, "package.module:Name"."""
     module, name = _split_entry_point(entry_point)
     try:
         imported_module = importlib.import_module(module)
@@ -254,11 +231,11 @@ def find_entry_point(factory: _Factory) -> str | None:
         factory: A class or a function.
 
     Returns:
-        "package.module:Name", from which `import_entry_point` loads the factory, else None.
+        "package.module:Name" where it can be imported by that, else None.
     """
     text = f"{getattr(factory, '__module__', '')}:{getattr(factory, '__qualname__', '')}"
     try:
-        is_found = not text.startswith("__main__:") and import_entry_point(text) is factory
+        is_found = not text.startswith("__main__:") and _import_entry_point(text) is factory
     except (TypeError, ValueError):
         return None
     return text if is_found else None

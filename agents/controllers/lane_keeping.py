@@ -45,28 +45,11 @@ HASTE = 3.0
 _OFFSET_SCALE, _INTEGRAL_SCALE = 0.1, 0.2  # m, m s
 
 
-def make_lane_model(
+def _make_lane_model(
     vehicle: Vehicle, speed: float, period: int, full_scale: float, haste: float
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Make the model of `Lane` over a period and its cost, as `solve_lqr` takes them.
-
-    Inputs are the fraction of the full yaw moment, and rad added to the driver's steering. The cost
-    rate, taken at each period's end, is the env's of beta and of both inputs, with gamma against V
-    kappa, and the squares of the offset over 0.1 m and of its integral over 0.2 m s. A last term is
-    haste times the square of the steering command's lead over the applied angle. Its unit is the
-    angle that the rate covers in a period and a lag: without it a linear law commands what the rate
-    cannot give.
-
-    Args:
-        vehicle: Vehicle of the design.
-        speed: Speed (m/s).
-        period: Control period in ticks.
-        full_scale: Full yaw moment (N m).
-        haste: Weight of the steering command's lead.
-
-    Returns:
-        G (n, n), H (n, 2), Q (n, n), R (2, 2) and N (n, 2).
-    """
+    """Make the model of `Lane` over a period (ticks) and its cost, as `solve_lqr` takes them."""
+    # Inputs are the fraction of the full yaw moment (N m), and rad added to the driver's steering.
     n, T = len(AT), period * TICK
     plane = make_vision_model(vehicle, speed)
     lags = [max(tau, TICK) for tau in (vehicle.motor_lag, vehicle.steering_lag)]
@@ -81,6 +64,10 @@ def make_lane_model(
     A[AT.delta_f, AT.driver] = 1.0 / lags[1]
     A[AT.integral, AT.y] = 1.0
     G, H = LinearModel(A, B, np.eye(n), Lane._fields, (), ()).discretise(T)
+    # The cost at a period's end is the env's of beta and both inputs, with gamma against V kappa,
+    # and the squares of the offset over 0.1 m and of its integral over 0.2 m s. The last term is
+    # haste times the square of the steering command's lead over the applied angle, in the angle
+    # that the rate covers in a period and a lag: without it a linear law commands too fast a steering.
     C = np.zeros((6, n))
     for row, state in enumerate((AT.beta, AT.gamma, AT.N_z, AT.y, AT.integral, AT.delta_f)):
         C[row, state] = 1.0
@@ -155,7 +142,7 @@ class LaneKeeping(Controller):
         env: Env of the controller, whose action steers.
         moment: Whether to use the yaw moment beside the steering.
         curvature_time: Time constant of the curvature's filter (s).
-        haste: Weight of the steering command's lead, as for `make_lane_model`.
+        haste: Weight of the steering command's lead, as for `_make_lane_model`.
 
     Raises:
         ValueError: The action does not steer, an entry is missing, or an option is out of range.
@@ -175,7 +162,9 @@ class LaneKeeping(Controller):
         speeds, inputs = SPEEDS[::2], slice(0 if moment else 1, 2)
         gains, car = [], self.nominal
         for speed in speeds:
-            G, H, Q, R, N = make_lane_model(car, speed, self.control_period, self.full_scale, haste)
+            G, H, Q, R, N = _make_lane_model(
+                car, speed, self.control_period, self.full_scale, haste
+            )
             optimum = solve_lqr(G, H[:, inputs], Q, R[inputs, inputs], N[:, inputs], len(MOVED))
             gains.append(optimum[0])
         self._design = (

@@ -152,8 +152,7 @@ class ModelFollowing(Controller):
         grip: Grip limit, as for `Controller`.
 
     Raises:
-        ValueError: The action does not steer, the bandwidth is not two positive numbers, or an
-            entry is missing.
+        ValueError: The action does not steer, an entry is missing, or the bandwidth is no pair.
     """
 
     memory = len(Memory._fields)

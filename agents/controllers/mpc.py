@@ -138,15 +138,8 @@ class Mpc(Lqr):
 
         self.__dict__.update(state | {"_osqp": osqp})
 
-    def get_program(self, speed: float) -> _QuadraticProgram:
-        """Get the quadratic program of the nearest speed of `SPEEDS`.
-
-        Args:
-            speed: Speed (m/s).
-
-        Returns:
-            Program of that speed.
-        """
+    def _get_program(self, speed: float) -> _QuadraticProgram:
+        """Get the quadratic program of the nearest speed of `SPEEDS`."""
         nearest = _find_nearest_speed(speed)
         return _condense_program(
             self.nominal, nearest, self.prediction, self.horizon, self.authority
@@ -207,7 +200,7 @@ class Mpc(Lqr):
     def _get_solver(self, speed: float) -> tuple[_QuadraticProgram, Any]:
         """Get the program of a speed of `SPEEDS` and its solver, set up at its first use."""
         if speed not in self._ready_for:
-            program, solver = self.get_program(speed), self._osqp.OSQP()
+            program, solver = self._get_program(speed), self._osqp.OSQP()
             solver.setup(
                 csc_matrix(np.triu(program.P)),
                 np.zeros(len(program.P)),

@@ -81,22 +81,12 @@ def _interpolate_regulator(table: Any, axes: Any, v: Any, front: Any, rear: Any,
 
 
 @jit
-def prepare_prediction(
+def _prepare_prediction(
     design: Design, x: Any, friction: Any, roll: Any, slewing: Any, max_moment: Any
 ) -> Any:
-    """Prepare a row's prediction and its regulator.
-
-    Args:
-        design: Parts that all decisions share.
-        x: Row of `lqr.Inputs`.
-        friction: Friction of the road.
-        roll: Roll angle and rate (rad, rad/s), shape (2,); NaN where they are not measured.
-        slewing: Steering last added (rad).
-        max_moment: Largest yaw moment as a fraction of full scale.
-
-    Returns:
-        `PredictionStart`, K (m, 9), and T (4, 9) of the terminal cost |T x|^2.
-    """
+    """Prepare a row's `PredictionStart`, K (m, 9), and T (4, 9) of the terminal cost |T x|^2."""
+    # x: row of `lqr.Inputs`, roll: angle and rate (rad, rad/s), NaN where they are not measured,
+    # slewing: steering last added (rad), max_moment: fraction of full scale
     model, disturbed = design.model, design.disturbed
     v = max(0.5 * (x[IN.wheel_left] + x[IN.wheel_right]), MIN_SPEED)
     front = x[IN.front_stiffness] if design.scheduled else model.car.C_f
@@ -140,11 +130,11 @@ def prepare_prediction(
 def _nmpc_law(
     x: Any, state: Any, action: Any, max_moment: Any, friction: Any, rolls: Any, design: Design
 ) -> None:
-    """Compute the actions; state: `Memory` and the plan, rolls: as in `prepare_prediction`."""
+    """Compute the actions; state: `Memory` and the plan, rolls: as in `_prepare_prediction`."""
     blocks, m = design.blocks, design.gains.shape[3]
     for row in range(len(x)):
         slewing = state[row, LAST.slewing]
-        start, K, T = prepare_prediction(
+        start, K, T = _prepare_prediction(
             design, x[row], friction[row], rolls[row], slewing, max_moment[row]
         )
         plan, extra_iterations = state[row, PLAN:].copy(), _FIRST_ITERATIONS
@@ -191,8 +181,7 @@ class Nmpc(Lqr):
         grip: Grip limit, as for `Controller`.
 
     Raises:
-        ValueError: An entry is missing, an option is out of range, or the rows of a vector env have
-            different plants.
+        ValueError: An entry is missing, an option is out of range, or rows have different plants.
     """
 
     min_period = MIN_STEP
@@ -290,8 +279,7 @@ _MIN_FRICTION, _MAX_FRICTION = 0.2, 1.2  # of the friction that is believed
 class AdaptiveLqr(Lqr):
     """`Lqr` scheduled on the stiffness factors front_tyres_hat and rear_tyres_hat of `joint`.
 
-    Where the observation has inverse_friction_hat (`joint` with inverse_friction_sd), limits use
-    that friction, within 0.2 to 1.2.
+    Where the observation has inverse_friction_hat, limits use that friction, within 0.2 to 1.2.
 
     Args:
         env: Env of the controller, with both factors in its observation.
@@ -322,10 +310,4 @@ class AdaptiveLqr(Lqr):
 
 
 class AdaptiveNmpc(AdaptiveLqr, Nmpc):
-    """`Nmpc` that predicts with the tyres and the friction of `joint`, as `AdaptiveLqr` has them.
-
-    Args:
-        env: Env of the controller, with both factors in its observation.
-        grip: Grip limit, as for `Controller`.
-        options: Other arguments of `Nmpc`.
-    """
+    """`Nmpc` that predicts with tyres and friction of `joint`, as `AdaptiveLqr` has them."""

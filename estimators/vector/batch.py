@@ -178,18 +178,17 @@ class BatchEstimator:
             rows: Number of fast rows of each filter, shape (N,).
             packets: Packets, shape (N, capacity, PACKET_WIDTH).
             counts: Number of packets of each filter, shape (N,).
-            *observed: Arguments of `kernel.observe_batch` after `counts`.
+            *observed: Arguments of `wrappers.kernel.observe` from `obs` on, of N filters.
         """
         done = np.full(len(self), -1) if mask is None else np.where(mask, -1, rows)
         memory = self.filters, self._designs.pool, self._places, done, self._lanes
         while compile_observe_batch()(*memory, fast, rows, packets, counts, *observed) > 0:
-            self._design_missing(np.flatnonzero(done < rows))
-
-    def _design_missing(self, rows: IntArray) -> None:
-        """Compute the tables of gains that compiled code has just asked for, each once."""
-        wanted = {(self._design_keys[i], int(self.filters[i, 0].wanted)): int(i) for i in rows}
-        for i in wanted.values():
-            self[i].design_missing()
+            missing = np.flatnonzero(
+                done < rows
+            )  # rows without gains, of which each is designed once
+            keys = [(self._design_keys[i], int(self.filters[i, 0].wanted)) for i in missing]
+            for i in dict(zip(keys, missing.tolist(), strict=True)).values():
+                self[i].design_missing()
 
     def get_state(self) -> Any:
         """Return a snapshot, from which `set_state` restores every bit."""
@@ -278,17 +277,9 @@ class ForeignBatch(BatchEstimator):
             self._check_states(i, self[i].names)
             self[i].sensors = dict(spec.sensors)
 
-    def take(
-        self,
-        mask: npt.NDArray[np.bool_] | None,
-        fast: Array,
-        rows: IntArray,
-        packets: Array,
-        counts: IntArray,
-        *observed: Any,
-    ) -> None:
+    def take(self, mask: npt.NDArray[np.bool_] | None, *arguments: Any) -> None:
         """Process rows and packets as `BatchEstimator.take` does."""
-        obs, inner, plan, limits, *row_arrays = observed
+        fast, rows, packets, counts, obs, inner, plan, limits, *row_arrays = arguments
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
         for i in chosen.tolist():
             estimator, (beta, gamma, out, summary) = self[i], (array[i] for array in row_arrays)

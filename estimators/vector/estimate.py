@@ -9,23 +9,23 @@ import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec, VectorizeMode, WrapperSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from ...envs.task import ObservationEntry, make_space
 from ...envs.vehicle.parameters import VehicleSource
 from ..wrappers.estimate import Arguments, EstimatorSource, EstimatorSpec
 from ..wrappers.estimate import EstimateObservation as Single
-from ..wrappers.outputs import BETA, NEES, STD, make_outputs, make_title
+from ..wrappers.outputs import BETA, NEES, STD, make_outputs
 from ..wrappers.truth import choose_vehicle, set_stiffness
 from .make import build_batch
 from .records import (
+    BatchedEnv,
     BatchedRecords,
     RecordBatch,
     SyncRecords,
     get_env_state,
     get_true_vehicles,
-    make_record_source,
 )
 
 
@@ -91,15 +91,13 @@ class EstimateObservation(
         outputs: States to append, each as `<state>_hat`.
         std: Whether each one's standard deviation is appended as `<state>_std`.
         replace: Whether the observation is these alone.
-        vehicle: Vehicle as the estimators believe it to be; None for each row's nominal, "truth"
-            for the true one.
+        vehicle: Vehicle as estimators believe it to be; None: each row's nominal, "truth": its own.
         options: Options of `make_estimator`.
         name: Put before every name as `<name>_`.
         **misplaced: Refused; the message names the nearest argument or option.
 
     Raises:
-        TypeError: It is not the innermost wrapper, the records are out of reach or the estimator is
-            an object, which cannot serve all rows.
+        TypeError: It is not innermost, records are out of reach, or the estimator is one object.
         ValueError: An output is unknown, names would stand twice, or there is no autoreset.
     """
 
@@ -136,16 +134,15 @@ class EstimateObservation(
         dt = self._records.dt
         self.estimator = build_batch(arguments.source, specs, dt, arguments.options)
         inner = () if replace else getattr(env, "layout", self._records.layout)
-        states = self.estimator.names
-        self._outputs = make_outputs(arguments.label, states, outputs, std, name, inner)
-        self._title = make_title(arguments.label, name)
+        states, label = self.estimator.names, arguments.label
+        self._outputs = make_outputs(label, states, outputs, std, name, inner)
+        self._title = label if name is None else f"{label} ({name})"
         self.layout: tuple[ObservationEntry, ...] = self._outputs.layout
         self.single_observation_space = make_space(self.layout)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._out = np.zeros((env.num_envs, len(self.layout)), np.float32)
-        self._ended: _Mask | None = (
-            None  # rows that the next step resets; None: all are to be reset
-        )
+        # rows that the next step resets; None: all are to be reset
+        self._ended: _Mask | None = None
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]  # as in VectorWrapper
@@ -311,4 +308,19 @@ def _find_records(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords
                 f"environment; inside it is {type(layer).__name__}"
             )
         layer = layer.env
-    return make_record_source(layer)
+    if isinstance(layer, AsyncVectorEnv):
+        raise TypeError(
+            "the records in AsyncVectorEnv's worker processes are out of reach; wrap each "
+            "environment in its worker with sideslip.estimators.EstimateObservation: "
+            "gym.make_vec(id, vectorization_mode='async', wrappers=[functools.partial("
+            "EstimateObservation, estimator=...)]), or use vectorization_mode='sync'"
+        )
+    if isinstance(layer, SyncVectorEnv):
+        return SyncRecords(layer)
+    missing = [name for name in BatchedEnv.__annotations__ if not hasattr(layer, name)]
+    if missing:
+        raise TypeError(
+            "EstimateObservation reads the records of a sideslip vector environment; "
+            f"{type(layer).__name__} has no {', '.join(missing)}"
+        )
+    return BatchedRecords(layer)

@@ -77,8 +77,7 @@ class GainPool:
             An estimator of the spec's design.
 
         Raises:
-            TypeError: The factory builds an `Estimator` for other specs and something else for this
-                one.
+            TypeError: The factory builds an `Estimator` for other specs, but not for this one.
         """
         design = spec.design
         if design not in self._estimators:

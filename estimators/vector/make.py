@@ -27,7 +27,7 @@ from .lane_ticks import Build, get_gains
 def _correct_batch(
     filters: Any, pool: Any, places: Any, chosen: Any, record: Any, observed: Any, corrections: Any
 ) -> None:
-    """Call `observe_corrected` for the filters `chosen`, else as `kernel.observe_batch`."""
+    """Call `observe_corrected` for the filters of the indices `chosen`."""
     fast, rows, packets, counts = record
     obs, inner, plan, limits, beta, gamma, out, summary = observed
     memory, net = corrections

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
+from gymnasium.vector import SyncVectorEnv
 
 from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Array
 from ...envs.sensors.link import SlowSensor
@@ -172,60 +172,11 @@ def get_true_vehicles(base: Any, rows: Sequence[int]) -> list[Vehicle]:
     return [base.vehicle[i] for i in rows]
 
 
-def get_true_states(base: Any) -> Array:
-    """Return the present `TrueState` of every row.
-
-    Args:
-        base: Vector environment without wrappers.
-
-    Returns:
-        States in SI units, shape (N, len(TrueState)).
-
-    Raises:
-        TypeError: The states are out of reach.
-    """
-    if isinstance(base, SyncVectorEnv):
-        return np.array([env.unwrapped.true_state for env in base.envs])  # type: ignore[attr-defined]
-    if not hasattr(base, "true_state"):
-        raise TypeError(f"{type(base).__name__} does not offer the true states of its rows")
-    return np.asarray(base.true_state)
-
-
 def _make_contiguous(fast: Any, rows: Any, packets: Any, counts: Any) -> RecordBatch:
     """Make arrays as compiled code takes them, copied only where they are not."""
     fast, packets = (np.ascontiguousarray(a, np.float64) for a in (fast, packets))
     rows, counts = (np.ascontiguousarray(a, np.int64) for a in (rows, counts))
     return RecordBatch(fast, rows, packets, counts)
-
-
-def make_record_source(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:
-    """Make the source of a vector env's records.
-
-    Args:
-        env: Vector environment without wrappers.
-
-    Returns:
-        Reader of the records.
-
-    Raises:
-        TypeError: The records are in worker processes, out of reach, or there are none.
-    """
-    if isinstance(env, AsyncVectorEnv):
-        raise TypeError(
-            "the records in AsyncVectorEnv's worker processes are out of reach; wrap each "
-            "environment in its worker with sideslip.estimators.EstimateObservation: "
-            "gym.make_vec(id, vectorization_mode='async', wrappers=[functools.partial("
-            "EstimateObservation, estimator=...)]), or use vectorization_mode='sync'"
-        )
-    if isinstance(env, SyncVectorEnv):
-        return SyncRecords(env)
-    missing = [name for name in BatchedEnv.__annotations__ if not hasattr(env, name)]
-    if missing:
-        raise TypeError(
-            "EstimateObservation reads the records of a sideslip vector environment; "
-            f"{type(env).__name__} has no {', '.join(missing)}"
-        )
-    return BatchedRecords(env)
 
 
 def get_env_state(env: Any) -> Any:

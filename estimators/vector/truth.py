@@ -7,14 +7,14 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from ...envs.task import make_space
-from ..wrappers.truth import STIFFNESSES, make_truth_entries, read_parameters, read_states
+from ..wrappers.truth import STIFFNESSES, make_truth_entries, read_states
 from ..wrappers.truth import TruthObservation as Single
 from .estimate import make_vector_spec
-from .records import get_env_state, get_true_states, get_true_vehicles
+from .records import get_env_state, get_true_vehicles
 
 _Observations = npt.NDArray[np.float32]
 
@@ -36,8 +36,8 @@ class TruthObservation(
 
     Raises:
         TypeError: The env has no layout or no vehicles.
-        ValueError: A name is unknown or stands twice, or states are wanted of rows that are reset
-            within the step that ends their episode, whose last ones are gone then.
+        ValueError: A name is unknown or stands twice, or states are wanted with a reset within the
+            step that ends an episode, when the last ones are gone.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class TruthObservation(
     def _append_truth(self, obs: _Observations) -> _Observations:
         parts = [obs, self._values]
         if self._states:
-            parts.append(read_states(get_true_states(self.unwrapped), self._states))
+            parts.append(read_states(_get_true_states(self.unwrapped), self._states))
         return np.hstack(parts)
 
     def step(self, actions: Any) -> tuple[_Observations, Any, Any, Any, dict[str, Any]]:
@@ -113,4 +113,13 @@ class TruthObservation(
         rows = np.flatnonzero(mask)
         cars = get_true_vehicles(self.unwrapped, rows.tolist())
         for i, car in zip(rows, cars, strict=True):
-            self._values[i] = read_parameters(car, self._parameters)
+            self._values[i] = [getattr(car, name) for name in self._parameters]
+
+
+def _get_true_states(base: Any) -> npt.NDArray[np.float64]:
+    """Return the present `TrueState` of every row of a bare vector env, (N, len(TrueState))."""
+    if isinstance(base, SyncVectorEnv):
+        return np.array([env.unwrapped.true_state for env in base.envs])  # type: ignore[attr-defined]
+    if not hasattr(base, "true_state"):
+        raise TypeError(f"{type(base).__name__} does not offer the true states of its rows")
+    return np.asarray(base.true_state)

@@ -20,7 +20,7 @@ from ..make import make_estimator
 from ..protocol import EstimatorFactory, EstimatorLike, ForeignEstimator, get_label
 from ..registry import find_entry_point
 from .kernel import compile_observe
-from .outputs import BETA, STD, Outputs, make_outputs, make_title, write_outputs
+from .outputs import BETA, STD, Outputs, make_outputs, write_outputs
 from .truth import TRUTH, choose_vehicle, set_stiffness
 
 EstimatorSource = str | EstimatorFactory | EstimatorLike
@@ -74,7 +74,7 @@ def build_estimator(
 
 
 class Arguments:
-    """The checked arguments of a wrapper, and the estimators they stand for.
+    """The checked arguments of a wrapper, and the estimator they stand for.
 
     Args:
         estimator: Name, factory or object; None for `choose_estimator` of the sensors.
@@ -92,8 +92,7 @@ class Arguments:
         recorded: Arguments for the env's spec.
 
     Raises:
-        TypeError: An argument is misplaced; the message has the nearest name of an argument or
-            option.
+        TypeError: An argument is misplaced; the message has the nearest name.
         ValueError: An object has a vehicle or options, which would not reach it.
     """
 
@@ -142,30 +141,6 @@ class Arguments:
             "options": self.options,
             "name": name,
         }
-
-    def build(self, spec: EstimatorSpec, dt: float) -> AnyEstimator:
-        """Build an estimator; where one object is used, return that one.
-
-        Args:
-            spec: Vehicle, sensors and speed.
-            dt: Tick (s).
-
-        Returns:
-            The estimator.
-
-        Raises:
-            ValueError: The object was built for another tick.
-        """
-        if self.object is None:
-            return build_estimator(self.source, self.options, dt, spec)
-        if not isinstance(self.object, AnyEstimator):
-            self.object = ForeignEstimator(self.object, self.label, dt, spec.sensors)
-        elif abs(self.object.dt - dt) > 1e-9:
-            raise ValueError(
-                f"{self.label} was built for ticks of {self.object.dt:g} s, the env has {dt:g} s"
-            )
-        estimator: AnyEstimator = self.object
-        return estimator
 
 
 class _NotSerializable:
@@ -280,7 +255,7 @@ class EstimateObservation(
         self.outputs: Outputs = make_outputs(label, states, outputs, std, name, inner)
         self.layout: tuple[ObservationEntry, ...] = self.outputs.layout
         self.observation_space = make_space(self.layout)
-        self._width, self._title = len(self.layout), make_title(label, name)
+        self._width, self._title = len(self.layout), label if name is None else f"{label} ({name})"
         self._summary = np.zeros(3)
 
     def _update_estimator(self) -> AnyEstimator:
@@ -295,11 +270,26 @@ class EstimateObservation(
                 car = choose_vehicle(self.estimator, previous.vehicle, car)
             spec = spec._replace(vehicle=car)
         if previous is None or spec.design != previous.design:
-            self.estimator, self._estimator_spec = arguments.build(spec, base.dt), spec
+            self.estimator, self._estimator_spec = self._build_estimator(spec), spec
             self._is_native = isinstance(self.estimator, Estimator) and self.estimator.compiled
         if arguments.truth:
             set_stiffness(self.estimator, base.vehicle)
         return self.estimator
+
+    def _build_estimator(self, spec: EstimatorSpec) -> AnyEstimator:
+        """Build an estimator for a spec; where one object is used, return that one."""
+        arguments, dt = self._arguments, self._base.dt
+        if arguments.object is None:
+            return build_estimator(arguments.source, arguments.options, dt, spec)
+        if not isinstance(arguments.object, AnyEstimator):
+            arguments.object = ForeignEstimator(arguments.object, arguments.label, dt, spec.sensors)
+        elif abs(arguments.object.dt - dt) > 1e-9:
+            raise ValueError(
+                f"{arguments.label} was built for ticks of {arguments.object.dt:g} s, the env has "
+                f"{dt:g} s"
+            )
+        estimator: AnyEstimator = arguments.object
+        return estimator
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

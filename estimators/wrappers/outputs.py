@@ -83,19 +83,6 @@ def make_outputs(
     )
 
 
-def make_title(label: str, name: str | None) -> str:
-    """Make the title of a wrapper's estimates in pictures.
-
-    Args:
-        label: Name of the estimator.
-        name: Name of the wrapper, or None.
-
-    Returns:
-        The title.
-    """
-    return label if name is None else f"{label} ({name})"
-
-
 def write_outputs(
     estimator: EstimatorLike,
     obs: npt.NDArray[np.float32],

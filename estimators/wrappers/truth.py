@@ -66,19 +66,6 @@ def make_truth_entries(
     return (*inner, *entries)
 
 
-def read_parameters(vehicle: Vehicle, parameters: Sequence[str]) -> npt.NDArray[np.float32]:
-    """Read parameters of a vehicle.
-
-    Args:
-        vehicle: The vehicle.
-        parameters: Names of `Vehicle`.
-
-    Returns:
-        Values in SI units, shape (len(parameters),).
-    """
-    return np.array([getattr(vehicle, name) for name in parameters], np.float32)
-
-
 def read_states(true_state: Any, states: Sequence[str]) -> npt.NDArray[np.float32]:
     """Read true states, clipped to their bounds.
 
@@ -112,12 +99,8 @@ def choose_vehicle(
     """
     if isinstance(estimator, ForeignEstimator) or estimator.filters[0].periodic:
         return vehicle
-    return vehicle.replace(
-        name=built.name,
-        friction=built.friction,
-        front_stiffness=built.front_stiffness,
-        rear_stiffness=built.rear_stiffness,
-    )
+    fixed = ("name", "friction", *STIFFNESSES)
+    return vehicle.replace(**{name: getattr(built, name) for name in fixed})
 
 
 def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> None:
@@ -139,12 +122,15 @@ class TruthObservation(
 
     No sensor measures these: it makes the oracles with which others are compared
     (`agents.baselines`), and stands outside of any `EstimateObservation`. `layout` describes the
-    whole observation. ValueError says that a name is unknown or stands twice.
+    whole observation.
 
     Args:
         env: Environment with a `layout`.
         parameters: Names of `Vehicle`, appended as `true_<name>` in their units.
         states: Names of `TrueState`, appended as `<name>_hat` as if by an estimator without error.
+
+    Raises:
+        ValueError: A name is unknown or stands twice.
     """
 
     def __init__(
@@ -167,7 +153,7 @@ class TruthObservation(
         """Reset the env and read its car; see `gymnasium.Env.reset`."""
         obs, info = self.env.reset(seed=seed, options=options)
         base: Any = self.unwrapped
-        self._values = read_parameters(base.vehicle, self._parameters)
+        self._values[:] = [getattr(base.vehicle, name) for name in self._parameters]
         return self._append_truth(obs), info
 
     def _append_truth(self, obs: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
