@@ -67,7 +67,7 @@ def _make_lane_model(
     # The cost at a period's end is the env's of beta and both inputs, with gamma against V kappa,
     # and the squares of the offset over 0.1 m and of its integral over 0.2 m s. The last term is
     # haste times the square of the steering command's lead over the applied angle, in the angle
-    # that the rate covers in a period and a lag: without it a linear law commands too fast a steering.
+    # that the rate covers in a period and a lag: else a linear law commands too fast a steering.
     C = np.zeros((6, n))
     for row, state in enumerate((AT.beta, AT.gamma, AT.N_z, AT.y, AT.integral, AT.delta_f)):
         C[row, state] = 1.0

@@ -21,7 +21,7 @@ from .base import Controller, check_not_negative, integrate_antiwindup
 
 MIN_SPEED = 2.0  # m/s: gains below it are those of this speed
 SPEEDS = np.arange(MIN_SPEED, 61.0, 0.5)  # m/s
-_CAMERA_PERIOD = 0.033  # s
+CAMERA_PERIOD = 0.033  # s
 FEEDFORWARDS = ("reference", "zero-slip")
 
 Inputs = namedtuple("Inputs", "wheel_left wheel_right steer_command beta_hat beta_ref")
@@ -173,7 +173,7 @@ class TwoDof(Controller):
         if rate not in ("control", "camera"):
             raise ValueError(f"rate is 'control' or 'camera', got {rate!r}")
         period = self.control_period * TICK
-        wait = 1 if rate == "control" else max(1, math.ceil(_CAMERA_PERIOD / period - 1e-9))
+        wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
         dt = wait * period
         factor = check_not_negative("gain", gain)
         if sampled:

@@ -1,6 +1,6 @@
 """Records of a vector env's cars, as a batch of estimators reads them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -128,17 +128,19 @@ class SyncRecords:
 
     def read_latest(self) -> RecordBatch:
         """Return the records of the newest step as `BatchedRecords.read_latest` does."""
-        for i, base in enumerate(self._bases):
-            self._store(i, base.rows, base.ticks_done, base.packets, base.delivered)
-        return self._records
+        return self._copy(range(len(self._bases)), "")
 
     def read_final(self, ended: npt.NDArray[np.bool_]) -> RecordBatch:
         """Return the last records of ended episodes as `BatchedRecords.read_final` does."""
+        return self._copy(np.flatnonzero(ended).tolist(), "final_")
+
+    def _copy(self, indices: Iterable[int], prefix: str) -> RecordBatch:
+        """Copy the records of some environments, those before a reset with "final_"."""
         fast, rows, packets, counts = self._records
-        for i in np.flatnonzero(ended):
-            base = self._bases[i]
-            n, m = base.final_ticks_done, base.final_delivered
-            fast[i, :n], packets[i, :m] = base.final_rows[:n], base.final_packets[:m]
+        for i in indices:
+            names = ("rows", "ticks_done", "packets", "delivered")
+            ticks, n, arrived, m = (getattr(self._bases[i], prefix + name) for name in names)
+            fast[i, :n], packets[i, :m] = ticks[:n], arrived[:m]
             rows[i], counts[i] = n, m
         return self._records
 
