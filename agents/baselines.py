@@ -47,6 +47,11 @@ STEER_WEIGHT = 100.0  # of added steering, which `lqr`'s design does not know th
 _NOISE = dict(
     gyro="gyro_noise", accel="accel_y_noise", camera_psi="psi_noise", camera_y="y_l_noise"
 )
+FILE = Path(__file__).with_name("tuned.toml")
+PARTS = ("filter", "controller")
+
+Options = dict[str, dict[str, Any]]
+"""Options of the filter and of the controller, by `PARTS`."""
 
 
 def make_noise_options(scenario: Scenario) -> dict[str, Any]:
@@ -168,13 +173,6 @@ def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, An
         vehicle=TRUTH if knows_tyres else None,
         options=levels | dict(options),
     )
-
-
-FILE = Path(__file__).with_name("tuned.toml")
-PARTS = ("filter", "controller")
-
-Options = dict[str, dict[str, Any]]
-"""Options of the filter and of the controller, by `PARTS`."""
 
 
 @cache

@@ -245,8 +245,9 @@ def _check_wrappers(env: Any, layout: tuple[ObservationEntry, ...]) -> None:
         single = "single_" if isinstance(env, VectorEnv) else ""
         observed = getattr(base, f"{single}observation_space")
         acted_on = getattr(base, f"{single}action_space")
-        actions = gym.spaces.Box(-1.0, 1.0, acted_on.shape, np.float32)
-        if observed != make_space(layout) or acted_on != actions:
+        if observed != make_space(layout) or acted_on != gym.spaces.Box(
+            -1.0, 1.0, acted_on.shape, np.float32
+        ):
             wrong.append(f"a wrapper within {type(base).__name__}")
     if wrong:
         raise ValueError(
@@ -264,9 +265,6 @@ def get_layout(env: VectorEnv[Any, Any, Any]) -> tuple[ObservationEntry, ...]:
 
     Returns:
         Entries of the observation, in order.
-
-    Raises:
-        ValueError: `get_env_facts` refuses a wrapper, or the rows have different layouts.
     """
     layer: Any = env
     while "layout" not in vars(layer) and isinstance(layer, VectorWrapper):

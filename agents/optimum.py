@@ -201,9 +201,6 @@ def compute_optimum(env: gym.Env[Any, Any], schedules: int = 1) -> Optimum:
 
     Returns:
         Optimum with its gains and the errors of each schedule.
-
-    Raises:
-        ValueError: The scenario is not linear.
     """
     plant = _make_linear_plant(env)
     gains, weights, cost = _solve_regulator(plant)

@@ -139,6 +139,28 @@ _UNITS = {
 _INFO_UNITS = {name: unit for unit, names in _UNITS.items() for name in names.split()}
 TRUTH = ("beta", "gamma", "psi", "v_x", "v_y", "phi", "y_l")
 """The true states in a log, named as estimators name them."""
+_DEGREES = 180.0 / np.pi
+_TRUE: dict[str, Any] = {"color": "#000000", "lw": 1.4, "zorder": 3}
+_ESTIMATE: dict[str, Any] = {"color": "#56B4E9", "lw": 1.0}
+_REFERENCE: dict[str, Any] = {"color": "#D55E00", "lw": 1.2, "ls": "--", "zorder": 2}
+_PANELS: tuple[tuple[tuple[tuple[str, str, dict[str, Any]], ...], str, float], ...] = (
+    (
+        (
+            ("obs_beta_hat", "estimate, 1 std", _ESTIMATE),
+            ("beta_ref", "reference", _REFERENCE),
+            ("beta", "true", _TRUE),
+        ),
+        "sideslip angle / deg",
+        _DEGREES,
+    ),
+    (
+        (("gamma_ref", "reference", _REFERENCE), ("gamma", "true", _TRUE)),
+        "yaw rate / (deg/s)",
+        _DEGREES,
+    ),
+    ((("yaw_moment", "delivered", _TRUE),), "yaw moment / (N m)", 1.0),
+    ((("steer", "front wheels", _TRUE),), "steering angle / deg", _DEGREES),
+)
 
 
 @dataclass(frozen=True, repr=False)
@@ -232,30 +254,6 @@ class Rollout:
         axes[-1].set_xlabel("time / s")
         figure.suptitle(f"{self.log.name}: cost {self.cost:.3g}")
         return figure
-
-
-_DEGREES = 180.0 / np.pi
-_TRUE: dict[str, Any] = {"color": "#000000", "lw": 1.4, "zorder": 3}
-_ESTIMATE: dict[str, Any] = {"color": "#56B4E9", "lw": 1.0}
-_REFERENCE: dict[str, Any] = {"color": "#D55E00", "lw": 1.2, "ls": "--", "zorder": 2}
-_PANELS: tuple[tuple[tuple[tuple[str, str, dict[str, Any]], ...], str, float], ...] = (
-    (
-        (
-            ("obs_beta_hat", "estimate, 1 std", _ESTIMATE),
-            ("beta_ref", "reference", _REFERENCE),
-            ("beta", "true", _TRUE),
-        ),
-        "sideslip angle / deg",
-        _DEGREES,
-    ),
-    (
-        (("gamma_ref", "reference", _REFERENCE), ("gamma", "true", _TRUE)),
-        "yaw rate / (deg/s)",
-        _DEGREES,
-    ),
-    ((("yaw_moment", "delivered", _TRUE),), "yaw moment / (N m)", 1.0),
-    ((("steer", "front wheels", _TRUE),), "steering angle / deg", _DEGREES),
-)
 
 
 def rollout(

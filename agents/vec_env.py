@@ -23,6 +23,9 @@ with require_extra("train", "training needs torch and stable-baselines3"):
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+Observations = npt.NDArray[np.float32]
+_Indices = int | Iterable[int] | None
+_Wrapping = Callable[[VectorEnv[Any, Any, Any]], VectorEnv[Any, Any, Any]]
 _ROW_ATTRIBUTES = (  # a sequence in the vector env, with an item for each row
     "vehicle", "nominal", "scenario", "record", "held_speed", "slow_sensors", "motion",
     "estimator", "np_random", "np_random_seed",
@@ -101,11 +104,6 @@ class _VecEnvRow:
         """Return whether a layer has this class, or is the vector twin of it."""
         wanted = _TWINS.get(wrapper_class, wrapper_class)
         return any(isinstance(layer, wanted) for layer in self._iterate_layers())
-
-
-Observations = npt.NDArray[np.float32]
-_Indices = int | Iterable[int] | None
-_Wrapping = Callable[[VectorEnv[Any, Any, Any]], VectorEnv[Any, Any, Any]]
 
 
 class _EmptyInfo(dict[str, Any]):
@@ -280,9 +278,6 @@ def make_vec_env(
 
     Returns:
         `VecEnv` that monitors episodes.
-
-    Raises:
-        ValueError: The id has no native vector env; or as `gym.make_vec` and `EstimateObservation`.
     """
     env = make_native_env(env_id, num_envs, estimator, env_kwargs)
     bridge = NativeVecEnv(env if wrapper_class is None else wrapper_class(env))
@@ -309,7 +304,7 @@ def make_native_env(
         Vector env, wrapped if there is an estimator.
 
     Raises:
-        ValueError: As `make_vec_env`.
+        ValueError: The id has no native vector env.
     """
     entry = gym.spec(env_id).vector_entry_point
     kind = load_env_creator(entry) if isinstance(entry, str) else entry

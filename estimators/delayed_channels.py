@@ -24,6 +24,8 @@ _MAX_SEARCHED_LATENCY = 0.12  # s
 _LOOK_TIMES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)  # s from where a stretch begins
 _STEPS = (0.02, 0.01, 0.005)  # s between the latencies that are compared, ever closer
 _MIN_LOG_RATIO = 8.0  # by which the logarithm of an accepted latency's likelihood is greater
+_HISTORY_OFFSET: int = FILTER.fields["predicted"][1]  # type: ignore[index]  # where a memory's window begins, in bytes
+_INDEX_COLUMN = PACKET_WIDTH  # column behind a packet's: its place in the call
 
 
 def _align_rows(rows: Array, lags: dict[int, int]) -> Array:
@@ -125,10 +127,6 @@ class _LatencySearch:
         is_used = np.isfinite(nis)
         sensors = packets[is_used, PACKET.sensor].astype(int)
         return float(nis[is_used].sum()), int(filters[0].rows[sensors].sum()), filters
-
-
-_HISTORY_OFFSET: int = FILTER.fields["predicted"][1]  # type: ignore[index]  # where a memory's window begins, in bytes
-_INDEX_COLUMN = PACKET_WIDTH  # column behind a packet's: its place in the call
 
 
 class LateEstimator(Estimator):

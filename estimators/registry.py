@@ -15,6 +15,7 @@ from ..envs.validation import describe_unknown
 
 SUFFIX = ".py"
 _PREFIX = "sideslip_user_file_"  # of the modules that users' files become
+_Factory = Callable[..., Any]
 
 
 def is_user_file(text: str) -> bool:
@@ -120,9 +121,6 @@ def describe_error(error: BaseException) -> str:
     return text + location
 
 
-_Factory = Callable[..., Any]
-
-
 class Registry:
     """Factories of one kind of thing by name; iterates over all names.
 
@@ -177,8 +175,6 @@ class Registry:
 
         Raises:
             ValueError: The name is not registered, or there is no such file, module or name.
-            TypeError: It is not callable.
-            ModuleNotFoundError: The module needs another one that is missing.
         """
         factory = self._factories.get(name, name)
         if not isinstance(factory, str):

@@ -38,6 +38,9 @@ _FIRST_ITERATIONS = 6  # more iterations at an episode's first decision
 _MAX_SIDESLIP = 1.2  # rad of sideslip, beyond which a prediction starts from this
 STATUSES = ("unknown", "solved", "the observation is not finite", "diverged")
 UNKNOWN, SOLVED, NOT_FINITE, DIVERGED = range(len(STATUSES))
+TYRES = ("front_tyres_hat", "rear_tyres_hat")
+INVERSE_FRICTION = "inverse_friction_hat"
+_MIN_FRICTION, _MAX_FRICTION = 0.2, 1.2  # of the friction that is believed
 
 Memory = namedtuple("Memory", "slewing status")
 """Steering last added (rad) and index in `STATUSES`; the plan stands behind."""
@@ -271,11 +274,6 @@ def _read_plant_kind(env: AnyEnv, reference: int) -> tuple[StepVariant, bool, bo
     return kind, plant.lags, plant.yaw_first
 
 
-TYRES = ("front_tyres_hat", "rear_tyres_hat")
-INVERSE_FRICTION = "inverse_friction_hat"
-_MIN_FRICTION, _MAX_FRICTION = 0.2, 1.2  # of the friction that is believed
-
-
 class AdaptiveLqr(Lqr):
     """`Lqr` scheduled on the stiffness factors front_tyres_hat and rear_tyres_hat of `joint`.
 
@@ -285,9 +283,6 @@ class AdaptiveLqr(Lqr):
         env: Env of the controller, with both factors in its observation.
         grip: Grip limit, as for `Controller`.
         options: Other arguments of `Lqr`.
-
-    Raises:
-        ValueError: The tyres are not in the observation, or as `Lqr`.
     """
 
     def __init__(self, env: AnyEnv, grip: float | None = 0.7, **options: Any) -> None:

@@ -243,9 +243,6 @@ class SlidingMode(Controller):
         rate: Decay rate of s within the boundary layer (rad/s).
         layer: Half width of the boundary layer (rad/s).
         grip: Grip limit, as for `Controller`.
-
-    Raises:
-        ValueError: An option is not positive, or the observation lacks beta_hat.
     """
 
     memory = len(Memory._fields)

@@ -28,6 +28,10 @@ from .records import (
     get_true_vehicles,
 )
 
+_Observations = npt.NDArray[np.float32]
+_Mask = npt.NDArray[np.bool_]
+_Step = tuple[_Observations, Any, Any, Any, dict[str, Any]]
+
 
 def make_vector_spec(
     spec: EnvSpec | None, single: Any, kwargs: Mapping[str, Any]
@@ -60,11 +64,6 @@ def make_vector_spec(
     if isinstance(vector_kwargs.get("autoreset_mode"), AutoresetMode):
         vector_kwargs["autoreset_mode"] = vector_kwargs["autoreset_mode"].value
     return spec
-
-
-_Observations = npt.NDArray[np.float32]
-_Mask = npt.NDArray[np.bool_]
-_Step = tuple[_Observations, Any, Any, Any, dict[str, Any]]
 
 
 class EstimateObservation(

@@ -3,7 +3,8 @@
 A block has a record's fields of the same names, whose numbers are lanes, so the equations of `core`
 are compiled for it unchanged. Filter i of a batch has lane i mod LANES of block i // LANES. Its
 model stays there and is loaded anew where its speed changed; its state is loaded and stored in
-every call.
+every call. In all functions b is a block, lane an index in it, and f the record of the lane's
+filter.
 """
 
 from typing import Any
@@ -96,14 +97,6 @@ def is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Any:
 
     Lanes compute models that change by speed alone, of which every tick predicts and corrects.
     Nothing is done between samples, and nothing of the past is stored but predictions.
-
-    Args:
-        b: Block of lanes.
-        lane: Index of the lane in the block.
-        f: Record of the lane's filter.
-
-    Returns:
-        True where the lane may compute them.
     """
     if b.shaped[lane] == 0:
         is_steady = f.tyres == 0 and f.kind != KINEMATIC and f.kind != VELOCITY_ROLL
@@ -190,13 +183,7 @@ def _load_model(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 @jit
 def load_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Load a filter's model, where its speed changed, and its state into its lane.
-
-    Args:
-        b: Block of lanes.
-        lane: Index of the lane in the block.
-        f: Record of the lane's filter.
-    """
+    """Load a filter's model, where its speed changed, and its state into its lane."""
     if b.model_speed[lane] != f.model_speed:
         _load_model(b, lane, f)
     _load_states(b, lane, f)
@@ -230,13 +217,7 @@ def _load_clock(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 @jit
 def store_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store the state of a lane in its filter's record.
-
-    Args:
-        b: Block of lanes.
-        lane: Index of the lane in the block.
-        f: Record of the lane's filter.
-    """
+    """Store the state of a lane in its filter's record."""
     _store_states(b, lane, f)
     for k in range(b.inputs):
         f.u[k] = b.u[k, lane]
@@ -259,13 +240,7 @@ def _store_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 @jit
 def store_captures(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store by its record what a lane's filter captured at its last tick; before the next one.
-
-    Args:
-        b: Block of lanes.
-        lane: Index of the lane in the block.
-        f: Record of the lane's filter.
-    """
+    """Store by its record what a lane's filter captured at its last tick; before the next one."""
     _store_states(b, lane, f)
     f.road_turn, f.speed_before = b.road_turn[lane], f.model_speed
     store_due_captures(f, b.tick[lane])
@@ -275,13 +250,7 @@ def store_captures(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 @jit
 def store_prediction(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store a lane's prediction of this tick, before its fast measurements.
-
-    Args:
-        b: Block of lanes.
-        lane: Index of the lane in the block.
-        f: Record of the lane's filter.
-    """
+    """Store a lane's prediction of this tick, before its fast measurements."""
     slot = b.tick[lane] % WINDOW
     f.past_road_turn[slot] = b.road_turn[lane]
     for i in range(b.n):

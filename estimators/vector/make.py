@@ -85,14 +85,8 @@ def _compile_correct_batch() -> Any:
     """Return `_correct_batch` as a plain call."""
     integers, cube = np.zeros(1, np.int64), np.zeros((1, 1, 1))
     layers = np.zeros((1, 1), FILTER), np.zeros(1), np.zeros((1, 4), np.int64), integers
-    corrections = np.zeros((1, 1)), EXAMPLE
-    return compile_call(
-        _correct_batch,
-        *layers,
-        (cube, integers, cube, integers),
-        make_empty_outputs(1),
-        corrections,
-    )
+    record, corrections = (cube, integers, cube, integers), (np.zeros((1, 1)), EXAMPLE)
+    return compile_call(_correct_batch, *layers, record, make_empty_outputs(1), corrections)
 
 
 def build_batch(

@@ -27,6 +27,14 @@ EstimatorSource = str | EstimatorFactory | EstimatorLike
 """What `EstimateObservation` takes for its estimator: a name, a factory or an object."""
 AnyEstimator = Estimator | ForeignEstimator
 _PARAMETERS = ("estimator", "outputs", "std", "replace", "vehicle", "options", "name")
+_ALLOWED_WRAPPERS = (PassiveEnvChecker, OrderEnforcing, TimeLimit)
+# stable-baselines3's make_vec_env and rl-zoo put it directly around the environment. It only counts
+# and is known by name: this module loads nothing of theirs.
+_MONITOR = ("stable_baselines3.common.monitor", "Monitor")
+_BASE_MEMBERS = (
+    *("rows", "ticks_done", "packets", "delivered", "slow_sensors", "nominal", "layout", "dt"),
+    "annotate",
+)
 
 
 class EstimatorSpec(NamedTuple):
@@ -174,16 +182,6 @@ def _is_object(source: Any) -> bool:
     if isinstance(source, str | type):
         return False
     return not callable(source) or hasattr(source, "step") or hasattr(source, "reset")
-
-
-_ALLOWED_WRAPPERS = (PassiveEnvChecker, OrderEnforcing, TimeLimit)
-# stable-baselines3's make_vec_env and rl-zoo put it directly around the environment. It only counts
-# and is known by name: this module loads nothing of theirs.
-_MONITOR = ("stable_baselines3.common.monitor", "Monitor")
-_BASE_MEMBERS = (
-    *("rows", "ticks_done", "packets", "delivered", "slow_sensors", "nominal", "layout", "dt"),
-    "annotate",
-)
 
 
 class EstimateObservation(

@@ -128,9 +128,6 @@ class TruthObservation(
         env: Environment with a `layout`.
         parameters: Names of `Vehicle`, appended as `true_<name>` in their units.
         states: Names of `TrueState`, appended as `<name>_hat` as if by an estimator without error.
-
-    Raises:
-        ValueError: A name is unknown or stands twice.
     """
 
     def __init__(
