@@ -49,7 +49,6 @@ _NOISE = dict(
 )
 FILE = Path(__file__).with_name("tuned.toml")
 PARTS = ("filter", "controller")
-
 Options = dict[str, dict[str, Any]]
 """Options of the filter and of the controller, by `PARTS`."""
 

@@ -1,10 +1,10 @@
 """The least expected cost of a linear scenario, by Riccati's equations: what no policy can beat.
 
-The plant is linear, all noise Gaussian and the cost a sum of squares, so certainty equivalence
-holds (Joseph and Tou 1961). The cost follows from two recursions: of the cost to go, backwards from
-the episode's end, and of the estimate's covariance along the packets' arrivals. Left out are the
-cap of the cost and the motors' limit, which such scenarios make rare. Measurements are those of the
-env's record; of the driver's next angle the best guess is `keep` times the last one.
+With Gaussian noise and a quadratic cost, certainty equivalence holds (Joseph and Tou 1961). The
+cost follows from the cost to go, backwards from the episode's end, and from the estimate's
+covariance along the packets' arrivals. The cap of the cost and the motors' limit, which such
+scenarios make rare, are left out. The best guess of the driver's next angle is `keep` times the
+last one.
 """
 
 from dataclasses import dataclass

@@ -167,8 +167,7 @@ _PANELS: tuple[tuple[tuple[tuple[str, str, dict[str, Any]], ...], str, float], .
 class Rollout:
     """An episode: row 0 is the reset, row k the state after the k-th step.
 
-    A column is a number of `info`, of the true motion or of the observation (`obs_...`), the action
-    that led to the row, or its reward.
+    Columns are `info`, true motion, observation (`obs_...`), action before the row, and reward.
     """
 
     columns: dict[str, npt.NDArray[np.float64]]  # a value for each row

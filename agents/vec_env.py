@@ -128,14 +128,15 @@ class NativeVecEnv(VecEnv):
     """stable-baselines3's `VecEnv` over a `StabilityVectorEnv`, wrapped or bare.
 
     It equals stable-baselines3's `DummyVecEnv` around single environments with the same seeds, bit
-    for bit, but for one thing: where no episode ends, `infos` holds one empty dict that all rows
-    share (`EMPTY_INFO`; it refuses to be written into, `infos` itself is a fresh list). Where one
-    ends, its row has the whole info of the last step, `terminal_observation` and
-    `TimeLimit.truncated`. `reset_infos` are those of each row's newest reset.
+    for bit, but for `infos`: where no episode ends it holds one empty dict that all rows share
+    (`EMPTY_INFO`, which refuses to be written into). Where one ends, its row has the whole info of
+    the last step, `terminal_observation` and `TimeLimit.truncated`. `reset_infos` are those of each
+    row's newest reset.
 
     `get_attr` reads what a single env has of each row; `set_attr` stores values beside the env;
-    `env_method` calls `reset` and the methods of wrapped attributes. `indices` are rows, None for
-    all. `set_options` takes the options of a single env's `reset`, for all rows or a list of them.
+    `env_method` calls a row's `reset` and its methods of wrapped attributes, with `method_args` and
+    `method_kwargs`. `indices` are rows, None for all. `set_options` takes the options of a single
+    env's `reset`, for all rows or a list of them.
 
     Args:
         vector_env: Vector env with autoreset in the same step; `make_vec_env` builds one.

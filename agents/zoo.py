@@ -67,8 +67,7 @@ def describe(
 def write_evaluation(folder: Path, env_id: str, model: Any, costs: Array, lengths: Array) -> None:
     """Write an evaluation's model, costs and lengths, where the folder is the zoo's.
 
-    Later evaluations in the file, of a training that was stopped before its checkpoint, are
-    removed.
+    Later evaluations in the file, of a training stopped before its checkpoint, are removed.
 
     Args:
         folder: Folder of the training.

@@ -30,10 +30,9 @@ NO_NIS = np.zeros(0)
 
 
 def compile_call(function: Any, *example_args: Any) -> Any:
-    """Return the compiled call of a function for arguments of the example's types.
+    """Return the compiled call of a function for arguments of the example's types and layouts.
 
-    numba finds out the types of the arguments at every call, which costs more than a filter's step.
-    This is the call without it, so arguments must have exactly these types and layouts.
+    numba finds out the types at every other call, which costs more than a filter's step.
 
     Args:
         function: A jitted function; any other is returned as it is.
@@ -139,9 +138,7 @@ class Estimator:
         return tuple(FAST._fields[column] for column in sorted(columns))
 
     def check(self, filters: FilterRecords) -> None:
-        """Check that the filter converges, and warn of what it cannot see.
-
-        A ValueError says that the estimation error diverges.
+        """Check that the filter converges, ValueError if not, and warn of what it cannot see.
 
         Args:
             filters: Its memory, or that of the same filter with its first slow sensor alone.

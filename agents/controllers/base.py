@@ -26,9 +26,9 @@ class Controller(ABC):
 
     A subclass names its inputs (`needs`, entries of the env's layout) and how many numbers it
     remembers (`memory`), and fills `_law`. `predict` is pure: all memory is in `state`, an array
-    (N, memory).
+    (N, memory). A controller serves a single env or all rows of a vector env, which then share its
+    design.
 
-    A controller serves a single env or all rows of a vector env, which then share its design.
     Where a needed entry is not finite the action is NaN and the memory stays as it was, which makes
     a failed estimator visible: an env with `on_bad_action="fail"` ends the episode, others raise.
 
@@ -43,8 +43,8 @@ class Controller(ABC):
         memory: Numbers of memory for each row.
 
     Raises:
-        ValueError: The observation lacks a needed entry, `grip` is not positive, or the rows of a
-            vector env have different nominal cars.
+        ValueError: A needed entry is missing, `grip` is not positive, or rows have different
+            nominals.
     """
 
     needs: tuple[str, ...] = ()

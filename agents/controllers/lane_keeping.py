@@ -1,7 +1,6 @@
 """Lane keeping on curved roads: motion and position together, by front steering and yaw moment.
 
-The aim of uneven-delay: a vision filter's sideslip angle, yaw rate, heading and lateral position
-serve one controller of all four.
+Uneven-delay's aim: sideslip angle, yaw rate, heading and offset of one vision filter serve it.
 """
 
 import math

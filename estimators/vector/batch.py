@@ -245,8 +245,6 @@ def _parse_counts(label: str, value: npt.ArrayLike | None, N: int, max_count: in
 class ForeignBatch(BatchEstimator):
     """N estimators of one factory, each an object of its row; none of them compiled.
 
-    ValueError says that they have different states.
-
     Args:
         first: Estimator of row 0.
         specs: Vehicle, sensors and speed of each estimator, N of them.

@@ -1,7 +1,4 @@
-"""The batch's part of an observation, compiled: every filter's ticks, in lanes or alone.
-
-The tables of gains of all filters lie in one flat array, the pool, since their shapes differ.
-"""
+"""The batch's part of an observation, compiled: every filter's ticks, in lanes or alone."""
 
 from functools import cache
 from typing import Any

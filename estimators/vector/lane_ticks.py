@@ -52,7 +52,7 @@ def get_gains(pool: Any, place: Any) -> Any:
 
 
 class GainPool:
-    """Estimators of the package by the design of their specs, and the pool of their gains.
+    """Estimators by the design of their specs, and their gains in one flat array, the pool.
 
     Args:
         build: Function that builds one estimator from its spec.
