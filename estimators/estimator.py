@@ -30,7 +30,7 @@ NO_NIS = np.zeros(0)
 
 
 def compile_call(function: Any, *example_args: Any) -> Any:
-    """Return the compiled call of a function for arguments of the example's types and layouts.
+    """Return a function compiled for exactly the types and layouts of the example's arguments.
 
     numba finds out the types at every other call, which costs more than a filter's step.
 

@@ -51,9 +51,8 @@ def make_estimator(
         The estimator; what a factory builds comes as a `ForeignEstimator`.
 
     Raises:
-        ValueError: Unknown name, a sensor that is absent, a Q or noise that is no covariance, a
-            schedule that does not repeat, a sensor that can be later than the filter's window,
-            options that exclude each other, a filter that diverges.
+        ValueError: Unknown name, absent sensor, Q or noise that is no covariance, schedule without
+            repetition, sensor later than the filter's window, options at odds, divergence.
     """
     available, label = dict(sensors or {}), get_label(name)
     if not dt > 0.0:

@@ -163,8 +163,7 @@ class Registry:
     def load(self, name: str, others: Iterable[str] = ()) -> _Factory:
         """Load the factory of a name or an entry point.
 
-        A user's file is run once a process, as long as its content stays; it may import its
-        neighbours.
+        A user's file is run once a process while its content stays; it may import its neighbours.
 
         Args:
             name: Registered name, "package.module:Name" or "FILE.py:Name".

@@ -34,9 +34,8 @@ class Controller(ABC):
 
     Args:
         env: Env whose nominal car and layout the controller is designed for.
-        grip: Fraction, for the yaw moment, of the force that friction lets the rear tyres transmit;
-            the rest is left for lateral force. None: the motors limit the moment alone. The
-            friction is the observation's `true_friction`, or else the nominal car's.
+        grip: Fraction of the rear tyres' friction force for the yaw moment; the rest is for lateral
+            force. None: no such limit. Friction is `true_friction`, else the nominal car's.
 
     Attributes:
         needs: Entries of the observation that the controller reads.

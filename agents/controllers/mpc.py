@@ -140,10 +140,8 @@ class Mpc(Lqr):
 
     def _get_program(self, speed: float) -> _QuadraticProgram:
         """Get the quadratic program of the nearest speed of `SPEEDS`."""
-        nearest = _find_nearest_speed(speed)
-        return _condense_program(
-            self.nominal, nearest, self.prediction, self.horizon, self.authority
-        )
+        car, nearest = self.nominal, _find_nearest_speed(speed)
+        return _condense_program(car, nearest, self.prediction, self.horizon, self.authority)
 
     def _mark_not_finite(self, rows: Any, state: Array) -> None:
         for i in np.flatnonzero(rows):

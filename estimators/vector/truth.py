@@ -36,8 +36,7 @@ class TruthObservation(
 
     Raises:
         TypeError: The env has no layout or no vehicles.
-        ValueError: A name is unknown or stands twice, or states are wanted with a reset within the
-            step that ends an episode, when the last ones are gone.
+        ValueError: A name is unknown or stands twice, or rows with states reset in the same step.
     """
 
     def __init__(

@@ -214,9 +214,8 @@ class EstimateObservation(
 
     Args:
         env: Environment, or wrappers that may be inside.
-        estimator: Name of `make_estimator`, entry point "package.module:Name", `EstimatorFactory`
-            or `EstimatorLike` object, which is reset at every episode but hears of no other car.
-            None for `choose_estimator` of the env's sensors.
+        estimator: Name of `make_estimator`, entry point "package.module:Name", factory, or object,
+            which hears of no other car. None for `choose_estimator` of the env's sensors.
         outputs: States to append, each as `<state>_hat`.
         std: Whether each one's standard deviation is appended as `<state>_std`.
         replace: Whether the observation is these alone.
