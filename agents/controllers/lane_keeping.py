@@ -141,7 +141,7 @@ class LaneKeeping(Controller):
         env: Env of the controller, whose action steers.
         moment: Whether to use the yaw moment beside the steering.
         curvature_time: Time constant of the curvature's filter (s).
-        haste: Weight of the steering command's lead, as for `_make_lane_model`.
+        haste: Weight of the steering command's lead over the applied angle.
 
     Raises:
         ValueError: The action does not steer, an entry is missing, or an option is out of range.
