@@ -96,10 +96,9 @@ def make_agent(
     """Make an agent for an env, single or vector; controllers are designed for its nominal vehicle.
 
     Args:
-        name: Name in `AGENTS`, shipped policy, path `.../NAME.safetensors`, zip of a
-            stable-baselines3 model trained on this env (`.../NAME.zip`), entry point
-            "package.module:Name" or class "FILE.py:Name"; a factory, called with the env and the
-            options; or an `Agent`, which is returned.
+        name: Name in `AGENTS`, shipped policy, `.../NAME.safetensors`, `.../NAME.zip` of a
+            stable-baselines3 model trained on this env, "package.module:Name", "FILE.py:Name"; a
+            factory, called with the env and the options; or an `Agent`, which is returned.
         env: Env of this package.
         trust: Whether a zip may be read, which can run code of its author.
         options: Arguments of the controller, or of `agents.training.export.policy_from_zip`.
@@ -145,10 +144,8 @@ def register_agent(name: str, factory: Callable[..., Agent] | str) -> None:
     """Give a user's agent a name that works wherever an agent's name does.
 
     Args:
-        name: New name, known in this process alone; worker processes and the command line take the
-            entry point itself.
-        factory: Called with the env and options, as the classes of `AGENTS` are; or
-            "package.module:Name", which is imported at its first use.
+        name: New name, in this process alone; workers and the command line take the entry point.
+        factory: Called with env and options; or "package.module:Name", imported at its first use.
 
     Raises:
         TypeError: The name or the factory has a wrong type.

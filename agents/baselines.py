@@ -1,13 +1,9 @@
-"""The oracles: reference controllers that know more and more of the truth.
+"""Oracles, controllers that know more and more of the truth, and the tuned options of entries.
 
-Every entry is scored between `nominal`, a well-designed LQG that knows the nominal car alone,
-and the better of the two that know state, disturbances and car: "Cost and score" of
-docs/ARCHITECTURE.md.
-
-Tuned options of the entries, by the class of tasks that they drive: `tuned.toml`.
-
-`sideslip tune controller` finds them. A class is a car with its disturbances and its reference,
-such as "coms-model" or "car-steering".
+An entry is scored between `nominal`, a well-designed LQG that knows the nominal car alone, and the
+better of the two that know state, disturbances and car: "Cost and score" of docs/ARCHITECTURE.md.
+`sideslip tune controller` finds the options of `tuned.toml`, by the class of tasks: a car with its
+disturbances and its reference, such as "coms-model" or "car-steering".
 """
 
 import math
@@ -39,19 +35,22 @@ ORACLES = (NOMINAL, *PARAMETER_ORACLES, *STATE_ORACLES)
 
 FILTER = "exact-kf"
 TYRE_FILTER = "joint"
-TYRE_FILTER_OPTIONS = dict.fromkeys(("front_tyres_sd", "rear_tyres_sd", "inverse_friction_sd"), 0.1)
+_TYRE_FILTER_OPTIONS = dict.fromkeys(
+    ("front_tyres_sd", "rear_tyres_sd", "inverse_friction_sd"), 0.1
+)
 """Options of the filter for tyres with a limit: it knows them to a tenth, for its tyre law differs
 from the plant's. To a thousandth it is overconfident, and costs 1.1 to 4 times as much."""
 OUTPUTS = ("beta", "gamma", "F_d", "N_d")
 STATES = (*OUTPUTS, "phi", "phi_rate")
 GRIP = 0.7  # fraction of the rear tyres' grip for the yaw moment; 0.71 of it is left across
 STEER_WEIGHT = 100.0  # of added steering, which `lqr`'s design does not know the rate limit of
-_NOISE = {
-    "gyro": "gyro_noise",
-    "accel": "accel_y_noise",
-    "camera_psi": "psi_noise",
-    "camera_y": "y_l_noise",
-}
+_NOISE = dict(
+    gyro="gyro_noise", accel="accel_y_noise", camera_psi="psi_noise", camera_y="y_l_noise"
+)
+FILE = Path(__file__).with_name("tuned.toml")
+PARTS = ("filter", "controller")
+Options = dict[str, dict[str, Any]]
+"""Options of the filter and of the controller, by `PARTS`."""
 
 
 def make_noise_options(scenario: Scenario) -> dict[str, Any]:
@@ -66,8 +65,7 @@ def make_noise_options(scenario: Scenario) -> dict[str, Any]:
     Returns:
         Options by name.
     """
-    noise = dict(scenario.noise)
-    share = HDOP_LAWS[scenario.hdop_law]
+    noise, share = scenario.noise, HDOP_LAWS[scenario.hdop_law]
     options = {
         "force_sd": scenario.disturbance_force,
         "moment_sd": scenario.disturbance_moment,
@@ -77,24 +75,9 @@ def make_noise_options(scenario: Scenario) -> dict[str, Any]:
     if scenario.roll:
         options["fast"] = ["gyro", "accel_y"]
         options["accel_bias_sd"] = compute_range_rms(scenario, "accel_y_bias")
-    options |= {
-        "bias_sd": compute_range_rms(scenario, "gyro_bias"),
-        "bank_sd": compute_range_rms(scenario, "bank"),
-    }
+    options["bias_sd"] = compute_range_rms(scenario, "gyro_bias")
+    options["bank_sd"] = compute_range_rms(scenario, "bank")
     return options | {option: noise[key] for key, option in _NOISE.items() if key in noise}
-
-
-def remove_biases(scenario: Scenario) -> Scenario:
-    """Remove the sensors' biases from a scenario, for a filter that knows and subtracts them.
-
-    Args:
-        scenario: Scenario with biases.
-
-    Returns:
-        Scenario without them.
-    """
-    noise = {key: value for key, value in scenario.noise.items() if not key.endswith("_bias")}
-    return scenario.replace(noise=noise, gyro_bias=0.0, accel_y_bias=0.0)
 
 
 def compute_range_rms(scenario: Scenario, name: str) -> float:
@@ -144,7 +127,10 @@ def make_oracle(
         raise TypeError(f"options of a rung are 'filter' and 'controller', got {sorted(chosen)}")
     single_env: Any = gym.make(env_id, **env_kwargs)
     if name in PARAMETER_ORACLES:
-        unbiased = remove_biases(single_env.unwrapped.scenario)
+        # as for a filter that knows and subtracts the biases
+        scenario: Scenario = single_env.unwrapped.scenario
+        noise = {key: sd for key, sd in scenario.noise.items() if not key.endswith("_bias")}
+        unbiased = scenario.replace(noise=noise, gyro_bias=0.0, accel_y_bias=0.0)
         env_kwargs |= {"scenario": unbiased.to_dict()}
         single_env = gym.make(env_id, **env_kwargs)
     base: Any = single_env.unwrapped
@@ -163,10 +149,8 @@ def make_oracle(
     if not plans:  # a plan foresees the steering's rate
         settings["steer_weight"] = STEER_WEIGHT
     if name != NOMINAL:
-        settings |= {
-            "vehicle": base.vehicle,
-            "stiffness": [f"true_{stiffness}" for stiffness in STIFFNESSES],
-        }
+        settings["vehicle"] = base.vehicle
+        settings["stiffness"] = [f"true_{stiffness}" for stiffness in STIFFNESSES]
     controller_class = Nmpc if plans else Lqr
     return env, controller_class(env, **settings | dict(chosen["controller"]))
 
@@ -178,7 +162,7 @@ def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, An
         del levels["hdop_table"]
     has_tyre_filter = knows_tyres and base.scenario.tyres == "fiala"
     if has_tyre_filter:
-        levels |= TYRE_FILTER_OPTIONS
+        levels |= _TYRE_FILTER_OPTIONS
     wrapper = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation
     return wrapper(
         env,
@@ -188,13 +172,6 @@ def _add_filter(env: Any, base: Any, knows_tyres: bool, options: Mapping[str, An
         vehicle=TRUTH if knows_tyres else None,
         options=levels | dict(options),
     )
-
-
-FILE = Path(__file__).with_name("tuned.toml")
-PARTS = ("filter", "controller")
-
-Options = dict[str, dict[str, Any]]
-"""Options of the filter and of the controller, by `PARTS`."""
 
 
 @cache

@@ -37,38 +37,25 @@ _CHANGES = {"reset", "step", "step_async", "step_wait", "observation", "observat
 
 @dataclass(frozen=True)
 class EnvFacts:
-    """The facts that controllers are designed from, the same for all rows of a vector env.
+    """The facts that controllers are designed from, the same for all rows of a vector env."""
 
-    Attributes:
-        layout: Entries of an observation.
-        nominal: Vehicle as controllers know it.
-        full_scale: Yaw moment at an action of 1 (N m).
-        authority: Added steering angle at an action of 1 (rad).
-        control_period: Ticks between two decisions.
-        reference: Name in `envs.task.REFERENCES`.
-        width: Number of entries of an action.
-    """
-
-    layout: tuple[ObservationEntry, ...]
-    nominal: Vehicle
-    full_scale: float
-    authority: float
-    control_period: int
-    reference: str
-    width: int
+    layout: tuple[ObservationEntry, ...]  # of an observation
+    nominal: Vehicle  # as controllers know it
+    full_scale: float  # yaw moment at an action of 1 (N m)
+    authority: float  # added steering angle at an action of 1 (rad)
+    control_period: int  # ticks between two decisions
+    reference: str  # name in `envs.task.REFERENCES`
+    width: int  # number of entries of an action
 
 
 class PlantKind(NamedTuple):
     """The variant of a plant, for the prediction of nonlinear MPC."""
 
-    tyres: str
-    """The tyre law, of `TYRE_LAWS`."""
+    tyres: str  # the tyre law, of `TYRE_LAWS`
     small_angle: bool
     roll: bool
-    lags: bool
-    """Whether the actuators lag."""
-    yaw_first: bool
-    """Whether the yaw moment comes before the drive torque."""
+    lags: bool  # whether the actuators lag
+    yaw_first: bool  # whether the yaw moment comes before the drive torque
 
 
 @dataclass(frozen=True)
@@ -77,18 +64,11 @@ class EnvView:
 
     `make_agent`, `get_env_facts` and the controllers accept it as an env. It has no `reset`, no
     `step` and no seed: an agent built from it learns of the true car by observations alone.
-
-    Attributes:
-        num_envs: Number of rows, one car each.
-        facts: Observation layout, nominal car and limits of the actuators.
-        plants: Kinds of plant among the rows.
-        single_observation_space: Observation space of one row.
-        single_action_space: Action space of one row.
     """
 
-    num_envs: int
-    facts: "EnvFacts"
-    plants: frozenset[PlantKind]
+    num_envs: int  # rows, one car each
+    facts: EnvFacts
+    plants: frozenset[PlantKind]  # among the rows
     single_observation_space: gym.Space[Any]
     single_action_space: gym.Space[Any]
 
@@ -179,29 +159,19 @@ def _collect_facts(env: Any) -> EnvFacts:
     vehicles: Sequence[Any]
     if isinstance(env, EnvView):
         return env.facts
+    base: Any = env.unwrapped
     if isinstance(env, gym.Env):
-        base: Any = env.unwrapped
         layout, width = env.get_wrapper_attr("layout"), base.action_space.shape[0]
         _check_wrappers(env, layout)
         nominals, vehicles = [base.nominal], [base.vehicle]
-        period, kind = base.control_period, base.reference
     elif isinstance(env, VectorEnv):
-        base = env.unwrapped
         layout, width = get_layout(env), base.single_action_space.shape[0]
         nominals, vehicles = _get_row_values(base, "nominal"), _get_row_values(base, "vehicle")
-        period, kind = (
-            _get_common_value(base, "control_period"),
-            _get_common_value(base, "reference"),
-        )
     else:
-        base = env.unwrapped
         layout, width = _get_common_value(base, "layout"), base.action_space.shape[0]
         _check_wrappers(env, layout)
         nominals, vehicles = base.get_attr("nominal"), base.get_attr("vehicle")
-        period, kind = (
-            _get_common_value(base, "control_period"),
-            _get_common_value(base, "reference"),
-        )
+    period, kind = (_get_common_value(base, name) for name in ("control_period", "reference"))
     limits = [(car.yaw_moment_limit, car.steering_authority) for car in vehicles]
     for i, car in enumerate(zip(nominals, limits, strict=True)):
         if car != (nominals[0], limits[0]):
@@ -225,8 +195,7 @@ def list_plant_kinds(env: AnyEnv | EnvView) -> frozenset[PlantKind]:
         return env.plants
     scenarios = ((config.scenario, config.yaw_first) for config in list_configs(env))
     return frozenset(
-        PlantKind(scenario.tyres, scenario.small_angle, scenario.roll, scenario.lags, yaw_first)
-        for scenario, yaw_first in scenarios
+        PlantKind(x.tyres, x.small_angle, x.roll, x.lags, yaw_first) for x, yaw_first in scenarios
     )
 
 
@@ -244,7 +213,7 @@ def list_configs(env: AnyEnv) -> Sequence[EnvConfig]:
 
 
 def _iterate_wrappers(env: Any) -> Iterator[Any]:
-    """The wrappers from the outermost in, and those of sub-environments in this process."""
+    """Iterate over the wrappers from the outermost in, and those of sub-environments."""
     inner = vars(env)
     if isinstance(env, gym.Wrapper | VectorWrapper) or "venv" in inner:
         yield env
@@ -260,10 +229,8 @@ def _is_transparent(wrapper: Any) -> bool:
     for base_class in type(wrapper).__mro__:
         if "transparent" in vars(base_class):
             return vars(base_class)["transparent"] is True
-        if (
-            base_class.__name__
-            in _TRANSPARENT.get(base_class.__module__.partition(".")[0], "").split()
-        ):
+        package = base_class.__module__.partition(".")[0]
+        if base_class.__name__ in _TRANSPARENT.get(package, "").split():
             return not getattr(wrapper, "norm_obs", False)  # of VecNormalize
         if not _CHANGES.isdisjoint(vars(base_class)):
             return False
@@ -271,16 +238,13 @@ def _is_transparent(wrapper: Any) -> bool:
 
 
 def _check_wrappers(env: Any, layout: tuple[ObservationEntry, ...]) -> None:
-    """ValueError for a wrapper that is not known to be transparent, with its name."""
-    wrong = [
-        type(wrapper).__name__ for wrapper in _iterate_wrappers(env) if not _is_transparent(wrapper)
-    ]
+    """Raise ValueError, with its name, for a wrapper that is not known to be transparent."""
+    wrong = [type(layer).__name__ for layer in _iterate_wrappers(env) if not _is_transparent(layer)]
     base = env.unwrapped
     if {"layout", "envs", "vector_env"}.isdisjoint(dir(base)):  # elsewhere: spaces show wrappers
         single = "single_" if isinstance(env, VectorEnv) else ""
-        observed, acted_on = (
-            getattr(base, f"{single}{role}_space") for role in ("observation", "action")
-        )
+        observed = getattr(base, f"{single}observation_space")
+        acted_on = getattr(base, f"{single}action_space")
         if observed != make_space(layout) or acted_on != gym.spaces.Box(
             -1.0, 1.0, acted_on.shape, np.float32
         ):
@@ -301,9 +265,6 @@ def get_layout(env: VectorEnv[Any, Any, Any]) -> tuple[ObservationEntry, ...]:
 
     Returns:
         Entries of the observation, in order.
-
-    Raises:
-        ValueError: `get_env_facts` refuses a wrapper, or the rows have different layouts.
     """
     layer: Any = env
     while "layout" not in vars(layer) and isinstance(layer, VectorWrapper):
@@ -314,12 +275,12 @@ def get_layout(env: VectorEnv[Any, Any, Any]) -> tuple[ObservationEntry, ...]:
 
 
 def _get_row_values(base: Any, name: str) -> Sequence[Any]:
-    """An attribute of each row: the vector env's own sequence, or its sub-environments'."""
+    """Return an attribute of each row: the vector env's own sequence, or its sub-environments'."""
     return list(getattr(base, name) if hasattr(base, name) else base.get_attr(name))
 
 
 def _get_common_value(base: Any, name: str) -> Any:
-    """An attribute that all rows share; ValueError where they do not."""
+    """Return an attribute that all rows share; ValueError where they do not."""
     if hasattr(base, name):
         return getattr(base, name)
     rows = base.get_attr(name)

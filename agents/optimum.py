@@ -1,14 +1,10 @@
 """The least expected cost of a linear scenario, by Riccati's equations: what no policy can beat.
 
-Where the plant is linear, all noise Gaussian and the cost a sum of squares, the best policy answers
-the best estimate as it would answer the state (certainty equivalence: Joseph and Tou 1961), and its
-cost follows from two recursions: that of the cost to go, backwards from the episode's end, and that
-of the estimate's covariance along the arrivals of the slow sensors' packets. What is left out are
-the cap of the cost and the limit of the motors, which the scenario makes rare.
-
-The information is that of the env's record, and of its observation with `fast="all"`: the gyro of
-every tick, packets with their stamps, the torques and the driver's angle that acted. The driver's
-next angle is none of it, except that of the start: the best guess is `keep` times the last one.
+With Gaussian noise and a quadratic cost, certainty equivalence holds (Joseph and Tou 1961). The
+cost follows from the cost to go, backwards from the episode's end, and from the estimate's
+covariance along the packets' arrivals. The cap of the cost and the motors' limit, which such
+scenarios make rare, are left out. The best guess of the driver's next angle is `keep` times the
+last one.
 """
 
 from dataclasses import dataclass
@@ -55,21 +51,13 @@ _MIN_NOISE = {"accel": 1e4, "wheel": 100.0, "gps_speed": 100.0, "gps_position": 
 
 @dataclass(frozen=True)
 class LinearPlant:
-    """A linear scenario at the decisions: x+ = G x + H u + w, with w of covariance W.
+    """A linear scenario at the decisions: x+ = G x + H u + w, with w of covariance W."""
 
-    Attributes:
-        model: Design model in which the driver's angle decays.
-        W: Covariance of w, shape (n, n).
-        rest: Cost of the noise within a period, under every policy.
-        start: Covariance of x at the start, shape (n, n).
-        steps: Control periods of an episode.
-    """
-
-    model: DesignModel
-    W: Array
-    rest: float
-    start: Array
-    steps: int
+    model: DesignModel  # with a driver's angle that decays
+    W: Array  # (n, n)
+    rest: float  # cost of the noise within a period, under every policy
+    start: Array  # covariance of x at the start, (n, n)
+    steps: int  # control periods of an episode
 
     @property
     def driver(self) -> int:
@@ -139,18 +127,8 @@ class Optimum:
         return np.asarray(wrong**2 @ self.weights)
 
 
-def make_linear_plant(env: AnyEnv) -> LinearPlant:
-    """Make the linear plant of an env.
-
-    Args:
-        env: Env, single or vector.
-
-    Returns:
-        Plant in steps of the control period.
-
-    Raises:
-        ValueError: The scenario is not linear.
-    """
+def _make_linear_plant(env: AnyEnv) -> LinearPlant:
+    """Make the linear plant of an env; ValueError where its scenario is not linear."""
     config = list_configs(env)[0]
     scenario, n = config.scenario, int(config.control_period)
     _check(config)
@@ -163,26 +141,22 @@ def make_linear_plant(env: AnyEnv) -> LinearPlant:
     G1, _, C, _ = make_tick_model(car, speed, design_spec)
     names, weights = design_spec.states, TICK * np.diag(compute_cost_weights(design_spec))
     sd = np.zeros(len(names))
-    sd[[names.index("F_d"), names.index("N_d")]] = (
-        scenario.disturbance_force,
-        scenario.disturbance_moment,
-    )
+    sd[names.index("F_d")] = scenario.disturbance_force
+    sd[names.index("N_d")] = scenario.disturbance_moment
     process_noise = np.diag(sd**2 * (1.0 - np.diag(G1) ** 2))
     W, rest = np.zeros_like(G1), 0.0
     for _ in range(n):
         rest += float(np.trace(weights @ C @ W @ C.T))
         W = G1 @ W @ G1.T + process_noise
     driver = names.index("driver")
-    amplitude, frequency, hold = (
-        scenario.range(name)[0] for name in ("amplitude", "frequency", "hold")
-    )
-    decay, angle_noise = as_python(compute_wander_gains)(amplitude, frequency, hold)
-    model.G[driver, driver], W[driver, driver], sd[driver] = decay, angle_noise**2, amplitude
+    wander = [scenario.range(name)[0] for name in ("amplitude", "frequency", "hold")]
+    decay, angle_noise = as_python(compute_wander_gains)(*wander)
+    model.G[driver, driver], W[driver, driver], sd[driver] = decay, angle_noise**2, wander[0]
     return LinearPlant(model, W, rest, np.diag(sd**2), round(scenario.duration / (n * TICK)))
 
 
 def _check(config: EnvConfig) -> None:
-    """ValueError, naming what, where no optimum is known."""
+    """Raise ValueError, naming what, where no optimum is known."""
     scenario, base, period = config.scenario, config.base, int(config.control_period) * TICK
     values = {key: getattr(scenario, key) for key in _REQUIRED}
     wrong = [f"{key} {value!r}" for key, value in values.items() if value != _REQUIRED[key]]
@@ -207,15 +181,8 @@ def _check(config: EnvConfig) -> None:
         raise ValueError(f"scenario {scenario.name!r} has no known optimum: {', '.join(wrong)}")
 
 
-def make_true_options(env: AnyEnv) -> dict[str, Any]:
-    """Make options of `exact-kf` with the true noise, disturbances and start of an episode.
-
-    Args:
-        env: Env, single or vector.
-
-    Returns:
-        Options by name.
-    """
+def _make_true_options(env: AnyEnv) -> dict[str, Any]:
+    """Make options of `exact-kf` with the true noise, disturbances and start of an episode."""
     config = list_configs(env)[0]
     start = dict.fromkeys(select_states(tuple(config.slow)), 0.0)
     options = make_noise_options(config.scenario) | {"slow": list(config.slow), "prior": start}
@@ -230,16 +197,12 @@ def compute_optimum(env: gym.Env[Any, Any], schedules: int = 1) -> Optimum:
 
     Args:
         env: Single env.
-        schedules: Number of seeds from 0 whose arrivals are averaged; one is enough where nothing
-            is lost or late by chance.
+        schedules: Number of seeds from 0 whose arrivals are averaged; 1 where none are random.
 
     Returns:
         Optimum with its gains and the errors of each schedule.
-
-    Raises:
-        ValueError: As `make_linear_plant`.
     """
-    plant = make_linear_plant(env)
+    plant = _make_linear_plant(env)
     gains, weights, cost = _solve_regulator(plant)
     errors = np.array([_compute_error_covariances(env, plant, seed) for seed in range(schedules)])
     blind = np.einsum("j,ji,kjil,jl->", weights, gains, errors, gains) / schedules
@@ -247,7 +210,7 @@ def compute_optimum(env: gym.Env[Any, Any], schedules: int = 1) -> Optimum:
 
 
 def _solve_regulator(plant: LinearPlant) -> tuple[Array, Array, float]:
-    """K_j (steps, n), S_j (steps,), and the expected cost of an episode whose state is known."""
+    """Compute K_j (steps, n), S_j (steps,) and the cost of an episode whose state is known."""
     model, n = plant.model, len(plant.model.G)
     G, H, V = model.G, model.H, np.zeros((n, n))
     gains, weights, cost = np.empty((plant.steps, n)), np.empty(plant.steps), 0.0
@@ -262,11 +225,11 @@ def _solve_regulator(plant: LinearPlant) -> tuple[Array, Array, float]:
 
 
 def _compute_error_covariances(env: gym.Env[Any, Any], plant: LinearPlant, seed: int) -> Array:
-    """Covariance of the best estimate at every decision of a seed's episode, (steps, n, n)."""
+    """Compute the best estimate's covariance at the decisions of a seed, (steps, n, n)."""
     env.reset(seed=seed)
     base: Any = env.unwrapped
     facts = {"vehicle": base.nominal, "sensors": base.slow_sensors, "speed": base.held_speed}
-    filter_ = make_estimator(FILTER, **facts, **make_true_options(env))
+    filter_ = make_estimator(FILTER, **facts, **_make_true_options(env))
     names = plant.model.design_spec.states
     state_indices = [names.index(name) for name in OUTPUTS]
     filter_indices = [filter_.names.index(name) for name in OUTPUTS]
@@ -275,9 +238,8 @@ def _compute_error_covariances(env: gym.Env[Any, Any], plant: LinearPlant, seed:
     for j in range(plant.steps):
         record = base.record
         filter_.step(record.fast, record.packets.reshape(-1, PACKET_WIDTH))
-        covariances[j][np.ix_(state_indices, state_indices)] = filter_.P[
-            np.ix_(filter_indices, filter_indices)
-        ]
+        P = filter_.P[np.ix_(filter_indices, filter_indices)]
+        covariances[j][np.ix_(state_indices, state_indices)] = P
         if j > 0:
             covariances[j, plant.driver, plant.driver] = plant.W[plant.driver, plant.driver]
         env.step(idle)
@@ -285,7 +247,7 @@ def _compute_error_covariances(env: gym.Env[Any, Any], plant: LinearPlant, seed:
 
 
 def _select_gains(plant: LinearPlant, gains: Array) -> Array:
-    """Gains (..., n) of the state as those (..., 5) of what `Lqg` reads."""
+    """Select, from gains (..., n) of the state, those (..., 5) of what `Lqg` reads."""
     names = plant.model.design_spec.states
     selected = gains[..., [names.index(name) for name in (*OUTPUTS, "driver")]]
     selected[..., -1] *= plant.decay
@@ -307,7 +269,7 @@ class Lqg(Controller):
 
     def __init__(self, env: AnyEnv, gains: Array | None = None) -> None:
         super().__init__(env)
-        plant = make_linear_plant(env)
+        plant = _make_linear_plant(env)
         self.gains = _solve_regulator(plant)[0][0] if gains is None else gains
         self._answer = _select_gains(plant, self.gains)
 
@@ -325,4 +287,4 @@ def wrap_optimal_estimate(env: Any) -> Any:
         Wrapped env.
     """
     wrapper: Any = EstimateObservation if isinstance(env, gym.Env) else vector.EstimateObservation
-    return wrapper(env, FILTER, outputs=OUTPUTS, std=False, options=make_true_options(env))
+    return wrapper(env, FILTER, outputs=OUTPUTS, std=False, options=_make_true_options(env))

@@ -14,7 +14,7 @@ from gymnasium.vector import VectorEnv
 
 from ..envs.io import atomic_file
 from ..envs.numerics import require_extra
-from ..envs.record import Log, Record, concatenate
+from ..envs.record import Log, concatenate
 from ..envs.validation import short_repr
 
 if TYPE_CHECKING:
@@ -28,24 +28,15 @@ class EpisodeStep(NamedTuple):
     """The outcome of an env-step as the env returns it; of a vector env, one row for each car.
 
     The first one is the reset, whose action and reward are zero.
-
-    Attributes:
-        obs: Observation, shape (k,) or (N, k).
-        info: Info of the env.
-        action: Action before this outcome, shape (width,) or (N, width).
-        reward: Reward, of the row or shape (N,).
-        terminated: Whether the episode ended by itself.
-        truncated: Whether the episode reached its time limit.
-        running: Rows that are in their first episode, shape (N,); a vector env restarts others.
     """
 
-    obs: Any
+    obs: Any  # (k,) or (N, k)
     info: dict[str, Any]
-    action: Any
-    reward: Any
-    terminated: Any
-    truncated: Any
-    running: npt.NDArray[np.bool_]
+    action: Any  # before this outcome, (width,) or (N, width)
+    reward: Any  # of the row or (N,)
+    terminated: Any  # whether the episode ended by itself
+    truncated: Any  # whether it reached its time limit
+    running: npt.NDArray[np.bool_]  # rows that are in their first episode, (N,)
 
 
 def iterate_steps(
@@ -145,25 +136,43 @@ _UNITS = {
     "m/s": "v_x v_y",
     "m": "y_l X Y",
 }
-INFO_UNITS = {name: unit for unit, names in _UNITS.items() for name in names.split()}
+_INFO_UNITS = {name: unit for unit, names in _UNITS.items() for name in names.split()}
 TRUTH = ("beta", "gamma", "psi", "v_x", "v_y", "phi", "y_l")
 """The true states in a log, named as estimators name them."""
+_DEGREES = 180.0 / np.pi
+_TRUE: dict[str, Any] = {"color": "#000000", "lw": 1.4, "zorder": 3}
+_ESTIMATE: dict[str, Any] = {"color": "#56B4E9", "lw": 1.0}
+_REFERENCE: dict[str, Any] = {"color": "#D55E00", "lw": 1.2, "ls": "--", "zorder": 2}
+_PANELS: tuple[tuple[tuple[tuple[str, str, dict[str, Any]], ...], str, float], ...] = (
+    (
+        (
+            ("obs_beta_hat", "estimate, 1 std", _ESTIMATE),
+            ("beta_ref", "reference", _REFERENCE),
+            ("beta", "true", _TRUE),
+        ),
+        "sideslip angle / deg",
+        _DEGREES,
+    ),
+    (
+        (("gamma_ref", "reference", _REFERENCE), ("gamma", "true", _TRUE)),
+        "yaw rate / (deg/s)",
+        _DEGREES,
+    ),
+    ((("yaw_moment", "delivered", _TRUE),), "yaw moment / (N m)", 1.0),
+    ((("steer", "front wheels", _TRUE),), "steering angle / deg", _DEGREES),
+)
 
 
 @dataclass(frozen=True, repr=False)
 class Rollout:
     """An episode: row 0 is the reset, row k the state after the k-th step.
 
-    Attributes:
-        columns: Arrays of one value for each row: numbers of `info`, true motion, entries of the
-            observation (`obs_...`), the action that led to the row, and its reward.
-        units: Units by column.
-        log: Record of every tick, with the truth at the ticks of the rows.
+    Columns are `info`, true motion, observation (`obs_...`), action before the row, and reward.
     """
 
-    columns: dict[str, npt.NDArray[np.float64]]
-    units: dict[str, str]
-    log: Log
+    columns: dict[str, npt.NDArray[np.float64]]  # a value for each row
+    units: dict[str, str]  # by column
+    log: Log  # record of every tick, with the truth at the ticks of the rows
 
     def __getitem__(self, name: str) -> npt.NDArray[np.float64]:
         if name not in self.columns:
@@ -246,30 +255,6 @@ class Rollout:
         return figure
 
 
-_DEGREES = 180.0 / np.pi
-_TRUE: dict[str, Any] = {"color": "#000000", "lw": 1.4, "zorder": 3}
-_ESTIMATE: dict[str, Any] = {"color": "#56B4E9", "lw": 1.0}
-_REFERENCE: dict[str, Any] = {"color": "#D55E00", "lw": 1.2, "ls": "--", "zorder": 2}
-_PANELS: tuple[tuple[tuple[tuple[str, str, dict[str, Any]], ...], str, float], ...] = (
-    (
-        (
-            ("obs_beta_hat", "estimate, 1 std", _ESTIMATE),
-            ("beta_ref", "reference", _REFERENCE),
-            ("beta", "true", _TRUE),
-        ),
-        "sideslip angle / deg",
-        _DEGREES,
-    ),
-    (
-        (("gamma_ref", "reference", _REFERENCE), ("gamma", "true", _TRUE)),
-        "yaw rate / (deg/s)",
-        _DEGREES,
-    ),
-    ((("yaw_moment", "delivered", _TRUE),), "yaw moment / (N m)", 1.0),
-    ((("steer", "front wheels", _TRUE),), "steering angle / deg", _DEGREES),
-)
-
-
 def rollout(
     env: gym.Env[Any, Any] | str,
     agent: Any = None,
@@ -302,10 +287,9 @@ def rollout(
     layout = env.get_wrapper_attr("layout")
     rows, records = [], []
     for step in iterate_steps(env, agent, seed, options):
-        info = step.info | get_motion(base)
+        info = step.info | _get_motion(base)
         info.pop("is_success", None)
-        numbers = (*info.values(), step.reward, *step.action, *step.obs)
-        rows.append([float(number) for number in numbers])
+        rows.append([*map(float, (*info.values(), step.reward, *step.action, *step.obs))])
         records.append(base.record)
     names, width = [*info, "reward"], len(step.action)
     names += ["action"] if width == 1 else [f"action_{i}" for i in range(width)]
@@ -315,18 +299,13 @@ def rollout(
     units |= {f"obs_{entry.name}": entry.unit for entry in layout}
     columns = dict(zip(names, table, strict=True))
     record = concatenate(records)
-    return Rollout(columns, units, _make_log(base, record, columns))
+    t = record.ticks * record.dt  # the truth between rows is interpolated
+    truth = {name: np.interp(t, columns["t"], columns[name]) for name in TRUTH}
+    return Rollout(columns, units, Log(record, base.slow_sensors, truth, base.scenario.name))
 
 
-def get_motion(base: Any) -> dict[str, float]:
-    """Read the motion that `info` lacks: v_x, v_y (m/s), phi (rad), y_l and place X, Y (m).
-
-    Args:
-        base: Unwrapped single env.
-
-    Returns:
-        Values by name, in SI units.
-    """
+def _get_motion(base: Any) -> dict[str, float]:
+    """Read the motion that `info` lacks: v_x, v_y (m/s), phi (rad), y_l and place X, Y (m)."""
     motion = base.motion
     return {
         "v_x": motion.v_x,
@@ -339,15 +318,5 @@ def get_motion(base: Any) -> dict[str, float]:
 
 
 def _find_unit(name: str) -> str:
-    """The unit of a number of `info`; those of wrappers end in a state's name."""
-    for ending in ("beta_hat", "beta_std"):
-        if name.endswith(ending):
-            return "rad"
-    return INFO_UNITS.get(name, "-")
-
-
-def _make_log(base: Any, record: Record, columns: dict[str, npt.NDArray[np.float64]]) -> Log:
-    """The record with the truth; ticks between rows are interpolated."""
-    t = record.ticks * record.dt
-    truth = {name: np.interp(t, columns["t"], columns[name]) for name in TRUTH}
-    return Log(record, base.slow_sensors, truth, base.scenario.name)
+    """Find the unit of a number of `info`; wrappers may put a prefix before beta's."""
+    return "rad" if name.endswith(("beta_hat", "beta_std")) else _INFO_UNITS.get(name, "-")

@@ -1,9 +1,4 @@
-"""One row of a native vector env, as far as it can be asked what a single environment is asked.
-
-The bridge to stable-baselines3: its `VecEnv` over the native vector env, a call for all rows.
-
-Stable-baselines3's kind of vector environment around the batch engine.
-"""
+"""Stable-baselines3's `VecEnv` over the native vector env: one call for all rows."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NoReturn
@@ -28,6 +23,9 @@ with require_extra("train", "training needs torch and stable-baselines3"):
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+Observations = npt.NDArray[np.float32]
+_Indices = int | Iterable[int] | None
+_Wrapping = Callable[[VectorEnv[Any, Any, Any]], VectorEnv[Any, Any, Any]]
 _ROW_ATTRIBUTES = (  # a sequence in the vector env, with an item for each row
     "vehicle", "nominal", "scenario", "record", "held_speed", "slow_sensors", "motion",
     "estimator", "np_random", "np_random_seed",
@@ -43,16 +41,8 @@ _TWINS: dict[type, type] = {
 }
 
 
-class VecEnvRow:
-    """One row of a vector env, with the attributes of the single env under the same names.
-
-    It has those of `_ROW_ATTRIBUTES`, `_SHARED_ATTRIBUTES` and `_SPACES`, the methods, and values
-    set here.
-
-    Args:
-        env: Vector env, wrapped or bare.
-        i: Index of the row.
-    """
+class _VecEnvRow:
+    """Row i of a vector env: the single env's attributes listed above, and values set here."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any], i: int) -> None:
         self._env, self._i = env, i
@@ -67,17 +57,7 @@ class VecEnvRow:
         yield layer
 
     def get_wrapper_attr(self, name: str) -> Any:
-        """Get an attribute of this row from the outermost layer that has it.
-
-        Args:
-            name: Name of the attribute.
-
-        Returns:
-            Value of this row.
-
-        Raises:
-            AttributeError: No layer has it.
-        """
+        """Get an attribute of this row from the outermost layer that has it."""
         if name in self._set:
             return self._set[name]
         if name in _METHODS:
@@ -87,22 +67,13 @@ class VecEnvRow:
             for layer in self._iterate_layers():
                 if attribute in vars(layer) or hasattr(type(layer), attribute):
                     value = getattr(layer, attribute)
-                    return self._get_row_value(name, value) if name in _ROW_ATTRIBUTES else value
+                    value = value[self._i] if name in _ROW_ATTRIBUTES else value
+                    return Motion(*value.tolist()) if name == "motion" else value
         known = (*_ROW_ATTRIBUTES, *_SHARED_ATTRIBUTES, *_SPACES, *_METHODS, *self._set)
         raise AttributeError(f"a row of a vector env has {', '.join(known)}; not {name!r}")
 
-    def _get_row_value(self, name: str, value: Any) -> Any:
-        return Motion(*value[self._i].tolist()) if name == "motion" else value[self._i]
-
     def has_wrapper_attr(self, name: str) -> bool:
-        """Return whether `get_wrapper_attr` finds an attribute.
-
-        Args:
-            name: Name of the attribute.
-
-        Returns:
-            True if it does.
-        """
+        """Return whether `get_wrapper_attr` finds an attribute."""
         try:
             self.get_wrapper_attr(name)
         except AttributeError:
@@ -110,15 +81,7 @@ class VecEnvRow:
         return True
 
     def set_wrapper_attr(self, name: str, value: Any, **_: Any) -> None:
-        """Set a value beside the env, under a name that the env does not have.
-
-        Args:
-            name: Name of the value.
-            value: Value for `get_wrapper_attr`.
-
-        Raises:
-            AttributeError: The name is the env's.
-        """
+        """Set a value beside the env, under a name that the env does not have."""
         if name not in self._set and self.has_wrapper_attr(name):
             raise AttributeError(
                 f"{name!r} is the environment's and is not set from outside; options of reset "
@@ -129,15 +92,7 @@ class VecEnvRow:
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start a new episode in this row alone.
-
-        Args:
-            seed: Seed of the row.
-            options: Options of the reset.
-
-        Returns:
-            Observation of shape (k,), and info.
-        """
+        """Start a new episode in this row alone; return observation (k,) and info."""
         mask = np.arange(self._env.num_envs) == self._i
         seeds: Any = [seed if is_row else None for is_row in mask]
         more = {name: [value] * len(mask) for name, value in (options or {}).items()}
@@ -146,21 +101,9 @@ class VecEnvRow:
         return obs[self._i], make_info(base.reports[self._i].tolist())
 
     def is_wrapped(self, wrapper_class: type) -> bool:
-        """Return whether a layer has a class, or is the vector twin of a single wrapper.
-
-        Args:
-            wrapper_class: Class of a wrapper.
-
-        Returns:
-            True if one does.
-        """
+        """Return whether a layer has this class, or is the vector twin of it."""
         wanted = _TWINS.get(wrapper_class, wrapper_class)
         return any(isinstance(layer, wanted) for layer in self._iterate_layers())
-
-
-Observations = npt.NDArray[np.float32]
-Indices = int | Iterable[int] | None
-Wrapping = Callable[[VectorEnv[Any, Any, Any]], VectorEnv[Any, Any, Any]]
 
 
 class _EmptyInfo(dict[str, Any]):
@@ -185,14 +128,15 @@ class NativeVecEnv(VecEnv):
     """stable-baselines3's `VecEnv` over a `StabilityVectorEnv`, wrapped or bare.
 
     It equals stable-baselines3's `DummyVecEnv` around single environments with the same seeds, bit
-    for bit, but for one thing: where no episode ends, `infos` holds one empty dict that all rows
-    share (`EMPTY_INFO`; it refuses to be written into, `infos` itself is a fresh list). Where one
-    ends, its row has the whole info of the last step, `terminal_observation` and
-    `TimeLimit.truncated`. `reset_infos` are those of each row's newest reset.
+    for bit, but for `infos`: where no episode ends it holds one empty dict that all rows share
+    (`EMPTY_INFO`, which refuses to be written into). Where one ends, its row has the whole info of
+    the last step, `terminal_observation` and `TimeLimit.truncated`. `reset_infos` are those of each
+    row's newest reset.
 
-    `get_attr` reads what `VecEnvRow` has of each row; `set_attr` stores values for `get_attr`;
-    `env_method` calls methods of `VecEnvRow`. `set_options` takes the options of a single env's
-    `reset`, for all rows or a list of them.
+    `get_attr` reads what a single env has of each row; `set_attr` stores values beside the env;
+    `env_method` calls a row's `reset` and its methods of wrapped attributes, with `method_args` and
+    `method_kwargs`. `indices` are rows, None for all. `set_options` takes the options of a single
+    env's `reset`, for all rows or a list of them.
 
     Args:
         vector_env: Vector env with autoreset in the same step; `make_vec_env` builds one.
@@ -216,12 +160,10 @@ class NativeVecEnv(VecEnv):
                 f"vector env with autoreset_mode='SameStep', not {mode}"
             )
         self.vector_env, self._base = vector_env, base
-        self._rows = [VecEnvRow(vector_env, i) for i in range(vector_env.num_envs)]
+        self._rows = [_VecEnvRow(vector_env, i) for i in range(vector_env.num_envs)]
         self._actions: Any = None
         super().__init__(
-            vector_env.num_envs,
-            vector_env.single_observation_space,
-            vector_env.single_action_space,
+            vector_env.num_envs, vector_env.single_observation_space, vector_env.single_action_space
         )
         self.metadata = dict(vector_env.metadata)
 
@@ -233,18 +175,16 @@ class NativeVecEnv(VecEnv):
     def reset(self) -> Observations:
         """Start an episode in every row, with the seeds and options that were set for it."""
         seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
-        obs, infos = self.vector_env.reset(seed=seeds, options=_merge_options(self._options))
+        names = dict.fromkeys(name for row_options in self._options for name in row_options)
+        options = {name: [row.get(name) for row in self._options] for name in names} or None
+        obs, infos = self.vector_env.reset(seed=seeds, options=options)
         self._reset_seeds()
         self._reset_options()
         self._store_infos(range(self.num_envs), infos)
         return np.asarray(obs)
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
-        """Store the actions for `step_wait`.
-
-        Args:
-            actions: Actions, shape (N, width).
-        """
+        """Store the actions, shape (N, width), for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -282,84 +222,36 @@ class NativeVecEnv(VecEnv):
         return frames or ()
 
     def render(self, mode: str | None = None) -> npt.NDArray[np.uint8] | None:
-        """Render all rows as one frame; None with render_mode="human", where `step` shows row 0.
-
-        Args:
-            mode: Passed to stable-baselines3, which warns where it differs from `render_mode`.
-
-        Returns:
-            Frame, shape (height, width, 3), or None.
-        """
+        """Render all rows as one frame (height, width, 3), whatever the mode; None for "human"."""
         return None if self.render_mode == "human" else super().render(mode)
 
     def close(self) -> None:
         """Close the vector env."""
         self.vector_env.close()
 
-    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Get an attribute of each row, as `VecEnvRow` has it.
-
-        Args:
-            attr_name: Name of the attribute.
-            indices: Rows, None for all.
-
-        Returns:
-            Values, one for each row.
-
-        Raises:
-            AttributeError: The rows do not have it.
-        """
+    def get_attr(self, attr_name: str, indices: _Indices = None) -> list[Any]:
+        """Get the attribute `attr_name` of each row; AttributeError where rows do not have it."""
         return [row.get_wrapper_attr(attr_name) for row in self._get_rows(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Set a value beside each row, under a name that the env does not have.
-
-        Args:
-            attr_name: Name of the value.
-            value: Value for `get_attr`.
-            indices: Rows, None for all.
-
-        Raises:
-            AttributeError: The name is the env's.
-        """
+    def set_attr(self, attr_name: str, value: Any, indices: _Indices = None) -> None:
+        """Set a `value` beside each row; AttributeError where `attr_name` is the env's."""
         for row in self._get_rows(indices):
             row.set_wrapper_attr(attr_name, value)
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+        self, method_name: str, *method_args: Any, indices: _Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of `VecEnvRow` for each row.
-
-        Args:
-            method_name: Name of the method.
-            method_args: Positional arguments.
-            indices: Rows, None for all.
-            method_kwargs: Keyword arguments.
-
-        Returns:
-            Results, one for each row.
-
-        Raises:
-            AttributeError: `VecEnvRow` has no such method.
-        """
+        """Call the method `method_name` for each row; AttributeError where there is none."""
         chosen = [row.get_wrapper_attr(method_name) for row in self._get_rows(indices)]
         return [method(*method_args, **method_kwargs) for method in chosen]
 
     def env_is_wrapped(
-        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Indices = None
+        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: _Indices = None
     ) -> list[bool]:
-        """Return for each row whether it has a wrapper or its vector twin.
-
-        Args:
-            wrapper_class: Class of a wrapper.
-            indices: Rows, None for all.
-
-        Returns:
-            True or False for each row.
-        """
+        """Return for each row whether it has the `wrapper_class` or its vector twin."""
         return [row.is_wrapped(wrapper_class) for row in self._get_rows(indices)]
 
-    def _get_rows(self, indices: Indices) -> list[VecEnvRow]:
+    def _get_rows(self, indices: _Indices) -> list[_VecEnvRow]:
         return [self._rows[i] for i in self._get_indices(indices)]
 
 
@@ -371,7 +263,7 @@ def make_vec_env(
     env_kwargs: Mapping[str, Any] | None = None,
     monitor_file: str | None = None,
     info_keywords: Sequence[str] = (),
-    wrapper_class: Wrapping | None = None,
+    wrapper_class: _Wrapping | None = None,
 ) -> VecMonitor:
     """Make stable-baselines3's `VecEnv` on the native vector env, like its function of this name.
 
@@ -387,9 +279,6 @@ def make_vec_env(
 
     Returns:
         `VecEnv` that monitors episodes.
-
-    Raises:
-        ValueError: The id has no native vector env; or as `gym.make_vec` and `EstimateObservation`.
     """
     env = make_native_env(env_id, num_envs, estimator, env_kwargs)
     bridge = NativeVecEnv(env if wrapper_class is None else wrapper_class(env))
@@ -416,7 +305,7 @@ def make_native_env(
         Vector env, wrapped if there is an estimator.
 
     Raises:
-        ValueError: As `make_vec_env`.
+        ValueError: The id has no native vector env.
     """
     entry = gym.spec(env_id).vector_entry_point
     kind = load_env_creator(entry) if isinstance(entry, str) else entry
@@ -429,10 +318,8 @@ def make_native_env(
     env: VectorEnv[Any, Any, Any] = gym.make_vec(env_id, num_envs=num_envs, **arguments)
     if estimator is None:
         return env
-    estimator_options = (
-        dict(estimator) if isinstance(estimator, Mapping) else {"estimator": estimator}
-    )
-    return EstimateObservation(env, **estimator_options)
+    estimator = estimator if isinstance(estimator, Mapping) else {"estimator": estimator}
+    return EstimateObservation(env, **estimator)
 
 
 def _split_infos(infos: Mapping[str, Any], rows: Sequence[int]) -> list[dict[str, Any]]:
@@ -445,9 +332,3 @@ def _split_infos(infos: Mapping[str, Any], rows: Sequence[int]) -> list[dict[str
                 if is_set:
                     info[key] = value
     return singles
-
-
-def _merge_options(options: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Merge the rows' options into those of the vector env, None where there are none."""
-    names = dict.fromkeys(name for row_options in options for name in row_options)
-    return {name: [row_options.get(name) for row_options in options] for name in names} or None

@@ -17,18 +17,11 @@ from ..envs.numerics import require_extra
 from ..envs.record import Array
 
 EVALUATIONS = "evaluations.npz"
-WRAPPER = "sideslip.estimators.EstimateObservation"
+_WRAPPER = "sideslip.estimators.EstimateObservation"
 
 
-def make_file_name(env_id: str) -> str:
-    """Make a file's name from an id.
-
-    Args:
-        env_id: Id of an env.
-
-    Returns:
-        Name without a slash.
-    """
+def _make_file_name(env_id: str) -> str:
+    """Make a file's name from an env's id: a dash stands for the slash."""
     return env_id.replace("/", "-")
 
 
@@ -43,10 +36,10 @@ def find_next_folder(logs: Path, algo: str, env_id: str) -> Path:
     Returns:
         Path LOGS/ALGO/ID_N with N above all that exist.
     """
-    numbered = re.compile(re.escape(make_file_name(env_id)) + r"_(\d+)")
+    numbered = re.compile(re.escape(_make_file_name(env_id)) + r"_(\d+)")
     entries = (logs / algo).iterdir() if (logs / algo).is_dir() else ()
     taken = [int(match[1]) for path in entries if (match := numbered.fullmatch(path.name))]
-    return logs / algo / f"{make_file_name(env_id)}_{max(taken, default=0) + 1}"
+    return logs / algo / f"{_make_file_name(env_id)}_{max(taken, default=0) + 1}"
 
 
 def describe(
@@ -56,8 +49,7 @@ def describe(
 
     Args:
         folder: Folder to make.
-        settings: Settings in the zoo's format, in JSON types; `normalize` becomes False, for the
-            model has its own scales.
+        settings: Settings in the zoo's format; `normalize` becomes False: the model has scales.
         estimator_kwargs: Arguments of `EstimateObservation`, or None.
         arguments: Arguments of the command line, "env" and "env_kwargs" among them.
     """
@@ -65,8 +57,8 @@ def describe(
         import yaml
     config = dict(settings) | {"normalize": False}
     if estimator_kwargs is not None:
-        config["env_wrapper"] = [{WRAPPER: estimator_kwargs}]
-    place = folder / make_file_name(arguments["env"])
+        config["env_wrapper"] = [{_WRAPPER: estimator_kwargs}]
+    place = folder / _make_file_name(arguments["env"])
     place.mkdir(parents=True)
     for name, content in (("config.yml", config), ("args.yml", dict(arguments))):
         write_atomic(place / name, yaml.safe_dump(content).encode())
@@ -75,8 +67,7 @@ def describe(
 def write_evaluation(folder: Path, env_id: str, model: Any, costs: Array, lengths: Array) -> None:
     """Write an evaluation's model, costs and lengths, where the folder is the zoo's.
 
-    Later evaluations in the file, of a training that was stopped before its checkpoint, are
-    removed.
+    Later evaluations in the file, of a training stopped before its checkpoint, are removed.
 
     Args:
         folder: Folder of the training.
@@ -85,9 +76,9 @@ def write_evaluation(folder: Path, env_id: str, model: Any, costs: Array, length
         costs: Costs J of the episodes, shape (N,).
         lengths: Steps of the episodes, shape (N,).
     """
-    if not (folder / make_file_name(env_id)).is_dir():
+    if not (folder / _make_file_name(env_id)).is_dir():
         return
-    with atomic_file(folder / f"{make_file_name(env_id)}.zip") as file:
+    with atomic_file(folder / f"{_make_file_name(env_id)}.zip") as file:
         model.save(file)
     evaluation: dict[str, Any] = {
         "timesteps": np.array([model.num_timesteps]),

@@ -1,15 +1,8 @@
-"""The latency of a fast channel, found while driving.
+"""Filters of late fast channels: by a known latency, or by one identified while driving.
 
-A gyro that is late turns the predicted heading later than the camera or the GPS sees it turn: so
-the latency is the one with which the filter's packets surprise it least. The record is filtered
-with several latencies, each from where the stretch began, and a parabola through the sums of the
-packets' normalised innovations squared has the latency and its variance. The innovations of the
-gyro itself are left out: tyres that build up their force late look like a gyro that is late.
-
-A log that cannot tell is left alone: an estimate counts where every latency that is far from it is
-less likely by a factor of e^8, and so is the one in force.
-
-An estimator some of whose fast channels are late: by a known time, or by one that it finds.
+A gyro that is late turns the predicted heading later than the camera or the GPS sees it turn. So
+its latency is the one at which the slow packets' normalised innovations squared (NIS) are least.
+The gyro's own innovations are left out: tyres that build up their force late look like a late gyro.
 """
 
 import copy
@@ -27,22 +20,16 @@ from .design.periodic import Schedule, count_ticks
 from .estimator import EMPTY, NO_NIS, Estimator, compile_advance, compile_process_packet
 from .protocol import compute_std
 
-MAX_SEARCHED_LATENCY = 0.12  # s, of what is looked for
-LOOK_TIMES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)  # s from where a stretch begins
-STEPS = (0.02, 0.01, 0.005)  # s between the latencies that are compared, ever closer
-MIN_LOG_RATIO = 8.0  # of a logarithm of a likelihood ratio
+_MAX_SEARCHED_LATENCY = 0.12  # s
+_LOOK_TIMES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)  # s from where a stretch begins
+_STEPS = (0.02, 0.01, 0.005)  # s between the latencies that are compared, ever closer
+_MIN_LOG_RATIO = 8.0  # by which the logarithm of an accepted latency's likelihood is greater
+_HISTORY_OFFSET: int = FILTER.fields["predicted"][1]  # type: ignore[index]  # where a memory's window begins, in bytes
+_INDEX_COLUMN = PACKET_WIDTH  # column behind a packet's: its place in the call
 
 
-def align_rows(rows: Array, lags: dict[int, int]) -> Array:
-    """Shift each late column of fast rows to the time when it was true.
-
-    Args:
-        rows: Fast rows, shape (k, FAST_WIDTH).
-        lags: Latency (ticks) by column.
-
-    Returns:
-        Aligned rows, shape (k, FAST_WIDTH); NaN where a value has not come yet.
-    """
+def _align_rows(rows: Array, lags: dict[int, int]) -> Array:
+    """Shift late columns of fast rows to when they were true, by lags (ticks); NaN at the end."""
     result = rows.copy()
     for column, lag in lags.items():
         split = max(len(rows) - lag, 0)
@@ -50,41 +37,23 @@ def align_rows(rows: Array, lags: dict[int, int]) -> Array:
     return result
 
 
-class LatencySearch:
-    """Search for the latency of some columns.
-
-    Args:
-        columns: Columns of the fast row that are late together.
-        dt: Tick (s).
-
-    Attributes:
-        lag: Latency in force (ticks).
-        sd: Its standard deviation (ticks), infinite before it is known.
-        done: Whether it needs no more looks.
-
-    Raises:
-        ValueError: The tick is too long to find a latency.
-    """
+class _LatencySearch:
+    """Search for the latency of `columns` of a fast row: least NIS, its variance by a parabola."""
 
     def __init__(self, columns: tuple[int, ...], dt: float) -> None:
-        self.columns, self.max_lag = columns, round(MAX_SEARCHED_LATENCY / dt)
+        self.columns, self.max_lag = columns, round(_MAX_SEARCHED_LATENCY / dt)
         if self.max_lag < 2:
             raise ValueError(
-                f"a latency that is looked for is at most {MAX_SEARCHED_LATENCY:g} s, of "
+                f"a latency that is looked for is at most {_MAX_SEARCHED_LATENCY:g} s, of "
                 f"which rows every {dt:g} s tell nothing: say the latency in s"
             )
-        self._steps = [max(round(step / dt), 1) for step in STEPS]
-        self._looks = [round(look / dt) for look in LOOK_TIMES]
+        self._steps = [max(round(step / dt), 1) for step in _STEPS]
+        self._looks = [round(look / dt) for look in _LOOK_TIMES]
+        # latency in force and its standard deviation (ticks), whether no more looks are needed
         self.lag, self.sd, self.done = 0, np.inf, False
 
     def begin(self, filters: Any, rows: Array, packets: Array) -> None:
-        """Begin a new stretch at a filter's memory.
-
-        Args:
-            filters: Memory of the filter, shape (layers,).
-            rows: Fast rows that it has not taken yet, shape (k, FAST_WIDTH).
-            packets: Packets that it has not taken yet, one a row.
-        """
+        """Begin a new stretch at a filter's memory, with what that has not taken yet."""
         self._start, self._rows, self._packets = filters.copy(), [rows], [packets]
         self._count = len(rows)
 
@@ -93,28 +62,13 @@ class LatencySearch:
         return min(look for look in self._looks if look > self._count) - self._count
 
     def take(self, rows: Array, packets: Array) -> None:
-        """Store rows, no further than the next look, and packets, as the memory takes them.
-
-        Args:
-            rows: Fast rows, shape (k, FAST_WIDTH).
-            packets: Packets, one a row.
-        """
+        """Store rows, no further than the next look, and packets, as the memory takes them."""
         self._rows.append(rows)
         self._packets.append(packets)
         self._count += len(rows)
 
     def look(self, delayed_filters: Any, rows: Array, packets: Array, gains: Any) -> Any:
-        """Compare latencies where a look is due.
-
-        Args:
-            delayed_filters: Memory of the filter, shape (layers,).
-            rows: Fast rows that it has not taken yet; a new stretch begins with them.
-            packets: Packets that it has not taken yet.
-            gains: Tables of gains, shape (cells, rows, columns).
-
-        Returns:
-            `delayed_filters`, or the memory for another latency that was found.
-        """
+        """Compare latencies where a look is due; return the memory for the latency in force."""
         if self._count in self._looks:
             delayed_filters = self._compare(delayed_filters, gains)
         if self._count == self._looks[-1] and not self.done:
@@ -132,22 +86,19 @@ class LatencySearch:
         lag, curvature, margin = self._minimise_nis(sum_nis)
         min_nis, count, memory = results[lag]
         scale = max(min_nis / max(count, 1), 1.0)
-        is_significant = margin > 2.0 * MIN_LOG_RATIO * scale and curvature > 0.0
+        is_significant = margin > 2.0 * _MIN_LOG_RATIO * scale and curvature > 0.0
         self.done = is_significant and self._count == self._looks[-1]
         if not is_significant:
             return delayed_filters
         self.sd = float(np.sqrt(2.0 * scale / curvature))
-        is_better = self.lag > 0 or sum_nis(self.lag) - min_nis > 2.0 * MIN_LOG_RATIO * scale
+        is_better = self.lag > 0 or sum_nis(self.lag) - min_nis > 2.0 * _MIN_LOG_RATIO * scale
         if lag == self.lag or not is_better:
             return delayed_filters
         self.lag = lag
         return memory
 
     def _minimise_nis(self, sum_nis: Any) -> tuple[int, float, float]:
-        """Find the lag of least NIS, the second derivative there (0: none), and its margin.
-
-        The margin is to the best lag that is far from it.
-        """
+        """Find the lag of least NIS, the second derivative there and the margin to distant lags."""
         max_lag, (coarse, *finer) = self.max_lag, self._steps
         grid = range(0, max_lag + 1, coarse)
         best, step = min(grid, key=sum_nis), coarse
@@ -166,7 +117,7 @@ class LatencySearch:
     def _filter_stretch(self, lag: int, rows: Array, gains: Any) -> tuple[float, int, Any]:
         """Filter the stretch with a lag: sum of its packets' NIS, count of numbers, memory."""
         filters, count = self._start.copy(), len(rows) - self.max_lag
-        fast = align_rows(rows, dict.fromkeys(self.columns, lag))[:count]
+        fast = _align_rows(rows, dict.fromkeys(self.columns, lag))[:count]
         packets = np.concatenate(self._packets)[:, :PACKET_WIDTH]
         is_past = packets[:, PACKET.arrived] <= filters[0].tick + count
         packets = np.ascontiguousarray(packets[is_past])
@@ -178,23 +129,12 @@ class LatencySearch:
         return float(nis[is_used].sum()), int(filters[0].rows[sensors].sum()), filters
 
 
-_HISTORY_OFFSET: int = FILTER.fields["predicted"][1]  # type: ignore[index]  # where a memory's window begins, in bytes
-_INDEX_COLUMN = PACKET_WIDTH  # column behind a packet's: its place in the call
-
-
 class LateEstimator(Estimator):
-    """A filter with the option `latency`; built by `make_estimator`.
+    """A filter with the option `latency`; arguments are those of `Estimator`.
 
-    `delayed_filters`, a memory, is the filter at the time t - L of the latest channel, with every
-    channel at the time when it was true. The estimate at t is a copy, propagated to t with all that
-    has come: inputs, channels that are less late, packets. So it is the conditional mean of a
-    linear system, as without latencies. A step costs L / dt ticks more.
-
-    Args:
-        config: Parsed options of the filter, with a latency.
-        dt: Tick (s).
-        filters: Memory of the filter, shape (layers,).
-        schedules: Schedules of the samples.
+    `delayed_filters` is the filter at the time t - L of the latest channel, with every channel at
+    the time when it was true. The estimate at t is a copy, propagated to t with all that has come.
+    So it is the conditional mean of a linear system. A step costs L / dt ticks more.
     """
 
     compiled = False
@@ -211,21 +151,13 @@ class LateEstimator(Estimator):
         super().__init__(config, dt, filters, schedules)
 
     def reset(self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0) -> None:
-        """Reset as `Estimator.reset` does; the search for a latency begins anew.
-
-        Args:
-            sensors: Slow sensors by name, whose clocks have a new phase; None keeps the phases.
-            first: Tick of the next fast row.
-        """
+        """Reset as `Estimator.reset` does; the search for a latency begins anew."""
         super().reset(sensors, first)
         self.delayed_filters = self.filters.copy()
         self._rows, self._waiting = np.zeros((0, FAST_WIDTH)), np.zeros((0, _INDEX_COLUMN + 1))
-        self._search = (
-            LatencySearch(find_columns(self._unknown_channel), self.dt)
-            if self._unknown_channel
-            else None
-        )
-        if self._search:
+        self._search: _LatencySearch | None = None
+        if self._unknown_channel:
+            self._search = _LatencySearch(find_columns(self._unknown_channel), self.dt)
             self._search.begin(self.delayed_filters, self._rows, self._waiting)
 
     @property
@@ -233,12 +165,6 @@ class LateEstimator(Estimator):
         """Ticks by column."""
         search = self._search
         return self._fixed_lags | (dict.fromkeys(search.columns, search.lag) if search else {})
-
-    @property
-    def _max_lag(self) -> int:
-        """Ticks by which `delayed_filters` is behind."""
-        search = self._search
-        return max(*self._lags.values(), search.max_lag if search and not search.done else 0)
 
     def _receive(self, packet: Array) -> None:
         self.take(np.zeros((0, FAST_WIDTH)), 0, packet[None], 1)
@@ -259,15 +185,6 @@ class LateEstimator(Estimator):
         """Process rows and packets as `Estimator.take` does.
 
         A packet that `delayed_filters` uses in a later call has no NIS.
-
-        Args:
-            fast: Fast rows, shape (k, FAST_WIDTH).
-            rows: Number of fast rows to take.
-            packets: Packets, shape (capacity, PACKET_WIDTH).
-            count: Number of packets to take.
-            X: Output for the states, shape (rows, n), or empty.
-            S: Output for the standard deviations, shape (rows, n), or empty.
-            nis: Output for each packet's normalised innovation squared, shape (count,), or empty.
         """
         remaining: Array = np.column_stack((packets[:count], np.arange(float(count))))
         self._waiting[:, _INDEX_COLUMN] = -1.0
@@ -291,26 +208,24 @@ class LateEstimator(Estimator):
     def _update_delayed(self, fast: Array, packets: Array, now: int, nis: Array) -> None:
         """Process rows up to the tick `now`, and packets; `delayed_filters` takes what is due."""
         rows = np.concatenate((self._rows, fast))
-        n_due = max(len(rows) - self._max_lag, 0)
+        search = self._search if self._search and not self._search.done else None
+        max_lag = max(*self._lags.values(), search.max_lag if search else 0)
+        n_due = max(len(rows) - max_lag, 0)
         pending = np.concatenate((self._waiting, packets))
         arrived = pending[:, PACKET.arrived]
-        is_later = (arrived > now - len(rows) + n_due) & (
-            arrived <= now
-        )  # others are to be counted
+        # others are to be counted
+        is_later = (arrived > now - len(rows) + n_due) & (arrived <= now)
         self._rows, self._waiting = rows[n_due:], pending[is_later]
-        self._process_delayed(align_rows(rows, self._lags)[:n_due], pending[~is_later], nis)
-        if self._search and not self._search.done:
-            self._search.take(fast, packets)
-            self.delayed_filters[:] = self._search.look(
-                self.delayed_filters, self._rows, self._waiting, self.gains
-            )
+        self._process_delayed(_align_rows(rows, self._lags)[:n_due], pending[~is_later], nis)
+        if search:
+            search.take(fast, packets)
+            record = self.delayed_filters, self._rows, self._waiting, self.gains
+            self.delayed_filters[:] = search.look(*record)
 
     def _process_delayed(self, fast: Array, pending: Array, nis: Array) -> None:
         """Pass rows and packets to `delayed_filters`."""
-        packets, pending_nis = (
-            np.ascontiguousarray(pending[:, :_INDEX_COLUMN]),
-            np.full(len(pending), np.nan),
-        )
+        packets = np.ascontiguousarray(pending[:, :_INDEX_COLUMN])
+        pending_nis = np.full(len(pending), np.nan)
         if len(fast):
             record = fast, len(fast), packets, len(packets), 0, EMPTY, EMPTY, pending_nis
             compile_advance()(self.delayed_filters, self.gains, *record)
@@ -323,15 +238,13 @@ class LateEstimator(Estimator):
 
     def _predict_current(self) -> None:
         """Propagate a copy of `delayed_filters` to the present tick, with what has come."""
-        current, delayed = (
-            records.view(np.uint8).reshape(len(records), -1)
-            for records in (self.filters, self.delayed_filters)
-        )
+        layers = self.filters, self.delayed_filters
+        current, delayed = (f.view(np.uint8).reshape(len(f), -1) for f in layers)
         skip_history = self.config.delay == "clone" and not self._f.store_predictions
         end = _HISTORY_OFFSET if skip_history else None
         current[:, :end] = delayed[:, :end]
         if len(self._rows):
-            rows = align_rows(self._rows, self._lags)
+            rows = _align_rows(self._rows, self._lags)
             packets = np.ascontiguousarray(self._waiting[:, :_INDEX_COLUMN])
             record = rows, len(rows), packets, len(packets), 0, EMPTY, EMPTY, NO_NIS
             compile_advance()(self.filters, self.gains, *record)
@@ -339,17 +252,12 @@ class LateEstimator(Estimator):
     @property
     def latency(self) -> dict[str, float]:
         """Latency in force (s) by channel."""
-        return {
-            channel: self._lags[find_columns(channel)[0]] * self.dt
-            for channel in self.config.latency
-        }
+        channels = self.config.latency
+        return {channel: self._lags[find_columns(channel)[0]] * self.dt for channel in channels}
 
     @property
     def latency_sd(self) -> float:
-        """Standard deviation (s) of the latency that is searched for.
-
-        It is infinite while the channel is taken as punctual, and 0 where all latencies are known.
-        """
+        """Standard deviation (s) of the unknown latency: infinite until found, 0 if none is."""
         return float(self._search.sd) * self.dt if self._search else 0.0
 
     def get_state(self) -> Any:
@@ -358,10 +266,6 @@ class LateEstimator(Estimator):
         return copy.deepcopy(state)
 
     def set_state(self, snapshot: Any) -> None:
-        """Restore a snapshot as `Estimator.set_state` does.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Restore a snapshot as `Estimator.set_state` does."""
         filters, delayed_filters, self._rows, self._waiting, self._search = copy.deepcopy(snapshot)
         self.filters[:], self.delayed_filters[:] = filters, delayed_filters

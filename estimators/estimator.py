@@ -1,7 +1,4 @@
-"""Compiled functions as plain calls.
-
-The estimator object: a filter's compiled memory behind a small face.
-"""
+"""A filter at work: the compiled memory of a Kalman filter or observer as a Python object."""
 
 import itertools
 import warnings
@@ -27,12 +24,15 @@ from .design.periodic import Schedule, compute_table_shape, count_ticks
 from .design.stability import MARGINAL, design_and_map, find_unobservable, spectral_radius
 from .protocol import Estimates, UnobservableWarning
 
+CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
+EMPTY = np.zeros((0, 0))
+NO_NIS = np.zeros(0)
+
 
 def compile_call(function: Any, *example_args: Any) -> Any:
-    """Return the compiled call of a function for arguments of the example's types.
+    """Return a function compiled for exactly the types and layouts of the example's arguments.
 
-    numba finds out the types of the arguments at every call, which costs more than a filter's
-    step. This is the call without it, so arguments must have exactly these types and layouts.
+    numba finds out the types at every other call, which costs more than a filter's step.
 
     Args:
         function: A jitted function; any other is returned as it is.
@@ -58,7 +58,7 @@ def compile_advance() -> Any:
 
 
 @cache
-def compile_estimate() -> Any:
+def _compile_estimate() -> Any:
     """Return `write_estimate` as a plain call."""
     return compile_call(write_estimate, *_make_example(), np.zeros(1), np.zeros((1, 1)))
 
@@ -70,16 +70,10 @@ def compile_process_packet() -> Any:
 
 
 @cache
-def compile_step() -> Any:
+def _compile_step() -> Any:
     """Return `step_all` as a plain call."""
     matrix = np.zeros((1, 1))
     return compile_call(step_all, *_make_example(), matrix, matrix, 0)
-
-
-CHECKED_SPEEDS = (3.0, 7.0, 14.0)  # m/s, where a filter without a fixed speed is checked
-EMPTY = np.zeros((0, 0))
-NO_NIS = np.zeros(0)
-_NO_PACKETS = np.zeros((0, PACKET_WIDTH))
 
 
 class Estimator:
@@ -144,9 +138,7 @@ class Estimator:
         return tuple(FAST._fields[column] for column in sorted(columns))
 
     def check(self, filters: FilterRecords) -> None:
-        """Check that the filter converges, and warn of what it cannot see.
-
-        A ValueError says that the estimation error diverges.
+        """Check that the filter converges, ValueError if not, and warn of what it cannot see.
 
         Args:
             filters: Its memory, or that of the same filter with its first slow sensor alone.
@@ -166,19 +158,17 @@ class Estimator:
             text = f"{self.name} cannot see: {'; '.join(self.unobservable)}"
             warnings.warn(text, UnobservableWarning, stacklevel=3)
 
-    def _design_table(
-        self, f: FilterRecord, schedule: Schedule, speed: float
-    ) -> tuple[Array, Array]:
+    def _design_table(self, f: FilterRecord, schedule: Schedule, v: float) -> tuple[Array, Array]:
         """Compute the table of gains at a speed and the error's map; ValueError if that grows."""
         try:
-            table, M = design_and_map(f, schedule, speed, self.config)
+            table, M = design_and_map(f, schedule, v, self.config)
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from None
         radius = spectral_radius(M)
         if radius > 1.0 + MARGINAL and not self.config.allow_unstable:
             raise ValueError(
                 f"{self.name}: its error grows by a factor of {radius:.6g} over a cycle of the "
-                f"schedule at {speed:g} m/s (allow_unstable=True builds it all the same)"
+                f"schedule at {v:g} m/s (allow_unstable=True builds it all the same)"
             )
         return table, M
 
@@ -228,20 +218,18 @@ class Estimator:
         """
         fast = np.ascontiguousarray(fast, np.float64)
         packets = np.ascontiguousarray(packets, np.float64)
-        try:
-            (_, fast_width), (n_packets, packet_width) = fast.shape, packets.shape
-        except ValueError:
-            fast_width, n_packets, packet_width = 0, 0, 0
-        if fast_width != FAST_WIDTH or packet_width != PACKET_WIDTH:
-            raise ValueError(_format_shape_error(fast, packets))
-        if count is not None:
-            if not 0 <= count <= n_packets:
-                raise ValueError(f"count is 0 to {n_packets}, as many as packets, got {count}")
-            n_packets = count
-        self._step(fast, packets, n_packets)
+        if fast.shape[1:] != (FAST_WIDTH,):
+            raise ValueError(f"fast rows have shape (k, {FAST_WIDTH}), got {fast.shape}")
+        if packets.shape[1:] != (PACKET_WIDTH,):
+            raise ValueError(f"packets have shape (k, {PACKET_WIDTH}), got {packets.shape}")
+        if count is None:
+            count = len(packets)
+        elif not 0 <= count <= len(packets):
+            raise ValueError(f"count is 0 to {len(packets)}, as many as packets, got {count}")
+        self._step(fast, packets, count)
 
     def _step(self, fast: Array, packets: Array, count: int) -> None:
-        done, rows = compile_step()(self.filters, self.gains, fast, packets, count), len(fast)
+        done, rows = _compile_step()(self.filters, self.gains, fast, packets, count), len(fast)
         if done < rows:  # gains are missing
             self._finish_rows(done, rows, (fast, rows, packets, count), (EMPTY, EMPTY, NO_NIS))
 
@@ -272,10 +260,7 @@ class Estimator:
             self._finish_rows(done, rows, record, outputs)
 
     def _finish_rows(self, done: int, rows: int, record: Any, outputs: Any) -> None:
-        """Process the rest of the rows and compute missing gains on the way.
-
-        record, outputs: the arguments of `advance` before and behind the rows done.
-        """
+        """Process the other rows: record, outputs are arguments of `advance` around `start`."""
         while done < rows:
             self.design_missing()
             done = compile_advance()(self.filters, self.gains, *record, done, *outputs)
@@ -286,7 +271,7 @@ class Estimator:
         Args:
             fast_row: Fast row of this tick, shape (FAST_WIDTH,).
         """
-        self.step(np.atleast_2d(np.asarray(fast_row, np.float64)), _NO_PACKETS)
+        self.step(np.atleast_2d(np.asarray(fast_row, np.float64)), np.zeros((0, PACKET_WIDTH)))
 
     def update(self, packet: npt.ArrayLike) -> None:
         """Process one packet that has arrived, after the fast row of this tick.
@@ -371,7 +356,7 @@ class Estimator:
     def _read_estimate(self, width: int) -> tuple[Array, Array]:
         """Read the states (n,) and their covariance (width, width): width is n, or 0 for none."""
         x, P = np.empty(len(self.names)), np.zeros((width, width))
-        while not compile_estimate()(self.filters, self.gains, x, P):
+        while not _compile_estimate()(self.filters, self.gains, x, P):
             self._design_cell(int(self._f.cell))
         return x, P
 
@@ -387,10 +372,7 @@ class Estimator:
 
     @property
     def nis(self) -> float:
-        """Normalised innovation squared of the last packet; NaN where there is none.
-
-        There is none where the packet was not used or the gains are precomputed.
-        """
+        """NIS of the last packet; NaN where it was not used, or the gains are precomputed."""
         return float(self._f.nis)
 
     def __getattr__(self, name: str) -> int:
@@ -400,9 +382,3 @@ class Estimator:
 
     def __repr__(self) -> str:
         return f"<{self.name}: {', '.join(self.names)} at tick {self.tick}>"
-
-
-def _format_shape_error(fast: Array, packets: Array) -> str:
-    if fast.shape[1:] != (FAST_WIDTH,):
-        return f"fast rows have shape (k, {FAST_WIDTH}), got {fast.shape}"
-    return f"packets have shape (k, {PACKET_WIDTH}), got {packets.shape}"

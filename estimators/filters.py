@@ -1,16 +1,11 @@
 """Every filter of the papers and its rivals: a row of a table.
 
 A filter is a model x a rule between slow samples x a rule for late ones x a tuning. A bicycle has
-the states that the slow sensor measures; the tunings stand in `tunings.py`.
-
-Where these filters are not the papers' by the letter: every model is discretised exactly, where
-double-layer-gps (38), (42) take A T + I; disturbances and process noise are per second, where
-double-layer-gps (34) and dual-rate (5) count them per step; the misprints of docs/PAPERS.md are
-corrected; and with pseudo-residuals every tick takes an even share of the gain that the filter
-without them applies at a sample (the papers do not say which gain they use in between).
-
-The poles of `lob-2` and `lob` have the least error of beta of a grid from 1 to 200 rad/s, on the
-training seeds of double-layer-fig9 and dakf-fig6.
+the states that the slow sensor measures. Where the papers differ: every model is discretised
+exactly (double-layer-gps (38), (42) take A T + I); disturbances and process noise are per second
+(double-layer-gps (34) and dual-rate (5) count them per step); misprints of docs/PAPERS.md are
+corrected; with pseudo-residuals every tick takes an even fraction of the gain that the filter
+without them applies at a sample.
 """
 
 from dataclasses import dataclass
@@ -21,44 +16,27 @@ from ..envs.sensors.slow import SLOW_NAMES
 
 @dataclass(frozen=True, kw_only=True)
 class FilterDefinition:
-    """One row of the table: what a filter is, and the defaults of its options.
+    """One row of the table: what a filter is, and the defaults of its options."""
 
-    Attributes:
-        slow: Slow sensors it can use, the preferred first; without any it uses fast ones alone.
-        model: "bicycle" or a name of `models.MODELS`.
-        fast: What it measures in every row.
-        intersample: "predict", "pseudo-residual", "dual-rate" or "single-rate"
-            (`core.intersample`).
-        gains: "periodic", "covariance" or "placed".
-        disturbances: A name of `models.DISTURBANCES`.
-        delay: A name of `delay.RULES`.
-        poles: Poles (rad/s), where gains are placed.
-        second: Model of a second layer; "" for none.
-        options: Pairs (option, its default) that differ from the common defaults.
-        hdop: Pairs (HDOP, factor on the GPS's noise).
-        source: Paper with the equations.
-    """
-
-    slow: tuple[str, ...] = ()
-    model: str = "bicycle"
-    fast: tuple[str, ...] = ("gyro",)
-    intersample: str = "predict"
-    gains: str = "periodic"
-    disturbances: str = "none"
-    delay: str = "clone"
-    poles: tuple[float, ...] = ()
-    second: str = ""
-    options: tuple[tuple[str, Any], ...] = ()
-    hdop: tuple[tuple[float, float], ...] = ()
-    source: str
+    slow: tuple[str, ...] = ()  # slow sensors it can use, the preferred first
+    model: str = "bicycle"  # or a name of `models.MODELS`
+    fast: tuple[str, ...] = ("gyro",)  # measured in every row
+    intersample: str = "predict"  # or "pseudo-residual", "dual-rate", "single-rate"
+    gains: str = "periodic"  # or "covariance", "placed"
+    disturbances: str = "none"  # a name of `models.DISTURBANCES`
+    delay: str = "clone"  # a name of `delay.RULES`
+    poles: tuple[float, ...] = ()  # rad/s, where gains are placed
+    second: str = ""  # model of a second layer
+    options: tuple[tuple[str, Any], ...] = ()  # (option, its default) unlike the common defaults
+    hdop: tuple[tuple[float, float], ...] = ()  # (HDOP, factor on the GPS's noise)
+    source: str  # paper with the equations
 
 
-ANY_SLOW = SLOW_NAMES
-GPS = ("gps",)
-CAMERA = ("camera",)
+_GPS = ("gps",)
+_CAMERA = ("camera",)
 
-JOINT = (("front_tyres_sd", 0.23), ("rear_tyres_sd", 0.23), ("wary", 10))
-ROBUST = (
+_JOINT = (("front_tyres_sd", 0.23), ("rear_tyres_sd", 0.23), ("wary", 10))
+_ROBUST = (
     ("fast", ("gyro", "accel_y")),
     ("inverse_friction_sd", 0.1),
     ("q_front_tyres", 0.0016),
@@ -76,41 +54,37 @@ ROBUST = (
     ("accel_scale_sd", 0.045),
     ("steer_rate", 3.0),
 )
-"""For a car of unknown parameters: levels of `benchmarks.tuning.robust`, found on simulated
-drives alone."""
+"""For a car of unknown parameters: found by `benchmarks.tuning.robust` on simulated drives."""
 
 FILTERS: dict[str, FilterDefinition] = {
     "bicycle-kf": FilterDefinition(source="tie-vision VI.A, the model (1)-(2)"),
     "single-rate-kf": FilterDefinition(
-        slow=ANY_SLOW, intersample="single-rate", source="tie-vision (12)-(15)"
+        slow=SLOW_NAMES, intersample="single-rate", source="tie-vision (12)-(15)"
     ),
-    "multirate-kf": FilterDefinition(slow=ANY_SLOW, source="tie-vision (12)-(13), (16)"),
+    "multirate-kf": FilterDefinition(slow=SLOW_NAMES, source="tie-vision (12)-(13), (16)"),
     "multirate-residual-kf": FilterDefinition(
-        slow=ANY_SLOW, intersample="pseudo-residual", source="tie-vision (12)-(13), (17)-(22)"
+        slow=SLOW_NAMES, intersample="pseudo-residual", source="tie-vision (12)-(13), (17)-(22)"
     ),
     "uneven-delay-kf": FilterDefinition(
-        slow=CAMERA,
-        intersample="pseudo-residual",
-        delay="stored",
-        source="uneven-delay (11)-(22)",
+        slow=_CAMERA, intersample="pseudo-residual", delay="stored", source="uneven-delay (11)-(22)"
     ),
     "constant-delay-kf": FilterDefinition(
-        slow=CAMERA,
+        slow=_CAMERA,
         intersample="pseudo-residual",
         delay="constant",
         source="uneven-delay 5, the rival in Fig. 5",
     ),
     "vision-only-kf": FilterDefinition(
-        slow=CAMERA, fast=(), source="uneven-delay (3)-(7), the camera's rows of C alone"
+        slow=_CAMERA, fast=(), source="uneven-delay (3)-(7), the camera's rows of C alone"
     ),
     "course-kf": FilterDefinition(
-        slow=GPS, gains="covariance", source="dakf-stability VI.A, [10]: (5)-(20) without d_1, d_2"
+        slow=_GPS, gains="covariance", source="dakf-stability VI.A, [10]: (5)-(20) without d_1, d_2"
     ),
     "dakf": FilterDefinition(
-        slow=GPS, gains="covariance", disturbances="walk", source="dakf-stability (5)-(20)"
+        slow=_GPS, gains="covariance", disturbances="walk", source="dakf-stability (5)-(20)"
     ),
     "double-layer": FilterDefinition(
-        slow=GPS,
+        slow=_GPS,
         intersample="pseudo-residual",
         gains="covariance",
         disturbances="walk",
@@ -118,6 +92,8 @@ FILTERS: dict[str, FilterDefinition] = {
         hdop=((1.0, 1.0), (20.0, 20.0)),
         source="double-layer-gps (28)-(29), (34)-(42)",
     ),
+    # the poles of both have the least error of beta of a grid from 1 to 200 rad/s, on the training
+    # seeds of double-layer-fig9 and dakf-fig6
     "lob-2": FilterDefinition(
         gains="placed", poles=(-60.0, -120.0), source="double-layer-gps 6.1, Aoki 2005"
     ),
@@ -131,7 +107,7 @@ FILTERS: dict[str, FilterDefinition] = {
         source="double-layer-gps 6.3 and (4)-(5), Chen 2008",
     ),
     "dual-rate": FilterDefinition(
-        slow=GPS,
+        slow=_GPS,
         fast=(),
         intersample="dual-rate",
         disturbances="walk-all",
@@ -155,20 +131,23 @@ FILTERS: dict[str, FilterDefinition] = {
         source="dakf-stability (1)-(2), [11]",
     ),
     "exact-kf": FilterDefinition(
-        slow=ANY_SLOW, gains="covariance", disturbances="forces", source="docs/PAPERS.md section 3"
-    ),
-    "joint": FilterDefinition(
-        slow=ANY_SLOW,
+        slow=SLOW_NAMES,
         gains="covariance",
         disturbances="forces",
-        options=JOINT,
+        source="docs/PAPERS.md section 3",
+    ),
+    "joint": FilterDefinition(
+        slow=SLOW_NAMES,
+        gains="covariance",
+        disturbances="forces",
+        options=_JOINT,
         source="docs/estimators.md, beyond the papers",
     ),
     "joint-robust": FilterDefinition(
-        slow=ANY_SLOW,
+        slow=SLOW_NAMES,
         gains="covariance",
         disturbances="forces",
-        options=(*JOINT, *ROBUST),
+        options=(*_JOINT, *_ROBUST),
         source="docs/estimators.md, beyond the papers",
     ),
 }

@@ -1,4 +1,4 @@
-"""`make_estimator`: from a row of the table, or a factory, and options to a filter."""
+"""Estimators by name: from a row of the table of filters, or a factory, and options."""
 
 import functools
 import math
@@ -51,21 +51,19 @@ def make_estimator(
         The estimator; what a factory builds comes as a `ForeignEstimator`.
 
     Raises:
-        ValueError: Unknown name, a sensor that is absent, a Q or noise that is no covariance, a
-            schedule that does not repeat, a sensor that can be later than the filter's window,
-            options that exclude each other, a filter that diverges.
+        ValueError: Unknown name, absent sensor, Q or noise that is no covariance, schedule without
+            repetition, sensor later than the filter's window, options at odds, divergence.
     """
     available, label = dict(sensors or {}), get_label(name)
     if not dt > 0.0:
         raise ValueError(f"{label}: a tick of {dt!r} s")
     if not (isinstance(name, str) and name in FILTERS):
         factory = ESTIMATORS.load(name) if isinstance(name, str) else name
-        built = factory(
-            vehicle=make_vehicle(vehicle), sensors=available, dt=dt, speed=speed, **options
-        )
-        return (
-            built if isinstance(built, Estimator) else ForeignEstimator(built, label, dt, available)
-        )
+        car = make_vehicle(vehicle)
+        built = factory(vehicle=car, sensors=available, dt=dt, speed=speed, **options)
+        if isinstance(built, Estimator):
+            return built
+        return ForeignEstimator(built, label, dt, available)
     if speed is not None and not 0.0 <= speed < math.inf:
         raise ValueError(f"{name}: speed is in m/s and not negative, got {speed!r}")
     config = parse_config(name, FILTERS[name], available, options)
@@ -73,10 +71,8 @@ def make_estimator(
     layers, schedules = assemble(config, car, dt, speed)
     estimator = (LateEstimator if config.latency else Estimator)(config, dt, layers, schedules)
     is_multi_sensor = len(config.sensors) > 1  # no cycle of both to check
-    checked_config = remove_tyre_states(select_first_sensor(config) if is_multi_sensor else config)
-    estimator.check(
-        layers if checked_config is config else assemble(checked_config, car, dt, speed)[0]
-    )
+    checked = remove_tyre_states(select_first_sensor(config) if is_multi_sensor else config)
+    estimator.check(layers if checked is config else assemble(checked, car, dt, speed)[0])
     return estimator
 
 

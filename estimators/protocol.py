@@ -1,7 +1,4 @@
-"""The estimates of a whole record, and the warning of what they cannot contain.
-
-The protocol of an estimator, and a user's own behind it, checked.
-"""
+"""What an estimator is: its protocol, a user's own one behind it, and the estimates of a record."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
@@ -29,8 +26,7 @@ class Estimates:
         x: States, shape (K, n).
         std: Their standard deviations, shape (K, n).
         names: Names of the n states.
-        nis: Normalised innovation squared of each packet, shape (packets,); NaN where it is not
-            used.
+        nis: Normalised innovation squared of each packet, shape (packets,); NaN without use.
     """
 
     time: Array
@@ -115,11 +111,11 @@ class ForeignEstimator:
     def __init__(
         self, inner: EstimatorLike, name: str, dt: float, sensors: Mapping[str, SlowSensor]
     ) -> None:
-        missing_members = [word for word in ("names", "reset", "step") if not hasattr(inner, word)]
-        if missing_members:
+        missing = [word for word in ("names", "reset", "step") if not hasattr(inner, word)]
+        if missing:
             raise TypeError(
                 f"{name} is no estimator: {type(inner).__name__} has no "
-                f"{', '.join(missing_members)}; see sideslip.estimators.EstimatorLike"
+                f"{', '.join(missing)}; see sideslip.estimators.EstimatorLike"
             )
         self.inner, self.name, self.dt, self.sensors = inner, name, dt, dict(sensors)
         self.names = () if isinstance(inner.names, str) else tuple(inner.names)
@@ -129,22 +125,12 @@ class ForeignEstimator:
         self.units = tuple(STATES.get(state, FOREIGN_STATE).unit for state in self.names)
 
     def reset(self, sensors: Mapping[str, SlowSensor] | None = None, first: int = 0) -> None:
-        """Reset as `EstimatorLike.reset` does.
-
-        Args:
-            sensors: Slow sensors of this episode by name; None keeps those of the last one.
-            first: Tick of the first fast row.
-        """
+        """Reset as `EstimatorLike.reset` does; without sensors those of the last episode stay."""
         self.sensors = self.sensors if sensors is None else dict(sensors)
         self.inner.reset(self.sensors, first)
 
     def step(self, rows: Array, packets: Array) -> None:
-        """Process copies of fast rows and packets.
-
-        Args:
-            rows: Fast rows, shape (k, FAST_WIDTH).
-            packets: Packets, shape (count, PACKET_WIDTH).
-        """
+        """Process copies of fast rows and packets as `EstimatorLike.step` does."""
         self.inner.step(np.array(rows, np.float64), np.array(packets, np.float64))
 
     @property
@@ -170,16 +156,9 @@ class ForeignEstimator:
         return value
 
     def run(self, source: Log | Record) -> Estimates:
-        """Reset, then filter a whole record tick by tick.
+        """Reset, then filter a whole record tick by tick, as `Estimator.run` does; NIS is NaN.
 
-        Args:
-            source: Record, or a log that has one.
-
-        Returns:
-            States and standard deviations of the record; NIS is NaN.
-
-        Raises:
-            ValueError: The record is empty or has another tick than `dt`.
+        ValueError says that the record is empty or has another tick than `dt`.
         """
         record = source.record if isinstance(source, Log) else source
         if len(record.fast) == 0 or abs(record.dt - self.dt) > 1e-9:
@@ -201,11 +180,7 @@ class ForeignEstimator:
         return copy.deepcopy(self.inner)
 
     def set_state(self, snapshot: Any) -> None:
-        """Replace `inner` by a copy of a snapshot.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Replace `inner` by a copy of what `get_state` returned."""
         self.inner = copy.deepcopy(snapshot)
 
     def __repr__(self) -> str:

@@ -1,7 +1,4 @@
-"""Classes in files of a user's own, by "FILE.py:Name": names of agents and estimators.
-
-Factories by name: those of the package, and those that users register as with Gymnasium.
-"""
+"""Factories of agents and estimators by name: built in, registered, or in a user's own file."""
 
 import ast
 import hashlib
@@ -17,7 +14,8 @@ from typing import Any
 from ..envs.validation import describe_unknown
 
 SUFFIX = ".py"
-_PREFIX = "sideslip_user_file_"  # of the modules' names
+_PREFIX = "sideslip_user_file_"  # of the modules that users' files become
+_Factory = Callable[..., Any]
 
 
 def is_user_file(text: str) -> bool:
@@ -43,8 +41,7 @@ def find_class(text: str) -> tuple[Path, str]:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: With file and line: it is no Python, has no such name, or defines no class or
-            several and none is named.
+        ValueError: With file and line: it is no Python, or has no such name or no single class.
     """
     file, _, name = (text, "", "") if text.endswith(SUFFIX) else text.rpartition(":")
     path = Path(file)
@@ -57,7 +54,7 @@ def find_class(text: str) -> tuple[Path, str]:
     except ValueError as error:  # a null byte
         raise ValueError(f"{path} is no Python: {error}") from None
     classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
-    classes = [class_name for class_name in classes if not class_name.startswith("_")]
+    classes = [word for word in classes if not word.startswith("_")]
     definitions = f"it defines {', '.join(classes) or 'no class'}"
     if name and name not in set(_iterate_bindings(tree)):
         raise ValueError(f"{path} has no {name!r}; {definitions}")
@@ -77,21 +74,8 @@ def _iterate_bindings(tree: ast.Module) -> Iterator[str]:
             yield node.id
 
 
-def load_user_class(text: str) -> Callable[..., Any]:
-    """Load the class, or another factory, of a user's file.
-
-    The file is run once a process as long as its content stays. It may import its neighbours.
-
-    Args:
-        text: "FILE.py:Name", or "FILE.py" for its only class.
-
-    Returns:
-        The factory.
-
-    Raises:
-        ValueError: As `find_class`, or the file raises; the message has the line.
-        TypeError: The name is not callable.
-    """
+def _load_user_class(text: str) -> Callable[..., Any]:
+    """Load a factory of a user's file as `find_class` finds it; the file is run once."""
     path, name = find_class(text)
     try:
         factory = getattr(_load_module(path.resolve()), name)
@@ -137,9 +121,6 @@ def describe_error(error: BaseException) -> str:
     return text + location
 
 
-Factory = Callable[..., Any]
-
-
 class Registry:
     """Factories of one kind of thing by name; iterates over all names.
 
@@ -148,22 +129,20 @@ class Registry:
         builtin: The package's own factories or entry points by name.
     """
 
-    def __init__(self, kind: str, builtin: Mapping[str, Factory | str]) -> None:
+    def __init__(self, kind: str, builtin: Mapping[str, _Factory | str]) -> None:
         self._kind = kind
-        self._factories: dict[str, Factory | str] = dict(builtin)
+        self._factories: dict[str, _Factory | str] = dict(builtin)
 
-    def register(self, name: str, factory: Factory | str) -> None:
+    def register(self, name: str, factory: _Factory | str) -> None:
         """Register a name; the same factory once more changes nothing.
 
         Args:
             name: New name, without a colon.
-            factory: A callable, or "package.module:Name" or "FILE.py:Name", loaded at its first
-                use.
+            factory: A callable, "package.module:Name" or "FILE.py:Name", loaded at its first use.
 
         Raises:
             TypeError: The name is no str, or the factory neither a callable nor a str.
-            ValueError: The name is empty, has a colon or belongs to another factory, or the string
-                is no entry point.
+            ValueError: The name is invalid or another factory's, or a str is no entry point.
         """
         if not isinstance(name, str):
             raise TypeError(f"the name of an {self._kind} is a str, got {name!r}")
@@ -181,26 +160,28 @@ class Registry:
         if known != factory:
             raise ValueError(f"the {self._kind} {name!r} is registered already, as {known!r}")
 
-    def load(self, name: str, others: Iterable[str] = ()) -> Factory:
-        """Load the factory of a name or an entry point; errors as in `import_entry_point`.
+    def load(self, name: str, others: Iterable[str] = ()) -> _Factory:
+        """Load the factory of a name or an entry point.
+
+        A user's file is run once a process while its content stays; it may import its neighbours.
 
         Args:
-            name: Registered name, "package.module:Name" or "FILE.py:Name" (see `load_user_class`).
+            name: Registered name, "package.module:Name" or "FILE.py:Name".
             others: Further names that may have been meant, for messages.
 
         Returns:
             The factory.
 
         Raises:
-            ValueError: The name is not registered.
+            ValueError: The name is not registered, or there is no such file, module or name.
         """
         factory = self._factories.get(name, name)
         if not isinstance(factory, str):
             return factory
         if is_user_file(factory):
-            return load_user_class(factory)
+            return _load_user_class(factory)
         if ":" in factory:
-            return import_entry_point(factory)
+            return _import_entry_point(factory)
         raise ValueError(describe_unknown(self._kind, [name], [*self._factories, *others]))
 
     def __contains__(self, name: object) -> bool:
@@ -220,20 +201,8 @@ def _split_entry_point(entry_point: str) -> tuple[str, str]:
     return module, name
 
 
-def import_entry_point(entry_point: str) -> Factory:
-    """Import the factory at an entry point.
-
-    Args:
-        entry_point: "package.module:Name".
-
-    Returns:
-        The factory.
-
-    Raises:
-        ModuleNotFoundError: The module needs another one that is missing.
-        TypeError: The object is not callable.
-        ValueError: There is no such module or name.
-    """
+def _import_entry_point(entry_point: str) -> _Factory:
+    """Import the factory at an entry point, "package.module:Name"."""
     module, name = _split_entry_point(entry_point)
     try:
         imported_module = importlib.import_module(module)
@@ -250,21 +219,18 @@ def import_entry_point(entry_point: str) -> Factory:
     return factory  # type: ignore[no-any-return]
 
 
-def find_entry_point(factory: Factory) -> str | None:
+def find_entry_point(factory: _Factory) -> str | None:
     """Find the entry point of a factory.
 
     Args:
         factory: A class or a function.
 
     Returns:
-        "package.module:Name", from which `import_entry_point` loads the factory, else None.
+        "package.module:Name" where it can be imported by that, else None.
     """
     text = f"{getattr(factory, '__module__', '')}:{getattr(factory, '__qualname__', '')}"
     try:
-        return (
-            text
-            if not text.startswith("__main__:") and import_entry_point(text) is factory
-            else None
-        )
+        is_found = not text.startswith("__main__:") and _import_entry_point(text) is factory
     except (TypeError, ValueError):
         return None
+    return text if is_found else None

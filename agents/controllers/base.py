@@ -1,4 +1,4 @@
-"""The base of every classical controller: named inputs, batches, memory outside the object."""
+"""The base of all classical controllers: named inputs, batches, memory outside the object."""
 
 import math
 from abc import ABC, abstractmethod
@@ -26,25 +26,24 @@ class Controller(ABC):
 
     A subclass names its inputs (`needs`, entries of the env's layout) and how many numbers it
     remembers (`memory`), and fills `_law`. `predict` is pure: all memory is in `state`, an array
-    (N, memory).
+    (N, memory). A controller serves a single env or all rows of a vector env, which then share its
+    design.
 
-    A controller serves a single env or all rows of a vector env, which then share its design.
     Where a needed entry is not finite the action is NaN and the memory stays as it was, which makes
     a failed estimator visible: an env with `on_bad_action="fail"` ends the episode, others raise.
 
     Args:
         env: Env whose nominal car and layout the controller is designed for.
-        grip: Fraction, for the yaw moment, of the force that friction lets the rear tyres transmit;
-            the rest is left for lateral force. None: the motors limit the moment alone. The
-            friction is the observation's `true_friction`, or else the nominal car's.
+        grip: Fraction of the rear tyres' friction force for the yaw moment; the rest is for lateral
+            force. None: no such limit. Friction is `true_friction`, else the nominal car's.
 
     Attributes:
         needs: Entries of the observation that the controller reads.
         memory: Numbers of memory for each row.
 
     Raises:
-        ValueError: The observation lacks a needed entry, `grip` is not positive, or the rows of a
-            vector env have different nominal cars.
+        ValueError: A needed entry is missing, `grip` is not positive, or rows have different
+            nominals.
     """
 
     needs: tuple[str, ...] = ()
@@ -56,8 +55,8 @@ class Controller(ABC):
         facts = get_env_facts(env)
         names = [entry.name for entry in facts.layout]
         self.grip = None if grip is None else check_positive("grip", grip)
-        limits = grip is not None or self.knows_friction
-        self._true_friction = limits and FRICTION in names
+        reads_friction = grip is not None or self.knows_friction
+        self._true_friction = reads_friction and FRICTION in names
         if self._true_friction:
             self.needs = (*self.needs, FRICTION)
         missing = [name for name in self.needs if name not in names]
@@ -90,12 +89,9 @@ class Controller(ABC):
         return inputs[:, -1] if self._true_friction else np.full(len(inputs), self.nominal.friction)
 
     def _compute_max_moment(self, inputs: Array) -> Array:
-        """Compute the largest yaw moment as a fraction of full scale, shape (N,).
-
-        The motors' power at the measured speed (columns 0 and 1, the front wheels) and `grip` limit
-        it.
-        """
+        """Compute the largest yaw moment as a fraction of full scale, shape (N,)."""
         car, max_moment = self.vehicle, np.ones(len(inputs))
+        # the motors' power limits it at the measured speed (columns 0 and 1, the front wheels)
         if car.motor_power > 0.0:
             max_moment = _torque_limit(inputs[:, :2].mean(axis=1), self._car) / car.motor_torque
         if self.grip is None:

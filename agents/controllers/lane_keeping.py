@@ -1,7 +1,6 @@
 """Lane keeping on curved roads: motion and position together, by front steering and yaw moment.
 
-The aim of uneven-delay: a vision filter's sideslip angle, yaw rate, heading and lateral position
-serve one controller of all four.
+Uneven-delay's aim: sideslip angle, yaw rate, heading and offset of one vision filter serve it.
 """
 
 import math
@@ -28,7 +27,6 @@ Inputs = namedtuple(
 )
 """Columns of the law's inputs."""
 
-
 Lane = namedtuple("Lane", "beta gamma psi y N_z delta_f integral driver kappa")
 """States of the lane model: the inputs move the first seven, the others move by themselves.
 
@@ -38,37 +36,19 @@ line (m), and integral is its integral (m s). N_z is a fraction of full scale.
 Memory = namedtuple("Memory", "integral rate heading started")
 """The integral, the filtered gamma / V and psi that the curvature is from, whether it began."""
 
-
 IN = Inputs(*range(10))
 AT = Lane(*range(9))
 LAST = Memory(*range(4))
 MOVED = Lane._fields[: AT.driver]
 HASTE = 3.0
-OFFSET_SCALE, INTEGRAL_SCALE = 0.1, 0.2  # m, m s
+_OFFSET_SCALE, _INTEGRAL_SCALE = 0.1, 0.2  # m, m s
 
 
-def make_lane_model(
+def _make_lane_model(
     vehicle: Vehicle, speed: float, period: int, full_scale: float, haste: float
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Make the model of `Lane` over a period and its cost, as `solve_lqr` takes them.
-
-    Inputs are the fraction of the full yaw moment, and rad added to the driver's steering. The cost
-    rate is the env's of beta and of both inputs, with gamma against V kappa. It adds the squares of
-    the offset over 0.1 m and of its integral over 0.2 m s. A last term is haste times the square of
-    the steering command's lead over the applied angle. Its unit is the angle that the rate covers
-    in a period and a lag: without it a linear law commands what the rate cannot give. The cost is
-    taken at each period's end.
-
-    Args:
-        vehicle: Vehicle of the design.
-        speed: Speed (m/s).
-        period: Control period in ticks.
-        full_scale: Full yaw moment (N m).
-        haste: Weight of the steering command's lead.
-
-    Returns:
-        G (n, n), H (n, 2), Q (n, n), R (2, 2) and N (n, 2).
-    """
+    """Make the model of `Lane` over a period (ticks) and its cost, as `solve_lqr` takes them."""
+    # Inputs are the fraction of the full yaw moment (N m), and rad added to the driver's steering.
     n, T = len(AT), period * TICK
     plane = make_vision_model(vehicle, speed)
     lags = [max(tau, TICK) for tau in (vehicle.motor_lag, vehicle.steering_lag)]
@@ -83,19 +63,19 @@ def make_lane_model(
     A[AT.delta_f, AT.driver] = 1.0 / lags[1]
     A[AT.integral, AT.y] = 1.0
     G, H = LinearModel(A, B, np.eye(n), Lane._fields, (), ()).discretise(T)
+    # The cost at a period's end is the env's of beta and both inputs, with gamma against V kappa,
+    # and the squares of the offset over 0.1 m and of its integral over 0.2 m s. The last term is
+    # haste times the square of the steering command's lead over the applied angle, in the angle
+    # that the rate covers in a period and a lag: else a linear law commands too fast a steering.
     C = np.zeros((6, n))
     for row, state in enumerate((AT.beta, AT.gamma, AT.N_z, AT.y, AT.integral, AT.delta_f)):
         C[row, state] = 1.0
     C[1, AT.kappa], C[5, AT.driver] = -speed, -1.0  # gamma - V kappa; the added steering alone
     command_error = np.zeros((1, n + 2))  # of the applied steering, the one asked for
-    command_error[0, AT.delta_f], command_error[0, AT.driver], command_error[0, n + 1] = (
-        -1.0,
-        1.0,
-        1.0,
-    )
+    command_error[0, [AT.delta_f, AT.driver, n + 1]] = -1.0, 1.0, 1.0
     cost_outputs = np.vstack([C @ np.hstack([G, H]), command_error])
     reach = vehicle.steering_rate * (T + vehicle.steering_lag)
-    scales = (BETA_SCALE, GAMMA_SCALE, 1.0, OFFSET_SCALE, INTEGRAL_SCALE, STEER_SCALE, reach)
+    scales = (BETA_SCALE, GAMMA_SCALE, 1.0, _OFFSET_SCALE, _INTEGRAL_SCALE, STEER_SCALE, reach)
     shares = (1.0, 1.0, EFFORT_WEIGHT, 1.0, 1.0, EFFORT_WEIGHT, haste)
     W = T * np.diag([share / scale**2 for share, scale in zip(shares, scales, strict=True)])
     cost_matrix = cost_outputs.T @ W @ cost_outputs
@@ -116,7 +96,7 @@ def _lane_keeping_law(
     dt: float,
     authority: float,
 ) -> None:
-    """x: `Inputs`. state: `Memory`."""
+    """Compute the actions from `Inputs` x and update the `Memory` state."""
     m, n = table.shape[3:]
     K, z = np.empty((m, n)), np.empty(n)
     for row in range(len(x)):
@@ -161,7 +141,7 @@ class LaneKeeping(Controller):
         env: Env of the controller, whose action steers.
         moment: Whether to use the yaw moment beside the steering.
         curvature_time: Time constant of the curvature's filter (s).
-        haste: Weight of the steering command's lead, as for `make_lane_model`.
+        haste: Weight of the steering command's lead over the applied angle.
 
     Raises:
         ValueError: The action does not steer, an entry is missing, or an option is out of range.
@@ -178,11 +158,12 @@ class LaneKeeping(Controller):
             raise ValueError("LaneKeeping needs an env whose action steers (steering=True)")
         if not 0.0 <= haste < math.inf:
             raise ValueError(f"haste is zero or more, got {haste!r}")
-        speeds = SPEEDS[::2]
-        inputs = slice(0 if moment else 1, 2)
+        speeds, inputs = SPEEDS[::2], slice(0 if moment else 1, 2)
         gains, car = [], self.nominal
         for speed in speeds:
-            G, H, Q, R, N = make_lane_model(car, speed, self.control_period, self.full_scale, haste)
+            G, H, Q, R, N = _make_lane_model(
+                car, speed, self.control_period, self.full_scale, haste
+            )
             optimum = solve_lqr(G, H[:, inputs], Q, R[inputs, inputs], N[:, inputs], len(MOVED))
             gains.append(optimum[0])
         self._design = (

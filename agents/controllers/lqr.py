@@ -24,8 +24,6 @@ Inputs = namedtuple(
     "beta_hat gamma_hat disturbance_1 disturbance_2 front_stiffness rear_stiffness",
 )
 """Columns of the law's inputs; `Lqr` puts in beta_ref for those that it does without."""
-
-
 IN = Inputs(*range(14))
 
 
@@ -35,8 +33,7 @@ def make_design_state(x: Any, share: Any, z: Any) -> None:
 
     Args:
         x: Row of `Inputs`.
-        share: Yaw moment per difference of the motors' torques, as a fraction of full scale (1/N
-            m).
+        share: Yaw moment, as a fraction of full scale, per difference of motor torques (1/N m).
         z: States of the design model, shape (n,), filled.
     """
     z[0], z[1] = x[IN.beta_hat], x[IN.gamma_hat]
@@ -60,12 +57,8 @@ def _lqr_law(
     slew: Any,
     front_arm: Any,
 ) -> None:
-    """Compute the actions of LQR within the limits.
-
-    x: `Inputs`. state: steering last added (rad), where the car steers. max_moment: yaw moment as a
-    fraction of full scale, shape (N,). sliding_slip: slip at which the front tyres slide (rad),
-    (N,).
-    """
+    """Compute the actions of LQR within the limits; state: steering last added (rad)."""
+    # sliding_slip: slip at which the front tyres slide (rad), max_moment: of full scale, both (N,)
     m, n = table.shape[3], table.shape[4] - table.shape[3]
     KS, z = np.empty((m, n + m)), np.empty(n)
     for row in range(len(x)):
@@ -88,7 +81,7 @@ def _lqr_law(
             min(straight - sliding_slip[row], 0.0),
         )
         low, high = _clip(min_w, low, high), _clip(max_w, low, high)
-        u, w = solve_box_qp(KS[0, n], KS[0, n + 1], KS[1, n + 1], u, w, max_moment[row], low, high)
+        u, w = _solve_box_qp(KS[0, n], KS[0, n + 1], KS[1, n + 1], u, w, max_moment[row], low, high)
         action[row, 0], action[row, 1], state[row, 0] = u, w / authority, w
 
 
@@ -106,14 +99,11 @@ class Lqr(Controller):
         env: Env of the controller.
         disturbance_time: Time in which F_d and N_d decay (s).
         vehicle: Vehicle of the design; None: the env's nominal one.
-        stiffness: Two entries of the observation, front and rear cornering stiffness of a tyre
-            (N/rad), on which the gains are scheduled too.
+        stiffness: Entries of the front and rear cornering stiffness (N/rad), to schedule gains on.
         span: Range of the stiffness schedule, as factors of the vehicle's.
         knots: Knots of each stiffness axis; the table is designed once.
-        steer_weight: Factor on the cost of added steering, for the rate limit that the design
-            lacks.
-        grip: Grip limit, as for `Controller`; it also keeps added steering from making the front
-            tyres slide.
+        steer_weight: Factor on the cost of added steering, whose rate limit the design lacks.
+        grip: Grip limit, as for `Controller`; it also keeps the front tyres from sliding.
 
     Raises:
         ValueError: An entry is missing, or an option is out of range.
@@ -212,12 +202,7 @@ class Lqr(Controller):
         return np.asarray(KS[:, len(self.design_spec.states) :] * np.outer(per, per))
 
     def record_action(self, state: Array, action: Any) -> None:
-        """Note the added steering, from which the rate limit counts.
-
-        Args:
-            state: Memory, shape (N, memory), updated.
-            action: Action that the env gets, shape (N, width).
-        """
+        """Note the added steering, from which the rate limit counts."""
         if self.width == 2:
             state[:, 0] = action[:, 1] * self.authority
 
@@ -226,11 +211,8 @@ class Lqr(Controller):
         _lqr_law(inputs, state, action, *limits, *self._design)
 
     def _compute_sliding_slip(self, inputs: Array) -> Array:
-        """Compute the slip at which the front tyres' force stops growing (Fiala), rad, shape (N,).
-
-        It is infinite without a grip limit.
-        """
-        if self.grip is None:
+        """Compute the slip at which the front tyres slide (Fiala), rad, shape (N,)."""
+        if self.grip is None:  # no limit
             return np.full(len(inputs), np.inf)
         car = self.vehicle
         stiffness = inputs[:, IN.front_stiffness] if self.scheduled else car.front_stiffness
@@ -245,27 +227,12 @@ def _clip(value: Any, low: Any, high: Any) -> Any:
 
 
 @jit
-def solve_box_qp(
+def _solve_box_qp(
     s_uu: Any, s_uw: Any, s_ww: Any, u: Any, w: Any, max_u: Any, low: Any, high: Any
 ) -> Any:
-    """Find the point with |u| <= max_u and low <= w <= high that is nearest to (u, w).
-
-    The distance is du^2 s_uu + 2 du dw s_uw + dw^2 s_ww, positive definite. The point is (u, w)
-    itself where it is within, else the least of the four edges' own minima.
-
-    Args:
-        s_uu: Weight of du^2.
-        s_uw: Weight of du dw, halved.
-        s_ww: Weight of dw^2.
-        u: First coordinate.
-        w: Second coordinate.
-        max_u: Limit of |u|.
-        low: Lower limit of w.
-        high: Upper limit of w.
-
-    Returns:
-        Coordinates u and w of the point.
-    """
+    """Find the point with |u| <= max_u, low <= w <= high that is nearest to (u, w)."""
+    # The distance is du^2 s_uu + 2 du dw s_uw + dw^2 s_ww, positive definite: the point is (u, w)
+    # itself where it is within, else the least of the four edges' own minima.
     if absolute(u) <= max_u and low <= w <= high:
         return u, w
     best_u, best_w, best_cost = 0.0, 0.0, -1.0

@@ -1,8 +1,7 @@
 """dakf-stability's controller: a model of the response is followed by steering and yaw moment.
 
-Section V: reference model (23), feedforward (28), feedback (31), disturbance rejection (26). All of
-it is algebra on the nominal A and B at the measured speed (the mean of the two front wheels'), so
-that nothing is tabulated and no design tool is needed.
+Section V: reference model (23), feedforward (28), feedback (31), disturbance rejection (26), as
+algebra on the nominal A and B at the measured speed, the mean of the two front wheels'.
 """
 
 import math
@@ -32,7 +31,6 @@ from .base import Controller, integrate_antiwindup, list_entry_names
 MIN_SPEED = 2.0  # m/s: below it the vehicle is taken as at this speed
 BANDWIDTH = (5.0, 5.0)  # rad/s, K_beta and K_gamma of dakf-stability V.D
 
-
 Inputs = namedtuple(
     "Inputs",
     "wheel_left wheel_right steer_command beta_ref gamma_ref beta_hat gamma_hat d1_hat d2_hat",
@@ -40,7 +38,6 @@ Inputs = namedtuple(
 """Columns of the law's inputs; what the observation lacks is put in by `ModelFollowing`."""
 Memory = namedtuple("Memory", "delta_f N_z driver known")
 """The integrals in rad and N m, the last steering command, and whether there was one."""
-
 
 IN = Inputs(*range(9))
 LAST = Memory(*range(4))
@@ -89,7 +86,7 @@ def _model_following_law(
     authority: float,
     dt: float,
 ) -> None:
-    """x: `Inputs`. state: `Memory`. K: K_beta, K_gamma."""
+    """Compute the actions from `Inputs` x and update the `Memory` state; K: K_beta, K_gamma."""
     for n in range(len(x)):
         v = maximum(0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right]), MIN_SPEED)
         driver, beta_ref, gamma_ref = x[n, IN.steer_command], x[n, IN.beta_ref], x[n, IN.gamma_ref]
@@ -126,9 +123,8 @@ def _model_following_law(
         limit = max_moment[n] * full_scale
         moment = min(max(N_z, -limit), limit)
         drift_rates = compute_drift(plant, p_beta, p_gamma)
-        steps = solve_inputs(
-            plant, -drift_rates[0] * dt, -drift_rates[1] * dt
-        )  # I of (31), forward Euler
+        # I of (31), forward Euler
+        steps = solve_inputs(plant, -drift_rates[0] * dt, -drift_rates[1] * dt)
         state[n, LAST.delta_f] = integrate_antiwindup(
             state[n, LAST.delta_f], steps[0], delta_f, steer
         )
@@ -156,8 +152,7 @@ class ModelFollowing(Controller):
         grip: Grip limit, as for `Controller`.
 
     Raises:
-        ValueError: The action does not steer, the bandwidth is not two positive numbers, or an
-            entry is missing.
+        ValueError: The action does not steer, an entry is missing, or the bandwidth is no pair.
     """
 
     memory = len(Memory._fields)

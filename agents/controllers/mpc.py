@@ -1,7 +1,4 @@
-"""The quadratic program of a linear predictive controller, states eliminated.
-
-Linear model predictive control: the LQR's cost under the actuators' limits, solved by OSQP.
-"""
+"""Linear model predictive control: the LQR's cost under the actuators' limits, solved by OSQP."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -15,47 +12,44 @@ from scipy.sparse import csc_matrix
 from ...envs.record import Array
 from ...envs.ticks import TICK
 from ...envs.vehicle.parameters import Vehicle
-from ..design.sampled_model import (
-    SPEEDS,
-    DesignModel,
-    DesignSpec,
-    compute_cost_to_go,
-    make_design_model,
-)
+from ..design.sampled_model import SPEEDS, DesignSpec, compute_cost_to_go, make_design_model
 from ..env_info import AnyEnv
 from .lqr import IN, Lqr, make_design_state
 
+MIN_STEP = 10  # ticks, the shortest of the prediction
+NOT_FINITE = "the observation is not finite"
+_RHO = 0.1  # the solver's first; every call starts from it, whatever the last one ended with
+_SETTINGS = {
+    "verbose": False,
+    "adaptive_rho": 1,  # by iterations, not by the time they take
+    "adaptive_rho_interval": 50,
+    "rho": _RHO,
+    "eps_abs": 1e-4,  # of full scale
+    "eps_rel": 1e-4,
+    "check_termination": 10,
+    "polishing": False,
+}
+
 
 @dataclass(frozen=True)
-class QuadraticProgram:
+class _QuadraticProgram:
     """Minimise a'P a / 2 + (F x)'a over the inputs a (h m,) of h steps from the state x (n,).
 
     Inputs stand step by step, as fractions of their limits. The cost is scaled so that the mean of
     P's diagonal is 1.
-
-    Attributes:
-        P: Hessian, shape (h m, h m).
-        F: Effect of the state on the gradient, shape (h m, n).
-        A: Constrained combinations, shape (rows, h m): the inputs themselves, then, where the car
-            steers, the change of the steering fraction in each step.
     """
 
-    P: Array
-    F: Array
-    A: Array
+    P: Array  # Hessian, (h m, h m)
+    F: Array  # effect of the state on the gradient, (h m, n)
+    A: Array  # constrained combinations, (rows, h m): inputs, then changes of added steering
 
 
-def condense_qp(model: DesignModel, horizon: int, limits: Array) -> QuadraticProgram:
-    """Condense a model's steps into a program, with the regulator's cost to go at its end.
-
-    Args:
-        model: Design model.
-        horizon: Number of steps.
-        limits: Inputs at a fraction of 1, shape (m,).
-
-    Returns:
-        Program in the inputs over `limits`.
-    """
+@lru_cache(maxsize=4 * len(SPEEDS))
+def _condense_program(
+    vehicle: Vehicle, speed: float, design_spec: DesignSpec, horizon: int, authority: float
+) -> _QuadraticProgram:
+    """Condense the design model's steps into a program, with the LQR's cost to go at its end."""
+    model, limits = make_design_model(vehicle, speed, design_spec), np.array([1.0, authority])
     n, m = model.H.shape
     Sx, Su = np.zeros(((horizon + 1) * n, n)), np.zeros(((horizon + 1) * n, horizon * m))
     Sx[:n] = np.eye(n)
@@ -66,7 +60,7 @@ def condense_qp(model: DesignModel, horizon: int, limits: Array) -> QuadraticPro
     Q = block_diag(*[model.Q] * horizon, compute_cost_to_go(model)[1])
     R = block_diag(*[model.R] * horizon)
     N = np.vstack([block_diag(*[model.N] * horizon), np.zeros((n, horizon * m))])
-    scale = np.tile(limits, horizon)
+    scale = np.tile(limits[: len(design_spec.inputs)], horizon)
     P = scale[:, None] * (Su.T @ Q @ Su + Su.T @ N + N.T @ Su + R) * scale
     F = scale[:, None] * ((Su.T @ Q + N.T) @ Sx)
     size = float(np.diag(P).mean())
@@ -74,30 +68,7 @@ def condense_qp(model: DesignModel, horizon: int, limits: Array) -> QuadraticPro
     if m > 1:
         changes = np.eye(horizon) - np.eye(horizon, k=-1)
         A = np.vstack([A, np.kron(changes, [[0.0, 1.0]])])
-    return QuadraticProgram(0.5 * (P + P.T) / size, F / size, A)
-
-
-MIN_STEP = 10  # ticks, the shortest of the prediction
-NOT_FINITE = "the observation is not finite"
-RHO = 0.1  # the solver's first; every call starts from it, whatever the last one ended with
-_SETTINGS = {
-    "verbose": False,
-    "adaptive_rho": 1,  # by iterations, not by the time they take
-    "adaptive_rho_interval": 50,
-    "rho": RHO,
-    "eps_abs": 1e-4,  # of full scale
-    "eps_rel": 1e-4,
-    "check_termination": 10,
-    "polishing": False,
-}
-
-
-@lru_cache(maxsize=4 * len(SPEEDS))
-def _make_program(
-    vehicle: Vehicle, speed: float, design_spec: DesignSpec, horizon: int, authority: float
-) -> QuadraticProgram:
-    limits = np.array([1.0, authority])[: len(design_spec.inputs)]
-    return condense_qp(make_design_model(vehicle, speed, design_spec), horizon, limits)
+    return _QuadraticProgram(0.5 * (P + P.T) / size, F / size, A)
 
 
 class Mpc(Lqr):
@@ -153,7 +124,7 @@ class Mpc(Lqr):
         inputs = horizon * self.width
         self._rows = inputs + (horizon if self.width > 1 else 0)
         self.memory = 1 + inputs + self._rows
-        self._ready_for: dict[float, tuple[QuadraticProgram, Any]] = {}
+        self._ready_for: dict[float, tuple[_QuadraticProgram, Any]] = {}
         self.status: list[str] = []
         self.solve_time: list[float] = []
 
@@ -167,17 +138,10 @@ class Mpc(Lqr):
 
         self.__dict__.update(state | {"_osqp": osqp})
 
-    def get_program(self, speed: float) -> QuadraticProgram:
-        """Get the quadratic program of the nearest speed of `SPEEDS`.
-
-        Args:
-            speed: Speed (m/s).
-
-        Returns:
-            Program of that speed.
-        """
-        nearest = _find_nearest_speed(speed)
-        return _make_program(self.nominal, nearest, self.prediction, self.horizon, self.authority)
+    def _get_program(self, speed: float) -> _QuadraticProgram:
+        """Get the quadratic program of the nearest speed of `SPEEDS`."""
+        car, nearest = self.nominal, _find_nearest_speed(speed)
+        return _condense_program(car, nearest, self.prediction, self.horizon, self.authority)
 
     def _mark_not_finite(self, rows: Any, state: Array) -> None:
         for i in np.flatnonzero(rows):
@@ -195,12 +159,7 @@ class Mpc(Lqr):
             self.solve_time.append(seconds)
 
     def record_action(self, state: Array, action: Any) -> None:
-        """Note the added steering as a fraction of the authority, from which the rate limit counts.
-
-        Args:
-            state: Memory, shape (N, memory), updated.
-            action: Action that the env gets, shape (N, width).
-        """
+        """Note the added steering as a fraction of the authority, from which its rate counts."""
         if self.width == 2:
             state[:, 0] = action[:, 1]
 
@@ -216,7 +175,7 @@ class Mpc(Lqr):
             low[count] += memory[0]
             high[count] += memory[0]
         program, solver = self._get_solver(_find_nearest_speed(speed))
-        solver.update_settings(rho=RHO)
+        solver.update_settings(rho=_RHO)
         solver.update(q=program.F @ z, l=low, u=high)
         solver.warm_start(x=memory[1 : 1 + count], y=memory[1 + count :])
         solution = solver.solve(raise_error=False)
@@ -236,10 +195,10 @@ class Mpc(Lqr):
             return values
         return np.concatenate([values[width:], values[-width:]])
 
-    def _get_solver(self, speed: float) -> tuple[QuadraticProgram, Any]:
+    def _get_solver(self, speed: float) -> tuple[_QuadraticProgram, Any]:
         """Get the program of a speed of `SPEEDS` and its solver, set up at its first use."""
         if speed not in self._ready_for:
-            program, solver = self.get_program(speed), self._osqp.OSQP()
+            program, solver = self._get_program(speed), self._osqp.OSQP()
             solver.setup(
                 csc_matrix(np.triu(program.P)),
                 np.zeros(len(program.P)),

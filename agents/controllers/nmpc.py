@@ -1,6 +1,7 @@
-"""Nonlinear model predictive control: the plant's own text foreseen, a plan improved each time.
+"""Nonlinear model predictive control by Gauss-Newton iterations, and control adapted to tyres.
 
-Adaptive control: gains and predictions follow the tyres that a filter estimates on the way.
+The prediction is the plant's own compiled code. The adaptive controllers follow the tyres that a
+filter estimates on the way.
 """
 
 import math
@@ -33,14 +34,16 @@ from .base import check_positive
 from .lqr import IN, Lqr
 
 MIN_STEP = 10  # ticks, the shortest of the prediction
-FIRST_ITERATIONS = 6  # more iterations at an episode's first decision
-MAX_SIDESLIP = 1.2  # rad of sideslip, beyond which a prediction starts from this
+_FIRST_ITERATIONS = 6  # more iterations at an episode's first decision
+_MAX_SIDESLIP = 1.2  # rad of sideslip, beyond which a prediction starts from this
 STATUSES = ("unknown", "solved", "the observation is not finite", "diverged")
 UNKNOWN, SOLVED, NOT_FINITE, DIVERGED = range(len(STATUSES))
+TYRES = ("front_tyres_hat", "rear_tyres_hat")
+INVERSE_FRICTION = "inverse_friction_hat"
+_MIN_FRICTION, _MAX_FRICTION = 0.2, 1.2  # of the friction that is believed
 
 Memory = namedtuple("Memory", "slewing status")
 """Steering last added (rad) and index in `STATUSES`; the plan stands behind."""
-
 LAST = Memory(*range(2))
 PLAN = len(Memory._fields)
 
@@ -81,22 +84,12 @@ def _interpolate_regulator(table: Any, axes: Any, v: Any, front: Any, rear: Any,
 
 
 @jit
-def prepare_prediction(
+def _prepare_prediction(
     design: Design, x: Any, friction: Any, roll: Any, slewing: Any, max_moment: Any
 ) -> Any:
-    """Prepare a row's prediction and its regulator.
-
-    Args:
-        design: Parts that all decisions share.
-        x: Row of `lqr.Inputs`.
-        friction: Friction of the road.
-        roll: Roll angle and rate (rad, rad/s), shape (2,); NaN where they are not measured.
-        slewing: Steering last added (rad).
-        max_moment: Largest yaw moment as a fraction of full scale.
-
-    Returns:
-        `PredictionStart`, K (m, 9), and T (4, 9) of the terminal cost |T x|^2.
-    """
+    """Prepare a row's `PredictionStart`, K (m, 9), and T (4, 9) of the terminal cost |T x|^2."""
+    # x: row of `lqr.Inputs`, roll: angle and rate (rad, rad/s), NaN where they are not measured,
+    # slewing: steering last added (rad), max_moment: fraction of full scale
     model, disturbed = design.model, design.disturbed
     v = max(0.5 * (x[IN.wheel_left] + x[IN.wheel_right]), MIN_SPEED)
     front = x[IN.front_stiffness] if design.scheduled else model.car.C_f
@@ -115,7 +108,7 @@ def prepare_prediction(
     if phi != phi:  # as in a steady turn
         phi, rate = car.S * v * gamma / (car.K_x - car.S * GRAVITY), 0.0
     rolls = float(model.kind.roll)
-    sine, cosine = sincos(min(max(x[IN.beta_hat], -MAX_SIDESLIP), MAX_SIDESLIP))
+    sine, cosine = sincos(min(max(x[IN.beta_hat], -_MAX_SIDESLIP), _MAX_SIDESLIP))
     v_y = v * (x[IN.beta_hat] if model.kind.small_angle else sine / cosine)
     start = PredictionStart(
         car,
@@ -140,17 +133,14 @@ def prepare_prediction(
 def _nmpc_law(
     x: Any, state: Any, action: Any, max_moment: Any, friction: Any, rolls: Any, design: Design
 ) -> None:
-    """Compute the actions of nonlinear MPC.
-
-    x: `lqr.Inputs`. state: `Memory` and the plan. rolls: (N, 2), as in `prepare_prediction`.
-    """
+    """Compute the actions; state: `Memory` and the plan, rolls: as in `_prepare_prediction`."""
     blocks, m = design.blocks, design.gains.shape[3]
     for row in range(len(x)):
         slewing = state[row, LAST.slewing]
-        start, K, T = prepare_prediction(
+        start, K, T = _prepare_prediction(
             design, x[row], friction[row], rolls[row], slewing, max_moment[row]
         )
-        plan, extra_iterations = state[row, PLAN:].copy(), FIRST_ITERATIONS
+        plan, extra_iterations = state[row, PLAN:].copy(), _FIRST_ITERATIONS
         if state[row, LAST.status] == SOLVED:
             _shift_plan(plan, blocks, m, design.steps)
             extra_iterations = 0
@@ -194,8 +184,7 @@ class Nmpc(Lqr):
         grip: Grip limit, as for `Controller`.
 
     Raises:
-        ValueError: An entry is missing, an option is out of range, or the rows of a vector env have
-            different plants.
+        ValueError: An entry is missing, an option is out of range, or rows have different plants.
     """
 
     min_period = MIN_STEP
@@ -267,9 +256,8 @@ class Nmpc(Lqr):
         if self._rolling:
             rolls = np.ascontiguousarray(inputs[:, len(IN) : len(IN) + 2])
         friction = np.ascontiguousarray(self._get_friction(inputs))
-        _nmpc_law(
-            inputs, state, action, self._compute_max_moment(inputs), friction, rolls, self.design
-        )
+        max_moment = self._compute_max_moment(inputs)
+        _nmpc_law(inputs, state, action, max_moment, friction, rolls, self.design)
 
 
 def _read_plant_kind(env: AnyEnv, reference: int) -> tuple[StepVariant, bool, bool]:
@@ -286,40 +274,29 @@ def _read_plant_kind(env: AnyEnv, reference: int) -> tuple[StepVariant, bool, bo
     return kind, plant.lags, plant.yaw_first
 
 
-TYRES = ("front_tyres_hat", "rear_tyres_hat")
-INVERSE_FRICTION = "inverse_friction_hat"
-MIN_FRICTION, MAX_FRICTION = 0.2, 1.2  # of the friction that is believed
-
-
 class AdaptiveLqr(Lqr):
     """`Lqr` scheduled on the stiffness factors front_tyres_hat and rear_tyres_hat of `joint`.
 
-    Where the observation has inverse_friction_hat (`joint` with inverse_friction_sd), limits use
-    that friction, within 0.2 to 1.2.
+    Where the observation has inverse_friction_hat, limits use that friction, within 0.2 to 1.2.
 
     Args:
         env: Env of the controller, with both factors in its observation.
         grip: Grip limit, as for `Controller`.
         options: Other arguments of `Lqr`.
-
-    Raises:
-        ValueError: The tyres are not in the observation, or as `Lqr`.
     """
 
     def __init__(self, env: AnyEnv, grip: float | None = 0.7, **options: Any) -> None:
         super().__init__(env, stiffness=TYRES, grip=grip, **options)
 
     def _list_extra_entries(self, names: set[str]) -> tuple[str, ...]:
-        return (
-            *super()._list_extra_entries(names),
-            *((INVERSE_FRICTION,) if INVERSE_FRICTION in names else ()),
-        )
+        extra = (INVERSE_FRICTION,) if INVERSE_FRICTION in names else ()
+        return (*super()._list_extra_entries(names), *extra)
 
     def _get_friction(self, inputs: Array) -> Array:
         if INVERSE_FRICTION not in self.needs:
             return super()._get_friction(inputs)
         estimated = inputs[:, self.needs.index(INVERSE_FRICTION)]
-        return np.asarray(1.0 / np.clip(estimated, 1.0 / MAX_FRICTION, 1.0 / MIN_FRICTION))
+        return np.asarray(1.0 / np.clip(estimated, 1.0 / _MAX_FRICTION, 1.0 / _MIN_FRICTION))
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         inputs[:, IN.front_stiffness] *= self.vehicle.front_stiffness
@@ -328,10 +305,4 @@ class AdaptiveLqr(Lqr):
 
 
 class AdaptiveNmpc(AdaptiveLqr, Nmpc):
-    """`Nmpc` that predicts with the tyres and the friction of `joint`, as `AdaptiveLqr` has them.
-
-    Args:
-        env: Env of the controller, with both factors in its observation.
-        grip: Grip limit, as for `Controller`.
-        options: Other arguments of `Nmpc`.
-    """
+    """`Nmpc` that predicts with tyres and friction of `joint`, as `AdaptiveLqr` has them."""

@@ -24,12 +24,10 @@ SPEEDS = np.arange(MIN_SPEED, 61.0, 0.5)  # m/s
 CAMERA_PERIOD = 0.033  # s
 FEEDFORWARDS = ("reference", "zero-slip")
 
-
 Inputs = namedtuple("Inputs", "wheel_left wheel_right steer_command beta_hat beta_ref")
 """Columns of the laws' inputs; the feedforward reads the first three alone."""
 Memory = namedtuple("Memory", "integral wait share")
 """The integral (N m), decisions until the next update, and the fraction held until then."""
-
 
 IN = Inputs(*range(5))
 LAST = Memory(*range(3))
@@ -39,6 +37,7 @@ LAST = Memory(*range(3))
 def _compute_denominator(car: Any, V: Any) -> Any:
     """Compute -a12 m V^2, kept from zero, where the yaw moment has no static effect on the slip."""
     mV2, excess = car[CAR.m] * V * V, car[CAR.l_f] * car[CAR.C_f] - car[CAR.l_r] * car[CAR.C_r]
+    # an understeering car has such a speed, m V^2 = 2 (l_r C_r - l_f C_f): 5 % of the terms remain
     denominator, min_size = mV2 + 2.0 * excess, 0.05 * (mV2 + 2.0 * absolute(excess))
     if absolute(denominator) < min_size:
         denominator = select(denominator < 0.0, -min_size, min_size)
@@ -61,32 +60,9 @@ def _compute_slip_gain(car: Any, V: Any) -> Any:
     return -(plant.a21 + plant.a22 * yaw_rate) / plant.b22
 
 
-def feedforward_gain(vehicle: Vehicle, speed: float) -> float:
-    """Compute the yaw moment per steering angle that makes the static slip zero, C_FF (N m/rad).
-
-    For an understeering car there is a speed at which the yaw moment has no static effect on beta,
-    m V^2 = 2 (l_r C_r - l_f C_f). So the denominator is at least 5 % of its terms.
-    Source: tie-vision (24).
-
-    Args:
-        vehicle: Vehicle of the design.
-        speed: Speed (m/s).
-
-    Returns:
-        Gain C_FF (N m/rad).
-    """
+def _compute_feedforward_gain(vehicle: Vehicle, speed: float) -> float:
+    """Compute the yaw moment per steering angle for a static slip of zero, C_FF (N m/rad), (24)."""
     return float(_compute_static_gain(make_nominal_car(vehicle), float(speed)))
-
-
-def _make_pi_table(
-    vehicle: Vehicle, gain: float, pole: float, placement: str, period: float | None
-) -> Array:
-    """Make the table of k_p and k_i, shape (len(SPEEDS), 2)."""
-    if period is None:
-        gains = [design_pi(vehicle, float(v), pole, placement) for v in SPEEDS]
-    else:
-        gains = [sample_pi(vehicle, float(v), period, pole, placement) for v in SPEEDS]
-    return gain * np.array([(pi.k_p, pi.k_i) for pi in gains])
 
 
 @jit
@@ -119,7 +95,7 @@ def _two_dof_law(
     wait: int,
     dt: float,
 ) -> None:
-    """x: `Inputs`. state: `Memory`."""
+    """Compute the actions from `Inputs` x and update the `Memory` state."""
     for n in range(len(x)):
         if state[n, LAST.wait] > 0.0:
             state[n, LAST.wait] -= 1.0
@@ -169,8 +145,8 @@ class TwoDof(Controller):
         placement: Rule of the pole, as for `design_pi`.
         sampled: Whether to place the poles of the sampled loop (`sample_pi`).
         grip: Grip limit, as for `Controller`.
-        feedforward: "reference" holds beta_ref in the steady turn of the nominal car, "zero-slip"
-            is (24) for every reference; where beta_ref is zero they are equal.
+        feedforward: "reference" holds beta_ref in the nominal car's steady turn, "zero-slip" is
+            (24).
 
     Raises:
         ValueError: A rate, placement or feedforward is unknown, or beta_hat is missing.
@@ -199,9 +175,12 @@ class TwoDof(Controller):
         period = self.control_period * TICK
         wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
         dt = wait * period
-        table = _make_pi_table(
-            self.nominal, check_not_negative("gain", gain), pole, placement, dt if sampled else None
-        )
+        factor = check_not_negative("gain", gain)
+        if sampled:
+            pis = [sample_pi(self.nominal, float(v), dt, pole, placement) for v in SPEEDS]
+        else:
+            pis = [design_pi(self.nominal, float(v), pole, placement) for v in SPEEDS]
+        table = factor * np.array([(pi.k_p, pi.k_i) for pi in pis])
         self.k_p, self.k_i = np.ascontiguousarray(table.T)
         car = make_nominal_car(self.nominal)
         follows = int(feedforward == FEEDFORWARDS[0])

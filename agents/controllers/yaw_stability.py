@@ -1,7 +1,4 @@
-"""ESC as cars have it: the yaw rate is held near what driver and friction ask for, slip bounded.
-
-Sliding mode: the yaw moment keeps errors of yaw rate and sideslip angle on one line.
-"""
+"""ESC as cars have it and sliding mode: yaw rate and sideslip angle are held by the yaw moment."""
 
 import math
 from collections import namedtuple
@@ -41,49 +38,27 @@ from .base import (
 from .model_following import MIN_SPEED
 
 BANDWIDTH = 16.0  # rad/s
-RELEASE = 0.5  # s, in which the integral is let go within the dead band
-
+_RELEASE = 0.5  # s, in which the integral is let go within the dead band
 
 EscInputs = namedtuple("EscInputs", "wheel_left wheel_right steer_command gyro beta_hat")
 """Columns of the law's inputs; the last one only where the slip is bounded."""
-
-
 ESC_IN = EscInputs(*range(5))
 
 
-def compute_yaw_gains(
+def _compute_yaw_gains(
     vehicle: Vehicle, speed: float, bandwidth: float = BANDWIDTH
 ) -> tuple[float, float]:
-    """Compute k_p (N m s/rad) and k_i (N m/rad) of the yaw moment on the yaw rate's error.
-
-    Both poles of the yaw equation with its own damping are at the bandwidth:
-    s^2 + (k_p / I - a22) s + k_i / I = (s + bandwidth)^2.
-    Where the damping alone is more, k_p is zero.
-
-    Args:
-        vehicle: Vehicle of the design.
-        speed: Speed (m/s).
-        bandwidth: Double pole of the closed loop (rad/s).
-
-    Returns:
-        Gains k_p and k_i.
-    """
+    """Compute k_p (N m s/rad) and k_i (N m/rad) of the yaw moment on the yaw rate's error."""
+    # both poles at the bandwidth (rad/s): s^2 + (k_p / I - a22) s + k_i / I = (s + bandwidth)^2;
+    # where the yaw equation's own damping is more, k_p is zero
     I = vehicle.yaw_inertia  # noqa: E741
     a22 = compute_plant_python(make_nominal_car(vehicle), speed).a22
     return max(I * (2.0 * bandwidth + a22), 0.0), I * bandwidth * bandwidth
 
 
 @jit
-def apply_dead_zone(value: Any, band: Any) -> Any:
-    """Compute the part of a value outside of a dead zone, with its sign.
-
-    Args:
-        value: Value of any unit.
-        band: Half width of the zone, in the same unit.
-
-    Returns:
-        Excess over the zone, 0 inside.
-    """
+def _apply_dead_zone(value: Any, band: Any) -> Any:
+    """Compute the part of a value outside of +-band, with its sign; 0 inside."""
     if value > band:
         return value - band
     if value < -band:
@@ -107,22 +82,22 @@ def _esc_law(
     full_scale: float,
     dt: float,
 ) -> None:
-    """x: `Inputs`. state: the integral in N m."""
+    """Compute the actions from `EscInputs` x; the state is the integral (N m)."""
     for n in range(len(x)):
         v = maximum(0.5 * (x[n, ESC_IN.wheel_left] + x[n, ESC_IN.wheel_right]), speeds[0])
         i, share = find_cell(speeds, v)
         k_p = (1.0 - share) * gains[i, 0] + share * gains[i + 1, 0]
         k_i = (1.0 - share) * gains[i, 1] + share * gains[i + 1, 1]
         _, gamma_ref = compute_reference(x[n, ESC_IN.steer_command], v, target, LIMITED)
-        error = apply_dead_zone(gamma_ref - x[n, ESC_IN.gyro], band)
+        error = _apply_dead_zone(gamma_ref - x[n, ESC_IN.gyro], band)
         unlimited = k_p * error + state[n, 0]
         if bounded:  # more yaw rate to the side the car slides to: beta' = ... - gamma
-            unlimited += stiffness * apply_dead_zone(x[n, ESC_IN.beta_hat], slip)
+            unlimited += stiffness * _apply_dead_zone(x[n, ESC_IN.beta_hat], slip)
         limit = max_moment[n] * full_scale
         N_z = min(max(unlimited, -limit), limit)
         state[n, 0] = integrate_antiwindup(state[n, 0], k_i * error * dt, unlimited, N_z)
         if absolute(error) == 0.0:
-            state[n, 0] -= state[n, 0] * dt / RELEASE
+            state[n, 0] -= state[n, 0] * dt / _RELEASE
         action[n, 0] = N_z / full_scale
 
 
@@ -136,7 +111,7 @@ class Esc(Controller):
 
     Args:
         env: Env of the controller.
-        bandwidth: Double pole of the yaw-rate loop (rad/s), as for `compute_yaw_gains`.
+        bandwidth: Double pole of the yaw-rate loop (rad/s).
         band: Half width of the yaw rate's dead band (rad/s).
         slip: Bound of the sideslip angle (rad).
         stiffness: Yaw moment per angle beyond the bound (N m/rad); None: full moment at twice it.
@@ -166,7 +141,7 @@ class Esc(Controller):
         self._design = (
             make_reference_params(self.nominal),
             np.array(SPEEDS),
-            np.array([compute_yaw_gains(self.nominal, v, bandwidth) for v in SPEEDS]),
+            np.array([_compute_yaw_gains(self.nominal, v, bandwidth) for v in SPEEDS]),
             float(band),
             slip,
             self.full_scale / slip
@@ -189,36 +164,21 @@ SlidingModeInputs = namedtuple(
 Memory = namedtuple("Memory", "beta_ref gamma_ref known")
 """The references of the last decision, for their derivatives, and whether there was one."""
 
-
 SLIDING_IN = SlidingModeInputs(*range(8))
 LAST = Memory(*range(3))
 
 
 @jit
-def compute_surface_slope(plant: Any, pole: Any) -> Any:
-    """Compute xi of s = gamma - gamma_ref + xi (beta - beta_ref), for an error's pole on s = 0.
-
-    There beta' = a11 beta + a12 gamma makes the pole of beta's error a11 - a12 xi. With a12 near
-    -1, xi is negative where the error shall decay faster than the car's own.
-
-    Args:
-        plant: `BicyclePlant` at the speed.
-        pole: Decay rate of beta's error (rad/s).
-
-    Returns:
-        Slope xi (1/s).
-    """
+def _compute_surface_slope(plant: Any, pole: Any) -> Any:
+    """Compute xi (1/s) of the surface on which the error of beta decays at `pole` (rad/s)."""
+    # on s = 0, beta' = a11 beta + a12 gamma makes the pole of beta's error a11 - a12 xi
     return (plant.a11 + pole) / plant.a12
 
 
 @jit
 def _compute_reference(x: Any, v: Any, plant: Any, target: Any, kind: int) -> Any:
-    """Compute (beta_ref, gamma_ref) of a row.
-
-    A lagged reference is the observation's. Where the yaw rate is free, it is the one that keeps
-    beta_ref.
-    """
-    if kind == LAGGED:
+    """Compute (beta_ref, gamma_ref) of a row; a free yaw rate is that which keeps beta_ref."""
+    if kind == LAGGED:  # then the observation has it
         return x[SLIDING_IN.beta_ref], x[SLIDING_IN.gamma_ref]
     beta, gamma = compute_reference(x[SLIDING_IN.steer_command], v, target, kind)
     if kind == ZERO_SLIP:
@@ -241,7 +201,7 @@ def _sliding_mode_law(
     full_scale: float,
     dt: float,
 ) -> None:
-    """x: `Inputs`. state: `Memory`."""
+    """Compute the actions from `SlidingModeInputs` x and update the `Memory` state."""
     for n in range(len(x)):
         v = maximum(0.5 * (x[n, SLIDING_IN.wheel_left] + x[n, SLIDING_IN.wheel_right]), MIN_SPEED)
         plant = compute_plant(car, v)
@@ -250,7 +210,7 @@ def _sliding_mode_law(
             x[n, SLIDING_IN.gamma_hat],
             x[n, SLIDING_IN.steer],
         )
-        xi = compute_surface_slope(plant, pole)
+        xi = _compute_surface_slope(plant, pole)
         beta_ref, gamma_ref = _compute_reference(x[n], v, plant, target, kind)
         beta_ref_rate, gamma_ref_rate = 0.0, 0.0  # the references' derivatives
         if state[n, LAST.known] > 0.0:
@@ -259,9 +219,8 @@ def _sliding_mode_law(
         s = gamma - gamma_ref + xi * (beta - beta_ref)
         drift_rates = compute_drift(plant, beta, gamma)
         s_rate = drift_rates[1] + plant.b21 * delta - gamma_ref_rate
-        s_rate += xi * (
-            drift_rates[0] + plant.b11 * delta - beta_ref_rate
-        )  # s' without the yaw moment
+        # s' without the yaw moment
+        s_rate += xi * (drift_rates[0] + plant.b11 * delta - beta_ref_rate)
         reach = rate * layer * min(max(s / layer, -1.0), 1.0)
         N_z = -(s_rate + reach) / plant.b22  # Rajamani 8.3: equivalent control and boundary layer
         state[n, LAST.beta_ref], state[n, LAST.gamma_ref] = beta_ref, gamma_ref
@@ -273,9 +232,9 @@ class SlidingMode(Controller):
     """s = gamma - gamma_ref + xi (beta - beta_ref) to zero by the yaw moment.
 
     The equivalent control of the nominal car at the measured speed keeps s constant. Within the
-    boundary layer s decays at `rate`, outside at rate x layer (rad/s2). xi is
-    `compute_surface_slope`. Where the yaw rate is not judged, gamma_ref is the yaw rate that keeps
-    beta_ref. Reads beta_hat, and gamma_hat or else the gyro.
+    boundary layer s decays at `rate`, outside at rate x layer (rad/s2). xi makes beta's error decay
+    at `pole`. Where the yaw rate is not judged, gamma_ref is the yaw rate that keeps beta_ref.
+    Reads beta_hat, and gamma_hat or else the gyro.
     Source: Rajamani, Vehicle Dynamics and Control, 8.3.
 
     Args:
@@ -284,9 +243,6 @@ class SlidingMode(Controller):
         rate: Decay rate of s within the boundary layer (rad/s).
         layer: Half width of the boundary layer (rad/s).
         grip: Grip limit, as for `Controller`.
-
-    Raises:
-        ValueError: An option is not positive, or the observation lacks beta_hat.
     """
 
     memory = len(Memory._fields)

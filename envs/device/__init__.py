@@ -1,4 +1,4 @@
-"""The environments on torch tensors: `torch_env` with gradients, `cuda_env` as one CUDA kernel a step.
+"""The environments on torch tensors: `torch_env` with gradients, `cuda_env` one CUDA kernel a step.
 
 `base` is what both share. `torch_ticks`, `torch_outputs` and `torch_step` are the engine's step by
 torch, `gradients` its derivatives. `cuda_text` makes device functions of the engine's own text,

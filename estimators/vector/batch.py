@@ -1,7 +1,4 @@
-"""Many filters of one kind at work side by side, each with its own memory and covariance.
-
-A batch of users' own estimators, or of late ones: an object a row, one after the other.
-"""
+"""Many filters of one kind side by side, compiled together, or an object a row."""
 
 import copy
 import functools
@@ -140,10 +137,8 @@ class BatchEstimator:
         packets = np.ascontiguousarray(packets, np.float64)
         _check_shape("fast rows", fast, N, FAST_WIDTH)
         _check_shape("packets", packets, N, PACKET_WIDTH)
-        rows = _parse_counts("rows", fast.shape[1] if rows is None else rows, N, fast.shape[1])
-        counts = _parse_counts(
-            "counts", packets.shape[1] if counts is None else counts, N, packets.shape[1]
-        )
+        rows = _parse_counts("rows", rows, N, fast.shape[1])
+        counts = _parse_counts("counts", counts, N, packets.shape[1])
         self.take(None, fast, rows, packets, counts, *self._empty_outputs)
 
     @functools.cached_property
@@ -183,29 +178,24 @@ class BatchEstimator:
             rows: Number of fast rows of each filter, shape (N,).
             packets: Packets, shape (N, capacity, PACKET_WIDTH).
             counts: Number of packets of each filter, shape (N,).
-            *observed: Arguments of `kernel.observe_batch` after `counts`.
+            *observed: Arguments of `wrappers.kernel.observe` from `obs` on, of N filters.
         """
         done = np.full(len(self), -1) if mask is None else np.where(mask, -1, rows)
         memory = self.filters, self._designs.pool, self._places, done, self._lanes
         while compile_observe_batch()(*memory, fast, rows, packets, counts, *observed) > 0:
-            self._design_missing(np.flatnonzero(done < rows))
-
-    def _design_missing(self, rows: IntArray) -> None:
-        """Compute the tables of gains that compiled code has just asked for, each once."""
-        wanted = {(self._design_keys[i], int(self.filters[i, 0].wanted)): int(i) for i in rows}
-        for i in wanted.values():
-            self[i].design_missing()
+            missing = np.flatnonzero(
+                done < rows
+            )  # rows without gains, of which each is designed once
+            keys = [(self._design_keys[i], int(self.filters[i, 0].wanted)) for i in missing]
+            for i in dict(zip(keys, missing.tolist(), strict=True)).values():
+                self[i].design_missing()
 
     def get_state(self) -> Any:
         """Return a snapshot, from which `set_state` restores every bit."""
         return self.filters.copy()
 
     def set_state(self, snapshot: Any) -> None:
-        """Restore a snapshot of this batch or of one with the same specs.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Restore a snapshot of this batch or of one with the same specs."""
         self.filters[:] = snapshot
 
     @property
@@ -244,8 +234,9 @@ def _check_shape(label: str, array: Array, count: int, width: int) -> None:
         raise ValueError(f"{label} have shape ({count}, k, {width}), got {array.shape}")
 
 
-def _parse_counts(label: str, value: npt.ArrayLike, count: int, max_count: int) -> IntArray:
-    numbers = np.ascontiguousarray(np.broadcast_to(np.asarray(value, np.int64), (count,)))
+def _parse_counts(label: str, value: npt.ArrayLike | None, N: int, max_count: int) -> IntArray:
+    numbers = np.asarray(max_count if value is None else value, np.int64)
+    numbers = np.ascontiguousarray(np.broadcast_to(numbers, (N,)))
     if numbers.min() < 0 or numbers.max() > max_count:
         raise ValueError(f"{label} are 0 to {max_count}, got {numbers.min()} to {numbers.max()}")
     return numbers
@@ -253,8 +244,6 @@ def _parse_counts(label: str, value: npt.ArrayLike, count: int, max_count: int) 
 
 class ForeignBatch(BatchEstimator):
     """N estimators of one factory, each an object of its row; none of them compiled.
-
-    ValueError says that they have different states.
 
     Args:
         first: Estimator of row 0.
@@ -279,38 +268,16 @@ class ForeignBatch(BatchEstimator):
         return self._estimators[i]
 
     def configure(self, rows: Iterable[int], specs: Iterable[EstimatorSpec]) -> None:
-        """Fit the estimators of some rows to their specs as `BatchEstimator.configure` does.
-
-        Args:
-            rows: Indices of the estimators.
-            specs: Spec of each of these estimators.
-        """
+        """Fit the estimators of some rows to their specs as `BatchEstimator.configure` does."""
         for i, spec in zip(rows, specs, strict=True):
             if spec.design != self._design_keys[i]:
                 self._estimators[i], self._design_keys[i] = self._build(spec), spec.design
             self._check_states(i, self[i].names)
             self[i].sensors = dict(spec.sensors)
 
-    def take(
-        self,
-        mask: npt.NDArray[np.bool_] | None,
-        fast: Array,
-        rows: IntArray,
-        packets: Array,
-        counts: IntArray,
-        *observed: Any,
-    ) -> None:
-        """Process rows and packets as `BatchEstimator.take` does.
-
-        Args:
-            mask: Estimators at work, bool, shape (N,); None for all.
-            fast: Fast rows, shape (N, k, FAST_WIDTH).
-            rows: Number of fast rows of each estimator, shape (N,).
-            packets: Packets, shape (N, capacity, PACKET_WIDTH).
-            counts: Number of packets of each estimator, shape (N,).
-            *observed: Arguments of `kernel.observe_batch` after `counts`.
-        """
-        obs, inner, plan, limits, *row_arrays = observed
+    def take(self, mask: npt.NDArray[np.bool_] | None, *arguments: Any) -> None:
+        """Process rows and packets as `BatchEstimator.take` does."""
+        fast, rows, packets, counts, obs, inner, plan, limits, *row_arrays = arguments
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
         for i in chosen.tolist():
             estimator, (beta, gamma, out, summary) = self[i], (array[i] for array in row_arrays)
@@ -322,10 +289,6 @@ class ForeignBatch(BatchEstimator):
         return [estimator.get_state() for estimator in self._estimators]
 
     def set_state(self, snapshot: Any) -> None:
-        """Restore a snapshot of this batch or of one with the same specs.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Restore a snapshot of this batch or of one with the same specs."""
         for estimator, state in zip(self._estimators, snapshot, strict=True):
             estimator.set_state(state)

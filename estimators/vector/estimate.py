@@ -1,7 +1,4 @@
-"""The spec of a vector wrapper: it names the single wrapper around each environment.
-
-EstimateObservation for vector environments: all rows' estimators in one compiled call.
-"""
+"""EstimateObservation for vector environments: all rows' estimators in one compiled call."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -12,24 +9,28 @@ import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec, VectorizeMode, WrapperSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from ...envs.task import ObservationEntry, make_space
 from ...envs.vehicle.parameters import VehicleSource
 from ..wrappers.estimate import Arguments, EstimatorSource, EstimatorSpec
 from ..wrappers.estimate import EstimateObservation as Single
-from ..wrappers.outputs import BETA, NEES, STD, make_outputs, make_title
+from ..wrappers.outputs import BETA, NEES, STD, make_outputs
 from ..wrappers.truth import choose_vehicle, set_stiffness
 from .make import build_batch
 from .records import (
+    BatchedEnv,
     BatchedRecords,
     RecordBatch,
     SyncRecords,
     get_env_state,
     get_true_vehicles,
-    make_record_source,
 )
+
+_Observations = npt.NDArray[np.float32]
+_Mask = npt.NDArray[np.bool_]
+_Step = tuple[_Observations, Any, Any, Any, dict[str, Any]]
 
 
 def make_vector_spec(
@@ -58,21 +59,15 @@ def make_vector_spec(
         spec.kwargs["vectorization_mode"] = VectorizeMode.SYNC.value
         spec.kwargs.pop("info", None)
         if "autoreset_mode" in spec.kwargs:
-            mode = spec.kwargs.pop("autoreset_mode")
-            spec.kwargs["vector_kwargs"] = {"autoreset_mode": mode}
+            spec.kwargs["vector_kwargs"] = {"autoreset_mode": spec.kwargs.pop("autoreset_mode")}
     vector_kwargs = spec.kwargs.get("vector_kwargs", {})
     if isinstance(vector_kwargs.get("autoreset_mode"), AutoresetMode):
         vector_kwargs["autoreset_mode"] = vector_kwargs["autoreset_mode"].value
     return spec
 
 
-Observations = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
-Step = tuple[Observations, Any, Any, Any, dict[str, Any]]
-
-
 class EstimateObservation(
-    VectorWrapper[Observations, Any, Observations, Any, Any], RecordConstructorArgs
+    VectorWrapper[_Observations, Any, _Observations, Any, Any], RecordConstructorArgs
 ):
     """Runs an estimator on each car's record and appends its states to the observations.
 
@@ -95,15 +90,13 @@ class EstimateObservation(
         outputs: States to append, each as `<state>_hat`.
         std: Whether each one's standard deviation is appended as `<state>_std`.
         replace: Whether the observation is these alone.
-        vehicle: Vehicle as the estimators believe it to be; None for each row's nominal, "truth"
-            for the true one.
+        vehicle: Vehicle as estimators believe it to be; None: each row's nominal, "truth": its own.
         options: Options of `make_estimator`.
         name: Put before every name as `<name>_`.
         **misplaced: Refused; the message names the nearest argument or option.
 
     Raises:
-        TypeError: It is not the innermost wrapper, the records are out of reach or the estimator is
-            an object, which cannot serve all rows.
+        TypeError: It is not innermost, records are out of reach, or the estimator is one object.
         ValueError: An output is unknown, names would stand twice, or there is no autoreset.
     """
 
@@ -140,14 +133,15 @@ class EstimateObservation(
         dt = self._records.dt
         self.estimator = build_batch(arguments.source, specs, dt, arguments.options)
         inner = () if replace else getattr(env, "layout", self._records.layout)
-        states = self.estimator.names
-        self._outputs = make_outputs(arguments.label, states, outputs, std, name, inner)
-        self._title = make_title(arguments.label, name)
+        states, label = self.estimator.names, arguments.label
+        self._outputs = make_outputs(label, states, outputs, std, name, inner)
+        self._title = label if name is None else f"{label} ({name})"
         self.layout: tuple[ObservationEntry, ...] = self._outputs.layout
         self.single_observation_space = make_space(self.layout)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._out = np.zeros((env.num_envs, len(self.layout)), np.float32)
-        self._ended: Mask | None = None  # rows that the next step resets; None: all are to be reset
+        # rows that the next step resets; None: all are to be reset
+        self._ended: _Mask | None = None
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]  # as in VectorWrapper
@@ -156,20 +150,11 @@ class EstimateObservation(
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, Any]]:
+    ) -> tuple[_Observations, dict[str, Any]]:
         """Reset the rows (those of options["reset_mask"]) and their estimators; take tick 0.
 
-        Args:
-            seed: Seed or seeds of the env.
-            options: Options of the env's reset.
-
-        Returns:
-            Observations, shape (N, width), and infos.
-
-        Raises:
-            ResetNeeded: A mask leaves out rows, and no step succeeded since the last whole reset.
-            TypeError: The env refuses the arguments.
-            ValueError: The env refuses the arguments.
+        ResetNeeded says that a mask leaves out rows, and no step succeeded since the last whole
+        reset.
         """
         mask = None if options is None else options.get("reset_mask")
         rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
@@ -190,18 +175,10 @@ class EstimateObservation(
         self._observe(self._records.read_latest(), obs, infos, rows, self._out)
         return self._out.copy(), infos
 
-    def step(self, actions: Any) -> Step:
+    def step(self, actions: Any) -> _Step:
         """Step all rows; the estimators take their records before observations are made.
 
-        Args:
-            actions: Actions of the env, one a row.
-
-        Returns:
-            Observations (N, width), rewards, terminated and truncated, each (N,), and infos.
-
-        Raises:
-            ResetNeeded: It is called before `reset`, or after a step that failed.
-            ValueError: The env refuses the actions.
+        ResetNeeded says that it is called before `reset`, or after a step that failed.
         """
         ended_before, self._ended = self._ended, None  # an error on the way leaves rows apart
         if ended_before is None:
@@ -224,16 +201,13 @@ class EstimateObservation(
         self._ended = ended
         return self._out.copy(), rewards, terminated, truncated, infos
 
-    def _restore_ended(self, ended_before: Mask | None) -> None:
+    def _restore_ended(self, ended_before: _Mask | None) -> None:
         """Restore the flags after an error: a `BatchedEnv` raises it before it moves any row."""
         if isinstance(self._records, BatchedRecords):
             self._ended = ended_before
 
     def get_state(self) -> dict[str, Any]:
-        """Return a snapshot of env and estimators, from which `set_state` restores every bit.
-
-        TypeError says that the vector env makes none.
-        """
+        """Return a snapshot of env and estimators; TypeError where the vector env makes none."""
         return {
             "env": get_env_state(self.env),
             "estimator": self.estimator.get_state(),
@@ -242,11 +216,7 @@ class EstimateObservation(
         }
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Restore a snapshot of this env or of one built with the same arguments."""
         env: Any = self.env
         env.set_state(snapshot["env"])
         self._update_cars(range(self.num_envs))
@@ -277,14 +247,14 @@ class EstimateObservation(
         for i, spec in zip(rows, specs, strict=True):
             set_stiffness(self.estimator[i], spec.vehicle)
 
-    def _reset_rows(self, mask: Mask) -> None:
+    def _reset_rows(self, mask: _Mask) -> None:
         """Reset the estimators of some rows with the clocks of their new episodes."""
         rows = np.flatnonzero(mask).tolist()
         if rows:
             self._update_cars(rows)
             self.estimator.reset(mask)
 
-    def _finish(self, infos: dict[str, Any], ended: Mask) -> None:
+    def _finish(self, infos: dict[str, Any], ended: _Mask) -> None:
         """Process the last record of rows that ended into their `final_obs` and `final_info`."""
         inner, out = self._outputs.inner, np.zeros_like(self._out)
         obs = np.zeros((self.num_envs, inner), np.float32)
@@ -297,10 +267,10 @@ class EstimateObservation(
     def _observe(
         self,
         records: RecordBatch,
-        obs: Observations,
+        obs: _Observations,
         infos: dict[str, Any],
-        mask: Mask,
-        out: Observations,
+        mask: _Mask,
+        out: _Observations,
     ) -> None:
         """Process the records of some rows; write their observations and their part of `infos`."""
         outputs, N = self._outputs, self.num_envs
@@ -337,4 +307,19 @@ def _find_records(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords
                 f"environment; inside it is {type(layer).__name__}"
             )
         layer = layer.env
-    return make_record_source(layer)
+    if isinstance(layer, AsyncVectorEnv):
+        raise TypeError(
+            "the records in AsyncVectorEnv's worker processes are out of reach; wrap each "
+            "environment in its worker with sideslip.estimators.EstimateObservation: "
+            "gym.make_vec(id, vectorization_mode='async', wrappers=[functools.partial("
+            "EstimateObservation, estimator=...)]), or use vectorization_mode='sync'"
+        )
+    if isinstance(layer, SyncVectorEnv):
+        return SyncRecords(layer)
+    missing = [name for name in BatchedEnv.__annotations__ if not hasattr(layer, name)]
+    if missing:
+        raise TypeError(
+            "EstimateObservation reads the records of a sideslip vector environment; "
+            f"{type(layer).__name__} has no {', '.join(missing)}"
+        )
+    return BatchedRecords(layer)

@@ -1,7 +1,4 @@
-"""Many filters in one compiled call: the loop around `observe`.
-
-The tables of gains of all filters lie in one flat array, the pool, since their shapes differ.
-"""
+"""The batch's part of an observation, compiled: every filter's ticks, in lanes or alone."""
 
 from functools import cache
 from typing import Any
@@ -41,10 +38,7 @@ def _fetch(f: FilterRecord, template: FilterRecord) -> None:
 
 @jit
 def _select_lanes(b: LaneBlock, first: int, filters: Any, done: Any, rows: Any) -> int:
-    """Select the filters from `first` on that do their rows in the lanes of a block, into b.here.
-
-    All of them do equally many rows; returns how many.
-    """
+    """Select the filters that do their rows in lanes into b.here; return how many rows all do."""
     n_rows, count = 0, 0
     for lane in range(count_lanes()):
         i = first + lane
@@ -58,7 +52,7 @@ def _select_lanes(b: LaneBlock, first: int, filters: Any, done: Any, rows: Any) 
 
 
 @jit_nrt
-def observe_batch(
+def _observe_batch(
     filters: Any,
     pool: Any,
     places: Any,
@@ -77,32 +71,9 @@ def observe_batch(
     out: Any,
     summary: Any,
 ) -> int:
-    """Call `observe` for every filter that has not done its rows.
-
-    Filters of one shape do their rows in lanes, others alone.
-
-    Args:
-        filters: Memories, dtype `FILTER`, shape (N, layers).
-        pool: Gains of all filters in one array, shape (total,).
-        places: Place of each filter's gains in the pool, shape (N, 4), see `get_gains`.
-        done: Number of rows done, shape (N,); -1 where a filter has not started. Updated.
-        lanes: Blocks of `lanes.make_blocks`.
-        fast: Fast rows, shape (N, k, FAST_WIDTH).
-        rows: Number of fast rows of each filter, shape (N,).
-        packets: Packets, shape (N, capacity, PACKET_WIDTH).
-        counts: Number of packets of each filter, shape (N,).
-        obs: Observations of the env, float32, shape (N, at least inner).
-        inner: Number of entries of each observation to copy.
-        plan: Shape (m, 3), see `observe`.
-        limits: Bounds of the outputs in their units, shape (m,).
-        beta: True sideslip angles (rad), shape (N,).
-        gamma: True yaw rates (rad/s), shape (N,).
-        out: Output, float32, shape (N, width), see `observe`.
-        summary: Output, shape (N, 3), see `observe`.
-
-    Returns:
-        Number of filters that still have not done their rows.
-    """
+    """Call `observe` for every filter that has rows to do; return how many still have."""
+    # arguments are those of `observe` with N filters as first axis, but for inner, plan and limits;
+    # done: rows done, -1 where a filter has not started, updated; filters of one shape go in lanes
     n_waiting = 0
     for first in range(0, len(filters), count_lanes()):  # without the compiler one by one
         b = lanes[first // LANES]
@@ -126,7 +97,7 @@ def observe_batch(
 
 
 def make_empty_outputs(count: int) -> tuple[Any, ...]:
-    """Make the arguments of `observe_batch` after `counts` for filters whose outputs are not read.
+    """Make the arguments of `observe` from `obs` on, for N filters whose outputs are not read.
 
     Args:
         count: Number of filters N.
@@ -134,19 +105,16 @@ def make_empty_outputs(count: int) -> tuple[Any, ...]:
     Returns:
         The arguments in their order.
     """
-    empty, plan, truth = (
-        np.zeros((count, 0), np.float32),
-        np.zeros((0, 3), np.int64),
-        np.zeros(count),
-    )
+    empty, plan = np.zeros((count, 0), np.float32), np.zeros((0, 3), np.int64)
+    truth = np.zeros(count)
     return empty, 0, plan, np.zeros(0), truth, truth, empty, np.zeros((count, 3))
 
 
 @cache
 def compile_observe_batch() -> Any:
-    """Return `observe_batch` as a plain call."""
+    """Return `_observe_batch` as a plain call."""
     filters, integers, cube = np.zeros((1, 1), FILTER), np.zeros(1, np.int64), np.zeros((1, 1, 1))
     memory = filters, np.zeros(1), np.zeros((1, 4), np.int64), integers, make_blocks(1)
     return compile_call(
-        observe_batch, *memory, cube, integers, cube, integers, *make_empty_outputs(1)
+        _observe_batch, *memory, cube, integers, cube, integers, *make_empty_outputs(1)
     )

@@ -1,6 +1,4 @@
-"""The few different filters of a batch: each is designed once, their gains lie in one pool.
-
-The ticks of a block of filters: what all do in lanes, and by its record what one alone does.
+"""The ticks of a block of filters, by lanes, and the pool of their tables of gains.
 
 A lane's tick is computed by its record, as that of a filter alone is, where the model changes or a
 row is not sound. So is every packet, and what is stored of a capture.
@@ -54,7 +52,7 @@ def get_gains(pool: Any, place: Any) -> Any:
 
 
 class GainPool:
-    """Estimators of the package by the design of their specs, and the pool of their gains.
+    """Estimators by the design of their specs, and their gains in one flat array, the pool.
 
     Args:
         build: Function that builds one estimator from its spec.
@@ -79,8 +77,7 @@ class GainPool:
             An estimator of the spec's design.
 
         Raises:
-            TypeError: The factory builds an `Estimator` for other specs and something else for this
-                one.
+            TypeError: The factory builds an `Estimator` for other specs, but not for this one.
         """
         design = spec.design
         if design not in self._estimators:
@@ -129,10 +126,7 @@ class GainPool:
 
 @jit
 def _fetch_next(b: LaneBlock, first: int, filters: Any, fast: Any, j: int, rows: int) -> None:
-    """Have the caches fetch what the next block reads at tick j, and a part of its states.
-
-    first: the first filter of that block.
-    """
+    """Have the caches fetch row j of the next block, from filter `first` on, and some states."""
     last = minimum(first + count_lanes(), len(filters))
     for i in range(first, last):
         for k in range(0, FAST_WIDTH, 5):  # a row lies on two cache lines or three
@@ -149,7 +143,7 @@ def _fetch_next(b: LaneBlock, first: int, filters: Any, fast: Any, j: int, rows:
 
 @jit
 def _read_rows(b: LaneBlock, first: int, fast: Any, j: int) -> None:
-    """Row j of each lane's filter into b.row."""
+    """Read row j of each lane's filter into b.row."""
     for lane in range(count_lanes()):
         if b.here[lane] == 1.0:
             for k in range(b.columns):
@@ -159,7 +153,7 @@ def _read_rows(b: LaneBlock, first: int, fast: Any, j: int) -> None:
 
 @jit
 def _read_signals(b: LaneBlock) -> Any:
-    """Inputs into b.u_new, measurements into b.y; (speeds, whether a lane's tick stands apart)."""
+    """Read b.u_new (inputs) and b.y (measurements); return speeds and which ticks stand apart."""
     is_outlier = load_element(b.here) != 1.0  # lanes without a filter: masked below
     for i in range(b.inputs):
         store_element(b.u_new, compute_signal(b.row, b.u_column[i], b.u_factor[i]), i)
@@ -267,10 +261,7 @@ def _average_wheel_speed(row: Vector) -> Any:
 def _store_outliers(
     b: LaneBlock, first: int, filters: Any, pool: Any, places: Any, fast: Any, j: int
 ) -> bool:
-    """Store lanes whose tick stands apart in their records.
-
-    Returns False, and nothing is changed, where the gains of one of them are missing.
-    """
+    """Store lanes that stand apart in their records; False, unchanged, where gains are missing."""
     if b.periodic == 1:
         for lane in range(count_lanes()):
             if b.apart[lane] == 1.0:

@@ -1,9 +1,10 @@
 """Filters of one shape in SIMD lanes: what their ticks read and write, side by side.
 
-The filters' records stay what they are; a block has fields of the same names whose numbers are
-lanes, so the equations of `core` are compiled for it unchanged. Filter i of a batch has lane
-i mod LANES of block i // LANES. Its model stays there from call to call and is loaded anew where
-its speed is another one; its state is loaded and stored in every call.
+A block has a record's fields of the same names, whose numbers are lanes, so the equations of `core`
+are compiled for it unchanged. Filter i of a batch has lane i mod LANES of block i // LANES. Its
+model stays there and is loaded anew where its speed changed; its state is loaded and stored in
+every call. In all functions b is a block, lane an index in it, and f the record of the lane's
+filter.
 """
 
 from typing import Any
@@ -61,9 +62,9 @@ _FLOATS = {
     "apart": (),  # 1: the tick is computed by the record
     "wild": (),  # 1: its residual is none
 }
+# of a lane: whether its filter has the block's shape (1, -1; 0 before the first look), tick, step
+# within the cycle, table of gains, packets done
 _INTS = ("shaped", "tick", "at", "cell", "cursor")
-"""Of a lane: 1 where its filter is known to have the block's shape, -1 where it has not, 0 before
-the first look; tick, step within the cycle, table of gains and packets done."""
 _SHAPE = (
     *("n", "dense", "total", "inputs", "fasts", "kind", "periodic", "measured", "cycle"),
     *("store_predictions", "tyres", "robust"),
@@ -92,19 +93,10 @@ def make_blocks(count: int) -> Any:
 
 @jit
 def is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Any:
-    """Return whether a filter's ticks are computed in its lane now.
+    """Return whether a filter's ticks are computed in its lane now; the first shapes the block.
 
-    The first filter that is shapes the block. Lanes compute models that change by speed alone, of
-    which every tick predicts and corrects. Nothing is done between samples, and nothing of the past
-    is stored but predictions.
-
-    Args:
-        b: Block of lanes.
-        lane: Index of the lane in the block.
-        f: Record of the lane's filter.
-
-    Returns:
-        True where the lane may compute them.
+    Lanes compute models that change by speed alone, of which every tick predicts and corrects.
+    Nothing is done between samples, and nothing of the past is stored but predictions.
     """
     if b.shaped[lane] == 0:
         is_steady = f.tyres == 0 and f.kind != KINEMATIC and f.kind != VELOCITY_ROLL
@@ -191,13 +183,7 @@ def _load_model(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 @jit
 def load_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Load a filter's model, where its speed changed, and its state into its lane.
-
-    Args:
-        b: Block of lanes.
-        lane: Index of the lane in the block.
-        f: Record of the lane's filter.
-    """
+    """Load a filter's model, where its speed changed, and its state into its lane."""
     if b.model_speed[lane] != f.model_speed:
         _load_model(b, lane, f)
     _load_states(b, lane, f)
@@ -231,13 +217,7 @@ def _load_clock(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 @jit
 def store_lane(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store the state of a lane in its filter's record.
-
-    Args:
-        b: Block of lanes.
-        lane: Index of the lane in the block.
-        f: Record of the lane's filter.
-    """
+    """Store the state of a lane in its filter's record."""
     _store_states(b, lane, f)
     for k in range(b.inputs):
         f.u[k] = b.u[k, lane]
@@ -260,13 +240,7 @@ def _store_states(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 @jit
 def store_captures(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store by its record what a lane's filter captured at its last tick; before the next one.
-
-    Args:
-        b: Block of lanes.
-        lane: Index of the lane in the block.
-        f: Record of the lane's filter.
-    """
+    """Store by its record what a lane's filter captured at its last tick; before the next one."""
     _store_states(b, lane, f)
     f.road_turn, f.speed_before = b.road_turn[lane], f.model_speed
     store_due_captures(f, b.tick[lane])
@@ -276,13 +250,7 @@ def store_captures(b: LaneBlock, lane: int, f: FilterRecord) -> None:
 
 @jit
 def store_prediction(b: LaneBlock, lane: int, f: FilterRecord) -> None:
-    """Store a lane's prediction of this tick, before its fast measurements.
-
-    Args:
-        b: Block of lanes.
-        lane: Index of the lane in the block.
-        f: Record of the lane's filter.
-    """
+    """Store a lane's prediction of this tick, before its fast measurements."""
     slot = b.tick[lane] % WINDOW
     f.past_road_turn[slot] = b.road_turn[lane]
     for i in range(b.n):

@@ -1,7 +1,4 @@
-"""A batch of learned estimators: all filters and their corrections in one compiled call.
-
-Batches of estimators from a name or a factory.
-"""
+"""Batches of estimators from a name or a factory, and the batch of learned ones."""
 
 import copy
 import functools
@@ -27,20 +24,10 @@ from .lane_ticks import Build, get_gains
 
 
 @jit_nrt
-def correct_batch(
+def _correct_batch(
     filters: Any, pool: Any, places: Any, chosen: Any, record: Any, observed: Any, corrections: Any
 ) -> None:
-    """Call `observe_corrected` for the chosen filters.
-
-    Args:
-        filters: Memories, dtype `FILTER`, shape (N, layers).
-        pool: Gains of all filters in one array, shape (total,).
-        places: Place of each filter's gains in the pool, shape (N, 4), see `get_gains`.
-        chosen: Indices of the filters.
-        record: Arguments of `kernel.observe_batch` from `fast` to `counts`.
-        observed: Arguments of `kernel.observe_batch` behind `counts`.
-        corrections: Memories of the corrections, shape (N, memory_size), and the network.
-    """
+    """Call `observe_corrected` for the filters of the indices `chosen`."""
     fast, rows, packets, counts = record
     obs, inner, plan, limits, beta, gamma, out, summary = observed
     memory, net = corrections
@@ -56,24 +43,14 @@ def _build_base(build: Build, spec: EstimatorSpec) -> Any:
     return build(spec).inner.base  # type: ignore[union-attr]
 
 
-class LearnedBatch(BatchEstimator):
-    """N learned estimators of one correction; `filters` are their filters' records.
-
-    Args:
-        first: Estimator of row 0.
-        specs: Vehicle, sensors and speed of each estimator, N of them.
-        dt: Tick (s).
-        build: Function that builds one estimator from its spec.
-
-    Attributes:
-        memory: Memories of the corrections, shape (N, memory_size).
-    """
+class _LearnedBatch(BatchEstimator):
+    """N learned estimators of one correction; `filters` are their filters' records."""
 
     def __init__(
         self, first: ForeignEstimator, specs: Sequence[EstimatorSpec], dt: float, build: Build
     ) -> None:
         self.first: LearnedEstimator = first.inner  # type: ignore[assignment]
-        self.memory = np.zeros((len(specs), len(self.first.memory)))
+        self.memory = np.zeros((len(specs), len(self.first.memory)))  # of the corrections
         super().__init__(first.name, specs, dt, functools.partial(_build_base, build))
 
     def __getitem__(self, i: int) -> Any:
@@ -82,51 +59,34 @@ class LearnedBatch(BatchEstimator):
         return ForeignEstimator(estimator, self.name, self.dt, estimator.base.sensors)
 
     def configure(self, rows: Iterable[int], specs: Iterable[EstimatorSpec]) -> None:
-        """Fit the filters of some rows to their specs as `BatchEstimator.configure` does.
-
-        Args:
-            rows: Indices of the filters.
-            specs: Spec of each of these filters.
-        """
+        """Fit the filters of some rows to their specs as `BatchEstimator.configure` does."""
         rows, specs = list(rows), list(specs)
         super().configure(rows, specs)
         self.memory[rows, MASS] = [spec.vehicle.mass for spec in specs]
 
     def take(self, mask: Any, *arguments: Any) -> None:
-        """Process rows and packets as `BatchEstimator.take` does.
-
-        Args:
-            mask: Filters at work, bool, shape (N,); None for all.
-            *arguments: Arguments of `kernel.observe_batch` from `fast` on.
-        """
+        """Process rows and packets as `BatchEstimator.take` does."""
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
         layers = self.filters, self._designs.pool, self._places, chosen
-        _compile_correct_batch()(
-            *layers, arguments[:4], arguments[4:], (self.memory, self.first.net)
-        )
+        correction = self.memory, self.first.net
+        _compile_correct_batch()(*layers, arguments[:4], arguments[4:], correction)
 
     def get_state(self) -> Any:
         """Return copies of the filters and of their corrections."""
         return self.filters.copy(), self.memory.copy()
 
     def set_state(self, snapshot: Any) -> None:
-        """Restore a snapshot of this batch or of one with the same specs.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Restore a snapshot of this batch or of one with the same specs."""
         self.filters[:], self.memory[:] = snapshot
 
 
 @functools.cache
 def _compile_correct_batch() -> Any:
-    """Return `correct_batch` as a plain call."""
+    """Return `_correct_batch` as a plain call."""
     integers, cube = np.zeros(1, np.int64), np.zeros((1, 1, 1))
     layers = np.zeros((1, 1), FILTER), np.zeros(1), np.zeros((1, 4), np.int64), integers
-    corrections = np.zeros((1, 1)), EXAMPLE
-    return compile_call(
-        correct_batch, *layers, (cube, integers, cube, integers), make_empty_outputs(1), corrections
-    )
+    record, corrections = (cube, integers, cube, integers), (np.zeros((1, 1)), EXAMPLE)
+    return compile_call(_correct_batch, *layers, record, make_empty_outputs(1), corrections)
 
 
 def build_batch(
@@ -152,10 +112,9 @@ def build_batch(
     build_one = functools.partial(build_estimator, source, dict(options), dt)
     if not (isinstance(source, str) and source in FILTERS) or options.get("latency"):
         first = build_one(specs[0])
-        if isinstance(first, ForeignEstimator) and isinstance(first.inner, LearnedEstimator):
-            return LearnedBatch(first, specs, dt, build_one)
         if isinstance(first, ForeignEstimator):
-            kind = getattr(first.inner, "batch", ForeignBatch)  # one that takes all rows at once
+            is_learned = isinstance(first.inner, LearnedEstimator)
+            kind = _LearnedBatch if is_learned else getattr(first.inner, "batch", ForeignBatch)
             return kind(first, specs, dt, build_one)
         if not first.compiled:
             return ForeignBatch(first, specs, dt, build_one)
@@ -194,19 +153,15 @@ def make_batch(
     cars = _expand_argument("vehicle", vehicle, count, (Vehicle, str, os.PathLike, Mapping))
     row_sensors = _expand_argument("sensors", sensors or {}, count, (Mapping,))
     speeds = _expand_argument("speed", speed, count, (int, float, np.number, type(None)))
-    specs = [
-        EstimatorSpec(make_vehicle(c), s, v)
-        for c, s, v in zip(cars, row_sensors, speeds, strict=True)
-    ]
+    specs = list(map(EstimatorSpec, map(make_vehicle, cars), row_sensors, speeds))
     batch = build_batch(name, specs, dt, options)
     batch.reset(None, row_sensors)
     return batch
 
 
-def _expand_argument(
-    label: str, value: Any, count: int, single_types: tuple[type, ...]
-) -> list[Any]:
-    if isinstance(value, single_types):
+def _expand_argument(label: str, value: Any, count: int, types: tuple[type, ...]) -> list[Any]:
+    """Expand an argument of one of these types to a list (count,); check the length of a list."""
+    if isinstance(value, types):
         return [value] * count
     if len(value) != count:
         raise ValueError(f"{label}: one or a list of {count}, got {len(value)}")

@@ -1,11 +1,11 @@
 """Records of a vector env's cars, as a batch of estimators reads them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
+from gymnasium.vector import SyncVectorEnv
 
 from ...envs.record import FAST_WIDTH, PACKET_WIDTH, Array
 from ...envs.sensors.link import SlowSensor
@@ -30,32 +30,21 @@ class BatchedEnv(Protocol):
 
     The final_... ones are a row's record before its newest reset. They are read in the step that
     ended its episode.
-
-    Attributes:
-        rows: Fast rows, shape (N, k, FAST_WIDTH).
-        ticks_done: Number of fast rows of each car, shape (N,).
-        packets: Packets, shape (N, capacity, PACKET_WIDTH).
-        delivered: Number of packets of each car, shape (N,).
-        slow_sensors: Slow sensors of each car by name.
-        nominal: Nominal vehicle of each car.
-        held_speed: Speed (m/s) of each car, None where it is not held.
-        layout: Entries of a row's observation.
-        dt: Tick (s).
     """
 
-    rows: Array
-    ticks_done: IntArray
-    packets: Array
-    delivered: IntArray
+    rows: Array  # fast rows, (N, k, FAST_WIDTH)
+    ticks_done: IntArray  # number of fast rows of each car, (N,)
+    packets: Array  # (N, capacity, PACKET_WIDTH)
+    delivered: IntArray  # number of packets of each car, (N,)
     final_rows: Array
     final_ticks_done: IntArray
     final_packets: Array
     final_delivered: IntArray
-    slow_sensors: Sequence[Mapping[str, SlowSensor]]
-    nominal: Sequence[Vehicle]
-    held_speed: Sequence[float | None]
-    layout: tuple[ObservationEntry, ...]
-    dt: float
+    slow_sensors: Sequence[Mapping[str, SlowSensor]]  # of each car, by name
+    nominal: Sequence[Vehicle]  # of each car
+    held_speed: Sequence[float | None]  # m/s, of each car where it is held
+    layout: tuple[ObservationEntry, ...]  # of a row's observation
+    dt: float  # tick (s)
 
 
 class BatchedRecords:
@@ -133,61 +122,34 @@ class SyncRecords:
         self.layout: tuple[ObservationEntry, ...] = layouts[0]
         self.dt: float = self._bases[0].dt
         N = len(self._bases)
-        ticks = max(len(base.rows) for base in self._bases)
-        capacity = max(len(base.packets) for base in self._bases)
-        self._records = RecordBatch(
-            np.zeros((N, ticks, FAST_WIDTH)),
-            np.zeros(N, np.int64),
-            np.zeros((N, capacity, PACKET_WIDTH)),
-            np.zeros(N, np.int64),
-        )
+        fast = np.zeros((N, max(len(base.rows) for base in self._bases), FAST_WIDTH))
+        packets = np.zeros((N, max(len(base.packets) for base in self._bases), PACKET_WIDTH))
+        self._records = RecordBatch(fast, np.zeros(N, np.int64), packets, np.zeros(N, np.int64))
 
     def read_latest(self) -> RecordBatch:
-        """Return the records of the newest step, or of tick 0 where a car was reset."""
-        fast, rows, packets, counts = self._records
-        for i, base in enumerate(self._bases):
-            n, m = base.ticks_done, base.delivered
-            fast[i, :n], packets[i, :m] = base.rows[:n], base.packets[:m]
-            rows[i], counts[i] = n, m
-        return self._records
+        """Return the records of the newest step as `BatchedRecords.read_latest` does."""
+        return self._copy(range(len(self._bases)), "")
 
     def read_final(self, ended: npt.NDArray[np.bool_]) -> RecordBatch:
-        """Return the records of the last step of the episodes that ended in this step.
+        """Return the last records of ended episodes as `BatchedRecords.read_final` does."""
+        return self._copy(np.flatnonzero(ended).tolist(), "final_")
 
-        Args:
-            ended: Rows whose episode ended, shape (N,).
-
-        Returns:
-            Records of all rows, valid in those that ended.
-        """
+    def _copy(self, indices: Iterable[int], prefix: str) -> RecordBatch:
+        """Copy the records of some environments, those before a reset with "final_"."""
         fast, rows, packets, counts = self._records
-        for i in np.flatnonzero(ended):
-            base = self._bases[i]
-            n, m = base.final_ticks_done, base.final_delivered
-            fast[i, :n], packets[i, :m] = base.final_rows[:n], base.final_packets[:m]
+        for i in indices:
+            names = ("rows", "ticks_done", "packets", "delivered")
+            ticks, n, arrived, m = (getattr(self._bases[i], prefix + name) for name in names)
+            fast[i, :n], packets[i, :m] = ticks[:n], arrived[:m]
             rows[i], counts[i] = n, m
         return self._records
 
     def make_specs(self, rows: Sequence[int]) -> list[EstimatorSpec]:
-        """Make the specs of some rows' estimators.
-
-        Args:
-            rows: Indices of the rows.
-
-        Returns:
-            Nominal vehicle, slow sensors and held speed of each.
-        """
+        """Make the specs of some rows' estimators as `BatchedRecords.make_specs` does."""
         return [make_spec(self._bases[i]) for i in rows]
 
     def annotate(self, label: str, beta: Array, std: Array, rows: npt.NDArray[np.bool_]) -> None:
-        """Pass estimates of some rows to their envs, which draw them beside the truth.
-
-        Args:
-            label: Title of the estimates.
-            beta: Estimated sideslip angles (rad), shape (N,).
-            std: Their standard deviations (rad), shape (N,).
-            rows: Rows to draw, shape (N,).
-        """
+        """Pass estimates to the envs that draw as `BatchedRecords.annotate` does."""
         for i in np.flatnonzero(rows):
             self._bases[i].annotate(label, float(beta[i]), float(std[i]))
 
@@ -212,63 +174,11 @@ def get_true_vehicles(base: Any, rows: Sequence[int]) -> list[Vehicle]:
     return [base.vehicle[i] for i in rows]
 
 
-def get_true_states(base: Any) -> Array:
-    """Return the present `TrueState` of every row.
-
-    Args:
-        base: Vector environment without wrappers.
-
-    Returns:
-        States in SI units, shape (N, len(TrueState)).
-
-    Raises:
-        TypeError: The states are out of reach.
-    """
-    if isinstance(base, SyncVectorEnv):
-        return np.array([env.unwrapped.true_state for env in base.envs])  # type: ignore[attr-defined]
-    if not hasattr(base, "true_state"):
-        raise TypeError(f"{type(base).__name__} does not offer the true states of its rows")
-    return np.asarray(base.true_state)
-
-
 def _make_contiguous(fast: Any, rows: Any, packets: Any, counts: Any) -> RecordBatch:
     """Make arrays as compiled code takes them, copied only where they are not."""
-    return RecordBatch(
-        np.ascontiguousarray(fast, np.float64),
-        np.ascontiguousarray(rows, np.int64),
-        np.ascontiguousarray(packets, np.float64),
-        np.ascontiguousarray(counts, np.int64),
-    )
-
-
-def make_record_source(env: VectorEnv[Any, Any, Any]) -> SyncRecords | BatchedRecords:
-    """Make the source of a vector env's records.
-
-    Args:
-        env: Vector environment without wrappers.
-
-    Returns:
-        Reader of the records.
-
-    Raises:
-        TypeError: The records are in worker processes, out of reach, or there are none.
-    """
-    if isinstance(env, AsyncVectorEnv):
-        raise TypeError(
-            "the records in AsyncVectorEnv's worker processes are out of reach; wrap each "
-            "environment in its worker with sideslip.estimators.EstimateObservation: "
-            "gym.make_vec(id, vectorization_mode='async', wrappers=[functools.partial("
-            "EstimateObservation, estimator=...)]), or use vectorization_mode='sync'"
-        )
-    if isinstance(env, SyncVectorEnv):
-        return SyncRecords(env)
-    missing = [name for name in BatchedEnv.__annotations__ if not hasattr(env, name)]
-    if missing:
-        raise TypeError(
-            "EstimateObservation reads the records of a sideslip vector environment; "
-            f"{type(env).__name__} has no {', '.join(missing)}"
-        )
-    return BatchedRecords(env)
+    fast, packets = (np.ascontiguousarray(a, np.float64) for a in (fast, packets))
+    rows, counts = (np.ascontiguousarray(a, np.int64) for a in (rows, counts))
+    return RecordBatch(fast, rows, packets, counts)
 
 
 def get_env_state(env: Any) -> Any:

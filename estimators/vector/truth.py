@@ -7,20 +7,20 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from ...envs.task import make_space
-from ..wrappers.truth import STIFFNESSES, make_truth_entries, read_parameters, read_states
+from ..wrappers.truth import STIFFNESSES, make_truth_entries, read_states
 from ..wrappers.truth import TruthObservation as Single
 from .estimate import make_vector_spec
-from .records import get_env_state, get_true_states, get_true_vehicles
+from .records import get_env_state, get_true_vehicles
 
-Observations = npt.NDArray[np.float32]
+_Observations = npt.NDArray[np.float32]
 
 
 class TruthObservation(
-    VectorWrapper[Observations, Any, Observations, Any, Any], RecordConstructorArgs
+    VectorWrapper[_Observations, Any, _Observations, Any, Any], RecordConstructorArgs
 ):
     """`sideslip.estimators.wrappers.truth.TruthObservation` of all rows, with the same bits.
 
@@ -36,8 +36,7 @@ class TruthObservation(
 
     Raises:
         TypeError: The env has no layout or no vehicles.
-        ValueError: A name is unknown or stands twice, or states are wanted of rows that are reset
-            within the step that ends their episode, whose last ones are gone then.
+        ValueError: A name is unknown or stands twice, or rows with states reset in the same step.
     """
 
     def __init__(
@@ -70,16 +69,8 @@ class TruthObservation(
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, Any]]:
-        """Reset the rows (those of options["reset_mask"]) and read their cars.
-
-        Args:
-            seed: Seed or seeds of the env.
-            options: Options of the env's reset.
-
-        Returns:
-            Observations, shape (N, width), and infos.
-        """
+    ) -> tuple[_Observations, dict[str, Any]]:
+        """Reset the rows (those of options["reset_mask"]) and read their cars."""
         mask = None if options is None else options.get("reset_mask")
         rows = np.ones(self.num_envs, np.bool_) if mask is None else np.array(mask)
         obs, infos = self.env.reset(seed=seed, options=options)
@@ -87,21 +78,14 @@ class TruthObservation(
         self._ended &= ~rows
         return self._append_truth(obs), infos
 
-    def _append_truth(self, obs: Observations) -> Observations:
-        if not self._states:
-            return np.hstack([obs, self._values])
-        states = get_true_states(self.unwrapped)
-        return np.hstack([obs, self._values, read_states(states, self._states)])
+    def _append_truth(self, obs: _Observations) -> _Observations:
+        parts = [obs, self._values]
+        if self._states:
+            parts.append(read_states(_get_true_states(self.unwrapped), self._states))
+        return np.hstack(parts)
 
-    def step(self, actions: Any) -> tuple[Observations, Any, Any, Any, dict[str, Any]]:
-        """Step all rows.
-
-        Args:
-            actions: Actions of the env, one a row.
-
-        Returns:
-            Observations (N, width), rewards, terminated and truncated, each (N,), and infos.
-        """
+    def step(self, actions: Any) -> tuple[_Observations, Any, Any, Any, dict[str, Any]]:
+        """Step all rows; `final_obs` gets the parameters of the old cars."""
         obs, rewards, terminated, truncated, infos = self.env.step(actions)
         ended = np.logical_or(terminated, truncated)
         if self._same_step:
@@ -119,11 +103,7 @@ class TruthObservation(
         return arrays | {"env": get_env_state(self.env)}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Restore a snapshot of this env or of one built with the same arguments."""
         env: Any = self.env
         env.set_state(snapshot["env"])
         self._values, self._ended = snapshot["values"].copy(), snapshot["ended"].copy()
@@ -132,4 +112,13 @@ class TruthObservation(
         rows = np.flatnonzero(mask)
         cars = get_true_vehicles(self.unwrapped, rows.tolist())
         for i, car in zip(rows, cars, strict=True):
-            self._values[i] = read_parameters(car, self._parameters)
+            self._values[i] = [getattr(car, name) for name in self._parameters]
+
+
+def _get_true_states(base: Any) -> npt.NDArray[np.float64]:
+    """Return the present `TrueState` of every row of a bare vector env, (N, len(TrueState))."""
+    if isinstance(base, SyncVectorEnv):
+        return np.array([env.unwrapped.true_state for env in base.envs])  # type: ignore[attr-defined]
+    if not hasattr(base, "true_state"):
+        raise TypeError(f"{type(base).__name__} does not offer the true states of its rows")
+    return np.asarray(base.true_state)

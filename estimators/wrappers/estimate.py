@@ -1,7 +1,4 @@
-"""The arguments of `EstimateObservation`, single and vector: an estimator, and its car.
-
-EstimateObservation: an estimator's states beside, or instead of, the raw observation.
-"""
+"""EstimateObservation: an estimator's states beside, or instead of, the raw observation."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,27 +20,29 @@ from ..make import make_estimator
 from ..protocol import EstimatorFactory, EstimatorLike, ForeignEstimator, get_label
 from ..registry import find_entry_point
 from .kernel import compile_observe
-from .outputs import BETA, STD, Outputs, make_outputs, make_title, write_outputs
+from .outputs import BETA, STD, Outputs, make_outputs, write_outputs
 from .truth import TRUTH, choose_vehicle, set_stiffness
 
 EstimatorSource = str | EstimatorFactory | EstimatorLike
 """What `EstimateObservation` takes for its estimator: a name, a factory or an object."""
 AnyEstimator = Estimator | ForeignEstimator
 _PARAMETERS = ("estimator", "outputs", "std", "replace", "vehicle", "options", "name")
+_ALLOWED_WRAPPERS = (PassiveEnvChecker, OrderEnforcing, TimeLimit)
+# stable-baselines3's make_vec_env and rl-zoo put it directly around the environment. It only counts
+# and is known by name: this module loads nothing of theirs.
+_MONITOR = ("stable_baselines3.common.monitor", "Monitor")
+_BASE_MEMBERS = (
+    *("rows", "ticks_done", "packets", "delivered", "slow_sensors", "nominal", "layout", "dt"),
+    "annotate",
+)
 
 
 class EstimatorSpec(NamedTuple):
-    """Vehicle, sensors and speed for which an estimator is built.
+    """Vehicle, sensors and speed for which an estimator is built."""
 
-    Attributes:
-        vehicle: The vehicle as the estimator believes it to be.
-        sensors: Slow sensors by name.
-        speed: Speed (m/s) where it is held, else None.
-    """
-
-    vehicle: Vehicle
-    sensors: Mapping[str, SlowSensor]
-    speed: float | None = None
+    vehicle: Vehicle  # as the estimator believes it to be
+    sensors: Mapping[str, SlowSensor]  # slow ones by name
+    speed: float | None = None  # m/s where it is held
 
     @property
     def design(self) -> Any:
@@ -83,7 +82,7 @@ def build_estimator(
 
 
 class Arguments:
-    """The checked arguments of a wrapper, and the estimators they stand for.
+    """The checked arguments of a wrapper, and the estimator they stand for.
 
     Args:
         estimator: Name, factory or object; None for `choose_estimator` of the sensors.
@@ -101,8 +100,7 @@ class Arguments:
         recorded: Arguments for the env's spec.
 
     Raises:
-        TypeError: An argument is misplaced; the message has the nearest name of the wrapper's or of
-            the estimator's options.
+        TypeError: An argument is misplaced; the message has the nearest name.
         ValueError: An object has a vehicle or options, which would not reach it.
     """
 
@@ -119,30 +117,28 @@ class Arguments:
         misplaced: Mapping[str, Any],
     ) -> None:
         source: Any = choose_estimator(slow_sensors) if estimator is None else estimator
-        recorded = source
         if misplaced:
             wrong = describe_unknown("argument of EstimateObservation", misplaced, _PARAMETERS)
             if isinstance(source, str) and "did you mean" not in wrong:
-                make_estimator(
-                    source, sensors=slow_sensors, **misplaced
-                )  # names the nearest option
-                wrong = (
-                    f"options of an estimator are passed as options={short_repr(dict(misplaced))}"
-                )
+                # this names the nearest option
+                make_estimator(source, sensors=slow_sensors, **misplaced)
+                passed = short_repr(dict(misplaced))
+                wrong = f"options of an estimator are passed as options={passed}"
             raise TypeError(wrong)
         self.options = dict(options or {})
         self.truth = isinstance(vehicle, str) and vehicle == TRUTH
         self.vehicle = None if vehicle is None or self.truth else make_vehicle(vehicle)
         self.source, self.object, self.label = source, None, get_label(source)
-        if not _is_object(source):
-            recorded = source if isinstance(source, str) else find_entry_point(source) or source
-        else:
+        recorded = source
+        if _is_object(source):
             if vehicle is not None or self.options:
                 raise ValueError(
                     f"{self.label} is built already: a vehicle and options go to a name or a "
                     "factory"
                 )
-            self.source, self.object, recorded = None, source, NotSerializable(self.label)
+            self.source, self.object, recorded = None, source, _NotSerializable(self.label)
+        elif not isinstance(source, str):
+            recorded = find_entry_point(source) or source
         car = vehicle.to_dict() if isinstance(vehicle, Vehicle) else vehicle
         self.recorded = {
             "estimator": recorded,
@@ -154,37 +150,9 @@ class Arguments:
             "name": name,
         }
 
-    def build(self, spec: EstimatorSpec, dt: float) -> AnyEstimator:
-        """Build an estimator; where one object is used, return that one.
 
-        Args:
-            spec: Vehicle, sensors and speed.
-            dt: Tick (s).
-
-        Returns:
-            The estimator.
-
-        Raises:
-            ValueError: The object was built for another tick.
-        """
-        if self.object is None:
-            return build_estimator(self.source, self.options, dt, spec)
-        if not isinstance(self.object, AnyEstimator):
-            self.object = ForeignEstimator(self.object, self.label, dt, spec.sensors)
-        elif abs(self.object.dt - dt) > 1e-9:
-            raise ValueError(
-                f"{self.label} was built for ticks of {self.object.dt:g} s, the env has {dt:g} s"
-            )
-        estimator: AnyEstimator = self.object
-        return estimator
-
-
-class NotSerializable:
-    """The place of an object in a spec: building from that spec raises the reason.
-
-    Args:
-        label: Name of the object for the message.
-    """
+class _NotSerializable:
+    """The place of an object in a spec: building from that spec raises the reason."""
 
     def __init__(self, label: str) -> None:
         self._label = label
@@ -214,16 +182,6 @@ def _is_object(source: Any) -> bool:
     if isinstance(source, str | type):
         return False
     return not callable(source) or hasattr(source, "step") or hasattr(source, "reset")
-
-
-_ALLOWED_WRAPPERS = (PassiveEnvChecker, OrderEnforcing, TimeLimit)
-# stable-baselines3's make_vec_env and rl-zoo put it directly around the environment. It only counts
-# and is known by name: this module loads nothing of theirs.
-_MONITOR = ("stable_baselines3.common.monitor", "Monitor")
-_BASE_MEMBERS = (
-    *("rows", "ticks_done", "packets", "delivered", "slow_sensors", "nominal", "layout", "dt"),
-    "annotate",
-)
 
 
 class EstimateObservation(
@@ -256,9 +214,8 @@ class EstimateObservation(
 
     Args:
         env: Environment, or wrappers that may be inside.
-        estimator: Name of `make_estimator`, entry point "package.module:Name", `EstimatorFactory`
-            or `EstimatorLike` object, which is reset at every episode but hears of no other car.
-            None for `choose_estimator` of the env's sensors.
+        estimator: Name of `make_estimator`, entry point "package.module:Name", factory, or object,
+            which hears of no other car. None for `choose_estimator` of the env's sensors.
         outputs: States to append, each as `<state>_hat`.
         std: Whether each one's standard deviation is appended as `<state>_std`.
         replace: Whether the observation is these alone.
@@ -295,7 +252,7 @@ class EstimateObservation(
         self.outputs: Outputs = make_outputs(label, states, outputs, std, name, inner)
         self.layout: tuple[ObservationEntry, ...] = self.outputs.layout
         self.observation_space = make_space(self.layout)
-        self._width, self._title = len(self.layout), make_title(label, name)
+        self._width, self._title = len(self.layout), label if name is None else f"{label} ({name})"
         self._summary = np.zeros(3)
 
     def _update_estimator(self) -> AnyEstimator:
@@ -306,42 +263,41 @@ class EstimateObservation(
             spec = spec._replace(vehicle=arguments.vehicle)
         elif arguments.truth:
             car = base.vehicle
-            vehicle = (
-                car if previous is None else choose_vehicle(self.estimator, previous.vehicle, car)
-            )
-            spec = spec._replace(vehicle=vehicle)
+            if previous is not None:
+                car = choose_vehicle(self.estimator, previous.vehicle, car)
+            spec = spec._replace(vehicle=car)
         if previous is None or spec.design != previous.design:
-            self.estimator, self._estimator_spec = arguments.build(spec, base.dt), spec
+            self.estimator, self._estimator_spec = self._build_estimator(spec), spec
             self._is_native = isinstance(self.estimator, Estimator) and self.estimator.compiled
         if arguments.truth:
             set_stiffness(self.estimator, base.vehicle)
         return self.estimator
 
+    def _build_estimator(self, spec: EstimatorSpec) -> AnyEstimator:
+        """Build an estimator for a spec; where one object is used, return that one."""
+        arguments, dt = self._arguments, self._base.dt
+        if arguments.object is None:
+            return build_estimator(arguments.source, arguments.options, dt, spec)
+        if not isinstance(arguments.object, AnyEstimator):
+            arguments.object = ForeignEstimator(arguments.object, arguments.label, dt, spec.sensors)
+        elif abs(arguments.object.dt - dt) > 1e-9:
+            raise ValueError(
+                f"{arguments.label} was built for ticks of {arguments.object.dt:g} s, the env has "
+                f"{dt:g} s"
+            )
+        estimator: AnyEstimator = arguments.object
+        return estimator
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Reset the env, then the estimator with this episode's clocks, and take tick 0.
-
-        Args:
-            seed: Seed of the env.
-            options: Options of the env's reset.
-
-        Returns:
-            Observation, shape (width,), and info.
-        """
+        """Reset the env, then the estimator with this episode's clocks, and take tick 0."""
         obs, info = self.env.reset(seed=seed, options=options)
         self._update_estimator().reset(self._base.slow_sensors)
         return self._append_estimates(obs, info), info
 
     def step(self, action: Any) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
-        """Step the env; the estimator takes its record before the observation is made.
-
-        Args:
-            action: Action of the env.
-
-        Returns:
-            Observation, shape (width,), reward, terminated, truncated and info.
-        """
+        """Step the env; the estimator takes its record before the observation is made."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._append_estimates(obs, info), reward, terminated, truncated, info
 
@@ -351,11 +307,7 @@ class EstimateObservation(
         return {"env": inner, "estimator": self.estimator.get_state()}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Restore a snapshot of this env or of one built with the same arguments."""
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
         self._update_estimator().set_state(snapshot["estimator"])
 

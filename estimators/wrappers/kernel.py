@@ -1,4 +1,4 @@
-"""An estimator's part of an observation, compiled: one call takes the step and writes it."""
+"""An estimator's part of an observation, compiled: one call runs the filter and writes it."""
 
 from functools import cache
 from typing import Any
@@ -22,10 +22,8 @@ def _clip_symmetric(value: Any, limit: Any) -> Any:
 
 @jit
 def _compute_nees(f: Any, gains: Any, i: int, j: int, beta: Any, gamma: Any) -> Any:
-    """e^T P^-1 e of the states i (beta) and j (gamma), per state; 0 if P is singular.
-
-    i, j: -1 where it is not to be judged. beta, gamma: the true ones.
-    """
+    """Compute e^T P^-1 e of the states i (beta) and j (gamma), -1: none; 0 if P is singular."""
+    # per state; beta and gamma are the true ones
     if i >= 0 and j >= 0:
         a, b = f.x[i] - beta, f.x[j] - gamma
         p, q = read_covariance(f, gains, i, i), read_covariance(f, gains, j, j)
@@ -70,8 +68,7 @@ def observe(
         start: Number of rows that are done already.
         obs: Observation of the env, float32, shape (at least inner,).
         inner: Number of entries of `obs` to copy.
-        plan: Shape (m, 3): each output's state, counted through the layers, whether it is wrapped,
-            and its truth (`outputs.TRUTHS`).
+        plan: State through the layers, whether to wrap it, its `outputs.TRUTHS`; shape (m, 3).
         limits: Bounds of the outputs in their units, shape (m,).
         beta: True sideslip angle (rad).
         gamma: True yaw rate (rad/s).

@@ -1,4 +1,4 @@
-"""An estimator's part of an observation: states, under which names, within which bounds."""
+"""States of an estimator as entries of an observation: names, units, bounds, and their values."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,23 +22,13 @@ _wrap = as_python(wrap, ARRAYS)
 
 @dataclass(frozen=True)
 class Outputs:
-    """The entries of a wrapped observation.
+    """The entries of a wrapped observation."""
 
-    Attributes:
-        layout: All entries; the first `inner` are the inner observation's.
-        inner: Number of inner entries.
-        plan: As `observe` takes it, shape (m, 3).
-        limits: Bounds of the outputs in their units, shape (m,).
-        keys: Keys of `info`, each with its place in the summary of `observe`. There are beta and
-            its standard deviation where the filter estimates it, and the NEES where an output's
-            truth is known.
-    """
-
-    layout: tuple[ObservationEntry, ...]
+    layout: tuple[ObservationEntry, ...]  # the first `inner` are the inner observation's
     inner: int
-    plan: npt.NDArray[np.int64]
-    limits: npt.NDArray[np.float64]
-    keys: tuple[tuple[str, int], ...]
+    plan: npt.NDArray[np.int64]  # as `kernel.observe` takes it, (m, 3)
+    limits: npt.NDArray[np.float64]  # bounds of the outputs in their units, (m,)
+    keys: tuple[tuple[str, int], ...]  # keys of `info`, with their places in the summary
 
 
 def make_outputs(
@@ -91,19 +81,6 @@ def make_outputs(
         np.array([kind.bound for kind in kinds]).astype(np.float32).astype(np.float64),
         tuple((prefix + key, place) for key, place in keys),
     )
-
-
-def make_title(label: str, name: str | None) -> str:
-    """Make the title of a wrapper's estimates in pictures.
-
-    Args:
-        label: Name of the estimator.
-        name: Name of the wrapper, or None.
-
-    Returns:
-        The title.
-    """
-    return label if name is None else f"{label} ({name})"
 
 
 def write_outputs(

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from gymnasium.utils import RecordConstructorArgs
 
 from ...envs.engine.views import TRUE_STATE
+from ...envs.record import Array
 from ...envs.task import ObservationEntry, make_space
 from ...envs.vehicle.parameters import Vehicle
 from ..estimator import Estimator
@@ -18,12 +19,12 @@ from ..protocol import ForeignEstimator
 
 TRUTH = "truth"  # in place of a vehicle: the one that is driven
 STIFFNESSES = ("front_stiffness", "rear_stiffness")
-MAX_PARAMETER = 1e7  # of any parameter of a vehicle, SI
+_MAX_PARAMETER = 1e7  # bound of any parameter of a vehicle, SI
 _STATES = {
     "beta": ("rad", math.pi),
     "gamma": ("rad/s", 20.0),
-    "F_d": ("N", MAX_PARAMETER),
-    "N_d": ("N m", MAX_PARAMETER),
+    "F_d": ("N", _MAX_PARAMETER),
+    "N_d": ("N m", _MAX_PARAMETER),
     "phi": ("rad", math.pi),
     "phi_rate": ("rad/s", 100.0),
 }
@@ -52,7 +53,7 @@ def make_truth_entries(
         if unit is None:
             known = ", ".join(key for key, value in fields.items() if value is not None)
             raise ValueError(f"a vehicle has no parameter {name!r}; it has: {known}")
-        entries.append(ObservationEntry(f"true_{name}", unit, -MAX_PARAMETER, MAX_PARAMETER))
+        entries.append(ObservationEntry(f"true_{name}", unit, -_MAX_PARAMETER, _MAX_PARAMETER))
     for name in states:
         if name not in _STATES:
             raise ValueError(f"there is no true state {name!r}; there is: {', '.join(_STATES)}")
@@ -63,19 +64,6 @@ def make_truth_entries(
     if duplicates:
         raise ValueError(f"{', '.join(duplicates)} would stand twice in the observation")
     return (*inner, *entries)
-
-
-def read_parameters(vehicle: Vehicle, parameters: Sequence[str]) -> npt.NDArray[np.float32]:
-    """Read parameters of a vehicle.
-
-    Args:
-        vehicle: The vehicle.
-        parameters: Names of `Vehicle`.
-
-    Returns:
-        Values in SI units, shape (len(parameters),).
-    """
-    return np.array([getattr(vehicle, name) for name in parameters], np.float32)
 
 
 def read_states(true_state: Any, states: Sequence[str]) -> npt.NDArray[np.float32]:
@@ -90,10 +78,8 @@ def read_states(true_state: Any, states: Sequence[str]) -> npt.NDArray[np.float3
     """
     limits = np.array([_STATES[name][1] for name in states])
     columns = [getattr(TRUE_STATE, name) for name in states]
-    values: npt.NDArray[np.float32] = (
-        true_state[..., columns].clip(-limits, limits).astype(np.float32)
-    )
-    return values
+    values: Array = true_state[..., columns].clip(-limits, limits)
+    return values.astype(np.float32)
 
 
 def choose_vehicle(
@@ -113,12 +99,8 @@ def choose_vehicle(
     """
     if isinstance(estimator, ForeignEstimator) or estimator.filters[0].periodic:
         return vehicle
-    return vehicle.replace(
-        name=built.name,
-        friction=built.friction,
-        front_stiffness=built.front_stiffness,
-        rear_stiffness=built.rear_stiffness,
-    )
+    fixed = ("name", "friction", *STIFFNESSES)
+    return vehicle.replace(**{name: getattr(built, name) for name in fixed})
 
 
 def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> None:
@@ -138,15 +120,18 @@ class TruthObservation(
 ):
     """Appends parameters of the true car, as they are at the reset, and true states.
 
-    No sensor measures these: it makes the oracles with which others are compared
-    (`agents.baselines`), and stands outside of any `EstimateObservation`. `layout` describes the
-    whole observation.
-    ValueError says that a name is unknown or stands twice.
+        No sensor measures these: it makes the oracles with which others are compared
+        (`agents.baselines`), and stands outside of any `EstimateObservation`. `layout` describes the
+        whole observation.
+    <<<<<<< HEAD
+        ValueError says that a name is unknown or stands twice.
+    =======
+    >>>>>>> shrink-E
 
-    Args:
-        env: Environment with a `layout`.
-        parameters: Names of `Vehicle`, appended as `true_<name>` in their units.
-        states: Names of `TrueState`, appended as `<name>_hat` as if by an estimator without error.
+        Args:
+            env: Environment with a `layout`.
+            parameters: Names of `Vehicle`, appended as `true_<name>` in their units.
+            states: Names of `TrueState`, appended as `<name>_hat` as if by an estimator without error.
     """
 
     def __init__(
@@ -166,35 +151,19 @@ class TruthObservation(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Reset the env and read its car.
-
-        Args:
-            seed: Seed of the env.
-            options: Options of the env's reset.
-
-        Returns:
-            Observation, shape (width,), and info.
-        """
+        """Reset the env and read its car; see `gymnasium.Env.reset`."""
         obs, info = self.env.reset(seed=seed, options=options)
         base: Any = self.unwrapped
-        self._values = read_parameters(base.vehicle, self._parameters)
+        self._values[:] = [getattr(base.vehicle, name) for name in self._parameters]
         return self._append_truth(obs), info
 
     def _append_truth(self, obs: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        if not self._states:
-            return np.concatenate([obs, self._values])
         base: Any = self.unwrapped
-        return np.concatenate([obs, self._values, read_states(base.true_state, self._states)])
+        states = [read_states(base.true_state, self._states)] if self._states else []
+        return np.concatenate([obs, self._values, *states])
 
     def step(self, action: Any) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
-        """Step the env.
-
-        Args:
-            action: Action of the env.
-
-        Returns:
-            Observation, shape (width,), reward, terminated, truncated and info.
-        """
+        """Step the env; see `gymnasium.Env.step`."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._append_truth(obs), reward, terminated, truncated, info
 
@@ -203,10 +172,6 @@ class TruthObservation(
         return {"env": self.env.get_wrapper_attr("get_state")(), "values": self._values.copy()}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments.
-
-        Args:
-            snapshot: Result of `get_state`.
-        """
+        """Restore a snapshot of this env or of one built with the same arguments."""
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
         self._values = snapshot["values"].copy()

@@ -11,8 +11,8 @@ from sideslip.agents.baselines import OUTPUTS
 from sideslip.agents.optimum import (
     Lqg,
     Optimum,
+    _make_linear_plant,
     compute_optimum,
-    make_linear_plant,
     wrap_optimal_estimate,
 )
 from sideslip.envs.record import FAST
@@ -67,7 +67,7 @@ def test_the_linear_plant_is_the_envs_step_and_its_cost(n: int) -> None:
     still = {} if n == 1 else {"disturbance_force": 1e-9, "disturbance_moment": 1e-9}
     env = gym.make(IDS[0], scenario=LINEAR | still | {"hold": 1e-3 * n}, control_period=n)
     base: Any = env.unwrapped
-    model = make_linear_plant(env).model
+    model = _make_linear_plant(env).model
     names, rng = model.design_spec.states, np.random.default_rng(0)
     env.reset(seed=0, options={"state": {"v_y": 0.2, "gamma": 0.1}})
     for _ in range(20):
@@ -148,7 +148,7 @@ def test_late_rare_and_lost_pictures_cost_more() -> None:
 )
 def test_what_has_no_known_optimum_is_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        make_linear_plant(gym.make(IDS[0], scenario=LINEAR | changes))
+        _make_linear_plant(gym.make(IDS[0], scenario=LINEAR | changes))
 
 
 @pytest.mark.parametrize("env_id", IDS)

@@ -8,7 +8,7 @@ import pytest
 
 from sideslip.envs.record import FAST, PACKET, PACKET_WIDTH, Log, Record
 from sideslip.estimators import make_estimator
-from sideslip.estimators.delayed_channels import LatencySearch, align_rows
+from sideslip.estimators.delayed_channels import _align_rows, _LatencySearch
 from tests.estimators.simulation import CAMERA, FIG7, simulate
 from tests.estimators.test_late import later
 
@@ -53,12 +53,12 @@ def test_it_finds_the_latency_whatever_the_tyres(tyres: tuple[float, float], lat
 @pytest.mark.parametrize("dt", [0.1, 0.25])
 def test_rows_too_far_apart_are_refused(dt: float) -> None:
     with pytest.raises(ValueError, match=f"rows every {dt:g} s tell nothing: say the latency"):
-        LatencySearch((FAST.gyro,), dt)
+        _LatencySearch((FAST.gyro,), dt)
 
 
 @pytest.mark.parametrize("least", [0.0, 3.2, 37.3, 62.6, 118.4, 120.0])
 def test_between_the_lags_that_are_tried_a_parabola_has_the_least(least: float) -> None:
-    search = LatencySearch((FAST.gyro,), 0.001)
+    search = _LatencySearch((FAST.gyro,), 0.001)
     lag, bend, _ = search._minimise_nis(lambda lag: 7.0 + 0.25 * (lag - least) ** 2)
     assert lag == round(least) and bend == pytest.approx(0.5)
 
@@ -73,7 +73,7 @@ def test_aligned_rows_are_those_that_were_never_late(lag: int) -> None:
     wanted = true[lag:].copy()
     wanted[come:, FAST.gyro] = np.nan
     before = late.copy()
-    np.testing.assert_array_equal(align_rows(late, {FAST.gyro: lag}), wanted)
+    np.testing.assert_array_equal(_align_rows(late, {FAST.gyro: lag}), wanted)
     np.testing.assert_array_equal(late, before)
 
 

@@ -11,7 +11,7 @@ import sideslip
 from sideslip.agents import AGENTS, register_agent
 from sideslip.estimators import FILTERS, make_estimator, register_estimator
 from sideslip.estimators.make import ESTIMATORS
-from sideslip.estimators.registry import Registry, find_entry_point, import_entry_point
+from sideslip.estimators.registry import Registry, _import_entry_point, find_entry_point
 from tests.estimators.wrappers.constant import Constant
 
 CONSTANT = "tests.estimators.wrappers.constant:Constant"
@@ -75,7 +75,9 @@ def test_what_cannot_be_registered(register: Any) -> None:
 
 
 def test_an_entry_point_is_imported_when_asked_for(module: str) -> None:
-    assert import_entry_point("tests.estimators.wrappers.constant:Constant.reset") is Constant.reset
+    assert (
+        _import_entry_point("tests.estimators.wrappers.constant:Constant.reset") is Constant.reset
+    )
     for text, message in (
         ("nowhere:Thing", "'nowhere:Thing': there is no module 'nowhere'"),
         ("tests.nowhere.at_all:Thing", "there is no module 'tests.nowhere'"),
@@ -85,7 +87,7 @@ def test_an_entry_point_is_imported_when_asked_for(module: str) -> None:
         with pytest.raises(ValueError, match=message):
             make_estimator(f"broken-{text.count('.')}")
     with pytest.raises(TypeError, match="is no factory but of type tuple"):
-        import_entry_point(f"{CONSTANT}.names")
+        _import_entry_point(f"{CONSTANT}.names")
     with pytest.raises(ModuleNotFoundError, match="nowhere_to_be_found"):  # the user's own error
         make_estimator(f"{module}:Thing")
 

@@ -8,7 +8,7 @@ import pytest
 
 from sideslip.agents import make_agent, register_agent
 from sideslip.estimators import make_estimator
-from sideslip.estimators.registry import describe_error, find_class, is_user_file, load_user_class
+from sideslip.estimators.registry import _load_user_class, describe_error, find_class, is_user_file
 
 AGENT = """
 class Still:
@@ -45,7 +45,7 @@ def test_a_files_class_is_a_name(tmp_path: Path) -> None:
         agent: Any = make_agent(name, env)
         assert type(agent).__name__ == "Still"
         assert agent.env is env
-    assert load_user_class(mine) is load_user_class(f"{mine}:Still")  # run once
+    assert _load_user_class(mine) is _load_user_class(f"{mine}:Still")  # run once
     register_agent("still-of-a-file", f"{mine}:Still")
     assert type(make_agent("still-of-a-file", env)).__name__ == "Still"
     own = make_estimator(f"{file(tmp_path, FILTER, 'my-filter.py')}:Filter", dt=0.002)
@@ -55,9 +55,9 @@ def test_a_files_class_is_a_name(tmp_path: Path) -> None:
 def test_another_text_is_another_class_and_neighbours_are_found(tmp_path: Path) -> None:
     mine = file(tmp_path, "from my_neighbour import GAIN\n\n\ndef build(env):\n    return GAIN\n")
     file(tmp_path, "GAIN = 3\n", "my_neighbour.py")
-    assert load_user_class(f"{mine}:build")(None) == 3
+    assert _load_user_class(f"{mine}:build")(None) == 3
     file(tmp_path, "def build(env):\n    return 4\n")
-    assert load_user_class(f"{mine}:build")(None) == 4
+    assert _load_user_class(f"{mine}:build")(None) == 4
 
 
 BAD = {
@@ -77,7 +77,7 @@ BAD = {
 def test_a_file_that_has_no_class_for_us_is_refused(case: str, tmp_path: Path) -> None:
     text, name, message = BAD[case]
     with pytest.raises((ValueError, TypeError), match=message):
-        load_user_class(file(tmp_path, text) + name)
+        _load_user_class(file(tmp_path, text) + name)
 
 
 def test_what_is_found_is_not_run(tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_other_names_are_no_files(text: str) -> None:
 
 
 def test_a_reason_has_the_line_of_the_users_file(tmp_path: Path) -> None:
-    build = load_user_class(
+    build = _load_user_class(
         file(tmp_path, "def build(x):\n    y = 1\n    return y / x\n") + ":build"
     )
     with pytest.raises(ZeroDivisionError) as caught:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.yaw_stability import compute_yaw_gains
+from sideslip.agents.controllers.yaw_stability import _compute_yaw_gains
 from sideslip.envs import COMS, PASSENGER_CAR, critical_speed
 from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation
@@ -32,7 +32,7 @@ def observed(env: Any, **told: float) -> np.ndarray:
 def test_the_sampled_loop_is_stable_over_the_speeds(car: Any) -> None:
     """Moment held over a period and late by the motors; below the critical speed."""
     for speed in np.arange(2.0, min(40.0, 0.95 * critical_speed(car)), 1.0):
-        k_p, k_i = compute_yaw_gains(car, float(speed))
+        k_p, k_i = _compute_yaw_gains(car, float(speed))
         model = make_bicycle_model(car, float(speed))
         G, H = model.discretise(T)
         lag = np.exp(-T / car.motor_lag)
@@ -44,7 +44,7 @@ def test_the_sampled_loop_is_stable_over_the_speeds(car: Any) -> None:
 
 
 def test_gains_place_both_poles_of_the_yaw_equation() -> None:
-    k_p, k_i = compute_yaw_gains(COMS, 7.0, 20.0)
+    k_p, k_i = _compute_yaw_gains(COMS, 7.0, 20.0)
     damping = make_bicycle_model(COMS, 7.0).A[1, 1]
     poles = np.roots([1.0, k_p / COMS.yaw_inertia - damping, k_i / COMS.yaw_inertia])
     assert poles == pytest.approx([-20.0, -20.0], rel=1e-5)

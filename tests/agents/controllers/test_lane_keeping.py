@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.lane_keeping import HASTE, MOVED, LaneKeeping, make_lane_model
+from sideslip.agents.controllers.lane_keeping import HASTE, MOVED, LaneKeeping, _make_lane_model
 from sideslip.agents.design.sampled_model import SPEEDS, solve_lqr
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation
@@ -47,7 +47,7 @@ def drive(env: Any, agent: Any, seed: int) -> tuple[np.ndarray, int]:
 def test_stable_over_the_speeds_with_python_controls_gains(inputs: slice) -> None:
     d = len(MOVED)
     for speed in SPEEDS[::6]:
-        G, H, Q, R, N = make_lane_model(COMS, speed, 10, LIMIT, HASTE)
+        G, H, Q, R, N = _make_lane_model(COMS, speed, 10, LIMIT, HASTE)
         B = H[:, inputs]
         K, _ = solve_lqr(G, B, Q, R[inputs, inputs], N[:, inputs], d)
         wanted = control.dlqr(G[:d, :d], B[:d], Q[:d, :d], R[inputs, inputs], N[:d, inputs])[0]
@@ -58,7 +58,7 @@ def test_stable_over_the_speeds_with_python_controls_gains(inputs: slice) -> Non
 def test_at_rest_on_a_curve_the_car_is_in_its_lane() -> None:
     """The integral leaves no offset; the car turns with the road."""
     d, speed, kappa = len(MOVED), 7.0, 0.02
-    G, H, Q, R, N = make_lane_model(COMS, speed, 10, LIMIT, HASTE)
+    G, H, Q, R, N = _make_lane_model(COMS, speed, 10, LIMIT, HASTE)
     K, _ = solve_lqr(G, H, Q, R, N, d)
     closed = G - H @ K
     rest = np.linalg.solve(np.eye(d) - closed[:d, :d], closed[:d, d + 1] * kappa)

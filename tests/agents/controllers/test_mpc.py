@@ -50,7 +50,7 @@ def test_without_a_limit_it_is_the_lqr(steers: bool, told: dict[str, float], hor
     agent = agent_of(env, horizon=horizon)
     lqr = Lqr(env)
     obs = observed(env, **told)
-    program = agent.get_program(V)
+    program = agent._get_program(V)
     K = lqr.gains(V) / np.array([1.0, COMS.steering_authority])[: agent.width, None]
     x = np.zeros(len(agent.design_spec.states))
     for name, value in told.items():

@@ -10,7 +10,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from sideslip.agents import Nmpc, make_agent
 from sideslip.agents.baselines import make_oracle
-from sideslip.agents.controllers.nmpc import _shift_plan, prepare_prediction
+from sideslip.agents.controllers.nmpc import _prepare_prediction, _shift_plan
 from sideslip.agents.design.gauss_newton import (
     DIFFERENCE,
     LIMIT,
@@ -57,7 +57,7 @@ def problem(agent: Nmpc, obs: np.ndarray) -> Any:
     """(start, K, T) of an observation."""
     x = obs[agent._columns].astype(np.float64)
     friction, roll = x[agent.needs.index("true_friction")], x[-3:-1]
-    return prepare_prediction(
+    return _prepare_prediction(
         agent.design, x, friction, roll, 0.0, agent._compute_max_moment(x[None])[0]
     )
 
@@ -267,7 +267,7 @@ def test_where_roll_is_not_measured_it_is_that_of_a_steady_turn() -> None:
     for _ in range(250):
         obs, *_ = env.step(np.zeros(1, np.float32))
     x, motion = obs[agent._columns].astype(np.float64), env.unwrapped.motion
-    start, _, _ = prepare_prediction(
+    start, _, _ = _prepare_prediction(
         agent.design, x, 0.9, np.full(2, np.nan), 0.0, agent._compute_max_moment(x[None])[0]
     )
     assert abs(motion.phi) > 1e-3

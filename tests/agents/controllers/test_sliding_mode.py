@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.yaw_stability import SlidingMode, compute_surface_slope
+from sideslip.agents.controllers.yaw_stability import SlidingMode, _compute_surface_slope
 from sideslip.agents.design.pi import BicyclePlant
 from sideslip.envs import COMS, critical_speed
 from sideslip.envs.vehicle.linear import make_bicycle_model
@@ -52,13 +52,13 @@ def test_the_distance_to_the_surface_decays_at_its_rate(
     N_z = moment(env, agent, beta_hat=state[0], gamma_hat=state[1])
     model = make_bicycle_model(COMS, 7.0)
     moved = model.A @ state + model.B @ [0.0, N_z]
-    xi = compute_surface_slope(coefficients(7.0), agent.pole)
+    xi = _compute_surface_slope(coefficients(7.0), agent.pole)
     s, ds = state[1] + xi * state[0], moved[1] + xi * moved[0]
     assert ds == pytest.approx(-8.0 * s, rel=1e-4)
 
 
 def test_on_the_surface_the_slip_decays_at_its_pole() -> None:
-    xi = compute_surface_slope(coefficients(7.0), 15.0)
+    xi = _compute_surface_slope(coefficients(7.0), 15.0)
     a11, a12 = coefficients(7.0)[:2]
     assert a11 - a12 * xi == pytest.approx(-15.0)
 
@@ -78,7 +78,7 @@ def test_the_sampled_loop_is_stable_over_the_speeds() -> None:
     lag = np.exp(-T / COMS.motor_lag)
     for speed in np.arange(2.0, 0.95 * critical_speed(COMS), 1.0):
         model = make_bicycle_model(COMS, float(speed))
-        xi = compute_surface_slope(coefficients(float(speed)), defaults.pole)
+        xi = _compute_surface_slope(coefficients(float(speed)), defaults.pole)
         row = np.array([xi, 1.0])
         K = COMS.yaw_inertia * (row @ model.A + defaults.rate * row)
         G, H = model.discretise(T)

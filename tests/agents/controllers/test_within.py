@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sideslip.agents.controllers.lqr import solve_box_qp
+from sideslip.agents.controllers.lqr import _solve_box_qp
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -12,7 +12,7 @@ def test_nothing_within_the_limits_costs_less(seed: int) -> None:
     root = rng.normal(size=(2, 2))
     S = root @ root.T + 0.01 * np.eye(2)
     free, (low, high) = rng.normal(size=2) * 3.0, np.sort(rng.normal(size=2))
-    u, w = solve_box_qp(S[0, 0], S[0, 1], S[1, 1], free[0], free[1], 1.0, low, high)
+    u, w = _solve_box_qp(S[0, 0], S[0, 1], S[1, 1], free[0], free[1], 1.0, low, high)
     assert abs(u) <= 1.0 and low <= w <= high
     grid = np.stack(np.meshgrid(np.linspace(-1.0, 1.0, 201), np.linspace(low, high, 201)), -1)
     off = grid - free
@@ -22,4 +22,4 @@ def test_nothing_within_the_limits_costs_less(seed: int) -> None:
 
 
 def test_what_is_within_the_limits_stays() -> None:
-    assert solve_box_qp(1.0, 0.9, 1.0, 0.3, -0.2, 1.0, -0.5, 0.5) == (0.3, -0.2)
+    assert _solve_box_qp(1.0, 0.9, 1.0, 0.3, -0.2, 1.0, -0.5, 0.5) == (0.3, -0.2)
