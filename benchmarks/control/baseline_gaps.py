@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -82,11 +82,11 @@ def make_oracle_table(
         if not parameters.error:
             gains = scale.compute_paired_ratios(parameters)[0]
             known = f"{gains.mean() if len(gains) else math.nan:.2f}"
-        ahead = foresight.get(task)
+        log_ratios = foresight.get(task)
         fails = 100.0 * (1.0 - survival_mask(scale.nominal).mean())
-        beyond = "" if ahead is None else f"{ahead.mean():.2f}"
+        beyond = "" if log_ratios is None else f"{log_ratios.mean():.2f}"
         counted = f"{len(oracle_gains)} of {len(scale.mark_compared(len(scale.oracle.costs)))}"
-        falls = _describe_order(scale, oracle_gains, ahead)
+        falls = _describe_order(scale, oracle_gains, log_ratios)
         texts = (find_oracle(task), average(oracle_gains).inline(), known, beyond, counted, falls)
         cells.append([task.name, f"{fails:.1f}", *texts])
     header = (
@@ -260,7 +260,7 @@ def measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
     errors += oracle_errors
     is_unknown = bool(nominal.error) or len(oracle_errors) == len(ORACLES[STATE])
     verdict = _describe_verdict(task, gap, failing, n_compared)
-    facts: dict[str, Any] = asdict(task) | {"env_version": __version__}
+    facts = asdict(task) | {"env_version": __version__}
     facts |= {"oracle": name, "knowing": knowing, "judged": n_compared, "n": len(nominal.costs)}
     numbers = zip(("gap", "low", "high", "failing"), (*gap, failing), strict=True)
     facts |= {key: round(number, 4) for key, number in numbers}

@@ -50,7 +50,7 @@ from .tasks import (
 
 TRUTH, REFERENCE_CONTROLLER = "truth", "lqr"
 REFERENCE_FILTER = "exact-kf, all sensors"
-_BOTH: dict[str, Any] = {"slow": ["camera", "gps"]}
+_BOTH = {"slow": ["camera", "gps"]}
 SETUPS: dict[str, tuple[str, dict[str, Any]]] = {
     REFERENCE_FILTER: ("exact-kf", _BOTH),
     "exact-kf, no bias states": ("exact-kf", _BOTH | {"bias_sd": 0.0, "accel_bias_sd": 0.0}),

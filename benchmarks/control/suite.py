@@ -5,7 +5,6 @@ All pairs of both drive the scored tasks of four tiers on salted seeds.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -194,7 +193,7 @@ def _make_failure_tables(results: Results, late: Sequence[Results]) -> list[Resu
 def _make_delay_rows(prices: Sequence[DelayCost], n: int, salt: str) -> list[ResultRow]:
     """Rows of the cost of delay; the scenario has the delay."""
     version, rows = f"{DELAY_TASK.env_id} {__version__}", []
-    common: Any = {"suite": "control", "n": n, "salt": salt, "env_version": version}
+    common = {"suite": "control", "n": n, "salt": salt, "env_version": version}
     for price in prices:
         labels = {"estimator": price.entry.estimator, "controller": price.entry.controller}
         for delay, ratio in zip(DELAYS[: len(price.over)], price.over, strict=True):

@@ -319,12 +319,11 @@ def score(
             row |= {name: number.value, f"{name}_low": number.low, f"{name}_high": number.high}
         pairs = standing.pairs.get(task)
         rows.append(row | {"n": len(pairs[0]) if pairs else 0, "error": result.error})
-    overall = {name: standing.overall.get(metric, _NONE) for name, metric in _COLUMNS.items()}
-    errors = [row["error"] for row in rows]
-    error, text = errors[0] if all(errors) else "", make_sentence(standing)
-    facts: dict[str, Any] = {"n": standing.n, "contests": tuple(rows), "error": error, "text": text}
-    facts |= overall
-    return Score(standing.entry.controller, standing.entry.estimator, **facts)
+    total, cost, won, failures = (standing.overall.get(x, _NONE) for x in _COLUMNS.values())
+    errors, driven = [row["error"] for row in rows], standing.entry
+    n, contests, error = standing.n, tuple(rows), errors[0] if all(errors) else ""
+    names, text = (driven.controller, driven.estimator), make_sentence(standing)
+    return Score(*names, total, cost, won, failures, n, contests, error, text)
 
 
 _TEXT = "Everybody drives the same episodes; an agent of yours on nominal's filter, or on yours."

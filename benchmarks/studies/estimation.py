@@ -160,13 +160,13 @@ def compose_verdict(errors: Sequence[tuple[Array, Array]]) -> str:
         by_label = dict(zip(labels, squares.T, strict=True))
         known_labels = [label for label in labels if label != TRUE_MODEL]
         leader, *rivals = sorted(known_labels, key=lambda name: by_label[name].mean())
-        least = by_label[leader]
-        ratios = {name: interval(least, ratio_of_roots, by_label[name]) for name in rivals}
-        over_bound = float(ratio_of_roots(least, best))
+        smallest = by_label[leader]
+        ratios = {name: interval(smallest, ratio_of_roots, by_label[name]) for name in rivals}
+        over_bound = float(ratio_of_roots(smallest, best))
         first = describe_leader(leader, ratios, "err")
         firsts.append(f"{experiment.brief}: {first}, {over_bound:.2f} times the least possible.")
-        unaided.append(f"{ratio_of_roots(by_label[_UNAIDED], least):.1f}")
-        known.append(f"{ratio_of_roots(by_label[TRUE_MODEL], least):.2f}")
+        unaided.append(f"{ratio_of_roots(by_label[_UNAIDED], smallest):.1f}")
+        known.append(f"{ratio_of_roots(by_label[TRUE_MODEL], smallest):.2f}")
     return format_verdict(
         "An estimator infers the sideslip angle: between where the car points and where it goes.",
         *firsts,

@@ -240,13 +240,12 @@ def add_tables(
         beaten = ["" if x == controller else f"{100.0 * rate:.0f} %" for x, rate in won.items()]
         fails = share(transfer.mark_failures(controller)).value
         totals.append([controller, *beaten, f"{100.0 * fails:.1f} %", f"{ratio:.2f}"])
-        labels: dict[str, Any] = {"suite": suite.name, "controller": controller, "n": episodes}
-        labels |= {"salt": transfer.salt, "env_version": f"{env_id} {__version__}"}
+        labels = {"controller": controller, "n": episodes, "salt": transfer.salt}
+        common = {"suite": suite.name, "env_version": f"{env_id} {__version__}"}
         for condition, item in scores.items():
             if np.isfinite(item.value):  # else there is no gap
-                scenario = f"{transfer.kind}, {condition}"
-                row = ResultRow.from_estimate("score", item, scenario=scenario, **labels)
-                suite.rows.append(row)
+                columns = {"scenario": f"{transfer.kind}, {condition}", **labels, **common}
+                suite.rows.append(ResultRow.from_estimate("score", item, **columns))
     count = episodes // len(transfer.drives)
     note = f"{scenarios}; {count} episodes a condition, the same for everybody. {remark}"
     if any("-" in row for row in shares):

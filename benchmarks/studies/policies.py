@@ -214,7 +214,7 @@ def _make_rows(result: PolicyEvaluation) -> list[ResultRow]:
     for name, outcome in result.drives.items():
         entry, is_policy = result.entries[name], name == result.policy.name
         controller = name if is_policy else entry.controller
-        labels: dict[str, Any] = {"estimator": entry.estimator, "controller": controller}
+        labels = {"estimator": entry.estimator, "controller": controller}
         seeds = {"n": len(result.seeds), "salt": result.salt, "spec": make_spec(entry)}
         common = {"suite": "enjoy", "env_version": f"{entry.task.env_id} {__version__}"}
         for metric in ("cost", "rms_slip", "peak_slip", "effort", "largest_step"):

@@ -198,8 +198,11 @@ def _train_memory(case: MemoryCase) -> tuple[Any, int]:
     budget = case.budget
     twins = wrap_optimal_estimate(_make_cars(case, budget.cars))
     task = DistillTask(CompactObservation(_make_cars(case, budget.cars)), twins, Lqg(twins))
-    training: Any = {"rounds": budget.rounds, "epochs": budget.epochs, "seed": case.seed}
-    config = DistillConfig(learning_rate=MEMORIES[case.learner].rate, noise=_NOISE, **training)
+    rounds, epochs, seed = budget.rounds, budget.epochs, case.seed
+    rate = MEMORIES[case.learner].rate
+    config = DistillConfig(
+        rounds=rounds, epochs=epochs, learning_rate=rate, noise=_NOISE, seed=seed
+    )
     weight, steps = float(case.best.weights[0]), list[int]()
     arguments = (case.learner, task, config, case.delay_steps, weight)
     agent = train_memory(*arguments, lambda round_result: steps.append(round_result.steps))
@@ -349,7 +352,7 @@ def _add_tables(suite: Suite, results: Results) -> None:
         gaps.append([learner, *texts])
         for condition, number in numbers.items():
             n = len(learner_runs[condition][0].costs)
-            columns: dict[str, Any] = {"scenario": condition, "controller": learner, "n": n}
+            columns = {"scenario": condition, "controller": learner, "n": n}
             common = {"suite": NAME, "salt": "fixed", "env_version": f"{ID} {__version__}"}
             suite.rows.append(ResultRow.from_estimate("gap", number, **columns, **common))
         if learner != FILTER:

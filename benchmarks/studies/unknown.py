@@ -51,7 +51,9 @@ def _make_columns(condition: Condition, result: ConditionResult) -> dict[str, An
     return common | {"env_version": version, "n": len(result.best)}
 
 
-def _add_rows(suite: Suite, numbers: Mapping[str, Estimate], label: str, columns: Any) -> None:
+def _add_rows(
+    suite: Suite, numbers: Mapping[str, Estimate], label: str, columns: Mapping[str, object]
+) -> None:
     """Rows of an estimator's numbers by metric."""
     suite.rows += [
         ResultRow.from_estimate(metric, number, estimator=label, **columns)
@@ -195,7 +197,8 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
     ratios, against, lines = dict[str, dict[str, Estimate]](), dict[str, Estimate](), []
     for condition, item in zip(CONDITIONS, results, strict=True):
         (joint_squares, nees, inside), labels = item.select("joint"), item.labels
-        exact_squares, own = item.select("exact-kf")[0], item.variances[:, labels.index("joint")]
+        exact_squares = item.select("exact-kf")[0]
+        variances = item.variances[:, labels.index("joint")]
         saved, honest = interval(joint_squares, ratio_of_roots, exact_squares), interval(nees, mean)
         against[condition.name], known = saved, None
         covered = inside.mean(axis=0)
@@ -205,7 +208,7 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
             known = numbers["rmse_over_bound"] = interval(joint_squares, ratio_of_roots, item.best)
             best = interval(exact_squares, ratio_of_roots, item.best)
             ratios[condition.name] = {"joint": known, "exact-kf": best}
-        theory = numbers["rmse_over_own"] = interval(joint_squares, ratio_of_roots, own)
+        theory = numbers["rmse_over_own"] = interval(joint_squares, ratio_of_roots, variances)
         _add_rows(suite, numbers, "joint", _make_columns(condition, item))
         lines.append([
             condition.name, str(len(nees)), str(item.left_out), _format_ratio(known),

@@ -6,6 +6,7 @@ A condition's drives are recorded once; every filter runs over the same records,
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -98,7 +99,7 @@ _CAR_LEVELS = {"force_sd": 200.0, "moment_sd": 350.0}
 _CAR_FILTERS: Filters = {"exact-kf": ("exact-kf", _CAR_LEVELS)}
 """The disturbances accelerate the passenger car as those of `LINEAR` do the COMS."""
 _UNEVEN = {"camera_delays": (0.02, 0.015, 0.01, 0.025)}
-_ON_CAR: dict[str, Any] = {"filters": _CAR_FILTERS, "vehicle": "passenger-car"}
+_on_car = partial(Condition, filters=_CAR_FILTERS, vehicle="passenger-car")
 _HALF, _TWICE = _scale_disturbances(0.5), _scale_disturbances(2.0)
 CONDITIONS = (
     Condition("camera", CAMERA, MIX),
@@ -108,7 +109,7 @@ CONDITIONS = (
     Condition("GPS, gentle steering", GPS),
     Condition("camera, 10 km/h", CAMERA, MIX | {"speed": 10.0 * _KMH}),
     Condition("camera, 40 km/h, gentle", CAMERA, {"speed": 40.0 * _KMH}),
-    Condition("camera, passenger car, 80 km/h", CAMERA, CAR, _CAR_LEVELS, **_ON_CAR),
+    _on_car("camera, passenger car, 80 km/h", CAMERA, CAR, _CAR_LEVELS),
     Condition("camera, gyro 60 ms late", CAMERA, MIX, modelled=False, gyro_late=LATE),
     Condition("the same, configured", CAMERA, MIX, {"latency": {"gyro": LATE}}, gyro_late=LATE),
     Condition("the same, found", CAMERA, MIX, _FIND, gyro_late=LATE),
@@ -288,8 +289,8 @@ def measure(case: tuple[Condition, Iterable[int]]) -> ConditionResult:
     """Drive some seeds of a condition, and run its filters over the records."""
     condition, seeds = case
     scenario = LINEAR | dict(condition.scenario)
-    options: Any = {"scenario": scenario, "vehicle": condition.vehicle}
-    env: Any = gym.make(condition.env_id, control_period=10, **options)
+    car = condition.vehicle
+    env: Any = gym.make(condition.env_id, scenario=scenario, control_period=10, vehicle=car)
     filters, left_out = dict[str, Any](), 0
     labels = tuple(condition.all_filters)
     squares, nees, inside, best, variances, driven_seeds = (list[Any]() for _ in range(6))
