@@ -120,18 +120,14 @@ class TruthObservation(
 ):
     """Appends parameters of the true car, as they are at the reset, and true states.
 
-        No sensor measures these: it makes the oracles with which others are compared
-        (`agents.baselines`), and stands outside of any `EstimateObservation`. `layout` describes the
-        whole observation.
-    <<<<<<< HEAD
-        ValueError says that a name is unknown or stands twice.
-    =======
-    >>>>>>> shrink-E
+    No sensor measures these: it makes the oracles with which others are compared
+    (`agents.baselines`), and stands outside of any `EstimateObservation`. `layout` describes the
+    whole observation.
 
-        Args:
-            env: Environment with a `layout`.
-            parameters: Names of `Vehicle`, appended as `true_<name>` in their units.
-            states: Names of `TrueState`, appended as `<name>_hat` as if by an estimator without error.
+    Args:
+        env: Environment with a `layout`.
+        parameters: Names of `Vehicle`, appended as `true_<name>` in their units.
+        states: Names of `TrueState`, appended as `<name>_hat` as if by an estimator without error.
     """
 
     def __init__(
