@@ -1,4 +1,4 @@
-"""What an estimator is: its protocol, a user's own one behind it, and the estimates of a record."""
+"""The protocol of an estimator, a user's own one behind it, and the estimates of a record."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
