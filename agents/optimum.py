@@ -3,7 +3,7 @@
 With Gaussian noise and a quadratic cost, certainty equivalence holds (Joseph and Tou 1961). The
 cost follows from the cost to go, backwards from the episode's end, and from the estimate's
 covariance along the packets' arrivals. The cap of the cost and the motors' limit, which such
-scenarios make rare, are left out. The best guess of the driver's next angle is `keep` times the
+scenarios make rare, are left out. The best guess of the driver's next angle is `decay` times the
 last one.
 """
 

@@ -24,7 +24,7 @@ class FilterDefinition:
     intersample: str = "predict"  # or "pseudo-residual", "dual-rate", "single-rate"
     gains: str = "periodic"  # or "covariance", "placed"
     disturbances: str = "none"  # a name of `models.DISTURBANCES`
-    delay: str = "clone"  # a name of `delay.RULES`
+    delay: str = "clone"  # a name of `innovation.RULES`
     poles: tuple[float, ...] = ()  # rad/s, where gains are placed
     second: str = ""  # model of a second layer
     options: tuple[tuple[str, Any], ...] = ()  # (option, its default) unlike the common defaults

@@ -1,1 +1,1 @@
-"""Controllers: one file each, around the compiled law of `base.Controller`."""
+"""Controllers, one or several alike in a file, around the compiled law of `base.Controller`."""

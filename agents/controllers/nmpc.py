@@ -53,7 +53,7 @@ class Design(NamedTuple):
 
     model: PredictionModel
     target: ReferenceParams
-    gains: Any  # K of `gain_schedule.GainTables`, (..., m, n)
+    gains: Any  # K of `GainTables`, (..., m, n)
     terminal: Any
     axes: Any
     blocks: Any

@@ -1,1 +1,1 @@
-"""Models and gains for controllers: the nominal and the sampled car, PI, schedules, MPC's QP."""
+"""Models and gains for controllers: the nominal and the sampled car, PI, schedules, predictions."""

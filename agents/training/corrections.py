@@ -36,7 +36,7 @@ FIRST_ROUND = (("lqr", "fusion"), ("none", "fusion"), ("shaken", "fusion"), ("lq
          ("shaken", "gps"))  # fmt: skip
 _SECOND_ROUND = (("lqr", "fusion"), ("lqr", "vision"), ("lqr", "gps"))
 """Who drives with which slow sensors, on the filter, then on the correction."""
-TRAINING, HELD_OUT = 2**67, 2**68  # seeds; `keeper` and `distill` have others
+TRAINING, HELD_OUT = 2**67, 2**68  # seeds; `callbacks` and `distill` have others
 _SEEDS = 2**40  # of a training
 _EVERY = 10  # env-steps from one sample to the next
 _MAX_SIDESLIP = 0.5  # rad: a car that slips more is lost, and nothing to learn from

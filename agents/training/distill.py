@@ -32,7 +32,7 @@ from .student import (
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 
-DISTILL_SEEDS = 2**69  # no other seeds are as large: `keeper`, `corrections`
+DISTILL_SEEDS = 2**69  # no other seeds are as large: `callbacks`, `corrections`
 SEEDS_PER_TRAINING = 2**40  # of a training
 _MEMORY = 0.95  # share of the noise left after a step
 

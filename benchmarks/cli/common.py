@@ -14,24 +14,20 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 import numpy as np
 from rich.console import Console
 from typer import Exit
 
 from ... import __version__
-from ...agents import make_agent
-from ...agents.env_info import make_env
 from ...envs.io import atomic_file
-from ...estimators.wrappers.estimate import EstimateObservation, choose_estimator
-from ..control.entries import list_outputs
 from ..harness.parallel import Bar
 from ..harness.results import Suite, check_writable, write_json, write_parquet, write_text
-from ..harness.study import call_quietly
 from ..report.terminal import print_run, print_suite
 from .names import check_env
 
 if TYPE_CHECKING:
+    import gymnasium as gym
+
     from ...agents.rollout import Rollout
     from ...agents.training.callbacks import Progress as TrainingProgress
     from ...agents.training.config import TrainingTask
@@ -213,7 +209,7 @@ class AgentSpec:
     estimator_options: dict[str, Any]
     trust: bool = False  # whether a policy's zip may be read, which runs code of its maker's
 
-    def build(self, env_id: str | None, options: dict[str, Any]) -> tuple[gym.Env[Any, Any], Any]:
+    def build(self, env_id: str | None, options: dict[str, Any]) -> "tuple[gym.Env[Any, Any], Any]":
         """Make the env with the estimator, and the agent.
 
         Args:
@@ -237,7 +233,13 @@ class AgentSpec:
                     continue
             raise
 
-    def _build(self, env_id: str, options: dict[str, Any]) -> tuple[gym.Env[Any, Any], Any]:
+    def _build(self, env_id: str, options: dict[str, Any]) -> "tuple[gym.Env[Any, Any], Any]":
+        from ...agents import make_agent
+        from ...agents.env_info import make_env
+        from ...estimators.wrappers.estimate import EstimateObservation, choose_estimator
+        from ..control.entries import list_outputs
+        from ..harness.drives import call_quietly
+
         env = make_env(env_id, options)
         sensors = env.get_wrapper_attr("slow_sensors")
         if self.estimator is not None:

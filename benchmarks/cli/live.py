@@ -18,7 +18,7 @@ from typer import Argument, Option
 
 from ...envs.io import write_atomic
 from ...envs.validation import check_choice
-from ..harness.study import format_verdict
+from ..harness.verdict import format_verdict
 from .common import AgentSpec, check_files, parse_options, print_written, show_episode
 from .names import File, Text, Texts, check_env, complete
 from .policies import Trust

@@ -1,1 +1,1 @@
-"""The matrix of estimators and controllers: cells, seeds, episodes, scores, tables, calibration."""
+"""The matrix of estimators and controllers: tasks, entries, runs, scores, report, calibration."""

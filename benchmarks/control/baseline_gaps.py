@@ -9,10 +9,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 from rich.console import Console
 from rich.table import Table
 
@@ -298,12 +296,14 @@ def _describe_verdict(task: ControlTask, gap: Estimate, failing: float, n_compar
     return "scored"
 
 
-def main(
-    write: Annotated[bool, typer.Option(help="Replace the package's file.")] = False,
-    episodes: Annotated[int, typer.Option(min=2, help="Tuning seeds a contest.")] = EPISODES,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes.")] = None,
-) -> None:
-    """Measure which tasks are scored: where the baselines lie apart, on tuning seeds."""
+def main(write: bool = False, episodes: int = EPISODES, jobs: int | None = None) -> None:
+    """Measure which tasks are scored: where the baselines lie apart, on tuning seeds.
+
+    Args:
+        write: Whether the package's file is replaced.
+        episodes: Tuning seeds a task, at least 2.
+        jobs: Processes; None: one a processor.
+    """
     console = Console()
     candidates = list_candidates()
     entries = [entry for task in candidates for entry in make_oracle_entries(task)]
@@ -321,4 +321,6 @@ def main(
 
 
 if __name__ == "__main__":
+    import typer
+
     typer.run(main)

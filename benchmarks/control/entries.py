@@ -35,7 +35,7 @@ from ...estimators.filters import FILTERS
 from ...estimators.learned.correction_file import load_correction
 from ...estimators.vector.estimate import EstimateObservation
 from ...estimators.vector.truth import TruthObservation
-from ..harness.study import call_quietly
+from ..harness.drives import call_quietly
 from .tasks import (
     NOMINAL,
     ORACLES,

@@ -15,16 +15,10 @@ from ...agents.rollout import Rollout, rollout
 from ...envs.record import Array
 from ...envs.rendering.palette import find_colour
 from ...envs.vehicle.parameters import VEHICLES
+from ..harness.drives import make_env
 from ..harness.results import Suite
 from ..harness.stats import Estimate, geometric_mean
-from ..harness.study import (
-    Explorer,
-    Panel,
-    describe_leader,
-    format_verdict,
-    make_env,
-    summarise_names,
-)
+from ..harness.verdict import Explorer, Panel, describe_leader, format_verdict, summarise_names
 from ..report.film import make_track_kml
 from .baseline_gaps import DELAY_TASK, DELAYS, DelayCost, make_cost_lines
 from .entries import (

@@ -286,7 +286,7 @@ def _has_shape(array: npt.NDArray[Any], shape: tuple[int, ...], entire: bool) ->
 
 
 def _write_case(path: Path, result: DriveResult) -> None:
-    """Write a file of `read_case`; a full disk loses the file, not the run."""
+    """Write a file of `_read_case`; a full disk loses the file, not the run."""
     arrays: dict[str, Any] = {"numbers": result.numbers, "seconds": np.array(result.seconds)}
     if result.series is not None:
         arrays["series"] = result.series

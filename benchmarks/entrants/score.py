@@ -25,7 +25,7 @@ from ..control.tasks import NOMINAL, ControlTask, make_salt, make_task_seeds, ma
 from ..harness.parallel import run_cases
 from ..harness.results import ResultTable, Suite
 from ..harness.stats import Estimate, geometric_mean
-from ..harness.study import format_percent
+from ..harness.verdict import format_percent
 from .baselines import find_baselines, make_baseline_entries
 from .challenge import EPISODES, ComparisonRequest, UserEntry, choose_estimator
 from .worker import LIMIT, run_isolated_chunk, run_rehearsal, run_user_chunk

@@ -14,7 +14,7 @@ from ...envs.record import Array
 from ...envs.validation import check_choice
 from .metrics import METRICS
 from .stats import Estimate
-from .study import Explorer
+from .verdict import Explorer
 
 if TYPE_CHECKING:
     from pandas import DataFrame

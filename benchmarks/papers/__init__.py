@@ -1,4 +1,4 @@
-"""The papers' claims: one or two modules a paper, each claim with its verdict.
+"""The papers' claims: one to three modules a paper, each claim with its verdict.
 
 `ledger` holds what a claim is measured with, `manoeuvres` the drives and plots of the control
 papers, `theory` what needs no simulation.

@@ -23,8 +23,8 @@ from ...estimators.analysis.bound import compute_error_bound
 from ...estimators.design.options import read_tunings
 from ...estimators.estimator import Estimator
 from ...estimators.make import make_estimator
+from ..harness.drives import SETTLED, call_quietly, make_filter_arguments
 from ..harness.parallel import split_seeds
-from ..harness.study import SETTLED, call_quietly, make_filter_arguments
 
 
 @dataclass

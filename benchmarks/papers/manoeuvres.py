@@ -15,8 +15,8 @@ from ...agents.rollout import Rollout, rollout
 from ...envs.record import PACKET, Array
 from ...envs.scenarios.manoeuvres import make_scenario
 from ...envs.scenarios.scenario import Scenario
+from ..harness.drives import make_env
 from ..harness.parallel import split_seeds
-from ..harness.study import make_env
 from .ledger import (
     FIRST,
     Example,

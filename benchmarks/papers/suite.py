@@ -11,8 +11,8 @@ from ... import __version__
 from ..harness.parallel import run_cases
 from ..harness.results import VERDICTS, ResultRow, ResultTable, Suite
 from ..harness.stats import Estimate
-from ..harness.study import format_verdict as format_verdict
-from ..harness.study import summarise_names
+from ..harness.verdict import format_verdict as format_verdict
+from ..harness.verdict import summarise_names
 from . import dakf_stability, double_layer, dual_rate, theory, tie_vision_control, uneven_delay
 from . import tie_vision_estimation as tie_vision
 from . import tie_vision_theory as tie_vision_convergence

@@ -25,7 +25,7 @@ from ...envs.scenarios.steering import (
 from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import Motion
 from ...envs.vehicle.parameters import COMS, PASSENGER_CAR, Vehicle
-from ..harness.study import make_env
+from ..harness.drives import make_env
 
 Fields = Mapping[str, Any]
 

@@ -1,6 +1,6 @@
 """ISO 3888: double lane change (part 1) and obstacle avoidance (part 2), with a check for cones.
 
-The lanes are `tracks.make_sections`; a driver model steers. A car hits a cone where any part of
+The lanes are `make_sections`; a driver model steers. A car hits a cone where any part of
 its body, a rectangle, is outside a lane while within its length. Part 1 is driven at a held speed,
 part 2 coasting. A driver may try again: at every speed each driver of `DRIVERS` goes until one hits
 no cone. The result is the highest speed of a clean run, which is that of the car and our drivers

@@ -14,7 +14,7 @@ from ...agents.rollout import rollout
 from ...envs.outside.plants import make_outside_vehicle
 from ...envs.vehicle.dynamics import Motion
 from ...envs.vehicle.parameters import GRAVITY
-from ..harness.study import make_env
+from ..harness.drives import make_env
 from . import fmvss126
 from .drive import OUTSIDE_ID, Law, ProcedureEntry, make_outside_car, make_plant_drive
 

@@ -10,7 +10,7 @@ from ...envs.outside.plants import OUTSIDE_PLANTS
 from ...envs.vehicle.parameters import GRAVITY
 from ..harness.parallel import run_cases
 from ..harness.results import Suite
-from ..harness.study import format_verdict, summarise_names
+from ..harness.verdict import format_verdict, summarise_names
 from . import fmvss126, iso3888, iso4138, iso7401, outside, tables
 from .drive import CARS, ENTRIES
 from .tables import NAME, CaseResults, ProcedureCase, SineDwellOutcome, Transient, select_cases

@@ -10,7 +10,7 @@ from ...envs.record import Array, Log
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.make import make_estimator
 from ..harness.results import ResultTable, Suite
-from ..harness.study import format_verdict
+from ..harness.verdict import format_verdict
 from .bicycle_fit import (
     PRIOR,
     BicycleFit,

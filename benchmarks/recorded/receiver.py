@@ -28,7 +28,7 @@ from ...envs.validation import Mask
 from ...estimators.filters import FILTERS
 from ..harness.results import ResultRow, ResultTable, Suite, write_text
 from ..harness.stats import Estimate, interval
-from ..harness.study import format_verdict
+from ..harness.verdict import format_verdict
 from ..report.film import make_track_kml
 
 SAME = "constant, same information"

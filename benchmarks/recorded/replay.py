@@ -8,8 +8,8 @@ from ...envs.recordings.log_file import WARNING_PREFIX, read_parts
 from ...envs.recordings.sources import is_nmea
 from ...envs.recordings.tables import parse_mapping
 from ...envs.vehicle.parameters import VehicleSource, make_vehicle
+from ..harness.drives import SETTLED
 from ..harness.results import Suite
-from ..harness.study import SETTLED
 from .identify import IdentificationResult, identify, make_suite
 from .quality import TRUTH, make_remarks, make_warnings
 from .suite import corners, replay

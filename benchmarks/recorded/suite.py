@@ -15,9 +15,10 @@ from ...envs.record import Array, Log
 from ...envs.sensors.link import SlowSensor
 from ...envs.vehicle.parameters import Vehicle
 from ...estimators.make import make_estimator
+from ..harness.drives import SETTLED, call_quietly
 from ..harness.results import ResultRow, ResultTable, Suite
 from ..harness.stats import Estimate
-from ..harness.study import SETTLED, call_quietly, describe_leader, format_verdict
+from ..harness.verdict import describe_leader, format_verdict
 from .emulate import Emulation, compute_path, find_backward
 
 GYRO_ONLY = "bicycle-kf"

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from ...envs.rendering.palette import INK, find_base, find_colour
 from ..harness.results import ResultTable, Suite, write_text
-from ..harness.study import Explorer
+from ..harness.verdict import Explorer
 
 
 def parse_number(cell: str) -> float | None:

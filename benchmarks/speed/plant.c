@@ -7,7 +7,7 @@
  * macro of its command line. Constants of a call are computed once a block. What the id's cars and
  * roads do not have is left out: load that moves between the axles, roads laid tick by tick.
  *
- * Compiled with -O3 -march=native -ffp-contract=off; more flags stand in `c_plant.py`.
+ * Compiled with -O3 -march=native -ffp-contract=off; more flags stand in `plant.py`.
  */
 #include <math.h>
 #include <string.h>

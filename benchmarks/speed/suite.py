@@ -6,7 +6,7 @@ from typing import NamedTuple
 from rich.console import Console
 
 from ..harness.results import ResultTable, Suite
-from ..harness.study import format_verdict, summarise_names
+from ..harness.verdict import format_verdict, summarise_names
 from . import env_steps, first_use, learning, plant
 from .timing import (
     FULL,

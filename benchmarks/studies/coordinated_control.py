@@ -22,10 +22,11 @@ from ...envs.ticks import TICK
 from ...envs.vehicle.dynamics import Motion
 from ...envs.vehicle.linear import LinearModel, make_bicycle_model
 from ...estimators.vector.estimate import EstimateObservation
+from ..harness.drives import call_quietly
 from ..harness.parallel import run_cases
 from ..harness.results import ResultRow, ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_means, share
-from ..harness.study import call_quietly, describe_leader, format_verdict
+from ..harness.verdict import describe_leader, format_verdict
 from ..papers.manoeuvres import measure_tracking, run_episode
 
 BANDWIDTHS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # rad/s, K_beta = K_gamma

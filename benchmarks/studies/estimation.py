@@ -16,10 +16,11 @@ from ... import __version__
 from ...agents.rollout import Rollout, rollout
 from ...envs.record import Array
 from ...estimators.analysis.bound import compute_error_bound
+from ..harness.drives import SETTLED, make_filter_arguments
 from ..harness.parallel import run_cases, split_seeds
 from ..harness.results import ResultRow, ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_roots, root_mean
-from ..harness.study import SETTLED, describe_leader, format_verdict, make_filter_arguments
+from ..harness.verdict import describe_leader, format_verdict
 from ..papers.ledger import PaperFilter, make_filters
 
 SEEDS = 100

@@ -37,7 +37,7 @@ from ..harness.stats import (
     geometric_mean,
     share,
 )
-from ..harness.study import format_verdict
+from ..harness.verdict import format_verdict
 
 NAME, TRAINED = "learned", "as trained"
 EPISODES, QUICK_EPISODES = 32, 4

@@ -35,7 +35,7 @@ from ..control.tasks import (
 )
 from ..harness.results import ResultTable, Suite
 from ..harness.stats import geometric_mean, share
-from ..harness.study import format_verdict
+from ..harness.verdict import format_verdict
 from .learned import EPISODES as EPISODES
 from .learned import QUICK_EPISODES as QUICK_EPISODES
 from .learned import TransferResult, add_figures, add_tables, collect_results, list_entries

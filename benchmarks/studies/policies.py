@@ -43,7 +43,7 @@ from ..control.tasks import (
 from ..harness.parallel import run_cases
 from ..harness.results import ResultRow, ResultTable, Suite
 from ..harness.stats import Estimate, compute_win_rate, geometric_mean, interval
-from ..harness.study import format_percent, format_verdict
+from ..harness.verdict import format_percent, format_verdict
 
 if TYPE_CHECKING:
     from ...agents.training.config import TrainingTask

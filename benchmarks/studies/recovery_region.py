@@ -22,7 +22,7 @@ from ..control.tasks import YAW, ControlTask
 from ..harness.parallel import run_cases
 from ..harness.results import ResultRow, ResultTable, ShareMap, Suite
 from ..harness.stats import interval, mean_share
-from ..harness.study import format_verdict, summarise_names
+from ..harness.verdict import format_verdict, summarise_names
 
 NAME = "recovery"
 _READING = ("two-dof", "esc", "sliding-mode", "lqr")

@@ -31,7 +31,7 @@ from ...envs.validation import check_choice
 from ..harness.parallel import run_cases
 from ..harness.results import ResultRow, ResultTable, Suite
 from ..harness.stats import Estimate, interval
-from ..harness.study import format_percent, format_verdict
+from ..harness.verdict import format_percent, format_verdict
 
 ID = "sideslip/LinearYawVision-v0"
 PERIOD, _STEP = 0.04, 0.01  # s, of pictures and of control

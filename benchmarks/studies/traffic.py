@@ -26,10 +26,11 @@ from ..control.entries import (
     make_estimate_options,
 )
 from ..control.tasks import ORACLES, STATE, ControlTask
+from ..harness.drives import call_quietly, make_env
 from ..harness.parallel import run_cases, split_seeds
 from ..harness.results import ResultRow, ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_means, root_mean, share
-from ..harness.study import call_quietly, format_percent, format_verdict, make_env
+from ..harness.verdict import format_percent, format_verdict
 
 _NAME, ID = "highway", "sideslip/Highway-v0"
 _TASK = ControlTask("", ID, "passenger-car", "lagged", "wet-evasion")

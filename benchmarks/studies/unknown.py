@@ -21,10 +21,11 @@ from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.vehicle.parameters import Vehicle
 from ...estimators.design.options import DISTURBANCE, NOISE
 from ...estimators.make import make_estimator
+from ..harness.drives import SETTLED, call_quietly, make_filter_arguments
 from ..harness.parallel import run_cases
 from ..harness.results import ResultRow, ResultTable, Suite
 from ..harness.stats import Estimate, interval, mean, mean_share, ratio_of_roots, root_mean
-from ..harness.study import SETTLED, call_quietly, format_verdict, make_filter_arguments
+from ..harness.verdict import format_verdict
 from .unknown_conditions import (
     CAMERA,
     CONDITIONS,

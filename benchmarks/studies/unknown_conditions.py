@@ -21,8 +21,8 @@ from ...envs.record import FAST, Array, Log, Record, concatenate
 from ...envs.vehicle.parameters import Vehicle
 from ...estimators.analysis.bound import Gust, VehicleChange, compute_error_bound
 from ...estimators.make import make_estimator
+from ..harness.drives import SETTLED, call_quietly, make_filter_arguments
 from ..harness.parallel import run_cases, split_seeds
-from ..harness.study import SETTLED, call_quietly, make_filter_arguments
 
 CAMERA, GPS, _FUSION = (f"sideslip/Yaw{sensors}-v0" for sensors in ("Vision", "Gps", "Fusion"))
 _KMH = 1.0 / 3.6

@@ -23,10 +23,10 @@ from ...estimators.design.options import read_tunings
 from ...estimators.estimator import Estimator
 from ...estimators.filters import FILTERS
 from ...estimators.make import ESTIMATORS, make_estimator
+from ..harness.drives import SETTLED, LoggedEpisode, call_quietly, make_filter_arguments
 from ..harness.parallel import run_cases
 from ..harness.results import write_text
 from ..harness.stats import root_mean
-from ..harness.study import SETTLED, LoggedEpisode, call_quietly, make_filter_arguments
 from ..studies.estimation import EXPERIMENTS
 
 Range = tuple[float, float]

@@ -23,8 +23,8 @@ from ...envs.numerics.kernel_cache import hash_sources
 from ...envs.record import FAST, Array, Log
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
 from ...estimators.make import make_estimator
+from ..harness.drives import SETTLED, LoggedEpisode, call_quietly
 from ..harness.parallel import run_cases
-from ..harness.study import SETTLED, LoggedEpisode, call_quietly
 from ..recorded.emulate import Emulation
 from .estimator import FIRST_SEED, STORAGE, Range
 from .study import create_study, run_search

@@ -20,10 +20,10 @@ from rich.console import Console
 from ...envs.numerics import require_extra
 from ...envs.record import Array
 from ...estimators.design.options import TUNINGS
+from ..harness.drives import LoggedEpisode
 from ..harness.parallel import Bar, count_cores, run_cases
 from ..harness.results import ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_roots, root_mean
-from ..harness.study import LoggedEpisode
 from .estimator import (
     SAMPLERS,
     STORAGE,

@@ -17,7 +17,7 @@ class EpisodeArrays(NamedTuple):
 
     # (PARAMS_WIDTH,), packed as in `EpisodeParams`; behind it a recorded trace, if there is one
     p: Any
-    z: Any  # (STATE_WIDTH,), packed as in `EpisodeState`
+    z: Any  # (STATE_WIDTH,), packed as in `_EpisodeState`
     switches: Any  # (len(Switches),) int64
     obs: Any  # (k,) float32
     rows: Any  # (n, FAST_WIDTH), the fast rows of the newest record

@@ -24,7 +24,7 @@ with require_extra("highway", "roads and traffic need highway-env"):
     from highway_env.road.lane import CircularLane, LineType, SineLane, StraightLane
     from highway_env.road.road import RoadNetwork
 
-from highway_env.road.road import Road  # isort: skip  # after `roads`, which names the extra
+from highway_env.road.road import Road  # isort: skip  # after those above, which name the extra
 from highway_env.vehicle.behavior import IDMVehicle  # isort: skip
 from highway_env.vehicle.kinematics import Vehicle as HighwayVehicle  # isort: skip
 from highway_env.vehicle.objects import Obstacle  # isort: skip

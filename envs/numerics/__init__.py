@@ -1,9 +1,9 @@
 """The compiler and the kinds of numbers: one text for Python, SIMD lanes, NumPy, torch and CasADi.
 
 `jit` compiles a plain function and rebuilds its text for another kind of numbers. Such texts may
-call what `primitives`, `packed` and `functions` have. `simd` and `simd8` are lanes of 4 and 8,
-`torch_backend` and `casadi_backend` the other kinds. `compiler` and `kernel_cache` keep machine
-code on disk.
+call what `primitives`, `packed` and `functions` have. `simd` has the lanes, `simd8` reads eight
+neighbours of a row, `torch_backend` and `casadi_backend` are the other kinds. `compiler` and
+`kernel_cache` keep machine code on disk.
 """
 
 from collections.abc import Iterator

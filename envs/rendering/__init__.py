@@ -1,1 +1,1 @@
-"""Pictures of cars: what is drawn of each (`scene`, `trace`), on what (`canvas`), and the views."""
+"""Pictures of cars: what is drawn of each (`road`, `trace`), on what (`canvas`), and the views."""

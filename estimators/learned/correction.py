@@ -53,7 +53,7 @@ class _CorrectionNet(NamedTuple):
 
 _INTEGERS, _FLOATS = np.zeros(1, np.int64), np.zeros(1)
 EXAMPLE = _CorrectionNet(_INTEGERS, 0, _FLOATS, _FLOATS, 1.0, _INTEGERS, _FLOATS)
-"""For `entry`: all nets have these types."""
+"""For `compile_call`: all nets have these types."""
 
 
 def _make_net(correction: Correction, states: tuple[str, ...]) -> _CorrectionNet:

@@ -333,7 +333,7 @@ def advance_block(
     packets: Any,
     counts: Any,
 ) -> int:
-    """Advance the filters that are `here` from their first row on, as `core.run.advance` does.
+    """Advance the filters that are `here` from their first row on, as `core.filter.advance` does.
 
     Args:
         b: Block of lanes.

@@ -118,7 +118,7 @@ def observe_corrected(
         gains: Tables of gains, shape (cells, rows, columns).
         record: Arguments of `observe` from `fast` to `count`.
         m: Memory of the correction, shape (memory_size,).
-        net: Network, as `learned.kernel.make_net` packs it.
+        net: Network, as `learned.correction` packs it.
         outputs: Arguments of `observe` behind `start`.
     """
     fast, rows, packets, count = record

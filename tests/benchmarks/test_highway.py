@@ -5,7 +5,7 @@ import importlib.util
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.study import LETTERS, LINES
+from sideslip.benchmarks.harness.verdict import LETTERS, LINES
 from sideslip.benchmarks.studies import traffic
 from sideslip.envs.task import COLLISION, DEPARTURE, RUNNING, SPIN
 
@@ -13,7 +13,7 @@ pytest.importorskip("highway_env")
 
 
 def made(*ends: int) -> np.ndarray:
-    """(10, 3) of `swerve`: the ends first, then successes."""
+    """(10, 3) of `simulate_swerve`: the ends first, then successes."""
     failures = np.array([*ends, *[RUNNING] * (10 - len(ends))], float)
     costs = np.where(failures == RUNNING, 1.0, 300.0)
     return np.stack([costs, failures, np.full(10, 0.1)], axis=1)

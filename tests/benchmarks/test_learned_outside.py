@@ -19,7 +19,7 @@ from sideslip.benchmarks.control.entries import (
 )
 from sideslip.benchmarks.control.run import NUMBERS, CachedDrive, Chunk, DriveResult, measure
 from sideslip.benchmarks.control.tasks import NOMINAL, PARAMETERS, list_scored_tasks
-from sideslip.benchmarks.harness.study import make_env
+from sideslip.benchmarks.harness.drives import make_env
 from sideslip.benchmarks.studies import learned_outside as outside_suite
 from sideslip.benchmarks.studies.learned import TransferResult, list_entries
 from sideslip.benchmarks.studies.learned_outside import (

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.study import Explorer, Panel
+from sideslip.benchmarks.harness.verdict import Explorer, Panel
 
 PANELS = (Panel("slip / mrad", (("beta", "true"),)),)
 

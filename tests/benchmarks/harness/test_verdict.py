@@ -7,7 +7,7 @@ import pytest
 
 from sideslip.benchmarks.harness.results import ResultTable
 from sideslip.benchmarks.harness.stats import Estimate
-from sideslip.benchmarks.harness.study import LETTERS, LINES, describe_leader, format_verdict
+from sideslip.benchmarks.harness.verdict import LETTERS, LINES, describe_leader, format_verdict
 from sideslip.benchmarks.papers import suite as papers
 from sideslip.benchmarks.papers.ledger import Bound, Claim, ClaimPart, MeasuredPart
 from sideslip.benchmarks.procedures import iso3888

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sideslip.agents.rollout import rollout
+from sideslip.benchmarks.harness.drives import SETTLED, call_quietly, make_filter_arguments
 from sideslip.benchmarks.harness.parallel import split_seeds
-from sideslip.benchmarks.harness.study import SETTLED, call_quietly, make_filter_arguments
 from sideslip.benchmarks.papers.ledger import (
     EstimationSimulation,
     PaperFilter,

@@ -4,7 +4,7 @@ import pytest
 
 pytest.importorskip("vehiclemodels")
 from sideslip.agents import make_agent
-from sideslip.benchmarks.harness.study import make_env
+from sideslip.benchmarks.harness.drives import make_env
 from sideslip.benchmarks.procedures import outside, suite
 from sideslip.benchmarks.procedures.drive import CARS, ENTRIES, ENV_ID
 from sideslip.benchmarks.procedures.tables import ProcedureCase

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.study import LETTERS, LINES
+from sideslip.benchmarks.harness.verdict import LETTERS, LINES
 from sideslip.benchmarks.recorded.receiver import (
     SAME,
     Signal,

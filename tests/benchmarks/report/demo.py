@@ -7,7 +7,7 @@ import pytest
 
 from sideslip.benchmarks.harness.results import ResultTable, Suite
 from sideslip.benchmarks.harness.stats import Estimate
-from sideslip.benchmarks.harness.study import Explorer, Panel
+from sideslip.benchmarks.harness.verdict import Explorer, Panel
 
 HOSTILE = "</script><b>1 & 2</b>"
 COMMAND = "sideslip bench --html report.html --json results.json"

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("torch")
 from sideslip.agents.training.recurrent import MEMORIES
 from sideslip.benchmarks.harness.results import Suite
-from sideslip.benchmarks.harness.study import LETTERS, LINES
+from sideslip.benchmarks.harness.verdict import LETTERS, LINES
 from sideslip.benchmarks.studies import recurrent
 from sideslip.benchmarks.studies.recurrent import (
     CONDITIONS,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sideslip.benchmarks.harness.study import LoggedEpisode
+from sideslip.benchmarks.harness.drives import LoggedEpisode
 from sideslip.benchmarks.tuning import estimator as tune_file
 from sideslip.benchmarks.tuning import estimator as tune_task
 from sideslip.benchmarks.tuning import study as tune

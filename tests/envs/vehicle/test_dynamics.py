@@ -201,7 +201,7 @@ def test_road_coordinates_and_ground_agree_after_a_long_bend() -> None:
     place = np.array([end.X, end.Y])
     radius = 1.0 / 0.02 - end.y
     expected = [radius * math.sin(end.theta), 50.0 - radius * math.cos(end.theta)]
-    # the error that `_moved` names, 1e-7 m a second, for 20 s
+    # the error that `_integrate_motion` names, 1e-7 m a second, for 20 s
     assert np.max(np.abs(place - expected)) < 2e-6
     assert end.theta == pytest.approx(0.02 * end.s, abs=1e-11)  # as many, up to 5 rad
 

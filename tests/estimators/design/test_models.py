@@ -144,7 +144,7 @@ def test_the_yaw_moment_of_a_fast_row_is_the_plants(vehicle: Any) -> None:
 
 @pytest.mark.parametrize("turning", [0.0, 0.3, -1.2])
 def test_the_second_layer_is_the_linear_model_at_every_yaw_rate(turning: float) -> None:
-    """`transition` writes double-layer-gps (42) for compiled code; `linear` has it for design."""
+    """`build_model` writes double-layer-gps (42) for compiled code; `linear` has it for design."""
     with pytest.warns(UserWarning, match="cannot see"):
         filter_ = make_estimator("double-layer", sensors={"gps": GPS}, speed=7.0)
     f = filter_.filters[1]

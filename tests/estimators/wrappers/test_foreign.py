@@ -12,7 +12,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from sideslip.agents import make_agent
 from sideslip.agents.rollout import rollout
-from sideslip.benchmarks.harness.study import LoggedEpisode, make_filter_arguments
+from sideslip.benchmarks.harness.drives import LoggedEpisode, make_filter_arguments
 from sideslip.benchmarks.tuning.estimator import compute_squares, make_estimator_tuning
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation, EstimatorFactory, EstimatorLike, make_estimator
