@@ -280,8 +280,8 @@ CLAIMS = (
         ),
         make_number_part("loops of the search within 0.5 dB of both", TABLE2, "loops", "count",
             metric="count"),
-        note="The table gives no speed, no Q and R, no discretisation: `table_two` searches "
-        "4590 loops for those that fit. Several do, at several speeds: the table does not tell "
+        note="The table gives no speed, no Q and R, no discretisation: a search of "
+        "4590 loops finds those that fit. Several do, at several speeds: the table does not tell "
         "which was meant. Every loop crosses at half its sampling rate; 477.46 Hz is 3000 rad/s, "
         "probably where a frequency grid ended."),
     claim("Table II", "multirate feedback raises the gain margin",
