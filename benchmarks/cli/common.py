@@ -80,6 +80,12 @@ def check_files(**paths: Path | None) -> None:
     check_writable(*paths.values())
 
 
+def announce_torch() -> None:
+    """Say that PyTorch is loaded, which takes seconds; nothing where it is there already."""
+    if sys.modules.get("torch") is None:
+        print("sideslip: loading PyTorch, some seconds ...", file=sys.stderr, flush=True)
+
+
 @contextmanager
 def handle_interrupt(how: str) -> Iterator[None]:
     """End with exit status 130 where the user interrupts, and print `how` to continue."""

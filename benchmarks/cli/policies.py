@@ -21,6 +21,7 @@ from ... import __version__
 from ..harness.parallel import use_shared_bar
 from ..harness.results import check_writable
 from .common import (
+    announce_torch,
     check_files,
     choose_folder,
     get_command_line,
@@ -227,6 +228,7 @@ def train_command(
 
     With --resume the options left out are those of the training in the folder.
     """
+    announce_torch()
     from ...agents.learned.policy import Policy, load_policy
     from ...agents.training.callbacks import CURVE, POLICY, RunOptions, RunRecord
     from ...agents.training.trainer import load_initial_policy, read_run_record, read_task, train
@@ -347,6 +349,7 @@ def distill_command(
     out: Annotated[File, Option(help="The file; default: NAME here.")] = None,
 ) -> None:
     """Distil a policy by DAgger; its card says what it costs in each contest, on unseen seeds."""
+    announce_torch()
     from ...agents.training.distill import RoundResult, distill
     from ...agents.training.student import DistillConfig
     from ..studies.policies import make_card, make_lessons
@@ -390,6 +393,7 @@ def train_estimator_command(
     out: Annotated[File, Option(help="The file; default: NAME here.")] = None,
 ) -> None:
     """Train a correction of a filter; `learned` with `file=FILE` estimates with it."""
+    announce_torch()
     from ...agents.training.corrections import READ, train_correction
     from ...envs.sensors.slow import SENSOR_SETS
     from ...estimators.learned.correction_file import CorrectionCard, save_correction
