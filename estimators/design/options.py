@@ -174,7 +174,7 @@ class FilterConfig:
     steer_rate: float
     model_error: float
     accel_time: float
-    shares: tuple[float, float]
+    shares: tuple[float, float]  # `force_share`, `moment_share`
     times: Mapping[str, float]  # s, of biases
     adapt: float
     prior: Mapping[str, float]  # of all states

@@ -109,7 +109,7 @@ def test_who_is_not_tuned_takes_over_what_means_the_same(monkeypatch: pytest.Mon
     }
     nothing: dict[str, Any] = {"filter": {}, "controller": {}}
     monkeypatch.setattr(
-        "sideslip.agents.baselines.get_tuned_options",
+        "sideslip.benchmarks.control.entries.get_tuned_options",
         lambda _, name: found.get(name, nothing),
     )
     one = {find_oracle(each, PARAMETERS)[-4:]: each for each in list_scored_tasks()}
@@ -248,7 +248,7 @@ def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(control, "list_scored_tasks", lambda: few)
     monkeypatch.setattr(control, "make_entries", lambda *_: some)
     monkeypatch.setattr(control, "TITLES", {"": "no tier", "2a": "a tier"})
-    for room in ("ladder", "figures"):
+    for room in ("baseline_gaps", "report"):
         named = {"": "no tier", "2a": "a"}
         monkeypatch.setattr(f"sideslip.benchmarks.control.{room}.TITLES", named)
     monkeypatch.setattr(control, "measure_delay_cost", lambda *_, **__: ([], []))

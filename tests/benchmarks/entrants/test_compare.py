@@ -269,7 +269,7 @@ def test_a_users_agent_has_nominals_filter(monkeypatch: pytest.MonkeyPatch) -> N
     """As it was tuned, and no tuned options of its own."""
     tuned = {NOMINAL: {"filter": {"force_sd": 7.0}, "controller": {"grip": 0.6}}}
     monkeypatch.setattr(
-        "sideslip.agents.baselines.get_tuned_options",
+        "sideslip.benchmarks.control.entries.get_tuned_options",
         lambda kind, name: tuned.get(name, {}),
     )
     mine = UserEntry("my.py:Pd").make_entry(ControlTask())

@@ -90,6 +90,7 @@ def drawn() -> list[tuple[str, Any, str]]:
     course = {"truth": beta, "camera": seen} | lines
     return [
         ("Error of each estimator", figures.draw_bars(names, *bars), "Shorter is better."),
+        ("The same once more, without a caption", figures.draw_bars(names, *bars), ""),
         (
             "The sideslip angle",
             figures.draw_time_series(t, course, label, dots=["camera"]),

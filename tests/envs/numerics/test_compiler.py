@@ -75,12 +75,12 @@ def test_an_edit_in_a_callee_reaches_its_cached_callers(copy: Path, tmp_path: Pa
     variables = {"XDG_CACHE_HOME": str(cache)}
     exact = 0.25**2 * (3.0 - 2.0 * 0.25)
     assert float(run(SHIFT, copy, **variables)) == exact
-    kernels = sorted(cache.rglob("tracks.compute_path_offset*.kernel"))
+    kernels = sorted(cache.rglob("road.compute_path_offset*.kernel"))
     assert len(kernels) == 1
     assert float(run(SHIFT, copy, **variables)) == exact
-    again = sorted(cache.rglob("tracks.compute_path_offset*.kernel"))
+    again = sorted(cache.rglob("road.compute_path_offset*.kernel"))
     assert again == kernels  # the second run compiled nothing
-    source = copy / "envs" / "backend" / "elementary.py"
+    source = copy / "envs" / "numerics" / "functions.py"
     text = source.read_text()
     changed = text.replace("return t * t * (3.0 - 2.0 * t)", "return t * t * (6.0 - 4.0 * t)")
     assert changed != text
