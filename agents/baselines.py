@@ -42,8 +42,8 @@ _TYRE_FILTER_OPTIONS = dict.fromkeys(
 from the plant's. To a thousandth it is overconfident, and costs 1.1 to 4 times as much."""
 OUTPUTS = ("beta", "gamma", "F_d", "N_d")
 STATES = (*OUTPUTS, "phi", "phi_rate")
-GRIP = 0.7  # fraction of the rear tyres' grip for the yaw moment; 0.71 of it is left across
-STEER_WEIGHT = 100.0  # of added steering, which `lqr`'s design does not know the rate limit of
+GRIP = 0.7  # fraction of the rear tyres' grip for the yaw moment; sqrt(1 - 0.7^2) is left laterally
+STEER_WEIGHT = 100.0  # factor on the cost of added steering, whose rate limit `lqr` does not design
 _NOISE = dict(
     gyro="gyro_noise", accel="accel_y_noise", camera_psi="psi_noise", camera_y="y_l_noise"
 )
@@ -127,7 +127,7 @@ def make_oracle(
         raise TypeError(f"options of a rung are 'filter' and 'controller', got {sorted(chosen)}")
     single_env: Any = gym.make(env_id, **env_kwargs)
     if name in PARAMETER_ORACLES:
-        # as for a filter that knows and subtracts the biases
+        # no biases: a filter that knows them would subtract them
         scenario: Scenario = single_env.unwrapped.scenario
         noise = {key: sd for key, sd in scenario.noise.items() if not key.endswith("_bias")}
         unbiased = scenario.replace(noise=noise, gyro_bias=0.0, accel_y_bias=0.0)
@@ -145,13 +145,13 @@ def make_oracle(
         parameters = (*STIFFNESSES, FRICTION.removeprefix("true_"))
         env = truth_wrapper(env, parameters, states)
     settings: dict[str, Any] = {"disturbance_time": base.scenario.disturbance_time, "grip": GRIP}
-    plans = name in (PARAMETER_ORACLES[1], STATE_ORACLES[1])
-    if not plans:  # a plan foresees the steering's rate
+    is_predictive = name in (PARAMETER_ORACLES[1], STATE_ORACLES[1])
+    if not is_predictive:  # the prediction has the steering's rate limit
         settings["steer_weight"] = STEER_WEIGHT
     if name != NOMINAL:
         settings["vehicle"] = base.vehicle
         settings["stiffness"] = [f"true_{stiffness}" for stiffness in STIFFNESSES]
-    controller_class = Nmpc if plans else Lqr
+    controller_class = Nmpc if is_predictive else Lqr
     return env, controller_class(env, **settings | dict(chosen["controller"]))
 
 

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 else:
     AnyEnv = Any  # stable-baselines3 comes with an extra, and needs a second to load
 
-# Not loaded here; vector twins have the same names. Ours describe what they change by `layout`.
+# Wrappers that keep observations and actions, by package and class name, so that none is imported.
+# Vector versions have the same names. Those of this package may change the observation: their
+# `layout` says how.
 _TRANSPARENT = {
     "gymnasium": "Wrapper VectorWrapper OrderEnforcing PassiveEnvChecker TimeLimit Autoreset "
     "RewardWrapper VectorRewardWrapper ClipReward NormalizeReward TransformReward AddWhiteNoise "
@@ -31,6 +33,7 @@ _TRANSPARENT = {
     __name__.partition(".")[0]: "CompactObservation EstimateObservation MemoryObservation "
     "NativeObservation RewardScaleWrapper TruthObservation",
 }
+# A wrapper that overrides one of these may change observations or actions.
 _CHANGES = {"reset", "step", "step_async", "step_wait", "observation", "observations", "action",
             "actions"}  # fmt: skip
 
@@ -231,7 +234,7 @@ def _is_transparent(wrapper: Any) -> bool:
             return vars(base_class)["transparent"] is True
         package = base_class.__module__.partition(".")[0]
         if base_class.__name__ in _TRANSPARENT.get(package, "").split():
-            return not getattr(wrapper, "norm_obs", False)  # of VecNormalize
+            return not getattr(wrapper, "norm_obs", False)  # a VecNormalize may change them
         if not _CHANGES.isdisjoint(vars(base_class)):
             return False
     return False
@@ -241,7 +244,8 @@ def _check_wrappers(env: Any, layout: tuple[ObservationEntry, ...]) -> None:
     """Raise ValueError, with its name, for a wrapper that is not known to be transparent."""
     wrong = [type(layer).__name__ for layer in _iterate_wrappers(env) if not _is_transparent(layer)]
     base = env.unwrapped
-    if {"layout", "envs", "vector_env"}.isdisjoint(dir(base)):  # elsewhere: spaces show wrappers
+    # sub-environments in other processes: their wrappers show in the spaces alone
+    if {"layout", "envs", "vector_env"}.isdisjoint(dir(base)):
         single = "single_" if isinstance(env, VectorEnv) else ""
         observed = getattr(base, f"{single}observation_space")
         acted_on = getattr(base, f"{single}action_space")

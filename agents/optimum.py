@@ -3,8 +3,8 @@
 With Gaussian noise and a quadratic cost, certainty equivalence holds (Joseph and Tou 1961). The
 cost follows from the cost to go, backwards from the episode's end, and from the estimate's
 covariance along the packets' arrivals. The cap of the cost and the motors' limit, which such
-scenarios make rare, are left out. The best guess of the driver's next angle is `decay` times the
-last one.
+scenarios make rare, are left out. The best guess of the driver's next angle is
+`LinearPlant.decay` times the last one (a first-order Gauss-Markov process).
 """
 
 from dataclasses import dataclass
@@ -79,7 +79,7 @@ class Optimum:
         cost: Expected cost of an episode.
         gains: K_j, shape (steps, n).
         weights: S_j, shape (steps,): an input that differs by du costs S_j du^2 more.
-        errors: Covariance of the optimal estimate, shape (schedules, steps, n, n).
+        errors: Error covariances of the optimal estimate, shape (schedules, steps, n, n).
     """
 
     plant: LinearPlant
@@ -100,9 +100,10 @@ class Optimum:
         model, W = self.plant.model, self.plant.W
         L = np.broadcast_to(gains, self.gains.shape)
         total = 0.0
-        for errors in self.errors:
+        for error_covariances in self.errors:
             X = self.plant.start
-            for j, P in enumerate(errors):
+            for j, P in enumerate(error_covariances):
+                # the estimate is orthogonal to its error: its covariance is the state's less P
                 known, d = X - P, self.gains[j] - L[j]
                 total += self.weights[j] * float(d @ known @ d)
                 closed = model.G - model.H @ L[j : j + 1]
@@ -115,14 +116,14 @@ class Optimum:
         It equals the cost less the optimum in expectation, for any agent, and scatters much less.
 
         Args:
-            read: Inputs of `Lqg` in these episodes, shape (N, steps, 5).
+            read: Entries `Lqg.needs` at the decisions of these episodes, shape (N, steps, 5).
             actions: Delivered actions, shape (N, steps).
 
         Returns:
             Excess cost, shape (N,).
         """
         read_gains = _select_gains(self.plant, self.gains)
-        read_gains[0, -1] /= self.plant.decay  # the first angle is seen before it acts
+        read_gains[0, -1] /= self.plant.decay  # the first angle is seen before it acts: no guess
         wrong = actions + np.einsum("nji,ji->nj", read, read_gains)
         return np.asarray(wrong**2 @ self.weights)
 
@@ -200,11 +201,12 @@ def compute_optimum(env: gym.Env[Any, Any], schedules: int = 1) -> Optimum:
         schedules: Number of seeds from 0 whose arrivals are averaged; 1 where none are random.
 
     Returns:
-        Optimum with its gains and the errors of each schedule.
+        Optimum with its gains and the error covariances of each schedule.
     """
     plant = _make_linear_plant(env)
     gains, weights, cost = _solve_regulator(plant)
     errors = np.array([_compute_error_covariances(env, plant, seed) for seed in range(schedules)])
+    # what the errors of the estimate add: the sum of S_j K_j P_j K_j'
     blind = np.einsum("j,ji,kjil,jl->", weights, gains, errors, gains) / schedules
     return Optimum(plant, cost + float(blind), gains, weights, errors)
 
@@ -225,7 +227,7 @@ def _solve_regulator(plant: LinearPlant) -> tuple[Array, Array, float]:
 
 
 def _compute_error_covariances(env: gym.Env[Any, Any], plant: LinearPlant, seed: int) -> Array:
-    """Compute the best estimate's covariance at the decisions of a seed, (steps, n, n)."""
+    """Compute the best estimate's error covariance at the decisions of a seed, (steps, n, n)."""
     env.reset(seed=seed)
     base: Any = env.unwrapped
     facts = {"vehicle": base.nominal, "sensors": base.slow_sensors, "speed": base.held_speed}
@@ -240,14 +242,14 @@ def _compute_error_covariances(env: gym.Env[Any, Any], plant: LinearPlant, seed:
         filter_.step(record.fast, record.packets.reshape(-1, PACKET_WIDTH))
         P = filter_.P[np.ix_(filter_indices, filter_indices)]
         covariances[j][np.ix_(state_indices, state_indices)] = P
-        if j > 0:
+        if j > 0:  # the angle from now on is not seen yet: its guess is off by the noise of W
             covariances[j, plant.driver, plant.driver] = plant.W[plant.driver, plant.driver]
         env.step(idle)
     return covariances
 
 
 def _select_gains(plant: LinearPlant, gains: Array) -> Array:
-    """Select, from gains (..., n) of the state, those (..., 5) of what `Lqg` reads."""
+    """Select, from gains (..., n) on the state, those (..., 5) on the entries `Lqg.needs`."""
     names = plant.model.design_spec.states
     selected = gains[..., [names.index(name) for name in (*OUTPUTS, "driver")]]
     selected[..., -1] *= plant.decay

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-COST_FLOOR = 0.001  # of an episode's cost, in logarithms and ratios: what differs by less is alike
+COST_FLOOR = 0.001  # added to an episode's cost in logarithms and ratios: less makes no difference
 
 
 class EpisodeStep(NamedTuple):
@@ -240,7 +240,7 @@ class Rollout:
         t, columns = self.columns["t"], self.columns
         for axis, (names, label, scale) in zip(axes, _PANELS, strict=True):
             for name, text, style in names:
-                # a task that judges the slip alone has no reference of the yaw rate
+                # a task that judges the sideslip angle alone has no reference of the yaw rate
                 if name in columns and (name != "gamma_ref" or columns[name].any()):
                     axis.plot(t, scale * columns[name], label=text, **style)
             std = columns.get("obs_beta_std")

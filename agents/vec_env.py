@@ -13,11 +13,11 @@ from ..envs.numerics import require_extra
 from ..envs.task import make_info
 from ..envs.vector import StabilityVectorEnv
 from ..envs.vehicle.dynamics import Motion
-from ..estimators.vector import estimate as vector
-from ..estimators.vector import truth as truth_vector
+from ..estimators.vector import estimate as vector_estimate
+from ..estimators.vector import truth as vector_truth
 from ..estimators.vector.estimate import EstimateObservation
-from ..estimators.wrappers import estimate as wrappers
-from ..estimators.wrappers import truth
+from ..estimators.wrappers import estimate as single_estimate
+from ..estimators.wrappers import truth as single_truth
 
 with require_extra("train", "training needs torch and stable-baselines3"):
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor
@@ -26,23 +26,23 @@ with require_extra("train", "training needs torch and stable-baselines3"):
 Observations = npt.NDArray[np.float32]
 _Indices = int | Iterable[int] | None
 _Wrapping = Callable[[VectorEnv[Any, Any, Any]], VectorEnv[Any, Any, Any]]
-_ROW_ATTRIBUTES = (  # a sequence in the vector env, with an item for each row
+_ROW_ATTRIBUTES = (  # each is a sequence in the vector env, with an item for each row
     "vehicle", "nominal", "scenario", "record", "held_speed", "slow_sensors", "motion",
     "estimator", "np_random", "np_random_seed",
 )  # fmt: skip
-_SHARED_ATTRIBUTES = (
+_SHARED_ATTRIBUTES = (  # each is the same for all rows
     "layout", "control_period", "reference", "dt", "setting", "spec", "render_mode", "metadata",
 )  # fmt: skip
 _SPACES = ("observation_space", "action_space")
 _METHODS = ("reset", "get_wrapper_attr", "has_wrapper_attr", "set_wrapper_attr")
 _TWINS: dict[type, type] = {
-    wrappers.EstimateObservation: vector.EstimateObservation,
-    truth.TruthObservation: truth_vector.TruthObservation,
+    single_estimate.EstimateObservation: vector_estimate.EstimateObservation,
+    single_truth.TruthObservation: vector_truth.TruthObservation,
 }
 
 
 class _VecEnvRow:
-    """Row i of a vector env: the single env's attributes listed above, and values set here."""
+    """Row i of a vector env: `_ROW_ATTRIBUTES` and the like, and values that are set on it."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any], i: int) -> None:
         self._env, self._i = env, i
@@ -275,7 +275,8 @@ def make_vec_env(
         env_kwargs: Arguments of the environment.
         monitor_file: CSV file of episodes.
         info_keywords: Keys of the last step's info that go into that file.
-        wrapper_class: Called with the native vector env in its estimator; returns what is bridged.
+        wrapper_class: Wrapper for the vector env, applied outside the estimator's wrapper; its
+            result becomes the `VecEnv`.
 
     Returns:
         `VecEnv` that monitors episodes.

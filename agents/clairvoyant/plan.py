@@ -30,12 +30,12 @@ from .sweep import (
 
 Actions = npt.NDArray[np.float32]
 
-STEP_LENGTHS = (1.0, 0.4, 0.1)  # of a step, tried in turn
-_FIRST_DAMPING = 1e-2  # of the first sweep
+STEP_LENGTHS = (1.0, 0.4, 0.1)  # fractions of the step d that are tried in turn
+_FIRST_DAMPING = 1e-2  # damping of the first sweep, as for `run_backward_pass`
 _DAMPING_LIMITS = (1e-8, 1e4)  # the least, and the one at which no step is left to try
-_DAMPING_FACTOR = 4.0  # between dampings
+_DAMPING_FACTOR = 4.0  # from one damping to the next
 MAX_ITERATIONS = 60
-_STALL_RULE = (1e-3, 3)  # so little gained, relative, in so many steps in a row: settled
+_STALL_RULE = (1e-3, 3)  # settled: a smaller fraction of the cost gained in so many steps in a row
 
 
 @dataclass(frozen=True)
@@ -162,14 +162,14 @@ def _run_line_search(
     """Return the first cheaper run, else the run itself, and the damping for the next step."""
     fixed, size = problem.fixed, len(problem.names)
     nominal_run = _use_achieved_steering(problem, run.trajectory)
-    slopes = linearise_run(problem, forecast.known, nominal_run)
+    linearisation = linearise_run(problem, forecast.known, nominal_run)
     limits = compute_limits(problem, forecast, nominal_run)
     inputs = np.zeros((fixed.periods, N_INPUTS))
     inputs[:, : fixed.width] = nominal_run.actions
     d, G = np.empty_like(inputs), np.empty((*inputs.shape, size))
     gains = np.zeros((fixed.periods, fixed.width, len(PlanState._fields)))
     while damping < _DAMPING_LIMITS[1]:
-        run_backward_pass(slopes, limits, inputs, run.length, damping, d, G)
+        run_backward_pass(linearisation, limits, inputs, run.length, damping, d, G)
         gains[:, :, problem.state_indices] = -G[:, : fixed.width] / problem.scale
         for length in STEP_LENGTHS:
             candidate = nominal_run.actions + length * d[:, : fixed.width]

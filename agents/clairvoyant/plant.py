@@ -15,10 +15,11 @@ from ...envs.vehicle.dynamics import DisturbanceForces, Motion, compute_sideslip
 from .preview import PlanParams, PlanState, PreviewStep
 
 _rk4, _load_at = to_casadi(rk4), to_casadi(compute_lagged_load)
-_torques, _slip = to_casadi(compute_motor_torques), to_casadi(compute_sideslip_angle)
+_motor_torques, _sideslip = to_casadi(compute_motor_torques), to_casadi(compute_sideslip_angle)
 _apply_lag, _yaw_moment = to_casadi(apply_lag), to_casadi(compute_yaw_moment)
 _reference = to_casadi(compute_reference)
-# a sum of squares: without its cap and, for the sake of its slope at zero, its sign's guard
+# compute_cost_rate as a plain sum of squares, smooth for the solver: its cap and its `absolute`,
+# whose slope is undefined at zero, are identities here
 _uncapped_cost_rate = as_python(
     compute_cost_rate, SYMBOLS | {"minimum": lambda rate, cap: rate, "absolute": lambda rate: rate}
 )
@@ -30,8 +31,8 @@ class _PlanStep(NamedTuple):
     """The end of one step of the plan."""
 
     state: PlanState
-    effort: Any  # cost of the actuators' work within the step
-    slewed: Any  # rad, by how much the added steering moved
+    effort: Any  # cost of the yaw moment and the added steering within the step
+    slewed: Any  # change of the added steering's command (rad)
 
 
 def list_active_states(fixed: PlanParams) -> tuple[str, ...]:
@@ -68,7 +69,7 @@ def compute_node_errors(fixed: PlanParams, x: PlanState, known: PreviewStep) -> 
         Errors e_beta (rad) and e_gamma (rad/s).
     """
     kind = fixed.kind
-    beta = _slip(x.v_x, x.v_y, kind.small_angle)
+    beta = _sideslip(x.v_x, x.v_y, kind.small_angle)
     beta_ref, gamma_ref = known.beta_ref, known.gamma_ref
     if kind.reference != LAGGED:
         beta_ref, gamma_ref = _reference(known.command, x.v_x, fixed.target, kind.reference)
@@ -107,16 +108,17 @@ def advance(fixed: PlanParams, x: PlanState, action: Any, known: PreviewStep) ->
     task, kind, q = fixed.task, fixed.kind, fixed.ticks
     speed_profile = fixed.speed_profile._replace(speed=known.speed, acceleration=known.acceleration)
     held = x.v_x, x.integral, speed_profile, car, task.yaw_first
-    T_l, T_r, _, integral = _torques(action[0] * task.yaw_scale, 0.0, *held)
+    T_l, T_r, _, integral = _motor_torques(action[0] * task.yaw_scale, 0.0, *held)
     slewing = action[1] * task.authority if fixed.width > 1 else 0.0
     moved = slewing - x.slewing if fixed.width > 1 else 0.0
-    # the angle moves at its full rate and then rests: its mean over the step
-    extra = slewing - moved * ca.fabs(moved) / (2.0 * q * task.slew)
+    # The command (rad) moves at `slew` (rad a tick) and then rests. Its mean over q ticks is
+    # command - moved |moved| / (2 q slew), for |moved| <= q slew.
+    mean_added = slewing - moved * ca.fabs(moved) / (2.0 * q * task.slew)
     motor, steering, road = fixed.motor, fixed.steering, fixed.road
     if kind.road == NOMINAL_PATH:
         road = road._replace(turn=known.turn)
     loads = tuple(
-        _load_at(angle + _apply_lag(extra, x.added, rest), T_l, T_r, x, motor_rest, car, kind)
+        _load_at(angle + _apply_lag(mean_added, x.added, rest), T_l, T_r, x, motor_rest, car, kind)
         for angle, rest, motor_rest in (
             (known.steer_start, steering.start, motor.start),
             (known.steer_middle, steering.middle, motor.middle),
@@ -131,15 +133,15 @@ def advance(fixed: PlanParams, x: PlanState, action: Any, known: PreviewStep) ->
     motion = _rk4(start, loads, forces, car, road, q * TICK, *variant)
     effort = 0.0
     for tick in range(q):
-        left, right = fixed.motor_tick, fixed.steering_tick
-        rest = left.mean * left.end**tick
-        share = _yaw_moment(_apply_lag(T_l, x.T_l, rest), _apply_lag(T_r, x.T_r, rest), car)
-        added = _apply_lag(extra, x.added, right.mean * right.end**tick)
-        share = share / task.yaw_scale
+        motor_tick, steering_tick = fixed.motor_tick, fixed.steering_tick
+        rest = motor_tick.mean * motor_tick.end**tick
+        moment = _yaw_moment(_apply_lag(T_l, x.T_l, rest), _apply_lag(T_r, x.T_r, rest), car)
+        added = _apply_lag(mean_added, x.added, steering_tick.mean * steering_tick.end**tick)
+        share = moment / task.yaw_scale
         effort += TICK * _uncapped_cost_rate(0.0, 0.0, share, added, kind.reference)
     torques = _apply_lag(T_l, x.T_l, motor.end), _apply_lag(T_r, x.T_r, motor.end)
     new_integral = x.integral + q * (integral - x.integral)
-    new_added = _apply_lag(extra, x.added, steering.end)
+    new_added = _apply_lag(mean_added, x.added, steering.end)
     next_state = PlanState._make((*motion, *torques, new_integral, slewing, new_added))
     return _PlanStep(next_state, effort, moved)
 

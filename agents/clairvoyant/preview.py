@@ -29,22 +29,22 @@ from ...envs.vehicle.dynamics import CarParams, RoadParams
 class PreviewStep(NamedTuple):
     """Inputs and parameters of one step of the plan, which actions change hardly or not at all."""
 
-    steer_start: Any  # rad, front steering angle without the added one
-    steer_middle: Any
-    steer_end: Any
+    steer_start: Any  # rad, front steering angle without the added one, at the step's start
+    steer_middle: Any  # rad, at the step's middle
+    steer_end: Any  # rad, at its end
     command: Any  # rad, the driver's at the start
     F_d: Any  # N, mean over the step, with the wind's
     N_d: Any  # N m
     N_x: Any  # N m
-    C_f: Any  # N/rad
-    C_r: Any
-    mu: Any
-    mu_r: Any
+    C_f: Any  # N/rad, of a front tyre
+    C_r: Any  # N/rad, of a rear tyre
+    mu: Any  # under the left wheels
+    mu_r: Any  # under the right wheels
     speed: Any  # m/s, the driver's set point
     acceleration: Any  # m/s2, the driver's acceleration, fed forward
-    turn: Any  # rad/s, of a road that is laid tick by tick
-    weight: Any  # s for which the cost rate at the start counts
-    beta_ref: Any  # rad, of a reference with a memory; of the step's start
+    turn: Any  # rad/s, mean turning rate of a road that the nominal car lays, else 0
+    weight: Any  # s, quadrature weight of the cost rate at the step's start
+    beta_ref: Any  # rad, at the step's start; read for a lagged reference alone
     gamma_ref: Any  # rad/s
 
 
@@ -72,16 +72,16 @@ class PlanState(NamedTuple):
 class PlanParams(NamedTuple):
     """Parameters that are constant within an episode; hashable, as the key of a solver."""
 
-    car: CarParams  # car, with zeros for the fields of `PreviewStep`
-    road: RoadParams  # road
-    speed_profile: SpeedProfile  # speed profile, with zeros for the fields of `PreviewStep`
+    car: CarParams  # with zeros for the fields of `PreviewStep`
+    road: RoadParams
+    speed_profile: SpeedProfile  # with zeros for the fields of `PreviewStep`
     motor: Lag  # lag of the motors over a step
     steering: Lag  # lag of the steering over a step
     motor_tick: Lag  # lag of the motors over a tick
     steering_tick: Lag  # lag of the steering over a tick
-    target: ReferenceParams  # reference of the task
-    task: TaskParams  # parameters of the task
-    kind: StepVariant  # variant of the plant
+    target: ReferenceParams
+    task: TaskParams
+    kind: StepVariant  # of the plant
     width: int  # entries of an action
     ticks: int  # ticks of a step, the control period
     periods: int  # steps of the episode
@@ -183,7 +183,7 @@ def _simulate_actions(
         drive[tick] = read(z, Z.drive)
         driver[tick], refs[tick] = z[Z.driver], read(z, Z.refs)
         step_vehicle(*row, held_actions[tick], 1, bounds, window)
-    # a car thrown about may leave the numbers
+    # an unstable simulation may give NaN or inf
     return np.nan_to_num(drive), np.nan_to_num(driver), np.nan_to_num(refs)
 
 
@@ -214,7 +214,9 @@ def _compute_preview(
         np.where(is_changed, factor * stiffness, stiffness)
         for factor, stiffness in ((change.front, car.C_f), (change.rear, car.C_r))
     ]
-    # s of each cost rate: the trapezoid rule over every q-th tick, without the end; exact for q = 1
+    # Weights (s) of the cost rates at every q-th tick, by the trapezoid rule: q / 2 ticks at either
+    # end. J sums ticks 1 to the last: the start, which does not count, has half a tick less, and
+    # the last one, which counts whole, half a tick more. Exact for q = 1.
     weights = np.where(nodes < fixed.task.duration, q * TICK, 0.0)
     weights[0] = 0.5 * (q - 1) * TICK
     table = (
@@ -254,6 +256,7 @@ def _compute_road_turns(p: Array, kind: StepVariant, command: Array) -> Array:
 
 def _compute_set_point(tick: float, speed_profile: SpeedProfile) -> tuple[float, float]:
     """Compute the driver's speed (m/s) and feedforward acceleration (m/s^2) at a tick."""
+    # at v_x = 0 the command is the feedforward with k_p = 0, and with k_p = 1 /s the speed more
     profile = speed_profile._replace(hold=1.0, k_p=0.0, k_i=0.0)
     feedforward = compute_acceleration_command(tick, 0.0, 0.0, profile, np.inf)[0]
     profile = profile._replace(k_p=1.0)

@@ -24,7 +24,7 @@ from .plant import (
 )
 from .preview import Forecast, PlanParams, PlanState, PreviewStep
 
-N_INPUTS = 2  # in a sweep: share of the moment and of the steering, which may be held at zero
+N_INPUTS = 2  # in a sweep: fractions of moment and added steering; the latter is 0 if unused
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ class Limits(NamedTuple):
     high: Array  # upper limits, shape (K, N_INPUTS)
     rate_low: Array  # lower limit of the steering by its rate, shape (K,)
     rate_high: Array  # upper limit of the steering by its rate, shape (K,)
-    column: int  # state that moves the rate's limits
-    slope: float  # change of these limits per unit of that state
+    column: int  # scaled state that moves the rate's limits: the last command of added steering
+    slope: float  # rise of both rate limits per unit of the scaled state `column`
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class IlqrProblem:
     fixed: PlanParams
     names: tuple[str, ...]  # of the active states
     scale: Array  # unit of each active state, shape (size,)
-    slopes: Any  # CasADi's function of the derivatives, for all nodes at once
+    differentiate: Any  # CasADi's function of the derivatives, for all nodes at once
 
     @property
     def state_indices(self) -> list[int]:
@@ -116,7 +116,7 @@ def linearise_run(problem: IlqrProblem, known: Array, run: Trajectory) -> Linear
     points[:size] = (run.states[:, problem.state_indices] / problem.scale).T
     points[size:, :K] = run.actions.T
     n_used, n = size + width, size + N_INPUTS
-    F, g, H = (np.nan_to_num(value.full()) for value in problem.slopes(points, known))
+    F, g, H = (np.nan_to_num(value.full()) for value in problem.differentiate(points, known))
     identities = np.tile(np.eye(n), (K + 1, 1, 1))
     result = Linearisation(np.zeros((K, size, n)), np.zeros((K + 1, n)), identities)
     result.F[:, :, :n_used] = F.reshape(size, K + 1, n_used).transpose(1, 0, 2)[:K]
@@ -187,28 +187,32 @@ def solve_input_qp(Q: Any, q: Any, low: Any, high: Any) -> Any:
 
 @jit
 def run_backward_pass(
-    slopes: Any, limits: Any, inputs: Any, length: int, damping: float, d: Any, G: Any
+    linearisation: Any, limits: Any, inputs: Any, length: int, damping: float, d: Any, G: Any
 ) -> None:
     """Run the backward pass over a run's linearisation.
 
-    Where the steering's rate is at its limit, its gain follows the state that it came from.
+    An input u of the run becomes u + d + G dx, with dx the scaled state less the run's;
+    G = -Quu^-1 Qux where both inputs are free. Where the rate limits the steering, the limit moves
+    with the last command: so does the gain.
 
     Args:
-        slopes: `Linearisation` of the run.
+        linearisation: `Linearisation` of the run.
         limits: `Limits` of the run.
         inputs: Inputs of the run, shape (K, 2).
         length: Periods of the run; later ones get zeros.
-        damping: Number added to the inputs' curvature.
+        damping: Number added to the diagonal of Quu, the Hessian in the inputs.
         d: Changes of the inputs, shape (K, 2), filled.
         G: Gains on the state, shape (K, 2, size), filled.
     """
-    size = slopes.F.shape[1]
-    V, v = slopes.H[length][:size, :size].copy(), slopes.g[length][:size].copy()
+    # The cost to go from the next period's state is v'dx + dx'V dx / 2. With this period's cost,
+    # in the state and the inputs, it is q'(dx, du) + (dx, du)'Q (dx, du) / 2.
+    size = linearisation.F.shape[1]
+    V, v = linearisation.H[length][:size, :size].copy(), linearisation.g[length][:size].copy()
     d[:], G[:] = 0.0, 0.0
     low, high = np.empty(2), np.empty(2)
     for k in range(length - 1, -1, -1):
-        F = slopes.F[k]
-        q, Q = slopes.g[k] + F.T @ v, slopes.H[k] + F.T @ (V @ F)
+        F = linearisation.F[k]
+        q, Q = linearisation.g[k] + F.T @ v, linearisation.H[k] + F.T @ (V @ F)
         Qxx, Qux, Quu = Q[:size, :size], Q[size:, :size].copy(), Q[size:, size:].copy()
         low[:], high[:] = limits.low[k] - inputs[k], limits.high[k] - inputs[k]
         low_1, high_1 = low[1], high[1]

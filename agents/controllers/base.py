@@ -66,7 +66,7 @@ class Controller(ABC):
                 f"{_describe_wrapper(missing)}"
             )
         self._columns = np.array([names.index(name) for name in self.needs], dtype=np.int64)
-        self._width = len(names)
+        self._n_entries = len(names)  # of an observation
         self.nominal = self.vehicle = facts.nominal
         self.full_scale, self.authority = facts.full_scale, facts.authority
         self.control_period, self.reference = facts.control_period, facts.reference
@@ -90,15 +90,17 @@ class Controller(ABC):
 
     def _compute_max_moment(self, inputs: Array) -> Array:
         """Compute the largest yaw moment as a fraction of full scale, shape (N,)."""
-        car, max_moment = self.vehicle, np.ones(len(inputs))
-        # the motors' power limits it at the measured speed (columns 0 and 1, the front wheels)
+        car, max_share = self.vehicle, np.ones(len(inputs))
+        # the motors' power is a limit at the measured speed (columns 0 and 1, the front wheels)
         if car.motor_power > 0.0:
-            max_moment = _torque_limit(inputs[:, :2].mean(axis=1), self._car) / car.motor_torque
+            max_share = _torque_limit(inputs[:, :2].mean(axis=1), self._car) / car.motor_torque
         if self.grip is None:
-            return max_moment
+            return max_share
         load = car.mass * GRAVITY * car.front_arm / (2.0 * car.wheelbase)  # N, of a rear tyre
+        # both rear tyres at mu F_z, one pulling and one braking: N_z = 2 (mu F_z) (d_r / 2), as a
+        # fraction of full scale
         per_friction = self.grip * load * car.rear_track / self.full_scale
-        return np.minimum(per_friction * self._get_friction(inputs), max_moment)
+        return np.minimum(per_friction * self._get_friction(inputs), max_share)
 
     @abstractmethod
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
@@ -146,9 +148,9 @@ class Controller(ABC):
             ValueError: The observation has another width.
         """
         obs = np.asarray(observation)
-        if obs.shape[-1] != self._width or obs.ndim > 2:
-            raise ValueError(f"expected observations of width {self._width}, got {obs.shape}")
-        batch = obs.reshape(-1, self._width)
+        if obs.shape[-1] != self._n_entries or obs.ndim > 2:
+            raise ValueError(f"expected observations of width {self._n_entries}, got {obs.shape}")
+        batch = obs.reshape(-1, self._n_entries)
         memory = np.zeros((len(batch), self.memory)) if state is None else np.array(state)
         if episode_start is not None:
             memory[np.asarray(episode_start, bool)] = 0.0

@@ -1,6 +1,8 @@
 """Lane keeping on curved roads: motion and position together, by front steering and yaw moment.
 
 Uneven-delay's aim: sideslip angle, yaw rate, heading and offset of one vision filter serve it.
+
+The papers' short names, such as tie-vision, are those of docs/PAPERS.md.
 """
 
 import math
@@ -34,13 +36,16 @@ psi is relative to the road (rad). y is the offset of the centre of gravity from
 line (m), and integral is its integral (m s). N_z is a fraction of full scale.
 """
 Memory = namedtuple("Memory", "integral rate heading started")
-"""The integral, the filtered gamma / V and psi that the curvature is from, whether it began."""
+"""The integral of y (m s), what the curvature is computed from (low-passed gamma / V in 1/m, and
+low-passed psi in rad), and whether the episode has started (1)."""
 
 IN = Inputs(*range(10))
 AT = Lane(*range(9))
 LAST = Memory(*range(4))
 MOVED = Lane._fields[: AT.driver]
 HASTE = 3.0
+"""Weight of ((command - applied angle) / reach)^2, reach = steering_rate (T + steering_lag): keeps
+the command within the actuator's rate."""
 _OFFSET_SCALE, _INTEGRAL_SCALE = 0.1, 0.2  # m, m s
 
 
@@ -65,13 +70,13 @@ def _make_lane_model(
     G, H = LinearModel(A, B, np.eye(n), Lane._fields, (), ()).discretise(T)
     # The cost at a period's end is the env's of beta and both inputs, with gamma against V kappa,
     # and the squares of the offset over 0.1 m and of its integral over 0.2 m s. The last term is
-    # haste times the square of the steering command's lead over the applied angle, in the angle
-    # that the rate covers in a period and a lag: else a linear law commands too fast a steering.
+    # haste ((command - applied angle) / reach)^2, with the angle `reach` that the actuator's rate
+    # covers in a period and a lag: without it a linear law commands too fast a steering.
     C = np.zeros((6, n))
     for row, state in enumerate((AT.beta, AT.gamma, AT.N_z, AT.y, AT.integral, AT.delta_f)):
         C[row, state] = 1.0
     C[1, AT.kappa], C[5, AT.driver] = -speed, -1.0  # gamma - V kappa; the added steering alone
-    command_error = np.zeros((1, n + 2))  # of the applied steering, the one asked for
+    command_error = np.zeros((1, n + 2))  # the steering command less the applied angle
     command_error[0, [AT.delta_f, AT.driver, n + 1]] = -1.0, 1.0, 1.0
     cost_outputs = np.vstack([C @ np.hstack([G, H]), command_error])
     reach = vehicle.steering_rate * (T + vehicle.steering_lag)
@@ -90,9 +95,9 @@ def _lane_keeping_law(
     action: Any,
     table: Any,
     axes: Any,
-    share: float,
+    share_per_torque: float,
     preview: float,
-    time: float,
+    filter_time: float,
     dt: float,
     authority: float,
 ) -> None:
@@ -106,12 +111,12 @@ def _lane_keeping_law(
             state[row, LAST.rate], state[row, LAST.heading] = gamma / v, psi
             state[row, LAST.started] = 1.0
         turned = psi - state[row, LAST.heading]
-        kappa = state[row, LAST.rate] - turned / (v * time)  # psi' = gamma - V kappa
-        state[row, LAST.rate] += (gamma / v - state[row, LAST.rate]) * dt / time
-        state[row, LAST.heading] += turned * dt / time
+        kappa = state[row, LAST.rate] - turned / (v * filter_time)  # psi' = gamma - V kappa
+        state[row, LAST.rate] += (gamma / v - state[row, LAST.rate]) * dt / filter_time
+        state[row, LAST.heading] += turned * dt / filter_time
         y = x[row, IN.y_l_hat] - preview * psi + 0.5 * kappa * preview * preview  # tie-vision (4)
         z[AT.beta], z[AT.gamma], z[AT.psi], z[AT.y] = x[row, IN.beta_hat], gamma, psi, y
-        z[AT.N_z] = share * (x[row, IN.torque_right] - x[row, IN.torque_left])
+        z[AT.N_z] = share_per_torque * (x[row, IN.torque_right] - x[row, IN.torque_left])
         z[AT.delta_f], z[AT.driver] = x[row, IN.steer], x[row, IN.steer_command]
         z[AT.integral], z[AT.kappa] = state[row, LAST.integral], kappa
         interpolate_gains(table, axes, v, 0.0, 0.0, K)
@@ -141,7 +146,7 @@ class LaneKeeping(Controller):
         env: Env of the controller, whose action steers.
         moment: Whether to use the yaw moment beside the steering.
         curvature_time: Time constant of the curvature's filter (s).
-        haste: Weight of the steering command's lead over the applied angle.
+        haste: Weight of the steering command less the applied angle, as for `HASTE`.
 
     Raises:
         ValueError: The action does not steer, an entry is missing, or an option is out of range.

@@ -23,7 +23,7 @@ Inputs = namedtuple(
     "wheel_left wheel_right torque_left torque_right steer steer_command beta_ref gamma_ref "
     "beta_hat gamma_hat disturbance_1 disturbance_2 front_stiffness rear_stiffness",
 )
-"""Columns of the law's inputs; `Lqr` puts in beta_ref for those that it does without."""
+"""Columns of the law's inputs; beta_ref stands in for those that `Lqr` does without."""
 IN = Inputs(*range(14))
 
 
@@ -47,7 +47,7 @@ def _lqr_law(
     x: Any,
     state: Any,
     action: Any,
-    max_moment: Any,
+    max_share: Any,
     sliding_slip: Any,
     table: Any,
     axes: Any,
@@ -58,7 +58,8 @@ def _lqr_law(
     front_arm: Any,
 ) -> None:
     """Compute the actions of LQR within the limits; state: steering last added (rad)."""
-    # sliding_slip: slip at which the front tyres slide (rad), max_moment: of full scale, both (N,)
+    # sliding_slip: slip angle at which the front tyres slide (rad), max_share: largest yaw moment
+    # as a fraction of full scale; both (N,)
     m, n = table.shape[3], table.shape[4] - table.shape[3]
     KS, z = np.empty((m, n + m)), np.empty(n)
     for row in range(len(x)):
@@ -72,16 +73,17 @@ def _lqr_law(
             u -= KS[0, j] * z[j]
             w -= KS[m - 1, j] * z[j]
         if m == 1:
-            action[row, 0] = _clip(u, -max_moment[row], max_moment[row])
+            action[row, 0] = _clip(u, -max_share[row], max_share[row])
             continue
         low, high = max(state[row, 0] - slew, -authority), min(state[row, 0] + slew, authority)
-        straight = z[0] + front_arm * z[1] / max(v, MIN_SPEED) - z[4]  # added, that leaves no slip
+        # added steering at which the front tyres have no slip angle
+        straight = z[0] + front_arm * z[1] / max(v, MIN_SPEED) - z[4]
         max_w, min_w = (
             max(straight + sliding_slip[row], 0.0),
             min(straight - sliding_slip[row], 0.0),
         )
         low, high = _clip(min_w, low, high), _clip(max_w, low, high)
-        u, w = _solve_box_qp(KS[0, n], KS[0, n + 1], KS[1, n + 1], u, w, max_moment[row], low, high)
+        u, w = _solve_box_qp(KS[0, n], KS[0, n + 1], KS[1, n + 1], u, w, max_share[row], low, high)
         action[row, 0], action[row, 1], state[row, 0] = u, w / authority, w
 
 
@@ -211,12 +213,13 @@ class Lqr(Controller):
         _lqr_law(inputs, state, action, *limits, *self._design)
 
     def _compute_sliding_slip(self, inputs: Array) -> Array:
-        """Compute the slip at which the front tyres slide (Fiala), rad, shape (N,)."""
+        """Compute the slip angle at which Fiala's front tyres slide, in rad, shape (N,)."""
         if self.grip is None:  # no limit
             return np.full(len(inputs), np.inf)
         car = self.vehicle
         stiffness = inputs[:, IN.front_stiffness] if self.scheduled else car.front_stiffness
         load = car.mass * GRAVITY * car.rear_arm / (2.0 * car.wheelbase)  # N, of a front tyre
+        # tan(slip angle) = 3 mu F_z / C, small angles
         sliding_slip: Array = 3.0 * self._get_friction(inputs) * load / np.maximum(stiffness, 1.0)
         return sliding_slip
 

@@ -37,7 +37,8 @@ Inputs = namedtuple(
 )
 """Columns of the law's inputs; what the observation lacks is put in by `ModelFollowing`."""
 Memory = namedtuple("Memory", "delta_f N_z driver known")
-"""The integrals in rad and N m, the last steering command, and whether there was one."""
+"""The integrals of steering (rad) and yaw moment (N m), the driver's last steering command (rad),
+and whether there was one."""
 
 IN = Inputs(*range(9))
 LAST = Memory(*range(4))
@@ -76,7 +77,7 @@ def _model_following_law(
     x: Any,
     state: Any,
     action: Any,
-    max_moment: Any,
+    max_share: Any,
     car: Any,
     target: Any,
     kind: int,
@@ -86,7 +87,10 @@ def _model_following_law(
     authority: float,
     dt: float,
 ) -> None:
-    """Compute the actions from `Inputs` x and update the `Memory` state; K: K_beta, K_gamma."""
+    """Compute the actions from `Inputs` x and update the `Memory` state.
+
+    K: K_beta and K_gamma (rad/s), max_share: largest yaw moment as a fraction of full scale (N,).
+    """
     for n in range(len(x)):
         v = maximum(0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right]), MIN_SPEED)
         driver, beta_ref, gamma_ref = x[n, IN.steer_command], x[n, IN.beta_ref], x[n, IN.gamma_ref]
@@ -120,7 +124,7 @@ def _model_following_law(
         )
         delta_f, N_z = delta_f + state[n, LAST.delta_f], N_z + state[n, LAST.N_z]  # (33)
         steer = min(max(delta_f, driver - authority), driver + authority)
-        limit = max_moment[n] * full_scale
+        limit = max_share[n] * full_scale
         moment = min(max(N_z, -limit), limit)
         drift_rates = compute_drift(plant, p_beta, p_gamma)
         # I of (31), forward Euler

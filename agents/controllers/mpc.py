@@ -18,10 +18,10 @@ from .lqr import IN, Lqr, make_design_state
 
 MIN_STEP = 10  # ticks, the shortest of the prediction
 NOT_FINITE = "the observation is not finite"
-_RHO = 0.1  # the solver's first; every call starts from it, whatever the last one ended with
+_RHO = 0.1  # OSQP's step size at the start of every call, whatever the last one ended with
 _SETTINGS = {
     "verbose": False,
-    "adaptive_rho": 1,  # by iterations, not by the time they take
+    "adaptive_rho": 1,  # after so many iterations, not after a time
     "adaptive_rho_interval": 50,
     "rho": _RHO,
     "eps_abs": 1e-4,  # of full scale
@@ -123,7 +123,12 @@ class Mpc(Lqr):
         self._change = self.nominal.steering_rate * period * TICK / self.authority
         inputs = horizon * self.width
         self._rows = inputs + (horizon if self.width > 1 else 0)
+        # The last added steering (fraction of authority), the solution, and its dual variables: of
+        # the inputs' limits, and of the added steering's rate where the env steers.
         self.memory = 1 + inputs + self._rows
+        self._primal, self._dual = slice(1, 1 + inputs), slice(1 + inputs, None)
+        self._dual_limits = slice(1 + inputs, 1 + 2 * inputs)
+        self._dual_rate = slice(1 + 2 * inputs, None)
         self._ready_for: dict[float, tuple[_QuadraticProgram, Any]] = {}
         self.status: list[str] = []
         self.solve_time: list[float] = []
@@ -177,16 +182,16 @@ class Mpc(Lqr):
         program, solver = self._get_solver(_find_nearest_speed(speed))
         solver.update_settings(rho=_RHO)
         solver.update(q=program.F @ z, l=low, u=high)
-        solver.warm_start(x=memory[1 : 1 + count], y=memory[1 + count :])
+        solver.warm_start(x=memory[self._primal], y=memory[self._dual])
         solution = solver.solve(raise_error=False)
         if solution.info.status_val not in self._accepted:
             row_action[:] = np.nan
             return str(solution.info.status), float(solution.info.run_time)
         row_action[:] = solution.x[:m]
         memory[0] = solution.x[1] if m > 1 else 0.0
-        memory[1 : 1 + count] = self._shift_solution(solution.x, m)
-        memory[1 + count : 1 + 2 * count] = self._shift_solution(solution.y[:count], m)
-        memory[1 + 2 * count :] = self._shift_solution(solution.y[count:], 1)
+        memory[self._primal] = self._shift_solution(solution.x, m)
+        memory[self._dual_limits] = self._shift_solution(solution.y[:count], m)
+        memory[self._dual_rate] = self._shift_solution(solution.y[count:], 1)
         return str(solution.info.status), float(solution.info.run_time)
 
     def _shift_solution(self, values: Array, width: int) -> Array:

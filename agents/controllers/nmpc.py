@@ -34,16 +34,16 @@ from .base import check_positive
 from .lqr import IN, Lqr
 
 MIN_STEP = 10  # ticks, the shortest of the prediction
-_FIRST_ITERATIONS = 6  # more iterations at an episode's first decision
-_MAX_SIDESLIP = 1.2  # rad of sideslip, beyond which a prediction starts from this
+_FIRST_ITERATIONS = 6  # added to the others at an episode's first decision
+_MAX_SIDESLIP = 1.2  # rad: a prediction starts from this sideslip angle at most
 STATUSES = ("unknown", "solved", "the observation is not finite", "diverged")
 UNKNOWN, SOLVED, NOT_FINITE, DIVERGED = range(len(STATUSES))
 TYRES = ("front_tyres_hat", "rear_tyres_hat")
 INVERSE_FRICTION = "inverse_friction_hat"
-_MIN_FRICTION, _MAX_FRICTION = 0.2, 1.2  # of the friction that is believed
+_MIN_FRICTION, _MAX_FRICTION = 0.2, 1.2  # estimates beyond count as these
 
-Memory = namedtuple("Memory", "slewing status")
-"""Steering last added (rad) and index in `STATUSES`; the plan stands behind."""
+Memory = namedtuple("Memory", "added_command status")
+"""Added steering last commanded (rad) and index in `STATUSES`; the plan's variables follow."""
 LAST = Memory(*range(2))
 PLAN = len(Memory._fields)
 
@@ -52,15 +52,15 @@ class Design(NamedTuple):
     """The parts that all decisions of a controller share."""
 
     model: PredictionModel
-    target: ReferenceParams
+    target: ReferenceParams  # of the nominal car
     gains: Any  # K of `GainTables`, (..., m, n)
-    terminal: Any
-    axes: Any
-    blocks: Any
-    scheduled: int  # 1: on the stiffnesses of the observation
-    disturbed: int  # 0, 1 by forces, 2 by rates
-    steps: float  # of the prediction in a control period
-    iterations: int
+    terminal: Any  # T of `GainTables`, (..., 4, n)
+    axes: Any  # knots of speed, front and rear stiffness
+    blocks: Any  # steps of each block
+    scheduled: int  # 1: gains follow the stiffnesses of the observation
+    disturbed: int  # disturbances of the observation: 0 none, 1 forces, 2 rates
+    steps: float  # steps of the prediction in a control period
+    iterations: int  # of a decision
 
 
 @jit
@@ -72,7 +72,10 @@ def _shift_plan(plan: Any, blocks: Any, m: int, steps: float) -> None:
 
 @jit
 def _interpolate_regulator(table: Any, axes: Any, v: Any, front: Any, rear: Any, per: Any) -> Any:
-    """Interpolate a table's rows, shape (rows, 9), for states with forces instead of rates."""
+    """Interpolate a table's rows, shape (rows, 9), for the nine states of `prediction`.
+
+    `per`: what turns F_d and N_d into the table's own disturbances, forces or rates.
+    """
     values, padded = np.empty(table.shape[3:]), np.zeros((table.shape[3], 9))
     interpolate_gains(table, axes, v, front, rear, values)
     for i in range(len(values)):
@@ -85,11 +88,11 @@ def _interpolate_regulator(table: Any, axes: Any, v: Any, front: Any, rear: Any,
 
 @jit
 def _prepare_prediction(
-    design: Design, x: Any, friction: Any, roll: Any, slewing: Any, max_moment: Any
+    design: Design, x: Any, friction: Any, roll: Any, added_command: Any, max_moment: Any
 ) -> Any:
     """Prepare a row's `PredictionStart`, K (m, 9), and T (4, 9) of the terminal cost |T x|^2."""
     # x: row of `lqr.Inputs`, roll: angle and rate (rad, rad/s), NaN where they are not measured,
-    # slewing: steering last added (rad), max_moment: fraction of full scale
+    # added_command: the last one of added steering (rad), max_moment: fraction of full scale
     model, disturbed = design.model, design.disturbed
     v = max(0.5 * (x[IN.wheel_left] + x[IN.wheel_right]), MIN_SPEED)
     front = x[IN.front_stiffness] if design.scheduled else model.car.C_f
@@ -104,19 +107,19 @@ def _prepare_prediction(
     per = (car.m * v, car.I) if disturbed == 2 else (1.0, 1.0)
     F_d = x[IN.disturbance_1] * per[0] if disturbed else 0.0
     N_d = x[IN.disturbance_2] * per[1] if disturbed else 0.0
-    phi, rate = roll[0], roll[1]
-    if phi != phi:  # as in a steady turn
-        phi, rate = car.S * v * gamma / (car.K_x - car.S * GRAVITY), 0.0
-    rolls = float(model.kind.roll)
+    phi, phi_rate = roll[0], roll[1]
+    if phi != phi:  # not measured: as in a steady turn
+        phi, phi_rate = car.S * v * gamma / (car.K_x - car.S * GRAVITY), 0.0
+    rolls = float(model.kind.roll)  # 1: the car rolls
     sine, cosine = sincos(min(max(x[IN.beta_hat], -_MAX_SIDESLIP), _MAX_SIDESLIP))
     v_y = v * (x[IN.beta_hat] if model.kind.small_angle else sine / cosine)
     start = PredictionStart(
         car,
-        Motion(v, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, rolls * phi, rolls * rate),
+        Motion(v, v_y, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, rolls * phi, rolls * phi_rate),
         x[IN.torque_left],
         x[IN.torque_right],
         x[IN.steer],
-        slewing,
+        added_command,
         driver,
         (x[IN.torque_left] + x[IN.torque_right]) / (car.m * car.r),
         refs,
@@ -136,23 +139,23 @@ def _nmpc_law(
     """Compute the actions; state: `Memory` and the plan, rolls: as in `_prepare_prediction`."""
     blocks, m = design.blocks, design.gains.shape[3]
     for row in range(len(x)):
-        slewing = state[row, LAST.slewing]
+        last_command = state[row, LAST.added_command]
         start, K, T = _prepare_prediction(
-            design, x[row], friction[row], rolls[row], slewing, max_moment[row]
+            design, x[row], friction[row], rolls[row], last_command, max_moment[row]
         )
         plan, extra_iterations = state[row, PLAN:].copy(), _FIRST_ITERATIONS
         if state[row, LAST.status] == SOLVED:
             _shift_plan(plan, blocks, m, design.steps)
             extra_iterations = 0
-        J, share, wheel = update_plan(
+        J, share, added_command = update_plan(
             design.model, start, K, T, blocks, plan, design.iterations + extra_iterations
         )
         if np.isfinite(J):
-            state[row, PLAN:], state[row, LAST.slewing] = plan, wheel
+            state[row, PLAN:], state[row, LAST.added_command] = plan, added_command
             state[row, LAST.status] = SOLVED
             action[row, 0] = share
             if m > 1:
-                action[row, 1] = wheel / design.model.authority
+                action[row, 1] = added_command / design.model.authority
         else:
             state[row, :], action[row, :] = 0.0, math.nan
             state[row, LAST.status] = DIVERGED

@@ -2,6 +2,8 @@
 
 Both are designed from the nominal vehicle and scheduled by the measured speed, the mean of the two
 front wheel speeds: the feedforward by its formula, the PI on a grid of speeds.
+
+The papers' short names, such as tie-vision, are those of docs/PAPERS.md.
 """
 
 import math
@@ -27,7 +29,8 @@ FEEDFORWARDS = ("reference", "zero-slip")
 Inputs = namedtuple("Inputs", "wheel_left wheel_right steer_command beta_hat beta_ref")
 """Columns of the laws' inputs; the feedforward reads the first three alone."""
 Memory = namedtuple("Memory", "integral wait share")
-"""The integral (N m), decisions until the next update, and the fraction held until then."""
+"""The PI's integral (N m), decisions until the next update, and the yaw moment held until then
+(fraction of full scale)."""
 
 IN = Inputs(*range(5))
 LAST = Memory(*range(3))
@@ -35,9 +38,12 @@ LAST = Memory(*range(3))
 
 @jit
 def _compute_denominator(car: Any, V: Any) -> Any:
-    """Compute -a12 m V^2, kept from zero, where the yaw moment has no static effect on the slip."""
+    """Compute -a12 m V^2 (N m), kept at least 5 % of the sum of its terms' magnitudes.
+
+    At zero the yaw moment has no static effect on the sideslip angle. An understeering car has such
+    a speed, m V^2 = 2 (l_r C_r - l_f C_f).
+    """
     mV2, excess = car[CAR.m] * V * V, car[CAR.l_f] * car[CAR.C_f] - car[CAR.l_r] * car[CAR.C_r]
-    # an understeering car has such a speed, m V^2 = 2 (l_r C_r - l_f C_f): 5 % of the terms remain
     denominator, min_size = mV2 + 2.0 * excess, 0.05 * (mV2 + 2.0 * absolute(excess))
     if absolute(denominator) < min_size:
         denominator = select(denominator < 0.0, -min_size, min_size)
@@ -46,14 +52,15 @@ def _compute_denominator(car: Any, V: Any) -> Any:
 
 @jit
 def _compute_static_gain(car: Any, V: Any) -> Any:
+    """Compute N_z / delta_f for a steady beta of zero (N m/rad), tie-vision (24)."""
     m, l_f, l_r, C_f, C_r = car[CAR.m], car[CAR.l_f], car[CAR.l_r], car[CAR.C_f], car[CAR.C_r]
     mV2 = m * V * V
     numerator = 4.0 * l_r * (l_f + l_r) * C_f * C_r - 2.0 * l_f * C_f * mV2
-    return numerator / _compute_denominator(car, V)  # tie-vision (24)
+    return numerator / _compute_denominator(car, V)
 
 
 @jit
-def _compute_slip_gain(car: Any, V: Any) -> Any:
+def _compute_sideslip_gain(car: Any, V: Any) -> Any:
     """Compute the yaw moment that holds a sideslip angle (N m/rad), beside that of (24)."""
     plant, m = compute_plant(car, V), car[CAR.m]
     yaw_rate = plant.a11 * m * V * V / _compute_denominator(car, V)  # that keeps it, -a11 / a12
@@ -61,7 +68,7 @@ def _compute_slip_gain(car: Any, V: Any) -> Any:
 
 
 def _compute_feedforward_gain(vehicle: Vehicle, speed: float) -> float:
-    """Compute the yaw moment per steering angle for a static slip of zero, C_FF (N m/rad), (24)."""
+    """Compute tie-vision's C_FF (N m/rad), (24): `_compute_static_gain` at a vehicle's speed."""
     return float(_compute_static_gain(make_nominal_car(vehicle), float(speed)))
 
 
@@ -86,7 +93,7 @@ def _two_dof_law(
     x: Any,
     state: Any,
     action: Any,
-    max_moment: Any,
+    max_share: Any,
     follows: int,
     car: Any,
     k_p: Any,
@@ -95,7 +102,10 @@ def _two_dof_law(
     wait: int,
     dt: float,
 ) -> None:
-    """Compute the actions from `Inputs` x and update the `Memory` state."""
+    """Compute the actions from `Inputs` x and update the `Memory` state.
+
+    `max_share` is the largest yaw moment (fraction of full scale). `follows`: 1 for "reference".
+    """
     for n in range(len(x)):
         if state[n, LAST.wait] > 0.0:
             state[n, LAST.wait] -= 1.0
@@ -105,10 +115,10 @@ def _two_dof_law(
         error = x[n, IN.beta_ref] - x[n, IN.beta_hat]
         forward = _compute_static_gain(car, maximum(v, MIN_SPEED)) * x[n, IN.steer_command]
         if follows:
-            forward += _compute_slip_gain(car, maximum(v, MIN_SPEED)) * x[n, IN.beta_ref]
+            forward += _compute_sideslip_gain(car, maximum(v, MIN_SPEED)) * x[n, IN.beta_ref]
         integral = state[n, LAST.integral]
         unlimited = forward + _interpolate_column(k_p, v) * error + integral
-        limit = max_moment[n] * full_scale
+        limit = max_share[n] * full_scale
         N_z = min(max(unlimited, -limit), limit)
         step = _interpolate_column(k_i, v) * error * dt  # forward Euler
         state[n, LAST.integral] = integrate_antiwindup(integral, step, unlimited, N_z)

@@ -37,11 +37,11 @@ from .base import (
 )
 from .model_following import MIN_SPEED
 
-BANDWIDTH = 16.0  # rad/s
-_RELEASE = 0.5  # s, in which the integral is let go within the dead band
+BANDWIDTH = 16.0  # rad/s, double pole of the yaw-rate loop
+_RELEASE = 0.5  # s, time constant by which the integral decays within the dead band
 
 EscInputs = namedtuple("EscInputs", "wheel_left wheel_right steer_command gyro beta_hat")
-"""Columns of the law's inputs; the last one only where the slip is bounded."""
+"""Columns of the law's inputs; the last one only where the sideslip angle is bounded."""
 ESC_IN = EscInputs(*range(5))
 
 
@@ -71,12 +71,12 @@ def _esc_law(
     x: Any,
     state: Any,
     action: Any,
-    max_moment: Any,
+    max_share: Any,
     target: Any,
     speeds: Any,
     gains: Any,
     band: float,
-    slip: float,
+    max_sideslip: float,
     stiffness: float,
     bounded: int,
     full_scale: float,
@@ -92,8 +92,8 @@ def _esc_law(
         error = _apply_dead_zone(gamma_ref - x[n, ESC_IN.gyro], band)
         unlimited = k_p * error + state[n, 0]
         if bounded:  # more yaw rate to the side the car slides to: beta' = ... - gamma
-            unlimited += stiffness * _apply_dead_zone(x[n, ESC_IN.beta_hat], slip)
-        limit = max_moment[n] * full_scale
+            unlimited += stiffness * _apply_dead_zone(x[n, ESC_IN.beta_hat], max_sideslip)
+        limit = max_share[n] * full_scale
         N_z = min(max(unlimited, -limit), limit)
         state[n, 0] = integrate_antiwindup(state[n, 0], k_i * error * dt, unlimited, N_z)
         if absolute(error) == 0.0:
@@ -106,8 +106,8 @@ class Esc(Controller):
 
     The yaw rate follows that of the nominal car within what friction holds, |gamma| <= 0.85 mu g /
     v, under every reference of the env. The PI acts outside of the dead band, within which its
-    integral decays. Beyond the bound of the slip a moment drives beta back, where the observation
-    has beta_hat. Source: Rajamani, Vehicle Dynamics and Control, 8.2.
+    integral decays. Beyond the bound of the sideslip angle a moment drives beta back, where the
+    observation has beta_hat. Source: Rajamani, Vehicle Dynamics and Control, 8.2.
 
     Args:
         env: Env of the controller.
@@ -170,7 +170,7 @@ LAST = Memory(*range(3))
 
 @jit
 def _compute_surface_slope(plant: Any, pole: Any) -> Any:
-    """Compute xi (1/s) of the surface on which the error of beta decays at `pole` (rad/s)."""
+    """Compute xi (1/s) of the surface s = 0, on which beta's error decays at `pole` (rad/s)."""
     # on s = 0, beta' = a11 beta + a12 gamma makes the pole of beta's error a11 - a12 xi
     return (plant.a11 + pole) / plant.a12
 
@@ -191,7 +191,7 @@ def _sliding_mode_law(
     x: Any,
     state: Any,
     action: Any,
-    max_moment: Any,
+    max_share: Any,
     car: Any,
     target: Any,
     kind: int,
@@ -225,7 +225,7 @@ def _sliding_mode_law(
         N_z = -(s_rate + reach) / plant.b22  # Rajamani 8.3: equivalent control and boundary layer
         state[n, LAST.beta_ref], state[n, LAST.gamma_ref] = beta_ref, gamma_ref
         state[n, LAST.known] = 1.0
-        action[n, 0] = min(max(N_z / full_scale, -max_moment[n]), max_moment[n])
+        action[n, 0] = min(max(N_z / full_scale, -max_share[n]), max_share[n])
 
 
 class SlidingMode(Controller):

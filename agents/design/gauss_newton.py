@@ -9,22 +9,24 @@ from ...envs.numerics.jit import jit
 from ...envs.numerics.packed import count_lanes
 from .prediction import N_RESIDUALS, N_TERMINAL, PredictionModel, PredictionStart, simulate_plans
 
-_N_CANDIDATES = 16  # that are tried at once
-MAX_VARIABLES = _N_CANDIDATES - 1  # one is the plan itself
-LIMIT = 2.0  # of a variable: from one limit of an input to the other
-DIFFERENCE = 0.01  # of a variable, for slopes
-_MIN_DAMPING = 1e-4  # Levenberg and Marquardt's, of the first of the steps that are tried
+# A variable of a plan is a fraction of the full yaw moment or of the steering's authority, which is
+# added to the regulator's action.
+_N_CANDIDATES = 16  # plans tried at once: the old one, zeros, and steps of seven dampings, two each
+MAX_VARIABLES = _N_CANDIDATES - 1  # of a plan: its batch of perturbed plans begins with itself
+LIMIT = 2.0  # of a variable's magnitude: from one limit of an input to the other
+DIFFERENCE = 0.01  # perturbation of a variable, for finite differences
+_MIN_DAMPING = 1e-4  # Levenberg and Marquardt's, of the first candidate; later ones: tenfold each
 _STEP_LENGTHS = (1.0, 0.3)  # each step is tried whole and in part
 
 
 class _PlanBatch(NamedTuple):
     """Plans side by side and their results, one column for each."""
 
-    plans: Any  # variables, shape (variables, count)
-    perturbations: Any  # changes beyond the limits, shape (variables, count)
+    plans: Any  # variables: fractions of the inputs' full scale, shape (variables, count)
+    perturbations: Any  # offsets behind the limits, in a variable's unit, shape as `plans`
     limits: Any  # 1 or -1 where a block starts at a limit, shape (variables, count)
     residuals: Any  # residuals, whose squares sum to J, shape (residuals, count)
-    first: Any  # first yaw moment (fraction) and added steering (rad), shape (2, count)
+    first: Any  # first yaw moment (of full scale) and added steering (rad), shape (2, count)
 
 
 @jit
@@ -62,8 +64,8 @@ def simulate_batch(
     Args:
         model: Numbers that all predictions share.
         start: Start of the prediction.
-        K: Gains of the regulator, shape (m, 9).
-        terminal: T of the terminal cost |T x|^2, shape (4, 9).
+        K: Gains of the regulator on the nine states of `prediction`, shape (m, 9).
+        terminal: T of the terminal cost |T x|^2 in the same states, shape (4, 9).
         blocks: Steps of each block, shape (blocks,).
         batch: Plans and perturbations, whose results are filled.
     """
@@ -97,9 +99,12 @@ def _sum_squares(residuals: Any, J: Any) -> None:
 
 @jit
 def _compute_normal_equations(batch: _PlanBatch, A: Any, g: Any) -> None:
-    """Fill A = J'J and g = J'r; column i + 1 perturbs variable i of the plan in the first."""
+    """Fill A = D'D and g = D'r, D the Jacobian of the residuals r by forward differences.
+
+    Column 0 of the batch is the plan itself; in column i + 1 its variable i is perturbed.
+    """
     n, residuals = len(g), batch.residuals
-    slope = np.empty(n)
+    slope = np.empty(n)  # a row of D
     A[:], g[:] = 0.0, 0.0
     for r in range(len(residuals)):
         for i in range(n):
@@ -115,13 +120,13 @@ def _compute_normal_equations(batch: _PlanBatch, A: Any, g: Any) -> None:
 
 @jit
 def solve_damped_step(A: Any, g: Any, damping: float, L: Any, d: Any) -> None:
-    """Solve (A + damping diag A) d = -g; d is zero where there is no solution.
+    """Solve (A + damping diag A + 1e-9 I) d = -g by Cholesky's factors; d is zero where they fail.
 
     Args:
         A: Positive semidefinite matrix, shape (n, n); a variable without an effect does not move.
         g: Gradient, shape (n,).
         damping: Levenberg-Marquardt's damping.
-        L: Scratch, shape (n, n).
+        L: Scratch for the lower Cholesky factor, shape (n, n).
         d: Step, shape (n,), filled.
     """
     n = len(g)
@@ -187,8 +192,8 @@ def update_plan(
     Args:
         model: Numbers that all predictions share.
         start: Start of the prediction.
-        K: Gains of the regulator, shape (m, 9).
-        terminal: T of the terminal cost |T x|^2, shape (4, 9).
+        K: Gains of the regulator on the nine states of `prediction`, shape (m, 9).
+        terminal: T of the terminal cost |T x|^2 in the same states, shape (4, 9).
         blocks: Steps of each block, shape (blocks,).
         plan: Plan, shape (variables,), improved in place.
         iterations: Number of iterations.
@@ -204,7 +209,7 @@ def update_plan(
         np.empty(n),
         np.empty(_N_CANDIDATES),
     )
-    min_cost, share, wheel = math.inf, 0.0, 0.0
+    min_cost, share, added_command = math.inf, 0.0, 0.0
     for _ in range(iterations):
         _fill_perturbations(plan, batch)
         simulate_batch(model, start, K, terminal, blocks, batch)
@@ -219,5 +224,5 @@ def update_plan(
                 best, min_cost = c, J[c]
         if min_cost < math.inf:
             plan[:] = batch.plans[:, best]
-            share, wheel = batch.first[0, best], batch.first[1, best]
-    return min_cost, share, wheel
+            share, added_command = batch.first[0, best], batch.first[1, best]
+    return min_cost, share, added_command

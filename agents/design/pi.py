@@ -1,4 +1,7 @@
-"""The nominal car in compiled laws, and the PI on its sideslip angle of tie-vision section V."""
+"""The nominal car in compiled laws, and the PI on its sideslip angle of tie-vision section V.
+
+The papers' short names, such as tie-vision, are those of docs/PAPERS.md.
+"""
 
 import math
 from dataclasses import dataclass
@@ -18,7 +21,7 @@ PLACEMENTS = ("radius", "real")
 
 @dataclass(frozen=True)
 class PI:
-    """Gains of the yaw moment on the slip error."""
+    """Gains of the yaw moment on the error of the sideslip angle."""
 
     k_p: float  # proportional gain (N m/rad)
     k_i: float  # integral gain (N m/(rad s))
@@ -28,8 +31,10 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str
     """Design a PI whose zero lies on the plant's slow pole, with closed-loop poles at `pole`.
 
     With G = k / ((s + p_1)(s + p_2)), p_1 < p_2, and C = k_p (s + p_1) / s the closed loop is
-    s^2 + p_2 s + k k_p. Gains are capped at the full yaw moment for 0.01 rad: k is nearly zero near
-    the speed where the yaw moment does not move beta.
+    s^2 + p_2 s + k k_p. That is for real poles; of complex ones (a passenger car's from about
+    23 km/h on) p_1 and p_2 both are the real part, and the zero cancels no pole. Gains are capped
+    at the full yaw moment for 0.01 rad: k is nearly zero near the speed where the yaw moment does
+    not move beta.
 
     Args:
         vehicle: Vehicle of the design.
@@ -48,7 +53,9 @@ def design_pi(vehicle: Vehicle, speed: float, pole: float = POLE, placement: str
     """
     _check(pole, placement)
     model = make_bicycle_model(vehicle, speed)
-    closed = model.A - model.B[:, 1:] @ [[1.0, 0.0]]  # its polynomial less the plant's is G's upper
+    # det(sI - A + b c) - det(sI - A) is the numerator of G = c (sI - A)^-1 b with c = [1, 0] and b
+    # of the yaw moment: k = a12 b22
+    closed = model.A - model.B[:, 1:] @ [[1.0, 0.0]]
     k = float((np.poly(closed) - np.poly(model.A))[-1])
     slow_first = sorted(-float(p.real) for p in np.linalg.eigvals(model.A))
     p_1, p_2 = max(slow_first[0], 0.0), slow_first[1]
@@ -79,7 +86,8 @@ def sample_pi(
 
     The PI is k_p + k_i T / (z - 1), its zero lies on the plant's slow pole a_1, and the poles of
     (z - a_2)(z - 1) + k_p (b_1 z + b_0) are placed: with ln z = s T, "radius" makes the product of
-    the two s pole^2, "real" puts one s at -pole. It tends to `design_pi` for a short period.
+    the two s pole^2, "real" puts one s at -pole. It tends to `design_pi` for a short period. As
+    there, the real parts of complex poles are taken: a_1 = a_2, and the zero cancels no pole.
 
     Args:
         vehicle: Vehicle of the design.
@@ -95,9 +103,9 @@ def sample_pi(
     model = make_bicycle_model(vehicle, speed)
     p_1, p_2 = np.sort(-np.linalg.eigvals(model.A).real).tolist()
     a_1, a_2 = math.exp(-max(p_1, 0.0) * period), math.exp(-p_2 * period)
-    G, H = model.discretise(period)
-    b_1 = H[0, 1]
-    b_0 = G[0, 1] * H[1, 1] - G[1, 1] * H[0, 1]
+    A_d, B_d = model.discretise(period)  # tie-vision's G and H, (9)
+    b_1 = B_d[0, 1]
+    b_0 = A_d[0, 1] * B_d[1, 1] - A_d[1, 1] * B_d[0, 1]
     if b_1 + b_0 == 0.0:
         return PI(0.0, 0.0)
     if placement == "real":
@@ -114,7 +122,8 @@ def sample_pi(
 
         from scipy.optimize import brentq  # slow to load
 
-        factors = np.linspace(0.0, 4.0, 81)  # the first of them, before a pole leaves z > 0
+        # a grid in steps of 0.05; the smallest root counts: beyond it a pole may leave z > 0
+        factors = np.linspace(0.0, 4.0, 81)
         upper = next((f for f in factors[1:] if compute_excess(f) > 0.0), None)
         factor = 4.0 if upper is None else brentq(compute_excess, upper - 0.05, upper)
         k_p = continuous * factor
@@ -123,7 +132,7 @@ def sample_pi(
 
 
 CAR, _ = make_offsets(Bicycle)
-"""A vehicle as laws read it, an array at these indices: SI units, stiffness per tyre."""
+"""Indices in the array by which laws read a vehicle: SI units, stiffness per tyre."""
 
 
 class BicyclePlant(NamedTuple):

@@ -3,6 +3,9 @@
 A plan is added to the linear regulator's action, constant in blocks of steps. The sum is limited
 as the plant limits it. So the plan of zeros is the regulator itself, which is optimal where the
 car is linear and no limit is met. As many plans as a SIMD value has lanes are simulated at once.
+
+The regulator's nine states, in this order, are the columns of K and T: beta, gamma, yaw moment
+(fraction of full scale), delta_f, driver's angle, beta_ref, gamma_ref, F_d, N_d.
 """
 
 import math
@@ -44,22 +47,22 @@ class PredictionModel(NamedTuple):
     car: CarParams  # the nominal one
     road: RoadParams  # straight and flat
     kind: StepVariant
-    motor: Lag  # of a step
-    steering: Lag
-    motor_work: tuple[float, float]  # mean and spread over a step of what is left of a deviation
-    steering_work: tuple[float, float]
+    motor: Lag  # lag of the motors over a step
+    steering: Lag  # lag of the steering over a step
+    motor_rest: tuple[float, float]  # of the motors, `_compute_lag_moments`
+    steering_rest: tuple[float, float]  # of the steering, likewise
     step: float  # s
     full_scale: float  # N m
     authority: float  # rad
     slew: float  # rad a step
     stop: float  # rad
-    yaw_first: float
-    decay: float  # what a step leaves of the disturbances
-    ref_rest: float  # and of a lagged reference's deviation
-    per_beta: float  # square roots of the cost's weights
-    per_gamma: float
-    per_share: float
-    per_steer: float
+    yaw_first: float  # 1: the yaw moment comes before the drive torque
+    decay: float  # fraction of the disturbances that a step leaves
+    ref_rest: float  # fraction of a lagged reference's deviation that a step leaves
+    per_beta: float  # square root of the cost's weight of beta (1/rad)
+    per_gamma: float  # of gamma (s/rad)
+    per_share: float  # of the yaw moment's fraction
+    per_steer: float  # of added steering (1/rad)
 
 
 class PredictionStart(NamedTuple):
@@ -70,7 +73,7 @@ class PredictionStart(NamedTuple):
     T_l: Any  # torque of the left motor (N m)
     T_r: Any  # torque of the right motor (N m)
     delta_f: Any  # applied steering angle (rad)
-    slewing: Any  # added steering that was last commanded (rad)
+    added_command: Any  # added steering that was last commanded (rad)
     driver: Any  # driver's steering angle, held (rad)
     a_x: Any  # acceleration, held (m/s^2)
     refs: Any  # beta_ref (rad) and gamma_ref (rad/s) now
@@ -80,10 +83,14 @@ class PredictionStart(NamedTuple):
 
 
 def _compute_lag_moments(time_constant: float, ticks: int) -> tuple[float, float]:
-    """Compute mean and deviation, over a step's ticks, of what a lag leaves of a deviation."""
+    """Compute mean and standard deviation, over a step's ticks, of the rest that a lag leaves.
+
+    The rest rho is a fraction of the deviation from a command. The mean square of
+    command + deviation rho is (command + deviation mean)^2 + (deviation std)^2.
+    """
     tick = make_lag(time_constant, TICK)
-    left = tick.mean * tick.end ** np.arange(ticks)
-    return float(left.mean()), float(left.std())
+    rest = tick.mean * tick.end ** np.arange(ticks)
+    return float(rest.mean()), float(rest.std())
 
 
 def make_prediction_model(
@@ -162,17 +169,20 @@ def replace_tyres(car: Any, C_f: Any, C_r: Any, mu: Any) -> Any:
         car: `CarParams` of the car.
         C_f: Front cornering stiffness of a tyre (N/rad).
         C_r: Rear cornering stiffness of a tyre (N/rad).
-        mu: Friction of the road, at both axles.
+        mu: Friction of the road, under all wheels.
 
     Returns:
         `CarParams` with the new numbers.
     """
-    tyres, road, other = (C_f, C_r), (mu,), (mu,)
-    return CarParams(*(car[:4] + tyres + car[6:10] + road + car[11:19] + other + car[20:]))
+    # C_f and C_r are the fields 4 and 5, mu of the left wheels is 10, mu_r of the right ones 19
+    tyres, left, right = (C_f, C_r), (mu,), (mu,)
+    return CarParams(*(car[:4] + tyres + car[6:10] + left + car[11:19] + right + car[20:]))
 
 
-N_RESIDUALS = 6  # of a step: slip, yaw rate, moment and steering with the spread of each in it
-N_TERMINAL = 4  # residuals behind the last step
+N_RESIDUALS = 6
+"""Residuals of a step: error of the sideslip angle, error of the yaw rate, then for the yaw moment
+and for added steering the mean over the step and the standard deviation within it."""
+N_TERMINAL = 4  # residuals behind the last step, of what is to come
 
 
 class _PredictionState(NamedTuple):
@@ -182,7 +192,7 @@ class _PredictionState(NamedTuple):
     T_l: Any  # torque of the left motor (N m)
     T_r: Any  # torque of the right motor (N m)
     delta_f: Any  # applied steering angle (rad)
-    slewing: Any  # added steering that was last commanded (rad)
+    added_command: Any  # added steering that was last commanded (rad)
     beta_ref: Any  # reference of the sideslip angle (rad)
     gamma_ref: Any  # reference of the yaw rate (rad/s)
     F_d: Any  # disturbance force (N)
@@ -206,7 +216,7 @@ def _detect_limit(value: Any, low: Any, high: Any) -> Any:
 def _multiply_row(
     M: Any, row: int, model: PredictionModel, driver: Any, state: _PredictionState, beta: Any
 ) -> Any:
-    """Multiply a row of M (rows, 9) by the states of the design model with forces."""
+    """Multiply a row of M, K or T of shape (rows, 9), by the nine states."""
     share = 0.5 * model.car.d_r / model.car.r / model.full_scale * (state.T_r - state.T_l)
     lateral = M[row, 0] * beta + M[row, 1] * state.motion.gamma + M[row, 2] * share
     held = M[row, 3] * state.delta_f + M[row, 4] * driver + M[row, 5] * state.beta_ref
@@ -221,27 +231,34 @@ def _compute_commands(
     K: Any,
     state: _PredictionState,
     beta: Any,
-    added: Any,
-    turn: Any,
+    moment_share: Any,
+    steer_share: Any,
 ) -> Any:
-    """Compute share of the yaw moment and steering (rad) within limits, and 1 or -1 at a limit."""
+    """Compute the commands within their limits, and 1 or -1 at a limit of either.
+
+    The plan adds `moment_share` (of full scale) and `steer_share` (of the authority) to the
+    regulator's action. Commands are the yaw moment (fraction of full scale) and the added steering
+    (rad).
+    """
     max_moment = start.max_moment
     share = (
         _clip_symmetric(0.0 - _multiply_row(K, 0, model, start.driver, state, beta), max_moment)
-        + added
+        + moment_share
     )
-    wheel, bound = 0.0 * share, 0.0 * share
+    added_command, steer_limit = 0.0 * share, 0.0 * share
     if len(K) > 1:
-        wheel = _clip_symmetric(
+        added_command = _clip_symmetric(
             0.0 - _multiply_row(K, 1, model, start.driver, state, beta), model.authority
         )
-        wheel = _clip_symmetric(wheel + model.authority * turn, model.authority)
-        wheel = limit_rate(state.slewing, wheel, model.slew)
-        high = minimum(state.slewing + model.slew, model.authority)
-        low = maximum(state.slewing - model.slew, 0.0 - model.authority)
-        bound = _detect_limit(wheel, low, high)
+        added_command = _clip_symmetric(
+            added_command + model.authority * steer_share, model.authority
+        )
+        added_command = limit_rate(state.added_command, added_command, model.slew)
+        high = minimum(state.added_command + model.slew, model.authority)
+        low = maximum(state.added_command - model.slew, 0.0 - model.authority)
+        steer_limit = _detect_limit(added_command, low, high)
     share = _clip_symmetric(share, max_moment)
-    return share, wheel, _detect_limit(share, 0.0 - max_moment, max_moment), bound
+    return share, added_command, _detect_limit(share, 0.0 - max_moment, max_moment), steer_limit
 
 
 @inline
@@ -250,7 +267,7 @@ def _predict_step(
     start: PredictionStart,
     state: _PredictionState,
     share: Any,
-    wheel: Any,
+    added_command: Any,
     share_beyond: Any,
     steer_beyond: Any,
 ) -> Any:
@@ -262,8 +279,8 @@ def _predict_step(
     T_l, T_r = allocate_torques(N_z, start.a_x, car, model.yaw_first, max_torque)
     torque_beyond = share_beyond * (model.full_scale * car.r / car.d_r)
     T_l, T_r = T_l - torque_beyond, T_r + torque_beyond
-    extra = limit_angle(wheel, driver, model.stop) + steer_beyond
-    steer = driver + extra
+    added_target = limit_angle(added_command, driver, model.stop) + steer_beyond
+    steer = driver + added_target
     loads = (
         compute_lagged_load(
             apply_lag(steer, state.delta_f, steering.start), T_l, T_r, state, motor.start, car, kind
@@ -285,19 +302,19 @@ def _predict_step(
     motion = rk4(state.motion, loads, push, car, road, h, kind.small_angle, kind.law, kind.roll)
     per_torque = 0.5 * car.d_r / car.r / model.full_scale
     target_share, share_before = per_torque * (T_r - T_l), per_torque * (state.T_r - state.T_l)
-    added = state.delta_f - driver
+    added_before = state.delta_f - driver
     efforts = (
-        model.per_share * apply_lag(target_share, share_before, model.motor_work[0]),
-        model.per_share * model.motor_work[1] * (share_before - target_share),
-        model.per_steer * apply_lag(extra, added, model.steering_work[0]),
-        model.per_steer * model.steering_work[1] * (added - extra),
+        model.per_share * apply_lag(target_share, share_before, model.motor_rest[0]),
+        model.per_share * model.motor_rest[1] * (share_before - target_share),
+        model.per_steer * apply_lag(added_target, added_before, model.steering_rest[0]),
+        model.per_steer * model.steering_rest[1] * (added_before - added_target),
     )
     next_state = _PredictionState(
         motion,
         apply_lag(T_l, state.T_l, motor.end),
         apply_lag(T_r, state.T_r, motor.end),
         apply_lag(steer, state.delta_f, steering.end),
-        wheel,
+        added_command,
         apply_lag(start.steady[0], state.beta_ref, model.ref_rest),
         apply_lag(start.steady[1], state.gamma_ref, model.ref_rest),
         model.decay * state.F_d,
@@ -331,10 +348,12 @@ def simulate_plans(
         terminal: T of the terminal cost |T x|^2, shape (4, 9).
         blocks: Steps of each block, shape (blocks,).
         plans: Plans, shape (variables, lanes).
-        perturbations: Changes of the commands beyond their limits, shape (variables, lanes).
+        perturbations: Offsets added to the commands after they are limited, for finite differences,
+            shape (variables, lanes).
         residuals: Residuals, shape (N_RESIDUALS steps + N_TERMINAL, lanes), filled.
         limits: 1 or -1 where a block starts at a limit, shape (variables, lanes), filled.
-        first: First commands, shape (2, lanes), filled.
+        first: First yaw moment (fraction of full scale) and added steering (rad), shape
+            (2, lanes), filled.
     """
     zero, m, start_motion = 0.0 * load_element(plans, 0), len(K), start.motion
     motion = Motion(
@@ -347,7 +366,7 @@ def simulate_plans(
         start.T_l + zero,
         start.T_r + zero,
         start.delta_f + zero,
-        start.slewing + zero,
+        start.added_command + zero,
         start.refs[0] + zero,
         start.refs[1] + zero,
         start.push.F_d + zero,
@@ -356,33 +375,36 @@ def simulate_plans(
     beta = compute_sideslip_angle(state.motion.v_x, state.motion.v_y, model.kind.small_angle)
     row, last = 0, N_RESIDUALS * (blocks.sum() - 1)
     for b in range(len(blocks)):
-        added, share_beyond, turn, steer_beyond = (
+        moment_share, share_beyond, steer_share, steer_beyond = (
             load_element(plans, m * b),
             load_element(perturbations, m * b),
             zero,
             zero,
         )
         if m > 1:
-            turn, steer_beyond = (
+            steer_share, steer_beyond = (
                 load_element(plans, m * b + 1),
                 model.authority * load_element(perturbations, m * b + 1),
             )
         for k in range(blocks[b]):
-            share, wheel, ends, bound = _compute_commands(model, start, K, state, beta, added, turn)
+            share, added_command, moment_limit, steer_limit = _compute_commands(
+                model, start, K, state, beta, moment_share, steer_share
+            )
             if k == 0:
-                store_element(limits, ends, m * b)
+                store_element(limits, moment_limit, m * b)
                 if m > 1:
-                    store_element(limits, bound, m * b + 1)
+                    store_element(limits, steer_limit, m * b + 1)
             if row == 0:
                 store_element(first, share, 0)
-                store_element(first, wheel, 1)
+                store_element(first, added_command, 1)
             state, efforts = _predict_step(
-                model, start, state, share, wheel, share_beyond, steer_beyond
+                model, start, state, share, added_command, share_beyond, steer_beyond
             )
             beta = compute_sideslip_angle(
                 state.motion.v_x, state.motion.v_y, model.kind.small_angle
             )
-            # ticks after the first step's start up to its end, by the trapezoid rule
+            # J sums the ticks after the start: trapezoid rule over the ends of the steps, plus half
+            # a tick because the last tick counts whole
             node = math.sqrt(model.step if row < last else 0.5 * (model.step + TICK))
             span = math.sqrt(model.step)
             store_element(residuals, node * model.per_beta * (beta - state.beta_ref), row)

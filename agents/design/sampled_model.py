@@ -143,7 +143,8 @@ def _discretise_plane(
     vehicle: Vehicle, speed: float, design_spec: DesignSpec
 ) -> tuple[Array, Array]:
     """Discretise beta and gamma over a tick: from the plane (2, 6) and the disturbances (2, 2)."""
-    # an actuator without lag is its command; the plane: itself, both actuators, both commands
+    # The plane's columns: beta, gamma, both actuators, both commands. An actuator without lag is
+    # its command.
     model = make_bicycle_model(vehicle, speed)
     scale = np.array([design_spec.full_scale, 1.0])
     B = model.B[:, ::-1] * scale  # columns N_z, delta_f, as the inputs stand
@@ -169,7 +170,7 @@ def compute_cost_weights(design_spec: DesignSpec) -> Sequence[float]:
         design_spec: Parameters of the design.
 
     Returns:
-        Weights of slip, yaw rate, yaw moment and added steering, in this order.
+        Weights of sideslip angle, yaw rate, yaw moment and added steering, in this order.
     """
     return (
         1.0 / BETA_SCALE**2,

@@ -37,7 +37,7 @@ MAX_BATCHES, _MAX_BLOCK_BYTES = 100, 1 << 13  # of a block at most: a tenth of a
 _LENGTH = struct.Struct("!I")
 _BLOCK = struct.Struct("!4sIIII")  # magic, batches, bytes, checksums of these and of estimates
 _ITEM = struct.Struct("!HH")  # which batch of the block, bytes of the datagram
-_MAGIC = b"BLOK"
+_BLOCK_MAGIC = b"BLOK"
 _SETUP: dict[str, Any] = {
     **dict.fromkeys(("estimator", "agent", "env"), str),
     **dict.fromkeys(("options", "agent_options", "estimator_options"), dict),
@@ -77,8 +77,8 @@ class OnboardController:
         self._kind, self._target = int(self._switches[FLAGS.reference]), read(self._p, P.target)
         self._bounds = self.base.config.bounds
         self._rows = np.zeros((self.facts.control_period, FAST_WIDTH))
-        self._X: Array = np.zeros((1, len(self.names)))
-        self._S = np.zeros_like(self._X)
+        self._estimates: Array = np.zeros((1, len(self.names)))
+        self._deviations = np.zeros_like(self._estimates)
         self.begin(0)
         row, packet = base.record.fast[0], np.zeros((1, NO_PACKETS.shape[1]))
         for number in range(self.facts.control_period + 1):  # compiles the code of first ticks
@@ -88,13 +88,13 @@ class OnboardController:
     @property
     def x(self) -> Array:
         """Estimated states, shape (n,)."""
-        estimate: Array = self._X[0]
+        estimate: Array = self._estimates[0]
         return estimate
 
     @property
     def std(self) -> Array:
         """Standard deviations of the estimated states, shape (n,)."""
-        deviation: Array = self._S[0]
+        deviation: Array = self._deviations[0]
         return deviation
 
     @property
@@ -109,7 +109,8 @@ class OnboardController:
             first: Number of the next tick.
         """
         self.estimator.reset(self.sensors, first)
-        self._z, self._refs = np.zeros(STATE_WIDTH), None
+        self._z = np.zeros(STATE_WIDTH)  # packed state, laid out as `Z`; no measurement
+        self._refs = None
         for sensor in Z.slow:
             self._z[sensor.captured] = NEVER
         self._count, self._packets = 0, [NO_PACKETS]
@@ -128,10 +129,13 @@ class OnboardController:
         n, row = self.facts.control_period, tick.row
         if self._is_native:
             rows, packets = row.reshape(1, -1), tick.packets
-            self.estimator.take(rows, 1, packets, len(packets), self._X, self._S)
+            self.estimator.take(rows, 1, packets, len(packets), self._estimates, self._deviations)
         else:
             self.estimator.step(row.reshape(1, -1), tick.packets)
-            self._X[0], self._S[0] = self.estimator.x, compute_std(self.estimator.P)
+            self._estimates[0], self._deviations[0] = (
+                self.estimator.x,
+                compute_std(self.estimator.P),
+            )
         self._rows[self._count] = row
         self._count += 1
         if len(tick.packets):
@@ -159,18 +163,19 @@ class OnboardController:
 
     def _make_observation(self, number: int) -> npt.NDArray[np.float32]:
         """Make the observation (k,) that the env's agents would get at a tick."""
-        done, outputs = self._count, self.outputs
+        n_rows, outputs = self._count, self.outputs
         packets = np.concatenate(self._packets)
-        self._rows[done:] = self._rows[done - 1]
-        shown = len(self._rows) if self._switches[FLAGS.all_samples] else done
+        self._rows[n_rows:] = self._rows[n_rows - 1]
+        shown = len(self._rows) if self._switches[FLAGS.all_samples] else n_rows
         obs = np.empty(self._bounds.shape[1], np.float32)
         self._z[Z.clock.tick] = number
         switches, report = self._switches, np.zeros(len(REPORT))
         row = EpisodeArrays(self._p, self._z, switches, obs, self._rows, packets, report)
         observe(row, shown, len(packets), self._refs, self._bounds)
         out, estimator = np.empty(len(outputs.layout), np.float32), self.estimator
+        # the true beta and gamma (0.0) serve the summary of errors alone, which nobody reads here
         last = outputs.inner, outputs.plan, outputs.limits, 0.0, 0.0, out, np.zeros(3)
-        if self._is_native:  # which takes no further row here
+        if self._is_native:  # `take` has given it all: no rows and no packets here
             record = self._rows, 0, NO_PACKETS, 0, 0
             compile_observe()(estimator.filters, estimator.gains, *record, obs, *last)
         else:
@@ -214,7 +219,7 @@ class Recorder:
 
     def _write(self) -> None:
         sizes = len(self._items), zlib.crc32(self._items), self._digest
-        self._file.write(_BLOCK.pack(_MAGIC, self._batches, *sizes) + self._items)
+        self._file.write(_BLOCK.pack(_BLOCK_MAGIC, self._batches, *sizes) + self._items)
         self._items, self._batches = bytearray(), 0
 
     def close(self) -> None:
@@ -279,8 +284,8 @@ def read_blocks(path: Path | str) -> Iterator[_SessionBlock]:
         _read_header(path, file)
         while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
             magic, count, size, check, digest = _BLOCK.unpack(head)
-            data = file.read(size) if magic == _MAGIC and count <= MAX_BATCHES else b""
-            if magic != _MAGIC or len(data) != size or zlib.crc32(data) != check:
+            data = file.read(size) if magic == _BLOCK_MAGIC and count <= MAX_BATCHES else b""
+            if magic != _BLOCK_MAGIC or len(data) != size or zlib.crc32(data) != check:
                 return
             batches = _parse_batches(data, count)
             if batches is None:
@@ -321,12 +326,12 @@ def replay(path: Path | str, onboard: OnboardController, patience: int | None) -
     Returns:
         Ticks, estimates and deviations, and whether they agree with the session's checksums.
     """
-    assembler, digest, same = StreamSynchroniser(patience), 0, True
+    synchroniser, digest, same = StreamSynchroniser(patience), 0, True
     ticks: list[int] = []
     numbers: list[list[npt.NDArray[np.float64]]] = [[], []]
     for block in read_blocks(path):
         for batch in block.batches:
-            for tick in assembler.take(batch):
+            for tick in synchroniser.take(batch):
                 onboard.take(tick)
                 digest = _update_digest(onboard, digest)
                 ticks.append(tick.number)

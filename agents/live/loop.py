@@ -163,11 +163,12 @@ class Port(AbstractContextManager["Port"]):
 
 PERIOD = 1_000_000  # ns, a tick of the loop
 LEAD = 100_000  # ns from a fast row's arrival to the deadline that follows it
-PHASE_GAIN, MAX_PHASE_STEP = 0.02, 5_000  # of the distance, ns a tick: two clocks drift apart
-_SUSPENDED = 1_000_000_000  # ns; who comes this late was not merely busy
-_STATUS_EVERY = 100  # ticks
-_IDLE = 0.1  # s
-_TOP = 100_000  # us
+PHASE_GAIN = 0.02  # fraction of the phase error that a tick corrects, as a first-order PLL does
+MAX_PHASE_STEP = 5_000  # ns, largest correction in a tick: two clocks drift apart slowly
+_SUSPENDED = 1_000_000_000  # ns; a loop that is this late was suspended, not merely busy
+_STATUS_EVERY = 100  # ticks between two datagrams of the status
+_IDLE = 0.1  # s, longest wait for a datagram before the end's conditions are checked
+_TOP = 100_000  # us, from which on times share a histogram's last bin
 
 
 class Histogram:
@@ -196,10 +197,10 @@ class Histogram:
         Returns:
             Upper edge of the quantile's bin, or the largest time (us).
         """
-        left = math.ceil(share * self.number)
+        n_missing = math.ceil(share * self.number)
         for us, count in enumerate(self.counts):
-            left -= count
-            if count and left <= 0:
+            n_missing -= count
+            if count and n_missing <= 0:
                 return us + 1.0 if us < _TOP else self.largest
         return math.nan
 
@@ -223,7 +224,7 @@ class _Statistics:
     work: Histogram = field(default_factory=Histogram)  # times of a tick's work (us)
     deadlines: int = 0  # number of deadlines that were due
     misses: int = 0  # deadlines that passed during the work of an earlier one
-    suspensions: int = 0  # number of misses of more than a second
+    suspensions: int = 0  # delays of more than `_SUSPENDED`
     ticks: int = 0  # ticks of the estimator
     actions: int = 0  # number of controls sent
     seconds: float = 0.0  # duration of the run (s)
@@ -306,6 +307,7 @@ class Loop:
         if rows and batch:
             statistics.latency.add((end_time - batch[0].at) * 1e-3)
         if rows == 1 and batch:
+            # the deadlines shall come LEAD behind the rows
             phase_step = PHASE_GAIN * (batch[-1].at + LEAD - deadline)
             deadline += round(min(max(phase_step, -MAX_PHASE_STEP), MAX_PHASE_STEP))
         deadline += PERIOD
@@ -339,8 +341,8 @@ class Loop:
         if onboard.has_new_action and action is not None and sender is not None:
             self.statistics.actions += 1
             moment = float(action[0]) * onboard.facts.full_scale
-            turn = float(action[1]) if len(action) > 1 else 0.0
-            control = moment, turn * onboard.facts.authority
+            steer_share = float(action[1]) if len(action) > 1 else 0.0
+            control = moment, steer_share * onboard.facts.authority
             self.port.send(sender, DatagramKind.CONTROL, stamp, control)
         receivers = [*self.targets, self.viewer] if tick.number % 10 == 0 else self.targets
         for target in filter(None, receivers):

@@ -11,10 +11,13 @@ Network byte order: a header of 20 bytes, `count` doubles and, behind the estima
 | 8-11 | sequence number: of this sender's datagrams of this kind, modulo 2^32 |
 | 12-19 | stamp, us of the inertial sender's clock, int64, 0 to 2^53; 0: of another clock |
 
-FIELDS names the doubles of each kind, in SI units. A change of any of it is another VERSION.
+FIELDS names the doubles of each kind, in SI units but for STATUS, `LoopStatus`. ESTIMATE has the
+states' values, then their standard deviations, then their names as ASCII with commas between. A
+change of any of it is another VERSION.
 
-Time is that of the inertial stamps. A fast row ends its tick; packets of slow sensors belong to the
-next row. They were captured their age before their stamp, or before that row where the stamp is 0.
+A fast row is the doubles of INERTIAL: what the sensors that speak in every tick measured in one.
+Time is that of its stamps. It ends its tick; packets of slow sensors belong to the next row. They
+were captured their age before their stamp or, where that is 0, their age before that row.
 Lost and late datagrams are counted and bridged by the last row, held. Equal batches give equal
 ticks, so that a session can be replayed.
 """
@@ -37,7 +40,7 @@ HEADER = struct.Struct("!4sBBHIq")
 MAX_BYTES = 1400  # bytes: fits a frame of Ethernet
 LIMIT = 1e7  # the largest magnitude of any value, SI
 MAX_STAMP = 2**53  # us: 285 years, and a whole number as a double too
-MAX_AGE = 10.0  # s, of a slow sensor's sample
+MAX_AGE = 10.0  # s, largest age of a slow sensor's packet
 TICK_US = 1000  # us a tick
 PATIENCE = 10  # ticks of silence, from which on the last row is held
 MAX_HELD = 1000  # ticks that are bridged; a longer gap begins anew
@@ -53,7 +56,7 @@ class DatagramKind(IntEnum):
     CAMERA = 2
     GPS = 3
     ESTIMATE = 4  # states, their standard deviations, then their names
-    CONTROL = 5  # its stamp is that of the fast row it answers
+    CONTROL = 5  # answers a fast row, whose stamp it has
     STATUS = 6  # what the loop has counted
     END = 7  # the drive is over
 
@@ -73,16 +76,16 @@ class RejectReason(StrEnum):
 
 
 class LoopStatus(NamedTuple):
-    """The counts of a loop, as the doubles of a datagram; latencies and jitter in us."""
+    """The counts of a loop, as the doubles of a datagram."""
 
-    ticks: float = 0.0
-    misses: float = 0.0
-    held: float = 0.0
-    bad: float = 0.0
-    lost: float = 0.0
-    jitter: float = 0.0
-    latency: float = 0.0
-    time: float = 0.0  # us of the last tick's work
+    ticks: float = 0.0  # of the estimator
+    misses: float = 0.0  # missed deadlines
+    held: float = 0.0  # ticks without a row
+    bad: float = 0.0  # datagrams with a `RejectReason`
+    lost: float = 0.0  # sequence numbers that never came
+    jitter: float = 0.0  # us, of the last tick
+    latency: float = 0.0  # us, of the last tick with a datagram
+    time: float = 0.0  # us, of the last tick's work
 
 
 SENSORS = {DatagramKind.CAMERA: CAMERA, DatagramKind.GPS: GPS}
@@ -167,9 +170,15 @@ def decode(data: bytes) -> Message | RejectReason:
 
 _INPUTS = (DatagramKind.INERTIAL, DatagramKind.END, *SENSORS)
 NO_PACKETS = np.zeros((0, PACKET_WIDTH))
-_BRIDGED = ("lost", "restarted", "held", "late", "begun anew", "dropped")
-"""Counts beside `RejectReason`: sequence numbers that never came, senders that restarted, ticks
-without a row, rows behind their tick, gaps too long to be bridged, packets without a row."""
+_STREAM_COUNTS = (
+    "lost",  # sequence numbers that never came
+    "restarted",  # senders that began anew
+    "held",  # ticks without a row
+    "late",  # rows behind their tick
+    "begun anew",  # gaps too long to be bridged
+    "dropped",  # packets that no row took
+)
+"""Counts beside those of `RejectReason`."""
 
 
 class Arrival(NamedTuple):
@@ -199,7 +208,7 @@ class StreamSynchroniser:
 
     def __init__(self, patience: int | None = PATIENCE) -> None:
         self.patience = patience
-        self.counts = Counter[str]({name: 0 for name in (*RejectReason, *_BRIDGED)})
+        self.counts = Counter[str]({name: 0 for name in (*RejectReason, *_STREAM_COUNTS)})
         self.sender: Any = None  # of the newest row
         self.accepted: list[bytes] = []  # of the newest batch
         self.over, self.silent = False, 0  # the drive's end came; calls since the last fast row
@@ -239,6 +248,7 @@ class StreamSynchroniser:
                     self.over = True
         last, patience = self._last, self.patience
         if last is not None and self.silent and patience is not None and self.silent > patience:
+            # the first call beyond the patience catches up on the ticks that it waited for
             missed = patience + 1 if before == patience else 1
             for _ in range(missed):
                 self.counts["held"] += 1

@@ -25,10 +25,10 @@ from ..rollout import Rollout, rollout
 from .loop import Port, clock, wait_until
 from .messages import MAX_AGE, SENSORS, TICK_US, DatagramKind, RejectReason, decode
 
-MAX_TICKS = 250  # of a control period in lock-step: so many rows the kernel holds
+MAX_TICKS = 250  # of a control period in lock-step: the kernel buffers so many rows
 _SLACK = 150_000  # ns before the next row is due, at which a control is too late
 CONTROL_TIMEOUT = 60.0  # s that lock-step waits for a control
-MAX_HDOP = 99.0  # of a receiver without a fix
+MAX_HDOP = 99.0  # what receivers give without a fix
 _MAX_PAUSE = 10.0  # s between two epochs of a file
 _KINDS = {place: kind for kind, place in SENSORS.items()}
 
@@ -119,8 +119,8 @@ class WireAgent:
             if isinstance(message, RejectReason) or message.kind != DatagramKind.CONTROL:
                 continue
             if message.stamp >= self._newest:
-                moment, turn = message.values
-                shares = moment / self._facts.full_scale, turn / self._facts.authority
+                moment, steering = message.values  # N m, rad
+                shares = moment / self._facts.full_scale, steering / self._facts.authority
                 self._action = np.array(shares[: self._facts.width], np.float32)
                 self._newest = message.stamp
 

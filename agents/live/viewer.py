@@ -22,9 +22,10 @@ from .loop import LOOPBACK, Port
 from .messages import DatagramKind, LoopStatus, Message, RejectReason, decode
 
 _PAGE = Path(__file__).with_name("page.html")
-_SECONDS = 20.0  # of the strips
-_DEGREES = 57.29577951308232
-_POLICY = (
+_SECONDS = 20.0  # s, of the page's plots
+_RATE = 100  # estimates a second: the loop sends the viewer every tenth tick's
+_DEGREES = 57.29577951308232  # deg/rad
+_CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'nonce-{0}'; style-src 'nonce-{0}'; connect-src 'self'; "
     "frame-ancestors 'none'"
 )
@@ -36,7 +37,7 @@ class ViewerProtocol(asyncio.DatagramProtocol):
     def __init__(self) -> None:
         self.names: tuple[str, ...] = ()  # of the states
         # time (s), estimates and standard deviations
-        self.samples = deque[list[float]](maxlen=round(100 * _SECONDS))
+        self.samples = deque[list[float]](maxlen=round(_RATE * _SECONDS))
         self.status, self.count, self.over = LoopStatus(), 0, asyncio.Event()
 
     def datagram_received(self, data: bytes, _: Any) -> None:
@@ -59,6 +60,7 @@ class ViewerProtocol(asyncio.DatagramProtocol):
         if message.names != self.names:
             self.names = message.names
             self.samples.clear()
+        # units of angles begin with "d": deg, deg/s
         factors = [_DEGREES if _get_unit(name)[0] == "d" else 1.0 for name in self.names] * 2
         values = [a * b for a, b in zip(message.values, factors, strict=True)]
         self.samples.append([message.stamp * 1e-6, *values])
@@ -140,13 +142,16 @@ async def _render_page(title: str, protocol: ViewerProtocol, _: Any) -> Any:
     nonce = secrets.token_urlsafe(16)
     page = _PAGE.read_text(encoding="utf-8").replace("NONCE", nonce).replace("TITLE", escape(title))
     text = page.replace("FIRST", text.replace("<", "\\u003c"))
-    headers = {"Content-Security-Policy": _POLICY.format(nonce), "Cache-Control": "no-store"}
+    headers = {
+        "Content-Security-Policy": _CONTENT_SECURITY_POLICY.format(nonce),
+        "Cache-Control": "no-store",
+    }
     return web.Response(text=text, content_type="text/html", headers=headers)
 
 
 def _is_same_origin(host: str, origin: str | None) -> bool:
     """Return whether a request is for this server and from its own page."""
-    # a foreign page whose name resolves to this address has that name as the host
+    # DNS rebinding: a foreign page whose name resolves to this address has that name as the host
     name = host.rpartition(":")[0].strip("[]") or host
     with suppress(ValueError):
         name = "localhost" if ip_address(name) else name
@@ -154,7 +159,7 @@ def _is_same_origin(host: str, origin: str | None) -> bool:
 
 
 async def _run_viewer(title: str, page: tuple[str, int] | None, screen: bool, pipe: Any) -> None:
-    loop, runner, address, local = asyncio.get_running_loop(), None, "", (LOOPBACK, 0)
+    loop, runner, url, local = asyncio.get_running_loop(), None, "", (LOOPBACK, 0)
     transport, protocol = await loop.create_datagram_endpoint(ViewerProtocol, local_addr=local)
     if page is not None:
         from aiohttp import web
@@ -172,14 +177,14 @@ async def _run_viewer(title: str, page: tuple[str, int] | None, screen: bool, pi
         await runner.setup()
         await web.TCPSite(runner, *page).start()
         host, port = runner.addresses[0][:2]
-        address = f"http://{host}:{port}/"
-    pipe.send((transport.get_extra_info("sockname"), address))
+        url = f"http://{host}:{port}/"
+    pipe.send((transport.get_extra_info("sockname"), url))
     if screen:
         from rich.live import Live
 
         with Live(refresh_per_second=5, auto_refresh=False) as live:
             while not protocol.over.is_set():
-                live.update(make_table(protocol, f"{title} {address}"), refresh=True)
+                live.update(make_table(protocol, f"{title} {url}"), refresh=True)
                 with suppress(TimeoutError):
                     await asyncio.wait_for(protocol.over.wait(), 0.2)
     await protocol.over.wait()
@@ -227,7 +232,7 @@ class Viewer(AbstractContextManager["Viewer"]):
             raise OSError(f"the page of port {page[1] if page else 0}: {reply.strerror}")
         if isinstance(reply, str):
             raise ModuleNotFoundError(reply)
-        self.address, self.url = reply  # of the loop's datagrams, of the page
+        self.address, self.url = reply  # where the loop sends its datagrams; the page's
 
     def __exit__(self, *_: object) -> None:
         with Port() as port:

@@ -49,7 +49,7 @@ _SCALING_ENVS = 64  # environments whose observations make the scaling
 
 # Seeds of tests and of the calibration are below 2^63, those of `corrections` and `distill` beyond.
 _WEIGHT_SEEDS, _EVALUATION_SEEDS, _SCALING_SEEDS, _TRAINING_SEEDS = 2**63, 2**64, 2**65, 2**66
-_SEEDS_PER_TRAINING = 2**40  # a start or resumption takes those from its steps on
+_SEEDS_PER_TRAINING = 2**40  # a run's first one is the training's first plus its steps so far
 
 
 def make_evaluation_seeds(episodes: int) -> list[int]:

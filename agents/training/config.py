@@ -21,7 +21,7 @@ from ...envs.validation import check_choice, is_finite
 from .. import zoo
 from ..vec_env import make_native_env
 from .export import list_activations
-from .normalise import Scaling, Standardised
+from .normalise import Standardised, StandardisedArguments
 
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm  # isort: skip
@@ -31,14 +31,15 @@ from stable_baselines3.common.vec_env import VecEnv  # isort: skip
 Settings = dict[str, Any]
 
 HYPERPARAMS = Path(__file__).parent / "hyperparams"
-PERIOD = 0.01  # s, of control: of the environments whose discount stands in the files
+PERIOD = 0.01  # s, control period for which the files give `gamma`
 WARM_START_ENTRY = "begun"  # the entry of training a policy further
-WARM_START_TRACES_ENTRY = "begun-traces"  # one with moving averages
-_UNIFORM_LOG_STD = -0.55  # log of the deviation of actions drawn evenly
+WARM_START_TRACES_ENTRY = "begun-traces"  # likewise, for a policy with moving averages
+_UNIFORM_LOG_STD = -0.55  # log(1 / sqrt(3)), of actions drawn uniformly from [-1, 1]
 
-_TRAINING_SETTINGS = ("n_timesteps", "n_envs", "policy", "normalize")
-_SCHEDULED = ("learning_rate", "clip_range")
+_TRAINING_SETTINGS = ("n_timesteps", "n_envs", "policy", "normalize")  # no arguments of the class
+_SCHEDULED = ("learning_rate", "clip_range")  # may fall to zero, `_make_schedule`
 _LOG_ARGUMENTS = {"verbose", "tensorboard_log", "stats_window_size"}
+# arguments that a file of settings may not have: the training gives them
 _MANAGED_ARGUMENTS = {"env", "seed", "device", "source"} | _LOG_ARGUMENTS
 
 
@@ -179,7 +180,7 @@ def make_model_options(algo: str, settings: Settings, seconds: float, num_envs: 
     if "gamma" in options:
         options["gamma"] = options["gamma"] ** (seconds / PERIOD)
     kind: Any = get_algorithm(algo).load()
-    rolls_out = issubclass(kind, OnPolicyAlgorithm)  # elsewhere n_steps is that of returns
+    rolls_out = issubclass(kind, OnPolicyAlgorithm)  # elsewhere n_steps counts those of a return
     if rolls_out and "n_steps" in options and "batch_size" in options:
         rollout = num_envs * options["n_steps"]
         max_size = min(options["batch_size"], rollout)
@@ -192,7 +193,7 @@ def make_model(
     settings: Settings,
     env: VecEnv,
     seconds: float,
-    scaling: Scaling,
+    scaling: StandardisedArguments,
     seed: int,
     **rest: Any,
 ) -> BaseAlgorithm:

@@ -36,15 +36,16 @@ FIRST_ROUND = (("lqr", "fusion"), ("none", "fusion"), ("shaken", "fusion"), ("lq
          ("shaken", "gps"))  # fmt: skip
 _SECOND_ROUND = (("lqr", "fusion"), ("lqr", "vision"), ("lqr", "gps"))
 """Who drives with which slow sensors, on the filter, then on the correction."""
-TRAINING, HELD_OUT = 2**67, 2**68  # seeds; `callbacks` and `distill` have others
-_SEEDS = 2**40  # of a training
+TRAINING, HELD_OUT = 2**67, 2**68  # first seeds; those of `callbacks` and `distill` differ
+_SEEDS = 2**40  # seeds of each training
 _EVERY = 10  # env-steps from one sample to the next
-_MAX_SIDESLIP = 0.5  # rad: a car that slips more is lost, and nothing to learn from
-_NOISE_STD, _MEMORY = 0.6, 0.95  # standard deviation of the added action, share left after a step
+_MAX_SIDESLIP = 0.5  # rad: a car beyond is lost, and gives no sample
+_NOISE_STD = 0.6  # standard deviation of the added action, as a fraction of full scale
+_NOISE_DECAY = 0.95  # factor of the coloured noise in a step
 _HIDDEN = (64, 64)
-_CLIP = 8.0  # standard deviations of an input
-_BATCH, _RATE = 1024, 2e-3  # of Adam; its steps fall to a fiftieth
-_NORMAL_95 = 1.959964
+_CLIP = 8.0  # limit of a normalised input (standard deviations)
+_BATCH, _RATE = 1024, 2e-3  # samples of a batch; Adam's learning rate, which falls to a fiftieth
+_NORMAL_95 = 1.959964  # deviations within which 95 % of a normal distribution lie
 
 _DriveSpec = tuple[str, dict[str, Any]]
 """A scenario in an env: an id, and options of `gym.make`."""
@@ -67,8 +68,8 @@ class _NoisyLqr(Lqr):
     def predict(self, *arguments: Any, **options: Any) -> Any:
         """Compute LQR's action with noise, clipped."""
         action, state = super().predict(*arguments, **options)
-        white_noise = self._rng.standard_normal(action.shape) * (1.0 - _MEMORY**2) ** 0.5
-        self._noise = _MEMORY * self._noise + _NOISE_STD * white_noise
+        white_noise = self._rng.standard_normal(action.shape) * (1.0 - _NOISE_DECAY**2) ** 0.5
+        self._noise = _NOISE_DECAY * self._noise + _NOISE_STD * white_noise
         return np.clip(action + self._noise, -1.0, 1.0).astype(np.float32), state
 
 
@@ -185,6 +186,7 @@ def _fit_network(data: Samples, mean: Array, scale: Array, epochs: int, seed: in
     sizes = [data.inputs.shape[1], *_HIDDEN, 2]
     layers = [torch.nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
     between = itertools.chain(*((linear, torch.nn.ReLU()) for linear in layers[:-1]))
+    # errors are learned in units of their standard deviation (rad)
     model, unit = torch.nn.Sequential(*between, layers[-1]), float(data.errors.std()) or 1.0
     x, y = torch.from_numpy(data.inputs), torch.from_numpy((data.errors / unit).astype(np.float32))
     optimiser = torch.optim.Adam(model.parameters(), _RATE)
@@ -196,7 +198,7 @@ def _fit_network(data: Samples, mean: Array, scale: Array, epochs: int, seed: in
             log_sd = log_sd.clamp(MIN_LOG_DEVIATION - np.log(unit), 0.0 - np.log(unit))
             nll = 0.5 * ((y[chosen] - middle) * torch.exp(-log_sd)) ** 2 + log_sd
             optimiser.zero_grad()
-            (nll * torch.exp(log_sd.detach())).mean().backward()
+            (nll * torch.exp(log_sd.detach())).mean().backward()  # sd^(2 beta), beta = 0.5
             optimiser.step()
             schedule.step()
     weights = [layer.weight.detach().numpy().astype(np.float64) for layer in layers]

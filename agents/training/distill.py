@@ -33,8 +33,8 @@ from .student import (
 import torch  # isort: skip  # after ours, which say which extra is missing
 
 DISTILL_SEEDS = 2**69  # no other seeds are as large: `callbacks`, `corrections`
-SEEDS_PER_TRAINING = 2**40  # of a training
-_MEMORY = 0.95  # share of the noise left after a step
+SEEDS_PER_TRAINING = 2**40
+_NOISE_DECAY = 0.95  # factor of the coloured noise in a step
 
 
 class DistillTask(NamedTuple):
@@ -48,9 +48,9 @@ class DistillTask(NamedTuple):
 class RoundResult(NamedTuple):
     """The result of a round."""
 
-    steps: int  # steps of the student's envs so far
+    steps: int  # steps that taught, in all rounds so far
     cost: float  # mean cost of the round's episodes
-    loss: float  # loss of the last epoch, relative to the episodes' cost
+    loss: float  # what `fit_model` returns
 
 
 def collect_demonstrations(
@@ -62,8 +62,9 @@ def collect_demonstrations(
         task: Cars and teacher.
         policy: `Policy`, object with stable-baselines3's `predict`, or None for the teacher.
         seeds: Seeds of the rows.
-        noise: Largest standard deviation of the teacher's noise.
-        max_cost: Maximum of the cost that divides errors: failed or lost episodes teach most.
+        noise: Largest standard deviation of the noise on the teacher's actions.
+        max_cost: Cap on the cost that divides an episode's errors, so that failed episodes keep
+            weight.
 
     Returns:
         Demonstrations with the teacher's actions, one row for each seed.
@@ -84,8 +85,8 @@ def collect_demonstrations(
     while running.any():
         label, teacher_state = teacher.predict(teacher_obs, teacher_state, start)
         if student is None:
-            white_noise = (1.0 - _MEMORY**2) ** 0.5 * rng.standard_normal(label.shape)
-            coloured_noise = _MEMORY * coloured_noise + white_noise
+            white_noise = (1.0 - _NOISE_DECAY**2) ** 0.5 * rng.standard_normal(label.shape)
+            coloured_noise = _NOISE_DECAY * coloured_noise + white_noise
             disturbed = np.nan_to_num(label) + spread * coloured_noise
             action = np.clip(disturbed, -1.0, 1.0).astype(np.float32)
         else:
@@ -100,13 +101,13 @@ def collect_demonstrations(
         costs -= np.where(running, rewards, 0.0)
         start = np.logical_or(terminated, truncated)
         running = running & ~start
-    x, y, privileged, w = (np.stack(columns, axis=1) for columns in zip(*steps, strict=True))
+    x, y, privileged, valid = (np.stack(columns, axis=1) for columns in zip(*steps, strict=True))
     curvature = np.eye(teacher.width, dtype=np.float32)
-    if isinstance(teacher, Lqr):  # the Riccati matrix of its design at the mean speed
+    if isinstance(teacher, Lqr):  # S of its design at the mean speed, `Lqr.curvature`
         names = [entry.name for entry in cars.layout]
         speed = float(x[..., names.index("wheel_left")].mean())
         curvature = teacher.curvature(speed).astype(np.float32)
-    weights = (w / (np.minimum(costs, max_cost)[:, None] + COST_FLOOR)).astype(np.float32)
+    weights = (valid / (np.minimum(costs, max_cost)[:, None] + COST_FLOOR)).astype(np.float32)
     return Demonstrations(x, y, privileged, weights, curvature, costs)
 
 

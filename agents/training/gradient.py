@@ -59,7 +59,7 @@ class GruPolicy(BasePolicy):
         observation_space: Space of the observation.
         action_space: Space of the action.
         lr_schedule: Learning rate by the remaining fraction of the training.
-        cells: Cells of the GRU.
+        cells: Hidden units of the GRU.
         net_arch: Sizes of the dense layers.
         features_extractor_class: Class before the GRU.
         features_extractor_kwargs: Arguments of that class.
@@ -87,7 +87,8 @@ class GruPolicy(BasePolicy):
         last_layer = nn.Linear(last, action_space.shape[0])
         self.layers = nn.Sequential(*layers, last_layer)
         with torch.no_grad():
-            last_layer.weight.mul_(0.1)  # a car that is steered at random teaches little
+            last_layer.weight.mul_(0.1)  # small first actions: random ones teach little
+        # betas as in Xu et al.: a shorter memory than Adam's defaults
         self.optimizer = torch.optim.Adam(self.parameters(), lr_schedule(1.0), betas=(0.7, 0.95))
 
     def forward(self, observations: Any, state: Any) -> tuple[Any, Any]:

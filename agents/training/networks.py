@@ -24,16 +24,16 @@ with require_extra("train", "training needs torch"):
     import torch
     from torch import nn
 
-_SAMPLE_STRIDE = 7  # steps, of those by which means are mixed
-_MIN_VARIANCE = 1e-4  # variance that a mixture of means has at least
+_SAMPLE_STRIDE = 7  # every so many steps one is a sample for a whitening
+_MIN_VARIANCE = 1e-4  # least variance of a mixture of means, for `compute_whitening`
 _TIMES = (3, 10, 30, 100, 300)
-"""Steps of the means: of control periods of 10 ms from the motors' lag to half a drive."""
+"""Times of the means in steps; of 10 ms each: from the motors' lag to half a drive."""
 _BLOCK = 50  # steps whose means are one product of matrices
-_MIN_SHARE = 1e-300  # instead of nothing: what a first step leaves of what was before
+_MIN_SHARE = 1e-300  # of the earlier means, in place of 0 at the first step, for the logarithm
 _SILENT = ("accel_", "wheel_", "roll_rate", "gps_X", "gps_Y", "gps_speed", "gps_satellites")
-"""Entries of sensors that the linear scenarios drown in noise, or that stand still there."""
+"""First parts of entries that the linear scenarios drown in noise, or that are constant there."""
 _OFFSET, RATE, _AGE = "camera_y_l", "camera_y_l_rate", "camera_age"
-MAX_AGE = 1.0  # s, from which on an age is no older
+MAX_AGE = 1.0  # s, at which ages are capped
 
 
 _Single = npt.NDArray[np.float32]
@@ -53,7 +53,9 @@ def compute_scale(spread: Any, minimum: float = 1e-9) -> Array:
 
 
 def compute_whitening(z: Any, minimum: float) -> Array:
-    """Compute the symmetric matrix that makes a covariance one.
+    """Compute the symmetric matrix that makes the samples' covariance the identity.
+
+    This is ZCA whitening (Bell and Sejnowski 1997), of eigenvalues that are not below a minimum.
 
     Args:
         z: Samples, shape (n, k).
@@ -69,8 +71,8 @@ def compute_whitening(z: Any, minimum: float) -> Array:
 class TraceLayer(nn.Module):
     """The inputs and SiLU units, with the moving averages of all.
 
-    The inputs and their averages are whitened: `mean` is subtracted, and `mixing` multiplies. The
-    small difference of two of them often has most information, as of how a sensor changes.
+    The inputs and their averages are whitened: `mean` is subtracted, and `mixing` multiplies. A
+    small difference of two of them often has most information: it says how a sensor changes.
 
     Args:
         inputs: Number of inputs.
@@ -137,7 +139,7 @@ class TraceLayer(nn.Module):
         """Make the runtime's layer for inputs that are mixed first.
 
         Args:
-            mixing: Mixing of the inputs, shape (k, k).
+            mixing: `Scaling.mixing` of the inputs, which the layer's weights take in, shape (k, k).
 
         Returns:
             Layer of plain NumPy arrays.
@@ -157,7 +159,7 @@ class TraceLayer(nn.Module):
             bias: Biases, shape (m,).
 
         Returns:
-            Weights and biases, shape (m,).
+            Weights, shape (m, size), and biases, shape (m,).
         """
         size, times = len(self.mean), 1 + len(self.times)
         linear = weight[:, :size] @ self.mixing.numpy().astype(np.float64).T
@@ -168,11 +170,16 @@ class TraceLayer(nn.Module):
 
 @functools.cache
 def _compute_weights(times: tuple[float, ...], first: int, steps: int) -> tuple[Any, Any]:
-    """Compute the weights of a block's steps (times, T, T) and of earlier averages (times, T)."""
+    """Compute the weights of a block's steps (times, T, T) and of earlier averages (times, T).
+
+    They solve the recursion m_t = m_(t-1) + a_t (u_t - m_(t-1)) of `MovingAverages`, with the share
+    a_t = max(1 / steps so far, 1 - exp(-1 / time)): u_s has the weight a_s prod (1 - a_r) over
+    r = s + 1, ..., t.
+    """
     ages = first + 1.0 + np.arange(steps)
     shares = np.maximum(1.0 / ages, -np.expm1(-1.0 / np.array(times))[:, None])
     left = np.log(np.maximum(1.0 - shares, _MIN_SHARE)).cumsum(-1)
-    since = left[:, :, None] - left[:, None, :]
+    since = left[:, :, None] - left[:, None, :]  # `left`: log of what is left of earlier averages
     new = np.tril(np.exp(np.minimum(since, 0.0))) * shares[:, None, :]
     new, old = new.astype(np.float32), np.exp(left).astype(np.float32)
     return torch.from_numpy(new), torch.from_numpy(old)
@@ -181,7 +188,7 @@ def _compute_weights(times: tuple[float, ...], first: int, steps: int) -> tuple[
 class Mixing(NamedTuple):
     """The whitening of memory features x: (x - mean) mixing."""
 
-    mean: Array  # means, shape (k,)
+    mean: Array  # shape (k,)
     mixing: Array  # symmetric matrix, shape (k, k)
 
     def adapt_to_mixed(self, network: Network) -> Network:

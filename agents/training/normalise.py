@@ -22,14 +22,14 @@ with require_extra("train", "training needs {}"):
     import torch
     from stable_baselines3.common.torch_layers import FlattenExtractor
 
-Scaling = tuple[list[float], list[float], float | None, list[list[float]] | None]
+StandardisedArguments = tuple[list[float], list[float], float | None, list[list[float]] | None]
 """Mean, scale, clip and mixing of `Standardised`, in JSON types."""
 
-CLIP = 10.0  # standard deviations
+CLIP = 10.0  # limit of a standardised entry (standard deviations)
 _WARM_UP, _DURATION = 0.2, 4.0  # s: until every sensor has spoken, and of the whole drive
 _CORRELATION_TIME = 0.2  # s, in which random actions fade to 1/e
-_MIN_VARIANCE = 1e-3  # variance, of what varies by 1, that a mixture of entries has at least
-_CONSTANT = 1e-9  # what varies less is not read
+_MIN_VARIANCE = 1e-3  # least variance of a mixture of standardised entries
+_CONSTANT = 1e-9  # standard deviation, in an entry's unit, up to which it is not read
 
 
 class Standardised(FlattenExtractor):
@@ -87,7 +87,7 @@ def measure_scaling(
     seed: int,
     reads: Sequence[str] = (),
     mixed: bool = False,
-) -> Scaling:
+) -> StandardisedArguments:
     """Measure the scaling of each entry under random actions.
 
     Args:

@@ -40,8 +40,8 @@ with require_extra("train", "memories need torch"):
     from torch import nn
 
 _HIDDEN = (64, 64)  # of the layers behind a memory
-_MIN_STD = 1e-2  # deviation of a mix of inputs below which it is not scaled up further
-_FADE_STEPS = (2.0, 300.0)  # over which a linear memory fades to 1/e when it is new
+_MIN_STD = 1e-2  # least standard deviation of a mixture of inputs, for `compute_whitening`
+_FADE_STEPS = (2.0, 300.0)  # in which the first and the last of a new linear memory fade to 1/e
 
 
 class _MemoryNetwork(nn.Module):
@@ -170,7 +170,7 @@ class Kalman(_LinearRnn):
     """
 
     size, outputs = 16, 4
-    gain_rise_steps = 10.0  # without a packet, in which gains come half way to their last values
+    gain_rise_steps = 10.0  # without a packet, after which gains are half way to their limits
 
     def __init__(self, inputs: int, fresh_index: int, delay_steps: int) -> None:
         super().__init__(inputs, fresh_index, delay_steps)
@@ -202,7 +202,7 @@ class Kalman(_LinearRnn):
             known.append(x)
         now = torch.stack(known, 1) * powers[delay_steps]
         if delay_steps:
-            inside = pushes[:, 1:].unfold(1, delay_steps, 1)  # (B, T, n, late), oldest first
+            inside = pushes[:, 1:].unfold(1, delay_steps, 1)  # (B, T, n, delay_steps), oldest first
             now = now + torch.einsum("btnk,kn->btn", inside, powers[:delay_steps].flip(0))
         state = torch.cat([torch.complex(since, 0.0 * since)[:, None], x[:, None]], 1)
         state = torch.cat([state, pushes[:, steps:]], 1)

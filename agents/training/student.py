@@ -26,18 +26,25 @@ with require_extra("train", "distillation needs torch"):
 
 Single = npt.NDArray[np.float32]
 
-_CLIP = 8.0  # of an input, scaled
+_CLIP = 8.0  # limit of a normalised input (standard deviations)
 UNREAD = ("gps_X", "gps_Y", "gps_satellites")
 """Entries without information for control, as they only locate the car."""
-_MIN_VARIANCE = 1e-3  # variance, of what varies by 1, that a mixture of inputs has at least
-_EARLY, _MEDIAN = 16.0, 50.0  # percentiles of an age
+_MIN_VARIANCE = 1e-3  # least variance of a mixture of normalised inputs, for `compute_whitening`
+_EARLY, _MEDIAN = 16.0, 50.0  # percentiles of an age, one deviation apart where it is normal
 _WINDOW = 50  # steps through which the gradient goes back in time
-_SAMPLES = 512  # steps of a batch without memory
+_SAMPLES = 512  # steps of a batch of a student without memory
 LAST_ROUND_FACTOR = 3  # times as many epochs in the last round
 
-_Batch = tuple[Any, Any, Any, Any, Any, bool]
-"""Mixed observations (B, T, k), labels (B, T, m), privileged inputs (B, T, q), weights (B, T),
-curvatures (B, m, m), and whether it begins the episodes."""
+
+class _Batch(NamedTuple):
+    """B episodes, or a window of T steps of them, as tensors; fields as in `Demonstrations`."""
+
+    inputs: Any  # (B, T, k), mixed by `Scaling`
+    labels: Any  # (B, T, m)
+    privileged: Any  # (B, T, q)
+    weights: Any  # (B, T)
+    curvatures: Any  # (B, m, m)
+    begins: bool  # whether the episodes begin with it
 
 
 class Demonstrations(NamedTuple):
@@ -46,8 +53,8 @@ class Demonstrations(NamedTuple):
     obs: Single  # observations, shape (N, T, k)
     labels: Single  # the teacher's actions, shape (N, T, m)
     privileged: Single  # the teacher's inputs that the observations lack, shape (N, T, q)
-    weights: Single  # Weights of the actions' errors, shape (N, T), zero after an episode's end
-    curvature: Single  # weight of an action's error, shape (m, m)
+    weights: Single  # 1 / (min(J, max_cost) + COST_FLOOR), 0 after an episode's end, (N, T)
+    curvature: Single  # S (m, m), of the cost-to-go: an action's error e adds e'S e
     costs: Array  # costs J, shape (N,)
 
     @property
@@ -58,7 +65,10 @@ class Demonstrations(NamedTuple):
 
 
 class Scaling(NamedTuple):
-    """The scaling of a student's inputs: clip((x - mean) scale) mixing."""
+    """The scaling of a student's inputs: clip((x - mean) scale) mixing.
+
+    `normalise.Standardised` is that of reinforcement learning.
+    """
 
     mean: Array  # shape (k,)
     scale: Array  # factors, shape (k,), zero for an entry that is not read
@@ -143,8 +153,8 @@ class DistillConfig:
     noise: float = 0.02  # largest standard deviation of the noise on the teacher's actions
     seed: int = 0  # of weights and episodes
     batch: int = 16  # episodes of a batch, for a student with memory
-    told: float = 0.0  # weight of the auxiliary loss
-    traces: int = 0  # SiLU units of `MovingAverages`, 0 for none
+    told: float = 0.0  # weight of the auxiliary loss: predict the teacher's inputs it cannot see
+    traces: int = 0  # SiLU units in front of the moving averages; 0: no averages
 
     def __post_init__(self) -> None:
         sizes = self.rounds, self.epochs, self.batch, *self.hidden
@@ -282,7 +292,7 @@ class _EpisodeBatches:
             arrays[0] = self.scaling.mix_inputs(arrays[0])
             for start in range(0, longest, self.window):
                 z, y, q, w = (torch.from_numpy(a[:, start : start + self.window]) for a in arrays)
-                yield z, y, q, w, S, start == 0
+                yield _Batch(z, y, q, w, S, start == 0)
 
 
 class _StepBatches:
@@ -305,7 +315,8 @@ class _StepBatches:
     def __iter__(self) -> Iterator[_Batch]:
         for i in torch.split(torch.randperm(len(self.w)), _SAMPLES):
             S = self.curvatures[self.demo_index[i]]
-            yield *(array[i, None] for array in (self.x, self.y, self.q, self.w)), S, True
+            z, y, q, w = (array[i, None] for array in (self.x, self.y, self.q, self.w))
+            yield _Batch(z, y, q, w, S, True)
 
 
 def fit_model(
@@ -325,7 +336,8 @@ def fit_model(
         epochs: Passes over all drives.
 
     Returns:
-        Mean loss of the last epoch.
+        What errors of the actions add to an episode's cost, as a fraction of it: the mean over the
+        episodes in the last epoch, without the auxiliary loss.
 
     Raises:
         FloatingPointError: The loss is not finite.
@@ -334,7 +346,7 @@ def fit_model(
     batches = (_EpisodeBatches if model.recurrent else _StepBatches)(drives, scaling, config)
     schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.02, epochs * batches.n_batches)
     count = sum(len(demo.costs) for demo in drives)
-    length = sum(int((demo.weights > 0.0).sum()) for demo in drives) / count
+    length = sum(int((demo.weights > 0.0).sum()) for demo in drives) / count  # steps, on average
     zero_loss = sum(demo.zero_loss for demo in drives) / count
     step, total, state = 0, 0.0, None
     for _ in range(epochs):
@@ -345,7 +357,7 @@ def fit_model(
             valid = w > 0.0
             error = out[..., : y.shape[-1]] - y
             added_cost = torch.einsum("bti,bij,btj->bt", error, S, error) * w
-            loss = length * added_cost.sum() / valid.sum().clamp(min=1)  # of an episode
+            loss = length * added_cost.sum() / valid.sum().clamp(min=1)  # by episode
             if config.told:
                 auxiliary_error = (out[..., y.shape[-1] :] - q)[valid].square().mean(-1).sum()
                 loss = loss / zero_loss + config.told * auxiliary_error / valid.sum().clamp(min=1)

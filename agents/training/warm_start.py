@@ -1,8 +1,8 @@
 """Start of a training from a zip of stable-baselines3 or a policy, and the scale of its rewards.
 
-The score compares logarithms of costs, whose derivative is that of the cost over the cost. So the
-scenarios of a mixture are weighted by the uncontrolled car's cost. Where a training starts from a
-policy, each drive is weighted by that policy's cost in the same drive.
+The score compares logarithms of costs, and d log J = dJ / J. So the scenarios of a mixture are
+weighted by 1 over the uncontrolled car's cost. Where a training starts from a policy, each drive is
+weighted by 1 over that policy's cost in the same drive.
 """
 
 import math
@@ -34,7 +34,7 @@ from .config import (
 )
 from .export import check_zip, find_normaliser, load_normaliser, read_normalisation
 from .networks import MemoryObservation, measure_mixing
-from .normalise import Scaling
+from .normalise import StandardisedArguments
 
 with require_extra("train", "training needs {}"):
     from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
@@ -43,7 +43,7 @@ import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.save_util import load_from_zip_file  # isort: skip
 
 _WEIGHT_DRIVES = 32  # uncontrolled drives by which a scenario is weighed
-_MIN_COST_SHARE = 0.05  # of the mean: a scenario that costs less uncontrolled weighs no more
+_MIN_COST_SHARE = 0.05  # of the scenarios' mean cost: a cheaper one counts as this in its weight
 _GRU = [f"cell.{part}_l0" for part in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
 
 
@@ -53,7 +53,7 @@ class WarmStart(NamedTuple):
     name: str  # path of the zip or name of the policy
     parameters: dict[str, Any]  # weights and optimisers by their names in `get_parameters`
     variables: dict[str, Any]  # further tensors of a zip
-    scaling: Scaling  # of the observations
+    scaling: StandardisedArguments  # of the observations
     partial: bool = False  # whether the rest of the model stays unchanged
 
 
@@ -156,13 +156,13 @@ def _get_policy_form(policy: Policy, algo: str) -> dict[str, Any]:
     kinds = [cell.kind for cell in network.cells]
     if algo != "ppo" and not on_tensors:
         raise ValueError(f"{algo} begins with a zip, not with policy {policy.name}")
-    form = network.output, network.history, kinds
+    architecture = network.output, network.history, kinds
     known = [["gru"]] if on_tensors else [[], [MovingAverages.kind]]
-    if form not in [("linear", 1, option) for option in known]:
+    if architecture not in [("linear", 1, option) for option in known]:
         needed = "a GRU" if on_tensors else "nothing or traces"
         raise ValueError(
             f"{algo} goes on from dense layers without tanh at their end, {needed} before them and "
-            f"no older frames; (output, history, cells) of {policy.name} are {form}"
+            f"no older frames; (output, history, cells) of {policy.name} are {architecture}"
         )
     if on_tensors and network.activation != "silu":
         raise ValueError(f"{algo} goes on from layers of silu, not of {network.activation}")
@@ -238,23 +238,29 @@ class NetworkAgent:
         self.network = network
 
     def predict(
-        self, obs: Any, state: Any = None, start: Any = None, deterministic: bool = True
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
     ) -> tuple[Any, Any]:
         """Compute actions within [-1, 1], with the signature of stable-baselines3.
 
         Args:
-            obs: Observations, shape (N, k).
+            observation: Observations, shape (N, k).
             state: Memory, shape (N, memory); None at the start.
-            start: Rows whose memory is cleared, shape (N,).
+            episode_start: Rows whose memory is cleared, shape (N,).
             deterministic: Without effect.
 
         Returns:
             Actions (N, m) and the next state.
         """
-        memory = np.zeros((len(obs), self.network.memory)) if state is None else state.copy()
-        if start is not None:
-            memory[np.asarray(start, np.bool_)] = 0.0
-        actions = self.network(np.asarray(obs, np.float64), memory)
+        memory = (
+            np.zeros((len(observation), self.network.memory)) if state is None else state.copy()
+        )
+        if episode_start is not None:
+            memory[np.asarray(episode_start, np.bool_)] = 0.0
+        actions = self.network(np.asarray(observation, np.float64), memory)
         return np.clip(actions, -1.0, 1.0).astype(np.float32), memory
 
 

@@ -10,8 +10,8 @@ import pytest
 from sideslip.agents.live import controller
 from sideslip.agents.live.controller import (
     _BLOCK,
+    _BLOCK_MAGIC,
     _ITEM,
-    _MAGIC,
     OnboardController,
     Recorder,
     read_blocks,
@@ -96,7 +96,7 @@ def test_a_block_that_somebody_made_up_ends_the_replay(tmp_path: Path, items: by
     path = tmp_path / "made-up.session"
     Recorder(path, {}).close()
     with path.open("ab") as file:
-        file.write(_BLOCK.pack(_MAGIC, 2, len(items), zlib.crc32(items), 0) + items)
+        file.write(_BLOCK.pack(_BLOCK_MAGIC, 2, len(items), zlib.crc32(items), 0) + items)
     assert list(read_blocks(path)) == []
 
 
