@@ -30,11 +30,11 @@ class ReferenceParams(NamedTuple):
     """Coefficients of the steady-state responses of the nominal vehicle."""
 
     b_0: Any  # l_r / l
-    b_1: Any  # M l_f / (2 l C_r l_r)
-    G: Any  # stability factor, dakf-stability (24)
-    per_l: Any  # 1 / l
-    mu_g: Any  # m/s2
-    G_lagged: Any  # stability factor of the lagged reference
+    b_1: Any  # s2/m2, M l_f / (2 l C_r l_r)
+    G: Any  # s2/m2, stability factor, dakf-stability (24)
+    per_l: Any  # 1/m, 1 / l
+    mu_g: Any  # m/s2, mu g
+    G_lagged: Any  # s2/m2, stability factor of the lagged reference
     rest: Any  # fraction of its deviation from the steady state that remains after a tick
 
 
@@ -114,8 +114,8 @@ def filter_reference(before: Any, steady: Any, target: Any, reference_kind: int)
     return steady
 
 
-BETA_SCALE, GAMMA_SCALE, STEER_SCALE = 0.02, 0.1, 0.05
-EFFORT_WEIGHT, COST_CAP = 0.01, 100.0
+BETA_SCALE, GAMMA_SCALE, STEER_SCALE = 0.02, 0.1, 0.05  # rad, rad/s, rad
+EFFORT_WEIGHT, COST_CAP = 0.01, 100.0  # 1/s both
 
 
 @jit
@@ -124,7 +124,8 @@ def compute_cost_rate(
 ) -> Any:
     """Compute the cost rate of a tick, capped at 100 per second.
 
-    c = (e_beta/0.02)^2 + (e_gamma/0.1)^2 + 0.01 (N_z/N_max)^2 + 0.01 (steer/0.05)^2
+    c = (e_beta/0.02)^2 + (e_gamma/0.1)^2 + 0.01 (N_z/N_max)^2 + 0.01 (added steering/0.05)^2,
+    angles in rad and rates in rad/s.
 
     Args:
         e_beta: Error of the sideslip angle (rad).
@@ -160,7 +161,7 @@ def compute_failure_cost(duration: Any, tick: Any) -> Any:
 
 RUNNING, SPIN, OFF_ROAD, NOT_FINITE, BAD_ACTION, COLLISION, DEPARTURE = range(7)
 FAILURES = ("none", "spin", "off-road", "not-finite", "bad-action", "collision", "departure")
-REFUSED = -1
+REFUSED = -1  # result of a step whose action is refused
 WILD = 1 << 30  # added to the result of a step where an action was beyond `WILD_LIMIT`
 WILD_LIMIT = 10.0  # fraction of full scale beyond which an action is a mistake
 
@@ -184,24 +185,24 @@ def select_failure(lost: Any, spun: Any, off: Any) -> Any:
 class StepReport(NamedTuple):
     """Columns of the report of a step, from which `info` is made."""
 
-    t: int = 0
-    beta: int = 1
-    gamma: int = 2
-    psi: int = 3
-    beta_ref: int = 4
-    gamma_ref: int = 5
-    steer: int = 6
-    yaw_moment: int = 7
-    cost: int = 8
-    failure: int = 9
-    packets: int = 10
+    t: int = 0  # s
+    beta: int = 1  # rad
+    gamma: int = 2  # rad/s
+    psi: int = 3  # rad
+    beta_ref: int = 4  # rad
+    gamma_ref: int = 5  # rad/s
+    steer: int = 6  # rad, front wheels
+    yaw_moment: int = 7  # N m, of both motors
+    cost: int = 8  # of the step
+    failure: int = 9  # place in `FAILURES`
+    packets: int = 10  # how many were delivered
     reward: int = 11
-    ended: int = 12  # 1 the time is over
+    ended: int = 12  # 1: the time is over
 
 
 REPORT = StepReport()
 
-_NUMBERS = REPORT._fields[: REPORT.failure]  # of `info`; `failure` and `is_success` follow
+_NUMBERS = REPORT._fields[: REPORT.failure]  # first keys of `info`, all floats
 _KEYS = (*_NUMBERS, "failure", "is_success")
 _RUNNING: dict[str, Any] = dict.fromkeys(_NUMBERS, 0.0) | {"failure": RUNNING, "is_success": False}
 _MASKS = tuple(f"_{key}" for key in _KEYS)

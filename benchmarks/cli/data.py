@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ...envs.sensors.camera.lane_finder import Lane, LaneFinder
     from ...envs.sensors.camera.pinhole import Pinhole
 
-Mapping = Annotated[
+MappingOption = Annotated[
     Texts, Option("--map", help="NAME_UNIT=COLUMN of the log (yaw_rate_degps=r); repeatable.")
 ]
 Ratio = Annotated[float | None, Option(help="Of the logged steering to the wheels' angle (15.2).")]
@@ -79,7 +79,7 @@ def replay_command(
     nominal: Annotated[
         str, Option(help="The car whose mass and arms `--vehicle identify` takes.")
     ] = "passenger-car",
-    mapping: Mapping = None,
+    mapping: MappingOption = None,
     estimator: Annotated[
         Texts, Option(help="A name; repeatable; default: all that the log serves.")
     ] = None,
@@ -157,7 +157,7 @@ def identify_command(
             autocompletion=complete("vehicles"),
         ),
     ] = "passenger-car",
-    mapping: Mapping = None,
+    mapping: MappingOption = None,
     out: Annotated[File, Option(help="Write the car and its wires as TOML.")] = None,
     until: Annotated[
         float | None, Option(help="s of the log that are used; the rest stays fresh.")

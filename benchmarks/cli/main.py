@@ -21,7 +21,7 @@ from .common import (
     show_episode,
     write_output,
 )
-from .data import Mapping, identify_command, lane_command, replay_command
+from .data import MappingOption, identify_command, lane_command, replay_command
 from .live import live_command
 from .names import (
     KINDS,
@@ -63,7 +63,7 @@ for _name, _command, _line in (
     app.command(_name, short_help=_line)(_command)
 console = Console()
 
-Vehicle = Annotated[
+VehicleOption = Annotated[
     Text,
     Option(help="The car: a name or a TOML or JSON file.", autocompletion=complete("vehicles")),
 ]
@@ -129,7 +129,7 @@ def run(
         Text,
         Option(help="A name, FILE.py:Class or module:Name.", autocompletion=complete("estimators")),
     ] = None,
-    vehicle: Vehicle = None,
+    vehicle: VehicleOption = None,
     scenario: Annotated[
         Text,
         Option(
@@ -182,8 +182,8 @@ def bench(
     ] = None,
     quick: Annotated[bool, Option("--quick", help="Few seeds: a first look in minutes.")] = False,
     log: Annotated[File, Option(help="Replay this recorded drive too.")] = None,
-    vehicle: Vehicle = None,
-    mapping: Mapping = None,
+    vehicle: VehicleOption = None,
+    mapping: MappingOption = None,
     html: Html = None,
     json: Json = None,
     parquet: Parquet = None,
@@ -213,7 +213,7 @@ def bench(
         bool, Option("--fresh", help="Seeds drawn after your files are hashed: publishable.")
     ] = False,
     salt: Annotated[
-        str, Option(help="Of the test seeds, hexadecimal; default: of the contestants' sources.")
+        str, Option(help="Salt of the test seeds, hexadecimal; default: made from the sources.")
     ] = "",
     limit: Annotated[float, Option(help="s of wall time for a contestant in a contest.")] = 600.0,
     trust: Trust = False,
@@ -236,8 +236,9 @@ def bench(
         car, scenarios = None if log else vehicle, tuple(scenario or [])
         n_episodes = episodes or (QUICK_EPISODES if quick else EPISODES)
         comparison = ComparisonRequest(
-            entries, car, scenarios, env_id, n_episodes, None, fresh, salt, limit
-        )
+            entries, vehicle=car, scenarios=scenarios, env_id=env_id, episodes=n_episodes,
+            fresh=fresh, salt=salt, limit=limit,
+        )  # fmt: skip
     elif scenario or env_id or fresh:
         raise ValueError("--scenario, --env and --fresh go with --agent or --estimator")
     names = suites or (["control"] if comparison else list(SUITES))

@@ -19,7 +19,7 @@ from .names import Address, EngineName, File, Jobs, Text, Texts
 
 tune_app = Typer(no_args_is_help=True)
 Storage = Annotated[Text, Option(help="RDB URL or SQLite file; default: sideslip-tune.db here.")]
-Seed = Annotated[int, Option(help="Of the sampler; another on each machine of a study.")]
+Seed = Annotated[int, Option(help="Seed of the sampler; another on each machine of a study.")]
 
 
 @tune_app.callback()
@@ -54,7 +54,7 @@ def tune_estimator(
     noise: Annotated[
         Texts, Option(help="psi_noise or psi_noise=LOW:HIGH, searched too; repeatable.")
     ] = None,
-    trials: Annotated[int, Option(help="Of the study, the finished ones included.")] = 200,
+    trials: Annotated[int, Option(help="Trials of the study, finished ones included.")] = 200,
     seeds: Annotated[int, Option(help="Training drives.")] = 12,
     test_seeds: Annotated[int, Option(help="Test drives.")] = 20,
     sampler: Annotated[str, Option(help="cma (CMA-ES) or tpe.")] = "cma",
@@ -106,23 +106,25 @@ def tune_estimator(
 
 @tune_app.command("controller")
 def tune_controller(
-    name: Annotated[str, Argument(help="A contestant of the matrix, or a rung.")],
-    kind: Annotated[Texts, Option("--class", help="Of contests; default: all. Repeatable.")] = None,
-    trials: Annotated[int, Option(help="Of a study, the finished ones included.")] = 60,
-    seeds: Annotated[int, Option(help="Tuning seeds a contest.")] = 16,
+    name: Annotated[str, Argument(help="A controller of the benchmark, or a baseline.")],
+    kind: Annotated[
+        Texts, Option("--class", help="Class of tasks, such as car-yaw; default: all. Repeatable.")
+    ] = None,
+    trials: Annotated[int, Option(help="Trials of a class, finished ones included.")] = 60,
+    seeds: Annotated[int, Option(help="Tuning seeds of a task.")] = 16,
     seed: Seed = 0,
     storage: Storage = None,
     jobs: Jobs = None,
     out: Annotated[File, Option(help="Write the options to this TOML file.")] = None,
     log: Annotated[File, Option(help="A folder for every study's log.")] = None,
-    write: Annotated[bool, Option("--write", help="Into the package: both.")] = False,
+    write: Annotated[bool, Option("--write", help="Put options and log into the package.")] = False,
     engine_name: EngineName = PROCESSES,
     address: Address = "",
 ) -> None:
-    """Find a contestant's weights, bandwidths, levels and grip over the contests of a class.
+    """Find a controller's weights, bandwidths, thresholds and friction over a class of tasks.
 
-    A stopped search goes on where it was when the same command runs again. A class whose contests
-    the contestant cannot drive is named and left out.
+    A stopped search goes on where it was when the same command runs again. A class whose tasks the
+    controller cannot drive is named and left out.
     """
     from ...agents.baselines import FILE
     from ..control.tasks import make_tuning_seeds
@@ -156,15 +158,15 @@ def tune_controller(
 def calibrate_command(
     out: Annotated[Path, Argument(help="The file to write.")] = Path("clairvoyant.json"),
     contest: Annotated[
-        Texts, Option(help="Its name in the tables; default: all. Repeatable.")
+        Texts, Option(help="Name of a task in the tables; default: all. Repeatable.")
     ] = None,
-    seeds: Annotated[int, Option(help="Seeds a contest.")] = 64,
-    write: Annotated[bool, Option("--write", help="Into the package instead.")] = False,
+    seeds: Annotated[int, Option(help="Seeds of a task.")] = 64,
+    write: Annotated[bool, Option("--write", help="Write the package's file instead.")] = False,
     jobs: Jobs = None,
     engine_name: EngineName = PROCESSES,
     address: Address = "",
 ) -> None:
-    """Find the cost of the clairvoyant, the ladder's highest rung, in the scored contests.
+    """Find the cost of the clairvoyant, the baseline that knows all, in the scored tasks.
 
     A stopped run goes on where it was when the same command runs again in the same folder. `bench
     control --clairvoyant FILE` reads the file.

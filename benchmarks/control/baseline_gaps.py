@@ -1,14 +1,18 @@
 """The gaps between the baselines: nominal, oracle-parameters, oracle-state and clairvoyant.
 
-Scales of scores, what each step of knowledge and delay costs, and which tasks are scored: those
-where the baselines lie apart on tuning seeds. `python -m
-sideslip.benchmarks.control.baseline_gaps --write` measures all candidates and writes the file.
+Each knows more than the one before: nominal the data sheet, oracle-parameters the true car,
+friction and biases, oracle-state the state and the disturbances too, the clairvoyant also what is
+ahead. From the gaps follow the scales of scores, what each step of knowledge and delay costs, and
+which tasks (contests in the tables) are scored: those where the baselines lie apart on tuning
+seeds. `python -m sideslip.benchmarks.control.baseline_gaps --write` measures all candidates and
+writes the file.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -38,9 +42,10 @@ from .tasks import (
     write_tasks,
 )
 
-_OF_THE_CAR = ("none", "spin", "off-road")
+_CAR_OUTCOMES = ("none", "spin", "off-road")  # how an episode ends by the car's own motion
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.3)  # s, of camera and GPS alike, beside what the seed draws
-_FRAME = 0.05  # s: so slow that a camera's frames 0.3 s late find room under way
+# s between the frames of a late camera: 0.3 s late, 7 are in flight of `link.MAX_IN_FLIGHT`
+_FRAME_PERIOD = 0.05
 DELAY_TASK = ControlTask("1", YAW, "coms", "zero-slip", "coms-random")
 _FILTERS = (REFERENCE_FILTER, "multirate-kf", "bicycle-kf")
 CONTESTANTS = (
@@ -75,18 +80,18 @@ def make_oracle_table(
             cells.append([task.name, *[""] * 6, "; ".join(filter(None, errors))])
             continue
         scale = scales[task]
-        oracle_gains = scale.compute_paired_ratios(scale.oracle)[1]
-        parameters, known = results.select(task, PARAMETERS), ""
+        oracle_ratios = scale.compute_paired_ratios(scale.oracle)[1]
+        parameters, parameters_text = results.select(task, PARAMETERS), ""
         if not parameters.error:
-            gains = scale.compute_paired_ratios(parameters)[0]
-            known = f"{gains.mean() if len(gains) else math.nan:.2f}"
+            ratios = scale.compute_paired_ratios(parameters)[0]
+            parameters_text = f"{ratios.mean() if len(ratios) else math.nan:.2f}"
         log_ratios = foresight.get(task)
         fails = 100.0 * (1.0 - survival_mask(scale.nominal).mean())
         beyond = "" if log_ratios is None else f"{log_ratios.mean():.2f}"
-        counted = f"{len(oracle_gains)} of {len(scale.mark_compared(len(scale.oracle.costs)))}"
-        falls = _describe_order(scale, oracle_gains, log_ratios)
-        texts = (find_oracle(task), average(oracle_gains).inline(), known, beyond, counted, falls)
-        cells.append([task.name, f"{fails:.1f}", *texts])
+        counted = f"{len(oracle_ratios)} of {len(scale.mark_compared(len(scale.oracle.costs)))}"
+        falls = _describe_order(scale, oracle_ratios, log_ratios)
+        texts = (average(oracle_ratios).inline(), parameters_text, beyond, counted, falls)
+        cells.append([task.name, f"{fails:.1f}", find_oracle(task), *texts])
     header = (
         *("contest", "nominal fails / %", "oracle-state is", "its gap", "oracle-parameters"),
         *("clairvoyant beyond", "episodes", "falls"),
@@ -97,15 +102,15 @@ def make_oracle_table(
     return ResultTable("The ladder", header, cells, note, keyed=False)
 
 
-def _describe_order(scale: ScoreScale, oracle_gains: Array, foresight: Array | None) -> str:
-    """Whether each rung costs less than the one below it."""
-    if not len(oracle_gains):
+def _describe_order(scale: ScoreScale, oracle_ratios: Array, foresight: Array | None) -> str:
+    """Describe whether each baseline costs less than the one that knows less."""
+    if not len(oracle_ratios):
         return "no episode that nominal and oracle-state survive"
     if scale.gap < MIN_GAP:
         return "nothing to win here"
     if foresight is not None and foresight.mean() <= 0.0:
         return "clairvoyant does not"
-    return "yes" if average(oracle_gains).low > 0.0 else "not surely"
+    return "yes" if average(oracle_ratios).low > 0.0 else "not surely"
 
 
 def describe_findings(standings: Sequence[Standing]) -> list[str]:
@@ -117,9 +122,9 @@ def describe_findings(standings: Sequence[Standing]) -> list[str]:
         and np.isfinite(item.overall.get("score", Estimate(math.nan)).value)
     ]
     excess = [
-        np.concatenate([oracle_gain - r for r, oracle_gain in item.pairs.values()])
+        np.concatenate([oracle_ratios - ratios for ratios, oracle_ratios in item.pairs.values()])
         for item in others
-    ]  # below 0 where the contestant is better
+    ]  # log(J / J_oracle-state): below 0 where the entry is better
     sure = holm([compute_p_value(item) for item in excess])
     better = [item for item, is_sure in zip(others, sure, strict=True) if is_sure]
     return [
@@ -130,7 +135,7 @@ def describe_findings(standings: Sequence[Standing]) -> list[str]:
 
 
 def find_below_optimum(names: Sequence[str], regrets: Sequence[Array]) -> list[str]:
-    """Find who is surely below the clairvoyant, from log(J / J_clairvoyant), shape (n,) each."""
+    """Find which surely cost less than the clairvoyant; regrets: log(J / J_clairvoyant), (n,)."""
     sure = holm([compute_p_value(logs) for logs in regrets])
     return [name for name, is_sure in zip(names, sure, strict=True) if is_sure]
 
@@ -145,9 +150,9 @@ def make_knowledge_table(results: Results, tiers: Mapping[str, Sequence[ControlT
         for task, scale in scales.items():
             parameters = results.select(task, PARAMETERS)
             if not parameters.error and scale.mark_compared(len(parameters.costs)).any():
-                r, oracle_gain = scale.compute_paired_ratios(parameters)
-                steps[0].append(r)
-                steps[1].append(oracle_gain - r)
+                ratios, oracle_ratios = scale.compute_paired_ratios(parameters)
+                steps[0].append(ratios)
+                steps[1].append(oracle_ratios - ratios)
         texts = (geometric_mean(*logs).inline() if logs else "" for logs in steps)
         cells.append([f"{tier}: {TITLES[tier]}", *texts])
     knowledge = ("car, friction, biases (model)", "state and disturbances (sensing)")
@@ -162,7 +167,7 @@ def make_knowledge_table(results: Results, tiers: Mapping[str, Sequence[ControlT
 def list_failures(results: Results, late: float = 0.0) -> list[list[str]]:
     """List (tier, task, entry, what happened) where the failure is not the car's, such as a NaN.
 
-    late: Delay of the sensors (s), of the cost of delay.
+    late: Delay of the sensors (s) where the results are those of `measure_delay_cost`.
     """
     lines, more = [], f", sensors {1e3 * late:.0f} ms late" if late else ""
     for entry, result in results.outcomes.items():
@@ -174,7 +179,7 @@ def list_failures(results: Results, late: float = 0.0) -> list[list[str]]:
         ended = [
             f"{name} {100.0 * (codes == code).mean():.1f} %"
             for code, name in enumerate(FAILURES)
-            if name not in _OF_THE_CAR and (codes == code).any()
+            if name not in _CAR_OUTCOMES and (codes == code).any()
         ]
         if ended:
             lines.append([*where, ", ".join(ended)])
@@ -192,10 +197,10 @@ class DelayCost:
 
 
 def _make_late_entries(delay: float) -> list[ControlEntry]:
-    """The contestants with camera (every _FRAME) and GPS a delay (s) late."""
-    late = {"camera_delays": [delay], "camera_jitter": 0.0, "gps_delays": [delay]}
-    scenario = {"base": DELAY_TASK.scenario, **late}
-    options = {"scenario": scenario, "camera": {"period": _FRAME}}
+    """Make the contestants' entries with camera (every `_FRAME_PERIOD`) and GPS `delay` s late."""
+    delays = {"camera_delays": [delay], "camera_jitter": 0.0, "gps_delays": [delay]}
+    scenario = {"base": DELAY_TASK.scenario, **delays}
+    options = {"scenario": scenario, "camera": {"period": _FRAME_PERIOD}}
     return [
         ControlEntry(DELAY_TASK, estimator, controller, options)
         for controller, estimator in CONTESTANTS
@@ -234,9 +239,11 @@ def make_cost_lines(prices: Sequence[DelayCost]) -> Mapping[str, tuple[Array, Ar
 
 
 EPISODES = 64
-# A task is scored whose gap is above the first and its lower limit above the second, and in which
-# nominal fails in less than this fraction (at the limit in any, but never always).
-_GAP, _MIN_LOW, _FAILING = 0.3, 0.2, 0.1
+_GAP = 0.3  # a scored task's mean of log(J_nominal / J_oracle) is above it: 26 % of the cost
+_MIN_LOW = 0.2  # and the lower limit of its 95 % interval above this one
+# of the episodes: nominal fails in less of a scored task's (but for the tiers `LIMIT`), and an
+# oracle that fails in more is worse than one that does not
+_FAILING = 0.1
 
 
 def make_oracle_entries(task: ControlTask) -> list[ControlEntry]:
@@ -246,30 +253,43 @@ def make_oracle_entries(task: ControlTask) -> list[ControlEntry]:
 
 
 def measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
-    """Measure a candidate; the better oracle is that of fewer failures, then of the larger gap.
+    """Measure a candidate with the better oracle of each kind.
 
-    A baseline that could not be computed, and cars that all fail, leave a gap of 0 and the reason.
+    That one fails in at most `_FAILING` of the episodes, and among those it has the larger gap. A
+    baseline that could not be computed, and cars that all fail, leave a gap of 0 and the reason.
     """
     nominal = results.select(task, NOMINAL)
     errors = [f"{NOMINAL}: {nominal.error}"] if nominal.error else []
     failing = 1.0 if nominal.error else float(np.mean(~survival_mask(nominal)))
-    knowing, _, _, _ = _select_oracle(results, task, PARAMETERS, nominal)
-    name, gap, n_compared, oracle_errors = _select_oracle(results, task, STATE, nominal)
+    parameter_oracle, _ = _select_oracle(results, task, PARAMETERS, nominal)
+    state_oracle, oracle_errors = _select_oracle(results, task, STATE, nominal)
+    gap, n_compared = state_oracle.gap, state_oracle.n_compared
     errors += oracle_errors
     is_unknown = bool(nominal.error) or len(oracle_errors) == len(ORACLES[STATE])
     verdict = _describe_verdict(task, gap, failing, n_compared)
     facts = asdict(task) | {"env_version": __version__}
-    facts |= {"oracle": name, "knowing": knowing, "judged": n_compared, "n": len(nominal.costs)}
+    facts |= {"oracle": state_oracle.name, "knowing": parameter_oracle.name}
+    facts |= {"judged": n_compared, "n": len(nominal.costs)}
     numbers = zip(("gap", "low", "high", "failing"), (*gap, failing), strict=True)
     facts |= {key: round(number, 4) for key, number in numbers}
     return TaskMeasurement(**facts, verdict="; ".join(errors) if is_unknown else verdict)
 
 
+class _OracleCandidate(NamedTuple):
+    """A candidate for an oracle; of several the smallest tuple is the best."""
+
+    often_fails: bool  # in more than `_FAILING` of the episodes
+    minus_gap: float
+    name: str
+    gap: Estimate  # mean of log(J_nominal / J) over the compared episodes
+    n_compared: int  # episodes that nominal and the candidate survive
+
+
 def _select_oracle(
     results: Results, task: ControlTask, oracle_kind: str, nominal: DriveResult
-) -> tuple[str, Estimate, int, list[str]]:
-    """Name, gap to nominal and compared episodes of the better candidate, and what went wrong."""
-    options: list[tuple[bool, float, str, Estimate, int]] = []
+) -> tuple[_OracleCandidate, list[str]]:
+    """Select the better candidate for an oracle; return also what went wrong."""
+    candidates: list[_OracleCandidate] = []
     errors = []
     for name in ORACLES[oracle_kind]:
         oracle = results.select(task, name)
@@ -280,10 +300,10 @@ def _select_oracle(
             gap, failing = Estimate(0.0, 0.0, 0.0), float(np.mean(~survival_mask(oracle)))
             if len(log_ratios) > 1:
                 gap = Estimate(*(math.log(number) for number in geometric_mean(log_ratios)))
-            options.append((failing > _FAILING, -gap.value, name, gap, len(log_ratios)))
-    nothing = (True, 0.0, ORACLES[oracle_kind][0], Estimate(0.0, 0.0, 0.0), 0)
-    _, _, name, gap, n_compared = min(options) if options else nothing
-    return name, gap, n_compared, errors
+            rank = failing > _FAILING, -gap.value
+            candidates.append(_OracleCandidate(*rank, name, gap, len(log_ratios)))
+    undriven = _OracleCandidate(True, 0.0, ORACLES[oracle_kind][0], Estimate(0.0, 0.0, 0.0), 0)
+    return min(candidates) if candidates else undriven, errors
 
 
 def _describe_verdict(task: ControlTask, gap: Estimate, failing: float, n_compared: int) -> str:

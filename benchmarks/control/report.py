@@ -1,7 +1,8 @@
 """The verdict of the control benchmark, and its figures, tracks and side-by-side views.
 
-`_Gains` are log ratios of nominal's cost over an entry's, by task; `foresight` everywhere is
-log(J_oracle-state / J_clairvoyant) of the calibrated tasks, shape (n,) each.
+`_Gains` are log(J_nominal / J) of an entry's episodes, shape (n,), by task (r in `score`);
+`foresight` everywhere is log(J_oracle-state / J_clairvoyant) of the calibrated tasks, shape (n,)
+each.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -49,15 +50,15 @@ def compose_verdict(
     foresight: Mapping[ControlTask, Array] | None = None,
 ) -> str:
     """Compose the verdict over all tiers: the best controller, the best estimator, and why."""
-    filters, drivers = _group_estimators(by_tier), _group_controllers(by_tier)
-    others, none = select_complete(drivers), drivers.get("none", {})
+    filters, controllers = _group_estimators(by_tier), _group_controllers(by_tier)
+    complete, none = select_complete(controllers), controllers.get("none", {})
     best = find_best_controller(by_tier)
-    ratio = _compute_cost_ratio(others[best], none) if best not in ("", "none") and none else None
+    ratio = _compute_cost_ratio(complete[best], none) if best not in ("", "none") and none else None
     text = f", and {100.0 * ratio.value:.0f} % as much as no control" if ratio else ""
-    episodes = max((len(r) for gains in drivers.values() for r in gains.values()), default=0)
+    episodes = max((len(r) for gains in controllers.values() for r in gains.values()), default=0)
     return format_verdict(
         "Controllers drive on what estimators infer; cost: squared error of slip and yaw rate.",
-        f"Of the controllers {_describe_first(others)}{text}.",
+        f"Of the controllers {_describe_first(complete)}{text}.",
         f"Of the estimators, under one controller, {_describe_first(filters)}.",
         _describe_reasons(by_tier, prices, foresight or {}),
         f"{_describe_exceptions(by_tier)}Not covered: other cars and roads, and what "
@@ -66,9 +67,9 @@ def compose_verdict(
 
 
 def _compute_relative_costs(standings: Mapping[str, Sequence[Standing]]) -> dict[str, Estimate]:
-    """Cost over nominal's (%) of who drives everywhere, the best first."""
-    drivers = select_complete(_group_controllers(standings))
-    logs = {name: [-r for r in drivers[name].values()] for name in _rank_entries(drivers)}
+    """Compute the cost over nominal's (%) of controllers with every task, the best first."""
+    complete = select_complete(_group_controllers(standings))
+    logs = {name: [-r for r in complete[name].values()] for name in _rank_entries(complete)}
     return {
         name: Estimate(*(100.0 * value for value in geometric_mean(*ratios)))
         for name, ratios in logs.items()
@@ -82,27 +83,27 @@ def is_default_filter(controller: str, estimator: str) -> bool:
 
 
 def find_best_controller(by_tier: Mapping[str, Sequence[Standing]]) -> str:
-    """Find who leads over all tiers of those who drive everywhere; "" where nobody has a score."""
+    """Find the best controller over all tiers among those with every task; "" without a score."""
     return next(iter(_rank_entries(select_complete(_group_controllers(by_tier)))), "")
 
 
 def select_complete(by_name: Mapping[str, Driven]) -> dict[str, Driven]:
-    """Select who drives every task that anybody drives: only they can be the best over all.
+    """Select the names with every task that any name has: only they can be the best over all.
 
-    by_name: Tasks, or a mapping of them, by name.
+    by_name: Tasks of a controller, or a mapping from them, by the controller's name.
     """
     all_tasks = {task for tasks in by_name.values() for task in tasks}
     return {name: tasks for name, tasks in by_name.items() if set(tasks) == all_tasks}
 
 
 def _group_estimators(by_tier: Mapping[str, Sequence[Standing]]) -> dict[str, _Gains]:
-    """_Gains of each estimator under the reference controller, the truth left out."""
+    """Collect the `_Gains` of each estimator under the reference controller, the truth left out."""
     return _collect_gains(by_tier, "estimator", lambda entry: (
         entry.controller == REFERENCE_CONTROLLER and entry.estimator != TRUTH))  # fmt: skip
 
 
 def _group_controllers(by_tier: Mapping[str, Sequence[Standing]]) -> dict[str, _Gains]:
-    """_Gains of each controller on its own filter, the baselines left out."""
+    """Collect the `_Gains` of each controller on its own filter, the baselines left out."""
     return _collect_gains(by_tier, "controller", lambda entry: (
         entry.controller not in ORACLE_NAMES and is_default_filter(entry.controller,
                                                                    entry.estimator)))  # fmt: skip
@@ -120,13 +121,13 @@ def _collect_gains(
 
 
 def _compute_cost_ratio(one: _Gains, other: _Gains) -> Estimate:
-    """Cost ratio of two on the tasks and seeds of both; NaN where there are none."""
+    """Compute J / J_other on the tasks and seeds of both; NaN where there are none."""
     both = [(r, other[task]) for task, r in one.items() if task in other]
     return geometric_mean(*(b[: len(a)] - a[: len(b)] for a, b in both))
 
 
 def _rank_entries(by_name: Mapping[str, _Gains]) -> dict[str, dict[str, Estimate]]:
-    """Cost ratios over rivals by name; the best, with the fewest cheaper rivals, is first."""
+    """Rank the cost ratios over rivals by name; the best, with fewest cheaper rivals, is first."""
     ratios = {
         name: {rival: _compute_cost_ratio(x, by_name[rival]) for rival in by_name if rival != name}
         for name, x in by_name.items()
@@ -144,13 +145,13 @@ def _rank_entries(by_name: Mapping[str, _Gains]) -> dict[str, dict[str, Estimate
 
 
 def _describe_first(by_name: Mapping[str, _Gains]) -> str:
-    """Clause on who leads, and by how much."""
+    """Describe in a clause which name leads, and by how much."""
     ranked = _rank_entries(by_name)
     return describe_leader(*next(iter(ranked.items())), "cost") if ranked else "nobody has a score"
 
 
 def _describe_exceptions(by_tier: Mapping[str, Sequence[Standing]]) -> str:
-    """The tiers in which another surely leads, and who does so on a part of the tasks."""
+    """Describe the tiers in which another name surely leads, and controllers of fewer tasks."""
     parts = []
     for tier, standings in by_tier.items():
         for collect in (_group_estimators, lambda by: select_complete(_group_controllers(by))):
@@ -159,9 +160,9 @@ def _describe_exceptions(by_tier: Mapping[str, Sequence[Standing]]) -> str:
             rivals = in_tier.get(best, {})
             if best != first and first in rivals and rivals[first].high < 1.0:
                 parts.append(f"{best} in tier {tier}")
-    drivers, overall_best = _group_controllers(by_tier), find_best_controller(by_tier)
-    parted = drivers.keys() - select_complete(drivers).keys() if overall_best else ()
-    ratios = {name: _compute_cost_ratio(drivers[name], drivers[overall_best]) for name in parted}
+    gains, overall_best = _group_controllers(by_tier), find_best_controller(by_tier)
+    partial = gains.keys() - select_complete(gains).keys() if overall_best else ()
+    ratios = {name: _compute_cost_ratio(gains[name], gains[overall_best]) for name in partial}
     cheaper = (name for name in ratios if ratios[name].high < 1.0)
     ordered = sorted(cheaper, key=lambda label: ratios[label].value)
     parts += [f"{name} on its own manoeuvres" for name in ordered]
@@ -173,7 +174,7 @@ def _describe_reasons(
     prices: Sequence[DelayCost],
     foresight: Mapping[ControlTask, Array],
 ) -> str:
-    """Sentence on what the baselines save by their knowledge, and on the cost of delay."""
+    """Describe what the baselines save by their knowledge, and the cost of delay."""
     all_standings = [standing for standings in by_tier.values() for standing in standings]
     knowing = [item for item in all_standings if item.entry.controller == PARAMETERS]
     parameter_pairs = [pair for item in knowing for pair in item.pairs.values()]
@@ -202,7 +203,7 @@ _PANELS = (
     Panel("front steering / mrad", (("steer", "delivered"),)),
 )
 _SCALES = {"beta": 1e3, "beta_ref": 1e3, "steer": 1e3}
-_BODY = (1.5, 1.15)  # of a car, over its wheelbase and its track
+_BODY = (1.5, 1.15)  # length and width of a car's body, over its wheelbase and its track
 _COST = "cost / nominal's, %: less is better"
 _CAPTION = "nominal: an LQG that knows the data sheet. Whiskers: 95 % intervals. Hollow: a variant."
 
@@ -249,7 +250,7 @@ def add_figures(
 def _group_costs(
     by_tier: Mapping[str, Sequence[Standing]], name: Any
 ) -> dict[str, dict[str, Estimate]]:
-    """Cost over nominal's (%) by tier, the best first; name: of an entry, "" leaves it out."""
+    """Group costs over nominal's (%) by tier and name(entry), "" left out; the best is first."""
     groups = {}
     for tier, standings in by_tier.items():
         shown = [item for item in standings if "cost_vs_nominal" in item.overall]
@@ -263,19 +264,19 @@ def _group_costs(
     return {title: costs for title, costs in groups.items() if costs}
 
 
-def _estimator(cell: ControlEntry) -> str:
-    return cell.estimator if cell.controller == REFERENCE_CONTROLLER else ""
+def _estimator(entry: ControlEntry) -> str:
+    return entry.estimator if entry.controller == REFERENCE_CONTROLLER else ""
 
 
-def _controller(cell: ControlEntry) -> str:
-    has_default = is_default_filter(cell.controller, cell.estimator) and cell.controller != NOMINAL
-    return cell.controller if has_default and cell.estimator != TRUTH else ""
+def _controller(entry: ControlEntry) -> str:
+    is_shown = is_default_filter(entry.controller, entry.estimator) and entry.controller != NOMINAL
+    return entry.controller if is_shown and entry.estimator != TRUTH else ""
 
 
 def _group_oracles(
     by_tier: Mapping[str, Sequence[Standing]], foresight: Mapping[ControlTask, Array]
 ) -> dict[str, dict[str, Estimate]]:
-    """Cost over nominal's (%) of the baselines by tier, the clairvoyant's from oracle-state's."""
+    """Group the baselines' costs over nominal's (%) by tier, clairvoyant's from oracle-state's."""
     names = ORACLE_NAMES
     groups = _group_costs(by_tier, lambda x: x.controller if x.controller in names else "")
     for tier in by_tier:
@@ -310,7 +311,7 @@ def _draw_maps(tier: str, standings: Sequence[Standing]) -> list[tuple[str, Any,
 
 
 def _make_tracks(series: Mapping[ControlEntry, Array], best: str) -> list[tuple[str, str, str]]:
-    """Tracks of the first and the last task for a map (KML): no control and the best controller."""
+    """Make the tracks (KML) of the first and the last task, without control and with the best."""
     tasks = list(dict.fromkeys(entry.task for entry in series))
     files = []
     for task in dict.fromkeys(tasks[:1] + tasks[-1:]):
@@ -327,12 +328,14 @@ def _make_tracks(series: Mapping[ControlEntry, Array], best: str) -> list[tuple[
 
 
 def _make_explorer(series: Mapping[ControlEntry, Array], best: str) -> Explorer:
-    """Every entry's first test seed; at first no control and the best controller."""
+    """Make the view of every entry's first test seed, at first no control and the best."""
     labels = (
-        c.label for c in series if c.controller == best and is_default_filter(best, c.estimator)
+        entry.label
+        for entry in series
+        if entry.controller == best and is_default_filter(best, entry.estimator)
     )
     keyed: dict[tuple[str, ...], Array] = {
-        (c.task.tier, c.task.name, c.label): values for c, values in series.items()
+        (entry.task.tier, entry.task.name, entry.label): values for entry, values in series.items()
     }
     bodies: dict[tuple[str, ...], tuple[float, float]] = {}
     for entry in series:

@@ -42,7 +42,7 @@ SIGNALS = (*_INFO[1:], *_PLACE)
 
 @dataclass(frozen=True)
 class Chunk:
-    """Some seeds of an entry; keep: whether the first seed's time series is returned."""
+    """Some seeds of an entry; keep: whether the first seed's series is returned, no folder."""
 
     entry: ControlEntry
     seeds: tuple[int, ...]
@@ -73,7 +73,7 @@ class DriveResult:
 
 
 class _MetricAccumulator:
-    """The metrics of all cars while their episodes run; reset: the first of their steps."""
+    """The metrics of all cars while their episodes run; reset: their step 0, after the reset."""
 
     def __init__(self, base: Any, reset: EpisodeStep) -> None:
         car, self.width = base.vehicle[0], base.single_action_space.shape[0]
@@ -82,7 +82,7 @@ class _MetricAccumulator:
         self.dt = base.control_period * TICK
         self.base, self.radius = base, car.wheel_radius
         self.last, self.last_command = reset.info, np.zeros((base.num_envs, 2))
-        self.turned, self.lateral_deviation = np.zeros((2, base.num_envs))
+        self.heading_error, self.lateral_deviation = np.zeros((2, base.num_envs))  # rad, m
         self.steps, self.totals = np.zeros(base.num_envs), np.zeros((len(EPISODE), base.num_envs))
 
     def add(self, step: EpisodeStep) -> None:
@@ -90,26 +90,29 @@ class _MetricAccumulator:
         shares = parse_actions(step.action, len(command), self.width, fail=True)
         command[:, : self.width] = np.clip(np.nan_to_num(shares), -1.0, 1.0)
         info, speed = step.info, self.base.motion[:, Motion._fields.index("v_x")]
-        self.turned += (info["gamma"] - info["gamma_ref"]) * self.dt
-        self.lateral_deviation += speed * (self.turned + info["beta"] - info["beta_ref"]) * self.dt
+        # heading error (rad): int (gamma - gamma_ref) dt; course error e (rad): that plus beta -
+        # beta_ref; lateral deviation (m): int v_x e dt, for small angles
+        self.heading_error += (info["gamma"] - info["gamma_ref"]) * self.dt
+        course_error = self.heading_error + info["beta"] - info["beta_ref"]
+        self.lateral_deviation += speed * course_error * self.dt
         torques = self.base.rows[:, -1, [FAST.torque_left, FAST.torque_right]]
         power = np.abs(torques).sum(axis=1) * speed / self.radius
         base, commands = self.base, (command, self.last_command)
         infos, scales = (info, self.last), (self.full_scale, self.dt)
         dissipation = compute_dissipation(base.params, base.states, base.switches)
-        moves = (self.lateral_deviation, power, dissipation)
-        moment = StepSample(*commands, step.reward, *infos, *scales, *moves)
+        motion = (self.lateral_deviation, power, dissipation)
+        sample = StepSample(*commands, step.reward, *infos, *scales, *motion)
         for metric, total in zip(EPISODE, self.totals, strict=True):
-            added = REDUCTIONS[metric.reduction].add(total, metric.compute(moment))
+            added = REDUCTIONS[metric.reduction].add(total, metric.compute(sample))
             np.copyto(total, added, where=step.running)
         self.steps += step.running
         self.last, self.last_command = step.info, command
 
     def numbers(self) -> Array:
         """Metrics of all episodes, shape (cars, NUMBERS)."""
-        folds = [REDUCTIONS[metric.reduction] for metric in EPISODE]
-        done = [f.finish(t, self.steps) for f, t in zip(folds, self.totals, strict=True)]
-        return np.stack(done, axis=1)
+        reductions = [REDUCTIONS[metric.reduction] for metric in EPISODE]
+        values = [r.finish(t, self.steps) for r, t in zip(reductions, self.totals, strict=True)]
+        return np.stack(values, axis=1)
 
 
 def run_chunk(chunk: Chunk) -> DriveResult:
@@ -137,7 +140,7 @@ def _run_chunk(chunk: Chunk) -> DriveResult:
 
 
 def _read_signals(env: Any, step: EpisodeStep) -> list[float]:
-    """Time and SIGNALS of the first car."""
+    """Read time (s) and SIGNALS of the first car."""
     motion = env.unwrapped.motion[0]
     place = [float(motion[Motion._fields.index(name)]) for name in _PLACE]
     return [float(step.info[name][0]) for name in _INFO] + place
@@ -149,8 +152,8 @@ def get_control_period(entry: ControlEntry) -> float:
 
 
 CHUNK = 64
-"""Episodes of a case: a run of so many is found again by a longer one."""
-_LENGTH = 24
+"""Episodes of a finished case at most: a longer run takes up the cases of a shorter one."""
+_LENGTH = 24  # hexadecimal digits of a case's file name
 
 
 @dataclass
@@ -181,7 +184,7 @@ def measure(
         seeds: Seeds of all tasks, or a function of the task.
         jobs: Processes, None for all processors.
         console: Where progress is shown.
-        keep: Folder in which finished cases stay, so that a run that was stopped goes on.
+        keep: Folder (no `Chunk.keep`) in which finished cases stay, so that a stopped run goes on.
         runner: Function that drives a chunk instead of `run_chunk`.
         title: Title of the progress bar.
 
@@ -221,8 +224,8 @@ def _join_results(parts: list[DriveResult]) -> DriveResult:
 class CachedDrive:
     """`run_chunk`, or another runner, behind a folder of results; None caches nothing.
 
-    Results of other sources, plant and matrix included, or of a policy's other weights, are not
-    taken.
+    A result is taken only where sources (those of the plant and the benchmark too) and a policy's
+    weights are the same.
     """
 
     folder: Path | None
@@ -233,12 +236,12 @@ class CachedDrive:
         if self.folder is None:
             return self._run_chunk(chunk)
         path = self._make_path(chunk)
-        cached = _read_case(path, chunk, entire=self.runner is None)
+        cached = _read_finished(path, chunk, entire=self.runner is None)
         if cached is not None:
             return cached
         result = self._run_chunk(chunk)
         if not result.error:  # an error is worth another try
-            _write_case(path, result)
+            _write_finished(path, result)
         return result
 
     def _run_chunk(self, chunk: Chunk) -> DriveResult:
@@ -262,8 +265,8 @@ def hash_sources() -> str:
     return digest.hexdigest()
 
 
-def _read_case(path: Path, chunk: Chunk, entire: bool = True) -> DriveResult | None:
-    """Read the chunk's result; None where the file is absent, damaged or another chunk's."""
+def _read_finished(path: Path, chunk: Chunk, entire: bool = True) -> DriveResult | None:
+    """Read a finished chunk's result; None where the file is absent, damaged or another's."""
     shapes: dict[str, tuple[int, ...]] = {"numbers": (len(chunk.seeds), len(NUMBERS))}
     shapes["seconds"] = ()
     try:
@@ -285,8 +288,8 @@ def _has_shape(array: npt.NDArray[Any], shape: tuple[int, ...], entire: bool) ->
     return array.dtype == np.float64 and array.shape == shape and bool(is_valid)
 
 
-def _write_case(path: Path, result: DriveResult) -> None:
-    """Write a file of `_read_case`; a full disk loses the file, not the run."""
+def _write_finished(path: Path, result: DriveResult) -> None:
+    """Write a file of `_read_finished`; a full disk loses the file, not the run."""
     arrays: dict[str, Any] = {"numbers": result.numbers, "seconds": np.array(result.seconds)}
     if result.series is not None:
         arrays["series"] = result.series

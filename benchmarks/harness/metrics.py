@@ -19,14 +19,14 @@ from ...envs.record import Array
 from ...envs.vehicle.dynamics import compute_gravity
 from ...envs.vehicle.tyres import compute_tyre_forces
 
-_FULL = 0.999  # of an input's range: saturated
+_FULL = 0.999  # fraction of full scale from which on an input counts as saturated
 
 
 class StepSample(NamedTuple):
     """An env-step of N cars."""
 
     command: Array  # fractions of yaw moment and added steering, shape (N, 2)
-    last_command: Array  # those of the last step, shape (N, 2)
+    last_command: Array  # commands of the last step, shape (N, 2)
     reward: Array  # rewards, shape (N,)
     info: Mapping[str, Any]  # info of the env after the step
     last: Mapping[str, Any]  # info of the env before the step
@@ -40,8 +40,8 @@ class StepSample(NamedTuple):
 class _Reduction(NamedTuple):
     """Reduction of the values of an episode's steps to one number, which starts at 0."""
 
-    add: Callable[[Array, Array], Array]  # of the number so far and a step's value
-    finish: Callable[[Array, Array], Array]  # of the last number and the count of steps
+    add: Callable[[Array, Array], Array]  # (number so far, a step's value) -> number
+    finish: Callable[[Array, Array], Array]  # (last number, count of steps) -> result
 
 
 def _keep_total(total: Array, _: Array) -> Array:
@@ -142,7 +142,7 @@ METRICS = {metric.name: metric.unit for metric in EPISODE} | {
 
 
 def compute_dissipation(params: Array, states: Array, switches: Any) -> Array:
-    """Compute the power that N cars' tyres dissipate: force times speed across, both axles.
+    """Compute the power that N cars' tyres dissipate: -F_y times the sliding speed, both axles.
 
     Drive slip is not modelled.
 

@@ -14,11 +14,11 @@ import numpy.typing as npt
 
 from ...envs.record import Array
 
-_LEVEL = 0.95
-_TAIL = 0.5 * (1.0 - _LEVEL)
+_LEVEL = 0.95  # of the intervals
+_TAIL = 0.5 * (1.0 - _LEVEL)  # probability beyond each bound
 _MIN_SEEDS = 4  # with fewer an interval spans orders of magnitude
-_WORST = 0.05  # fraction of the episodes that `compute_tail_mean` takes the mean of
-_MIN_TAIL = 25  # episodes in the tail, with fewer its interval covers too rarely
+_WORST = 0.05  # fraction of the episodes whose mean `compute_tail_mean` takes
+_MIN_TAIL = 25  # episodes in the tail; with fewer an interval covers too rarely
 
 
 class Estimate(NamedTuple):

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from ...envs.record import Array
 from .stats import Estimate
 
-LINES, LETTERS = 5, 110  # of a verdict, of a line with the package's names
-_MAX_NAMES = 2  # of those that tie
+LINES, LETTERS = 5, 110  # lines of a verdict, letters of a line with the package's names
+_MAX_NAMES = 2  # names in a sentence; the others are counted
 _MIN_TIE = 0.995  # a ratio below it is a lead
 
 

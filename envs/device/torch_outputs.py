@@ -1,6 +1,6 @@
 """Outputs of an env-step on tensors: slow sensors with their packets, observation and report.
 
-A row's packets are sorted by (arrived, captured, sensor). An env-step appends the new ones, sorts
+A car's packets are sorted by (arrived, captured, sensor). An env-step appends the new ones, sorts
 all, and removes those that have arrived from the front.
 """
 
@@ -26,7 +26,7 @@ _NEVER_KEY = 1 << 62  # sorts packets that never arrive behind all others
 
 
 class SlowState(NamedTuple):
-    """The slow sensors' part of the rows' state."""
+    """The slow sensors' part of the cars' state; the cars (N) are the last axis."""
 
     slow: Tensor  # (sensors, SLOW_WIDTH, N)
     queue: Tensor  # (capacity, PACKET_WIDTH, N), by arrival
@@ -44,7 +44,7 @@ class TickWindow(NamedTuple):
 
     first: Tensor
     last: Tensor
-    running: Tensor  # rows that were stepped
+    running: Tensor  # whether the car was stepped
     track: Tensor  # (n, len(Motion), N), motion at each tick
 
 
@@ -108,8 +108,8 @@ class SlowSensors:
         active = window.running & (tick > window.first) & (tick <= window.last)
         when = tick.to(torch.int64)
         j = (when - window.first.to(torch.int64) - 1).clamp(0, len(window.track) - 1)
-        row_index = j.expand(1, window.track.shape[1], -1)
-        motion = Motion(*window.track.gather(0, row_index)[0].unbind(0))
+        tick_index = j.expand(1, window.track.shape[1], -1)
+        motion = Motion(*window.track.gather(0, tick_index)[0].unbind(0))
         link = self._read(p, P.slow[sensor])
         context = self._make_measurement_context(p, motion, self._small_angle, keys, tick)
         values, quality, drift = self._sample_sensor(sensor, context, link, slow[SLOW_STATE.drift])
@@ -250,14 +250,14 @@ class Observer:
         age = self._select(captured != NEVER, (tick - captured) * TICK, AGE_CAP)
         packets = delivered.packets
         place = torch.arange(len(packets), device=tick.device)[:, None]
-        # neither late nor a duplicate
+        # the newest sample's own packet, neither an older one nor a duplicate
         is_newest = packets[:, PACKET.arrived] == slow[SLOW_STATE.arrived]
         is_fresh = (place < delivered.number) & (packets[:, PACKET.sensor] == sensor) & is_newest
         values = [slow[i] for i in SLOW_STATE.values[: WIDTHS[sensor]]]
         return [*values, age, is_fresh.any(0).to(tick.dtype)]
 
     def report(self, tick_state: TickState, duration: Tensor, count: Tensor) -> Tensor:
-        """Compute the reports (len(StepReport), N) of rows that were stepped."""
+        """Compute the reports (len(StepReport), N) of cars that were stepped."""
         failure_cost = self._compute_failure_cost(duration, tick_state.tick)
         cost = tick_state.cost + self._select(tick_state.failure != RUNNING, failure_cost, 0.0)
         info_values = InfoValues(*tick_state.shown)
@@ -272,7 +272,7 @@ class Observer:
         return torch.stack([values[name] for name in StepReport._fields])
 
     def report_refusal(self, tick_state: TickState, duration: Tensor, before: Tensor) -> Tensor:
-        """Compute the reports of rows that fail by a non-finite action, from those before."""
+        """Compute the reports of cars that fail by a non-finite action, from those before."""
         cost = self._compute_failure_cost(duration, tick_state.tick)
         values = dict(zip(StepReport._fields, before.unbind(0), strict=True))
         values |= {"cost": cost, "reward": -cost, "packets": torch.zeros_like(cost)}

@@ -1,4 +1,4 @@
-"""Env-steps of all rows on tensors, pure functions that never wait for the device; and tick 0."""
+"""Env-steps of all cars on tensors, pure functions that never wait for the device; and tick 0."""
 
 from typing import Any, NamedTuple
 
@@ -25,18 +25,18 @@ Tensor = torch.Tensor
 
 
 class TorchState(NamedTuple):
-    """State of the rows that an env-step changes; the rows are the last axis."""
+    """State of the cars that an env-step changes; the cars (N) are the last axis."""
 
     motion: Tensor  # (len(Motion), N)
     drive: Tensor  # (len(ActuatorState), N)
-    driver: Tensor  # (N,)
-    refs: Tensor  # (2, N)
+    driver: Tensor  # rad, the driver's steering command, (N,)
+    refs: Tensor  # rad, rad/s, references of beta and gamma, (2, N)
     nominal_motion: Tensor  # (len(NominalMotion), N)
-    tick: Tensor
-    failure: Tensor
-    slow: Tensor  # the fields of `SlowState`
-    queue: Tensor
-    over: Tensor  # (N,) of bool
+    tick: Tensor  # ticks since the start, as floats, (N,)
+    failure: Tensor  # places in `FAILURES`, as floats, (N,)
+    slow: Tensor  # `SlowState.slow`, (sensors, SLOW_WIDTH, N)
+    queue: Tensor  # `SlowState.queue`, (capacity, PACKET_WIDTH, N)
+    over: Tensor  # whether the episode has ended, bool, (N,)
     report: Tensor  # (len(StepReport), N)
 
     @property
@@ -48,19 +48,19 @@ class TorchState(NamedTuple):
 class StepOutcome(NamedTuple):
     """Outcome of an env-step."""
 
-    obs: Tensor  # (N, k); zeros where the row had no tick
+    obs: Tensor  # (N, k); zeros where the car had no tick
     rewards: Tensor  # (N,)
-    terminated: Tensor
-    truncated: Tensor
-    refused: Tensor  # (N,), the action is not finite and counts
-    rows: Tensor  # (n, FAST_WIDTH, N)
+    terminated: Tensor  # bool, (N,)
+    truncated: Tensor  # bool, (N,)
+    refused: Tensor  # whether a running car got an action that is not finite, bool, (N,)
+    rows: Tensor  # fast sensors of each tick, (n, FAST_WIDTH, N)
     packets: Tensor  # (max, PACKET_WIDTH, N)
-    done: Tensor  # (N,), how many ticks and packets there are, int64
-    delivered: Tensor
+    done: Tensor  # ticks of the step that count, int64, (N,)
+    delivered: Tensor  # packets that count, int64, (N,)
 
 
 class TorchStep:
-    """Env-steps of rows of one variant.
+    """Env-steps of cars of one variant.
 
     Args:
         kind: Variant of the ticks.
@@ -90,18 +90,18 @@ class TorchStep:
     def __call__(
         self, p: Tensor, keys: Tensor, state: TorchState, actions: Tensor
     ) -> tuple[TorchState, StepOutcome]:
-        """Step all rows; those that are over stand still, those with a non-finite action fail.
+        """Step all cars; those that are over stand still, those with a non-finite action fail.
 
         p is (PARAMS_WIDTH, N), keys (2, N) int64, actions (N, width) of the floats of p.
         """
         is_finite = torch.isfinite(actions).all(1)
-        gate = GradientGate()
+        gate = GradientGate()  # its hooks run in the backward pass, after `open` is set below
         p, state = gate(p), TorchState(*map(gate, state))
         shares = self._clip(torch.where(is_finite[:, None], actions, 0.0), -1.0, 1.0)
         yaw_share, *steer_shares = map(gate, shares.unbind(1))
         steer_share = steer_shares[0] if steer_shares else torch.zeros_like(state.tick)
         running = is_finite & ~state.over
-        start = make_tick_state(*state[:6], running)  # motion to tick
+        start = make_tick_state(*state[:6], running)  # the fields from motion to tick
         tick_state, rows, track = self._ticks.integrate_step(
             p, keys, start, yaw_share, steer_share, self.n
         )
@@ -147,7 +147,8 @@ class TorchStep:
 class TorchReset:
     """Tick 0 on tensors as `reset_vehicle` makes it, with gradients to motion and parameters.
 
-    A path that a driver follows stays where the reset put it. `sensors` are those present.
+    A path that a driver follows stays where the reset put it. `sensors` are the indices of the slow
+    sensors present.
     """
 
     def __init__(self, step: TorchStep, sensors: tuple[int, ...]) -> None:
@@ -186,20 +187,21 @@ class TorchReset:
         row = [zero + number for number in row]
         v = 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
         refs = torch.stack(self._compute_reference(steer, v, params.target, kind.reference))
-        all_rows = torch.ones_like(state.over)
+        all_cars = torch.ones_like(state.over)
         beta = self._compute_sideslip_angle(motion.v_x, motion.v_y, kind.small_angle)
         info_values = InfoValues(beta, refs[0], refs[1], steer, zero)
         tick_state = make_tick_state(
-            state.motion, drive, steer, refs, state.nominal_motion, state.tick, all_rows
+            state.motion, drive, steer, refs, state.nominal_motion, state.tick, all_cars
         )
         empty_queue = torch.full_like(state.queue, NEVER)
+        # as if a step of one tick had led here from tick -1: its window holds tick 0 alone
         previous = state._replace(
             tick=state.tick - 1.0, slow=self._rewind_sensors(p, keys, state.slow), queue=empty_queue
         )
-        rows = torch.stack(row).expand(self._step.n, -1, -1)
+        rows = torch.stack(row).expand(self._step.n, -1, -1)  # tick 0 stands for every sample
         tick_state = tick_state._replace(shown=info_values)
         result: tuple[TorchState, StepOutcome] = self._step.finish_step(
-            p, keys, previous, tick_state, rows, state.motion[None], all_rows, ~all_rows
+            p, keys, previous, tick_state, rows, state.motion[None], all_cars, ~all_cars
         )
         return result
 

@@ -1,4 +1,4 @@
-"""The ticks of an env-step on tensors: `integrate_tick` for all rows, each frozen at its end.
+"""The ticks of an env-step on tensors: `integrate_tick` for all cars, each frozen at its end.
 
 Nothing branches on values, so the device never waits for the host.
 """
@@ -25,17 +25,17 @@ Numbers = tuple[Tensor, ...]
 
 
 class InfoValues(NamedTuple):
-    """Numbers of `info` from the last tick of a row; (N,) each."""
+    """Numbers of `info` from the last tick of a car; (N,) each."""
 
-    beta: Any
-    beta_ref: Any
-    gamma_ref: Any
-    steer: Any
-    moment: Any
+    beta: Any  # rad
+    beta_ref: Any  # rad
+    gamma_ref: Any  # rad/s
+    steer: Any  # rad, front wheels
+    moment: Any  # N m, yaw moment of both motors
 
 
 class TickState(NamedTuple):
-    """State of the rows within an env-step; (N,) each, or tuples of such."""
+    """State of the cars within an env-step; (N,) each, or tuples of such."""
 
     alive: Tensor  # not frozen yet
     motion: Numbers
@@ -44,15 +44,15 @@ class TickState(NamedTuple):
     refs: Numbers
     nominal_motion: Numbers
     tick: Tensor
-    failure: Tensor  # codes as floats
-    cost: Tensor
-    shown: Numbers
+    failure: Tensor  # places in `FAILURES`, as floats
+    cost: Tensor  # of the ticks of this step
+    shown: Numbers  # `InfoValues`
     row: Numbers  # the newest fast row
     track: Numbers  # the newest motion, fit for `info` or not
 
 
 class Ticks:
-    """Ticks of rows of one variant; `compile`: a tick and the window go through `torch.compile`."""
+    """Ticks of cars of one variant; `compile`: a tick and the window go through `torch.compile`."""
 
     def __init__(self, kind: StepVariant, dtype: torch.dtype, compile: bool) -> None:
         self.kind = kind
@@ -85,7 +85,7 @@ class Ticks:
         self, p: Tensor, yaw_share: Tensor, steer_share: Tensor, tick_state: TickState,
         draws: Numbers, next_steer: Any,
     ) -> TickState:  # fmt: skip
-        """Step the rows that are alive by a tick; p is (PARAMS_WIDTH, N), the shares (N,)."""
+        """Step the cars that are alive by a tick; p is (PARAMS_WIDTH, N), the shares (N,)."""
         pick = self._select
         params = self._make_step_params(p)
         task = params.task
@@ -112,36 +112,36 @@ class Ticks:
         beta = pick(measured.lost, 0.0, tick_cost.beta)
         info_values = (beta, *refs, measured.steer, measured.moment)
 
-        def select_rows(where: Tensor, new: Any, old: Any) -> Numbers:
+        def select_cars(where: Tensor, new: Any, old: Any) -> Numbers:
             return tuple(pick(where, a, b) for a, b in zip(new, old, strict=True))
 
         return TickState(
             alive & (failure == RUNNING) & (tick < task.duration),
-            select_rows(is_fit, next_state.motion, tick_state.motion),
-            select_rows(alive, next_state.drive, tick_state.drive),
+            select_cars(is_fit, next_state.motion, tick_state.motion),
+            select_cars(alive, next_state.drive, tick_state.drive),
             pick(alive, next_state.driver, tick_state.driver),
-            select_rows(alive, refs, tick_state.refs),
-            select_rows(alive, next_state.nominal_motion, tick_state.nominal_motion),
+            select_cars(alive, refs, tick_state.refs),
+            select_cars(alive, next_state.nominal_motion, tick_state.nominal_motion),
             tick,
             pick(alive, failure, tick_state.failure),
             tick_state.cost + pick(alive, tick_cost.cost * TICK, 0.0),
-            select_rows(alive, info_values, tick_state.shown),
-            select_rows(alive, measured.row, tick_state.row),
-            select_rows(alive, next_state.motion, tick_state.track),
+            select_cars(alive, info_values, tick_state.shown),
+            select_cars(alive, measured.row, tick_state.row),
+            select_cars(alive, next_state.motion, tick_state.track),
         )
 
     def integrate_step(
         self, p: Tensor, keys: Tensor, start: TickState, yaw_share: Tensor, steer_share: Tensor,
         n: int,
     ) -> tuple[TickState, Tensor, Tensor]:  # fmt: skip
-        """Integrate n ticks, fewer for rows that fail or end, whose last values are repeated.
+        """Integrate n ticks, fewer for cars that fail or end, whose last values are repeated.
 
         Returns the state, and the fast rows and motions of all ticks, (n, width, N) each.
         """
         all_draws, steering = self.precompute_window(p, keys, start.tick + 1, n)
         tick_state, rows, track = start, [], []
         for j in range(n):
-            draws = tuple(normals_of[j] for normals_of in all_draws)
+            draws = tuple(normals[j] for normals in all_draws)
             angle = None if steering is None else steering[j]
             tick_state = self.tick(p, yaw_share, steer_share, tick_state, draws, angle)
             rows.append(torch.stack(tick_state.row))
@@ -153,7 +153,7 @@ def make_tick_state(
     motion: Tensor, drive: Tensor, driver: Tensor, refs: Tensor, nominal_motion: Tensor,
     tick: Tensor, alive: Tensor,
 ) -> TickState:  # fmt: skip
-    """Make the state of rows at the start of an env-step, from tensors (..., N)."""
+    """Make the state of cars at the start of an env-step, from tensors (..., N)."""
     zeros = tick.new_zeros((2 + len(InfoValues._fields) + FAST_WIDTH, len(tick)))
     failure, cost, *numbers = zeros.unbind(0)
     info_values, row = numbers[: len(InfoValues._fields)], numbers[len(InfoValues._fields) :]

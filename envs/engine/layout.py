@@ -27,7 +27,7 @@ class Disturbance(NamedTuple):
 
     force: Any  # N, standard deviation
     moment: Any  # N m
-    decay: Any  # what is left after a tick
+    decay: Any  # fraction that is left after a tick
     noise_gain: Any  # sqrt(1 - decay^2)
 
 
@@ -35,44 +35,44 @@ class TaskParams(NamedTuple):
     """The episode's length and limits."""
 
     duration: Any  # ticks
-    half_width: Any  # m, of the road or proving ground
-    yaw_scale: Any  # N m of action 1
+    half_width: Any  # m, half the width of the road or proving ground
+    yaw_scale: Any  # N m, yaw moment of an action of 1
     yaw_first: Any  # 1: yaw moment before acceleration
-    spin: Any  # rad of sideslip
-    authority: Any  # rad of added steering, of action 1
-    slew: Any  # rad a tick, of added steering
-    stop: Any  # rad, of the whole steering angle
+    spin: Any  # rad, sideslip angle beyond which the car spins
+    authority: Any  # rad, added steering of an action of 1
+    slew: Any  # rad per tick, rate limit of the added steering
+    stop: Any  # rad, limit of the whole front steering angle
 
 
 class TyreChange(NamedTuple):
     """Tyres that change in mid-run."""
 
-    tick: Any  # from which on
-    front: Any  # factors on the cornering stiffness
-    rear: Any
+    tick: Any  # at whose start they change
+    front: Any  # factor on the front cornering stiffness
+    rear: Any  # factor on the rear cornering stiffness
 
 
 class ActuatorState(NamedTuple):
     """Actuators, the driver's integral and the disturbances now acting."""
 
-    T_l: Any
-    T_r: Any
-    delta_f: Any
-    integral: Any
-    F_d: Any
-    N_d: Any
-    slewing: Any  # rad, the command of added steering within its rate
+    T_l: Any  # N m, torque of the left motor
+    T_r: Any  # N m, torque of the right motor
+    delta_f: Any  # rad, front steering angle
+    integral: Any  # m/s2, integral part of the driver's acceleration command
+    F_d: Any  # N, lateral force
+    N_d: Any  # N m, yaw moment
+    slewing: Any  # rad, the command of added steering within its rate limit
     added: Any  # rad, the added steering that acts
 
 
 class Clock(NamedTuple):
     """Integers of an episode, as floats."""
 
-    key_low: Any
-    key_high: Any
+    key_low: Any  # lower 32 bits of the episode's key
+    key_high: Any  # upper 32 bits
     tick: Any
-    failure: Any
-    redraws: Any
+    failure: Any  # place in `FAILURES`
+    redraws: Any  # how often an unstable car was drawn anew
     next_due: Any  # arrival tick of the next packet
 
 
@@ -80,10 +80,10 @@ class _SlowSensorState(NamedTuple):
     """State of a slow sensor, and its newest sample."""
 
     frames: Any  # captured so far
-    next_capture: Any
+    next_capture: Any  # tick
     captured: Any  # tick of the newest delivered sample, NEVER before the first
     values: Annotated[tuple[Any, ...], VALUES]
-    arrived: Any  # tick of its delivery
+    arrived: Any  # tick of the newest sample's delivery
     drift: Any  # what the sensor carries from sample to sample
 
 
@@ -135,15 +135,15 @@ Z, STATE_WIDTH = make_offsets(_EpisodeState)
 class Switches(NamedTuple):
     """Integers that choose variants of the plant and the task, the same for a whole batch."""
 
-    small_angle: int
-    law: int
-    reference: int
+    small_angle: int  # 1: the small-angle plant
+    law: int  # place in `TYRE_LAWS`
+    reference: int  # place in `REFERENCES`
     steering: int  # kind of steering profile, used at reset
     all_samples: int  # the observation holds every fast sample
-    with_map: int  # and the road's curvature
+    with_map: int  # the observation holds the road's curvature
     fail_bad: int  # a non-finite action ends the episode instead of being refused
     roll: int  # the body rolls
-    road: int  # of `scenarios.road.ROADS`
+    road: int  # place in `scenarios.road.ROADS`
 
 
 FLAGS, _ = make_offsets(Switches)

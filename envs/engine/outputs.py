@@ -17,7 +17,7 @@ from ..task import AGE_CAP, N_SAMPLED, REPORT
 from ..ticks import NEVER, TICK
 from .layout import FLAGS, P, Z
 
-NEVER_DUE = 1e15
+NEVER_DUE = 1e15  # tick of the next arrival where no packet is under way
 
 
 @jit
@@ -88,7 +88,7 @@ def _move_due_packets(z: Any, tick: Any, packets: Any, count: int) -> int:
         for i in range(PACKET_WIDTH):
             packets[count, i] = z[best + i]
         update_newest(z, packets[count], tick)
-        last = Z.queue + (under_way - 1) * PACKET_WIDTH  # it takes the free place
+        last = Z.queue + (under_way - 1) * PACKET_WIDTH  # the last packet takes the free place
         for i in range(PACKET_WIDTH):
             z[best + i] = z[last + i]
         z[Z.under_way] = under_way - 1.0
@@ -160,7 +160,7 @@ def observe_fast(rows: Any, n: int, refs: Any, bounds: Any, switches: Any, obs: 
             _store_clipped(obs, load_element(rows, n - 1, column), bounds, k)
             _store_clipped(obs, total / n, bounds, k + 1)
             k += 2
-    for i in range(4):
+    for i in range(4):  # steering angle, both torques, the driver's steering command
         _store_clipped(obs, load_element(rows, n - 1, FAST.steer + i), bounds, k)
         k += 1
     if switches[FLAGS.with_map]:
@@ -193,7 +193,7 @@ def observe_slow(row: Any, k: int, count: int, bounds: Any) -> None:
             obs[k] = clip(select(z[newest.captured] != NEVER, age, AGE_CAP), 0.0, AGE_CAP)
             is_fresh = 0.0
             for i in range(count):
-                # not late, no duplicate
+                # the newest sample's own packet, neither an older one nor a duplicate
                 is_newest = packets[i, PACKET.arrived] == z[newest.arrived]
                 if packets[i, PACKET.sensor] == sensor and is_newest:
                     is_fresh = 1.0

@@ -62,8 +62,8 @@ def _write_motion(z: Any, d: Any, start: Any, small_angle: int) -> None:
     mirrored = d.side < 0.5
     beta = select(mirrored, 0.0 - d.initial_beta, d.initial_beta)
     sine, cosine = sincos(beta)
-    slope = beta if small_angle else sine / cosine
-    z[Z.motion.v_x], z[Z.motion.v_y] = d.speed, d.speed * slope
+    tangent = beta if small_angle else sine / cosine
+    z[Z.motion.v_x], z[Z.motion.v_y] = d.speed, d.speed * tangent
     z[Z.motion.gamma] = select(mirrored, 0.0 - d.initial_gamma, d.initial_gamma)
     for i in range(len(Z.motion)):
         if start[i] == start[i]:

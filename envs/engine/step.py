@@ -95,7 +95,7 @@ def integrate_step(
     params = make_step_params(p)
     task = params.task
     N_z, added = yaw_share * task.yaw_scale, steer_share * task.authority
-    last = n
+    n_run = n
     while True:
         motion, drive, tick = read(z, Z.motion), read(z, Z.drive), load_element(z, Z.clock.tick)
         car = apply_tyre_change(params.car, params.tyre_change, tick > params.tyre_change.tick)
@@ -104,8 +104,8 @@ def integrate_step(
         state = StepState(
             motion, drive, tyre_load, load_element(z, Z.driver), car, refs, nominal_motion
         )
-        for j in range(last):
-            before = state.motion
+        for j in range(n_run):
+            motion_before = state.motion
             draws, next_steer = read_draws(window, j), load_element(window, WINDOW.steer, j)
             state, measured = integrate_tick(
                 params, N_z, added, state, tick, draws, next_steer, variant
@@ -115,17 +115,17 @@ def integrate_step(
             write(window, state.motion, WINDOW.track, j)
             write(window, measured.cost_inputs, WINDOW.cost_inputs, j)
             is_lost = any_lane(measured.lost)
-            if is_lost or any_lane(tick >= task.duration) or j + 1 == last:
+            if is_lost or any_lane(tick >= task.duration) or j + 1 == n_run:
                 cost, done, failed = evaluate_cost(window, j + 1, 0.0 * N_z, params, variant)
                 if not is_single and (is_lost or failed or done < n):
                     return 0
-                last = done
-                if done <= j:  # the car was no longer running: once more, and only so far
+                n_run = done
+                if done <= j:  # a tick before this one failed: integrate anew, up to that one
                     break
                 tick_cost = read(window, TICK_COST, j)
                 motion, beta, refs = state.motion, tick_cost.beta, measured.refs
-                if is_lost:  # the last that is fit for `info`
-                    motion, beta, refs = before, 0.0 * cost, (0.0 * cost, 0.0 * cost)
+                if is_lost:  # the last motion that is finite, for `info`
+                    motion, beta, refs = motion_before, 0.0 * cost, (0.0 * cost, 0.0 * cost)
                 write(z, motion, Z.motion)
                 failure = select_failure(measured.lost, tick_cost.spun != 0.0, tick_cost.off != 0.0)
                 write_final_state(
@@ -164,7 +164,7 @@ def finish_step(row: EpisodeArrays, n: int, done: int, bounds: Any, window: Any)
 
 @noinline
 def finish_slow_sensors(row: EpisodeArrays, done: int, k: int, bounds: Any, window: Any) -> None:
-    """Do slow sensors and report of a step of `done` ticks; their entries begin at k."""
+    """Do slow sensors and report of a step of `done` ticks; k is their first observation entry."""
     _finish_report(row, k, sample_slow_ticks(row, 0, done, 0, done, window), bounds)
 
 
@@ -174,13 +174,13 @@ def sample_slow_ticks(
 ) -> int:
     """Sample the slow sensors at ticks first to last - 1 of a step's `done`.
 
-    `count` is the number of packets before; returns the number then.
+    `count` is the number of packets delivered before; returns the number delivered by then.
     """
     z = row.z
-    before = z[Z.clock.tick] - done
-    tick = find_next_due(z, before + first)
-    while tick <= before + last:
-        j = int(tick - before) - 1
+    start_tick = z[Z.clock.tick] - done
+    tick = find_next_due(z, start_tick + first)
+    while tick <= start_tick + last:
+        j = int(tick - start_tick) - 1
         count = sample_slow_sensors(row, read(window, WINDOW.track, j), tick, count)
         tick = find_next_due(z, tick)
     return count
@@ -218,12 +218,13 @@ def _finish_report(row: EpisodeArrays, k: int, count: int, bounds: Any) -> None:
 @jit
 def clip_action(action: Any) -> tuple[float, float]:
     """Clip (yaw moment, added steering) of an action to +-1; NaN where it is not finite."""
-    share = float(action[0])  # in plain Python a float32 would make float32 of all that follows
-    turn = float(action[1]) if len(action) > 1 else 0.0
-    total = share + turn
-    if total - total != 0.0:
+    # in plain Python a float32 would make float32 of all that follows
+    yaw_share = float(action[0])
+    steer_share = float(action[1]) if len(action) > 1 else 0.0
+    total = yaw_share + steer_share
+    if total - total != 0.0:  # not finite
         return total - total, total - total
-    return clip(share, -1.0, 1.0), clip(turn, -1.0, 1.0)
+    return clip(yaw_share, -1.0, 1.0), clip(steer_share, -1.0, 1.0)
 
 
 @jit

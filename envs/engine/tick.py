@@ -44,14 +44,14 @@ _NO_LAG, _ONE_LAG = range(2)  # 2: both lag
 class StepVariant(NamedTuple):
     """Integers that choose a tick's code, the same for all cars computed together."""
 
-    small_angle: int
-    law: int
-    reference: int
-    roll: int
+    small_angle: int  # 1: the small-angle plant
+    law: int  # place in `TYRE_LAWS`
+    reference: int  # place in `REFERENCES`
+    roll: int  # 1: the body rolls
     has_driver: int  # the driver reacts to the car
     lag: int  # how many of motors and steering lag
     has_load_shift: int  # 1 where the lateral acceleration shifts load between the wheels
-    road: int  # of `scenarios.road.ROADS`
+    road: int  # place in `scenarios.road.ROADS`
 
 
 class StepParams(NamedTuple):
@@ -89,14 +89,14 @@ class AppliedInputs(NamedTuple):
     """Mean inputs over a tick; the first six are columns of `Fast`, from `steer` on."""
 
     steer: Any  # rad, front wheels
-    T_l: Any  # N m
-    T_r: Any
-    driver: Any  # rad, the driver's command
-    a_x: Any  # m/s2, the driver's command
+    T_l: Any  # N m, left motor
+    T_r: Any  # N m, right motor
+    driver: Any  # rad, the driver's steering command
+    a_x: Any  # m/s2, the driver's acceleration command
     curvature: Any  # 1/m, the road's at the car
     added: Any  # rad, the part of steer that was added to the driver's
     moment: Any  # N m, yaw moment of both motors
-    effort: Any  # its fraction of full scale
+    effort: Any  # the yaw moment as a fraction of full scale
 
 
 class _PlantInputs(NamedTuple):
@@ -104,19 +104,19 @@ class _PlantInputs(NamedTuple):
 
     steer: Any  # rad, command to the front wheels
     T_l: Any  # N m, command to the left motor
-    T_r: Any
-    disturbance: Any
-    applied: Any
-    drive: Any  # at the tick's end
+    T_r: Any  # N m, command to the right motor
+    disturbance: Any  # `DisturbanceForces`
+    applied: Any  # `AppliedInputs`
+    drive: Any  # `ActuatorState` at the tick's end
 
 
 class Measurements(NamedTuple):
     """Sensors at the end of a tick."""
 
     row: Any  # the fast sensors, columns as in `Fast`
-    refs: Any
-    steer: Any  # rad, N m: of `AppliedInputs`
-    moment: Any
+    refs: Any  # rad, rad/s, the references of beta and gamma
+    steer: Any  # rad, `AppliedInputs.steer`
+    moment: Any  # N m, `AppliedInputs.moment`
     lost: Any  # whether a number is not finite
     cost_inputs: CostInputs
 
@@ -127,7 +127,7 @@ def apply_tyre_change(car: Any, change: Any, is_changed: Any) -> Any:
     C_f = select(is_changed, car.C_f * change.front, car.C_f)
     C_r = select(is_changed, car.C_r * change.rear, car.C_r)
     new_stiffness = (C_f, C_r)
-    return CarParams(*(car[:4] + new_stiffness + car[6:]))
+    return CarParams(*(car[:4] + new_stiffness + car[6:]))  # fields 4 and 5
 
 
 @inline
@@ -181,7 +181,7 @@ def _follow_nominal_path(
     turn_rate, nominal_motion = step_nominal_car(
         state.nominal_motion, state.driver, speed, params.nominal_car
     )
-    road, turn_part = params.road, (turn_rate,)
+    road, turn_part = params.road, (turn_rate,)  # `turn` is the road's field 5, `road` field 1
     road_part = (RoadParams(*(road[:5] + turn_part)),)
     return StepParams(*(params[:1] + road_part + params[2:])), nominal_motion
 
@@ -267,7 +267,8 @@ def measure_tick(
     steady = compute_reference(driver, v, params.target, variant.reference)
     refs = filter_reference(refs_before, steady, params.target, variant.reference)
     size = motion.v_x * motion.v_x + motion.v_y * motion.v_y + motion.gamma * motion.gamma
-    finite = size + motion.psi + motion.Y + motion.phi  # squares: the references take them too
+    # squares: the references take them too, so what overflows there is lost as well
+    finite = size + motion.psi + motion.Y + motion.phi
     measured = Measurements(
         row, refs, applied.steer, applied.moment, finite - finite != 0.0,
         CostInputs(refs[0], refs[1], applied.effort, applied.added),

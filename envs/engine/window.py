@@ -35,19 +35,19 @@ from .layout import PARAMS_WIDTH, P, Z
 class CostInputs(NamedTuple):
     """Inputs of a tick's cost besides the motion at its end."""
 
-    beta_ref: Any
-    gamma_ref: Any
-    effort: Any  # of `AppliedInputs`
-    added: Any
+    beta_ref: Any  # rad
+    gamma_ref: Any  # rad/s
+    effort: Any  # yaw moment as a fraction of full scale
+    added: Any  # rad, added steering
 
 
 class _TickCost(NamedTuple):
     """Cost and failures of a tick."""
 
-    cost: Any  # per second
-    beta: Any
+    cost: Any  # 1/s, cost rate
+    beta: Any  # rad
     spun: Any  # whether the car spins
-    off: Any  # or has left the road
+    off: Any  # whether it has left the road
 
 
 class _StepWindow(NamedTuple):
@@ -55,7 +55,7 @@ class _StepWindow(NamedTuple):
 
     inertial: Annotated[tuple[Any, ...], 4]
     wheels: Annotated[tuple[Any, ...], 4]
-    steer: Any
+    steer: Any  # rad, the profile's
     track: Motion
     cost_inputs: CostInputs
 

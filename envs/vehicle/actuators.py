@@ -11,10 +11,10 @@ from .tyres import MIN_SPEED
 class Lag(NamedTuple):
     """Remaining fractions of a deviation from the command within a tick; all zero without lag."""
 
-    start: Any
+    start: Any  # 1, at the tick's start
     middle: Any
     end: Any
-    mean: Any  # Simpson's mean over the tick, which the record carries
+    mean: Any  # mean over the tick by Simpson's rule; the record has the inputs of this mean
 
 
 def make_lag(time_constant: float, tick: float) -> Lag:

@@ -18,28 +18,28 @@ from .tyres import MIN_SPEED, compute_tyre_forces
 class CarParams(NamedTuple):
     """The true vehicle of an episode in SI units; letters as in the papers, stiffness per tyre."""
 
-    m: Any
-    I: Any  # noqa: E741  the papers' letter
-    l_f: Any
-    l_r: Any
-    C_f: Any
-    C_r: Any
-    d_f: Any
-    d_r: Any
-    r: Any
-    T_max: Any
-    mu: Any  # under the left wheels
-    l_pre: Any
-    S: Any  # kg m, M_s h_s
-    I_x: Any
-    K_x: Any
-    C_x: Any
-    h: Any
-    forward: Any  # m, the GPS antenna from the centre of gravity
-    left: Any  # m
-    mu_r: Any  # under the right wheels
-    P: Any  # W, of one motor; 0: no limit
-    h_x: Any  # m, at which drive force moves load between the axles
+    m: Any  # kg
+    I: Any  # noqa: E741  kg m2, yaw inertia; the papers' letter
+    l_f: Any  # m, from the centre of gravity to the front axle
+    l_r: Any  # m, to the rear axle
+    C_f: Any  # N/rad, cornering stiffness of a front tyre
+    C_r: Any  # N/rad, of a rear tyre
+    d_f: Any  # m, front track
+    d_r: Any  # m, rear track
+    r: Any  # m, wheel radius
+    T_max: Any  # N m, of one motor
+    mu: Any  # friction under the left wheels
+    l_pre: Any  # m, preview distance of the camera
+    S: Any  # kg m, M_s h_s: sprung mass times its arm to the roll axis
+    I_x: Any  # kg m2, roll inertia
+    K_x: Any  # N m/rad, roll stiffness
+    C_x: Any  # N m s/rad, roll damping
+    h: Any  # m, height of the centre of gravity
+    forward: Any  # m, the GPS antenna ahead of the centre of gravity
+    left: Any  # m, the GPS antenna left of the centre of gravity
+    mu_r: Any  # friction under the right wheels
+    P: Any  # W, power limit of one motor; 0: no limit
+    h_x: Any  # m, height by which drive force moves load between the axles
 
 
 class Motion(NamedTuple):
@@ -66,11 +66,12 @@ class RoadParams(NamedTuple):
     ramp: Any  # m, positive
     lateral: Any = 0.0  # m/s2, g sin(bank), left side up positive
     longitudinal: Any = 0.0  # m/s2, g sin(grade), uphill positive
-    turn: Any = 0.0  # rad/s, of its direction beside the car, where it is laid tick by tick
+    turn: Any = 0.0  # rad/s, turning rate of its direction where it is laid tick by tick
 
 
 @jit
 def _compute_ramp(road: Any, s: Any) -> Any:
+    """Compute the fraction of curvature, bank and grade that is reached at s (m)."""
     return minimum(maximum((s - road.start) * (1.0 / road.ramp), 0.0), 1.0)
 
 
@@ -108,8 +109,8 @@ def compute_car_curvature(motion: Any, road: Any) -> Any:
 @inline
 def _rotate_gravity(road: Any, s: Any, sin_r: Any, cos_r: Any) -> Any:
     """(x, y) of the gravity that a car without roll measures (m/s2), by its heading on the road."""
-    share = _compute_ramp(road, s)
-    g_s, g_n = road.longitudinal * share, road.lateral * share
+    ramp = _compute_ramp(road, s)
+    g_s, g_n = road.longitudinal * ramp, road.lateral * ramp  # along the road, to its left
     return g_s * cos_r + g_n * sin_r, g_n * cos_r - g_s * sin_r
 
 
@@ -200,7 +201,7 @@ def compute_rates(
     if roll or not small_angle:
         dv_x = dv_x + v_y * gamma  # double-layer-gps (4)
     dv_y = F_y * per_m - v_x * gamma - g_y  # tie-vision (1)
-    dgamma = (car.l_f * F_yc - car.l_r * F_yr + N_z + disturbance.N_d) * per_I  # (2)
+    dgamma = (car.l_f * F_yc - car.l_r * F_yr + N_z + disturbance.N_d) * per_I  # tie-vision (2)
     return Velocity(dv_x, dv_y, dgamma, phi_dot, phi_ddot)
 
 

@@ -21,12 +21,12 @@ Array = npt.NDArray[np.float64]
 class Bicycle(NamedTuple):
     """Parameters of the linear bicycle, as `compute_bicycle_coefficients` takes them."""
 
-    m: Any
-    I: Any  # noqa: E741  the papers' letter
-    l_f: Any
-    l_r: Any
-    C_f: Any
-    C_r: Any
+    m: Any  # kg
+    I: Any  # noqa: E741  kg m2, yaw inertia; the papers' letter
+    l_f: Any  # m, from the centre of gravity to the front axle
+    l_r: Any  # m, to the rear axle
+    C_f: Any  # N/rad, cornering stiffness of a front tyre
+    C_r: Any  # N/rad, of a rear tyre
 
 
 @jit
@@ -235,7 +235,7 @@ def make_course_model(vehicle: Vehicle, speed: float) -> LinearModel:
 
 
 def _compute_roll_ratios(vehicle: Vehicle) -> tuple[float, float, float]:
-    """Roll stiffness, damping and M_s h_s over the roll inertia."""
+    """Compute roll stiffness (1/s2), damping (1/s) and M_s h_s (1/m) over the roll inertia."""
     I_x = vehicle.roll_inertia
     return vehicle.roll_stiffness / I_x, vehicle.roll_damping / I_x, vehicle.roll_moment_arm / I_x
 

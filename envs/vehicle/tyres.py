@@ -30,26 +30,26 @@ class TyreInputs(NamedTuple):
 class TyreLoad(NamedTuple):
     """Steering, drive forces and lateral capacities under one instant's inputs."""
 
-    sin_d: Any  # of the front steering angle
-    cos_d: Any
-    steer: Any  # rad
+    sin_d: Any  # sine of the front steering angle
+    cos_d: Any  # its cosine
+    steer: Any  # rad, the angle itself
     F_x: Any  # N, drive force
     N_z: Any  # N m, yaw moment of the motors
     limit_f: Any  # N, lateral capacity of one front tyre, of the left and of the right rear tyre
     limit_l: Any
     limit_r: Any
-    slope_f: Any  # C / 3 F_max of the same tyres, 1/tan
+    slope_f: Any  # C / (3 F_max) of the same tyres
     slope_l: Any
     slope_r: Any
     rear_l: Any  # N, capacity of the left and the right rear tyre in all directions, without roll
     rear_r: Any
-    F_l: Any  # N, drive force that the left and the right motor command
-    F_r: Any
+    F_l: Any  # N, drive force that the left motor commands
+    F_r: Any  # N, that of the right motor
 
 
 @inline
 def _compute_squared_capacity(limit: Any, drive: Any) -> Any:
-    """Squared lateral capacity (N2) of a tyre that also drives: friction circle, at least 5 %."""
+    """Squared lateral capacity (N2) of a tyre that drives: friction circle, at least (5 %)^2."""
     return maximum(limit * limit - drive * drive, 0.0025 * limit * limit)
 
 
@@ -70,7 +70,7 @@ def has_load_shift(small_angle: int, law: int, roll: int) -> int:
 
 @inline
 def _compute_axle_shift(F_l: Any, F_r: Any, rear_l: Any, rear_r: Any, weight: Any, car: Any) -> Any:
-    """Force F_x h / 2 l (N) by which each rear wheel's load grows and each front one's falls."""
+    """Load F_x h_x / (2 l) (N) that drive moves from each front wheel to the rear one behind it."""
     # F_x is within the tyres' standing capacity, so that it does not depend on its own effect.
     # At most nine tenths of an axle's standing load move.
     F_x = minimum(maximum(F_l, 0.0 - rear_l), rear_l) + minimum(maximum(F_r, 0.0 - rear_r), rear_r)
@@ -121,9 +121,9 @@ def compute_tyre_load(inputs: Any, car: Any, small_angle: int, load_shift: int =
 class Tyre(NamedTuple):
     """One tyre at one instant."""
 
-    tangent: Any  # of its slip angle t; of the small-angle plant the angle itself
+    tangent: Any  # t, tangent of its slip angle; on the small-angle plant the angle itself
     limit: Any  # N, F_max: mu F_z, less what the friction circle leaves to the drive force
-    slope: Any  # C / 3 F_max
+    slope: Any  # C / (3 F_max)
 
 
 @jit
@@ -135,7 +135,7 @@ def _linear(tyre: Any, small_angle: int) -> Any:
 
 @jit
 def _fiala(tyre: Any) -> Any:
-    """Lateral force (N) F_max z (3 - 3 |z| + z^2), z = clip(C t / 3 F_max, -1, 1)."""
+    """Lateral force (N) F_max z (3 - 3 |z| + z^2), z = clip(C t / (3 F_max), -1, 1)."""
     # Pacejka, Tire and Vehicle Dynamics, 3
     z = minimum(maximum(tyre.slope * tyre.tangent, -1.0), 1.0)
     return tyre.limit * z * (3.0 - 3.0 * absolute(z) + z * z)
@@ -143,13 +143,13 @@ def _fiala(tyre: Any) -> Any:
 
 @jit
 def _dugoff(tyre: Any) -> Any:
-    """Lateral force (N) C t q (2 - q), q = min(1, F_max / 2 C |t|)."""
+    """Lateral force (N) C t q (2 - q), q = min(1, F_max / (2 C |t|))."""
     # Dugoff, Fancher, Segel, SAE 700377, 1970. With u = C t / F_max it is F_max u up to |u| = 1/2
-    # and F_max (1 - 1 / 4 |u|) from there on, always below the limit.
+    # and F_max (1 - 1 / (4 |u|)) from there on, always below the limit.
     u = 3.0 * (tyre.slope * tyre.tangent)
     size = absolute(u)
-    share = minimum(size, 0.5) + (0.5 - 0.25 / maximum(size, 0.5))
-    return tyre.limit * minimum(maximum(u, 0.0 - share), share)
+    max_ratio = minimum(size, 0.5) + (0.5 - 0.25 / maximum(size, 0.5))
+    return tyre.limit * minimum(maximum(u, 0.0 - max_ratio), max_ratio)
 
 
 @inline
@@ -306,7 +306,7 @@ def _compute_shifted_tyres(motion: Any, load: Any, car: Any, g_y: Any) -> Any:
     left, right = sqrt(square_l), sqrt(square_r)
     sides, squares = relieved * burdened, square_l * square_r
     inv_product = 1.0 / (along_f * along_r * (sides * squares))
-    front = load.slope_f * (along_r * squares * inv_product)  # C_f / 3 F_max of the standing tyre
+    front = load.slope_f * (along_r * squares * inv_product)  # C_f / (3 F_max), standing
     rear = car.C_r * (1.0 / 3.0) * (along_f * sides * inv_product)
     return (
         Tyre(across_f, load.limit_f * relieved, front * burdened),

@@ -149,8 +149,8 @@ def predict_covariance(f: FilterRecord) -> None:
 def correct_scalar(f: FilterRecord, variance: Any, residual: Any) -> None:
     """Correct by one residual whose covariance with the state is `f.PC`.
 
-    P <- P - K s K^T, to which Joseph's form comes down for the optimal gain of a scalar. With
-    products of two entries of P C^T it is symmetric to the last bit.
+    P <- P - K s K^T with the residual's variance s, to which Joseph's form comes down for the
+    optimal gain of a scalar. With products of two entries of P C^T it is symmetric to the last bit.
 
     Args:
         f: Memory of the filter.
@@ -159,7 +159,7 @@ def correct_scalar(f: FilterRecord, variance: Any, residual: Any) -> None:
     """
     N, x, P, PC, gain, step = f.total, f.x, f.P, f.PC, f.gain, vector_width(f.P)
     inverse = 1.0 / variance
-    if f.robust > 0.0:  # Huber's: the noise is what makes it `robust` deviations
+    if f.robust > 0.0:  # Huber: a larger residual's variance grows by deviations / robust
         deviations = absolute(residual) * sqrt(inverse)
         inverse = inverse * select(deviations > f.robust, f.robust / deviations, 1.0)
     for j in range(0, N, step):
@@ -172,7 +172,7 @@ def correct_scalar(f: FilterRecord, variance: Any, residual: Any) -> None:
 
 @jit
 def _update_weight(f: FilterRecord, variance: Any, residual: Any) -> None:
-    """Update the weight of a bank's member by a residual of the given variance."""
+    """Update a bank member's log-likelihood by a normal residual: -(residual^2 / s + log s) / 2."""
     if f.members > 0:
         f.weight -= 0.5 * (residual * residual * (1.0 / variance) + log(variance))
 
@@ -199,7 +199,7 @@ def project(f: FilterRecord, row: Vector) -> Any:
     variance = 0.0
     for k in range(n):
         h = load_element(row, k)
-        if any_lane(h != 0.0):  # no sum waits for nothing
+        if any_lane(h != 0.0):  # a zero would only lengthen the chain of sums
             variance = variance + h * load_element(PC, k)
     return variance
 

@@ -206,8 +206,8 @@ def _update_second_layer(
     """Correct the second layer by a packet as a velocity: v_x = V cos(beta), v_y = V sin(beta).
 
     double-layer-gps (8)-(9), with the first layer's sideslip angle as it was predicted for the
-    captured tick. The noise along is the speed's, after the table of HDOP; the one across is that
-    of the angle, (V sigma_beta)^2, and of the speed, (sigma_V sin(beta))^2.
+    captured tick. The variance of v_x is sigma_V^2 times the squared factor of the HDOP; that of
+    v_y is (V sigma_beta)^2 + (sigma_V sin(beta))^2, in (m/s)^2.
     """
     s, captured = int(packet[PACKET.sensor]), int(packet[PACKET.captured])
     beta = first.x[BETA]
@@ -231,7 +231,7 @@ def _update_second_layer(
 
 @jit
 def _first_member(layers: FilterRecords) -> int:
-    """Return the first layer that measures: 1 where there is a bank, else 0."""
+    """Return the index of the first layer that takes measurements: 1 in a bank, else 0."""
     return 1 if layers[0].members > 0 else 0
 
 
@@ -335,7 +335,7 @@ def advance(
             read_fast_row(layers[layer], fast[j], wheel_speed)
             run_tick(layers[layer], gains)
         while position < count and not (f.tick < packets[position, PACKET.arrived] <= last):
-            # from beyond the last row: counted here
+            # also one that arrives after the last row, which `process_packet` counts
             was_used = process_packet(f, gains, packets[position])
             if len(nis) > 0:
                 nis[position] = f.nis
@@ -350,7 +350,7 @@ def advance(
             compute_mixture(layers)
         if len(X) > 0:
             _write_row(layers, gains, j, X, S)
-    f.counts[COUNTERS.future] += count - position  # of a call without rows
+    f.counts[COUNTERS.future] += count - position  # packets of a call without rows
     return rows
 
 

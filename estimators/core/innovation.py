@@ -31,7 +31,7 @@ NONE, PSEUDO, DUAL_RATE = range(3)
 """Codes of the field `between`, the rule between samples."""
 
 DIRECT = -1  # a sample measures the states as they are
-DROPPED = -2
+DROPPED = -2  # it is not used
 STORED_ONE = -3  # it is compared with what was stored at its capture
 
 
@@ -185,7 +185,7 @@ def find_clone(f: FilterRecord, s: int, captured: int) -> int:
     return target
 
 
-_AGREEMENT_SD = 4.0  # standard deviations
+_AGREEMENT_SD = 4.0  # standard deviations within which two gated residuals agree
 
 
 @jit
@@ -205,14 +205,14 @@ def interpolate_hdop(f: FilterRecord, s: int, packet: Vector) -> Any:
     if f.knots == 0 or f.hdop_column[s] == 0:
         return 1.0
     hdop, last = packet[f.hdop_column[s]], f.knots - 1
-    if hdop - hdop != 0.0:
+    if hdop - hdop != 0.0:  # not finite
         return 1.0
     if hdop <= f.hdop[0]:
         return f.hdop_factor[0]
     for i in range(last):
         if hdop <= f.hdop[i + 1]:
-            share = (hdop - f.hdop[i]) / (f.hdop[i + 1] - f.hdop[i])
-            return f.hdop_factor[i] + share * (f.hdop_factor[i + 1] - f.hdop_factor[i])
+            position = (hdop - f.hdop[i]) / (f.hdop[i + 1] - f.hdop[i])
+            return f.hdop_factor[i] + position * (f.hdop_factor[i + 1] - f.hdop_factor[i])
     return f.hdop_factor[last]
 
 
@@ -284,7 +284,8 @@ def _is_consistent(f: FilterRecord, s: int) -> bool:
         if f.angle[s, i] == 1:
             difference = wrap(difference)
         for j in range(i + 1):
-            row_variance += f.S[i, j] * f.S[i, j]  # Cholesky's factor
+            row_variance += f.S[i, j] * f.S[i, j]  # f.S holds Cholesky's factor
+        # a difference of two residuals has twice the variance of one
         if difference * difference > 2.0 * _AGREEMENT_SD * _AGREEMENT_SD * row_variance:
             return False
     return True
@@ -292,7 +293,7 @@ def _is_consistent(f: FilterRecord, s: int) -> bool:
 
 @jit
 def _is_observed_elsewhere(f: FilterRecord, s: int, state: int) -> bool:
-    """Return whether another sensor that measures a state was believed since s was doubted."""
+    """Return whether another sensor of a state was accepted since s was first gated."""
     for other in range(N_SLOW):
         if other != s and f.rows[other] > 0 and f.believed[other] >= f.doubted[s]:
             for i in range(f.rows[other]):
@@ -358,7 +359,8 @@ def check_sample(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
     if f.wary == 0:
         return passed
     if not passed and f.believed[s] >= 0:
-        if f.members > 0:  # as unlikely as the gate is high, or a member gains by refusing
+        # a member that refuses would gain: it loses (gate + log det S) / 2, as at the gate
+        if f.members > 0:
             f.weight -= 0.5 * f.gate[f.rows[s]]
             for i in range(f.rows[s]):
                 f.weight -= log(f.S[i, i])

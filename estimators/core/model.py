@@ -49,16 +49,17 @@ def _build_lateral(f: FilterRecord, V: Any) -> None:
 def _write_body(f: FilterRecord, V: Any) -> None:
     """Write phi, phi_rate and their effect on beta: double-layer-gps (1), (3), solved for phi''."""
     A, B, i = f.A, f.B, f.rolling
-    share = 1.0 / (1.0 - f.roll_arm * f.sway)
-    lift, lag = share * f.roll_arm, f.sway / V
-    stiffness = share * (f.roll_stiffness - f.roll_arm * GRAVITY)
-    write_roll(A, B, i, 0, stiffness, share * f.roll_damping, lift * V * B[0, 0])
+    # phi'' enters F_y, hence phi'' itself: with S = M_s h_s all divides by 1 - S^2 / (M I_x)
+    inverse = 1.0 / (1.0 - f.roll_arm * f.sway)
+    lift, beta_per_roll = inverse * f.roll_arm, f.sway / V  # 1/m, s
+    stiffness = inverse * (f.roll_stiffness - f.roll_arm * GRAVITY)
+    write_roll(A, B, i, 0, stiffness, inverse * f.roll_damping, lift * V * B[0, 0])
     A[i + 1, BETA], A[i + 1, GAMMA] = lift * V * A[0, BETA], lift * V * (A[0, GAMMA] + 1.0)
     B[i + 1, N_INPUTS] = lift * V * B[0, N_INPUTS]  # the force that pushes beta
     for j in range(f.dense):
-        A[0, j] += lag * A[i + 1, j]
-    B[0, 0] += lag * B[i + 1, 0]
-    B[0, N_INPUTS] += lag * B[i + 1, N_INPUTS]
+        A[0, j] += beta_per_roll * A[i + 1, j]
+    B[0, 0] += beta_per_roll * B[i + 1, 0]
+    B[0, N_INPUTS] += beta_per_roll * B[i + 1, N_INPUTS]
 
 
 @jit
@@ -68,7 +69,7 @@ def _write_accel(f: FilterRecord, V: Any) -> None:
     for j in range(f.dense):
         row[j] = V * f.A[0, j]
     row[GAMMA] = V * (f.A[0, GAMMA] + 1.0)
-    if f.pushed[0] >= 0:  # what comes first behind is no bias
+    if f.pushed[0] >= 0:  # the first state behind the dense ones is no bias
         row[f.dense] = V * f.B[0, N_INPUTS]
     if f.rolling > 0:
         row[f.rolling] += GRAVITY
@@ -89,7 +90,7 @@ def _compute_rates(f: FilterRecord, V: Any, front: Any, rear: Any) -> Any:
 @jit
 def _write_tyres(f: FilterRecord, V: Any) -> None:
     """Write the estimated tyres' columns of B, besides their slope by slip, and f.push."""
-    for j in range(3):  # both factors, then the grip
+    for j in range(3):  # the factors of front and rear stiffness, then 1/friction
         if j < 2 or f.grip > 0:
             front = f.per_tyre[0, j // 2] if j != 1 else 0.0
             rear = f.per_tyre[1, j // 2] if j != 0 else 0.0
@@ -185,10 +186,10 @@ def discretise(f: FilterRecord) -> None:
             store8(Phi, load8(one, i, j), i, j)
     for order in range(15 if norm > 0.05 else 9, 1, -1):  # Horner: h (I + A h / 2 (I + ...))
         _multiply(f.A, Phi, T, n, n)
-        share = h / order
+        factor = h / order
         for i in range(n):
             for j in range(0, n, 8):
-                store8(Phi, load8(T, i, j) * share + load8(one, i, j), i, j)
+                store8(Phi, load8(T, i, j) * factor + load8(one, i, j), i, j)
     for _ in range(doublings):  # the integral over 2 h is (I + e^(A h)) times that over h
         _multiply(f.A, Phi, E, n, n)
         for i in range(n):
@@ -288,7 +289,7 @@ def build_model(f: FilterRecord, speed: Any, turning: Any) -> None:
             f.r[s, i] = compute_row_variance(f, s, i, V)
 
 
-_MIN_SLOPE = 0.02  # of a tyre's slope, where it slides
+_MIN_SLOPE = 0.02  # least slope by slip of a sliding tyre, as a fraction of its stiffness
 
 
 @jit
@@ -296,7 +297,7 @@ def compute_axle_force(stiffness: Any, load: Any, alpha: Any, factor: Any, grip:
     """Compute an axle's lateral force and its slopes: Fiala's law with friction 1/grip.
 
     F = C s alpha (1 - |z| + z^2 / 3), z = C s alpha grip / (3 F_z) within +-1; at grip 0 it is
-    linear.
+    linear. Source: Pacejka, Tire and Vehicle Dynamics, 3.
 
     Args:
         stiffness: Nominal cornering stiffness of the axle, C (N/rad).
@@ -311,22 +312,22 @@ def compute_axle_force(stiffness: Any, load: Any, alpha: Any, factor: Any, grip:
     total_stiffness = stiffness * factor
     slip_ratio = total_stiffness * absolute(alpha) / (3.0 * load)
     z = minimum(slip_ratio * grip, 1.0)
-    share = 1.0 - z + z * z * (1.0 / 3.0)
-    if z >= 1.0:  # it slides: F_z / grip
+    saturation = 1.0 - z + z * z * (1.0 / 3.0)
+    if z >= 1.0:  # it slides: |F| = F_z / grip
         force = load / grip if alpha > 0.0 else 0.0 - load / grip
         return force, _MIN_SLOPE * total_stiffness, 0.0, 0.0 - force / grip
     slope = (1.0 - z) * (1.0 - z)
     grip_slope = total_stiffness * alpha * slip_ratio * (z * (2.0 / 3.0) - 1.0)
     return (
-        total_stiffness * alpha * share,
+        total_stiffness * alpha * saturation,
         maximum(slope, _MIN_SLOPE) * total_stiffness,
         stiffness * alpha * slope,
         grip_slope,
     )
 
 
-MAX_NUMBER = 1e15  # of a number that a filter takes: below it, whole floats are exact as int
-_SPEED_TOLERANCE = 0.005  # the model is built anew where the speed moved by this share
+MAX_NUMBER = 1e15  # bound of the numbers that a filter takes: whole floats below are exact as int
+_SPEED_TOLERANCE = 0.005  # fraction by which the speed moves until the model is built anew
 
 
 @jit

@@ -14,11 +14,11 @@ from ...envs.numerics.simd8 import load8, store8
 from .innovation import inflate_covariance
 from .record import FilterRecord, FilterRecords
 
-MIN_LOG_WEIGHT = -60.0  # of a member's weight, below the likeliest
+MIN_LOG_WEIGHT = -60.0  # least weight of a member, a logarithm, relative to the likeliest
 CALM, GUSTY, CHANGED, _SETTLING = range(1, 5)
 """Layers of the members that interact."""
-_GUST_RATE, _LULL_RATE = 0.03, 0.3  # 1/s, of gusts that begin and end
-# 1/s, of tyres: into CHANGED, SETTLING, CALM
+_GUST_RATE, _LULL_RATE = 0.03, 0.3  # 1/s, rates at which gusts begin and end
+# 1/s, rates of the transitions into CHANGED, _SETTLING and CALM
 _CHANGE_RATE, _SETTLE_RATE, _TRUST_RATE = 0.1, 2.0, 0.3
 
 
@@ -44,7 +44,7 @@ def _set_level(f: FilterRecord, i: int, level: Any) -> None:
 def replace_least_likely(layers: FilterRecords) -> None:
     """Replace the least likely member by the likeliest with tyres that may have changed.
 
-    Its tyres walk until the next one begins, since the change may come later. Where members differ
+    Its tyres walk until the next replacement, since the change may come later. Where members differ
     in the level of their disturbances, a place in the bank stays at its own.
 
     Args:
@@ -60,7 +60,7 @@ def replace_least_likely(layers: FilterRecords) -> None:
     force, moment, odds, i = f.level[0], f.level[1], f.odds, f.dense
     first = f.prior[i, i], f.prior[i + 1, i + 1]
     layers[worst] = layers[best]
-    f.odds = odds  # with which the place, not the member, begins
+    f.odds = odds  # the initial weight belongs to the place, not to the copied member
     if f.forces == 1:
         _set_level(f, 0, force)
         _set_level(f, 1, moment)
@@ -81,7 +81,7 @@ def _copy_moments(source: FilterRecord, target: FilterRecord) -> None:
 
 @jit
 def _split_weight(source: FilterRecord, share: Any) -> Any:
-    """Split off the probability (a member's `weight`, here) that leaves it, and return it."""
+    """Split off and return a fraction of a member's probability, which its `weight` is here."""
     moved = share * source.weight
     source.weight -= moved
     return moved
@@ -89,15 +89,15 @@ def _split_weight(source: FilterRecord, share: Any) -> Any:
 
 @jit
 def _merge(source: FilterRecord, probability: Any, target: FilterRecord) -> Any:
-    """Merge a source's mean and covariance into a member's; return the source's fraction."""
+    """Merge a source's moments into a member's as a mixture's; return the source's fraction."""
     target.weight += probability
     share = probability / target.weight
     product = share * (1.0 - share)
     for j in range(0, target.total, 8):
         offset = load8(source.x, j) - load8(target.x, j)
         for i in range(target.total):
-            entry, spread = load8(target.P, i, j), (source.x[i] - target.x[i]) * offset * product
-            store8(target.P, entry + (load8(source.P, i, j) - entry) * share + spread, i, j)
+            entry, between = load8(target.P, i, j), (source.x[i] - target.x[i]) * offset * product
+            store8(target.P, entry + (load8(source.P, i, j) - entry) * share + between, i, j)
     for i in range(target.total):
         target.x[i] += share * (source.x[i] - target.x[i])
     return share
@@ -112,7 +112,7 @@ def _remove_gust(f: FilterRecord) -> None:
         for j in range(f.total):
             f.P[index, j] = 0.0
             f.P[j, index] = 0.0
-        f.P[index, index] = f.q_known[i] / f.q_share
+        f.P[index, index] = f.q_known[i] / f.q_share  # the stationary variance
 
 
 @noinline
@@ -178,8 +178,8 @@ def compute_mixture(layers: FilterRecords) -> None:
         for j in range(0, n, 8):
             offset = load8(f.x, j) - load8(mixture.x, j)
             for i in range(n):
-                spread = load8(f.P, i, j) + (f.x[i] - mixture.x[i]) * offset
-                store8(mixture.P, load8(mixture.P, i, j) + share * spread, i, j)
+                moment = load8(f.P, i, j) + (f.x[i] - mixture.x[i]) * offset
+                store8(mixture.P, load8(mixture.P, i, j) + share * moment, i, j)
     mixture.tick, mixture.speed, mixture.nis = likeliest.tick, likeliest.speed, layers[1].nis
     for i in range(len(mixture.counts)):
         mixture.counts[i] = layers[1].counts[i]

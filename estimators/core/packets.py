@@ -164,8 +164,8 @@ def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: in
             correct_fast(f, gains)
             if (tick - f.start) % SNAPSHOT_INTERVAL == 0:
                 _store_snapshot(f, _find_slot(f, tick))
-        f.stretch = 1.0  # what was restored is of this tick's speed
-        # no snapshot was changed before
+        f.stretch = 1.0  # the restored beta belongs to this tick's speed
+        # no snapshot was changed before a refusal
         if not _apply_tick_samples(f, gains, tick, count, new_place):
             passed = False
             break

@@ -26,8 +26,8 @@ from .model import (
 )
 from .record import CAR, COUNTERS, N_CORE, N_SLOW, FilterRecord, Vector
 
-_FACTOR_LIMITS = (0.2, 3.0)
-_MAX_INVERSE_FRICTION = 4.0  # of the reciprocal of friction
+_FACTOR_LIMITS = (0.2, 3.0)  # limits of the estimated factors on the stiffness
+_MAX_INVERSE_FRICTION = 4.0  # limit of the estimated reciprocal of friction
 
 
 @jit
@@ -51,7 +51,8 @@ def compute_signal(row: Vector, column: Vector, factor: Vector) -> Any:
 def _estimate_noise(f: FilterRecord, accel_y: float) -> None:
     """Estimate the variance of a_y from its second differences, which motion hardly has."""
     second_difference = accel_y - 2.0 * f.y_past[0] + f.y_past[1]
-    if is_finite(second_difference):  # white noise gives it 6 r; far beyond counts as 9 r
+    # white noise of variance r gives it 1 + 4 + 1 = 6 r; an outlier counts as 9 r
+    if is_finite(second_difference):
         r = f.r_fast[f.accel_row]
         sample_variance = minimum(second_difference * second_difference * (1.0 / 6.0), 9.0 * r)
         f.r_fast[f.accel_row] = maximum(r + f.r_share * (sample_variance - r), f.r_told)
@@ -150,7 +151,7 @@ def linearise(f: FilterRecord, steer: Any) -> None:
         grip = minimum(maximum(x[f.grip], 0.0), _MAX_INVERSE_FRICTION)
         x[f.grip] = grip
     beta, gamma = x[0], x[1]
-    push, moves = 0.0, f.speed > MIN_SPEED
+    total_force, moves = 0.0, f.speed > MIN_SPEED
     _set_random_walk(f, moves)
     for i in range(2):
         arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
@@ -160,13 +161,13 @@ def linearise(f: FilterRecord, steer: Any) -> None:
             f.stiffness[i], f.load[i], alpha, factor, grip
         )
         f.car[CAR.front_stiffness + i] = 0.5 * slope
-        if not moves:  # nothing of the tyres is seen
+        if not moves:  # the tyres are unobservable
             per_factor, per_grip = 0.0, 0.0
         f.per_tyre[i, 0], f.per_tyre[i, 1] = per_factor, per_grip
         f.rest[i] = force - slope * alpha - per_factor * factor - per_grip * grip
-        push += absolute(force)
+        total_force += absolute(force)
     if f.model_error > 0.0:
-        force_error = f.model_error * push
+        force_error = f.model_error * total_force
         moment_error = 0.5 * (f.car[CAR.front_arm] + f.car[CAR.rear_arm]) * force_error
         f.Q[f.dense, f.dense] = f.q_known[0] + f.q_share * force_error * force_error
         f.Q[f.dense + 1, f.dense + 1] = f.q_known[1] + f.q_share * moment_error * moment_error

@@ -17,16 +17,16 @@ from ...envs.record import PACKET_WIDTH
 from ...envs.sensors.slow import SLOW_NAMES
 
 N_CORE = 16  # states of a model; in whole eights, as `N_TOTAL`
-N_INPUTS = 4  # that drive it
+N_INPUTS = 4  # inputs that drive a model
 N_FAST = 3  # measurements of a fast row
-N_DRIVERS = N_CORE + 8  # columns of all that drives a state
-N_SLOW = len(SLOW_NAMES)  # sensors
-N_ROWS = 4  # of C, of one slow sensor
-N_FRAMES = 8  # of one slow sensor, captured and not here yet
+N_DRIVERS = N_CORE + 8  # columns of B: inputs, then disturbances
+N_SLOW = len(SLOW_NAMES)  # slow sensors
+N_ROWS = 4  # rows of C of one slow sensor
+N_FRAMES = 8  # frames of one slow sensor that are captured and have not arrived
 N_TOTAL = 32  # states and their clones
 N_STAMPS = 16  # frames whose stamps are stored, to know a duplicate
 N_WAITING = 8  # packets that wait for the next step of a single-rate filter
-N_KNOTS = 8  # of the table of HDOP
+N_KNOTS = 8  # knots of the table of HDOP
 WINDOW = 512  # ticks of history (rules "stored", "constant", "buffer")
 SNAPSHOT_INTERVAL = 16  # ticks between two snapshots of the rule "buffer"
 N_SNAPSHOTS = WINDOW // SNAPSHOT_INTERVAL
@@ -51,7 +51,7 @@ class SkipCounters(NamedTuple):
     future: int = 2  # captured or arriving after "now"
     invalid: int = 3  # not finite or beyond all measure, in a packet or a fast row
     poor: int = 4  # quality 0, or too few satellites
-    unknown: int = 5  # no sensor of ours, or a stamp that is no tick of the sensor's clock
+    unknown: int = 5  # no sensor of the filter, or a stamp that is no tick of the sensor's clock
     gated: int = 6  # an innovation that chi-square calls impossible
     stuck: int = 7  # every value as in the sensor's last packet, of an earlier tick, while it moves
 
@@ -65,9 +65,9 @@ class CarIndex(NamedTuple):
     mass: int = 0  # kg
     yaw_inertia: int = 1  # kg m2
     front_arm: int = 2  # m
-    rear_arm: int = 3
-    front_stiffness: int = 4  # N/rad, of a tyre
-    rear_stiffness: int = 5
+    rear_arm: int = 3  # m
+    front_stiffness: int = 4  # N/rad, of a front tyre
+    rear_stiffness: int = 5  # N/rad, of a rear tyre
 
 
 COUNTERS, CAR = SkipCounters(), CarIndex()
@@ -82,8 +82,8 @@ _FIELDS = [
     ("delayed", _INT),  # the last dense states that lag behind what the camera sees
     ("total", _INT),  # states and clones
     ("forces", _INT),  # 1: disturbances are a force and a moment; 0: they push states
-    ("pushed", _INT, (N_CORE,)),  # the state that each one behind pushes; -1: none
-    ("banked", _INT),  # which of those behind is the road's bank; -1: none
+    ("pushed", _INT, (N_CORE,)),  # the state that each state behind the dense ones pushes; -1: none
+    ("banked", _INT),  # place of the road's bank behind the dense states; -1: none
     ("rolling", _INT),  # where a bicycle's phi and phi_rate stand; 0: it does not roll
     ("car", _FLOAT, (len(CarIndex._fields),)),
     ("roll_stiffness", _FLOAT),  # K_x / I_x
@@ -91,70 +91,70 @@ _FIELDS = [
     ("roll_arm", _FLOAT),  # M_s h_s / I_x
     ("sway", _FLOAT),  # m, M_s h_s / M
     ("preview", _FLOAT),  # m
-    # tyres that are estimated: `car` has what they give more for more slip, at the present state
+    # tyres that are estimated: `car` has their slopes by slip at the present state
     ("tyres", _INT),  # where the factors of front and rear stiffness stand; 0: they are known
     ("grip", _INT),  # where the reciprocal of friction stands; 0: tyres without a limit
     ("stiffness", _FLOAT, (2,)),  # N/rad, nominal, of the axles
     ("load", _FLOAT, (2,)),  # N, on the axles
-    ("per_tyre", _FLOAT, (2, 2)),  # N, of each axle by its factor, by the grip's state
-    ("rest", _FLOAT, (2,)),  # N, of each axle where all that is linear is zero
-    ("again", _INT),  # ticks between two expansions
-    ("q_tyres", _FLOAT, (3,)),  # variances of a step of the factors and the grip, while it moves
-    ("model_error", _FLOAT),  # share of the axles' forces by which the tyres' law errs
-    ("q_known", _FLOAT, (2,)),  # variances of a step of F_d, N_d without it
-    ("q_share", _FLOAT),  # share of a disturbance's variance that comes in a step
+    ("per_tyre", _FLOAT, (2, 2)),  # N, slopes of each axle's force: by its factor, by 1/friction
+    ("rest", _FLOAT, (2,)),  # N, each axle's force less its linear terms
+    ("again", _INT),  # ticks between two expansions of the tyres' forces
+    ("q_tyres", _FLOAT, (3,)),  # variances of a step of factors and 1/friction, while it moves
+    ("model_error", _FLOAT),  # fraction of the axles' forces by which the tyres' law errs
+    ("q_known", _FLOAT, (2,)),  # variances of a step of F_d, N_d without `model_error`
+    ("q_share", _FLOAT),  # fraction of a disturbance's variance that comes in a step
     ("step", _FLOAT),  # s, the filter's own step
-    ("relax", _FLOAT),  # share by which the delayed states follow in a step
+    ("relax", _FLOAT),  # fraction by which the delayed states follow in a step
     ("A", _FLOAT, (N_CORE, N_CORE)),
     ("B", _FLOAT, (N_CORE, N_DRIVERS)),  # inputs, then disturbances
     ("push", _FLOAT, (N_CORE,)),  # what `rest` adds to dx
     ("G", _FLOAT, (N_CORE, N_CORE)),  # tie-vision (9), rows of the dense states
     ("H", _FLOAT, (N_CORE, N_INPUTS)),
     ("drift", _FLOAT, (N_CORE,)),  # known part of a step, dual-rate (7) u_d, or of tyres
-    ("decay", _FLOAT, (N_CORE,)),  # share of a state that is left after a step
+    ("decay", _FLOAT, (N_CORE,)),  # fraction of a state that is left after a step
     ("GT", _FLOAT, (N_CORE, N_CORE)),  # G and H transposed; zeros beyond the dense states
     ("HT", _FLOAT, (N_INPUTS, N_CORE)),
-    ("keep", _FLOAT, (N_TOTAL,)),  # left after a step: 0 of dense states, 1 of clones
-    ("Q", _FLOAT, (N_CORE, N_CORE)),  # of one step
+    ("keep", _FLOAT, (N_TOTAL,)),  # `decay`, but 0 for dense states and 1 for clones
+    ("Q", _FLOAT, (N_CORE, N_CORE)),  # process noise of one step
     ("prior", _FLOAT, (N_CORE, N_CORE)),  # P at the start
     ("first", _FLOAT, (N_CORE,)),  # x at the start
     ("speed_state", _INT),  # the state that starts at the measured speed; -1: none
     # bank: several filters beside each other, of which the first record is the mixture
     ("members", _INT),  # records behind the mixture; 0: no bank
-    ("weight", _FLOAT),  # of a member: the logarithm of its likelihood
+    ("weight", _FLOAT),  # logarithm of a member's likelihood
     ("odds", _FLOAT),  # its weight at the start
     ("respawn", _INT),  # ticks after which the least likely member begins anew
-    ("hazard", _FLOAT),  # log of the probability of a change within them
-    ("level", _FLOAT, (2,)),  # of a member: its force's and moment's variance over that configured
+    ("hazard", _FLOAT),  # log of the probability that tyres change within `respawn`
+    ("level", _FLOAT, (2,)),  # a member's variances of force, moment over those configured
     ("spread", _FLOAT),  # variance by which a new member forgets the tyres
     ("fresh", _FLOAT),  # variance of a step of a new member's tyres, until the next one begins
-    ("alert", _FLOAT),  # what `fresh` is then
+    ("alert", _FLOAT),  # value of `fresh` for a new member
     ("burst", _FLOAT, (2,)),  # variances of a gust's force, moment; 0: members do not interact
     # fast rows: inputs and fast measurements: sums of two columns of the fast row
     ("inputs", _INT),
     ("u_column", _INT, (N_INPUTS, 2)),
     ("u_factor", _FLOAT, (N_INPUTS, 2)),
     ("steer_jump", _FLOAT),  # rad, a step of the first input that a row must confirm; 0: none
-    ("steer_before", _FLOAT),  # rad, of the row before, as it came
+    ("steer_before", _FLOAT),  # rad, steering angle of the row before, as it came
     ("fasts", _INT),
     ("y_column", _INT, (N_FAST, 2)),
     ("y_factor", _FLOAT, (N_FAST, 2)),
     ("C_fast", _FLOAT, (N_FAST, N_CORE)),
     ("D_fast", _FLOAT, (N_FAST, N_INPUTS)),
     ("accel_row", _INT),  # the fast measurement that is a bicycle's a_y; 0: none
-    ("scaled", _INT),  # where the error of its scale stands; 0: it has none
+    ("scaled", _INT),  # where the error of the accelerometer's scale stands; 0: none
     ("rest_fast", _FLOAT, (N_FAST,)),  # what is measured where states and inputs are zero
-    ("r_fast", _FLOAT, (N_FAST,)),  # variances
-    ("r_told", _FLOAT),  # (m/s2)^2, of a_y, as configured: the least
-    ("r_share", _FLOAT),  # of a new second difference in the variance of a_y; 0: as configured
+    ("r_fast", _FLOAT, (N_FAST,)),  # variances of the fast measurements
+    ("r_told", _FLOAT),  # (m/s2)^2, configured variance of a_y, the least it may have
+    ("r_share", _FLOAT),  # weight of a new second difference in a_y's variance; 0: fixed
     ("y_past", _FLOAT, (2,)),  # a_y of the two rows before
     ("robust", _FLOAT),  # standard deviations from which a residual counts less; 0: none does
     # slow sensors: what each one measures, how noisy it is, when it captures
-    ("rows", _INT, (N_SLOW,)),  # of C
+    ("rows", _INT, (N_SLOW,)),  # rows of C
     ("C", _FLOAT, (N_SLOW, N_ROWS, N_CORE)),
     ("angle", _INT, (N_SLOW, N_ROWS)),  # 1: the residual is wrapped
     ("ground", _INT, (N_SLOW, N_ROWS)),  # 1: a heading over the ground, where psi is the road's
-    ("r", _FLOAT, (N_SLOW, N_ROWS)),  # variances, at the present speed
+    ("r", _FLOAT, (N_SLOW, N_ROWS)),  # variances of the rows at the present speed
     ("noise_over_speed", _FLOAT, (N_SLOW, N_ROWS)),  # r is this / V^2; 0: r as it stands
     ("heading_fix", _INT, (N_SLOW,)),  # 1: where the first sample is far off, it sets the heading
     # columns of the sensor's packet; 0: it has none
@@ -162,63 +162,63 @@ _FIELDS = [
     ("satellites_column", _INT, (N_SLOW,)),
     ("speed_column", _INT, (N_SLOW,)),
     ("r_speed", _FLOAT),  # (m/s)^2, of the speed over ground that a second layer takes
-    ("knots", _INT),  # of the table HDOP -> factor on a sensor's noise; 0: no table
+    ("knots", _INT),  # rows of the table HDOP -> factor on a sensor's noise; 0: no table
     ("hdop", _FLOAT, (N_KNOTS,)),
     ("hdop_factor", _FLOAT, (N_KNOTS,)),
     ("least_satellites", _FLOAT),  # packets with fewer are refused
     ("gate", _FLOAT, (N_ROWS + 1,)),  # by dimension, the largest NIS; 0: no gate
     ("wary", _INT),  # gated samples that agree until the sensor is believed again; 0: it never is
-    ("adapt", _FLOAT),  # share of a new innovation in the scale of R; 0: R as configured
+    ("adapt", _FLOAT),  # weight of a new innovation in the scale of R; 0: R as configured
     ("first_slow", _INT),  # index of the first slow sensor that is used; -1: none
     ("period", _INT, (N_SLOW,)),  # ticks; 0: not used
-    ("phase", _INT, (N_SLOW,)),
+    ("phase", _INT, (N_SLOW,)),  # tick of the first capture
     ("stride", _INT),  # ticks of one step of the filter
     ("pace", _INT),  # ticks between two steps that listen to sensors
-    ("origin", _INT),  # phase of a single-rate filter's steps
+    ("origin", _INT),  # tick, phase of a single-rate filter's steps
     # the rule for late samples
     ("late", _INT),
     ("frames", _INT, (N_SLOW,)),  # captured and not here yet, at most; CLONE, LARSEN
     ("first_clone", _INT, (N_SLOW,)),  # where the sensor's clones start in x; CLONE
     ("store_predictions", _INT),  # 1: `predicted` is filled; STORED, CONSTANT, below a second layer
-    ("assumed", _INT),  # ticks; CONSTANT
+    ("assumed", _INT),  # ticks, assumed delay; CONSTANT
     # gains
     ("periodic", _INT),
     ("joint", _INT),  # 1: the rows of a sensor correct together, not one after the other
     ("between", _INT),
     ("cycle", _INT),  # steps after which the schedule repeats
-    ("pattern", _INT),  # frames in it
+    ("pattern", _INT),  # frames in the schedule's cycle
     ("low", _FLOAT),  # m/s, speed of the first table of gains
-    ("high", _FLOAT),  # of the last one
+    ("high", _FLOAT),  # m/s, speed of the last table
     ("spacing", _FLOAT),  # m/s between tables; 0: one table
-    ("inverse", _FLOAT, (N_FAST + N_ROWS, N_TOTAL)),  # transposed, of (20); PSEUDO, not periodic
+    ("inverse", _FLOAT, (N_FAST + N_ROWS, N_TOTAL)),  # C^+ transposed; PSEUDO, not periodic
     # speed
     ("measured", _INT),  # 1: from the wheels, 0: fixed
-    ("smoothing", _FLOAT),  # share of a new sample in the low-pass
+    ("smoothing", _FLOAT),  # weight of a new sample in the low-pass
     ("speed", _FLOAT),  # m/s, low-passed
-    ("model_speed", _FLOAT),  # the present model's
-    ("stretch", _FLOAT),  # of beta = v_y / V before the next step: old speed over new
-    ("speed_before", _FLOAT),  # the model's at the row before
+    ("model_speed", _FLOAT),  # m/s, speed of the present model
+    ("stretch", _FLOAT),  # old speed over new, by which beta = v_y / V is scaled before a step
+    ("speed_before", _FLOAT),  # m/s, speed of the model at the row before
     ("turning", _FLOAT),  # rad/s, the present model's yaw rate; KINEMATIC, VELOCITY_ROLL
     ("cell", _INT),  # the present table of gains
     ("wanted", _INT),  # the table that is missing; -1: none
     # state of the filter now
     ("start", _INT),  # tick of the first row
-    ("tick", _INT),  # of the last row
+    ("tick", _INT),  # tick of the last row
     ("has_started", _INT),  # 1: there was a first step
-    ("road_turn", _FLOAT),  # rad, of the road since the first row
+    ("road_turn", _FLOAT),  # rad, by which the road has turned since the first row
     ("at", _INT),  # step within the schedule's cycle
     ("x", _FLOAT, (N_TOTAL,)),  # states, then clones
     ("P", _FLOAT, (N_TOTAL, N_TOTAL)),
     ("u", _FLOAT, (N_INPUTS,)),  # the last finite inputs
-    ("u_sum", _FLOAT, (N_INPUTS,)),  # since the last step, over `u_count` ticks; stride > 1
+    ("u_sum", _FLOAT, (N_INPUTS,)),  # sum over `u_count` ticks since the last step; stride > 1
     ("u_count", _INT),
-    ("y", _FLOAT, (N_FAST,)),  # of this tick; NaN: none
+    ("y", _FLOAT, (N_FAST,)),  # fast measurements of this tick; NaN: none
     ("cursor", _INT),  # packets of the present call that are done
     ("counts", _INT, (len(SkipCounters._fields),)),
-    ("scale", _FLOAT, (N_SLOW, N_ROWS)),  # of R, where it adapts
-    ("nis", _FLOAT),  # of the last packet; NaN where it is not known
-    # `wary`: of each slow sensor
-    ("last", _FLOAT, (N_SLOW, PACKET_WIDTH)),  # packet
+    ("scale", _FLOAT, (N_SLOW, N_ROWS)),  # factor on R, where it adapts
+    ("nis", _FLOAT),  # normalised innovation squared of the last packet; NaN: unknown
+    # of each slow sensor, where `wary` is above 0
+    ("last", _FLOAT, (N_SLOW, PACKET_WIDTH)),  # its last packet
     ("believed", _INT, (N_SLOW,)),  # tick of the last sample that was used; -1: none was
     ("doubts", _INT, (N_SLOW,)),  # gated samples since then that agree with each other
     ("doubted", _INT, (N_SLOW,)),  # tick of the first of them
@@ -227,9 +227,9 @@ _FIELDS = [
     ("next", _INT, (N_SLOW,)),  # tick of the next capture
     ("known_stamps", _INT, (N_SLOW, N_STAMPS)),  # captured ticks of frames that came
     ("stamp", _INT, (N_SLOW, N_FRAMES)),  # captured tick of each frame that is due; -1: none
-    ("speed_captured", _FLOAT, (N_SLOW, N_FRAMES)),  # m/s, the model's at that tick; CLONE
+    ("speed_captured", _FLOAT, (N_SLOW, N_FRAMES)),  # m/s, speed of the model at that tick; CLONE
     ("waiting", _FLOAT, (N_WAITING, PACKET_WIDTH)),  # packets for the next step; pace > 1
-    ("waits", _INT),  # how many
+    ("waits", _INT),  # how many packets wait
     ("sample", _FLOAT, (PACKET_WIDTH,)),  # the packet at hand
     # LARSEN: what the residual of a frame that is due will do to the states, and its expectation
     ("larsen_gain", _FLOAT, (N_SLOW, N_ROWS, N_CORE)),
@@ -239,15 +239,15 @@ _FIELDS = [
     ("e", _FLOAT, (N_TOTAL,)),  # estimated error, tie-vision (18); PSEUDO
     ("expected", _FLOAT, (N_ROWS,)),  # C x before this tick's corrections, slow rows; PSEUDO
     ("eps", _FLOAT, (N_FAST + N_ROWS,)),  # residuals of this tick: fast, slow rows; joint, PSEUDO
-    ("innovation", _FLOAT, (N_ROWS,)),  # of the last sample; DUAL_RATE
-    ("since", _INT),  # steps since it; -1: there was none; DUAL_RATE
+    ("innovation", _FLOAT, (N_ROWS,)),  # innovation of the last sample; DUAL_RATE
+    ("since", _INT),  # steps since the last sample; -1: there was none; DUAL_RATE
     # scratch
     ("u_new", _FLOAT, (N_INPUTS,)),
     ("PC", _FLOAT, (N_TOTAL,)),  # P C^T
-    ("gain", _FLOAT, (N_TOTAL,)),  # of the last measurement
-    ("residual", _FLOAT, (N_ROWS,)),  # of the sample at hand
-    ("S", _FLOAT, (N_ROWS, N_ROWS)),  # its covariance, then the Cholesky factor
-    ("white", _FLOAT, (N_ROWS,)),  # the residual by that factor
+    ("gain", _FLOAT, (N_TOTAL,)),  # gain of the last measurement
+    ("residual", _FLOAT, (N_ROWS,)),  # residuals of the sample at hand
+    ("S", _FLOAT, (N_ROWS, N_ROWS)),  # covariance of `residual`, then its Cholesky factor
+    ("white", _FLOAT, (N_ROWS,)),  # `residual`, whitened by that factor
     ("e_seen", _FLOAT, (N_FAST,)),  # C G e of the fast rows
 ]
 _WINDOW = [  # history: of tick k in row k % WINDOW
@@ -255,9 +255,9 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
     # the rest: BUFFER
     ("past_u", _FLOAT, (WINDOW, N_INPUTS)),
     ("past_y", _FLOAT, (WINDOW, N_FAST)),
-    ("past_speed", _FLOAT, (WINDOW,)),  # the model's
+    ("past_speed", _FLOAT, (WINDOW,)),  # m/s, speed of the model
     ("past_turning", _FLOAT, (WINDOW,)),
-    ("past_road_turn", _FLOAT, (WINDOW,)),  # and with `predicted`
+    ("past_road_turn", _FLOAT, (WINDOW,)),  # rad; also where `store_predictions`
     # the last snapshot is "now", while the past is redone
     ("snapshot_x", _FLOAT, (N_SNAPSHOTS + 1, N_CORE)),
     ("snapshot_P", _FLOAT, (N_SNAPSHOTS + 1, N_CORE, N_CORE)),
@@ -273,7 +273,7 @@ def _count_numbers(row: Any) -> int:
     return math.prod(row[2]) if len(row) > 2 else 1
 
 
-_LEADING = (  # what a tick in lanes reads or writes by the record, next to another
+_LEADING = (  # fields of a record that a tick in lanes reads or writes, side by side
     *("n", "total", "periodic", "members", "measured", "speed", "speed_before", "model_speed"),
     *("tick", "has_started", "cell", "at", "cursor", "road_turn", "period", "next"),
     *("y", "u", "counts"),

@@ -1,9 +1,9 @@
 """Corrections: by the fast sensors, by a sample, and between samples of a slow sensor.
 
 Rules between samples: predict: nothing. pseudo-residual: tie-vision (19)-(22), which uneven-delay
-(20)-(22), double-layer (28)-(29), dual-rate (31) and Oh's (35) repeat: the propagated estimate of
-the error, by one constant gain K, columns in the order fast rows, slow rows, or by the share of
-the last sample's gain. dual-rate: shares of the last innovation from a table.
+(20)-(22), double-layer-gps (28)-(29), dual-rate (31) and Oh's (35) repeat: the propagated estimate
+of the error, by one constant gain K, columns in the order fast rows, slow rows, or by a fraction of
+the last sample's gain. dual-rate: fractions of the last innovation from a table.
 """
 
 from typing import Any
@@ -55,7 +55,10 @@ def locate_step_row(f: FilterRecord) -> Any:
 
 @jit
 def _locate_frame_row(f: FilterRecord, s: int, frame: int) -> Any:
-    """Locate the gain of sensor s's first row for a frame; `f.pattern`: of the rule between."""
+    """Locate the gain of sensor s's first row for a frame.
+
+    Behind the last frame, at `f.pattern`, stand the gains of the rule between samples.
+    """
     return 1 + f.cycle * maximum(f.fasts, 1) + frame * f.rows[s]
 
 
@@ -75,16 +78,16 @@ def _correct_between(f: FilterRecord, gains: GainTables, s: int) -> None:
     The rows of K^T, then of the inverse's transpose, stand behind those of the steps and frames.
     """
     x, e, N, m = f.x, f.e, f.total, f.fasts
-    first = _locate_frame_row(f, s, f.pattern)
+    first_row = _locate_frame_row(f, s, f.pattern)
     for i in range(m):
         f.e_seen[i] = dot(f.C_fast[i], e, f.n)
     for i in range(m):
-        K = gains[f.cell, first + i]
+        K = gains[f.cell, first_row + i]
         for j in range(N):
             x[j] += K[j] * f.eps[i]
-            e[j] -= K[j] * f.e_seen[i]  # (21): (I - K C) G e
+            e[j] -= K[j] * f.e_seen[i]  # tie-vision (21): (I - K C) G e
     for i in range(m, m + f.rows[s]):
-        K = gains[f.cell, first + i]
+        K = gains[f.cell, first_row + i]
         for j in range(N):
             x[j] += K[j] * f.eps[i]
             e[j] -= K[j] * f.eps[i]
@@ -94,16 +97,16 @@ def _correct_between(f: FilterRecord, gains: GainTables, s: int) -> None:
 def _correct_sample(f: FilterRecord, gains: GainTables, s: int) -> None:
     """Correct by a sample of this tick: its residuals replace the pseudo ones; e starts anew."""
     m, N, rows = f.fasts, f.total, f.rows[s]
-    first = _locate_frame_row(f, s, f.pattern)
+    first_row = _locate_frame_row(f, s, f.pattern)
     for i in range(rows):
-        K, real = gains[f.cell, first + m + i], f.residual[i]  # tie-vision (19)
+        K, residual = gains[f.cell, first_row + m + i], f.residual[i]  # tie-vision (19)
         for j in range(N):
-            f.x[j] += K[j] * (real - f.eps[m + i])
-        f.eps[m + i] = real
-    for j in range(N):  # (20): e = (C^+ - K) eps
+            f.x[j] += K[j] * (residual - f.eps[m + i])
+        f.eps[m + i] = residual
+    for j in range(N):  # tie-vision (20): e = (C^+ - K) eps
         total = 0.0
         for i in range(m + rows):
-            pinv, K = gains[f.cell, first + m + rows + i, j], gains[f.cell, first + i, j]
+            pinv, K = gains[f.cell, first_row + m + rows + i, j], gains[f.cell, first_row + i, j]
             total += (pinv - K) * f.eps[i]
         f.e[j] = total
 
@@ -161,9 +164,9 @@ def _split_sample_gain(f: FilterRecord, s: int, first: int, packet: Vector) -> N
 @jit
 def _apply_share(f: FilterRecord, gains: GainTables, s: int) -> None:
     """Add the fraction of the last innovation that is due now to x."""
-    first = _locate_frame_row(f, s, f.pattern) + f.since * f.rows[s]
+    first_row = _locate_frame_row(f, s, f.pattern) + f.since * f.rows[s]
     for i in range(f.rows[s]):
-        K = gains[f.cell, first + i]
+        K = gains[f.cell, first_row + i]
         for j in range(f.total):
             f.x[j] += K[j] * f.innovation[i]
 
@@ -186,8 +189,8 @@ def _apply_next_share(f: FilterRecord, gains: GainTables, s: int) -> None:
             _apply_share(f, gains, s)
 
 
-_MIN_SCALE, _MAX_SCALE = 0.05, 100.0  # of the scale of R
-_HEADING_TOLERANCE = 0.5  # rad: the first heading fix sets the heading where it is so far off
+_MIN_SCALE, _MAX_SCALE = 0.05, 100.0  # limits of the adapted factor on R
+_HEADING_TOLERANCE = 0.5  # rad, residual of the first heading fix above which it sets the heading
 
 
 @jit
@@ -370,10 +373,10 @@ def correct_fast(f: FilterRecord, gains: GainTables) -> None:
             f.eps[i] = 0.0
             continue
         if f.periodic == 1:
-            step = locate_step_row(f) + i
+            row = locate_step_row(f) + i
             for j in range(f.total):
                 store_element(
-                    f.x, load_element(f.x, j) + load_element(gains, f.cell, step, j) * residual, j
+                    f.x, load_element(f.x, j) + load_element(gains, f.cell, row, j) * residual, j
                 )
             continue
         update_with_states(f, f.C_fast[i], f.r_fast[i], residual)

@@ -48,7 +48,7 @@ def _count_frames(sensor: SlowSensor, rule: str) -> int:
 def _allocate_clones(f: FilterRecord, config: FilterConfig) -> None:
     """Lay the clones of every sensor behind the states; ValueError where there are too many."""
     rule, label = config.delay, config.name
-    f.late = IGNORE if rule in ("literal", "lag") else RULES.index(rule)  # their models are late
+    f.late = IGNORE if rule in ("literal", "lag") else RULES.index(rule)  # late states instead
     f.total = f.n
     for name, sensor in config.sensors.items():
         s, frames = SLOW_NAMES.index(name), _count_frames(sensor, rule)
@@ -109,15 +109,16 @@ def _check_window(f: FilterRecord, config: FilterConfig) -> None:
         )
 
 
-_SMOOTHING_TIME = 0.015  # s, of the measured speed
-_MAX_SPEED = 80.0  # m/s, of the tables of gains
-_SPACING = 0.5  # m/s between them
-REPLACE_TIME = 0.5  # s between two members of a bank that begin anew
-HAZARD = 0.2  # 1/s, of tyres that change
-_TYRE_VARIANCE = 0.06  # variance of their factors
-_TYRE_WALK = 0.02  # 1/s, of the factors of a new member until the next one: the change may be later
+_SMOOTHING_TIME = 0.015  # s, time constant of the low-pass on the measured speed
+_MAX_SPEED = 80.0  # m/s, speed of the last table of gains
+_SPACING = 0.5  # m/s between two tables of gains
+REPLACE_TIME = 0.5  # s between two replacements of a bank's least likely member
+HAZARD = 0.2  # 1/s, rate at which tyres change
+_TYRE_VARIANCE = 0.06  # variance that a change adds to the factors on the stiffness
+# 1/s, variance per second of a new member's factors until the next one: the change may be later
+_TYRE_WALK = 0.02
 _IMM_TIME = 0.2  # s between two steps of members that interact
-_GUST = (8.0, 2.0)  # times the usual force and moment
+_GUST = (8.0, 2.0)  # standard deviations of a gust's force and moment over those configured
 
 
 def assemble(
@@ -183,7 +184,7 @@ def _build_bank(layers: Any, config: FilterConfig, dt: float) -> Any:
     f.hazard, f.level[:], f.alert = math.log(HAZARD * REPLACE_TIME), 1.0, _TYRE_WALK * f.step
     bank = np.repeat(layers, 1 + config.members).view(np.recarray)
     for m, f in enumerate(bank[1:]):
-        # a twin of another begins anew first
+        # of two members with equal levels the later one is replaced first
         f.odds = MIN_LOG_WEIGHT if m >= len(config.levels) else 0.0
         f.level[:] = np.square(config.levels[m % len(config.levels)])
         if f.forces:
@@ -279,10 +280,10 @@ def _make_schedules(f: FilterRecord, config: FilterConfig, dt: float) -> tuple[S
     if config.delay == "constant":
         f.assumed = count_ticks(config.assumed_delay, dt, f"{config.name}: assumed_delay")
         sensor = SlowSensor(sensor.period, (config.assumed_delay,), sensor.phase)
-    if config.row.intersample == "dual-rate":  # knows of no delay
+    if config.row.intersample == "dual-rate":  # its rules have no delay
         sensor = SlowSensor(sensor.period, (0.0,), sensor.phase)
     label, stride, pace = f"{config.name}: the {name}", int(f.stride), int(f.pace)
-    slots = max(1, int(f.frames[f.first_slow]))  # of stored captures, which take turns
+    slots = max(1, int(f.frames[f.first_slow]))  # places of stored captures, which take turns
     period = count_ticks(sensor.period, dt, f"{label}'s period") // stride
     late = [count_ticks(delay, dt, f"a delay: {label}'s") for delay in sensor.delays]
     jitter = count_ticks(sensor.jitter, dt, f"{label}'s jitter")

@@ -35,7 +35,7 @@ from .options import FilterConfig as FilterConfig
 _GATE_PROBABILITY = 1.0 - 1e-9
 _MIN_SATELLITES = 4.0  # double-layer-gps 4.3
 _ASSUMED_DELAY = 0.033  # s
-_MAX_LATENCY = 0.5  # s, of a latency that is known
+_MAX_LATENCY = 0.5  # s, largest latency that may be configured
 _MAX_MEMBERS = 8
 _N_IMM_MEMBERS = 4
 

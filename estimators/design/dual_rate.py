@@ -1,4 +1,4 @@
-"""The corrections of dual-rate filters between slow samples, as shares of the last innovation.
+"""The corrections of dual-rate filters between slow samples, as parts of the last innovation.
 
 At fixed speed and ratio r, every rule of the paper is x_{k+i} = F x_{k+i-1} + H u + B_i eps_k for
 i = 0 .. r-1: B_i = L G_i with the gain L and the matrix G_i of the pseudo measurement (14).
@@ -14,7 +14,7 @@ from .kalman import compute_inverse, observer_gain
 
 RULES = ("predict", "hold", "oh", "pseudo")
 GAINS = ("constant", "from-29", "placed")
-_CYCLES, _SETTLED = 400, 1e-12
+_CYCLES, _SETTLED = 400, 1e-12  # most samples of a recursion, relative change where it ends
 
 
 def _compute_sampled_gain(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Array:
@@ -145,7 +145,7 @@ def compute_shares(
     if rule == "predict":
         return np.concatenate([L[None], np.zeros((steps - 1, *L.shape))])
     if gains == "constant":
-        L = L / steps  # every step takes its even share
+        L = L / steps  # every step takes an even part
     inverse = compute_inverse("moore-penrose", C, np.eye(len(F)), R)
     return compute_pseudo_shares(F, C, L, inverse - L, steps)
 

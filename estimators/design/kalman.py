@@ -31,7 +31,7 @@ def check_covariance(name: str, M: Array, definite: bool = False) -> None:
         raise ValueError(f"{name} must be positive definite: its least eigenvalue is {lowest:.3g}")
 
 
-_RIDGE = 1e-3  # lambda of Tikhonov's inverse, in SI units squared
+_RIDGE = 1e-3  # lambda of Tikhonov's inverse, in the square of a row's SI unit
 INVERSES = ("moore-penrose", "p-weighted", "tikhonov", "bayes")
 
 

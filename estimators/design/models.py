@@ -67,11 +67,11 @@ MEASUREMENTS: dict[str, Measurement] = {
         (
             MeasurementRow(("v_x",), "gps_speed", 0.05),
             MeasurementRow(("v_y",), "gps_speed", 0.05),
-        ),  # (41)
+        ),  # double-layer-gps (41)
         heading_fix=True,
     ),
 }
-"""By the sensor's name. (41): double-layer-gps."""
+"""What each slow sensor measures, by its name."""
 
 
 def find_packet_column(sensor: str, value: str) -> int:
@@ -93,7 +93,7 @@ class StateInfo(NamedTuple):
 
     unit: str
     prior: float  # usual standard deviation at the start
-    bound: float  # of estimates in observations
+    bound: float  # largest magnitude of an estimate in an observation
 
 
 STATES = {
@@ -125,7 +125,7 @@ STATES = {
 }
 """All states of all models, by name."""
 FOREIGN_STATE = StateInfo("-", 0.0, 1e6)
-"""Any other, which only a user's estimator has."""
+"""A state that `STATES` lacks, which only a user's estimator has."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ accelerometer feels, the error of the accelerometer's scale, and the tyres: fact
 and the reciprocal of friction."""
 NONLINEAR = (*TYRES, SCALE)
 _WALK = (("d1", "beta"), ("d2", "gamma"))  # dakf-stability (8)-(9), (14)
-_WALK_ALL = (*_WALK, ("d3", "psi"))  # dual-rate (4): one for every state of (37)
+_WALK_ALL = (*_WALK, ("d3", "psi"))  # dual-rate (4): one for every state of dual-rate (37)
 DISTURBANCES = ("none", "walk", "walk-all", "forces")
 
 MODELS: dict[str, FilterModel] = {
@@ -361,9 +361,9 @@ def _write_rows(
     f.first_slow = used[0] if used else -1
     for s in used:
         sensor = MEASUREMENTS[SLOW_NAMES[s]]
-        second = model.kind == VELOCITY_ROLL
-        rows = sensor.velocities if second else sensor.rows
-        f.rows[s], f.heading_fix[s] = len(rows), sensor.heading_fix and not second
+        is_second_layer = model.kind == VELOCITY_ROLL
+        rows = sensor.velocities if is_second_layer else sensor.rows
+        f.rows[s], f.heading_fix[s] = len(rows), sensor.heading_fix and not is_second_layer
         f.hdop_column[s] = find_packet_column(SLOW_NAMES[s], "hdop")
         f.satellites_column[s] = find_packet_column(SLOW_NAMES[s], "satellites")
         f.speed_column[s] = find_packet_column(SLOW_NAMES[s], "speed")
@@ -374,5 +374,5 @@ def _write_rows(
             for state in row.states:
                 late = _LATE.get(state)
                 f.C[s, i, model.names.index(late if late in model.late else state)] = 1.0
-        if second:
+        if is_second_layer:
             f.r_speed = f.r[s, 0]

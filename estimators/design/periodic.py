@@ -3,8 +3,8 @@
 The covariance filter is run over the schedule until its gains repeat. A table of gains has a head
 row; for each step of the cycle a row for every fast measurement (one where there is none); for
 each frame of the pattern a row for every slow row. Pseudo-residuals add K^T and the transposed
-inverse, dual-rate rules a share for each step. Behind the gains of a step stands the upper half
-of the states' covariance after it.
+inverse, dual-rate rules a fraction of the innovation for each step. Behind the gains of a step
+stands the upper half of the states' covariance after it.
 """
 
 from dataclasses import dataclass
@@ -80,8 +80,8 @@ class Schedule:
 NO_SENSOR = Schedule(1, ())
 
 
-_GAIN_TOLERANCE = 1e-12
-_MAX_RECURSION = 600.0  # s of the recursion
+_GAIN_TOLERANCE = 1e-12  # relative change of a settled gain in a cycle
+_MAX_RECURSION = 600.0  # s of driving after which the recursion ends in any case
 _BIAS_WALK_TIME = 10.0  # s in which a bias walks by its prior where a filter is checked
 
 

@@ -18,7 +18,7 @@ from .kalman import transition_matrix
 from .options import FilterConfig
 from .periodic import Schedule, build_measurement_rows, design_gains
 
-MARGINAL = 1e-9
+MARGINAL = 1e-9  # below 1, an eigenvalue's magnitude from which on an error stays
 
 
 def spectral_radius(M: Array) -> float:
@@ -210,12 +210,12 @@ def _build_pseudo_correction(
         residual_rows[:, :size] = C
         if stored_at >= 0:
             residual_rows = _build_residual_rows(f, schedule, arriving[-1], width, stored_at)
-        M[error] -= K @ residual_rows  # (19)
-        M[e] = (inverse - K) @ residual_rows  # (20)
+        M[error] -= K @ residual_rows  # tie-vision (19)
+        M[e] = (inverse - K) @ residual_rows  # tie-vision (20)
         return M
     M[error, error] -= K[:, :m] @ C[:m]  # the fast rows' residuals are real
-    M[error, e] -= K[:, m:] @ C[m:]  # (22)
-    M[e, e] -= K @ C  # (21)
+    M[error, e] -= K[:, m:] @ C[m:]  # tie-vision (22)
+    M[e, e] -= K @ C  # tie-vision (21)
     return M
 
 

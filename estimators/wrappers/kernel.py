@@ -22,8 +22,10 @@ def _clip_symmetric(value: Any, limit: Any) -> Any:
 
 @jit
 def _compute_nees(f: Any, gains: Any, i: int, j: int, beta: Any, gamma: Any) -> Any:
-    """Compute e^T P^-1 e of the states i (beta) and j (gamma), -1: none; 0 if P is singular."""
-    # per state; beta and gamma are the true ones
+    """Compute e' P_e^-1 e / len(e), the NEES per state; 0 without states or for a singular P_e.
+
+    e is the error of the states i and j, estimates of the true beta and gamma; -1: there is none.
+    """
     if i >= 0 and j >= 0:
         a, b = f.x[i] - beta, f.x[j] - gamma
         p, q = read_covariance(f, gains, i, i), read_covariance(f, gains, j, j)
@@ -65,21 +67,24 @@ def observe(
         rows: Number of fast rows to take.
         packets: Packets, shape (capacity, PACKET_WIDTH).
         count: Number of packets to take.
-        start: Number of rows that are done already.
+        start: Number of fast rows that are done already.
         obs: Observation of the env, float32, shape (at least inner,).
         inner: Number of entries of `obs` to copy.
-        plan: State through the layers, whether to wrap it, its `outputs.TRUTHS`; shape (m, 3).
+        plan: Of each output the state's index, counted through the layers, 1 to wrap an angle, and
+            its code in `outputs.TRUTHS`; shape (m, 3).
         limits: Bounds of the outputs in their units, shape (m,).
         beta: True sideslip angle (rad).
         gamma: True yaw rate (rad/s).
         out: Output, float32, shape (inner + m,), or (inner + 2 m,) with standard deviations.
-        summary: Output, shape (3,): the first state, its standard deviation and the NEES.
+        summary: Output, shape (3,): the filter's first state (beta where it has beta), its standard
+            deviation, and the normalised estimation error squared of the outputs beta and gamma
+            per state, e' P_e^-1 e / len(e), with expectation 1; 0 where P_e is singular.
 
     Returns:
-        Number of rows done, as `advance` returns it.
+        Number of fast rows done, as `advance` returns it.
     """
-    X, nis = fast[:0], summary[:0]  # nothing to be filled
-    done = advance(filters, gains, fast, rows, packets, count, start, X, X, nis)
+    no_states, no_nis = fast[:0], summary[:0]  # empty: `advance` writes no records
+    done = advance(filters, gains, fast, rows, packets, count, start, no_states, no_states, no_nis)
     if done < rows:
         return done
     for i in range(inner):

@@ -14,9 +14,9 @@ from ...envs.task import ObservationEntry
 from ..design.models import FOREIGN_STATE, STATES
 from ..protocol import EstimatorLike, compute_std
 
-TRUTHS = {"beta": 1, "gamma": 2}  # states whose truth stands in the info
+TRUTHS = {"beta": 1, "gamma": 2}  # code of each state whose truth `observe` gets; 0: none
 BETA, STD, NEES = 0, 1, 2  # places in the summary of a step
-_WRAPPED = ("psi", "psi_late")
+_WRAPPED = ("psi", "psi_late")  # angles that are wrapped to +-pi
 _wrap = as_python(wrap, ARRAYS)
 
 
@@ -26,7 +26,8 @@ class Outputs:
 
     layout: tuple[ObservationEntry, ...]  # the first `inner` are the inner observation's
     inner: int
-    plan: npt.NDArray[np.int64]  # as `kernel.observe` takes it, (m, 3)
+    # of each output the state's index, 1 to wrap an angle, the code in `TRUTHS`; (m, 3)
+    plan: npt.NDArray[np.int64]
     limits: npt.NDArray[np.float64]  # bounds of the outputs in their units, (m,)
     keys: tuple[tuple[str, int], ...]  # keys of `info`, with their places in the summary
 
@@ -60,14 +61,15 @@ def make_outputs(
             raise ValueError(f"{estimator} has no state {output!r}; it has: {', '.join(states)}")
     prefix = "" if name is None else f"{name}_"
     kinds = [STATES.get(s, FOREIGN_STATE) for s in outputs]
-    item = list(zip(outputs, kinds, strict=True))
+    pairs = list(zip(outputs, kinds, strict=True))
     hats = [
-        ObservationEntry(f"{prefix}{s}_hat", kind.unit, -kind.bound, kind.bound) for s, kind in item
+        ObservationEntry(f"{prefix}{s}_hat", kind.unit, -kind.bound, kind.bound)
+        for s, kind in pairs
     ]
-    stds = [ObservationEntry(f"{prefix}{s}_std", kind.unit, 0.0, kind.bound) for s, kind in item]
+    stds = [ObservationEntry(f"{prefix}{s}_std", kind.unit, 0.0, kind.bound) for s, kind in pairs]
     layout = (*inner, *hats, *(stds if std else ()))
-    names = [item.name for item in layout]
-    duplicates = sorted({item for item in names if names.count(item) > 1})
+    names = [entry.name for entry in layout]
+    duplicates = sorted({entry for entry in names if names.count(entry) > 1})
     if duplicates:
         raise ValueError(f"{', '.join(duplicates)} would stand twice; give this wrapper a name=...")
     truths = [TRUTHS.get(s, 0) for s in outputs]
@@ -96,18 +98,20 @@ def write_outputs(
 ) -> None:
     """Write a user's estimates as `kernel.observe` writes those of a compiled filter.
 
-    Errors are those of `ForeignEstimator.x`.
+    Raises what `ForeignEstimator.x` raises.
 
     Args:
         estimator: The user's estimator.
         obs: Observation of the env, shape (at least inner,).
         inner: Number of entries of `obs` to copy.
-        plan: Shape (m, 3), see `kernel.observe`.
+        plan: Of each output the state's index, 1 to wrap an angle, its code in `TRUTHS`; (m, 3).
         limits: Bounds of the outputs in their units, shape (m,).
         beta: True sideslip angle (rad).
         gamma: True yaw rate (rad/s).
         out: Output, shape (inner + m,), or (inner + 2 m,) with standard deviations.
-        summary: Output, shape (3,): the first state, its standard deviation and the NEES.
+        summary: Output, shape (3,): beta (the first state where there is no beta), its standard
+            deviation, and the normalised estimation error squared of the outputs beta and gamma
+            per state, e' P_e^-1 e / len(e), with expectation 1; 0 where P_e is singular.
     """
     x, P = np.asarray(estimator.x), np.asarray(estimator.P)
     std, states, m = compute_std(P), plan[:, 0], len(plan)
@@ -120,6 +124,6 @@ def write_outputs(
     first = estimator.names.index("beta") if "beta" in estimator.names else 0
     truth_plan = plan[plan[:, 2] > 0]
     e = x[truth_plan[:, 0]] - np.where(truth_plan[:, 2] == 1, beta, gamma)
-    S = P[np.ix_(truth_plan[:, 0], truth_plan[:, 0])]
-    nees = e @ np.linalg.solve(S, e) / len(e) if len(e) and np.linalg.det(S) > 0.0 else 0.0
+    P_e = P[np.ix_(truth_plan[:, 0], truth_plan[:, 0])]
+    nees = e @ np.linalg.solve(P_e, e) / len(e) if len(e) and np.linalg.det(P_e) > 0.0 else 0.0
     summary[:] = x[first], std[first], nees
