@@ -78,7 +78,7 @@ def solved_by_ipopt(agent: Nmpc, found: Any, monkeypatch: pytest.MonkeyPatch) ->
         target[at] = value
 
     monkeypatch.setitem(SYMBOLS, "load_element", lambda array, at: array[at])
-    monkeypatch.setitem(SYMBOLS, "put", put)
+    monkeypatch.setitem(SYMBOLS, "store_element", put)
     blocks = agent.design.blocks
     plan = ca.SX.sym("plan", agent.width * len(blocks))
     residuals: dict[int, Any] = {}
