@@ -14,6 +14,7 @@ from gymnasium.vector import VectorEnv
 
 from ..envs.io import atomic_file
 from ..envs.numerics import require_extra
+from ..envs.numerics.primitives import Scalar
 from ..envs.record import Log, concatenate
 from ..envs.validation import short_repr
 
@@ -33,7 +34,7 @@ class EpisodeStep(NamedTuple):
     obs: Any  # (k,) or (N, k)
     info: dict[str, Any]
     action: Any  # before this outcome, (width,) or (N, width)
-    reward: Any  # of the row or (N,)
+    reward: Scalar  # of the row or (N,)
     terminated: Any  # whether the episode ended by itself
     truncated: Any  # whether it reached its time limit
     running: npt.NDArray[np.bool_]  # rows that are in their first episode, (N,)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .numerics.jit import jit
-from .numerics.primitives import absolute, maximum, minimum, select
+from .numerics.primitives import Scalar, Vector, absolute, maximum, minimum, select
 from .record import FAST, FAST_UNITS, Array
 from .sensors.slow import SLOW
 from .ticks import TICK
@@ -32,9 +32,9 @@ class ReferenceParams(NamedTuple):
     b_0: Any  # l_r / l
     b_1: Any  # s2/m2, M l_f / (2 l C_r l_r)
     G: Any  # s2/m2, stability factor, dakf-stability (24)
-    per_l: Any  # 1/m, 1 / l
-    mu_g: Any  # m/s2, mu g
-    G_lagged: Any  # s2/m2, stability factor of the lagged reference
+    per_l: Scalar  # 1/m, 1 / l
+    mu_g: Scalar  # m/s2, mu g
+    G_lagged: Scalar  # s2/m2, stability factor of the lagged reference
     rest: Any  # fraction of its deviation from the steady state that remains after a tick
 
 
@@ -63,7 +63,9 @@ def make_reference_params(nominal: Vehicle) -> ReferenceParams:
 
 
 @jit
-def compute_reference(steer: Any, v: Any, target: Any, reference_kind: int) -> Any:
+def compute_reference(
+    steer: Scalar, v: Scalar, target: ReferenceParams, reference_kind: int
+) -> Any:
     """Compute the steady-state reference for a steering command at a measured speed.
 
     zero-slip: (0, 0), the yaw rate is not judged. model: the nominal steady state, with
@@ -95,7 +97,9 @@ def compute_reference(steer: Any, v: Any, target: Any, reference_kind: int) -> A
 
 
 @jit
-def filter_reference(before: Any, steady: Any, target: Any, reference_kind: int) -> Any:
+def filter_reference(
+    before: Vector, steady: Vector, target: ReferenceParams, reference_kind: int
+) -> Any:
     """Filter the reference over a tick: the lagged one approaches the steady state, others jump.
 
     Args:
@@ -120,8 +124,8 @@ EFFORT_WEIGHT, COST_CAP = 0.01, 100.0  # 1/s both
 
 @jit
 def compute_cost_rate(
-    e_beta: Any, e_gamma: Any, moment_share: Any, steer_added: Any, reference_kind: int
-) -> Any:
+    e_beta: Scalar, e_gamma: Scalar, moment_share: Scalar, steer_added: Scalar, reference_kind: int
+) -> Scalar:
     """Compute the cost rate of a tick, capped at 100 per second.
 
     c = (e_beta/0.02)^2 + (e_gamma/0.1)^2 + 0.01 (N_z/N_max)^2 + 0.01 (added steering/0.05)^2,
@@ -146,7 +150,7 @@ def compute_cost_rate(
 
 
 @jit
-def compute_failure_cost(duration: Any, tick: Any) -> Any:
+def compute_failure_cost(duration: Scalar, tick: Scalar) -> Scalar:
     """Compute the cost of the rest of a failed episode, so that failing never pays.
 
     Args:
@@ -167,7 +171,7 @@ WILD_LIMIT = 10.0  # fraction of full scale beyond which an action is a mistake
 
 
 @jit
-def select_failure(lost: Any, spun: Any, off: Any) -> Any:
+def select_failure(lost: Scalar, spun: Scalar, off: Scalar) -> Scalar:
     """Select the failure's code.
 
     Args:

@@ -1,9 +1,7 @@
 """Time in ticks: the base tick, conversion from seconds, and the values of never and for ever."""
 
-from typing import Any
-
 from .numerics.jit import as_python, jit
-from .numerics.primitives import floor
+from .numerics.primitives import Scalar, floor
 
 TICK = 0.001
 """The base tick of the simulated car in seconds."""
@@ -12,7 +10,7 @@ NEVER = -1.0
 
 
 @jit
-def round_to_ticks(seconds: Any) -> Any:
+def round_to_ticks(seconds: Scalar) -> Scalar:
     """Round a time in seconds to whole ticks."""
     return floor(seconds / TICK + 0.5)
 

@@ -7,6 +7,7 @@ import casadi as ca
 from ...envs.engine.tick import compute_lagged_load, compute_motor_torques
 from ...envs.numerics.casadi_backend import SYMBOLS, to_casadi
 from ...envs.numerics.jit import as_python
+from ...envs.numerics.primitives import Scalar
 from ...envs.scenarios.road import NOMINAL_PATH
 from ...envs.task import LAGGED, compute_cost_rate, compute_reference
 from ...envs.ticks import TICK
@@ -32,7 +33,7 @@ class _PlanStep(NamedTuple):
 
     state: PlanState
     effort: Any  # cost of the yaw moment and the added steering within the step
-    slewed: Any  # change of the added steering's command (rad)
+    slewed: Scalar  # change of the added steering's command (rad)
 
 
 def list_active_states(fixed: PlanParams) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from ...envs.engine.window import compute_profile_angle, make_window
 from ...envs.engine.workspace import EpisodeArrays
 from ...envs.numerics.jit import as_python
 from ...envs.numerics.packed import read
+from ...envs.numerics.primitives import Scalar
 from ...envs.record import Array
 from ...envs.scenarios.driver import (
     SpeedProfile,
@@ -29,23 +30,23 @@ from ...envs.vehicle.dynamics import CarParams, RoadParams
 class PreviewStep(NamedTuple):
     """Inputs and parameters of one step of the plan, which actions change hardly or not at all."""
 
-    steer_start: Any  # rad, front steering angle without the added one, at the step's start
-    steer_middle: Any  # rad, at the step's middle
-    steer_end: Any  # rad, at its end
-    command: Any  # rad, the driver's at the start
-    F_d: Any  # N, mean over the step, with the wind's
-    N_d: Any  # N m
-    N_x: Any  # N m
-    C_f: Any  # N/rad, of a front tyre
-    C_r: Any  # N/rad, of a rear tyre
-    mu: Any  # under the left wheels
-    mu_r: Any  # under the right wheels
-    speed: Any  # m/s, the driver's set point
-    acceleration: Any  # m/s2, the driver's acceleration, fed forward
-    turn: Any  # rad/s, mean turning rate of a road that the nominal car lays, else 0
-    weight: Any  # s, quadrature weight of the cost rate at the step's start
-    beta_ref: Any  # rad, at the step's start; read for a lagged reference alone
-    gamma_ref: Any  # rad/s
+    steer_start: Scalar  # rad, front steering angle without the added one, at the step's start
+    steer_middle: Scalar  # rad, at the step's middle
+    steer_end: Scalar  # rad, at its end
+    command: Scalar  # rad, the driver's at the start
+    F_d: Scalar  # N, mean over the step, with the wind's
+    N_d: Scalar  # N m
+    N_x: Scalar  # N m
+    C_f: Scalar  # N/rad, of a front tyre
+    C_r: Scalar  # N/rad, of a rear tyre
+    mu: Scalar  # under the left wheels
+    mu_r: Scalar  # under the right wheels
+    speed: Scalar  # m/s, the driver's set point
+    acceleration: Scalar  # m/s2, the driver's acceleration, fed forward
+    turn: Scalar  # rad/s, mean turning rate of a road that the nominal car lays, else 0
+    weight: Scalar  # s, quadrature weight of the cost rate at the step's start
+    beta_ref: Scalar  # rad, at the step's start; read for a lagged reference alone
+    gamma_ref: Scalar  # rad/s
 
 
 class PlanState(NamedTuple):
@@ -62,11 +63,11 @@ class PlanState(NamedTuple):
     theta: Any
     phi: Any
     phi_dot: Any
-    T_l: Any  # torque of the left motor (N m)
+    T_l: Scalar  # torque of the left motor (N m)
     T_r: Any
     integral: Any
-    slewing: Any  # added steering that is commanded (rad)
-    added: Any  # added steering that is applied (rad)
+    slewing: Scalar  # added steering that is commanded (rad)
+    added: Scalar  # added steering that is applied (rad)
 
 
 class PlanParams(NamedTuple):

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from ...envs.numerics.jit import as_python, jit
-from ...envs.numerics.primitives import ARRAYS
+from ...envs.numerics.primitives import ARRAYS, Matrix, Vector
 from ...envs.record import Array
 from ...envs.vehicle.actuators import limit_angle
 from .plant import (
@@ -152,7 +152,7 @@ def compute_limits(problem: IlqrProblem, forecast: Forecast, run: Trajectory) ->
 
 
 @jit
-def solve_input_qp(Q: Any, q: Any, low: Any, high: Any) -> Any:
+def solve_input_qp(Q: Matrix, q: Vector, low: Vector, high: Vector) -> Any:
     """Minimise q'd + d'Qd / 2 with low <= d <= high.
 
     Args:
@@ -187,7 +187,13 @@ def solve_input_qp(Q: Any, q: Any, low: Any, high: Any) -> Any:
 
 @jit
 def run_backward_pass(
-    linearisation: Any, limits: Any, inputs: Any, length: int, damping: float, d: Any, G: Any
+    linearisation: Linearisation,
+    limits: Limits,
+    inputs: Matrix,
+    length: int,
+    damping: float,
+    d: Matrix,
+    G: Matrix,
 ) -> None:
     """Run the backward pass over a run's linearisation.
 

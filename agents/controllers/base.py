@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ...envs.engine.config import make_car
 from ...envs.numerics.jit import as_python, jit
-from ...envs.numerics.primitives import ARRAYS
+from ...envs.numerics.primitives import ARRAYS, Scalar
 from ...envs.record import Array
 from ...envs.vehicle.actuators import compute_torque_limit
 from ...envs.vehicle.dynamics import CarParams
@@ -227,7 +227,9 @@ def check_not_negative(name: str, value: float) -> float:
 
 
 @jit
-def integrate_antiwindup(integral: Any, step: Any, unlimited: Any, limited: Any) -> Any:
+def integrate_antiwindup(
+    integral: Scalar, step: Scalar, unlimited: Scalar, limited: Scalar
+) -> Scalar:
     """Integrate a step, unless it would push the output further past its limit.
 
     Args:

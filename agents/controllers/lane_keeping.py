@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...envs.numerics.jit import jit
-from ...envs.numerics.primitives import maximum
+from ...envs.numerics.primitives import Matrix, maximum
 from ...envs.record import Array
 from ...envs.task import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE
 from ...envs.ticks import TICK
@@ -90,9 +90,9 @@ def _make_lane_model(
 
 @jit
 def _lane_keeping_law(
-    x: Any,
-    state: Any,
-    action: Any,
+    x: Matrix,
+    state: Matrix,
+    action: Matrix,
     table: Any,
     axes: Any,
     share_per_torque: float,

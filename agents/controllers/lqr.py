@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...envs.numerics.jit import copy_into, jit
-from ...envs.numerics.primitives import absolute
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute
 from ...envs.record import Array
 from ...envs.task import REFERENCES
 from ...envs.ticks import TICK
@@ -28,7 +28,7 @@ IN = Inputs(*range(14))
 
 
 @jit
-def make_design_state(x: Any, share: Any, z: Any) -> None:
+def make_design_state(x: Vector, share: Scalar, z: Vector) -> None:
     """Fill the states of the design model from a row of `Inputs`.
 
     Args:
@@ -44,18 +44,18 @@ def make_design_state(x: Any, share: Any, z: Any) -> None:
 
 @jit
 def _lqr_law(
-    x: Any,
-    state: Any,
-    action: Any,
-    max_share: Any,
-    sliding_slip: Any,
+    x: Matrix,
+    state: Matrix,
+    action: Matrix,
+    max_share: Vector,
+    sliding_slip: Vector,
     table: Any,
     axes: Any,
     scheduled: int,
-    share: Any,
-    authority: Any,
-    slew: Any,
-    front_arm: Any,
+    share: Scalar,
+    authority: Scalar,
+    slew: Scalar,
+    front_arm: Scalar,
 ) -> None:
     """Compute the actions of LQR within the limits; state: steering last added (rad)."""
     # sliding_slip: slip angle at which the front tyres slide (rad), max_share: largest yaw moment
@@ -231,7 +231,14 @@ def _clip(value: Any, low: Any, high: Any) -> Any:
 
 @jit
 def _solve_box_qp(
-    s_uu: Any, s_uw: Any, s_ww: Any, u: Any, w: Any, max_u: Any, low: Any, high: Any
+    s_uu: Scalar,
+    s_uw: Scalar,
+    s_ww: Scalar,
+    u: Scalar,
+    w: Scalar,
+    max_u: Scalar,
+    low: Scalar,
+    high: Scalar,
 ) -> Any:
     """Find the point with |u| <= max_u, low <= w <= high that is nearest to (u, w)."""
     # The distance is du^2 s_uu + 2 du dw s_uw + dw^2 s_ww, positive definite: the point is (u, w)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...envs.numerics.jit import as_python, jit
-from ...envs.numerics.primitives import maximum
+from ...envs.numerics.primitives import Matrix, Vector, maximum
 from ...envs.record import Array
 from ...envs.task import LAGGED, REFERENCES, ZERO_SLIP, compute_reference, make_reference_params
 from ...envs.ticks import TICK
@@ -74,10 +74,10 @@ _drift, _inputs = as_python(compute_drift), as_python(solve_inputs)
 
 @jit
 def _model_following_law(
-    x: Any,
-    state: Any,
-    action: Any,
-    max_share: Any,
+    x: Matrix,
+    state: Matrix,
+    action: Matrix,
+    max_share: Vector,
     car: Any,
     target: Any,
     kind: int,

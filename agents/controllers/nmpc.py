@@ -14,6 +14,7 @@ import numpy as np
 from ...envs.engine.tick import StepVariant
 from ...envs.numerics.functions import sincos
 from ...envs.numerics.jit import jit
+from ...envs.numerics.primitives import Matrix, Scalar, Vector
 from ...envs.record import Array
 from ...envs.task import LAGGED, ReferenceParams, compute_reference, make_reference_params
 from ...envs.ticks import TICK
@@ -64,14 +65,16 @@ class Design(NamedTuple):
 
 
 @jit
-def _shift_plan(plan: Any, blocks: Any, m: int, steps: float) -> None:
+def _shift_plan(plan: Vector, blocks: Vector, m: int, steps: float) -> None:
     """Shift a plan by so many steps of the prediction, each block towards its next."""
     for i in range(len(plan) - m):
         plan[i] += (plan[i + m] - plan[i]) * min(1.0, steps / blocks[i // m])
 
 
 @jit
-def _interpolate_regulator(table: Any, axes: Any, v: Any, front: Any, rear: Any, per: Any) -> Any:
+def _interpolate_regulator(
+    table: Any, axes: Any, v: Scalar, front: Scalar, rear: Scalar, per: Vector
+) -> Any:
     """Interpolate a table's rows, shape (rows, 9), for the nine states of `prediction`.
 
     `per`: what turns F_d and N_d into the table's own disturbances, forces or rates.
@@ -88,7 +91,7 @@ def _interpolate_regulator(table: Any, axes: Any, v: Any, front: Any, rear: Any,
 
 @jit
 def _prepare_prediction(
-    design: Design, x: Any, friction: Any, roll: Any, added_command: Any, max_moment: Any
+    design: Design, x: Vector, friction: Any, roll: Vector, added_command: Any, max_moment: Any
 ) -> Any:
     """Prepare a row's `PredictionStart`, K (m, 9), and T (4, 9) of the terminal cost |T x|^2."""
     # x: row of `lqr.Inputs`, roll: angle and rate (rad, rad/s), NaN where they are not measured,
@@ -134,7 +137,13 @@ def _prepare_prediction(
 
 @jit
 def _nmpc_law(
-    x: Any, state: Any, action: Any, max_moment: Any, friction: Any, rolls: Any, design: Design
+    x: Vector,
+    state: Matrix,
+    action: Matrix,
+    max_moment: Vector,
+    friction: Vector,
+    rolls: Vector,
+    design: Design,
 ) -> None:
     """Compute the actions; state: `Memory` and the plan, rolls: as in `_prepare_prediction`."""
     blocks, m = design.blocks, design.gains.shape[3]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...envs.numerics.jit import jit
-from ...envs.numerics.primitives import absolute, maximum, select
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum, select
 from ...envs.record import Array
 from ...envs.ticks import TICK
 from ...envs.vehicle.parameters import Vehicle
@@ -37,7 +37,7 @@ LAST = Memory(*range(3))
 
 
 @jit
-def _compute_denominator(car: Any, V: Any) -> Any:
+def _compute_denominator(car: Any, V: Scalar) -> Any:
     """Compute -a12 m V^2 (N m), kept at least 5 % of the sum of its terms' magnitudes.
 
     At zero the yaw moment has no static effect on the sideslip angle. An understeering car has such
@@ -51,7 +51,7 @@ def _compute_denominator(car: Any, V: Any) -> Any:
 
 
 @jit
-def _compute_static_gain(car: Any, V: Any) -> Any:
+def _compute_static_gain(car: Any, V: Scalar) -> Any:
     """Compute N_z / delta_f for a steady beta of zero (N m/rad), tie-vision (24)."""
     m, l_f, l_r, C_f, C_r = car[CAR.m], car[CAR.l_f], car[CAR.l_r], car[CAR.C_f], car[CAR.C_r]
     mV2 = m * V * V
@@ -60,7 +60,7 @@ def _compute_static_gain(car: Any, V: Any) -> Any:
 
 
 @jit
-def _compute_sideslip_gain(car: Any, V: Any) -> Any:
+def _compute_sideslip_gain(car: Any, V: Scalar) -> Any:
     """Compute the yaw moment that holds a sideslip angle (N m/rad), beside that of (24)."""
     plant, m = compute_plant(car, V), car[CAR.m]
     yaw_rate = plant.a11 * m * V * V / _compute_denominator(car, V)  # that keeps it, -a11 / a12
@@ -73,7 +73,7 @@ def _compute_feedforward_gain(vehicle: Vehicle, speed: float) -> float:
 
 
 @jit
-def _interpolate_column(table: Any, v: Any) -> Any:
+def _interpolate_column(table: Any, v: Scalar) -> Any:
     """Interpolate a column of a table over SPEEDS at v, held beyond its ends."""
     position = min(max((v - MIN_SPEED) / 0.5, 0.0), len(table) - 1.000001)
     i = int(position)
@@ -81,7 +81,7 @@ def _interpolate_column(table: Any, v: Any) -> Any:
 
 
 @jit
-def _feedforward_law(x: Any, action: Any, car: Any, full_scale: float) -> None:
+def _feedforward_law(x: Matrix, action: Matrix, car: Any, full_scale: float) -> None:
     for n in range(len(x)):
         v = 0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right])
         gain = _compute_static_gain(car, maximum(v, MIN_SPEED))
@@ -90,14 +90,14 @@ def _feedforward_law(x: Any, action: Any, car: Any, full_scale: float) -> None:
 
 @jit
 def _two_dof_law(
-    x: Any,
-    state: Any,
-    action: Any,
-    max_share: Any,
+    x: Matrix,
+    state: Matrix,
+    action: Matrix,
+    max_share: Vector,
     follows: int,
     car: Any,
-    k_p: Any,
-    k_i: Any,
+    k_p: Vector,
+    k_i: Vector,
     full_scale: float,
     wait: int,
     dt: float,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...envs.numerics.jit import jit
-from ...envs.numerics.primitives import absolute, maximum
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
 from ...envs.record import Array
 from ...envs.task import (
     LAGGED,
@@ -57,7 +57,7 @@ def _compute_yaw_gains(
 
 
 @jit
-def _apply_dead_zone(value: Any, band: Any) -> Any:
+def _apply_dead_zone(value: Scalar, band: Scalar) -> Scalar:
     """Compute the part of a value outside of +-band, with its sign; 0 inside."""
     if value > band:
         return value - band
@@ -68,13 +68,13 @@ def _apply_dead_zone(value: Any, band: Any) -> Any:
 
 @jit
 def _esc_law(
-    x: Any,
-    state: Any,
-    action: Any,
-    max_share: Any,
+    x: Matrix,
+    state: Matrix,
+    action: Matrix,
+    max_share: Vector,
     target: Any,
-    speeds: Any,
-    gains: Any,
+    speeds: Vector,
+    gains: Matrix,
     band: float,
     max_sideslip: float,
     stiffness: float,
@@ -169,14 +169,14 @@ LAST = Memory(*range(3))
 
 
 @jit
-def _compute_surface_slope(plant: Any, pole: Any) -> Any:
+def _compute_surface_slope(plant: Any, pole: Scalar) -> Scalar:
     """Compute xi (1/s) of the surface s = 0, on which beta's error decays at `pole` (rad/s)."""
     # on s = 0, beta' = a11 beta + a12 gamma makes the pole of beta's error a11 - a12 xi
     return (plant.a11 + pole) / plant.a12
 
 
 @jit
-def _compute_reference(x: Any, v: Any, plant: Any, target: Any, kind: int) -> Any:
+def _compute_reference(x: Vector, v: Scalar, plant: Any, target: Any, kind: int) -> Any:
     """Compute (beta_ref, gamma_ref) of a row; a free yaw rate is that which keeps beta_ref."""
     if kind == LAGGED:  # then the observation has it
         return x[SLIDING_IN.beta_ref], x[SLIDING_IN.gamma_ref]
@@ -188,10 +188,10 @@ def _compute_reference(x: Any, v: Any, plant: Any, target: Any, kind: int) -> An
 
 @jit
 def _sliding_mode_law(
-    x: Any,
-    state: Any,
-    action: Any,
-    max_share: Any,
+    x: Matrix,
+    state: Matrix,
+    action: Matrix,
+    max_share: Vector,
     car: Any,
     target: Any,
     kind: int,

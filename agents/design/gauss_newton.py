@@ -7,6 +7,7 @@ import numpy as np
 
 from ...envs.numerics.jit import jit
 from ...envs.numerics.packed import count_lanes
+from ...envs.numerics.primitives import Matrix, Vector
 from .prediction import N_RESIDUALS, N_TERMINAL, PredictionModel, PredictionStart, simulate_plans
 
 # A variable of a plan is a fraction of the full yaw moment or of the steering's authority, which is
@@ -24,13 +25,13 @@ class _PlanBatch(NamedTuple):
 
     plans: Any  # variables: fractions of the inputs' full scale, shape (variables, count)
     perturbations: Any  # offsets behind the limits, in a variable's unit, shape as `plans`
-    limits: Any  # 1 or -1 where a block starts at a limit, shape (variables, count)
-    residuals: Any  # residuals, whose squares sum to J, shape (residuals, count)
+    limits: Matrix  # 1 or -1 where a block starts at a limit, shape (variables, count)
+    residuals: Matrix  # residuals, whose squares sum to J, shape (residuals, count)
     first: Any  # first yaw moment (of full scale) and added steering (rad), shape (2, count)
 
 
 @jit
-def make_plan_batch(variables: int, blocks: Any, count: int) -> _PlanBatch:
+def make_plan_batch(variables: int, blocks: Vector, count: int) -> _PlanBatch:
     """Make a batch of plans of zeros.
 
     Args:
@@ -55,8 +56,8 @@ def simulate_batch(
     model: PredictionModel,
     start: PredictionStart,
     K: Any,
-    terminal: Any,
-    blocks: Any,
+    terminal: Matrix,
+    blocks: Vector,
     batch: _PlanBatch,
 ) -> None:
     """Simulate any number of plans, as many at a time as there are lanes.
@@ -89,7 +90,7 @@ def simulate_batch(
 
 
 @jit
-def _sum_squares(residuals: Any, J: Any) -> None:
+def _sum_squares(residuals: Matrix, J: Vector) -> None:
     """Fill J (count,) with the sums of the squared residuals."""
     J[:] = 0.0
     for r in range(len(residuals)):
@@ -98,7 +99,7 @@ def _sum_squares(residuals: Any, J: Any) -> None:
 
 
 @jit
-def _compute_normal_equations(batch: _PlanBatch, A: Any, g: Any) -> None:
+def _compute_normal_equations(batch: _PlanBatch, A: Matrix, g: Vector) -> None:
     """Fill A = D'D and g = D'r, D the Jacobian of the residuals r by forward differences.
 
     Column 0 of the batch is the plan itself; in column i + 1 its variable i is perturbed.
@@ -119,7 +120,7 @@ def _compute_normal_equations(batch: _PlanBatch, A: Any, g: Any) -> None:
 
 
 @jit
-def solve_damped_step(A: Any, g: Any, damping: float, L: Any, d: Any) -> None:
+def solve_damped_step(A: Matrix, g: Vector, damping: float, L: Matrix, d: Vector) -> None:
     """Solve (A + damping diag A + 1e-9 I) d = -g by Cholesky's factors; d is zero where they fail.
 
     Args:
@@ -154,7 +155,7 @@ def solve_damped_step(A: Any, g: Any, damping: float, L: Any, d: Any) -> None:
 
 
 @jit
-def _fill_perturbations(plan: Any, batch: _PlanBatch) -> None:
+def _fill_perturbations(plan: Vector, batch: _PlanBatch) -> None:
     """Fill every column with the plan; a column perturbs one variable, the first none."""
     for i in range(len(plan)):
         batch.plans[i, :] = plan[i]
@@ -162,7 +163,7 @@ def _fill_perturbations(plan: Any, batch: _PlanBatch) -> None:
 
 
 @jit
-def _fill_candidates(plan: Any, A: Any, g: Any, plans: Any) -> None:
+def _fill_candidates(plan: Vector, A: Matrix, g: Vector, plans: Matrix) -> None:
     """Fill plans with the plan, the regulator's own (zeros), and steps of growing damping."""
     n, damping = len(plan), _MIN_DAMPING
     L, d = np.empty((n, n)), np.empty(n)
@@ -180,9 +181,9 @@ def update_plan(
     model: PredictionModel,
     start: PredictionStart,
     K: Any,
-    terminal: Any,
-    blocks: Any,
-    plan: Any,
+    terminal: Matrix,
+    blocks: Vector,
+    plan: Vector,
     iterations: int,
 ) -> Any:
     """Improve a plan by Gauss-Newton iterations.

@@ -11,6 +11,7 @@ import numpy as np
 
 from ...envs.numerics.jit import as_python, jit
 from ...envs.numerics.packed import make_offsets
+from ...envs.numerics.primitives import Scalar
 from ...envs.record import Array
 from ...envs.vehicle.linear import Bicycle, compute_bicycle_coefficients, make_bicycle_model
 from ...envs.vehicle.parameters import Vehicle
@@ -138,13 +139,13 @@ CAR, _ = make_offsets(Bicycle)
 class BicyclePlant(NamedTuple):
     """A and B of tie-vision (8): beta and gamma, from the steering angle and the yaw moment."""
 
-    a11: Any  # effect of beta on beta' (1/s)
-    a12: Any  # effect of gamma on beta'
-    a21: Any  # effect of beta on gamma' (1/s^2)
-    a22: Any  # effect of gamma on gamma' (1/s)
-    b11: Any  # effect of the steering angle on beta' (1/s)
-    b21: Any  # effect of the steering angle on gamma' (1/s^2)
-    b22: Any  # effect of the yaw moment on gamma' (1/(kg m^2))
+    a11: Scalar  # effect of beta on beta' (1/s)
+    a12: Scalar  # effect of gamma on beta'
+    a21: Scalar  # effect of beta on gamma' (1/s^2)
+    a22: Scalar  # effect of gamma on gamma' (1/s)
+    b11: Scalar  # effect of the steering angle on beta' (1/s)
+    b21: Scalar  # effect of the steering angle on gamma' (1/s^2)
+    b22: Scalar  # effect of the yaw moment on gamma' (1/(kg m^2))
 
 
 def make_nominal_car(vehicle: Vehicle) -> Array:
@@ -160,7 +161,7 @@ def make_nominal_car(vehicle: Vehicle) -> Array:
 
 
 @jit
-def compute_plant(car: Any, V: Any) -> Any:
+def compute_plant(car: Any, V: Scalar) -> BicyclePlant:
     """Compute the bicycle plant at a speed.
 
     Args:
@@ -181,7 +182,7 @@ compute_plant_python = as_python(compute_plant)
 
 
 @jit
-def compute_drift(plant: Any, beta: Any, gamma: Any) -> Any:
+def compute_drift(plant: BicyclePlant, beta: Scalar, gamma: Scalar) -> Any:
     """Compute A [beta, gamma], the rates without inputs.
 
     Args:
@@ -196,7 +197,7 @@ def compute_drift(plant: Any, beta: Any, gamma: Any) -> Any:
 
 
 @jit
-def compute_steady_yaw_rate(plant: Any, beta: Any, delta: Any) -> Any:
+def compute_steady_yaw_rate(plant: BicyclePlant, beta: Scalar, delta: Scalar) -> Scalar:
     """Compute the yaw rate that keeps a sideslip angle constant.
 
     Args:
@@ -211,7 +212,7 @@ def compute_steady_yaw_rate(plant: Any, beta: Any, delta: Any) -> Any:
 
 
 @jit
-def solve_inputs(plant: Any, first: Any, second: Any) -> Any:
+def solve_inputs(plant: BicyclePlant, first: Scalar, second: Scalar) -> Any:
     """Solve B u = [first, second] for the inputs: dakf-stability (26).
 
     Args:

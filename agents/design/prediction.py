@@ -17,7 +17,7 @@ from ...envs.engine.config import make_car
 from ...envs.engine.tick import StepVariant, compute_lagged_load
 from ...envs.numerics.jit import inline, jit, noinline
 from ...envs.numerics.packed import load_element, store_element
-from ...envs.numerics.primitives import maximum, minimum, select
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum, select
 from ...envs.record import Array
 from ...envs.task import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE, ZERO_SLIP
 from ...envs.ticks import TICK
@@ -70,16 +70,16 @@ class PredictionStart(NamedTuple):
 
     car: Any  # `CarParams` of the car
     motion: Any  # motion of the car
-    T_l: Any  # torque of the left motor (N m)
-    T_r: Any  # torque of the right motor (N m)
-    delta_f: Any  # applied steering angle (rad)
-    added_command: Any  # added steering that was last commanded (rad)
-    driver: Any  # driver's steering angle, held (rad)
-    a_x: Any  # acceleration, held (m/s^2)
+    T_l: Scalar  # torque of the left motor (N m)
+    T_r: Scalar  # torque of the right motor (N m)
+    delta_f: Scalar  # applied steering angle (rad)
+    added_command: Scalar  # added steering that was last commanded (rad)
+    driver: Scalar  # driver's steering angle, held (rad)
+    a_x: Scalar  # acceleration, held (m/s^2)
     refs: Any  # beta_ref (rad) and gamma_ref (rad/s) now
     steady: Any  # values that a lagged reference approaches
     push: Any  # disturbance forces
-    max_moment: Any  # largest yaw moment as a fraction of full scale
+    max_moment: Scalar  # largest yaw moment as a fraction of full scale
 
 
 def _compute_lag_moments(time_constant: float, ticks: int) -> tuple[float, float]:
@@ -162,7 +162,7 @@ def make_blocks(steps: int, count: int) -> Array:
 
 
 @jit
-def replace_tyres(car: Any, C_f: Any, C_r: Any, mu: Any) -> Any:
+def replace_tyres(car: CarParams, C_f: Any, C_r: Any, mu: Any) -> CarParams:
     """Replace stiffnesses and friction of a car.
 
     Args:
@@ -188,25 +188,25 @@ N_TERMINAL = 4  # residuals behind the last step, of what is to come
 class _PredictionState(NamedTuple):
     """A prediction's state between steps."""
 
-    motion: Any  # motion of the car
-    T_l: Any  # torque of the left motor (N m)
-    T_r: Any  # torque of the right motor (N m)
-    delta_f: Any  # applied steering angle (rad)
-    added_command: Any  # added steering that was last commanded (rad)
-    beta_ref: Any  # reference of the sideslip angle (rad)
-    gamma_ref: Any  # reference of the yaw rate (rad/s)
-    F_d: Any  # disturbance force (N)
-    N_d: Any  # disturbance moment (N m)
+    motion: Any  # `Motion` of the car
+    T_l: Scalar  # torque of the left motor (N m)
+    T_r: Scalar  # torque of the right motor (N m)
+    delta_f: Scalar  # applied steering angle (rad)
+    added_command: Scalar  # added steering that was last commanded (rad)
+    beta_ref: Scalar  # reference of the sideslip angle (rad)
+    gamma_ref: Scalar  # reference of the yaw rate (rad/s)
+    F_d: Scalar  # disturbance force (N)
+    N_d: Scalar  # disturbance moment (N m)
 
 
 @inline
-def _clip_symmetric(value: Any, limit: Any) -> Any:
+def _clip_symmetric(value: Scalar, limit: Scalar) -> Scalar:
     """Clip a value to +-limit."""
     return minimum(maximum(value, 0.0 - limit), limit)
 
 
 @inline
-def _detect_limit(value: Any, low: Any, high: Any) -> Any:
+def _detect_limit(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
     """Detect a limit: 1 or -1 where the value is at the upper or the lower one, else 0."""
     close = 1e-9 * (high - low)
     return select(value >= high - close, 1.0, select(value <= low + close, -1.0, 0.0))
@@ -214,7 +214,12 @@ def _detect_limit(value: Any, low: Any, high: Any) -> Any:
 
 @inline
 def _multiply_row(
-    M: Any, row: int, model: PredictionModel, driver: Any, state: _PredictionState, beta: Any
+    M: Matrix,
+    row: int,
+    model: PredictionModel,
+    driver: Scalar,
+    state: _PredictionState,
+    beta: Scalar,
 ) -> Any:
     """Multiply a row of M, K or T of shape (rows, 9), by the nine states."""
     share = 0.5 * model.car.d_r / model.car.r / model.full_scale * (state.T_r - state.T_l)
@@ -230,9 +235,9 @@ def _compute_commands(
     start: PredictionStart,
     K: Any,
     state: _PredictionState,
-    beta: Any,
-    moment_share: Any,
-    steer_share: Any,
+    beta: Scalar,
+    moment_share: Scalar,
+    steer_share: Scalar,
 ) -> Any:
     """Compute the commands within their limits, and 1 or -1 at a limit of either.
 
@@ -266,10 +271,10 @@ def _predict_step(
     model: PredictionModel,
     start: PredictionStart,
     state: _PredictionState,
-    share: Any,
-    added_command: Any,
-    share_beyond: Any,
-    steer_beyond: Any,
+    share: Scalar,
+    added_command: Scalar,
+    share_beyond: Scalar,
+    steer_beyond: Scalar,
 ) -> Any:
     """Predict one step with held commands: the state after it, and the effort's four residuals."""
     kind, motor, steering, h = model.kind, model.motor, model.steering, model.step
@@ -328,13 +333,13 @@ def simulate_plans(
     model: PredictionModel,
     start: PredictionStart,
     K: Any,
-    terminal: Any,
-    blocks: Any,
-    plans: Any,
-    perturbations: Any,
-    residuals: Any,
-    limits: Any,
-    first: Any,
+    terminal: Matrix,
+    blocks: Vector,
+    plans: Matrix,
+    perturbations: Matrix,
+    residuals: Matrix,
+    limits: Matrix,
+    first: Vector,
 ) -> None:
     """Simulate plans: fill their residuals, whose squares sum to J, and their first commands.
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...envs.numerics.jit import jit
+from ...envs.numerics.primitives import Scalar, Vector
 from ...envs.record import Array
 from ...envs.task import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE, ZERO_SLIP
 from ...envs.ticks import TICK
@@ -250,7 +251,7 @@ SPEEDS = tuple(np.geomspace(2.0, 60.0, 48).tolist())
 
 
 @jit
-def find_cell(axis: Any, value: Any) -> Any:
+def find_cell(axis: Vector, value: Scalar) -> Any:
     """Find the cell of a value in an axis, held at its ends.
 
     Args:
@@ -270,7 +271,9 @@ def find_cell(axis: Any, value: Any) -> Any:
 
 
 @jit
-def interpolate_gains(table: Any, axes: Any, v: Any, front: Any, rear: Any, K: Any) -> None:
+def interpolate_gains(
+    table: Any, axes: Any, v: Scalar, front: Scalar, rear: Scalar, K: Any
+) -> None:
     """Interpolate a table of gains, linear along each axis.
 
     Args:

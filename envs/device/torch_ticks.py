@@ -10,7 +10,7 @@ from ..engine.step import make_step_params
 from ..engine.tick import StepState, StepVariant, apply_tyre_change, integrate_tick
 from ..engine.window import compute_tick_cost
 from ..numerics.functions import CHANNELS, draw_normals
-from ..numerics.primitives import select
+from ..numerics.primitives import Scalar, select
 from ..numerics.torch_backend import compile_method, to_torch, torch
 from ..record import FAST_WIDTH
 from ..scenarios.road import NominalMotion
@@ -27,11 +27,11 @@ Numbers = tuple[Tensor, ...]
 class InfoValues(NamedTuple):
     """Numbers of `info` from the last tick of a car; (N,) each."""
 
-    beta: Any  # rad
-    beta_ref: Any  # rad
-    gamma_ref: Any  # rad/s
-    steer: Any  # rad, front wheels
-    moment: Any  # N m, yaw moment of both motors
+    beta: Scalar  # rad
+    beta_ref: Scalar  # rad
+    gamma_ref: Scalar  # rad/s
+    steer: Scalar  # rad, front wheels
+    moment: Scalar  # N m, yaw moment of both motors
 
 
 class TickState(NamedTuple):

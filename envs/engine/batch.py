@@ -1,12 +1,13 @@
 """Env-steps and resets of a batch, its vehicles of one variant in SIMD lanes; compiled."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ..numerics.jit import copy_into, jit, noinline
 from ..numerics.packed import count_lanes, load_element, read
+from ..numerics.primitives import Matrix, Vector
 from ..numerics.simd import LANES
 from ..record import FAST_WIDTH, Array
 from ..task import REFUSED, REPORT, RUNNING
@@ -61,7 +62,7 @@ def make_lane_buffers(count: int, n: int, entries: int) -> _LaneBuffers:
 
 @noinline
 def _step_lanes(
-    count: int, batch: BatchArrays, actions: Any, n: int, bounds: Any, buffers: _LaneBuffers
+    count: int, batch: BatchArrays, actions: Vector, n: int, bounds: Vector, buffers: _LaneBuffers
 ) -> bool:
     """Step the block's first `count` members; False, and nothing changes, where one ends early."""
     params, states = batch.params, batch.states
@@ -113,9 +114,9 @@ _MAX_SCALAR = 2  # up to so many vehicles are stepped one by one
 
 @jit
 def step_rows(
-    params: Any, states: Any, switches: Any, obs: Any, rows: Any, packets: Any, reports: Any,
-    ticks_done: Any, delivered: Any, over: Any, actions: Any, n: int, bounds: Any, rewards: Any,
-    terminated: Any, truncated: Any, buffers: _LaneBuffers,
+    params: Matrix, states: Matrix, switches: Matrix, obs: Matrix, rows: Matrix, packets: Matrix,
+    reports: Matrix, ticks_done: Vector, delivered: Vector, over: Vector, actions: Matrix, n: int,
+    bounds: Matrix, rewards: Vector, terminated: Vector, truncated: Vector, buffers: _LaneBuffers,
 ) -> int:  # fmt: skip
     """Step every row by one env-step, and count the episodes that ended.
 
@@ -171,7 +172,7 @@ def step_rows(
 
 
 @jit
-def read_ends(report: Any) -> tuple[float, bool, bool]:
+def read_ends(report: Vector) -> tuple[float, bool, bool]:
     """Read (reward, terminated, truncated) from a step's report (len(Report),)."""
     terminated = report[REPORT.failure] != RUNNING
     return -report[REPORT.cost], terminated, report[REPORT.ended] == 1.0 and not terminated
@@ -189,7 +190,7 @@ def _has_variant_change(m: int, batch: BatchArrays, buffers: _LaneBuffers) -> bo
 
 @jit
 def _step_single(
-    i: int, batch: BatchArrays, actions: Any, n: int, bounds: Any, buffers: _LaneBuffers
+    i: int, batch: BatchArrays, actions: Vector, n: int, bounds: Matrix, buffers: _LaneBuffers
 ) -> int:
     """Step row i by itself; return the ticks done."""
     row = get_episode_arrays(batch, i)
@@ -203,8 +204,8 @@ def _step_single(
 
 @jit
 def reset_rows(
-    chosen: Any, start_index: Any, starts: EpisodeStart, keys: Any, bounds: Any, batch: BatchArrays,
-    final: RecordArrays,
+    chosen: Vector, start_index: Vector, starts: EpisodeStart, keys: Matrix, bounds: Matrix,
+    batch: BatchArrays, final: RecordArrays,
 ) -> None:  # fmt: skip
     """Reset the chosen rows (M,), whose records are first copied into `final`.
 

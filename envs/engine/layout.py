@@ -7,6 +7,7 @@
 from typing import Annotated, Any, NamedTuple
 
 from ..numerics.packed import make_offsets
+from ..numerics.primitives import Scalar
 from ..record import PACKET_WIDTH
 from ..scenarios.driver import DriverParams, SpeedProfile, Wind
 from ..scenarios.road import NominalMotion, TrackPath
@@ -25,8 +26,8 @@ from ..vehicle.linear import Bicycle
 class Disturbance(NamedTuple):
     """Ornstein-Uhlenbeck lateral force and yaw moment, per tick."""
 
-    force: Any  # N, standard deviation
-    moment: Any  # N m
+    force: Scalar  # N, standard deviation
+    moment: Scalar  # N m
     decay: Any  # fraction that is left after a tick
     noise_gain: Any  # sqrt(1 - decay^2)
 
@@ -34,56 +35,56 @@ class Disturbance(NamedTuple):
 class TaskParams(NamedTuple):
     """The episode's length and limits."""
 
-    duration: Any  # ticks
-    half_width: Any  # m, half the width of the road or proving ground
-    yaw_scale: Any  # N m, yaw moment of an action of 1
-    yaw_first: Any  # 1: yaw moment before acceleration
-    spin: Any  # rad, sideslip angle beyond which the car spins
-    authority: Any  # rad, added steering of an action of 1
-    slew: Any  # rad per tick, rate limit of the added steering
-    stop: Any  # rad, limit of the whole front steering angle
+    duration: Scalar  # ticks
+    half_width: Scalar  # m, half the width of the road or proving ground
+    yaw_scale: Scalar  # N m, yaw moment of an action of 1
+    yaw_first: Scalar  # 1: yaw moment before acceleration
+    spin: Scalar  # rad, sideslip angle beyond which the car spins
+    authority: Scalar  # rad, added steering of an action of 1
+    slew: Scalar  # rad per tick, rate limit of the added steering
+    stop: Scalar  # rad, limit of the whole front steering angle
 
 
 class TyreChange(NamedTuple):
     """Tyres that change in mid-run."""
 
-    tick: Any  # at whose start they change
-    front: Any  # factor on the front cornering stiffness
-    rear: Any  # factor on the rear cornering stiffness
+    tick: Scalar  # at whose start they change
+    front: Scalar  # factor on the front cornering stiffness
+    rear: Scalar  # factor on the rear cornering stiffness
 
 
 class ActuatorState(NamedTuple):
     """Actuators, the driver's integral and the disturbances now acting."""
 
-    T_l: Any  # N m, torque of the left motor
-    T_r: Any  # N m, torque of the right motor
-    delta_f: Any  # rad, front steering angle
-    integral: Any  # m/s2, integral part of the driver's acceleration command
-    F_d: Any  # N, lateral force
-    N_d: Any  # N m, yaw moment
-    slewing: Any  # rad, the command of added steering within its rate limit
-    added: Any  # rad, the added steering that acts
+    T_l: Scalar  # N m, torque of the left motor
+    T_r: Scalar  # N m, torque of the right motor
+    delta_f: Scalar  # rad, front steering angle
+    integral: Scalar  # m/s2, integral part of the driver's acceleration command
+    F_d: Scalar  # N, lateral force
+    N_d: Scalar  # N m, yaw moment
+    slewing: Scalar  # rad, the command of added steering within its rate limit
+    added: Scalar  # rad, the added steering that acts
 
 
 class Clock(NamedTuple):
     """Integers of an episode, as floats."""
 
-    key_low: Any  # lower 32 bits of the episode's key
+    key_low: Scalar  # lower 32 bits of the episode's key
     key_high: Any  # upper 32 bits
     tick: Any
     failure: Any  # place in `FAILURES`
     redraws: Any  # how often an unstable car was drawn anew
-    next_due: Any  # arrival tick of the next packet
+    next_due: Scalar  # arrival tick of the next packet
 
 
 class _SlowSensorState(NamedTuple):
     """State of a slow sensor, and its newest sample."""
 
     frames: Any  # captured so far
-    next_capture: Any  # tick
-    captured: Any  # tick of the newest delivered sample, NEVER before the first
+    next_capture: Scalar  # tick
+    captured: Scalar  # tick of the newest delivered sample, NEVER before the first
     values: Annotated[tuple[Any, ...], VALUES]
-    arrived: Any  # tick of the newest sample's delivery
+    arrived: Scalar  # tick of the newest sample's delivery
     drift: Any  # what the sensor carries from sample to sample
 
 
@@ -124,7 +125,7 @@ class _EpisodeState(NamedTuple):
     slow: Annotated[tuple[_SlowSensorState, ...], len(SLOW)]
     # packets, columns as in `Packet`
     queue: Annotated[Any, len(SLOW) * MAX_IN_FLIGHT * PACKET_WIDTH]
-    driver: Any  # rad, the driver's steering command
+    driver: Scalar  # rad, the driver's steering command
     under_way: Any  # how many packets are in the queue
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from ..numerics.functions import clip
 from ..numerics.jit import jit
 from ..numerics.packed import load_element, read, store_element
-from ..numerics.primitives import maximum, minimum, select, to_word
+from ..numerics.primitives import Matrix, Scalar, Vector, maximum, minimum, select, to_word
 from ..record import FAST, PACKET, PACKET_WIDTH
 from ..sensors.link import compute_arrivals
 from ..sensors.slow import BLOCKS, NEEDS_QUALITY, VALUES, WIDTHS, MeasurementContext, sample_sensor
@@ -22,7 +22,7 @@ NEVER_DUE = 1e15  # tick of the next arrival where no packet is under way
 
 @jit
 def _push_packet(
-    z: Any, sensor: int, captured: Any, due: Any, quality: Any, frame: Any, values: Any
+    z: Vector, sensor: int, captured: Any, due: Scalar, quality: Any, frame: Any, values: Vector
 ) -> None:
     """Queue a captured sample; `make_link` has checked that the queue is long enough."""
     slot = int(z[Z.under_way])
@@ -40,7 +40,7 @@ def _push_packet(
 
 @jit
 def _send_frame(
-    z: Any, sensor: int, link: Any, tick: Any, key: Any, values: Any, quality: Any
+    z: Vector, sensor: int, link: Any, tick: Scalar, key: Vector, values: Vector, quality: Any
 ) -> None:
     """Queue a slow sensor's frame for its arrivals, and set the sensor's clock on."""
     column = Z.slow[sensor]
@@ -55,7 +55,7 @@ def _send_frame(
 
 
 @jit
-def update_newest(z: Any, packet: Any, tick: Any) -> None:
+def update_newest(z: Vector, packet: Vector, tick: Any) -> None:
     """Take a delivered packet (PACKET_WIDTH,) as its sensor's newest sample, if it is newer."""
     sensor = int(packet[PACKET.sensor])
     newest = Z.slow[sensor]
@@ -68,7 +68,7 @@ def update_newest(z: Any, packet: Any, tick: Any) -> None:
 
 
 @jit
-def _move_due_packets(z: Any, tick: Any, packets: Any, count: int) -> int:
+def _move_due_packets(z: Vector, tick: Scalar, packets: Matrix, count: int) -> int:
     """Move the packets that arrive at this tick into `packets`; return the new count."""
     while True:
         best, best_rank, due = -1, NEVER_DUE, NEVER_DUE
@@ -96,7 +96,7 @@ def _move_due_packets(z: Any, tick: Any, packets: Any, count: int) -> int:
 
 
 @jit
-def find_next_due(z: Any, tick: Any) -> Any:
+def find_next_due(z: Vector, tick: Scalar) -> Any:
     """Find the first tick after this one at which a slow sensor captures or a packet arrives."""
     due = maximum(z[Z.clock.next_due], tick + 1.0)
     for sensor in range(len(Z.slow)):
@@ -107,7 +107,7 @@ def find_next_due(z: Any, tick: Any) -> Any:
 
 @jit
 def make_measurement_context(
-    p: Any, motion: Any, small_angle: int, key: Any, tick: Any
+    p: Vector, motion: Any, small_angle: int, key: Vector, tick: Any
 ) -> MeasurementContext:
     """Make the inputs of the slow sensors' measurements at a tick."""
     road, car, noise = read(p, P.road), read(p, P.car), read(p, P.noise)
@@ -118,7 +118,7 @@ def make_measurement_context(
 
 
 @jit
-def sample_slow_sensors(row: Any, motion: Any, tick: Any, count: int) -> int:
+def sample_slow_sensors(row: Any, motion: Any, tick: Scalar, count: int) -> int:
     """Sample the slow sensors at a tick and deliver due packets; return the new packet count."""
     p, z, small_angle = row.p, row.z, row.switches[FLAGS.small_angle]
     key = (to_word(z[Z.clock.key_low]), to_word(z[Z.clock.key_high]))
@@ -135,14 +135,16 @@ def sample_slow_sensors(row: Any, motion: Any, tick: Any, count: int) -> int:
 
 
 @jit
-def observe(row: Any, n: int, count: int, refs: Any, bounds: Any) -> None:
+def observe(row: Any, n: int, count: int, refs: Vector, bounds: Matrix) -> None:
     """Write the float32 observation of n fast rows and `count` packets, clipped at its bounds."""
     k = observe_fast(row.rows, n, refs, bounds, row.switches, row.obs)
     observe_slow(row, k, count, bounds)
 
 
 @jit
-def observe_fast(rows: Any, n: int, refs: Any, bounds: Any, switches: Any, obs: Any) -> int:
+def observe_fast(
+    rows: Vector, n: int, refs: Vector, bounds: Matrix, switches: Vector, obs: Vector
+) -> int:
     """Write the observation's first entries, of n fast rows, and its last two, the references.
 
     Returns the number of first entries. For a block `rows` and `obs` have an axis more.
@@ -173,13 +175,13 @@ def observe_fast(rows: Any, n: int, refs: Any, bounds: Any, switches: Any, obs: 
 
 
 @jit
-def _store_clipped(obs: Any, value: Any, bounds: Any, k: int) -> None:
+def _store_clipped(obs: Vector, value: Scalar, bounds: Matrix, k: int) -> None:
     """Store entry k of an observation, clipped at its bounds (2, k)."""
     store_element(obs, clip(value, bounds[0, k], bounds[1, k]), k)
 
 
 @jit
-def observe_slow(row: Any, k: int, count: int, bounds: Any) -> None:
+def observe_slow(row: Any, k: int, count: int, bounds: Matrix) -> None:
     """Write the entries of the slow sensors, from k on, of a record of `count` packets."""
     p, z, obs, packets = row.p, row.z, row.obs, row.packets
     tick = z[Z.clock.tick]
@@ -202,7 +204,7 @@ def observe_slow(row: Any, k: int, count: int, bounds: Any) -> None:
 
 
 @jit
-def write_report(report: Any, z: Any) -> None:
+def write_report(report: Vector, z: Vector) -> None:
     """Write time, yaw rate, heading and failure of the state into the report."""
     report[REPORT.t] = z[Z.clock.tick] * TICK
     report[REPORT.gamma] = z[Z.motion.gamma]

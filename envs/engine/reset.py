@@ -5,7 +5,7 @@ from typing import Any
 from ..numerics.functions import CHANNELS, draw_normals, sincos
 from ..numerics.jit import copy_into, jit, noinline
 from ..numerics.packed import read, write
-from ..numerics.primitives import from_word, select
+from ..numerics.primitives import Scalar, Vector, from_word, select
 from ..record import FAST
 from ..scenarios.draws import DRAWS, DRAWS_WIDTH, draw_stable
 from ..scenarios.driver import compute_target_angle
@@ -25,7 +25,7 @@ from .workspace import EpisodeArrays, EpisodeStart
 
 
 @jit
-def _write_surroundings(p: Any, d: Any, s: Any, v_x: Any) -> None:
+def _write_surroundings(p: Vector, d: Any, s: Scalar, v_x: Scalar) -> None:
     """Write drawn friction, wind, road and path, for a start at s (m) with v_x (m/s)."""
     mirrored = d.side < 0.5
     right = select(d.friction_right > 0.0, d.friction_right, d.friction)
@@ -45,7 +45,7 @@ def _write_surroundings(p: Any, d: Any, s: Any, v_x: Any) -> None:
 
 
 @jit
-def _write_sensors(p: Any, d: Any, low: Any, high: Any) -> None:
+def _write_sensors(p: Vector, d: Any, low: Vector, high: Vector) -> None:
     """Write drawn biases and GPS latency, which was packed as the worst case of low and high."""
     p[P.noise.gyro_bias] = p[P.noise.gyro_bias] + d.gyro_bias
     p[P.noise.accel_y_bias] = p[P.noise.accel_y_bias] + d.accel_y_bias
@@ -57,7 +57,7 @@ def _write_sensors(p: Any, d: Any, low: Any, high: Any) -> None:
 
 
 @jit
-def _write_motion(z: Any, d: Any, start: Any, small_angle: int) -> None:
+def _write_motion(z: Vector, d: Any, start: Vector, small_angle: int) -> None:
     """Write the drawn motion, or the numbers of `start` (len(Motion),) that are not NaN."""
     mirrored = d.side < 0.5
     beta = select(mirrored, 0.0 - d.initial_beta, d.initial_beta)
@@ -72,7 +72,7 @@ def _write_motion(z: Any, d: Any, start: Any, small_angle: int) -> None:
 
 @jit
 def compute_first_row(
-    motion: Any, steer: Any, road: Any, d_f: Any, noise: Any, draws: Any, small_angle: int
+    motion: Any, steer: Any, road: Any, d_f: Scalar, noise: Any, draws: Any, small_angle: int
 ) -> Any:
     """Compute the fast sensors (FAST_WIDTH) at tick 0, when only the steering has acted."""
     applied = (steer, 0.0, 0.0, steer, 0.0, compute_car_curvature(motion, road))

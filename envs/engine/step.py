@@ -11,7 +11,7 @@ from typing import Any
 from ..numerics.functions import clip
 from ..numerics.jit import copy_into, inline, jit, noinline
 from ..numerics.packed import load_element, read, store_element, write
-from ..numerics.primitives import any_lane, select
+from ..numerics.primitives import Matrix, Scalar, Vector, any_lane, select
 from ..record import FAST
 from ..scenarios.steering import DRIVER
 from ..task import (
@@ -41,7 +41,7 @@ from .workspace import EpisodeArrays, EpisodeStart, split_workspace
 
 
 @jit
-def make_step_params(p: Any) -> StepParams:
+def make_step_params(p: Vector) -> StepParams:
     """Make the parameters that are constant within an env-step from packed ones."""
     return StepParams(
         car=read(p, P.car), road=read(p, P.road), motor=read(p, P.motor),
@@ -53,7 +53,7 @@ def make_step_params(p: Any) -> StepParams:
 
 
 @jit
-def make_step_variant(p: Any, switches: Any) -> StepVariant:
+def make_step_variant(p: Vector, switches: Vector) -> StepVariant:
     """Make the variant of a vehicle's ticks from packed parameters p and switches."""
     flags = read(switches, FLAGS)
     lag = int(p[P.motor.start] > 0.0) + int(p[P.steering.start] > 0.0)
@@ -72,8 +72,8 @@ def get_start_variant(start: EpisodeStart) -> StepVariant:
 
 @jit
 def integrate_step(
-    p: Any, z: Any, variant: StepVariant, yaw_share: Any, steer_share: Any, n: int, rows: Any,
-    report: Any, window: Any, is_single: bool,
+    p: Vector, z: Vector, variant: StepVariant, yaw_share: Scalar, steer_share: Scalar, n: int,
+    rows: Matrix, report: Vector, window: Vector, is_single: bool,
 ) -> int:  # fmt: skip
     """Integrate plant and fast sensors over n ticks, fewer where the episode ends.
 
@@ -136,8 +136,8 @@ def integrate_step(
 
 @inline
 def write_final_state(
-    z: Any, report: Any, state: StepState, measured: Measurements, failure: Any, beta: Any,
-    refs: Any, tick: Any, cost: Any, duration: Any,
+    z: Vector, report: Vector, state: StepState, measured: Measurements, failure: Scalar, beta: Any,
+    refs: Vector, tick: Scalar, cost: Scalar, duration: Scalar,
 ) -> None:  # fmt: skip
     """Write the end of an env-step into z, but for the motion, and into its report."""
     write(z, state.drive, Z.drive)
@@ -157,20 +157,22 @@ def write_final_state(
 
 
 @jit
-def finish_step(row: EpisodeArrays, n: int, done: int, bounds: Any, window: Any) -> None:
+def finish_step(row: EpisodeArrays, n: int, done: int, bounds: Matrix, window: Vector) -> None:
     """Do slow sensors, observation and report of one vehicle's step of `done` ticks of n."""
     finish_slow_sensors(row, done, _observe_step(row, n, done, bounds), bounds, window)
 
 
 @noinline
-def finish_slow_sensors(row: EpisodeArrays, done: int, k: int, bounds: Any, window: Any) -> None:
+def finish_slow_sensors(
+    row: EpisodeArrays, done: int, k: int, bounds: Matrix, window: Vector
+) -> None:
     """Do slow sensors and report of a step of `done` ticks; k is their first observation entry."""
     _finish_report(row, k, sample_slow_ticks(row, 0, done, 0, done, window), bounds)
 
 
 @jit
 def sample_slow_ticks(
-    row: EpisodeArrays, first: int, last: int, count: int, done: int, window: Any
+    row: EpisodeArrays, first: int, last: int, count: int, done: int, window: Vector
 ) -> int:
     """Sample the slow sensors at ticks first to last - 1 of a step's `done`.
 
@@ -187,7 +189,7 @@ def sample_slow_ticks(
 
 
 @jit
-def _observe_step(row: EpisodeArrays, n: int, done: int, bounds: Any) -> int:
+def _observe_step(row: EpisodeArrays, n: int, done: int, bounds: Matrix) -> int:
     """Write the observation but for the slow sensors, whose first entry's index is returned."""
     report, rows = row.report, row.rows
     refs = (report[REPORT.beta_ref], report[REPORT.gamma_ref])
@@ -200,13 +202,13 @@ def _observe_step(row: EpisodeArrays, n: int, done: int, bounds: Any) -> int:
 
 
 @jit
-def finish_outputs(row: EpisodeArrays, n: int, done: int, count: int, bounds: Any) -> None:
+def finish_outputs(row: EpisodeArrays, n: int, done: int, count: int, bounds: Matrix) -> None:
     """Write observation and report of a step of `done` ticks of n with `count` packets."""
     _finish_report(row, _observe_step(row, n, done, bounds), count, bounds)
 
 
 @jit
-def _finish_report(row: EpisodeArrays, k: int, count: int, bounds: Any) -> None:
+def _finish_report(row: EpisodeArrays, k: int, count: int, bounds: Matrix) -> None:
     """Write the report, and the observation of the slow sensors from entry k on."""
     report = row.report
     observe_slow(row, k, count, bounds)
@@ -216,7 +218,7 @@ def _finish_report(row: EpisodeArrays, k: int, count: int, bounds: Any) -> None:
 
 
 @jit
-def clip_action(action: Any) -> tuple[float, float]:
+def clip_action(action: Vector) -> tuple[float, float]:
     """Clip (yaw moment, added steering) of an action to +-1; NaN where it is not finite."""
     # in plain Python a float32 would make float32 of all that follows
     yaw_share = float(action[0])
@@ -252,8 +254,8 @@ def reject_action(row: EpisodeArrays) -> int:
 
 @noinline
 def step_vehicle(
-    p: Any, z: Any, switches: Any, obs: Any, rows: Any, packets: Any, report: Any, action: Any,
-    n: int, bounds: Any, window: Any,
+    p: Vector, z: Vector, switches: Vector, obs: Vector, rows: Matrix, packets: Matrix,
+    report: Vector, action: Vector, n: int, bounds: Matrix, window: Vector,
 ) -> int:  # fmt: skip
     """Step one vehicle by n ticks, fewer where the episode ends; return the ticks done.
 
@@ -273,7 +275,7 @@ def step_vehicle(
 
 
 @jit
-def step_workspace(workspace: Any, action: Any) -> int:
+def step_workspace(workspace: Any, action: Vector) -> int:
     """Step the vehicle of a workspace as `step_vehicle` does, and add WILD where it applies."""
     row, bounds, window = split_workspace(workspace)
     n = len(row.rows)

@@ -7,7 +7,7 @@ it serve outside plants too.
 from typing import Any, NamedTuple
 
 from ..numerics.jit import inline
-from ..numerics.primitives import any_lane, select
+from ..numerics.primitives import Scalar, Vector, any_lane, select
 from ..record import FAST
 from ..scenarios.driver import (
     compute_acceleration_command,
@@ -79,7 +79,7 @@ class StepState(NamedTuple):
     motion: Any
     drive: Any
     start: Any  # `TyreLoad` at the tick's start
-    driver: Any  # rad, the driver's steering command
+    driver: Scalar  # rad, the driver's steering command
     car: Any  # with the present tyres
     refs: Any  # rad, rad/s, the references of beta and gamma
     nominal_motion: Any  # the nominal car that lays the road
@@ -88,23 +88,23 @@ class StepState(NamedTuple):
 class AppliedInputs(NamedTuple):
     """Mean inputs over a tick; the first six are columns of `Fast`, from `steer` on."""
 
-    steer: Any  # rad, front wheels
-    T_l: Any  # N m, left motor
-    T_r: Any  # N m, right motor
-    driver: Any  # rad, the driver's steering command
-    a_x: Any  # m/s2, the driver's acceleration command
-    curvature: Any  # 1/m, the road's at the car
-    added: Any  # rad, the part of steer that was added to the driver's
-    moment: Any  # N m, yaw moment of both motors
-    effort: Any  # the yaw moment as a fraction of full scale
+    steer: Scalar  # rad, front wheels
+    T_l: Scalar  # N m, left motor
+    T_r: Scalar  # N m, right motor
+    driver: Scalar  # rad, the driver's steering command
+    a_x: Scalar  # m/s2, the driver's acceleration command
+    curvature: Scalar  # 1/m, the road's at the car
+    added: Scalar  # rad, the part of steer that was added to the driver's
+    moment: Scalar  # N m, yaw moment of both motors
+    effort: Scalar  # the yaw moment as a fraction of full scale
 
 
 class _PlantInputs(NamedTuple):
     """Inputs of the plant during a tick."""
 
-    steer: Any  # rad, command to the front wheels
-    T_l: Any  # N m, command to the left motor
-    T_r: Any  # N m, command to the right motor
+    steer: Scalar  # rad, command to the front wheels
+    T_l: Scalar  # N m, command to the left motor
+    T_r: Scalar  # N m, command to the right motor
     disturbance: Any  # `DisturbanceForces`
     applied: Any  # `AppliedInputs`
     drive: Any  # `ActuatorState` at the tick's end
@@ -115,14 +115,14 @@ class Measurements(NamedTuple):
 
     row: Any  # the fast sensors, columns as in `Fast`
     refs: Any  # rad, rad/s, the references of beta and gamma
-    steer: Any  # rad, `AppliedInputs.steer`
-    moment: Any  # N m, `AppliedInputs.moment`
+    steer: Scalar  # rad, `AppliedInputs.steer`
+    moment: Scalar  # N m, `AppliedInputs.moment`
     lost: Any  # whether a number is not finite
     cost_inputs: CostInputs
 
 
 @inline
-def apply_tyre_change(car: Any, change: Any, is_changed: Any) -> Any:
+def apply_tyre_change(car: Any, change: Any, is_changed: Scalar) -> Any:
     """Change the car's tyres where `is_changed` holds."""
     C_f = select(is_changed, car.C_f * change.front, car.C_f)
     C_r = select(is_changed, car.C_r * change.rear, car.C_r)
@@ -139,7 +139,7 @@ def compute_static_load(drive: Any, car: Any, variant: StepVariant) -> Any:
 
 @inline
 def compute_lagged_load(
-    steer: Any, T_l: Any, T_r: Any, drive: Any, rest: Any, car: Any, variant: StepVariant
+    steer: Any, T_l: Scalar, T_r: Scalar, drive: Any, rest: Scalar, car: Any, variant: StepVariant
 ) -> Any:
     """Compute the tyres' load; `rest` of the motors' deviation from T_l and T_r (N m) is left."""
     inputs = TyreInputs(steer, apply_lag(T_l, drive.T_l, rest), apply_lag(T_r, drive.T_r, rest))
@@ -148,7 +148,13 @@ def compute_lagged_load(
 
 @inline
 def compute_motor_torques(
-    N_z: Any, tick: Any, v_x: Any, integral: Any, profile: Any, car: Any, yaw_first: Any
+    N_z: Scalar,
+    tick: Scalar,
+    v_x: Scalar,
+    integral: Scalar,
+    profile: Any,
+    car: Any,
+    yaw_first: Scalar,
 ) -> Any:
     """Compute (T_l, T_r, a_x, integral): torques (N m) for yaw moment and driver's acceleration."""
     max_torque = compute_torque_limit(v_x, car)
@@ -160,7 +166,7 @@ def compute_motor_torques(
 
 @inline
 def _apply_due_change(
-    params: StepParams, state: StepState, tick: Any, variant: StepVariant
+    params: StepParams, state: StepState, tick: Scalar, variant: StepVariant
 ) -> StepState:
     """Change the tyres if they are due to change at this tick."""
     is_due, car, start = tick == params.tyre_change.tick, state.car, state.start
@@ -174,7 +180,7 @@ def _apply_due_change(
 
 @inline
 def _follow_nominal_path(
-    params: StepParams, state: StepState, tick: Any
+    params: StepParams, state: StepState, tick: Scalar
 ) -> tuple[StepParams, NominalMotion]:
     """Compute (parameters with the road's turning rate, nominal car at the tick's end)."""
     speed, _ = compute_speed_reference(tick, params.speed_profile)
@@ -188,7 +194,7 @@ def _follow_nominal_path(
 
 @inline
 def compute_inputs(
-    params: StepParams, N_z: Any, steer_command: Any, state: StepState, tick: Any,
+    params: StepParams, N_z: Scalar, steer_command: Scalar, state: StepState, tick: Scalar,
     draws: NormalDraws,
 ) -> _PlantInputs:  # fmt: skip
     """Compute the plant's inputs during a tick; arguments as in `integrate_tick`."""
@@ -248,7 +254,7 @@ def _compute_loads(
 
 @inline
 def measure_tick(
-    params: StepParams, motion: Any, accel: Any, applied: AppliedInputs, refs_before: Any,
+    params: StepParams, motion: Any, accel: Vector, applied: AppliedInputs, refs_before: Vector,
     next_steer: Any, draws: NormalDraws, variant: StepVariant,
 ) -> tuple[Any, Measurements]:  # fmt: skip
     """Compute the driver's command (rad) and the measurements at the end of a tick.
@@ -278,7 +284,7 @@ def measure_tick(
 
 @inline
 def integrate_tick(
-    params: StepParams, N_z: Any, steer_command: Any, state: StepState, tick: Any,
+    params: StepParams, N_z: Scalar, steer_command: Scalar, state: StepState, tick: Scalar,
     draws: NormalDraws, next_steer: Any, variant: StepVariant,
 ) -> tuple[StepState, Measurements]:  # fmt: skip
     """Integrate one tick of the plant.

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..numerics.jit import jit
 from ..numerics.packed import read
+from ..numerics.primitives import Matrix, Vector
 from ..record import Array, Record
 from ..scenarios.driver import compute_wind
 from ..sensors.link import SlowSensor
@@ -73,7 +74,7 @@ def compute_true_states(params: Array, states: Array, switches: Any) -> Array:
 
 
 @jit
-def _write_true_states(params: Any, states: Any, switches: Any, out: Any) -> None:
+def _write_true_states(params: Vector, states: Vector, switches: Matrix, out: Matrix) -> None:
     """Write the `TrueState` of N episodes into out (N, len(TrueState))."""
     for i in range(len(params)):
         p, z = params[i], states[i]

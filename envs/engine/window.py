@@ -20,7 +20,17 @@ from ..numerics.packed import (
     store_element,
     write,
 )
-from ..numerics.primitives import absolute, any_lane, select, to_float, to_int, to_word
+from ..numerics.primitives import (
+    Matrix,
+    Scalar,
+    Vector,
+    absolute,
+    any_lane,
+    select,
+    to_float,
+    to_int,
+    to_word,
+)
 from ..numerics.simd import LANES
 from ..record import Array
 from ..scenarios.road import compute_path_offset
@@ -35,17 +45,17 @@ from .layout import PARAMS_WIDTH, P, Z
 class CostInputs(NamedTuple):
     """Inputs of a tick's cost besides the motion at its end."""
 
-    beta_ref: Any  # rad
-    gamma_ref: Any  # rad/s
-    effort: Any  # yaw moment as a fraction of full scale
-    added: Any  # rad, added steering
+    beta_ref: Scalar  # rad
+    gamma_ref: Scalar  # rad/s
+    effort: Scalar  # yaw moment as a fraction of full scale
+    added: Scalar  # rad, added steering
 
 
 class _TickCost(NamedTuple):
     """Cost and failures of a tick."""
 
-    cost: Any  # 1/s, cost rate
-    beta: Any  # rad
+    cost: Scalar  # 1/s, cost rate
+    beta: Scalar  # rad
     spun: Any  # whether the car spins
     off: Any  # whether it has left the road
 
@@ -55,7 +65,7 @@ class _StepWindow(NamedTuple):
 
     inertial: Annotated[tuple[Any, ...], 4]
     wheels: Annotated[tuple[Any, ...], 4]
-    steer: Any  # rad, the profile's
+    steer: Scalar  # rad, the profile's
     track: Motion
     cost_inputs: CostInputs
 
@@ -78,7 +88,7 @@ def make_window(n: int, *lanes: int) -> Array:
 
 
 @jit
-def compute_profile_angle(p: Any, tick: Any) -> Any:
+def compute_profile_angle(p: Vector, tick: Scalar) -> Any:
     """Compute the steering angle (rad) of a profile, or of the trace behind `EpisodeParams`."""
     if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
         return interpolate_trace(tick, p[PARAMS_WIDTH:])
@@ -86,7 +96,7 @@ def compute_profile_angle(p: Any, tick: Any) -> Any:
 
 
 @jit
-def overwrite_steering(p: Any, z: Any, n: int, window: Any) -> None:
+def overwrite_steering(p: Vector, z: Vector, n: int, window: Matrix) -> None:
     """Write the angles of a trace, or of a wandering driver, over those of the profile."""
     if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
         for j in range(n):
@@ -104,13 +114,13 @@ def overwrite_steering(p: Any, z: Any, n: int, window: Any) -> None:
 
 
 @jit
-def has_overwrite(p: Any, width: int) -> bool:
+def has_overwrite(p: Vector, width: int) -> bool:
     """Whether `overwrite_steering` has something to write for a block: p with `width` rows."""
     return width > PARAMS_WIDTH or bool(any_lane(load_element(p, _HOLD) > 0.0))
 
 
 @jit
-def precompute_window(p: Any, z: Any, n: int, has_driver: int, window: Any) -> None:
+def precompute_window(p: Vector, z: Vector, n: int, has_driver: int, window: Vector) -> None:
     """Write noise and steering of one vehicle's next n ticks; with has_driver no profile steers."""
     clock = read(z, Z.clock)
     key_low, key_high, first = to_word(clock.key_low), to_word(clock.key_high), int(clock.tick) + 1
@@ -127,7 +137,7 @@ def precompute_window(p: Any, z: Any, n: int, has_driver: int, window: Any) -> N
 
 
 @jit
-def precompute_lane_window(p: Any, z: Any, n: int, has_driver: int, window: Any) -> None:
+def precompute_lane_window(p: Vector, z: Vector, n: int, has_driver: int, window: Vector) -> None:
     """Write noise and steering of a block: `precompute_window` of p, z with a column a vehicle."""
     clock = read(z, Z.clock)
     key_low, key_high = to_word(clock.key_low), to_word(clock.key_high)
@@ -143,7 +153,7 @@ def precompute_lane_window(p: Any, z: Any, n: int, has_driver: int, window: Any)
 
 
 @jit
-def read_draws(window: Any, j: int) -> NormalDraws:
+def read_draws(window: Vector, j: int) -> NormalDraws:
     """Read the random numbers of tick j of the step."""
     return NormalDraws(read(window, WINDOW.inertial, j), read(window, WINDOW.wheels, j))
 
@@ -172,7 +182,7 @@ def compute_tick_cost(
 
 @jit
 def evaluate_cost(
-    window: Any, n: int, cost: Any, params: Any, variant: Any
+    window: Vector, n: int, cost: Scalar, params: Any, variant: Any
 ) -> tuple[Any, int, bool]:
     """Evaluate a step's n ticks up to a failure: (cost, number of ticks, whether the last fails).
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..numerics.jit import as_python, jit
 from ..numerics.packed import as_float32, as_int64, as_matrix, make_offsets, read
+from ..numerics.primitives import Scalar
 from ..record import FAST_WIDTH, PACKET_WIDTH, Array
 from ..task import REPORT
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH
@@ -28,7 +29,7 @@ class EpisodeArrays(NamedTuple):
 class _WorkspaceSizes(NamedTuple):
     """Sizes at the beginning of a workspace."""
 
-    n: Any  # ticks a step
+    n: Scalar  # ticks a step
     n_entries: Any  # of an observation
     max_packets: Any  # packets of a step
 

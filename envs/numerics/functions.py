@@ -9,7 +9,7 @@ words are signed 64-bit integers under masks.
 from typing import Any, NamedTuple
 
 from .jit import jit
-from .primitives import absolute, floor, frexp, maximum, minimum, select, sqrt, to_float
+from .primitives import Scalar, absolute, floor, frexp, maximum, minimum, select, sqrt, to_float
 
 _TWO_OVER_PI = 0.6366197723675814
 _PI_2_HIGH = 1.5707963267341256  # the first 33 bits of pi/2, so that k * high is exact
@@ -18,7 +18,7 @@ PI = 3.141592653589793
 
 
 @jit
-def sin_kernel(r: Any) -> Any:
+def sin_kernel(r: Scalar) -> Scalar:
     """Compute sin r for |r| <= pi/4, error below 1e-16."""
     z = r * r
     p = 1.58969099521155010221e-10
@@ -31,7 +31,7 @@ def sin_kernel(r: Any) -> Any:
 
 
 @jit
-def cos_kernel(r: Any) -> Any:
+def cos_kernel(r: Scalar) -> Scalar:
     """Compute cos r for |r| <= pi/4, error below 2e-16."""
     z = r * r
     p = -1.13596475577881948265e-11
@@ -44,7 +44,7 @@ def cos_kernel(r: Any) -> Any:
 
 
 @jit
-def sincos(x: Any) -> Any:
+def sincos(x: Scalar) -> Any:
     """Compute (sin x, cos x), error below 3e-16 + 1e-16 |x| for |x| < 1e6 rad."""
     k = floor(x * _TWO_OVER_PI + 0.5)
     r = (x - k * _PI_2_HIGH) - k * _PI_2_LOW
@@ -52,7 +52,7 @@ def sincos(x: Any) -> Any:
 
 
 @jit
-def _quadrant(q: Any, s: Any, c: Any) -> Any:
+def _quadrant(q: Scalar, s: Scalar, c: Scalar) -> Any:
     """(sin, cos) of an angle turned by q = 0, 1, 2 or 3 quarter turns."""
     odd = (q == 1.0) | (q == 3.0)
     sign_s = select(q > 1.5, -1.0, 1.0)
@@ -61,7 +61,7 @@ def _quadrant(q: Any, s: Any, c: Any) -> Any:
 
 
 @jit
-def _atan_kernel(t: Any) -> Any:
+def _atan_kernel(t: Scalar) -> Scalar:
     """arctan t for |t| < 0.1990, error below 1e-16: the series."""
     z = t * t
     p = 1.0 / 23.0
@@ -79,7 +79,7 @@ def _atan_kernel(t: Any) -> Any:
 
 
 @jit
-def atan(x: Any) -> Any:
+def atan(x: Scalar) -> Scalar:
     """Compute arctan x, error below 5e-16: reciprocal above 1, two half-angle steps, series."""
     steep = absolute(x) > 1.0
     u = select(steep, -1.0, x) / select(steep, x, 1.0)
@@ -89,7 +89,7 @@ def atan(x: Any) -> Any:
 
 
 @jit
-def atan2(y: Any, x: Any) -> Any:
+def atan2(y: Scalar, x: Scalar) -> Scalar:
     """Compute the angle of (x, y) in [-pi, pi], error below 1e-15; 0 at the origin.
 
     The half-angle steps of `atan` without their quotients: tan(a / 2) = y / (x + |(x, y)|).
@@ -106,20 +106,20 @@ def atan2(y: Any, x: Any) -> Any:
 
 
 @jit
-def wrap(angle: Any) -> Any:
+def wrap(angle: Scalar) -> Scalar:
     """Wrap an angle into [-pi, pi)."""
     return angle - 2.0 * PI * floor(angle / (2.0 * PI) + 0.5)
 
 
 @jit
-def smoothstep(x: Any) -> Any:
+def smoothstep(x: Scalar) -> Scalar:
     """Compute the C1 step: 0 below 0, 1 above 1, a cubic between."""
     t = select(x < 0.0, 0.0, select(x > 1.0, 1.0, x))
     return t * t * (3.0 - 2.0 * t)
 
 
 @jit
-def exp(x: Any) -> Any:
+def exp(x: Scalar) -> Scalar:
     """Compute e^x for |x| < 8, relative error below 5e-14: polynomial at x / 64, to the 64th."""
     z = x * (1.0 / 64.0)
     p = 1.0 / 362880.0
@@ -138,7 +138,7 @@ def exp(x: Any) -> Any:
 
 
 @jit
-def clip(value: Any, low: Any, high: Any) -> Any:
+def clip(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
     """Clip a value to [low, high]."""
     return minimum(maximum(value, low), high)
 
@@ -189,13 +189,13 @@ def philox(key_low: int, key_high: int, a: int, b: int, c: int = 0, d: int = 0) 
 
 
 @jit
-def to_uniform(word: int) -> Any:
+def to_uniform(word: int) -> Scalar:
     """Convert a 32-bit word to a number in (0, 1); never 0, never 1."""
     return (to_float(word) + 0.5) / _2_32
 
 
 @jit
-def _log_uniform(word: int) -> Any:
+def _log_uniform(word: int) -> Scalar:
     """log((word + 0.5) / 2^32), error below 1e-13."""
     m, exponent = frexp(to_float(2 * word + 1))  # of 2^33
     z = (m - _SQRT_HALF) / (m + _SQRT_HALF)  # |z| < 0.1716

@@ -8,7 +8,7 @@ single numbers and lanes take the same instructions.
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from llvmlite import ir
@@ -26,49 +26,56 @@ from .simd import (
     register_primitive,
 )
 
+Scalar: TypeAlias = Any
+"""One number a car: a float, lanes of a SIMD register, an array, a tensor or a symbol."""
+Vector: TypeAlias = Any
+"""Numbers in one axis, of any of these kinds."""
+Matrix: TypeAlias = Any
+"""Numbers in two axes or more."""
 
-def minimum(a: Any, b: Any) -> Any:
+
+def minimum(a: Scalar, b: Scalar) -> Scalar:
     """The smaller of two numbers."""
     return a if a < b else b
 
 
-def maximum(a: Any, b: Any) -> Any:
+def maximum(a: Scalar, b: Scalar) -> Scalar:
     """The larger of two numbers."""
     return a if a > b else b
 
 
-def absolute(a: Any) -> Any:
+def absolute(a: Scalar) -> Scalar:
     """Compute |a|."""
     return math.fabs(a)
 
 
-def floor(a: Any) -> Any:
+def floor(a: Scalar) -> Scalar:
     """The largest whole number at or below a, as a float."""
     return math.floor(a) * 1.0
 
 
-def sqrt(a: Any) -> Any:
+def sqrt(a: Scalar) -> Scalar:
     """The square root, correctly rounded."""
     return math.sqrt(a)
 
 
-def select(condition: Any, a: Any, b: Any) -> Any:
+def select(condition: Scalar, a: Scalar, b: Scalar) -> Scalar:
     """a where the condition holds, else b (both are evaluated)."""
     return a if condition else b
 
 
-def to_float(a: Any) -> Any:
+def to_float(a: Scalar) -> Scalar:
     """Convert an integer to a float."""
     return a * 1.0
 
 
-def frexp(a: Any) -> Any:
+def frexp(a: Scalar) -> Scalar:
     """Split a positive number into (m, e), a = m 2^e with 0.5 <= m < 1, both floats."""
     m, e = math.frexp(a)
     return m, e * 1.0
 
 
-def to_int(a: Any) -> Any:
+def to_int(a: Scalar) -> Scalar:
     """Convert a float that is a whole number to an integer."""
     return int(a)
 
@@ -83,7 +90,7 @@ def from_word(a: Any) -> Any:
     return a * 1.0
 
 
-def any_lane(condition: Any) -> Any:
+def any_lane(condition: Scalar) -> Scalar:
     """Check whether a condition holds for any of the cars in the lanes."""
     return condition
 

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 from ..numerics.functions import CHANNELS, draw_uniforms
 from ..numerics.jit import jit
 from ..numerics.packed import make_offsets, read
-from ..numerics.primitives import select
+from ..numerics.primitives import Scalar, Vector, select
 
 _ATTEMPTS = 64
 
@@ -13,43 +13,45 @@ _ATTEMPTS = 64
 class Draws(NamedTuple):
     """The quantities that a scenario gives as a number or a range."""
 
-    speed: Any  # m/s
-    friction: Any
-    front_stiffness: Any  # factor on the vehicle's
-    rear_stiffness: Any
-    onset: Any  # s
-    amplitude: Any  # rad
-    amplitude_2: Any  # rad, of the second pair of a random steering
-    frequency: Any  # Hz
-    frequency_2: Any
-    frequency_3: Any
-    frequency_4: Any
-    hold: Any  # s, of a step, a dwell, a ramp, a sweep; from one lane change to the next
-    wind_force: Any  # N
-    wind_arm: Any  # m, ahead of the centre of gravity
-    wind_start: Any  # s
-    wind_length: Any  # s
-    side: Any  # uniform in (0, 1): below a half the steering is mirrored
-    wind_side: Any
-    curvature: Any  # 1/m, of the road
-    path_speed: Any  # m/s at which a track has its standard's lengths; 0 always
-    friction_right: Any  # 0 as on the left
-    tyre_change_time: Any  # s; 0 never
-    front_change: Any  # factors on the stiffness from then on
-    rear_change: Any
-    gyro_bias: Any  # rad/s
-    accel_y_bias: Any  # m/s2
-    gps_latency: Any  # s, on top of the GPS's delays
-    bank: Any  # rad
-    initial_beta: Any  # rad, where the episode begins
-    initial_gamma: Any  # rad/s
+    speed: Scalar  # m/s
+    friction: Scalar
+    front_stiffness: Scalar  # factor on the vehicle's
+    rear_stiffness: Scalar
+    onset: Scalar  # s
+    amplitude: Scalar  # rad
+    amplitude_2: Scalar  # rad, of the second pair of a random steering
+    frequency: Scalar  # Hz
+    frequency_2: Scalar
+    frequency_3: Scalar
+    frequency_4: Scalar
+    hold: Scalar  # s, of a step, a dwell, a ramp, a sweep; from one lane change to the next
+    wind_force: Scalar  # N
+    wind_arm: Scalar  # m, ahead of the centre of gravity
+    wind_start: Scalar  # s
+    wind_length: Scalar  # s
+    side: Scalar  # uniform in (0, 1): below a half the steering is mirrored
+    wind_side: Scalar
+    curvature: Scalar  # 1/m, of the road
+    path_speed: Scalar  # m/s at which a track has its standard's lengths; 0 always
+    friction_right: Scalar  # 0 as on the left
+    tyre_change_time: Scalar  # s; 0 never
+    front_change: Scalar  # factors on the stiffness from then on
+    rear_change: Scalar
+    gyro_bias: Scalar  # rad/s
+    accel_y_bias: Scalar  # m/s2
+    gps_latency: Scalar  # s, on top of the GPS's delays
+    bank: Scalar  # rad
+    initial_beta: Scalar  # rad, where the episode begins
+    initial_gamma: Scalar  # rad/s
 
 
 DRAWS, DRAWS_WIDTH = make_offsets(Draws)
 
 
 @jit
-def _draw_numbers(low: Any, high: Any, key_low: int, key_high: int, attempt: int, out: Any) -> None:
+def _draw_numbers(
+    low: Vector, high: Vector, key_low: int, key_high: int, attempt: int, out: Vector
+) -> None:
     """Draw uniform numbers in [low, high] into out (len(Draws),); equal ends keep their bits."""
     u = draw_uniforms(key_low, key_high, attempt, CHANNELS.scenario, 0)
     for i in range(len(out)):
@@ -59,7 +61,7 @@ def _draw_numbers(low: Any, high: Any, key_low: int, key_high: int, attempt: int
 
 
 @jit
-def is_stable(d: Any, car: Any) -> Any:
+def is_stable(d: Draws, car: Any) -> Scalar:
     """Check whether the drawn linear vehicle is stable at 1.05 times the drawn speed.
 
     Args:
@@ -79,7 +81,7 @@ def is_stable(d: Any, car: Any) -> Any:
 
 
 @jit
-def _is_below_critical(C_f: Any, C_r: Any, speed: Any, car: Any) -> Any:
+def _is_below_critical(C_f: Scalar, C_r: Scalar, speed: Scalar, car: Any) -> Scalar:
     """Check whether 1.05 times a speed (m/s) is below the critical speed of linear tyres."""
     excess = C_f * car.l_f - C_r * car.l_r
     l, v = car.l_f + car.l_r, 1.05 * speed  # noqa: E741
@@ -87,7 +89,9 @@ def _is_below_critical(C_f: Any, C_r: Any, speed: Any, car: Any) -> Any:
 
 
 @jit
-def draw_stable(low: Any, high: Any, key_low: int, key_high: int, car: Any, out: Any) -> Any:
+def draw_stable(
+    low: Vector, high: Vector, key_low: int, key_high: int, car: Any, out: Vector
+) -> tuple[Draws, int]:
     """Draw until the vehicle is stable, at most 64 times.
 
     Args:

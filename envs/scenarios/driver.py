@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from ..numerics.functions import sincos
 from ..numerics.jit import inline, jit
-from ..numerics.primitives import any_lane, maximum, minimum, select
+from ..numerics.primitives import Scalar, any_lane, maximum, minimum, select
 from ..ticks import TICK
 from ..vehicle.actuators import apply_lag, limit_rate
 from ..vehicle.dynamics import compute_curvature
@@ -23,14 +23,14 @@ _MIN_PREVIEW = 1.0  # wheelbases: a driver looks no nearer
 class DriverParams(NamedTuple):
     """Parameters of a driver who steers by preview."""
 
-    preview: Any  # s, T
+    preview: Scalar  # s, T
     gain: Any
     rest: Any  # what a tick leaves of a deviation from the wanted angle
-    slew: Any  # rad a tick, at the wheels
+    slew: Scalar  # rad a tick, at the wheels
 
 
 @jit
-def _compute_lateral_error(motion: Any, path: Any, road: Any, preview: Any) -> Any:
+def _compute_lateral_error(motion: Any, path: Any, road: Any, preview: Scalar) -> Scalar:
     """Compute how far the path lies to the left of the car's course at a preview distance (m)."""
     sin_r, cos_r = sincos(motion.psi - motion.theta)
     slope = (motion.v_x * sin_r + motion.v_y * cos_r) / maximum(motion.v_x, MIN_SPEED)
@@ -41,8 +41,8 @@ def _compute_lateral_error(motion: Any, path: Any, road: Any, preview: Any) -> A
 
 @jit
 def compute_target_angle(
-    motion: Any, path: Any, road: Any, target: Any, driver: Any, stop: Any
-) -> Any:
+    motion: Any, path: Any, road: Any, target: Any, driver: DriverParams, stop: Scalar
+) -> Scalar:
     """Compute the steering angle that brings the car onto the path.
 
     Args:
@@ -66,8 +66,14 @@ def compute_target_angle(
 
 @jit
 def compute_driver_angle(
-    angle: Any, motion: Any, path: Any, road: Any, target: Any, driver: Any, stop: Any
-) -> Any:
+    angle: Scalar,
+    motion: Any,
+    path: Any,
+    road: Any,
+    target: Any,
+    driver: DriverParams,
+    stop: Scalar,
+) -> Scalar:
     """Compute the driver's steering angle a tick later.
 
     Source: MacAdam, "Application of an optimal preview control for simulation of closed-loop
@@ -94,17 +100,17 @@ class SpeedProfile(NamedTuple):
 
     speed: Any  # m/s, at the start and to hold
     hold: Any  # 1 hold the speed that `acceleration` and `surge` make of it; 0 apply them alone
-    acceleration: Any  # m/s2, from start to end
+    acceleration: Scalar  # m/s2, from start to end
     start: Any  # tick
     end: Any
-    k_p: Any  # 1/s
+    k_p: Scalar  # 1/s
     k_i: Any  # 1/s2
-    surge: Any = 0.0  # m/s2, amplitude of a sine
-    surge_rate: Any = 1.0  # rad/s
+    surge: Scalar = 0.0  # m/s2, amplitude of a sine
+    surge_rate: Scalar = 1.0  # rad/s
 
 
 @inline
-def compute_speed_reference(tick: Any, profile: Any) -> Any:
+def compute_speed_reference(tick: Scalar, profile: SpeedProfile) -> Any:
     """Compute the speed and the acceleration that the driver wants at a tick.
 
     Args:
@@ -126,7 +132,7 @@ def compute_speed_reference(tick: Any, profile: Any) -> Any:
 
 @inline
 def compute_acceleration_command(
-    tick: Any, v_x: Any, integral: Any, profile: Any, limit: Any
+    tick: Scalar, v_x: Scalar, integral: Scalar, profile: SpeedProfile, limit: Scalar
 ) -> Any:
     """Compute the driver's acceleration command: PI on the speed with feedforward.
 
@@ -154,15 +160,15 @@ def compute_acceleration_command(
 class Wind(NamedTuple):
     """A side wind between two ticks."""
 
-    force: Any  # N, to the left
-    arm: Any  # m, ahead of the centre of gravity
-    start: Any
-    end: Any
-    height: Any = 0.0  # m, above the roll axis
+    force: Scalar  # N, to the left
+    arm: Scalar  # m, ahead of the centre of gravity
+    start: Scalar
+    end: Scalar
+    height: Scalar = 0.0  # m, above the roll axis
 
 
 @jit
-def compute_wind(tick: Any, wind: Any) -> Any:
+def compute_wind(tick: Scalar, wind: Wind) -> Any:
     """Compute force and moments of the wind from this tick to the next.
 
     Args:

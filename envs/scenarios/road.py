@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from ..numerics.functions import smoothstep
 from ..numerics.jit import inline, jit
-from ..numerics.primitives import maximum
+from ..numerics.primitives import Scalar, maximum
 from ..ticks import TICK
 from ..vehicle.linear import Bicycle, compute_bicycle_coefficients
 
@@ -24,13 +24,13 @@ _MIN_SPEED = 1.0  # m/s, of the nominal car
 class NominalMotion(NamedTuple):
     """State of the nominal car whose path is the road."""
 
-    beta: Any  # rad
-    gamma: Any  # rad/s
+    beta: Scalar  # rad
+    gamma: Scalar  # rad/s
 
 
 @inline
 def step_nominal_car(
-    nominal_motion: NominalMotion, steer: Any, speed: Any, car: Bicycle
+    nominal_motion: NominalMotion, steer: Scalar, speed: Scalar, car: Bicycle
 ) -> tuple[Any, NominalMotion]:
     """Step the nominal car, whose path is the road, over a tick by explicit Euler.
 
@@ -73,9 +73,9 @@ class Section(NamedTuple):
 class TrackPath(NamedTuple):
     """A lateral offset from the road's centre line: two smooth transitions."""
 
-    shift_1: Any  # m, to the left
-    start_1: Any  # m, along the road
-    length_1: Any  # m
+    shift_1: Scalar  # m, to the left
+    start_1: Scalar  # m, along the road
+    length_1: Scalar  # m
     shift_2: Any
     start_2: Any
     length_2: Any
@@ -158,7 +158,7 @@ def make_path(track: str, width: float) -> TrackPath:
 
 
 @jit
-def transform_path(path: Any, start: Any, scale: Any, side: Any) -> Any:
+def transform_path(path: TrackPath, start: Scalar, scale: Scalar, side: Scalar) -> TrackPath:
     """Shift, scale and mirror the path of a track.
 
     Args:
@@ -177,7 +177,7 @@ def transform_path(path: Any, start: Any, scale: Any, side: Any) -> Any:
 
 
 @jit
-def compute_path_offset(path: Any, s: Any) -> Any:
+def compute_path_offset(path: TrackPath, s: Scalar) -> Scalar:
     """Compute the path's lateral offset from the road's centre line; its slope is continuous.
 
     Args:

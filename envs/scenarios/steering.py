@@ -5,7 +5,7 @@ from typing import Any
 from ..numerics.functions import PI, exp, sincos, smoothstep
 from ..numerics.jit import jit
 from ..numerics.packed import load_element
-from ..numerics.primitives import any_lane, floor, maximum, minimum, select, sqrt
+from ..numerics.primitives import Scalar, Vector, any_lane, floor, maximum, minimum, select, sqrt
 from ..ticks import FOREVER, TICK, round_to_ticks
 
 (
@@ -25,7 +25,7 @@ _RISE = 0.2  # s, of a step
 
 
 @jit
-def compute_steering(tick: Any, profile: Any) -> Any:
+def compute_steering(tick: Scalar, profile: Vector) -> Scalar:
     """Compute the driver's steering command at a tick.
 
     The profile is an array: a tuple goes through memory in every call.
@@ -71,7 +71,7 @@ def compute_steering(tick: Any, profile: Any) -> Any:
 
 
 @jit
-def interpolate_trace(tick: Any, trace: Any) -> Any:
+def interpolate_trace(tick: Scalar, trace: Vector) -> Scalar:
     """Interpolate a recorded trace at a tick, linearly between its samples.
 
     Args:
@@ -87,7 +87,7 @@ def interpolate_trace(tick: Any, trace: Any) -> Any:
 
 
 @jit
-def compute_wander_gains(amplitude: Any, hertz: Any, hold: Any) -> Any:
+def compute_wander_gains(amplitude: Scalar, hertz: Scalar, hold: Scalar) -> Any:
     """Compute decay and noise gain of a wandering driver's angle over one hold.
 
     The next angle is decay times the last one plus noise gain times a standard normal number.
@@ -105,7 +105,9 @@ def compute_wander_gains(amplitude: Any, hertz: Any, hold: Any) -> Any:
 
 
 @jit
-def _write_sine(profile: Any, i: int, amplitude: Any, hertz: Any, start: Any, end: Any) -> None:
+def _write_sine(
+    profile: Vector, i: int, amplitude: Any, hertz: Scalar, start: Any, end: Any
+) -> None:
     """Write sine i (rad) between two ticks, with phase 0 at its start."""
     profile[5 * i] = amplitude
     profile[5 * i + 1] = 2.0 * PI * hertz
@@ -115,14 +117,14 @@ def _write_sine(profile: Any, i: int, amplitude: Any, hertz: Any, start: Any, en
 
 
 @jit
-def _write_step(profile: Any, i: int, amplitude: Any, start: Any, rise: Any) -> None:
+def _write_step(profile: Vector, i: int, amplitude: Any, start: Any, rise: Any) -> None:
     """Write smooth step i (rad), which rises for some ticks from its start."""
     k = 5 * SINES + 3 * i
     profile[k], profile[k + 1], profile[k + 2] = amplitude, start, rise
 
 
 @jit
-def _write_dwell(profile: Any, a: Any, hertz: Any, start: Any, dwell: Any) -> None:
+def _write_dwell(profile: Vector, a: Scalar, hertz: Scalar, start: Scalar, dwell: Scalar) -> None:
     """Write three quarters of a sine, its peak held for some ticks, and the last quarter."""
     peak, last = start + round_to_ticks(0.75 / hertz), start + round_to_ticks(1.0 / hertz)
     _write_sine(profile, 0, a, hertz, start, peak)
@@ -133,7 +135,7 @@ def _write_dwell(profile: Any, a: Any, hertz: Any, start: Any, dwell: Any) -> No
 
 
 @jit
-def write_steering(kind: int, d: Any, profile: Any) -> None:
+def write_steering(kind: int, d: Any, profile: Vector) -> None:
     """Write the steering profile of a kind from drawn numbers.
 
     A driver's and a trace's is empty; a wandering driver's has `compute_wander_gains`. The slalom,

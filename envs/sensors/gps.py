@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 from ..numerics.functions import CHANNELS, PI, sincos, wrap
 from ..numerics.jit import jit
-from ..numerics.primitives import floor, maximum, minimum, select, sqrt
+from ..numerics.primitives import Scalar, Vector, floor, maximum, minimum, select, sqrt
 from ..vehicle.dynamics import compute_sideslip_angle
 from ..vehicle.tyres import MIN_SPEED
 from .link import Blocks, PacketValue, SlowKind
@@ -38,7 +38,9 @@ class SatelliteGeometry(NamedTuple):
 
 
 @jit
-def compute_hdop_deviation(before: Any, sky: Any, link: Any, tick: Any, n: Any) -> Any:
+def compute_hdop_deviation(
+    before: Scalar, sky: SatelliteGeometry, link: Any, tick: Scalar, n: Vector
+) -> Scalar:
     """Compute the deviation of log HDOP from its median at a capture.
 
     Args:
@@ -58,7 +60,7 @@ def compute_hdop_deviation(before: Any, sky: Any, link: Any, tick: Any, n: Any) 
 
 
 @jit
-def count_satellites(hdop: Any) -> Any:
+def count_satellites(hdop: Scalar) -> Scalar:
     """Count the satellites that a receiver sees at an HDOP: 12 at 1, 4 up to 5, fewer above.
 
     Args:
@@ -73,12 +75,12 @@ def count_satellites(hdop: Any) -> Any:
 @jit
 def sample_gps(
     motion: Any,
-    forward: Any,
-    left: Any,
-    hdop: Any,
-    weight: Any,
+    forward: Scalar,
+    left: Scalar,
+    hdop: Scalar,
+    weight: Scalar,
     noise: Any,
-    n: Any,
+    n: Vector,
     small_angle: int,
 ) -> Any:
     """Sample the GPS at its antenna, with noise.

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..numerics.jit import inline
-from ..numerics.primitives import any_lane, select
+from ..numerics.primitives import Scalar, Vector, any_lane, select
 from ..ticks import TICK
 from ..vehicle.dynamics import compute_gravity
 from ..vehicle.parameters import GRAVITY
@@ -48,7 +48,7 @@ def compute_specific_force(before: Any, after: Any, road: Any, small_angle: int,
 
 @inline
 def compute_fast_row(
-    motion: Any, accel: Any, applied: Any, d_f: Any, noise: Any, draws: Any
+    motion: Any, accel: Vector, applied: Vector, d_f: Scalar, noise: Any, draws: NormalDraws
 ) -> Any:
     """Compute the fast sensors' samples at a tick, columns as in `Fast`.
 
@@ -84,14 +84,14 @@ def compute_fast_row(
 class Noise(NamedTuple):
     """Standard deviations and biases; the defaults are those of the project's simulations."""
 
-    gyro: Any = 0.005  # rad/s
-    gyro_bias: Any = 0.0
-    accel: Any = 0.1  # m/s2, both axes
-    accel_y_bias: Any = 0.0
-    roll_rate: Any = 0.005  # rad/s
-    wheel: Any = 0.02  # m/s
-    camera_psi: Any = 3.5e-3  # rad
-    camera_y: Any = 0.02  # m
-    course: Any = 0.14 * np.pi / 180.0 * (60.0 / 3.6)  # rad m/s: 0.14 deg at 60 km/h, as 1 / V
-    gps_speed: Any = 0.05  # m/s
-    gps_position: Any = 0.5  # m
+    gyro: Scalar = 0.005  # rad/s
+    gyro_bias: Scalar = 0.0
+    accel: Scalar = 0.1  # m/s2, both axes
+    accel_y_bias: Scalar = 0.0
+    roll_rate: Scalar = 0.005  # rad/s
+    wheel: Scalar = 0.02  # m/s
+    camera_psi: Scalar = 3.5e-3  # rad
+    camera_y: Scalar = 0.02  # m
+    course: Scalar = 0.14 * np.pi / 180.0 * (60.0 / 3.6)  # rad m/s: 0.14 deg at 60 km/h, as 1 / V
+    gps_speed: Scalar = 0.05  # m/s
+    gps_position: Scalar = 0.5  # m

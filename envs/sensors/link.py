@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from ..numerics.functions import CHANNELS, draw_uniforms
 from ..numerics.jit import jit
-from ..numerics.primitives import any_lane, floor, select, to_int
+from ..numerics.primitives import Scalar, any_lane, floor, select, to_int
 from ..ticks import NEVER, TICK, count_ticks
 from ..validation import is_finite, short_repr
 
@@ -132,7 +132,7 @@ def count_max_in_flight(link: Link) -> int:
 
 @jit
 def compute_arrivals(
-    link: Any, frame: Any, tick: Any, key_low: int, key_high: int, block: int
+    link: Link, frame: Scalar, tick: Scalar, key_low: int, key_high: int, block: int
 ) -> Any:
     """Compute when a frame arrives: loss, outage, duplication, latency and jitter.
 
@@ -165,7 +165,7 @@ def compute_arrivals(
 
 
 @jit
-def draw_clock_phase(link: Any, key_low: int, key_high: int, sensor: int) -> Any:
+def draw_clock_phase(link: Link, key_low: int, key_high: int, sensor: int) -> Scalar:
     """Compute the tick of the first capture: the phase, or a drawn one where that is -1.
 
     Args:

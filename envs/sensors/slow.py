@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from ..numerics.functions import draw_normals, exp
 from ..numerics.jit import jit
-from ..numerics.primitives import to_int
+from ..numerics.primitives import Scalar, to_int
 from ..validation import check_mapping, describe_unknown
 from .camera import CAMERA_KIND, compute_lane_quality, sample_camera
 from .gps import GPS_KIND, compute_hdop_deviation, sample_gps
@@ -50,7 +50,7 @@ class MeasurementContext(NamedTuple):
     car: Any
     noise: Any
     sky: Any  # the satellites
-    field_of_view: Any  # the camera's `FieldOfView`
+    field_of_view: Scalar  # the camera's `FieldOfView`
     small_angle: int
     key_low: Any
     key_high: Any
@@ -66,7 +66,7 @@ class Sample(NamedTuple):
 
 
 @jit
-def sample_sensor(sensor: int, context: MeasurementContext, link: Any, drift: Any) -> Sample:
+def sample_sensor(sensor: int, context: MeasurementContext, link: Any, drift: Scalar) -> Sample:
     """Sample a slow sensor.
 
     Args:
@@ -96,7 +96,7 @@ def sample_sensor(sensor: int, context: MeasurementContext, link: Any, drift: An
 
 
 @jit
-def draw_first_drift(sensor: int, sky: Any, key_low: Any, key_high: Any) -> Any:
+def draw_first_drift(sensor: int, sky: Any, key_low: Scalar, key_high: Scalar) -> Scalar:
     """Draw a slow sensor's drift at the start of an episode.
 
     Args:

@@ -4,7 +4,7 @@ import math
 from typing import Any, NamedTuple
 
 from ..numerics.jit import jit
-from ..numerics.primitives import absolute, any_lane, maximum, minimum, select
+from ..numerics.primitives import Scalar, absolute, any_lane, maximum, minimum, select
 from .tyres import MIN_SPEED
 
 
@@ -34,7 +34,7 @@ def make_lag(time_constant: float, tick: float) -> Lag:
 
 
 @jit
-def apply_lag(command: Any, value: Any, rest: Any) -> Any:
+def apply_lag(command: Scalar, value: Scalar, rest: Scalar) -> Scalar:
     """Compute the actuator's value from what remains of its deviation from the command.
 
     Args:
@@ -49,7 +49,7 @@ def apply_lag(command: Any, value: Any, rest: Any) -> Any:
 
 
 @jit
-def compute_torque_limit(v_x: Any, car: Any) -> Any:
+def compute_torque_limit(v_x: Scalar, car: Any) -> Scalar:
     """Compute the torque limit of one motor at a speed, driving or braking.
 
     Args:
@@ -67,7 +67,9 @@ def compute_torque_limit(v_x: Any, car: Any) -> Any:
 
 
 @jit
-def allocate_torques(N_z: Any, a_x: Any, car: Any, yaw_first: Any, max_torque: Any) -> Any:
+def allocate_torques(
+    N_z: Scalar, a_x: Scalar, car: Any, yaw_first: Scalar, max_torque: Scalar
+) -> Any:
     """Distribute a yaw moment and an acceleration over two motors: tie-vision (3) in ISO axes.
 
     A positive yaw moment drives the right wheel.
@@ -94,7 +96,7 @@ def allocate_torques(N_z: Any, a_x: Any, car: Any, yaw_first: Any, max_torque: A
 
 
 @jit
-def limit_rate(value: Any, command: Any, max_change: Any) -> Any:
+def limit_rate(value: Scalar, command: Scalar, max_change: Scalar) -> Scalar:
     """Move a value towards a command by at most `max_change`.
 
     Args:
@@ -109,7 +111,7 @@ def limit_rate(value: Any, command: Any, max_change: Any) -> Any:
 
 
 @jit
-def limit_angle(added: Any, driver: Any, stop: Any) -> Any:
+def limit_angle(added: Scalar, driver: Scalar, stop: Scalar) -> Scalar:
     """Limit an added steering angle so that the sum with the driver's stays within the stop.
 
     Where the driver's angle alone is beyond the stop, nothing is added to that side.
@@ -126,7 +128,7 @@ def limit_angle(added: Any, driver: Any, stop: Any) -> Any:
 
 
 @jit
-def compute_yaw_moment(T_l: Any, T_r: Any, car: Any) -> Any:
+def compute_yaw_moment(T_l: Scalar, T_r: Scalar, car: Any) -> Scalar:
     """Compute the yaw moment of two motor torques.
 
     Args:

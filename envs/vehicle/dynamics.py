@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from ..numerics.functions import atan2, sincos
 from ..numerics.jit import inline, jit
-from ..numerics.primitives import any_lane, maximum, minimum, select
+from ..numerics.primitives import Scalar, any_lane, maximum, minimum, select
 from .parameters import GRAVITY
 from .tyres import MIN_SPEED, compute_tyre_forces
 
@@ -18,65 +18,65 @@ from .tyres import MIN_SPEED, compute_tyre_forces
 class CarParams(NamedTuple):
     """The true vehicle of an episode in SI units; letters as in the papers, stiffness per tyre."""
 
-    m: Any  # kg
-    I: Any  # noqa: E741  kg m2, yaw inertia; the papers' letter
-    l_f: Any  # m, from the centre of gravity to the front axle
-    l_r: Any  # m, to the rear axle
-    C_f: Any  # N/rad, cornering stiffness of a front tyre
-    C_r: Any  # N/rad, of a rear tyre
-    d_f: Any  # m, front track
-    d_r: Any  # m, rear track
-    r: Any  # m, wheel radius
-    T_max: Any  # N m, of one motor
-    mu: Any  # friction under the left wheels
-    l_pre: Any  # m, preview distance of the camera
-    S: Any  # kg m, M_s h_s: sprung mass times its arm to the roll axis
-    I_x: Any  # kg m2, roll inertia
-    K_x: Any  # N m/rad, roll stiffness
-    C_x: Any  # N m s/rad, roll damping
-    h: Any  # m, height of the centre of gravity
-    forward: Any  # m, the GPS antenna ahead of the centre of gravity
-    left: Any  # m, the GPS antenna left of the centre of gravity
-    mu_r: Any  # friction under the right wheels
-    P: Any  # W, power limit of one motor; 0: no limit
-    h_x: Any  # m, height by which drive force moves load between the axles
+    m: Scalar  # kg
+    I: Scalar  # noqa: E741  kg m2, yaw inertia; the papers' letter
+    l_f: Scalar  # m, from the centre of gravity to the front axle
+    l_r: Scalar  # m, to the rear axle
+    C_f: Scalar  # N/rad, cornering stiffness of a front tyre
+    C_r: Scalar  # N/rad, of a rear tyre
+    d_f: Scalar  # m, front track
+    d_r: Scalar  # m, rear track
+    r: Scalar  # m, wheel radius
+    T_max: Scalar  # N m, of one motor
+    mu: Scalar  # friction under the left wheels
+    l_pre: Scalar  # m, preview distance of the camera
+    S: Scalar  # kg m, M_s h_s: sprung mass times its arm to the roll axis
+    I_x: Scalar  # kg m2, roll inertia
+    K_x: Scalar  # N m/rad, roll stiffness
+    C_x: Scalar  # N m s/rad, roll damping
+    h: Scalar  # m, height of the centre of gravity
+    forward: Scalar  # m, the GPS antenna ahead of the centre of gravity
+    left: Scalar  # m, the GPS antenna left of the centre of gravity
+    mu_r: Scalar  # friction under the right wheels
+    P: Scalar  # W, power limit of one motor; 0: no limit
+    h_x: Scalar  # m, height by which drive force moves load between the axles
 
 
 class Motion(NamedTuple):
     """The integrated state of the plant: velocities, heading, place on ground and road, roll."""
 
-    v_x: Any  # m/s
-    v_y: Any  # m/s
-    gamma: Any  # rad/s
-    psi: Any  # rad, from the ground's x axis
-    X: Any  # m, on the ground
-    Y: Any  # m
-    s: Any  # m, along the road
-    y: Any  # m, left of the road's centre line
-    theta: Any  # rad, the road's direction at the car
-    phi: Any = 0.0  # rad, roll of the body against the road
-    phi_dot: Any = 0.0  # rad/s
+    v_x: Scalar  # m/s
+    v_y: Scalar  # m/s
+    gamma: Scalar  # rad/s
+    psi: Scalar  # rad, from the ground's x axis
+    X: Scalar  # m, on the ground
+    Y: Scalar  # m
+    s: Scalar  # m, along the road
+    y: Scalar  # m, left of the road's centre line
+    theta: Scalar  # rad, the road's direction at the car
+    phi: Scalar = 0.0  # rad, roll of the body against the road
+    phi_dot: Scalar = 0.0  # rad/s
 
 
 class RoadParams(NamedTuple):
     """A road that is straight and flat up to `start` and changes over `ramp` metres from there."""
 
-    curvature: Any  # 1/m, left positive
-    start: Any  # m
-    ramp: Any  # m, positive
-    lateral: Any = 0.0  # m/s2, g sin(bank), left side up positive
-    longitudinal: Any = 0.0  # m/s2, g sin(grade), uphill positive
-    turn: Any = 0.0  # rad/s, turning rate of its direction where it is laid tick by tick
+    curvature: Scalar  # 1/m, left positive
+    start: Scalar  # m
+    ramp: Scalar  # m, positive
+    lateral: Scalar = 0.0  # m/s2, g sin(bank), left side up positive
+    longitudinal: Scalar = 0.0  # m/s2, g sin(grade), uphill positive
+    turn: Scalar = 0.0  # rad/s, turning rate of its direction where it is laid tick by tick
 
 
 @jit
-def _compute_ramp(road: Any, s: Any) -> Any:
+def _compute_ramp(road: Any, s: Scalar) -> Scalar:
     """Compute the fraction of curvature, bank and grade that is reached at s (m)."""
     return minimum(maximum((s - road.start) * (1.0 / road.ramp), 0.0), 1.0)
 
 
 @jit
-def compute_curvature(road: Any, s: Any) -> Any:
+def compute_curvature(road: RoadParams, s: Scalar) -> Scalar:
     """Compute the curvature of the road at a distance along it.
 
     Args:
@@ -90,7 +90,7 @@ def compute_curvature(road: Any, s: Any) -> Any:
 
 
 @jit
-def compute_car_curvature(motion: Any, road: Any) -> Any:
+def compute_car_curvature(motion: Motion, road: RoadParams) -> Scalar:
     """Compute the curvature of the road at the car, a turning road's direction included.
 
     Args:
@@ -107,7 +107,7 @@ def compute_car_curvature(motion: Any, road: Any) -> Any:
 
 
 @inline
-def _rotate_gravity(road: Any, s: Any, sin_r: Any, cos_r: Any) -> Any:
+def _rotate_gravity(road: Any, s: Scalar, sin_r: Scalar, cos_r: Scalar) -> Any:
     """(x, y) of the gravity that a car without roll measures (m/s2), by its heading on the road."""
     ramp = _compute_ramp(road, s)
     g_s, g_n = road.longitudinal * ramp, road.lateral * ramp  # along the road, to its left
@@ -115,7 +115,7 @@ def _rotate_gravity(road: Any, s: Any, sin_r: Any, cos_r: Any) -> Any:
 
 
 @jit
-def compute_gravity(motion: Any, road: Any, small_angle: int) -> Any:
+def compute_gravity(motion: Motion, road: RoadParams, small_angle: int) -> Any:
     """Compute the gravity that accelerometers measure in a car without roll.
 
     Args:
@@ -135,9 +135,9 @@ def compute_gravity(motion: Any, road: Any, small_angle: int) -> Any:
 class DisturbanceForces(NamedTuple):
     """Force and moments that disturb the car during a tick."""
 
-    F_d: Any  # N, lateral force at the centre of gravity
-    N_d: Any  # N m, yaw moment
-    N_x: Any = 0.0  # N m, roll moment on the body
+    F_d: Scalar  # N, lateral force at the centre of gravity
+    N_d: Scalar  # N m, yaw moment
+    N_x: Scalar = 0.0  # N m, roll moment on the body
 
 
 class Velocity(NamedTuple):
@@ -151,7 +151,9 @@ class Velocity(NamedTuple):
 
 
 @inline
-def _compute_roll_acceleration(motion: Any, F_y: Any, N_x: Any, car: Any, per_m: Any) -> Any:
+def _compute_roll_acceleration(
+    motion: Any, F_y: Scalar, N_x: Scalar, car: Any, per_m: Scalar
+) -> Scalar:
     """phi'' (rad/s2) of double-layer-gps (1) and (3), in which gravity's pull cancels from F_y."""
     body_moment = N_x - car.C_x * motion.phi_dot - car.K_x * motion.phi
     lever = car.S * (F_y * per_m + GRAVITY * motion.phi)
@@ -160,15 +162,9 @@ def _compute_roll_acceleration(motion: Any, F_y: Any, N_x: Any, car: Any, per_m:
 
 @inline
 def compute_rates(
-    motion: Any,
-    load: Any,
-    disturbance: Any,
-    car: Any,
-    gravity: Any,
-    small_angle: int,
-    law: int,
-    roll: int,
-) -> Any:
+    motion: Any, load: Any, disturbance: DisturbanceForces, car: CarParams, gravity: Any,
+    small_angle: int, law: int, roll: int,
+) -> Any:  # fmt: skip
     """Compute the time derivative of the velocities and the roll.
 
     Args:
@@ -206,7 +202,9 @@ def compute_rates(
 
 
 @inline
-def _compute_course_rates(motion: Any, v_x: Any, v_y: Any, road: Any, small_angle: int) -> Any:
+def _compute_course_rates(
+    motion: Any, v_x: Scalar, v_y: Scalar, road: Any, small_angle: int
+) -> Any:
     """(dX, dY, ds, dy, dtheta)/dt (m/s, rad/s) at a Motion's place and heading."""
     kappa = compute_curvature(road, motion.s)
     if small_angle:
@@ -227,11 +225,11 @@ def _compute_course_rates(motion: Any, v_x: Any, v_y: Any, road: Any, small_angl
 
 @inline
 def derivative(
-    motion: Any,
+    motion: Motion,
     load: Any,
-    disturbance: Any,
-    car: Any,
-    road: Any,
+    disturbance: DisturbanceForces,
+    car: CarParams,
+    road: RoadParams,
     small_angle: int,
     law: int,
     roll: int = 0,
@@ -262,7 +260,7 @@ def derivative(
 
 
 @inline
-def compute_sideslip_angle(v_x: Any, v_y: Any, small_angle: int) -> Any:
+def compute_sideslip_angle(v_x: Scalar, v_y: Scalar, small_angle: int) -> Scalar:
     """Compute the sideslip angle: atan2(v_y, v_x) above 0.5 m/s, else 0.
 
     Args:
@@ -280,7 +278,7 @@ def compute_sideslip_angle(v_x: Any, v_y: Any, small_angle: int) -> Any:
 
 
 @jit
-def _step_euler(start: Any, h: Any, rate: Any) -> Any:
+def _step_euler(start: Any, h: Scalar, rate: Any) -> Any:
     """Velocity start + h rate, written out so that it compiles for every number type."""
     return Velocity(
         start.v_x + h * rate.v_x,
@@ -292,7 +290,7 @@ def _step_euler(start: Any, h: Any, rate: Any) -> Any:
 
 
 @jit
-def _average(first: Any, middle: Any, last: Any) -> Any:
+def _average(first: Scalar, middle: Scalar, last: Scalar) -> Scalar:
     """Mean of a number by Simpson's rule."""
     return (first + 4.0 * middle + last) * (1.0 / 6.0)
 
@@ -322,7 +320,7 @@ def _average_two(a: Any, b: Any) -> Any:
 
 
 @inline
-def _compute_mid_gravity(motion: Any, road: Any, h: Any, small_angle: int) -> Any:
+def _compute_mid_gravity(motion: Any, road: Any, h: Scalar, small_angle: int) -> Any:
     """Measured gravity (m/s2) in the middle of a step of h seconds, extrapolated from its start."""
     s_mid = motion.s + 0.5 * h * motion.v_x
     if not any_lane((road.lateral != 0.0) | (road.longitudinal != 0.0)):
@@ -336,7 +334,7 @@ def _compute_mid_gravity(motion: Any, road: Any, h: Any, small_angle: int) -> An
 
 @inline
 def _integrate_motion(
-    motion: Any, middle: Any, end: Any, mean: Any, road: Any, h: Any, small_angle: int
+    motion: Any, middle: Any, end: Any, mean: Any, road: Any, h: Scalar, small_angle: int
 ) -> Any:
     """Motion after h seconds from the velocities halfway, at the end and in the mean."""
     # Forces do not depend on place and heading, which follow here once a step. The mean of the
@@ -366,12 +364,12 @@ def _integrate_motion(
 
 @inline
 def kutta3(
-    motion: Any,
+    motion: Motion,
     load: tuple[Any, Any, Any],
-    disturbance: Any,
-    car: Any,
-    road: Any,
-    h: Any,
+    disturbance: DisturbanceForces,
+    car: CarParams,
+    road: RoadParams,
+    h: Scalar,
     small_angle: int,
     law: int,
     roll: int = 0,
@@ -408,12 +406,12 @@ def kutta3(
 
 @inline
 def rk4(
-    motion: Any,
+    motion: Motion,
     load: tuple[Any, Any, Any],
-    disturbance: Any,
-    car: Any,
-    road: Any,
-    h: Any,
+    disturbance: DisturbanceForces,
+    car: CarParams,
+    road: RoadParams,
+    h: Scalar,
     small_angle: int,
     law: int,
     roll: int = 0,

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..numerics.jit import as_python, jit
+from ..numerics.primitives import Matrix, Scalar
 from .parameters import GRAVITY, Vehicle
 
 if TYPE_CHECKING:
@@ -21,23 +22,23 @@ Array = npt.NDArray[np.float64]
 class Bicycle(NamedTuple):
     """Parameters of the linear bicycle, as `compute_bicycle_coefficients` takes them."""
 
-    m: Any  # kg
-    I: Any  # noqa: E741  kg m2, yaw inertia; the papers' letter
-    l_f: Any  # m, from the centre of gravity to the front axle
-    l_r: Any  # m, to the rear axle
-    C_f: Any  # N/rad, cornering stiffness of a front tyre
-    C_r: Any  # N/rad, of a rear tyre
+    m: Scalar  # kg
+    I: Scalar  # noqa: E741  kg m2, yaw inertia; the papers' letter
+    l_f: Scalar  # m, from the centre of gravity to the front axle
+    l_r: Scalar  # m, to the rear axle
+    C_f: Scalar  # N/rad, cornering stiffness of a front tyre
+    C_r: Scalar  # N/rad, of a rear tyre
 
 
 @jit
 def compute_bicycle_coefficients(
-    m: Any,
-    I: Any,  # noqa: E741  the papers' letter
-    l_f: Any,
-    l_r: Any,
-    C_f: Any,
-    C_r: Any,
-    V: Any,
+    m: Scalar,
+    I: Scalar,  # noqa: E741  the papers' letter
+    l_f: Scalar,
+    l_r: Scalar,
+    C_f: Scalar,
+    C_r: Scalar,
+    V: Scalar,
 ) -> Any:
     """Compute the coefficients of the linear bicycle, tie-vision (8).
 
@@ -61,7 +62,9 @@ def compute_bicycle_coefficients(
 
 
 @jit
-def write_lateral(A: Any, B: Any, car: Any, V: Any, states: int, inputs: int, preview: Any) -> None:
+def write_lateral(
+    A: Matrix, B: Matrix, car: Any, V: Scalar, states: int, inputs: int, preview: Scalar
+) -> None:
     """Write the linear lateral model into A and B; entries that are zero are left alone.
 
     States are beta, gamma, psi and y_l; inputs are delta_f, N_z and the road's curvature.
@@ -91,7 +94,7 @@ def write_lateral(A: Any, B: Any, car: Any, V: Any, states: int, inputs: int, pr
 
 
 @jit
-def write_roll(A: Any, B: Any, i: int, column: int, K: Any, C: Any, S: Any) -> None:
+def write_roll(A: Matrix, B: Matrix, i: int, column: int, K: Scalar, C: Scalar, S: Any) -> None:
     """Write phi and phi_dot, driven by a_y, into A and B: double-layer-gps (3).
 
     Args:
@@ -109,7 +112,7 @@ def write_roll(A: Any, B: Any, i: int, column: int, K: Any, C: Any, S: Any) -> N
 
 
 @jit
-def write_kinematic(A: Any, B: Any, gamma: Any) -> None:
+def write_kinematic(A: Matrix, B: Matrix, gamma: Scalar) -> None:
     """Write v_x and v_y, driven by a_x and a_y, into A and B: double-layer-gps (4)-(5).
 
     Args:

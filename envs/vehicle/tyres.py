@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from ..numerics.functions import atan, sincos
 from ..numerics.jit import inline, jit
-from ..numerics.primitives import absolute, any_lane, maximum, minimum, sqrt
+from ..numerics.primitives import Scalar, absolute, any_lane, maximum, minimum, sqrt
 from .parameters import GRAVITY
 
 TYRE_LAWS = ("linear", "fiala", "dugoff")
@@ -22,9 +22,9 @@ MIN_SPEED = 0.5  # m/s: below it slip is computed as at this speed, and beta is 
 class TyreInputs(NamedTuple):
     """Steering angle and motor torques at one instant."""
 
-    delta_f: Any  # rad, front steering angle
-    T_l: Any  # N m, left motor
-    T_r: Any  # N m, right motor
+    delta_f: Scalar  # rad, front steering angle
+    T_l: Scalar  # N m, left motor
+    T_r: Scalar  # N m, right motor
 
 
 class TyreLoad(NamedTuple):
@@ -32,23 +32,25 @@ class TyreLoad(NamedTuple):
 
     sin_d: Any  # sine of the front steering angle
     cos_d: Any  # its cosine
-    steer: Any  # rad, the angle itself
-    F_x: Any  # N, drive force
-    N_z: Any  # N m, yaw moment of the motors
-    limit_f: Any  # N, lateral capacity of one front tyre, of the left and of the right rear tyre
+    steer: Scalar  # rad, the angle itself
+    F_x: Scalar  # N, drive force
+    N_z: Scalar  # N m, yaw moment of the motors
+    limit_f: Scalar  # N, lateral capacity of one front tyre, of the left and of the right rear tyre
     limit_l: Any
     limit_r: Any
     slope_f: Any  # C / (3 F_max) of the same tyres
     slope_l: Any
     slope_r: Any
-    rear_l: Any  # N, capacity of the left and the right rear tyre in all directions, without roll
+    rear_l: (
+        Scalar  # N, capacity of the left and the right rear tyre in all directions, without roll
+    )
     rear_r: Any
-    F_l: Any  # N, drive force that the left motor commands
-    F_r: Any  # N, that of the right motor
+    F_l: Scalar  # N, drive force that the left motor commands
+    F_r: Scalar  # N, that of the right motor
 
 
 @inline
-def _compute_squared_capacity(limit: Any, drive: Any) -> Any:
+def _compute_squared_capacity(limit: Scalar, drive: Scalar) -> Scalar:
     """Squared lateral capacity (N2) of a tyre that drives: friction circle, at least (5 %)^2."""
     return maximum(limit * limit - drive * drive, 0.0025 * limit * limit)
 
@@ -69,7 +71,9 @@ def has_load_shift(small_angle: int, law: int, roll: int) -> int:
 
 
 @inline
-def _compute_axle_shift(F_l: Any, F_r: Any, rear_l: Any, rear_r: Any, weight: Any, car: Any) -> Any:
+def _compute_axle_shift(
+    F_l: Scalar, F_r: Scalar, rear_l: Scalar, rear_r: Scalar, weight: Scalar, car: Any
+) -> Scalar:
     """Load F_x h_x / (2 l) (N) that drive moves from each front wheel to the rear one behind it."""
     # F_x is within the tyres' standing capacity, so that it does not depend on its own effect.
     # At most nine tenths of an axle's standing load move.
@@ -79,7 +83,7 @@ def _compute_axle_shift(F_l: Any, F_r: Any, rear_l: Any, rear_r: Any, weight: An
 
 
 @inline
-def compute_tyre_load(inputs: Any, car: Any, small_angle: int, load_shift: int = 0) -> Any:
+def compute_tyre_load(inputs: Any, car: Any, small_angle: int, load_shift: int = 0) -> TyreLoad:
     """Compute the tyres' load under the inputs of one instant.
 
     Each rear tyre's friction limits its motor's force; the front tyres have the mean of both sides.
@@ -122,19 +126,19 @@ class Tyre(NamedTuple):
     """One tyre at one instant."""
 
     tangent: Any  # t, tangent of its slip angle; on the small-angle plant the angle itself
-    limit: Any  # N, F_max: mu F_z, less what the friction circle leaves to the drive force
+    limit: Scalar  # N, F_max: mu F_z, less what the friction circle leaves to the drive force
     slope: Any  # C / (3 F_max)
 
 
 @jit
-def _linear(tyre: Any, small_angle: int) -> Any:
+def _linear(tyre: Any, small_angle: int) -> Scalar:
     """Lateral force (N) F_y = C atan t, without a limit."""
     angle = tyre.tangent if small_angle else atan(tyre.tangent)
     return 3.0 * tyre.limit * (tyre.slope * angle)
 
 
 @jit
-def _fiala(tyre: Any) -> Any:
+def _fiala(tyre: Any) -> Scalar:
     """Lateral force (N) F_max z (3 - 3 |z| + z^2), z = clip(C t / (3 F_max), -1, 1)."""
     # Pacejka, Tire and Vehicle Dynamics, 3
     z = minimum(maximum(tyre.slope * tyre.tangent, -1.0), 1.0)
@@ -142,7 +146,7 @@ def _fiala(tyre: Any) -> Any:
 
 
 @jit
-def _dugoff(tyre: Any) -> Any:
+def _dugoff(tyre: Any) -> Scalar:
     """Lateral force (N) C t q (2 - q), q = min(1, F_max / (2 C |t|))."""
     # Dugoff, Fancher, Segel, SAE 700377, 1970. With u = C t / F_max it is F_max u up to |u| = 1/2
     # and F_max (1 - 1 / (4 |u|)) from there on, always below the limit.
@@ -153,7 +157,7 @@ def _dugoff(tyre: Any) -> Any:
 
 
 @inline
-def compute_lateral_forces(a: Any, b: Any, c: Any, d: Any, law: int, small_angle: int) -> Any:
+def compute_lateral_forces(a: Tyre, b: Tyre, c: Tyre, d: Tyre, law: int, small_angle: int) -> Any:
     """Compute the lateral forces of the four tyres; the law is chosen once for all of them.
 
     Args:
@@ -190,7 +194,7 @@ def _compute_slip_ratios(motion: Any, load: Any, car: Any, small_angle: int) -> 
 
 
 @jit
-def compute_slips(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
+def compute_slips(motion: Any, load: TyreLoad, car: Any, small_angle: int) -> Any:
     """Compute the tangents of the front and rear slip angle.
 
     Args:
@@ -207,7 +211,7 @@ def compute_slips(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
 
 
 @inline
-def compute_load_transfer(motion: Any, car: Any, g_y: Any) -> Any:
+def compute_load_transfer(motion: Any, car: Any, g_y: Scalar) -> Any:
     """Compute the fraction of its standing load that each axle's left wheel gives to its right.
 
     The suspension transmits K_x phi + C_x phi_dot; the moment of the rest of the car's height,
@@ -232,7 +236,7 @@ def compute_load_transfer(motion: Any, car: Any, g_y: Any) -> Any:
 
 @inline
 def compute_tyre_forces(
-    motion: Any, load: Any, car: Any, g_y: Any, small_angle: int, law: int, roll: int
+    motion: Any, load: TyreLoad, car: Any, g_y: Scalar, small_angle: int, law: int, roll: int
 ) -> Any:
     """Compute the forces of the axles and the moment of the motors.
 
@@ -259,7 +263,7 @@ def compute_tyre_forces(
 
 @inline
 def compute_tyres(
-    motion: Any, load: Any, car: Any, g_y: Any, small_angle: int, law: int, roll: int
+    motion: Any, load: TyreLoad, car: Any, g_y: Scalar, small_angle: int, law: int, roll: int
 ) -> Any:
     """Compute the state of the four tyres, and the motors' drive force and yaw moment.
 
@@ -291,7 +295,7 @@ def _compute_static_tyres(motion: Any, load: Any, car: Any, small_angle: int) ->
 
 
 @inline
-def _compute_shifted_tyres(motion: Any, load: Any, car: Any, g_y: Any) -> Any:
+def _compute_shifted_tyres(motion: Any, load: Any, car: Any, g_y: Scalar) -> Any:
     """`compute_tyres` where roll moves load from side to side; all quotients come from one."""
     across_f, along_f, across_r, along_r = _compute_slip_ratios(motion, load, car, 0)
     e_f, e_r = compute_load_transfer(motion, car, g_y)

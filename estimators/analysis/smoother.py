@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 
 from ...envs.numerics.jit import jit
+from ...envs.numerics.primitives import Matrix, Vector
 from ...envs.record import FAST, PACKET, Array, Log
 from ..core.filter import run_tick
 from ..core.innovation import IGNORE, NONE
 from ..core.model import BETA, LATERAL
 from ..core.packets import process_packet
 from ..core.predict import read_fast_row
-from ..core.record import WINDOW, FilterRecord, GainTables, Vector
+from ..core.record import WINDOW, FilterRecord, GainTables
 from ..design.periodic import count_ticks
 from ..estimator import Estimator
 from ..make import make_estimator
@@ -98,14 +99,14 @@ def _remove_delay(estimator: Estimator) -> Estimator:
 def _filter_forwards(
     f: FilterRecord,
     gains: GainTables,
-    fast: Any,
-    packets: Any,
+    fast: Matrix,
+    packets: Matrix,
     position: int,
     nis: Vector,
-    F: Any,
-    before: Any,
-    x: Any,
-    P: Any,
+    F: Matrix,
+    before: Matrix,
+    x: Matrix,
+    P: Matrix,
 ) -> int:
     """Filter fast rows (K, FAST_WIDTH) and the packets (count, PACKET_WIDTH) from `position` on.
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from ...envs.numerics.jit import inline, jit
 from ...envs.numerics.packed import load_element
-from ...envs.numerics.primitives import absolute, any_lane, select, sqrt
+from ...envs.numerics.primitives import Scalar, Vector, absolute, any_lane, select, sqrt
 from ...envs.numerics.simd8 import (
     allocate_scratch,
     count_upper_rows,
@@ -21,11 +21,11 @@ from ...envs.numerics.simd8 import (
     store8,
     vector_width,
 )
-from .record import N_CORE, N_TOTAL, FilterRecord, Vector
+from .record import N_CORE, N_TOTAL, FilterRecord
 
 
 @jit
-def dot(row: Vector, v: Vector, n: int) -> Any:
+def dot(row: Vector, v: Vector, n: int) -> Scalar:
     """Compute the product of a row of C and a vector of states.
 
     Args:
@@ -43,7 +43,7 @@ def dot(row: Vector, v: Vector, n: int) -> Any:
 
 
 @jit
-def predict_measurement(f: FilterRecord, s: int, i: int) -> Any:
+def predict_measurement(f: FilterRecord, s: int, i: int) -> Scalar:
     """Predict a row of a slow sensor: C x and, over the ground, the road's heading.
 
     Args:
@@ -59,14 +59,16 @@ def predict_measurement(f: FilterRecord, s: int, i: int) -> Any:
 
 
 @inline
-def _accumulate_rows(M: Vector, i: int, k: int, v: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+def _accumulate_rows(
+    M: Vector, i: int, k: int, v: Scalar, a: Scalar, b: Scalar, c: Scalar, d: Scalar
+) -> Any:
     a, b = a + load_element(M, i, k) * v, b + load_element(M, i + 1, k) * v
     return a, b, c + load_element(M, i + 2, k) * v, d + load_element(M, i + 3, k) * v
 
 
 @inline
 def multiply_rows(
-    M: Vector, i: int, V: Vector, n: int, j: int, a: Any, b: Any, c: Any, d: Any
+    M: Vector, i: int, V: Vector, n: int, j: int, a: Scalar, b: Scalar, c: Scalar, d: Scalar
 ) -> Any:
     """Add rows i to i + 3 of M times V to a, b, c and d, eight columns from j on.
 
@@ -146,7 +148,7 @@ def predict_covariance(f: FilterRecord) -> None:
 
 
 @jit
-def correct_scalar(f: FilterRecord, variance: Any, residual: Any) -> None:
+def correct_scalar(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
     """Correct by one residual whose covariance with the state is `f.PC`.
 
     P <- P - K s K^T with the residual's variance s, to which Joseph's form comes down for the
@@ -171,14 +173,14 @@ def correct_scalar(f: FilterRecord, variance: Any, residual: Any) -> None:
 
 
 @jit
-def _update_weight(f: FilterRecord, variance: Any, residual: Any) -> None:
+def _update_weight(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
     """Update a bank member's log-likelihood by a normal residual: -(residual^2 / s + log s) / 2."""
     if f.members > 0:
         f.weight -= 0.5 * (residual * residual * (1.0 / variance) + log(variance))
 
 
 @jit
-def project(f: FilterRecord, row: Vector) -> Any:
+def project(f: FilterRecord, row: Vector) -> Scalar:
     """Compute f.PC = P C^T of a measurement of the states.
 
     Args:
@@ -229,7 +231,7 @@ def project_row(f: FilterRecord, s: int, i: int, first: int) -> Any:
 
 
 @jit
-def update_with_states(f: FilterRecord, row: Vector, r: Any, residual: Any) -> None:
+def update_with_states(f: FilterRecord, row: Vector, r: Scalar, residual: Scalar) -> None:
     """Correct by the residual of a measurement of the states.
 
     Args:
@@ -244,7 +246,7 @@ def update_with_states(f: FilterRecord, row: Vector, r: Any, residual: Any) -> N
 
 
 @jit
-def update_with_clone(f: FilterRecord, clone: int, r: Any, residual: Any) -> None:
+def update_with_clone(f: FilterRecord, clone: int, r: Scalar, residual: Scalar) -> None:
     """Correct by the residual of a measurement of one clone.
 
     Args:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...envs.numerics.functions import sincos
 from ...envs.numerics.jit import copy_into, jit, jit_nrt, noinline
-from ...envs.numerics.primitives import maximum, sqrt
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, sqrt
 from ...envs.record import FAST, PACKET
 from .innovation import BUFFER, interpolate_hdop, store_due_captures
 from .model import (
@@ -38,7 +38,6 @@ from .record import (
     FilterRecord,
     FilterRecords,
     GainTables,
-    Vector,
 )
 from .update import correct_fast, locate_step_row
 
@@ -185,7 +184,7 @@ def read_covariance(f: FilterRecord, gains: GainTables, i: int, j: int) -> Any:
 
 
 @jit
-def compute_deviation(f: FilterRecord, gains: GainTables, i: int) -> Any:
+def compute_deviation(f: FilterRecord, gains: GainTables, i: int) -> Scalar:
     """Compute the present standard deviation of a state.
 
     Args:
@@ -252,7 +251,7 @@ def _update_bank(layers: FilterRecords) -> None:
 
 
 @jit
-def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Any, S: Any) -> None:
+def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Matrix, S: Matrix) -> None:
     """Write the states and standard deviations of all layers in row j of X and S (rows, n)."""
     column = 0
     for layer in range(len(layers) if _first_member(layers) == 0 else 1):
@@ -264,7 +263,7 @@ def _write_row(layers: FilterRecords, gains: GainTables, j: int, X: Any, S: Any)
 
 
 @jit
-def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Any) -> bool:
+def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Matrix) -> bool:
     """Write the states of all layers and their covariance.
 
     Args:
@@ -294,13 +293,13 @@ def write_estimate(layers: FilterRecords, gains: GainTables, x: Vector, P: Any) 
 def advance(
     layers: FilterRecords,
     gains: GainTables,
-    fast: Any,
+    fast: Matrix,
     rows: int,
-    packets: Any,
+    packets: Matrix,
     count: int,
     start: int,
-    X: Any,
-    S: Any,
+    X: Matrix,
+    S: Matrix,
     nis: Vector,
 ) -> int:
     """Process the fast rows from `start` to `rows` and the first `count` packets.
@@ -355,7 +354,9 @@ def advance(
 
 
 @jit_nrt
-def step_all(layers: FilterRecords, gains: GainTables, fast: Any, packets: Any, count: int) -> int:
+def step_all(
+    layers: FilterRecords, gains: GainTables, fast: Matrix, packets: Matrix, count: int
+) -> int:
     """Call `advance` over all rows without outputs: fewer arguments to hand over.
 
     Args:

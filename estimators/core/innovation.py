@@ -10,11 +10,11 @@ from typing import Any
 
 from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import jit
-from ...envs.numerics.primitives import sqrt
+from ...envs.numerics.primitives import Scalar, Vector, sqrt
 from ...envs.record import PACKET
 from .covariance import dot, predict_measurement, project, project_row, update_with_states
 from .model import compute_row_variance
-from .record import COUNTERS, N_SLOW, N_SNAPSHOTS, N_STAMPS, WINDOW, FilterRecord, Vector
+from .record import COUNTERS, N_SLOW, N_SNAPSHOTS, N_STAMPS, WINDOW, FilterRecord
 
 RULES = ("clone", "ignore", "stored", "constant", "larsen", "buffer", "literal", "lag")
 """Rules for late samples; what is older than a rule stores is refused and counted.
@@ -227,7 +227,7 @@ def _find_capture_variance(f: FilterRecord, s: int, i: int, packet: Vector) -> A
 
 
 @jit
-def compute_packet_variance(f: FilterRecord, s: int, i: int, packet: Vector) -> Any:
+def compute_packet_variance(f: FilterRecord, s: int, i: int, packet: Vector) -> Scalar:
     """Compute the variance of a packet's row.
 
     Args:
@@ -303,7 +303,7 @@ def _is_observed_elsewhere(f: FilterRecord, s: int, state: int) -> bool:
 
 
 @jit
-def inflate_covariance(f: FilterRecord, state: int, variance: Any) -> None:
+def inflate_covariance(f: FilterRecord, state: int, variance: Scalar) -> None:
     """Add a variance to a state, now and in what was captured of it.
 
     Args:

@@ -10,12 +10,12 @@ from typing import Any
 
 from ...envs.numerics.jit import jit, noinline
 from ...envs.numerics.packed import load_element, store_element
-from ...envs.numerics.primitives import absolute, maximum, minimum
+from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum, minimum
 from ...envs.numerics.simd8 import allocate_scratch, load8, store8
 from ...envs.vehicle.linear import write_kinematic, write_lateral, write_roll
 from ...envs.vehicle.parameters import GRAVITY
 from .covariance import multiply_rows
-from .record import CAR, N_CORE, N_DRIVERS, N_INPUTS, N_SLOW, FilterRecord, Vector
+from .record import CAR, N_CORE, N_DRIVERS, N_INPUTS, N_SLOW, FilterRecord
 
 LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES, LINEAR = range(7)
 """Kinds of models; LINEAR is any linear system, whose matrices are arguments."""
@@ -28,7 +28,7 @@ MIN_SPEED = 1.5  # m/s: below it the model stays that of this speed
 
 
 @jit
-def _build_lateral(f: FilterRecord, V: Any) -> None:
+def _build_lateral(f: FilterRecord, V: Scalar) -> None:
     """Build tie-vision (8), dakf-stability (5)-(11), a body that rolls and what a_y feels of it."""
     A, B = f.A, f.B
     rolling = 2 if f.rolling > 0 else 0
@@ -46,7 +46,7 @@ def _build_lateral(f: FilterRecord, V: Any) -> None:
 
 
 @jit
-def _write_body(f: FilterRecord, V: Any) -> None:
+def _write_body(f: FilterRecord, V: Scalar) -> None:
     """Write phi, phi_rate and their effect on beta: double-layer-gps (1), (3), solved for phi''."""
     A, B, i = f.A, f.B, f.rolling
     # phi'' enters F_y, hence phi'' itself: with S = M_s h_s all divides by 1 - S^2 / (M I_x)
@@ -63,7 +63,7 @@ def _write_body(f: FilterRecord, V: Any) -> None:
 
 
 @jit
-def _write_accel(f: FilterRecord, V: Any) -> None:
+def _write_accel(f: FilterRecord, V: Scalar) -> None:
     """Write the specific force a_y = V (beta' + gamma) + g phi, with feed-through of steering."""
     row = f.C_fast[f.accel_row]
     for j in range(f.dense):
@@ -77,7 +77,7 @@ def _write_accel(f: FilterRecord, V: Any) -> None:
 
 
 @jit
-def _compute_rates(f: FilterRecord, V: Any, front: Any, rear: Any) -> Any:
+def _compute_rates(f: FilterRecord, V: Scalar, front: Scalar, rear: Scalar) -> Any:
     """Compute (beta', gamma', phi_rate') by forces of the axles in N."""
     beta = (front + rear) / (f.car[CAR.mass] * V)
     gamma = (f.car[CAR.front_arm] * front - f.car[CAR.rear_arm] * rear) / f.car[CAR.yaw_inertia]
@@ -88,7 +88,7 @@ def _compute_rates(f: FilterRecord, V: Any, front: Any, rear: Any) -> Any:
 
 
 @jit
-def _write_tyres(f: FilterRecord, V: Any) -> None:
+def _write_tyres(f: FilterRecord, V: Scalar) -> None:
     """Write the estimated tyres' columns of B, besides their slope by slip, and f.push."""
     for j in range(3):  # the factors of front and rear stiffness, then 1/friction
         if j < 2 or f.grip > 0:
@@ -109,7 +109,7 @@ def _write_tyres(f: FilterRecord, V: Any) -> None:
 
 
 @jit
-def _build_continuous(f: FilterRecord, V: Any, turning: Any) -> None:
+def _build_continuous(f: FilterRecord, V: Scalar, turning: Scalar) -> None:
     """Build f.A and f.B = [inputs, disturbances] at a speed V (m/s) and yaw rate (rad/s)."""
     A, B = f.A, f.B
     for i in range(f.dense):
@@ -235,7 +235,7 @@ def _set_delayed_rows(f: FilterRecord) -> None:
 
 
 @jit
-def compute_road_turn(V: Any, curvature: Any, step: Any) -> Any:
+def compute_road_turn(V: Scalar, curvature: Scalar, step: Scalar) -> Scalar:
     """Compute the angle by which a road turns within a step.
 
     Args:
@@ -250,7 +250,7 @@ def compute_road_turn(V: Any, curvature: Any, step: Any) -> Any:
 
 
 @jit
-def compute_row_variance(f: FilterRecord, s: int, i: int, V: Any) -> Any:
+def compute_row_variance(f: FilterRecord, s: int, i: int, V: Scalar) -> Scalar:
     """Compute the variance of a slow sensor's row at a speed.
 
     Args:
@@ -267,7 +267,7 @@ def compute_row_variance(f: FilterRecord, s: int, i: int, V: Any) -> Any:
 
 
 @noinline
-def build_model(f: FilterRecord, speed: Any, turning: Any) -> None:
+def build_model(f: FilterRecord, speed: Scalar, turning: Scalar) -> None:
     """Build the model at a speed, and the noise that grows with 1/V.
 
     Args:
@@ -293,7 +293,9 @@ _MIN_SLOPE = 0.02  # least slope by slip of a sliding tyre, as a fraction of its
 
 
 @jit
-def compute_axle_force(stiffness: Any, load: Any, alpha: Any, factor: Any, grip: Any) -> Any:
+def compute_axle_force(
+    stiffness: Scalar, load: Scalar, alpha: Scalar, factor: Scalar, grip: Scalar
+) -> Any:
     """Compute an axle's lateral force and its slopes: Fiala's law with friction 1/grip.
 
     F = C s alpha (1 - |z| + z^2 / 3), z = C s alpha grip / (3 F_z) within +-1; at grip 0 it is
@@ -331,7 +333,7 @@ _SPEED_TOLERANCE = 0.005  # fraction by which the speed moves until the model is
 
 
 @jit
-def is_finite(value: float) -> Any:
+def is_finite(value: float) -> Scalar:
     """Return whether a number can be calculated with: not NaN, infinite or beyond `MAX_NUMBER`.
 
     Args:
@@ -344,7 +346,7 @@ def is_finite(value: float) -> Any:
 
 
 @jit
-def smooth_speed(speed: Any, sample: Any, share: Any) -> Any:
+def smooth_speed(speed: Scalar, sample: Scalar, share: Scalar) -> Scalar:
     """Low-pass the speed.
 
     Args:
@@ -359,7 +361,7 @@ def smooth_speed(speed: Any, sample: Any, share: Any) -> Any:
 
 
 @jit
-def is_speed_changed(speed: Any, model_speed: Any) -> Any:
+def is_speed_changed(speed: Scalar, model_speed: Scalar) -> Scalar:
     """Return whether a speed is too far from the model's.
 
     Args:
@@ -391,7 +393,7 @@ def filter_speed(f: FilterRecord, sample: float) -> Any:
 
 
 @jit
-def is_model_outdated(f: FilterRecord, speed: float) -> Any:
+def is_model_outdated(f: FilterRecord, speed: float) -> Scalar:
     """Return whether the model has to be built anew.
 
     Args:

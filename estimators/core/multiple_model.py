@@ -6,10 +6,9 @@ a gust blows, the tyres have just changed, they settle.
 """
 
 from math import exp, log
-from typing import Any
 
 from ...envs.numerics.jit import jit, noinline
-from ...envs.numerics.primitives import maximum
+from ...envs.numerics.primitives import Scalar, maximum
 from ...envs.numerics.simd8 import load8, store8
 from .innovation import inflate_covariance
 from .record import FilterRecord, FilterRecords
@@ -32,7 +31,7 @@ def _find_likeliest(layers: FilterRecords) -> int:
 
 
 @jit
-def _set_level(f: FilterRecord, i: int, level: Any) -> None:
+def _set_level(f: FilterRecord, i: int, level: Scalar) -> None:
     """Set the variance of disturbance i to `level` times the configured one."""
     index, ratio = f.dense + i, level / f.level[i]
     f.level[i] = level
@@ -80,7 +79,7 @@ def _copy_moments(source: FilterRecord, target: FilterRecord) -> None:
 
 
 @jit
-def _split_weight(source: FilterRecord, share: Any) -> Any:
+def _split_weight(source: FilterRecord, share: Scalar) -> Scalar:
     """Split off and return a fraction of a member's probability, which its `weight` is here."""
     moved = share * source.weight
     source.weight -= moved
@@ -88,7 +87,7 @@ def _split_weight(source: FilterRecord, share: Any) -> Any:
 
 
 @jit
-def _merge(source: FilterRecord, probability: Any, target: FilterRecord) -> Any:
+def _merge(source: FilterRecord, probability: Scalar, target: FilterRecord) -> Scalar:
     """Merge a source's moments into a member's as a mixture's; return the source's fraction."""
     target.weight += probability
     share = probability / target.weight
@@ -149,7 +148,7 @@ def run_imm_step(layers: FilterRecords) -> None:
 
 
 @jit
-def _compute_likelihood(layers: FilterRecords, m: int, best: int) -> Any:
+def _compute_likelihood(layers: FilterRecords, m: int, best: int) -> Scalar:
     return exp(maximum(layers[m].weight - layers[best].weight, MIN_LOG_WEIGHT))
 
 

@@ -6,12 +6,10 @@ ticks up to now are filtered anew with all samples known by now: exact for any d
 The gate judges a sample once, by what was known before it; a refused one changes nothing.
 """
 
-from typing import Any
-
 import numpy as np
 
 from ...envs.numerics.jit import copy_into, jit, noinline
-from ...envs.numerics.primitives import floor, maximum
+from ...envs.numerics.primitives import Scalar, Vector, floor, maximum
 from ...envs.record import PACKET, PACKET_WIDTH
 from .innovation import BUFFER, DROPPED, find_clone, get_direct, is_duplicate
 from .model import MIN_SPEED, VELOCITY_ROLL, build_model, is_finite
@@ -26,7 +24,6 @@ from .record import (
     WINDOW,
     FilterRecord,
     GainTables,
-    Vector,
 )
 from .update import correct_fast, update_filter
 
@@ -218,12 +215,12 @@ def _apply_packet(f: FilterRecord, gains: GainTables, s: int, packet: Vector) ->
 
 
 @jit
-def _is_whole(value: Any) -> Any:
+def _is_whole(value: Scalar) -> Scalar:
     return floor(value) == value
 
 
 @jit
-def _is_timely(f: FilterRecord, captured: Any, arrived: Any) -> bool:
+def _is_timely(f: FilterRecord, captured: Scalar, arrived: Scalar) -> bool:
     """Return whether stamps are ticks from the first row to now, in order; else count them."""
     if not (_is_whole(captured) and _is_whole(arrived)) or arrived < captured:
         f.counts[COUNTERS.unknown] += 1

@@ -6,7 +6,7 @@ import numpy as np
 
 from ...envs.numerics.jit import jit, noinline
 from ...envs.numerics.packed import load_element
-from ...envs.numerics.primitives import absolute, maximum, minimum
+from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum, minimum
 from ...envs.numerics.simd8 import allocate_scratch, load8, store8, vector_width
 from ...envs.record import FAST
 from .covariance import predict_covariance
@@ -24,14 +24,14 @@ from .model import (
     is_finite,
     is_model_outdated,
 )
-from .record import CAR, COUNTERS, N_CORE, N_SLOW, FilterRecord, Vector
+from .record import CAR, COUNTERS, N_CORE, N_SLOW, FilterRecord
 
 _FACTOR_LIMITS = (0.2, 3.0)  # limits of the estimated factors on the stiffness
 _MAX_INVERSE_FRICTION = 4.0  # limit of the estimated reciprocal of friction
 
 
 @jit
-def compute_signal(row: Vector, column: Vector, factor: Vector) -> Any:
+def compute_signal(row: Vector, column: Vector, factor: Vector) -> Scalar:
     """Compute a signal of a fast row: the sum of two of its columns times their factors.
 
     Args:
@@ -250,7 +250,7 @@ def advance_state(f: FilterRecord, u: Vector) -> None:
 
 
 @jit
-def compute_residual(f: FilterRecord, i: int) -> Any:
+def compute_residual(f: FilterRecord, i: int) -> Scalar:
     """Compute the residual of a fast measurement.
 
     Args:

@@ -39,8 +39,6 @@ FilterRecords = npt.NDArray[Any]
 GainTables = Any
 """(cells, rows, columns): a table of gains for each cell of speed; `design.periodic` has its
 rows. Zeros where they are computed from P."""
-Vector = Any
-"""A vector of numbers, the shape said where it is taken."""
 
 
 class SkipCounters(NamedTuple):

@@ -13,7 +13,7 @@ import numpy as np
 from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import jit, noinline
 from ...envs.numerics.packed import load_element, store_element
-from ...envs.numerics.primitives import absolute, maximum, minimum
+from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum, minimum
 from ...envs.numerics.simd8 import load8, store8
 from ...envs.record import PACKET
 from .covariance import dot, predict_measurement, project_row, update_with_clone, update_with_states
@@ -31,7 +31,7 @@ from .innovation import (
 from .innovation import NONE as NONE
 from .model import PSI, is_finite
 from .predict import compute_residual
-from .record import COUNTERS, N_SNAPSHOTS, WINDOW, FilterRecord, GainTables, Vector
+from .record import COUNTERS, N_SNAPSHOTS, WINDOW, FilterRecord, GainTables
 
 
 @jit
@@ -41,7 +41,7 @@ def _apply_row(f: FilterRecord, s: int, i: int, v: Vector) -> Any:
 
 
 @jit
-def locate_step_row(f: FilterRecord) -> Any:
+def locate_step_row(f: FilterRecord) -> Scalar:
     """Locate the gain of the first fast measurement in this step.
 
     Args:
@@ -54,7 +54,7 @@ def locate_step_row(f: FilterRecord) -> Any:
 
 
 @jit
-def _locate_frame_row(f: FilterRecord, s: int, frame: int) -> Any:
+def _locate_frame_row(f: FilterRecord, s: int, frame: int) -> Scalar:
     """Locate the gain of sensor s's first row for a frame.
 
     Behind the last frame, at `f.pattern`, stand the gains of the rule between samples.

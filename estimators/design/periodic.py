@@ -14,12 +14,12 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 from ...envs.numerics.jit import jit
-from ...envs.numerics.primitives import absolute, maximum
+from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum
 from ...envs.record import Array
 from ..core.covariance import update_with_clone, update_with_states
 from ..core.filter import reset_filter, reset_filters, run_tick
 from ..core.innovation import CLONE, DIRECT, DROPPED, DUAL_RATE, IGNORE, NONE, PSEUDO, find_clone
-from ..core.record import FilterRecord, FilterRecords, GainTables, Vector
+from ..core.record import FilterRecord, FilterRecords, GainTables
 from .dual_rate import compute_shares, write_shares
 from .kalman import compute_inverse, observer_gain, transition_matrix
 from .options import FilterConfig
@@ -89,10 +89,10 @@ _BIAS_WALK_TIME = 10.0  # s in which a bias walks by its prior where a filter is
 def _iterate_gains(
     filters: FilterRecords,
     s: int,
-    lags: Any,
+    lags: Vector,
     cycles: int,
     table: Any,
-    before: Any,
+    before: Vector,
     gains: GainTables,
 ) -> int:
     """Run a covariance filter over its schedule until its gains settle; return the cycles used.
@@ -137,7 +137,7 @@ def _iterate_gains(
 
 
 @jit
-def _copy_gain(source: Vector, target: Vector, size: int) -> Any:
+def _copy_gain(source: Vector, target: Vector, size: int) -> Scalar:
     """Copy `size` entries of a gain; return the largest relative change."""
     change = 0.0
     for i in range(size):

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...envs.numerics.functions import clip, exp
 from ...envs.numerics.jit import copy_into, jit, noinline
-from ...envs.numerics.primitives import maximum
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum
 from ...envs.record import FAST, PACKET, PACKET_WIDTH, Array
 from ...envs.sensors.link import SlowSensor
 from ...envs.ticks import TICK
@@ -72,7 +72,7 @@ def _make_net(correction: Correction, states: tuple[str, ...]) -> _CorrectionNet
 
 
 @jit
-def locate_stack(net: Any) -> Any:
+def locate_stack(net: _CorrectionNet) -> Scalar:
     """Locate the stack of frames, which is the network's input, in a memory.
 
     Args:
@@ -85,7 +85,7 @@ def locate_stack(net: Any) -> Any:
 
 
 @jit
-def _reset_memory(m: Any, first: int) -> None:
+def _reset_memory(m: Vector, first: int) -> None:
     """Reset a memory to the tick before the first fast row; the car's mass stays."""
     for i in range(len(m)):
         m[i] *= 1.0 if i == MASS else 0.0
@@ -93,7 +93,7 @@ def _reset_memory(m: Any, first: int) -> None:
 
 
 @jit
-def _gather(m: Any, row: Any) -> None:
+def _gather(m: Vector, row: Vector) -> None:
     """Add a fast row to the sums of this pace."""
     m[TICK_PLACE] += 1.0
     m[COUNT] += 1.0
@@ -104,7 +104,7 @@ def _gather(m: Any, row: Any) -> None:
 
 
 @jit
-def _write_frame(f: Any, gains: Any, m: Any, net: Any, offset: int) -> int:
+def _write_frame(f: Any, gains: Any, m: Vector, net: Any, offset: int) -> int:
     """Write the frame of this pace at a place; return how many of its numbers are not finite."""
     k, n = len(COLUMNS) + 1, len(net.states)
     for i in range(k):  # the slip rate stands before the columns
@@ -120,7 +120,7 @@ def _write_frame(f: Any, gains: Any, m: Any, net: Any, offset: int) -> int:
 
 
 @jit
-def _run_layers(m: Any, net: Any, offset: int) -> int:
+def _run_layers(m: Vector, net: Any, offset: int) -> int:
     """Run the network on the stack at a place, which it normalises; return the outputs' place."""
     inputs, at = net.sizes[0], 0
     for i in range(inputs):
@@ -142,7 +142,7 @@ def _run_layers(m: Any, net: Any, offset: int) -> int:
 
 
 @jit
-def _update_correction(f: Any, gains: Any, m: Any, net: Any) -> None:
+def _update_correction(f: Any, gains: Any, m: Vector, net: Any) -> None:
     """Update the correction at this pace."""
     width, stack, newest = net.sizes[0] // len(LAGS), locate_stack(net), int(m[FRAMES])
     if _write_frame(f, gains, m, net, HISTORY + width * (newest % RING_FRAMES)) > 0:
@@ -159,7 +159,14 @@ def _update_correction(f: Any, gains: Any, m: Any, net: Any) -> None:
 
 @noinline
 def filter_and_correct(
-    filters: Any, gains: Any, fast: Any, rows: int, packets: Any, count: int, m: Any, net: Any
+    filters: Vector,
+    gains: Matrix,
+    fast: Matrix,
+    rows: int,
+    packets: Matrix,
+    count: int,
+    m: Vector,
+    net: _CorrectionNet,
 ) -> None:
     """Advance a filter whose gains follow P, pace by pace, and update its correction.
 
@@ -192,7 +199,7 @@ def filter_and_correct(
 
 
 @jit
-def apply_correction(f: Any, m: Any, net: Any) -> None:
+def apply_correction(f: Any, m: Vector, net: _CorrectionNet) -> None:
     """Add the correction to a filter's record, whose own numbers go to the memory's end.
 
     How the sum's error depends on those of the other states is not known: covariances are zero.
@@ -213,7 +220,7 @@ def apply_correction(f: Any, m: Any, net: Any) -> None:
 
 
 @jit
-def remove_correction(f: Any, m: Any, net: Any) -> None:
+def remove_correction(f: Any, m: Vector, net: _CorrectionNet) -> None:
     """Restore a filter's own numbers in its record.
 
     Args:

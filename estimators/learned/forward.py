@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from ...envs.numerics.functions import clip, exp
 from ...envs.numerics.jit import jit, jit_nrt
-from ...envs.numerics.primitives import maximum, minimum
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum
 from ...envs.record import Array
 
 GATES = {"gru": 3, "lstm": 4}
@@ -188,17 +188,17 @@ class PackedNetwork(NamedTuple):
 
 
 @jit
-def _tanh(x: Any) -> Any:
+def _tanh(x: Scalar) -> Scalar:
     return 1.0 - 2.0 / (1.0 + exp(clip(x + x, 0.0 - _MAX_EXPONENT, _MAX_EXPONENT)))
 
 
 @jit
-def _sigmoid(x: Any) -> Any:
+def _sigmoid(x: Scalar) -> Scalar:
     return 1.0 / (1.0 + exp(clip(0.0 - x, 0.0 - _MAX_EXPONENT, _MAX_EXPONENT)))
 
 
 @jit
-def _apply_activation(x: Any, kind: int) -> Any:
+def _apply_activation(x: Scalar, kind: int) -> Scalar:
     """Apply an activation with torch's default arguments."""
     if kind == _TANH:
         return _tanh(x)
@@ -212,7 +212,7 @@ def _apply_activation(x: Any, kind: int) -> Any:
 
 
 @jit
-def _apply_dense(z: Any, numbers: Any, offset: int, out: Any) -> int:
+def _apply_dense(z: Vector, numbers: Vector, offset: int, out: Vector) -> int:
     """Write out = W z + b with the numbers at a place; return the place behind them."""
     n = len(out)
     bias = offset + len(z) * n
@@ -226,7 +226,7 @@ def _apply_dense(z: Any, numbers: Any, offset: int, out: Any) -> int:
 
 
 @jit_nrt
-def _step_cell(z: Any, h: Any, gates: int, numbers: Any, offset: int) -> int:
+def _step_cell(z: Vector, h: Vector, gates: int, numbers: Vector, offset: int) -> int:
     """Step torch's GRU (3 gates) or LSTM (4); h: its state, updated; return the place behind."""
     n = len(h) // (gates - 2)
     from_input, from_state = np.empty(gates * n), np.empty(gates * n)
@@ -251,7 +251,7 @@ def _step_cell(z: Any, h: Any, gates: int, numbers: Any, offset: int) -> int:
 
 @jit
 def _compute_gates(
-    z: Any, h: Any, numbers: Any, offset: int, from_input: Any, from_state: Any
+    z: Vector, h: Vector, numbers: Vector, offset: int, from_input: Vector, from_state: Vector
 ) -> int:
     """Compute a cell's sums of input and state, whose arrays stand as in `CELL_WEIGHTS`."""
     n, n_inputs = len(from_input), len(z) + len(h)
@@ -270,7 +270,7 @@ def _compute_gates(
 
 
 @jit_nrt
-def _step_averages(z: Any, m: Any, form: Any, numbers: Any, offset: int) -> Any:
+def _step_averages(z: Vector, m: Vector, form: Vector, numbers: Vector, offset: int) -> Any:
     """Step `MovingAverages`, whose state m is updated; return the output and the place behind."""
     units, times = form[1], form[3]
     out = np.empty(units * (1 + times))
@@ -288,7 +288,7 @@ def _step_averages(z: Any, m: Any, form: Any, numbers: Any, offset: int) -> Any:
 
 
 @jit_nrt
-def forward(net: Any, x: Any, state: Any, out: Any) -> None:
+def forward(net: PackedNetwork, x: Matrix, state: Matrix, out: Matrix) -> None:
     """Compute the network's outputs.
 
     Args:

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...envs.numerics.jit import jit, jit_nrt
 from ...envs.numerics.packed import count_lanes
-from ...envs.numerics.primitives import maximum, minimum
+from ...envs.numerics.primitives import Matrix, Vector, maximum, minimum
 from ...envs.numerics.simd import LANES
 from ...envs.numerics.simd8 import prefetch
 from ..core.record import FILTER, N_SMALL, N_TOTAL, X_OFFSET, FilterRecord
@@ -37,7 +37,7 @@ def _fetch(f: FilterRecord, template: FilterRecord) -> None:
 
 
 @jit
-def _select_lanes(b: LaneBlock, first: int, filters: Any, done: Any, rows: Any) -> int:
+def _select_lanes(b: LaneBlock, first: int, filters: Matrix, done: Vector, rows: Vector) -> int:
     """Select the filters that do their rows in lanes into b.here; return how many rows all do."""
     n_rows, count = 0, 0
     for lane in range(count_lanes()):
@@ -53,23 +53,23 @@ def _select_lanes(b: LaneBlock, first: int, filters: Any, done: Any, rows: Any) 
 
 @jit_nrt
 def _observe_batch(
-    filters: Any,
-    pool: Any,
+    filters: Matrix,
+    pool: Vector,
     places: Any,
-    done: Any,
-    lanes: Any,
-    fast: Any,
-    rows: Any,
-    packets: Any,
-    counts: Any,
-    obs: Any,
+    done: Vector,
+    lanes: Vector,
+    fast: Vector,
+    rows: Vector,
+    packets: Vector,
+    counts: Vector,
+    obs: Vector,
     inner: int,
     plan: Any,
     limits: Any,
-    beta: Any,
-    gamma: Any,
-    out: Any,
-    summary: Any,
+    beta: Vector,
+    gamma: Vector,
+    out: Vector,
+    summary: Vector,
 ) -> int:
     """Call `observe` for every filter that has rows to do; return how many still have."""
     # arguments are those of `observe` with N filters as first axis, but for inner, plan and limits;

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ...envs.numerics.jit import jit, jit_nrt, noinline
 from ...envs.numerics.packed import count_lanes, load_element, store_element
-from ...envs.numerics.primitives import any_lane, maximum, minimum, select
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, any_lane, maximum, minimum, select
 from ...envs.numerics.simd8 import prefetch
 from ...envs.record import FAST, FAST_WIDTH, PACKET, Array
 from ..core.covariance import correct_scalar, project
@@ -28,7 +28,7 @@ from ..core.model import (
 )
 from ..core.packets import process_packet
 from ..core.predict import compute_residual, compute_signal, propagate, read_fast_row
-from ..core.record import X_OFFSET, FilterRecord, GainTables, Vector
+from ..core.record import X_OFFSET, FilterRecord, GainTables
 from ..estimator import Estimator
 from ..wrappers.estimate import AnyEstimator, EstimatorSpec
 from .lanes import LaneBlock, load_lane, store_captures, store_lane, store_prediction
@@ -37,7 +37,7 @@ Build = Callable[[EstimatorSpec], AnyEstimator]
 
 
 @jit_nrt
-def get_gains(pool: Any, place: Any) -> Any:
+def get_gains(pool: Vector, place: Vector) -> Any:
     """Return the table of gains at a place in the pool.
 
     Args:
@@ -125,7 +125,7 @@ class GainPool:
 
 
 @jit
-def _fetch_next(b: LaneBlock, first: int, filters: Any, fast: Any, j: int, rows: int) -> None:
+def _fetch_next(b: LaneBlock, first: int, filters: Matrix, fast: Any, j: int, rows: int) -> None:
     """Have the caches fetch row j of the next block, from filter `first` on, and some states."""
     last = minimum(first + count_lanes(), len(filters))
     for i in range(first, last):
@@ -142,7 +142,7 @@ def _fetch_next(b: LaneBlock, first: int, filters: Any, fast: Any, j: int, rows:
 
 
 @jit
-def _read_rows(b: LaneBlock, first: int, fast: Any, j: int) -> None:
+def _read_rows(b: LaneBlock, first: int, fast: Matrix, j: int) -> None:
     """Read row j of each lane's filter into b.row."""
     for lane in range(count_lanes()):
         if b.here[lane] == 1.0:
@@ -188,7 +188,7 @@ def _gather_gains(b: LaneBlock, first: int, pool: Vector, places: Any) -> None:
 
 
 @jit
-def _correct(b: LaneBlock, first: int, filters: Any) -> None:
+def _correct(b: LaneBlock, first: int, filters: Matrix) -> None:
     """Correct all lanes by their fast measurements; a residual that is not finite is skipped."""
     for i in range(b.fasts):
         residual = compute_residual(b, i)
@@ -216,7 +216,7 @@ def _correct(b: LaneBlock, first: int, filters: Any) -> None:
 
 
 @jit
-def _store_captures(b: LaneBlock, first: int, filters: Any) -> None:
+def _store_captures(b: LaneBlock, first: int, filters: Matrix) -> None:
     """Store what lanes that do this tick together captured at the last one."""
     if any_lane((load_element(b.now) > load_element(b.next)) & (load_element(b.here) == 1.0)):
         for lane in range(count_lanes()):
@@ -227,7 +227,7 @@ def _store_captures(b: LaneBlock, first: int, filters: Any) -> None:
 
 @jit
 def _step_lanes(
-    b: LaneBlock, first: int, filters: Any, pool: Vector, places: Any, speed: Any
+    b: LaneBlock, first: int, filters: Matrix, pool: Vector, places: Any, speed: Any
 ) -> None:
     """Step all lanes by one tick."""
     store_element(b.speed_before, load_element(b.model_speed))
@@ -253,13 +253,13 @@ def _step_lanes(
 
 
 @jit
-def _average_wheel_speed(row: Vector) -> Any:
+def _average_wheel_speed(row: Vector) -> Scalar:
     return 0.5 * (row[FAST.wheel_left] + row[FAST.wheel_right])
 
 
 @jit
 def _store_outliers(
-    b: LaneBlock, first: int, filters: Any, pool: Any, places: Any, fast: Any, j: int
+    b: LaneBlock, first: int, filters: Matrix, pool: Vector, places: Any, fast: Matrix, j: int
 ) -> bool:
     """Store lanes that stand apart in their records; False, unchanged, where gains are missing."""
     if b.periodic == 1:
@@ -286,7 +286,7 @@ def _step_filter(f: FilterRecord, gains: GainTables, row: Vector) -> None:
 
 @jit
 def _step_outliers(
-    b: LaneBlock, first: int, filters: Any, pool: Any, places: Any, fast: Any, j: int
+    b: LaneBlock, first: int, filters: Matrix, pool: Vector, places: Any, fast: Matrix, j: int
 ) -> None:
     """Step the lanes that stand apart by their records, which the lanes take over."""
     for lane in range(count_lanes()):
@@ -297,7 +297,7 @@ def _step_outliers(
 
 
 @jit
-def _set_next_due(b: LaneBlock, lane: int, packets: Any, count: int) -> None:
+def _set_next_due(b: LaneBlock, lane: int, packets: Matrix, count: int) -> None:
     """Set when the lane's next packet is taken; one that no tick of this call waits for is next."""
     k, due_tick = b.cursor[lane], np.inf
     if k < count:
@@ -308,7 +308,7 @@ def _set_next_due(b: LaneBlock, lane: int, packets: Any, count: int) -> None:
 
 @jit
 def _process_packets(
-    b: LaneBlock, lane: int, f: FilterRecord, gains: GainTables, packets: Any, count: int
+    b: LaneBlock, lane: int, f: FilterRecord, gains: GainTables, packets: Matrix, count: int
 ) -> None:
     """Process the packets of a lane's filter that are here now, by its record."""
     k = b.cursor[lane]
@@ -325,13 +325,13 @@ def _process_packets(
 def advance_block(
     b: LaneBlock,
     first: int,
-    filters: Any,
-    pool: Any,
+    filters: Matrix,
+    pool: Vector,
     places: Any,
-    fast: Any,
+    fast: Matrix,
     rows: int,
-    packets: Any,
-    counts: Any,
+    packets: Matrix,
+    counts: Vector,
 ) -> int:
     """Advance the filters that are `here` from their first row on, as `core.filter.advance` does.
 

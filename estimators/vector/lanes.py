@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...envs.numerics.jit import jit
+from ...envs.numerics.primitives import Scalar
 from ...envs.numerics.simd import LANES
 from ...envs.numerics.simd8 import allocate_aligned, pad_to_cache_line
 from ...envs.record import FAST, FAST_WIDTH
@@ -92,7 +93,7 @@ def make_blocks(count: int) -> Any:
 
 
 @jit
-def is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Any:
+def is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Scalar:
     """Return whether a filter's ticks are computed in its lane now; the first shapes the block.
 
     Lanes compute models that change by speed alone, of which every tick predicts and corrects.
@@ -111,7 +112,7 @@ def is_lane_compatible(b: LaneBlock, lane: int, f: FilterRecord) -> Any:
 
 
 @jit
-def _is_same_shape(b: LaneBlock, f: FilterRecord) -> Any:
+def _is_same_shape(b: LaneBlock, f: FilterRecord) -> Scalar:
     is_same = f.n == b.n and f.dense == b.dense and f.total == b.total and f.inputs == b.inputs
     is_same = is_same and f.fasts == b.fasts and f.kind == b.kind and f.periodic == b.periodic
     is_same = is_same and f.measured == b.measured and f.cycle == b.cycle and f.robust == b.robust

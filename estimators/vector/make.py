@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...envs.numerics.jit import jit_nrt
+from ...envs.numerics.primitives import Vector
 from ...envs.ticks import TICK
 from ...envs.vehicle.parameters import COMS, Vehicle, VehicleSource, make_vehicle
 from ..core.record import FILTER
@@ -25,7 +26,13 @@ from .lane_ticks import Build, get_gains
 
 @jit_nrt
 def _correct_batch(
-    filters: Any, pool: Any, places: Any, chosen: Any, record: Any, observed: Any, corrections: Any
+    filters: Vector,
+    pool: Vector,
+    places: Any,
+    chosen: Vector,
+    record: Any,
+    observed: Any,
+    corrections: Any,
 ) -> None:
     """Call `observe_corrected` for the filters of the indices `chosen`."""
     fast, rows, packets, counts = record

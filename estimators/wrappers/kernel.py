@@ -7,7 +7,7 @@ import numpy as np
 
 from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import jit, noinline
-from ...envs.numerics.primitives import maximum, minimum
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum
 from ..core.filter import advance, compute_deviation, read_covariance
 from ..core.record import FILTER
 from ..estimator import compile_call
@@ -15,13 +15,13 @@ from ..learned.correction import EXAMPLE, apply_correction, filter_and_correct, 
 
 
 @jit
-def _clip_symmetric(value: Any, limit: Any) -> Any:
+def _clip_symmetric(value: Scalar, limit: Scalar) -> Scalar:
     """Clip the value to +-limit; NaN stays, so that a filter that failed is seen."""
     return value if value != value else minimum(maximum(value, 0.0 - limit), limit)
 
 
 @jit
-def _compute_nees(f: Any, gains: Any, i: int, j: int, beta: Any, gamma: Any) -> Any:
+def _compute_nees(f: Any, gains: Any, i: int, j: int, beta: Scalar, gamma: Scalar) -> Scalar:
     """Compute e' P_e^-1 e / len(e), the NEES per state; 0 without states or for a singular P_e.
 
     e is the error of the states i and j, estimates of the true beta and gamma; -1: there is none.
@@ -42,21 +42,21 @@ def _compute_nees(f: Any, gains: Any, i: int, j: int, beta: Any, gamma: Any) -> 
 
 @noinline
 def observe(
-    filters: Any,
-    gains: Any,
-    fast: Any,
+    filters: Vector,
+    gains: Matrix,
+    fast: Matrix,
     rows: int,
-    packets: Any,
+    packets: Matrix,
     count: int,
     start: int,
-    obs: Any,
+    obs: Vector,
     inner: int,
-    plan: Any,
-    limits: Any,
+    plan: Matrix,
+    limits: Vector,
     beta: float,
     gamma: float,
-    out: Any,
-    summary: Any,
+    out: Vector,
+    summary: Vector,
 ) -> int:
     """Advance the filter, then write the observation and the outputs.
 
@@ -114,7 +114,7 @@ def observe(
 
 @jit
 def observe_corrected(
-    filters: Any, gains: Any, record: Any, m: Any, net: Any, outputs: Any
+    filters: Vector, gains: Matrix, record: Any, m: Vector, net: Any, outputs: Any
 ) -> None:
     """Call `filter_and_correct`, and write the sums as `observe` does.
 

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 from ...numerics.functions import CHANNELS, PI, wrap
 from ...numerics.jit import inline, jit
-from ...numerics.primitives import absolute, select
+from ...numerics.primitives import Scalar, Vector, absolute, select
 from ...vehicle.dynamics import compute_curvature
 from ..link import Blocks, PacketValue, SlowKind
 
@@ -19,12 +19,12 @@ CAMERA_KIND = SlowKind(
 class FieldOfView(NamedTuple):
     """Field of view of the camera, beyond which no lane is in the picture."""
 
-    heading: Any  # rad, relative to the road, either side
-    offset: Any  # m, of the centre of gravity from the lane's centre, either side
+    heading: Scalar  # rad, relative to the road, either side
+    offset: Scalar  # m, of the centre of gravity from the lane's centre, either side
 
 
 @jit
-def compute_lane_quality(motion: Any, field_of_view: Any) -> Any:
+def compute_lane_quality(motion: Any, field_of_view: FieldOfView) -> Scalar:
     """Compute the quality of a camera sample.
 
     Args:
@@ -39,7 +39,7 @@ def compute_lane_quality(motion: Any, field_of_view: Any) -> Any:
 
 
 @inline
-def compute_preview_offset(y: Any, psi: Any, kappa: Any, l_pre: Any) -> Any:
+def compute_preview_offset(y: Scalar, psi: Scalar, kappa: Scalar, l_pre: Scalar) -> Scalar:
     """Compute the lateral offset y_l at the preview point from the lane's centre line.
 
     Args:
@@ -55,7 +55,7 @@ def compute_preview_offset(y: Any, psi: Any, kappa: Any, l_pre: Any) -> Any:
 
 
 @jit
-def compute_lane_offset(motion: Any, road: Any, l_pre: Any) -> Any:
+def compute_lane_offset(motion: Any, road: Any, l_pre: Scalar) -> Scalar:
     """Compute the lateral offset at the preview point of a car on a road.
 
     Args:
@@ -72,7 +72,7 @@ def compute_lane_offset(motion: Any, road: Any, l_pre: Any) -> Any:
 
 
 @jit
-def sample_camera(motion: Any, road: Any, l_pre: Any, noise: Any, n: Any) -> Any:
+def sample_camera(motion: Any, road: Any, l_pre: Scalar, noise: Any, n: Vector) -> Any:
     """Sample the camera's heading relative to the road and its lateral offset, with noise.
 
     Args:

@@ -38,7 +38,7 @@ def draws(name: str, count: int, first: int = 0) -> tuple[list[Draws], list[int]
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_draws_lie_in_their_ranges_and_fill_them(name: str) -> None:
-    values = np.array(draws(name, 400)[0])
+    values = np.array(draws(name, 400)[0], np.float64)
     low, high = SCENARIOS[name].get_draw_ranges()
     assert np.all((low <= values) & (values <= high))
     fixed = low == high
@@ -88,7 +88,7 @@ def test_the_same_key_draws_the_same_and_another_draws_anew() -> None:
 
 
 def test_quantities_are_drawn_independently() -> None:
-    values = np.array(draws("random-steering", 3000)[0])
+    values = np.array(draws("random-steering", 3000)[0], np.float64)
     low, high = SCENARIOS["random-steering"].get_draw_ranges()
     skip = [Draws._fields.index(name) for name in ("speed", "front_stiffness", "rear_stiffness")]
     free = [i for i in np.flatnonzero(low < high) if i not in skip]  # redraws tie those three
