@@ -168,11 +168,11 @@ def test_a_kill_in_the_middle_of_saving_leaves_the_older_checkpoint(
 def test_a_kill_at_any_time_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None:
     code = (
         "import sys\n"
-        "from sideslip.agents.training import train\n"
+        "from sideslip.agents.training import trainer\n"
         "options = {'scenario': 'sine-with-dwell'}\n"
-        "task = train.TrainingTask(num_envs=8, env_options=options, n_eval_envs=4)\n"
-        "run_options = train.RunOptions(eval_freq=256)\n"
-        "train.train(task, 10**8, sys.argv[1], len(sys.argv) > 2, run_options)\n"
+        "task = trainer.TrainingTask(num_envs=8, env_options=options, n_eval_envs=4)\n"
+        "run_options = trainer.RunOptions(eval_freq=256)\n"
+        "trainer.train(task, 10**8, sys.argv[1], len(sys.argv) > 2, run_options)\n"
     )
     path, reached = tmp_path / CHECKPOINT, [-1]
     for wait in np.random.default_rng(0).uniform(0.0, 0.5, 4):

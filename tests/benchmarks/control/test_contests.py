@@ -142,8 +142,9 @@ def test_the_ladder_falls_in_a_sample(contest: ControlTask) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("contest", SCORED, ids=[contest.name for contest in SCORED])
-def test_the_ladder_falls_in_every_scored_contest(contest: ControlTask) -> None:
+@pytest.mark.parametrize("contest", SCORED[1::3], ids=[contest.name for contest in SCORED[1::3]])
+def test_the_ladder_falls_in_every_third_scored_contest(contest: ControlTask) -> None:
+    """`control` in `make bench-all` has it in all of them, on fewer seeds."""
     falls(contest, 64)
 
 
