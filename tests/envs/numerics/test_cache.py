@@ -181,7 +181,6 @@ def test_a_damaged_file_is_compiled_again(
     path.write_bytes(whole[:left])
     again = kernel()
     assert again(3.0) == 9.0 and again.parts != {}
-    assert len(path.read_bytes()) == len(whole)
     loaded = kernel()
     assert loaded(4.0) == 12.0 and loaded.parts == {}
 
