@@ -173,10 +173,11 @@ def correct_scalar(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
 
 
 @jit
-def _update_weight(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
-    """Update a bank member's log-likelihood by a normal residual: -(residual^2 / s + log s) / 2."""
+def _update(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
+    """Correct, and update a bank member's log-likelihood: -(residual^2 / s + log s) / 2."""
     if f.members > 0:
         f.weight -= 0.5 * (residual * residual * (1.0 / variance) + log(variance))
+    correct_scalar(f, variance, residual)
 
 
 @jit
@@ -207,14 +208,6 @@ def project(f: FilterRecord, row: Vector) -> Scalar:
 
 
 @jit
-def _project_clone(f: FilterRecord, clone: int) -> Any:
-    """Compute f.PC = P C^T of a measurement of one clone; return C P C^T."""
-    for i in range(f.total):
-        f.PC[i] = f.P[clone, i]
-    return f.PC[clone]
-
-
-@jit
 def project_row(f: FilterRecord, s: int, i: int, first: int) -> Any:
     """Compute f.PC = P C^T of a sensor's row.
 
@@ -227,7 +220,11 @@ def project_row(f: FilterRecord, s: int, i: int, first: int) -> Any:
     Returns:
         C P C^T.
     """
-    return _project_clone(f, first + i) if first >= 0 else project(f, f.C[s, i])
+    if first < 0:
+        return project(f, f.C[s, i])
+    for j in range(f.total):
+        f.PC[j] = f.P[first + i, j]
+    return f.PC[first + i]
 
 
 @jit
@@ -240,21 +237,21 @@ def update_with_states(f: FilterRecord, row: Vector, r: Scalar, residual: Scalar
         r: Variance of its noise.
         residual: Measurement minus its prediction.
     """
-    variance = project(f, row) + r
-    _update_weight(f, variance, residual)
-    correct_scalar(f, variance, residual)
+    _update(f, project(f, row) + r, residual)
 
 
 @jit
-def update_with_clone(f: FilterRecord, clone: int, r: Scalar, residual: Scalar) -> None:
-    """Correct by the residual of a measurement of one clone.
+def update_with_row(
+    f: FilterRecord, s: int, i: int, first: int, r: Scalar, residual: Scalar
+) -> None:
+    """Correct by the residual of a sensor's row.
 
     Args:
         f: Memory of the filter.
-        clone: Index of the clone in x.
-        r: Variance of the noise.
+        s: Index of the slow sensor.
+        i: Index of its row.
+        first: Clone of its first row, negative where it measures the states.
+        r: Variance of its noise.
         residual: Measurement minus its prediction.
     """
-    variance = _project_clone(f, clone) + r
-    _update_weight(f, variance, residual)
-    correct_scalar(f, variance, residual)
+    _update(f, project_row(f, s, i, first) + r, residual)

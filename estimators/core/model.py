@@ -161,11 +161,9 @@ def discretise(f: FilterRecord) -> None:
         f: Memory of the filter with A, B and its step.
     """
     n, m = f.dense - f.delayed, N_INPUTS + f.n - f.dense
-    E, Phi, T = (
-        allocate_scratch(f.A, N_CORE, N_DRIVERS),
-        allocate_scratch(f.A, N_CORE, N_DRIVERS),
-        allocate_scratch(f.A, N_CORE, N_DRIVERS),
-    )
+    E = allocate_scratch(f.A, N_CORE, N_DRIVERS)
+    Phi = allocate_scratch(f.A, N_CORE, N_DRIVERS)
+    T = allocate_scratch(f.A, N_CORE, N_DRIVERS)
     one = allocate_scratch(f.A, N_CORE, N_CORE)  # h I
     norm = 0.0
     for i in range(n):
@@ -211,27 +209,6 @@ def discretise(f: FilterRecord) -> None:
             store_element(f.H, load_element(T, i, j), i, j)
         for j in range(f.n - f.dense):
             store_element(f.G, load_element(T, i, N_INPUTS + j), i, f.dense + j)
-
-
-@jit
-def _transpose(f: FilterRecord) -> None:
-    """Write f.GT and f.HT, by which states and covariance are predicted."""
-    for i in range(f.dense):
-        for k in range(f.n):
-            store_element(f.GT, load_element(f.G, i, k), k, i)
-        for k in range(f.inputs):
-            store_element(f.HT, load_element(f.H, i, k), k, i)
-
-
-@jit
-def _set_delayed_rows(f: FilterRecord) -> None:
-    """Set the rows by which delayed states follow the camera's: tie-vision (12), at every step."""
-    first = f.dense - f.delayed
-    for i in range(f.delayed):
-        for j in range(f.n):
-            f.G[first + i, j] = 0.0
-        f.G[first + i, PSI + i] = f.relax
-        f.G[first + i, first + i] = 1.0 - f.relax
 
 
 @jit
@@ -282,8 +259,17 @@ def build_model(f: FilterRecord, speed: Scalar, turning: Scalar) -> None:
     if f.kind != LINEAR:
         _build_continuous(f, V, turning)
         discretise(f)
-        _set_delayed_rows(f)
-    _transpose(f)
+        first = f.dense - f.delayed
+        for i in range(f.delayed):  # they follow the camera's states: tie-vision (12), at each step
+            for j in range(f.n):
+                f.G[first + i, j] = 0.0
+            f.G[first + i, PSI + i] = f.relax
+            f.G[first + i, first + i] = 1.0 - f.relax
+    for i in range(f.dense):
+        for k in range(f.n):
+            store_element(f.GT, load_element(f.G, i, k), k, i)
+        for k in range(f.inputs):
+            store_element(f.HT, load_element(f.H, i, k), k, i)
     for s in range(N_SLOW):
         for i in range(f.rows[s]):
             f.r[s, i] = compute_row_variance(f, s, i, V)
@@ -393,20 +379,6 @@ def filter_speed(f: FilterRecord, sample: float) -> Any:
 
 
 @jit
-def is_model_outdated(f: FilterRecord, speed: float) -> Scalar:
-    """Return whether the model has to be built anew.
-
-    Args:
-        f: Memory of the filter.
-        speed: Speed (m/s).
-
-    Returns:
-        True where the speed is too far from the model's.
-    """
-    return is_speed_changed(speed, f.model_speed)
-
-
-@jit
 def find_cell(f: FilterRecord, speed: float) -> Any:
     """Find the table of gains nearest to a speed.
 
@@ -436,6 +408,6 @@ def find_next_cell(f: FilterRecord, sample: float) -> Any:
     """
     if f.measured == 1:
         speed = filter_speed(f, sample)
-        if is_model_outdated(f, speed):
+        if is_speed_changed(speed, f.model_speed):
             return find_cell(f, speed)
     return f.cell

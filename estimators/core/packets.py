@@ -27,7 +27,6 @@ from .record import (
 )
 from .update import correct_fast, update_filter
 
-_EMPTY_STAMP = -1  # the captured tick of a place that is empty
 _NOW_SLOT = N_SNAPSHOTS  # the snapshot of now, while the past is filtered anew
 
 
@@ -84,41 +83,12 @@ def _restore_history(f: FilterRecord, tick: int) -> None:
 
 
 @jit
-def _find_oldest(f: FilterRecord) -> int:
-    """Find the place to store a packet in: an empty one, or that of the earliest captured."""
-    place = 0
-    for i in range(N_RECENT):
-        if f.recent[i, PACKET.captured] < f.recent[place, PACKET.captured]:
-            place = i
-    return place
-
-
-@jit
-def _store_packet(f: FilterRecord, s: int, packet: Vector, place: int) -> None:
-    """Store a packet and its noise; what stood in its place is lost."""
-    f.lost = maximum(f.lost, int(f.recent[place, PACKET.captured]))
-    copy_into(packet, f.recent[place])
-    copy_into(f.r[s], f.recent_r[place])
-
-
-@jit
 def _is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
     """Return whether a sample is a duplicate of a stored one."""
     for i in range(N_RECENT):
         if f.recent[i, PACKET.captured] == captured and f.recent[i, PACKET.sensor] == s:
             return True
     return False
-
-
-@jit
-def _collect_samples(f: FilterRecord, first: int) -> int:
-    """Collect in f.replay the good samples captured at `first` or later; returns how many."""
-    count = 0
-    for i in range(N_RECENT):
-        if f.recent[i, PACKET.captured] >= first and f.recent[i, PACKET.quality] > 0.0:
-            f.replay[count] = i
-            count += 1
-    return count
 
 
 @jit
@@ -150,7 +120,11 @@ def _apply_tick_samples(
 @jit
 def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: int) -> bool:
     """Filter anew from `first` to now with a new sample; False, undone, if the gate refuses it."""
-    now, invalid, count = f.tick, f.counts[COUNTERS.invalid], _collect_samples(f, first)
+    now, invalid, count = f.tick, f.counts[COUNTERS.invalid], 0
+    for i in range(N_RECENT):
+        if f.recent[i, PACKET.captured] >= first and f.recent[i, PACKET.quality] > 0.0:
+            f.replay[count] = i
+            count += 1
     _store_snapshot(f, _NOW_SLOT)
     _restore(f, _find_slot(f, first))
     passed = True
@@ -182,26 +156,20 @@ def _rewind_update(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -
     if _is_duplicate(f, s, captured):
         f.counts[COUNTERS.duplicates] += 1
         return False
-    place = _find_oldest(f)
-    if f.tick - first >= WINDOW or first <= maximum(f.lost, int(f.recent[place, PACKET.captured])):
+    place = 0  # an empty one, or that of the earliest captured, which is lost
+    for i in range(N_RECENT):
+        if f.recent[i, PACKET.captured] < f.recent[place, PACKET.captured]:
+            place = i
+    lost = maximum(f.lost, int(f.recent[place, PACKET.captured]))
+    if f.tick - first >= WINDOW or first <= lost:
         f.counts[COUNTERS.refused] += 1
         return False
-    _store_packet(f, s, packet, place)
+    f.lost = lost
+    copy_into(packet, f.recent[place])
+    copy_into(f.r[s], f.recent_r[place])
     if captured == f.tick:
         return _apply_stored(f, gains, s, place, captured == f.tick)
     return _replay_window(f, gains, first, place)
-
-
-@jit
-def clear_history(f: FilterRecord) -> None:
-    """Empty the window.
-
-    Args:
-        f: Memory of the filter.
-    """
-    f.lost = _EMPTY_STAMP
-    for i in range(N_RECENT):
-        f.recent[i, PACKET.captured] = _EMPTY_STAMP
 
 
 @jit
@@ -297,26 +265,6 @@ def _store_waiting(f: FilterRecord, s: int, packet: Vector) -> bool:
     return True
 
 
-@jit
-def process_sample(f: FilterRecord, gains: GainTables) -> bool:
-    """Process the packet in f.sample, see `process_packet`.
-
-    Args:
-        f: Memory of the filter.
-        gains: Tables of gains, shape (cells, rows, columns).
-
-    Returns:
-        False if it was dropped.
-    """
-    f.nis = np.nan
-    if not _is_valid(f, f.sample):
-        return False
-    s = int(f.sample[PACKET.sensor])
-    if f.pace > 1 and not (f.has_started == 1 and (f.tick - f.origin) % f.pace == 0):
-        return _store_waiting(f, s, f.sample)
-    return _apply_packet(f, gains, s, f.sample)
-
-
 @noinline
 def process_packet(f: FilterRecord, gains: GainTables, packet: Vector) -> bool:
     """Use a packet that has arrived, queue it for the next step, or drop and count it.
@@ -330,7 +278,13 @@ def process_packet(f: FilterRecord, gains: GainTables, packet: Vector) -> bool:
         False if it was dropped.
     """
     copy_into(packet, f.sample)
-    return process_sample(f, gains)
+    f.nis = np.nan
+    if not _is_valid(f, f.sample):
+        return False
+    s = int(f.sample[PACKET.sensor])
+    if f.pace > 1 and not (f.has_started == 1 and (f.tick - f.origin) % f.pace == 0):
+        return _store_waiting(f, s, f.sample)
+    return _apply_packet(f, gains, s, f.sample)
 
 
 @jit

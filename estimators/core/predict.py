@@ -22,7 +22,7 @@ from .model import (
     filter_speed,
     find_cell,
     is_finite,
-    is_model_outdated,
+    is_speed_changed,
 )
 from .record import CAR, COUNTERS, N_CORE, N_SLOW, FilterRecord
 
@@ -60,28 +60,6 @@ def _estimate_noise(f: FilterRecord, accel_y: float) -> None:
 
 
 @jit
-def _write_scale_column(f: FilterRecord) -> None:
-    """Write the accelerometer's prediction in the column of its scale's error, 0 at standstill."""
-    row = f.C_fast[f.accel_row]
-    row[f.scaled] = 0.0
-    if f.speed <= MIN_SPEED:
-        return
-    specific_force = f.rest_fast[f.accel_row] + f.D_fast[f.accel_row, 0] * f.u[0]
-    for k in range(f.n):
-        specific_force += row[k] * f.x[k]
-    row[f.scaled] = specific_force
-
-
-@jit
-def _check_steering(f: FilterRecord) -> None:
-    """Skip a steering angle (the first input) that jumps until the next row confirms it."""
-    steer = f.u_new[0]
-    if absolute(steer - f.steer_before) > f.steer_jump:
-        f.u_new[0] = np.nan
-    f.steer_before = steer
-
-
-@jit
 def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
     """Read a fast row: its inputs (the last finite ones), measurements and speed.
 
@@ -95,8 +73,11 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
     is_sound = True
     for i in range(f.inputs):
         f.u_new[i] = compute_signal(row, f.u_column[i], f.u_factor[i])
-    if f.steer_jump > 0.0:
-        _check_steering(f)
+    if f.steer_jump > 0.0:  # a steering angle (the first input) that jumps waits for the next row
+        steer = f.u_new[0]
+        if absolute(steer - f.steer_before) > f.steer_jump:
+            f.u_new[0] = np.nan
+        f.steer_before = steer
     for i in range(f.inputs):
         is_sound = is_sound and is_finite(f.u_new[i])
     if is_sound:
@@ -111,18 +92,14 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
     turning, f.speed_before = f.turning, f.model_speed
     if (f.kind == KINEMATIC or f.kind == VELOCITY_ROLL) and is_finite(row[FAST.gyro]):
         turning = row[FAST.gyro]
-    is_outdated = turning != f.turning
+    is_outdated, speed = turning != f.turning, f.speed if f.measured == 0 else f.model_speed
     if f.measured == 1:
         f.speed = filter_speed(f, wheel_speed)
-        if is_model_outdated(f, f.speed):
-            is_outdated = True
+        if is_speed_changed(f.speed, f.model_speed):
+            is_outdated, speed = True, f.speed
             f.cell = find_cell(f, f.speed)
     if is_outdated:
-        build_model(
-            f,
-            f.speed if f.measured == 0 or is_model_outdated(f, f.speed) else f.model_speed,
-            turning,
-        )
+        build_model(f, speed, turning)
 
 
 @jit
@@ -237,8 +214,14 @@ def advance_state(f: FilterRecord, u: Vector) -> None:
     if f.tyres > 0 and (f.tick % f.again == 0 or f.late == BUFFER):
         linearise(f, u[0])
         build_model(f, f.model_speed, f.turning)
-        if f.scaled > 0:
-            _write_scale_column(f)
+        if f.scaled > 0:  # the column of the scale's error is what a_y predicts, 0 at standstill
+            row = f.C_fast[f.accel_row]
+            row[f.scaled] = 0.0
+            if not f.speed <= MIN_SPEED:
+                specific_force = f.rest_fast[f.accel_row] + f.D_fast[f.accel_row, 0] * f.u[0]
+                for k in range(f.n):
+                    specific_force += row[k] * f.x[k]
+                row[f.scaled] = specific_force
     propagate(f, u)
     if f.between == PSEUDO:
         _predict(f, f.e)
