@@ -24,31 +24,19 @@ _MODEL = ("car", "A", "B", "G", "GT", "H", "HT", "C_fast", "D_fast")
 
 
 class VehicleChange(NamedTuple):
-    """Another vehicle from a time on.
+    """Another vehicle from a time on."""
 
-    Attributes:
-        time: Time since the first row (s).
-        vehicle: The later vehicle.
-    """
-
-    time: float
-    vehicle: Vehicle
+    time: float  # s since the first row
+    vehicle: Vehicle  # the later one
 
 
 class Gust(NamedTuple):
-    """A side force of unknown strength that is constant from start to end.
+    """A side force of unknown strength that is constant from start to end."""
 
-    Attributes:
-        force_sd: Root mean square of the force (N).
-        arm: Distance ahead of the centre of gravity (m).
-        start: Time of its start since the first row (s).
-        end: Time of its end since the first row (s).
-    """
-
-    force_sd: float
-    arm: float
-    start: float
-    end: float
+    force_sd: float  # N, root mean square of the force
+    arm: float  # m ahead of the centre of gravity
+    start: float  # s since the first row
+    end: float  # s since the first row
 
 
 def compute_error_bound(

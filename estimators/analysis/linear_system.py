@@ -21,12 +21,11 @@ from ..core.record import FILTER, N_CORE, N_INPUTS, N_ROWS
 from ..design.dual_rate import GAINS, RULES, compute_shares, frame_map, write_shares
 from ..design.kalman import check_covariance
 from ..design.stability import MARGINAL, find_unobservable, spectral_radius
-from ..estimator import compile_advance, compile_process_packet
+from ..estimator import EMPTY, NO_NIS, compile_advance, compile_process_packet
 from ..protocol import Estimates, UnobservableWarning
 
 _SENSOR = 0  # the place of the slow sensor in a filter's memory
 _NO_PACKETS = np.zeros((0, PACKET_WIDTH))
-_EMPTY, _NO_NIS = np.zeros((0, 0)), np.zeros(0)
 
 
 class DualRate:
@@ -129,16 +128,16 @@ class DualRate:
 
     def reset(self) -> None:
         """Reset to k = 0, before the first sample."""
-        self._reset_filter()
-        self._take(np.zeros((1, FAST_WIDTH)), _NO_PACKETS)
+        self._filter_anew(np.zeros((1, FAST_WIDTH)), _NO_PACKETS)
 
-    def _reset_filter(self) -> None:
+    def _filter_anew(self, fast: Array, packets: Array, X: Array = EMPTY, S: Array = EMPTY) -> None:
         reset_filters(self._filters, 0)
         self._filters[0].x[: len(self.names)] = self._start
+        self._take(fast, packets, X, S)
 
-    def _take(self, fast: Array, packets: Array, X: Array = _EMPTY, S: Array = _EMPTY) -> None:
+    def _take(self, fast: Array, packets: Array, X: Array = EMPTY, S: Array = EMPTY) -> None:
         advance, count = compile_advance(), len(packets)
-        advance(self._filters, self.gains, fast, len(fast), packets, count, 0, X, S, _NO_NIS)
+        advance(self._filters, self.gains, fast, len(fast), packets, count, 0, X, S, NO_NIS)
 
     def step(self, u: npt.ArrayLike) -> None:
         """Step from k to k+1: dual-rate (17), (19).
@@ -197,9 +196,8 @@ class DualRate:
         packets[:, PACKET.quality] = 1.0
         packets[:, PACKET.value : PACKET.value + q] = y
         is_present = ~np.isnan(y).any(axis=1)
-        self._reset_filter()
         X, S = (np.empty((len(fast), len(self.names))) for _ in range(2))
-        self._take(fast, np.ascontiguousarray(packets[is_present]), X, S)
+        self._filter_anew(fast, np.ascontiguousarray(packets[is_present]), X, S)
         return Estimates(np.arange(float(len(fast))), X, S, self.names, np.full(count, np.nan))
 
     @property

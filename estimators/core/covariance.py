@@ -67,25 +67,10 @@ def _accumulate_rows(
 
 
 @inline
-def multiply_rows(
+def _multiply_rows(
     M: Vector, i: int, V: Vector, n: int, j: int, a: Scalar, b: Scalar, c: Scalar, d: Scalar
 ) -> Any:
-    """Add rows i to i + 3 of M times V to a, b, c and d, eight columns from j on.
-
-    Args:
-        M: Matrix, shape (., n).
-        i: First row of M.
-        V: Matrix, shape (n, .).
-        n: Number of columns of M.
-        j: First column of V.
-        a: Sum of row i.
-        b: Sum of row i + 1.
-        c: Sum of row i + 2.
-        d: Sum of row i + 3.
-
-    Returns:
-        The four sums.
-    """
+    """Add rows i to i + 3 of M (., n) times V to a, b, c and d, eight columns from j on."""
     for k in range(n):
         a, b, c, d = _accumulate_rows(M, i, k, load8(V, k, j), a, b, c, d)
     return a, b, c, d
@@ -93,11 +78,31 @@ def multiply_rows(
 
 @inline
 def _multiply_symmetric(M: Vector, i: int, P: Vector, n: int, j: int) -> Any:
-    """Multiply rows i to i + 3 of M by a symmetric matrix P, see `multiply_rows`."""
+    """Multiply rows i to i + 3 of M by a symmetric matrix P, see `_multiply_rows`."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     for k in range(n):
         a, b, c, d = _accumulate_rows(M, i, k, load8_symmetric(P, k, j), a, b, c, d)
     return a, b, c, d
+
+
+@jit
+def multiply(a: Vector, b: Vector, c: Vector, n: int, m: int) -> None:
+    """Multiply c = a b, in the corners of larger arrays.
+
+    Args:
+        a: Matrix, shape (n, n) or larger.
+        b: Matrix, shape (n, m) or larger.
+        c: Output, shape (n, m) or larger.
+        n: Rows of the product.
+        m: Columns of the product.
+    """
+    for j in range(0, m, 8):
+        for i in range(0, n, 4):
+            first, second, third, fourth = _multiply_rows(a, i, b, n, j, 0.0, 0.0, 0.0, 0.0)
+            store8(c, first, i, j)
+            store8(c, second, i + 1, j)
+            store8(c, third, i + 2, j)
+            store8(c, fourth, i + 3, j)
 
 
 @jit
@@ -127,7 +132,7 @@ def predict_covariance(f: FilterRecord) -> None:
             b = load8(Q, i + 1, j) + load8(FP, i + 1, j) * factor
             c = load8(Q, i + 2, j) + load8(FP, i + 2, j) * factor
             d = load8(Q, i + 3, j) + load8(FP, i + 3, j) * factor
-            a, b, c, d = multiply_rows(FP, i, GT, n, j, a, b, c, d)
+            a, b, c, d = _multiply_rows(FP, i, GT, n, j, a, b, c, d)
             store8(P, a, i, j)
             if i + 1 < dense:
                 store8(P, b, i + 1, j)

@@ -27,24 +27,12 @@ from .model import (
 from .multiple_model import compute_mixture, replace_least_likely, run_imm_step
 from .packets import apply_waiting, process_packet, store_history
 from .predict import advance_state, linearise, read_fast_row
-from .record import (
-    COUNTERS,
-    N_CORE,
-    N_FRAMES,
-    N_RECENT,
-    N_SLOW,
-    N_STAMPS,
-    N_TOTAL,
-    WINDOW,
-    FilterRecord,
-    FilterRecords,
-    GainTables,
-)
+from .record import COUNTERS, N_SLOW, WINDOW, FilterRecord, FilterRecords, GainTables
 from .update import correct_fast, locate_step_row
 
 
 @jit
-def _fill(vector: Vector, value: float) -> None:
+def _fill(vector: Vector, value: Scalar) -> None:
     for i in range(len(vector)):
         vector[i] = value
 
@@ -63,27 +51,24 @@ def _reset_filter(f: FilterRecord, first: int) -> None:
     copy_into(f.first, f.x)
     for i in range(len(f.share)):
         _fill(f.share[i], 0.0)
-    for i in range(N_TOTAL):
+    for i in range(len(f.P)):
         _fill(f.P[i], 0.0)
-    for i in range(N_CORE):
+    for i in range(len(f.prior)):
         copy_into(f.prior[i], f.P[i])
     for s in range(N_SLOW):
         _fill(f.scale[s], 1.0)
         _fill(f.last[s], np.nan)
         f.believed[s], f.doubts[s] = -1, 0
-        for i in range(N_FRAMES):
-            f.stamp[s, i] = -1
-        for i in range(N_STAMPS):
-            f.known_stamps[s, i] = -1
+        _fill(f.stamp[s], -1)
+        _fill(f.known_stamps[s], -1)
         if f.period[s] > 0:
             since_phase = maximum(first - f.phase[s], 0)
             f.next[s] = f.phase[s] + (since_phase + f.period[s] - 1) // f.period[s] * f.period[s]
-    for i in range(len(f.counts)):
-        f.counts[i] = 0
+    _fill(f.counts, 0)
     f.lost = -1
-    for i in range(N_RECENT):
+    for i in range(len(f.recent)):
         f.recent[i, PACKET.captured] = -1  # an empty place
-    for i in range(N_TOTAL):
+    for i in range(len(f.keep)):
         f.keep[i] = 0.0 if i < f.dense else f.decay[i] if i < f.n else 1.0
     f.weight, f.fresh = f.odds, 0.0
     if f.r_share > 0.0:

@@ -128,17 +128,16 @@ def is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
         True for a sample that must not be used.
     """
     frame = (captured - f.phase[s]) // f.period[s]
+    last_stamp = f.known_stamps[s, frame % N_STAMPS]
     if f.phase[s] + frame * f.period[s] != captured:
         f.counts[COUNTERS.unknown] += 1
-        return True
-    last_stamp = f.known_stamps[s, frame % N_STAMPS]
-    if last_stamp == captured:
+    elif last_stamp == captured:
         f.counts[COUNTERS.duplicates] += 1
-        return True
-    if captured < last_stamp:
+    elif captured < last_stamp:
         f.counts[COUNTERS.refused] += 1
-        return True
-    return False
+    else:
+        return False
+    return True
 
 
 @jit

@@ -10,11 +10,11 @@ from typing import Any
 
 from ...envs.numerics.jit import jit, noinline
 from ...envs.numerics.packed import load_element, store_element
-from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum, minimum
+from ...envs.numerics.primitives import Scalar, absolute, maximum, minimum
 from ...envs.numerics.simd8 import allocate_scratch, load8, store8
 from ...envs.vehicle.linear import write_kinematic, write_lateral, write_roll
 from ...envs.vehicle.parameters import GRAVITY
-from .covariance import multiply_rows
+from .covariance import multiply
 from .record import CAR, N_CORE, N_DRIVERS, N_INPUTS, N_SLOW, FilterRecord
 
 LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES, LINEAR = range(7)
@@ -139,18 +139,6 @@ def _build_continuous(f: FilterRecord, V: Scalar, turning: Scalar) -> None:
 
 
 @jit
-def _multiply(a: Vector, b: Vector, c: Vector, n: int, m: int) -> None:
-    """Multiply c = a b for a (n, n) and b (n, m), in the corners of larger arrays."""
-    for j in range(0, m, 8):
-        for i in range(0, n, 4):
-            first, second, third, fourth = multiply_rows(a, i, b, n, j, 0.0, 0.0, 0.0, 0.0)
-            store8(c, first, i, j)
-            store8(c, second, i + 1, j)
-            store8(c, third, i + 2, j)
-            store8(c, fourth, i + 3, j)
-
-
-@jit
 def discretise(f: FilterRecord) -> None:
     """Compute f.G and f.H of tie-vision (9): exact for inputs and disturbances held over the step.
 
@@ -183,21 +171,21 @@ def discretise(f: FilterRecord) -> None:
         for j in range(0, n, 8):
             store8(Phi, load8(one, i, j), i, j)
     for order in range(15 if norm > 0.05 else 9, 1, -1):  # Horner: h (I + A h / 2 (I + ...))
-        _multiply(f.A, Phi, T, n, n)
+        multiply(f.A, Phi, T, n, n)
         factor = h / order
         for i in range(n):
             for j in range(0, n, 8):
                 store8(Phi, load8(T, i, j) * factor + load8(one, i, j), i, j)
     for _ in range(doublings):  # the integral over 2 h is (I + e^(A h)) times that over h
-        _multiply(f.A, Phi, E, n, n)
+        multiply(f.A, Phi, E, n, n)
         for i in range(n):
             store_element(E, load_element(E, i, i) + 2.0, i, i)
-        _multiply(E, Phi, T, n, n)
+        multiply(E, Phi, T, n, n)
         for i in range(n):
             for j in range(0, n, 8):
                 store8(Phi, load8(T, i, j), i, j)
-    _multiply(f.A, Phi, E, n, n)
-    _multiply(Phi, f.B, T, n, m)
+    multiply(f.A, Phi, E, n, n)
+    multiply(Phi, f.B, T, n, m)
     for i in range(n):
         store_element(E, load_element(E, i, i) + 1.0, i, i)
         drift = 0.0

@@ -48,18 +48,6 @@ def compute_signal(row: Vector, column: Vector, factor: Vector) -> Scalar:
 
 
 @jit
-def _estimate_noise(f: FilterRecord, accel_y: float) -> None:
-    """Estimate the variance of a_y from its second differences, which motion hardly has."""
-    second_difference = accel_y - 2.0 * f.y_past[0] + f.y_past[1]
-    # white noise of variance r gives it 1 + 4 + 1 = 6 r; an outlier counts as 9 r
-    if is_finite(second_difference):
-        r = f.r_fast[f.accel_row]
-        sample_variance = minimum(second_difference * second_difference * (1.0 / 6.0), 9.0 * r)
-        f.r_fast[f.accel_row] = maximum(r + f.r_share * (sample_variance - r), f.r_told)
-    f.y_past[1], f.y_past[0] = f.y_past[0], accel_y
-
-
-@jit
 def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
     """Read a fast row: its inputs (the last finite ones), measurements and speed.
 
@@ -87,8 +75,14 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
         f.counts[COUNTERS.invalid] += 1
     for i in range(f.fasts):
         f.y[i] = compute_signal(row, f.y_column[i], f.y_factor[i])
-    if f.r_share > 0.0:
-        _estimate_noise(f, f.y[f.accel_row])
+    if f.r_share > 0.0:  # the variance of a_y, by its second differences, which motion hardly has
+        accel_y, r = f.y[f.accel_row], f.r_fast[f.accel_row]
+        second_difference = accel_y - 2.0 * f.y_past[0] + f.y_past[1]
+        # white noise of variance r gives it 1 + 4 + 1 = 6 r; an outlier counts as 9 r
+        if is_finite(second_difference):
+            sample_variance = minimum(second_difference * second_difference * (1.0 / 6.0), 9.0 * r)
+            f.r_fast[f.accel_row] = maximum(r + f.r_share * (sample_variance - r), f.r_told)
+        f.y_past[1], f.y_past[0] = f.y_past[0], accel_y
     turning, f.speed_before = f.turning, f.model_speed
     if (f.kind == KINEMATIC or f.kind == VELOCITY_ROLL) and is_finite(row[FAST.gyro]):
         turning = row[FAST.gyro]
@@ -100,16 +94,6 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
             f.cell = find_cell(f, f.speed)
     if is_outdated:
         build_model(f, speed, turning)
-
-
-@jit
-def _set_random_walk(f: FilterRecord, moves: bool) -> None:
-    """Set the tyres' random walk, while the car moves; a new member's tyres walk more."""
-    for i in range(3 if f.grip > 0 else 2):
-        index = f.tyres + i if i < 2 else f.grip
-        walks = moves and f.P[index, index] < f.prior[index, index]
-        extra = f.fresh if i < 2 else 0.0
-        f.Q[index, index] = f.q_tyres[i] + extra if walks else 0.0
 
 
 @jit
@@ -129,7 +113,11 @@ def linearise(f: FilterRecord, steer: Any) -> None:
         x[f.grip] = grip
     beta, gamma = x[0], x[1]
     total_force, moves = 0.0, f.speed > MIN_SPEED
-    _set_random_walk(f, moves)
+    for i in range(3 if f.grip > 0 else 2):  # tyres walk while the car moves, a new member's more
+        index = f.tyres + i if i < 2 else f.grip
+        walks = moves and f.P[index, index] < f.prior[index, index]
+        extra = f.fresh if i < 2 else 0.0
+        f.Q[index, index] = f.q_tyres[i] + extra if walks else 0.0
     for i in range(2):
         arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
         alpha = (steer if i == 0 else 0.0) - beta - arm * gamma / V

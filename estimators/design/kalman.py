@@ -89,13 +89,10 @@ def compute_inverse(kind: str, C: Array, P: Array, R: Array) -> Array:
         Inverse, shape (n, p).
     """
     I, zero = np.eye(C.shape[1]), np.zeros((len(C), len(C)))  # noqa: E741
-    if kind == "moore-penrose":
-        return kalman_gain(I, C, zero)
-    if kind == "p-weighted":
-        return kalman_gain(P, C, zero)
-    if kind == "bayes":
-        return kalman_gain(P, C, R)
-    return kalman_gain(I, C, _RIDGE * np.eye(len(C)))
+    ridge = _RIDGE * np.eye(len(C))
+    kinds = {"moore-penrose": (I, zero), "p-weighted": (P, zero), "bayes": (P, R)}
+    weight, noise = kinds.get(kind, (I, ridge))
+    return kalman_gain(weight, C, noise)
 
 
 def transition_matrix(f: FilterRecord, G: Array) -> Array:

@@ -50,14 +50,10 @@ class Schedule:
     """Cycle of a slow sensor: frame i is captured at the step i `period`, arrives lags[i] later.
 
     A schedule without frames has one step.
-
-    Attributes:
-        period: Steps between two captures.
-        lags: Steps from the capture of each frame of the cycle to its arrival.
     """
 
-    period: int
-    lags: tuple[int, ...]
+    period: int  # steps between two captures
+    lags: tuple[int, ...]  # steps from the capture of each frame of the cycle to its arrival
 
     @property
     def cycle(self) -> int:

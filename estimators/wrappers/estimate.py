@@ -291,13 +291,28 @@ class EstimateObservation(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Reset the env, then the estimator with this episode's clocks, and take tick 0."""
+        """Reset the env, then the estimator with this episode's clocks, and take tick 0.
+
+        Args:
+            seed: Seed of the env, or None.
+            options: Options of the env's reset, or None.
+
+        Returns:
+            Observation and info.
+        """
         obs, info = self.env.reset(seed=seed, options=options)
         self._update_estimator().reset(self._base.slow_sensors)
         return self._append_estimates(obs, info), info
 
     def step(self, action: Any) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
-        """Step the env; the estimator takes its record before the observation is made."""
+        """Step the env; the estimator takes its record before the observation is made.
+
+        Args:
+            action: Action of the env.
+
+        Returns:
+            Observation, reward, terminated, truncated and info.
+        """
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._append_estimates(obs, info), reward, terminated, truncated, info
 
@@ -307,7 +322,11 @@ class EstimateObservation(
         return {"env": inner, "estimator": self.estimator.get_state()}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments."""
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
         self._update_estimator().set_state(snapshot["estimator"])
 
