@@ -17,6 +17,7 @@ from ...envs.sensors.link import SlowSensor
 from ...envs.ticks import TICK
 from ...envs.vehicle.parameters import Vehicle
 from ..design.models import select_states
+from ..estimator import Estimator
 from ..make import make_estimator
 from ..protocol import UnobservableWarning
 
@@ -96,7 +97,7 @@ def compute_error_bound(
     return _run_events(first, record, sorted(events, key=lambda event: event[0]))
 
 
-def _set_gust_input(filter_: Any, arm: float) -> None:
+def _set_gust_input(filter_: Estimator, arm: float) -> None:
     """Let the state `bank` push as F_d does, and as N_d by an arm in m."""
     f, names = filter_.filters[0], filter_.names
     gust, force, moment = (names.index(name) for name in ("bank", "F_d", "N_d"))
@@ -105,13 +106,13 @@ def _set_gust_input(filter_: Any, arm: float) -> None:
     f.GT[gust] = f.G[:, gust]
 
 
-def _copy_model(filter_: Any, later: Any) -> None:
+def _copy_model(filter_: Estimator, later: Estimator) -> None:
     """Copy the model of a later filter at its held speed."""
     for name in _MODEL:
         filter_.filters[0][name] = later.filters[0][name]
 
 
-def _reset_gust(filter_: Any, variance: float) -> None:
+def _reset_gust(filter_: Estimator, variance: float) -> None:
     """Reset the gust's state: from now on it is independent of what was known before."""
     f, index = filter_.filters[0], filter_.names.index("bank")
     f.P[index], f.P[:, index] = 0.0, 0.0
@@ -119,7 +120,7 @@ def _reset_gust(filter_: Any, variance: float) -> None:
 
 
 def _run_events(
-    filter_: Any, record: Record, events: Sequence[tuple[float, Callable[[], None]]]
+    filter_: Estimator, record: Record, events: Sequence[tuple[float, Callable[[], None]]]
 ) -> Array:
     """Compute the deviations of beta over the record; each event follows the row at its time."""
     fast, packets = np.ascontiguousarray(record.fast), np.ascontiguousarray(record.packets)

@@ -8,7 +8,6 @@ It runs on the compiled core of all filters, as its rule "dual-rate" with matric
 
 import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +16,7 @@ from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
 from ..core.filter import reset_filters
 from ..core.innovation import DUAL_RATE, IGNORE
 from ..core.model import LINEAR
-from ..core.record import FILTER, N_CORE, N_INPUTS, N_ROWS
+from ..core.record import FILTER, N_CORE, N_INPUTS, N_ROWS, FilterRecords
 from ..design.dual_rate import GAINS, RULES, compute_shares, frame_map, write_shares
 from ..design.kalman import check_covariance
 from ..design.stability import MARGINAL, find_unobservable, spectral_radius
@@ -251,7 +250,7 @@ def _parse_poles(
     return placed
 
 
-def _make_record(F: Array, B: Array, drift: Array, C: Array, ratio: int) -> Any:
+def _make_record(F: Array, B: Array, drift: Array, C: Array, ratio: int) -> FilterRecords:
     """Make the filter's memory: every state is dense, the slow sensor is the first."""
     filters = np.zeros(1, FILTER).view(np.recarray)
     f, n, q, p = filters[0], len(F), len(C), B.shape[1]

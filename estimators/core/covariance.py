@@ -7,7 +7,6 @@ a gain is a division. One filter's memory is a record of numbers; that of severa
 """
 
 from math import log
-from typing import Any
 
 from ...envs.numerics.jit import inline, jit
 from ...envs.numerics.packed import load_element
@@ -61,7 +60,7 @@ def predict_measurement(f: FilterRecord, s: int, i: int) -> Scalar:
 @inline
 def _accumulate_rows(
     M: Vector, i: int, k: int, v: Scalar, a: Scalar, b: Scalar, c: Scalar, d: Scalar
-) -> Any:
+) -> tuple[Scalar, ...]:
     a, b = a + load_element(M, i, k) * v, b + load_element(M, i + 1, k) * v
     return a, b, c + load_element(M, i + 2, k) * v, d + load_element(M, i + 3, k) * v
 
@@ -69,7 +68,7 @@ def _accumulate_rows(
 @inline
 def _multiply_rows(
     M: Vector, i: int, V: Vector, n: int, j: int, a: Scalar, b: Scalar, c: Scalar, d: Scalar
-) -> Any:
+) -> tuple[Scalar, ...]:
     """Add rows i to i + 3 of M (., n) times V to a, b, c and d, eight columns from j on."""
     for k in range(n):
         a, b, c, d = _accumulate_rows(M, i, k, load8(V, k, j), a, b, c, d)
@@ -77,7 +76,7 @@ def _multiply_rows(
 
 
 @inline
-def _multiply_symmetric(M: Vector, i: int, P: Vector, n: int, j: int) -> Any:
+def _multiply_symmetric(M: Vector, i: int, P: Vector, n: int, j: int) -> tuple[Scalar, ...]:
     """Multiply rows i to i + 3 of M by a symmetric matrix P, see `_multiply_rows`."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     for k in range(n):
@@ -213,7 +212,7 @@ def project(f: FilterRecord, row: Vector) -> Scalar:
 
 
 @jit
-def project_row(f: FilterRecord, s: int, i: int, first: int) -> Any:
+def project_row(f: FilterRecord, s: int, i: int, first: int) -> Scalar:
     """Compute f.PC = P C^T of a sensor's row.
 
     Args:

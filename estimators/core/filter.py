@@ -6,8 +6,6 @@ slow sensor's rate listens every `pace` ticks, to the packets that came meanwhil
 states in between (`stride`) or predicts them.
 """
 
-from typing import Any
-
 import numpy as np
 
 from ...envs.numerics.functions import sincos
@@ -133,7 +131,7 @@ def run_tick(f: FilterRecord, gains: GainTables) -> None:
 
 
 @jit
-def read_covariance(f: FilterRecord, gains: GainTables, i: int, j: int) -> Any:
+def read_covariance(f: FilterRecord, gains: GainTables, i: int, j: int) -> Scalar:
     """Read the present covariance of two states; with periodic gains that of the settled cycle.
 
     Args:

@@ -6,7 +6,6 @@ then the state that only this sensor measures is forgotten by as much as the res
 """
 
 from math import log
-from typing import Any
 
 from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import jit
@@ -178,7 +177,7 @@ _AGREEMENT_SD = 4.0  # standard deviations within which two gated residuals agre
 
 
 @jit
-def interpolate_hdop(f: FilterRecord, s: int, packet: Vector) -> Any:
+def interpolate_hdop(f: FilterRecord, s: int, packet: Vector) -> Scalar:
     """Interpolate the factor on a sensor's standard deviations at the HDOP of its packet.
 
     The filter's table, linear between its knots; 1 without a table or an HDOP.

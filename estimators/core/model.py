@@ -6,8 +6,6 @@ its slope by slip stands in `car` and makes the bicycle's matrices, its slopes b
 columns beside them, and the rest is a known push. `design.periodic` has the tables of gains.
 """
 
-from typing import Any
-
 from ...envs.numerics.jit import jit, noinline
 from ...envs.numerics.packed import load_element, store_element
 from ...envs.numerics.primitives import Scalar, absolute, maximum, minimum
@@ -77,7 +75,7 @@ def _write_accel(f: FilterRecord, V: Scalar) -> None:
 
 
 @jit
-def _compute_rates(f: FilterRecord, V: Scalar, front: Scalar, rear: Scalar) -> Any:
+def _compute_rates(f: FilterRecord, V: Scalar, front: Scalar, rear: Scalar) -> tuple[Scalar, ...]:
     """Compute (beta', gamma', phi_rate') by forces of the axles in N."""
     beta = (front + rear) / (f.car[CAR.mass] * V)
     gamma = (f.car[CAR.front_arm] * front - f.car[CAR.rear_arm] * rear) / f.car[CAR.yaw_inertia]
@@ -269,7 +267,7 @@ _MIN_SLOPE = 0.02  # least slope by slip of a sliding tyre, as a fraction of its
 @jit
 def compute_axle_force(
     stiffness: Scalar, load: Scalar, alpha: Scalar, factor: Scalar, grip: Scalar
-) -> Any:
+) -> tuple[Scalar, ...]:
     """Compute an axle's lateral force and its slopes: Fiala's law with friction 1/grip.
 
     F = C s alpha (1 - |z| + z^2 / 3), z = C s alpha grip / (3 F_z) within +-1; at grip 0 it is
@@ -349,7 +347,7 @@ def is_speed_changed(speed: Scalar, model_speed: Scalar) -> Scalar:
 
 
 @jit
-def filter_speed(f: FilterRecord, sample: float) -> Any:
+def filter_speed(f: FilterRecord, sample: float) -> Scalar:
     """Compute the low-passed mean of the front wheels' speeds; a bad sample is skipped.
 
     Args:
@@ -367,7 +365,7 @@ def filter_speed(f: FilterRecord, sample: float) -> Any:
 
 
 @jit
-def find_cell(f: FilterRecord, speed: float) -> Any:
+def find_cell(f: FilterRecord, speed: float) -> int:
     """Find the table of gains nearest to a speed.
 
     Args:
@@ -384,7 +382,7 @@ def find_cell(f: FilterRecord, speed: float) -> Any:
 
 
 @jit
-def find_next_cell(f: FilterRecord, sample: float) -> Any:
+def find_next_cell(f: FilterRecord, sample: float) -> int:
     """Find the table of gains that the next row will use.
 
     Args:

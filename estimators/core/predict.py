@@ -1,7 +1,5 @@
 """From one step to the next: a fast row is read, and states and covariance are predicted."""
 
-from typing import Any
-
 import numpy as np
 
 from ...envs.numerics.jit import jit, noinline
@@ -97,7 +95,7 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
 
 
 @jit
-def linearise(f: FilterRecord, steer: Any) -> None:
+def linearise(f: FilterRecord, steer: Scalar) -> None:
     """Expand both axles' forces at the present state.
 
     Args:

@@ -6,8 +6,6 @@ of the error, by one constant gain K, columns in the order fast rows, slow rows,
 the last sample's gain. dual-rate: fractions of the last innovation from a table.
 """
 
-from typing import Any
-
 import numpy as np
 
 from ...envs.numerics.functions import wrap
@@ -35,7 +33,7 @@ from .record import COUNTERS, N_SNAPSHOTS, WINDOW, FilterRecord, GainTables
 
 
 @jit
-def _apply_row(f: FilterRecord, s: int, i: int, v: Vector) -> Any:
+def _apply_row(f: FilterRecord, s: int, i: int, v: Vector) -> Scalar:
     """Apply row i of sensor s to a vector of states and clones (total,): its clone, if it has."""
     return v[f.first_clone[s] + i] if f.frames[s] > 0 else dot(f.C[s, i], v, f.n)
 
@@ -145,7 +143,7 @@ _HEADING_TOLERANCE = 0.5  # rad, residual of the first heading fix above which i
 
 
 @jit
-def _predict_row(f: FilterRecord, s: int, i: int, first: int, captured: int) -> Any:
+def _predict_row(f: FilterRecord, s: int, i: int, first: int, captured: int) -> Scalar:
     """Predict row i of a sample."""
     if first == STORED_ONE and f.late == LARSEN:
         return f.larsen_expected[s, i]

@@ -259,7 +259,7 @@ def _parse_inertial(
     return fast, {name: sd for name, sd in biases.items() if sd > 0.0}
 
 
-def _parse_gate(delay: str, reader: _Reader) -> dict[str, Any]:
+def _parse_gate(delay: str, reader: _Reader) -> dict[str, float | None]:
     """Parse `gate` and `wary` of a `FilterConfig`."""
     count = reader.read_number("wary", 0.0, "is a number of samples", lambda v: v in range(1000))
     wary = int(count) if delay in ("clone", "buffer") else 0
@@ -272,7 +272,7 @@ def _parse_gate(delay: str, reader: _Reader) -> dict[str, Any]:
 
 def _parse_latency(reader: _Reader, is_findable: bool) -> dict[str, float | str]:
     """Parse the latencies above zero (s, or `FIND` for one of them) by channel."""
-    value: Any = reader.read_value("latency", {})
+    value = reader.read_value("latency", {})
     if not isinstance(value, Mapping):
         raise TypeError(f"{reader.name}: latency is seconds by channel, got {value!r}")
     for channel in value:

@@ -8,13 +8,12 @@ stands the upper half of the states' covariance after it.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 from ...envs.numerics.jit import jit
-from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
 from ...envs.record import Array
 from ..core.covariance import update_with_row
 from ..core.filter import reset_filters, run_tick
@@ -87,7 +86,7 @@ def _iterate_gains(
     s: int,
     lags: Vector,
     cycles: int,
-    table: Any,
+    table: Matrix,
     before: Vector,
     gains: GainTables,
 ) -> int:

@@ -1,7 +1,7 @@
 """EstimateObservation: an estimator's states beside, or instead of, the raw observation."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, NoReturn
 
 import gymnasium as gym
@@ -25,6 +25,7 @@ from .truth import TRUTH, choose_vehicle, set_stiffness
 
 EstimatorSource = str | EstimatorFactory | EstimatorLike
 """What `EstimateObservation` takes for its estimator: a name, a factory or an object."""
+_Floats = npt.NDArray[np.float32]
 AnyEstimator = Estimator | ForeignEstimator
 _PARAMETERS = ("estimator", "outputs", "std", "replace", "vehicle", "options", "name")
 _ALLOWED_WRAPPERS = (PassiveEnvChecker, OrderEnforcing, TimeLimit)
@@ -45,7 +46,7 @@ class EstimatorSpec(NamedTuple):
     speed: float | None = None  # m/s where it is held
 
     @property
-    def design(self) -> Any:
+    def design(self) -> Hashable:
         """A key that is equal for specs that differ in the phases of their clocks alone."""
         clocks = [(name, dataclasses.replace(s, phase=0.0)) for name, s in self.sensors.items()]
         return self.vehicle, tuple(sorted(clocks)), self.speed
@@ -64,7 +65,7 @@ def make_spec(base: Any) -> EstimatorSpec:
 
 
 def build_estimator(
-    source: str | EstimatorFactory, options: Mapping[str, Any], dt: float, spec: EstimatorSpec
+    source: str | EstimatorFactory, options: Mapping[str, object], dt: float, spec: EstimatorSpec
 ) -> AnyEstimator:
     """Build an estimator for a spec by `make_estimator`.
 
@@ -111,10 +112,10 @@ class Arguments:
         std: bool,
         replace: bool,
         vehicle: VehicleSource | None,
-        options: Mapping[str, Any] | None,
+        options: Mapping[str, object] | None,
         name: str | None,
         slow_sensors: Mapping[str, SlowSensor],
-        misplaced: Mapping[str, Any],
+        misplaced: Mapping[str, object],
     ) -> None:
         source: Any = choose_estimator(slow_sensors) if estimator is None else estimator
         if misplaced:
@@ -157,7 +158,7 @@ class _NotSerializable:
     def __init__(self, label: str) -> None:
         self._label = label
 
-    def __call__(self, **_: Any) -> NoReturn:
+    def __call__(self, **_: object) -> NoReturn:
         """Refuse to be the factory that the spec would need."""
         raise TypeError(
             f"a spec cannot build {self._label} once more: it was passed as an object; pass its "
@@ -177,16 +178,14 @@ def choose_estimator(slow_sensors: Iterable[str]) -> str:
     return "dakf" if "gps" in slow_sensors else "exact-kf"
 
 
-def _is_object(source: Any) -> bool:
+def _is_object(source: object) -> bool:
     """Return whether this is an estimator, well made or not, rather than what builds one."""
     if isinstance(source, str | type):
         return False
     return not callable(source) or hasattr(source, "step") or hasattr(source, "reset")
 
 
-class EstimateObservation(
-    gym.Wrapper[npt.NDArray[np.float32], Any, npt.NDArray[np.float32], Any], RecordConstructorArgs
-):
+class EstimateObservation(gym.Wrapper[_Floats, _Floats, _Floats, _Floats], RecordConstructorArgs):
     """Runs an estimator on the car's record and appends its states to the observation.
 
     It must be the innermost wrapper: the estimator sees every tick of every step. Others of its
@@ -228,15 +227,15 @@ class EstimateObservation(
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: gym.Env[_Floats, _Floats],
         estimator: EstimatorSource | None = None,
         outputs: Sequence[str] = ("beta", "gamma"),
         std: bool = True,
         replace: bool = False,
         vehicle: VehicleSource | None = None,
-        options: Mapping[str, Any] | None = None,
+        options: Mapping[str, object] | None = None,
         name: str | None = None,
-        **misplaced: Any,
+        **misplaced: object,
     ) -> None:
         self._base = find_base_env(env)
         clocks = self._base.slow_sensors
@@ -290,7 +289,7 @@ class EstimateObservation(
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[_Floats, dict[str, Any]]:
         """Reset the env, then the estimator with this episode's clocks, and take tick 0.
 
         Args:
@@ -304,7 +303,7 @@ class EstimateObservation(
         self._update_estimator().reset(self._base.slow_sensors)
         return self._append_estimates(obs, info), info
 
-    def step(self, action: Any) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
+    def step(self, action: _Floats) -> tuple[_Floats, Any, bool, bool, dict[str, Any]]:
         """Step the env; the estimator takes its record before the observation is made.
 
         Args:
@@ -316,7 +315,7 @@ class EstimateObservation(
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._append_estimates(obs, info), reward, terminated, truncated, info
 
-    def get_state(self) -> dict[str, Any]:
+    def get_state(self) -> dict[str, object]:
         """Return a snapshot of the env and the estimator for `set_state`."""
         inner = self.env.get_wrapper_attr("get_state")()
         return {"env": inner, "estimator": self.estimator.get_state()}
@@ -330,9 +329,7 @@ class EstimateObservation(
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
         self._update_estimator().set_state(snapshot["estimator"])
 
-    def _append_estimates(
-        self, obs: npt.NDArray[np.float32], info: dict[str, Any]
-    ) -> npt.NDArray[np.float32]:
+    def _append_estimates(self, obs: _Floats, info: dict[str, Any]) -> _Floats:
         """Process the newest step; return the observation with its outputs, (width,)."""
         base, outputs, summary = self._base, self.outputs, self._summary
         estimator: Any = self.estimator
@@ -361,7 +358,7 @@ class EstimateObservation(
         return out
 
 
-def find_base_env(env: gym.Env[Any, Any]) -> Any:
+def find_base_env(env: gym.Env[_Floats, _Floats]) -> Any:
     """Find the base env, with no wrapper in between that may hide ticks from the estimator.
 
     Args:

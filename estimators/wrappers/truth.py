@@ -17,6 +17,7 @@ from ...envs.vehicle.parameters import Vehicle
 from ..estimator import Estimator
 from ..protocol import ForeignEstimator
 
+_Floats = npt.NDArray[np.float32]
 TRUTH = "truth"  # in place of a vehicle: the one that is driven
 STIFFNESSES = ("front_stiffness", "rear_stiffness")
 _MAX_PARAMETER = 1e7  # bound of any parameter of a vehicle, SI
@@ -66,7 +67,7 @@ def make_truth_entries(
     return (*inner, *entries)
 
 
-def read_states(true_state: Any, states: Sequence[str]) -> npt.NDArray[np.float32]:
+def read_states(true_state: Array, states: Sequence[str]) -> _Floats:
     """Read true states, clipped to their bounds.
 
     Args:
@@ -115,10 +116,7 @@ def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> 
             f.car[4], f.car[5] = vehicle.front_stiffness, vehicle.rear_stiffness
 
 
-class TruthObservation(
-    gym.ObservationWrapper[npt.NDArray[np.float32], Any, npt.NDArray[np.float32]],
-    RecordConstructorArgs,
-):
+class TruthObservation(gym.ObservationWrapper[_Floats, _Floats, _Floats], RecordConstructorArgs):
     """Appends parameters of the true car, as they are at the reset, and true states.
 
     No sensor measures these: it makes the oracles with which others are compared
@@ -133,7 +131,7 @@ class TruthObservation(
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: gym.Env[_Floats, _Floats],
         parameters: Sequence[str] = STIFFNESSES,
         states: Sequence[str] = (),
     ) -> None:
@@ -147,7 +145,7 @@ class TruthObservation(
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[_Floats, dict[str, Any]]:
         """Reset the env and read its car.
 
         Args:
@@ -162,7 +160,7 @@ class TruthObservation(
         self._values[:] = [getattr(base.vehicle, name) for name in self._parameters]
         return self.observation(obs), info
 
-    def observation(self, observation: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def observation(self, observation: _Floats) -> _Floats:
         """Append parameters and states.
 
         Args:
@@ -175,7 +173,7 @@ class TruthObservation(
         states = [read_states(base.true_state, self._states)] if self._states else []
         return np.concatenate([observation, self._values, *states])
 
-    def get_state(self) -> dict[str, Any]:
+    def get_state(self) -> dict[str, object]:
         """Return a snapshot of the env and the parameters for `set_state`."""
         return {"env": self.env.get_wrapper_attr("get_state")(), "values": self._values.copy()}
 
