@@ -220,13 +220,12 @@ def _parse_disturbed(rows: Sequence[int] | None, m: int) -> list[int]:
 
 def _check_sizes(A: Array, B: Array, C: Array, d: int) -> None:
     """Check that shapes fit each other and a filter's memory; else ValueError."""
-    m = len(A)
+    m, shapes = len(A), f"{A.shape}, {B.shape}, {C.shape}"
     if A.shape != (m, m) or len(B) != m or C.shape[1] != m:
-        raise ValueError(
-            f"A, B and C have shapes (m, m), (m, p) and (q, m), got {A.shape}, {B.shape}, {C.shape}"
-        )
-    checked = (("states with their disturbances", m + d, N_CORE), ("inputs", B.shape[1], N_INPUTS))
-    for label, count, max_count in (*checked, ("outputs", len(C), N_ROWS)):
+        raise ValueError(f"A, B and C have shapes (m, m), (m, p) and (q, m), got {shapes}")
+    names = "states with their disturbances", "inputs", "outputs"
+    sizes = zip(names, (m + d, B.shape[1], len(C)), (N_CORE, N_INPUTS, N_ROWS), strict=True)
+    for label, count, max_count in sizes:
         if count > max_count:
             raise ValueError(f"{count} {label} are more than a filter can have ({max_count})")
 

@@ -382,7 +382,7 @@ def find_cell(f: FilterRecord, speed: float) -> int:
 
 
 @jit
-def find_next_cell(f: FilterRecord, sample: float) -> int:
+def find_next_cell(f: FilterRecord, sample: float) -> Scalar:
     """Find the table of gains that the next row will use.
 
     Args:

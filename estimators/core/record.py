@@ -266,7 +266,7 @@ _WINDOW = [  # history: of tick k in row k % WINDOW
 ]
 
 
-def _count_numbers(row: tuple[object, ...]) -> int:
+def _count_numbers(row: Any) -> int:
     """Count the numbers of a row."""
     return math.prod(row[2]) if len(row) > 2 else 1
 

@@ -259,7 +259,7 @@ def _parse_inertial(
     return fast, {name: sd for name, sd in biases.items() if sd > 0.0}
 
 
-def _parse_gate(delay: str, reader: _Reader) -> dict[str, float | None]:
+def _parse_gate(delay: str, reader: _Reader) -> dict[str, Any]:
     """Parse `gate` and `wary` of a `FilterConfig`."""
     count = reader.read_number("wary", 0.0, "is a number of samples", lambda v: v in range(1000))
     wary = int(count) if delay in ("clone", "buffer") else 0

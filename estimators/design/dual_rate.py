@@ -5,13 +5,11 @@ i = 0 .. r-1: B_i = L G_i with the gain L and the matrix G_i of the pseudo measu
 """
 
 import numpy as np
-import numpy.typing as npt
 
 from ...envs.record import Array
 from . import kalman
-from .kalman import compute_inverse, observer_gain
+from .kalman import Poles, compute_inverse, observer_gain
 
-Poles = Array | npt.NDArray[np.complex128] | None
 RULES = ("predict", "hold", "oh", "pseudo")
 GAINS = ("constant", "from-29", "placed")
 _CYCLES, _SETTLED = 400, 1e-12  # most samples of a recursion, relative change where it ends
@@ -112,7 +110,7 @@ def compute_shares_29(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Arr
 
 
 def compute_shares(
-    rule: str, gains: str, poles: Poles, F: Array, Q: Array, C: Array, R: Array, steps: int
+    rule: str, gains: str, poles: Poles | None, F: Array, Q: Array, C: Array, R: Array, steps: int
 ) -> Array:
     """Compute B_i of a rule.
 

@@ -4,6 +4,7 @@ Shapes: P (n, n), C (p, n), R (p, p), y = C x + v (p,).
 """
 
 import numpy as np
+import numpy.typing as npt
 
 from ...envs.record import Array
 from ..core.record import FilterRecord
@@ -32,6 +33,7 @@ def check_covariance(name: str, M: Array, definite: bool = False) -> None:
 
 
 _RIDGE = 1e-3  # lambda of Tikhonov's inverse, in the square of a row's SI unit
+Poles = Array | npt.NDArray[np.complex128]
 INVERSES = ("moore-penrose", "p-weighted", "tikhonov", "bayes")
 
 
@@ -112,7 +114,7 @@ def transition_matrix(f: FilterRecord, G: Array) -> Array:
     return F
 
 
-def observer_gain(F: Array, C: Array, poles: Array) -> Array:
+def observer_gain(F: Array, C: Array, poles: Poles) -> Array:
     """Compute the gain K that gives (I - K C) F its poles.
 
     Args:

@@ -1,6 +1,7 @@
 """EstimateObservation: an estimator's states beside, or instead of, the raw observation."""
 
 import dataclasses
+import functools
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, NoReturn
 
@@ -133,37 +134,24 @@ class Arguments:
         recorded = source
         if _is_object(source):
             if vehicle is not None or self.options:
-                raise ValueError(
-                    f"{self.label} is built already: a vehicle and options go to a name or a "
-                    "factory"
-                )
-            self.source, self.object, recorded = None, source, _NotSerializable(self.label)
+                text = "is built already: a vehicle and options go to a name or a factory"
+                raise ValueError(f"{self.label} {text}")
+            self.source, self.object = None, source
+            recorded = functools.partial(_refuse_rebuild, self.label)
         elif not isinstance(source, str):
             recorded = find_entry_point(source) or source
         car = vehicle.to_dict() if isinstance(vehicle, Vehicle) else vehicle
-        self.recorded = {
-            "estimator": recorded,
-            "outputs": list(outputs),
-            "std": bool(std),
-            "replace": bool(replace),
-            "vehicle": dict(car) if isinstance(car, Mapping) else car,
-            "options": self.options,
-            "name": name,
-        }
+        car = dict(car) if isinstance(car, Mapping) else car
+        values = recorded, list(outputs), bool(std), bool(replace), car, self.options, name
+        self.recorded = dict(zip(_PARAMETERS, values, strict=True))
 
 
-class _NotSerializable:
-    """The place of an object in a spec: building from that spec raises the reason."""
-
-    def __init__(self, label: str) -> None:
-        self._label = label
-
-    def __call__(self, **_: object) -> NoReturn:
-        """Refuse to be the factory that the spec would need."""
-        raise TypeError(
-            f"a spec cannot build {self._label} once more: it was passed as an object; pass its "
-            "class, a factory or a name"
-        )
+def _refuse_rebuild(label: str, **_: object) -> NoReturn:
+    """Raise the reason why a spec with an object cannot be built, in the place of a factory."""
+    raise TypeError(
+        f"a spec cannot build {label} once more: it was passed as an object; pass its class, a "
+        "factory or a name"
+    )
 
 
 def choose_estimator(slow_sensors: Iterable[str]) -> str:
@@ -185,7 +173,7 @@ def _is_object(source: object) -> bool:
     return not callable(source) or hasattr(source, "step") or hasattr(source, "reset")
 
 
-class EstimateObservation(gym.Wrapper[_Floats, _Floats, _Floats, _Floats], RecordConstructorArgs):
+class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstructorArgs):
     """Runs an estimator on the car's record and appends its states to the observation.
 
     It must be the innermost wrapper: the estimator sees every tick of every step. Others of its
@@ -227,7 +215,7 @@ class EstimateObservation(gym.Wrapper[_Floats, _Floats, _Floats, _Floats], Recor
 
     def __init__(
         self,
-        env: gym.Env[_Floats, _Floats],
+        env: gym.Env[_Floats, Any],
         estimator: EstimatorSource | None = None,
         outputs: Sequence[str] = ("beta", "gamma"),
         std: bool = True,
@@ -251,8 +239,7 @@ class EstimateObservation(gym.Wrapper[_Floats, _Floats, _Floats, _Floats], Recor
         self.outputs: Outputs = make_outputs(label, states, outputs, std, name, inner)
         self.layout: tuple[ObservationEntry, ...] = self.outputs.layout
         self.observation_space = make_space(self.layout)
-        self._width, self._title = len(self.layout), label if name is None else f"{label} ({name})"
-        self._summary = np.zeros(3)
+        self._title, self._summary = label if name is None else f"{label} ({name})", np.zeros(3)
 
     def _update_estimator(self) -> AnyEstimator:
         """Return the estimator for the env's present spec; that at hand where nothing changed."""
@@ -280,10 +267,8 @@ class EstimateObservation(gym.Wrapper[_Floats, _Floats, _Floats, _Floats], Recor
         if not isinstance(arguments.object, AnyEstimator):
             arguments.object = ForeignEstimator(arguments.object, arguments.label, dt, spec.sensors)
         elif abs(arguments.object.dt - dt) > 1e-9:
-            raise ValueError(
-                f"{arguments.label} was built for ticks of {arguments.object.dt:g} s, the env has "
-                f"{dt:g} s"
-            )
+            built = f"{arguments.label} was built for ticks of {arguments.object.dt:g} s"
+            raise ValueError(f"{built}, the env has {dt:g} s")
         estimator: AnyEstimator = arguments.object
         return estimator
 
@@ -303,7 +288,7 @@ class EstimateObservation(gym.Wrapper[_Floats, _Floats, _Floats, _Floats], Recor
         self._update_estimator().reset(self._base.slow_sensors)
         return self._append_estimates(obs, info), info
 
-    def step(self, action: _Floats) -> tuple[_Floats, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[_Floats, Any, bool, bool, dict[str, Any]]:
         """Step the env; the estimator takes its record before the observation is made.
 
         Args:
@@ -334,7 +319,7 @@ class EstimateObservation(gym.Wrapper[_Floats, _Floats, _Floats, _Floats], Recor
         base, outputs, summary = self._base, self.outputs, self._summary
         estimator: Any = self.estimator
         inner = None if self._is_native else getattr(estimator, "inner", None)
-        out, rows, done = np.empty(self._width, np.float32), base.ticks_done, 0
+        out, rows, done = np.empty(len(self.layout), np.float32), base.ticks_done, 0
         record = base.rows, rows, base.packets, base.delivered
         layout_args = outputs.inner, outputs.plan, outputs.limits
         observe_args = obs, *layout_args, info["beta"], info["gamma"], out, summary
@@ -358,7 +343,7 @@ class EstimateObservation(gym.Wrapper[_Floats, _Floats, _Floats, _Floats], Recor
         return out
 
 
-def find_base_env(env: gym.Env[_Floats, _Floats]) -> Any:
+def find_base_env(env: gym.Env[_Floats, Any]) -> Any:
     """Find the base env, with no wrapper in between that may hide ticks from the estimator.
 
     Args:

@@ -116,7 +116,7 @@ def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> 
             f.car[4], f.car[5] = vehicle.front_stiffness, vehicle.rear_stiffness
 
 
-class TruthObservation(gym.ObservationWrapper[_Floats, _Floats, _Floats], RecordConstructorArgs):
+class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordConstructorArgs):
     """Appends parameters of the true car, as they are at the reset, and true states.
 
     No sensor measures these: it makes the oracles with which others are compared
@@ -131,7 +131,7 @@ class TruthObservation(gym.ObservationWrapper[_Floats, _Floats, _Floats], Record
 
     def __init__(
         self,
-        env: gym.Env[_Floats, _Floats],
+        env: gym.Env[_Floats, Any],
         parameters: Sequence[str] = STIFFNESSES,
         states: Sequence[str] = (),
     ) -> None:
