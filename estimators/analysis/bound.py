@@ -17,6 +17,7 @@ from ...envs.sensors.link import SlowSensor
 from ...envs.ticks import TICK
 from ...envs.vehicle.parameters import Vehicle
 from ..design.models import select_states
+from ..estimator import Estimator
 from ..make import make_estimator
 from ..protocol import UnobservableWarning
 
@@ -24,31 +25,19 @@ _MODEL = ("car", "A", "B", "G", "GT", "H", "HT", "C_fast", "D_fast")
 
 
 class VehicleChange(NamedTuple):
-    """Another vehicle from a time on.
+    """Another vehicle from a time on."""
 
-    Attributes:
-        time: Time since the first row (s).
-        vehicle: The later vehicle.
-    """
-
-    time: float
-    vehicle: Vehicle
+    time: float  # s since the first row
+    vehicle: Vehicle  # the later one
 
 
 class Gust(NamedTuple):
-    """A side force of unknown strength that is constant from start to end.
+    """A side force of unknown strength that is constant from start to end."""
 
-    Attributes:
-        force_sd: Root mean square of the force (N).
-        arm: Distance ahead of the centre of gravity (m).
-        start: Time of its start since the first row (s).
-        end: Time of its end since the first row (s).
-    """
-
-    force_sd: float
-    arm: float
-    start: float
-    end: float
+    force_sd: float  # N, root mean square of the force
+    arm: float  # m ahead of the centre of gravity
+    start: float  # s since the first row
+    end: float  # s since the first row
 
 
 def compute_error_bound(
@@ -108,7 +97,7 @@ def compute_error_bound(
     return _run_events(first, record, sorted(events, key=lambda event: event[0]))
 
 
-def _set_gust_input(filter_: Any, arm: float) -> None:
+def _set_gust_input(filter_: Estimator, arm: float) -> None:
     """Let the state `bank` push as F_d does, and as N_d by an arm in m."""
     f, names = filter_.filters[0], filter_.names
     gust, force, moment = (names.index(name) for name in ("bank", "F_d", "N_d"))
@@ -117,13 +106,13 @@ def _set_gust_input(filter_: Any, arm: float) -> None:
     f.GT[gust] = f.G[:, gust]
 
 
-def _copy_model(filter_: Any, later: Any) -> None:
+def _copy_model(filter_: Estimator, later: Estimator) -> None:
     """Copy the model of a later filter at its held speed."""
     for name in _MODEL:
         filter_.filters[0][name] = later.filters[0][name]
 
 
-def _reset_gust(filter_: Any, variance: float) -> None:
+def _reset_gust(filter_: Estimator, variance: float) -> None:
     """Reset the gust's state: from now on it is independent of what was known before."""
     f, index = filter_.filters[0], filter_.names.index("bank")
     f.P[index], f.P[:, index] = 0.0, 0.0
@@ -131,7 +120,7 @@ def _reset_gust(filter_: Any, variance: float) -> None:
 
 
 def _run_events(
-    filter_: Any, record: Record, events: Sequence[tuple[float, Callable[[], None]]]
+    filter_: Estimator, record: Record, events: Sequence[tuple[float, Callable[[], None]]]
 ) -> Array:
     """Compute the deviations of beta over the record; each event follows the row at its time."""
     fast, packets = np.ascontiguousarray(record.fast), np.ascontiguousarray(record.packets)

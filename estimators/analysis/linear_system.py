@@ -8,7 +8,6 @@ It runs on the compiled core of all filters, as its rule "dual-rate" with matric
 
 import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,16 +16,15 @@ from ...envs.record import FAST_WIDTH, PACKET, PACKET_WIDTH, Array
 from ..core.filter import reset_filters
 from ..core.innovation import DUAL_RATE, IGNORE
 from ..core.model import LINEAR
-from ..core.record import FILTER, N_CORE, N_INPUTS, N_ROWS
+from ..core.record import FILTER, N_CORE, N_INPUTS, N_ROWS, FilterRecords
 from ..design.dual_rate import GAINS, RULES, compute_shares, frame_map, write_shares
 from ..design.kalman import check_covariance
 from ..design.stability import MARGINAL, find_unobservable, spectral_radius
-from ..estimator import compile_advance, compile_process_packet
+from ..estimator import EMPTY, NO_NIS, compile_advance, compile_process_packet
 from ..protocol import Estimates, UnobservableWarning
 
 _SENSOR = 0  # the place of the slow sensor in a filter's memory
 _NO_PACKETS = np.zeros((0, PACKET_WIDTH))
-_EMPTY, _NO_NIS = np.zeros((0, 0)), np.zeros(0)
 
 
 class DualRate:
@@ -129,16 +127,16 @@ class DualRate:
 
     def reset(self) -> None:
         """Reset to k = 0, before the first sample."""
-        self._reset_filter()
-        self._take(np.zeros((1, FAST_WIDTH)), _NO_PACKETS)
+        self._filter_anew(np.zeros((1, FAST_WIDTH)), _NO_PACKETS)
 
-    def _reset_filter(self) -> None:
+    def _filter_anew(self, fast: Array, packets: Array, X: Array = EMPTY, S: Array = EMPTY) -> None:
         reset_filters(self._filters, 0)
         self._filters[0].x[: len(self.names)] = self._start
+        self._take(fast, packets, X, S)
 
-    def _take(self, fast: Array, packets: Array, X: Array = _EMPTY, S: Array = _EMPTY) -> None:
+    def _take(self, fast: Array, packets: Array, X: Array = EMPTY, S: Array = EMPTY) -> None:
         advance, count = compile_advance(), len(packets)
-        advance(self._filters, self.gains, fast, len(fast), packets, count, 0, X, S, _NO_NIS)
+        advance(self._filters, self.gains, fast, len(fast), packets, count, 0, X, S, NO_NIS)
 
     def step(self, u: npt.ArrayLike) -> None:
         """Step from k to k+1: dual-rate (17), (19).
@@ -197,9 +195,8 @@ class DualRate:
         packets[:, PACKET.quality] = 1.0
         packets[:, PACKET.value : PACKET.value + q] = y
         is_present = ~np.isnan(y).any(axis=1)
-        self._reset_filter()
         X, S = (np.empty((len(fast), len(self.names))) for _ in range(2))
-        self._take(fast, np.ascontiguousarray(packets[is_present]), X, S)
+        self._filter_anew(fast, np.ascontiguousarray(packets[is_present]), X, S)
         return Estimates(np.arange(float(len(fast))), X, S, self.names, np.full(count, np.nan))
 
     @property
@@ -223,13 +220,12 @@ def _parse_disturbed(rows: Sequence[int] | None, m: int) -> list[int]:
 
 def _check_sizes(A: Array, B: Array, C: Array, d: int) -> None:
     """Check that shapes fit each other and a filter's memory; else ValueError."""
-    m = len(A)
+    m, shapes = len(A), f"{A.shape}, {B.shape}, {C.shape}"
     if A.shape != (m, m) or len(B) != m or C.shape[1] != m:
-        raise ValueError(
-            f"A, B and C have shapes (m, m), (m, p) and (q, m), got {A.shape}, {B.shape}, {C.shape}"
-        )
-    checked = (("states with their disturbances", m + d, N_CORE), ("inputs", B.shape[1], N_INPUTS))
-    for label, count, max_count in (*checked, ("outputs", len(C), N_ROWS)):
+        raise ValueError(f"A, B and C have shapes (m, m), (m, p) and (q, m), got {shapes}")
+    names = "states with their disturbances", "inputs", "outputs"
+    sizes = zip(names, (m + d, B.shape[1], len(C)), (N_CORE, N_INPUTS, N_ROWS), strict=True)
+    for label, count, max_count in sizes:
         if count > max_count:
             raise ValueError(f"{count} {label} are more than a filter can have ({max_count})")
 
@@ -253,7 +249,7 @@ def _parse_poles(
     return placed
 
 
-def _make_record(F: Array, B: Array, drift: Array, C: Array, ratio: int) -> Any:
+def _make_record(F: Array, B: Array, drift: Array, C: Array, ratio: int) -> FilterRecords:
     """Make the filter's memory: every state is dense, the slow sensor is the first."""
     filters = np.zeros(1, FILTER).view(np.recarray)
     f, n, q, p = filters[0], len(F), len(C), B.shape[1]

@@ -7,7 +7,6 @@ a gain is a division. One filter's memory is a record of numbers; that of severa
 """
 
 from math import log
-from typing import Any
 
 from ...envs.numerics.jit import inline, jit
 from ...envs.numerics.packed import load_element
@@ -61,43 +60,48 @@ def predict_measurement(f: FilterRecord, s: int, i: int) -> Scalar:
 @inline
 def _accumulate_rows(
     M: Vector, i: int, k: int, v: Scalar, a: Scalar, b: Scalar, c: Scalar, d: Scalar
-) -> Any:
+) -> tuple[Scalar, ...]:
     a, b = a + load_element(M, i, k) * v, b + load_element(M, i + 1, k) * v
     return a, b, c + load_element(M, i + 2, k) * v, d + load_element(M, i + 3, k) * v
 
 
 @inline
-def multiply_rows(
+def _multiply_rows(
     M: Vector, i: int, V: Vector, n: int, j: int, a: Scalar, b: Scalar, c: Scalar, d: Scalar
-) -> Any:
-    """Add rows i to i + 3 of M times V to a, b, c and d, eight columns from j on.
-
-    Args:
-        M: Matrix, shape (., n).
-        i: First row of M.
-        V: Matrix, shape (n, .).
-        n: Number of columns of M.
-        j: First column of V.
-        a: Sum of row i.
-        b: Sum of row i + 1.
-        c: Sum of row i + 2.
-        d: Sum of row i + 3.
-
-    Returns:
-        The four sums.
-    """
+) -> tuple[Scalar, ...]:
+    """Add rows i to i + 3 of M (., n) times V to a, b, c and d, eight columns from j on."""
     for k in range(n):
         a, b, c, d = _accumulate_rows(M, i, k, load8(V, k, j), a, b, c, d)
     return a, b, c, d
 
 
 @inline
-def _multiply_symmetric(M: Vector, i: int, P: Vector, n: int, j: int) -> Any:
-    """Multiply rows i to i + 3 of M by a symmetric matrix P, see `multiply_rows`."""
+def _multiply_symmetric(M: Vector, i: int, P: Vector, n: int, j: int) -> tuple[Scalar, ...]:
+    """Multiply rows i to i + 3 of M by a symmetric matrix P, see `_multiply_rows`."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     for k in range(n):
         a, b, c, d = _accumulate_rows(M, i, k, load8_symmetric(P, k, j), a, b, c, d)
     return a, b, c, d
+
+
+@jit
+def multiply(a: Vector, b: Vector, c: Vector, n: int, m: int) -> None:
+    """Multiply c = a b, in the corners of larger arrays.
+
+    Args:
+        a: Matrix, shape (n, n) or larger.
+        b: Matrix, shape (n, m) or larger.
+        c: Output, shape (n, m) or larger.
+        n: Rows of the product.
+        m: Columns of the product.
+    """
+    for j in range(0, m, 8):
+        for i in range(0, n, 4):
+            first, second, third, fourth = _multiply_rows(a, i, b, n, j, 0.0, 0.0, 0.0, 0.0)
+            store8(c, first, i, j)
+            store8(c, second, i + 1, j)
+            store8(c, third, i + 2, j)
+            store8(c, fourth, i + 3, j)
 
 
 @jit
@@ -127,7 +131,7 @@ def predict_covariance(f: FilterRecord) -> None:
             b = load8(Q, i + 1, j) + load8(FP, i + 1, j) * factor
             c = load8(Q, i + 2, j) + load8(FP, i + 2, j) * factor
             d = load8(Q, i + 3, j) + load8(FP, i + 3, j) * factor
-            a, b, c, d = multiply_rows(FP, i, GT, n, j, a, b, c, d)
+            a, b, c, d = _multiply_rows(FP, i, GT, n, j, a, b, c, d)
             store8(P, a, i, j)
             if i + 1 < dense:
                 store8(P, b, i + 1, j)
@@ -173,10 +177,11 @@ def correct_scalar(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
 
 
 @jit
-def _update_weight(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
-    """Update a bank member's log-likelihood by a normal residual: -(residual^2 / s + log s) / 2."""
+def _update(f: FilterRecord, variance: Scalar, residual: Scalar) -> None:
+    """Correct, and update a bank member's log-likelihood: -(residual^2 / s + log s) / 2."""
     if f.members > 0:
         f.weight -= 0.5 * (residual * residual * (1.0 / variance) + log(variance))
+    correct_scalar(f, variance, residual)
 
 
 @jit
@@ -207,15 +212,7 @@ def project(f: FilterRecord, row: Vector) -> Scalar:
 
 
 @jit
-def _project_clone(f: FilterRecord, clone: int) -> Any:
-    """Compute f.PC = P C^T of a measurement of one clone; return C P C^T."""
-    for i in range(f.total):
-        f.PC[i] = f.P[clone, i]
-    return f.PC[clone]
-
-
-@jit
-def project_row(f: FilterRecord, s: int, i: int, first: int) -> Any:
+def project_row(f: FilterRecord, s: int, i: int, first: int) -> Scalar:
     """Compute f.PC = P C^T of a sensor's row.
 
     Args:
@@ -227,7 +224,11 @@ def project_row(f: FilterRecord, s: int, i: int, first: int) -> Any:
     Returns:
         C P C^T.
     """
-    return _project_clone(f, first + i) if first >= 0 else project(f, f.C[s, i])
+    if first < 0:
+        return project(f, f.C[s, i])
+    for j in range(f.total):
+        f.PC[j] = f.P[first + i, j]
+    return f.PC[first + i]
 
 
 @jit
@@ -240,21 +241,21 @@ def update_with_states(f: FilterRecord, row: Vector, r: Scalar, residual: Scalar
         r: Variance of its noise.
         residual: Measurement minus its prediction.
     """
-    variance = project(f, row) + r
-    _update_weight(f, variance, residual)
-    correct_scalar(f, variance, residual)
+    _update(f, project(f, row) + r, residual)
 
 
 @jit
-def update_with_clone(f: FilterRecord, clone: int, r: Scalar, residual: Scalar) -> None:
-    """Correct by the residual of a measurement of one clone.
+def update_with_row(
+    f: FilterRecord, s: int, i: int, first: int, r: Scalar, residual: Scalar
+) -> None:
+    """Correct by the residual of a sensor's row.
 
     Args:
         f: Memory of the filter.
-        clone: Index of the clone in x.
-        r: Variance of the noise.
+        s: Index of the slow sensor.
+        i: Index of its row.
+        first: Clone of its first row, negative where it measures the states.
+        r: Variance of its noise.
         residual: Measurement minus its prediction.
     """
-    variance = _project_clone(f, clone) + r
-    _update_weight(f, variance, residual)
-    correct_scalar(f, variance, residual)
+    _update(f, project_row(f, s, i, first) + r, residual)

@@ -6,8 +6,6 @@ slow sensor's rate listens every `pace` ticks, to the packets that came meanwhil
 states in between (`stride`) or predicts them.
 """
 
-from typing import Any
-
 import numpy as np
 
 from ...envs.numerics.functions import sincos
@@ -25,69 +23,50 @@ from .model import (
     is_finite,
 )
 from .multiple_model import compute_mixture, replace_least_likely, run_imm_step
-from .packets import apply_waiting, clear_history, process_packet, process_sample, store_history
+from .packets import apply_waiting, process_packet, store_history
 from .predict import advance_state, linearise, read_fast_row
-from .record import (
-    COUNTERS,
-    N_CORE,
-    N_FRAMES,
-    N_SLOW,
-    N_STAMPS,
-    N_TOTAL,
-    WINDOW,
-    FilterRecord,
-    FilterRecords,
-    GainTables,
-)
+from .record import COUNTERS, N_SLOW, WINDOW, FilterRecord, FilterRecords, GainTables
 from .update import correct_fast, locate_step_row
 
 
 @jit
-def _fill(vector: Vector, value: float) -> None:
+def _fill(vector: Vector, value: Scalar) -> None:
     for i in range(len(vector)):
         vector[i] = value
 
 
 @noinline
-def reset_filter(f: FilterRecord, first: int) -> None:
-    """Reset a filter to its start.
-
-    Args:
-        f: Memory of the filter.
-        first: Tick of its first fast row.
-    """
+def _reset_filter(f: FilterRecord, first: int) -> None:
+    """Reset a filter to its start, before the fast row of the tick `first`."""
     f.start, f.tick, f.has_started, f.at = first, first - 1, 0, 0
     f.cell, f.wanted, f.cursor, f.waits, f.u_count = 0, -1, 0, 0, 0
     f.first_fix, f.since, f.nis, f.turning, f.road_turn = -1, -1, np.nan, 0.0, 0.0
-    _fill(f.x, 0.0)
-    copy_into(f.first, f.x)
-    _fill(f.e, 0.0)
-    _fill(f.gain, 0.0)
+    for vector in (f.x, f.e, f.gain):
+        _fill(vector, 0.0)
+    for vector in (f.innovation, f.u, f.u_sum):
+        _fill(vector, 0.0)
     _fill(f.eps, 0.0)
-    _fill(f.innovation, 0.0)
-    _fill(f.u, 0.0)
-    _fill(f.u_sum, 0.0)
+    copy_into(f.first, f.x)
     for i in range(len(f.share)):
         _fill(f.share[i], 0.0)
-    for i in range(N_TOTAL):
+    for i in range(len(f.P)):
         _fill(f.P[i], 0.0)
-    for i in range(N_CORE):
+    for i in range(len(f.prior)):
         copy_into(f.prior[i], f.P[i])
     for s in range(N_SLOW):
         _fill(f.scale[s], 1.0)
         _fill(f.last[s], np.nan)
         f.believed[s], f.doubts[s] = -1, 0
-        for i in range(N_FRAMES):
-            f.stamp[s, i] = -1
-        for i in range(N_STAMPS):
-            f.known_stamps[s, i] = -1
+        _fill(f.stamp[s], -1)
+        _fill(f.known_stamps[s], -1)
         if f.period[s] > 0:
             since_phase = maximum(first - f.phase[s], 0)
             f.next[s] = f.phase[s] + (since_phase + f.period[s] - 1) // f.period[s] * f.period[s]
-    for i in range(len(f.counts)):
-        f.counts[i] = 0
-    clear_history(f)
-    for i in range(N_TOTAL):
+    _fill(f.counts, 0)
+    f.lost = -1
+    for i in range(len(f.recent)):
+        f.recent[i, PACKET.captured] = -1  # an empty place
+    for i in range(len(f.keep)):
         f.keep[i] = 0.0 if i < f.dense else f.decay[i] if i < f.n else 1.0
     f.weight, f.fresh = f.odds, 0.0
     if f.r_share > 0.0:
@@ -103,22 +82,6 @@ def reset_filter(f: FilterRecord, first: int) -> None:
     else:
         build_model(f, f.speed, 0.0)
     f.stretch = 1.0
-
-
-@jit
-def _start(f: FilterRecord) -> None:
-    """Start: the first step has nothing to predict from."""
-    f.has_started = 1
-    f.at = ((f.tick - f.origin) // f.stride) % f.cycle
-    if f.speed_state >= 0:
-        f.x[f.speed_state] = f.speed
-
-
-@jit
-def _update_road_turn(f: FilterRecord, u: Vector) -> None:
-    """Add the road's turn beside the car, over a step with the inputs u (INPUTS,)."""
-    if f.kind == LATERAL and f.inputs > CURVATURE:
-        f.road_turn += compute_road_turn(f.model_speed, u[CURVATURE], f.step)
 
 
 @jit
@@ -142,14 +105,16 @@ def run_tick(f: FilterRecord, gains: GainTables) -> None:
         if f.stride > 1:
             for i in range(f.inputs):
                 f.u_sum[i] /= f.u_count
-            _update_road_turn(f, f.u_sum)
-            advance_state(f, f.u_sum)
-        else:
-            _update_road_turn(f, f.u)
-            advance_state(f, f.u)
+        u = f.u_sum if f.stride > 1 else f.u
+        if f.kind == LATERAL and f.inputs > CURVATURE:
+            f.road_turn += compute_road_turn(f.model_speed, u[CURVATURE], f.step)
+        advance_state(f, u)
         f.at = f.at + 1 if f.at + 1 < f.cycle else 0
-    else:
-        _start(f)
+    else:  # the first step has nothing to predict from
+        f.has_started = 1
+        f.at = ((f.tick - f.origin) // f.stride) % f.cycle
+        if f.speed_state >= 0:
+            f.x[f.speed_state] = f.speed
     if f.store_predictions == 1:
         f.past_road_turn[f.tick % WINDOW] = f.road_turn
         for i in range(f.n):
@@ -166,7 +131,7 @@ def run_tick(f: FilterRecord, gains: GainTables) -> None:
 
 
 @jit
-def read_covariance(f: FilterRecord, gains: GainTables, i: int, j: int) -> Any:
+def read_covariance(f: FilterRecord, gains: GainTables, i: int, j: int) -> Scalar:
     """Read the present covariance of two states; with periodic gains that of the settled cycle.
 
     Args:
@@ -225,7 +190,7 @@ def _update_second_layer(
     speed_variance = second.r_speed * factor * factor
     second.r[s, 0] = speed_variance
     second.r[s, 1] = V * V * first.P[BETA, BETA] + speed_variance * sine * sine
-    process_sample(second, gains)
+    process_packet(second, gains, velocity)
 
 
 @jit
@@ -239,15 +204,6 @@ def _process_packet_members(layers: FilterRecords, gains: GainTables, packet: Ve
     """Process a packet by every member behind the first one."""
     for m in range(2, len(layers)):
         process_packet(layers[m], gains, packet)
-
-
-@jit
-def _update_bank(layers: FilterRecords) -> None:
-    """Run the bank's own step: interact, or replace a member."""
-    if layers[0].burst[0] > 0.0:
-        run_imm_step(layers)
-    else:
-        replace_least_likely(layers)
 
 
 @jit
@@ -344,7 +300,10 @@ def advance(
                 _update_second_layer(f, layers[1], gains, packets[position])
             position += 1
         if first > 0 and f.tick % f.respawn == 0 and f.tick > f.start:
-            _update_bank(layers)
+            if layers[0].burst[0] > 0.0:
+                run_imm_step(layers)
+            else:
+                replace_least_likely(layers)
         if first > 0 and (len(X) > 0 or j == rows - 1):
             compute_mixture(layers)
         if len(X) > 0:
@@ -384,7 +343,7 @@ def reset_filters(layers: FilterRecords, first: int) -> None:
         first: Tick of the first fast row.
     """
     for i in range(len(layers)):
-        reset_filter(layers[i], first)
+        _reset_filter(layers[i], first)
 
 
 @jit

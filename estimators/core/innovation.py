@@ -6,7 +6,6 @@ then the state that only this sensor measures is forgotten by as much as the res
 """
 
 from math import log
-from typing import Any
 
 from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import jit
@@ -42,17 +41,6 @@ def get_direct() -> int:
 
 
 @jit
-def _clone_covariance(f: FilterRecord, row: Vector, clone: int) -> None:
-    """Write the covariance of a new clone of a combination (n,) of the states."""
-    variance = project(f, row)
-    N, P, PC = f.total, f.P, f.PC
-    for i in range(N):
-        P[clone, i] = PC[i]
-        P[i, clone] = PC[i]
-    P[clone, clone] = variance
-
-
-@jit
 def _clone_states(f: FilterRecord, s: int, slot: int) -> None:
     """Clone what sensor s captured at the last tick: tie-vision (12) at a trigger."""
     f.speed_captured[s, slot] = f.speed_before
@@ -62,7 +50,11 @@ def _clone_states(f: FilterRecord, s: int, slot: int) -> None:
         f.x[clone] = predict_measurement(f, s, i)
         f.e[clone] = dot(row, f.e, f.n)
         if f.periodic == 0:
-            _clone_covariance(f, row, clone)
+            variance = project(f, row)
+            for j in range(f.total):
+                f.P[clone, j] = f.PC[j]
+                f.P[j, clone] = f.PC[j]
+            f.P[clone, clone] = variance
 
 
 @jit
@@ -111,11 +103,8 @@ def store_due_captures(f: FilterRecord, last: int) -> None:
     for s in range(N_SLOW):
         if f.period[s] > 0 and last >= f.next[s]:
             frame = (f.next[s] - f.phase[s]) // f.period[s]
-            if (
-                f.frames[s] > 0
-                and last == f.next[s]
-                and f.known_stamps[s, frame % N_STAMPS] != last
-            ):
+            is_unknown = f.known_stamps[s, frame % N_STAMPS] != last
+            if f.frames[s] > 0 and last == f.next[s] and is_unknown:
                 slot = frame % f.frames[s]
                 if f.late == LARSEN:
                     _update_covariance(f, s)
@@ -138,17 +127,16 @@ def is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
         True for a sample that must not be used.
     """
     frame = (captured - f.phase[s]) // f.period[s]
+    last_stamp = f.known_stamps[s, frame % N_STAMPS]
     if f.phase[s] + frame * f.period[s] != captured:
         f.counts[COUNTERS.unknown] += 1
-        return True
-    last_stamp = f.known_stamps[s, frame % N_STAMPS]
-    if last_stamp == captured:
+    elif last_stamp == captured:
         f.counts[COUNTERS.duplicates] += 1
-        return True
-    if captured < last_stamp:
+    elif captured < last_stamp:
         f.counts[COUNTERS.refused] += 1
-        return True
-    return False
+    else:
+        return False
+    return True
 
 
 @jit
@@ -189,7 +177,7 @@ _AGREEMENT_SD = 4.0  # standard deviations within which two gated residuals agre
 
 
 @jit
-def interpolate_hdop(f: FilterRecord, s: int, packet: Vector) -> Any:
+def interpolate_hdop(f: FilterRecord, s: int, packet: Vector) -> Scalar:
     """Interpolate the factor on a sensor's standard deviations at the HDOP of its packet.
 
     The filter's table, linear between its knots; 1 without a table or an HDOP.
@@ -217,16 +205,6 @@ def interpolate_hdop(f: FilterRecord, s: int, packet: Vector) -> Any:
 
 
 @jit
-def _find_capture_variance(f: FilterRecord, s: int, i: int, packet: Vector) -> Any:
-    """Find the variance of row i of a packet at the speed at which it was captured."""
-    captured = int(packet[PACKET.captured])
-    if f.late == CLONE and f.noise_over_speed[s, i] > 0.0 and captured < f.tick:
-        slot = (captured - f.phase[s]) // f.period[s] % f.frames[s]
-        return compute_row_variance(f, s, i, f.speed_captured[s, slot])
-    return f.r[s, i]
-
-
-@jit
 def compute_packet_variance(f: FilterRecord, s: int, i: int, packet: Vector) -> Scalar:
     """Compute the variance of a packet's row.
 
@@ -239,26 +217,23 @@ def compute_packet_variance(f: FilterRecord, s: int, i: int, packet: Vector) -> 
     Returns:
         Variance in the row's unit squared.
     """
-    factor = interpolate_hdop(f, s, packet)
-    return _find_capture_variance(f, s, i, packet) * f.scale[s, i] * factor * factor
-
-
-@jit
-def _compute_covariance(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
-    """Compute f.S = C P C^T + R of the sample, its lower half."""
-    for i in range(f.rows[s]):
-        projected = project_row(f, s, i, first)
-        f.S[i, i] = projected + compute_packet_variance(f, s, i, packet)
-        for j in range(i + 1, f.rows[s]):
-            f.S[j, i] = f.PC[first + j] if first >= 0 else dot(f.C[s, j], f.PC, f.n)
+    factor, variance = interpolate_hdop(f, s, packet), f.r[s, i]
+    captured = int(packet[PACKET.captured])
+    if f.late == CLONE and f.noise_over_speed[s, i] > 0.0 and captured < f.tick:
+        slot = (captured - f.phase[s]) // f.period[s] % f.frames[s]
+        variance = compute_row_variance(f, s, i, f.speed_captured[s, slot])
+    return variance * f.scale[s, i] * factor * factor
 
 
 @jit
 def _test_innovation(f: FilterRecord, s: int, first: int, packet: Vector) -> bool:
     """Compute f.nis = residual^T S^-1 residual (f.residual); return whether it passes the gate."""
-    p, S = f.rows[s], f.S
-    _compute_covariance(f, s, first, packet)
-    nis = 0.0
+    p, S, nis = f.rows[s], f.S, 0.0
+    for i in range(p):  # C P C^T + R, its lower half
+        projected = project_row(f, s, i, first)
+        S[i, i] = projected + compute_packet_variance(f, s, i, packet)
+        for j in range(i + 1, p):
+            S[j, i] = f.PC[first + j] if first >= 0 else dot(f.C[s, j], f.PC, f.n)
     for i in range(p):  # Cholesky and forward substitution in one go
         remainder = f.residual[i]
         for j in range(i):

@@ -6,15 +6,13 @@ its slope by slip stands in `car` and makes the bicycle's matrices, its slopes b
 columns beside them, and the rest is a known push. `design.periodic` has the tables of gains.
 """
 
-from typing import Any
-
 from ...envs.numerics.jit import jit, noinline
 from ...envs.numerics.packed import load_element, store_element
-from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum, minimum
+from ...envs.numerics.primitives import Scalar, absolute, maximum, minimum
 from ...envs.numerics.simd8 import allocate_scratch, load8, store8
 from ...envs.vehicle.linear import write_kinematic, write_lateral, write_roll
 from ...envs.vehicle.parameters import GRAVITY
-from .covariance import multiply_rows
+from .covariance import multiply
 from .record import CAR, N_CORE, N_DRIVERS, N_INPUTS, N_SLOW, FilterRecord
 
 LATERAL, ROLL, KINEMATIC, VELOCITY_ROLL, YAW, FORCES, LINEAR = range(7)
@@ -77,7 +75,7 @@ def _write_accel(f: FilterRecord, V: Scalar) -> None:
 
 
 @jit
-def _compute_rates(f: FilterRecord, V: Scalar, front: Scalar, rear: Scalar) -> Any:
+def _compute_rates(f: FilterRecord, V: Scalar, front: Scalar, rear: Scalar) -> tuple[Scalar, ...]:
     """Compute (beta', gamma', phi_rate') by forces of the axles in N."""
     beta = (front + rear) / (f.car[CAR.mass] * V)
     gamma = (f.car[CAR.front_arm] * front - f.car[CAR.rear_arm] * rear) / f.car[CAR.yaw_inertia]
@@ -139,18 +137,6 @@ def _build_continuous(f: FilterRecord, V: Scalar, turning: Scalar) -> None:
 
 
 @jit
-def _multiply(a: Vector, b: Vector, c: Vector, n: int, m: int) -> None:
-    """Multiply c = a b for a (n, n) and b (n, m), in the corners of larger arrays."""
-    for j in range(0, m, 8):
-        for i in range(0, n, 4):
-            first, second, third, fourth = multiply_rows(a, i, b, n, j, 0.0, 0.0, 0.0, 0.0)
-            store8(c, first, i, j)
-            store8(c, second, i + 1, j)
-            store8(c, third, i + 2, j)
-            store8(c, fourth, i + 3, j)
-
-
-@jit
 def discretise(f: FilterRecord) -> None:
     """Compute f.G and f.H of tie-vision (9): exact for inputs and disturbances held over the step.
 
@@ -161,11 +147,9 @@ def discretise(f: FilterRecord) -> None:
         f: Memory of the filter with A, B and its step.
     """
     n, m = f.dense - f.delayed, N_INPUTS + f.n - f.dense
-    E, Phi, T = (
-        allocate_scratch(f.A, N_CORE, N_DRIVERS),
-        allocate_scratch(f.A, N_CORE, N_DRIVERS),
-        allocate_scratch(f.A, N_CORE, N_DRIVERS),
-    )
+    E = allocate_scratch(f.A, N_CORE, N_DRIVERS)
+    Phi = allocate_scratch(f.A, N_CORE, N_DRIVERS)
+    T = allocate_scratch(f.A, N_CORE, N_DRIVERS)
     one = allocate_scratch(f.A, N_CORE, N_CORE)  # h I
     norm = 0.0
     for i in range(n):
@@ -185,21 +169,21 @@ def discretise(f: FilterRecord) -> None:
         for j in range(0, n, 8):
             store8(Phi, load8(one, i, j), i, j)
     for order in range(15 if norm > 0.05 else 9, 1, -1):  # Horner: h (I + A h / 2 (I + ...))
-        _multiply(f.A, Phi, T, n, n)
+        multiply(f.A, Phi, T, n, n)
         factor = h / order
         for i in range(n):
             for j in range(0, n, 8):
                 store8(Phi, load8(T, i, j) * factor + load8(one, i, j), i, j)
     for _ in range(doublings):  # the integral over 2 h is (I + e^(A h)) times that over h
-        _multiply(f.A, Phi, E, n, n)
+        multiply(f.A, Phi, E, n, n)
         for i in range(n):
             store_element(E, load_element(E, i, i) + 2.0, i, i)
-        _multiply(E, Phi, T, n, n)
+        multiply(E, Phi, T, n, n)
         for i in range(n):
             for j in range(0, n, 8):
                 store8(Phi, load8(T, i, j), i, j)
-    _multiply(f.A, Phi, E, n, n)
-    _multiply(Phi, f.B, T, n, m)
+    multiply(f.A, Phi, E, n, n)
+    multiply(Phi, f.B, T, n, m)
     for i in range(n):
         store_element(E, load_element(E, i, i) + 1.0, i, i)
         drift = 0.0
@@ -211,27 +195,6 @@ def discretise(f: FilterRecord) -> None:
             store_element(f.H, load_element(T, i, j), i, j)
         for j in range(f.n - f.dense):
             store_element(f.G, load_element(T, i, N_INPUTS + j), i, f.dense + j)
-
-
-@jit
-def _transpose(f: FilterRecord) -> None:
-    """Write f.GT and f.HT, by which states and covariance are predicted."""
-    for i in range(f.dense):
-        for k in range(f.n):
-            store_element(f.GT, load_element(f.G, i, k), k, i)
-        for k in range(f.inputs):
-            store_element(f.HT, load_element(f.H, i, k), k, i)
-
-
-@jit
-def _set_delayed_rows(f: FilterRecord) -> None:
-    """Set the rows by which delayed states follow the camera's: tie-vision (12), at every step."""
-    first = f.dense - f.delayed
-    for i in range(f.delayed):
-        for j in range(f.n):
-            f.G[first + i, j] = 0.0
-        f.G[first + i, PSI + i] = f.relax
-        f.G[first + i, first + i] = 1.0 - f.relax
 
 
 @jit
@@ -282,8 +245,17 @@ def build_model(f: FilterRecord, speed: Scalar, turning: Scalar) -> None:
     if f.kind != LINEAR:
         _build_continuous(f, V, turning)
         discretise(f)
-        _set_delayed_rows(f)
-    _transpose(f)
+        first = f.dense - f.delayed
+        for i in range(f.delayed):  # they follow the camera's states: tie-vision (12), at each step
+            for j in range(f.n):
+                f.G[first + i, j] = 0.0
+            f.G[first + i, PSI + i] = f.relax
+            f.G[first + i, first + i] = 1.0 - f.relax
+    for i in range(f.dense):
+        for k in range(f.n):
+            store_element(f.GT, load_element(f.G, i, k), k, i)
+        for k in range(f.inputs):
+            store_element(f.HT, load_element(f.H, i, k), k, i)
     for s in range(N_SLOW):
         for i in range(f.rows[s]):
             f.r[s, i] = compute_row_variance(f, s, i, V)
@@ -295,7 +267,7 @@ _MIN_SLOPE = 0.02  # least slope by slip of a sliding tyre, as a fraction of its
 @jit
 def compute_axle_force(
     stiffness: Scalar, load: Scalar, alpha: Scalar, factor: Scalar, grip: Scalar
-) -> Any:
+) -> tuple[Scalar, ...]:
     """Compute an axle's lateral force and its slopes: Fiala's law with friction 1/grip.
 
     F = C s alpha (1 - |z| + z^2 / 3), z = C s alpha grip / (3 F_z) within +-1; at grip 0 it is
@@ -375,7 +347,7 @@ def is_speed_changed(speed: Scalar, model_speed: Scalar) -> Scalar:
 
 
 @jit
-def filter_speed(f: FilterRecord, sample: float) -> Any:
+def filter_speed(f: FilterRecord, sample: float) -> Scalar:
     """Compute the low-passed mean of the front wheels' speeds; a bad sample is skipped.
 
     Args:
@@ -393,21 +365,7 @@ def filter_speed(f: FilterRecord, sample: float) -> Any:
 
 
 @jit
-def is_model_outdated(f: FilterRecord, speed: float) -> Scalar:
-    """Return whether the model has to be built anew.
-
-    Args:
-        f: Memory of the filter.
-        speed: Speed (m/s).
-
-    Returns:
-        True where the speed is too far from the model's.
-    """
-    return is_speed_changed(speed, f.model_speed)
-
-
-@jit
-def find_cell(f: FilterRecord, speed: float) -> Any:
+def find_cell(f: FilterRecord, speed: float) -> int:
     """Find the table of gains nearest to a speed.
 
     Args:
@@ -424,7 +382,7 @@ def find_cell(f: FilterRecord, speed: float) -> Any:
 
 
 @jit
-def find_next_cell(f: FilterRecord, sample: float) -> Any:
+def find_next_cell(f: FilterRecord, sample: float) -> Scalar:
     """Find the table of gains that the next row will use.
 
     Args:
@@ -436,6 +394,6 @@ def find_next_cell(f: FilterRecord, sample: float) -> Any:
     """
     if f.measured == 1:
         speed = filter_speed(f, sample)
-        if is_model_outdated(f, speed):
+        if is_speed_changed(speed, f.model_speed):
             return find_cell(f, speed)
     return f.cell

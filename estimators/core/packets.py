@@ -9,25 +9,14 @@ The gate judges a sample once, by what was known before it; a refused one change
 import numpy as np
 
 from ...envs.numerics.jit import copy_into, jit, noinline
-from ...envs.numerics.primitives import Scalar, Vector, floor, maximum
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, floor, maximum
 from ...envs.record import PACKET, PACKET_WIDTH
 from .innovation import BUFFER, DROPPED, find_clone, get_direct, is_duplicate
 from .model import MIN_SPEED, VELOCITY_ROLL, build_model, is_finite
 from .predict import advance_state
-from .record import (
-    COUNTERS,
-    N_RECENT,
-    N_SLOW,
-    N_SNAPSHOTS,
-    N_WAITING,
-    SNAPSHOT_INTERVAL,
-    WINDOW,
-    FilterRecord,
-    GainTables,
-)
+from .record import COUNTERS, N_SNAPSHOTS, SNAPSHOT_INTERVAL, WINDOW, FilterRecord, GainTables
 from .update import correct_fast, update_filter
 
-_EMPTY_STAMP = -1  # the captured tick of a place that is empty
 _NOW_SLOT = N_SNAPSHOTS  # the snapshot of now, while the past is filtered anew
 
 
@@ -38,21 +27,12 @@ def _find_slot(f: FilterRecord, tick: int) -> int:
 
 
 @jit
-def _store_snapshot(f: FilterRecord, slot: int) -> None:
-    """Store states and covariance in a snapshot."""
-    for i in range(f.n):
-        f.snapshot_x[slot, i] = f.x[i]
-        for j in range(f.n):
-            f.snapshot_P[slot, i, j] = f.P[i, j]
-
-
-@jit
-def _restore(f: FilterRecord, slot: int) -> None:
-    """Restore the states and covariance of a snapshot."""
-    for i in range(f.n):
-        f.x[i] = f.snapshot_x[slot, i]
-        for j in range(f.n):
-            f.P[i, j] = f.snapshot_P[slot, i, j]
+def _copy_moments(n: int, x: Vector, P: Matrix, to_x: Vector, to_P: Matrix) -> None:
+    """Copy n states and their covariance to or from a snapshot."""
+    for i in range(n):
+        to_x[i] = x[i]
+        for j in range(n):
+            to_P[i, j] = P[i, j]
 
 
 @jit
@@ -68,7 +48,8 @@ def store_history(f: FilterRecord) -> None:
     f.past_speed[slot], f.past_turning[slot] = f.model_speed, f.turning
     f.past_road_turn[slot] = f.road_turn
     if (f.tick - f.start) % SNAPSHOT_INTERVAL == 0:
-        _store_snapshot(f, _find_slot(f, f.tick))
+        slot = _find_slot(f, f.tick)
+        _copy_moments(f.n, f.x, f.P, f.snapshot_x[slot], f.snapshot_P[slot])
 
 
 @jit
@@ -84,41 +65,12 @@ def _restore_history(f: FilterRecord, tick: int) -> None:
 
 
 @jit
-def _find_oldest(f: FilterRecord) -> int:
-    """Find the place to store a packet in: an empty one, or that of the earliest captured."""
-    place = 0
-    for i in range(N_RECENT):
-        if f.recent[i, PACKET.captured] < f.recent[place, PACKET.captured]:
-            place = i
-    return place
-
-
-@jit
-def _store_packet(f: FilterRecord, s: int, packet: Vector, place: int) -> None:
-    """Store a packet and its noise; what stood in its place is lost."""
-    f.lost = maximum(f.lost, int(f.recent[place, PACKET.captured]))
-    copy_into(packet, f.recent[place])
-    copy_into(f.r[s], f.recent_r[place])
-
-
-@jit
 def _is_duplicate(f: FilterRecord, s: int, captured: int) -> bool:
     """Return whether a sample is a duplicate of a stored one."""
-    for i in range(N_RECENT):
+    for i in range(len(f.recent)):
         if f.recent[i, PACKET.captured] == captured and f.recent[i, PACKET.sensor] == s:
             return True
     return False
-
-
-@jit
-def _collect_samples(f: FilterRecord, first: int) -> int:
-    """Collect in f.replay the good samples captured at `first` or later; returns how many."""
-    count = 0
-    for i in range(N_RECENT):
-        if f.recent[i, PACKET.captured] >= first and f.recent[i, PACKET.quality] > 0.0:
-            f.replay[count] = i
-            count += 1
-    return count
 
 
 @jit
@@ -138,7 +90,7 @@ def _apply_tick_samples(
     f: FilterRecord, gains: GainTables, tick: int, count: int, new_place: int
 ) -> bool:
     """Use the samples captured at a tick, one sensor after the other; False as `_apply_stored`."""
-    for s in range(N_SLOW):
+    for s in range(len(f.period)):
         for i in range(count):
             place = f.replay[i]
             due = f.recent[place, PACKET.captured] == tick and f.recent[place, PACKET.sensor] == s
@@ -150,17 +102,22 @@ def _apply_tick_samples(
 @jit
 def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: int) -> bool:
     """Filter anew from `first` to now with a new sample; False, undone, if the gate refuses it."""
-    now, invalid, count = f.tick, f.counts[COUNTERS.invalid], _collect_samples(f, first)
-    _store_snapshot(f, _NOW_SLOT)
-    _restore(f, _find_slot(f, first))
-    passed = True
+    now, invalid, count = f.tick, f.counts[COUNTERS.invalid], 0
+    for i in range(len(f.recent)):
+        if f.recent[i, PACKET.captured] >= first and f.recent[i, PACKET.quality] > 0.0:
+            f.replay[count] = i
+            count += 1
+    x, P, passed, slot = f.snapshot_x, f.snapshot_P, True, _find_slot(f, first)
+    _copy_moments(f.n, f.x, f.P, x[_NOW_SLOT], P[_NOW_SLOT])
+    _copy_moments(f.n, x[slot], P[slot], f.x, f.P)
     for tick in range(first, now + 1):
         _restore_history(f, tick)
         if tick > first:
             advance_state(f, f.u)
             correct_fast(f, gains)
             if (tick - f.start) % SNAPSHOT_INTERVAL == 0:
-                _store_snapshot(f, _find_slot(f, tick))
+                slot = _find_slot(f, tick)
+                _copy_moments(f.n, f.x, f.P, x[slot], P[slot])
         f.stretch = 1.0  # the restored beta belongs to this tick's speed
         # no snapshot was changed before a refusal
         if not _apply_tick_samples(f, gains, tick, count, new_place):
@@ -169,7 +126,7 @@ def _replay_window(f: FilterRecord, gains: GainTables, first: int, new_place: in
     f.counts[COUNTERS.invalid] = invalid  # each row was counted when it came
     if not passed:
         _restore_history(f, now)
-        _restore(f, _NOW_SLOT)
+        _copy_moments(f.n, x[_NOW_SLOT], P[_NOW_SLOT], f.x, f.P)
         f.stretch = 1.0
     return passed
 
@@ -182,26 +139,20 @@ def _rewind_update(f: FilterRecord, gains: GainTables, s: int, packet: Vector) -
     if _is_duplicate(f, s, captured):
         f.counts[COUNTERS.duplicates] += 1
         return False
-    place = _find_oldest(f)
-    if f.tick - first >= WINDOW or first <= maximum(f.lost, int(f.recent[place, PACKET.captured])):
+    place = 0  # an empty one, or that of the earliest captured, which is lost
+    for i in range(len(f.recent)):
+        if f.recent[i, PACKET.captured] < f.recent[place, PACKET.captured]:
+            place = i
+    lost = maximum(f.lost, int(f.recent[place, PACKET.captured]))
+    if f.tick - first >= WINDOW or first <= lost:
         f.counts[COUNTERS.refused] += 1
         return False
-    _store_packet(f, s, packet, place)
+    f.lost = lost
+    copy_into(packet, f.recent[place])
+    copy_into(f.r[s], f.recent_r[place])
     if captured == f.tick:
         return _apply_stored(f, gains, s, place, captured == f.tick)
     return _replay_window(f, gains, first, place)
-
-
-@jit
-def clear_history(f: FilterRecord) -> None:
-    """Empty the window.
-
-    Args:
-        f: Memory of the filter.
-    """
-    f.lost = _EMPTY_STAMP
-    for i in range(N_RECENT):
-        f.recent[i, PACKET.captured] = _EMPTY_STAMP
 
 
 @jit
@@ -257,7 +208,7 @@ def _is_valid(f: FilterRecord, packet: Vector) -> bool:
             f.counts[COUNTERS.invalid] += 1
             return False
     sensor = packet[PACKET.sensor]
-    if sensor < 0.0 or sensor >= N_SLOW or not _is_whole(sensor):
+    if sensor < 0.0 or sensor >= len(f.period) or not _is_whole(sensor):
         f.counts[COUNTERS.unknown] += 1
         return False
     s = int(sensor)
@@ -289,32 +240,12 @@ def _store_waiting(f: FilterRecord, s: int, packet: Vector) -> bool:
         if is_same_sensor and f.waiting[i, PACKET.captured] == packet[PACKET.captured]:
             f.counts[COUNTERS.duplicates] += 1
             return False
-    if f.waits == N_WAITING:
+    if f.waits == len(f.waiting):
         f.counts[COUNTERS.refused] += 1
         return False
     copy_into(packet, f.waiting[f.waits])
     f.waits += 1
     return True
-
-
-@jit
-def process_sample(f: FilterRecord, gains: GainTables) -> bool:
-    """Process the packet in f.sample, see `process_packet`.
-
-    Args:
-        f: Memory of the filter.
-        gains: Tables of gains, shape (cells, rows, columns).
-
-    Returns:
-        False if it was dropped.
-    """
-    f.nis = np.nan
-    if not _is_valid(f, f.sample):
-        return False
-    s = int(f.sample[PACKET.sensor])
-    if f.pace > 1 and not (f.has_started == 1 and (f.tick - f.origin) % f.pace == 0):
-        return _store_waiting(f, s, f.sample)
-    return _apply_packet(f, gains, s, f.sample)
 
 
 @noinline
@@ -330,7 +261,13 @@ def process_packet(f: FilterRecord, gains: GainTables, packet: Vector) -> bool:
         False if it was dropped.
     """
     copy_into(packet, f.sample)
-    return process_sample(f, gains)
+    f.nis = np.nan
+    if not _is_valid(f, f.sample):
+        return False
+    s = int(f.sample[PACKET.sensor])
+    if f.pace > 1 and not (f.has_started == 1 and (f.tick - f.origin) % f.pace == 0):
+        return _store_waiting(f, s, f.sample)
+    return _apply_packet(f, gains, s, f.sample)
 
 
 @jit

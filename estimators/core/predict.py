@@ -1,7 +1,5 @@
 """From one step to the next: a fast row is read, and states and covariance are predicted."""
 
-from typing import Any
-
 import numpy as np
 
 from ...envs.numerics.jit import jit, noinline
@@ -22,7 +20,7 @@ from .model import (
     filter_speed,
     find_cell,
     is_finite,
-    is_model_outdated,
+    is_speed_changed,
 )
 from .record import CAR, COUNTERS, N_CORE, N_SLOW, FilterRecord
 
@@ -48,40 +46,6 @@ def compute_signal(row: Vector, column: Vector, factor: Vector) -> Scalar:
 
 
 @jit
-def _estimate_noise(f: FilterRecord, accel_y: float) -> None:
-    """Estimate the variance of a_y from its second differences, which motion hardly has."""
-    second_difference = accel_y - 2.0 * f.y_past[0] + f.y_past[1]
-    # white noise of variance r gives it 1 + 4 + 1 = 6 r; an outlier counts as 9 r
-    if is_finite(second_difference):
-        r = f.r_fast[f.accel_row]
-        sample_variance = minimum(second_difference * second_difference * (1.0 / 6.0), 9.0 * r)
-        f.r_fast[f.accel_row] = maximum(r + f.r_share * (sample_variance - r), f.r_told)
-    f.y_past[1], f.y_past[0] = f.y_past[0], accel_y
-
-
-@jit
-def _write_scale_column(f: FilterRecord) -> None:
-    """Write the accelerometer's prediction in the column of its scale's error, 0 at standstill."""
-    row = f.C_fast[f.accel_row]
-    row[f.scaled] = 0.0
-    if f.speed <= MIN_SPEED:
-        return
-    specific_force = f.rest_fast[f.accel_row] + f.D_fast[f.accel_row, 0] * f.u[0]
-    for k in range(f.n):
-        specific_force += row[k] * f.x[k]
-    row[f.scaled] = specific_force
-
-
-@jit
-def _check_steering(f: FilterRecord) -> None:
-    """Skip a steering angle (the first input) that jumps until the next row confirms it."""
-    steer = f.u_new[0]
-    if absolute(steer - f.steer_before) > f.steer_jump:
-        f.u_new[0] = np.nan
-    f.steer_before = steer
-
-
-@jit
 def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
     """Read a fast row: its inputs (the last finite ones), measurements and speed.
 
@@ -95,8 +59,11 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
     is_sound = True
     for i in range(f.inputs):
         f.u_new[i] = compute_signal(row, f.u_column[i], f.u_factor[i])
-    if f.steer_jump > 0.0:
-        _check_steering(f)
+    if f.steer_jump > 0.0:  # a steering angle (the first input) that jumps waits for the next row
+        steer = f.u_new[0]
+        if absolute(steer - f.steer_before) > f.steer_jump:
+            f.u_new[0] = np.nan
+        f.steer_before = steer
     for i in range(f.inputs):
         is_sound = is_sound and is_finite(f.u_new[i])
     if is_sound:
@@ -106,37 +73,29 @@ def read_fast_row(f: FilterRecord, row: Vector, wheel_speed: float) -> None:
         f.counts[COUNTERS.invalid] += 1
     for i in range(f.fasts):
         f.y[i] = compute_signal(row, f.y_column[i], f.y_factor[i])
-    if f.r_share > 0.0:
-        _estimate_noise(f, f.y[f.accel_row])
+    if f.r_share > 0.0:  # the variance of a_y, by its second differences, which motion hardly has
+        accel_y, r = f.y[f.accel_row], f.r_fast[f.accel_row]
+        second_difference = accel_y - 2.0 * f.y_past[0] + f.y_past[1]
+        # white noise of variance r gives it 1 + 4 + 1 = 6 r; an outlier counts as 9 r
+        if is_finite(second_difference):
+            sample_variance = minimum(second_difference * second_difference * (1.0 / 6.0), 9.0 * r)
+            f.r_fast[f.accel_row] = maximum(r + f.r_share * (sample_variance - r), f.r_told)
+        f.y_past[1], f.y_past[0] = f.y_past[0], accel_y
     turning, f.speed_before = f.turning, f.model_speed
     if (f.kind == KINEMATIC or f.kind == VELOCITY_ROLL) and is_finite(row[FAST.gyro]):
         turning = row[FAST.gyro]
-    is_outdated = turning != f.turning
+    is_outdated, speed = turning != f.turning, f.speed if f.measured == 0 else f.model_speed
     if f.measured == 1:
         f.speed = filter_speed(f, wheel_speed)
-        if is_model_outdated(f, f.speed):
-            is_outdated = True
+        if is_speed_changed(f.speed, f.model_speed):
+            is_outdated, speed = True, f.speed
             f.cell = find_cell(f, f.speed)
     if is_outdated:
-        build_model(
-            f,
-            f.speed if f.measured == 0 or is_model_outdated(f, f.speed) else f.model_speed,
-            turning,
-        )
+        build_model(f, speed, turning)
 
 
 @jit
-def _set_random_walk(f: FilterRecord, moves: bool) -> None:
-    """Set the tyres' random walk, while the car moves; a new member's tyres walk more."""
-    for i in range(3 if f.grip > 0 else 2):
-        index = f.tyres + i if i < 2 else f.grip
-        walks = moves and f.P[index, index] < f.prior[index, index]
-        extra = f.fresh if i < 2 else 0.0
-        f.Q[index, index] = f.q_tyres[i] + extra if walks else 0.0
-
-
-@jit
-def linearise(f: FilterRecord, steer: Any) -> None:
+def linearise(f: FilterRecord, steer: Scalar) -> None:
     """Expand both axles' forces at the present state.
 
     Args:
@@ -152,7 +111,11 @@ def linearise(f: FilterRecord, steer: Any) -> None:
         x[f.grip] = grip
     beta, gamma = x[0], x[1]
     total_force, moves = 0.0, f.speed > MIN_SPEED
-    _set_random_walk(f, moves)
+    for i in range(3 if f.grip > 0 else 2):  # tyres walk while the car moves, a new member's more
+        index = f.tyres + i if i < 2 else f.grip
+        walks = moves and f.P[index, index] < f.prior[index, index]
+        extra = f.fresh if i < 2 else 0.0
+        f.Q[index, index] = f.q_tyres[i] + extra if walks else 0.0
     for i in range(2):
         arm = f.car[CAR.front_arm] if i == 0 else 0.0 - f.car[CAR.rear_arm]
         alpha = (steer if i == 0 else 0.0) - beta - arm * gamma / V
@@ -237,8 +200,14 @@ def advance_state(f: FilterRecord, u: Vector) -> None:
     if f.tyres > 0 and (f.tick % f.again == 0 or f.late == BUFFER):
         linearise(f, u[0])
         build_model(f, f.model_speed, f.turning)
-        if f.scaled > 0:
-            _write_scale_column(f)
+        if f.scaled > 0:  # the column of the scale's error is what a_y predicts, 0 at standstill
+            row = f.C_fast[f.accel_row]
+            row[f.scaled] = 0.0
+            if not f.speed <= MIN_SPEED:
+                specific_force = f.rest_fast[f.accel_row] + f.D_fast[f.accel_row, 0] * f.u[0]
+                for k in range(f.n):
+                    specific_force += row[k] * f.x[k]
+                row[f.scaled] = specific_force
     propagate(f, u)
     if f.between == PSEUDO:
         _predict(f, f.e)

@@ -3,7 +3,7 @@
 A copy of the record is a complete snapshot and an array of records is a batch. Sizes are fixed,
 so every filter runs on the same compiled code. The codes `kind` (of model), `late` (rule for late
 samples), `between` (rule between samples) and `periodic` (1: gains from a table, 0: from P) say
-which fields are used. `design.assemble` writes all up to the gains, `filter.reset_filter` the rest.
+which fields are used. `design.assemble` writes all up to the gains, `reset_filters` the rest.
 """
 
 import math

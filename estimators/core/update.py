@@ -6,8 +6,6 @@ of the error, by one constant gain K, columns in the order fast rows, slow rows,
 the last sample's gain. dual-rate: fractions of the last innovation from a table.
 """
 
-from typing import Any
-
 import numpy as np
 
 from ...envs.numerics.functions import wrap
@@ -16,7 +14,7 @@ from ...envs.numerics.packed import load_element, store_element
 from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum, minimum
 from ...envs.numerics.simd8 import load8, store8
 from ...envs.record import PACKET
-from .covariance import dot, predict_measurement, project_row, update_with_clone, update_with_states
+from .covariance import dot, predict_measurement, project_row, update_with_row, update_with_states
 from .innovation import (
     BUFFER,
     CONSTANT,
@@ -35,7 +33,7 @@ from .record import COUNTERS, N_SNAPSHOTS, WINDOW, FilterRecord, GainTables
 
 
 @jit
-def _apply_row(f: FilterRecord, s: int, i: int, v: Vector) -> Any:
+def _apply_row(f: FilterRecord, s: int, i: int, v: Vector) -> Scalar:
     """Apply row i of sensor s to a vector of states and clones (total,): its clone, if it has."""
     return v[f.first_clone[s] + i] if f.frames[s] > 0 else dot(f.C[s, i], v, f.n)
 
@@ -63,12 +61,10 @@ def _locate_frame_row(f: FilterRecord, s: int, frame: int) -> Scalar:
 
 
 @jit
-def _predict_slow_rows(f: FilterRecord, s: int) -> None:
-    """Predict the slow rows of sensor s, and their pseudo-residuals: tie-vision (22)."""
-    for i in range(f.rows[s]):
-        has_clones = f.frames[s] > 0
-        f.expected[i] = f.x[f.first_clone[s] + i] if has_clones else predict_measurement(f, s, i)
-        f.eps[f.fasts + i] = _apply_row(f, s, i, f.e)  # C G e
+def _add_gain(f: FilterRecord, gains: GainTables, row: int, residual: float) -> None:
+    """Correct x by a row of the table of gains."""
+    for j in range(f.total):
+        store_element(f.x, load_element(f.x, j) + load_element(gains, f.cell, row, j) * residual, j)
 
 
 @jit
@@ -81,16 +77,11 @@ def _correct_between(f: FilterRecord, gains: GainTables, s: int) -> None:
     first_row = _locate_frame_row(f, s, f.pattern)
     for i in range(m):
         f.e_seen[i] = dot(f.C_fast[i], e, f.n)
-    for i in range(m):
-        K = gains[f.cell, first_row + i]
+    for i in range(m + f.rows[s]):
+        K, projected = gains[f.cell, first_row + i], f.e_seen[i] if i < m else f.eps[i]
         for j in range(N):
             x[j] += K[j] * f.eps[i]
-            e[j] -= K[j] * f.e_seen[i]  # tie-vision (21): (I - K C) G e
-    for i in range(m, m + f.rows[s]):
-        K = gains[f.cell, first_row + i]
-        for j in range(N):
-            x[j] += K[j] * f.eps[i]
-            e[j] -= K[j] * f.eps[i]
+            e[j] -= K[j] * projected  # tie-vision (21): (I - K C) G e
 
 
 @jit
@@ -112,24 +103,6 @@ def _correct_sample(f: FilterRecord, gains: GainTables, s: int) -> None:
 
 
 @jit
-def _update_error(f: FilterRecord, i: int, residual: float) -> None:
-    """Correct e by a fast row's gain f.share[i], which x has used, and its residual."""
-    projected = dot(f.C_fast[i], f.e, f.n)
-    f.eps[i] = residual
-    for j in range(f.total):
-        f.e[j] -= f.share[i, j] * projected
-
-
-@jit
-def _apply_gain_shares(f: FilterRecord, s: int) -> None:
-    """Correct x and e by the pseudo-residuals with the even fraction of the last sample's gain."""
-    for i in range(f.fasts, f.fasts + f.rows[s]):
-        for j in range(f.total):
-            f.x[j] += f.share[i, j] * f.eps[i]
-            f.e[j] -= f.share[i, j] * f.eps[i]
-
-
-@jit
 def _split_sample_gain(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
     """Correct by a sample as `_correct_sample` does, with the covariance's gain of this packet.
 
@@ -141,11 +114,7 @@ def _split_sample_gain(f: FilterRecord, s: int, first: int, packet: Vector) -> N
         for j in range(N):
             f.x[j] -= f.share[m + i, j] * f.eps[m + i]
     for i in range(rows):
-        r = compute_packet_variance(f, s, i, packet)
-        if first >= 0:
-            update_with_clone(f, first + i, r, 0.0)
-        else:
-            update_with_states(f, f.C[s, i], r, 0.0)
+        update_with_row(f, s, i, first, compute_packet_variance(f, s, i, packet), 0.0)
         for k in range(i):  # the rows before it correct what it measures
             correction = _apply_row(f, s, i, f.share[m + k])
             for j in range(N):
@@ -166,27 +135,7 @@ def _apply_share(f: FilterRecord, gains: GainTables, s: int) -> None:
     """Add the fraction of the last innovation that is due now to x."""
     first_row = _locate_frame_row(f, s, f.pattern) + f.since * f.rows[s]
     for i in range(f.rows[s]):
-        K = gains[f.cell, first_row + i]
-        for j in range(f.total):
-            f.x[j] += K[j] * f.innovation[i]
-
-
-@jit
-def _start_shares(f: FilterRecord, gains: GainTables, s: int) -> None:
-    """Store a sample's innovation and use its first fraction."""
-    for i in range(f.rows[s]):
-        f.innovation[i] = f.residual[i]
-    f.since = 0
-    _apply_share(f, gains, s)
-
-
-@jit
-def _apply_next_share(f: FilterRecord, gains: GainTables, s: int) -> None:
-    """Use the next fraction of the innovation, as long as there is one."""
-    if f.since >= 0:
-        f.since += 1
-        if f.since < f.cycle:
-            _apply_share(f, gains, s)
+        _add_gain(f, gains, first_row + i, f.innovation[i])
 
 
 _MIN_SCALE, _MAX_SCALE = 0.05, 100.0  # limits of the adapted factor on R
@@ -194,7 +143,7 @@ _HEADING_TOLERANCE = 0.5  # rad, residual of the first heading fix above which i
 
 
 @jit
-def _predict_row(f: FilterRecord, s: int, i: int, first: int, captured: int) -> Any:
+def _predict_row(f: FilterRecord, s: int, i: int, first: int, captured: int) -> Scalar:
     """Predict row i of a sample."""
     if first == STORED_ONE and f.late == LARSEN:
         return f.larsen_expected[s, i]
@@ -254,21 +203,8 @@ def _correct_periodic(
     captured = int(packet[PACKET.captured])
     first_row = _locate_frame_row(f, s, (captured - f.phase[s]) // f.period[s] % f.pattern)
     for i in range(f.rows[s]):
-        K, residual = gains[f.cell, first_row + i], f.residual[i]
-        for j in range(f.total):
-            f.x[j] += K[j] * residual
-        _reduce_residuals(f, s, first, i, K)
-
-
-@jit
-def _adapt_noise(
-    f: FilterRecord, s: int, i: int, projected: float, residual: float, r: float
-) -> None:
-    """Adapt R to innovations: the mean of residual^2 - C P C^T, over the configured one."""
-    if r > 0.0:
-        sample_scale = (residual * residual - projected) / r * f.scale[s, i]
-        scale = f.scale[s, i] + f.adapt * (sample_scale - f.scale[s, i])
-        f.scale[s, i] = minimum(maximum(scale, _MIN_SCALE), _MAX_SCALE)
+        _add_gain(f, gains, first_row + i, f.residual[i])
+        _reduce_residuals(f, s, first, i, gains[f.cell, first_row + i])
 
 
 @jit
@@ -276,23 +212,15 @@ def _correct(f: FilterRecord, s: int, first: int, packet: Vector) -> None:
     """Correct by the rows of a sample, one after the other, with the covariance."""
     for i in range(f.rows[s]):
         residual, r = f.residual[i], compute_packet_variance(f, s, i, packet)
-        if f.adapt > 0.0:
-            _adapt_noise(f, s, i, project_row(f, s, i, first), residual, r)
-        if first >= 0:
-            update_with_clone(f, first + i, r, residual)
-        else:
-            update_with_states(f, f.C[s, i], r, residual)
+        if f.adapt > 0.0 and r > 0.0:  # R follows the mean of residual^2 - C P C^T
+            projected = project_row(f, s, i, first)
+            sample_scale = (residual * residual - projected) / r * f.scale[s, i]
+            scale = f.scale[s, i] + f.adapt * (sample_scale - f.scale[s, i])
+            f.scale[s, i] = minimum(maximum(scale, _MIN_SCALE), _MAX_SCALE)
+        update_with_row(f, s, i, first, r, residual)
         _reduce_residuals(f, s, first, i, f.gain)
         if f.late == LARSEN:
             propagate_larsen_gains(f, f.C[s, i])
-
-
-@jit
-def _correct_states(f: FilterRecord, s: int) -> None:
-    """Correct x <- x + M K residual, Larsen's correction at the arrival."""
-    for i in range(f.rows[s]):
-        for k in range(f.n):
-            f.x[k] += f.larsen_gain[s, i, k] * f.residual[i]
 
 
 @noinline
@@ -322,11 +250,16 @@ def update_filter(
     elif f.between == PSEUDO:
         _split_sample_gain(f, s, first, packet)
     elif f.between != NONE:
-        _start_shares(f, gains, s)
+        for i in range(f.rows[s]):
+            f.innovation[i] = f.residual[i]
+        f.since = 0
+        _apply_share(f, gains, s)
     elif f.periodic == 1:
         _correct_periodic(f, gains, s, first, packet)
-    elif first == STORED_ONE and f.late == LARSEN:
-        _correct_states(f, s)
+    elif first == STORED_ONE and f.late == LARSEN:  # x <- x + M K residual
+        for i in range(f.rows[s]):
+            for k in range(f.n):
+                f.x[k] += f.larsen_gain[s, i, k] * f.residual[i]
     else:
         if is_gated and not check_sample(f, s, first, packet):
             f.counts[COUNTERS.gated] += 1
@@ -334,15 +267,6 @@ def update_filter(
             return False
         _correct(f, s, first, packet)
     return True
-
-
-@jit
-def _correct_joint(f: FilterRecord, gains: GainTables) -> None:
-    """Correct x += K residuals with residuals that are all taken before, in f.eps."""
-    for i in range(f.fasts):
-        K = gains[f.cell, locate_step_row(f) + i]
-        for j in range(f.total):
-            f.x[j] += K[j] * f.eps[i]
 
 
 @noinline
@@ -353,19 +277,24 @@ def correct_fast(f: FilterRecord, gains: GainTables) -> None:
         f: Memory of the filter.
         gains: Tables of gains, shape (cells, rows, columns).
     """
+    s = f.first_slow
     for i in range(f.fasts):
         if not is_finite(f.y[i]):
             f.counts[COUNTERS.invalid] += 1
     if f.between == PSEUDO:
-        _predict_slow_rows(f, f.first_slow)
-    if f.joint == 1:
+        for i in range(f.rows[s]):
+            is_cloned = f.frames[s] > 0
+            f.expected[i] = f.x[f.first_clone[s] + i] if is_cloned else predict_measurement(f, s, i)
+            f.eps[f.fasts + i] = _apply_row(f, s, i, f.e)  # pseudo-residual C G e, tie-vision (22)
+    if f.joint == 1:  # all residuals are taken before the first correction
         for i in range(f.fasts):
             residual = compute_residual(f, i)
             f.eps[i] = residual if is_finite(residual) else 0.0
         if f.between == PSEUDO:
-            _correct_between(f, gains, f.first_slow)
-        else:
-            _correct_joint(f, gains)
+            _correct_between(f, gains, s)
+            return
+        for i in range(f.fasts):
+            _add_gain(f, gains, locate_step_row(f) + i, f.eps[i])
         return
     for i in range(f.fasts):
         residual = compute_residual(f, i)
@@ -373,20 +302,24 @@ def correct_fast(f: FilterRecord, gains: GainTables) -> None:
             f.eps[i] = 0.0
             continue
         if f.periodic == 1:
-            row = locate_step_row(f) + i
-            for j in range(f.total):
-                store_element(
-                    f.x, load_element(f.x, j) + load_element(gains, f.cell, row, j) * residual, j
-                )
+            _add_gain(f, gains, locate_step_row(f) + i, residual)
             continue
         update_with_states(f, f.C_fast[i], f.r_fast[i], residual)
         for j in range(0, f.total, 8):  # the design of periodic gains reads them, too
             store8(f.share, load8(f.gain, j), i, j)
         if f.between == PSEUDO:
-            _update_error(f, i, residual)
+            projected = dot(f.C_fast[i], f.e, f.n)
+            f.eps[i] = residual
+            for j in range(f.total):
+                f.e[j] -= f.share[i, j] * projected
         if f.late == LARSEN:
             propagate_larsen_gains(f, f.C_fast[i])
-    if f.between == PSEUDO:
-        _apply_gain_shares(f, f.first_slow)
-    elif f.between == DUAL_RATE:
-        _apply_next_share(f, gains, f.first_slow)
+    if f.between == PSEUDO:  # the even fraction of the last sample's gain
+        for i in range(f.fasts, f.fasts + f.rows[s]):
+            for j in range(f.total):
+                f.x[j] += f.share[i, j] * f.eps[i]
+                f.e[j] -= f.share[i, j] * f.eps[i]
+    elif f.between == DUAL_RATE and f.since >= 0:
+        f.since += 1
+        if f.since < f.cycle:
+            _apply_share(f, gains, s)

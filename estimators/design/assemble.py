@@ -1,114 +1,101 @@
 """From a filter's config to its compiled memory, one record a layer, and its schedules."""
 
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
+from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
 from ...envs.sensors.slow import SLOW_NAMES
+from ...envs.vehicle.linear import make_roll_model
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
-from ..core.innovation import (
-    BUFFER,
-    CONSTANT,
-    DUAL_RATE,
-    IGNORE,
-    LARSEN,
-    NONE,
-    PSEUDO,
-    RULES,
-    STORED,
-)
-from ..core.model import KINEMATIC, MIN_SPEED, VELOCITY_ROLL
+from ..core import innovation as rule
+from ..core import record as size
+from ..core.model import FORCES, KINEMATIC, LATERAL, MIN_SPEED, VELOCITY_ROLL
 from ..core.multiple_model import CHANGED, GUSTY, MIN_LOG_WEIGHT
-from ..core.record import (
-    FILTER,
-    N_FRAMES,
-    N_RECENT,
-    N_ROWS,
-    N_TOTAL,
-    SNAPSHOT_INTERVAL,
-    WINDOW,
-    FilterRecord,
-)
+from ..core.record import FILTER, CarIndex, FilterRecord, FilterRecords
+from . import models
 from .kalman import kalman_gain
-from .models import NONLINEAR, write_model
+from .models import TYRES, FilterModel, find_packet_column
 from .options import FilterConfig
 from .periodic import NO_SENSOR, Schedule, build_measurement_rows, count_ticks
 
 
-def _count_frames(sensor: SlowSensor, rule: str) -> int:
-    """Count the frames whose capture must be stored at once, by the sensor's longest delay."""
-    if rule not in ("clone", "larsen"):
-        return 0
-    return math.ceil(sensor.longest_delay / sensor.period - 1e-9)
+def _refuse(label: str, checks: Iterable[tuple[object, str]]) -> None:
+    """Raise ValueError with the first message whose condition holds."""
+    for is_wrong, message in checks:
+        if is_wrong:
+            raise ValueError(f"{label}: {message}")
 
 
 def _allocate_clones(f: FilterRecord, config: FilterConfig) -> None:
     """Lay the clones of every sensor behind the states; ValueError where there are too many."""
-    rule, label = config.delay, config.name
-    f.late = IGNORE if rule in ("literal", "lag") else RULES.index(rule)  # late states instead
+    delay = config.delay
+    f.late = rule.IGNORE if delay in ("literal", "lag") else rule.RULES.index(delay)
     f.total = f.n
-    for name, sensor in config.sensors.items():
-        s, frames = SLOW_NAMES.index(name), _count_frames(sensor, rule)
-        max_frames = 1 if rule == "larsen" else N_FRAMES
-        if frames > max_frames:
-            raise ValueError(
-                f"{label}: the {name} can be {sensor.longest_delay:g} s late, {frames} of its "
-                f"periods of {sensor.period:g} s; delay={rule!r} can hold {max_frames}"
-            )
+    max_frames = 1 if delay == "larsen" else size.N_FRAMES
+    for name, sensor in config.sensors.items() if delay in ("clone", "larsen") else ():
+        s, frames = SLOW_NAMES.index(name), math.ceil(sensor.longest_delay / sensor.period - 1e-9)
+        text = (
+            f"the {name} can be {sensor.longest_delay:g} s late, {frames} of its periods of "
+            f"{sensor.period:g} s; delay={delay!r} can hold {max_frames}"
+        )
+        _refuse(config.name, [(frames > max_frames, text)])
         f.frames[s] = frames
-        if rule == "clone":
+        if delay == "clone":
             f.first_clone[s] = f.total
             f.total += frames * f.rows[s]
-    if rule == "larsen" and f.frames.sum() > 1:
-        raise ValueError(f"{label}: delay='larsen' is for one late sensor")
-    if f.total > N_TOTAL:
-        raise ValueError(
-            f"{label}: {f.n} states and {f.total - f.n} clones are more than the {N_TOTAL} of "
-            f"delay={rule!r}; delay='buffer' needs no clones"
-        )
+    too_many = (
+        f"{f.n} states and {f.total - f.n} clones are more than the {size.N_TOTAL} of "
+        f"delay={delay!r}; delay='buffer' needs no clones"
+    )
+    is_twice = delay == "larsen" and f.frames.sum() > 1
+    checks = (is_twice, "delay='larsen' is for one late sensor"), (f.total > size.N_TOTAL, too_many)
+    _refuse(config.name, checks)
 
 
 def _check_window(f: FilterRecord, config: FilterConfig) -> None:
     """Check that the window holds the longest delay and that rules go together; else ValueError."""
-    dt, label, sensors = float(f.step / f.stride), config.name, config.sensors
-    if f.late == CONSTANT and f.assumed >= WINDOW:
-        raise ValueError(
-            f"{label}: assumed_delay of {f.assumed * dt:g} s is not within the window of "
-            f"{WINDOW * dt:g} s ({WINDOW} ticks)"
-        )
-    if f.late == LARSEN and (f.gate.any() or f.knots > 0):
-        raise ValueError(
-            f"{label}: delay='larsen' weighs a sample before it is here, so it takes no gate "
-            "and no hdop_table"
-        )
-    if f.late == BUFFER and f.pace > 1:
-        raise ValueError(f"{label}: delay='buffer' is for filters that listen at every tick")
-    if f.late == BUFFER and config.accel_time > 0.0:
-        raise ValueError(
-            f"{label}: delay='buffer' filters stored ticks again and does not store the noise that "
-            f"accel_time={config.accel_time:g} finds; use delay='clone'"
-        )
-    if f.late not in (BUFFER, STORED):
-        return
-    window = WINDOW - SNAPSHOT_INTERVAL if f.late == BUFFER else WINDOW - 1
+    dt, sensors, is_buffer = float(f.step / f.stride), config.sensors, f.late == rule.BUFFER
+    window = size.WINDOW - size.SNAPSHOT_INTERVAL if is_buffer else size.WINDOW - 1
+    checks = [
+        (
+            f.late == rule.CONSTANT and f.assumed >= size.WINDOW,
+            f"assumed_delay of {f.assumed * dt:g} s is not within the window of "
+            f"{size.WINDOW * dt:g} s ({size.WINDOW} ticks)",
+        ),
+        (
+            f.late == rule.LARSEN and (f.gate.any() or f.knots > 0),
+            "delay='larsen' weighs a sample before it is here, so it takes no gate and no "
+            "hdop_table",
+        ),
+        (is_buffer and f.pace > 1, "delay='buffer' is for filters that listen at every tick"),
+        (
+            is_buffer and config.accel_time > 0.0,
+            "delay='buffer' filters stored ticks again and does not store the noise that "
+            f"accel_time={config.accel_time:g} finds; use delay='clone'",
+        ),
+    ]
     n_samples = 0
-    for name, sensor in sensors.items():
-        if sensor.longest_delay > (window + 1e-6) * dt:
-            raise ValueError(
-                f"{label}: the {name} can be {sensor.longest_delay:g} s late; "
-                f"delay={RULES[f.late]!r} has a window of {window * dt:g} s ({window} ticks)"
-            )
-        n_samples += 2 + math.ceil((sensor.longest_delay + SNAPSHOT_INTERVAL * dt) / sensor.period)
-    if f.late == BUFFER and n_samples > N_RECENT:
-        raise ValueError(
-            f"{label}: {n_samples} samples of {' and '.join(sensors)} can come within the "
-            f"longest delay; delay='buffer' stores {N_RECENT}"
+    for name, sensor in sensors.items() if f.late in (rule.BUFFER, rule.STORED) else ():
+        text = (
+            f"the {name} can be {sensor.longest_delay:g} s late; delay={rule.RULES[f.late]!r} has "
+            f"a window of {window * dt:g} s ({window} ticks)"
         )
+        checks.append((sensor.longest_delay > (window + 1e-6) * dt, text))
+        n_samples += 2 + math.ceil(
+            (sensor.longest_delay + size.SNAPSHOT_INTERVAL * dt) / sensor.period
+        )
+    text = (
+        f"{n_samples} samples of {' and '.join(sensors)} can come within the longest delay; "
+        f"delay='buffer' stores {size.N_RECENT}"
+    )
+    _refuse(config.name, [*checks, (is_buffer and n_samples > size.N_RECENT, text)])
 
 
+_EXPANSION_TIME = 0.004  # s between two expansions of the tyres' forces
 _SMOOTHING_TIME = 0.015  # s, time constant of the low-pass on the measured speed
 _MAX_SPEED = 80.0  # m/s, speed of the last table of gains
 _SPACING = 0.5  # m/s between two tables of gains
@@ -123,7 +110,7 @@ _GUST = (8.0, 2.0)  # standard deviations of a gust's force and moment over thos
 
 def assemble(
     config: FilterConfig, vehicle: Vehicle, dt: float, speed: float | None
-) -> tuple[Any, tuple[Schedule, ...]]:
+) -> tuple[FilterRecords, tuple[Schedule, ...]]:
     """Assemble the memory of a filter and the schedules of its first slow sensor.
 
     ValueError says that a schedule does not fit ticks, that a sensor can be later than the filter's
@@ -141,15 +128,14 @@ def assemble(
     layers, first = np.zeros(len(config.models), FILTER).view(np.recarray), 0
     for f, model in zip(layers, config.models, strict=True):
         _write_clocks(f, config, dt)
-        n, step = len(model.names), f.stride * dt
+        n, f.step = len(model.names), f.stride * dt
         block = slice(first, first + n)
-        noise = _scale_noise(config, vehicle), config.noise_over_speed
-        write_model(f, model, vehicle, step, *noise, config.Q[block, block])
+        _write_model(f, model, vehicle, config, config.Q[block, block] * f.step)
         f.decay[f.dense : n - len(model.biases)] *= math.exp(-config.leak * f.stride * dt)
         f.prior[:n, :n] = np.diag([config.prior[state] ** 2 for state in model.names])
         for state, time in config.times.items():
             if time > 0.0:
-                i, decay = model.names.index(state), math.exp(-step / time)
+                i, decay = model.names.index(state), math.exp(-f.step / time)
                 f.decay[i], f.Q[i, i] = decay, (1.0 - decay * decay) * f.prior[i, i]
         _allocate_clones(f, config)
         f.measured, f.speed = int(speed is None), speed or 0.0
@@ -165,17 +151,7 @@ def assemble(
     return _build_bank(layers, config, dt), planned
 
 
-def _scale_noise(config: FilterConfig, vehicle: Vehicle) -> dict[str, float]:
-    """Compute the noise with the fractions of the car's weight in it."""
-    noise, weight = dict(config.noise), vehicle.mass * GRAVITY
-    arm = 0.5 * (vehicle.front_arm + vehicle.rear_arm)
-    for name, share, size in zip(("force", "moment"), config.shares, (1.0, arm), strict=True):
-        if share > 0.0:
-            noise[name] = math.hypot(noise[name], share * weight * size)
-    return noise
-
-
-def _build_bank(layers: Any, config: FilterConfig, dt: float) -> Any:
+def _build_bank(layers: FilterRecords, config: FilterConfig, dt: float) -> FilterRecords:
     """Build the mixture and the members of a bank of the filter; the filter itself without one."""
     if config.members < 2:
         return layers
@@ -192,19 +168,14 @@ def _build_bank(layers: Any, config: FilterConfig, dt: float) -> Any:
             f.q_known *= f.level
             f.Q[both, both] *= f.level
             f.prior[both, both] *= f.level
-    if config.sudden:
-        _set_imm_members(bank, dt)
+    if config.sudden:  # what the interacting members differ in
+        bank.respawn = round(_IMM_TIME / dt)
+        for f in bank:
+            f.burst[:] = np.square(_GUST) * f.q_known / f.q_share
+        gusty, changed = bank[GUSTY], bank[CHANGED]
+        gusty.decay[gusty.dense : gusty.dense + 2] = 1.0
+        changed.q_tyres[:2] += _TYRE_WALK * changed.step
     return bank
-
-
-def _set_imm_members(bank: Any, dt: float) -> None:
-    """Set what the interacting members differ in."""
-    bank.respawn = round(_IMM_TIME / dt)
-    for f in bank:
-        f.burst[:] = np.square(_GUST) * f.q_known / f.q_share
-    gusty, changed = bank[GUSTY], bank[CHANGED]
-    gusty.decay[gusty.dense : gusty.dense + 2] = 1.0
-    changed.q_tyres[:2] += _TYRE_WALK * changed.step
 
 
 def select_first_sensor(config: FilterConfig) -> FilterConfig:
@@ -228,16 +199,16 @@ def remove_tyre_states(config: FilterConfig) -> FilterConfig:
     Returns:
         Its options without these states.
     """
-    if not any(name in NONLINEAR for name in config.states):
+    prior = {name: sd for name, sd in config.prior.items() if name not in models.NONLINEAR}
+    if len(prior) == len(config.prior):
         return config
-    indices = [i for i, name in enumerate(config.states) if name not in NONLINEAR]
-    models = tuple(
-        replace(model, biases=tuple(name for name in model.biases if name not in NONLINEAR))
+    indices = [i for i, name in enumerate(config.states) if name in prior]
+    layers = tuple(
+        replace(model, biases=tuple(name for name in model.biases if name in prior))
         for model in config.models
     )
-    prior = {name: sd for name, sd in config.prior.items() if name not in NONLINEAR}
     Q = config.Q[np.ix_(indices, indices)]
-    return replace(config, models=models, Q=Q, prior=prior, members=1)
+    return replace(config, models=layers, Q=Q, prior=prior, members=1)
 
 
 def _write_clocks(f: FilterRecord, config: FilterConfig, dt: float) -> None:
@@ -265,11 +236,113 @@ def _write_trust(f: FilterRecord, config: FilterConfig) -> None:
     if config.gate is not None:
         from scipy.stats import chi2  # slow to load
 
-        f.gate[1:] = chi2.ppf(config.gate, np.arange(1, N_ROWS + 1))
+        f.gate[1:] = chi2.ppf(config.gate, np.arange(1, size.N_ROWS + 1))
     knots = config.hdop_table if f.kind != VELOCITY_ROLL else ()  # applied by the first layer
     f.knots = len(knots)
     for i, (hdop, factor) in enumerate(knots):
         f.hdop[i], f.hdop_factor[i] = hdop, factor
+
+
+def _write_model(
+    f: FilterRecord, model: FilterModel, vehicle: Vehicle, config: FilterConfig, Q: Array
+) -> None:
+    """Write the model and its measurements; Q (n, n): a step's process noise besides forces'."""
+    names, dense = model.names, len(model.states) + len(model.late)
+    n = len(names)
+    f.kind, f.n, f.total, f.dense, f.delayed = model.kind, n, n, dense, len(model.late)
+    f.forces = int(model.forces)
+    for j, (_, pushed) in enumerate(model.disturbances):
+        f.pushed[j] = names.index(pushed)
+    f.pushed[n - len(model.biases) - dense : n - dense] = -1
+    f.banked = names.index("bank") - dense if "bank" in model.biases else -1
+    f.rolling = names.index("phi") if model.kind == LATERAL and "phi" in names else 0
+    f.car[:] = [getattr(vehicle, name) for name in CarIndex._fields]
+    body = make_roll_model(vehicle)
+    f.roll_stiffness, f.roll_damping, f.roll_arm = -body.A[1, 0], -body.A[1, 1], body.B[1, 0]
+    f.sway = vehicle.roll_moment_arm / vehicle.mass
+    f.preview = vehicle.preview
+    f.Q[:n, :n] = Q
+    f.decay[:] = 1.0
+    noise, weight = dict(config.noise), vehicle.mass * GRAVITY
+    arm = 0.5 * (vehicle.front_arm + vehicle.rear_arm)
+    for name, share, length in zip(("force", "moment"), config.shares, (1.0, arm), strict=True):
+        if share > 0.0:
+            noise[name] = math.hypot(noise[name], share * weight * length)
+    if model.forces:  # exact discretisation of the process
+        decay = math.exp(-f.step / noise["time"])
+        f.decay[dense : dense + 2] = decay
+        f.Q[dense, dense] += (1.0 - decay * decay) * noise["force"] ** 2
+        f.Q[dense + 1, dense + 1] += (1.0 - decay * decay) * noise["moment"] ** 2
+        f.q_known[:], f.q_share = np.diag(f.Q)[dense : dense + 2], 1.0 - decay * decay
+    f.speed_state = names.index("v_x") if "v_x" in names else -1
+    _write_tyres(f, model, vehicle)
+    _write_signals(f, model, vehicle, noise)
+    _write_rows(f, model, config)
+
+
+def _write_tyres(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> None:
+    """Write where the tyres' states stand and start: at the nominal ones."""
+    names = model.names
+    if TYRES[0] not in names:
+        return
+    f.tyres, f.grip = names.index(TYRES[0]), names.index(TYRES[2]) if TYRES[2] in names else 0
+    f.again = max(1, round(_EXPANSION_TIME / f.step))
+    f.stiffness[:] = 2.0 * vehicle.front_stiffness, 2.0 * vehicle.rear_stiffness
+    wheelbase = vehicle.front_arm + vehicle.rear_arm
+    arms = np.array([vehicle.rear_arm, vehicle.front_arm])
+    f.load[:] = vehicle.mass * GRAVITY * arms / wheelbase
+    f.first[f.tyres : f.tyres + 2] = 1.0
+    f.q_tyres[:2] = np.diag(f.Q)[f.tyres : f.tyres + 2]
+    if f.grip:
+        f.q_tyres[2] = f.Q[f.grip, f.grip]
+        f.first[f.grip] = 1.0 / vehicle.friction
+
+
+def _write_signals(
+    f: FilterRecord, model: FilterModel, vehicle: Vehicle, noise: Mapping[str, float]
+) -> None:
+    """Write inputs and fast measurements; `build_model` writes rows that depend on speed."""
+    table, names = models.make_signals(vehicle), model.names
+    f.inputs, f.fasts = len(model.inputs), len(model.fast)
+    for i, name in enumerate(model.inputs):
+        f.u_column[i], f.u_factor[i] = zip(*table[name], strict=True)
+    measured_state = {"gyro": "gamma", "roll_rate": "phi_rate", "wheel": "v_x"}
+    for i, name in enumerate(model.fast):
+        f.y_column[i], f.y_factor[i] = zip(*table[name], strict=True)
+        f.r_fast[i] = noise[name] ** 2
+        if name in measured_state:
+            f.C_fast[i, names.index(measured_state[name])] = 1.0
+    f.scaled = names.index(models.SCALE) if models.SCALE in model.biases else 0
+    for bias in filter(models.WANDER.get, model.biases):
+        f.C_fast[model.fast.index(models.BIASES[bias]), names.index(bias)] = 1.0
+    if model.kind == LATERAL and "accel_y" in model.fast:
+        f.accel_row = model.fast.index("accel_y")
+    if model.kind == FORCES:  # m a_y = F_yf + F_yr
+        f.C_fast[1, 1] = f.C_fast[1, 2] = 1.0 / vehicle.mass
+
+
+def _write_rows(f: FilterRecord, model: FilterModel, config: FilterConfig) -> None:
+    """Write what the used slow sensors measure."""
+    used = [s for s in range(len(SLOW_NAMES)) if f.period[s] > 0]
+    f.first_slow = used[0] if used else -1
+    for s in used:
+        name = SLOW_NAMES[s]
+        sensor = models.MEASUREMENTS[name]
+        is_second_layer = model.kind == VELOCITY_ROLL
+        rows = sensor.velocities if is_second_layer else sensor.rows
+        f.rows[s], f.heading_fix[s] = len(rows), sensor.heading_fix and not is_second_layer
+        f.hdop_column[s] = find_packet_column(name, "hdop")
+        f.satellites_column[s] = find_packet_column(name, "satellites")
+        f.speed_column[s] = find_packet_column(name, "speed")
+        for i, row in enumerate(rows):
+            f.angle[s, i], f.ground[s, i] = row.angle, row.ground
+            f.r[s, i] = config.noise[row.noise] ** 2
+            f.noise_over_speed[s, i] = config.noise_over_speed.get(row.noise, 0.0) ** 2
+            for state in row.states:
+                late = models.LATE.get(state)
+                f.C[s, i, model.names.index(late if late in model.late else state)] = 1.0
+        if is_second_layer:
+            f.r_speed = f.r[s, 0]
 
 
 def _make_schedules(f: FilterRecord, config: FilterConfig, dt: float) -> tuple[Schedule, ...]:
@@ -304,24 +377,25 @@ def _write_rules(f: FilterRecord, config: FilterConfig, planned: tuple[Schedule,
     f.cycle, f.pattern = planned[-1].cycle, max(1, len(planned[-1].lags))
     pseudo = config.intersample == "pseudo-residual"
     shared = config.row.intersample == "dual-rate"
-    f.between = PSEUDO if pseudo else DUAL_RATE if shared else NONE
+    f.between = rule.PSEUDO if pseudo else rule.DUAL_RATE if shared else rule.NONE
     f.periodic = _is_periodic(f, config, len(planned) > 1)
     f.joint = config.row.gains == "placed" or (pseudo and f.periodic)
-    f.store_predictions = f.late in (STORED, CONSTANT)
+    f.store_predictions = f.late in (rule.STORED, rule.CONSTANT)
     if f.measured and f.periodic:
         f.low, f.high, f.spacing = MIN_SPEED, _MAX_SPEED, _SPACING
     if pseudo:
         C = build_measurement_rows(f, 0)
         zero = np.zeros((len(C), len(C)))
         f.inverse[: len(C), : f.total] = kalman_gain(np.eye(f.total), C, zero).T
-    if _is_covariance_needed(config) and (f.periodic or f.between != NONE):
-        raise ValueError(
-            f"{config.name}: gate, adapt, latency, delay='larsen' and delay='buffer' need "
-            f"gains='covariance' and no correction between samples; got gate={config.gate}, "
-            f"adapt={config.adapt}, latency={dict(config.latency)}, delay={config.delay!r}"
-        )
-    if config.adapt > 0.0 and config.delay in ("larsen", "buffer"):
-        raise ValueError(f"{config.name}: adapt needs delay='clone', got delay={config.delay!r}")
+    text = (
+        "gate, adapt, latency, delay='larsen' and delay='buffer' need gains='covariance' and no "
+        f"correction between samples; got gate={config.gate}, adapt={config.adapt}, "
+        f"latency={dict(config.latency)}, delay={config.delay!r}"
+    )
+    is_contradiction = _is_covariance_needed(config) and (f.periodic or f.between != rule.NONE)
+    cannot_adapt = config.adapt > 0.0 and config.delay in ("larsen", "buffer")
+    needed = f"adapt needs delay='clone', got delay={config.delay!r}"
+    _refuse(config.name, [(is_contradiction, text), (cannot_adapt, needed)])
 
 
 def _is_covariance_needed(config: FilterConfig) -> bool:
@@ -332,31 +406,25 @@ def _is_covariance_needed(config: FilterConfig) -> bool:
 def _is_periodic(f: FilterRecord, config: FilterConfig, random: bool) -> bool:
     """Return whether gains are precomputed; `random`: whether the first sensor's delay is."""
 
-    def refuse(reason: str) -> ValueError:
-        return ValueError(f"{config.name}: no gains={config.gains!r}: {reason}")
-
-    if f.between == DUAL_RATE or config.row.gains == "placed":
+    if f.between == rule.DUAL_RATE or config.row.gains == "placed":
         return True
     is_multi_sensor, ignores_lag = len(config.sensors) > 1, f.frames.max() == 0
     impossible = ""
     if f.kind in (KINEMATIC, VELOCITY_ROLL) or config.row.second:
         impossible = "its model changes with the yaw rate"
-    elif f.between == PSEUDO:
-        if config.gains == "covariance":
-            raise refuse("it has one constant gain")
-        if f.frames.max() > 1:
-            raise ValueError(
-                f"{config.name}: a sample must arrive before the next one is captured, got "
-                f"{config.sensors}"
-            )
+    elif f.between == rule.PSEUDO:
+        early = f"a sample must arrive before the next one is captured, got {config.sensors}"
+        is_covariance = config.gains == "covariance"
+        refusal = "no gains='covariance': it has one constant gain"
+        _refuse(config.name, [(is_covariance, refusal), (f.frames.max() > 1, early)])
         return True
     elif any(model.biases for model in config.models):
         impossible = "a constant bias has no settled gain"
     elif is_multi_sensor or (random and not ignores_lag):
         impossible = "two slow sensors" if is_multi_sensor else "random delay"
     if impossible:
-        if config.gains == "periodic":
-            raise refuse(f"{impossible}; use gains='covariance'")
+        text = f"no gains='periodic': {impossible}; use gains='covariance'"
+        _refuse(config.name, [(config.gains == "periodic", text)])
         return False
     default = "covariance" if _is_covariance_needed(config) else config.row.gains
     return (config.gains or default) == "periodic"

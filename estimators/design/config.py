@@ -14,21 +14,9 @@ from ...envs.validation import describe_unknown
 from ..core.innovation import RULES
 from ..core.record import N_KNOTS
 from ..filters import FilterDefinition
-from . import dual_rate
+from . import dual_rate, models
 from .kalman import INVERSES, check_covariance
-from .models import (
-    BIASES,
-    COURSE_SPEED,
-    DISTURBANCES,
-    INERTIAL,
-    MEASUREMENTS,
-    MODELS,
-    SCALE,
-    STATES,
-    TYRES,
-    WANDER,
-    make_bicycle_model,
-)
+from .models import BIASES, SCALE, STATES, TYRES, WANDER
 from .options import DISTURBANCE, EXTRA_NOISE, FAST_CHANNELS, FIND, NOISE, TUNINGS
 from .options import FilterConfig as FilterConfig
 
@@ -46,7 +34,7 @@ _Fits = Callable[[float], bool]
 class _Reader:
     """Keyword arguments of a filter by name; `check_unread` refuses those that were not read."""
 
-    def __init__(self, name: str, options: Mapping[str, Any]) -> None:
+    def __init__(self, name: str, options: Mapping[str, object]) -> None:
         self.name, self._unread, self._known = name, dict(options), list[str]()
 
     def __contains__(self, key: str) -> bool:
@@ -57,7 +45,7 @@ class _Reader:
         self._known.append(key)
         return self._unread.pop(key, default)
 
-    def make_error(self, key: str, expected: str, value: Any) -> ValueError:
+    def make_error(self, key: str, expected: str, value: object) -> ValueError:
         """Make the error for a value that an option cannot have; expected: "is ..."."""
         return ValueError(f"{self.name}: {key} {expected}, got {value!r}")
 
@@ -96,18 +84,18 @@ class _Reader:
         return self.read_number(key, default, expected, lambda v: 0.0 < v < np.inf)
 
     def check_number(
-        self, key: str, value: Any, expected: str = "", fits: _Fits = lambda _: True
+        self, key: str, value: object, expected: str = "", fits: _Fits = lambda _: True
     ) -> float:
         """Convert to a number that fits; TypeError for no number, ValueError where it does not."""
         try:
-            number = float(value)
+            number = float(value)  # type: ignore[arg-type]  # anything that a user passes
         except (TypeError, ValueError):
             raise TypeError(f"{self.name}: {key} is a number, got {value!r}") from None
         if not fits(number):
             raise self.make_error(key, expected, number)
         return number
 
-    def read_array(self, key: str, value: Any) -> npt.NDArray[np.float64]:
+    def read_array(self, key: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Convert an option's value to a new array of numbers; else TypeError."""
         try:
             return np.array(value, np.float64)
@@ -122,7 +110,10 @@ class _Reader:
 
 
 def parse_config(
-    name: str, row: FilterDefinition, sensors: Mapping[str, SlowSensor], options: Mapping[str, Any]
+    name: str,
+    row: FilterDefinition,
+    sensors: Mapping[str, SlowSensor],
+    options: Mapping[str, object],
 ) -> FilterConfig:
     """Parse the options of a filter.
 
@@ -146,22 +137,22 @@ def parse_config(
     rules = _parse_rules(row, used, reader)
     fast, biases = _parse_inertial(row, reader)
     if row.model == "bicycle":
-        disturbances = reader.read_choice("disturbances", row.disturbances, DISTURBANCES)
+        disturbances = reader.read_choice("disturbances", row.disturbances, models.DISTURBANCES)
         late, rolls = rules["delay"] in ("literal", "lag"), fast != row.fast
-        first = make_bicycle_model(used, fast, disturbances, late, rolls, tuple(biases))
+        first = models.make_bicycle_model(used, fast, disturbances, late, rolls, tuple(biases))
     else:
-        first = MODELS[row.model]
-    models = (first, MODELS[row.second]) if row.second else (first,)
-    states = [state for model in models for state in model.names]
+        first = models.MODELS[row.model]
+    layers = (first, models.MODELS[row.second]) if row.second else (first,)
+    states = [state for model in layers for state in model.names]
     if rules["poles"] and len(rules["poles"]) != len(states):
         raise reader.make_error("poles", f"are one for each of {', '.join(states)}", rules["poles"])
-    noise, noise_over_speed = _parse_noise(models[0].forces, reader)
-    steered = models[0].inputs[0] == "steer"
+    noise, noise_over_speed = _parse_noise(first.forces, reader)
+    is_steered = first.inputs[0] == "steer"
     config = FilterConfig(
         name=name,
         row=row,
         sensors={sensor: sensors[sensor] for sensor in used},
-        models=models,
+        models=layers,
         **rules,
         leak=reader.read_non_negative("leak", "1/s"),
         Q=_parse_process_noise(states, TUNINGS.get((name, ",".join(used)), {}), reader),
@@ -170,9 +161,9 @@ def parse_config(
         hdop_table=_parse_hdop_table(row, reader),
         satellites=reader.read_number("satellites", _MIN_SATELLITES),
         **_parse_gate(rules["delay"], reader),
-        **_parse_bank(states, models[0].forces, rules["delay"], reader),
+        **_parse_bank(states, first.forces, rules["delay"], reader),
         robust=reader.read_non_negative("robust", "standard deviations"),
-        steer_rate=reader.read_non_negative("steer_rate", "rad/s") if steered else 0.0,
+        steer_rate=reader.read_non_negative("steer_rate", "rad/s") if is_steered else 0.0,
         model_error=reader.read_non_negative("model_error", "shares of a force"),
         accel_time=reader.read_non_negative("accel_time", "s"),
         shares=(
@@ -255,7 +246,7 @@ def _parse_inertial(
     """Parse the fast sensors, and the standard deviations of their biases by state."""
     if row.model != "bicycle" or row.gains != "covariance" or row.second:
         return row.fast, {}
-    fast = reader.read_choices("fast", row.fast, INERTIAL)
+    fast = reader.read_choices("fast", row.fast, models.INERTIAL)
     biases = {name: reader.read_non_negative(f"{name}_sd", STATES[name].unit) for name in BIASES}
     known = [name for name in TYRES if not biases[name] > 0.0]
     if known not in (list(TYRES), list(TYRES[2:]), []):
@@ -281,7 +272,7 @@ def _parse_gate(delay: str, reader: _Reader) -> dict[str, Any]:
 
 def _parse_latency(reader: _Reader, is_findable: bool) -> dict[str, float | str]:
     """Parse the latencies above zero (s, or `FIND` for one of them) by channel."""
-    value: Any = reader.read_value("latency", {})
+    value = reader.read_value("latency", {})
     if not isinstance(value, Mapping):
         raise TypeError(f"{reader.name}: latency is seconds by channel, got {value!r}")
     for channel in value:
@@ -304,14 +295,14 @@ def _parse_latency(reader: _Reader, is_findable: bool) -> dict[str, float | str]
 
 def _parse_noise(forces: bool, reader: _Reader) -> tuple[dict[str, float], dict[str, float]]:
     """Parse `FilterConfig.noise` and `FilterConfig.noise_over_speed`."""
-    rows = [row for sensor in MEASUREMENTS.values() for row in sensor.rows]
+    rows = [row for sensor in models.MEASUREMENTS.values() for row in sensor.rows]
     growing = [row.noise for row in rows if row.over_speed and f"{row.noise}_noise" not in reader]
     sds = NOISE | EXTRA_NOISE
     noise = {key.removesuffix("_noise"): reader.read_positive(key, sd) for key, sd in sds.items()}
     if forces:
         keys = zip(("force", "moment", "time"), DISTURBANCE.items(), strict=True)
         noise |= {short: reader.read_positive(key, default) for short, (key, default) in keys}
-    return noise, {name: noise[name] * COURSE_SPEED for name in growing}
+    return noise, {name: noise[name] * models.COURSE_SPEED for name in growing}
 
 
 def _parse_hdop_table(row: FilterDefinition, reader: _Reader) -> tuple[tuple[float, float], ...]:

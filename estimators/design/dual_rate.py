@@ -4,13 +4,11 @@ At fixed speed and ratio r, every rule of the paper is x_{k+i} = F x_{k+i-1} + H
 i = 0 .. r-1: B_i = L G_i with the gain L and the matrix G_i of the pseudo measurement (14).
 """
 
-from typing import Any
-
 import numpy as np
 
 from ...envs.record import Array
 from . import kalman
-from .kalman import compute_inverse, observer_gain
+from .kalman import Poles, compute_inverse, observer_gain
 
 RULES = ("predict", "hold", "oh", "pseudo")
 GAINS = ("constant", "from-29", "placed")
@@ -112,7 +110,7 @@ def compute_shares_29(F: Array, Q: Array, C: Array, R: Array, steps: int) -> Arr
 
 
 def compute_shares(
-    rule: str, gains: str, poles: Any, F: Array, Q: Array, C: Array, R: Array, steps: int
+    rule: str, gains: str, poles: Poles | None, F: Array, Q: Array, C: Array, R: Array, steps: int
 ) -> Array:
     """Compute B_i of a rule.
 

@@ -4,6 +4,7 @@ Shapes: P (n, n), C (p, n), R (p, p), y = C x + v (p,).
 """
 
 import numpy as np
+import numpy.typing as npt
 
 from ...envs.record import Array
 from ..core.record import FilterRecord
@@ -32,6 +33,7 @@ def check_covariance(name: str, M: Array, definite: bool = False) -> None:
 
 
 _RIDGE = 1e-3  # lambda of Tikhonov's inverse, in the square of a row's SI unit
+Poles = Array | npt.NDArray[np.complex128]
 INVERSES = ("moore-penrose", "p-weighted", "tikhonov", "bayes")
 
 
@@ -89,13 +91,10 @@ def compute_inverse(kind: str, C: Array, P: Array, R: Array) -> Array:
         Inverse, shape (n, p).
     """
     I, zero = np.eye(C.shape[1]), np.zeros((len(C), len(C)))  # noqa: E741
-    if kind == "moore-penrose":
-        return kalman_gain(I, C, zero)
-    if kind == "p-weighted":
-        return kalman_gain(P, C, zero)
-    if kind == "bayes":
-        return kalman_gain(P, C, R)
-    return kalman_gain(I, C, _RIDGE * np.eye(len(C)))
+    ridge = _RIDGE * np.eye(len(C))
+    kinds = {"moore-penrose": (I, zero), "p-weighted": (P, zero), "bayes": (P, R)}
+    weight, noise = kinds.get(kind, (I, ridge))
+    return kalman_gain(weight, C, noise)
 
 
 def transition_matrix(f: FilterRecord, G: Array) -> Array:
@@ -115,7 +114,7 @@ def transition_matrix(f: FilterRecord, G: Array) -> Array:
     return F
 
 
-def observer_gain(F: Array, C: Array, poles: Array) -> Array:
+def observer_gain(F: Array, C: Array, poles: Poles) -> Array:
     """Compute the gain K that gives (I - K C) F its poles.
 
     Args:

@@ -6,56 +6,37 @@ physical model ("dense"), the disturbances behind them decay by themselves.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from ...envs.record import FAST, PACKET, Array
+from ...envs.record import FAST, PACKET
 from ...envs.sensors.slow import SLOW, SLOW_NAMES
-from ...envs.vehicle.linear import make_roll_model
-from ...envs.vehicle.parameters import GRAVITY, Vehicle
+from ...envs.vehicle.parameters import Vehicle
 from ..core.model import FORCES, KINEMATIC, LATERAL, ROLL, VELOCITY_ROLL, YAW
-from ..core.record import CarIndex, FilterRecord
 
 COURSE_SPEED = 60.0 / 3.6  # m/s at which the receivers' course noise is quoted
 
 
 class MeasurementRow(NamedTuple):
-    """One value of a packet as a measurement: a sum of states.
-
-    Attributes:
-        states: Names of the states.
-        noise: Its standard deviation is the option `<noise>_noise`.
-        sd: That option's default, in the unit of the value.
-        angle: Whether the innovation is wrapped.
-        over_speed: Whether the default holds at `COURSE_SPEED` and grows as 1/V; the option holds
-            at every speed.
-        ground: Whether it is a direction over the ground, where psi is relative to the road.
-    """
+    """One value of a packet as a measurement: a sum of states."""
 
     states: tuple[str, ...]
-    noise: str
-    sd: float
-    angle: bool = False
-    over_speed: bool = False
-    ground: bool = False
+    noise: str  # its standard deviation is the option `<noise>_noise`
+    sd: float  # default of that option, in the unit of the value
+    angle: bool = False  # the innovation is wrapped
+    over_speed: bool = False  # the default holds at `COURSE_SPEED` and grows as 1/V; no option does
+    ground: bool = False  # a direction over the ground, where psi is relative to the road
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """A slow sensor as a filter sees it.
+    """A slow sensor as a filter sees it."""
 
-    Attributes:
-        rows: Sums of a bicycle's states, for the packet's first values.
-        velocities: Rows of a second layer, in their place.
-        heading_fix: Whether its first sample, where it is far off, sets psi.
-    """
-
-    rows: tuple[MeasurementRow, ...]
-    velocities: tuple[MeasurementRow, ...] = ()
-    heading_fix: bool = False
+    rows: tuple[MeasurementRow, ...]  # sums of a bicycle's states, for the packet's first values
+    velocities: tuple[MeasurementRow, ...] = ()  # rows of a second layer, in their place
+    heading_fix: bool = False  # its first sample, where it is far off, sets psi
 
 
 MEASUREMENTS: dict[str, Measurement] = {
@@ -130,27 +111,16 @@ FOREIGN_STATE = StateInfo("-", 0.0, 1e6)
 
 @dataclass(frozen=True)
 class FilterModel:
-    """States by name, what drives them and what is measured.
+    """States by name, what drives them and what is measured."""
 
-    Attributes:
-        kind: Code of `core.model`.
-        states: Names of the states that follow the model.
-        inputs: Names of `make_signals`.
-        fast: Names of `make_signals` that are measured in every row.
-        disturbances: Name of each state behind them and of the state that it pushes.
-        forces: Whether the disturbances are an Ornstein-Uhlenbeck force and moment instead.
-        late: States that lag behind the camera's (tie-vision (12)).
-        biases: Last states, names of `BIASES`.
-    """
-
-    kind: int
-    states: tuple[str, ...]
-    inputs: tuple[str, ...] = ("steer", "N_z")
-    fast: tuple[str, ...] = ("gyro",)
-    disturbances: tuple[tuple[str, str], ...] = ()
-    forces: bool = False
-    late: tuple[str, ...] = ()
-    biases: tuple[str, ...] = ()
+    kind: int  # code of `core.model`
+    states: tuple[str, ...]  # those that follow the model
+    inputs: tuple[str, ...] = ("steer", "N_z")  # names of `make_signals`
+    fast: tuple[str, ...] = ("gyro",)  # names of `make_signals` that are measured in every row
+    disturbances: tuple[tuple[str, str], ...] = ()  # states behind them, and what each one pushes
+    forces: bool = False  # disturbances are an Ornstein-Uhlenbeck force and moment instead
+    late: tuple[str, ...] = ()  # states that lag behind the camera's (tie-vision (12))
+    biases: tuple[str, ...] = ()  # last states, names of `BIASES`
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -191,9 +161,7 @@ MODELS: dict[str, FilterModel] = {
 }
 """Models other than the bicycle's, by name."""
 
-_EXPANSION_TIME = 0.004  # s between two expansions of the tyres' forces
-
-_LATE = {"psi": "psi_late", "y_l": "y_l_late"}
+LATE = {"psi": "psi_late", "y_l": "y_l_late"}
 
 Signal = tuple[tuple[int, float], tuple[int, float]]
 
@@ -213,8 +181,7 @@ def make_signals(vehicle: Vehicle) -> dict[str, Signal]:
         name: ((getattr(FAST, name), 1.0), (getattr(FAST, name), 0.0)) for name in single
     }
     table["N_z"] = ((FAST.torque_right, arm), (FAST.torque_left, -arm))
-    table["wheel"] = ((FAST.wheel_left, 0.5), (FAST.wheel_right, 0.5))
-    return table
+    return table | {"wheel": ((FAST.wheel_left, 0.5), (FAST.wheel_right, 0.5))}
 
 
 def select_states(sensors: tuple[str, ...]) -> tuple[str, ...]:
@@ -253,126 +220,8 @@ def make_bicycle_model(
     """
     states, walks = select_states(sensors), {"walk": _WALK, "walk-all": _WALK_ALL}
     lags = late and "camera" in sensors
-    late_states = tuple(_LATE[state] for state in states if lags and state in _LATE)
+    late_states = tuple(LATE[state] for state in states if lags and state in LATE)
     walking = tuple(pair for pair in walks.get(disturbances, ()) if pair[1] in states)
     inputs = ("steer", "N_z", "curvature") if "psi" in states else ("steer", "N_z")
     forces, states = disturbances == "forces", states + _BODY * body
     return FilterModel(LATERAL, states, inputs, fast, walking, forces, late_states, biases)
-
-
-def write_model(
-    f: FilterRecord,
-    model: FilterModel,
-    vehicle: Vehicle,
-    step: float,
-    noise: Mapping[str, float],
-    noise_over_speed: Mapping[str, float],
-    Q: Array,
-) -> None:
-    """Write the model and its measurements into a filter's memory.
-
-    Args:
-        f: Memory of the filter, written.
-        model: States, inputs and measurements.
-        vehicle: The filter's vehicle.
-        step: Step of the filter (s).
-        noise: `FilterConfig.noise`.
-        noise_over_speed: `FilterConfig.noise_over_speed`.
-        Q: Process noise per second on top of the forces', shape (n, n).
-    """
-    names, dense = model.names, len(model.states) + len(model.late)
-    n = len(names)
-    f.kind, f.n, f.total, f.dense, f.delayed = model.kind, n, n, dense, len(model.late)
-    f.forces = int(model.forces)
-    for j, (_, pushed) in enumerate(model.disturbances):
-        f.pushed[j] = names.index(pushed)
-    f.pushed[n - len(model.biases) - dense : n - dense] = -1
-    f.banked = names.index("bank") - dense if "bank" in model.biases else -1
-    f.rolling = names.index("phi") if model.kind == LATERAL and "phi" in names else 0
-    f.car[:] = [getattr(vehicle, name) for name in CarIndex._fields]
-    body = make_roll_model(vehicle)
-    f.roll_stiffness, f.roll_damping, f.roll_arm = -body.A[1, 0], -body.A[1, 1], body.B[1, 0]
-    f.sway = vehicle.roll_moment_arm / vehicle.mass
-    f.preview = vehicle.preview
-    f.step = step
-    f.Q[:n, :n] = Q * step
-    f.decay[:] = 1.0
-    if model.forces:  # exact discretisation of the process
-        decay = math.exp(-step / noise["time"])
-        f.decay[dense : dense + 2] = decay
-        f.Q[dense, dense] += (1.0 - decay * decay) * noise["force"] ** 2
-        f.Q[dense + 1, dense + 1] += (1.0 - decay * decay) * noise["moment"] ** 2
-        f.q_known[:], f.q_share = np.diag(f.Q)[dense : dense + 2], 1.0 - decay * decay
-    f.speed_state = names.index("v_x") if "v_x" in names else -1
-    _write_tyres(f, model, vehicle)
-    _write_signals(f, model, vehicle, noise)
-    _write_rows(f, model, noise, noise_over_speed)
-
-
-def _write_tyres(f: FilterRecord, model: FilterModel, vehicle: Vehicle) -> None:
-    """Write where the tyres' states stand and start: at the nominal ones."""
-    names = model.names
-    if TYRES[0] not in names:
-        return
-    f.tyres, f.grip = names.index(TYRES[0]), names.index(TYRES[2]) if TYRES[2] in names else 0
-    f.again = max(1, round(_EXPANSION_TIME / f.step))
-    f.stiffness[:] = 2.0 * vehicle.front_stiffness, 2.0 * vehicle.rear_stiffness
-    wheelbase = vehicle.front_arm + vehicle.rear_arm
-    arms = np.array([vehicle.rear_arm, vehicle.front_arm])
-    f.load[:] = vehicle.mass * GRAVITY * arms / wheelbase
-    f.first[f.tyres : f.tyres + 2] = 1.0
-    f.q_tyres[:2] = np.diag(f.Q)[f.tyres : f.tyres + 2]
-    if f.grip:
-        f.q_tyres[2] = f.Q[f.grip, f.grip]
-        f.first[f.grip] = 1.0 / vehicle.friction
-
-
-def _write_signals(
-    f: FilterRecord, model: FilterModel, vehicle: Vehicle, noise: Mapping[str, float]
-) -> None:
-    """Write inputs and fast measurements; `build_model` writes rows that depend on speed."""
-    table, names = make_signals(vehicle), model.names
-    f.inputs, f.fasts = len(model.inputs), len(model.fast)
-    for i, name in enumerate(model.inputs):
-        f.u_column[i], f.u_factor[i] = zip(*table[name], strict=True)
-    measured_state = {"gyro": "gamma", "roll_rate": "phi_rate", "wheel": "v_x"}
-    for i, name in enumerate(model.fast):
-        f.y_column[i], f.y_factor[i] = zip(*table[name], strict=True)
-        f.r_fast[i] = noise[name] ** 2
-        if name in measured_state:
-            f.C_fast[i, names.index(measured_state[name])] = 1.0
-    f.scaled = names.index(SCALE) if SCALE in model.biases else 0
-    for bias in filter(WANDER.get, model.biases):
-        f.C_fast[model.fast.index(BIASES[bias]), names.index(bias)] = 1.0
-    if model.kind == LATERAL and "accel_y" in model.fast:
-        f.accel_row = model.fast.index("accel_y")
-    if model.kind == FORCES:  # m a_y = F_yf + F_yr
-        f.C_fast[1, 1] = f.C_fast[1, 2] = 1.0 / vehicle.mass
-
-
-def _write_rows(
-    f: FilterRecord,
-    model: FilterModel,
-    noise: Mapping[str, float],
-    noise_over_speed: Mapping[str, float],
-) -> None:
-    """Write what the used slow sensors measure."""
-    used = [s for s in range(len(SLOW_NAMES)) if f.period[s] > 0]
-    f.first_slow = used[0] if used else -1
-    for s in used:
-        sensor = MEASUREMENTS[SLOW_NAMES[s]]
-        is_second_layer = model.kind == VELOCITY_ROLL
-        rows = sensor.velocities if is_second_layer else sensor.rows
-        f.rows[s], f.heading_fix[s] = len(rows), sensor.heading_fix and not is_second_layer
-        f.hdop_column[s] = find_packet_column(SLOW_NAMES[s], "hdop")
-        f.satellites_column[s] = find_packet_column(SLOW_NAMES[s], "satellites")
-        f.speed_column[s] = find_packet_column(SLOW_NAMES[s], "speed")
-        for i, row in enumerate(rows):
-            f.angle[s, i], f.ground[s, i] = row.angle, row.ground
-            f.r[s, i] = noise[row.noise] ** 2
-            f.noise_over_speed[s, i] = noise_over_speed.get(row.noise, 0.0) ** 2
-            for state in row.states:
-                late = _LATE.get(state)
-                f.C[s, i, model.names.index(late if late in model.late else state)] = 1.0
-        if is_second_layer:
-            f.r_speed = f.r[s, 0]

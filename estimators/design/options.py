@@ -86,19 +86,15 @@ class FilterConfig:
 
     Options, as `make_estimator` takes them
     ---------------------------------------
-    slow: the slow sensor to use (default: the first of the row's that is there). A filter with
-        gains "covariance" also takes several.
-    gains: "periodic" (precomputed for a schedule that repeats) or "covariance"; of dual-rate
-        "constant", "from-29" or "placed" (with poles).
+    slow: the slow sensor to use (default: the row's first that is there); several by "covariance".
+    gains: "periodic" (precomputed), "covariance"; of dual-rate "constant", "from-29" or "placed".
     delay: the rule for late samples, see `sideslip.estimators.core.innovation`: "clone" or "buffer"
         (exact), "larsen", "stored", "constant" (with assumed_delay, s), "literal", "lag", "ignore".
     between: of single-rate-kf, "hold" (default) or "predict" between its steps.
-    intersample: of double-layer "pseudo-residual" (default) or "predict"; of dual-rate "pseudo"
-        (default), "predict", "hold" or "oh".
-    inverse: the generalised inverse of the pseudo-residual rule, "moore-penrose", "p-weighted",
-        "tikhonov" or "bayes".
-    poles: negative numbers in rad/s, one for each state, where gains are placed: of the filter's
-        error, of dual-rate as `sideslip.estimators.DualRate` says.
+    intersample: of double-layer "pseudo-residual" or "predict"; of dual-rate "pseudo", "predict",
+        "hold" or "oh".
+    inverse: of the pseudo-residual rule, "moore-penrose", "p-weighted", "tikhonov" or "bayes".
+    poles: of placed gains, negative numbers in rad/s, one a state; of dual-rate see `DualRate`.
     disturbances: of a bicycle, "none", "walk" (d1 and d2 push beta and gamma), "walk-all" (d3
         pushes psi) or "forces" (an Ornstein-Uhlenbeck force and moment).
     leak: 1/s, by which disturbances decay on top of that.
@@ -113,28 +109,24 @@ class FilterConfig:
         `bias`, `accel_bias` or `bank`, a constant of this deviation that the sensor adds, or by
         which the road leans, the left side up; with q_bias, ... it walks, with bias_time, ... (s)
         above 0 it wanders about 0 with that deviation and forgets within that time.
-    q_beta, q_gamma, ...: process noise of a state per second, (unit)^2/s; or Q, (n, n) or (n,)
-        (default: of `tunings.toml`).
+    q_beta, q_gamma, ...: process noise per second, (unit)^2/s; or Q, (n, n) or (n,); tuned ones.
     gyro_noise (rad/s), psi_noise (rad), y_l_noise (m), course_noise (rad at every speed; default
         0.14 deg at 60 km/h growing as 1/V), accel_y_noise (m/s2), roll_rate_noise (rad/s),
         wheel_noise, gps_speed_noise (m/s): standard deviations.
-    hdop_table: pairs (HDOP, factor on the GPS's noise), linear in between; None for one noise at
-        every HDOP (default: the factor is the HDOP for double-layer, None for the others).
+    hdop_table: pairs (HDOP, factor on the GPS's noise), linear in between; None for one noise
+        (default of all but double-layer, where the factor is the HDOP).
     satellites: the least that a GPS fix needs (default 4).
     robust: standard deviations of an innovation from which it counts less (Huber); 0: none does.
-    steer_rate: rad/s; a steering angle that changes faster is skipped until the next row confirms
-        it; 0 (default of all but joint-robust): none is.
+    steer_rate: rad/s; a steering angle that changes faster waits for the next row; 0: none does.
     force_share, moment_share: fractions of the car's weight, and of that at half the wheelbase,
         that are added to force_sd and moment_sd, as variances (default 0).
     model_error: of joint, the fraction of the axles' forces by which its tyres err, added likewise.
-    accel_time: s; above 0 the accelerometer's noise is found while driving, over so long; then
-        `accel_y_noise` is the least.
-    members: of joint, the number of filters side by side, of which the least likely forgets the
-        tyres twice a second (default: one for each of `levels`).
-    levels: of joint, factors on force_sd and moment_sd, or pairs of one for each, which its members
-        take in turn; the likeliest counts most (default (1,)).
-    sudden: of joint, True runs four filters side by side that interact: nothing happens, a gust
-        blows, the tyres have just changed, they settle; then neither members nor levels.
+    accel_time: s over which the accelerometer's noise is found, from `accel_y_noise` up; 0: fixed.
+    members: of joint, filters side by side (default: one for each of `levels`), of which the least
+        likely forgets the tyres twice a second.
+    levels: of joint, factors on force_sd and moment_sd, or pairs, which members take in turn.
+    sudden: of joint, True runs four filters that interact, without members or levels: nothing
+        happens, a gust blows, the tyres have just changed, they settle.
     gate: a probability; a sample whose innovation is less likely than 1 - gate is skipped.
     wary: 0 is off (default; joint and joint-robust have 10). Above, with delay "clone" or "buffer":
         a packet that repeats the last one while the car moves is skipped; the gate is 1 - 1e-9
@@ -142,8 +134,8 @@ class FilterConfig:
         in a row that agree with each other the filter begins anew with the sensor.
     adapt: fraction of a new innovation in an R that follows them (0: R as configured).
     force_sd (N), moment_sd (N m), disturbance_time (s): of disturbances that are forces.
-    latency: s by which fast channels (steer, gyro, accel_x, accel_y, roll_rate, wheels) stand too
-        late in the record, {"gyro": 0.06}; "find" for one that joint finds while driving.
+    latency: s by which fast channels (steer, gyro, accel_x, accel_y, roll_rate, wheels) come late,
+        {"gyro": 0.06}; "find" for one that joint finds while driving.
     prior: standard deviations of states at the start, by state.
     allow_unstable: build a filter whose error grows.
     """

@@ -8,17 +8,16 @@ stands the upper half of the states' covariance after it.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 from ...envs.numerics.jit import jit
-from ...envs.numerics.primitives import Scalar, Vector, absolute, maximum
+from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum
 from ...envs.record import Array
-from ..core.covariance import update_with_clone, update_with_states
-from ..core.filter import reset_filter, reset_filters, run_tick
-from ..core.innovation import CLONE, DIRECT, DROPPED, DUAL_RATE, IGNORE, NONE, PSEUDO, find_clone
+from ..core.covariance import update_with_row
+from ..core.filter import reset_filters, run_tick
+from ..core.innovation import CLONE, DROPPED, DUAL_RATE, IGNORE, NONE, PSEUDO, find_clone
 from ..core.record import FilterRecord, FilterRecords, GainTables
 from .dual_rate import compute_shares, write_shares
 from .kalman import compute_inverse, observer_gain, transition_matrix
@@ -50,14 +49,10 @@ class Schedule:
     """Cycle of a slow sensor: frame i is captured at the step i `period`, arrives lags[i] later.
 
     A schedule without frames has one step.
-
-    Attributes:
-        period: Steps between two captures.
-        lags: Steps from the capture of each frame of the cycle to its arrival.
     """
 
-    period: int
-    lags: tuple[int, ...]
+    period: int  # steps between two captures
+    lags: tuple[int, ...]  # steps from the capture of each frame of the cycle to its arrival
 
     @property
     def cycle(self) -> int:
@@ -91,7 +86,7 @@ def _iterate_gains(
     s: int,
     lags: Vector,
     cycles: int,
-    table: Any,
+    table: Matrix,
     before: Vector,
     gains: GainTables,
 ) -> int:
@@ -101,7 +96,7 @@ def _iterate_gains(
     frame. lags (pattern,): steps from capture to arrival. s: the slow sensor, -1 for none.
     """
     f = filters[0]
-    reset_filter(f, 0)
+    reset_filters(filters, 0)
     n, N, cycle, width = f.n, f.total, f.cycle, maximum(f.fasts, 1)
     for cycle_index in range(cycles):
         change = 0.0
@@ -120,10 +115,7 @@ def _iterate_gains(
                 for i in range(N):
                     _copy_gain(f.P[i], before[i], N)
                 for i in range(f.rows[s]):
-                    if first == DIRECT:
-                        update_with_states(f, f.C[s, i], f.r[s, i], 0.0)
-                    else:
-                        update_with_clone(f, first + i, f.r[s, i], 0.0)
+                    update_with_row(f, s, i, first, f.r[s, i], 0.0)
                     to = table[1 + cycle * width + frame * f.rows[s] + i]
                     change = maximum(change, _copy_gain(f.gain, to, N))
             k = N
@@ -177,16 +169,7 @@ def design_gains(
     Returns:
         Table, shape (rows, columns), and the memory with the G and the C_fast of this speed.
     """
-    table, copy = _design_settled(f, schedule, speed, config)
     record: FilterRecord = np.array([f]).view(np.recarray)[0]
-    record.G[:], record.C_fast[:] = copy.G, copy.C_fast  # an accelerometer's row has the speed
-    return table, record
-
-
-def _design_settled(
-    f: FilterRecord, schedule: Schedule, speed: float, config: FilterConfig
-) -> tuple[Array, FilterRecord]:
-    """Design the table of gains on a copy of the filter's memory, which is returned too."""
     filters: FilterRecords = np.array([f])
     copy = filters.view(np.recarray)[0]
     copy.periodic = copy.measured = copy.origin = copy.joint = copy.between = 0
@@ -209,16 +192,18 @@ def _design_settled(
             _write_shares(copy, G, schedule, config, table)
         else:
             _write_placed_gains(copy, G, config.poles, table)
-        return table, copy
-    lags = np.array(schedule.lags, np.int64) * int(f.late == CLONE)
-    cycles = max(2, int(_MAX_RECURSION / float(copy.step)) // schedule.cycle)
-    before = np.zeros((int(f.total), int(f.total)))
-    _iterate_gains(filters, s, lags, cycles, table, before, np.zeros((1, 1, 1)))
-    if f.between == PSEUDO:
-        C = build_measurement_rows(f, 0)
-        R = np.diag([*copy.r_fast[: copy.fasts], *copy.r[s, : copy.rows[s]]])
-        _write_pseudo_gains(copy, schedule, table, compute_inverse(config.inverse, C, before, R))
-    return table, copy
+    else:
+        lags = np.array(schedule.lags, np.int64) * int(f.late == CLONE)
+        cycles = max(2, int(_MAX_RECURSION / float(copy.step)) // schedule.cycle)
+        before = np.zeros((int(f.total), int(f.total)))
+        _iterate_gains(filters, s, lags, cycles, table, before, np.zeros((1, 1, 1)))
+        if f.between == PSEUDO:
+            C = build_measurement_rows(f, 0)
+            R = np.diag([*copy.r_fast[: copy.fasts], *copy.r[s, : copy.rows[s]]])
+            inverse = compute_inverse(config.inverse, C, before, R)
+            _write_pseudo_gains(copy, schedule, table, inverse)
+    record.G[:], record.C_fast[:] = copy.G, copy.C_fast  # an accelerometer's row has the speed
+    return table, record
 
 
 def build_measurement_rows(f: FilterRecord, frame: int, lag: int = 1) -> Array:

@@ -5,14 +5,13 @@ spectral radius decides: above one the filter diverges; at one it has an unobser
 """
 
 import pickle
-from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
 
 from ...envs.record import Array
 from ..core.innovation import CLONE, CONSTANT, DUAL_RATE, PSEUDO, STORED
-from ..core.record import FilterRecord
+from ..core.record import FILTER, FilterRecord
 from .dual_rate import frame_map
 from .kalman import transition_matrix
 from .options import FilterConfig
@@ -55,21 +54,12 @@ def find_unobservable(M: Array, names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(directions)
 
 
-@dataclass(frozen=True)
-class _DesignKey:
-    """All that a table of gains depends on; `key` has all of it."""
-
-    key: bytes
-    f: FilterRecord = field(compare=False)
-    schedule: Schedule = field(compare=False)
-    speed: float = field(compare=False)
-    config: FilterConfig = field(compare=False)
-
-
 @lru_cache(maxsize=64)  # the same filter drives in many envs
-def _design_cached(task: _DesignKey) -> tuple[Array, Array]:
-    table, record = design_gains(task.f, task.schedule, task.speed, task.config)
-    return table, compute_error_map(record, table, task.schedule)
+def _design_cached(key: bytes) -> tuple[Array, Array]:
+    memory, schedule, speed, config = pickle.loads(key)
+    f = np.frombuffer(memory, FILTER).view(np.recarray)[0]
+    table, record = design_gains(f, schedule, speed, config)
+    return table, compute_error_map(record, table, schedule)
 
 
 def design_and_map(
@@ -86,8 +76,7 @@ def design_and_map(
     Returns:
         Table, shape (rows, columns), and map, see `compute_error_map`.
     """
-    key = pickle.dumps((f.tobytes(), schedule, speed, config))
-    return _design_cached(_DesignKey(key, f, schedule, speed, config))
+    return _design_cached(pickle.dumps((f.tobytes(), schedule, speed, config)))
 
 
 def compute_error_map(f: FilterRecord, table: Array, schedule: Schedule) -> Array:
@@ -107,11 +96,13 @@ def compute_error_map(f: FilterRecord, table: Array, schedule: Schedule) -> Arra
     size, s = int(f.total), int(f.first_slow)
     F = np.eye(size)
     F[: f.n, : f.n] = transition_matrix(f, f.G[: f.dense, : f.n])
-    if f.between == DUAL_RATE:
-        return _build_dual_rate_map(f, table, F, schedule)
+    rows = int(f.rows[s]) if s >= 0 else 0
+    if f.between == DUAL_RATE:  # from sample to sample, with the weights in the table
+        n, r, first = int(f.n), schedule.period, 1 + schedule.cycle + rows * len(schedule.lags)
+        B = table[first : first + r * rows, :n].reshape(r, rows, n).transpose(0, 2, 1)
+        return frame_map(F[:n, :n], f.C[s, :rows, :n], B)
     late = f.late in (STORED, CONSTANT) and s >= 0
     stored = max(schedule.lags) // schedule.period + 1 if late else 0  # the newest first
-    rows = int(f.rows[s]) if s >= 0 else 0
     n_errors = 2 if f.between == PSEUDO else 1
     width = n_errors * size + stored * rows
     total: Array = np.eye(width)
@@ -217,12 +208,3 @@ def _build_pseudo_correction(
     M[error, e] -= K[:, m:] @ C[m:]  # tie-vision (22)
     M[e, e] -= K @ C  # tie-vision (21)
     return M
-
-
-def _build_dual_rate_map(f: FilterRecord, table: Array, F: Array, schedule: Schedule) -> Array:
-    """Build the map from sample to sample, with the weights in the table."""
-    n, s, r = int(f.n), int(f.first_slow), schedule.period
-    q = int(f.rows[s])
-    first = 1 + schedule.cycle + q * len(schedule.lags)
-    B = table[first : first + r * q, :n].reshape(r, q, n).transpose(0, 2, 1)
-    return frame_map(F[:n, :n], f.C[s, :q, :n], B)

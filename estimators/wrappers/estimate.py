@@ -1,7 +1,8 @@
 """EstimateObservation: an estimator's states beside, or instead of, the raw observation."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+import functools
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, NoReturn
 
 import gymnasium as gym
@@ -25,6 +26,7 @@ from .truth import TRUTH, choose_vehicle, set_stiffness
 
 EstimatorSource = str | EstimatorFactory | EstimatorLike
 """What `EstimateObservation` takes for its estimator: a name, a factory or an object."""
+_Floats = npt.NDArray[np.float32]
 AnyEstimator = Estimator | ForeignEstimator
 _PARAMETERS = ("estimator", "outputs", "std", "replace", "vehicle", "options", "name")
 _ALLOWED_WRAPPERS = (PassiveEnvChecker, OrderEnforcing, TimeLimit)
@@ -45,7 +47,7 @@ class EstimatorSpec(NamedTuple):
     speed: float | None = None  # m/s where it is held
 
     @property
-    def design(self) -> Any:
+    def design(self) -> Hashable:
         """A key that is equal for specs that differ in the phases of their clocks alone."""
         clocks = [(name, dataclasses.replace(s, phase=0.0)) for name, s in self.sensors.items()]
         return self.vehicle, tuple(sorted(clocks)), self.speed
@@ -64,7 +66,7 @@ def make_spec(base: Any) -> EstimatorSpec:
 
 
 def build_estimator(
-    source: str | EstimatorFactory, options: Mapping[str, Any], dt: float, spec: EstimatorSpec
+    source: str | EstimatorFactory, options: Mapping[str, object], dt: float, spec: EstimatorSpec
 ) -> AnyEstimator:
     """Build an estimator for a spec by `make_estimator`.
 
@@ -111,10 +113,10 @@ class Arguments:
         std: bool,
         replace: bool,
         vehicle: VehicleSource | None,
-        options: Mapping[str, Any] | None,
+        options: Mapping[str, object] | None,
         name: str | None,
         slow_sensors: Mapping[str, SlowSensor],
-        misplaced: Mapping[str, Any],
+        misplaced: Mapping[str, object],
     ) -> None:
         source: Any = choose_estimator(slow_sensors) if estimator is None else estimator
         if misplaced:
@@ -132,37 +134,24 @@ class Arguments:
         recorded = source
         if _is_object(source):
             if vehicle is not None or self.options:
-                raise ValueError(
-                    f"{self.label} is built already: a vehicle and options go to a name or a "
-                    "factory"
-                )
-            self.source, self.object, recorded = None, source, _NotSerializable(self.label)
+                text = "is built already: a vehicle and options go to a name or a factory"
+                raise ValueError(f"{self.label} {text}")
+            self.source, self.object = None, source
+            recorded = functools.partial(_refuse_rebuild, self.label)
         elif not isinstance(source, str):
             recorded = find_entry_point(source) or source
         car = vehicle.to_dict() if isinstance(vehicle, Vehicle) else vehicle
-        self.recorded = {
-            "estimator": recorded,
-            "outputs": list(outputs),
-            "std": bool(std),
-            "replace": bool(replace),
-            "vehicle": dict(car) if isinstance(car, Mapping) else car,
-            "options": self.options,
-            "name": name,
-        }
+        car = dict(car) if isinstance(car, Mapping) else car
+        values = recorded, list(outputs), bool(std), bool(replace), car, self.options, name
+        self.recorded = dict(zip(_PARAMETERS, values, strict=True))
 
 
-class _NotSerializable:
-    """The place of an object in a spec: building from that spec raises the reason."""
-
-    def __init__(self, label: str) -> None:
-        self._label = label
-
-    def __call__(self, **_: Any) -> NoReturn:
-        """Refuse to be the factory that the spec would need."""
-        raise TypeError(
-            f"a spec cannot build {self._label} once more: it was passed as an object; pass its "
-            "class, a factory or a name"
-        )
+def _refuse_rebuild(label: str, **_: object) -> NoReturn:
+    """Raise the reason why a spec with an object cannot be built, in the place of a factory."""
+    raise TypeError(
+        f"a spec cannot build {label} once more: it was passed as an object; pass its class, a "
+        "factory or a name"
+    )
 
 
 def choose_estimator(slow_sensors: Iterable[str]) -> str:
@@ -177,16 +166,14 @@ def choose_estimator(slow_sensors: Iterable[str]) -> str:
     return "dakf" if "gps" in slow_sensors else "exact-kf"
 
 
-def _is_object(source: Any) -> bool:
+def _is_object(source: object) -> bool:
     """Return whether this is an estimator, well made or not, rather than what builds one."""
     if isinstance(source, str | type):
         return False
     return not callable(source) or hasattr(source, "step") or hasattr(source, "reset")
 
 
-class EstimateObservation(
-    gym.Wrapper[npt.NDArray[np.float32], Any, npt.NDArray[np.float32], Any], RecordConstructorArgs
-):
+class EstimateObservation(gym.Wrapper[_Floats, Any, _Floats, Any], RecordConstructorArgs):
     """Runs an estimator on the car's record and appends its states to the observation.
 
     It must be the innermost wrapper: the estimator sees every tick of every step. Others of its
@@ -228,15 +215,15 @@ class EstimateObservation(
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: gym.Env[_Floats, Any],
         estimator: EstimatorSource | None = None,
         outputs: Sequence[str] = ("beta", "gamma"),
         std: bool = True,
         replace: bool = False,
         vehicle: VehicleSource | None = None,
-        options: Mapping[str, Any] | None = None,
+        options: Mapping[str, object] | None = None,
         name: str | None = None,
-        **misplaced: Any,
+        **misplaced: object,
     ) -> None:
         self._base = find_base_env(env)
         clocks = self._base.slow_sensors
@@ -252,8 +239,7 @@ class EstimateObservation(
         self.outputs: Outputs = make_outputs(label, states, outputs, std, name, inner)
         self.layout: tuple[ObservationEntry, ...] = self.outputs.layout
         self.observation_space = make_space(self.layout)
-        self._width, self._title = len(self.layout), label if name is None else f"{label} ({name})"
-        self._summary = np.zeros(3)
+        self._title, self._summary = label if name is None else f"{label} ({name})", np.zeros(3)
 
     def _update_estimator(self) -> AnyEstimator:
         """Return the estimator for the env's present spec; that at hand where nothing changed."""
@@ -281,44 +267,59 @@ class EstimateObservation(
         if not isinstance(arguments.object, AnyEstimator):
             arguments.object = ForeignEstimator(arguments.object, arguments.label, dt, spec.sensors)
         elif abs(arguments.object.dt - dt) > 1e-9:
-            raise ValueError(
-                f"{arguments.label} was built for ticks of {arguments.object.dt:g} s, the env has "
-                f"{dt:g} s"
-            )
+            built = f"{arguments.label} was built for ticks of {arguments.object.dt:g} s"
+            raise ValueError(f"{built}, the env has {dt:g} s")
         estimator: AnyEstimator = arguments.object
         return estimator
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Reset the env, then the estimator with this episode's clocks, and take tick 0."""
+    ) -> tuple[_Floats, dict[str, Any]]:
+        """Reset the env, then the estimator with this episode's clocks, and take tick 0.
+
+        Args:
+            seed: Seed of the env, or None.
+            options: Options of the env's reset, or None.
+
+        Returns:
+            Observation and info.
+        """
         obs, info = self.env.reset(seed=seed, options=options)
         self._update_estimator().reset(self._base.slow_sensors)
         return self._append_estimates(obs, info), info
 
-    def step(self, action: Any) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
-        """Step the env; the estimator takes its record before the observation is made."""
+    def step(self, action: Any) -> tuple[_Floats, Any, bool, bool, dict[str, Any]]:
+        """Step the env; the estimator takes its record before the observation is made.
+
+        Args:
+            action: Action of the env.
+
+        Returns:
+            Observation, reward, terminated, truncated and info.
+        """
         obs, reward, terminated, truncated, info = self.env.step(action)
         return self._append_estimates(obs, info), reward, terminated, truncated, info
 
-    def get_state(self) -> dict[str, Any]:
+    def get_state(self) -> dict[str, object]:
         """Return a snapshot of the env and the estimator for `set_state`."""
         inner = self.env.get_wrapper_attr("get_state")()
         return {"env": inner, "estimator": self.estimator.get_state()}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments."""
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
         self._update_estimator().set_state(snapshot["estimator"])
 
-    def _append_estimates(
-        self, obs: npt.NDArray[np.float32], info: dict[str, Any]
-    ) -> npt.NDArray[np.float32]:
+    def _append_estimates(self, obs: _Floats, info: dict[str, Any]) -> _Floats:
         """Process the newest step; return the observation with its outputs, (width,)."""
         base, outputs, summary = self._base, self.outputs, self._summary
         estimator: Any = self.estimator
         inner = None if self._is_native else getattr(estimator, "inner", None)
-        out, rows, done = np.empty(self._width, np.float32), base.ticks_done, 0
+        out, rows, done = np.empty(len(self.layout), np.float32), base.ticks_done, 0
         record = base.rows, rows, base.packets, base.delivered
         layout_args = outputs.inner, outputs.plan, outputs.limits
         observe_args = obs, *layout_args, info["beta"], info["gamma"], out, summary
@@ -342,7 +343,7 @@ class EstimateObservation(
         return out
 
 
-def find_base_env(env: gym.Env[Any, Any]) -> Any:
+def find_base_env(env: gym.Env[_Floats, Any]) -> Any:
     """Find the base env, with no wrapper in between that may hide ticks from the estimator.
 
     Args:

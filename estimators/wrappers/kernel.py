@@ -9,7 +9,7 @@ from ...envs.numerics.functions import wrap
 from ...envs.numerics.jit import jit, noinline
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, maximum, minimum
 from ..core.filter import advance, compute_deviation, read_covariance
-from ..core.record import FILTER
+from ..core.record import FILTER, FilterRecord, GainTables
 from ..estimator import compile_call
 from ..learned.correction import EXAMPLE, apply_correction, filter_and_correct, remove_correction
 
@@ -21,7 +21,9 @@ def _clip_symmetric(value: Scalar, limit: Scalar) -> Scalar:
 
 
 @jit
-def _compute_nees(f: Any, gains: Any, i: int, j: int, beta: Scalar, gamma: Scalar) -> Scalar:
+def _compute_nees(
+    f: FilterRecord, gains: GainTables, i: int, j: int, beta: Scalar, gamma: Scalar
+) -> Scalar:
     """Compute e' P_e^-1 e / len(e), the NEES per state; 0 without states or for a singular P_e.
 
     e is the error of the states i and j, estimates of the true beta and gamma; -1: there is none.

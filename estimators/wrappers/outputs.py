@@ -61,13 +61,10 @@ def make_outputs(
             raise ValueError(f"{estimator} has no state {output!r}; it has: {', '.join(states)}")
     prefix = "" if name is None else f"{name}_"
     kinds = [STATES.get(s, FOREIGN_STATE) for s in outputs]
-    pairs = list(zip(outputs, kinds, strict=True))
-    hats = [
-        ObservationEntry(f"{prefix}{s}_hat", kind.unit, -kind.bound, kind.bound)
-        for s, kind in pairs
-    ]
-    stds = [ObservationEntry(f"{prefix}{s}_std", kind.unit, 0.0, kind.bound) for s, kind in pairs]
-    layout = (*inner, *hats, *(stds if std else ()))
+    layout = list(inner)
+    for ending, low in (("hat", -1.0), ("std", 0.0)) if std else (("hat", -1.0),):
+        for s, (unit, _, bound) in zip(outputs, kinds, strict=True):
+            layout.append(ObservationEntry(f"{prefix}{s}_{ending}", unit, low * bound, bound))
     names = [entry.name for entry in layout]
     duplicates = sorted({entry for entry in names if names.count(entry) > 1})
     if duplicates:
@@ -77,7 +74,7 @@ def make_outputs(
     keys = [("beta_hat", BETA), ("beta_std", STD)] if "beta" in states else []
     keys += [("nees", NEES)] if any(truths) else []
     return Outputs(
-        layout,
+        tuple(layout),
         len(inner),
         np.array(columns, np.int64).T.copy(),
         np.array([kind.bound for kind in kinds]).astype(np.float32).astype(np.float64),

@@ -17,6 +17,7 @@ from ...envs.vehicle.parameters import Vehicle
 from ..estimator import Estimator
 from ..protocol import ForeignEstimator
 
+_Floats = npt.NDArray[np.float32]
 TRUTH = "truth"  # in place of a vehicle: the one that is driven
 STIFFNESSES = ("front_stiffness", "rear_stiffness")
 _MAX_PARAMETER = 1e7  # bound of any parameter of a vehicle, SI
@@ -66,7 +67,7 @@ def make_truth_entries(
     return (*inner, *entries)
 
 
-def read_states(true_state: Any, states: Sequence[str]) -> npt.NDArray[np.float32]:
+def read_states(true_state: Array, states: Sequence[str]) -> _Floats:
     """Read true states, clipped to their bounds.
 
     Args:
@@ -115,9 +116,7 @@ def set_stiffness(estimator: Estimator | ForeignEstimator, vehicle: Vehicle) -> 
             f.car[4], f.car[5] = vehicle.front_stiffness, vehicle.rear_stiffness
 
 
-class TruthObservation(
-    gym.Wrapper[npt.NDArray[np.float32], Any, npt.NDArray[np.float32], Any], RecordConstructorArgs
-):
+class TruthObservation(gym.ObservationWrapper[_Floats, Any, _Floats], RecordConstructorArgs):
     """Appends parameters of the true car, as they are at the reset, and true states.
 
     No sensor measures these: it makes the oracles with which others are compared
@@ -132,7 +131,7 @@ class TruthObservation(
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: gym.Env[_Floats, Any],
         parameters: Sequence[str] = STIFFNESSES,
         states: Sequence[str] = (),
     ) -> None:
@@ -146,28 +145,43 @@ class TruthObservation(
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """Reset the env and read its car; see `gymnasium.Env.reset`."""
+    ) -> tuple[_Floats, dict[str, Any]]:
+        """Reset the env and read its car.
+
+        Args:
+            seed: Seed of the env, or None.
+            options: Options of the env's reset, or None.
+
+        Returns:
+            Observation and info.
+        """
         obs, info = self.env.reset(seed=seed, options=options)
         base: Any = self.unwrapped
         self._values[:] = [getattr(base.vehicle, name) for name in self._parameters]
-        return self._append_truth(obs), info
+        return self.observation(obs), info
 
-    def _append_truth(self, obs: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def observation(self, observation: _Floats) -> _Floats:
+        """Append parameters and states.
+
+        Args:
+            observation: Observation of the env, float32, shape (inner,).
+
+        Returns:
+            Observation of the wrapper, float32, shape (len(layout),).
+        """
         base: Any = self.unwrapped
         states = [read_states(base.true_state, self._states)] if self._states else []
-        return np.concatenate([obs, self._values, *states])
+        return np.concatenate([observation, self._values, *states])
 
-    def step(self, action: Any) -> tuple[npt.NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
-        """Step the env; see `gymnasium.Env.step`."""
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        return self._append_truth(obs), reward, terminated, truncated, info
-
-    def get_state(self) -> dict[str, Any]:
+    def get_state(self) -> dict[str, object]:
         """Return a snapshot of the env and the parameters for `set_state`."""
         return {"env": self.env.get_wrapper_attr("get_state")(), "values": self._values.copy()}
 
     def set_state(self, snapshot: Mapping[str, Any]) -> None:
-        """Restore a snapshot of this env or of one built with the same arguments."""
+        """Restore a snapshot of this env or of one built with the same arguments.
+
+        Args:
+            snapshot: Result of `get_state`.
+        """
         self.env.get_wrapper_attr("set_state")(snapshot["env"])
         self._values = snapshot["values"].copy()

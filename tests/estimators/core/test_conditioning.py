@@ -16,15 +16,8 @@ from tests.estimators.dense import GYRO, Posterior, arrivals, inputs, speeds
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
 PRIOR = {"beta": 0.02, "gamma": 0.05, "psi": 0.05, "y_l": 0.3, "F_d": 50.0, "N_d": 20.0}
-PRIOR |= {
-    "d1": 0.1,
-    "d2": 1.0,
-    "phi": 0.02,
-    "phi_rate": 0.05,
-    "bias": 0.01,
-    "accel_bias": 0.2,
-    "bank": 0.02,
-}
+PRIOR |= {"d1": 0.1, "d2": 1.0, "phi": 0.02, "phi_rate": 0.05}
+PRIOR |= {"bias": 0.01, "accel_bias": 0.2, "bank": 0.02}
 INERTIAL = ("gyro", "accel_y", "roll_rate")
 HDOP = ((1.0, 1.0), (2.0, 1.5), (5.0, 4.0))
 EXACT = 1e-10  # of the posterior's standard deviation
@@ -51,13 +44,8 @@ class Case:
         told: Any = {"slow": list(self.sensors), "dt": self.dt, "gains": "covariance"}
         if self.Q:
             told["Q"] = self.Q
-        return make_estimator(
-            self.name,
-            sensors=self.sensors,
-            speed=self.speed,
-            delay=delay,
-            **(told | self.options),
-        )
+        told |= {"sensors": self.sensors, "speed": self.speed, "delay": delay}
+        return make_estimator(self.name, **(told | self.options))
 
     def schedule(self, seed: int, clock: bool = True) -> Log:
         """A record and clocks of their own."""
@@ -88,46 +76,32 @@ class Case:
         )
 
 
+BOTH = {"camera": CAMERA, "gps": GPS}
+QUICK = {
+    "camera": SlowSensor(0.007, (0.003,), 0.0, 0.015),
+    "gps": SlowSensor(0.011, (0.0,), 0, 0.03),
+}
+ACCEL: dict[str, Any] = {"fast": INERTIAL[:2]}
+BIASES = {"bias_sd": 0.01, "accel_bias_sd": 0.2, "bank_sd": 0.02}
 CASES = {
-    "forces, camera and gps": Case("exact-kf", {"camera": CAMERA, "gps": GPS}, 7.0),
+    "forces, camera and gps": Case("exact-kf", BOTH, 7.0),
     "forces, camera": Case("exact-kf", {"camera": CAMERA}, 3.0),
     "forces, gps": Case("exact-kf", {"gps": FAST_GPS}, 15.0),
     "forces, both, measured speed": Case("exact-kf", {"camera": CAMERA, "gps": FAST_GPS}),
-    "forces at 1 ms": Case(
-        "exact-kf",
-        {
-            "camera": SlowSensor(0.007, (0.003,), 0.0, 0.015),
-            "gps": SlowSensor(0.011, (0.0,), 0, 0.03),
-        },
-        7.0,
-        dt=0.001,
-        rows=100,
-    ),
+    "forces at 1 ms": Case("exact-kf", QUICK, 7.0, dt=0.001, rows=100),
     "none, camera": Case("multirate-kf", {"camera": CAMERA}, 7.0, (3e-3, 2e-2, 1e-4, 1e-4)),
-    "none, both": Case(
-        "multirate-kf", {"camera": CAMERA, "gps": GPS}, 12.0, (3e-3, 2e-2, 0.0, 0.0)
-    ),
+    "none, both": Case("multirate-kf", BOTH, 12.0, (3e-3, 2e-2, 0.0, 0.0)),
     "none, vision alone": Case("vision-only-kf", {"camera": CAMERA}, None, (3e-3, 2e-2, 0.0, 0.0)),
     "walk, gps": Case("dakf", {"gps": GPS}, 7.0, (4e-4, 4e-4, 1e-8, 3e-2, 0.2)),
     "accelerometer, roll rate, bias": Case(
-        "exact-kf",
-        {"camera": CAMERA, "gps": GPS},
-        7.0,
-        options={
-            "fast": ["gyro", "accel_y", "roll_rate"],
-            "bias_sd": 0.01,
-            "accel_bias_sd": 0.2,
-            "bank_sd": 0.02,
-        },
+        "exact-kf", BOTH, 7.0, options={"fast": INERTIAL} | BIASES
     ),
-    "accelerometer, measured speed": Case(
-        "exact-kf", {"camera": CAMERA}, options={"fast": ["gyro", "accel_y"]}
-    ),
+    "accelerometer, measured speed": Case("exact-kf", {"camera": CAMERA}, options=dict(ACCEL)),
     "roll rate, gps": Case("exact-kf", {"gps": FAST_GPS}, 12.0, options={"fast": INERTIAL[::2]}),
     "no disturbance, accelerometer's bias": Case(
         "exact-kf",
         {"camera": CAMERA},
-        options={"fast": ["gyro", "accel_y"], "accel_bias_sd": 0.2, "disturbances": "none"},
+        options=ACCEL | {"accel_bias_sd": 0.2, "disturbances": "none"},
     ),
     "bias, gps": Case("exact-kf", {"gps": FAST_GPS}, options={"bias_sd": 0.01, "bank_sd": 0.02}),
     "walk, accelerometer, bias": Case(

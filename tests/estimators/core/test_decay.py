@@ -15,6 +15,8 @@ from sideslip.envs.record import FAST_WIDTH, PACKET_WIDTH
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.sensors.slow import SLOW_NAMES
 from sideslip.estimators import FILTERS, Estimator, UnobservableWarning, make_estimator
+from sideslip.estimators.design.dual_rate import RULES
+from sideslip.estimators.design.kalman import INVERSES
 from sideslip.estimators.design.stability import MARGINAL
 from tests.estimators.simulation import CAMERA, GPS
 
@@ -53,17 +55,14 @@ def case(name: str, clock: SlowSensor | None, **options: Any) -> Any:
 def defaults() -> list[Any]:
     """Every filter with every slow sensor that it prefers."""
     clocks = {"": None, "camera": CAMERA, "gps": GPS}
-    cases = [
-        (name, sensor)
+    left_out = ("constant-delay-kf", "joint", "joint-robust")  # joint: its tyres are nonlinear
+    return [
+        case(name, clocks[sensor])
         for name, row in FILTERS.items()
-        for sensor in row.slow or ("",)
-        if name
-        not in ("constant-delay-kf", "joint", "joint-robust")  # joint: its tyres make it nonlinear
+        for sensor in (row.slow or ("",) if name not in left_out else ())
     ]
-    return [case(name, clocks[sensor]) for name, sensor in cases]
 
 
-SLOWER = [-3.0, -4.0, -5.0]
 VARIANTS = [
     *(case("multirate-kf", ALTERNATING, delay=rule) for rule in ("ignore", "stored", "lag")),
     *(case("multirate-kf", ALTERNATING, delay=rule) for rule in ("clone", "literal")),
@@ -73,25 +72,24 @@ VARIANTS = [
     case("single-rate-kf", ALTERNATING, between="predict"),
     case("constant-delay-kf", CAMERA, assumed_delay=0.020),
     case("uneven-delay-kf", PAPERS),
-    *(
-        case("multirate-residual-kf", CAMERA, inverse=rule)
-        for rule in ("p-weighted", "tikhonov", "bayes")
-    ),
+    *(case("multirate-residual-kf", CAMERA, inverse=each) for each in INVERSES[1:]),
     case("exact-kf", THREE_UNDER_WAY),
     case("exact-kf", THREE_UNDER_WAY, gains="periodic"),
     case("exact-kf", PAPERS, gains="periodic"),
     case("dakf", GPS, leak=2.0),
     case("double-layer", GPS, intersample="predict"),
     *(
-        case("dual-rate", GPS, disturbances="none", intersample=rule)
-        for rule in ("pseudo", "predict", "hold", "oh")
-    ),
-    *(
-        case("dual-rate", GPS, disturbances="none", intersample=rule, gains="placed", poles=SLOWER)
-        for rule in ("pseudo", "predict", "hold", "oh")
+        case("dual-rate", GPS, disturbances="none", intersample=rule, **placed)
+        for placed in ({}, {"gains": "placed", "poles": [-3.0, -4.0, -5.0]})
+        for rule in RULES
     ),
     case("dual-rate", GPS, disturbances="none", gains="from-29"),
     case("dual-rate", GPS, gains="from-29"),
+    # a prediction is stored for a period or longer
+    case("constant-delay-kf", CAMERA),
+    case("uneven-delay-kf", SlowSensor(0.033, (0.040,))),
+    case("uneven-delay-kf", SlowSensor(0.033, (0.070, 0.010))),
+    case("multirate-kf", SlowSensor(0.033, (0.060, 0.090)), delay="stored"),
 ]
 
 
@@ -100,12 +98,8 @@ def frames(sensor: str, clock: SlowSensor, ticks: int) -> np.ndarray:
     captured = np.arange(0, ticks, round(1e3 * clock.period))
     delays = np.resize(np.round(1e3 * np.array(clock.delays)), len(captured))
     packets = np.zeros((len(captured), PACKET_WIDTH))
-    packets[:, 0], packets[:, 1], packets[:, 2] = (
-        SLOW_NAMES.index(sensor),
-        captured,
-        captured + delays,
-    )
-    packets[:, 3], packets[:, 4] = 1.0, np.arange(len(captured))
+    header = SLOW_NAMES.index(sensor), captured, captured + delays, 1.0, np.arange(len(captured))
+    packets[:, :5] = np.column_stack(np.broadcast_arrays(*header))
     packets = packets[np.argsort(packets[:, 2], kind="stable")]
     return packets[packets[:, 2] < ticks]
 
@@ -163,20 +157,6 @@ def shrinks(case: Case) -> None:
     assert filter_.spectral_radius <= 1.0 + MARGINAL
     found = decay(filter_)
     assert agrees(found, filter_.spectral_radius), (found, filter_.spectral_radius)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "case",
-    [
-        case("constant-delay-kf", CAMERA),
-        case("uneven-delay-kf", SlowSensor(0.033, (0.040,))),
-        case("uneven-delay-kf", SlowSensor(0.033, (0.070, 0.010))),
-        case("multirate-kf", SlowSensor(0.033, (0.060, 0.090)), delay="stored"),
-    ],
-)
-def test_so_it_does_where_a_prediction_is_stored_for_a_period_or_longer(case: Case) -> None:
-    shrinks(case)
 
 
 @quietly

@@ -1,6 +1,5 @@
 """The rules for late samples that are not exact, written out slowly."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -99,83 +98,24 @@ def held_residuals(log: Any, age: Any) -> Any:
 
 
 @pytest.mark.plain
-def test_stored_compares_a_sample_with_the_prediction_of_its_capture() -> None:
+@pytest.mark.parametrize(
+    ("age", "options"),
+    [
+        (lambda packet: int(packet[2] - packet[1]), {"delay": "stored"}),
+        (lambda packet: 17, {"delay": "constant", "assumed_delay": 0.017}),
+    ],
+    ids=["stored", "constant"],
+)
+def test_a_sample_meets_the_prediction_of_its_capture_or_of_an_assumed_one(
+    age: Any, options: Any
+) -> None:
     log = simulate(QUICK, {"camera": UNEVEN}, 3)
     filter_ = make_estimator(
-        "multirate-kf", sensors=log.slow, speed=V, gains="covariance", delay="stored", **Q
+        "multirate-kf", sensors=log.slow, speed=V, gains="covariance", **options, **Q
     )
-    found = filter_.run(log)
-    x, std = held_residuals(log, lambda packet: int(packet[2] - packet[1]))
+    found, (x, std) = filter_.run(log), held_residuals(log, age)
     np.testing.assert_allclose(found.x, x, rtol=0.0, atol=1e-11)
     np.testing.assert_allclose(found.std, std, rtol=1e-8)
-
-
-@pytest.mark.plain
-def test_constant_compares_it_with_the_prediction_of_an_assumed_one() -> None:
-    log = simulate(QUICK, {"camera": UNEVEN}, 3)
-    filter_ = make_estimator(
-        "multirate-kf",
-        sensors=log.slow,
-        speed=V,
-        gains="covariance",
-        delay="constant",
-        assumed_delay=0.017,
-        **Q,
-    )
-    x, std = held_residuals(log, lambda packet: 17)
-    found = filter_.run(log)
-    np.testing.assert_allclose(found.x, x, rtol=0.0, atol=1e-11)
-    np.testing.assert_allclose(found.std, std, rtol=1e-8)
-
-
-def test_samples_are_as_far_apart_as_their_delays_make_them() -> None:
-    """uneven-delay (16): T_smp = T_l - T_d^{i-1} + T_d^i is between two arrivals; a filter that
-    goes by the stamps is nowhere told of it, and its estimates jump there."""
-    log = simulate(QUICK, {"camera": UNEVEN}, 3)
-    told = [0.020, 0.015, 0.010, 0.025]
-    arrived = log.record.packets[:, PACKET.arrived]
-    expected = [0.033 - told[(i - 1) % 4] + told[i % 4] for i in range(1, len(arrived))]
-    np.testing.assert_allclose(np.diff(arrived) * 0.001, expected, atol=1e-12)
-
-
-# literal, lag: tie-vision (12)-(13) at every step
-@pytest.mark.plain
-@pytest.mark.parametrize("rule", ["literal", "lag"])
-def test_late_states_that_follow_at_every_step(rule: Any) -> None:
-    """literal: psi_bar_{k+1} = psi_k (12) at T = 1 ms, a delay of 1 ms. lag: psi_bar follows psi
-    as a first-order lag of the camera's mean delay."""
-    log = simulate(QUICK, {"camera": UNEVEN}, 4)
-    mean = (0.020 + 0.015 + 0.010 + 0.025) / 4.0
-    follow = 1.0 if rule == "literal" else 1.0 - math.exp(-0.001 / mean)
-    G, H = make_vision_model(COMS, V).discretise(0.001)
-    G_a = np.zeros((6, 6))  # (13)
-    G_a[:4, :4] = G
-    G_a[4, 2] = G_a[5, 3] = follow
-    G_a[4, 4] = G_a[5, 5] = 1.0 - follow
-    H_a = np.vstack([H[:, :2], np.zeros((2, 2))])
-    C_a = np.zeros((3, 6))
-    C_a[0, 1] = C_a[1, 4] = C_a[2, 5] = 1.0
-    R = np.diag([0.005**2, 3.5e-3**2, 0.02**2])
-    x, P = np.zeros(6), np.diag([0.02**2, 0.05**2, 0.05**2, 0.3**2, 0.05**2, 0.3**2])
-    noise = np.diag([*np.diag(NOISE), 0.0, 0.0])
-    due = {int(packet[PACKET.arrived]): packet for packet in log.record.packets}
-    states, stds = [], []
-    for k, row in enumerate(log.record.fast):
-        if k > 0:
-            x, P = G_a @ x + H_a @ [row[FAST.steer], 0.0], G_a @ P @ G_a.T + noise
-        used = [0, 1, 2] if k in due else [0]
-        y = np.array([row[FAST.gyro], *(due[k][5:7] if k in due else ())])
-        C = C_a[used]
-        K = P @ C.T @ np.linalg.inv(C @ P @ C.T + R[np.ix_(used, used)])
-        x, P = x + K @ (y - C @ x), (np.eye(6) - K @ C) @ P
-        states.append(x)
-        stds.append(np.sqrt(np.diag(P)))
-    found = make_estimator(
-        "multirate-kf", sensors=log.slow, speed=V, gains="covariance", delay=rule, **Q
-    ).run(log)
-    assert found.names[4:] == ("psi_late", "y_l_late")
-    np.testing.assert_allclose(found.x, np.array(states), rtol=0.0, atol=1e-11)
-    np.testing.assert_allclose(found.std, np.array(stds), rtol=1e-7)
 
 
 @pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")

@@ -118,35 +118,6 @@ def test_late_courses_that_set_the_heading_set_it_alike() -> None:
     assert abs(clone["psi"][-1] - log.truth["psi"][-1] - 2.0) < 0.05
 
 
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        ("multirate-kf", {"gains": "periodic", "gate": 0.99}),
-        ("multirate-kf", {"gains": "periodic", "adapt": 0.02}),
-        ("multirate-residual-kf", {"gate": 0.99}),
-        ("double-layer", {"gate": 0.99}),
-        ("dual-rate", {"adapt": 0.1}),
-        ("lob", {"gate": 0.5}),
-    ],
-)
-def test_a_gate_needs_the_covariance(name: Any, options: Any) -> None:
-    sensors = {"camera": SlowSensor(0.033, (0.030,)), "gps": SlowSensor(0.2)}
-    with pytest.raises(ValueError, match=f"{name}: gate, adapt.* need gains='covariance'"):
-        make_estimator(name, sensors=sensors, speed=7.0, **options)
-
-
-@pytest.mark.parametrize("gate", [0.0, 1.0, -0.5, 2.0, float("nan")])
-def test_a_gate_is_a_probability(gate: Any) -> None:
-    with pytest.raises(ValueError, match="gate is a probability between 0 and 1, got"):
-        told_the_truth(gate=gate)
-
-
-@pytest.mark.parametrize("adapt", [-0.1, 1.0, float("nan")])
-def test_adapt_is_a_share(adapt: Any) -> None:
-    with pytest.raises(ValueError, match="adapt is a share from 0 to 1, got"):
-        told_the_truth(adapt=adapt)
-
-
 def scales(filter_: Any, log: Any) -> Any:
     """The scales of the camera's R, (k, 2), after every 100 ticks."""
     filter_.prepare_record(log)

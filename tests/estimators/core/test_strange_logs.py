@@ -75,14 +75,6 @@ def test_the_scale_of_the_accelerometer_is_found(wrong: float) -> None:
     assert errors[0] < 0.9 * errors[1]
 
 
-def test_a_scale_needs_tyres_and_an_accelerometer() -> None:
-    _, log = drive()
-    with pytest.raises(ValueError, match="accel_scale_sd needs tyres"):
-        built("exact-kf", log, fast=["gyro", "accel_y"], accel_scale_sd=0.1)
-    with pytest.raises(ValueError, match="accel_scale_sd needs accel_y among fast"):
-        built("joint", log, accel_scale_sd=0.1)
-
-
 def test_tyres_are_expanded_every_row_of_a_slow_log() -> None:
     """Every 4 ms, or every row where rows are further apart."""
     _, log = drive()

@@ -230,26 +230,3 @@ def test_a_bank_step_by_step_and_from_a_snapshot_is_the_same(options: dict[str, 
         parts.step(record.fast[rows], record.packets[start:end])
         start = end
     np.testing.assert_array_equal(parts.x, expected[k + 6])
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"front_tyres_sd": 0.0}, "another tyre's state"),
-        ({"front_tyres_sd": 0.0, "rear_tyres_sd": 0.0, "members": 2}, "members is 1 where tyres"),
-        ({"members": 0}, "from 1 to 8"),
-        ({"members": 2.5}, "from 1 to 8"),
-        ({"rear_tyres_sd": -1.0}, "not negative"),
-        ({"levels": (0.5, -1.0)}, "positive factors or pairs"),
-        ({"levels": [[0.5, 1.0, 2.0]]}, "positive factors or pairs"),
-        ({"levels": 2.0}, "a member each"),
-        ({"levels": (0.5, 1.0), "disturbances": "walk"}, "a member each"),
-        ({"levels": (0.5, 1.0, 2.0), "members": 2}, "a member each"),
-        ({"sudden": True, "members": 2}, "no members or levels"),
-        ({"sudden": True, "delay": "buffer"}, "delay='clone'"),
-    ],
-)
-def test_bad_options(options: dict[str, Any], message: str) -> None:
-    base, ((log, _), *_) = drives(1)
-    with pytest.raises(ValueError, match=message):
-        built(base, log, **options)

@@ -35,6 +35,10 @@ def built(base: Any, log: Log, **options: Any) -> Estimator:
     return make_estimator("joint", **held, slow=list(log.slow), **options)
 
 
+def with_packets(log: Log, packets: Array) -> Log:
+    return dataclasses.replace(log, record=dataclasses.replace(log.record, packets=packets))
+
+
 def spoilt(log: Log, spoil: Callable[[Array], None], sensor: int, end: int = TO) -> Log:
     """The log with some packets (count, PACKET_WIDTH) of a sensor changed."""
     packets = log.record.packets.copy()
@@ -43,7 +47,7 @@ def spoilt(log: Log, spoil: Callable[[Array], None], sensor: int, end: int = TO)
     chosen = packets[mine]
     spoil(chosen)
     packets[mine] = chosen
-    return dataclasses.replace(log, record=dataclasses.replace(log.record, packets=packets))
+    return with_packets(log, packets)
 
 
 def lose(packets: Array) -> None:
@@ -148,9 +152,8 @@ def test_a_first_course_that_is_turned_is_found_out(delay: str, members: int) ->
     base, (log, *_) = drives("gps")
     packets = log.record.packets.copy()
     packets[:3, VALUE] += np.pi
-    record = dataclasses.replace(log.record, packets=packets)
     filter_ = built(base, log, delay=delay, members=members)
-    run = filter_.run(dataclasses.replace(log, record=record))
+    run = filter_.run(with_packets(log, packets))
     assert filter_.gated == 9
     assert abs(run["psi"][-1] - log.truth["psi"][-1]) < 0.05
     errors = (run["beta"] - log.truth["beta"])[4000:] / run.std[4000:, 0]
@@ -161,8 +164,7 @@ def test_a_member_that_refuses_a_sample_is_no_likelier_for_it() -> None:
     """One sample beyond both gates costs either member as much as its gate."""
     base, (log, *_) = drives("gps")
     filter_ = built(base, log, members=2)
-    record = dataclasses.replace(log.record, packets=log.record.packets[:-1])
-    filter_.run(dataclasses.replace(log, record=record))
+    filter_.run(with_packets(log, log.record.packets[:-1]))
     packet = log.record.packets[-1].copy()
     assert packet[ARRIVED] <= filter_.tick
     packet[VALUE] += 2.0
@@ -190,13 +192,12 @@ def test_a_receiver_whose_rounded_course_repeats_is_not_stuck() -> None:
     """It sends a position as well; a packet with one number alone may repeat it."""
     base, (log, *_) = drives("gps")
     packets = log.record.packets.copy()
-    packets[:, VALUE] = 0.0
     filter_ = built(base, log)
-    filter_.run(dataclasses.replace(log, record=dataclasses.replace(log.record, packets=packets)))
-    assert filter_.stuck == 0
-    packets[:, VALUE + 1 :] = np.nan
-    filter_.run(dataclasses.replace(log, record=dataclasses.replace(log.record, packets=packets)))
-    assert filter_.stuck == 0
-    packets[:, VALUE + 1] = 5.0
-    filter_.run(dataclasses.replace(log, record=dataclasses.replace(log.record, packets=packets)))
-    assert filter_.stuck == len(packets) - 1
+    for columns, value, stuck in (
+        (VALUE, 0.0, 0),
+        (slice(VALUE + 1, None), np.nan, 0),
+        (VALUE + 1, 5.0, len(packets) - 1),
+    ):
+        packets[:, columns] = value
+        filter_.run(with_packets(log, packets))
+        assert filter_.stuck == stuck

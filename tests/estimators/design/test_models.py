@@ -21,6 +21,7 @@ from sideslip.envs.vehicle.parameters import COMS, PASSENGER_CAR
 from sideslip.estimators import make_estimator
 from sideslip.estimators.core.model import build_model, discretise
 from sideslip.estimators.design.models import make_signals
+from tests.estimators.filters.literal import car
 from tests.estimators.simulation import CAMERA, GPS
 
 STEPS = (0.001, 0.01, 0.033, 0.1, 0.2)
@@ -53,20 +54,14 @@ def test_below_walking_pace_the_model_stays() -> None:
 def test_dakf_is_the_papers_discrete_model() -> None:
     """dakf-stability (5)-(17), written out."""
     V, T_c = 25.0 / 3.6, 0.001
-    m, I_z, l_f, l_r, C_f, C_r = 380.0, 136.08, 0.8, 0.6, 10000.0, 10000.0
-    A_n = np.array(
-        [
-            [-2 * (C_f + C_r) / (m * V), -1 - 2 * (C_f * l_f - C_r * l_r) / (m * V**2), 0],  # (10)
-            [-2 * (C_f * l_f - C_r * l_r) / I_z, -2 * (C_f * l_f**2 + C_r * l_r**2) / (I_z * V), 0],
-            [0, 1, 0],
-        ]
-    )
-    B_n = np.array([[2 * C_f / (m * V), 0], [2 * C_f * l_f / I_z, 1 / I_z], [0, 0]])  # (11)
+    stiff = COMS.replace(front_stiffness=10000.0, rear_stiffness=10000.0)
+    assert (COMS.mass, COMS.yaw_inertia, COMS.front_arm, COMS.rear_arm) == (380, 136.08, 0.8, 0.6)
+    A, B = car(V, stiff)
+    A_n, B_n = A[:3, :3], B[:3]  # (10), (11)
     D_n = np.array([[1.0, 0], [0, 1], [0, 0]])  # (7)
     grid = (np.arange(50) + 0.5) * T_c / 50
     integral = sum(expm(A_n * t) for t in grid) * T_c / 50  # (13)
     A_nd, B_nd, D_nd = expm(A_n * T_c), integral @ B_n, integral @ D_n
-    stiff = COMS.replace(front_stiffness=C_f, rear_stiffness=C_r)
     with pytest.warns(UserWarning, match="cannot see"):
         filter_ = make_estimator("dakf", vehicle=stiff, sensors={"gps": GPS}, speed=V)
     f = filter_.filters[0]

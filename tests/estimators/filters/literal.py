@@ -82,6 +82,40 @@ def settled(step: Any, period: int, size: int, cycles: int = 3000) -> Any:
     return gains
 
 
+def stationary(G: Any, C: Any, Q: Any, R: Any) -> Any:
+    """The settled gain of a filter that measures at every step."""
+
+    def step(_: Any, P: Any) -> Any:
+        P = G @ P @ G.T + Q
+        K = gain(P, C, R)
+        return (np.eye(len(G)) - K @ C) @ P, K
+
+    return settled(step, 1, len(G))[0]
+
+
+def ackermann(G: Any, C: Any, poles: Any) -> Any:
+    """K of one output with the poles of (I - K C) G, z-plane: Ackermann's formula on (G, C G)."""
+    n = len(G)
+    wanted = np.eye(n)
+    for pole in poles:
+        wanted = wanted @ (G - pole * np.eye(n))
+    seen = np.vstack([C @ np.linalg.matrix_power(G, i + 1) for i in range(n)])
+    return wanted @ np.linalg.inv(seen)[:, -1:]
+
+
+def observer(log: Any, G: Any, H: Any, C: Any, K: Any, u: Any, y: Any, D: Any = None) -> Any:
+    """x_k = G x + H u, then + K (y - C x - D u); u, y: of a fast row, or their columns."""
+    u_of, y_of = (each if callable(each) else lambda row, at=each: row[at] for each in (u, y))
+    x: Any = np.zeros(len(G))
+    wanted: Any = []
+    for k, row in enumerate(log.record.fast):
+        if k > 0:
+            x = G @ x + H @ u_of(row)
+        x = x + K @ (y_of(row) - C @ x - (0.0 if D is None else D @ u_of(row)))
+        wanted.append(x)
+    return np.array(wanted)
+
+
 def excited(log: Any) -> Any:
     """The same log with motor torques, so that N_z matters."""
     t = np.arange(len(log.record.fast)) * T

@@ -9,18 +9,9 @@ from scipy.signal import place_poles
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.vehicle.parameters import COMS
 from sideslip.estimators import make_estimator
-from tests.estimators.filters.literal import (
-    COURSE,
-    T,
-    car,
-    correct,
-    due,
-    excited,
-    inputs,
-    pushed,
-    zoh,
-)
 from tests.estimators.simulation import FIG6, GPS, simulate
+
+from .literal import COURSE, T, ackermann, car, correct, due, excited, inputs, observer, pushed, zoh
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
@@ -70,42 +61,18 @@ def test_the_kalman_filters_through_an_outage(name: Any, walks: Any) -> None:
     np.testing.assert_allclose(found.std, wanted[:, n:], rtol=1e-7)
 
 
-def observer(log: Any, A: Any, B: Any, C: Any, K: Any, u_of: Any, y_of: Any, D: Any = 0.0) -> Any:
-    """x_k = A x + B u, then + K (y - C x - D u)."""
-    G, H = zoh(A, B)
-    x: Any = np.zeros(len(A))
-    wanted: Any = []
-    for k, row in enumerate(log.record.fast):
-        u = u_of(row)
-        if k > 0:
-            x = G @ x + H @ u
-        x = x + K @ (y_of(row) - C @ x - D @ u)
-        wanted.append(x)
-    return wanted
-
-
 @pytest.mark.plain
 def test_the_linear_observer_has_its_poles_where_they_were_placed() -> None:
     """LOB [5]: gamma and a_y = V (beta' + gamma); two outputs of two states leave one gain."""
     log, A, B = log_of(1), A_3[:2, :2], B_3[:2]
     C = np.array([[0.0, 1.0], [V * A[0, 0], V * (A[0, 1] + 1.0)]])
     D = np.array([[0.0, 0.0], [V * B[0, 0], V * B[0, 1]]])
-    G, _ = zoh(A, B)
+    G, H = zoh(A, B)
     K = (np.eye(2) - np.exp(-2.0 * T) * np.linalg.inv(G)) @ np.linalg.inv(C)
     np.testing.assert_allclose(np.linalg.eigvals((np.eye(2) - K @ C) @ G), np.exp(-2.0 * T))
-    wanted = observer(log, A, B, C, K, inputs, lambda row: row[[FAST.gyro, FAST.accel_y]], D)
+    wanted = observer(log, G, H, C, K, inputs, [FAST.gyro, FAST.accel_y], D)
     found = make_estimator("lob", speed=V).run(log)
     np.testing.assert_allclose(found.x, wanted, rtol=0.0, atol=1e-9)
-
-
-def ackermann(G: Any, C: Any, poles: Any) -> Any:
-    """K of one output with the poles of (I - K C) G, z-plane: Ackermann's formula on (G, C G)."""
-    n = len(G)
-    wanted = np.eye(n)
-    for pole in poles:
-        wanted = wanted @ (G - pole * np.eye(n))
-    seen = np.vstack([C @ np.linalg.matrix_power(G, i + 1) for i in range(n)])
-    return wanted @ np.linalg.inv(seen)[:, -1:]
 
 
 @pytest.mark.plain
@@ -114,13 +81,12 @@ def test_the_yaw_moment_observer() -> None:
     log, I_z = log_of(2), COMS.yaw_inertia
     A, B = np.array([[0.0, 1.0 / I_z], [0.0, 0.0]]), np.array([[1.0 / I_z], [0.0]])
     C = np.array([[1.0, 0.0]])
-    K = ackermann(zoh(A, B)[0], C, np.exp(np.array([-20.0, -25.0]) * T))
-    wanted = observer(
-        log, A, B, C, K, lambda row: inputs(row)[1:], lambda row: row[[FAST.gyro]], np.zeros((1, 1))
-    )
+    G, H = zoh(A, B)
+    K = ackermann(G, C, np.exp(np.array([-20.0, -25.0]) * T))
+    wanted = observer(log, G, H, C, K, lambda row: inputs(row)[1:], [FAST.gyro])
     found = make_estimator("yaw-moment-observer", speed=V).run(log)
     scale = np.array([1.0, I_z])
-    np.testing.assert_allclose(found.x / scale, np.array(wanted) / scale, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(found.x / scale, wanted / scale, rtol=0.0, atol=1e-9)
 
 
 def test_the_lateral_force_observer() -> None:
@@ -130,24 +96,15 @@ def test_the_lateral_force_observer() -> None:
     A[0, 1:] = COMS.front_arm / I_z, -COMS.rear_arm / I_z
     B = np.array([[1.0 / I_z], [0.0], [0.0]])
     C = np.array([[1.0, 0.0, 0.0], [0.0, 1.0 / m, 1.0 / m]])
-    G, _ = zoh(A, B)
+    G, H = zoh(A, B)
     poles = np.exp(np.array([-20.0, -25.0, -30.0]) * T)
     K = place_poles(G.T, (C @ G).T, poles).gain_matrix.T
     reached = np.linalg.eigvals((np.eye(3) - K @ C) @ G)
     np.testing.assert_allclose(np.sort(reached), np.sort(poles), rtol=1e-9)
-    wanted = observer(
-        log,
-        A,
-        B,
-        C,
-        K,
-        lambda row: inputs(row)[1:],
-        lambda row: row[[FAST.gyro, FAST.accel_y]],
-        np.zeros((2, 1)),
-    )
+    wanted = observer(log, G, H, C, K, lambda row: inputs(row)[1:], [FAST.gyro, FAST.accel_y])
     found = make_estimator("lateral-force-observer", speed=V).run(log)
     scale = np.array([1.0, m, m])
-    np.testing.assert_allclose(found.x / scale, np.array(wanted) / scale, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(found.x / scale, wanted / scale, rtol=0.0, atol=1e-8)
 
 
 def test_the_force_observer_finds_the_forces() -> None:

@@ -10,20 +10,23 @@ from sideslip.envs.sensors.link import SlowSensor
 from sideslip.envs.vehicle.parameters import COMS, GRAVITY
 from sideslip.estimators import make_estimator
 from sideslip.estimators.design.periodic import NO_SENSOR, design_gains
-from tests.estimators.filters.literal import (
+from tests.estimators.simulation import FIG6, GPS, simulate
+
+from .literal import (
     COURSE,
     T,
+    ackermann,
     car,
     correct,
     due,
     excited,
     gain,
     inputs,
+    observer,
     pushed,
-    settled,
+    stationary,
     zoh,
 )
-from tests.estimators.simulation import FIG6, GPS, simulate
 
 pytestmark = pytest.mark.filterwarnings("ignore::sideslip.estimators.UnobservableWarning")
 
@@ -238,18 +241,8 @@ def test_the_roll_filter() -> None:
     G, H = zoh(A, np.array([[0.0], [COMS.sprung_mass * COMS.roll_arm / I_x]]))
     C, r, Q = np.array([[0.0, 1.0]]), np.array([[0.005**2]]), np.diag([1e-4, 1e-2]) * T
 
-    def step(_: Any, P: Any) -> Any:
-        P = G @ P @ G.T + Q
-        K = gain(P, C, r)
-        return (np.eye(2) - K @ C) @ P, K
-
-    K, x = settled(step, 1, 2)[0], np.zeros(2)
-    wanted: Any = []
-    for k, row in enumerate(log.record.fast):
-        if k > 0:
-            x = G @ x + H @ row[[FAST.accel_y]]
-        x = x + K @ (row[[FAST.roll_rate]] - C @ x)
-        wanted.append(x)
+    K = stationary(G, C, Q, r)
+    wanted = observer(log, G, H, C, K, [FAST.accel_y], [FAST.roll_rate])
     filter_ = make_estimator("roll-kf", vehicle=told, speed=V, q_phi=1e-4, q_phi_rate=1e-2)
     np.testing.assert_allclose(filter_.run(log).x, wanted, rtol=0.0, atol=1e-10)
 
@@ -260,20 +253,13 @@ def test_the_two_state_observer() -> None:
     A, B = (M[:2, :2] for M in car(V))
     G, H = zoh(A, B)
     C, poles = np.array([[0.0, 1.0]]), np.exp(np.array([-60.0, -120.0]) * T)
-    wanted_poly = (G - poles[0] * np.eye(2)) @ (G - poles[1] * np.eye(2))
-    K = wanted_poly @ np.linalg.inv(np.vstack([C @ G, C @ G @ G]))[:, -1:]  # Ackermann
+    K = ackermann(G, C, poles)
     reached = np.linalg.eigvals((np.eye(2) - K @ C) @ G)
     np.testing.assert_allclose(np.sort(reached), np.sort(poles), rtol=1e-9)
     filter_ = make_estimator("lob-2", speed=V)
     table, _ = design_gains(filter_.filters[0], NO_SENSOR, V, filter_.config)
     np.testing.assert_allclose(table[1, :2], K[:, 0], rtol=1e-9)
-    x: Any = np.zeros(2)
-    wanted: Any = []
-    for k, row in enumerate(log.record.fast):
-        if k > 0:
-            x = G @ x + H @ inputs(row)
-        x = x + K @ (row[[FAST.gyro]] - C @ x)
-        wanted.append(x)
+    wanted = observer(log, G, H, C, K, inputs, [FAST.gyro])
     np.testing.assert_allclose(filter_.run(log).x, wanted, rtol=0.0, atol=1e-10)
 
 

@@ -10,8 +10,9 @@ from sideslip.envs.record import PACKET
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import DualRate, make_estimator
 from sideslip.estimators.design.dual_rate import compute_shares, frame_map
-from tests.estimators.filters.literal import COURSE, T, car, due, excited, gain, inputs, pushed, zoh
 from tests.estimators.simulation import FIG6, simulate
+
+from .literal import COURSE, T, car, due, excited, gain, inputs, pushed, zoh
 
 pytestmark = [
     pytest.mark.plain,
@@ -260,25 +261,13 @@ def test_course_alone(rule: Any, gains: Any) -> None:
 
 
 def test_course_alone_with_placed_poles() -> None:
-    poles = (-2.0, -3.0, -4.0)
-    filter_ = make_estimator(
-        "dual-rate",
-        sensors={"gps": COURSE_10_HZ},
-        speed=V,
-        gains="placed",
-        poles=poles,
-        disturbances="none",
-        intersample="hold",
-    )
+    poles = (-2.0, -3.0, -4.0, -5.0, -6.0, -7.0)
+    placed: dict[str, Any] = {"sensors": {"gps": COURSE_10_HZ}, "speed": V, "gains": "placed"}
+    three = {"poles": poles[:3], "disturbances": "none", "intersample": "hold"}
+    filter_ = make_estimator("dual-rate", **placed, **three)
     assert filter_.spectral_radius == pytest.approx(np.exp(-2.0 * 0.1), rel=1e-6)
     with pytest.raises(ValueError, match="cannot be placed"):
-        make_estimator(
-            "dual-rate",
-            sensors={"gps": COURSE_10_HZ},
-            speed=V,
-            gains="placed",
-            poles=(-2.0, -3.0, -4.0, -5.0, -6.0, -7.0),
-        )
+        make_estimator("dual-rate", poles=poles, **placed)
 
 
 def test_literal_gains_from_29_make_the_error_grow() -> None:

@@ -93,35 +93,44 @@ def drive(env: Any, rows: int, steps: int, estimator: str, **options: Any) -> An
     return [np.array([info[key] for info in infos]) for key in ("beta", "beta_hat")]
 
 
-@pytest.mark.parametrize("scenario", ["random-steering", "slalom"])
-def test_the_accelerometer_halves_the_error_of_beta(scenario: str) -> None:
-    """On the plant with Fiala's tyres and a body that rolls, told the nominal car."""
-    errors = []
-    for fast in (["gyro"], ["gyro", "accel_y"]):
-        beta, found = drive(scenario, 24, 600, "exact-kf", slow=["camera", "gps"], fast=fast)
-        errors.append(np.median(np.sqrt(np.mean((found - beta)[200:] ** 2, 0))))
-    assert errors[1] < 0.5 * errors[0], errors
+def spread(error: Any) -> Any:
+    return np.median(np.sqrt(np.mean(error**2, 0)))
 
 
-def test_an_accelerometers_bias_is_no_sideslip_to_the_filter_that_has_a_state_for_it() -> None:
-    """A bias of 0.3 m/s2 costs a filter that believes its accelerometer most of its accuracy."""
-    scenario = {"base": "random-steering", "duration": 6.0, "noise": {"accel_y_bias": 0.3}}
+GYRO, ACCEL = ({"slow": ["camera", "gps"], "fast": INERTIAL[:n]} for n in (1, 2))
+STEERING = {"base": "random-steering", "duration": 6.0}
+
+
+@pytest.mark.parametrize(
+    ("scenario", "less", "more", "score"),
+    [
+        # on the plant with Fiala's tyres and a body that rolls, told the nominal car
+        ("random-steering", GYRO, ACCEL, spread),
+        ("slalom", GYRO, ACCEL, spread),
+        # a bias of 0.3 m/s2 costs a filter that believes its accelerometer most of its accuracy
+        (
+            STEERING | {"noise": {"accel_y_bias": 0.3}},
+            ACCEL,
+            ACCEL | {"accel_bias_sd": 0.3},
+            spread,
+        ),
+        # a crossfall of 0.03 all along leaves the mean of beta's error to a filter without a state
+        (
+            STEERING | {"bank": 0.03, "curve_start": -100.0},
+            ACCEL | {"bank_sd": 0.0},
+            ACCEL | {"bank_sd": 0.03},
+            lambda error: abs(np.mean(error)),
+        ),
+    ],
+    ids=["accelerometer", "accelerometer, slalom", "accelerometer's bias", "road's bank"],
+)
+def test_a_sensor_or_a_state_for_it_halves_the_error_of_beta(
+    scenario: Any, less: Any, more: Any, score: Any
+) -> None:
     errors = []
-    for more in ({}, {"accel_bias_sd": 0.3}):
-        options: Any = {"slow": ["camera", "gps"], "fast": ["gyro", "accel_y"], **more}
+    for options in (less, more):
         beta, found = drive(scenario, 24, 600, "exact-kf", **options)
-        errors.append(np.median(np.sqrt(np.mean((found - beta)[200:] ** 2, 0))))
-    assert errors[1] < 0.5 * errors[0], errors
-
-
-def test_a_banks_sideslip_is_seen_by_the_filter_that_has_a_state_for_it() -> None:
-    """A crossfall of 0.03 all along leaves the mean of beta's error to a filter without one."""
-    scenario = {"base": "random-steering", "duration": 6.0, "bank": 0.03, "curve_start": -100.0}
-    errors = []
-    for sd in (0.0, 0.03):
-        options: Any = {"slow": ["camera", "gps"], "fast": ["gyro", "accel_y"], "bank_sd": sd}
-        beta, found = drive(scenario, 24, 600, "exact-kf", **options)
-        errors.append(abs(np.mean((found - beta)[200:])))
+        errors.append(score((found - beta)[200:]))
     assert errors[1] < 0.5 * errors[0], errors
 
 

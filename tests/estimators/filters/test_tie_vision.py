@@ -8,18 +8,9 @@ import pytest
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator
-from tests.estimators.filters.literal import (
-    T,
-    car,
-    correct,
-    due,
-    excited,
-    gain,
-    inputs,
-    settled,
-    zoh,
-)
 from tests.estimators.simulation import CAMERA, FIG7, simulate
+
+from .literal import T, car, correct, due, excited, gain, inputs, observer, settled, stationary, zoh
 
 V = FIG7.speed
 QUICK = type(FIG7)(duration=0.5)
@@ -58,37 +49,31 @@ def log_of(seed: Any) -> Any:
 @pytest.mark.plain
 def test_the_bicycle_filter_knows_the_gyro_alone() -> None:
     """VI.A: beta and gamma of (1)-(2) with the stationary gain."""
-    log, C, r = log_of(0), np.array([[0.0, 1.0]]), R[:1, :1]
-    A, B = car(V)
+    log, C, (A, B) = log_of(0), np.array([[0.0, 1.0]]), car(V)
     G, H = zoh(A[:2, :2], B[:2])
-
-    def step(_: Any, P: Any) -> Any:
-        P = G @ P @ G.T + NOISE[:2, :2] * T
-        K = gain(P, C, r)
-        return (np.eye(2) - K @ C) @ P, K
-
-    K = settled(step, 1, 2)[0]
-    x: Any = np.zeros(2)
-    wanted: Any = []
-    for k, row in enumerate(log.record.fast):
-        if k > 0:
-            x = G @ x + H @ inputs(row)
-        x = x + K @ (row[[FAST.gyro]] - C @ x)
-        wanted.append(x)
+    K = stationary(G, C, NOISE[:2, :2] * T, R[:1, :1])
+    wanted = observer(log, G, H, C, K, inputs, [FAST.gyro])
     found = make_estimator("bicycle-kf", speed=V, q_beta=2e-3, q_gamma=2e-2).run(log)
     np.testing.assert_allclose(found.x, wanted, rtol=0.0, atol=1e-11)
 
 
-FOLLOW = {"clone": None, "literal": 1.0, "lag": 1.0 - np.exp(-T / 0.030)}
+UNEVEN = SlowSensor(0.033, (0.020, 0.015, 0.010, 0.025))
 
 
 @pytest.mark.plain
-@pytest.mark.parametrize("delay", FOLLOW)
-def test_multirate_with_delayed_states(delay: Any) -> None:
+@pytest.mark.parametrize(
+    ("delay", "share", "camera"),
+    [
+        ("clone", None, CAMERA),
+        ("literal", 1.0, UNEVEN),  # psi_bar_{k+1} = psi_k at T = 1 ms, a delay of 1 ms
+        ("lag", 1.0 - np.exp(-T / 0.0175), UNEVEN),  # a first-order lag of the mean delay
+    ],
+)
+def test_multirate_with_delayed_states(delay: Any, share: Any, camera: Any) -> None:
     """(12)-(13), (16) at 1 ms as a Kalman filter on six states, for each reading of (12)."""
-    log, at = log_of(0), due(simulate(QUICK, {"camera": CAMERA}, 0))
-    share = FOLLOW[delay]
-    x, P = np.zeros(6), PRIOR.copy()
+    log = excited(simulate(QUICK, {"camera": camera}, 0))
+    at, n = due(log), 4 if share is None else 6
+    x, P = np.zeros(6), PRIOR + (0.0 if share is None else np.diag([0, 0, 0, 0, 0.05**2, 0.3**2]))
     wanted: Any = []
     for k, row in enumerate(log.record.fast):
         if k > 0:
@@ -98,15 +83,14 @@ def test_multirate_with_delayed_states(delay: Any) -> None:
         measured = [0, 1, 2] if k in at else [0]  # (16): between frames the gyro alone
         y = np.array([row[FAST.gyro], *(at[k][5:7] if k in at else ())])
         x, P = correct(x, P, C_A[measured], R[np.ix_(measured, measured)], y)
-        wanted.append(np.concatenate([x[:4], np.sqrt(np.diag(P)[:4])]))
-    late: dict[str, Any] = {} if share is None else {"prior": {"psi_late": 0.0, "y_l_late": 0.0}}
+        wanted.append([x[:n], np.sqrt(np.diag(P)[:n])])
     filter_ = make_estimator(
-        "multirate-kf", sensors=log.slow, speed=V, gains="covariance", delay=delay, **late, **Q
+        "multirate-kf", sensors=log.slow, speed=V, gains="covariance", delay=delay, **Q
     )
-    found = filter_.run(log)
-    wanted = np.array(wanted)
-    np.testing.assert_allclose(found.x[:, :4], wanted[:, :4], rtol=0.0, atol=1e-10)
-    np.testing.assert_allclose(found.std[:, :4], wanted[:, 4:], rtol=1e-7)
+    found, (states, stds) = filter_.run(log), np.array(wanted).swapaxes(0, 1)
+    assert found.names[4:] == ("psi_late", "y_l_late")[: n - 4]
+    np.testing.assert_allclose(found.x, states, rtol=0.0, atol=1e-11)
+    np.testing.assert_allclose(found.std, stds, rtol=1e-7)
 
 
 def frame_step(k: Any, P: Any) -> Any:

@@ -8,18 +8,9 @@ import pytest
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.sensors.link import SlowSensor
 from sideslip.estimators import make_estimator
-from tests.estimators.filters.literal import (
-    T,
-    car,
-    correct,
-    due,
-    excited,
-    gain,
-    inputs,
-    settled,
-    zoh,
-)
 from tests.estimators.simulation import CAMERA, FIG7, simulate
+
+from .literal import T, car, correct, due, excited, gain, inputs, settled, zoh
 
 V = FIG7.speed
 UNEVEN = SlowSensor(period=0.033, delays=(0.020, 0.015, 0.010, 0.025))  # Fig. 4

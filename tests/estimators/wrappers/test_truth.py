@@ -155,20 +155,3 @@ def test_given_the_truth_the_filter_knows_its_error() -> None:
         means.append(np.mean(nees[100:]))
     error = np.std(means, ddof=1) / len(means) ** 0.5
     assert abs(np.mean(means) - 1.0) < 3.0 * error < 0.3
-
-
-def test_bad_input() -> None:
-    env = gym.make(FUSION)
-    with pytest.raises(ValueError, match="no parameter 'colour'; it has: mass"):
-        TruthObservation(env, ["colour"])
-    with pytest.raises(ValueError, match="no true state 'mood'; there is: beta"):
-        TruthObservation(env, [], ["mood"])
-    with pytest.raises(ValueError, match="true_mass would stand twice"):
-        TruthObservation(TruthObservation(env, ["mass"]), ["mass"])
-    with pytest.raises(ValueError, match="beta_hat would stand twice"):
-        TruthObservation(EstimateObservation(env, "exact-kf"), [], ["beta"])
-    with pytest.raises(TypeError, match="has no layout"):
-        VectorTruthObservation(SyncVectorEnv([lambda: gym.make(FUSION)]))
-    rows = gym.make_vec(FUSION, num_envs=2, autoreset_mode="SameStep")
-    with pytest.raises(ValueError, match="true states need autoreset_mode"):
-        VectorTruthObservation(rows, [], ["beta"])
