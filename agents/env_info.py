@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+import numpy.typing as npt
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
@@ -14,10 +15,13 @@ from ..envs.task import ObservationEntry, make_space
 from ..envs.validation import short_repr
 from ..envs.vehicle.parameters import Vehicle
 
+CarEnv = gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]
+CarVectorEnv = VectorEnv[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[Any]]
+
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
-    AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any] | VecEnv
+    AnyEnv = CarEnv | CarVectorEnv | VecEnv
 else:
     AnyEnv = Any  # stable-baselines3 comes with an extra, and needs a second to load
 
@@ -76,7 +80,7 @@ class EnvView:
     single_action_space: gym.Space[Any]
 
     @classmethod
-    def from_env(cls, env: VectorEnv[Any, Any, Any]) -> "EnvView":
+    def from_env(cls, env: CarVectorEnv) -> "EnvView":
         """Make the view of a vector env.
 
         Args:
@@ -114,7 +118,7 @@ class EnvView:
         return self.facts.nominal
 
 
-def make_env(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
+def make_env(env_id: str, options: Mapping[str, Any]) -> CarEnv:
     """Make the env of an id, with the env's own short message for a missing or unknown argument.
 
     Args:
@@ -261,7 +265,7 @@ def _check_wrappers(env: Any, layout: tuple[ObservationEntry, ...]) -> None:
         )
 
 
-def get_layout(env: VectorEnv[Any, Any, Any]) -> tuple[ObservationEntry, ...]:
+def get_layout(env: CarVectorEnv) -> tuple[ObservationEntry, ...]:
     """Read the layout of the outermost layer that has one, else that of the sub-environments.
 
     Args:

@@ -10,19 +10,26 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 from zipfile import BadZipFile, ZipFile
 
 import gymnasium as gym
 import numpy as np
 
 from ...envs.numerics import require_extra
+from ...envs.record import Array
 from ...envs.task import ObservationEntry, make_space
 from ...estimators.learned.forward import ACTIVATIONS, RecurrentCell
 from ...estimators.learned.network import SUFFIX, Network
 from ...estimators.wrappers.estimate import EstimateObservation
-from ..env_info import AnyEnv, get_env_facts
+from ..env_info import AnyEnv, CarEnv, get_env_facts
 from ..learned.policy import Card, Policy, save_policy
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.policies import BasePolicy
+    from stable_baselines3.common.vec_env import VecNormalize
+    from torch import Tensor, nn
 
 _NEEDED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
 _MEMBERS = {"data", "policy.pth"}
@@ -30,7 +37,9 @@ _NORMALISER = "vecnormalize.pkl"
 _PRIOR = 1e-4  # samples that a VecNormalize starts with, of mean 0 and variance 1
 
 
-def convert_sb3_policy(model: Any, normaliser: Any = None, history: int = 1) -> Network:
+def convert_sb3_policy(
+    model: "BaseAlgorithm | BasePolicy", normaliser: "VecNormalize | None" = None, history: int = 1
+) -> Network:
     """Convert the deterministic actor of a model to a network; scale 0: an entry never varied.
 
     Args:
@@ -80,19 +89,16 @@ def convert_sb3_policy(model: Any, normaliser: Any = None, history: int = 1) -> 
 class _Actor(NamedTuple):
     """The actor of a policy; `squashed`: whether tanh follows its layers."""
 
-    layers: list[Any]
+    layers: list["nn.Module"]
     squashed: bool
-    extractor: Any
-    recurrent: Any = None
+    extractor: "nn.Module"
+    recurrent: "nn.RNNBase | None" = None
 
 
 def _find_on_policy_actor(policy: Any) -> _Actor:
-    layers = [*policy.mlp_extractor.policy_net, policy.action_net]
-    return _Actor(layers, bool(policy.squash_output), policy.pi_features_extractor)
-
-
-def _find_recurrent_actor(policy: Any) -> _Actor:
-    return _find_on_policy_actor(policy)._replace(recurrent=policy.lstm_actor)
+    layers, squashed = [*policy.mlp_extractor.policy_net, policy.action_net], policy.squash_output
+    recurrent = getattr(policy, "lstm_actor", None)
+    return _Actor(layers, bool(squashed), policy.pi_features_extractor, recurrent)
 
 
 def _find_gru_actor(policy: Any) -> _Actor:
@@ -115,7 +121,7 @@ _ACTORS: dict[str, Callable[[Any], _Actor]] = {
     "stable_baselines3.sac.policies.SACPolicy": _find_gaussian_actor,
     "stable_baselines3.td3.policies.TD3Policy": _find_deterministic_actor,
     "sb3_contrib.tqc.policies.TQCPolicy": _find_gaussian_actor,
-    "sb3_contrib.common.recurrent.policies.RecurrentActorCriticPolicy": _find_recurrent_actor,
+    "sb3_contrib.common.recurrent.policies.RecurrentActorCriticPolicy": _find_on_policy_actor,
     f"{__package__}.gradient.GruPolicy": _find_gru_actor,
 }
 """Readers of actors by the policy's class; a subclass may compute anything and is none of them."""
@@ -130,7 +136,7 @@ def _find_actor_reader(kind: type) -> Callable[[Any], _Actor]:
     return _ACTORS[name]
 
 
-def _convert_cells(module: Any) -> list[RecurrentCell]:
+def _convert_cells(module: "nn.RNNBase | None") -> list[RecurrentCell]:
     """Convert the cells of torch's GRU or LSTM; none for a policy without them."""
     if module is None:
         return []
@@ -144,7 +150,7 @@ def _convert_cells(module: Any) -> list[RecurrentCell]:
     return cells
 
 
-def _to_array(parameter: Any) -> Any:
+def _to_array(parameter: "Tensor") -> Array:
     return parameter.detach().cpu().numpy().copy()
 
 
@@ -156,13 +162,15 @@ def list_activations() -> dict[str, type]:
     return dict(zip(ACTIVATIONS, kinds, strict=True))
 
 
-def _convert_dense(layers: list[Any]) -> tuple[list[Any], list[Any], list[str], str]:
+def _convert_dense(
+    layers: list["nn.Module"],
+) -> tuple[list[Array], list[Array], list[str], str]:
     """Convert linear layers to weights, biases, activations between them, and the output's."""
     from torch import nn
 
     names = {kind: name for name, kind in list_activations().items()}
     known = f"linear, {', '.join(names.values())}"
-    weights, biases, layer_activations = list[Any](), list[Any](), list[str]()
+    weights, biases, layer_activations = list[Array](), list[Array](), list[str]()
     for layer in layers:
         if isinstance(layer, nn.Linear):
             if len(layer_activations) != len(weights):
@@ -183,8 +191,8 @@ def _convert_dense(layers: list[Any]) -> tuple[list[Any], list[Any], list[str], 
 
 
 def read_normalisation(
-    normaliser: Any, n_inputs: int, history: int
-) -> tuple[Any, Any, float | None]:
+    normaliser: "VecNormalize | None", n_inputs: int, history: int
+) -> tuple[Array, Array, float | None]:
     """Read mean, scale and clip of a VecNormalize, around the stack of frames or inside of it.
 
     Args:
@@ -197,7 +205,7 @@ def read_normalisation(
     """
     if normaliser is None or not normaliser.norm_obs:
         return np.zeros(n_inputs), np.ones(n_inputs), None
-    stats = normaliser.obs_rms
+    stats: Any = normaliser.obs_rms
     if getattr(stats, "mean", np.zeros(0)).shape not in ((n_inputs,), (n_inputs // history,)):
         raise ValueError(f"the normaliser is of another observation than the network's {n_inputs}")
     prior = _PRIOR * (1.0 + stats.mean**2) / stats.count  # what it leaves of a constant's variance
@@ -238,9 +246,7 @@ def policy_from_zip(
     content, weights = _read(file)
     policy = _build_policy(file, content, weights)
     frames = _count_frames(file, policy.observation_space, get_env_facts(env).layout)
-    normaliser_file = find_normaliser(file, normalise)
-    normaliser = None if normaliser_file is None else load_normaliser(normaliser_file)
-    network = convert_sb3_policy(policy, normaliser, frames)
+    network = convert_sb3_policy(policy, load_normaliser(file, trust, normalise), frames)
     algorithm = f"stable-baselines3's {type(policy).__name__}"
     described = {"algorithm": algorithm, "steps": int(content.get("num_timesteps", 0))}
     return Policy(file.stem, network, Card.from_env(env, **{"env_id": "", **described, **about}))
@@ -279,7 +285,7 @@ def export_zip(
     if Path(target).suffix != SUFFIX:
         raise ValueError(f"a policy's file is NAME{SUFFIX}, got {target}")
     options = dict(env_options or {})
-    env: gym.Env[Any, Any] = gym.make(env_id, **options)
+    env: CarEnv = gym.make(env_id, **options)
     if estimator:
         env = EstimateObservation(env, estimator)
     about = {"env_id": env_id, "env_options": options, "estimator": estimator, "command": command}
@@ -370,7 +376,7 @@ def _read(file: Path) -> tuple[dict[str, Any], Any]:
     return content or {}, (weights or {})["policy"]
 
 
-def _build_policy(file: Path, content: dict[str, Any], weights: Any) -> Any:
+def _build_policy(file: Path, content: Mapping[str, Any], weights: Any) -> "BasePolicy":
     """Build the policy with its weights, without the algorithm and its environments."""
     from stable_baselines3.common.policies import ActorCriticPolicy
 
@@ -384,7 +390,7 @@ def _build_policy(file: Path, content: dict[str, Any], weights: Any) -> Any:
         options.setdefault("use_sde", bool(content.get("use_sde", False)))
     spaces = content["observation_space"], content["action_space"]
     try:
-        policy = kind(*spaces, lambda _: 0.0, **options)
+        policy: BasePolicy = kind(*spaces, lambda _: 0.0, **options)
         policy.load_state_dict(weights)
     except Exception as error:
         wrong = f"its weights are not those of its {kind.__name__}"
@@ -392,21 +398,31 @@ def _build_policy(file: Path, content: dict[str, Any], weights: Any) -> Any:
     return policy
 
 
-def load_normaliser(file: Path) -> Any:
-    """Load a VecNormalize from its pickle, which can run code.
+def load_normaliser(
+    path: Path, trust: bool, normalise: str | Path | None = None
+) -> "VecNormalize | None":
+    """Load a zip's VecNormalize from its pickle, which can run code; None without one.
 
     Args:
-        file: Path of the pickle.
+        path: Path of the zip.
+        trust: Whether the pickle may be read.
+        normalise: Path of the pickle, as for `find_normaliser`.
 
     Returns:
         VecNormalize of the training.
 
     Raises:
         FileNotFoundError: There is no such file.
+        PermissionError: There is a pickle and no trust.
         ValueError: The file holds no VecNormalize.
     """
     from stable_baselines3.common.vec_env import VecNormalize
 
+    file = find_normaliser(path, normalise)
+    if file is None:
+        return None
+    if not trust:
+        raise PermissionError(f"{file} is a pickle, which may run code: say --trust to read it")
     if not file.is_file():
         raise FileNotFoundError(f"{file}: no such file")
     try:
@@ -418,7 +434,7 @@ def load_normaliser(file: Path) -> Any:
     return normaliser
 
 
-def _count_frames(file: Path, space: Any, layout: Sequence[ObservationEntry]) -> int:
+def _count_frames(file: Path, space: gym.Space[Any], layout: Sequence[ObservationEntry]) -> int:
     """Count the layout's frames in the policy's observation; ValueError for another observation."""
     if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
         raise ValueError(f"{file} was trained on {space}, not on an observation of one dimension")
@@ -434,7 +450,7 @@ def _count_frames(file: Path, space: Any, layout: Sequence[ObservationEntry]) ->
     )
 
 
-def _describe_matching_env(space: Any) -> str:
+def _describe_matching_env(space: gym.Space[Any]) -> str:
     """Describe the registered env that has this observation, if there is one."""
     for env_id in [name for name in gym.registry if name.startswith("sideslip/")]:
         try:

@@ -21,13 +21,14 @@ from .callbacks import (
     CURVE,
     POLICY,
     WARM_START_FILE,
+    Checkpoint,
     EvalCallback,
     Evaluation,
     Progress,
     RunOptions,
     RunRecord,
+    read_state,
 )
-from .checkpoint import read_state
 from .config import TrainingTask
 from .export import check_zip
 
@@ -250,7 +251,7 @@ def read_task(folder: str | Path, **arguments: Any) -> TrainingTask:
     return task
 
 
-def _prepare_folder(task: TrainingTask, folder: Path, resume: bool) -> dict[str, Any] | None:
+def _prepare_folder(task: TrainingTask, folder: Path, resume: bool) -> Checkpoint | None:
     """Return the checkpoint's state, or prepare the folder of a new training and return None."""
     if resume:
         read_task(folder, **asdict(task))

@@ -15,15 +15,21 @@ import torch
 
 from sideslip.agents.learned.policy import PolicyController, load_policy
 from sideslip.agents.training import callbacks, trainer
-from sideslip.agents.training.callbacks import BEST, CHECKPOINT, POLICY, Progress, RunOptions
-from sideslip.agents.training.checkpoint import read_state
+from sideslip.agents.training.callbacks import (
+    BEST,
+    CHECKPOINT,
+    POLICY,
+    Progress,
+    RunOptions,
+    read_state,
+)
 from sideslip.agents.training.config import (
     ALGORITHMS,
     HYPERPARAMS,
     WARM_START_ENTRY,
     WARM_START_TRACES_ENTRY,
     TrainingTask,
-    check_settings,
+    _check_settings,
     get_algorithm,
     make_model_options,
     read_settings,
@@ -156,7 +162,7 @@ def test_the_packages_settings_are_of_ids_there_are() -> None:
         ours = {"default", WARM_START_ENTRY, WARM_START_TRACES_ENTRY}
         assert "default" in entries and set(entries) - ours <= set(gym.registry)
         for key in entries:
-            check_settings(name, entries[key])
+            _check_settings(name, entries[key])
             assert read_settings(name, key) == entries[key]
     assert len(list(HYPERPARAMS.iterdir())) == len(ALGORITHMS)
 

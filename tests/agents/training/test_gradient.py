@@ -16,9 +16,9 @@ from sideslip.agents.training.gradient import (
     AnalyticPolicyGradient,
     GruPolicy,
     TrainingSource,
-    unroll_window,
+    _unroll_window,
 )
-from sideslip.agents.training.warm_start import RewardScale
+from sideslip.agents.training.normalise import RewardScale
 from sideslip.agents.vec_env import make_vec_env
 from sideslip.envs.device import DeviceVectorEnv
 
@@ -52,7 +52,7 @@ def policy_of(cars: Any) -> Any:
 def paid_by(policy: Any, cars: Any, weights: Any, steps: int) -> Any:
     obs, _ = cars.reset(seed=list(range(cars.num_envs)))
     rates = RewardScale([[each] for each in weights.tolist()])
-    return unroll_window(policy, cars, obs, policy.begin(cars.num_envs).double(), rates, steps)
+    return _unroll_window(policy, cars, obs, policy._begin(cars.num_envs).double(), rates, steps)
 
 
 def test_the_slope_is_that_of_the_cost() -> None:
@@ -84,7 +84,7 @@ def test_a_car_of_weight_zero_teaches_nothing() -> None:
     paid, *_ = paid_by(policy, cars, torch.tensor([0.0, 1.0], dtype=torch.float64), 4)
     alone = cars_of(1)
     obs, _ = alone.reset(seed=[1])
-    one, *_ = unroll_window(policy, alone, obs, policy.begin(1).double(), RewardScale([[1.0]]), 4)
+    one, *_ = _unroll_window(policy, alone, obs, policy._begin(1).double(), RewardScale([[1.0]]), 4)
     assert paid.item() == pytest.approx(0.5 * one.item(), rel=1e-12) and one.item() > 0.0
 
 
@@ -112,8 +112,8 @@ def test_a_drive_has_a_weight_of_its_own() -> None:
     policy, parts = policy_of(cars), []
     for rates in ([2.0, 0.0], [0.0, 3.0], [2.0, 3.0]):
         obs, _ = cars.reset(seed=[0])
-        start = policy.begin(1).double()
-        paid, *_ = unroll_window(
+        start = policy._begin(1).double()
+        paid, *_ = _unroll_window(
             policy, cars, obs, start, RewardScale([rates]), 20
         )  # an episode has 15
         parts.append(paid.item())

@@ -21,16 +21,18 @@ from sideslip.agents.training.callbacks import (
     EvalCallback,
     Evaluation,
     RunOptions,
-    make_evaluation_seeds,
+    _make_evaluation_seeds,
 )
 from sideslip.agents.training.config import HYPERPARAMS, TrainingTask
-from sideslip.agents.training.trainer import load_initial_policy, read_task, train
-from sideslip.agents.training.warm_start import (
-    NetworkAgent,
+from sideslip.agents.training.normalise import (
     RewardScale,
     RewardScaleWrapper,
-    make_finetune_task,
     measure_reward_scale,
+)
+from sideslip.agents.training.trainer import load_initial_policy, read_task, train
+from sideslip.agents.training.warm_start import (
+    _NetworkAgent,
+    make_finetune_task,
     resolve_settings,
 )
 from sideslip.agents.vec_env import make_vec_env
@@ -76,7 +78,7 @@ def test_a_model_acts_as_the_policy_that_it_begins_with(tmp_path: Path) -> None:
     model, env = started(task, tmp_path), task.vector_env(4)
     obs, _ = env.reset(seed=0)
     for _ in range(20):
-        actions, _ = NetworkAgent(POLICY.network).predict(obs)
+        actions, _ = _NetworkAgent(POLICY.network).predict(obs)
         assert np.abs(model.predict(obs, deterministic=True)[0] - actions).max() < 1e-5
         obs, *_ = env.step(actions)
     assert np.ptp(actions) > 1e-4
@@ -111,7 +113,7 @@ def test_each_drive_weighs_by_what_the_policy_pays_in_it() -> None:
     """Driven by the policy itself, each whole drive is paid -1 a step in the mean, but for the
     floor."""
     task = make_finetune_task(POLICY, **FEW)
-    driver = NetworkAgent(POLICY.network)
+    driver = _NetworkAgent(POLICY.network)
 
     def cars() -> Any:
         options = task.options(4)
@@ -146,13 +148,13 @@ def test_what_a_training_drives_is_what_the_policy_drove(
     options = car | {"scenario": {"base": base, "duration": 0.3}}
     more: dict[str, Any] = {"num_envs": 4, "n_eval_envs": 4, "env_options": options}
     task = make_finetune_task(policy, algo=algo, **more)
-    monkeypatch.setattr(callbacks, "load_parameters", lambda *_: None)
+    monkeypatch.setattr(callbacks, "_load_parameters", lambda *_: None)
     network, saved = policy.network, None
     if steps:
         scaling = network.mean.tolist(), network.scale.tolist(), network.clip, None
         saved = {"steps": steps, "scaling": scaling, "evaluations": []}
     model: Any = EvalCallback(task, tmp_path, saved, RunOptions(), 400, policy).build(saved)
-    driver, cars = NetworkAgent(network), model.get_env()
+    driver, cars = _NetworkAgent(network), model.get_env()
     paid, costs, state, start = np.zeros(4), np.zeros(4), None, np.ones(4, np.bool_)
     if algo == "gradient":
         tensors, seeds, rates = model.source(device="cpu", compile=False)
@@ -209,9 +211,9 @@ def test_a_training_from_a_policy_goes_on_after_a_stop(tmp_path: Path) -> None:
     assert np.array_equal(
         load_policy(tmp_path / WARM_START_FILE).network.scale, POLICY.network.scale
     )
-    env, seeds = task.vector_env(4), make_evaluation_seeds(4)
+    env, seeds = task.vector_env(4), _make_evaluation_seeds(4)
     start, now = (
-        evaluate_costs(env, each, seeds) for each in (NetworkAgent(POLICY.network), found.model)
+        evaluate_costs(env, each, seeds) for each in (_NetworkAgent(POLICY.network), found.model)
     )
     ratio = np.exp(np.log((now + COST_FLOOR) / (start + COST_FLOOR)).mean())
     assert found.evaluations[-1].of_start == pytest.approx(ratio, rel=1e-12)

@@ -12,10 +12,14 @@ from sideslip.agents.controllers.base import NoControl
 from sideslip.agents.learned.policy import PolicyController, load_policy
 from sideslip.agents.rollout import evaluate_costs
 from sideslip.agents.training import callbacks, trainer
-from sideslip.agents.training.callbacks import POLICY, RunOptions
+from sideslip.agents.training.callbacks import (
+    POLICY,
+    RunOptions,
+    _compute_equal_weights,
+    _compute_scenario_weights,
+)
 from sideslip.agents.training.config import TrainingTask
 from sideslip.agents.training.trainer import read_task
-from sideslip.agents.training.warm_start import compute_equal_weights, compute_scenario_weights
 
 TINY, ROLLOUT = TrainingTask(num_envs=8, seed=3, n_eval_envs=4), 256  # steps of 8 environments
 MIXTURE: list[Any] = ["coms-slalom", {"base": "coms-step", "duration": 0.3}]
@@ -68,7 +72,7 @@ def test_the_scenarios_of_a_mixture_weigh_alike(
     monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
     scenarios = ["coms-brake-in-turn", {"base": "coms-slalom", "duration": 3.0}]
     task = dataclasses.replace(TINY, scenarios=scenarios, n_eval_envs=7)
-    env, seeds = task.vector_env(7), callbacks.make_evaluation_seeds(7)
+    env, seeds = task.vector_env(7), callbacks._make_evaluation_seeds(7)
     none = evaluate_costs(env, NoControl(env), seeds)
     assert none[::2].mean() > 3.0 * none[1::2].mean()  # else there is nothing to weigh
     wide = dataclasses.replace(task, num_envs=64)
@@ -92,11 +96,13 @@ def test_the_scenarios_of_a_mixture_weigh_alike(
 
 
 def test_weights_do_not_depend_on_the_evaluation_and_are_bounded() -> None:
-    found = compute_scenario_weights(dataclasses.replace(TINY, scenarios=MIXTURE, n_eval_envs=2), 5)
-    same = compute_scenario_weights(dataclasses.replace(TINY, scenarios=MIXTURE), 5)
+    found = _compute_scenario_weights(
+        dataclasses.replace(TINY, scenarios=MIXTURE, n_eval_envs=2), 5
+    )
+    same = _compute_scenario_weights(dataclasses.replace(TINY, scenarios=MIXTURE), 5)
     assert np.array_equal(found, same) and found[0] != found[1]
-    assert compute_equal_weights(np.array([1e-9, 10.0]))[0] == pytest.approx(20.0)
-    assert compute_equal_weights(np.array([4.0, 2.0])).tolist() == [0.75, 1.5]
+    assert _compute_equal_weights(np.array([1e-9, 10.0]))[0] == pytest.approx(20.0)
+    assert _compute_equal_weights(np.array([4.0, 2.0])).tolist() == [0.75, 1.5]
 
 
 def test_where_the_uncontrolled_car_costs_nothing_there_is_nothing_to_learn(tmp_path: Path) -> None:

@@ -25,8 +25,15 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sideslip.agents.training import callbacks, trainer
-from sideslip.agents.training.callbacks import BEST, CHECKPOINT, CURVE, POLICY, Progress, RunOptions
-from sideslip.agents.training.checkpoint import read_state
+from sideslip.agents.training.callbacks import (
+    BEST,
+    CHECKPOINT,
+    CURVE,
+    POLICY,
+    Progress,
+    RunOptions,
+    read_state,
+)
 from sideslip.agents.training.config import TrainingTask, make_model_options
 from sideslip.agents.training.export import convert_sb3_policy
 from sideslip.agents.training.trainer import read_task
@@ -73,7 +80,7 @@ def test_the_best_evaluation_is_kept(folder: Path) -> None:
     assert np.all(np.diff([line["cpu_seconds"] for line in lines]) > 0.0)
     model = PPO.load(folder / BEST, device="cpu")
     env = TINY.vector_env(4)
-    seeds = callbacks.make_evaluation_seeds(4)
+    seeds = callbacks._make_evaluation_seeds(4)
     best = min(line["cost"] for line in lines)
     assert evaluate_costs(env, model, seeds).mean() == pytest.approx(best, rel=1e-6)
     policy = PolicyController(env, folder / POLICY)
@@ -128,7 +135,7 @@ def test_no_seed_serves_two_purposes(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(StabilityVectorEnv, "reset", watched)
     trainer.train(TINY, ROLLOUT, tmp_path)
     trainer.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)
-    tested = set(callbacks.make_evaluation_seeds(4))
+    tested = set(callbacks._make_evaluation_seeds(4))
     others = [seed for seed in told if seed not in tested]
     assert len(others) == len(set(others)) == 8 + 8 + 8  # scaling, training, going on
     assert min(told) >= 2**63

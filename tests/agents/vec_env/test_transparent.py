@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import (
     VecVideoRecorder,
 )
 
-from sideslip.agents.training.warm_start import RewardScale, RewardScaleWrapper
+from sideslip.agents.training.normalise import RewardScale, RewardScaleWrapper
 from sideslip.agents.vec_env import make_vec_env
 
 VISION = "sideslip/YawVision-v0"
