@@ -49,7 +49,7 @@ class Controller(ABC):
     needs: tuple[str, ...] = ()
     memory = 0
     knows_friction = False  # whether it reads the true friction, if that is there, without a grip
-    _design: tuple[Any, ...] = ()  # the arguments of a compiled law behind inputs, state, action
+    _design: tuple[Any, ...]  # the last argument of a compiled law
 
     def __init__(self, env: AnyEnv, grip: float | None = None) -> None:
         facts = get_env_facts(env)
@@ -115,7 +115,9 @@ class Controller(ABC):
                 and, where the env steers, added steering as a fraction of the vehicle's authority.
         """
 
-    def _mark_not_finite(self, rows: Any, state: Array) -> None:  # noqa: B027
+    def _mark_not_finite(  # noqa: B027
+        self, rows: npt.NDArray[np.bool_], state: Array
+    ) -> None:
         """Note the rows (N,) whose inputs are not finite, in the state (N, memory) or elsewhere."""
 
     def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:  # noqa: B027

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 _NEEDED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
 _MEMBERS = {"data", "policy.pth"}
 _NORMALISER = "vecnormalize.pkl"
-_PRIOR = 1e-4  # samples that a VecNormalize starts with, of mean 0 and variance 1
 
 
 def convert_sb3_policy(
@@ -56,7 +55,7 @@ def convert_sb3_policy(
     with require_extra("train", "networks come from stable-baselines3"):
         from stable_baselines3.common.torch_layers import FlattenExtractor
 
-        from .normalise import Standardised
+        from .normalise import Standardised, read_normalisation
     policy = getattr(model, "policy", model)
     actor = _find_actor_reader(type(policy))(policy)
     space = policy.action_space
@@ -96,13 +95,9 @@ class _Actor(NamedTuple):
 
 
 def _find_on_policy_actor(policy: Any) -> _Actor:
-    layers, squashed = [*policy.mlp_extractor.policy_net, policy.action_net], policy.squash_output
-    recurrent = getattr(policy, "lstm_actor", None)
-    return _Actor(layers, bool(squashed), policy.pi_features_extractor, recurrent)
-
-
-def _find_gru_actor(policy: Any) -> _Actor:
-    return _Actor(list(policy.layers), False, policy.features_extractor, policy.cell)
+    layers, recurrent = policy.mlp_extractor.policy_net, getattr(policy, "lstm_actor", None)
+    squashed, extractor = bool(policy.squash_output), policy.pi_features_extractor
+    return _Actor([*layers, policy.action_net], squashed, extractor, recurrent)
 
 
 def _find_gaussian_actor(policy: Any) -> _Actor:
@@ -112,17 +107,20 @@ def _find_gaussian_actor(policy: Any) -> _Actor:
     return _Actor([*actor.latent_pi, actor.mu], True, actor.features_extractor)
 
 
-def _find_deterministic_actor(policy: Any) -> _Actor:
-    return _Actor(list(policy.actor.mu), False, policy.actor.features_extractor)  # tanh is a layer
+def _find_sequential_actor(policy: Any) -> _Actor:
+    """Find the actor of a `TD3Policy`, whose tanh is a layer, or of a `GruPolicy`."""
+    if hasattr(policy, "actor"):
+        return _Actor(list(policy.actor.mu), False, policy.actor.features_extractor)
+    return _Actor(list(policy.layers), False, policy.features_extractor, policy.cell)
 
 
 _ACTORS: dict[str, Callable[[Any], _Actor]] = {
     "stable_baselines3.common.policies.ActorCriticPolicy": _find_on_policy_actor,
     "stable_baselines3.sac.policies.SACPolicy": _find_gaussian_actor,
-    "stable_baselines3.td3.policies.TD3Policy": _find_deterministic_actor,
+    "stable_baselines3.td3.policies.TD3Policy": _find_sequential_actor,
     "sb3_contrib.tqc.policies.TQCPolicy": _find_gaussian_actor,
     "sb3_contrib.common.recurrent.policies.RecurrentActorCriticPolicy": _find_on_policy_actor,
-    f"{__package__}.gradient.GruPolicy": _find_gru_actor,
+    f"{__package__}.gradient.GruPolicy": _find_sequential_actor,
 }
 """Readers of actors by the policy's class; a subclass may compute anything and is none of them."""
 
@@ -169,7 +167,6 @@ def _convert_dense(
     from torch import nn
 
     names = {kind: name for name, kind in list_activations().items()}
-    known = f"linear, {', '.join(names.values())}"
     weights, biases, layer_activations = list[Array](), list[Array](), list[str]()
     for layer in layers:
         if isinstance(layer, nn.Linear):
@@ -184,33 +181,11 @@ def _convert_dense(
         ):
             layer_activations.append(names[type(layer)])
         else:
-            raise ValueError(f"layer {layer} is not known; known: {known}")
+            known = ", ".join(names.values())
+            raise ValueError(f"layer {layer} is not known; known: linear, {known}")
     if len(layer_activations) == len(weights):  # the last one is the output's
         return weights, biases, layer_activations[:-1], layer_activations[-1]
     return weights, biases, layer_activations, "linear"
-
-
-def read_normalisation(
-    normaliser: "VecNormalize | None", n_inputs: int, history: int
-) -> tuple[Array, Array, float | None]:
-    """Read mean, scale and clip of a VecNormalize, around the stack of frames or inside of it.
-
-    Args:
-        normaliser: VecNormalize or None.
-        n_inputs: Entries that the network reads, of all frames together.
-        history: Number of frames.
-
-    Returns:
-        Mean, factor (0: not read) and clip (None: none), by entry of all frames or of one.
-    """
-    if normaliser is None or not normaliser.norm_obs:
-        return np.zeros(n_inputs), np.ones(n_inputs), None
-    stats: Any = normaliser.obs_rms
-    if getattr(stats, "mean", np.zeros(0)).shape not in ((n_inputs,), (n_inputs // history,)):
-        raise ValueError(f"the normaliser is of another observation than the network's {n_inputs}")
-    prior = _PRIOR * (1.0 + stats.mean**2) / stats.count  # what it leaves of a constant's variance
-    scale = 1.0 / np.sqrt(stats.var + normaliser.epsilon)
-    return stats.mean, np.where(stats.var > 2.0 * prior, scale, 0.0), normaliser.clip_obs
 
 
 def policy_from_zip(
@@ -349,8 +324,10 @@ def check_zip(file: Path) -> None:
     except BadZipFile as error:
         raise ValueError(f"{file} is no zip, or is cut short: {error}") from None
     if missing:
-        lacks = f"it holds no {' and '.join(sorted(missing))}"
-        raise ValueError(f"{file} is no zip of stable-baselines3, or is cut short: {lacks}")
+        raise ValueError(
+            f"{file} is no zip of stable-baselines3, or is cut short: it holds no "
+            f"{' and '.join(sorted(missing))}"
+        )
 
 
 def _read(file: Path) -> tuple[dict[str, Any], Any]:
@@ -393,8 +370,9 @@ def _build_policy(file: Path, content: Mapping[str, Any], weights: Any) -> "Base
         policy: BasePolicy = kind(*spaces, lambda _: 0.0, **options)
         policy.load_state_dict(weights)
     except Exception as error:
-        wrong = f"its weights are not those of its {kind.__name__}"
-        raise ValueError(f"{file}: {wrong}: {error}") from error
+        raise ValueError(
+            f"{file}: its weights are not those of its {kind.__name__}: {error}"
+        ) from error
     return policy
 
 
@@ -441,12 +419,10 @@ def _count_frames(file: Path, space: gym.Space[Any], layout: Sequence[Observatio
     frames, rest = divmod(space.shape[0], len(layout))
     if frames > 0 and rest == 0 and space == make_space(layout, frames):
         return frames
-    names = ", ".join(entry.name for entry in layout)
     raise ValueError(
         f"{file} was trained on {space.shape[0]} numbers{_describe_matching_env(space)}; the "
-        "observation here has "
-        f"{len(layout)}: {names}. An export (`sideslip export`) reads its entries by name and "
-        "drives a wider observation too"
+        f"observation here has {len(layout)}: {', '.join(entry.name for entry in layout)}. An "
+        "export (`sideslip export`) reads its entries by name and drives a wider observation too"
     )
 
 

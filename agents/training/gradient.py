@@ -88,9 +88,8 @@ class GruPolicy(BasePolicy):
         self.cell = nn.GRU(self.features_extractor.features_dim, cells)
         self.layers = make_dense_layers(cells, *net_arch, action_space.shape[0])
         with torch.no_grad():
-            list(self.layers.parameters())[-2].mul_(
-                0.1
-            )  # small first actions: random ones teach little
+            last_weight = list(self.layers.parameters())[-2]
+            last_weight.mul_(0.1)  # small first actions: random ones teach little
         # betas as in Xu et al.: a shorter memory than Adam's defaults
         self.optimizer = torch.optim.Adam(self.parameters(), lr_schedule(1.0), betas=(0.7, 0.95))
 

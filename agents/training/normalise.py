@@ -23,7 +23,7 @@ from .student import compute_whitening
 with require_extra("train", "training needs {}"):
     import torch
     from stable_baselines3.common.torch_layers import FlattenExtractor
-    from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+    from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ CLIP = 10.0  # limit of a standardised entry (standard deviations)
 _WARM_UP, _DURATION = 0.2, 4.0  # s: until every sensor has spoken, and of the whole drive
 _CORRELATION_TIME = 0.2  # s, in which random actions fade to 1/e
 _MIN_VARIANCE = 1e-3  # least variance of a mixture of standardised entries
+_PRIOR = 1e-4  # samples that a VecNormalize starts with, of mean 0 and variance 1
 _CONSTANT = 1e-9  # standard deviation, in an entry's unit, up to which it is not read
 
 
@@ -87,6 +88,29 @@ class Standardised(FlattenExtractor):
         """
         z = torch.clamp((observations - self.mean) * self.scale, -self.clip, self.clip)
         return z @ self.mixing
+
+
+def read_normalisation(
+    normaliser: VecNormalize | None, n_inputs: int, history: int
+) -> tuple[Array, Array, float | None]:
+    """Read mean, scale and clip of a VecNormalize, around the stack of frames or inside of it.
+
+    Args:
+        normaliser: VecNormalize or None.
+        n_inputs: Entries that the network reads, of all frames together.
+        history: Number of frames.
+
+    Returns:
+        Mean, factor (0: not read) and clip (None: none), by entry of all frames or of one.
+    """
+    if normaliser is None or not normaliser.norm_obs:
+        return np.zeros(n_inputs), np.ones(n_inputs), None
+    stats: Any = normaliser.obs_rms
+    if getattr(stats, "mean", np.zeros(0)).shape not in ((n_inputs,), (n_inputs // history,)):
+        raise ValueError(f"the normaliser is of another observation than the network's {n_inputs}")
+    prior = _PRIOR * (1.0 + stats.mean**2) / stats.count  # what it leaves of a constant's variance
+    scale = 1.0 / np.sqrt(stats.var + normaliser.epsilon)
+    return stats.mean, np.where(stats.var > 2.0 * prior, scale, 0.0), normaliser.clip_obs
 
 
 def measure_scaling(

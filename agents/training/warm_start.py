@@ -30,8 +30,8 @@ from .config import (
     get_algorithm,
     read_settings,
 )
-from .export import check_zip, load_normaliser, read_normalisation
-from .normalise import StandardisedArguments
+from .export import check_zip, load_normaliser
+from .normalise import StandardisedArguments, read_normalisation
 from .student import SAMPLE_STRIDE, compute_whitening
 
 with require_extra("train", "training needs {}"):

@@ -12,12 +12,12 @@ from sideslip.agents import Nmpc, make_agent
 from sideslip.agents.baselines import make_oracle
 from sideslip.agents.controllers.nmpc import _prepare_prediction, _shift_plan
 from sideslip.agents.design.gauss_newton import (
-    DIFFERENCE,
+    _DIFFERENCE,
     LIMIT,
     _compute_normal_equations,
-    make_plan_batch,
-    simulate_batch,
-    solve_damped_step,
+    _make_plan_batch,
+    _simulate_batch,
+    _solve_damped_step,
     update_plan,
 )
 from sideslip.agents.design.prediction import make_blocks, simulate_plans
@@ -65,9 +65,9 @@ def problem(agent: Nmpc, obs: np.ndarray) -> Any:
 def cost_of(agent: Nmpc, found: Any, plan: np.ndarray) -> float:
     start, K, T = found
     blocks = agent.design.blocks
-    all = make_plan_batch(len(plan), blocks, 1)
+    all = _make_plan_batch(len(plan), blocks, 1)
     all.plans[:, 0] = plan
-    simulate_batch(agent.design.model, start, K, T, blocks, all)
+    _simulate_batch(agent.design.model, start, K, T, blocks, all)
     return float((all.residuals**2).sum())
 
 
@@ -145,8 +145,8 @@ def test_what_it_foresees_is_what_comes() -> None:
     blocks = agent.design.blocks
     for _ in range(5):
         start, K, T = problem(agent, obs)
-        all = make_plan_batch(len(blocks), blocks, 1)
-        simulate_batch(agent.design.model, start, K, T, blocks, all)
+        all = _make_plan_batch(len(blocks), blocks, 1)
+        _simulate_batch(agent.design.model, start, K, T, blocks, all)
         obs, _, _, _, info = env.step(all.first[:1, 0].astype(np.float32))
         foreseen = all.residuals[:2, 0] / np.sqrt(0.01) * [0.02, 0.1]
         came = [info["beta"] - info["beta_ref"], info["gamma"] - info["gamma_ref"]]
@@ -211,7 +211,7 @@ def test_a_damped_step_is_the_solution() -> None:
     J, r = rng.normal(size=(30, 6)), rng.normal(size=30)
     J[:, 2] = 0.0  # a variable that changes nothing
     A, g, d = J.T @ J, J.T @ r, np.empty(6)
-    solve_damped_step(A, g, 0.1, np.empty((6, 6)), d)
+    _solve_damped_step(A, g, 0.1, np.empty((6, 6)), d)
     wanted = np.linalg.solve(A + 0.1 * np.diag(np.diag(A)) + 1e-9 * np.eye(6), -g)
     assert d == pytest.approx(wanted, rel=1e-6) and d[2] == 0.0
 
@@ -220,14 +220,14 @@ def test_a_variable_that_a_limit_holds_is_left_out_of_the_step() -> None:
     """At a limit beyond which it would be cheaper; where it is cheaper within, it moves."""
     rng = np.random.default_rng(3)
     blocks = np.array([3, 2])
-    all = make_plan_batch(4, blocks, 5)
+    all = _make_plan_batch(4, blocks, 5)
     J, r = rng.normal(size=(len(all.residuals), 4)), rng.normal(size=len(all.residuals))
-    all.residuals[:] = r[:, None] + DIFFERENCE * np.insert(J, 0, 0.0, axis=1)
+    all.residuals[:] = r[:, None] + _DIFFERENCE * np.insert(J, 0, 0.0, axis=1)
     falls = -np.sign(J.T @ r)  # where the cost falls
     all.limits[1, 0], all.limits[2, 0] = falls[1], -falls[2]
     A, g, d = np.empty((4, 4)), np.empty(4), np.empty(4)
     _compute_normal_equations(all, A, g)
-    solve_damped_step(A, g, 0.0, np.empty((4, 4)), d)
+    _solve_damped_step(A, g, 0.0, np.empty((4, 4)), d)
     free = [0, 2, 3]
     assert d[1] == 0.0
     assert d[free] == pytest.approx(np.linalg.lstsq(J[:, free], -r)[0], rel=1e-6)
