@@ -158,7 +158,7 @@ class Controller(ABC):
             memory[np.asarray(episode_start, bool)] = 0.0
         action = np.zeros((len(batch), self.width))
         inputs = batch[:, self._columns].astype(np.float64)
-        bad = ~np.isfinite(inputs).all(axis=1)
+        bad = np.asarray(~np.isfinite(inputs).all(axis=1))
         if bad.any():
             before = memory[bad]
             inputs[bad] = 0.0

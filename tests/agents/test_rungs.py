@@ -9,7 +9,7 @@ import pytest
 from sideslip.agents.baselines import ORACLES, make_noise_options, make_oracle
 from sideslip.agents.controllers.base import Controller
 from sideslip.agents.controllers.lqr import Lqr
-from sideslip.agents.design.sampled_model import compute_regulator, make_design_model
+from sideslip.agents.design.sampled_model import compute_cost_to_go, make_design_model
 from sideslip.envs import COMS
 from sideslip.envs.scenarios.manoeuvres import SCENARIOS
 from tests.envs.helpers import bits
@@ -62,7 +62,7 @@ def test_gains_between_the_knots_are_those_of_the_true_car() -> None:
         speed, front, rear = rng.uniform((5.0, 0.6, 0.6), (10.0, 1.4, 1.4))
         car = COMS.scale_stiffness(front, rear)
         K = agent.gains(speed, car.front_stiffness, car.rear_stiffness)
-        wanted = compute_regulator(make_design_model(car, speed, agent.design_spec))[0]
+        wanted = compute_cost_to_go(make_design_model(car, speed, agent.design_spec))[0]
         assert np.abs(K[:, :4] - wanted[:, :4]).max() < 0.02 * np.abs(wanted[:, :4]).max()
 
 

@@ -12,7 +12,8 @@ from sideslip.agents.design.sampled_model import (
     DYNAMIC,
     SPEEDS,
     DesignSpec,
-    compute_regulator,
+    _compute_input_cost,
+    compute_cost_to_go,
     make_design_model,
 )
 from sideslip.envs import COMS, PASSENGER_CAR
@@ -90,7 +91,7 @@ def test_gains_are_python_controls_for_all_states_at_once(
     G[held, held] *= 1.0 - 1e-8
     wanted, _, _ = control.dlqr(G, model.H, model.Q, model.R, model.N)
     scale = np.abs(wanted).max()
-    assert compute_regulator(model)[0] / scale == pytest.approx(
+    assert compute_cost_to_go(model)[0] / scale == pytest.approx(
         np.asarray(wanted) / scale, abs=1e-6
     )
 
@@ -98,7 +99,7 @@ def test_gains_are_python_controls_for_all_states_at_once(
 def test_tabled_gains_are_the_designed_ones(steered: Any) -> None:
     agent = agent_of(steered)
     for speed in (SPEEDS[3], SPEEDS[20]):
-        wanted = compute_regulator(make_design_model(COMS, speed, agent.design_spec))[0]
+        wanted = compute_cost_to_go(make_design_model(COMS, speed, agent.design_spec))[0]
         assert agent.gains(speed) == pytest.approx(wanted, rel=1e-12)
     assert (agent.gains(0.1) == agent.gains(SPEEDS[0])).all()
     assert (agent.gains(99.0) == agent.gains(SPEEDS[-1])).all()
@@ -109,7 +110,7 @@ def test_tabled_gains_are_the_designed_ones(steered: Any) -> None:
 def test_the_closed_loop_is_stable_over_the_speeds(car: Any, steers: bool) -> None:
     """At the tabled speeds and between; the COMS alone is unstable above 17.6 m/s."""
     purpose = DesignSpec(10, car.yaw_moment_limit, steers, MODEL)
-    gains = [compute_regulator(make_design_model(car, speed, purpose))[0] for speed in SPEEDS[::4]]
+    gains = [compute_cost_to_go(make_design_model(car, speed, purpose))[0] for speed in SPEEDS[::4]]
     for i, (low, high) in enumerate(zip(SPEEDS[::4], SPEEDS[4::4], strict=False)):
         for share in (0.0, 0.5):
             K = (1.0 - share) * gains[i] + share * gains[i + 1]
@@ -122,7 +123,7 @@ def test_the_closed_loop_is_stable_over_the_speeds(car: Any, steers: bool) -> No
 def test_it_follows_the_references_where_they_can_be_had(steered: Any) -> None:
     """With both inputs free of limits, beta and gamma reach the model's steady state."""
     model = make_design_model(COMS, 7.0, agent_of(steered).design_spec)
-    K, d = compute_regulator(model)[0], len(DYNAMIC)
+    K, d = compute_cost_to_go(model)[0], len(DYNAMIC)
     refs = compute_reference(0.01, 7.0, make_reference_params(COMS), MODEL)
     held = np.array([0.01, *refs])
     closed = model.G - model.H @ K
@@ -227,11 +228,12 @@ def test_bad_input(steered: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_another_action_costs_what_the_curvature_says_and_moves_the_rate_limit() -> None:
-    """`compute_regulator`'s S, in shares of the yaw moment and of the authority; steering that was
+    """`_compute_input_cost`'s S, in shares of the yaw moment and of the authority; steering that was
     added by somebody else is what the next decision may differ from by a step of the rate."""
     env = estimating(gym.make("sideslip/AfsYawFusion-v0", reference="model"), "F_d", "N_d")
     agent, speed = Lqr(env), float(SPEEDS[8])
-    _, S = compute_regulator(make_design_model(agent.vehicle, speed, agent.design_spec))
+    model = make_design_model(agent.vehicle, speed, agent.design_spec)
+    S = _compute_input_cost(model, compute_cost_to_go(model)[1])
     per = np.diag([1.0, agent.authority])
     assert agent.curvature(speed) == pytest.approx(per @ S @ per, rel=1e-9)
     obs = np.array([each.low if each.name == "steer_command" else 0.0 for each in

@@ -9,13 +9,13 @@ import pytest
 
 import sideslip
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.two_dof import _compute_feedforward_gain
-from sideslip.agents.design.pi import POLE, design_pi, sample_pi
+from sideslip.agents.controllers.two_dof import _compute_static_gain
+from sideslip.agents.design.pi import POLE, design_pi, make_nominal_car, sample_pi
 from sideslip.envs import COMS, PASSENGER_CAR
 from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation
 
-KMH = 1 / 3.6
+KMH, CAR = 1 / 3.6, make_nominal_car(COMS)
 
 
 @pytest.mark.smoke
@@ -24,18 +24,14 @@ def test_feedforward_is_the_ratio_of_dc_gains() -> None:
     for kmh in (10.0, 20.0, 25.0, 45.0):
         model = make_bicycle_model(COMS, kmh * KMH)
         static = -np.linalg.solve(model.A, model.B)[0]  # beta over delta_f and N_z
-        assert _compute_feedforward_gain(COMS, kmh * KMH) == pytest.approx(
+        assert _compute_static_gain(CAR, kmh * KMH) == pytest.approx(
             -static[0] / static[1], rel=1e-12
         )
 
 
 def test_feedforward_at_25_kmh_and_its_change_of_sign() -> None:
-    assert _compute_feedforward_gain(COMS, 25 * KMH) == pytest.approx(-2652.0, abs=0.1)
-    assert (
-        _compute_feedforward_gain(COMS, 20.72 * KMH)
-        > 0
-        > _compute_feedforward_gain(COMS, 20.74 * KMH)
-    )
+    assert _compute_static_gain(CAR, 25 * KMH) == pytest.approx(-2652.0, abs=0.1)
+    assert _compute_static_gain(CAR, 20.72 * KMH) > 0 > _compute_static_gain(CAR, 20.74 * KMH)
 
 
 def test_feedforward_stays_finite_where_the_moment_does_not_move_beta() -> None:
@@ -43,7 +39,7 @@ def test_feedforward_stays_finite_where_the_moment_does_not_move_beta() -> None:
     m, l_f, l_r = PASSENGER_CAR.mass, PASSENGER_CAR.front_arm, PASSENGER_CAR.rear_arm
     C_f, C_r = PASSENGER_CAR.front_stiffness, PASSENGER_CAR.rear_stiffness
     speed = np.sqrt(2 * (l_r * C_r - l_f * C_f) / m)
-    assert np.isfinite(_compute_feedforward_gain(PASSENGER_CAR, float(speed)))
+    assert np.isfinite(_compute_static_gain(make_nominal_car(PASSENGER_CAR), float(speed)))
 
 
 @pytest.mark.parametrize("kmh", [10.0, 18.0, 25.0, 32.0, 45.0])
