@@ -76,8 +76,8 @@ class EnvView:
     num_envs: int  # rows, one car each
     facts: EnvFacts
     plants: frozenset[PlantKind]  # among the rows
-    single_observation_space: gym.Space[Any]
-    single_action_space: gym.Space[Any]
+    single_observation_space: gym.Space[npt.NDArray[np.float32]]
+    single_action_space: gym.Space[npt.NDArray[np.float32]]
 
     @classmethod
     def from_env(cls, env: CarVectorEnv) -> "EnvView":
@@ -98,12 +98,12 @@ class EnvView:
         return self
 
     @property
-    def observation_space(self) -> gym.Space[Any]:
+    def observation_space(self) -> gym.Space[npt.NDArray[np.float32]]:
         """Observation space of all rows."""
         return batch_space(self.single_observation_space, self.num_envs)
 
     @property
-    def action_space(self) -> gym.Space[Any]:
+    def action_space(self) -> gym.Space[npt.NDArray[np.float32]]:
         """Action space of all rows."""
         return batch_space(self.single_action_space, self.num_envs)
 
@@ -118,7 +118,7 @@ class EnvView:
         return self.facts.nominal
 
 
-def make_env(env_id: str, options: Mapping[str, Any]) -> CarEnv:
+def make_env(env_id: str, options: Mapping[str, object]) -> CarEnv:
     """Make the env of an id, with the env's own short message for a missing or unknown argument.
 
     Args:
@@ -162,8 +162,8 @@ def get_env_facts(env: AnyEnv | EnvView) -> EnvFacts:
 
 
 def _collect_facts(env: Any) -> EnvFacts:
-    nominals: Sequence[Any]
-    vehicles: Sequence[Any]
+    nominals: Sequence[Vehicle]
+    vehicles: Sequence[Vehicle]
     if isinstance(env, EnvView):
         return env.facts
     base: Any = env.unwrapped

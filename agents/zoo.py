@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ..envs.io import atomic_file, write_atomic
 from ..envs.numerics import require_extra
@@ -43,7 +44,10 @@ def find_next_folder(logs: Path, algo: str, env_id: str) -> Path:
 
 
 def describe(
-    folder: Path, settings: Mapping[str, Any], estimator_kwargs: Any, arguments: Mapping[str, Any]
+    folder: Path,
+    settings: Mapping[str, object],
+    estimator_kwargs: Mapping[str, object] | None,
+    arguments: Mapping[str, Any],
 ) -> None:
     """Make a training's folder with the files that `enjoy` reads before it loads a model.
 
@@ -80,7 +84,7 @@ def write_evaluation(folder: Path, env_id: str, model: Any, costs: Array, length
         return
     with atomic_file(folder / f"{_make_file_name(env_id)}.zip") as file:
         model.save(file)
-    evaluation: dict[str, Any] = {
+    evaluation: dict[str, npt.NDArray[Any]] = {
         "timesteps": np.array([model.num_timesteps]),
         "results": -costs[None],
         "ep_lengths": lengths[None].astype(np.int64),

@@ -13,12 +13,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from gymnasium.vector import VectorEnv
-
 from ...envs.numerics import require_extra
 from ...envs.scenarios.manoeuvres import make_scenario
 from ...envs.validation import check_choice, is_finite
 from .. import zoo
+from ..env_info import CarVectorEnv
 from ..vec_env import make_native_env
 from .export import list_activations
 from .normalise import Standardised, StandardisedArguments
@@ -203,7 +202,7 @@ def make_model(
     return kind(settings["policy"], env, stats_window_size=window, seed=seed, **options, **rest)
 
 
-def _make_schedule(name: str, value: Any) -> Any:
+def _make_schedule(name: str, value: object) -> LinearSchedule | float:
     """Make a schedule that falls to zero of "lin_NUMBER", and a float of a number."""
     word, _, number = str(value).rpartition("_")
     try:
@@ -280,7 +279,7 @@ class TrainingTask:
         turns = itertools.islice(itertools.cycle(self.scenarios), num_envs)
         return self.env_options | {"scenario": list(turns)}
 
-    def vector_env(self, num_envs: int) -> VectorEnv[Any, Any, Any]:
+    def vector_env(self, num_envs: int) -> CarVectorEnv:
         """Make a vector env of the task with its estimator, for other seeds than the training's.
 
         Args:

@@ -3,6 +3,7 @@
 A policy's moving averages become part of the environments, for algorithms without memory.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,6 +22,7 @@ from ...estimators.learned.forward import CELL_WEIGHTS, MovingAverages
 from ...estimators.learned.network import Network
 from ..env_info import CarVectorEnv, get_layout
 from ..learned.policy import Policy
+from ..rollout import iterate_steps
 from ..vec_env import Observations
 from .config import (
     WARM_START_ENTRY,
@@ -338,15 +340,11 @@ class MemoryObservation(
 
 def _measure_mixing(env: CarVectorEnv, network: Network, seed: int) -> _Mixing:
     """Measure the whitening in a network's own drives, one episode of each row from a seed on."""
-    agent = _NetworkAgent(network.dense)
-    wrapped, collected = MemoryObservation(env, network), []
-    obs, _ = wrapped.reset(seed=seed)
-    running, step = np.ones(env.num_envs, np.bool_), 0
-    while running.any():
-        if step % SAMPLE_STRIDE == 0:
-            collected.append(obs[running])
-        obs, _, terminated, truncated, _ = wrapped.step(agent.predict(obs)[0])
-        running, step = running & ~(terminated | truncated), step + 1
+    collected, agent = [], _NetworkAgent(network.dense)
+    drive = iterate_steps(MemoryObservation(env, network), agent, seed)
+    for step in itertools.islice(drive, 0, None, SAMPLE_STRIDE):
+        over = np.logical_or(step.terminated, step.truncated)
+        collected.append(step.obs[step.running & ~over])
     x = np.concatenate(collected).astype(np.float64)
     return _Mixing(x.mean(0), compute_whitening(x, _MIN_VARIANCE))
 

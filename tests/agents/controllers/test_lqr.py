@@ -228,8 +228,8 @@ def test_bad_input(steered: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_another_action_costs_what_the_curvature_says_and_moves_the_rate_limit() -> None:
-    """`_compute_input_cost`'s S, in shares of the yaw moment and of the authority; steering that was
-    added by somebody else is what the next decision may differ from by a step of the rate."""
+    """`_compute_input_cost`'s S, in shares of the yaw moment and of the authority; steering that
+    was added by somebody else is what the next decision may differ from by a step of the rate."""
     env = estimating(gym.make("sideslip/AfsYawFusion-v0", reference="model"), "F_d", "N_d")
     agent, speed = Lqr(env), float(SPEEDS[8])
     model = make_design_model(agent.vehicle, speed, agent.design_spec)

@@ -33,7 +33,7 @@ def test_a_mixture_survives_autoreset() -> None:
     base: Any = env.unwrapped
     ended = np.zeros(5, int)
     for _ in range(75):
-        _, _, terminated, truncated, _ = env.step(np.zeros((5, 1)))
+        _, _, terminated, truncated, _ = env.step(np.zeros((5, 1), np.float32))
         ended += terminated | truncated
     assert ended.tolist() == [0, 2, 0, 2, 0]
     durations = [each.duration for each in base.scenario]
