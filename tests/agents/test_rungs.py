@@ -10,6 +10,7 @@ from sideslip.agents.baselines import ORACLES, make_noise_options, make_oracle
 from sideslip.agents.controllers.base import Controller
 from sideslip.agents.controllers.lqr import Lqr
 from sideslip.agents.design.sampled_model import compute_cost_to_go, make_design_model
+from sideslip.agents.rollout import evaluate_costs
 from sideslip.envs import COMS
 from sideslip.envs.scenarios.manoeuvres import SCENARIOS
 from tests.envs.helpers import bits
@@ -17,19 +18,6 @@ from tests.envs.helpers import bits
 FUSION, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"
 VISION = "sideslip/YawVision-v0"
 LINEAR = {"base": "random-steering", "tyres": "linear"}
-
-
-def costs(rung: str, count: int, **env: Any) -> np.ndarray:
-    """J of the seeds from 0 on."""
-    envs, agent = make_oracle(rung, FUSION, num_envs=count, **env)
-    obs, _ = envs.reset(seed=list(range(count)))
-    J, alive, state = np.zeros(count), np.ones(count, bool), None
-    while alive.any():
-        action, state = agent.predict(obs, state)
-        obs, reward, terminated, truncated, _ = envs.step(action)
-        J -= np.where(alive, reward, 0.0)
-        alive &= ~(terminated | truncated)
-    return J
 
 
 OFTEN = [*((rung, FUSION) for rung in ORACLES), ("oracle-state-lqr", AFS), ("nominal", VISION)]
@@ -118,7 +106,8 @@ def test_one_table_serves_all_who_ask_for_it() -> None:
 def test_knowing_pays_on_the_linear_car() -> None:
     """Where the LQG is the optimum each rung costs less than the one below: three errors."""
     plain = LINEAR | {"small_angle": True, "roll": False}
-    found = [np.log(costs(rung, 64, scenario=plain)) for rung in ORACLES[:3]]
+    pairs = [make_oracle(rung, FUSION, 64, scenario=plain) for rung in ORACLES[:3]]
+    found = [np.log(evaluate_costs(*pair, range(64))) for pair in pairs]
     for lower, upper in itertools.pairwise(found):
         gap = lower - upper
         assert gap.mean() > 3.0 * gap.std(ddof=1) / len(gap) ** 0.5

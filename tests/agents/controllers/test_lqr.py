@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents import Lqr, make_agent
+from sideslip.agents.controllers.lqr import _solve_box_qp
 from sideslip.agents.design.sampled_model import (
     DYNAMIC,
     SPEEDS,
@@ -20,6 +21,7 @@ from sideslip.envs import COMS, PASSENGER_CAR
 from sideslip.envs.task import MODEL, ZERO_SLIP, compute_reference, make_reference_params
 from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation
+from tests.agents.helpers import observe
 
 SMALL = {
     "base": "straight",
@@ -34,7 +36,6 @@ SMALL = {
     "disturbance_moment": 0.0,
     "noise": {"wheel": 0.0},
 }
-BOTH = DesignSpec(10, COMS.yaw_moment_limit, True, MODEL, "forces")
 
 
 def estimating(env: Any, *disturbances: str) -> Any:
@@ -141,7 +142,7 @@ def test_the_law_is_minus_k_x(steered: Any) -> None:
     share = 3.0 / (2.0 * COMS.motor_torque)
     x = [2e-4, 1e-3, share, 0.001, 0.002, 1e-4, 2e-3]
     wanted = -agent.gains(7.0) @ x / [1.0, COMS.steering_authority]
-    action, _ = agent.predict(observed(steered, told))
+    action, _ = agent.predict(observe(steered, **told))
     assert action == pytest.approx(wanted, rel=1e-4) and np.abs(wanted).max() < 1.0
 
 
@@ -153,15 +154,6 @@ def disturbed(kind: str) -> Any:
     return EstimateObservation(gym.make("sideslip/YawGps-v0"), "dakf", outputs=outputs)
 
 
-def observed(env: Any, told: dict[str, float]) -> np.ndarray:
-    """An observation that is zero but for these entries."""
-    names = [entry.name for entry in env.get_wrapper_attr("layout")]
-    obs = np.zeros(len(names), np.float32)
-    for name, value in told.items():
-        obs[names.index(name)] = value
-    return obs
-
-
 @pytest.mark.parametrize(
     ("kind", "levels"),
     [("forces", {"F_d_hat": 30.0, "N_d_hat": -8.0}), ("rates", {"d1_hat": 0.02, "d2_hat": -0.1})],
@@ -170,11 +162,10 @@ def test_disturbances_are_fed_forward_by_their_gains(kind: str, levels: dict[str
     """Of a car that is at rest beside them; each on its own, and both."""
     env = disturbed(kind)
     agent = agent_of(env)
-    wheels = {"wheel_left": 7.0, "wheel_right": 7.0}
     answers = []
     for share in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
         d = np.array(list(levels.values())) * share
-        action, _ = agent.predict(observed(env, wheels | dict(zip(levels, d, strict=True))))
+        action, _ = agent.predict(observe(env, **dict(zip(levels, d, strict=True))))
         answers.append(float(action[0]))
         assert action == pytest.approx(-agent.gains(7.0)[:, len(DYNAMIC) + 3 :] @ d, rel=1e-5)
     assert np.abs(answers).min() > 0.01
@@ -193,11 +184,10 @@ def test_a_held_disturbance_is_met_by_the_best_held_yaw_moment() -> None:
     beta, gamma = free + per_u * scale * u
     torque = u * COMS.motor_torque
     action, _ = agent.predict(
-        observed(env, {
-            "wheel_left": v, "wheel_right": v, "torque_left": -torque, "torque_right": torque,
-            "beta_hat": beta, "gamma_hat": gamma, "beta_ref": refs[0], "gamma_ref": refs[1],
-            "d1_hat": d[0], "d2_hat": d[1],
-        })
+        observe(
+            env, v, torque_left=-torque, torque_right=torque, beta_hat=beta, gamma_hat=gamma,
+            beta_ref=refs[0], gamma_ref=refs[1], d1_hat=d[0], d2_hat=d[1],
+        )
     )  # fmt: skip
     assert 0.05 < abs(u) < 1.0
     assert action[0] == pytest.approx(u, rel=1e-3)
@@ -210,21 +200,6 @@ def test_disturbances_and_gyro_are_read_where_they_are() -> None:
     assert agent_of(estimating(plain, "F_d", "N_d")).design_spec.disturbances == "forces"
     walks = EstimateObservation(plain, "dakf", outputs=["beta", "gamma", "d1", "d2"])
     assert agent_of(walks).design_spec.disturbances == "rates"
-
-
-def test_bad_input(steered: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValueError, match=r"beta_hat.*EstimateObservation"):
-        make_agent("lqr", gym.make("sideslip/YawFusion-v0"))
-    with pytest.raises(ValueError, match="disturbance_time is a positive number"):
-        make_agent("lqr", steered, disturbance_time=0.0)
-    with pytest.raises(ValueError, match="names two entries or none"):
-        make_agent("lqr", steered, stiffness=["a"])
-    with pytest.raises(ValueError, match="span rises from above zero"):
-        make_agent("lqr", steered, span=(1.0, 0.5))
-    with pytest.raises(TypeError, match="weight"):
-        make_agent("lqr", steered, weight=1.0)
-    with pytest.raises(ValueError, match="positive speed"):
-        make_design_model(COMS, 0.0, BOTH)
 
 
 def test_another_action_costs_what_the_curvature_says_and_moves_the_rate_limit() -> None:
@@ -249,3 +224,22 @@ def test_another_action_costs_what_the_curvature_says_and_moves_the_rate_limit()
     step = COMS.steering_rate * 0.01 / agent.authority
     assert planner.predict(obs, memory)[0][1] > 1.0 - step - 1e-6
     assert abs(free[1]) <= step + 1e-6 and abs(taken[1] - 0.5) <= step + 1e-6
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_nothing_within_the_limits_costs_less(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(2, 2))
+    S = root @ root.T + 0.01 * np.eye(2)
+    free, (low, high) = rng.normal(size=2) * 3.0, np.sort(rng.normal(size=2))
+    u, w = _solve_box_qp(S[0, 0], S[0, 1], S[1, 1], free[0], free[1], 1.0, low, high)
+    assert abs(u) <= 1.0 and low <= w <= high
+    grid = np.stack(np.meshgrid(np.linspace(-1.0, 1.0, 201), np.linspace(low, high, 201)), -1)
+    off = grid - free
+    costs = np.einsum("...i,ij,...j", off, S, off)
+    found = np.array([u, w]) - free
+    assert found @ S @ found <= costs.min() + 1e-12
+
+
+def test_what_is_within_the_limits_stays() -> None:
+    assert _solve_box_qp(1.0, 0.9, 1.0, 0.3, -0.2, 1.0, -0.5, 0.5) == (0.3, -0.2)

@@ -14,6 +14,7 @@ from sideslip.agents.design.pi import POLE, design_pi, make_nominal_car, sample_
 from sideslip.envs import COMS, PASSENGER_CAR
 from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation
+from tests.agents.helpers import observe
 
 KMH, CAR = 1 / 3.6, make_nominal_car(COMS)
 
@@ -110,8 +111,6 @@ def test_sampling_fast_gives_the_continuous_design() -> None:
         one = sample_pi(COMS, 25.0 * KMH, 1e-5, POLE, placement)
         other = design_pi(COMS, 25.0 * KMH, POLE, placement)
         assert (one.k_p, one.k_i) == pytest.approx((other.k_p, other.k_i), rel=1e-3)
-    with pytest.raises(ValueError, match="placement is one of radius, real"):
-        sample_pi(COMS, 25.0 * KMH, 1e-3, POLE, "both")
 
 
 def _lane_change(agent: str, estimator: str, scenario: str, **options: Any) -> Any:
@@ -139,13 +138,9 @@ def test_the_integral_does_not_wind_up() -> None:
     """While the moment is saturated the memory stays below one full scale."""
     env = EstimateObservation(gym.make("sideslip/YawVision-v0"), "bicycle-kf")
     agent = make_agent("two-dof", env)
-    names = [entry.name for entry in env.get_wrapper_attr("layout")]
-    obs = np.zeros(len(names), np.float32)
-    obs[names.index("wheel_left")] = obs[names.index("wheel_right")] = 7.0
-    obs[names.index("beta_hat")] = 0.2
     state = None
     for _ in range(1000):
-        action, state = agent.predict(obs, state)
+        action, state = agent.predict(observe(env, beta_hat=0.2), state)
     assert action == pytest.approx([1.0])
     assert state is not None and abs(state[0, 0]) < COMS.yaw_moment_limit
 
@@ -156,18 +151,12 @@ def test_forward_to_the_reference_the_nominal_car_holds_it(kmh: float) -> None:
     env = EstimateObservation(
         gym.make("sideslip/YawFusion-v0", reference="model"), "exact-kf", std=False
     )
-    names = [entry.name for entry in env.layout]
     model, delta, v = make_bicycle_model(COMS, kmh * KMH), 0.01, kmh * KMH
     for beta in (0.0, 2e-3, -1e-3):
-        obs = np.zeros(len(names), np.float32)
-        values = {"wheel_left": v, "wheel_right": v, "steer_command": delta}
-        for name, value in (values | {"beta_ref": beta, "beta_hat": beta}).items():
-            obs[names.index(name)] = value
+        obs = observe(env, v, steer_command=delta, beta_ref=beta, beta_hat=beta)
         share, _ = make_agent("two-dof", env).predict(obs)
         turn = np.linalg.solve(model.A, -model.B @ [delta, share[0] * COMS.yaw_moment_limit])
         assert turn[0] == pytest.approx(beta, abs=1e-8)
         papers, _ = make_agent("two-dof", env, feedforward="zero-slip").predict(obs)
         turn = np.linalg.solve(model.A, -model.B @ [delta, papers[0] * COMS.yaw_moment_limit])
         assert turn[0] == pytest.approx(0.0, abs=1e-8)
-    with pytest.raises(ValueError, match="feedforward is one of reference, zero-slip"):
-        make_agent("two-dof", env, feedforward="none")

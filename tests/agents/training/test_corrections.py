@@ -87,10 +87,3 @@ def test_a_learned_batch_is_pickled_whole() -> None:
 def test_nobody_else_has_its_seeds() -> None:
     assert min(TRAINING, HELD_OUT) > 2**66 + 2**40  # of trainings of policies
     assert max(make_tuning_seeds(4096)) < 2**32 < TRAINING
-
-
-def test_nothing_to_learn_from_is_refused() -> None:
-    with pytest.raises(ValueError, match="0 drives, 32 episodes, 20 epochs"):
-        train_correction(CARD, [])
-    with pytest.raises(ValueError, match="1 drives, 0 episodes"):
-        train_correction(CARD, [DRIVE], episodes=0)

@@ -115,13 +115,6 @@ def test_the_network_is_torchs(cells: int) -> None:
     assert np.abs(ours - theirs).max() < 1e-6 < np.abs(np.diff(ours, axis=1)).max()
 
 
-def test_with_nothing_left_to_be_told_no_drive_is_made(tmp_path: Path) -> None:
-    _, twins, teacher = lesson()
-    course, path = replace(COURSE, told=0.5), tmp_path / "student.safetensors"
-    with pytest.raises(ValueError, match="nothing is left to be told"):
-        distill(Card.from_env_id(ID, OPTIONS), [DistillTask(twins, twins, teacher)], course, path)
-
-
 def test_what_is_told_is_what_the_teacher_reads_and_the_student_does_not_see() -> None:
     """On seeds that it has not seen, the cells know the yaw rate, which so short a training shows
     them; the policy's file has nothing of it."""
@@ -274,31 +267,6 @@ def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_f
     with pytest.raises(FloatingPointError):
         distill(Card.from_env_id(ID, OPTIONS), [lesson()], quick, path)
     assert load_policy(path).card.steps == CARS * 120
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"rounds": 0}, "1 at least"),
-        ({"hidden": (0,)}, "1 at least"),
-        ({"seed": -1}, "1 at least"),
-        ({"learning_rate": float("nan")}, "learning_rate"),
-        ({"noise": -0.1}, "learning_rate is above zero, noise"),
-        ({"told": -1.0}, "noise and told not below"),
-        ({"batch": 0}, "1 at least"),
-        ({"told": 1.0, "cells": 0}, "nothing to say"),
-        ({"traces": -1}, "cells, traces and seed 0"),
-        ({"traces": 4, "cells": 3}, "cells or traces, got 3 and 4"),
-    ],
-)
-def test_a_course_out_of_range_is_refused(wrong: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        DistillConfig(**wrong)
-
-
-def test_nothing_to_learn_from_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no lessons"):
-        distill(Card.from_env_id(ID, OPTIONS), [], COURSE, tmp_path / "student.safetensors")
 
 
 def test_mixed_inputs_show_what_two_of_them_differ_by() -> None:

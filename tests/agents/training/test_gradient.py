@@ -138,12 +138,6 @@ def test_what_begins_with_a_distilled_policy_acts_as_it_does(tmp_path: Path) -> 
         start = terminated | truncated
 
 
-def test_another_form_than_the_policys_is_named(tmp_path: Path) -> None:
-    smaller = tuned_task(policy_kwargs={"cells": 8, "net_arch": [64, 64]})
-    with pytest.raises(ValueError, match=r"network of {.*'cells': 96}, and the .* {'cells': 8,"):
-        begun(smaller, tmp_path)
-
-
 class Torn:
     """Cars whose rewards have no finite slope."""
 
@@ -183,12 +177,3 @@ def test_a_slope_that_is_not_finite_stops_it_at_its_step() -> None:
     with pytest.raises(FloatingPointError, match="slope is not finite after step 6"):
         model.learn(12)
     assert all(torch.equal(a, b) for a, b in zip(before, model.policy.parameters(), strict=True))
-
-
-def test_what_it_cannot_do_is_said() -> None:
-    with pytest.raises(ValueError, match="gradient reads sensors alone: no estimator runs on"):
-        TrainingTask(VISION, "gradient", "exact-kf")
-    with pytest.raises(ValueError, match="n_steps is at least 1, got 0"):
-        made(None, n_steps=0)
-    with pytest.raises(ValueError, match="needs their source"):
-        made(None).learn(1)

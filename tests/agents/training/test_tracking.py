@@ -8,7 +8,7 @@ from unittest.mock import Mock, call
 import pytest
 
 pytest.importorskip("stable_baselines3")
-from sideslip.agents.training import callbacks, trainer
+from sideslip.agents.training import trainer
 from sideslip.agents.training.callbacks import CURVE, RunOptions
 from sideslip.agents.training.config import TrainingTask
 
@@ -19,7 +19,6 @@ def test_a_tracked_training_hands_over_what_is_logged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One run: named as the folder, told the task, given evaluations and losses, and ended."""
-    monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
     run = Mock()
     monkeypatch.setitem(sys.modules, "wandb", Mock(init=run.init))
     trainer.train(TINY, ROLLOUT, tmp_path / "mine", run_options=RunOptions(track="cars"))

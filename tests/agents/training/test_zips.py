@@ -3,6 +3,7 @@
 import functools
 import json
 import pickle
+import sys
 import zipfile
 from copy import deepcopy
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 
 import sideslip
 from sideslip.agents.learned.policy import load_policy
-from sideslip.agents.training.export import export_zip
+from sideslip.agents.training.export import convert_sb3_policy, export_zip
 
 sb3 = pytest.importorskip("stable_baselines3")
 contrib = pytest.importorskip("sb3_contrib")
@@ -35,6 +36,7 @@ APART = {"net_arch": {"pi": [8, 4], "vf": [3]}, "share_features_extractor": Fals
 SQUASHED = SMALL | {"squash_output": True}
 MODELS: dict[str, tuple[Any, Any]] = {
     "PPO": (sb3.PPO, {}),
+    "PPO, linear": (sb3.PPO, {"policy_kwargs": {"net_arch": []}}),
     "PPO, gSDE": (sb3.PPO, {"use_sde": True}),
     "PPO, squashed gSDE": (sb3.PPO, {"use_sde": True, "policy_kwargs": SQUASHED}),
     "PPO, two extractors": (sb3.PPO, {"policy_kwargs": APART}),
@@ -233,6 +235,13 @@ REFUSED: dict[str, tuple[Any, Any, Any, dict[str, Any], str]] = {
     ),
     "DQN": (sb3.DQN, "MlpPolicy", lambda: "CartPole-v1", OFF, "DQNPolicy is not known"),
     "gSDE": (sb3.SAC, "MlpPolicy", bridged, OFF | {"use_sde": True}, "gSDE.* clips the mean"),
+    "GELU": (
+        sb3.PPO,
+        "MlpPolicy",
+        bridged,
+        {"policy_kwargs": {"activation_fn": torch.nn.GELU}},
+        "layer GELU",
+    ),
     "activation": (
         sb3.PPO,
         "MlpPolicy",
@@ -288,3 +297,42 @@ def test_another_normaliser_is_refused(zipped: Path, tmp_path: Path) -> None:
         path.write_bytes(content)
         with pytest.raises(ValueError, match=said):
             make(normalise=path)
+
+
+@pytest.mark.parametrize("name", ["PPO", "PPO, linear", "PPO, ReLU", "A2C", "SAC", "TD3"])
+def test_it_is_torchs_function_where_torch_is_in_double_precision(name: str) -> None:
+    """For observations of any size, where single precision rounds more than 1e-6 away."""
+    kind, options = MODELS[name]
+    model = made(kind, "MlpPolicy", bridged(), **options)
+    x, policy = np.random.default_rng(0).normal(size=(200, 22)) * 10.0, model.policy
+    if kind in (sb3.PPO, sb3.A2C):
+        layers = [policy.mlp_extractor.policy_net, policy.action_net]
+    elif kind is sb3.SAC:
+        layers = [policy.actor.latent_pi, policy.actor.mu, torch.nn.Tanh()]
+    else:
+        layers = [policy.actor.mu]
+    with torch.no_grad():
+        theirs = torch.nn.Sequential(*layers).double()(torch.from_numpy(x)).numpy()
+    ours = convert_sb3_policy(model)(x)
+    assert np.abs(ours - theirs).max() < 1e-12 * max(1.0, np.abs(theirs).max())
+
+
+def test_what_never_varied_is_not_read() -> None:
+    env = normalised(bridged())
+    network = convert_sb3_policy(made(sb3.PPO, "MlpPolicy", env), env)
+    names = [entry.name for entry in gym.make(ID).get_wrapper_attr("layout")]
+    unread = {name for name, scale in zip(names, network.scale, strict=True) if scale == 0.0}
+    assert unread == {"beta_ref", "gamma_ref"}
+    assert network.clip == env.clip_obs
+
+
+def test_another_range_of_actions_and_a_missing_extra_are_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wide = made(sb3.PPO, "MlpPolicy", bridged())
+    wide.policy.action_space = gym.spaces.Box(-2.0, 2.0, (1,), np.float32)
+    with pytest.raises(ValueError, match=r"within \[-1, 1\]"):
+        convert_sb3_policy(wide)
+    monkeypatch.setitem(sys.modules, "stable_baselines3.common.torch_layers", None)
+    with pytest.raises(ModuleNotFoundError, match=r"sideslip\[train\]"):
+        convert_sb3_policy(wide)
