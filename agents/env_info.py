@@ -118,7 +118,7 @@ class EnvView:
         return self.facts.nominal
 
 
-def make_env(env_id: str, options: Mapping[str, object]) -> CarEnv:
+def make_env(env_id: str, options: Mapping[str, Any]) -> CarEnv:
     """Make the env of an id, with the env's own short message for a missing or unknown argument.
 
     Args:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ..envs.io import atomic_file, write_atomic
 from ..envs.numerics import require_extra
@@ -84,7 +83,7 @@ def write_evaluation(folder: Path, env_id: str, model: Any, costs: Array, length
         return
     with atomic_file(folder / f"{_make_file_name(env_id)}.zip") as file:
         model.save(file)
-    evaluation: dict[str, npt.NDArray[Any]] = {
+    evaluation: dict[str, Any] = {
         "timesteps": np.array([model.num_timesteps]),
         "results": -costs[None],
         "ep_lengths": lengths[None].astype(np.int64),

@@ -192,39 +192,23 @@ def list_entry_names(env: AnyEnv) -> set[str]:
     return {entry.name for entry in get_env_facts(env).layout}
 
 
-def check_positive(name: str, value: float) -> float:
+def check_positive(name: str, value: float, allow_zero: bool = False) -> float:
     """Return a number that must be positive and finite.
 
     Args:
         name: Name of the option, for the message.
         value: Number to check.
+        allow_zero: Whether it may be zero too.
 
     Returns:
         The number as a float.
 
     Raises:
-        ValueError: The number is not positive and finite.
+        ValueError: The number is out of range.
     """
-    if not 0.0 < value < math.inf:
-        raise ValueError(f"{name} is a positive number, got {value!r}")
-    return float(value)
-
-
-def check_not_negative(name: str, value: float) -> float:
-    """Return a number that must be finite and not negative.
-
-    Args:
-        name: Name of the option, for the message.
-        value: Number to check.
-
-    Returns:
-        The number as a float.
-
-    Raises:
-        ValueError: The number is negative or not finite.
-    """
-    if not 0.0 <= value < math.inf:
-        raise ValueError(f"{name} is a number of zero or more, got {value!r}")
+    if not 0.0 <= value < math.inf or (value == 0.0 and not allow_zero):
+        rule = "number of zero or more" if allow_zero else "positive number"
+        raise ValueError(f"{name} is a {rule}, got {value!r}")
     return float(value)
 
 

@@ -18,7 +18,7 @@ from ...envs.record import Array
 from ...envs.ticks import TICK
 from ..design.pi import CAR, PLACEMENTS, POLE, compute_plant, design_pi, make_nominal_car, sample_pi
 from ..env_info import AnyEnv
-from .base import Controller, check_not_negative, integrate_antiwindup
+from .base import Controller, check_positive, integrate_antiwindup
 
 MIN_SPEED = 2.0  # m/s: gains below it are those of this speed
 SPEEDS = np.arange(MIN_SPEED, 61.0, 0.5)  # m/s
@@ -171,7 +171,7 @@ class TwoDof(Controller):
         period = self.control_period * TICK
         wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
         dt = wait * period
-        factor = check_not_negative("gain", gain)
+        factor = check_positive("gain", gain, allow_zero=True)
         if sampled:
             pis = [sample_pi(self.nominal, float(v), dt, pole, placement) for v in SPEEDS]
         else:

@@ -32,7 +32,6 @@ from ..design.sampled_model import SPEEDS, find_cell
 from ..env_info import AnyEnv
 from .base import (
     Controller,
-    check_not_negative,
     check_positive,
     integrate_antiwindup,
     list_entry_names,
@@ -137,7 +136,7 @@ class Esc(Controller):
             slip,
             self.full_scale / slip
             if stiffness is None
-            else check_not_negative("stiffness", stiffness),
+            else check_positive("stiffness", stiffness, allow_zero=True),
             int(bounded),
             self.full_scale,
             self.control_period * TICK,

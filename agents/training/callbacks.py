@@ -159,8 +159,8 @@ class EvalCallback(BaseCallback):
             self.eval_env = self.warm_start.wrap_env(self.eval_env)
         base: Any = self.eval_env.unwrapped
         self.period: float = base.control_period * base.dt  # s
-        saved = {} if checkpoint is None else checkpoint
-        self.evaluations = [Evaluation(*row) for row in saved.get("evaluations", [])]
+        self.checkpoint = checkpoint or {}
+        self.evaluations = [Evaluation(*row) for row in self.checkpoint.get("evaluations", [])]
         uncontrolled = self._average_scenarios(evaluate_costs(self.eval_env, None, self.seeds))
         if uncontrolled.mean() == 0.0:
             raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
@@ -171,20 +171,14 @@ class EvalCallback(BaseCallback):
             self.weights = _compute_scenario_weights(task, _WEIGHT_SEEDS)
         driver = self.warm_start.driver if self.warm_start else None
         self.initial_costs = evaluate_costs(self.eval_env, driver, self.seeds) if driver else None
-        self.scaling: Any = saved.get("scaling")
+        self.scaling: Any = self.checkpoint.get("scaling")
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
         self.since = time.process_time()
 
-    def build(
-        self,
-        checkpoint: Checkpoint | None,
-        trained_agent: str | Path | None = None,
-        trust: bool = False,
-    ) -> BaseAlgorithm:
+    def build(self, trained_agent: str | Path | None = None, trust: bool = False) -> BaseAlgorithm:
         """Build the model, new or of the checkpoint, a zip or a policy, with its environments.
 
         Args:
-            checkpoint: State of a checkpoint, None for a new training.
             trained_agent: Zip to start from, None for none.
             trust: Whether a pickle of VecNormalize beside the zip may be read.
 
@@ -192,25 +186,23 @@ class EvalCallback(BaseCallback):
             Model, ready to learn.
         """
         task, run_options = self.task, self.run_options
-        start = None
+        start = self.warm_start.start if self.warm_start and not self.checkpoint else None
         if trained_agent is not None:
             width = (self.eval_env.single_observation_space.shape or (0,))[0]
             start = read_warm_start(trained_agent, width, trust)
-        elif checkpoint is None:
-            start = self.warm_start.start if self.warm_start else None
         if start is not None:
             self.scaling = start.scaling
+        on_tensors = get_algorithm(task.algo).on_tensors
         if self.scaling is None:
             kwargs, seed = task.settings.get("policy_kwargs", {}), _SCALING_SEEDS + task.seed
             spread = math.exp(kwargs.get("log_std_init", _UNIFORM_LOG_STD))
-            mixed = get_algorithm(task.algo).on_tensors
             scaling_env = task.vector_env(_SCALING_ENVS)
-            self.scaling = measure_scaling(scaling_env, spread, seed, task.reads, mixed)
+            self.scaling = measure_scaling(scaling_env, spread, seed, task.reads, on_tensors)
         options = dict[str, Any](estimator=task.estimator_kwargs)
         options["env_kwargs"] = task.options(task.num_envs)
         options["wrapper_class"] = self.warm_start.wrap_env if self.warm_start else None
         env = make_vec_env(task.env_id, task.num_envs, **options)
-        steps = 0 if checkpoint is None else int(checkpoint["steps"])
+        steps = int(self.checkpoint.get("steps", 0))
         seed = (task.seed + steps) % 2**32
         first = _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING + steps
         if self.warm_start is not None:
@@ -221,13 +213,13 @@ class EvalCallback(BaseCallback):
         scaled_env = RewardScaleWrapper(env, RewardScale(scales))
         log, device = run_options.tensorboard_log, run_options.device
         further = dict[str, Any](device=device, tensorboard_log=log)
-        if get_algorithm(task.algo).on_tensors:
+        if on_tensors:
             from .gradient import make_source
 
             further["source"] = partial(make_source, task, first, scaled_env.reward_scale)
         setup = scaled_env, self.period, self.scaling, seed
         model = make_model(task.algo, task.settings, *setup, **further)
-        if checkpoint is not None:
+        if self.checkpoint:
             _load_parameters(self.folder / CHECKPOINT, model)
             if isinstance(model, OffPolicyAlgorithm):
                 model.learning_starts += steps  # its buffer begins empty

@@ -10,6 +10,7 @@ matrix of the teacher's design, over the cost of the episode: the score's logari
 """
 
 import itertools
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 _DISTILL_SEEDS = 2**69  # no other seeds are as large: `callbacks`, `corrections`
 _SEEDS_PER_TRAINING = 2**40
 _NOISE_DECAY = 0.95  # factor of the coloured noise in a step
+_WINDOW = 50  # steps through which the gradient goes back in time, but for traces
 _SAMPLES = 512  # steps of a batch of a student without memory
 _LAST_ROUND_FACTOR = 3  # times as many epochs in the last round
 
@@ -242,7 +244,7 @@ class _EpisodeBatches:
         self, drives: Sequence[Demonstrations], scaling: Scaling, config: DistillConfig
     ) -> None:
         self.drives, self.scaling = drives, scaling
-        self.batch, self.window = config.batch, config.window
+        self.batch, self.window = config.batch, sys.maxsize if config.traces else _WINDOW
         self.episodes = [(i, j) for i, demo in enumerate(drives) for j in range(len(demo.costs))]
         longest = max(demo.weights.shape[1] for demo in drives)
         self.n_batches = -(-len(self.episodes) // self.batch) * -(-longest // self.window)

@@ -144,14 +144,6 @@ class GruPolicy(BasePolicy):
     def _predict(self, observation: Any, deterministic: bool = False) -> Any:
         return self(observation, self._begin(len(observation)))[0]
 
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        layers = [layer.out_features for layer in self.layers if isinstance(layer, nn.Linear)]
-        parameters: dict[str, Any] = super()._get_constructor_parameters()
-        parameters |= {"cells": self.cell.hidden_size, "net_arch": layers[:-1]}
-        for name in ("features_extractor_class", "features_extractor_kwargs"):
-            parameters[name] = getattr(self, name)
-        return parameters | {"lr_schedule": self._dummy_schedule}
-
 
 class AnalyticPolicyGradient(BaseAlgorithm):
     """The algorithm that follows the cost's gradient, in stable-baselines3's form.

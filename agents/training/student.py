@@ -5,7 +5,6 @@
 
 import functools
 import itertools
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import NamedTuple
@@ -31,7 +30,6 @@ _UNREAD = ("gps_X", "gps_Y", "gps_satellites")
 _MIN_VARIANCE = 1e-3  # least variance of a mixture of normalised inputs, for `compute_whitening`
 _MIN_TRACE_VARIANCE = 1e-4  # likewise, of a mixture of inputs and their averages
 _EARLY, _MEDIAN = 16.0, 50.0  # percentiles of an age, one deviation apart where it is normal
-_WINDOW = 50  # steps through which the gradient goes back in time
 _TIMES = (3, 10, 30, 100, 300)
 """Times of the means in steps; of 10 ms each: from the motors' lag to half a drive."""
 SAMPLE_STRIDE = 7  # every so many steps one is a sample for a whitening
@@ -192,11 +190,6 @@ class DistillConfig:
         """Collect all numbers but the seed, in JSON types."""
         numbers = asdict(self) | {"hidden": list(self.hidden)}
         return {name: value for name, value in numbers.items() if name != "seed"}
-
-    @property
-    def window(self) -> int:
-        """Steps of truncated back-propagation; with traces all of them."""
-        return sys.maxsize if self.traces else _WINDOW
 
 
 class _TraceLayer(nn.Module):

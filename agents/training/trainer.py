@@ -112,7 +112,7 @@ def train(
     zip_path = None if isinstance(trained_agent, Policy) else trained_agent
     callback = EvalCallback(task, folder_path, checkpoint, chosen_options, steps, initial_policy)
     callbacks: list[BaseCallback] = [callback] if tracker is None else [tracker, callback]
-    model = callback.build(checkpoint, zip_path, trust)
+    model = callback.build(zip_path, trust)
     done = model.num_timesteps
     if done < steps:
         log = dict[str, Any](reset_num_timesteps=done == 0, tb_log_name=task.algo)

@@ -121,7 +121,7 @@ def test_a_drive_has_a_weight_of_its_own() -> None:
 
 
 def begun(task: TrainingTask, folder: Path) -> Any:
-    return EvalCallback(task, folder, None, RunOptions(), 1, load_policy("raw-car-yaw")).build(None)
+    return EvalCallback(task, folder, None, RunOptions(), 1, load_policy("raw-car-yaw")).build()
 
 
 def test_what_begins_with_a_distilled_policy_acts_as_it_does(tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ def finetuned(message: str, policy: Any, algo: str = "ppo") -> Refusal:
 def started(message: str, policy: Any, make: Callable[[], TrainingTask]) -> Refusal:
     """Before anybody drives."""
     begin = RunOptions(), 16, policy
-    return lambda folder: EvalCallback(make(), folder, None, *begin).build(None), message
+    return lambda folder: EvalCallback(make(), folder, None, *begin).build(), message
 
 
 def scaled(message: str, *reads: str) -> Refusal:
@@ -98,7 +98,7 @@ def memory(message: str, name: str, fresh: bool = True) -> Refusal:
 
 
 def normalised_twice(_: Path) -> None:
-    model = trainer.EvalCallback(TINY, Path(), None, RunOptions()).build(None)
+    model = trainer.EvalCallback(TINY, Path(), None, RunOptions()).build()
     convert_sb3_policy(model, VecNormalize(make_vec_env(TINY.env_id, 2)))
 
 

@@ -45,7 +45,7 @@ FEW = {"num_envs": 4, "n_eval_envs": 4, "env_options": COMS | SHORT}
 
 
 def started(task: TrainingTask, folder: Path, policy: Policy = POLICY) -> Any:
-    return EvalCallback(task, folder, None, RunOptions(), 16, policy).build(None)
+    return EvalCallback(task, folder, None, RunOptions(), 16, policy).build()
 
 
 def test_the_task_is_that_of_the_card(tmp_path: Path) -> None:
@@ -127,7 +127,7 @@ def test_what_a_training_drives_is_what_the_policy_drove(
     if steps:
         scaling = network.mean.tolist(), network.scale.tolist(), network.clip, None
         saved = {"steps": steps, "scaling": scaling, "evaluations": []}
-    model: Any = EvalCallback(task, tmp_path, saved, RunOptions(), 400, policy).build(saved)
+    model: Any = EvalCallback(task, tmp_path, saved, RunOptions(), 400, policy).build()
     driver, cars = _NetworkAgent(network), model.get_env()
     paid, costs, state, start = np.zeros(4), np.zeros(4), None, np.ones(4, np.bool_)
     if algo == "gradient":
@@ -217,7 +217,7 @@ def test_the_best_is_that_of_the_score_not_of_the_mean(
     other = EvalCallback(
         make_finetune_task(POLICY, **FEW), tmp_path, None, RunOptions(), 16, POLICY
     )
-    other.build(None).set_logger(configure(None, []))
+    other.build().set_logger(configure(None, []))
     cost = 0.0 if kept else 1e9
     other.evaluations.append(Evaluation(0, 0.0, cost=cost, of_none=cost, of_start=ratio))
     other.evaluate()

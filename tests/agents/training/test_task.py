@@ -71,7 +71,7 @@ def test_the_scenarios_of_a_mixture_weigh_alike(tmp_path: Path) -> None:
     none = evaluate_costs(env, NoControl(env), seeds)
     assert none[::2].mean() > 3.0 * none[1::2].mean()  # else there is nothing to weigh
     wide = dataclasses.replace(task, num_envs=64)
-    cars: Any = callbacks.EvalCallback(wide, tmp_path, None, RunOptions()).build(None).get_env()
+    cars: Any = callbacks.EvalCallback(wide, tmp_path, None, RunOptions()).build().get_env()
     cars.seed(2**63)
     cars.reset()
     returns, driven, running = np.zeros(64), np.zeros(64), np.ones(64)

@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
@@ -184,6 +185,32 @@ def test_a_file_that_is_no_checkpoint_says_so(folder: Path, tmp_path: Path) -> N
     (tmp_path / CHECKPOINT).write_bytes(save({"a": torch.zeros(1)}))
     with pytest.raises(ValueError, match="is no checkpoint of this format"):
         read_task(tmp_path)
+
+
+def test_a_tracked_training_hands_over_what_is_logged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One run: named as the folder, told the task, given evaluations and losses, and ended."""
+    run = Mock()
+    monkeypatch.setitem(sys.modules, "wandb", Mock(init=run.init))
+    trainer.train(TINY, ROLLOUT, tmp_path / "mine", run_options=RunOptions(track="cars"))
+    assert run.init.call_args.kwargs["project"] == "cars"
+    assert run.init.call_args.kwargs["name"] == "mine"
+    assert run.init.call_args.kwargs["config"]["env_id"] == TINY.env_id
+    own = run.init.return_value
+    logged = [(each.kwargs["step"], each.args[0]) for each in own.log.call_args_list]
+    lines = [json.loads(line) for line in (tmp_path / "mine" / CURVE).read_text().splitlines()]
+    rewards = {
+        step: each["eval/mean_reward"] for step, each in logged if "eval/mean_reward" in each
+    }
+    assert rewards == {each["steps"]: -each["cost"] for each in lines}
+    assert any("train/loss" in each for _, each in logged)
+    own.finish.assert_called_once_with()
+    assert own.method_calls[-1] == call.finish()  # a run that ended takes nothing
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(ModuleNotFoundError, match="tracking needs wandb: pip install wandb"):
+        trainer.train(TINY, ROLLOUT, tmp_path / "other", run_options=RunOptions(track="cars"))
+    assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.long

@@ -31,7 +31,7 @@ def begun(tmp_path: Path, zipped: Path, trust: bool = False) -> Any:
     """The model before its first step."""
     place = tmp_path / "new"
     place.mkdir()
-    return trainer.EvalCallback(TASK, place, None, RunOptions()).build(None, zipped, trust)
+    return trainer.EvalCallback(TASK, place, None, RunOptions()).build(zipped, trust)
 
 
 def foreign(path: Path, normalised: bool, **options: Any) -> Any:
