@@ -90,6 +90,9 @@ def make_agent(name: str, env: AnyEnv, **options: Any) -> Controller:
         name: Name of the agent.
         env: Env of this package.
         options: Arguments of the agent, and `trust`.
+
+    Returns:
+        The controller.
     """
 
 
@@ -101,6 +104,9 @@ def make_agent(name: Agent | Callable[..., Agent], env: AnyEnv, **options: Any) 
         name: Factory, or the agent itself.
         env: Env of this package.
         options: Arguments of the factory.
+
+    Returns:
+        The agent.
     """
 
 

@@ -228,6 +228,9 @@ class NativeVecEnv(VecEnv):
 
         Args:
             mode: As in stable-baselines3, without effect on the frame.
+
+        Returns:
+            The frame.
         """
         return None if self.render_mode == "human" else super().render(mode)
 
@@ -241,6 +244,9 @@ class NativeVecEnv(VecEnv):
         Args:
             attr_name: Name of the attribute.
             indices: Rows, None for all.
+
+        Returns:
+            Values, one for each row.
         """
         return [row.get_wrapper_attr(attr_name) for row in self._get_rows(indices)]
 
@@ -265,6 +271,9 @@ class NativeVecEnv(VecEnv):
             method_args: Arguments of the method.
             indices: Rows, None for all.
             method_kwargs: Arguments of the method by name.
+
+        Returns:
+            Results, one for each row.
         """
         chosen = [row.get_wrapper_attr(method_name) for row in self._get_rows(indices)]
         return [method(*method_args, **method_kwargs) for method in chosen]
@@ -277,6 +286,9 @@ class NativeVecEnv(VecEnv):
         Args:
             wrapper_class: Class of the wrapper.
             indices: Rows, None for all.
+
+        Returns:
+            Whether it has, one for each row.
         """
         return [row.is_wrapped(wrapper_class) for row in self._get_rows(indices)]
 
