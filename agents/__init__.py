@@ -83,11 +83,31 @@ class Agent(Protocol):
 
 
 @overload
-def make_agent(name: str, env: AnyEnv, **options: Any) -> Controller: ...
+def make_agent(name: str, env: AnyEnv, **options: Any) -> Controller:
+    """Make a controller or policy by its name.
+
+    Args:
+        name: Name of the agent.
+        env: Env of this package.
+        options: Arguments of the agent, and `trust`.
+
+    Returns:
+        The controller.
+    """
 
 
 @overload
-def make_agent(name: Agent | Callable[..., Agent], env: AnyEnv, **options: Any) -> Agent: ...
+def make_agent(name: Agent | Callable[..., Agent], env: AnyEnv, **options: Any) -> Agent:
+    """Make an agent by a factory.
+
+    Args:
+        name: Factory, or the agent itself.
+        env: Env of this package.
+        options: Arguments of the factory.
+
+    Returns:
+        The agent.
+    """
 
 
 def make_agent(

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+import numpy.typing as npt
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
@@ -14,10 +15,13 @@ from ..envs.task import ObservationEntry, make_space
 from ..envs.validation import short_repr
 from ..envs.vehicle.parameters import Vehicle
 
+CarEnv = gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]
+CarVectorEnv = VectorEnv[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[Any]]
+
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
-    AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any] | VecEnv
+    AnyEnv = CarEnv | CarVectorEnv | VecEnv
 else:
     AnyEnv = Any  # stable-baselines3 comes with an extra, and needs a second to load
 
@@ -72,11 +76,11 @@ class EnvView:
     num_envs: int  # rows, one car each
     facts: EnvFacts
     plants: frozenset[PlantKind]  # among the rows
-    single_observation_space: gym.Space[Any]
-    single_action_space: gym.Space[Any]
+    single_observation_space: gym.Space[npt.NDArray[np.float32]]
+    single_action_space: gym.Space[npt.NDArray[np.float32]]
 
     @classmethod
-    def from_env(cls, env: VectorEnv[Any, Any, Any]) -> "EnvView":
+    def from_env(cls, env: CarVectorEnv) -> "EnvView":
         """Make the view of a vector env.
 
         Args:
@@ -94,12 +98,12 @@ class EnvView:
         return self
 
     @property
-    def observation_space(self) -> gym.Space[Any]:
+    def observation_space(self) -> gym.Space[npt.NDArray[np.float32]]:
         """Observation space of all rows."""
         return batch_space(self.single_observation_space, self.num_envs)
 
     @property
-    def action_space(self) -> gym.Space[Any]:
+    def action_space(self) -> gym.Space[npt.NDArray[np.float32]]:
         """Action space of all rows."""
         return batch_space(self.single_action_space, self.num_envs)
 
@@ -114,7 +118,7 @@ class EnvView:
         return self.facts.nominal
 
 
-def make_env(env_id: str, options: Mapping[str, Any]) -> gym.Env[Any, Any]:
+def make_env(env_id: str, options: Mapping[str, Any]) -> CarEnv:
     """Make the env of an id, with the env's own short message for a missing or unknown argument.
 
     Args:
@@ -158,8 +162,8 @@ def get_env_facts(env: AnyEnv | EnvView) -> EnvFacts:
 
 
 def _collect_facts(env: Any) -> EnvFacts:
-    nominals: Sequence[Any]
-    vehicles: Sequence[Any]
+    nominals: Sequence[Vehicle]
+    vehicles: Sequence[Vehicle]
     if isinstance(env, EnvView):
         return env.facts
     base: Any = env.unwrapped
@@ -261,7 +265,7 @@ def _check_wrappers(env: Any, layout: tuple[ObservationEntry, ...]) -> None:
         )
 
 
-def get_layout(env: VectorEnv[Any, Any, Any]) -> tuple[ObservationEntry, ...]:
+def get_layout(env: CarVectorEnv) -> tuple[ObservationEntry, ...]:
     """Read the layout of the outermost layer that has one, else that of the sub-environments.
 
     Args:

@@ -32,7 +32,7 @@ from .design.sampled_model import (
     make_design_model,
     make_tick_model,
 )
-from .env_info import AnyEnv, list_configs
+from .env_info import AnyEnv, CarEnv, list_configs
 
 _REQUIRED = {
     "steering": "wander", "small_angle": True, "tyres": "linear", "roll": False,
@@ -193,7 +193,7 @@ def _make_true_options(env: AnyEnv) -> dict[str, Any]:
     return options
 
 
-def compute_optimum(env: gym.Env[Any, Any], schedules: int = 1) -> Optimum:
+def compute_optimum(env: CarEnv, schedules: int = 1) -> Optimum:
     """Compute the optimum of a linear scenario; the env runs to show what arrives when.
 
     Args:
@@ -226,7 +226,7 @@ def _solve_regulator(plant: LinearPlant) -> tuple[Array, Array, float]:
     return gains, weights, cost + float(np.trace(V @ plant.start))
 
 
-def _compute_error_covariances(env: gym.Env[Any, Any], plant: LinearPlant, seed: int) -> Array:
+def _compute_error_covariances(env: CarEnv, plant: LinearPlant, seed: int) -> Array:
     """Compute the best estimate's error covariance at the decisions of a seed, (steps, n, n)."""
     env.reset(seed=seed)
     base: Any = env.unwrapped

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-from gymnasium.vector import VectorEnv
 
 from ..envs.io import atomic_file
 from ..envs.numerics import require_extra
 from ..envs.numerics.primitives import Scalar
-from ..envs.record import Log, concatenate
+from ..envs.record import Array, Log, concatenate
 from ..envs.validation import short_repr
+from .env_info import CarEnv, CarVectorEnv
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,13 +35,13 @@ class EpisodeStep(NamedTuple):
     info: dict[str, Any]
     action: Any  # before this outcome, (width,) or (N, width)
     reward: Scalar  # of the row or (N,)
-    terminated: Any  # whether the episode ended by itself
-    truncated: Any  # whether it reached its time limit
+    terminated: bool | npt.NDArray[np.bool_]  # whether the episode ended by itself
+    truncated: bool | npt.NDArray[np.bool_]  # whether it reached its time limit
     running: npt.NDArray[np.bool_]  # rows that are in their first episode, (N,)
 
 
 def iterate_steps(
-    env: gym.Env[Any, Any] | VectorEnv[Any, Any, Any],
+    env: CarEnv | CarVectorEnv,
     agent: Any = None,
     seeds: Any = None,
     options: dict[str, Any] | None = None,
@@ -78,9 +78,7 @@ def iterate_steps(
         running = running & ~start
 
 
-def evaluate_episodes(
-    env: VectorEnv[Any, Any, Any], agent: Any, seeds: Sequence[int]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def evaluate_episodes(env: CarVectorEnv, agent: Any, seeds: Sequence[int]) -> tuple[Array, Array]:
     """Evaluate the cost and length of each seed's first episode.
 
     Args:
@@ -98,9 +96,7 @@ def evaluate_episodes(
     return costs, lengths
 
 
-def evaluate_costs(
-    env: VectorEnv[Any, Any, Any], agent: Any, seeds: Sequence[int]
-) -> npt.NDArray[np.float64]:
+def evaluate_costs(env: CarVectorEnv, agent: Any, seeds: Sequence[int]) -> Array:
     """Evaluate the cost J of each seed's first episode, shape (N,).
 
     Args:
@@ -114,9 +110,7 @@ def evaluate_costs(
     return evaluate_episodes(env, agent, seeds)[0]
 
 
-def compute_cost_ratios(
-    costs: npt.NDArray[np.float64], others: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
+def compute_cost_ratios(costs: Array, others: Array) -> Array:
     """Compute ratios of costs on the same seeds, each with `COST_FLOOR` added.
 
     Args:
@@ -141,27 +135,20 @@ _INFO_UNITS = {name: unit for unit, names in _UNITS.items() for name in names.sp
 TRUTH = ("beta", "gamma", "psi", "v_x", "v_y", "phi", "y_l")
 """The true states in a log, named as estimators name them."""
 _DEGREES = 180.0 / np.pi
-_TRUE: dict[str, Any] = {"color": "#000000", "lw": 1.4, "zorder": 3}
-_ESTIMATE: dict[str, Any] = {"color": "#56B4E9", "lw": 1.0}
-_REFERENCE: dict[str, Any] = {"color": "#D55E00", "lw": 1.2, "ls": "--", "zorder": 2}
-_PANELS: tuple[tuple[tuple[tuple[str, str, dict[str, Any]], ...], str, float], ...] = (
-    (
-        (
-            ("obs_beta_hat", "estimate, 1 std", _ESTIMATE),
-            ("beta_ref", "reference", _REFERENCE),
-            ("beta", "true", _TRUE),
-        ),
-        "sideslip angle / deg",
-        _DEGREES,
-    ),
-    (
-        (("gamma_ref", "reference", _REFERENCE), ("gamma", "true", _TRUE)),
-        "yaw rate / (deg/s)",
-        _DEGREES,
-    ),
-    ((("yaw_moment", "delivered", _TRUE),), "yaw moment / (N m)", 1.0),
-    ((("steer", "front wheels", _TRUE),), "steering angle / deg", _DEGREES),
+_ESTIMATE_COLOUR = "#56B4E9"
+_STYLES: dict[str, dict[str, str | float]] = {
+    "estimate, 1 std": {"color": _ESTIMATE_COLOUR, "lw": 1.0},
+    "reference": {"color": "#D55E00", "lw": 1.2, "ls": "--", "zorder": 2},
+}
+_TRUE_STYLE: dict[str, str | float] = {"color": "#000000", "lw": 1.4, "zorder": 3}
+_SIDESLIP = {"obs_beta_hat": "estimate, 1 std", "beta_ref": "reference", "beta": "true"}
+_PANELS: tuple[tuple[dict[str, str], str, float], ...] = (
+    (_SIDESLIP, "sideslip angle / deg", _DEGREES),
+    ({"gamma_ref": "reference", "gamma": "true"}, "yaw rate / (deg/s)", _DEGREES),
+    ({"yaw_moment": "delivered"}, "yaw moment / (N m)", 1.0),
+    ({"steer": "front wheels"}, "steering angle / deg", _DEGREES),
 )
+"""Panels: labels of the curves by column, label of the axis, and the factor to its unit."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -171,11 +158,11 @@ class Rollout:
     Columns are `info`, true motion, observation (`obs_...`), action before the row, and reward.
     """
 
-    columns: dict[str, npt.NDArray[np.float64]]  # a value for each row
+    columns: dict[str, Array]  # a value for each row
     units: dict[str, str]  # by column
     log: Log  # record of every tick, with the truth at the ticks of the rows
 
-    def __getitem__(self, name: str) -> npt.NDArray[np.float64]:
+    def __getitem__(self, name: str) -> Array:
         if name not in self.columns:
             raise KeyError(f"no signal {name!r}; there are: {', '.join(self.columns)}")
         return self.columns[name]
@@ -223,10 +210,8 @@ class Rollout:
             import pyarrow as pa
             import pyarrow.parquet as pq
 
-        fields = [
-            pa.field(name, pa.float64(), metadata={"unit": self.units[name]})
-            for name in self.columns
-        ]
+        units = {name: {"unit": self.units[name]} for name in self.columns}
+        fields = [pa.field(name, pa.float64(), metadata=unit) for name, unit in units.items()]
         table = pa.table(list(self.columns.values()), schema=pa.schema(fields))
         with atomic_file(path) as file:
             pq.write_table(table, file)
@@ -240,14 +225,16 @@ class Rollout:
         axes = figure.subplots(4, 1, sharex=True)
         t, columns = self.columns["t"], self.columns
         for axis, (names, label, scale) in zip(axes, _PANELS, strict=True):
-            for name, text, style in names:
+            for name, text in names.items():
                 # a task that judges the sideslip angle alone has no reference of the yaw rate
                 if name in columns and (name != "gamma_ref" or columns[name].any()):
-                    axis.plot(t, scale * columns[name], label=text, **style)
-            std = columns.get("obs_beta_std")
-            if names[0][0] == "obs_beta_hat" and names[0][0] in columns and std is not None:
-                low, high = (scale * (columns["obs_beta_hat"] + x * std) for x in (-1.0, 1.0))
-                axis.fill_between(t, low, high, color=_ESTIMATE["color"], alpha=0.3, lw=0)
+                    axis.plot(
+                        t, scale * columns[name], label=text, **_STYLES.get(text, _TRUE_STYLE)
+                    )
+            if "obs_beta_hat" in names and {"obs_beta_hat", "obs_beta_std"} <= columns.keys():
+                estimate, std = columns["obs_beta_hat"], columns["obs_beta_std"]
+                low, high = (scale * (estimate + x * std) for x in (-1.0, 1.0))
+                axis.fill_between(t, low, high, color=_ESTIMATE_COLOUR, alpha=0.3, lw=0)
             axis.set_ylabel(label)
             axis.grid(alpha=0.3)
             axis.legend(loc="best", fontsize="small")
@@ -257,7 +244,7 @@ class Rollout:
 
 
 def rollout(
-    env: gym.Env[Any, Any] | str,
+    env: CarEnv | str,
     agent: Any = None,
     seed: int | None = 0,
     options: dict[str, Any] | None = None,
@@ -308,14 +295,9 @@ def rollout(
 def _get_motion(base: Any) -> dict[str, float]:
     """Read the motion that `info` lacks: v_x, v_y (m/s), phi (rad), y_l and place X, Y (m)."""
     motion = base.motion
-    return {
-        "v_x": motion.v_x,
-        "v_y": motion.v_y,
-        "phi": motion.phi,
-        "y_l": motion.y + base.vehicle.preview * (motion.psi - motion.theta),  # tie-vision (4)
-        "X": motion.X,
-        "Y": motion.Y,
-    }
+    y_l = motion.y + base.vehicle.preview * (motion.psi - motion.theta)  # tie-vision (4)
+    moved = {name: getattr(motion, name) for name in ("v_x", "v_y", "phi")}
+    return moved | {"y_l": y_l, "X": motion.X, "Y": motion.Y}
 
 
 def _find_unit(name: str) -> str:

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium.envs.registration import load_env_creator
-from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector import AutoresetMode, VectorWrapper
 
 from ..envs.numerics import require_extra
 from ..envs.task import make_info
@@ -18,6 +18,7 @@ from ..estimators.vector import truth as vector_truth
 from ..estimators.vector.estimate import EstimateObservation
 from ..estimators.wrappers import estimate as single_estimate
 from ..estimators.wrappers import truth as single_truth
+from .env_info import CarVectorEnv
 
 with require_extra("train", "training needs torch and stable-baselines3"):
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor
@@ -25,7 +26,7 @@ with require_extra("train", "training needs torch and stable-baselines3"):
 
 Observations = npt.NDArray[np.float32]
 _Indices = int | Iterable[int] | None
-_Wrapping = Callable[[VectorEnv[Any, Any, Any]], VectorEnv[Any, Any, Any]]
+_Wrapping = Callable[[CarVectorEnv], CarVectorEnv]
 _ROW_ATTRIBUTES = (  # each is a sequence in the vector env, with an item for each row
     "vehicle", "nominal", "scenario", "record", "held_speed", "slow_sensors", "motion",
     "estimator", "np_random", "np_random_seed",
@@ -44,11 +45,11 @@ _TWINS: dict[type, type] = {
 class _VecEnvRow:
     """Row i of a vector env: `_ROW_ATTRIBUTES` and the like, and values that are set on it."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], i: int) -> None:
+    def __init__(self, env: CarVectorEnv, i: int) -> None:
         self._env, self._i = env, i
-        self._set: dict[str, Any] = {}
+        self._set: dict[str, object] = {}
 
-    def _iterate_layers(self) -> Iterator[VectorEnv[Any, Any, Any]]:
+    def _iterate_layers(self) -> Iterator[CarVectorEnv]:
         """Iterate from the outermost wrapper to the bare vector env."""
         layer = self._env
         while isinstance(layer, VectorWrapper):
@@ -80,7 +81,7 @@ class _VecEnvRow:
             return False
         return True
 
-    def set_wrapper_attr(self, name: str, value: Any, **_: Any) -> None:
+    def set_wrapper_attr(self, name: str, value: object, **_: object) -> None:
         """Set a value beside the env, under a name that the env does not have."""
         if name not in self._set and self.has_wrapper_attr(name):
             raise AttributeError(
@@ -106,10 +107,10 @@ class _VecEnvRow:
         return any(isinstance(layer, wanted) for layer in self._iterate_layers())
 
 
-class _EmptyInfo(dict[str, Any]):
+class _EmptyInfo(dict[str, object]):
     """The info of a row where nothing ended: empty, one for all rows, and closed."""
 
-    def _refuse(self, *_: Any, **__: Any) -> NoReturn:
+    def _refuse(self, *_: object, **__: object) -> NoReturn:
         raise TypeError(
             "the info of a row whose episode goes on is one empty dict that all rows share; put "
             "another dict in its place in the list instead of writing into it"
@@ -117,7 +118,7 @@ class _EmptyInfo(dict[str, Any]):
 
     __setitem__ = update = setdefault = __ior__ = _refuse
 
-    def __reduce__(self) -> tuple[Any, ...]:  # a copy is an ordinary dict
+    def __reduce__(self) -> tuple[object, ...]:  # a copy is an ordinary dict
         return dict, ()
 
 
@@ -133,10 +134,7 @@ class NativeVecEnv(VecEnv):
     the last step, `terminal_observation` and `TimeLimit.truncated`. `reset_infos` are those of each
     row's newest reset.
 
-    `get_attr` reads what a single env has of each row; `set_attr` stores values beside the env;
-    `env_method` calls a row's `reset` and its methods of wrapped attributes, with `method_args` and
-    `method_kwargs`. `indices` are rows, None for all. `set_options` takes the options of a single
-    env's `reset`, for all rows or a list of them.
+    `set_options` takes the options of a single env's `reset`, for all rows or a list of them.
 
     Args:
         vector_env: Vector env with autoreset in the same step; `make_vec_env` builds one.
@@ -146,7 +144,7 @@ class NativeVecEnv(VecEnv):
         ValueError: The env has another autoreset mode.
     """
 
-    def __init__(self, vector_env: VectorEnv[Any, Any, Any]) -> None:
+    def __init__(self, vector_env: CarVectorEnv) -> None:
         base = vector_env.unwrapped
         if not isinstance(base, StabilityVectorEnv):
             raise TypeError(
@@ -183,8 +181,12 @@ class NativeVecEnv(VecEnv):
         self._store_infos(range(self.num_envs), infos)
         return np.asarray(obs)
 
-    def step_async(self, actions: npt.NDArray[Any]) -> None:
-        """Store the actions, shape (N, width), for `step_wait`."""
+    def step_async(self, actions: npt.NDArray[np.floating]) -> None:
+        """Store the actions for `step_wait`.
+
+        Args:
+            actions: Actions, shape (N, width).
+        """
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -222,7 +224,14 @@ class NativeVecEnv(VecEnv):
         return frames or ()
 
     def render(self, mode: str | None = None) -> npt.NDArray[np.uint8] | None:
-        """Render all rows as one frame (height, width, 3), whatever the mode; None for "human"."""
+        """Render all rows as one frame (height, width, 3); None for "human".
+
+        Args:
+            mode: As in stable-baselines3, without effect on the frame.
+
+        Returns:
+            The frame.
+        """
         return None if self.render_mode == "human" else super().render(mode)
 
     def close(self) -> None:
@@ -230,25 +239,57 @@ class NativeVecEnv(VecEnv):
         self.vector_env.close()
 
     def get_attr(self, attr_name: str, indices: _Indices = None) -> list[Any]:
-        """Get the attribute `attr_name` of each row; AttributeError where rows do not have it."""
+        """Get what a single env has of each row; AttributeError where rows do not have it.
+
+        Args:
+            attr_name: Name of the attribute.
+            indices: Rows, None for all.
+
+        Returns:
+            Values, one for each row.
+        """
         return [row.get_wrapper_attr(attr_name) for row in self._get_rows(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: _Indices = None) -> None:
-        """Set a `value` beside each row; AttributeError where `attr_name` is the env's."""
+    def set_attr(self, attr_name: str, value: object, indices: _Indices = None) -> None:
+        """Store a value beside the env for each row; AttributeError where the name is the env's.
+
+        Args:
+            attr_name: Name of the value.
+            value: Value.
+            indices: Rows, None for all.
+        """
         for row in self._get_rows(indices):
             row.set_wrapper_attr(attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: _Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call the method `method_name` for each row; AttributeError where there is none."""
+        """Call a row's `reset` or a method of wrapped attributes; AttributeError without one.
+
+        Args:
+            method_name: Name of the method.
+            method_args: Arguments of the method.
+            indices: Rows, None for all.
+            method_kwargs: Arguments of the method by name.
+
+        Returns:
+            Results, one for each row.
+        """
         chosen = [row.get_wrapper_attr(method_name) for row in self._get_rows(indices)]
         return [method(*method_args, **method_kwargs) for method in chosen]
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: _Indices = None
     ) -> list[bool]:
-        """Return for each row whether it has the `wrapper_class` or its vector twin."""
+        """Return for each row whether it has a wrapper's class or its vector twin.
+
+        Args:
+            wrapper_class: Class of the wrapper.
+            indices: Rows, None for all.
+
+        Returns:
+            Whether it has, one for each row.
+        """
         return [row.is_wrapped(wrapper_class) for row in self._get_rows(indices)]
 
     def _get_rows(self, indices: _Indices) -> list[_VecEnvRow]:
@@ -259,8 +300,8 @@ def make_vec_env(
     env_id: str,
     num_envs: int = 1,
     seed: int | None = None,
-    estimator: str | Mapping[str, Any] | None = None,
-    env_kwargs: Mapping[str, Any] | None = None,
+    estimator: str | Mapping[str, object] | None = None,
+    env_kwargs: Mapping[str, object] | None = None,
     monitor_file: str | None = None,
     info_keywords: Sequence[str] = (),
     wrapper_class: _Wrapping | None = None,
@@ -291,9 +332,9 @@ def make_vec_env(
 def make_native_env(
     env_id: str,
     num_envs: int,
-    estimator: str | Mapping[str, Any] | None = None,
-    env_kwargs: Mapping[str, Any] | None = None,
-) -> VectorEnv[Any, Any, Any]:
+    estimator: str | Mapping[str, object] | None = None,
+    env_kwargs: Mapping[str, object] | None = None,
+) -> CarVectorEnv:
     """Make the vector env that `make_vec_env` bridges, with its estimator around it.
 
     Args:
@@ -316,7 +357,7 @@ def make_native_env(
             "stable_baselines3.common.env_util.make_vec_env"
         )
     arguments: dict[str, Any] = {"autoreset_mode": "SameStep", "info": "ends", **(env_kwargs or {})}
-    env: VectorEnv[Any, Any, Any] = gym.make_vec(env_id, num_envs=num_envs, **arguments)
+    env: CarVectorEnv = gym.make_vec(env_id, num_envs=num_envs, **arguments)
     if estimator is None:
         return env
     estimator = estimator if isinstance(estimator, Mapping) else {"estimator": estimator}

@@ -43,7 +43,10 @@ def find_next_folder(logs: Path, algo: str, env_id: str) -> Path:
 
 
 def describe(
-    folder: Path, settings: Mapping[str, Any], estimator_kwargs: Any, arguments: Mapping[str, Any]
+    folder: Path,
+    settings: Mapping[str, object],
+    estimator_kwargs: Mapping[str, object] | None,
+    arguments: Mapping[str, Any],
 ) -> None:
     """Make a training's folder with the files that `enjoy` reads before it loads a model.
 

@@ -158,7 +158,7 @@ def test_a_training_goes_on_from_its_checkpoint(
 ) -> None:
     pytest.importorskip("stable_baselines3")
     from sideslip.agents.training import trainer
-    from sideslip.agents.training.checkpoint import read_state
+    from sideslip.agents.training.callbacks import read_state
 
     folder = shutil.copytree(OLD / "training", tmp_path / "training")
     state = read_state(folder / trainer.CHECKPOINT)

@@ -49,7 +49,7 @@ class Controller(ABC):
     needs: tuple[str, ...] = ()
     memory = 0
     knows_friction = False  # whether it reads the true friction, if that is there, without a grip
-    _design: tuple[Any, ...] = ()  # the arguments of a compiled law behind inputs, state, action
+    _design: tuple[Any, ...]  # the last argument of a compiled law
 
     def __init__(self, env: AnyEnv, grip: float | None = None) -> None:
         facts = get_env_facts(env)
@@ -115,7 +115,9 @@ class Controller(ABC):
                 and, where the env steers, added steering as a fraction of the vehicle's authority.
         """
 
-    def _mark_not_finite(self, rows: Any, state: Array) -> None:  # noqa: B027
+    def _mark_not_finite(  # noqa: B027
+        self, rows: npt.NDArray[np.bool_], state: Array
+    ) -> None:
         """Note the rows (N,) whose inputs are not finite, in the state (N, memory) or elsewhere."""
 
     def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:  # noqa: B027
@@ -156,7 +158,7 @@ class Controller(ABC):
             memory[np.asarray(episode_start, bool)] = 0.0
         action = np.zeros((len(batch), self.width))
         inputs = batch[:, self._columns].astype(np.float64)
-        bad = ~np.isfinite(inputs).all(axis=1)
+        bad = np.asarray(~np.isfinite(inputs).all(axis=1))
         if bad.any():
             before = memory[bad]
             inputs[bad] = 0.0
@@ -190,39 +192,23 @@ def list_entry_names(env: AnyEnv) -> set[str]:
     return {entry.name for entry in get_env_facts(env).layout}
 
 
-def check_positive(name: str, value: float) -> float:
+def check_positive(name: str, value: float, allow_zero: bool = False) -> float:
     """Return a number that must be positive and finite.
 
     Args:
         name: Name of the option, for the message.
         value: Number to check.
+        allow_zero: Whether it may be zero too.
 
     Returns:
         The number as a float.
 
     Raises:
-        ValueError: The number is not positive and finite.
+        ValueError: The number is out of range.
     """
-    if not 0.0 < value < math.inf:
-        raise ValueError(f"{name} is a positive number, got {value!r}")
-    return float(value)
-
-
-def check_not_negative(name: str, value: float) -> float:
-    """Return a number that must be finite and not negative.
-
-    Args:
-        name: Name of the option, for the message.
-        value: Number to check.
-
-    Returns:
-        The number as a float.
-
-    Raises:
-        ValueError: The number is negative or not finite.
-    """
-    if not 0.0 <= value < math.inf:
-        raise ValueError(f"{name} is a number of zero or more, got {value!r}")
+    if not 0.0 <= value < math.inf or (value == 0.0 and not allow_zero):
+        rule = "number of zero or more" if allow_zero else "positive number"
+        raise ValueError(f"{name} is a {rule}, got {value!r}")
     return float(value)
 
 

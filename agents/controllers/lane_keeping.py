@@ -89,19 +89,9 @@ def _make_lane_model(
 
 
 @jit
-def _lane_keeping_law(
-    x: Matrix,
-    state: Matrix,
-    action: Matrix,
-    table: Any,
-    axes: Any,
-    share_per_torque: float,
-    preview: float,
-    filter_time: float,
-    dt: float,
-    authority: float,
-) -> None:
+def _lane_keeping_law(x: Matrix, state: Matrix, action: Matrix, design: tuple[Any, ...]) -> None:
     """Compute the actions from `Inputs` x and update the `Memory` state."""
+    table, axes, share_per_torque, preview, filter_time, dt, authority = design
     m, n = table.shape[3:]
     K, z = np.empty((m, n)), np.empty(n)
     for row in range(len(x)):
@@ -182,4 +172,4 @@ class LaneKeeping(Controller):
         )
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _lane_keeping_law(inputs, state, action, *self._design)
+        _lane_keeping_law(inputs, state, action, self._design)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ...envs.numerics.jit import copy_into, jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute
@@ -49,17 +50,12 @@ def _lqr_law(
     action: Matrix,
     max_share: Vector,
     sliding_slip: Vector,
-    table: Any,
-    axes: Any,
-    scheduled: int,
-    share: Scalar,
-    authority: Scalar,
-    slew: Scalar,
-    front_arm: Scalar,
+    design: tuple[Any, ...],
 ) -> None:
     """Compute the actions of LQR within the limits; state: steering last added (rad)."""
     # sliding_slip: slip angle at which the front tyres slide (rad), max_share: largest yaw moment
     # as a fraction of full scale; both (N,)
+    table, axes, scheduled, share, authority, slew, front_arm = design
     m, n = table.shape[3], table.shape[4] - table.shape[3]
     KS, z = np.empty((m, n + m)), np.empty(n)
     for row in range(len(x)):
@@ -78,10 +74,8 @@ def _lqr_law(
         low, high = max(state[row, 0] - slew, -authority), min(state[row, 0] + slew, authority)
         # added steering at which the front tyres have no slip angle
         straight = z[0] + front_arm * z[1] / max(v, MIN_SPEED) - z[4]
-        max_w, min_w = (
-            max(straight + sliding_slip[row], 0.0),
-            min(straight - sliding_slip[row], 0.0),
-        )
+        max_w = max(straight + sliding_slip[row], 0.0)
+        min_w = min(straight - sliding_slip[row], 0.0)
         low, high = _clip(min_w, low, high), _clip(max_w, low, high)
         u, w = _solve_box_qp(KS[0, n], KS[0, n + 1], KS[1, n + 1], u, w, max_share[row], low, high)
         action[row, 0], action[row, 1], state[row, 0] = u, w / authority, w
@@ -203,14 +197,19 @@ class Lqr(Controller):
         )
         return np.asarray(KS[:, len(self.design_spec.states) :] * np.outer(per, per))
 
-    def record_action(self, state: Array, action: Any) -> None:
-        """Note the added steering, from which the rate limit counts."""
+    def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:
+        """Note the added steering, from which the rate limit counts.
+
+        Args:
+            state: Memory, shape (N, memory), updated.
+            action: Action that the env gets, shape (N, width).
+        """
         if self.width == 2:
             state[:, 0] = action[:, 1] * self.authority
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
         limits = self._compute_max_moment(inputs), self._compute_sliding_slip(inputs)
-        _lqr_law(inputs, state, action, *limits, *self._design)
+        _lqr_law(inputs, state, action, *limits, self._design)
 
     def _compute_sliding_slip(self, inputs: Array) -> Array:
         """Compute the slip angle at which Fiala's front tyres slide, in rad, shape (N,)."""
@@ -225,7 +224,7 @@ class Lqr(Controller):
 
 
 @jit
-def _clip(value: Any, low: Any, high: Any) -> Any:
+def _clip(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
     return min(max(value, low), high)
 
 
@@ -239,7 +238,7 @@ def _solve_box_qp(
     max_u: Scalar,
     low: Scalar,
     high: Scalar,
-) -> Any:
+) -> tuple[Scalar, Scalar]:
     """Find the point with |u| <= max_u, low <= w <= high that is nearest to (u, w)."""
     # The distance is du^2 s_uu + 2 du dw s_uw + dw^2 s_ww, positive definite: the point is (u, w)
     # itself where it is within, else the least of the four edges' own minima.

@@ -74,45 +74,28 @@ _drift, _inputs = as_python(compute_drift), as_python(solve_inputs)
 
 @jit
 def _model_following_law(
-    x: Matrix,
-    state: Matrix,
-    action: Matrix,
-    max_share: Vector,
-    car: Any,
-    target: Any,
-    kind: int,
-    K: Any,
-    rejection: float,
-    full_scale: float,
-    authority: float,
-    dt: float,
+    x: Matrix, state: Matrix, action: Matrix, max_share: Vector, design: tuple[Any, ...]
 ) -> None:
     """Compute the actions from `Inputs` x and update the `Memory` state.
 
     K: K_beta and K_gamma (rad/s), max_share: largest yaw moment as a fraction of full scale (N,).
     """
+    car, target, kind, K, rejection, full_scale, authority, dt = design
     for n in range(len(x)):
         v = maximum(0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right]), MIN_SPEED)
         driver, beta_ref, gamma_ref = x[n, IN.steer_command], x[n, IN.beta_ref], x[n, IN.gamma_ref]
         plant = compute_plant(car, v)
         last_driver = state[n, LAST.driver] if state[n, LAST.known] > 0.0 else driver
-        old, new = (
-            compute_reference(last_driver, v, target, kind),
-            compute_reference(driver, v, target, kind),
-        )
+        old = compute_reference(last_driver, v, target, kind)
+        new = compute_reference(driver, v, target, kind)
         reference_rates = ((new[0] - old[0]) / dt, (new[1] - old[1]) / dt)  # of the references
         if kind == LAGGED:
-            approach_rate = (1.0 - target.rest) / TICK
-            reference_rates = (
-                approach_rate * (new[0] - beta_ref),
-                approach_rate * (new[1] - gamma_ref),
-            )
+            approach = (1.0 - target.rest) / TICK
+            reference_rates = (approach * (new[0] - beta_ref), approach * (new[1] - gamma_ref))
         if kind == ZERO_SLIP:  # the yaw rate is free: the one that keeps beta_ref
             gamma_ref = compute_steady_yaw_rate(plant, beta_ref, driver)
-            reference_rates = (
-                reference_rates[0],
-                (gamma_ref - compute_steady_yaw_rate(plant, beta_ref, last_driver)) / dt,
-            )
+            last_gamma_ref = compute_steady_yaw_rate(plant, beta_ref, last_driver)
+            reference_rates = (reference_rates[0], (gamma_ref - last_gamma_ref) / dt)
         drift_rates = compute_drift(plant, beta_ref, gamma_ref)
         p_beta = K[0] * (beta_ref - x[n, IN.beta_hat])
         p_gamma = K[1] * (gamma_ref - x[n, IN.gamma_hat])
@@ -190,4 +173,4 @@ class ModelFollowing(Controller):
         )
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _model_following_law(inputs, state, action, self._compute_max_moment(inputs), *self._design)
+        _model_following_law(inputs, state, action, self._compute_max_moment(inputs), self._design)

@@ -6,6 +6,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import block_diag
 from scipy.sparse import csc_matrix
 
@@ -148,7 +149,7 @@ class Mpc(Lqr):
         car, nearest = self.nominal, _find_nearest_speed(speed)
         return _condense_program(car, nearest, self.prediction, self.horizon, self.authority)
 
-    def _mark_not_finite(self, rows: Any, state: Array) -> None:
+    def _mark_not_finite(self, rows: npt.NDArray[np.bool_], state: Array) -> None:
         for i in np.flatnonzero(rows):
             self.status[i] = NOT_FINITE
 
@@ -163,8 +164,13 @@ class Mpc(Lqr):
             self.status.append(status)
             self.solve_time.append(seconds)
 
-    def record_action(self, state: Array, action: Any) -> None:
-        """Note the added steering as a fraction of the authority, from which its rate counts."""
+    def record_action(self, state: Array, action: npt.NDArray[np.float32]) -> None:
+        """Note the added steering as a fraction of the authority, from which its rate counts.
+
+        Args:
+            state: Memory, shape (N, memory), updated.
+            action: Action that the env gets, shape (N, width).
+        """
         if self.width == 2:
             state[:, 0] = action[:, 1]
 

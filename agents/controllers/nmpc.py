@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from ...envs.engine.tick import StepVariant
 from ...envs.numerics.functions import sincos
@@ -54,10 +55,10 @@ class Design(NamedTuple):
 
     model: PredictionModel
     target: ReferenceParams  # of the nominal car
-    gains: Any  # K of `GainTables`, (..., m, n)
-    terminal: Any  # T of `GainTables`, (..., 4, n)
-    axes: Any  # knots of speed, front and rear stiffness
-    blocks: Any  # steps of each block
+    gains: Matrix  # K of `GainTables`, (..., m, n)
+    terminal: Matrix  # T of `GainTables`, (..., 4, n)
+    axes: tuple[Vector, ...]  # knots of speed, front and rear stiffness
+    blocks: Vector  # steps of each block
     scheduled: int  # 1: gains follow the stiffnesses of the observation
     disturbed: int  # disturbances of the observation: 0 none, 1 forces, 2 rates
     steps: float  # steps of the prediction in a control period
@@ -73,8 +74,8 @@ def _shift_plan(plan: Vector, blocks: Vector, m: int, steps: float) -> None:
 
 @jit
 def _interpolate_regulator(
-    table: Any, axes: Any, v: Scalar, front: Scalar, rear: Scalar, per: Vector
-) -> Any:
+    table: Matrix, axes: tuple[Vector, ...], v: Scalar, front: Scalar, rear: Scalar, per: Vector
+) -> Matrix:
     """Interpolate a table's rows, shape (rows, 9), for the nine states of `prediction`.
 
     `per`: what turns F_d and N_d into the table's own disturbances, forces or rates.
@@ -91,8 +92,13 @@ def _interpolate_regulator(
 
 @jit
 def _prepare_prediction(
-    design: Design, x: Vector, friction: Any, roll: Vector, added_command: Any, max_moment: Any
-) -> Any:
+    design: Design,
+    x: Vector,
+    friction: Scalar,
+    roll: Vector,
+    added_command: Scalar,
+    max_moment: Scalar,
+) -> tuple[PredictionStart, Matrix, Matrix]:
     """Prepare a row's `PredictionStart`, K (m, 9), and T (4, 9) of the terminal cost |T x|^2."""
     # x: row of `lqr.Inputs`, roll: angle and rate (rad, rad/s), NaN where they are not measured,
     # added_command: the last one of added steering (rad), max_moment: fraction of full scale
@@ -249,7 +255,7 @@ class Nmpc(Lqr):
         self._rolling = names.issuperset(rolling)
         return rolling if self._rolling else ()
 
-    def _mark_not_finite(self, rows: Any, state: Array) -> None:
+    def _mark_not_finite(self, rows: npt.NDArray[np.bool_], state: Array) -> None:
         state[rows, LAST.status] = NOT_FINITE
 
     def status(self, state: Array) -> list[str]:

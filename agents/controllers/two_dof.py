@@ -16,10 +16,9 @@ from ...envs.numerics.jit import jit
 from ...envs.numerics.primitives import Matrix, Scalar, Vector, absolute, maximum, select
 from ...envs.record import Array
 from ...envs.ticks import TICK
-from ...envs.vehicle.parameters import Vehicle
 from ..design.pi import CAR, PLACEMENTS, POLE, compute_plant, design_pi, make_nominal_car, sample_pi
 from ..env_info import AnyEnv
-from .base import Controller, check_not_negative, integrate_antiwindup
+from .base import Controller, check_positive, integrate_antiwindup
 
 MIN_SPEED = 2.0  # m/s: gains below it are those of this speed
 SPEEDS = np.arange(MIN_SPEED, 61.0, 0.5)  # m/s
@@ -37,7 +36,7 @@ LAST = Memory(*range(3))
 
 
 @jit
-def _compute_denominator(car: Any, V: Scalar) -> Any:
+def _compute_denominator(car: Vector, V: Scalar) -> Scalar:
     """Compute -a12 m V^2 (N m), kept at least 5 % of the sum of its terms' magnitudes.
 
     At zero the yaw moment has no static effect on the sideslip angle. An understeering car has such
@@ -51,7 +50,7 @@ def _compute_denominator(car: Any, V: Scalar) -> Any:
 
 
 @jit
-def _compute_static_gain(car: Any, V: Scalar) -> Any:
+def _compute_static_gain(car: Vector, V: Scalar) -> Scalar:
     """Compute N_z / delta_f for a steady beta of zero (N m/rad), tie-vision (24)."""
     m, l_f, l_r, C_f, C_r = car[CAR.m], car[CAR.l_f], car[CAR.l_r], car[CAR.C_f], car[CAR.C_r]
     mV2 = m * V * V
@@ -60,20 +59,15 @@ def _compute_static_gain(car: Any, V: Scalar) -> Any:
 
 
 @jit
-def _compute_sideslip_gain(car: Any, V: Scalar) -> Any:
+def _compute_sideslip_gain(car: Vector, V: Scalar) -> Scalar:
     """Compute the yaw moment that holds a sideslip angle (N m/rad), beside that of (24)."""
     plant, m = compute_plant(car, V), car[CAR.m]
     yaw_rate = plant.a11 * m * V * V / _compute_denominator(car, V)  # that keeps it, -a11 / a12
     return -(plant.a21 + plant.a22 * yaw_rate) / plant.b22
 
 
-def _compute_feedforward_gain(vehicle: Vehicle, speed: float) -> float:
-    """Compute tie-vision's C_FF (N m/rad), (24): `_compute_static_gain` at a vehicle's speed."""
-    return float(_compute_static_gain(make_nominal_car(vehicle), float(speed)))
-
-
 @jit
-def _interpolate_column(table: Any, v: Scalar) -> Any:
+def _interpolate_column(table: Vector, v: Scalar) -> Scalar:
     """Interpolate a column of a table over SPEEDS at v, held beyond its ends."""
     position = min(max((v - MIN_SPEED) / 0.5, 0.0), len(table) - 1.000001)
     i = int(position)
@@ -81,7 +75,8 @@ def _interpolate_column(table: Any, v: Scalar) -> Any:
 
 
 @jit
-def _feedforward_law(x: Matrix, action: Matrix, car: Any, full_scale: float) -> None:
+def _feedforward_law(x: Matrix, action: Matrix, design: tuple[Any, ...]) -> None:
+    car, full_scale = design
     for n in range(len(x)):
         v = 0.5 * (x[n, IN.wheel_left] + x[n, IN.wheel_right])
         gain = _compute_static_gain(car, maximum(v, MIN_SPEED))
@@ -90,22 +85,13 @@ def _feedforward_law(x: Matrix, action: Matrix, car: Any, full_scale: float) -> 
 
 @jit
 def _two_dof_law(
-    x: Matrix,
-    state: Matrix,
-    action: Matrix,
-    max_share: Vector,
-    follows: int,
-    car: Any,
-    k_p: Vector,
-    k_i: Vector,
-    full_scale: float,
-    wait: int,
-    dt: float,
+    x: Matrix, state: Matrix, action: Matrix, max_share: Vector, design: tuple[Any, ...]
 ) -> None:
     """Compute the actions from `Inputs` x and update the `Memory` state.
 
     `max_share` is the largest yaw moment (fraction of full scale). `follows`: 1 for "reference".
     """
+    follows, car, k_p, k_i, full_scale, wait, dt = design
     for n in range(len(x)):
         if state[n, LAST.wait] > 0.0:
             state[n, LAST.wait] -= 1.0
@@ -141,7 +127,7 @@ class Feedforward(Controller):
         self._design = make_nominal_car(self.nominal), self.full_scale
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _feedforward_law(inputs, action, *self._design)
+        _feedforward_law(inputs, action, self._design)
 
 
 class TwoDof(Controller):
@@ -185,7 +171,7 @@ class TwoDof(Controller):
         period = self.control_period * TICK
         wait = 1 if rate == "control" else max(1, math.ceil(CAMERA_PERIOD / period - 1e-9))
         dt = wait * period
-        factor = check_not_negative("gain", gain)
+        factor = check_positive("gain", gain, allow_zero=True)
         if sampled:
             pis = [sample_pi(self.nominal, float(v), dt, pole, placement) for v in SPEEDS]
         else:
@@ -197,4 +183,4 @@ class TwoDof(Controller):
         self._design = follows, car, self.k_p, self.k_i, self.full_scale, wait, dt
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _two_dof_law(inputs, state, action, self._compute_max_moment(inputs), *self._design)
+        _two_dof_law(inputs, state, action, self._compute_max_moment(inputs), self._design)

@@ -14,12 +14,14 @@ from ...envs.task import (
     LIMITED,
     REFERENCES,
     ZERO_SLIP,
+    ReferenceParams,
     compute_reference,
     make_reference_params,
 )
 from ...envs.ticks import TICK
 from ...envs.vehicle.parameters import Vehicle
 from ..design.pi import (
+    BicyclePlant,
     compute_drift,
     compute_plant,
     compute_plant_python,
@@ -30,7 +32,6 @@ from ..design.sampled_model import SPEEDS, find_cell
 from ..env_info import AnyEnv
 from .base import (
     Controller,
-    check_not_negative,
     check_positive,
     integrate_antiwindup,
     list_entry_names,
@@ -68,21 +69,10 @@ def _apply_dead_zone(value: Scalar, band: Scalar) -> Scalar:
 
 @jit
 def _esc_law(
-    x: Matrix,
-    state: Matrix,
-    action: Matrix,
-    max_share: Vector,
-    target: Any,
-    speeds: Vector,
-    gains: Matrix,
-    band: float,
-    max_sideslip: float,
-    stiffness: float,
-    bounded: int,
-    full_scale: float,
-    dt: float,
+    x: Matrix, state: Matrix, action: Matrix, max_share: Vector, design: tuple[Any, ...]
 ) -> None:
     """Compute the actions from `EscInputs` x; the state is the integral (N m)."""
+    target, speeds, gains, band, max_sideslip, stiffness, bounded, full_scale, dt = design
     for n in range(len(x)):
         v = maximum(0.5 * (x[n, ESC_IN.wheel_left] + x[n, ESC_IN.wheel_right]), speeds[0])
         i, share = find_cell(speeds, v)
@@ -146,14 +136,14 @@ class Esc(Controller):
             slip,
             self.full_scale / slip
             if stiffness is None
-            else check_not_negative("stiffness", stiffness),
+            else check_positive("stiffness", stiffness, allow_zero=True),
             int(bounded),
             self.full_scale,
             self.control_period * TICK,
         )
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _esc_law(inputs, state, action, self._compute_max_moment(inputs), *self._design)
+        _esc_law(inputs, state, action, self._compute_max_moment(inputs), self._design)
 
 
 SlidingModeInputs = namedtuple(
@@ -169,14 +159,16 @@ LAST = Memory(*range(3))
 
 
 @jit
-def _compute_surface_slope(plant: Any, pole: Scalar) -> Scalar:
+def _compute_surface_slope(plant: BicyclePlant, pole: Scalar) -> Scalar:
     """Compute xi (1/s) of the surface s = 0, on which beta's error decays at `pole` (rad/s)."""
     # on s = 0, beta' = a11 beta + a12 gamma makes the pole of beta's error a11 - a12 xi
     return (plant.a11 + pole) / plant.a12
 
 
 @jit
-def _compute_reference(x: Vector, v: Scalar, plant: Any, target: Any, kind: int) -> Any:
+def _compute_reference(
+    x: Vector, v: Scalar, plant: BicyclePlant, target: ReferenceParams, kind: int
+) -> tuple[Scalar, Scalar]:
     """Compute (beta_ref, gamma_ref) of a row; a free yaw rate is that which keeps beta_ref."""
     if kind == LAGGED:  # then the observation has it
         return x[SLIDING_IN.beta_ref], x[SLIDING_IN.gamma_ref]
@@ -188,28 +180,15 @@ def _compute_reference(x: Vector, v: Scalar, plant: Any, target: Any, kind: int)
 
 @jit
 def _sliding_mode_law(
-    x: Matrix,
-    state: Matrix,
-    action: Matrix,
-    max_share: Vector,
-    car: Any,
-    target: Any,
-    kind: int,
-    pole: float,
-    rate: float,
-    layer: float,
-    full_scale: float,
-    dt: float,
+    x: Matrix, state: Matrix, action: Matrix, max_share: Vector, design: tuple[Any, ...]
 ) -> None:
     """Compute the actions from `SlidingModeInputs` x and update the `Memory` state."""
+    car, target, kind, pole, rate, layer, full_scale, dt = design
     for n in range(len(x)):
         v = maximum(0.5 * (x[n, SLIDING_IN.wheel_left] + x[n, SLIDING_IN.wheel_right]), MIN_SPEED)
         plant = compute_plant(car, v)
-        beta, gamma, delta = (
-            x[n, SLIDING_IN.beta_hat],
-            x[n, SLIDING_IN.gamma_hat],
-            x[n, SLIDING_IN.steer],
-        )
+        beta, gamma = x[n, SLIDING_IN.beta_hat], x[n, SLIDING_IN.gamma_hat]
+        delta = x[n, SLIDING_IN.steer]
         xi = _compute_surface_slope(plant, pole)
         beta_ref, gamma_ref = _compute_reference(x[n], v, plant, target, kind)
         beta_ref_rate, gamma_ref_rate = 0.0, 0.0  # the references' derivatives
@@ -271,4 +250,4 @@ class SlidingMode(Controller):
         )
 
     def _law(self, inputs: Array, state: Array, action: Array) -> None:
-        _sliding_mode_law(inputs, state, action, self._compute_max_moment(inputs), *self._design)
+        _sliding_mode_law(inputs, state, action, self._compute_max_moment(inputs), self._design)

@@ -1,13 +1,13 @@
 """Gauss-Newton on plans of `prediction`: gradients by differences, steps by trial, in lanes."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ...envs.numerics.jit import jit
 from ...envs.numerics.packed import count_lanes
-from ...envs.numerics.primitives import Matrix, Vector
+from ...envs.numerics.primitives import Matrix, Scalar, Vector
 from .prediction import N_RESIDUALS, N_TERMINAL, PredictionModel, PredictionStart, simulate_plans
 
 # A variable of a plan is a fraction of the full yaw moment or of the steering's authority, which is
@@ -15,7 +15,7 @@ from .prediction import N_RESIDUALS, N_TERMINAL, PredictionModel, PredictionStar
 _N_CANDIDATES = 16  # plans tried at once: the old one, zeros, and steps of seven dampings, two each
 MAX_VARIABLES = _N_CANDIDATES - 1  # of a plan: its batch of perturbed plans begins with itself
 LIMIT = 2.0  # of a variable's magnitude: from one limit of an input to the other
-DIFFERENCE = 0.01  # perturbation of a variable, for finite differences
+_DIFFERENCE = 0.01  # perturbation of a variable, for finite differences
 _MIN_DAMPING = 1e-4  # Levenberg and Marquardt's, of the first candidate; later ones: tenfold each
 _STEP_LENGTHS = (1.0, 0.3)  # each step is tried whole and in part
 
@@ -23,70 +23,45 @@ _STEP_LENGTHS = (1.0, 0.3)  # each step is tried whole and in part
 class _PlanBatch(NamedTuple):
     """Plans side by side and their results, one column for each."""
 
-    plans: Any  # variables: fractions of the inputs' full scale, shape (variables, count)
-    perturbations: Any  # offsets behind the limits, in a variable's unit, shape as `plans`
+    plans: Matrix  # variables: fractions of the inputs' full scale, shape (variables, count)
+    perturbations: Matrix  # offsets behind the limits, in a variable's unit, shape as `plans`
     limits: Matrix  # 1 or -1 where a block starts at a limit, shape (variables, count)
     residuals: Matrix  # residuals, whose squares sum to J, shape (residuals, count)
-    first: Any  # first yaw moment (of full scale) and added steering (rad), shape (2, count)
+    first: Matrix  # first yaw moment (of full scale) and added steering (rad), shape (2, count)
 
 
 @jit
-def make_plan_batch(variables: int, blocks: Vector, count: int) -> _PlanBatch:
-    """Make a batch of plans of zeros.
-
-    Args:
-        variables: Variables of a plan.
-        blocks: Steps of each block, shape (blocks,).
-        count: Number of plans.
-
-    Returns:
-        Batch with one column for each plan.
-    """
-    return _PlanBatch(
-        np.zeros((variables, count)),
-        np.zeros((variables, count)),
-        np.zeros((variables, count)),
-        np.zeros((N_RESIDUALS * blocks.sum() + N_TERMINAL, count)),
-        np.zeros((2, count)),
-    )
+def _make_plan_batch(variables: int, blocks: Vector, count: int) -> _PlanBatch:
+    """Make a batch of so many plans of zeros, with one column for each."""
+    shape, n_residuals = (variables, count), N_RESIDUALS * blocks.sum() + N_TERMINAL
+    plans, perturbations, limits = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    residuals, first = np.zeros((n_residuals, count)), np.zeros((2, count))
+    return _PlanBatch(plans, perturbations, limits, residuals, first)
 
 
 @jit
-def simulate_batch(
+def _simulate_batch(
     model: PredictionModel,
     start: PredictionStart,
-    K: Any,
+    K: Matrix,
     terminal: Matrix,
     blocks: Vector,
     batch: _PlanBatch,
 ) -> None:
-    """Simulate any number of plans, as many at a time as there are lanes.
-
-    Args:
-        model: Numbers that all predictions share.
-        start: Start of the prediction.
-        K: Gains of the regulator on the nine states of `prediction`, shape (m, 9).
-        terminal: T of the terminal cost |T x|^2 in the same states, shape (4, 9).
-        blocks: Steps of each block, shape (blocks,).
-        batch: Plans and perturbations, whose results are filled.
-    """
+    """Simulate any number of plans, as many at a time as there are lanes, as `update_plan`."""
     width, (variables, count) = count_lanes(), batch.plans.shape
-    chunk = make_plan_batch(variables, blocks, width)
+    chunk = _make_plan_batch(variables, blocks, width)
     for c in range(0, count, width):
         n = min(width, count - c)
-        chunk.plans[:, :n], chunk.perturbations[:, :n] = (
-            batch.plans[:, c : c + n],
-            batch.perturbations[:, c : c + n],
-        )
+        chunk.plans[:, :n] = batch.plans[:, c : c + n]
+        chunk.perturbations[:, :n] = batch.perturbations[:, c : c + n]
         simulate_plans(
             model, start, K, terminal, blocks,
             chunk.plans, chunk.perturbations, chunk.residuals, chunk.limits, chunk.first,
         )  # fmt: skip
         batch.residuals[:, c : c + n] = chunk.residuals[:, :n]
-        batch.limits[:, c : c + n], batch.first[:, c : c + n] = (
-            chunk.limits[:, :n],
-            chunk.first[:, :n],
-        )
+        batch.limits[:, c : c + n] = chunk.limits[:, :n]
+        batch.first[:, c : c + n] = chunk.first[:, :n]
 
 
 @jit
@@ -109,7 +84,7 @@ def _compute_normal_equations(batch: _PlanBatch, A: Matrix, g: Vector) -> None:
     A[:], g[:] = 0.0, 0.0
     for r in range(len(residuals)):
         for i in range(n):
-            slope[i] = (residuals[r, i + 1] - residuals[r, 0]) / DIFFERENCE
+            slope[i] = (residuals[r, i + 1] - residuals[r, 0]) / _DIFFERENCE
         for i in range(n):
             g[i] += slope[i] * residuals[r, 0]
             for j in range(n):
@@ -120,15 +95,11 @@ def _compute_normal_equations(batch: _PlanBatch, A: Matrix, g: Vector) -> None:
 
 
 @jit
-def solve_damped_step(A: Matrix, g: Vector, damping: float, L: Matrix, d: Vector) -> None:
+def _solve_damped_step(A: Matrix, g: Vector, damping: float, L: Matrix, d: Vector) -> None:
     """Solve (A + damping diag A + 1e-9 I) d = -g by Cholesky's factors; d is zero where they fail.
 
-    Args:
-        A: Positive semidefinite matrix, shape (n, n); a variable without an effect does not move.
-        g: Gradient, shape (n,).
-        damping: Levenberg-Marquardt's damping.
-        L: Scratch for the lower Cholesky factor, shape (n, n).
-        d: Step, shape (n,), filled.
+    A (n, n) is positive semidefinite; a variable without an effect does not move. L (n, n) is
+    scratch for the lower factor.
     """
     n = len(g)
     d[:] = 0.0
@@ -159,7 +130,7 @@ def _fill_perturbations(plan: Vector, batch: _PlanBatch) -> None:
     """Fill every column with the plan; a column perturbs one variable, the first none."""
     for i in range(len(plan)):
         batch.plans[i, :] = plan[i]
-        batch.perturbations[i, i + 1] = DIFFERENCE
+        batch.perturbations[i, i + 1] = _DIFFERENCE
 
 
 @jit
@@ -169,7 +140,7 @@ def _fill_candidates(plan: Vector, A: Matrix, g: Vector, plans: Matrix) -> None:
     L, d = np.empty((n, n)), np.empty(n)
     plans[:, 0], plans[:, 1] = plan, 0.0
     for c in range(2, plans.shape[1], len(_STEP_LENGTHS)):
-        solve_damped_step(A, g, damping, L, d)
+        _solve_damped_step(A, g, damping, L, d)
         damping *= 10.0
         for k in range(len(_STEP_LENGTHS)):
             for i in range(n):
@@ -180,12 +151,12 @@ def _fill_candidates(plan: Vector, A: Matrix, g: Vector, plans: Matrix) -> None:
 def update_plan(
     model: PredictionModel,
     start: PredictionStart,
-    K: Any,
+    K: Matrix,
     terminal: Matrix,
     blocks: Vector,
     plan: Vector,
     iterations: int,
-) -> Any:
+) -> tuple[Scalar, Scalar, Scalar]:
     """Improve a plan by Gauss-Newton iterations.
 
     The plan is never costlier, as predicted, than it was or than zeros.
@@ -203,21 +174,16 @@ def update_plan(
         Cost J of the improved plan, not finite where no plan's was and the plan is unchanged; its
         first yaw moment (fraction of full scale) and added steering (rad).
     """
-    n = len(plan)
-    batch, A, g, J = (
-        make_plan_batch(n, blocks, _N_CANDIDATES),
-        np.empty((n, n)),
-        np.empty(n),
-        np.empty(_N_CANDIDATES),
-    )
+    n, batch = len(plan), _make_plan_batch(len(plan), blocks, _N_CANDIDATES)
+    A, g, J = np.empty((n, n)), np.empty(n), np.empty(_N_CANDIDATES)
     min_cost, share, added_command = math.inf, 0.0, 0.0
     for _ in range(iterations):
         _fill_perturbations(plan, batch)
-        simulate_batch(model, start, K, terminal, blocks, batch)
+        _simulate_batch(model, start, K, terminal, blocks, batch)
         _compute_normal_equations(batch, A, g)
         _fill_candidates(plan, A, g, batch.plans)
         batch.perturbations[:] = 0.0
-        simulate_batch(model, start, K, terminal, blocks, batch)
+        _simulate_batch(model, start, K, terminal, blocks, batch)
         _sum_squares(batch.residuals, J)
         best, min_cost = 0, math.inf
         for c in range(_N_CANDIDATES):

@@ -5,13 +5,13 @@ The papers' short names, such as tie-vision, are those of docs/PAPERS.md.
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ...envs.numerics.jit import as_python, jit
 from ...envs.numerics.packed import make_offsets
-from ...envs.numerics.primitives import Scalar
+from ...envs.numerics.primitives import Scalar, Vector
 from ...envs.record import Array
 from ...envs.vehicle.linear import Bicycle, compute_bicycle_coefficients, make_bicycle_model
 from ...envs.vehicle.parameters import Vehicle
@@ -161,7 +161,7 @@ def make_nominal_car(vehicle: Vehicle) -> Array:
 
 
 @jit
-def compute_plant(car: Any, V: Scalar) -> BicyclePlant:
+def compute_plant(car: Vector, V: Scalar) -> BicyclePlant:
     """Compute the bicycle plant at a speed.
 
     Args:
@@ -182,7 +182,7 @@ compute_plant_python = as_python(compute_plant)
 
 
 @jit
-def compute_drift(plant: BicyclePlant, beta: Scalar, gamma: Scalar) -> Any:
+def compute_drift(plant: BicyclePlant, beta: Scalar, gamma: Scalar) -> tuple[Scalar, Scalar]:
     """Compute A [beta, gamma], the rates without inputs.
 
     Args:
@@ -212,7 +212,7 @@ def compute_steady_yaw_rate(plant: BicyclePlant, beta: Scalar, delta: Scalar) ->
 
 
 @jit
-def solve_inputs(plant: BicyclePlant, first: Scalar, second: Scalar) -> Any:
+def solve_inputs(plant: BicyclePlant, first: Scalar, second: Scalar) -> tuple[Scalar, Scalar]:
     """Solve B u = [first, second] for the inputs: dakf-stability (26).
 
     Args:

@@ -9,7 +9,7 @@ The regulator's nine states, in this order, are the columns of K and T: beta, ga
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -68,17 +68,17 @@ class PredictionModel(NamedTuple):
 class PredictionStart(NamedTuple):
     """The state and the held quantities at the start of a prediction."""
 
-    car: Any  # `CarParams` of the car
-    motion: Any  # motion of the car
+    car: CarParams
+    motion: Motion
     T_l: Scalar  # torque of the left motor (N m)
     T_r: Scalar  # torque of the right motor (N m)
     delta_f: Scalar  # applied steering angle (rad)
     added_command: Scalar  # added steering that was last commanded (rad)
     driver: Scalar  # driver's steering angle, held (rad)
     a_x: Scalar  # acceleration, held (m/s^2)
-    refs: Any  # beta_ref (rad) and gamma_ref (rad/s) now
-    steady: Any  # values that a lagged reference approaches
-    push: Any  # disturbance forces
+    refs: tuple[Scalar, Scalar]  # beta_ref (rad) and gamma_ref (rad/s) now
+    steady: tuple[Scalar, Scalar]  # values that a lagged reference approaches
+    push: DisturbanceForces
     max_moment: Scalar  # largest yaw moment as a fraction of full scale
 
 
@@ -162,7 +162,7 @@ def make_blocks(steps: int, count: int) -> Array:
 
 
 @jit
-def replace_tyres(car: CarParams, C_f: Any, C_r: Any, mu: Any) -> CarParams:
+def replace_tyres(car: CarParams, C_f: Scalar, C_r: Scalar, mu: Scalar) -> CarParams:
     """Replace stiffnesses and friction of a car.
 
     Args:
@@ -188,7 +188,7 @@ N_TERMINAL = 4  # residuals behind the last step, of what is to come
 class _PredictionState(NamedTuple):
     """A prediction's state between steps."""
 
-    motion: Any  # `Motion` of the car
+    motion: Motion
     T_l: Scalar  # torque of the left motor (N m)
     T_r: Scalar  # torque of the right motor (N m)
     delta_f: Scalar  # applied steering angle (rad)
@@ -220,7 +220,7 @@ def _multiply_row(
     driver: Scalar,
     state: _PredictionState,
     beta: Scalar,
-) -> Any:
+) -> Scalar:
     """Multiply a row of M, K or T of shape (rows, 9), by the nine states."""
     share = 0.5 * model.car.d_r / model.car.r / model.full_scale * (state.T_r - state.T_l)
     lateral = M[row, 0] * beta + M[row, 1] * state.motion.gamma + M[row, 2] * share
@@ -233,12 +233,12 @@ def _multiply_row(
 def _compute_commands(
     model: PredictionModel,
     start: PredictionStart,
-    K: Any,
+    K: Matrix,
     state: _PredictionState,
     beta: Scalar,
     moment_share: Scalar,
     steer_share: Scalar,
-) -> Any:
+) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """Compute the commands within their limits, and 1 or -1 at a limit of either.
 
     The plan adds `moment_share` (of full scale) and `steer_share` (of the authority) to the
@@ -246,18 +246,14 @@ def _compute_commands(
     (rad).
     """
     max_moment = start.max_moment
-    share = (
-        _clip_symmetric(0.0 - _multiply_row(K, 0, model, start.driver, state, beta), max_moment)
-        + moment_share
-    )
+    regulator_share = 0.0 - _multiply_row(K, 0, model, start.driver, state, beta)
+    share = _clip_symmetric(regulator_share, max_moment) + moment_share
     added_command, steer_limit = 0.0 * share, 0.0 * share
     if len(K) > 1:
-        added_command = _clip_symmetric(
-            0.0 - _multiply_row(K, 1, model, start.driver, state, beta), model.authority
-        )
-        added_command = _clip_symmetric(
-            added_command + model.authority * steer_share, model.authority
-        )
+        added_command = 0.0 - _multiply_row(K, 1, model, start.driver, state, beta)
+        added_command = _clip_symmetric(added_command, model.authority)
+        added_command = added_command + model.authority * steer_share
+        added_command = _clip_symmetric(added_command, model.authority)
         added_command = limit_rate(state.added_command, added_command, model.slew)
         high = minimum(state.added_command + model.slew, model.authority)
         low = maximum(state.added_command - model.slew, 0.0 - model.authority)
@@ -275,7 +271,7 @@ def _predict_step(
     added_command: Scalar,
     share_beyond: Scalar,
     steer_beyond: Scalar,
-) -> Any:
+) -> tuple[_PredictionState, tuple[Scalar, Scalar, Scalar, Scalar]]:
     """Predict one step with held commands: the state after it, and the effort's four residuals."""
     kind, motor, steering, h = model.kind, model.motor, model.steering, model.step
     car, driver = start.car, start.driver
@@ -286,22 +282,15 @@ def _predict_step(
     T_l, T_r = T_l - torque_beyond, T_r + torque_beyond
     added_target = limit_angle(added_command, driver, model.stop) + steer_beyond
     steer = driver + added_target
+    angles = (
+        apply_lag(steer, state.delta_f, steering.start),
+        apply_lag(steer, state.delta_f, steering.middle),
+        apply_lag(steer, state.delta_f, steering.end),
+    )
     loads = (
-        compute_lagged_load(
-            apply_lag(steer, state.delta_f, steering.start), T_l, T_r, state, motor.start, car, kind
-        ),
-        compute_lagged_load(
-            apply_lag(steer, state.delta_f, steering.middle),
-            T_l,
-            T_r,
-            state,
-            motor.middle,
-            car,
-            kind,
-        ),
-        compute_lagged_load(
-            apply_lag(steer, state.delta_f, steering.end), T_l, T_r, state, motor.end, car, kind
-        ),
+        compute_lagged_load(angles[0], T_l, T_r, state, motor.start, car, kind),
+        compute_lagged_load(angles[1], T_l, T_r, state, motor.middle, car, kind),
+        compute_lagged_load(angles[2], T_l, T_r, state, motor.end, car, kind),
     )
     push, road = DisturbanceForces(state.F_d, state.N_d, 0.0), model.road
     motion = rk4(state.motion, loads, push, car, road, h, kind.small_angle, kind.law, kind.roll)
@@ -332,7 +321,7 @@ def _predict_step(
 def simulate_plans(
     model: PredictionModel,
     start: PredictionStart,
-    K: Any,
+    K: Matrix,
     terminal: Matrix,
     blocks: Vector,
     plans: Matrix,
@@ -380,17 +369,11 @@ def simulate_plans(
     beta = compute_sideslip_angle(state.motion.v_x, state.motion.v_y, model.kind.small_angle)
     row, last = 0, N_RESIDUALS * (blocks.sum() - 1)
     for b in range(len(blocks)):
-        moment_share, share_beyond, steer_share, steer_beyond = (
-            load_element(plans, m * b),
-            load_element(perturbations, m * b),
-            zero,
-            zero,
-        )
+        moment_share, share_beyond = load_element(plans, m * b), load_element(perturbations, m * b)
+        steer_share, steer_beyond = zero, zero
         if m > 1:
-            steer_share, steer_beyond = (
-                load_element(plans, m * b + 1),
-                model.authority * load_element(perturbations, m * b + 1),
-            )
+            steer_share = load_element(plans, m * b + 1)
+            steer_beyond = model.authority * load_element(perturbations, m * b + 1)
         for k in range(blocks[b]):
             share, added_command, moment_limit, steer_limit = _compute_commands(
                 model, start, K, state, beta, moment_share, steer_share
@@ -413,15 +396,13 @@ def simulate_plans(
             node = math.sqrt(model.step if row < last else 0.5 * (model.step + TICK))
             span = math.sqrt(model.step)
             store_element(residuals, node * model.per_beta * (beta - state.beta_ref), row)
-            store_element(
-                residuals, node * model.per_gamma * (state.motion.gamma - state.gamma_ref), row + 1
-            )
+            gamma_error = state.motion.gamma - state.gamma_ref
+            store_element(residuals, node * model.per_gamma * gamma_error, row + 1)
             store_element(residuals, span * efforts[0], row + 2)
             store_element(residuals, span * efforts[1], row + 3)
             store_element(residuals, span * efforts[2], row + 4)
             store_element(residuals, span * efforts[3], row + 5)
             row += N_RESIDUALS
     for j in range(N_TERMINAL):
-        store_element(
-            residuals, _multiply_row(terminal, j, model, start.driver, state, beta), row + j
-        )
+        value = _multiply_row(terminal, j, model, start.driver, state, beta)
+        store_element(residuals, value, row + j)

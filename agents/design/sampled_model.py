@@ -10,12 +10,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ...envs.numerics.jit import jit
-from ...envs.numerics.primitives import Scalar, Vector
+from ...envs.numerics.primitives import Matrix, Scalar, Vector
 from ...envs.record import Array
 from ...envs.task import BETA_SCALE, EFFORT_WEIGHT, GAMMA_SCALE, STEER_SCALE, ZERO_SLIP
 from ...envs.ticks import TICK
@@ -181,21 +181,8 @@ def compute_cost_weights(design_spec: DesignSpec) -> Sequence[float]:
     )
 
 
-def compute_regulator(model: DesignModel) -> tuple[Array, Array]:
-    """Compute the regulator u = -K x of least cost, and the cost of another input.
-
-    Args:
-        model: Design model.
-
-    Returns:
-        K (m, n) and S (m, m): another input costs (u + K x)'S(u + K x) more in one period.
-    """
-    K, V = compute_cost_to_go(model)
-    return K, _compute_input_cost(model, V)
-
-
 def _compute_input_cost(model: DesignModel, V: Array) -> Array:
-    """Compute S = R + H'V H, shape (m, m), of `compute_regulator` by the cost to go V (n, n)."""
+    """Compute S = R + H'V H (m, m): another input costs (u + K x)'S(u + K x) more in one period."""
     return model.R + model.H.T @ V @ model.H
 
 
@@ -251,7 +238,7 @@ SPEEDS = tuple(np.geomspace(2.0, 60.0, 48).tolist())
 
 
 @jit
-def find_cell(axis: Vector, value: Scalar) -> Any:
+def find_cell(axis: Vector, value: Scalar) -> tuple[int, Scalar]:
     """Find the cell of a value in an axis, held at its ends.
 
     Args:
@@ -272,7 +259,7 @@ def find_cell(axis: Vector, value: Scalar) -> Any:
 
 @jit
 def interpolate_gains(
-    table: Any, axes: Any, v: Scalar, front: Scalar, rear: Scalar, K: Any
+    table: Matrix, axes: tuple[Vector, ...], v: Scalar, front: Scalar, rear: Scalar, K: Matrix
 ) -> None:
     """Interpolate a table of gains, linear along each axis.
 
@@ -296,7 +283,7 @@ def interpolate_gains(
 
 
 class GainTables(NamedTuple):
-    """The regulators on a grid, shape (speeds, fronts, rears, ...): see `compute_regulator`."""
+    """The regulators on a grid, shape (speeds, fronts, rears, ...): `compute_cost_to_go`."""
 
     gains: Array  # [K S], (..., m, n + m)
     terminal: Array  # T, (..., d, n): what is to come costs |T x|^2, but for what no input changes

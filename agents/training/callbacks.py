@@ -1,6 +1,15 @@
-"""The callback of a training: evaluations on other seeds, the best policy, a checkpoint."""
+"""The callback of a training: evaluations on other seeds, the best policy, a checkpoint.
+
+The checkpoint is one file: tensors as safetensors, the rest as JSON beside them. Reading it runs
+no code, and a save that is stopped leaves the older file as it was.
+
+The score compares logarithms of costs, and d log J = dJ / J. So the scenarios of a mixture are
+weighted by 1 over the uncontrolled car's cost. Where a training starts from a policy, each drive is
+weighted by 1 over that policy's cost in the same drive.
+"""
 
 import json
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -12,55 +21,45 @@ import numpy as np
 
 from ... import __version__
 from ...envs.io import atomic_file, write_atomic
+from ...envs.numerics import require_extra
 from ...envs.record import Array
 from .. import zoo
 from ..learned.policy import Card, Policy, save_policy
 from ..rollout import compute_cost_ratios, evaluate_costs, evaluate_episodes
-from ..vec_env import make_vec_env
-from .checkpoint import load_parameters, save_checkpoint
-from .config import (
-    TrainingTask,
-    check_device,
-    compute_action_std,
-    get_algorithm,
-    make_model,
-    make_model_options,
-)
+from ..vec_env import make_native_env, make_vec_env
+from .config import TrainingTask, get_algorithm, make_model, make_model_options
 from .export import convert_sb3_policy
-from .normalise import measure_scaling
-from .warm_start import (
-    PolicyWarmStart,
-    RewardScale,
-    RewardScaleWrapper,
-    compute_equal_weights,
-    compute_scenario_weights,
-    load_warm_start,
-    measure_reward_scale,
-    read_warm_start,
-)
+from .normalise import RewardScale, RewardScaleWrapper, measure_reward_scale, measure_scaling
+from .warm_start import PolicyWarmStart, load_warm_start, read_warm_start
 
-from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip  # after ours, which
-from stable_baselines3.common.callbacks import BaseCallback  # isort: skip  # name a missing extra
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm  # isort: skip
+with require_extra("train", "training needs {}"):
+    import torch
+    from safetensors import SafetensorError, safe_open
+    from safetensors.torch import save
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+    from stable_baselines3.common.utils import get_device
 
+Checkpoint = Mapping[str, Any]
+"""The state of a checkpoint, in JSON types."""
 CHECKPOINT, CURVE = "checkpoint.safetensors", "curve.jsonl"
 POLICY, BEST, WARM_START_FILE = "policy.safetensors", "best_model.zip", "begun_with.safetensors"
+_FORMAT = 3  # of a checkpoint
+_VARIABLES = "variables"  # tensors of no module, such as the logarithm of an entropy's weight
+_STATE = {"groups", "sideslip", "task", "steps", "aim", "scaling", "evaluations"}
+"""Keys of a resumed training's state, besides the tensors."""
 _SCALING_ENVS = 64  # environments whose observations make the scaling
+_UNIFORM_LOG_STD = -0.55  # log(1 / sqrt(3)), of actions drawn uniformly from [-1, 1]
+_WEIGHT_DRIVES = 32  # uncontrolled drives by which a scenario is weighed
+_MIN_COST_SHARE = 0.05  # of the scenarios' mean cost: a cheaper one counts as this in its weight
 
 # Seeds of tests and of the calibration are below 2^63, those of `corrections` and `distill` beyond.
 _WEIGHT_SEEDS, _EVALUATION_SEEDS, _SCALING_SEEDS, _TRAINING_SEEDS = 2**63, 2**64, 2**65, 2**66
 _SEEDS_PER_TRAINING = 2**40  # a run's first one is the training's first plus its steps so far
 
 
-def make_evaluation_seeds(episodes: int) -> list[int]:
-    """Make the seeds of an evaluation.
-
-    Args:
-        episodes: Number of seeds.
-
-    Returns:
-        Seeds, as many as `episodes`.
-    """
+def _make_evaluation_seeds(episodes: int) -> list[int]:
     return [_EVALUATION_SEEDS + i for i in range(episodes)]
 
 
@@ -105,7 +104,15 @@ class RunOptions:
     def __post_init__(self) -> None:
         if self.eval_freq < 1:
             raise ValueError(f"eval_freq is at least 1, got {self.eval_freq}")
-        check_device(self.device)
+        try:
+            device = get_device(self.device)  # the CPU where there is no CUDA
+        except RuntimeError:
+            known = "a device is cpu, cuda or another of torch's, or auto"
+            raise ValueError(f"{known}, got {self.device!r}") from None
+        if self.device.startswith("cuda") and device.type != "cuda":
+            raise ValueError(
+                f"torch finds no CUDA device, got {self.device!r}; auto takes one if there is"
+            )
 
 
 @dataclass(frozen=True)
@@ -134,7 +141,7 @@ class EvalCallback(BaseCallback):
         self,
         task: TrainingTask,
         folder: Path,
-        checkpoint: Mapping[str, Any] | None,
+        checkpoint: Checkpoint | None,
         run_options: RunOptions,
         steps: int = 0,
         initial_policy: Policy | None = None,
@@ -143,7 +150,7 @@ class EvalCallback(BaseCallback):
         self.task, self.folder, self.run_options = task, folder, run_options
         name = "" if initial_policy is None else initial_policy.name
         self.run_record = RunRecord(steps, run_options.eval_freq, run_options.command, name)
-        self.seeds = make_evaluation_seeds(task.n_eval_envs)
+        self.seeds = _make_evaluation_seeds(task.n_eval_envs)
         self.eval_env = task.vector_env(task.n_eval_envs)
         self.initial_policy, self.warm_start = initial_policy, None
         if initial_policy is not None:
@@ -152,32 +159,26 @@ class EvalCallback(BaseCallback):
             self.eval_env = self.warm_start.wrap_env(self.eval_env)
         base: Any = self.eval_env.unwrapped
         self.period: float = base.control_period * base.dt  # s
-        saved = {} if checkpoint is None else checkpoint
-        self.evaluations = [Evaluation(*row) for row in saved.get("evaluations", [])]
+        self.checkpoint = checkpoint or {}
+        self.evaluations = [Evaluation(*row) for row in self.checkpoint.get("evaluations", [])]
         uncontrolled = self._average_scenarios(evaluate_costs(self.eval_env, None, self.seeds))
         if uncontrolled.mean() == 0.0:
             raise ValueError("the uncontrolled car costs nothing there: there is nothing to learn")
-        self.equal_weights = compute_equal_weights(uncontrolled)
+        self.equal_weights = _compute_equal_weights(uncontrolled)
         self.uncontrolled_cost = float(np.mean(uncontrolled * self.equal_weights))
         self.weights = np.ones(1)
         if not initial_policy:
-            self.weights = compute_scenario_weights(task, _WEIGHT_SEEDS)
+            self.weights = _compute_scenario_weights(task, _WEIGHT_SEEDS)
         driver = self.warm_start.driver if self.warm_start else None
         self.initial_costs = evaluate_costs(self.eval_env, driver, self.seeds) if driver else None
-        self.scaling: Any = saved.get("scaling")
+        self.scaling: Any = self.checkpoint.get("scaling")
         self.spent = self.evaluations[-1].cpu_seconds if self.evaluations else 0.0
         self.since = time.process_time()
 
-    def build(
-        self,
-        checkpoint: Mapping[str, Any] | None,
-        trained_agent: str | Path | None = None,
-        trust: bool = False,
-    ) -> BaseAlgorithm:
+    def build(self, trained_agent: str | Path | None = None, trust: bool = False) -> BaseAlgorithm:
         """Build the model, new or of the checkpoint, a zip or a policy, with its environments.
 
         Args:
-            checkpoint: State of a checkpoint, None for a new training.
             trained_agent: Zip to start from, None for none.
             trust: Whether a pickle of VecNormalize beside the zip may be read.
 
@@ -185,24 +186,23 @@ class EvalCallback(BaseCallback):
             Model, ready to learn.
         """
         task, run_options = self.task, self.run_options
-        start = None
+        start = self.warm_start.start if self.warm_start and not self.checkpoint else None
         if trained_agent is not None:
             width = (self.eval_env.single_observation_space.shape or (0,))[0]
             start = read_warm_start(trained_agent, width, trust)
-        elif checkpoint is None:
-            start = self.warm_start.start if self.warm_start else None
         if start is not None:
             self.scaling = start.scaling
+        on_tensors = get_algorithm(task.algo).on_tensors
         if self.scaling is None:
-            spread, seed = compute_action_std(task.settings), _SCALING_SEEDS + task.seed
-            mixed = get_algorithm(task.algo).on_tensors
+            kwargs, seed = task.settings.get("policy_kwargs", {}), _SCALING_SEEDS + task.seed
+            spread = math.exp(kwargs.get("log_std_init", _UNIFORM_LOG_STD))
             scaling_env = task.vector_env(_SCALING_ENVS)
-            self.scaling = measure_scaling(scaling_env, spread, seed, task.reads, mixed)
+            self.scaling = measure_scaling(scaling_env, spread, seed, task.reads, on_tensors)
         options = dict[str, Any](estimator=task.estimator_kwargs)
         options["env_kwargs"] = task.options(task.num_envs)
         options["wrapper_class"] = self.warm_start.wrap_env if self.warm_start else None
         env = make_vec_env(task.env_id, task.num_envs, **options)
-        steps = 0 if checkpoint is None else int(checkpoint["steps"])
+        steps = int(self.checkpoint.get("steps", 0))
         seed = (task.seed + steps) % 2**32
         first = _TRAINING_SEEDS + task.seed * _SEEDS_PER_TRAINING + steps
         if self.warm_start is not None:
@@ -213,14 +213,14 @@ class EvalCallback(BaseCallback):
         scaled_env = RewardScaleWrapper(env, RewardScale(scales))
         log, device = run_options.tensorboard_log, run_options.device
         further = dict[str, Any](device=device, tensorboard_log=log)
-        if get_algorithm(task.algo).on_tensors:
+        if on_tensors:
             from .gradient import make_source
 
             further["source"] = partial(make_source, task, first, scaled_env.reward_scale)
         setup = scaled_env, self.period, self.scaling, seed
         model = make_model(task.algo, task.settings, *setup, **further)
-        if checkpoint is not None:
-            load_parameters(self.folder / CHECKPOINT, model)
+        if self.checkpoint:
+            _load_parameters(self.folder / CHECKPOINT, model)
             if isinstance(model, OffPolicyAlgorithm):
                 model.learning_starts += steps  # its buffer begins empty
         if start is not None:
@@ -282,7 +282,7 @@ class EvalCallback(BaseCallback):
             "scaling": self.scaling,
             "evaluations": self.evaluations,
         }
-        save_checkpoint(self.folder / CHECKPOINT, self.model, checkpoint)
+        _save_checkpoint(self.folder / CHECKPOINT, self.model, checkpoint)
         lines = "".join(json.dumps(evaluation._asdict()) + "\n" for evaluation in self.evaluations)
         write_atomic(self.folder / CURVE, lines.encode())
         zoo.write_evaluation(self.folder, self.task.env_id, self.model, costs, lengths)
@@ -321,3 +321,94 @@ class EvalCallback(BaseCallback):
         save_policy(self.folder / POLICY, network, card)
         with atomic_file(self.folder / BEST) as file:
             self.model.save(file)
+
+
+def read_state(path: Path) -> Checkpoint:
+    """Read a training's state without the tensors.
+
+    Args:
+        path: Checkpoint.
+
+    Returns:
+        State in JSON types.
+
+    Raises:
+        ValueError: The file is no checkpoint of this format, or is cut short.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            text = (file.metadata() or {}).get("checkpoint")
+    except SafetensorError as error:
+        raise ValueError(f"{path} is no checkpoint, or is cut short: {error}") from None
+    try:
+        state: Any = {} if text is None else json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is no checkpoint: its state is no JSON ({error})") from None
+    if not isinstance(state, dict) or state.get("format") != _FORMAT:
+        raise ValueError(f"{path} is no checkpoint of this format ({_FORMAT})")
+    missing = sorted(_STATE - state.keys())
+    if missing:
+        raise ValueError(f"{path}: the checkpoint's state lacks {', '.join(missing)}")
+    return state
+
+
+def _save_checkpoint(path: Path, model: BaseAlgorithm, rest: Checkpoint) -> None:
+    """Save a model's parameters and optimisers, and the rest of the training's state."""
+    tensors: dict[str, torch.Tensor] = {}
+    groups: dict[str, Any] = {}
+    for part, state in model.get_parameters().items():
+        if "param_groups" in state:  # an optimiser's
+            groups[part] = state["param_groups"]
+            for i, values in state["state"].items():
+                tensors |= {f"{part}/{i}/{key}": value for key, value in values.items()}
+        else:
+            tensors |= {f"{part}/{name}": value for name, value in state.items()}
+    tensors |= {f"{_VARIABLES}/{name}": value for name, value in _get_variables(model).items()}
+    plain = {name: value.detach().cpu().clone() for name, value in tensors.items()}
+    content = json.dumps({"format": _FORMAT, "groups": groups, **rest}, allow_nan=False)
+    write_atomic(path, save(plain, {"checkpoint": content}))
+
+
+def _get_variables(model: BaseAlgorithm) -> dict[str, torch.Tensor]:
+    """Get the tensors that `get_parameters` leaves out, though a model's zip has them."""
+    return {name: getattr(model, name) for name in model._get_torch_save_params()[1]}
+
+
+def _load_parameters(path: Path, model: BaseAlgorithm) -> None:
+    """Load a checkpoint's parameters and optimisers into a model."""
+    groups = read_state(path)["groups"]
+    parts: dict[str, Any] = {part: {} for part in model.get_parameters()}
+    variables = _get_variables(model)
+    for part, group in groups.items():
+        parts[part] = {"param_groups": group, "state": {}}
+    with safe_open(path, "pt") as file:
+        for name in file.keys():  # noqa: SIM118  it is no mapping
+            part, key = name.split("/", 1)
+            if part == _VARIABLES:
+                variables[key].data.copy_(file.get_tensor(name))
+            elif part in groups:
+                i, key = key.split("/", 1)
+                parts[part]["state"].setdefault(int(i), {})[key] = file.get_tensor(name)
+            else:
+                parts[part][key] = file.get_tensor(name)
+    model.set_parameters(parts, device=model.device)
+
+
+def _compute_equal_weights(costs: Array) -> Array:
+    """Compute weights (k,) that make scenarios' mean costs (k,) equal: none outweighs others."""
+    return np.asarray(costs.mean() / np.maximum(costs, _MIN_COST_SHARE * costs.mean()))
+
+
+def _compute_scenario_weights(task: TrainingTask, first: int) -> Array:
+    """Compute each scenario's weight by the uncontrolled cost of a control period, from a seed on.
+
+    The weight is 1, shape (1,), for a task without a mixture.
+    """
+    k = len(task.scenarios)
+    if not k:
+        return np.ones(1)
+    rows = _WEIGHT_DRIVES * k
+    env = make_native_env(task.env_id, rows, None, task.options(rows))
+    costs, steps = evaluate_episodes(env, None, range(first, first + rows))
+    rates = [costs[i::k].sum() / steps[i::k].sum() for i in range(k)]
+    return _compute_equal_weights(np.array(rates))

@@ -13,19 +13,18 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from gymnasium.vector import VectorEnv
-
 from ...envs.numerics import require_extra
 from ...envs.scenarios.manoeuvres import make_scenario
 from ...envs.validation import check_choice, is_finite
 from .. import zoo
+from ..env_info import CarVectorEnv
 from ..vec_env import make_native_env
 from .export import list_activations
 from .normalise import Standardised, StandardisedArguments
 
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm  # isort: skip
-from stable_baselines3.common.utils import LinearSchedule, get_device  # isort: skip
+from stable_baselines3.common.utils import LinearSchedule  # isort: skip
 from stable_baselines3.common.vec_env import VecEnv  # isort: skip
 
 Settings = dict[str, Any]
@@ -34,7 +33,6 @@ HYPERPARAMS = Path(__file__).parent / "hyperparams"
 PERIOD = 0.01  # s, control period for which the files give `gamma`
 WARM_START_ENTRY = "begun"  # the entry of training a policy further
 WARM_START_TRACES_ENTRY = "begun-traces"  # likewise, for a policy with moving averages
-_UNIFORM_LOG_STD = -0.55  # log(1 / sqrt(3)), of actions drawn uniformly from [-1, 1]
 
 _TRAINING_SETTINGS = ("n_timesteps", "n_envs", "policy", "normalize")  # no arguments of the class
 _SCHEDULED = ("learning_rate", "clip_range")  # may fall to zero, `_make_schedule`
@@ -110,22 +108,14 @@ def read_settings(algo: str, env_id: str, file: str | Path | None = None) -> Set
         raise ValueError(f"{path} has no settings of {env_id}, and no 'default'")
     settings = entries[key]
     try:
-        check_settings(algo, settings)
+        _check_settings(algo, settings)
     except ValueError as error:
         raise ValueError(f"{path}, {key}: {error}") from None
     return dict(settings)
 
 
-def check_settings(algo: str, settings: Any) -> None:
-    """Check that an algorithm has all settings, and that none is code instead of a value.
-
-    Args:
-        algo: Name of the algorithm.
-        settings: Settings to check.
-
-    Raises:
-        ValueError: A setting is unknown, missing or of another type.
-    """
+def _check_settings(algo: str, settings: object) -> None:
+    """Check that an algorithm has all settings, and that none is code instead of a value."""
     if not isinstance(settings, Mapping):
         raise ValueError(f"settings are {{name: value}}, got {settings!r}")
     arguments = inspect.signature(get_algorithm(algo).load()).parameters
@@ -148,18 +138,6 @@ def check_settings(algo: str, settings: Any) -> None:
     missing = [item for item in ("n_envs", "n_timesteps", "policy") if item not in settings]
     if missing:
         raise ValueError(f"no {', '.join(missing)}")
-
-
-def compute_action_std(settings: Settings) -> float:
-    """Compute the standard deviation of a training's first actions.
-
-    Args:
-        settings: Settings of `read_settings`.
-
-    Returns:
-        Standard deviation, as a fraction of full scale.
-    """
-    return math.exp(settings.get("policy_kwargs", {}).get("log_std_init", _UNIFORM_LOG_STD))
 
 
 def make_model_options(algo: str, settings: Settings, seconds: float, num_envs: int) -> Settings:
@@ -224,7 +202,7 @@ def make_model(
     return kind(settings["policy"], env, stats_window_size=window, seed=seed, **options, **rest)
 
 
-def _make_schedule(name: str, value: Any) -> Any:
+def _make_schedule(name: str, value: object) -> LinearSchedule | float:
     """Make a schedule that falls to zero of "lin_NUMBER", and a float of a number."""
     word, _, number = str(value).rpartition("_")
     try:
@@ -234,24 +212,6 @@ def _make_schedule(name: str, value: Any) -> Any:
     if word not in ("", "lin") or not 0.0 < start < math.inf:
         raise ValueError(f"{name} is a positive number or lin_NUMBER, got {value!r}")
     return LinearSchedule(start, 0.0, 1.0) if word else start
-
-
-def check_device(name: str) -> None:
-    """Check that torch has a device.
-
-    Args:
-        name: Name of the device.
-
-    Raises:
-        ValueError: The name is no device of torch's, or the device is not available.
-    """
-    try:
-        device = get_device(name)  # the CPU where there is no CUDA
-    except RuntimeError:
-        known = "a device is cpu, cuda or another of torch's, or auto"
-        raise ValueError(f"{known}, got {name!r}") from None
-    if name.startswith("cuda") and device.type != "cuda":
-        raise ValueError(f"torch finds no CUDA device, got {name!r}; auto takes one if there is")
 
 
 @dataclass(frozen=True)
@@ -276,7 +236,7 @@ class TrainingTask:
 
     def __post_init__(self) -> None:
         settings = self.settings or read_settings(self.algo, self.env_id)
-        check_settings(self.algo, settings)
+        _check_settings(self.algo, settings)
         object.__setattr__(self, "settings", settings)
         object.__setattr__(self, "num_envs", self.num_envs or settings["n_envs"])
         if self.seed < 0:
@@ -319,7 +279,7 @@ class TrainingTask:
         turns = itertools.islice(itertools.cycle(self.scenarios), num_envs)
         return self.env_options | {"scenario": list(turns)}
 
-    def vector_env(self, num_envs: int) -> VectorEnv[Any, Any, Any]:
+    def vector_env(self, num_envs: int) -> CarVectorEnv:
         """Make a vector env of the task with its estimator, for other seeds than the training's.
 
         Args:

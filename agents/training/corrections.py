@@ -22,18 +22,19 @@ from ...estimators.learned.correction import DEVIATION, MIN_LOG_DEVIATION, learn
 from ...estimators.learned.correction_file import Correction, CorrectionCard
 from ...estimators.learned.network import Network
 from ...estimators.vector.estimate import EstimateObservation
-from ..controllers.base import NoControl
+from ..controllers.base import Controller, NoControl
 from ..controllers.lqr import Lqr
+from ..env_info import AnyEnv
 from ..rollout import iterate_steps
-from .networks import compute_scale
+from .student import Single, compute_scale, make_dense_layers
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 
 _OUTPUTS = ("beta", "gamma", "F_d", "N_d")  # what LQR reads
 READ = (*_OUTPUTS, "bias", "front_tyres", "rear_tyres", "inverse_friction")
 """States that a network reads where the filter has them."""
-FIRST_ROUND = (("lqr", "fusion"), ("none", "fusion"), ("shaken", "fusion"), ("lqr", "vision"),
-         ("shaken", "gps"))  # fmt: skip
+_FIRST_ROUND = (("lqr", "fusion"), ("none", "fusion"), ("shaken", "fusion"), ("lqr", "vision"),
+                ("shaken", "gps"))  # fmt: skip
 _SECOND_ROUND = (("lqr", "fusion"), ("lqr", "vision"), ("lqr", "gps"))
 """Who drives with which slow sensors, on the filter, then on the correction."""
 TRAINING, HELD_OUT = 2**67, 2**68  # first seeds; those of `callbacks` and `distill` differ
@@ -51,17 +52,17 @@ _DriveSpec = tuple[str, dict[str, Any]]
 """A scenario in an env: an id, and options of `gym.make`."""
 
 
-class Samples(NamedTuple):
-    """Samples of a filter's error."""
+class _Samples(NamedTuple):
+    """_Samples of a filter's error."""
 
-    inputs: Any  # inputs that the network normalises, float32, shape (k, inputs)
+    inputs: Single  # inputs that the network normalises, shape (k, inputs)
     errors: Array  # numbers to add to the filter's sideslip angle (rad), shape (k,)
 
 
 class _NoisyLqr(Lqr):
     """LQR whose action is disturbed by coloured noise."""
 
-    def __init__(self, env: Any) -> None:
+    def __init__(self, env: AnyEnv) -> None:
         super().__init__(env)
         self._rng, self._noise = np.random.default_rng(0), np.zeros(())
 
@@ -73,29 +74,18 @@ class _NoisyLqr(Lqr):
         return np.clip(action + self._noise, -1.0, 1.0).astype(np.float32), state
 
 
-_AGENTS: dict[str, Any] = {"none": NoControl, "lqr": Lqr, "shaken": _NoisyLqr}
+_AGENTS: dict[str, type[Controller]] = {"none": NoControl, "lqr": Lqr, "shaken": _NoisyLqr}
 
 
-def collect_samples(
+def _collect_samples(
     correction: Correction,
     drives: Sequence[_DriveSpec],
-    drivers: Sequence[Any],
+    drivers: Sequence[tuple[str, str]],
     seed: int,
     episodes: int,
-) -> Samples:
-    """Collect samples of every drive with every driver on a correction.
-
-    Args:
-        correction: Correction behind the filter.
-        drives: Scenarios, as ids and options of `gym.make`.
-        drivers: Pairs of a key of `_AGENTS` and slow sensors.
-        seed: First seed.
-        episodes: Seeds of each drive and driver.
-
-    Returns:
-        Samples of all drives, one after another.
-    """
-    seeds, collected = itertools.count(seed, episodes), list[Samples]()
+) -> _Samples:
+    """Collect samples of every drive with every driver, a key of `_AGENTS` and slow sensors."""
+    seeds, collected = itertools.count(seed, episodes), list[_Samples]()
     for (env_id, options), (driver, sensors) in itertools.product(drives, drivers):
         options = {"sensors": sensors, "on_bad_action": "fail", **options}
         env: Any = gym.make_vec(env_id, num_envs=episodes, **options)
@@ -107,7 +97,7 @@ def collect_samples(
     return _concatenate(collected)
 
 
-def _iterate_samples(env: Any, agent: Any, seed: int) -> Iterator[Samples]:
+def _iterate_samples(env: Any, agent: Controller, seed: int) -> Iterator[_Samples]:
     """Iterate over samples of the first episodes' steps, one of `_EVERY`."""
     batch, seeds = env.estimator, list(range(seed, seed + env.num_envs))
     net = batch.first.net
@@ -116,11 +106,11 @@ def _iterate_samples(env: Any, agent: Any, seed: int) -> Iterator[Samples]:
         truth, memory = step.info["beta"], batch.memory
         chosen = step.running & (np.abs(truth) < _MAX_SIDESLIP) & (memory[:, DEVIATION] > 0.0)
         beta = batch.filters[chosen, 0].x[:, net.beta]
-        yield Samples(memory[chosen, stack].astype(np.float32), truth[chosen] - beta)
+        yield _Samples(memory[chosen, stack].astype(np.float32), truth[chosen] - beta)
 
 
-def _concatenate(parts: Sequence[Samples]) -> Samples:
-    return Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+def _concatenate(parts: Sequence[_Samples]) -> _Samples:
+    return _Samples(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def train_correction(
@@ -151,7 +141,7 @@ def train_correction(
     report("drives on the filter")
     plain, none = (np.zeros(card.inputs), np.ones(card.inputs)), np.zeros((2, card.inputs))
     blank = Correction(card, Network(*plain, [none], [np.zeros(2)], "relu", clip=np.inf))
-    first_samples = collect_samples(blank, drives, FIRST_ROUND, TRAINING + first, episodes)
+    first_samples = _collect_samples(blank, drives, _FIRST_ROUND, TRAINING + first, episodes)
     inputs = first_samples.inputs  # normalised in place
     mean, spread = inputs.mean(0, np.float64), inputs.std(0, dtype=np.float64)
     scale = compute_scale(spread)
@@ -161,33 +151,30 @@ def train_correction(
     draft = Correction(card, _fit_network(first_samples, mean, scale, (epochs + 1) // 2, card.seed))
     report("drives on the first network")
     second_seed = TRAINING + first + _SEEDS // 2
-    second_samples = collect_samples(draft, drives, _SECOND_ROUND, second_seed, episodes)
+    second_samples = _collect_samples(draft, drives, _SECOND_ROUND, second_seed, episodes)
     report("the second network")
     all_samples = _concatenate([first_samples, second_samples])
     network = _fit_network(all_samples, mean, scale, epochs, card.seed)
     report("calibration")
     last = Correction(card, network)
-    held_out = collect_samples(last, drives, _SECOND_ROUND, HELD_OUT + first, n_test)
-    errors, deviations = compute_errors(last, held_out)
+    held_out = _collect_samples(last, drives, _SECOND_ROUND, HELD_OUT + first, n_test)
+    errors, deviations = _compute_errors(last, held_out)
     factor = float(np.quantile(np.abs(errors / deviations), 0.95)) / _NORMAL_95
     biases = [*network.biases[:-1], network.biases[-1] + [0.0, np.log(factor)]]
     last = Correction(card, replace(network, biases=biases))
-    test = collect_samples(last, drives, _SECOND_ROUND, HELD_OUT + first + _SEEDS // 2, n_test)
+    test = _collect_samples(last, drives, _SECOND_ROUND, HELD_OUT + first + _SEEDS // 2, n_test)
     cpu_seconds = round(time.process_time() - start_time, 1)
-    quality = compute_quality(last, test)
+    quality = _compute_quality(last, test)
     card = replace(card, temperature=factor, cpu_seconds=cpu_seconds, evaluation=quality)
     return replace(last, card=card)
 
 
-def _fit_network(data: Samples, mean: Array, scale: Array, epochs: int, seed: int) -> Network:
+def _fit_network(data: _Samples, mean: Array, scale: Array, epochs: int, seed: int) -> Network:
     """Fit a network to samples whose inputs are normalised by mean and scale."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
-    sizes = [data.inputs.shape[1], *_HIDDEN, 2]
-    layers = [torch.nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
-    between = itertools.chain(*((linear, torch.nn.ReLU()) for linear in layers[:-1]))
-    # errors are learned in units of their standard deviation (rad)
-    model, unit = torch.nn.Sequential(*between, layers[-1]), float(data.errors.std()) or 1.0
+    model = make_dense_layers(data.inputs.shape[1], *_HIDDEN, 2, activation=torch.nn.ReLU)
+    unit = float(data.errors.std()) or 1.0  # of learned errors: their standard deviation (rad)
     x, y = torch.from_numpy(data.inputs), torch.from_numpy((data.errors / unit).astype(np.float32))
     optimiser = torch.optim.Adam(model.parameters(), _RATE)
     steps = epochs * -(-len(x) // _BATCH)
@@ -201,40 +188,24 @@ def _fit_network(data: Samples, mean: Array, scale: Array, epochs: int, seed: in
             (nll * torch.exp(log_sd.detach())).mean().backward()  # sd^(2 beta), beta = 0.5
             optimiser.step()
             schedule.step()
-    weights = [layer.weight.detach().numpy().astype(np.float64) for layer in layers]
-    biases = [layer.bias.detach().numpy().astype(np.float64) for layer in layers]
+    numbers = [x.detach().numpy().astype(np.float64) for x in model.parameters()]
+    weights, biases = numbers[::2], numbers[1::2]
     weights[-1][0] *= unit
     biases[-1] = biases[-1] * [unit, 1.0] + [0.0, np.log(unit)]
     return Network(mean, scale, weights, biases, "relu", clip=_CLIP)
 
 
-def compute_errors(correction: Correction, data: Samples) -> tuple[Array, Array]:
-    """Compute the corrected errors and their deviations.
-
-    Args:
-        correction: Correction on which the samples were driven.
-        data: Samples.
-
-    Returns:
-        Errors and standard deviations (rad), shape (k,) each.
-    """
+def _compute_errors(correction: Correction, data: _Samples) -> tuple[Array, Array]:
+    """Compute the corrected errors and their standard deviations (rad), shape (k,) each."""
     ones = np.ones(correction.card.inputs)
     plain = replace(correction.network, mean=0.0 * ones, scale=ones)
     added, logarithm = plain(data.inputs.astype(np.float64)).T
     return data.errors - added, np.exp(np.clip(logarithm, MIN_LOG_DEVIATION, 0.0))
 
 
-def compute_quality(correction: Correction, data: Samples) -> dict[str, float]:
-    """Compute RMSE of the filter and of the correction (rad), 95 % coverage and NEES.
-
-    Args:
-        correction: Correction on which the samples were driven.
-        data: Samples.
-
-    Returns:
-        Numbers by name: "filter_rmse", "rmse", "coverage" and "nees".
-    """
-    errors, deviations = compute_errors(correction, data)
+def _compute_quality(correction: Correction, data: _Samples) -> dict[str, float]:
+    """Compute RMSE of the filter and of the correction (rad), 95 % coverage and NEES."""
+    errors, deviations = _compute_errors(correction, data)
     squares = (errors / deviations) ** 2
     return {
         "filter_rmse": float(np.mean(data.errors**2) ** 0.5),

@@ -4,37 +4,45 @@ A teacher drives cars of its own, with any sensors, filter or truth, in lockstep
 student's: equal seeds and actions give equal motion to the last bit. In the first round the
 teacher acts, with coloured noise, in later ones the student; the teacher's action is always the
 label (Ross et al., AISTATS 2011).
+
+The loss is what an action's error adds to the cost of the rest of the drive, by the Riccati
+matrix of the teacher's design, over the cost of the episode: the score's logarithm, linearised.
 """
 
 import itertools
+import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from ..controllers.lqr import Lqr
 from ..learned.policy import Card, Policy, PolicyController, save_policy
 from ..rollout import COST_FLOOR
-from .networks import compute_scale
 from .student import (
-    LAST_ROUND_FACTOR,
     Demonstrations,
     DistillConfig,
     Scaling,
     Student,
-    compute_scaling,
-    fit_model,
+    compute_scale,
     normalise_inputs,
 )
 
 import torch  # isort: skip  # after ours, which say which extra is missing
+from torch import nn  # isort: skip
 
-DISTILL_SEEDS = 2**69  # no other seeds are as large: `callbacks`, `corrections`
-SEEDS_PER_TRAINING = 2**40
+if TYPE_CHECKING:
+    from .. import Agent
+
+_DISTILL_SEEDS = 2**69  # no other seeds are as large: `callbacks`, `corrections`
+_SEEDS_PER_TRAINING = 2**40
 _NOISE_DECAY = 0.95  # factor of the coloured noise in a step
+_WINDOW = 50  # steps through which the gradient goes back in time, but for traces
+_SAMPLES = 512  # steps of a batch of a student without memory
+_LAST_ROUND_FACTOR = 3  # times as many epochs in the last round
 
 
 class DistillTask(NamedTuple):
@@ -50,27 +58,86 @@ class RoundResult(NamedTuple):
 
     steps: int  # steps that taught, in all rounds so far
     cost: float  # mean cost of the round's episodes
-    loss: float  # what `fit_model` returns
+    loss: float  # what `_fit_model` returns
 
 
-def collect_demonstrations(
-    task: DistillTask, policy: Any, seeds: Sequence[int], noise: float, max_cost: float = np.inf
+class _Batch(NamedTuple):
+    """B episodes, or a window of T steps of them, as tensors; fields as in `Demonstrations`."""
+
+    inputs: torch.Tensor  # (B, T, k), mixed by `Scaling`
+    labels: torch.Tensor  # (B, T, m)
+    privileged: torch.Tensor  # (B, T, q)
+    weights: torch.Tensor  # (B, T)
+    curvatures: torch.Tensor  # (B, m, m)
+    begins: bool  # whether the episodes begin with it
+
+
+_AgentT = TypeVar("_AgentT", bound="Agent | Policy")
+
+
+def imitate(
+    model: Any,
+    tasks: Sequence[DistillTask],
+    config: DistillConfig,
+    make_agent: Callable[[Scaling, RoundResult], _AgentT],
+    weight: float | None = None,
+) -> _AgentT:
+    """Let a model drive and learn in rounds.
+
+    Args:
+        model: Network like `Student`, with `recurrent`, `fit_scaling` and its outputs.
+        tasks: Cars and teachers.
+        config: Configuration of the training.
+        make_agent: Function that makes the agent of a round; it drives the next one.
+        weight: S, the cost of a squared error. None: the teacher's curvature, over costs that are
+            capped after the first round at their median there.
+
+    Returns:
+        Agent of the last round.
+    """
+    layout, needs, num_envs = tasks[0].cars.layout, tasks[0].teacher.needs, tasks[0].cars.num_envs
+    seeds = itertools.count(_DISTILL_SEEDS + config.seed * _SEEDS_PER_TRAINING, num_envs)
+    agent: _AgentT | None = None
+    scaling: Scaling | None = None
+    drives, max_costs, steps = list[Demonstrations](), [np.inf] * len(tasks), 0
+    for i in range(config.rounds):
+        new_drives = []
+        for task, max_cost in zip(tasks, max_costs, strict=True):
+            first = next(seeds)
+            numbers = range(first, first + task.cars.num_envs)
+            demo = _collect_demonstrations(task, agent, numbers, config.noise, max_cost)
+            if weight is not None:
+                demo = demo._replace(curvature=np.full((1, 1), weight, np.float32))
+            new_drives.append(demo)
+        steps += sum(int(demo.is_valid.sum()) for demo in new_drives)
+        if scaling is None:
+            scaling = model.fit_scaling(new_drives, layout, needs)
+            if weight is None:
+                max_costs = [float(np.median(demo.costs)) for demo in new_drives]
+            privileged = np.concatenate([demo.privileged[demo.is_valid] for demo in new_drives])
+            middle, scale = privileged.mean(0), compute_scale(privileged.std(0))
+        for demo in new_drives:
+            standard = normalise_inputs(demo.privileged, middle, scale)
+            drives.append(demo._replace(privileged=standard))
+        epochs = config.epochs * (_LAST_ROUND_FACTOR if i == config.rounds - 1 else 1)
+        loss = _fit_model(model, drives, scaling, config, epochs)
+        mean_cost = float(np.mean([demo.costs.mean() for demo in new_drives]))
+        agent = make_agent(scaling, RoundResult(steps, mean_cost, loss))
+    assert agent is not None
+    return agent
+
+
+def _collect_demonstrations(
+    task: DistillTask,
+    policy: "Agent | Policy | None",
+    seeds: Sequence[int],
+    noise: float,
+    max_cost: float = np.inf,
 ) -> Demonstrations:
     """Collect each seed's first episode, driven by a policy, or by the teacher with noise.
 
-    Args:
-        task: Cars and teacher.
-        policy: `Policy`, object with stable-baselines3's `predict`, or None for the teacher.
-        seeds: Seeds of the rows.
-        noise: Largest standard deviation of the noise on the teacher's actions.
-        max_cost: Cap on the cost that divides an episode's errors, so that failed episodes keep
-            weight.
-
-    Returns:
-        Demonstrations with the teacher's actions, one row for each seed.
-
-    Raises:
-        ValueError: The teacher's cars differ from the student's.
+    `noise` is the largest standard deviation of the noise on the teacher's actions. Episodes that
+    cost more than `max_cost` are weighted as if they cost that: failed ones keep their weight.
     """
     cars, twins, teacher = task
     student = PolicyController(cars, policy) if isinstance(policy, Policy) else policy
@@ -153,40 +220,118 @@ def distill(
         raise ValueError("nothing is left to be told: the student sees all that its teacher reads")
     torch.set_num_threads(1)
     torch.manual_seed(config.seed)
-    start_time, target, steps = time.process_time(), Path(path), 0
-    cars = tasks[0].cars
-    seeds = itertools.count(DISTILL_SEEDS + config.seed * SEEDS_PER_TRAINING, cars.num_envs)
+    start_time, target, cars = time.process_time(), Path(path), tasks[0].cars
+    rounds = list[RoundResult]()
     width = cars.single_action_space.shape[0]
     model = Student(len(cars.layout), width, config, n_privileged)
-    policy: Policy | None = None
-    scaling: Scaling | None = None
-    drives, rounds = list[Demonstrations](), list[RoundResult]()
-    max_costs = [np.inf] * len(tasks)
-    for i in range(config.rounds):
-        new_drives = []
-        for task, max_cost in zip(tasks, max_costs, strict=True):
-            first = next(seeds)
-            numbers = range(first, first + task.cars.num_envs)
-            new_drives.append(collect_demonstrations(task, policy, numbers, config.noise, max_cost))
-        steps += sum(int((demo.weights > 0.0).sum()) for demo in new_drives)
-        if scaling is None:
-            scaling = compute_scaling(new_drives, cars.layout, tasks[0].teacher.needs)
-            model.fit_whitening(new_drives, scaling)
-            max_costs = [float(np.median(demo.costs)) for demo in new_drives]
-            valid_parts = [demo.privileged[demo.weights > 0.0] for demo in new_drives]
-            privileged = np.concatenate(valid_parts)
-            middle, scale = privileged.mean(0), compute_scale(privileged.std(0))
-        for demo in new_drives:
-            standard = normalise_inputs(demo.privileged, middle, scale)
-            drives.append(demo._replace(privileged=standard))
-        epochs = config.epochs * (LAST_ROUND_FACTOR if i == config.rounds - 1 else 1)
-        loss = fit_model(model, drives, scaling, config, epochs)
-        mean_cost = float(np.mean([demo.costs.mean() for demo in new_drives]))
-        rounds.append(RoundResult(steps, mean_cost, loss))
+
+    def save_round(scaling: Scaling, result: RoundResult) -> Policy:
         cpu_seconds = round(time.process_time() - start_time, 1)
-        card = replace(card, steps=steps, cpu_seconds=cpu_seconds)
-        policy = Policy(target.stem, model.network(scaling), card)
-        save_policy(target, policy.network, card)
-        report(rounds[-1])
-    assert policy is not None
-    return _DistillResult(policy, tuple(rounds))
+        numbers = replace(card, steps=result.steps, cpu_seconds=cpu_seconds)
+        policy = Policy(target.stem, model.network(scaling), numbers)
+        save_policy(target, policy.network, policy.card)
+        rounds.append(result)
+        report(result)
+        return policy
+
+    return _DistillResult(imitate(model, tasks, config, save_round), tuple(rounds))
+
+
+class _EpisodeBatches:
+    """Batches of episodes, cut into windows through which the state is carried."""
+
+    def __init__(
+        self, drives: Sequence[Demonstrations], scaling: Scaling, config: DistillConfig
+    ) -> None:
+        self.drives, self.scaling = drives, scaling
+        self.batch, self.window = config.batch, sys.maxsize if config.traces else _WINDOW
+        self.episodes = [(i, j) for i, demo in enumerate(drives) for j in range(len(demo.costs))]
+        longest = max(demo.weights.shape[1] for demo in drives)
+        self.n_batches = -(-len(self.episodes) // self.batch) * -(-longest // self.window)
+
+    def __iter__(self) -> Iterator[_Batch]:
+        names = ("obs", "labels", "privileged", "weights")
+        for chosen in torch.split(torch.randperm(len(self.episodes)), self.batch):
+            rows = [self.episodes[int(i)] for i in chosen]
+            longest = max(self.drives[i].weights.shape[1] for i, _ in rows)
+            shapes = [getattr(self.drives[0], name).shape[2:] for name in names]
+            arrays = [np.zeros((len(rows), longest, *shape), np.float32) for shape in shapes]
+            for row, (i, j) in enumerate(rows):
+                length = self.drives[i].weights.shape[1]
+                for array, name in zip(arrays, names, strict=True):
+                    array[row, :length] = getattr(self.drives[i], name)[j]
+            S = torch.from_numpy(np.stack([self.drives[i].curvature for i, _ in rows]))
+            arrays[0] = self.scaling.mix_inputs(arrays[0])
+            for start in range(0, longest, self.window):
+                z, y, q, w = (torch.from_numpy(a[:, start : start + self.window]) for a in arrays)
+                yield _Batch(z, y, q, w, S, start == 0)
+
+
+class _StepBatches:
+    """Batches of `_SAMPLES` single steps of all drives, each like an episode."""
+
+    def __init__(
+        self, drives: Sequence[Demonstrations], scaling: Scaling, _: DistillConfig
+    ) -> None:
+        parts = []
+        for demo in drives:
+            inputs, count = scaling.mix_inputs(demo.obs[demo.is_valid]), int(demo.is_valid.sum())
+            arrays = [x[demo.is_valid] for x in (demo.labels, demo.privileged, demo.weights)]
+            parts.append((inputs, *arrays, np.repeat(demo.curvature[None], count, axis=0)))
+        columns = zip(*parts, strict=True)
+        self.arrays = [torch.from_numpy(np.concatenate(column)) for column in columns]
+        self.n_batches = -(-len(self.arrays[0]) // _SAMPLES)
+
+    def __iter__(self) -> Iterator[_Batch]:
+        for i in torch.split(torch.randperm(len(self.arrays[0])), _SAMPLES):
+            z, y, q, w, S = (array[i] for array in self.arrays)
+            yield _Batch(z[:, None], y[:, None], q[:, None], w[:, None], S, True)
+
+
+def _fit_model(
+    model: Any,
+    drives: Sequence[Demonstrations],
+    scaling: Scaling,
+    config: DistillConfig,
+    epochs: int,
+) -> float:
+    """Fit a model to drives; FloatingPointError where the loss is not finite.
+
+    Returns what errors of the actions add to an episode's cost, as a fraction of it: the mean over
+    the episodes in the last epoch, without the auxiliary loss.
+    """
+    optimiser = torch.optim.Adam(model.parameters(), config.learning_rate)
+    batches = (_EpisodeBatches if model.recurrent else _StepBatches)(drives, scaling, config)
+    schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.02, epochs * batches.n_batches)
+    count = sum(len(demo.costs) for demo in drives)
+    length = sum(int(demo.is_valid.sum()) for demo in drives) / count  # steps, on average
+    zero_loss = sum(map(_compute_zero_loss, drives)) / count
+    step, total, state = 0, 0.0, None
+    for _ in range(epochs):
+        total = 0.0
+        for z, y, q, w, S, begins in batches:
+            out, state = model(z, None if begins else state)
+            state = None if state is None else state.detach()
+            valid = w > 0.0
+            error = out[..., : y.shape[-1]] - y
+            added_cost = torch.einsum("bti,bij,btj->bt", error, S, error) * w
+            loss = length * added_cost.sum() / valid.sum().clamp(min=1)  # by episode
+            if config.told:
+                auxiliary_error = (out[..., y.shape[-1] :] - q)[valid].square().mean(-1).sum()
+                loss = loss / zero_loss + config.told * auxiliary_error / valid.sum().clamp(min=1)
+            optimiser.zero_grad()
+            torch.autograd.backward(loss)
+            norm = nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+            if not torch.isfinite(loss + norm):
+                raise FloatingPointError(f"the loss is {loss.item()} at step {step}")
+            optimiser.step()
+            schedule.step()
+            step += 1
+            total += float(added_cost.detach().sum())
+    return total / count
+
+
+def _compute_zero_loss(demo: Demonstrations) -> float:
+    """Compute the loss of a student whose actions are zero, summed over episodes."""
+    losses = np.einsum("nti,ij,ntj->nt", demo.labels, demo.curvature, demo.labels)
+    return float((losses * demo.weights).sum())

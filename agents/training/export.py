@@ -10,27 +10,35 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 from zipfile import BadZipFile, ZipFile
 
 import gymnasium as gym
 import numpy as np
 
 from ...envs.numerics import require_extra
+from ...envs.record import Array
 from ...envs.task import ObservationEntry, make_space
 from ...estimators.learned.forward import ACTIVATIONS, RecurrentCell
 from ...estimators.learned.network import SUFFIX, Network
 from ...estimators.wrappers.estimate import EstimateObservation
-from ..env_info import AnyEnv, get_env_facts
+from ..env_info import AnyEnv, CarEnv, get_env_facts
 from ..learned.policy import Card, Policy, save_policy
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.policies import BasePolicy
+    from stable_baselines3.common.vec_env import VecNormalize
+    from torch import Tensor, nn
 
 _NEEDED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
 _MEMBERS = {"data", "policy.pth"}
 _NORMALISER = "vecnormalize.pkl"
-_PRIOR = 1e-4  # samples that a VecNormalize starts with, of mean 0 and variance 1
 
 
-def convert_sb3_policy(model: Any, normaliser: Any = None, history: int = 1) -> Network:
+def convert_sb3_policy(
+    model: "BaseAlgorithm | BasePolicy", normaliser: "VecNormalize | None" = None, history: int = 1
+) -> Network:
     """Convert the deterministic actor of a model to a network; scale 0: an entry never varied.
 
     Args:
@@ -47,7 +55,7 @@ def convert_sb3_policy(model: Any, normaliser: Any = None, history: int = 1) -> 
     with require_extra("train", "networks come from stable-baselines3"):
         from stable_baselines3.common.torch_layers import FlattenExtractor
 
-        from .normalise import Standardised
+        from .normalise import Standardised, read_normalisation
     policy = getattr(model, "policy", model)
     actor = _find_actor_reader(type(policy))(policy)
     space = policy.action_space
@@ -80,23 +88,16 @@ def convert_sb3_policy(model: Any, normaliser: Any = None, history: int = 1) -> 
 class _Actor(NamedTuple):
     """The actor of a policy; `squashed`: whether tanh follows its layers."""
 
-    layers: list[Any]
+    layers: list["nn.Module"]
     squashed: bool
-    extractor: Any
-    recurrent: Any = None
+    extractor: "nn.Module"
+    recurrent: "nn.RNNBase | None" = None
 
 
 def _find_on_policy_actor(policy: Any) -> _Actor:
-    layers = [*policy.mlp_extractor.policy_net, policy.action_net]
-    return _Actor(layers, bool(policy.squash_output), policy.pi_features_extractor)
-
-
-def _find_recurrent_actor(policy: Any) -> _Actor:
-    return _find_on_policy_actor(policy)._replace(recurrent=policy.lstm_actor)
-
-
-def _find_gru_actor(policy: Any) -> _Actor:
-    return _Actor(list(policy.layers), False, policy.features_extractor, policy.cell)
+    layers, recurrent = policy.mlp_extractor.policy_net, getattr(policy, "lstm_actor", None)
+    squashed, extractor = bool(policy.squash_output), policy.pi_features_extractor
+    return _Actor([*layers, policy.action_net], squashed, extractor, recurrent)
 
 
 def _find_gaussian_actor(policy: Any) -> _Actor:
@@ -106,17 +107,20 @@ def _find_gaussian_actor(policy: Any) -> _Actor:
     return _Actor([*actor.latent_pi, actor.mu], True, actor.features_extractor)
 
 
-def _find_deterministic_actor(policy: Any) -> _Actor:
-    return _Actor(list(policy.actor.mu), False, policy.actor.features_extractor)  # tanh is a layer
+def _find_sequential_actor(policy: Any) -> _Actor:
+    """Find the actor of a `TD3Policy`, whose tanh is a layer, or of a `GruPolicy`."""
+    if hasattr(policy, "actor"):
+        return _Actor(list(policy.actor.mu), False, policy.actor.features_extractor)
+    return _Actor(list(policy.layers), False, policy.features_extractor, policy.cell)
 
 
 _ACTORS: dict[str, Callable[[Any], _Actor]] = {
     "stable_baselines3.common.policies.ActorCriticPolicy": _find_on_policy_actor,
     "stable_baselines3.sac.policies.SACPolicy": _find_gaussian_actor,
-    "stable_baselines3.td3.policies.TD3Policy": _find_deterministic_actor,
+    "stable_baselines3.td3.policies.TD3Policy": _find_sequential_actor,
     "sb3_contrib.tqc.policies.TQCPolicy": _find_gaussian_actor,
-    "sb3_contrib.common.recurrent.policies.RecurrentActorCriticPolicy": _find_recurrent_actor,
-    f"{__package__}.gradient.GruPolicy": _find_gru_actor,
+    "sb3_contrib.common.recurrent.policies.RecurrentActorCriticPolicy": _find_on_policy_actor,
+    f"{__package__}.gradient.GruPolicy": _find_sequential_actor,
 }
 """Readers of actors by the policy's class; a subclass may compute anything and is none of them."""
 
@@ -130,7 +134,7 @@ def _find_actor_reader(kind: type) -> Callable[[Any], _Actor]:
     return _ACTORS[name]
 
 
-def _convert_cells(module: Any) -> list[RecurrentCell]:
+def _convert_cells(module: "nn.RNNBase | None") -> list[RecurrentCell]:
     """Convert the cells of torch's GRU or LSTM; none for a policy without them."""
     if module is None:
         return []
@@ -144,7 +148,7 @@ def _convert_cells(module: Any) -> list[RecurrentCell]:
     return cells
 
 
-def _to_array(parameter: Any) -> Any:
+def _to_array(parameter: "Tensor") -> Array:
     return parameter.detach().cpu().numpy().copy()
 
 
@@ -156,13 +160,14 @@ def list_activations() -> dict[str, type]:
     return dict(zip(ACTIVATIONS, kinds, strict=True))
 
 
-def _convert_dense(layers: list[Any]) -> tuple[list[Any], list[Any], list[str], str]:
+def _convert_dense(
+    layers: list["nn.Module"],
+) -> tuple[list[Array], list[Array], list[str], str]:
     """Convert linear layers to weights, biases, activations between them, and the output's."""
     from torch import nn
 
     names = {kind: name for name, kind in list_activations().items()}
-    known = f"linear, {', '.join(names.values())}"
-    weights, biases, layer_activations = list[Any](), list[Any](), list[str]()
+    weights, biases, layer_activations = list[Array](), list[Array](), list[str]()
     for layer in layers:
         if isinstance(layer, nn.Linear):
             if len(layer_activations) != len(weights):
@@ -176,33 +181,11 @@ def _convert_dense(layers: list[Any]) -> tuple[list[Any], list[Any], list[str], 
         ):
             layer_activations.append(names[type(layer)])
         else:
-            raise ValueError(f"layer {layer} is not known; known: {known}")
+            known = ", ".join(names.values())
+            raise ValueError(f"layer {layer} is not known; known: linear, {known}")
     if len(layer_activations) == len(weights):  # the last one is the output's
         return weights, biases, layer_activations[:-1], layer_activations[-1]
     return weights, biases, layer_activations, "linear"
-
-
-def read_normalisation(
-    normaliser: Any, n_inputs: int, history: int
-) -> tuple[Any, Any, float | None]:
-    """Read mean, scale and clip of a VecNormalize, around the stack of frames or inside of it.
-
-    Args:
-        normaliser: VecNormalize or None.
-        n_inputs: Entries that the network reads, of all frames together.
-        history: Number of frames.
-
-    Returns:
-        Mean, factor (0: not read) and clip (None: none), by entry of all frames or of one.
-    """
-    if normaliser is None or not normaliser.norm_obs:
-        return np.zeros(n_inputs), np.ones(n_inputs), None
-    stats = normaliser.obs_rms
-    if getattr(stats, "mean", np.zeros(0)).shape not in ((n_inputs,), (n_inputs // history,)):
-        raise ValueError(f"the normaliser is of another observation than the network's {n_inputs}")
-    prior = _PRIOR * (1.0 + stats.mean**2) / stats.count  # what it leaves of a constant's variance
-    scale = 1.0 / np.sqrt(stats.var + normaliser.epsilon)
-    return stats.mean, np.where(stats.var > 2.0 * prior, scale, 0.0), normaliser.clip_obs
 
 
 def policy_from_zip(
@@ -238,9 +221,7 @@ def policy_from_zip(
     content, weights = _read(file)
     policy = _build_policy(file, content, weights)
     frames = _count_frames(file, policy.observation_space, get_env_facts(env).layout)
-    normaliser_file = find_normaliser(file, normalise)
-    normaliser = None if normaliser_file is None else load_normaliser(normaliser_file)
-    network = convert_sb3_policy(policy, normaliser, frames)
+    network = convert_sb3_policy(policy, load_normaliser(file, trust, normalise), frames)
     algorithm = f"stable-baselines3's {type(policy).__name__}"
     described = {"algorithm": algorithm, "steps": int(content.get("num_timesteps", 0))}
     return Policy(file.stem, network, Card.from_env(env, **{"env_id": "", **described, **about}))
@@ -279,7 +260,7 @@ def export_zip(
     if Path(target).suffix != SUFFIX:
         raise ValueError(f"a policy's file is NAME{SUFFIX}, got {target}")
     options = dict(env_options or {})
-    env: gym.Env[Any, Any] = gym.make(env_id, **options)
+    env: CarEnv = gym.make(env_id, **options)
     if estimator:
         env = EstimateObservation(env, estimator)
     about = {"env_id": env_id, "env_options": options, "estimator": estimator, "command": command}
@@ -343,8 +324,10 @@ def check_zip(file: Path) -> None:
     except BadZipFile as error:
         raise ValueError(f"{file} is no zip, or is cut short: {error}") from None
     if missing:
-        lacks = f"it holds no {' and '.join(sorted(missing))}"
-        raise ValueError(f"{file} is no zip of stable-baselines3, or is cut short: {lacks}")
+        raise ValueError(
+            f"{file} is no zip of stable-baselines3, or is cut short: it holds no "
+            f"{' and '.join(sorted(missing))}"
+        )
 
 
 def _read(file: Path) -> tuple[dict[str, Any], Any]:
@@ -370,7 +353,7 @@ def _read(file: Path) -> tuple[dict[str, Any], Any]:
     return content or {}, (weights or {})["policy"]
 
 
-def _build_policy(file: Path, content: dict[str, Any], weights: Any) -> Any:
+def _build_policy(file: Path, content: Mapping[str, Any], weights: Any) -> "BasePolicy":
     """Build the policy with its weights, without the algorithm and its environments."""
     from stable_baselines3.common.policies import ActorCriticPolicy
 
@@ -384,29 +367,40 @@ def _build_policy(file: Path, content: dict[str, Any], weights: Any) -> Any:
         options.setdefault("use_sde", bool(content.get("use_sde", False)))
     spaces = content["observation_space"], content["action_space"]
     try:
-        policy = kind(*spaces, lambda _: 0.0, **options)
+        policy: BasePolicy = kind(*spaces, lambda _: 0.0, **options)
         policy.load_state_dict(weights)
     except Exception as error:
-        wrong = f"its weights are not those of its {kind.__name__}"
-        raise ValueError(f"{file}: {wrong}: {error}") from error
+        raise ValueError(
+            f"{file}: its weights are not those of its {kind.__name__}: {error}"
+        ) from error
     return policy
 
 
-def load_normaliser(file: Path) -> Any:
-    """Load a VecNormalize from its pickle, which can run code.
+def load_normaliser(
+    path: Path, trust: bool, normalise: str | Path | None = None
+) -> "VecNormalize | None":
+    """Load a zip's VecNormalize from its pickle, which can run code; None without one.
 
     Args:
-        file: Path of the pickle.
+        path: Path of the zip.
+        trust: Whether the pickle may be read.
+        normalise: Path of the pickle, as for `find_normaliser`.
 
     Returns:
         VecNormalize of the training.
 
     Raises:
         FileNotFoundError: There is no such file.
+        PermissionError: There is a pickle and no trust.
         ValueError: The file holds no VecNormalize.
     """
     from stable_baselines3.common.vec_env import VecNormalize
 
+    file = find_normaliser(path, normalise)
+    if file is None:
+        return None
+    if not trust:
+        raise PermissionError(f"{file} is a pickle, which may run code: say --trust to read it")
     if not file.is_file():
         raise FileNotFoundError(f"{file}: no such file")
     try:
@@ -418,23 +412,21 @@ def load_normaliser(file: Path) -> Any:
     return normaliser
 
 
-def _count_frames(file: Path, space: Any, layout: Sequence[ObservationEntry]) -> int:
+def _count_frames(file: Path, space: gym.Space[Any], layout: Sequence[ObservationEntry]) -> int:
     """Count the layout's frames in the policy's observation; ValueError for another observation."""
     if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
         raise ValueError(f"{file} was trained on {space}, not on an observation of one dimension")
     frames, rest = divmod(space.shape[0], len(layout))
     if frames > 0 and rest == 0 and space == make_space(layout, frames):
         return frames
-    names = ", ".join(entry.name for entry in layout)
     raise ValueError(
         f"{file} was trained on {space.shape[0]} numbers{_describe_matching_env(space)}; the "
-        "observation here has "
-        f"{len(layout)}: {names}. An export (`sideslip export`) reads its entries by name and "
-        "drives a wider observation too"
+        f"observation here has {len(layout)}: {', '.join(entry.name for entry in layout)}. An "
+        "export (`sideslip export`) reads its entries by name and drives a wider observation too"
     )
 
 
-def _describe_matching_env(space: Any) -> str:
+def _describe_matching_env(space: gym.Space[Any]) -> str:
     """Describe the registered env that has this observation, if there is one."""
     for env_id in [name for name in gym.registry if name.startswith("sideslip/")]:
         try:

@@ -8,16 +8,19 @@ the short-horizon actor-critic (Xu et al., ICLR 2022) without its critic.
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 
 from ...envs.device.torch_env import DeviceVectorEnv
 from .config import TrainingTask
-from .normalise import Standardised
-from .warm_start import RewardScale
+from .normalise import RewardScale, Standardised
+from .student import make_dense_layers
 
 import torch  # isort: skip  # after ours, which say which extra is missing
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.policies import BasePolicy  # isort: skip
+from stable_baselines3.common.type_aliases import MaybeCallback, Schedule  # isort: skip
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor  # isort: skip
 from torch import nn  # isort: skip
 
 _MAX_GRADIENT_NORM = 1.0  # norm of a step's gradient
@@ -26,13 +29,17 @@ _MAX_GRADIENT_NORM = 1.0  # norm of a step's gradient
 class TrainingSource(NamedTuple):
     """The cars of a training."""
 
-    cars: Any  # `DeviceVectorEnv` with gradients that resets itself in the same step
+    cars: Any  # `DeviceVectorEnv` with gradients, which resets itself in the same step
     seeds: list[int]  # seeds of the cars
     reward_scale: RewardScale  # factor of each car's reward
 
 
 def make_source(
-    task: TrainingTask, first: int, reward_scale: RewardScale, device: Any, compile: bool
+    task: TrainingTask,
+    first: int,
+    reward_scale: RewardScale,
+    device: str | torch.device,
+    compile: bool,
 ) -> TrainingSource:
     """Make a task's environments on tensors.
 
@@ -67,31 +74,28 @@ class GruPolicy(BasePolicy):
 
     def __init__(
         self,
-        observation_space: Any,
-        action_space: Any,
-        lr_schedule: Callable[[float], float],
+        observation_space: gym.spaces.Box,
+        action_space: gym.spaces.Box,
+        lr_schedule: Schedule,
         cells: int = 64,
         net_arch: Sequence[int] = (64, 64),
-        features_extractor_class: Any = Standardised,
+        features_extractor_class: type[BaseFeaturesExtractor] = Standardised,
         features_extractor_kwargs: Mapping[str, Any] | None = None,
     ) -> None:
         further = dict(features_extractor_kwargs or {})
         super().__init__(observation_space, action_space, features_extractor_class, further)
         self.features_extractor = self.make_features_extractor()
-        inputs, last = self.features_extractor.features_dim, cells
-        self.cell = nn.GRU(inputs, cells)
-        layers = list[nn.Module]()
-        for size in net_arch:
-            layers += [nn.Linear(last, size), nn.SiLU()]
-            last = size
-        last_layer = nn.Linear(last, action_space.shape[0])
-        self.layers = nn.Sequential(*layers, last_layer)
+        self.cell = nn.GRU(self.features_extractor.features_dim, cells)
+        self.layers = make_dense_layers(cells, *net_arch, action_space.shape[0])
         with torch.no_grad():
-            last_layer.weight.mul_(0.1)  # small first actions: random ones teach little
+            last_weight = list(self.layers.parameters())[-2]
+            last_weight.mul_(0.1)  # small first actions: random ones teach little
         # betas as in Xu et al.: a shorter memory than Adam's defaults
         self.optimizer = torch.optim.Adam(self.parameters(), lr_schedule(1.0), betas=(0.7, 0.95))
 
-    def forward(self, observations: Any, state: Any) -> tuple[Any, Any]:
+    def forward(
+        self, observations: torch.Tensor, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Compute actions (N, m) and the next state (N, cells).
 
         Args:
@@ -105,15 +109,8 @@ class GruPolicy(BasePolicy):
         _, after = self.cell(z[None], state[None])
         return self.layers(after[0]), after[0]
 
-    def begin(self, count: int) -> Any:
-        """Make the state of an episode's start, zeros of shape (count, cells).
-
-        Args:
-            count: Number of cars.
-
-        Returns:
-            State on the policy's device.
-        """
+    def _begin(self, count: int) -> torch.Tensor:
+        """Make the state of an episode's start, zeros of shape (count, cells)."""
         return torch.zeros(count, self.cell.hidden_size, device=self.device)
 
     def predict(
@@ -135,7 +132,7 @@ class GruPolicy(BasePolicy):
             Actions, shape (m,) or (N, m), and the next state for the next call.
         """
         obs_tensor, is_single = self.obs_to_tensor(observation)[0], np.ndim(observation) == 1
-        before = self.begin(len(obs_tensor)) if state is None else torch.as_tensor(state[0])
+        before = self._begin(len(obs_tensor)) if state is None else torch.as_tensor(state[0])
         if state is not None and episode_start is not None:
             is_start = torch.as_tensor(np.asarray(episode_start, np.bool_), device=self.device)
             before = torch.where(is_start[:, None], 0.0, before)
@@ -145,15 +142,7 @@ class GruPolicy(BasePolicy):
         return clipped[0] if is_single else clipped, (after,)
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Any:
-        return self(observation, self.begin(len(observation)))[0]
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        layers = [layer.out_features for layer in self.layers if isinstance(layer, nn.Linear)]
-        parameters: dict[str, Any] = super()._get_constructor_parameters()
-        parameters |= {"cells": self.cell.hidden_size, "net_arch": layers[:-1]}
-        for name in ("features_extractor_class", "features_extractor_kwargs"):
-            parameters[name] = getattr(self, name)
-        return parameters | {"lr_schedule": self._dummy_schedule}
+        return self(observation, self._begin(len(observation)))[0]
 
 
 class AnalyticPolicyGradient(BaseAlgorithm):
@@ -182,9 +171,9 @@ class AnalyticPolicyGradient(BaseAlgorithm):
 
     def __init__(
         self,
-        policy: Any,
+        policy: str | type[GruPolicy],
         env: Any,
-        learning_rate: Any = 5e-3,
+        learning_rate: float | Schedule = 5e-3,
         n_steps: int = 16,
         compile: bool = True,
         source: Callable[..., TrainingSource] | None = None,
@@ -193,16 +182,15 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         policy_kwargs: dict[str, Any] | None = None,
         verbose: int = 0,
         seed: int | None = None,
-        device: Any = "auto",
+        device: torch.device | str = "auto",
         _init_setup_model: bool = True,
     ) -> None:
         if n_steps < 1:
             raise ValueError(f"n_steps is at least 1, got {n_steps}")
-        further = dict[str, Any](
-            policy_kwargs=policy_kwargs, device=device, seed=seed, verbose=verbose
-        )
-        further |= {"stats_window_size": stats_window_size, "tensorboard_log": tensorboard_log}
-        super().__init__(policy, env, learning_rate, support_multi_env=True, **further)
+        super().__init__(
+            policy, env, learning_rate, policy_kwargs, stats_window_size, tensorboard_log, verbose,
+            device, support_multi_env=True, seed=seed,
+        )  # fmt: skip
         self.n_steps, self.compile, self.source = n_steps, compile, source
         if _init_setup_model:
             self._setup_model()
@@ -217,7 +205,7 @@ class AnalyticPolicyGradient(BaseAlgorithm):
     def learn(
         self,
         total_timesteps: int,
-        callback: Any = None,
+        callback: MaybeCallback = None,
         log_interval: int = 1,
         tb_log_name: str = "gradient",
         reset_num_timesteps: bool = True,
@@ -249,13 +237,14 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         cars, seeds, reward_scale = self.source(device=self.device, compile=self.compile)
         reward_scale.begin()
         obs, _ = cars.reset(seed=seeds)
-        state = policy.begin(cars.num_envs)
+        state = policy._begin(cars.num_envs)
         callback.on_training_start(locals(), globals())
         is_running, windows = True, 0
         while is_running and self.num_timesteps < total:
             callback.on_rollout_start()
-            window = reward_scale, self.n_steps
-            mean_cost, obs, state = unroll_window(policy, cars, obs, state, *window)
+            mean_cost, obs, state = _unroll_window(
+                policy, cars, obs, state, reward_scale, self.n_steps
+            )
             self.num_timesteps += self.n_steps * cars.num_envs
             self._update_current_progress_remaining(self.num_timesteps, total)
             self._update_weights(mean_cost)
@@ -269,12 +258,12 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         callback.on_training_end()
         return self
 
-    def _update_weights(self, mean_cost: Any) -> None:
+    def _update_weights(self, mean_cost: torch.Tensor) -> None:
         """Update the weights by one step down the gradient of a window's cost."""
         optimizer = self.policy.optimizer
         self._update_learning_rate(optimizer)
         optimizer.zero_grad()
-        mean_cost.backward()
+        torch.autograd.backward(mean_cost)
         norm = nn.utils.clip_grad_norm_(self.policy.parameters(), _MAX_GRADIENT_NORM)
         if not norm.isfinite():
             step = self.num_timesteps
@@ -288,21 +277,17 @@ class AnalyticPolicyGradient(BaseAlgorithm):
         return ["policy", "policy.optimizer"], []
 
 
-def unroll_window(
-    policy: Any, cars: Any, obs: Any, state: Any, reward_scale: RewardScale, steps: int
-) -> tuple[Any, Any, Any]:
-    """Drive cars for a window, and keep the graph of their mean weighted cost.
+def _unroll_window(
+    policy: GruPolicy,
+    cars: DeviceVectorEnv,
+    obs: torch.Tensor,
+    state: torch.Tensor,
+    reward_scale: RewardScale,
+    steps: int,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Drive cars for a window: mean weighted cost with its graph, last observations and state.
 
-    Args:
-        policy: `GruPolicy`.
-        cars: Cars of a `TrainingSource`.
-        obs: Observations, shape (N, k).
-        state: State, shape (N, cells), zero where an episode begins.
-        reward_scale: Factor of each car's reward.
-        steps: Control periods of the window.
-
-    Returns:
-        Mean cost with its graph, last observations, and last state.
+    The state (N, cells) is zero where an episode begins.
     """
     mean_cost = torch.zeros((), dtype=cars.dtype, device=cars.device)
     for _ in range(steps):

@@ -6,84 +6,166 @@ action of the optimal filter's estimate. So imitation on the student's own drive
 cost, and the student needs memory, not exploration.
 """
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import VectorObservationWrapper
+from gymnasium.vector.utils import batch_space
 
 from ...envs.numerics import require_extra
 from ...envs.record import Array
+from ...envs.task import AGE_CAP, ObservationEntry, make_space
 from ...envs.validation import check_choice
-from .distill import (
-    DISTILL_SEEDS,
-    SEEDS_PER_TRAINING,
-    DistillTask,
-    RoundResult,
-    collect_demonstrations,
-)
-from .networks import compute_whitening
+from ..env_info import CarVectorEnv
+from .distill import DistillTask, RoundResult, imitate
 from .student import (
-    LAST_ROUND_FACTOR,
     Demonstrations,
     DistillConfig,
     Scaling,
     Single,
     compute_scaling,
-    fit_model,
+    compute_whitening,
+    make_dense_layers,
     normalise_inputs,
 )
 
 with require_extra("train", "memories need torch"):
     import torch
-    from torch import nn
+    from torch import Tensor, nn
 
 _HIDDEN = (64, 64)  # of the layers behind a memory
 _MIN_STD = 1e-2  # least standard deviation of a mixture of inputs, for `compute_whitening`
 _FADE_STEPS = (2.0, 300.0)  # in which the first and the last of a new linear memory fade to 1/e
+_SILENT = ("accel_", "wheel_", "roll_rate", "gps_X", "gps_Y", "gps_speed", "gps_satellites")
+"""First parts of entries that the linear scenarios drown in noise, or that are constant there."""
+_OFFSET, RATE, _AGE = "camera_y_l", "camera_y_l_rate", "camera_age"
+MAX_AGE = 1.0  # s, at which ages are capped
+
+
+class CompactObservation(VectorObservationWrapper[Single, Single, Single, npt.NDArray[Any]]):
+    """A vector env whose observations networks learn from more easily.
+
+    The lateral offset varies over metres and is measured to a millimetre. It becomes its mean rate
+    between the last two pictures, zero until there are two. With the pictures' ages that is the
+    same information, but for the first picture's. Ages end at `MAX_AGE`; entries that begin as in
+    `_SILENT` and the references are left out.
+
+    Args:
+        env: Vector env of a linear scenario, whose rows do not end and begin in the same step.
+    """
+
+    def __init__(self, env: CarVectorEnv) -> None:
+        super().__init__(env)
+        base: Any = env.unwrapped
+        inner = base.layout
+        self._period: float = base.control_period * base.dt
+        excluded = (*_SILENT, "beta_ref", "gamma_ref")
+        chosen = [i for i, entry in enumerate(inner) if not entry.name.startswith(excluded)]
+        names = [inner[i].name for i in chosen]
+        self._columns = np.array(chosen)
+        self._ages = [i for i, name in enumerate(names) if name.endswith("_age")]
+        self._offset = names.index(_OFFSET) if _OFFSET in names else None
+        self._at = names.index(_AGE) if _AGE in names else None
+        rate = ObservationEntry(RATE, "m/s", -100.0, 100.0)
+        self.layout = tuple(rate if inner[i].name == _OFFSET else inner[i] for i in chosen)
+        self.single_observation_space = make_space(self.layout)
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self._last = np.full((3, env.num_envs), AGE_CAP)  # offset, its rate, age of the picture
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Single, dict[str, Any]]:
+        """Reset all rows.
+
+        Args:
+            seed: Seeds of the inner env.
+            options: Options of the inner env, without `reset_mask`.
+
+        Returns:
+            Observations, shape (N, k), and infos.
+
+        Raises:
+            ValueError: Only some rows are to be reset.
+        """
+        if "reset_mask" in (options or {}):
+            raise ValueError("rates of the lateral offset begin together: reset all rows at once")
+        return super().reset(seed=seed, options=options)
+
+    def observations(self, observations: Single) -> Single:
+        """Compute compact observations.
+
+        Args:
+            observations: Observations of the inner env, shape (N, all).
+
+        Returns:
+            Observations, shape (N, k).
+        """
+        x = observations[:, self._columns]
+        if self._offset is not None and self._at is not None:
+            x[:, self._offset] = self._compute_rate(x[:, self._offset], x[:, self._at])
+        x[:, self._ages] = np.minimum(x[:, self._ages], MAX_AGE)
+        return x
+
+    def _compute_rate(self, offset: Single, age: Single) -> Array:
+        """Compute the offset's mean rate between the last two pictures (m/s), shape (N,)."""
+        before, rate, aged = self._last
+        between = aged + self._period - age  # from the last picture to this one
+        new = between > 0.5 * self._period
+        known = new & (aged < AGE_CAP)
+        rate = np.where(known, (offset - before) / np.where(known, between, 1.0), rate)
+        rate = np.where(age < AGE_CAP, np.where(new & ~known, 0.0, rate), 0.0)
+        self._last = np.stack([offset, rate, age])
+        return rate
 
 
 class _MemoryNetwork(nn.Module):
-    """Whitened inputs, a memory and layers for the action; arguments as for `make_memory`."""
+    """Whitened inputs, a memory and layers for the action.
+
+    `fresh_index` is the entry that says whether a packet arrived, `delay_steps` the control periods
+    between a packet's capture and its arrival.
+    """
 
     rate: ClassVar[float] = 1e-2  # learning rate of Adam
     recurrent: ClassVar[bool] = True
-    mix: Any
+    mix: Tensor
 
     def __init__(self, inputs: int, fresh_index: int, delay_steps: int) -> None:
         super().__init__()
         self.inputs, self.fresh_index, self.delay_steps = inputs, fresh_index, delay_steps
         self.register_buffer("mix", torch.eye(inputs))
-        self.head: nn.Module = _make_dense_layers(self._build_memory() + inputs, *_HIDDEN, 1)
+        self.head: nn.Module = make_dense_layers(self._build_memory() + inputs, *_HIDDEN, 1)
 
     def _build_memory(self) -> int:
         """Build the memory, and return the width of the output of `_update_memory`."""
         return 0
 
-    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+    def _update_memory(
+        self, z: Tensor, arrived: Tensor, state: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
         """Compute memory (B, T, m) and next state by inputs (B, T, k) and arrivals (B, T, 1)."""
         return z[..., :0], state
 
-    def fit_whitening(self, drives: Sequence[Demonstrations], mean: Array, scale: Array) -> None:
-        """Fit the whitening of the inputs on drives, normalised by mean (k,) and scale (k,)."""
+    def fit_scaling(
+        self,
+        drives: Sequence[Demonstrations],
+        layout: Sequence[ObservationEntry],
+        needs: Sequence[str],
+    ) -> Scaling:
+        """Fit the scaling and whitening on drives, as `Student.fit_scaling` but for the mixing."""
+        mean, scale, _ = compute_scaling(drives, layout, needs, usual_ages=False)
         inputs = np.concatenate([normalise_inputs(demo.obs, mean, scale) for demo in drives])
         whitening = compute_whitening(inputs.reshape(-1, self.inputs), _MIN_STD**2)
         self.mix.copy_(torch.from_numpy(whitening))
+        return Scaling(mean, scale, np.eye(len(mean)))  # memories mix by themselves
 
-    def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
+    def forward(self, z: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
         """Compute actions (B, T, 1) and the next state of normalised observations (B, T, k)."""
         arrived, z = (z[..., self.fresh_index, None] > 0.0).to(z.dtype), z @ self.mix
         known, state = self._update_memory(z, arrived, state)
         return self.head(torch.cat([known, z], -1)), state
-
-
-def _make_dense_layers(*sizes: int) -> nn.Sequential:
-    """Make dense layers of these sizes, the input's first, with SiLU between them."""
-    layers: list[nn.Module] = []
-    for a, b in itertools.pairwise(sizes):
-        layers += [nn.Linear(a, b), nn.SiLU()]
-    return nn.Sequential(*layers[:-1])
 
 
 class _LastObservation(_MemoryNetwork):
@@ -100,7 +182,9 @@ class _FrameStack(_MemoryNetwork):
     def _build_memory(self) -> int:
         return (self.count - 1) * self.inputs
 
-    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+    def _update_memory(
+        self, z: Tensor, arrived: Tensor, state: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
         before = z.new_zeros(len(z), self.count - 1, self.inputs) if state is None else state
         frames = torch.cat([before, z], 1)
         past = frames[:, :-1].unfold(1, self.count - 1, 1).flatten(2)
@@ -116,7 +200,9 @@ class _Gru(_MemoryNetwork):
         self.cell = nn.GRU(self.inputs, self.size, batch_first=True)
         return self.size
 
-    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+    def _update_memory(
+        self, z: Tensor, arrived: Tensor, state: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
         known, state = self.cell(z, None if state is None else state[None])
         return known, state[0]
 
@@ -134,17 +220,19 @@ class _LinearRnn(_MemoryNetwork):
         self.read = nn.Linear(self.inputs, 2 * self.size, bias=False)
         return 2 * self.size
 
-    def _compute_powers(self, steps: int) -> Any:
+    def _compute_powers(self, steps: int) -> Tensor:
         """Compute the factors of 0 to steps - 1 steps on each number, shape (steps, n)."""
         once = torch.complex(-torch.exp(self.fade), self.turn)
         return torch.exp(torch.arange(steps)[:, None] * once)
 
-    def _project_inputs(self, z: Any) -> Any:
+    def _project_inputs(self, z: Tensor) -> Tensor:
         """Project inputs to (B, T, n), so that white ones give states of one size."""
         unit = torch.sqrt(1.0 - torch.exp(-2.0 * torch.exp(self.fade)))
         return torch.view_as_complex(self.read(z).unflatten(-1, (self.size, 2))) * unit
 
-    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+    def _update_memory(
+        self, z: Tensor, arrived: Tensor, state: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
         steps = z.shape[1]
         powers, ages = self._compute_powers(steps + 1), torch.arange(steps)
         past = ages[:, None] - ages
@@ -155,18 +243,13 @@ class _LinearRnn(_MemoryNetwork):
         return torch.view_as_real(known).flatten(2), known[:, -1]
 
 
-class Kalman(_LinearRnn):
+class _Kalman(_LinearRnn):
     """A learned observer of a linear car, for packets that come late.
 
     Its state is `delay_steps` old and its numbers rotate and decay as the car's modes. At a
     packet's arrival x+ = x + L (y - C x), with y a mix of the inputs; L grows with the time since
     the last packet, as a filter's gain does. The present follows from the inputs since then: equal
     to rewinding and filtering again where gains are constant. The action is linear in it.
-
-    Args:
-        inputs: Number of entries of an observation.
-        fresh_index: Entry that says whether a packet arrived.
-        delay_steps: Control periods between a packet's capture and its arrival.
     """
 
     size, outputs = 16, 4
@@ -183,7 +266,9 @@ class Kalman(_LinearRnn):
         self.gains = nn.Parameter(0.1 * torch.randn(2, self.outputs, width))
         return width
 
-    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+    def _update_memory(
+        self, z: Tensor, arrived: Tensor, state: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
         n, delay_steps, steps = self.size, self.delay_steps, z.shape[1]
         if state is None:
             state = z.new_zeros(len(z), 2 + delay_steps, n, dtype=torch.complex64)
@@ -219,12 +304,14 @@ class _Transformer(_MemoryNetwork):
         self.embed = nn.Linear(self.inputs, width)
         self.attention_inputs = nn.ModuleList(nn.Linear(width, 3 * width) for _ in layers)
         self.attention_outputs = nn.ModuleList(nn.Linear(width, width) for _ in layers)
-        self.feedforward = nn.ModuleList(_make_dense_layers(width, 64, width) for _ in layers)
+        self.feedforward = nn.ModuleList(make_dense_layers(width, 64, width) for _ in layers)
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(2 * self.layers))
         self.bias = nn.Parameter(torch.zeros(self.layers, self.heads, self.window))
         return width
 
-    def _update_memory(self, z: Any, arrived: Any, state: Any) -> tuple[Any, Any]:
+    def _update_memory(
+        self, z: Tensor, arrived: Tensor, state: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
         batch, steps, _ = z.shape
         before, width = self.window - 1, self.width
         if state is None:
@@ -252,43 +339,13 @@ MEMORIES: dict[str, type[_MemoryNetwork]] = {
     "frames": _FrameStack,
     "gru": _Gru,
     "linear-rnn": _LinearRnn,
-    "kalman": Kalman,
+    "kalman": _Kalman,
     "transformer": _Transformer,
 }
 
 
-def make_memory(name: str, inputs: int, fresh_index: int, delay_steps: int) -> _MemoryNetwork:
-    """Make a new network of `MEMORIES`.
-
-    Args:
-        name: Key of `MEMORIES`.
-        inputs: Number of entries of an observation.
-        fresh_index: Entry that says whether a packet arrived.
-        delay_steps: Control periods between a packet's capture and its arrival.
-
-    Returns:
-        Network with random weights.
-
-    Raises:
-        ValueError: The name is unknown, or a number is out of range.
-    """
-    check_choice("memory", name, MEMORIES)
-    if not 0 <= fresh_index < inputs or delay_steps < 0:
-        raise ValueError(
-            f"fresh is one of {inputs} inputs and late at least 0, got fresh {fresh_index}, "
-            f"late {delay_steps}"
-        )
-    return MEMORIES[name](inputs, fresh_index, delay_steps)
-
-
-class MemoryAgent:
-    """A memory as an agent on plain observations.
-
-    Args:
-        model: Network with memory.
-        mean: Means of the observation, shape (k,).
-        scale: Factors of the observation, shape (k,).
-    """
+class _MemoryAgent:
+    """A memory as an agent on plain observations."""
 
     def __init__(self, model: _MemoryNetwork, mean: Array, scale: Array) -> None:
         self.model, self.mean, self.scale = model, mean, scale
@@ -296,21 +353,11 @@ class MemoryAgent:
     def predict(
         self,
         observation: Single,
-        state: Any = None,
-        episode_start: Any = None,
+        state: Tensor | None = None,
+        episode_start: npt.NDArray[np.bool_] | None = None,
         deterministic: bool = True,
-    ) -> tuple[Single, Any]:
-        """Compute actions and the next state, with the signature of stable-baselines3.
-
-        Args:
-            observation: Observations, shape (N, k).
-            state: State from the last call; None at the start.
-            episode_start: Rows whose state is cleared, shape (N,).
-            deterministic: Without effect.
-
-        Returns:
-            Actions within [-1, 1], shape (N, 1), and the next state.
-        """
+    ) -> tuple[Single, Tensor | None]:
+        """Compute actions and the next state, with the signature of stable-baselines3."""
         z = torch.from_numpy(normalise_inputs(observation, self.mean, self.scale))[:, None]
         if state is not None and episode_start is not None and np.any(episode_start):
             state = state.clone()
@@ -327,7 +374,7 @@ def train_memory(
     delay_steps: int,
     weight: float = 1.0,
     report: Callable[[RoundResult], None] = lambda _: None,
-) -> MemoryAgent:
+) -> _MemoryAgent:
     """Train a memory to act as a task's teacher, by DAgger.
 
     Args:
@@ -344,33 +391,18 @@ def train_memory(
     Raises:
         ValueError: The observation does not say whether a packet arrived, or the name is unknown.
     """
-    cars = task.cars
-    names = [entry.name for entry in cars.layout]
+    names = [entry.name for entry in task.cars.layout]
     fresh_columns = [i for i, label in enumerate(names) if label.endswith("_fresh")]
     count = len(fresh_columns)
     if count != 1:
         raise ValueError(f"a memory knows one sensor with packets, got {count} in {names}")
     torch.set_num_threads(1)
     torch.manual_seed(config.seed)
-    model = make_memory(name, len(names), fresh_columns[0], delay_steps)
-    seeds = itertools.count(DISTILL_SEEDS + config.seed * SEEDS_PER_TRAINING, cars.num_envs)
-    drives: list[Demonstrations] = []
-    agent, steps = None, 0
-    scaling: Scaling | None = None
-    for i in range(config.rounds):
-        first = next(seeds)
-        row_seeds = range(first, first + cars.num_envs)
-        demo = collect_demonstrations(task, agent, row_seeds, config.noise)
-        drives.append(demo._replace(curvature=np.full((1, 1), weight, np.float32)))
-        steps += int((demo.weights > 0.0).sum())
-        if scaling is None:
-            needs = task.teacher.needs
-            mean, scale, _ = compute_scaling(drives, cars.layout, needs, usual_ages=False)
-            scaling = Scaling(mean, scale, np.eye(len(mean)))  # memories mix by themselves
-            model.fit_whitening(drives, mean, scale)
-        epochs = config.epochs * (LAST_ROUND_FACTOR if i == config.rounds - 1 else 1)
-        loss = fit_model(model, drives, scaling, config, epochs)
-        agent = MemoryAgent(model, scaling.mean, scaling.scale)
-        report(RoundResult(steps, float(demo.costs.mean()), loss))
-    assert agent is not None
-    return agent
+    check_choice("memory", name, MEMORIES)
+    model = MEMORIES[name](len(names), fresh_columns[0], delay_steps)
+
+    def make_agent(scaling: Scaling, result: RoundResult) -> _MemoryAgent:
+        report(result)
+        return _MemoryAgent(model, scaling.mean, scaling.scale)
+
+    return imitate(model, [task], config, make_agent, weight)

@@ -1,14 +1,13 @@
-"""The student of a distillation: demonstrations, scaled inputs, network, a round of learning.
+"""The student of a distillation: demonstrations, scaled inputs, moving averages, the network.
 
-The loss is what an action's error adds to the cost of the rest of the drive, by the Riccati
-matrix of the teacher's design, over the cost of the episode: the score's logarithm, linearised.
+`_TraceLayer` is the runtime's `MovingAverages` for training, by whole episodes.
 """
 
+import functools
 import itertools
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +15,8 @@ import numpy.typing as npt
 from ...envs.numerics import require_extra
 from ...envs.record import Array
 from ...envs.task import ObservationEntry
-from ...estimators.learned.forward import MemoryLayer, RecurrentCell
+from ...estimators.learned.forward import MemoryLayer, MovingAverages, RecurrentCell
 from ...estimators.learned.network import Network
-from .networks import TraceLayer, compute_scale, compute_whitening
 
 with require_extra("train", "distillation needs torch"):
     import torch
@@ -27,24 +25,45 @@ with require_extra("train", "distillation needs torch"):
 Single = npt.NDArray[np.float32]
 
 _CLIP = 8.0  # limit of a normalised input (standard deviations)
-UNREAD = ("gps_X", "gps_Y", "gps_satellites")
+_UNREAD = ("gps_X", "gps_Y", "gps_satellites")
 """Entries without information for control, as they only locate the car."""
 _MIN_VARIANCE = 1e-3  # least variance of a mixture of normalised inputs, for `compute_whitening`
+_MIN_TRACE_VARIANCE = 1e-4  # likewise, of a mixture of inputs and their averages
 _EARLY, _MEDIAN = 16.0, 50.0  # percentiles of an age, one deviation apart where it is normal
-_WINDOW = 50  # steps through which the gradient goes back in time
-_SAMPLES = 512  # steps of a batch of a student without memory
-LAST_ROUND_FACTOR = 3  # times as many epochs in the last round
+_TIMES = (3, 10, 30, 100, 300)
+"""Times of the means in steps; of 10 ms each: from the motors' lag to half a drive."""
+SAMPLE_STRIDE = 7  # every so many steps one is a sample for a whitening
+_BLOCK = 50  # steps whose means are one product of matrices
+_MIN_SHARE = 1e-300  # of the earlier means, in place of 0 at the first step, for the logarithm
 
 
-class _Batch(NamedTuple):
-    """B episodes, or a window of T steps of them, as tensors; fields as in `Demonstrations`."""
+def compute_scale(spread: Array, minimum: float = 1e-9) -> Array:
+    """Compute the inverse of each standard deviation, zero where nothing varies.
 
-    inputs: Any  # (B, T, k), mixed by `Scaling`
-    labels: Any  # (B, T, m)
-    privileged: Any  # (B, T, q)
-    weights: Any  # (B, T)
-    curvatures: Any  # (B, m, m)
-    begins: bool  # whether the episodes begin with it
+    Args:
+        spread: Standard deviations, shape (k,).
+        minimum: Deviation below which an input counts as constant.
+
+    Returns:
+        Factors, shape (k,).
+    """
+    return np.where(spread > minimum, 1.0 / np.maximum(spread, minimum), 0.0)
+
+
+def compute_whitening(z: npt.NDArray[np.floating], minimum: float) -> Array:
+    """Compute the symmetric matrix that makes the samples' covariance the identity.
+
+    This is ZCA whitening (Bell and Sejnowski 1997), of eigenvalues that are not below a minimum.
+
+    Args:
+        z: Samples, shape (n, k).
+        minimum: Minimum of the covariance's eigenvalues.
+
+    Returns:
+        Matrix, shape (k, k).
+    """
+    sizes, axes = np.linalg.eigh(np.cov(z, rowvar=False))
+    return np.asarray(axes / np.sqrt(np.maximum(sizes, minimum)) @ axes.T)
 
 
 class Demonstrations(NamedTuple):
@@ -58,16 +77,15 @@ class Demonstrations(NamedTuple):
     costs: Array  # costs J, shape (N,)
 
     @property
-    def zero_loss(self) -> float:
-        """Loss of a student whose actions are zero, summed over episodes."""
-        losses = np.einsum("nti,ij,ntj->nt", self.labels, self.curvature, self.labels)
-        return float((losses * self.weights).sum())
+    def is_valid(self) -> npt.NDArray[np.bool_]:
+        """Whether a step counts, shape (N, T)."""
+        return self.weights > 0.0
 
 
 class Scaling(NamedTuple):
     """The scaling of a student's inputs: clip((x - mean) scale) mixing.
 
-    `normalise.Standardised` is that of reinforcement learning.
+    `Standardised` is that of reinforcement learning.
     """
 
     mean: Array  # shape (k,)
@@ -96,7 +114,7 @@ def compute_scaling(
     """Compute the scaling of a student's inputs from drives.
 
     A student that has all of `needs` reads nothing else, which would only be noise to it. One that
-    has less reads all that varies, but for `UNREAD`.
+    has less reads all that varies, but for `_UNREAD`.
 
     Args:
         drives: Demonstrations.
@@ -107,9 +125,9 @@ def compute_scaling(
     Returns:
         Mean and factor, shape (k,), and mixing, shape (k, k).
     """
-    x = np.concatenate([demo.obs[demo.weights > 0.0] for demo in drives])
+    x = np.concatenate([demo.obs[demo.is_valid] for demo in drives])
     names = [entry.name for entry in layout]
-    is_read = np.isin(names, needs) if set(needs) <= set(names) else ~np.isin(names, UNREAD)
+    is_read = np.isin(names, needs) if set(needs) <= set(names) else ~np.isin(names, _UNREAD)
     mean, spread = x.mean(0, np.float64), x.std(0, dtype=np.float64)
     for i, name in enumerate(names):
         if usual_ages and name.endswith("_age"):
@@ -146,7 +164,7 @@ class DistillConfig:
     """
 
     rounds: int = 7  # of driving and learning; in the first one the teacher drives
-    epochs: int = 12  # over all drives in a round; in the last one times `LAST_ROUND_FACTOR`
+    epochs: int = 12  # over all drives in a round; in the last one three times as many
     cells: int = 0  # of a GRU, 0 for none
     hidden: tuple[int, ...] = (64, 64)  # sizes of the dense layers
     learning_rate: float = 3e-3  # of Adam, which falls to a fiftieth in each round
@@ -168,15 +186,121 @@ class DistillConfig:
         if self.told and not (self.cells or self.traces):
             raise ValueError("a student without memory has nothing to say: told is for those with")
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, object]:
         """Collect all numbers but the seed, in JSON types."""
         numbers = asdict(self) | {"hidden": list(self.hidden)}
         return {name: value for name, value in numbers.items() if name != "seed"}
 
+
+class _TraceLayer(nn.Module):
+    """The inputs and SiLU units, with the moving averages of all over some times (steps).
+
+    The inputs and their averages are whitened: `mean` is subtracted, and `mixing` multiplies. A
+    small difference of two of them often has most information: it says how a sensor changes.
+    """
+
+    mean: torch.Tensor
+    mixing: torch.Tensor
+
+    def __init__(self, inputs: int, n_silu: int, times: Sequence[float] = _TIMES) -> None:
+        super().__init__()
+        self.inputs, self.times = inputs, tuple(times)
+        self.unit = nn.Linear(inputs, n_silu)
+        n_linear = inputs * (1 + len(self.times))
+        self.register_buffer("mean", torch.zeros(n_linear))
+        self.register_buffer("mixing", torch.eye(n_linear))
+
     @property
-    def window(self) -> int:
-        """Steps of truncated back-propagation; with traces all of them."""
-        return sys.maxsize if self.traces else _WINDOW
+    def size(self) -> int:
+        """Size of the output: inputs and their averages, then SiLU units and theirs."""
+        return (self.inputs + self.unit.out_features) * (1 + len(self.times))
+
+    def forward(
+        self, z: torch.Tensor, state: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compute units and averages (B, T, size) of inputs (B, T, k), and the next state.
+
+        Episodes begin together. The state holds averages and the number of steps, shape (B, times,
+        units + 1).
+        """
+        u = torch.cat([z, nn.functional.silu(self.unit(z))], -1)
+        if state is None:
+            state = u.new_zeros(len(u), len(self.times), u.shape[-1] + 1)
+        first, means, blocks = int(state[0, 0, -1]), state[..., :-1], []
+        for part in torch.split(u, _BLOCK, 1):
+            new, old = _compute_weights(self.times, first, part.shape[1])
+            values = torch.einsum("nts,bsk->bntk", new, part) + old[..., None] * means[:, :, None]
+            blocks.append(values)
+            first, means = first + part.shape[1], values[:, :, -1]
+        all_values = torch.cat([u[:, None], torch.cat(blocks, 2)], 1).transpose(1, 2)
+        linear, silu = (values.flatten(2) for values in all_values.tensor_split([self.inputs], -1))
+        age = means.new_full((*means.shape[:-1], 1), float(first))
+        mixed = (linear - self.mean) @ self.mixing
+        return torch.cat([mixed, silu], -1), torch.cat([means, age], -1)
+
+    def fit_whitening(self, drives: Sequence[Demonstrations], scaling: Scaling) -> None:
+        """Fit the whitening of inputs and their averages on drives."""
+        outputs, size = [], len(self.mean)
+        with torch.no_grad():
+            for demo in drives:
+                linear_part = self(torch.from_numpy(scaling.mix_inputs(demo.obs)))[0][..., :size]
+                outputs.append(linear_part[torch.from_numpy(demo.is_valid)][::SAMPLE_STRIDE])
+        linear = torch.cat(outputs).numpy()
+        self.mean.copy_(torch.from_numpy(linear.mean(0)))
+        self.mixing.copy_(torch.from_numpy(compute_whitening(linear, _MIN_TRACE_VARIANCE)))
+
+    def cell(self, mixing: Array) -> MovingAverages:
+        """Make the runtime's layer for inputs that `Scaling.mixing` mixes first, shape (k, k)."""
+        silu_weights = self.unit.weight.detach().numpy() @ mixing
+        bias = np.concatenate([np.zeros(self.inputs), self.unit.bias.detach().numpy()])
+        weights = np.concatenate([mixing, silu_weights])
+        return MovingAverages(weights, bias, self.unit.out_features, self.times)
+
+    def convert_weights(self, weight: Array, bias: Array) -> tuple[Array, Array]:
+        """Convert the next layer's weights (m, size) and biases (m,) for the output of `cell`.
+
+        That output is in the order of times, inputs before SiLU units, without whitening.
+        """
+        size, times = len(self.mean), 1 + len(self.times)
+        linear = weight[:, :size] @ self.mixing.numpy().astype(np.float64).T
+        bias = bias - linear @ self.mean.numpy()
+        parts = [block.reshape(len(bias), times, -1) for block in (linear, weight[:, size:])]
+        return np.concatenate(parts, -1).reshape(len(bias), -1), bias
+
+
+@functools.cache
+def _compute_weights(
+    times: tuple[float, ...], first: int, steps: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Compute the weights of a block's steps (times, T, T) and of earlier averages (times, T).
+
+    They solve the recursion m_t = m_(t-1) + a_t (u_t - m_(t-1)) of `MovingAverages`, with the share
+    a_t = max(1 / steps so far, 1 - exp(-1 / time)): u_s has the weight a_s prod (1 - a_r) over
+    r = s + 1, ..., t.
+    """
+    ages = first + 1.0 + np.arange(steps)
+    shares = np.maximum(1.0 / ages, -np.expm1(-1.0 / np.array(times))[:, None])
+    left = np.log(np.maximum(1.0 - shares, _MIN_SHARE)).cumsum(-1)
+    since = left[:, :, None] - left[:, None, :]  # `left`: log of what is left of earlier averages
+    new = np.tril(np.exp(np.minimum(since, 0.0))) * shares[:, None, :]
+    new, old = new.astype(np.float32), np.exp(left).astype(np.float32)
+    return torch.from_numpy(new), torch.from_numpy(old)
+
+
+def make_dense_layers(*sizes: int, activation: type[nn.Module] = nn.SiLU) -> nn.Sequential:
+    """Make dense layers with an activation between them.
+
+    Args:
+        sizes: Sizes of the inputs and of each layer.
+        activation: Class of the activations.
+
+    Returns:
+        Layers, the last of which is linear.
+    """
+    layers: list[nn.Module] = []
+    for a, b in itertools.pairwise(sizes):
+        layers += [nn.Linear(a, b), activation()]
+    return nn.Sequential(*layers[:-1])
 
 
 class Student(nn.Module):
@@ -194,7 +318,7 @@ class Student(nn.Module):
     ) -> None:
         super().__init__()
         self.cell = nn.GRU(inputs, config.cells, batch_first=True) if config.cells else None
-        self.traces = TraceLayer(inputs, config.traces) if config.traces else None
+        self.traces = _TraceLayer(inputs, config.traces) if config.traces else None
         memory_size = self.traces.size if self.traces else config.cells
         sizes = [memory_size or inputs, *config.hidden, width]
         self.dense = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
@@ -202,7 +326,9 @@ class Student(nn.Module):
         self.auxiliary_head = nn.Linear(head_inputs, n_privileged) if config.told else None
         self.recurrent = bool(memory_size)
 
-    def forward(self, z: Any, state: Any = None) -> tuple[Any, Any]:
+    def forward(
+        self, z: torch.Tensor, state: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Compute actions and auxiliary outputs (B, T, m + q), and the next state.
 
         Args:
@@ -223,16 +349,26 @@ class Student(nn.Module):
             auxiliary.append(self.auxiliary_head(memory_output if self.cell else z))
         return torch.cat([self.dense[-1](z), *auxiliary], dim=-1), state
 
-    def fit_whitening(self, drives: Sequence[Demonstrations], scaling: Scaling) -> None:
-        """Fit the whitening of the moving averages' linear part on drives.
+    def fit_scaling(
+        self,
+        drives: Sequence[Demonstrations],
+        layout: Sequence[ObservationEntry],
+        needs: Sequence[str],
+    ) -> Scaling:
+        """Fit the scaling of the inputs, and the whitening of the moving averages, on drives.
 
         Args:
             drives: Demonstrations.
-            scaling: Scaling of the inputs.
+            layout: Entries of the observation.
+            needs: Entries that the teacher reads.
+
+        Returns:
+            Scaling of the inputs.
         """
+        scaling = compute_scaling(drives, layout, needs)
         if self.traces is not None:
-            samples = [(scaling.mix_inputs(demo.obs), demo.weights > 0.0) for demo in drives]
-            self.traces.fit_whitening(samples)
+            self.traces.fit_whitening(drives, scaling)
+        return scaling
 
     def network(self, scaling: Scaling) -> Network:
         """Convert the student to a network of plain observations without auxiliary outputs.
@@ -243,131 +379,20 @@ class Student(nn.Module):
         Returns:
             Network of the actions, by NumPy.
         """
-        numbers = {name: value.detach().numpy().copy() for name, value in self.named_parameters()}
-        names = ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
-        first = "cell.weight_ih_l0" if self.cell else "dense.0.weight"
+        numbers = [_to_array(parameter) for parameter in self.dense.parameters()]
+        weights, biases = numbers[::2], numbers[1::2]
         cells: list[MemoryLayer] = []
         if self.traces:
             cells.append(self.traces.cell(scaling.mixing))
-            layer = [numbers[f"dense.0.{part}"] for part in ("weight", "bias")]
-            numbers["dense.0.weight"], numbers["dense.0.bias"] = self.traces.convert_weights(*layer)
+            weights[0], biases[0] = self.traces.convert_weights(weights[0], biases[0])
+        elif self.cell:  # weights of the inputs and of the state, then both biases
+            weight_in, *rest = map(_to_array, self.cell.parameters())
+            cells.append(RecurrentCell("gru", weight_in @ scaling.mixing, *rest))
         else:
-            numbers[first] = numbers[first] @ scaling.mixing
-        if self.cell:
-            cells.append(RecurrentCell("gru", *(numbers[f"cell.{name}"] for name in names)))
-        weights = [numbers[f"dense.{i}.weight"] for i in range(len(self.dense))]
-        biases = [numbers[f"dense.{i}.bias"] for i in range(len(self.dense))]
+            weights[0] = weights[0] @ scaling.mixing
         mean, scale, _ = scaling
         return Network(mean, scale, weights, biases, "silu", clip=_CLIP, cells=cells)
 
 
-def _concatenate(parts: Sequence[Single]) -> Any:
-    return torch.from_numpy(np.concatenate(parts))
-
-
-class _EpisodeBatches:
-    """Batches of episodes, cut into windows through which the state is carried."""
-
-    def __init__(
-        self, drives: Sequence[Demonstrations], scaling: Scaling, config: DistillConfig
-    ) -> None:
-        self.drives, self.scaling = drives, scaling
-        self.batch, self.window = config.batch, config.window
-        self.episodes = [(i, j) for i, demo in enumerate(drives) for j in range(len(demo.costs))]
-        longest = max(demo.weights.shape[1] for demo in drives)
-        self.n_batches = -(-len(self.episodes) // self.batch) * -(-longest // self.window)
-
-    def __iter__(self) -> Iterator[_Batch]:
-        names = ("obs", "labels", "privileged", "weights")
-        for chosen in torch.split(torch.randperm(len(self.episodes)), self.batch):
-            rows = [self.episodes[int(i)] for i in chosen]
-            longest = max(self.drives[i].weights.shape[1] for i, _ in rows)
-            shapes = [getattr(self.drives[0], name).shape[2:] for name in names]
-            arrays = [np.zeros((len(rows), longest, *shape), np.float32) for shape in shapes]
-            for row, (i, j) in enumerate(rows):
-                length = self.drives[i].weights.shape[1]
-                for array, name in zip(arrays, names, strict=True):
-                    array[row, :length] = getattr(self.drives[i], name)[j]
-            S = torch.from_numpy(np.stack([self.drives[i].curvature for i, _ in rows]))
-            arrays[0] = self.scaling.mix_inputs(arrays[0])
-            for start in range(0, longest, self.window):
-                z, y, q, w = (torch.from_numpy(a[:, start : start + self.window]) for a in arrays)
-                yield _Batch(z, y, q, w, S, start == 0)
-
-
-class _StepBatches:
-    """Batches of `_SAMPLES` single steps of all drives, each like an episode."""
-
-    def __init__(
-        self, drives: Sequence[Demonstrations], scaling: Scaling, _: DistillConfig
-    ) -> None:
-        valid = [demo.weights > 0.0 for demo in drives]
-        indices = [torch.full((int(mask.sum()),), i) for i, mask in enumerate(valid)]
-        self.demo_index = torch.cat(indices)
-        self.curvatures = torch.from_numpy(np.stack([demo.curvature for demo in drives]))
-        pairs = list(zip(drives, valid, strict=True))
-        self.x = _concatenate([scaling.mix_inputs(demo.obs[mask]) for demo, mask in pairs])
-        self.y = _concatenate([demo.labels[mask] for demo, mask in pairs])
-        self.q = _concatenate([demo.privileged[mask] for demo, mask in pairs])
-        self.w = _concatenate([demo.weights[mask] for demo, mask in pairs])
-        self.n_batches = -(-len(self.w) // _SAMPLES)
-
-    def __iter__(self) -> Iterator[_Batch]:
-        for i in torch.split(torch.randperm(len(self.w)), _SAMPLES):
-            S = self.curvatures[self.demo_index[i]]
-            z, y, q, w = (array[i, None] for array in (self.x, self.y, self.q, self.w))
-            yield _Batch(z, y, q, w, S, True)
-
-
-def fit_model(
-    model: nn.Module,
-    drives: Sequence[Demonstrations],
-    scaling: Scaling,
-    config: DistillConfig,
-    epochs: int,
-) -> float:
-    """Fit a model to drives.
-
-    Args:
-        model: Network with the outputs of a `Student`; `recurrent` says whether it has memory.
-        drives: Demonstrations.
-        scaling: Scaling of the inputs.
-        config: Configuration of the training.
-        epochs: Passes over all drives.
-
-    Returns:
-        What errors of the actions add to an episode's cost, as a fraction of it: the mean over the
-        episodes in the last epoch, without the auxiliary loss.
-
-    Raises:
-        FloatingPointError: The loss is not finite.
-    """
-    optimiser = torch.optim.Adam(model.parameters(), config.learning_rate)
-    batches = (_EpisodeBatches if model.recurrent else _StepBatches)(drives, scaling, config)
-    schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.02, epochs * batches.n_batches)
-    count = sum(len(demo.costs) for demo in drives)
-    length = sum(int((demo.weights > 0.0).sum()) for demo in drives) / count  # steps, on average
-    zero_loss = sum(demo.zero_loss for demo in drives) / count
-    step, total, state = 0, 0.0, None
-    for _ in range(epochs):
-        total = 0.0
-        for z, y, q, w, S, begins in batches:
-            out, state = model(z, None if begins else state)
-            state = None if state is None else state.detach()
-            valid = w > 0.0
-            error = out[..., : y.shape[-1]] - y
-            added_cost = torch.einsum("bti,bij,btj->bt", error, S, error) * w
-            loss = length * added_cost.sum() / valid.sum().clamp(min=1)  # by episode
-            if config.told:
-                auxiliary_error = (out[..., y.shape[-1] :] - q)[valid].square().mean(-1).sum()
-                loss = loss / zero_loss + config.told * auxiliary_error / valid.sum().clamp(min=1)
-            optimiser.zero_grad()
-            loss.backward()
-            norm = nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-            if not torch.isfinite(loss + norm):
-                raise FloatingPointError(f"the loss is {loss.item()} at step {step}")
-            optimiser.step()
-            schedule.step()
-            step += 1
-            total += float(added_cost.detach().sum())
-    return total / count
+def _to_array(parameter: torch.Tensor) -> Array:
+    return parameter.detach().numpy().copy()

@@ -21,13 +21,14 @@ from .callbacks import (
     CURVE,
     POLICY,
     WARM_START_FILE,
+    Checkpoint,
     EvalCallback,
     Evaluation,
     Progress,
     RunOptions,
     RunRecord,
+    read_state,
 )
-from .checkpoint import read_state
 from .config import TrainingTask
 from .export import check_zip
 
@@ -102,7 +103,8 @@ def train(
         raise ModuleNotFoundError("a log for TensorBoard needs it: pip install tensorboard")
     tracker = None
     if chosen_options.track:
-        tracker = _WandbCallback(chosen_options.track, Path(folder).name, asdict(task))
+        project, name = chosen_options.track, Path(folder).name
+        tracker = _WandbCallback(project=project, name=name, config=asdict(task))
     torch.set_num_threads(1)  # on small matrices threads only wait for each other
     folder_path = Path(folder)
     checkpoint = _prepare_folder(task, folder_path, resume)
@@ -110,7 +112,7 @@ def train(
     zip_path = None if isinstance(trained_agent, Policy) else trained_agent
     callback = EvalCallback(task, folder_path, checkpoint, chosen_options, steps, initial_policy)
     callbacks: list[BaseCallback] = [callback] if tracker is None else [tracker, callback]
-    model = callback.build(checkpoint, zip_path, trust)
+    model = callback.build(zip_path, trust)
     done = model.num_timesteps
     if done < steps:
         log = dict[str, Any](reset_num_timesteps=done == 0, tb_log_name=task.algo)
@@ -171,41 +173,34 @@ def read_run_record(folder: str | Path) -> RunRecord:
     return from_json(RunRecord, read_state(path)["aim"], f"{path}: the aim")
 
 
-class _WandbCallback(BaseCallback):
+class _WandbCallback(BaseCallback, KVWriter):
     """Write the log of stable-baselines3 to a run of Weights & Biases."""
 
-    def __init__(self, project: str, name: str, config: dict[str, Any]) -> None:
+    def __init__(self, **run_arguments: object) -> None:
         super().__init__()
         try:
-            wandb: Any = import_module("wandb")
+            self._wandb: Any = import_module("wandb")
         except ImportError:
             raise ModuleNotFoundError("tracking needs wandb: pip install wandb") from None
-        self._wandb = wandb
-        self._run_arguments = {"project": project, "name": name, "config": config}
+        self._run_arguments = run_arguments
         self._run: Any = None
 
     def _on_training_start(self) -> None:
         self._run = self._wandb.init(**self._run_arguments)
-        self.logger.output_formats.append(_WandbWriter(self._run))
+        self.logger.output_formats.append(self)
 
     def _on_step(self) -> bool:
         return True
 
-    def finish(self) -> None:
-        """End the run, if there is one; the last evaluation comes after the training's end."""
-        if self._run is not None:
-            self._run.finish()
-
-
-class _WandbWriter(KVWriter):
-    def __init__(self, run: Any) -> None:
-        self._run = run
-
-    def write(self, key_values: dict[str, Any], key_excluded: Any, step: int = 0) -> None:
+    def write(self, key_values: dict[str, object], key_excluded: object, step: int = 0) -> None:
         self._run.log(dict(key_values), step=step)  # the logger empties its own
 
     def close(self) -> None:
-        """Do nothing: the run ends with the training."""
+        """Do nothing: the last evaluation comes after the training's end."""
+
+    def finish(self) -> None:
+        if self._run is not None:
+            self._run.finish()
 
 
 def read_task(folder: str | Path, **arguments: Any) -> TrainingTask:
@@ -250,7 +245,7 @@ def read_task(folder: str | Path, **arguments: Any) -> TrainingTask:
     return task
 
 
-def _prepare_folder(task: TrainingTask, folder: Path, resume: bool) -> dict[str, Any] | None:
+def _prepare_folder(task: TrainingTask, folder: Path, resume: bool) -> Checkpoint | None:
     """Return the checkpoint's state, or prepare the folder of a new training and return None."""
     if resume:
         read_task(folder, **asdict(task))

@@ -1,29 +1,29 @@
-"""Start of a training from a zip of stable-baselines3 or a policy, and the scale of its rewards.
+"""Start of a training from a zip of stable-baselines3 or a policy.
 
-The score compares logarithms of costs, and d log J = dJ / J. So the scenarios of a mixture are
-weighted by 1 over the uncontrolled car's cost. Where a training starts from a policy, each drive is
-weighted by 1 over that policy's cost in the same drive.
+A policy's moving averages become part of the environments, for algorithms without memory.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import VectorWrapper
+from gymnasium.vector.utils import batch_space
 
 from ...envs.numerics import require_extra
 from ...envs.record import Array
-from ...envs.task import ObservationEntry
+from ...envs.task import ObservationEntry, make_space
 from ...estimators.learned.forward import CELL_WEIGHTS, MovingAverages
 from ...estimators.learned.network import Network
-from ..env_info import get_layout
+from ..env_info import CarVectorEnv, get_layout
 from ..learned.policy import Policy
-from ..rollout import COST_FLOOR, evaluate_episodes
-from ..vec_env import Observations, make_native_env
+from ..rollout import iterate_steps
+from ..vec_env import Observations
 from .config import (
     WARM_START_ENTRY,
     WARM_START_TRACES_ENTRY,
@@ -32,22 +32,22 @@ from .config import (
     get_algorithm,
     read_settings,
 )
-from .export import check_zip, find_normaliser, load_normaliser, read_normalisation
-from .networks import MemoryObservation, measure_mixing
-from .normalise import StandardisedArguments
+from .export import check_zip, load_normaliser
+from .normalise import StandardisedArguments, read_normalisation
+from .student import SAMPLE_STRIDE, compute_whitening
 
 with require_extra("train", "training needs {}"):
-    from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+    import torch
+    from stable_baselines3.common.save_util import load_from_zip_file
 
-import torch  # isort: skip  # after ours, which say which extra is missing
-from stable_baselines3.common.save_util import load_from_zip_file  # isort: skip
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
 
-_WEIGHT_DRIVES = 32  # uncontrolled drives by which a scenario is weighed
-_MIN_COST_SHARE = 0.05  # of the scenarios' mean cost: a cheaper one counts as this in its weight
 _GRU = [f"cell.{part}_l0" for part in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
+_MIN_VARIANCE = 1e-4  # least variance of a mixture of memory features, for `compute_whitening`
 
 
-class WarmStart(NamedTuple):
+class _WarmStart(NamedTuple):
     """The tensors of a zip or policy for a new model."""
 
     name: str  # path of the zip or name of the policy
@@ -57,7 +57,7 @@ class WarmStart(NamedTuple):
     partial: bool = False  # whether the rest of the model stays unchanged
 
 
-def read_warm_start(path: str | Path, width: int, trust: bool = False) -> WarmStart:
+def read_warm_start(path: str | Path, width: int, trust: bool = False) -> _WarmStart:
     """Read the tensors of a zip without running code from it.
 
     Args:
@@ -87,16 +87,10 @@ def read_warm_start(path: str | Path, width: int, trust: bool = False) -> WarmSt
         mixing = buffers["mixing"].tolist() if "mixing" in buffers else None
         mean_scale = buffers["mean"].tolist(), buffers["scale"].tolist()
         inner_scaling = (*mean_scale, bound if bound < math.inf else None, mixing)
-        return WarmStart(str(file), parameters, variables or {}, inner_scaling)
-    normaliser_file = find_normaliser(file)
-    if normaliser_file is not None and not trust:
-        raise PermissionError(
-            f"{normaliser_file} is a pickle, which may run code: say --trust to read it"
-        )
-    normaliser = load_normaliser(normaliser_file) if normaliser_file else None
-    mean, scale, clip = read_normalisation(normaliser, width, 1)
+        return _WarmStart(str(file), parameters, variables or {}, inner_scaling)
+    mean, scale, clip = read_normalisation(load_normaliser(file, trust), width, 1)
     scaling = mean.tolist(), scale.tolist(), clip, None
-    return WarmStart(str(file), parameters, variables or {}, scaling)
+    return _WarmStart(str(file), parameters, variables or {}, scaling)
 
 
 def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
@@ -125,7 +119,7 @@ def make_finetune_task(policy: Policy, **fields: Any) -> TrainingTask:
     return TrainingTask(**task_fields | fields)
 
 
-def resolve_settings(file: str | Path | None, algo: str, env_id: str, start: Any) -> Settings:
+def resolve_settings(file: str | Path | None, algo: str, env_id: str, start: object) -> Settings:
     """Resolve the settings of an environment, or of training a policy further.
 
     Args:
@@ -173,7 +167,7 @@ def _get_policy_form(policy: Policy, algo: str) -> dict[str, Any]:
 
 def _make_warm_start(
     policy: Policy, task: TrainingTask, layout: Sequence[ObservationEntry]
-) -> WarmStart:
+) -> _WarmStart:
     """Make the warm start of a task's actor from a policy; a critic stays unchanged."""
     network, policy_entries = policy.network, [name for name, _ in policy.card.observation]
     names = [entry.name for entry in layout]
@@ -198,10 +192,10 @@ def _make_warm_start(
     tensors = {name: torch.tensor(x, dtype=torch.float32) for name, x in arrays.items()}
     read = network if on_tensors else network.dense
     scaling = read.mean.tolist(), read.scale.tolist(), read.clip, None
-    return WarmStart(policy.name, {"policy": tensors}, {}, scaling, partial=True)
+    return _WarmStart(policy.name, {"policy": tensors}, {}, scaling, partial=True)
 
 
-def load_warm_start(start: WarmStart, model: Any) -> None:
+def load_warm_start(start: _WarmStart, model: "BaseAlgorithm") -> None:
     """Load a warm start into a model.
 
     Args:
@@ -227,34 +221,20 @@ def load_warm_start(start: WarmStart, model: Any) -> None:
         ) from error
 
 
-class NetworkAgent:
-    """A network as an agent on plain observations; rows may be of any cars.
-
-    Args:
-        network: Network that computes the action.
-    """
+class _NetworkAgent:
+    """A network as an agent on plain observations; rows may be of any cars."""
 
     def __init__(self, network: Network) -> None:
         self.network = network
 
     def predict(
         self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
+        observation: Observations,
+        state: Array | None = None,
+        episode_start: npt.NDArray[np.bool_] | None = None,
         deterministic: bool = True,
-    ) -> tuple[Any, Any]:
-        """Compute actions within [-1, 1], with the signature of stable-baselines3.
-
-        Args:
-            observation: Observations, shape (N, k).
-            state: Memory, shape (N, memory); None at the start.
-            episode_start: Rows whose memory is cleared, shape (N,).
-            deterministic: Without effect.
-
-        Returns:
-            Actions (N, m) and the next state.
-        """
+    ) -> tuple[Observations, Array]:
+        """Compute actions within [-1, 1] and the next memory, as stable-baselines3 does."""
         memory = (
             np.zeros((len(observation), self.network.memory)) if state is None else state.copy()
         )
@@ -262,6 +242,111 @@ class NetworkAgent:
             memory[np.asarray(episode_start, np.bool_)] = 0.0
         actions = self.network(np.asarray(observation, np.float64), memory)
         return np.clip(actions, -1.0, 1.0).astype(np.float32), memory
+
+
+class _Mixing(NamedTuple):
+    """The whitening of memory features x: (x - mean) mixing."""
+
+    mean: Array  # shape (k,)
+    mixing: Array  # symmetric matrix, shape (k, k)
+
+    def adapt_to_mixed(self, network: Network) -> Network:
+        """Adapt a network of plain x to mixed x."""
+        first = network.weights[0] @ np.linalg.inv(self.mixing)
+        bias = network.biases[0] + network.weights[0] @ self.mean
+        return _replace_first_layer(network, first, bias)
+
+    def adapt_to_plain(self, network: Network) -> Network:
+        """Adapt a network of mixed x to plain x."""
+        first = network.weights[0] @ self.mixing
+        return _replace_first_layer(network, first, network.biases[0] - first @ self.mean)
+
+
+def _replace_first_layer(network: Network, weights: Array, biases: Array) -> Network:
+    """Replace weights (m, k) and biases (m,) of a network's first dense layer."""
+    all_weights, all_biases = [weights, *network.weights[1:]], [biases, *network.biases[1:]]
+    return replace(network, weights=all_weights, biases=all_biases)
+
+
+class MemoryObservation(
+    VectorWrapper[Observations, Observations, Observations, Observations, npt.NDArray[Any]]
+):
+    """A vector env whose observations (N, k) are the inputs of a network's dense layers.
+
+    Args:
+        env: Vector env that resets a row in the step that ends it, with the network's observation.
+        network: Network with memory.
+        mixing: Whitening of the observations, None for none.
+    """
+
+    def __init__(self, env: CarVectorEnv, network: Network, mixing: _Mixing | None = None) -> None:
+        super().__init__(env)
+        names = [f"memory_{i}" for i in range(network.dense.inputs)]
+        self.layout = tuple(ObservationEntry(name, "-", -np.inf, np.inf) for name in names)
+        self.single_observation_space = make_space(self.layout)
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self._network, self._state = network, np.zeros((env.num_envs, network.memory))
+        self._mixing = mixing and _Mixing(mixing.mean, mixing.mixing.astype(np.float32))
+        self._last = np.zeros(self.observation_space.shape or (), np.float32)
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Reset the rows; those that a `reset_mask` leaves out keep their memory and observation.
+
+        Args:
+            seed: Seeds of the inner env.
+            options: Options of the inner env.
+
+        Returns:
+            Observations of all rows, and infos.
+        """
+        mask = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_)))
+        obs, infos = self.env.reset(seed=seed, options=options)
+        new_state, updated = np.zeros_like(self._state[mask]), self._last.copy()
+        updated[mask] = self._read(obs[mask], new_state)
+        self._state[mask], self._last = new_state, updated
+        return updated.copy(), infos
+
+    def step(self, actions: Observations) -> Any:
+        """Step the inner env and compute the observations, `final_obs` of the infos too.
+
+        Args:
+            actions: Actions, shape (N, width).
+
+        Returns:
+            Observations, rewards, terminated, truncated and infos.
+        """
+        obs, rewards, terminated, truncated, infos = self.env.step(actions)
+        over = terminated | truncated
+        if over.any():
+            last = np.full(len(over), None)
+            final_obs = self._read(np.stack(infos["final_obs"][over]), self._state[over])
+            for i, final in zip(np.flatnonzero(over), final_obs, strict=True):
+                last[i] = final
+            infos = infos | {"final_obs": last}
+            self._state[over] = 0.0
+        self._last = self._read(obs, self._state)
+        return self._last.copy(), rewards, terminated, truncated, infos
+
+    def _read(self, obs: Observations, state: Array) -> Observations:
+        """Compute observations (N, k), float32; the state (N, memory) is updated."""
+        x = self._network.compute_features(obs.astype(np.float64), state)
+        if self._mixing is None:
+            return x.astype(np.float32)
+        whitened = (x - self._mixing.mean).astype(np.float32) @ self._mixing.mixing
+        return np.asarray(whitened, np.float32)
+
+
+def _measure_mixing(env: CarVectorEnv, network: Network, seed: int) -> _Mixing:
+    """Measure the whitening in a network's own drives, one episode of each row from a seed on."""
+    collected, agent = [], _NetworkAgent(network.dense)
+    drive = iterate_steps(MemoryObservation(env, network), agent, seed)
+    for step in itertools.islice(drive, 0, None, SAMPLE_STRIDE):
+        over = np.logical_or(step.terminated, step.truncated)
+        collected.append(step.obs[step.running & ~over])
+    x = np.concatenate(collected).astype(np.float64)
+    return _Mixing(x.mean(0), compute_whitening(x, _MIN_VARIANCE))
 
 
 class PolicyWarmStart:
@@ -277,23 +362,18 @@ class PolicyWarmStart:
         seed: Seed of the drives.
     """
 
-    def __init__(
-        self, policy: Policy, task: TrainingTask, env: VectorEnv[Any, Any, Any], seed: int
-    ) -> None:
+    def __init__(self, policy: Policy, task: TrainingTask, env: CarVectorEnv, seed: int) -> None:
         layout, self._network = get_layout(env), policy.network
         self.start = _make_warm_start(policy, task, layout)
-        self.driver = NetworkAgent(policy.network)  # drives as the policy does
+        self.driver = _NetworkAgent(policy.network)  # drives as the policy does
         self._mixing = None
         if policy.network.cells and not get_algorithm(task.algo).on_tensors:
-            dense_agent = NetworkAgent(policy.network.dense)
-            self._mixing = measure_mixing(
-                env, policy.network, lambda obs: dense_agent.predict(obs)[0], seed
-            )
+            self._mixing = _measure_mixing(env, policy.network, seed)
             mixed = self._mixing.adapt_to_mixed(policy.network)
             self.start = _make_warm_start(replace(policy, network=mixed), task, layout)
-            self.driver = NetworkAgent(mixed.dense)
+            self.driver = _NetworkAgent(mixed.dense)
 
-    def wrap_env(self, env: VectorEnv[Any, Any, Any]) -> VectorEnv[Any, Any, Any]:
+    def wrap_env(self, env: CarVectorEnv) -> CarVectorEnv:
         """Wrap a vector env so that it has the model's observation.
 
         Args:
@@ -316,123 +396,3 @@ class PolicyWarmStart:
         if not self._mixing:
             return network
         return self._network.replace_dense(self._mixing.adapt_to_plain(network))
-
-
-def compute_equal_weights(costs: Array) -> Array:
-    """Compute weights that make scenarios' costs equal, so that costly ones do not outweigh others.
-
-    Args:
-        costs: Mean costs of the scenarios, shape (k,).
-
-    Returns:
-        Weights, shape (k,).
-    """
-    return np.asarray(costs.mean() / np.maximum(costs, _MIN_COST_SHARE * costs.mean()))
-
-
-def compute_scenario_weights(task: TrainingTask, first: int) -> Array:
-    """Compute each scenario's weight by the uncontrolled cost of a control period.
-
-    Args:
-        task: Task of the training.
-        first: First seed of the uncontrolled drives.
-
-    Returns:
-        Weights of the scenarios, shape (k,); 1 for a task without a mixture.
-    """
-    k = len(task.scenarios)
-    if not k:
-        return np.ones(1)
-    rows = _WEIGHT_DRIVES * k
-    env = make_native_env(task.env_id, rows, None, task.options(rows))
-    costs, steps = evaluate_episodes(env, None, range(first, first + rows))
-    rates = [costs[i::k].sum() / steps[i::k].sum() for i in range(k)]
-    return compute_equal_weights(np.array(rates))
-
-
-class RewardScale:
-    """The factors of the cars' rewards, which change from drive to drive.
-
-    Args:
-        drive_scales: Factors of each car's drives in order; the last one serves for all later ones.
-    """
-
-    def __init__(self, drive_scales: Sequence[Sequence[float]]) -> None:
-        self._drive_scales, self._drive = drive_scales, np.zeros(len(drive_scales), np.intp)
-        self.now = np.zeros(len(drive_scales), np.float32)  # present factors
-        self.begin()
-
-    def begin(self) -> None:
-        """Start every car's first drive."""
-        self._drive[:] = 0
-        self._update_scale(range(len(self._drive)))
-
-    def start_next_drives(self, rows: npt.NDArray[np.bool_]) -> None:
-        """Start the next drive of some cars.
-
-        Args:
-            rows: Whether a car starts its next drive, shape (N,).
-        """
-        chosen = np.flatnonzero(rows).tolist()
-        self._drive[chosen] += 1
-        self._update_scale(chosen)
-
-    def _update_scale(self, rows: Sequence[int]) -> None:
-        for i in rows:
-            scales = self._drive_scales[i]
-            self.now[i] = scales[min(self._drive[i], len(scales) - 1)]
-
-
-def measure_reward_scale(agent: Any, env: VecEnv, seed: int, steps: int) -> list[list[float]]:
-    """Measure the factors with which an agent's mean reward is -1 in each drive.
-
-    Args:
-        agent: Agent, as for `iterate_steps`.
-        env: Env that resets itself, whose scenarios do not depend on the agent.
-        seed: Seed of row 0.
-        steps: Steps of each row.
-
-    Returns:
-        Factors of each row's drives, then their median for all further drives.
-    """
-    scales: list[list[float]] = [[] for _ in range(env.num_envs)]
-    costs, lengths = np.zeros(env.num_envs), np.zeros(env.num_envs)
-    env.seed(seed)
-    obs, state, start = env.reset(), None, np.ones(env.num_envs, np.bool_)
-    for _ in range(steps):
-        actions, state = agent.predict(obs, state, start, deterministic=True)
-        obs, rewards, start, _ = env.step(actions)
-        costs -= rewards
-        lengths += 1.0
-        for i in np.flatnonzero(start).tolist():
-            scales[i].append(float(lengths[i] / (costs[i] + COST_FLOOR)))
-            costs[i] = lengths[i] = 0.0
-    open_scales = lengths / (costs + COST_FLOOR)
-    for row_scales, open_scale in zip(scales, open_scales, strict=True):
-        row_scales.append(float(np.median(row_scales or [open_scale])))
-    return scales
-
-
-class RewardScaleWrapper(VecEnvWrapper):
-    """Rewards times `RewardScale`, outside of the monitor, which counts costs.
-
-    Args:
-        venv: Env of stable-baselines3.
-        reward_scale: Factors of the rewards.
-    """
-
-    def __init__(self, venv: VecEnv, reward_scale: RewardScale) -> None:
-        super().__init__(venv)
-        self.reward_scale = reward_scale
-
-    def reset(self) -> Observations:
-        """Reset the inner env and the factors."""
-        self.reward_scale.begin()
-        return np.asarray(self.venv.reset())
-
-    def step_wait(self) -> Any:
-        """Step the inner env and scale its rewards."""
-        obs, rewards, dones, infos = self.venv.step_wait()
-        scaled = rewards * self.reward_scale.now
-        self.reward_scale.start_next_drives(dones)
-        return obs, scaled, dones, infos

@@ -176,7 +176,7 @@ def run_case(case: MemoryCase) -> MemoryResult:
         agent, steps = _train_ppo(case, cars), case.budget.ppo
     else:
         agent, steps = _train_memory(case)
-        from ...agents.training.networks import CompactObservation
+        from ...agents.training.recurrent import CompactObservation
 
         cars = CompactObservation(_make_cars(case, count))
     seconds = time.process_time() - start_time if steps else 0.0
@@ -191,8 +191,7 @@ def _make_cars(case: MemoryCase, count: int) -> Any:
 def _train_memory(case: MemoryCase) -> tuple[Any, int]:
     """A memory that acts, and the steps that it saw."""
     from ...agents.training.distill import DistillTask
-    from ...agents.training.networks import CompactObservation
-    from ...agents.training.recurrent import MEMORIES, train_memory
+    from ...agents.training.recurrent import MEMORIES, CompactObservation, train_memory
     from ...agents.training.student import DistillConfig
 
     budget = case.budget

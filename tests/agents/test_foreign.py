@@ -120,27 +120,28 @@ def test_what_is_no_agent(agent: Any, error: Any, message: str) -> None:
         make_agent(agent, gym.make(VISION))
 
 
-def test_bad_arguments() -> None:
-    env = gym.make(VISION)
-    with pytest.raises(TypeError, match="Still is built already, got width"):
-        make_agent(Still(), env, width=2)
-    with pytest.raises(TypeError, match="unexpected keyword argument 'depth'"):
-        make_agent(Still, env, depth=2)
-    with pytest.raises(
-        TypeError, match="an agent has stable-baselines3's predict, got str; make_a"
-    ):
-        rollout(env, "none")
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda env: make_agent(Still(), env, width=2), "Still is built already, got width"),
+        (lambda env: make_agent(Still, env, depth=2), "unexpected keyword argument 'depth'"),
+        (lambda env: rollout(env, "none"), "stable-baselines3's predict, got str; make_a"),
+    ],
+)
+def test_bad_arguments(call: Any, message: str) -> None:
+    with pytest.raises(TypeError, match=message):
+        call(gym.make(VISION))
 
 
 def test_a_policys_card_names_no_code() -> None:
     """It comes with a file from elsewhere."""
     from sideslip.agents.learned.policy import Card
 
+    layout = (("gyro", "rad/s"),)
     for name in ("os:system", "evil.py", "folder/evil.py:Filter"):
         with pytest.raises(ValueError, match="estimator is a name, got the entry point"):
-            Card(VISION, (("gyro", "rad/s"),), 10, "zero-slip", estimator=name)
+            Card(VISION, layout, 10, "zero-slip", estimator=name)
     with pytest.raises(ValueError, match="env_id is that of a registered env, got 'evil:Car-v0'"):
-        Card("evil:Car-v0", (("gyro", "rad/s"),), 10, "zero-slip")
-    hidden = {"estimator": "evil.py"}
+        Card("evil:Car-v0", layout, 10, "zero-slip")
     with pytest.raises(ValueError, match="estimator_options holds an estimator"):
-        Card(VISION, (("gyro", "rad/s"),), 10, "zero-slip", {}, "dakf", hidden)
+        Card(VISION, layout, 10, "zero-slip", {}, "dakf", {"estimator": "evil.py"})

@@ -12,6 +12,7 @@ import sideslip
 from sideslip.agents import AGENTS, make_agent
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.wrappers.truth import TruthObservation
+from tests.agents.helpers import observe
 from tests.envs.helpers import bits
 
 PARAMETERS = ["front_stiffness", "rear_stiffness", "friction"]
@@ -71,10 +72,7 @@ def test_a_nan_that_is_read_comes_out_as_nan(name: str, steered: gym.Env[Any, An
 
 def test_episode_start_clears_the_memory(env: gym.Env[Any, Any]) -> None:
     agent = make_agent("two-dof", env)
-    obs = np.zeros((2, env.observation_space.shape[0]), np.float32)  # type: ignore[index]
-    names = [entry.name for entry in env.get_wrapper_attr("layout")]
-    obs[:, names.index("wheel_left")] = obs[:, names.index("wheel_right")] = 7.0
-    obs[:, names.index("beta_hat")] = 0.001
+    obs = np.stack([observe(env, beta_hat=0.001)] * 2)
     _, state = agent.predict(obs)
     _, state = agent.predict(obs, state)
     fresh, _ = agent.predict(obs)
@@ -108,20 +106,6 @@ def test_moment_controllers_leave_the_steering_alone(steered: gym.Env[Any, Any])
         assert (action[0] == 0.0) == (name == "none")
 
 
-def test_bad_input(env: gym.Env[Any, Any]) -> None:
-    bare = gym.make("sideslip/YawVision-v0")
-    with pytest.raises(ValueError, match="unknown agent 'pid'"):
-        make_agent("pid", env)
-    with pytest.raises(ValueError, match=r"beta_hat.*EstimateObservation"):
-        make_agent("two-dof", bare)
-    with pytest.raises(ValueError, match="rate is 'control' or 'camera'"):
-        make_agent("two-dof", env, rate="fast")
-    for sampled in (True, False):
-        with pytest.raises(ValueError, match="placement is one of radius, real, got 'both'"):
-            make_agent("two-dof", env, placement="both", sampled=sampled)
-        with pytest.raises(ValueError, match="pole is a positive number"):
-            make_agent("two-dof", env, pole=-1.0, sampled=sampled)
-    with pytest.raises(TypeError, match="speed"):
-        make_agent("two-dof", env, speed=3)
+def test_an_observation_of_another_width_is_refused(env: gym.Env[Any, Any]) -> None:
     with pytest.raises(ValueError, match="width"):
         make_agent("none", env).predict(np.zeros(3, np.float32))

@@ -9,27 +9,18 @@ import pytest
 from sideslip.agents.baselines import ORACLES, make_noise_options, make_oracle
 from sideslip.agents.controllers.base import Controller
 from sideslip.agents.controllers.lqr import Lqr
-from sideslip.agents.design.sampled_model import compute_regulator, make_design_model
+from sideslip.agents.design.sampled_model import compute_cost_to_go, make_design_model
+from sideslip.agents.rollout import evaluate_costs
 from sideslip.envs import COMS
+from sideslip.envs.record import PACKET
 from sideslip.envs.scenarios.manoeuvres import SCENARIOS
+from sideslip.envs.scenarios.scenario import Scenario
+from sideslip.envs.scenarios.tiers import TIERS
 from tests.envs.helpers import bits
 
 FUSION, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"
 VISION = "sideslip/YawVision-v0"
 LINEAR = {"base": "random-steering", "tyres": "linear"}
-
-
-def costs(rung: str, count: int, **env: Any) -> np.ndarray:
-    """J of the seeds from 0 on."""
-    envs, agent = make_oracle(rung, FUSION, num_envs=count, **env)
-    obs, _ = envs.reset(seed=list(range(count)))
-    J, alive, state = np.zeros(count), np.ones(count, bool), None
-    while alive.any():
-        action, state = agent.predict(obs, state)
-        obs, reward, terminated, truncated, _ = envs.step(action)
-        J -= np.where(alive, reward, 0.0)
-        alive &= ~(terminated | truncated)
-    return J
 
 
 OFTEN = [*((rung, FUSION) for rung in ORACLES), ("oracle-state-lqr", AFS), ("nominal", VISION)]
@@ -62,7 +53,7 @@ def test_gains_between_the_knots_are_those_of_the_true_car() -> None:
         speed, front, rear = rng.uniform((5.0, 0.6, 0.6), (10.0, 1.4, 1.4))
         car = COMS.scale_stiffness(front, rear)
         K = agent.gains(speed, car.front_stiffness, car.rear_stiffness)
-        wanted = compute_regulator(make_design_model(car, speed, agent.design_spec))[0]
+        wanted = compute_cost_to_go(make_design_model(car, speed, agent.design_spec))[0]
         assert np.abs(K[:, :4] - wanted[:, :4]).max() < 0.02 * np.abs(wanted[:, :4]).max()
 
 
@@ -118,7 +109,57 @@ def test_one_table_serves_all_who_ask_for_it() -> None:
 def test_knowing_pays_on_the_linear_car() -> None:
     """Where the LQG is the optimum each rung costs less than the one below: three errors."""
     plain = LINEAR | {"small_angle": True, "roll": False}
-    found = [np.log(costs(rung, 64, scenario=plain)) for rung in ORACLES[:3]]
+    pairs = [make_oracle(rung, FUSION, 64, scenario=plain) for rung in ORACLES[:3]]
+    found = [np.log(evaluate_costs(*pair, range(64))) for pair in pairs]
     for lower, upper in itertools.pairwise(found):
         gap = lower - upper
         assert gap.mean() > 3.0 * gap.std(ddof=1) / len(gap) ** 0.5
+
+
+CARS = 16
+VIEWED = ("coms-slalom", "coms-brake-in-turn", "car-step", "limit-sine-with-dwell")
+SCORED = [
+    each.name if each.name in VIEWED else pytest.param(each.name, marks=pytest.mark.long)
+    for each in TIERS
+    if each.tier
+]
+
+
+def share_seen(scenario: Scenario) -> float:
+    """Of the camera's frames, under the rung that knows the nominal car."""
+    car = "coms" if scenario.tier == "1" else "passenger-car"
+    env: Any
+    env, agent = make_oracle(
+        "nominal",
+        "sideslip/YawFusion-v0",
+        CARS,
+        scenario=scenario.to_dict(),
+        vehicle=car,
+        nominal=car,
+        reference="limited",
+    )
+    base, state, start = env.unwrapped, None, np.ones(CARS, bool)
+    obs, _ = env.reset(seed=100)
+    seen = []
+    for _ in range(round(scenario.duration / 0.01) - 1):
+        actions, state = agent.predict(obs, state, start)
+        obs, _, terminated, truncated, _ = env.step(actions)
+        start = terminated | truncated
+        for i in range(CARS):
+            packets = base.packets[i, : base.delivered[i]]
+            seen.append(packets[packets[:, PACKET.sensor] == 0, PACKET.quality])
+    return float(np.concatenate(seen).mean())
+
+
+@pytest.mark.parametrize("name", SCORED)
+def test_the_lane_is_seen_in_four_of_five_frames(name: str) -> None:
+    """With tyres from 0.6 to 1.4 of the nominal ones."""
+    scenario = SCENARIOS[name]
+    assert scenario.front_stiffness == (0.6, 1.4) and scenario.camera_heading < 0.4
+    assert share_seen(scenario) > 0.8
+
+
+@pytest.mark.parametrize("name", ["coms-brake-in-turn", "coms-step", "limit-step"])
+def test_on_a_straight_road_it_would_not(name: str) -> None:
+    scenario = SCENARIOS[name]
+    assert share_seen(scenario.replace(road="straight")) < min(0.9, share_seen(scenario))

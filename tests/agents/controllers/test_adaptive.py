@@ -86,12 +86,6 @@ def test_one_car_and_many_decide_alike(name: str) -> None:
         single = one.step(alone)[0]
 
 
-def test_without_tyres_in_the_observation_it_says_so() -> None:
-    env = EstimateObservation(gym.make(STEERING), "exact-kf")
-    with pytest.raises(ValueError, match="AdaptiveLqr needs front_tyres_hat, rear_tyres_hat"):
-        make_agent("adaptive-lqr", env)
-
-
 def test_knowing_its_tyres_is_worth_a_third_of_the_cost() -> None:
     seeds = tuple(range(700, 712))
     costs = [

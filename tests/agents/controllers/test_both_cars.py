@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.agents import make_agent
+from sideslip.agents.rollout import evaluate_costs
 from sideslip.estimators.vector import EstimateObservation
 
 CARS = 12
@@ -38,15 +39,7 @@ def costs(env_id: str, name: str, contest: tuple[str, str, str], **options: Any)
     )
     if name != "none":
         env = EstimateObservation(env, "exact-kf", outputs=["beta", "gamma"], std=False)
-    agent = make_agent(name, env, **options)
-    obs, _ = env.reset(seed=0)
-    J, alive, state = np.zeros(CARS), np.ones(CARS, bool), None
-    while alive.any():
-        action, state = agent.predict(obs, state)
-        obs, reward, terminated, truncated, _ = env.step(action)
-        J -= np.where(alive, reward, 0.0)
-        alive &= ~(terminated | truncated)
-    return J
+    return evaluate_costs(env, make_agent(name, env, **options), range(CARS))
 
 
 @cache

@@ -10,6 +10,7 @@ from sideslip.agents import make_agent
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation
 from sideslip.estimators.wrappers.truth import TruthObservation
+from tests.agents.helpers import observe
 from tests.envs.helpers import bits
 
 YAW, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"
@@ -28,12 +29,7 @@ def made(name: str, friction: bool = False, **options: Any) -> tuple[Any, Any]:
 
 def harsh(env: Any, beta: float = 0.3, **more: float) -> np.ndarray:
     """An observation of a car that slides."""
-    names = [entry.name for entry in env.get_wrapper_attr("layout")]
-    obs = np.zeros(len(names), np.float32)
-    values = {"wheel_left": 7.0, "wheel_right": 7.0, "beta_hat": beta, **more}
-    for name, value in values.items():
-        obs[names.index(name)] = value
-    return obs
+    return observe(env, beta_hat=beta, **more)
 
 
 def most(friction: float, grip: float) -> float:
@@ -97,9 +93,3 @@ def test_no_more_is_asked_than_the_motors_power_gives(name: str) -> None:
     action, _ = make_agent(name, env).predict(harsh(env))
     torque = 2000.0 * COMS.wheel_radius / 7.0
     assert abs(action[0]) == pytest.approx(torque / COMS.motor_torque, rel=1e-4)
-
-
-def test_bad_input() -> None:
-    for grip in (0.0, -1.0, float("nan")):
-        with pytest.raises(ValueError, match="grip is a positive number"):
-            made("lqr", grip=grip)

@@ -12,6 +12,7 @@ from sideslip.agents.controllers.lane_keeping import HASTE, MOVED, LaneKeeping, 
 from sideslip.agents.design.sampled_model import SPEEDS, solve_lqr
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation
+from tests.agents.helpers import observe
 
 OUTPUTS = ["beta", "gamma", "psi", "y_l"]
 LIMIT = COMS.yaw_moment_limit
@@ -88,12 +89,8 @@ def test_the_integral_holds_while_an_input_is_at_its_limit() -> None:
     env = env_of(0.02)
     agent = make_agent("lane-keeping", env)
     assert isinstance(agent, LaneKeeping)
-    names = [entry.name for entry in env.get_wrapper_attr("layout")]
-    obs = np.zeros(len(names), np.float32)
-    obs[names.index("wheel_left")] = obs[names.index("wheel_right")] = 7.0
     for offset, grows in ((0.001, True), (1.9, False)):
-        obs[names.index("y_l_hat")] = offset
-        _, state = agent.predict(obs)
+        _, state = agent.predict(observe(env, y_l_hat=offset))
         assert (state[0, 0] > 0.0) == grows
 
 
@@ -104,18 +101,3 @@ def test_without_the_moment_it_only_steers() -> None:
     both = make_agent("lane-keeping", env).predict(obs)[0]
     alone = make_agent("lane-keeping", env, moment=False).predict(obs)[0]
     assert both[0] != 0.0 and alone[0] == 0.0 and alone[1] != 0.0
-
-
-def test_bad_input() -> None:
-    env = env_of(0.02)
-    with pytest.raises(ValueError, match="curvature_time is a positive number"):
-        make_agent("lane-keeping", env, curvature_time=0.0)
-    with pytest.raises(ValueError, match="haste is zero or more"):
-        make_agent("lane-keeping", env, haste=-1.0)
-    fixed = EstimateObservation(gym.make("sideslip/YawVision-v0"), "multirate-kf", outputs=OUTPUTS)
-    with pytest.raises(ValueError, match="action steers"):
-        make_agent("lane-keeping", fixed)
-    with pytest.raises(ValueError, match=r"psi_hat, y_l_hat.*EstimateObservation"):
-        make_agent(
-            "lane-keeping", EstimateObservation(gym.make("sideslip/YawVision-v0"), "bicycle-kf")
-        )

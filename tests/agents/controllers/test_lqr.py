@@ -8,17 +8,20 @@ import numpy as np
 import pytest
 
 from sideslip.agents import Lqr, make_agent
+from sideslip.agents.controllers.lqr import _solve_box_qp
 from sideslip.agents.design.sampled_model import (
     DYNAMIC,
     SPEEDS,
     DesignSpec,
-    compute_regulator,
+    _compute_input_cost,
+    compute_cost_to_go,
     make_design_model,
 )
 from sideslip.envs import COMS, PASSENGER_CAR
 from sideslip.envs.task import MODEL, ZERO_SLIP, compute_reference, make_reference_params
 from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation
+from tests.agents.helpers import observe
 
 SMALL = {
     "base": "straight",
@@ -33,7 +36,6 @@ SMALL = {
     "disturbance_moment": 0.0,
     "noise": {"wheel": 0.0},
 }
-BOTH = DesignSpec(10, COMS.yaw_moment_limit, True, MODEL, "forces")
 
 
 def estimating(env: Any, *disturbances: str) -> Any:
@@ -90,7 +92,7 @@ def test_gains_are_python_controls_for_all_states_at_once(
     G[held, held] *= 1.0 - 1e-8
     wanted, _, _ = control.dlqr(G, model.H, model.Q, model.R, model.N)
     scale = np.abs(wanted).max()
-    assert compute_regulator(model)[0] / scale == pytest.approx(
+    assert compute_cost_to_go(model)[0] / scale == pytest.approx(
         np.asarray(wanted) / scale, abs=1e-6
     )
 
@@ -98,7 +100,7 @@ def test_gains_are_python_controls_for_all_states_at_once(
 def test_tabled_gains_are_the_designed_ones(steered: Any) -> None:
     agent = agent_of(steered)
     for speed in (SPEEDS[3], SPEEDS[20]):
-        wanted = compute_regulator(make_design_model(COMS, speed, agent.design_spec))[0]
+        wanted = compute_cost_to_go(make_design_model(COMS, speed, agent.design_spec))[0]
         assert agent.gains(speed) == pytest.approx(wanted, rel=1e-12)
     assert (agent.gains(0.1) == agent.gains(SPEEDS[0])).all()
     assert (agent.gains(99.0) == agent.gains(SPEEDS[-1])).all()
@@ -109,7 +111,7 @@ def test_tabled_gains_are_the_designed_ones(steered: Any) -> None:
 def test_the_closed_loop_is_stable_over_the_speeds(car: Any, steers: bool) -> None:
     """At the tabled speeds and between; the COMS alone is unstable above 17.6 m/s."""
     purpose = DesignSpec(10, car.yaw_moment_limit, steers, MODEL)
-    gains = [compute_regulator(make_design_model(car, speed, purpose))[0] for speed in SPEEDS[::4]]
+    gains = [compute_cost_to_go(make_design_model(car, speed, purpose))[0] for speed in SPEEDS[::4]]
     for i, (low, high) in enumerate(zip(SPEEDS[::4], SPEEDS[4::4], strict=False)):
         for share in (0.0, 0.5):
             K = (1.0 - share) * gains[i] + share * gains[i + 1]
@@ -122,7 +124,7 @@ def test_the_closed_loop_is_stable_over_the_speeds(car: Any, steers: bool) -> No
 def test_it_follows_the_references_where_they_can_be_had(steered: Any) -> None:
     """With both inputs free of limits, beta and gamma reach the model's steady state."""
     model = make_design_model(COMS, 7.0, agent_of(steered).design_spec)
-    K, d = compute_regulator(model)[0], len(DYNAMIC)
+    K, d = compute_cost_to_go(model)[0], len(DYNAMIC)
     refs = compute_reference(0.01, 7.0, make_reference_params(COMS), MODEL)
     held = np.array([0.01, *refs])
     closed = model.G - model.H @ K
@@ -140,7 +142,7 @@ def test_the_law_is_minus_k_x(steered: Any) -> None:
     share = 3.0 / (2.0 * COMS.motor_torque)
     x = [2e-4, 1e-3, share, 0.001, 0.002, 1e-4, 2e-3]
     wanted = -agent.gains(7.0) @ x / [1.0, COMS.steering_authority]
-    action, _ = agent.predict(observed(steered, told))
+    action, _ = agent.predict(observe(steered, **told))
     assert action == pytest.approx(wanted, rel=1e-4) and np.abs(wanted).max() < 1.0
 
 
@@ -152,15 +154,6 @@ def disturbed(kind: str) -> Any:
     return EstimateObservation(gym.make("sideslip/YawGps-v0"), "dakf", outputs=outputs)
 
 
-def observed(env: Any, told: dict[str, float]) -> np.ndarray:
-    """An observation that is zero but for these entries."""
-    names = [entry.name for entry in env.get_wrapper_attr("layout")]
-    obs = np.zeros(len(names), np.float32)
-    for name, value in told.items():
-        obs[names.index(name)] = value
-    return obs
-
-
 @pytest.mark.parametrize(
     ("kind", "levels"),
     [("forces", {"F_d_hat": 30.0, "N_d_hat": -8.0}), ("rates", {"d1_hat": 0.02, "d2_hat": -0.1})],
@@ -169,11 +162,10 @@ def test_disturbances_are_fed_forward_by_their_gains(kind: str, levels: dict[str
     """Of a car that is at rest beside them; each on its own, and both."""
     env = disturbed(kind)
     agent = agent_of(env)
-    wheels = {"wheel_left": 7.0, "wheel_right": 7.0}
     answers = []
     for share in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
         d = np.array(list(levels.values())) * share
-        action, _ = agent.predict(observed(env, wheels | dict(zip(levels, d, strict=True))))
+        action, _ = agent.predict(observe(env, **dict(zip(levels, d, strict=True))))
         answers.append(float(action[0]))
         assert action == pytest.approx(-agent.gains(7.0)[:, len(DYNAMIC) + 3 :] @ d, rel=1e-5)
     assert np.abs(answers).min() > 0.01
@@ -192,11 +184,10 @@ def test_a_held_disturbance_is_met_by_the_best_held_yaw_moment() -> None:
     beta, gamma = free + per_u * scale * u
     torque = u * COMS.motor_torque
     action, _ = agent.predict(
-        observed(env, {
-            "wheel_left": v, "wheel_right": v, "torque_left": -torque, "torque_right": torque,
-            "beta_hat": beta, "gamma_hat": gamma, "beta_ref": refs[0], "gamma_ref": refs[1],
-            "d1_hat": d[0], "d2_hat": d[1],
-        })
+        observe(
+            env, v, torque_left=-torque, torque_right=torque, beta_hat=beta, gamma_hat=gamma,
+            beta_ref=refs[0], gamma_ref=refs[1], d1_hat=d[0], d2_hat=d[1],
+        )
     )  # fmt: skip
     assert 0.05 < abs(u) < 1.0
     assert action[0] == pytest.approx(u, rel=1e-3)
@@ -211,27 +202,13 @@ def test_disturbances_and_gyro_are_read_where_they_are() -> None:
     assert agent_of(walks).design_spec.disturbances == "rates"
 
 
-def test_bad_input(steered: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValueError, match=r"beta_hat.*EstimateObservation"):
-        make_agent("lqr", gym.make("sideslip/YawFusion-v0"))
-    with pytest.raises(ValueError, match="disturbance_time is a positive number"):
-        make_agent("lqr", steered, disturbance_time=0.0)
-    with pytest.raises(ValueError, match="names two entries or none"):
-        make_agent("lqr", steered, stiffness=["a"])
-    with pytest.raises(ValueError, match="span rises from above zero"):
-        make_agent("lqr", steered, span=(1.0, 0.5))
-    with pytest.raises(TypeError, match="weight"):
-        make_agent("lqr", steered, weight=1.0)
-    with pytest.raises(ValueError, match="positive speed"):
-        make_design_model(COMS, 0.0, BOTH)
-
-
 def test_another_action_costs_what_the_curvature_says_and_moves_the_rate_limit() -> None:
-    """`compute_regulator`'s S, in shares of the yaw moment and of the authority; steering that was
-    added by somebody else is what the next decision may differ from by a step of the rate."""
+    """`_compute_input_cost`'s S, in shares of the yaw moment and of the authority; steering that
+    was added by somebody else is what the next decision may differ from by a step of the rate."""
     env = estimating(gym.make("sideslip/AfsYawFusion-v0", reference="model"), "F_d", "N_d")
     agent, speed = Lqr(env), float(SPEEDS[8])
-    _, S = compute_regulator(make_design_model(agent.vehicle, speed, agent.design_spec))
+    model = make_design_model(agent.vehicle, speed, agent.design_spec)
+    S = _compute_input_cost(model, compute_cost_to_go(model)[1])
     per = np.diag([1.0, agent.authority])
     assert agent.curvature(speed) == pytest.approx(per @ S @ per, rel=1e-9)
     obs = np.array([each.low if each.name == "steer_command" else 0.0 for each in
@@ -247,3 +224,22 @@ def test_another_action_costs_what_the_curvature_says_and_moves_the_rate_limit()
     step = COMS.steering_rate * 0.01 / agent.authority
     assert planner.predict(obs, memory)[0][1] > 1.0 - step - 1e-6
     assert abs(free[1]) <= step + 1e-6 and abs(taken[1] - 0.5) <= step + 1e-6
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_nothing_within_the_limits_costs_less(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(2, 2))
+    S = root @ root.T + 0.01 * np.eye(2)
+    free, (low, high) = rng.normal(size=2) * 3.0, np.sort(rng.normal(size=2))
+    u, w = _solve_box_qp(S[0, 0], S[0, 1], S[1, 1], free[0], free[1], 1.0, low, high)
+    assert abs(u) <= 1.0 and low <= w <= high
+    grid = np.stack(np.meshgrid(np.linspace(-1.0, 1.0, 201), np.linspace(low, high, 201)), -1)
+    off = grid - free
+    costs = np.einsum("...i,ij,...j", off, S, off)
+    found = np.array([u, w]) - free
+    assert found @ S @ found <= costs.min() + 1e-12
+
+
+def test_what_is_within_the_limits_stays() -> None:
+    assert _solve_box_qp(1.0, 0.9, 1.0, 0.3, -0.2, 1.0, -0.5, 0.5) == (0.3, -0.2)

@@ -15,6 +15,7 @@ from sideslip.agents.controllers.mpc import NOT_FINITE, Mpc
 from sideslip.agents.design.sampled_model import SPEEDS
 from sideslip.envs import COMS
 from sideslip.estimators import EstimateObservation
+from tests.agents.helpers import observe
 from tests.envs.helpers import bits
 
 V = SPEEDS[18]
@@ -31,14 +32,6 @@ def agent_of(env: Any, **options: Any) -> Mpc:
     return agent
 
 
-def observed(env: Any, **told: float) -> np.ndarray:
-    names = [entry.name for entry in env.get_wrapper_attr("layout")]
-    obs = np.zeros(len(names), np.float32)
-    for name, value in ({"wheel_left": V, "wheel_right": V} | told).items():
-        obs[names.index(name)] = value
-    return obs
-
-
 @pytest.mark.parametrize("steers", [False, True])
 @pytest.mark.parametrize(
     "told", [{"beta_hat": 3e-4}, {"gamma_hat": 1e-3}, {"steer_command": 1e-4, "steer": 1e-4}]
@@ -49,7 +42,7 @@ def test_without_a_limit_it_is_the_lqr(steers: bool, told: dict[str, float], hor
     env = env_of(steers)
     agent = agent_of(env, horizon=horizon)
     lqr = Lqr(env)
-    obs = observed(env, **told)
+    obs = observe(env, V, **told)
     program = agent._get_program(V)
     K = lqr.gains(V) / np.array([1.0, COMS.steering_authority])[: agent.width, None]
     x = np.zeros(len(agent.design_spec.states))
@@ -65,7 +58,7 @@ def test_without_a_limit_it_is_the_lqr(steers: bool, told: dict[str, float], hor
 
 def test_where_the_moment_saturates_it_is_at_its_limit() -> None:
     env = env_of(False)
-    action, _ = agent_of(env).predict(observed(env, beta_hat=0.05))
+    action, _ = agent_of(env).predict(observe(env, V, beta_hat=0.05))
     assert action == pytest.approx([1.0], abs=1e-3)
 
 
@@ -88,7 +81,7 @@ def test_steering_is_asked_for_no_faster_than_it_moves() -> None:
 def test_no_solution_is_no_action_and_the_episode_says_so() -> None:
     env = env_of(False, on_bad_action="fail")
     agent = agent_of(env, iterations=1)
-    obs = np.stack([observed(env, beta_hat=0.01), observed(env)])
+    obs = np.stack([observe(env, V, beta_hat=0.01), observe(env, V)])
     obs[1, 0] = 0.0
     action, state = agent.predict(obs)
     assert np.isnan(action[0]).all() and agent.status[0] == "maximum iterations reached"
@@ -101,7 +94,7 @@ def test_no_solution_is_no_action_and_the_episode_says_so() -> None:
 def test_a_row_that_is_not_finite_leaves_its_neighbours_alone() -> None:
     env = env_of(True)
     agent = agent_of(env)
-    obs = np.stack([observed(env, beta_hat=0.002)] * 3)
+    obs = np.stack([observe(env, V, beta_hat=0.002)] * 3)
     whole, _ = agent.predict(obs)
     obs[1] = np.nan
     action, _ = agent.predict(obs)
@@ -113,18 +106,14 @@ def test_what_was_solved_before_does_not_matter() -> None:
     """The warm start is in the memory, not in the solver; copies and pickles act alike."""
     env = env_of(True)
     agent = agent_of(env)
-    first = agent.predict(observed(env, beta_hat=0.002))
-    agent.predict(observed(env, beta_hat=-0.3, gamma_hat=2.0))
+    first = agent.predict(observe(env, V, beta_hat=0.002))
+    agent.predict(observe(env, V, beta_hat=-0.3, gamma_hat=2.0))
     for other in (agent, copy.deepcopy(agent), pickle.loads(pickle.dumps(agent))):
-        again = other.predict(observed(env, beta_hat=0.002))
+        again = other.predict(observe(env, V, beta_hat=0.002))
         assert bits(again[0]) == bits(first[0]) and bits(again[1]) == bits(first[1])
 
 
-def test_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = env_of(False)
-    for option in ({"horizon": 0}, {"horizon": 2.5}, {"iterations": True}):
-        with pytest.raises(ValueError, match="is a positive whole number"):
-            make_agent("mpc", env, **option)
+def test_without_its_solver_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "osqp", None)
     with pytest.raises(ModuleNotFoundError, match=r"sideslip\[mpc\]"):
-        make_agent("mpc", env)
+        make_agent("mpc", env_of(False))

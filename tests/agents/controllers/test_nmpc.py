@@ -12,17 +12,19 @@ from sideslip.agents import Nmpc, make_agent
 from sideslip.agents.baselines import make_oracle
 from sideslip.agents.controllers.nmpc import _prepare_prediction, _shift_plan
 from sideslip.agents.design.gauss_newton import (
-    DIFFERENCE,
+    _DIFFERENCE,
     LIMIT,
     _compute_normal_equations,
-    make_plan_batch,
-    simulate_batch,
-    solve_damped_step,
+    _make_plan_batch,
+    _simulate_batch,
+    _solve_damped_step,
     update_plan,
 )
 from sideslip.agents.design.prediction import make_blocks, simulate_plans
+from sideslip.agents.rollout import evaluate_costs
 from sideslip.envs.numerics.casadi_backend import SYMBOLS, to_casadi
 from sideslip.estimators.wrappers.truth import TruthObservation
+from tests.agents.helpers import observe
 
 YAW, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"
 STATES = ["beta", "gamma", "F_d", "N_d", "phi", "phi_rate"]
@@ -44,15 +46,6 @@ def made(env_id: str, **env: Any) -> tuple[Any, Nmpc]:
     return wrapped, agent
 
 
-def seen(env: Any, speed: float = 20.0, **values: float) -> np.ndarray:
-    """An observation with some values."""
-    names = [entry.name for entry in env.get_wrapper_attr("layout")]
-    obs = np.zeros(len(names), np.float32)
-    for name, value in (values | {"wheel_left": speed, "wheel_right": speed}).items():
-        obs[names.index(name)] = value
-    return obs
-
-
 def problem(agent: Nmpc, obs: np.ndarray) -> Any:
     """(start, K, T) of an observation."""
     x = obs[agent._columns].astype(np.float64)
@@ -65,9 +58,9 @@ def problem(agent: Nmpc, obs: np.ndarray) -> Any:
 def cost_of(agent: Nmpc, found: Any, plan: np.ndarray) -> float:
     start, K, T = found
     blocks = agent.design.blocks
-    all = make_plan_batch(len(plan), blocks, 1)
+    all = _make_plan_batch(len(plan), blocks, 1)
     all.plans[:, 0] = plan
-    simulate_batch(agent.design.model, start, K, T, blocks, all)
+    _simulate_batch(agent.design.model, start, K, T, blocks, all)
     return float((all.residuals**2).sum())
 
 
@@ -110,7 +103,7 @@ def test_ipopt_finds_nothing_much_cheaper(
     Saturated tyres and inputs make kinks and several local optima: neither always finds the best.
     """
     env, agent = made(env_id, **CAR)
-    found = problem(agent, seen(env, **SLIDES[slide]))
+    found = problem(agent, observe(env, **({"speed": 20.0} | SLIDES[slide])))
     least = solved_by_ipopt(agent, found, monkeypatch)
     plan = np.zeros(agent.width * len(agent.design.blocks))
     zeros = cost_of(agent, found, plan)
@@ -129,7 +122,7 @@ def test_on_the_linear_plant_it_is_lqr(env_id: str, reference: str) -> None:
     lqr = make_agent("lqr", env, steer_weight=10.0)
     values = [{"beta_hat": 1e-4}, {"gamma_hat": 1e-3}, {"F_d_hat": 3.0, "N_d_hat": -0.5}]
     for each in values:
-        obs = seen(env, 7.0, true_friction=0.9, **each)
+        obs = observe(env, 7.0, true_friction=0.9, **each)
         action, _ = agent.predict(obs)
         wanted, _ = lqr.predict(obs)
         assert np.abs(action - wanted).max() < 0.05 * np.abs(wanted).max()
@@ -145,8 +138,8 @@ def test_what_it_foresees_is_what_comes() -> None:
     blocks = agent.design.blocks
     for _ in range(5):
         start, K, T = problem(agent, obs)
-        all = make_plan_batch(len(blocks), blocks, 1)
-        simulate_batch(agent.design.model, start, K, T, blocks, all)
+        all = _make_plan_batch(len(blocks), blocks, 1)
+        _simulate_batch(agent.design.model, start, K, T, blocks, all)
         obs, _, _, _, info = env.step(all.first[:1, 0].astype(np.float32))
         foreseen = all.residuals[:2, 0] / np.sqrt(0.01) * [0.02, 0.1]
         came = [info["beta"] - info["beta_ref"], info["gamma"] - info["gamma_ref"]]
@@ -155,7 +148,7 @@ def test_what_it_foresees_is_what_comes() -> None:
 
 def test_what_is_not_finite_has_a_name() -> None:
     env, agent = made(YAW)
-    good = seen(env, 7.0, true_friction=0.9, beta_hat=0.05)
+    good = observe(env, 7.0, true_friction=0.9, beta_hat=0.05)
     bad, wild = good.copy(), good.copy()
     bad[np.argmax(good == np.float32(0.05))] = np.nan
     wild[[entry.name for entry in env.layout].index("gamma_hat")] = 1e30
@@ -171,31 +164,19 @@ def test_what_is_not_finite_has_a_name() -> None:
 def test_predict_reads_its_memory_alone() -> None:
     """Another row, another call in between: the same bits."""
     env, agent = made(YAW)
-    obs = seen(env, 7.0, true_friction=0.4, beta_hat=0.08)
+    obs = observe(env, 7.0, true_friction=0.4, beta_hat=0.08)
     _, state = agent.predict(obs)
     once = agent.predict(obs, state)
-    agent.predict(seen(env, 5.0, true_friction=0.9))
+    agent.predict(observe(env, 5.0, true_friction=0.9))
     again = agent.predict(obs, state)
     assert (once[0] == again[0]).all() and (once[1] == again[1]).all()
 
 
-def costs(rung: str, count: int, **env: Any) -> np.ndarray:
-    envs, agent = make_oracle(rung, YAW, num_envs=count, **env)
-    obs, _ = envs.reset(seed=list(range(count)))
-    J, alive, state = np.zeros(count), np.ones(count, bool), None
-    while alive.any():
-        action, state = agent.predict(obs, state)
-        obs, reward, terminated, truncated, _ = envs.step(action)
-        J -= np.where(alive, reward, 0.0)
-        alive &= ~(terminated | truncated)
-    return J
-
-
 def test_at_the_limit_it_is_better_than_lqr() -> None:
     """Paired episodes at low friction, both knowing state and car: three standard errors."""
-    found = [
-        costs(f"oracle-state-{who}", 24, scenario="limit-slalom", **CAR) for who in ("lqr", "nmpc")
-    ]
+    told: dict[str, Any] = {"scenario": "limit-slalom", **CAR}
+    pairs = [make_oracle(f"oracle-state-{who}", YAW, 24, **told) for who in ("lqr", "nmpc")]
+    found = [evaluate_costs(*pair, range(24)) for pair in pairs]
     gap = np.log(found[0] / found[1])
     assert gap.mean() > 3.0 * gap.std(ddof=1) / len(gap) ** 0.5 > 0.0
 
@@ -211,7 +192,7 @@ def test_a_damped_step_is_the_solution() -> None:
     J, r = rng.normal(size=(30, 6)), rng.normal(size=30)
     J[:, 2] = 0.0  # a variable that changes nothing
     A, g, d = J.T @ J, J.T @ r, np.empty(6)
-    solve_damped_step(A, g, 0.1, np.empty((6, 6)), d)
+    _solve_damped_step(A, g, 0.1, np.empty((6, 6)), d)
     wanted = np.linalg.solve(A + 0.1 * np.diag(np.diag(A)) + 1e-9 * np.eye(6), -g)
     assert d == pytest.approx(wanted, rel=1e-6) and d[2] == 0.0
 
@@ -220,14 +201,14 @@ def test_a_variable_that_a_limit_holds_is_left_out_of_the_step() -> None:
     """At a limit beyond which it would be cheaper; where it is cheaper within, it moves."""
     rng = np.random.default_rng(3)
     blocks = np.array([3, 2])
-    all = make_plan_batch(4, blocks, 5)
+    all = _make_plan_batch(4, blocks, 5)
     J, r = rng.normal(size=(len(all.residuals), 4)), rng.normal(size=len(all.residuals))
-    all.residuals[:] = r[:, None] + DIFFERENCE * np.insert(J, 0, 0.0, axis=1)
+    all.residuals[:] = r[:, None] + _DIFFERENCE * np.insert(J, 0, 0.0, axis=1)
     falls = -np.sign(J.T @ r)  # where the cost falls
     all.limits[1, 0], all.limits[2, 0] = falls[1], -falls[2]
     A, g, d = np.empty((4, 4)), np.empty(4), np.empty(4)
     _compute_normal_equations(all, A, g)
-    solve_damped_step(A, g, 0.0, np.empty((4, 4)), d)
+    _solve_damped_step(A, g, 0.0, np.empty((4, 4)), d)
     free = [0, 2, 3]
     assert d[1] == 0.0
     assert d[free] == pytest.approx(np.linalg.lstsq(J[:, free], -r)[0], rel=1e-6)
@@ -236,7 +217,7 @@ def test_a_variable_that_a_limit_holds_is_left_out_of_the_step() -> None:
 def test_no_plan_is_dearer_than_the_regulators_own() -> None:
     """However bad the plan is that the last decision left: zeros are tried too."""
     env, agent = made(YAW, scenario=SMALL, reference="model")
-    found = problem(agent, seen(env, 7.0, true_friction=0.9, beta_hat=0.01))
+    found = problem(agent, observe(env, 7.0, true_friction=0.9, beta_hat=0.01))
     blocks = agent.design.blocks
     plan = LIMIT * (-1.0) ** np.arange(len(blocks))
     zeros = cost_of(agent, found, np.zeros(len(blocks)))
@@ -274,13 +255,7 @@ def test_where_roll_is_not_measured_it_is_that_of_a_steady_turn() -> None:
     assert (start.motion.phi, start.motion.phi_dot) == pytest.approx((motion.phi, 0.0), rel=0.02)
 
 
-def test_bad_input() -> None:
-    env, _ = made(YAW)
-    for iterations in (0, 2.5, True):
-        with pytest.raises(ValueError, match="iterations is a positive whole number"):
-            make_agent("nmpc", env, iterations=iterations)
-    with pytest.raises(ValueError, match="horizon is a positive number"):
-        make_agent("nmpc", env, horizon=-1.0)
+def test_rows_of_different_plants_are_refused() -> None:
     plants = [{"base": "straight", "roll": roll} for roll in (True, False)]
     cars: Any = SyncVectorEnv([lambda each=each: made(YAW, scenario=each)[0] for each in plants])  # type: ignore[misc]
     with pytest.raises(ValueError, match="their plants differ"):

@@ -9,13 +9,14 @@ import pytest
 
 import sideslip
 from sideslip.agents import make_agent
-from sideslip.agents.controllers.two_dof import _compute_feedforward_gain
-from sideslip.agents.design.pi import POLE, design_pi, sample_pi
+from sideslip.agents.controllers.two_dof import _compute_static_gain
+from sideslip.agents.design.pi import POLE, design_pi, make_nominal_car, sample_pi
 from sideslip.envs import COMS, PASSENGER_CAR
 from sideslip.envs.vehicle.linear import make_bicycle_model
 from sideslip.estimators import EstimateObservation
+from tests.agents.helpers import observe
 
-KMH = 1 / 3.6
+KMH, CAR = 1 / 3.6, make_nominal_car(COMS)
 
 
 @pytest.mark.smoke
@@ -24,18 +25,14 @@ def test_feedforward_is_the_ratio_of_dc_gains() -> None:
     for kmh in (10.0, 20.0, 25.0, 45.0):
         model = make_bicycle_model(COMS, kmh * KMH)
         static = -np.linalg.solve(model.A, model.B)[0]  # beta over delta_f and N_z
-        assert _compute_feedforward_gain(COMS, kmh * KMH) == pytest.approx(
+        assert _compute_static_gain(CAR, kmh * KMH) == pytest.approx(
             -static[0] / static[1], rel=1e-12
         )
 
 
 def test_feedforward_at_25_kmh_and_its_change_of_sign() -> None:
-    assert _compute_feedforward_gain(COMS, 25 * KMH) == pytest.approx(-2652.0, abs=0.1)
-    assert (
-        _compute_feedforward_gain(COMS, 20.72 * KMH)
-        > 0
-        > _compute_feedforward_gain(COMS, 20.74 * KMH)
-    )
+    assert _compute_static_gain(CAR, 25 * KMH) == pytest.approx(-2652.0, abs=0.1)
+    assert _compute_static_gain(CAR, 20.72 * KMH) > 0 > _compute_static_gain(CAR, 20.74 * KMH)
 
 
 def test_feedforward_stays_finite_where_the_moment_does_not_move_beta() -> None:
@@ -43,7 +40,7 @@ def test_feedforward_stays_finite_where_the_moment_does_not_move_beta() -> None:
     m, l_f, l_r = PASSENGER_CAR.mass, PASSENGER_CAR.front_arm, PASSENGER_CAR.rear_arm
     C_f, C_r = PASSENGER_CAR.front_stiffness, PASSENGER_CAR.rear_stiffness
     speed = np.sqrt(2 * (l_r * C_r - l_f * C_f) / m)
-    assert np.isfinite(_compute_feedforward_gain(PASSENGER_CAR, float(speed)))
+    assert np.isfinite(_compute_static_gain(make_nominal_car(PASSENGER_CAR), float(speed)))
 
 
 @pytest.mark.parametrize("kmh", [10.0, 18.0, 25.0, 32.0, 45.0])
@@ -114,8 +111,6 @@ def test_sampling_fast_gives_the_continuous_design() -> None:
         one = sample_pi(COMS, 25.0 * KMH, 1e-5, POLE, placement)
         other = design_pi(COMS, 25.0 * KMH, POLE, placement)
         assert (one.k_p, one.k_i) == pytest.approx((other.k_p, other.k_i), rel=1e-3)
-    with pytest.raises(ValueError, match="placement is one of radius, real"):
-        sample_pi(COMS, 25.0 * KMH, 1e-3, POLE, "both")
 
 
 def _lane_change(agent: str, estimator: str, scenario: str, **options: Any) -> Any:
@@ -143,13 +138,9 @@ def test_the_integral_does_not_wind_up() -> None:
     """While the moment is saturated the memory stays below one full scale."""
     env = EstimateObservation(gym.make("sideslip/YawVision-v0"), "bicycle-kf")
     agent = make_agent("two-dof", env)
-    names = [entry.name for entry in env.get_wrapper_attr("layout")]
-    obs = np.zeros(len(names), np.float32)
-    obs[names.index("wheel_left")] = obs[names.index("wheel_right")] = 7.0
-    obs[names.index("beta_hat")] = 0.2
     state = None
     for _ in range(1000):
-        action, state = agent.predict(obs, state)
+        action, state = agent.predict(observe(env, beta_hat=0.2), state)
     assert action == pytest.approx([1.0])
     assert state is not None and abs(state[0, 0]) < COMS.yaw_moment_limit
 
@@ -160,18 +151,12 @@ def test_forward_to_the_reference_the_nominal_car_holds_it(kmh: float) -> None:
     env = EstimateObservation(
         gym.make("sideslip/YawFusion-v0", reference="model"), "exact-kf", std=False
     )
-    names = [entry.name for entry in env.layout]
     model, delta, v = make_bicycle_model(COMS, kmh * KMH), 0.01, kmh * KMH
     for beta in (0.0, 2e-3, -1e-3):
-        obs = np.zeros(len(names), np.float32)
-        values = {"wheel_left": v, "wheel_right": v, "steer_command": delta}
-        for name, value in (values | {"beta_ref": beta, "beta_hat": beta}).items():
-            obs[names.index(name)] = value
+        obs = observe(env, v, steer_command=delta, beta_ref=beta, beta_hat=beta)
         share, _ = make_agent("two-dof", env).predict(obs)
         turn = np.linalg.solve(model.A, -model.B @ [delta, share[0] * COMS.yaw_moment_limit])
         assert turn[0] == pytest.approx(beta, abs=1e-8)
         papers, _ = make_agent("two-dof", env, feedforward="zero-slip").predict(obs)
         turn = np.linalg.solve(model.A, -model.B @ [delta, papers[0] * COMS.yaw_moment_limit])
         assert turn[0] == pytest.approx(0.0, abs=1e-8)
-    with pytest.raises(ValueError, match="feedforward is one of reference, zero-slip"):
-        make_agent("two-dof", env, feedforward="none")

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,13 +14,13 @@ from sideslip.estimators.learned.network import Network
 pytest.importorskip("torch")
 import torch
 
-from sideslip.agents.training.networks import TraceLayer
+from sideslip.agents.training.distill import _EpisodeBatches
 from sideslip.agents.training.student import (
     Demonstrations,
     DistillConfig,
     Scaling,
     Student,
-    _EpisodeBatches,
+    _TraceLayer,
 )
 
 CARD = Card.from_env_id("sideslip/YawVision-v0")
@@ -93,7 +93,7 @@ def test_the_network_is_torchs(cut: int) -> None:
     mixing = np.eye(5) + 0.3 * np.ones((5, 5))
     scaling = Scaling(rng.normal(size=5), rng.uniform(0.5, 2.0, 5), mixing)
     x = rng.normal(size=(3, 150, 5)).astype(np.float32)
-    student.fit_whitening([drives_of(x)], scaling)
+    cast(_TraceLayer, student.traces).fit_whitening([drives_of(x)], scaling)
     z, net = torch.from_numpy(scaling.mix_inputs(x)), student.network(scaling)
     first, between = student(z[:, :cut])
     parts = [first] + ([student(z[:, cut:], between)[0]] if cut < 150 else [])
@@ -122,17 +122,16 @@ def test_what_is_plain_goes_on_without_correlation() -> None:
     layer: Any = student.traces
     there = drives_of(x).weights > 0.0
     before = layer(z)[0].detach().numpy()[there][:, :18]
-    student.fit_whitening([drives_of(x)], scaling)
+    layer.fit_whitening([drives_of(x)], scaling)
     mixed = layer(z)[0].detach().numpy()[there][:, :18]
     assert np.abs(np.corrcoef(before.T) - np.eye(18)).max() > 0.99
     assert np.cov(mixed.T) == pytest.approx(np.eye(18), abs=0.3)  # what hardly varies less
     assert mixed.mean(0) == pytest.approx(0.0, abs=0.05)
-    Student(3, 1, DistillConfig()).fit_whitening([], scaling)  # nothing remembered, nothing to mix
 
 
 def test_the_slope_reaches_the_first_step() -> None:
     """Which the last mean holds as much of as of any other."""
-    layer, z = TraceLayer(2, 3, (3, 1000)), torch.randn(1, 120, 2, requires_grad=True)
+    layer, z = _TraceLayer(2, 3, (3, 1000)), torch.randn(1, 120, 2, requires_grad=True)
     last = layer(z)[0][0, -1]  # two inputs with two means of each, then the same of three units
     (slope,) = torch.autograd.grad(last[4], z)
     assert slope[0, :, 0].numpy() == pytest.approx(1.0 / 120.0, rel=1e-4)

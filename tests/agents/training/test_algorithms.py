@@ -1,7 +1,6 @@
 """Every algorithm trains, goes on, is exported and stops at NaN; settings are checked."""
 
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +13,22 @@ pytest.importorskip("sb3_contrib")
 import torch
 
 from sideslip.agents.learned.policy import PolicyController, load_policy
-from sideslip.agents.training import callbacks, trainer
-from sideslip.agents.training.callbacks import BEST, CHECKPOINT, POLICY, Progress, RunOptions
-from sideslip.agents.training.checkpoint import read_state
+from sideslip.agents.training import trainer
+from sideslip.agents.training.callbacks import (
+    BEST,
+    CHECKPOINT,
+    POLICY,
+    Progress,
+    RunOptions,
+    read_state,
+)
 from sideslip.agents.training.config import (
     ALGORITHMS,
     HYPERPARAMS,
     WARM_START_ENTRY,
     WARM_START_TRACES_ENTRY,
     TrainingTask,
-    check_settings,
+    _check_settings,
     get_algorithm,
     make_model_options,
     read_settings,
@@ -32,14 +37,6 @@ from sideslip.agents.training.config import (
 SMALL: dict[str, Any] = {"n_steps": 16, "learning_starts": 64, "buffer_size": 4096}
 ROLLOUT, VISION = 128, "sideslip/YawVision-v0"
 EACH = RunOptions(eval_freq=ROLLOUT)
-
-
-@pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
 
 
 def tiny(algo: str, **more: Any) -> TrainingTask:
@@ -67,25 +64,31 @@ def tensors(model: Any) -> dict[str, Any]:
 
 @pytest.fixture(scope="module", params=list(ALGORITHMS))
 def trained(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """(task, folder, model) of two rollouts."""
+    """(task, folder, result) of two rollouts."""
     task, folder = tiny(request.param), tmp_path_factory.mktemp(request.param)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(callbacks, "_SCALING_ENVS", 8)
-        model = trainer.train(task, 2 * ROLLOUT, folder, run_options=EACH).model
-    return task, folder, model
+    return task, folder, trainer.train(task, 2 * ROLLOUT, folder, run_options=EACH)
 
 
 def test_it_goes_on_where_the_checkpoint_is(trained: Any) -> None:
-    task, folder, model = trained
+    """Weights, the optimiser's moments, the step size, the count, the evaluations."""
+    task, folder, first = trained
     again = trainer.train(task, 2 * ROLLOUT, folder, resume=True)  # there is nothing to do
-    one, other = tensors(model), tensors(again.model)
+    assert again.evaluations == first.evaluations
+    one, other = tensors(first.model), tensors(again.model)
     assert one.keys() == other.keys() and len(one) > 30
     assert all(torch.equal(one[name], other[name]) for name in one)
     assert any("log_ent_coef" in name for name in one) == (task.algo in ("sac", "tqc"))
     before = {name: value.clone() for name, value in other.items()}
     more = trainer.train(task, 4 * ROLLOUT, folder, resume=True, run_options=EACH)
     assert [each.steps // ROLLOUT for each in more.evaluations] == [0, 1, 2, 3, 4]
+    assert more.evaluations[:3] == first.evaluations
+    assert more.model.num_timesteps == 4 * ROLLOUT
+    if task.algo == "ppo":  # its settings let the step size fall to zero
+        rate = more.model.policy.optimizer.param_groups[0]["lr"]
+        assert rate == pytest.approx(0.0, abs=1e-12)
     moved = tensors(more.model)
+    measured = [name for name in moved if name.endswith("features_extractor.scale")]  # once
+    assert measured and all(torch.equal(moved[name], before[name]) for name in measured)
     actor = [name for name in moved if "policy " in name and name.endswith(".weight")]
     assert actor and all(not torch.equal(moved[name], before[name]) for name in actor)
 
@@ -112,9 +115,10 @@ def test_numpys_policy_drives_as_torchs(trained: Any) -> None:
 
 
 def test_the_same_seed_trains_the_same(trained: Any, tmp_path: Path) -> None:
-    task, _, model = trained
+    task, _, first = trained
     here = trainer.train(task, 2 * ROLLOUT, tmp_path, run_options=EACH)
-    one, other = tensors(model), tensors(here.model)
+    assert [each.cost for each in here.evaluations] == [each.cost for each in first.evaluations]
+    one, other = tensors(first.model), tensors(here.model)
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
@@ -156,7 +160,7 @@ def test_the_packages_settings_are_of_ids_there_are() -> None:
         ours = {"default", WARM_START_ENTRY, WARM_START_TRACES_ENTRY}
         assert "default" in entries and set(entries) - ours <= set(gym.registry)
         for key in entries:
-            check_settings(name, entries[key])
+            _check_settings(name, entries[key])
             assert read_settings(name, key) == entries[key]
     assert len(list(HYPERPARAMS.iterdir())) == len(ALGORITHMS)
 
@@ -195,3 +199,9 @@ def test_a_batch_divides_a_rollout_where_there_is_one() -> None:
     assert ppo["batch_size"] == 192
     replayed = {"n_steps": 3, "batch_size": 256}
     assert make_model_options("sac", replayed, 0.01, 64)["batch_size"] == 256
+    settings = TrainingTask().settings
+    for num_envs in (1, 7, 100, 256, 1000):
+        told = make_model_options("ppo", settings, 0.02, num_envs)
+        assert num_envs * told["n_steps"] % told["batch_size"] == 0
+        assert told["batch_size"] <= settings["batch_size"]
+        assert told["gamma"] == pytest.approx(settings["gamma"] ** 2, rel=1e-12)  # longer period

@@ -11,13 +11,12 @@ import torch
 from safetensors.torch import save
 
 from sideslip import __version__
-from sideslip.agents.training.callbacks import CHECKPOINT
-from sideslip.agents.training.checkpoint import FORMAT, STATE
+from sideslip.agents.training.callbacks import _FORMAT, _STATE, CHECKPOINT
 from sideslip.agents.training.config import TrainingTask
 from sideslip.agents.training.trainer import read_run_record, read_task
 
-WHOLE: dict[str, object] = dict.fromkeys(sorted(STATE), 0)
-WHOLE |= {"format": FORMAT, "task": dataclasses.asdict(TrainingTask()), "sideslip": __version__}
+WHOLE: dict[str, object] = dict.fromkeys(sorted(_STATE), 0)
+WHOLE |= {"format": _FORMAT, "task": dataclasses.asdict(TrainingTask()), "sideslip": __version__}
 
 
 def without(key: str, values: dict[str, object]) -> dict[str, object]:
@@ -32,7 +31,7 @@ def of(**change: object) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("state", "message"),
     [
-        *((without(key, WHOLE), f": the checkpoint's state lacks {key}") for key in sorted(STATE)),
+        *((without(key, WHOLE), f": the checkpoint's state lacks {key}") for key in sorted(_STATE)),
         *(
             (WHOLE | {"task": without(each.name, WHOLE["task"])}, f"'s task lacks {each.name}")  # type: ignore[arg-type]
             for each in dataclasses.fields(TrainingTask)

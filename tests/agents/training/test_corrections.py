@@ -10,13 +10,13 @@ import pytest
 
 pytest.importorskip("torch")
 from sideslip.agents.training.corrections import (
-    FIRST_ROUND,
+    _FIRST_ROUND,
     HELD_OUT,
     TRAINING,
-    Samples,
-    collect_samples,
-    compute_errors,
-    compute_quality,
+    _collect_samples,
+    _compute_errors,
+    _compute_quality,
+    _Samples,
     train_correction,
 )
 from sideslip.benchmarks.control.tasks import make_tuning_seeds
@@ -34,7 +34,7 @@ def test_it_learns_what_the_filter_lacks_and_says_how_well() -> None:
     """Of tyres that never vary and a filter that is told others: most of its error, on seeds that
     it has not seen, with intervals that hold what they promise."""
     found = train_correction(CARD, [DRIVE], episodes=16, epochs=150)
-    quality = compute_quality(found, collect_samples(found, [DRIVE], FIRST_ROUND[:1], 7, 32))
+    quality = _compute_quality(found, _collect_samples(found, [DRIVE], _FIRST_ROUND[:1], 7, 32))
     assert quality["rmse"] < 0.7 * quality["filter_rmse"]
     assert 0.85 < quality["coverage"] <= 1.0
     assert found.card.temperature > 0.0 and found.card.evaluation.keys() == quality.keys()
@@ -49,9 +49,9 @@ def test_a_seed_gives_the_same_bits_and_another_one_others() -> None:
 
 def test_samples_are_what_the_kernel_read_and_the_filters_error() -> None:
     made, (env_id, options) = correction(), DRIVE
-    seen = collect_samples(made, [(env_id, options)], [("none", "fusion")], 5, 3)
+    seen = _collect_samples(made, [(env_id, options)], [("none", "fusion")], 5, 3)
     assert seen.inputs.shape == (len(seen.errors), CARD.inputs) and len(seen.errors) > 60
-    errors, deviations = compute_errors(made, seen)
+    errors, deviations = _compute_errors(made, seen)
     assert np.abs(seen.inputs).max() <= 3.0  # its clip
     assert (deviations > 0.0).all() and np.isfinite(errors).all()
     assert np.abs(seen.errors).max() < 0.1
@@ -68,9 +68,9 @@ def test_the_kernel_adds_what_the_network_does() -> None:
         obs, *_ = env.step(np.full((3, 1), 0.2, np.float32))
         net = batch.first.net
         stack = batch.memory[:, locate_stack(net) : locate_stack(net) + int(net.sizes[0])]
-        seen = Samples(stack.astype(np.float32), batch.filters[:, 0].x[:, net.beta])
-        added.append(float(np.abs(compute_errors(made, seen)[0] - seen.errors).max()))
-        estimate = seen.errors + (seen.errors - compute_errors(made, seen)[0])
+        seen = _Samples(stack.astype(np.float32), batch.filters[:, 0].x[:, net.beta])
+        added.append(float(np.abs(_compute_errors(made, seen)[0] - seen.errors).max()))
+        estimate = seen.errors + (seen.errors - _compute_errors(made, seen)[0])
         assert obs[:, -1] == pytest.approx(estimate, abs=1e-6)
     assert max(added) > 1e-4
 
@@ -87,10 +87,3 @@ def test_a_learned_batch_is_pickled_whole() -> None:
 def test_nobody_else_has_its_seeds() -> None:
     assert min(TRAINING, HELD_OUT) > 2**66 + 2**40  # of trainings of policies
     assert max(make_tuning_seeds(4096)) < 2**32 < TRAINING
-
-
-def test_nothing_to_learn_from_is_refused() -> None:
-    with pytest.raises(ValueError, match="0 drives, 32 episodes, 20 epochs"):
-        train_correction(CARD, [])
-    with pytest.raises(ValueError, match="1 drives, 0 episodes"):
-        train_correction(CARD, [DRIVE], episodes=0)

@@ -15,15 +15,20 @@ from sideslip.agents.baselines import make_oracle
 from sideslip.agents.learned.policy import Card, load_policy
 from sideslip.agents.rollout import COST_FLOOR
 from sideslip.agents.training import distill as training
-from sideslip.agents.training.distill import DistillTask, collect_demonstrations, distill
+from sideslip.agents.training.distill import (
+    DistillTask,
+    _collect_demonstrations,
+    _fit_model,
+    distill,
+)
 from sideslip.agents.training.student import (
-    UNREAD,
+    _UNREAD,
     Demonstrations,
     DistillConfig,
     Scaling,
     Student,
+    _TraceLayer,
     compute_scaling,
-    fit_model,
     normalise_inputs,
 )
 from sideslip.envs.task import ObservationEntry
@@ -52,26 +57,26 @@ def test_a_student_comes_nearer_to_its_teacher_on_seeds_it_has_not_seen(learned:
     nothing = {name: [0.0 * x for x in getattr(last, name)] for name in ("weights", "biases")}
     idle = replace(last, **nothing)
     ours, none = (
-        collect_demonstrations(
+        _collect_demonstrations(
             lesson(), replace(found.policy, network=each), seeds, 0.0
         ).costs.mean()
         for each in (last, idle)
     )
-    teachers = collect_demonstrations(lesson(), None, seeds, 0.0).costs.mean()
+    teachers = _collect_demonstrations(lesson(), None, seeds, 0.0).costs.mean()
     assert teachers < ours < teachers + 0.5 * (none - teachers)
 
 
 def test_a_student_with_traces_mixes_them_once_by_the_first_drives(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[tuple[Any, Any]] = []
+    asked: list[tuple[Any, _TraceLayer]] = []
 
-    def whiten(self: Student, drives: Any, scaling: Scaling) -> None:
+    def whiten(self: _TraceLayer, drives: Any, scaling: Scaling) -> None:
         whole(self, drives, scaling)
-        asked.append((drives, self.traces))
+        asked.append((drives, self))
 
-    whole = Student.fit_whitening
-    monkeypatch.setattr(Student, "fit_whitening", whiten)
+    whole = _TraceLayer.fit_whitening
+    monkeypatch.setattr(_TraceLayer, "fit_whitening", whiten)
     course = replace(COURSE, rounds=2, epochs=1, cells=0, traces=3, told=0.5)
     path = tmp_path / "student.safetensors"
     found = distill(Card.from_env_id(ID, OPTIONS), [lesson()], course, path)
@@ -110,18 +115,11 @@ def test_the_network_is_torchs(cells: int) -> None:
     assert np.abs(ours - theirs).max() < 1e-6 < np.abs(np.diff(ours, axis=1)).max()
 
 
-def test_with_nothing_left_to_be_told_no_drive_is_made(tmp_path: Path) -> None:
-    _, twins, teacher = lesson()
-    course, path = replace(COURSE, told=0.5), tmp_path / "student.safetensors"
-    with pytest.raises(ValueError, match="nothing is left to be told"):
-        distill(Card.from_env_id(ID, OPTIONS), [DistillTask(twins, twins, teacher)], course, path)
-
-
 def test_what_is_told_is_what_the_teacher_reads_and_the_student_does_not_see() -> None:
     """On seeds that it has not seen, the cells know the yaw rate, which so short a training shows
     them; the policy's file has nothing of it."""
     seen, other = (
-        collect_demonstrations(lesson(), None, range(at, at + CARS), 0.1) for at in (0, 900)
+        _collect_demonstrations(lesson(), None, range(at, at + CARS), 0.1) for at in (0, 900)
     )
     cars, _, teacher = lesson()
     names = [entry.name for entry in cars.layout]
@@ -137,7 +135,7 @@ def test_what_is_told_is_what_the_teacher_reads_and_the_student_does_not_see() -
     torch.manual_seed(0)
     model = Student(len(names), 1, course, len(told))
     scaling = compute_scaling([seen], cars.layout, ("beta_hat",))
-    fit_model(model, [seen], scaling, course, 60)
+    _fit_model(model, [seen], scaling, course, 60)
     out = model(torch.from_numpy(scaling.mix_inputs(other.obs)))[0].detach().numpy()
     missed, varies = (
         x.mean((0, 1)) for x in ((out[..., 1:] - other.privileged) ** 2, other.privileged**2)
@@ -150,18 +148,18 @@ def test_what_is_told_is_what_the_teacher_reads_and_the_student_does_not_see() -
 
 def test_windows_in_which_every_episode_is_over_tell_nothing() -> None:
     """Such as those of a car that spins early, in a batch of its own."""
-    seen = collect_demonstrations(lesson(), None, range(CARS), 0.1)
+    seen = _collect_demonstrations(lesson(), None, range(CARS), 0.1)
     weights = seen.weights.copy()
     weights[:, 1:] = 0.0
     course = replace(COURSE, cells=4, told=1.0, batch=1)
     model = Student(seen.obs.shape[2], 1, course, seen.privileged.shape[2])
     scaling = compute_scaling([seen], lesson()[0].layout, ("beta_hat",))
-    assert np.isfinite(fit_model(model, [seen._replace(weights=weights)], scaling, course, 1))
+    assert np.isfinite(_fit_model(model, [seen._replace(weights=weights)], scaling, course, 1))
 
 
 def test_a_teacher_of_other_cars_is_refused() -> None:
     with pytest.raises(ValueError, match="cars are others than the student's"):
-        collect_demonstrations(lesson(scenario=SHORT | {"friction": 0.5}), None, range(CARS), 0.0)
+        _collect_demonstrations(lesson(scenario=SHORT | {"friction": 0.5}), None, range(CARS), 0.0)
 
 
 class Watched:
@@ -193,7 +191,7 @@ def test_a_teacher_is_told_what_was_done_and_teaches_what_it_knows() -> None:
         return step(action)
 
     plain.cars.step = noted
-    seen = collect_demonstrations(plain._replace(teacher=watched), None, range(CARS), 0.01)
+    seen = _collect_demonstrations(plain._replace(teacher=watched), None, range(CARS), 0.01)
     assert np.array_equal(watched.acts, done) and len(done) == seen.labels.shape[1]
     assert not seen.weights[3].any() and (np.delete(seen.weights, 3, axis=0) > 0.0).all()
     shaken = np.stack(done, axis=1)[..., 0] - seen.labels[..., 0]
@@ -203,7 +201,7 @@ def test_a_teacher_is_told_what_was_done_and_teaches_what_it_knows() -> None:
 def test_what_the_teachers_sensors_do_changes_no_car() -> None:
     """`oracle-parameters` has sensors without biases: another record of the same motion."""
     knowing = make_oracle("oracle-parameters-lqr", ID, CARS, **OPTIONS)
-    seen = collect_demonstrations(
+    seen = _collect_demonstrations(
         lesson()._replace(teachers=knowing[0], teacher=knowing[1]), None, range(CARS), 0.1
     )
     assert (seen.weights > 0.0).all() and np.ptp(seen.labels) > 0.0
@@ -212,7 +210,7 @@ def test_what_the_teachers_sensors_do_changes_no_car() -> None:
 def test_a_drive_that_is_lost_weighs_as_a_usual_one() -> None:
     """So that what led there is learned, however much it cost."""
     plain, capped = (
-        collect_demonstrations(lesson(), None, range(CARS), 0.1, most) for most in (np.inf, 0.0)
+        _collect_demonstrations(lesson(), None, range(CARS), 0.1, most) for most in (np.inf, 0.0)
     )
     assert np.allclose(plain.weights[:, 0], 1.0 / (plain.costs + COST_FLOOR))
     assert np.allclose(capped.weights, 1.0 / COST_FLOOR) and (capped.costs == plain.costs).all()
@@ -220,12 +218,12 @@ def test_a_drive_that_is_lost_weighs_as_a_usual_one() -> None:
 
 def test_a_student_that_sees_what_its_teacher_reads_reads_nothing_else() -> None:
     cars = lesson().cars
-    seen = [collect_demonstrations(lesson(), None, range(CARS), 0.1)]
+    seen = [_collect_demonstrations(lesson(), None, range(CARS), 0.1)]
     names = [entry.name for entry in cars.layout]
     for needs, there in ((("steer", "beta_ref"), {"steer"}), (("beta_hat",), None)):
         scaling = compute_scaling(seen, cars.layout, needs)
         reads = {name for name, each in zip(names, scaling.scale, strict=True) if each > 0.0}
-        assert reads == there if there else "gyro" in reads and not reads & set(UNREAD)
+        assert reads == there if there else "gyro" in reads and not reads & set(_UNREAD)
 
 
 def test_an_age_is_scaled_as_it_varies_while_packets_come() -> None:
@@ -250,8 +248,8 @@ def test_an_age_is_scaled_as_it_varies_while_packets_come() -> None:
 def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, real = tmp_path / "student.safetensors", fit_model
-    drives = [collect_demonstrations(lesson(), None, range(CARS), 0.0)]
+    path, real = tmp_path / "student.safetensors", _fit_model
+    drives = [_collect_demonstrations(lesson(), None, range(CARS), 0.0)]
     names, model = len(drives[0].obs[0, 0]), Student(len(drives[0].obs[0, 0]), 1, COURSE)
     with pytest.raises(FloatingPointError, match=r"the loss is nan at step \d+"):
         scaling = Scaling(np.full(names, np.nan), np.ones(names), np.eye(names))
@@ -264,42 +262,17 @@ def test_a_training_that_diverges_stops_with_the_step_and_leaves_the_last_good_f
             raise FloatingPointError("the loss is nan at step 3")
         return real(*arguments)
 
-    monkeypatch.setattr(training, "fit_model", second)
+    monkeypatch.setattr(training, "_fit_model", second)
     quick = replace(COURSE, epochs=1)
     with pytest.raises(FloatingPointError):
         distill(Card.from_env_id(ID, OPTIONS), [lesson()], quick, path)
     assert load_policy(path).card.steps == CARS * 120
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"rounds": 0}, "1 at least"),
-        ({"hidden": (0,)}, "1 at least"),
-        ({"seed": -1}, "1 at least"),
-        ({"learning_rate": float("nan")}, "learning_rate"),
-        ({"noise": -0.1}, "learning_rate is above zero, noise"),
-        ({"told": -1.0}, "noise and told not below"),
-        ({"batch": 0}, "1 at least"),
-        ({"told": 1.0, "cells": 0}, "nothing to say"),
-        ({"traces": -1}, "cells, traces and seed 0"),
-        ({"traces": 4, "cells": 3}, "cells or traces, got 3 and 4"),
-    ],
-)
-def test_a_course_out_of_range_is_refused(wrong: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        DistillConfig(**wrong)
-
-
-def test_nothing_to_learn_from_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no lessons"):
-        distill(Card.from_env_id(ID, OPTIONS), [], COURSE, tmp_path / "student.safetensors")
-
-
 def test_mixed_inputs_show_what_two_of_them_differ_by() -> None:
     """As course less heading, whose difference is a tenth of either: it varies like the rest."""
     cars = lesson().cars
-    seen = collect_demonstrations(lesson(), None, range(CARS), 0.1)
+    seen = _collect_demonstrations(lesson(), None, range(CARS), 0.1)
     names, rng = [entry.name for entry in cars.layout], np.random.default_rng(0)
     a, b = (names.index(name) for name in ("gps_course", "camera_psi"))
     seen.obs[..., a] = rng.normal(size=seen.obs.shape[:2])

@@ -16,9 +16,9 @@ from sideslip.agents.training.gradient import (
     AnalyticPolicyGradient,
     GruPolicy,
     TrainingSource,
-    unroll_window,
+    _unroll_window,
 )
-from sideslip.agents.training.warm_start import RewardScale
+from sideslip.agents.training.normalise import RewardScale
 from sideslip.agents.vec_env import make_vec_env
 from sideslip.envs.device import DeviceVectorEnv
 
@@ -52,7 +52,7 @@ def policy_of(cars: Any) -> Any:
 def paid_by(policy: Any, cars: Any, weights: Any, steps: int) -> Any:
     obs, _ = cars.reset(seed=list(range(cars.num_envs)))
     rates = RewardScale([[each] for each in weights.tolist()])
-    return unroll_window(policy, cars, obs, policy.begin(cars.num_envs).double(), rates, steps)
+    return _unroll_window(policy, cars, obs, policy._begin(cars.num_envs).double(), rates, steps)
 
 
 def test_the_slope_is_that_of_the_cost() -> None:
@@ -84,7 +84,7 @@ def test_a_car_of_weight_zero_teaches_nothing() -> None:
     paid, *_ = paid_by(policy, cars, torch.tensor([0.0, 1.0], dtype=torch.float64), 4)
     alone = cars_of(1)
     obs, _ = alone.reset(seed=[1])
-    one, *_ = unroll_window(policy, alone, obs, policy.begin(1).double(), RewardScale([[1.0]]), 4)
+    one, *_ = _unroll_window(policy, alone, obs, policy._begin(1).double(), RewardScale([[1.0]]), 4)
     assert paid.item() == pytest.approx(0.5 * one.item(), rel=1e-12) and one.item() > 0.0
 
 
@@ -112,8 +112,8 @@ def test_a_drive_has_a_weight_of_its_own() -> None:
     policy, parts = policy_of(cars), []
     for rates in ([2.0, 0.0], [0.0, 3.0], [2.0, 3.0]):
         obs, _ = cars.reset(seed=[0])
-        start = policy.begin(1).double()
-        paid, *_ = unroll_window(
+        start = policy._begin(1).double()
+        paid, *_ = _unroll_window(
             policy, cars, obs, start, RewardScale([rates]), 20
         )  # an episode has 15
         parts.append(paid.item())
@@ -121,7 +121,7 @@ def test_a_drive_has_a_weight_of_its_own() -> None:
 
 
 def begun(task: TrainingTask, folder: Path) -> Any:
-    return EvalCallback(task, folder, None, RunOptions(), 1, load_policy("raw-car-yaw")).build(None)
+    return EvalCallback(task, folder, None, RunOptions(), 1, load_policy("raw-car-yaw")).build()
 
 
 def test_what_begins_with_a_distilled_policy_acts_as_it_does(tmp_path: Path) -> None:
@@ -136,12 +136,6 @@ def test_what_begins_with_a_distilled_policy_acts_as_it_does(tmp_path: Path) -> 
         assert np.abs(a - b).max() < 1e-5
         obs, _, terminated, truncated, _ = env.step(a)
         start = terminated | truncated
-
-
-def test_another_form_than_the_policys_is_named(tmp_path: Path) -> None:
-    smaller = tuned_task(policy_kwargs={"cells": 8, "net_arch": [64, 64]})
-    with pytest.raises(ValueError, match=r"network of {.*'cells': 96}, and the .* {'cells': 8,"):
-        begun(smaller, tmp_path)
 
 
 class Torn:
@@ -183,12 +177,3 @@ def test_a_slope_that_is_not_finite_stops_it_at_its_step() -> None:
     with pytest.raises(FloatingPointError, match="slope is not finite after step 6"):
         model.learn(12)
     assert all(torch.equal(a, b) for a, b in zip(before, model.policy.parameters(), strict=True))
-
-
-def test_what_it_cannot_do_is_said() -> None:
-    with pytest.raises(ValueError, match="gradient reads sensors alone: no estimator runs on"):
-        TrainingTask(VISION, "gradient", "exact-kf")
-    with pytest.raises(ValueError, match="n_steps is at least 1, got 0"):
-        made(None, n_steps=0)
-    with pytest.raises(ValueError, match="needs their source"):
-        made(None).learn(1)

@@ -10,16 +10,17 @@ pytest.importorskip("torch")
 import torch
 
 from sideslip.agents.optimum import Lqg, wrap_optimal_estimate
-from sideslip.agents.training.distill import DistillTask, collect_demonstrations
-from sideslip.agents.training.networks import MAX_AGE, RATE, CompactObservation
+from sideslip.agents.training.distill import DistillTask, _collect_demonstrations
 from sideslip.agents.training.recurrent import (
+    MAX_AGE,
     MEMORIES,
-    Kalman,
-    MemoryAgent,
-    make_memory,
+    RATE,
+    CompactObservation,
+    _Kalman,
+    _MemoryAgent,
     train_memory,
 )
-from sideslip.agents.training.student import DistillConfig, compute_scaling, normalise_inputs
+from sideslip.agents.training.student import DistillConfig, normalise_inputs
 
 ID, CARS, INPUTS, FRESH, STEPS = "sideslip/LinearYawVision-v0", 16, 5, 4, 90
 CAMERA = {"period": 0.04, "delays": [0.03], "loss": 0.3}
@@ -35,7 +36,7 @@ def name(request: Any) -> str:
 def made(name: str, late: int = 3) -> tuple[Any, Any]:
     """A memory whose parts all act, and inputs (2, STEPS, INPUTS) with packets."""
     torch.manual_seed(0)
-    model, rng = make_memory(name, INPUTS, FRESH, late), np.random.default_rng(0)
+    model, rng = MEMORIES[name](INPUTS, FRESH, late), np.random.default_rng(0)
     with torch.no_grad():
         for each in model.parameters():
             each.add_(0.02 * torch.randn_like(each))
@@ -74,7 +75,7 @@ def test_windows_and_single_steps_are_the_whole(name: str) -> None:
 
 def test_an_episode_begins_without_the_last_ones_memory(name: str) -> None:
     model, z = made(name)
-    agent, x = MemoryAgent(model, np.zeros(INPUTS), np.ones(INPUTS)), z.numpy()
+    agent, x = _MemoryAgent(model, np.zeros(INPUTS), np.ones(INPUTS)), z.numpy()
     state = None
     for t in range(20):
         _, state = agent.predict(x[:, t], state, np.zeros(2, bool))
@@ -93,7 +94,7 @@ def test_without_packets_an_observer_that_is_late_knows_what_a_prompt_one_knows(
     for late in (0, 7):
         torch.manual_seed(1)
         with torch.no_grad():
-            known.append(Kalman(INPUTS, FRESH, late)._update_memory(z, none, None)[0])
+            known.append(_Kalman(INPUTS, FRESH, late)._update_memory(z, none, None)[0])
     assert (known[0] - known[1]).abs().max() < 1e-5 < known[0].abs().max()
 
 
@@ -105,11 +106,10 @@ def lesson(**camera: Any) -> DistillTask:
 
 def test_inputs_are_whitened() -> None:
     mine = lesson()
-    seen = [collect_demonstrations(mine, None, range(CARS), 0.3)]
-    mean, scale, _ = compute_scaling(seen, mine.cars.layout, mine.teacher.needs, usual_ages=False)
+    seen = [_collect_demonstrations(mine, None, range(CARS), 0.3)]
     inputs = len(mine.cars.layout)
-    model = make_memory("mlp", inputs, inputs - 1, 0)
-    model.fit_whitening(seen, mean, scale)
+    model = MEMORIES["mlp"](inputs, inputs - 1, 0)
+    mean, scale, _ = model.fit_scaling(seen, mine.cars.layout, mine.teacher.needs)
     z = normalise_inputs(seen[0].obs, mean, scale).reshape(-1, inputs) @ model.mix.numpy()
     spread = np.linalg.eigvalsh(np.cov(z.T))
     assert spread.max() == pytest.approx(1.0, abs=1e-3)
@@ -147,14 +147,14 @@ def test_a_memory_comes_nearer_to_the_filter() -> None:
     agent = train_memory("frames", lesson(), COURSE, 3, 3e-4, rounds.append)
     assert [each.steps for each in rounds] == [CARS * 100, 2 * CARS * 100]
     ours, idle = (
-        np.square(collect_demonstrations(lesson(), each, range(CARS), 0.0).labels).sum()
-        for each in (agent, MemoryAgent(_still(agent.model), agent.mean, agent.scale))
+        np.square(_collect_demonstrations(lesson(), each, range(CARS), 0.0).labels).sum()
+        for each in (agent, _MemoryAgent(_still(agent.model), agent.mean, agent.scale))
     )
     assert ours < 0.7 * idle  # what remains to be done about the car
 
 
 def _still(model: Any) -> Any:
-    other = make_memory("mlp", model.inputs, model.fresh_index, model.delay_steps)
+    other = MEMORIES["mlp"](model.inputs, model.fresh_index, model.delay_steps)
     for each in other.parameters():
         each.data.zero_()
     return other
@@ -164,23 +164,3 @@ def test_the_same_seed_learns_the_same() -> None:
     course = DistillConfig(rounds=1, epochs=1, noise=0.3)
     first, second = (train_memory("gru", lesson(), course, 3).model.state_dict() for _ in range(2))
     assert all(torch.equal(first[key], second[key]) for key in first)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("lstm", 5, 4, 0), "unknown memory 'lstm'; known: mlp, frames, gru"),
-        (("gru", 5, 5, 0), "fresh is one of 5 inputs"),
-        (("kalman", 5, 4, -1), "late at least 0, got fresh 4, late -1"),
-    ],
-)
-def test_a_memory_that_cannot_be_is_refused(arguments: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        make_memory(*arguments)
-
-
-def test_a_lesson_without_packets_is_refused() -> None:
-    mine = lesson()
-    mine.cars.layout = tuple(e for e in mine.cars.layout if not e.name.endswith("_fresh"))
-    with pytest.raises(ValueError, match="one sensor with packets, got 0"):
-        train_memory("gru", mine, COURSE, 3)

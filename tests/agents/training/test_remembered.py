@@ -16,13 +16,18 @@ from sideslip.agents.training.callbacks import (
     _SCALING_SEEDS,
     WARM_START_FILE,
     RunOptions,
-    make_evaluation_seeds,
+    _make_evaluation_seeds,
 )
 from sideslip.agents.training.export import convert_sb3_policy
-from sideslip.agents.training.networks import MemoryObservation, measure_mixing
 from sideslip.agents.training.student import DistillConfig, Scaling, Student
 from sideslip.agents.training.trainer import train
-from sideslip.agents.training.warm_start import NetworkAgent, PolicyWarmStart, make_finetune_task
+from sideslip.agents.training.warm_start import (
+    MemoryObservation,
+    PolicyWarmStart,
+    _measure_mixing,
+    _NetworkAgent,
+    make_finetune_task,
+)
 
 ID = "sideslip/YawFusion-v0"
 OPTIONS: dict[str, Any] = {"vehicle": "coms", "nominal": "coms", "reference": "zero-slip"}
@@ -93,8 +98,7 @@ def test_a_row_that_is_not_reset_goes_on_with_its_memory(policy: Policy) -> None
 def test_mixed_and_back_a_network_is_the_same(policy: Policy) -> None:
     """And what is remembered in its own drives varies alike, mixed."""
     net = policy.network
-    drive = NetworkAgent(net.dense)
-    mixing = measure_mixing(cars(60), net, lambda obs: drive.predict(obs)[0], 3)
+    mixing = _measure_mixing(cars(60), net, 3)
     mixed, x = (
         mixing.adapt_to_mixed(net),
         np.random.default_rng(1).normal(size=(5, net.dense.inputs)),
@@ -107,7 +111,7 @@ def test_mixed_and_back_a_network_is_the_same(policy: Policy) -> None:
     seen, (obs, _) = [], env.reset(seed=3)
     for _ in range(STEPS):
         seen.append(obs)
-        obs, *_ = env.step(NetworkAgent(mixed.dense).predict(obs)[0])
+        obs, *_ = env.step(_NetworkAgent(mixed.dense).predict(obs)[0])
     found = np.concatenate(seen[::7])
     assert np.abs(found.mean(0)).max() < 0.05 and np.var(found, axis=0).max() < 1.1
 
@@ -124,9 +128,9 @@ def test_ppo_goes_on_behind_the_traces(policy: Policy, tmp_path: Path) -> None:
     assert np.array_equal(kept.mean, policy.network.mean)
     begun = PolicyWarmStart(policy, task, task.vector_env(4), _SCALING_SEEDS + task.seed)
     last = begun.merge_network(convert_sb3_policy(found.model))
-    seeds = make_evaluation_seeds(4)
+    seeds = _make_evaluation_seeds(4)
     begins, ours, best = (
-        evaluate_costs(task.vector_env(4), NetworkAgent(each), seeds)
+        evaluate_costs(task.vector_env(4), _NetworkAgent(each), seeds)
         for each in (policy.network, last, kept)
     )
     theirs = evaluate_costs(begun.wrap_env(task.vector_env(4)), found.model, seeds)

@@ -7,9 +7,9 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
@@ -22,49 +22,35 @@ pytest.importorskip("stable_baselines3")
 import torch
 from safetensors.torch import save
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecNormalize
 
 from sideslip.agents.training import callbacks, trainer
-from sideslip.agents.training.callbacks import BEST, CHECKPOINT, CURVE, POLICY, Progress, RunOptions
-from sideslip.agents.training.checkpoint import read_state
-from sideslip.agents.training.config import TrainingTask, make_model_options
-from sideslip.agents.training.export import convert_sb3_policy
+from sideslip.agents.training.callbacks import (
+    BEST,
+    CHECKPOINT,
+    CURVE,
+    POLICY,
+    Progress,
+    RunOptions,
+    read_state,
+)
+from sideslip.agents.training.config import TrainingTask
 from sideslip.agents.training.trainer import read_task
-from sideslip.agents.vec_env import make_vec_env
 
 TINY = TrainingTask(num_envs=8, env_options={"scenario": "sine-with-dwell"}, seed=3, n_eval_envs=4)
 ROLLOUT = 256  # steps of 8 environments
 EACH = RunOptions(eval_freq=ROLLOUT)
 
 
-@pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
-
-
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of a training of three rollouts."""
     path = tmp_path_factory.mktemp("trained")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(callbacks, "_SCALING_ENVS", 8)
-        trainer.train(TINY, 3 * ROLLOUT, path, run_options=EACH)
-    yield path
+    trainer.train(TINY, 3 * ROLLOUT, path, run_options=EACH)
+    return path
 
 
 def curve(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / CURVE).read_text().splitlines()]
-
-
-def parameters(model: Any) -> dict[str, Any]:
-    """Every tensor of a model and of its optimisers, by name."""
-    found: dict[str, Any] = dict(model.policy.state_dict())
-    for i, each in model.policy.optimizer.state_dict()["state"].items():
-        found |= {f"{i} {key}": value for key, value in each.items()}
-    return found
 
 
 def test_the_best_evaluation_is_kept(folder: Path) -> None:
@@ -73,7 +59,7 @@ def test_the_best_evaluation_is_kept(folder: Path) -> None:
     assert np.all(np.diff([line["cpu_seconds"] for line in lines]) > 0.0)
     model = PPO.load(folder / BEST, device="cpu")
     env = TINY.vector_env(4)
-    seeds = callbacks.make_evaluation_seeds(4)
+    seeds = callbacks._make_evaluation_seeds(4)
     best = min(line["cost"] for line in lines)
     assert evaluate_costs(env, model, seeds).mean() == pytest.approx(best, rel=1e-6)
     policy = PolicyController(env, folder / POLICY)
@@ -86,32 +72,6 @@ def test_the_best_evaluation_is_kept(folder: Path) -> None:
     none = evaluate_costs(env, still, seeds).mean()
     assert lines[0]["of_none"] == pytest.approx(lines[0]["cost"] / none, rel=1e-12)
     assert sorted(os.listdir(folder)) == sorted([BEST, CHECKPOINT, CURVE, POLICY])
-
-
-def test_training_goes_on_where_the_checkpoint_is(folder: Path, tmp_path: Path) -> None:
-    """Weights, the optimiser's moments, the step size, the count, the evaluations."""
-    first = trainer.train(TINY, 2 * ROLLOUT, tmp_path, run_options=EACH)
-    again = trainer.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)  # there is nothing to do
-    assert again.evaluations == first.evaluations
-    one, other = parameters(first.model), parameters(again.model)
-    assert one.keys() == other.keys() and len(one) > 30
-    assert all(torch.equal(one[name], other[name]) for name in one)
-    more = trainer.train(TINY, 5 * ROLLOUT, tmp_path, resume=True, run_options=EACH)
-    assert more.model.num_timesteps == 5 * ROLLOUT
-    assert more.evaluations[:3] == first.evaluations
-    assert [each.steps // ROLLOUT for each in more.evaluations] == [0, 1, 2, 3, 4, 5]
-    rate = more.model.policy.optimizer.param_groups[0]["lr"]
-    assert rate == pytest.approx(0.0, abs=1e-12)
-    moved = parameters(more.model)
-    assert not torch.equal(moved["action_net.weight"], one["action_net.weight"])
-    assert torch.equal(
-        moved["features_extractor.scale"], one["features_extractor.scale"]
-    )  # measured once
-
-
-def test_the_same_seed_trains_the_same(folder: Path, tmp_path: Path) -> None:
-    here = trainer.train(TINY, 3 * ROLLOUT, tmp_path, run_options=EACH)
-    assert [each.cost for each in here.evaluations] == [line["cost"] for line in curve(folder)]
 
 
 def test_no_seed_serves_two_purposes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,7 +88,7 @@ def test_no_seed_serves_two_purposes(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(StabilityVectorEnv, "reset", watched)
     trainer.train(TINY, ROLLOUT, tmp_path)
     trainer.train(TINY, 2 * ROLLOUT, tmp_path, resume=True)
-    tested = set(callbacks.make_evaluation_seeds(4))
+    tested = set(callbacks._make_evaluation_seeds(4))
     others = [seed for seed in told if seed not in tested]
     assert len(others) == len(set(others)) == 8 + 8 + 8  # scaling, training, going on
     assert min(told) >= 2**63
@@ -227,47 +187,30 @@ def test_a_file_that_is_no_checkpoint_says_so(folder: Path, tmp_path: Path) -> N
         read_task(tmp_path)
 
 
-def test_what_cannot_be_trained_says_why_and_leaves_no_checkpoint(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="unknown algorithm 'dqn'; known: ppo, sac, tqc"):
-        TrainingTask(algo="dqn")
-    with pytest.raises(ValueError, match="seed is at least 0, got -1"):
-        TrainingTask(seed=-1)
-    with pytest.raises(ValueError, match="steps is at least 1, got 0"):
-        trainer.train(TINY, 0, tmp_path)
-    for task, said in (
-        (TrainingTask(estimator="dakf"), "dakf needs the slow sensor gps"),
-        (TrainingTask(estimator="kf"), "kf"),
-        (TrainingTask(env_options={"scenario": "moon"}), "unknown scenario 'moon'"),
-        (TrainingTask("CartPole-v1"), "has no native vector env"),
-    ):
-        with pytest.raises(ValueError, match=said):
-            trainer.train(task, 10, tmp_path)
-    assert not (tmp_path / CHECKPOINT).exists()
-
-
-def test_the_network_of_the_file_standardises_as_torch_does(folder: Path) -> None:
-    model = PPO.load(folder / BEST, device="cpu")
-    network = convert_sb3_policy(model)
-    env = TINY.vector_env(8)
-    obs, _ = env.reset(seed=0)
-    for _ in range(50):
-        actions, _ = model.predict(obs, deterministic=True)
-        assert np.clip(network(obs.astype(np.float64)), -1.0, 1.0) == pytest.approx(
-            actions, abs=1e-6
-        )
-        obs, *_ = env.step(actions)
-    twice = VecNormalize(make_vec_env(TINY.env_id, 2))
-    with pytest.raises(ValueError, match="normalised twice"):
-        convert_sb3_policy(model, twice)
-
-
-@pytest.mark.parametrize("num_envs", [1, 7, 100, 256, 1000])
-def test_batches_divide_a_rollout(num_envs: int) -> None:
-    settings = TrainingTask().settings
-    told = make_model_options("ppo", settings, 0.02, num_envs)
-    assert num_envs * told["n_steps"] % told["batch_size"] == 0
-    assert told["batch_size"] <= settings["batch_size"]
-    assert told["gamma"] == pytest.approx(settings["gamma"] ** 2, rel=1e-12)  # a longer period
+def test_a_tracked_training_hands_over_what_is_logged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One run: named as the folder, told the task, given evaluations and losses, and ended."""
+    run = Mock()
+    monkeypatch.setitem(sys.modules, "wandb", Mock(init=run.init))
+    trainer.train(TINY, ROLLOUT, tmp_path / "mine", run_options=RunOptions(track="cars"))
+    assert run.init.call_args.kwargs["project"] == "cars"
+    assert run.init.call_args.kwargs["name"] == "mine"
+    assert run.init.call_args.kwargs["config"]["env_id"] == TINY.env_id
+    own = run.init.return_value
+    logged = [(each.kwargs["step"], each.args[0]) for each in own.log.call_args_list]
+    lines = [json.loads(line) for line in (tmp_path / "mine" / CURVE).read_text().splitlines()]
+    rewards = {
+        step: each["eval/mean_reward"] for step, each in logged if "eval/mean_reward" in each
+    }
+    assert rewards == {each["steps"]: -each["cost"] for each in lines}
+    assert any("train/loss" in each for _, each in logged)
+    own.finish.assert_called_once_with()
+    assert own.method_calls[-1] == call.finish()  # a run that ended takes nothing
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(ModuleNotFoundError, match="tracking needs wandb: pip install wandb"):
+        trainer.train(TINY, ROLLOUT, tmp_path / "other", run_options=RunOptions(track="cars"))
+    assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.long

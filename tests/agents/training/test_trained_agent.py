@@ -1,6 +1,5 @@
 """A training begins with the weights of a zip: ours, or a foreign one with its VecNormalize."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +8,10 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 import torch
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sideslip.agents.training import callbacks, trainer
+from sideslip.agents.training import trainer
 from sideslip.agents.training.callbacks import BEST, RunOptions
 from sideslip.agents.training.config import TrainingTask
 from sideslip.agents.training.normalise import CLIP
@@ -20,11 +19,6 @@ from sideslip.agents.vec_env import make_vec_env
 
 SHORT: dict[str, Any] = {"scenario": {"base": "sine-with-dwell", "duration": 0.3}}
 TASK = TrainingTask(num_envs=4, env_options=SHORT, n_eval_envs=4)
-
-
-@pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(callbacks, "_SCALING_ENVS", 8)
 
 
 def observations() -> Any:
@@ -37,7 +31,7 @@ def begun(tmp_path: Path, zipped: Path, trust: bool = False) -> Any:
     """The model before its first step."""
     place = tmp_path / "new"
     place.mkdir()
-    return trainer.EvalCallback(TASK, place, None, RunOptions()).build(None, zipped, trust)
+    return trainer.EvalCallback(TASK, place, None, RunOptions()).build(zipped, trust)
 
 
 def foreign(path: Path, normalised: bool, **options: Any) -> Any:
@@ -82,28 +76,3 @@ def test_a_zip_from_elsewhere_acts_as_it_did(normalised: bool, tmp_path: Path) -
             scale == 0.0
         ]
     assert model.predict(x, deterministic=True)[0] == pytest.approx(acts(x), abs=1e-6)
-
-
-def test_what_no_training_can_begin_with_is_refused(tmp_path: Path) -> None:
-    foreign(tmp_path / "model.zip", True)
-    zipped = tmp_path / "model.zip"
-    for arguments, kind, said in (
-        ((zipped,), PermissionError, "vecnormalize.pkl is a pickle.*--trust"),
-        ((tmp_path / "none.zip",), FileNotFoundError, "none.zip: no such file"),
-        ((tmp_path / "vecnormalize.pkl",), ValueError, "is no zip, or is cut short"),
-    ):
-        with pytest.raises(kind, match=said):
-            trainer.train(TASK, 128, tmp_path / "new", trained_agent=arguments[0])
-    assert not (tmp_path / "new" / trainer.CHECKPOINT).exists()
-    with pytest.raises(ValueError, match="goes on from its checkpoint begins with nothing else"):
-        trainer.train(TASK, 128, tmp_path / "new", resume=True, trained_agent=zipped)
-    reading = dataclasses.replace(TASK, reads=["gyro"])  # of which the zip's network knows nothing
-    with pytest.raises(ValueError, match="give reads or a network"):
-        trainer.train(reading, 128, tmp_path / "new", trained_agent=zipped)
-    (tmp_path / "vecnormalize.pkl").unlink()
-    foreign(zipped, False, policy_kwargs={"net_arch": [8]})
-    with pytest.raises(ValueError, match="holds other networks than this training's PPO"):
-        trainer.train(TASK, 128, tmp_path / "new", trained_agent=zipped)
-    SAC("MlpPolicy", make_vec_env(TASK.env_id, 1), buffer_size=10, device="cpu").save(zipped)
-    with pytest.raises(ValueError, match="holds other networks than this training's PPO"):
-        trainer.train(TASK, 128, tmp_path / "new", trained_agent=zipped)

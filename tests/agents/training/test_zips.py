@@ -3,6 +3,7 @@
 import functools
 import json
 import pickle
+import sys
 import zipfile
 from copy import deepcopy
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 
 import sideslip
 from sideslip.agents.learned.policy import load_policy
-from sideslip.agents.training.export import export_zip
+from sideslip.agents.training.export import convert_sb3_policy, export_zip
 
 sb3 = pytest.importorskip("stable_baselines3")
 contrib = pytest.importorskip("sb3_contrib")
@@ -208,68 +209,59 @@ class Shy(FlattenExtractor):
     """So does this."""
 
 
-REFUSED: dict[str, tuple[Any, Any, Any, dict[str, Any], str]] = {
+def offered(
+    kind: Any = sb3.PPO, policy: Any = "MlpPolicy", env: Any = bridged, **options: Any
+) -> tuple[Any, Any, Any, dict[str, Any]]:
+    return kind, policy, env, {"policy_kwargs": SMALL} | options
+
+
+IMAGES = functools.partial(envs.FakeImageEnv, discrete=False)
+SEVERAL = functools.partial(envs.SimpleMultiObsEnv, discrete_actions=False)
+FUSION = functools.partial(bridged, env_id="sideslip/YawFusion-v0")
+BOX = functools.partial(envs.IdentityEnvBox, -1, 1)
+HALF = functools.partial(torch.nn.ELU, 0.5)
+REFUSED: dict[str, tuple[tuple[Any, Any, Any, dict[str, Any]], str]] = {
     "CNN": (
-        sb3.PPO,
-        "CnnPolicy",
-        functools.partial(envs.FakeImageEnv, discrete=False),
-        {"policy_kwargs": {}, "n_steps": 8},
+        offered(policy="CnnPolicy", env=IMAGES, policy_kwargs={}, n_steps=8),
         "the actor of .*ActorCriticCnnPolicy is not known; known: ActorCriticPolicy, SACPolicy",
     ),
     "several inputs": (
-        sb3.PPO,
-        "MultiInputPolicy",
-        functools.partial(envs.SimpleMultiObsEnv, discrete_actions=False),
-        {"policy_kwargs": {}, "n_steps": 8},
+        offered(policy="MultiInputPolicy", env=SEVERAL, policy_kwargs={}, n_steps=8),
         "actor of .*MultiInputActorCriticPolicy is not known",
     ),
-    "own policy": (sb3.PPO, Mine, bridged, {}, "the actor of .*Mine is not known"),
+    "own policy": (offered(policy=Mine), "the actor of .*Mine is not known"),
     "own extractor": (
-        sb3.PPO,
-        "MlpPolicy",
-        bridged,
-        {"policy_kwargs": {"features_extractor_class": Shy}},
+        offered(policy_kwargs={"features_extractor_class": Shy}),
         "the observation goes through Shy",
     ),
-    "DQN": (sb3.DQN, "MlpPolicy", lambda: "CartPole-v1", OFF, "DQNPolicy is not known"),
-    "gSDE": (sb3.SAC, "MlpPolicy", bridged, OFF | {"use_sde": True}, "gSDE.* clips the mean"),
+    "DQN": (offered(sb3.DQN, env=lambda: "CartPole-v1", **OFF), "DQNPolicy is not known"),
+    "gSDE": (offered(sb3.SAC, **OFF, use_sde=True), "gSDE.* clips the mean"),
+    "GELU": (offered(policy_kwargs={"activation_fn": torch.nn.GELU}), "layer GELU"),
     "activation": (
-        sb3.PPO,
-        "MlpPolicy",
-        bridged,
-        {"policy_kwargs": {"activation_fn": functools.partial(torch.nn.ELU, 0.5)}},
+        offered(policy_kwargs={"activation_fn": HALF}),
         r"layer ELU\(alpha=0.5\) is not known; known: linear, tanh, relu, elu",
     ),
     "both ways": (
-        contrib.RecurrentPPO,
-        "MlpLstmPolicy",
-        bridged,
-        {"policy_kwargs": LSTM | {"lstm_kwargs": {"batch_first": True}}},
+        offered(
+            contrib.RecurrentPPO,
+            "MlpLstmPolicy",
+            policy_kwargs=LSTM | {"lstm_kwargs": {"batch_first": True}},
+        ),
         "recurrent layers with further arguments",
     ),
     "another env": (
-        sb3.PPO,
-        "MlpPolicy",
-        functools.partial(bridged, env_id="sideslip/YawFusion-v0"),
-        {},
+        offered(env=FUSION),
         r"trained on 30 numbers, those of sideslip/YawFusion-v0: gyro, .*gps_\w+.*; "
         "the observation here has 22: gyro, ",
     ),
-    "other bounds": (
-        sb3.PPO,
-        "MlpPolicy",
-        functools.partial(envs.IdentityEnvBox, -1, 1),
-        {},
-        "trained on 1 numbers that no environment here has",
-    ),
+    "other bounds": (offered(env=BOX), "trained on 1 numbers that no environment here has"),
 }
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_cannot_be_exported_is_refused_by_name(name: str, tmp_path: Path) -> None:
-    kind, policy, env, options, said = REFUSED[name]
-    options = deepcopy({"policy_kwargs": SMALL} | options)
-    model = kind(policy, env(), device="cpu", **options)
+    (kind, policy, env, options), said = REFUSED[name]
+    model = kind(policy, env(), device="cpu", **deepcopy(options))
     model.save(tmp_path / "mine.zip")
     with pytest.raises(ValueError, match=said):
         sideslip.make_agent(str(tmp_path / "mine.zip"), gym.make(ID), trust=True)
@@ -288,3 +280,43 @@ def test_another_normaliser_is_refused(zipped: Path, tmp_path: Path) -> None:
         path.write_bytes(content)
         with pytest.raises(ValueError, match=said):
             make(normalise=path)
+
+
+@pytest.mark.parametrize("name", ["PPO", "PPO, linear", "PPO, ReLU", "A2C", "SAC", "TD3"])
+def test_it_is_torchs_function_where_torch_is_in_double_precision(name: str) -> None:
+    """For observations of any size, where single precision rounds more than 1e-6 away."""
+    linear: dict[str, Any] = {"PPO, linear": (sb3.PPO, {"policy_kwargs": {"net_arch": []}})}
+    kind, options = (MODELS | linear)[name]
+    model = made(kind, "MlpPolicy", bridged(), **options)
+    x, policy = np.random.default_rng(0).normal(size=(200, 22)) * 10.0, model.policy
+    if kind in (sb3.PPO, sb3.A2C):
+        layers = [policy.mlp_extractor.policy_net, policy.action_net]
+    elif kind is sb3.SAC:
+        layers = [policy.actor.latent_pi, policy.actor.mu, torch.nn.Tanh()]
+    else:
+        layers = [policy.actor.mu]
+    with torch.no_grad():
+        theirs = torch.nn.Sequential(*layers).double()(torch.from_numpy(x)).numpy()
+    ours = convert_sb3_policy(model)(x)
+    assert np.abs(ours - theirs).max() < 1e-12 * max(1.0, np.abs(theirs).max())
+
+
+def test_what_never_varied_is_not_read() -> None:
+    env = normalised(bridged())
+    network = convert_sb3_policy(made(sb3.PPO, "MlpPolicy", env), env)
+    names = [entry.name for entry in gym.make(ID).get_wrapper_attr("layout")]
+    unread = {name for name, scale in zip(names, network.scale, strict=True) if scale == 0.0}
+    assert unread == {"beta_ref", "gamma_ref", "steer", "steer_command"}  # a gust, zero slip
+    assert network.clip == env.clip_obs
+
+
+def test_another_range_of_actions_and_a_missing_extra_are_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wide = made(sb3.PPO, "MlpPolicy", bridged())
+    wide.policy.action_space = gym.spaces.Box(-2.0, 2.0, (1,), np.float32)
+    with pytest.raises(ValueError, match=r"within \[-1, 1\]"):
+        convert_sb3_policy(wide)
+    monkeypatch.setitem(sys.modules, "stable_baselines3.common.torch_layers", None)
+    with pytest.raises(ModuleNotFoundError, match=r"sideslip\[train\]"):
+        convert_sb3_policy(wide)

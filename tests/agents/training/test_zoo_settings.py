@@ -13,7 +13,7 @@ from sideslip.agents.rollout import evaluate_costs
 from sideslip.agents.training.callbacks import POLICY, RunOptions
 from sideslip.agents.training.config import ALGORITHMS, HYPERPARAMS, TrainingTask
 from sideslip.agents.training.trainer import train
-from sideslip.agents.training.warm_start import NetworkAgent
+from sideslip.agents.training.warm_start import _NetworkAgent
 
 THEIRS = [name for name, each in ALGORITHMS.items() if not each.on_tensors]
 FEW = {"n_envs": 4, "n_steps": 16, "batch_size": 32, "learning_starts": 32, "buffer_size": 1000}
@@ -54,7 +54,7 @@ def test_the_zoo_finds_and_drives_what_we_left(algo: str, tmp_path: Path) -> Non
     task.describe_for_zoo(folder, 64, 64)
     train(task, 64, folder, run_options=RunOptions(eval_freq=64))
     cars = task.vector_env(1)
-    cost = evaluate_costs(cars, NetworkAgent(load_policy(folder / POLICY).network), [0])[0]
+    cost = evaluate_costs(cars, _NetworkAgent(load_policy(folder / POLICY).network), [0])[0]
     command = [
         *(sys.executable, "-m", "rl_zoo3.enjoy", "--algo", ALGORITHMS[algo].zoo, "--no-render"),
         *("--env", "sideslip/YawVision-v0", "--gym-packages", "sideslip", "-f", str(tmp_path)),

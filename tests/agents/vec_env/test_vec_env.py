@@ -8,6 +8,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium import wrappers
+from gymnasium.wrappers import vector
 
 from sideslip.agents import make_agent
 from sideslip.envs import SCENARIOS, StabilityVectorEnv
@@ -21,9 +23,13 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     VecCheckNan,
+    VecFrameStack,
+    VecMonitor,
     VecNormalize,
+    VecVideoRecorder,
 )
 
+from sideslip.agents.training.normalise import RewardScale, RewardScaleWrapper
 from sideslip.agents.vec_env import EMPTY_INFO, NativeVecEnv, make_vec_env
 
 VISION, FUSION = "sideslip/YawVision-v0", "sideslip/AfsYawFusion-v0"
@@ -276,3 +282,25 @@ def test_what_cannot_be_bridged_says_why() -> None:
         make_vec_env("sideslip/Yaw-v0", 2)
     with pytest.raises(ValueError, match="dakf needs the slow sensor gps"):
         make_vec_env(VISION, 2, estimator="dakf")
+
+
+def within(wrapper: Any) -> Any:
+    """A bridged vector env with a wrapper of Gymnasium's inside of the bridge."""
+    return make_vec_env(VISION, 2, 0, wrapper_class=wrapper)
+
+
+def test_a_controller_is_not_designed_on_changed_observations(tmp_path: Path) -> None:
+    env, single = make_vec_env(VISION, 2, 0), DummyVecEnv([lambda: Monitor(gym.make(VISION))])
+    rated = RewardScaleWrapper(env, RewardScale([[1.0, 1.0]]))
+    filmed = make_vec_env(VISION, 2, 0, env_kwargs={"render_mode": "rgb_array"})
+    film = VecVideoRecorder(filmed, str(tmp_path), lambda _: False)
+    rewards = VecNormalize(env, norm_obs=False)
+    for same in (env, single, rated, film, rewards, VecCheckNan(env), VecMonitor(env)):
+        assert make_agent("none", same).nominal == env.get_attr("nominal")[0]
+    assert make_agent("none", within(vector.NormalizeReward)).control_period == 10
+    changed: Any = VecNormalize(env), VecFrameStack(env, 2), within(vector.ClipAction)
+    changed += (DummyVecEnv([lambda: wrappers.NormalizeObservation(gym.make(VISION))]),)
+    names = "VecNormalize", "VecFrameStack", "ClipAction", "NormalizeObservation"
+    for name, each in zip(names, changed, strict=True):
+        with pytest.raises(ValueError, match=f"^{name} may change observations or actions"):
+            make_agent("none", each)

@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from sideslip.agents import zoo
 from sideslip.agents.rollout import evaluate_costs
 from sideslip.agents.training import callbacks
-from sideslip.agents.training.callbacks import RunOptions, make_evaluation_seeds
+from sideslip.agents.training.callbacks import RunOptions, _make_evaluation_seeds
 from sideslip.agents.training.config import TrainingTask
 from sideslip.agents.training.trainer import train
 from tests.agents.vec_env.test_zoo import wrapper_of
@@ -80,7 +80,7 @@ def enjoyed(folder: Path, model: str) -> tuple[Any, Any]:
 def test_what_enjoy_makes_of_it_drives_as_the_evaluation_did(folder: Path, model: str) -> None:
     """The network's scales are in the zip; the mixture's first scenario is driven."""
     env, loaded = enjoyed(folder, model)
-    seed = make_evaluation_seeds(1)[0]
+    seed = _make_evaluation_seeds(1)[0]
     cost, done = 0.0, False
     env.seed(seed)
     obs = env.reset()
@@ -89,7 +89,7 @@ def test_what_enjoy_makes_of_it_drives_as_the_evaluation_did(folder: Path, model
         obs, rewards, dones, _ = env.step(action)
         cost, done = cost - float(rewards[0]), bool(dones[0])
     assert cost == pytest.approx(
-        evaluate_costs(TASK.vector_env(4), loaded, make_evaluation_seeds(4))[0]
+        evaluate_costs(TASK.vector_env(4), loaded, _make_evaluation_seeds(4))[0]
     )
     if model != "best_model.zip":
         with np.load(folder / zoo.EVALUATIONS) as found:

@@ -119,7 +119,6 @@ def test_without_the_extra_the_command_names_it(
             "sideslip.agents.training.callbacks",
             "sideslip.agents.training.config",
             "sideslip.agents.training.normalise",
-            "sideslip.agents.training.checkpoint",
             "sideslip.agents.vec_env",
         ):
             monkeypatch.delitem(sys.modules, name)

@@ -1,0 +1,99 @@
+"""What no controller can be built with, or on, is refused, and the message says why."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sideslip.agents import make_agent
+from sideslip.agents.design.sampled_model import DesignSpec, make_design_model
+from sideslip.envs import COMS
+from sideslip.envs.task import MODEL
+from sideslip.estimators import EstimateObservation
+
+YAW, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"
+VISION, UNEVEN = "sideslip/YawVision-v0", "sideslip/YawVisionUneven-v0"
+RATES, LANE = ["beta", "gamma", "d1", "d2"], ["beta", "gamma", "psi", "y_l"]
+ENVS: dict[str, Callable[[], Any]] = {
+    "bare": lambda: gym.make(YAW),
+    "slip": lambda: EstimateObservation(gym.make(VISION), "bicycle-kf"),
+    "steered": lambda: EstimateObservation(gym.make(AFS), "exact-kf"),
+    "no rates": lambda: EstimateObservation(gym.make(AFS), "course-kf", outputs=["beta"]),
+    "rates": lambda: EstimateObservation(gym.make(AFS), "dakf", outputs=RATES),
+    "unsteered": lambda: EstimateObservation(gym.make("sideslip/YawGps-v0"), "dakf", outputs=RATES),
+    "lane": lambda: EstimateObservation(
+        gym.make(UNEVEN, steering=True), "uneven-delay-kf", outputs=LANE
+    ),
+    "unsteered lane": lambda: EstimateObservation(gym.make(VISION), "multirate-kf", outputs=LANE),
+}
+Refusal = tuple[str, str, dict[str, Any], str]
+VALUES: list[Refusal] = [
+    ("esc", "slip", {"bandwidth": 0.0}, "is a positive number"),
+    ("esc", "slip", {"slip": -1.0}, "is a positive number"),
+    ("esc", "slip", {"band": -0.1}, "band is zero or more"),
+    *(
+        ("sliding-mode", "slip", {name: 0.0}, f"{name} is a positive number")
+        for name in ("pole", "rate", "layer")
+    ),
+    ("sliding-mode", "bare", {}, r"beta_hat.*EstimateObservation"),
+    ("model-following", "no rates", {}, r"needs d1_hat, d2_hat .*EstimateObservation"),
+    ("model-following", "unsteered", {}, "action steers"),
+    *(
+        ("model-following", "rates", {"bandwidth": wrong}, "two positive numbers")
+        for wrong in ((5.0,), (5.0, 0.0), (5.0, np.inf), (np.nan, 5.0), (1.0, 2.0, 3.0))
+    ),
+    ("lane-keeping", "lane", {"curvature_time": 0.0}, "curvature_time is a positive number"),
+    ("lane-keeping", "lane", {"haste": -1.0}, "haste is zero or more"),
+    ("lane-keeping", "unsteered lane", {}, "action steers"),
+    ("lane-keeping", "slip", {}, r"psi_hat, y_l_hat.*EstimateObservation"),
+    ("lqr", "bare", {}, r"beta_hat.*EstimateObservation"),
+    ("lqr", "steered", {"disturbance_time": 0.0}, "disturbance_time is a positive number"),
+    ("lqr", "steered", {"stiffness": ["a"]}, "names two entries or none"),
+    ("lqr", "steered", {"span": (1.0, 0.5)}, "span rises from above zero"),
+    *(("lqr", "steered", {"grip": x}, "grip is a positive number") for x in (0.0, -1.0, np.nan)),
+    ("adaptive-lqr", "steered", {}, "AdaptiveLqr needs front_tyres_hat, rear_tyres_hat"),
+    *(
+        ("mpc", "slip", option, "is a positive whole number")
+        for option in ({"horizon": 0}, {"horizon": 2.5}, {"iterations": True})
+    ),
+    *(
+        ("nmpc", "slip", {"iterations": x}, "iterations is a positive whole number")
+        for x in (0, 2.5, True)
+    ),
+    ("nmpc", "slip", {"horizon": -1.0}, "horizon is a positive number"),
+    ("two-dof", "bare", {}, r"beta_hat.*EstimateObservation"),
+    ("two-dof", "slip", {"rate": "fast"}, "rate is 'control' or 'camera'"),
+    ("two-dof", "slip", {"feedforward": "none"}, "feedforward is one of reference, zero-slip"),
+    *(
+        ("two-dof", "slip", {"sampled": sampled} | option, message)
+        for sampled in (True, False)
+        for option, message in (
+            ({"placement": "both"}, "placement is one of radius, real, got 'both'"),
+            ({"pole": -1.0}, "pole is a positive number"),
+        )
+    ),
+    ("pid", "slip", {}, "unknown agent 'pid'"),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "env", "options", "message"), VALUES, ids=[f"{x[0]} {x[1]} {x[2]}" for x in VALUES]
+)
+def test_what_no_controller_can_be_built_with_is_refused(
+    name: str, env: str, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_agent(name, ENVS[env](), **options)
+
+
+@pytest.mark.parametrize(("name", "option"), [("lqr", "weight"), ("two-dof", "speed")])
+def test_an_option_that_there_is_not_is_named(name: str, option: str) -> None:
+    with pytest.raises(TypeError, match=option):
+        make_agent(name, ENVS["slip"](), **{option: 3.0})
+
+
+def test_a_car_at_rest_has_no_design() -> None:
+    with pytest.raises(ValueError, match="positive speed"):
+        make_design_model(COMS, 0.0, DesignSpec(10, COMS.yaw_moment_limit, True, MODEL, "forces"))
