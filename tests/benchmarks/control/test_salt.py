@@ -26,7 +26,7 @@ from sideslip.benchmarks.control.tasks import (
 )
 from sideslip.benchmarks.studies import recovery_region
 from sideslip.benchmarks.studies.learned_outside import KINDS, make_outside_task
-from sideslip.benchmarks.suites import SALTED, SUITES, Request, run_suite
+from sideslip.benchmarks.suites import SALTED, SUITES, Request, _run_suite
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS
 from sideslip.estimators.learned.network import SUFFIX
 
@@ -118,8 +118,8 @@ def test_a_suite_drives_the_salt_that_it_is_given(
     for salt in (ONE, OTHER, ""):
         with pytest.raises(StopIteration):
             if module is readme:
-                readme.measure_first(salt=salt)
-            run_suite(name, Request(quick=True, episodes=4, salt=salt))
+                readme._measure_first(salt=salt)
+            _run_suite(name, Request(quick=True, episodes=4, salt=salt))
     assert found == [
         make_salted_seeds(salt or make_salt(), 4, GUST.seed_text) for salt in (ONE, OTHER, "")
     ]

@@ -15,7 +15,7 @@ from sideslip.benchmarks.control.baseline_gaps import (
     make_score_scales,
 )
 from sideslip.benchmarks.control.entries import REFERENCE_FILTER, ControlEntry
-from sideslip.benchmarks.control.report import compose_verdict, find_best_controller
+from sideslip.benchmarks.control.report import _find_best_controller, compose_verdict
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult, Results
 from sideslip.benchmarks.control.score import (
     Standing,
@@ -103,7 +103,7 @@ def test_an_adaptive_controller_is_compared_on_the_filter_it_follows(
     found = results()
     for contest in (ONE, TWO):
         found.outcomes[ControlEntry(contest, filter_, "adaptive-lqr")] = episodes(1.5)
-    assert find_best_controller({"1": table(found)}) == best
+    assert _find_best_controller({"1": table(found)}) == best
 
 
 def test_a_cell_that_was_not_driven_says_so_and_the_rest_goes_on() -> None:

@@ -34,7 +34,7 @@ from sideslip.benchmarks.entrants.challenge import (
     UserEntry,
     make_user_entries,
 )
-from sideslip.benchmarks.entrants.score import compose_verdict, make_sentence, make_table
+from sideslip.benchmarks.entrants.score import _make_sentence, compose_verdict, make_table
 
 COST, FAILURE = NUMBERS.index("cost"), NUMBERS.index("failure")
 PD = """
@@ -221,16 +221,16 @@ def test_the_verdict_has_a_sentence_for_each_and_five_lines_at_most(
 ) -> None:
     pairs = [UserEntry(f"{tmp_path}/{name}.py") for name in ("a", "broken", "c", "d", "e")]
     for pair in pairs:
-        Path(pair.agent).write_text(PD)
+        Path(str(pair.agent)).write_text(PD)
     found = score.compare(ComparisonRequest(tuple(pairs), seeds=(1, 2, 3)))
     lines = compose_verdict(found)
     assert len(lines) == 5 and "2 more stand in the table" in lines[3]
     mine = found.select(pairs[0])
-    assert lines[0] == f"Place 3 of 9: {make_sentence(mine)}."
+    assert lines[0] == f"Place 3 of 9: {_make_sentence(mine)}."
     assert "50 % [50, 50] of nominal's cost (tier 1: 50, tier 2a: 50, tier 2b: 50" in lines[0]
     assert "closes 50 % [50, 50] of the gap" in lines[0] and "fails in 0.0 %" in lines[0]
-    assert "fails in 33.3 % (nominal 0.0 %)" in make_sentence(found.select(pairs[4]))
-    broken = make_sentence(found.select(pairs[1]))
+    assert "fails in 33.3 % (nominal 0.0 %)" in _make_sentence(found.select(pairs[4]))
+    broken = _make_sentence(found.select(pairs[1]))
     assert "not driven: " in broken and broken.endswith("ValueError: no (pd.py, line 3)")
     cells = make_table(found).cells
     assert sum(line[0].startswith("> ") for line in cells) == 5

@@ -9,7 +9,7 @@ import pytest
 from sideslip.benchmarks.control.entries import ControlEntry
 from sideslip.benchmarks.control.run import Chunk
 from sideslip.benchmarks.control.tasks import ControlTask
-from sideslip.benchmarks.entrants.worker import find_place, run_isolated_chunk, run_user_chunk
+from sideslip.benchmarks.entrants.worker import _find_place, run_isolated_chunk, run_user_chunk
 
 SHORT = {"scenario": {"base": "gust", "duration": 0.05}}
 HEAD = """
@@ -82,8 +82,8 @@ def test_what_it_does_to_its_process_is_its_result(
 
 def test_a_hang_is_found_in_the_users_file() -> None:
     stack = 'File "/lib/time.py", line 9 in sleep\n  File "/home/mine.py", line 12'
-    assert find_place(("/home/mine.py:Mine", ""), stack) == ", still in mine.py, line 12"
-    assert find_place(("pd", ""), stack) == ""
+    assert _find_place(("/home/mine.py:Mine", ""), stack) == ", still in mine.py, line 12"
+    assert _find_place(("pd", ""), stack) == ""
 
 
 FILTER = """

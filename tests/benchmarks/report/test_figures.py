@@ -10,7 +10,7 @@ from sideslip.agents import AGENTS, baselines
 from sideslip.benchmarks.control.entries import LEARNED
 from sideslip.benchmarks.control.entries import ORACLE_NAMES as MATRIX_RUNGS
 from sideslip.benchmarks.harness.stats import Estimate
-from sideslip.benchmarks.report.figures import choose_line_styles
+from sideslip.benchmarks.report.figures import _choose_line_styles
 from sideslip.envs.rendering.palette import (
     COLOURS,
     CONTROLLERS,
@@ -28,9 +28,9 @@ def test_colours_stay_with_their_names() -> None:
     assert find_colour("exact-kf, true model") == COLOURS["exact-kf"]
     assert find_colour("somebody-else") == find_colour("somebody-else")
     names = [*COLOURS, "somebody-else", "two-dof (1 ms)", "two-dof (33 ms)"]
-    styles = choose_line_styles(names)
+    styles = _choose_line_styles(names)
     assert len(set(styles.values())) == len(names)
-    assert choose_line_styles(["multirate-kf"])["multirate-kf"] == (
+    assert _choose_line_styles(["multirate-kf"])["multirate-kf"] == (
         COLOURS["multirate-kf"],
         "solid",
     )
