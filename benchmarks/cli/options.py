@@ -21,39 +21,30 @@ Kind = TypeVar("Kind", bound=type)
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
-def take(help: str, default: Any = None, *names: str, **more: Any) -> Any:
+def take(
+    help: str,
+    default: Any = None,
+    *names: str,
+    declare: Callable[..., Any] = typer.Option,
+    **more: Any,
+) -> Any:
     """Make the field of an option.
 
     Args:
         help: Text on it.
         default: Default value, `...` for a required one.
         names: Names instead of the field's, such as "--jobs" and "-j".
-        more: Other arguments of typer's `Option`.
+        declare: Typer's function that declares it.
+        more: Other arguments of that function.
 
     Returns:
         Field of a dataclass.
     """
-    return _make_field(default, typer.Option(default, *names, help=help, **more))
+    declared = {"typer": declare(default, *names, help=help, **more)}
+    return field(default=MISSING if default is ... else default, metadata=declared)
 
 
-def take_argument(help: str, default: Any = ..., **more: Any) -> Any:
-    """Make the field of an argument.
-
-    Args:
-        help: Text on it.
-        default: Default value, `...` for a required one.
-        more: Other arguments of typer's `Argument`.
-
-    Returns:
-        Field of a dataclass.
-    """
-    return _make_field(default, typer.Argument(default, help=help, **more))
-
-
-def _make_field(default: Any, declared: Any) -> Any:
-    return field(default=MISSING if default is ... else default, metadata={"typer": declared})
-
-
+take_argument = partial(take, declare=typer.Argument)
 _SHARED: dict[str, Callable[[], Any]] = {
     "address": partial(take, "HOST:PORT of the cluster; default: this machine's.", ""),
     "control_period": partial(take, "Ticks of 1 ms.", 10),

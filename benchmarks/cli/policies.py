@@ -39,7 +39,7 @@ EPISODES = 256  # of a policy's test
 class _Export:
     """Make a policy's file of a zip: weights and a card, which no reader has to trust."""
 
-    zipped: Path = take_argument("Of stable-baselines3.", metavar="ZIP")
+    zipped: Path = take_argument("Of stable-baselines3.", ..., metavar="ZIP")
     out: File = take("Default: NAME.safetensors beside it.", None, "--out", "-o")
     env: str = take("The id that it was trained on.", ENV)
     estimator: str = take("The estimator around it.", "")
@@ -92,7 +92,7 @@ class _Enjoy:
     A zip drives the id that it was trained on (--env); `sideslip export` takes further options.
     """
 
-    policy: str = take_argument("A shipped policy's name, or a file's or zip's path.")
+    policy: str = take_argument("A shipped policy's name, or a file's or zip's path.", ...)
     env: Text = take("Another id than the policy's own.")
     episodes: int = take("How many.", 256, min=1)
     scenario: Text = take("A scenario's name.")
@@ -179,7 +179,7 @@ def make_task_table(file: Path, kind: str, episodes: int) -> Table:
 class _Distill:
     """Distil a policy by DAgger; its card says what it costs in each contest, on unseen seeds."""
 
-    name: str = take_argument("Of the file NAME.safetensors.")
+    name: str = take_argument("Of the file NAME.safetensors.", ...)
     kind: str = take("Of contests, as coms-model.", ..., "--class")
     teacher: str = take("A rung, a controller of the matrix, or a policy.", "adaptive-nmpc")
     estimator: str = take("What the policy reads: joint, or nothing but the sensors.", "joint")
@@ -224,8 +224,8 @@ class _Distill:
             bar.advance(bar.task_ids[0])
 
         with use_shared_bar(console, f"distill {self.name}", "rounds", self.rounds) as bar:
-            who = self.kind, self.teacher, self.estimator
-            lessons = make_lessons(*who, self.cars, self.varied, self.seed, observed)
+            entry = self.kind, self.teacher, self.estimator
+            lessons = make_lessons(*entry, self.cars, self.varied, self.seed, observed)
             distill(card, lessons, config, target, show)
         console.print(make_task_table(target, self.kind, self.episodes))
         print_written(console, target)
@@ -235,7 +235,7 @@ class _Distill:
 class _TrainEstimator:
     """Train a correction of a filter; `learned` with `file=FILE` estimates with it."""
 
-    name: str = take_argument("Of the file NAME.safetensors.")
+    name: str = take_argument("Of the file NAME.safetensors.", ...)
     base: str = take("The filter.", "exact-kf", autocompletion=complete("estimators"))
     scenarios: Texts = take("Repeatable; default: of all scored contests.")
     option: Texts = take("NAME=VALUE of the filter; repeatable.")

@@ -44,7 +44,7 @@ class _TuneEstimator:
     A stopped search goes on where it was when the same command runs again.
     """
 
-    name: str = take_argument("An estimator's name.")
+    name: str = take_argument("An estimator's name.", ...)
     scenario: list[str] = take("A scenario's name; repeatable: each counts alike.", ...)
     env: str = take("An environment's id; default: one that fits.", "")
     target: str = take("The state whose error counts.", "beta")
@@ -99,7 +99,7 @@ class _TuneController:
     controller cannot drive is named and left out.
     """
 
-    name: str = take_argument("A controller of the benchmark, or a baseline.")
+    name: str = take_argument("A controller of the benchmark, or a baseline.", ...)
     kind: Texts = take(
         "Class of tasks, such as car-yaw; default: all. Repeatable.", None, "--class"
     )

@@ -54,9 +54,8 @@ def test_a_line_has_every_tier_with_cost_interval_and_failures() -> None:
     assert set(readme.HEADS) == set(TITLES)
     cost = ResultRow("control", "tier 2a", "cost_vs_nominal", 0.5, "", "none", 0.4, 0.6, 12)
     rows = [cost, replace(cost, metric="failure_rate", value=0.07)]
-    (line,) = (
-        line for line in readme.make_table(rows).splitlines() if line.startswith("| no control")
-    )
+    lines = readme.make_table(rows).splitlines()
+    (line,) = (line for line in lines if line.startswith("| no control"))
     assert line == "| no control |  | 50 [40, 60] (7) |  |  |"
     with pytest.raises(ValueError, match="no table that begins with the tiers"):
         readme._replace_table("# a README", line)
@@ -124,13 +123,10 @@ def test_rows_that_nobody_can_be_added_to_are_refused(monkeypatch: pytest.Monkey
     with pytest.raises(ValueError, match=r"the matrix's policies are .*, got 'lqr'"):
         readme._add_policy([STATE_ROW], "lqr")
     for rows, got in (([], "none"), ([replace(STATE_ROW, env_version="0.1.0")], r"0\.1\.0")):
-        with pytest.raises(
-            ValueError, match=f"of oracle-state in tier 1, of version .*, got {got}"
-        ):
+        message = f"of oracle-state in tier 1, of version .*, got {got}"
+        with pytest.raises(ValueError, match=message):
             readme._add_policy(rows, "raw-coms-yaw")
     wrong = DriveResult(np.zeros((0, len(NUMBERS))), 0.0, error="no action")
-    monkeypatch.setattr(
-        readme, "measure", lambda asked, *_, **__: Results(dict.fromkeys(asked, wrong))
-    )
+    monkeypatch.setattr(readme, "measure", lambda x, *_, **__: Results(dict.fromkeys(x, wrong)))
     with pytest.raises(ValueError, match=r"in .*: no action"):
         readme._add_policy([STATE_ROW], "raw-coms-yaw")

@@ -45,12 +45,10 @@ def driven(costs: np.ndarray, failed: int = 0, error: str = "") -> DriveResult:
 def found(contest: ControlTask, levels: dict[str, float], **failed: int) -> TaskMeasurement:
     """What is made of nominal's and both oracles' costs on 40 seeds."""
     seeds = np.random.default_rng(0).lognormal(0.0, 1.0, 40) + 1.0
-    made = {
-        ControlEntry(contest, "", name): driven(
-            level * seeds, failed.get(name.replace("-", "_"), 0)
-        )
-        for name, level in levels.items()
-    }
+    made = {}
+    for name, level in levels.items():
+        count = failed.get(name.replace("-", "_"), 0)
+        made[ControlEntry(contest, "", name)] = driven(level * seeds, count)
     for cell in _make_oracle_entries(contest):
         made.setdefault(cell, driven(np.full(40, np.nan), error="no plant"))
     return _measure_task(Results(made), contest)
