@@ -234,7 +234,7 @@ def _add_policy(
     return merged + _make_tier_rows(results, tasks, tier_1[0].salt, name)
 
 
-def main(
+def _main(
     rows: Annotated[Path | None, typer.Argument(help="Of sideslip bench control --json.")] = None,
     add: Annotated[list[str] | None, typer.Option(help="A policy that came later.")] = None,
     first: Annotated[bool, typer.Option("--first", help="Drive README's entries.")] = False,
@@ -260,4 +260,4 @@ def _write(path: Path, rows: Sequence[ResultRow], page: Path, new_table: str) ->
 
 if __name__ == "__main__":
     with report_user_errors():
-        typer.run(main)
+        typer.run(_main)

@@ -111,7 +111,7 @@ def test_it_is_in_every_tier_of_its_class_on_what_it_reads(
     Path("docs").mkdir()
     readme.PAGE.write_text((ROOT / readme.PAGE).read_text())
     write_json(tmp_path / "rows.json", [STATE_ROW])
-    readme.main(tmp_path / "rows.json", [name])
+    readme._main(tmp_path / "rows.json", [name])
     new = [row for row in readme._read_tier_rows(readme.ROWS) if row.controller == name]
     assert {row.scenario for row in new} == tiers and len(new) == 2 * len(tiers)
     assert {row.estimator for row in new} == {reads}
