@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from ..envs.io import atomic_file
 from ..envs.numerics import require_extra
@@ -13,13 +13,23 @@ from .harness.metrics import METRICS
 from .harness.results import ResultRow, ShareMap, Suite
 from .report.figures import SHARE_SCALE
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import SubFigure
+
 _MAX_COLUMNS = 3  # panels
 
 
 def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
-    """Bars of every estimator's error and the controllers' scores, with their intervals.
+    """Write bars of every estimator's error and the controllers' scores, with their intervals.
 
-    Needs the extra `report`. Raises ValueError if no suite has a row to draw.
+    Args:
+        path: File of the picture.
+        suites: Results.
+
+    Raises:
+        ValueError: No suite has a row to draw.
+        ModuleNotFoundError: The extra `report` is not installed.
     """
     with require_extra("report", "pictures need matplotlib"):
         from matplotlib.figure import Figure
@@ -54,7 +64,7 @@ def write_picture(path: str | Path, suites: Sequence[Suite]) -> None:
         axis.set_axis_off()
     for axis, (title, panel_rows, label) in zip(axes, panels, strict=False):
         scenario = panel_rows[0].scenario
-        _draw_bars(axis, panel_rows, title, label, find_partial_entries(rows, scenario))
+        _draw_bars(axis, panel_rows, title, label, _find_partial_entries(rows, scenario))
         over_bound = [r for r in rows if (r.scenario, r.metric) == (scenario, "rmse_over_bound")]
         ratios = {r.estimator: r.value for r in over_bound}
         bounded = [row for row in panel_rows if row.estimator in ratios]
@@ -72,7 +82,7 @@ def _is_shown(row: ResultRow) -> bool:
     return row.metric != "score" or is_default_filter(row.controller, row.estimator)
 
 
-def find_partial_entries(rows: Sequence[ResultRow], tier: str) -> set[str]:
+def _find_partial_entries(rows: Sequence[ResultRow], tier: str) -> set[str]:
     """Find the controllers that drive a part of a tier's tasks, so that theirs is another score."""
     of_tier = {task.name for task in list_scored_tasks() if f"tier {task.tier}" == tier}
     driven: dict[str, set[str]] = {}
@@ -82,7 +92,7 @@ def find_partial_entries(rows: Sequence[ResultRow], tier: str) -> set[str]:
     return set(driven.keys() - select_complete(driven).keys())
 
 
-def _draw_maps(strip: Any, share_map: ShareMap) -> None:
+def _draw_maps(strip: "SubFigure", share_map: ShareMap) -> None:
     """Shares over two axes in a row, a panel a name, with the line at one half."""
     from matplotlib.colors import LinearSegmentedColormap
 
@@ -101,7 +111,7 @@ def _draw_maps(strip: Any, share_map: ShareMap) -> None:
 
 
 def _draw_bars(
-    axis: Any, rows: Sequence[ResultRow], title: str, label: str, parted: set[str]
+    axis: "Axes", rows: Sequence[ResultRow], title: str, label: str, parted: set[str]
 ) -> None:
     """Horizontal bars, the best on top: the smallest error or the highest score."""
     sign = 1.0 if rows[0].metric == "score" else -1.0

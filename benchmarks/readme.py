@@ -81,22 +81,10 @@ FIRST: Mapping[str, Sequence[tuple[str, str]]] = {
 EPISODES = 32  # a contest, of README's table
 
 
-def measure_first(
+def _measure_first(
     jobs: int | None = None, console: Console | None = None, salt: str = ""
 ) -> list[ResultRow]:
-    """Drive README's entries in every scored contest with steering; return the tiers' rows.
-
-    Args:
-        jobs: Processes, None for all processors.
-        console: Where progress is shown.
-        salt: Salt of the seeds, "" for the one of the contestants' sources.
-
-    Returns:
-        Cost and failures of each entry in each tier.
-
-    Raises:
-        ValueError: An entry could not drive.
-    """
+    """Drive README's entries in every scored contest with steering; return the tiers' rows."""
     tasks = [item for item in list_scored_tasks() if item.tier and item.env_id == STEERING]
     policies = {policy: kind for kind, pairs in LEARNED.items() for _, policy in pairs}
     requests = [
@@ -134,14 +122,21 @@ def _make_tier_rows(
     return rows
 
 
-def read_tier_rows(path: str | Path) -> list[ResultRow]:
-    """The tiers' rows of a file that the table is made of; raises what `read_json` does."""
+def _read_tier_rows(path: str | Path) -> list[ResultRow]:
+    """Read the tiers' rows of which the table is made; raises what `read_json` does."""
     tiers = {f"tier {tier}" for tier in HEADS}
     return [row for row in read_json(path) if row.metric in METRICS and row.scenario in tiers]
 
 
 def make_table(rows: Sequence[ResultRow]) -> str:
-    """Cost in % of nominal's with its interval, and in brackets failures in %, as Markdown."""
+    """Make the table: cost in % of nominal's with its interval, and in brackets failures in %.
+
+    Args:
+        rows: Rows of the tiers.
+
+    Returns:
+        Markdown.
+    """
     by_key = {(row.scenario, row.controller, row.estimator, row.metric): row for row in rows}
     lines = []
     for name, key in _SHOWN.items():
@@ -165,7 +160,7 @@ def _format_table(lines: Sequence[Sequence[str]]) -> str:
     return "\n".join([f"| | {heads} |", "|---" * (1 + len(HEADS)) + "|", *body])
 
 
-def make_first_table(rows: Sequence[ResultRow]) -> str:
+def _make_first_table(rows: Sequence[ResultRow]) -> str:
     """Make README's table: cost in % of nominal's, the best of the first tier's columns first."""
     cost_rows = [row for row in rows if row.metric == METRICS[0]]
     by_key = {(row.scenario, row.controller, row.estimator): row.value for row in cost_rows}
@@ -177,7 +172,7 @@ def make_first_table(rows: Sequence[ResultRow]) -> str:
     return _format_table(lines)
 
 
-def make_headlines(root: Path) -> list[str]:
+def _make_headlines(root: Path) -> list[str]:
     """Make README's sentences with numbers from the files in docs.
 
     `sideslip bench estimation --json docs/estimation.json` and `sideslip bench speed --json
@@ -201,21 +196,20 @@ def make_headlines(root: Path) -> list[str]:
     ]
 
 
-def replace_table(text: str, new_table: str) -> str:
-    """A page with another table; ValueError where it has none."""
+def _replace_table(text: str, new_table: str) -> str:
+    """Replace the table of a page."""
     pattern = re.compile(r"^\| \| 1: [^\n]*\n(\|[^\n]*\n)+", re.MULTILINE)
     if len(pattern.findall(text)) != 1:
         raise ValueError("the page has no table that begins with the tiers, or several")
     return pattern.sub(lambda _: new_table + "\n", text)
 
 
-def add_policy(
+def _add_policy(
     rows: Sequence[ResultRow], name: str, jobs: int | None = None, console: Console | None = None
 ) -> list[ResultRow]:
-    """The rows with those of a learned policy in its class's contests, on the rows' own seeds.
+    """Add the rows of a learned policy in its class's contests, on the rows' own seeds.
 
-    Its contests' reference points are driven anew. Raises ValueError for one that is not among
-    `LEARNED`, for rows of another version or without tier 1, and where somebody cannot drive.
+    Its contests' reference points are driven anew.
     """
     estimators = {
         kind: read for kind, pairs in LEARNED.items() for read, policy in pairs if policy == name
@@ -240,7 +234,7 @@ def add_policy(
     return merged + _make_tier_rows(results, tasks, tier_1[0].salt, name)
 
 
-def main(
+def _main(
     rows: Annotated[Path | None, typer.Argument(help="Of sideslip bench control --json.")] = None,
     add: Annotated[list[str] | None, typer.Option(help="A policy that came later.")] = None,
     first: Annotated[bool, typer.Option("--first", help="Drive README's entries.")] = False,
@@ -249,21 +243,21 @@ def main(
     """Write rows and the tables made of them, in the repository's root."""
     console = Console(stderr=True)
     if first:
-        result_rows = measure_first(console=console, salt=salt)
-        _write(FIRST_ROWS, result_rows, README, make_first_table(result_rows))
+        result_rows = _measure_first(console=console, salt=salt)
+        _write(FIRST_ROWS, result_rows, README, _make_first_table(result_rows))
     if rows is not None:
-        result_rows = read_tier_rows(rows)
+        result_rows = _read_tier_rows(rows)
         for name in add or []:
-            result_rows = add_policy(result_rows, name, console=console)
+            result_rows = _add_policy(result_rows, name, console=console)
         _write(ROWS, result_rows, PAGE, make_table(result_rows))
 
 
 def _write(path: Path, rows: Sequence[ResultRow], page: Path, new_table: str) -> None:
-    text = replace_table(page.read_text(encoding="utf-8"), new_table)
+    text = _replace_table(page.read_text(encoding="utf-8"), new_table)
     write_json(path, rows)
     write_text(page, text)
 
 
 if __name__ == "__main__":
     with report_user_errors():
-        typer.run(main)
+        typer.run(_main)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Protocol, cast
 
 from rich.console import Console
 
@@ -40,15 +40,26 @@ class Request:
     salt: str = ""
 
 
-_Run = Callable[[Any, Request], Suite]
+class _SuiteModule(Protocol):
+    run: Callable[..., Suite]
 
 
-def _run_seeds(suite: Any, r: Request) -> Any:
-    usual = suite.QUICK_SEEDS if r.quick else suite.SEEDS
-    return suite.run(r.episodes or usual, r.jobs, r.console)
+_Run = Callable[[_SuiteModule, Request], Suite]
 
 
-def _run_control(suite: Any, r: Request) -> Any:
+def _make_run(*numbers: str) -> _Run:
+    """Make the run of a suite with its numbers of that name, QUICK_... in a quick run."""
+
+    def run(suite: _SuiteModule, r: Request) -> Suite:
+        chosen = [getattr(suite, f"QUICK_{name}" if r.quick else name) for name in numbers]
+        if len(numbers) == 1 and r.episodes:
+            chosen = [r.episodes]
+        return suite.run(*chosen, r.jobs, r.console)
+
+    return run
+
+
+def _run_control(suite: _SuiteModule, r: Request) -> Suite:
     from .control.entries import EPISODES, QUICK_EPISODES
 
     if r.comparison is not None:
@@ -59,28 +70,18 @@ def _run_control(suite: Any, r: Request) -> Any:
     return suite.run(r.episodes or usual, r.jobs, r.console, r.keep, r.quick, r.clairvoyant, r.salt)
 
 
-def _run_learned(suite: Any, r: Request) -> Any:
-    usual = suite.QUICK_EPISODES if r.quick else suite.EPISODES
-    return suite.run(r.episodes or usual, r.jobs, r.console, r.keep, r.quick, r.salt)
+def _run_learned(suite: _SuiteModule, r: Request) -> Suite:
+    episodes = r.episodes or getattr(suite, "QUICK_EPISODES" if r.quick else "EPISODES")
+    return suite.run(episodes, r.jobs, r.console, r.keep, r.quick, r.salt)
 
 
-def _run_following(suite: Any, r: Request) -> Any:
-    numbers = (suite.QUICK_SEEDS, suite.QUICK_CARS) if r.quick else (suite.SEEDS, suite.CARS)
-    return suite.run(*numbers, r.jobs, r.console)
-
-
-def _run_highway(suite: Any, r: Request) -> Any:
-    numbers = (suite.QUICK_SEEDS, suite.QUICK_DRIVES) if r.quick else (suite.SEEDS, suite.DRIVES)
-    return suite.run(*numbers, r.jobs, r.console)
-
-
-def _run_quick(suite: Any, r: Request) -> Any:
+def _run_quick(suite: _SuiteModule, r: Request) -> Suite:
     return suite.run(r.quick, r.jobs, r.console)
 
 
 SUITES: dict[str, tuple[str, _Run]] = {
-    "estimation": (".studies.estimation", _run_seeds),
-    "unknown": (".studies.unknown", _run_seeds),
+    "estimation": (".studies.estimation", _make_run("SEEDS")),
+    "unknown": (".studies.unknown", _make_run("SEEDS")),
     "control": (".control.suite", _run_control),
     "learned": (".studies.learned", _run_learned),
     "learned-outside": (".studies.learned_outside", _run_learned),
@@ -88,9 +89,9 @@ SUITES: dict[str, tuple[str, _Run]] = {
         ".studies.recurrent",
         lambda suite, r: suite.run(r.quick, r.episodes, r.jobs, r.console, r.keep),
     ),
-    "papers": (".papers.suite", _run_seeds),
-    "following": (".studies.coordinated_control", _run_following),
-    "highway": (".studies.traffic", _run_highway),
+    "papers": (".papers.suite", _make_run("SEEDS")),
+    "following": (".studies.coordinated_control", _make_run("SEEDS", "CARS")),
+    "highway": (".studies.traffic", _make_run("SEEDS", "DRIVES")),
     "recovery": (".studies.recovery_region", _run_quick),
     "procedures": (".procedures.suite", _run_quick),
     "speed": (".speed.suite", lambda suite, r: suite.run(r.quick, r.console)),
@@ -101,7 +102,15 @@ SALTED = ("control", "learned", "learned-outside")
 
 
 def check_salt(salt: str, names: Sequence[str]) -> None:
-    """Raise ValueError for a salt that is not hexadecimal, or that no suite takes."""
+    """Check the salt of a request.
+
+    Args:
+        salt: Salt, "" for none.
+        names: Names of the suites.
+
+    Raises:
+        ValueError: It is not hexadecimal, or no suite takes it.
+    """
     if salt and not {*SALTED} & {*names}:
         raise ValueError(f"--salt goes with {', '.join(SALTED)}, got {', '.join(names)}")
     if salt:
@@ -111,12 +120,20 @@ def check_salt(salt: str, names: Sequence[str]) -> None:
 
 
 def run_suites(names: Sequence[str], request: Request) -> list[Suite]:
-    """Run suites of `SUITES` one after the other, with one progress bar for all of them."""
+    """Run suites one after the other, with one progress bar for all of them.
+
+    Args:
+        names: Names in `SUITES`.
+        request: Options of the run.
+
+    Returns:
+        Results.
+    """
     with use_shared_bar(request.console, f"bench {' '.join(names)}"):
-        return [run_suite(name, request) for name in names]
+        return [_run_suite(name, request) for name in names]
 
 
-def run_suite(name: str, request: Request) -> Suite:
-    """Run a suite of `SUITES`."""
+def _run_suite(name: str, request: Request) -> Suite:
+    """Run a suite."""
     module, run = SUITES[name]
-    return run(import_module(module, __package__), request)
+    return run(cast(_SuiteModule, import_module(module, __package__)), request)

@@ -1,15 +1,10 @@
-"""Helpers of the commands: their options' values, the files that they write, who drives.
+"""Helpers of the commands: the files that they write, and who drives in `run` and `live`."""
 
-`AgentSpec` makes who drives in `run` and `live`: an agent, its estimator, and a fitting env.
-"""
-
-import json
 import platform
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,17 +15,17 @@ from typer import Exit
 
 from ... import __version__
 from ...envs.io import atomic_file
-from ..harness.parallel import Bar
 from ..harness.results import Suite, check_writable, write_json, write_parquet, write_text
 from ..report.terminal import print_run, print_suite
 from .names import check_env
+from .options import parse_options
 
 if TYPE_CHECKING:
     import gymnasium as gym
 
+    from ...agents import Agent
     from ...agents.rollout import Rollout
-    from ...agents.training.callbacks import Progress as TrainingProgress
-    from ...agents.training.config import TrainingTask
+    from ...envs.record import Array
 
 _SUFFIXES = {
     "correction": (".safetensors",),
@@ -50,31 +45,19 @@ _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "control", "plotly")  # nam
 _DEFAULT_ENVS = ("sideslip/YawVision-v0", "sideslip/AfsYawFusion-v0")
 
 
-def parse_option(text: str) -> tuple[str, Any]:
-    """Parse NAME=VALUE to name and value, JSON or a word; ValueError for another form."""
-    name, equals, value = text.partition("=")
-    if not (name and equals):
-        raise ValueError(f"an option is NAME=VALUE, got {text!r}")
-    try:
-        return name, json.loads(value)
-    except json.JSONDecodeError:
-        return name, value
-
-
-def parse_options(texts: Sequence[str] | None) -> dict[str, Any]:
-    """Parse texts of NAME=VALUE, as `parse_option` does, to values by name."""
-    return dict(map(parse_option, texts or ()))
-
-
 def get_command_line() -> str:
     """Get the command line of this process."""
     return shlex.join(["sideslip", *sys.argv[1:]])
 
 
 def check_files(**paths: Path | None) -> None:
-    """Check before the work that files have their kind's suffix and can be written."""
-    for option, path in paths.items():
-        known = _SUFFIXES[option]
+    """Check before the work that files have their kind's suffix and can be written.
+
+    Args:
+        paths: Files by kind, None for none.
+    """
+    for kind, path in paths.items():
+        known = _SUFFIXES[kind]
         if path and path.suffix.lower() not in known and not path.is_char_device():
             raise ValueError(f"{path}: expected a file that ends in {' or '.join(known)}")
     check_writable(*paths.values())
@@ -88,7 +71,11 @@ def announce_torch() -> None:
 
 @contextmanager
 def handle_interrupt(how: str) -> Iterator[None]:
-    """End with exit status 130 where the user interrupts, and print `how` to continue."""
+    """End with exit status 130 where the user interrupts.
+
+    Args:
+        how: How to continue, which is printed.
+    """
     try:
         yield
     except KeyboardInterrupt:
@@ -97,7 +84,12 @@ def handle_interrupt(how: str) -> Iterator[None]:
 
 
 def print_written(console: Console, path: Path) -> None:
-    """Print on the console that the file `path` was written."""
+    """Print that a file was written.
+
+    Args:
+        console: The screen.
+        path: The file.
+    """
     console.print(f"wrote {path}", highlight=False, soft_wrap=True, markup=False)
 
 
@@ -109,7 +101,16 @@ def show_episode(
     parquet: Path | None = None,
     kml: Path | None = None,
 ) -> None:
-    """Print an episode's score, and write its picture, signals and track with the driver's name."""
+    """Print an episode's score, and write its picture, signals and track.
+
+    Args:
+        console: The screen.
+        drive: The episode.
+        driver: Name of the track.
+        plot: File of the picture, None for none.
+        parquet: File of all signals, None for none.
+        kml: File of the track for a map, None for none.
+    """
     from ..report.film import make_track_kml
 
     slip = drive["beta"]
@@ -132,20 +133,23 @@ def show_episode(
 
 
 def write_output(
-    console: Console,
-    suites: Sequence[Suite],
-    html: Path | None = None,
-    json: Path | None = None,
-    parquet: Path | None = None,
-    brief: bool = False,
+    console: Console, suites: Sequence[Suite], files: Mapping[str, Path | None], brief: bool = False
 ) -> None:
-    """Print all tables, or if `brief` verdicts and a table; write report and rows to files."""
+    """Print suites, and write their report and rows to files.
+
+    Args:
+        console: The screen.
+        suites: Results.
+        files: Files of the report (html) and the rows (json, parquet), None for none.
+        brief: Whether verdicts and a table are printed instead of all tables.
+    """
+    html = files["html"]
     if brief:
         print_run(console, suites, html is not None)
     for suite in () if brief else suites:
         print_suite(console, suite)
     rows = [row for suite in suites for row in suite.rows]
-    for path, write in ((json, write_json), (parquet, write_parquet)):
+    for path, write in ((files["json"], write_json), (files["parquet"], write_parquet)):
         if path is not None:
             write(path, rows)
             print_written(console, path)
@@ -160,107 +164,75 @@ def write_output(
         print_written(console, html)
 
 
-def make_command(task: "TrainingTask", steps: int) -> list[str]:
-    """Make the words of the command that trains a task from the start, for so many steps."""
-    words = ["sideslip", "train", "--algo", task.algo, "--env", task.env_id]
-    words += ["--estimator", task.estimator] if task.estimator else []
-    option_groups = {"--estimator-option": task.estimator_options, "--option": task.env_options}
-    for option, values in option_groups.items():
-        for name, value in values.items():
-            words += [option, f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
-    words += [word for item in task.scenarios for word in ("--scenarios", str(item))]
-    words += [word for item in task.reads for word in ("--reads", item)]
-    numbers = {"--steps": steps, "--seed": task.seed, "--num-envs": task.num_envs}
-    numbers |= {"--n-eval-envs": task.n_eval_envs}
-    return words + [word for name, value in numbers.items() for word in (name, str(value))]
+def make_setup(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Make the record of who drives, in which env.
 
+    Args:
+        options: Options of the command by name.
 
-def choose_folder(task: "TrainingTask", start: str, out: Path | None, logs: Path | None) -> Path:
-    """Choose a training's folder: `out`, the zoo's next one in `logs`, or one named by its task.
-
-    Raises ValueError for both of them. start: Name of the policy that it begins with, "" for none.
+    Returns:
+        Names and options of agent, estimator and env, and the seed.
     """
-    if logs is not None:
-        if out is not None:
-            raise ValueError(f"--log-folder {logs} numbers its folders itself: without --out {out}")
-        return task.find_zoo_folder(logs)
-    if out is not None:
-        return out
-    env_options = task.env_options.items()
-    options = [value if isinstance(value, str) else name for name, value in env_options]
-    options += ["mixture"] if task.scenarios else []
-    words = [task.env_id.rpartition("/")[2], task.algo, task.estimator, *options, start]
-    return Path("-".join(["train", *filter(None, words), str(task.seed)]))
+    chosen = {name: options[name] for name in ("scenario", "vehicle", "control_period")}
+    env_options = {name: value for name, value in chosen.items() if value is not None}
+    return {
+        **{name: options[name] for name in ("estimator", "agent", "env")},
+        "options": env_options | parse_options(options["option"]),
+        "agent_options": parse_options(options["agent_option"]),
+        "estimator_options": parse_options(options["estimator_option"]),
+        "seed": options["seed"],
+    }
 
 
-def show_training(bar: Bar, now: "TrainingProgress") -> None:
-    """Show in a bar a training's newest episodes, and its newest and best evaluation."""
-    text = "" if now.cost is None else f"cost {now.cost:.3g} exploring, "
-    last = now.evaluations[-1]
-    best = min(now.evaluations, key=lambda evaluation: evaluation.criterion)
-    if last.of_start is None:
-        text += f"of none's {last.of_none:.3f}, best {best.of_none:.3f}"
-    else:
-        text += f"of its start's {last.of_start:.3f}, best {best.of_start:.3f}"
-    bar.update(bar.task_ids[0], completed=now.steps, description=text)
+def make_driver(setup: Mapping[str, Any], trust: bool) -> "tuple[gym.Env[Array, Array], Agent]":
+    """Make an env with its estimator, and the agent; without an env the first that fits.
+
+    Args:
+        setup: Record of `make_setup`.
+        trust: Whether a policy's zip may be read, which runs code of its maker's.
+
+    Returns:
+        Env and agent.
+    """
+    if setup["env"] is not None:
+        check_env(setup["env"])
+        return _make_driver(setup, setup["env"], trust)
+    first, *others = _DEFAULT_ENVS
+    try:
+        return _make_driver(setup, first, trust)
+    except ValueError:
+        for other in others:
+            with suppress(TypeError, ValueError):
+                return _make_driver(setup, other, trust)
+        raise
 
 
-@dataclass(frozen=True)
-class AgentSpec:
-    """An agent and the estimator in front of it, by their names and options."""
+def _make_driver(
+    setup: Mapping[str, Any], env_id: str, trust: bool
+) -> "tuple[gym.Env[Array, Array], Agent]":
+    """Make them in one env."""
+    from ...agents import make_agent
+    from ...agents.env_info import make_env
+    from ...estimators.wrappers.estimate import EstimateObservation, choose_estimator
+    from ..control.entries import list_outputs
+    from ..harness.drives import call_quietly
 
-    agent: str
-    agent_options: dict[str, Any]
-    estimator: str | None  # None without one
-    estimator_options: dict[str, Any]
-    trust: bool = False  # whether a policy's zip may be read, which runs code of its maker's
-
-    def build(self, env_id: str | None, options: dict[str, Any]) -> "tuple[gym.Env[Any, Any], Any]":
-        """Make the env with the estimator, and the agent.
-
-        Args:
-            env_id: Id of the env; None: the first of the usual ones that fits.
-            options: Options of the env.
-
-        Returns:
-            Env and agent.
-        """
-        if env_id is not None:
-            check_env(env_id)
-            return self._build(env_id, options)
-        first, *others = _DEFAULT_ENVS
-        try:
-            return self._build(first, options)
-        except ValueError:
-            for other in others:
-                try:
-                    return self._build(other, options)
-                except (TypeError, ValueError):
-                    continue
-            raise
-
-    def _build(self, env_id: str, options: dict[str, Any]) -> "tuple[gym.Env[Any, Any], Any]":
-        from ...agents import make_agent
-        from ...agents.env_info import make_env
-        from ...estimators.wrappers.estimate import EstimateObservation, choose_estimator
-        from ..control.entries import list_outputs
-        from ..harness.drives import call_quietly
-
-        env = make_env(env_id, options)
-        sensors = env.get_wrapper_attr("slow_sensors")
-        if self.estimator is not None:
-            outputs, filter_options = list_outputs(self.estimator), self.estimator_options
-            env = call_quietly(
-                EstimateObservation, env, self.estimator, outputs, options=filter_options or None
-            )
-        elif self.estimator_options:
-            raise ValueError("--estimator-option needs --estimator")
-        try:
-            return env, make_agent(self.agent, env, trust=self.trust, **self.agent_options)
-        except ValueError as error:
-            if self.estimator is None and "_hat" in str(error):
-                raise ValueError(
-                    f"{self.agent} works on an estimate: add --estimator, for example "
-                    f"--estimator {choose_estimator(sensors)}"
-                ) from None
-            raise
+    agent, estimator, filter_options = (
+        setup[x] for x in ("agent", "estimator", "estimator_options")
+    )
+    env = make_env(env_id, setup["options"])
+    sensors = env.get_wrapper_attr("slow_sensors")
+    if estimator is not None:
+        arguments = env, estimator, list_outputs(estimator)
+        env = call_quietly(EstimateObservation, *arguments, options=filter_options or None)
+    elif filter_options:
+        raise ValueError("--estimator-option needs --estimator")
+    try:
+        return env, make_agent(agent, env, trust=trust, **setup["agent_options"])
+    except ValueError as error:
+        if estimator is None and "_hat" in str(error):
+            raise ValueError(
+                f"{agent} works on an estimate: add --estimator, for example "
+                f"--estimator {choose_estimator(sensors)}"
+            ) from None
+        raise

@@ -8,55 +8,55 @@ import os
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
-from typer import Argument, Exit, Option
+from typer import Exit
 
 from ...envs.io import atomic_file, read_document, write_atomic, write_document
 from ...envs.numerics import require_extra
 from ..harness.parallel import use_shared_bar
 from ..report.terminal import print_suite
-from .common import check_files, parse_option, parse_options, print_written, write_output
-from .names import File, Html, Json, Parquet, Text, Texts, complete
+from .common import check_files, print_written, write_output
+from .names import complete
+from .options import File, Text, Texts, parse_option, parse_options, register, take, take_argument
 
 if TYPE_CHECKING:
+    from ...envs.sensors.camera.films import Film
     from ...envs.sensors.camera.images import Image
     from ...envs.sensors.camera.lane_finder import Lane, LaneFinder
     from ...envs.sensors.camera.pinhole import Pinhole
-
-MappingOption = Annotated[
-    Texts, Option("--map", help="NAME_UNIT=COLUMN of the log (yaw_rate_degps=r); repeatable.")
-]
-Ratio = Annotated[float | None, Option(help="Of the logged steering to the wheels' angle (15.2).")]
-Sign = Annotated[int | None, Option(help="1 or -1, of the logged steering.")]
-Offset = Annotated[float | None, Option(help="deg at the wheels, added to the steering.")]
+    from ..recorded.wires import SignalCalibration
 
 _MAX_TRIES = 60  # frames in which a lane is looked for that shows how the camera is mounted
 _MAX_PIXELS = 2**26  # of a picture; a small file may hold many more
 
 
-def _read_wires(
-    vehicle: str | None,
-    latency: Texts,
-    ratio: float | None,
-    sign: int | None,
-    offset_deg: float | None,
-) -> Any:
+def _read_wires(command: "_Replay | _Identify", latency: Texts = None) -> "SignalCalibration":
     """Read the calibration of signals from the vehicle's file, and replace what is given."""
     from ..recorded.wires import read_wires
 
-    known = read_wires(vehicle)
-    offset = None if offset_deg is None else math.radians(offset_deg)
-    steering = {"ratio": ratio, "sign": sign, "offset": offset}
+    known, degrees = read_wires(command.vehicle), command.steering_offset
+    offset = None if degrees is None else math.radians(degrees)
+    steering = {"ratio": command.steering_ratio, "sign": command.steering_sign, "offset": offset}
     overrides: dict[str, Any] = {k: value for k, value in steering.items() if value is not None}
     late = {**known.latency, **parse_options(latency)}
     return known._replace(latency=late, **overrides).check()
 
 
 def parse_estimator_options(texts: Texts) -> dict[str, dict[str, Any]]:
-    """Parse texts such as "joint.members=4" to options by estimator, {"joint": {"members": 4}}."""
+    """Parse options by estimator, such as {"joint": {"members": 4}} from "joint.members=4".
+
+    Args:
+        texts: ESTIMATOR.NAME=VALUE each, None for none.
+
+    Returns:
+        Values by estimator and name.
+
+    Raises:
+        ValueError: A text has another form.
+    """
     options: dict[str, dict[str, Any]] = {}
     for text in texts or ():
         key, value = parse_option(text)
@@ -67,190 +67,178 @@ def parse_estimator_options(texts: Texts) -> dict[str, dict[str, Any]]:
     return options
 
 
-def replay_command(
-    log: Annotated[Path, Argument(help="A recorded drive: CSV, Parquet, MATLAB, MDF or NMEA.")],
-    vehicle: Annotated[
-        Text,
-        Option(
-            help="A name, a TOML or JSON file, or `identify`: found in the log itself.",
-            autocompletion=complete("vehicles"),
-        ),
-    ] = None,
-    nominal: Annotated[
-        str, Option(help="The car whose mass and arms `--vehicle identify` takes.")
-    ] = "passenger-car",
-    mapping: MappingOption = None,
-    estimator: Annotated[
-        Texts, Option(help="A name; repeatable; default: all that the log serves.")
-    ] = None,
-    estimator_option: Annotated[
-        Texts, Option(help="ESTIMATOR.NAME=VALUE (joint.gate=0.99); repeatable.")
-    ] = None,
-    steering_ratio: Ratio = None,
-    steering_sign: Sign = None,
-    steering_offset: Offset = None,
-    latency: Annotated[
-        Texts, Option(help="CHANNEL=S, by which a channel is late (gps=0.2); repeatable.")
-    ] = None,
-    until: Annotated[
-        float | None, Option(help="s of the log from which `identify` is; the rest is replayed.")
-    ] = None,
-    course_rate: Annotated[float, Option(help="Hz of the emulated course.")] = 10.0,
-    course_noise: Annotated[float, Option(help="deg, standard deviation.")] = 0.5,
-    course_delay: Annotated[float, Option(help="s the course arrives late.")] = 0.0,
-    course_bias: Annotated[float, Option(help="deg.")] = 0.0,
-    gyro_bias: Annotated[float, Option(help="deg/s added to the gyro.")] = 0.0,
-    html: Html = None,
-    json: Json = None,
-    parquet: Parquet = None,
-    plot: Annotated[File, Option(help="Draw a receiver's track: PNG, PDF, SVG.")] = None,
-    kml: Annotated[File, Option(help="Write a receiver's track for a map.")] = None,
-) -> None:
+@register("replay", "Run estimators over a recorded drive.")
+class _Replay:
     """Run the estimators over a recorded drive and score them; over a receiver's log (NMEA), which
     has no gyro, filter the fixes with noise that follows HDOP or does not."""
-    from ...envs.recordings.sources import is_nmea
-    from ..recorded.replay import replay_file
 
-    console = Console()
-    check_files(html=html, json=json, parquet=parquet, plot=plot, kml=kml)
-    if is_nmea(log):
-        from ..recorded.receiver import draw, make_receiver_suite, replay_nmea, write_kml
+    log: Path = take_argument("A recorded drive: CSV, Parquet, MATLAB, MDF or NMEA.", ...)
+    vehicle: Text = take(
+        "A name, a TOML or JSON file, or `identify`: found in the log itself.",
+        autocompletion=complete("vehicles"),
+    )
+    nominal: str = take("The car whose mass and arms `--vehicle identify` takes.", "passenger-car")
+    mapping: Texts
+    estimator: Texts = take("A name; repeatable; default: all that the log serves.")
+    estimator_option: Texts = take("ESTIMATOR.NAME=VALUE (joint.gate=0.99); repeatable.")
+    steering_ratio: float | None
+    steering_sign: int | None
+    steering_offset: float | None
+    latency: Texts = take("CHANNEL=S, by which a channel is late (gps=0.2); repeatable.")
+    until: float | None = take("s of the log from which `identify` is; the rest is replayed.")
+    course_rate: float = take("Hz of the emulated course.", 10.0)
+    course_noise: float = take("deg, standard deviation.", 0.5)
+    course_delay: float = take("s the course arrives late.", 0.0)
+    course_bias: float = take("deg.", 0.0)
+    gyro_bias: float = take("deg/s added to the gyro.", 0.0)
+    html: File
+    json: File
+    parquet: File
+    plot: File = take("Draw a receiver's track: PNG, PDF, SVG.")
+    kml: File = take("Write a receiver's track for a map.")
 
+    def run(self) -> None:
+        from ...envs.recordings.sources import is_nmea
+        from ..recorded.replay import replay_file
+
+        console, log = Console(), self.log
+        files = {"html": self.html, "json": self.json, "parquet": self.parquet}
+        check_files(**files, plot=self.plot, kml=self.kml)
+        if is_nmea(log):
+            from ..recorded.receiver import draw, make_receiver_suite, replay_nmea, write_kml
+
+            with use_shared_bar(console, f"replay {log}"):
+                received = replay_nmea(log, self.vehicle, self.mapping)
+            write_output(console, [make_receiver_suite(received)], files)
+            for path, write in ((self.plot, draw), (self.kml, write_kml)):
+                if path is not None:
+                    write(path, received)
+                    print_written(console, path)
+            return
+        if self.plot or self.kml:
+            raise ValueError(f"{log}: --plot and --kml are for a receiver's log (NMEA); see --html")
+        wires = _read_wires(self, self.latency)
         with use_shared_bar(console, f"replay {log}"):
-            received = replay_nmea(log, vehicle, mapping)
-        write_output(console, [make_receiver_suite(received)], html, json, parquet)
-        for path, write in ((plot, draw), (kml, write_kml)):
-            if path is not None:
-                write(path, received)
-                print_written(console, path)
-        return
-    if plot or kml:
-        raise ValueError(f"{log}: --plot and --kml are for a receiver's log (NMEA); see --html")
-    wires = _read_wires(vehicle, latency, steering_ratio, steering_sign, steering_offset)
-    with use_shared_bar(console, f"replay {log}"):
-        suite = replay_file(
-            log,
-            vehicle,
-            mapping=mapping,
-            wires=wires,
-            nominal=nominal,
-            until=until,
-            estimators=estimator,
-            options=parse_estimator_options(estimator_option),
-            course_rate=course_rate,
-            course_noise_deg=course_noise,
-            delay=course_delay,
-            bias_deg=course_bias,
-            gyro_bias_degps=gyro_bias,
-        )
-    write_output(console, [suite], html, json, parquet)
+            suite = replay_file(
+                log,
+                self.vehicle,
+                mapping=self.mapping,
+                wires=wires,
+                nominal=self.nominal,
+                until=self.until,
+                estimators=self.estimator,
+                options=parse_estimator_options(self.estimator_option),
+                course_rate=self.course_rate,
+                course_noise_deg=self.course_noise,
+                delay=self.course_delay,
+                bias_deg=self.course_bias,
+                gyro_bias_degps=self.gyro_bias,
+            )
+        write_output(console, [suite], files)
 
 
-def identify_command(
-    log: Annotated[
-        Path, Argument(help="A recorded drive: CSV, Parquet, MATLAB (.mat) or MDF (.mf4).")
-    ],
-    vehicle: Annotated[
-        str,
-        Option(
-            help="The car that is stated: its mass and arms stay, the search starts there.",
-            autocompletion=complete("vehicles"),
-        ),
-    ] = "passenger-car",
-    mapping: MappingOption = None,
-    out: Annotated[File, Option(help="Write the car and its wires as TOML.")] = None,
-    until: Annotated[
-        float | None, Option(help="s of the log that are used; the rest stays fresh.")
-    ] = None,
-    tyres: Annotated[
-        Text,
-        Option(
-            help="linear: as stiff as in this drive; fiala: as at small slips; default: "
-            "what predicts better."
-        ),
-    ] = None,
-    steering_ratio: Ratio = None,
-    steering_sign: Sign = None,
-    steering_offset: Offset = None,
-) -> None:
+@register("identify", "Find the car of a recorded drive.")
+class _Identify:
     """Find a car's stiffness, inertia, steering, noise and latencies in a recorded drive, with
     intervals, and which of them the log cannot tell; exit status 1, and no file, where nothing is
     identified."""
-    from ..recorded.replay import identify_file
-    from ..recorded.wires import write_vehicle
 
-    console = Console()
-    check_files(toml=out)
-    wires = _read_wires(vehicle, None, steering_ratio, steering_sign, steering_offset)
-    with use_shared_bar(console, f"identify {log}"):
-        result, suite = identify_file(log, vehicle, mapping or (), wires, tyres, until)
-    print_suite(console, suite)
-    if result.reason:
-        raise Exit(1)
-    if out is not None:
-        write_vehicle(out, result.car, result.wires)
-        print_written(console, out)
+    log: Path = take_argument("A recorded drive: CSV, Parquet, MATLAB (.mat) or MDF (.mf4).", ...)
+    vehicle: str = take(
+        "The car that is stated: its mass and arms stay, the search starts there.",
+        "passenger-car",
+        autocompletion=complete("vehicles"),
+    )
+    mapping: Texts
+    out: File = take("Write the car and its wires as TOML.")
+    until: float | None = take("s of the log that are used; the rest stays fresh.")
+    tyres: Text = take(
+        "linear: as stiff as in this drive; fiala: as at small slips; default: what predicts "
+        "better."
+    )
+    steering_ratio: float | None
+    steering_sign: int | None
+    steering_offset: float | None
+
+    def run(self) -> None:
+        from ..recorded.replay import identify_file
+        from ..recorded.wires import write_vehicle
+
+        console, stated = Console(), (self.vehicle, self.mapping or ())
+        check_files(toml=self.out)
+        wires = _read_wires(self)
+        with use_shared_bar(console, f"identify {self.log}"):
+            result, suite = identify_file(self.log, *stated, wires, self.tyres, self.until)
+        print_suite(console, suite)
+        if result.reason:
+            raise Exit(1)
+        if self.out is not None:
+            write_vehicle(self.out, result.car, result.wires)
+            print_written(console, self.out)
 
 
-def lane_command(
-    source: Annotated[File, Argument(metavar="IMAGE|VIDEO", help="A picture or a film.")] = None,
-    intrinsics: Annotated[
-        File, Option(help="The camera: TOML or JSON with K, dist, size, perhaps height and tilt.")
-    ] = None,
-    lane_width: Annotated[float, Option(help="m, from marking to marking.")] = 3.7,
-    out: Annotated[File, Option("--out", "-o", help="Write what was found on it.")] = None,
-    json: Annotated[File, Option("--json", help="Write the numbers.")] = None,
-    calibrate: Annotated[
-        File, Option(help="A folder of chessboards (9 x 6): find the intrinsics.")
-    ] = None,
-) -> None:
+@register("lane", "Find the lane in a picture or film.")
+class _Lane:
     """Find the lane: heading, offset, curvature and a quality, drawn over the picture.
 
     Without height and tilt among the intrinsics they are estimated from a picture, for a straight
     lane of the width stated; without intrinsics a lens of usual width is assumed.
     """
-    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(_MAX_PIXELS))  # read where it is loaded
-    with require_extra("vision", "the lane finder needs {}"):
-        import cv2
-    from ...envs.sensors.camera.films import PICTURES, Film, read_picture
 
-    console = Console(soft_wrap=True)
-    check_files(json=json)
-    if (source is None) == (calibrate is None):
-        raise ValueError("expected a picture or a film, or --calibrate FOLDER")
-    if source is None:
-        assert calibrate is not None
-        _calibrate(calibrate, json or Path("intrinsics.json"), console)
-        return
-    if not 1.0 < lane_width < 10.0:
-        raise ValueError(f"--lane-width is 1 to 10 m, got {lane_width}")
-    cv2.setNumThreads(1)
-    still = source.suffix.lower() in PICTURES
-    check_files(**{"image" if still else "film": out})
-    if still:
-        try:
-            picture = read_picture(source)
-        except cv2.error:
-            raise ValueError(
-                f"{source}: expected a picture of at most {_MAX_PIXELS} pixels"
-            ) from None
-        finder = _make_finder([picture], intrinsics, lane_width, source)
-        lanes, seconds = _process_picture(picture, finder, out)
-    else:
-        film = Film(source)
-        finder = _make_finder(film.read_head(_MAX_TRIES), intrinsics, lane_width, source)
-        lanes, seconds = _process_film(film, finder, out, console)
-        if len(lanes) < film.frame_count:
-            console.print(
-                f"the film ends after {len(lanes)} of the {film.frame_count} frames it promises"
+    source: File = take_argument("A picture or a film.", None, metavar="IMAGE|VIDEO")
+    intrinsics: File = take("The camera: TOML or JSON with K, dist, size, perhaps height and tilt.")
+    lane_width: float = take("m, from marking to marking.", 3.7)
+    out: File = take("Write what was found on it.", None, "--out", "-o")
+    json: File = take("Write the numbers.")
+    calibrate: File = take("A folder of chessboards (9 x 6): find the intrinsics.")
+
+    def run(self) -> None:
+        os.environ.setdefault(
+            "OPENCV_IO_MAX_IMAGE_PIXELS", str(_MAX_PIXELS)
+        )  # read where it is loaded
+        with require_extra("vision", "the lane finder needs {}"):
+            import cv2
+        from ...envs.sensors.camera.films import PICTURES, Film, read_picture
+
+        console, source, out, json = Console(soft_wrap=True), self.source, self.out, self.json
+        check_files(json=json)
+        if (source is None) == (self.calibrate is None):
+            raise ValueError("expected a picture or a film, or --calibrate FOLDER")
+        if self.calibrate is not None:
+            _calibrate(self.calibrate, json or Path("intrinsics.json"), console)
+            return
+        assert source is not None
+        if not 1.0 < self.lane_width < 10.0:
+            raise ValueError(f"--lane-width is 1 to 10 m, got {self.lane_width}")
+        cv2.setNumThreads(1)
+        still = source.suffix.lower() in PICTURES
+        check_files(**{"image" if still else "film": out})
+        if still:
+            try:
+                picture = read_picture(source)
+            except cv2.error:
+                raise ValueError(
+                    f"{source}: expected a picture of at most {_MAX_PIXELS} pixels"
+                ) from None
+            finder = _make_finder([picture], self.intrinsics, self.lane_width, source)
+            lanes, seconds = _process_picture(picture, finder, out)
+        else:
+            film = Film(source)
+            finder = _make_finder(
+                film.read_head(_MAX_TRIES), self.intrinsics, self.lane_width, source
             )
-    _report(console, source, finder.camera, lanes, seconds)
-    if json is not None:
-        frames = [lane._asdict() for lane in lanes]
-        write_document(json, {"source": str(source), "frames": frames})
-    for path in (out, json):
-        if path is not None:
-            print_written(console, path)
+            lanes, seconds = _process_film(film, finder, out, console)
+            if len(lanes) < film.frame_count:
+                console.print(
+                    f"the film ends after {len(lanes)} of the {film.frame_count} frames it promises"
+                )
+        _report(console, source, finder.camera, lanes, seconds)
+        if json is not None:
+            frames = [lane._asdict() for lane in lanes]
+            write_document(json, {"source": str(source), "frames": frames})
+        for path in (out, json):
+            if path is not None:
+                print_written(console, path)
 
 
 def _calibrate(folder: Path, path: Path, console: Console) -> None:
@@ -329,7 +317,7 @@ def _process_picture(
 
 
 def _process_film(
-    film: Any, finder: "LaneFinder", out: Path | None, console: Console
+    film: "Film", finder: "LaneFinder", out: Path | None, console: Console
 ) -> tuple[list["Lane"], float]:
     """Find a film's lanes, draw them, and return them with the median CPU seconds of a frame."""
     import cv2

@@ -1,29 +1,15 @@
-"""Names and options that commands share: a line on each name, completion in shells."""
+"""Everything that has a name, with a line on each, and its completion in shells."""
 
 import ast
 import math
 from collections.abc import Callable, Iterable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
 
 import gymnasium as gym
-from typer import Option
 
 from ...envs.validation import check_choice
 from ..suites import SUITES
-
-Text = str | None
-Texts = list[str] | None
-File = Path | None
-EngineName = Annotated[
-    str, Option("--engine", help="What runs the cases: processes, or ray, a cluster.")
-]
-Address = Annotated[str, Option(help="HOST:PORT of the cluster; default: this machine's.")]
-Jobs = Annotated[int | None, Option("--jobs", "-j", min=1, help="Processes.")]
-Html = Annotated[File, Option("--html", help="Write a self-contained report.")]
-Json = Annotated[File, Option("--json", help="Write the rows as JSON.")]
-Parquet = Annotated[File, Option("--parquet", help="Write the rows as Parquet.")]
 
 _ENVIRONMENTS = {
     "YawVision": "camera every 33 ms, 30 ms late",
@@ -45,7 +31,14 @@ def _list_environments() -> dict[str, str]:
 
 
 def check_env(env_id: str) -> None:
-    """Raise ValueError for an id that is not registered and, without a colon, has no module."""
+    """Check that an id is registered or, with a colon, has a module.
+
+    Args:
+        env_id: Id of the env.
+
+    Raises:
+        ValueError: There is no such id.
+    """
     if env_id not in gym.registry and ":" not in env_id:
         check_choice("environment", env_id, _list_environments())
 
@@ -155,8 +148,15 @@ KINDS: dict[str, Callable[[], dict[str, str]]] = {
 """Functions that list the names of a kind with a line on each."""
 
 
-def complete(*kinds: str) -> Callable[[str], Iterable[Any]]:
-    """Make a shell completion of the names of some `KINDS`, with the line on each."""
+def complete(*kinds: str) -> Callable[[str], Iterable[tuple[str, str]]]:
+    """Make a shell completion of names.
+
+    Args:
+        kinds: Their kinds, of `KINDS`.
+
+    Returns:
+        Function from the beginning of a name to the names and a line on each.
+    """
 
     def list_matches(incomplete: str) -> list[tuple[str, str]]:
         pairs = [pair for kind in kinds for pair in KINDS[kind]().items()]

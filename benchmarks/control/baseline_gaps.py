@@ -57,7 +57,15 @@ CONTESTANTS = (
 def make_score_scales(
     results: Results, tasks: Sequence[ControlTask]
 ) -> dict[ControlTask, ScoreScale]:
-    """Make the scale of scores of each task in which both baselines were driven."""
+    """Make the scale of scores of each task in which both baselines were driven.
+
+    Args:
+        results: Episodes of the entries.
+        tasks: Tasks.
+
+    Returns:
+        Scales by task.
+    """
     scales = {}
     for task in tasks:
         nominal, oracle = (results.select(task, name) for name in (NOMINAL, STATE))
@@ -71,7 +79,13 @@ def make_oracle_table(
 ) -> ResultTable:
     """Make the table of every task's baselines, and of whether they fall in cost.
 
-    foresight: log(J_oracle-state / J_clairvoyant) of the calibrated tasks, shape (n,) each.
+    Args:
+        results: Episodes of the entries.
+        tasks: Tasks, a row each.
+        foresight: log(J_oracle-state / J_clairvoyant) of the calibrated tasks, shape (n,) each.
+
+    Returns:
+        Table.
     """
     scales, cells = make_score_scales(results, tasks), []
     for task in tasks:
@@ -114,7 +128,14 @@ def _describe_order(scale: ScoreScale, oracle_ratios: Array, foresight: Array | 
 
 
 def describe_findings(standings: Sequence[Standing]) -> list[str]:
-    """Describe the entries that cost less than oracle-state over their tier, Holm-corrected."""
+    """Describe the entries that cost less than oracle-state over their tier, Holm-corrected.
+
+    Args:
+        standings: Entries of a tier.
+
+    Returns:
+        Sentences.
+    """
     others = [
         item
         for item in standings
@@ -135,14 +156,31 @@ def describe_findings(standings: Sequence[Standing]) -> list[str]:
 
 
 def find_below_optimum(names: Sequence[str], regrets: Sequence[Array]) -> list[str]:
-    """Find which surely cost less than the clairvoyant; regrets: log(J / J_clairvoyant), (n,)."""
+    """Find which surely cost less than the clairvoyant, Holm-corrected.
+
+    Args:
+        names: Names of the entries.
+        regrets: log(J / J_clairvoyant) of each, shape (n,).
+
+    Returns:
+        Names of those.
+    """
     sure = holm([compute_p_value(logs) for logs in regrets])
     return [name for name, is_sure in zip(names, sure, strict=True) if is_sure]
 
 
 def make_knowledge_table(results: Results, tiers: Mapping[str, Sequence[ControlTask]],
                     foresight: Mapping[ControlTask, Array]) -> ResultTable:  # fmt: skip
-    """Make the table of what not knowing costs in each tier: ratios of neighbouring baselines."""
+    """Make the table of what not knowing costs in each tier: ratios of neighbouring baselines.
+
+    Args:
+        results: Episodes of the entries.
+        tiers: Tasks by tier.
+        foresight: log(J_oracle-state / J_clairvoyant) of the calibrated tasks, shape (n,) each.
+
+    Returns:
+        Table.
+    """
     cells = []
     for tier, tasks in tiers.items():
         scales = make_score_scales(results, tasks)
@@ -165,9 +203,14 @@ def make_knowledge_table(results: Results, tiers: Mapping[str, Sequence[ControlT
 
 
 def list_failures(results: Results, late: float = 0.0) -> list[list[str]]:
-    """List (tier, task, entry, what happened) where the failure is not the car's, such as a NaN.
+    """List where a failure is not the car's, such as a NaN.
 
-    late: Delay of the sensors (s) where the results are those of `measure_delay_cost`.
+    Args:
+        results: Episodes of the entries.
+        late: Delay of the sensors (s) in results of `measure_delay_cost`.
+
+    Returns:
+        Tier, task, entry and what happened of each.
     """
     lines, more = [], f", sensors {1e3 * late:.0f} ms late" if late else ""
     for entry, result in results.outcomes.items():
@@ -214,7 +257,17 @@ def measure_delay_cost(
     console: Console | None = None,
     keep: Path | None = None,
 ) -> tuple[list[DelayCost], list[Results]]:
-    """Drive every contestant at each of DELAYS, all on the same seeds; the results by delay too."""
+    """Drive every contestant at each of DELAYS, all on the same seeds.
+
+    Args:
+        seeds: Seeds.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+        keep: Folder in which finished cases stay.
+
+    Returns:
+        Costs of the contestants, and the results by delay.
+    """
     delay_results = [
         measure(_make_late_entries(d), seeds, jobs=jobs, console=console, keep=keep) for d in DELAYS
     ]
@@ -233,7 +286,14 @@ def measure_delay_cost(
 
 
 def make_cost_lines(prices: Sequence[DelayCost]) -> Mapping[str, tuple[Array, Array, Array]]:
-    """Make (value, low, high) over the delays by name, of those that drove at all of them."""
+    """Make the lines of cost over delay, of those that drove at all delays.
+
+    Args:
+        prices: Costs of the contestants.
+
+    Returns:
+        Value, lower and upper bound, shape (DELAYS,) each, by name.
+    """
     complete = [price for price in prices if np.isfinite(price.over).all()]
     return {price.entry.label: (*np.array(price.over).T,) for price in complete}
 
@@ -246,13 +306,13 @@ _MIN_LOW = 0.2  # and the lower limit of its 95 % interval above this one
 _FAILING = 0.1
 
 
-def make_oracle_entries(task: ControlTask) -> list[ControlEntry]:
+def _make_oracle_entries(task: ControlTask) -> list[ControlEntry]:
     """Make the entries of nominal and of the candidates for the oracles."""
     names = (NOMINAL, *ORACLES[PARAMETERS], *ORACLES[STATE])
     return [ControlEntry(task, "", name) for name in names]
 
 
-def measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
+def _measure_task(results: Results, task: ControlTask) -> TaskMeasurement:
     """Measure a candidate with the better oracle of each kind.
 
     That one fails in at most `_FAILING` of the episodes, and among those it has the larger gap. A
@@ -326,9 +386,9 @@ def main(write: bool = False, episodes: int = EPISODES, jobs: int | None = None)
     """
     console = Console()
     candidates = list_candidates()
-    entries = [entry for task in candidates for entry in make_oracle_entries(task)]
+    entries = [entry for task in candidates for entry in _make_oracle_entries(task)]
     results = measure(entries, make_tuning_seeds(episodes), jobs=jobs, console=console)
-    measurements = [measure_task(results, task) for task in candidates]
+    measurements = [_measure_task(results, task) for task in candidates]
     columns = "tier", "contest", *ORACLES, "gap", "nominal fails / %", "verdict"
     table = Table(*columns)
     for m in measurements:

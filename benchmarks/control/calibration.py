@@ -27,7 +27,7 @@ from ..harness.results import read_objects, write_text
 from .entries import ControlEntry
 from .run import Results, hash_sources, measure
 from .score import compute_log_ratios, survival_mask
-from .tasks import NOMINAL, STATE, ControlTask, find_oracle
+from .tasks import NOMINAL, STATE, ControlTask, TaskRecord, find_oracle
 
 FILE = Path(__file__).with_name("clairvoyant.json")
 SEEDS = 64
@@ -65,22 +65,12 @@ class ClairvoyantEpisode:
 
 
 @dataclass(frozen=True)
-class CalibrationRecord:
+class CalibrationRecord(TaskRecord):
     """A contest's episodes, and the command that made them."""
 
-    tier: str
-    env_id: str
-    vehicle: str
-    reference: str
-    scenario: str
     env_version: str
     command: str
     episodes: tuple[ClairvoyantEpisode, ...]
-
-    @property
-    def task(self) -> ControlTask:
-        """The task of the costs."""
-        return ControlTask(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
 
     @property
     def costs(self) -> Array:
@@ -89,14 +79,29 @@ class CalibrationRecord:
 
 
 def derive_seeds(task: ControlTask, count: int = SEEDS) -> list[int]:
-    """Derive the first `count` seeds of a task's calibration; more begin with the same ones."""
+    """Derive the seeds of a task's calibration; more of them begin with the same ones.
+
+    Args:
+        task: Task.
+        count: Number of seeds.
+
+    Returns:
+        Seeds.
+    """
     texts = [f"clairvoyant {__version__} {task.seed_text} {i}" for i in range(count)]
     digests = [hashlib.sha256(text.encode()).digest() for text in texts]
     return [_FIRST + int.from_bytes(digest[:4]) % _FIRST for digest in digests]
 
 
 def solve(case: CalibrationCase) -> ClairvoyantEpisode:
-    """Solve from nominal's and the oracle's runs, or read the folder of finished cases."""
+    """Solve from nominal's and the oracle's runs, or read the folder of finished cases.
+
+    Args:
+        case: Episode to solve.
+
+    Returns:
+        Costs of the plans.
+    """
     from ...agents.baselines import make_oracle
     from ...agents.clairvoyant.plan import compute_clairvoyant, record_actions
 
@@ -107,7 +112,7 @@ def solve(case: CalibrationCase) -> ClairvoyantEpisode:
     for name, oracle in ((NOMINAL, NOMINAL), (STATE, find_oracle(task))):
         driver = make_oracle(oracle, task.env_id, **task.env_options)
         starts[name] = record_actions(*driver, case.seed)
-    env: gym.Env[Any, Any] = gym.make(task.env_id, **task.env_options)
+    env: gym.Env[Array, Array] = gym.make(task.env_id, **task.env_options)
     result = compute_clairvoyant(env, case.seed, starts)
     plan = (result.cost, result.winner, result.costs, result.statuses, round(result.seconds, 1))
     episode = ClairvoyantEpisode(case.seed, *plan)
@@ -136,8 +141,20 @@ def calibrate(
 ) -> list[CalibrationRecord]:
     """Calibrate each task; a stopped run goes on from the folder of finished cases.
 
-    Raises ValueError for fewer than two seeds (no interval), and ModuleNotFoundError, with what to
-    install, before the work rather than in a worker.
+    Args:
+        tasks: Tasks.
+        folder: Folder of finished cases.
+        seeds: Seeds of a task.
+        command: Command line, for the records.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+
+    Returns:
+        Record of each task.
+
+    Raises:
+        ValueError: There are fewer than two seeds, so that there is no interval.
+        ModuleNotFoundError: CasADi or OSQP is not installed.
     """
     if seeds < 2:
         raise ValueError(f"an interval needs two seeds or more, got {seeds}")
@@ -155,12 +172,25 @@ def calibrate(
 
 
 def make_cases(tasks: Sequence[ControlTask], folder: Path, seeds: int) -> list[CalibrationCase]:
-    """Make the case of every episode, task by task."""
+    """Make the case of every episode, task by task.
+
+    Args:
+        tasks: Tasks.
+        folder: Folder of finished cases.
+        seeds: Seeds of a task.
+
+    Returns:
+        Cases.
+    """
     return [CalibrationCase(c, seed, str(folder)) for c in tasks for seed in derive_seeds(c, seeds)]
 
 
 def remove_cases(cases: Sequence[CalibrationCase]) -> None:
-    """Remove finished cases once their entries are written; those of other runs stay."""
+    """Remove finished cases once their entries are written; those of other runs stay.
+
+    Args:
+        cases: Cases of a run.
+    """
     for case in cases:
         case.path.unlink(missing_ok=True)
     folder = Path(cases[0].folder)
@@ -171,10 +201,19 @@ def remove_cases(cases: Sequence[CalibrationCase]) -> None:
 def read_calibration(
     path: str | Path = FILE, stale: bool = False
 ) -> dict[ControlTask, CalibrationRecord]:
-    """Read the entries of a file by task; stale: leave out what does not fit, refuse nothing.
+    """Read the entries of a file by task.
 
-    Raises FileNotFoundError where there is none, ValueError, with file, entry and field, for one
-    that is cut short or lacks something, of another version or of other seeds.
+    Args:
+        path: File.
+        stale: Whether what does not fit is left out instead of refused.
+
+    Returns:
+        Records by task.
+
+    Raises:
+        FileNotFoundError: There is no file.
+        ValueError: An entry is cut short or lacks something, is of another version or of other
+            seeds.
     """
     records = {}
     for i, item in enumerate(read_objects(path), 1):
@@ -200,7 +239,12 @@ def read_calibration(
 
 
 def update(path: str | Path, new_records: Sequence[CalibrationRecord]) -> None:
-    """Replace or add entries of a file, which is made if needed; its stale ones go."""
+    """Replace or add entries of a file, which is made if needed; its stale ones go.
+
+    Args:
+        path: File.
+        new_records: Records.
+    """
     records = read_calibration(path, stale=True) if Path(path).exists() else {}
     records |= {record.task: record for record in new_records}
     ordered = sorted(records.values(), key=lambda record: record.task.name)
@@ -210,7 +254,15 @@ def update(path: str | Path, new_records: Sequence[CalibrationRecord]) -> None:
 def check_current(
     records: Mapping[ControlTask, CalibrationRecord], path: str | Path = FILE
 ) -> None:
-    """Raise ValueError for a task in which the uncontrolled car no longer costs what it did."""
+    """Check that the uncontrolled car costs what it did.
+
+    Args:
+        records: Records by task.
+        path: Their file.
+
+    Raises:
+        ValueError: It costs something else in a task.
+    """
     for task, record in records.items():
         entry, seeds = ControlEntry(task, "", "none"), [one.seed for one in record.episodes]
         now = measure([entry], seeds, jobs=1).outcomes[entry]
@@ -227,7 +279,16 @@ def measure_calibrated(
     control_entries: Sequence[ControlEntry],
     **options: Any,
 ) -> Results:
-    """Drive the entries of calibrated tasks on the clairvoyant's seeds; options: of `measure`."""
+    """Drive the entries of calibrated tasks on the clairvoyant's seeds.
+
+    Args:
+        records: Records by task.
+        control_entries: Entries, of other tasks too.
+        options: Options of `measure`.
+
+    Returns:
+        Episodes by entry.
+    """
     seeds = {task: [one.seed for one in record.episodes] for task, record in records.items()}
     selected = [entry for task in records for entry in control_entries if entry.task == task]
     title = "control, the clairvoyant's seeds"
@@ -237,7 +298,15 @@ def measure_calibrated(
 def compute_regrets(
     records: Mapping[ControlTask, CalibrationRecord], results: Results
 ) -> dict[ControlEntry, Array]:
-    """Compute log(J / J_clairvoyant), shape (n,), of each entry on the seeds that it survives."""
+    """Compute the costs over the clairvoyant's on the seeds that an entry survives.
+
+    Args:
+        records: Records by task.
+        results: Episodes by entry.
+
+    Returns:
+        log(J / J_clairvoyant), shape (n,), by entry.
+    """
     regrets = {}
     for entry, result in results.outcomes.items():
         if not result.error and survival_mask(result).any():

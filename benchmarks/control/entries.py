@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from ...agents import AGENTS, make_agent
+from ...agents import AGENTS, Agent, make_agent
 from ...agents.baselines import (
     FILTER,
     GRIP,
@@ -26,6 +26,7 @@ from ...agents.baselines import (
 )
 from ...agents.learned.policy import is_policy, load_policy
 from ...agents.rollout import iterate_steps
+from ...envs.record import Array
 from ...envs.scenarios.manoeuvres import make_scenario
 from ...envs.sensors.slow import SENSOR_SETS
 from ...envs.task import OBSERVATION_OPTIONS
@@ -106,7 +107,14 @@ _QUICK_TASKS = 2  # of each tier, in a quick run
 
 
 def select_quick_tasks(tasks: Sequence[ControlTask]) -> list[ControlTask]:
-    """`_QUICK_TASKS` of each tier, from its first to its last."""
+    """Select `_QUICK_TASKS` of each tier, from its first to its last.
+
+    Args:
+        tasks: Tasks.
+
+    Returns:
+        Selected tasks.
+    """
     selected = []
     for tier in dict.fromkeys(task.tier for task in tasks):
         tier_tasks = [task for task in tasks if task.tier == tier]
@@ -190,9 +198,16 @@ class ControlEntry:
 
 
 def make_entries(tasks: Sequence[ControlTask], quick: bool = False) -> Iterator[ControlEntry]:
-    """Make every entry, task by task; quick: without the slow contestants.
+    """Make every entry, task by task.
 
     All estimators drive in the tasks with the first of their tier's ids.
+
+    Args:
+        tasks: Tasks.
+        quick: Whether slow contestants are left out.
+
+    Yields:
+        Entries.
     """
     for task in tasks:
         entries = [ControlEntry(task, "", oracle) for oracle in (*ORACLE_NAMES, "none")]
@@ -213,7 +228,14 @@ _DISTURBANCES = {"forces": ("F_d", "N_d"), "walk": ("d1", "d2"), "walk-all": ("d
 
 
 def list_outputs(estimator: str) -> tuple[str, ...]:
-    """List the estimates that controllers read: beta, gamma, and disturbances if there are any."""
+    """List the estimates that controllers read: beta, gamma, and disturbances if there are any.
+
+    Args:
+        estimator: Name as in a `ControlEntry`.
+
+    Returns:
+        Names of the estimates.
+    """
     name = get_filter_name(estimator)
     base = name.removeprefix("learned-")
     row = FILTERS.get(base)  # a user's own has none
@@ -225,12 +247,26 @@ def list_outputs(estimator: str) -> tuple[str, ...]:
 
 
 def get_filter_name(estimator: str) -> str:
-    """Return the name of `make_estimator` of an entry's estimator."""
+    """Return the name of `make_estimator` of an entry's estimator.
+
+    Args:
+        estimator: Name as in a `ControlEntry`.
+
+    Returns:
+        Name.
+    """
     return SETUPS.get(estimator, (estimator, {}))[0]
 
 
 def make_estimate_options(entry: ControlEntry) -> dict[str, Any]:
-    """Make options of `EstimateObservation`; a policy gets the estimate it was trained on."""
+    """Make options of `EstimateObservation`; a policy gets the estimate it was trained on.
+
+    Args:
+        entry: Entry.
+
+    Returns:
+        Options by name.
+    """
     if is_policy(entry.controller):
         card = load_policy(entry.controller).card
         if card.estimator == entry.estimator:
@@ -256,20 +292,39 @@ def make_estimate_options(entry: ControlEntry) -> dict[str, Any]:
 
 
 class CheckedAgent:
-    """A user's agent, whose `predict` is to return actions, shape (rows, width), and a state.
+    """A user's agent, whose `predict` is to return actions and a state; NaN is the env's to judge.
 
-    Raises TypeError or ValueError with what came instead; NaN is the env's to judge.
+    Args:
+        agent: The agent.
+        rows: Number of cars.
+        width: Length of an action.
+
+    Raises:
+        TypeError: `predict` returns no pair.
+        ValueError: Its actions have another shape.
     """
 
-    def __init__(self, agent: Any, rows: int, width: int) -> None:
+    def __init__(self, agent: Agent, rows: int, width: int) -> None:
         self.agent, self.shape = agent, (rows, width)
 
     def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None,
+        self, observation: Array, state: object = None, episode_start: Array | None = None,
         deterministic: bool = True,
-    ) -> tuple[Any, Any]:  # fmt: skip
-        """Return what the agent does, checked."""
-        result = self.agent.predict(observation, state, episode_start, deterministic=deterministic)
+    ) -> tuple[Any, object]:  # fmt: skip
+        """Return what the agent does, checked.
+
+        Args:
+            observation: Observations, shape (rows, k).
+            state: Memory from the last call.
+            episode_start: Whether each row's episode has just begun, shape (rows,).
+            deterministic: Whether to take the mean action.
+
+        Returns:
+            Actions, shape (rows, width), and the next state.
+        """
+        result: object = self.agent.predict(
+            observation, state, episode_start, deterministic=deterministic
+        )
         if not (isinstance(result, tuple) and len(result) == 2):
             raise TypeError(f"predict returns (action, state), got {short_repr(result)}")
         shape = np.shape(result[0])
@@ -281,8 +336,16 @@ class CheckedAgent:
         return result
 
 
-def make_cars(entry: ControlEntry, cars: int) -> tuple[VectorEnv[Any, Any, Any], Any]:
-    """Make the vector env of `cars` rows with the entry's estimator, and its agent, both tuned."""
+def make_cars(entry: ControlEntry, cars: int) -> tuple[VectorEnv[Array, Array, Array], Any]:
+    """Make the vector env with the entry's estimator, and its agent, both tuned.
+
+    Args:
+        entry: Entry.
+        cars: Number of rows.
+
+    Returns:
+        Env and agent.
+    """
     task, options = entry.task, entry.env_options
     if entry.oracle:
         return make_oracle(entry.oracle, task.env_id, cars, options=entry.best, **options)
@@ -300,7 +363,14 @@ def make_cars(entry: ControlEntry, cars: int) -> tuple[VectorEnv[Any, Any, Any],
 
 
 def make_agent_options(entry: ControlEntry) -> dict[str, Any]:
-    """Make the options of `make_agent` for an entry."""
+    """Make the options of `make_agent` for an entry.
+
+    Args:
+        entry: Entry.
+
+    Returns:
+        Options by name.
+    """
     options: dict[str, Any] = {}
     if entry.controller == "model-following":
         options["rejection"] = entry.estimator == "dakf"
@@ -314,10 +384,10 @@ def make_agent_options(entry: ControlEntry) -> dict[str, Any]:
 class _TimedFunction:
     """A function that notes how long each of its calls takes, in s of wall time."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., object]) -> None:
         self.function, self.seconds = function, list[float]()
 
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+    def __call__(self, *args: object, **kwargs: object) -> object:
         start_time = time.perf_counter()
         result = self.function(*args, **kwargs)
         self.seconds.append(time.perf_counter() - start_time)
@@ -325,9 +395,15 @@ class _TimedFunction:
 
 
 def measure_decision_time(entry: ControlEntry) -> float:
-    """Measure the wall time of a decision of one car (us): predict, and the estimator's part.
+    """Measure the wall time of a decision of one car: predict, and the estimator's part.
 
     Medians over _STEPS steps of an episode, the bare env stepped side by side.
+
+    Args:
+        entry: Entry.
+
+    Returns:
+        Wall time (us).
     """
     cars: tuple[Any, Any] = make_cars(entry, 1)
     env, agent = cars

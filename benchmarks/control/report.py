@@ -5,9 +5,9 @@
 each.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from itertools import product
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -38,10 +38,13 @@ from .run import SIGNALS, Results
 from .score import Standing
 from .tasks import NOMINAL, PARAMETERS, TITLES, ControlTask
 
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
+
 _POLICIES = {pair for pairs in LEARNED.values() for pair in pairs}
 
 _Gains = dict[ControlTask, Array]
-Driven = TypeVar("Driven", bound=Collection[Any])
+Driven = TypeVar("Driven", bound=Collection[Hashable])
 
 
 def compose_verdict(
@@ -49,10 +52,19 @@ def compose_verdict(
     prices: Sequence[DelayCost] = (),
     foresight: Mapping[ControlTask, Array] | None = None,
 ) -> str:
-    """Compose the verdict over all tiers: the best controller, the best estimator, and why."""
+    """Compose the verdict over all tiers: the best controller, the best estimator, and why.
+
+    Args:
+        by_tier: Entries by tier, the best first.
+        prices: Cost of delay.
+        foresight: log(J_oracle-state / J_clairvoyant) by task, None without a calibration.
+
+    Returns:
+        Verdict.
+    """
     filters, controllers = _group_estimators(by_tier), _group_controllers(by_tier)
     complete, none = select_complete(controllers), controllers.get("none", {})
-    best = find_best_controller(by_tier)
+    best = _find_best_controller(by_tier)
     ratio = _compute_cost_ratio(complete[best], none) if best not in ("", "none") and none else None
     text = f", and {100.0 * ratio.value:.0f} % as much as no control" if ratio else ""
     episodes = max((len(r) for gains in controllers.values() for r in gains.values()), default=0)
@@ -77,12 +89,20 @@ def _compute_relative_costs(standings: Mapping[str, Sequence[Standing]]) -> dict
 
 
 def is_default_filter(controller: str, estimator: str) -> bool:
-    """Whether a controller is compared on it: the reference, none, or its own filter."""
+    """Whether a controller is compared on it: the reference, none, or its own filter.
+
+    Args:
+        controller: Name of the controller.
+        estimator: Name of the estimator.
+
+    Returns:
+        Whether it is.
+    """
     follows = ADAPTIVE.get(estimator) == controller
     return estimator in ("", REFERENCE_FILTER) or follows or (estimator, controller) in _POLICIES
 
 
-def find_best_controller(by_tier: Mapping[str, Sequence[Standing]]) -> str:
+def _find_best_controller(by_tier: Mapping[str, Sequence[Standing]]) -> str:
     """Find the best controller over all tiers among those with every task; "" without a score."""
     return next(iter(_rank_entries(select_complete(_group_controllers(by_tier)))), "")
 
@@ -90,7 +110,11 @@ def find_best_controller(by_tier: Mapping[str, Sequence[Standing]]) -> str:
 def select_complete(by_name: Mapping[str, Driven]) -> dict[str, Driven]:
     """Select the names with every task that any name has: only they can be the best over all.
 
-    by_name: Tasks of a controller, or a mapping from them, by the controller's name.
+    Args:
+        by_name: Tasks of a controller, or a mapping from them, by the controller's name.
+
+    Returns:
+        Selected names.
     """
     all_tasks = {task for tasks in by_name.values() for task in tasks}
     return {name: tasks for name, tasks in by_name.items() if set(tasks) == all_tasks}
@@ -160,7 +184,7 @@ def _describe_exceptions(by_tier: Mapping[str, Sequence[Standing]]) -> str:
             rivals = in_tier.get(best, {})
             if best != first and first in rivals and rivals[first].high < 1.0:
                 parts.append(f"{best} in tier {tier}")
-    gains, overall_best = _group_controllers(by_tier), find_best_controller(by_tier)
+    gains, overall_best = _group_controllers(by_tier), _find_best_controller(by_tier)
     partial = gains.keys() - select_complete(gains).keys() if overall_best else ()
     ratios = {name: _compute_cost_ratio(gains[name], gains[overall_best]) for name in partial}
     cheaper = (name for name in ratios if ratios[name].high < 1.0)
@@ -215,10 +239,18 @@ def add_figures(
     prices: Sequence[DelayCost],
     foresight: Mapping[ControlTask, Array],
 ) -> None:
-    """Add the figures to a suite that has its verdict; without plotly only the tracks."""
+    """Add the figures to a suite that has its verdict; without plotly only the tracks.
+
+    Args:
+        suite: Suite, to which they are added.
+        by_tier: Entries by tier, the best first.
+        results: Episodes by entry.
+        prices: Cost of delay.
+        foresight: log(J_oracle-state / J_clairvoyant) by task.
+    """
     outcomes = results.outcomes.items()
     series = {entry: drive.series for entry, drive in outcomes if drive.series is not None}
-    best = find_best_controller(by_tier)
+    best = _find_best_controller(by_tier)
     suite.files += _make_tracks(series, best)
     try:
         from ..report.figures import draw_curves, draw_groups
@@ -248,7 +280,7 @@ def add_figures(
 
 
 def _group_costs(
-    by_tier: Mapping[str, Sequence[Standing]], name: Any
+    by_tier: Mapping[str, Sequence[Standing]], name: Callable[[ControlEntry], str]
 ) -> dict[str, dict[str, Estimate]]:
     """Group costs over nominal's (%) by tier and name(entry), "" left out; the best is first."""
     groups = {}
@@ -289,7 +321,7 @@ def _group_oracles(
     return groups
 
 
-def _draw_maps(tier: str, standings: Sequence[Standing]) -> list[tuple[str, Any, str]]:
+def _draw_maps(tier: str, standings: Sequence[Standing]) -> list[tuple[str, "Figure", str]]:
     from ..report.figures import draw_heat_map
 
     names = [standing.label for standing in standings]
@@ -377,12 +409,27 @@ def make_time_explorer(
 
 
 def run_entry(entry: ControlEntry, seed: int) -> Rollout:
-    """Run one episode of an entry in a single env."""
+    """Run one episode of an entry in a single env.
+
+    Args:
+        entry: Entry.
+        seed: Seed of the episode.
+
+    Returns:
+        Episode.
+    """
     return rollout(*make_env_and_agent(entry), seed)
 
 
 def make_env_and_agent(entry: ControlEntry) -> tuple[Any, Any]:
-    """Make a single env with its filter, and the agent that drives it."""
+    """Make a single env with its filter, and the agent that drives it.
+
+    Args:
+        entry: Entry.
+
+    Returns:
+        Env and agent.
+    """
     estimate = make_estimate_options(entry) if entry.estimator else None
     name = get_filter_name(entry.estimator)
     env = make_env(entry.task.env_id, name, estimate, **entry.env_options)

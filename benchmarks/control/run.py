@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 
 from ...agents.learned.policy import hash_policy
@@ -68,7 +67,14 @@ class DriveResult:
         return self["cost"]
 
     def mark_failures(self, cause: str) -> Array:
-        """Mark episodes that ended by this failure with 1, undriven ones with NaN; (seeds,)."""
+        """Mark the episodes that ended by a failure.
+
+        Args:
+            cause: Failure, of `FAILURES`.
+
+        Returns:
+            1 where it did, NaN where nothing was driven, shape (seeds,).
+        """
         return np.where(np.isnan(self["failure"]), np.nan, self["failure"] == FAILURES.index(cause))
 
 
@@ -116,7 +122,14 @@ class _MetricAccumulator:
 
 
 def run_chunk(chunk: Chunk) -> DriveResult:
-    """Drive one episode a seed; why an entry cannot be built or driven is its `error`."""
+    """Drive one episode a seed.
+
+    Args:
+        chunk: Seeds of an entry.
+
+    Returns:
+        Episodes; why an entry cannot be built or driven is its `error`.
+    """
     try:
         return _run_chunk(chunk)
     except Exception as error:
@@ -147,7 +160,14 @@ def _read_signals(env: Any, step: EpisodeStep) -> list[float]:
 
 
 def get_control_period(entry: ControlEntry) -> float:
-    """Return the time between two decisions of an entry (s)."""
+    """Return the time between two decisions of an entry.
+
+    Args:
+        entry: Entry.
+
+    Returns:
+        Period (s).
+    """
     return int(entry.options.get("control_period", 10)) * TICK
 
 
@@ -163,7 +183,19 @@ class Results:
     outcomes: dict[ControlEntry, DriveResult] = field(default_factory=dict)
 
     def select(self, task: ControlTask, controller: str, estimator: str = "") -> DriveResult:
-        """Return one entry's episodes; KeyError if it was not asked for."""
+        """Return one entry's episodes.
+
+        Args:
+            task: Task.
+            controller: Name of the controller.
+            estimator: Name of the estimator.
+
+        Returns:
+            Episodes.
+
+        Raises:
+            KeyError: It was not asked for.
+        """
         return self.outcomes[ControlEntry(task, estimator, controller)]
 
 
@@ -281,7 +313,7 @@ def _read_finished(path: Path, chunk: Chunk, entire: bool = True) -> DriveResult
     return DriveResult(arrays["numbers"], float(arrays["seconds"]), arrays.get("series"))
 
 
-def _has_shape(array: npt.NDArray[Any], shape: tuple[int, ...], entire: bool) -> bool:
+def _has_shape(array: Array, shape: tuple[int, ...], entire: bool) -> bool:
     """Whether an array has a shape and finite numbers: all if it is to be entire, else any."""
     finite = np.isfinite(array)
     is_valid = finite.all() if entire else finite.any()

@@ -41,12 +41,27 @@ FAILURE_RATIO = 20.0  # times nominal's cost, of an episode that ends by a failu
 
 
 def survival_mask(result: DriveResult) -> npt.NDArray[np.bool_]:
-    """Whether each episode ended by no failure, shape (seeds,)."""
+    """Mark the episodes that ended by no failure.
+
+    Args:
+        result: Episodes.
+
+    Returns:
+        Whether each did, shape (seeds,).
+    """
     return np.asarray(result["failure"] == 0.0)
 
 
 def compute_log_ratios(nominal: Array, result: DriveResult) -> Array:
-    """Compute r of the first n episodes from nominal's costs of the same seeds, shape (n,) each."""
+    """Compute r of the first n episodes.
+
+    Args:
+        nominal: Costs of nominal on the same seeds, shape (n,).
+        result: Episodes of at least as many seeds.
+
+    Returns:
+        Values of r, shape (n,).
+    """
     n = len(nominal)
     with np.errstate(invalid="ignore"):
         r = np.log(compute_cost_ratios(nominal, result.costs[:n]))
@@ -69,12 +84,26 @@ class ScoreScale:
                 raise ValueError(f"{name}: {oracle.error}")
 
     def mark_compared(self, n: int) -> npt.NDArray[np.bool_]:
-        """Mark which of at most n episodes both survive, shape (m,)."""
+        """Mark the episodes that both survive.
+
+        Args:
+            n: Maximum of episodes.
+
+        Returns:
+            Whether both survive each, shape (m,).
+        """
         n = min(n, len(self.nominal.costs), len(self.oracle.costs))
         return survival_mask(self.nominal)[:n] & survival_mask(self.oracle)[:n]
 
     def compute_paired_ratios(self, result: DriveResult) -> tuple[Array, Array]:
-        """Compute r of an entry and r of the oracle on the episodes that count, shape (n,) each."""
+        """Compute r of an entry and of the oracle on the episodes that count.
+
+        Args:
+            result: Episodes of the entry.
+
+        Returns:
+            r of both, shape (n,) each.
+        """
         compared = self.mark_compared(len(result.costs))
         nominal = self.nominal.costs[: len(compared)]
         r, oracle_ratios = (compute_log_ratios(nominal, x)[compared] for x in (result, self.oracle))
@@ -88,7 +117,14 @@ class ScoreScale:
 
 
 def score(pairs: Sequence[tuple[Array, Array]]) -> Estimate:
-    """Compute the score from each task's `compute_paired_ratios`; NaN without a gap to be won."""
+    """Compute the score.
+
+    Args:
+        pairs: Result of `compute_paired_ratios` in each task.
+
+    Returns:
+        Score; NaN without a gap to be won.
+    """
     filled = [pair for pair in pairs if len(pair[0])]
     if not filled or np.mean([oracle_ratios.mean() for _, oracle_ratios in filled]) < MIN_GAP:
         return Estimate(math.nan)
@@ -168,7 +204,14 @@ class Standing:
         return sum(len(r) for r, _ in self.pairs.values())
 
     def mean(self, name: str) -> float:
-        """Average a number of `EPISODE` over all tasks in which it means something."""
+        """Average a metric over all tasks in which it means something.
+
+        Args:
+            name: Name of the metric, in `EPISODE`.
+
+        Returns:
+            Average; NaN without such a task.
+        """
         turning = next(metric.turning for metric in EPISODE if metric.name == name)
         runs = self.drives.items()
         counted = [run for task, run in runs if not (turning and task.reference == "zero-slip")]
@@ -202,7 +245,16 @@ class Standing:
 def rank_entries(
     results: Mapping[ControlEntry, DriveResult], tier: str | None, scales: _ScoreScales
 ) -> list[Standing]:
-    """Rank the entries of a tier, None: of all; the best is first, by failures or by score."""
+    """Rank the entries of a tier, by failures or by score.
+
+    Args:
+        results: Episodes by entry.
+        tier: Tier, None for all.
+        scales: Scales by task.
+
+    Returns:
+        Entries, the best first.
+    """
     by_pair: dict[tuple[str, str], list[ControlEntry]] = {}
     for entry in results:
         if tier in (None, entry.task.tier):
@@ -222,7 +274,15 @@ def _rank(standing: Standing) -> tuple[float, float]:
 
 
 def make_rows(standing: Standing, salt: str) -> list[ResultRow]:
-    """Make a row for each metric and task, and those of the tier."""
+    """Make a row for each metric and task, and those of the tier.
+
+    Args:
+        standing: Entry.
+        salt: Salt of the seeds.
+
+    Returns:
+        Rows.
+    """
     entry = standing.entry
     common: dict[str, Any] = {"suite": "control", "salt": salt}
     common |= {"estimator": entry.estimator, "controller": entry.controller}
@@ -248,13 +308,29 @@ def make_rows(standing: Standing, salt: str) -> list[ResultRow]:
 
 
 def make_spec(entry: ControlEntry) -> str:
-    """Make the JSON of the env from which `gym.make` builds it again."""
+    """Make the JSON of the env from which `gym.make` builds it again.
+
+    Args:
+        entry: Entry.
+
+    Returns:
+        JSON.
+    """
     env = gym.make(gym.spec(entry.task.env_id), **entry.env_options)
     return env.spec.to_json() if env.spec is not None else ""
 
 
 def make_main_table(title: str, ranked: Sequence[Standing], note: str = "") -> ResultTable:
-    """Make the table of the entries, the best first."""
+    """Make the table of the entries, the best first.
+
+    Args:
+        title: Title of the table.
+        ranked: Entries, the best first.
+        note: Meaning of the columns.
+
+    Returns:
+        Table.
+    """
     header = (
         *("controller and estimator", "fails / %", "95 %", "cost / nominal's, %", "95 % "),
         *("score", "95 %  ", "won / %", "worst 5 %", "contests", "episodes", "left out"),
@@ -284,7 +360,16 @@ def _format_texts(number: Estimate | None, scale: float, digits: str) -> tuple[s
 def make_task_table(
     title: str, ranked: Sequence[Standing], tasks: Sequence[ControlTask]
 ) -> ResultTable:
-    """Make the table of the cost over nominal's (%), every entry in every task."""
+    """Make the table of the cost over nominal's (%), every entry in every task.
+
+    Args:
+        title: Title of the table.
+        ranked: Entries, the best first.
+        tasks: Tasks, a column each.
+
+    Returns:
+        Table.
+    """
     cells = [[item.label, *(_format_cell(item, task) for task in tasks)] for item in ranked]
     note = "Percent of nominal's cost, the paired geometric mean; in brackets failures in percent."
     header = ("controller and estimator", *(c.name for c in tasks))
@@ -309,7 +394,15 @@ def _format_cell(standing: Standing, task: ControlTask) -> str:
 
 
 def make_motion_table(title: str, ranked: Sequence[Standing]) -> ResultTable:
-    """Make the table of the motion, the entries in the same order: means over all tasks."""
+    """Make the table of the motion, means over all tasks.
+
+    Args:
+        title: Title of the table.
+        ranked: Entries, the best first.
+
+    Returns:
+        Table.
+    """
     shown = [metric for metric in EPISODE if metric.heading]
     header = ["controller and estimator", *(m.heading for m in shown), "of the period / %"]
     cells = []

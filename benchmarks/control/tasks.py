@@ -87,10 +87,17 @@ class ControlTask:
 
 
 def vary_scenario(task: ControlTask, change: Mapping[str, Any]) -> dict[str, Any]:
-    """Make a task's scenario, over its name, with some fields of `Scenario` changed.
+    """Make a task's scenario, over its name, with some fields changed.
 
     Noise comes to the scenario's own; "mass" is a factor on the true car's, of which controllers
     and filters know nothing.
+
+    Args:
+        task: Task.
+        change: Fields of `Scenario`.
+
+    Returns:
+        Scenario as a mapping.
     """
     fields, base = dict(change), make_scenario(task.scenario)
     if "noise" in fields:
@@ -102,7 +109,23 @@ def vary_scenario(task: ControlTask, change: Mapping[str, Any]) -> dict[str, Any
 
 
 @dataclass(frozen=True)
-class TaskMeasurement:
+class TaskRecord:
+    """The task of an entry of a file."""
+
+    tier: str
+    env_id: str
+    vehicle: str
+    reference: str
+    scenario: str
+
+    @property
+    def task(self) -> ControlTask:
+        """The task of these numbers."""
+        return ControlTask(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
+
+
+@dataclass(frozen=True)
+class TaskMeasurement(TaskRecord):
     """A candidate with what was measured on tuning seeds: an entry of the file.
 
     oracle, knowing: The better of `ORACLES` for state and for parameters. gap: Mean of
@@ -110,11 +133,6 @@ class TaskMeasurement:
     interval. failing: Fraction in which nominal fails. verdict: "scored", or why not.
     """
 
-    tier: str
-    env_id: str
-    vehicle: str
-    reference: str
-    scenario: str
     env_version: str
     oracle: str
     knowing: str
@@ -125,11 +143,6 @@ class TaskMeasurement:
     judged: int
     n: int
     verdict: str
-
-    @property
-    def task(self) -> ControlTask:
-        """The task of these numbers."""
-        return ControlTask(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
 
 
 def list_candidates() -> list[ControlTask]:
@@ -146,8 +159,15 @@ def list_candidates() -> list[ControlTask]:
 def read_tasks(path: Path = FILE) -> tuple[TaskMeasurement, ...]:
     """Read all candidates of a file.
 
-    Raises FileNotFoundError, and ValueError, with the file and what to do, where it was measured
-    with another version, is cut short, or names what there is not.
+    Args:
+        path: File.
+
+    Returns:
+        Candidates.
+
+    Raises:
+        FileNotFoundError: There is no file.
+        ValueError: It was measured with another version, is cut short, or names what there is not.
     """
     measurements = []
     for i, item in enumerate(read_objects(path), 1):
@@ -169,7 +189,12 @@ def read_tasks(path: Path = FILE) -> tuple[TaskMeasurement, ...]:
 
 
 def write_tasks(entries: Sequence[TaskMeasurement], path: Path = FILE) -> None:
-    """Write a file that `read_tasks` reads."""
+    """Write a file that `read_tasks` reads.
+
+    Args:
+        entries: Candidates.
+        path: File.
+    """
     write_text(path, json.dumps([asdict(entry) for entry in entries], indent=1) + "\n")
 
 
@@ -185,7 +210,15 @@ def _index_measurements() -> dict[ControlTask, TaskMeasurement]:
 
 
 def find_oracle(task: ControlTask, name: str = STATE) -> str:
-    """Find the better of `ORACLES` of a name in a task; LQR where none was measured."""
+    """Find the better of the candidates for a baseline in a task; LQR where none was measured.
+
+    Args:
+        task: Task.
+        name: Name of the baseline, in `ORACLES`.
+
+    Returns:
+        Name of the candidate.
+    """
     measurement = _index_measurements().get(task)
     if measurement is None:
         return ORACLES[name][0]
@@ -201,7 +234,14 @@ _TUNING = 2**29  # the clairvoyant's are beyond 2^30
 
 
 def make_salt(*more: str) -> str:
-    """Make the salt: a hash of the contestants' files, weights, the env's version and texts."""
+    """Make the salt: a hash of the contestants' files, weights, the env's version and texts.
+
+    Args:
+        more: Texts that belong to it.
+
+    Returns:
+        Hexadecimal digits.
+    """
     digest = hashlib.sha256(__version__.encode())
     for folder, endings in _CONTESTANTS.items():
         for path in sorted((_PACKAGE / folder).rglob("*")):
@@ -213,9 +253,18 @@ def make_salt(*more: str) -> str:
 
 
 def make_salted_seeds(salt: str, n: int, more: str = "") -> list[int]:
-    """Make the first n test seeds of a salt, below 2^32; more seeds keep the first.
+    """Make the first test seeds of a salt, below 2^32; more seeds keep the first.
 
-    more: A text that makes them others. Raises ValueError for a salt that is not hexadecimal.
+    Args:
+        salt: Hexadecimal digits.
+        n: Number of seeds.
+        more: Text that makes them others.
+
+    Returns:
+        Seeds.
+
+    Raises:
+        ValueError: The salt is not hexadecimal.
     """
     if not re.fullmatch("[0-9a-f]+", salt):
         raise ValueError(f"a salt is hexadecimal digits, got {salt!r}")
@@ -230,10 +279,24 @@ def make_task_seeds(salt: str, n: int) -> Callable[[ControlTask], list[int]]:
 
     They differ between tasks: a seed draws the car as well, and tasks that share their cars would
     not be independent strata of an interval.
+
+    Args:
+        salt: Hexadecimal digits.
+        n: Number of seeds.
+
+    Returns:
+        Function from a task to its seeds.
     """
     return lambda task: make_salted_seeds(salt, n, task.seed_text)
 
 
 def make_tuning_seeds(n: int) -> list[int]:
-    """Make the first n seeds on which tasks are chosen and controllers tuned: no test's."""
+    """Make the first seeds on which tasks are chosen and controllers tuned: no test's.
+
+    Args:
+        n: Number of seeds.
+
+    Returns:
+        Seeds.
+    """
     return list(range(_TUNING, _TUNING + n))

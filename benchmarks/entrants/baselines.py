@@ -26,6 +26,7 @@ from ..control.tasks import (
     NOMINAL,
     STATE,
     ControlTask,
+    TaskRecord,
     list_scored_tasks,
     make_salt,
     make_task_seeds,
@@ -44,14 +45,9 @@ _SAME = 1e-6  # of a cost
 
 
 @dataclass(frozen=True)
-class BaselineRecord:
+class BaselineRecord(TaskRecord):
     """A baseline's episodes in a task: an entry of the file; failures: codes of `FAILURES`."""
 
-    tier: str
-    env_id: str
-    vehicle: str
-    reference: str
-    scenario: str
     estimator: str
     controller: str
     salt: str
@@ -62,11 +58,17 @@ class BaselineRecord:
     @property
     def entry(self) -> ControlEntry:
         """The entry of these episodes."""
-        task = ControlTask(self.tier, self.env_id, self.vehicle, self.reference, self.scenario)
-        return ControlEntry(task, self.estimator, self.controller)
+        return ControlEntry(self.task, self.estimator, self.controller)
 
     def drives(self, n: int) -> DriveResult:
-        """Return the first n episodes; what is not on file is NaN."""
+        """Return the first episodes; what is not on file is NaN.
+
+        Args:
+            n: Number of episodes.
+
+        Returns:
+            Episodes.
+        """
         numbers = np.full((n, len(NUMBERS)), np.nan)
         numbers[:, NUMBERS.index("cost")] = self.costs[:n]
         numbers[:, NUMBERS.index("failure")] = self.failures[:n]
@@ -76,13 +78,32 @@ class BaselineRecord:
 def make_baseline_entries(
     tasks: Sequence[ControlTask], agents: bool = True, estimators: bool = True
 ) -> list[ControlEntry]:
-    """Make the baselines' entries; agents, estimators: whether such are among the rivals."""
+    """Make the baselines' entries.
+
+    Args:
+        tasks: Tasks.
+        agents: Whether an agent's rivals are among them.
+        estimators: Whether an estimator's rivals are among them.
+
+    Returns:
+        Entries, task by task.
+    """
     pairs = _BASELINE_PAIRS + (CONTROLLERS if agents else ()) + (ESTIMATORS if estimators else ())
     return [ControlEntry(task, *pair) for task in tasks for pair in pairs]
 
 
 def read_baselines(path: Path = FILE) -> dict[ControlEntry, BaselineRecord]:
-    """Read the entries of a file of this version; raises ValueError for another kind of file."""
+    """Read the records of a file that are of this version.
+
+    Args:
+        path: File.
+
+    Returns:
+        Records by entry.
+
+    Raises:
+        ValueError: The file is of another kind.
+    """
     items = enumerate(read_objects(path), 1)
     records = (from_json(BaselineRecord, item, f"{path}: entry {i}") for i, item in items)
     return {record.entry: record for record in records if record.env_version == __version__}
@@ -91,10 +112,18 @@ def read_baselines(path: Path = FILE) -> dict[ControlEntry, BaselineRecord]:
 def find_baselines(
     wanted: Sequence[ControlEntry], n: int, **options: Any
 ) -> tuple[str, Results] | None:
-    """Find salt and first n episodes of baselines that are all on file with so many; else None.
+    """Find the episodes of baselines that are all on file with so many.
 
-    None, too, where of a baseline no episode of a sample costs the same again: `_SAMPLE` episodes
-    of each, of the slow ones in one task. options: of `measure`.
+    Nothing is found, too, where of a baseline no episode of a sample costs the same again:
+    `_SAMPLE` episodes of each, of the slow ones in one task.
+
+    Args:
+        wanted: Entries.
+        n: Number of episodes of each.
+        options: Options of `measure`.
+
+    Returns:
+        Salt and episodes, or None.
     """
     records = read_baselines(FILE) if FILE.is_file() else {}
     known = (records[entry] for entry in wanted if entry in records)
@@ -116,7 +145,15 @@ def find_baselines(
 
 
 def write_baselines(path: Path = FILE, jobs: int | None = None) -> None:
-    """Drive all baselines of the usual tasks, and write the file; ValueError where one fails."""
+    """Drive all baselines of the usual tasks, and write the file.
+
+    Args:
+        path: File.
+        jobs: Processes, None for all processors.
+
+    Raises:
+        ValueError: An entry cannot drive.
+    """
     salt, lines = make_salt(), []
     entries = make_baseline_entries(select_quick_tasks(list_scored_tasks()))
     seeds = make_task_seeds(salt, EPISODES)

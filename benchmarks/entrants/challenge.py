@@ -53,8 +53,8 @@ class UserEntry:
         trust: Whether a zip may be read.
     """
 
-    agent: Any
-    estimator: Any = REFERENCE_FILTER
+    agent: object
+    estimator: object = REFERENCE_FILTER
     trust: bool = False
 
     @property
@@ -65,7 +65,15 @@ class UserEntry:
     def make_entry(
         self, task: ControlTask, options: Mapping[str, Any] | None = None
     ) -> ControlEntry:
-        """Make the entry of a task; options: of the env, beside the task's."""
+        """Make the entry of a task.
+
+        Args:
+            task: Task.
+            options: Options of the env beside the task's.
+
+        Returns:
+            Entry.
+        """
         parts = {"controller": self.agent, "estimator": self.estimator}
         objects = {part: value for part, value in parts.items() if not isinstance(value, str)}
         estimator, agent = _label(self.estimator), _label(self.agent)
@@ -96,7 +104,7 @@ class UserEntry:
                 known.load(source, list_shipped() if known is AGENTS else SETUPS)
 
 
-def _label(source: Any) -> str:
+def _label(source: object) -> str:
     kind = source if isinstance(source, type) or hasattr(source, "__qualname__") else type(source)
     return source if isinstance(source, str) else str(kind.__qualname__)
 
@@ -104,7 +112,16 @@ def _label(source: Any) -> str:
 def make_user_entries(
     agents: Sequence[str], estimators: Sequence[str], trust: bool = False
 ) -> list[UserEntry]:
-    """Make every agent on every or its usual estimator, and the reference controller on each."""
+    """Make every agent on every or its usual estimator, and the reference controller on each.
+
+    Args:
+        agents: Names, files' classes or paths.
+        estimators: The same of estimators; empty: each agent's usual one.
+        trust: Whether a zip may be read.
+
+    Returns:
+        Entries without repetition.
+    """
     entries = [
         UserEntry(agent, estimator, trust and agent.endswith(ZIP))
         for agent in agents
@@ -115,7 +132,14 @@ def make_user_entries(
 
 
 def choose_estimator(agent: str) -> str:
-    """Choose the estimator of an agent: a policy's own, none for what saw an env alone."""
+    """Choose the estimator of an agent: a policy's own, none for what saw an env alone.
+
+    Args:
+        agent: Name, file's class or path.
+
+    Returns:
+        Name of the estimator, "" for none.
+    """
     if is_policy(agent):
         return load_policy(agent).card.estimator or ""
     return "" if agent.endswith(ZIP) else REFERENCE_FILTER

@@ -24,9 +24,11 @@ import numpy as np
 
 from ...agents import make_agent
 from ...agents.env_info import EnvView
+from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
 from ...envs.validation import parse_actions
 from ...estimators.make import make_estimator
+from ...estimators.protocol import EstimatorLike
 from ...estimators.registry import describe_error
 from ..control.entries import CheckedAgent
 
@@ -51,9 +53,9 @@ class _EntryServer:
     """The agent, or the estimators of all rows, of one process."""
 
     def __init__(self) -> None:
-        self._agent: Any = None
-        self._state: Any = None
-        self._estimators: dict[int, Any] = {}
+        self._agent: CheckedAgent
+        self._state: object = None
+        self._estimators: dict[int, EstimatorLike] = {}
 
     def agent(self, source: str, view: EnvView, options: Mapping[str, Any]) -> bytes:
         """Build the agent of a text that `make_agent` takes."""
@@ -62,7 +64,7 @@ class _EntryServer:
         self._agent = CheckedAgent(agent, view.num_envs, view.facts.width)
         return b""
 
-    def predict(self, observation: Any, start: Any) -> bytes:
+    def predict(self, observation: Array, start: Array) -> bytes:
         """Return the actions of all rows, float32 (rows, width); the memory stays here."""
         action, self._state = self._agent.predict(observation, self._state, start)
         rows, width = self._agent.shape
@@ -78,7 +80,7 @@ class _EntryServer:
         self._estimators[row].reset(sensors, first)
         return b""
 
-    def step(self, records: Sequence[tuple[int, Any, Any]]) -> bytes:
+    def step(self, records: Sequence[tuple[int, Array, Array]]) -> bytes:
         """Let some rows take fast rows and packets; return each x and P, float64."""
         parts = []
         for row, fast, packets in records:
@@ -121,12 +123,12 @@ def main() -> None:
 
 def _make_audit_hook(
     opened: set[str], start: ChildSettings, refuse: Callable[[str], None]
-) -> Callable[[str, tuple[Any, ...]], None]:
+) -> Callable[[str, tuple[object, ...]], None]:
     """Make the audit hook that notes what is opened outside the installation, or ends there."""
     folders = {*_INSTALLED, *_SYSTEM, start.scratch}
     skipped = tuple(f"{os.path.realpath(folder)}/" for folder in folders)
 
-    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+    def hook(event: str, arguments: tuple[object, ...]) -> None:
         place = _OPENS.get(event)
         path = None if place is None else arguments[place]
         if not isinstance(path, str | bytes | os.PathLike) or not path:
@@ -163,7 +165,7 @@ _NEWER = {1: 1 << 13 | 1 << 14, 2: 1 << 14}  # rights that this version does not
 _SIGNALS = 0b11  # sockets and signals to processes outside
 
 
-def _apply_landlock(libc: Any, rights: Mapping[Path, int]) -> None:
+def _apply_landlock(libc: ctypes.CDLL, rights: Mapping[Path, int]) -> None:
     """Deny this process to change files but below these paths, and to reach others, if it can."""
     version = libc.syscall(_CREATE, None, 0, 1)
     if version < 1:

@@ -51,7 +51,14 @@ class Comparison:
         return self.standings(None)
 
     def standings(self, tier: str | None) -> list[Standing]:
-        """Rank everybody in a tier, None: in all of them, the best first."""
+        """Rank everybody in a tier.
+
+        Args:
+            tier: Tier, None for all of them.
+
+        Returns:
+            Standings, the best first.
+        """
         scales = make_score_scales(self.results, self.tasks)
         return rank_entries(self.results.outcomes, tier, scales)
 
@@ -61,7 +68,14 @@ class Comparison:
         return list(self.request.tasks)
 
     def select(self, entry: UserEntry) -> Standing:
-        """Return an entry's standing over all tasks."""
+        """Return an entry's standing over all tasks.
+
+        Args:
+            entry: Entry of the request.
+
+        Returns:
+            Standing.
+        """
         return next(standing for standing in self.overall if standing.label == entry.label)
 
 
@@ -71,9 +85,16 @@ def compare(
     console: Console | None = None,
     keep: Path | None = None,
 ) -> Comparison:
-    """Drive a request; keep: folder of the baselines' finished cases.
+    """Drive a request: entries of names and files in processes of their own, objects in this one.
 
-    An entry of names and files drives in processes of its own, objects in this one.
+    Args:
+        request: Entries and tasks.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+        keep: Folder of the baselines' finished cases.
+
+    Returns:
+        Episodes.
     """
     entries, tasks = request.entries, request.tasks
     shared: dict[str, Any] = {"jobs": jobs, "console": console, "keep": keep}
@@ -121,17 +142,24 @@ _MAX_SENTENCES = 4  # contestants with a sentence
 
 
 def compose_verdict(comparison: Comparison) -> list[str]:
-    """Compose at most five lines: the user's entries, the best first, and how far to trust them."""
+    """Compose at most five lines: the user's entries, the best first, and how far to trust them.
+
+    Args:
+        comparison: Episodes.
+
+    Returns:
+        Lines.
+    """
     labels = {entry.label for entry in comparison.request.entries}
     placed = [(i, x) for i, x in enumerate(comparison.overall, 1) if x.label in labels]
     count, more = len(comparison.overall), len(placed) - _MAX_SENTENCES
-    lines = [f"Place {i} of {count}: {make_sentence(x)}." for i, x in placed[:_MAX_SENTENCES]]
+    lines = [f"Place {i} of {count}: {_make_sentence(x)}." for i, x in placed[:_MAX_SENTENCES]]
     if more > 0:
         lines[-1] = f"{more + 1} more stand in the table."
     return [*lines, _describe_trust(comparison)]
 
 
-def make_sentence(standing: Standing) -> str:
+def _make_sentence(standing: Standing) -> str:
     """Make the sentence that says where an entry stands."""
     cost = standing.overall.get("cost_vs_nominal")
     errors = [f"{c.name}: {r.error}" for c, r in standing.results.items() if r.error]
@@ -194,7 +222,14 @@ def _describe_trust(comparison: Comparison) -> str:
 
 
 def make_table(comparison: Comparison) -> ResultTable:
-    """Make the table of everybody over all tasks, the best first; the user's own are marked."""
+    """Make the table of everybody over all tasks, the best first; the user's own are marked.
+
+    Args:
+        comparison: Episodes.
+
+    Returns:
+        Table.
+    """
     labels, cells = {entry.label for entry in comparison.request.entries}, []
     for standing in comparison.overall:
         numbers = [standing.overall.get(name) for name in ("cost_vs_nominal", "share_won", "score")]
@@ -263,12 +298,12 @@ _COLUMNS |= {"won": "share_won", "failures": "failure_rate"}
 
 
 def score(
-    agent: Any,
+    agent: object,
     env_id: str = "",
     *,
     scenarios: Sequence[Any] = (),
     vehicle: Any = None,
-    estimator: Any = None,
+    estimator: object = None,
     episodes: int = EPISODES,
     seeds: Sequence[int] | None = None,
     fresh: bool = False,
@@ -322,7 +357,7 @@ def score(
     total, cost, won, failures = (standing.overall.get(x, _NONE) for x in _COLUMNS.values())
     errors, driven = [row["error"] for row in rows], standing.entry
     n, contests, error = standing.n, tuple(rows), errors[0] if all(errors) else ""
-    names, text = (driven.controller, driven.estimator), make_sentence(standing)
+    names, text = (driven.controller, driven.estimator), _make_sentence(standing)
     return Score(*names, total, cost, won, failures, n, contests, error, text)
 
 
@@ -335,7 +370,17 @@ def run(
     console: Console | None = None,
     keep: Path | None = None,
 ) -> Suite:
-    """Drive a request and make its suite; keep: folder of the baselines' finished cases."""
+    """Drive a request and make its suite.
+
+    Args:
+        request: Entries and tasks.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+        keep: Folder of the baselines' finished cases.
+
+    Returns:
+        Suite.
+    """
     comparison = compare(request, jobs, console, keep)
     suite = Suite("control", "Your own beside the package's", _TEXT)
     suite.verdict = "\n".join(compose_verdict(comparison))

@@ -20,13 +20,16 @@ from dataclasses import replace
 from multiprocessing import Pipe
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import VectorEnv
 
 from ...agents.env_info import EnvView
 from ...agents.learned.policy import ZIP
 from ...envs.numerics.kernel_cache import LAYERS, find_kernel_folder
+from ...envs.record import Array
 from ...envs.sensors.link import SlowSensor
 from ...estimators.registry import is_user_file
 from ...estimators.vector.batch import ForeignBatch
@@ -82,7 +85,7 @@ class _ChildProcess:
         self._started = float(json.loads(self.call(start)))
         self._left = self._limit = limit
 
-    def call(self, *message: Any, length: int | None = None) -> bytes:
+    def call(self, *message: object, length: int | None = None) -> bytes:
         """Ask for a method of `_EntryServer` by name; the answer's bytes, of a known length.
 
         Raises _ContestantError where it failed, ended, was too slow or sent something else.
@@ -108,7 +111,7 @@ class _ChildProcess:
             raise _ContestantError(self.reason)
         return content
 
-    def __deepcopy__(self, memo: Any) -> "_ChildProcess":
+    def __deepcopy__(self, memo: object) -> "_ChildProcess":
         return self  # in a copy of a wrapper's recorded arguments, too, there is one process
 
     def _stop(self) -> None:
@@ -133,7 +136,7 @@ class _ChildProcess:
         log = self._log.read().decode(errors="replace")
         text, _, stack = log.partition("(most recent call first)")
         if late:
-            return f"no end within {self._limit:g} s{find_place(self._texts, stack)}"
+            return f"no end within {self._limit:g} s{_find_place(self._texts, stack)}"
         last = (text.strip().splitlines() or [""])[-1]
         return f"its process ended with status {status}; {last}".rstrip("; ")
 
@@ -150,8 +153,8 @@ class _ChildProcess:
         return max(spent - self._started, 0.0)
 
 
-def find_place(texts: Sequence[str], stack: str) -> str:
-    """Say where a user's file was, from a stack whose innermost frame comes first."""
+def _find_place(texts: Sequence[str], stack: str) -> str:
+    """Describe where a user's file was."""
     for file, line in re.findall(r'File "(.*)", line (\d+)', stack):
         if any(Path(file).name in text for text in texts):
             return f", still in {Path(file).name}, line {line}"
@@ -167,7 +170,7 @@ class _RemoteAgent:
     def __init__(self, child: _ChildProcess, source: str, trust: bool) -> None:
         self._child, self._source, self._trust = child, source, trust
 
-    def __call__(self, env: Any, **options: Any) -> "_RemotePolicy":
+    def __call__(self, env: VectorEnv[Array, Array, Array], **options: object) -> "_RemotePolicy":
         """Let the child build its agent from the view of an env."""
         view = EnvView.from_env(env)
         self._child.call("agent", self._source, view, {"trust": self._trust, **options})
@@ -179,9 +182,9 @@ class _RemotePolicy:
         self._child, self._shape = child, shape
 
     def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None,
+        self, observation: Array, state: object = None, episode_start: Array | None = None,
         deterministic: bool = True,
-    ) -> tuple[Any, Any]:  # fmt: skip
+    ) -> tuple[npt.NDArray[np.float32], None]:  # fmt: skip
         """Return the child's actions, float32 (rows, width); its memory stays there."""
         length = 4 * self._shape[0] * self._shape[1]
         answer = self._child.call("predict", observation, episode_start, length=length)
@@ -194,7 +197,7 @@ class _RemoteEstimators:
     def __init__(self, child: _ChildProcess, source: str) -> None:
         self._child, self.name, self._rows = child, source, 0
 
-    def __call__(self, **arguments: Any) -> "_RemoteRow":
+    def __call__(self, **arguments: object) -> "_RemoteRow":
         """Let the child build one more estimator."""
         row, self._rows = self._rows, self._rows + 1
         return _RemoteRow(self._child, self.name, row, arguments)
@@ -203,11 +206,9 @@ class _RemoteEstimators:
 class _RemoteBatch(ForeignBatch):
     """The estimators of a child, all rows in one message."""
 
-    def take(
-        self, mask: Any, fast: Any, rows: Any, packets: Any, counts: Any, *observed: Any
-    ) -> None:
+    def take(self, mask: npt.NDArray[np.bool_] | None, *arguments: Any) -> None:
         """Process some rows, as `BatchEstimator.take`."""
-        obs, inner, plan, limits, *others = observed
+        fast, rows, packets, counts, obs, inner, plan, limits, *others = arguments
         chosen = np.arange(len(self)) if mask is None else np.flatnonzero(mask)
         remote: list[Any] = [self[i].inner for i in chosen.tolist()]
         records = [
@@ -224,11 +225,11 @@ class _RemoteRow:
     """One estimator of a child, as an `EstimatorLike`."""
 
     batch = _RemoteBatch
-    x: Any = None
-    P: Any = None
+    x: Array | None = None
+    P: Array | None = None
 
     def __init__(
-        self, child: _ChildProcess, source: str, row: int, arguments: dict[str, Any]
+        self, child: _ChildProcess, source: str, row: int, arguments: dict[str, object]
     ) -> None:
         self.child, self.row = child, row
         names = json.loads(child.call("estimator", row, source, arguments))
@@ -238,12 +239,12 @@ class _RemoteRow:
         """Start anew, as `EstimatorLike.reset`."""
         self.child.call("reset", self.row, dict(sensors), first)
 
-    def step(self, rows: Any, packets: Any) -> None:
+    def step(self, rows: Array, packets: Array) -> None:
         """Process records, as `EstimatorLike.step`."""
         self.take([self], [(self.row, rows, packets)])
 
     @staticmethod
-    def take(rows: Sequence["_RemoteRow"], records: Sequence[tuple[int, Any, Any]]) -> None:
+    def take(rows: Sequence["_RemoteRow"], records: Sequence[tuple[int, Array, Array]]) -> None:
         """Step some rows of one child with their records; set each one's x and P."""
         if not rows:
             return
@@ -253,7 +254,7 @@ class _RemoteRow:
             row.x, row.P = values[:n], values[n:].reshape(n, n)
 
 
-def _is_foreign(source: Any) -> bool:
+def _is_foreign(source: object) -> TypeGuard[str]:
     """Whether a text names code that is not the package's."""
     return isinstance(source, str) and (
         is_user_file(source) or source.endswith(ZIP) or ":" in source
@@ -261,7 +262,14 @@ def _is_foreign(source: Any) -> bool:
 
 
 def run_user_chunk(chunk: Chunk) -> DriveResult:
-    """Run a chunk; an entry whose every episode ends by an action that is none was not driven."""
+    """Run a chunk; an entry whose every episode ends by an action that is none was not driven.
+
+    Args:
+        chunk: Seeds of an entry.
+
+    Returns:
+        Episodes.
+    """
     result, wrong = run_chunk(chunk), "every action is NaN, or infinite, before an episode is over"
     failed = not result.error and result.mark_failures("bad-action").all()
     return _make_failed_result(chunk, wrong) if failed else result
@@ -284,7 +292,15 @@ def run_isolated_chunk(
 
 
 def run_rehearsal(chunk: Chunk, limit: float = LIMIT) -> tuple[DriveResult, set[str]]:
-    """Drive a chunk as `run_isolated_chunk`; return the files that its contestants opened, too."""
+    """Drive a chunk as `run_isolated_chunk`, and note the files that its contestants open.
+
+    Args:
+        chunk: Chunk whose entry has names and files.
+        limit: Wall time (s).
+
+    Returns:
+        Episodes, and the files.
+    """
     return _run_isolated_chunk(chunk, limit, None)
 
 

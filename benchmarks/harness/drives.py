@@ -24,12 +24,28 @@ class LoggedEpisode:
 
 
 def make_filter_arguments(base: Any) -> dict[str, Any]:
-    """Make the arguments of `make_estimator`, dt (s) too, from an unwrapped env's episode."""
+    """Make the arguments of `make_estimator` from an env's episode.
+
+    Args:
+        base: Unwrapped env.
+
+    Returns:
+        Arguments by name, dt (s) too.
+    """
     return make_spec(base)._asdict() | {"dt": base.dt}
 
 
-def call_quietly(make: Callable[..., T], *args: Any, **options: Any) -> T:
-    """Call a maker of a filter, or of an env with one, without `UnobservableWarning`."""
+def call_quietly(make: Callable[..., T], *args: object, **options: object) -> T:
+    """Call a maker of a filter, or of an env with one, without `UnobservableWarning`.
+
+    Args:
+        make: Function to call.
+        args: Its positional arguments.
+        options: Its other arguments.
+
+    Returns:
+        What it returns.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnobservableWarning)
         return make(*args, **options)

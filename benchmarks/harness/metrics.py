@@ -5,7 +5,7 @@ A new metric of an episode is one entry of `EPISODE`: its rows, its column and i
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from ...envs.engine.tick import apply_tyre_change, compute_static_load
 from ...envs.numerics.functions import sincos
 from ...envs.numerics.jit import jit
 from ...envs.numerics.packed import read
+from ...envs.numerics.primitives import Matrix, Vector
 from ...envs.record import Array
 from ...envs.vehicle.dynamics import compute_gravity
 from ...envs.vehicle.tyres import compute_tyre_forces
@@ -28,8 +29,8 @@ class StepSample(NamedTuple):
     command: Array  # fractions of yaw moment and added steering, shape (N, 2)
     last_command: Array  # commands of the last step, shape (N, 2)
     reward: Array  # rewards, shape (N,)
-    info: Mapping[str, Any]  # info of the env after the step
-    last: Mapping[str, Any]  # info of the env before the step
+    info: Mapping[str, Array]  # info of the env after the step
+    last: Mapping[str, Array]  # info of the env before the step
     full_scale: Array  # yaw moment (N m) and added steering (rad) at a fraction of 1, shape (2,)
     dt: float  # control period (s)
     lateral_deviation: Array  # distance from the path of the reference (m), shape (N,)
@@ -71,7 +72,14 @@ class Metric:
     turning: bool = False  # whether it is meaningful only where the reference has a yaw rate
 
     def text(self, value: float) -> str:
-        """Format a value in the metric's unit for its column."""
+        """Format a value for the metric's column.
+
+        Args:
+            value: Number in the metric's unit.
+
+        Returns:
+            Text in the column's unit.
+        """
         return f"{self.scale * value:.{self.digits}f}"
 
 
@@ -141,7 +149,7 @@ METRICS = {metric.name: metric.unit for metric in EPISODE} | {
 """Unit of every metric that a row may have."""
 
 
-def compute_dissipation(params: Array, states: Array, switches: Any) -> Array:
+def compute_dissipation(params: Array, states: Array, switches: Array) -> Array:
     """Compute the power that N cars' tyres dissipate: -F_y times the sliding speed, both axles.
 
     Drive slip is not modelled.
@@ -160,7 +168,7 @@ def compute_dissipation(params: Array, states: Array, switches: Any) -> Array:
 
 
 @jit
-def _write(params: Any, states: Any, switches: Any, out: Any) -> None:
+def _write(params: Matrix, states: Matrix, switches: Matrix, out: Vector) -> None:
     for i in range(len(params)):
         p, z = params[i], states[i]
         motion, drive, change = read(z, Z.motion), read(z, Z.drive), read(p, P.tyre_change)

@@ -106,7 +106,15 @@ _EVERY = 15.0  # s between two lines
 
 
 def split_seeds(seeds: int, size: int) -> list[tuple[int, ...]]:
-    """Split the seeds 0 .. seeds-1 into tuples of at most `size` consecutive ones."""
+    """Split the seeds 0 .. seeds-1 into consecutive ones.
+
+    Args:
+        seeds: Number of seeds.
+        size: Maximum of seeds in a part.
+
+    Returns:
+        Parts.
+    """
     return [tuple(range(k, min(k + size, seeds))) for k in range(0, seeds, size)]
 
 
@@ -127,7 +135,15 @@ class Bar(progress.Progress):
         self._before = progress.TaskID(-1), 0.0, 0.0  # the newest task as it was first seen
 
     def add_task(self, *args: Any, **options: Any) -> progress.TaskID:
-        """Add a task as rich does, with the `unit` of its count, and report it in a line."""
+        """Add a task as rich does, and report it in a line.
+
+        Args:
+            args: Description, and what rich takes.
+            options: Options of rich's, and the `unit` of the count.
+
+        Returns:
+            Id of the task.
+        """
         made = super().add_task(*args, **options)
         self._say()
         return made

@@ -18,6 +18,7 @@ from .verdict import Explorer
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+    from plotly.graph_objects import Figure
 
 VERDICTS = ("", "reproduced", "partly", "not reproduced", "report only")
 
@@ -53,7 +54,16 @@ class ResultRow:
 
     @classmethod
     def from_estimate(cls, metric: str, number: Estimate, **columns: Any) -> "ResultRow":
-        """Make a row of a metric from a number with its interval, and other columns."""
+        """Make a row from a number with its interval.
+
+        Args:
+            metric: Name of the metric.
+            number: Number and interval.
+            columns: Other fields of the row.
+
+        Returns:
+            Row.
+        """
         return cls(metric=metric, value=number.value, low=number.low, high=number.high, **columns)
 
 
@@ -104,13 +114,13 @@ class Suite:
     text: str
     rows: list[ResultRow] = field(default_factory=list)
     tables: list[ResultTable] = field(default_factory=list)
-    figures: list[tuple[str, Any, str]] = field(default_factory=list)  # title, plotly, caption
+    figures: list[tuple[str, "Figure", str]] = field(default_factory=list)  # title, plotly, caption
     explorers: list[Explorer] = field(default_factory=list)  # figures with menus
     maps: list[ShareMap] = field(default_factory=list)  # maps for the summary's PNG
     files: list[tuple[str, str, str]] = field(default_factory=list)  # name, media type, text
     verdict: str = ""  # answer in plain words, at most five lines
     warnings: list[str] = field(default_factory=list)  # about the input, above the verdict
-    answers: list[tuple[str, Any, str]] = field(default_factory=list)  # question, plotly, text
+    answers: list[tuple[str, "Figure", str]] = field(default_factory=list)  # question, plotly, text
 
     @property
     def headlines(self) -> list[str]:
@@ -132,7 +142,11 @@ class Suite:
 
 
 def check_writable(*paths: Path | None) -> None:
-    """Check before the work that files can be written, None aside; OSError otherwise."""
+    """Check before the work that files can be written; OSError otherwise.
+
+    Args:
+        paths: Files, None for none.
+    """
     for path in paths:
         if path is None:
             continue
@@ -148,12 +162,22 @@ def check_writable(*paths: Path | None) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
+    """Write a text file, whole or not at all.
+
+    Args:
+        path: File.
+        text: Content.
+    """
     write_atomic(path, text.encode())
 
 
 def write_json(path: str | Path, rows: Sequence[ResultRow]) -> None:
-    """Write rows as a JSON list of objects; NaN becomes null."""
+    """Write rows as a JSON list of objects; NaN becomes null.
+
+    Args:
+        path: File.
+        rows: Rows.
+    """
     plain = [
         {
             key: None if isinstance(value, float) and not math.isfinite(value) else value
@@ -165,7 +189,17 @@ def write_json(path: str | Path, rows: Sequence[ResultRow]) -> None:
 
 
 def read_json(path: str | Path) -> list[ResultRow]:
-    """Read rows of `write_json`; ValueError with file, row and column for others."""
+    """Read rows of `write_json`.
+
+    Args:
+        path: File.
+
+    Returns:
+        Rows.
+
+    Raises:
+        ValueError: The file has no such rows; the message has file, row and column.
+    """
     rows = []
     for i, entry in enumerate(read_objects(path), 1):
         numbers = {name: math.nan if value is None else value for name, value in entry.items()}
@@ -174,7 +208,17 @@ def read_json(path: str | Path) -> list[ResultRow]:
 
 
 def read_objects(path: str | Path) -> list[dict[str, Any]]:
-    """Read a JSON list of objects; ValueError with the path for something else."""
+    """Read a JSON list of objects.
+
+    Args:
+        path: File.
+
+    Returns:
+        Objects.
+
+    Raises:
+        ValueError: The file holds something else.
+    """
     try:
         entries = json.loads(Path(path).read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
@@ -185,7 +229,12 @@ def read_objects(path: str | Path) -> list[dict[str, Any]]:
 
 
 def write_parquet(path: str | Path, rows: Sequence[ResultRow]) -> None:
-    """Write rows as a Parquet table (needs the extra `report`)."""
+    """Write rows as a Parquet table (needs the extra `report`).
+
+    Args:
+        path: File.
+        rows: Rows.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 

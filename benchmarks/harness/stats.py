@@ -29,23 +29,55 @@ class Estimate(NamedTuple):
     high: float = math.nan
 
     def text(self, scale: float = 1.0, digits: str = ".3f") -> tuple[str, str]:
-        """Format scaled number and interval, "" without one, as two cells of a table."""
+        """Format number and interval as two cells of a table.
+
+        Args:
+            scale: Factor of the numbers.
+            digits: Format of the numbers.
+
+        Returns:
+            Number and interval, "" without one.
+        """
         value, low, high = (f"{scale * number:{digits}}" for number in self)
         return value, f"{low} .. {high}" if math.isfinite(self.low) else ""
 
     def inline(self, scale: float = 1.0, digits: str = ".2f") -> str:
-        """Format the scaled number and, in brackets, its interval if there is one."""
+        """Format the number and, in brackets, its interval if there is one.
+
+        Args:
+            scale: Factor of the numbers.
+            digits: Format of the numbers.
+
+        Returns:
+            Text.
+        """
         value, low, high = (f"{scale * number:{digits}}" for number in self)
         return f"{value} [{low}, {high}]" if math.isfinite(self.low) else value
 
 
 def root_mean(squares: Array, axis: int = -1) -> Array:
-    """Compute the square root of the mean over the seeds' axis: RMSE from squared errors."""
+    """Compute the square root of the mean over the seeds: RMSE from squared errors.
+
+    Args:
+        squares: Squared errors.
+        axis: Axis of the seeds.
+
+    Returns:
+        Roots.
+    """
     return np.asarray(np.sqrt(np.mean(squares, axis=axis)))
 
 
 def mean(values: Array, axis: int = -1) -> Array:
-    """Compute the mean over the seeds' axis, a statistic of `interval`."""
+    """Compute the mean over the seeds, a statistic of `interval`.
+
+    Args:
+        values: Numbers.
+        axis: Axis of the seeds.
+
+    Returns:
+        Means.
+    """
     return np.asarray(np.mean(values, axis=axis))
 
 
@@ -111,7 +143,14 @@ def interval(
 
 
 def mean_share(values: Array) -> Estimate:
-    """Compute the mean of fractions (n,); its interval is that of the odds, if they vary."""
+    """Compute the mean of fractions; its interval is that of the odds, if they vary.
+
+    Args:
+        values: Fractions of the seeds, shape (n,).
+
+    Returns:
+        Mean and interval.
+    """
     if not 0.0 < np.mean(values) < 1.0:
         return interval(values)
     return Estimate(*(odds / (1.0 + odds) for odds in interval(values, _odds)))
@@ -123,17 +162,42 @@ def _odds(values: Array, axis: int = -1) -> Array:
 
 
 def ratio_of_roots(squares: Array, reference: Array, axis: int = -1) -> Array:
-    """Compute the RMSE over that of a reference on the same seeds, from squared errors."""
+    """Compute the RMSE over that of a reference on the same seeds, from squared errors.
+
+    Args:
+        squares: Squared errors.
+        reference: Those of the reference.
+        axis: Axis of the seeds.
+
+    Returns:
+        Ratios.
+    """
     return np.asarray(root_mean(squares, axis) / root_mean(reference, axis))
 
 
 def ratio_of_means(values: Array, reference: Array, axis: int = -1) -> Array:
-    """Compute the mean over that of a reference on the same seeds, along their axis."""
+    """Compute the mean over that of a reference on the same seeds.
+
+    Args:
+        values: Numbers.
+        reference: Those of the reference.
+        axis: Axis of the seeds.
+
+    Returns:
+        Ratios.
+    """
     return np.asarray(mean(values, axis) / mean(reference, axis))
 
 
 def average(*strata: Array) -> Estimate:
-    """Average the means of strata (n_i,); NaN without strata, and where a number is NaN."""
+    """Average the means of strata.
+
+    Args:
+        strata: Numbers of each stratum, shape (n_i,).
+
+    Returns:
+        Average and interval; NaN without strata, and where a number is NaN.
+    """
     filled = [stratum for stratum in strata if len(stratum)]
     if not filled:
         return Estimate(math.nan)
@@ -143,12 +207,26 @@ def average(*strata: Array) -> Estimate:
 
 
 def geometric_mean(*strata: Array) -> Estimate:
-    """Compute exp of the `average` of strata of logarithms (n_i,), of equal weight."""
+    """Compute exp of the `average` of strata of logarithms, of equal weight.
+
+    Args:
+        strata: Logarithms of each stratum, shape (n_i,).
+
+    Returns:
+        Mean and interval.
+    """
     return Estimate(*(math.exp(log) for log in average(*strata)))
 
 
 def share(hits: npt.ArrayLike) -> Estimate:
-    """Compute the mean of numbers (n,) that are 0 or 1, a tie 0.5, with Wilson's interval."""
+    """Compute the mean of hits with Wilson's interval.
+
+    Args:
+        hits: Numbers that are 0 or 1, a tie 0.5, shape (n,).
+
+    Returns:
+        Mean and interval; NaN without hits.
+    """
     from scipy.stats import norm
 
     values, z = np.asarray(hits, np.float64), float(norm.isf(_TAIL))
@@ -162,7 +240,15 @@ def share(hits: npt.ArrayLike) -> Estimate:
 
 
 def compute_win_rate(costs: Array, others: Array) -> Estimate:
-    """Compute the fraction of episodes that cost less than the other's on the same seeds."""
+    """Compute the fraction of episodes that cost less than the other's.
+
+    Args:
+        costs: Costs, shape (n,).
+        others: Costs of the other on the same seeds, shape (n,).
+
+    Returns:
+        Fraction and interval.
+    """
     return share(np.where(costs == others, 0.5, np.less(costs, others)))
 
 
@@ -229,7 +315,14 @@ def ratio_of_sums(tops: Sequence[Array], bottoms: Sequence[Array]) -> Estimate:
 
 
 def compute_p_value(logs: Array) -> float:
-    """Compute p of Student's test that paired differences (n,) have a mean not below 0."""
+    """Compute p of Student's test that paired differences have a mean not below 0.
+
+    Args:
+        logs: Differences, shape (n,).
+
+    Returns:
+        Probability; 1 where they do not vary.
+    """
     spread = float(np.std(logs, ddof=1)) if len(logs) > 1 else math.nan
     middle = float(np.mean(logs)) if len(logs) else math.nan
     if not spread > 0.0:
@@ -240,7 +333,14 @@ def compute_p_value(logs: Array) -> float:
 
 
 def holm(chances: Sequence[float]) -> list[bool]:
-    """Test p values at a family-wise level of 5 %, by Holm's step-down: which are significant."""
+    """Test p values at a family-wise level of 5 %, by Holm's step-down.
+
+    Args:
+        chances: Values of p.
+
+    Returns:
+        Whether each is significant.
+    """
     significant = [False] * len(chances)
     for rank, i in enumerate(np.argsort(chances)):
         if not chances[i] <= (1.0 - _LEVEL) / (len(chances) - rank):

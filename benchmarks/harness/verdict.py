@@ -54,7 +54,17 @@ class Explorer:
 
 
 def format_verdict(*lines: str) -> str:
-    """Join the lines that are not empty; ValueError for more than LINES of them."""
+    """Join the lines of a verdict.
+
+    Args:
+        lines: Lines, of which empty ones are left out.
+
+    Returns:
+        Verdict.
+
+    Raises:
+        ValueError: There are more than LINES of them.
+    """
     filled = [line for line in lines if line]
     if len(filled) > LINES:
         raise ValueError(f"a verdict has at most {LINES} lines, got {len(filled)}: {filled}")
@@ -89,6 +99,12 @@ def describe_leader(name: str, ratios: Mapping[str, Estimate], verb: str) -> str
 def format_percent(ratio: Estimate) -> str:
     """Format a ratio in percent with its interval, if it has one.
 
+    Args:
+        ratio: Ratio.
+
+    Returns:
+        Text.
+
     >>> format_percent(Estimate(0.71, 0.65, 0.77)), format_percent(Estimate(0.5))
     ('71 % [65, 77]', '50 %')
     """
@@ -97,7 +113,14 @@ def format_percent(ratio: Estimate) -> str:
 
 
 def summarise_names(names: Sequence[str], limit: int = _MAX_NAMES) -> str:
-    """Join names for a sentence; of more than `limit`, the later ones are counted.
+    """Join names for a sentence; of many the later ones are counted.
+
+    Args:
+        names: Names.
+        limit: Number of names up to which none is counted.
+
+    Returns:
+        Names in words.
 
     >>> summarise_names(["a"]), summarise_names(["a", "b"]), summarise_names(["a", "b", "c", "d"])
     ('a', 'a and b', 'a, b and 2 more')

@@ -6,7 +6,6 @@ Importing this module needs plotly, the extra `report`.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,10 +29,10 @@ _DASH_ORDER = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot")
 _LOG = {"type": "log", "dtick": "D2", "tickformat": "~g"}  # 1, 2, 5, 10, ...
 
 
-def choose_line_styles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
+def _choose_line_styles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
     """Choose (colour, dash) of each line: no two alike, a variant of a known name dashed.
 
-    >>> [dash for _, dash in choose_line_styles(["exact-kf", "exact-kf, true model"]).values()]
+    >>> [dash for _, dash in _choose_line_styles(["exact-kf", "exact-kf, true model"]).values()]
     ['solid', 'dash']
     """
     styles: dict[str, tuple[str, str]] = {}
@@ -66,15 +65,25 @@ def draw_time_series(
     unit_label: str,
     x_label: str = "time / s",
     dots: Collection[str] = (),
-) -> Any:
-    """Draw series (n,) by name over times t (n,) on one axis, "truth" on top and thicker.
+) -> go.Figure:
+    """Draw series on one axis over time, "truth" on top and thicker.
 
-    unit_label: Quantity and unit, as "sideslip angle / mrad". dots: Names that are drawn as dots,
-    for packets with NaN between them. Raises ValueError for a series that is not as long as t.
+    Args:
+        t: Times (s), shape (n,).
+        series: Values by name, shape (n,) each.
+        unit_label: Quantity and unit, as "sideslip angle / mrad".
+        x_label: Quantity and unit of `t`.
+        dots: Names that are drawn as dots, for packets with NaN between them.
+
+    Returns:
+        Figure.
+
+    Raises:
+        ValueError: A series is not as long as `t`.
     """
     t = np.asarray(t, float)
     figure = go.Figure()
-    for name, colour_and_dash in choose_line_styles(series).items():
+    for name, colour_and_dash in _choose_line_styles(series).items():
         y = np.asarray(series[name], float)
         if y.shape != t.shape:
             raise ValueError(f"series {name!r} has shape {y.shape}, its time {t.shape}")
@@ -89,8 +98,17 @@ def draw_time_series(
     return _finish(_sort_facts(figure), x_label, unit_label, 380, hovermode="x unified")
 
 
-def draw_error_series(t: Array, errors: Mapping[str, Array], unit_label: str) -> Any:
-    """Draw estimate minus truth over time, as `draw_time_series`, with a line at zero."""
+def draw_error_series(t: Array, errors: Mapping[str, Array], unit_label: str) -> go.Figure:
+    """Draw estimate minus truth over time, with a line at zero.
+
+    Args:
+        t: Times (s), shape (n,).
+        errors: Errors by name, shape (n,) each.
+        unit_label: Quantity and unit.
+
+    Returns:
+        Figure.
+    """
     figure = draw_time_series(t, errors, unit_label)
     figure.add_hline(y=0.0, line={"color": GREY, "width": 1}, layer="below")
     return figure
@@ -102,13 +120,24 @@ def draw_curves(
     x_label: str,
     y_label: str,
     log: str = "",
-) -> Any:
-    """Draw lines with dots; series: values (n,) by name, or (value, low, high) for whiskers.
+) -> go.Figure:
+    """Draw lines with dots.
 
-    log: Logarithmic axes, of "x", "y" and "xy". Raises ValueError for a series not as long as x.
+    Args:
+        x: Places of the dots, shape (n,).
+        series: Values by name, shape (n,), or (value, low, high) for whiskers.
+        x_label: Quantity and unit of `x`.
+        y_label: Quantity and unit of the values.
+        log: Logarithmic axes, of "x", "y" and "xy".
+
+    Returns:
+        Figure.
+
+    Raises:
+        ValueError: A series is not as long as `x`.
     """
     figure = go.Figure()
-    for name, pen in choose_line_styles(series).items():
+    for name, pen in _choose_line_styles(series).items():
         line = series[name]
         value, *bounds = line if isinstance(line, tuple) else (line,)
         if len(value) != len(x):
@@ -124,10 +153,20 @@ def draw_curves(
     return _finish(figure, x_label, y_label, 400, hovermode="x unified")
 
 
-def draw_track(paths: Mapping[str, tuple[Array, Array]]) -> Any:
-    """Draw paths (x, y) in m by name, seen from above; ValueError for unequal lengths."""
+def draw_track(paths: Mapping[str, tuple[Array, Array]]) -> go.Figure:
+    """Draw paths, seen from above.
+
+    Args:
+        paths: Paths (x, y) (m) by name.
+
+    Returns:
+        Figure.
+
+    Raises:
+        ValueError: The two of a path differ in length.
+    """
     figure = go.Figure()
-    for name, colour_and_dash in choose_line_styles(paths).items():
+    for name, colour_and_dash in _choose_line_styles(paths).items():
         x, y = (np.asarray(values, float) for values in paths[name])
         if x.shape != y.shape:
             raise ValueError(f"track {name!r}: x has shape {x.shape}, y {y.shape}")
@@ -144,10 +183,18 @@ def draw_bars(
     lows: Sequence[float],
     highs: Sequence[float],
     unit: str,
-) -> Any:
+) -> go.Figure:
     """Draw a bar for each label, the first on top, with its interval as whiskers.
 
-    unit: Quantity and unit, "RMSE / mrad". No whiskers for NaN, or bounds that equal the value.
+    Args:
+        labels: Names of the bars.
+        values: Lengths of the bars.
+        lows: Lower bounds; no whiskers for NaN, or a bound that equals the value.
+        highs: Upper bounds.
+        unit: Quantity and unit, as "RMSE / mrad".
+
+    Returns:
+        Figure.
     """
     if not len(labels) == len(values) == len(lows) == len(highs):
         raise ValueError("labels, values, lows and highs differ in length")
@@ -187,11 +234,18 @@ def draw_bars(
 
 def draw_groups(
     groups: Mapping[str, Mapping[str, Estimate]], unit: str, lines: Mapping[float, str]
-) -> Any:
-    """Draw dots with intervals on a logarithmic axis, group below group, each under its title.
+) -> go.Figure:
+    """Draw dots with intervals on a logarithmic axis, group below group.
 
-    groups: Numbers by name, by title. unit: Quantity and unit. lines: Meanings of certain values.
     A name that is a variant of a known one has a hollow dot.
+
+    Args:
+        groups: Numbers by name, by the group's title.
+        unit: Quantity and unit.
+        lines: Meanings of certain values, which are drawn as lines.
+
+    Returns:
+        Figure.
     """
     figure, ticks, row = go.Figure(), dict[int, str](), 0
     for title, numbers in groups.items():
@@ -225,7 +279,9 @@ def draw_groups(
     return figure
 
 
-def _make_line(name: str, x: Array, y: Array, colour: str, dash: str, dots: bool = False) -> Any:
+def _make_line(
+    name: str, x: Array, y: Array, colour: str, dash: str, dots: bool = False
+) -> go.Scatter:
     x, y = _reduce_precision(x), _reduce_precision(y)
     if dots:
         return go.Scatter(x=x, y=y, name=name, mode="markers", marker={"color": colour, "size": 4})
@@ -241,7 +297,7 @@ def _reduce_precision(values: Array) -> Array:
     return values if far else values.astype(np.float32)
 
 
-def _compute_slimness(figure: Any) -> float:
+def _compute_slimness(figure: go.Figure) -> float:
     """Compute the height over the width of all paths."""
     spans = []
     for axis in ("y", "x"):
@@ -251,14 +307,14 @@ def _compute_slimness(figure: Any) -> float:
     return spans[0] / max(spans[1], 1e-9)
 
 
-def _sort_facts(figure: Any) -> Any:
+def _sort_facts(figure: go.Figure) -> go.Figure:
     """Sort the truth above the estimates; the legend names it first."""
     figure.data = sorted(figure.data, key=lambda trace: trace.name in FACTS)
     figure.update_traces(legendrank=1, selector=lambda trace: trace.name in FACTS)
     return figure
 
 
-def _finish(figure: Any, x: str, y: str, height: int, **layout: Any) -> Any:
+def _finish(figure: go.Figure, x: str, y: str, height: int, **layout: object) -> go.Figure:
     legend = {"orientation": "h", "x": 0, "xanchor": "left", "y": 1.02, "yanchor": "bottom"}
     figure.update_layout(height=height, legend=legend, showlegend=len(figure.data) > 1, **layout)
     figure.update_xaxes(title_text=x, hoverformat=".4~g", automargin=True)
@@ -268,10 +324,18 @@ def _finish(figure: Any, x: str, y: str, height: int, **layout: Any) -> Any:
 
 def draw_heat_map(
     names: Sequence[str], columns: Sequence[str], values: Array, unit: str, good: str = "high"
-) -> Any:
+) -> go.Figure:
     """Draw names down, columns across, the number in each field; NaN stays empty.
 
-    values: Shape (names, columns). good: "high" or "low" values are the good ones (blue).
+    Args:
+        names: Names of the rows.
+        columns: Names of the columns.
+        values: Numbers, shape (names, columns).
+        unit: Unit of the numbers.
+        good: Which values are the good ones (blue), "high" or "low".
+
+    Returns:
+        Figure.
     """
     flipped = [(1.0 - at, shade) for at, shade in SHARE_SCALE[::-1]]
     scale = [list(stop) for stop in (SHARE_SCALE if good == "high" else flipped)]
@@ -301,8 +365,15 @@ def draw_heat_map(
     return figure
 
 
-def draw_share_maps(share_map: ShareMap) -> Any:
-    """Draw fractions over two axes, a panel for each name, with the line at one half."""
+def draw_share_maps(share_map: ShareMap) -> go.Figure:
+    """Draw fractions over two axes, a panel for each name, with the line at one half.
+
+    Args:
+        share_map: Fractions.
+
+    Returns:
+        Figure.
+    """
     n_columns = min(3, len(share_map.shares))
     n_rows = -(-len(share_map.shares) // n_columns)
     names = list(share_map.shares)
@@ -311,7 +382,7 @@ def draw_share_maps(share_map: ShareMap) -> Any:
     for i, (name, share) in enumerate(share_map.shares.items()):
         place = {"row": i // n_columns + 1, "col": i % n_columns + 1}
         hover = f"{name}<br>%{{x:.1f}}, %{{y:.1f}}: %{{z:.2f}}<extra></extra>"
-        axes: dict[str, Any] = {"x": share_map.x, "y": share_map.y, "z": share}
+        axes = {"x": share_map.x, "y": share_map.y, "z": share}
         figure.add_trace(go.Heatmap(**axes, coloraxis="coloraxis", hovertemplate=hover), **place)
         half = {"start": 0.5, "end": 0.5, "size": 1.0, "coloring": "none"}
         pen = {"contours": half, "line": {"color": INK, "width": 1.5}}

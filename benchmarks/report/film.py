@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from ...agents import make_agent
+from ...agents import Agent, make_agent
 from ...agents.rollout import iterate_steps
 from ...envs.io import atomic_file
 from ...envs.numerics import require_extra
@@ -31,11 +31,19 @@ class FilmDriver(NamedTuple):
 
     name: str
     env: Any  # a Gymnasium environment of this package, wrapped or not
-    agent: Any  # with stable-baselines3's `predict`, or None
+    agent: Agent | None
 
 
 def check_film(path: Path | None) -> None:
-    """Check before the work that a film can be written; ValueError for another ending."""
+    """Check before the work that a film can be written.
+
+    Args:
+        path: File, None for none.
+
+    Raises:
+        ValueError: The file has another ending.
+        ModuleNotFoundError: The extra `render` is not installed.
+    """
     if path is None:
         return
     if path.suffix.lower() not in RATES:
@@ -49,9 +57,17 @@ def check_film(path: Path | None) -> None:
 def write_drive_film(
     path: Path | None, driver: FilmDriver, beside: str | None, seed: int | None, console: Console
 ) -> None:
-    """Write the film of a drive, where there is a path, with an agent `beside` it as a ghost.
+    """Write the film of a drive, where there is a path, with another agent as a ghost.
 
-    Raises ValueError for a ghost without a film, and as `write_film` and `make_agent`.
+    Args:
+        path: File, None for none.
+        driver: Agent and env of the drive.
+        beside: Name of the ghost's agent, None for none.
+        seed: Seed of the episode.
+        console: The screen.
+
+    Raises:
+        ValueError: There is a ghost without a film, or as `write_film` and `make_agent`.
     """
     if path is None:
         if beside is not None:
@@ -69,10 +85,13 @@ def write_drive_film(
 def write_film(
     path: Path, drivers: Sequence[FilmDriver], seed: int | None = 0, console: Console | None = None
 ) -> None:
-    """Drive an episode and write its film, whole or not at all, with progress on a console.
+    """Drive an episode and write its film, whole or not at all; raises as `check_film`.
 
-    The first driver's car is filmed until its episode ends; the others' drive on the same road.
-    Raises as `check_film`.
+    Args:
+        path: File.
+        drivers: Agents; the first one's car is filmed until its episode ends, on the others' road.
+        seed: Seed of the episode.
+        console: Where progress is shown.
     """
     check_film(path)
     base = drivers[0].env.unwrapped
@@ -83,7 +102,7 @@ def write_film(
         tempfile.TemporaryDirectory() as folder,
         use_shared_bar(console, str(path), "pictures") as bar,
     ):
-        frames = bar.track(render_frames(drivers, seed, every), total, task_id=bar.task_ids[0])
+        frames = bar.track(_render_frames(drivers, seed, every), total, task_id=bar.task_ids[0])
         part = Path(folder, "film").with_suffix(path.suffix.lower())
         write = _write_gif if part.suffix == ".gif" else _write_mp4
         write(part, frames, 1.0 / (every * step))
@@ -91,8 +110,8 @@ def write_film(
             file.write(part.read_bytes())
 
 
-def render_frames(drivers: Sequence[FilmDriver], seed: int | None, every: int) -> Iterator[Frame]:
-    """Render every `every`-th step of the first driver's episode, and its last one."""
+def _render_frames(drivers: Sequence[FilmDriver], seed: int | None, every: int) -> Iterator[Frame]:
+    """Render steps of the first driver's episode, and its last one."""
     from ...envs.rendering.canvas import read_pixels
     from ...envs.rendering.charts import draw_picture
 
@@ -165,9 +184,19 @@ def make_track_kml(
     colours: dict[str, str] | None = None,
     origin: tuple[float, float] = ORIGIN,
 ) -> str:
-    """Make a KML document of tracks, (X east, Y north) in m by name, around an origin.
+    """Make a KML document of tracks.
 
-    colours: "#RRGGBB" by name. Raises ValueError for no track, or an unequal or infinite one.
+    Args:
+        title: Title of the document.
+        tracks: Tracks, X east and Y north (m), by name.
+        colours: Colours, "#RRGGBB", by name.
+        origin: Place of X = Y = 0 (deg north and east).
+
+    Returns:
+        Document.
+
+    Raises:
+        ValueError: There is no track, or an unequal or infinite one.
     """
     if not tracks:
         raise ValueError("a KML document needs at least one track")

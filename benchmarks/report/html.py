@@ -9,7 +9,6 @@ import base64
 import gzip
 import hashlib
 import json
-import math
 import re
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,47 +17,53 @@ from html import escape
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import Any, TypeGuard
+from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
 
+from ...envs.record import Array
 from ...envs.rendering.palette import INK, find_base, find_colour
 from ..harness.results import ResultTable, Suite, write_text
 from ..harness.verdict import Explorer
 
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
 
-def parse_number(cell: str) -> float | None:
+
+def _parse_number(cell: str) -> float | None:
     """Parse the number that a cell begins with, None for one that begins with none or with NaN.
 
-    >>> parse_number("0.31 [0.29, 0.33]"), parse_number("-1,250 N m")
+    >>> _parse_number("0.31 [0.29, 0.33]"), _parse_number("-1,250 N m")
     (0.31, -1250.0)
-    >>> parse_number("< 2e-3"), parse_number("2-dof")
+    >>> _parse_number("< 2e-3"), _parse_number("2-dof")
     (0.002, None)
     """
     match = _NUMBER.match(cell)
-    if not match:
-        return None
-    sign = -1.0 if match["sign"] in ("-", "\u2212") else 1.0
-    if match["inf"]:
-        return sign * math.inf
-    return sign * float(re.sub(r"[,\u00a0\u202f]", "", match["digits"]).replace("\u2212", "-"))
+    return float(match[1].translate(_PLAIN)) if match else None
 
 
 _NUMBER = re.compile(
-    r"\s*[\[(<>≤≥~≈±]*\s*(?P<sign>[-+\u2212])?"
-    r"(?:(?P<inf>inf\b|∞)"
-    r"|(?P<digits>(?>\d+(?:[,\u00a0\u202f]\d{3})*(?:\.\d*)?|\.\d+)(?>e[-+\u2212]?\d+)?)(?!-\w))",
+    r"\s*[\[(<>≤≥~≈±]*\s*([-+\u2212]?(?:inf\b|∞"
+    r"|(?>\d+(?:[,\u00a0\u202f]\d{3})*(?:\.\d*)?|\.\d+)(?>e[-+\u2212]?\d+)?(?!-\w)))",
     re.IGNORECASE,
 )
+_PLAIN = str.maketrans({",": "", "\u00a0": "", "\u202f": "", "\u2212": "-", "∞": "inf"})
 _MAX_LETTERS = 40  # letters: a longer cell wraps
 _BLANK = {"", "-", "\u2013", "\u2014", "nan", "n/a"}
 
 
 def is_numeric(cells: Iterable[str]) -> bool:
-    """Check whether a column has numbers, and nothing else but blanks."""
+    """Check whether a column has numbers, and nothing else but blanks.
+
+    Args:
+        cells: Texts of the column.
+
+    Returns:
+        Whether it has.
+    """
     texts = [cell for cell in cells if cell.strip().lower() not in _BLANK]
-    return bool(texts) and all(parse_number(cell) is not None for cell in texts)
+    return bool(texts) and all(_parse_number(cell) is not None for cell in texts)
 
 
 def _format_table(table: ResultTable) -> str:
@@ -91,7 +96,7 @@ def _format_table(table: ResultTable) -> str:
 def _format_row(row: Sequence[str], numeric: Sequence[bool], keyed: bool) -> str:
     cells = []
     for i, (cell, is_number) in enumerate(zip(row, numeric, strict=True)):
-        value = parse_number(cell) if is_number else None
+        value = _parse_number(cell) if is_number else None
         data = "" if value is None else f' data-value="{value!r}"'.replace("inf", "Infinity")
         tag, key = ('th scope="row"', _format_key(cell) if keyed else "") if i == 0 else ("td", "")
         kind = ' class="long"' if len(cell) > _MAX_LETTERS else _format_class(is_number)
@@ -112,14 +117,21 @@ def _format_key(cell: str) -> str:
 
 
 def inline(text: str) -> str:
-    """Escape a text; what stands in backticks becomes code."""
+    """Escape a text; what stands in backticks becomes code.
+
+    Args:
+        text: Text.
+
+    Returns:
+        HTML.
+    """
     return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
 
 
 _MARKED = r"(?<=^<!-- tables of {} -->\n).*?(?=^<!-- end -->$)"
 
 
-def format_page_table(table: ResultTable) -> str:
+def _format_page_table(table: ResultTable) -> str:
     """Format a heading, the table, and its note in lines of 120."""
     head, *rows = (
         [text.replace("|", r"\|") for text in row] for row in (table.header, *table.cells)
@@ -132,7 +144,15 @@ def format_page_table(table: ResultTable) -> str:
 
 
 def check_page(path: Path | None, names: Sequence[str]) -> None:
-    """Check that a page has marks for a suite that is asked for; ValueError otherwise."""
+    """Check that a page has marks for a suite that is asked for.
+
+    Args:
+        path: File of the page, None for none.
+        names: Names of the suites.
+
+    Raises:
+        ValueError: The page has none.
+    """
     if path is not None:
         text = path.read_text(encoding="utf-8")
         if not any(_compile_pattern(name).search(text) for name in names):
@@ -143,10 +163,15 @@ def check_page(path: Path | None, names: Sequence[str]) -> None:
 
 
 def write_page(path: Path, suites: Sequence[Suite]) -> None:
-    """Write a page with new tables of its marked suites, but for details."""
+    """Write a page with new tables of its marked suites, but for details.
+
+    Args:
+        path: File of the page.
+        suites: Results.
+    """
     text = path.read_text(encoding="utf-8")
     for suite in suites:
-        made = "\n".join(format_page_table(table) for table in suite.tables if not table.detail)
+        made = "\n".join(_format_page_table(table) for table in suite.tables if not table.detail)
         before, *marked = _compile_pattern(suite.name).split(text, maxsplit=1)
         text = f"\n{made}\n".join((before, *marked))
     write_text(path, text)
@@ -160,15 +185,15 @@ _MIN_PACKED = 40  # a shorter array is left as it is
 _LEVELS = {"x": 2**13, "y": 2**11}  # more than a screen has pixels
 
 
-def pack_text(text: str) -> str:
+def _pack_text(text: str) -> str:
     """Pack a text for the page's `unpack`; the same text gives the same letters."""
     return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
 
 
-def encode_steps(values: npt.ArrayLike, levels: int = _LEVELS["y"]) -> dict[str, Any]:
-    """Encode numbers (n,) as steps in quanta, `levels` of them in the range; null for a gap.
+def _encode_steps(values: npt.ArrayLike, levels: int = _LEVELS["y"]) -> dict[str, object]:
+    """Encode numbers as steps in quanta; null for a gap.
 
-    >>> encode_steps([1.0, 2.0, float("nan"), 3.0], levels=3)
+    >>> _encode_steps([1.0, 2.0, float("nan"), 3.0], levels=3)
     {'from': 1.0, 'by': 1.0, 'steps': [0, 1, None, 1]}
     """
     v = np.asarray(values, float)
@@ -182,7 +207,7 @@ def encode_steps(values: npt.ArrayLike, levels: int = _LEVELS["y"]) -> dict[str,
     return {"from": low, "by": by, "steps": encoded}
 
 
-def encode_figure(figure: Any) -> str:
+def _encode_figure(figure: "Figure") -> str:
     """Encode a plotly figure's data and layout as JSON, without template and title."""
     from plotly.utils import PlotlyJSONEncoder
 
@@ -193,12 +218,12 @@ def encode_figure(figure: Any) -> str:
         for axis, levels in _LEVELS.items():
             values = getattr(trace, axis, None)
             if _is_line(values):
-                plain[axis] = encode_steps(values, levels)
+                plain[axis] = _encode_steps(values, levels)
     plain = {name: content[name] for name in ("data", "layout") if content.get(name)}
     return json.dumps(plain, cls=PlotlyJSONEncoder, separators=(",", ":"))
 
 
-def _is_line(values: Any) -> TypeGuard[npt.NDArray[np.floating[Any]]]:
+def _is_line(values: object) -> TypeGuard[Array]:
     """Check whether values are many enough, in a row, to be worth their steps."""
     return (
         isinstance(values, np.ndarray)
@@ -217,8 +242,16 @@ def write_report(
 ) -> None:
     """Write one self-contained HTML file: an answer, then every suite's verdict, pictures, tables.
 
-    command: Command line that made the suites. environment: Versions by name. The file is written
-    whole or not at all. Raises ValueError for no suite or a row not as long as its header.
+    The file is written whole or not at all.
+
+    Args:
+        path: File.
+        suites: Results.
+        command: Command line that made the suites.
+        environment: Versions by name.
+
+    Raises:
+        ValueError: There is no suite, or a row is not as long as its header.
     """
     if not suites:
         raise ValueError("a report needs at least one suite")
@@ -272,13 +305,13 @@ def _format_section(link: str, suite: Suite, opened: int) -> str:
     return f'<section id="{link}">\n' + "\n".join(blocks) + "\n</section>"
 
 
-def _format_figure(title: str, figure: Any, caption: str) -> str:
+def _format_figure(title: str, figure: "Figure", caption: str) -> str:
     """Format a figure; its layout's meta is "wide", or "scroll" to keep its width on phones."""
     kind = figure.layout.meta or ""
     return (
         f'<figure class="{kind}">\n<h3>{escape(title)}</h3>\n<div class="frame">'
         f'<div class="plot" role="img" aria-label="{escape(title)}"></div></div>\n'
-        f"{_format_data('figure', encode_figure(figure))}\n"
+        f"{_format_data('figure', _encode_figure(figure))}\n"
         f"<figcaption>{inline(caption)}</figcaption>\n</figure>"
     )
 
@@ -294,7 +327,7 @@ def _format_explorer(explorer: Explorer) -> str:
         "cells": [
             [
                 list(key),
-                {name: encode_steps(_select_samples(values)) for name, values in signals.items()},
+                {name: _encode_steps(_select_samples(values)) for name, values in signals.items()},
             ]
             for key, signals in explorer.cells.items()
         ],
@@ -306,15 +339,16 @@ def _format_explorer(explorer: Explorer) -> str:
     )
 
 
-def _select_samples(values: Any) -> Any:
+def _select_samples(values: Array) -> Array:
     """Select at most POINTS samples, of every signal of a cell at the same places."""
     n = len(values)
-    return values[np.unique(np.linspace(0, n - 1, min(n, POINTS)).astype(int))]
+    chosen: Array = values[np.unique(np.linspace(0, n - 1, min(n, POINTS)).astype(int))]
+    return chosen
 
 
 def _format_data(name: str, text: str) -> str:
     """Format a packed text, which no browser runs."""
-    return f'<script type="application/gzip" data-name="{name}">{pack_text(text)}</script>'
+    return f'<script type="application/gzip" data-name="{name}">{_pack_text(text)}</script>'
 
 
 def _hash(script: str) -> str:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 from rich import box
 from rich.console import Console
@@ -54,7 +53,12 @@ def _print_title(console: Console, suite: Suite) -> None:
 
 
 def print_suite(console: Console, suite: Suite) -> None:
-    """Print title, verdict, text, and each table with its note, but for details."""
+    """Print title, verdict, text, and each table with its note, but for details.
+
+    Args:
+        console: The screen.
+        suite: Results.
+    """
     _print_title(console, suite)
     if suite.verdict:
         console.print(f"[bold]{escape(chr(10).join(suite.headlines))}[/]\n", highlight=False)
@@ -102,8 +106,8 @@ def _choose_width(width: int) -> int:
 
 def _make_rich_table(table: ResultTable, width: int) -> RichTable:
     """Make a table with numbers to the right and whole, texts to the left and wrapped."""
-    style: Any = {"title_justify": "left", "box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0)}
-    shown = RichTable(title=table.title, **style)
+    title, style = table.title, box.SIMPLE_HEAD
+    shown = RichTable(title=title, title_justify="left", box=style, padding=(0, 1, 0, 0))
     columns = zip(*table.cells, strict=True) if table.cells else [()] * len(table.header)
     for i, (name, column) in enumerate(zip(table.header, columns, strict=True)):
         right = i > 0 and is_numeric(column)

@@ -6,7 +6,7 @@ import pytest
 
 from sideslip.benchmarks.control.tasks import list_scored_tasks
 from sideslip.benchmarks.harness.results import ResultRow, Suite
-from sideslip.benchmarks.picture import find_partial_entries, write_picture
+from sideslip.benchmarks.picture import _find_partial_entries, write_picture
 
 MINE = [each.name for each in list_scored_tasks() if each.tier == "2a"]
 STEERING = [name for name in MINE if name.endswith("steering")]
@@ -24,8 +24,8 @@ def test_a_score_over_a_part_of_a_tiers_contests_is_marked(tmp_path: Path) -> No
     elsewhere = next(each.name for each in list_scored_tasks() if each.tier == "1")
     rows = driven("lqr", MINE) + driven("model-following", STEERING)
     rows += [ResultRow("control", elsewhere, "score", 0.5, controller="lqr")]
-    assert find_partial_entries(rows, "tier 2a") == {"model-following"}
-    assert find_partial_entries(rows, "tier 1") == set()
+    assert _find_partial_entries(rows, "tier 2a") == {"model-following"}
+    assert _find_partial_entries(rows, "tier 1") == set()
     pytest.importorskip("matplotlib")
     for ending, head in (("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")):
         path = tmp_path / f"bench.{ending}"

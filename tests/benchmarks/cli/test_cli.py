@@ -121,10 +121,7 @@ def test_run_films_a_drive_with_another_beside(run: Run, tmp_path: Path) -> None
         (("run", "--option", "reverence=model"), "'reverence'; did you mean 'reference'?"),
         (("run", "--option", "reference"), "an option is NAME=VALUE, got 'reference'"),
         ((*LQR, "--agent-option", "grib=1"), "lqr: unknown option 'grib'; did you mean 'grip'"),
-        (
-            (*LQR, "--estimator-option", "q_bta=1"),
-            "unknown option 'q_bta'; did you mean 'q_beta'",
-        ),
+        ((*LQR, "--estimator-option", "q_bta=1"), "unknown option 'q_bta'; did you mean 'q_beta'"),
         (("run", "--estimator-option", "q_beta=1"), "--estimator-option needs --estimator"),
         (("run", "--plot", "drive.txt"), "drive.txt: expected a file that ends in .png or"),
         (("bench", "--html", "report.json"), "report.json: expected a file that ends in .html"),

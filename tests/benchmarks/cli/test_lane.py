@@ -44,17 +44,8 @@ def test_a_picture_is_read_drawn_and_written(run: Run, camera: Path, tmp_path: P
     picture = PAINTER.render_picture(RoadScene(psi=0.05, y=-0.4))
     cv2.imwrite(str(tmp_path / "road.png"), picture)
     out, numbers = tmp_path / "found.png", tmp_path / "found.json"
-    status, text, _ = run(
-        "lane",
-        tmp_path / "road.png",
-        "--intrinsics",
-        camera,
-        *WIDE,
-        "--out",
-        out,
-        "--json",
-        numbers,
-    )
+    arguments = ("--intrinsics", camera, *WIDE, "--out", out, "--json", numbers)
+    status, text, _ = run("lane", tmp_path / "road.png", *arguments)
     assert status == 0 and "offset -0.40 m" in text and "frames a second" in text
     (frame,) = json.loads(numbers.read_text())["frames"]
     assert frame["psi"] == pytest.approx(0.05, abs=2e-3) and frame["quality"] > 0.5

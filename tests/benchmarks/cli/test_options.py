@@ -57,8 +57,8 @@ def _of(command: str, function: str, *rows: Row) -> list[Case]:
 # fmt: off
 CASES = [
     *_of("run", "agents.rollout.rollout", ("--seed 3", "seed", 3)),
-    *_of("run", f"{CLI}.common.AgentSpec.build",
-         ("--control-period 20", "options.control_period", 20)),
+    *_of("run", f"{CLI}.main.make_driver",
+         ("--control-period 20", "setup.options.control_period", 20)),
     *_of("bench control", f"{CLI}.main.run_suites",
          ("--episodes 8", "request.episodes", 8),
          ("--salt ab12", "request.salt", "ab12"),
@@ -98,13 +98,13 @@ CASES = [
          ("--tyres fiala", "tyres", "fiala")),
     *_of("identify log.csv", "benchmarks.recorded.wires.write_vehicle",
          ("--out car.toml", "path", Path("car.toml"))),
-    *_of("live exact-kf --port 0", f"{CLI}.common.AgentSpec.build",
-         ("--vehicle coms", "options.vehicle", "coms"),
-         ("--control-period 20", "options.control_period", 20),
-         ("--option reference=model", "options.reference", "model"),
-         ("--agent-option grip=0.6", "self.agent_options", {"grip": 0.6}),
-         ("--estimator-option q_beta=1", "self.estimator_options", {"q_beta": 1}),
-         ("--trust", "self.trust", True)),
+    *_of("live exact-kf --port 0", f"{CLI}.live.make_driver",
+         ("--vehicle coms", "setup.options.vehicle", "coms"),
+         ("--control-period 20", "setup.options.control_period", 20),
+         ("--option reference=model", "setup.options.reference", "model"),
+         ("--agent-option grip=0.6", "setup.agent_options", {"grip": 0.6}),
+         ("--estimator-option q_beta=1", "setup.estimator_options", {"q_beta": 1}),
+         ("--trust", "trust", True)),
     *_of("live exact-kf --port 0", "agents.live.controller.OnboardController",
          ("--seed 5", "seed", 5)),
     *_of("live exact-kf --port 0", "agents.live.loop.Loop.run", ("--duration 9", "duration", 9.0)),
@@ -170,7 +170,7 @@ CASES = [
 NOTHING = SimpleNamespace(spec=None, search={}, car=None, wires=None, reason="")
 RETURNED: dict[str, dict[str, Any]] = {
     "run": {
-        f"{CLI}.common.AgentSpec.build": (NOTHING, None),
+        f"{CLI}.main.make_driver": (NOTHING, None),
         f"{CLI}.main.show_episode": None,
         "agents.rollout.rollout": None,
     },
@@ -185,7 +185,7 @@ RETURNED: dict[str, dict[str, Any]] = {
         f"{CLI}.data.print_suite": None,
     },
     "live": {
-        f"{CLI}.common.AgentSpec.build": (None, None),
+        f"{CLI}.live.make_driver": (None, None),
         f"{CLI}.live._watch_signals": [],
         "agents.live.controller.OnboardController": SimpleNamespace(
             base=SimpleNamespace(spec=SimpleNamespace(id=""))

@@ -12,8 +12,9 @@ from sideslip.agents.learned.policy import load_policy
 
 pytest.importorskip("stable_baselines3")
 from sideslip.agents.training import callbacks, trainer
-from sideslip.benchmarks.cli import policies as train_command
-from sideslip.benchmarks.cli.common import choose_folder, make_command, parse_options
+from sideslip.benchmarks.cli import train as train_command
+from sideslip.benchmarks.cli.options import parse_options
+from sideslip.benchmarks.cli.train import _choose_folder, _make_command
 from sideslip.benchmarks.studies import policies as enjoy
 from sideslip.benchmarks.studies.policies import list_tasks
 from tests.benchmarks.conftest import Run
@@ -131,7 +132,7 @@ def test_without_the_extra_the_command_names_it(
 def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
     told = {"outputs": ["beta", "F_d"], "options": {"fast": ["gyro", "accel_y"]}}
     task = trainer.TrainingTask(estimator="exact-kf", estimator_options=told)
-    words = make_command(task, 10)
+    words = _make_command(task, 10)
     found = [words[i + 1] for i, word in enumerate(words) if word == "--estimator-option"]
     assert parse_options(found) == told
     status, _, err = run("--estimator-option", found[0])
@@ -140,10 +141,10 @@ def test_the_command_of_a_card_says_what_the_filter_was(run: Run) -> None:
 
 def test_the_folder_is_named_by_what_is_trained() -> None:
     task = trainer.TrainingTask("sideslip/YawGps-v0", "ppo", "dakf", {"scenario": "gust"}, 7)
-    assert choose_folder(task, "", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-7")
-    assert choose_folder(task, "mine", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-mine-7")
-    assert choose_folder(task, "", Path("here"), None) == Path("here")
-    zoos = choose_folder(task, "", None, Path("logs"))
+    assert _choose_folder(task, "", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-7")
+    assert _choose_folder(task, "mine", None, None) == Path("train-YawGps-v0-ppo-dakf-gust-mine-7")
+    assert _choose_folder(task, "", Path("here"), None) == Path("here")
+    zoos = _choose_folder(task, "", None, Path("logs"))
     assert zoos == Path("logs/ppo/sideslip-YawGps-v0_1")
 
 

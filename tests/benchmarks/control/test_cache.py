@@ -128,9 +128,6 @@ def test_another_policy_in_the_same_file_is_another_case(tmp_path: Path) -> None
     names = []
     for weights in (b"one", b"another", b"one"):
         file.write_bytes(weights)
-        names.append(
-            drive._make_path(
-                Chunk(ControlEntry(ControlTask(scenario="gust"), "", str(file)), SEEDS)
-            ).name
-        )
+        chunk = Chunk(ControlEntry(ControlTask(scenario="gust"), "", str(file)), SEEDS)
+        names.append(drive._make_path(chunk).name)
     assert names[0] == names[2] != names[1]

@@ -43,10 +43,8 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         assert set(starts) == {NOMINAL, STATE}
         seeds.append(seed)
         cost = float(seed % 10)
-        costs = {"none": 20.0, "from none": cost}
-        return ClairvoyantResult(
-            np.zeros((1, 1), np.float32), cost, "from none", costs, {"none": "ok"}, 0.0
-        )
+        costs, actions = {"none": 20.0, "from none": cost}, np.zeros((1, 1), np.float32)
+        return ClairvoyantResult(actions, cost, "from none", costs, {"none": "ok"}, 0.0)
 
     monkeypatch.setattr(clairvoyant, "compute_clairvoyant", stand_in)
     monkeypatch.setattr(clairvoyant, "record_actions", lambda *_: np.zeros((1, 1)))
@@ -124,11 +122,8 @@ def test_where_the_plant_has_changed_the_file_is_stale(asked: list[int], tmp_pat
     (entry,) = calibrate([GUST], tmp_path / "cases", seeds=2, jobs=1)
     with pytest.raises(ValueError, match="file: gust, yaw is stale: the uncontrolled car costs"):
         check_current({GUST: entry}, "file")
-    none = (
-        measure([ControlEntry(GUST, "", "none")], derive_seeds(GUST, 2), jobs=1)
-        .select(GUST, "none")
-        .costs
-    )
+    found = measure([ControlEntry(GUST, "", "none")], derive_seeds(GUST, 2), jobs=1)
+    none = found.select(GUST, "none").costs
     episodes = tuple(
         dataclasses.replace(episode, costs={"none": cost})
         for episode, cost in zip(entry.episodes, none.tolist(), strict=True)

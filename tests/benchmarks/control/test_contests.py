@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sideslip.benchmarks.control import tasks as module
-from sideslip.benchmarks.control.baseline_gaps import make_oracle_entries, measure_task
+from sideslip.benchmarks.control.baseline_gaps import _make_oracle_entries, _measure_task
 from sideslip.benchmarks.control.entries import ControlEntry
 from sideslip.benchmarks.control.run import NUMBERS, DriveResult, Results, measure
 from sideslip.benchmarks.control.score import ScoreScale
@@ -45,15 +45,13 @@ def driven(costs: np.ndarray, failed: int = 0, error: str = "") -> DriveResult:
 def found(contest: ControlTask, levels: dict[str, float], **failed: int) -> TaskMeasurement:
     """What is made of nominal's and both oracles' costs on 40 seeds."""
     seeds = np.random.default_rng(0).lognormal(0.0, 1.0, 40) + 1.0
-    made = {
-        ControlEntry(contest, "", name): driven(
-            level * seeds, failed.get(name.replace("-", "_"), 0)
-        )
-        for name, level in levels.items()
-    }
-    for cell in make_oracle_entries(contest):
+    made = {}
+    for name, level in levels.items():
+        count = failed.get(name.replace("-", "_"), 0)
+        made[ControlEntry(contest, "", name)] = driven(level * seeds, count)
+    for cell in _make_oracle_entries(contest):
         made.setdefault(cell, driven(np.full(40, np.nan), error="no plant"))
-    return measure_task(Results(made), contest)
+    return _measure_task(Results(made), contest)
 
 
 def test_every_tier_asks_its_question_in_five_manoeuvres_or_more() -> None:

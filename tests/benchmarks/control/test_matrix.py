@@ -36,10 +36,8 @@ from sideslip.estimators import EstimateObservation
 SEEDS = (3, 4, 2**32 - 1)
 GUST, DWELL = (ControlTask(scenario=name) for name in ("gust", "sine-with-dwell"))
 PAIRS = (
-    ("", "none"),
-    ("multirate-residual-kf", "two-dof"),
-    ("exact-kf", "lqr"),
-    ("", "ppo-yaw-vision"),
+    *(("", "none"), ("multirate-residual-kf", "two-dof")),
+    *(("exact-kf", "lqr"), ("", "ppo-yaw-vision")),
 )
 
 
@@ -83,9 +81,8 @@ def test_every_contest_has_its_rungs_and_no_cell_stands_twice() -> None:
         mine = [cell for cell in all_ if cell.task == contest]
         assert {cell.controller for cell in mine} >= {*ORACLE_NAMES, "none", "lqr"}
         assert sum(cell.estimator == REFERENCE_FILTER for cell in mine) >= 4
-        assert {(cell.estimator, cell.controller) for cell in mine} >= {
-            *LEARNED.get(contest.kind, ())
-        }
+        pairs = {(cell.estimator, cell.controller) for cell in mine}
+        assert pairs >= {*LEARNED.get(contest.kind, ())}
     fast = list(make_entries(list_scored_tasks(), quick=True))
     assert set(fast) < set(all_) and not any(cell.slow and not cell.oracle for cell in fast)
 
@@ -167,12 +164,8 @@ def test_the_moment_rate_is_what_the_motors_delivered_and_the_step_what_was_aske
     """From limit to limit five times a second: ten times the limit, in N m/s, whatever the lag."""
     scenario = {"base": "straight", "duration": 4.0, "speed": 8.0}
     broken(monkeypatch, SquareWave())
-    driven = drive.run_chunk(
-        Chunk(
-            ControlEntry(ControlTask(scenario="straight"), "", "none", {"scenario": scenario}),
-            SEEDS,
-        )
-    )
+    task = ControlTask(scenario="straight")
+    driven = drive.run_chunk(Chunk(ControlEntry(task, "", "none", {"scenario": scenario}), SEEDS))
     limit = COMS.yaw_moment_limit
     assert driven["moment_rate"] == pytest.approx(np.full(3, 2.0 * limit / 0.2), rel=0.05)
     assert driven["largest_step"] == pytest.approx(np.full(3, 2.0 * limit))
@@ -240,11 +233,8 @@ def test_a_small_matrix_from_end_to_end(monkeypatch: pytest.MonkeyPatch) -> None
     few = [ControlTask(tier, YAW, "coms", "zero-slip", f"coms-{name}")
            for tier, name in (("", "step"), ("2a", "random"))]  # fmt: skip
     some = [ControlEntry(c, "", rung) for c in few for rung in (*ORACLE_NAMES, "none")]
-    some += [
-        ControlEntry(c, name, "lqr")
-        for c in few
-        for name in ("exact-kf", "bicycle-kf", "nobody-kf")
-    ]
+    filters = ("exact-kf", "bicycle-kf", "nobody-kf")
+    some += [ControlEntry(c, name, "lqr") for c in few for name in filters]
     monkeypatch.setattr(control, "list_scored_tasks", lambda: few)
     monkeypatch.setattr(control, "make_entries", lambda *_: some)
     monkeypatch.setattr(control, "TITLES", {"": "no tier", "2a": "a tier"})

@@ -26,7 +26,7 @@ from sideslip.benchmarks.control.tasks import (
 )
 from sideslip.benchmarks.studies import recovery_region
 from sideslip.benchmarks.studies.learned_outside import KINDS, make_outside_task
-from sideslip.benchmarks.suites import SALTED, SUITES, Request, run_suite
+from sideslip.benchmarks.suites import SALTED, SUITES, Request, _run_suite
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS
 from sideslip.estimators.learned.network import SUFFIX
 
@@ -48,10 +48,8 @@ def test_the_episodes_are_those_of_the_salt(salt: str, monkeypatch: pytest.Monke
 
 
 def test_another_salt_is_other_episodes() -> None:
-    one, other = (
-        measure([NONE], make_salted_seeds(salt, 3), jobs=1).select(GUST, "none")
-        for salt in (ONE, OTHER)
-    )
+    drawn = (make_salted_seeds(salt, 3) for salt in (ONE, OTHER))
+    one, other = (measure([NONE], seeds, jobs=1).select(GUST, "none") for seeds in drawn)
     assert not set(one.costs) & set(other.costs)
 
 
@@ -118,22 +116,18 @@ def test_a_suite_drives_the_salt_that_it_is_given(
     for salt in (ONE, OTHER, ""):
         with pytest.raises(StopIteration):
             if module is readme:
-                readme.measure_first(salt=salt)
-            run_suite(name, Request(quick=True, episodes=4, salt=salt))
-    assert found == [
-        make_salted_seeds(salt or make_salt(), 4, GUST.seed_text) for salt in (ONE, OTHER, "")
-    ]
+                readme._measure_first(salt=salt)
+            _run_suite(name, Request(quick=True, episodes=4, salt=salt))
+    salts = (ONE, OTHER, make_salt())
+    assert found == [make_salted_seeds(salt, 4, GUST.seed_text) for salt in salts]
 
 
 def test_the_salt_follows_every_file_of_the_contestants(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     contestants = (
-        "estimators/core/a.py",
-        "estimators/b.toml",
-        "agents/c/d.py",
-        f"agents/e{SUFFIX}",
-        f"estimators/learned/h{SUFFIX}",
+        *("estimators/core/a.py", "estimators/b.toml", "agents/c/d.py"),
+        *(f"agents/e{SUFFIX}", f"estimators/learned/h{SUFFIX}"),
     )
     others = ("envs/f.py", "benchmarks/g.py", "agents/notes.md")
     for name in contestants + others:

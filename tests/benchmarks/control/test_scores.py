@@ -38,10 +38,8 @@ def test_the_score_is_a_ratio_of_sums_over_contests() -> None:
     """A contest with little to win weighs little, whatever is done there."""
     wide = ScoreScale(driven([8.0] * 4), driven([1.0] * 4))
     narrow = ScoreScale(driven([1.08] * 4), driven([1.0] * 4))
-    pairs = [
-        wide.compute_paired_ratios(driven([1.0] * 4)),
-        narrow.compute_paired_ratios(driven([1.2] * 4)),
-    ]
+    drives = ((wide, 1.0), (narrow, 1.2))
+    pairs = [scale.compute_paired_ratios(driven([cost] * 4)) for scale, cost in drives]
     gaps = wide.gap, narrow.gap
     expected = (gaps[0] + math.log(1.081 / 1.201)) / sum(gaps)
     assert score(pairs).value == pytest.approx(expected)
@@ -80,10 +78,7 @@ def test_nothing_to_win_or_to_count_is_no_score() -> None:
     assert math.isnan(lost.gap)
     assert math.isnan(score([lost.compute_paired_ratios(driven([0.5] * 4))]).value)
     good = ScoreScale(driven([2.0] * 4), driven([0.5] * 4))
-    pairs = [
-        lost.compute_paired_ratios(driven([0.5] * 4)),
-        good.compute_paired_ratios(driven([0.5] * 4)),
-    ]
+    pairs = [scale.compute_paired_ratios(driven([0.5] * 4)) for scale in (lost, good)]
     assert score(pairs).value == pytest.approx(1.0)  # the rest goes on
     with pytest.raises(ValueError, match="oracle-state: no plant"):
         ScoreScale(driven([1.0]), driven([1.0], error="no plant"))

@@ -1,7 +1,7 @@
 """The user's row is the one that the matrix would give, on seeds that are whose they should be."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,8 @@ from sideslip.benchmarks.entrants.challenge import (
     UserEntry,
     make_user_entries,
 )
-from sideslip.benchmarks.entrants.score import compose_verdict, make_sentence, make_table
+from sideslip.benchmarks.entrants.score import _make_sentence, compose_verdict, make_table
+from tests.benchmarks.conftest import Run
 
 COST, FAILURE = NUMBERS.index("cost"), NUMBERS.index("failure")
 PD = """
@@ -42,7 +43,7 @@ class Pd:
     def __init__(self, env):
         pass
 """
-Run = Callable[..., tuple[int, str, str]]
+Driven = list[tuple[ControlEntry, tuple[int, ...]]]
 
 
 def wrapped(folder: Path, options: dict[str, Any]) -> str:
@@ -88,9 +89,9 @@ def test_a_wrapped_controller_has_the_shipped_ones_row(tmp_path: Path, run: Run)
 
 
 @pytest.fixture
-def driven(monkeypatch: pytest.MonkeyPatch) -> list[tuple[ControlEntry, tuple[int, ...]]]:
+def driven(monkeypatch: pytest.MonkeyPatch) -> Driven:
     """Every cell that is to be driven with its seeds; none is. Whom the user brings costs half."""
-    asked: list[tuple[ControlEntry, tuple[int, ...]]] = []
+    asked: Driven = []
 
     def stand_in(cells: Sequence[ControlEntry], seeds: Seeds, **_: Any) -> Results:
         mine = [(c, tuple(seeds(c.task) if callable(seeds) else seeds)) for c in cells]
@@ -108,9 +109,8 @@ def episodes(cell: ControlEntry, n: int) -> DriveResult:
     numbers[:, COST] = levels.get(cell.controller, 2.0) * (1.0 + 0.1 * np.arange(n) % 3)
     numbers[: n // 3, FAILURE] = cell.controller.endswith("e.py")
     if "broken" in cell.controller:
-        return DriveResult(
-            np.full_like(numbers, np.nan), np.nan, error="ValueError: no (pd.py, line 3)"
-        )
+        nothing = np.full_like(numbers, np.nan)
+        return DriveResult(nothing, np.nan, error="ValueError: no (pd.py, line 3)")
     return DriveResult(numbers, 0.0)
 
 
@@ -137,9 +137,7 @@ def salted(salt: str, n: int, cell: ControlEntry) -> tuple[int, ...]:
 
 
 def test_committed_baselines_serve_where_a_sample_costs_the_same(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    driven: list[tuple[ControlEntry, tuple[int, ...]]],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, driven: Driven
 ) -> None:
     on_file(tmp_path, monkeypatch)
     del driven[:]
@@ -155,10 +153,7 @@ def test_committed_baselines_serve_where_a_sample_costs_the_same(
 
 @pytest.mark.parametrize("why", ["costs", "episodes", "vehicle", "scenario", "seeds", "fresh"])
 def test_otherwise_they_drive_anew_on_everybodys_seeds(
-    why: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    driven: list[tuple[ControlEntry, tuple[int, ...]]],
+    why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, driven: Driven
 ) -> None:
     on_file(tmp_path, monkeypatch, change=1.01 if why == "costs" else 1.0)
     changes: dict[str, dict[str, Any]] = {
@@ -177,23 +172,18 @@ def test_otherwise_they_drive_anew_on_everybodys_seeds(
     contests = {cell.task for cell in everyone}
     assert len(set(everyone.values())) == (1 if why == "seeds" else len(contests))
     if why in ("costs", "episodes", "vehicle", "scenario"):
-        assert all(
-            seeds == salted(make_salt(), len(seeds), cell) for cell, seeds in everyone.items()
-        )
+        salt = make_salt()
+        assert all(seeds == salted(salt, len(seeds), cell) for cell, seeds in everyone.items())
     if why == "seeds":
         assert set(everyone.values()) == {(5, 6, 7)} and found.salt == ""
     if why == "vehicle":
-        masses = {
-            cell.env_options[car]["mass"] for cell in everyone for car in ("vehicle", "nominal")
-        }
-        assert masses == {900.0}
+        cars = [cell.env_options[car] for cell in everyone for car in ("vehicle", "nominal")]
+        assert {car["mass"] for car in cars} == {900.0}
     assert ("Publishable" in compose_verdict(found)[-1]) == (why == "fresh")
 
 
 def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    driven: list[tuple[ControlEntry, tuple[int, ...]]],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, driven: Driven
 ) -> None:
     """Other ones each time; with the bytes that the driver drew, others for another file."""
     rehearsed = frozenset({str((tmp_path / "pd.py").resolve())})
@@ -210,27 +200,26 @@ def test_fresh_seeds_are_nobodys_to_foresee_and_can_be_driven_again(
     salts = set()
     for text in (PD, PD + "# better\n"):
         (tmp_path / "pd.py").write_text(text)
-        salts.add(
-            score.compare(ComparisonRequest((UserEntry(f"{tmp_path}/pd.py"),), fresh=True)).salt
-        )
+        request = ComparisonRequest((UserEntry(f"{tmp_path}/pd.py"),), fresh=True)
+        salts.add(score.compare(request).salt)
     assert len(salts) == 2
 
 
 def test_the_verdict_has_a_sentence_for_each_and_five_lines_at_most(
-    tmp_path: Path, driven: list[tuple[ControlEntry, tuple[int, ...]]]
+    tmp_path: Path, driven: Driven
 ) -> None:
     pairs = [UserEntry(f"{tmp_path}/{name}.py") for name in ("a", "broken", "c", "d", "e")]
     for pair in pairs:
-        Path(pair.agent).write_text(PD)
+        Path(str(pair.agent)).write_text(PD)
     found = score.compare(ComparisonRequest(tuple(pairs), seeds=(1, 2, 3)))
     lines = compose_verdict(found)
     assert len(lines) == 5 and "2 more stand in the table" in lines[3]
     mine = found.select(pairs[0])
-    assert lines[0] == f"Place 3 of 9: {make_sentence(mine)}."
+    assert lines[0] == f"Place 3 of 9: {_make_sentence(mine)}."
     assert "50 % [50, 50] of nominal's cost (tier 1: 50, tier 2a: 50, tier 2b: 50" in lines[0]
     assert "closes 50 % [50, 50] of the gap" in lines[0] and "fails in 0.0 %" in lines[0]
-    assert "fails in 33.3 % (nominal 0.0 %)" in make_sentence(found.select(pairs[4]))
-    broken = make_sentence(found.select(pairs[1]))
+    assert "fails in 33.3 % (nominal 0.0 %)" in _make_sentence(found.select(pairs[4]))
+    broken = _make_sentence(found.select(pairs[1]))
     assert "not driven: " in broken and broken.endswith("ValueError: no (pd.py, line 3)")
     cells = make_table(found).cells
     assert sum(line[0].startswith("> ") for line in cells) == 5

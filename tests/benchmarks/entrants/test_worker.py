@@ -9,8 +9,9 @@ import pytest
 from sideslip.benchmarks.control.entries import ControlEntry
 from sideslip.benchmarks.control.run import Chunk
 from sideslip.benchmarks.control.tasks import ControlTask
-from sideslip.benchmarks.entrants.worker import find_place, run_isolated_chunk, run_user_chunk
+from sideslip.benchmarks.entrants.worker import _find_place, run_isolated_chunk, run_user_chunk
 
+GUST = ControlTask(scenario="gust")
 SHORT = {"scenario": {"base": "gust", "duration": 0.05}}
 HEAD = """
 import os
@@ -29,18 +30,13 @@ class Mine:
 
 def chunk(folder: Path, body: str, estimator: str = "") -> Chunk:
     (folder / "mine.py").write_text(f"{HEAD}        {body}\n")
-    cell = ControlEntry(
-        ControlTask(scenario="gust"), estimator, str(folder / "mine.py"), dict(SHORT)
-    )
+    cell = ControlEntry(GUST, estimator, str(folder / "mine.py"), dict(SHORT))
     return Chunk(cell, (0, 1, 2), keep=True)
 
 
 WRONG = {
     "raises": ("return action / self.forgotten, state", r"no attribute 'forgotten' .mine.py, line"),
-    "one action for all": (
-        "return action[0], state",
-        r"returns actions \(3, 1\).* got shape \(1,\)",
-    ),
+    "one action for all": ("return action[0], state", r"actions \(3, 1\).* got shape \(1,\)"),
     "too wide": ("return np.hstack([action] * 2), state", r"got shape \(3, 2\)"),
     "ragged": ("return [[0.0], [0.0, 1.0], [0.0]], state", "inhomogeneous"),
     "no state": ("return action", r"predict returns \(action, state\), got"),
@@ -82,8 +78,8 @@ def test_what_it_does_to_its_process_is_its_result(
 
 def test_a_hang_is_found_in_the_users_file() -> None:
     stack = 'File "/lib/time.py", line 9 in sleep\n  File "/home/mine.py", line 12'
-    assert find_place(("/home/mine.py:Mine", ""), stack) == ", still in mine.py, line 12"
-    assert find_place(("pd", ""), stack) == ""
+    assert _find_place(("/home/mine.py:Mine", ""), stack) == ", still in mine.py, line 12"
+    assert _find_place(("pd", ""), stack) == ""
 
 
 FILTER = """
@@ -110,9 +106,7 @@ class Integrator:
 
 def test_a_filter_in_a_child_gives_the_bits_of_one_in_this_process(tmp_path: Path) -> None:
     (tmp_path / "filter.py").write_text(FILTER)
-    cell = ControlEntry(
-        ControlTask(scenario="gust"), str(tmp_path / "filter.py"), "lqr", dict(SHORT)
-    )
+    cell = ControlEntry(GUST, str(tmp_path / "filter.py"), "lqr", dict(SHORT))
     apart, here = (drive(Chunk(cell, (0, 1, 2))) for drive in (run_isolated_chunk, run_user_chunk))
     assert not apart.error
     assert np.array_equal(apart.numbers, here.numbers)

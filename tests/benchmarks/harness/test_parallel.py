@@ -43,20 +43,22 @@ def counted(folder: Path, what: str) -> Counter[str]:
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_results_come_in_the_order_of_the_cases(tmp_path: Path, jobs: int) -> None:
-    assert run_cases(partial(noted, str(tmp_path), 0.0), CASES, jobs=jobs) == [
-        case / 3.0 for case in CASES
-    ]
+    found = run_cases(partial(noted, str(tmp_path), 0.0), CASES, jobs=jobs)
+    assert found == [case / 3.0 for case in CASES]
     assert set(counted(tmp_path, "done").values()) == {1}
     assert run_cases(abs, [], jobs=jobs) == []
 
 
-def test_an_engine_that_is_none_is_refused() -> None:
-    with pytest.raises(ValueError, match="unknown engine 'rai'"), use_engine("rai"):
-        pass
-    with (
-        pytest.raises(ValueError, match="an address is of a Ray cluster"),
-        use_engine(address="x:1"),
-    ):
+@pytest.mark.parametrize(
+    ("engine", "message"),
+    [
+        (("rai",), "unknown engine 'rai'"),
+        (("processes", "x:1"), "an address is of a Ray cluster"),
+        (("ray", "127.0.0.1:1"), r"no Ray cluster at 127\.0\.0\.1:1"),
+    ],
+)
+def test_an_engine_that_is_none_is_refused(engine: tuple[str, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message), use_engine(*engine):
         pass
 
 
@@ -174,14 +176,6 @@ def test_a_suite_has_the_same_rows_on_a_cluster(cluster: Any) -> None:
     timed = "us_per_tick"
     rows = [[repr(row) for row in each.rows if row.metric != timed] for each in (alone, there)]
     assert rows[0] == rows[1]  # as text: NaN is no NaN
-
-
-def test_a_cluster_that_is_not_there_is_named() -> None:
-    with (
-        pytest.raises(ValueError, match=r"no Ray cluster at 127\.0\.0\.1:1"),
-        use_engine("ray", "127.0.0.1:1"),
-    ):
-        pass
 
 
 def test_a_run_has_one_progress_bar() -> None:

@@ -52,10 +52,8 @@ def test_an_interval_that_reaches_one_is_a_tie() -> None:
 def errors(levels: dict[str, float], experiment: estimation.Experiment) -> Any:
     """Squared errors of 50 seeds, of those not named 16."""
     common = RNG.lognormal(0.0, 0.3, 50)
-    columns = [
-        levels.get(each.label, 16.0) * common * RNG.lognormal(0.0, 0.05, 50)
-        for each in experiment.filters
-    ]
+    means = [levels.get(each.label, 16.0) for each in experiment.filters]
+    columns = [mean * common * RNG.lognormal(0.0, 0.05, 50) for mean in means]
     return np.array(columns).T, 1.0 * common
 
 
@@ -86,9 +84,8 @@ def test_recovery_names_who_saves_most_and_what_the_oracles_do() -> None:
     assert first == "a car: esc 70 %; lqr 50 %, none 20 %."
     assert second.startswith("another: esc and lqr 70 %; two-dof 30 %")
     assert "saves 90 % and 90 %, foresight too 95 % and 95 %" in why
-    assert (
-        len(fits(recovery_region.compose_verdict({"a car": {"none": shares(0.1)}}))) == 2
-    )  # nothing driven
+    undriven = {"a car": {"none": shares(0.1)}}
+    assert len(fits(recovery_region.compose_verdict(undriven))) == 2
 
 
 def test_following_takes_the_bandwidth_that_errs_least_and_never_fails() -> None:
@@ -142,9 +139,8 @@ def test_procedures_name_who_passes_and_who_is_fastest(monkeypatch: pytest.Monke
 
 def test_a_replay_without_truth_has_no_winner() -> None:
     traces = {"bicycle-kf": np.zeros(3), "exact-kf": np.zeros(3)}
-    assert fits(recorded.compose_verdict(Replayed(traces=traces), False))[0].startswith(
-        "Nobody wins"
-    )
+    first, *_ = fits(recorded.compose_verdict(Replayed(traces=traces), False))
+    assert first.startswith("Nobody wins")
     squares = {"bicycle-kf": np.full(3, 4e-4), "exact-kf": np.array([0.9, 1.0, 1.1]) * 1e-4}
     lines = fits(recorded.compose_verdict(Replayed(squares=squares, traces=traces), True))
     assert "exact-kf strays least, 50 % [47, 52] as much as bicycle-kf" in lines[1]

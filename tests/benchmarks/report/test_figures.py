@@ -10,7 +10,7 @@ from sideslip.agents import AGENTS, baselines
 from sideslip.benchmarks.control.entries import LEARNED
 from sideslip.benchmarks.control.entries import ORACLE_NAMES as MATRIX_RUNGS
 from sideslip.benchmarks.harness.stats import Estimate
-from sideslip.benchmarks.report.figures import choose_line_styles
+from sideslip.benchmarks.report import figures
 from sideslip.envs.rendering.palette import (
     COLOURS,
     CONTROLLERS,
@@ -28,12 +28,10 @@ def test_colours_stay_with_their_names() -> None:
     assert find_colour("exact-kf, true model") == COLOURS["exact-kf"]
     assert find_colour("somebody-else") == find_colour("somebody-else")
     names = [*COLOURS, "somebody-else", "two-dof (1 ms)", "two-dof (33 ms)"]
-    styles = choose_line_styles(names)
+    styles = figures._choose_line_styles(names)
     assert len(set(styles.values())) == len(names)
-    assert choose_line_styles(["multirate-kf"])["multirate-kf"] == (
-        COLOURS["multirate-kf"],
-        "solid",
-    )
+    style = figures._choose_line_styles(["multirate-kf"])["multirate-kf"]
+    assert style == (COLOURS["multirate-kf"], "solid")
 
 
 def test_every_filter_controller_and_rung_has_a_colour_of_its_own() -> None:
@@ -82,7 +80,6 @@ def oklab(rgb: np.ndarray) -> np.ndarray:
 
 
 def test_groups_stand_below_each_other_with_their_intervals() -> None:
-    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     numbers = {"dakf": Estimate(2.0, 1.5, 3.0), "exact-kf, gps": Estimate(4.0, 3.0, 5.0)}
     figure = figures.draw_groups({"A": numbers, "B": numbers}, "ratio", {1.0: "one"})
     assert [trace.y[0] for trace in figure.data] == [1, 2, 4, 5]
@@ -103,8 +100,7 @@ def test_without_plotly_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatc
 
 
 def test_time_series_keep_every_peak_and_gap() -> None:
-    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
-    t = np.arange(100_001) * 1e-3
+    t: np.ndarray = np.arange(100_001) * 1e-3
     y = np.sin(t)
     y[54_321], y[77_777] = 5.0, -4.0
     y[20_000:30_000] = np.nan
@@ -123,8 +119,7 @@ def test_time_series_keep_every_peak_and_gap() -> None:
 
 
 def test_small_ranges_far_from_zero_keep_their_shape() -> None:
-    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
-    t = 1.6e9 + np.arange(1000) * 0.01
+    t: np.ndarray = 1.6e9 + np.arange(1000) * 0.01
     nothing = np.full(t.size, np.nan)
     series = {"dakf": np.sin(t), "lost": nothing}
     line, _ = figures.draw_time_series(t, series, "angle / rad").data
@@ -133,7 +128,6 @@ def test_small_ranges_far_from_zero_keep_their_shape() -> None:
 
 
 def test_figures_refuse_unequal_lengths() -> None:
-    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     with pytest.raises(ValueError, match="'dakf' has shape"):
         figures.draw_time_series(np.arange(3.0), {"dakf": np.arange(2.0)}, "angle / rad")
     with pytest.raises(ValueError, match="track 'truth'"):
@@ -143,7 +137,6 @@ def test_figures_refuse_unequal_lengths() -> None:
 
 
 def test_curves_stand_on_logarithmic_axes() -> None:
-    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     x, y = np.array([1.0, 1024.0, 65536.0]), np.array([8.0, 1.0, 1.0])
     figure = figures.draw_curves(x, {"gym.make": y}, "environments", "CPU time / us", "xy")
     (line,) = figure.data
@@ -151,16 +144,14 @@ def test_curves_stand_on_logarithmic_axes() -> None:
     assert line.mode == "lines+markers"
     assert figure.layout.xaxis.type == figure.layout.yaxis.type == "log"
     assert figure.layout.yaxis.title.text == "CPU time / us"
-    whiskers = (
-        figures.draw_curves(x, {"gym.make": (y, y - 1.0, y + 2.0)}, "n", "us").data[0].error_y
-    )
+    figure = figures.draw_curves(x, {"gym.make": (y, y - 1.0, y + 2.0)}, "n", "us")
+    whiskers = figure.data[0].error_y
     assert list(whiskers.array) == [2.0] * 3 and list(whiskers.arrayminus) == [1.0] * 3
     with pytest.raises(ValueError, match="has 3 values, x 2"):
         figures.draw_curves(x[:2], {"gym.make": y}, "environments", "CPU time / us")
 
 
 def test_tracks_have_equal_axes() -> None:
-    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
     figure = figures.draw_track({"truth": (np.arange(5000.0), np.arange(5000.0))})
     assert figure.layout.yaxis.scaleanchor == "x"
     assert len(figure.data[0].x) == figures.POINTS
@@ -168,10 +159,8 @@ def test_tracks_have_equal_axes() -> None:
 
 
 def test_whiskers_are_the_interval() -> None:
-    figures = pytest.importorskip("sideslip.benchmarks.report.figures")
-    (bar,) = figures.draw_bars(
-        ["a", "b", "c"], [2.0, 3.0, 4.0], [1.5, np.nan, 4.0], [3.0, np.nan, 4.0], "m"
-    ).data
+    numbers = [2.0, 3.0, 4.0], [1.5, np.nan, 4.0], [3.0, np.nan, 4.0]
+    (bar,) = figures.draw_bars(["a", "b", "c"], *numbers, "m").data
     np.testing.assert_array_equal(bar.error_x.array, [1.0, np.nan, np.nan])
     np.testing.assert_array_equal(bar.error_x.arrayminus, [0.5, np.nan, np.nan])
     assert list(bar.customdata) == ["2 [1.5, 3]", "3", "4"]

@@ -16,8 +16,8 @@ from rich.console import Console
 from sideslip.agents import make_agent
 from sideslip.benchmarks.report.film import (
     FilmDriver,
+    _render_frames,
     check_film,
-    render_frames,
     write_drive_film,
     write_film,
 )
@@ -46,8 +46,8 @@ def test_a_film_lasts_as_long_as_the_drive(tmp_path: Path) -> None:
 
 def test_a_ghost_is_the_drive_that_it_would_be_alone() -> None:
     alone, beside = driver(), driver()
-    list(render_frames([alone], 3, 10))
-    frames = list(render_frames([driver("feedforward"), beside], 3, 10))
+    list(_render_frames([alone], 3, 10))
+    frames = list(_render_frames([driver("feedforward"), beside], 3, 10))
     assert bytes(alone.env.unwrapped._state) == bytes(beside.env.unwrapped._state)
     grey = [int(GREY[i : i + 2], 16) for i in (1, 3, 5)]
     assert (frames[-1][262:] == grey).all(2).sum() > 30  # its lines and its name
@@ -55,7 +55,7 @@ def test_a_ghost_is_the_drive_that_it_would_be_alone() -> None:
 
 def test_nothing_is_half_written(tmp_path: Path) -> None:
     class Broken:
-        def predict(self, obs: Any, state: Any = None, *_: Any, **__: Any) -> Any:
+        def predict(self, observation: Any, state: Any = None, *_: Any, **__: Any) -> Any:
             if state == 9:
                 raise RuntimeError("broken")
             return np.zeros(1, np.float32), (state or 0) + 1

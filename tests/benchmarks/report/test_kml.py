@@ -26,11 +26,7 @@ def test_document_holds_every_track_and_hostile_names() -> None:
 
 @pytest.mark.parametrize(
     "tracks",
-    [
-        {},
-        {"short": (np.zeros(3), np.zeros(2))},
-        {"lost": (np.array([0.0, np.nan]), np.zeros(2))},
-    ],
+    [{}, {"short": (np.zeros(3), np.zeros(2))}, {"lost": (np.array([0.0, np.nan]), np.zeros(2))}],
     ids=["none", "unequal", "nan"],
 )
 def test_bad_tracks_are_refused(tracks: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:

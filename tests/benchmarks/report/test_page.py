@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from sideslip.benchmarks.harness.results import ResultTable, Suite
-from sideslip.benchmarks.report.html import check_page, format_page_table, write_page
+from sideslip.benchmarks.report.html import _format_page_table, check_page, write_page
 
 PAGE = """# Words before
 
@@ -31,13 +31,13 @@ def suite(name: str = "one") -> Suite:
 
 def test_a_table_is_markdown() -> None:
     text = "## First\n\n| who | cost |\n|---|---|\n| a\\|b | 1 [0, 2] |\n| c | - |\n\nOf two.\n"
-    assert format_page_table(suite().tables[0]) == text
+    assert _format_page_table(suite().tables[0]) == text
 
 
 def test_a_long_note_is_wrapped_between_words() -> None:
     words = ["a-long-name-" * 3, "no", "camera", "from", "2", "to", "7", "s;"] * 6
     table = ResultTable("First", ("who",), [["c"]], " ".join(words))
-    lines = format_page_table(table).splitlines()[5:]
+    lines = _format_page_table(table).splitlines()[5:]
     assert len(lines) > 2 and max(map(len, lines)) <= 120 and " ".join(lines).split() == words
 
 
@@ -46,7 +46,7 @@ def test_only_what_stands_between_the_marks_changes(tmp_path: Path) -> None:
     page.write_text(PAGE)
     check_page(page, ["one", "absent"])
     write_page(page, [suite(), suite("absent")])
-    made = format_page_table(suite().tables[0])
+    made = _format_page_table(suite().tables[0])
     assert page.read_text() == PAGE.replace("old\n", f"\n{made}\n")
     once = page.read_text()
     write_page(page, [suite()])

@@ -16,7 +16,7 @@ import pytest
 
 from sideslip.benchmarks.harness.results import ResultTable, Suite
 from sideslip.benchmarks.report import html as report
-from sideslip.benchmarks.report.html import inline, parse_number, write_report
+from sideslip.benchmarks.report.html import _parse_number, inline, write_report
 
 from .demo import COMMAND, HOSTILE, VERSIONS, answered, control, estimation, matrix
 
@@ -188,7 +188,7 @@ def test_every_cell_is_there_thinned(tmp_path: Path) -> None:
     ],
 )
 def test_number_of_a_cell(cell: str, expected: float | None) -> None:
-    assert parse_number(cell) == expected
+    assert _parse_number(cell) == expected
 
 
 def test_columns_of_numbers_are_marked_for_sorting(tmp_path: Path) -> None:
@@ -220,7 +220,7 @@ def test_failure_leaves_the_old_report(
         raise OSError("No space left on device")
 
     if failing == "drawing":
-        monkeypatch.setattr(report, "encode_figure", fail)
+        monkeypatch.setattr(report, "_encode_figure", fail)
     else:
         monkeypatch.setattr(os, "fsync", fail)
     with pytest.raises(OSError, match="No space left"):

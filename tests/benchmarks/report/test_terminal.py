@@ -15,14 +15,17 @@ HEADER = ("controller and estimator", *(f"column {i} / %" for i in range(12)))
 ROWS = [[f"contestant {k} on a filter", *(f"{100 * k + i}.5" for i in range(12))] for k in (1, 2)]
 
 
+def printed(suite: Suite, width: int = 80) -> str:
+    written = io.StringIO()
+    print_suite(Console(file=written, width=width), suite)
+    return written.getvalue()
+
+
 @pytest.mark.parametrize("width", [80, 100, 120, 400])
 def test_nothing_of_a_wide_table_is_cut(width: int) -> None:
     """It is printed in parts, each with the names."""
-    suite = Suite("wide", "A wide table", "")
-    suite.tables.append(ResultTable("Numbers", HEADER, ROWS))
-    written = io.StringIO()
-    print_suite(Console(file=written, width=width), suite)
-    text = written.getvalue()
+    tables = [ResultTable("Numbers", HEADER, ROWS)]
+    text = printed(Suite("wide", "A wide table", "", tables=tables), width)
     assert max(map(len, text.splitlines())) <= width
     parts = text.count("contestant 1 on a filter")
     assert parts == text.count("contestant 2 on a filter") == 1 + text.count("(continued)")
@@ -32,22 +35,16 @@ def test_nothing_of_a_wide_table_is_cut(width: int) -> None:
 
 
 def test_long_texts_wrap_and_are_no_part_of_their_own() -> None:
-    suite = Suite("wordy", "Words", "")
-    suite.tables.append(ResultTable("Errors", ("tier", "what"), [["1", "its error grows " * 9]]))
-    written = io.StringIO()
-    print_suite(Console(file=written, width=80), suite)
-    assert "(continued)" not in written.getvalue()
-    assert written.getvalue().count("grows") == 9
+    tables = [ResultTable("Errors", ("tier", "what"), [["1", "its error grows " * 9]])]
+    text = printed(Suite("wordy", "Words", "", tables=tables))
+    assert "(continued)" not in text and text.count("grows") == 9
 
 
 def test_details_are_in_the_report_alone() -> None:
-    suite = Suite("long", "Details", "")
-    suite.tables += [ResultTable("Main", ("who", "cost"), [["a", "1"]])]
-    suite.tables += [ResultTable("Contests", ("who", "cost"), [["b", "2"]], detail=True)]
-    written = io.StringIO()
-    print_suite(Console(file=written, width=80), suite)
-    assert "Main" in written.getvalue() and "Contests" not in written.getvalue()
-    assert "1 table more is in the report" in written.getvalue()
+    tables = [ResultTable("Main", ("who", "cost"), [["a", "1"]])]
+    tables += [ResultTable("Contests", ("who", "cost"), [["b", "2"]], detail=True)]
+    text = printed(Suite("long", "Details", "", tables=tables))
+    assert "Main" in text and "Contests" not in text and "1 table more is in the report" in text
 
 
 LONG = "Fig. 9 (twin): multirate-residual-kf/constant-delay-kf"
@@ -100,8 +97,6 @@ def test_a_run_fits_on_a_screen_and_says_where_the_rest_is(count: int) -> None:
     lines = written.getvalue().splitlines()
     assert len(lines) <= 60 and max(map(len, lines)) <= 80
     assert written.getvalue().count("And so.") == 9 * count
-    assert (
-        lines[-1]
-        == f"All {3 * count} tables, with notes and figures, are in a report: --html FILE."
-    )
+    rest = "tables, with notes and figures, are in a report: --html FILE."
+    assert lines[-1] == f"All {3 * count} {rest}"
     assert ("filter-0" in written.getvalue()) == (count <= 2)

@@ -1,0 +1,137 @@
+"""Commands as records of options: the fields make typer's signature, `run` does the work."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import MISSING, dataclass, field, fields
+from functools import partial
+from inspect import Parameter, Signature
+from pathlib import Path
+from typing import Any, TypeVar
+
+import typer
+
+from ..harness.parallel import PROCESSES
+from .names import complete
+
+Text = str | None
+Texts = list[str] | None
+File = Path | None
+Kind = TypeVar("Kind", bound=type)
+
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+def take(
+    help: str,
+    default: Any = None,
+    *names: str,
+    declare: Callable[..., Any] = typer.Option,
+    **more: Any,
+) -> Any:
+    """Make the field of an option.
+
+    Args:
+        help: Text on it.
+        default: Default value, `...` for a required one.
+        names: Names instead of the field's, such as "--jobs" and "-j".
+        declare: Typer's function that declares it.
+        more: Other arguments of that function.
+
+    Returns:
+        Field of a dataclass.
+    """
+    declared = {"typer": declare(default, *names, help=help, **more)}
+    return field(default=MISSING if default is ... else default, metadata=declared)
+
+
+take_argument = partial(take, declare=typer.Argument)
+_SHARED: dict[str, Callable[[], Any]] = {
+    "address": partial(take, "HOST:PORT of the cluster; default: this machine's.", ""),
+    "control_period": partial(take, "Ticks of 1 ms.", 10),
+    "engine_name": partial(
+        take, "What runs the cases: processes, or ray, a cluster.", PROCESSES, "--engine"
+    ),
+    "html": partial(take, "Write a self-contained report."),
+    "jobs": partial(take, "Processes.", None, "--jobs", "-j", min=1),
+    "json": partial(take, "Write the rows as JSON."),
+    "mapping": partial(
+        take, "NAME_UNIT=COLUMN of the log (yaw_rate_degps=r); repeatable.", None, "--map"
+    ),
+    "parquet": partial(take, "Write the rows as Parquet."),
+    "seed": partial(take, "Seed of the sampler; another on each machine of a study.", 0),
+    "steering_offset": partial(take, "deg at the wheels, added to the steering."),
+    "steering_ratio": partial(take, "Of the logged steering to the wheels' angle (15.2)."),
+    "steering_sign": partial(take, "1 or -1, of the logged steering."),
+    "storage": partial(take, "RDB URL or SQLite file; default: sideslip-tune.db here."),
+    "trust": partial(
+        take, "Read policies' zips, which may run code of their makers.", False, "--trust"
+    ),
+    "vehicle": partial(
+        take, "The car: a name or a TOML or JSON file.", autocompletion=complete("vehicles")
+    ),
+}  # of commands whose field of that name has no value
+
+
+def register(name: str, line: str | None = None, to: typer.Typer = app) -> Callable[[Kind], Kind]:
+    """Make a command of a class with `run`: its help is the docstring, its options the fields.
+
+    Args:
+        name: Name of the command.
+        line: Text on it in the list of commands.
+        to: Application that it belongs to.
+
+    Returns:
+        Decorator of the class.
+    """
+
+    def register_class(kind: Kind) -> Kind:
+        for shared in kind.__annotations__.keys() - vars(kind).keys():
+            setattr(kind, shared, _SHARED[shared]())
+        record: Any = dataclass(frozen=True)(kind)
+
+        def call(**values: Any) -> None:
+            record(**values).run()
+
+        call.__doc__ = kind.__doc__
+        vars(call)["__signature__"] = Signature([
+            Parameter(x.name, Parameter.KEYWORD_ONLY, default=x.metadata["typer"],
+                      annotation=x.type)
+            for x in fields(record)
+        ])  # fmt: skip
+        to.command(name, short_help=line)(call)
+        return kind
+
+    return register_class
+
+
+def parse_option(text: str) -> tuple[str, Any]:
+    """Parse an option to its name and value.
+
+    Args:
+        text: NAME=VALUE; the value is JSON or a word.
+
+    Returns:
+        Name and value.
+
+    Raises:
+        ValueError: The text has another form.
+    """
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise ValueError(f"an option is NAME=VALUE, got {text!r}")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value
+
+
+def parse_options(texts: Sequence[str] | None) -> dict[str, Any]:
+    """Parse options, as `parse_option` does.
+
+    Args:
+        texts: NAME=VALUE each, None for none.
+
+    Returns:
+        Values by name.
+    """
+    return dict(map(parse_option, texts or ()))
