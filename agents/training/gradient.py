@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...envs.device.torch_env import DeviceVectorEnv
+from ...envs.device import make_device_env
 from .config import TrainingTask
 from .normalise import Standardised
 from .warm_start import RewardScale
@@ -48,7 +48,7 @@ def make_source(
     """
     options = dict[str, Any](device=device, dtype="float32", grad=True, compile=compile)
     options |= {"autoreset_mode": "SameStep", **task.options(task.num_envs)}
-    cars = DeviceVectorEnv.make(task.env_id, task.num_envs, **options)
+    cars = make_device_env(task.env_id, task.num_envs, **options)
     return TrainingSource(cars, [first + i for i in range(task.num_envs)], reward_scale)
 
 
