@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from ...envs.device.torch_env import DeviceVectorEnv
+from ...envs.device import make_device_env
 from .config import TrainingTask
 from .normalise import RewardScale, Standardised
 from .student import make_dense_layers
@@ -55,7 +55,7 @@ def make_source(
     """
     options = dict[str, Any](device=device, dtype="float32", grad=True, compile=compile)
     options |= {"autoreset_mode": "SameStep", **task.options(task.num_envs)}
-    cars = DeviceVectorEnv.make(task.env_id, task.num_envs, **options)
+    cars = make_device_env(task.env_id, task.num_envs, **options)
     return TrainingSource(cars, [first + i for i in range(task.num_envs)], reward_scale)
 
 

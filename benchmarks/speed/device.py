@@ -15,7 +15,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 from rich.console import Console
 
-from ...envs.device.torch_env import DeviceVectorEnv
+from ...envs.device import make_device_env
 from ...envs.engine.layout import PARAMS_WIDTH
 from ...envs.numerics.torch_backend import torch
 from ..harness.parallel import report_user_errors
@@ -117,7 +117,7 @@ def main(
     engine = engine or ("cuda" if device.startswith("cuda") else "torch")
     options: dict[str, Any] = {"engine": engine} | ({"compile": True} if compiled else {})
     for kind, size in itertools.product(dtype or ("float32", "float64"), count or _COUNTS):
-        batch = DeviceVectorEnv.make(
+        batch = make_device_env(
             env, size, device=device, dtype=kind, on_bad_action="fail", **options
         )
         copied = copied or _measure_bandwidth(batch.device)

@@ -25,6 +25,7 @@ from ..engine.tick import StepVariant
 from ..engine.window import make_window, precompute_window
 from ..engine.workspace import EpisodeArrays, EpisodeStart
 from ..numerics.jit import copy_into
+from ..numerics.primitives import Matrix, Vector
 from ..record import FAST_WIDTH, PACKET_WIDTH, Array
 from ..scenarios.draws import DRAWS_WIDTH
 from ..task import REPORT
@@ -36,7 +37,7 @@ _MASK = 0xFFFFFFFF
 _M0, _M1, _M2, _M3 = 0x9FCCF645, 0x4385DF64, 0x1FC65DA4, 0x2360ED05
 
 
-def draw_key(words: Any) -> Any:
+def _draw_key(words: Vector) -> tuple[int, int]:
     """Draw the generator's next 64 bits as (low, high) of 32; its words (WORDS,) advance."""
     a, b, c, d = int(words[0]), int(words[1]), int(words[2]), int(words[3])
     aa, ab, ba = a * _M0, a * _M1, b * _M0
@@ -63,7 +64,14 @@ def _extract_high(product: int) -> int:
 
 
 def read_words(generators: Sequence[np.random.Generator]) -> npt.NDArray[np.int64]:
-    """Read the words (WORDS, N) of generators."""
+    """Read the words of generators.
+
+    Args:
+        generators: N generators of NumPy's PCG64.
+
+    Returns:
+        Words, shape (WORDS, N).
+    """
     words = np.empty((WORDS, len(generators)), np.int64)
     for i, generator in enumerate(generators):
         state: Any = generator.bit_generator.state["state"]
@@ -96,7 +104,16 @@ class KernelConstants(NamedTuple):
 
 
 def make_constants(config: EnvConfig, mode: str, record: bool) -> KernelConstants:
-    """Make the kernel's constants from an env's config, autoreset mode and whether it records."""
+    """Make the kernel's constants.
+
+    Args:
+        config: Config of the environment.
+        mode: Autoreset mode, of `MODES`.
+        record: Whether records are written.
+
+    Returns:
+        The constants.
+    """
     base = config.base
     return KernelConstants(
         mode=MODES.index(mode), n=int(config.control_period), kind=get_start_variant(base.start),
@@ -109,38 +126,52 @@ def make_constants(config: EnvConfig, mode: str, record: bool) -> KernelConstant
 class DeviceArrays(NamedTuple):
     """Arrays on the device, of N rows; `make_specification` has types and shapes."""
 
-    params: Any
-    states: Any
-    reports: Any
-    over: Any  # RUNS, _OVER or ASKED
-    generators: Any  # as `draw_key` reads them
-    which: Any  # index in starts of a row that is asked for
-    starts: Any  # packed one behind the other: parameters, low, high, motion; the first: no options
-    switches: Any  # of the starts
-    bounds: Any
-    actions: Any
-    obs: Any
-    rewards: Any
-    terminated: Any
-    truncated: Any
-    final_obs: Any  # of rows that end and are reset in the same step
-    final_reports: Any
-    rows: Any  # of the record
-    packets: Any
-    counts: Any  # of ticks and of packets
+    params: Matrix
+    states: Matrix
+    reports: Matrix
+    over: Vector  # RUNS, _OVER or ASKED
+    generators: Matrix  # as `_draw_key` reads them
+    which: Vector  # index in starts of a row that is asked for
+    starts: (
+        Matrix  # packed one behind the other: parameters, low, high, motion; the first: no options
+    )
+    switches: Matrix  # of the starts
+    bounds: Matrix
+    actions: Matrix
+    obs: Matrix
+    rewards: Vector
+    terminated: Vector
+    truncated: Vector
+    final_obs: Matrix  # of rows that end and are reset in the same step
+    final_reports: Matrix
+    rows: Matrix  # of the record
+    packets: Matrix
+    counts: Matrix  # of ticks and of packets
 
 
 class _ThreadArrays(NamedTuple):
     """A thread's own working arrays, or its part of the record."""
 
-    switches: Any
-    window: Any
-    rows: Any
-    packets: Any
+    switches: Matrix
+    window: Matrix
+    rows: Matrix
+    packets: Matrix
 
 
-def make_specification(constants: KernelConstants, real: type, N: int, starts: int) -> DeviceArrays:
-    """Make (type, shape) of each array, for N rows and a number of starts."""
+def make_specification(
+    constants: KernelConstants, real: type[np.floating[Any]], N: int, starts: int
+) -> DeviceArrays:
+    """Make (type, shape) of each array.
+
+    Args:
+        constants: Constants of the kernel.
+        real: Type of floats.
+        N: Number of rows.
+        starts: Number of starts.
+
+    Returns:
+        Types and shapes in place of the arrays.
+    """
     width, byte, report = constants.width + sum(_DRAWN), np.uint8, len(REPORT)
     ends, n_record = N * (constants.mode == SAME_STEP), N * constants.record
     return DeviceArrays(
@@ -158,7 +189,14 @@ def make_specification(constants: KernelConstants, real: type, N: int, starts: i
 
 
 def pack_starts(starts: Sequence[EpisodeStart]) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Pack starts as `DeviceArrays.starts` and `DeviceArrays.switches`."""
+    """Pack starts.
+
+    Args:
+        starts: Starts of episodes.
+
+    Returns:
+        `DeviceArrays.starts` and `DeviceArrays.switches`.
+    """
     packed = [np.concatenate([x.params, x.low, x.high, x.motion]) for x in starts]
     return np.stack(packed), np.stack([start.switches for start in starts])
 
@@ -198,7 +236,9 @@ def _step_row(
     _count(i, constants, m, 1, row.report)
 
 
-def _run_row(row: Any, action: Any, constants: KernelConstants, bounds: Any, window: Any) -> int:
+def _run_row(
+    row: EpisodeArrays, action: Vector, constants: KernelConstants, bounds: Matrix, window: Matrix
+) -> int:
     """Step a row that runs by one env-step; return the ticks done."""
     yaw_share, steer_share = clip_action(action)
     if yaw_share != yaw_share:
@@ -216,7 +256,11 @@ def _run_row(row: Any, action: Any, constants: KernelConstants, bounds: Any, win
 
 
 def _reset_row(
-    start_index: int, row: Any, generator: Any, constants: KernelConstants, m: DeviceArrays
+    start_index: int,
+    row: EpisodeArrays,
+    generator: Vector,
+    constants: KernelConstants,
+    m: DeviceArrays,
 ) -> None:
     """Start a row's next episode, with the next key of its generator."""
     packed, low = m.starts[start_index], constants.width
@@ -226,11 +270,11 @@ def _reset_row(
         packed[:low], packed[low:high], packed[high:motion], m.switches[start_index],
         packed[motion:],
     )  # fmt: skip
-    key_low, key_high = draw_key(generator)
+    key_low, key_high = _draw_key(generator)
     reset_vehicle(start, key_low, key_high, m.bounds, row)
 
 
-def _count(i: int, constants: KernelConstants, m: DeviceArrays, done: int, report: Any) -> None:
+def _count(i: int, constants: KernelConstants, m: DeviceArrays, done: int, report: Vector) -> None:
     """Write the numbers of ticks and packets of row i's record."""
     if constants.record:
         m.counts[0, i], m.counts[1, i] = done, int(report[REPORT.packets])
@@ -239,7 +283,12 @@ def _count(i: int, constants: KernelConstants, m: DeviceArrays, done: int, repor
 def make_kernel(constants: KernelConstants, real: type[np.floating[Any]]) -> Any:
     """Make the kernel for numba-cuda or its simulator.
 
-    Its arguments are N, whether rows are reset, and pointers to `DeviceArrays`, of floats `real`.
+    Args:
+        constants: Constants of the kernel.
+        real: Type of floats.
+
+    Returns:
+        Function of N, whether rows are reset, and pointers to `DeviceArrays`.
     """
     step, make_array = to_cuda(_step_row, real), _get_numbers if SIMULATED else carray
     floats = types.float32 if real is np.float32 else types.float64
@@ -281,6 +330,6 @@ def make_kernel(constants: KernelConstants, real: type[np.floating[Any]]) -> Any
     return step_kernel
 
 
-def _get_numbers(array: Any, shape: Any) -> Any:
+def _get_numbers(array: Vector, shape: tuple[int, ...]) -> Vector:
     """Get the array of a simulated pointer."""
     return array.numbers

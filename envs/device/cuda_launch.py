@@ -41,7 +41,16 @@ _Capability = tuple[int, int]  # of a GPU: (9, 0) is an H200
 def get_ptx(
     constants: KernelConstants, real: type[np.floating[Any]], capability: _Capability
 ) -> str:
-    """Get a kernel's PTX for GPUs of a compute capability, from the disk or compiled."""
+    """Get a kernel's PTX, from the disk or compiled.
+
+    Args:
+        constants: Constants of the kernel.
+        real: Type of floats.
+        capability: Compute capability of the GPU.
+
+    Returns:
+        The PTX text.
+    """
     folder = kernel_cache.find_kernel_folder("envs")
     versions = version("numba-cuda"), version("numba"), NVVM().get_version()
     key = json.dumps([constants, real.__name__, capability, versions])
@@ -99,11 +108,18 @@ def _set_capability(capability: _Capability) -> Iterator[None]:
 
 
 def count_opcodes(ptx: str) -> Counter[str]:
-    """Count the instructions of a PTX text by name."""
+    """Count the instructions of a PTX text.
+
+    Args:
+        ptx: PTX text.
+
+    Returns:
+        Their numbers by name.
+    """
     return Counter(re.findall(r"^\t(?:@!?%\w+ )?([a-z][a-z0-9]*(?:\.[a-z0-9:]+)*)[\s;]", ptx, re.M))
 
 
-def make_context_current(device: torch.device) -> None:
+def _make_context_current(device: torch.device) -> None:
     """Make torch's context on the device the current one."""
     torch.empty(1, device=device)
 
@@ -123,7 +139,7 @@ class DriverKernel:
         self._driver, self._device = driver, device
         self._text = ptx.encode() + b"\0"  # as long as the module is there
         with torch.cuda.device(device):
-            make_context_current(device)
+            _make_context_current(device)
             major, minor = torch.cuda.get_device_capability(device)
             label = f"the kernel for sm_{major}{minor} on {device}"
             self._module = self._check_result(driver.cuModuleLoadData(self._text), label)
@@ -154,7 +170,16 @@ class DriverKernel:
 def load_kernel(
     constants: KernelConstants, real: type[np.floating[Any]], device: torch.device
 ) -> Any:
-    """Load the kernel of floats `real` on a GPU or in the simulator."""
+    """Load a kernel on a GPU or in the simulator.
+
+    Args:
+        constants: Constants of the kernel.
+        real: Type of floats.
+        device: GPU.
+
+    Returns:
+        Function of the number of rows, whether they are reset, and `DeviceArrays`.
+    """
     if SIMULATED:
         return _SimulatedKernel(constants, real)
     from cuda.bindings import driver

@@ -25,7 +25,15 @@ SIMULATED = bool(cuda.config.ENABLE_CUDASIM)
 
 
 def to_cuda(function: Any, real: type[np.floating[Any]]) -> Any:
-    """Rebuild a function and its callees with floats of `real`, plain Python in the simulator."""
+    """Rebuild a function and its callees, as plain Python in the simulator.
+
+    Args:
+        function: Compiled function.
+        real: Type of floats.
+
+    Returns:
+        The device function.
+    """
 
     def finish(rebuilt: Any) -> Any:
         if real is not np.float64:

@@ -121,7 +121,16 @@ def _find_places(names: Iterable[str], config: EpisodeConfig) -> list[int]:
 
 
 def replace_motion(motion: Tensor, state: Mapping[str, Tensor], rows: Tensor) -> Tensor:
-    """Replace the motion (len(Motion), M) of some rows by a reset's tensors (N,)."""
+    """Replace the motion of some rows by a reset's tensors.
+
+    Args:
+        motion: Motion of the rows, shape (len(Motion), M).
+        state: Tensors by the names of a `Motion`, shape (N,).
+        rows: The rows, shape (M,).
+
+    Returns:
+        The motion, shape (len(Motion), M).
+    """
     numbers = dict(zip(Motion._fields, motion.unbind(0), strict=True))
     return torch.stack([state[name][rows] if name in state else numbers[name] for name in numbers])
 
@@ -135,7 +144,13 @@ class AttachedParameters:
     def put(
         self, rows: Tensor, configs: Sequence[EpisodeConfig], parameters: dict[str, Any]
     ) -> None:
-        """Put parameters (N,) of these rows (M,) in place of those that they had."""
+        """Put parameters of some rows in place of those that they had.
+
+        Args:
+            rows: The rows, shape (M,).
+            configs: Configs of all N rows.
+            parameters: Tensors () or (N,), or numbers, by the names of a `Vehicle`.
+        """
         selected = torch.zeros(len(configs), dtype=torch.bool, device=rows.device)
         selected[rows] = True
         remaining = [(mask & ~selected, old, values) for mask, old, values in self._held]
@@ -144,7 +159,14 @@ class AttachedParameters:
             self._held.append((selected, list(configs), parameters))
 
     def insert_tensors(self, params: Tensor) -> Tensor:
-        """Insert the tensors into the packed parameters (PARAMS_WIDTH, N)."""
+        """Insert the tensors into the packed parameters.
+
+        Args:
+            params: Packed parameters, shape (PARAMS_WIDTH, N).
+
+        Returns:
+            Parameters with the tensors.
+        """
         columns, count = list(params.unbind(0)), params.shape[1]
         for mask, configs, parameters in self._held:
             values = {
@@ -159,7 +181,12 @@ class AttachedParameters:
         return torch.stack(columns) if self._held else params
 
     def write(self, params: Tensor, packed: Array) -> None:
-        """Write the tensors' numbers in params (PARAMS_WIDTH, N) to packed (N, PARAMS_WIDTH)."""
+        """Write the tensors' numbers into the packed parameters on the host.
+
+        Args:
+            params: Parameters with the tensors, shape (PARAMS_WIDTH, N).
+            packed: Packed parameters, shape (N, PARAMS_WIDTH).
+        """
         for mask, configs, parameters in self._held:
             places = _find_places(parameters, configs[0])
             where = np.ix_(mask.cpu().numpy(), np.array(places))

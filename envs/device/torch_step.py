@@ -2,24 +2,34 @@
 
 from typing import Any, NamedTuple
 
-from ..engine.layout import SLOW_STATE, ActuatorState, P, Switches
+from ..engine.config import EnvConfig
+from ..engine.layout import FLAGS, SLOW_STATE, ActuatorState, P
 from ..engine.reset import compute_first_row
-from ..engine.step import make_step_params
-from ..engine.tick import StepVariant
+from ..engine.step import get_start_variant, make_step_params
 from ..numerics.functions import CHANNELS, clip, draw_normals
 from ..numerics.packed import read
 from ..numerics.primitives import select
 from ..numerics.torch_backend import compile_method, to_torch, torch
-from ..record import FAST, Array
+from ..record import FAST, FAST_WIDTH, PACKET
 from ..scenarios.driver import compute_target_angle
 from ..sensors.inertial import NormalDraws
-from ..sensors.slow import draw_first_drift
-from ..task import BAD_ACTION, NOT_FINITE, REPORT, RUNNING, compute_reference
-from ..ticks import NEVER
+from ..sensors.slow import WIDTHS, draw_first_drift
+from ..task import (
+    AGE_CAP,
+    BAD_ACTION,
+    N_SAMPLED,
+    NOT_FINITE,
+    REPORT,
+    RUNNING,
+    StepReport,
+    compute_failure_cost,
+    compute_reference,
+)
+from ..ticks import NEVER, TICK
 from ..vehicle.dynamics import Motion, compute_sideslip_angle
 from .gradients import GradientGate
-from .torch_outputs import Observer, PacketCapacity, SlowSensors, SlowState, TickWindow
-from .torch_ticks import InfoValues, Ticks, TickState, make_tick_state
+from .torch_sensors import Delivered, PacketCapacity, SlowSensors, SlowState, TickWindow
+from .torch_ticks import InfoValues, Ticks, TickState
 
 Tensor = torch.Tensor
 
@@ -63,11 +73,8 @@ class TorchStep:
     """Env-steps of cars of one variant.
 
     Args:
-        kind: Variant of the ticks.
-        n: Ticks of an env-step.
+        config: Config of the environment.
         capacities: Capacity of each slow sensor present, by index.
-        switches: Switches of the plant and the task.
-        bounds: Bounds of the observation's entries, shape (2, k).
         dtype: Type of floats.
         obs_dtype: Type of observations.
         device: Device.
@@ -75,16 +82,19 @@ class TorchStep:
     """
 
     def __init__(
-        self, kind: StepVariant, n: int, capacities: dict[int, PacketCapacity], switches: Switches,
-        bounds: Array, dtype: torch.dtype, obs_dtype: torch.dtype, device: torch.device,
-        compile: bool,
+        self, config: EnvConfig, capacities: dict[int, PacketCapacity], dtype: torch.dtype,
+        obs_dtype: torch.dtype, device: torch.device, compile: bool,
     ) -> None:  # fmt: skip
-        self.kind, self.n, self.dtype = kind, n, dtype
-        self._ticks = Ticks(kind, dtype, compile)
-        self._slow = SlowSensors(capacities, kind.small_angle, dtype)
-        limits = torch.as_tensor(bounds, dtype=dtype, device=device)
-        self._observer = Observer(tuple(capacities), switches, limits, dtype, obs_dtype)
-        self._clip, self._select = to_torch(dtype, clip, select)
+        start = config.base.start
+        self.kind, self.n, self.dtype = get_start_variant(start), int(config.control_period), dtype
+        self.sensors, self._obs_dtype = tuple(capacities), obs_dtype
+        self._ticks = Ticks(self.kind, dtype, compile)
+        self._slow = SlowSensors(capacities, self.kind.small_angle, dtype)
+        self._switches = read(start.switches, FLAGS)
+        self._bounds = torch.as_tensor(config.bounds, dtype=dtype, device=device)[:, :, None]
+        self._clip, self._select, self._compute_failure_cost = to_torch(
+            dtype, clip, select, compute_failure_cost
+        )
         self.finish_step: Any = compile_method(self._finish_step) if compile else self._finish_step
 
     def __call__(
@@ -101,7 +111,7 @@ class TorchStep:
         yaw_share, *steer_shares = map(gate, shares.unbind(1))
         steer_share = steer_shares[0] if steer_shares else torch.zeros_like(state.tick)
         running = is_finite & ~state.over
-        start = make_tick_state(*state[:6], running)  # the fields from motion to tick
+        start = _make_tick_state(state, running)
         tick_state, rows, track = self._ticks.integrate_step(
             p, keys, start, yaw_share, steer_share, self.n
         )
@@ -121,11 +131,11 @@ class TorchStep:
         done, duration = tick_state.tick - state.tick, p[P.task.duration]
         window = TickWindow(state.tick, tick_state.tick, running, track)
         slow_state, delivered = self._slow(p, keys, state.slow_state, window)
-        obs = self._observer.observe(rows, done, tick_state, slow_state.slow, delivered)
+        obs = self._observe(rows, done, tick_state, slow_state.slow, delivered)
         obs = torch.where(running[:, None], obs, 0.0)
-        report = self._observer.report(tick_state, duration, delivered.number)
+        report = self._report(tick_state, duration, delivered.number)
         report = torch.where(running, report, state.report)
-        refusal = self._observer.report_refusal(tick_state, duration, state.report)
+        refusal = self._report_refusal(tick_state, duration, state.report)
         report = torch.where(refused, refusal, report)
         failure = self._select(running, tick_state.failure, state.failure)
         failure = self._select(refused, BAD_ACTION * 1.0, failure)
@@ -143,16 +153,79 @@ class TorchStep:
             done.to(torch.int64), delivered.number,
         )  # fmt: skip
 
+    def _observe(
+        self, rows: Tensor, done: Tensor, tick_state: TickState, slow: Tensor, delivered: Delivered
+    ) -> Tensor:
+        """Compute the observation (N, k) from the first `done` (N,) of rows (n, FAST_WIDTH, N)."""
+        entries: list[Tensor] = []
+        sampled = rows[:, :N_SAMPLED]
+        if self._switches.all_samples:
+            entries += sampled.transpose(0, 1).flatten(0, 1).unbind(0)
+        else:
+            total: Any = 0.0
+            for j in range(len(rows)):
+                total = total + self._select(j < done, sampled[j], 0.0)
+            entries += torch.stack((sampled[-1], total / done), 1).flatten(0, 1).unbind(0)
+        entries += rows[-1, FAST.steer : FAST.steer + 4].unbind(0)
+        if self._switches.with_map:
+            entries.append(rows[-1, FAST.curvature])
+        for sensor in self.sensors:
+            entries += self._read_sensor(sensor, tick_state.tick, slow[sensor], delivered)
+        info_values = InfoValues(*tick_state.shown)
+        entries += [info_values.beta_ref, info_values.gamma_ref]
+        low, high = self._bounds.unbind(0)
+        clipped: Tensor = self._clip(torch.stack(entries), low, high)
+        return clipped.T.to(self._obs_dtype).contiguous()
+
+    def _read_sensor(
+        self, sensor: int, tick: Tensor, slow: Tensor, delivered: Delivered
+    ) -> list[Tensor]:
+        """Read values, age and freshness of one sensor's newest sample."""
+        captured = slow[SLOW_STATE.captured]
+        age = self._select(captured != NEVER, (tick - captured) * TICK, AGE_CAP)
+        packets = delivered.packets
+        place = torch.arange(len(packets), device=tick.device)[:, None]
+        # the newest sample's own packet, neither an older one nor a duplicate
+        is_newest = packets[:, PACKET.arrived] == slow[SLOW_STATE.arrived]
+        is_fresh = (place < delivered.number) & (packets[:, PACKET.sensor] == sensor) & is_newest
+        values = [slow[i] for i in SLOW_STATE.values[: WIDTHS[sensor]]]
+        return [*values, age, is_fresh.any(0).to(tick.dtype)]
+
+    def _report(self, tick_state: TickState, duration: Tensor, count: Tensor) -> Tensor:
+        """Compute the reports (len(StepReport), N) of cars that were stepped."""
+        failure_cost = self._compute_failure_cost(duration, tick_state.tick)
+        cost = tick_state.cost + self._select(tick_state.failure != RUNNING, failure_cost, 0.0)
+        info_values = InfoValues(*tick_state.shown)
+        values = {
+            "t": tick_state.tick * TICK, "beta": info_values.beta, "gamma": tick_state.motion[2],
+            "psi": tick_state.motion[3], "beta_ref": info_values.beta_ref,
+            "gamma_ref": info_values.gamma_ref, "steer": info_values.steer,
+            "yaw_moment": info_values.moment, "cost": cost, "failure": tick_state.failure,
+            "packets": count.to(cost.dtype), "reward": -cost,
+            "ended": (tick_state.tick >= duration).to(cost.dtype),
+        }  # fmt: skip
+        return torch.stack([values[name] for name in StepReport._fields])
+
+    def _report_refusal(self, tick_state: TickState, duration: Tensor, before: Tensor) -> Tensor:
+        """Compute the reports of cars that fail by a non-finite action, from those before."""
+        cost = self._compute_failure_cost(duration, tick_state.tick)
+        values = dict(zip(StepReport._fields, before.unbind(0), strict=True))
+        values |= {"cost": cost, "reward": -cost, "packets": torch.zeros_like(cost)}
+        values["failure"] = torch.full_like(cost, BAD_ACTION)
+        return torch.stack([values[name] for name in StepReport._fields])
+
 
 class TorchReset:
     """Tick 0 on tensors as `reset_vehicle` makes it, with gradients to motion and parameters.
 
-    A path that a driver follows stays where the reset put it. `sensors` are the indices of the slow
-    sensors present.
+    A path that a driver follows stays where the reset put it.
+
+    Args:
+        step: Env-steps of the cars.
     """
 
-    def __init__(self, step: TorchStep, sensors: tuple[int, ...]) -> None:
-        self._step, self._sensors = step, sensors
+    def __init__(self, step: TorchStep) -> None:
+        self._step = step
         self._make_step_params, self._read, self._draw_normals, self._draw_first_drift = to_torch(
             step.dtype, make_step_params, read, draw_normals, draw_first_drift
         )
@@ -190,9 +263,8 @@ class TorchReset:
         all_cars = torch.ones_like(state.over)
         beta = self._compute_sideslip_angle(motion.v_x, motion.v_y, kind.small_angle)
         info_values = InfoValues(beta, refs[0], refs[1], steer, zero)
-        tick_state = make_tick_state(
-            state.motion, drive, steer, refs, state.nominal_motion, state.tick, all_cars
-        )
+        started = state._replace(drive=drive, driver=steer, refs=refs)
+        tick_state = _make_tick_state(started, all_cars)
         empty_queue = torch.full_like(state.queue, NEVER)
         # as if a step of one tick had led here from tick -1: its window holds tick 0 alone
         previous = state._replace(
@@ -208,7 +280,7 @@ class TorchReset:
     def _rewind_sensors(self, p: Tensor, keys: Tensor, slow: Tensor) -> Tensor:
         """Compute the slow sensors' state before tick 0 from that after it."""
         sensors = list(slow.unbind(0))
-        for i in self._sensors:
+        for i in self._step.sensors:
             after, sky = sensors[i], self._read(p, P.sky)
             period = self._read(p, P.slow[i]).period
             before = list(torch.zeros_like(after).unbind(0))
@@ -220,3 +292,16 @@ class TorchReset:
             )
             sensors[i] = torch.stack(before)
         return torch.stack(sensors)
+
+
+def _make_tick_state(state: TorchState, alive: Tensor) -> TickState:
+    """Make the state of cars at the start of an env-step."""
+    tick, n_shown = state.tick, len(InfoValues._fields)
+    zeros = tick.new_zeros((2 + n_shown + FAST_WIDTH, len(tick)))
+    failure, cost, *numbers = zeros.unbind(0)
+    motion, drive, refs = state.motion.unbind(0), state.drive.unbind(0), state.refs.unbind(0)
+    # no tensor stands twice: torch.compile would compile the first tick and the others apart
+    return TickState(
+        alive, motion, drive, state.driver, refs, state.nominal_motion.unbind(0), tick, failure,
+        cost, tuple(numbers[:n_shown]), tuple(numbers[n_shown:]), state.motion.unbind(0),
+    )  # fmt: skip

@@ -12,7 +12,6 @@ from ..engine.window import compute_tick_cost
 from ..numerics.functions import CHANNELS, draw_normals
 from ..numerics.primitives import Scalar, select
 from ..numerics.torch_backend import compile_method, to_torch, torch
-from ..record import FAST_WIDTH
 from ..scenarios.road import NominalMotion
 from ..scenarios.steering import compute_steering
 from ..sensors.inertial import NormalDraws
@@ -52,7 +51,13 @@ class TickState(NamedTuple):
 
 
 class Ticks:
-    """Ticks of cars of one variant; `compile`: a tick and the window go through `torch.compile`."""
+    """Ticks of cars.
+
+    Args:
+        kind: Variant of the ticks.
+        dtype: Type of floats.
+        compile: Whether a tick and the window go through `torch.compile`.
+    """
 
     def __init__(self, kind: StepVariant, dtype: torch.dtype, compile: bool) -> None:
         self.kind = kind
@@ -134,9 +139,18 @@ class Ticks:
         self, p: Tensor, keys: Tensor, start: TickState, yaw_share: Tensor, steer_share: Tensor,
         n: int,
     ) -> tuple[TickState, Tensor, Tensor]:  # fmt: skip
-        """Integrate n ticks, fewer for cars that fail or end, whose last values are repeated.
+        """Integrate ticks, fewer for cars that fail or end, whose last values are repeated.
 
-        Returns the state, and the fast rows and motions of all ticks, (n, width, N) each.
+        Args:
+            p: Packed parameters, shape (PARAMS_WIDTH, N).
+            keys: Keys of the episodes, int64, shape (2, N).
+            start: State at the start.
+            yaw_share: Yaw moment as a fraction of full scale, shape (N,).
+            steer_share: Added steering as a fraction of full scale, shape (N,).
+            n: Number of ticks.
+
+        Returns:
+            The state, and the fast rows and motions of all ticks, (n, width, N) each.
         """
         all_draws, steering = self.precompute_window(p, keys, start.tick + 1, n)
         tick_state, rows, track = start, [], []
@@ -147,18 +161,3 @@ class Ticks:
             rows.append(torch.stack(tick_state.row))
             track.append(torch.stack(tick_state.track))
         return tick_state, torch.stack(rows), torch.stack(track)
-
-
-def make_tick_state(
-    motion: Tensor, drive: Tensor, driver: Tensor, refs: Tensor, nominal_motion: Tensor,
-    tick: Tensor, alive: Tensor,
-) -> TickState:  # fmt: skip
-    """Make the state of cars at the start of an env-step, from tensors (..., N)."""
-    zeros = tick.new_zeros((2 + len(InfoValues._fields) + FAST_WIDTH, len(tick)))
-    failure, cost, *numbers = zeros.unbind(0)
-    info_values, row = numbers[: len(InfoValues._fields)], numbers[len(InfoValues._fields) :]
-    # no tensor stands twice: torch.compile would compile the first tick and the others apart
-    return TickState(
-        alive, motion.unbind(0), drive.unbind(0), driver, refs.unbind(0), nominal_motion.unbind(0),
-        tick, failure, cost, tuple(info_values), tuple(row), motion.unbind(0),
-    )  # fmt: skip

@@ -148,25 +148,23 @@ class OutsidePlant(ABC):
         self.specific_force = (0.0, 0.0)
         self.x = np.zeros(0)
 
-    @abstractmethod
     def start(self, motion: Motion) -> None:
         """Set the car to a Motion's velocities, heading and place, wheels rolling.
 
         Args:
             motion: Motion of the car.
         """
+        speed, slip = math.hypot(motion.v_x, motion.v_y), math.atan2(motion.v_y, motion.v_x)
+        core = [motion.X, motion.Y, 0.0, speed, motion.psi, motion.gamma, slip]
+        self.x = self._make_state(core, motion)
 
     @abstractmethod
-    def derivative(self, x: Array, inputs: OutsideInputs) -> Array:
-        """Compute dx/dt of a state, which is left unchanged (the models themselves change it).
+    def _make_state(self, core: list[float], motion: Motion) -> Array:
+        """Make x of a Motion from X, Y, steering, speed, heading, yaw rate and slip angle."""
 
-        Args:
-            x: State of the model.
-            inputs: Inputs of the plant.
-
-        Returns:
-            The derivative, in the shape of x.
-        """
+    @abstractmethod
+    def _compute_derivative(self, x: Array, inputs: OutsideInputs) -> Array:
+        """Compute dx/dt of a state, which is left unchanged (the models themselves change it)."""
 
     @property
     @abstractmethod
@@ -174,15 +172,8 @@ class OutsidePlant(ABC):
         """Velocities and place of the car, on a straight road along the ground's x axis."""
 
     @abstractmethod
-    def compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:
-        """Compute the specific force of the state x; the models' own errors pass.
-
-        Args:
-            inputs: Inputs of the plant.
-
-        Returns:
-            (a_x, a_y) (m/s2).
-        """
+    def _compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:
+        """Compute (a_x, a_y) (m/s2) of the state x; the models' own errors pass."""
 
     @property
     def is_finite(self) -> bool:
@@ -204,17 +195,17 @@ class OutsidePlant(ABC):
                 for _ in range(parts):
                     self.x = self._rk4(self.x, inputs, h / parts)
                     self.x[self.wheels] = np.maximum(self.x[self.wheels], 0.0)
-                self.specific_force = self.compute_specific_force(inputs)
+                self.specific_force = self._compute_specific_force(inputs)
         except (ArithmeticError, ValueError):  # a wheel at rest in a spin, the sine of infinity
             self.specific_force = (math.nan, math.nan)
         if not all(map(math.isfinite, self.specific_force)):
             self.x = np.full_like(self.x, np.nan)
 
     def _rk4(self, x: Array, inputs: OutsideInputs, h: float) -> Array:
-        a = self.derivative(x, inputs)
-        b = self.derivative(x + 0.5 * h * a, inputs)
-        c = self.derivative(x + 0.5 * h * b, inputs)
-        d = self.derivative(x + h * c, inputs)
+        a = self._compute_derivative(x, inputs)
+        b = self._compute_derivative(x + 0.5 * h * a, inputs)
+        c = self._compute_derivative(x + 0.5 * h * b, inputs)
+        d = self._compute_derivative(x + h * c, inputs)
         return x + h / 6.0 * (a + 2.0 * (b + c) + d)
 
 
@@ -223,12 +214,10 @@ class SingleTrack(OutsidePlant):
 
     law = "vehicle_dynamics_st"
 
-    def start(self, motion: Motion) -> None:
-        """Set the car to a Motion, steering straight."""
-        speed, slip = math.hypot(motion.v_x, motion.v_y), math.atan2(motion.v_y, motion.v_x)
-        self.x = np.array([motion.X, motion.Y, 0.0, speed, motion.psi, motion.gamma, slip])
+    def _make_state(self, core: list[float], motion: Motion) -> Array:
+        return np.array(core)
 
-    def derivative(self, x: Array, inputs: OutsideInputs) -> Array:
+    def _compute_derivative(self, x: Array, inputs: OutsideInputs) -> Array:
         """Compute dx/dt; the motors push along the path and turn the car by N_z / I_z."""
         state = x.tolist()
         state[2] = inputs.steer
@@ -245,9 +234,9 @@ class SingleTrack(OutsidePlant):
         X, Y, _, v, psi, gamma, slip = self.x[:7].tolist()
         return Motion(v * math.cos(slip), v * math.sin(slip), gamma, psi, X, Y, X, Y, 0.0)
 
-    def compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:
+    def _compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:
         """Compute the specific force of the state x from the path's tangent and normal."""
-        rate, slip = self.derivative(self.x, inputs), self.x[6]
+        rate, slip = self._compute_derivative(self.x, inputs), self.x[6]
         tangential, normal = rate[3], self.x[3] * (rate[6] + self.x[5])  # of the path
         sine, cosine = math.sin(slip), math.cos(slip)
         a_x, a_y = tangential * cosine - normal * sine, tangential * sine + normal * cosine
@@ -261,10 +250,8 @@ class Drift(SingleTrack):
     wheels = slice(7, 9)
     wheel_load = 1.0
 
-    def start(self, motion: Motion) -> None:
-        """Set the car to a Motion, its wheels rolling."""
-        super().start(motion)
-        self.x = np.append(self.x, np.full(2, motion.v_x / self.p.R_w))
+    def _make_state(self, core: list[float], motion: Motion) -> Array:
+        return np.append(core, np.full(2, motion.v_x / self.p.R_w))
 
 
 class MultiBody(OutsidePlant):
@@ -275,14 +262,12 @@ class MultiBody(OutsidePlant):
     wheel_load = 0.5
     velocity_columns = (3, 5, 10)
 
-    def start(self, motion: Motion) -> None:
-        """Set the car to a Motion, its roll included."""
-        speed, slip = math.hypot(motion.v_x, motion.v_y), math.atan2(motion.v_y, motion.v_x)
-        core = [motion.X, motion.Y, 0.0, speed, motion.psi, motion.gamma, slip]
-        self.x = np.array(_import_model("init_mb").init_mb(core, self.p), float)
-        self.x[6], self.x[7] = -motion.phi, -motion.phi_dot
+    def _make_state(self, core: list[float], motion: Motion) -> Array:
+        x: Array = np.array(_import_model("init_mb").init_mb(core, self.p), float)
+        x[6], x[7] = -motion.phi, -motion.phi_dot
+        return x
 
-    def derivative(self, x: Array, inputs: OutsideInputs) -> Array:
+    def _compute_derivative(self, x: Array, inputs: OutsideInputs) -> Array:
         """Compute dx/dt; motor torques act on the rear wheels."""
         state = x.tolist()
         state[2] = inputs.steer
@@ -299,9 +284,9 @@ class MultiBody(OutsidePlant):
         x = self.x.tolist()
         return Motion(x[3], x[10], x[5], x[4], x[0], x[1], x[0], x[1], 0.0, -x[6], -x[7])
 
-    def compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:
+    def _compute_specific_force(self, inputs: OutsideInputs) -> tuple[float, float]:
         """Compute the specific force that the rolled body of the state x feels."""
-        rate, x = self.derivative(self.x, inputs), self.x
+        rate, x = self._compute_derivative(self.x, inputs), self.x
         a_x = rate[3] - x[5] * x[10]
         a_y = rate[10] + x[5] * x[3] - GRAVITY * math.sin(x[6])  # felt by the rolled body
         return float(a_x), float(a_y)

@@ -1,13 +1,14 @@
 """The GPS: course, speed and position of the antenna, HDOP and satellites."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ..numerics.functions import CHANNELS, PI, sincos, wrap
 from ..numerics.jit import jit
 from ..numerics.primitives import Scalar, Vector, floor, maximum, minimum, select, sqrt
-from ..vehicle.dynamics import compute_sideslip_angle
+from ..vehicle.dynamics import Motion, compute_sideslip_angle
 from ..vehicle.tyres import MIN_SPEED
-from .link import Blocks, PacketValue, SlowKind
+from .inertial import Noise
+from .link import Blocks, Link, PacketValue, SlowKind
 
 GPS_KIND = SlowKind(
     "gps",
@@ -30,16 +31,16 @@ OUTAGE_JUMP = 3.0  # spreads by which log HDOP rises where an outage ends
 class SatelliteGeometry(NamedTuple):
     """Satellite geometry: log HDOP is an Ornstein-Uhlenbeck process."""
 
-    median: Any  # log of the median HDOP
-    spread: Any  # standard deviation of log HDOP
-    decay: Any  # fraction of a deviation that remains after one period of the GPS
-    noise_gain: Any  # sqrt(1 - decay^2)
-    weight: Any  # of HDOP in the noise, HDOP_LAWS
+    median: Scalar  # log of the median HDOP
+    spread: Scalar  # standard deviation of log HDOP
+    decay: Scalar  # fraction of a deviation that remains after one period of the GPS
+    noise_gain: Scalar  # sqrt(1 - decay^2)
+    weight: Scalar  # of HDOP in the noise, HDOP_LAWS
 
 
 @jit
 def compute_hdop_deviation(
-    before: Scalar, sky: SatelliteGeometry, link: Any, tick: Scalar, n: Vector
+    before: Scalar, sky: SatelliteGeometry, link: Link, tick: Scalar, n: Vector
 ) -> Scalar:
     """Compute the deviation of log HDOP from its median at a capture.
 
@@ -60,29 +61,22 @@ def compute_hdop_deviation(
 
 
 @jit
-def count_satellites(hdop: Scalar) -> Scalar:
-    """Count the satellites that a receiver sees at an HDOP: 12 at 1, 4 up to 5, fewer above.
-
-    Args:
-        hdop: Horizontal dilution of precision.
-
-    Returns:
-        Number of satellites.
-    """
+def _count_satellites(hdop: Scalar) -> Scalar:
+    """Satellites that a receiver sees at an HDOP: 12 at 1, 4 up to 5, fewer above."""
     return floor(2.0 + minimum(10.0 / hdop, 28.0))
 
 
 @jit
 def sample_gps(
-    motion: Any,
+    motion: Motion,
     forward: Scalar,
     left: Scalar,
     hdop: Scalar,
     weight: Scalar,
-    noise: Any,
+    noise: Noise,
     n: Vector,
     small_angle: int,
-) -> Any:
+) -> tuple[Scalar, ...]:
     """Sample the GPS at its antenna, with noise.
 
     course = psi + beta, dakf-stability (3), with the antenna's beta.
@@ -112,6 +106,6 @@ def sample_gps(
         motion.X + (forward * c - left * s) + noise.gps_position * noise_scale * n[2],
         motion.Y + (forward * s + left * c) + noise.gps_position * noise_scale * n[3],
         hdop,
-        count_satellites(hdop),
+        _count_satellites(hdop),
         select(v < COURSE_SPEED, 0.0, 1.0),
     )

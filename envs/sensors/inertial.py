@@ -1,25 +1,27 @@
 """The fast sensors (gyro, accelerometers, roll rate, wheels), and the noise of all sensors."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..numerics.jit import inline
 from ..numerics.primitives import Scalar, Vector, any_lane, select
 from ..ticks import TICK
-from ..vehicle.dynamics import compute_gravity
+from ..vehicle.dynamics import Motion, RoadParams, compute_gravity
 from ..vehicle.parameters import GRAVITY
 
 
 class NormalDraws(NamedTuple):
     """Random numbers of a tick, four standard normal ones each."""
 
-    inertial: Any
-    wheels: Any
+    inertial: Vector
+    wheels: Vector
 
 
 @inline
-def compute_specific_force(before: Any, after: Any, road: Any, small_angle: int, roll: int) -> Any:
+def compute_specific_force(
+    before: Motion, after: Motion, road: RoadParams, small_angle: int, roll: int
+) -> tuple[Scalar, Scalar]:
     """Compute the mean specific force over a tick, from v', the turning axes and gravity.
 
     Args:
@@ -48,8 +50,8 @@ def compute_specific_force(before: Any, after: Any, road: Any, small_angle: int,
 
 @inline
 def compute_fast_row(
-    motion: Any, accel: Vector, applied: Vector, d_f: Scalar, noise: Any, draws: NormalDraws
-) -> Any:
+    motion: Motion, accel: Vector, applied: Vector, d_f: Scalar, noise: "Noise", draws: NormalDraws
+) -> tuple[Scalar, ...]:
     """Compute the fast sensors' samples at a tick, columns as in `Fast`.
 
     Args:

@@ -1,7 +1,7 @@
 """A slow sensor's kind, clock and link: what it sends, and when it captures and it arrives."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ..numerics.functions import CHANNELS, draw_uniforms
 from ..numerics.jit import jit
@@ -65,18 +65,18 @@ class SlowSensor:
 class Link(NamedTuple):
     """A slow sensor's clock and link in ticks; period 0: the sensor is absent."""
 
-    period: Any
-    phase: Any  # -1: drawn at reset
-    n_delays: Any  # how many of the four delays repeat
-    delay_0: Any
-    delay_1: Any
-    delay_2: Any
-    delay_3: Any
-    jitter: Any
-    loss: Any
-    duplicate: Any
-    outage_start: Any
-    outage_end: Any
+    period: Scalar
+    phase: Scalar  # -1: drawn at reset
+    n_delays: Scalar  # how many of the four delays repeat
+    delay_0: Scalar
+    delay_1: Scalar
+    delay_2: Scalar
+    delay_3: Scalar
+    jitter: Scalar
+    loss: Scalar
+    duplicate: Scalar
+    outage_start: Scalar
+    outage_end: Scalar
 
 
 def make_link(sensor: SlowSensor | None, outage: tuple[float, float] | None = None) -> Link:
@@ -133,7 +133,7 @@ def count_max_in_flight(link: Link) -> int:
 @jit
 def compute_arrivals(
     link: Link, frame: Scalar, tick: Scalar, key_low: int, key_high: int, block: int
-) -> Any:
+) -> tuple[Scalar, Scalar]:
     """Compute when a frame arrives: loss, outage, duplication, latency and jitter.
 
     Args:

@@ -1,7 +1,7 @@
 """The slow sensors: their table, a sample of any of them, and the sensors of each id.
 
 A new one is a file beside `camera` and `gps`, a row of `SLOW` and a branch of `sample_sensor`:
-packets, observation, random numbers, reset and the device engine follow from the table.
+packets, observation, random numbers, reset and the gradient engine follow from the table.
 """
 
 import dataclasses
@@ -10,11 +10,13 @@ from typing import Any, NamedTuple
 
 from ..numerics.functions import draw_normals, exp
 from ..numerics.jit import jit
-from ..numerics.primitives import Scalar, to_int
+from ..numerics.primitives import Scalar, Vector, to_int
 from ..validation import check_mapping, describe_unknown
-from .camera import CAMERA_KIND, compute_lane_quality, sample_camera
-from .gps import GPS_KIND, compute_hdop_deviation, sample_gps
-from .link import Blocks, SlowSensor
+from ..vehicle.dynamics import CarParams, Motion, RoadParams
+from .camera import CAMERA_KIND, FieldOfView, compute_lane_quality, sample_camera
+from .gps import GPS_KIND, SatelliteGeometry, compute_hdop_deviation, sample_gps
+from .inertial import Noise
+from .link import Blocks, Link, SlowSensor
 
 SLOW = (CAMERA_KIND, GPS_KIND)
 CAMERA, GPS = range(len(SLOW))
@@ -45,28 +47,28 @@ BLOCKS = tuple(kind.blocks or make_blocks(place) for place, kind in enumerate(SL
 class MeasurementContext(NamedTuple):
     """The truth at a tick, and the noise and random numbers to measure it with."""
 
-    motion: Any
-    road: Any
-    car: Any
-    noise: Any
-    sky: Any  # the satellites
-    field_of_view: Scalar  # the camera's `FieldOfView`
+    motion: Motion
+    road: RoadParams
+    car: CarParams
+    noise: Noise
+    sky: SatelliteGeometry
+    field_of_view: FieldOfView
     small_angle: int
-    key_low: Any
-    key_high: Any
-    tick: Any
+    key_low: Scalar
+    key_high: Scalar
+    tick: Scalar
 
 
 class Sample(NamedTuple):
     """One measurement of a slow sensor."""
 
-    values: Any  # VALUES numbers
-    quality: Any
-    drift: Any  # a number that the sensor carries from sample to sample
+    values: Vector  # VALUES numbers
+    quality: Scalar
+    drift: Scalar  # a number that the sensor carries from sample to sample
 
 
 @jit
-def sample_sensor(sensor: int, context: MeasurementContext, link: Any, drift: Scalar) -> Sample:
+def sample_sensor(sensor: int, context: MeasurementContext, link: Link, drift: Scalar) -> Sample:
     """Sample a slow sensor.
 
     Args:
@@ -96,7 +98,9 @@ def sample_sensor(sensor: int, context: MeasurementContext, link: Any, drift: Sc
 
 
 @jit
-def draw_first_drift(sensor: int, sky: Any, key_low: Scalar, key_high: Scalar) -> Scalar:
+def draw_first_drift(
+    sensor: int, sky: SatelliteGeometry, key_low: Scalar, key_high: Scalar
+) -> Scalar:
     """Draw a slow sensor's drift at the start of an episode.
 
     Args:

@@ -1,20 +1,23 @@
 """The actuators: torque distribution, added steering, and first-order lags solved exactly."""
 
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from ..numerics.jit import jit
 from ..numerics.primitives import Scalar, absolute, any_lane, maximum, minimum, select
 from .tyres import MIN_SPEED
 
+if TYPE_CHECKING:
+    from .dynamics import CarParams
+
 
 class Lag(NamedTuple):
     """Remaining fractions of a deviation from the command within a tick; all zero without lag."""
 
-    start: Any  # 1, at the tick's start
-    middle: Any
-    end: Any
-    mean: Any  # mean over the tick by Simpson's rule; the record has the inputs of this mean
+    start: Scalar  # 1, at the tick's start
+    middle: Scalar
+    end: Scalar
+    mean: Scalar  # mean over the tick by Simpson's rule; the record has the inputs of this mean
 
 
 def make_lag(time_constant: float, tick: float) -> Lag:
@@ -49,7 +52,7 @@ def apply_lag(command: Scalar, value: Scalar, rest: Scalar) -> Scalar:
 
 
 @jit
-def compute_torque_limit(v_x: Scalar, car: Any) -> Scalar:
+def compute_torque_limit(v_x: Scalar, car: "CarParams") -> Scalar:
     """Compute the torque limit of one motor at a speed, driving or braking.
 
     Args:
@@ -68,8 +71,8 @@ def compute_torque_limit(v_x: Scalar, car: Any) -> Scalar:
 
 @jit
 def allocate_torques(
-    N_z: Scalar, a_x: Scalar, car: Any, yaw_first: Scalar, max_torque: Scalar
-) -> Any:
+    N_z: Scalar, a_x: Scalar, car: "CarParams", yaw_first: Scalar, max_torque: Scalar
+) -> tuple[Scalar, Scalar]:
     """Distribute a yaw moment and an acceleration over two motors: tie-vision (3) in ISO axes.
 
     A positive yaw moment drives the right wheel.
@@ -128,7 +131,7 @@ def limit_angle(added: Scalar, driver: Scalar, stop: Scalar) -> Scalar:
 
 
 @jit
-def compute_yaw_moment(T_l: Scalar, T_r: Scalar, car: Any) -> Scalar:
+def compute_yaw_moment(T_l: Scalar, T_r: Scalar, car: "CarParams") -> Scalar:
     """Compute the yaw moment of two motor torques.
 
     Args:

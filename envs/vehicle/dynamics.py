@@ -6,13 +6,13 @@ a_y = v_y' + v_x gamma + g phi, and a road banked by b adds g sin b. The functio
 on values; the integers `small_angle`, `law` and `roll` choose the text that is compiled.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ..numerics.functions import atan2, sincos
 from ..numerics.jit import inline, jit
 from ..numerics.primitives import Scalar, any_lane, maximum, minimum, select
 from .parameters import GRAVITY
-from .tyres import MIN_SPEED, compute_tyre_forces
+from .tyres import MIN_SPEED, TyreLoad, compute_tyre_forces
 
 
 class CarParams(NamedTuple):
@@ -70,7 +70,7 @@ class RoadParams(NamedTuple):
 
 
 @jit
-def _compute_ramp(road: Any, s: Scalar) -> Scalar:
+def _compute_ramp(road: RoadParams, s: Scalar) -> Scalar:
     """Compute the fraction of curvature, bank and grade that is reached at s (m)."""
     return minimum(maximum((s - road.start) * (1.0 / road.ramp), 0.0), 1.0)
 
@@ -107,7 +107,9 @@ def compute_car_curvature(motion: Motion, road: RoadParams) -> Scalar:
 
 
 @inline
-def _rotate_gravity(road: Any, s: Scalar, sin_r: Scalar, cos_r: Scalar) -> Any:
+def _rotate_gravity(
+    road: RoadParams, s: Scalar, sin_r: Scalar, cos_r: Scalar
+) -> tuple[Scalar, Scalar]:
     """(x, y) of the gravity that a car without roll measures (m/s2), by its heading on the road."""
     ramp = _compute_ramp(road, s)
     g_s, g_n = road.longitudinal * ramp, road.lateral * ramp  # along the road, to its left
@@ -115,7 +117,7 @@ def _rotate_gravity(road: Any, s: Scalar, sin_r: Scalar, cos_r: Scalar) -> Any:
 
 
 @jit
-def compute_gravity(motion: Motion, road: RoadParams, small_angle: int) -> Any:
+def compute_gravity(motion: Motion, road: RoadParams, small_angle: int) -> tuple[Scalar, Scalar]:
     """Compute the gravity that accelerometers measure in a car without roll.
 
     Args:
@@ -143,16 +145,16 @@ class DisturbanceForces(NamedTuple):
 class Velocity(NamedTuple):
     """The part of a Motion that forces change and depend on, with a Motion's units."""
 
-    v_x: Any
-    v_y: Any
-    gamma: Any
-    phi: Any
-    phi_dot: Any
+    v_x: Scalar
+    v_y: Scalar
+    gamma: Scalar
+    phi: Scalar
+    phi_dot: Scalar
 
 
 @inline
 def _compute_roll_acceleration(
-    motion: Any, F_y: Scalar, N_x: Scalar, car: Any, per_m: Scalar
+    motion: Motion | Velocity, F_y: Scalar, N_x: Scalar, car: CarParams, per_m: Scalar
 ) -> Scalar:
     """phi'' (rad/s2) of double-layer-gps (1) and (3), in which gravity's pull cancels from F_y."""
     body_moment = N_x - car.C_x * motion.phi_dot - car.K_x * motion.phi
@@ -162,9 +164,9 @@ def _compute_roll_acceleration(
 
 @inline
 def compute_rates(
-    motion: Any, load: Any, disturbance: DisturbanceForces, car: CarParams, gravity: Any,
-    small_angle: int, law: int, roll: int,
-) -> Any:  # fmt: skip
+    motion: Motion | Velocity, load: TyreLoad, disturbance: DisturbanceForces, car: CarParams,
+    gravity: tuple[Scalar, Scalar], small_angle: int, law: int, roll: int,
+) -> Velocity:  # fmt: skip
     """Compute the time derivative of the velocities and the roll.
 
     Args:
@@ -203,8 +205,8 @@ def compute_rates(
 
 @inline
 def _compute_course_rates(
-    motion: Any, v_x: Scalar, v_y: Scalar, road: Any, small_angle: int
-) -> Any:
+    motion: Motion, v_x: Scalar, v_y: Scalar, road: RoadParams, small_angle: int
+) -> tuple[Scalar, Scalar, Scalar, Scalar, Scalar]:
     """(dX, dY, ds, dy, dtheta)/dt (m/s, rad/s) at a Motion's place and heading."""
     kappa = compute_curvature(road, motion.s)
     if small_angle:
@@ -226,14 +228,14 @@ def _compute_course_rates(
 @inline
 def derivative(
     motion: Motion,
-    load: Any,
+    load: TyreLoad,
     disturbance: DisturbanceForces,
     car: CarParams,
     road: RoadParams,
     small_angle: int,
     law: int,
     roll: int = 0,
-) -> Any:
+) -> Motion:
     """Compute the time derivative of a Motion.
 
     Args:
@@ -251,9 +253,8 @@ def derivative(
     """
     gravity = compute_gravity(motion, road, small_angle)
     rate = compute_rates(motion, load, disturbance, car, gravity, small_angle, law, roll)
-    dX, dY, ds, dy, dtheta = _compute_course_rates(
-        motion, motion.v_x, motion.v_y, road, small_angle
-    )
+    course = _compute_course_rates(motion, motion.v_x, motion.v_y, road, small_angle)
+    dX, dY, ds, dy, dtheta = course
     return Motion(
         rate.v_x, rate.v_y, rate.gamma, motion.gamma, dX, dY, ds, dy, dtheta, rate.phi, rate.phi_dot
     )  # fmt: skip
@@ -278,7 +279,7 @@ def compute_sideslip_angle(v_x: Scalar, v_y: Scalar, small_angle: int) -> Scalar
 
 
 @jit
-def _step_euler(start: Any, h: Scalar, rate: Any) -> Any:
+def _step_euler(start: Velocity, h: Scalar, rate: Velocity) -> Velocity:
     """Velocity start + h rate, written out so that it compiles for every number type."""
     return Velocity(
         start.v_x + h * rate.v_x,
@@ -296,7 +297,7 @@ def _average(first: Scalar, middle: Scalar, last: Scalar) -> Scalar:
 
 
 @jit
-def _average_velocities(a: Any, b: Any, c: Any) -> Any:
+def _average_velocities(a: Velocity, b: Velocity, c: Velocity) -> Velocity:
     """Mean of three Velocities by Simpson's rule."""
     return Velocity(
         _average(a.v_x, b.v_x, c.v_x),
@@ -308,7 +309,7 @@ def _average_velocities(a: Any, b: Any, c: Any) -> Any:
 
 
 @jit
-def _average_two(a: Any, b: Any) -> Any:
+def _average_two(a: Velocity, b: Velocity) -> Velocity:
     """Mean of two Velocities."""
     return Velocity(
         0.5 * (a.v_x + b.v_x),
@@ -320,7 +321,9 @@ def _average_two(a: Any, b: Any) -> Any:
 
 
 @inline
-def _compute_mid_gravity(motion: Any, road: Any, h: Scalar, small_angle: int) -> Any:
+def _compute_mid_gravity(
+    motion: Motion, road: RoadParams, h: Scalar, small_angle: int
+) -> tuple[Scalar, Scalar]:
     """Measured gravity (m/s2) in the middle of a step of h seconds, extrapolated from its start."""
     s_mid = motion.s + 0.5 * h * motion.v_x
     if not any_lane((road.lateral != 0.0) | (road.longitudinal != 0.0)):
@@ -334,8 +337,9 @@ def _compute_mid_gravity(motion: Any, road: Any, h: Scalar, small_angle: int) ->
 
 @inline
 def _integrate_motion(
-    motion: Any, middle: Any, end: Any, mean: Any, road: Any, h: Scalar, small_angle: int
-) -> Any:
+    motion: Motion, middle: Velocity, end: Velocity, mean: Velocity, road: RoadParams, h: Scalar,
+    small_angle: int,
+) -> Motion:  # fmt: skip
     """Motion after h seconds from the velocities halfway, at the end and in the mean."""
     # Forces do not depend on place and heading, which follow here once a step. The mean of the
     # turning velocity is the mean velocity in the mean direction, but for its length, 1 - r^2 / 24
@@ -348,9 +352,8 @@ def _integrate_motion(
     psi = motion.psi + h * (motion.gamma + 2.0 * middle.gamma) * (1.0 / 6.0)  # in the mean
     s, y, theta = motion.s, motion.y, motion.theta
     if any_lane(road.curvature != 0.0) or any_lane(road.turn != 0.0):
-        _, _, ds, dy, dtheta = _compute_course_rates(
-            motion, motion.v_x, motion.v_y, road, small_angle
-        )
+        course = _compute_course_rates(motion, motion.v_x, motion.v_y, road, small_angle)
+        _, _, ds, dy, dtheta = course
         s, y, theta = s + half * ds, y + half * dy, theta + half * dtheta
     mid_motion = Motion(
         v_x, v_y, mean.gamma, psi, motion.X, motion.Y, s, y, theta, end.phi, end.phi_dot
@@ -365,7 +368,7 @@ def _integrate_motion(
 @inline
 def kutta3(
     motion: Motion,
-    load: tuple[Any, Any, Any],
+    load: tuple[TyreLoad, TyreLoad, TyreLoad],
     disturbance: DisturbanceForces,
     car: CarParams,
     road: RoadParams,
@@ -373,7 +376,7 @@ def kutta3(
     small_angle: int,
     law: int,
     roll: int = 0,
-) -> Any:
+) -> Motion:
     """Integrate the plant over h seconds by Kutta's third-order rule (errors: docs/physics.md).
 
     Args:
@@ -398,16 +401,14 @@ def kutta3(
     end = _step_euler(_step_euler(start, 0.0 - h, a), 2.0 * h, b)
     c = compute_rates(end, load[2], disturbance, car, gravity, small_angle, law, roll)
     mean = _average_velocities(start, middle, end)
-    return _integrate_motion(
-        motion, middle, _step_euler(start, h, _average_velocities(a, b, c)), mean, road, h,
-        small_angle,
-    )  # fmt: skip
+    last = _step_euler(start, h, _average_velocities(a, b, c))
+    return _integrate_motion(motion, middle, last, mean, road, h, small_angle)
 
 
 @inline
 def rk4(
     motion: Motion,
-    load: tuple[Any, Any, Any],
+    load: tuple[TyreLoad, TyreLoad, TyreLoad],
     disturbance: DisturbanceForces,
     car: CarParams,
     road: RoadParams,
@@ -415,7 +416,7 @@ def rk4(
     small_angle: int,
     law: int,
     roll: int = 0,
-) -> Any:
+) -> Motion:
     """Integrate the plant over h seconds, longer in plans, by the classical Runge-Kutta method.
 
     Args:

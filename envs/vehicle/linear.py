@@ -4,13 +4,13 @@ The compiled functions write the matrices, here and in the filters.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ..numerics.jit import as_python, jit
-from ..numerics.primitives import Matrix, Scalar
+from ..numerics.primitives import Matrix, Scalar, Vector
 from .parameters import GRAVITY, Vehicle
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def compute_bicycle_coefficients(
     C_f: Scalar,
     C_r: Scalar,
     V: Scalar,
-) -> Any:
+) -> tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]:
     """Compute the coefficients of the linear bicycle, tie-vision (8).
 
     Args:
@@ -63,7 +63,7 @@ def compute_bicycle_coefficients(
 
 @jit
 def write_lateral(
-    A: Matrix, B: Matrix, car: Any, V: Scalar, states: int, inputs: int, preview: Scalar
+    A: Matrix, B: Matrix, car: Vector, V: Scalar, states: int, inputs: int, preview: Scalar
 ) -> None:
     """Write the linear lateral model into A and B; entries that are zero are left alone.
 
@@ -94,7 +94,7 @@ def write_lateral(
 
 
 @jit
-def write_roll(A: Matrix, B: Matrix, i: int, column: int, K: Scalar, C: Scalar, S: Any) -> None:
+def write_roll(A: Matrix, B: Matrix, i: int, column: int, K: Scalar, C: Scalar, S: Scalar) -> None:
     """Write phi and phi_dot, driven by a_y, into A and B: double-layer-gps (3).
 
     Args:
@@ -259,27 +259,11 @@ def make_roll_model(vehicle: Vehicle) -> LinearModel:
     return LinearModel(A, B, np.array([[0.0, 1.0]]), ("phi", "phi_dot"), ("a_y",), ("phi_dot",))
 
 
-def make_kinematic_model(gamma: float) -> LinearModel:
-    """Make the model of v_x and v_y from both specific forces, double-layer-gps (4)-(5).
-
-    It has no roll and no bank. The output is v_x, which wheels measure; at zero yaw rate v_y is
-    unobservable.
-
-    Args:
-        gamma: Yaw rate (rad/s).
-
-    Returns:
-        The model.
-    """
-    A, B = np.zeros((2, 2)), np.zeros((2, 2))
-    _write_kinematic(A, B, gamma)
-    return LinearModel(A, B, np.array([[1.0, 0.0]]), ("v_x", "v_y"), ("a_x", "a_y"), ("v_x",))
-
-
 def make_velocity_roll_model(vehicle: Vehicle, gamma: float) -> LinearModel:
     """Make the model of v_x, v_y, phi and phi_dot from both specific forces, double-layer-gps (42).
 
-    Outputs are v_x and v_y, which the GPS and the first layer measure, and phi_dot.
+    Outputs are v_x and v_y, which the GPS and the first layer measure, and phi_dot. Without a yaw
+    rate v_y is unobservable from v_x alone.
 
     Args:
         vehicle: The vehicle.

@@ -175,27 +175,6 @@ def critical_speed(vehicle: Vehicle) -> float:
     return math.sqrt(product / (vehicle.mass * excess))
 
 
-COMS = Vehicle(  # Table I of tie-vision; front track, height of the centre and roll are assumed
-    name="coms",
-    mass=380.0,
-    yaw_inertia=136.08,
-    front_arm=0.8,
-    rear_arm=0.6,
-    front_stiffness=6000.0,
-    rear_stiffness=6000.0,
-    front_track=0.84,
-    rear_track=0.82,
-    wheel_radius=0.22,
-    gravity_height=0.45,
-    motor_torque=100.0,
-    width=1.095,  # the maker's
-    sprung_mass=300.0,
-    roll_arm=0.35,
-    roll_inertia=60.0,
-    roll_stiffness=8000.0,
-    roll_damping=324.0,
-)
-
 PASSENGER_CAR = Vehicle(  # a compact electric car with two 700 N m in-wheel motors
     name="passenger-car",
     mass=1500.0,
@@ -309,8 +288,10 @@ def _parse_vehicle(values: dict[str, Any], strict: bool, is_complete: bool = Fal
     return vehicle
 
 
+_PRESETS = Path(__file__).parent / "presets"
+COMS = _read_vehicle(_PRESETS / "coms.toml")
 VEHICLES: dict[str, Vehicle] = {"coms": COMS, "passenger-car": PASSENGER_CAR}
-"""Vehicles by name: two presets, and those of recorded drives, from files."""
+"""Vehicles by name: two presets, and those of recorded drives; all but one from files."""
 
-for _path in sorted((Path(__file__).parent / "presets").glob("*.toml")):
-    VEHICLES[_path.stem] = _read_vehicle(_path)
+for _path in sorted(_PRESETS.glob("*.toml")):
+    VEHICLES.setdefault(_path.stem, _read_vehicle(_path))

@@ -5,12 +5,20 @@ in `TYRE_LAWS` and its equation in `compute_lateral_forces`. `estimators.core.mo
 once more, with slopes; a test holds both equal.
 """
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..numerics.functions import atan, sincos
 from ..numerics.jit import inline, jit
 from ..numerics.primitives import Scalar, absolute, any_lane, maximum, minimum, sqrt
 from .parameters import GRAVITY
+
+if TYPE_CHECKING:
+    from typing import TypeAlias
+
+    from .dynamics import CarParams as Car
+    from .dynamics import Motion, Velocity
+
+    State: TypeAlias = Motion | Velocity
 
 TYRE_LAWS = ("linear", "fiala", "dugoff")
 """The laws by the names that `Scenario.tyres` takes; a law's code is its place."""
@@ -30,21 +38,19 @@ class TyreInputs(NamedTuple):
 class TyreLoad(NamedTuple):
     """Steering, drive forces and lateral capacities under one instant's inputs."""
 
-    sin_d: Any  # sine of the front steering angle
-    cos_d: Any  # its cosine
+    sin_d: Scalar  # sine of the front steering angle
+    cos_d: Scalar  # its cosine
     steer: Scalar  # rad, the angle itself
     F_x: Scalar  # N, drive force
     N_z: Scalar  # N m, yaw moment of the motors
     limit_f: Scalar  # N, lateral capacity of one front tyre, of the left and of the right rear tyre
-    limit_l: Any
-    limit_r: Any
-    slope_f: Any  # C / (3 F_max) of the same tyres
-    slope_l: Any
-    slope_r: Any
-    rear_l: (
-        Scalar  # N, capacity of the left and the right rear tyre in all directions, without roll
-    )
-    rear_r: Any
+    limit_l: Scalar
+    limit_r: Scalar
+    slope_f: Scalar  # C / (3 F_max) of the same tyres
+    slope_l: Scalar
+    slope_r: Scalar
+    rear_l: Scalar  # N, of the left and right rear tyre in all directions, without roll
+    rear_r: Scalar
     F_l: Scalar  # N, drive force that the left motor commands
     F_r: Scalar  # N, that of the right motor
 
@@ -72,7 +78,7 @@ def has_load_shift(small_angle: int, law: int, roll: int) -> int:
 
 @inline
 def _compute_axle_shift(
-    F_l: Scalar, F_r: Scalar, rear_l: Scalar, rear_r: Scalar, weight: Scalar, car: Any
+    F_l: Scalar, F_r: Scalar, rear_l: Scalar, rear_r: Scalar, weight: Scalar, car: "Car"
 ) -> Scalar:
     """Load F_x h_x / (2 l) (N) that drive moves from each front wheel to the rear one behind it."""
     # F_x is within the tyres' standing capacity, so that it does not depend on its own effect.
@@ -125,20 +131,20 @@ def compute_tyre_load(inputs: Any, car: Any, small_angle: int, load_shift: int =
 class Tyre(NamedTuple):
     """One tyre at one instant."""
 
-    tangent: Any  # t, tangent of its slip angle; on the small-angle plant the angle itself
+    tangent: Scalar  # t, tangent of its slip angle; on the small-angle plant the angle itself
     limit: Scalar  # N, F_max: mu F_z, less what the friction circle leaves to the drive force
-    slope: Any  # C / (3 F_max)
+    slope: Scalar  # C / (3 F_max)
 
 
 @jit
-def _linear(tyre: Any, small_angle: int) -> Scalar:
+def _linear(tyre: Tyre, small_angle: int) -> Scalar:
     """Lateral force (N) F_y = C atan t, without a limit."""
     angle = tyre.tangent if small_angle else atan(tyre.tangent)
     return 3.0 * tyre.limit * (tyre.slope * angle)
 
 
 @jit
-def _fiala(tyre: Any) -> Scalar:
+def _fiala(tyre: Tyre) -> Scalar:
     """Lateral force (N) F_max z (3 - 3 |z| + z^2), z = clip(C t / (3 F_max), -1, 1)."""
     # Pacejka, Tire and Vehicle Dynamics, 3
     z = minimum(maximum(tyre.slope * tyre.tangent, -1.0), 1.0)
@@ -146,7 +152,7 @@ def _fiala(tyre: Any) -> Scalar:
 
 
 @jit
-def _dugoff(tyre: Any) -> Scalar:
+def _dugoff(tyre: Tyre) -> Scalar:
     """Lateral force (N) C t q (2 - q), q = min(1, F_max / (2 C |t|))."""
     # Dugoff, Fancher, Segel, SAE 700377, 1970. With u = C t / F_max it is F_max u up to |u| = 1/2
     # and F_max (1 - 1 / (4 |u|)) from there on, always below the limit.
@@ -180,7 +186,9 @@ def compute_lateral_forces(a: Tyre, b: Tyre, c: Tyre, d: Tyre, law: int, small_a
 
 
 @jit
-def _compute_slip_ratios(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
+def _compute_slip_ratios(
+    motion: "State", load: TyreLoad, car: "Car", small_angle: int
+) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """Numerator and denominator (m/s) of the tangents of the front and the rear slip angle."""
     front = motion.v_y + car.l_f * motion.gamma
     rear = motion.v_y - car.l_r * motion.gamma
@@ -194,7 +202,9 @@ def _compute_slip_ratios(motion: Any, load: Any, car: Any, small_angle: int) -> 
 
 
 @jit
-def compute_slips(motion: Any, load: TyreLoad, car: Any, small_angle: int) -> Any:
+def compute_slips(
+    motion: "State", load: TyreLoad, car: "Car", small_angle: int
+) -> tuple[Scalar, Scalar]:
     """Compute the tangents of the front and rear slip angle.
 
     Args:
@@ -211,20 +221,12 @@ def compute_slips(motion: Any, load: TyreLoad, car: Any, small_angle: int) -> An
 
 
 @inline
-def compute_load_transfer(motion: Any, car: Any, g_y: Scalar) -> Any:
-    """Compute the fraction of its standing load that each axle's left wheel gives to its right.
+def _compute_load_transfer(motion: "State", car: "Car", g_y: Scalar) -> tuple[Scalar, Scalar]:
+    """Fractions (-0.9 to 0.9) of its load that the front and the rear left wheel give to the right.
 
     The suspension transmits K_x phi + C_x phi_dot; the moment of the rest of the car's height,
     (M h - M_s h_s) a_y, acts at once, with a_y = v_x gamma and gravity. Each axle bears it in
     proportion to its standing load.
-
-    Args:
-        motion: `Motion` or `Velocity` of the car.
-        car: `CarParams`.
-        g_y: Lateral gravity that the car feels on a banked road (m/s2).
-
-    Returns:
-        (front, rear), from -0.9 to 0.9.
     """
     direct = (car.m * car.h - car.S) * (motion.v_x * motion.gamma + g_y)
     moment = car.K_x * motion.phi + car.C_x * motion.phi_dot + direct
@@ -236,8 +238,8 @@ def compute_load_transfer(motion: Any, car: Any, g_y: Scalar) -> Any:
 
 @inline
 def compute_tyre_forces(
-    motion: Any, load: TyreLoad, car: Any, g_y: Scalar, small_angle: int, law: int, roll: int
-) -> Any:
+    motion: "State", load: TyreLoad, car: "Car", g_y: Scalar, small_angle: int, law: int, roll: int
+) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """Compute the forces of the axles and the moment of the motors.
 
     Args:
@@ -252,19 +254,15 @@ def compute_tyre_forces(
     Returns:
         (F_yf, F_yr, F_x, N_z): lateral forces of the axles, drive force (N), yaw moment (N m).
     """
-    if has_load_shift(small_angle, law, roll):
-        a, b, c, d, F_x, N_z = _compute_shifted_tyres(motion, load, car, g_y)
-        F_fl, F_fr, F_rl, F_rr = compute_lateral_forces(a, b, c, d, law, 0)
-        return F_fl + F_fr, F_rl + F_rr, F_x, N_z
-    a, b, c, d, F_x, N_z = _compute_static_tyres(motion, load, car, small_angle)
+    a, b, c, d, F_x, N_z = compute_tyres(motion, load, car, g_y, small_angle, law, roll)
     F_fl, F_fr, F_rl, F_rr = compute_lateral_forces(a, b, c, d, law, small_angle)
     return F_fl + F_fr, F_rl + F_rr, F_x, N_z
 
 
 @inline
 def compute_tyres(
-    motion: Any, load: TyreLoad, car: Any, g_y: Scalar, small_angle: int, law: int, roll: int
-) -> Any:
+    motion: "State", load: TyreLoad, car: "Car", g_y: Scalar, small_angle: int, law: int, roll: int
+) -> tuple[Tyre, Tyre, Tyre, Tyre, Scalar, Scalar]:
     """Compute the state of the four tyres, and the motors' drive force and yaw moment.
 
     Args:
@@ -281,12 +279,6 @@ def compute_tyres(
     """
     if has_load_shift(small_angle, law, roll):
         return _compute_shifted_tyres(motion, load, car, g_y)
-    return _compute_static_tyres(motion, load, car, small_angle)
-
-
-@inline
-def _compute_static_tyres(motion: Any, load: Any, car: Any, small_angle: int) -> Any:
-    """`compute_tyres` where roll moves no load."""
     t_f, t_r = compute_slips(motion, load, car, small_angle)
     front = Tyre(t_f, load.limit_f, load.slope_f)
     left = Tyre(t_r, load.limit_l, load.slope_l)
@@ -295,18 +287,18 @@ def _compute_static_tyres(motion: Any, load: Any, car: Any, small_angle: int) ->
 
 
 @inline
-def _compute_shifted_tyres(motion: Any, load: Any, car: Any, g_y: Scalar) -> Any:
+def _compute_shifted_tyres(
+    motion: "State", load: TyreLoad, car: "Car", g_y: Scalar
+) -> tuple[Tyre, Tyre, Tyre, Tyre, Scalar, Scalar]:
     """`compute_tyres` where roll moves load from side to side; all quotients come from one."""
     across_f, along_f, across_r, along_r = _compute_slip_ratios(motion, load, car, 0)
-    e_f, e_r = compute_load_transfer(motion, car, g_y)
+    e_f, e_r = _compute_load_transfer(motion, car, g_y)
     relieved, burdened = 1.0 - e_f, 1.0 + e_f
     rear_l, rear_r = load.rear_l * (1.0 - e_r), load.rear_r * (1.0 + e_r)
     F_l = minimum(maximum(load.F_l, 0.0 - rear_l), rear_l)
     F_r = minimum(maximum(load.F_r, 0.0 - rear_r), rear_r)
-    square_l, square_r = (
-        _compute_squared_capacity(rear_l, F_l),
-        _compute_squared_capacity(rear_r, F_r),
-    )
+    square_l = _compute_squared_capacity(rear_l, F_l)
+    square_r = _compute_squared_capacity(rear_r, F_r)
     left, right = sqrt(square_l), sqrt(square_r)
     sides, squares = relieved * burdened, square_l * square_r
     inv_product = 1.0 / (along_f * along_r * (sides * squares))

@@ -1,11 +1,12 @@
 """The analytic camera: heading relative to the road, and lateral offset at the preview point."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ...numerics.functions import CHANNELS, PI, wrap
 from ...numerics.jit import inline, jit
 from ...numerics.primitives import Scalar, Vector, absolute, select
-from ...vehicle.dynamics import compute_curvature
+from ...vehicle.dynamics import Motion, RoadParams, compute_curvature
+from ..inertial import Noise
 from ..link import Blocks, PacketValue, SlowKind
 
 CAMERA_KIND = SlowKind(
@@ -24,7 +25,7 @@ class FieldOfView(NamedTuple):
 
 
 @jit
-def compute_lane_quality(motion: Any, field_of_view: FieldOfView) -> Scalar:
+def compute_lane_quality(motion: Motion, field_of_view: FieldOfView) -> Scalar:
     """Compute the quality of a camera sample.
 
     Args:
@@ -55,7 +56,7 @@ def compute_preview_offset(y: Scalar, psi: Scalar, kappa: Scalar, l_pre: Scalar)
 
 
 @jit
-def compute_lane_offset(motion: Any, road: Any, l_pre: Scalar) -> Scalar:
+def compute_lane_offset(motion: Motion, road: RoadParams, l_pre: Scalar) -> Scalar:
     """Compute the lateral offset at the preview point of a car on a road.
 
     Args:
@@ -72,7 +73,9 @@ def compute_lane_offset(motion: Any, road: Any, l_pre: Scalar) -> Scalar:
 
 
 @jit
-def sample_camera(motion: Any, road: Any, l_pre: Scalar, noise: Any, n: Vector) -> Any:
+def sample_camera(
+    motion: Motion, road: RoadParams, l_pre: Scalar, noise: Noise, n: Vector
+) -> tuple[Scalar, Scalar]:
     """Sample the camera's heading relative to the road and its lateral offset, with noise.
 
     Args:

@@ -6,7 +6,7 @@ the extra `vision`.
 
 from dataclasses import dataclass, fields
 from math import cos, sin
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -80,7 +80,7 @@ class RoadRenderer:
         self.rows = slice(first, last)
         self._rays = np.moveaxis(camera.compute_rays(first, last), -1, 0).astype(np.float32).copy()
 
-    def render_picture(self, scene: RoadScene, seed: Any = 0) -> Image:
+    def render_picture(self, scene: RoadScene, seed: int | tuple[int, int] = 0) -> Image:
         """Render the picture of a scene.
 
         Args:
@@ -134,11 +134,11 @@ class RoadRenderer:
         return np.asarray(light, np.float32)
 
 
-def _make_rotation(roll: float, pitch: float) -> Any:
+def _make_rotation(roll: float, pitch: float) -> npt.NDArray[np.float64]:
     """Rotation matrix (3, 3) from body axes to the road's."""
     roll_matrix = np.array([[1, 0, 0], [0, cos(roll), -sin(roll)], [0, sin(roll), cos(roll)]])
     pitch_matrix = np.array([[cos(pitch), 0, sin(pitch)], [0, 1, 0], [-sin(pitch), 0, cos(pitch)]])
-    return pitch_matrix @ roll_matrix
+    return np.asarray(pitch_matrix @ roll_matrix, float)
 
 
 def _compute_lane_coordinates(X: _Flat, Y: _Flat, scene: RoadScene) -> tuple[_Flat, _Flat]:

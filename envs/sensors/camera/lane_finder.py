@@ -51,7 +51,7 @@ class _LaneFit(NamedTuple):
     side: npt.NDArray[np.int64]  # of each point: 1 on the left marking, -1 on the right one, or 0
     error: Array  # (2,), standard errors of psi in rad and of y_l in m
 
-    def compute_support(self, weight: Array) -> float:
+    def _compute_support(self, weight: Array) -> float:
         """Weight of the points on both markings, dominated by the weaker one's."""
         left, right = (float(np.sum(weight[self.side == side])) for side in (1, -1))
         return min(left, right) + 0.25 * (left + right)
@@ -64,7 +64,7 @@ class _FitStart(NamedTuple):
     values: Array  # (5,), psi, y, kappa, pitch and roll
 
 
-class CameraMount(NamedTuple):
+class _CameraMount(NamedTuple):
     """Place of a camera, and the lane that it looks for."""
 
     height: float  # m
@@ -92,19 +92,10 @@ def _draw_triples(x: Array, y: Array, weight: Array, rng: np.random.Generator) -
     return np.stack([a, b, c])[:, np.flatnonzero(is_marking)[:_MAX_TRIPLES]]
 
 
-def search_starts(x: Array, y: Array, weight: Array, mount: CameraMount) -> list[_FitStart]:
-    """Search starts of a fit: pairs of markings that hold many of the points.
+def _search_starts(x: Array, y: Array, weight: Array, mount: _CameraMount) -> list[_FitStart]:
+    """Starts of a fit: pairs of markings that hold many of the points, the best first.
 
     The random draws depend on the number of points alone.
-
-    Args:
-        x: Distance of the points ahead (m), shape (n,).
-        y: Distance of the points to the left (m), shape (n,).
-        weight: Weight of each point, shape (n,).
-        mount: Place of the camera.
-
-    Returns:
-        Starts, the best first; none where no three points can be a marking.
     """
     if len(x) < 6:
         return []
@@ -138,7 +129,7 @@ def search_starts(x: Array, y: Array, weight: Array, mount: CameraMount) -> list
 
 
 def _correct_attitude(
-    x: Array, y: Array, pitch: float, roll: float, mount: CameraMount
+    x: Array, y: Array, pitch: float, roll: float, mount: _CameraMount
 ) -> tuple[Array, Array]:
     """(ahead, left) (m) of points on the road, from their places seen without pitch and roll."""
     (sp, cp), (sr, cr) = ((np.sin(angle), np.cos(angle)) for angle in (pitch, roll))
@@ -162,7 +153,7 @@ def _project_to_lane(
 
 
 def _fit_lane(
-    x: Array, y: Array, deviation: Array, start: Array, mount: CameraMount
+    x: Array, y: Array, deviation: Array, start: Array, mount: _CameraMount
 ) -> _LaneFit | None:
     """Lane by Gauss-Newton least squares from a start (5,); None without both markings' points."""
     values, half = start, 0.5 * mount.width
@@ -247,7 +238,7 @@ class LaneFinder:
             )
         self.camera, self.view = camera, view
         self._scale = scale = camera.size[0] / WORKING_WIDTH
-        self._mount = CameraMount(camera.height, camera.ahead, camera.preview, lane_width)
+        self._mount = _CameraMount(camera.height, camera.ahead, camera.preview, lane_width)
         steps = camera.K[1][1] / scale * camera.height * (1.0 / near - 1.0 / far)  # picture's rows
         self.rows_ahead = 1.0 / np.linspace(1.0 / near, 1.0 / far, max(int(steps), 20))
         self._y = np.arange(side, -side, -_CELL)
@@ -291,10 +282,10 @@ class LaneFinder:
         self.points, self.fit = np.stack([x, y], 1), None
         focal = self.camera.K[0][0] / self._scale
         weight, deviation = np.minimum(strength, 40.0), 0.03 + 2.0 * x / focal
-        starts = search_starts(x, y, weight, self._mount)
+        starts = _search_starts(x, y, weight, self._mount)
         fits = (_fit_lane(x, y, deviation, start.values, self._mount) for start in starts)
         candidates = [fit for fit in fits if fit is not None]
-        best = max(candidates, key=lambda fit: fit.compute_support(weight), default=None)
+        best = max(candidates, key=lambda fit: fit._compute_support(weight), default=None)
         if best is None or (quality := self._compute_quality(best, x)) == 0.0:
             return Lane()
         self.fit = best

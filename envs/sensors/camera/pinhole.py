@@ -5,7 +5,6 @@ Car axes: X forward, Y left, Z up, from the road below the centre of gravity. Ne
 
 import dataclasses
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from math import cos, radians, sin
 from typing import Any
@@ -62,27 +61,6 @@ class Pinhole:
         object.__setattr__(self, "size", size)
 
     @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> "Pinhole":
-        """Make a camera from names and values.
-
-        Args:
-            values: Values by the names of fields.
-
-        Returns:
-            The camera.
-
-        Raises:
-            ValueError: For an unknown name or a value out of place.
-        """
-        known = [field.name for field in dataclasses.fields(cls)]
-        if unknown := [name for name in values if name not in (*known, *_MEASURED)]:
-            raise ValueError(describe_unknown("camera field", unknown, known))
-        try:
-            return cls(**{name: values[name] for name in values if name in known})
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"a camera's fields: {error}") from None
-
-    @classmethod
     def read(cls, path: "str | os.PathLike[str]") -> "Pinhole":
         """Read a camera from a TOML or JSON file.
 
@@ -98,10 +76,13 @@ class Pinhole:
         values = read_document(path, "camera")
         if missing := {"K", "dist", "size"} - values.keys():
             raise ValueError(f"{path}: a camera needs {', '.join(sorted(missing))}")
+        known = [field.name for field in dataclasses.fields(cls)]
+        if unknown := [name for name in values if name not in (*known, *_MEASURED)]:
+            raise ValueError(f"{path}: {describe_unknown('camera field', unknown, known)}")
         try:
-            return cls.from_mapping(values)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+            return cls(**{name: values[name] for name in values if name in known})
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path}: a camera's fields: {error}") from None
 
     def write(self, path: "str | os.PathLike[str]", **measured: float) -> None:
         """Write a file that `read` reads back.

@@ -20,7 +20,7 @@ from sideslip.agents.training.gradient import (
 )
 from sideslip.agents.training.normalise import RewardScale
 from sideslip.agents.vec_env import make_vec_env
-from sideslip.envs.device import DeviceVectorEnv
+from sideslip.envs.device import make_device_env
 
 VISION, FUSION = "sideslip/YawVision-v0", "sideslip/YawFusion-v0"
 SHORT = {"scenario": {"base": "sine-with-dwell", "duration": 0.03}, "control_period": 2}
@@ -28,7 +28,7 @@ SHORT = {"scenario": {"base": "sine-with-dwell", "duration": 0.03}, "control_per
 
 def cars_of(count: int, **options: Any) -> Any:
     how: dict[str, Any] = {"grad": True, "autoreset_mode": "SameStep", **SHORT, **options}
-    return DeviceVectorEnv.make(VISION, count, **how)
+    return make_device_env(VISION, count, **how)
 
 
 def policy_of(cars: Any) -> Any:

@@ -36,7 +36,7 @@ from sideslip.agents.training.warm_start import (
     resolve_settings,
 )
 from sideslip.agents.vec_env import make_vec_env
-from sideslip.envs.device import DeviceVectorEnv
+from sideslip.envs.device import make_device_env
 
 POLICY = load_policy("distill-coms-yaw")
 SHORT = {"scenario": {"base": "coms-slalom", "duration": 0.3}}
@@ -167,7 +167,7 @@ def test_what_cars_meet_does_not_depend_on_who_drives_them_nor_on_what() -> None
         firsts.append(obs)
     assert np.array_equal(*firsts)
     how = {"autoreset_mode": "SameStep", "dtype": "float32", **task.env_options}
-    cars: Any = DeviceVectorEnv.make(task.env_id, 2, **how)
+    cars: Any = make_device_env(task.env_id, 2, **how)
     seen, _ = cars.reset(seed=[5, 6])
     for _ in range(60):
         seen, *_ = cars.step(torch.zeros(2, 1))

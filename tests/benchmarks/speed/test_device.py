@@ -1,4 +1,4 @@
-"""The device engine's table in a small form."""
+"""The gradient engine's table in a small form."""
 
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from sideslip.benchmarks.speed import device as device_speed  # noqa: E402
-from sideslip.envs.device.torch_env import DeviceVectorEnv  # noqa: E402
+from sideslip.envs.device import make_device_env  # noqa: E402
 
 ENV_ID = "sideslip/YawVision-v0"
 
@@ -32,7 +32,7 @@ def test_the_table_has_a_line_for_each_size_and_says_how_it_was_made(
 
 def test_every_round_takes_its_steps() -> None:
     """One round more than is counted, the first of them."""
-    env: Any = DeviceVectorEnv.make(ENV_ID, 2)
+    env: Any = make_device_env(ENV_ID, 2)
     steps: list[Any] = []
     env.step = steps.append
     found = device_speed.measure(env, 1e9, rounds=2, steps=3)

@@ -1,4 +1,4 @@
-"""The device engine beside the compiled one: one env-step from many moments of whole episodes.
+"""The gradient engine beside the compiled one: one env-step from many moments of whole episodes.
 
 The compiled engine drives a few episodes; each of their steps is a row of one batch on the device,
 which takes that step from the very same state.
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sideslip.envs import StabilityVectorEnv
-from sideslip.envs.device.torch_env import DeviceVectorEnv
+from sideslip.envs.device import TensorVectorEnv, make_device_env
 from sideslip.envs.engine.layout import STATE_WIDTH, Z
 from sideslip.envs.record import PACKET, PACKET_WIDTH
 
@@ -75,11 +75,11 @@ def episodes(env_id: str, steps: int, every: int = 1, **arguments: Any) -> Momen
     return drive(batch(env_id, 3, **arguments), steps, every)
 
 
-def device_step(env_id: str, moments: Moments, **arguments: Any) -> tuple[Any, DeviceVectorEnv]:
+def device_step(env_id: str, moments: Moments, **arguments: Any) -> tuple[Any, TensorVectorEnv]:
     """(what the device's step returned, the env after it) from these moments."""
     import torch
 
-    env = DeviceVectorEnv.make(env_id, len(moments.actions), **arguments)
+    env = make_device_env(env_id, len(moments.actions), **arguments)
     env.set_state(moments.before)
     return env.step(torch.as_tensor(moments.actions, device=env.device)), env
 
@@ -114,7 +114,7 @@ def largest_error(one: dict[str, Any], other: dict[str, Any]) -> float:
     return worst
 
 
-def agrees(env_id: str, moments: Moments, **arguments: Any) -> DeviceVectorEnv:
+def agrees(env_id: str, moments: Moments, **arguments: Any) -> TensorVectorEnv:
     """The device's step from these moments is the compiled engine's; returns the env after it."""
     returned, env = device_step(env_id, moments, **arguments)
     obs, rewards, terminated, truncated, infos = returned

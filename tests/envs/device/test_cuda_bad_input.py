@@ -1,5 +1,6 @@
 """Without a driver, without memory, on another GPU: the CUDA engine says what is missing."""
 
+import re
 from collections.abc import Callable
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -35,15 +36,18 @@ def test_rows_that_do_not_fit_are_refused_with_how_many_would(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     config = StabilityVectorEnv(1).config
-    sizes = make_specification(
-        make_constants(config, "NextStep", record=False), np.float64, 1000, 1
-    )
-    needed = cuda_env.count_bytes(sizes)
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (needed // 2, needed))
-    with pytest.raises(MemoryError, match=r"1000 rows of \d+ bytes .* on cuda:0.*at most 499 rows"):
-        cuda_env.check_memory(sizes, 1000, torch.device("cuda:0"))
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (needed, needed))
-    cuda_env.check_memory(sizes, 1000, torch.device("cuda:0"))
+    constants = make_constants(config, "NextStep", record=False)
+    sizes = make_specification(constants, np.float64, 1000, 1)
+    free, device = 0, torch.device("cuda:0")
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, free))
+    with pytest.raises(MemoryError, match=r"1000 rows of \d+ bytes .* on cuda:0") as refused:
+        cuda_env.check_memory(sizes, 1000, device)
+    row = int(re.findall(r"(\d+) bytes", str(refused.value))[0])
+    free = 500 * row - 1
+    with pytest.raises(MemoryError, match="at most 499 rows"):
+        cuda_env.check_memory(sizes, 1000, device)
+    free = 1000 * row
+    cuda_env.check_memory(sizes, 1000, device)
 
 
 @pytest.fixture
@@ -74,7 +78,7 @@ def driver(monkeypatch: pytest.MonkeyPatch) -> Callable[..., SimpleNamespace]:
     monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
     stream = SimpleNamespace(cuda_stream=77)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
-    monkeypatch.setattr(cuda_launch, "make_context_current", lambda device: None)
+    monkeypatch.setattr(cuda_launch, "_make_context_current", lambda device: None)
     return fake
 
 

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("numba_cuda")
 
-from sideslip.envs.device.cuda_kernel import draw_key, read_words
+from sideslip.envs.device.cuda_kernel import _draw_key, read_words
 
 pytestmark = pytest.mark.plain
 
@@ -16,5 +16,5 @@ def test_keys_are_those_of_numpys_generator() -> None:
     for i, generator in enumerate(generators):
         for _ in range(5):
             key = int(generator.integers(0, 2**64, dtype=np.uint64))
-            assert draw_key(words[:, i]) == (key & 0xFFFFFFFF, key >> 32)
+            assert _draw_key(words[:, i]) == (key & 0xFFFFFFFF, key >> 32)
     assert np.array_equal(words, read_words(generators))  # and it stands where NumPy's does

@@ -13,7 +13,6 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("numba_cuda")
 
 from sideslip.envs import StabilityVectorEnv  # noqa: E402
-from sideslip.envs.device import DeviceVectorEnv  # noqa: E402
 from sideslip.envs.device.cuda_env import CudaVectorEnv  # noqa: E402
 from sideslip.envs.device.cuda_text import SIMULATED  # noqa: E402
 
@@ -31,10 +30,7 @@ FUSION: dict[str, Any] = {"sensors": "fusion", "scenario": SHORT, "on_bad_action
 
 def both(mode: str = "NextStep", **arguments: Any) -> tuple[CudaVectorEnv, StabilityVectorEnv]:
     told = FUSION | arguments
-    ours = DeviceVectorEnv(
-        N, engine="cuda", device=DEVICE, autoreset_mode=mode, record=True, **told
-    )
-    assert isinstance(ours, CudaVectorEnv)
+    ours = CudaVectorEnv(N, device=DEVICE, autoreset_mode=mode, record=True, **told)
     return ours, StabilityVectorEnv(N, autoreset_mode=mode, **told)
 
 
@@ -206,7 +202,7 @@ def test_a_snapshot_of_another_env_is_refused() -> None:
             ours.set_state(other.get_state())
     for wrong in (tuple(ours.get_state()), {"rows": 1}):
         with pytest.raises(ValueError, match="a snapshot of this engine is a Snapshot, got"):
-            ours.set_state(wrong)  # type: ignore[arg-type]
+            ours.set_state(wrong)
     assert torch.equal(ours.motion, before)
     fresh, _ = both()
     ours.set_state(fresh.get_state())

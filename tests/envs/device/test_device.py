@@ -1,4 +1,4 @@
-"""The device engine takes the steps of the compiled one: the same equations, noise and sensors."""
+"""The gradient engine takes the steps of the compiled one: equations, noise and sensors."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from ..helpers import FULL, IDS, unwrapped
 
 torch = pytest.importorskip("torch")
 
-from sideslip.envs.device.torch_env import DeviceVectorEnv  # noqa: E402
+from sideslip.envs.device import make_device_env  # noqa: E402
 from sideslip.envs.engine.layout import Z  # noqa: E402
 from sideslip.envs.numerics import functions as noise  # noqa: E402
 from sideslip.envs.numerics.torch_backend import to_torch  # noqa: E402
@@ -144,7 +144,7 @@ def test_a_row_that_fails_stops_at_that_tick(
 @pytest.mark.plain
 def test_a_batch_has_the_episodes_of_its_seeds() -> None:
     """Row i of reset(seed=s) is the single environment of s + i."""
-    env = DeviceVectorEnv.make(UNEVEN, 4, camera={"phase": None})
+    env = make_device_env(UNEVEN, 4, camera={"phase": None})
     obs, infos = env.reset(seed=11)
     for i in range(4):
         alone = unwrapped(UNEVEN, camera={"phase": None})
@@ -162,7 +162,8 @@ def test_episodes_follow_each_other_as_in_the_vector_env(mode: str) -> None:
         "autoreset_mode": mode,
         "steering": True,
     }
-    one, other = batch(FUSION, 5, **told), DeviceVectorEnv.make(FUSION, 5, **told)
+    one: Any = batch(FUSION, 5, **told)
+    other: Any = make_device_env(FUSION, 5, **told)
     one.reset(seed=[3, 1, None, 2**40, 9])
     one.np_random[2].bit_generator.state = np.random.default_rng(0).bit_generator.state
     other.set_state(one.get_state())
@@ -192,7 +193,7 @@ def test_episodes_follow_each_other_as_in_the_vector_env(mode: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("name", DRIVEN)
 def test_a_second_of_stable_driving_is_the_same(name: str) -> None:
-    one, other = batch(name, 8), DeviceVectorEnv.make(name, 8)
+    one, other = batch(name, 8), make_device_env(name, 8)
     one.reset(seed=2)
     other.reset(seed=2)
     for step in range(100):
@@ -228,8 +229,8 @@ def test_float32_costs_little(scenario: str) -> None:
 
 @pytest.mark.long
 def test_float32_costs_little_in_a_second() -> None:
-    one = DeviceVectorEnv.make(FUSION, 32)
-    other = DeviceVectorEnv.make(FUSION, 32, dtype=torch.float32)
+    one = make_device_env(FUSION, 32)
+    other = make_device_env(FUSION, 32, dtype=torch.float32)
     for env in (one, other):
         env.reset(seed=2)
         for step in range(100):
@@ -241,7 +242,7 @@ def test_float32_costs_little_in_a_second() -> None:
 
 @pytest.mark.plain
 def test_whoever_has_a_result_may_write_into_it() -> None:
-    env = DeviceVectorEnv.make(FUSION, 2)
+    env = make_device_env(FUSION, 2)
     idle = np.zeros((2, 1))
     for first in (True, False):
         obs, infos = env.reset(seed=0) if first else env.step(idle)[::4]
@@ -255,7 +256,7 @@ def test_whoever_has_a_result_may_write_into_it() -> None:
 @pytest.mark.plain
 def test_a_snapshot_goes_on_in_the_compiled_engine() -> None:
     """There and back: what a device leaves out of a state nobody needs."""
-    env = DeviceVectorEnv.make(FUSION, 3, camera={"duplicate": 0.5})
+    env = make_device_env(FUSION, 3, camera={"duplicate": 0.5})
     env.reset(seed=0)
     host = batch(FUSION, 3, camera={"duplicate": 0.5})
     for step in range(6):
@@ -271,7 +272,7 @@ def test_a_snapshot_goes_on_in_the_compiled_engine() -> None:
 
 
 def test_spaces_and_layout_are_those_of_the_vector_env() -> None:
-    env = DeviceVectorEnv.make(FUSION, 2)
+    env = make_device_env(FUSION, 2)
     host = batch(FUSION, 2)
     assert isinstance(host, StabilityVectorEnv)
     assert env.observation_space == host.observation_space

@@ -1,4 +1,4 @@
-"""The device engine refuses bad input at the border, and steps nothing."""
+"""The gradient engine refuses bad input at the border, and steps nothing."""
 
 import os
 import subprocess
@@ -16,7 +16,7 @@ from ..helpers import bits
 
 torch = pytest.importorskip("torch")
 
-from sideslip.envs.device.torch_env import DeviceVectorEnv  # noqa: E402
+from sideslip.envs.device import DeviceVectorEnv, make_device_env  # noqa: E402
 
 pytestmark = pytest.mark.plain
 
@@ -47,7 +47,7 @@ ARGUMENTS: list[tuple[dict[str, Any], type[Exception], str]] = [
 @pytest.mark.parametrize(("arguments", "error", "message"), ARGUMENTS, ids=str)
 def test_arguments(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
-        DeviceVectorEnv.make(FUSION, **(FEW | arguments))
+        make_device_env(FUSION, **(FEW | arguments))
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
@@ -58,7 +58,7 @@ def test_a_device_that_is_not_there_is_named_with_those_that_are() -> None:
 
 def test_a_device_is_called_as_its_tensors_call_it() -> None:
     """Or their actions would be refused: those of cuda:0 where the env is on cuda."""
-    env = DeviceVectorEnv.make(FUSION, 2, device="cpu:0")
+    env = make_device_env(FUSION, 2, device="cpu:0")
     assert env.device == torch.zeros(1, device=env.device).device == torch.device("cpu")
     env.reset(seed=0)
     env.step(torch.zeros(2, 1, device=env.device))
@@ -74,14 +74,14 @@ def test_without_a_compiler_nothing_is_compiled_and_a_warning_says_so(
 ) -> None:
     monkeypatch.setenv("CXX", "no-such-compiler")
     with pytest.warns(RuntimeWarning, match="there is no 'no-such-compiler': ticks are not compi"):
-        env = DeviceVectorEnv.make(FUSION, 2, compile=True, control_period=1)
+        env = make_device_env(FUSION, 2, compile=True, control_period=1)
     env.reset(seed=0)
     env.step(torch.zeros(2, 1))
 
 
 def test_an_id_that_has_no_such_environment() -> None:
     with pytest.raises(ValueError, match="sideslip/Outside-v0 has no environment on the device"):
-        DeviceVectorEnv.make("sideslip/Outside-v0", 2)
+        make_device_env("sideslip/Outside-v0", 2)
 
 
 STILL = torch.zeros(3, 1)
@@ -100,7 +100,7 @@ BAD: list[tuple[Any, str]] = [
 
 @pytest.mark.parametrize(("actions", "message"), BAD, ids=lambda told: str(told)[:40])
 def test_bad_actions_are_refused_and_nothing_is_stepped(actions: Any, message: str) -> None:
-    env = DeviceVectorEnv.make(FUSION, 3, control_period=2)
+    env = make_device_env(FUSION, 3, control_period=2)
     env.reset(seed=0)
     env.step(STILL)
     before = bits(env.get_state()["states"])
@@ -113,7 +113,7 @@ def test_bad_actions_are_refused_and_nothing_is_stepped(actions: Any, message: s
 @pytest.mark.parametrize("bad", [torch.nan, -torch.inf])
 def test_a_bad_action_may_fail_its_row_and_leaves_the_others_their_bits(bad: float) -> None:
     told: dict[str, Any] = {"control_period": 3, "on_bad_action": "fail"}
-    env, beside = (DeviceVectorEnv.make(AFS, 3, **told) for _ in range(2))
+    env, beside = (make_device_env(AFS, 3, **told) for _ in range(2))
     actions = torch.full((3, 2), 0.5)
     for each in (env, beside):
         each.reset(seed=4)
@@ -136,24 +136,24 @@ def test_a_bad_action_may_fail_its_row_and_leaves_the_others_their_bits(bad: flo
 
 
 def test_a_plant_of_another_kind_is_refused_and_nothing_is_reset() -> None:
-    env = DeviceVectorEnv.make(FUSION, 2)
+    env = make_device_env(FUSION, 2)
     env.reset(seed=0)
     before = env.get_state()
     with pytest.raises(ValueError, match=r"all rows have one kind of plant.*'dakf-fig6'"):
         env.reset(seed=1, options={"scenario": ["straight", "dakf-fig6"]})
     after = env.get_state()
     assert bits(before["states"]) == bits(after["states"])
-    after["configs"] = DeviceVectorEnv.make(FUSION, 2, scenario="dakf-fig6").get_state()["configs"]
+    after["configs"] = make_device_env(FUSION, 2, scenario="dakf-fig6").get_state()["configs"]
     with pytest.raises(ValueError, match="one kind of plant"):
         env.set_state(after)
     with pytest.raises(ValueError, match="the snapshot has 3 rows"):
-        env.set_state(DeviceVectorEnv.make(FUSION, 3).get_state())
+        env.set_state(make_device_env(FUSION, 3).get_state())
     with pytest.raises(ValueError, match=r"a snapshot of this engine is a mapping, got \(1, 2\)"):
-        env.set_state((1, 2))  # type: ignore[arg-type]
+        env.set_state((1, 2))
 
 
 def test_what_was_not_started_or_is_over_waits_for_a_reset() -> None:
-    env = DeviceVectorEnv.make(
+    env = make_device_env(
         FUSION, 2, autoreset_mode="Disabled", scenario={"base": "straight", "duration": 0.01}
     )
     with pytest.raises(ResetNeeded, match=r"call reset\(\) first"):

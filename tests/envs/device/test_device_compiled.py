@@ -1,10 +1,10 @@
-"""The device engine by `torch.compile`: the same steps, compiled once."""
+"""The gradient engine by `torch.compile`: the same steps, compiled once."""
 
 import pytest
 
 torch = pytest.importorskip("torch")
 
-from sideslip.envs.device.torch_env import DeviceVectorEnv  # noqa: E402
+from sideslip.envs.device import make_device_env  # noqa: E402
 
 from .moments import FUSION, UNEVEN, agrees, episodes  # noqa: E402
 
@@ -32,6 +32,6 @@ def test_more_environments_are_compiled_than_torch_allows_for_one_text(
         lambda f, fullgraph, options: whole(f, fullgraph=fullgraph, backend="eager"),
     )
     for period in range(1, 4):
-        env = DeviceVectorEnv.make(UNEVEN, 2, control_period=period, compile=True)
+        env = make_device_env(UNEVEN, 2, control_period=period, compile=True)
         env.reset(seed=0)
         assert env.step(torch.zeros(2, 1))[0].shape == (2, len(env.layout))

@@ -7,8 +7,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from sideslip.envs.device import TensorVectorEnv, make_device_env  # noqa: E402
 from sideslip.envs.device.gradients import GradientGate  # noqa: E402
-from sideslip.envs.device.torch_env import DeviceVectorEnv  # noqa: E402
 from sideslip.envs.record import PACKET  # noqa: E402
 
 from .moments import DRIVEN, FUSION  # noqa: E402
@@ -25,7 +25,7 @@ INPUTS = STATE | PARAMETERS | ACTIONS
 STEPS = 7  # in the last of which the camera's second picture arrives
 
 
-def drive(env: DeviceVectorEnv, inputs: dict[str, Any]) -> Any:
+def drive(env: TensorVectorEnv, inputs: dict[str, Any]) -> Any:
     """A number of each row (N,) that all observations, rewards and infos of a drive enter.
 
     inputs: tensors (N,). "first" and "last" are the first action and the others.
@@ -60,10 +60,10 @@ def test_a_gate_lets_slopes_through_to_the_open_rows_alone(shape: tuple[int, ...
 def test_gradients_are_central_differences_on_every_id(name: str, device: str) -> None:
     """To actions, the state at the start and parameters. Two rows of one drive move each input."""
     here: dict[str, Any] = {"dtype": torch.float64, "device": device}
-    env = DeviceVectorEnv.make(name, 1, grad=True, device=device)
+    env = make_device_env(name, 1, grad=True, device=device)
     inputs = {key: torch.tensor([at], **here).requires_grad_() for key, (at, _) in INPUTS.items()}
     drive(env, inputs).sum().backward()
-    many = DeviceVectorEnv.make(name, 2 * len(INPUTS), grad=True, device=device)
+    many = make_device_env(name, 2 * len(INPUTS), grad=True, device=device)
     moved = {key: torch.full((many.num_envs,), at, **here) for key, (at, _) in INPUTS.items()}
     for i, (key, (_, by)) in enumerate(INPUTS.items()):
         moved[key][2 * i : 2 * i + 2] += torch.tensor([by, -by], **here)
@@ -77,7 +77,7 @@ def test_gradients_are_central_differences_on_every_id(name: str, device: str) -
 
 def test_a_picture_knows_nothing_of_the_last_thirty_milliseconds() -> None:
     """One action a tick: what arrives at tick 63 was seen at 33."""
-    env = DeviceVectorEnv.make(VISION, 2, grad=True, control_period=1)
+    env = make_device_env(VISION, 2, grad=True, control_period=1)
     env.reset(seed=1)
     actions = torch.full((63, 2, 1), 0.2, dtype=torch.float64, requires_grad=True)
     for action in actions:
@@ -101,7 +101,7 @@ def test_numbers_are_those_without_gradients(reference: str) -> None:
     scenario = {"base": "random-steering", "duration": 0.05}
     arguments: dict[str, Any] = {"scenario": scenario, "reference": reference}
     one, other = (
-        DeviceVectorEnv.make(FUSION, 3, autoreset_mode="SameStep", grad=grad, **arguments)
+        make_device_env(FUSION, 3, autoreset_mode="SameStep", grad=grad, **arguments)
         for grad in (False, True)
     )
     first, second = one.reset(seed=7)[0], other.reset(seed=7)[0]
@@ -123,7 +123,7 @@ def test_numbers_are_those_without_gradients(reference: str) -> None:
         assert exact.requires_grad == (step != 4)  # then an episode ends, and the next one begins
 
 
-def late_observer(env: DeviceVectorEnv, gains: Any, feedback: Any, steps: int) -> Any:
+def late_observer(env: TensorVectorEnv, gains: Any, feedback: Any, steps: int) -> Any:
     """The return (N,) of feedback from a fixed-gain observer of a gyro and a late camera.
 
     gains: (3,), of the gyro on slip and yaw rate, and of the picture on the heading. The picture is
@@ -148,7 +148,7 @@ def late_observer(env: DeviceVectorEnv, gains: Any, feedback: Any, steps: int) -
 
 
 def test_gains_of_an_observer_of_late_pictures_have_gradients() -> None:
-    env = DeviceVectorEnv.make(VISION, 2, grad=True, reference="model")
+    env = make_device_env(VISION, 2, grad=True, reference="model")
     gains = torch.tensor([-0.02, 0.9, 0.3], dtype=torch.float64, requires_grad=True)
     late_observer(env, gains, -4.0, 12).sum().backward()
     for i in range(3):

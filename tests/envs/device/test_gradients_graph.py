@@ -11,7 +11,7 @@ from ..helpers import FULL
 
 torch = pytest.importorskip("torch")
 
-from sideslip.envs.device.torch_env import DeviceVectorEnv  # noqa: E402
+from sideslip.envs.device import DeviceVectorEnv, make_device_env  # noqa: E402
 from sideslip.envs.engine.layout import P  # noqa: E402
 
 from ..batches import batch  # noqa: E402
@@ -25,7 +25,9 @@ def leaf(*values: float) -> Any:
 
 
 def made(count: int = 2, **arguments: Any) -> DeviceVectorEnv:
-    return DeviceVectorEnv.make(FUSION, count, grad=True, **{"control_period": 3, **arguments})
+    env = make_device_env(FUSION, count, grad=True, **{"control_period": 3, **arguments})
+    assert isinstance(env, DeviceVectorEnv)
+    return env
 
 
 def slope(of: Any, to: Any) -> Any:
@@ -232,6 +234,6 @@ def test_friction_is_that_of_both_sides_but_where_the_right_one_has_its_own() ->
 
 
 def test_parameters_need_gradients() -> None:
-    env = DeviceVectorEnv.make(FUSION, 2)
+    env = make_device_env(FUSION, 2)
     with pytest.raises(ValueError, match="unknown reset option parameters"):
         env.reset(options={"parameters": {"mass": leaf(400.0, 400.0)}})

@@ -77,17 +77,17 @@ class OwnPlant(OutsidePlant):
     law = "vehicle_dynamics_std"  # loaded, not used
     car: CarParams
 
-    def start(self, motion: Motion) -> None:
-        self.x = np.array(motion)
+    def _make_state(self, core: list[float], motion: Motion) -> Any:
+        return np.array(motion)
 
-    def derivative(self, x: Any, acting: OutsideInputs) -> Any:
+    def _compute_derivative(self, x: Any, acting: OutsideInputs) -> Any:
         raise NotImplementedError
 
     @property
     def motion(self) -> Motion:
         return Motion(*self.x.tolist())
 
-    def compute_specific_force(self, acting: OutsideInputs) -> tuple[float, float]:
+    def _compute_specific_force(self, acting: OutsideInputs) -> tuple[float, float]:
         raise NotImplementedError
 
     def step(self, acting: OutsideInputs, h: float) -> None:
@@ -237,7 +237,7 @@ def test_a_force_that_cannot_be_told_makes_the_state_no_number(
     def nothing(acting: OutsideInputs) -> tuple[float, float]:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(env.plant, "compute_specific_force", nothing)
+    monkeypatch.setattr(env.plant, "_compute_specific_force", nothing)
     *_, info = env.step([0.0])
     assert FAILURES[info["failure"]] == "not-finite"
     assert np.isfinite(env.record.fast).all()
@@ -250,51 +250,72 @@ def test_a_wheel_at_rest_in_a_spin_makes_the_state_no_number() -> None:
     assert not plant.is_finite
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("curvature", 0.01),
-        ("bank", 0.05),
-        ("grade", 0.05),
-        ("small_angle", True),
-        ("tyres", "linear"),
-        ("vehicle", {"mass": 1500.0}),
-        ("friction_right", 0.3),
-        ("tyre_change_time", 1.0),
+OURS: dict[str, Any] = {  # of our own plant and road
+    "curvature": 0.01, "bank": 0.05, "grade": 0.05, "small_angle": True, "tyres": "linear",
+    "vehicle": {"mass": 1500.0}, "friction_right": 0.3, "tyre_change_time": 1.0,
+}  # fmt: skip
+SLOW: list[dict[str, Any]] = [
+    {"speed": (0.99, 20.0)},
+    {"speed": 10.0, "speed_change": -9.5},
+    {"speed": 10.0, "acceleration": -1.0, "duration": 9.5},
+]
+COMES_DOWN = "'custom': its speed comes down to 0.* needs 1.0 m/s"
+REFUSED_SCENARIOS: list[tuple[str, dict[str, Any], str]] = [
+    *[("drift", {name: value}, f"{name} .* is of our own plant") for name, value in OURS.items()],
+    *[("multi-body", scenario, COMES_DOWN) for scenario in SLOW],
+    ("single-track", {"wind_height": 0.4}, "wind_height 0.4 rolls the body; the single-track"),
+    ("drift", {"wind_height": -0.4}, "wind_height -0.4 rolls the body; the drift"),
+    ("multi-body", {"roll": False}, "roll False; the multi-body model always rolls"),
+]
+REFUSED_OPTIONS: list[tuple[str, dict[str, Any], str]] = [
+    ("drift", {"vehicle": "coms"}, "its own vehicle"),
+    ("drift", {"state": {"s": 1.0}}, "s follows from X and Y"),
+    ("drift", {"state": {"phi": 0.1}}, "drift model has no roll"),
+    ("drift", {"wheels": 3}, "unknown reset option wheels"),
+    ("single-track", {"friction": 0.5}, "friction: the single-track model's tyres are linear"),
+    ("multi-body", {"scenario": SLOW[0]}, "comes down to 0"),
+    ("multi-body", {"scenario": SLOW[2] | {"duration": 1.0}, "duration": 9.5}, "comes down to 0"),
+    *[
+        ("multi-body", {"state": {"v_x": v_x}}, f"v_x is {v_x} m/s; the multi-body model needs 1.0")
+        for v_x in (0.9, -5.0)
     ],
-)
-def test_a_scenario_of_our_own_plant_is_refused(field: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=f"{field} .* is of our own plant"):
-        outside("drift", scenario={field: value})
-    env = outside("drift", scenario=STEP)
-    with pytest.raises(ValueError, match=field):
-        env.reset(options={"scenario": {field: value}})
+]
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"vehicle": "coms"}, "its own vehicle"),
-        ({"state": {"s": 1.0}}, "s follows from X and Y"),
-        ({"state": {"phi": 0.1}}, "drift model has no roll"),
-        ({"wheels": 3}, "unknown reset option wheels"),
-    ],
-)
-def test_an_option_that_has_no_meaning_is_refused(options: Any, message: str) -> None:
+@pytest.mark.parametrize(("model", "scenario", "message"), REFUSED_SCENARIOS, ids=str)
+def test_a_scenario_that_a_model_cannot_drive_is_refused(
+    model: str, scenario: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
-        outside("drift", scenario=STEP).reset(options=options)
+        outside(model, scenario=scenario)
+    with pytest.raises(ValueError, match=message):
+        outside(model, scenario=STEP).reset(options={"scenario": scenario})
 
 
-def test_unknown_models_and_vehicles_are_refused() -> None:
+@pytest.mark.parametrize(("model", "options", "message"), REFUSED_OPTIONS, ids=str)
+def test_an_option_that_has_no_meaning_is_refused(
+    model: str, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        outside(model, scenario=STEP).reset(options=options)
+
+
+def test_what_the_other_models_can_drive_is_allowed() -> None:
+    for scenario in SLOW:
+        outside("drift", scenario=scenario)
+    for model in MODELS:
+        allowed = {"wind_height": 0.4} if model == "multi-body" else {"roll": False}
+        outside(model, scenario=CALM | allowed).reset(seed=0)
+    outside("drift", scenario=STEP).reset(seed=0, options={"friction": 0.5})
+
+
+def test_unknown_models_and_vehicles_and_snapshots_of_another_are_refused() -> None:
     with pytest.raises(ValueError, match="unknown model 'brick'; known: single-track, drift"):
         outside("brick")
     with pytest.raises(TypeError, match="its own vehicle"):
         outside("drift", vehicle="coms")
-    env, other = outside("drift", scenario=STEP), outside("single-track", scenario=STEP)
-    env.reset(seed=0)
-    other.reset(seed=0)
     with pytest.raises(ValueError, match="'drift', not 'single-track'"):
-        other.set_state(env.get_state())
+        outside("single-track", scenario=STEP).set_state(outside("drift").get_state())
 
 
 def test_a_bad_action_is_refused_or_fails_as_in_every_environment() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from sideslip.agents.clairvoyant.preview import make_forecast
 from sideslip.envs import StabilityEnv, make_scenario
-from sideslip.envs.device.torch_env import DeviceVectorEnv
+from sideslip.envs.device import make_device_env
 from sideslip.envs.record import FAST
 from sideslip.envs.scenarios.manoeuvres import read_trace
 
@@ -117,4 +117,4 @@ def test_a_forecast_knows_the_trace_and_a_device_refuses_it() -> None:
     np.testing.assert_allclose(make_forecast(env).driver.ravel(), expected, rtol=0.0, atol=1e-15)
     pytest.importorskip("torch")
     with pytest.raises(ValueError, match="'custom': no trace is driven on a device"):
-        DeviceVectorEnv.make(VISION, scenario=TRACE)
+        make_device_env(VISION, scenario=TRACE)

@@ -8,7 +8,7 @@ import pytest
 
 from sideslip.agents.clairvoyant.preview import make_forecast
 from sideslip.envs import StabilityEnv
-from sideslip.envs.device.torch_env import DeviceVectorEnv
+from sideslip.envs.device import make_device_env
 from sideslip.envs.record import FAST
 
 from ..helpers import bits, drive_alike
@@ -70,4 +70,4 @@ def test_a_forecast_knows_the_angles_and_a_device_refuses_them() -> None:
     assert bits(make_forecast(env).driver.ravel()) == bits(commands())
     pytest.importorskip("torch")
     with pytest.raises(ValueError, match="'custom': no wander is driven on a device"):
-        DeviceVectorEnv.make("sideslip/YawVision-v0", scenario=WANDER)
+        make_device_env("sideslip/YawVision-v0", scenario=WANDER)

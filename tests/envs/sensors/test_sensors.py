@@ -10,7 +10,7 @@ from scipy import stats
 from sideslip.envs import COMS, StabilityEnv
 from sideslip.envs.record import FAST, PACKET
 from sideslip.envs.sensors.camera import sample_camera
-from sideslip.envs.sensors.gps import HDOP_LAWS, OUTAGE_JUMP, count_satellites, sample_gps
+from sideslip.envs.sensors.gps import HDOP_LAWS, OUTAGE_JUMP, _count_satellites, sample_gps
 from sideslip.envs.sensors.inertial import Noise
 from sideslip.envs.vehicle.dynamics import Motion, RoadParams
 
@@ -154,9 +154,9 @@ def test_gps_noise_follows_hdop_as_its_law_says(law: str, weight: float) -> None
 
 @pytest.mark.plain
 def test_satellites_fall_with_hdop_below_four() -> None:
-    seen = [count_satellites(hdop) for hdop in (0.5, 1.0, 1.4, 2.0, 5.0, 5.01, 11.0, 1e9)]
+    seen = [_count_satellites(hdop) for hdop in (0.5, 1.0, 1.4, 2.0, 5.0, 5.01, 11.0, 1e9)]
     assert seen == [22.0, 12.0, 9.0, 7.0, 4.0, 3.0, 2.0, 2.0]
-    assert count_satellites(1e-300) == 30.0
+    assert _count_satellites(1e-300) == 30.0
 
 
 def test_accelerometers_feel_the_forces_not_the_turning_axes() -> None:
@@ -264,6 +264,6 @@ def test_hdop_jumps_where_an_outage_ends() -> None:
     for tick, packet in cut.items():
         jump = math.log(packet[HDOP] / calm[tick][HDOP])
         assert jump == pytest.approx(OUTAGE_JUMP * 0.5 if tick >= 1100 else 0.0, abs=1e-6)
-        assert packet[SATELLITES] == count_satellites(packet[HDOP])
+        assert packet[SATELLITES] == _count_satellites(packet[HDOP])
         assert packet[PACKET.quality] == 1.0  # the filter refuses few satellites, not the sensor
     assert min(packet[SATELLITES] for packet in cut.values()) < 4.0

@@ -103,8 +103,3 @@ def test_a_car_that_brakes_in_a_turn_turns_in() -> None:
         env.reset(seed=0)
         rates.append(max(moment.info["gamma"] for moment in play(env, [0.0] * 250)[100:]))
     assert rates[1] > 1.02 * rates[0]
-
-
-def test_the_height_is_no_negative_number() -> None:
-    with pytest.raises(ValueError, match=r"Vehicle.transfer_height: -0.1 m is not zero or more"):
-        COMS.replace(transfer_height=-0.1)

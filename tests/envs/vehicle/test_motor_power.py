@@ -71,9 +71,3 @@ def test_braking_is_limited_too() -> None:
     play(env, [0.0])
     fall = (before - env.motion.v_x) / 0.01
     assert fall == pytest.approx(2.0 * 2000.0 / (COMS.mass * 8.0), rel=2e-3)
-
-
-def test_it_is_a_number_in_every_file_of_a_vehicle() -> None:
-    assert COMS.motor_power == 0.0
-    with pytest.raises(ValueError, match=r"Vehicle.motor_power: -1.0 W is not zero or more"):
-        COMS.replace(motor_power=-1.0)

@@ -30,7 +30,7 @@ from sideslip.envs.vehicle.tyres import (
     LINEAR,
     TYRE_LAWS,
     TyreInputs,
-    compute_load_transfer,
+    _compute_load_transfer,
     compute_tyre_forces,
     compute_tyre_load,
 )
@@ -198,7 +198,7 @@ def test_loads_move_by_the_moment_and_keep_their_sum(
 ) -> None:
     phi *= 0.1
     state = Motion(8.0, 0.0, gamma, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi, 0.1 * phi_dot)
-    front, rear = compute_load_transfer(state, car, 0.5)
+    front, rear = _compute_load_transfer(state, car, 0.5)
     weight = car.m * 9.81
     on_front, on_rear = (
         weight * car.l_r / (car.l_f + car.l_r),
@@ -238,7 +238,7 @@ def test_rear_tyres_stay_within_the_friction_circle_of_their_own_load(
     state = Motion(8.0, 10.0 * v_y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phi)
     load = compute_tyre_load(TyreInputs(0.0, T_l, T_r), CAR, 0)
     _, F_yr, F_x, N_z = compute_tyre_forces(state, load, CAR, 0.0, 0, law, 1)
-    share = compute_load_transfer(state, CAR, 0.0)[1]
+    share = _compute_load_transfer(state, CAR, 0.0)[1]
     left, right = load.rear_l * (1.0 - share), load.rear_r * (1.0 + share)
     F_l, F_r = 0.5 * F_x - N_z / CAR.d_r, 0.5 * F_x + N_z / CAR.d_r
     assert abs(F_l) <= left * (1.0 + 1e-12)

@@ -68,10 +68,14 @@ def dugoff(tangent: float, C: float, limit: float) -> float:
 
 
 @given(tangents, st.floats(100.0, 1e5), st.floats(10.0, 1e4))
-def test_dugoff_is_the_printed_law(tangent: float, C: float, limit: float) -> None:
-    force = lateral_force(tangent, limit, C / (3.0 * limit), DUGOFF)
-    assert force == pytest.approx(dugoff(tangent, C, limit), rel=1e-14)  # a few roundings
-    assert abs(force) <= limit
+def test_both_limited_laws_are_the_printed_ones(tangent: float, C: float, limit: float) -> None:
+    # Dugoff: a few roundings; Fiala's printed polynomial cancels near the limit: a few roundings
+    # of its largest term, 3 limit
+    curves = (dugoff(tangent, C, limit), 1e-14, 0.0), (fiala(tangent, C, limit), 0.0, 1e-14 * limit)
+    for law, (printed, rel, error) in zip((DUGOFF, FIALA), curves, strict=True):
+        force = lateral_force(tangent, limit, C / (3.0 * limit), law)
+        assert force == pytest.approx(printed, rel=rel, abs=error)
+        assert abs(force) <= limit
 
 
 @pytest.mark.parametrize("law", LIMITED)
@@ -98,14 +102,6 @@ def test_all_laws_are_the_linear_one_at_small_slip(u: float, C: float, limit: fl
             force = lateral_force(t, limit, C / (3.0 * limit), law, small_angle)
             off = {FIALA: abs(u) / 3.0, DUGOFF: 0.0, LINEAR: t * t / 3.0}[law]
             assert force == pytest.approx(C * t, rel=1.01 * off + 1e-14, abs=1e-300)
-
-
-@given(tangents, st.floats(100.0, 1e5), st.floats(10.0, 1e4))
-def test_fiala_is_the_printed_law(tangent: float, C: float, limit: float) -> None:
-    force = lateral_force(tangent, limit, C / (3.0 * limit), FIALA)
-    # the printed polynomial cancels near the limit: a few roundings of its largest term, 3 limit
-    assert force == pytest.approx(fiala(tangent, C, limit), abs=1e-14 * limit)
-    assert abs(force) <= limit
 
 
 @pytest.mark.smoke

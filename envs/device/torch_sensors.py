@@ -1,25 +1,22 @@
-"""Outputs of an env-step on tensors: slow sensors with their packets, observation and report.
+"""The slow sensors of an env-step on tensors, with their packets.
 
 A car's packets are sorted by (arrived, captured, sensor). An env-step appends the new ones, sorts
 all, and removes those that have arrived from the front.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from ..engine.layout import SLOW_STATE, SLOW_WIDTH, P, Switches, Z
+from ..engine.layout import SLOW_STATE, SLOW_WIDTH, P, Z
 from ..engine.outputs import NEVER_DUE, make_measurement_context
-from ..numerics.functions import clip
 from ..numerics.packed import read
 from ..numerics.primitives import select
 from ..numerics.torch_backend import to_torch, torch
-from ..record import FAST, PACKET, PACKET_WIDTH
+from ..record import PACKET, PACKET_WIDTH
 from ..sensors.link import Link, compute_arrivals, count_max_in_flight
-from ..sensors.slow import BLOCKS, NEEDS_QUALITY, VALUES, WIDTHS, sample_sensor
-from ..task import AGE_CAP, BAD_ACTION, N_SAMPLED, RUNNING, StepReport, compute_failure_cost
-from ..ticks import NEVER, TICK
+from ..sensors.slow import BLOCKS, NEEDS_QUALITY, VALUES, sample_sensor
+from ..ticks import NEVER
 from ..vehicle.dynamics import Motion
-from .torch_ticks import InfoValues, TickState
 
 Tensor = torch.Tensor
 _NEVER_KEY = 1 << 62  # sorts packets that never arrive behind all others
@@ -57,7 +54,15 @@ class PacketCapacity(NamedTuple):
 
 
 def compute_capacity(links: Sequence[Link], n: int) -> PacketCapacity:
-    """Compute the capacity for sensors with any of these links in an env-step of n ticks."""
+    """Compute the capacity for sensors with any of some links.
+
+    Args:
+        links: Links of the sensors.
+        n: Ticks of an env-step.
+
+    Returns:
+        The capacity.
+    """
     return PacketCapacity(
         max(-int(-n // link.period) for link in links),
         max(count_max_in_flight(link) for link in links),
@@ -66,7 +71,13 @@ def compute_capacity(links: Sequence[Link], n: int) -> PacketCapacity:
 
 
 class SlowSensors:
-    """Slow sensors of a batch: those present, by index, each with its capacity."""
+    """Slow sensors of a batch.
+
+    Args:
+        capacities: Capacity of each sensor present, by index.
+        small_angle: 1 for the small-angle plant, else 0.
+        dtype: Type of floats.
+    """
 
     def __init__(
         self, capacities: dict[int, PacketCapacity], small_angle: int, dtype: torch.dtype
@@ -174,7 +185,15 @@ def _remove_first(queue: Tensor, count: Tensor) -> Tensor:
 
 
 def read_packed(states: Tensor, capacity: int) -> SlowState:
-    """Read the slow sensors' part of states (STATE_WIDTH, N) with at most `capacity` packets."""
+    """Read the slow sensors' part of packed states.
+
+    Args:
+        states: Packed states, shape (STATE_WIDTH, N).
+        capacity: Largest number of packets under way.
+
+    Returns:
+        The state.
+    """
     if bool((states[Z.under_way] > capacity).any()):
         raise ValueError(f"a state has more than {capacity} packets under way")
     slow = states[Z.slow[0].frames : Z.queue].reshape(len(Z.slow), SLOW_WIDTH, -1)
@@ -185,7 +204,12 @@ def read_packed(states: Tensor, capacity: int) -> SlowState:
 
 
 def write_packed(state: SlowState, states: Tensor) -> None:
-    """Write the slow sensors' part into packed states (STATE_WIDTH, N)."""
+    """Write the slow sensors' part into packed states.
+
+    Args:
+        state: State of the slow sensors.
+        states: Packed states, shape (STATE_WIDTH, N).
+    """
     count = states.shape[1]
     states[Z.slow[0].frames : Z.queue] = state.slow.reshape(-1, count)
     states[Z.queue : Z.driver] = 0.0
@@ -194,87 +218,3 @@ def write_packed(state: SlowState, states: Tensor) -> None:
     arrived = state.queue[:, PACKET.arrived]
     states[Z.under_way] = (arrived != NEVER).sum(0).to(states.dtype)
     states[Z.clock.next_due] = torch.where(arrived[0] == NEVER, NEVER_DUE, arrived[0])
-
-
-class Observer:
-    """Observations and reports of a batch.
-
-    Args:
-        sensors: Slow sensors present, by index.
-        switches: Switches of the plant and the task.
-        bounds: Bounds of the observation's entries, shape (2, k).
-        dtype: Type of floats.
-        obs_dtype: Type of observations.
-    """
-
-    def __init__(
-        self, sensors: tuple[int, ...], switches: Switches, bounds: Tensor, dtype: torch.dtype,
-        obs_dtype: torch.dtype,
-    ) -> None:  # fmt: skip
-        self._obs_dtype = obs_dtype
-        self._sensors, self._switches = sensors, switches
-        self._bounds = bounds[:, :, None]
-        self._clip, self._select, self._compute_failure_cost = to_torch(
-            dtype, clip, select, compute_failure_cost
-        )
-
-    def observe(
-        self, rows: Tensor, done: Tensor, tick_state: TickState, slow: Tensor, delivered: Delivered
-    ) -> Tensor:
-        """Compute the observation (N, k) from the first `done` (N,) of rows (n, FAST_WIDTH, N)."""
-        entries: list[Tensor] = []
-        sampled = rows[:, :N_SAMPLED]
-        if self._switches.all_samples:
-            entries += sampled.transpose(0, 1).flatten(0, 1).unbind(0)
-        else:
-            total: Any = 0.0
-            for j in range(len(rows)):
-                total = total + self._select(j < done, sampled[j], 0.0)
-            entries += torch.stack((sampled[-1], total / done), 1).flatten(0, 1).unbind(0)
-        entries += rows[-1, FAST.steer : FAST.steer + 4].unbind(0)
-        if self._switches.with_map:
-            entries.append(rows[-1, FAST.curvature])
-        for sensor in self._sensors:
-            entries += self._read_sensor(sensor, tick_state.tick, slow[sensor], delivered)
-        info_values = InfoValues(*tick_state.shown)
-        entries += [info_values.beta_ref, info_values.gamma_ref]
-        low, high = self._bounds.unbind(0)
-        clipped: Tensor = self._clip(torch.stack(entries), low, high)
-        return clipped.T.to(self._obs_dtype).contiguous()
-
-    def _read_sensor(
-        self, sensor: int, tick: Tensor, slow: Tensor, delivered: Delivered
-    ) -> list[Tensor]:
-        """Read values, age and freshness of one sensor's newest sample."""
-        captured = slow[SLOW_STATE.captured]
-        age = self._select(captured != NEVER, (tick - captured) * TICK, AGE_CAP)
-        packets = delivered.packets
-        place = torch.arange(len(packets), device=tick.device)[:, None]
-        # the newest sample's own packet, neither an older one nor a duplicate
-        is_newest = packets[:, PACKET.arrived] == slow[SLOW_STATE.arrived]
-        is_fresh = (place < delivered.number) & (packets[:, PACKET.sensor] == sensor) & is_newest
-        values = [slow[i] for i in SLOW_STATE.values[: WIDTHS[sensor]]]
-        return [*values, age, is_fresh.any(0).to(tick.dtype)]
-
-    def report(self, tick_state: TickState, duration: Tensor, count: Tensor) -> Tensor:
-        """Compute the reports (len(StepReport), N) of cars that were stepped."""
-        failure_cost = self._compute_failure_cost(duration, tick_state.tick)
-        cost = tick_state.cost + self._select(tick_state.failure != RUNNING, failure_cost, 0.0)
-        info_values = InfoValues(*tick_state.shown)
-        values = {
-            "t": tick_state.tick * TICK, "beta": info_values.beta, "gamma": tick_state.motion[2],
-            "psi": tick_state.motion[3], "beta_ref": info_values.beta_ref,
-            "gamma_ref": info_values.gamma_ref, "steer": info_values.steer,
-            "yaw_moment": info_values.moment, "cost": cost, "failure": tick_state.failure,
-            "packets": count.to(cost.dtype), "reward": -cost,
-            "ended": (tick_state.tick >= duration).to(cost.dtype),
-        }  # fmt: skip
-        return torch.stack([values[name] for name in StepReport._fields])
-
-    def report_refusal(self, tick_state: TickState, duration: Tensor, before: Tensor) -> Tensor:
-        """Compute the reports of cars that fail by a non-finite action, from those before."""
-        cost = self._compute_failure_cost(duration, tick_state.tick)
-        values = dict(zip(StepReport._fields, before.unbind(0), strict=True))
-        values |= {"cost": cost, "reward": -cost, "packets": torch.zeros_like(cost)}
-        values["failure"] = torch.full_like(cost, BAD_ACTION)
-        return torch.stack([values[name] for name in StepReport._fields])

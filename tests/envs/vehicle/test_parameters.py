@@ -1,15 +1,86 @@
-"""One reader of vehicles: names, files and mappings; each refuses what is out of place."""
+"""Vehicles: their numbers, and the reader of names, files and mappings; what is refused."""
 
+import dataclasses
 import json
+import math
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import pytest
 
-from sideslip.envs import COMS, PASSENGER_CAR, VEHICLES, Vehicle, make_vehicle
+from sideslip.envs import COMS, PASSENGER_CAR, VEHICLES, Vehicle, critical_speed, make_vehicle
 from sideslip.envs.io import write_document
 
 pytestmark = pytest.mark.plain
+
+NUMBERS = [entry.name for entry in dataclasses.fields(Vehicle) if entry.name != "name"]
+MAY_BE_ZERO = ("motor_lag", "steering_lag", "motor_power", "transfer_height")
+PLACES = ("antenna_ahead", "antenna_left")
+
+
+@pytest.mark.smoke
+def test_coms_is_table_i() -> None:
+    assert COMS.lateral == (380.0, 136.08, 0.8, 0.6, 6000.0, 6000.0)
+    assert (COMS.rear_track, COMS.wheel_radius, COMS.motor_torque) == (0.82, 0.22, 100.0)
+    assert COMS.preview == 5.135
+    assert COMS.wheelbase == pytest.approx(1.4, rel=1e-15)
+
+
+@pytest.mark.smoke
+def test_critical_speed_of_the_coms_is_63_3_kmh() -> None:
+    assert round(critical_speed(COMS) * 3.6, 1) == 63.3
+
+
+def test_an_understeering_car_has_no_critical_speed() -> None:
+    assert critical_speed(PASSENGER_CAR) == math.inf
+    neutral = COMS.replace(front_arm=0.7, rear_arm=0.7)
+    assert critical_speed(neutral) == math.inf
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_every_parameter_has_a_unit_and_a_description(name: str) -> None:
+    metadata = Vehicle.__dataclass_fields__[name].metadata
+    assert metadata["unit"]
+    assert metadata["text"]
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+@pytest.mark.parametrize("value", [-1.0, 0.0, math.nan, math.inf])
+def test_values_that_cannot_be_are_refused_by_name(name: str, value: float) -> None:
+    """Zero is for some only, a negative number for places alone."""
+    allowed = {-1.0: PLACES, 0.0: PLACES + MAY_BE_ZERO}
+    if name in allowed.get(value, ()):
+        assert getattr(COMS.replace(**{name: value}), name) == value
+        return
+    rule = "zero or more and " if name in MAY_BE_ZERO else "positive and "
+    rule = "" if name in PLACES else rule
+    with pytest.raises(ValueError, match=rf"Vehicle\.{name}: {value!r} .* is not {rule}finite"):
+        COMS.replace(**{name: value})
+
+
+@pytest.mark.parametrize("value", ["380", None, True, [380.0]])
+def test_what_is_no_number_is_refused(value: Any) -> None:
+    with pytest.raises(TypeError, match=r"Vehicle\.mass: expected a number"):
+        COMS.replace(mass=value)
+
+
+def test_scaled_scales_the_stiffness_only() -> None:
+    soft = COMS.scale_stiffness(0.7)
+    assert (soft.front_stiffness, soft.rear_stiffness) == (4200.0, 4200.0)
+    apart = COMS.scale_stiffness(0.7, 1.3)
+    assert (apart.front_stiffness, apart.rear_stiffness) == (4200.0, 7800.0)
+    assert apart.replace(front_stiffness=6000.0, rear_stiffness=6000.0) == COMS
+
+
+def test_a_body_that_falls_over_or_has_no_inertia_cannot_roll() -> None:
+    for vehicle in VEHICLES.values():
+        vehicle.check_roll()
+    with pytest.raises(ValueError, match=r"roll_stiffness: 1000.0 .* M_s g h_s = 1030.05"):
+        COMS.replace(roll_stiffness=1000.0).check_roll()
+    with pytest.raises(ValueError, match=r"roll_inertia: 29.0 .* more than 29.01"):
+        COMS.replace(roll_inertia=29.0).check_roll()
+
 
 TOML = """\
 name = "mine"
@@ -120,13 +191,15 @@ def test_a_bad_file_is_refused(
 
 
 def test_a_file_that_is_none(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.toml: there is no such vehicle file"):
-        make_vehicle(tmp_path / "nowhere.toml")
-    with pytest.raises(ValueError, match=r"ends in \.toml or \.json"):
-        make_vehicle(tmp_path)
     (tmp_path / "folder.toml").mkdir()
-    with pytest.raises(ValueError, match="found a folder"):
-        make_vehicle(tmp_path / "folder.toml")
+    refusals: list[tuple[str, type[Exception], str]] = [
+        ("nowhere.toml", FileNotFoundError, r"nowhere\.toml: there is no such vehicle file"),
+        ("", ValueError, r"ends in \.toml or \.json"),
+        ("folder.toml", ValueError, "found a folder"),
+    ]
+    for name, error, message in refusals:
+        with pytest.raises(error, match=message):
+            make_vehicle(tmp_path / name)
 
 
 @pytest.mark.smoke
@@ -139,19 +212,16 @@ def test_the_vehicles_of_the_stanford_log_come_with_the_package() -> None:
     assert fitted.yaw_inertia == 1340.0
 
 
-def test_a_whole_mapping_is_per_tyre_and_builds_the_env_again() -> None:
+def test_an_env_takes_what_the_reader_takes_and_is_built_again(tmp_path: Path) -> None:
     soft = COMS.scale_stiffness(0.8)
     env = gym.make("sideslip/YawVision-v0", vehicle=soft.to_dict())
     assert env.spec is not None
     again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
     assert again.get_wrapper_attr("config").vehicle == soft
+    file = tmp_path / "mine.toml"
+    file.write_text(TOML)
+    env = gym.make("sideslip/YawVision-v0", vehicle=str(file))
+    assert env.get_wrapper_attr("config").vehicle.name == "mine"
     scenario = {"base": "straight", "vehicle": {"front_stiffness": 7000.0}}  # as of `Vehicle`
     env = gym.make("sideslip/YawVision-v0", scenario=scenario)
     assert env.get_wrapper_attr("_episode").vehicle.front_stiffness == 7000.0
-
-
-def test_an_env_takes_what_the_reader_takes(tmp_path: Path) -> None:
-    file = tmp_path / "mine.toml"
-    file.write_text(TOML)
-    env = gym.make("sideslip/YawVision-v0", vehicle=str(file)).unwrapped
-    assert env.config.vehicle.name == "mine"  # type: ignore[attr-defined]
