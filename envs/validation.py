@@ -56,7 +56,7 @@ def join_names(names: Iterable[str]) -> str:
     return textwrap.shorten(", ".join(names), 250, placeholder=" ...")
 
 
-def is_finite(value: object) -> TypeGuard[float]:
+def is_finite(value: Any) -> TypeGuard[float]:
     """Check whether a value is a number within +-MAX_NUMBER; True and False are none.
 
     Args:
@@ -65,9 +65,8 @@ def is_finite(value: object) -> TypeGuard[float]:
     Returns:
         True for a number.
     """
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        return False
-    return bool(abs(value) <= MAX_NUMBER)
+    is_number = isinstance(value, int | float | np.integer | np.floating)
+    return is_number and not isinstance(value, bool) and bool(abs(value) <= MAX_NUMBER)
 
 
 def check_number(name: str, value: object) -> float:

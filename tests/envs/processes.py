@@ -3,13 +3,18 @@
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 SOURCE = Path(__file__).resolve().parents[2] / "src"
 
 
 def start(
-    code: str, *arguments: str, cwd: Path | None = None, source: Path = SOURCE, **variables: str
+    code: str,
+    variables: Mapping[str, str],
+    *arguments: str,
+    cwd: Path | None = None,
+    source: Path = SOURCE,
 ) -> subprocess.Popen[str]:
     """Start code with every warning an error, without settings of the compiler but `variables`."""
     environment = {
@@ -19,7 +24,7 @@ def start(
     }
     return subprocess.Popen(
         [sys.executable, "-W", "error", "-c", code, *arguments],
-        env=environment | {"PYTHONPATH": str(source)} | variables,
+        env=environment | {"PYTHONPATH": str(source)} | dict(variables),
         cwd=cwd,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -106,7 +106,7 @@ def folder(tmp_path: Path) -> Path:
 def start(folder: Path, code: str = USE, **variables: str) -> subprocess.Popen[str]:
     variables = {"PYTHONPATH": f"{folder.parent}{os.pathsep}{processes.SOURCE}"} | variables
     code = f"from tiny import *\n{code}"
-    return processes.start(code, str(folder), cwd=folder.parent, **variables)
+    return processes.start(code, variables, str(folder), cwd=folder.parent)
 
 
 def run(folder: Path, code: str = USE, **variables: str) -> tuple[list[str], str]:

@@ -30,7 +30,7 @@ def copy(tmp_path: Path) -> Path:
 
 def run(code: str, home: Path, **variables: str) -> str:
     """Run code on the package in `home`; returns what it prints."""
-    process = processes.start(code, cwd=home.parent, source=home.parent, **variables)
+    process = processes.start(code, variables, cwd=home.parent, source=home.parent)
     return "\n".join(processes.finish(process)[0])
 
 

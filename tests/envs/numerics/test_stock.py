@@ -16,7 +16,7 @@ print("sideslip.envs.numerics.compiler" in sys.modules)
 
 def run(cache: Path, first: str = "", **variables: str) -> tuple[list[str], str]:
     code = f"import sys, numba\n{first}\n{USE}"
-    return finish(start(code, XDG_CACHE_HOME=str(cache), **variables))
+    return finish(start(code, {"XDG_CACHE_HOME": str(cache)} | variables))
 
 
 @pytest.fixture(scope="module")
