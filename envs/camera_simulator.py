@@ -48,7 +48,7 @@ class CameraSimulator:
         lane: Newest lane.
     """
 
-    def __init__(self, delay: str, appearance: Mapping[str, Any] | None) -> None:
+    def __init__(self, delay: str, appearance: Mapping[str, object] | None) -> None:
         with require_extra("vision", "vision='image' needs {}"):
             from .sensors.camera.images import Appearance, RoadRenderer, RoadScene
             from .sensors.camera.lane_finder import LaneFinder
@@ -67,7 +67,7 @@ class CameraSimulator:
         self.finder.find(np.zeros(self.finder.camera.size[::-1], np.uint8))  # warm
 
     def process_step(
-        self, before: Any, row: EpisodeArrays, done: int, bounds: Array, window: Array
+        self, before: Array, row: EpisodeArrays, done: int, bounds: Array, window: Array
     ) -> None:
         """Replay the slow sensors of a step, with pictures.
 
@@ -139,7 +139,9 @@ class CameraMixin:
     _state: Array
     _spec: EnvSpec | None = None
 
-    def _init_camera(self, vision: str, delay: str | None, appearance: Any) -> None:
+    def _init_camera(
+        self, vision: str, delay: str | None, appearance: Mapping[str, object] | None
+    ) -> None:
         if vision == "image":
             self.camera = CameraSimulator(delay or "fitted", appearance)
             self.metadata = {**self.metadata, **self.camera.metadata_flags}
@@ -158,6 +160,11 @@ class CameraMixin:
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
+        """Set the spec.
+
+        Args:
+            spec: Spec that states whether the env is deterministic.
+        """
         if spec is not None and self.camera is not None and self.camera.metadata_flags:
             spec.nondeterministic = True
         self._spec = spec

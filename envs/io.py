@@ -127,8 +127,13 @@ def read_document(source: "str | os.PathLike[str]", what: str) -> dict[str, Any]
     values = _parse_file(path, what)
     base = _find_base(path, values)
     if base is not None:
-        _check_base_cycle(path, base, what)
         values["base"] = str(base)
+    visited = {path.resolve()}
+    while base is not None:
+        if base.resolve() in visited:
+            raise ValueError(f"{path}: its base is the file itself, or leads back to it")
+        visited.add(base.resolve())
+        base = _find_base(base, _parse_file(base, what)) if has_suffix(base, _SUFFIXES) else None
     return values
 
 
@@ -155,7 +160,7 @@ def _parse_file(path: Path, what: str) -> dict[str, Any]:
     return values
 
 
-def _find_base(path: Path, values: Mapping[str, Any]) -> Path | None:
+def _find_base(path: Path, values: Mapping[str, object]) -> Path | None:
     """Path of the file beside a file that it names under `base`; None without one."""
     base = values.get("base")
     with contextlib.suppress(OSError, ValueError):  # a text that can be no file's name
@@ -164,17 +169,7 @@ def _find_base(path: Path, values: Mapping[str, Any]) -> Path | None:
     return None
 
 
-def _check_base_cycle(path: Path, base: Path | None, what: str) -> None:
-    """Check that a file's base, or the base of that, does not lead back to one of them."""
-    visited = {path.resolve()}
-    while base is not None:
-        if base.resolve() in visited:
-            raise ValueError(f"{path}: its base is the file itself, or leads back to it")
-        visited.add(base.resolve())
-        base = _find_base(base, _parse_file(base, what)) if has_suffix(base, _SUFFIXES) else None
-
-
-def write_document(path: "str | os.PathLike[str]", values: Mapping[str, Any]) -> None:
+def write_document(path: "str | os.PathLike[str]", values: Mapping[str, object]) -> None:
     """Write a mapping to a TOML or JSON file, which `read_document` reads back.
 
     Args:
@@ -195,7 +190,7 @@ def write_document(path: "str | os.PathLike[str]", values: Mapping[str, Any]) ->
     write_atomic(os.fspath(path), (text + "\n").encode())
 
 
-def to_toml(value: Any) -> str:
+def to_toml(value: object) -> str:
     """Format a value as TOML writes it behind a key.
 
     Args:
@@ -218,7 +213,7 @@ def _format_key(name: str) -> str:
     return name if name.isascii() and name.isidentifier() else to_toml(name)
 
 
-def from_json(kind: type[_DataclassT], entry: Any, where: str) -> _DataclassT:
+def from_json(kind: type[_DataclassT], entry: object, where: str) -> _DataclassT:
     """Make a dataclass's instance from a JSON object, whose lists may stand for tuples.
 
     Args:
@@ -234,7 +229,7 @@ def from_json(kind: type[_DataclassT], entry: Any, where: str) -> _DataclassT:
     """
     if not isinstance(entry, dict):
         raise ValueError(f"{where}: expected a JSON object, got {short_repr(entry)}")
-    known: dict[str, Any] = {spec.name: spec for spec in fields(kind)}
+    known = {spec.name: spec for spec in fields(kind)}
     required = {name for name, spec in known.items() if spec.default is spec.default_factory}
     for what, names in (("unknown", entry.keys() - known), ("missing", required - entry.keys())):
         if names:
@@ -248,7 +243,7 @@ def from_json(kind: type[_DataclassT], entry: Any, where: str) -> _DataclassT:
         raise ValueError(f"{where}: {error}") from None
 
 
-def check_types(kind: "type[DataclassInstance]", values: Mapping[str, Any], where: str) -> None:
+def check_types(kind: "type[DataclassInstance]", values: Mapping[str, object], where: str) -> None:
     """Check that values have the types of a dataclass's fields.
 
     Args:

@@ -1,7 +1,8 @@
 """StabilityEnv: the Gymnasium environment of a car that its yaw moment and steering stabilise."""
 
 import copy
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -14,15 +15,10 @@ from .engine.config import EnvConfig
 from .engine.layout import PARAMS_WIDTH, Z
 from .engine.reset import reset_vehicle
 from .engine.step import step_workspace
-from .engine.views import (
-    compute_true_states,
-    get_motion,
-    get_slow_sensors,
-    get_vehicle,
-    make_record,
-)
+from .engine.views import compute_true_states, get_slow_sensors, get_vehicle, make_record
 from .engine.workspace import WorkspaceMixin
 from .numerics.jit import compile_call
+from .numerics.packed import read
 from .record import Array, Record
 from .rendering.renderer import PackedArrays, SingleRenderMixin
 from .scenarios.manoeuvres import ScenarioSource, make_scenario
@@ -34,7 +30,11 @@ from .validation import parse_action, warn_once
 from .vehicle.dynamics import Motion
 from .vehicle.parameters import Vehicle, VehicleSource, make_vehicle
 
-_COMPILED_STEP: list[Any] = []  # `step_workspace` for an env's types, once one has stepped
+
+@functools.cache
+def _compile_step() -> Callable[..., int]:
+    """Compile `step_workspace` for the types that every environment has."""
+    return compile_call(step_workspace, np.zeros(1), np.zeros(1, np.float32))
 
 
 class StabilityEnv(
@@ -209,7 +209,7 @@ class StabilityEnv(
             raise ResetNeeded("the episode is over or was never started: call reset() first")
         command = parse_action(action, self._action_width, self._fail_on_bad_action)
         camera = self.camera
-        before = None if camera is None else self._state.copy()
+        before = self._state if camera is None else self._state.copy()
         done = self._advance(command)
         if done <= 0:
             if done == REFUSED:
@@ -229,9 +229,7 @@ class StabilityEnv(
 
     def _advance(self, command: npt.NDArray[np.float32]) -> int:
         """Advance one control period; returns the ticks done, or the code of a refusal."""
-        if not _COMPILED_STEP:
-            _COMPILED_STEP.append(compile_call(step_workspace, self._workspace, command))
-        done: int = _COMPILED_STEP[0](self._workspace, command)
+        done: int = _compile_step()(self._workspace, command)
         if done >= WILD:
             done -= WILD
             warn_once(self, command)
@@ -261,7 +259,7 @@ class StabilityEnv(
     @property
     def motion(self) -> Motion:
         """The true velocities, heading, place and roll now, in SI units."""
-        return get_motion(self._state)
+        return read(self._state, Z.motion)
 
     @property
     def true_state(self) -> Array:

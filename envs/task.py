@@ -29,13 +29,13 @@ REFERENCE_LAG = 0.1  # s
 class ReferenceParams(NamedTuple):
     """Coefficients of the steady-state responses of the nominal vehicle."""
 
-    b_0: Any  # l_r / l
-    b_1: Any  # s2/m2, M l_f / (2 l C_r l_r)
-    G: Any  # s2/m2, stability factor, dakf-stability (24)
+    b_0: Scalar  # l_r / l
+    b_1: Scalar  # s2/m2, M l_f / (2 l C_r l_r)
+    G: Scalar  # s2/m2, stability factor, dakf-stability (24)
     per_l: Scalar  # 1/m, 1 / l
     mu_g: Scalar  # m/s2, mu g
     G_lagged: Scalar  # s2/m2, stability factor of the lagged reference
-    rest: Any  # fraction of its deviation from the steady state that remains after a tick
+    rest: Scalar  # fraction of its deviation from the steady state that remains after a tick
 
 
 def make_reference_params(nominal: Vehicle) -> ReferenceParams:
@@ -65,7 +65,7 @@ def make_reference_params(nominal: Vehicle) -> ReferenceParams:
 @jit
 def compute_reference(
     steer: Scalar, v: Scalar, target: ReferenceParams, reference_kind: int
-) -> Any:
+) -> Vector:
     """Compute the steady-state reference for a steering command at a measured speed.
 
     zero-slip: (0, 0), the yaw rate is not judged. model: the nominal steady state, with
@@ -99,7 +99,7 @@ def compute_reference(
 @jit
 def filter_reference(
     before: Vector, steady: Vector, target: ReferenceParams, reference_kind: int
-) -> Any:
+) -> Vector:
     """Filter the reference over a tick: the lagged one approaches the steady state, others jump.
 
     Args:

@@ -11,7 +11,14 @@ NEVER = -1.0
 
 @jit
 def round_to_ticks(seconds: Scalar) -> Scalar:
-    """Round a time in seconds to whole ticks."""
+    """Round a time in seconds to whole ticks.
+
+    Args:
+        seconds: The time (s).
+
+    Returns:
+        The number of ticks.
+    """
     return floor(seconds / TICK + 0.5)
 
 
@@ -19,5 +26,12 @@ _round_to_ticks = as_python(round_to_ticks)
 
 
 def count_ticks(seconds: float) -> float:
-    """Round a time in seconds to whole ticks, without the compiler."""
+    """Round a time in seconds to whole ticks, without the compiler.
+
+    Args:
+        seconds: The time (s).
+
+    Returns:
+        The number of ticks.
+    """
     return float(_round_to_ticks(seconds))

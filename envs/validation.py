@@ -8,12 +8,15 @@ import operator
 import reprlib
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import logger
 from gymnasium.vector import AutoresetMode
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 Mask = npt.NDArray[np.bool_]
 Actions = npt.NDArray[np.float32]
@@ -27,7 +30,14 @@ _REPR.maxstring = _REPR.maxother = 80
 
 
 def short_repr(value: object) -> str:
-    """Format a value for a message, shortened."""
+    """Format a value for a message, shortened.
+
+    Args:
+        value: Any value.
+
+    Returns:
+        The text.
+    """
     try:
         return _REPR.repr(value)
     except Exception:  # such as an integer of thousands of digits
@@ -35,46 +45,97 @@ def short_repr(value: object) -> str:
 
 
 def join_names(names: Iterable[str]) -> str:
-    """Format names for a message, the first of them where they are many."""
+    """Format names for a message, the first of them where they are many.
+
+    Args:
+        names: The names.
+
+    Returns:
+        The text.
+    """
     return textwrap.shorten(", ".join(names), 250, placeholder=" ...")
 
 
-def is_finite(value: Any) -> bool:
-    """Check whether a value is a number within +-MAX_NUMBER; True and False are none."""
-    number = isinstance(value, int | float | np.integer | np.floating)
-    return number and not isinstance(value, bool) and bool(abs(value) <= MAX_NUMBER)
+def is_finite(value: Any) -> TypeGuard[float]:
+    """Check whether a value is a number within +-MAX_NUMBER; True and False are none.
+
+    Args:
+        value: Any value.
+
+    Returns:
+        True for a number.
+    """
+    is_number = isinstance(value, int | float | np.integer | np.floating)
+    return is_number and not isinstance(value, bool) and bool(abs(value) <= MAX_NUMBER)
 
 
-def check_number(name: str, value: Any) -> float:
-    """Check a number and convert it to float; ValueError, with its name, for another value."""
+def check_number(name: str, value: object) -> float:
+    """Check a number and convert it to float; ValueError, with its name, for another value.
+
+    Args:
+        name: Name of the number, for messages.
+        value: The value.
+
+    Returns:
+        The number.
+    """
     if not is_finite(value):
         raise ValueError(f"{name} {short_repr(value)} is no finite number")
     return float(value)
 
 
-def check_mapping(name: str, value: Any) -> Mapping[str, Any]:
-    """Check a mapping; TypeError, with its name, for another value."""
+def check_mapping(name: str, value: object) -> Mapping[str, Any]:
+    """Check a mapping; TypeError, with its name, for another value.
+
+    Args:
+        name: Name of the mapping, for messages.
+        value: The value.
+
+    Returns:
+        The mapping.
+    """
     if not isinstance(value, Mapping):
         raise TypeError(f"{name} is a mapping, got {short_repr(value)}")
     return value
 
 
-def describe_unknown(what: str, values: Iterable[Any], known: Iterable[str]) -> str:
-    """Describe unknown names: the nearest known one of the first, or all that are known."""
+def describe_unknown(what: str, values: Iterable[object], known: Iterable[str]) -> str:
+    """Describe unknown names: the nearest known one of the first, or all that are known.
+
+    Args:
+        what: What the names name.
+        values: The unknown names, one at least.
+        known: Known names.
+
+    Returns:
+        The text.
+    """
     got, names = list(values), list(known)
     close = difflib.get_close_matches(got[0][:80], names, 1) if isinstance(got[0], str) else []
     hint = f"did you mean {close[0]!r}?" if close else f"known: {join_names(names)}"
     return f"unknown {what} {join_names(map(short_repr, got))}; {hint}"
 
 
-def check_choice(what: str, value: Any, known: Iterable[str]) -> None:
-    """Check that a value is a known name; ValueError, with the nearest one, for another."""
+def check_choice(what: str, value: object, known: Iterable[str]) -> None:
+    """Check that a value is a known name; ValueError, with the nearest one, for another.
+
+    Args:
+        what: What the value names.
+        value: The value.
+        known: Known names.
+    """
     if not isinstance(value, str) or value not in known:
         raise ValueError(describe_unknown(what, [value], known))
 
 
-def check_options(what: str, function: Callable[..., Any], options: Iterable[str]) -> None:
-    """Check options of a function beside its first argument; TypeError for an unknown one."""
+def check_options(what: str, function: Callable[..., object], options: Iterable[str]) -> None:
+    """Check options of a function beside its first argument; TypeError for an unknown one.
+
+    Args:
+        what: What has the options, for messages.
+        function: The function.
+        options: Names of options.
+    """
     parameters = list(inspect.signature(function).parameters.values())[1:]
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         return
@@ -84,9 +145,20 @@ def check_options(what: str, function: Callable[..., Any], options: Iterable[str
 
 
 def check_int(
-    name: str, value: Any, what: str, minimum: int = 1, maximum: int | None = None
+    name: str, value: object, what: str, minimum: int = 1, maximum: int | None = None
 ) -> int:
-    """Check a number of `what`; TypeError for no integer, ValueError out of its limits."""
+    """Check a number of `what`; TypeError for no integer, ValueError out of its limits.
+
+    Args:
+        name: Name of the number, for messages.
+        value: The value.
+        what: What is counted.
+        minimum: Smallest number.
+        maximum: Largest number; None for no limit.
+
+    Returns:
+        The number.
+    """
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name} is a number of {what}, got {short_repr(value)}")
     if value < minimum or (maximum is not None and value > maximum):
@@ -95,17 +167,15 @@ def check_int(
     return int(value)
 
 
-def expand_rows(name: str, value: Any, count: int) -> Sequence[Any]:
-    """Expand an argument to one for each row; ValueError for a list of another length."""
-    if not isinstance(value, list | tuple):
-        return [value] * count
-    if len(value) != count:
-        raise ValueError(f"{name}: one or a list of {count}, one a row, got {len(value)}")
-    return value
+def parse_autoreset_mode(autoreset_mode: object) -> AutoresetMode:
+    """Parse an autoreset mode or its name; ValueError for another.
 
+    Args:
+        autoreset_mode: The mode or its name.
 
-def parse_autoreset_mode(autoreset_mode: Any) -> AutoresetMode:
-    """Parse an autoreset mode or its name; ValueError for another."""
+    Returns:
+        The mode.
+    """
     try:
         return AutoresetMode(autoreset_mode)
     except ValueError:
@@ -115,7 +185,14 @@ def parse_autoreset_mode(autoreset_mode: Any) -> AutoresetMode:
 
 
 def format_rows(rows: npt.ArrayLike) -> str:
-    """Format rows for a message: "row 3" or "rows 1, 5, ..."."""
+    """Format rows for a message: "row 3" or "rows 1, 5, ...".
+
+    Args:
+        rows: Numbers of rows, shape (M,).
+
+    Returns:
+        The text.
+    """
     numbers = np.asarray(rows).tolist()
     if len(numbers) == 1:
         return f"row {numbers[0]}"
@@ -123,11 +200,19 @@ def format_rows(rows: npt.ArrayLike) -> str:
     return f"rows {', '.join(map(str, numbers[:_MAX_LISTED_ROWS]))}{dots} ({len(numbers)} of them)"
 
 
-def parse_seeds(seed: Any, count: int) -> list[int | None]:
-    """Make a seed for each row: `seed + i` of a number, a list as it is.
+def parse_seeds(seed: object, count: int) -> list[int | None]:
+    """Make a seed for each row.
 
-    Raises ValueError for a list of another length or a negative seed, TypeError for a seed that is
-    no whole number.
+    Args:
+        seed: A number s, of which row i gets s + i, a list (N,) of numbers or None, or None.
+        count: Number of rows N.
+
+    Returns:
+        Seed of each row, or None.
+
+    Raises:
+        ValueError: For a list of another length or a negative seed.
+        TypeError: For a seed that is no whole number.
     """
     if seed is None:
         return [None] * count
@@ -146,8 +231,16 @@ def parse_seeds(seed: Any, count: int) -> list[int | None]:
     return seeds
 
 
-def parse_reset_mask(mask: Any, count: int) -> Mask:
-    """Parse options["reset_mask"], all rows without it; TypeError or ValueError for no mask."""
+def parse_reset_mask(mask: object, count: int) -> Mask:
+    """Parse options["reset_mask"], all rows without it; TypeError or ValueError for no mask.
+
+    Args:
+        mask: The mask, or None.
+        count: Number of rows.
+
+    Returns:
+        A mask of the rows, shape (count,).
+    """
     if mask is None:
         return np.ones(count, np.bool_)
     if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
@@ -160,8 +253,16 @@ def parse_reset_mask(mask: Any, count: int) -> Mask:
     return mask.copy()
 
 
-def split_options(options: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
-    """Split options of reset by rows: a list, tuple or array has one, or None, for each row."""
+def split_options(options: Mapping[str, object], count: int) -> list[dict[str, Any]]:
+    """Split options of reset by rows: a list, tuple or array has one, or None, for each row.
+
+    Args:
+        options: Options by name.
+        count: Number of rows.
+
+    Returns:
+        Options of each row by name.
+    """
     columns = {}
     for name, value in options.items():
         if isinstance(value, np.ndarray) and value.ndim > 0:
@@ -175,8 +276,17 @@ def split_options(options: Mapping[str, Any], count: int) -> list[dict[str, Any]
     return [{n: v[i] for n, v in columns.items() if v[i] is not None} for i in rows]
 
 
-def parse_action(action: Any, width: int, fail: bool) -> Actions:
-    """Parse an action (width,) to float32; a bad one raises ValueError, or is NaN with `fail`."""
+def parse_action(action: object, width: int, fail: bool) -> Actions:
+    """Parse an action to float32.
+
+    Args:
+        action: The action.
+        width: Numbers of an action.
+        fail: Whether a bad one becomes NaN instead of raising ValueError.
+
+    Returns:
+        The action, shape (width,).
+    """
     if type(action) is np.ndarray and action.dtype is _FLOAT32 and action.shape == (width,):
         return action if action.flags.carray else action.copy()  # others are other types
     try:
@@ -189,9 +299,19 @@ def parse_action(action: Any, width: int, fail: bool) -> Actions:
 
 
 def parse_actions(actions: Any, count: int, width: int, fail: bool) -> Actions:
-    """Parse actions (count, width) to float32.
+    """Parse actions of several rows to float32.
 
-    A wrong shape or no numbers raises ValueError, which names the rows; with `fail` they are NaN.
+    Args:
+        actions: The actions.
+        count: Number of rows.
+        width: Numbers of a row.
+        fail: Whether rows of a wrong shape or without numbers become NaN.
+
+    Returns:
+        The actions, shape (count, width).
+
+    Raises:
+        ValueError: For a wrong shape or no numbers, with the rows, unless `fail` is set.
     """
     try:
         array = np.array(actions, np.float32)  # a copy: contiguous whatever came
@@ -216,18 +336,24 @@ def parse_actions(actions: Any, count: int, width: int, fail: bool) -> Actions:
     return array
 
 
-def warn_once(env: Any, actions: Actions) -> None:
-    """Warn, once per env, of actions far outside of -1 to 1."""
-    if not vars(env).get("_warned"):
+def warn_once(env: object, actions: Actions) -> None:
+    """Warn, once per env, of actions far outside of -1 to 1.
+
+    Args:
+        env: The environment.
+        actions: Actions, of any shape, one of them far outside.
+    """
+    attributes = vars(env)
+    if not attributes.get("_warned"):
         largest = np.abs(actions[np.isfinite(actions)]).max()
         logger.warn(
             f"an action of {largest:g} is clipped to 1: actions are shares of full scale, "
             "from -1 to 1, not N m or rad; the env says so once"
         )
-    env._warned = True
+    attributes["_warned"] = True
 
 
-def _convert_action(action: Any, width: int) -> Actions:
+def _convert_action(action: object, width: int) -> Actions:
     """Action (width,) as float32; ValueError with the value or shape of a bad one."""
     try:
         array = np.array(action, np.float32)
@@ -258,13 +384,29 @@ def quantity(
     default: Any = dataclasses.MISSING,
     per: tuple[str, ...] = (),
 ) -> Any:
-    """Make a dataclass's field whose numbers are plausible from low to high, times fields `per`."""
+    """Make a dataclass's field whose numbers have a plausible range.
+
+    Args:
+        unit: Unit of the numbers.
+        low: Lower end of the range.
+        high: Upper end of the range.
+        text: Meaning of the field, for tables.
+        default: Default value, if there is one.
+        per: Names of fields by which the range is multiplied.
+
+    Returns:
+        The field.
+    """
     metadata = {"unit": unit, "text": text, "plausible": (low, high), "per": per}
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def check_plausible(values: Any) -> None:
-    """Check a dataclass's numbers; ValueError outside of a range, with the unit by mistake."""
+def check_plausible(values: "DataclassInstance") -> None:
+    """Check a dataclass's numbers; ValueError outside of a range, with the unit by mistake.
+
+    Args:
+        values: The dataclass, with fields made by `quantity`.
+    """
     entries = [spec for spec in dataclasses.fields(values) if "plausible" in spec.metadata]
     entries.sort(key=lambda spec: len(spec.metadata["per"]))  # ranges that depend on others last
     for entry in entries:

@@ -22,7 +22,6 @@ from .stability import StabilityEnv
 from .task import REFUSED, WILD, make_infos
 from .validation import (
     check_int,
-    expand_rows,
     format_rows,
     parse_actions,
     parse_autoreset_mode,
@@ -36,7 +35,6 @@ Flags = npt.NDArray[np.bool_]
 Infos = dict[str, Any]
 
 _INFO_MODES = ("all", "ends")
-_ROW_ARGUMENTS = ("scenario", "vehicle")  # arguments that may be a list
 
 
 class StabilityVectorEnv(
@@ -119,6 +117,11 @@ class StabilityVectorEnv(
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
+        """Set the spec.
+
+        Args:
+            spec: Spec whose autoreset mode becomes a text.
+        """
         if spec is not None and "autoreset_mode" in spec.kwargs:
             spec.kwargs["autoreset_mode"] = self._mode.value  # as JSON writes it
         self._spec = spec
@@ -183,9 +186,7 @@ class StabilityVectorEnv(
         over_rows = np.flatnonzero(self.over) if self._n_over else None
         results = np.empty(N), np.empty(N, np.bool_), np.empty(N, np.bool_)
         rewards, terminated, truncated = results
-        n_ended = step_rows(
-            *self.arrays, commands, self.control_period, config.bounds, *results, self.lane_buffers
-        )
+        n_ended = step_rows(self.arrays, commands, config.bounds, results, self.lane_buffers)
         if n_ended == REFUSED:
             bad = np.flatnonzero(~np.isfinite(commands).all(1) & ~self.over)
             raise ValueError(
@@ -234,13 +235,13 @@ class StabilityVectorEnv(
     @property  # type: ignore[misc]  # without a setter, as in sync
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
         """Each row's generator, which draws one 64-bit key a reset."""
-        return tuple(map(self.get_generator, range(self.num_envs)))
+        return tuple(map(self._get_generator, range(self.num_envs)))
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
         """The seed of each row's generator."""
         for i in range(self.num_envs):
-            self.get_generator(i)  # a row without one gets one now
+            self._get_generator(i)  # a row without one gets one now
         return tuple(self.seeds)
 
     def get_state(self) -> dict[str, Any]:
@@ -274,11 +275,11 @@ class StabilityVectorEnv(
         for name, array in self.arrays._asdict().items():
             if name != "params":
                 array[:] = snapshot[name]
-        self.set_params(snapshot["params"].copy())
+        self._set_params(snapshot["params"].copy())
         self.configs, self.seeds = list(snapshot["configs"]), list(snapshot["seeds"])
         self.generators = copy.deepcopy(snapshot["rng"])
         self._started, self._n_over = snapshot["started"], int(self.over.sum())
-        self.group_by_variant()
+        self._group_by_variant()
 
 
 def _make_row_configs(
@@ -288,7 +289,14 @@ def _make_row_configs(
     if arguments.get("vision") == "image":
         mode = "make_vec(..., vectorization_mode='sync')"
         raise ValueError(f"vision='image' sees for one car at a time: {mode}")
-    columns = {name: expand_rows(name, arguments.get(name), count) for name in _ROW_ARGUMENTS}
+    columns = {}
+    for name in ("scenario", "vehicle"):  # arguments that may be a list
+        value = arguments.get(name)
+        if not isinstance(value, list | tuple):
+            value = [value] * count
+        elif len(value) != count:
+            raise ValueError(f"{name}: one or a list of {count}, one a row, got {len(value)}")
+        columns[name] = value
     envs: dict[tuple[int, ...], StabilityEnv] = {}
     rows = []
     for values in zip(*columns.values(), strict=True):

@@ -183,7 +183,7 @@ def _simulate_actions(
     for tick in range(ticks + 1):
         drive[tick] = read(z, Z.drive)
         driver[tick], refs[tick] = z[Z.driver], read(z, Z.refs)
-        step_vehicle(*row, held_actions[tick], 1, bounds, window)
+        step_vehicle(row, held_actions[tick], 1, bounds, window)
     # an unstable simulation may give NaN or inf
     return np.nan_to_num(drive), np.nan_to_num(driver), np.nan_to_num(refs)
 

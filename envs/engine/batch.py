@@ -22,17 +22,35 @@ from .step import (
     make_step_variant,
     step_vehicle,
 )
-from .window import has_overwrite, make_window, overwrite_steering, precompute_lane_window
-from .workspace import (
-    BatchArrays,
-    EpisodeStart,
-    RecordArrays,
-    get_episode_arrays,
-    get_episode_start,
-)
+from .window import make_window, overwrite_steering, precompute_lane_window
+from .workspace import EpisodeArrays, EpisodeStart
 
 _REPORT, _REFS = len(REPORT), (REPORT.beta_ref, REPORT.gamma_ref)
 _DYNAMIC_WIDTH = Z.slow[0].frames  # a tick changes the first numbers, and the driver's angle
+
+
+class BatchArrays(NamedTuple):
+    """The arrays of N episodes, a row for each."""
+
+    params: Matrix  # (N, ...), the rest as in `EpisodeArrays`
+    states: Matrix
+    switches: Matrix
+    obs: Matrix
+    rows: Matrix
+    packets: Matrix
+    reports: Matrix
+    ticks_done: Vector  # (N,), how many of `rows` are there
+    delivered: Vector  # (N,), how many of `packets` are there
+    over: Vector  # (N,) of bool: the episode has ended and was not reset yet
+
+
+class RecordArrays(NamedTuple):
+    """The records of N episodes."""
+
+    rows: Matrix
+    packets: Matrix
+    ticks_done: Vector
+    delivered: Vector
 
 
 class _LaneBuffers(NamedTuple):
@@ -51,7 +69,16 @@ class _LaneBuffers(NamedTuple):
 
 
 def make_lane_buffers(count: int, n: int, entries: int) -> _LaneBuffers:
-    """Make the working arrays of an env of `count` rows, n ticks a step and `entries` observed."""
+    """Make the working arrays of a batch step.
+
+    Args:
+        count: Number of rows.
+        n: Ticks of a step.
+        entries: Entries of an observation.
+
+    Returns:
+        The arrays.
+    """
     return _LaneBuffers(
         np.arange(count), np.zeros(LANES, np.int64), np.zeros((PARAMS_WIDTH, LANES)),
         np.zeros((STATE_WIDTH, LANES)), np.zeros((2, LANES)), np.zeros((n, FAST_WIDTH, LANES)),
@@ -60,12 +87,29 @@ def make_lane_buffers(count: int, n: int, entries: int) -> _LaneBuffers:
     )  # fmt: skip
 
 
+@jit
+def _get_episode_arrays(batch: BatchArrays, i: int) -> EpisodeArrays:
+    """Get the arrays of episode i of a batch."""
+    return EpisodeArrays(
+        batch.params[i], batch.states[i], batch.switches[i], batch.obs[i], batch.rows[i],
+        batch.packets[i], batch.reports[i],
+    )  # fmt: skip
+
+
+@jit
+def _get_episode_start(starts: EpisodeStart, i: int) -> EpisodeStart:
+    """Get the start of one of several episodes."""
+    return EpisodeStart(
+        starts.params[i], starts.low[i], starts.high[i], starts.switches[i], starts.motion[i]
+    )
+
+
 @noinline
 def _step_lanes(
-    count: int, batch: BatchArrays, actions: Vector, n: int, bounds: Vector, buffers: _LaneBuffers
+    count: int, batch: BatchArrays, actions: Matrix, bounds: Matrix, buffers: _LaneBuffers
 ) -> bool:
     """Step the block's first `count` members; False, and nothing changes, where one ends early."""
-    params, states = batch.params, batch.states
+    params, states, n = batch.params, batch.states, batch.rows.shape[1]
     for lane in range(count_lanes()):
         i = buffers.members[lane if lane < count else 0]  # spare lanes repeat the first
         for k in range(PARAMS_WIDTH):
@@ -77,10 +121,9 @@ def _step_lanes(
     first = buffers.members[0]
     variant = make_step_variant(params[first], batch.switches[first])
     precompute_lane_window(buffers.params, buffers.states, n, variant.has_driver, buffers.window)
-    if has_overwrite(buffers.params, params.shape[1]):
-        for lane in range(count_lanes()):
-            i = buffers.members[lane if lane < count else 0]
-            overwrite_steering(params[i], states[i], n, buffers.window[:, :, lane])
+    for lane in range(count_lanes()):
+        i = buffers.members[lane if lane < count else 0]
+        overwrite_steering(params[i], states[i], n, buffers.window[:, :, lane])
     done = integrate_step(
         buffers.params, buffers.states, variant, load_element(buffers.shares, 0),
         load_element(buffers.shares, 1), n, buffers.rows, buffers.reports, buffers.window, False,
@@ -104,7 +147,7 @@ def _step_lanes(
         for k in range(last, last + 2):
             batch.obs[i, k] = buffers.obs[k, lane]
         finish_slow_sensors(
-            get_episode_arrays(batch, i), n, slow_start, bounds, buffers.window[:, :, lane]
+            _get_episode_arrays(batch, i), n, slow_start, bounds, buffers.window[:, :, lane]
         )
     return True
 
@@ -114,23 +157,29 @@ _MAX_SCALAR = 2  # up to so many vehicles are stepped one by one
 
 @jit
 def step_rows(
-    params: Matrix, states: Matrix, switches: Matrix, obs: Matrix, rows: Matrix, packets: Matrix,
-    reports: Matrix, ticks_done: Vector, delivered: Vector, over: Vector, actions: Matrix, n: int,
-    bounds: Matrix, rewards: Vector, terminated: Vector, truncated: Vector, buffers: _LaneBuffers,
+    batch: BatchArrays, actions: Matrix, bounds: Matrix, results: tuple[Vector, Vector, Vector],
+    buffers: _LaneBuffers,
 ) -> int:  # fmt: skip
     """Step every row by one env-step, and count the episodes that ended.
 
-    The first ten arguments are `BatchArrays`, one by one as in `step_vehicle`. Rows whose episode
-    is `over` stand still with reward 0; then `over` is set for those that ended in this step. WILD
-    is added for an action beyond its limit. REFUSED is returned, and nothing stepped, where an
-    action that does not fail its row is not finite.
+    Rows whose episode is `over` stand still with reward 0; then `over` is set for those that ended
+    in this step.
+
+    Args:
+        batch: Arrays of the rows.
+        actions: Fractions of full scale, float32 of shape (N, 1) or (N, 2).
+        bounds: Bounds of the observation, shape (2, k).
+        results: Rewards, terminated and truncated, shape (N,) each, which are written.
+        buffers: Working arrays.
+
+    Returns:
+        The count, with WILD added for an action beyond its limit; REFUSED, and nothing is stepped,
+        where an action that does not fail its row is not finite.
     """
-    n_ended = 0
-    batch = BatchArrays(
-        params, states, switches, obs, rows, packets, reports, ticks_done, delivered, over
-    )
+    n_ended, over = 0, batch.over
+    rewards, terminated, truncated = results
     for i in range(len(over)):
-        if switches[i, FLAGS.fail_bad] == 0 and not over[i]:
+        if batch.switches[i, FLAGS.fail_bad] == 0 and not over[i]:
             for share in actions[i]:
                 if float(share) - float(share) != 0.0:
                     return REFUSED
@@ -142,8 +191,8 @@ def step_rows(
         if not over[i]:
             share, _ = clip_action(actions[i])
             if share != share:
-                ticks_done[i] = _step_single(i, batch, actions, n, bounds, buffers)
-                obs[i, :] = 0.0
+                batch.ticks_done[i] = _step_single(i, batch, actions, bounds, buffers)
+                batch.obs[i, :] = 0.0
             else:
                 buffers.members[n_pending] = i
                 n_pending += 1
@@ -152,18 +201,20 @@ def step_rows(
         ):
             is_vectorised = False
             if n_pending > _MAX_SCALAR:
-                is_vectorised = _step_lanes(n_pending, batch, actions, n, bounds, buffers)
+                is_vectorised = _step_lanes(n_pending, batch, actions, bounds, buffers)
             for lane in range(n_pending):
                 i = buffers.members[lane]
-                done = n if is_vectorised else _step_single(i, batch, actions, n, bounds, buffers)
-                ticks_done[i] = done
+                if is_vectorised:
+                    batch.ticks_done[i] = batch.rows.shape[1]
+                else:
+                    batch.ticks_done[i] = _step_single(i, batch, actions, bounds, buffers)
             n_pending = 0
     for i in range(len(over)):
         if over[i]:
             rewards[i], terminated[i], truncated[i], over[i] = 0.0, False, False, False
             continue
-        report = reports[i]
-        delivered[i] = int(report[REPORT.packets])
+        report = batch.reports[i]
+        batch.delivered[i] = int(report[REPORT.packets])
         rewards[i], terminated[i], truncated[i] = read_ends(report)
         over[i] = terminated[i] or truncated[i]
         if over[i]:
@@ -173,7 +224,14 @@ def step_rows(
 
 @jit
 def read_ends(report: Vector) -> tuple[float, bool, bool]:
-    """Read (reward, terminated, truncated) from a step's report (len(Report),)."""
+    """Read how a step ended from its report.
+
+    Args:
+        report: The report, shape (len(StepReport),).
+
+    Returns:
+        (reward, terminated, truncated).
+    """
     terminated = report[REPORT.failure] != RUNNING
     return -report[REPORT.cost], terminated, report[REPORT.ended] == 1.0 and not terminated
 
@@ -190,16 +248,11 @@ def _has_variant_change(m: int, batch: BatchArrays, buffers: _LaneBuffers) -> bo
 
 @jit
 def _step_single(
-    i: int, batch: BatchArrays, actions: Vector, n: int, bounds: Matrix, buffers: _LaneBuffers
+    i: int, batch: BatchArrays, actions: Matrix, bounds: Matrix, buffers: _LaneBuffers
 ) -> int:
     """Step row i by itself; return the ticks done."""
-    row = get_episode_arrays(batch, i)
-    return int(
-        step_vehicle(
-            row.p, row.z, row.switches, row.obs, row.rows, row.packets, row.report, actions[i], n,
-            bounds, buffers.single_window,
-        )
-    )  # fmt: skip
+    row, n = _get_episode_arrays(batch, i), batch.rows.shape[1]
+    return int(step_vehicle(row, actions[i], n, bounds, buffers.single_window))
 
 
 @jit
@@ -207,9 +260,16 @@ def reset_rows(
     chosen: Vector, start_index: Vector, starts: EpisodeStart, keys: Matrix, bounds: Matrix,
     batch: BatchArrays, final: RecordArrays,
 ) -> None:  # fmt: skip
-    """Reset the chosen rows (M,), whose records are first copied into `final`.
+    """Reset rows, whose records are first copied.
 
-    `start_index` (M,) is each one's index in `starts`; keys (M, 2) are two words of 32 bits.
+    Args:
+        chosen: The rows, shape (M,).
+        start_index: Index of each one's start, shape (M,).
+        starts: The starts.
+        keys: Key of each one, two words of 32 bits, shape (M, 2).
+        bounds: Bounds of the observation, shape (2, k).
+        batch: Arrays of all rows.
+        final: Records of all rows, into which those of the chosen are copied.
     """
     for m in range(len(chosen)):
         i, t = chosen[m], start_index[m]
@@ -220,7 +280,7 @@ def reset_rows(
         final.ticks_done[i], final.delivered[i] = batch.ticks_done[i], batch.delivered[i]
         key_low, key_high = int(keys[m, 0]), int(keys[m, 1])
         reset_vehicle(
-            get_episode_start(starts, t), key_low, key_high, bounds, get_episode_arrays(batch, i)
+            _get_episode_start(starts, t), key_low, key_high, bounds, _get_episode_arrays(batch, i)
         )
         batch.ticks_done[i] = 1
         batch.delivered[i] = int(batch.reports[i, REPORT.packets])

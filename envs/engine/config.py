@@ -26,6 +26,7 @@ from ..task import REFERENCES, ObservationEntry, make_observation_layout, make_r
 from ..ticks import FOREVER, TICK, count_ticks
 from ..validation import (
     check_choice,
+    check_int,
     check_mapping,
     check_number,
     check_plausible,
@@ -58,7 +59,14 @@ class EpisodeConfig:
 
 
 def make_car(vehicle: Vehicle) -> CarParams:
-    """Make the plant's parameters of a vehicle."""
+    """Make the plant's parameters of a vehicle.
+
+    Args:
+        vehicle: The vehicle.
+
+    Returns:
+        The parameters.
+    """
     return CarParams(
         m=vehicle.mass, I=vehicle.yaw_inertia, l_f=vehicle.front_arm, l_r=vehicle.rear_arm,
         C_f=vehicle.front_stiffness, C_r=vehicle.rear_stiffness, d_f=vehicle.front_track,
@@ -71,7 +79,16 @@ def make_car(vehicle: Vehicle) -> CarParams:
 
 
 def make_task_params(vehicle: Vehicle, scenario: Scenario, yaw_first: bool) -> TaskParams:
-    """Make the episode's length and limits; yaw_first: the yaw moment comes before acceleration."""
+    """Make the episode's length and limits.
+
+    Args:
+        vehicle: The true vehicle.
+        scenario: The scenario.
+        yaw_first: Whether the yaw moment comes before acceleration.
+
+    Returns:
+        Length and limits.
+    """
     return TaskParams(
         duration=count_ticks(scenario.duration), half_width=scenario.half_width,
         yaw_scale=vehicle.yaw_moment_limit, yaw_first=float(yaw_first), spin=_SPIN_ANGLE,
@@ -108,77 +125,11 @@ def _compute_gains(exponent: float) -> tuple[float, float]:
     return decay, math.sqrt(1.0 - decay * decay)
 
 
-def _list_numbers(part: Any) -> list[float]:
+def _list_numbers(part: tuple[Any, ...] | float) -> list[float]:
     """List the numbers of nested tuples, in order."""
     if not isinstance(part, tuple):
         return [part]
     return [number for item in part for number in _list_numbers(item)]
-
-
-def pad_params(params: Array, width: int) -> Array:
-    """Pad packed parameters to (width,): a trace repeats its last angle, others append zeros."""
-    has_trace = len(params) > PARAMS_WIDTH
-    return np.pad(params, (0, width - len(params)), "edge" if has_trace else "constant")
-
-
-def _make_episode_config(
-    config: "EnvConfig", scenario: Scenario, vehicle: Vehicle, slow: dict[str, SlowSensor],
-    motion: Array | None,
-) -> EpisodeConfig:  # fmt: skip
-    """Pack everything that a reset does not draw; motion (len(Motion),) is NaN by default."""
-    check_choice("reference", config.reference, REFERENCES)
-    vehicle = vehicle.replace(**scenario.vehicle)
-    nominal = config.nominal.replace(**scenario.nominal)
-    if scenario.roll:
-        vehicle.check_roll()
-    links = {name: _make_link(scenario, name, slow.get(name)) for name in SLOW_NAMES}
-    hdop_gains = _compute_gains(-links["gps"].period * TICK / scenario.hdop_time)
-    gains = _compute_gains(-TICK / scenario.disturbance_time)
-    params = EpisodeParams(
-        car=make_car(vehicle),
-        road=RoadParams(  # curvature and bank are drawn
-            0.0, scenario.curve_start, scenario.curve_ramp, 0.0, GRAVITY * math.sin(scenario.grade)
-        ),
-        motor=make_lag(vehicle.motor_lag if scenario.lags else 0.0, TICK),
-        steering=make_lag(vehicle.steering_lag if scenario.lags else 0.0, TICK),
-        wind=Wind(0.0, 0.0, 0.0, 0.0, scenario.wind_height),  # the rest is drawn
-        speed_profile=_make_speed_profile(scenario),
-        noise=Noise()._replace(**scenario.noise),
-        slow=tuple(links.values()),
-        target=make_reference_params(nominal),
-        disturbance=Disturbance(scenario.disturbance_force, scenario.disturbance_moment, *gains),
-        task=make_task_params(vehicle, scenario, config.yaw_first),
-        steering_profile=(0.0,) * STEERING_WIDTH,  # drawn
-        sky=SatelliteGeometry(
-            math.log(scenario.hdop), scenario.hdop_spread, *hdop_gains, HDOP_LAWS[scenario.hdop_law]
-        ),
-        driver=DriverParams(
-            preview=scenario.driver_preview,
-            gain=scenario.driver_gain,
-            rest=make_lag(scenario.driver_lag, TICK).end,
-            slew=scenario.driver_rate * TICK,
-        ),
-        path=make_path(scenario.path, vehicle.width),
-        tyre_change=TyreChange(FOREVER, 1.0, 1.0),  # drawn
-        field_of_view=FieldOfView(scenario.camera_heading, scenario.camera_offset),
-        nominal_car=Bicycle(*nominal.lateral),
-    )
-    switches = Switches(
-        small_angle=int(scenario.small_angle), law=TYRE_LAWS.index(scenario.tyres),
-        reference=REFERENCES.index(config.reference),
-        steering=STEERING_KINDS.index(scenario.steering), all_samples=int(config.fast == "all"),
-        with_map=int(config.with_map), fail_bad=int(config.on_bad_action == "fail"),
-        roll=int(scenario.roll), road=ROADS.index(scenario.road),
-    )  # fmt: skip
-    low, high = scenario.get_draw_ranges()
-    angles = scenario.trace  # as `steering.interpolate_trace` reads them
-    trace = [scenario.trace_step / TICK, *angles, angles[-1]] if angles else []
-    packed = np.array(_list_numbers(params) + trace, np.float64)
-    motion = np.full(len(Motion._fields), np.nan) if motion is None else motion
-    start = EpisodeStart(packed, low, high, np.array(switches, np.int64), motion)
-    assert len(start.params) == PARAMS_WIDTH or scenario.trace
-    held_speed = scenario.held_speed if np.isnan(motion[0]) else None
-    return EpisodeConfig(start, vehicle, nominal, scenario, slow, held_speed)
 
 
 def _apply_scenario_clocks(
@@ -202,12 +153,6 @@ def _apply_scenario_clocks(
             sensor = dataclasses.replace(sensor, delays=delays, jitter=jitter)
         changed[name] = sensor
     return changed
-
-
-def _count_max_packets(sensor: SlowSensor, n: int) -> int:
-    """Count the most packets of a step: all its frames, doubled, and those under way before."""
-    period = min(sensor.period, MIN_GPS_PERIOD)  # of any scenario
-    return 2 * (n // int(count_ticks(period)) + 1) + MAX_IN_FLIGHT
 
 
 def _apply_detector_clock(camera: SlowSensor, delay: str | None) -> SlowSensor:
@@ -249,11 +194,7 @@ class EnvConfig:
         if unknown := [name for name in self.slow_changes if name not in SLOW_NAMES]:
             known = [entry.name for entry in dataclasses.fields(self)][:-1]
             raise TypeError(describe_unknown("argument", unknown, [*known, *SLOW_NAMES]))
-        n = self.control_period
-        if isinstance(n, bool) or not isinstance(n, int | np.integer):
-            raise TypeError(f"control_period is a number of ticks, got {short_repr(n)}")
-        if not 1 <= n <= 1000:
-            raise ValueError(f"control_period is 1 to 1000 ticks, got {short_repr(n)}")
+        check_int("control_period", self.control_period, "ticks", 1, 1000)
         if not isinstance(self.fast, str) or self.fast not in ("summary", "all"):
             raise ValueError(f"fast is 'summary' or 'all', got {short_repr(self.fast)}")
         for name in ("steering", "yaw_first", "with_map", "strict"):
@@ -288,9 +229,10 @@ class EnvConfig:
 
     @property
     def max_packets(self) -> int:
-        """Largest number of packets in a step."""
+        """Largest number of packets in a step: its frames, doubled, and those under way before."""
         n = int(self.control_period)
-        return sum(_count_max_packets(sensor, n) for sensor in self.slow.values())
+        periods = [min(sensor.period, MIN_GPS_PERIOD) for sensor in self.slow.values()]
+        return sum(2 * (n // int(count_ticks(period)) + 1) + MAX_IN_FLIGHT for period in periods)
 
     @property
     def action_width(self) -> int:
@@ -300,24 +242,94 @@ class EnvConfig:
     @cached_property
     def base(self) -> EpisodeConfig:
         """An episode without options."""
-        return self.make_episode(self.scenario, self.vehicle)
+        return self._make_episode(self.scenario, self.vehicle)
 
-    def make_episode(
+    def _make_episode(
         self, scenario: Scenario, vehicle: Vehicle, motion: Array | None = None
     ) -> EpisodeConfig:
-        """Make an episode with a true vehicle; motion (len(Motion),) is NaN where it is default."""
+        """Pack all that a reset does not draw; motion (len(Motion),) is NaN where it is default."""
+        vehicle = vehicle.replace(**scenario.vehicle)
+        nominal = self.nominal.replace(**scenario.nominal)
         if self.strict:
-            cars = vehicle.replace(**scenario.vehicle), self.nominal.replace(**scenario.nominal)
-            for part in (scenario, *cars):
+            for part in (scenario, vehicle, nominal):
                 check_plausible(part)
         slow = _apply_scenario_clocks(self.slow, scenario)
         if self.vision == "image":
             slow["camera"] = _apply_detector_clock(slow["camera"], self.delay)
             scenario = scenario.replace(noise={**scenario.noise, **load_detector().noise})
-        return _make_episode_config(self, scenario, vehicle, slow, motion)
+        check_choice("reference", self.reference, REFERENCES)
+        if scenario.roll:
+            vehicle.check_roll()
+        links = {name: _make_link(scenario, name, slow.get(name)) for name in SLOW_NAMES}
+        hdop_gains = _compute_gains(-links["gps"].period * TICK / scenario.hdop_time)
+        gains = _compute_gains(-TICK / scenario.disturbance_time)
+        params = EpisodeParams(
+            car=make_car(vehicle),
+            road=RoadParams(  # curvature and bank are drawn
+                0.0,
+                scenario.curve_start,
+                scenario.curve_ramp,
+                0.0,
+                GRAVITY * math.sin(scenario.grade),
+            ),
+            motor=make_lag(vehicle.motor_lag if scenario.lags else 0.0, TICK),
+            steering=make_lag(vehicle.steering_lag if scenario.lags else 0.0, TICK),
+            wind=Wind(0.0, 0.0, 0.0, 0.0, scenario.wind_height),  # the rest is drawn
+            speed_profile=_make_speed_profile(scenario),
+            noise=Noise()._replace(**scenario.noise),
+            slow=tuple(links.values()),
+            target=make_reference_params(nominal),
+            disturbance=Disturbance(
+                scenario.disturbance_force, scenario.disturbance_moment, *gains
+            ),
+            task=make_task_params(vehicle, scenario, self.yaw_first),
+            steering_profile=(0.0,) * STEERING_WIDTH,  # drawn
+            sky=SatelliteGeometry(
+                math.log(scenario.hdop),
+                scenario.hdop_spread,
+                *hdop_gains,
+                HDOP_LAWS[scenario.hdop_law],
+            ),
+            driver=DriverParams(
+                preview=scenario.driver_preview,
+                gain=scenario.driver_gain,
+                rest=make_lag(scenario.driver_lag, TICK).end,
+                slew=scenario.driver_rate * TICK,
+            ),
+            path=make_path(scenario.path, vehicle.width),
+            tyre_change=TyreChange(FOREVER, 1.0, 1.0),  # drawn
+            field_of_view=FieldOfView(scenario.camera_heading, scenario.camera_offset),
+            nominal_car=Bicycle(*nominal.lateral),
+        )
+        switches = Switches(
+            small_angle=int(scenario.small_angle), law=TYRE_LAWS.index(scenario.tyres),
+            reference=REFERENCES.index(self.reference),
+            steering=STEERING_KINDS.index(scenario.steering), all_samples=int(self.fast == "all"),
+            with_map=int(self.with_map), fail_bad=int(self.on_bad_action == "fail"),
+            roll=int(scenario.roll), road=ROADS.index(scenario.road),
+        )  # fmt: skip
+        low, high = scenario.get_draw_ranges()
+        angles = scenario.trace  # as `steering.interpolate_trace` reads them
+        trace = [scenario.trace_step / TICK, *angles, angles[-1]] if angles else []
+        packed = np.array(_list_numbers(params) + trace, np.float64)
+        motion = np.full(len(Motion._fields), np.nan) if motion is None else motion
+        start = EpisodeStart(packed, low, high, np.array(switches, np.int64), motion)
+        assert len(start.params) == PARAMS_WIDTH or scenario.trace
+        held_speed = scenario.held_speed if np.isnan(motion[0]) else None
+        return EpisodeConfig(start, vehicle, nominal, scenario, slow, held_speed)
 
     def apply_options(self, options: Mapping[str, Any]) -> EpisodeConfig:
-        """Make an episode with options of reset; ValueError for an unknown option or state."""
+        """Make an episode with options of reset.
+
+        Args:
+            options: Options by name, as `StabilityEnv` lists them.
+
+        Returns:
+            The episode.
+
+        Raises:
+            ValueError: For an unknown option or state.
+        """
         if not options:
             return self.base
         unknown = sorted(map(str, set(options) - set(_RESET_OPTIONS)))
@@ -326,14 +338,12 @@ class EnvConfig:
             raise ValueError(f"unknown reset option {', '.join(unknown)}; known: {known}")
         scenario = make_scenario(options.get("scenario", self.scenario))
         vehicle = make_vehicle(options.get("vehicle", self.vehicle), self.strict)
-        if "friction" in options:
-            friction = check_number("reset option friction", options["friction"])
-            scenario = scenario.replace(friction=friction)
-        if "duration" in options:
-            duration = check_number("reset option duration", options["duration"])
-            scenario = scenario.replace(duration=duration)
+        for name in ("friction", "duration"):
+            if name in options:
+                number = check_number(f"reset option {name}", options[name])
+                scenario = scenario.replace(**{name: number})
         motion = _parse_initial_motion(options.get("state", {}), scenario)
-        return self.make_episode(scenario, vehicle, motion)
+        return self._make_episode(scenario, vehicle, motion)
 
 
 def _parse_initial_motion(state: Mapping[str, Any], scenario: Scenario) -> Array:

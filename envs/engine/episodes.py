@@ -1,7 +1,7 @@
 """`EpisodeBatch`: the state of N episodes, arrays with a row for each."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -14,14 +14,42 @@ from ..task import REPORT
 from ..ticks import TICK
 from ..validation import split_options
 from ..vehicle.parameters import Vehicle
-from .batch import make_lane_buffers, reset_rows
-from .config import EnvConfig, EpisodeConfig, pad_params
+from .batch import BatchArrays, RecordArrays, make_lane_buffers, reset_rows
+from .config import EnvConfig, EpisodeConfig
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, P, Z
-from .views import LazyRows, compute_true_states, get_slow_sensors, get_vehicle, make_record
-from .workspace import BatchArrays, EpisodeStart, RecordArrays
+from .views import compute_true_states, get_slow_sensors, get_vehicle, make_record
+from .workspace import EpisodeStart
 
 IntArray = npt.NDArray[np.int64]
 T = TypeVar("T")
+
+
+def _pad_params(params: Array, width: int) -> Array:
+    """Pad packed parameters to (width,): a trace repeats its last angle, others append zeros."""
+    has_trace = len(params) > PARAMS_WIDTH
+    return np.pad(params, (0, width - len(params)), "edge" if has_trace else "constant")
+
+
+class _LazyRows(Sequence[T]):
+    """Items of a batch's `count` rows, each made by `make_item` when it is read."""
+
+    def __init__(self, count: int, make_item: Callable[[int], T]) -> None:
+        self._rows, self._make_item = range(count), make_item
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @overload
+    def __getitem__(self, i: int) -> T: ...
+    @overload
+    def __getitem__(self, i: slice) -> tuple[T, ...]: ...
+    def __getitem__(self, i: int | slice) -> T | tuple[T, ...]:
+        if isinstance(i, slice):
+            return tuple(map(self._make_item, self._rows[i]))
+        return self._make_item(self._rows[i])
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} rows>"
 
 
 class EpisodeBatch:
@@ -64,7 +92,15 @@ class EpisodeBatch:
     def apply_options(
         self, options: Mapping[str, Any], chosen: Sequence[int]
     ) -> tuple[list[EpisodeConfig], IntArray]:
-        """Make configs with options of reset, and find the index (M,) of each chosen row's."""
+        """Make configs with options of reset.
+
+        Args:
+            options: Options by name, each one or a list (N,).
+            chosen: The rows, shape (M,).
+
+        Returns:
+            The configs, and the index (M,) of each chosen row's.
+        """
         row_options, places = split_options(options, self._count), []
         configs: list[EpisodeConfig] = []
         known: dict[tuple[Any, ...], int] = {}  # rows with the same objects as options share one
@@ -82,41 +118,44 @@ class EpisodeBatch:
         configs: Sequence[EpisodeConfig] | None = None,
         config_index: IntArray | None = None,
     ) -> None:
-        """Reset the chosen rows (M,) with the next keys of their generators.
+        """Reset rows with the next keys of their generators.
 
-        `config_index` (M,) is each one's index in `configs`; None for those without options.
+        Args:
+            chosen: The rows, shape (M,).
+            configs: Configs of their episodes; None for those without options.
+            config_index: Index of each one's config, shape (M,).
         """
         if configs is None or config_index is None:
             places, config_index = np.unique(self._config_index[chosen], return_inverse=True)
             configs = [self._distinct_configs[place].base for place in places]
         keys = np.empty(len(chosen), np.uint64)
         for m, (i, place) in enumerate(zip(chosen.tolist(), config_index.tolist(), strict=True)):
-            keys[m] = self.get_generator(i).integers(0, 2**64, dtype=np.uint64)
+            keys[m] = self._get_generator(i).integers(0, 2**64, dtype=np.uint64)
             self.configs[i] = configs[place]
         words = np.stack([keys & 0xFFFFFFFF, keys >> 32], 1).astype(np.int64)
         width = max(self.params.shape[1], *(len(config.start.params) for config in configs))
         if width > self.params.shape[1]:  # for a trace
-            self.set_params(np.array([pad_params(row, width) for row in self.params]))
-        packed = [c.start._replace(params=pad_params(c.start.params, width)) for c in configs]
+            self._set_params(np.array([_pad_params(row, width) for row in self.params]))
+        packed = [c.start._replace(params=_pad_params(c.start.params, width)) for c in configs]
         starts = EpisodeStart(*map(np.stack, zip(*packed, strict=True)))
         reset_rows(
             chosen, config_index, starts, words, self.config.bounds, self.arrays, self._final
         )
-        self.group_by_variant()
+        self._group_by_variant()
 
-    def set_params(self, params: Array) -> None:
+    def _set_params(self, params: Array) -> None:
         """Replace the packed parameters by others, shape (N, width)."""
         self.params = params
         self.arrays = self.arrays._replace(params=params)
 
-    def group_by_variant(self) -> None:
+    def _group_by_variant(self) -> None:
         """Sort rows of the same variant next to each other in the block's order."""
         lags = self.params[:, [P.motor.start, P.steering.start]] > 0.0
         variants = np.hstack([self.switches, lags])
         is_mixed = (variants != variants[0]).any()
         self.lane_buffers.order[:] = np.lexsort(variants.T) if is_mixed else np.arange(self._count)
 
-    def get_generator(self, i: int) -> np.random.Generator:
+    def _get_generator(self, i: int) -> np.random.Generator:
         """Get row i's generator, which draws one 64-bit key a reset; seeded randomly at first."""
         generator = self.generators[i]
         if generator is None:
@@ -176,5 +215,5 @@ class EpisodeBatch:
         """Each row's slow sensors by name, with the clock phases that its episode drew."""
         return self._map_rows(lambda i: get_slow_sensors(self.configs[i], self.states[i]))
 
-    def _map_rows(self, make_item: Callable[[int], T]) -> LazyRows[T]:
-        return LazyRows(self._count, make_item)
+    def _map_rows(self, make_item: Callable[[int], T]) -> _LazyRows[T]:
+        return _LazyRows(self._count, make_item)

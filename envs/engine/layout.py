@@ -7,7 +7,7 @@
 from typing import Annotated, Any, NamedTuple
 
 from ..numerics.packed import make_offsets
-from ..numerics.primitives import Scalar
+from ..numerics.primitives import Scalar, Vector
 from ..record import PACKET_WIDTH
 from ..scenarios.driver import DriverParams, SpeedProfile, Wind
 from ..scenarios.road import NominalMotion, TrackPath
@@ -28,8 +28,8 @@ class Disturbance(NamedTuple):
 
     force: Scalar  # N, standard deviation
     moment: Scalar  # N m
-    decay: Any  # fraction that is left after a tick
-    noise_gain: Any  # sqrt(1 - decay^2)
+    decay: Scalar  # fraction that is left after a tick
+    noise_gain: Scalar  # sqrt(1 - decay^2)
 
 
 class TaskParams(NamedTuple):
@@ -70,10 +70,10 @@ class Clock(NamedTuple):
     """Integers of an episode, as floats."""
 
     key_low: Scalar  # lower 32 bits of the episode's key
-    key_high: Any  # upper 32 bits
-    tick: Any
-    failure: Any  # place in `FAILURES`
-    redraws: Any  # how often an unstable car was drawn anew
+    key_high: Scalar  # upper 32 bits
+    tick: Scalar
+    failure: Scalar  # place in `FAILURES`
+    redraws: Scalar  # how often an unstable car was drawn anew
     next_due: Scalar  # arrival tick of the next packet
 
 
@@ -83,9 +83,9 @@ class _SlowSensorState(NamedTuple):
     frames: Any  # captured so far
     next_capture: Scalar  # tick
     captured: Scalar  # tick of the newest delivered sample, NEVER before the first
-    values: Annotated[tuple[Any, ...], VALUES]
+    values: Annotated[tuple[Scalar, ...], VALUES]
     arrived: Scalar  # tick of the newest sample's delivery
-    drift: Any  # what the sensor carries from sample to sample
+    drift: Scalar  # what the sensor carries from sample to sample
 
 
 SLOW_STATE, SLOW_WIDTH = make_offsets(_SlowSensorState)
@@ -105,7 +105,7 @@ class EpisodeParams(NamedTuple):
     target: ReferenceParams
     disturbance: Disturbance
     task: TaskParams
-    steering_profile: Annotated[tuple[Any, ...], STEERING_WIDTH]
+    steering_profile: Annotated[tuple[Scalar, ...], STEERING_WIDTH]
     sky: SatelliteGeometry  # of the GPS
     driver: DriverParams
     path: TrackPath
@@ -120,13 +120,13 @@ class _EpisodeState(NamedTuple):
     motion: Motion
     drive: ActuatorState
     clock: Clock
-    refs: Annotated[tuple[Any, ...], 2]  # rad, rad/s, the references of beta and gamma
+    refs: Annotated[tuple[Scalar, ...], 2]  # rad, rad/s, the references of beta and gamma
     nominal_motion: NominalMotion  # the nominal car where it lays the road
     slow: Annotated[tuple[_SlowSensorState, ...], len(SLOW)]
     # packets, columns as in `Packet`
-    queue: Annotated[Any, len(SLOW) * MAX_IN_FLIGHT * PACKET_WIDTH]
+    queue: Annotated[Vector, len(SLOW) * MAX_IN_FLIGHT * PACKET_WIDTH]
     driver: Scalar  # rad, the driver's steering command
-    under_way: Any  # how many packets are in the queue
+    under_way: Scalar  # how many packets are in the queue
 
 
 P, PARAMS_WIDTH = make_offsets(EpisodeParams)

@@ -4,25 +4,31 @@ Packets are captured at a tick and delivered at their arrival in the order (capt
 those under way lie in the state.
 """
 
-from typing import Any
-
 from ..numerics.functions import clip
 from ..numerics.jit import jit
 from ..numerics.packed import load_element, read, store_element
-from ..numerics.primitives import Matrix, Scalar, Vector, maximum, minimum, select, to_word
+from ..numerics.primitives import Matrix, Scalar, Vector, minimum, select, to_word
 from ..record import FAST, PACKET, PACKET_WIDTH
-from ..sensors.link import compute_arrivals
+from ..sensors.link import Link, compute_arrivals
 from ..sensors.slow import BLOCKS, NEEDS_QUALITY, VALUES, WIDTHS, MeasurementContext, sample_sensor
 from ..task import AGE_CAP, N_SAMPLED, REPORT
 from ..ticks import NEVER, TICK
+from ..vehicle.dynamics import Motion
 from .layout import FLAGS, P, Z
+from .workspace import EpisodeArrays
 
 NEVER_DUE = 1e15  # tick of the next arrival where no packet is under way
 
 
 @jit
 def _push_packet(
-    z: Vector, sensor: int, captured: Any, due: Scalar, quality: Any, frame: Any, values: Vector
+    z: Vector,
+    sensor: int,
+    captured: Scalar,
+    due: Scalar,
+    quality: Scalar,
+    frame: Scalar,
+    values: Vector,
 ) -> None:
     """Queue a captured sample; `make_link` has checked that the queue is long enough."""
     slot = int(z[Z.under_way])
@@ -40,7 +46,7 @@ def _push_packet(
 
 @jit
 def _send_frame(
-    z: Vector, sensor: int, link: Any, tick: Scalar, key: Vector, values: Vector, quality: Any
+    z: Vector, sensor: int, link: Link, tick: Scalar, key: Vector, values: Vector, quality: Scalar
 ) -> None:
     """Queue a slow sensor's frame for its arrivals, and set the sensor's clock on."""
     column = Z.slow[sensor]
@@ -55,8 +61,14 @@ def _send_frame(
 
 
 @jit
-def update_newest(z: Vector, packet: Vector, tick: Any) -> None:
-    """Take a delivered packet (PACKET_WIDTH,) as its sensor's newest sample, if it is newer."""
+def update_newest(z: Vector, packet: Vector, tick: Scalar) -> None:
+    """Take a delivered packet as its sensor's newest sample, if it is newer.
+
+    Args:
+        z: Packed state.
+        packet: The packet, shape (PACKET_WIDTH,).
+        tick: Tick of its arrival.
+    """
     sensor = int(packet[PACKET.sensor])
     newest = Z.slow[sensor]
     is_empty = NEEDS_QUALITY[sensor] and packet[PACKET.quality] <= 0.0
@@ -96,20 +108,21 @@ def _move_due_packets(z: Vector, tick: Scalar, packets: Matrix, count: int) -> i
 
 
 @jit
-def find_next_due(z: Vector, tick: Scalar) -> Any:
-    """Find the first tick after this one at which a slow sensor captures or a packet arrives."""
-    due = maximum(z[Z.clock.next_due], tick + 1.0)
-    for sensor in range(len(Z.slow)):
-        capture = z[Z.slow[sensor].next_capture]
-        due = select(capture > tick, minimum(due, capture), due)
-    return due
-
-
-@jit
 def make_measurement_context(
-    p: Vector, motion: Any, small_angle: int, key: Vector, tick: Any
+    p: Vector, motion: Motion, small_angle: int, key: Vector, tick: Scalar
 ) -> MeasurementContext:
-    """Make the inputs of the slow sensors' measurements at a tick."""
+    """Make the inputs of the slow sensors' measurements at a tick.
+
+    Args:
+        p: Packed parameters.
+        motion: Motion of the car.
+        small_angle: 1 for the small-angle plant.
+        key: Lower and upper 32 bits of the episode's key.
+        tick: The tick.
+
+    Returns:
+        The inputs.
+    """
     road, car, noise = read(p, P.road), read(p, P.car), read(p, P.noise)
     sky, field_of_view = read(p, P.sky), read(p, P.field_of_view)
     return MeasurementContext(
@@ -118,8 +131,18 @@ def make_measurement_context(
 
 
 @jit
-def sample_slow_sensors(row: Any, motion: Any, tick: Scalar, count: int) -> int:
-    """Sample the slow sensors at a tick and deliver due packets; return the new packet count."""
+def sample_slow_sensors(row: EpisodeArrays, motion: Motion, tick: Scalar, count: int) -> int:
+    """Sample the slow sensors at a tick and deliver due packets.
+
+    Args:
+        row: Arrays of the episode.
+        motion: Motion of the car.
+        tick: The tick.
+        count: Number of packets of the step that were delivered before.
+
+    Returns:
+        The number that is delivered now.
+    """
     p, z, small_angle = row.p, row.z, row.switches[FLAGS.small_angle]
     key = (to_word(z[Z.clock.key_low]), to_word(z[Z.clock.key_high]))
     for sensor in range(len(Z.slow)):
@@ -135,19 +158,36 @@ def sample_slow_sensors(row: Any, motion: Any, tick: Scalar, count: int) -> int:
 
 
 @jit
-def observe(row: Any, n: int, count: int, refs: Vector, bounds: Matrix) -> None:
-    """Write the float32 observation of n fast rows and `count` packets, clipped at its bounds."""
+def observe(row: EpisodeArrays, n: int, count: int, refs: Vector, bounds: Matrix) -> None:
+    """Write the float32 observation, clipped at its bounds.
+
+    Args:
+        row: Arrays of the episode.
+        n: Number of fast rows.
+        count: Number of packets.
+        refs: (beta_ref, gamma_ref) (rad, rad/s).
+        bounds: Bounds of the observation, shape (2, k).
+    """
     k = observe_fast(row.rows, n, refs, bounds, row.switches, row.obs)
     observe_slow(row, k, count, bounds)
 
 
 @jit
 def observe_fast(
-    rows: Vector, n: int, refs: Vector, bounds: Matrix, switches: Vector, obs: Vector
+    rows: Matrix, n: int, refs: Vector, bounds: Matrix, switches: Vector, obs: Vector
 ) -> int:
-    """Write the observation's first entries, of n fast rows, and its last two, the references.
+    """Write the observation's first entries, of fast rows, and its last two, the references.
 
-    Returns the number of first entries. For a block `rows` and `obs` have an axis more.
+    Args:
+        rows: Fast rows; of a block rows and obs have an axis more.
+        n: Number of fast rows.
+        refs: (beta_ref, gamma_ref) (rad, rad/s).
+        bounds: Bounds of the observation, shape (2, k).
+        switches: `Switches` of the episode.
+        obs: The observation.
+
+    Returns:
+        Number of first entries.
     """
     k = 0
     for column in range(N_SAMPLED):
@@ -181,8 +221,15 @@ def _store_clipped(obs: Vector, value: Scalar, bounds: Matrix, k: int) -> None:
 
 
 @jit
-def observe_slow(row: Any, k: int, count: int, bounds: Matrix) -> None:
-    """Write the entries of the slow sensors, from k on, of a record of `count` packets."""
+def observe_slow(row: EpisodeArrays, k: int, count: int, bounds: Matrix) -> None:
+    """Write the observation's entries of the slow sensors.
+
+    Args:
+        row: Arrays of the episode.
+        k: The first of the entries.
+        count: Number of packets.
+        bounds: Bounds of the observation, shape (2, k).
+    """
     p, z, obs, packets = row.p, row.z, row.obs, row.packets
     tick = z[Z.clock.tick]
     for sensor in range(len(Z.slow)):
@@ -205,7 +252,12 @@ def observe_slow(row: Any, k: int, count: int, bounds: Matrix) -> None:
 
 @jit
 def write_report(report: Vector, z: Vector) -> None:
-    """Write time, yaw rate, heading and failure of the state into the report."""
+    """Write time, yaw rate, heading and failure of the state into the report.
+
+    Args:
+        report: The report, shape (len(StepReport),).
+        z: Packed state.
+    """
     report[REPORT.t] = z[Z.clock.tick] * TICK
     report[REPORT.gamma] = z[Z.motion.gamma]
     report[REPORT.psi] = z[Z.motion.psi]

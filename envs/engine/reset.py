@@ -1,22 +1,26 @@
 """Reset of an episode: its draws from a key, and tick 0; compiled."""
 
-from typing import Any
-
 from ..numerics.functions import CHANNELS, draw_normals, sincos
 from ..numerics.jit import copy_into, jit, noinline
 from ..numerics.packed import read, write
-from ..numerics.primitives import Scalar, Vector, from_word, select
+from ..numerics.primitives import Matrix, Scalar, Vector, from_word, select
 from ..record import FAST
-from ..scenarios.draws import DRAWS, DRAWS_WIDTH, draw_stable
+from ..scenarios.draws import DRAWS, DRAWS_WIDTH, Draws, draw_stable
 from ..scenarios.driver import compute_target_angle
 from ..scenarios.road import transform_path
 from ..scenarios.steering import DRIVER, WANDER, write_steering
-from ..sensors.inertial import NormalDraws, compute_fast_row
+from ..sensors.inertial import Noise, NormalDraws, compute_fast_row
 from ..sensors.link import draw_clock_phase
 from ..sensors.slow import GPS, draw_first_drift
 from ..task import REPORT, compute_reference
 from ..ticks import FOREVER, NEVER, round_to_ticks
-from ..vehicle.dynamics import compute_car_curvature, compute_gravity, compute_sideslip_angle
+from ..vehicle.dynamics import (
+    Motion,
+    RoadParams,
+    compute_car_curvature,
+    compute_gravity,
+    compute_sideslip_angle,
+)
 from ..vehicle.parameters import GRAVITY
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH, P, Z
 from .outputs import NEVER_DUE, observe, sample_slow_sensors, write_report
@@ -25,7 +29,7 @@ from .workspace import EpisodeArrays, EpisodeStart
 
 
 @jit
-def _write_surroundings(p: Vector, d: Any, s: Scalar, v_x: Scalar) -> None:
+def _write_surroundings(p: Vector, d: Draws, s: Scalar, v_x: Scalar) -> None:
     """Write drawn friction, wind, road and path, for a start at s (m) with v_x (m/s)."""
     mirrored = d.side < 0.5
     right = select(d.friction_right > 0.0, d.friction_right, d.friction)
@@ -45,7 +49,7 @@ def _write_surroundings(p: Vector, d: Any, s: Scalar, v_x: Scalar) -> None:
 
 
 @jit
-def _write_sensors(p: Vector, d: Any, low: Vector, high: Vector) -> None:
+def _write_sensors(p: Vector, d: Draws, low: Vector, high: Vector) -> None:
     """Write drawn biases and GPS latency, which was packed as the worst case of low and high."""
     p[P.noise.gyro_bias] = p[P.noise.gyro_bias] + d.gyro_bias
     p[P.noise.accel_y_bias] = p[P.noise.accel_y_bias] + d.accel_y_bias
@@ -57,7 +61,7 @@ def _write_sensors(p: Vector, d: Any, low: Vector, high: Vector) -> None:
 
 
 @jit
-def _write_motion(z: Vector, d: Any, start: Vector, small_angle: int) -> None:
+def _write_motion(z: Vector, d: Draws, start: Vector, small_angle: int) -> None:
     """Write the drawn motion, or the numbers of `start` (len(Motion),) that are not NaN."""
     mirrored = d.side < 0.5
     beta = select(mirrored, 0.0 - d.initial_beta, d.initial_beta)
@@ -72,9 +76,23 @@ def _write_motion(z: Vector, d: Any, start: Vector, small_angle: int) -> None:
 
 @jit
 def compute_first_row(
-    motion: Any, steer: Any, road: Any, d_f: Scalar, noise: Any, draws: Any, small_angle: int
-) -> Any:
-    """Compute the fast sensors (FAST_WIDTH) at tick 0, when only the steering has acted."""
+    motion: Motion, steer: Scalar, road: RoadParams, d_f: Scalar, noise: Noise, draws: NormalDraws,
+    small_angle: int,
+) -> Vector:  # fmt: skip
+    """Compute the fast sensors at tick 0, when only the steering has acted.
+
+    Args:
+        motion: Motion of the car.
+        steer: Steering angle (rad).
+        road: The road.
+        d_f: Front track (m).
+        noise: Noise of the sensors.
+        draws: Random numbers of the tick.
+        small_angle: 1 for the small-angle plant.
+
+    Returns:
+        The fast row, FAST_WIDTH numbers.
+    """
     applied = (steer, 0.0, 0.0, steer, 0.0, compute_car_curvature(motion, road))
     g_x, g_y = compute_gravity(motion, road, small_angle)
     return compute_fast_row(motion, (g_x, g_y + GRAVITY * motion.phi), applied, d_f, noise, draws)
@@ -82,9 +100,17 @@ def compute_first_row(
 
 @noinline
 def reset_vehicle(
-    start: EpisodeStart, key_low: int, key_high: int, bounds: Any, row: EpisodeArrays
+    start: EpisodeStart, key_low: int, key_high: int, bounds: Matrix, row: EpisodeArrays
 ) -> None:
-    """Draw the episode from a key, two words of 32 bits, and deliver tick 0."""
+    """Draw the episode from a key and deliver tick 0.
+
+    Args:
+        start: Packed start of the episode.
+        key_low: Lower 32 bits of the key.
+        key_high: Upper 32 bits.
+        bounds: Bounds of the observation, shape (2, k).
+        row: Arrays of the episode, which are written.
+    """
     p, z, rows, report = row.p, row.z, row.rows, row.report
     copy_into(start.params, p)
     copy_into(start.switches, row.switches)

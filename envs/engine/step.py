@@ -6,12 +6,10 @@ k+1 to k+n; a reset returns tick 0 alone. `precompute_window` writes what does n
 car, `integrate_step` moves the car, `finish_step` does slow sensors, observation and report.
 """
 
-from typing import Any
-
 from ..numerics.functions import clip
 from ..numerics.jit import copy_into, inline, jit, noinline
 from ..numerics.packed import load_element, read, store_element, write
-from ..numerics.primitives import Matrix, Scalar, Vector, any_lane, select
+from ..numerics.primitives import Matrix, Scalar, Vector, any_lane, maximum, minimum, select
 from ..record import FAST
 from ..scenarios.steering import DRIVER
 from ..task import (
@@ -26,7 +24,7 @@ from ..task import (
 )
 from ..vehicle.tyres import has_load_shift
 from .layout import FLAGS, P, Z
-from .outputs import find_next_due, observe_fast, observe_slow, sample_slow_sensors, write_report
+from .outputs import observe_fast, observe_slow, sample_slow_sensors, write_report
 from .tick import (
     Measurements,
     StepParams,
@@ -42,7 +40,14 @@ from .workspace import EpisodeArrays, EpisodeStart, split_workspace
 
 @jit
 def make_step_params(p: Vector) -> StepParams:
-    """Make the parameters that are constant within an env-step from packed ones."""
+    """Make the parameters that are constant within an env-step.
+
+    Args:
+        p: Packed parameters.
+
+    Returns:
+        The parameters.
+    """
     return StepParams(
         car=read(p, P.car), road=read(p, P.road), motor=read(p, P.motor),
         steering=read(p, P.steering), wind=read(p, P.wind), speed_profile=read(p, P.speed_profile),
@@ -54,7 +59,15 @@ def make_step_params(p: Vector) -> StepParams:
 
 @jit
 def make_step_variant(p: Vector, switches: Vector) -> StepVariant:
-    """Make the variant of a vehicle's ticks from packed parameters p and switches."""
+    """Make the variant of a vehicle's ticks.
+
+    Args:
+        p: Packed parameters.
+        switches: `Switches` of the episode.
+
+    Returns:
+        The variant.
+    """
     flags = read(switches, FLAGS)
     lag = int(p[P.motor.start] > 0.0) + int(p[P.steering.start] > 0.0)
     has_driver = int(flags.steering == DRIVER)
@@ -66,7 +79,14 @@ def make_step_variant(p: Vector, switches: Vector) -> StepVariant:
 
 
 def get_start_variant(start: EpisodeStart) -> StepVariant:
-    """Get the variant of an episode's ticks from its packed start."""
+    """Get the variant of an episode's ticks.
+
+    Args:
+        start: Packed start of the episode.
+
+    Returns:
+        The variant.
+    """
     return StepVariant(*map(int, make_step_variant(start.params, start.switches)))
 
 
@@ -136,10 +156,23 @@ def integrate_step(
 
 @inline
 def write_final_state(
-    z: Vector, report: Vector, state: StepState, measured: Measurements, failure: Scalar, beta: Any,
-    refs: Vector, tick: Scalar, cost: Scalar, duration: Scalar,
+    z: Vector, report: Vector, state: StepState, measured: Measurements, failure: Scalar,
+    beta: Scalar, refs: Vector, tick: Scalar, cost: Scalar, duration: Scalar,
 ) -> None:  # fmt: skip
-    """Write the end of an env-step into z, but for the motion, and into its report."""
+    """Write the end of an env-step, but for the motion.
+
+    Args:
+        z: Packed state to write.
+        report: Report to write.
+        state: State at the end.
+        measured: Measurements at the end.
+        failure: Code of the failure.
+        beta: Sideslip angle (rad).
+        refs: (beta_ref, gamma_ref) (rad, rad/s).
+        tick: Tick of the end.
+        cost: Cost of the step.
+        duration: Length of the episode (ticks).
+    """
     write(z, state.drive, Z.drive)
     store_element(z, state.driver, Z.driver)
     write(z, refs, Z.refs)
@@ -158,7 +191,15 @@ def write_final_state(
 
 @jit
 def finish_step(row: EpisodeArrays, n: int, done: int, bounds: Matrix, window: Vector) -> None:
-    """Do slow sensors, observation and report of one vehicle's step of `done` ticks of n."""
+    """Do slow sensors, observation and report of one vehicle's step.
+
+    Args:
+        row: Arrays of the episode.
+        n: Ticks of a control period.
+        done: Ticks of the step.
+        bounds: Bounds of the observation, shape (2, k).
+        window: Window of the step.
+    """
     finish_slow_sensors(row, done, _observe_step(row, n, done, bounds), bounds, window)
 
 
@@ -166,25 +207,52 @@ def finish_step(row: EpisodeArrays, n: int, done: int, bounds: Matrix, window: V
 def finish_slow_sensors(
     row: EpisodeArrays, done: int, k: int, bounds: Matrix, window: Vector
 ) -> None:
-    """Do slow sensors and report of a step of `done` ticks; k is their first observation entry."""
+    """Do slow sensors and report of one vehicle's step.
+
+    Args:
+        row: Arrays of the episode.
+        done: Ticks of the step.
+        k: The first of their entries in the observation.
+        bounds: Bounds of the observation, shape (2, k).
+        window: Window of the step.
+    """
     _finish_report(row, k, sample_slow_ticks(row, 0, done, 0, done, window), bounds)
+
+
+@jit
+def _find_next_due(z: Vector, tick: Scalar) -> Scalar:
+    """Find the first tick after this one at which a slow sensor captures or a packet arrives."""
+    due = maximum(z[Z.clock.next_due], tick + 1.0)
+    for sensor in range(len(Z.slow)):
+        capture = z[Z.slow[sensor].next_capture]
+        due = select(capture > tick, minimum(due, capture), due)
+    return due
 
 
 @jit
 def sample_slow_ticks(
     row: EpisodeArrays, first: int, last: int, count: int, done: int, window: Vector
 ) -> int:
-    """Sample the slow sensors at ticks first to last - 1 of a step's `done`.
+    """Sample the slow sensors at ticks first to last - 1 of a step.
 
-    `count` is the number of packets delivered before; returns the number delivered by then.
+    Args:
+        row: Arrays of the episode.
+        first: The first of the ticks.
+        last: The tick behind the last one.
+        count: Number of packets of the step that were delivered before.
+        done: Ticks of the step.
+        window: Window of the step.
+
+    Returns:
+        The number that is delivered by then.
     """
     z = row.z
     start_tick = z[Z.clock.tick] - done
-    tick = find_next_due(z, start_tick + first)
+    tick = _find_next_due(z, start_tick + first)
     while tick <= start_tick + last:
         j = int(tick - start_tick) - 1
         count = sample_slow_sensors(row, read(window, WINDOW.track, j), tick, count)
-        tick = find_next_due(z, tick)
+        tick = _find_next_due(z, tick)
     return count
 
 
@@ -203,7 +271,15 @@ def _observe_step(row: EpisodeArrays, n: int, done: int, bounds: Matrix) -> int:
 
 @jit
 def finish_outputs(row: EpisodeArrays, n: int, done: int, count: int, bounds: Matrix) -> None:
-    """Write observation and report of a step of `done` ticks of n with `count` packets."""
+    """Write observation and report of one vehicle's step.
+
+    Args:
+        row: Arrays of the episode.
+        n: Ticks of a control period.
+        done: Ticks of the step.
+        count: Number of packets.
+        bounds: Bounds of the observation, shape (2, k).
+    """
     _finish_report(row, _observe_step(row, n, done, bounds), count, bounds)
 
 
@@ -219,7 +295,14 @@ def _finish_report(row: EpisodeArrays, k: int, count: int, bounds: Matrix) -> No
 
 @jit
 def clip_action(action: Vector) -> tuple[float, float]:
-    """Clip (yaw moment, added steering) of an action to +-1; NaN where it is not finite."""
+    """Clip an action to +-1; NaN where it is not finite.
+
+    Args:
+        action: Fractions of full scale, shape (1,) or (2,).
+
+    Returns:
+        (yaw moment, added steering) as fractions of full scale.
+    """
     # in plain Python a float32 would make float32 of all that follows
     yaw_share = float(action[0])
     steer_share = float(action[1]) if len(action) > 1 else 0.0
@@ -230,8 +313,15 @@ def clip_action(action: Vector) -> tuple[float, float]:
 
 
 @jit
-def check_action_range(action: Any) -> int:
-    """Check an action: WILD where a number is finite and beyond WILD_LIMIT, else 0."""
+def check_action_range(action: Vector) -> int:
+    """Check whether a number of an action is finite and beyond WILD_LIMIT.
+
+    Args:
+        action: Fractions of full scale, shape (1,) or (2,).
+
+    Returns:
+        WILD where one is, else 0.
+    """
     for share in action:
         if (share > WILD_LIMIT or share < -WILD_LIMIT) and share - share == 0.0:
             return WILD
@@ -240,7 +330,14 @@ def check_action_range(action: Any) -> int:
 
 @jit
 def reject_action(row: EpisodeArrays) -> int:
-    """Refuse an action that is not finite, or end the episode as a failure (`fail_bad`)."""
+    """Refuse an action that is not finite, or end the episode as a failure (`fail_bad`).
+
+    Args:
+        row: Arrays of the episode.
+
+    Returns:
+        REFUSED, or 0: no tick was done.
+    """
     z, report = row.z, row.report
     if row.switches[FLAGS.fail_bad] == 0:
         return REFUSED
@@ -253,36 +350,43 @@ def reject_action(row: EpisodeArrays) -> int:
 
 
 @noinline
-def step_vehicle(
-    p: Vector, z: Vector, switches: Vector, obs: Vector, rows: Matrix, packets: Matrix,
-    report: Vector, action: Vector, n: int, bounds: Matrix, window: Vector,
-) -> int:  # fmt: skip
-    """Step one vehicle by n ticks, fewer where the episode ends; return the ticks done.
+def step_vehicle(row: EpisodeArrays, action: Vector, n: int, bounds: Matrix, window: Matrix) -> int:
+    """Step one vehicle by n ticks, fewer where the episode ends.
 
-    The first seven arguments are `EpisodeArrays`, one by one: numba takes 0.2 us for every array
-    within a tuple. The action holds fractions of the yaw moment and, if there are two, of the added
-    steering; one that is not finite returns REFUSED, or fails the episode (`fail_bad`).
+    Args:
+        row: Arrays of the episode.
+        action: Fractions of full scale of the yaw moment and, if there are two, the added steering.
+        n: Ticks of a control period.
+        bounds: Bounds of the observation, shape (2, k).
+        window: Window of the step.
+
+    Returns:
+        Ticks done; for an action that is not finite REFUSED, or 0 with `fail_bad`.
     """
-    row = EpisodeArrays(p, z, switches, obs, rows, packets, report)
+    p, z = row.p, row.z
     yaw_share, steer_share = clip_action(action)
     if yaw_share != yaw_share:
         return int(reject_action(row))
-    variant = make_step_variant(p, switches)
+    variant = make_step_variant(p, row.switches)
     precompute_window(p, z, n, variant.has_driver, window)
-    done = integrate_step(p, z, variant, yaw_share, steer_share, n, rows, report, window, True)
+    done = integrate_step(
+        p, z, variant, yaw_share, steer_share, n, row.rows, row.report, window, True
+    )
     finish_step(row, n, done, bounds, window)
     return int(done)
 
 
 @jit
-def step_workspace(workspace: Any, action: Vector) -> int:
-    """Step the vehicle of a workspace as `step_vehicle` does, and add WILD where it applies."""
+def step_workspace(workspace: Vector, action: Vector) -> int:
+    """Step the vehicle of a workspace.
+
+    Args:
+        workspace: The workspace.
+        action: Fractions of full scale, shape (1,) or (2,).
+
+    Returns:
+        As `step_vehicle`, with WILD added for an action beyond its limit.
+    """
     row, bounds, window = split_workspace(workspace)
-    n = len(row.rows)
-    done = int(
-        step_vehicle(
-            row.p, row.z, row.switches, row.obs, row.rows, row.packets, row.report, action, n,
-            bounds, window,
-        )
-    )  # fmt: skip
+    done = int(step_vehicle(row, action, len(row.rows), bounds, window))
     return done + check_action_range(action) if done > 0 else done

@@ -10,16 +10,20 @@ from ..numerics.jit import inline
 from ..numerics.primitives import Scalar, Vector, any_lane, select
 from ..record import FAST
 from ..scenarios.driver import (
+    DriverParams,
+    SpeedProfile,
+    Wind,
     compute_acceleration_command,
     compute_driver_angle,
     compute_speed_reference,
     compute_wind,
 )
-from ..scenarios.road import NOMINAL_PATH, NominalMotion, step_nominal_car
-from ..sensors.inertial import NormalDraws, compute_fast_row, compute_specific_force
-from ..task import compute_reference, filter_reference
+from ..scenarios.road import NOMINAL_PATH, NominalMotion, TrackPath, step_nominal_car
+from ..sensors.inertial import Noise, NormalDraws, compute_fast_row, compute_specific_force
+from ..task import ReferenceParams, compute_reference, filter_reference
 from ..ticks import TICK
 from ..vehicle.actuators import (
+    Lag,
     allocate_torques,
     apply_lag,
     compute_torque_limit,
@@ -30,12 +34,14 @@ from ..vehicle.actuators import (
 from ..vehicle.dynamics import (
     CarParams,
     DisturbanceForces,
+    Motion,
     RoadParams,
     compute_car_curvature,
     kutta3,
 )
-from ..vehicle.tyres import TyreInputs, compute_tyre_load
-from .layout import ActuatorState
+from ..vehicle.linear import Bicycle
+from ..vehicle.tyres import TyreInputs, TyreLoad, compute_tyre_load
+from .layout import ActuatorState, Disturbance, TaskParams, TyreChange
 from .window import CostInputs
 
 _NO_LAG, _ONE_LAG = range(2)  # 2: both lag
@@ -55,34 +61,34 @@ class StepVariant(NamedTuple):
 
 
 class StepParams(NamedTuple):
-    """Parameters that are constant within an env-step; each a tuple of numbers."""
+    """Parameters that are constant within an env-step."""
 
-    car: Any
-    road: Any
-    motor: Any
-    steering: Any
-    wind: Any
-    speed_profile: Any
-    target: Any
-    disturbance: Any
-    task: Any
-    noise: Any
-    driver: Any
-    path: Any
-    tyre_change: Any
-    nominal_car: Any
+    car: CarParams
+    road: RoadParams
+    motor: Lag
+    steering: Lag
+    wind: Wind
+    speed_profile: SpeedProfile
+    target: ReferenceParams
+    disturbance: Disturbance
+    task: TaskParams
+    noise: Noise
+    driver: DriverParams
+    path: TrackPath
+    tyre_change: TyreChange
+    nominal_car: Bicycle
 
 
 class StepState(NamedTuple):
     """The state that a tick changes."""
 
-    motion: Any
-    drive: Any
-    start: Any  # `TyreLoad` at the tick's start
+    motion: Motion
+    drive: ActuatorState
+    start: Any  # `TyreLoad` at the tick's start; outside plants have none
     driver: Scalar  # rad, the driver's steering command
-    car: Any  # with the present tyres
-    refs: Any  # rad, rad/s, the references of beta and gamma
-    nominal_motion: Any  # the nominal car that lays the road
+    car: CarParams  # with the present tyres
+    refs: Vector  # rad, rad/s, the references of beta and gamma
+    nominal_motion: NominalMotion  # the nominal car that lays the road
 
 
 class AppliedInputs(NamedTuple):
@@ -105,25 +111,34 @@ class _PlantInputs(NamedTuple):
     steer: Scalar  # rad, command to the front wheels
     T_l: Scalar  # N m, command to the left motor
     T_r: Scalar  # N m, command to the right motor
-    disturbance: Any  # `DisturbanceForces`
-    applied: Any  # `AppliedInputs`
-    drive: Any  # `ActuatorState` at the tick's end
+    disturbance: DisturbanceForces
+    applied: AppliedInputs
+    drive: ActuatorState  # at the tick's end
 
 
 class Measurements(NamedTuple):
     """Sensors at the end of a tick."""
 
-    row: Any  # the fast sensors, columns as in `Fast`
-    refs: Any  # rad, rad/s, the references of beta and gamma
+    row: Vector  # the fast sensors, columns as in `Fast`
+    refs: Vector  # rad, rad/s, the references of beta and gamma
     steer: Scalar  # rad, `AppliedInputs.steer`
     moment: Scalar  # N m, `AppliedInputs.moment`
-    lost: Any  # whether a number is not finite
+    lost: Scalar  # whether a number is not finite
     cost_inputs: CostInputs
 
 
 @inline
-def apply_tyre_change(car: Any, change: Any, is_changed: Scalar) -> Any:
-    """Change the car's tyres where `is_changed` holds."""
+def apply_tyre_change(car: CarParams, change: TyreChange, is_changed: Scalar) -> CarParams:
+    """Change the car's tyres.
+
+    Args:
+        car: Parameters of the car.
+        change: The change.
+        is_changed: Whether they are changed.
+
+    Returns:
+        The car with its present tyres.
+    """
     C_f = select(is_changed, car.C_f * change.front, car.C_f)
     C_r = select(is_changed, car.C_r * change.rear, car.C_r)
     new_stiffness = (C_f, C_r)
@@ -131,32 +146,63 @@ def apply_tyre_change(car: Any, change: Any, is_changed: Scalar) -> Any:
 
 
 @inline
-def compute_static_load(drive: Any, car: Any, variant: StepVariant) -> Any:
-    """Compute the tyres' load at the actuators' present state."""
+def compute_static_load(drive: ActuatorState, car: CarParams, variant: StepVariant) -> TyreLoad:
+    """Compute the tyres' load at the actuators' present state.
+
+    Args:
+        drive: State of the actuators.
+        car: Parameters of the car.
+        variant: Variant of the tick.
+
+    Returns:
+        The load.
+    """
     inputs = TyreInputs(drive.delta_f, drive.T_l, drive.T_r)
     return compute_tyre_load(inputs, car, variant.small_angle, variant.has_load_shift)
 
 
 @inline
 def compute_lagged_load(
-    steer: Any, T_l: Scalar, T_r: Scalar, drive: Any, rest: Scalar, car: Any, variant: StepVariant
-) -> Any:
-    """Compute the tyres' load; `rest` of the motors' deviation from T_l and T_r (N m) is left."""
+    steer: Scalar, T_l: Scalar, T_r: Scalar, drive: Any, rest: Scalar, car: CarParams,
+    variant: StepVariant,
+) -> Any:  # fmt: skip
+    """Compute the tyres' load while the motors lag.
+
+    Args:
+        steer: Front steering angle (rad).
+        T_l: Command of the left motor (N m).
+        T_r: Command of the right motor (N m).
+        drive: State of the actuators at the tick's start, with `T_l` and `T_r`.
+        rest: Fraction of the motors' deviation from their commands that is left.
+        car: Parameters of the car.
+        variant: Variant of the tick.
+
+    Returns:
+        The load.
+    """
     inputs = TyreInputs(steer, apply_lag(T_l, drive.T_l, rest), apply_lag(T_r, drive.T_r, rest))
     return compute_tyre_load(inputs, car, variant.small_angle, variant.has_load_shift)
 
 
 @inline
 def compute_motor_torques(
-    N_z: Scalar,
-    tick: Scalar,
-    v_x: Scalar,
-    integral: Scalar,
-    profile: Any,
-    car: Any,
+    N_z: Scalar, tick: Scalar, v_x: Scalar, integral: Scalar, profile: SpeedProfile, car: CarParams,
     yaw_first: Scalar,
-) -> Any:
-    """Compute (T_l, T_r, a_x, integral): torques (N m) for yaw moment and driver's acceleration."""
+) -> tuple[Scalar, Scalar, Scalar, Scalar]:  # fmt: skip
+    """Compute the motors' commands for yaw moment and driver's acceleration.
+
+    Args:
+        N_z: Commanded yaw moment (N m).
+        tick: The tick.
+        v_x: Speed (m/s).
+        integral: Integral part of the driver's acceleration command (m/s2).
+        profile: The driver's speed profile.
+        car: Parameters of the car.
+        yaw_first: 1 where the yaw moment comes before acceleration.
+
+    Returns:
+        Left and right torque (N m), acceleration command (m/s2), its next integral part (m/s2).
+    """
     max_torque = compute_torque_limit(v_x, car)
     limit = 2.0 * max_torque / (car.m * car.r)
     a_x, integral = compute_acceleration_command(tick, v_x, integral, profile, limit)
@@ -197,7 +243,19 @@ def compute_inputs(
     params: StepParams, N_z: Scalar, steer_command: Scalar, state: StepState, tick: Scalar,
     draws: NormalDraws,
 ) -> _PlantInputs:  # fmt: skip
-    """Compute the plant's inputs during a tick; arguments as in `integrate_tick`."""
+    """Compute the plant's inputs during a tick.
+
+    Args:
+        params: Parameters.
+        N_z: Commanded yaw moment (N m).
+        steer_command: Commanded added steering (rad).
+        state: State at the start.
+        tick: Tick at which it starts.
+        draws: Random numbers of the tick's end.
+
+    Returns:
+        The inputs.
+    """
     motor, steering, task, ou = params.motor, params.steering, params.task, params.disturbance
     drive, driver, car = state.drive, state.driver, state.car
     slewing = limit_rate(drive.slewing, steer_command, task.slew)
@@ -231,7 +289,7 @@ def compute_inputs(
 @inline
 def _compute_loads(
     params: StepParams, inputs: _PlantInputs, state: StepState, variant: StepVariant
-) -> Any:
+) -> tuple[TyreLoad, TyreLoad, TyreLoad]:
     """Compute the tyres' load at the start, the middle and the end of a tick."""
     motor, steering = params.motor, params.steering
     drive, car, start = state.drive, state.car, state.start
@@ -254,12 +312,23 @@ def _compute_loads(
 
 @inline
 def measure_tick(
-    params: StepParams, motion: Any, accel: Vector, applied: AppliedInputs, refs_before: Vector,
-    next_steer: Any, draws: NormalDraws, variant: StepVariant,
-) -> tuple[Any, Measurements]:  # fmt: skip
-    """Compute the driver's command (rad) and the measurements at the end of a tick.
+    params: StepParams, motion: Motion, accel: Vector, applied: AppliedInputs, refs_before: Vector,
+    next_steer: Scalar, draws: NormalDraws, variant: StepVariant,
+) -> tuple[Scalar, Measurements]:  # fmt: skip
+    """Compute the driver's command and the measurements at the end of a tick.
 
-    `accel` is (a_x, a_y), specific forces in m/s2; `refs_before` are the references at the start.
+    Args:
+        params: Parameters.
+        motion: Motion at the end.
+        accel: (a_x, a_y), specific forces (m/s2).
+        applied: Mean inputs over the tick.
+        refs_before: References of beta and gamma at the start (rad, rad/s).
+        next_steer: Profile's steering (rad) at the end, used where no driver reacts to the car.
+        draws: Random numbers of the tick's end.
+        variant: Variant of the tick.
+
+    Returns:
+        The driver's steering command (rad), and the measurements.
     """
     task = params.task
     row = compute_fast_row(motion, accel, applied, params.car.d_f, params.noise, draws)
@@ -285,7 +354,7 @@ def measure_tick(
 @inline
 def integrate_tick(
     params: StepParams, N_z: Scalar, steer_command: Scalar, state: StepState, tick: Scalar,
-    draws: NormalDraws, next_steer: Any, variant: StepVariant,
+    draws: NormalDraws, next_steer: Scalar, variant: StepVariant,
 ) -> tuple[StepState, Measurements]:  # fmt: skip
     """Integrate one tick of the plant.
 

@@ -1,10 +1,10 @@
 """Views of an episode's packed numbers: vehicle, slow sensors, motion, true state and record."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar, overload
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from ..numerics.jit import jit
 from ..numerics.packed import read
@@ -14,16 +14,23 @@ from ..scenarios.driver import compute_wind
 from ..sensors.link import SlowSensor
 from ..sensors.slow import SLOW_NAMES
 from ..ticks import TICK, count_ticks
-from ..vehicle.dynamics import Motion, compute_gravity, compute_sideslip_angle
+from ..vehicle.dynamics import compute_gravity, compute_sideslip_angle
 from ..vehicle.parameters import Vehicle
 from .config import EpisodeConfig
 from .layout import FLAGS, P, Z
 
-T = TypeVar("T")
-
 
 def get_vehicle(config: EpisodeConfig, params: Array, state: Array) -> Vehicle:
-    """Get the true vehicle now, with the seed's draws; friction is the mean of both sides."""
+    """Get the true vehicle now, with the seed's draws; friction is the mean of both sides.
+
+    Args:
+        config: The episode's config.
+        params: Packed parameters.
+        state: Packed state.
+
+    Returns:
+        The vehicle.
+    """
     car, change = read(params, P.car), read(params, P.tyre_change)
     if not car.m > 0.0:  # not reset yet
         return config.vehicle
@@ -36,7 +43,15 @@ def get_vehicle(config: EpisodeConfig, params: Array, state: Array) -> Vehicle:
 
 
 def get_slow_sensors(config: EpisodeConfig, state: Array) -> dict[str, SlowSensor]:
-    """Get the slow sensors by name, with the clock phases that the episode drew."""
+    """Get the slow sensors with the clock phases that the episode drew.
+
+    Args:
+        config: The episode's config.
+        state: Packed state.
+
+    Returns:
+        The sensors by name.
+    """
     sensors = {}
     for name, sensor in config.slow.items():
         if sensor.phase is None:
@@ -45,11 +60,6 @@ def get_slow_sensors(config: EpisodeConfig, state: Array) -> dict[str, SlowSenso
             sensor = dataclasses.replace(sensor, phase=first * TICK)
         sensors[name] = sensor
     return sensors
-
-
-def get_motion(state: Array) -> Motion:
-    """Get the true `Motion` now, in SI units."""
-    return read(state, Z.motion)
 
 
 class TrueState(NamedTuple):
@@ -66,8 +76,17 @@ class TrueState(NamedTuple):
 TRUE_STATE = TrueState()
 
 
-def compute_true_states(params: Array, states: Array, switches: Any) -> Array:
-    """Compute the `TrueState` of N episodes now, shape (N, len(TrueState))."""
+def compute_true_states(params: Array, states: Array, switches: npt.NDArray[np.int64]) -> Array:
+    """Compute the `TrueState` of N episodes now.
+
+    Args:
+        params: Packed parameters, a row for each.
+        states: Packed states likewise.
+        switches: `Switches` likewise.
+
+    Returns:
+        True states, shape (N, len(TrueState)).
+    """
     out = np.empty((len(params), len(TRUE_STATE)))
     _write_true_states(params, states, switches, out)
     return out
@@ -89,27 +108,14 @@ def _write_true_states(params: Vector, states: Vector, switches: Matrix, out: Ma
 
 
 def make_record(state: Array, rows: Array, packets: Array) -> Record:
-    """Make a record from copies of fast rows that end now, and of packets."""
+    """Make a record from copies.
+
+    Args:
+        state: Packed state.
+        rows: Fast rows that end now, shape (n, FAST_WIDTH).
+        packets: Packets, shape (count, PACKET_WIDTH).
+
+    Returns:
+        The record.
+    """
     return Record(rows.copy(), packets.copy(), int(state[Z.clock.tick]) - len(rows) + 1)
-
-
-class LazyRows(Sequence[T]):
-    """Items of a batch's `count` rows, each made by `make_item` when it is read."""
-
-    def __init__(self, count: int, make_item: Callable[[int], T]) -> None:
-        self._rows, self._make_item = range(count), make_item
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    @overload
-    def __getitem__(self, i: int) -> T: ...
-    @overload
-    def __getitem__(self, i: slice) -> tuple[T, ...]: ...
-    def __getitem__(self, i: int | slice) -> T | tuple[T, ...]:
-        if isinstance(i, slice):
-            return tuple(map(self._make_item, self._rows[i]))
-        return self._make_item(self._rows[i])
-
-    def __repr__(self) -> str:
-        return f"<{len(self)} rows>"

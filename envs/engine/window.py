@@ -3,7 +3,7 @@
 Its columns are the ticks of the step. A block of vehicles has a third axis, their lanes.
 """
 
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from ..numerics.packed import (
     count_lanes,
     iota,
     lane_width,
-    load_element,
     load_lanes,
     make_offsets,
     read,
@@ -33,13 +32,16 @@ from ..numerics.primitives import (
 )
 from ..numerics.simd import LANES
 from ..record import Array
-from ..scenarios.road import compute_path_offset
+from ..scenarios.road import TrackPath, compute_path_offset
 from ..scenarios.steering import WANDER_START, compute_steering, interpolate_trace
 from ..sensors.inertial import NormalDraws
 from ..task import compute_cost_rate
 from ..ticks import TICK
 from ..vehicle.dynamics import Motion, compute_sideslip_angle
-from .layout import PARAMS_WIDTH, P, Z
+from .layout import PARAMS_WIDTH, P, TaskParams, Z
+
+if TYPE_CHECKING:
+    from .tick import StepParams, StepVariant
 
 
 class CostInputs(NamedTuple):
@@ -56,15 +58,15 @@ class _TickCost(NamedTuple):
 
     cost: Scalar  # 1/s, cost rate
     beta: Scalar  # rad
-    spun: Any  # whether the car spins
-    off: Any  # whether it has left the road
+    spun: Scalar  # whether the car spins
+    off: Scalar  # whether it has left the road
 
 
 class _StepWindow(NamedTuple):
     """Rows of the window: normal numbers, steering angle (rad), motion and cost inputs."""
 
-    inertial: Annotated[tuple[Any, ...], 4]
-    wheels: Annotated[tuple[Any, ...], 4]
+    inertial: Annotated[tuple[Scalar, ...], 4]
+    wheels: Annotated[tuple[Scalar, ...], 4]
     steer: Scalar  # rad, the profile's
     track: Motion
     cost_inputs: CostInputs
@@ -78,18 +80,41 @@ _DECAY, _NOISE_GAIN, _HOLD = P.steering_profile[WANDER_START : WANDER_START + 3]
 
 @jit
 def count_columns(n: int) -> int:
-    """Count the columns for n ticks a step: whole lanes."""
+    """Count the columns of a window: whole lanes.
+
+    Args:
+        n: Ticks of a step.
+
+    Returns:
+        The number of columns.
+    """
     return -(-n // LANES) * LANES
 
 
 def make_window(n: int, *lanes: int) -> Array:
-    """Make a window (WINDOW_HEIGHT, columns, *lanes) for n ticks a step."""
+    """Make a window of zeros.
+
+    Args:
+        n: Ticks of a step.
+        lanes: Number of lanes, for a block.
+
+    Returns:
+        The window, shape (WINDOW_HEIGHT, columns, *lanes).
+    """
     return np.zeros((WINDOW_HEIGHT, count_columns(n), *lanes))
 
 
 @jit
-def compute_profile_angle(p: Vector, tick: Scalar) -> Any:
-    """Compute the steering angle (rad) of a profile, or of the trace behind `EpisodeParams`."""
+def compute_profile_angle(p: Vector, tick: Scalar) -> Scalar:
+    """Compute the steering angle of a profile, or of the trace behind `EpisodeParams`.
+
+    Args:
+        p: Packed parameters.
+        tick: The tick.
+
+    Returns:
+        The angle (rad).
+    """
     if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
         return interpolate_trace(tick, p[PARAMS_WIDTH:])
     return compute_steering(tick, p[P.steering_profile[0] :])
@@ -97,7 +122,14 @@ def compute_profile_angle(p: Vector, tick: Scalar) -> Any:
 
 @jit
 def overwrite_steering(p: Vector, z: Vector, n: int, window: Matrix) -> None:
-    """Write the angles of a trace, or of a wandering driver, over those of the profile."""
+    """Write the angles of a trace, or of a wandering driver, over those of the profile.
+
+    Args:
+        p: Packed parameters.
+        z: Packed state.
+        n: Number of ticks.
+        window: The window.
+    """
     if len(p) > PARAMS_WIDTH and p[PARAMS_WIDTH] > 0.0:
         for j in range(n):
             window[WINDOW.steer, j] = interpolate_trace(z[Z.clock.tick] + (j + 1), p[PARAMS_WIDTH:])
@@ -114,14 +146,16 @@ def overwrite_steering(p: Vector, z: Vector, n: int, window: Matrix) -> None:
 
 
 @jit
-def has_overwrite(p: Vector, width: int) -> bool:
-    """Whether `overwrite_steering` has something to write for a block: p with `width` rows."""
-    return width > PARAMS_WIDTH or bool(any_lane(load_element(p, _HOLD) > 0.0))
-
-
-@jit
 def precompute_window(p: Vector, z: Vector, n: int, has_driver: int, window: Vector) -> None:
-    """Write noise and steering of one vehicle's next n ticks; with has_driver no profile steers."""
+    """Write noise and steering of one vehicle's next ticks.
+
+    Args:
+        p: Packed parameters.
+        z: Packed state.
+        n: Number of ticks.
+        has_driver: Whether a driver reacts to the car, so that no profile steers.
+        window: The window.
+    """
     clock = read(z, Z.clock)
     key_low, key_high, first = to_word(clock.key_low), to_word(clock.key_high), int(clock.tick) + 1
     profile = p[P.steering_profile[0] :]
@@ -138,7 +172,15 @@ def precompute_window(p: Vector, z: Vector, n: int, has_driver: int, window: Vec
 
 @jit
 def precompute_lane_window(p: Vector, z: Vector, n: int, has_driver: int, window: Vector) -> None:
-    """Write noise and steering of a block: `precompute_window` of p, z with a column a vehicle."""
+    """Write noise and steering of a block's next ticks, but for `overwrite_steering`.
+
+    Args:
+        p: Packed parameters with a column for each vehicle.
+        z: Packed state likewise.
+        n: Number of ticks.
+        has_driver: Whether a driver reacts to the car, so that no profile steers.
+        window: The window of the block.
+    """
     clock = read(z, Z.clock)
     key_low, key_high = to_word(clock.key_low), to_word(clock.key_high)
     profile = p[P.steering_profile[0] :]
@@ -154,17 +196,36 @@ def precompute_lane_window(p: Vector, z: Vector, n: int, has_driver: int, window
 
 @jit
 def read_draws(window: Vector, j: int) -> NormalDraws:
-    """Read the random numbers of tick j of the step."""
+    """Read the random numbers of a tick.
+
+    Args:
+        window: The window.
+        j: Number of the tick in the step.
+
+    Returns:
+        The random numbers.
+    """
     return NormalDraws(read(window, WINDOW.inertial, j), read(window, WINDOW.wheels, j))
 
 
 @inline
 def compute_tick_cost(
-    motion: Any, cost_inputs: CostInputs, task: Any, path: Any, variant: Any
-) -> _TickCost:
+    motion: Motion, cost_inputs: CostInputs, task: TaskParams, path: TrackPath,
+    variant: "StepVariant",
+) -> _TickCost:  # fmt: skip
     """Compute cost and failures of a tick from the motion at its end.
 
     No tick of the plant waits for it: a step's ticks are evaluated together.
+
+    Args:
+        motion: Motion at the tick's end.
+        cost_inputs: The other inputs of the cost.
+        task: Limits of the episode.
+        path: The driver's path.
+        variant: Variant of the tick.
+
+    Returns:
+        Cost and failures.
     """
     beta = compute_sideslip_angle(motion.v_x, motion.v_y, variant.small_angle)
     e_beta, e_gamma = beta - cost_inputs.beta_ref, motion.gamma - cost_inputs.gamma_ref
@@ -182,11 +243,19 @@ def compute_tick_cost(
 
 @jit
 def evaluate_cost(
-    window: Vector, n: int, cost: Scalar, params: Any, variant: Any
-) -> tuple[Any, int, bool]:
-    """Evaluate a step's n ticks up to a failure: (cost, number of ticks, whether the last fails).
+    window: Matrix, n: int, cost: Scalar, params: "StepParams", variant: "StepVariant"
+) -> tuple[Scalar, int, bool]:
+    """Evaluate a step's ticks up to a failure.
 
-    Cost and failures overwrite the cost inputs in the window. `cost` is 0, of one car or a block.
+    Args:
+        window: The window, where cost and failures overwrite the cost inputs.
+        n: Number of ticks.
+        cost: 0, of one car or a block.
+        params: Parameters of the step.
+        variant: Variant of the ticks.
+
+    Returns:
+        Cost, number of ticks, and whether the last one fails.
     """
     for j in range(0, n, lane_width(window)):
         motion = load_lanes(window, WINDOW.track, j)

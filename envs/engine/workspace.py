@@ -1,43 +1,46 @@
-"""Arrays of an episode and of a batch of N; an episode's workspace, one vector that holds them."""
+"""Arrays of an episode; its workspace, one vector that holds them."""
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..numerics.jit import as_python, jit
 from ..numerics.packed import as_float32, as_int64, as_matrix, make_offsets, read
-from ..numerics.primitives import Scalar
+from ..numerics.primitives import Matrix, Scalar, Vector
 from ..record import FAST_WIDTH, PACKET_WIDTH, Array
 from ..task import REPORT
 from .layout import FLAGS, PARAMS_WIDTH, STATE_WIDTH
 from .window import WINDOW_HEIGHT, count_columns
+
+if TYPE_CHECKING:
+    from .config import EnvConfig
 
 
 class EpisodeArrays(NamedTuple):
     """One episode's arrays."""
 
     # (PARAMS_WIDTH,), packed as in `EpisodeParams`; behind it a recorded trace, if there is one
-    p: Any
-    z: Any  # (STATE_WIDTH,), packed as in `_EpisodeState`
-    switches: Any  # (len(Switches),) int64
-    obs: Any  # (k,) float32
-    rows: Any  # (n, FAST_WIDTH), the fast rows of the newest record
-    packets: Any  # (max, PACKET_WIDTH), its packets
-    report: Any  # (len(Report),)
+    p: Vector
+    z: Vector  # (STATE_WIDTH,), packed as in `_EpisodeState`
+    switches: Vector  # (len(Switches),) int64
+    obs: Vector  # (k,) float32
+    rows: Matrix  # (n, FAST_WIDTH), the fast rows of the newest record
+    packets: Matrix  # (max, PACKET_WIDTH), its packets
+    report: Vector  # (len(Report),)
 
 
 class _WorkspaceSizes(NamedTuple):
     """Sizes at the beginning of a workspace."""
 
     n: Scalar  # ticks a step
-    n_entries: Any  # of an observation
-    max_packets: Any  # packets of a step
+    n_entries: Scalar  # of an observation
+    max_packets: Scalar  # packets of a step
 
 
 SIZES, _HEADER = make_offsets(_WorkspaceSizes)
 
 
-def make_workspace(n: int, bounds: Array, max_packets: int, trace_width: int = 0) -> Array:
+def _make_workspace(n: int, bounds: Array, max_packets: int, trace_width: int = 0) -> Array:
     """Make a workspace of n ticks: one vector, since numba takes 0.04 us for every array passed.
 
     `bounds` are (2, k); `trace_width` values of a trace follow the parameters.
@@ -52,8 +55,15 @@ def make_workspace(n: int, bounds: Array, max_packets: int, trace_width: int = 0
 
 
 @jit
-def split_workspace(workspace: Any) -> Any:
-    """Split a workspace into (`EpisodeArrays`, bounds of the observation, window)."""
+def split_workspace(workspace: Vector) -> tuple[EpisodeArrays, Matrix, Matrix]:
+    """Split a workspace into its parts.
+
+    Args:
+        workspace: The workspace.
+
+    Returns:
+        The episode's arrays, bounds of the observation, window.
+    """
     sizes = read(workspace, SIZES)
     n, k, max_packets = int(sizes.n), int(sizes.n_entries), int(sizes.max_packets)
     report = _HEADER + STATE_WIDTH
@@ -89,7 +99,7 @@ class WorkspaceMixin:
     `rows` and `packets` are the newest record's; `delivered` of the latter are there.
     """
 
-    config: Any
+    config: "EnvConfig"
     control_period: int
     _workspace: Array | None = None
 
@@ -98,7 +108,7 @@ class WorkspaceMixin:
         if self._workspace is None or len(self._params) != width:
             config, n = self.config, self.control_period
             sizes = config.max_packets, width - PARAMS_WIDTH
-            self._workspace = make_workspace(n, config.bounds, *sizes)
+            self._workspace = _make_workspace(n, config.bounds, *sizes)
             self._bind_views()
 
     def _bind_views(self) -> None:
@@ -108,10 +118,10 @@ class WorkspaceMixin:
         self.rows, self.packets, self._report = record
         self._read_report, self._copy_observation = self._report.tolist, self._obs.copy
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         return {name: value for name, value in vars(self).items() if name not in _VIEW_NAMES}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, object]) -> None:
         vars(self).update(state)
         self._bind_views()
 
@@ -121,52 +131,11 @@ class WorkspaceMixin:
         return int(self._report[REPORT.packets])
 
 
-class BatchArrays(NamedTuple):
-    """The arrays of N episodes, a row for each."""
-
-    params: Any  # (N, ...), the rest as in `EpisodeArrays`
-    states: Any
-    switches: Any
-    obs: Any
-    rows: Any
-    packets: Any
-    reports: Any
-    ticks_done: Any  # (N,), how many of `rows` are there
-    delivered: Any  # (N,), how many of `packets` are there
-    over: Any  # (N,) of bool: the episode has ended and was not reset yet
-
-
-class RecordArrays(NamedTuple):
-    """The records of N episodes."""
-
-    rows: Any
-    packets: Any
-    ticks_done: Any
-    delivered: Any
-
-
 class EpisodeStart(NamedTuple):
     """The packed start of an episode; of several, arrays have an axis more, the first."""
 
-    params: Any  # as in `EpisodeArrays`, but for the draws
-    low: Any  # (len(Draws),), the ranges that it draws from
-    high: Any
-    switches: Any
-    motion: Any  # (len(Motion),), NaN: standing on the road at the drawn speed
-
-
-@jit
-def get_episode_arrays(batch: BatchArrays, i: int) -> EpisodeArrays:
-    """Get the arrays of episode i of a batch."""
-    return EpisodeArrays(
-        batch.params[i], batch.states[i], batch.switches[i], batch.obs[i], batch.rows[i],
-        batch.packets[i], batch.reports[i],
-    )  # fmt: skip
-
-
-@jit
-def get_episode_start(starts: EpisodeStart, i: int) -> EpisodeStart:
-    """The start of one of several episodes."""
-    return EpisodeStart(
-        starts.params[i], starts.low[i], starts.high[i], starts.switches[i], starts.motion[i]
-    )
+    params: Vector  # as in `EpisodeArrays`, but for the draws
+    low: Vector  # (len(Draws),), the ranges that it draws from
+    high: Vector
+    switches: Vector
+    motion: Vector  # (len(Motion),), NaN: standing on the road at the drawn speed

@@ -6,10 +6,12 @@ Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 
 words are signed 64-bit integers under masks.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from .jit import jit
 from .primitives import Scalar, absolute, floor, frexp, maximum, minimum, select, sqrt, to_float
+
+_Four = tuple[Scalar, Scalar, Scalar, Scalar]
 
 _TWO_OVER_PI = 0.6366197723675814
 _PI_2_HIGH = 1.5707963267341256  # the first 33 bits of pi/2, so that k * high is exact
@@ -18,7 +20,7 @@ PI = 3.141592653589793
 
 
 @jit
-def sin_kernel(r: Scalar) -> Scalar:
+def _sin_kernel(r: Scalar) -> Scalar:
     """Compute sin r for |r| <= pi/4, error below 1e-16."""
     z = r * r
     p = 1.58969099521155010221e-10
@@ -31,7 +33,7 @@ def sin_kernel(r: Scalar) -> Scalar:
 
 
 @jit
-def cos_kernel(r: Scalar) -> Scalar:
+def _cos_kernel(r: Scalar) -> Scalar:
     """Compute cos r for |r| <= pi/4, error below 2e-16."""
     z = r * r
     p = -1.13596475577881948265e-11
@@ -44,15 +46,22 @@ def cos_kernel(r: Scalar) -> Scalar:
 
 
 @jit
-def sincos(x: Scalar) -> Any:
-    """Compute (sin x, cos x), error below 3e-16 + 1e-16 |x| for |x| < 1e6 rad."""
+def sincos(x: Scalar) -> tuple[Scalar, Scalar]:
+    """Compute (sin x, cos x), error below 3e-16 + 1e-16 |x| for |x| < 1e6 rad.
+
+    Args:
+        x: Angle (rad).
+
+    Returns:
+        (sin x, cos x).
+    """
     k = floor(x * _TWO_OVER_PI + 0.5)
     r = (x - k * _PI_2_HIGH) - k * _PI_2_LOW
-    return _quadrant(k - 4.0 * floor(0.25 * k), sin_kernel(r), cos_kernel(r))
+    return _quadrant(k - 4.0 * floor(0.25 * k), _sin_kernel(r), _cos_kernel(r))
 
 
 @jit
-def _quadrant(q: Scalar, s: Scalar, c: Scalar) -> Any:
+def _quadrant(q: Scalar, s: Scalar, c: Scalar) -> tuple[Scalar, Scalar]:
     """(sin, cos) of an angle turned by q = 0, 1, 2 or 3 quarter turns."""
     odd = (q == 1.0) | (q == 3.0)
     sign_s = select(q > 1.5, -1.0, 1.0)
@@ -80,7 +89,14 @@ def _atan_kernel(t: Scalar) -> Scalar:
 
 @jit
 def atan(x: Scalar) -> Scalar:
-    """Compute arctan x, error below 5e-16: reciprocal above 1, two half-angle steps, series."""
+    """Compute arctan x, error below 5e-16: reciprocal above 1, two half-angle steps, series.
+
+    Args:
+        x: Tangent of the angle.
+
+    Returns:
+        The angle (rad).
+    """
     steep = absolute(x) > 1.0
     u = select(steep, -1.0, x) / select(steep, x, 1.0)
     t = u / (1.0 + sqrt(1.0 + u * u))
@@ -93,6 +109,13 @@ def atan2(y: Scalar, x: Scalar) -> Scalar:
     """Compute the angle of (x, y) in [-pi, pi], error below 1e-15; 0 at the origin.
 
     The half-angle steps of `atan` without their quotients: tan(a / 2) = y / (x + |(x, y)|).
+
+    Args:
+        y: Second coordinate.
+        x: First coordinate.
+
+    Returns:
+        The angle (rad).
     """
     wide, high = absolute(x), absolute(y)
     steep = high > wide
@@ -107,20 +130,41 @@ def atan2(y: Scalar, x: Scalar) -> Scalar:
 
 @jit
 def wrap(angle: Scalar) -> Scalar:
-    """Wrap an angle into [-pi, pi)."""
+    """Wrap an angle into [-pi, pi).
+
+    Args:
+        angle: Angle (rad).
+
+    Returns:
+        The wrapped angle (rad).
+    """
     return angle - 2.0 * PI * floor(angle / (2.0 * PI) + 0.5)
 
 
 @jit
 def smoothstep(x: Scalar) -> Scalar:
-    """Compute the C1 step: 0 below 0, 1 above 1, a cubic between."""
+    """Compute the C1 step: 0 below 0, 1 above 1, a cubic between.
+
+    Args:
+        x: Argument.
+
+    Returns:
+        The step, 0 to 1.
+    """
     t = select(x < 0.0, 0.0, select(x > 1.0, 1.0, x))
     return t * t * (3.0 - 2.0 * t)
 
 
 @jit
 def exp(x: Scalar) -> Scalar:
-    """Compute e^x for |x| < 8, relative error below 5e-14: polynomial at x / 64, to the 64th."""
+    """Compute e^x for |x| < 8, relative error below 5e-14: polynomial at x / 64, to the 64th.
+
+    Args:
+        x: Exponent.
+
+    Returns:
+        The power.
+    """
     z = x * (1.0 / 64.0)
     p = 1.0 / 362880.0
     p = p * z + 1.0 / 40320.0
@@ -139,7 +183,16 @@ def exp(x: Scalar) -> Scalar:
 
 @jit
 def clip(value: Scalar, low: Scalar, high: Scalar) -> Scalar:
-    """Clip a value to [low, high]."""
+    """Clip a value to [low, high].
+
+    Args:
+        value: The value.
+        low: Lower limit.
+        high: Upper limit, at least low.
+
+    Returns:
+        The clipped value.
+    """
     return minimum(maximum(value, low), high)
 
 
@@ -170,8 +223,20 @@ CHANNELS = Channels()
 
 
 @jit
-def philox(key_low: int, key_high: int, a: int, b: int, c: int = 0, d: int = 0) -> Any:
-    """Compute four random 32-bit words (non-negative integers) for a counter (a, b, c, d)."""
+def philox(key_low: int, key_high: int, a: int, b: int, c: int = 0, d: int = 0) -> _Four:
+    """Compute four random 32-bit words for a key and a counter (a, b, c, d).
+
+    Args:
+        key_low: Lower 32 bits of the key.
+        key_high: Upper 32 bits.
+        a: First word of the counter.
+        b: Second word.
+        c: Third word.
+        d: Fourth word.
+
+    Returns:
+        The words, non-negative integers.
+    """
     k0, k1 = key_low & _MASK, key_high & _MASK  # tells compilers that products fit
     a, b, c, d = a & _MASK, b & _MASK, c & _MASK, d & _MASK
     for _ in range(10):
@@ -189,7 +254,7 @@ def philox(key_low: int, key_high: int, a: int, b: int, c: int = 0, d: int = 0) 
 
 
 @jit
-def to_uniform(word: int) -> Scalar:
+def _to_uniform(word: int) -> Scalar:
     """Convert a 32-bit word to a number in (0, 1); never 0, never 1."""
     return (to_float(word) + 0.5) / _2_32
 
@@ -211,19 +276,29 @@ def _log_uniform(word: int) -> Scalar:
 
 
 @jit
-def _draw_normal_pair(first: int, second: int) -> Any:
+def _draw_normal_pair(first: int, second: int) -> tuple[Scalar, Scalar]:
     """Two standard normal numbers from two words (Box and Muller)."""
     radius = sqrt(maximum(-2.0 * _log_uniform(first), 0.0))  # below 0 by rounding in float32 alone
     turn = second + (1 << 29)  # the quarter turns are the two leading bits, exactly
     q = turn >> 30
     r = (to_float(turn - (q << 30)) - 536870912.0 + 0.5) * (2.0 * PI / _2_32)
-    s, c = _quadrant(to_float(q & 3), sin_kernel(r), cos_kernel(r))
+    s, c = _quadrant(to_float(q & 3), _sin_kernel(r), _cos_kernel(r))
     return radius * c, radius * s
 
 
 @jit
-def draw_normals(key_low: int, key_high: int, tick: int, block: int) -> Any:
-    """Draw four independent standard normal numbers of a block at a tick."""
+def draw_normals(key_low: int, key_high: int, tick: int, block: int) -> _Four:
+    """Draw four independent standard normal numbers of a block at a tick.
+
+    Args:
+        key_low: Lower 32 bits of the key.
+        key_high: Upper 32 bits.
+        tick: The tick, or several.
+        block: Block of `Channels`.
+
+    Returns:
+        The four numbers.
+    """
     a, b, c, d = philox(key_low, key_high, tick, block)
     n0, n1 = _draw_normal_pair(a, b)
     n2, n3 = _draw_normal_pair(c, d)
@@ -231,7 +306,18 @@ def draw_normals(key_low: int, key_high: int, tick: int, block: int) -> Any:
 
 
 @jit
-def draw_uniforms(key_low: int, key_high: int, tick: int, block: int, index: int = 0) -> Any:
-    """Draw four independent numbers, uniform in (0, 1), of a block at a tick."""
+def draw_uniforms(key_low: int, key_high: int, tick: int, block: int, index: int = 0) -> _Four:
+    """Draw four independent numbers, uniform in (0, 1), of a block at a tick.
+
+    Args:
+        key_low: Lower 32 bits of the key.
+        key_high: Upper 32 bits.
+        tick: The tick, or several.
+        block: Block of `Channels`.
+        index: Number of the draw, where a block is drawn from more than once at a tick.
+
+    Returns:
+        The four numbers.
+    """
     a, b, c, d = philox(key_low, key_high, tick, block, index)
-    return to_uniform(a), to_uniform(b), to_uniform(c), to_uniform(d)
+    return _to_uniform(a), _to_uniform(b), _to_uniform(c), _to_uniform(d)

@@ -6,8 +6,8 @@ same code for Python floats, NumPy arrays or any other table of primitives.
 
 import functools
 import os
-import types
 from collections.abc import Callable, Mapping
+from types import FunctionType
 from typing import Any, TypeVar, cast
 
 import numba
@@ -15,7 +15,7 @@ from numba.extending import is_jitted
 
 from .kernel_cache import LAYERS, find_kernel_folder, report_once
 from .packed import read
-from .primitives import minimum
+from .primitives import Vector, minimum
 
 _STOCK = "SIDESLIP_STOCK_NUMBA"  # environment variable with which plain numba compiles
 _PREFIX = __name__.removesuffix("envs.numerics.jit")
@@ -26,7 +26,14 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def jit(function: F) -> F:
-    """Compile with numba: IEEE arithmetic in the order written, cached on disk where possible."""
+    """Compile with numba: IEEE arithmetic in the order written, cached on disk where possible.
+
+    Args:
+        function: The function.
+
+    Returns:
+        The compiled function.
+    """
     return _compile(function)
 
 
@@ -34,6 +41,12 @@ def jit_nrt(function: F) -> F:
     """Compile with reference counting: what allocates or reshapes arrays, and its callers.
 
     All others in `envs` and `estimators` do without it, which halves the time of a filter's tick.
+
+    Args:
+        function: The function.
+
+    Returns:
+        The compiled function.
     """
     return _compile(function, _nrt=True)
 
@@ -43,16 +56,29 @@ def inline(function: F) -> F:
 
     A call of a plant's function passes some sixty numbers through memory, which takes as long as
     the function itself.
+
+    Args:
+        function: The function.
+
+    Returns:
+        The compiled function.
     """
     return _compile(function, forceinline=True)
 
 
 def noinline(function: F) -> F:
-    """Compile once, to machine code that all callers call: what is long and called seldom."""
+    """Compile once, to machine code that all callers call: what is long and called seldom.
+
+    Args:
+        function: The function.
+
+    Returns:
+        The compiled function.
+    """
     return _compile(function, apart=True)
 
 
-def compile_call(function: F, *arguments: Any) -> F:
+def compile_call(function: F, *arguments: object) -> F:
     """Compile a function for the types of some arguments alone, which saves numba's dispatch.
 
     Args:
@@ -71,31 +97,29 @@ def compile_call(function: F, *arguments: Any) -> F:
 def _compile(function: F, apart: bool = False, **options_more: bool) -> F:
     if config.DISABLE_JIT:
         return function
-    kernel = _load_kernel_class()
-    if kernel is None:
+    make_kernel = _load_compiler()
+    if make_kernel is None:
         stock_jit: Any = numba.njit(error_model="numpy", forceinline="forceinline" in options_more)
         return cast(F, stock_jit(function))
     layer = function.__module__.removeprefix(_PREFIX).partition(".")[0]
     is_hashed = function.__module__.startswith(_PREFIX) and layer in LAYERS
     folder = find_kernel_folder(layer) if is_hashed else None
-    options: dict[str, Any] = {"nopython": True, "boundscheck": None}
-    options |= {"error_model": "numpy", "fastmath": False, "forceinline": False}
-    options |= {"_nrt": layer not in ("envs", "estimators")} | options_more
-    return cast(F, kernel(function, targetoptions=options, folder=folder, apart=apart))
+    options = {"_nrt": layer not in ("envs", "estimators")} | options_more
+    return cast(F, make_kernel(function, folder, apart, options))
 
 
 @functools.cache
-def _load_kernel_class() -> Any:
-    """The class of our compiler's kernels; None for plain numba, on request or by its version."""
+def _load_compiler() -> Callable[..., object] | None:
+    """The maker of our compiler's kernels; None for plain numba, on request or by its version."""
     if os.environ.get(_STOCK):
         reason = f"{_STOCK} is set"
     elif not numba.__version__.startswith(f"{_SUPPORTED}."):
         reason = f"our compiler is made for {_SUPPORTED}"
     else:
         try:
-            from .compiler import Kernel
+            from .compiler import make_kernel
 
-            return Kernel
+            return make_kernel
         except (ImportError, AttributeError) as error:
             reason = f"our compiler cannot use it: {error}"
     text = "compiles by itself: longer, in every process, and for the same numbers"
@@ -104,8 +128,13 @@ def _load_kernel_class() -> Any:
 
 
 @jit
-def copy_into(source: Any, target: Any) -> None:
-    """Copy a vector's numbers into another one; assigning a slice would allocate."""
+def copy_into(source: Vector, target: Vector) -> None:
+    """Copy a vector's numbers into another one; assigning a slice would allocate.
+
+    Args:
+        source: Vector to read.
+        target: Vector to write, at least as long.
+    """
     for i in range(len(source)):
         target[i] = source[i]
 
@@ -117,7 +146,7 @@ _PRIMITIVE_MODULES = {read.__module__, minimum.__module__}  # what a table may r
 def as_python(
     function: F,
     table: Mapping[str, Callable[..., Any]] | None = None,
-    finish: Callable[[Any], Any] = lambda function: function,
+    finish: Callable[[FunctionType], Any] = lambda function: function,
 ) -> F:
     """Rebuild a function and its callees from the same code objects, without the compiler.
 
@@ -134,19 +163,23 @@ def as_python(
 
 
 def _rebuild(
-    function: Any, table: dict[str, Any], finish: Any, rebuilt_functions: dict[Any, Any]
+    function: Any,
+    table: dict[str, Callable[..., Any]],
+    finish: Callable[[FunctionType], Any],
+    rebuilt_functions: dict[Any, Any],
 ) -> Any:
+    """Rebuild a function and its callees, of which some are rebuilt already."""
     source = function.py_func if is_jitted(function) else function
     if source.__name__ in table and source.__module__ in _PRIMITIVE_MODULES:
         return table[source.__name__]
     if source in rebuilt_functions:
         return rebuilt_functions[source]
-    names: dict[str, Any] = dict(source.__globals__)
-    rebuilt = types.FunctionType(source.__code__, names, source.__name__, source.__defaults__)
+    names = dict(source.__globals__)
+    rebuilt = FunctionType(source.__code__, names, source.__name__, source.__defaults__)
     rebuilt_functions[source] = finished = finish(rebuilt)
     for name in source.__code__.co_names:
         callee: Any = names.get(name)
-        is_function = isinstance(callee, types.FunctionType)
+        is_function = isinstance(callee, FunctionType)
         if is_jitted(callee) or (is_function and (callee.__module__ or "").startswith(_PACKAGE)):
             names[name] = _rebuild(callee, table, finish, rebuilt_functions)
     del names["__name__"]  # by which torch.compile would look the names up in the module itself

@@ -7,15 +7,18 @@ more, the last, and the same functions read and write lanes there. Lanes that ar
 C-contiguous matrix of single numbers go along its row.
 """
 
+from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
+from numba.core.base import BaseContext
 from numba.core.typing.templates import signature
 from numba.np.arrayobj import load_item, make_array, populate_array, store_item
 
-from .simd import FLOATS, INTS, LANES, register_primitive, splat
+from .primitives import Matrix, Scalar, Vector
+from .simd import FLOATS, INTS, LANES, register_primitive
 
 T = TypeVar("T")
 
@@ -25,8 +28,8 @@ def make_offsets(kind: type[T], start: int = 0) -> tuple[T, int]:
 
     Args:
         kind: The NamedTuple. A field is a number, another NamedTuple, `count` equal parts as
-            `Annotated[tuple[part, ...], count]`, or `count` numbers as `Annotated[Any, count]`, of
-            which only the first one's offset is stored.
+            `Annotated[tuple[part, ...], count]`, or `count` numbers as `Annotated[Vector, count]`,
+            of which only the first one's offset is stored.
         start: Offset of the first number.
 
     Returns:
@@ -49,7 +52,7 @@ def make_offsets(kind: type[T], start: int = 0) -> tuple[T, int]:
     return make(indices), start
 
 
-def read(array: Any, where: T, *index: int) -> T:
+def read(array: Vector, where: T, *index: int) -> T:
     """Read neighbours along the first axis of a packed array.
 
     Args:
@@ -66,7 +69,7 @@ def read(array: Any, where: T, *index: int) -> T:
     return make(values)  # type: ignore[no-any-return]
 
 
-def write(array: Any, values: Any, where: Any, *index: int) -> None:
+def write(array: Vector, values: tuple[Scalar, ...], where: tuple[int, ...], *index: int) -> None:
     """Write numbers along the first axis of a packed array.
 
     Args:
@@ -79,39 +82,96 @@ def write(array: Any, values: Any, where: Any, *index: int) -> None:
         array[(place, *index)] = value
 
 
-def load_element(array: Any, *index: int) -> Any:
-    """Load the number at an index of an array."""
-    item: Any = array[index]
-    return item.item()
+def load_element(array: Vector, *index: int) -> Scalar:
+    """Load a number of an array.
+
+    Args:
+        array: The array.
+        index: Its index.
+
+    Returns:
+        The number.
+    """
+    return array[index].item()
 
 
-def store_element(array: Any, value: Any, *index: int) -> None:
-    """Store a number at an index of an array."""
+def store_element(array: Vector, value: Scalar, *index: int) -> None:
+    """Store a number in an array.
+
+    Args:
+        array: The array.
+        value: The number.
+        index: Its index.
+    """
     array[index] = value
 
 
-def as_matrix(array: Any, first: int, rows: int, columns: int) -> Any:
-    """View the numbers of a vector from `first` on as a matrix (rows, columns)."""
+def as_matrix(array: Vector, first: int, rows: int, columns: int) -> Matrix:
+    """View numbers of a vector as a matrix.
+
+    Args:
+        array: The vector.
+        first: Index of the first number.
+        rows: Number of rows.
+        columns: Number of columns.
+
+    Returns:
+        The view, shape (rows, columns).
+    """
     return array[first : first + rows * columns].reshape(rows, columns)
 
 
-def as_int64(array: Any, first: int, count: int) -> Any:
-    """View the bytes of `count` numbers of a vector from `first` on as int64."""
+def as_int64(array: Vector, first: int, count: int) -> Vector:
+    """View the bytes of a vector's numbers as integers.
+
+    Args:
+        array: The vector.
+        first: Index of the first number.
+        count: Number of integers.
+
+    Returns:
+        The view, int64 of shape (count,).
+    """
     return array[first : first + count].view(np.int64)
 
 
-def as_float32(array: Any, first: int, count: int) -> Any:
-    """View `count` float32, two to a number, from a vector's number `first` on."""
+def as_float32(array: Vector, first: int, count: int) -> Vector:
+    """View the bytes of a vector's numbers as float32, two to a number.
+
+    Args:
+        array: The vector.
+        first: Index of the first number.
+        count: Number of float32.
+
+    Returns:
+        The view, float32 of shape (count,).
+    """
     return array[first : first - (-count // 2)].view(np.float32)[:count]
 
 
-def lane_width(array: Any) -> int:
-    """Count the columns of a matrix that `load_lanes` reads at once; 1 where they are lanes."""
+def lane_width(array: Matrix) -> int:
+    """Count the columns of a matrix that `load_lanes` reads at once.
+
+    Args:
+        array: The matrix, or one of lanes.
+
+    Returns:
+        The number of columns, 1 where they are lanes.
+    """
     return 1
 
 
-def load_lanes(array: Any, where: T, first: int) -> T:
-    """Read neighbouring columns of a matrix from `first` on into lanes."""
+def load_lanes(array: Matrix, where: T, first: int) -> T:
+    """Read neighbouring columns of a matrix into lanes.
+
+    Args:
+        array: The matrix, or one of lanes.
+        where: Rows to read, a NamedTuple of offsets.
+        first: First of the `lane_width(array)` columns.
+
+    Returns:
+        Lanes, in a tuple like `where`.
+    """
     return read(array, where, first)
 
 
@@ -120,13 +180,37 @@ def count_lanes() -> int:
     return 1
 
 
-def iota(first: int) -> Any:
-    """Make lanes of the whole numbers from `first` on, `count_lanes()` of them."""
+def iota(first: int) -> Scalar:
+    """Make lanes of consecutive whole numbers.
+
+    Args:
+        first: The first of them.
+
+    Returns:
+        `count_lanes()` whole numbers.
+    """
     return first
 
 
-def locate_element(context, builder, kind, array, index):
-    """Compute the pointer to the number, or the lanes, at an index of an array."""
+def locate_element(
+    context: BaseContext,
+    builder: ir.IRBuilder,
+    kind: types.Array,
+    array: ir.Value,
+    index: Sequence[ir.Value],
+) -> ir.Value:
+    """Compute the pointer to the number, or the lanes, at an index of an array.
+
+    Args:
+        context: Target of the compiler.
+        builder: Builder of LLVM's instructions.
+        kind: Type of the array.
+        array: Machine value of the array.
+        index: Machine values of the index.
+
+    Returns:
+        The pointer, to lanes where the index leaves out the last axis.
+    """
     made = make_array(kind)(context, builder, array)
     shape = cgutils.unpack_tuple(builder, made.shape)
     strides = cgutils.unpack_tuple(builder, made.strides)
@@ -167,18 +251,13 @@ def _find_kind(array, indices):
     return FLOATS if lanes else None
 
 
-def make_index_types(index):
-    """Make the types of an index."""
-    return [types.intp] * len(index)
-
-
 def _infer_read(array, where, *index):
     kind = _find_kind(array, 1 + len(index))
     if kind is None or not isinstance(where, types.BaseTuple):
         return None
     numbers = [kind] * len(where)
     made = types.BaseTuple.from_types(numbers, getattr(where, "instance_class", None))
-    return signature(made, array, where, *make_index_types(index))
+    return signature(made, array, where, *[types.intp] * len(index))
 
 
 def _lower_read(context, builder, sig, args):
@@ -189,7 +268,7 @@ def _lower_read(context, builder, sig, args):
 
 def _infer_load_element(array, *index):
     kind = _find_kind(array, len(index))
-    return kind and signature(kind, array, *make_index_types(index))
+    return kind and signature(kind, array, *[types.intp] * len(index))
 
 
 def _lower_load_element(context, builder, sig, args):
@@ -199,7 +278,7 @@ def _lower_load_element(context, builder, sig, args):
 def _infer_store_element(array, value, *index):
     if _find_kind(array, len(index)) is None:
         return None
-    return signature(types.none, array, value, *make_index_types(index))
+    return signature(types.none, array, value, *[types.intp] * len(index))
 
 
 def _lower_store_element(context, builder, sig, args):
@@ -211,7 +290,7 @@ def _infer_write(array, values, where, *index):
     tuples = isinstance(values, types.BaseTuple) and isinstance(where, types.BaseTuple)
     if not tuples or len(values) != len(where) or _find_kind(array, 1 + len(index)) is None:
         return None
-    return signature(types.none, array, values, where, *make_index_types(index))
+    return signature(types.none, array, values, where, *[types.intp] * len(index))
 
 
 def _lower_write(context, builder, sig, args):
@@ -230,7 +309,7 @@ def _register_view(primitive: Any, dtype: Any) -> None:
         vector_type = types.Array(types.float64, 1, "C")
         if vector != vector_type:
             return None
-        return signature(kind, vector_type, *make_index_types(sizes))
+        return signature(kind, vector_type, *[types.intp] * len(sizes))
 
     def lower(context, builder, sig, args):
         size = context.get_constant(types.intp, dtype.bitwidth // 8)
@@ -266,7 +345,10 @@ def _lower_count_lanes(context, builder, sig, args):
 
 
 def _lower_iota(context, builder, sig, args):
-    return builder.add(splat(builder, args[0], INTS), ir.Constant(INTS.value, list(range(LANES))))
+    return builder.add(
+        context.cast(builder, args[0], types.int64, INTS),
+        ir.Constant(INTS.value, list(range(LANES))),
+    )
 
 
 register_primitive(read, _infer_read, _lower_read)

@@ -9,7 +9,6 @@ above the diagonal counts. Records of such matrices begin on cache lines (`pad_t
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from llvmlite import ir
@@ -17,64 +16,130 @@ from numba.core import cgutils, types
 from numba.core.typing.templates import signature
 from numba.np.arrayobj import make_array, populate_array
 
-from .packed import locate_element, make_index_types
+from .packed import locate_element
+from .primitives import Matrix, Scalar
 from .simd import FLOATS, FLOATS8, LANES, register_primitive
 
 _LINE_BYTES = 64  # of a cache line: eight numbers
 
 
-def load8(array: Any, *index: int) -> Any:
-    """Load eight neighbours of a matrix's row or a vector, the first of them at an index."""
+def load8(array: Matrix, *index: int) -> Scalar:
+    """Load eight neighbours of a matrix's row or of a vector.
+
+    Args:
+        array: The matrix or vector.
+        index: Index of the first of them.
+
+    Returns:
+        The eight numbers.
+    """
     *row, first = index
     return array[(*row, slice(first, first + 8))].copy()
 
 
-def load8_symmetric(matrix: Any, k: int, j: int) -> Any:
-    """Load eight neighbours of a row of a symmetric matrix."""
+def load8_symmetric(matrix: Matrix, k: int, j: int) -> Scalar:
+    """Load eight neighbours of a row of a symmetric matrix.
+
+    Args:
+        matrix: The matrix.
+        k: Row.
+        j: First column.
+
+    Returns:
+        The eight numbers.
+    """
     return load8(matrix, k, j)
 
 
-def count_upper_rows(matrix: Any, rows: int, j: int) -> int:
-    """Count the rows of a symmetric matrix that count in the columns from j on."""
+def count_upper_rows(matrix: Matrix, rows: int, j: int) -> int:
+    """Count the rows of a symmetric matrix that count in its last columns.
+
+    Args:
+        matrix: The matrix.
+        rows: Number of its rows.
+        j: First of the columns.
+
+    Returns:
+        The number of rows.
+    """
     return rows
 
 
-def store8(array: Any, values: Any, *index: int) -> None:
-    """Store eight numbers, or one number eight times, as neighbours."""
+def store8(array: Matrix, values: Scalar, *index: int) -> None:
+    """Store eight numbers, or one number eight times, as neighbours.
+
+    Args:
+        array: The matrix or vector.
+        values: The numbers.
+        index: Index of the first of them.
+    """
     *row, first = index
     array[(*row, slice(first, first + 8))] = values
 
 
-def mirror(array: Any, i: int, j: int) -> None:
-    """Mirror a matrix's 8 x 8 block at (i, j), i <= j, to (j, i): where i = j its upper part."""
+def mirror(array: Matrix, i: int, j: int) -> None:
+    """Mirror an 8 x 8 block of a matrix across the diagonal.
+
+    Args:
+        array: The matrix.
+        i: First row of the block.
+        j: First column, at least i; where they are equal the upper part is mirrored.
+    """
     block = array[i : i + 8, j : j + 8]
     array[j : j + 8, i : i + 8] = np.where(np.tri(8, k=-1), block.T, block) if i == j else block.T
 
 
-def prefetch(array: Any, *index: int) -> None:
-    """Prefetch the cache line of a number, which may lie beyond the array."""
+def prefetch(array: Matrix, *index: int) -> None:
+    """Prefetch the cache line of a number.
+
+    Args:
+        array: The matrix or vector.
+        index: Index of the number, which may lie beyond the array.
+    """
 
 
-def pad_to_cache_line(fields: Sequence[Any]) -> np.dtype[Any]:
-    """Pad the structured dtype of some fields to whole cache lines."""
+def pad_to_cache_line(fields: Sequence[tuple[object, ...]]) -> np.dtype[np.void]:
+    """Pad a structured dtype to whole cache lines.
+
+    Args:
+        fields: Its fields, as `numpy.dtype` takes them.
+
+    Returns:
+        The padded dtype.
+    """
     rest = -np.dtype(list(fields)).itemsize % _LINE_BYTES
     return np.dtype([*fields, *([("to_line_end", np.int8, rest)] if rest else [])])
 
 
-def allocate_aligned(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
-    """Allocate a record array of zeros that begins on a cache line."""
+def allocate_aligned(shape: tuple[int, ...], dtype: np.dtype[np.void]) -> Matrix:
+    """Allocate a record array of zeros that begins on a cache line.
+
+    Args:
+        shape: Shape of the array.
+        dtype: Structured dtype of its records.
+
+    Returns:
+        The array.
+    """
     size = math.prod(shape) * dtype.itemsize
     buffer = np.zeros(size + _LINE_BYTES, np.int8)
     first = -buffer.ctypes.data % _LINE_BYTES
     return buffer[first : first + size].view(dtype).reshape(shape).view(np.recarray)
 
 
-def vector_width(array: Any) -> int:
-    """Count the columns of a matrix that `load8` reads at once; 1 where they are lanes."""
+def vector_width(array: Matrix) -> int:
+    """Count the columns of a matrix that `load8` reads at once.
+
+    Args:
+        array: The matrix, or one of lanes.
+
+    Returns:
+        The number of columns, 1 where they are lanes.
+    """
     return 8
 
 
-def allocate_scratch(template: Any, rows: int, columns: int) -> Any:
+def allocate_scratch(template: Matrix, rows: int, columns: int) -> Matrix:
     """Allocate a matrix of constant shape, uninitialised, on the stack where compiled.
 
     Args:
@@ -101,7 +166,7 @@ def _lower_vector_width(context, builder, sig, args):
 
 def _infer_load8(array, *index):
     kind = _find_kind(array, len(index))
-    return kind and signature(kind, array, *make_index_types(index))
+    return kind and signature(kind, array, *[types.intp] * len(index))
 
 
 def _lower_load8(context, builder, sig, args):
@@ -118,7 +183,7 @@ def _lower_load8_symmetric(context, builder, sig, args):
 
 
 def _infer_count_upper_rows(matrix, *index):
-    return signature(types.intp, matrix, *make_index_types(index))
+    return signature(types.intp, matrix, *[types.intp] * len(index))
 
 
 def _lower_count_upper_rows(context, builder, sig, args):
@@ -131,7 +196,7 @@ def _lower_count_upper_rows(context, builder, sig, args):
 
 def _infer_store8(array, values, *index):
     kind = _find_kind(array, len(index))
-    return kind and signature(types.none, array, kind, *make_index_types(index))
+    return kind and signature(types.none, array, kind, *[types.intp] * len(index))
 
 
 def _lower_store8(context, builder, sig, args):
@@ -141,7 +206,7 @@ def _lower_store8(context, builder, sig, args):
 
 
 def _infer_mirror(array, *index):
-    return _find_kind(array, 2) and signature(types.none, array, *make_index_types(index))
+    return _find_kind(array, 2) and signature(types.none, array, *[types.intp] * len(index))
 
 
 def _lower_mirror(context, builder, sig, args):
@@ -175,7 +240,7 @@ def _lower_mirror(context, builder, sig, args):
 def _infer_prefetch(array, *index):
     if _find_kind(array, len(index)) is not FLOATS8:
         return None
-    return signature(types.none, array, *make_index_types(index))
+    return signature(types.none, array, *[types.intp] * len(index))
 
 
 def _lower_prefetch(context, builder, sig, args):

@@ -12,7 +12,7 @@ from . import require_extra
 from .jit import as_python
 
 with require_extra("train", "the device engine needs torch"):
-    import torch as torch  # for the other modules of the device engine
+    import torch as torch  # for the modules of the gradient engine
 
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 

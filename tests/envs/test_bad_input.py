@@ -15,66 +15,6 @@ from .helpers import LINEAR, bits, play
 pytestmark = pytest.mark.plain
 
 Arguments = dict[str, Any]
-ARGUMENTS: list[tuple[Arguments, type[Exception], str]] = [
-    (
-        {"sensors": "radar"},
-        ValueError,
-        "unknown sensors 'radar'; known: vision, ",
-    ),
-    ({"scenario": "slalon"}, ValueError, "unknown scenario 'slalon'; did you mean 'slalom'"),
-    ({"scenario": {"speeed": 1.0}}, TypeError, "unknown scenario field 'speeed'"),
-    ({"scenario": {"duration": -1.0}}, ValueError, "'custom': duration -1.0"),
-    ({"vehicle": "comms"}, ValueError, "unknown vehicle 'comms'; did you mean 'coms'"),
-    (
-        {"vehicle": {"base": "coms", "mass": 0.0}},
-        ValueError,
-        "Vehicle.mass: 0.0 kg is not",
-    ),
-    ({"vehicle": {"base": "coms", "mass": math.nan}}, ValueError, "Vehicle.mass: nan kg"),
-    ({"vehicle": {"base": "coms", "masss": 1.0}}, TypeError, "unknown vehicle parameter 'masss'"),
-    ({"nominal": "comms"}, ValueError, "unknown vehicle 'comms'"),
-    ({"control_period": 0}, ValueError, "control_period is 1 to 1000 ticks, got 0"),
-    ({"control_period": 1001}, ValueError, "control_period is 1 to 1000 ticks, got 1001"),
-    ({"control_period": 10.0}, TypeError, "control_period is a number of ticks, got 10.0"),
-    ({"control_period": True}, TypeError, "control_period is a number of ticks, got True"),
-    ({"steering": "yes"}, TypeError, "steering is True or False, got 'yes'"),
-    ({"with_map": 1}, TypeError, "with_map is True or False, got 1"),
-    (
-        {"reference": "slip"},
-        ValueError,
-        "unknown reference 'slip'; did you mean 'zero-slip'",
-    ),
-    ({"fast": "some"}, ValueError, "fast is 'summary' or 'all', got 'some'"),
-    ({"on_bad_action": "shrug"}, ValueError, "on_bad_action is 'raise' or 'fail', got 'shrug'"),
-    ({"render_mode": "ansi"}, ValueError, "unknown render_mode 'ansi'; known: human, rgb_array"),
-    ({"gps": {"period": 0.1}}, ValueError, "this id has no gps; it has: camera"),
-    ({"camera": {"perriod": 0.1}}, TypeError, "perriod"),
-    ({"camera": {"period": -0.1}}, ValueError, "period must be at least one tick, got -0.1"),
-    (
-        {"camera": {"delays": [0.3]}},
-        ValueError,
-        "10 packets under way at once; .* room for 8",
-    ),
-    ({"estimator": "dakf"}, TypeError, "estimator"),
-]
-
-
-@pytest.mark.smoke
-@pytest.mark.parametrize(("arguments", "error", "message"), ARGUMENTS, ids=str)
-def test_arguments(arguments: Arguments, error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
-        StabilityEnv(**arguments)
-
-
-def test_a_sensor_s_number_is_named() -> None:
-    with pytest.raises(TypeError, match="unknown number of the camera 'perod'; did you mean 'per"):
-        gymnasium.make("sideslip/YawVision-v0", camera={"perod": 0.05})
-
-
-def test_a_camera_argument_on_the_gps_id() -> None:
-    with pytest.raises(ValueError, match="this id has no camera; it has: gps"):
-        gymnasium.make("sideslip/YawGps-v0", camera={"period": 0.05})
-
 
 OPTIONS: list[tuple[Arguments, type[Exception], str]] = [
     ({3: 1}, ValueError, "unknown reset option 3; known"),  # type: ignore[dict-item]

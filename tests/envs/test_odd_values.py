@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,61 +47,54 @@ def drive(**arguments: Any) -> None:
     assert np.isfinite(obs).all() and math.isfinite(reward)
 
 
-FIELDS = [entry.name for entry in dataclasses.fields(Scenario)]
+Maker = Callable[[str, Any], Any]  # of a field and its value
 
 
-@pytest.mark.parametrize("field", FIELDS)
-def test_a_scenarios_field(field: str) -> None:
-    names = {  # what the fault is a fault of
-        "vehicle": "",
-        "nominal": "",
-        "camera_delays": "camera",
-        "gps_delays": "gps",
-    }
-    count = refused(lambda value: drive(scenario={field: value}), names.get(field, field))
-    assert count > 15
+def reset(option: str, value: Any) -> None:
+    StabilityEnv().reset(seed=1, options={option: value})
 
 
-@pytest.mark.parametrize("base", ["iso-3888-1", "gps-course"])
-def test_a_scenarios_field_on_a_track_and_a_linear_plant(base: str) -> None:
-    for field in ("gps_period", "roll", "small_angle", "path_speed", "speed", "half_width"):
-        drive_it = lambda value, f=field: drive(scenario={"base": base, f: value})  # noqa: E731
-        assert refused(drive_it, "") > 15
+def list_fields(kind: Any) -> list[str]:
+    return [entry.name for entry in dataclasses.fields(kind)]
 
 
-@pytest.mark.parametrize("field", [entry.name for entry in dataclasses.fields(Vehicle)])
-def test_a_vehicles_field(field: str) -> None:
-    names = {"sprung_mass": "Vehicle.", "roll_arm": "Vehicle."}  # its suspension is too soft
-
-    key = f"{field}_per_tyre" if field in ("front_stiffness", "rear_stiffness") else field
-
-    def try_it(value: Any) -> None:
-        drive(vehicle={"base": "coms", key: value})
-
-    assert refused(try_it, names.get(field, field)) > 15
+def drive_part(part: str, others: dict[str, Any], field: str, value: Any) -> None:
+    drive(**{part: others | {field: value}})
 
 
-@pytest.mark.parametrize("field", [entry.name for entry in dataclasses.fields(SlowSensor)])
-def test_a_slow_sensors_field(field: str) -> None:
-    """The clock and the link go by all of them: a message may name another one."""
-    assert refused(lambda value: drive(camera={field: value}), "") > 15
+def drive_argument(name: str, value: Any) -> None:
+    drive(**{name: value})
 
 
-@pytest.mark.parametrize("option", ["scenario", "vehicle", "friction", "state", "duration"])
-def test_an_option_of_reset(option: str) -> None:
-    env = StabilityEnv()
-    name = "" if option in ("scenario", "vehicle", "state") else option
-    count = refused(lambda value: env.reset(seed=1, options={option: value}), name)
-    assert count > 15
+SCENARIO, CAMERA = partial(drive_part, "scenario", {}), partial(drive_part, "camera", {})
+TRACK, COURSE = (
+    partial(drive_part, "scenario", {"base": base}) for base in ("iso-3888-1", "gps-course")
+)
+VEHICLE = partial(drive_part, "vehicle", {"base": "coms"})
+OTHERS = ("gps_period", "roll", "small_angle", "path_speed", "speed", "half_width")
+CHOICES = ("reference", "control_period", "fast", "on_bad_action")
+PARTS = ("scenario", "vehicle", "nominal", "state")  # the fault is a fault of something in them
+CASES: list[tuple[str, Maker, str, str]] = [  # what, how it is made, the field, what errors name
+    *(("scenario", SCENARIO, name, name) for name in list_fields(Scenario)),
+    *(("track", TRACK, name, "") for name in OTHERS),
+    *(("linear plant", COURSE, name, "") for name in OTHERS),
+    *(("vehicle", VEHICLE, name, name) for name in list_fields(Vehicle)),
+    *(("camera", CAMERA, name, "") for name in list_fields(SlowSensor)),  # or another one
+    *(("reset", reset, name, name) for name in (*PARTS[:2], "friction", "state", "duration")),
+    *(("argument", drive_argument, name, name) for name in (*PARTS[:3], *CHOICES)),
+]
+NAMES = {"camera_delays": "camera", "gps_delays": "gps"} | dict.fromkeys(PARTS, "")
+NAMES |= dict.fromkeys(("sprung_mass", "roll_arm"), "Vehicle.")  # its suspension is too soft
+KEYS = {name: f"{name}_per_tyre" for name in ("front_stiffness", "rear_stiffness")}
 
 
 @pytest.mark.parametrize(
-    "argument",
-    ["scenario", "vehicle", "nominal", "reference", "control_period", "fast", "on_bad_action"],
+    ("what", "make", "field", "named"), CASES, ids=[f"{row[0]} {row[2]}" for row in CASES]
 )
-def test_an_argument(argument: str) -> None:
-    name = "" if argument in ("scenario", "vehicle", "nominal") else argument
-    assert refused(lambda value: drive(**{argument: value}), name) > 15
+def test_a_field(what: str, make: Maker, field: str, named: str) -> None:
+    key = KEYS.get(field, field) if what == "vehicle" else field
+    count = refused(lambda value: make(key, value), NAMES.get(named, named))
+    assert count > 15
 
 
 def test_what_a_message_says_is_short() -> None:

@@ -13,27 +13,18 @@ from sideslip.envs.scenarios.scenario import Scenario
 from sideslip.envs.validation import check_plausible
 from sideslip.envs.vehicle.parameters import Vehicle
 
-CAR = {
-    name.replace("stiffness", "stiffness_per_tyre"): getattr(PASSENGER_CAR, name)
-    for name in ("mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness",
-                 "rear_stiffness")
-}  # fmt: skip
-MODEL = {  # a car at 1:43, and a lorry
-    "mass": 0.041,
-    "yaw_inertia": 2.78e-5,
-    "front_arm": 0.029,
-    "rear_arm": 0.033,
-    "front_stiffness_per_tyre": 0.5,
-    "rear_stiffness_per_tyre": 0.5,
-}
-LORRY = {
-    "mass": 18e3,
-    "yaw_inertia": 1.3e5,
-    "front_arm": 3.5,
-    "rear_arm": 2.3,
-    "front_stiffness_axle": 4e5,
-    "rear_stiffness_axle": 8e5,
-}
+NAMES = "mass", "yaw_inertia", "front_arm", "rear_arm", "front_stiffness", "rear_stiffness"
+
+
+def make_car(kind: str, *values: float) -> dict[str, float]:
+    """A car by its stiffnesses per tyre or per axle."""
+    keys = [name.replace("stiffness", f"stiffness_{kind}") for name in NAMES]
+    return dict(zip(keys, values, strict=True))
+
+
+CAR = make_car("per_tyre", *(getattr(PASSENGER_CAR, name) for name in NAMES))
+MODEL = make_car("per_tyre", 0.041, 2.78e-5, 0.029, 0.033, 0.5, 0.5)  # at 1:43
+LORRY = make_car("axle", 18e3, 1.3e5, 3.5, 2.3, 4e5, 8e5)
 
 
 @pytest.mark.plain

@@ -115,8 +115,7 @@ def test_vehicles_that_nobody_builds(
     arguments: dict[str, Any] = {"reference": "model", "gps": {"period": 0.01}, "strict": False}
     env = StabilityEnv("gps", scenario=scenario, **arguments)
     start = env.reset(
-        seed=0,
-        options={"vehicle": {"base": "coms", **vehicle}, "state": state, "duration": 0.3},
+        seed=0, options={"vehicle": {"base": "coms", **vehicle}, "state": state, "duration": 0.3}
     )
     moments = play(env, [1.0, -1.0] * 15)
     assert_finite(env, start, moments)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sideslip.envs import StabilityEnv
-from sideslip.envs.engine.workspace import make_workspace, split_workspace
+from sideslip.envs.engine.workspace import _make_workspace, split_workspace
 from sideslip.envs.numerics.jit import as_python
 
 from ..helpers import bits
@@ -20,7 +20,7 @@ SPINS = {"v_x": 15.0, "v_y": 8.0, "gamma": -1.0}
 @pytest.mark.parametrize("entries", [4, 5])
 @pytest.mark.parametrize("n", [1, 10, 33])
 def test_every_part_has_a_place_of_its_own(n: int, entries: int) -> None:
-    work = make_workspace(n, np.zeros((2, entries)), max_packets=3, trace_width=2)
+    work = _make_workspace(n, np.zeros((2, entries)), max_packets=3, trace_width=2)
     row, bounds, window = as_python(split_workspace)(work)
     parts = [row.p, row.z, row.switches, row.obs, row.report, row.rows, row.packets, bounds, window]
     for k, part in enumerate(parts):

@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +9,10 @@ import numba
 import numpy as np
 import pytest
 
-from sideslip.envs.numerics import kernel_cache
-from sideslip.envs.numerics.compiler import Kernel
+from sideslip.envs.numerics import compiler
+from sideslip.envs.numerics.compiler import _Kernel
+
+from .. import processes
 
 MODULE = '''
 """Kernels in a folder named by the first argument."""
@@ -26,13 +27,13 @@ import numpy as np
 for name in ("sideslip", "sideslip.envs"):  # without what they import, which takes as long as numba
     sys.modules[name] = importlib.util.module_from_spec(importlib.util.find_spec(name))
 
-from sideslip.envs.numerics.compiler import Kernel
+from sideslip.envs.numerics.compiler import _Kernel
 
 FOLDER = Path(sys.argv[1])
 
 
 def kernel(function, apart=False):
-    return Kernel(function, targetoptions={"nopython": True}, folder=FOLDER, apart=apart)
+    return _Kernel(function, targetoptions={"nopython": True}, folder=FOLDER, apart=apart)
 
 
 @kernel
@@ -103,30 +104,13 @@ def folder(tmp_path: Path) -> Path:
 
 
 def start(folder: Path, code: str = USE, **variables: str) -> subprocess.Popen[str]:
-    others = {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith(("NUMBA_", "SIDESLIP_"))
-    }
-    return subprocess.Popen(
-        [sys.executable, "-W", "error", "-c", "from tiny import *\n" + code, str(folder)],
-        env=others | {"PYTHONPATH": f"{folder.parent}{os.pathsep}{SOURCE}"} | variables,
-        cwd=folder.parent,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-SOURCE = Path(__file__).resolve().parents[3] / "src"
+    variables = {"PYTHONPATH": f"{folder.parent}{os.pathsep}{processes.SOURCE}"} | variables
+    code = f"from tiny import *\n{code}"
+    return processes.start(code, variables, str(folder), cwd=folder.parent)
 
 
 def run(folder: Path, code: str = USE, **variables: str) -> tuple[list[str], str]:
-    """The lines that a process prints, and what it writes to standard error."""
-    process = start(folder, code, **variables)
-    printed, complained = process.communicate(timeout=100)
-    assert process.returncode == 0, complained
-    return printed.splitlines(), complained
+    return processes.finish(start(folder, code, **variables))
 
 
 def test_a_second_process_loads_what_the_first_compiled(folder: Path) -> None:
@@ -169,8 +153,8 @@ def test_a_damaged_file_is_compiled_again(
     left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def kernel() -> Any:
-        monkeypatch.setattr(kernel_cache, "_libraries", {})  # as in a process of its own
-        return Kernel(_tripled, targetoptions={"nopython": True}, folder=tmp_path)
+        monkeypatch.setattr(compiler, "_libraries", {})  # as in a process of its own
+        return _Kernel(_tripled, targetoptions={"nopython": True}, folder=tmp_path)
 
     assert kernel()(2.0) == 6.0
     (path,) = tmp_path.iterdir()
@@ -207,8 +191,7 @@ except ValueError as error:
 
 def test_processes_that_start_at_once(folder: Path) -> None:
     """Each of them compiles, one file is left, and it is whole."""
-    processes = [start(folder) for _ in range(2)]
-    for process in processes:
+    for process in [start(folder) for _ in range(2)]:
         printed = process.communicate(timeout=100)[0]
         assert process.returncode == 0 and printed.splitlines() == EXPECTED
     assert len(list(folder.iterdir())) == 1
@@ -219,8 +202,8 @@ def test_signatures_compiled_at_once_do_not_take_each_others_files(folder: Path)
     """numba's numbered files do: two processes both take the first number."""
     floats = "print(halved(16.0))"
     whole = "print(halved(36))"
-    processes = [start(folder, code) for code in (floats, whole)]
-    assert [process.communicate(timeout=100)[0] for process in processes] == ["2.0\n", "3.0\n"]
+    started = [start(folder, code) for code in (floats, whole)]
+    assert [process.communicate(timeout=100)[0] for process in started] == ["2.0\n", "3.0\n"]
     assert len(list(folder.iterdir())) == 2
     assert run(folder, floats + "\n" + whole) == (["2.0", "3.0"], "")
 
@@ -239,7 +222,7 @@ def test_a_kernel_that_cannot_be_written_is_compiled(
             raise OSError(28, "No space left on device")
 
         monkeypatch.setattr(os, "fsync", full)
-    kernel: Any = Kernel(_tripled, targetoptions={"nopython": True}, folder=folder)
+    kernel: Any = _Kernel(_tripled, targetoptions={"nopython": True}, folder=folder)
     assert kernel(2.0) == 6.0
     assert not folder.is_dir() or not list(folder.iterdir())  # nothing half written is left
 
@@ -249,8 +232,8 @@ def _tripled(x: float) -> float:
 
 
 def test_a_callee_is_compiled_once_for_all_literals() -> None:
-    kernel: Any = Kernel(_tripled, targetoptions={"nopython": True})
-    caller: Any = Kernel(_caller(kernel), targetoptions={"nopython": True})
+    kernel: Any = _Kernel(_tripled, targetoptions={"nopython": True})
+    caller: Any = _Kernel(_caller(kernel), targetoptions={"nopython": True})
     assert caller(5) == 3 * (5 + 7 + 9)
     assert [str(each) for args in kernel.parts for each in args] == ["int64"]
     assert kernel.overloads == {}  # no machine code of its own
@@ -265,8 +248,8 @@ def _caller(kernel: Any) -> Any:
 
 @pytest.mark.parametrize("apart", [False, True])
 def test_a_function_compiled_by_numba_itself_may_call_a_kernel(apart: bool) -> None:
-    inner: Any = Kernel(_tripled, targetoptions={"nopython": True})
-    kernel: Any = Kernel(_caller(inner), targetoptions={"nopython": True}, apart=apart)
+    inner: Any = _Kernel(_tripled, targetoptions={"nopython": True})
+    kernel: Any = _Kernel(_caller(inner), targetoptions={"nopython": True}, apart=apart)
     assert numba.njit(_caller(kernel))(1) == sum(3 * (x + 7 + 9) for x in (1, 7, 9))
 
 

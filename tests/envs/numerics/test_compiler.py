@@ -2,8 +2,6 @@
 
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,8 @@ import pytest
 from numba.core.dispatcher import Dispatcher
 
 from sideslip.envs.numerics import jit, kernel_cache
+
+from .. import processes
 
 PACKAGE = kernel_cache._PACKAGE
 kernel_folder = kernel_cache.find_kernel_folder.__wrapped__  # asked anew each time
@@ -29,20 +29,9 @@ def copy(tmp_path: Path) -> Path:
 
 
 def run(code: str, home: Path, **variables: str) -> str:
-    """Run code on the package in `home` with every warning an error; returns what it prints."""
-    others = {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith(("NUMBA_", "SIDESLIP_"))
-    }
-    return subprocess.run(
-        [sys.executable, "-W", "error", "-c", code],
-        env=others | {"PYTHONPATH": str(home.parent)} | variables,
-        cwd=home.parent,
-        check=True,
-        capture_output=True,
-        text=True,
-    ).stdout
+    """Run code on the package in `home`; returns what it prints."""
+    process = processes.start(code, variables, cwd=home.parent, source=home.parent)
+    return "\n".join(processes.finish(process)[0])
 
 
 @pytest.mark.smoke

@@ -11,10 +11,10 @@ from scipy import stats
 from sideslip.envs.numerics import functions as noise
 from sideslip.envs.numerics.functions import (
     CHANNELS,
+    _to_uniform,
     draw_normals,
     draw_uniforms,
     philox,
-    to_uniform,
 )
 from sideslip.envs.numerics.jit import as_python
 from sideslip.envs.numerics.primitives import ARRAYS
@@ -65,8 +65,8 @@ def sample(block: int, count: int = N) -> np.ndarray:
 
 
 def test_uniforms_lie_strictly_inside_the_unit_interval() -> None:
-    assert 0.0 < to_uniform(0) < to_uniform(0xFFFFFFFF) < 1.0
-    assert to_uniform(0) == 0.5 / 2.0**32
+    assert 0.0 < _to_uniform(0) < _to_uniform(0xFFFFFFFF) < 1.0
+    assert _to_uniform(0) == 0.5 / 2.0**32
 
 
 def test_uniforms_are_uniform() -> None:

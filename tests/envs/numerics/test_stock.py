@@ -1,13 +1,11 @@
 """Any numba compiles the equations: without our compiler the numbers are the same."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-SOURCE = Path(__file__).resolve().parents[3] / "src"
+from ..processes import finish, start
+
 USE = """
 from sideslip.envs.scenarios.road import TrackPath, compute_path_offset
 offset = compute_path_offset(TrackPath(1.0, 0.3, 1.0, 0.7, 0.1, 1.0), 0.85)
@@ -17,22 +15,8 @@ print("sideslip.envs.numerics.compiler" in sys.modules)
 
 
 def run(cache: Path, first: str = "", **variables: str) -> tuple[list[str], str]:
-    """The lines that a process prints, and what it writes to standard error."""
-    others = {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith(("NUMBA_", "SIDESLIP_"))
-    }
-    variables = {"PYTHONPATH": str(SOURCE), "XDG_CACHE_HOME": str(cache)} | variables
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", f"import sys, numba\n{first}\n{USE}"],
-        env=others | variables,
-        capture_output=True,
-        text=True,
-        timeout=200,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines(), done.stderr
+    code = f"import sys, numba\n{first}\n{USE}"
+    return finish(start(code, {"XDG_CACHE_HOME": str(cache)} | variables))
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from sideslip.envs.numerics import kernel_cache
-from sideslip.envs.numerics.compiler import Kernel
+from sideslip.envs.numerics import compiler, kernel_cache
+from sideslip.envs.numerics.compiler import _Kernel
 
 kernel_folder = kernel_cache.find_kernel_folder.__wrapped__  # asked anew each time
 LEVELS = (
@@ -27,9 +27,9 @@ LEVELS = (
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """As in a process of its own, in which nothing was said yet."""
-    monkeypatch.setattr(kernel_cache, "_libraries", {})
+    monkeypatch.setattr(compiler, "_libraries", {})
     monkeypatch.setattr(kernel_cache, "_reported", {"compiling"})
-    monkeypatch.setattr(kernel_cache._logger, "hasHandlers", lambda: False)
+    monkeypatch.setattr(kernel_cache.logger, "hasHandlers", lambda: False)
     for name in ("NUMBA_CACHE_DIR", "SIDESLIP_QUIET"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "base"))
@@ -41,14 +41,14 @@ def planted(tmp_path: Path) -> Path:
     """The file of a cached kernel, in a folder of the user's."""
     compiled(tmp_path / "kernels")
     (path,) = (tmp_path / "kernels").iterdir()
-    kernel_cache._libraries.clear()
+    compiler._libraries.clear()
     return path
 
 
 def compiled(folder: Path, function: Any = None) -> bool:
     """Whether a kernel was compiled, and not loaded from a folder; its result is right anyhow."""
     folder.mkdir(mode=0o700, exist_ok=True)
-    kernel: Any = Kernel(function or _tripled, targetoptions={"nopython": True}, folder=folder)
+    kernel: Any = _Kernel(function or _tripled, targetoptions={"nopython": True}, folder=folder)
     assert kernel(2.0) == (6.0 if function is None else function(2.0))
     return bool(kernel.parts)
 
@@ -85,7 +85,7 @@ def test_a_pickle_is_not_opened(
     for content in (pickle.dumps(_Bomb()), pickle.dumps((b"", _Bomb(), (), ()), protocol=0)):
         planted.write_bytes(digested(content))
         assert compiled(planted.parent)
-        kernel_cache._libraries.clear()
+        compiler._libraries.clear()
     assert not (tmp_path / "exploded").exists()
     assert capsys.readouterr().err.count(str(planted)) == 1
     assert not compiled(planted.parent)  # the file is a kernel's again
@@ -97,7 +97,7 @@ def test_another_kernels_file_is_not_run(
     compiled(tmp_path / "other", _halved)
     (other,) = (tmp_path / "other").iterdir()
     planted.write_bytes(other.read_bytes())
-    kernel_cache._libraries.clear()
+    compiler._libraries.clear()
     assert compiled(planted.parent)
     assert "another kernel's" in capsys.readouterr().err
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
-from sideslip.envs import StabilityVectorEnv
 from sideslip.estimators import EstimateObservation, vector
 
 from ..batches import MODES, SHORT, batch, drive, same, same_cars, sync
@@ -50,19 +49,3 @@ def test_estimators_work_with_a_limit_of_steps() -> None:
         together.append(steps[0][0])
     assert step[3] and steps[3].all() and not step[2]
     np.testing.assert_array_equal(seen, together)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"scenario": ["gust", "slalom"]}, ValueError, "scenario: one or a list of 3, one a row"),
-        ({"vehicle": ["coms"] * 4}, ValueError, "vehicle: one or a list of 3, one a row, got 4"),
-        ({"scenario": ["gust", "gust", "gusty"]}, ValueError, "did you mean 'gust'"),
-        ({"scenario": ["gust", None, "gust"]}, TypeError, "a scenario is a name"),
-        ({"max_episode_steps": 0}, ValueError, "max_episode_steps is at least 1, got 0"),
-        ({"max_episode_steps": 1.5}, TypeError, "max_episode_steps is a number of steps"),
-    ],
-)
-def test_bad_arguments(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
-        StabilityVectorEnv(3, **arguments)

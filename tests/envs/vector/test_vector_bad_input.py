@@ -3,40 +3,16 @@
 import math
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 
-from sideslip.envs import FAILURES, StabilityVectorEnv
+from sideslip.envs import FAILURES
 
 from ..batches import batch, plain
 
 pytestmark = pytest.mark.plain
 
 FUSION, AFS = "sideslip/YawFusion-v0", "sideslip/AfsYawFusion-v0"
-
-ARGUMENTS: list[tuple[dict[str, Any], type[Exception], str]] = [
-    ({"num_envs": 0}, ValueError, "num_envs is at least 1, got 0"),
-    ({"num_envs": -3}, ValueError, "num_envs is at least 1, got -3"),
-    ({"num_envs": 2.0}, TypeError, "num_envs is a number of environments, got 2.0"),
-    ({"num_envs": True}, TypeError, "num_envs is a number of environments, got True"),
-    ({"autoreset_mode": "Later"}, ValueError, "'Later'; known: 'NextStep', 'SameStep', 'Disabled'"),
-    ({"info": "some"}, ValueError, "info is 'all' or 'ends', got 'some'"),
-    ({"scenario": "slalon"}, ValueError, "unknown scenario 'slalon'"),
-    ({"render_mode": "ansi"}, ValueError, "unknown render_mode 'ansi'; known: human, rgb_array"),
-    ({"on_bad_action": "shrug"}, ValueError, "on_bad_action is 'raise' or 'fail'"),
-    ({"estimator": "dakf"}, TypeError, "unknown argument 'estimator'"),
-]
-
-
-@pytest.mark.smoke
-@pytest.mark.parametrize(("arguments", "error", "message"), ARGUMENTS, ids=str)
-def test_arguments(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
-    told = {"num_envs": 2} | arguments
-    with pytest.raises(error, match=message):
-        StabilityVectorEnv(**told)
-    with pytest.raises(error, match=message):
-        gymnasium.make_vec(FUSION, **told)
 
 
 BAD: list[tuple[Any, str]] = [
