@@ -6,13 +6,18 @@ from .ledger import (
     Analysis,
     Bound,
     ClaimPart,
-    EstimationSimulation,
     PaperFilter,
     make_claim_factory,
     make_number_part,
     make_smaller_part,
 )
-from .manoeuvres import FollowingSimulation, PaperFigure, make_course, make_curves
+from .manoeuvres import (
+    EstimationSimulation,
+    FollowingSimulation,
+    PaperFigure,
+    make_course,
+    make_curves,
+)
 from .theory import compute_coms_ranks
 
 PAPER = "dakf-stability"
@@ -40,7 +45,7 @@ SIMULATIONS = (
         {"base": FIG6, "name": BIAS, "steering": "straight", "duration": 120.0, "wind_force": 0.0,
             "gps_outage": None, "disturbance_force": 0.0, "disturbance_moment": 0.0,
             "noise": {"gyro_bias": _GYRO_BIAS}}, _FILTERS[:2], control_period=100),
-    Analysis(RANKS, compute_coms_ranks, random=False),
+    Analysis(RANKS, compute_coms_ranks, share=0.0),
 )
 # fmt: on
 
@@ -115,7 +120,7 @@ FIGURES = (
             (FIG8, "Fig. 8 (twin)", "Lane change at 20 km/h; course unused from 10.5 to 13.0 s."))
         for panel, draw in (
             ("(a): sideslip angle", make_curves("beta", _SLIP, ("truth", LOB, KF, DAKF))),
-            ("(b): course angle", make_course("course angle / rad", ("truth", KF, DAKF))))
+            ("(b): course angle", make_course("truth", KF, DAKF)))
     ),
     figure("Sec. IV.D: slip with a gyro bias of 0.05 deg/s", BIAS, make_curves("beta", _SLIP),
         "Straight on at 25 km/h: the direction that the DAKF cannot see fills up."),

@@ -2,19 +2,16 @@
 
 from functools import partial
 
-import numpy as np
-
 from ...estimators.filters import FILTERS
 from .ledger import (
     Bound,
     ClaimPart,
-    EstimationSimulation,
     PaperFilter,
-    compare_others,
     make_claim_factory,
     make_smaller_part,
+    select_ratio,
 )
-from .manoeuvres import PaperFigure, make_curves
+from .manoeuvres import EstimationSimulation, PaperFigure, make_curves
 
 PAPER = "double-layer-gps"
 FIG9, FASTER, PERIODS = "double-layer-fig9", "double-layer-fig9-fast", "double-layer-fig9-periods"
@@ -118,7 +115,7 @@ CLAIMS = (
         "follows HDOP (docs/PAPERS.md)."),
     claim("Fig. 9 (twin)", "the proposed estimator is the best on the road",
         ClaimPart("slip, double layer / best rival", ROAD,
-            compare_others(ROAD, PROPOSED, (THREE, LOB), np.min), Bound("<", 1.0)),
+            select_ratio(ROAD, PROPOSED, THREE, LOB), Bound("<", 1.0)),
         make_smaller_part("slip, three-state / two-state", ROAD, THREE, LOB),
         make_smaller_part("roll, double layer / roll KF", ROAD, PROPOSED, ROLL, metric="phi"),
         make_smaller_part("v_y, double layer / kinematic KF", ROAD, PROPOSED, KINEMATIC,

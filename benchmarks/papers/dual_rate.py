@@ -4,12 +4,11 @@ from functools import partial
 
 from .ledger import (
     ClaimPart,
-    EstimationSimulation,
     PaperFilter,
     make_claim_factory,
     make_smaller_part,
 )
-from .manoeuvres import PaperFigure, make_course, make_curves
+from .manoeuvres import EstimationSimulation, PaperFigure, make_course, make_curves
 from .theory import PAPER
 
 FIG4, FIG5 = "dual-rate-fig4", "dual-rate-fig5"
@@ -80,7 +79,7 @@ FIGURES = tuple(
     for name, number, caption in (
         (FIG4, "Fig. 4", "A slalom at 25 km/h, wind from 4 to 8 s, tyres 1.3 times too stiff."),
         (FIG5, "Fig. 5 (twin)", "The road test's slalom, with everything that the plant has."))
-    for panel, draw in (("(a): course angle", make_course("course angle / rad", _ALL)),
+    for panel, draw in (("(a): course angle", make_course(*_ALL)),
         ("(b): sideslip angle", make_curves("beta", _SLIP, _ALL)),
         ("(c): inter-sample performance", make_curves("beta", _SLIP, _ALL, (6.0, 7.0))))
 )

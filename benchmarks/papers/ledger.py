@@ -8,23 +8,23 @@ in the verdict.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from ...agents.rollout import rollout
-from ...envs.record import PACKET, Array, Log
-from ...envs.scenarios.manoeuvres import make_scenario
-from ...estimators.analysis.bound import compute_error_bound
+from ...envs.record import Array
 from ...estimators.design.options import read_tunings
 from ...estimators.estimator import Estimator
 from ...estimators.make import make_estimator
-from ..harness.drives import SETTLED, call_quietly, make_filter_arguments
+from ..harness.drives import call_quietly, make_filter_arguments
 from ..harness.parallel import split_seeds
+from ..harness.stats import Estimate
+
+if TYPE_CHECKING:
+    from ...envs.stability import StabilityEnv
 
 
 @dataclass
@@ -73,7 +73,14 @@ class Bound:
             )
 
     def is_met(self, values: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Tell which of the values meet it; NaN never does."""
+        """Tell which of the values meet it; NaN never does.
+
+        Args:
+            values: Numbers of any shape.
+
+        Returns:
+            Whether each one does, of the same shape.
+        """
         return np.asarray(_RELATIONS[self.relation](np.asarray(values, float), self.value))
 
     def __str__(self) -> str:
@@ -108,7 +115,14 @@ class Claim:
 
 
 def make_claim_factory(paper: str) -> Callable[..., Claim]:
-    """Make a function that makes a paper's claims from source, text, parts and a note."""
+    """Make a function that makes a paper's claims from source, text, parts and a note.
+
+    Args:
+        paper: Short name of the paper.
+
+    Returns:
+        The function.
+    """
 
     def make_claim(source: str, text: str, *parts: ClaimPart, note: str = "") -> Claim:
         return Claim(paper, source, text, parts, note)
@@ -124,19 +138,10 @@ class MeasuredPart:
     values: Array
 
     @property
-    def median(self) -> float:
-        """The median over the seeds."""
-        return float(np.median(self.values))
-
-    @property
-    def low(self) -> float:
-        """The smallest number of the seeds."""
-        return float(np.min(self.values))
-
-    @property
-    def high(self) -> float:
-        """The largest number of the seeds."""
-        return float(np.max(self.values))
+    def number(self) -> Estimate:
+        """The median over the seeds, with their range as its bounds."""
+        values = np.median(self.values), np.min(self.values), np.max(self.values)
+        return Estimate(*map(float, values))
 
     @property
     def agreement(self) -> float:
@@ -147,17 +152,25 @@ class MeasuredPart:
     @property
     def holds_in_median(self) -> bool:
         """Whether the median meets what the paper states."""
-        return self.part.stated is not None and bool(self.part.stated.is_met(self.median))
+        return self.part.stated is not None and bool(self.part.stated.is_met(self.number.value))
 
     @property
     def meets_threshold(self) -> bool | None:
         """Whether the median meets the threshold; None where there is none."""
         threshold = self.part.threshold
-        return None if threshold is None else bool(threshold.is_met(self.median))
+        return None if threshold is None else bool(threshold.is_met(self.number.value))
 
 
 def measure_parts(claim: Claim, results: Results) -> tuple[MeasuredPart, ...]:
-    """Measure every part of a claim; ValueError for a part without numbers."""
+    """Measure every part of a claim; ValueError for a part without numbers.
+
+    Args:
+        claim: Claim.
+        results: Results of all simulations that its parts name.
+
+    Returns:
+        Its parts with their numbers.
+    """
     parts = []
     for part in claim.parts:
         values = np.atleast_1d(np.asarray(part.compute(results), np.float64))
@@ -172,6 +185,12 @@ def evaluate_claim(parts: Sequence[MeasuredPart]) -> str:
 
     "reproduced": all are as stated in at least nine of ten seeds; "not reproduced": none is, even
     in the median over the seeds; "partly": anything between; "report only": no such part.
+
+    Args:
+        parts: Parts with their numbers.
+
+    Returns:
+        Verdict, one of `VERDICTS`.
     """
     stated_parts = [result for result in parts if result.part.stated is not None]
     if not stated_parts:
@@ -183,11 +202,6 @@ def evaluate_claim(parts: Sequence[MeasuredPart]) -> str:
     return "not reproduced"
 
 
-def select_number(scenario: str, subject: str, metric: str) -> Callable[[Results], Array]:
-    """Select a measured number as it stands."""
-    return lambda results: results[scenario].numbers[subject, metric]
-
-
 def make_number_part(
     label: str,
     scenario: str,
@@ -197,22 +211,46 @@ def make_number_part(
     threshold: Bound | None = None,
     metric: str = "ratio",
 ) -> ClaimPart:
-    """Make a part of a claim of a measured number: a quantity of a subject in a scenario."""
-    number = select_number(scenario, subject, quantity)
-    return ClaimPart(label, scenario, number, stated, threshold, metric)
+    """Make a part of a claim of a measured number as it stands.
+
+    Args:
+        label: What is measured.
+        scenario: Name of the simulation or analysis.
+        subject: Filter, controller or other name that has the number.
+        quantity: Name of the number.
+        stated: What the paper states of it.
+        threshold: What an honest implementation meets.
+        metric: Metric of the row.
+
+    Returns:
+        Part.
+    """
+
+    def select_number(results: Results) -> Array:
+        return results[scenario].numbers[subject, quantity]
+
+    return ClaimPart(label, scenario, select_number, stated, threshold, metric)
 
 
 def select_ratio(
-    scenario: str, one: str, other: str, metric: str = "beta"
+    scenario: str,
+    one: str,
+    *others: str,
+    metric: str = "beta",
+    pick: Callable[..., Array] = np.min,
 ) -> Callable[[Results], Array]:
-    """Select one's number over the other's, seed by seed."""
-    return compare_others(scenario, one, (other,), np.min, metric)
+    """Select one's number over the best or the poorest of others', seed by seed.
 
+    Args:
+        scenario: Name of the simulation.
+        one: Subject of the numerator.
+        *others: Subjects of the denominator, one or more.
+        metric: Name of the number.
+        pick: `np.min` for the best of them, `np.max` for the poorest.
 
-def compare_others(
-    scenario: str, one: str, others: Sequence[str], pick: Callable[..., Array], metric: str = "beta"
-) -> Callable[[Results], Array]:
-    """Select one's number over the best (pick: np.min) or the poorest (np.max) of others'."""
+    Returns:
+        Function of all results.
+    """
 
     def compute_ratio(results: Results) -> Array:
         numbers = results[scenario].numbers
@@ -230,59 +268,104 @@ def make_smaller_part(
     max_ratio: float | None = None,
     metric: str = "beta",
 ) -> ClaimPart:
-    """Make a part that states one's number smaller than the other's; max_ratio: threshold."""
+    """Make a part that states one's number smaller than the other's.
+
+    Args:
+        label: What is compared with what.
+        scenario: Name of the simulation.
+        one: Subject whose number is stated to be smaller.
+        other: Subject whose number is larger.
+        max_ratio: Threshold of the ratio, None for none.
+        metric: Name of the number.
+
+    Returns:
+        Part.
+    """
     threshold = None if max_ratio is None else Bound("<=", max_ratio)
-    ratio = select_ratio(scenario, one, other, metric)
+    ratio = select_ratio(scenario, one, other, metric=metric)
     return ClaimPart(label, scenario, ratio, Bound("<", 1.0), threshold)
 
 
-FIRST = 0  # the seed of the figures
-_CHUNK = 5  # seeds of a case that is over in seconds
-
-Numbers = dict[tuple[str, str], float]
-"""One seed's numbers, by who and metric."""
-
-
-class Simulation(Protocol):
-    """A simulation with a unique name: the seeds of its cases, and numbers on those of a case."""
-
-    @property
-    def name(self) -> str: ...  # noqa: D102
-
-    def chunks(self, seeds: int) -> list[tuple[int, ...]]: ...  # noqa: D102
-
-    def measure(self, seeds: tuple[int, ...]) -> SimulationResult: ...  # noqa: D102
+Numbers = dict[tuple[str, str], float | Array]
+"""One seed's numbers, by subject and metric."""
+SeedFunction = Callable[[int], tuple[Numbers, Example | None]]
+"""From a seed to its numbers and signals."""
 
 
 @dataclass(frozen=True)
-class Analysis:
-    """A computation without noise of sensors."""
+class Simulation:
+    """A simulation with a unique name, whose seeds are split into cases; `prepare` is its own."""
 
+    size: ClassVar[int] = 5  # seeds of a case
     name: str
-    function: Callable[[tuple[int, ...]], SimulationResult]  # of seeds, importable
-    random: bool = True  # whether the seeds mean anything to it; else it is called once
+    _: KW_ONLY
+    share: float = 1.0  # of the seeds; 0: once; above 1 where a ratio is close to its threshold
 
-    def chunks(self, seeds: int) -> list[tuple[int, ...]]:
-        """Split the seeds into cases."""
-        return split_seeds(seeds if self.random else 1, _CHUNK)
+    def split(self, seeds: int) -> list[tuple[int, ...]]:
+        """Split the share of some seeds into cases.
+
+        Args:
+            seeds: Number of seeds of the suite.
+
+        Returns:
+            Seeds of each case.
+        """
+        return split_seeds(max(1, round(self.share * seeds)), self.size)
 
     def measure(self, seeds: tuple[int, ...]) -> SimulationResult:
-        """Call the function."""
-        return self.function(seeds)
+        """Measure the numbers of a case, and keep the signals of seed 0.
+
+        Args:
+            seeds: Seeds of the case.
+
+        Returns:
+            Numbers by subject and metric, shape (seeds,) each, and the example.
+        """
+        measure_seed, lines, example = self.prepare(), list[Numbers](), None
+        for seed in seeds:
+            line, signals = measure_seed(seed)
+            lines.append(line)
+            example = signals if seed == 0 else example
+        numbers = {x: np.concatenate([np.atleast_1d(at[x]) for at in lines]) for x in lines[0]}
+        return SimulationResult(numbers, example)
+
+    def prepare(self) -> SeedFunction:
+        """Prepare a case: make the function that measures one of its seeds."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Analysis(Simulation):
+    """A computation without noise of sensors."""
+
+    function: SeedFunction
+
+    def prepare(self) -> SeedFunction:
+        """Return the function of a seed."""
+        return self.function
 
 
 def rms(values: npt.ArrayLike) -> float:
-    """Compute the root of the mean square."""
+    """Compute the root of the mean square.
+
+    Args:
+        values: Numbers of any shape.
+
+    Returns:
+        Root of the mean square.
+    """
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def collect_numbers(lines: list[Numbers]) -> dict[tuple[str, str], Array]:
-    """Collect each number over the seeds, (seeds,), from the numbers of each seed."""
-    return {name: np.array([line[name] for line in lines]) for name in lines[0]}
-
-
 def join_results(chunks: list[SimulationResult]) -> SimulationResult:
-    """Join the chunks of one simulation."""
+    """Join the results of one simulation's cases.
+
+    Args:
+        chunks: Results in the order of their seeds.
+
+    Returns:
+        Result of all seeds.
+    """
     names = chunks[0].numbers
     numbers = {name: np.concatenate([chunk.numbers[name] for chunk in chunks]) for name in names}
     return SimulationResult(numbers, next((c.example for c in chunks if c.example), None))
@@ -295,7 +378,14 @@ _TUNED = {
 
 
 def get_paper_tuning(name: str) -> Mapping[str, float]:
-    """Get the options by which a filter is tuned for its paper's simulation; {}: the default."""
+    """Get the options by which a filter is tuned for its paper's simulation.
+
+    Args:
+        name: Name of the filter.
+
+    Returns:
+        Options of `make_estimator`, {} for the default.
+    """
     return _TUNED.get(name, {})
 
 
@@ -309,8 +399,16 @@ class PaperFilter:
     vehicle: str = "nominal"  # or "true", for which it is built
 
 
-def make_filters(filters: Sequence[PaperFilter], base: Any) -> dict[str, Estimator]:
-    """Make filters by label, tuned for their papers, for the running episode of a base env."""
+def make_filters(filters: Sequence[PaperFilter], base: "StabilityEnv") -> dict[str, Estimator]:
+    """Make filters, tuned for their papers, for the running episode of an env.
+
+    Args:
+        filters: Filters of a simulation.
+        base: Unwrapped env.
+
+    Returns:
+        Estimators by label.
+    """
     cars, facts = {"nominal": base.nominal, "true": base.vehicle}, make_filter_arguments(base)
     by_label = {}
     for spec in filters:
@@ -318,82 +416,3 @@ def make_filters(filters: Sequence[PaperFilter], base: Any) -> dict[str, Estimat
         options |= {**get_paper_tuning(spec.name), **spec.options}
         by_label[spec.label] = call_quietly(make_estimator, spec.name, **options)
     return by_label
-
-
-@dataclass(frozen=True)
-class EstimationSimulation:
-    """Filters over the drives of a scenario, without control.
-
-    Numbers of each filter: the RMSE of every state whose truth is known, from `SETTLED` on;
-    "outage", that of beta while the GPS is out; "jump", the RMS change of beta in the milliseconds
-    in which a packet arrives; "last", the mean of beta's error over the last second, its size.
-    Raises ValueError for the bound of a car whose tyres change on the way.
-    """
-
-    name: str
-    env_id: str
-    scenario: str | Mapping[str, Any]
-    filters: tuple[PaperFilter, ...]
-    bound: bool = False  # whether to add "bound", the RMS of the optimal standard deviation of beta
-    times: int = 1  # that many times the seeds, where a ratio is close to its threshold
-    control_period: int = 10  # ticks between rows of the truth, interpolated in between
-
-    def __post_init__(self) -> None:
-        if self.bound and make_scenario(self.scenario).tyre_change_time is not None:
-            raise ValueError(f"{self.name}: no bound is known where the tyres change on the way")
-
-    def chunks(self, seeds: int) -> list[tuple[int, ...]]:
-        """Split the seeds into cases."""
-        return split_seeds(self.times * seeds, _CHUNK)
-
-    def measure(self, seeds: tuple[int, ...]) -> SimulationResult:
-        """Drive each seed once and run every filter over its record."""
-        options: dict[str, Any] = {"scenario": self.scenario, "control_period": self.control_period}
-        env: gym.Env[Any, Any] = gym.make(self.env_id, **options)
-        base: Any = env.unwrapped
-        estimators: dict[str, Estimator] = {}
-        lines, example = [], None
-        for seed in seeds:
-            drive = rollout(env, seed=seed)
-            if drive.failed:
-                raise RuntimeError(f"{self.name}: the car of seed {seed} failed without control")
-            truth = drive.log.truth
-            numbers: Numbers = {("truth", "beta"): _compute_settled_rms(truth["beta"], drive.log)}
-            curves = {"truth": truth}
-            estimators = estimators or make_filters(self.filters, base)
-            for label, estimator in estimators.items():
-                estimates = estimator.run(drive.log)
-                curves[label] = {name: estimates[name] for name in estimates.names}
-                numbers |= _compute_errors(label, curves[label], truth, drive.log, base.scenario)
-            if self.bound:
-                facts = make_filter_arguments(base) | {"vehicle": base.vehicle}
-                std = compute_error_bound(record=drive.log.record, **facts)
-                numbers["bound", "beta"] = _compute_settled_rms(std, drive.log)
-            lines.append(numbers)
-            if seed == FIRST:
-                record = drive.log.record
-                packets = {sensor: record.select_packets(sensor) for sensor in drive.log.slow}
-                example = Example(drive.log.time, curves, packets)
-        return SimulationResult(collect_numbers(lines), example)
-
-
-def _compute_settled_rms(values: Array, log: Log) -> float:
-    return rms(values[log.time >= SETTLED - 1e-9])
-
-
-def _compute_errors(
-    label: str, estimates: Mapping[str, Array], truth: Mapping[str, Array], log: Log, scenario: Any
-) -> Numbers:
-    errors = {name: estimates[name] - truth[name] for name in truth if name in estimates}
-    numbers = {(label, name): _compute_settled_rms(error, log) for name, error in errors.items()}
-    if "beta" not in estimates:
-        return numbers
-    t, beta = log.time, estimates["beta"]
-    numbers[label, "last"] = float(abs(np.mean(errors["beta"][t >= t[-1] - 1.0])))
-    arrived = log.record.packets[:, PACKET.arrived].astype(int) - log.record.first
-    arrived = arrived[(arrived > 0) & (t[np.minimum(arrived, len(t) - 1)] >= SETTLED)]
-    numbers[label, "jump"] = rms(beta[arrived] - beta[arrived - 1])
-    if scenario.gps_outage is not None:
-        start, end = scenario.gps_outage
-        numbers[label, "outage"] = rms(errors["beta"][(t >= start) & (t < end)])
-    return numbers

@@ -1,33 +1,119 @@
-"""Controllers over the papers' manoeuvres, and the papers' figures from an example's signals.
+"""Filters and controllers over the papers' manoeuvres, and the papers' figures.
 
 tie-vision's controllers are measured by the sideslip angle that they leave, dakf-stability's by how
 well the car follows its reference model.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 
 from ...agents import make_agent
 from ...agents.rollout import Rollout, rollout
-from ...envs.record import PACKET, Array
+from ...envs.record import PACKET, Array, Log
 from ...envs.scenarios.manoeuvres import make_scenario
 from ...envs.scenarios.scenario import Scenario
-from ..harness.drives import make_env
-from ..harness.parallel import split_seeds
+from ...estimators.analysis.bound import compute_error_bound
+from ..harness.drives import SETTLED, make_env, make_filter_arguments
 from .ledger import (
-    FIRST,
     Example,
     Numbers,
-    SimulationResult,
-    collect_numbers,
+    PaperFilter,
+    SeedFunction,
+    Simulation,
     get_paper_tuning,
+    make_filters,
     rms,
 )
 
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
+
+    from ...estimators.estimator import Estimator
+
 _Manoeuvre = str | Mapping[str, Any] | Scenario
+
+
+@dataclass(frozen=True)
+class EstimationSimulation(Simulation):
+    """Filters over the drives of a scenario, without control.
+
+    Numbers of each filter: the RMSE of every state whose truth is known, from `SETTLED` on;
+    "outage", that of beta while the GPS is out; "jump", the RMS change of beta in the milliseconds
+    in which a packet arrives; "last", the mean of beta's error over the last second, its size.
+    Raises ValueError for the bound of a car whose tyres change on the way.
+    """
+
+    env_id: str
+    scenario: str | Mapping[str, Any]
+    filters: tuple[PaperFilter, ...]
+    bound: bool = False  # whether to add "bound", the RMS of the optimal standard deviation of beta
+    control_period: int = 10  # ticks between rows of the truth, interpolated in between
+
+    def __post_init__(self) -> None:
+        if self.bound and make_scenario(self.scenario).tyre_change_time is not None:
+            raise ValueError(f"{self.name}: no bound is known where the tyres change on the way")
+
+    def prepare(self) -> SeedFunction:
+        """Make the function that drives a seed and runs every filter over its record."""
+        options: dict[str, Any] = {"scenario": self.scenario, "control_period": self.control_period}
+        env: gym.Env[Any, Any] = gym.make(self.env_id, **options)
+        base: Any = env.unwrapped
+        estimators: dict[str, Estimator] = {}
+
+        def measure_seed(seed: int) -> tuple[Numbers, Example]:
+            drive = rollout(env, seed=seed)
+            if drive.failed:
+                raise RuntimeError(f"{self.name}: the car of seed {seed} failed without control")
+            log, truth = drive.log, drive.log.truth
+            numbers: Numbers = {("truth", "beta"): _compute_settled_rms(truth["beta"], log)}
+            curves = {"truth": truth}
+            if not estimators:
+                estimators.update(make_filters(self.filters, base))
+            for label, estimator in estimators.items():
+                estimates = estimator.run(log)
+                curves[label] = {name: estimates[name] for name in estimates.names}
+                numbers |= _compute_errors(label, curves[label], truth, log, base.scenario)
+            if self.bound:
+                facts = make_filter_arguments(base) | {"vehicle": base.vehicle}
+                std = compute_error_bound(record=log.record, **facts)
+                numbers["bound", "beta"] = _compute_settled_rms(std, log)
+            packets = {sensor: log.record.select_packets(sensor) for sensor in log.slow}
+            return numbers, Example(log.time, curves, packets)
+
+        return measure_seed
+
+
+def _compute_settled_rms(values: Array, log: Log) -> float:
+    return rms(values[log.time >= SETTLED - 1e-9])
+
+
+def _compute_errors(
+    label: str,
+    estimates: Mapping[str, Array],
+    truth: Mapping[str, Array],
+    log: Log,
+    scenario: Scenario,
+) -> Numbers:
+    errors = {name: estimates[name] - truth[name] for name in truth if name in estimates}
+    numbers: Numbers = {
+        (label, name): _compute_settled_rms(error, log) for name, error in errors.items()
+    }
+    if "beta" not in estimates:
+        return numbers
+    t, beta = log.time, estimates["beta"]
+    numbers[label, "last"] = float(abs(np.mean(errors["beta"][t >= t[-1] - 1.0])))
+    arrived = log.record.packets[:, PACKET.arrived].astype(int) - log.record.first
+    arrived = arrived[(arrived > 0) & (t[np.minimum(arrived, len(t) - 1)] >= SETTLED)]
+    numbers[label, "jump"] = rms(beta[arrived] - beta[arrived - 1])
+    if scenario.gps_outage is not None:
+        start, end = scenario.gps_outage
+        numbers[label, "outage"] = rms(errors["beta"][(t >= start) & (t < end)])
+    return numbers
+
 
 _ENV_ID = "sideslip/AfsYawFusion-v0"
 _STATES = ("beta", "gamma", "d1", "d2")
@@ -71,7 +157,14 @@ def run_episode(
 
 
 def measure_tracking(episode: Rollout) -> Tracking:
-    """Measure how an episode of `run_episode` tracks its reference."""
+    """Measure how an episode tracks its reference.
+
+    Args:
+        episode: Episode of `run_episode`.
+
+    Returns:
+        Errors, peak and saturation.
+    """
     moment, steering = np.abs(episode["action_0"]), np.abs(episode["action_1"])
     return Tracking(
         rms_beta=rms(episode["beta"] - episode["beta_ref"]),
@@ -96,25 +189,43 @@ _NOISE = {"camera_psi": "psi_noise", "camera_y": "y_l_noise"}
 
 
 @dataclass(frozen=True)
-class SlipSimulation:
+class _AgentSimulation(Simulation):
+    """Controllers on each seed; `_run_episode` gives the numbers of one."""
+
+    size: ClassVar[int] = 2
+    scenario: str | Mapping[str, Any]
+    contestants: Sequence[str] | Mapping[str, Mapping[str, Any]]  # labels
+
+    def prepare(self) -> SeedFunction:
+        """Return the function that drives every contestant."""
+        return self._measure_seed
+
+    def _measure_seed(self, seed: int) -> tuple[Numbers, Example]:
+        numbers: Numbers = {}
+        curves: dict[str, dict[str, Array]] = {}
+        for label in self.contestants:
+            episode, values = self._run_episode(label, seed)
+            if episode.failed:  # fewer ticks are no better drive
+                raise RuntimeError(f"{label}: the car of seed {seed} failed")
+            numbers |= {(label, name): value for name, value in values.items()}
+            curves[label] = {name: episode[name] for name in SIGNALS}
+        curves["reference"] = {name: episode[f"{name}_ref"] for name in ("beta", "gamma")}
+        return numbers, Example(episode["t"], curves)
+
+    def _run_episode(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class SlipSimulation(_AgentSimulation):
     """tie-vision's controllers on a lane change, each with a filter that knows the camera's noise.
 
-    Numbers of each: RMS and peak of the slip, the largest change of the yaw moment in 1 ms, the sum
-    of all its changes and the fraction of time at its limit.
+    Contestants are those of `_CONTESTANTS`, or have a remark behind a comma. Numbers of each: RMS
+    and peak of the slip, the largest change of the yaw moment in 1 ms, the sum of all its changes
+    and the fraction of time at its limit.
     """
 
-    name: str
-    scenario: str
-    contestants: tuple[str, ...]  # of `_CONTESTANTS`, or with a remark behind a comma
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # more ones of the agent
-
-    def chunks(self, seeds: int) -> list[tuple[int, ...]]:
-        """Split the seeds into cases."""
-        return split_seeds(seeds, 2)
-
-    def measure(self, seeds: tuple[int, ...]) -> SimulationResult:
-        """Drive every contestant on each seed."""
-        return _measure_agents(seeds, self.contestants, self._run_episode)
 
     def _run_episode(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
         agent, estimator, options = _CONTESTANTS[label.partition(",")[0]]
@@ -136,53 +247,22 @@ class SlipSimulation:
         }
 
 
-def _measure_agents(
-    seeds: tuple[int, ...],
-    labels: Iterable[str],
-    drive: Callable[[str, int], tuple[Rollout, dict[str, float]]],
-) -> SimulationResult:
-    """Measure every contestant on each seed, with the signals of the first seed."""
-    lines, example = [], None
-    for seed in seeds:
-        numbers: Numbers = {}
-        curves: dict[str, dict[str, Array]] = {}
-        for label in labels:
-            episode, values = drive(label, seed)
-            if episode.failed:  # fewer ticks are no better drive
-                raise RuntimeError(f"{label}: the car of seed {seed} failed")
-            numbers |= {(label, name): value for name, value in values.items()}
-            curves[label] = {name: episode[name] for name in SIGNALS}
-        lines.append(numbers)
-        if seed == FIRST:
-            curves["reference"] = {name: episode[f"{name}_ref"] for name in ("beta", "gamma")}
-            example = Example(episode["t"], curves)
-    return SimulationResult(collect_numbers(lines), example)
-
-
 @dataclass(frozen=True)
-class FollowingSimulation:
-    """dakf-stability's controller by wire, with and without parts of it; numbers of `Tracking`."""
+class FollowingSimulation(_AgentSimulation):
+    """dakf-stability's controller by wire, with and without parts of it; numbers of `Tracking`.
 
-    name: str
-    scenario: str | Mapping[str, Any]
-    agents: Mapping[str, Mapping[str, Any]]  # options of `run_episode` by label
-    share: float = 1.0  # of the seeds that are driven
+    Contestants are options of `run_episode` by label.
+    """
 
-    def chunks(self, seeds: int) -> list[tuple[int, ...]]:
-        """Split the seeds into cases."""
-        return split_seeds(max(1, round(self.share * seeds)), 2)
-
-    def measure(self, seeds: tuple[int, ...]) -> SimulationResult:
-        """Drive every agent on each seed."""
-        return _measure_agents(seeds, self.agents, self._run_episode)
+    contestants: Mapping[str, Mapping[str, Any]]
 
     def _run_episode(self, label: str, seed: int) -> tuple[Rollout, dict[str, float]]:
-        drive = run_episode(seed, self.scenario, **self.agents[label])
+        drive = run_episode(seed, self.scenario, **self.contestants[label])
         values = vars(measure_tracking(drive))
         return drive, {name: float(value) for name, value in values.items()}
 
 
-_Draw = Callable[[Example], Any]
+_Draw = Callable[[Example], "Figure"]
 
 
 @dataclass(frozen=True)
@@ -202,8 +282,8 @@ def _draw_lines(
     y_label: str,
     window: tuple[float, float] | None = None,
     **more: Any,
-) -> Any:
-    """_Draw lines over time, in a window (s) of it; more: of `draw_time_series`."""
+) -> "Figure":
+    """Draw lines over time, in a window (s) of it; more: of `draw_time_series`."""
     from ..report.figures import draw_time_series
 
     t = example.time
@@ -219,9 +299,20 @@ def make_curves(
     window: tuple[float, float] | None = None,
     x_label: str = "time / s",
 ) -> _Draw:
-    """Make a figure of a signal over time, of all subjects or the labels, in a window (s)."""
+    """Make a figure of a signal over time.
 
-    def draw(example: Example) -> Any:
+    Args:
+        signal: Name of the signal.
+        y_label: Label of the vertical axis.
+        labels: Subjects, none for all.
+        window: Part of the time (s), None for all of it.
+        x_label: Label of the horizontal axis.
+
+    Returns:
+        Function that draws.
+    """
+
+    def draw(example: Example) -> "Figure":
         signals = {name: example.curves.get(name, {}) for name in labels or example.curves}
         series = {name: values[signal] for name, values in signals.items() if signal in values}
         return _draw_lines(example, series, y_label, window, x_label=x_label)
@@ -229,35 +320,45 @@ def make_curves(
     return draw
 
 
-def make_loops(y_label: str) -> _Draw:
-    """Make a figure of open loops over frequency in Hz, on a logarithmic axis."""
+def draw_loops(example: Example) -> "Figure":
+    """Draw the gain of open loops over the frequency, on a logarithmic axis.
 
-    def draw(example: Example) -> Any:
-        series = {name: signals["magnitude"] for name, signals in example.curves.items()}
-        figure = _draw_lines(example, series, y_label, x_label="frequency / Hz")
-        ends = np.log10(example.time[[0, -1]])
-        figure.update_xaxes(type="log", range=[float(end) for end in ends])
-        return figure
+    Args:
+        example: Magnitudes (dB) over Hz.
 
-    return draw
+    Returns:
+        Figure.
+    """
+    series = {name: signals["magnitude"] for name, signals in example.curves.items()}
+    figure = _draw_lines(example, series, "gain of the open loop / dB", x_label="frequency / Hz")
+    ends = np.log10(example.time[[0, -1]])
+    figure.update_xaxes(type="log", range=[float(end) for end in ends])
+    return figure
 
 
-def make_course(y_label: str, labels: Sequence[str]) -> _Draw:
-    """Make a figure of the course psi + beta: truth, the receiver's samples, each filter's."""
+def make_course(*labels: str) -> _Draw:
+    """Make a figure of the course psi + beta, with the receiver's samples.
 
-    def draw(example: Example) -> Any:
+    Args:
+        *labels: Subjects: the truth, filters.
+
+    Returns:
+        Function that draws.
+    """
+
+    def draw(example: Example) -> "Figure":
         curves = {name: example.curves[name] for name in labels}
         series = {name: curve["psi"] + curve["beta"] for name, curve in curves.items()}
-        series["measured"] = _extract_samples(example, "gps", 0, "arrived")
-        return _draw_lines(example, series, y_label, dots=("measured",))
+        series["measured"] = _extract_samples(example, "gps", 0)
+        return _draw_lines(example, series, "course angle / rad", dots=("measured",))
 
     return draw
 
 
-def _extract_samples(example: Example, sensor: str, row: int, at: str) -> Array:
-    """Extract a slow sensor's values at the ticks `captured` or `arrived`, NaN elsewhere."""
+def _extract_samples(example: Example, sensor: str, row: int) -> Array:
+    """Extract a slow sensor's values at the ticks at which they arrive, NaN elsewhere."""
     values = np.full(len(example.time), np.nan)
-    ticks = example.packets[sensor][:, getattr(PACKET, at)].astype(int)
+    ticks = example.packets[sensor][:, PACKET.arrived].astype(int)
     in_range = ticks < len(values)
     values[ticks[in_range]] = example.packets[sensor][in_range, PACKET.value + row]
     return values
@@ -272,21 +373,34 @@ def _repeat_samples(values: Array) -> Array:
     return out
 
 
-def make_offset(y_label: str, labels: Sequence[str], window: tuple[float, float]) -> _Draw:
-    """Make a figure of the lateral offset: truth, the camera's held late samples, each filter's."""
+def make_offset(labels: Sequence[str], window: tuple[float, float]) -> _Draw:
+    """Make a figure of the lateral offset, with the camera's held late samples.
 
-    def draw(example: Example) -> Any:
+    Args:
+        labels: Subjects: the truth, filters.
+        window: Part of the time (s).
+
+    Returns:
+        Function that draws.
+    """
+
+    def draw(example: Example) -> "Figure":
         series = {name: example.curves[name]["y_l"] for name in labels}
-        series["measured, held"] = _repeat_samples(
-            _extract_samples(example, "camera", 1, "arrived")
-        )
-        return _draw_lines(example, series, y_label, window)
+        series["measured, held"] = _repeat_samples(_extract_samples(example, "camera", 1))
+        return _draw_lines(example, series, "lateral offset / m", window)
 
     return draw
 
 
-def draw_delays(example: Example) -> Any:
-    """_Draw the delay of the newest frame over the time of its capture, for the first second."""
+def draw_delays(example: Example) -> "Figure":
+    """Draw the delay of the newest frame over the time of its capture, for the first second.
+
+    Args:
+        example: Signals with the camera's packets.
+
+    Returns:
+        Figure.
+    """
     packets = example.packets["camera"]
     late = np.full(len(example.time), np.nan)
     ticks = packets[:, PACKET.captured].astype(int)

@@ -7,12 +7,10 @@ from collections import Counter
 
 from rich.console import Console
 
-from ... import __version__
 from ..harness.parallel import run_cases
-from ..harness.results import VERDICTS, ResultRow, ResultTable, Suite
-from ..harness.stats import Estimate
-from ..harness.verdict import format_verdict as format_verdict
-from ..harness.verdict import summarise_names
+from ..harness.results import VERDICTS, ResultTable, Suite
+from ..harness.verdict import format_verdict, summarise_names
+from ..report.study import add_rows, import_figures
 from . import dakf_stability, double_layer, dual_rate, theory, tie_vision_control, uneven_delay
 from . import tie_vision_estimation as tie_vision
 from . import tie_vision_theory as tie_vision_convergence
@@ -60,7 +58,14 @@ Ledger = list[tuple[Claim, tuple[MeasuredPart, ...]]]
 
 
 def measure(case: Case) -> SimulationResult:
-    """Measure one simulation on a few of its seeds."""
+    """Measure one simulation on a few of its seeds.
+
+    Args:
+        case: Name and seeds.
+
+    Returns:
+        Numbers of the seeds.
+    """
     name, seeds = case
     return SIMULATIONS[name].measure(seeds)
 
@@ -84,13 +89,30 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
     for paper in dict.fromkeys(claim.paper for claim in CLAIMS):
         suite.tables.append(_make_number_table(ledger, paper))
     for claim, parts in ledger:
-        suite.rows += [_make_row(claim, result, evaluate_claim(parts)) for result in parts]
-    _draw_figures(suite, results)
+        columns = {"verdict": evaluate_claim(parts)}
+        columns["paper"] = f"{_format_source(claim)}: {claim.text}"
+        for result in parts:
+            part, n = result.part, len(result.values)
+            where = {"scenario": part.scenario, "estimator": part.label}
+            add_rows(suite, {part.metric: result.number}, n=n, **where, **columns)
+    if import_figures() is None:
+        return suite
+    for figure in FIGURES:
+        if (example := results[figure.scenario].example) is not None:
+            title = f"{figure.paper} {figure.title}"
+            suite.figures.append((title, figure.draw(example), figure.caption))
     return suite
 
 
 def compose_verdict(ledger: Ledger) -> str:
-    """Compose the verdict: how many claims hold, which do not."""
+    """Compose the verdict: how many claims hold, which do not.
+
+    Args:
+        ledger: Claims with their measured parts.
+
+    Returns:
+        Verdict.
+    """
     verdicts = [(claim, evaluate_claim(parts)) for claim, parts in ledger]
     counted = Counter(item for _, item in verdicts)
     papers = dict.fromkeys(claim.paper for claim, _ in verdicts)
@@ -112,13 +134,14 @@ def compose_verdict(ledger: Ledger) -> str:
     )
 
 
-def _simulate(seeds: int, jobs: int | None = None, console: Console | None = None) -> Results:
+def _simulate(seeds: int, jobs: int | None, console: Console | None) -> Results:
     """Run every simulation and analysis; return the results by name."""
-    cases = [(name, chunk) for name, x in SIMULATIONS.items() for chunk in x.chunks(seeds)]
+    cases = [(name, chunk) for name, x in SIMULATIONS.items() for chunk in x.split(seeds)]
     parts: dict[str, list[SimulationResult]] = {name: [] for name in SIMULATIONS}
-    done = run_cases(measure, cases, NAME, jobs, console)
-    for (name, _), measured in zip(cases, done, strict=True):
-        parts[name].append(measured)
+    for (name, _), result in zip(
+        cases, run_cases(measure, cases, NAME, jobs, console), strict=True
+    ):
+        parts[name].append(result)
     return {name: join_results(chunks) for name, chunks in parts.items()}
 
 
@@ -161,10 +184,8 @@ def _format_source(claim: Claim) -> str:
 
 
 def _format_range(result: MeasuredPart) -> str:
-    if result.low == result.high:
-        return _format_number(result.median)
-    median, low, high = map(_format_number, (result.median, result.low, result.high))
-    return f"{median} [{low}, {high}]"
+    median, low, high = map(_format_number, result.number)
+    return median if result.number.low == result.number.high else f"{median} [{low}, {high}]"
 
 
 def _format_number(value: float) -> str:
@@ -178,27 +199,3 @@ def _format_checks(parts: tuple[MeasuredPart, ...]) -> str:
     if not checked:
         return ""
     return "met" if all(checked) else f"{checked.count(False)} of {len(checked)} MISSED"
-
-
-def _make_row(claim: Claim, result: MeasuredPart, judged: str) -> ResultRow:
-    """Make a row of a part; low and high are the range over the seeds."""
-    number = Estimate(result.median, result.low, result.high)
-    where = {"suite": NAME, "scenario": result.part.scenario, "estimator": result.part.label}
-    paper = f"{_format_source(claim)}: {claim.text}"
-    common = {"salt": "fixed", "env_version": __version__, "verdict": judged, "paper": paper}
-    return ResultRow.from_estimate(
-        result.part.metric, number, n=len(result.values), **where, **common
-    )
-
-
-def _draw_figures(suite: Suite, results: Results) -> None:
-    """Draw the papers' figures; nothing where plotly is not installed."""
-    try:
-        from ..report import figures  # noqa: F401
-    except ModuleNotFoundError:
-        return
-    for figure in FIGURES:
-        example = results[figure.scenario].example
-        if example is not None:
-            title = f"{figure.paper} {figure.title}"
-            suite.figures.append((title, figure.draw(example), figure.caption))

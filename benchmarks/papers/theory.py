@@ -17,21 +17,33 @@ from ...envs.vehicle import linear
 from ...envs.vehicle.linear import make_course_model
 from ...envs.vehicle.parameters import COMS
 from ...estimators.design import dual_rate, kalman
-from .ledger import Analysis, Bound, SimulationResult, make_claim_factory, make_number_part
+from .ledger import Analysis, Bound, Numbers, make_claim_factory, make_number_part
 from .manoeuvres import PaperFigure
 
 
-def make_fast_maps(A: Array, C: Array, L: Array, r: int) -> list[Array]:
-    """Make the maps, i = 0 .. r-1, with a measurement at every step: (22) repeated."""
-    left = np.eye(len(A)) - L @ C
-    maps = [left]
-    for _ in range(1, r):
-        maps.append(left @ A @ maps[-1])  # Omega of (22)
-    return maps
+def make_maps(rule: str, A: Array, C: Array, L: Array, r: int) -> list[Array]:
+    """Make the maps of a rule between samples.
 
+    Args:
+        rule: "fast": a measurement at every step, (22) repeated; "pseudo": pseudo measurements
+            (14), G from (31); "predicted": no correction, (34).
+        A: Transition of a step, shape (n, n).
+        C: Measurement, shape (q, n).
+        L: Gain, shape (n, q).
+        r: Steps between samples.
 
-def _make_shared_maps(A: Array, C: Array, shares: Array) -> list[Array]:
-    """Make the maps with corrections by shares (r, n, q) of the sample's innovation."""
+    Returns:
+        Maps for i = 0 .. r-1, shape (n, n) each.
+    """
+    if rule == "fast":
+        left = np.eye(len(A)) - L @ C
+        maps = [left]
+        for _ in range(1, r):
+            maps.append(left @ A @ maps[-1])  # Omega of (22)
+        return maps
+    shares = np.concatenate([L[None], np.zeros((r - 1, *L.shape))])  # of the sample's innovation
+    if rule == "pseudo":
+        shares = dual_rate.compute_pseudo_shares(A, C, L, np.linalg.pinv(C) - L, r)
     error, maps = np.eye(len(A)), []
     for i, share in enumerate(shares):
         error = (A @ error if i > 0 else error) - share @ C
@@ -39,19 +51,16 @@ def _make_shared_maps(A: Array, C: Array, shares: Array) -> list[Array]:
     return maps
 
 
-def make_pseudo_maps(A: Array, C: Array, L: Array, r: int) -> list[Array]:
-    """Make the maps with pseudo measurements (14), G from (31)."""
-    shares = dual_rate.compute_pseudo_shares(A, C, L, np.linalg.pinv(C) - L, r)
-    return _make_shared_maps(A, C, shares)
-
-
-def make_predicted_maps(A: Array, C: Array, L: Array, r: int) -> list[Array]:
-    """Make the maps with no correction between samples: (34)."""
-    return _make_shared_maps(A, C, np.concatenate([L[None], np.zeros((r - 1, *L.shape))]))
-
-
 def compute_difference(maps: list[Array], others: list[Array]) -> float:
-    """Compute the largest difference of two sequences of maps, over the largest of the others."""
+    """Compute the largest difference of two sequences of maps, over the largest of the others.
+
+    Args:
+        maps: Maps, shape (n, n) each.
+        others: Maps with which they are compared.
+
+    Returns:
+        Ratio of Frobenius norms.
+    """
     size = max(float(np.linalg.norm(matrix)) for matrix in others)
     return max(float(np.linalg.norm(a - b)) / size for a, b in zip(maps, others, strict=True))
 
@@ -59,7 +68,7 @@ def compute_difference(maps: list[Array], others: list[Array]) -> float:
 Matrix = list[list[Fraction]]
 
 
-def rank(matrix: Sequence[Sequence[Fraction | int]]) -> int:
+def _rank(matrix: Sequence[Sequence[Fraction | int]]) -> int:
     """Compute the rank of a matrix of fractions by elimination.
 
     >>> rank([[1, 2], [2, 4]]), rank([[Fraction(1, 3), 0], [0, 1]])
@@ -93,7 +102,7 @@ def _compute_observability_rank(A: Matrix, C: Sequence[Sequence[Fraction | int]]
             for row in block
         ]
         stacked += block
-    return rank(stacked)
+    return _rank(stacked)
 
 
 def _add_disturbances(A: Matrix, rows: int) -> Matrix:
@@ -104,8 +113,15 @@ def _add_disturbances(A: Matrix, rows: int) -> Matrix:
     return [a + e for a, e in zip(A, ends, strict=True)] + zeros
 
 
-def compute_coms_ranks(_: tuple[int, ...]) -> SimulationResult:
-    """Compute the rank of each paper's observability matrix for the COMS at 25 km/h, exactly."""
+def compute_coms_ranks(seed: int) -> tuple[Numbers, None]:
+    """Compute the rank of each paper's observability matrix for the COMS at 25 km/h, exactly.
+
+    Args:
+        seed: Not used.
+
+    Returns:
+        Rank by paper, and no signals.
+    """
     model = linear.make_vision_model(COMS, 25.0 * KMH)
     vision = [[Fraction(entry) for entry in row] for row in model.A]
     course = [row[:3] for row in vision[:3]]
@@ -114,11 +130,13 @@ def compute_coms_ranks(_: tuple[int, ...]) -> SimulationResult:
         "dual-rate": (_add_disturbances(course, 3), [[1, 0, 1]]),
         "vision": (vision, [[0, 0, 1, 0], [0, 0, 0, 1]]),
     }
-    ranks = {
-        name: _compute_observability_rank(A, [row + [0] * (len(A) - len(row)) for row in C])
+    ranks: Numbers = {
+        (name, "rank"): float(
+            _compute_observability_rank(A, [row + [0] * (len(A) - len(row)) for row in C])
+        )
         for name, (A, C) in models.items()
     }
-    return SimulationResult({(name, "rank"): np.array([float(n)]) for name, n in ranks.items()})
+    return ranks, None
 
 
 PAPER = "dual-rate"
@@ -131,43 +149,41 @@ STRONG, ANY = "strong disturbances", "any tuning"
 _GROWS = 1.001  # the unobservable directions stay at 1, to the rounding of a double eigenvalue
 
 
-def make_extended_model(stiffness: float = 9100.0) -> tuple[Array, Array]:
+def make_extended_model() -> tuple[Array, Array]:
     """Make A and C of (11), the course model at 25 km/h and 1 ms with a random walk per state."""
-    car = COMS.replace(front_stiffness=stiffness, rear_stiffness=stiffness)
+    car = COMS.replace(front_stiffness=9100.0, rear_stiffness=9100.0)
     model = make_course_model(car, SPEED)
     A = np.zeros((6, 6))
     A[:3, :3], A[:3, 3:] = model.A, np.eye(3)
     return expm(A * 1e-3), np.array([[1.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
 
 
-def _measure_maps(seeds: tuple[int, ...]) -> SimulationResult:
-    """Compare the error dynamics with pseudo measurements to those with fast ones.
+def _compare_maps(A: Array, C: Array, L: Array) -> float:
+    """Compare the error dynamics with pseudo measurements to those with fast ones."""
+    return compute_difference(*(make_maps(rule, A, C, L, RATIO) for rule in ("pseudo", "fast")))
 
-    Square: random systems of three states, all measured. Course only: the extended model with the
-    Kalman gain that a random process noise has after 5 s of fast measurements.
+
+def _measure_maps(seed: int) -> tuple[Numbers, None]:
+    """Compare maps of a random system of three states, all measured, and of the extended model.
+
+    That one's Kalman gain is what a random process noise has after 5 s of fast measurements.
     """
     A, C = make_extended_model()
     R = np.array([[COURSE_SD**2]])
-    square, application = [], []
-    for seed in seeds:
-        rng = np.random.default_rng(seed)
-        a = 0.97 * np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        c = rng.normal(size=(3, 3))
-        l = kalman.kalman_gain(np.eye(3), c, np.eye(3))  # noqa: E741
-        pseudo_maps = make_pseudo_maps(a, c, l, RATIO)
-        square.append(compute_difference(pseudo_maps, make_fast_maps(a, c, l, RATIO)))
-        Q = np.diag(10.0 ** rng.uniform([-4, -4, -8, -2, -2, -7], [-2, -2, -6, 0, 0, -5])) * 1e-3
-        P = np.eye(6) * 1e-2
-        for _ in range(5000):
-            L = kalman.kalman_gain(P, C, R)
-            P = A @ kalman.joseph_form(P, L, C, R) @ A.T + Q
-        pseudo_maps = make_pseudo_maps(A, C, L, RATIO)
-        application.append(compute_difference(pseudo_maps, make_fast_maps(A, C, L, RATIO)))
-    differences = {SQUARE: square, APPLICATION: application}
-    return SimulationResult({(name, "difference"): np.array(d) for name, d in differences.items()})
+    rng = np.random.default_rng(seed)
+    a = 0.97 * np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    c = rng.normal(size=(3, 3))
+    square = _compare_maps(a, c, kalman.kalman_gain(np.eye(3), c, np.eye(3)))
+    Q = np.diag(10.0 ** rng.uniform([-4, -4, -8, -2, -2, -7], [-2, -2, -6, 0, 0, -5])) * 1e-3
+    P = np.eye(6) * 1e-2
+    for _ in range(5000):
+        L = kalman.kalman_gain(P, C, R)
+        P = A @ kalman.joseph_form(P, L, C, R) @ A.T + Q
+    application = _compare_maps(A, C, L)
+    return {(SQUARE, "difference"): square, (APPLICATION, "difference"): application}, None
 
 
-def _measure_gains(seeds: tuple[int, ...]) -> SimulationResult:
+def _measure_gains(seed: int) -> tuple[Numbers, None]:
     """Measure the growth of the error from sample to sample with gains from the noise (29).
 
     Strong: process noise 1e-4 per second on the states and the same 5 to 50 on each of the three
@@ -175,26 +191,24 @@ def _measure_gains(seeds: tuple[int, ...]) -> SimulationResult:
     """
     A, C = make_extended_model()
     R = np.array([[COURSE_SD**2]])
-    radii: dict[str, list[float]] = {STRONG: [], ANY: []}
-    for seed in seeds:
-        rng = np.random.default_rng(seed)
-        strong = 10.0 ** rng.uniform(math.log10(5.0), math.log10(50.0))
-        tunings = {
-            STRONG: np.array([1e-4] * 3 + [strong] * 3),
-            ANY: 10.0 ** rng.uniform([-6.0] * 3 + [-3.0] * 3, [0.0] * 3 + [2.0] * 3),
-        }
-        for name, q in tunings.items():
-            Q = np.diag(np.asarray(q, np.float64)) * 1e-3
-            shares = dual_rate.compute_shares_29(A, Q, C, R, RATIO)
-            growth = np.linalg.eigvals(dual_rate.frame_map(A, C, shares))
-            radii[name].append(float(np.abs(growth).max()))
-    return SimulationResult({(name, "spectral_radius"): np.array(r) for name, r in radii.items()})
+    radii: Numbers = {}
+    rng = np.random.default_rng(seed)
+    strong = 10.0 ** rng.uniform(math.log10(5.0), math.log10(50.0))
+    tunings = {
+        STRONG: np.array([1e-4] * 3 + [strong] * 3),
+        ANY: 10.0 ** rng.uniform([-6.0] * 3 + [-3.0] * 3, [0.0] * 3 + [2.0] * 3),
+    }
+    for name, q in tunings.items():
+        shares = dual_rate.compute_shares_29(A, np.diag(q) * 1e-3, C, R, RATIO)
+        growth = np.linalg.eigvals(dual_rate.frame_map(A, C, shares))
+        radii[name, "spectral_radius"] = float(np.abs(growth).max())
+    return radii, None
 
 
 SIMULATIONS = (
     Analysis(MAPS, _measure_maps),
     Analysis(GAINS, _measure_gains),
-    Analysis(RANKS, compute_coms_ranks, random=False),
+    Analysis(RANKS, compute_coms_ranks, share=0.0),
 )
 
 claim = make_claim_factory(PAPER)

@@ -2,7 +2,7 @@
 
 Table II gives two gain margins, 5.92 dB at 15.15 Hz (half of 1 / 33 ms) and 22.8 dB at 477.46 Hz
 (3000 rad/s, probably where a frequency grid ended), for closed-loop poles "at -2 Hz", and nothing
-else: no speed, no Q and R, no discretisation. `search` tries what it leaves open, for loops of a PI
+else: no speed, no Q and R, no discretisation. `_search` tries what is open, for loops of a PI
 on the sideslip angle, opened at the plant's input.
 """
 
@@ -31,13 +31,13 @@ from .ledger import (
     Bound,
     ClaimPart,
     Example,
-    SimulationResult,
+    Numbers,
     make_claim_factory,
     make_number_part,
     make_smaller_part,
     select_ratio,
 )
-from .manoeuvres import PaperFigure, SlipSimulation, make_curves, make_loops
+from .manoeuvres import PaperFigure, SlipSimulation, draw_loops, make_curves
 from .tie_vision_theory import compute_gain_margin
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def _compute_direct_gain(pi: PI, dt: float, integral: str) -> float:
     return pi.k_p + INTEGRALS[integral] * pi.k_i * dt
 
 
-def make_plain_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
+def _make_plain_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
     """Make the loop of PI and plant with beta measured without delay; moment held over dt (s)."""
     import control
 
@@ -116,7 +116,7 @@ def _split_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> tuple[Parts,
     return plant, (A, B, np.hstack([direct * beta_x, -one]), direct * beta_y)
 
 
-def make_estimator_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
+def _make_estimator_loop(vehicle: Vehicle, design: LoopDesign, dt: float) -> "StateSpace":
     """Make the loop of plant, Kalman filter and PI, opened where the moment enters the plant.
 
     The filter's input is the moment that the PI commands: opened behind both, a filter with the
@@ -159,7 +159,7 @@ class _LoopMatch:
         return max(abs(a - b) for a, b in zip(self.decibels, PRINTED, strict=True))
 
 
-def search(vehicle: Vehicle, within: float = 0.5) -> list[_LoopMatch]:
+def _search(vehicle: Vehicle) -> list[_LoopMatch]:
     """Search the designs of the grid whose margins both lie within some dB of Table II, best first.
 
     Both crossovers are at half the sampling rate and the closed loops are stable, as in the paper.
@@ -171,9 +171,9 @@ def search(vehicle: Vehicle, within: float = 0.5) -> list[_LoopMatch]:
         for dt, printed in zip((CAMERA_PERIOD, TICK), PRINTED, strict=True):
             # a screen, before all crossings
             end = _evaluate_nyquist(_split_loop(vehicle, design, dt))
-            if end >= 0.0 or abs(-20.0 * math.log10(-end) - printed) > within:
+            if end >= 0.0 or abs(-20.0 * math.log10(-end) - printed) > 0.5:
                 break
-            loop = make_estimator_loop(vehicle, design, dt)
+            loop = _make_estimator_loop(vehicle, design, dt)
             decibels, omega = compute_gain_margin(loop)
             if abs(omega * dt - math.pi) > 1e-9 or not _is_stable(loop):
                 break
@@ -197,7 +197,7 @@ EQUAL = "multirate, gain margin of single-rate"
 HERTZ = (15.15, 477.46)  # Table II's crossovers
 
 
-def _measure_static_slip(_: tuple[int, ...]) -> SimulationResult:
+def _measure_static_slip(_: int) -> tuple[Numbers, None]:
     """Measure the slip left after 10 s of steering by 0.001 rad with the feedforward (24)."""
     left = []
     for kmh in range(10, 46, 5):
@@ -207,34 +207,33 @@ def _measure_static_slip(_: tuple[int, ...]) -> SimulationResult:
         }  # fmt: skip
         env = gym.make("sideslip/YawVision-v0", scenario=scenario)
         left.append(abs(rollout(env, make_agent("feedforward", env))["beta"][-1]))
-    return SimulationResult({("feedforward", "static_slip"): np.array(left)})
+    return {("feedforward", "static_slip"): np.array(left)}, None
 
 
 def _compute_margin_gain(design: LoopDesign) -> float:
     """Compute by how many dB 1 ms raises the gain margin of 33 ms, the same PI on the true slip."""
-    loops = [make_plain_loop(COMS, design, dt) for dt in (CAMERA_PERIOD, TICK)]
+    loops = [_make_plain_loop(COMS, design, dt) for dt in (CAMERA_PERIOD, TICK)]
     slow, fast = (compute_gain_margin(loop)[0] for loop in loops)
     return float(fast - slow)
 
 
-def _measure_table_two(_: tuple[int, ...]) -> SimulationResult:
+def _measure_table_two(_: int) -> tuple[Numbers, Example]:
     """Measure the loops of the search that fit Table II, and the best of 25 km/h over frequency."""
-    matches = search(COMS)
+    matches = _search(COMS)
     at_25 = [hit for hit in matches if math.isclose(hit.design.speed, 25.0 * KMH)]
     raised = [_compute_margin_gain(LoopDesign(placement=name)) for name in ("real", "radius")]
-    numbers = {
-        ("loops", "count"): np.array([float(len(matches))]),
-        ("loops", "off"): np.array([min(hit.off for hit in matches)] if matches else [np.inf]),
-        ("25 km/h", "off"): np.array([at_25[0].off] if at_25 else [np.inf]),
+    numbers: Numbers = {
+        ("loops", "count"): float(len(matches)),
+        ("loops", "off"): min((hit.off for hit in matches), default=np.inf),
+        ("25 km/h", "off"): at_25[0].off if at_25 else np.inf,
         ("same PI", "raised"): np.array(raised),
     }
-    shown = at_25[0] if at_25 else _LoopMatch(LoopDesign(), PRINTED)
-    example = _compute_magnitudes(shown.design)
+    design = at_25[0].design if at_25 else LoopDesign()
     for label, dt in ((SINGLE, CAMERA_PERIOD), (MULTI, TICK)):
-        decibels, omega = compute_gain_margin(make_estimator_loop(COMS, shown.design, dt))
-        numbers[label, "gain_margin"] = np.array([decibels])
-        numbers[label, "crossover"] = np.array([round(omega / (2.0 * math.pi), 2)])
-    return SimulationResult(numbers, example)
+        decibels, omega = compute_gain_margin(_make_estimator_loop(COMS, design, dt))
+        numbers[label, "gain_margin"] = decibels
+        numbers[label, "crossover"] = round(omega / (2.0 * math.pi), 2)
+    return numbers, _compute_magnitudes(design)
 
 
 def _compute_magnitudes(design: LoopDesign) -> Example:
@@ -243,7 +242,7 @@ def _compute_magnitudes(design: LoopDesign) -> Example:
     lines = {}
     for label, dt in ((SINGLE, CAMERA_PERIOD), (MULTI, TICK)):
         below_nyquist = hertz <= 0.5 / dt
-        loop = make_estimator_loop(COMS, design, dt)
+        loop = _make_estimator_loop(COMS, design, dt)
         size = np.full(len(hertz), np.nan)
         response = loop(np.exp(2j * np.pi * hertz[below_nyquist] * dt))
         size[below_nyquist] = 20.0 * np.log10(np.abs(response))
@@ -253,11 +252,11 @@ def _compute_magnitudes(design: LoopDesign) -> Example:
 
 _CONTESTANTS = ("none", "feedforward", SINGLE, MULTI, PROPOSED)
 SIMULATIONS = (
-    Analysis(TABLE2, _measure_table_two, random=False),
+    Analysis(TABLE2, _measure_table_two, share=0.0),
     SlipSimulation(FIG8, FIG8, (*_CONTESTANTS, EQUAL), {EQUAL: {"gain": 10.0 ** (28.8 / 20.0)}}),
     SlipSimulation(STIFF, STIFF, _CONTESTANTS),
     SlipSimulation(FIG10, FIG10, ("none", SINGLE, MULTI, PROPOSED)),
-    Analysis(STATIC, _measure_static_slip, random=False),
+    Analysis(STATIC, _measure_static_slip, share=0.0),
 )
 
 _TYRES = {FIG8: "nominal", STIFF: "tyres x 1.2", FIG10: "twin"}
@@ -311,7 +310,7 @@ CLAIMS = (
             "share of time at the yaw moment's limit, multirate with single-rate's margin", FIG8,
             EQUAL, "saturation", metric="share"),
         ClaimPart("its slip / multirate with the same PI", FIG8,
-            select_ratio(FIG8, EQUAL, MULTI, "rms_slip")),
+            select_ratio(FIG8, EQUAL, MULTI, metric="rms_slip")),
         note="Taken literally the multirate PI is 28.8 dB stronger and its yaw moment jumps from "
         "limit to limit with the noise."),
     claim("Fig. 10 (twin)", "on the road control reduces the slip, multirate more than single-rate",
@@ -329,7 +328,7 @@ _BEHIND = {
 }
 figure = partial(PaperFigure, PAPER)
 FIGURES = (
-    figure("Table II: the open loops", TABLE2, make_loops("gain of the open loop / dB"),
+    figure("Table II: the open loops", TABLE2, draw_loops,
         "Each line ends at half its sampling rate, where the phase is -180 deg: the gain margin "
         "is how far it is below 0 dB there."),
     *(

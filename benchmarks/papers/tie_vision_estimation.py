@@ -7,15 +7,13 @@ import numpy as np
 from .ledger import (
     Bound,
     ClaimPart,
-    EstimationSimulation,
     PaperFilter,
     SimulationResult,
-    compare_others,
     make_claim_factory,
     make_smaller_part,
     select_ratio,
 )
-from .manoeuvres import PaperFigure, make_curves
+from .manoeuvres import EstimationSimulation, PaperFigure, make_curves
 
 PAPER = "tie-vision"
 FIG7, FIG9 = "tie-vision-fig7", "tie-vision-fig9"
@@ -34,14 +32,14 @@ SIMULATIONS = (
     EstimationSimulation(FIG7, "sideslip/YawVision-v0", FIG7,
         (*_PAPERS_OWN, PaperFilter(NO_DELAY, MULTI, {"delay": "ignore"}),
             PaperFilter(RETUNED, MULTI, {"delay": "ignore", **_FOR_NO_DELAY}),
-            PaperFilter(EXACT, "exact-kf", vehicle="true")), bound=True, times=5),
+            PaperFilter(EXACT, "exact-kf", vehicle="true")), bound=True, share=5.0),
     EstimationSimulation(FIG9, "sideslip/YawVision-v0", FIG9, _PAPERS_OWN),
 )
 # fmt: on
 
 
 def _make_poorest_part(scenario: str, threshold: Bound | None) -> ClaimPart:
-    ratio = compare_others(scenario, BICYCLE, (SINGLE, MULTI, PROPOSED), np.max)
+    ratio = select_ratio(scenario, BICYCLE, SINGLE, MULTI, PROPOSED, pick=np.max)
     label = "bicycle / poorest vision filter"
     return ClaimPart(label, scenario, ratio, Bound(">", 1.0), threshold)
 

@@ -26,13 +26,10 @@ from ...estimators.design import kalman
 from ...estimators.make import make_estimator
 from . import theory
 from .ledger import (
-    FIRST,
     Analysis,
     Bound,
     Example,
     Numbers,
-    SimulationResult,
-    collect_numbers,
     make_claim_factory,
     make_number_part,
 )
@@ -134,13 +131,11 @@ def _check_compensated(d: _RandomSystem) -> dict[str, float]:
     return sums
 
 
-def compute_residuals(seeds: tuple[int, ...]) -> SimulationResult:
+def _compute_residuals(seed: int) -> tuple[Numbers, None]:
     """Compute every formula's residual on each seed's system."""
-    lines: list[Numbers] = []
-    for drive in map(_draw_system, seeds):
-        by_case = _check_ideal(drive) | _check_predicted(drive) | _check_compensated(drive)
-        lines.append({(label, "residual"): value for label, value in by_case.items()})
-    return SimulationResult(collect_numbers(lines))
+    d = _draw_system(seed)
+    by_case = _check_ideal(d) | _check_predicted(d) | _check_compensated(d)
+    return {(label, "residual"): value for label, value in by_case.items()}, None
 
 
 PAPER = "tie-vision"
@@ -186,22 +181,21 @@ def _compute_spectral_radius(K: Array) -> float:
     return float(np.abs(np.linalg.eigvals(total)).max())
 
 
-def _measure_tunings(seeds: tuple[int, ...], batch: int = 20) -> SimulationResult:
-    """Measure the fraction of random tunings with which the error grows; a batch a seed.
+def _measure_tunings(seed: int) -> tuple[Numbers, None]:
+    """Measure the fraction of 20 random tunings with which the error grows.
 
     Process noise of each state log-uniform over eight decades up to 1 (unit)^2/s.
     """
-    shares: dict[str, list[float]] = {LITERAL: [], SPREAD: []}
-    for seed in seeds:
-        rng = np.random.default_rng(seed)
-        tunings = 10.0 ** rng.uniform(-8.0, 0.0, (batch, 4))
-        radii = {
-            LITERAL: [_compute_spectral_radius(_compute_literal_gain(Q)) for Q in tunings],
-            SPREAD: [_compute_shipped_radius(Q) for Q in tunings],
-        }
-        for name, tuning_radii in radii.items():
-            shares[name].append(float(np.mean(np.array(tuning_radii) > 1.0 + 1e-9)))
-    return SimulationResult({(name, "share"): np.array(values) for name, values in shares.items()})
+    tunings = 10.0 ** np.random.default_rng(seed).uniform(-8.0, 0.0, (20, 4))
+    radii = {
+        LITERAL: [_compute_spectral_radius(_compute_literal_gain(Q)) for Q in tunings],
+        SPREAD: [_compute_shipped_radius(Q) for Q in tunings],
+    }
+    shares: Numbers = {
+        (name, "share"): float(np.mean(np.array(values) > 1.0 + 1e-9))
+        for name, values in radii.items()
+    }
+    return shares, None
 
 
 def _compute_shipped_radius(Q: Array) -> float:
@@ -211,37 +205,32 @@ def _compute_shipped_radius(Q: Array) -> float:
     ).spectral_radius
 
 
-def _measure_maps(seeds: tuple[int, ...]) -> SimulationResult:
+def _measure_maps(seed: int) -> tuple[Numbers, Example]:
     """Compare the error dynamics with pseudo-residuals to those of a fast camera.
 
     The vision model at 1 ms, every row slow, a Kalman gain of random process noise a seed. The
-    example has the size of the maps of the appendix's three cases, of the first seed.
+    example has the size of the maps of the appendix's three cases.
     """
     model = make_vision_model(COMS, SPEED)
     G, _ = model.discretise(1e-3)
-    differences, example = [], None
-    for seed in seeds:
-        Q = 1e-3 * np.diag(10.0 ** np.random.default_rng(seed).uniform(-8.0, 0.0, 4))
-        K = kalman.kalman_gain(solve_discrete_are(G.T, model.C.T, Q, R), model.C, R)
-        cases = {
-            "ideal": theory.make_fast_maps(G, model.C, K, PERIOD),
-            "none": theory.make_predicted_maps(G, model.C, K, PERIOD),
-            "pseudo-residuals": theory.make_pseudo_maps(G, model.C, K, PERIOD),
-        }
-        differences.append(theory.compute_difference(cases["pseudo-residuals"], cases["ideal"]))
-        if seed == FIRST:
-            size, curves = np.linalg.norm(np.eye(len(G))), {}
-            for name, maps in cases.items():
-                sizes = np.array([np.linalg.norm(matrix) / size for matrix in maps])
-                curves[name] = {"error": sizes}
-            example = Example(np.arange(float(PERIOD)), curves)
-    return SimulationResult({("pseudo-residuals", "difference"): np.array(differences)}, example)
+    Q = 1e-3 * np.diag(10.0 ** np.random.default_rng(seed).uniform(-8.0, 0.0, 4))
+    K = kalman.kalman_gain(solve_discrete_are(G.T, model.C.T, Q, R), model.C, R)
+    rules = {"ideal": "fast", "none": "predicted", "pseudo-residuals": "pseudo"}
+    cases = {x: theory.make_maps(rule, G, model.C, K, PERIOD) for x, rule in rules.items()}
+    size = np.linalg.norm(np.eye(len(G)))
+    curves = {
+        name: {"error": np.array([np.linalg.norm(matrix) / size for matrix in maps])}
+        for name, maps in cases.items()
+    }
+    difference = theory.compute_difference(cases["pseudo-residuals"], cases["ideal"])
+    example = Example(np.arange(float(PERIOD)), curves)
+    return {("pseudo-residuals", "difference"): difference}, example
 
 
 SIMULATIONS = (
     Analysis(TUNINGS, _measure_tunings),
     Analysis(MAPS, _measure_maps),
-    Analysis(APPENDIX, compute_residuals),
+    Analysis(APPENDIX, _compute_residuals),
 )
 
 _zero = Bound("<=", 1e-12)
@@ -292,7 +281,7 @@ if TYPE_CHECKING:
 _DECADES, _POINTS = 6, 4000  # of the frequency grid, below half the sampling rate
 
 
-def find_crossings(loop: "Loop") -> Array:
+def _find_crossings(loop: "Loop") -> Array:
     """Find the factors on the loop that bring it to -1, and rad/s, by frequency: (n, 2).
 
     L is real at z = -1: where it is negative there, half the sampling rate is a phase crossover.
@@ -327,8 +316,15 @@ def find_crossings(loop: "Loop") -> Array:
 
 
 def compute_gain_margin(loop: "Loop") -> tuple[float, float]:
-    """Compute (dB, rad/s) of the smallest gain above 1 that reaches -1; (inf, nan) if none does."""
-    margins = find_crossings(loop)
+    """Compute the smallest gain above 1 with which a loop reaches -1.
+
+    Args:
+        loop: Loop in discrete time with one input and one output.
+
+    Returns:
+        Gain (dB) and frequency (rad/s); inf and NaN if none does.
+    """
+    margins = _find_crossings(loop)
     rising = margins[margins[:, 0] > 1.0]
     if not len(rising):
         return math.inf, math.nan

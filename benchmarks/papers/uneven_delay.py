@@ -6,14 +6,13 @@ from .ledger import (
     Analysis,
     Bound,
     ClaimPart,
-    EstimationSimulation,
     PaperFilter,
     make_claim_factory,
     make_number_part,
     make_smaller_part,
     select_ratio,
 )
-from .manoeuvres import PaperFigure, draw_delays, make_curves, make_offset
+from .manoeuvres import EstimationSimulation, PaperFigure, draw_delays, make_curves, make_offset
 from .theory import compute_coms_ranks
 
 PAPER = "uneven-delay"
@@ -41,7 +40,7 @@ SIMULATIONS = (
     EstimationSimulation(FIG5, _ENV, FIG5, _make_filters(psi_noise=0.001, y_l_noise=0.01)),
     EstimationSimulation(NOISY, _ENV, NOISY, _make_filters(psi_noise=0.003, y_l_noise=0.03)),
     EstimationSimulation(FIG7, _ENV, FIG7, _make_filters()),
-    Analysis(RANKS, compute_coms_ranks, random=False),
+    Analysis(RANKS, compute_coms_ranks, share=0.0),
 )
 
 _NOISES = ((FIG5, ""), (NOISY, ", three times the noise"))
@@ -67,7 +66,7 @@ CLAIMS = (
     claim("Fig. 5", "what exact handling of the delay is worth, lateral offset",
         *(
             ClaimPart(f"exact rollback / constant 17 ms{text}", scenario,
-                select_ratio(scenario, EXACT, ROLLBACK_17, "y_l"),
+                select_ratio(scenario, EXACT, ROLLBACK_17, metric="y_l"),
                 threshold=Bound("<=", 0.95) if scenario == FIG5 else None)
             for scenario, text in _NOISES
         )),
@@ -84,12 +83,12 @@ CLAIMS = (
         make_smaller_part("proposed / constant 17 ms", FIG7, PROPOSED, MEAN, metric="y_l")),
 )
 
-_OFFSET, _SHOWN = "lateral offset / m", ("truth", FRAME, PROPOSED)
+_SHOWN = ("truth", FRAME, PROPOSED)
 figure = partial(PaperFigure, PAPER)
 FIGURES = (
     figure("Fig. 4: delay of each frame", FIG5, draw_delays, "20, 15, 10, 25 ms, repeated."),
     figure("Fig. 5: lateral offset at the preview point", FIG5,
-        make_offset(_OFFSET, _SHOWN, (4.0, 4.5)),
+        make_offset(_SHOWN, (4.0, 4.5)),
         "Truth, the camera's held late samples, a constant delay and the proposed filter."),
     figure("Fig. 5: body slip angle", FIG5,
         make_curves("beta", "body slip angle / rad", ("truth", FRAME, PROPOSED, VISION)),
@@ -97,6 +96,6 @@ FIGURES = (
     figure("Fig. 6 (twin): delay of each frame", FIG7, draw_delays,
         "Processing takes 9 to 18 ms, as on the road."),
     figure("Fig. 7 (twin): lateral offset at the preview point", FIG7,
-        make_offset(_OFFSET, _SHOWN, (20.0, 20.5)),
+        make_offset(_SHOWN, (20.0, 20.5)),
         "The driver's sine at about 28 km/h, half a second."),
 )

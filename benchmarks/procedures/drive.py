@@ -69,7 +69,15 @@ class Series:
         return np.gradient(self.v_y, self.t) + self.v_x * self.gamma
 
     def interpolate(self, name: str, time: float) -> float:
-        """Interpolate a signal at a time (s) between two samples; NaN after the end."""
+        """Interpolate a signal between two samples.
+
+        Args:
+            name: Name of the signal.
+            time: Time (s).
+
+        Returns:
+            Value; NaN after the end.
+        """
         values = np.asarray(getattr(self, name))
         return float(np.interp(time, self.t, values, right=np.nan))
 
@@ -129,9 +137,7 @@ def _get_motion(m: Motion) -> tuple[float, ...]:
     return m.v_x, m.v_y, m.gamma, m.psi, m.X, m.Y
 
 
-def make_plant_drive(
-    model: str, law: Law | None = None, friction: float | None = None
-) -> DriveFunction:
+def make_plant_drive(model: str, law: Law | None = None) -> DriveFunction:
     """Make drives of an outside plant alone, its steering angle prescribed and no actuator's lag.
 
     The scenario's field `acceleration` None holds the speed, 0 lets the car coast.
@@ -139,7 +145,6 @@ def make_plant_drive(
     Args:
         model: Name of the plant, of `OUTSIDE_PLANTS`.
         law: Law of the yaw moment, evaluated every millisecond; None: no moment.
-        friction: Peak lateral friction of its tyres; None: CommonRoad's.
 
     Returns:
         The function that drives.
@@ -147,19 +152,20 @@ def make_plant_drive(
 
     def run_drive(fields: Fields) -> Series:
         scenario = Scenario(**(CALM | dict(fields)))
-        profile = make_steering_profile(scenario)
-
-        def steering(t: float) -> float:
-            return float(compute_steering(t / TICK, profile))
-
-        speed, hold = scenario.range("speed")[0], scenario.acceleration is None
-        plant = OUTSIDE_PLANTS[model](friction)
-        return simulate_plant(plant, steering, speed, scenario.duration, hold, law)
+        profile, hold = _make_steering_profile(scenario), scenario.acceleration is None
+        return _simulate_plant(
+            OUTSIDE_PLANTS[model](None),
+            lambda t: float(compute_steering(t / TICK, profile)),
+            scenario.range("speed")[0],
+            scenario.duration,
+            hold,
+            law,
+        )
 
     return run_drive
 
 
-def simulate_plant(
+def _simulate_plant(
     plant: OutsidePlant,
     steering: Callable[[float], float],
     speed: float,
@@ -185,7 +191,7 @@ def simulate_plant(
     return _make_series(rows, not plant.is_finite)
 
 
-def make_steering_profile(scenario: Scenario) -> Array:
+def _make_steering_profile(scenario: Scenario) -> Array:
     """Make the numbers that `compute_steering` reads, of a scenario that draws nothing.
 
     Raises ValueError for a range: a procedure leaves nothing to the seed.
@@ -238,7 +244,14 @@ class ProcedureEntry:
     policies: Mapping[str, str] = field(default_factory=dict)  # learned, with its estimator, by car
 
     def get_configuration(self, car: str) -> tuple[str, str, Mapping[str, Any]]:
-        """Get agent, estimator and its options on a car; the passenger car's if not of `CARS`."""
+        """Get what drives a car.
+
+        Args:
+            car: One of `CARS`, or an outside model, which is taken for the passenger car.
+
+        Returns:
+            Agent, estimator and the options of its wrapper.
+        """
         if not self.policies:
             return self.agent, self.estimator, self.estimate
         name = self.policies.get(car, self.policies["passenger-car"])
@@ -246,7 +259,15 @@ class ProcedureEntry:
         return name, card.estimator, card.estimator_options
 
     def drive(self, car: str, seed: int = 0) -> DriveFunction:
-        """Make the drives of one of `CARS`; references stay within what friction can hold."""
+        """Make the drives of a car; references stay within what friction can hold.
+
+        Args:
+            car: One of `CARS`.
+            seed: Seed of every drive.
+
+        Returns:
+            The function that drives.
+        """
         options: dict[str, Any] = {"vehicle": CARS[car].vehicle.to_dict(), "reference": "limited"}
         agent, estimator, estimate = self.get_configuration(car)
         return make_env_drive(ENV_ID, agent, estimator, seed, estimate, **options)

@@ -1,14 +1,11 @@
 """The suite's figures: yaw rate with its criteria, tracks with cones, frequency responses."""
 
-from typing import Any
-
 import numpy as np
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
 from ...envs.record import Array
 from ...envs.rendering.palette import GREY, INK, find_colour
-from ...envs.scenarios.road import Section
 from ..harness.results import Suite
 from ..report.figures import draw_time_series, draw_track
 from . import fmvss126, iso3888, iso7401
@@ -17,7 +14,12 @@ from .tables import CaseResults, ProcedureCase, SineDwellOutcome, Transient, sel
 
 
 def add(suite: Suite, done: CaseResults) -> None:
-    """Add every figure of the results to a suite."""
+    """Add every figure of the results to a suite.
+
+    Args:
+        suite: Suite.
+        done: Result of every case.
+    """
     for car in CARS:
         car_results = {case: result for case, result in done.items() if case.car == car}
         title = f"FMVSS 126, {car}: yaw rate at 5 A over its own peak"
@@ -38,7 +40,7 @@ def add(suite: Suite, done: CaseResults) -> None:
             suite.figures.append((title, _draw_bode(result), text))
 
 
-def _draw_yaw_rates(done: dict[ProcedureCase, SineDwellOutcome]) -> Any:
+def _draw_yaw_rates(done: dict[ProcedureCase, SineDwellOutcome]) -> go.Figure:
     """Draw the yaw rate at 5 A over its peak after the reversal, with the two limits."""
     t = max((result.shown.t for result in done.values()), key=len)
     series = {
@@ -69,18 +71,15 @@ def _choose_best(runs: list[iso3888.TrackRun]) -> iso3888.TrackRun:
     return max((run for run in runs if run.passed), key=lambda run: run.speed, default=runs[0])
 
 
-def _draw_cones(done: dict[ProcedureCase, iso3888.TrackRun]) -> Any:
+def _draw_cones(done: dict[ProcedureCase, iso3888.TrackRun]) -> go.Figure:
     """Draw the paths of the centre of gravity, from where the first lane begins, and the cones."""
-    paths: dict[str, tuple[Array, Array]] = {}
-    lanes: tuple[Section, ...] = ()
-    speed = 0.0
-    for case, run in done.items():
-        speed = run.speed
-        paths[case.agent] = run.series.X - speed * iso3888.ONSET, run.series.Y
-        lanes = iso3888.make_lanes(CARS[case.car], case.procedure, speed)
+    starts = {case: run.speed * iso3888.ONSET for case, run in done.items()}
+    paths = {x.agent: (run.series.X - starts[x], run.series.Y) for x, run in done.items()}
+    case, run = list(done.items())[-1]
+    lanes = iso3888.make_lanes(CARS[case.car], case.procedure, run.speed)
     figure = draw_track(paths)
     places = [
-        (x - speed * iso3888.ONSET, lane.offset + side * 0.5 * lane.width)
+        (x - starts[case], lane.offset + side * 0.5 * lane.width)
         for lane in lanes
         for x in np.linspace(lane.start, lane.start + lane.length, 5)
         for side in (-1.0, 1.0)
@@ -93,7 +92,7 @@ def _draw_cones(done: dict[ProcedureCase, iso3888.TrackRun]) -> Any:
     return figure
 
 
-def _draw_bode(result: Transient) -> Any:
+def _draw_bode(result: Transient) -> go.Figure:
     """Draw magnitude and phase of both outputs over the frequency."""
     figure = make_subplots(rows=2, cols=2, shared_xaxes=True, vertical_spacing=0.06)
     for column, name in enumerate(iso7401.OUTPUTS, 1):

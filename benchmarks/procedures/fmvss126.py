@@ -61,18 +61,16 @@ class SineDwellRun:
         return self.stable and (self.multiple < _RESPONSIVE or self.sideways >= SIDEWAYS)
 
 
-def _make_slow_steer(car: TestCar, side: float, max_acceleration: float = 0.5 * GRAVITY) -> Fields:
-    """Make the slowly rising steer, 2 s or more, until a linear car has an acceleration (m/s2)."""
+def _make_slow_steer(car: TestCar, side: float) -> Fields:
+    """Make the slowly rising steer, of which a quarter is driven."""
     seconds = 30.0
-    amplitude = side * _RAMP_RATE / car.ratio * seconds
     return {
-        "steering": "ramp", "onset": ONSET, "amplitude": amplitude, "hold": seconds,
-        "speed": car.speed,
-        "duration": ONSET + seconds * min(1.0, max_acceleration / (2.0 * GRAVITY)),
+        "steering": "ramp", "onset": ONSET, "amplitude": side * _RAMP_RATE / car.ratio * seconds,
+        "hold": seconds, "speed": car.speed, "duration": ONSET + seconds * 0.25,
     }  # fmt: skip
 
 
-def fit_reference_angle(series: Series, ratio: float) -> float:
+def _fit_reference_angle(series: Series, ratio: float) -> float:
     """Fit |A| (rad at the steering wheel): where the line through 0.1 to 0.375 g crosses 0.3 g.
 
     Raises ValueError where the car never gets there.
@@ -86,7 +84,7 @@ def fit_reference_angle(series: Series, ratio: float) -> float:
     return float(start + slope * A_AT)
 
 
-def list_amplitudes(A: float) -> Array:
+def _list_amplitudes(A: float) -> Array:
     """List the steering wheel angles (rad) of a series, from 1.5 A on."""
     last = MAX_AMPLITUDE if LAST * A > MAX_AMPLITUDE else max(LAST * A, MIN_AMPLITUDE)
     count = math.ceil(round((last / A - FIRST) / STEP, 9))
@@ -94,7 +92,15 @@ def list_amplitudes(A: float) -> Array:
 
 
 def make_sine_with_dwell(car: TestCar, amplitude: float) -> Fields:
-    """Make a run of an amplitude (rad at the steering wheel), signed as its first half."""
+    """Make a sine with dwell.
+
+    Args:
+        car: Car.
+        amplitude: Amplitude (rad at the steering wheel), signed as its first half.
+
+    Returns:
+        Fields of the scenario.
+    """
     return {
         "steering": "sine-with-dwell", "onset": ONSET, "amplitude": amplitude / car.ratio,
         "frequency": FREQUENCY, "hold": DWELL, "speed": car.speed, "acceleration": 0.0,
@@ -102,7 +108,7 @@ def make_sine_with_dwell(car: TestCar, amplitude: float) -> Fields:
     }  # fmt: skip
 
 
-def evaluate_run(series: Series, amplitude: float, A: float) -> SineDwellRun:
+def _evaluate_run(series: Series, amplitude: float, A: float) -> SineDwellRun:
     """Evaluate a run; amplitude and A in rad at the steering wheel."""
     towards = -math.copysign(1.0, amplitude)
     steered = (series.t >= REVERSAL) & (series.t <= COMPLETION)
@@ -137,15 +143,23 @@ class SineDwellResult:
 
 
 def measure_reference_angle(drive: DriveFunction, car: TestCar) -> float:
-    """Measure A (rad at the steering wheel), the mean of turns to the left and to the right."""
+    """Measure A, the mean of turns to the left and to the right.
+
+    Args:
+        drive: Drives of the car.
+        car: Car.
+
+    Returns:
+        Angle (rad at the steering wheel).
+    """
     turns = [drive(_make_slow_steer(car, side)) for side in (1.0, -1.0)]
-    return float(np.mean([fit_reference_angle(turn, car.ratio) for turn in turns]))
+    return float(np.mean([_fit_reference_angle(turn, car.ratio) for turn in turns]))
 
 
 def run(
     drive: DriveFunction,
     car: TestCar,
-    A: float | None = None,
+    A: float,
     multiples: Sequence[float] | None = None,
 ) -> SineDwellResult:
     """Run the procedure.
@@ -153,14 +167,13 @@ def run(
     Args:
         drive: Drives of the car.
         car: The car.
-        A: Reference angle (rad at the steering wheel); None: it is measured.
+        A: Reference angle (rad at the steering wheel).
         multiples: Amplitudes (of A); None: the standard's series.
 
     Returns:
         The runs, both sides of each amplitude.
     """
-    A = measure_reference_angle(drive, car) if A is None else A
-    angles = list_amplitudes(A) if multiples is None else A * np.asarray(multiples)
+    angles = _list_amplitudes(A) if multiples is None else A * np.asarray(multiples)
     signed = [side * angle for angle in angles.tolist() for side in (1.0, -1.0)]
-    runs = [evaluate_run(drive(make_sine_with_dwell(car, angle)), angle, A) for angle in signed]
+    runs = [_evaluate_run(drive(make_sine_with_dwell(car, angle)), angle, A) for angle in signed]
     return SineDwellResult(A, tuple(runs))

@@ -50,7 +50,7 @@ class TrackRun:
         return self.min_margin >= 0.0
 
 
-def compute_corners(series: Series, car: TestCar) -> Array:
+def _compute_corners(series: Series, car: TestCar) -> Array:
     """Compute the body's corners on the ground (m), going round it: (n, 4, 2)."""
     front = car.vehicle.front_arm + car.front_overhang
     half = 0.5 * car.vehicle.width
@@ -62,7 +62,7 @@ def compute_corners(series: Series, car: TestCar) -> Array:
     return np.asarray(place[:, None, :] + np.einsum("ijn,kj->nki", turned, body))
 
 
-def compute_margin(body: Array, lane: Section) -> float:
+def _compute_margin(body: Array, lane: Section) -> float:
     """Compute the smallest distance (m) of a body (n, 4, 2) to the edges of a lane that it crosses.
 
     The body's sides are cut where the lane begins and ends: a side may touch the first or the
@@ -87,7 +87,16 @@ def compute_margin(body: Array, lane: Section) -> float:
 
 
 def make_lanes(car: TestCar, track: str, speed: float) -> tuple[Section, ...]:
-    """Make the lanes where the car drives them at a speed (m/s)."""
+    """Make the lanes where the car drives them.
+
+    Args:
+        car: Car.
+        track: One of `TRACKS`.
+        speed: Speed (m/s).
+
+    Returns:
+        Lanes in the order in which they are driven.
+    """
     return make_sections(track, car.vehicle.width, speed * ONSET, _compute_length_share(car))
 
 
@@ -111,28 +120,44 @@ def _make_lane_change(car: TestCar, track: str, speed: float) -> Fields:
     }
 
 
-def evaluate_run(series: Series, car: TestCar, track: str, speed: float) -> TrackRun:
+def _evaluate_run(series: Series, car: TestCar, track: str, speed: float) -> TrackRun:
     """Evaluate a run's margins."""
-    body, lanes = compute_corners(series, car), make_lanes(car, track, speed)
-    return TrackRun(speed, tuple(compute_margin(body, lane) for lane in lanes), series)
+    body, lanes = _compute_corners(series, car), make_lanes(car, track, speed)
+    return TrackRun(speed, tuple(_compute_margin(body, lane) for lane in lanes), series)
 
 
 def _try_speed(drive: DriveFunction, car: TestCar, track: str, speed: float) -> TrackRun:
     """Try a speed (m/s): the first clean run of a driver, or the one that came closest to it."""
-    runs = []
+    runs, fields = [], _make_lane_change(car, track, speed)
     for driver in DRIVERS:
-        series = drive({**_make_lane_change(car, track, speed), **driver})
-        runs.append(evaluate_run(series, car, track, speed))
+        runs.append(_evaluate_run(drive({**fields, **driver}), car, track, speed))
         if runs[-1].passed:
             return runs[-1]
     return max(runs, key=lambda track_run: track_run.min_margin)
 
 
 def run(drive: DriveFunction, car: TestCar, track: str, speeds: Sequence[float]) -> list[TrackRun]:
-    """Drive one attempt at each of the speeds (m/s)."""
+    """Drive one attempt at each speed.
+
+    Args:
+        drive: Drives of the car.
+        car: Car.
+        track: One of `TRACKS`.
+        speeds: Speeds (m/s).
+
+    Returns:
+        Run of the best driver at each speed.
+    """
     return [_try_speed(drive, car, track, speed) for speed in speeds]
 
 
 def find_highest_speed(runs: Sequence[TrackRun]) -> float:
-    """Find the highest speed (m/s) of a clean run; 0 where there is none."""
+    """Find the highest speed of a clean run.
+
+    Args:
+        runs: Runs.
+
+    Returns:
+        Speed (m/s); 0 where there is none.
+    """
     return max((track_run.speed for track_run in runs if track_run.passed), default=0.0)

@@ -12,7 +12,7 @@ import numpy as np
 from ...envs.record import Array
 from ...envs.task import make_reference_params
 from ...envs.vehicle.parameters import GRAVITY, Vehicle
-from .drive import DriveFunction, Fields, Series, TestCar
+from .drive import DriveFunction, Series, TestCar
 
 _SETTLE = 3.0  # s, at the first speed
 LINEAR_FROM, LINEAR_TO = 0.05 * GRAVITY, 0.25 * GRAVITY  # the range of the slope
@@ -29,20 +29,18 @@ class Handling:
 
 
 def compute_understeer_gradient(vehicle: Vehicle) -> float:
-    """Compute K (rad s2/m) of the linear model."""
+    """Compute the understeer gradient of the linear model.
+
+    Args:
+        vehicle: Vehicle.
+
+    Returns:
+        Gradient K (rad s2/m).
+    """
     return float(make_reference_params(vehicle).G) * vehicle.wheelbase
 
 
-def _make_circle(car: TestCar, steer: float, first: float, last: float, seconds: float) -> Fields:
-    """Make a constant steering angle (rad) while the speed rises from first to last (m/s)."""
-    return {
-        "steering": "held-step", "amplitude": steer, "onset": 0.0, "speed": first,
-        "speed_change": last - first, "change_start": _SETTLE, "change_length": seconds,
-        "duration": _SETTLE + seconds,
-    }  # fmt: skip
-
-
-def compute_handling(series: Series, vehicle: Vehicle) -> Handling:
+def _compute_handling(series: Series, vehicle: Vehicle) -> Handling:
     """Compute the handling diagram of a circle, and the slope in its linear range.
 
     Raises ValueError where the car does not reach the end of that range.
@@ -59,23 +57,23 @@ def compute_handling(series: Series, vehicle: Vehicle) -> Handling:
     return Handling(a_y, angle, -slope, compute_understeer_gradient(vehicle))
 
 
-def run(
-    drive: DriveFunction,
-    car: TestCar,
-    max_acceleration: float = 0.5 * GRAVITY,
-    seconds: float = 60.0,
-) -> Handling:
-    """Drive a circle on which the linear car would reach an acceleration at its full speed.
+def run(drive: DriveFunction, car: TestCar, seconds: float = 60.0) -> Handling:
+    """Drive a circle on which the linear car would reach 0.5 g at its full speed.
 
     Args:
         drive: Drives of the car.
         car: The car.
-        max_acceleration: Lateral acceleration (m/s2).
         seconds: Time in which the speed rises (s).
 
     Returns:
         The handling diagram.
     """
     v, K = car.speed, compute_understeer_gradient(car.vehicle)
-    steer = (car.vehicle.wheelbase / v**2 + K) * max_acceleration
-    return compute_handling(drive(_make_circle(car, steer, 0.2 * v, v, seconds)), car.vehicle)
+    steer = (car.vehicle.wheelbase / v**2 + K) * (0.5 * GRAVITY)
+    first = 0.2 * v
+    circle = {
+        "steering": "held-step", "amplitude": steer, "onset": 0.0, "speed": first,
+        "speed_change": v - first, "change_start": _SETTLE, "change_length": seconds,
+        "duration": _SETTLE + seconds,
+    }  # fmt: skip
+    return _compute_handling(drive(circle), car.vehicle)

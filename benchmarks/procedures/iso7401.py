@@ -49,25 +49,21 @@ class FrequencyResponse:
     sd: Array  # of the real or the imaginary part of H
 
 
-def make_step(car: TestCar, steer: float, seconds: float = 4.0) -> Fields:
-    """Make a step of the steering angle (rad) that is held."""
-    steering = {"steering": "held-step", "amplitude": steer, "onset": ONSET}
-    return steering | {"speed": car.speed, "duration": ONSET + seconds}
+def make_step(car: TestCar, steer: float) -> Fields:
+    """Make a step of the steering angle that is held for 4 s.
 
+    Args:
+        car: Car.
+        steer: Steering angle (rad).
 
-def _make_sweep(car: TestCar, steer: float, seconds: float = 100.0) -> Fields:
-    """Make a sine of an amplitude (rad) whose frequency rises from 0.05 to 2.5 Hz.
-
-    It has passed half a segment when it comes to the lowest frequency of the standard.
+    Returns:
+        Fields of the scenario.
     """
-    return {
-        "steering": "sweep", "amplitude": steer, "onset": ONSET, "frequency": 0.25 * LOWEST,
-        "frequency_2": 1.25 * HIGHEST, "hold": seconds, "speed": car.speed,
-        "duration": ONSET + seconds + 2.0,
-    }  # fmt: skip
+    steering = {"steering": "held-step", "amplitude": steer, "onset": ONSET}
+    return steering | {"speed": car.speed, "duration": ONSET + 4.0}
 
 
-def compute_step_response(t: Array, steer: Array, output: Array) -> StepResponse:
+def _compute_step_response(t: Array, steer: Array, output: Array) -> StepResponse:
     """Compute the standard's numbers of a step that is held to the end; t, steer, output: (n,).
 
     The steady state is the mean of the last half second. Raises ValueError without a step.
@@ -92,7 +88,7 @@ def _find_crossing(t: Array, values: Array, level: float) -> float:
     return float(t[k - 1] + part * (t[k] - t[k - 1]))
 
 
-def estimate_frequency_response(
+def _estimate_frequency_response(
     t: Array, steer: Array, output: Array, segment: float = _SEGMENT
 ) -> FrequencyResponse:
     """Estimate the frequency response of output to steering from 0.2 to 2 Hz; arrays: (n,)."""
@@ -117,7 +113,16 @@ def estimate_frequency_response(
 def compute_linear_response(
     vehicle: Vehicle, speed: float, frequency: Array
 ) -> dict[str, _Complex]:
-    """Compute the linear model's response to steering by output, shape (k,) each."""
+    """Compute the linear model's response to steering.
+
+    Args:
+        vehicle: Vehicle.
+        speed: Speed (m/s).
+        frequency: Frequencies (Hz), shape (k,).
+
+    Returns:
+        Response by output, shape (k,) each.
+    """
     model = make_bicycle_model(vehicle, speed)
     B = model.B[:, 0]
     turned = [np.linalg.solve(2j * np.pi * f * np.eye(2) - model.A, B) for f in frequency]
@@ -127,7 +132,16 @@ def compute_linear_response(
 
 
 def compute_linear_step(vehicle: Vehicle, speed: float, series: Series) -> dict[str, StepResponse]:
-    """Compute the numbers of the linear model under the same steering, by output."""
+    """Compute the numbers of the linear model under the same steering.
+
+    Args:
+        vehicle: Vehicle.
+        speed: Speed (m/s).
+        series: Motion of the car after a step.
+
+    Returns:
+        Numbers by output.
+    """
     from scipy.signal import lsim
 
     model = make_bicycle_model(vehicle, speed)
@@ -135,17 +149,40 @@ def compute_linear_step(vehicle: Vehicle, speed: float, series: Series) -> dict[
     C = np.vstack([[0.0, 1.0], speed * (A[0] + [0.0, 1.0])])
     D = np.array([[0.0], [speed * B[0, 0]]])
     outputs = zip(OUTPUTS, lsim((A, B, C, D), series.steer, series.t)[1].T, strict=True)
-    return {name: compute_step_response(series.t, series.steer, y) for name, y in outputs}
+    return {name: _compute_step_response(series.t, series.steer, y) for name, y in outputs}
 
 
 def compute_responses(series: Series) -> dict[str, StepResponse]:
-    """Compute the numbers of yaw rate and lateral acceleration after a step, by output."""
+    """Compute the numbers of yaw rate and lateral acceleration after a step.
+
+    Args:
+        series: Motion of the car after a step.
+
+    Returns:
+        Numbers by output.
+    """
     t, steer = series.t, series.steer
-    return {name: compute_step_response(t, steer, getattr(series, name)) for name in OUTPUTS}
+    return {name: _compute_step_response(t, steer, getattr(series, name)) for name in OUTPUTS}
 
 
 def run_sweep(drive: DriveFunction, car: TestCar, steer: float) -> dict[str, FrequencyResponse]:
-    """Drive a sweep of an amplitude (rad); return the frequency responses by output."""
-    series = drive(_make_sweep(car, steer))
+    """Drive a sine whose frequency rises from 0.05 to 2.5 Hz, and estimate the responses.
+
+    It has passed half a segment when it comes to the lowest frequency of the standard.
+
+    Args:
+        drive: Drives of the car.
+        car: Car.
+        steer: Amplitude of the steering angle (rad).
+
+    Returns:
+        Frequency response by output.
+    """
+    seconds = 100.0
+    series = drive({
+        "steering": "sweep", "amplitude": steer, "onset": ONSET, "frequency": 0.25 * LOWEST,
+        "frequency_2": 1.25 * HIGHEST, "hold": seconds, "speed": car.speed,
+        "duration": ONSET + seconds + 2.0,
+    })  # fmt: skip
     t, steered = series.t, series.steer
-    return {x: estimate_frequency_response(t, steered, getattr(series, x)) for x in OUTPUTS}
+    return {x: _estimate_frequency_response(t, steered, getattr(series, x)) for x in OUTPUTS}

@@ -16,12 +16,12 @@ from ...envs.vehicle.dynamics import Motion
 from ...envs.vehicle.parameters import GRAVITY
 from ..harness.drives import make_env
 from . import fmvss126
-from .drive import OUTSIDE_ID, Law, ProcedureEntry, make_outside_car, make_plant_drive
+from .drive import OUTSIDE_ID, ProcedureEntry, make_outside_car, make_plant_drive
 
 MODEL = "drift"
 _LIMIT = 500.0  # N m
 _GAIN = 2e4  # N m s/rad
-FAILS_AT, PASSES_AT = 5.0, 6.5  # of A
+_FAILS_AT, _PASSES_AT = 5.0, 6.5  # of A
 
 _SCENARIO: dict[str, Any] = {
     "name": "outside-lane-change", "steering": "lane-change", "duration": 5.0, "mirror": True,
@@ -53,17 +53,13 @@ class OutsideCheck:
         return not any(run.passed for run in self.none.runs) and self.law.passed
 
 
-def run_check(model: str = MODEL) -> OutsideCheck:
+def run_check() -> OutsideCheck:
     """Drive the check; A is the uncontrolled car's."""
-    car = make_outside_car()
-    A = fmvss126.measure_reference_angle(make_plant_drive(model), car)
-
-    def run_multiple(multiple: float, law: Law | None) -> fmvss126.SineDwellResult:
-        return fmvss126.run(make_plant_drive(model, law), car, A, [multiple])
-
-    return OutsideCheck(
-        run_multiple(FAILS_AT, None), run_multiple(PASSES_AT, _compute_limited_moment)
-    )
+    car, none = make_outside_car(), make_plant_drive(MODEL)
+    law = make_plant_drive(MODEL, _compute_limited_moment)
+    A = fmvss126.measure_reference_angle(none, car)
+    pairs = ((none, _FAILS_AT), (law, _PASSES_AT))
+    return OutsideCheck(*(fmvss126.run(drive, car, A, [multiple]) for drive, multiple in pairs))
 
 
 @dataclass(frozen=True)
@@ -76,7 +72,16 @@ class OutsideEpisode:
 
 
 def run_episodes(model: str, entry: ProcedureEntry, seeds: Sequence[int]) -> list[OutsideEpisode]:
-    """Run the episodes of a controller on an outside plant."""
+    """Run the episodes of a controller on an outside plant.
+
+    Args:
+        model: Name of the plant, of `OUTSIDE_PLANTS`.
+        entry: Controller with its estimator.
+        seeds: Seeds of the episodes.
+
+    Returns:
+        Episodes in the order of their seeds.
+    """
     options: dict[str, Any] = {"model": model, "scenario": _SCENARIO, "reference": "limited"}
     agent_name, estimator, estimate = entry.get_configuration(model)
     env = make_env(OUTSIDE_ID, estimator, estimate, **options)

@@ -1,7 +1,6 @@
 """Question: do the cars pass the standard test procedures, and on equations that are not ours?"""
 
 from importlib.util import find_spec
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -13,7 +12,15 @@ from ..harness.results import Suite
 from ..harness.verdict import format_verdict, summarise_names
 from . import fmvss126, iso3888, iso4138, iso7401, outside, tables
 from .drive import CARS, ENTRIES
-from .tables import NAME, CaseResults, ProcedureCase, SineDwellOutcome, Transient, select_cases
+from .tables import (
+    NAME,
+    CaseResult,
+    CaseResults,
+    ProcedureCase,
+    SineDwellOutcome,
+    Transient,
+    select_cases,
+)
 
 SHOWN = 5.0  # of A: the sine with dwell in the figures
 _QUICK_MULTIPLES = (1.5, 3.0, 5.0, 6.5)  # of A
@@ -36,8 +43,15 @@ _OUTSIDE = (
 _NONE_OUTSIDE = " Outside plants are left out: pip install 'sideslip[outside]'."
 
 
-def measure(case: ProcedureCase) -> Any:
-    """Drive a case: the result of its procedure."""
+def measure(case: ProcedureCase) -> CaseResult:
+    """Drive a case.
+
+    Args:
+        case: Procedure, car and controller.
+
+    Returns:
+        Result of its procedure.
+    """
     if case.procedure == "outside":
         return outside.run_episodes(case.car, ENTRIES[case.contestant], case.seeds)
     if case.procedure == "check":
@@ -68,7 +82,7 @@ def _measure_transient(case: ProcedureCase) -> Transient:
     return Transient(step, linear_step, sweep, linear_sweep)
 
 
-def make_cases(quick: bool) -> list[ProcedureCase]:
+def _make_cases(quick: bool) -> list[ProcedureCase]:
     """Make the list of what is driven; outside plants only where their extra is installed."""
     indices = [k for k, entry in enumerate(ENTRIES) if not (quick and entry.slow)]
     driven = ("fmvss-126", *iso3888.TRACKS)
@@ -84,7 +98,14 @@ def make_cases(quick: bool) -> list[ProcedureCase]:
 
 
 def make_verdict(done: CaseResults) -> str:
-    """Make the verdict: on each car, who passes the sine with dwell, and how fast the lanes are."""
+    """Make the verdict: on each car, who passes the sine with dwell, and how fast the lanes are.
+
+    Args:
+        done: Result of every case.
+
+    Returns:
+        Verdict.
+    """
     passed, lanes = [], []
     for car in CARS:
         car_results = {case: result for case, result in done.items() if case.car == car}
@@ -119,7 +140,7 @@ def run(quick: bool = False, jobs: int | None = None, console: Console | None = 
     Returns:
         The suite.
     """
-    cases = make_cases(quick)
+    cases = _make_cases(quick)
     done = dict(zip(cases, run_cases(measure, cases, NAME, jobs, console), strict=True))
     has_outside = any(case.procedure == "outside" for case in cases)
     text = _TEXT + (_OUTSIDE if has_outside else _NONE_OUTSIDE)

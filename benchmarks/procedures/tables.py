@@ -1,15 +1,16 @@
 """The suite's cases and their results, its tables and rows, one of each for a procedure."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ... import __version__
 from ...agents.rollout import compute_cost_ratios
 from ...envs.vehicle.parameters import GRAVITY
-from ..harness.results import ResultRow, ResultTable, Suite
-from ..harness.stats import geometric_mean, interval
+from ..harness.results import ResultTable, Suite
+from ..harness.stats import Estimate, geometric_mean, interval
+from ..report.study import add_rows
 from . import fmvss126, iso3888, iso4138, iso7401, outside
 from .drive import ENTRIES, Series
 
@@ -50,12 +51,22 @@ class Transient:
     linear_sweep: dict[str, Any]
 
 
-CaseResults = dict[ProcedureCase, Any]
+CaseResult = Any
+"""What a procedure gives: a result of its own module."""
+CaseResults = dict[ProcedureCase, CaseResult]
 """The result of every case."""
 
 
 def select_cases(done: CaseResults, procedure: str) -> CaseResults:
-    """Select the cases of one procedure."""
+    """Select the cases of one procedure.
+
+    Args:
+        done: Result of every case.
+        procedure: Name of the procedure.
+
+    Returns:
+        Result of each of its cases.
+    """
     return {case: result for case, result in done.items() if case.procedure == procedure}
 
 
@@ -64,7 +75,12 @@ RIVAL = "lqr"
 
 
 def add(suite: Suite, done: CaseResults) -> None:
-    """Add every table of the results to a suite."""
+    """Add every table of the results to a suite.
+
+    Args:
+        suite: Suite.
+        done: Result of every case.
+    """
     _add_sine(suite, select_cases(done, "fmvss-126"))
     _add_tracks(suite, {track: select_cases(done, track) for track in iso3888.TRACKS})
     _add_circle(suite, select_cases(done, "iso-4138"))
@@ -75,15 +91,20 @@ def add(suite: Suite, done: CaseResults) -> None:
         _add_check(suite, check_result)
 
 
-def _make_row(
-    case: ProcedureCase, metric: str, value: float, output: str = "", **more: Any
-) -> ResultRow:
-    """Make a row of a case; output: what is measured, if a case has several."""
+def _add_rows(
+    suite: Suite,
+    case: ProcedureCase,
+    numbers: Mapping[str, Estimate | float],
+    output: str = "",
+    **more: str | int,
+) -> None:
+    """Add rows of a case; output: what is measured, if a case has several."""
     entry = ENTRIES[case.contestant]
-    columns = {"estimator": entry.get_configuration(case.car)[1], "controller": entry.agent}
-    columns["env_version"] = __version__
-    scenario = f"{case.procedure} {case.car}" + (f", {output}" if output else "")
-    return ResultRow(NAME, scenario, metric, value, **columns | more)
+    columns: dict[str, Any] = {"estimator": entry.get_configuration(case.car)[1]}
+    columns |= {"controller": entry.agent, "salt": ""} | more
+    columns["scenario"] = f"{case.procedure} {case.car}" + (f", {output}" if output else "")
+    estimates = {x: Estimate(y) if isinstance(y, float) else y for x, y in numbers.items()}
+    add_rows(suite, estimates, **columns)
 
 
 def _add_sine(suite: Suite, done: dict[ProcedureCase, SineDwellOutcome]) -> None:
@@ -91,7 +112,7 @@ def _add_sine(suite: Suite, done: dict[ProcedureCase, SineDwellOutcome]) -> None
     cells = []
     for case, sine in done.items():
         result = sine.result
-        suite.rows.append(_make_row(case, "amplitude", result.highest, n=len(result.runs)))
+        _add_rows(suite, case, {"amplitude": result.highest}, n=len(result.runs))
         failed = [run for run in result.runs if not run.passed]
         last = max(run.multiple for run in result.runs)
         verdict = "passes"
@@ -119,7 +140,7 @@ def _add_tracks(suite: Suite, done: dict[str, dict[ProcedureCase, list[iso3888.T
     for track_results in done.values():
         for case, runs in track_results.items():
             speed = iso3888.find_highest_speed(runs)
-            suite.rows.append(_make_row(case, "speed", speed, n=len(runs)))
+            _add_rows(suite, case, {"speed": speed}, n=len(runs))
             text = f"{3.6 * speed:.0f}" if speed else "none clean"
             cells.setdefault((case.agent, case.car), []).append(text)
     header = ("controller", "car", *(f"{track} / (km/h)" for track in done))
@@ -133,7 +154,7 @@ def _add_circle(suite: Suite, done: dict[ProcedureCase, iso4138.Handling]) -> No
     """Add ISO 4138: the understeer gradient against the linear model's."""
     cells = []
     for case, handling in done.items():
-        suite.rows.append(_make_row(case, "understeer_gradient", handling.K))
+        _add_rows(suite, case, {"understeer_gradient": handling.K})
         per_g = np.degrees(GRAVITY * np.array([handling.K, handling.theory]))
         cells.append([case.agent, case.car, f"{per_g[0]:+.3f}", f"{per_g[1]:+.3f}"])
     header = ("controller", "car", "measured / (deg/g)", "linear model / (deg/g)")
@@ -147,8 +168,8 @@ def _add_step(suite: Suite, done: dict[ProcedureCase, Transient]) -> None:
     for case, transient in done.items():
         for name in iso7401.OUTPUTS:
             one, other = transient.step[name], transient.linear_step[name]
-            suite.rows.append(_make_row(case, "response_time", one.response_time, name))
-            suite.rows.append(_make_row(case, "overshoot", one.overshoot, name))
+            numbers = {"response_time": one.response_time, "overshoot": one.overshoot}
+            _add_rows(suite, case, numbers, name)
             pairs = [(a, vars(other)[key]) for key, a in vars(one).items()]
             cells.append([case.agent, case.car, name, *(f"{a:.3g} ({b:.3g})" for a, b in pairs)])
     header = ("output", "gain / (1/rad)", "90 % after / s", "peak after / s", "overshoot")
@@ -169,9 +190,7 @@ def _add_episodes(suite: Suite, done: dict[ProcedureCase, list[outside.OutsideEp
             logs = np.log(compute_cost_ratios(costs[case], rivals[case.car]))
             paired = geometric_mean(logs).inline(100.0, ".0f")
         spins = float(np.mean([episode.failed for episode in episodes]))
-        more: dict[str, Any] = {"n": len(episodes), "salt": "fixed"}
-        suite.rows.append(_make_row(case, "cost", cost.value, low=cost.low, high=cost.high, **more))
-        suite.rows.append(_make_row(case, "share", spins, **more))
+        _add_rows(suite, case, {"cost": cost, "share": spins}, n=len(episodes), salt="fixed")
         peak = 1e3 * float(np.median([episode.peak for episode in episodes]))
         texts = cost.inline(1.0, ".3g"), paired, f"{100 * spins:.0f}", f"{peak:.0f}"
         cells.append([case.agent, case.car, *texts])
@@ -195,8 +214,8 @@ def _add_check(suite: Suite, check_result: outside.OutsideCheck) -> None:
         sideways = f"{min(run.sideways for run in result.runs):.2f}"
         outcome = "passes" if result.passed else "fails"
         cells.append([control, f"{worst.multiple:.3g}", *ratios, sideways, outcome])
-        more: dict[str, Any] = {"n": len(result.runs), "verdict": verdict, "paper": text}
-        suite.rows.append(_make_row(case, "ratio", worst.ratio_1, controller=control, **more))
+        columns = {"controller": control, "verdict": verdict, "paper": text}
+        _add_rows(suite, case, {"ratio": worst.ratio_1}, n=len(result.runs), **columns)
     header = ("control", "amplitude / A", "at 1.00 s / %", "at 1.75 s / %", "sideways / m", "")
     title = f"Sine with dwell on the drift model at 80 km/h: {text}: {verdict}"
     suite.tables.append(ResultTable(title, header, cells, "Worst of both sides.", keyed=False))

@@ -62,7 +62,7 @@ def _count_bytes(env: Any) -> float:
     return float((read + written) / env.num_envs)
 
 
-def measure(env: Any, copied: float, rounds: int, steps: int) -> _DeviceTiming:
+def _measure(env: Any, copied: float, rounds: int, steps: int) -> _DeviceTiming:
     """Measure a batch in rounds of `steps`, after a first one; copied: a copy's bytes a second."""
     env.reset(seed=0)
     actions = torch.zeros(env.action_space.shape or (), device=env.device)
@@ -97,7 +97,7 @@ def _format_table(timings: Sequence[_DeviceTiming]) -> str:
     return "\n".join(lines)
 
 
-def main(
+def _main(
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1, ...")] = "cpu",
     dtype: Annotated[list[str] | None, typer.Option(help="float32, float64; both.")] = None,
     env: Annotated[str, typer.Option(help="An environment's id.")] = "sideslip/YawFusion-v0",
@@ -121,7 +121,7 @@ def main(
             env, size, device=device, dtype=kind, on_bad_action="fail", **options
         )
         copied = copied or _measure_bandwidth(batch.device)
-        timings.append(measure(batch, copied, rounds, steps))
+        timings.append(_measure(batch, copied, rounds, steps))
         console.print(f"{size}, {kind}: {timings[-1].rate:.3g} env-steps/s", highlight=False)
         del batch
     hardware = f"CPU, {torch.get_num_threads()} threads of torch"
@@ -141,4 +141,4 @@ def main(
 
 if __name__ == "__main__":
     with report_user_errors():
-        typer.run(main)
+        typer.run(_main)

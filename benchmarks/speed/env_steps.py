@@ -11,14 +11,16 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import numpy.typing as npt
 
+from ...envs.record import Array
 from ...estimators.filters import FILTERS
 from ...estimators.learned.correction_file import list_shipped
 from ...estimators.make import make_estimator
 from ...estimators.vector.estimate import EstimateObservation as EstimateObservations
 from ...estimators.wrappers.estimate import EstimateObservation
 from ..harness.results import ResultTable, Suite
-from .timing import Effort, Taken, Workload, WorkloadSet, add_row, format_range, measure_interleaved
+from .timing import Effort, Workload, WorkloadSet, add_row, format_range, measure_interleaved
 
 COUNT, FEWER = 1024, 256  # environments at once, alone and with each filter
 EPISODE, _CHUNK = 500, 50  # steps, the most; in one call
@@ -36,16 +38,18 @@ CARTPOLES, PENDULUMS = f"{CARTPOLE} x {COUNT}", f"Pendulum-v1 x {COUNT}"
 ENVPOOL = f"{PENDULUMS} (EnvPool)"
 
 
-def choose_upright_action(obs: Any) -> Any:
+def _choose_upright_action(obs: Array) -> npt.NDArray[np.int_]:
     """Choose the action that keeps a cart's pole up, so that episodes are long."""
     return (obs[..., 2] + 0.3 * obs[..., 3] > 0.0).astype(int)
 
 
-def _make_episode(env: gym.Env[Any, Any], policy: Callable[[Any], Any] | None = None) -> Workload:
+def _make_episode(
+    env: gym.Env[Any, Any], policy: Callable[[Array], npt.NDArray[np.int_]] | None = None
+) -> Workload:
     """Make calls of `_CHUNK` steps of one episode, in which a policy acts, or nothing is done."""
     idle = env.action_space.sample() * 0
     obs, _ = env.reset(seed=0)
-    actions, over = list[Any](), False
+    actions, over = list[object](), False
     while not over and len(actions) < EPISODE:
         actions.append(idle if policy is None else int(policy(obs)))
         obs, _, terminated, truncated, _ = env.step(actions[-1])
@@ -84,7 +88,7 @@ def _make_cartpoles() -> Workload:
     obs, _ = env.reset(seed=0)
     actions = []
     for _ in range(EPISODE // 5):
-        actions.append(choose_upright_action(obs))
+        actions.append(_choose_upright_action(obs))
         obs, *_ = env.step(actions[-1])
 
     def run_steps() -> None:
@@ -110,10 +114,15 @@ def _make_lane_keeping() -> Workload:
         return _make_episode(gym.make("highway_env:lane-keeping-v0"))
 
 
-def _make_workloads() -> WorkloadSet:
+def make_workloads() -> WorkloadSet:
     """Make all workloads but those of packages that are not installed."""
-    field = WorkloadSet()
-    make = gym.make_vec
+    note = (
+        "Ours: 10 ms of driving, ten ticks of plant and sensors, with infos. Singles through "
+        f"gym.make, in episodes of at most {EPISODE} steps; x {COUNT}: a step of one environment "
+        "of a batch. Filters with full P compute the covariance of six states at every tick; a "
+        "filter's own cost is the difference to the line without."
+    )
+    field, make = WorkloadSet("Cost of an env-step", "step", note), gym.make_vec
     field.add(FUSION, lambda: _make_episode(gym.make(_FUSION_ID)))
     field.add(AT_ONCE, lambda: _make_batch(make(_FUSION_ID, COUNT)))
     field.add(
@@ -121,7 +130,7 @@ def _make_workloads() -> WorkloadSet:
     )
     field.add(LATE, lambda: _make_batch(make(_VISION_ID, COUNT), _FRAMES))
     field.add(NONE_LATE, lambda: _make_batch(make(_VISION_ID, COUNT, **_PROMPT), _FRAMES))
-    field.add(CARTPOLE, lambda: _make_episode(gym.make(CARTPOLE), choose_upright_action))
+    field.add(CARTPOLE, lambda: _make_episode(gym.make(CARTPOLE), _choose_upright_action))
     field.add(LANE, _make_lane_keeping, "highway-env")
     field.add(CARTPOLES, _make_cartpoles)
     # Pendulum has no batch of arrays
@@ -130,19 +139,13 @@ def _make_workloads() -> WorkloadSet:
     return field
 
 
-def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
-    """Add rows and a table to a suite; CPU us a step by name, and why others are absent."""
-    note = (
-        "Ours: 10 ms of driving, ten ticks of plant and sensors, with infos. Singles through "
-        f"gym.make, in episodes of at most {EPISODE} steps; x {COUNT}: a step of one environment "
-        "of a batch. Filters with full P compute the covariance of six states at every tick; a "
-        "filter's own cost is the difference to the line without."
-    )
-    return _make_workloads().measure(suite, "Cost of an env-step", "step", effort, note)
-
-
 def add_filters(suite: Suite, effort: Effort) -> None:
-    """Add rows and a table of the CPU us that each filter adds, in a third of the rounds."""
+    """Add rows and a table of the CPU time that each filter adds, in a third of the rounds.
+
+    Args:
+        suite: Suite.
+        effort: Rounds and time of each.
+    """
     envs = {
         "one": _make_episode(gym.make(_FUSION_ID)),
         "many": _make_batch(gym.make_vec(_FUSION_ID, FEWER)),
@@ -155,7 +158,7 @@ def add_filters(suite: Suite, effort: Effort) -> None:
         cells.append([name])
         for env, added in ((FUSION, one - bare), (f"{FUSION} x {FEWER}", many - bare_many)):
             row = add_row(suite, f"{env} + {name}", "us_added", added.tolist())
-            cells[-1] += format_range(*row)
+            cells[-1] += format_range(row)
     note = (
         f"CPU us that a filter adds to an env-step of {FUSION}, its first two states and their "
         "deviations in the observation: differences round by round."

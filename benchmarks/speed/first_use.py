@@ -14,6 +14,7 @@ from .timing import AbsentError, Taken, add_row
 
 FIRST = "gym.make to the first step, kernels on disk"
 KERNEL = "cold compile of the dearest kernel"
+_RUNS, _QUICK_RUNS = 5, 2  # fresh processes
 LIMIT = 60.0  # s, on the wall, of a process that has nothing to compile
 
 _WARM = """
@@ -76,7 +77,7 @@ def _measure_first_step() -> dict[str, float]:
     return {name: at - before[i] for i, (name, at) in enumerate(marks)}
 
 
-def measure_compilation(code: str = _COLD) -> list[tuple[str, float]]:
+def _measure_compilation(code: str = _COLD) -> list[tuple[str, float]]:
     """Measure the CPU seconds of each kernel that code compiles with nothing on disk."""
     with TemporaryDirectory() as folder:
         environment = {"XDG_CACHE_HOME": folder, "NUMBA_CACHE_DIR": ""}
@@ -96,18 +97,26 @@ def _run_python(
     return run.stdout.splitlines()[-1]
 
 
-def add(suite: Suite, runs: int, compiling: bool) -> tuple[dict[str, Taken], dict[str, str]]:
-    """Add rows and a table; CPU s of the targets, reasons of absence. compiling: cold, minutes."""
+def add(suite: Suite, quick: bool) -> tuple[dict[str, Taken], dict[str, str]]:
+    """Add rows and a table.
+
+    Args:
+        suite: Suite.
+        quick: Whether a few processes do and nothing is compiled, which takes minutes.
+
+    Returns:
+        CPU seconds of the targets, and reasons of absence, by name.
+    """
     columns, absent = dict[str, Taken](), dict[str, str]()
     try:
-        taken = [_measure_first_step() for _ in range(runs + 1)][1:]
+        taken = [_measure_first_step() for _ in range((_QUICK_RUNS if quick else _RUNS) + 1)][1:]
         columns = {f"first use: {name}": [run[name] for run in taken] for name in taken[0]}
         counted = ("import numba", "gym.make", "first reset", "first step")
         columns[FIRST] = [sum(run[name] for name in counted) for run in taken]
     except AbsentError as error:
         absent[FIRST] = str(error)
-    if compiling:
-        kernels = measure_compilation()
+    if not quick:
+        kernels = _measure_compilation()
         columns["cold compile of all kernels"] = [sum(seconds for _, seconds in kernels)]
         columns[KERNEL] = [max(seconds for _, seconds in kernels)]
     else:

@@ -4,20 +4,17 @@ A call is one rollout and the gradient steps on it, with the same settings for b
 steps in stable-baselines3's own vector environment.
 """
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from ...envs.ticks import TICK
-from ..harness.results import Suite
-from .timing import Effort, Taken, Workload, WorkloadSet
+from .timing import Workload, WorkloadSet
 
 YAW, _PENDULUM_ID = "sideslip/YawFusion-v0", "Pendulum-v1"
 PPO_YAW = "PPO, YawFusion-v0"
 PENDULUM = f"PPO, {_PENDULUM_ID}"
 
 _COUNT = 256  # environments
-_MAX_ROUNDS = 5  # a round takes long
 
 
 def _make_learner(name: str) -> Workload:
@@ -45,17 +42,16 @@ def _get_settings() -> dict[str, Any]:
     return {name: options[name] for name in ("n_steps", "n_epochs", "batch_size", "gamma")}
 
 
-def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
-    """Add rows and a table to a suite; CPU us a step by name, and why others are absent."""
-    field = WorkloadSet()
+def make_workloads() -> WorkloadSet:
+    """Make both learners, unless stable-baselines3 is not installed."""
+    field = WorkloadSet("Cost of a learned env-step", "step", "", is_slow=True)
     for name in (PPO_YAW, PENDULUM):
         field.add(name, partial(_make_learner, name), "stable-baselines3")
-    settings = ", ".join(
-        f"{name} = {value}" for name, value in (_get_settings() if field.workloads else {}).items()
-    )
-    note = (
+    settings = _get_settings() if field.workloads else {}
+    field.note = (
         "PPO of stable-baselines3, rollout and gradient steps, on as many environments each: "
-        f"{_COUNT}, YawFusion-v0 through the bridge; {settings}, the rest is its default."
+        f"{_COUNT}, YawFusion-v0 through the bridge; "
+        f"{', '.join(f'{name} = {value}' for name, value in settings.items())}, the rest is its "
+        "default."
     )
-    fewer = replace(effort, rounds=max(1, min(effort.rounds // 2, _MAX_ROUNDS)))
-    return field.measure(suite, "Cost of a learned env-step", "step", fewer, note)
+    return field

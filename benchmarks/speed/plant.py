@@ -26,8 +26,7 @@ from ...envs.ticks import TICK
 from ...envs.vehicle.actuators import apply_lag
 from ...envs.vehicle.dynamics import CarParams, DisturbanceForces, Motion, RoadParams, kutta3, rk4
 from ...envs.vehicle.tyres import FIALA, TyreInputs, compute_tyre_load, has_load_shift
-from ..harness.results import Suite
-from .timing import AbsentError, Effort, Taken, Workload, WorkloadSet
+from .timing import AbsentError, Workload, WorkloadSet
 
 _FLAGS = ("-O3", "-march=native", "-ffp-contract=off")
 _VECTOR_FLAGS = """
@@ -91,7 +90,7 @@ _Advance = Callable[[Cars, int], object]
 """Moves cars on by some ticks, in place."""
 
 
-def make_cars(count: int, seed: int = 0) -> Cars:
+def _make_cars(count: int, seed: int = 0) -> Cars:
     """Make cars as the seeds of `YawFusion-v0` draw; count: a multiple of LANES."""
     env: Any = gym.make_vec("sideslip/YawFusion-v0", num_envs=count)
     env.reset(seed=seed)
@@ -113,7 +112,7 @@ def make_cars(count: int, seed: int = 0) -> Cars:
 
 
 @inline
-def integrate_tick(
+def _integrate_tick(
     first: Any,
     motion: Any,
     acting: Any,
@@ -147,7 +146,7 @@ def integrate_tick(
 
 
 @jit
-def advance(
+def _advance(
     left: Any,
     cars: Any,
     roads: Any,
@@ -165,16 +164,16 @@ def advance(
         motion, applied = read(motions[b], _MOTION), read(acting[b], _INPUTS)
         load = compute_tyre_load(applied, car, 0, has_load_shift(0, FIALA, 1))
         for _ in range(ticks):
-            load, motion, applied = integrate_tick(
+            load, motion, applied = _integrate_tick(
                 load, motion, applied, command, push, car, road, left, stages
             )
         write(motions[b], motion, _MOTION)
         write(acting[b], applied, _INPUTS)
 
 
-def advance_in_lanes(cars: Cars, ticks: int) -> None:
+def _advance_in_lanes(cars: Cars, ticks: int) -> None:
     """Move cars by some ticks as the batch engine does, in lanes."""
-    advance(*cars, ticks, 3)
+    _advance(*cars, ticks, 3)
 
 
 def make_c_advance() -> _Advance:
@@ -184,9 +183,9 @@ def make_c_advance() -> _Advance:
     def advance_in_c(cars: Cars, ticks: int) -> None:
         function(len(cars.cars), ticks, TICK, *(array.ctypes.data for array in cars))
 
-    numba_cars = make_cars(LANES)
+    numba_cars = _make_cars(LANES)
     c_cars = numba_cars.clone()
-    advance_in_lanes(numba_cars, 100)
+    _advance_in_lanes(numba_cars, 100)
     advance_in_c(c_cars, 100)
     if not np.allclose(c_cars.motions, numba_cars.motions, rtol=1e-9, atol=1e-12):
         off = np.abs(c_cars.motions - numba_cars.motions).max()
@@ -194,24 +193,24 @@ def make_c_advance() -> _Advance:
     return advance_in_c
 
 
-def _make_workload(advance: _Advance, cars: Cars) -> Workload:
+def _make_workload(_advance: _Advance, cars: Cars) -> Workload:
     """Make calls that move cars by `_TICKS`, in every round from the same state on."""
     running = cars.clone()
 
     def reset_cars() -> None:
         running.motions[:], running.acting[:] = cars.motions, cars.acting
 
-    return Workload(lambda: advance(running, _TICKS), CARS * _TICKS, reset_cars)
+    return Workload(lambda: _advance(running, _TICKS), CARS * _TICKS, reset_cars)
 
 
-def add(suite: Suite, effort: Effort) -> tuple[dict[str, Taken], dict[str, str]]:
-    """Add rows and a table to a suite; CPU us a tick by name, and why others are absent."""
-    cars, field = make_cars(CARS), WorkloadSet()
-    field.add(PLANT, lambda: _make_workload(advance_in_lanes, cars))
-    field.add(C, lambda: _make_workload(make_c_advance(), cars))
+def make_workloads() -> WorkloadSet:
+    """Make both plants, unless there is no C compiler."""
     note = (
         f"One car, one millisecond: lag, load, Fiala tyres, roll, Kutta's rule; {CARS} cars at "
         "once. The C is the same text in blocks of as many cars, compiled on the spot "
         "(-O3 -march=native, no fused multiply-add), with the same numbers."
     )
-    return field.measure(suite, "Cost of a tick of the plant", "tick", effort, note)
+    cars, field = _make_cars(CARS), WorkloadSet("Cost of a tick of the plant", "tick", note)
+    field.add(PLANT, lambda: _make_workload(_advance_in_lanes, cars))
+    field.add(C, lambda: _make_workload(make_c_advance(), cars))
+    return field

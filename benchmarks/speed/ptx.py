@@ -23,7 +23,7 @@ from ..harness.results import check_writable, write_text
 _ARITHMETIC = "add|sub|mul|fma|div|rcp|sqrt"
 
 
-def count_by_kind(text: str) -> dict[str, Any]:
+def _count_by_kind(text: str) -> dict[str, Any]:
     """Count the instructions of a PTX text by kind."""
     totals = count_opcodes(text)
 
@@ -39,7 +39,7 @@ def count_by_kind(text: str) -> dict[str, Any]:
     }
 
 
-def assemble_kernel(text: str, capability: tuple[int, int]) -> dict[str, Any]:
+def _assemble_kernel(text: str, capability: tuple[int, int]) -> dict[str, Any]:
     """Count a thread's registers and spilled bytes with `ptxas`; {} without it on the path."""
     if shutil.which("ptxas") is None:
         return {}
@@ -57,7 +57,7 @@ def assemble_kernel(text: str, capability: tuple[int, int]) -> dict[str, Any]:
     return {name: re.findall(pattern, run.stderr)[-1] for name, pattern in patterns.items()}
 
 
-def main(
+def _main(
     env: Annotated[str, typer.Option(help="An environment's id.")] = "sideslip/YawFusion-v0",
     out: Annotated[Path | None, typer.Option(help="Write the table as Markdown.")] = None,
 ) -> None:
@@ -69,7 +69,7 @@ def main(
     columns: list[dict[str, Any]] = []
     for real in (np.float64, np.float32):
         text = get_ptx(options, real, (9, 0))
-        columns.append({"": real.__name__} | count_by_kind(text) | assemble_kernel(text, (9, 0)))
+        columns.append({"": real.__name__} | _count_by_kind(text) | _assemble_kernel(text, (9, 0)))
     lines = [
         f"| {name} | {' | '.join(str(column[name]) for column in columns)} |" for name in columns[0]
     ]
@@ -80,4 +80,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    typer.run(_main)

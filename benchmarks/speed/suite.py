@@ -65,7 +65,14 @@ def add(
     seconds: Mapping[str, Taken],
     absent: Mapping[str, str],
 ) -> None:
-    """Add rows of measured targets, and first of all the table of all; absent: reasons."""
+    """Add rows of measured targets, and first of all the table of all.
+
+    Args:
+        suite: Suite.
+        taken: CPU time a unit (us) of the workloads in each round, by name.
+        seconds: CPU seconds of the first use in each process, by name.
+        absent: Reasons why others were not measured, by name.
+    """
     cells, missing = [], dict[str, str]()
     for target in TARGETS:
         needed = [target.over, target.workload] if target.over else [target.workload]
@@ -80,8 +87,8 @@ def add(
             measured = add_row(suite, target.name, "ratio", ratios)
         else:
             measured = compute_range(seconds[target.workload])
-        met = "met" if target.met(measured[0]) else "not met"
-        cells[-1][2:] = *format_range(*measured), met
+        met = "met" if target.met(measured.value) else "not met"
+        cells[-1][2:] = *format_range(measured), met
     header = ("figure", "target", "measured", "range", "")
     note = "Ratios are taken round by round, in CPU time; the median counts."
     note += format_absences(missing)
@@ -89,11 +96,18 @@ def add(
 
 
 _RIVALS = (env_steps.CARTPOLE, env_steps.LANE)
-_RUNS, _QUICK_RUNS = 5, 2  # fresh processes
 
 
 def run(quick: bool = False, console: Console | None = None) -> Suite:
-    """Measure the CPU times of steps, ticks, learning and first use; quick: nothing cold."""
+    """Measure the CPU times of steps, ticks, learning and first use.
+
+    Args:
+        quick: Whether rounds are few and nothing is compiled.
+        console: Not used: workloads take turns in this process.
+
+    Returns:
+        Suite.
+    """
     suite = Suite(
         "speed",
         "What a step costs",
@@ -101,27 +115,32 @@ def run(quick: bool = False, console: Console | None = None) -> Suite:
         "take turns. An env-step of ours is 10 ms of driving: ten ticks of plant and sensors.",
     )
     effort = QUICK if quick else FULL
-    taken, absent = env_steps.add(suite, effort)
-    env_steps.add_filters(suite, effort)
-    for part in (plant, learning):
-        more, more_absent = part.add(suite, effort)
-        taken |= more
-        absent |= more_absent
-    seconds, more_absent = first_use.add(
-        suite, _QUICK_RUNS if quick else _RUNS, compiling=not quick
-    )
+    taken, absent = dict[str, Taken](), dict[str, str]()
+    for part in (env_steps, plant, learning):
+        field = part.make_workloads()
+        taken |= field.measure(suite, effort)
+        absent |= field.absent
+        if part is env_steps:
+            env_steps.add_filters(suite, effort)
+    seconds, more_absent = first_use.add(suite, quick)
     add(suite, taken, seconds, absent | more_absent)
     suite.verdict = make_verdict(taken, suite.tables[0])
     return suite
 
 
 def make_verdict(taken: Mapping[str, Taken], goals: ResultTable) -> str:
-    """Make the verdict from the CPU us of the workloads and the table of targets, `goals`."""
-    us = {name: compute_range(times)[0] for name, times in taken.items()}
+    """Make the verdict.
+
+    Args:
+        taken: CPU time a unit (us) of the workloads in each round, by name.
+        goals: Table of targets.
+
+    Returns:
+        Verdict.
+    """
+    us = {name: compute_range(times).value for name, times in taken.items()}
     step_time = us[env_steps.FUSION]
-    over = [
-        f"{format_three_digits(us[name] / step_time)} for {name}" for name in _RIVALS if name in us
-    ]
+    over = [f"{format_three_digits(us[x] / step_time)} for {x}" for x in _RIVALS if x in us]
     met = [line[0] for line in goals.cells if line[-1] == "met"]
     missed = [f"{name} ({measured} of {goal})" for name, goal, measured, _, outcome in goals.cells
               if outcome == "not met"]  # fmt: skip

@@ -4,9 +4,11 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from ..harness.results import ResultRow, ResultTable, Suite
+from ..harness.results import ResultTable, Suite
+from ..harness.stats import Estimate
+from ..report.study import add_rows
 
 
 @dataclass(frozen=True)
@@ -30,12 +32,21 @@ QUICK = Effort(9, 0.01)
 FULL = Effort(25, 0.04)
 """Many short rounds: what the machine does meanwhile falls on all workloads of one round."""
 
+_MAX_SLOW_ROUNDS = 5
 Taken = list[float]
 """CPU microseconds a unit, round by round."""
 
 
 def measure_interleaved(workloads: Mapping[str, Workload], effort: Effort) -> dict[str, Taken]:
-    """Measure the CPU us a unit of workloads, round by round, after a first round."""
+    """Measure the CPU time a unit of workloads, round by round, after a first round.
+
+    Args:
+        workloads: Workloads by name.
+        effort: Rounds and time of each.
+
+    Returns:
+        CPU time a unit (us) in each round, by name.
+    """
     with limit_threads():
         calls = {
             name: _count_calls(workload, effort.seconds) for name, workload in workloads.items()
@@ -75,9 +86,16 @@ def limit_threads() -> Iterator[None]:
         yield
 
 
-def compute_range(values: Taken) -> tuple[float, float, float]:
-    """Compute the median, minimum and maximum of some values."""
-    return statistics.median(values), min(values), max(values)
+def compute_range(values: Taken) -> Estimate:
+    """Compute the median and range of rounds.
+
+    Args:
+        values: A number of each round.
+
+    Returns:
+        Median, with smallest and largest number as bounds.
+    """
+    return Estimate(statistics.median(values), min(values), max(values))
 
 
 class AbsentError(Exception):
@@ -86,13 +104,23 @@ class AbsentError(Exception):
 
 @dataclass
 class WorkloadSet:
-    """Workloads by name, and the reasons why others are absent."""
+    """Workloads of a table by name, and the reasons why others are absent."""
 
+    title: str  # title of the table
+    unit: str  # unit of the workloads, "step" or "tick"
+    note: str  # note of the table
+    is_slow: bool = False  # whether few rounds have to do
     workloads: dict[str, Workload] = field(default_factory=dict)
     absent: dict[str, str] = field(default_factory=dict)
 
     def add(self, name: str, make: Callable[[], Workload], package: str | None = None) -> None:
-        """Add a workload, or why it is absent: the optional package it needs is not installed."""
+        """Add a workload, or why it is absent.
+
+        Args:
+            name: Name of the workload.
+            make: Function that makes it, or raises `AbsentError`.
+            package: Optional package that it needs, None for none.
+        """
         try:
             self.workloads[name] = make()
         except AbsentError as error:
@@ -102,50 +130,85 @@ class WorkloadSet:
                 raise
             self.absent[name] = f"{package} is not installed"
 
-    def measure(
-        self, suite: Suite, title: str, unit: str, effort: Effort, note: str
-    ) -> tuple[dict[str, Taken], dict[str, str]]:
-        """Measure all; add rows and a table in us per "step" or "tick"; times, reasons by name."""
+    def measure(self, suite: Suite, effort: Effort) -> dict[str, Taken]:
+        """Measure all, and add rows and a table to a suite.
+
+        Args:
+            suite: Suite.
+            effort: Rounds and time of each.
+
+        Returns:
+            CPU time a unit (us) in each round, by name.
+        """
+        if self.is_slow:
+            effort = replace(effort, rounds=max(1, min(effort.rounds // 2, _MAX_SLOW_ROUNDS)))
         taken, cells = measure_interleaved(self.workloads, effort), []
         for name, values in taken.items():
-            middle, *bounds = add_row(suite, name, f"us_per_{unit}", values)
-            cells.append([name, *format_range(middle, *bounds), _format_rate(middle)])
+            number = add_row(suite, name, f"us_per_{self.unit}", values)
+            rate = f"{float(f'{1e6 / number.value:.3g}'):,.0f}"
+            cells.append([name, *format_range(number), rate])
         if cells:
-            header = ("", f"us per {unit}", "range", "per CPU-s")
-            text = note + format_absences(self.absent)
-            suite.tables.append(ResultTable(title, header, cells, text, keyed=False))
-        return taken, self.absent
+            header = ("", f"us per {self.unit}", "range", "per CPU-s")
+            text = self.note + format_absences(self.absent)
+            suite.tables.append(ResultTable(self.title, header, cells, text, keyed=False))
+        return taken
 
 
-def add_row(suite: Suite, name: str, metric: str, values: Taken) -> tuple[float, float, float]:
-    """Add the median and range of rounds as a row of a suite, and return them."""
-    middle, low, high = compute_range(values)
-    row = ResultRow(suite.name, name, metric, middle, low=low, high=high, n=len(values))
-    suite.rows.append(row)
-    return middle, low, high
+def add_row(suite: Suite, name: str, metric: str, values: Taken) -> Estimate:
+    """Add the median and range of rounds as a row of a suite.
+
+    Args:
+        suite: Suite.
+        name: Name of the workload.
+        metric: Metric of the row.
+        values: A number of each round.
+
+    Returns:
+        Median with its range.
+    """
+    number = compute_range(values)
+    columns = {"salt": "", "env_version": "", "scenario": name}
+    add_rows(suite, {metric: number}, n=len(values), **columns)
+    return number
 
 
 def format_absences(absent: Mapping[str, str]) -> str:
-    """Format a sentence on the absent workloads, with reasons by name; "" without any."""
+    """Format a sentence on the absent workloads.
+
+    Args:
+        absent: Reasons by name.
+
+    Returns:
+        Sentence, "" without any.
+    """
     if not absent:
         return ""
     return f" Not measured: {'; '.join(f'{name} ({reason})' for name, reason in absent.items())}."
 
 
-def format_range(middle: float, low: float, high: float) -> tuple[str, str]:
-    """Format a median and its range, to three digits, as two cells of a table."""
-    return format_three_digits(middle), " .. ".join(map(format_three_digits, (low, high)))
+def format_range(number: Estimate) -> tuple[str, str]:
+    """Format a median and its range, to three digits, as two cells of a table.
+
+    Args:
+        number: Median with its range.
+
+    Returns:
+        Both texts.
+    """
+    middle, low, high = map(format_three_digits, number)
+    return middle, f"{low} .. {high}"
 
 
 def format_three_digits(value: float) -> str:
     """Format a number to three digits, without an exponent.
 
+    Args:
+        value: Number.
+
+    Returns:
+        Text.
+
     >>> format_three_digits(0.04431), format_three_digits(7.2), format_three_digits(1004.0)
     ('0.0443', '7.2', '1000')
     """
     return f"{float(f'{value:.3g}'):g}"
-
-
-def _format_rate(microseconds: float) -> str:
-    """Format the number of units in a second of CPU time, to three digits."""
-    return f"{float(f'{1e6 / microseconds:.3g}'):,.0f}"

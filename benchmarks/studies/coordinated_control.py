@@ -12,7 +12,6 @@ import gymnasium as gym
 import numpy as np
 from rich.console import Console
 
-from ... import __version__
 from ...agents import make_agent
 from ...agents.controllers.model_following import compute_feedback_gains
 from ...agents.rollout import iterate_steps
@@ -24,10 +23,11 @@ from ...envs.vehicle.linear import LinearModel, make_bicycle_model
 from ...estimators.vector.estimate import EstimateObservation
 from ..harness.drives import call_quietly
 from ..harness.parallel import run_cases
-from ..harness.results import ResultRow, ResultTable, Suite
+from ..harness.results import ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_means, share
 from ..harness.verdict import describe_leader, format_verdict
 from ..papers.manoeuvres import measure_tracking, run_episode
+from ..report.study import add_rows, import_figures
 
 BANDWIDTHS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # rad/s, K_beta = K_gamma
 SEEDS, QUICK_SEEDS = 10, 2
@@ -53,7 +53,7 @@ with uneven delay; nobody steers but the controller."""
 _STATES = ("beta", "gamma", "psi", "y_l")
 
 
-def compute_loop_radius(scenario: str | dict[str, Any], bandwidth: float) -> float:
+def _compute_loop_radius(scenario: str | dict[str, object], bandwidth: float) -> float:
     """Compute the spectral radius of dakf-stability's loop, sampled every millisecond, unfiltered.
 
     The true car with its lags, the PI (31) designed for the nominal one and summed by forward
@@ -80,7 +80,7 @@ def compute_loop_radius(scenario: str | dict[str, Any], bandwidth: float) -> flo
     return float(np.abs(np.linalg.eigvals(loop)).max())
 
 
-def track_reference(case: tuple[float, int]) -> Array:
+def _track_reference(case: tuple[float, int]) -> Array:
     """Run the step with dakf in the loop: rms_beta (rad), rms_gamma (rad/s), saturated, failed.
 
     case: Bandwidth (rad/s; 0: no control) and seed.
@@ -91,7 +91,7 @@ def track_reference(case: tuple[float, int]) -> Array:
     return np.array([result.rms_beta, result.rms_gamma, result.saturated, result.failed], float)
 
 
-def keep_lane(index: int, cars: int) -> Array:
+def _keep_lane(index: int, cars: int) -> Array:
     """Drive the road: largest offset from the lane (m), RMS slip (rad), departed; (cars, 3)."""
     _, estimator, moment = LANE_CONTROLLERS[index]
     env: Any = gym.make_vec(_ROAD_ID, num_envs=cars, scenario=_ROAD, steering=True)
@@ -113,13 +113,23 @@ def keep_lane(index: int, cars: int) -> Array:
 def run(
     seeds: int = SEEDS, cars: int = CARS, jobs: int | None = None, console: Console | None = None
 ) -> Suite:
-    """Answer both questions; seeds of the step, cars on the road."""
+    """Answer both questions.
+
+    Args:
+        seeds: Seeds of the step.
+        cars: Cars on the road.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+
+    Returns:
+        Suite.
+    """
     suite = Suite("following", "What steering and yaw moment do together", _TEXT)
     cases = list(product((0.0, *BANDWIDTHS), range(seeds)))
-    errors = np.array(run_cases(track_reference, cases, "bandwidth", jobs, console))
+    errors = np.array(run_cases(_track_reference, cases, "bandwidth", jobs, console))
     errors = errors.reshape(len(BANDWIDTHS) + 1, seeds, -1)
     _add_bandwidths(suite, errors)
-    run_lane = partial(keep_lane, cars=cars)
+    run_lane = partial(_keep_lane, cars=cars)
     lanes = run_cases(run_lane, range(len(LANE_CONTROLLERS)), "lanes", jobs, console)
     _add_lanes(suite, lanes)
     suite.verdict = compose_verdict(errors, lanes)
@@ -127,7 +137,15 @@ def run(
 
 
 def compose_verdict(errors: Array, lanes: Sequence[Array]) -> str:
-    """Compose the verdict from the errors of `_add_bandwidths` and of `keep_lane` by controller."""
+    """Compose the verdict.
+
+    Args:
+        errors: Numbers of `_track_reference`, shape (1 + bandwidths, seeds, 4).
+        lanes: Numbers of `_keep_lane` of each of `LANE_CONTROLLERS`.
+
+    Returns:
+        Verdict.
+    """
     ratios = (errors[1:, :, :2].mean(axis=1) / errors[0, :, :2].mean(axis=0)).mean(axis=1)
     stable = [i for i in range(len(BANDWIDTHS)) if not errors[1 + i, :, 3].any()]
     best = min(stable, key=ratios.__getitem__, default=None)
@@ -164,7 +182,7 @@ def _label_controller(i: int) -> str:
     return f"{actuators} on {estimator}" if actuators != "none" else actuators
 
 
-_COLUMNS = {  # what `track_reference` gives, and what the figure calls it
+_COLUMNS = {  # what `_track_reference` gives, and what the figure calls it
     "error of beta / without control": "ratio",
     "error of the yaw rate / without control": "ratio",
     "share of time at the motors' limit": "saturation",
@@ -173,29 +191,28 @@ _COLUMNS = {  # what `track_reference` gives, and what the figure calls it
 
 
 def _add_bandwidths(suite: Suite, errors: Array) -> None:
-    """Add table, rows and figure; errors: (none and every bandwidth, seeds, `track_reference`)."""
+    """Add table, rows and figure; errors: (none and every bandwidth, seeds, `_track_reference`)."""
     none, seeds = errors[0].mean(axis=0), errors.shape[1]
     shares = errors[1:] / np.where([True, True, False, False], none, 1.0)
     numbers = [[*map(interval, at_K.T[:-1]), share(at_K.T[-1])] for at_K in shares]
-    radius = np.array([compute_loop_radius(_STEP, K) for K in BANDWIDTHS])
+    radius = np.array([_compute_loop_radius(_STEP, K) for K in BANDWIDTHS])
     cells = []
     for K, spread, r in zip(BANDWIDTHS, numbers, radius.tolist(), strict=True):
         cells.append([f"{K:.0f}", *(f"{number.value:.3f}" for number in spread), f"{r:.5f}"])
         scenario = f"{_STEP}, K = {K:.0f} rad/s"
+        columns = {"estimator": "dakf", "controller": "model-following", "scenario": scenario}
         for metric, number in zip(_COLUMNS.values(), spread, strict=True):
-            suite.rows.append(_make_row(scenario, metric, number, seeds))
-        suite.rows.append(_make_row(scenario, "spectral_radius", Estimate(r, r, r), 1))
+            add_rows(suite, {metric: number}, **columns, n=seeds)
+        add_rows(suite, {"spectral_radius": Estimate(r, r, r)}, **columns, n=1)
     header = ("K / (rad/s)", "beta", "yaw rate", "saturated", "failed", "radius")
     note = "Errors over those without control; shares of time and of runs."
     suite.tables.append(ResultTable("The bandwidth K", header, cells, note, keyed=False))
-    try:
-        from ..report.figures import draw_curves
-    except ModuleNotFoundError:
+    if (figures := import_figures()) is None:
         return
-    columns = np.array(numbers).transpose(1, 2, 0)  # (column, value low high, K)
-    lines = {name: tuple(column) for name, column in zip(_COLUMNS, columns, strict=True)}
+    curves = np.array(numbers).transpose(1, 2, 0)  # (column, value low high, K)
+    lines = {name: tuple(curve) for name, curve in zip(_COLUMNS, curves, strict=True)}
     lines["spectral radius of the loop"] = (radius, radius, radius)
-    figure = draw_curves(np.array(BANDWIDTHS), lines, "K / (rad/s)", "ratio or share", "x")
+    figure = figures.draw_curves(np.array(BANDWIDTHS), lines, "K / (rad/s)", "ratio or share", "x")
     caption = "Tracking, saturation and stability against the bandwidth; whiskers 95 % over seeds."
     suite.figures.append(("dakf-stability V.D: the bandwidth K", figure, caption))
 
@@ -207,16 +224,9 @@ def _add_lanes(suite: Suite, lanes: list[Array]) -> None:
         max_offset, slip, departures = *map(interval, numbers.T[:-1]), share(numbers.T[-1])
         texts = (*max_offset.text(), f"{1e3 * slip.value:.1f}", f"{100.0 * departures.value:.1f}")
         cells.append([_label_controller(i), *texts])
-        labels = {"estimator": estimator, "controller": actuators}
+        columns = {"scenario": _ROAD, "estimator": estimator, "controller": actuators}
         metrics = {"offset": max_offset, "rms_slip": slip, "departure_rate": departures}
-        for metric, number in metrics.items():
-            suite.rows.append(_make_row(_ROAD, metric, number, len(numbers), **labels))
+        add_rows(suite, metrics, **columns, n=len(numbers))
     header = ("controller", "largest offset / m", "95 % interval", "RMS slip / mrad", "left / %")
     note = "The largest offset of the centre of gravity from the lane's centre, mean over cars."
     suite.tables.append(ResultTable("Keeping the lane on curved roads", header, cells, note))
-
-
-def _make_row(scenario: str, metric: str, number: Estimate, n: int, **labels: str) -> ResultRow:
-    labels = {"estimator": "dakf", "controller": "model-following"} | labels
-    common = {"suite": "following", "salt": "fixed", "env_version": __version__}
-    return ResultRow.from_estimate(metric, number, scenario=scenario, n=n, **labels, **common)

@@ -6,22 +6,22 @@ On the papers' simulations tie-vision-fig7 and dakf-fig6.
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from rich.console import Console
 
-from ... import __version__
 from ...agents.rollout import Rollout, rollout
 from ...envs.record import Array
 from ...estimators.analysis.bound import compute_error_bound
 from ..harness.drives import SETTLED, make_filter_arguments
 from ..harness.parallel import run_cases, split_seeds
-from ..harness.results import ResultRow, ResultTable, Suite
+from ..harness.results import ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_roots, root_mean
 from ..harness.verdict import describe_leader, format_verdict
 from ..papers.ledger import PaperFilter, make_filters
+from ..report.study import add_rows, import_figures
 
 SEEDS = 100
 QUICK_SEEDS = 10
@@ -77,8 +77,7 @@ class SeedChunk:
     seeds: tuple[int, ...]
 
 
-@dataclass
-class _EstimationResult:
+class _EstimationResult(NamedTuple):
     """Errors and cost of an experiment's filters, and the drive of seed 0 with its estimates."""
 
     squares: Array  # mean squared errors (rad2), shape (seeds, filters)
@@ -92,7 +91,14 @@ def _make_env(experiment: Experiment) -> gym.Env[Any, Any]:
 
 
 def measure(case: SeedChunk) -> _EstimationResult:
-    """Drive the seeds of a case once and run every filter over the same records."""
+    """Drive the seeds of a case once and run every filter over the same records.
+
+    Args:
+        case: Experiment and seeds.
+
+    Returns:
+        Errors, bound, cost, and the drive of seed 0.
+    """
     experiment = EXPERIMENTS[case.experiment]
     env = _make_env(experiment)
     base: Any = env.unwrapped
@@ -119,7 +125,16 @@ def measure(case: SeedChunk) -> _EstimationResult:
 
 
 def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = None) -> Suite:
-    """Run every estimator of both experiments on the seeds 0 .. seeds-1."""
+    """Run every estimator of both experiments.
+
+    Args:
+        seeds: Number of seeds.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+
+    Returns:
+        Suite.
+    """
     chunks = split_seeds(seeds, _CHUNK)
     cases = [SeedChunk(e, chunk) for e in range(len(EXPERIMENTS)) for chunk in chunks]
     results = run_cases(measure, cases, "estimation", jobs, console)
@@ -138,15 +153,10 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
     )
     errors, examples = list[tuple[Array, Array]](), list[tuple[Rollout, dict[str, Array]]]()
     for e, experiment in enumerate(EXPERIMENTS):
-        pairs = zip(cases, results, strict=True)
-        chunked = [result for case, result in pairs if case.experiment == e]
-        squares, best, costs = (
-            np.concatenate([getattr(m, name) for m in chunked])
-            for name in ("squares", "bound", "cost")
-        )
-        cost = np.median(costs, axis=0)
+        chunked = results[e * len(chunks) : (e + 1) * len(chunks)]
+        squares, best, costs = map(np.concatenate, list(zip(*chunked, strict=True))[:3])
         errors.append((squares, best))
-        _add_rows(suite, experiment, squares, best, cost)
+        _add_rows(suite, experiment, squares, best, np.median(costs, axis=0))
         examples += [m.example for m in chunked if m.example is not None]
     suite.verdict = compose_verdict(errors)
     _draw_figures(suite, errors, examples)
@@ -154,7 +164,14 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
 
 
 def compose_verdict(errors: Sequence[tuple[Array, Array]]) -> str:
-    """Compose the verdict from each experiment's squares, (seeds, filters), and bound, (seeds,)."""
+    """Compose the verdict.
+
+    Args:
+        errors: Squared errors, shape (seeds, filters), and bound, (seeds,), of each experiment.
+
+    Returns:
+        Verdict.
+    """
     firsts, unaided, known = [], [], []
     for experiment, (squares, best) in zip(EXPERIMENTS, errors, strict=True):
         labels = [filter_.label for filter_ in experiment.filters]
@@ -181,21 +198,17 @@ def _add_rows(
     suite: Suite, experiment: Experiment, squares: Array, best: Array, cost: Array
 ) -> None:
     """Rows and a table of one experiment, best estimator first."""
-    env = _make_env(experiment)
-    spec = env.spec.to_json() if env.spec is not None else ""
-    common: dict[str, Any] = {"suite": suite.name, "scenario": experiment.scenario, "spec": spec}
-    common |= {"n": len(squares), "salt": "fixed", "paper": experiment.paper}
-    common |= {"env_version": f"{experiment.env_id} {__version__}"}
+    spec = _make_env(experiment).spec
+    columns = {"scenario": experiment.scenario, "spec": spec.to_json() if spec else ""}
+    columns["paper"] = experiment.paper
     lines = [(float(root_mean(best)), ["the bound", f"{1e3 * root_mean(best):.2f}", "", "1", ""])]
     for j, filter_ in enumerate(experiment.filters):
         error = interval(squares[:, j], root_mean)
         ratio = interval(squares[:, j], ratio_of_roots, best)
         us = float(cost[j])
         numbers = {"rmse": error, "rmse_over_bound": ratio, "us_per_tick": Estimate(us)}
-        suite.rows += [
-            ResultRow.from_estimate(metric, number, estimator=filter_.label, **common)
-            for metric, number in numbers.items()
-        ]
+        columns["estimator"] = filter_.label
+        add_rows(suite, numbers, experiment.env_id, **columns, n=len(squares))
         texts = error.text(1e3, ".2f")
         lines.append((error.value, [filter_.label, *texts, f"{ratio.value:.2f}", f"{us:.3f}"]))
     title = f"{experiment.paper}: error of the sideslip angle ({len(squares)} seeds)"
@@ -210,26 +223,24 @@ def _draw_figures(
     examples: Sequence[tuple[Rollout, dict[str, Array]]],
 ) -> None:
     """Figures of every experiment; nothing where plotly is not installed."""
-    try:
-        from ..report.figures import draw_error_series, draw_groups, draw_time_series
-    except ModuleNotFoundError:
+    if (figures := import_figures()) is None:
         return
     groups, angle = {}, "sideslip angle / mrad"
     for experiment, (squares, best) in zip(EXPERIMENTS, errors, strict=True):
         labels = [filter_.label for filter_ in experiment.filters]
-        numbers = (Estimate(*interval(column, ratio_of_roots, best)) for column in squares.T)
+        numbers = (interval(column, ratio_of_roots, best) for column in squares.T)
         ratios = dict(zip(labels, numbers, strict=True))
         title = f"{experiment.brief} ({experiment.paper})"
         groups[title] = dict(sorted(ratios.items(), key=lambda pair: pair[1].value))
     ratio = "error / the least possible: less is better"
-    bars = draw_groups(groups, ratio, {1.0: "the bound"})
+    bars = figures.draw_groups(groups, ratio, {1.0: "the bound"})
     text = "Root mean square error over what the optimal filter has; whiskers: 95 % intervals."
     suite.answers.append(("Which estimator comes closest to the sideslip angle?", bars, text))
     for experiment, (drive, traces) in zip(EXPERIMENTS, examples, strict=True):
         t, beta = drive.log.time, drive.log.truth["beta"]
         lines = {"truth": 1e3 * beta} | {label: 1e3 * item for label, item in traces.items()}
         missed = {label: 1e3 * (item - beta) for label, item in traces.items()}
-        over_time = draw_time_series(t, lines, angle)
+        over_time = figures.draw_time_series(t, lines, angle)
         if experiment is EXPERIMENTS[0]:
             over_time.update_layout(meta="wide")
             text = f"{experiment.text} The truth lies on top of the estimates."
@@ -237,6 +248,6 @@ def _draw_figures(
         else:
             title = f"{experiment.paper}: the sideslip angle and its estimates (seed 0)"
             suite.figures.append((title, over_time, experiment.text))
-        figure = draw_error_series(t, missed, f"error of the {angle}")
+        figure = figures.draw_error_series(t, missed, f"error of the {angle}")
         title, caption = f"{experiment.paper}: errors (seed 0)", "Estimate minus truth."
         suite.figures.append((title, figure, caption))

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from ... import __version__
 from ...agents.rollout import compute_cost_ratios
 from ...envs.record import Array
 from ..control.entries import ADAPTIVE, CONTROLLERS, LEARNED, REFERENCE_FILTER, ControlEntry
@@ -28,7 +27,7 @@ from ..control.tasks import (
     make_task_seeds,
     vary_scenario,
 )
-from ..harness.results import ResultRow, ResultTable, Suite
+from ..harness.results import ResultTable, Suite
 from ..harness.stats import (
     Estimate,
     compute_profile,
@@ -38,6 +37,7 @@ from ..harness.stats import (
     share,
 )
 from ..harness.verdict import format_verdict
+from ..report.study import add_rows, import_figures
 
 NAME, TRAINED = "learned", "as trained"
 EPISODES, QUICK_EPISODES = 32, 4
@@ -79,19 +79,21 @@ LATELY_MET = ("no camera from 2 to 7 s", "400 N from the side")
 _QUICK_CONDITIONS = (TRAINED, "tyres 1.4 to 1.8", "no GPS from 2 to 7 s", "400 N from the side")
 
 
-def make_condition_scenario(task: ControlTask, condition: str) -> dict[str, Any]:
-    """Make a task's scenario in a condition, over its name."""
-    return vary_scenario(task, CONDITIONS[condition])
-
-
 def list_entries(kind: str) -> list[tuple[str, str]]:
-    """List (estimator, controller) of all who drive a class: baselines, classics, policies."""
-    available = CONTROLLERS[select_tasks(kind)[0].env_id]
+    """List all who drive a class: baselines, classics, policies.
+
+    Args:
+        kind: Class of tasks.
+
+    Returns:
+        Estimator and controller of each.
+    """
+    available = CONTROLLERS[_select_tasks(kind)[0].env_id]
     classics = [(REFERENCE_FILTER, name) for name in _PAPERS if name in available]
     return [("", NOMINAL), ("", PARAMETERS), *classics, *ADAPTIVE.items(), *LEARNED[kind]]
 
 
-def select_tasks(kind: str) -> list[ControlTask]:
+def _select_tasks(kind: str) -> list[ControlTask]:
     """Select a class's tasks: the middle one of each of three tiers, or three of its only one."""
     tasks = [task for task in list_scored_tasks() if task.kind == kind]
     tiers = [[c for c in tasks if c.tier == tier] for tier in dict.fromkeys(c.tier for c in tasks)]
@@ -101,14 +103,22 @@ def select_tasks(kind: str) -> list[ControlTask]:
 
 @dataclass
 class TransferResult:
-    """A class's episodes by condition, of each task in the order of `select_tasks`, by name."""
+    """A class's episodes by condition, of each task in the order of `_select_tasks`, by name."""
 
     kind: str
     drives: dict[str, list[dict[str, DriveResult]]] = field(default_factory=dict)
     salt: str = ""
 
     def score_condition(self, name: str, condition: str) -> Estimate:
-        """Compute an entry's share of the gap in a condition; NaN of one below _MIN_SCORED_GAP."""
+        """Compute an entry's share of the gap in a condition.
+
+        Args:
+            name: Name of the entry.
+            condition: Name of the condition.
+
+        Returns:
+            Share; NaN of a gap below _MIN_SCORED_GAP.
+        """
         drives = self.drives[condition]
         scales = [ScoreScale(by_name[NOMINAL], by_name[PARAMETERS]) for by_name in drives]
         gaps = [scale.gap for scale in scales if not np.isnan(scale.gap)]  # NaN: nobody survived
@@ -118,20 +128,29 @@ class TransferResult:
         return score([scale.compute_paired_ratios(by_name[name]) for scale, by_name in pairs])
 
     def ratios(self, name: str) -> Array:
-        """Cost over nominal's of each episode, infinite where it ended by a failure; (n,)."""
-        ratios = compute_cost_ratios(self.costs(name), self.costs(NOMINAL))
-        return np.where(self.mark_failures(name), np.inf, ratios)
+        """Compute the cost over nominal's of each episode.
 
-    def costs(self, name: str) -> Array:
-        """Costs in all conditions and tasks, one behind the other, shape (n,)."""
-        return np.concatenate([results[name].costs for results in self._list_drives()])
+        Args:
+            name: Name of the entry.
 
-    def mark_failures(self, name: str) -> Array:
-        """Mark which of those episodes ended by a failure, shape (n,)."""
-        return np.concatenate([results[name]["failure"] != 0.0 for results in self._list_drives()])
+        Returns:
+            Ratios, infinite where the episode ended by a failure, shape (n,).
+        """
+        ratios = compute_cost_ratios(self.select("cost", name), self.select("cost", NOMINAL))
+        return np.where(self.select("failure", name) != 0.0, np.inf, ratios)
 
-    def _list_drives(self) -> list[dict[str, DriveResult]]:
-        return [results for task_results in self.drives.values() for results in task_results]
+    def select(self, metric: str, name: str) -> Array:
+        """Select a number of each episode, in all conditions and tasks one behind the other.
+
+        Args:
+            metric: One of `NUMBERS`.
+            name: Name of the entry.
+
+        Returns:
+            Numbers, shape (n,).
+        """
+        by_task = (results for drives in self.drives.values() for results in drives)
+        return np.concatenate([results[name][metric] for results in by_task])
 
 
 def run(
@@ -161,10 +180,10 @@ def run(
     suite = Suite(NAME, "Learned policies where contests never are", _TEXT)
     salt = salt or make_salt()
     seeds, results = make_task_seeds(salt, episodes), dict[str, Results]()
-    tasks = [task for kind in LEARNED for task in select_tasks(kind)]
+    tasks = [task for kind in LEARNED for task in _select_tasks(kind)]
     for condition in _QUICK_CONDITIONS if quick else CONDITIONS:
         entries = [
-            ControlEntry(task, *pair, {"scenario": make_condition_scenario(task, condition)})
+            ControlEntry(task, *pair, {"scenario": vary_scenario(task, CONDITIONS[condition])})
             for task in tasks
             for pair in list_entries(task.kind)
         ]
@@ -173,12 +192,10 @@ def run(
         )
     transfers = [TransferResult(kind, salt=salt) for kind in LEARNED]
     for transfer in transfers:
-        selected = select_tasks(transfer.kind)
+        selected = _select_tasks(transfer.kind)
         for condition, drives in results.items():
             by_task = [collect_results(drives, task, condition) for task in selected]
             transfer.drives[condition] = by_task
-    for transfer in transfers:
-        selected = select_tasks(transfer.kind)
         scenarios = ", ".join(task.scenario for task in selected)
         note = f"No training met: {'; '.join(NEVER_MET)}. "
         note += f"Only those of the COMS's policies without a filter met: {'; '.join(LATELY_MET)}."
@@ -189,7 +206,19 @@ def run(
 
 
 def collect_results(results: Results, task: ControlTask, condition: str) -> dict[str, DriveResult]:
-    """Collect the episodes of all who drive a task; ValueError with the reason where one cannot."""
+    """Collect the episodes of all who drive a task.
+
+    Args:
+        results: Episodes by entry.
+        task: Task.
+        condition: Name of the condition, for the message.
+
+    Returns:
+        Episodes by controller.
+
+    Raises:
+        ValueError: An entry cannot drive; the message says why.
+    """
     pairs = list_entries(task.kind)
     drives = {controller: results.select(task, controller, name) for name, controller in pairs}
     wrong = [f"{name}, {condition}: {run.error}" for name, run in drives.items() if run.error]
@@ -199,7 +228,14 @@ def collect_results(results: Results, task: ControlTask, condition: str) -> dict
 
 
 def compose_verdict(transfers: Sequence[TransferResult]) -> str:
-    """Compose the verdict: each policy's share of the gap, as trained and at worst."""
+    """Compose the verdict: each class's first policy's share of the gap, as trained and at worst.
+
+    Args:
+        transfers: Episodes of each class.
+
+    Returns:
+        Verdict.
+    """
     lines = []
     for transfer in transfers:
         _, policy = LEARNED[transfer.kind][0]
@@ -207,7 +243,7 @@ def compose_verdict(transfers: Sequence[TransferResult]) -> str:
         unmet = NEVER_MET + LATELY_MET  # by it, the class's first
         met = [share for name, share in shares.items() if name not in (TRAINED, *unmet)]
         new = [share for name, share in shares.items() if name in unmet]
-        better = compute_win_rate(transfer.costs(policy), transfer.costs(RIVALS[0])).value
+        better = compute_win_rate(*(transfer.select("cost", x) for x in (policy, RIVALS[0]))).value
         lines.append(
             f"{policy} closes {shares[TRAINED]:.2f} of the gap; at worst {_format_min(met)} where "
             f"it trained, {_format_min(new)} where never; "
@@ -225,27 +261,36 @@ def _format_min(shares: Sequence[float]) -> str:
 def add_tables(
     suite: Suite, transfer: TransferResult, title: str, env_id: str, scenarios: str, remark: str
 ) -> None:
-    """Add a class's rows and tables; scenarios: what was driven; remark: end of the note."""
+    """Add a class's rows and tables.
+
+    Args:
+        suite: Suite.
+        transfer: Episodes of the class.
+        title: Beginning of the tables' titles.
+        env_id: Id of the env.
+        scenarios: What was driven, for the note.
+        remark: End of the note.
+    """
     names = [controller for _, controller in list_entries(transfer.kind)]
-    episodes = len(transfer.costs(NOMINAL))
+    all_costs = {name: transfer.select("cost", name) for name in names}
+    episodes = len(all_costs[NOMINAL])
     rivals = [controller for controller in (NOMINAL, *_PAPERS, *RIVALS) if controller in names]
     shares, totals = [], []
     for controller in names:
         scores = {name: transfer.score_condition(controller, name) for name in transfer.drives}
         texts = (x.inline() if np.isfinite(x.value) else "-" for x in scores.values())
         shares.append([controller, *texts])
-        costs = transfer.costs(controller)
-        ratio = compute_tail_mean(compute_cost_ratios(costs, transfer.costs(NOMINAL))).value
-        won = {rival: compute_win_rate(costs, transfer.costs(rival)).value for rival in rivals}
+        costs = all_costs[controller]
+        ratio = compute_tail_mean(compute_cost_ratios(costs, all_costs[NOMINAL])).value
+        won = {rival: compute_win_rate(costs, all_costs[rival]).value for rival in rivals}
         beaten = ["" if x == controller else f"{100.0 * rate:.0f} %" for x, rate in won.items()]
-        fails = share(transfer.mark_failures(controller)).value
+        fails = share(transfer.select("failure", controller) != 0.0).value
         totals.append([controller, *beaten, f"{100.0 * fails:.1f} %", f"{ratio:.2f}"])
-        labels = {"controller": controller, "n": episodes, "salt": transfer.salt}
-        common = {"suite": suite.name, "env_version": f"{env_id} {__version__}"}
+        columns = {"controller": controller, "salt": transfer.salt}
         for condition, item in scores.items():
             if np.isfinite(item.value):  # else there is no gap
-                columns = {"scenario": f"{transfer.kind}, {condition}", **labels, **common}
-                suite.rows.append(ResultRow.from_estimate("score", item, **columns))
+                where = f"{transfer.kind}, {condition}"
+                add_rows(suite, {"score": item}, env_id, scenario=where, n=episodes, **columns)
     count = episodes // len(transfer.drives)
     note = f"{scenarios}; {count} episodes a condition, the same for everybody. {remark}"
     if any("-" in row for row in shares):
@@ -259,28 +304,33 @@ def add_tables(
 
 
 def add_figures(suite: Suite, transfers: Sequence[TransferResult]) -> None:
-    """Add figures of what each costs, and how often how much; nothing without plotly."""
-    try:
-        from ..report.figures import draw_curves, draw_groups
-    except ModuleNotFoundError:
+    """Add figures of what each costs, and how often how much; nothing without plotly.
+
+    Args:
+        suite: Suite.
+        transfers: Episodes of each class.
+    """
+    if (figures := import_figures()) is None:
         return
-    names = {transfer.kind: [w for _, w in list_entries(transfer.kind)] for transfer in transfers}
-    costs: dict[str, dict[str, Estimate]] = {}
-    for transfer in transfers:
-        costs[transfer.kind] = {}
-        for controller in names[transfer.kind]:
-            log = np.log(np.minimum(transfer.ratios(controller), FAILURE_RATIO))
-            percent = Estimate(*(100.0 * end for end in geometric_mean(log)))
-            costs[transfer.kind][controller] = percent
+    ratios = {
+        transfer.kind: {name: transfer.ratios(name) for _, name in list_entries(transfer.kind)}
+        for transfer in transfers
+    }
+    costs = dict[str, dict[str, Estimate]]()
+    for kind, by_name in ratios.items():
+        logs = {name: np.log(np.minimum(x, FAILURE_RATIO)) for name, x in by_name.items()}
+        means = {name: geometric_mean(log) for name, log in logs.items()}
+        costs[kind] = {name: Estimate(*(100.0 * end for end in x)) for name, x in means.items()}
     label = "cost / nominal's, %: less is better"
-    figure = draw_groups(costs, label, {100.0: NOMINAL})
+    figure = figures.draw_groups(costs, label, {100.0: NOMINAL})
     failing = f"a failure costs {FAILURE_RATIO:.0f} times nominal's."
     text = f"Geometric means over all conditions; {failing}"
     suite.answers.append(("Who holds the car where contests never are?", figure, text))
-    for transfer in transfers:
-        ratios = {name: transfer.ratios(name) for name in names[transfer.kind]}
-        lines = {name: compute_profile(x, _LEVELS) for name, x in ratios.items()}
+    for kind, by_name in ratios.items():
+        lines = {name: compute_profile(x, _LEVELS) for name, x in by_name.items()}
         label = "share of episodes that cost no more"
-        figure = draw_curves(_LEVELS, lines, "cost / nominal's on the same seed", label, "x")
+        figure = figures.draw_curves(
+            _LEVELS, lines, "cost / nominal's on the same seed", label, "x"
+        )
         text = "A performance profile: the higher the better; a failure is never reached."
-        suite.figures.append((f"{transfer.kind}: how often at what cost", figure, text))
+        suite.figures.append((f"{kind}: how often at what cost", figure, text))

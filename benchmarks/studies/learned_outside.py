@@ -87,13 +87,21 @@ class _OutsideTask(ControlTask):
 
 
 def make_outside_task(kind: str, model: str) -> _OutsideTask:
-    """Make a class's task of `MANOEUVRE` with a model as the car."""
+    """Make a class's task of `MANOEUVRE` with a model as the car.
+
+    Args:
+        kind: Class of tasks.
+        model: Name of the model.
+
+    Returns:
+        Task.
+    """
     tasks = (task for task in list_scored_tasks() if task.scenario == MANOEUVRE)
     like = next(task for task in tasks if task.kind == kind)
     return _OutsideTask("", OUTSIDE_ID, "", like.reference, MANOEUVRE, model, like.env_id)
 
 
-def run_chunk(chunk: Chunk) -> DriveResult:
+def _run_chunk(chunk: Chunk) -> DriveResult:
     """Drive cars that are stepped one by one; all metrics but cost and failure are NaN."""
     start_time, numbers = time.process_time(), np.full((len(chunk.seeds), len(NUMBERS)), np.nan)
     try:
@@ -118,9 +126,21 @@ def run(
     quick: bool = False,
     salt: str = "",
 ) -> Suite:
-    """Run every class of `KINDS` on every model; arguments as of `learned.run`.
+    """Run every class of `KINDS` on every model.
 
-    quick: The drift model alone. Raises ValueError with the reason where an entry cannot drive.
+    Args:
+        episodes: Episodes of each model.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+        keep: Folder in which finished cases stay.
+        quick: Whether to run the drift model alone.
+        salt: Salt of the seeds, "" for `make_salt`'s.
+
+    Returns:
+        Suite of all classes, empty where the models are not installed.
+
+    Raises:
+        ValueError: An entry cannot drive.
     """
     suite = Suite(_NAME, "Learned policies in cars that are not ours", _TEXT)
     if find_spec("vehiclemodels") is None:
@@ -136,7 +156,7 @@ def run(
     salt = salt or make_salt()
     seeds = make_task_seeds(salt, episodes)
     results = measure(
-        entries, seeds, jobs=jobs, console=console, keep=keep, runner=run_chunk, title=_NAME
+        entries, seeds, jobs=jobs, console=console, keep=keep, runner=_run_chunk, title=_NAME
     )
     transfers = [TransferResult(kind, salt=salt) for kind in KINDS]
     for item, model in product(transfers, models):
@@ -147,12 +167,12 @@ def run(
         title = f"{item.kind} in a BMW"
         add_tables(suite, item, title, OUTSIDE_ID, f"{MANOEUVRE} on a straight road", note)
         suite.tables.insert(-1, _make_ratio_table(item, title))
-    suite.verdict = compose_verdict(transfers)
+    suite.verdict = _compose_verdict(transfers)
     add_figures(suite, transfers)
     return suite
 
 
-def compose_verdict(transfers: Sequence[TransferResult]) -> str:
+def _compose_verdict(transfers: Sequence[TransferResult]) -> str:
     """Compose the verdict: the cost of each class's policies over their rivals' on all models."""
     lines = []
     for transfer in transfers:
@@ -160,7 +180,7 @@ def compose_verdict(transfers: Sequence[TransferResult]) -> str:
             models = transfer.drives
             ratios = {x: _format_cost_ratio(transfer, policy, x, models) for x in _RIVALS}
             costs = ", ".join(f"{ratio} % of {rival}'s" for rival, ratio in ratios.items())
-            fails = 100.0 * share(transfer.mark_failures(policy)).value
+            fails = 100.0 * share(transfer.select("failure", policy) != 0.0).value
             lines.append(f"{policy} costs {costs}; {fails:.0f} % fail.")
     return format_verdict("On CommonRoad's BMW, designed for by all but the policies:", *lines)
 

@@ -1,7 +1,6 @@
-"""Costs of a learned policy beside no control, the classical line and a class's baselines.
+"""Costs of a learned policy beside others' on the same seeds, and what policies are trained on.
 
-All drive the same seeds, made from the policy's weights. Lessons of `sideslip distill` and starts
-of `sideslip train -i` are made here: the tasks of a class with their teacher, some of them varied.
+Lessons of `sideslip distill` and starts of `sideslip train -i`: a class's tasks, some varied.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from ... import __version__
 from ...agents.learned.policy import Card, JsonMap, Policy, is_policy, load_policy, save_policy
 from ...agents.rollout import compute_cost_ratios
 from ...envs.record import Array
@@ -41,9 +39,10 @@ from ..control.tasks import (
     vary_scenario,
 )
 from ..harness.parallel import run_cases
-from ..harness.results import ResultRow, ResultTable, Suite
+from ..harness.results import ResultTable, Suite
 from ..harness.stats import Estimate, compute_win_rate, geometric_mean, interval
 from ..harness.verdict import format_percent, format_verdict
+from ..report.study import add_rows
 
 if TYPE_CHECKING:
     from ...agents.training.config import TrainingTask
@@ -63,10 +62,6 @@ class PolicyEvaluation:
     entries: dict[str, ControlEntry]  # entries by name
     drives: dict[str, DriveResult]  # episodes by name
     left_out: dict[str, str]  # why an entry is not among them, by name
-
-    def costs(self, name: str) -> Array:
-        """Return the costs of an entry, shape (seeds,)."""
-        return self.drives[name].costs
 
 
 def evaluate_policy(
@@ -93,7 +88,11 @@ def evaluate_policy(
         ValueError: The policy cannot drive the env.
     """
     loaded = load_policy(policy)
-    home, shown, reference, options = _describe_task(loaded, env_id, scenario)
+    card = loaded.card
+    home = env_id or card.env_id
+    options = dict(card.env_options) if env_id in (None, card.env_id) else {}
+    options |= {} if scenario is None else {"scenario": scenario}
+    base: Any = gym.make(home, **options).unwrapped
     salt = loaded.salt if seed is None else ""
     seeds = (
         make_salted_seeds(salt, episodes) if seed is None else list(range(seed, seed + episodes))
@@ -101,11 +100,9 @@ def evaluate_policy(
     rivals = {f"{_CLASSICAL} on {FILTER}": (FILTER, _CLASSICAL), "none": ("", "none")}
     if loaded.name in rivals:
         raise ValueError(f"the policy's file is called {loaded.name!r}, as what it is held against")
-    contestants = {loaded.name: (loaded.card.estimator, policy)} | rivals
-    entries = {
-        name: ControlEntry(ControlTask(env_id=home, scenario=shown), estimator, controller, options)
-        for name, (estimator, controller) in contestants.items()
-    }
+    contestants = {loaded.name: (card.estimator, policy)} | rivals
+    task = ControlTask(env_id=home, scenario=base.scenario.name)
+    entries = {name: ControlEntry(task, *pair, options) for name, pair in contestants.items()}
     chunks = [Chunk(entry, tuple(seeds), keep=True) for entry in entries.values()]
     results = dict(zip(entries, run_cases(run_chunk, chunks, loaded.name, jobs=1), strict=True))
     errors = {name: outcome.error for name, outcome in results.items() if outcome.error}
@@ -113,33 +110,35 @@ def evaluate_policy(
         if needed in errors:
             raise ValueError(f"{needed} cannot drive {home}: {errors[needed]}")
     drives = {name: outcome for name, outcome in results.items() if name not in errors}
-    return PolicyEvaluation(loaded, salt, seeds, reference, entries, drives, errors)
+    return PolicyEvaluation(loaded, salt, seeds, base.reference, entries, drives, errors)
 
 
-def _describe_task(
-    policy: Policy, env_id: str | None, scenario: str | None
-) -> tuple[str, str, str, JsonMap]:
-    """Id of the env, the name of its scenario, its reference, its options."""
-    card = policy.card
-    options = dict(card.env_options) if env_id in (None, card.env_id) else {}
-    if scenario is not None:
-        options["scenario"] = scenario
-    home = env_id or card.env_id
-    base: Any = gym.make(home, **options).unwrapped
-    return home, base.scenario.name, base.reference, options
+def summarise_evaluation(result: PolicyEvaluation) -> JsonMap:
+    """Summarise an evaluation for a card.
 
+    Args:
+        result: Episodes of all entries.
 
-def summarise_evaluation(result: PolicyEvaluation) -> dict[str, Any]:
-    """Summarise for a card: the salt, and each entry's mean cost with its 95 % interval."""
+    Returns:
+        Salt, number of episodes, and each entry's mean cost with its 95 % interval.
+    """
     costs = {}
-    for name in result.drives:
-        mean, low, high = (round(number, 6) for number in interval(result.costs(name)))
+    for name, drive in result.drives.items():
+        mean, low, high = (round(number, 6) for number in interval(drive.costs))
         costs[name] = {"mean": mean, "low": low, "high": high}
     return {"salt": result.salt, "episodes": len(result.seeds), "cost": costs}
 
 
 def record_evaluation(path: str | Path, episodes: int = 256) -> PolicyEvaluation:
-    """Drive a policy's test seeds in its own env and write what it costs into its card."""
+    """Drive a policy's test seeds in its own env and write what it costs into its card.
+
+    Args:
+        path: File of the policy.
+        episodes: Episodes of each entry.
+
+    Returns:
+        Episodes of all entries.
+    """
     result = evaluate_policy(str(path), episodes)
     policy = result.policy
     save_policy(path, policy.network, replace(policy.card, evaluation=summarise_evaluation(result)))
@@ -147,7 +146,14 @@ def record_evaluation(path: str | Path, episodes: int = 256) -> PolicyEvaluation
 
 
 def make_suite(result: PolicyEvaluation) -> Suite:
-    """Make a suite of table and rows, and of the first episode over time and in motion."""
+    """Make a suite of table and rows, and of the first episode over time and in motion.
+
+    Args:
+        result: Episodes of all entries.
+
+    Returns:
+        Suite.
+    """
     name, card = result.policy.name, result.policy.card
     entry = result.entries[name]
     text = (
@@ -155,17 +161,14 @@ def make_suite(result: PolicyEvaluation) -> Suite:
         f"{name} was trained by {card.algorithm or 'an unnamed algorithm'} on {card.steps} "
         f"steps of {card.env_id} (reference: {card.reference}) in {card.cpu_seconds:.0f} CPU-s."
     )
-    reference = result.reference
-    if reference != card.reference:
-        text += f" Here it is judged by another reference, {reference}: by another cost."
-    title = f"{name} on {entry.task.env_id}"
-    suite = Suite("enjoy", title, text, _make_rows(result), [_make_table(result)])
+    if result.reference != card.reference:
+        text += f" Here it is judged by another reference, {result.reference}: by another cost."
+    suite = Suite("enjoy", f"{name} on {entry.task.env_id}", text, tables=[_make_table(result)])
+    _add_rows(suite, result)
     from ..control.report import make_time_explorer
 
-    series: dict[tuple[str, ...], Array] = {}
-    for label, outcome in result.drives.items():
-        if outcome.series is not None:
-            series[label,] = outcome.series
+    driven = {(label,): outcome.series for label, outcome in result.drives.items()}
+    series: dict[tuple[str, ...], Array] = {x: y for x, y in driven.items() if y is not None}
     suite.explorers.append(make_time_explorer("The first seed, side by side", (), series, name))
     suite.verdict = _compose_verdict(result)
     return suite
@@ -178,22 +181,25 @@ def _compose_verdict(result: PolicyEvaluation) -> str:
     fails = 100.0 * np.mean(result.drives[name]["failure"] != 0.0)
     lines = []
     for other in others:
-        logs = np.log(compute_cost_ratios(result.costs(name), result.costs(other)))
-        ratio = format_percent(geometric_mean(logs))
+        ratio = _format_cost_ratio(result, other)
         lines.append(f"{name} costs {ratio} of {other}, seed by seed.")
     limits = f"Not said: other cars, scenarios and seeds than these {len(result.seeds)}."
     return format_verdict(*lines, f"It fails in {fails:.0f} % of the episodes. {limits}")
 
 
+def _format_cost_ratio(result: PolicyEvaluation, other: str) -> str:
+    costs, others = (result.drives[name].costs for name in (result.policy.name, other))
+    return format_percent(geometric_mean(np.log(compute_cost_ratios(costs, others))))
+
+
 def _make_table(result: PolicyEvaluation) -> ResultTable:
     """Table of what the policy costs over each other's, and of everybody's motion."""
     first = result.policy.name
-    costs, cells = result.costs(first), []
+    costs, cells = result.drives[first].costs, []
     for name, outcome in result.drives.items():
         ratio = better = ""
         if name != first:
-            logs = np.log(compute_cost_ratios(costs, outcome.costs))
-            ratio = format_percent(geometric_mean(logs))
+            ratio = _format_cost_ratio(result, name)
             better = f"{100.0 * compute_win_rate(costs, outcome.costs).value:.0f} %"
         slip, step = 1e3 * outcome["rms_slip"].mean(), outcome["largest_step"].mean()
         fails = 100.0 * np.mean(outcome["failure"] != 0.0)
@@ -208,19 +214,16 @@ def _make_table(result: PolicyEvaluation) -> ResultTable:
     return ResultTable("What it costs", ("controller", *header), cells, " ".join([note, *left_out]))
 
 
-def _make_rows(result: PolicyEvaluation) -> list[ResultRow]:
-    """Rows of every entry: cost, slip, effort and steps."""
-    rows = []
+def _add_rows(suite: Suite, result: PolicyEvaluation) -> None:
+    """Add rows of every entry: cost, slip, effort and steps."""
     for name, outcome in result.drives.items():
-        entry, is_policy = result.entries[name], name == result.policy.name
-        controller = name if is_policy else entry.controller
-        labels = {"estimator": entry.estimator, "controller": controller}
-        seeds = {"n": len(result.seeds), "salt": result.salt, "spec": make_spec(entry)}
-        common = {"suite": "enjoy", "env_version": f"{entry.task.env_id} {__version__}"}
-        for metric in ("cost", "rms_slip", "peak_slip", "effort", "largest_step"):
-            columns = {"scenario": entry.task.scenario, **common, **labels, **seeds}
-            rows.append(ResultRow.from_estimate(metric, interval(outcome[metric]), **columns))
-    return rows
+        entry = result.entries[name]
+        task, is_policy = entry.task, name == result.policy.name
+        labels = {"estimator": entry.estimator, "scenario": task.scenario, "salt": result.salt}
+        labels |= {"controller": name if is_policy else entry.controller, "spec": make_spec(entry)}
+        metrics = ("cost", "rms_slip", "peak_slip", "effort", "largest_step")
+        numbers = {metric: interval(outcome[metric]) for metric in metrics}
+        add_rows(suite, numbers, task.env_id, n=len(result.seeds), **labels)
 
 
 _JOINT, _RIVAL = "joint, friction", "adaptive-nmpc"
@@ -229,18 +232,24 @@ _OUTPUTS = ("beta", "gamma", "phi", "phi_rate", "F_d", "N_d", "bias", "front_tyr
 """States that a student on `joint` reads, with standard deviations."""
 VARIED = {"tyres": (0.4, 2.0), "wind": (-500.0, 500.0), "mass": (0.8, 1.3)}
 VARIED |= {"camera": (0.01, 0.12), "out": (2.0, 6.0)}
-"""Of lessons that are varied: factors on each axle's tyres and the wind's force from the side, in
-N, in every episode, and, of a lesson, on the true car's mass; how late its camera is, and how long
-its GPS or its camera is out, in s."""
+"""Drawn in each episode: factors on each axle's tyres, side wind (N); once a lesson: a factor on
+the true car's mass, how late its camera is (s), how long its GPS or its camera is out (s)."""
 _WITHOUT_FILTER = (*ORACLE_NAMES, *(name for names in ORACLES.values() for name in names))
 FILTERS = ("", "joint")
 
 
 def list_tasks(kind: str) -> list[ControlTask]:
-    """List the scored tasks of a class; ValueError for an unknown one."""
-    kinds = list(dict.fromkeys(task.kind for task in list_scored_tasks()))
-    check_choice("class of contests", kind, kinds)
-    return [task for task in list_scored_tasks() if task.kind == kind]
+    """List the scored tasks of a class; ValueError for an unknown one.
+
+    Args:
+        kind: Class of tasks.
+
+    Returns:
+        Tasks.
+    """
+    tasks = list_scored_tasks()
+    check_choice("class of contests", kind, list(dict.fromkeys(task.kind for task in tasks)))
+    return [task for task in tasks if task.kind == kind]
 
 
 def make_card(
@@ -250,7 +259,18 @@ def make_card(
     observation_options: Mapping[str, Any] | None = None,
     **rest: Any,
 ) -> Card:
-    """Make the card of a policy for a class of tasks in the first one's env."""
+    """Make the card of a policy for a class of tasks in the first one's env.
+
+    Args:
+        kind: Class of tasks.
+        estimator: Estimator that the policy reads, one of `FILTERS`.
+        teacher: Name of its teacher, whose filter it shares where that is `joint`.
+        observation_options: Options of the observation.
+        **rest: Other fields of the card.
+
+    Returns:
+        Card.
+    """
     check_choice("estimator", estimator, FILTERS)
     for name in observation_options or {}:
         check_choice("option", name, OBSERVATION_OPTIONS)
@@ -344,9 +364,17 @@ def prepare_start(
     """Prepare what `sideslip train -i` begins with, and the function that makes its task.
 
     A zip's path stays what it is; a distilled policy goes on in all tasks of its class, but for
-    those with a driver where cars are driven on tensors: rows are of one kind there. varied: so
-    many times in each of them as `VARIED` says, drawn by the training's seed. Raises ValueError for
-    them without tasks of a class.
+    those with a driver where cars are driven on tensors: rows are of one kind there.
+
+    Args:
+        agent: File of a policy or a zip, None for none.
+        varied: How often each task varies by `VARIED`, drawn by the training's seed.
+
+    Returns:
+        Path or policy, and the function of the fields of `TrainingTask`.
+
+    Raises:
+        ValueError: Tasks vary, but the policy is of no class.
     """
     from ...agents.training.config import TrainingTask, get_algorithm
     from ...agents.training.warm_start import make_finetune_task
@@ -377,7 +405,16 @@ def prepare_start(
 
 
 def evaluate_card(path: Path, kind: str, episodes: int) -> JsonMap:
-    """Drive a policy and its class's baselines, write what it costs into its card; return that."""
+    """Drive a policy and its class's baselines, and write what it costs into its card.
+
+    Args:
+        path: File of the policy.
+        kind: Class of tasks.
+        episodes: Episodes of each task.
+
+    Returns:
+        The card's evaluation.
+    """
     policy, policy_evaluation = load_policy(path), evaluate_policy(str(path), episodes)
     tasks, evaluate = list_tasks(kind), partial(_evaluate_task, path, episodes=episodes)
     task_costs = run_cases(evaluate, tasks, "contests", jobs=1)

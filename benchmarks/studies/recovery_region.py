@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from ... import __version__
 from ...agents.rollout import iterate_steps
 from ...envs.record import Array
 from ...envs.scenarios.draws import KMH
@@ -20,9 +19,10 @@ from ..control.entries import REFERENCE_FILTER, ControlEntry, make_cars
 from ..control.run import get_control_period
 from ..control.tasks import YAW, ControlTask
 from ..harness.parallel import run_cases
-from ..harness.results import ResultRow, ResultTable, ShareMap, Suite
+from ..harness.results import ResultTable, ShareMap, Suite
 from ..harness.stats import interval, mean_share
 from ..harness.verdict import format_verdict, summarise_names
+from ..report.study import add_rows, import_figures
 
 NAME = "recovery"
 _READING = ("two-dof", "esc", "sliding-mode", "lqr")
@@ -77,35 +77,48 @@ class RecoveryCase:
 
 
 @dataclass
-class PulseThenAgent:
-    """An agent that takes over each row after a pulse: fraction of the full moment, decisions."""
+class _PulseThenAgent:
+    """An agent that takes over each row after a pulse."""
 
-    agent: Any
-    share: Array
-    decisions: Array
+    agent: Any  # anything with stable-baselines3's `predict`
+    share: Array  # fraction of the full moment, shape (rows,)
+    decisions: Array  # how many decisions the pulse lasts, shape (rows,)
 
     def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None,
+        self,
+        observation: Array,
+        state: tuple[int, Any] | None = None,
+        episode_start: object = None,
         deterministic: bool = True,
-    ) -> tuple[Any, Any]:  # fmt: skip
-        """Return the agent's action, the pulse's while that lasts."""
+    ) -> tuple[Array, tuple[int, Any]]:
+        """Return the agent's action, the pulse's while that lasts.
+
+        Args:
+            observation: Observations, shape (rows, k).
+            state: Count of decisions and the agent's memory, None at the start.
+            episode_start: Whether an episode starts, for the agent.
+            deterministic: Whether the agent draws nothing.
+
+        Returns:
+            Actions, shape (rows, 1), and the next state.
+        """
         count, inner = state or (0, None)
         action, inner = self.agent.predict(observation, inner, episode_start, deterministic)
         combined = np.where(count < self.decisions, self.share, np.ravel(action))
         return combined.reshape(np.shape(action)), (count + 1, inner)
 
 
-def make_grid(points: tuple[int, int]) -> tuple[Array, Array]:
+def _make_grid(points: tuple[int, int]) -> tuple[Array, Array]:
     """Make the sideslip angles (rad) and yaw rates (rad/s) of the starts."""
     axes = zip(MAX_START, points, strict=True)
     beta, gamma = (np.linspace(-limit, limit, n) for limit, n in axes)
     return beta, gamma
 
 
-def compute_recovery_mask(case: RecoveryCase) -> Array:
+def _compute_recovery_mask(case: RecoveryCase) -> Array:
     """Mark with 1 where a pulse lets the car be saved, shape (yaw rates, slip angles, seeds)."""
     task, scenario = CARS[case.car]
-    beta, gamma = make_grid(case.points)
+    beta, gamma = _make_grid(case.points)
     tries = len(case.pulses)
     starts = [(g, b) for g in gamma for b in beta] * tries
     v_x, indices = scenario["speed"], range(case.seeds)
@@ -115,7 +128,7 @@ def compute_recovery_mask(case: RecoveryCase) -> Array:
     entry = ControlEntry(task, reads, case.controller, {"scenario": scenario})
     env, agent = make_cars(entry, len(states))
     share, seconds = np.repeat(case.pulses, len(states) // tries, axis=0).T
-    agent = PulseThenAgent(agent, share, np.round(seconds / get_control_period(entry)))
+    agent = _PulseThenAgent(agent, share, np.round(seconds / get_control_period(entry)))
     lost, last = np.zeros(len(states), np.bool_), np.zeros(len(states))
     for step in iterate_steps(env, agent, seeds, {"state": states}):
         lost |= step.running & (step.info["failure"] != 0)
@@ -127,15 +140,24 @@ def compute_recovery_mask(case: RecoveryCase) -> Array:
 
 
 def run(quick: bool = False, jobs: int | None = None, console: Console | None = None) -> Suite:
-    """Run the maps of every controller on both cars; quick: a coarse grid and few seeds."""
+    """Run the maps of every controller on both cars.
+
+    Args:
+        quick: Whether the grid is coarse and the seeds are few.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+
+    Returns:
+        Suite.
+    """
     points, seeds = (QUICK_POINTS, QUICK_SEEDS) if quick else (_POINTS, SEEDS)
     cases = [RecoveryCase(car, name, points, seeds) for car in CARS for name in CONTROLLERS]
     starts = [_PULSES[k : k + _TRIES] for k in range(0, len(_PULSES), _TRIES)]
     cases += [RecoveryCase(car, ORACLES[0], points, seeds, item) for car in CARS for item in starts]
-    masks_by_case = run_cases(compute_recovery_mask, cases, NAME, jobs, console)
+    masks_by_case = run_cases(_compute_recovery_mask, cases, NAME, jobs, console)
     results = dict(zip(cases, masks_by_case, strict=True))
     suite = Suite(NAME, "From where the car is still saved", _TEXT)
-    beta, gamma = (np.degrees(axis) for axis in make_grid(points))
+    beta, gamma = (np.degrees(axis) for axis in _make_grid(points))
     cars = {car: {name: results[RecoveryCase(car, name, points, seeds)] for name in CONTROLLERS}
             for car in CARS}  # fmt: skip
     for car, masks in cars.items():
@@ -153,12 +175,10 @@ def run(quick: bool = False, jobs: int | None = None, console: Console | None = 
 
 def _draw_figures(suite: Suite) -> None:
     """The maps, those of the best first; nothing where plotly is not installed."""
-    try:
-        from ..report.figures import draw_share_maps
-    except ModuleNotFoundError:
+    if (figures := import_figures()) is None:
         return
     text = "Colour: the share of seeds on which the car is saved; the line is at one half."
-    suite.figures = [(item.title, draw_share_maps(item), text) for item in suite.maps]
+    suite.figures = [(item.title, figures.draw_share_maps(item), text) for item in suite.maps]
     first, best = suite.maps[0], suite.verdict.splitlines()[1:-2]
     shown = ["none"]
     for group in (_READING, ORACLES, (CLAIRVOYANT,)):
@@ -166,11 +186,18 @@ def _draw_figures(suite: Suite) -> None:
         shown += sorted(names, key=lambda name: -float(first.shares[name].mean()))[:1]
     selected = replace(first, shares={name: first.shares[name] for name in shown})
     title = f"From where is a car still saved? ({first.title})"
-    suite.answers.append((title, draw_share_maps(selected), " ".join([*best[:1], text])))
+    suite.answers.append((title, figures.draw_share_maps(selected), " ".join([*best[:1], text])))
 
 
 def compose_verdict(cars: Mapping[str, Mapping[str, Array]]) -> str:
-    """Compose the verdict from each car's masks of `compute_recovery_mask` by controller."""
+    """Compose the verdict.
+
+    Args:
+        cars: Masks of `_compute_recovery_mask` by car and controller.
+
+    Returns:
+        Verdict.
+    """
     firsts, knowing, clairvoyant_shares = list[str](), list[str](), list[str]()
     for car, masks in cars.items():
         share = {name: values.mean(axis=(0, 1)) for name, values in masks.items()}  # (seeds,)
@@ -202,9 +229,8 @@ def _add_table(suite: Suite, car: str, masks: Mapping[str, Array]) -> None:
     for name, share in shares.items():
         number, difference = mean_share(share), interval(share - shares["none"])
         cells.append([name, *number.text(1e2, ".1f"), *difference.text(1e2, ".1f")])
-        where = {"scenario": car, "controller": name, "n": len(share)}
-        common = {"suite": NAME, "salt": "fixed", "env_version": f"{YAW} {__version__}"}
-        suite.rows.append(ResultRow.from_estimate("saved_rate", number, **where, **common))
+        columns = {"scenario": car, "controller": name}
+        add_rows(suite, {"saved_rate": number}, YAW, n=len(share), **columns)
     header = ("controller", "saved / %", "95 % interval", "above none / %", "95 % interval")
     starts = next(iter(masks.values())).shape
     note = (

@@ -22,16 +22,15 @@ import gymnasium as gym
 import numpy as np
 from rich.console import Console
 
-from ... import __version__
 from ...agents.optimum import Lqg, Optimum, compute_optimum, wrap_optimal_estimate
 from ...envs.io import atomic_file
 from ...envs.numerics.kernel_cache import hash_experiment
 from ...envs.record import Array
-from ...envs.validation import check_choice
 from ..harness.parallel import run_cases
-from ..harness.results import ResultRow, ResultTable, Suite
+from ..harness.results import ResultTable, Suite
 from ..harness.stats import Estimate, interval
 from ..harness.verdict import format_percent, format_verdict
+from ..report.study import add_rows, import_figures
 
 ID = "sideslip/LinearYawVision-v0"
 PERIOD, _STEP = 0.04, 0.01  # s, of pictures and of control
@@ -100,16 +99,11 @@ def _compute_best(condition: str, budget: Budget) -> Optimum:
     return compute_optimum(gym.make(ID, **options), n)
 
 
-def make_cases(
-    quick: bool, episodes: int | None = None, conditions: Sequence[str] = (), seeds: int = SEEDS
-) -> list[MemoryCase]:
+def _make_cases(quick: bool, episodes: int | None = None) -> list[MemoryCase]:
     """Make the cases of a run, the repeated seeds last; arguments as of `run`."""
     from ...agents.training.recurrent import MEMORIES
 
-    for item in conditions:
-        check_choice("condition", item, CONDITIONS)
-    budget, default = (QUICK, (REPEATED,)) if quick else (Budget(), tuple(CONDITIONS))
-    conditions = list(dict.fromkeys((REPEATED, *conditions))) if conditions else default
+    budget, conditions = (QUICK, (REPEATED,)) if quick else (Budget(), tuple(CONDITIONS))
     count = episodes or (QUICK_EPISODES if quick else EPISODES)
     pairs = product(conditions, (FILTER, *MEMORIES))
     cases = [MemoryCase(name, condition, 0, budget, count) for condition, name in pairs]
@@ -117,7 +111,7 @@ def make_cases(
         cases.append(MemoryCase(PPO, REPEATED, 0, budget, count))
         memories = [case for case in cases if case.learner in MEMORIES]
         repeated = [case for case in memories if case.condition == REPEATED]
-        cases += [replace(item, seed=seed) for seed in range(1, seeds) for item in repeated]
+        cases += [replace(item, seed=seed) for seed in range(1, SEEDS) for item in repeated]
     return cases
 
 
@@ -140,7 +134,14 @@ class MemoryResult(NamedTuple):
         return interval(self.excess / self.best)
 
     def compute_paired_gap(self, reference: "MemoryResult") -> Estimate:
-        """Compute the gap from the costs, over the optimum's own policy on the same seeds."""
+        """Compute the gap from the costs.
+
+        Args:
+            reference: Result of the optimum's own policy on the same seeds.
+
+        Returns:
+            Gap with its interval.
+        """
         return interval((self.costs - reference.costs[: len(self.costs)]) / self.best)
 
 
@@ -164,7 +165,7 @@ def _evaluate_agent(
     return best.excess(np.stack(read, 1), np.stack(actions, 1)), costs
 
 
-def run_case(case: MemoryCase) -> MemoryResult:
+def _run_case(case: MemoryCase) -> MemoryResult:
     """Train and judge a case."""
     best, start_time = case.best, time.process_time()
     count = case.episodes * (LQG_FACTOR if case.learner == FILTER else 1)
@@ -197,10 +198,9 @@ def _train_memory(case: MemoryCase) -> tuple[Any, int]:
     budget = case.budget
     twins = wrap_optimal_estimate(_make_cars(case, budget.cars))
     task = DistillTask(CompactObservation(_make_cars(case, budget.cars)), twins, Lqg(twins))
-    rounds, epochs, seed = budget.rounds, budget.epochs, case.seed
-    rate = MEMORIES[case.learner].rate
+    rate, rounds, epochs = MEMORIES[case.learner].rate, budget.rounds, budget.epochs
     config = DistillConfig(
-        rounds=rounds, epochs=epochs, learning_rate=rate, noise=_NOISE, seed=seed
+        rounds=rounds, epochs=epochs, learning_rate=rate, noise=_NOISE, seed=case.seed
     )
     weight, steps = float(case.best.weights[0]), list[int]()
     arguments = (case.learner, task, config, case.delay_steps, weight)
@@ -223,21 +223,21 @@ def _train_ppo(case: MemoryCase, cars: Any) -> Any:
 
 @dataclass(frozen=True)
 class CaseCache:
-    """`run_case` behind a folder of results; None keeps nothing."""
+    """`_run_case` behind a folder of results; None keeps nothing."""
 
     folder: Path | None
 
     def __call__(self, case: MemoryCase) -> MemoryResult:
         """Return the case's result, from the folder if it is there."""
         if self.folder is None:
-            return run_case(case)
+            return _run_case(case)
         sources = Path(__file__).read_text()  # beside agents and case, all that numbers depend on
         text = hash_experiment() + sources + json.dumps(asdict(case) | case.options)
         path = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:_LETTERS]}.npz"
         # a damaged file is measured anew
         with contextlib.suppress(Exception), np.load(path, allow_pickle=False) as saved:
             return MemoryResult(*(saved[name] for name in MemoryResult._fields))
-        result = run_case(case)
+        result = _run_case(case)
         with contextlib.suppress(OSError):  # a full disk loses the file, not the run
             path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_file(path) as file:
@@ -265,8 +265,6 @@ def run(
     jobs: int | None = None,
     console: Console | None = None,
     keep: Path | None = None,
-    conditions: Sequence[str] = (),
-    seeds: int = SEEDS,
 ) -> Suite:
     """Train and judge all in every condition; quick: in one, little, and without PPO.
 
@@ -276,8 +274,6 @@ def run(
         jobs: Processes, None for all processors.
         console: Where progress is shown.
         keep: Folder in which finished cases stay.
-        conditions: Names in `CONDITIONS`, none for all; `REPEATED` is always among them.
-        seeds: Trainings of each memory in `REPEATED`.
 
     Returns:
         Suite with verdict, tables and a figure.
@@ -286,12 +282,12 @@ def run(
     if find_spec("torch") is None:
         suite.verdict = 'Not trained: it needs torch, pip install "sideslip[train]".'
         return suite
-    cases = make_cases(quick, episodes, conditions, seeds)
+    cases = _make_cases(quick, episodes)
     outcomes = run_cases(CaseCache(keep and keep.absolute()), cases, NAME, jobs, console)
     results: dict[str, dict[str, list[MemoryResult]]] = {}
     for case, outcome in zip(cases, outcomes, strict=True):
         results.setdefault(case.learner, {}).setdefault(case.condition, []).append(outcome)
-    suite.verdict = make_verdict(results)
+    suite.verdict = _make_verdict(results)
     _add_tables(suite, results)
     _draw(suite, results)
     return suite
@@ -302,7 +298,7 @@ def _average_seeds(runs: Sequence[MemoryResult]) -> MemoryResult:
     return MemoryResult(*(np.mean(arrays, axis=0) for arrays in zip(*runs, strict=True)))
 
 
-def make_verdict(results: Results) -> str:
+def _make_verdict(results: Results) -> str:
     """Compose the verdict."""
     gaps, mean = dict[str, dict[str, Estimate]](), dict[str, float]()
     for learner in (name for name in results if name not in (FILTER, PPO)):
@@ -351,9 +347,7 @@ def _add_tables(suite: Suite, results: Results) -> None:
         gaps.append([learner, *texts])
         for condition, number in numbers.items():
             n = len(learner_runs[condition][0].costs)
-            columns = {"scenario": condition, "controller": learner, "n": n}
-            common = {"suite": NAME, "salt": "fixed", "env_version": f"{ID} {__version__}"}
-            suite.rows.append(ResultRow.from_estimate("gap", number, **columns, **common))
+            add_rows(suite, {"gap": number}, ID, scenario=condition, controller=learner, n=n)
         if learner != FILTER:
             runs = learner_runs[REPEATED]
             seeds = ", ".join(f"{100.0 * result.gap().value:.1f}" for result in runs)
@@ -379,17 +373,14 @@ def _draw(suite: Suite, results: Results) -> None:
     late = {name: camera for name, camera in CONDITIONS.items() if "loss" not in camera}
     measured = [(1e3 * late[name]["delays"][0], name) for name in late if name in results[FILTER]]
     delays = dict(sorted(measured))
-    if find_spec("plotly") is None or len(delays) < 2:
+    if len(delays) < 2 or (figures := import_figures()) is None:
         return
-    from ..report.figures import draw_curves
-
     series = {}
     for learner in results:
         if set(delays.values()) <= set(results[learner]) and learner != FILTER:
             gaps = [_average_seeds(results[learner][name]).gap() for name in delays.values()]
-            value, low, high = 100.0 * np.array(gaps).T
-            series[learner] = value, low, high
+            series[learner] = tuple(100.0 * np.array(gaps).T)
     labels = ("delay of the pictures / ms", "cost over the optimum / %")
-    figure = draw_curves(np.array(list(delays)), series, *labels, log="y")
+    figure = figures.draw_curves(np.array(list(delays)), series, *labels, log="y")
     question = "How much of the optimum does each memory find?"
     suite.answers.append((question, figure, suite.verdict.splitlines()[0]))

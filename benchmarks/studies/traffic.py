@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from ... import __version__
 from ...agents import make_agent
 from ...agents.baselines import make_oracle
 from ...agents.rollout import iterate_steps
@@ -28,9 +27,10 @@ from ..control.entries import (
 from ..control.tasks import ORACLES, STATE, ControlTask
 from ..harness.drives import call_quietly, make_env
 from ..harness.parallel import run_cases, split_seeds
-from ..harness.results import ResultRow, ResultTable, Suite
+from ..harness.results import ResultTable, Suite
 from ..harness.stats import Estimate, interval, ratio_of_means, root_mean, share
 from ..harness.verdict import format_percent, format_verdict
+from ..report.study import add_rows
 
 _NAME, ID = "highway", "sideslip/Highway-v0"
 _TASK = ControlTask("", ID, "passenger-car", "lagged", "wet-evasion")
@@ -54,7 +54,7 @@ highway-env's own lane keeping: our record (gyro, camera 30 ms late) built from 
 filters and `lane-keeping` on it, beside the noisy state that highway-env observes itself."""
 
 
-def simulate_swerve(case: tuple[str, tuple[int, ...]]) -> Array:
+def _simulate_swerve(case: tuple[str, tuple[int, ...]]) -> Array:
     """Run a controller on some seeds: cost, failure and largest slip (rad), shape (seeds, 3)."""
     controller, seeds = case
     entry = ControlEntry(_TASK, _READS.get(controller, REFERENCE_FILTER), controller)
@@ -74,7 +74,7 @@ def simulate_swerve(case: tuple[str, tuple[int, ...]]) -> Array:
     return np.array(rows)
 
 
-def keep_lane(case: tuple[str, int]) -> Array:
+def _keep_lane(case: tuple[str, int]) -> Array:
     """Drive with a reader and a seed: RMS of five numbers in the second half, shape (5,).
 
     Errors of slip, yaw rate, heading (rad, rad/s) and the preview point's offset (m); the car's
@@ -104,20 +104,30 @@ def run(
     jobs: int | None = None,
     console: Console | None = None,
 ) -> Suite:
-    """Answer both questions; seeds of the swerve, drives of the lane keeping."""
+    """Answer both questions.
+
+    Args:
+        seeds: Seeds of the swerve.
+        drives: Drives of the lane keeping.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+
+    Returns:
+        Suite; without rows where highway-env is not installed.
+    """
     suite = Suite(_NAME, "Swerving among other vehicles, on highway-env's roads", _TEXT)
     if find_spec("highway_env") is None:
         suite.verdict = 'Not driven: it needs highway-env, pip install "sideslip[highway]".'
         return suite
     chunks = split_seeds(seeds, _CHUNK)
     cases, lane_cases = list(product(CONTROLLERS, chunks)), list(product(READERS, range(drives)))
-    parts = iter(run_cases(simulate_swerve, cases, _NAME, jobs, console))
+    parts = iter(run_cases(_simulate_swerve, cases, _NAME, jobs, console))
     swerves = {name: np.concatenate([next(parts) for _ in chunks]) for name in CONTROLLERS}
-    rows = iter(run_cases(keep_lane, lane_cases, KEEPING, jobs, console))
+    rows = iter(run_cases(_keep_lane, lane_cases, KEEPING, jobs, console))
     lanes = {reader: np.array([next(rows) for _ in range(drives)]) for reader in READERS}
     _add_swerves(suite, swerves)
     _add_lanes(suite, lanes)
-    suite.verdict = compose_verdict(swerves, lanes)
+    suite.verdict = _compose_verdict(swerves, lanes)
     return suite
 
 
@@ -126,7 +136,7 @@ def _compute_end_rate(numbers: Array, cause: str) -> Estimate:
     return share(numbers[:, 1] == FAILURES.index(cause))
 
 
-def compose_verdict(swerves: Mapping[str, Array], lanes: Mapping[str, Array]) -> str:
+def _compose_verdict(swerves: Mapping[str, Array], lanes: Mapping[str, Array]) -> str:
     """Compose the verdict from `simulate_swerve` by controller and `keep_lane` by reader."""
     success = {name: _compute_end_rate(numbers, "none") for name, numbers in swerves.items()}
     names = [name for name in success if name not in ("none", ORACLE)]
@@ -160,8 +170,8 @@ def _add_swerves(suite: Suite, swerves: Mapping[str, Array]) -> None:
         cells.append([controller, *texts, f"{np.degrees(slip.value):.2f}"])
         metrics = {"success_rate": success, "ratio": cost, "peak_slip": slip}
         metrics |= {f"{cause}_rate": rate for cause, rate in ends.items()}
-        labels = {"controller": controller, "estimator": _READS.get(controller, REFERENCE_FILTER)}
-        _add_rows(suite, _TASK.scenario, metrics, len(numbers), **labels)
+        columns = {"controller": controller, "estimator": _READS.get(controller, REFERENCE_FILTER)}
+        add_rows(suite, metrics, ID, scenario=_TASK.scenario, n=len(numbers), **columns)
     header = ("controller", "success / %", "95 % interval", *(f"{cause} / %" for cause in _ENDS))
     more = ("cost / none's / %", "95 % interval", "peak slip / deg")
     note = (
@@ -179,19 +189,9 @@ def _add_lanes(suite: Suite, lanes: Mapping[str, Array]) -> None:
         shown = [f"{1e3 * error.value:.1f}" for error in (slip, rate, heading)]
         texts = (f"{100.0 * preview_offset.value:.1f}", *offset.text(1.0, ".2f"))
         cells.append([reader, *shown, *texts])
-        labels = {"controller": "lane-keeping", "estimator": reader}
-        _add_rows(suite, KEEPING, {"rmse": slip, "offset": offset}, len(numbers), **labels)
+        columns = {"controller": "lane-keeping", "estimator": reader, "scenario": KEEPING}
+        add_rows(suite, {"rmse": slip, "offset": offset}, ID, n=len(numbers), **columns)
     header = ("reads", "slip / mrad", "yaw rate / (mrad/s)", "heading / mrad", "y_l / cm")
     where = ("off the centre / m", "95 % interval")
     note = "RMS errors of what the controller reads, and where the car was, from half time on."
     suite.tables.append(ResultTable("highway-env's lane keeping", (*header, *where), cells, note))
-
-
-def _add_rows(
-    suite: Suite, scenario: str, metrics: Mapping[str, Estimate], n: int, **labels: str
-) -> None:
-    common = {"suite": _NAME, "salt": "fixed", "env_version": f"{ID} {__version__}"}
-    suite.rows += [
-        ResultRow.from_estimate(metric, number, scenario=scenario, n=n, **labels, **common)
-        for metric, number in metrics.items()
-    ]

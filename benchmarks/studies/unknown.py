@@ -16,16 +16,16 @@ import gymnasium as gym
 import numpy as np
 from rich.console import Console
 
-from ... import __version__
 from ...envs.record import FAST, PACKET, Array, Log
 from ...envs.vehicle.parameters import Vehicle
 from ...estimators.design.options import DISTURBANCE, NOISE
 from ...estimators.make import make_estimator
 from ..harness.drives import SETTLED, call_quietly, make_filter_arguments
 from ..harness.parallel import run_cases
-from ..harness.results import ResultRow, ResultTable, Suite
+from ..harness.results import ResultTable, Suite
 from ..harness.stats import Estimate, interval, mean, mean_share, ratio_of_roots, root_mean
 from ..harness.verdict import format_verdict
+from ..report.study import add_rows, import_figures
 from .unknown_conditions import (
     CAMERA,
     CONDITIONS,
@@ -45,53 +45,44 @@ from .unknown_conditions import (
 BOUND = "the bound"
 
 
-def _make_columns(condition: Condition, result: ConditionResult) -> dict[str, Any]:
-    """The columns that the rows of a condition share."""
-    common = {"suite": NAME, "scenario": condition.name, "salt": "fixed"}
-    version = f"{condition.env_id} {__version__}"
-    return common | {"env_version": version, "n": len(result.best)}
-
-
 def _add_rows(
-    suite: Suite, numbers: Mapping[str, Estimate], label: str, columns: Mapping[str, object]
+    suite: Suite,
+    condition: Condition,
+    result: ConditionResult,
+    label: str,
+    numbers: Mapping[str, Estimate],
 ) -> None:
-    """Rows of an estimator's numbers by metric."""
-    suite.rows += [
-        ResultRow.from_estimate(metric, number, estimator=label, **columns)
-        for metric, number in numbers.items()
-    ]
+    """Add rows of an estimator's numbers by metric in a condition."""
+    columns = {"scenario": condition.name, "estimator": label}
+    add_rows(suite, numbers, condition.env_id, n=len(result.best), **columns)
 
 
 def _add_curve(suite: Suite, curve: Curve, results: Sequence[ConditionResult]) -> None:
     """Rows and a figure of a curve; no figure where plotly is not installed."""
     lines = dict[str, list[Estimate]]()
     for condition, result in zip(curve.conditions(), results, strict=True):
-        columns = _make_columns(condition, result)
         for label in results[0].labels:
             squares, nees, _ = result.select(label)
             numbers = {"rmse": interval(squares, root_mean), "nees": interval(nees, mean)}
             if condition.bounded:
                 numbers["rmse_over_bound"] = interval(squares, ratio_of_roots, result.best)
-            _add_rows(suite, numbers, label, columns)
+            _add_rows(suite, condition, result, label, numbers)
             lines.setdefault(label, []).append(numbers["rmse"])
         if condition.bounded:
             best = interval(result.best, root_mean)
-            _add_rows(suite, {"rmse": best}, BOUND, columns)
+            _add_rows(suite, condition, result, BOUND, {"rmse": best})
             lines.setdefault(BOUND, []).append(best)
-    try:
-        from ..report.figures import draw_curves
-    except ModuleNotFoundError:
+    if (figures := import_figures()) is None:
         return
     series = {label: _split_line(values, 1e3) for label, values in lines.items()}
     unit = "RMSE of the sideslip angle / mrad"
-    figure = draw_curves(np.array(curve.values), series, curve.label, unit, curve.log)
+    figure = figures.draw_curves(np.array(curve.values), series, curve.label, unit, curve.log)
     suite.answers.append((curve.question, figure, _describe_range(lines, results)))
 
 
-def _split_line(line: Sequence[Estimate], scale: float) -> tuple[Array, Array, Array]:
+def _split_line(line: Sequence[Estimate], scale: float) -> tuple[Array, ...]:
     """Values, lows and highs of a line."""
-    value, low, high = scale * np.array(line).T
-    return value, low, high
+    return tuple(scale * np.array(line).T)
 
 
 def _describe_range(
@@ -131,14 +122,11 @@ def _add_reliability(suite: Suite, results: Sequence[ConditionResult]) -> None:
             inside = np.array([np.mean(item, axis=0) for item in by_seed.values()])
             line = [mean_share(column) for column in inside.T]
             shares[f"{label}, {kind}"] = line
-            columns = _make_columns(*selected[0])
-            columns |= {"scenario": f"all with {kind}", "n": len(inside)}
             pairs = zip(LEVELS, line, strict=True)
             numbers = {f"covered_{100.0 * level:.0f}": covered for level, covered in pairs}
-            _add_rows(suite, numbers, label, columns)
-    try:
-        from ..report.figures import draw_curves
-    except ModuleNotFoundError:
+            columns = {"scenario": f"all with {kind}", "estimator": label}
+            add_rows(suite, numbers, selected[0][0].env_id, n=len(inside), **columns)
+    if (figures := import_figures()) is None:
         return
     percent = 100.0 * np.array(LEVELS)
     series: dict[str, Any] = {label: _split_line(line, 1e2) for label, line in shares.items()}
@@ -148,7 +136,7 @@ def _add_reliability(suite: Suite, results: Sequence[ConditionResult]) -> None:
     text = "; ".join(f"{label} {100.0 * line[at].value:.0f} %" for label, line in shares.items())
     question = "Do the intervals hold what they promise?"
     text = f"In the interval of 90 % are: {text}. Below the diagonal a filter is too sure."
-    suite.answers.append((question, draw_curves(percent, series, *labels), text))
+    suite.answers.append((question, figures.draw_curves(percent, series, *labels), text))
 
 
 def _make_parts_table(suite: Suite, results: Sequence[ConditionResult]) -> ResultTable:
@@ -156,12 +144,11 @@ def _make_parts_table(suite: Suite, results: Sequence[ConditionResult]) -> Resul
     cells = [[label] for label in WITHOUT]
     for condition, result in zip(PARTS, results, strict=True):
         complete_squares = result.select(next(iter(WITHOUT)))[0]
-        columns = _make_columns(condition, result)
         for line, label in zip(cells, WITHOUT, strict=True):
             squares = result.select(label)[0]
             error = interval(squares, root_mean)
             ratio = interval(squares, ratio_of_roots, complete_squares)
-            _add_rows(suite, {"rmse": error, "ratio": ratio}, label, columns)
+            _add_rows(suite, condition, result, label, {"rmse": error, "ratio": ratio})
             line.append(f"{1e3 * error.value:.2f} ({ratio.value:.2f})")
     title = "What each part of joint saves: RMSE / mrad, and over the complete one's "
     note = (
@@ -178,7 +165,16 @@ _COVERED = (0.5, 0.8, 0.95)
 
 
 def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = None) -> Suite:
-    """Run all conditions on the seeds 0 .. seeds-1; curves, parts on the first quarter of many."""
+    """Run all conditions; curves and parts on the first quarter of many seeds.
+
+    Args:
+        seeds: Number of seeds.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+
+    Returns:
+        Suite.
+    """
     few = min(seeds, max(seeds // 4, QUICK_SEEDS))
     results = measure_all(CONDITIONS, seeds, NAME, jobs, console)
     curve_conditions = [condition for curve in CURVES for condition in curve.conditions()]
@@ -210,7 +206,7 @@ def run(seeds: int = SEEDS, jobs: int | None = None, console: Console | None = N
             best = interval(exact_squares, ratio_of_roots, item.best)
             ratios[condition.name] = {"joint": known, "exact-kf": best}
         theory = numbers["rmse_over_own"] = interval(joint_squares, ratio_of_roots, variances)
-        _add_rows(suite, numbers, "joint", _make_columns(condition, item))
+        _add_rows(suite, condition, item, "joint", numbers)
         lines.append([
             condition.name, str(len(nees)), str(item.left_out), _format_ratio(known),
             _format_ratio(saved),
@@ -247,16 +243,15 @@ def _make_race_table(
     if find_spec("filterpy") is None:
         return []
     cases = list(product(DELAYS.values(), range(seeds)))
-    results = run_cases(compare_filters, cases, f"{NAME}: FilterPy", jobs, console)
+    results = run_cases(_compare_filters, cases, f"{NAME}: FilterPy", jobs, console)
     errors = np.reshape(results, (-1, seeds, 3, 2))
     cells = []
     for name, values in zip(DELAYS, errors, strict=True):
         for i, label in enumerate(("joint", "FilterPy")):
             error = interval(values[:, i, 0], ratio_of_roots, values[:, 2, 0])
             us = Estimate(float(np.median(values[:, i, 1])))
-            columns = {"suite": NAME, "scenario": name, "salt": "fixed", "n": seeds}
-            columns["env_version"] = f"{CAMERA} {__version__}"
-            _add_rows(suite, {"rmse_over_bound": error, "us_per_tick": us}, label, columns)
+            numbers = {"rmse_over_bound": error, "us_per_tick": us}
+            add_rows(suite, numbers, CAMERA, scenario=name, estimator=label, n=seeds)
             cells.append([name, label, _format_ratio(error), f"{us.value:.3g}"])
     head = ("camera", "filter", "over the bound", "CPU us a tick")
     text = "The same eight states; FilterPy's takes a frame as it arrives. "
@@ -288,13 +283,11 @@ def _compose_verdict(
 
 def _draw_figures(suite: Suite, ratios: Mapping[str, Mapping[str, Estimate]]) -> None:
     """One picture; nothing where plotly is not installed."""
-    try:
-        from ..report.figures import draw_groups
-    except ModuleNotFoundError:
+    if (figures := import_figures()) is None:
         return
     label = "error / that of a filter that knows the tyres: less is better"
     groups = {name: dict(numbers) for name, numbers in ratios.items()}
-    bars = draw_groups(groups, label, {1.0: "knows the tyres"})
+    bars = figures.draw_groups(groups, label, {1.0: "knows the tyres"})
     text = suite.verdict.splitlines()[1]
     suite.answers.append(("What does it cost not to know the tyres?", bars, text))
 
@@ -373,7 +366,7 @@ class _FilterPyEkf:
         return slips
 
 
-def compare_filters(case: tuple[float, int]) -> Array:
+def _compare_filters(case: tuple[float, int]) -> Array:
     """Compare mean squared error of beta and CPU time per tick (us): joint, FilterPy's, the bound.
 
     case: The camera's delay (s) and a seed. Shape (3, 2), without a time of the bound.

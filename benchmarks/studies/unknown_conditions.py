@@ -4,11 +4,11 @@ A condition's drives are recorded once; every filter runs over the same records,
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -18,8 +18,10 @@ from scipy.stats import norm
 from ...agents.baselines import compute_range_rms
 from ...agents.rollout import iterate_steps
 from ...envs.record import FAST, Array, Log, Record, concatenate
+from ...envs.scenarios.scenario import Scenario
 from ...envs.vehicle.parameters import Vehicle
 from ...estimators.analysis.bound import Gust, VehicleChange, compute_error_bound
+from ...estimators.estimator import Estimator
 from ...estimators.make import make_estimator
 from ..harness.drives import SETTLED, call_quietly, make_filter_arguments
 from ..harness.parallel import run_cases, split_seeds
@@ -243,21 +245,39 @@ _Z = norm.ppf(0.5 + 0.5 * np.array(LEVELS))
 _CHUNK = 16
 
 
+class _SeedResult(NamedTuple):
+    """Results of an episode."""
+
+    seed: int
+    squares: Array  # mean squared errors (rad2), shape (filters,)
+    best: float  # mean square of the bound (rad2), NaN where there is none
+    nees: Array  # normalised squared errors, shape (filters,)
+    inside: Array  # fractions of the errors within `LEVELS`, shape (filters, levels)
+    variances: Array  # the filters' own variances (rad2), shape (filters,)
+
+
 @dataclass
 class ConditionResult:
-    """Results of the seeds whose episodes did not end early."""
+    """Results of the seeds whose episodes did not end early, as those of `_SeedResult`."""
 
     labels: tuple[str, ...]  # labels of the filters
     seeds: tuple[int, ...]  # seeds of the episodes
-    squares: Array  # mean squared errors (rad2), shape (seeds, filters)
-    best: Array  # mean squares of the bound (rad2), NaN where there is none, shape (seeds,)
-    nees: Array  # normalised squared errors, shape (seeds, filters)
-    inside: Array  # fractions of the errors within `LEVELS`, shape (seeds, filters, levels)
-    variances: Array  # the filters' own variances (rad2), shape (seeds, filters)
+    squares: Array  # shape (seeds, filters)
+    best: Array  # shape (seeds,)
+    nees: Array  # shape (seeds, filters)
+    inside: Array  # shape (seeds, filters, levels)
+    variances: Array  # shape (seeds, filters)
     left_out: int  # number of episodes that ended early
 
     def select(self, label: str) -> tuple[Array, Array, Array]:
-        """Return squares (seeds,), NEES (seeds,) and fractions (seeds, levels) of a filter."""
+        """Select the numbers of a filter.
+
+        Args:
+            label: Label of the filter.
+
+        Returns:
+            Squares (seeds,), NEES (seeds,) and fractions (seeds, levels).
+        """
         at = self.labels.index(label)
         return self.squares[:, at], self.nees[:, at], self.inside[:, at]
 
@@ -269,38 +289,51 @@ def measure_all(
     jobs: int | None = None,
     console: Console | None = None,
 ) -> list[ConditionResult]:
-    """Measure every condition on the seeds 0 .. seeds-1."""
-    cases = list(product(conditions, split_seeds(seeds, _CHUNK)))
-    results = iter(run_cases(measure, cases, title, jobs, console))
-    return [_join_results([next(results) for _ in split_seeds(seeds, _CHUNK)]) for _ in conditions]
+    """Measure every condition on the same seeds.
+
+    Args:
+        conditions: Conditions.
+        seeds: Number of seeds.
+        title: Title of the progress bar.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+
+    Returns:
+        Result of each condition.
+    """
+    chunks = split_seeds(seeds, _CHUNK)
+    done = iter(run_cases(_measure_chunk, list(product(conditions, chunks)), title, jobs, console))
+    return [_join_results(item, [x for _ in chunks for x in next(done)]) for item in conditions]
 
 
-def _join_results(parts: Sequence[ConditionResult]) -> ConditionResult:
-    squares, best, nees, inside, variances = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("squares", "best", "nees", "inside", "variances")
+def _join_results(condition: Condition, parts: Sequence[_SeedResult | None]) -> ConditionResult:
+    labels, driven = tuple(condition.all_filters), [part for part in parts if part is not None]
+    shape = (-1, len(labels))
+    return ConditionResult(
+        labels,
+        tuple(part.seed for part in driven),
+        np.reshape([part.squares for part in driven], shape),
+        np.array([part.best for part in driven]),
+        np.reshape([part.nees for part in driven], shape),
+        np.reshape([part.inside for part in driven], (*shape, len(LEVELS))),
+        np.reshape([part.variances for part in driven], shape),
+        len(parts) - len(driven),
     )
-    left_out = sum(part.left_out for part in parts)
-    seeds = tuple(seed for part in parts for seed in part.seeds)
-    return ConditionResult(parts[0].labels, seeds, squares, best, nees, inside, variances, left_out)
 
 
-def measure(case: tuple[Condition, Iterable[int]]) -> ConditionResult:
-    """Drive some seeds of a condition, and run its filters over the records."""
+def _measure_chunk(case: tuple[Condition, Sequence[int]]) -> list[_SeedResult | None]:
+    """Drive some seeds of a condition, and run its filters over the records; None: ended early."""
     condition, seeds = case
     scenario = LINEAR | dict(condition.scenario)
     car = condition.vehicle
     env: Any = gym.make(condition.env_id, scenario=scenario, control_period=10, vehicle=car)
-    filters, left_out = dict[str, Any](), 0
-    labels = tuple(condition.all_filters)
-    squares, nees, inside, best, variances, driven_seeds = (list[Any]() for _ in range(6))
+    filters, results = dict[str, Estimator](), list[_SeedResult | None]()
     for seed in seeds:
         episode = _run_episode(env, seed)
         if episode is None:
-            left_out += 1
+            results.append(None)
             continue
         log, cars = episode
-        driven_seeds.append(seed)
         settled = log.time >= condition.since - 1e-9
         if not filters or _TRUE in filters:  # else only clocks differ, and the log has them
             filters = _make_filters(condition, env.unwrapped, log)
@@ -309,25 +342,30 @@ def measure(case: tuple[Condition, Iterable[int]]) -> ConditionResult:
             estimates = filter_.run(felt)
             errors.append((estimates["beta"] - log.truth["beta"])[settled])
             sds.append(estimates.std[settled, estimates.names.index("beta")])
-        sizes = np.abs(errors) / sds
-        squares.append(np.mean(np.square(errors), axis=1))
-        nees.append(np.mean(sizes**2, axis=1))
-        variances.append(np.mean(np.square(sds), axis=1))
-        inside.append(np.mean(sizes[:, :, None] < _Z, axis=1))
+        sizes, best = np.abs(errors) / sds, np.nan
+        squares, variances = (np.mean(np.square(x), axis=1) for x in (errors, sds))
+        inside = np.mean(sizes[:, :, None] < _Z, axis=1)
         if condition.bounded:
             bound = _compute_bound(env.unwrapped, log, cars, condition.gyro_late)
-            best.append(np.mean(bound[settled] ** 2))
-        else:
-            best.append(np.nan)
-    n = len(labels)
-    square, normalised, variance = (np.reshape(x, (-1, n)) for x in (squares, nees, variances))
-    shares, driven = np.reshape(inside, (-1, n, len(LEVELS))), tuple(driven_seeds)
-    tables = (square, np.array(best), normalised, shares, variance)
-    return ConditionResult(labels, driven, *tables, left_out)
+            best = float(np.mean(bound[settled] ** 2))
+        nees = np.mean(sizes**2, axis=1)
+        results.append(_SeedResult(seed, squares, best, nees, inside, variances))
+    return results
 
 
-def run_with_bound(env: Any, seed: int) -> tuple[Log, Array]:
-    """Return an episode's record, the bound (rad) at every row; RuntimeError if it ends early."""
+def run_with_bound(env: gym.Env[Any, Any], seed: int) -> tuple[Log, Array]:
+    """Run an episode with its bound.
+
+    Args:
+        env: Env.
+        seed: Seed of the episode.
+
+    Returns:
+        Record, and the bound (rad) at every row.
+
+    Raises:
+        RuntimeError: The episode ends early.
+    """
     episode = _run_episode(env, seed)
     if episode is None:
         raise RuntimeError(f"the episode of seed {seed} ends early")
@@ -343,9 +381,10 @@ def _delay_gyro(log: Log, late: float) -> Log:
     return dataclasses.replace(log, record=dataclasses.replace(log.record, fast=fast))
 
 
-def _run_episode(env: Any, seed: int) -> tuple[Log, tuple[Vehicle, Vehicle]] | None:
+def _run_episode(env: gym.Env[Any, Any], seed: int) -> tuple[Log, tuple[Vehicle, Vehicle]] | None:
     """Record with the true sideslip angle, car at start and end; None where it ended early."""
-    base, records, times, slips = env.unwrapped, list[Record](), [], []
+    base: Any = env.unwrapped
+    records, times, slips = list[Record](), [], []
     for step in iterate_steps(env, None, seed):
         if not records:
             first = base.vehicle
@@ -359,12 +398,12 @@ def _run_episode(env: Any, seed: int) -> tuple[Log, tuple[Vehicle, Vehicle]] | N
     return Log(record, base.slow_sensors, truth), (first, base.vehicle)
 
 
-def _get_levels(scenario: Any) -> dict[str, Any]:
+def _get_levels(scenario: Scenario) -> dict[str, Any]:
     """The true levels of disturbances, as options of a filter."""
     return {"force_sd": scenario.disturbance_force, "moment_sd": scenario.disturbance_moment}
 
 
-def _make_filters(condition: Condition, base: Any, log: Log) -> dict[str, Any]:
+def _make_filters(condition: Condition, base: Any, log: Log) -> dict[str, Estimator]:
     facts, filters = make_filter_arguments(base) | {"slow": list(log.slow)}, {}
     true = facts | {"vehicle": base.vehicle} | _get_levels(base.scenario)
     for label, (name, options) in condition.all_filters.items():

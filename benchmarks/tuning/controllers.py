@@ -31,7 +31,7 @@ from ..control.tasks import ControlTask, list_candidates, list_scored_tasks
 from ..harness.parallel import count_cores, run_cases
 from ..harness.results import Suite, write_text
 from .estimator import STORAGE
-from .study import make_result_table
+from .study import create_study, make_result_table, run_search
 
 KINDS = ("coms-model", "coms-zero-slip", "car-yaw", "car-steering")
 """Classes of tasks."""
@@ -110,19 +110,19 @@ LOGS = Path(__file__).with_name("logs")
 _UNTUNED: Options = {"filter": {}, "controller": {}}
 
 
-def get_space(name: str, kind: str) -> tuple[SearchNumber, ...]:
+def _get_space(name: str, kind: str) -> tuple[SearchNumber, ...]:
     """Get the numbers of a controller in a class of tasks; ValueError for unknown names."""
     check_choice("controller", name, SPACES)
     check_choice("class", kind, KINDS)
     return tuple(number for number in SPACES[name] if kind in STEERING or not number.steering)
 
 
-def make_options(numbers: tuple[SearchNumber, ...], values: Mapping[str, float]) -> Options:
+def _make_options(numbers: tuple[SearchNumber, ...], values: Mapping[str, float]) -> Options:
     """Make the options of filter and controller from the values of numbers by name."""
     options: dict[str, dict[str, Any]] = {"filter": {}, "controller": {}}
     for number in numbers:
         name, _, index = number.name.partition(".")
-        value = round(values[number.name]) if number.is_integer else float(values[number.name])
+        value = (round if number.is_integer else float)(values[number.name])
         for part in number.of:
             if index:
                 options[part].setdefault(name, []).append(value)
@@ -159,25 +159,44 @@ class ControllerTuning:
         return {number.name: number.start for number in self.numbers}
 
     def options(self, values: dict[str, float]) -> Options:
-        """Make the options from values of the numbers, rounded to three digits."""
-        return make_options(self.numbers, {name: float(f"{v:.3g}") for name, v in values.items()})
+        """Make the options from values of the numbers, rounded to three digits.
+
+        Args:
+            values: Value of each number by name.
+
+        Returns:
+            Options of filter and controller.
+        """
+        return _make_options(self.numbers, {name: float(f"{v:.3g}") for name, v in values.items()})
 
 
 def make_controller_tuning(name: str, kind: str, seeds: Sequence[int]) -> ControllerTuning:
-    """Make the search; ValueError for an unknown name or class, no tasks and no seeds."""
-    numbers, matching = get_space(name, kind), list_contests(name, kind)
+    """Make the search of a controller's options.
+
+    Args:
+        name: Name of the controller.
+        kind: Class of tasks.
+        seeds: Tuning seeds.
+
+    Returns:
+        Search.
+
+    Raises:
+        ValueError: The name or class is unknown, or there are no tasks or no seeds.
+    """
+    numbers, matching = _get_space(name, kind), _list_contests(name, kind)
     if not matching or not seeds:
         raise ValueError(f"{kind}: {len(matching)} contests, {len(seeds)} seeds; both are needed")
     return ControllerTuning(name, kind, tuple(matching), tuple(seeds), numbers)
 
 
-def list_contests(name: str, kind: str) -> list[ControlTask]:
+def _list_contests(name: str, kind: str) -> list[ControlTask]:
     """List the scored tasks of a class; for an oracle all candidates, chosen by its costs."""
     tasks = list_candidates() if name in ORACLES else list_scored_tasks()
     return [task for task in tasks if task.kind == kind]
 
 
-def run_contestant(
+def _run_contestant(
     contest: ControlTask, name: str, options: Options, seeds: tuple[int, ...]
 ) -> DriveResult:
     """Run a controller on a task with some options, an episode for each seed."""
@@ -188,16 +207,16 @@ def run_contestant(
 
 @lru_cache(maxsize=64)
 def _compute_nominal_costs(contest: ControlTask, seeds: tuple[int, ...]) -> Array:
-    return run_contestant(contest, NOMINAL, _UNTUNED, seeds).costs
+    return _run_contestant(contest, NOMINAL, _UNTUNED, seeds).costs
 
 
-def compute_objective(
+def _compute_objective(
     task: ControllerTuning, seeds: tuple[int, ...], values: dict[str, float]
 ) -> float:
     """Compute the mean over tasks and some seeds; infinite where the design fails."""
     options, log_ratios = task.options(values), []
     for contest in task.contests:
-        result = run_contestant(contest, task.name, options, seeds)
+        result = _run_contestant(contest, task.name, options, seeds)
         if result.error:
             return math.inf
         log_ratios.append(-compute_log_ratios(_compute_nominal_costs(contest, seeds), result))
@@ -217,7 +236,7 @@ def _evaluate_trials(
     for count in (*stages, len(task.seeds)):
         new = task.seeds[done:count]
         trials = [batch[i] for i in remaining]
-        values = run_cases(partial(compute_objective, task, new), trials, jobs=jobs)
+        values = run_cases(partial(_compute_objective, task, new), trials, jobs=jobs)
         for i, value in zip(remaining, values, strict=True):
             results[i] = (results[i][0] * done + value * len(new)) / count, count
         done = count
@@ -235,16 +254,26 @@ def tune(
 ) -> dict[str, Any]:
     """Search for the best options; a search that was stopped goes on.
 
-    Returns the study's log as JSON types. Raises ValueError for a controller that cannot drive a
-    task, no trials, a storage that fails, and where no trial that drove all seeds is finite.
-    """
-    from .study import create_study, run_search
+    Args:
+        task: Search.
+        trials: Trials of the study, the finished ones included.
+        storage: RDB URL or SQLite file.
+        seed: Seed of the sampler.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
 
+    Returns:
+        The study's log as JSON types.
+
+    Raises:
+        ValueError: The controller cannot drive a task, there are no trials, the storage fails, or
+            no trial that drove all seeds is finite.
+    """
     if trials < 1:
         raise ValueError(f"trials must be at least 1, got {trials}")
     options = task.options(task.start)
     for contest in task.contests:  # what cannot be driven at all; kernels are compiled once
-        if error := run_contestant(contest, task.name, options, task.seeds[:1]).error:
+        if error := _run_contestant(contest, task.name, options, task.seeds[:1]).error:
             raise ValueError(f"{task.name} in {contest.name}: {error}")
     study = create_study(task, storage, "tpe", seed)
     if not study.trials:
@@ -281,14 +310,27 @@ def _make_log(task: ControllerTuning, trials: Sequence[Any]) -> dict[str, Any]:
 
 
 def write_log(path: Path, log: dict[str, Any]) -> None:
-    """Write a log as JSON, a trial a line."""
+    """Write a log as JSON, a trial a line.
+
+    Args:
+        path: File.
+        log: Log of `tune`.
+    """
     lines = ",\n  ".join(json.dumps(trial) for trial in log["trials"])
     head = json.dumps({key: value for key, value in log.items() if key != "trials"}, indent=1)
     write_text(path, f'{head[:-2]},\n "trials": [\n  {lines}\n ]\n}}\n')
 
 
 def make_suite(task: ControllerTuning, log: dict[str, Any]) -> Suite:
-    """Make a suite with the numbers that a study found."""
+    """Make a suite with the numbers that a study found.
+
+    Args:
+        task: Search.
+        log: Log of `tune`.
+
+    Returns:
+        Suite with a table.
+    """
     best = log["best"]
     start = math.inf if log["start"] is None else math.exp(log["start"])
     text = (

@@ -123,7 +123,7 @@ def make_estimator_tuning(
         if option in held:
             raise ValueError(f"the option {option} is both held and searched")
         if not _has_option(estimator, option, held, facts):
-            build_estimator(estimator, facts, {**held, option: 1.0})  # raises with what it has
+            _build_estimator(estimator, facts, {**held, option: 1.0})  # raises with what it has
     unit, sensors = filter_.units[states.index(target)], ",".join(filter_.sensors)
     ranges = {option: _check_range(option, limits) for option, limits in searched.items()}
     numbers = tuple(range(FIRST_SEED, FIRST_SEED + seeds))
@@ -139,7 +139,7 @@ def _check_range(option: str, limits: Range | None) -> Range:
     return float(low), float(high)
 
 
-def build_estimator(
+def _build_estimator(
     estimator: str, facts: Mapping[str, Any], options: Mapping[str, Any]
 ) -> Estimator:
     """Build an estimator for an env's facts, without `UnobservableWarning`."""
@@ -157,7 +157,7 @@ def _has_option(
     """Check whether the estimator has an option, whatever number suits it."""
     try:
         options = {**_make_unstable_option(estimator), **held, option: 1e-3}
-        build_estimator(estimator, facts, options)
+        _build_estimator(estimator, facts, options)
     except TypeError:
         return False
     except ValueError:
@@ -180,7 +180,7 @@ def _find_env(
                 env.reset(seed=FIRST_SEED)
                 facts = make_filter_arguments(env.unwrapped)
                 options = {**_make_unstable_option(estimator), **held}
-                filter_ = build_estimator(estimator, facts, options)
+                filter_ = _build_estimator(estimator, facts, options)
         except ValueError as error:
             refused.setdefault(str(error), name)
         else:
@@ -206,7 +206,18 @@ def simulate(
     jobs: int | None,
     console: Console | None,
 ) -> list[LoggedEpisode]:
-    """Simulate the drives of some seeds in each scenario in turn, four a case."""
+    """Simulate the drives of some seeds in each scenario in turn, four a case.
+
+    Args:
+        task: Tuning.
+        seeds: Seeds.
+        title: Title of the progress bar.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+
+    Returns:
+        Drives of the first scenario, then those of the next one.
+    """
     fours = [tuple(seeds[i : i + 4]) for i in range(0, len(seeds), 4)]
     cases = [(task.env_id, scenario, four) for scenario in task.scenarios for four in fours]
     done = run_cases(_simulate_case, cases, title, jobs, console)
@@ -216,9 +227,18 @@ def simulate(
 def compute_squares(
     task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: Mapping[str, float]
 ) -> Array:
-    """Compute the target's mean squared error from `SETTLED` s on, shape (scenarios, seeds).
+    """Compute the target's mean squared error from `SETTLED` s on.
 
-    It is infinite where an estimate is not finite. Raises ValueError where the estimator fails.
+    Args:
+        task: Tuning.
+        drives: Drives of `simulate`.
+        values: Values of the options that are searched.
+
+    Returns:
+        Squared errors, infinite where an estimate is not finite, shape (scenarios, seeds).
+
+    Raises:
+        ValueError: The estimator fails.
     """
     options, turn = task.options | dict(values), 2.0 * math.pi
     errors, filters = np.empty(len(drives)), dict[str, Estimator]()
@@ -226,7 +246,7 @@ def compute_squares(
         clocks = [dataclasses.replace(sensor, phase=0.0) for sensor in facts["sensors"].values()]
         key = repr(facts | {"sensors": clocks})  # a reset sets the clocks' phases
         if key not in filters:
-            filters[key] = build_estimator(task.estimator, facts, options)
+            filters[key] = _build_estimator(task.estimator, facts, options)
         late = log.time >= SETTLED - 1e-9
         with np.errstate(all="ignore"):
             error = (filters[key].run(log)[task.target] - log.truth[task.target])[late]
@@ -238,7 +258,14 @@ def compute_squares(
 
 
 def compute_objective(errors: Array) -> float:
-    """Compute the geometric mean of the scenarios' RMSE from squared errors."""
+    """Compute the geometric mean of the scenarios' RMSE.
+
+    Args:
+        errors: Squared errors, shape (scenarios, seeds).
+
+    Returns:
+        Geometric mean.
+    """
     return float(np.exp(np.mean(np.log(root_mean(errors)))))
 
 
@@ -257,7 +284,9 @@ def update(path: str | Path, entry: dict[str, Any]) -> None:
 
     An old entry's note stays where that entry has a command and the new one has no note.
 
-    entry: Estimator, sensors, command, q by state, and perhaps noise by option and a note.
+    Args:
+        path: File.
+        entry: Estimator, sensors, command, q by state, and perhaps noise by option and a note.
     """
     target = Path(path)
     entries = {_make_key(old): old for old in read_tunings(target)} if target.exists() else {}
@@ -279,7 +308,14 @@ def _format_entry(entry: dict[str, Any]) -> str:
 
 
 def write_tuned(path: str | Path, kind: str, name: str, options: Options) -> None:
-    """Replace or add a controller's options, class by class, in a file of `read_tuned`."""
+    """Replace or add a controller's options in a file of `read_tuned`.
+
+    Args:
+        path: File.
+        kind: Class of tasks.
+        name: Name of the controller.
+        options: Options of filter and controller.
+    """
     target = Path(path)
     read_tuned.cache_clear()
     classes = read_tuned(target) if target.exists() else {}

@@ -6,14 +6,11 @@ filter is configured with other tyres, friction and roll stiffness.
 """
 
 import dataclasses
-import functools
 import math
-import tempfile
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import gymnasium as gym
-import joblib
 import numpy as np
 import typer
 from rich.console import Console
@@ -27,7 +24,7 @@ from ..harness.drives import SETTLED, LoggedEpisode, call_quietly
 from ..harness.parallel import run_cases
 from ..recorded.emulate import Emulation
 from .estimator import FIRST_SEED, STORAGE, Range
-from .study import create_study, run_search
+from .study import create_study, search_on_drives
 
 _PLANTS = ("", "drift", "multi-body")  # of a drive: ours, then CommonRoad's
 _EVERY = 10  # ticks between two rows of a log
@@ -60,7 +57,7 @@ def _make_scenario(draw: np.random.Generator, outside: bool) -> dict[str, Any]:
     return fields if outside else fields | {"bank": draw.uniform(-0.03, 0.03), "roll": True}
 
 
-def simulate_drive(seed: int) -> LoggedEpisode | None:
+def _simulate_drive(seed: int) -> LoggedEpisode | None:
     """Simulate a log at 100 Hz with what a filter is configured with; None for a spin."""
     draw = np.random.default_rng(seed)
     plant = _PLANTS[seed % len(_PLANTS)]
@@ -122,13 +119,13 @@ def _draw_ou_path(draw: np.random.Generator, n: int, share: float) -> Array:
     return path
 
 
-def make_options(values: Mapping[str, float]) -> dict[str, float]:
+def _make_options(values: Mapping[str, float]) -> dict[str, float]:
     """Make the options of `joint-robust` from levels, both axles alike."""
     both = {name.replace("front", "rear"): value for name, value in values.items()}
     return both | dict(values)
 
 
-def compute_errors(options: Mapping[str, Any], drives: Sequence[LoggedEpisode]) -> Array:
+def _compute_errors(options: Mapping[str, Any], drives: Sequence[LoggedEpisode]) -> Array:
     """Compute RMSE of beta (rad) and NEES, without and with late course: (drives, 2, 2)."""
     results = np.empty((len(drives), 2, 2))
     for i, sample in enumerate(drives):
@@ -146,7 +143,7 @@ def compute_errors(options: Mapping[str, Any], drives: Sequence[LoggedEpisode]) 
     return np.where(np.isfinite(results), results, np.inf)
 
 
-def compute_objective(results: Array) -> float:
+def _compute_objective(results: Array) -> float:
     """Compute the mean logarithm of the RMSE, and a tenth of the NEES' distance from 1."""
     rmse, nees = np.log(results[..., 0]), np.log(results[..., 1])
     return float(np.mean(rmse + 0.1 * np.abs(nees)))
@@ -160,12 +157,11 @@ class _Levels:
     search: Mapping[str, Range] = dataclasses.field(default_factory=lambda: _SPACE)
 
 
-def _evaluate_levels(path: str, values: dict[str, float]) -> float:
-    drives = joblib.load(path)
-    return compute_objective(compute_errors(make_options(values), drives))
+def _evaluate_levels(drives: Sequence[LoggedEpisode], values: dict[str, float]) -> float:
+    return _compute_objective(_compute_errors(_make_options(values), drives))
 
 
-def main(
+def _main(
     trials: Annotated[int, typer.Option(help="Of the study, the finished ones included.")] = 600,
     drives: Annotated[int, typer.Option(help="Training drives; as many for the test.")] = 24,
     jobs: Annotated[int | None, typer.Option("--jobs", "-j", help="Processes.")] = None,
@@ -174,24 +170,17 @@ def main(
     """Search the levels; print them, and what they give on drives not seen."""
     console = Console()
     seeds = range(FIRST_SEED, FIRST_SEED + 2 * drives)
-    simulated = run_cases(simulate_drive, seeds, "drives", jobs, console)
+    simulated = run_cases(_simulate_drive, seeds, "drives", jobs, console)
     all_drives = [drive for drive in simulated if drive is not None]
     training, test = all_drives[0::2], all_drives[1::2]
-    study = create_study(_Levels(f"joint-robust {hash_sources('estimators')}"), storage)
-    with tempfile.TemporaryDirectory() as folder:
-        path = f"{folder}/drives"
-        joblib.dump(training, path)
-
-        def evaluate_batch(batch: Sequence[dict[str, float]]) -> list[tuple[float, int]]:
-            values = run_cases(functools.partial(_evaluate_levels, path), batch, jobs=jobs)
-            return [(value, len(training)) for value in values]
-
-        run_search(study, _Levels(study.study_name), trials, evaluate_batch, len(training), console)
+    task = _Levels(f"joint-robust {hash_sources('estimators')}")
+    study = create_study(task, storage)
+    search_on_drives(study, task, trials, _evaluate_levels, training, jobs, console)
     best = {name: float(f"{value:.2g}") for name, value in study.best_params.items()}
-    for name, value in make_options(best).items():
+    for name, value in _make_options(best).items():
         console.print(f"{name} = {value}")
-    for label, options in (("as shipped", {}), ("found", make_options(best))):
-        results = compute_errors(options, test)
+    for label, options in (("as shipped", {}), ("found", _make_options(best))):
+        results = _compute_errors(options, test)
         rmse = np.degrees(np.exp(np.mean(np.log(results[..., 0]), axis=0)))
         nees = np.median(results[..., 1], axis=0)
         text = f"{label}, {len(test)} test drives: {rmse[0]:.3f} deg inertial, {rmse[1]:.3f} with"
@@ -199,4 +188,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    typer.run(_main)

@@ -11,7 +11,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import joblib
 import numpy as np
@@ -53,15 +53,26 @@ class _Question(Protocol):
     def search(self) -> Mapping[str, tuple[float, float]]: ...
 
 
+_Evaluate = Callable[[list[LoggedEpisode], dict[str, float]], float]
+"""From drives and numbers to the objective."""
+
+
 @functools.lru_cache(maxsize=1)
-def _load_drives(path: str) -> Any:
-    return joblib.load(path)
+def _load_drives(path: str) -> list[LoggedEpisode]:
+    drives: list[LoggedEpisode] = joblib.load(path)
+    return drives
 
 
-def evaluate_trial(path: str, task: EstimatorTuning, values: dict[str, float]) -> float:
-    """Evaluate the objective of some numbers on the drives in a file; infinite if unstable."""
+def _evaluate_file(path: str, evaluate: _Evaluate, values: dict[str, float]) -> float:
+    return evaluate(_load_drives(path), values)
+
+
+def _evaluate_trial(
+    task: EstimatorTuning, drives: Sequence[LoggedEpisode], values: dict[str, float]
+) -> float:
+    """Evaluate the objective of some numbers; infinite if unstable."""
     try:
-        return compute_objective(compute_squares(task, _load_drives(path), values))
+        return compute_objective(compute_squares(task, drives, values))
     except ValueError:  # a filter that diverges, a covariance that is none
         return math.inf
 
@@ -71,8 +82,18 @@ def create_study(
 ) -> "optuna.Study":
     """Create or load a task's study in a storage: an RDB URL, or the path of an SQLite file.
 
-    Machines that share one take different seeds. Raises ValueError for an unknown sampler, a
-    storage that cannot be used, and a study that holds something else.
+    Args:
+        task: Question.
+        storage: RDB URL or SQLite file.
+        sampler: Name in `SAMPLERS`.
+        seed: Seed of the sampler; machines that share a storage take different ones.
+
+    Returns:
+        Study.
+
+    Raises:
+        ValueError: The sampler is unknown, the storage cannot be used, or the study holds
+            something else.
     """
     url = storage if "://" in storage else f"sqlite:///{storage}"
     wait = {"connect_args": {"timeout": 60.0}} if url.startswith("sqlite") else {}
@@ -89,7 +110,7 @@ def create_study(
         return study
 
 
-def search(
+def _search(
     study: "optuna.Study",
     task: EstimatorTuning,
     drives: Sequence[LoggedEpisode],
@@ -101,22 +122,46 @@ def search(
 
     Raises ValueError for a storage that fails and where no trial gave a stable filter.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        path = str(Path(folder) / "drives")
-        joblib.dump(list(drives), path)
-        n_jobs = min(jobs or count_cores(), BATCH)
-
-        def evaluate_batch(batch: Sequence[dict[str, float]]) -> list[tuple[float, int]]:
-            values = run_cases(functools.partial(evaluate_trial, path, task), batch, jobs=n_jobs)
-            return [(value, len(drives)) for value in values]
-
-        run_search(study, task, trials, evaluate_batch, len(drives), console)
+    evaluate = functools.partial(_evaluate_trial, task)
+    search_on_drives(study, task, trials, evaluate, drives, jobs, console)
     with _convert_storage_errors(study.study_name):
         best = study.best_trial
     if best.value is None or not math.isfinite(best.value):
         compute_squares(task, drives, best.params)  # the estimator's own words, if it has any
         raise ValueError(f"none of {trials} trials of {task.estimator} gave finite estimates")
     return {name: float(f"{v:.3g}") for name, v in best.params.items()}
+
+
+def search_on_drives(
+    study: "optuna.Study",
+    task: _Question,
+    trials: int,
+    evaluate: _Evaluate,
+    drives: Sequence[LoggedEpisode],
+    jobs: int | None = None,
+    console: Console | None = None,
+) -> None:
+    """Run trials, each on all drives, which workers read from a file.
+
+    Args:
+        study: Study.
+        task: Its question.
+        trials: Trials of the study, the finished ones included.
+        evaluate: Function of the drives and a trial's numbers, importable by workers.
+        drives: Drives.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = str(Path(folder) / "drives")
+        joblib.dump(list(drives), path)
+        n_jobs = min(jobs or count_cores(), BATCH)
+
+        def evaluate_batch(batch: Sequence[dict[str, float]]) -> list[tuple[float, int]]:
+            evaluate_values = functools.partial(_evaluate_file, path, evaluate)
+            return [(x, len(drives)) for x in run_cases(evaluate_values, batch, jobs=n_jobs)]
+
+        run_search(study, task, trials, evaluate_batch, len(drives), console)
 
 
 def run_search(
@@ -129,8 +174,13 @@ def run_search(
 ) -> None:
     """Run batches of trials until the study has so many, those it holds included.
 
-    `evaluate` maps the numbers of a batch to (value, drives it is the mean of) of each. A trial of
-    fewer drives than `n_drives` counts as pruned; its user attributes have both.
+    Args:
+        study: Study.
+        task: Its question.
+        trials: Trials of the study, the finished ones included.
+        evaluate: Function of the numbers of a batch: value, and drives it is the mean of, of each.
+        n_drives: Drives of a complete trial; one of fewer counts as pruned.
+        console: Where progress is shown.
     """
     space: dict[str, optuna.distributions.BaseDistribution] = {
         name: optuna.distributions.FloatDistribution(*limits, log=True)
@@ -220,9 +270,24 @@ def run(
     jobs: int | None = None,
     console: Console | None = None,
 ) -> tuple[Suite, dict[str, float]]:
-    """Search on the task's seeds, judge on the seeds 0 .. test_seeds-1; a suite and the numbers.
+    """Search on the task's seeds, and judge on others.
 
-    Raises ValueError for no trials or test seeds, and as `create_study` and `search`.
+    Args:
+        task: Tuning.
+        trials: Trials of the study, the finished ones included.
+        test_seeds: Number of test seeds, from 0 on.
+        storage: RDB URL or SQLite file.
+        sampler: Name in `SAMPLERS`.
+        seed: Seed of the sampler.
+        jobs: Processes, None for all processors.
+        console: Where progress is shown.
+
+    Returns:
+        Suite and the numbers.
+
+    Raises:
+        ValueError: There are no trials or test seeds, the storage fails, or no trial gave a stable
+            filter.
     """
     if trials < 1:
         raise ValueError(f"trials must be at least 1, got {trials}")
@@ -230,7 +295,7 @@ def run(
         raise ValueError(f"test seeds are 1 to {task.seeds[0]}, got {test_seeds}")
     study = create_study(task, storage, sampler, seed)
     training = simulate(task, task.seeds, "training drives", jobs, console)
-    numbers = search(study, task, training, trials, jobs, console)
+    numbers = _search(study, task, training, trials, jobs, console)
     test = simulate(task, range(test_seeds), "test drives", jobs, console)
     suite = Suite(
         "tune",
@@ -294,7 +359,15 @@ def _format_spread(errors: Array) -> str:
 def make_result_table(
     numbers: Mapping[str, float], search: Mapping[str, tuple[float, float]]
 ) -> ResultTable:
-    """Make a table of the numbers that were found, marked at the end of their ranges."""
+    """Make a table of the numbers that were found, marked at the end of their ranges.
+
+    Args:
+        numbers: Value by name.
+        search: Range (low, high) by name.
+
+    Returns:
+        Table.
+    """
     cells = []
     for name, (low, high) in search.items():
         value = numbers[name]
@@ -306,11 +379,25 @@ def make_result_table(
 
 def make_entry(
     task: EstimatorTuning, numbers: dict[str, float], command: str, note: str = ""
-) -> dict[str, Any]:
-    """Make the entry of a tunings file from the numbers that a command found."""
+) -> dict[str, object]:
+    """Make the entry of a tunings file from the numbers that a command found.
+
+    Args:
+        task: Tuning.
+        numbers: Value by option.
+        command: Command that found them.
+        note: Remark, "" for none.
+
+    Returns:
+        Entry.
+    """
     used = task.options | numbers
     q = {key.removeprefix("q_"): value for key, value in used.items() if key.startswith("q_")}
     q = TUNINGS.get((task.estimator, task.sensors), {}) | q
     noise = {key: value for key, value in numbers.items() if not key.startswith("q_")}
-    result = {"estimator": task.estimator, "sensors": task.sensors, "command": command}
+    result: dict[str, object] = {
+        "estimator": task.estimator,
+        "sensors": task.sensors,
+        "command": command,
+    }
     return result | {"q": q, "noise": noise} | ({"note": note} if note else {})

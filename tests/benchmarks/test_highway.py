@@ -29,14 +29,14 @@ def test_an_episode_is_that_of_the_environment() -> None:
     while not over:
         _, reward, terminated, truncated, info = env.step([0.0])
         cost, over = cost - float(reward), terminated or truncated
-    ((found, failure, slip),) = traffic.simulate_swerve(("none", (0,)))
+    ((found, failure, slip),) = traffic._simulate_swerve(("none", (0,)))
     assert (found, failure) == (cost, info["failure"])
     assert 0.0 < slip < 0.6
 
 
 @pytest.mark.parametrize("who", traffic.CONTROLLERS)
 def test_every_contestant_drives(who: str) -> None:
-    numbers = traffic.simulate_swerve((who, (1,)))
+    numbers = traffic._simulate_swerve((who, (1,)))
     assert numbers.shape == (1, 3) and np.isfinite(numbers).all()
 
 
@@ -45,7 +45,7 @@ def test_the_verdict_names_the_best_and_why_the_others_fail() -> None:
     swerves["none"] = made(SPIN, SPIN, COLLISION, DEPARTURE)
     swerves["lqr"], swerves[traffic.ORACLE] = made(COLLISION), made()
     lanes = {name: np.full((2, 5), 0.1 * (1 + i)) for i, name in enumerate(traffic.READERS)}
-    text = traffic.compose_verdict(swerves, lanes)
+    text = traffic._compose_verdict(swerves, lanes)
     lines = text.splitlines()
     assert len(lines) <= LINES and max(map(len, lines)) <= LETTERS
     assert "lqr 90 % [" in lines[1] and "none 60 % [" in lines[1]

@@ -26,8 +26,8 @@ from sideslip.benchmarks.studies.learned_outside import (
     KINDS,
     MANOEUVRE,
     OUTSIDE_ID,
+    _run_chunk,
     make_outside_task,
-    run_chunk,
 )
 from sideslip.envs.outside.plants import OUTSIDE_PLANTS, make_outside_vehicle
 from sideslip.envs.scenarios.manoeuvres import make_scenario
@@ -76,7 +76,7 @@ def test_a_finished_case_is_found_again(tmp_path: Path) -> None:
     assert len(driven) == 1
     chunk = Chunk(cell, (3, 4))
     assert CachedDrive(tmp_path, drive_it)._make_path(chunk) != CachedDrive(
-        tmp_path, run_chunk
+        tmp_path, _run_chunk
     )._make_path(chunk)
 
 
@@ -84,7 +84,7 @@ def test_a_drive_costs_what_the_single_car_s_costs() -> None:
     """On a road so narrow that the cars leave it one after the other: what follows is no cost."""
     contest, seeds = make_outside_task("car-yaw", "drift"), (3, 5)
     narrow = {"scenario": contest.env_options["scenario"] | {"half_width": 0.5}}
-    driven = run_chunk(Chunk(ControlEntry(contest, "", "raw-car-yaw", narrow), seeds))
+    driven = _run_chunk(Chunk(ControlEntry(contest, "", "raw-car-yaw", narrow), seeds))
     assert not driven.error
     env = make_env(OUTSIDE_ID, **contest.env_options | narrow)
     alone = [rollout(env, make_agent("raw-car-yaw", env), seed) for seed in seeds]
@@ -94,7 +94,7 @@ def test_a_drive_costs_what_the_single_car_s_costs() -> None:
 
 
 def test_a_reason_is_the_drive_s_error() -> None:
-    driven = run_chunk(Chunk(ControlEntry(make_outside_task("car-yaw", "drift"), "", "lqr"), (0,)))
+    driven = _run_chunk(Chunk(ControlEntry(make_outside_task("car-yaw", "drift"), "", "lqr"), (0,)))
     assert "beta_hat" in driven.error and np.isnan(driven.costs).all()
 
 
@@ -124,7 +124,7 @@ def test_ratios_are_paired_over_each_rival_and_a_failure_counts() -> None:
     assert rows[NOMINAL][0] == rows[planner][1] == ""
     fails = f"{100.0 * math.exp(0.25 * math.log(20.0)):.0f}"
     assert [cell.split()[0] for cell in rows["two-dof"]] == [fails, "200"] * 3
-    said = outside_suite.compose_verdict([found])
+    said = outside_suite._compose_verdict([found])
     assert f"{policy} costs 200 [200, 200] % of nominal's, 400 [400, 400] % of {planner}'s" in said
     assert "0 % fail" in said
 

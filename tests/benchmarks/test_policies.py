@@ -56,8 +56,8 @@ def test_everybody_drives_the_same_seeds_which_the_weights_make(tmp_path: Path) 
     env = gym.make(HERE, scenario=SHORT)
     for name, agent in (("damper", make_agent(str(path), env)), ("none", None)):
         alone = [sideslip.rollout(env, agent, seed).cost for seed in found.seeds]
-        assert found.costs(name) == pytest.approx(alone, rel=1e-12)
-    assert found.costs("lqr on exact-kf").mean() < found.costs("none").mean()
+        assert found.drives[name].costs == pytest.approx(alone, rel=1e-12)
+    assert found.drives["lqr on exact-kf"].costs.mean() < found.drives["none"].costs.mean()
     assert evaluate_policy(str(path), 3, seed=7).seeds == [7, 8, 9]
 
 
@@ -77,7 +77,7 @@ def test_the_evaluation_goes_into_the_card_and_leaves_the_weights(tmp_path: Path
     told = after.card.evaluation
     assert told["episodes"] == 5 and told["salt"] == before.salt
     for name, costs in told["cost"].items():
-        assert costs["mean"] == pytest.approx(found.costs(name).mean(), abs=1e-6)
+        assert costs["mean"] == pytest.approx(found.drives[name].costs.mean(), abs=1e-6)
         assert costs["low"] <= costs["mean"] <= costs["high"]
 
 
@@ -90,11 +90,11 @@ def test_the_suite_tells_it_in_rows_table_and_pictures(tmp_path: Path) -> None:
     assert [line[0] for line in table.cells] == ["damper", "lqr on exact-kf", "none"]
     assert all(len(line) == len(table.header) for line in table.cells)
     costs = {row.controller: row.value for row in suite.rows if row.metric == "cost"}
-    assert costs["damper"] == pytest.approx(found.costs("damper").mean())
+    assert costs["damper"] == pytest.approx(found.drives["damper"].costs.mean())
     assert {row.scenario for row in suite.rows} == {"gust"}
     assert "another reference, model" in suite.text  # it was trained for zero slip
     assert len(suite.explorers) == 1
-    ratios = np.log((found.costs("damper") + 0.001) / (found.costs("none") + 0.001))
+    ratios = np.log((found.drives["damper"].costs + 0.001) / (found.drives["none"].costs + 0.001))
     said = suite.verdict.splitlines()
     assert said[1].startswith(f"damper costs {100.0 * np.exp(ratios.mean()):.0f} % [")
     assert said[1].endswith("of none, seed by seed.") and "these 4" in said[2]
@@ -116,10 +116,10 @@ def test_what_a_shipped_card_says_is_so(name: str) -> None:
     told = load_policy(name).card.evaluation
     found = evaluate_policy(name, 16)
     assert found.salt == told["salt"]
-    none = found.costs("none")
+    none = found.drives["none"].costs
     error = none.std(ddof=1) / 4.0
     assert abs(none.mean() - told["cost"]["none"]["mean"]) < 5.0 * error
-    assert found.costs(name).mean() < 0.5 * none.mean()
+    assert found.drives[name].costs.mean() < 0.5 * none.mean()
     assert told["cost"][name]["high"] < told["cost"]["none"]["low"]
 
 

@@ -14,10 +14,10 @@ from sideslip.benchmarks.studies.recovery_region import (
     CARS,
     CLAIRVOYANT,
     ORACLES,
-    PulseThenAgent,
     RecoveryCase,
-    compute_recovery_mask,
-    make_grid,
+    _compute_recovery_mask,
+    _make_grid,
+    _PulseThenAgent,
 )
 
 CAR, COMS = CARS
@@ -28,7 +28,7 @@ def test_feedback_saves_cars_that_nothing_saves() -> None:
     points = (9, 7)
     for car in CARS:
         none, lqr = (
-            compute_recovery_mask(RecoveryCase(car, name, points, 4)) for name in ("none", "lqr")
+            _compute_recovery_mask(RecoveryCase(car, name, points, 4)) for name in ("none", "lqr")
         )
         assert none.shape == lqr.shape == (7, 9, 4)
         assert none.mean() < lqr.mean(), car
@@ -37,7 +37,7 @@ def test_feedback_saves_cars_that_nothing_saves() -> None:
 
 def test_a_slide_that_turns_further_out_is_lost_and_one_that_turns_back_is_saved() -> None:
     """beta' = ... - gamma: a yaw rate against the slip's sign makes it grow."""
-    found = compute_recovery_mask(RecoveryCase(CAR, "none", (3, 3), 4))
+    found = _compute_recovery_mask(RecoveryCase(CAR, "none", (3, 3), 4))
     assert found[0, 2].max() == found[2, 0].max() == 0.0
     assert found[2, 2].mean() > 0.0 and found[0, 0].mean() > 0.0
 
@@ -51,7 +51,7 @@ def test_after_a_beginning_the_agent_takes_over() -> None:
             return np.full((3, 1), 0.1 * count, np.float32), count
 
     begun, state, taken = (
-        PulseThenAgent(Counts(), np.array([1.0, -1.0, 1.0]), np.array([2, 1, 0])),
+        _PulseThenAgent(Counts(), np.array([1.0, -1.0, 1.0]), np.array([2, 1, 0])),
         None,
         [],
     )
@@ -64,12 +64,12 @@ def test_after_a_beginning_the_agent_takes_over() -> None:
 def test_of_several_beginnings_the_best_counts() -> None:
     points, tries = (3, 3), ((1.0, 0.0), (1.0, 0.5), (-1.0, 1.5))
     found = [
-        compute_recovery_mask(RecoveryCase(CAR, ORACLES[0], points, 4, (each,))) for each in tries
+        _compute_recovery_mask(RecoveryCase(CAR, ORACLES[0], points, 4, (each,))) for each in tries
     ]
     np.testing.assert_array_equal(
-        found[0], compute_recovery_mask(RecoveryCase(CAR, ORACLES[0], points, 4))
+        found[0], _compute_recovery_mask(RecoveryCase(CAR, ORACLES[0], points, 4))
     )
-    both = compute_recovery_mask(RecoveryCase(CAR, ORACLES[0], points, 4, tries))
+    both = _compute_recovery_mask(RecoveryCase(CAR, ORACLES[0], points, 4, tries))
     np.testing.assert_array_equal(both, np.maximum.reduce(found))
 
 
@@ -82,10 +82,10 @@ def test_starts_are_what_the_axes_say(monkeypatch: pytest.MonkeyPatch) -> None:
         return iter(())
 
     monkeypatch.setattr(recovery_region, "iterate_steps", steps)
-    compute_recovery_mask(RecoveryCase(COMS, "none", (3, 2), 2))
+    _compute_recovery_mask(RecoveryCase(COMS, "none", (3, 2), 2))
     seeds, beta, gamma = seen
     assert seeds == [recovery_region.FIRST_SEED, recovery_region.FIRST_SEED + 1] * 6
-    betas, gammas = make_grid((3, 2))
+    betas, gammas = _make_grid((3, 2))
     np.testing.assert_allclose(beta.reshape(2, 3, 2)[1, :, 0], betas, atol=1e-9)
     np.testing.assert_allclose(gamma.reshape(2, 3, 2)[:, 1, 1], gammas, atol=1e-9)
 

@@ -19,8 +19,8 @@ def test_pseudo_measurements_equal_fast_ones_for_square_c_only() -> None:
     for outputs, equal in ((3, True), (2, False)):
         C = rng.normal(size=(outputs, 3))
         L = kalman_gain(np.eye(3), C, np.eye(outputs))
-        ours = theory.make_pseudo_maps(A, C, L, 10)
-        off = theory.compute_difference(ours, theory.make_fast_maps(A, C, L, 10))
+        ours = theory.make_maps("pseudo", A, C, L, 10)
+        off = theory.compute_difference(ours, theory.make_maps("fast", A, C, L, 10))
         assert off < 1e-12 if equal else off > 0.1
 
 
@@ -29,7 +29,7 @@ def test_the_maps_are_what_a_simulated_error_does() -> None:
     rng = np.random.default_rng(6)
     A, C = 0.3 * rng.normal(size=(3, 3)), rng.normal(size=(1, 3))
     L = 0.3 * rng.normal(size=(3, 1))
-    maps = theory.make_pseudo_maps(A, C, L, 3)
+    maps = theory.make_maps("pseudo", A, C, L, 3)
     x, start = rng.normal(size=3), rng.normal(size=3)
     hat = x - start
     innovation = C @ (x - hat)  # (13)
@@ -52,7 +52,7 @@ def test_prediction_alone_moves_what_the_sample_left() -> None:
     """(34)."""
     rng = np.random.default_rng(7)
     A, C, L = rng.normal(size=(3, 3)), rng.normal(size=(2, 3)), rng.normal(size=(3, 2))
-    maps = theory.make_predicted_maps(A, C, L, 4)
+    maps = theory.make_maps("predicted", A, C, L, 4)
     np.testing.assert_allclose(maps[3], A @ A @ A @ (np.eye(3) - L @ C))
 
 

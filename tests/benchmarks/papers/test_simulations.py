@@ -9,13 +9,12 @@ import pytest
 from sideslip.agents.rollout import rollout
 from sideslip.benchmarks.harness.drives import SETTLED, call_quietly, make_filter_arguments
 from sideslip.benchmarks.harness.parallel import split_seeds
-from sideslip.benchmarks.papers.ledger import (
+from sideslip.benchmarks.papers.ledger import PaperFilter, get_paper_tuning, make_filters
+from sideslip.benchmarks.papers.manoeuvres import (
     EstimationSimulation,
-    PaperFilter,
-    get_paper_tuning,
-    make_filters,
+    FollowingSimulation,
+    SlipSimulation,
 )
-from sideslip.benchmarks.papers.manoeuvres import FollowingSimulation, SlipSimulation
 from sideslip.estimators import make_estimator
 
 VISION = "sideslip/YawVision-v0"
@@ -80,8 +79,8 @@ def test_following_has_the_reference_beside_the_car() -> None:
 
 def test_seeds_are_split_and_shared() -> None:
     assert split_seeds(7, 3) == [(0, 1, 2), (3, 4, 5), (6,)]
-    assert FollowingSimulation("f", "dakf-fig7", {}, share=0.25).chunks(8) == [(0, 1)]
-    assert FollowingSimulation("f", "dakf-fig7", {}, share=0.25).chunks(1) == [(0,)]
+    assert FollowingSimulation("f", "dakf-fig7", {}, share=0.25).split(8) == [(0, 1)]
+    assert FollowingSimulation("f", "dakf-fig7", {}, share=0.25).split(1) == [(0,)]
 
 
 def test_claims_are_judged_with_the_papers_tuning() -> None:

@@ -1,4 +1,4 @@
-"""The loops behind Table II: written out another way, and what the search finds."""
+"""The loops behind Table II: written out another way, and what the _search finds."""
 
 import dataclasses
 import math
@@ -13,9 +13,9 @@ from sideslip.benchmarks.papers.tie_vision_control import (
     PRINTED,
     SENSORS,
     LoopDesign,
-    make_estimator_loop,
-    make_plain_loop,
-    search,
+    _make_estimator_loop,
+    _make_plain_loop,
+    _search,
 )
 from sideslip.benchmarks.papers.tie_vision_theory import compute_gain_margin
 from sideslip.envs import COMS
@@ -41,7 +41,7 @@ def test_the_loop_is_what_a_step_by_step_controller_does(sensors: str, integral:
     """An impulse of yaw moment on the plant; the filter's gain from its covariance recursion."""
     design = dataclasses.replace(DESIGN, sensors=sensors, integral=integral, noise=1e-3)
     dt = 0.033
-    loop = make_estimator_loop(COMS, design, dt)
+    loop = _make_estimator_loop(COMS, design, dt)
     steps = 40
     _, response = control.impulse_response(loop, np.arange(steps) * dt)
     pi = design_pi(COMS, V, design.pole, design.placement)
@@ -78,7 +78,7 @@ def test_the_loop_is_what_a_step_by_step_controller_does(sensors: str, integral:
 
 def test_a_filter_that_sees_the_true_moment_does_not_show() -> None:
     """Why the loop is opened at the plant only: the plain loop is the limit of a perfect filter."""
-    loop = make_plain_loop(COMS, DESIGN, 0.001)
+    loop = _make_plain_loop(COMS, DESIGN, 0.001)
     pi = design_pi(COMS, V, DESIGN.pole, DESIGN.placement)
     z = np.exp(1j * np.array([1.0, 10.0, 100.0]) * 0.001)
     G, H = make_bicycle_model(COMS, V).discretise(0.001)
@@ -90,7 +90,7 @@ def test_a_filter_that_sees_the_true_moment_does_not_show() -> None:
 def test_table_ii_within_half_a_decibel() -> None:
     """PAPERS section 3: 5.92 and 22.8 dB, both crossovers at half the sampling rate."""
     for printed, dt in zip(PRINTED, (0.033, 0.001), strict=True):
-        decibels, omega = compute_gain_margin(make_estimator_loop(COMS, DESIGN, dt))
+        decibels, omega = compute_gain_margin(_make_estimator_loop(COMS, DESIGN, dt))
         assert decibels == pytest.approx(printed, abs=0.5)
         assert omega == pytest.approx(math.pi / dt, rel=1e-12)
 
@@ -100,14 +100,14 @@ def test_the_multirate_loop_has_the_larger_gain_margin_with_the_same_pi(placemen
     """PAPERS section 3: by 20 dB at least."""
     design = dataclasses.replace(DESIGN, placement=placement)
     slow, fast = (
-        compute_gain_margin(make_plain_loop(COMS, design, dt))[0] for dt in (0.033, 0.001)
+        compute_gain_margin(_make_plain_loop(COMS, design, dt))[0] for dt in (0.033, 0.001)
     )
     assert fast - slow >= 20.0
 
 
 @pytest.mark.long
 def test_the_search_finds_the_table_at_25_kmh_among_others() -> None:
-    hits = search(COMS)
+    hits = _search(COMS)
     assert hits == sorted(hits, key=lambda hit: hit.off)
     assert all(hit.off <= 0.5 for hit in hits)
     assert len({hit.design.speed for hit in hits}) > 1  # the table does not say at which speed

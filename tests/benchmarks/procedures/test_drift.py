@@ -13,7 +13,7 @@ from sideslip.benchmarks.procedures.drive import (
     Law,
     Series,
     TestCar,
-    simulate_plant,
+    _simulate_plant,
 )
 from sideslip.envs.outside.plants import Drift, make_outside_vehicle
 from sideslip.envs.vehicle.dynamics import Motion
@@ -40,7 +40,7 @@ def steering(fields: Fields, t: float) -> float:
 def drive_with(law: Law | None) -> DriveFunction:
     def drive(fields: Fields) -> Series:
         hold = fields["steering"] == "ramp"
-        return simulate_plant(
+        return _simulate_plant(
             Drift(), lambda t: steering(fields, t), V, fields["duration"], hold, law
         )
 

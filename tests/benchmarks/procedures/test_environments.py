@@ -12,8 +12,8 @@ from sideslip.benchmarks.procedures.drive import (
     ENTRIES,
     DriveFunction,
     Series,
+    _make_steering_profile,
     make_env_drive,
-    make_steering_profile,
 )
 from sideslip.envs import Scenario
 from sideslip.envs.scenarios.steering import compute_steering
@@ -68,7 +68,7 @@ def test_the_kernels_sine_with_dwell_is_the_standards(side: float) -> None:
     """One period of 0.7 Hz that waits for 0.5 s at the second peak."""
     car = CARS["passenger-car"]
     fields = fmvss126.make_sine_with_dwell(car, side * 2.0)
-    programme = make_steering_profile(Scenario(**(CALM | dict(fields))))
+    programme = _make_steering_profile(Scenario(**(CALM | dict(fields))))
 
     def angle(t: float) -> float:
         phase = 0.7 * (t - fmvss126.ONSET)
@@ -111,7 +111,7 @@ def test_a_failed_episode_is_told_and_ends_early() -> None:
 def test_a_procedure_leaves_nothing_to_the_seed() -> None:
     scenario = Scenario(name="drawn", speed=(10.0, 20.0))
     with pytest.raises(ValueError, match="'drawn' draws; a procedure gives numbers"):
-        make_steering_profile(scenario)
+        _make_steering_profile(scenario)
 
 
 def test_a_series_is_one_value_a_time() -> None:

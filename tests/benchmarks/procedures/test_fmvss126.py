@@ -28,16 +28,16 @@ def series(gamma: Function, Y: Function | None = None, until: float = COMPLETION
 
 
 def test_amplitudes_go_up_by_half_an_a_to_the_larger_of_6_5_a_and_270_degrees() -> None:
-    found = np.degrees(fmvss126.list_amplitudes(math.radians(20.0)))
+    found = np.degrees(fmvss126._list_amplitudes(math.radians(20.0)))
     assert found[:3].tolist() == pytest.approx([30.0, 40.0, 50.0])
     assert found[-2:].tolist() == pytest.approx([260.0, 270.0])
-    assert np.degrees(fmvss126.list_amplitudes(math.radians(42.0)))[-1] == pytest.approx(273.0)
-    exactly = np.degrees(fmvss126.list_amplitudes(math.radians(270.0 / 6.5)))
+    assert np.degrees(fmvss126._list_amplitudes(math.radians(42.0)))[-1] == pytest.approx(273.0)
+    exactly = np.degrees(fmvss126._list_amplitudes(math.radians(270.0 / 6.5)))
     assert exactly / (270.0 / 6.5) == pytest.approx(np.arange(1.5, 6.6, 0.5))
 
 
 def test_no_amplitude_is_above_300_degrees() -> None:
-    found = np.degrees(fmvss126.list_amplitudes(math.radians(50.0)))
+    found = np.degrees(fmvss126._list_amplitudes(math.radians(50.0)))
     assert found[-2:].tolist() == pytest.approx([275.0, 300.0])
     assert (np.diff(found) > 0.0).all()
 
@@ -47,12 +47,12 @@ def test_a_is_where_the_line_through_the_accelerations_crosses_0_3_g() -> None:
     zero, steer = np.zeros_like(t), -0.01 * t
     a_y = -(steer / 0.05) * GRAVITY * np.where(np.abs(steer) > 0.08, 0.1, 1.0)  # 1 g at 0.05 rad
     driven = Series(t, steer, zero + 20.0, zero, a_y / 20.0, zero, 20.0 * t, zero, zero)
-    assert fmvss126.fit_reference_angle(driven, 16.0) == pytest.approx(16.0 * 0.3 * 0.05, rel=1e-6)
+    assert fmvss126._fit_reference_angle(driven, 16.0) == pytest.approx(16.0 * 0.3 * 0.05, rel=1e-6)
 
 
 def test_a_car_that_does_not_get_there_has_no_a() -> None:
     with pytest.raises(ValueError, match=r"reached 0.00 m/s2, not 3.68"):
-        fmvss126.fit_reference_angle(series(lambda t: 0.0), 16.0)
+        fmvss126._fit_reference_angle(series(lambda t: 0.0), 16.0)
 
 
 def test_ratios_are_those_to_the_peak_after_the_reversal() -> None:
@@ -63,11 +63,11 @@ def test_ratios_are_those_to_the_peak_after_the_reversal() -> None:
             return -0.8
         return -0.8 * (0.3 if t < COMPLETION + 1.5 else 0.1)
 
-    run = fmvss126.evaluate_run(series(gamma), 3.0 * A, A)
+    run = fmvss126._evaluate_run(series(gamma), 3.0 * A, A)
     assert (run.ratio_1, run.ratio_2) == pytest.approx((0.3, 0.1))
     assert run.stable
     assert run.passed
-    mirrored = fmvss126.evaluate_run(series(lambda t: -gamma(t)), -3.0 * A, A)
+    mirrored = fmvss126._evaluate_run(series(lambda t: -gamma(t)), -3.0 * A, A)
     assert (mirrored.ratio_1, mirrored.ratio_2) == (run.ratio_1, run.ratio_2)
 
 
@@ -76,18 +76,18 @@ def test_too_much_yaw_rate_at_either_time_fails(first: float, second: float) -> 
     def gamma(t: float) -> float:
         return -1.0 if t < COMPLETION else -(first if t < COMPLETION + 1.5 else second)
 
-    assert not fmvss126.evaluate_run(series(gamma), 3.0 * A, A).stable
+    assert not fmvss126._evaluate_run(series(gamma), 3.0 * A, A).stable
 
 
 def test_a_spin_is_judged_by_the_peak_before_completion() -> None:
-    run = fmvss126.evaluate_run(series(lambda t: -max(0.0, t - REVERSAL)), 3.0 * A, A)
+    run = fmvss126._evaluate_run(series(lambda t: -max(0.0, t - REVERSAL)), 3.0 * A, A)
     peak = COMPLETION - REVERSAL
     assert run.ratio_1 == pytest.approx((peak + 1.0) / peak, rel=1e-3)
     assert not run.stable
 
 
 def test_an_end_before_the_time_is_a_failure() -> None:
-    run = fmvss126.evaluate_run(series(lambda t: -1.0, until=COMPLETION + 0.5), 3.0 * A, A)
+    run = fmvss126._evaluate_run(series(lambda t: -1.0, until=COMPLETION + 0.5), 3.0 * A, A)
     assert math.isnan(run.ratio_1)
     assert not run.passed
 
@@ -98,11 +98,11 @@ def test_the_displacement_is_asked_from_5_a_on(way: float, multiple: float, pass
         return 7.0 + way * (t - BEGIN) / 1.07
 
     still = series(lambda t: -1.0 if t < COMPLETION else 0.0, Y)
-    run = fmvss126.evaluate_run(still, multiple * A, A)
+    run = fmvss126._evaluate_run(still, multiple * A, A)
     assert run.sideways == pytest.approx(way)
     assert run.stable
     assert run.passed is passed
-    assert fmvss126.evaluate_run(still, 4.5 * A, A).passed
+    assert fmvss126._evaluate_run(still, 4.5 * A, A).passed
 
 
 def test_the_highest_amplitude_is_below_the_first_failure_of_either_side() -> None:

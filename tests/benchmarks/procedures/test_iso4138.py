@@ -26,7 +26,7 @@ def steady(vehicle: Vehicle, steer: float, fastest: float) -> Series:
 @CARS
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_steady_states_of_the_linear_car_have_its_gradient(vehicle: Vehicle, side: float) -> None:
-    found = iso4138.compute_handling(steady(vehicle, 0.06 * side, 13.0), vehicle)
+    found = iso4138._compute_handling(steady(vehicle, 0.06 * side, 13.0), vehicle)
     assert found.theory == pytest.approx(iso4138.compute_understeer_gradient(vehicle))
     np.testing.assert_allclose(found.K, found.theory, rtol=1e-6)
     np.testing.assert_allclose(found.angle, -found.theory * found.a_y, atol=1e-12)
@@ -44,4 +44,4 @@ def test_the_gradient_is_the_weights_over_the_stiffnesses(vehicle: Vehicle) -> N
 
 def test_a_circle_without_lateral_acceleration_is_refused() -> None:
     with pytest.raises(ValueError, match=r"circle reached .* m/s2, not 2.45"):
-        iso4138.compute_handling(steady(PASSENGER_CAR, 0.001, 10.0), PASSENGER_CAR)
+        iso4138._compute_handling(steady(PASSENGER_CAR, 0.001, 10.0), PASSENGER_CAR)

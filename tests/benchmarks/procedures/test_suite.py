@@ -14,7 +14,7 @@ from sideslip.envs.outside.plants import OUTSIDE_PLANTS
 
 def test_every_contestant_drives_every_procedure_that_has_a_verdict() -> None:
     assert "procedures" in SUITES
-    cases = suite.make_cases(quick=False)
+    cases = suite._make_cases(quick=False)
     assert len(set(cases)) == len(cases)
     for procedure in ("fmvss-126", "iso-3888-1", "iso-3888-2"):
         mine = {(case.car, case.contestant) for case in cases if case.procedure == procedure}
@@ -37,14 +37,14 @@ def test_each_contestant_has_what_it_reads(car: str) -> None:
 
 
 def test_who_plans_is_left_out_of_a_quick_run() -> None:
-    driven = {ENTRIES[case.contestant].agent for case in suite.make_cases(quick=True)}
+    driven = {ENTRIES[case.contestant].agent for case in suite._make_cases(quick=True)}
     assert "adaptive-nmpc" not in driven
     assert {"adaptive-lqr", "distilled"} <= driven
 
 
 def test_without_the_extra_outside_plants_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(suite, "find_spec", lambda name: None)
-    kinds = {case.procedure for case in suite.make_cases(quick=True)}
+    kinds = {case.procedure for case in suite._make_cases(quick=True)}
     assert kinds == {"fmvss-126", "iso-3888-1", "iso-3888-2", "iso-4138", "iso-7401"}
 
 
@@ -60,9 +60,9 @@ def test_the_check_on_the_drift_model_is_reproduced() -> None:
 @pytest.mark.long
 def test_tables_rows_and_figures_of_the_uncontrolled_cars(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("plotly")
-    known = [case for case in suite.make_cases(quick=True) if case.contestant == 0]
+    known = [case for case in suite._make_cases(quick=True) if case.contestant == 0]
     cases = [case for case in known if case.car != "multi-body"]
-    monkeypatch.setattr(suite, "make_cases", lambda quick: cases)
+    monkeypatch.setattr(suite, "_make_cases", lambda quick: cases)
     found = suite.run(quick=True, jobs=1)
     assert [table.title.split(",")[0] for table in found.tables[:2]] == ["FMVSS 126", "ISO 3888"]
     for table in found.tables:

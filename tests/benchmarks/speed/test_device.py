@@ -18,7 +18,7 @@ def test_the_table_has_a_line_for_each_size_and_says_how_it_was_made(
 ) -> None:
     monkeypatch.setattr(device_speed, "_COPIED", 1 << 20)
     out = tmp_path / "table.md"
-    device_speed.main("cpu", ["float64"], ENV_ID, [4, 8], steps=1, rounds=2, out=out)
+    device_speed._main("cpu", ["float64"], ENV_ID, [4, 8], steps=1, rounds=2, out=out)
     command, _, text, _, *lines = out.read_text().splitlines()
     assert "sideslip.benchmarks.speed.device" in command
     assert f"{ENV_ID}, engine torch, not compiled. Median and range of 2 rounds of 1 steps" in text
@@ -35,7 +35,7 @@ def test_every_round_takes_its_steps() -> None:
     env: Any = make_device_env(ENV_ID, 2)
     steps: list[Any] = []
     env.step = steps.append
-    found = device_speed.measure(env, 1e9, rounds=2, steps=3)
+    found = device_speed._measure(env, 1e9, rounds=2, steps=3)
     assert len(steps) == (2 + 1) * 3 and found.size == 2
 
 
@@ -45,17 +45,17 @@ def test_every_round_takes_its_steps() -> None:
 )
 def test_a_wrong_word_is_refused(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        device_speed.main(**wrong, count=[2], rounds=1, steps=1, out=None)
+        device_speed._main(**wrong, count=[2], rounds=1, steps=1, out=None)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_without_a_gpu_it_says_so_and_writes_nothing(tmp_path: Path) -> None:
     out = tmp_path / "table.md"
     with pytest.raises(ValueError, match="device 'cuda' is not there: torch"):
-        device_speed.main("cuda", count=[2], out=out)
+        device_speed._main("cuda", count=[2], out=out)
     assert not out.exists()
 
 
 def test_a_table_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="there is no such folder"):
-        device_speed.main(device="gpu", out=tmp_path / "no" / "table.md")
+        device_speed._main(device="gpu", out=tmp_path / "no" / "table.md")

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("numba_cuda")
 
-from sideslip.benchmarks.speed.ptx import assemble_kernel, count_by_kind
+from sideslip.benchmarks.speed.ptx import _assemble_kernel, _count_by_kind
 
 TEXT = """
 .visible .entry step(
@@ -28,7 +28,7 @@ $L__BB0_1:
 
 
 def test_arithmetic_is_told_from_the_rest() -> None:
-    assert count_by_kind(TEXT) == {
+    assert _count_by_kind(TEXT) == {
         "instructions": 8,
         "on float64": 2,
         "on float32": 1,
@@ -46,13 +46,13 @@ def test_the_assembler_says_what_a_thread_holds_or_ends_the_count(
 ) -> None:
     """Without one on the path nothing is counted."""
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert assemble_kernel(TEXT, (9, 0)) == {}
+    assert _assemble_kernel(TEXT, (9, 0)) == {}
     ptxas = tmp_path / "ptxas"
     ptxas.write_text(f"#!/bin/sh\necho '{SAID}' >&2\nexit {status}\n")
     ptxas.chmod(0o755)
     if status:
         with pytest.raises(subprocess.CalledProcessError):
-            assemble_kernel(TEXT, (9, 0))
+            _assemble_kernel(TEXT, (9, 0))
     else:
         held = {"registers": "42", "stack, bytes": "16", "spilled, bytes": "4"}
-        assert assemble_kernel(TEXT, (9, 0)) == held
+        assert _assemble_kernel(TEXT, (9, 0)) == held

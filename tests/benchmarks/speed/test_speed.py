@@ -9,8 +9,6 @@ import pytest
 
 from sideslip.benchmarks.harness.results import Suite
 from sideslip.benchmarks.speed import env_steps, first_use, learning, plant, suite, timing
-from sideslip.benchmarks.speed import plant as yardstick
-from sideslip.benchmarks.speed import timing as field
 from sideslip.envs.numerics.simd import LANES
 from sideslip.estimators import FILTERS
 from sideslip.estimators.make import ESTIMATORS
@@ -38,7 +36,8 @@ def test_env_steps_are_measured_and_the_absent_are_named(monkeypatch: pytest.Mon
     """Without the optional packages: the suite needs none of them."""
     without(monkeypatch, "highway_env", "envpool")
     measured = Suite("speed", "", "")
-    taken, absent = env_steps.add(measured, SHORT)
+    workloads = env_steps.make_workloads()
+    taken, absent = workloads.measure(measured, SHORT), workloads.absent
     assert {env_steps.FUSION, env_steps.AT_ONCE, env_steps.FILTERED} <= set(taken)
     assert {env_steps.CARTPOLE, env_steps.CARTPOLES, env_steps.PENDULUMS} <= set(taken)
     assert absent == {
@@ -68,7 +67,7 @@ def test_every_filter_of_the_catalogue_has_its_line() -> None:
 
 def test_the_lane_keeping_environment_runs() -> None:
     pytest.importorskip("highway_env")
-    contestants = field.WorkloadSet()
+    contestants = timing.WorkloadSet("", "step", "")
     contestants.add(env_steps.LANE, env_steps._make_lane_keeping, "highway-env")
     contestants.workloads[env_steps.LANE].work()
     assert contestants.absent == {}
@@ -81,20 +80,20 @@ def test_poles_stay_up_so_that_no_reset_is_measured() -> None:
     env: Any = gym.make("CartPole-v1")
     obs, _ = env.reset(seed=0)
     for _ in range(400):
-        obs, _, terminated, _, _ = env.step(int(env_steps.choose_upright_action(obs)))
+        obs, _, terminated, _, _ = env.step(int(env_steps._choose_upright_action(obs)))
         assert not terminated
 
 
 @compiler
 def test_the_plant_in_c_is_ours() -> None:
     """To rounding, over half a second of cars that slide, roll, brake and turn."""
-    mine = plant.make_cars(32, seed=3)
+    mine = plant._make_cars(32, seed=3)
     mine.motions[:, 1] += np.linspace(-3.0, 3.0, 32).reshape(-1, LANES)  # m/s of v_y: tyres slide
     mine.roads[0] = np.array(
         [[0.01], [0.5], [2.0], [0.3], [0.2], [0.0]]
     )  # the others: straight, flat
     theirs = mine.clone()
-    plant.advance_in_lanes(mine, 500)
+    plant._advance_in_lanes(mine, 500)
     plant.make_c_advance()(theirs, 500)
     assert np.isfinite(mine.motions).all()
     scale = np.abs(mine.motions).max(axis=(0, 2), keepdims=True)
@@ -104,16 +103,16 @@ def test_the_plant_in_c_is_ours() -> None:
 
 @compiler
 def test_another_plant_in_c_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    other = yardstick.read_source().replace("GRAVITY = 9.81", "GRAVITY = 9.8")
-    monkeypatch.setattr(yardstick, "read_source", lambda: other)
+    other = plant.read_source().replace("GRAVITY = 9.81", "GRAVITY = 9.8")
+    monkeypatch.setattr(plant, "read_source", lambda: other)
     with pytest.raises(RuntimeError, match="the plant in C is not ours"):
         plant.make_c_advance()
 
 
 @compiler
 def test_a_compiler_that_fails_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(yardstick, "read_source", lambda: "no C at all")
-    with pytest.raises(field.AbsentError, match=r"does not compile it: .*error"):
+    monkeypatch.setattr(plant, "read_source", lambda: "no C at all")
+    with pytest.raises(timing.AbsentError, match=r"does not compile it: .*error"):
         plant.make_c_advance()
 
 
@@ -121,7 +120,8 @@ def test_without_a_compiler_the_line_is_absent(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CC", raising=False)
     measured = Suite("speed", "", "")
-    taken, absent = plant.add(measured, SHORT)
+    workloads = plant.make_workloads()
+    taken, absent = workloads.measure(measured, SHORT), workloads.absent
     assert set(taken) == {plant.PLANT}
     assert absent == {plant.C: "no C compiler"}
     assert "no C compiler" in measured.tables[0].note
@@ -131,7 +131,8 @@ def test_learning_without_torch_is_absent(monkeypatch: pytest.MonkeyPatch) -> No
     without(monkeypatch, "torch", "stable_baselines3")
     monkeypatch.delitem(sys.modules, "sideslip.agents.vec_env", raising=False)
     measured = Suite("speed", "", "")
-    taken, absent = learning.add(measured, SHORT)
+    workloads = learning.make_workloads()
+    taken, absent = workloads.measure(measured, SHORT), workloads.absent
     assert taken == {} and measured.tables == []
     assert absent[learning.PENDULUM] == "stable-baselines3 is not installed"
 
@@ -147,11 +148,11 @@ def outer(x):
     return inner(x) * 2
 outer(1); outer(1.0); outer(2); inner(1)
 """
-    found = first_use.measure_compilation(code)
+    found = first_use._measure_compilation(code)
     assert [name for name, _ in found] == ["outer", "outer", "inner"]
     assert all(seconds > 0.0 for _, seconds in found)
     with pytest.raises(RuntimeError, match="no such thing"):
-        first_use.measure_compilation("raise ValueError('no such thing')")
+        first_use._measure_compilation("raise ValueError('no such thing')")
 
 
 def test_where_no_kernels_are_on_disk_the_first_step_is_absent(
@@ -159,7 +160,7 @@ def test_where_no_kernels_are_on_disk_the_first_step_is_absent(
 ) -> None:
     monkeypatch.setattr(first_use, "LIMIT", 0.01)
     measured = Suite("speed", "", "")
-    seconds, absent = first_use.add(measured, 1, compiling=False)
+    seconds, absent = first_use.add(measured, quick=True)
     assert seconds == {} and measured.rows == []
     assert absent[first_use.FIRST] == "no kernels are cached on disk here"
 
@@ -237,9 +238,14 @@ def test_targets_are_held_beside_all_parts(monkeypatch: pytest.MonkeyPatch) -> N
         found.tables.append(None)
         held.extend(numbers)
 
-    for part in (env_steps, plant, learning, first_use):
-        own = {part.__name__: (1.0,)}, {part.__name__: "not there"}
-        monkeypatch.setattr(part, "add", lambda *_, own=own, **__: own)
+    for part in (env_steps, plant, learning):
+        workloads = timing.WorkloadSet("", "", "", absent={part.__name__: "not there"})
+        own = {part.__name__: (1.0,)}
+        monkeypatch.setattr(workloads, "measure", lambda *_, own=own: own)
+        monkeypatch.setattr(part, "make_workloads", lambda workloads=workloads: workloads)
+    monkeypatch.setattr(env_steps, "add_filters", lambda *_: None)
+    name = first_use.__name__
+    monkeypatch.setattr(first_use, "add", lambda *_: ({name: (1.0,)}, {name: "not there"}))
     monkeypatch.setattr(suite, "add", judge)
     monkeypatch.setattr(suite, "make_verdict", lambda *_: "")
     suite.run(quick=True)

@@ -21,7 +21,7 @@ from sideslip.benchmarks.studies.recurrent import (
     CaseCache,
     MemoryCase,
     MemoryResult,
-    run_case,
+    _run_case,
 )
 
 TINY = Budget(cars=4, rounds=1, epochs=1, ppo=0, duration=1.0)
@@ -40,7 +40,7 @@ def test_a_quick_run_has_its_rows_and_nobody_beats_the_optimum(
     assert abs(rows[FILTER].value) < 0.5  # 32 short episodes scatter by 0.12
     assert [cells[0] for cells in found.tables[0].cells] == list(rows)
     assert found.verdict and not found.answers
-    monkeypatch.setattr(recurrent, "run_case", None)  # so that a second run trains nobody
+    monkeypatch.setattr(recurrent, "_run_case", None)  # so that a second run trains nobody
     again = recurrent.run(quick=True, episodes=4, jobs=1, keep=tmp_path)
     assert again.rows == found.rows and again.tables == found.tables
 
@@ -56,12 +56,12 @@ def test_what_is_kept_is_of_one_case_and_a_damaged_file_is_made_anew(tmp_path: P
 
 
 def test_learning_from_rewards_is_judged_alike() -> None:
-    found = run_case(MemoryCase(PPO, REPEATED, 0, Budget(ppo=1000, duration=0.2), 2))
+    found = _run_case(MemoryCase(PPO, REPEATED, 0, Budget(ppo=1000, duration=0.2), 2))
     assert found.steps == 1000 and found.seconds > 0.0 and (found.excess > 0.0).all()
 
 
 def test_a_full_run_is_everybody_everywhere_and_some_seeds() -> None:
-    full, quick = recurrent.make_cases(False), recurrent.make_cases(True, 5)
+    full, quick = recurrent._make_cases(False), recurrent._make_cases(True, 5)
     learners = {each.learner for each in full} - {FILTER, PPO}
     for where in CONDITIONS:
         seeds = {(each.learner, each.seed) for each in full if each.condition == where}
@@ -76,15 +76,6 @@ def test_a_full_run_is_everybody_everywhere_and_some_seeds() -> None:
         10,
         30,
     ]
-
-
-def test_a_part_of_a_run_is_some_of_its_cases() -> None:
-    part = recurrent.make_cases(False, conditions=["300 ms"], seeds=1)
-    assert set(part) < set(recurrent.make_cases(False))
-    assert {each.condition for each in part} == {REPEATED, "300 ms"}
-    assert {each.seed for each in part} == {0}
-    with pytest.raises(ValueError, match="unknown condition '30 ms'"):
-        recurrent.make_cases(False, conditions=["30 ms"])
 
 
 def made(gaps: Mapping[str, float]) -> dict[str, dict[str, list[MemoryResult]]]:
@@ -105,9 +96,9 @@ def test_the_verdict_ranks_and_the_figure_has_a_line_each() -> None:
     results = made({FILTER: 0.0, "mlp": 2.0, "gru": 0.25, "kalman": 0.02, PPO: 4.0})
     long = made({FILTER: 0.0, PPO: 4.0, **dict.fromkeys(MEMORIES, 12.3)})
     results[PPO] = {REPEATED: results[PPO][REPEATED]}
-    lines = recurrent.make_verdict(results).splitlines()
+    lines = recurrent._make_verdict(results).splitlines()
     assert len(lines) <= LINES
-    assert max(map(len, [*lines, *recurrent.make_verdict(long).splitlines()])) <= LETTERS
+    assert max(map(len, [*lines, *recurrent._make_verdict(long).splitlines()])) <= LETTERS
     assert "kalman 2 %, gru 25 %, mlp 200 %" in lines[0] and "ppo" in lines[2]
     made_suite = Suite("", "", "", verdict="Who wins.")
     recurrent._draw(made_suite, results)

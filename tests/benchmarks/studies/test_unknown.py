@@ -123,22 +123,22 @@ def test_a_filter_without_bias_states_pays_for_the_bias(few: Any) -> None:
 
 def test_a_gust_has_the_bound_of_a_filter_that_does_not_know_its_strength() -> None:
     """The bound that knows it is that of the same drives without wind."""
-    gust = unknown_conditions.measure((NAMED["a gust of unknown strength"], (0, 1)))
-    calm = unknown_conditions.measure((NAMED["camera"], (0, 1)))
+    conditions = (NAMED["a gust of unknown strength"], NAMED["camera"])
+    gust, calm = unknown_conditions.measure_all(conditions, 2, "", 1)
     assert (gust.best > 1.02 * calm.best).all()
 
 
 def test_an_episode_that_ends_early_is_left_out_and_counted() -> None:
     spinning = unknown_conditions.Condition("fast", CAMERA, {"speed": 25.0, "rear_stiffness": 0.3})
-    found = unknown_conditions.measure((spinning, (0, 1)))
+    (found,) = unknown_conditions.measure_all([spinning], 2, "", 1)
     assert found.left_out == 2 and np.shape(found.squares) == (0, 2)
 
 
 def test_filterpys_filter_errs_as_ours_where_the_camera_is_at_once() -> None:
     """The same model and noise; where frames are late, which it does not know, it errs more."""
     pytest.importorskip("filterpy")
-    from sideslip.benchmarks.studies.unknown import compare_filters
+    from sideslip.benchmarks.studies.unknown import _compare_filters
 
     for late in (0.0, 0.03):
-        (ours, _), (theirs, _), _ = compare_filters((late, 1))
+        (ours, _), (theirs, _), _ = _compare_filters((late, 1))
         assert np.sqrt(theirs / ours) > 1.5 if late else theirs == pytest.approx(ours, rel=0.1)

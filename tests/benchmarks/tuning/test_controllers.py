@@ -21,10 +21,10 @@ from sideslip.benchmarks.tuning.controllers import (
     SPACES,
     ControllerTuning,
     SearchNumber,
-    compute_objective,
-    list_contests,
-    make_options,
-    run_contestant,
+    _compute_objective,
+    _list_contests,
+    _make_options,
+    _run_contestant,
     tune,
 )
 from sideslip.benchmarks.tuning.estimator import write_tuned
@@ -54,7 +54,7 @@ def test_a_planted_bad_weight_is_found_and_left(tmp_path: Path) -> None:
     assert log["best"]["objective"] < log["start"] - 0.5
     assert log["best"]["numbers"]["grip"] > 0.1
     best = log["options"]["controller"]
-    assert compute_objective(planted, SEEDS, best) == pytest.approx(
+    assert _compute_objective(planted, SEEDS, best) == pytest.approx(
         log["best"]["objective"], abs=1e-4
     )
     assert "cost" in controllers.make_suite(planted, log).text
@@ -63,10 +63,10 @@ def test_a_planted_bad_weight_is_found_and_left(tmp_path: Path) -> None:
 def test_the_objective_is_the_mean_log_of_paired_costs() -> None:
     gain = task(SearchNumber("gain", 1.0, 0.1, 10.0))
     nothing: dict[str, dict[str, Any]] = {"filter": {}, "controller": {}}
-    costs = run_contestant(SHORT, "two-dof", nothing | {"controller": {"gain": 3.0}}, SEEDS).costs
-    nominal = run_contestant(SHORT, "nominal", nothing, SEEDS).costs
+    costs = _run_contestant(SHORT, "two-dof", nothing | {"controller": {"gain": 3.0}}, SEEDS).costs
+    nominal = _run_contestant(SHORT, "nominal", nothing, SEEDS).costs
     wanted = np.clip(np.log((costs + 1e-3) / (nominal + 1e-3)), -3.0, 3.0).mean()
-    assert compute_objective(gain, SEEDS, {"gain": 3.0}) == pytest.approx(wanted, rel=1e-12)
+    assert _compute_objective(gain, SEEDS, {"gain": 3.0}) == pytest.approx(wanted, rel=1e-12)
 
 
 def test_an_adaptive_contestant_is_tuned_with_the_filter_it_follows(
@@ -77,7 +77,7 @@ def test_an_adaptive_contestant_is_tuned_with_the_filter_it_follows(
     monkeypatch.setattr(controllers, "run_chunk", lambda chunk: asked.append(chunk.entry))
     asked_of = controllers.make_controller_tuning("adaptive-nmpc", "car-yaw", (1,))
     options = asked_of.options(asked_of.start | {"force_sd": 77.0})
-    run_contestant(asked_of.contests[0], asked_of.name, options, (1,))
+    _run_contestant(asked_of.contests[0], asked_of.name, options, (1,))
     (cell,) = asked
     assert make_estimate_options(cell)["options"]["force_sd"] == 77.0
     assert make_estimate_options(replace(cell, controller="lqr"))["options"]["force_sd"] != 77.0
@@ -90,16 +90,16 @@ def test_a_failure_costs_twenty_times_nominal(monkeypatch: pytest.MonkeyPatch) -
         numbers[:, NUMBERS.index("failure")] = [0.0, 1.0] if name == "two-dof" else 0.0
         return DriveResult(numbers, 0.0)
 
-    monkeypatch.setattr(controllers, "run_contestant", fake)
+    monkeypatch.setattr(controllers, "_run_contestant", fake)
     controllers._compute_nominal_costs.cache_clear()
-    found = compute_objective(task(SearchNumber("gain", 1.0, 0.1, 10.0)), SEEDS, {"gain": 1.0})
+    found = _compute_objective(task(SearchNumber("gain", 1.0, 0.1, 10.0)), SEEDS, {"gain": 1.0})
     controllers._compute_nominal_costs.cache_clear()
     assert found == pytest.approx(0.5 * (math.log(0.501 / 1.001) + math.log(20.0)))
 
 
 def test_what_cannot_be_designed_is_infinitely_dear(monkeypatch: pytest.MonkeyPatch) -> None:
     bad = task(SearchNumber("pole", 1.0, 0.1, 10.0))
-    assert compute_objective(bad, SEEDS, {"pole": -1.0}) == math.inf
+    assert _compute_objective(bad, SEEDS, {"pole": -1.0}) == math.inf
 
 
 def test_of_a_slow_contestant_the_worse_half_stops_early(
@@ -112,7 +112,7 @@ def test_of_a_slow_contestant_the_worse_half_stops_early(
         asked.append(seeds)
         return abs(math.log(found["grip"] / 0.5)) + float(seeds[0] == first)
 
-    monkeypatch.setattr(controllers, "compute_objective", fake)
+    monkeypatch.setattr(controllers, "_compute_objective", fake)
     monkeypatch.setattr(
         controllers, "run_contestant", lambda *_: DriveResult(np.zeros((1, 1)), 0.0)
     )
@@ -139,7 +139,7 @@ def test_a_stopped_search_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
         calls.append(found["gain"])
         return found["gain"]
 
-    monkeypatch.setattr(controllers, "compute_objective", fake)
+    monkeypatch.setattr(controllers, "_compute_objective", fake)
     once = task(SearchNumber("gain", 1.0, 0.1, 10.0))
     with pytest.raises(KeyboardInterrupt):
         tune(once, 16, storage(tmp_path), jobs=1)
@@ -153,8 +153,8 @@ def test_a_stopped_search_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_class_has_contests_and_every_start_lies_within(kind: str) -> None:
     for name in SPACES:
-        assert len(list_contests(name, kind)) >= 5
-        numbers = controllers.get_space(name, kind)
+        assert len(_list_contests(name, kind)) >= 5
+        numbers = controllers._get_space(name, kind)
         assert all(0.0 < each.low <= each.start <= each.high for each in numbers)
         steers = any(each.steering for each in numbers)
         assert not (steers and kind not in controllers.STEERING)
@@ -169,7 +169,7 @@ def test_numbers_become_options() -> None:
         both,
     )
     found = {"bandwidth.0": 2.0, "bandwidth.1": 3.0, "horizon": 20.4, "disturbance_time": 0.2}
-    assert make_options(numbers, found) == {
+    assert _make_options(numbers, found) == {
         "filter": {"disturbance_time": 0.2},
         "controller": {"bandwidth": [2.0, 3.0], "horizon": 20, "disturbance_time": 0.2},
     }
@@ -231,7 +231,7 @@ def test_the_command_writes_options_and_log(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(controllers, "list_contests", lambda *_: [SHORT])
+    monkeypatch.setattr(controllers, "_list_contests", lambda *_: [SHORT])
     few = ("--class", "coms-model", "--trials", 2, "--seeds", 1, "--jobs", 1)
     status, out, _ = run("tune", "controller", "two-dof", *few, "--out", "t.toml", "--log", "logs")
     assert status == 0 and "untuned nominal" in " ".join(out.split())
