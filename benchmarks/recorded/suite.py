@@ -370,9 +370,10 @@ def _make_rows(
         measured = {"us_per_tick": (cost, math.nan, math.nan)}
         if name in result.squares:
             measured = {"rmse": result.rmse(name), "ratio": result.ratio(name)} | measured
-        where |= {"estimator": name, "n": len(result.squares.get(name, [cost]))}
-        for metric, numbers in measured.items():
-            rows.append(ResultRow.from_estimate(metric, Estimate(*numbers), **where))
+        n = len(result.squares.get(name, [cost]))
+        for metric, x in measured.items():
+            row = ResultRow.from_estimate(metric, Estimate(*x), estimator=name, n=n, **where)
+            rows.append(row)
     return rows
 
 

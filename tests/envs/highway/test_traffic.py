@@ -28,9 +28,8 @@ def test_our_car_is_where_its_body_is() -> None:
     ours = traffic().ego
     ours.set_motion(AHEAD._replace(X=10.0, Y=2.0, psi=0.3, v_y=1.0))
     centre = 0.5 * (CAR.front_arm - CAR.rear_arm)
-    assert ours.position == pytest.approx(
-        [10.0 + centre * np.cos(0.3), -2.0 - centre * np.sin(0.3)]
-    )
+    place = [10.0 + centre * np.cos(0.3), -2.0 - centre * np.sin(0.3)]
+    assert ours.position == pytest.approx(place)
     assert ours.heading == -0.3
     course = -np.arctan2(ours.velocity[1], ours.velocity[0])
     assert course == pytest.approx(0.3 + np.arctan2(1.0, V))

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -51,7 +52,7 @@ def later(by: float, since: int = 20) -> Spoiler:
     return lambda table: table.assign(time_s=table["time_s"] + by * (np.arange(50) >= since))
 
 
-def assigned(**columns: object) -> Spoiler:
+def assigned(**columns: Any) -> Spoiler:
     return lambda table: table.assign(**columns)
 
 

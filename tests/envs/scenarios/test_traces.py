@@ -10,24 +10,13 @@ import pytest
 from sideslip.agents.clairvoyant.preview import make_forecast
 from sideslip.envs import StabilityEnv, make_scenario
 from sideslip.envs.device.torch_env import DeviceVectorEnv
-from sideslip.envs.record import FAST
 
 from ..helpers import bits, drive_alike
 from ..recordings.drives import drive, saved
+from .commands import commands
 
 VISION = "sideslip/YawVision-v0"
 TRACE: dict[str, Any] = {"steering": "trace", "trace": [0.0, 0.03, -0.02, 0.01], "duration": 0.2}
-
-
-def commands(env: StabilityEnv, seed: int = 0, **options: Any) -> Any:
-    """The driver's steering command at the ticks of an episode but the last, (T,)."""
-    env.reset(seed=seed, options=options)
-    rows, over = [env.record.fast[:, FAST.steer_command]], False
-    while not over:
-        _, _, terminated, truncated, _ = env.step(np.zeros(1, np.float32))
-        rows.append(env.record.fast[:, FAST.steer_command])
-        over = terminated or truncated
-    return np.concatenate(rows)[1:]  # a row has what acted before it
 
 
 def test_a_log_is_driven_again(tmp_path: Path) -> None:
